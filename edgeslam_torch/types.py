@@ -1,0 +1,184 @@
+"""Every record that crosses a stage boundary. Read this first, then ``slam.py``.
+
+Frames of reference: ``w`` world (z up), ``b`` body (x forward, y left, z up), ``c`` camera (x right, y down,
+z forward). ``T_w_c`` takes camera coordinates to world coordinates. Metres, radians, seconds; pixel centres at
+integers. Arrays are numpy, float64 for poses and float32 for bulk data, unless a field says otherwise.
+"""
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.floating]
+IntArray = NDArray[np.integer]
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One camera image."""
+
+    index: int
+    """Position in the source, from 0; a gap means a dropped or unreadable image."""
+    stamp_s: float
+    """Time of exposure [s]."""
+    image: NDArray[np.uint8]
+    """``(H, W, 3)`` BGR or ``(H, W)`` grey, as OpenCV reads it, with the lens distortion still in it."""
+    path: Path | None = None
+    """File it came from, for messages."""
+
+
+@dataclass(frozen=True, slots=True)
+class TelemetrySample:
+    """One state message of the drone in SI units; a missing field is NaN.
+
+    Velocity is in the frame that was fixed at power-on, turned to our world axes (x forward at power-on, y left,
+    z up); `io/tello.py` makes this from the SDK's north-east-down decimetres.
+    """
+
+    stamp_s: float
+    """Arrival time [s], on the frames' clock."""
+    velocity_m_s: FloatArray = field(default_factory=lambda: np.full(3, np.nan))
+    """``(3,)`` linear velocity [m/s]."""
+    rpy_rad: FloatArray = field(default_factory=lambda: np.full(3, np.nan))
+    """``(3,)`` roll, pitch, yaw of the body in the power-on world, ``R = Rz(yaw) Ry(pitch) Rx(roll)``."""
+    height_m: float = np.nan
+    """Height above take-off (SDK ``h``)."""
+    tof_m: float = np.nan
+    """Range to the floor below (SDK ``tof``)."""
+    baro_m: float = np.nan
+    """Barometric height (SDK ``baro``)."""
+    acceleration_m_s2: FloatArray = field(default_factory=lambda: np.full(3, np.nan))
+    """``(3,)`` specific force in the body frame."""
+    battery: float = np.nan
+    """Charge in [0, 1]."""
+
+
+@dataclass(frozen=True, slots=True)
+class FrameFeatures:
+    """ORB keypoints of one frame (stage 1)."""
+
+    uv: FloatArray
+    """``(N, 2)`` undistorted pixels, float32."""
+    octave: IntArray
+    """``(N,)`` pyramid level, int32."""
+    angle_rad: FloatArray
+    """``(N,)`` orientation, float32."""
+    descriptors: NDArray[np.uint8]
+    """``(N, 32)`` ORB bits."""
+
+
+@dataclass(frozen=True, slots=True)
+class Edges:
+    """Canny edge pixels of one keyframe (stage 1)."""
+
+    uv: FloatArray
+    """``(E, 2)`` undistorted pixels, float32."""
+    normal: FloatArray
+    """``(E, 2)`` unit image gradient, across the edge, float32."""
+    colour: NDArray[np.uint8]
+    """``(E, 3)`` RGB."""
+
+
+@dataclass(frozen=True, slots=True)
+class DepthMap:
+    """Depth network output for one image (stage 1)."""
+
+    depth_m: FloatArray
+    """``(H, W)`` z-depth [m], float32, in the pixels of the *undistorted* image; NaN or <= 0 where unknown."""
+    sigma_log: FloatArray
+    """``(H, W)`` standard deviation of log depth, float32."""
+
+
+class MotionKind(StrEnum):
+    """What two views say about the motion between them."""
+
+    GENERAL = "general"
+    PURE_ROTATION = "pure rotation"
+    PLANAR = "planar scene"
+    NO_MOTION = "no motion"
+    FEW_MATCHES = "few matches"
+    DEGENERATE = "degenerate"
+
+
+@dataclass(frozen=True, slots=True)
+class RelativePose:
+    """Two-view motion from the essential matrix (stage 2), paper eqs. (2)-(5)."""
+
+    kind: MotionKind
+    T_j_i: FloatArray
+    """``(4, 4)``, takes coordinates of view i to view j; translation has unit length unless the kind says none."""
+    inliers: NDArray[np.bool_]
+    """``(M,)`` matches that agree."""
+    parallax_rad: float
+    """Median ray angle of the inliers, rotation removed."""
+
+
+class Units(StrEnum):
+    """Units of a trajectory."""
+
+    METRES = "metres"
+    ARBITRARY = "arbitrary"
+
+
+@dataclass(frozen=True, slots=True)
+class ScaleEstimate:
+    """Metres per map unit with its uncertainty."""
+
+    value: float = 1.0
+    sigma: float = np.inf
+    """Standard deviation of ``value``; infinite while unknown."""
+    source: str = "none"
+    """What it rests on: ``none``, ``depth``, ``telemetry``, ``height``, or several joined by ``+``."""
+
+    @property
+    def units(self) -> Units:
+        """Metres only when the scale is known."""
+        return Units.METRES if np.isfinite(self.sigma) else Units.ARBITRARY
+
+
+class FrameStatus(StrEnum):
+    """How a frame got its pose."""
+
+    INITIALISED = "initialised"
+    TRACKED = "tracked"
+    RELOCALISED = "relocalised"
+    PREDICTED = "predicted"
+    LOST = "lost"
+
+
+@dataclass(frozen=True, slots=True)
+class SlamOutput:
+    """What `EdgeSlam.step` knows about one frame when it returns."""
+
+    index: int
+    stamp_s: float
+    T_w_c: FloatArray
+    """``(4, 4)`` camera to world; always finite, see ``status`` for what it is worth."""
+    status: FrameStatus
+    reason: str
+    """Why the status is what it is, in words; empty when tracked well."""
+    matches: int
+    inliers: int
+    parallax_rad: float
+    """Median ray angle between this frame and its reference keyframe."""
+    keyframe: bool
+    scale: ScaleEstimate
+    stage_ms: dict[str, float]
+    """Milliseconds of each stage in this step."""
+
+
+@dataclass(frozen=True, slots=True)
+class PointCloud:
+    """Points with colour and uncertainty, in the trajectory's world frame."""
+
+    p_w: FloatArray
+    """``(P, 3)`` float32 [m, or map units while the scale is unknown]."""
+    colour: NDArray[np.uint8]
+    """``(P, 3)`` RGB."""
+    sigma_m: FloatArray
+    """``(P,)`` standard deviation along the viewing ray, float32."""
+    observations: IntArray
+    """``(P,)`` frames that agree on the point, int32."""
