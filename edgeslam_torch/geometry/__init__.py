@@ -1,0 +1,1 @@
+"""Rigid motion, cameras, epipolar geometry and triangulation."""

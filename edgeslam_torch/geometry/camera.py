@@ -1,0 +1,173 @@
+"""Pinhole camera with Brown-Conrady distortion; calibration files and presets."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import yaml
+
+from edgeslam_torch.errors import CalibrationError
+from edgeslam_torch.types import FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Camera:
+    """Intrinsics of one camera [px]; pixel centres at integers.
+
+    Example:
+        >>> camera = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
+        >>> camera.back_project(np.array([[420.0, 190.0]]), np.array([2.0]))
+        array([[ 0.4, -0.2,  2. ]])
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    """k1 k2 p1 p2 k3, as OpenCV orders them."""
+    source: str = "given"
+    """Where the numbers come from, in words; goes into every summary."""
+
+    def __post_init__(self) -> None:
+        numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
+        if self.width <= 0 or self.height <= 0 or self.fx <= 0 or self.fy <= 0:
+            raise CalibrationError(f"image size and focal lengths must be positive: {self}")
+        if not np.all(np.isfinite(numbers)):
+            raise CalibrationError(f"calibration holds a number that is not finite: {self}")
+
+    @property
+    def K(self) -> FloatArray:
+        """Calibration matrix [px], shape ``(3, 3)``, float64."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    @property
+    def is_distorted(self) -> bool:
+        """Whether any distortion coefficient differs from zero."""
+        return any(k != 0.0 for k in self.distortion)
+
+    def scaled(self, width: int, height: int) -> "Camera":
+        """The same lens on an image resized to ``width x height`` (pixel centres at integers)."""
+        sx, sy = width / self.width, height / self.height
+        return replace(
+            self,
+            width=width,
+            height=height,
+            fx=self.fx * sx,
+            fy=self.fy * sy,
+            cx=(self.cx + 0.5) * sx - 0.5,
+            cy=(self.cy + 0.5) * sy - 0.5,
+        )
+
+    def undistort_points(self, uv: FloatArray) -> FloatArray:
+        """Pixels ``(N, 2)`` as the same camera without distortion would see them."""
+        if not self.is_distorted or len(uv) == 0:
+            return np.asarray(uv, dtype=np.float32)
+        points = np.ascontiguousarray(uv, dtype=np.float64).reshape(-1, 1, 2)
+        return cv2.undistortPoints(points, self.K, np.array(self.distortion), P=self.K).reshape(-1, 2).astype(np.float32)
+
+    def undistort_image(self, image: np.ndarray) -> np.ndarray:
+        """Image resampled to the undistorted pinhole camera of the same ``K``."""
+        if not self.is_distorted:
+            return image
+        return cv2.remap(image, *self.undistortion_maps(), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+    def undistortion_maps(self) -> tuple[np.ndarray, np.ndarray]:
+        """Fixed-point maps for `cv2.remap` from the distorted to the undistorted image."""
+        maps = cv2.initUndistortRectifyMap(
+            self.K, np.array(self.distortion), None, self.K, (self.width, self.height), cv2.CV_16SC2
+        )
+        return maps[0], maps[1]
+
+    def back_project(self, uv: FloatArray, depth_m: FloatArray) -> FloatArray:
+        """Points ``(N, 3)`` in the camera frame of undistorted pixels ``(N, 2)`` at z-depth ``(N,)``, paper eq. (17)."""
+        uv, z = np.asarray(uv, dtype=np.float64), np.asarray(depth_m, dtype=np.float64)
+        x = (uv[:, 0] - self.cx) / self.fx * z
+        y = (uv[:, 1] - self.cy) / self.fy * z
+        return np.stack([x, y, z], axis=1)
+
+    def project(self, p_c: FloatArray) -> FloatArray:
+        """Undistorted pixels ``(N, 2)`` of camera-frame points ``(N, 3)``, paper eq. (1); callers mask ``z <= 0``."""
+        z = p_c[:, 2]
+        return np.stack([self.fx * p_c[:, 0] / z + self.cx, self.fy * p_c[:, 1] / z + self.cy], axis=1)
+
+    def save(self, path: Path) -> None:
+        """Write ``camera.yaml``."""
+        record = {
+            "model": "pinhole",
+            "width": self.width,
+            "height": self.height,
+            "fx": float(self.fx),
+            "fy": float(self.fy),
+            "cx": float(self.cx),
+            "cy": float(self.cy),
+            "distortion": [float(k) for k in self.distortion],
+            "source": self.source,
+        }
+        Path(path).write_text(yaml.safe_dump(record, sort_keys=False))
+
+
+PRESETS = {
+    # https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats
+    "tum_fr1": Camera(
+        640, 480, 517.306408, 516.469215, 318.643040, 255.313989, (0.262383, -0.953104, -0.005358, 0.002628, 1.163314)
+    ),
+    "tum_fr2": Camera(
+        640, 480, 520.908620, 521.007327, 325.141442, 249.701764, (0.231222, -0.784899, -0.003257, -0.000105, 0.917205)
+    ),
+    "tum_fr3": Camera(640, 480, 535.4, 539.2, 320.1, 247.6),
+    # Median of five measured drones (fx 920-936, fy within 2 px of it, cx 460-509, cy 351-364) at 960x720.
+    "tello": Camera(960, 720, 925.0, 925.0, 485.0, 360.0),
+    "kinect": Camera(640, 480, 525.0, 525.0, 319.5, 239.5),
+}
+
+
+def load_camera(name: str | Path) -> Camera:
+    """Camera from a preset's name or a calibration file.
+
+    Reads our ``camera.yaml``, ROS ``ost.yaml`` (``camera_matrix`` / ``distortion_coefficients``) and EuRoC
+    ``sensor.yaml`` (``intrinsics``).
+
+    Raises:
+        CalibrationError: If there is neither such a preset nor such a file, or the file is malformed.
+    """
+    if str(name) in PRESETS:
+        return replace(PRESETS[str(name)], source=f"preset {name}")
+    path = Path(name)
+    if not path.is_file():
+        raise CalibrationError(f"no camera file or preset {str(name)!r}; presets: {', '.join(PRESETS)}")
+    try:
+        record = yaml.safe_load(path.read_text(encoding="utf-8").replace("%YAML:1.0", ""))
+        return _camera_from_record(record, str(path))
+    except (yaml.YAMLError, UnicodeDecodeError, KeyError, TypeError, ValueError, IndexError) as error:
+        reason = " ".join(str(error).split())
+        raise CalibrationError(
+            f"{path}: not a camera calibration ({type(error).__name__}: {reason}); it needs width, height, fx, fy, cx, cy"
+        ) from error
+
+
+def _camera_from_record(record: dict[str, Any], source: str) -> Camera:
+    if "camera_matrix" in record:  # ROS camera_calibration
+        k = [float(x) for x in record["camera_matrix"]["data"]]
+        d = [float(x) for x in record["distortion_coefficients"]["data"]]
+        size = (int(record["image_width"]), int(record["image_height"]))
+        return Camera(*size, k[0], k[4], k[2], k[5], _five(d), source)
+    if "intrinsics" in record:  # EuRoC sensor.yaml
+        fx, fy, cx, cy = (float(x) for x in record["intrinsics"])
+        width, height = (int(x) for x in record["resolution"])
+        return Camera(width, height, fx, fy, cx, cy, _five(record.get("distortion_coefficients", [])), source)
+    model = record.get("model", "pinhole")
+    if model != "pinhole":
+        raise ValueError(f"camera model {model!r} is not supported, only pinhole")
+    fx, fy, cx, cy = (float(record[key]) for key in ("fx", "fy", "cx", "cy"))
+    return Camera(int(record["width"]), int(record["height"]), fx, fy, cx, cy, _five(record.get("distortion", [])), source)
+
+
+def _five(coefficients: list[float]) -> tuple[float, ...]:
+    if len(coefficients) > 5:
+        raise ValueError(f"{len(coefficients)} distortion coefficients; k1 k2 p1 p2 k3 are supported")
+    return tuple(float(k) for k in (*coefficients, *([0.0] * (5 - len(coefficients)))))
