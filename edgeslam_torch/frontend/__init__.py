@@ -1,0 +1,1 @@
+"""Stage 1: keypoints, edges, corners and depth of single images."""

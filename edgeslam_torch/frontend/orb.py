@@ -1,0 +1,65 @@
+"""ORB keypoints spread evenly over the image (Rublee et al., ICCV 2011)."""
+
+import cv2
+import numpy as np
+
+from edgeslam_torch.config import OrbConfig
+from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.types import FloatArray, FrameFeatures, IntArray
+
+
+class OrbExtractor:
+    """Detects more corners than asked for, keeps the best of every cell, describes those."""
+
+    def __init__(self, config: OrbConfig, camera: Camera) -> None:
+        self.config = config
+        self.camera = camera
+        self._orb = cv2.ORB_create(
+            nfeatures=config.candidates,
+            scaleFactor=config.scale_factor,
+            nlevels=config.levels,
+            fastThreshold=config.fast_threshold,
+        )
+
+    def __call__(self, grey: np.ndarray) -> FrameFeatures:
+        """Features of a grey image ``(H, W)`` uint8 with the lens distortion still in it."""
+        found = self._orb.detect(grey, None)
+        if found:
+            uv = cv2.KeyPoint_convert(found)
+            score = np.array([k.response for k in found], dtype=np.float32)
+            octave = np.array([k.octave for k in found], dtype=np.int32)
+            keep = spread(uv, score, octave, grey.shape[1], grey.shape[0], self.config.features)
+            found, descriptors = self._orb.compute(grey, [found[i] for i in keep])
+        if not found or descriptors is None:
+            return FrameFeatures(
+                np.zeros((0, 2), np.float32),
+                np.zeros(0, np.int32),
+                np.zeros(0, np.float32),
+                np.zeros((0, 32), np.uint8),
+            )
+        return FrameFeatures(
+            uv=self.camera.undistort_points(cv2.KeyPoint_convert(found)),
+            octave=np.array([k.octave for k in found], dtype=np.int32),
+            angle_rad=np.deg2rad(np.array([k.angle for k in found], dtype=np.float32)),
+            descriptors=descriptors,
+        )
+
+
+def spread(uv: FloatArray, score: FloatArray, octave: IntArray, width: int, height: int, wanted: int) -> IntArray:
+    """Indices of about ``wanted`` keypoints, the strongest of every image cell first.
+
+    Cells are taken in rounds: every cell gives its best corner, then its second best, and so on, until there are
+    enough; within the last round the strongest win. Weakly textured parts of the image keep their few corners,
+    which hold the pose in rotation and depth.
+    """
+    if len(uv) <= wanted:
+        return np.arange(len(uv))
+    side = np.sqrt(width * height / wanted * 4.0)  # four corners to a cell on average
+    columns = int(np.ceil(width / side))
+    cell = (uv[:, 1] // side).astype(np.int64) * columns + (uv[:, 0] // side).astype(np.int64)
+    order = np.lexsort((-score, cell))
+    sorted_cell = cell[order]
+    starts = np.flatnonzero(np.r_[True, sorted_cell[1:] != sorted_cell[:-1]])
+    rank_in_cell = np.arange(len(order)) - np.repeat(starts, np.diff(np.r_[starts, len(order)]))
+    best_first = np.lexsort((-score[order], rank_in_cell))[:wanted]
+    return np.sort(order[best_first])

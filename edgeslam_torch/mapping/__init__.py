@@ -1,0 +1,1 @@
+"""Stage 3: keyframes, triangulated anchors, edge points and the fused edge map."""

@@ -1,0 +1,1 @@
+"""Stage 2: the pose of every frame against the local map; initialisation and relocalisation."""
