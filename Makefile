@@ -1,0 +1,54 @@
+# From a bare Python 3.11 and a fresh clone: `make demo`, `make test`. The first call makes .venv (minutes, most of it
+# the download of torch); later calls find the stamp file and start at once.
+#   make test PYTEST_ARGS="-k ply"
+#   make demo PIP_ARGS="--extra-index-url URL"   another package index, e.g. torch's own with the smaller CPU build
+SHELL := /bin/bash
+PYTHON ?= $(shell command -v python3.11 || command -v python3)
+VENV ?= .venv
+BIN := $(VENV)/bin
+PIP_ARGS ?=
+PYTEST_ARGS ?=
+DEMO_ARGS ?= --out runs/demo
+STAMP := $(VENV)/.installed
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+
+.PHONY: help install demo test test-slow lint docs wheel clean
+
+help:
+	@echo "make demo | test | test-slow | lint | docs | wheel | clean"
+
+install: $(STAMP)
+
+$(STAMP): pyproject.toml constraints.txt
+	@test -n "$(PYTHON)" || { echo "make: no python3.11 or python3 found; install Python 3.11 or newer, or say make PYTHON=..."; exit 1; }
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+		{ echo "make: $(PYTHON) is older than Python 3.11; say make PYTHON=/path/to/python3.11"; exit 1; }
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install $(PIP_ARGS) -c constraints.txt -e '.[dev,drone]'
+	@touch $@
+
+demo: $(STAMP)
+	$(BIN)/edgeslam demo $(DEMO_ARGS)
+
+test: $(STAMP)
+	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+test-slow: $(STAMP)
+	$(BIN)/python -m pytest -m slow $(PYTEST_ARGS)
+
+lint: $(STAMP)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+wheel: $(STAMP)
+	rm -rf dist
+	$(BIN)/python -m pip wheel $(PIP_ARGS) --no-deps -w dist .
+	$(BIN)/python tests/check_wheel.py dist/*.whl
+
+docs: $(STAMP)
+	@echo "docs/ is Markdown, readable as it is"
+
+clean:
+	rm -rf dist build site runs .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -not -path './$(VENV)/*' -prune -exec rm -rf {} +
