@@ -1,0 +1,75 @@
+"""Least-squares alignment of two point sets: none, SE(3), Sim(3).
+
+S. Umeyama, "Least-squares estimation of transformation parameters between two point patterns", PAMI 1991.
+"""
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+
+from edgeslam_torch.eval.errors import EvaluationError
+from edgeslam_torch.types import FloatArray
+
+
+class AlignmentKind(StrEnum):
+    """Degrees of freedom given to the estimate before it is compared."""
+
+    NONE = "none"
+    SE3 = "se3"
+    SIM3 = "sim3"
+
+
+@dataclass(frozen=True, slots=True)
+class Alignment:
+    """``p_truth = scale * R @ p_estimate + t``."""
+
+    scale: float = 1.0
+    R: FloatArray = field(default_factory=lambda: np.eye(3))
+    """``(3, 3)``."""
+    t: FloatArray = field(default_factory=lambda: np.zeros(3))
+    """``(3,)`` [m]."""
+    kind: AlignmentKind = AlignmentKind.NONE
+    degenerate: bool = False
+    """The positions lie on a line or a point, so that the rotation is not determined."""
+
+    def points(self, p: FloatArray) -> FloatArray:
+        """Estimated points ``(N, 3)`` in the truth's frame."""
+        return self.scale * p @ self.R.T + self.t
+
+    def poses(self, T: FloatArray) -> FloatArray:
+        """Estimated poses ``(N, 4, 4)`` in the truth's frame; rotations stay rotations."""
+        out = T.copy()
+        out[:, :3, :3] = self.R @ T[:, :3, :3]
+        out[:, :3, 3] = self.points(T[:, :3, 3])
+        return out
+
+
+def umeyama(estimate: FloatArray, truth: FloatArray, kind: AlignmentKind | str = AlignmentKind.SIM3) -> Alignment:
+    """Alignment of ``estimate`` ``(N, 3)`` to ``truth`` ``(N, 3)`` with the least squared distance.
+
+    Raises:
+        EvaluationError: With fewer than two points, or an estimate that never moves (no scale).
+
+    Example:
+        >>> p = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
+        >>> umeyama(p, 2 * p + 1).scale
+        2.0
+    """
+    kind = AlignmentKind(kind)
+    if kind is AlignmentKind.NONE:
+        return Alignment()
+    if len(estimate) < 2:
+        raise EvaluationError(f"{len(estimate)} matched pose(s): an alignment needs at least 2, better 3 off a line")
+    mean_e, mean_t = estimate.mean(axis=0), truth.mean(axis=0)
+    centred_e, centred_t = estimate - mean_e, truth - mean_t
+    variance_e = float(np.mean(np.sum(centred_e**2, axis=1)))
+    if variance_e < 1e-18:
+        raise EvaluationError("the estimated trajectory never moves: nothing to align")
+    U, d, Vt = np.linalg.svd(centred_t.T @ centred_e / len(estimate))  # eq. 38
+    sign = np.ones(3)
+    if np.linalg.det(U) * np.linalg.det(Vt) < 0:
+        sign[2] = -1.0  # eq. 43: no reflection
+    R = U @ np.diag(sign) @ Vt
+    scale = float(np.sum(d * sign) / variance_e) if kind is AlignmentKind.SIM3 else 1.0
+    return Alignment(scale, R, mean_t - scale * R @ mean_e, kind, degenerate=bool(d[1] <= 1e-9 * max(d[0], 1e-300)))

@@ -1,0 +1,7 @@
+"""What makes an evaluation impossible, said in words that name the likely mistake."""
+
+from edgeslam_torch.errors import EdgeSlamError
+
+
+class EvaluationError(EdgeSlamError):
+    """Two files cannot be compared; the message says what is probably wrong with them."""

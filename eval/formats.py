@@ -1,0 +1,268 @@
+"""Trajectory files: TUM, EuRoC, KITTI and 7-Scenes, read and written.
+
+All give camera (or body) to world poses, as the files' own conventions say. Every reader refuses what cannot be a
+trajectory with one line that names the file and the likely mistake.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from edgeslam_torch.eval.errors import EvaluationError
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.types import FloatArray
+
+SEVEN_SCENES_HZ = 30.0
+"""The 7-Scenes files carry no stamps; the sensor ran at 30 Hz."""
+
+_MAX_FILE_BYTES = 1 << 30
+"""A gigabyte of poses is 80 hours at 100 Hz: larger files are something else (a bag, a video)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Trajectory:
+    """Poses over time."""
+
+    stamps_s: FloatArray
+    """``(N,)`` float64, strictly increasing."""
+    T_w_c: FloatArray
+    """``(N, 4, 4)`` camera to world, float64."""
+    source: str = "trajectory"
+    """File it came from, for messages."""
+    notes: tuple[str, ...] = ()
+    """What the reader had to mend or assume."""
+    rows: FloatArray | None = None
+    """``(N, 7)`` position and quaternion as the file gives them, so that a wrong order can be recognised."""
+
+    def __len__(self) -> int:
+        return len(self.stamps_s)
+
+    @property
+    def positions(self) -> FloatArray:
+        """Camera centres ``(N, 3)``."""
+        return self.T_w_c[:, :3, 3]
+
+    @property
+    def path_length(self) -> float:
+        """Sum of the steps between consecutive positions."""
+        return float(np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum())
+
+    def take(self, index: NDArray[np.integer] | NDArray[np.bool_] | slice) -> "Trajectory":
+        """The poses at ``index``."""
+        rows = None if self.rows is None else self.rows[index]
+        return Trajectory(self.stamps_s[index], self.T_w_c[index], self.source, self.notes, rows)
+
+
+def read_trajectory(path: Path | str, stamps_s: FloatArray | None = None) -> Trajectory:
+    """Trajectory from a file or folder; the format is recognised by what is in it.
+
+    Args:
+        path: A TUM, EuRoC (``.csv``) or KITTI text file, a folder of 7-Scenes ``*.pose.txt``, or a run's or data
+            set's folder that holds one of them under its usual name.
+        stamps_s: Stamps of a KITTI file's rows ``(N,)`` [s]; a ``times.txt`` beside it is found by itself.
+
+    Raises:
+        EvaluationError: If there is no such file, or it is empty or malformed.
+    """
+    path = Path(path)
+    if path.is_dir():
+        return _read_folder(path)
+    table, lines = _read_table(path)
+    columns = table.shape[1]
+    if columns == 8:
+        return _from_rows(table[:, 0], table[:, 1:8], path)
+    if columns == 12:
+        return _from_kitti(table, path, stamps_s)
+    if columns in (11, 17) or (columns > 8 and path.suffix == ".csv"):  # EuRoC: ns, p, q (w first), v, biases
+        return _from_rows(table[:, 0] * 1e-9, table[:, [1, 2, 3, 5, 6, 7, 4]], path)
+    hint = " (positions without orientation?)" if columns == 4 else ""
+    raise EvaluationError(
+        f"{path}: {columns} numbers a row{hint}; TUM has 8 (t x y z qx qy qz qw), KITTI 12, EuRoC 17: "
+        f"line {lines[0]} is the first"
+    )
+
+
+def write_tum(trajectory: Trajectory, path: Path | str) -> None:
+    """Write ``t tx ty tz qx qy qz qw``, camera to world."""
+    rows = [
+        f"{stamp:.6f} " + " ".join(f"{x:.9f}" for x in se3.pose_to_tum(T))
+        for stamp, T in zip(trajectory.stamps_s, trajectory.T_w_c, strict=True)
+    ]
+    Path(path).write_text("# timestamp tx ty tz qx qy qz qw\n" + "\n".join(rows) + "\n", encoding="ascii")
+
+
+def write_euroc(trajectory: Trajectory, path: Path | str) -> None:
+    """Write EuRoC's ``ns, px, py, pz, qw, qx, qy, qz`` followed by zero velocity and biases."""
+    header = "#timestamp [ns],px,py,pz,qw,qx,qy,qz,vx,vy,vz,bwx,bwy,bwz,bax,bay,baz"
+    rows = []
+    for stamp, T in zip(trajectory.stamps_s, trajectory.T_w_c, strict=True):
+        x = se3.pose_to_tum(T)
+        numbers = [f"{v:.9f}" for v in (*x[:3], x[6], *x[3:6])] + ["0"] * 9
+        rows.append(f"{round(stamp * 1e9)}," + ",".join(numbers))
+    Path(path).write_text(header + "\n" + "\n".join(rows) + "\n", encoding="ascii")
+
+
+def write_kitti(trajectory: Trajectory, path: Path | str) -> None:
+    """Write 12 numbers a row and the stamps to ``times.txt`` beside it."""
+    path = Path(path)
+    np.savetxt(path, trajectory.T_w_c[:, :3, :].reshape(-1, 12), fmt="%.9e")
+    np.savetxt(path.with_name("times.txt"), trajectory.stamps_s, fmt="%.9f")
+
+
+def write_seven_scenes(trajectory: Trajectory, folder: Path | str) -> None:
+    """Write one ``frame-NNNNNN.pose.txt`` a pose; the number is the stamp in 30 Hz frames."""
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    numbers = np.round(trajectory.stamps_s * SEVEN_SCENES_HZ).astype(int)
+    if len(set(numbers.tolist())) != len(numbers) or numbers.min() < 0:
+        raise EvaluationError("7-Scenes numbers frames at 30 Hz from stamp 0; these stamps do not fit that")
+    for number, T in zip(numbers, trajectory.T_w_c, strict=True):
+        np.savetxt(folder / f"frame-{number:06d}.pose.txt", T, fmt="%.9e")
+
+
+WRITERS: dict[str, Callable[[Trajectory, Path | str], None]] = {
+    "tum": write_tum,
+    "euroc": write_euroc,
+    "kitti": write_kitti,
+    "7scenes": write_seven_scenes,
+}
+
+
+def _read_folder(folder: Path) -> Trajectory:
+    names = (
+        "trajectory.txt",
+        "groundtruth.txt",
+        "mav0/state_groundtruth_estimate0/data.csv",
+        "state_groundtruth_estimate0/data.csv",
+        "data.csv",
+        "poses.txt",
+    )
+    for name in names:
+        if (folder / name).is_file():
+            return read_trajectory(folder / name)
+    files = sorted(folder.glob("*.pose.txt"))
+    if files:
+        return _from_seven_scenes(files, folder)
+    raise EvaluationError(f"{folder}: no trajectory in this folder (looked for {', '.join(names)}, *.pose.txt)")
+
+
+def _read_table(path: Path) -> tuple[FloatArray, list[int]]:
+    """Numbers of a text table and the line each row came from."""
+    try:
+        if path.stat().st_size > _MAX_FILE_BYTES:
+            raise EvaluationError(f"{path}: {path.stat().st_size / 1e9:.1f} GB is no trajectory file")
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError as error:
+        raise EvaluationError(f"{path}: no such trajectory file") from error
+    except UnicodeDecodeError as error:
+        raise EvaluationError(f"{path}: not a text file, so not a trajectory") from error
+    except OSError as error:
+        raise EvaluationError(f"{path}: cannot be read ({error.strerror})") from error
+    rows: list[list[float]] = []
+    lines: list[int] = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        fields = line.split("#", 1)[0].replace(",", " ").split()
+        if not fields:
+            continue
+        try:
+            rows.append([float(x) for x in fields])
+        except ValueError as error:
+            if not rows:
+                continue  # a header without '#'
+            raise EvaluationError(f"{path}: line {number} is not numbers: {line.strip()[:60]!r}") from error
+        lines.append(number)
+        if len(rows[-1]) != len(rows[0]):
+            if number == len(text.splitlines()) and not text.endswith("\n"):
+                rows.pop(), lines.pop()  # the writer was cut off in the middle of a line
+                break
+            raise EvaluationError(
+                f"{path}: line {number} has {len(rows[-1])} numbers, line {lines[0]} has {len(rows[0])}"
+            )
+    if not rows:
+        raise EvaluationError(f"{path}: the file holds no poses (did the run stop before its first frame?)")
+    return np.array(rows), lines
+
+
+def _from_rows(stamps_s: FloatArray, rows: FloatArray, path: Path) -> Trajectory:
+    """Trajectory from stamps and ``x y z qx qy qz qw``, cleaned and checked."""
+    notes: list[str] = []
+    finite = np.isfinite(stamps_s) & np.isfinite(rows).all(axis=1)
+    if not finite.any():
+        raise EvaluationError(f"{path}: every pose holds a NaN or infinity")
+    if not finite.all():
+        notes.append(f"{np.count_nonzero(~finite)} of {len(rows)} poses are not finite and were left out")
+    stamps_s, rows = stamps_s[finite], rows[finite]
+    norms = np.linalg.norm(rows[:, 3:], axis=1)
+    odd = np.abs(norms - 1.0) > 0.05  # files with three decimals stay within 0.005
+    if odd.mean() > 0.5:
+        raise EvaluationError(
+            f"{path}: the last four numbers of a row are no unit quaternion (norm {np.median(norms):.3g}); "
+            "the order must be t x y z qx qy qz qw"
+        )
+    if odd.any():
+        notes.append(f"{np.count_nonzero(odd)} poses without a unit quaternion were left out")
+        stamps_s, rows = stamps_s[~odd], rows[~odd]
+    stamps_s, rows, more = _increasing(stamps_s, rows)
+    T = np.tile(np.eye(4), (len(rows), 1, 1))
+    T[:, :3, :3] = Rotation.from_quat(rows[:, 3:]).as_matrix()
+    T[:, :3, 3] = rows[:, :3]
+    return Trajectory(stamps_s, T, str(path), tuple(notes + more), rows)
+
+
+def _increasing(stamps_s: FloatArray, rows: FloatArray) -> tuple[FloatArray, FloatArray, list[str]]:
+    """Rows in order of time, one a stamp."""
+    notes: list[str] = []
+    steps = np.diff(stamps_s)
+    if len(steps) and np.all(steps < 0):
+        notes.append("the rows run backwards in time: sorted")
+    elif np.any(steps < 0):
+        notes.append(f"{np.count_nonzero(steps < 0)} rows are out of order in time: sorted")
+    order = np.argsort(stamps_s, kind="stable")
+    stamps_s, rows = stamps_s[order], rows[order]
+    first = np.concatenate([[True], np.diff(stamps_s) > 0])
+    if not first.all():
+        notes.append(f"{np.count_nonzero(~first)} rows repeat a stamp: the first of each was kept")
+    return stamps_s[first], rows[first], notes
+
+
+def _from_matrices(stamps_s: FloatArray, T: FloatArray, source: str, notes: list[str]) -> Trajectory:
+    finite = np.isfinite(T).all(axis=(1, 2))
+    if not finite.any():
+        raise EvaluationError(f"{source}: every pose holds a NaN or infinity")
+    if not finite.all():
+        notes.append(f"{np.count_nonzero(~finite)} of {len(T)} poses are not finite and were left out")
+    stamps_s, T = stamps_s[finite], T[finite].copy()
+    if np.median(np.abs(np.linalg.det(T[:, :3, :3]) - 1.0)) > 0.05:
+        raise EvaluationError(f"{source}: the 3x3 parts are no rotations (determinant not 1)")
+    T[:, :3, :3] = Rotation.from_matrix(T[:, :3, :3]).as_matrix()
+    return Trajectory(stamps_s, T, source, tuple(notes))
+
+
+def _from_kitti(table: FloatArray, path: Path, stamps_s: FloatArray | None) -> Trajectory:
+    notes: list[str] = []
+    if stamps_s is None and (path.with_name("times.txt")).is_file():
+        stamps_s = _read_table(path.with_name("times.txt"))[0][:, 0]
+    if stamps_s is None:
+        notes.append("no times.txt beside the KITTI poses: rows are matched by number, at 10 Hz")
+        stamps_s = np.arange(len(table)) / 10.0  # KITTI odometry's frame rate
+    if len(stamps_s) != len(table):
+        raise EvaluationError(f"{path}: {len(table)} poses but {len(stamps_s)} stamps")
+    T = np.tile(np.eye(4), (len(table), 1, 1))
+    T[:, :3, :] = table.reshape(-1, 3, 4)
+    return _from_matrices(np.asarray(stamps_s, dtype=np.float64), T, str(path), notes)
+
+
+def _from_seven_scenes(files: list[Path], folder: Path) -> Trajectory:
+    numbers = np.array([int("".join(c for c in file.name.split(".")[0] if c.isdigit()) or -1) for file in files])
+    T = np.empty((len(files), 4, 4))
+    for i, file in enumerate(files):
+        table = _read_table(file)[0]
+        if table.shape != (4, 4):
+            raise EvaluationError(f"{file}: a 7-Scenes pose is 4x4 numbers, got {table.shape[0]}x{table.shape[1]}")
+        T[i] = table
+    note = f"7-Scenes has no stamps: frame number / {SEVEN_SCENES_HZ:g} s"
+    return _from_matrices(numbers / SEVEN_SCENES_HZ, T, str(folder), [note])
