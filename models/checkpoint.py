@@ -1,0 +1,174 @@
+"""Network weights on disk: safetensors with a JSON record in the header."""
+
+import dataclasses
+import hashlib
+import json
+import pickle
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import safetensors
+import safetensors.torch
+import torch
+from torch import Tensor
+
+from edgeslam_torch.errors import WeightsError
+from edgeslam_torch.models.fastdepth import FastDepth, Output, Variant, Widths
+from edgeslam_torch.models.mobilenet import Padding
+
+_KEY = "edgeslam"
+DEFAULT_WEIGHTS = Path(__file__).parent / "weights" / "default.safetensors"
+
+
+@dataclass(frozen=True, slots=True)
+class Metadata:
+    """Everything needed to run the weights correctly, and what they are worth."""
+
+    variant: str = Variant.SKIPADD.value
+    input_height: int = 192
+    input_width: int = 256
+    """Size of the training images [px]."""
+    focal_px: float = 210.0
+    """Focal length at ``input_width`` for which the network's metres hold; other cameras are corrected by the ratio."""
+    mean: tuple[float, float, float] = (0.5, 0.5, 0.5)
+    std: tuple[float, float, float] = (0.5, 0.5, 0.5)
+    """Input is ``(rgb - mean) / std`` with rgb in [0, 1]."""
+    padding: str = Padding.TF_SAME.value
+    output: str = Output.LOG_DEPTH.value
+    uncertainty: bool = True
+    sigma_scale: float = 1.0
+    sigma_floor: float = 0.0
+    """Calibrated standard deviation of log depth: ``hypot(sigma_scale * sigma, sigma_floor)``."""
+    units: str = "m"
+    data: tuple[str, ...] = ()
+    """Data sets it was trained on."""
+    licence: str = ""
+    metrics: dict[str, float] = field(default_factory=dict)
+    notes: str = ""
+
+    def build(self, widths: Widths | None = None) -> FastDepth:
+        """A network of this description with fresh weights."""
+        return FastDepth(self.variant, widths, self.padding, self.output, self.uncertainty)
+
+
+def save_checkpoint(network: FastDepth, metadata: Metadata, path: Path, half: bool = False) -> None:
+    """Write weights and metadata; ``half`` stores float16 (half the size, depth changes by less than 0.1 %)."""
+    tensors = {k: _stored(v, half) for k, v in network.state_dict().items()}
+    header = {_KEY: json.dumps(dataclasses.asdict(metadata)), "format": "pt"}
+    temporary = path.with_name(path.name + ".part")
+    safetensors.torch.save_file(tensors, temporary, metadata=header)
+    temporary.replace(path)
+
+
+def load_checkpoint(path: Path | None = None) -> tuple[FastDepth, Metadata]:
+    """Network in evaluation mode and its metadata; the shipped weights when ``path`` is None.
+
+    Also reads ``weights_only`` torch files that hold ``{"state_dict": ..., "metadata": ...}`` or a bare state_dict.
+
+    Raises:
+        WeightsError: If the file is missing, damaged or of another network.
+    """
+    path = DEFAULT_WEIGHTS if path is None else Path(path)
+    if not path.is_file():
+        raise WeightsError(
+            f"{path}: no such weights file; `edgeslam weights list` shows what can be downloaded"
+        )
+    state, metadata = _read(path)
+    network = metadata.build(Widths.of_state_dict(state))
+    try:
+        network.load_state_dict({k: v.float() if v.is_floating_point() else v for k, v in state.items()})
+    except RuntimeError as error:
+        raise WeightsError(
+            f"{path}: does not fit {metadata.variant} ({' '.join(str(error).split())[:200]})"
+        ) from None
+    return network.eval(), metadata
+
+
+def read_metadata(path: Path) -> Metadata:
+    """The record in the header alone."""
+    return _read(Path(path))[1]
+
+
+def file_hash(path: Path) -> str:
+    """SHA-256 of a file, hexadecimal."""
+    digest = hashlib.sha256()
+    with Path(path).open("rb") as file:
+        while chunk := file.read(1 << 20):
+            digest.update(chunk)
+    return digest.hexdigest()
+
+
+def metadata_from_json(text: str) -> Metadata:
+    """Parse the header's record; unknown keys are ignored so that newer files still load."""
+    record: dict[str, Any] = json.loads(text)
+    known = {f.name for f in dataclasses.fields(Metadata)}
+    lists = {k: tuple(v) if isinstance(v, list) else v for k, v in record.items() if k in known}
+    return Metadata(**lists)
+
+
+def upstream_metadata(state: dict[str, Tensor]) -> Metadata:
+    """What an official checkpoint without a record is: NYU Depth v2, 224x224, RGB in [0, 1], depth in metres.
+
+    The focal length is that of NYU's Kinect (518.86 px at 640) in upstream's preprocessing: 640x480 scaled to height
+    250, centre-cropped to 304x228, then squeezed to 224x224.
+    """
+    widths = Widths.of_state_dict(state)
+    skips = "conv0.0.weight" in state
+    if not skips:
+        variant = Variant.NNCONV5DW if "decoder.conv1.1.0.weight" in state else Variant.NNCONV5
+    else:
+        variant = Variant.SKIPADD if widths.encoder[-1] == 1024 else Variant.PRUNED
+    return Metadata(
+        variant=variant.value,
+        input_height=224,
+        input_width=224,
+        focal_px=518.86 * 250 / 480 * 224 / 304,
+        mean=(0.0, 0.0, 0.0),
+        std=(1.0, 1.0, 1.0),
+        padding=Padding.SYMMETRIC.value,
+        output=Output.DEPTH.value,
+        uncertainty=False,
+        sigma_floor=0.25,
+        data=("NYU Depth v2",),
+        licence="MIT (dwofk/fast-depth)",
+    )
+
+
+def _stored(tensor: Tensor, half: bool) -> Tensor:
+    tensor = tensor.detach().cpu().contiguous().clone()
+    return tensor.half() if half and tensor.is_floating_point() else tensor
+
+
+def _read(path: Path) -> tuple[dict[str, Tensor], Metadata]:
+    try:
+        with path.open("rb") as file:
+            is_zip = file.read(2) == b"PK"
+        if is_zip:
+            return _read_torch(path)
+        with safetensors.safe_open(path, framework="pt") as opened:
+            header = opened.metadata() or {}
+            state = {key: opened.get_tensor(key) for key in opened.keys()}  # noqa: SIM118 - not a mapping
+    except (OSError, safetensors.SafetensorError) as error:
+        raise WeightsError(f"{path}: damaged or not a safetensors file ({error})") from error
+    try:
+        metadata = metadata_from_json(header[_KEY]) if _KEY in header else upstream_metadata(state)
+    except (json.JSONDecodeError, TypeError) as error:
+        raise WeightsError(f"{path}: unreadable metadata in the header ({error})") from error
+    return state, metadata
+
+
+def _read_torch(path: Path) -> tuple[dict[str, Tensor], Metadata]:
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except (RuntimeError, EOFError, ValueError, ModuleNotFoundError) as error:
+        raise WeightsError(f"{path}: damaged torch file ({' '.join(str(error).split())[:160]})") from error
+    except pickle.UnpicklingError:
+        raise WeightsError(
+            f"{path}: holds pickled code, not plain tensors; convert it first: `edgeslam weights convert`"
+        ) from None
+    if not isinstance(content, dict):
+        raise WeightsError(f"{path}: holds no state_dict")
+    state = content.get("state_dict", content)
+    record = content.get("metadata") if "state_dict" in content else None
+    return state, metadata_from_json(json.dumps(record)) if record else upstream_metadata(state)

@@ -1,0 +1,195 @@
+"""FastDepth (Wofk et al., ICRA 2019) in its four published variants, under upstream's parameter names."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from edgeslam_torch.errors import WeightsError
+from edgeslam_torch.models.mobilenet import Padding, encoder_layers
+
+
+class Variant(StrEnum):
+    """The paper's four networks."""
+
+    NNCONV5 = "mobilenet-nnconv5"
+    NNCONV5DW = "mobilenet-nnconv5dw"
+    SKIPADD = "mobilenet-nnconv5dw-skipadd"
+    PRUNED = "mobilenet-nnconv5dw-skipadd-pruned"
+
+    @property
+    def has_skips(self) -> bool:
+        """Whether encoder features are added to the decoder's."""
+        return self in (Variant.SKIPADD, Variant.PRUNED)
+
+
+class Output(StrEnum):
+    """What the last layer means."""
+
+    DEPTH = "depth"
+    """ReLU of the last layer is depth in metres (upstream)."""
+    LOG_DEPTH = "log_depth"
+    """The exponential of the last layer is depth: positive everywhere, relative errors weigh the same near and far."""
+
+
+@dataclass(frozen=True, slots=True)
+class Widths:
+    """Output channels of every layer."""
+
+    encoder: tuple[int, ...]
+    """conv0 ... conv13."""
+    decoder: tuple[int, ...]
+    """decode_conv1 ... decode_conv5; decode_conv6 has one channel."""
+
+    @staticmethod
+    def of_state_dict(state: Mapping[str, Tensor]) -> "Widths":
+        """Read the widths off a checkpoint's shapes, whichever variant it is.
+
+        Raises:
+            WeightsError: If a layer is missing.
+        """
+        skips = "conv0.0.weight" in state
+        encoder, decoder = ("conv", "decode_conv") if skips else ("mobilenet.", "decoder.conv")
+        try:
+            e = [state[f"{encoder}0.0.weight"].shape[0]]
+            e += [state[f"{encoder}{i}.3.weight"].shape[0] for i in range(1, 14)]
+            point = "1.0.weight" if f"{decoder}1.1.0.weight" in state else "0.weight"
+            d = [state[f"{decoder}{i}.{point}"].shape[0] for i in range(1, 6)]
+        except KeyError as missing:
+            raise WeightsError(f"not a FastDepth checkpoint: no parameter {missing}") from None
+        return Widths(tuple(e), tuple(d))
+
+
+FULL = Widths((32, 64, 128, 128, 256, 256, 512, 512, 512, 512, 512, 512, 1024, 1024), (512, 256, 128, 64, 32))
+PRUNED = Widths((16, 56, 88, 120, 144, 256, 408, 376, 272, 288, 296, 328, 480, 512), (200, 256, 120, 56, 16))
+_SKIP_INTO = {4: 1, 3: 3, 2: 5}
+"""Decoder layer -> encoder layer whose output is added after upsampling."""
+MAX_LOG_DEPTH = math.log(100.0)
+INPUT_MULTIPLE = 32
+"""Height and width of an input must be multiples of this."""
+
+
+class Prediction(NamedTuple):
+    """What the network says about a batch; all ``(B, 1, H, W)``."""
+
+    log_depth: Tensor
+    """Natural logarithm of depth at the training focal length [log m]."""
+    log_sigma: Tensor | None
+    """Logarithm of the standard deviation of ``log_depth``; None without an uncertainty head."""
+
+
+class FastDepth(nn.Module):
+    """Encoder MobileNetV1, decoder of five 5x5 nearest-neighbour upsampling convolutions.
+
+    Args:
+        variant: One of the four networks.
+        widths: Channels; by default those published for the variant.
+        padding: Of the encoder's strided convolutions, see `Padding`.
+        output: Meaning of the last layer.
+        uncertainty: Adds a 1x1 head (``uncertainty``) on the last features; upstream has none.
+    """
+
+    def __init__(
+        self,
+        variant: Variant | str = Variant.SKIPADD,
+        widths: Widths | None = None,
+        padding: Padding | str = Padding.SYMMETRIC,
+        output: Output | str = Output.DEPTH,
+        uncertainty: bool = False,
+    ) -> None:
+        super().__init__()
+        self.variant, self.padding, self.output = Variant(variant), Padding(padding), Output(output)
+        self.widths = widths or (PRUNED if self.variant is Variant.PRUNED else FULL)
+        layers = encoder_layers(self.widths.encoder, self.padding)
+        channels = (self.widths.encoder[-1], *self.widths.decoder)
+        block = _dense5 if self.variant is Variant.NNCONV5 else _separable5
+        decoder = [block(a, b) for a, b in zip(channels, channels[1:], strict=False)]
+        decoder.append(_pointwise(channels[-1], 1))
+        if self.variant.has_skips:
+            for i, layer in enumerate(layers):
+                self.add_module(f"conv{i}", layer)
+            for i, layer in enumerate(decoder, start=1):
+                self.add_module(f"decode_conv{i}", layer)
+        else:
+            self.mobilenet = nn.Sequential(*layers)
+            self.decoder = nn.ModuleDict({f"conv{i}": layer for i, layer in enumerate(decoder, start=1)})
+        self.uncertainty = nn.Conv2d(channels[-1], 1, 1) if uncertainty else None
+        self.apply(_initialise)
+        if self.uncertainty is not None:
+            nn.init.zeros_(self.uncertainty.weight)
+            nn.init.constant_(self.uncertainty.bias, math.log(0.2))  # type: ignore[arg-type]
+
+    def encoder(self) -> list[nn.Module]:
+        """conv0 ... conv13 in order."""
+        if self.variant.has_skips:
+            return [self.get_submodule(f"conv{i}") for i in range(14)]
+        return list(self.mobilenet)
+
+    def decoder_layers(self) -> list[nn.Module]:
+        """decode_conv1 ... decode_conv6 in order."""
+        prefix = "decode_conv" if self.variant.has_skips else "decoder.conv"
+        return [self.get_submodule(f"{prefix}{i}") for i in range(1, 7)]
+
+    def predict(self, x: Tensor) -> Prediction:
+        """Log depth and its uncertainty for normalised RGB ``(B, 3, H, W)``, H and W multiples of 32."""
+        last, features = self._last_layer(x)
+        log_sigma = None if self.uncertainty is None else self.uncertainty(features).clamp(-4.0, 1.5)
+        if self.output is Output.LOG_DEPTH:
+            return Prediction(last.clamp(-MAX_LOG_DEPTH, MAX_LOG_DEPTH), log_sigma)
+        return Prediction(F.relu(last).clamp(1e-3, 100.0).log(), log_sigma)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Depth at the training focal length [m], ``(B, 1, H, W)``, for normalised RGB ``(B, 3, H, W)``."""
+        last, _ = self._last_layer(x)
+        if self.output is Output.LOG_DEPTH:
+            return last.clamp(-MAX_LOG_DEPTH, MAX_LOG_DEPTH).exp()
+        return F.relu(last)
+
+    def _last_layer(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        if x.shape[-1] % INPUT_MULTIPLE or x.shape[-2] % INPUT_MULTIPLE:
+            raise ValueError(
+                f"height and width must be multiples of {INPUT_MULTIPLE}, got {tuple(x.shape[-2:])}"
+            )
+        kept: dict[int, Tensor] = {}
+        for i, layer in enumerate(self.encoder()):
+            x = layer(x)
+            if self.variant.has_skips and i in _SKIP_INTO.values():
+                kept[i] = x
+        *stages, head = self.decoder_layers()
+        for i, layer in enumerate(stages, start=1):
+            x = F.interpolate(layer(x), scale_factor=2.0, mode="nearest")
+            if self.variant.has_skips and i in _SKIP_INTO:
+                x = x + kept[_SKIP_INTO[i]]
+        return head[1](head[0](x)), x  # type: ignore[index]
+
+
+def _pointwise(inputs: int, outputs: int) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Conv2d(inputs, outputs, 1, bias=False), nn.BatchNorm2d(outputs), nn.ReLU(inplace=True)
+    )
+
+
+def _dense5(inputs: int, outputs: int) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Conv2d(inputs, outputs, 5, padding=2, bias=False), nn.BatchNorm2d(outputs), nn.ReLU(inplace=True)
+    )
+
+
+def _separable5(inputs: int, outputs: int) -> nn.Sequential:
+    depthwise = nn.Sequential(
+        nn.Conv2d(inputs, inputs, 5, padding=2, groups=inputs, bias=False),
+        nn.BatchNorm2d(inputs),
+        nn.ReLU(inplace=True),
+    )
+    return nn.Sequential(depthwise, _pointwise(inputs, outputs))
+
+
+def _initialise(module: nn.Module) -> None:
+    """He initialisation (fan out); keeps activations alive through 13 ReLUs."""
+    if isinstance(module, nn.Conv2d):
+        nn.init.kaiming_normal_(module.weight, mode="fan_out")

@@ -1,0 +1,123 @@
+"""Where a training step's loss comes from. A signal draws its part of a batch and returns named losses."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from edgeslam_torch.losses.depth import BerHu, GradientMatching, LaplaceNll, MaskedL1, SILog
+from edgeslam_torch.models.checkpoint import Metadata
+from edgeslam_torch.models.fastdepth import FastDepth
+from edgeslam_torch.train.augment import AugmentConfig, View, random_view
+from edgeslam_torch.train.validate import image_tensor
+
+
+@dataclass(frozen=True, slots=True)
+class Slot:
+    """One image's place in the global batch of a step; everything random about it follows from these three numbers."""
+
+    seed: int
+    step: int
+    index: int
+
+    def rng(self) -> np.random.Generator:
+        """The slot's own generator: the same on every machine, after any restart, in any process."""
+        return np.random.default_rng((self.seed, self.step, self.index))
+
+
+class Signal(Protocol):
+    """A kind of supervision."""
+
+    name: str
+
+    def draw(self, slots: Sequence[Slot]) -> dict[str, Tensor]:
+        """Tensors of a batch, one image per slot; ``names`` for messages is kept by `describe`."""
+        ...
+
+    def describe(self, slots: Sequence[Slot]) -> list[str]:
+        """What each slot shows, for messages."""
+        ...
+
+    def losses(self, network: FastDepth, batch: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Weighted losses by name, each ``(B,)``."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class SupervisedWeights:
+    """Weights of the supervised terms; 0 leaves one out."""
+
+    l1: float = 1.0
+    berhu: float = 0.0
+    silog: float = 0.0
+    gradient: float = 0.5
+    uncertainty: float = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """A pool of views drawn with equal chances."""
+
+    name: str
+    views: Sequence[View]
+    share: float
+    """Part of the batch taken from here, relative to the other sources."""
+
+
+@dataclass
+class Supervised:
+    """Images with depth from several sources, augmented."""
+
+    sources: Sequence[Source]
+    metadata: Metadata
+    augment: AugmentConfig = field(default_factory=AugmentConfig)
+    weights: SupervisedWeights = field(default_factory=SupervisedWeights)
+    name: str = "supervised"
+
+    def __post_init__(self) -> None:
+        shares = np.array([s.share for s in self.sources], dtype=np.float64)
+        self._edges = np.cumsum(shares / shares.sum())
+        self._terms = nn.ModuleDict(
+            {"l1": MaskedL1(), "berhu": BerHu(), "silog": SILog(), "gradient": GradientMatching()}
+        )
+        self._nll = LaplaceNll()
+
+    def _choose(self, rng: np.random.Generator) -> tuple[Source, int]:
+        source = self.sources[min(int(np.searchsorted(self._edges, rng.random())), len(self.sources) - 1)]
+        return source, int(rng.integers(len(source.views)))
+
+    def describe(self, slots: Sequence[Slot]) -> list[str]:
+        """``source/index`` of each image."""
+        chosen = [self._choose(slot.rng()) for slot in slots]
+        return [f"{source.name}/{index}" for source, index in chosen]
+
+    def draw(self, slots: Sequence[Slot]) -> dict[str, Tensor]:
+        """``image (B, 3, H, W)``, ``log_depth (B, 1, H, W)`` at the training focal length, ``mask``."""
+        images, targets = [], []
+        size = (self.metadata.input_height, self.metadata.input_width)
+        for slot in slots:
+            rng = slot.rng()
+            source, index = self._choose(rng)
+            view = random_view(source.views[index], size, self.augment, rng)
+            images.append(image_tensor(view.image, self.metadata))
+            focal = float(np.sqrt(view.K[0, 0] * view.K[1, 1]))
+            targets.append(torch.from_numpy(view.depth_m * (self.metadata.focal_px / focal))[None])
+        depth = torch.stack(targets)
+        mask = (depth > 0.05) & (depth < 30.0)
+        return {"image": torch.stack(images), "log_depth": depth.clamp(0.05, 30.0).log(), "mask": mask}
+
+    def losses(self, network: FastDepth, batch: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Weighted terms, each ``(B,)``."""
+        predicted, target, mask = network.predict(batch["image"]), batch["log_depth"], batch["mask"]
+        out = {}
+        for name, term in self._terms.items():
+            weight = getattr(self.weights, name)
+            if weight:
+                out[name] = weight * term(predicted.log_depth, target, mask)
+        if predicted.log_sigma is not None and self.weights.uncertainty:
+            nll = self._nll(predicted.log_sigma, predicted.log_depth, target, mask)
+            out["uncertainty"] = self.weights.uncertainty * nll
+        return out

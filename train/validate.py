@@ -1,0 +1,105 @@
+"""Depth metrics on held-out views, as the recipe prints them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from torch import nn
+
+from edgeslam_torch.models.checkpoint import Metadata
+from edgeslam_torch.models.fastdepth import FastDepth
+from edgeslam_torch.train.augment import View, fitted_view
+from edgeslam_torch.types import FloatArray
+
+MIN_DEPTH_M, MAX_DEPTH_M = 0.1, 10.0
+
+
+@dataclass(frozen=True, slots=True)
+class DepthScores:
+    """Means over images; relative errors unless a unit is given."""
+
+    abs_rel: float
+    """Metric."""
+    abs_rel_scaled: float
+    """After each image's median is matched."""
+    rmse_m: float
+    delta1: float
+    delta1_scaled: float
+    abs_rel_edges: float
+    """Metric, Canny edge pixels alone."""
+    log_scale_std: float
+    """Spread over images of the log of the median ratio: how much the scale wanders."""
+
+
+def image_tensor(image: np.ndarray, metadata: Metadata) -> torch.Tensor:
+    """BGR uint8 ``(H, W, 3)`` -> normalised RGB ``(3, H, W)`` float32."""
+    rgb = image[..., ::-1].astype(np.float32) / 255.0
+    normalised = (rgb - np.float32(metadata.mean)) / np.float32(metadata.std)
+    return torch.from_numpy(np.ascontiguousarray(normalised.transpose(2, 0, 1)))
+
+
+def log_focal_ratio(K: FloatArray, width: int, metadata: Metadata) -> float:
+    """Log of this view's focal length over the training one at the same image width: metres = canonical * ratio."""
+    mean_focal = float(np.sqrt(K[0, 0] * K[1, 1]))
+    return float(np.log(mean_focal / metadata.focal_px * (metadata.input_width / width)))
+
+
+def predict_metres(network: FastDepth, metadata: Metadata, view: View) -> tuple[FloatArray, FloatArray]:
+    """Depth [m] and its sigma (log) at the view's own size, focal length corrected."""
+    size = (metadata.input_height, metadata.input_width)
+    fitted = fitted_view(view, size)
+    with torch.no_grad():
+        prediction = network.predict(image_tensor(fitted.image, metadata)[None])
+    # The network sees pixels, so what counts is the focal length in its own pixels (input_width of them).
+    log_depth = prediction.log_depth[0, 0].numpy() + np.log(
+        np.sqrt(fitted.K[0, 0] * fitted.K[1, 1]) / metadata.focal_px
+    )
+    log_sigma = (
+        prediction.log_sigma[0, 0].numpy() if prediction.log_sigma is not None else np.zeros_like(log_depth)
+    )
+    h, w = view.image.shape[:2]
+    large = cv2.resize(log_depth, (w, h), interpolation=cv2.INTER_LINEAR)
+    return np.exp(large), np.exp(cv2.resize(log_sigma, (w, h), interpolation=cv2.INTER_LINEAR))
+
+
+def score(network: FastDepth, metadata: Metadata, views: Sequence[View]) -> DepthScores:
+    """Evaluate on views with depth; images without a valid pixel are skipped."""
+    was_training = network.training
+    network.eval()
+    rows = []
+    for view in views:
+        predicted, _ = predict_metres(network, metadata, view)
+        row = _scores_of(predicted, view)
+        if row is not None:
+            rows.append(row)
+    network.train(was_training)
+    means = np.nanmean(np.array(rows), axis=0)
+    return DepthScores(*(float(x) for x in means[:-1]), float(np.std([r[-1] for r in rows])))
+
+
+def _scores_of(predicted: FloatArray, view: View) -> tuple[float, ...] | None:
+    mask = (view.depth_m > MIN_DEPTH_M) & (view.depth_m < MAX_DEPTH_M)
+    if not mask.any():
+        return None
+    p, t = predicted[mask], view.depth_m[mask]
+    ratio = float(np.median(t) / np.median(p))
+    edges = (cv2.Canny(cv2.cvtColor(view.image, cv2.COLOR_BGR2GRAY), 50, 150) > 0) & mask
+    at_edges = np.abs(predicted[edges] / view.depth_m[edges] - 1).mean() if edges.any() else np.nan
+    return (
+        float(np.abs(p / t - 1).mean()),
+        float(np.abs(p * ratio / t - 1).mean()),
+        float(np.sqrt(np.square(p - t).mean())),
+        float((np.maximum(p / t, t / p) < 1.25).mean()),
+        float((np.maximum(p * ratio / t, t / (p * ratio)) < 1.25).mean()),
+        float(at_edges),
+        float(np.log(ratio)),
+    )
+
+
+def set_training(network: nn.Module, frozen: Sequence[nn.Module], fixed_norm: Sequence[nn.Module]) -> None:
+    """Training mode, but frozen parts and the batch norms of ``fixed_norm`` keep their statistics."""
+    network.train()
+    for part in (*frozen, *fixed_norm):
+        part.eval()
