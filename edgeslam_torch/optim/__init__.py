@@ -1,0 +1,1 @@
+"""Levenberg-Marquardt refinement of poses, anchors, edge depths and junctions."""

@@ -1,0 +1,260 @@
+"""Robust refinement of one camera pose against fixed points; runs once or twice per frame, so numpy."""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.optim.priors import inverse_left_jacobian, pose_prior_residual
+from edgeslam_torch.optim.problem import PosePrior
+from edgeslam_torch.optim.robust import CHI2_2DOF_95
+from edgeslam_torch.types import FloatArray
+
+
+class PoseStatus(StrEnum):
+    """What a refined pose is worth."""
+
+    OK = "ok"
+    FEW_POINTS = "few points"
+    DEGENERATE = "degenerate points"
+    NOT_CONVERGED = "not converged"
+    NOT_FINITE = "not finite"
+
+
+@dataclass(frozen=True, slots=True)
+class PoseConfig:
+    """How to refine a pose."""
+
+    rounds: int = 4
+    """Outliers are chosen anew after each round."""
+    robust_rounds: int = 2
+    """Rounds with a Huber kernel; the later ones trust the inliers, as in ORB-SLAM."""
+    iterations: int = 10
+    """Steps per round."""
+    chi2: float = CHI2_2DOF_95
+    """Squared whitened residual above which a point is an outlier."""
+    step_tolerance: float = 1e-6
+    """Largest tangent component that still counts as movement."""
+    cost_tolerance: float = 1e-4
+    """Relative decrease of the cost that still counts as progress."""
+    min_points: int = 6
+    min_depth: float = 1e-3
+    condition_max: float = 1e12
+    """Ratio of extreme eigenvalues of the scaled normal matrix above which the points do not fix a pose."""
+
+
+@dataclass(frozen=True, slots=True)
+class PoseResult:
+    """A refined pose."""
+
+    T_c_w: FloatArray
+    """``(4, 4)`` world to camera; the start when the status is not OK or NOT_CONVERGED."""
+    inliers: NDArray[np.bool_]
+    """``(N,)`` points that agree with the pose."""
+    chi2: FloatArray
+    """``(N,)`` squared whitened residuals; infinite behind the camera."""
+    covariance: FloatArray
+    """``(6, 6)`` of a left perturbation, from the inliers; NaN when there is none."""
+    iterations: int
+    status: PoseStatus
+
+    @property
+    def n_inliers(self) -> int:
+        """Number of inliers."""
+        return int(np.count_nonzero(self.inliers))
+
+
+def refine_pose(
+    T_c_w: FloatArray,
+    p_w: FloatArray,
+    uv: FloatArray,
+    inv_sigma: FloatArray,
+    K: tuple[float, float, float, float],
+    *,
+    prior: PosePrior | None = None,
+    config: PoseConfig | None = None,
+) -> PoseResult:
+    """Refine a pose against fixed points by damped, reweighted Gauss-Newton in rounds.
+
+    Args:
+        T_c_w: Starting world-to-camera pose ``(4, 4)``.
+        p_w: Points ``(N, 3)``.
+        uv: Their undistorted pixels ``(N, 2)``.
+        inv_sigma: Inverse standard deviations ``(N,)`` [1/px].
+        K: fx, fy, cx, cy [px].
+        prior: Predicted pose with its information; ``prior.pose`` is not used.
+        config: Rounds, thresholds.
+
+    Returns:
+        Pose, inliers and status; the pose is finite whenever the start was.
+
+    Example:
+        >>> rng = np.random.default_rng(0)
+        >>> p = rng.uniform((-1, -1, 2), (1, 1, 4), (50, 3))
+        >>> uv = 500 * p[:, :2] / p[:, 2:]
+        >>> start = se3.exp(np.array([0.02, 0.0, 0.03, 0.01, 0.0, 0.0]))
+        >>> result = refine_pose(start, p, uv, np.ones(50), (500.0, 500.0, 0.0, 0.0))
+        >>> result.status.value, bool(np.allclose(result.T_c_w, np.eye(4), atol=1e-6))
+        ('ok', True)
+    """
+    config = config or PoseConfig()
+    start: FloatArray = np.array(T_c_w, dtype=np.float64)
+    points = _Points(p_w, uv, inv_sigma, K, prior, config)
+    n = len(points.use)
+    if n < config.min_points:
+        return _failed(start, n, PoseStatus.FEW_POINTS)
+    if not (np.isfinite(start).all() and points.finite()):
+        return _failed(start, n, PoseStatus.NOT_FINITE)
+    T: FloatArray = start
+    iterations, converged = 0, False
+    for k in range(config.rounds):
+        robust = k < config.robust_rounds
+        T, used, converged = _round(T, points, robust, config)
+        iterations += used
+        inliers = points.chi2 <= config.chi2
+        same = np.array_equal(inliers, points.use)
+        if np.count_nonzero(inliers) < config.min_points:
+            return _failed(start, n, PoseStatus.FEW_POINTS, iterations)
+        points.use = inliers
+        if same and converged and not robust:
+            break
+    H, _, _ = points.linearise(T, robust=False)
+    if H is None:
+        return _failed(start, n, PoseStatus.NOT_FINITE, iterations)
+    scale = 1.0 / np.sqrt(np.maximum(H.diagonal(), 1e-30))
+    values, vectors = np.linalg.eigh(scale[:, None] * H * scale)
+    if values[0] <= values[-1] / config.condition_max:
+        return _failed(start, n, PoseStatus.DEGENERATE, iterations)
+    half = scale[:, None] * vectors / np.sqrt(values)
+    return PoseResult(
+        T_c_w=T,
+        inliers=points.chi2 <= config.chi2,
+        chi2=points.chi2,
+        covariance=half @ half.T,
+        iterations=iterations,
+        status=PoseStatus.OK if converged else PoseStatus.NOT_CONVERGED,
+    )
+
+
+def _failed(T: FloatArray, n: int, status: PoseStatus, iterations: int = 0) -> PoseResult:
+    return PoseResult(T, np.zeros(n, bool), np.full(n, np.inf), np.full((6, 6), np.nan), iterations, status)
+
+
+def _round(
+    T: FloatArray, points: "_Points", robust: bool, config: PoseConfig
+) -> tuple[FloatArray, int, bool]:
+    """Levenberg-Marquardt with the present inliers; leaves ``points.chi2`` at the returned pose."""
+    H, g, cost = points.linearise(T, robust)
+    mu, used = 1e-6, 0
+    if H is None:
+        return T, used, False
+    while used < config.iterations:
+        used += 1
+        damped = H.copy()
+        damped[_DIAGONAL, _DIAGONAL] *= 1.0 + mu
+        try:
+            delta = -np.linalg.solve(damped, g)
+        except np.linalg.LinAlgError:
+            return T, used, False
+        chi2 = points.chi2
+        trial = se3.exp(delta) @ T
+        H_new, g_new, cost_new = points.linearise(trial, robust)
+        small = float(np.abs(delta).max()) < config.step_tolerance
+        if H_new is None or not cost_new <= cost:
+            points.chi2 = chi2
+            if small:
+                return T, used, True
+            mu = max(10.0 * mu, 1e-3)
+            continue
+        flat = cost - cost_new <= config.cost_tolerance * cost
+        T, H, g, cost, mu = trial, H_new, g_new, cost_new, 0.1 * mu
+        if small or flat:
+            return T, used, True
+    return T, used, False
+
+
+class _Points:
+    """Points of one refinement and the scratch rows of their Jacobian."""
+
+    def __init__(
+        self,
+        p_w: FloatArray,
+        uv: FloatArray,
+        inv_sigma: FloatArray,
+        K: tuple[float, float, float, float],
+        prior: PosePrior | None,
+        config: PoseConfig,
+    ) -> None:
+        fx, fy, cx, cy = K
+        self.p = np.ascontiguousarray(np.asarray(p_w, dtype=np.float64).reshape(-1, 3).T)
+        uv64 = np.asarray(uv, dtype=np.float64).reshape(-1, 2)
+        n = len(uv64)
+        if self.p.shape[1] != n or len(inv_sigma) != n:
+            raise ValueError(
+                f"{self.p.shape[1]} points, {n} pixels and {len(inv_sigma)} sigmas must be equally many"
+            )
+        # In units of the focal length the Jacobian needs no intrinsics; they go into the weights.
+        self.xy = np.stack(((uv64[:, 0] - cx) / fx, (uv64[:, 1] - cy) / fy))
+        self.weight = np.array([[fx], [fy]]) * np.asarray(inv_sigma, dtype=np.float64)
+        self.prior, self.config = prior, config
+        self.use = np.ones(n, dtype=bool)
+        self.chi2 = np.full(n, np.inf)
+        self.rows = np.zeros((7, 2, n))
+
+    def finite(self) -> bool:
+        """Whether every input is finite."""
+        return bool(
+            np.isfinite(self.p).all() and np.isfinite(self.xy).all() and np.isfinite(self.weight).all()
+        )
+
+    def linearise(self, T: FloatArray, robust: bool) -> tuple[FloatArray | None, FloatArray, float]:
+        """Normal matrix, gradient and cost over the points in use; sets ``chi2`` of all points."""
+        p_c = T[:3, :3] @ self.p + T[:3, 3:]
+        z = p_c[2]
+        front = z > self.config.min_depth
+        iz = 1.0 / np.where(front, z, 1.0)
+        n = p_c[:2] * iz
+        x, y = n
+        r = n - self.xy
+        whitened = r * self.weight
+        s = np.einsum("ij,ij->j", whitened, whitened)
+        s[~front] = np.inf
+        self.chi2 = s
+        use = self.use & front
+        if robust:
+            delta = self.config.chi2**0.5
+            norm = np.sqrt(np.maximum(s, self.config.chi2))
+            # s inside, 2 delta |r| - delta^2 outside; its derivative is delta / norm
+            cost = np.minimum(s, self.config.chi2) + 2.0 * delta * (norm - delta)
+            weight = self.weight * np.where(use, np.sqrt(delta / norm), 0.0)
+            # A point behind the camera costs as much as one a thousand pixels off.
+            total = float(cost[use].sum()) + 2000.0 * delta * np.count_nonzero(self.use & ~front)
+        else:
+            weight = self.weight * use
+            total = float(s[use].sum()) + 1e6 * np.count_nonzero(self.use & ~front)
+        rows = self.rows
+        xy = x * y
+        rows[0, 0] = rows[1, 1] = iz
+        np.multiply(n, -iz, out=rows[2])
+        np.negative(xy, out=rows[3, 0])
+        np.add(x * x, 1.0, out=rows[4, 0])
+        np.negative(y, out=rows[5, 0])
+        np.subtract(-1.0, y * y, out=rows[3, 1])
+        rows[4, 1], rows[5, 1], rows[6] = xy, x, r
+        B = (rows * weight).reshape(7, -1)
+        G = B @ B.T
+        H, g = G[:6, :6], G[:6, 6].copy()
+        if self.prior is not None:
+            e = pose_prior_residual(T, self.prior)
+            J = inverse_left_jacobian(e)
+            H = H + J.T @ self.prior.information @ J
+            g += J.T @ (self.prior.information @ e)
+            total += float(e @ self.prior.information @ e)
+        if not np.isfinite(total):
+            return None, g, total
+        return H, g, total
+
+
+_DIAGONAL = np.arange(6)

@@ -1,0 +1,149 @@
+"""What goes into a refinement and what comes out: numpy records, no behaviour."""
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgeslam_torch.optim.robust import CHI2_2DOF_95, Kernel
+from edgeslam_torch.types import FloatArray, IntArray
+
+
+class StopReason(StrEnum):
+    """Why the solver stopped."""
+
+    COST_CONVERGED = "cost converged"
+    STEP_CONVERGED = "step converged"
+    GRADIENT_CONVERGED = "gradient converged"
+    MAX_ITERATIONS = "iteration limit"
+    STALLED = "no step lowers the cost"
+    SINGULAR = "reduced system not positive definite"
+    NO_OBSERVATIONS = "no usable observations"
+    NOTHING_FREE = "nothing to refine"
+    NOT_FINITE = "not finite"
+
+    @property
+    def converged(self) -> bool:
+        """Whether the state is a minimum to within the tolerances."""
+        return self in (self.COST_CONVERGED, self.STEP_CONVERGED, self.GRADIENT_CONVERGED)
+
+
+@dataclass(frozen=True, slots=True)
+class PosePrior:
+    """What is known beforehand about one pose: ``log(T_c_w T_prior^-1) ~ N(0, information^-1)``."""
+
+    pose: int
+    T_c_w: FloatArray
+    """``(4, 4)`` expected world-to-camera pose."""
+    information: FloatArray
+    """``(6, 6)`` inverse covariance, translation first, of a left perturbation."""
+
+
+@dataclass(frozen=True, slots=True)
+class ScalePrior:
+    """Expected distance between two camera centres; fixes the scale gauge."""
+
+    pose_i: int
+    pose_j: int
+    distance: float
+    sigma_log: float
+    """Standard deviation of the log of the distance."""
+
+
+@dataclass(frozen=True, slots=True)
+class DepthPriors:
+    """Expected inverse z-depths of anchors in host poses, as a depth network gives them."""
+
+    anchor: IntArray
+    """``(D,)`` anchor indices."""
+    pose: IntArray
+    """``(D,)`` host pose indices."""
+    inverse_depth: FloatArray
+    """``(D,)`` [1/m]."""
+    sigma: FloatArray
+    """``(D,)`` standard deviations [1/m]."""
+
+
+@dataclass(frozen=True, slots=True)
+class WindowProblem:
+    """Poses and anchors to refine together; ``W`` poses, ``A`` anchors, ``M`` observations."""
+
+    T_c_w: FloatArray
+    """``(W, 4, 4)`` world-to-camera poses."""
+    pose_fixed: NDArray[np.bool_]
+    """``(W,)`` poses that hold the gauge and do not move."""
+    p_w: FloatArray
+    """``(A, 3)`` anchors in the world."""
+    obs_pose: IntArray
+    """``(M,)`` which pose saw it."""
+    obs_anchor: IntArray
+    """``(M,)`` which anchor was seen."""
+    uv: FloatArray
+    """``(M, 2)`` undistorted pixels."""
+    inv_sigma: FloatArray
+    """``(M,)`` inverse standard deviation of a keypoint [1/px], from its octave."""
+    K: tuple[float, float, float, float]
+    """fx, fy, cx, cy [px]."""
+    pose_priors: tuple[PosePrior, ...] = ()
+    scale_priors: tuple[ScalePrior, ...] = ()
+    depth_priors: DepthPriors | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class LmConfig:
+    """How to minimise."""
+
+    max_iterations: int = 10
+    """Steps tried, accepted or not."""
+    kernel: Kernel = Kernel.HUBER
+    delta: float = CHI2_2DOF_95**0.5
+    """Where the kernel departs from least squares [standard deviations]."""
+    mu: float = 1e-4
+    """First damping, relative to the diagonal of the normal matrix."""
+    mu_max: float = 1e8
+    cost_tolerance: float = 1e-5
+    """Relative decrease of the cost below which an accepted step is the last."""
+    step_tolerance: float = 1e-9
+    """Largest tangent component below which a step is the last."""
+    gradient_tolerance: float = 1e-9
+    """Largest gradient component, in units of its own curvature, below which nothing is tried."""
+    min_depth: float = 1e-3
+    """Points nearer than this in front of a camera count as behind it (map units)."""
+    behind_px: float = 1000.0
+    """Residual that stands for an observation whose point is behind the camera."""
+    diagnostics: bool = True
+    """Report rank deficiency and the newest pose's covariance (costs one more linearisation)."""
+    rank_tolerance: float = 1e-9
+    """Eigenvalues of the scaled reduced system below this fraction of the largest count as zero."""
+
+    def __post_init__(self) -> None:
+        if self.max_iterations < 0:
+            raise ValueError(f"max_iterations must not be negative, got {self.max_iterations}")
+        if self.delta <= 0 or self.mu <= 0:
+            raise ValueError(f"delta and mu must be positive, got {self.delta} and {self.mu}")
+
+
+@dataclass(frozen=True, slots=True)
+class WindowResult:
+    """Refined state and what is known about it."""
+
+    T_c_w: FloatArray
+    """``(W, 4, 4)`` refined world-to-camera poses."""
+    p_w: FloatArray
+    """``(A, 3)`` refined anchors."""
+    chi2: FloatArray
+    """``(M,)`` squared whitened reprojection residuals at the result; infinite behind the camera."""
+    in_front: NDArray[np.bool_]
+    """``(M,)`` whether the anchor lies in front of the camera."""
+    cost_before: float
+    """Robust cost (sum of rho) at the start."""
+    cost_after: float
+    iterations: int
+    """Steps tried."""
+    accepted: int
+    stop: StopReason
+    rank_deficiency: int = 0
+    """Unobservable directions of the free poses (1 for a free scale), -1 when not computed."""
+    pose_covariance: FloatArray = field(default_factory=lambda: np.full((6, 6), np.nan))
+    """``(6, 6)`` of the last free pose, left tangent, anchors marginalised; NaN when not computed."""

@@ -1,0 +1,48 @@
+"""Robust kernels on squared whitened residuals, with their iteratively-reweighted weights."""
+
+from enum import StrEnum
+
+import torch
+from torch import Tensor
+
+CHI2_2DOF_95 = 5.991
+"""95 % quantile of chi-square with 2 degrees of freedom."""
+CHI2_1DOF_95 = 3.841
+"""95 % quantile of chi-square with 1 degree of freedom."""
+
+
+class Kernel(StrEnum):
+    """Shape of the robust cost."""
+
+    L2 = "l2"
+    HUBER = "huber"
+    CAUCHY = "cauchy"
+    TUKEY = "tukey"
+
+
+def rho(s: Tensor, kernel: Kernel, delta: float) -> tuple[Tensor, Tensor]:
+    r"""Robust cost and its derivative, the weight of one reweighted least-squares step.
+
+    Args:
+        s: Squared whitened residuals, any shape, ``>= 0``.
+        kernel: Shape; every one behaves like ``s`` near zero.
+        delta: Where the kernel departs from ``s``, in standard deviations.
+
+    Returns:
+        ``rho(s)`` and ``rho'(s)``, shaped like ``s``.
+
+    Example:
+        >>> cost, weight = rho(torch.tensor([1.0, 16.0]), Kernel.HUBER, 2.0)
+        >>> cost, weight
+        (tensor([ 1., 12.]), tensor([1.0000, 0.5000]))
+    """
+    if kernel is Kernel.L2:
+        return s, torch.ones_like(s)
+    c2 = delta * delta
+    if kernel is Kernel.HUBER:
+        outside = s.clamp_min(c2).sqrt()
+        return s.clamp_max(c2) + 2.0 * delta * (outside - delta), delta / outside
+    if kernel is Kernel.CAUCHY:
+        return c2 * torch.log1p(s / c2), c2 / (c2 + s)
+    rest = (1.0 - s / c2).clamp_min(0.0)
+    return c2 / 3.0 * (1.0 - rest**3), rest * rest

@@ -1,0 +1,96 @@
+"""Reprojection error of anchors, paper eqs. (15)-(16)."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+
+class ReprojectionJacobians(NamedTuple):
+    """Residuals with their derivatives, components first so that every row is one contiguous vector."""
+
+    residual: Tensor
+    """``(2, M)`` predicted minus observed [px]."""
+    pose: Tensor
+    """``(2, 6, M)`` by the left tangent ``(rho, phi)`` of ``T_c_w``."""
+    point: Tensor
+    """``(2, 3, M)`` by the anchor in the world."""
+    depth: Tensor
+    """``(M,)`` z in the camera; rows with ``z <= 0`` hold no meaning."""
+
+
+def camera_points(T_c_w: Tensor, p_w: Tensor, obs_pose: Tensor, obs_anchor: Tensor) -> tuple[Tensor, Tensor]:
+    """Each observation's rotation ``(3, 3, M)`` and point in its camera ``(3, M)``.
+
+    Args:
+        T_c_w: World-to-camera poses ``(W, 4, 4)``.
+        p_w: Anchors ``(A, 3)``.
+        obs_pose: ``(M,)`` pose indices.
+        obs_anchor: ``(M,)`` anchor indices.
+    """
+    Rt = T_c_w[:, :3, :].permute(1, 2, 0).reshape(12, -1).index_select(1, obs_pose).view(3, 4, -1)
+    p = p_w.mT.contiguous().index_select(1, obs_anchor)
+    R = Rt[:, :3]
+    return R, (R * p).sum(1) + Rt[:, 3]
+
+
+def reprojection_residuals(
+    T_c_w: Tensor, p_w: Tensor, obs_pose: Tensor, obs_anchor: Tensor, uv: Tensor, K: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Predicted minus observed pixels ``(2, M)`` and depths ``(M,)``, paper eqs. (15)-(16).
+
+    Args:
+        T_c_w: World-to-camera poses ``(W, 4, 4)``.
+        p_w: Anchors ``(A, 3)``.
+        obs_pose: ``(M,)`` pose indices.
+        obs_anchor: ``(M,)`` anchor indices.
+        uv: Observed undistorted pixels ``(2, M)``.
+        K: fx, fy, cx, cy [px], shape ``(4,)``.
+    """
+    _, p_c = camera_points(T_c_w, p_w, obs_pose, obs_anchor)
+    z = p_c[2]
+    return p_c[:2] / z * K[:2, None] + (K[2:, None] - uv), z
+
+
+def reprojection_jacobians(
+    T_c_w: Tensor, p_w: Tensor, obs_pose: Tensor, obs_anchor: Tensor, uv: Tensor, K: Tensor
+) -> ReprojectionJacobians:
+    """`reprojection_residuals` with derivatives written out; arguments as there."""
+    R, p_c = camera_points(T_c_w, p_w, obs_pose, obs_anchor)
+    z = p_c[2]
+    iz = z.reciprocal()
+    n = p_c[:2] * iz  # (2, M) normalised image coordinates
+    x, y = n
+    residual = n * K[:2, None] + (K[2:, None] - uv)
+    f_iz = K[:2, None] * iz
+    point = f_iz[:, None] * (R[:2] - n[:, None] * R[2])
+    pose = torch.empty(2, 6, z.shape[0], dtype=z.dtype, device=z.device)
+    pose[0, 0], pose[0, 1] = f_iz[0], 0.0
+    pose[1, 0], pose[1, 1] = 0.0, f_iz[1]
+    torch.mul(f_iz, n, out=pose[:, 2]).neg_()
+    xy = x * y
+    fx, fy = K[0], K[1]
+    torch.mul(xy, -fx, out=pose[0, 3])
+    torch.mul(x * x + 1.0, fx, out=pose[0, 4])
+    torch.mul(y, -fx, out=pose[0, 5])
+    torch.mul(y * y + 1.0, -fy, out=pose[1, 3])
+    torch.mul(xy, fy, out=pose[1, 4])
+    torch.mul(x, fy, out=pose[1, 5])
+    return ReprojectionJacobians(residual, pose, point, z)
+
+
+def inverse_depth_jacobians(R: Tensor, p_c: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Inverse z-depth of points and its derivatives, for the depth network's prior on anchors.
+
+    Args:
+        R: Rotations ``(3, 3, D)`` of the host poses (world to camera).
+        p_c: Points in the host cameras ``(3, D)``.
+
+    Returns:
+        ``1 / z`` ``(D,)``, its derivatives by the pose's left tangent ``(6, D)`` and by the anchor ``(3, D)``.
+    """
+    iz = p_c[2].reciprocal()
+    m = -iz * iz
+    zero = torch.zeros_like(iz)
+    pose = torch.stack((zero, zero, m, m * p_c[1], -m * p_c[0], zero))
+    return iz, pose, m * R[2]
