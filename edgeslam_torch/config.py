@@ -1,0 +1,156 @@
+"""Every setting of the SLAM system with its unit, default and reason. TOML in, dataclass inside.
+
+One section per stage; `SlamConfig` holds them all. Functions take plain arguments or one section, never the whole.
+"""
+
+from dataclasses import dataclass, field
+
+from edgeslam_torch.fusion.config import FusionConfig
+
+
+def _positive(section: object, *names: str) -> None:
+    for name in names:
+        value = getattr(section, name)
+        if not value > 0:
+            raise ValueError(f"{name} must be positive, got {value}")
+
+
+@dataclass(frozen=True, slots=True)
+class OrbConfig:
+    """Stage 1: keypoints."""
+
+    features: int = 1000
+    """Keypoints kept per frame; the figure of ORB-SLAM2 for 640x480."""
+    candidates: int = 2000
+    """Corners detected before the even spread."""
+    scale_factor: float = 1.2
+    levels: int = 8
+    fast_threshold: int = 7
+    """Grey levels; low, because the spread keeps the strongest of every cell."""
+
+    def __post_init__(self) -> None:
+        _positive(self, "features", "candidates", "levels", "fast_threshold")
+        if not 1.0 < self.scale_factor <= 2.0:
+            raise ValueError(f"scale_factor must be in (1, 2], got {self.scale_factor}")
+
+
+@dataclass(frozen=True, slots=True)
+class DepthConfig:
+    """Stage 1: the depth network, once per keyframe."""
+
+    weights: str = "default"
+    """``default``, ``none``, or a weights file."""
+    backend: str = "onnxruntime"
+    """``onnxruntime`` or ``torch``."""
+    prior_sigma_log: float = 0.35
+    """Spread of log depth assumed where no network speaks; wide enough for a desk and a wall behind it."""
+
+    def __post_init__(self) -> None:
+        _positive(self, "prior_sigma_log")
+        if self.backend not in ("onnxruntime", "torch"):
+            raise ValueError(f"backend must be onnxruntime or torch, got {self.backend!r}")
+
+
+@dataclass(frozen=True, slots=True)
+class TrackingConfig:
+    """Stage 2: the pose of every frame."""
+
+    motion_radius_px: float = 15.0
+    """Search radius around the predicted pixel, at pyramid level 0."""
+    map_radius_px: float = 5.0
+    """Search radius for the local map once the pose is known from the first pass."""
+    max_hamming: int = 64
+    """Bits, of 256; ORB-SLAM2 uses 50 (strict) and 100 (loose)."""
+    ratio: float = 0.85
+    """Nearest over second nearest descriptor distance (Lowe)."""
+    min_inliers: int = 25
+    """Below this a pose is not trusted."""
+    local_keyframes: int = 30
+    """Keyframes whose anchors are looked for in a frame."""
+    relocalisation_keyframes: int = 4
+    """Keyframes tried per lost frame."""
+
+    def __post_init__(self) -> None:
+        _positive(self, "motion_radius_px", "map_radius_px", "max_hamming", "ratio", "min_inliers", "local_keyframes")
+
+
+@dataclass(frozen=True, slots=True)
+class InitialisationConfig:
+    """Two-view initialisation that replaces the depth-prior map of the first frame."""
+
+    min_parallax_deg: float = 1.5
+    """Median ray angle of the inliers before two views are tried."""
+    min_points: int = 80
+    """Anchors that must triangulate well."""
+    max_reprojection_px: float = 2.0
+
+    def __post_init__(self) -> None:
+        _positive(self, "min_parallax_deg", "min_points", "max_reprojection_px")
+
+
+@dataclass(frozen=True, slots=True)
+class MappingConfig:
+    """Stage 3: keyframes and anchors."""
+
+    keyframe_min_gap: int = 3
+    """Frames between keyframes at least."""
+    keyframe_max_gap: int = 30
+    """Frames between keyframes at most while the camera moves."""
+    keyframe_overlap: float = 0.8
+    """A new keyframe when fewer than this share of the reference keyframe's anchors is tracked."""
+    keyframe_parallax_deg: float = 4.0
+    """A new keyframe when the median ray angle to the reference exceeds this."""
+    max_keyframes: int = 200
+    """Keyframes kept in the map; the least useful one goes first. Bounds memory and time."""
+    redundancy: float = 0.9
+    """A keyframe goes when this share of its anchors is seen by three others."""
+    neighbours: int = 6
+    """Keyframes that new anchors are triangulated with."""
+    min_parallax_deg: float = 1.0
+    """Smallest ray angle of a triangulated anchor."""
+    window: int = 10
+    """Keyframes refined together (the paper says "short")."""
+    window_fixed: int = 15
+    """Keyframes outside the window that hold its gauge."""
+
+    def __post_init__(self) -> None:
+        _positive(self, "keyframe_min_gap", "keyframe_max_gap", "keyframe_parallax_deg", "neighbours", "min_parallax_deg")
+        if self.window < 2:
+            raise ValueError(f"window must be at least 2, got {self.window}")
+        if self.max_keyframes < self.window + self.window_fixed:
+            raise ValueError(f"max_keyframes must be at least window + window_fixed, got {self.max_keyframes}")
+        if not 0.0 < self.keyframe_overlap < 1.0:
+            raise ValueError(f"keyframe_overlap must be in (0, 1), got {self.keyframe_overlap}")
+
+
+@dataclass(frozen=True, slots=True)
+class EdgeConfig:
+    """Stages 1 and 3: Canny edges and the semi-dense edge map."""
+
+    canny_low: float = 60.0
+    canny_high: float = 150.0
+    """Grey-level gradient thresholds, L2 norm, 3x3 Sobel."""
+    max_pixels: int = 8000
+    """Edge pixels kept per keyframe, evenly thinned."""
+    voxel: float = 0.01
+    """Side of the map's fusion cell relative to the median scene depth."""
+    max_points: int = 400_000
+    """Points kept in the edge map; the least observed go first."""
+
+    def __post_init__(self) -> None:
+        _positive(self, "canny_low", "canny_high", "max_pixels", "voxel", "max_points")
+
+
+@dataclass(frozen=True, slots=True)
+class SlamConfig:
+    """Everything `EdgeSlam` can be told."""
+
+    seed: int = 0
+    """Of the robust estimators; the same seed and input give the same bytes out."""
+    orb: OrbConfig = field(default_factory=OrbConfig)
+    depth: DepthConfig = field(default_factory=DepthConfig)
+    tracking: TrackingConfig = field(default_factory=TrackingConfig)
+    initialisation: InitialisationConfig = field(default_factory=InitialisationConfig)
+    mapping: MappingConfig = field(default_factory=MappingConfig)
+    edges: EdgeConfig = field(default_factory=EdgeConfig)
+    fusion: FusionConfig = field(default_factory=FusionConfig)

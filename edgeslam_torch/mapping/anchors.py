@@ -1,0 +1,77 @@
+"""Triangulated anchors as a structure of arrays; an anchor's id is its row."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgeslam_torch.types import FloatArray, IntArray
+
+
+class Anchors:
+    """All anchors of the map. Rows of removed anchors are used again from the next `begin_pass` on."""
+
+    def __init__(self, capacity: int = 4096) -> None:
+        self.p_w: FloatArray = np.zeros((capacity, 3))
+        self.words: NDArray[np.uint64] = np.zeros((capacity, 4), dtype=np.uint64)
+        self.normal: FloatArray = np.zeros((capacity, 3))
+        """Mean direction from the observing cameras to the anchor."""
+        self.max_distance: FloatArray = np.zeros(capacity)
+        """Distance at which the anchor would be seen at pyramid level 0."""
+        self.colour: NDArray[np.uint8] = np.zeros((capacity, 3), dtype=np.uint8)
+        self.observations: IntArray = np.zeros(capacity, dtype=np.int64)
+        """Keyframes that hold the anchor."""
+        self.visible: IntArray = np.zeros(capacity, dtype=np.int64)
+        self.found: IntArray = np.zeros(capacity, dtype=np.int64)
+        """Frames in which it should have been, and was, seen."""
+        self.born: IntArray = np.zeros(capacity, dtype=np.int64)
+        """Keyframe id of creation."""
+        self.alive: NDArray[np.bool_] = np.zeros(capacity, dtype=bool)
+        self.from_depth: NDArray[np.bool_] = np.zeros(capacity, dtype=bool)
+        """Position is a depth guess, not a triangulation."""
+        self.sigma: FloatArray = np.zeros(capacity)
+        """Standard deviation along the ray [map units]."""
+        self._free: list[int] = list(range(capacity))
+        self._just_removed: list[int] = []
+
+    def __len__(self) -> int:
+        return int(self.alive.sum())
+
+    def begin_pass(self) -> None:
+        """Open the rows that the last mapping pass removed; nobody refers to them any more."""
+        self._free.extend(self._just_removed)
+        self._just_removed.clear()
+
+    def add(
+        self, p_w: FloatArray, words: NDArray[np.uint64], born: int, from_depth: bool, colour: NDArray[np.uint8]
+    ) -> IntArray:
+        """New anchors from points ``(M, 3)``; returns their ids ``(M,)``."""
+        while len(self._free) < len(p_w):
+            self._grow()
+        ids = np.array([self._free.pop(0) for _ in range(len(p_w))], dtype=np.int64)
+        self.p_w[ids] = p_w
+        self.words[ids] = words
+        self.colour[ids] = colour
+        self.born[ids] = born
+        self.from_depth[ids] = from_depth
+        self.observations[ids] = 0
+        self.visible[ids] = 1
+        self.found[ids] = 1
+        self.normal[ids] = 0.0
+        self.max_distance[ids] = 0.0
+        self.sigma[ids] = np.inf
+        self.alive[ids] = True
+        return ids
+
+    def remove(self, ids: IntArray) -> None:
+        """Forget anchors; the caller has taken them out of the keyframes."""
+        ids = np.unique(ids[self.alive[ids]])
+        self.alive[ids] = False
+        self._just_removed.extend(ids.tolist())
+
+    def _grow(self) -> None:
+        old = len(self.alive)
+        for name in (
+            "p_w words normal max_distance colour observations visible found born alive from_depth sigma"
+        ).split():
+            array = getattr(self, name)
+            setattr(self, name, np.concatenate([array, np.zeros_like(array)]))
+        self._free.extend(range(old, 2 * old))

@@ -1,0 +1,74 @@
+"""How deep a keypoint probably is before it is triangulated: depth network and anchors under one scale."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from edgeslam_torch.mapping.keyframe import Keyframe
+from edgeslam_torch.types import DepthMap, FloatArray
+
+MIN_ANCHORS = 8
+"""Below this a fit to anchors says less than the network."""
+
+
+@dataclass(frozen=True, slots=True)
+class DepthFit:
+    """Map units per network metre, from the anchors that one keyframe sees."""
+
+    log_ratio: float
+    sigma_log: float
+    """Robust spread of single anchors around the fit."""
+    anchors: int
+
+
+def sample(depth: DepthMap, uv: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Depth [m] and its log sigma at the nearest pixels of ``(N, 2)``; NaN where the network says nothing."""
+    height, width = depth.depth_m.shape
+    u = np.clip(np.rint(uv[:, 0]), 0, width - 1).astype(np.int64)
+    v = np.clip(np.rint(uv[:, 1]), 0, height - 1).astype(np.int64)
+    z = depth.depth_m[v, u].astype(np.float64)
+    return np.where(z > 0, z, np.nan), depth.sigma_log[v, u].astype(np.float64)
+
+
+def fit_to_anchors(network_m: FloatArray, anchor_depth: FloatArray) -> DepthFit | None:
+    """Robust scale between network depth and anchor depth at the same pixels, both ``(A,)``."""
+    usable = np.isfinite(network_m) & (network_m > 0) & (anchor_depth > 0)
+    if usable.sum() < MIN_ANCHORS:
+        return None
+    log_ratio = np.log(anchor_depth[usable] / network_m[usable])
+    centre = float(np.median(log_ratio))
+    spread = 1.4826 * float(np.median(np.abs(log_ratio - centre)))
+    return DepthFit(centre, max(spread, 0.02), int(usable.sum()))
+
+
+def keypoint_depth_prior(
+    keyframe: Keyframe, anchor_p_w: FloatArray, unknown_sigma_log: float
+) -> tuple[FloatArray, FloatArray]:
+    """Expected z-depth [map units] and its log sigma at every keypoint of a keyframe, ``(N,)`` each.
+
+    With a depth map: the network's depth, brought to map units by the keyframe's own anchors. Without one: the
+    distance-weighted log depth of the nearest anchors in the image, with a wide sigma.
+
+    Args:
+        keyframe: Keyframe with some anchors.
+        anchor_p_w: ``(A, 3)`` positions of all anchors, indexed by id.
+        unknown_sigma_log: Sigma where no network speaks.
+    """
+    uv = keyframe.features.uv
+    held = keyframe.keypoints_with_anchor()
+    z = (anchor_p_w[keyframe.anchor[held]] @ keyframe.T_c_w[:3, :3].T + keyframe.T_c_w[:3, 3])[:, 2]
+    held, z = held[z > 0], z[z > 0]
+    if len(held) == 0:
+        return np.full(len(uv), np.nan), np.full(len(uv), np.inf)
+    if keyframe.depth is not None:
+        network, sigma = sample(keyframe.depth, uv)
+        fit = fit_to_anchors(network[held], z)
+        if fit is not None:
+            return network * np.exp(fit.log_ratio), np.hypot(sigma, 0.05)
+    k = min(4, len(held))
+    distance, nearest = cKDTree(uv[held]).query(uv, k=k)
+    distance, nearest = distance.reshape(len(uv), k), nearest.reshape(len(uv), k)
+    weight = 1.0 / (distance + 5.0)
+    log_z = (weight * np.log(z)[nearest]).sum(1) / weight.sum(1)
+    return np.exp(log_z), np.full(len(uv), unknown_sigma_log)

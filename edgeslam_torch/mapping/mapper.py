@@ -1,0 +1,166 @@
+"""Stage 3 and 4 for one keyframe: cull, triangulate, fuse, refine, cull keyframes."""
+
+import logging
+
+import numpy as np
+
+from edgeslam_torch.config import DepthConfig, MappingConfig, OrbConfig, TrackingConfig
+from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.mapping.depth_prior import keypoint_depth_prior
+from edgeslam_torch.mapping.keyframe import Keyframe
+from edgeslam_torch.mapping.new_anchors import epipolar_matches, triangulate_matches
+from edgeslam_torch.mapping.refinement import choose_window, refine
+from edgeslam_torch.mapping.slam_map import SlamMap
+from edgeslam_torch.optim.problem import LmConfig, WindowResult
+from edgeslam_torch.tracking.projection import match_projection, project_anchors
+from edgeslam_torch.types import IntArray
+
+logger = logging.getLogger(__name__)
+
+
+class Mapper:
+    """Takes keyframes into the map, one at a time."""
+
+    def __init__(
+        self,
+        slam_map: SlamMap,
+        camera: Camera,
+        orb: OrbConfig,
+        tracking: TrackingConfig,
+        mapping: MappingConfig,
+        depth: DepthConfig,
+        lm: LmConfig,
+    ) -> None:
+        self.map = slam_map
+        self.camera = camera
+        self.orb = orb
+        self.tracking = tracking
+        self.config = mapping
+        self.depth = depth
+        self.lm = lm
+        self._recent: IntArray = np.zeros(0, dtype=np.int64)
+
+    def insert(self, keyframe: Keyframe, colour: np.ndarray) -> WindowResult | None:
+        """Take in a tracked keyframe that carries its matched anchors.
+
+        Args:
+            keyframe: New keyframe; ``keyframe.anchor`` holds what tracking matched.
+            colour: RGB of each keypoint, ``(N, 3)`` uint8.
+
+        Returns:
+            What the window refinement reports, or None when there was nothing to refine.
+        """
+        self.map.anchors.begin_pass()
+        self.map.add_keyframe(keyframe)
+        self.map.refresh_anchors(keyframe.anchor[keyframe.anchor >= 0])
+        self.cull_recent_anchors(keyframe)
+        neighbours = self.map.covisible(keyframe, self.config.neighbours)
+        self.triangulate_new(keyframe, neighbours, colour)
+        self.fuse(keyframe, self.map.covisible(keyframe, 2 * self.config.neighbours))
+        window = choose_window(self.map, keyframe, self.config.window, self.config.window_fixed)
+        result = refine(self.map, window, self.camera, self.lm)
+        self.map.refresh_anchors(window.anchor[self.map.anchors.alive[window.anchor]])
+        self.cull_keyframes(keyframe)
+        return result
+
+    def cull_recent_anchors(self, keyframe: Keyframe) -> None:
+        """Remove young anchors that tracking does not find again or that only two keyframes ever saw."""
+        anchors = self.map.anchors
+        recent = self._recent[anchors.alive[self._recent]]
+        age = keyframe.id - anchors.born[recent]
+        rarely_found = anchors.found[recent] < 0.25 * anchors.visible[recent]
+        lonely = (age >= 2) & (anchors.observations[recent] <= 2)
+        self.map.remove_anchors(recent[rarely_found | lonely])
+        self._recent = recent[~(rarely_found | lonely) & (age < 3)]
+
+    def triangulate_new(self, keyframe: Keyframe, neighbours: list[Keyframe], colour: np.ndarray) -> None:
+        """New anchors from keypoints that neither side has an anchor for yet."""
+        prior, sigma = keypoint_depth_prior(keyframe, self.map.anchors.p_w, self.depth.prior_sigma_log)
+        for other in neighbours:
+            baseline = float(np.linalg.norm(other.centre_w - keyframe.centre_w))
+            if baseline < 0.01 * float(np.nanmedian(prior)):
+                continue
+            matches = epipolar_matches(
+                keyframe,
+                other,
+                self.camera,
+                prior,
+                sigma,
+                self.orb.scale_factor,
+                self.tracking.max_hamming,
+                self.tracking.ratio,
+            )
+            p_w, sigma_ray, used = triangulate_matches(
+                keyframe,
+                other,
+                matches,
+                self.camera,
+                self.orb.scale_factor,
+                np.deg2rad(self.config.min_parallax_deg),
+            )
+            if len(p_w) == 0:
+                continue
+            mine, theirs = matches.query[used], matches.train[used]
+            ids = self.map.anchors.add(p_w, keyframe.words[mine], keyframe.id, False, colour[mine])
+            self.map.anchors.sigma[ids] = sigma_ray
+            self.map.observe(keyframe, mine, ids)
+            self.map.observe(other, theirs, ids)
+            self.map.refresh_anchors(ids)
+            self._recent = np.concatenate([self._recent, ids])
+
+    def fuse(self, keyframe: Keyframe, neighbours: list[Keyframe]) -> None:
+        """Look for the keyframe's anchors in its neighbours: more observations, fewer doubles."""
+        anchors = self.map.anchors
+        for other in neighbours:
+            ids = self.map.anchors_seen_by([keyframe])
+            ids = ids[~np.isin(ids, other.anchor)]
+            seen = project_anchors(
+                anchors, ids, other.T_c_w, self.camera, self.orb.scale_factor, self.orb.levels
+            )
+            matches = match_projection(
+                seen,
+                anchors.words[seen.anchor],
+                other.words,
+                other.features.octave,
+                other.tree,
+                3.0,
+                self.orb.scale_factor,
+                50,
+                1.0,
+            )
+            error = seen.uv[matches.query] - other.features.uv[matches.train]
+            sigma = self.orb.scale_factor ** other.features.octave[matches.train].astype(np.float64)
+            good = (error**2).sum(1) <= 5.991 * sigma**2
+            found, keypoint = seen.anchor[matches.query[good]], matches.train[good]
+            held = other.anchor[keypoint]
+            free = held < 0
+            self.map.observe(other, keypoint[free], found[free])
+            self._merge_doubles(found[~free], held[~free])
+
+    def _merge_doubles(self, a: IntArray, b: IntArray) -> None:
+        """Two ids for one point: the one with more observations stays."""
+        keep_a = self.map.anchors.observations[a] >= self.map.anchors.observations[b]
+        winners, losers = np.where(keep_a, a, b), np.where(keep_a, b, a)
+        # One id may sit in several pairs; only disjoint pairs are merged now, the rest at a later keyframe.
+        _, first = np.unique(np.concatenate([winners, losers]), return_index=True)
+        once = np.zeros(2 * len(a), dtype=bool)
+        once[first] = True
+        disjoint = once[: len(a)] & once[len(a) :]
+        self.map.merge_anchors(losers[disjoint], winners[disjoint])
+
+    def cull_keyframes(self, newest: Keyframe) -> None:
+        """Remove covisible keyframes whose anchors three others see at the same or finer scale; bound the map."""
+        for other in self.map.covisible(newest, 2 * self.config.window):
+            if other.id == 0 or newest.id - other.id < 3:
+                continue
+            held = other.anchor[other.anchor >= 0]
+            if len(held) == 0 or np.mean(self.map.anchors.observations[held] >= 4) > self.config.redundancy:
+                self.map.remove_keyframe(other)
+        while len(self.map.keyframes) > self.config.max_keyframes:
+            self.map.remove_keyframe(self._least_useful(newest))
+
+    def _least_useful(self, newest: Keyframe) -> Keyframe:
+        """The keyframe farthest from the newest, in position relative to the map's extent; ties to the oldest."""
+        others = [k for k in self.map.keyframes.values() if newest.id - k.id >= self.config.window]
+        distance = [float(np.linalg.norm(k.centre_w - newest.centre_w)) for k in others]
+        return others[int(np.argmax(distance))]

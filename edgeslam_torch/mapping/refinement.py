@@ -1,0 +1,91 @@
+"""Stage 4 as the map sees it: choose a window, refine it, take the result back, drop what disagrees."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.mapping.keyframe import Keyframe
+from edgeslam_torch.mapping.slam_map import SlamMap
+from edgeslam_torch.optim.local_ba import refine_window
+from edgeslam_torch.optim.problem import LmConfig, ScalePrior, WindowProblem, WindowResult
+from edgeslam_torch.types import IntArray
+
+CHI2_2 = 5.991
+"""Chi-square, two degrees of freedom, 95 %."""
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """Keyframes to refine, keyframes that hold the gauge, and the anchors of the former."""
+
+    free: list[Keyframe]
+    fixed: list[Keyframe]
+    anchor: IntArray
+
+
+def choose_window(slam_map: SlamMap, newest: Keyframe, free: int, fixed: int) -> Window:
+    """The newest keyframe, its best covisible ones, and the next best as fixed poses.
+
+    The oldest of the window is fixed when nothing outside sees its anchors, so that the gauge never floats.
+    """
+    members = [newest, *slam_map.covisible(newest, free - 1)]
+    anchor = slam_map.anchors_seen_by(members)
+    counts = slam_map.shared_counts(anchor)
+    inside = {k.id for k in members}
+    outside = sorted((id for id in counts if id not in inside), key=lambda id: (-counts[id], -id))[:fixed]
+    frozen = [slam_map.keyframes[id] for id in outside]
+    if len(frozen) < 2:  # one fixed pose leaves the scale free, two hold it
+        members.sort(key=lambda k: -k.id)
+        while len(frozen) < 2 and len(members) > 1:
+            frozen.append(members.pop())
+    return Window(members, frozen, slam_map.anchors_seen_by(members))
+
+
+def refine(
+    slam_map: SlamMap,
+    window: Window,
+    camera: Camera,
+    config: LmConfig,
+    scale_prior: ScalePrior | None = None,
+) -> WindowResult | None:
+    """Refine the window in place; observations that disagree with the result are taken out of the map."""
+    keyframes = [*window.free, *window.fixed]
+    row_of_anchor = np.full(len(slam_map.anchors.alive) + 1, -1, dtype=np.int64)
+    row_of_anchor[window.anchor] = np.arange(len(window.anchor))
+    row_of_anchor[-1] = -1
+    keypoint, pose = [], []
+    for i, keyframe in enumerate(keyframes):
+        seen = np.flatnonzero(row_of_anchor[keyframe.anchor] >= 0)
+        keypoint.append(seen)
+        pose.append(np.full(len(seen), i, dtype=np.int64))
+    obs_pose = np.concatenate(pose)
+    if len(obs_pose) == 0:
+        return None
+    row = np.concatenate([row_of_anchor[k.anchor[s]] for k, s in zip(keyframes, keypoint, strict=True)])
+    uv = np.concatenate([k.features.uv[s] for k, s in zip(keyframes, keypoint, strict=True)])
+    octave = np.concatenate([k.features.octave[s] for k, s in zip(keyframes, keypoint, strict=True)])
+    problem = WindowProblem(
+        T_c_w=np.stack([k.T_c_w for k in keyframes]),
+        pose_fixed=np.arange(len(keyframes)) >= len(window.free),
+        p_w=slam_map.anchors.p_w[window.anchor],
+        obs_pose=obs_pose,
+        obs_anchor=row,
+        uv=uv.astype(np.float64),
+        inv_sigma=slam_map.scale_factor ** -octave.astype(np.float64),
+        K=(camera.fx, camera.fy, camera.cx, camera.cy),
+        scale_priors=(scale_prior,) if scale_prior is not None else (),
+    )
+    result = refine_window(problem, config)
+    if not np.isfinite(result.T_c_w).all() or not np.isfinite(result.p_w).all():
+        return result
+    for keyframe, T_c_w in zip(keyframes, result.T_c_w, strict=True):
+        keyframe.T_c_w = T_c_w
+    slam_map.anchors.p_w[window.anchor] = result.p_w
+    bad = (result.chi2 > CHI2_2) | ~result.in_front
+    start = 0
+    for keyframe, seen in zip(keyframes, keypoint, strict=True):
+        wrong = seen[bad[start : start + len(seen)]]
+        start += len(seen)
+        slam_map.forget_observations(keyframe, wrong)
+    return result

@@ -1,0 +1,150 @@
+"""Keyframes and anchors with the observations that join them."""
+
+import numpy as np
+
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.mapping.anchors import Anchors
+from edgeslam_torch.mapping.keyframe import NO_ANCHOR, Keyframe
+from edgeslam_torch.types import FloatArray, IntArray
+
+
+class SlamMap:
+    """The map that tracking reads and mapping writes.
+
+    Keyframes that were removed live on as a rigid link to a surviving one, so that every frame ever tracked keeps a
+    pose that moves with the map.
+    """
+
+    def __init__(self, scale_factor: float) -> None:
+        self.scale_factor = scale_factor
+        self.anchors = Anchors()
+        self.keyframes: dict[int, Keyframe] = {}
+        self.links: dict[int, tuple[int, FloatArray]] = {}
+        """Removed keyframe id -> (surviving id, ``T_removed_surviving``)."""
+        self._next_id = 0
+
+    def next_keyframe_id(self) -> int:
+        """A keyframe id never used before."""
+        self._next_id += 1
+        return self._next_id - 1
+
+    def pose_of(self, keyframe_id: int) -> FloatArray:
+        """``T_c_w`` of a keyframe, alive or removed."""
+        T = np.eye(4)
+        while keyframe_id in self.links:
+            keyframe_id, T_link = self.links[keyframe_id]
+            T = T @ T_link
+        return T @ self.keyframes[keyframe_id].T_c_w
+
+    def latest(self) -> Keyframe:
+        """The newest keyframe."""
+        return self.keyframes[max(self.keyframes)]
+
+    # -- observations ------------------------------------------------------------------------------------------
+
+    def observe(self, keyframe: Keyframe, keypoints: IntArray, anchors: IntArray) -> None:
+        """Record that a keyframe's keypoints see anchors; both must be free of an earlier partner."""
+        keyframe.anchor[keypoints] = anchors
+        self.anchors.observations[anchors] += 1
+
+    def forget_observations(self, keyframe: Keyframe, keypoints: IntArray) -> None:
+        """Take observations back; anchors seen by fewer than two keyframes afterwards are removed."""
+        held = keyframe.anchor[keypoints]
+        keypoints, held = keypoints[held >= 0], held[held >= 0]
+        keyframe.anchor[keypoints] = NO_ANCHOR
+        self.anchors.observations[held] -= 1
+        poor = held[(self.anchors.observations[held] < 2) & ~self.anchors.from_depth[held]]
+        self.remove_anchors(poor)
+
+    def remove_anchors(self, ids: IntArray) -> None:
+        """Remove anchors from the map and from every keyframe that holds them."""
+        if len(ids) == 0:
+            return
+        gone = np.zeros(len(self.anchors.alive), dtype=bool)
+        gone[ids] = True
+        for keyframe in self.keyframes.values():
+            held = keyframe.anchor >= 0
+            hit = held & gone[np.where(held, keyframe.anchor, 0)]
+            keyframe.anchor[hit] = NO_ANCHOR
+        self.anchors.observations[ids] = 0
+        self.anchors.remove(ids)
+
+    def merge_anchors(self, losers: IntArray, winners: IntArray) -> None:
+        """Give every observation of ``losers`` to ``winners``, ``(M,)`` each, one-to-one."""
+        if len(losers) == 0:
+            return
+        target = np.arange(len(self.anchors.alive))
+        target[losers] = winners
+        for keyframe in self.keyframes.values():
+            keypoints = keyframe.keypoints_with_anchor()
+            held = keyframe.anchor[keypoints]
+            moved = target[held] != held
+            if not moved.any():
+                continue
+            already = np.isin(target[held[moved]], held)  # one keypoint per anchor and keyframe
+            self.anchors.observations[held[moved]] -= 1
+            keyframe.anchor[keypoints[moved]] = np.where(already, NO_ANCHOR, target[held[moved]])
+            self.anchors.observations[target[held[moved]][~already]] += 1
+        self.anchors.found[winners] += self.anchors.found[losers]
+        self.anchors.visible[winners] += self.anchors.visible[losers]
+        self.remove_anchors(losers)
+
+    # -- covisibility ------------------------------------------------------------------------------------------
+
+    def shared_counts(self, anchor_ids: IntArray) -> dict[int, int]:
+        """Number of the given anchors that each keyframe sees; keyframes that see none are left out."""
+        mark = np.zeros(len(self.anchors.alive) + 1, dtype=bool)  # the last row answers for NO_ANCHOR
+        mark[anchor_ids] = True
+        mark[-1] = False
+        counts = {id: int(np.count_nonzero(mark[k.anchor])) for id, k in self.keyframes.items()}
+        return {id: count for id, count in counts.items() if count > 0}
+
+    def covisible(self, keyframe: Keyframe, most: int, min_shared: int = 15) -> list[Keyframe]:
+        """Other keyframes by number of shared anchors, best first."""
+        counts = self.shared_counts(keyframe.anchor[keyframe.anchor >= 0])
+        counts.pop(keyframe.id, None)
+        ranked = sorted(counts, key=lambda id: (-counts[id], -id))
+        return [self.keyframes[id] for id in ranked if counts[id] >= min_shared][:most]
+
+    def anchors_seen_by(self, keyframes: list[Keyframe]) -> IntArray:
+        """Sorted ids of anchors that at least one of the keyframes sees."""
+        if not keyframes:
+            return np.zeros(0, dtype=np.int64)
+        ids = np.unique(np.concatenate([k.anchor for k in keyframes]))
+        return ids[ids >= 0]
+
+    # -- keyframes ---------------------------------------------------------------------------------------------
+
+    def add_keyframe(self, keyframe: Keyframe) -> None:
+        """Take a keyframe with its observations into the map."""
+        self.keyframes[keyframe.id] = keyframe
+        self.anchors.observations[keyframe.anchor[keyframe.anchor >= 0]] += 1
+
+    def remove_keyframe(self, keyframe: Keyframe) -> None:
+        """Drop a keyframe; its frames stay tied to the nearest surviving one in time."""
+        self.forget_observations(keyframe, keyframe.keypoints_with_anchor())
+        del self.keyframes[keyframe.id]
+        heir = min(self.keyframes, key=lambda id: (abs(id - keyframe.id), id))
+        self.links[keyframe.id] = (heir, keyframe.T_c_w @ se3.inverse(self.keyframes[heir].T_c_w))
+
+    def refresh_anchors(self, ids: IntArray) -> None:
+        """Recompute viewing direction, reference distance and descriptor from the observing keyframes.
+
+        The newest observation gives descriptor and octave; the direction is the mean over all observations.
+        """
+        wanted = np.zeros(len(self.anchors.alive) + 1, dtype=bool)
+        wanted[ids] = True
+        wanted[-1] = False
+        self.anchors.normal[ids] = 0.0
+        for keyframe in self.keyframes.values():
+            keypoints = np.flatnonzero(wanted[keyframe.anchor])
+            if len(keypoints) == 0:
+                continue
+            held = keyframe.anchor[keypoints]
+            ray = self.anchors.p_w[held] - keyframe.centre_w
+            distance = np.linalg.norm(ray, axis=1)
+            self.anchors.normal[held] += ray / distance[:, None]
+            self.anchors.max_distance[held] = distance * self.scale_factor ** keyframe.features.octave[keypoints]
+            self.anchors.words[held] = keyframe.words[keypoints]
+        norm = np.linalg.norm(self.anchors.normal[ids], axis=1)
+        self.anchors.normal[ids] /= np.where(norm > 0, norm, 1.0)[:, None]

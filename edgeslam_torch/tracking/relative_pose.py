@@ -1,0 +1,73 @@
+"""Two-view motion from the essential matrix, paper eqs. (2)-(5), with the degenerate cases named."""
+
+import cv2
+import numpy as np
+
+from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.geometry.triangulation import bearings, parallax
+from edgeslam_torch.types import FloatArray, MotionKind, RelativePose
+
+MIN_MATCHES = 15
+NO_MOTION_PX = 1.0
+"""Median displacement below which two views are the same to within the detector's noise."""
+
+
+def relative_pose(
+    uv_i: FloatArray, uv_j: FloatArray, camera: Camera, threshold_px: float = 1.0, min_parallax_rad: float = 0.01
+) -> RelativePose:
+    """Robust relative pose of matched undistorted pixels ``(M, 2)`` in two views.
+
+    The essential matrix comes from MAGSAC++ (Barath et al., CVPR 2020). A homography fitted to the same matches
+    tells a rotation from a plane: a rotation explains all matches with ``K R K^-1``.
+
+    Args:
+        uv_i: Undistorted pixels in view i.
+        uv_j: The same points in view j.
+        camera: Intrinsics.
+        threshold_px: Inlier distance to the epipolar line.
+        min_parallax_rad: Median ray angle below which the translation direction means nothing.
+    """
+    nothing = np.zeros(len(uv_i), dtype=bool)
+    if len(uv_i) < MIN_MATCHES:
+        return RelativePose(MotionKind.FEW_MATCHES, np.eye(4), nothing, 0.0)
+    if np.median(np.linalg.norm(uv_i - uv_j, axis=1)) < NO_MOTION_PX:
+        return RelativePose(MotionKind.NO_MOTION, np.eye(4), ~nothing, 0.0)
+    a, b = np.ascontiguousarray(uv_i, np.float64), np.ascontiguousarray(uv_j, np.float64)
+    E, mask = cv2.findEssentialMat(a, b, camera.K, cv2.USAC_MAGSAC, 0.999, threshold_px)
+    if E is None or E.shape != (3, 3):
+        return RelativePose(MotionKind.DEGENERATE, np.eye(4), nothing, 0.0)
+    inliers = mask.ravel().astype(bool)
+    if inliers.sum() < MIN_MATCHES:
+        return RelativePose(MotionKind.FEW_MATCHES, np.eye(4), inliers, 0.0)
+    # Cheirality (points in front of both cameras) picks one of the four decompositions.
+    _, R, t, _ = cv2.recoverPose(E, a[inliers], b[inliers], camera.K)
+    T_j_i = np.eye(4)
+    T_j_i[:3, :3], T_j_i[:3, 3] = R, t[:, 0]
+    ray_i, ray_j = bearings(a[inliers], camera.K), bearings(b[inliers], camera.K)
+    angle = float(np.median(parallax(ray_i, ray_j, R)))
+    kind = _kind(ray_i, ray_j, a[inliers], b[inliers], angle, min_parallax_rad, threshold_px)
+    return RelativePose(kind, T_j_i, inliers, angle)
+
+
+def _kind(
+    ray_i: FloatArray,
+    ray_j: FloatArray,
+    uv_i: FloatArray,
+    uv_j: FloatArray,
+    angle: float,
+    min_parallax_rad: float,
+    threshold_px: float,
+) -> MotionKind:
+    if angle < min_parallax_rad:
+        return MotionKind.PURE_ROTATION
+    # The best rotation alone (Kabsch on unit rays): if it explains the matches there is no usable translation.
+    unit_i = ray_i / np.linalg.norm(ray_i, axis=1, keepdims=True)
+    unit_j = ray_j / np.linalg.norm(ray_j, axis=1, keepdims=True)
+    u, _, vt = np.linalg.svd(unit_j.T @ unit_i)
+    R = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+    if float(np.median(parallax(ray_i, ray_j, R))) < 0.5 * min_parallax_rad:
+        return MotionKind.PURE_ROTATION
+    H, mask = cv2.findHomography(uv_i, uv_j, cv2.USAC_MAGSAC, 2.0 * threshold_px)
+    if H is not None and mask.mean() > 0.9:
+        return MotionKind.PLANAR
+    return MotionKind.GENERAL

@@ -1,0 +1,146 @@
+"""The pose of one frame against the local map, so that poses do not chain from frame to frame."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from edgeslam_torch.config import OrbConfig, TrackingConfig
+from edgeslam_torch.frontend.matching import words
+from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.mapping.keyframe import Keyframe
+from edgeslam_torch.mapping.slam_map import SlamMap
+from edgeslam_torch.optim.pose_only import refine_pose
+from edgeslam_torch.tracking.projection import match_projection, project_anchors
+from edgeslam_torch.types import FloatArray, FrameFeatures, IntArray
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """Features of one frame with what matching needs."""
+
+    features: FrameFeatures
+    words: NDArray[np.uint64]
+    tree: cKDTree
+    inv_sigma: FloatArray
+    """``(N,)`` inverse standard deviation of each keypoint [1/px], from its pyramid level."""
+
+
+@dataclass(frozen=True, slots=True)
+class Track:
+    """A pose with the matches that carry it."""
+
+    T_c_w: FloatArray
+    keypoint: IntArray
+    """``(M,)`` inlier keypoints."""
+    anchor: IntArray
+    """``(M,)`` their anchors."""
+    matched_keypoint: IntArray
+    matched_anchor: IntArray
+    """All matches, before outliers were thrown out."""
+    covariance: FloatArray
+    """``(6, 6)`` of the left tangent of ``T_c_w``."""
+
+    @property
+    def matches(self) -> int:
+        """Number of matches before outliers were thrown out."""
+        return len(self.matched_anchor)
+
+    @property
+    def inliers(self) -> int:
+        """Number of matches that agree with the pose."""
+        return len(self.anchor)
+
+
+def make_view(features: FrameFeatures, scale_factor: float) -> View:
+    """Index a frame's features for matching."""
+    return View(
+        features=features,
+        words=words(features.descriptors),
+        tree=cKDTree(features.uv),
+        inv_sigma=scale_factor ** -features.octave.astype(np.float64),
+    )
+
+
+class Tracker:
+    """Finds anchors in a frame and refines its pose; keeps nothing between frames."""
+
+    def __init__(self, slam_map: SlamMap, camera: Camera, orb: OrbConfig, config: TrackingConfig) -> None:
+        self.map = slam_map
+        self.camera = camera
+        self.orb = orb
+        self.config = config
+
+    def track(self, view: View, T_c_w: FloatArray, recent: IntArray) -> Track | None:
+        """Pose near a predicted one: anchors of the last frame first, then the local map; None if too few agree."""
+        first = self.refine(view, T_c_w, recent, self.config.motion_radius_px)
+        if first is None or first.inliers < self.config.min_inliers:
+            first = self.refine(view, T_c_w, recent, 2.5 * self.config.motion_radius_px)
+        if first is None or first.inliers < 10:
+            return None
+        local = self.map.anchors_seen_by(self.local_keyframes(first.anchor))
+        self_seen = self.refine(view, first.T_c_w, local, self.config.map_radius_px, count_visible=True)
+        if self_seen is None or self_seen.inliers < self.config.min_inliers:
+            return None
+        return self_seen
+
+    def local_keyframes(self, anchor_ids: IntArray) -> list[Keyframe]:
+        """Keyframes that see the given anchors, and of those the ones that see most."""
+        counts = self.map.shared_counts(anchor_ids)
+        ranked = sorted(counts, key=lambda id: (-counts[id], -id))
+        return [self.map.keyframes[id] for id in ranked[: self.config.local_keyframes]]
+
+    def refine(
+        self, view: View, T_c_w: FloatArray, anchor_ids: IntArray, radius_px: float, count_visible: bool = False
+    ) -> Track | None:
+        """Match the given anchors around their predicted pixels and refine the pose on what matches."""
+        anchors = self.map.anchors
+        ids = anchor_ids[anchors.alive[anchor_ids]]
+        seen = project_anchors(anchors, ids, T_c_w, self.camera, self.orb.scale_factor, self.orb.levels)
+        matches = match_projection(
+            seen,
+            anchors.words[seen.anchor],
+            view.words,
+            view.features.octave,
+            view.tree,
+            radius_px,
+            self.orb.scale_factor,
+            self.config.max_hamming,
+            self.config.ratio,
+        )
+        track = self.solve(view, T_c_w, matches.train, seen.anchor[matches.query])
+        if count_visible and track is not None:
+            anchors.visible[seen.anchor] += 1
+            anchors.found[track.anchor] += 1
+        return track
+
+    def solve(self, view: View, T_c_w: FloatArray, keypoint: IntArray, anchor: IntArray) -> Track | None:
+        """Robust pose from given matches; None when there are too few to constrain it."""
+        if len(keypoint) < 6:
+            return None
+        result = refine_pose(
+            T_c_w,
+            self.map.anchors.p_w[anchor],
+            view.features.uv[keypoint].astype(np.float64),
+            view.inv_sigma[keypoint],
+            (self.camera.fx, self.camera.fy, self.camera.cx, self.camera.cy),
+        )
+        return Track(
+            T_c_w=result.T_c_w,
+            keypoint=keypoint[result.inliers],
+            anchor=anchor[result.inliers],
+            matched_keypoint=keypoint,
+            matched_anchor=anchor,
+            covariance=result.covariance,
+        )
+
+
+def median_parallax(p_w: FloatArray, T_c_w: FloatArray, centre_w: FloatArray) -> float:
+    """Median angle [rad] between the rays from two camera centres to points ``(N, 3)``; 0 without points."""
+    if len(p_w) == 0:
+        return 0.0
+    a = p_w + T_c_w[:3, :3].T @ T_c_w[:3, 3]
+    b = p_w - centre_w
+    cosine = (a * b).sum(1) / np.maximum(np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1), 1e-12)
+    return float(np.median(np.arccos(np.clip(cosine, -1.0, 1.0))))
