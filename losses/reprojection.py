@@ -87,7 +87,7 @@ def inverse_depth_jacobians(R: Tensor, p_c: Tensor) -> tuple[Tensor, Tensor, Ten
         p_c: Points in the host cameras ``(3, D)``.
 
     Returns:
-        ``1 / z`` ``(D,)``, its derivatives by the pose's left tangent ``(6, D)`` and by the anchor ``(3, D)``.
+        ``1 / z`` ``(D,)``, its derivatives by the pose's left tangent ``(6, D)`` and the anchor ``(3, D)``.
     """
     iz = p_c[2].reciprocal()
     m = -iz * iz

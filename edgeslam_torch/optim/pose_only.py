@@ -1,12 +1,12 @@
 """Robust refinement of one camera pose against fixed points; runs once or twice per frame, so numpy."""
 
+import math
 from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edgeslam_torch.geometry import se3
 from edgeslam_torch.optim.priors import inverse_left_jacobian, pose_prior_residual
 from edgeslam_torch.optim.problem import PosePrior
 from edgeslam_torch.optim.robust import CHI2_2DOF_95
@@ -159,7 +159,7 @@ def _round(
         except np.linalg.LinAlgError:
             return T, used, False
         chi2 = points.chi2
-        trial = se3.exp(delta) @ T
+        trial = _exp(delta) @ T
         H_new, g_new, cost_new = points.linearise(trial, robust)
         small = float(np.abs(delta).max()) < config.step_tolerance
         if H_new is None or not cost_new <= cost:
@@ -173,6 +173,43 @@ def _round(
         if small or flat:
             return T, used, True
     return T, used, False
+
+
+def _exp(xi: FloatArray) -> FloatArray:
+    """`se3.exp` of one small tangent in scalars: a fifth of the time, and it runs a dozen times per frame."""
+    a, b, c, x, y, z = xi.tolist()
+    theta2 = x * x + y * y + z * z
+    if theta2 < 1e-8:
+        s, k, m = 1.0 - theta2 / 6.0, 0.5 - theta2 / 24.0, 1.0 / 6.0 - theta2 / 120.0
+    else:
+        theta = math.sqrt(theta2)
+        s = math.sin(theta) / theta
+        k = (1.0 - math.cos(theta)) / theta2
+        m = (1.0 - s) / theta2
+    u, v, w = y * c - z * b, z * a - x * c, x * b - y * a  # phi x rho
+    return np.array(
+        (
+            (
+                1.0 - k * (y * y + z * z),
+                k * x * y - s * z,
+                k * x * z + s * y,
+                a + k * u + m * (y * w - z * v),
+            ),
+            (
+                k * x * y + s * z,
+                1.0 - k * (x * x + z * z),
+                k * y * z - s * x,
+                b + k * v + m * (z * u - x * w),
+            ),
+            (
+                k * x * z - s * y,
+                k * y * z + s * x,
+                1.0 - k * (x * x + y * y),
+                c + k * w + m * (x * v - y * u),
+            ),
+            (0.0, 0.0, 0.0, 1.0),
+        )
+    )
 
 
 class _Points:
@@ -213,27 +250,30 @@ class _Points:
         """Normal matrix, gradient and cost over the points in use; sets ``chi2`` of all points."""
         p_c = T[:3, :3] @ self.p + T[:3, 3:]
         z = p_c[2]
-        front = z > self.config.min_depth
-        iz = 1.0 / np.where(front, z, 1.0)
+        use, behind = self.use, 0
+        hidden = z <= self.config.min_depth
+        if hidden.any():
+            z = np.where(hidden, 1.0, z)
+            behind = np.count_nonzero(use & hidden)
+            use = use & ~hidden
+        iz = 1.0 / z
         n = p_c[:2] * iz
         x, y = n
         r = n - self.xy
-        whitened = r * self.weight
-        s = np.einsum("ij,ij->j", whitened, whitened)
-        s[~front] = np.inf
-        self.chi2 = s
-        use = self.use & front
+        s = np.square(r * self.weight).sum(0)
+        self.chi2 = np.where(hidden, np.inf, s)
         if robust:
-            delta = self.config.chi2**0.5
-            norm = np.sqrt(np.maximum(s, self.config.chi2))
+            chi2 = self.config.chi2
+            delta = math.sqrt(chi2)
+            norm = np.sqrt(np.maximum(s, chi2))
             # s inside, 2 delta |r| - delta^2 outside; its derivative is delta / norm
-            cost = np.minimum(s, self.config.chi2) + 2.0 * delta * (norm - delta)
-            weight = self.weight * np.where(use, np.sqrt(delta / norm), 0.0)
+            cost = np.minimum(s, chi2) + 2.0 * delta * norm
             # A point behind the camera costs as much as one a thousand pixels off.
-            total = float(cost[use].sum()) + 2000.0 * delta * np.count_nonzero(self.use & ~front)
+            total = float(cost @ use) - 2.0 * chi2 * np.count_nonzero(use) + 2000.0 * delta * behind
+            weight = self.weight * (np.sqrt(delta / norm) * use)
         else:
             weight = self.weight * use
-            total = float(s[use].sum()) + 1e6 * np.count_nonzero(self.use & ~front)
+            total = float(s @ use) + 1e6 * behind
         rows = self.rows
         xy = x * y
         rows[0, 0] = rows[1, 1] = iz
