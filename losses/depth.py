@@ -1,6 +1,8 @@
-"""Training-only depth terms: every one takes log depth ``(B, 1, H, W)`` and a mask, and returns one value per image.
+"""Training-only depth terms: every one takes log depth ``(B, 1, H, W)`` and a mask, and returns one value
+per image.
 
-Per-image means (not means over the batch's pixels) make the loss of a batch the mean of its images' losses, so the
+Per-image means (not means over the batch's pixels) make the loss of a batch the mean of its images'
+losses, so the
 same batch split over two processes gives the same gradient.
 """
 
@@ -64,7 +66,8 @@ class SILog(nn.Module):
 
 
 class GradientMatching(nn.Module):
-    """Absolute difference of the residual's gradients over several scales (MegaDepth, CVPR 2018): keeps edges sharp.
+    """Absolute difference of the residual's gradients over several scales (MegaDepth, CVPR 2018): keeps
+    edges sharp.
 
     Args:
         scales: Differences over 1, 2, 4, ... pixels.

@@ -4,9 +4,7 @@ import dataclasses
 import hashlib
 import json
 import pickle
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import safetensors
 import safetensors.torch
@@ -16,46 +14,19 @@ from torch import Tensor
 from edgeslam_torch.errors import WeightsError
 from edgeslam_torch.models.fastdepth import FastDepth, Output, Variant, Widths
 from edgeslam_torch.models.mobilenet import Padding
-
-_KEY = "edgeslam"
-DEFAULT_WEIGHTS = Path(__file__).parent / "weights" / "default.safetensors"
+from edgeslam_torch.models.record import DEFAULT_WEIGHTS, HEADER_KEY, Metadata, metadata_from_json
 
 
-@dataclass(frozen=True, slots=True)
-class Metadata:
-    """Everything needed to run the weights correctly, and what they are worth."""
-
-    variant: str = Variant.SKIPADD.value
-    input_height: int = 192
-    input_width: int = 256
-    """Size of the training images [px]."""
-    focal_px: float = 210.0
-    """Focal length at ``input_width`` for which the network's metres hold; other cameras are corrected by the ratio."""
-    mean: tuple[float, float, float] = (0.5, 0.5, 0.5)
-    std: tuple[float, float, float] = (0.5, 0.5, 0.5)
-    """Input is ``(rgb - mean) / std`` with rgb in [0, 1]."""
-    padding: str = Padding.TF_SAME.value
-    output: str = Output.LOG_DEPTH.value
-    uncertainty: bool = True
-    sigma_scale: float = 1.0
-    sigma_floor: float = 0.0
-    """Calibrated standard deviation of log depth: ``hypot(sigma_scale * sigma, sigma_floor)``."""
-    units: str = "m"
-    data: tuple[str, ...] = ()
-    """Data sets it was trained on."""
-    licence: str = ""
-    metrics: dict[str, float] = field(default_factory=dict)
-    notes: str = ""
-
-    def build(self, widths: Widths | None = None) -> FastDepth:
-        """A network of this description with fresh weights."""
-        return FastDepth(self.variant, widths, self.padding, self.output, self.uncertainty)
+def build_network(metadata: Metadata, widths: Widths | None = None) -> FastDepth:
+    """A network of this description with fresh weights."""
+    return FastDepth(metadata.variant, widths, metadata.padding, metadata.output, metadata.uncertainty)
 
 
 def save_checkpoint(network: FastDepth, metadata: Metadata, path: Path, half: bool = False) -> None:
-    """Write weights and metadata; ``half`` stores float16 (half the size, depth changes by less than 0.1 %)."""
+    """Write weights and metadata; ``half`` stores float16 (half the size, depth changes by less than 0.1
+    %)."""
     tensors = {k: _stored(v, half) for k, v in network.state_dict().items()}
-    header = {_KEY: json.dumps(dataclasses.asdict(metadata)), "format": "pt"}
+    header = {HEADER_KEY: json.dumps(dataclasses.asdict(metadata)), "format": "pt"}
     temporary = path.with_name(path.name + ".part")
     safetensors.torch.save_file(tensors, temporary, metadata=header)
     temporary.replace(path)
@@ -64,7 +35,8 @@ def save_checkpoint(network: FastDepth, metadata: Metadata, path: Path, half: bo
 def load_checkpoint(path: Path | None = None) -> tuple[FastDepth, Metadata]:
     """Network in evaluation mode and its metadata; the shipped weights when ``path`` is None.
 
-    Also reads ``weights_only`` torch files that hold ``{"state_dict": ..., "metadata": ...}`` or a bare state_dict.
+    Also reads ``weights_only`` torch files that hold ``{"state_dict": ..., "metadata": ...}`` or a bare
+    state_dict.
 
     Raises:
         WeightsError: If the file is missing, damaged or of another network.
@@ -75,7 +47,7 @@ def load_checkpoint(path: Path | None = None) -> tuple[FastDepth, Metadata]:
             f"{path}: no such weights file; `edgeslam weights list` shows what can be downloaded"
         )
     state, metadata = _read(path)
-    network = metadata.build(Widths.of_state_dict(state))
+    network = build_network(metadata, Widths.of_state_dict(state))
     try:
         network.load_state_dict({k: v.float() if v.is_floating_point() else v for k, v in state.items()})
     except RuntimeError as error:
@@ -99,18 +71,11 @@ def file_hash(path: Path) -> str:
     return digest.hexdigest()
 
 
-def metadata_from_json(text: str) -> Metadata:
-    """Parse the header's record; unknown keys are ignored so that newer files still load."""
-    record: dict[str, Any] = json.loads(text)
-    known = {f.name for f in dataclasses.fields(Metadata)}
-    lists = {k: tuple(v) if isinstance(v, list) else v for k, v in record.items() if k in known}
-    return Metadata(**lists)
-
-
 def upstream_metadata(state: dict[str, Tensor]) -> Metadata:
     """What an official checkpoint without a record is: NYU Depth v2, 224x224, RGB in [0, 1], depth in metres.
 
-    The focal length is that of NYU's Kinect (518.86 px at 640) in upstream's preprocessing: 640x480 scaled to height
+    The focal length is that of NYU's Kinect (518.86 px at 640) in upstream's preprocessing: 640x480 scaled
+    to height
     250, centre-cropped to 304x228, then squeezed to 224x224.
     """
     widths = Widths.of_state_dict(state)
@@ -152,7 +117,9 @@ def _read(path: Path) -> tuple[dict[str, Tensor], Metadata]:
     except (OSError, safetensors.SafetensorError) as error:
         raise WeightsError(f"{path}: damaged or not a safetensors file ({error})") from error
     try:
-        metadata = metadata_from_json(header[_KEY]) if _KEY in header else upstream_metadata(state)
+        metadata = (
+            metadata_from_json(header[HEADER_KEY]) if HEADER_KEY in header else upstream_metadata(state)
+        )
     except (json.JSONDecodeError, TypeError) as error:
         raise WeightsError(f"{path}: unreadable metadata in the header ({error})") from error
     return state, metadata

@@ -16,7 +16,8 @@ class Complexity:
 
 
 def measure_complexity(network: nn.Module, height: int, width: int) -> Complexity:
-    """Count what one forward pass over ``(1, 3, height, width)`` costs; biases and batch norm are not MACs."""
+    """Count what one forward pass over ``(1, 3, height, width)`` costs; biases and batch norm are not
+    MACs."""
     macs = 0
 
     def count(module: nn.Module, _: tuple[Tensor, ...], output: Tensor) -> None:

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import NamedTuple
 
-import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
@@ -34,7 +33,8 @@ class Output(StrEnum):
     DEPTH = "depth"
     """ReLU of the last layer is depth in metres (upstream)."""
     LOG_DEPTH = "log_depth"
-    """The exponential of the last layer is depth: positive everywhere, relative errors weigh the same near and far."""
+    """The exponential of the last layer is depth: positive everywhere, relative errors weigh the same near
+    and far."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,9 @@
 """ImageNet MobileNetV1 from a quantised TFLite file: the encoder FastDepth training starts from.
 
-The file holds uint8 weights with batch norm already folded in: ``w = (q - zero_point) * scale`` per tensor, biases
-int32. We put the folded bias into the batch norm (weight 1, mean 0, variance 1), so names and shapes stay upstream's.
+The file holds uint8 weights with batch norm already folded in: ``w = (q - zero_point) * scale`` per
+tensor, biases
+int32. We put the folded bias into the batch norm (weight 1, mean 0, variance 1), so names and shapes stay
+upstream's.
 Field numbers below are those of TFLite's ``schema.fbs``.
 """
 
@@ -26,7 +28,8 @@ _LAYER = re.compile(r"MobilenetV1/Conv2d_(\d+)(?:_(depthwise|pointwise))?/")
 def load_imagenet_encoder(network: FastDepth, path: Path) -> None:
     """Overwrite the encoder of ``network`` with the TFLite file's weights.
 
-    The network must use TF padding and inputs ``x / 127.5 - 1`` (RGB 0..255) to see what the weights were trained on.
+    The network must use TF padding and inputs ``x / 127.5 - 1`` (RGB 0..255) to see what the weights were
+    trained on.
 
     Raises:
         WeightsError: If the file is no MobileNetV1 1.0 or the network's encoder has other widths.
@@ -47,9 +50,8 @@ def load_imagenet_encoder(network: FastDepth, path: Path) -> None:
                     ) from None
                 target, norm = layer[conv], layer[conv + 1]  # type: ignore[index]
                 if target.weight.shape != weight.shape:
-                    raise WeightsError(
-                        f"{path}: Conv2d_{i} {kind} is {tuple(weight.shape)}, the network's {tuple(target.weight.shape)}"
-                    )
+                    found, wanted = tuple(weight.shape), tuple(target.weight.shape)
+                    raise WeightsError(f"{path}: Conv2d_{i} {kind} is {found}, the network's {wanted}")
                 target.weight.copy_(weight)
                 norm.reset_running_stats()
                 norm.running_var.fill_(1.0 - norm.eps)

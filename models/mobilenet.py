@@ -12,13 +12,15 @@ class Padding(StrEnum):
     SYMMETRIC = "symmetric"
     """One pixel on every side (torch, the official FastDepth weights)."""
     TF_SAME = "tf_same"
-    """TensorFlow's SAME: at stride 2 nothing before and one pixel after (the ImageNet encoder we start from)."""
+    """TensorFlow's SAME: at stride 2 nothing before and one pixel after (the ImageNet encoder we start
+    from)."""
 
 
 class SameConv2d(nn.Conv2d):
     """A 3x3 convolution of stride 2 padded as TensorFlow does for even sizes: right and bottom only.
 
-    With symmetric padding output ``i`` is centred on input ``2i``, here on ``2i + 1``: weights learnt one way see an
+    With symmetric padding output ``i`` is centred on input ``2i``, here on ``2i + 1``: weights learnt one
+    way see an
     image shifted by up to 31 pixels at the end of the encoder when they are run the other way.
     """
 

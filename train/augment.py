@@ -51,9 +51,11 @@ class View:
 
 
 def random_view(view: View, size: tuple[int, int], config: AugmentConfig, rng: np.random.Generator) -> View:
-    """What a virtual camera of ``size = (height, width)`` at the same place sees: rotated, zoomed, mirrored, recoloured.
+    """What a virtual camera of ``size = (height, width)`` at the same place sees: rotated, zoomed,
+    mirrored, recoloured.
 
-    Pure rotations and new intrinsics are homographies of the image, so this is exact; z-depth changes with the axis.
+    Pure rotations and new intrinsics are homographies of the image, so this is exact; z-depth changes with
+    the axis.
     """
     K, R = _virtual_camera(view, size, config, rng)
     warped = warp(view, K, R, size)

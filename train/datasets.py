@@ -29,9 +29,11 @@ class DepthFolder:
 def load_depth_folder(
     folder: Path, width: int = 400, max_gap_s: float = 0.02, stride: int = 1
 ) -> DepthFolder:
-    """Read a folder in TUM layout (``rgb.txt``, ``depth.txt``, ``camera.yaml``), undistorted and scaled to ``width``.
+    """Read a folder in TUM layout (``rgb.txt``, ``depth.txt``, ``camera.yaml``), undistorted and scaled to
+    ``width``.
 
-    Each depth map is paired with the colour image nearest in time; depth is undistorted by nearest neighbour and holes
+    Each depth map is paired with the colour image nearest in time; depth is undistorted by nearest
+    neighbour and holes
     (0, 65535) become 0.
 
     Args:

@@ -1,7 +1,9 @@
 """The training recipe, read from top to bottom; `Hooks` is where others join in.
 
-A step is a function of (seed, step): nothing random is carried from one to the next, so a run killed anywhere goes on
-from its last checkpoint exactly as if it had never stopped, and a batch split over processes is the same batch.
+A step is a function of (seed, step): nothing random is carried from one to the next, so a run killed
+anywhere goes on
+from its last checkpoint exactly as if it had never stopped, and a batch split over processes is the same
+batch.
 """
 
 import copy
@@ -16,8 +18,9 @@ import torch.distributed as dist
 from torch import Tensor, nn
 
 from edgeslam_torch.errors import EdgeSlamError
-from edgeslam_torch.models.checkpoint import Metadata, save_checkpoint
+from edgeslam_torch.models.checkpoint import save_checkpoint
 from edgeslam_torch.models.fastdepth import FastDepth
+from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.train.signals import Signal, Slot
 
 
@@ -39,7 +42,8 @@ class TrainConfig:
     frozen_stages: int = 4
     """conv0 ... conv(n-1) are not trained; 14 freezes the encoder."""
     freeze_norm: bool = False
-    """Keep all batch-norm statistics (right for fine-tuning on little data); the encoder's are always kept."""
+    """Keep all batch-norm statistics (right for fine-tuning on little data); the encoder's are always
+    kept."""
     weight_decay: float = 1e-2
     warmup_steps: int = 100
     clip_norm: float = 1.0
@@ -98,7 +102,8 @@ def train(
 ) -> TrainState:
     """Train until ``config.steps``, early stopping or an error; resumes when ``out/last.pt`` exists.
 
-    Writes ``out/last.pt`` (everything), ``out/best.safetensors`` and ``out/final.safetensors`` (averaged weights) and
+    Writes ``out/last.pt`` (everything), ``out/best.safetensors`` and ``out/final.safetensors`` (averaged
+    weights) and
     ``out/curve.jsonl``.
 
     Raises:

@@ -9,15 +9,16 @@ import torch
 from torch import Tensor, nn
 
 from edgeslam_torch.losses.depth import BerHu, GradientMatching, LaplaceNll, MaskedL1, SILog
-from edgeslam_torch.models.checkpoint import Metadata
 from edgeslam_torch.models.fastdepth import FastDepth
+from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.train.augment import AugmentConfig, View, random_view
 from edgeslam_torch.train.validate import image_tensor
 
 
 @dataclass(frozen=True, slots=True)
 class Slot:
-    """One image's place in the global batch of a step; everything random about it follows from these three numbers."""
+    """One image's place in the global batch of a step; everything random about it follows from these three
+    numbers."""
 
     seed: int
     step: int

@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from torch import nn
 
-from edgeslam_torch.models.checkpoint import Metadata
 from edgeslam_torch.models.fastdepth import FastDepth
+from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.train.augment import View, fitted_view
 from edgeslam_torch.types import FloatArray
 
@@ -41,7 +41,8 @@ def image_tensor(image: np.ndarray, metadata: Metadata) -> torch.Tensor:
 
 
 def log_focal_ratio(K: FloatArray, width: int, metadata: Metadata) -> float:
-    """Log of this view's focal length over the training one at the same image width: metres = canonical * ratio."""
+    """Log of this view's focal length over the training one at the same image width: metres = canonical *
+    ratio."""
     mean_focal = float(np.sqrt(K[0, 0] * K[1, 1]))
     return float(np.log(mean_focal / metadata.focal_px * (metadata.input_width / width)))
 

@@ -1,0 +1,187 @@
+"""Stage 1, depth: FastDepth on one thread, in metres for the camera at hand."""
+
+import logging
+from pathlib import Path
+from typing import Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from edgeslam_torch.errors import WeightsError
+from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.models.record import DEFAULT_WEIGHTS, Metadata, metadata_from_json
+from edgeslam_torch.types import DepthMap, FloatArray
+
+logger = logging.getLogger(__name__)
+
+_MULTIPLE = 32
+
+
+class _Engine(Protocol):
+    metadata: Metadata
+    fixed_size: tuple[int, int] | None
+
+    def run(self, image: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """``(1, 3, H, W)`` -> log depth and sigma, both ``(H, W)``."""
+        ...
+
+
+class DepthPredictor:
+    """Depth of an undistorted image.
+
+    Args:
+        weights: A ``.safetensors`` file or an exported ``.onnx`` file; the shipped weights by default.
+        backend: ``"onnxruntime"`` (falls back to torch when it is not installed) or ``"torch"``.
+        threads: Threads of one inference. With torch this sets the process's number of threads.
+
+    Raises:
+        WeightsError: If the weights are missing or damaged.
+        ValueError: If the backend is unknown.
+
+    Example:
+        >>> predictor = DepthPredictor()  # doctest: +SKIP
+        >>> predictor(image, camera).depth_m.shape  # doctest: +SKIP
+        (480, 640)
+    """
+
+    def __init__(self, weights: Path | None = None, backend: str = "onnxruntime", threads: int = 1) -> None:
+        if backend not in ("onnxruntime", "torch"):
+            raise ValueError(f"backend must be 'onnxruntime' or 'torch', got {backend!r}")
+        self.weights = DEFAULT_WEIGHTS if weights is None else Path(weights)
+        if not self.weights.is_file():
+            raise WeightsError(
+                f"{self.weights}: no such weights file; `edgeslam weights list` shows what there is"
+            )
+        self._engine = _open_engine(self.weights, backend, threads)
+
+    @property
+    def metadata(self) -> Metadata:
+        """What the weights say about themselves."""
+        return self._engine.metadata
+
+    @property
+    def backend(self) -> str:
+        """What actually runs."""
+        return "torch" if isinstance(self._engine, _TorchEngine) else "onnxruntime"
+
+    def __call__(self, image: NDArray[np.uint8], camera: Camera) -> DepthMap:
+        """Depth [m] and its uncertainty at the image's size.
+
+        The network's metres hold for the focal length it was trained with; the same pixels through a lens
+        twice as
+        long are twice as far away, so depth is multiplied by the ratio of focal lengths, both measured in the
+        network's own pixels.
+
+        Args:
+            image: ``(H, W, 3)`` BGR or ``(H, W)`` grey, undistorted.
+            camera: Intrinsics of that image.
+
+        Raises:
+            ValueError: If the image's size is not the camera's or it has neither one nor three channels.
+        """
+        if image.shape[:2] != (camera.height, camera.width) or image.ndim not in (2, 3):
+            raise ValueError(f"image {image.shape} does not fit a camera of {camera.width}x{camera.height}")
+        height, width = self._engine.fixed_size or network_size(camera.height, camera.width, self.metadata)
+        log_depth, sigma = self._engine.run(preprocess(image, height, width, self.metadata))
+        small = camera.scaled(width, height)
+        focal_ratio = float(np.sqrt(small.fx * small.fy)) / self.metadata.focal_px
+        size = (camera.width, camera.height)
+        depth_m = cv2.resize(
+            np.exp(log_depth) * np.float32(focal_ratio), size, interpolation=cv2.INTER_LINEAR
+        )
+        return DepthMap(depth_m, cv2.resize(sigma, size, interpolation=cv2.INTER_LINEAR))
+
+
+def preprocess(image: NDArray[np.uint8], height: int, width: int, metadata: Metadata) -> FloatArray:
+    """BGR or grey uint8 -> ``(1, 3, height, width)`` float32, the whole image squeezed, normalised RGB."""
+    shrinks = height <= image.shape[0] and width <= image.shape[1]
+    small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+    rgb = np.repeat(small[..., None], 3, axis=2) if small.ndim == 2 else small[..., ::-1]
+    gain = np.float32(1.0) / (np.float32(255.0) * np.float32(metadata.std))
+    offset = np.float32(metadata.mean) / np.float32(metadata.std)
+    return np.ascontiguousarray((rgb * gain - offset).transpose(2, 0, 1)[None], dtype=np.float32)
+
+
+def network_size(height: int, width: int, metadata: Metadata) -> tuple[int, int]:
+    """Input size ``(height, width)``: multiples of 32 close to the image's shape, at most the training
+    area."""
+    area = metadata.input_height * metadata.input_width
+    best, best_cost = (metadata.input_height, metadata.input_width), np.inf
+    for h in range(_MULTIPLE, 2 * metadata.input_height + 1, _MULTIPLE):
+        for w in range(_MULTIPLE, 2 * metadata.input_width + 1, _MULTIPLE):
+            if h * w > area:
+                continue
+            # Squeezing by 10 % weighs as much as giving up 20 % of the pixels.
+            cost = abs(np.log((w / h) / (width / height))) + 0.5 * np.log(area / (h * w))
+            if cost < best_cost - 1e-9:
+                best, best_cost = (h, w), cost
+    return best
+
+
+def _open_engine(weights: Path, backend: str, threads: int) -> _Engine:
+    if backend == "onnxruntime":
+        try:
+            import onnxruntime  # noqa: F401 - only to see whether it is there
+        except ImportError:
+            if weights.suffix == ".onnx":
+                raise WeightsError(
+                    f"{weights}: running an ONNX file needs onnxruntime (pip install onnxruntime)"
+                ) from None
+            logger.warning("onnxruntime is not installed: depth runs in torch, about twice as slow")
+        else:
+            return _OnnxEngine(weights, threads)
+    if weights.suffix == ".onnx":
+        raise WeightsError(f"{weights}: an ONNX file runs in onnxruntime only, not with backend 'torch'")
+    return _TorchEngine(weights, threads)
+
+
+class _OnnxEngine:
+    def __init__(self, weights: Path, threads: int) -> None:
+        import onnxruntime
+
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
+        options.log_severity_level = 3
+        if weights.suffix == ".onnx":
+            source: str | bytes = str(weights)
+        else:
+            from edgeslam_torch.models.onnx_graph import build_graph
+
+            source, self.metadata = build_graph(weights)
+        try:
+            self._session = onnxruntime.InferenceSession(source, options, providers=["CPUExecutionProvider"])
+        except RuntimeError as error:  # onnxruntime's own exceptions derive from it
+            raise WeightsError(f"{weights}: onnxruntime cannot load it ({str(error)[:160]})") from error
+        if weights.suffix == ".onnx":
+            record = self._session.get_modelmeta().custom_metadata_map.get("edgeslam")
+            if record is None:
+                raise WeightsError(f"{weights}: holds no EdgeSLAM metadata; export it with `edgeslam export`")
+            self.metadata = metadata_from_json(record)
+        height, width = self._session.get_inputs()[0].shape[2:]
+        self.fixed_size = (height, width) if isinstance(height, int) and isinstance(width, int) else None
+
+    def run(self, image: FloatArray) -> tuple[FloatArray, FloatArray]:
+        log_depth, sigma = self._session.run(["log_depth", "sigma_log"], {"image": image})
+        return log_depth[0, 0], sigma[0, 0]
+
+
+class _TorchEngine:
+    fixed_size = None
+
+    def __init__(self, weights: Path, threads: int) -> None:
+        import torch
+
+        from edgeslam_torch.models.checkpoint import load_checkpoint
+        from edgeslam_torch.models.fold import deployed
+
+        torch.set_num_threads(threads)
+        network, self.metadata = load_checkpoint(weights)
+        self._network = deployed(network, self.metadata).to(memory_format=torch.channels_last)
+
+    def run(self, image: FloatArray) -> tuple[FloatArray, FloatArray]:
+        import torch
+
+        with torch.inference_mode():
+            log_depth, sigma = self._network(torch.from_numpy(image).to(memory_format=torch.channels_last))
+        return log_depth[0, 0].numpy(), sigma[0, 0].numpy()
