@@ -70,7 +70,9 @@ def _shape_notes(
             f"ATE is {share:.0%} of what a fixed position scores ({score.fixed_position_m:.3f} m): the trajectory is "
             "probably of another sequence, or the run failed"
         ]
-    return [f"ATE is {share:.0%} of what a fixed position scores ({score.fixed_position_m:.3f} m): the run drifted or broke"]
+    return [
+        f"ATE is {share:.0%} of what a fixed position scores ({score.fixed_position_m:.3f} m): the run drifted or broke"
+    ]
 
 
 def _rotation_notes(truth: Trajectory, estimate: Trajectory, score: TrajectoryScore) -> list[str]:

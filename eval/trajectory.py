@@ -147,7 +147,9 @@ def score_trajectory(
     )
 
 
-def relative_errors(T_true: FloatArray, T: FloatArray, stamps_s: FloatArray, max_dt_s: float) -> tuple[RelativeError, ...]:
+def relative_errors(
+    T_true: FloatArray, T: FloatArray, stamps_s: FloatArray, max_dt_s: float
+) -> tuple[RelativeError, ...]:
     """RPE over one frame, one second and one metre of the true path, all pairs."""
     n = len(stamps_s)
     frames = np.arange(n - 1), np.arange(1, n)
@@ -186,9 +188,7 @@ def drift(T_true: FloatArray, T: FloatArray) -> tuple[Drift, ...]:
 def _relative(name: str, T_true: FloatArray, T: FloatArray, i: IntArray, j: IntArray) -> RelativeError:
     motion_true = se3.inverse(T_true[i]) @ T_true[j]
     error = se3.inverse(motion_true) @ (se3.inverse(T[i]) @ T[j])
-    return RelativeError(
-        name, len(i), Stats.of(np.linalg.norm(error[:, :3, 3], axis=1)), Stats.of(_angle_deg(error))
-    )
+    return RelativeError(name, len(i), Stats.of(np.linalg.norm(error[:, :3, 3], axis=1)), Stats.of(_angle_deg(error)))
 
 
 def _angle_deg(T: FloatArray) -> FloatArray:

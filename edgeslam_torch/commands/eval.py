@@ -1,0 +1,105 @@
+"""``edgeslam eval``: judge trajectories and maps against ground truth."""
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+from edgeslam_torch.errors import OutputError
+
+HELP = "judge runs or trajectory files against ground truth"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's options."""
+    parser.add_argument("runs", nargs="+", type=Path, help="output folders of 'edgeslam run', or trajectory files")
+    parser.add_argument(
+        "--groundtruth",
+        "-g",
+        type=Path,
+        required=True,
+        help="data set folder or trajectory file (TUM, EuRoC, KITTI, 7-Scenes)",
+    )
+    parser.add_argument(
+        "--depth-gt", type=Path, help="data set whose depth maps judge the map (default: --groundtruth)"
+    )
+    parser.add_argument("--max-dt", type=float, default=0.02, help="largest time between matched poses [s]")
+    parser.add_argument("--offset", type=float, default=0.0, help="added to the estimated stamps [s]")
+    parser.add_argument("--json", type=Path, help="write all figures here")
+    parser.add_argument("--markdown", type=Path, help="write the tables here")
+    parser.add_argument("--plots", type=Path, help="write one picture per run into this folder")
+    parser.add_argument(
+        "--convert",
+        nargs=2,
+        metavar=("FORMAT", "PATH"),
+        help="also write the (first) trajectory as tum, euroc, kitti or 7scenes",
+    )
+
+
+def main(args: argparse.Namespace) -> int:
+    """Print the tables; 0 when every run could be judged."""
+    from edgeslam_torch.eval.run_score import RunScore, evaluate_run
+    from edgeslam_torch.eval.tables import markdown_report
+
+    scores: list[RunScore] = []
+    for run in args.runs:
+        scores.append(evaluate_run(run, args.groundtruth, args.depth_gt, args.max_dt, args.offset))
+    report = markdown_report(scores)
+    if len(scores) == 1:
+        report += "\n" + _details(scores[0])
+    print(report)
+    try:
+        _write_files(args, scores, report)
+    except OSError as error:
+        raise OutputError(f"{error.filename}: cannot be written ({error.strerror})") from error
+    return 0
+
+
+def _write_files(args: argparse.Namespace, scores: list[Any], report: str) -> None:
+    from edgeslam_torch.eval.formats import WRITERS, read_trajectory
+
+    if args.markdown is not None:
+        args.markdown.write_text(report, encoding="utf-8")
+    if args.json is not None:
+        args.json.write_text(json.dumps([s.to_dict() for s in scores], indent=1, default=str) + "\n", encoding="utf-8")
+    if args.plots is not None:
+        _plot(args.plots, args, scores)
+    if args.convert is not None:
+        name, target = args.convert
+        if name not in WRITERS:
+            raise OutputError(f"--convert {name}: known formats are {', '.join(WRITERS)}")
+        WRITERS[name](read_trajectory(args.runs[0]), target)
+
+
+def _plot(folder: Path, args: argparse.Namespace, scores: list[Any]) -> None:
+    from edgeslam_torch.eval.formats import read_trajectory
+    from edgeslam_torch.eval.plots import plot_errors
+
+    folder.mkdir(parents=True, exist_ok=True)
+    truth = read_trajectory(args.groundtruth)
+    for number, (run, score) in enumerate(zip(args.runs, scores, strict=True)):
+        if score.sim3 is not None:
+            plot_errors(truth, read_trajectory(run), score.sim3, folder / f"{number:02d}_{score.name}.png")
+
+
+def _details(score: Any) -> str:
+    """What one run's table has no room for."""
+    found = score.sim3
+    lines = [
+        f"alignment none {score.ate_raw_m:.4f} m, SE(3) {score.ate_se3_m:.4f} m, Sim(3) {score.ate_sim3_m:.4f} m "
+        f"(a fixed position scores {score.fixed_position_m:.3f} m)",
+        f"Sim(3): mean {found.ate_m.mean:.6f} median {found.ate_m.median:.6f} std {found.ate_m.std:.6f} "
+        f"max {found.ate_m.max:.6f} rmse {found.ate_m.rmse:.6f} m over {found.matched} pairs, "
+        f"{found.truth_path_m:.2f} m of path, scale {found.scale:.6f}",
+    ]
+    for r in found.relative:
+        lines.append(
+            f"RPE over {r.delta}: {r.translation_m.rmse:.4f} m, {r.rotation_deg.rmse:.3f} deg rmse ({r.pairs} pairs)"
+        )
+    for d in found.drift:
+        lines.append(
+            f"drift over {d.segment_m:g} m: {d.translation_percent:.2f} %, {d.rotation_deg_per_m:.3f} deg/m ({d.segments} segments)"
+        )
+    if score.map is None and score.map_note:
+        lines.append(f"map not judged: {score.map_note}")
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,186 @@
+"""What an evaluation needs of a data set: true poses, image stamps, measured depth maps.
+
+Three layouts: TUM RGB-D (``groundtruth.txt``, ``rgb.txt``, ``depth.txt``), 7-Scenes as published
+(``frame-NNNNNN.{color,depth}.png`` and ``.pose.txt``), EuRoC (ground truth and image stamps, no depth).
+"""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from edgeslam_torch.errors import CalibrationError
+from edgeslam_torch.eval.associate import nearest
+from edgeslam_torch.eval.errors import EvaluationError
+from edgeslam_torch.eval.formats import SEVEN_SCENES_HZ, Trajectory, read_trajectory
+from edgeslam_torch.geometry.camera import PRESETS, Camera, load_camera
+from edgeslam_torch.types import FloatArray
+
+SEVEN_SCENES_DEPTH_CAMERA = Camera(640, 480, 585.0, 585.0, 320.0, 240.0, source="7-Scenes depth camera")
+"""https://www.microsoft.com/en-us/research/project/rgb-d-dataset-7-scenes/: (585, 585), (320, 240)."""
+
+SEVEN_SCENES_T_C_D = np.array(
+    [
+        [0.99996518, 0.00267651, -0.00790410, -0.02555894],
+        [-0.00274093, 0.99996303, -0.00815045, 0.00010110],
+        [0.00788199, 0.00817183, 0.99993554, 0.00203183],
+        [0.0, 0.0, 0.0, 1.0],
+    ]
+)
+"""Depth camera to colour camera of the 7-Scenes Kinect, as the relocalisation literature uses it (Brachmann & Rother,
+DSAC*, 2021, data preparation): the published depth maps are not registered to colour."""
+
+_MAX_TRUTH_GAP_S = 0.1
+"""True poses are interpolated over gaps up to this long."""
+
+
+@dataclass(frozen=True, slots=True)
+class DepthFiles:
+    """Measured depth maps of a data set."""
+
+    stamps_s: FloatArray
+    """``(D,)``."""
+    paths: tuple[Path, ...]
+    metres_per_unit: float
+    camera: Camera
+    """Camera that took the depth maps."""
+    T_c_d: FloatArray
+    """``(4, 4)`` depth camera to colour camera; identity when the maps are registered."""
+
+    def read(self, index: int) -> FloatArray:
+        """Depth map ``(H, W)`` [m] in undistorted pixels, 0 where nothing was measured.
+
+        Raises:
+            EvaluationError: If the file is not a 16-bit image.
+        """
+        raw = cv2.imread(str(self.paths[index]), cv2.IMREAD_UNCHANGED)
+        if raw is None or raw.dtype != np.uint16 or raw.ndim != 2:
+            raise EvaluationError(f"{self.paths[index]}: not a 16-bit depth map")
+        depth = np.where(raw == 65535, 0, raw).astype(np.float32) * np.float32(self.metres_per_unit)
+        if self.camera.is_distorted:
+            maps = self.camera.undistortion_maps()
+            depth = cv2.remap(depth, *maps, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+        return depth
+
+
+@dataclass(frozen=True, slots=True)
+class EvalDataset:
+    """One recording with ground truth."""
+
+    name: str
+    folder: Path
+    truth: Trajectory
+    frame_stamps_s: FloatArray
+    """``(F,)`` stamps of the colour images; empty when there are none."""
+    image_paths: tuple[Path, ...]
+    camera: Camera | None
+    """Colour camera, when its calibration is known."""
+    depth: DepthFiles | None
+
+
+def open_dataset(folder: Path | str) -> EvalDataset:
+    """Data set with ground truth in any of the three layouts.
+
+    Raises:
+        EvaluationError: If the folder or its ground truth is missing or malformed.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise EvaluationError(f"{folder}: no such data set folder")
+    if any(folder.glob("*.pose.txt")):
+        return _open_seven_scenes(folder)
+    if (folder / "mav0").is_dir():
+        return _open_euroc(folder)
+    if not (folder / "groundtruth.txt").is_file():
+        raise EvaluationError(f"{folder}: no groundtruth.txt, *.pose.txt or mav0/ in this folder")
+    return _open_tum(folder)
+
+
+def interpolate(trajectory: Trajectory, stamps_s: FloatArray) -> tuple[FloatArray, np.ndarray]:
+    """Poses ``(N, 4, 4)`` at ``stamps_s`` and which of them lie within the trajectory's time and no long gap."""
+    known = trajectory.stamps_s
+    T = np.tile(np.eye(4), (len(stamps_s), 1, 1))
+    if len(known) < 2:
+        return T, np.zeros(len(stamps_s), dtype=bool)
+    inside = np.clip(stamps_s, known[0], known[-1])
+    T[:, :3, :3] = Slerp(known, Rotation.from_matrix(trajectory.T_w_c[:, :3, :3]))(inside).as_matrix()
+    for axis in range(3):
+        T[:, axis, 3] = np.interp(inside, known, trajectory.positions[:, axis])
+    right = np.clip(np.searchsorted(known, inside), 1, len(known) - 1)
+    exact = np.abs(known[nearest(known, stamps_s)] - stamps_s) < 1e-4
+    return T, exact | ((known[right] - known[right - 1] <= _MAX_TRUTH_GAP_S) & (inside == stamps_s))
+
+
+def _open_tum(folder: Path) -> EvalDataset:
+    truth = read_trajectory(folder / "groundtruth.txt")
+    stamps, images, _ = _read_list(folder / "rgb.txt", folder)
+    camera = _camera(folder)
+    depth = None
+    if (folder / "depth.txt").is_file() and camera is not None:
+        depth_stamps, paths, header = _read_list(folder / "depth.txt", folder)
+        divisor = re.search(r"/\s*(\d+)", header)
+        unregistered = "not registered" in header.lower()
+        depth = DepthFiles(
+            depth_stamps,
+            paths,
+            1.0 / float(divisor.group(1)) if divisor else 1.0 / 5000.0,  # TUM's file format page
+            SEVEN_SCENES_DEPTH_CAMERA if unregistered else camera,
+            SEVEN_SCENES_T_C_D if unregistered else np.eye(4),
+        )
+    return EvalDataset(folder.resolve().name, folder, truth, stamps, images, camera, depth)
+
+
+def _open_seven_scenes(folder: Path) -> EvalDataset:
+    truth = read_trajectory(folder)
+    images = tuple(sorted(folder.glob("*.color.png")))
+    depths = tuple(sorted(p for p in folder.glob("*.depth.png")))
+    depth = None
+    if depths:
+        depth = DepthFiles(_frame_stamps(depths), depths, 1e-3, SEVEN_SCENES_DEPTH_CAMERA, SEVEN_SCENES_T_C_D)
+    camera = _camera(folder) or PRESETS["kinect"]
+    name = "_".join(folder.resolve().parts[-2:])
+    return EvalDataset(name, folder, truth, _frame_stamps(images), images, camera, depth)
+
+
+def _open_euroc(folder: Path) -> EvalDataset:
+    truth = read_trajectory(folder)
+    listing = folder / "mav0" / "cam0" / "data.csv"
+    stamps, images = np.zeros(0), ()
+    if listing.is_file():
+        rows = [r.split(",") for r in listing.read_text().splitlines() if r.strip() and not r.startswith("#")]
+        stamps = np.array([int(r[0]) for r in rows]) * 1e-9
+        images = tuple(listing.parent / "data" / r[1].strip() for r in rows)
+    return EvalDataset(folder.resolve().name, folder, truth, stamps, images, None, None)
+
+
+def _frame_stamps(files: tuple[Path, ...]) -> FloatArray:
+    numbers = ["".join(c for c in file.name.split(".")[0] if c.isdigit()) for file in files]
+    return np.array([int(n or 0) for n in numbers]) / SEVEN_SCENES_HZ
+
+
+def _camera(folder: Path) -> Camera | None:
+    try:
+        if (folder / "camera.yaml").is_file():
+            return load_camera(folder / "camera.yaml")
+    except CalibrationError as error:
+        raise EvaluationError(str(error)) from error
+    for number in (1, 2, 3):
+        if f"freiburg{number}" in folder.resolve().name or f"fr{number}" in folder.resolve().name:
+            return load_camera(f"tum_fr{number}")
+    return None
+
+
+def _read_list(path: Path, folder: Path) -> tuple[FloatArray, tuple[Path, ...], str]:
+    """Stamps and files of a TUM list, and its comment lines."""
+    if not path.is_file():
+        return np.zeros(0), (), ""
+    lines = path.read_text(encoding="utf-8").splitlines()
+    header = " ".join(line for line in lines if line.startswith("#"))
+    rows = [line.split() for line in lines if line.strip() and not line.startswith("#")]
+    try:
+        return np.array([float(r[0]) for r in rows]), tuple(folder / r[1] for r in rows), header
+    except (ValueError, IndexError) as error:
+        raise EvaluationError(f"{path}: every line must be 'stamp file'") from error

@@ -1,0 +1,91 @@
+"""The output folder of ``edgeslam run``, read back."""
+
+import csv
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from edgeslam_torch.eval.errors import EvaluationError
+from edgeslam_torch.eval.formats import Trajectory, read_trajectory
+from edgeslam_torch.types import PointCloud
+
+TRUSTED = frozenset({"initialised", "tracked", "relocalised"})
+"""Status of a frame whose pose rests on its own image."""
+
+
+@dataclass(frozen=True, slots=True)
+class RunFolder:
+    """What a run left; a part that is missing is None or empty."""
+
+    path: Path
+    trajectory: Trajectory
+    online: Trajectory | None
+    status: tuple[dict[str, str], ...]
+    """Rows of ``status.csv``."""
+    summary: dict[str, Any]
+
+    @property
+    def name(self) -> str:
+        """Folder name."""
+        return self.path.resolve().name
+
+    def cloud(self, name: str = "edge_map.ply") -> PointCloud | None:
+        """Point cloud of the folder, None when it is not there."""
+        from edgeslam_torch.io.ply import read_ply
+
+        file = self.path / name
+        return read_ply(file) if file.is_file() else None
+
+    @property
+    def trusted_frames(self) -> int:
+        """Frames that `TRUSTED` counts; all poses when there is no ``status.csv``."""
+        if not self.status:
+            return len(self.trajectory)
+        return sum(row.get("status", "") in TRUSTED for row in self.status)
+
+
+def open_run(path: Path | str) -> RunFolder:
+    """Run folder, or a single trajectory file taken as one.
+
+    Raises:
+        EvaluationError: If it holds no trajectory or a part is malformed.
+    """
+    path = Path(path)
+    if path.is_file():
+        return RunFolder(path, read_trajectory(path), None, (), {})
+    if not path.exists():
+        raise EvaluationError(f"{path}: no such run folder or trajectory file")
+    online = path / "trajectory_online.txt"
+    return RunFolder(
+        path,
+        read_trajectory(path),
+        read_trajectory(online) if online.is_file() else None,
+        read_status(path / "status.csv"),
+        read_summary(path / "summary.json"),
+    )
+
+
+def read_status(path: Path) -> tuple[dict[str, str], ...]:
+    """Rows of ``status.csv``; empty when there is none."""
+    if not path.is_file():
+        return ()
+    with path.open(newline="", encoding="utf-8") as file:
+        return tuple({k: v or "" for k, v in row.items() if k is not None} for row in csv.DictReader(file))
+
+
+def read_summary(path: Path) -> dict[str, Any]:
+    """``summary.json``; empty when there is none.
+
+    Raises:
+        EvaluationError: If it is not a JSON object.
+    """
+    if not path.is_file():
+        return {}
+    try:
+        summary = json.loads(path.read_text(encoding="utf-8"))
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise EvaluationError(f"{path}: not JSON ({error})") from error
+    if not isinstance(summary, dict):
+        raise EvaluationError(f"{path}: not a JSON object")
+    return summary
