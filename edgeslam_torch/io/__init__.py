@@ -1,0 +1,1 @@
+"""Readers that give frames and telemetry, writers that take records."""

@@ -1,0 +1,85 @@
+"""Which calibration a source gets, and what it costs when there is none."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from edgeslam_torch.errors import CalibrationError
+from edgeslam_torch.geometry.camera import PRESETS, Camera, load_camera
+
+CALIBRATION_FILES = ("camera.yaml", "ost.yaml", "sensor.yaml")
+_ASPECT_TOLERANCE = 0.005
+"""Relative; KITTI's 1241x376 halved is off by 0.001, 4:3 and 16:9 differ by 0.33."""
+
+GUESS_COST = (
+    "a focal length that is off by 10 % bends the trajectory and changes its scale by about as much; "
+    "give --camera FILE (make one with: edgeslam calibrate)"
+)
+
+
+def choose_camera(
+    size: tuple[int, int],
+    given: str | Path | None = None,
+    folders: Sequence[Path] = (),
+    default: Camera | None = None,
+    is_drone: bool = False,
+) -> tuple[Camera, list[str]]:
+    """Calibration for images of one size; the paper's ``E = K^T F K`` needs K, so it cannot give it.
+
+    What was given, else a calibration file in the source, else the data set's own default, else the Tello's
+    when it looks like one, else a guess. A focal length from F may replace a guess later.
+
+    Args:
+        size: ``(width, height)`` of the images [px].
+        given: File or preset from ``--camera``.
+        folders: Where to look for `CALIBRATION_FILES`, in this order.
+        default: Of the data set.
+        is_drone: Whether there is telemetry.
+
+    Returns:
+        The camera, whose ``source`` says where it is from, and warnings in words.
+
+    Raises:
+        CalibrationError: If the calibration is malformed or made for images of another shape.
+    """
+    if given is not None:
+        return fitted(load_camera(given), size, str(given))
+    found = _calibration_in(folders)
+    if found is not None:
+        return fitted(load_camera(found), size, str(found))
+    if default is not None:
+        camera, notes = fitted(default, size, default.source)
+        return camera, [*notes, f"no calibration found: using {camera.source}; give --camera FILE for yours"]
+    if is_drone and size == (PRESETS["tello"].width, PRESETS["tello"].height):
+        camera = replace(PRESETS["tello"], source="default for a Tello (median of five drones)")
+        note = f"no calibration found: using the {camera.source}; yours may differ by 1 % in focal length"
+        return camera, [note]
+    focal = 1.2 * max(size)
+    centre = ((size[0] - 1) / 2.0, (size[1] - 1) / 2.0)
+    camera = Camera(*size, focal, focal, *centre, source=f"guess: 1.2*max(w,h) = {focal:.0f} px")
+    return camera, [f"no calibration found: guessing a focal length of {focal:.0f} px; {GUESS_COST}"]
+
+
+def fitted(camera: Camera, size: tuple[int, int], name: str) -> tuple[Camera, list[str]]:
+    """The calibration for images of ``size``, scaled when only the resolution differs.
+
+    Raises:
+        CalibrationError: If the aspect ratio differs: nobody can say what was cropped.
+    """
+    if (camera.width, camera.height) == size:
+        return camera, []
+    made_for, are = f"{camera.width}x{camera.height}", f"{size[0]}x{size[1]}"
+    if not math.isclose(camera.width * size[1], camera.height * size[0], rel_tol=_ASPECT_TOLERANCE):
+        raise CalibrationError(
+            f"{name}: made for {made_for} images, these are {are}, another shape; "
+            f"calibrate at {are} or give another --camera"
+        )
+    source = f"{camera.source}, scaled from {made_for} to {are}"
+    note = f"{name}: made for {made_for} images, scaled to {are}"
+    return replace(camera.scaled(*size), source=source), [note]
+
+
+def _calibration_in(folders: Sequence[Path]) -> Path | None:
+    candidates = (folder / name for folder in folders for name in CALIBRATION_FILES)
+    return next((path for path in candidates if path.is_file()), None)

@@ -1,0 +1,94 @@
+"""Lists of images with stamps, and what is wrong with them."""
+
+from bisect import bisect_left
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from edgeslam_torch.types import FloatArray, IntArray
+
+
+class Problem(NamedTuple):
+    """Something in a source that was left out, and why."""
+
+    file: str
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class ImageEntry:
+    """One image that a source says it has."""
+
+    index: int
+    """Position in the source, from 0."""
+    stamp_s: float
+    path: Path
+
+
+def seconds_from(stamps: Sequence[float]) -> tuple[FloatArray, str]:
+    """Stamps in seconds and the unit that they were in, told by their size.
+
+    A clock that counts from 1970 reads about 2e9 s now; no unit reaches the next one's numbers before the year
+    5138.
+
+    Example:
+        >>> seconds_from([1403636579763555584.0])[1]
+        'ns'
+    """
+    array = np.asarray(stamps, dtype=np.float64)
+    size = float(np.median(np.abs(array))) if len(array) else 0.0
+    for unit, limit, factor in (("ns", 1e17, 1e-9), ("us", 1e14, 1e-6), ("ms", 1e11, 1e-3)):
+        if size >= limit:
+            return array * factor, unit
+    return array, "s"
+
+
+def in_order(entries: Sequence[ImageEntry], name: str) -> tuple[list[ImageEntry], list[Problem]]:
+    """The entries with strictly increasing stamps, and a problem for each one left out.
+
+    One wild stamp costs one image, wherever it lies: the longest increasing run is kept. A list that is not in
+    time order at all (less than nine tenths would stay) is sorted instead, without repeated stamps.
+
+    Args:
+        entries: As listed.
+        name: File or folder that lists them, for messages.
+    """
+    stamps = np.array([entry.stamp_s for entry in entries])
+    problems: list[Problem] = []
+    keep = _longest_increasing(stamps)
+    if len(keep) < 0.9 * len(entries):
+        entries = sorted(entries, key=lambda entry: entry.stamp_s)
+        stamps = np.array([entry.stamp_s for entry in entries])
+        keep = np.flatnonzero(np.diff(stamps, prepend=-np.inf) > 0)
+        problems.append(Problem(name, "images are not listed in the order of their stamps; sorted"))
+    kept = set(keep.tolist())
+    kept_stamps = set(stamps[keep].tolist())
+    for i, entry in enumerate(entries):
+        if i not in kept:
+            word = "is a repetition" if entry.stamp_s in kept_stamps else "is out of order"
+            problems.append(Problem(str(entry.path), f"stamp {entry.stamp_s:.6f} {word}; image left out"))
+    return [entries[i] for i in keep], problems
+
+
+def _longest_increasing(values: FloatArray) -> IntArray:
+    """Indices of a longest strictly increasing subsequence (patience sorting)."""
+    tails: list[float] = []
+    tail_index: list[int] = []
+    previous = np.full(len(values), -1)
+    for i, value in enumerate(values.tolist()):
+        at = bisect_left(tails, value)
+        previous[i] = tail_index[at - 1] if at else -1
+        if at == len(tails):
+            tails.append(value)
+            tail_index.append(i)
+        else:
+            tails[at], tail_index[at] = value, i
+    chain = []
+    i = tail_index[-1] if tail_index else -1
+    while i >= 0:
+        chain.append(i)
+        i = int(previous[i])
+    return np.array(chain[::-1], dtype=np.int64)
