@@ -1,0 +1,340 @@
+"""Assembling a `World`: surfaces, solids and lamps in; light baked into every texture out."""
+
+from dataclasses import dataclass, field
+from functools import lru_cache
+
+import cv2
+import numpy as np
+
+from edgeslam_torch.synthetic import textures
+from edgeslam_torch.synthetic.world import Box, Quad, Texture, World
+from edgeslam_torch.types import FloatArray
+
+LIGHT_GRID_M = 0.16
+"""Spacing of the points at which light is computed."""
+UNIT_LIGHT = 100.0
+"""Light 1.0 in the 8-bit light maps; they saturate at 2.55."""
+Z = np.array([0.0, 0.0, 1.0])
+VARIANTS = 6
+"""Tiles of each material and pictures of each kind that a process draws at most."""
+
+
+@lru_cache(maxsize=None)
+def material_tile(kind: str, variant: int) -> Texture:
+    """One of `VARIANTS` fixed tiles of a material, drawn when first wanted."""
+    rng = np.random.default_rng([list(textures.MATERIALS).index(kind), variant])
+    return Texture(textures.MATERIALS[kind](rng))
+
+
+PICTURES = {
+    "poster": (textures.poster, (480, 360)),
+    "picture": (textures.poster, (360, 480)),
+    "book_spines": (textures.book_spines, (200, 700)),
+    "screen": (textures.screen, (330, 520)),
+    "door": (textures.door, (800, 380)),
+    "cabinet": (textures.cabinet, (480, 480)),
+    "window": (textures.window, (480, 520)),
+    "whiteboard": (textures.whiteboard, (480, 760)),
+    "radiator": (textures.radiator, (200, 400)),
+    "keyboard": (textures.keyboard, (110, 330)),
+    "rug": (textures.rug, (420, 600)),
+}
+
+
+@lru_cache(maxsize=None)
+def picture(kind: str, variant: int) -> np.ndarray:
+    """One of a fixed set of pictures of a kind, ``(H, W, 3)`` BGR, drawn when first wanted."""
+    draw, shape = PICTURES[kind]
+    return draw(np.random.default_rng([1000 + list(PICTURES).index(kind), variant]), shape)
+
+
+@dataclass(frozen=True, slots=True)
+class Paint:
+    """What a surface is covered with."""
+
+    kind: str
+    """A name in `textures.MATERIALS` or `PICTURES`."""
+    variant: int = 0
+    tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """BGR gain."""
+    zoom: float = 1.0
+    """Magnification of a material's pattern."""
+    turned: bool = False
+    """Pattern along v instead of u."""
+    offset: tuple[float, float] = (0.0, 0.0)
+    """Start within the tile, in [0, 1)."""
+    glow: bool = False
+    """Shines by itself: not shaded."""
+
+
+def random_paint(rng: np.random.Generator, kinds: tuple[str, ...], turned: bool = False, vivid: float = 0.04) -> Paint:
+    """Paint of a random kind among ``kinds``, its colour varied."""
+    kind = str(rng.choice(kinds))
+    gain = np.exp(rng.normal(0.0, 0.12) + rng.normal(0.0, vivid, 3))
+    return Paint(
+        kind,
+        int(rng.integers(VARIANTS)),
+        (float(gain[0]), float(gain[1]), float(gain[2])),
+        float(np.exp(rng.uniform(-0.35, 0.35))),
+        turned,
+        (float(rng.random()), float(rng.random())),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where a piece of furniture stands: local x along the wall, y into the room, z up."""
+
+    x: float
+    y: float
+    yaw_rad: float
+    z: float = 0.0
+
+    def point(self, local: FloatArray) -> FloatArray:
+        """World coordinates of a local point ``(3,)``."""
+        return np.array([self.x, self.y, self.z]) + self.direction(local)
+
+    def direction(self, local: FloatArray) -> FloatArray:
+        """World direction of a local vector ``(3,)``."""
+        c, s = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
+        x, y, z = local
+        return np.array([c * x - s * y, s * x + c * y, z])
+
+    def at(self, x: float, y: float, z: float = 0.0, yaw_rad: float = 0.0) -> "Place":
+        """A place given in this place's own axes."""
+        p = self.point(np.array([x, y, z]))
+        return Place(float(p[0]), float(p[1]), self.yaw_rad + yaw_rad, float(p[2]))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Surface:
+    """A parallelogram before its light is baked."""
+
+    origin_w: FloatArray
+    u_w: FloatArray
+    v_w: FloatArray
+    paint: Paint
+    name: str
+    two_sided: bool
+    solid: int
+    """Index of the solid it bounds, -1 for none."""
+
+
+@dataclass
+class Scene:
+    """A world being put together; `world()` bakes it."""
+
+    low_w: FloatArray
+    high_w: FloatArray
+    """Inner corners of the room [m]."""
+    texel_m: float = 0.004
+    surfaces: list[Surface] = field(default_factory=list)
+    boxes: list[Box] = field(default_factory=list)
+    lamps_w: list[FloatArray] = field(default_factory=list)
+    ambient: float = 0.5
+    """Share of the light that comes from everywhere."""
+    exposure: float = 1.0
+    light_bgr: tuple[float, float, float] = (1.0, 1.0, 1.0)
+
+    def surface(
+        self,
+        origin_w: FloatArray,
+        u_w: FloatArray,
+        v_w: FloatArray,
+        paint: Paint,
+        name: str,
+        *,
+        two_sided: bool = False,
+        solid: int = -1,
+    ) -> None:
+        """Add a parallelogram; see `Quad` for its sides."""
+        arrays = [np.asarray(a, dtype=np.float64) for a in (origin_w, u_w, v_w)]
+        self.surfaces.append(Surface(arrays[0], arrays[1], arrays[2], paint, name, two_sided, solid))
+
+    def box(
+        self,
+        place: Place,
+        centre: tuple[float, float, float],
+        size: tuple[float, float, float],
+        paint: Paint,
+        name: str,
+        *,
+        faces: str = "frblt",
+        special: dict[str, Paint] | None = None,
+        inside: bool = False,
+    ) -> None:
+        """Add a solid; ``faces`` of Front (+y), Right (+x), Back, Left, Top, Under; ``special`` paints by face.
+
+        ``inside`` marks a solid within another one, which needs no shadow of its own.
+        """
+        if not inside:
+            self.boxes.append(Box(place.point(np.array(centre)), 0.5 * np.array(size), place.yaw_rad))
+        solid = len(self.boxes) - 1
+        normals = {"f": (0, 1, 0), "r": (1, 0, 0), "b": (0, -1, 0), "l": (-1, 0, 0), "t": (0, 0, 1), "u": (0, 0, -1)}
+        for face in faces:
+            n = np.array(normals[face], dtype=np.float64)
+            if face in "tu":
+                u, v = np.array([size[0], 0.0, 0.0]), np.array([0.0, -n[2] * size[1], 0.0])
+            else:
+                u, v = np.cross(Z, n) * size, np.array([0.0, 0.0, -size[2]])
+            corner = np.array(centre) + 0.5 * n * size - 0.5 * u - 0.5 * v
+            chosen = (special or {}).get(face, paint)
+            self.surface(place.point(corner), place.direction(u), place.direction(v), chosen, name, solid=solid)
+
+    def panel(
+        self, place: Place, centre: tuple[float, float, float], width: float, height: float, paint: Paint, name: str
+    ) -> None:
+        """Add an upright sheet that faces local +y."""
+        u, v = np.array([-width, 0.0, 0.0]), np.array([0.0, 0.0, -height])
+        corner = np.array(centre) - 0.5 * u - 0.5 * v
+        self.surface(place.point(corner), place.direction(u), place.direction(v), paint, name)
+
+    def prism(
+        self, place: Place, radius: float, height: float, paint: Paint, name: str, *, sides: int = 8, top: float = 1.0
+    ) -> None:
+        """Add a closed column with an even number of sides; ``top`` scales the upper radius."""
+        r = radius * np.cos(np.pi / sides)
+        self.boxes.append(Box(place.point(np.array([0, 0, height / 2])), np.array([r, r, height / 2]), place.yaw_rad))
+        solid = len(self.boxes) - 1
+        angles = 2 * np.pi * np.arange(sides) / sides
+        ring = np.stack([np.cos(angles), np.sin(angles), np.zeros(sides)], axis=1) * radius
+        lift = np.array([0.0, 0.0, height])
+        for k in range(sides):
+            a, b = ring[k], ring[(k + 1) % sides]
+            # A tapered side is a trapezium; the parallelogram through its middle line is close enough.
+            slope = 0.5 * (a + b) * (top - 1.0)
+            v = -(lift + slope)
+            self.surface(
+                place.point(a - v), place.direction(b - a), place.direction(v), paint, name, solid=solid
+            )
+        path = [(ring[(k + 1) % sides] - ring[k]) * top for k in range(sides // 2)]
+        start = ring[0] * top + lift
+        for origin, u, v in _rhombi(start, path):
+            self.surface(place.point(origin), place.direction(v), place.direction(u), paint, name, solid=solid)
+
+    def world(self, name: str) -> World:
+        """Bake the light and build the world."""
+        light = self._light_maps()
+        quads = []
+        for s, field_ in zip(self.surfaces, light, strict=True):
+            quads.append(Quad(s.origin_w, s.u_w, s.v_w, Texture(_bake(s, field_, self)), s.name, s.two_sided))
+        return World(quads, name, np.stack([self.low_w, self.high_w]), self.boxes)
+
+    def _light_maps(self) -> list[FloatArray]:
+        """Light at a grid of points of every surface, 1.0 on average."""
+        points, normals, solids, shapes = [], [], [], []
+        for s in self.surfaces:
+            n = np.cross(s.v_w, s.u_w)
+            n /= np.linalg.norm(n)
+            columns = int(np.clip(np.ceil(np.linalg.norm(s.u_w) / LIGHT_GRID_M), 2, 80))
+            rows = int(np.clip(np.ceil(np.linalg.norm(s.v_w) / LIGHT_GRID_M), 2, 80))
+            a, b = (np.arange(columns) + 0.5) / columns, (np.arange(rows) + 0.5) / rows
+            grid = s.origin_w + a[None, :, None] * s.u_w + b[:, None, None] * s.v_w
+            points.append(grid.reshape(-1, 3) + 0.004 * n)
+            normals.append(np.broadcast_to(n, (rows * columns, 3)))
+            solids.append(np.full(rows * columns, s.solid))
+            shapes.append((rows, columns))
+        p, n, solid = (np.concatenate(x) for x in (points, normals, solids))
+        light = self._light(p, n, solid)
+        out, start = [], 0
+        for shape in shapes:
+            size = shape[0] * shape[1]
+            out.append(light[start : start + size].reshape(shape))
+            start += size
+        return out
+
+    def _light(self, p: FloatArray, n: FloatArray, solid: np.ndarray) -> FloatArray:
+        """Lamps with shadows, ambient light, and darkening near other surfaces, ``(N,)``."""
+        direct = np.zeros(len(p))
+        for lamp in self.lamps_w:
+            ray = lamp - p
+            distance = np.linalg.norm(ray, axis=1)
+            lambert = np.maximum(np.einsum("ni,ni->n", n, ray) / np.maximum(distance, 1e-6), 0.0)
+            lit = lambert > 0
+            open_ = np.ones(len(p))
+            open_[lit] = self._visibility(p[lit], lamp, solid[lit])
+            direct += lambert * open_ / (distance**2 + 0.8)
+        room = n @ Z
+        sky = 1.0 + 0.12 * room  # what looks up sees the lit ceiling and walls
+        for axis in range(3):
+            for distance, inward in ((p[:, axis] - self.low_w[axis], 1.0), (self.high_w[axis] - p[:, axis], -1.0)):
+                facing = n[:, axis] * inward
+                sky *= 1.0 - 0.4 * (facing < 0.9) * np.exp(-np.maximum(distance, 0.0) / 0.22)
+        for k, box in enumerate(self.boxes):
+            if box.half_m.max() < 0.08:
+                continue
+            close = box.distance(p)
+            reach = 0.6 * min(0.25, float(box.half_m.max()))
+            sky *= 1.0 - 0.45 * (solid != k) * np.exp(-close / reach)
+        mean = float(np.median(direct[direct > 0])) if np.any(direct > 0) else 1.0
+        light = self.ambient * sky + (1.0 - self.ambient) * direct / mean
+        light = light / max(float(np.median(light)), 1e-6)
+        return 0.88 * self.exposure * np.where(light > 1, 1 + 0.4 * np.tanh((light - 1) / 1.2), light)
+
+    def _visibility(self, p: FloatArray, lamp: FloatArray, solid: np.ndarray) -> FloatArray:
+        """Share of a lamp that points see past the solids, ``(N,)``: 1 lit, 0 in shadow."""
+        seen = np.ones(len(p))
+        for k, box in enumerate(self.boxes):
+            if box.half_m.max() < 0.12 or box.distance(lamp) == 0:
+                continue
+            a, b = box.to_local(p), box.to_local(lamp)
+            d = b - a
+            d = np.where(np.abs(d) < 1e-9, 1e-9, d)
+            t0, t1 = (-box.half_m - a) / d, (box.half_m - a) / d
+            enter, leave = np.minimum(t0, t1).max(1), np.maximum(t0, t1).min(1)
+            chord = np.clip(leave, 0, 1) - np.clip(enter, 0, 1)
+            blocked = (enter < leave) & (leave > 1e-3) & (enter < 1) & (solid != k)
+            # A ray that only grazes the solid is half lit: a soft edge for nothing.
+            seen *= 1.0 - blocked * np.clip(chord * 12.0, 0.0, 1.0) * 0.92
+        return seen
+
+
+def _rhombi(start: FloatArray, path: list[FloatArray]) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
+    """Parallelograms ``(origin, a, b)`` that tile the even polygon whose first half of sides is ``path``.
+
+    Sorting the sides into reverse order by swaps of neighbours sweeps the polygon, one parallelogram a swap.
+    """
+    order, out = list(range(len(path))), []
+    for _ in range(len(path)):
+        for i in range(len(path) - 1):
+            if order[i] < order[i + 1]:
+                corner = start + sum((path[k] for k in order[:i]), np.zeros(3))
+                out.append((corner, path[order[i]], path[order[i + 1]]))
+                order[i], order[i + 1] = order[i + 1], order[i]
+    return out
+
+
+def _bake(surface: Surface, light: FloatArray, scene: Scene) -> np.ndarray:
+    """Texture of a surface: its paint times its light."""
+    width_m, height_m = float(np.linalg.norm(surface.u_w)), float(np.linalg.norm(surface.v_w))
+    paint = surface.paint
+    if paint.kind in PICTURES:
+        image = picture(paint.kind, paint.variant)
+        if paint.turned:
+            image = cv2.rotate(image, cv2.ROTATE_90_CLOCKWISE)
+        needed = max(width_m / image.shape[1], height_m / image.shape[0])
+        if needed < 0.6 * scene.texel_m:  # finer than anything else in the world: shrink
+            size = [max(4, round(x / (0.7 * scene.texel_m))) for x in (width_m, height_m)]
+            image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    else:
+        image = _spread(paint, width_m, height_m, scene.texel_m)
+    gain = np.array(paint.tint) * (np.ones(3) if paint.glow else np.array(scene.light_bgr))
+    field_ = np.full_like(light, scene.exposure) if paint.glow else light
+    light8 = np.clip(UNIT_LIGHT * field_[..., None] * gain, 0, 255).astype(np.uint8)
+    size = (image.shape[1], image.shape[0])
+    return cv2.multiply(image, cv2.resize(light8, size, interpolation=cv2.INTER_LINEAR), scale=1.0 / UNIT_LIGHT)
+
+
+def _spread(paint: Paint, width_m: float, height_m: float, texel_m: float) -> np.ndarray:
+    """A material's tile repeated over a surface at ``texel_m`` metres a texel."""
+    texel_m = max(texel_m, max(width_m, height_m) / 4096)
+    columns, rows = max(4, round(width_m / texel_m)), max(4, round(height_m / texel_m))
+    pyramid = material_tile(paint.kind, paint.variant)
+    step = texel_m * textures.TILE_PX / (textures.TILE_M * paint.zoom)  # finest texels of the tile per texel
+    level = int(np.clip(round(2 * np.log2(step)), 0, 8))
+    tile = pyramid.level(level)
+    step *= tile.shape[1] / textures.TILE_PX
+    x0, y0 = paint.offset[0] * tile.shape[1], paint.offset[1] * tile.shape[0]
+    M = np.array([[0.0, step, x0], [step, 0.0, y0]]) if paint.turned else np.array([[step, 0.0, x0], [0.0, step, y0]])
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    return cv2.warpAffine(tile, M, (columns, rows), flags=flags, borderMode=cv2.BORDER_WRAP)
