@@ -1,6 +1,5 @@
 """Sliding-window refinement of poses and anchors, paper eq. (28) and its thread 4."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -57,8 +56,7 @@ def refine_window(problem: WindowProblem, config: LmConfig | None = None) -> Win
     config = config or LmConfig()
     _check(problem)
     finite = all(
-        bool(np.isfinite(x).all())
-        for x in (problem.T_c_w, problem.p_w, problem.uv, problem.inv_sigma, problem.K)
+        bool(np.isfinite(x).all()) for x in (problem.T_c_w, problem.p_w, problem.uv, problem.inv_sigma, problem.K)
     )
     if not finite:
         return _unchanged(problem, StopReason.NOT_FINITE)
@@ -72,9 +70,7 @@ def _check(problem: WindowProblem) -> None:
     W, A, M = len(problem.T_c_w), len(problem.p_w), len(problem.obs_pose)
     lengths = {len(problem.obs_anchor), len(problem.uv), len(problem.inv_sigma), M}
     if len(lengths) != 1:
-        raise ValueError(
-            f"obs_pose, obs_anchor, uv and inv_sigma must be equally long, got {sorted(lengths)}"
-        )
+        raise ValueError(f"obs_pose, obs_anchor, uv and inv_sigma must be equally long, got {sorted(lengths)}")
     if len(problem.pose_fixed) != W:
         raise ValueError(f"pose_fixed must have {W} entries, got {len(problem.pose_fixed)}")
     for name, index, limit in (("obs_pose", problem.obs_pose, W), ("obs_anchor", problem.obs_anchor, A)):
@@ -124,19 +120,18 @@ class _Window:
         F = len(self.free)
         column = torch.full((len(T),), F, dtype=torch.int64)
         column[self.free] = torch.arange(F)
-        # Free-pose factors first, grouped by pose: pose blocks are then slices, and fixed poses need no
-        # derivatives of their own.
-        self.order = torch.argsort(column[pose], stable=True)
-        self.pose = pose[self.order]
-        obs_column = column[self.pose]
-        self.n_free = int((obs_column < F).sum())
-        self.bounds: Sequence[int] = torch.searchsorted(obs_column, torch.arange(F + 1)).tolist()
         # Anchors by the first free pose that sees them: chunks then span few poses.
         first_seen = torch.full((A,), F).scatter_reduce_(0, anchor, column[pose], "amin")
         self.anchor_order = torch.argsort(first_seen, stable=True)
         rank = torch.empty_like(self.anchor_order)
         rank[self.anchor_order] = torch.arange(A)
-        self.anchor = rank[anchor[self.order]]
+        # Factors by chunk, pose, anchor: blocks of a pose are slices and writes run forward through memory.
+        # Those of fixed poses come last and need no derivatives of their own.
+        key = torch.where(column[pose] < F, schur.chunk_of(rank[anchor], F), A) * (F + 1) + column[pose]
+        self.order = torch.argsort(key * A + rank[anchor])
+        self.pose, self.anchor = pose[self.order], rank[anchor[self.order]]
+        obs_column = column[self.pose]
+        self.n_free = int((obs_column < F).sum())
         self.n_obs = M
         self.depth_rows = torch.nonzero(self.order >= M)[:, 0]
         self.inverse_depth = _values(depth.inverse_depth)[self.order[self.depth_rows] - M]
@@ -147,6 +142,7 @@ class _Window:
         self.K = torch.tensor(problem.K, dtype=torch.float64)
         p_w = _values(problem.p_w)[self.anchor_order]
         self.chunks = schur.plan_chunks(obs_column[: self.n_free], self.anchor[: self.n_free], A, F)
+        self.Y = [torch.zeros(len(c.columns), 3 * (c.last - c.first), dtype=torch.float64) for c in self.chunks]
         column[fixed] = -1
         self.priors = PriorTerms(problem.pose_priors, problem.scale_priors, column.tolist())
         self.state = _State(T, p_w)
@@ -185,24 +181,26 @@ class _Window:
         self.H = torch.zeros(6 * F, 6 * F, dtype=T.dtype)
         self.g = torch.zeros(6 * F, dtype=T.dtype)
         rf = r[:, :n]
-        g_pose = (Jp * rf[:, None]).sum(0)
-        for k, (lo, hi) in enumerate(zip(self.bounds[:-1], self.bounds[1:], strict=True)):
-            block = Jp[:, :, lo:hi]
-            self.H[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] = (block @ block.mT).sum(0)
-            self.g[6 * k : 6 * k + 6] = g_pose[:, lo:hi].sum(1)
+        g_pose = torch.addcmul(Jp[0] * rf[0], Jp[1], rf[1])
+        for chunk in self.chunks:
+            for pose, lo, hi in chunk.slices:
+                block = Jp[:, :, lo:hi]
+                at = slice(6 * pose, 6 * pose + 6)
+                self.H[at, at] += (block @ block.mT).sum(0)
+                self.g[at] += g_pose[:, lo:hi].sum(1)
         products = torch.empty(9, r.shape[1], dtype=T.dtype)
         for row, (i, j) in enumerate(_UPPER):
             torch.addcmul(Jl[0, i] * Jl[0, j], Jl[1, i], Jl[1, j], out=products[row])
         torch.addcmul(Jl[0] * r[0], Jl[1], r[1], out=products[6:])
         sums = torch.zeros(9, A, dtype=T.dtype)
-        schur.accumulate_points(sums, self.anchor, products)
+        sums.index_add_(1, self.anchor, products)
         prior_cost = self.priors.linearise(T, self.H, self.g)
         self.V, self.g_point = sums[:6], sums[6:]
         return float(value.sum()) + prior_cost, self._scaled_gradient()
 
     def propose(self, mu: float) -> Step[_State] | None:
         """Solve the damped system by eliminating the anchors."""
-        S, b, Y, factor = self._reduce(mu)
+        S, b, factor = self._reduce(mu)
         diagonal = self.H.diagonal()
         S.diagonal().add_(mu * diagonal + _PIVOT_FLOOR)
         L, info = torch.linalg.cholesky_ex(S)
@@ -211,8 +209,8 @@ class _Window:
         delta = -torch.cholesky_solve(b[:, None], L)[:, 0]
         y = schur.whiten(factor, self.g_point)
         back = -y
-        for chunk, Yc in zip(self.chunks, Y, strict=True):
-            back[:, chunk.first : chunk.last] -= (Yc @ delta[chunk.columns]).view(-1, 3).mT
+        for chunk, Yc in zip(self.chunks, self.Y, strict=True):
+            back[:, chunk.first : chunk.last] -= (delta[chunk.columns] @ Yc).view(3, -1)
         step = schur.unwhiten(factor, back)
         damped = (diagonal * delta * delta).sum() + (self.V[_DIAGONAL] * step * step).sum()
         predicted = float(mu * damped - self.g @ delta - (self.g_point * step).sum())
@@ -266,28 +264,26 @@ class _Window:
         point = self.g_point / (self.V[_DIAGONAL] + _PIVOT_FLOOR).sqrt()
         return float(torch.maximum(_abs_max(pose), _abs_max(point)))
 
-    def _reduce(self, mu: float) -> tuple[Tensor, Tensor, list[Tensor], Tensor]:
-        """Pose system without the anchors, its right side, the ``Y`` blocks, the anchors' factors."""
+    def _reduce(self, mu: float) -> tuple[Tensor, Tensor, Tensor]:
+        """Pose system without the anchors, its right side and the anchors' factors; fills ``Y``."""
         factor, _ = schur.inverse_cholesky(self.V, mu)
         y = schur.whiten(factor, self.g_point)
         n = self.n_free
         a, b_, c, d, e, f = factor.index_select(1, self.anchor[:n])
         J = self.Jl[..., :n]
-        white = torch.stack(
-            (a * J[:, 0], b_ * J[:, 0] + c * J[:, 1], d * J[:, 0] + e * J[:, 1] + f * J[:, 2])
-        )
-        blocks = self.Jp[0][:, None] * white[:, 0] + self.Jp[1][:, None] * white[:, 1]  # (6, 3, n)
+        white = torch.stack((a * J[:, 0], b_ * J[:, 0] + c * J[:, 1], d * J[:, 0] + e * J[:, 1] + f * J[:, 2]))
+        blocks = torch.addcmul(self.Jp[0][:, None] * white[:, 0], self.Jp[1][:, None], white[:, 1])  # (6, 3, n)
         blocks = blocks.view(18, -1)
-        S, b, Y = self.H.clone(), self.g.clone(), []
-        for chunk in self.chunks:
-            width = len(chunk.columns)
-            Yc = torch.zeros(3 * (chunk.last - chunk.first) * width, dtype=S.dtype)
-            Yc.index_add_(0, chunk.flat, blocks.index_select(1, chunk.rows).flatten())
-            Yc = Yc.view(-1, width)
-            S[chunk.columns[:, None], chunk.columns] -= Yc.mT @ Yc
-            b[chunk.columns] -= Yc.mT @ y[:, chunk.first : chunk.last].mT.flatten()
-            Y.append(Yc)
-        return S, b, Y, factor
+        S, b = self.H.clone(), self.g.clone()
+        for chunk, Yc in zip(self.chunks, self.Y, strict=True):
+            part = blocks[:, chunk.lo : chunk.hi].flatten()
+            if chunk.unique:
+                Yc.view(-1).index_copy_(0, chunk.flat, part)
+            else:
+                Yc.zero_().view(-1).index_add_(0, chunk.flat, part)
+            S[chunk.columns[:, None], chunk.columns] -= Yc @ Yc.mT
+            b[chunk.columns] -= Yc @ y[:, chunk.first : chunk.last].flatten()
+        return S, b, factor
 
     def _diagnose(self) -> tuple[int, Tensor]:
         """Unobservable directions of the undamped pose system and the last free pose's covariance."""

@@ -94,7 +94,8 @@ def refine_pose(
         >>> rng = np.random.default_rng(0)
         >>> p = rng.uniform((-1, -1, 2), (1, 1, 4), (50, 3))
         >>> uv = 500 * p[:, :2] / p[:, 2:]
-        >>> start = se3.exp(np.array([0.02, 0.0, 0.03, 0.01, 0.0, 0.0]))
+        >>> start = np.eye(4)
+        >>> start[:3, 3] = 0.02, 0.0, 0.03
         >>> result = refine_pose(start, p, uv, np.ones(50), (500.0, 500.0, 0.0, 0.0))
         >>> result.status.value, bool(np.allclose(result.T_c_w, np.eye(4), atol=1e-6))
         ('ok', True)
@@ -142,9 +143,7 @@ def _failed(T: FloatArray, n: int, status: PoseStatus, iterations: int = 0) -> P
     return PoseResult(T, np.zeros(n, bool), np.full(n, np.inf), np.full((6, 6), np.nan), iterations, status)
 
 
-def _round(
-    T: FloatArray, points: "_Points", robust: bool, config: PoseConfig
-) -> tuple[FloatArray, int, bool]:
+def _round(T: FloatArray, points: "_Points", robust: bool, config: PoseConfig) -> tuple[FloatArray, int, bool]:
     """Levenberg-Marquardt with the present inliers; leaves ``points.chi2`` at the returned pose."""
     H, g, cost = points.linearise(T, robust)
     mu, used = 1e-6, 0
@@ -229,9 +228,7 @@ class _Points:
         uv64 = np.asarray(uv, dtype=np.float64).reshape(-1, 2)
         n = len(uv64)
         if self.p.shape[1] != n or len(inv_sigma) != n:
-            raise ValueError(
-                f"{self.p.shape[1]} points, {n} pixels and {len(inv_sigma)} sigmas must be equally many"
-            )
+            raise ValueError(f"{self.p.shape[1]} points, {n} pixels and {len(inv_sigma)} sigmas must be equally many")
         # In units of the focal length the Jacobian needs no intrinsics; they go into the weights.
         self.xy = np.stack(((uv64[:, 0] - cx) / fx, (uv64[:, 1] - cy) / fy))
         self.weight = np.array([[fx], [fy]]) * np.asarray(inv_sigma, dtype=np.float64)
@@ -242,9 +239,7 @@ class _Points:
 
     def finite(self) -> bool:
         """Whether every input is finite."""
-        return bool(
-            np.isfinite(self.p).all() and np.isfinite(self.xy).all() and np.isfinite(self.weight).all()
-        )
+        return bool(np.isfinite(self.p).all() and np.isfinite(self.xy).all() and np.isfinite(self.weight).all())
 
     def linearise(self, T: FloatArray, robust: bool) -> tuple[FloatArray | None, FloatArray, float]:
         """Normal matrix, gradient and cost over the points in use; sets ``chi2`` of all points."""

@@ -18,9 +18,7 @@ class PriorTerms:
     A handful of 6-vectors: numpy, where a call costs a tenth of a torch call.
     """
 
-    def __init__(
-        self, poses: tuple[PosePrior, ...], scales: tuple[ScalePrior, ...], column: list[int]
-    ) -> None:
+    def __init__(self, poses: tuple[PosePrior, ...], scales: tuple[ScalePrior, ...], column: list[int]) -> None:
         """Prepare the terms.
 
         Args:

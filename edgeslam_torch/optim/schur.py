@@ -1,7 +1,7 @@
 """Point elimination: accumulate observation blocks, remove the 3x3 anchor blocks, substitute back.
 
 An observation's point block is first multiplied by the inverse Cholesky factor of its anchor's block; what is
-subtracted from the pose system is then one matrix product ``Y^T Y``. Anchors are sorted by the poses that see
+subtracted from the pose system is then one matrix product ``Y Y^T``. Anchors are sorted by the poses that see
 them and cut into chunks, so that each chunk's ``Y`` spans only the poses seen in it: one dense product in a
 window, a banded one over a whole map.
 """
@@ -11,59 +11,74 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-_ANCHORS_PER_CHUNK = 1024
+ANCHORS_PER_CHUNK = 1024
 _PIVOT = 1e-12
 """A Cholesky pivot below this fraction of its diagonal entry is a direction that nothing observes."""
 
 
 @dataclass(frozen=True, slots=True)
 class Chunk:
-    """Consecutive anchors with the free poses that see them."""
+    """Consecutive anchors with the free poses that see them; its factors are consecutive too."""
 
     first: int
     last: int
     """Anchors ``first <= a < last``."""
-    rows: Tensor
-    """Places of the chunk's observations among the free-pose observations."""
+    lo: int
+    hi: int
+    """Factors ``lo <= m < hi``, sorted by pose, then anchor."""
     flat: Tensor
-    """``(18 m,)`` places of their blocks in the flattened ``Y``."""
+    """``(18 (hi - lo),)`` places of their 6x3 blocks in the flattened ``Y (6 w, 3 (last - first))``."""
+    unique: bool
+    """Whether no pose sees an anchor twice: blocks can then be stored without adding."""
     columns: Tensor
     """``(6 w,)`` scalar columns of the pose system."""
+    slices: tuple[tuple[int, int, int], ...]
+    """Pose, first and last factor of each pose's run."""
 
 
-def plan_chunks(obs_column: Tensor, obs_anchor: Tensor, n_anchors: int, n_poses: int) -> list[Chunk]:
-    """Cut the anchors ``0..n_anchors`` (already sorted by the poses that see them) into chunks.
+def chunk_of(anchor: Tensor, n_poses: int) -> Tensor:
+    """Chunk number of each anchor: one chunk for a window of few poses, where cutting saves nothing."""
+    return torch.zeros_like(anchor) if n_poses <= 12 else anchor // ANCHORS_PER_CHUNK
+
+
+def plan_chunks(column: Tensor, anchor: Tensor, n_anchors: int, n_poses: int) -> list[Chunk]:
+    """Lay out the ``Y`` of each chunk.
 
     Args:
-        obs_column: ``(M,)`` free-pose number of each observation by a free pose.
-        obs_anchor: ``(M,)`` its anchor.
+        column: ``(M,)`` free-pose number of each factor of a free pose.
+        anchor: ``(M,)`` its anchor; factors are sorted by chunk, pose, anchor.
         n_anchors: Number of anchors.
         n_poses: Number of free poses.
     """
-    order = torch.argsort(obs_anchor, stable=True)
-    sorted_anchor = obs_anchor[order]
-    size = n_anchors if n_poses <= 16 else _ANCHORS_PER_CHUNK
-    six = torch.arange(6, device=obs_column.device)
-    three = torch.arange(3, device=obs_column.device)
-    chunks = []
-    for first in range(0, n_anchors, max(size, 1)):
+    if len(anchor) == 0:
+        return []
+    size = n_anchors if n_poses <= 12 else ANCHORS_PER_CHUNK
+    numbers, counts = torch.unique_consecutive(chunk_of(anchor, n_poses), return_counts=True)
+    chunks, lo = [], 0
+    for number, count in zip(numbers.tolist(), counts.tolist(), strict=True):
+        first, hi = number * size, lo + count
         last = min(first + size, n_anchors)
-        lo, hi = torch.searchsorted(sorted_anchor, torch.tensor([first, last], device=order.device)).tolist()
-        if lo == hi:
-            continue
-        rows = order[lo:hi]
-        poses, local = torch.unique(obs_column[rows], return_inverse=True)
-        width = 6 * len(poses)
-        row = 3 * (obs_anchor[rows] - first) + three[:, None]  # (3, m)
-        flat = row[None] * width + (6 * local + six[:, None])[:, None]  # (6, 3, m)
-        columns = (6 * poses[:, None] + six).flatten()
-        chunks.append(Chunk(first, last, rows, flat.flatten(), columns))
+        poses, local, runs = torch.unique_consecutive(column[lo:hi], return_inverse=True, return_counts=True)
+        n = last - first
+        place = 18 * n * local + (anchor[lo:hi] - first)  # entry (0, 0) of the block
+        inner = (3 * n * torch.arange(6)[:, None] + n * torch.arange(3)).flatten()
+        keys = torch.unique(place)
+        ends = (lo + runs.cumsum(0)).tolist()
+        starts = [lo, *ends[:-1]]
+        chunks.append(
+            Chunk(
+                first=first,
+                last=last,
+                lo=lo,
+                hi=hi,
+                flat=(inner[:, None] + place).flatten(),
+                unique=len(keys) == count,
+                columns=(6 * poses[:, None] + torch.arange(6)).flatten(),
+                slices=tuple(zip(poses.tolist(), starts, ends, strict=True)),
+            )
+        )
+        lo = hi
     return chunks
-
-
-def accumulate_points(target: Tensor, index: Tensor, values: Tensor) -> None:
-    """Add ``values (k, m)`` into ``target (k, A)`` at columns ``index``."""
-    target.index_add_(1, index, values)
 
 
 def inverse_cholesky(V: Tensor, damping: float) -> tuple[Tensor, int]:
