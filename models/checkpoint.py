@@ -43,17 +43,13 @@ def load_checkpoint(path: Path | None = None) -> tuple[FastDepth, Metadata]:
     """
     path = DEFAULT_WEIGHTS if path is None else Path(path)
     if not path.is_file():
-        raise WeightsError(
-            f"{path}: no such weights file; `edgeslam weights list` shows what can be downloaded"
-        )
+        raise WeightsError(f"{path}: no such weights file; `edgeslam weights list` shows what can be downloaded")
     state, metadata = _read(path)
     network = build_network(metadata, Widths.of_state_dict(state))
     try:
         network.load_state_dict({k: v.float() if v.is_floating_point() else v for k, v in state.items()})
     except RuntimeError as error:
-        raise WeightsError(
-            f"{path}: does not fit {metadata.variant} ({' '.join(str(error).split())[:200]})"
-        ) from None
+        raise WeightsError(f"{path}: does not fit {metadata.variant} ({' '.join(str(error).split())[:200]})") from None
     return network.eval(), metadata
 
 
@@ -117,9 +113,7 @@ def _read(path: Path) -> tuple[dict[str, Tensor], Metadata]:
     except (OSError, safetensors.SafetensorError) as error:
         raise WeightsError(f"{path}: damaged or not a safetensors file ({error})") from error
     try:
-        metadata = (
-            metadata_from_json(header[HEADER_KEY]) if HEADER_KEY in header else upstream_metadata(state)
-        )
+        metadata = metadata_from_json(header[HEADER_KEY]) if HEADER_KEY in header else upstream_metadata(state)
     except (json.JSONDecodeError, TypeError) as error:
         raise WeightsError(f"{path}: unreadable metadata in the header ({error})") from error
     return state, metadata

@@ -35,6 +35,19 @@ _STORAGES = {
 _UPSTREAM_CLASSES = {"MobileNet", "MobileNetSkipAdd", "MobileNetSkipConcat", "NNConv", "Identity"}
 _UPSTREAM_MODULES = {"models", "imagenet.mobilenet", "__main__"}
 MAX_TENSOR_BYTES = 1 << 30
+_DAMAGE = (
+    pickle.UnpicklingError,
+    zipfile.BadZipFile,
+    EOFError,
+    ValueError,
+    TypeError,
+    LookupError,
+    AttributeError,
+    RuntimeError,
+    OverflowError,
+    MemoryError,
+)
+"""What reading arbitrary bytes as a pickle, zip or tensor raises."""
 
 
 class _Module:
@@ -57,17 +70,13 @@ class _Storage:
             self.fill(data)
 
     def fill(self, data: bytes) -> None:
-        read = (
-            torch.frombuffer(bytearray(data), dtype=self.dtype) if data else torch.empty(0, dtype=self.dtype)
-        )
+        read = torch.frombuffer(bytearray(data), dtype=self.dtype) if data else torch.empty(0, dtype=self.dtype)
         if read.numel() != self.count:
             raise WeightsError("checkpoint is truncated: a tensor's bytes are missing")
         self.values.copy_(read)
 
 
-def _rebuild_tensor(
-    storage: _Storage, offset: int, size: tuple[int, ...], stride: tuple[int, ...], *_: Any
-) -> Tensor:
+def _rebuild_tensor(storage: _Storage, offset: int, size: tuple[int, ...], stride: tuple[int, ...], *_: Any) -> Tensor:
     if not isinstance(storage, _Storage):
         raise WeightsError("checkpoint rebuilds a tensor from something that is no storage")
     return torch.as_strided(storage.values, tuple(size), tuple(stride), int(offset))
@@ -93,6 +102,8 @@ class RestrictedUnpickler(pickle.Unpickler):
         """The only door from a pickle to code."""
         if module == "collections" and name == "OrderedDict":
             return _make_ordered
+        if module in ("builtins", "__builtin__") and name == "set":
+            return set
         if module == "torch._utils" and name in ("_rebuild_tensor", "_rebuild_tensor_v2"):
             return _rebuild_tensor
         if module == "torch._utils" and name == "_rebuild_parameter":
@@ -111,22 +122,21 @@ class RestrictedUnpickler(pickle.Unpickler):
             return _IgnoredDtype
         raise WeightsError(f"checkpoint refers to {module}.{name}: refused, it may run code; nothing was run")
 
-    def persistent_load(self, pid: Any) -> _Storage:
-        """A storage named by the pickle: ``("storage", dtype, key, location, count, view)``."""
-        if not (
-            isinstance(pid, tuple)
-            and len(pid) >= 5
-            and pid[0] == "storage"
-            and isinstance(pid[1], torch.dtype)
-        ):
+    def persistent_load(self, pid: Any) -> Any:
+        """A storage named by the pickle: ``("storage", dtype, key, location, count, view)``.
+
+        Legacy files also wrap classes as ``("module", class, file, source)``; the class came through
+        `find_class`.
+        """
+        if isinstance(pid, tuple) and len(pid) == 4 and pid[0] == "module" and pid[1] is _Module:
+            return pid[1]
+        if not (isinstance(pid, tuple) and len(pid) >= 5 and pid[0] == "storage" and isinstance(pid[1], torch.dtype)):
             raise WeightsError("checkpoint holds an unknown kind of external object: refused")
         key, count = str(pid[2]), pid[4]
         if key not in self.storages:
             if self._records is not None and key not in self._records:
                 raise WeightsError("checkpoint is truncated: a tensor's bytes are missing")
-            self.storages[key] = _Storage(
-                pid[1], count, None if self._records is None else self._records[key]
-            )
+            self.storages[key] = _Storage(pid[1], count, None if self._records is None else self._records[key])
         return self.storages[key]
 
 
@@ -154,13 +164,8 @@ def read_upstream(path: Path) -> dict[str, Tensor]:
         raise WeightsError(f"{path}: cannot read ({error.strerror})") from error
     except WeightsError as error:
         raise WeightsError(f"{path}: {error}") from None
-    except (
-        pickle.UnpicklingError, EOFError, ValueError, TypeError, KeyError, IndexError, AttributeError, RuntimeError,
-        UnicodeDecodeError, OverflowError, MemoryError, zipfile.BadZipFile,
-    ) as error:  # fmt: skip
-        raise WeightsError(
-            f"{path}: damaged checkpoint ({type(error).__name__}: {str(error)[:120]})"
-        ) from None
+    except _DAMAGE as error:
+        raise WeightsError(f"{path}: damaged checkpoint ({type(error).__name__}: {str(error)[:120]})") from None
     if isinstance(content, dict):
         content = content.get("model", content.get("state_dict", content))
     state: dict[str, Tensor] = {}

@@ -39,7 +39,7 @@ def export_onnx(network: FastDepth, metadata: Metadata, path: Path, options: Exp
     Raises:
         OutputError: If the file written is not what was asked for (opset, checker).
     """
-    module = deployed(network, metadata).to(memory_format=torch.contiguous_format)
+    module = deployed(network, metadata)
     example = torch.zeros(1, 3, options.height, options.width)
     shapes = None
     if options.dynamic:
@@ -58,8 +58,9 @@ def export_onnx(network: FastDepth, metadata: Metadata, path: Path, options: Exp
             optimize=True,
             verbose=False,
         )
-    model = program.model_proto
-    model = set_opset(model, options.opset)
+    if program is None:
+        raise OutputError(f"{path}: the exporter returned nothing")
+    model = set_opset(program.model_proto, options.opset)
     write_metadata(model, metadata, options)
     check_model(model, options.opset)
     temporary = path.with_name(path.name + ".part")
@@ -103,6 +104,4 @@ def check_model(model: onnx.ModelProto, opset: int) -> None:
     try:
         onnx.checker.check_model(model, full_check=True)
     except (onnx.checker.ValidationError, onnx.shape_inference.InferenceError) as error:
-        raise OutputError(
-            f"exported model fails ONNX's checker: {' '.join(str(error).split())[:200]}"
-        ) from error
+        raise OutputError(f"exported model fails ONNX's checker: {' '.join(str(error).split())[:200]}") from error

@@ -152,9 +152,7 @@ class FastDepth(nn.Module):
 
     def _last_layer(self, x: Tensor) -> tuple[Tensor, Tensor]:
         if x.shape[-1] % INPUT_MULTIPLE or x.shape[-2] % INPUT_MULTIPLE:
-            raise ValueError(
-                f"height and width must be multiples of {INPUT_MULTIPLE}, got {tuple(x.shape[-2:])}"
-            )
+            raise ValueError(f"height and width must be multiples of {INPUT_MULTIPLE}, got {tuple(x.shape[-2:])}")
         kept: dict[int, Tensor] = {}
         for i, layer in enumerate(self.encoder()):
             x = layer(x)
@@ -169,9 +167,7 @@ class FastDepth(nn.Module):
 
 
 def _pointwise(inputs: int, outputs: int) -> nn.Sequential:
-    return nn.Sequential(
-        nn.Conv2d(inputs, outputs, 1, bias=False), nn.BatchNorm2d(outputs), nn.ReLU(inplace=True)
-    )
+    return nn.Sequential(nn.Conv2d(inputs, outputs, 1, bias=False), nn.BatchNorm2d(outputs), nn.ReLU(inplace=True))
 
 
 def _dense5(inputs: int, outputs: int) -> nn.Sequential:

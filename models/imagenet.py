@@ -35,9 +35,7 @@ def load_imagenet_encoder(network: FastDepth, path: Path) -> None:
         WeightsError: If the file is no MobileNetV1 1.0 or the network's encoder has other widths.
     """
     if network.padding is not Padding.TF_SAME:
-        raise ValueError(
-            f"the ImageNet encoder needs padding {Padding.TF_SAME.value}, not {network.padding.value}"
-        )
+        raise ValueError(f"the ImageNet encoder needs padding {Padding.TF_SAME.value}, not {network.padding.value}")
     folded = read_tflite_encoder(path)
     with torch.no_grad():
         for i, layer in enumerate(network.encoder()):
@@ -45,9 +43,7 @@ def load_imagenet_encoder(network: FastDepth, path: Path) -> None:
                 try:
                     weight, bias = folded[(i, kind)]
                 except KeyError:
-                    raise WeightsError(
-                        f"{path}: holds no layer Conv2d_{i} {kind}; not a MobileNetV1"
-                    ) from None
+                    raise WeightsError(f"{path}: holds no layer Conv2d_{i} {kind}; not a MobileNetV1") from None
                 target, norm = layer[conv], layer[conv + 1]  # type: ignore[index]
                 if target.weight.shape != weight.shape:
                     found, wanted = tuple(weight.shape), tuple(target.weight.shape)

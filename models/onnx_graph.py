@@ -11,6 +11,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
@@ -70,8 +71,8 @@ class _Builder:
                 x = self.node("Add", x, kept[_SKIP_INTO[i]])
         last = self.conv(x, f"{decoder}6.0", f"{decoder}6.1")
         self.finish(last, x)
-        size = ["batch", 3, "height", "width"]
-        out = ["batch", 1, "height", "width"]
+        size: list[str | int | None] = ["batch", 3, "height", "width"]
+        out: list[str | int | None] = ["batch", 1, "height", "width"]
         graph = helper.make_graph(
             self.nodes,
             "fastdepth",
@@ -79,9 +80,7 @@ class _Builder:
             [helper.make_tensor_value_info(n, TensorProto.FLOAT, out) for n in (LOG_DEPTH, SIGMA)],
             self.constants,
         )
-        model = helper.make_model(
-            graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION
-        )
+        model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION)
         helper.set_model_props(model, {"edgeslam": json.dumps(asdict(self.metadata))})
         return model
 
@@ -97,17 +96,13 @@ class _Builder:
         if self.metadata.output == "log_depth":
             self.node("Clip", last, self.constant(-limit), self.constant(limit), name=LOG_DEPTH)
         else:
-            clipped = self.node(
-                "Clip", last, self.constant(np.float32(1e-3)), self.constant(np.float32(100.0))
-            )
+            clipped = self.node("Clip", last, self.constant(np.float32(1e-3)), self.constant(np.float32(100.0)))
             self.node("Log", clipped, name=LOG_DEPTH)
         floor = self.constant(np.float32(self.metadata.sigma_floor**2))
         if "uncertainty.weight" in self.weights:
             raw = self.conv(features, "uncertainty", None)
             raw = self.node("Clip", raw, self.constant(np.float32(-4.0)), self.constant(np.float32(1.5)))
-            sigma = self.node(
-                "Mul", self.node("Exp", raw), self.constant(np.float32(self.metadata.sigma_scale))
-            )
+            sigma = self.node("Mul", self.node("Exp", raw), self.constant(np.float32(self.metadata.sigma_scale)))
             variance = self.node("Mul", sigma, sigma)
         else:
             variance = self.node("Mul", LOG_DEPTH, self.constant(np.float32(0.0)))
@@ -143,7 +138,7 @@ class _Builder:
         return self.node("Clip", x, self.constant(np.float32(0.0)), self.constant(np.float32(6.0)))
 
     def upsample(self, x: str) -> str:
-        scales = self.constant(np.float32([1, 1, 2, 2]))
+        scales = self.constant(np.array([1, 1, 2, 2], np.float32))
         return self.node(
             "Resize",
             x,
@@ -154,7 +149,7 @@ class _Builder:
             nearest_mode="floor",
         )
 
-    def node(self, op: str, *inputs: str, name: str | None = None, **attributes: object) -> str:
+    def node(self, op: str, *inputs: str, name: str | None = None, **attributes: Any) -> str:
         output = name or f"t{len(self.nodes)}"
         self.nodes.append(helper.make_node(op, list(inputs), [output], **attributes))
         return output

@@ -45,7 +45,8 @@ def metadata_from_json(text: str) -> Metadata:
     """Parse the header's record; unknown keys are ignored so that newer files still load."""
     record: dict[str, Any] = json.loads(text)
     known = {f.name for f in dataclasses.fields(Metadata)}
-    return Metadata(**{k: tuple(v) if isinstance(v, list) else v for k, v in record.items() if k in known})
+    kept: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in record.items() if k in known}
+    return Metadata(**kept)
 
 
 def read_header(path: Path) -> Metadata:

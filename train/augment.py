@@ -8,6 +8,9 @@ from numpy.typing import NDArray
 
 from edgeslam_torch.types import FloatArray
 
+_LUMA = np.array([[0.114], [0.587], [0.299]], np.float32)
+"""Grey from BGR (ITU-R BT.601)."""
+
 
 @dataclass(frozen=True, slots=True)
 class AugmentConfig:
@@ -70,7 +73,8 @@ def fitted_view(view: View, size: tuple[int, int]) -> View:
     h, w = view.image.shape[:2]
     image = cv2.resize(view.image, (width, height), interpolation=cv2.INTER_AREA)
     depth = cv2.resize(view.depth_m, (width, height), interpolation=cv2.INTER_NEAREST)
-    return View(image, depth, scaled_K(view.K, width / w, height / h))
+    K = scaled_K(view.K, width / w, height / h)
+    return View(np.asarray(image, np.uint8), np.asarray(depth, np.float32), K)
 
 
 def scaled_K(K: FloatArray, sx: float, sy: float) -> FloatArray:
@@ -97,7 +101,8 @@ def warp(view: View, K: FloatArray, R: FloatArray, size: tuple[int, int]) -> Vie
     u, v = np.meshgrid(np.arange(width), np.arange(height))
     rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], axis=-1)
     old_z = rays @ R[:, 2]  # third row of R^T: z in the old camera of a ray with z = 1 in the new one
-    return View(image, (depth / np.maximum(old_z, 0.1)).astype(np.float32), K)
+    depth_m = (depth / np.maximum(old_z, 0.1)).astype(np.float32)
+    return View(np.asarray(image, np.uint8), depth_m, K)
 
 
 def mirrored(view: View) -> View:
@@ -128,9 +133,9 @@ def _virtual_camera(
 def _recolour(image: NDArray[np.uint8], config: AugmentConfig, rng: np.random.Generator) -> NDArray[np.uint8]:
     x = image.astype(np.float32) / 255.0
     if rng.random() < config.grey:
-        x = np.repeat(x @ np.float32([0.114, 0.587, 0.299])[:, None], 3, axis=2)
+        x = np.repeat(x @ _LUMA, 3, axis=2)
     else:
-        luma = x @ np.float32([0.114, 0.587, 0.299])[:, None]
+        luma = x @ _LUMA
         x = luma + (x - luma) * rng.uniform(1 - config.saturation, 1 + config.saturation)
         x = x * rng.uniform(1 - config.channel, 1 + config.channel, 3).astype(np.float32)
     mean = x.mean()
@@ -147,11 +152,11 @@ def _recolour(image: NDArray[np.uint8], config: AugmentConfig, rng: np.random.Ge
 
 def _blur(x: FloatArray, rng: np.random.Generator) -> FloatArray:
     if rng.random() < 0.5:
-        return cv2.GaussianBlur(x, (0, 0), rng.uniform(0.4, 1.5))
+        return np.asarray(cv2.GaussianBlur(x, (0, 0), rng.uniform(0.4, 1.5)), np.float32)
     length = int(rng.integers(3, 8))
     kernel = np.zeros((length, length), np.float32)
     angle = rng.uniform(0, np.pi)
     c, d = (length - 1) / 2, (length - 1) / 2 * np.array([np.cos(angle), np.sin(angle)])
     ends = [tuple(int(round(c + s * k)) for k in d) for s in (-1, 1)]
     cv2.line(kernel, ends[0], ends[1], 1.0)
-    return cv2.filter2D(x, -1, kernel / kernel.sum())
+    return np.asarray(cv2.filter2D(x, -1, kernel / kernel.sum()), np.float32)

@@ -12,6 +12,7 @@ import yaml
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.geometry.camera import load_camera
 from edgeslam_torch.train.augment import View, fitted_view
+from edgeslam_torch.types import FloatArray
 
 logger = logging.getLogger(__name__)
 
@@ -60,12 +61,16 @@ def load_depth_folder(
         if image is None or raw is None or raw.ndim != 2:
             unreadable.append(str(colours[nearest][1] if image is None else depth_path))
             continue
-        depth = np.where(raw == 65535, 0, raw).astype(np.float32) / scale
+        depth: FloatArray = np.where(raw == 65535, 0, raw).astype(np.float32) / scale
         maps = camera.undistortion_maps()
         if camera.is_distorted:
             image = cv2.remap(image, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-            depth = cv2.remap(depth, *maps, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
-        views.append(_reduced(View(image, depth, camera.K), width))
+            undistorted = cv2.remap(
+                depth, *maps, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0
+            )
+            depth = np.asarray(undistorted, np.float32)
+        view = View(np.asarray(image, np.uint8), np.asarray(depth, np.float32), camera.K)
+        views.append(_reduced(view, width))
     if not views:
         raise SourceError(f"{folder}: no image with depth could be read")
     if unreadable:

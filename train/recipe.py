@@ -111,7 +111,7 @@ def train(
     """
     out.mkdir(parents=True, exist_ok=True)
     if config.channels_last:
-        network = network.to(memory_format=torch.channels_last)
+        network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     state = TrainState(network, copy.deepcopy(network).eval(), build_optimiser(network, config))
     resume(state, out / "last.pt")
     rank, world = _rank(), _world()

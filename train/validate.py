@@ -36,7 +36,7 @@ class DepthScores:
 def image_tensor(image: np.ndarray, metadata: Metadata) -> torch.Tensor:
     """BGR uint8 ``(H, W, 3)`` -> normalised RGB ``(3, H, W)`` float32."""
     rgb = image[..., ::-1].astype(np.float32) / 255.0
-    normalised = (rgb - np.float32(metadata.mean)) / np.float32(metadata.std)
+    normalised = (rgb - np.array(metadata.mean, np.float32)) / np.array(metadata.std, np.float32)
     return torch.from_numpy(np.ascontiguousarray(normalised.transpose(2, 0, 1)))
 
 
@@ -76,8 +76,10 @@ def score(network: FastDepth, metadata: Metadata, views: Sequence[View]) -> Dept
         if row is not None:
             rows.append(row)
     network.train(was_training)
-    means = np.nanmean(np.array(rows), axis=0)
-    return DepthScores(*(float(x) for x in means[:-1]), float(np.std([r[-1] for r in rows])))
+    table = np.array(rows)
+    means = [float(x) for x in np.nanmean(table, axis=0)]
+    means[-1] = float(np.std(table[:, -1]))
+    return DepthScores(*means)
 
 
 def _scores_of(predicted: FloatArray, view: View) -> tuple[float, ...] | None:

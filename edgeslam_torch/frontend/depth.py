@@ -90,7 +90,8 @@ class DepthPredictor:
         depth_m = cv2.resize(
             np.exp(log_depth) * np.float32(focal_ratio), size, interpolation=cv2.INTER_LINEAR
         )
-        return DepthMap(depth_m, cv2.resize(sigma, size, interpolation=cv2.INTER_LINEAR))
+        sigma_log = cv2.resize(sigma, size, interpolation=cv2.INTER_LINEAR)
+        return DepthMap(np.asarray(depth_m, np.float32), np.asarray(sigma_log, np.float32))
 
 
 def preprocess(image: NDArray[np.uint8], height: int, width: int, metadata: Metadata) -> FloatArray:
@@ -98,8 +99,8 @@ def preprocess(image: NDArray[np.uint8], height: int, width: int, metadata: Meta
     shrinks = height <= image.shape[0] and width <= image.shape[1]
     small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
     rgb = np.repeat(small[..., None], 3, axis=2) if small.ndim == 2 else small[..., ::-1]
-    gain = np.float32(1.0) / (np.float32(255.0) * np.float32(metadata.std))
-    offset = np.float32(metadata.mean) / np.float32(metadata.std)
+    gain = np.float32(1.0) / (np.float32(255.0) * np.array(metadata.std, np.float32))
+    offset = np.array(metadata.mean, np.float32) / np.array(metadata.std, np.float32)
     return np.ascontiguousarray((rgb * gain - offset).transpose(2, 0, 1)[None], dtype=np.float32)
 
 
@@ -167,7 +168,7 @@ class _OnnxEngine:
 
 
 class _TorchEngine:
-    fixed_size = None
+    fixed_size: tuple[int, int] | None = None
 
     def __init__(self, weights: Path, threads: int) -> None:
         import torch
@@ -177,7 +178,7 @@ class _TorchEngine:
 
         torch.set_num_threads(threads)
         network, self.metadata = load_checkpoint(weights)
-        self._network = deployed(network, self.metadata).to(memory_format=torch.channels_last)
+        self._network = deployed(network, self.metadata).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def run(self, image: FloatArray) -> tuple[FloatArray, FloatArray]:
         import torch

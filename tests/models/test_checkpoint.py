@@ -1,0 +1,76 @@
+"""Weights on disk."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from edgeslam_torch.errors import WeightsError
+from edgeslam_torch.models.checkpoint import build_network, load_checkpoint, save_checkpoint
+from edgeslam_torch.models.fastdepth import FastDepth, Variant
+from edgeslam_torch.models.record import DEFAULT_WEIGHTS, Metadata, read_header
+
+
+def small_network() -> tuple[FastDepth, Metadata]:
+    metadata = Metadata(variant=Variant.PRUNED.value, data=("a", "b"), metrics={"x": 0.5})
+    torch.manual_seed(0)
+    return build_network(metadata).eval(), metadata
+
+
+def test_weights_and_record_come_back(tmp_path: Path) -> None:
+    network, metadata = small_network()
+    save_checkpoint(network, metadata, tmp_path / "w.safetensors")
+    loaded, record = load_checkpoint(tmp_path / "w.safetensors")
+    assert record == metadata == read_header(tmp_path / "w.safetensors")
+    x = torch.randn(1, 3, 32, 64)
+    assert torch.equal(loaded(x), network(x))
+    assert list(tmp_path.iterdir()) == [tmp_path / "w.safetensors"]
+
+
+def test_half_precision_halves_the_file_and_hardly_changes_depth(tmp_path: Path) -> None:
+    network, metadata = small_network()
+    for name, half in (("full", False), ("half", True)):
+        save_checkpoint(network, metadata, tmp_path / name, half)
+    assert (tmp_path / "half").stat().st_size < 0.52 * (tmp_path / "full").stat().st_size
+    x = torch.randn(1, 3, 64, 64)
+    a, b = network.predict(x).log_depth, load_checkpoint(tmp_path / "half")[0].predict(x).log_depth
+    assert (a - b).abs().max() < 1e-2 * (1 + a.abs().max())
+
+
+def test_plain_torch_state_dict_is_read_as_upstreams(tmp_path: Path) -> None:
+    network = FastDepth(Variant.PRUNED)
+    torch.save(network.state_dict(), tmp_path / "w.pt")
+    loaded, metadata = load_checkpoint(tmp_path / "w.pt")
+    assert metadata.variant == Variant.PRUNED.value
+    assert metadata.output == "depth"
+    assert torch.equal(loaded.state_dict()["conv3.3.weight"], network.state_dict()["conv3.3.weight"])
+
+
+def test_missing_truncated_and_foreign_files_are_named(tmp_path: Path) -> None:
+    with pytest.raises(WeightsError, match="no such weights"):
+        load_checkpoint(tmp_path / "none.safetensors")
+    network, metadata = small_network()
+    save_checkpoint(network, metadata, tmp_path / "w.safetensors")
+    (tmp_path / "cut.safetensors").write_bytes((tmp_path / "w.safetensors").read_bytes()[:100_000])
+    with pytest.raises(WeightsError, match=r"cut\.safetensors"):
+        load_checkpoint(tmp_path / "cut.safetensors")
+    (tmp_path / "text.safetensors").write_text("hello, this is not a network at all")
+    with pytest.raises(WeightsError, match=r"text\.safetensors"):
+        load_checkpoint(tmp_path / "text.safetensors")
+    with pytest.raises(WeightsError, match=r"text\.safetensors"):
+        read_header(tmp_path / "text.safetensors")
+
+
+def test_pickled_module_is_refused_with_the_remedy(tmp_path: Path) -> None:
+    torch.save({"model": FastDepth(Variant.PRUNED)}, tmp_path / "whole.pth.tar")
+    with pytest.raises(WeightsError, match="edgeslam weights convert"):
+        load_checkpoint(tmp_path / "whole.pth.tar")
+
+
+def test_shipped_weights_are_small_and_say_what_they_are() -> None:
+    assert DEFAULT_WEIGHTS.stat().st_size <= 8_000_000
+    metadata = read_header(DEFAULT_WEIGHTS)
+    assert metadata.units == "m"
+    assert metadata.licence
+    assert metadata.data
+    assert not any("xyz" in name or "kitchen" in name for name in metadata.data)

@@ -1,0 +1,103 @@
+"""Upstream's pickled checkpoints: read without running them."""
+
+import os
+import pickle
+import sys
+import types
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import torch
+from torch import nn
+
+from edgeslam_torch.errors import WeightsError
+from edgeslam_torch.models.checkpoint import load_checkpoint
+from edgeslam_torch.models.convert import convert_upstream, read_upstream
+from edgeslam_torch.models.fastdepth import FastDepth, Variant
+
+
+@pytest.fixture
+def upstream_class() -> Iterator[type[nn.Module]]:
+    """A class that pickles as upstream's ``models.MobileNetSkipAdd`` does."""
+    module = types.ModuleType("models")
+
+    class MobileNetSkipAdd(nn.Module):
+        def __init__(self, network: FastDepth) -> None:
+            super().__init__()
+            for name, child in network.named_children():
+                self.add_module(name, child)
+
+    MobileNetSkipAdd.__module__, MobileNetSkipAdd.__qualname__ = "models", "MobileNetSkipAdd"
+    module.MobileNetSkipAdd = MobileNetSkipAdd  # type: ignore[attr-defined]
+    before = sys.modules.get("models")
+    sys.modules["models"] = module
+    yield MobileNetSkipAdd
+    del sys.modules["models"]
+    if before is not None:
+        sys.modules["models"] = before
+
+
+@pytest.mark.filterwarnings("ignore:Couldn't retrieve source")
+@pytest.mark.parametrize("zipped", [True, False])
+def test_whole_module_becomes_tensors(tmp_path: Path, upstream_class: type[nn.Module], zipped: bool) -> None:
+    network = FastDepth(Variant.PRUNED).eval()
+    path = tmp_path / "model_best.pth.tar"
+    content = {"model": upstream_class(network), "epoch": 19, "best_result": 0.6}
+    torch.save(content, path, _use_new_zipfile_serialization=zipped)
+    metadata = convert_upstream(path, tmp_path / "out.safetensors")
+    assert metadata.variant == Variant.PRUNED.value
+    loaded, record = load_checkpoint(tmp_path / "out.safetensors")
+    assert record.padding == "symmetric"
+    x = torch.randn(1, 3, 32, 32)
+    assert torch.equal(loaded(x), network(x))
+
+
+class _Hostile:
+    def __init__(self, marker: Path) -> None:
+        self.marker = marker
+
+    def __reduce__(self) -> tuple[object, tuple[str]]:
+        return os.system, (f"touch {self.marker}",)
+
+
+@pytest.mark.parametrize("zipped", [True, False])
+def test_hostile_pickle_is_refused_and_runs_nothing(tmp_path: Path, zipped: bool) -> None:
+    marker = tmp_path / "ran"
+    torch.save({"model": _Hostile(marker)}, tmp_path / "evil.pth", _use_new_zipfile_serialization=zipped)
+    with pytest.raises(WeightsError, match="refused"):
+        read_upstream(tmp_path / "evil.pth")
+    assert not marker.exists()
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["builtins eval", "builtins getattr", "os system", "torch load", "torch.nn.modules.module os", "models exec"],
+)
+def test_names_outside_the_list_are_refused(tmp_path: Path, name: str) -> None:
+    module, attribute = name.split()
+    program = f"c{module}\n{attribute}\n(V1+1\ntR.".encode()
+    (tmp_path / "p.pth").write_bytes(program)
+    with pytest.raises(WeightsError, match=f"{module}.{attribute}: refused"):
+        read_upstream(tmp_path / "p.pth")
+
+
+def test_damaged_files_are_named(tmp_path: Path, rng) -> None:  # type: ignore[no-untyped-def]
+    torch.save(FastDepth(Variant.PRUNED).state_dict(), tmp_path / "w.pt", _use_new_zipfile_serialization=False)
+    whole = (tmp_path / "w.pt").read_bytes()
+    for cut in (0, 1, 20, 3000, len(whole) // 2, len(whole) - 3):
+        (tmp_path / "cut.pt").write_bytes(whole[:cut])
+        with pytest.raises(WeightsError, match=r"cut\.pt"):
+            read_upstream(tmp_path / "cut.pt")
+    for _ in range(50):
+        (tmp_path / "noise.pt").write_bytes(rng.integers(0, 256, 200, dtype="uint8").tobytes())
+        with pytest.raises(WeightsError, match=r"noise\.pt"):
+            read_upstream(tmp_path / "noise.pt")
+
+
+def test_huge_claimed_storage_is_refused(tmp_path: Path) -> None:
+    program = pickle.dumps({"x": 1}, protocol=2)
+    program = b"\x80\x02(U\x07storagectorch\nFloatStorage\nU\x010U\x03cpuJ\xff\xff\xff\x7fNtQ."  # 2^31 - 1 floats
+    (tmp_path / "big.pth").write_bytes(program)
+    with pytest.raises(WeightsError, match="claims a tensor storage"):
+        read_upstream(tmp_path / "big.pth")
