@@ -1,0 +1,1 @@
+"""Telemetry and vision together: extended Kalman filter, metric scale, gravity (stage 2)."""

@@ -1,0 +1,112 @@
+"""Settings of the Kalman filter and of the metric scale; every number has its unit and its reason."""
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+_POSITIVE = (
+    "sigma_velocity_m_s",
+    "sigma_attitude_rad",
+    "buffer_s",
+    "interval_s",
+    "window_s",
+    "sigma_tof_m",
+    "sigma_h_m",
+    "sigma_baro_m",
+    "depth_bias_log",
+    "bias_knot_s",
+    "max_gap_s",
+)
+_NOT_NEGATIVE = (
+    "beta",
+    "lambda_tau",
+    "floor_position_m",
+    "floor_angle_rad",
+    "sigma_bias_m_s",
+    "bias_walk_m_s_sqrt_s",
+    "initial_sigma_position_m",
+    "initial_sigma_angle_rad",
+    "sigma_turn_rad_sqrt_s",
+    "literal_beta",
+    "systematic_log",
+    "min_speed_m_s",
+    "alignment_sigma_rad",
+)
+
+
+@dataclass(frozen=True, slots=True)
+class FusionConfig:
+    """Kalman filter, scale and delay."""
+
+    literal: bool = False
+    """Paper eqs. (8)-(14) as printed: no time step in Q, no wrap, no gate, absolute visual update."""
+    velocity_frame: Literal["world", "body"] = "world"
+    """Frame of ``TelemetrySample.velocity_m_s``: three real flights say the power-on world, paper eq. (9) says body."""
+
+    beta: float = 1.0
+    """Growth of the process noise with the spent battery, paper eq. (10)."""
+    lambda_tau: float = 0.5
+    """Growth of the process noise with the time since the last visual update [1/s], paper eq. (10)."""
+    literal_beta: float = 1e-3
+    """The paper's beta, which there has the units of the whole covariance (m^2 and rad^2)."""
+    sigma_velocity_m_s: float = 0.04
+    """Error of one velocity reading: 0.1 / sqrt(12) of quantisation, and as much again for the drone's own estimate."""
+    sigma_attitude_rad: float = math.radians(0.6)
+    """Error of one attitude reading: 1 deg / sqrt(12) of quantisation that repeats while the drone hovers."""
+    sigma_turn_rad_sqrt_s: float = 0.3
+    """Random walk of the angles between readings: the drone's own turning, which the state does not predict."""
+    sigma_bias_m_s: float = 0.05
+    """Velocity bias at the start (0 takes the bias out of the state: the paper's six states)."""
+    bias_walk_m_s_sqrt_s: float = 0.005
+    """Random walk of the velocity bias, before the battery factor."""
+    floor_position_m: float = 1e-4
+    """Least process noise of one step: keeps the covariance positive on a full battery."""
+    floor_angle_rad: float = 1e-4
+    initial_sigma_position_m: float = 0.0
+    initial_sigma_angle_rad: float = math.radians(1.0)
+    gate_probability: float = 0.95
+    """Innovations beyond this quantile of chi-square are refused."""
+    refusals_before_recovery: int = 5
+    """Refusals in a row after which the covariance is inflated and the measurement taken: the filter is wrong, not it."""
+    buffer_s: float = 3.0
+    """How far back a late measurement is still put in its place."""
+
+    delay_s: float | None = None
+    """Video delay behind telemetry [s]; ``None`` estimates it from the motion."""
+    delay_range_s: tuple[float, float] = (-0.2, 1.2)
+    """Range that is searched; a Tello's video is 0.3-0.8 s late."""
+    interval_s: float = 0.5
+    """Length of one displacement: long against the pose noise, short against a hand's or drone's swing."""
+    window_s: float = 120.0
+    """Displacements older than this are forgotten."""
+    max_gap_s: float = 0.35
+    """A longer hole in telemetry or tracking ends a displacement."""
+    bias_knot_s: float = 15.0
+    """Spacing of the piecewise-constant velocity bias in the scale fit."""
+    alignment_sigma_rad: float = math.radians(3.0)
+    """How far the attitude-derived rotation from map to power-on world may be corrected by displacements."""
+    min_speed_m_s: float = 0.06
+    """RMS metric speed below which an interval says nothing of scale (hover, turning on the spot)."""
+    systematic_log: float = 0.008
+    """Scale error of the drone's own velocity and range that no averaging removes."""
+    sigma_tof_m: float = 0.015
+    sigma_h_m: float = 0.06
+    """SDK ``h`` moves in steps of 10 cm."""
+    sigma_baro_m: float = 0.15
+    depth_bias_log: float = 0.09
+    """Error of the depth network that all keyframes of a scene share: it does not average out."""
+
+    def __post_init__(self) -> None:
+        for name in _POSITIVE:
+            _require(getattr(self, name) > 0, name, "positive", getattr(self, name))
+        for name in _NOT_NEGATIVE:
+            _require(getattr(self, name) >= 0, name, "at least 0", getattr(self, name))
+        _require(0.5 <= self.gate_probability < 1, "gate_probability", "in [0.5, 1)", self.gate_probability)
+        _require(self.refusals_before_recovery >= 1, "refusals_before_recovery", ">= 1", self.refusals_before_recovery)
+        _require(self.delay_range_s[0] < self.delay_range_s[1], "delay_range_s", "ascending", self.delay_range_s)
+        _require(self.velocity_frame in ("world", "body"), "velocity_frame", "world or body", self.velocity_frame)
+
+
+def _require(condition: bool, name: str, what: str, value: object) -> None:
+    if not condition:
+        raise ValueError(f"{name} must be {what}, got {value}")

@@ -1,0 +1,237 @@
+r"""Extended Kalman filter of the drone's position and attitude, paper eqs. (8)-(14).
+
+The state is :math:`x = (p, \alpha)`, position and roll-pitch-yaw in the power-on world, eq. (8); behind it lie a
+velocity bias and a clone of the pose at the last visual update, which relative visual measurements need.
+
+Note:
+    The printed filter and the corrected default differ in seven points (docs/decisions.md, "EKF");
+    ``FusionConfig.literal`` selects the printed one.
+"""
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from scipy.stats import chi2
+
+from edgeslam_torch.fusion.config import FusionConfig
+from edgeslam_torch.fusion.rotations import euler_rate_matrix, matrix_from_rpy, rotation_vector, wrapped
+from edgeslam_torch.types import FloatArray
+
+_P, _A, _B = slice(0, 3), slice(3, 6), slice(6, 9)
+_POSE, _CLONE = slice(0, 6), slice(9, 15)
+_SIZE = 15
+
+
+class Outcome(StrEnum):
+    """What became of one measurement."""
+
+    ACCEPTED = "accepted"
+    REFUSED = "refused"
+    RECOVERED = "recovered"
+    NO_CLONE = "no clone"
+    NOT_FINITE = "not finite"
+
+
+@dataclass(frozen=True, slots=True)
+class EkfState:
+    """Pose of the body in the power-on world with its covariance."""
+
+    stamp_s: float
+    p_w: FloatArray
+    """``(3,)`` position [m]."""
+    rpy_rad: FloatArray
+    """``(3,)`` roll, pitch, yaw."""
+    velocity_bias_m_s: FloatArray
+    """``(3,)``, in the frame of the velocity readings."""
+    covariance: FloatArray
+    """``(6, 6)`` of position [m] and angles [rad]."""
+
+    def nees(self, p_w: FloatArray, rpy_rad: FloatArray) -> float:
+        """Normalised estimation error squared against the truth; chi-square with 6 degrees when consistent."""
+        error = np.concatenate([self.p_w - p_w, wrapped(self.rpy_rad - rpy_rad)])
+        return float(error @ np.linalg.solve(self.covariance, error))
+
+
+class Ekf:
+    """The filter proper: it knows no clock and no buffer, see `BufferedEkf` for late measurements."""
+
+    def __init__(self, config: FusionConfig) -> None:
+        self.config = config
+        self.x = np.zeros(_SIZE)
+        self.P = np.zeros((_SIZE, _SIZE))
+        self.P[range(3), range(3)] = config.initial_sigma_position_m**2
+        self.P[range(3, 6), range(3, 6)] = config.initial_sigma_angle_rad**2
+        if config.sigma_bias_m_s > 0 and not config.literal:
+            self.P[range(6, 9), range(6, 9)] = config.sigma_bias_m_s**2
+        self.tau_s = 0.0
+        """Time since the last visual update, paper eq. (10)."""
+        self.refused_in_row = 0
+        self.nis = math.nan
+        """Normalised innovation squared of the last measurement."""
+        self._gate = {n: float(chi2.ppf(config.gate_probability, n)) for n in (3, 6)}
+        self._diagonal = np.arange(_SIZE)
+
+    def reset_pose(self, p_w: FloatArray, rpy_rad: FloatArray) -> None:
+        """Start at a known pose with the initial uncertainty."""
+        self.x[_P], self.x[_A] = p_w, rpy_rad
+        self.clone()
+
+    def predict(self, dt_s: float, velocity_m_s: FloatArray, battery: float = math.nan) -> None:
+        """Propagate by a velocity reading over ``dt_s``, paper eqs. (9)-(10); battery in [0, 1], NaN counts as full."""
+        self.tau_s += dt_s
+        spent = 1.0 - battery if battery == battery else 0.0
+        if self.config.literal:
+            self._predict_literal(dt_s, velocity_m_s, spent)
+            return
+        config, x, P = self.config, self.x, self.P
+        velocity = velocity_m_s - x[_B]
+        A = np.zeros((3, 6))
+        if config.velocity_frame == "body":
+            R = matrix_from_rpy(x[_A])
+            moved = R @ velocity
+            A[:, :3] = dt_s * _cross_columns(euler_rate_matrix(x[_A]), moved)
+            A[:, 3:] = -dt_s * R
+        else:
+            moved = velocity
+            A[0, 3] = A[1, 4] = A[2, 5] = -dt_s
+        x[_P] += dt_s * moved
+        P[_P] += A @ P[3:9]
+        P[:, _P] += P[:, 3:9] @ A.T
+        growth = 1.0 + config.beta * spent + config.lambda_tau * min(self.tau_s, 60.0)
+        noise = np.zeros(_SIZE)
+        # A reading stands for the 0.1 s around it: its error is constant over the reading, so dt * 0.1 s, not dt^2.
+        noise[_P] = dt_s * 0.1 * config.sigma_velocity_m_s**2 * growth + config.floor_position_m**2 * dt_s
+        noise[_A] = dt_s * config.sigma_turn_rad_sqrt_s**2 + config.floor_angle_rad**2 * dt_s
+        if config.sigma_bias_m_s > 0:
+            noise[_B] = dt_s * config.bias_walk_m_s_sqrt_s**2 * growth
+        P[self._diagonal, self._diagonal] += noise
+
+    def _predict_literal(self, dt_s: float, velocity_m_s: FloatArray, spent: float) -> None:
+        x, P, config = self.x, self.P, self.config
+        moved = velocity_m_s
+        if config.velocity_frame == "body":
+            R = matrix_from_rpy(x[_A])
+            moved = R @ velocity_m_s
+            A = dt_s * _cross_columns(euler_rate_matrix(x[_A]), moved)
+            P[_P] += A @ P[_A]
+            P[:, _P] += P[:, _A] @ A.T
+        x[_P] += dt_s * moved
+        noise = config.literal_beta * (spent + config.lambda_tau * self.tau_s)
+        P[self._diagonal[_POSE], self._diagonal[_POSE]] += noise
+
+    def update_attitude(self, rpy_rad: FloatArray, sigma_rad: float | None = None) -> Outcome:
+        """Euler angles from the drone, paper eqs. (11)-(12)."""
+        sigma = self.config.sigma_attitude_rad if sigma_rad is None else sigma_rad
+        residual = rpy_rad - self.x[_A]
+        if not self.config.literal:
+            residual = wrapped(residual)
+        H = np.zeros((3, _SIZE))
+        H[0, 3] = H[1, 4] = H[2, 5] = 1.0
+        return self._update(H, residual, np.full(3, sigma**2))
+
+    def update_absolute(self, p_w: FloatArray, rpy_rad: FloatArray, sigma_t_m: float, sigma_r_rad: float) -> Outcome:
+        """Accumulated visual pose as a full-state measurement, paper eqs. (13)-(14)."""
+        residual = np.concatenate([p_w - self.x[_P], rpy_rad - self.x[_A]])
+        if not self.config.literal:
+            residual[3:] = wrapped(residual[3:])
+        H = np.zeros((6, _SIZE))
+        H[:, _POSE] = np.eye(6)
+        outcome = self._update(H, residual, _pose_noise(sigma_t_m, sigma_r_rad))
+        self._after_visual(outcome)
+        return outcome
+
+    def clone(self) -> None:
+        """Remember the present pose as the one the next relative measurement starts from."""
+        self.x[_CLONE] = self.x[_POSE]
+        self.P[_CLONE] = self.P[_POSE]
+        self.P[:, _CLONE] = self.P[:, _POSE]
+
+    def update_relative(self, T_clone_b: FloatArray, sigma_t_m: float, sigma_r_rad: float) -> Outcome:
+        r"""Visual motion since the clone, :math:`\Delta T_{rel}` of paper eq. (13), as a measurement of both poses.
+
+        Args:
+            T_clone_b: Body pose in the cloned body frame [m], shape ``(4, 4)``.
+            sigma_t_m: Standard deviation of its translation [m], per axis.
+            sigma_r_rad: Standard deviation of its rotation [rad], per axis.
+        """
+        x = self.x
+        R_c, R = matrix_from_rpy(x[12:15]), matrix_from_rpy(x[_A])
+        step = x[_P] - x[9:12]
+        predicted_t = R_c.T @ step
+        residual = np.empty(6)
+        residual[:3] = T_clone_b[:3, 3] - predicted_t
+        residual[3:] = rotation_vector(T_clone_b[:3, :3] @ R.T @ R_c)
+        E_c = euler_rate_matrix(x[12:15])
+        H = np.zeros((6, _SIZE))
+        H[:3, _P] = R_c.T
+        H[:3, 9:12] = -R_c.T
+        H[:3, 12:15] = -R_c.T @ _cross_columns(E_c, step)
+        H[3:, _A] = R_c.T @ euler_rate_matrix(x[_A])
+        H[3:, 12:15] = -R_c.T @ E_c
+        outcome = self._update(H, residual, _pose_noise(sigma_t_m, sigma_r_rad))
+        self._after_visual(outcome)
+        return outcome
+
+    def _after_visual(self, outcome: Outcome) -> None:
+        if outcome in (Outcome.ACCEPTED, Outcome.RECOVERED):
+            self.tau_s = 0.0
+
+    def _update(self, H: FloatArray, residual: FloatArray, noise: FloatArray) -> Outcome:
+        if not math.isfinite(float(residual.sum())):
+            return Outcome.NOT_FINITE
+        P_Ht = self.P @ H.T
+        n = len(residual)
+        S = H @ P_Ht
+        S[range(n), range(n)] += noise
+        S_inverse = np.linalg.inv(S)
+        self.nis = float(residual @ S_inverse @ residual)
+        outcome = Outcome.ACCEPTED
+        if not self.config.literal and self.nis > self._gate[n]:
+            self.refused_in_row += 1
+            if self.refused_in_row < self.config.refusals_before_recovery:
+                return Outcome.REFUSED
+            outcome = Outcome.RECOVERED
+            # The filter has been sure of the wrong thing: believe it less, by what the innovation says.
+            factor = min(self.nis / n, 1e4)
+            self.P *= factor
+            P_Ht *= factor
+            S *= factor
+            S[range(n), range(n)] += (1.0 - factor) * noise
+            S_inverse = np.linalg.inv(S)
+        self.refused_in_row = 0
+        K = P_Ht @ S_inverse
+        self.x += K @ residual
+        self.P -= K @ P_Ht.T
+        self.P = 0.5 * (self.P + self.P.T)
+        if not self.config.literal:
+            self.x[_A] = wrapped(self.x[_A])
+            self.x[12:15] = wrapped(self.x[12:15])
+        return outcome
+
+    def state(self, stamp_s: float) -> EkfState:
+        """Snapshot of the pose and its covariance."""
+        x = self.x
+        return EkfState(stamp_s, x[_P].copy(), x[_A].copy(), x[_B].copy(), self.P[_POSE, _POSE].copy())
+
+    def copy_state(self) -> tuple[FloatArray, FloatArray, float, int]:
+        """Everything that changes, for a later `restore`."""
+        return self.x.copy(), self.P.copy(), self.tau_s, self.refused_in_row
+
+    def restore(self, saved: tuple[FloatArray, FloatArray, float, int]) -> None:
+        """Go back to what `copy_state` returned."""
+        self.x, self.P = saved[0].copy(), saved[1].copy()
+        self.tau_s, self.refused_in_row = saved[2], saved[3]
+
+
+def _pose_noise(sigma_t_m: float, sigma_r_rad: float) -> FloatArray:
+    noise = np.empty(6)
+    noise[:3], noise[3:] = sigma_t_m**2, sigma_r_rad**2
+    return noise
+
+
+def _cross_columns(E: FloatArray, v: FloatArray) -> FloatArray:
+    """Columns ``E[:, k] x v``: how ``v`` turns with each Euler angle, shape ``(3, 3)``."""
+    x, y, z = float(v[0]), float(v[1]), float(v[2])
+    return np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]) @ E

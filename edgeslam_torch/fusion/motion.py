@@ -1,0 +1,501 @@
+"""What telemetry knows about the map: metric scale, gravity, video delay, and where the camera is without vision."""
+
+import math
+from collections import Counter, deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from edgeslam_torch.fusion.config import FusionConfig
+from edgeslam_torch.fusion.delayed import BufferedEkf
+from edgeslam_torch.fusion.ekf import EkfState
+from edgeslam_torch.fusion.rotations import mean_rotation, rotation_vector
+from edgeslam_torch.fusion.scale import (
+    DepthRatio,
+    DisplacementFit,
+    LogScale,
+    fit_displacements,
+    fit_height,
+    floor_segments,
+    fuse,
+)
+from edgeslam_torch.fusion.track import TelemetryTrack
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.types import FloatArray, ScaleEstimate, TelemetrySample
+
+_DELAY_GUESS_S = 0.3
+"""Used until the motion says better; the short end of what Tello owners measure."""
+_REFIT_S = 1.0
+_DELAY_STEP_S = 0.05
+_MIN_DELAY_INTERVALS = 12
+_VISUAL_REACH_S = 0.15
+"""The last visual velocity predicts better than 10 Hz readings of 0.1 m/s up to about here."""
+_VISUAL_LIMIT_S = 0.5
+"""Without telemetry, the camera is held where constant velocity puts it after this time."""
+_HEIGHT_SOURCES = {"tof": "sigma_tof_m", "h": "sigma_h_m", "baro": "sigma_baro_m"}
+
+
+@dataclass(frozen=True, slots=True)
+class PoseEstimate:
+    """Predicted camera pose in the map's own gauge."""
+
+    stamp_s: float
+    T_w_c: FloatArray
+    """``(4, 4)``, map units."""
+    sigma_t: float
+    """Standard deviation of the translation per axis [map units]."""
+    sigma_r_rad: float
+    source: str
+    """``visual``, ``telemetry`` or ``visual+telemetry``."""
+
+
+@dataclass(slots=True)
+class _Visual:
+    stamp_s: float
+    T: FloatArray
+    sigma_t: float
+    sigma_r_rad: float
+
+
+@dataclass(slots=True)
+class _Interval:
+    """One visual displacement, kept until telemetry of the same time is there."""
+
+    from_s: float
+    to_s: float
+    T_from: FloatArray
+    T_to: FloatArray
+    sigma: float
+
+
+class MotionFusion:
+    """Ties the visual map to the drone's telemetry; `EdgeSlam` calls it for every frame and every packet.
+
+    The map may be in any gauge: ``T_w_c`` in arbitrary units and axes, as long as they stay the same until `rescale`
+    (or `reset_map`). A frame stamped ``t`` shows what telemetry reported at ``t - delay``.
+
+    Args:
+        config: Settings.
+        T_b_c: Camera in the body frame ``(4, 4)`` [m]; for a Tello tilted down by some 12 degrees.
+    """
+
+    def __init__(self, config: FusionConfig, T_b_c: FloatArray) -> None:
+        self.config = config
+        self.T_b_c = np.asarray(T_b_c, dtype=np.float64)
+        self._track = TelemetryTrack(config.velocity_frame, config.max_gap_s)
+        self._intervals: deque[_Interval] = deque(maxlen=max(20, int(config.window_s / config.interval_s)))
+        self._sightings: deque[_Visual] = deque(maxlen=int(10 * config.window_s))
+        """Tracked poses at some 10 Hz, for height and attitude."""
+        self._start: _Visual | None = None
+        self._previous: _Visual | None = None
+        self._last: _Visual | None = None
+        self._depth = DepthRatio(config.depth_bias_log)
+        self._ekf = BufferedEkf(config)
+        self._ekf_delay: float | None = None
+        self._delay_s = _DELAY_GUESS_S if config.delay_s is None else config.delay_s
+        self._delay_sigma_s = math.inf if config.delay_s is None else 0.0
+        self._delay_tried_at = 0
+        self._R_w_m: FloatArray | None = None
+        self._fit: DisplacementFit | None = None
+        self._telemetry_opinions: list[LogScale] = []
+        self._fitted_s = -math.inf
+        self._counts: Counter[str] = Counter()
+
+    # --- input ---------------------------------------------------------------------------------------------------
+
+    def add_telemetry(self, samples: Sequence[TelemetrySample]) -> None:
+        """State messages in the order of arrival."""
+        for sample in self._track.add(samples):
+            self._ekf.add_telemetry(sample)
+
+    def add_visual(
+        self, stamp_s: float, T_w_c: FloatArray, sigma_t: float, sigma_r_rad: float, tracked: bool = True
+    ) -> None:
+        """Pose of one frame in the map.
+
+        Args:
+            stamp_s: Stamp of the frame.
+            T_w_c: Camera to map ``(4, 4)`` [map units].
+            sigma_t: Standard deviation of its translation per axis [map units].
+            sigma_r_rad: Standard deviation of its rotation per axis.
+            tracked: False when the pose does not rest on this frame's image (predicted, lost): it is then no evidence.
+        """
+        if not tracked or not np.isfinite(T_w_c).all():
+            self._start = None
+            self._previous = None
+            self._counts["visual not tracked"] += 1
+            return
+        if self._last is not None and stamp_s <= self._last.stamp_s:
+            self._counts["visual out of order"] += 1
+            return
+        visual = _Visual(stamp_s, np.array(T_w_c, dtype=np.float64), sigma_t, sigma_r_rad)
+        gap = self._last is None or stamp_s - self._last.stamp_s > self.config.max_gap_s
+        if gap:
+            self._start = None
+        self._previous = None if gap else self._last
+        self._last = visual
+        if not self._sightings or stamp_s - self._sightings[-1].stamp_s > 0.09:
+            self._sightings.append(visual)
+        self._extend_interval(visual)
+        self._feed_filter(visual)
+
+    def _extend_interval(self, visual: _Visual) -> None:
+        start = self._start
+        if start is None:
+            self._start = visual
+        elif visual.stamp_s - start.stamp_s >= self.config.interval_s - 1e-3:
+            sigma = math.hypot(start.sigma_t, visual.sigma_t)
+            self._intervals.append(_Interval(start.stamp_s, visual.stamp_s, start.T, visual.T, sigma))
+            self._start = visual
+
+    def add_depth_ratio(self, log_ratio: float, sigma_log: float) -> None:
+        """One keyframe's log of (network depth [m] / map depth) on its anchors."""
+        self._depth.add(log_ratio, sigma_log)
+
+    def rescale(self, factor: float, about: FloatArray | None = None) -> None:
+        """The map was scaled: ``p' = about + factor (p - about)``; everything remembered follows."""
+        if not (math.isfinite(factor) and factor > 0):
+            raise ValueError(f"factor must be positive, got {factor}")
+        centre = np.zeros(3) if about is None else np.asarray(about, dtype=np.float64)
+        seen: set[int] = set()
+        poses = [v for v in (*self._sightings, self._start, self._previous, self._last) if v is not None]
+        for visual in poses:
+            if id(visual) not in seen:
+                seen.add(id(visual))
+                visual.T = _scaled(visual.T, factor, centre)
+                visual.sigma_t *= factor
+        for interval in self._intervals:
+            interval.T_from = _scaled(interval.T_from, factor, centre)
+            interval.T_to = _scaled(interval.T_to, factor, centre)
+            interval.sigma *= factor
+        self._depth.rescale(factor)
+        shift = math.log(factor)
+        self._telemetry_opinions = [LogScale(o.log_scale - shift, o.sigma, o.source) for o in self._telemetry_opinions]
+
+    def reset_map(self) -> None:
+        """A new map in a new gauge: visual memory and scale are forgotten, telemetry and delay are kept."""
+        self._intervals.clear()
+        self._sightings.clear()
+        self._start = self._previous = self._last = None
+        self._depth = DepthRatio(self.config.depth_bias_log)
+        self._telemetry_opinions = []
+        self._R_w_m, self._fit, self._fitted_s, self._ekf_delay = None, None, -math.inf, None
+
+    # --- output --------------------------------------------------------------------------------------------------
+
+    @property
+    def delay_s(self) -> float:
+        """Video delay behind telemetry [s]: configured, estimated, or the guess while nothing is known."""
+        return self._delay_s
+
+    @property
+    def delay_sigma_s(self) -> float:
+        """Standard deviation of `delay_s`; infinite while it is a guess, 0 when configured."""
+        return self._delay_sigma_s
+
+    def scale(self) -> ScaleEstimate:
+        """Metres per map unit with sigma and source; held while the motion says nothing new."""
+        self._refit()
+        opinions = list(self._telemetry_opinions)
+        depth = self._depth.estimate()
+        if depth is not None:
+            opinions.append(depth)
+        return fuse(opinions)
+
+    def gravity(self) -> FloatArray | None:
+        """Unit vector ``(3,)`` that points up, in the map frame; ``None`` without telemetry attitude."""
+        R = self.rotation()
+        return None if R is None else R.T @ np.array([0.0, 0.0, 1.0])
+
+    def rotation(self) -> FloatArray | None:
+        """``R_w_m`` ``(3, 3)``: map axes to the drone's power-on world; ``None`` without telemetry attitude."""
+        self._refit()
+        return self._R_w_m
+
+    def filter_state(self, stamp_s: float | None = None) -> EkfState | None:
+        """The Kalman filter's body pose in the power-on world, on the telemetry clock."""
+        stamp = self._ekf.stamp_s if stamp_s is None else stamp_s
+        return None if stamp is None else self._ekf.state_at(stamp)
+
+    def predict(self, stamp_s: float) -> PoseEstimate | None:
+        """Camera pose at a frame's stamp from the last visual pose, visual velocity and telemetry.
+
+        Returns:
+            The estimate in map units, or ``None`` before the first tracked frame.
+        """
+        last = self._last
+        if last is None:
+            return None
+        gap = stamp_s - last.stamp_s
+        visual = self._predict_visual(last, gap)
+        telemetry = self._predict_telemetry(last, stamp_s)
+        if telemetry is None or gap <= 0:
+            return visual
+        share = float(np.clip((gap - _VISUAL_REACH_S) / _VISUAL_REACH_S, 0.0, 1.0))
+        if self._previous is None:
+            share = 1.0
+        if share <= 0.0:
+            return visual
+        if share >= 1.0:
+            return telemetry
+        T = se3.exp(share * se3.log(telemetry.T_w_c @ se3.inverse(visual.T_w_c))) @ visual.T_w_c
+        sigma_t = (1 - share) * visual.sigma_t + share * telemetry.sigma_t
+        sigma_r = (1 - share) * visual.sigma_r_rad + share * telemetry.sigma_r_rad
+        return PoseEstimate(stamp_s, T, sigma_t, sigma_r, "visual+telemetry")
+
+    def _predict_visual(self, last: _Visual, gap: float) -> PoseEstimate:
+        T = last.T.copy()
+        speed = turn = 0.0
+        if self._previous is not None:
+            dt = last.stamp_s - self._previous.stamp_s
+            reach = min(gap, _VISUAL_LIMIT_S) / dt
+            v = (last.T[:3, 3] - self._previous.T[:3, 3]) * reach
+            increment = rotation_vector(self._previous.T[:3, :3].T @ last.T[:3, :3]) * reach
+            T[:3, 3] += v
+            T[:3, :3] = T[:3, :3] @ se3.exp(np.concatenate([np.zeros(3), increment]))[:3, :3]
+            speed, turn = float(np.linalg.norm(v)), float(np.linalg.norm(increment))
+        growth = max(0.0, gap) / _VISUAL_REACH_S
+        sigma_t = last.sigma_t + growth * max(speed, last.sigma_t)
+        return PoseEstimate(last.stamp_s + gap, T, sigma_t, last.sigma_r_rad + growth * max(turn, 0.005), "visual")
+
+    def _predict_telemetry(self, last: _Visual, stamp_s: float) -> PoseEstimate | None:
+        if len(self._track) < 2:
+            return None
+        times = np.array([last.stamp_s, stamp_s]) - self._delay_s
+        # Telemetry runs ahead of a late video; one packet of extrapolation is allowed.
+        if times[1] > self._track.last_s + 0.15 or not self._track.covered(times[:1], times[1:] - 0.3)[0]:
+            return None
+        estimate = self.scale()
+        R_w_b = self._track.attitude(times)
+        R_c_b = self.T_b_c[:3, :3].T
+        T = last.T.copy()
+        T[:3, :3] = last.T[:3, :3] @ R_c_b @ R_w_b[0].T @ R_w_b[1] @ R_c_b.T
+        gap = float(times[1] - times[0])
+        if self._R_w_m is None or not math.isfinite(estimate.sigma):
+            return PoseEstimate(stamp_s, T, math.inf, 0.01 + 0.01 * gap, "telemetry")
+        moved = np.diff(self._track.displacement(times), axis=0)[0]
+        if self._fit is not None:
+            moved = moved - self._fit.bias_m_s[-1] * gap
+        moved = moved + (R_w_b[1] - R_w_b[0]) @ self.T_b_c[:3, 3]
+        T[:3, 3] = last.T[:3, 3] + self._R_w_m.T @ moved / estimate.value
+        walk = self.config.sigma_velocity_m_s * math.sqrt(0.1 * gap) + 0.02 * gap
+        sigma_m = math.hypot(walk, float(np.linalg.norm(moved)) * estimate.sigma / estimate.value)
+        return PoseEstimate(
+            stamp_s, T, last.sigma_t + sigma_m / estimate.value, math.radians(0.5) + 0.002 * gap, "telemetry"
+        )
+
+    def statistics(self) -> dict[str, float]:
+        """Counters and the state of the estimates, for the report."""
+        numbers: dict[str, float] = dict(self._counts)
+        numbers.update({f"ekf {k}": v for k, v in self._ekf.statistics().items()})
+        numbers["telemetry samples"] = len(self._track)
+        numbers["telemetry refused"] = self._track.refused
+        numbers["displacements"] = len(self._intervals)
+        numbers["video delay s"] = self._delay_s
+        numbers["video delay sigma s"] = self._delay_sigma_s
+        if self._fit is not None:
+            numbers["displacement residual m"] = self._fit.rms_m
+        for opinion in [*self._telemetry_opinions, *filter(None, [self._depth.estimate()])]:
+            numbers[f"scale {opinion.source}"] = math.exp(opinion.log_scale)
+            numbers[f"scale {opinion.source} sigma"] = math.exp(opinion.log_scale) * opinion.sigma
+        return numbers
+
+    # --- estimation ----------------------------------------------------------------------------------------------
+
+    def _refit(self) -> None:
+        """Alignment, delay and scale from what is remembered, at most once per second of frames."""
+        last = self._last
+        if last is None or len(self._track) == 0:
+            return
+        if self._R_w_m is not None and last.stamp_s - self._fitted_s < _REFIT_S:
+            return
+        self._fitted_s = last.stamp_s
+        if self._R_w_m is None:
+            self._R_w_m = self._attitude_alignment(self._delay_s)
+        if self.config.delay_s is None:
+            self._estimate_delay()
+        R = self._attitude_alignment(self._delay_s)
+        if R is None:
+            return
+        self._R_w_m = R
+        fit = self._fit_at(self._delay_s, R)
+        if fit is None:
+            return  # nothing new to say: hover, pure rotation, or telemetry missing
+        opinions = []
+        self._fit, self._R_w_m = fit, fit.rotation @ R
+        if fit.sigma < 0.3:
+            sigma = math.hypot(fit.sigma, self.config.systematic_log)
+            opinions.append(LogScale(fit.log_scale, sigma, "telemetry"))
+        opinions += self._height_opinions(math.exp(fit.log_scale))
+        if opinions:
+            self._telemetry_opinions = opinions
+
+    def _attitude_alignment(self, delay_s: float) -> FloatArray | None:
+        """Mean of ``R_w_b(telemetry) R_b_c R_m_c^T`` over the remembered poses."""
+        if not np.isfinite(self._track.attitude(np.array([0.0]))).all():
+            return None
+        stamps = np.array([v.stamp_s for v in self._sightings]) - delay_s
+        inside = self._track.covered(stamps, stamps)
+        if not inside.any():
+            return None
+        R_m_c = np.array([v.T[:3, :3] for v in self._sightings])[inside]
+        R_w_b = self._track.attitude(stamps[inside])
+        return mean_rotation(R_w_b @ self.T_b_c[:3, :3] @ np.swapaxes(R_m_c, 1, 2))
+
+    def _fit_at(self, delay_s: float, R_w_m: FloatArray, only: FloatArray | None = None) -> DisplacementFit | None:
+        """Displacement fit for a delay; ``only`` picks intervals, so that delays compare on the same ones."""
+        if len(self._intervals) == 0:
+            return None
+        from_s, to_s, moved, sigma = self._visual_displacements()
+        use = self._track.covered(from_s - delay_s, to_s - delay_s) if only is None else only
+        if use.sum() < 2:
+            return None
+        from_s, to_s, moved, sigma = from_s[use] - delay_s, to_s[use] - delay_s, moved[use], sigma[use]
+        lever = self.T_b_c[:3, 3]
+        R_from, R_to = self._track.attitude(from_s), self._track.attitude(to_s)
+        moved_m = self._track.displacement(to_s) - self._track.displacement(from_s) + (R_to - R_from) @ lever
+        moving = self._moving(moved, to_s - from_s, moved_m)
+        if moving.sum() < 2:
+            return None
+        duration = (to_s - from_s)[moving]
+        sigma_m = self.config.sigma_velocity_m_s * np.sqrt(0.1 * duration)
+        block = ((from_s[moving] - from_s[moving][0]) // self.config.bias_knot_s).astype(int)
+        block = np.unique(block, return_inverse=True)[1]
+        return fit_displacements(
+            moved[moving] @ R_w_m.T,
+            moved_m[moving],
+            duration,
+            sigma[moving],
+            sigma_m,
+            block,
+            self.config.alignment_sigma_rad,
+            self.config.sigma_bias_m_s,
+        )
+
+    def _moving(self, moved_map: FloatArray, duration_s: FloatArray, moved_m: FloatArray) -> FloatArray:
+        """Intervals fast enough to speak of scale, judged by vision once the scale is roughly known."""
+        if self._fit is not None:
+            speed = np.linalg.norm(moved_map, axis=1) * math.exp(self._fit_log_scale()) / duration_s
+        else:
+            speed = np.linalg.norm(moved_m, axis=1) / duration_s
+        return speed > self.config.min_speed_m_s
+
+    def _fit_log_scale(self) -> float:
+        for opinion in self._telemetry_opinions:
+            return opinion.log_scale
+        assert self._fit is not None
+        return self._fit.log_scale
+
+    def _visual_displacements(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        from_s = np.array([i.from_s for i in self._intervals])
+        to_s = np.array([i.to_s for i in self._intervals])
+        moved = np.array([i.T_to[:3, 3] - i.T_from[:3, 3] for i in self._intervals])
+        return from_s, to_s, moved, np.array([i.sigma for i in self._intervals])
+
+    def _height_opinions(self, rough_scale: float) -> list[LogScale]:
+        """At most one opinion: the best of range, SDK height and barometer (they watch the same motion)."""
+        assert self._R_w_m is not None
+        stamps = np.array([v.stamp_s for v in self._sightings]) - self._delay_s
+        p_m = np.array([v.T[:3, 3] for v in self._sightings])
+        up = p_m @ (self._R_w_m.T @ np.array([0.0, 0.0, 1.0]))
+        sigma_map = float(np.median([v.sigma_t for v in self._sightings]))
+        best: LogScale | None = None
+        for name, (times, z) in self._track.heights().items():
+            if len(times) < 2:
+                continue
+            here = (stamps >= times[0]) & (stamps <= times[-1])
+            near = np.clip(np.searchsorted(times, stamps), 1, len(times) - 1)
+            here &= times[near] - times[near - 1] < self.config.max_gap_s
+            if not here.any():
+                continue
+            sigma = getattr(self.config, _HEIGHT_SOURCES[name])
+            z_m = np.interp(stamps[here], times, z)
+            segment = floor_segments(stamps[here], z_m, rough_scale * up[here], step_m=max(0.08, 4.0 * sigma))
+            opinion = fit_height(up[here], z_m, segment, sigma_map, sigma)
+            if opinion is not None and (best is None or opinion.sigma < best.sigma):
+                best = opinion
+        if best is None:
+            return []
+        return [LogScale(best.log_scale, math.hypot(best.sigma, self.config.systematic_log), best.source)]
+
+    def _estimate_delay(self) -> None:
+        """Delay at which visual and telemetry displacements and turns agree best; refined as evidence grows."""
+        n = len(self._intervals)
+        if n < _MIN_DELAY_INTERVALS or n < 1.3 * self._delay_tried_at:
+            return
+        self._delay_tried_at = n
+        low, high = self.config.delay_range_s
+        from_s, to_s, *_ = self._visual_displacements()
+        common = self._track.covered(from_s - high, to_s - low)
+        if common.sum() < _MIN_DELAY_INTERVALS:
+            return
+        delays = np.arange(low, high + 1e-9, _DELAY_STEP_S)
+        cost = np.array([self._delay_cost(d, common) for d in delays])
+        best = int(np.argmin(cost))
+        if not math.isfinite(cost[best]) or best in (0, len(delays) - 1):
+            return
+        around = cost[best - 1 : best + 2]
+        curvature = float(around[0] - 2.0 * around[1] + around[2]) / _DELAY_STEP_S**2
+        if curvature <= 0:
+            return
+        offset = 0.5 * float(around[0] - around[2]) / (curvature * _DELAY_STEP_S**2)
+        sigma = math.sqrt(1.0 / curvature)
+        far = np.abs(delays - delays[best]) > 0.15
+        if sigma > 0.05 or float(np.min(cost[far])) - cost[best] < 6.0:  # a second valley as good as this one
+            return
+        self._delay_s = float(np.clip(delays[best] + offset * _DELAY_STEP_S, low, high))
+        self._delay_sigma_s = math.hypot(sigma, 0.005)
+
+    def _delay_cost(self, delay_s: float, only: FloatArray) -> float:
+        """Misfit of displacements (log-likelihood with the residual's own spread) and of rotations."""
+        R = self._attitude_alignment(delay_s)
+        if R is None:
+            return math.inf
+        from_s, to_s, moved, _ = self._visual_displacements()
+        from_s, to_s, moved = from_s[only] - delay_s, to_s[only] - delay_s, moved[only] @ R.T
+        moved_m = self._track.displacement(to_s) - self._track.displacement(from_s)
+        centred = moved_m - moved_m.mean(axis=0), moved - moved.mean(axis=0)
+        scale = float(np.sum(centred[0] * centred[1]) / max(float(np.sum(centred[1] ** 2)), 1e-30))
+        residual = centred[0] - max(scale, 0.0) * centred[1]
+        power = np.sort(np.sum(residual**2, axis=1))[: max(3, int(0.9 * len(residual)))]
+        sigma = self.config.sigma_velocity_m_s * math.sqrt(0.1 * self.config.interval_s)
+        cost = 1.5 * len(residual) * math.log(float(power.mean()) / 3.0 + 0.25 * sigma**2)
+        return cost + self._turn_cost(from_s, to_s, only)
+
+    def _turn_cost(self, from_s: FloatArray, to_s: FloatArray, only: FloatArray) -> float:
+        R_from = np.array([i.T_from[:3, :3] for i in self._intervals])[only]
+        R_to = np.array([i.T_to[:3, :3] for i in self._intervals])[only]
+        R_b_c = self.T_b_c[:3, :3]
+        seen = R_b_c @ np.swapaxes(R_from, 1, 2) @ R_to @ R_b_c.T
+        told = np.swapaxes(self._track.attitude(from_s), 1, 2) @ self._track.attitude(to_s)
+        trace = np.einsum("nij,nij->n", seen, told)
+        angle = np.sort(np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0)))[: max(3, int(0.9 * len(trace)))]
+        floor = (0.5 * self.config.sigma_attitude_rad) ** 2
+        return 1.5 * len(trace) * math.log(float(np.mean(angle**2)) / 3.0 + floor)
+
+    def _feed_filter(self, visual: _Visual) -> None:
+        """Visual increments to the Kalman filter once they are metric."""
+        if self._previous is None or not math.isfinite(self._delay_sigma_s):
+            return
+        estimate = self.scale()
+        if not estimate.sigma < 0.1 * estimate.value or not self._telemetry_opinions:
+            return
+        if self._ekf_delay is None or abs(self._ekf_delay - self._delay_s) > 0.1:
+            self._ekf_delay = self._delay_s
+        previous = self._previous
+        T_c = se3.inverse(previous.T) @ visual.T
+        moved = float(np.linalg.norm(T_c[:3, 3])) * estimate.value
+        T_c[:3, 3] *= estimate.value
+        T_b = self.T_b_c @ T_c @ se3.inverse(self.T_b_c)
+        sigma_t = math.sqrt(2.0) * visual.sigma_t * estimate.value
+        sigma_t = math.hypot(max(sigma_t, 1e-4), moved * estimate.sigma / estimate.value)
+        sigma_r = max(math.sqrt(2.0) * visual.sigma_r_rad, 1e-4)
+        delay = self._ekf_delay
+        self._ekf.add_relative(previous.stamp_s - delay, visual.stamp_s - delay, T_b, sigma_t, sigma_r)
+
+
+def _scaled(T: FloatArray, factor: float, centre: FloatArray) -> FloatArray:
+    out = T.copy()
+    out[:3, 3] = centre + factor * (T[:3, 3] - centre)
+    return out

@@ -1,0 +1,131 @@
+"""The drone's telemetry as a continuous track: integrated displacement and attitude at any time."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from edgeslam_torch.fusion.rotations import matrix_from_rpy
+from edgeslam_torch.types import FloatArray, TelemetrySample
+
+_FROZEN_S = 1.5
+"""Velocity and attitude repeated to the bit for so long, while anything but zero: the link repeats its last packet."""
+
+
+class TelemetryTrack:
+    """Growing arrays of telemetry with displacement and attitude interpolated between readings."""
+
+    def __init__(self, velocity_frame: str, max_gap_s: float, keep_s: float = 900.0) -> None:
+        self._body = velocity_frame == "body"
+        self._max_gap_s, self._keep_s = max_gap_s, keep_s
+        self._rows: list[FloatArray] = []
+        self._table: FloatArray | None = None
+        self.refused = 0
+        """Samples left out because they were not newer than the last one or held neither velocity nor attitude."""
+
+    def add(self, samples: Sequence[TelemetrySample]) -> list[TelemetrySample]:
+        """Append samples; returns those that were used."""
+        used = []
+        for sample in samples:
+            last = self._rows[-1][0] if self._rows else -math.inf
+            known = np.isfinite(sample.velocity_m_s).all() or np.isfinite(sample.rpy_rad).all()
+            if not (math.isfinite(sample.stamp_s) and sample.stamp_s > last and known):
+                self.refused += 1
+                continue
+            heights = [sample.tof_m, sample.height_m, sample.baro_m]
+            self._rows.append(np.concatenate([[sample.stamp_s], sample.velocity_m_s, sample.rpy_rad, heights]))
+            used.append(sample)
+        if used:
+            self._table = None
+            while self._rows[-1][0] - self._rows[0][0] > self._keep_s:
+                del self._rows[: max(1, len(self._rows) // 10)]
+        return used
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    @property
+    def last_s(self) -> float:
+        """Stamp of the newest sample, minus infinity before the first."""
+        return float(self._rows[-1][0]) if self._rows else -math.inf
+
+    def _tables(self) -> FloatArray:
+        if self._table is None:
+            self._table = self._build()
+        return self._table
+
+    def _build(self) -> FloatArray:
+        """Columns: stamp, displacement 3, unwrapped rpy 3, tof, h, baro, valid."""
+        rows = np.array(self._rows)
+        stamp, velocity = rows[:, 0], _filled(rows[:, 1:4])
+        rpy = np.unwrap(_filled(rows[:, 4:7]), axis=0)
+        if self._body:
+            velocity = np.einsum("nij,nj->ni", Rotation.from_euler("ZYX", rpy[:, ::-1]).as_matrix(), velocity)
+        valid = np.isfinite(rows[:, 1:4]).all(axis=1) & ~_frozen(stamp, rows[:, 1:7])
+        steps = 0.5 * (velocity[1:] + velocity[:-1]) * np.diff(stamp)[:, None]
+        moved = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+        return np.column_stack([stamp, moved, rpy, rows[:, 7:10], valid])
+
+    def displacement(self, stamps_s: FloatArray) -> FloatArray:
+        """Integrated velocity [m] in the power-on world, shape ``(N, 3)``; only differences mean anything."""
+        table = self._tables()
+        return np.stack([np.interp(stamps_s, table[:, 0], table[:, 1 + i]) for i in range(3)], axis=-1)
+
+    def attitude(self, stamps_s: FloatArray) -> FloatArray:
+        """Body to power-on world ``(N, 3, 3)``."""
+        table = self._tables()
+        rpy = np.stack([np.interp(stamps_s, table[:, 0], table[:, 4 + i]) for i in range(3)], axis=-1)
+        if len(rpy) == 1:
+            return matrix_from_rpy(rpy[0])[None]
+        return Rotation.from_euler("ZYX", rpy[:, ::-1]).as_matrix()
+
+    def covered(self, from_s: FloatArray, to_s: FloatArray) -> FloatArray:
+        """Whether each interval lies within readings without a hole, a frozen stretch or a missing velocity."""
+        if len(self._rows) < 2:
+            return np.zeros(len(from_s), dtype=bool)
+        table = self._tables()
+        stamp = table[:, 0]
+        bad = (np.diff(stamp) > self._max_gap_s) | (table[1:, 10] == 0) | (table[:-1, 10] == 0)
+        count = np.concatenate([[0], np.cumsum(bad)])  # holes before each reading
+        first = np.searchsorted(stamp, from_s, side="right") - 1
+        last = np.searchsorted(stamp, to_s, side="left")
+        inside = (first >= 0) & (last < len(stamp))
+        first, last = np.clip(first, 0, len(stamp) - 1), np.clip(last, 0, len(stamp) - 1)
+        return inside & (count[last] == count[first])
+
+    def heights(self) -> dict[str, tuple[FloatArray, FloatArray]]:
+        """Readings of each height source: name to (stamps, metres above floor or take-off, plumb)."""
+        if not self._rows:
+            return {}
+        table = self._tables()
+        plumb = np.cos(table[:, 4]) * np.cos(table[:, 5])
+        plumb = np.where(np.isfinite(plumb), plumb, 1.0)
+        sources = {}
+        for column, name in ((7, "tof"), (8, "h"), (9, "baro")):
+            z = table[:, column] * (plumb if name == "tof" else 1.0)
+            # A Tello prints 10 cm on the ground and 65.53 m beyond its range.
+            good = np.isfinite(z) & ((z > 0.12) & (z < 8.0) if name == "tof" else True)
+            if good.any():
+                sources[name] = (table[good, 0], z[good])
+        return sources
+
+
+def _filled(rows: FloatArray) -> FloatArray:
+    """Missing rows replaced by the reading before them (the first by the one after, or zero)."""
+    known = np.isfinite(rows).all(axis=1)
+    if known.all():
+        return rows
+    if not known.any():
+        return np.zeros_like(rows)
+    source = np.maximum.accumulate(np.where(known, np.arange(len(rows)), -1))
+    source[source < 0] = int(np.argmax(known))
+    return rows[source]
+
+
+def _frozen(stamp: FloatArray, readings: FloatArray) -> FloatArray:
+    """Which readings belong to a run of identical ones, not all zero, that is too long to be flight."""
+    same = (readings[1:] == readings[:-1]).all(axis=1)
+    run = np.concatenate([[0], np.cumsum(~same)])
+    first, last = np.searchsorted(run, run, side="left"), np.searchsorted(run, run, side="right") - 1
+    return (readings[:, :3] != 0).any(axis=1) & (stamp[last] - stamp[first] > _FROZEN_S)
