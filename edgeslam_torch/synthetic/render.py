@@ -5,6 +5,7 @@ is exact at every pixel centre, and one `cv2.warpPerspective` per visible quad a
 Borders are smoothed by five samples per pixel: its centre and, shared with its neighbours, its corners.
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import cv2
@@ -16,8 +17,6 @@ from edgeslam_torch.synthetic.world import MAX_LEVEL, World
 from edgeslam_torch.types import FloatArray
 
 NEAR_M = 0.02
-REMAP_CHUNK = 32000
-"""`cv2.remap` wants image sides below 2**15."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,17 +36,26 @@ class _Polygon:
     """A quad clipped to the near plane and projected."""
 
     quad: int
-    uv: FloatArray
-    """``(V, 2)`` corners [px], float64."""
-    inverse_depth: FloatArray
-    """``(3,)`` 1/z = inverse_depth @ (u, v, 1)."""
+    uv: list[tuple[float, float]]
+    """Three to five corners [px]."""
     st_from_uv: FloatArray
-    """``(3, 3)`` homography from pixels to texture coordinates in [0, 1]; its third row is ``inverse_depth``."""
-    plane_m: float
-    """Distance of the camera from the plane."""
-    roi: tuple[int, int, int, int]
-    """x0, y0, x1, y1 of the corner grid, inclusive."""
+    """``(3, 3)`` homography from pixels to texture coordinates in [0, 1]; third row times (u, v, 1) is 1/z."""
     iz_range: tuple[float, float]
+    level_offset: float
+    """g of level = g - 3.5 log2(1/z), where one texel covers one pixel."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Spans:
+    """The polygons' pixels on one sampling grid: columns ``low..high`` on each row."""
+
+    roi: np.ndarray
+    """``(P, 4)`` x0, y0, x1, y1, exclusive ends; empty where x0 >= x1."""
+    start: np.ndarray
+    """``(P,)`` where each polygon's rows begin in ``low`` and ``high``, counted as if they began at its y0."""
+    low: np.ndarray
+    high: np.ndarray
+    """``(rows,)`` int32, inclusive."""
 
 
 def render(world: World, camera: Camera, T_w_c: FloatArray, *, antialias: bool = True) -> Rendered:
@@ -62,16 +70,18 @@ def render(world: World, camera: Camera, T_w_c: FloatArray, *, antialias: bool =
     if camera.is_distorted:
         return _render_distorted(world, camera, T_w_c, antialias)
     polygons = _project(world, camera, T_w_c)
-    iz, ids = _depth_pass(polygons, camera.width, camera.height, 0.0)
+    iz, ids, spans = _depth_pass(polygons, camera.width, camera.height, 0.0)
     image = np.empty((camera.height, camera.width, 3), np.uint8)
     image[:] = world.background
-    for polygon in polygons:
-        _draw(image, iz, ids, polygon, world)
+    seen = np.bincount(ids.ravel() + 1, minlength=len(world.quads) + 1)[1:] > 0
+    for polygon, roi in zip(polygons, spans.roi.tolist(), strict=True):
+        if seen[polygon.quad]:
+            _draw(image, iz, ids, polygon, roi, world)
     if antialias:
-        _smooth_borders(image, ids, polygons, world)
+        _smooth_borders(image, ids, [p for p in polygons if seen[p.quad]])
     with np.errstate(divide="ignore"):
         depth = np.where(iz > 0, np.float32(1.0) / iz, np.float32(0.0))
-    return Rendered(image, depth, ids)
+    return Rendered(image, depth, ids.astype(np.int32))
 
 
 def _project(world: World, camera: Camera, T_w_c: FloatArray) -> list[_Polygon]:
@@ -89,32 +99,20 @@ def _project(world: World, camera: Camera, T_w_c: FloatArray) -> list[_Polygon]:
     if len(index) == 0:
         return []
     c = corners[index]
-    frame = np.stack([c[:, 1] - c[:, 0], c[:, 3] - c[:, 0], c[:, 0]], axis=2)  # columns u, v, origin
-    st_from_uv = np.linalg.inv(camera.K @ frame)
+    frame = camera.K @ np.stack([c[:, 1] - c[:, 0], c[:, 3] - c[:, 0], c[:, 0]], axis=2)  # columns u, v, origin
+    st_from_uv = np.linalg.inv(frame)
+    # Texels per pixel are det(st_from_uv) / iz^3 times the texture's size. Half an octave more for each doubling
+    # of obliqueness, cos = plane distance times iz, keeps grazing surfaces from flickering.
+    texels = world.texels[index] / np.abs(np.linalg.det(frame))
+    level_offset = (np.log2(texels) - 0.5 * np.log2(np.abs(side[index]))).tolist()
     polygons = []
-    for row, quad in enumerate(index):
-        points = _clip(c[row].tolist())
+    for row, (quad, points) in enumerate(zip(index.tolist(), c.tolist(), strict=True)):
+        points = _clip(points)
         if len(points) < 3:
             continue
         uv = [(camera.fx * p[0] / p[2] + camera.cx, camera.fy * p[1] / p[2] + camera.cy) for p in points]
-        us, vs = [p[0] for p in uv], [p[1] for p in uv]
-        # The corner grid reaches half a pixel beyond the centres on every side.
-        x0, x1 = max(0, int(np.floor(min(us)))), min(camera.width, int(np.ceil(max(us))) + 1)
-        y0, y1 = max(0, int(np.floor(min(vs)))), min(camera.height, int(np.ceil(max(vs))) + 1)
-        if x0 > x1 or y0 > y1:
-            continue
         izs = [1.0 / p[2] for p in points]
-        polygons.append(
-            _Polygon(
-                int(quad),
-                np.array(uv),
-                st_from_uv[row, 2],
-                st_from_uv[row],
-                abs(float(side[quad])),
-                (x0, y0, x1, y1),
-                (min(izs), max(izs)),
-            )
-        )
+        polygons.append(_Polygon(quad, uv, st_from_uv[row], (min(izs), max(izs)), level_offset[row]))
     polygons.sort(key=lambda p: -p.iz_range[1])
     return polygons
 
@@ -135,65 +133,62 @@ def _clip(points: list[list[float]]) -> list[list[float]]:
 
 def _depth_pass(
     polygons: list[_Polygon], width: int, height: int, offset: float
-) -> tuple[FloatArray, np.ndarray]:
-    """Inverse depth ``(height, width)`` float32 and quad index, sampled at integer pixels plus ``offset``."""
+) -> tuple[FloatArray, np.ndarray, _Spans]:
+    """Inverse depth ``(height, width)`` float32 and quad index int16, at integer pixels plus ``offset``."""
     iz = np.zeros((height, width), np.float32)
-    ids = np.full((height, width), -1, np.int32)
-    for polygon in polygons:
-        x0, y0, x1, y1 = polygon.roi
-        x1, y1 = min(x1, width - 1), min(y1, height - 1)
-        xs, ys = np.arange(x0, x1 + 1) + offset, np.arange(y0, y1 + 1) + offset
-        low, high = _row_spans(polygon.uv, ys, x0 + offset, x1 + offset)
-        rows = np.flatnonzero(low <= high)
-        if len(rows) == 0:
+    ids = np.full((height, width), -1, np.int16)
+    spans = _spans(polygons, width, height, offset)
+    columns = np.arange(width, dtype=np.int32)
+    planes = np.array([p.st_from_uv[2] for p in polygons]).reshape(-1, 3)
+    planes[:, 2] += offset * (planes[:, 0] + planes[:, 1])
+    for polygon, (x0, y0, x1, y1), start, (a, b, c) in zip(
+        polygons, spans.roi.tolist(), spans.start.tolist(), planes.tolist(), strict=True
+    ):
+        if x0 >= x1:
             continue
-        first, last = int(rows[0]), int(rows[-1]) + 1
-        low, high, ys = low[first:last], high[first:last], ys[first:last]
-        left = max(int(np.ceil(low.min() - xs[0])), 0)
-        right = min(int(np.floor(high.max() - xs[0])) + 1, len(xs))
-        if left >= right:
-            continue
-        xs = xs[left:right]
-        a, b, c = polygon.inverse_depth
+        xs, ys = columns[x0:x1], np.arange(y0, y1)
         here = (a * xs).astype(np.float32) + (b * ys + c).astype(np.float32)[:, None]
-        part = np.s_[y0 + first : y0 + last, x0 + left : x0 + right]
-        nearer = here > iz[part]
-        nearer &= xs >= low[:, None]
-        nearer &= xs <= high[:, None]
-        np.copyto(iz[part], here, where=nearer)
-        np.copyto(ids[part], polygon.quad, where=nearer)
-    return iz, ids
+        target = iz[y0:y1, x0:x1]
+        nearer = here > target
+        rows = slice(start, start + y1 - y0)
+        nearer &= xs >= spans.low[rows, None]
+        nearer &= xs <= spans.high[rows, None]
+        np.copyto(target, here, where=nearer)
+        np.copyto(ids[y0:y1, x0:x1], polygon.quad, where=nearer)
+    return iz, ids, spans
 
 
-def _row_spans(uv: FloatArray, ys: FloatArray, x_min: float, x_max: float) -> tuple[FloatArray, FloatArray]:
-    """First and last x inside a convex polygon ``(V, 2)`` on each row; first > last where the row misses it."""
-    following = np.roll(uv, -1, axis=0)
-    dx, dy = (following - uv).T
-    area = float(np.sum(uv[:, 0] * following[:, 1] - uv[:, 1] * following[:, 0]))
-    sign = 1.0 if area > 0 else -1.0
-    # Inside: sign * (dx (y - y0) - dy (x - x0)) >= 0, that is A x + D >= 0 on a row.
-    A = -sign * dy
-    D = sign * (dx[:, None] * (ys - uv[:, 1:]) + (dy * uv[:, 0])[:, None])  # (V, rows)
-    low, high = np.full(len(ys), x_min), np.full(len(ys), x_max)
-    for a, d in zip(A, D, strict=True):
-        if a > 0:
-            np.maximum(low, -d / a, out=low)
-        elif a < 0:
-            np.minimum(high, -d / a, out=high)
-        else:
-            low[d < 0] = np.inf
-    return low, high
-
-
-def _level_offset(polygon: _Polygon, world: World) -> float:
-    """``g`` of level = g - 3.5 log2(1/z): where one texel covers one pixel.
-
-    Texels per pixel are det(st_from_uv) / iz^3 times the texture's size; half an octave more for each doubling of
-    obliqueness, cos = plane distance times iz, keeps grazing surfaces from flickering.
-    """
-    image = world.quads[polygon.quad].texture.image
-    texels = image.shape[0] * image.shape[1] * abs(float(np.linalg.det(polygon.st_from_uv)))
-    return float(np.log2(max(texels, 1e-30)) - 0.5 * np.log2(polygon.plane_m))
+def _spans(polygons: list[_Polygon], width: int, height: int, offset: float) -> _Spans:
+    """First and last column inside each convex polygon on each of its rows."""
+    count = len(polygons)
+    uv = np.array([p.uv + [p.uv[-1]] * (5 - len(p.uv)) for p in polygons]).reshape(-1, 5, 2) - offset
+    top = np.clip(np.ceil(uv[:, :, 1].min(1)), 0, height).astype(np.int64)
+    bottom = np.clip(np.floor(uv[:, :, 1].max(1)) + 1, top, height).astype(np.int64)
+    rows = bottom - top
+    start = np.cumsum(rows) - rows
+    owner = np.repeat(np.arange(count), rows)
+    y = (np.arange(len(owner)) - start[owner] + top[owner]).astype(np.float64)
+    following = np.roll(uv, -1, axis=1)
+    edge = following - uv
+    area = np.sum(uv[..., 0] * following[..., 1] - uv[..., 1] * following[..., 0], axis=1)
+    low, high = np.full(len(y), 0.0), np.full(len(y), width - 1.0)
+    for k in range(5):
+        dx, dy = edge[:, k, 0], edge[:, k, 1]
+        slope = np.divide(dx, dy, out=np.zeros(count), where=dy != 0)
+        cut = (y - uv[owner, k, 1]) * slope[owner] + uv[owner, k, 0]
+        # With positive area the inside lies where dx (y - y0) - dy (x - x0) >= 0.
+        bounds_low = (np.sign(area) * dy < 0)[owner]
+        bounds_high = (np.sign(area) * dy > 0)[owner]
+        np.maximum(low, cut, out=low, where=bounds_low)
+        np.minimum(high, cut, out=high, where=bounds_high)
+    first, last = np.ceil(low).astype(np.int32), np.floor(high).astype(np.int32)
+    roi = np.zeros((count, 4), np.int64)
+    nonempty = np.flatnonzero(rows)
+    if len(nonempty):
+        left = np.minimum.reduceat(first, start[nonempty])
+        right = np.maximum.reduceat(last, start[nonempty]) + 1
+        roi[nonempty] = np.stack([left, top[nonempty], right, bottom[nonempty]], axis=1)
+    return _Spans(roi, start, first, last)
 
 
 def _texture_from_st(level: np.ndarray) -> FloatArray:
@@ -202,20 +197,17 @@ def _texture_from_st(level: np.ndarray) -> FloatArray:
     return np.array([[w, 0.0, -0.5], [0.0, h, -0.5], [0.0, 0.0, 1.0]])
 
 
-def _draw(image: np.ndarray, iz: FloatArray, ids: np.ndarray, polygon: _Polygon, world: World) -> None:
+def _draw(
+    image: np.ndarray, iz: FloatArray, ids: np.ndarray, polygon: _Polygon, roi: list[int], world: World
+) -> None:
     """Colour the pixels where this quad is the nearest."""
-    x0, y0, x1, y1 = polygon.roi
-    mine = (ids[y0 : y1 + 1, x0 : x1 + 1] == polygon.quad).view(np.uint8)
-    if mine.size == 0:
-        return
+    x0, y0, x1, y1 = roi
+    mine = (ids[y0:y1, x0:x1] == polygon.quad).view(np.uint8)
     bx, by, bw, bh = cv2.boundingRect(mine)
-    if bw == 0:
-        return
     mine = mine[by : by + bh, bx : bx + bw]
     x0, y0 = x0 + bx, y0 + by
-    texture = world.quads[polygon.quad].texture
-    g = _level_offset(polygon, world)
-    a, b, c = polygon.inverse_depth
+    texture, g = world.quads[polygon.quad].texture, polygon.level_offset
+    a, b, c = polygon.st_from_uv[2].tolist()
     at_corners = [a * x + b * y + c for x in (x0, x0 + bw - 1) for y in (y0, y0 + bh - 1)]
     near = min(max(at_corners), polygon.iz_range[1])
     far = max(min(at_corners), polygon.iz_range[0])
@@ -242,76 +234,45 @@ def _draw(image: np.ndarray, iz: FloatArray, ids: np.ndarray, polygon: _Polygon,
 
 
 def _level_at(iz: float, g: float) -> int:
-    return int(min(max(np.floor(g - 3.5 * np.log2(max(iz, 1e-6)) + 0.5), 0), MAX_LEVEL))
+    return min(max(math.floor(g - 3.5 * math.log2(max(iz, 1e-6)) + 0.5), 0), MAX_LEVEL)
 
 
 def _iz_of_level(level: float, g: float) -> np.float32:
     return np.float32(2.0 ** ((g - level) / 3.5))
 
 
-def _smooth_borders(image: np.ndarray, ids: np.ndarray, polygons: list[_Polygon], world: World) -> None:
-    """Blend pixels whose corners show another quad than their centre: half centre, an eighth each corner."""
+def _smooth_borders(image: np.ndarray, ids: np.ndarray, polygons: list[_Polygon]) -> None:
+    """Blend pixels whose corners show another quad than their centre: half centre, an eighth each corner.
+
+    A corner takes its colour from the pixels around it whose centre shows the same quad.
+    """
     height, width = ids.shape
-    iz_corner, ids_corner = _depth_pass(polygons, width + 1, height + 1, -0.5)
-    corners = [ids_corner[:-1, :-1], ids_corner[:-1, 1:], ids_corner[1:, :-1], ids_corner[1:, 1:]]
-    mixed = corners[0] != ids
-    for corner in corners[1:]:
+    _, ids_corner, _ = _depth_pass(polygons, width + 1, height + 1, -0.5)
+    mixed = ids_corner[:-1, :-1] != ids
+    for corner in (ids_corner[:-1, 1:], ids_corner[1:, :-1], ids_corner[1:, 1:]):
         mixed |= corner != ids
     pixel = np.flatnonzero(mixed)
     if len(pixel) == 0:
         return
+    # On a frame one pixel wider all round, corner (i, j) touches pixels (i, j), (i, j+1), (i+1, j), (i+1, j+1).
+    wide = width + 2
+    padded_ids = cv2.copyMakeBorder(ids, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=-2).ravel()
+    padded = cv2.copyMakeBorder(image, 1, 1, 1, 1, cv2.BORDER_REPLICATE).reshape(-1, 3)
     row, column = np.divmod(pixel, width)
-    first = row * (width + 1) + column
-    touched = np.zeros((height + 1) * (width + 1), bool)
-    neighbours = [first, first + 1, first + width + 1, first + width + 2]
-    for n in neighbours:
-        touched[n] = True
-    sample = np.flatnonzero(touched)
-    colour = _sample_colours(sample, iz_corner.ravel()[sample], ids_corner.ravel()[sample], width + 1, polygons, world)
-    position = np.zeros(len(touched), np.int64)
-    position[sample] = np.arange(len(sample))
-    flat = image.reshape(-1, 3)
-    total = 4.0 * flat[pixel].astype(np.float32)
-    for n in neighbours:
-        total += colour[position[n]]
-    flat[pixel] = (total * 0.125 + 0.5).astype(np.uint8)
-
-
-def _sample_colours(
-    sample: np.ndarray, iz: FloatArray, ids: np.ndarray, stride: int, polygons: list[_Polygon], world: World
-) -> FloatArray:
-    """Colours ``(N, 3)`` float32 at single points of the corner grid (flat indices ``sample``)."""
-    colour = np.empty((len(sample), 3), np.float32)
-    colour[:] = world.background
-    order = np.argsort(ids, kind="stable")
-    ids_sorted = ids[order]
-    for polygon in polygons:
-        start, end = np.searchsorted(ids_sorted, [polygon.quad, polygon.quad + 1])
-        if start == end:
-            continue
-        chosen = order[start:end]
-        texture = world.quads[polygon.quad].texture
-        g = _level_offset(polygon, world)
-        levels = np.floor(g - 3.5 * np.log2(iz[chosen]) + 0.5)
-        levels = np.clip(levels, 0, MAX_LEVEL).astype(np.int64)
-        y, x = np.divmod(sample[chosen], stride)
-        st = polygon.st_from_uv @ np.stack([x - 0.5, y - 0.5, np.ones(len(x))])
-        st = st[:2] / st[2]
-        for k in range(int(levels.min()), int(levels.max()) + 1):
-            at = np.flatnonzero(levels == k)
-            if len(at) == 0:
-                continue
-            level = texture.level(k)
-            h, w = level.shape[:2]
-            map_x = (st[0, at] * w - 0.5).astype(np.float32)
-            map_y = (st[1, at] * h - 0.5).astype(np.float32)
-            for i in range(0, len(at), REMAP_CHUNK):
-                part = np.s_[i : i + REMAP_CHUNK]
-                values = cv2.remap(
-                    level, map_x[part], map_y[part], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-                )
-                colour[chosen[at[part]]] = values.reshape(-1, 3)
-    return colour
+    own = padded[(row + 1) * wide + column + 1].astype(np.float32)
+    total = 4.0 * own
+    for dy in (0, 1):
+        for dx in (0, 1):
+            target = ids_corner[row + dy, column + dx]
+            around = (row + dy) * wide + column + dx
+            weight = np.zeros((len(pixel), 1), np.float32)
+            colour = np.zeros((len(pixel), 3), np.float32)
+            for step in (0, 1, wide, wide + 1):
+                same = (padded_ids[around + step] == target)[:, None]
+                weight += same
+                colour += same * padded[around + step]
+            total += np.where(weight > 0, colour / np.maximum(weight, 1.0), own)
+    image.reshape(-1, 3)[pixel] = (total * 0.125 + 0.5).astype(np.uint8)
 
 
 def _render_distorted(world: World, camera: Camera, T_w_c: FloatArray, antialias: bool) -> Rendered:
@@ -338,7 +299,7 @@ def _render_distorted(world: World, camera: Camera, T_w_c: FloatArray, antialias
     ids = view.quad_id[nearest[:, 1], nearest[:, 0]]
     planes = np.zeros((len(world.quads) + 1, 3))
     for polygon in _project(world, wide, T_w_c):
-        planes[polygon.quad] = polygon.inverse_depth
+        planes[polygon.quad] = polygon.st_from_uv[2]
     iz = np.einsum("ni,ni->n", planes[ids], np.column_stack([local, np.ones(len(local))]))
     depth = np.zeros(len(iz), np.float32)
     depth[iz > 0] = 1.0 / iz[iz > 0]

@@ -14,7 +14,6 @@ LIGHT_GRID_M = 0.16
 """Spacing of the points at which light is computed."""
 UNIT_LIGHT = 100.0
 """Light 1.0 in the 8-bit light maps; they saturate at 2.55."""
-Z = np.array([0.0, 0.0, 1.0])
 VARIANTS = 6
 """Tiles of each material and pictures of each kind that a process draws at most."""
 
@@ -176,7 +175,7 @@ class Scene:
             if face in "tu":
                 u, v = np.array([size[0], 0.0, 0.0]), np.array([0.0, -n[2] * size[1], 0.0])
             else:
-                u, v = np.cross(Z, n) * size, np.array([0.0, 0.0, -size[2]])
+                u, v = np.array([-n[1] * size[0], n[0] * size[1], 0.0]), np.array([0.0, 0.0, -size[2]])
             corner = np.array(centre) + 0.5 * n * size - 0.5 * u - 0.5 * v
             chosen = (special or {}).get(face, paint)
             self.surface(place.point(corner), place.direction(u), place.direction(v), chosen, name, solid=solid)
@@ -222,71 +221,75 @@ class Scene:
 
     def _light_maps(self) -> list[FloatArray]:
         """Light at a grid of points of every surface, 1.0 on average."""
-        points, normals, solids, shapes = [], [], [], []
-        for s in self.surfaces:
-            n = np.cross(s.v_w, s.u_w)
-            n /= np.linalg.norm(n)
-            columns = int(np.clip(np.ceil(np.linalg.norm(s.u_w) / LIGHT_GRID_M), 2, 80))
-            rows = int(np.clip(np.ceil(np.linalg.norm(s.v_w) / LIGHT_GRID_M), 2, 80))
-            a, b = (np.arange(columns) + 0.5) / columns, (np.arange(rows) + 0.5) / rows
-            grid = s.origin_w + a[None, :, None] * s.u_w + b[:, None, None] * s.v_w
-            points.append(grid.reshape(-1, 3) + 0.004 * n)
-            normals.append(np.broadcast_to(n, (rows * columns, 3)))
-            solids.append(np.full(rows * columns, s.solid))
-            shapes.append((rows, columns))
-        p, n, solid = (np.concatenate(x) for x in (points, normals, solids))
-        light = self._light(p, n, solid)
-        out, start = [], 0
-        for shape in shapes:
-            size = shape[0] * shape[1]
-            out.append(light[start : start + size].reshape(shape))
-            start += size
-        return out
+        origin, u, v = (np.array([getattr(s, k) for s in self.surfaces]) for k in ("origin_w", "u_w", "v_w"))
+        normal = np.cross(v, u)
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        columns = np.clip(np.ceil(np.linalg.norm(u, axis=1) / LIGHT_GRID_M), 2, 80).astype(int)
+        rows = np.clip(np.ceil(np.linalg.norm(v, axis=1) / LIGHT_GRID_M), 2, 80).astype(int)
+        size = rows * columns
+        start = np.cumsum(size) - size
+        owner = np.repeat(np.arange(len(size)), size)
+        j, i = np.divmod(np.arange(len(owner)) - start[owner], columns[owner])
+        a, b = ((i + 0.5) / columns[owner])[:, None], ((j + 0.5) / rows[owner])[:, None]
+        p = origin[owner] + a * u[owner] + b * v[owner] + 0.004 * normal[owner]
+        solid = np.array([s.solid for s in self.surfaces])[owner]
+        light = self._light(p.T.astype(np.float32), normal[owner].T.astype(np.float32), solid)
+        return [light[s : s + r * c].reshape(r, c) for s, r, c in zip(start, rows, columns, strict=True)]
 
     def _light(self, p: FloatArray, n: FloatArray, solid: np.ndarray) -> FloatArray:
-        """Lamps with shadows, ambient light, and darkening near other surfaces, ``(N,)``."""
-        direct = np.zeros(len(p))
+        """Lamps with shadows, ambient light, and darkening near other surfaces; ``p``, ``n`` are ``(3, N)``."""
+        local = [_local(box, p) for box in self.boxes]
+        direct = np.zeros(p.shape[1], np.float32)
         for lamp in self.lamps_w:
-            ray = lamp - p
-            distance = np.linalg.norm(ray, axis=1)
-            lambert = np.maximum(np.einsum("ni,ni->n", n, ray) / np.maximum(distance, 1e-6), 0.0)
-            lit = lambert > 0
-            open_ = np.ones(len(p))
-            open_[lit] = self._visibility(p[lit], lamp, solid[lit])
-            direct += lambert * open_ / (distance**2 + 0.8)
-        room = n @ Z
-        sky = 1.0 + 0.12 * room  # what looks up sees the lit ceiling and walls
+            ray = lamp.astype(np.float32)[:, None] - p
+            squared = (ray * ray).sum(0)
+            lambert = np.maximum((n * ray).sum(0), 0.0) / np.sqrt(np.maximum(squared, 1e-12))
+            lit = np.flatnonzero(lambert > 0)
+            seen = np.zeros_like(lambert)
+            seen[lit] = self._visibility([x[:, lit] for x in local], lamp, solid[lit])
+            direct += lambert * seen / (squared + 0.8)
+        sky = 1.0 + 0.12 * n[2]  # what looks up sees the lit ceiling and walls
         for axis in range(3):
-            for distance, inward in ((p[:, axis] - self.low_w[axis], 1.0), (self.high_w[axis] - p[:, axis], -1.0)):
-                facing = n[:, axis] * inward
-                sky *= 1.0 - 0.4 * (facing < 0.9) * np.exp(-np.maximum(distance, 0.0) / 0.22)
+            for distance, inward in ((p[axis] - self.low_w[axis], 1.0), (self.high_w[axis] - p[axis], -1.0)):
+                sky *= 1.0 - 0.4 * (n[axis] * inward < 0.9) * np.exp(np.minimum(-distance, 0.0) / 0.22)
         for k, box in enumerate(self.boxes):
-            if box.half_m.max() < 0.08:
-                continue
-            close = box.distance(p)
             reach = 0.6 * min(0.25, float(box.half_m.max()))
-            sky *= 1.0 - 0.45 * (solid != k) * np.exp(-close / reach)
+            if reach < 0.048:
+                continue
+            out = np.maximum(np.abs(local[k]) - box.half_m.astype(np.float32)[:, None], 0.0)
+            squared = (out * out).sum(0)
+            close = np.flatnonzero((squared < (4 * reach) ** 2) & (solid != k))
+            sky[close] *= 1.0 - 0.45 * np.exp(-np.sqrt(squared[close]) / reach)
         mean = float(np.median(direct[direct > 0])) if np.any(direct > 0) else 1.0
         light = self.ambient * sky + (1.0 - self.ambient) * direct / mean
         light = light / max(float(np.median(light)), 1e-6)
         return 0.88 * self.exposure * np.where(light > 1, 1 + 0.4 * np.tanh((light - 1) / 1.2), light)
 
-    def _visibility(self, p: FloatArray, lamp: FloatArray, solid: np.ndarray) -> FloatArray:
+    def _visibility(self, local: list[FloatArray], lamp: FloatArray, solid: np.ndarray) -> FloatArray:
         """Share of a lamp that points see past the solids, ``(N,)``: 1 lit, 0 in shadow."""
-        seen = np.ones(len(p))
+        seen = np.ones(len(solid), np.float32)
         for k, box in enumerate(self.boxes):
             if box.half_m.max() < 0.12 or box.distance(lamp) == 0:
                 continue
-            a, b = box.to_local(p), box.to_local(lamp)
-            d = b - a
-            d = np.where(np.abs(d) < 1e-9, 1e-9, d)
-            t0, t1 = (-box.half_m - a) / d, (box.half_m - a) / d
-            enter, leave = np.minimum(t0, t1).max(1), np.maximum(t0, t1).min(1)
-            chord = np.clip(leave, 0, 1) - np.clip(enter, 0, 1)
-            blocked = (enter < leave) & (leave > 1e-3) & (enter < 1) & (solid != k)
+            half = box.half_m.astype(np.float32)
+            b = _local(box, lamp.astype(np.float32)[:, None])
+            enter, leave = np.float32(0.0), np.float32(1.0)
+            for axis in range(3):
+                d = b[axis] - local[k][axis]
+                d[np.abs(d) < 1e-9] = 1e-9
+                middle, reach = -local[k][axis] / d, half[axis] / np.abs(d)
+                enter, leave = np.maximum(enter, middle - reach), np.minimum(leave, middle + reach)
+            blocked = np.flatnonzero((enter < leave) & (leave > 1e-3) & (solid != k))
             # A ray that only grazes the solid is half lit: a soft edge for nothing.
-            seen *= 1.0 - blocked * np.clip(chord * 12.0, 0.0, 1.0) * 0.92
+            seen[blocked] *= 1.0 - 0.92 * np.minimum((leave - enter)[blocked] * 12.0, 1.0)
         return seen
+
+
+def _local(box: Box, p: FloatArray) -> FloatArray:
+    """Points ``(3, N)`` in a box's own axes."""
+    c, s = np.float32(np.cos(box.yaw_rad)), np.float32(np.sin(box.yaw_rad))
+    x, y, z = p - box.centre_w.astype(np.float32)[:, None]
+    return np.stack([c * x + s * y, c * y - s * x, z])
 
 
 def _rhombi(start: FloatArray, path: list[FloatArray]) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
@@ -325,16 +328,23 @@ def _bake(surface: Surface, light: FloatArray, scene: Scene) -> np.ndarray:
     return cv2.multiply(image, cv2.resize(light8, size, interpolation=cv2.INTER_LINEAR), scale=1.0 / UNIT_LIGHT)
 
 
+@lru_cache(maxsize=256)
+def _sized_tile(kind: str, variant: int, side_px: int) -> np.ndarray:
+    """A material's tile resampled to ``side_px`` (smoothed first when it shrinks)."""
+    pyramid = material_tile(kind, variant)
+    level = max(0, int(2 * np.log2(textures.TILE_PX / side_px)))
+    return cv2.resize(pyramid.level(level), (side_px, side_px), interpolation=cv2.INTER_LINEAR)
+
+
 def _spread(paint: Paint, width_m: float, height_m: float, texel_m: float) -> np.ndarray:
     """A material's tile repeated over a surface at ``texel_m`` metres a texel."""
     texel_m = max(texel_m, max(width_m, height_m) / 4096)
     columns, rows = max(4, round(width_m / texel_m)), max(4, round(height_m / texel_m))
-    pyramid = material_tile(paint.kind, paint.variant)
-    step = texel_m * textures.TILE_PX / (textures.TILE_M * paint.zoom)  # finest texels of the tile per texel
-    level = int(np.clip(round(2 * np.log2(step)), 0, 8))
-    tile = pyramid.level(level)
-    step *= tile.shape[1] / textures.TILE_PX
-    x0, y0 = paint.offset[0] * tile.shape[1], paint.offset[1] * tile.shape[0]
-    M = np.array([[0.0, step, x0], [step, 0.0, y0]]) if paint.turned else np.array([[step, 0.0, x0], [0.0, step, y0]])
-    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    return cv2.warpAffine(tile, M, (columns, rows), flags=flags, borderMode=cv2.BORDER_WRAP)
+    # Sizes in steps of 16 texels keep the number of resampled tiles small.
+    tile = _sized_tile(paint.kind, paint.variant, max(32, 16 * round(textures.TILE_M * paint.zoom / texel_m / 16)))
+    if paint.turned:
+        tile = tile.transpose(1, 0, 2)
+    side = tile.shape[0]
+    tile = np.roll(tile, (-int(paint.offset[1] * side), -int(paint.offset[0] * side)), axis=(0, 1))
+    below, right = max(0, rows - side), max(0, columns - side)
+    return cv2.copyMakeBorder(tile[:rows, :columns], 0, below, 0, right, cv2.BORDER_WRAP)

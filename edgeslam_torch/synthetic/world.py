@@ -119,14 +119,15 @@ class World:
         background: tuple[int, int, int] = (90, 90, 90),
     ) -> None:
         """Args: ``bounds_w`` ``(2, 3)`` free space, low and high corner; ``boxes`` the solids inside it."""
-        if not quads:
-            raise ValueError("a world needs at least one quad")
+        if not 0 < len(quads) < 2**15:
+            raise ValueError(f"a world needs 1 to 32767 quads, got {len(quads)}")
         self.quads = tuple(quads)
         self.name = name
         self.boxes = tuple(boxes or [])
         self.background = background
         self.corners_w = np.stack([q.corners_w for q in quads])
         self.normals_w = np.stack([q.normal_w for q in quads])
+        self.texels = np.array([q.texture.image.shape[0] * q.texture.image.shape[1] for q in quads], dtype=np.float64)
         self.two_sided = np.array([q.two_sided for q in quads])
         low, high = self.corners_w.min((0, 1)), self.corners_w.max((0, 1))
         self.bounds_w = np.stack([low, high]) if bounds_w is None else np.asarray(bounds_w, dtype=np.float64)
