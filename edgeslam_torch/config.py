@@ -127,18 +127,28 @@ class MappingConfig:
 class EdgeConfig:
     """Stages 1 and 3: Canny edges and the semi-dense edge map."""
 
-    canny_low: float = 60.0
-    canny_high: float = 150.0
+    canny_low: float = 40.0
+    canny_high: float = 100.0
     """Grey-level gradient thresholds, L2 norm, 3x3 Sobel."""
-    max_pixels: int = 8000
+    max_pixels: int = 5000
     """Edge pixels kept per keyframe, evenly thinned."""
-    voxel: float = 0.01
+    delay_keyframes: int = 3
+    """Keyframes that must follow before a keyframe's edges are measured: views from both sides, refined poses."""
+    targets: int = 6
+    """Keyframes searched for each edge."""
+    max_sigma: float = 0.02
+    """Relative depth sigma above which a measured edge point stays out of the map."""
+    min_observations: int = 2
+    """Keyframes that must agree on a point of the exported map."""
+    voxel: float = 0.005
     """Side of the map's fusion cell relative to the median scene depth."""
     max_points: int = 400_000
-    """Points kept in the edge map; the least observed go first."""
+    """Points kept; beyond it the oldest are fused, then thinned."""
 
     def __post_init__(self) -> None:
-        _positive(self, "canny_low", "canny_high", "max_pixels", "voxel", "max_points")
+        _positive(self, "canny_low", "canny_high", "max_pixels", "targets", "max_sigma", "voxel", "max_points")
+        if self.canny_high < self.canny_low:
+            raise ValueError(f"canny_high must not be below canny_low, got {self.canny_high} < {self.canny_low}")
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,6 +20,7 @@ from edgeslam_torch.frontend.orb import OrbExtractor
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.mapping.depth_prior import fit_to_anchors, sample
+from edgeslam_torch.mapping.edge_map import EdgeMap
 from edgeslam_torch.mapping.keyframe import Keyframe, make_keyframe
 from edgeslam_torch.mapping.mapper import Mapper
 from edgeslam_torch.mapping.refinement import Window, refine
@@ -102,6 +103,7 @@ class EdgeSlam:
             self.config.depth,
             self.lm,
         )
+        self.edges = EdgeMap(self.map, camera, self.config.edges, self.config.depth.prior_sigma_log)
         self.records: list[FrameRecord] = []
         self.events: dict[str, int] = {"lost": 0, "relocalised": 0, "restarted": 0, "initialisations_refused": 0}
         self._mode = Mode.EMPTY
@@ -113,6 +115,7 @@ class EdgeSlam:
         self._reference_tracked = 0
         self._bootstrap_views: list[BootstrapView] = []
         self._guess_depth: FloatArray = np.zeros(0)
+        self._start_image = np.zeros((camera.height, camera.width), dtype=np.uint8)
         self._stage_ms: dict[str, float] = {}
         cv2.setRNGSeed(self.config.seed)
 
@@ -221,6 +224,7 @@ class EdgeSlam:
             network, _ = sample(keyframe.depth, view.features.uv)
             guess = np.where(np.isfinite(network), network, np.nanmedian(network))
         self._guess_depth = guess
+        self._start_image = undistorted
         p_c = self.camera.back_project(view.features.uv, guess)
         self.map.anchors.begin_pass()
         ids = self.map.anchors.add(
@@ -322,6 +326,8 @@ class EdgeSlam:
         self.map.refresh_anchors(ids[self.map.anchors.alive[ids]])
         with self._timed("depth"):
             keyframe.depth = None if self.depth is None else self.depth(undistorted, self.camera)
+        self._give_image(keyframe, undistorted)
+        self._give_image(reference, self._start_image)
         self.mapper.triangulate_new(keyframe, [reference], _colours(undistorted, view.features.uv))
         points[:] = np.nan
         held = reference.keypoints_with_anchor()
@@ -367,12 +373,25 @@ class EdgeSlam:
             keyframe.depth = None if self.depth is None else self.depth(undistorted, self.camera)
         with self._timed("mapping"):
             self.mapper.insert(keyframe, _colours(undistorted, view.features.uv))
+        with self._timed("edges"):
+            self._give_image(keyframe, undistorted)
+            self.edges.update()
         return keyframe
+
+    def _give_image(self, keyframe: Keyframe, undistorted: np.ndarray) -> None:
+        keyframe.image = undistorted
+        keyframe.grey = undistorted if undistorted.ndim == 2 else cv2.cvtColor(undistorted, cv2.COLOR_BGR2GRAY)
+        self.edges.announce(keyframe)
 
     # -- results -----------------------------------------------------------------------------------------------
 
     def finish(self) -> None:
         """Last refinement once no frame follows."""
+        self.edges.update(everything=True)
+
+    def edge_map(self) -> PointCloud:
+        """Semi-dense edge points that several keyframes agree on."""
+        return self.edges.points()
 
     def trajectory(self) -> tuple[FloatArray, FloatArray]:
         """Stamps ``(F,)`` and refined ``T_w_c`` ``(F, 4, 4)`` of every frame stepped so far."""

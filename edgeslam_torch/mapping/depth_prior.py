@@ -42,32 +42,33 @@ def fit_to_anchors(network_m: FloatArray, anchor_depth: FloatArray) -> DepthFit 
     return DepthFit(centre, max(spread, 0.02), int(usable.sum()))
 
 
-def keypoint_depth_prior(
-    keyframe: Keyframe, anchor_p_w: FloatArray, unknown_sigma_log: float
+def depth_prior(
+    keyframe: Keyframe, uv: FloatArray, anchor_p_w: FloatArray, unknown_sigma_log: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Expected z-depth [map units] and its log sigma at every keypoint of a keyframe, ``(N,)`` each.
+    """Expected z-depth [map units] and its log sigma at pixels ``(N, 2)`` of a keyframe, ``(N,)`` each.
 
     With a depth map: the network's depth, brought to map units by the keyframe's own anchors. Without one: the
     distance-weighted log depth of the nearest anchors in the image, with a wide sigma.
 
     Args:
         keyframe: Keyframe with some anchors.
+        uv: Undistorted pixels.
         anchor_p_w: ``(A, 3)`` positions of all anchors, indexed by id.
         unknown_sigma_log: Sigma where no network speaks.
     """
-    uv = keyframe.features.uv
     held = keyframe.keypoints_with_anchor()
     z = (anchor_p_w[keyframe.anchor[held]] @ keyframe.T_c_w[:3, :3].T + keyframe.T_c_w[:3, 3])[:, 2]
     held, z = held[z > 0], z[z > 0]
     if len(held) == 0:
         return np.full(len(uv), np.nan), np.full(len(uv), np.inf)
+    anchor_uv = keyframe.features.uv[held]
     if keyframe.depth is not None:
-        network, sigma = sample(keyframe.depth, uv)
-        fit = fit_to_anchors(network[held], z)
+        fit = fit_to_anchors(sample(keyframe.depth, anchor_uv)[0], z)
         if fit is not None:
+            network, sigma = sample(keyframe.depth, uv)
             return network * np.exp(fit.log_ratio), np.hypot(sigma, 0.05)
     k = min(4, len(held))
-    distance, nearest = cKDTree(uv[held]).query(uv, k=k)
+    distance, nearest = cKDTree(anchor_uv).query(uv, k=k)
     distance, nearest = distance.reshape(len(uv), k), nearest.reshape(len(uv), k)
     weight = 1.0 / (distance + 5.0)
     log_z = (weight * np.log(z)[nearest]).sum(1) / weight.sum(1)

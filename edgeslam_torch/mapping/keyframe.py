@@ -30,8 +30,10 @@ class Keyframe:
     tree: cKDTree
     """Over ``features.uv``."""
     depth: DepthMap | None = None
+    image: NDArray[np.uint8] | None = None
+    """Undistorted, ``(H, W, 3)`` BGR or ``(H, W)`` grey; for edges."""
     grey: NDArray[np.uint8] | None = None
-    """``(H, W)`` undistorted, for edge depth; dropped when the keyframe leaves the edge window."""
+    """``(H, W)`` undistorted, as other keyframes' edges are searched in it."""
 
     @property
     def T_w_c(self) -> FloatArray:

@@ -6,7 +6,7 @@ import numpy as np
 
 from edgeslam_torch.config import DepthConfig, MappingConfig, OrbConfig, TrackingConfig
 from edgeslam_torch.geometry.camera import Camera
-from edgeslam_torch.mapping.depth_prior import keypoint_depth_prior
+from edgeslam_torch.mapping.depth_prior import depth_prior
 from edgeslam_torch.mapping.keyframe import Keyframe
 from edgeslam_torch.mapping.new_anchors import epipolar_matches, triangulate_matches
 from edgeslam_torch.mapping.refinement import choose_window, refine
@@ -75,7 +75,9 @@ class Mapper:
 
     def triangulate_new(self, keyframe: Keyframe, neighbours: list[Keyframe], colour: np.ndarray) -> None:
         """New anchors from keypoints that neither side has an anchor for yet."""
-        prior, sigma = keypoint_depth_prior(keyframe, self.map.anchors.p_w, self.depth.prior_sigma_log)
+        prior, sigma = depth_prior(
+            keyframe, keyframe.features.uv, self.map.anchors.p_w, self.depth.prior_sigma_log
+        )
         for other in neighbours:
             baseline = float(np.linalg.norm(other.centre_w - keyframe.centre_w))
             if baseline < 0.01 * float(np.nanmedian(prior)):

@@ -1,0 +1,47 @@
+"""Canny edges twice: kornia's for batches, devices and training, OpenCV's for the CPU in real time.
+
+Both use the 3x3 Sobel gradient with the L2 norm, so that a kornia threshold ``t`` is OpenCV's ``255 t``; a test holds
+them together. kornia's own hysteresis walks the edges pixel by pixel in Python (1.4 s a frame); connected components
+give the same pixels in 3 ms.
+"""
+
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+
+def canny(grey: NDArray[np.uint8], low: float, high: float) -> NDArray[np.bool_]:
+    """Edge mask ``(H, W)`` of a grey image; thresholds in grey levels of the 3x3 Sobel gradient."""
+    smooth = cv2.GaussianBlur(grey, (5, 5), 1.0)
+    return cv2.Canny(smooth, low, high, L2gradient=True).astype(bool)
+
+
+def canny_batch(images: "Tensor", low: float, high: float) -> "Tensor":
+    """Edge masks ``(B, H, W)`` bool of images ``(B, 1 or 3, H, W)`` in [0, 1]; the same thresholds as `canny`.
+
+    Runs on the images' device; carries no gradient.
+    """
+    import torch
+    from kornia.filters import Canny
+
+    detector = Canny(low / 255.0, high / 255.0, hysteresis=False, kernel_size=(5, 5), sigma=(1.0, 1.0))
+    with torch.no_grad():
+        _, classes = detector(images)  # 0.5 weak, 1.0 strong
+    strong = (classes[:, 0] > 0.75).cpu().numpy()
+    candidate = (classes[:, 0] > 0.25).cpu().numpy()
+    masks = np.stack([hysteresis(c, s) for c, s in zip(candidate, strong, strict=True)])
+    return torch.from_numpy(masks).to(images.device)
+
+
+def hysteresis(candidate: NDArray[np.bool_], strong: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Candidate pixels that hang together (8 neighbours) with a strong one."""
+    count, labels = cv2.connectedComponents(candidate.astype(np.uint8), connectivity=8)
+    keep = np.zeros(count, dtype=bool)
+    keep[labels[strong & candidate]] = True
+    keep[0] = False
+    return keep[labels]

@@ -1,0 +1,37 @@
+"""Edge pixels of a keyframe with their normals and colours."""
+
+import cv2
+import numpy as np
+
+from edgeslam_torch.frontend.canny import canny
+from edgeslam_torch.types import Edges, FloatArray
+
+
+def extract_edges(image: np.ndarray, low: float, high: float, most: int, border_px: int = 6) -> Edges:
+    """Canny edges of an undistorted image ``(H, W, 3)`` BGR or ``(H, W)`` grey.
+
+    Args:
+        image: Undistorted image.
+        low: Lower hysteresis threshold, grey levels.
+        high: Upper hysteresis threshold.
+        most: Edge pixels to keep; more are thinned evenly along the edges.
+        border_px: Margin without edges, where gradients and warped patches leave the image.
+    """
+    grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    mask = canny(grey, low, high)
+    mask[:border_px] = mask[-border_px:] = False
+    mask[:, :border_px] = mask[:, -border_px:] = False
+    v, u = np.nonzero(mask)
+    if len(u) > most:
+        # Every n-th pixel of a diagonal sweep: neighbours on an edge differ in u + v, so edges thin evenly.
+        order = np.argsort((u + v) % max(2, int(np.ceil(len(u) / most))) * 2 + (u % 2), kind="stable")[:most]
+        order.sort()
+        u, v = u[order], v[order]
+    smooth = cv2.GaussianBlur(grey, (5, 5), 1.0)
+    gx = cv2.Sobel(smooth, cv2.CV_32F, 1, 0)[v, u]
+    gy = cv2.Sobel(smooth, cv2.CV_32F, 0, 1)[v, u]
+    norm = np.maximum(np.hypot(gx, gy), 1e-6)
+    colour = image[v, u]
+    colour = np.repeat(colour[:, None], 3, axis=1) if image.ndim == 2 else colour[:, ::-1]
+    normal: FloatArray = np.stack([gx / norm, gy / norm], axis=1).astype(np.float32)
+    return Edges(np.stack([u, v], axis=1).astype(np.float32), normal, np.ascontiguousarray(colour))

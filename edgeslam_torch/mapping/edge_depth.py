@@ -1,0 +1,200 @@
+"""Depth of edge pixels: the prior narrows a search along the epipolar lines of several keyframes.
+
+The depth network (or the anchors around a pixel) says roughly how deep an edge is; where exactly is measured, as in
+semi-dense mapping (Engel et al., ICCV 2013; Mur-Artal and Tardos, RSS 2015), by comparing the grey profile across
+the edge with what the other keyframes show at each hypothesis. An edge that runs along the epipolar line cannot be
+measured and is left out.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.types import FloatArray
+
+PROFILE_PX = np.array([-4.0, -2.0, 0.0, 2.0, 4.0])
+"""Offsets along the edge normal at which grey values are compared."""
+TRUNCATE = 30.0
+"""Grey levels; a larger difference says no more (occlusion, highlight)."""
+MAX_COST = 12.0
+"""Mean grey difference of an accepted match; sensor noise and resampling give 3 to 6."""
+MIN_CURVATURE = 0.3
+"""Grey levels per squared hypothesis step; flatter minima have no position."""
+
+_ROW = 1024
+
+
+@dataclass(frozen=True, slots=True)
+class StereoView:
+    """A keyframe as edge stereo sees it."""
+
+    grey: NDArray[np.uint8]
+    """``(H, W)`` undistorted."""
+    T_c_w: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class EdgeDepth:
+    """Measured inverse depths of edge pixels."""
+
+    inverse_depth: FloatArray
+    """``(E,)`` [1/map unit], NaN where not measured."""
+    sigma: FloatArray
+    """``(E,)`` its standard deviation."""
+
+
+def measure_edge_depth(
+    host: StereoView,
+    uv: FloatArray,
+    normal: FloatArray,
+    prior_depth: FloatArray,
+    prior_sigma_log: FloatArray,
+    targets: list[StereoView],
+    camera: Camera,
+    hypotheses: int = 32,
+) -> EdgeDepth:
+    """Inverse depth of edge pixels ``(E, 2)`` of the host by multi-view search.
+
+    Args:
+        host: Keyframe that owns the pixels.
+        uv: Edge pixels.
+        normal: Unit gradients ``(E, 2)``.
+        prior_depth: Expected z-depth ``(E,)`` [map units].
+        prior_sigma_log: Its log standard deviation; the search spans two and a half either way.
+        targets: Other keyframes with some baseline.
+        camera: Intrinsics.
+        hypotheses: Samples of the coarse search.
+    """
+    E = len(uv)
+    unknown = EdgeDepth(np.full(E, np.nan), np.full(E, np.nan))
+    if E == 0 or not targets:
+        return unknown
+    reach = np.exp(2.5 * prior_sigma_log)
+    low, high = 1.0 / (prior_depth * reach), reach / prior_depth
+    step = (high - low) / (hypotheses - 1)
+    grid = low[:, None] + step[:, None] * np.arange(hypotheses)
+    rays = np.stack(
+        [(uv[:, 0] - camera.cx) / camera.fx, (uv[:, 1] - camera.cy) / camera.fy, np.ones(E)], axis=1
+    ).astype(np.float32)
+    profile = _profile(host.grey, uv, normal)
+    coarse = _cost(host, rays, normal, profile, grid, targets, camera)
+    best = np.argmin(coarse, axis=1)
+    rows = np.arange(E)
+    lowest = coarse[rows, best]
+    # Unique: no other valley nearly as deep.
+    away = np.abs(np.arange(hypotheses)[None, :] - best[:, None]) > 3
+    rival = np.where(away, coarse, np.inf).min(axis=1)
+    inner = (best > 0) & (best < hypotheses - 1)
+    ok = np.flatnonzero(inner & (lowest < MAX_COST) & (rival > 1.3 * lowest + 1.0))
+    if len(ok) == 0:
+        return unknown
+    fine_step = 0.3 * step[ok]
+    fine_grid = grid[ok, best[ok]][:, None] + fine_step[:, None] * np.arange(-4, 5)
+    fine = _cost(host, rays[ok], normal[ok], profile[ok], fine_grid, targets, camera)
+    k = np.clip(np.argmin(fine, axis=1), 1, fine.shape[1] - 2)
+    r = np.arange(len(ok))
+    a, b, c = fine[r, k - 1], fine[r, k], fine[r, k + 1]
+    curvature = a - 2.0 * b + c
+    with np.errstate(divide="ignore", invalid="ignore"):
+        offset = np.clip(0.5 * (a - c) / curvature, -1.0, 1.0)
+    rho = fine_grid[r, k] + offset * fine_step
+    sharp = (curvature > 1e-3) & np.isfinite(offset) & (b < MAX_COST)
+    inverse_depth, sigma = np.full(E, np.nan), np.full(E, np.nan)
+    inverse_depth[ok[sharp]] = rho[sharp]
+    sigma[ok[sharp]] = _sigma(host, rays[ok[sharp]], normal[ok[sharp]], rho[sharp], targets, camera)
+    return EdgeDepth(inverse_depth, sigma)
+
+
+def _profile(grey: NDArray[np.uint8], uv: FloatArray, normal: FloatArray) -> FloatArray:
+    """Grey values ``(E, P)`` across each edge."""
+    x = uv[:, None, 0] + PROFILE_PX * normal[:, None, 0]
+    y = uv[:, None, 1] + PROFILE_PX * normal[:, None, 1]
+    return _bilinear(grey, x, y)
+
+
+def _bilinear(grey: NDArray[np.uint8], x: FloatArray, y: FloatArray) -> FloatArray:
+    """Grey values at float pixels of any shape; `cv2.remap` wants fewer than 32768 rows and columns."""
+    rows = -(-x.size // _ROW)
+    maps = [np.zeros(rows * _ROW, np.float32) for _ in range(2)]
+    for flat, values in zip(maps, (x, y), strict=True):
+        flat[: x.size] = values.ravel()
+    out = cv2.remap(
+        grey, maps[0].reshape(rows, _ROW), maps[1].reshape(rows, _ROW), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
+    return out.ravel()[: x.size].reshape(x.shape).astype(np.float32)
+
+
+def _relative(host: StereoView, target: StereoView) -> tuple[FloatArray, FloatArray]:
+    R = target.T_c_w[:3, :3] @ host.T_c_w[:3, :3].T
+    return R.astype(np.float32), (target.T_c_w[:3, 3] - R @ host.T_c_w[:3, 3]).astype(np.float32)
+
+
+def _cost(
+    host: StereoView,
+    rays: FloatArray,
+    normal: FloatArray,
+    profile: FloatArray,
+    inverse_depth: FloatArray,
+    targets: list[StereoView],
+    camera: Camera,
+) -> FloatArray:
+    """Mean truncated grey difference ``(E, D)`` over the targets that can see and measure each edge."""
+    E, D = inverse_depth.shape
+    rho = inverse_depth.astype(np.float32)
+    total = np.zeros((E, D), np.float32)
+    weight = np.full((E, 1), 1e-6, np.float32)
+    for target in targets:
+        R, t = _relative(host, target)
+        a = rays @ R.T
+        z = a[:, 2:3] + rho * t[2]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            x = camera.fx * (a[:, 0:1] + rho * t[0]) / z + camera.cx
+            y = camera.fy * (a[:, 1:2] + rho * t[1]) / z + camera.cy
+        inside = (z > 0) & (x > 5) & (x < camera.width - 6) & (y > 5) & (y < camera.height - 6)
+        along = np.stack([x[:, -1] - x[:, 0], y[:, -1] - y[:, 0]], axis=1)
+        length = np.linalg.norm(along, axis=1)
+        turned = normal @ R[:2, :2].T
+        turned /= np.maximum(np.linalg.norm(turned, axis=1, keepdims=True), 1e-6)
+        across = np.abs((along * turned).sum(1)) / np.maximum(length, 1e-6)
+        useful = inside.all(axis=1) & (across > 0.25) & np.isfinite(length)
+        if not useful.any():
+            continue
+        w = np.where(useful, across, 0.0).astype(np.float32)[:, None]
+        rows = np.flatnonzero(useful)
+        px = x[rows, :, None] + (PROFILE_PX * turned[rows, 0:1]).astype(np.float32)[:, None, :]
+        py = y[rows, :, None] + (PROFILE_PX * turned[rows, 1:2]).astype(np.float32)[:, None, :]
+        seen = _bilinear(target.grey, px, py)
+        difference = seen - profile[rows, None, :]
+        # Half of a common brightness change is taken out: exposure drifts, but brightness also tells edges apart.
+        difference -= 0.5 * difference.mean(axis=2, keepdims=True)
+        total[rows] += w[rows] * np.minimum(np.abs(difference), TRUNCATE).mean(axis=2)
+        weight[rows] += w[rows]
+    cost = total / weight
+    cost[weight[:, 0] < 0.5] = np.inf  # fewer than about two useful targets
+    return cost
+
+
+def _sigma(
+    host: StereoView,
+    rays: FloatArray,
+    normal: FloatArray,
+    rho: FloatArray,
+    targets: list[StereoView],
+    camera: Camera,
+) -> FloatArray:
+    """Inverse-depth sigma of half a pixel across the edge, all useful targets together."""
+    information = np.full(len(rho), 1e-12)
+    for target in targets:
+        R, t = _relative(host, target)
+        a = rays @ R.T
+        z = a[:, 2] + rho * t[2]
+        # Derivative of the pixel by inverse depth.
+        du = camera.fx * (t[0] * a[:, 2] - a[:, 0] * t[2]) / z**2
+        dv = camera.fy * (t[1] * a[:, 2] - a[:, 1] * t[2]) / z**2
+        turned = normal @ R[:2, :2].T
+        turned /= np.maximum(np.linalg.norm(turned, axis=1, keepdims=True), 1e-6)
+        information += (du * turned[:, 0] + dv * turned[:, 1]) ** 2 / 0.5**2
+    return 1.0 / np.sqrt(information)

@@ -1,0 +1,174 @@
+"""The semi-dense edge map: edge points stay with the keyframe that measured them and move with its pose."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from edgeslam_torch.config import EdgeConfig
+from edgeslam_torch.frontend.edges import extract_edges
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.mapping.depth_prior import depth_prior
+from edgeslam_torch.mapping.edge_depth import StereoView, measure_edge_depth
+from edgeslam_torch.mapping.keyframe import Keyframe
+from edgeslam_torch.mapping.slam_map import SlamMap
+from edgeslam_torch.types import FloatArray, IntArray, PointCloud
+
+AGREE_PX = 2.0
+"""An edge of another keyframe this near to a projected point may be the same edge."""
+AGREE_DEPTH = 0.04
+"""Relative depth difference of the same edge measured from two keyframes."""
+
+
+@dataclass(slots=True)
+class EdgePoints:
+    """Measured edges of one keyframe, in its camera frame."""
+
+    keyframe_id: int
+    uv: FloatArray
+    """``(E, 2)``"""
+    p_c: FloatArray
+    """``(E, 3)``"""
+    sigma: FloatArray
+    """``(E,)`` standard deviation of the depth [map units]."""
+    colour: NDArray[np.uint8]
+    observations: IntArray
+    """``(E,)`` keyframes that measured the same point, this one included."""
+
+
+class EdgeMap:
+    """Measures the edges of keyframes and keeps them."""
+
+    def __init__(self, slam_map: SlamMap, camera: Camera, config: EdgeConfig, unknown_sigma_log: float) -> None:
+        self.map = slam_map
+        self.camera = camera
+        self.config = config
+        self.unknown_sigma_log = unknown_sigma_log
+        self.hosts: list[EdgePoints] = []
+        self._waiting: list[int] = []
+
+    def announce(self, keyframe: Keyframe) -> None:
+        """Queue a keyframe; its edges are measured once enough others have followed."""
+        self._waiting.append(keyframe.id)
+
+    def update(self, everything: bool = False) -> None:
+        """Measure the keyframes that have waited long enough, or all of them."""
+        keep = 0 if everything else self.config.delay_keyframes
+        while len(self._waiting) > keep:
+            keyframe = self.map.keyframes.get(self._waiting.pop(0))
+            if keyframe is not None:  # it may have been found redundant meanwhile
+                self._measure(keyframe)
+
+    def _measure(self, keyframe: Keyframe) -> None:
+        if keyframe.image is None:
+            return
+        targets = self._targets(keyframe)
+        if not targets:
+            return
+        config = self.config
+        edges = extract_edges(keyframe.image, config.canny_low, config.canny_high, config.max_pixels)
+        prior, sigma = depth_prior(keyframe, edges.uv, self.map.anchors.p_w, self.unknown_sigma_log)
+        known = np.isfinite(prior)
+        uv, normal = edges.uv[known], edges.normal[known]
+        measured = measure_edge_depth(
+            StereoView(keyframe.grey, keyframe.T_c_w),
+            uv,
+            normal,
+            prior[known],
+            sigma[known],
+            [StereoView(t.grey, t.T_c_w) for t in targets],
+            self.camera,
+        )
+        depth = 1.0 / measured.inverse_depth
+        relative = measured.sigma * depth
+        good = np.isfinite(depth) & (depth > 0) & (relative < config.max_sigma)
+        points = EdgePoints(
+            keyframe_id=keyframe.id,
+            uv=uv[good],
+            p_c=self.camera.back_project(uv[good], depth[good]),
+            sigma=(relative * depth)[good],
+            colour=edges.colour[known][good],
+            observations=np.ones(int(good.sum()), dtype=np.int32),
+        )
+        for other in self._overlapping(keyframe):
+            self._count_agreement(points, other)
+        self.hosts.append(points)
+
+    def _targets(self, keyframe: Keyframe) -> list[Keyframe]:
+        """Covisible keyframes whose baseline is long enough to measure and short enough to look alike."""
+        depth = self._median_depth(keyframe)
+        chosen = []
+        for other in self.map.covisible(keyframe, 4 * self.config.targets, min_shared=30):
+            baseline = float(np.linalg.norm(other.centre_w - keyframe.centre_w)) / depth
+            if other.image is not None and 0.02 < baseline < 0.5:
+                chosen.append(other)
+        return chosen[: self.config.targets]
+
+    def _median_depth(self, keyframe: Keyframe) -> float:
+        held = keyframe.anchor[keyframe.anchor >= 0]
+        z = (self.map.anchors.p_w[held] @ keyframe.T_c_w[:3, :3].T + keyframe.T_c_w[:3, 3])[:, 2]
+        return float(np.median(z[z > 0])) if (z > 0).any() else 1.0
+
+    def _overlapping(self, keyframe: Keyframe) -> list[EdgePoints]:
+        near = {k.id for k in self.map.covisible(keyframe, 3 * self.config.targets)}
+        return [h for h in self.hosts[-40:] if h.keyframe_id in near][-8:]
+
+    def _count_agreement(self, points: EdgePoints, other: EdgePoints) -> None:
+        """Raise the count of points that two keyframes measured alike: the cycle of paper eqs. (17)-(22), as a test."""
+        if len(points.uv) == 0 or len(other.uv) == 0:
+            return
+        T = self.map.pose_of(other.keyframe_id) @ se3.inverse(self.map.pose_of(points.keyframe_id))
+        p_o = se3.transform(T, points.p_c)
+        front = np.flatnonzero(p_o[:, 2] > 0)
+        distance, nearest = cKDTree(other.uv).query(
+            self.camera.project(p_o[front]), distance_upper_bound=AGREE_PX
+        )
+        found = np.isfinite(distance)
+        mine, theirs = front[found], nearest[found]
+        z_theirs = other.p_c[theirs, 2]
+        same = np.abs(p_o[mine, 2] - z_theirs) < AGREE_DEPTH * z_theirs
+        points.observations[mine[same]] += 1
+        other.observations[np.unique(theirs[same])] += 1
+
+    def points(self) -> PointCloud:
+        """Edge points that several keyframes agree on, fused in cells, in the map's world frame."""
+        clouds = [
+            (se3.transform(se3.inverse(self.map.pose_of(h.keyframe_id)), h.p_c), h) for h in self.hosts
+        ]
+        if not clouds:
+            empty = np.zeros((0, 3), np.float32)
+            return PointCloud(empty, np.zeros((0, 3), np.uint8), np.zeros(0, np.float32), np.zeros(0, np.int32))
+        p_w = np.concatenate([p for p, _ in clouds])
+        sigma = np.concatenate([h.sigma for _, h in clouds])
+        colour = np.concatenate([h.colour for _, h in clouds])
+        count = np.concatenate([h.observations for _, h in clouds])
+        depth = np.median(np.concatenate([h.p_c[:, 2] for _, h in clouds]))
+        agreed = count >= self.config.min_observations
+        return fuse(p_w[agreed], sigma[agreed], colour[agreed], count[agreed], self.config.voxel * float(depth))
+
+
+def fuse(
+    p_w: FloatArray, sigma: FloatArray, colour: NDArray[np.uint8], count: IntArray, voxel: float
+) -> PointCloud:
+    """One point per occupied cell: the inverse-variance mean of what lies in it."""
+    if len(p_w) == 0:
+        return PointCloud(p_w.astype(np.float32), colour, sigma.astype(np.float32), count.astype(np.int32))
+    cell = np.floor(p_w / voxel).astype(np.int64)
+    cell -= cell.min(axis=0)
+    extent = cell.max(axis=0) + 1
+    key = (cell[:, 0] * extent[1] + cell[:, 1]) * extent[2] + cell[:, 2]
+    _, group, size = np.unique(key, return_inverse=True, return_counts=True)
+    weight = 1.0 / np.maximum(sigma, 1e-9) ** 2
+    total = np.bincount(group, weight)
+    mean = np.stack([np.bincount(group, weight * p_w[:, i]) / total for i in range(3)], axis=1)
+    rgb = np.stack([np.bincount(group, weight * colour[:, i]) / total for i in range(3)], axis=1)
+    most = np.zeros(len(size), dtype=np.int64)
+    np.maximum.at(most, group, count)
+    # Errors of one cell's points share their poses: the best single sigma, not the sum of informations.
+    best = np.full(len(size), np.inf)
+    np.minimum.at(best, group, sigma)
+    return PointCloud(
+        mean.astype(np.float32), np.rint(rgb).astype(np.uint8), best.astype(np.float32), most.astype(np.int32)
+    )
