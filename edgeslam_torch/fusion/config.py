@@ -55,7 +55,7 @@ class FusionConfig:
     """Error of one attitude reading: 1 deg / sqrt(12) of quantisation that repeats while the drone hovers."""
     sigma_turn_rad_sqrt_s: float = 0.3
     """Random walk of the angles between readings: the drone's own turning, which the state does not predict."""
-    sigma_bias_m_s: float = 0.05
+    sigma_bias_m_s: float = 0.03
     """Velocity bias at the start (0 takes the bias out of the state: the paper's six states)."""
     bias_walk_m_s_sqrt_s: float = 0.005
     """Random walk of the velocity bias, before the battery factor."""
@@ -67,7 +67,7 @@ class FusionConfig:
     gate_probability: float = 0.95
     """Innovations beyond this quantile of chi-square are refused."""
     refusals_before_recovery: int = 5
-    """Refusals in a row after which the covariance is inflated and the measurement taken: the filter is wrong, not it."""
+    """Refusals in a row after which the covariance is inflated and the measurement taken."""
     buffer_s: float = 3.0
     """How far back a late measurement is still put in its place."""
 
@@ -81,7 +81,7 @@ class FusionConfig:
     """Displacements older than this are forgotten."""
     max_gap_s: float = 0.35
     """A longer hole in telemetry or tracking ends a displacement."""
-    bias_knot_s: float = 15.0
+    bias_knot_s: float = 5.0
     """Spacing of the piecewise-constant velocity bias in the scale fit."""
     alignment_sigma_rad: float = math.radians(3.0)
     """How far the attitude-derived rotation from map to power-on world may be corrected by displacements."""

@@ -203,7 +203,7 @@ class Ekf:
         self.refused_in_row = 0
         K = P_Ht @ S_inverse
         self.x += K @ residual
-        self.P -= K @ P_Ht.T
+        self.P = self.P - K @ P_Ht.T
         self.P = 0.5 * (self.P + self.P.T)
         if not self.config.literal:
             self.x[_A] = wrapped(self.x[_A])

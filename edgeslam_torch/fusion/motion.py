@@ -323,7 +323,7 @@ class MotionFusion:
         if fit is None:
             return  # nothing new to say: hover, pure rotation, or telemetry missing
         opinions = []
-        self._fit, self._R_w_m = fit, fit.rotation @ R
+        self._fit = fit
         if fit.sigma < 0.3:
             sigma = math.hypot(fit.sigma, self.config.systematic_log)
             opinions.append(LogScale(fit.log_scale, sigma, "telemetry"))
@@ -371,6 +371,7 @@ class MotionFusion:
             block,
             self.config.alignment_sigma_rad,
             self.config.sigma_bias_m_s,
+            max(1.5 * self.config.bias_walk_m_s_sqrt_s * math.sqrt(self.config.bias_knot_s), 1e-4),
         )
 
     def _moving(self, moved_map: FloatArray, duration_s: FloatArray, moved_m: FloatArray) -> FloatArray:

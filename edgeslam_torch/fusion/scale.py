@@ -54,6 +54,7 @@ def fit_displacements(
     block: IntArray,
     alignment_sigma_rad: float,
     bias_sigma_m_s: float,
+    bias_step_m_s: float,
     iterations: int = 12,
 ) -> DisplacementFit | None:
     r"""Scale between visual and telemetry displacements of the same intervals, both of them noisy.
@@ -70,7 +71,8 @@ def fit_displacements(
         sigma_m: Expected standard deviation of ``moved_m`` per axis, shape ``(N,)``.
         block: Index of the velocity bias that holds in the interval, from 0, shape ``(N,)``.
         alignment_sigma_rad: Prior on the rotation correction.
-        bias_sigma_m_s: Prior on each velocity bias.
+        bias_sigma_m_s: Prior on the first velocity bias.
+        bias_step_m_s: Prior on the change from one block's bias to the next.
         iterations: Reweighting steps.
 
     Returns:
@@ -86,7 +88,7 @@ def fit_displacements(
     R, bias = np.eye(3), np.zeros((K, 3))
     sigma_map = np.minimum(sigma_map, 0.3 * math.sqrt(float(np.mean(moved_map**2))))
     spread = 1.0
-    prior = np.concatenate([[0.0], np.full(3, alignment_sigma_rad**-2), np.full(3 * K, bias_sigma_m_s**-2)])
+    prior = _prior(K, alignment_sigma_rad, bias_sigma_m_s, bias_step_m_s)
     information = np.eye(4 + 3 * K)
     for iteration in range(iterations):
         scale = math.exp(log_scale)
@@ -105,8 +107,8 @@ def fit_displacements(
         J, J_latent = (_jacobian(scale * v, duration_s, block, K) for v in (turned, latent))
         w = np.repeat(weight / (variance * spread**2), 3)
         theta = np.concatenate([[0.0], _small_rotation(R), bias.ravel()])
-        information = (J_latent * w[:, None]).T @ J + np.diag(prior)
-        step = np.linalg.solve(information, J_latent.T @ (w * residual.ravel()) - prior * theta)
+        information = (J_latent * w[:, None]).T @ J + prior
+        step = np.linalg.solve(information, J_latent.T @ (w * residual.ravel()) - prior @ theta)
         log_scale += float(np.clip(step[0], -0.5, 0.5))
         R = _rotation(step[1:4]) @ R
         bias += step[4:].reshape(K, 3)
@@ -121,6 +123,18 @@ def fit_displacements(
     if weight.sum() < _MIN_DISPLACEMENTS or not math.isfinite(sigma):
         return None
     return DisplacementFit(log_scale, sigma, R, bias, cost, rms)
+
+
+def _prior(K: int, alignment_sigma_rad: float, bias_sigma_m_s: float, bias_step_m_s: float) -> FloatArray:
+    """Information of (log s, rotation, biases) before any displacement: the biases are a random walk."""
+    difference = np.eye(K) - np.eye(K, k=-1)
+    sigma = np.full(K, bias_step_m_s)
+    sigma[0] = bias_sigma_m_s
+    walk = difference.T @ np.diag(sigma**-2) @ difference
+    information = np.zeros((4 + 3 * K, 4 + 3 * K))
+    information[range(1, 4), range(1, 4)] = alignment_sigma_rad**-2
+    information[4:, 4:] = np.kron(walk, np.eye(3))
+    return information
 
 
 def _jacobian(moved: FloatArray, duration_s: FloatArray, block: IntArray, K: int) -> FloatArray:

@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.fusion.rotations import matrix_from_rpy
@@ -56,21 +57,24 @@ class TelemetryTrack:
         return self._table
 
     def _build(self) -> FloatArray:
-        """Columns: stamp, displacement 3, unwrapped rpy 3, tof, h, baro, valid."""
+        """Columns: stamp, displacement 3, unwrapped rpy 3, tof, h, baro, valid, velocity 3."""
         rows = np.array(self._rows)
         stamp, velocity = rows[:, 0], _filled(rows[:, 1:4])
         rpy = np.unwrap(_filled(rows[:, 4:7]), axis=0)
         if self._body:
             velocity = np.einsum("nij,nj->ni", Rotation.from_euler("ZYX", rpy[:, ::-1]).as_matrix(), velocity)
-        valid = np.isfinite(rows[:, 1:4]).all(axis=1) & ~_frozen(stamp, rows[:, 1:7])
-        steps = 0.5 * (velocity[1:] + velocity[:-1]) * np.diff(stamp)[:, None]
-        moved = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
-        return np.column_stack([stamp, moved, rpy, rows[:, 7:10], valid])
+        valid = np.isfinite(rows[:, 1:4]).all(axis=1) & np.logical_not(_frozen(stamp, rows[:, 1:7]))
+        moved = _integral(stamp, velocity)
+        return np.column_stack([stamp, moved, rpy, rows[:, 7:10], valid, velocity])
 
     def displacement(self, stamps_s: FloatArray) -> FloatArray:
         """Integrated velocity [m] in the power-on world, shape ``(N, 3)``; only differences mean anything."""
         table = self._tables()
-        return np.stack([np.interp(stamps_s, table[:, 0], table[:, 1 + i]) for i in range(3)], axis=-1)
+        if len(table) < 2:
+            return np.zeros((len(stamps_s), 3))
+        inside = np.clip(stamps_s, table[0, 0], table[-1, 0])
+        after = (np.asarray(stamps_s) - inside)[:, None] * table[-1, 11:14]  # one packet ahead at the last velocity
+        return CubicHermiteSpline(table[:, 0], table[:, 1:4], table[:, 11:14])(inside) + np.clip(after, -0.5, 0.5)
 
     def attitude(self, stamps_s: FloatArray) -> FloatArray:
         """Body to power-on world ``(N, 3, 3)``."""
@@ -109,6 +113,21 @@ class TelemetryTrack:
             if good.any():
                 sources[name] = (table[good, 0], z[good])
         return sources
+
+
+def _integral(stamp: FloatArray, velocity: FloatArray) -> FloatArray:
+    """Running integral with cubic pieces ``(N, 3)``.
+
+    At 10 Hz the trapezoid rule loses (w h)^2 / 12 of a swing at w rad/s: more than 1 % of a hand's motion.
+    """
+    if len(stamp) < 3:
+        slope = np.zeros_like(velocity)
+    else:
+        slope = np.gradient(velocity, stamp, axis=0)
+    h = np.diff(stamp)[:, None]
+    h_squared = np.where(h < 0.5, h**2, 0.0)  # no curvature across a hole
+    steps = 0.5 * h * (velocity[1:] + velocity[:-1]) + h_squared / 12.0 * (slope[:-1] - slope[1:])
+    return np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
 
 
 def _filled(rows: FloatArray) -> FloatArray:
