@@ -1,6 +1,7 @@
 """FastDepth to ONNX: one graph, checked before it is called done."""
 
 import json
+import logging
 import warnings
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -45,6 +46,8 @@ def export_onnx(network: FastDepth, metadata: Metadata, path: Path, options: Exp
     if options.dynamic:
         h, w = torch.export.Dim("h32", min=1, max=64), torch.export.Dim("w32", min=1, max=64)
         shapes = ({2: 32 * h, 3: 32 * w},)
+    # The exporter warns about operators of torchvision, which we do not use.
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     with warnings.catch_warnings(), torch.no_grad():
         warnings.simplefilter("ignore")
         program = torch.onnx.export(

@@ -1,0 +1,161 @@
+"""``edgeslam export``: depth network to ONNX for other computers, checked and measured."""
+
+import argparse
+import time
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from edgeslam_torch.errors import ConfigError, OutputError
+
+if TYPE_CHECKING:
+    from torch import nn
+
+    from edgeslam_torch.models.record import Metadata
+    from edgeslam_torch.types import FloatArray
+
+HELP = "export the depth network to ONNX (float32, float16 or int8)"
+
+PARITY_RTOL = 1e-4
+"""Largest relative difference of depth between torch and onnxruntime in float32."""
+CALIBRATION_IMAGES = 96
+CHECK_IMAGES = 16
+TIMED_RUNS = 20
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's options."""
+    parser.add_argument("weights", nargs="?", type=Path, help="weights (.safetensors); the shipped ones by default")
+    parser.add_argument("--out", "-o", type=Path, required=True, help="ONNX file to write")
+    parser.add_argument("--int8", action="store_true", help="static int8 quantisation; needs --calibrate")
+    parser.add_argument("--fp16", action="store_true", help="store weights as float16")
+    parser.add_argument("--calibrate", help="images, recording or video like those it will see")
+    parser.add_argument("--size", metavar="HxW", help="input size, multiples of 32 (default: as trained)")
+    parser.add_argument("--opset", type=int, default=18, help="ONNX operator set")
+    parser.add_argument(
+        "--old-runtime", action="store_true", help="for onnxruntime before 1.17: opset 17 and IR version 9"
+    )
+
+
+def main(args: argparse.Namespace) -> int:
+    """Export, compare with torch on real frames, print the table."""
+    from edgeslam_torch.models.checkpoint import load_checkpoint
+    from edgeslam_torch.models.export_onnx import OLD_RUNTIME_OPSET, ExportOptions, export_onnx
+    from edgeslam_torch.models.fold import deployed
+    from edgeslam_torch.models.quantize import quantize_int8, store_float16
+
+    if args.int8 and args.fp16:
+        raise ConfigError("--int8 and --fp16 exclude each other")
+    if args.int8 and args.calibrate is None:
+        raise ConfigError("--int8 needs --calibrate DATA: real frames like those the network will see")
+    network, metadata = load_checkpoint(args.weights)
+    height, width = _size(args.size, metadata)
+    opset = min(args.opset, OLD_RUNTIME_OPSET) if args.old_runtime else args.opset
+    images = _images(args.calibrate, height, width, metadata)
+    try:
+        args.out.parent.mkdir(parents=True, exist_ok=True)
+        with TemporaryDirectory() as folder:
+            plain = Path(folder) / "float32.onnx"
+            export_onnx(network, metadata, plain, ExportOptions(height, width, opset))
+            models = {"float32": _Model(plain)}
+            _require_parity(models["float32"], deployed(network, metadata), images[:CHECK_IMAGES])
+            target = plain
+            if args.int8 or args.fp16:
+                target = Path(folder) / "target.onnx"
+                if args.int8:
+                    quantize_int8(plain, target, images)
+                else:
+                    store_float16(plain, target)
+                models["int8" if args.int8 else "float16"] = _Model(target)
+            print(_table(models, images[:CHECK_IMAGES]))
+            temporary = args.out.with_name(args.out.name + ".part")
+            temporary.write_bytes(target.read_bytes())
+            temporary.replace(args.out)
+    except OSError as error:
+        raise OutputError(f"{args.out}: cannot be written ({error.strerror or error})") from error
+    print(f"{args.out}: {height}x{width}, opset {opset}, focal length {metadata.focal_px:.1f} px in the input")
+    return 0
+
+
+def _size(text: str | None, metadata: "Metadata") -> tuple[int, int]:
+    if text is None:
+        return metadata.input_height, metadata.input_width
+    try:
+        height, width = (int(n) for n in text.lower().split("x"))
+    except ValueError:
+        raise ConfigError(f"--size {text}: expected HEIGHTxWIDTH, for example 192x256") from None
+    if height % 32 or width % 32 or height < 32 or width < 32:
+        raise ConfigError(f"--size {text}: height and width must be multiples of 32")
+    return height, width
+
+
+def _images(source: str | None, height: int, width: int, metadata: "Metadata") -> "list[FloatArray]":
+    """Preprocessed frames, spread evenly over the source; noise-free ramps when there is none."""
+    from edgeslam_torch.frontend.depth import preprocess
+
+    if source is None:
+        ramp = np.linspace(0, 255, 640 * 480 * 3).reshape(480, 640, 3).astype(np.uint8)
+        flips = (ramp, np.ascontiguousarray(ramp[::-1]), np.ascontiguousarray(ramp[:, ::-1]))
+        return [preprocess(image, height, width, metadata) for image in flips]
+    from edgeslam_torch.io.source import open_source
+
+    opened = open_source(source)
+    step = max((opened.length or CALIBRATION_IMAGES) // CALIBRATION_IMAGES, 1)
+    kept = (f for i, f in enumerate(opened.frames()) if i % step == 0)
+    undistorted = (np.asarray(opened.camera.undistort_image(f.image), np.uint8) for f in kept)
+    return [preprocess(image, height, width, metadata) for image in undistorted]
+
+
+def _require_parity(model: "_Model", module: "nn.Module", images: "list[FloatArray]") -> None:
+    """Raise OutputError unless onnxruntime gives torch's depth."""
+    import torch
+
+    for image in images:
+        with torch.no_grad():
+            expected = module(torch.from_numpy(image))[0].numpy()
+        worst = float(np.abs(np.exp(model.log_depth(image) - expected) - 1).max())
+        if worst > PARITY_RTOL:
+            raise OutputError(f"exported depth differs from torch by {worst:.1e} (limit {PARITY_RTOL:.0e})")
+
+
+def _table(models: "dict[str, _Model]", images: "list[FloatArray]") -> str:
+    lines = [
+        "| model | MB | ms (1 thread, median) | depth against float32: mean | 99 % |",
+        "|---|---|---|---|---|",
+    ]
+    reference = [models["float32"].log_depth(image) for image in images]
+    for name, model in models.items():
+        pairs = zip(images, reference, strict=True)
+        error = np.concatenate([np.abs(np.exp(model.log_depth(x) - r) - 1).ravel() for x, r in pairs])
+        ms = np.median([model.milliseconds(image) for image in images[:3]])
+        lines.append(
+            f"| {name} | {model.megabytes:.1f} | {ms:.1f} | {error.mean():.2%} | {np.percentile(error, 99):.2%} |"
+        )
+    return "\n".join(lines)
+
+
+class _Model:
+    """An ONNX file on one thread."""
+
+    def __init__(self, path: Path) -> None:
+        import onnxruntime
+
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads, options.inter_op_num_threads, options.log_severity_level = 1, 1, 3
+        self.megabytes = path.stat().st_size / 1e6
+        self._session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+
+    def log_depth(self, image: "FloatArray") -> "FloatArray":
+        """``(1, 1, H, W)``."""
+        return np.asarray(self._session.run(["log_depth"], {"image": image})[0])
+
+    def milliseconds(self, image: "FloatArray") -> float:
+        """Median of several runs."""
+        times = []
+        for _ in range(TIMED_RUNS):
+            start = time.perf_counter()
+            self._session.run(None, {"image": image})
+            times.append(time.perf_counter() - start)
+        return float(np.median(times)) * 1e3

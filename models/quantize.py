@@ -1,0 +1,118 @@
+"""Static int8 quantisation of an exported network, and float16 weights.
+
+Activations uint8, weights int8 per output channel, as QDQ pairs: the combination onnxruntime's x86 and Arm
+kernels
+are fastest with (signed activations run slower than float32 on x86 without VNNI).
+"""
+
+import logging
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import onnx
+from numpy.typing import NDArray
+from onnx import TensorProto, helper, numpy_helper
+
+from edgeslam_torch.models.export_onnx import INPUT, LOG_DEPTH, SIGMA
+
+MIN_CALIBRATION_IMAGES = 8
+
+
+def quantize_int8(source: Path, target: Path, images: Iterable[NDArray[np.float32]]) -> None:
+    """Write an int8 version of ``source``.
+
+    The last convolution and what follows it stay in float32: they turn 32 features into the depth itself,
+    cost
+    nothing, and 256 levels of log depth would be visible as steps.
+
+    Args:
+        source: File written by `export_onnx`.
+        target: Where to write.
+        images: Preprocessed inputs ``(1, 3, H, W)`` of real frames like those it will see.
+
+    Raises:
+        ValueError: If there are fewer than 8 images.
+    """
+    from onnxruntime.quantization import CalibrationMethod, QuantFormat, QuantType, quantize_static
+    from onnxruntime.quantization.shape_inference import quant_pre_process
+
+    samples = list(images)
+    if len(samples) < MIN_CALIBRATION_IMAGES:
+        raise ValueError(f"calibration needs at least {MIN_CALIBRATION_IMAGES} images, got {len(samples)}")
+    properties = {p.key: p.value for p in onnx.load(str(source)).metadata_props}
+    logger = logging.getLogger()
+    level = logger.level
+    with TemporaryDirectory() as folder:
+        prepared = Path(folder) / "prepared.onnx"
+        logger.setLevel(logging.ERROR)  # onnxruntime advises on the root logger what we already do
+        try:
+            quant_pre_process(str(source), str(prepared), skip_symbolic_shape=True)
+            quantize_static(
+                str(prepared),
+                str(target),
+                _Samples(samples),
+                quant_format=QuantFormat.QDQ,
+                per_channel=True,
+                activation_type=QuantType.QUInt8,
+                weight_type=QuantType.QInt8,
+                nodes_to_exclude=_tail(onnx.load(str(prepared))),
+                calibrate_method=CalibrationMethod.MinMax,
+                extra_options={"ActivationSymmetric": False, "WeightSymmetric": True},
+            )
+        finally:
+            logger.setLevel(level)
+    model = onnx.load(str(target))
+    helper.set_model_props(model, properties)
+    onnx.checker.check_model(model, full_check=True)
+    onnx.save(model, str(target))
+
+
+def store_float16(source: Path, target: Path) -> None:
+    """Halve a file: weights are stored as float16 and cast once when the model is loaded; arithmetic stays
+    float32."""
+    model = onnx.load(str(source))
+    casts, kept = [], []
+    for tensor in model.graph.initializer:
+        array = numpy_helper.to_array(tensor)
+        if array.dtype != np.float32 or array.size < 256:
+            kept.append(tensor)
+            continue
+        half = f"{tensor.name}_half"
+        kept.append(numpy_helper.from_array(array.astype(np.float16), half))
+        casts.append(helper.make_node("Cast", [half], [tensor.name], to=TensorProto.FLOAT))
+    nodes = casts + list(model.graph.node)
+    del model.graph.initializer[:], model.graph.node[:]
+    model.graph.initializer.extend(kept)
+    model.graph.node.extend(nodes)
+    onnx.checker.check_model(model, full_check=True)
+    onnx.save(model, str(target))
+
+
+class _Samples:
+    """onnxruntime's calibration reader."""
+
+    def __init__(self, images: list[NDArray[np.float32]]) -> None:
+        self._iterator: Iterator[NDArray[np.float32]] = iter(images)
+
+    def get_next(self) -> dict[str, NDArray[np.float32]] | None:
+        """One input, None at the end."""
+        image = next(self._iterator, None)
+        return None if image is None else {INPUT: image}
+
+
+def _tail(model: onnx.ModelProto) -> list[str]:
+    """Names of the nodes between the last features and the outputs (back to and including the
+    convolutions)."""
+    producer = {output: node for node in model.graph.node for output in node.output}
+    names: list[str] = []
+    waiting = [LOG_DEPTH, SIGMA]
+    while waiting:
+        node = producer.get(waiting.pop())
+        if node is None or node.name in names:
+            continue
+        names.append(node.name)
+        if node.op_type != "Conv":
+            waiting.extend(node.input)
+    return names
