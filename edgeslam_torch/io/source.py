@@ -41,6 +41,8 @@ class Source(Protocol):
     """For messages and file names."""
     kind: str
     """``tum``, ``7scenes``, ``euroc``, ``images``, ``video``, ``flight`` or ``live``."""
+    location: str
+    """Absolute path, or the address of a live source."""
     camera: Camera
     telemetry: list[TelemetrySample]
     """In time order; a live source appends to it while it runs."""
@@ -64,6 +66,7 @@ class Recording:
 
     name: str
     kind: str
+    location: str
     camera: Camera
     decode: Callable[[list[Problem]], Iterator[Frame]]
     """Frames, decoded as they are asked for; appends what it leaves out."""
@@ -134,6 +137,7 @@ def open_source(
     return Recording(
         name=path.resolve().name,
         kind="flight" if samples and content.kind in ("tum", "video") else content.kind,
+        location=str(path.resolve()),
         camera=chosen,
         decode=lambda problems: content.decode(content.size, problems),
         length=length,

@@ -1,0 +1,143 @@
+"""Trajectory and semi-dense edge map from a recording, an image folder, a video or a live camera."""
+
+import argparse
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from edgeslam_torch.config import SlamConfig
+    from edgeslam_torch.io.source import Source
+    from edgeslam_torch.run import RunResult
+
+EXIT_INTERRUPTED = 130
+_MAX_PROBLEMS_SHOWN = 3
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's options."""
+    parser.add_argument(
+        "source",
+        metavar="SOURCE",
+        help="TUM, 7-Scenes, EuRoC or image folder, video file, flight recording, tello://HOST, webcam:N, rtsp://...",
+    )
+    parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the results (default: runs/NAME)")
+    parser.add_argument(
+        "--camera",
+        metavar="FILE|PRESET",
+        help="calibration file, or tum_fr1, tum_fr2, tum_fr3, tello, kinect (default: the source's own camera.yaml)",
+    )
+    parser.add_argument(
+        "--telemetry", type=Path, metavar="FILE", help="telemetry.csv of the flight (default: SOURCE's own)"
+    )
+    parser.add_argument("--depth", metavar="FILE|none", help="weights of the depth network, or none to go without")
+    parser.add_argument(
+        "--mode",
+        choices=("offline", "realtime"),
+        help="offline: every frame, repeatable; realtime: at camera pace, late frames dropped "
+        "(default: offline, realtime for live sources)",
+    )
+    parser.add_argument("--max-frames", type=_positive_int, metavar="N", help="stop after N frames")
+    parser.add_argument("--config", type=Path, metavar="FILE.toml", help="settings; a run's config.toml is one")
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="SECTION.KEY=VALUE",
+        help="change one setting, such as orb.features=1500; may be repeated",
+    )
+    parser.add_argument("--seed", type=int, help="seed of the robust estimators (default: 0)")
+    parser.add_argument(
+        "--progress",
+        action=argparse.BooleanOptionalAction,
+        help="progress bar (default: when the output is a terminal; a line every few seconds otherwise)",
+    )
+
+
+def main(args: argparse.Namespace) -> int:
+    """Run, and say in a few lines how it went."""
+    from edgeslam_torch.io.source import open_source
+    from edgeslam_torch.progress import make_progress
+    from edgeslam_torch.run import Mode, run
+
+    config = resolved_config(args)
+    source = open_source(args.source, args.camera, args.telemetry, args.max_frames)
+    for warning in source.warnings:
+        _say(f"warning: {warning}")
+    _say(f"camera: {source.camera.source}, {source.camera.width}x{source.camera.height}, f {source.camera.fx:.1f} px")
+    mode = Mode(args.mode) if args.mode else (Mode.REALTIME if source.live else Mode.OFFLINE)
+    out = args.out if args.out is not None else Path("runs") / source.name
+    show_bar = sys.stderr.isatty() if args.progress is None else args.progress
+    with make_progress(source.length, show_bar) as progress:
+        result = run(source, out, config, mode, [progress])
+    _report(result, source)
+    if result.failure is not None:
+        from edgeslam_torch.errors import OutputError
+
+        frames = result.summary["frames"]
+        raise OutputError(f"{result.failure}; what the folder holds is valid, up to frame {frames}")
+    if result.interrupted:
+        sys.stderr.write(
+            f"edgeslam: interrupted after {result.summary['frames']} frames; results are in {result.folder}\n"
+        )
+        return EXIT_INTERRUPTED
+    return 0
+
+
+def resolved_config(args: argparse.Namespace) -> "SlamConfig":
+    """Defaults, then ``--config``, then ``--set``, then the options that have a name of their own."""
+    from edgeslam_torch.config import SlamConfig
+    from edgeslam_torch.io.config_file import load_config
+
+    config = load_config(SlamConfig(), args.config, args.set)
+    if args.seed is not None:
+        config = replace(config, seed=args.seed)
+    if args.depth is not None:
+        config = replace(config, depth=replace(config.depth, weights=args.depth))
+    return config
+
+
+def _report(result: "RunResult", source: "Source") -> None:
+    summary = result.summary
+    scale = summary["scale"]
+    for problem in source.problems[:_MAX_PROBLEMS_SHOWN]:
+        _say(f"left out: {problem.file}: {problem.reason}")
+    if len(source.problems) > _MAX_PROBLEMS_SHOWN:
+        _say(f"left out: {len(source.problems)} in all, listed in {result.folder / 'summary.json'}")
+    print(
+        f"{summary['tracked']} of {summary['frames']} frames tracked ({100 * summary['coverage']:.1f} %), "
+        f"lost {_times(summary['lost_events'])}, {summary['fps']:.1f} frames/s, "
+        f"{summary['cpu_ms_per_frame']:.0f} ms CPU a frame, {summary['peak_rss_mb'] or 0:.0f} MB"
+    )
+    if summary["dropped_frames"]:
+        print(f"{summary['dropped_frames']} frames dropped to keep up")
+    if scale["units"] == "metres":
+        print(f"scale from {scale['source']}: {scale['value']:.4f} +- {scale['sigma']:.4f}, units are metres")
+    else:
+        print("scale unknown (no telemetry, no depth network): units are arbitrary")
+    counts = summary["map"]
+    print(f"map: {counts['edge_points']} edge points, {counts['anchors']} anchors, {counts['keyframes']} keyframes")
+    print(f"results: {result.folder} (look at {_best_view(result.folder)})")
+
+
+def _best_view(folder: Path) -> str:
+    return next((name for name in ("report.html", "map.png") if (folder / name).is_file()), "trajectory.txt")
+
+
+def _times(count: int) -> str:
+    return {0: "never", 1: "once"}.get(count, f"{count} times")
+
+
+def _say(text: str) -> None:
+    sys.stderr.write(f"edgeslam: {text}\n")
+
+
+def _positive_int(text: str) -> int:
+    try:
+        value = int(text)
+    except ValueError:
+        value = 0
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"must be a whole number of at least 1, got {text!r}")
+    return value

@@ -1,0 +1,65 @@
+"""A recording played at the pace it was recorded at."""
+
+import queue
+import threading
+import time
+from collections.abc import Iterator
+
+from edgeslam_torch.types import Frame
+
+REALTIME_QUEUE = 4
+"""Frames that may wait for a slow step; a keyframe takes longer than the time between two frames."""
+
+
+class Counter:
+    """A number that a feeding thread counts up."""
+
+    def __init__(self) -> None:
+        self.value = 0
+
+
+def at_their_pace(frames: Iterator[Frame], dropped: Counter, waiting: int = REALTIME_QUEUE) -> Iterator[Frame]:
+    """Frames of a recording as a camera would give them: at their stamps, the oldest waiting one lost when it is late.
+
+    Args:
+        frames: Of a recording.
+        dropped: Counts the lost ones.
+        waiting: Frames that may wait.
+    """
+    buffer: queue.Queue[Frame | None] = queue.Queue()
+    stop = threading.Event()
+    failure: list[BaseException] = []
+
+    def feed() -> None:
+        begin_wall, begin_stamp = time.monotonic(), None
+        try:
+            for frame in frames:
+                begin_stamp = frame.stamp_s if begin_stamp is None else begin_stamp
+                due_s = begin_wall + frame.stamp_s - begin_stamp
+                if stop.wait(max(0.0, due_s - time.monotonic())):
+                    return
+                while buffer.qsize() >= waiting:
+                    try:
+                        buffer.get_nowait()
+                    except queue.Empty:
+                        break
+                    dropped.value += 1
+                buffer.put(frame)
+        except BaseException as error:  # handed over whole: the consumer's thread raises it
+            failure.append(error)
+        finally:
+            buffer.put(None)
+
+    worker = threading.Thread(target=feed, name="camera-pace", daemon=True)
+    worker.start()
+    try:
+        while (frame := buffer.get()) is not None:
+            yield frame
+        if failure:
+            raise failure[0]
+    finally:
+        stop.set()
+        worker.join()
+        close = getattr(frames, "close", None)
+        if close is not None:
+            close()

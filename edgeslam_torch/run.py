@@ -1,0 +1,289 @@
+"""Drive the SLAM system over a source and leave the results in a folder: what ``edgeslam run`` does."""
+
+import logging
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from types import FrameType
+from typing import Any, Protocol
+
+from edgeslam_torch.config import SlamConfig
+from edgeslam_torch.errors import SourceError
+from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.io.config_file import to_toml
+from edgeslam_torch.io.pace import Counter, at_their_pace
+from edgeslam_torch.io.run_writer import CAMERA, PICTURE, RunWriter
+from edgeslam_torch.io.source import Source
+from edgeslam_torch.run_summary import Tally, summarise
+from edgeslam_torch.types import (
+    FloatArray,
+    Frame,
+    PointCloud,
+    ScaleEstimate,
+    SlamOutput,
+    TelemetrySample,
+)
+
+logger = logging.getLogger(__name__)
+
+
+class Mode(StrEnum):
+    """How frames are fed."""
+
+    OFFLINE = "offline"
+    """One after the other, none lost; the same input gives the same bytes out."""
+    REALTIME = "realtime"
+    """At the pace of their stamps; those that nobody has time for are dropped and counted."""
+
+
+class Slam(Protocol):
+    """What the loop needs of `EdgeSlam`."""
+
+    events: dict[str, int]
+
+    def step(self, frame: Frame, telemetry: Sequence[TelemetrySample] = ()) -> SlamOutput:
+        """Pose of one frame."""
+
+    def finish(self) -> None:
+        """Last refinement."""
+
+    def trajectory(self) -> tuple[FloatArray, FloatArray]:
+        """Stamps ``(F,)`` and refined ``T_w_c`` ``(F, 4, 4)``."""
+
+    def edge_map(self) -> PointCloud:
+        """Semi-dense map."""
+
+    def anchors(self) -> PointCloud:
+        """Triangulated anchors."""
+
+    def keyframes(self) -> Sequence[Any]:
+        """Keyframes in the map."""
+
+    @property
+    def scale(self) -> ScaleEstimate:
+        """Metres per map unit."""
+
+
+class Listener(Protocol):
+    """Somebody who looks on: a progress bar, a viewer."""
+
+    def on_frame(self, frame: Frame, output: SlamOutput, slam: Slam) -> None:
+        """Called after every step, in the loop's thread."""
+
+    def on_finish(self, slam: Slam) -> None:
+        """Called once, after the last refinement."""
+
+
+@dataclass(frozen=True, slots=True)
+class RunResult:
+    """What a run left."""
+
+    folder: Path
+    summary: dict[str, Any]
+    """As in ``summary.json``."""
+    stamps_s: FloatArray
+    """``(F,)``"""
+    T_w_c: FloatArray
+    """``(F, 4, 4)`` refined."""
+    interrupted: bool
+    """Whether Ctrl-C ended it."""
+    failure: str | None
+    """What could not be written; None when everything was."""
+
+
+def run(
+    source: Source,
+    out_dir: Path,
+    config: SlamConfig | None = None,
+    mode: Mode = Mode.OFFLINE,
+    listeners: Sequence[Listener] = (),
+    make_slam: Callable[[Camera, SlamConfig, bool], Slam] | None = None,
+) -> RunResult:
+    """Run the SLAM system over a source and write its folder.
+
+    Whatever ends the run early (Ctrl-C, a full disk, a live source that goes away), trajectory, map and summary of
+    what was done are written.
+
+    Args:
+        source: From `open_source`.
+        out_dir: Folder for the results; made when missing, an older run in it is replaced.
+        config: Settings; the defaults when None.
+        mode: How frames are fed.
+        listeners: Called after every frame.
+        make_slam: Builds the system from camera, config and whether it runs in real time.
+
+    Raises:
+        OutputError: If the folder cannot be written to at all.
+        SourceError: If the source gives not a single frame, or fails on the way (after the results are written).
+    """
+    config = config or SlamConfig()
+    writer = RunWriter(out_dir, keep=[Path(source.location)])
+    try:
+        writer.write_config(to_toml(config))
+        slam = (make_slam or _edge_slam)(source.camera, config, mode is Mode.REALTIME)
+        return _Run(source, writer, slam, config, mode, listeners).go()
+    finally:
+        writer.close()
+
+
+class _Run:
+    """One pass over a source."""
+
+    def __init__(
+        self,
+        source: Source,
+        writer: RunWriter,
+        slam: Slam,
+        config: SlamConfig,
+        mode: Mode,
+        listeners: Sequence[Listener],
+    ) -> None:
+        self.source = source
+        self.writer = writer
+        self.slam = slam
+        self.config = config
+        self.mode = mode
+        self.listeners = listeners
+        self.tally = Tally()
+        self.dropped = Counter()
+        self.interrupt = _Interrupt()
+        self.result: RunResult | None = None
+
+    def go(self) -> RunResult:
+        wall, cpu = time.perf_counter(), time.process_time()
+        with self.interrupt:
+            try:
+                self._loop()
+            finally:  # also when the source fails on the way: nothing done so far may be lost
+                if self.tally.frames:
+                    self._write(time.perf_counter() - wall, cpu)
+        if self.result is None:
+            raise SourceError(self._no_frame())
+        return self.result
+
+    def _loop(self) -> None:
+        frames = self.source.frames()
+        if self.mode is Mode.REALTIME and not self.source.live:
+            frames = at_their_pace(frames, self.dropped)
+        telemetry = _TelemetryCursor(self.source.telemetry)
+        try:
+            while (frame := self._next(frames)) is not None:
+                started = time.perf_counter()
+                output = self.slam.step(frame, telemetry.until(frame.stamp_s))
+                step_ms = 1e3 * (time.perf_counter() - started)
+                self.tally.add(output, step_ms)
+                if not self.writer.append(output, step_ms):
+                    return
+                for listener in self.listeners:
+                    listener.on_frame(frame, output, self.slam)
+        finally:
+            close = getattr(frames, "close", None)
+            if close is not None:
+                close()
+
+    def _next(self, frames: Iterator[Frame]) -> Frame | None:
+        """The next frame; None at the end or when the user wants to stop, also while a live source is silent."""
+        if self.interrupt.requested:
+            return None
+        self.interrupt.at_once = True
+        try:
+            return next(frames, None)
+        except KeyboardInterrupt:
+            return None
+        finally:
+            self.interrupt.at_once = False
+
+    def _write(self, loop_s: float, cpu_start_s: float) -> None:
+        started = time.perf_counter()
+        try:
+            self.slam.finish()
+        except KeyboardInterrupt:
+            logger.warning("stopped before the last refinement was through")
+        wall_s = loop_s + time.perf_counter() - started
+        stamps, poses = self.slam.trajectory()
+        edge_map, anchors, scale = self.slam.edge_map(), self.slam.anchors(), self.slam.scale
+        for listener in self.listeners:
+            listener.on_finish(self.slam)
+        cpu_s = time.process_time() - cpu_start_s
+        summary = {
+            **summarise(self.source, self.tally, scale, self.dropped.value, wall_s, cpu_s),
+            "map": {
+                "keyframes": len(self.slam.keyframes()),
+                "anchors": len(anchors.p_w),
+                "edge_points": len(edge_map.p_w),
+            },
+            "events": dict(self.slam.events),
+            "mode": str(self.mode),
+            "seed": self.config.seed,
+            "interrupted": self.interrupt.requested,
+        }
+        title = f"{self.source.name}: {self.tally.frames} frames, {len(edge_map.p_w)} edge points"
+
+        def picture(path: Path) -> None:
+            from edgeslam_torch.io.map_picture import write_map_picture  # matplotlib: only when a run ends
+
+            write_map_picture(path, edge_map, poses, scale.units, title)
+
+        extras = [(CAMERA, self.source.camera.save), (PICTURE, picture)]
+        self.writer.finish(summary, stamps, poses, edge_map, anchors, scale.units, extras)
+        self.result = RunResult(
+            self.writer.folder, summary, stamps, poses, self.interrupt.requested, self.writer.failure
+        )
+
+    def _no_frame(self) -> str:
+        if self.interrupt.requested:
+            return f"{self.source.name}: interrupted before the first frame; nothing was written"
+        first = self.source.problems[0] if self.source.problems else None
+        why = f" ({first.file}: {first.reason})" if first is not None else ""
+        return f"{self.source.name}: gave not a single frame{why}"
+
+
+class _TelemetryCursor:
+    """Telemetry that arrived since the last frame; the list may grow while it is read."""
+
+    def __init__(self, samples: list[TelemetrySample]) -> None:
+        self._samples = samples
+        self._next = 0
+
+    def until(self, stamp_s: float) -> list[TelemetrySample]:
+        first = self._next
+        while self._next < len(self._samples) and self._samples[self._next].stamp_s <= stamp_s:
+            self._next += 1
+        return self._samples[first : self._next]
+
+
+class _Interrupt:
+    """Ctrl-C as a wish to stop: the first lets everything be written, the second skips the last refinement."""
+
+    def __init__(self) -> None:
+        self.requested = False
+        self.at_once = False
+        """Whether the main thread may be torn out of what it does: it only waits."""
+        self._old: dict[int, Any] = {}
+
+    def __enter__(self) -> "_Interrupt":
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGINT, signal.SIGTERM):
+                self._old[number] = signal.signal(number, self._on_signal)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._old.items():
+            signal.signal(number, handler)
+
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:
+        again = self.requested
+        self.requested = True
+        if again or self.at_once:
+            raise KeyboardInterrupt
+
+
+def _edge_slam(camera: Camera, config: SlamConfig, realtime: bool) -> Slam:
+    from edgeslam_torch.slam import EdgeSlam  # torch loads here, not on `import edgeslam_torch.run`
+
+    slam: Slam = EdgeSlam(camera, config, realtime=realtime) if realtime else EdgeSlam(camera, config)
+    return slam

@@ -1,0 +1,102 @@
+"""``summary.json``: a run in numbers."""
+
+import sys
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from edgeslam_torch import __version__
+from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.io.source import Source
+from edgeslam_torch.types import FrameStatus, ScaleEstimate, SlamOutput
+
+OWN_POSE = frozenset({FrameStatus.INITIALISED, FrameStatus.TRACKED, FrameStatus.RELOCALISED})
+"""Status of a frame whose pose rests on its own image."""
+
+
+MAX_PROBLEMS = 100
+"""Listed in the summary one by one; ``left_out`` counts them all."""
+
+
+@dataclass(slots=True)
+class Tally:
+    """Counts over a run, enough for the summary and no more than a few numbers a frame."""
+
+    frames: int = 0
+    own_pose: int = 0
+    lost_events: int = 0
+    first_pose_frame: int | None = None
+    statuses: dict[str, int] = field(default_factory=dict)
+    stage_ms: dict[str, list[float]] = field(default_factory=dict)
+    step_ms: list[float] = field(default_factory=list)
+    _was_lost: bool = False
+
+    def add(self, output: SlamOutput, step_ms: float) -> None:
+        """Count one frame."""
+        has_pose = output.status in OWN_POSE
+        if has_pose and self.first_pose_frame is None:
+            self.first_pose_frame = output.index
+        is_lost = not has_pose and self.first_pose_frame is not None
+        self.lost_events += is_lost and not self._was_lost
+        self._was_lost = is_lost
+        self.frames += 1
+        self.own_pose += has_pose
+        self.statuses[str(output.status)] = self.statuses.get(str(output.status), 0) + 1
+        self.step_ms.append(step_ms)
+        for stage, ms in output.stage_ms.items():
+            self.stage_ms.setdefault(stage, []).append(ms)
+
+
+def summarise(
+    source: Source, tally: Tally, scale: ScaleEstimate, dropped: int, wall_s: float, cpu_s: float
+) -> dict[str, Any]:
+    """The part of the summary that every run has; the caller adds what only it knows.
+
+    Args:
+        source: What was run on.
+        tally: Of at least one frame.
+        scale: At the end.
+        dropped: Frames that came too late in real time.
+        wall_s: Time from the first frame to the end of the last refinement.
+        cpu_s: User and system time of the whole process, all threads, over the same.
+    """
+    offered = tally.frames + dropped + len(source.problems)
+    return {
+        "version": __version__,
+        "source": {"name": source.name, "kind": source.kind, "location": source.location, "length": source.length},
+        "camera": _camera(source.camera),
+        "frames": tally.frames,
+        "tracked": tally.own_pose,
+        "coverage": tally.own_pose / offered,
+        "first_pose_frame": tally.first_pose_frame,
+        "lost_events": tally.lost_events,
+        "dropped_frames": dropped,
+        "left_out": len(source.problems),
+        "statuses": tally.statuses,
+        "duration_s": wall_s,
+        "fps": tally.frames / wall_s if wall_s > 0 else None,
+        "cpu_ms_per_frame": 1e3 * cpu_s / tally.frames,
+        "peak_rss_mb": peak_rss_mb(),
+        "step_ms": {"median": float(np.median(tally.step_ms)), "p95": float(np.percentile(tally.step_ms, 95))},
+        "stage_median_ms": {stage: float(np.median(ms)) for stage, ms in tally.stage_ms.items()},
+        "stage_mean_ms_per_frame": {stage: sum(ms) / tally.frames for stage, ms in tally.stage_ms.items()},
+        "scale": {"value": scale.value, "sigma": scale.sigma, "source": scale.source, "units": str(scale.units)},
+        "telemetry_samples": len(source.telemetry),
+        "warnings": list(source.warnings),
+        "problems": [{"file": problem.file, "reason": problem.reason} for problem in source.problems[:MAX_PROBLEMS]],
+    }
+
+
+def _camera(camera: Camera) -> dict[str, Any]:
+    return {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy", "source")}
+
+
+def peak_rss_mb() -> float | None:
+    """Largest memory of this process so far [MB]; None where the system does not tell."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return None
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (2**20 if sys.platform == "darwin" else 2**10)
