@@ -2,8 +2,10 @@
 
 import os
 import zlib
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -23,3 +25,33 @@ def data_dir() -> Path:
     if not Path(folder).is_dir():
         pytest.skip(f"EDGESLAM_DATA={folder} is not a folder")
     return Path(folder)
+
+
+@pytest.fixture
+def write_images(rng: np.random.Generator) -> Callable[..., list[Path]]:
+    """Function that writes small random grey pictures: ``write_images(folder, names, size=(64, 48))``."""
+
+    def write(folder: Path, names: Sequence[str], size: tuple[int, int] = (64, 48)) -> list[Path]:
+        folder.mkdir(parents=True, exist_ok=True)
+        paths = [folder / name for name in names]
+        for path in paths:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            assert cv2.imwrite(str(path), rng.integers(0, 256, (size[1], size[0]), dtype=np.uint8))
+        return paths
+
+    return write
+
+
+@pytest.fixture
+def write_tum(write_images: Callable[..., list[Path]]) -> Callable[..., Path]:
+    """Function that writes a TUM-layout folder with images at 10 Hz: ``write_tum(folder, count)``."""
+
+    def write(folder: Path, count: int, size: tuple[int, int] = (64, 48)) -> Path:
+        stamps = [100.0 + 0.1 * i for i in range(count)]
+        names = [f"rgb/{stamp:.6f}.png" for stamp in stamps]
+        write_images(folder, names, size)
+        lines = [f"{stamp:.6f} {name}" for stamp, name in zip(stamps, names, strict=True)]
+        (folder / "rgb.txt").write_text("# stamp file\n" + "\n".join(lines) + "\n")
+        return folder
+
+    return write
