@@ -25,7 +25,7 @@ class OrbConfig:
     """Corners detected before the even spread."""
     scale_factor: float = 1.2
     levels: int = 8
-    fast_threshold: int = 7
+    fast_threshold: int = 12
     """Grey levels; low, because the spread keeps the strongest of every cell."""
 
     def __post_init__(self) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgeslam_torch.geometry.camera import Camera
-from edgeslam_torch.types import FloatArray
+from edgeslam_torch.types import FloatArray, IntArray
 
 PROFILE_PX = np.array([-4.0, -2.0, 0.0, 2.0, 4.0])
 """Offsets along the edge normal at which grey values are compared."""
@@ -21,8 +21,8 @@ TRUNCATE = 30.0
 """Grey levels; a larger difference says no more (occlusion, highlight)."""
 MAX_COST = 12.0
 """Mean grey difference of an accepted match; sensor noise and resampling give 3 to 6."""
-MIN_CURVATURE = 0.3
-"""Grey levels per squared hypothesis step; flatter minima have no position."""
+MIN_ACROSS = 0.25
+"""Sine of the angle between an edge and the epipolar line below which the edge slides along the line."""
 
 _ROW = 1024
 
@@ -93,7 +93,7 @@ def measure_edge_depth(
         return unknown
     fine_step = 0.3 * step[ok]
     fine_grid = grid[ok, best[ok]][:, None] + fine_step[:, None] * np.arange(-4, 5)
-    fine = _cost(host, rays[ok], normal[ok], profile[ok], fine_grid, targets, camera)
+    fine = _cost(host, rays[ok], normal[ok], profile[:, ok], fine_grid, targets, camera)
     k = np.clip(np.argmin(fine, axis=1), 1, fine.shape[1] - 2)
     r = np.arange(len(ok))
     a, b, c = fine[r, k - 1], fine[r, k], fine[r, k + 1]
@@ -109,9 +109,9 @@ def measure_edge_depth(
 
 
 def _profile(grey: NDArray[np.uint8], uv: FloatArray, normal: FloatArray) -> FloatArray:
-    """Grey values ``(E, P)`` across each edge."""
-    x = uv[:, None, 0] + PROFILE_PX * normal[:, None, 0]
-    y = uv[:, None, 1] + PROFILE_PX * normal[:, None, 1]
+    """Grey values ``(P, E)`` across each edge."""
+    x = uv[:, 0] + PROFILE_PX[:, None] * normal[:, 0]
+    y = uv[:, 1] + PROFILE_PX[:, None] * normal[:, 1]
     return _bilinear(grey, x, y)
 
 
@@ -145,36 +145,58 @@ def _cost(
     E, D = inverse_depth.shape
     rho = inverse_depth.astype(np.float32)
     total = np.zeros((E, D), np.float32)
-    weight = np.full((E, 1), 1e-6, np.float32)
+    weight = np.full(E, 1e-6, np.float32)
     for target in targets:
         R, t = _relative(host, target)
         a = rays @ R.T
-        z = a[:, 2:3] + rho * t[2]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            x = camera.fx * (a[:, 0:1] + rho * t[0]) / z + camera.cx
-            y = camera.fy * (a[:, 1:2] + rho * t[1]) / z + camera.cy
-        inside = (z > 0) & (x > 5) & (x < camera.width - 6) & (y > 5) & (y < camera.height - 6)
-        along = np.stack([x[:, -1] - x[:, 0], y[:, -1] - y[:, 0]], axis=1)
-        length = np.linalg.norm(along, axis=1)
         turned = normal @ R[:2, :2].T
         turned /= np.maximum(np.linalg.norm(turned, axis=1, keepdims=True), 1e-6)
-        across = np.abs((along * turned).sum(1)) / np.maximum(length, 1e-6)
-        useful = inside.all(axis=1) & (across > 0.25) & np.isfinite(length)
-        if not useful.any():
+        rows, across = _measurable(a, rho, t, turned, camera)
+        if len(rows) == 0:
             continue
-        w = np.where(useful, across, 0.0).astype(np.float32)[:, None]
-        rows = np.flatnonzero(useful)
-        px = x[rows, :, None] + (PROFILE_PX * turned[rows, 0:1]).astype(np.float32)[:, None, :]
-        py = y[rows, :, None] + (PROFILE_PX * turned[rows, 1:2]).astype(np.float32)[:, None, :]
-        seen = _bilinear(target.grey, px, py)
-        difference = seen - profile[rows, None, :]
+        iz = 1.0 / (a[rows, 2:3] + rho[rows] * t[2])
+        x = camera.fx * (a[rows, 0:1] + rho[rows] * t[0]) * iz + camera.cx
+        y = camera.fy * (a[rows, 1:2] + rho[rows] * t[1]) * iz + camera.cy
+        # Profile first, so that every sum below runs over contiguous memory.
+        seen = [
+            _bilinear(target.grey, x + offset * turned[rows, 0:1], y + offset * turned[rows, 1:2])
+            for offset in PROFILE_PX.astype(np.float32)
+        ]
+        for grey, expected in zip(seen, profile, strict=True):
+            grey -= expected[rows, None]
         # Half of a common brightness change is taken out: exposure drifts, but brightness also tells edges apart.
-        difference -= 0.5 * difference.mean(axis=2, keepdims=True)
-        total[rows] += w[rows] * np.minimum(np.abs(difference), TRUNCATE).mean(axis=2)
-        weight[rows] += w[rows]
-    cost = total / weight
-    cost[weight[:, 0] < 0.5] = np.inf  # fewer than about two useful targets
+        common = (0.5 / len(seen)) * sum(seen[1:], seen[0])
+        cost = np.zeros_like(common)
+        for grey in seen:
+            grey -= common
+            np.abs(grey, out=grey)
+            np.minimum(grey, TRUNCATE, out=grey)
+            cost += grey
+        total[rows] += (across / len(seen))[:, None] * cost
+        weight[rows] += across
+    cost = total / weight[:, None]
+    cost[weight < 0.5] = np.inf  # fewer than about two useful targets
     return cost
+
+
+def _measurable(
+    rays: FloatArray, rho: FloatArray, t: FloatArray, normal: FloatArray, camera: Camera
+) -> tuple[IntArray, FloatArray]:
+    """Edges whose whole search segment lies in the target, and the share of it that crosses the edge."""
+    ends = []
+    inside = np.ones(len(rays), dtype=bool)
+    for column in (0, -1):
+        z = rays[:, 2] + rho[:, column] * t[2]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            x = camera.fx * (rays[:, 0] + rho[:, column] * t[0]) / z + camera.cx
+            y = camera.fy * (rays[:, 1] + rho[:, column] * t[1]) / z + camera.cy
+        inside &= (z > 0) & (x > 5) & (x < camera.width - 6) & (y > 5) & (y < camera.height - 6)
+        ends.append((x, y))
+    (x0, y0), (x1, y1) = ends
+    du, dv = x1 - x0, y1 - y0
+    across = np.abs(du * normal[:, 0] + dv * normal[:, 1]) / np.maximum(np.hypot(du, dv), 1e-6)
+    rows = np.flatnonzero(inside & (across > MIN_ACROSS))
+    return rows, across[rows].astype(np.float32)
 
 
 def _sigma(

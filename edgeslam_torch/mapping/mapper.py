@@ -113,6 +113,7 @@ class Mapper:
     def fuse(self, keyframe: Keyframe, neighbours: list[Keyframe]) -> None:
         """Look for the keyframe's anchors in its neighbours: more observations, fewer doubles."""
         anchors = self.map.anchors
+        doubles: list[tuple[IntArray, IntArray]] = []
         for other in neighbours:
             ids = self.map.anchors_seen_by([keyframe])
             ids = ids[~np.isin(ids, other.anchor)]
@@ -137,7 +138,9 @@ class Mapper:
             held = other.anchor[keypoint]
             free = held < 0
             self.map.observe(other, keypoint[free], found[free])
-            self._merge_doubles(found[~free], held[~free])
+            doubles.append((found[~free], held[~free]))
+        if doubles:
+            self._merge_doubles(*(np.concatenate(side) for side in zip(*doubles, strict=True)))
 
     def _merge_doubles(self, a: IntArray, b: IntArray) -> None:
         """Two ids for one point: the one with more observations stays."""

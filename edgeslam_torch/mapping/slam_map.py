@@ -60,31 +60,27 @@ class SlamMap:
         """Remove anchors from the map and from every keyframe that holds them."""
         if len(ids) == 0:
             return
-        gone = np.zeros(len(self.anchors.alive), dtype=bool)
+        gone = np.zeros(len(self.anchors.alive) + 1, dtype=bool)
         gone[ids] = True
         for keyframe in self.keyframes.values():
-            held = keyframe.anchor >= 0
-            hit = held & gone[np.where(held, keyframe.anchor, 0)]
-            keyframe.anchor[hit] = NO_ANCHOR
+            keyframe.anchor[gone[keyframe.anchor]] = NO_ANCHOR
         self.anchors.observations[ids] = 0
         self.anchors.remove(ids)
 
     def merge_anchors(self, losers: IntArray, winners: IntArray) -> None:
-        """Give every observation of ``losers`` to ``winners``, ``(M,)`` each, one-to-one."""
+        """Give every observation of ``losers`` to ``winners``, ``(M,)`` each, one-to-one and disjoint."""
         if len(losers) == 0:
             return
-        target = np.arange(len(self.anchors.alive))
+        target = np.full(len(self.anchors.alive) + 1, NO_ANCHOR)  # the last row answers for NO_ANCHOR
         target[losers] = winners
         for keyframe in self.keyframes.values():
-            keypoints = keyframe.keypoints_with_anchor()
-            held = keyframe.anchor[keypoints]
-            moved = target[held] != held
-            if not moved.any():
+            new = target[keyframe.anchor]
+            keypoints = np.flatnonzero(new >= 0)
+            if len(keypoints) == 0:
                 continue
-            already = np.isin(target[held[moved]], held)  # one keypoint per anchor and keyframe
-            self.anchors.observations[held[moved]] -= 1
-            keyframe.anchor[keypoints[moved]] = np.where(already, NO_ANCHOR, target[held[moved]])
-            self.anchors.observations[target[held[moved]][~already]] += 1
+            already = np.isin(new[keypoints], keyframe.anchor)  # one keypoint per anchor and keyframe
+            keyframe.anchor[keypoints] = np.where(already, NO_ANCHOR, new[keypoints])
+            self.anchors.observations[new[keypoints[~already]]] += 1
         self.anchors.found[winners] += self.anchors.found[losers]
         self.anchors.visible[winners] += self.anchors.visible[losers]
         self.remove_anchors(losers)
