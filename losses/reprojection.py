@@ -5,6 +5,33 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from edgeslam_torch.losses.base import ResidualLoss, Residuals, masked, move, project
+
+
+class ReprojectionLoss(ResidualLoss):
+    """Squared reprojection error over a window, paper eqs. (15)-(16).
+
+    ``Reduction.SUM`` is the paper's literal form; the default mean does not fall when points leave the image.
+    """
+
+    def residuals(  # type: ignore[override]
+        self, T_c_w: Tensor, p_w: Tensor, uv: Tensor, K: Tensor, mask: Tensor | None = None
+    ) -> Residuals:
+        """Predicted minus observed pixels.
+
+        Args:
+            T_c_w: World-to-camera poses ``(W, 4, 4)``.
+            p_w: Anchors ``(N, 3)``.
+            uv: Observed pixels ``(W, N, 2)``.
+            K: Calibration matrix ``(3, 3)`` [px].
+            mask: Which anchor was seen in which frame ``(W, N)``; all by default.
+
+        Returns:
+            ``(W, N, 2)`` [px]; invalid where unseen or behind the camera.
+        """
+        predicted, valid = project(move(T_c_w, p_w), K)
+        return masked(predicted - uv, valid if mask is None else valid & mask)
+
 
 class ReprojectionJacobians(NamedTuple):
     """Residuals with their derivatives, components first so that every row is one contiguous vector."""

@@ -12,11 +12,14 @@ from edgeslam_torch.losses.reprojection import (
     reprojection_jacobians,
     reprojection_residuals,
 )
+from edgeslam_torch.losses.robust import rho
 from edgeslam_torch.optim import lie, schur
 from edgeslam_torch.optim.levenberg_marquardt import Step, minimise
 from edgeslam_torch.optim.priors import PriorTerms
 from edgeslam_torch.optim.problem import (
     DepthPriors,
+    EdgeTerms,
+    JunctionTerms,
     LmConfig,
     PosePrior,
     ScalePrior,
@@ -24,11 +27,13 @@ from edgeslam_torch.optim.problem import (
     WindowProblem,
     WindowResult,
 )
-from edgeslam_torch.optim.robust import rho
+from edgeslam_torch.optim.relative import INVERSE_DEPTH_MIN, EdgeBlocks, JunctionBlocks
 from edgeslam_torch.types import FloatArray, IntArray
 
 __all__ = [
     "DepthPriors",
+    "EdgeTerms",
+    "JunctionTerms",
     "LmConfig",
     "PosePrior",
     "ScalePrior",
@@ -40,7 +45,7 @@ __all__ = [
 
 
 def refine_window(problem: WindowProblem, config: LmConfig | None = None) -> WindowResult:
-    """Refine the free poses and all anchors of a window.
+    """Refine the free poses of a window with its anchors, edge depths and junctions.
 
     Args:
         problem: Poses, anchors, observations and what is known beforehand.
@@ -60,7 +65,7 @@ def refine_window(problem: WindowProblem, config: LmConfig | None = None) -> Win
     )
     if not finite:
         return _unchanged(problem, StopReason.NOT_FINITE)
-    if len(problem.obs_pose) == 0:
+    if len(problem.obs_pose) == 0 and problem.edges is None and problem.junctions is None:
         return _unchanged(problem, StopReason.NO_OBSERVATIONS)
     with torch.inference_mode():
         return _Window(problem, config).refine()
@@ -99,6 +104,8 @@ class _State:
     T_c_w: Tensor
     p_w: Tensor
     """Anchors in the solver's order."""
+    relative: tuple[Tensor, ...]
+    """Inverse depths ``(size, E)`` of edges and junctions, in the solver's order."""
 
 
 class _Window:
@@ -120,15 +127,17 @@ class _Window:
         F = len(self.free)
         column = torch.full((len(T),), F, dtype=torch.int64)
         column[self.free] = torch.arange(F)
-        # Anchors by the first free pose that sees them: chunks then span few poses.
-        first_seen = torch.full((A,), F).scatter_reduce_(0, anchor, column[pose], "amin")
-        self.anchor_order = torch.argsort(first_seen, stable=True)
+        # Anchors by the first and last free pose that sees them: chunks then span few poses.
+        first = torch.full((A,), F).scatter_reduce_(0, anchor, column[pose], "amin")
+        last = torch.full((A,), -1).scatter_reduce_(0, anchor, torch.where(column < F, column, -1)[pose], "amax")
+        self.anchor_order = torch.argsort(first * (F + 1) + last, stable=True)
         rank = torch.empty_like(self.anchor_order)
         rank[self.anchor_order] = torch.arange(A)
         # Factors by chunk, pose, anchor: blocks of a pose are slices and writes run forward through memory.
         # Those of fixed poses come last and need no derivatives of their own.
-        key = torch.where(column[pose] < F, schur.chunk_of(rank[anchor], F), A) * (F + 1) + column[pose]
-        self.order = torch.argsort(key * A + rank[anchor])
+        size = A if F <= _FEW_POSES else _ANCHORS_PER_CHUNK
+        chunk = torch.where(column[pose] < F, rank[anchor] // max(size, 1), A)
+        self.order = torch.argsort((chunk * (F + 1) + column[pose]) * A + rank[anchor])
         self.pose, self.anchor = pose[self.order], rank[anchor[self.order]]
         obs_column = column[self.pose]
         self.n_free = int((obs_column < F).sum())
@@ -140,12 +149,18 @@ class _Window:
         self.inv_sigma = torch.cat((_values(problem.inv_sigma), 1.0 / _values(depth.sigma)))[self.order]
         self.behind = (config.behind_px * self.inv_sigma).square()
         self.K = torch.tensor(problem.K, dtype=torch.float64)
-        p_w = _values(problem.p_w)[self.anchor_order]
-        self.chunks = schur.plan_chunks(obs_column[: self.n_free], self.anchor[: self.n_free], A, F)
+        p_w = _values(problem.p_w).reshape(-1, 3)[self.anchor_order]
+        bounds = [*range(0, A, max(size, 1)), A]
+        self.chunks = schur.plan_chunks(obs_column[: self.n_free], self.anchor[: self.n_free], bounds, 3)
         self.Y = [torch.zeros(len(c.columns), 3 * (c.last - c.first), dtype=torch.float64) for c in self.chunks]
         column[fixed] = -1
         self.priors = PriorTerms(problem.pose_priors, problem.scale_priors, column.tolist())
-        self.state = _State(T, p_w)
+        self.relative: list[EdgeBlocks | JunctionBlocks] = []
+        if problem.edges is not None and len(problem.edges.host):
+            self.relative.append(EdgeBlocks(problem.edges, self.K, column, config))
+        if problem.junctions is not None and len(problem.junctions.host):
+            self.relative.append(JunctionBlocks(problem.junctions, self.K, column, config))
+        self.state = _State(T, p_w, tuple(block.x for block in self.relative))
 
     # -- LeastSquares ---------------------------------------------------------------------------------------
 
@@ -153,7 +168,8 @@ class _Window:
         """Robust cost of a candidate."""
         s, _ = self._chi2(state)
         value, _ = rho(s, self.config.kernel, self.config.delta)
-        return float(value.sum()) + self.priors.cost(state.T_c_w)
+        total = float(value.sum()) + self.priors.cost(state.T_c_w)
+        return total + sum(float(b.cost(state.T_c_w, x)) for b, x in self._blocks(state))
 
     def accept(self, state: _State) -> None:
         """Make the candidate the current state."""
@@ -162,7 +178,92 @@ class _Window:
     def linearise(self) -> tuple[float, float]:
         """Blocks of the normal equations at the current state."""
         T, p_w, F, A = self.state.T_c_w, self.state.p_w, len(self.free), len(self.state.p_w)
-        n = self.n_free
+        r, Jp, Jl, value = self._factors(T, p_w)
+        self.Jp, self.Jl = Jp, Jl
+        self.H = torch.zeros(6 * F, 6 * F, dtype=T.dtype)
+        self.g = torch.zeros(6 * F, dtype=T.dtype)
+        g_pose = (Jp * r[:, None, : self.n_free]).sum(0)
+        for chunk in self.chunks:
+            for pose, lo, hi in chunk.slices:
+                block = Jp[:, :, lo:hi]
+                at = slice(6 * pose, 6 * pose + 6)
+                self.H[at, at] += (block @ block.mT).sum(0)
+                self.g[at] += g_pose[:, lo:hi].sum(1)
+        sums = torch.zeros(9, A, dtype=T.dtype)
+        sums.index_add_(1, self.anchor, torch.cat((schur.triangle(Jl), (Jl * r[:, None]).sum(0))))
+        self.V, self.g_point = sums[:6], sums[6:]
+        cost = float(value.sum()) + self.priors.linearise(T, self.H, self.g)
+        cost += sum(float(b.linearise(T, x, self.H, self.g)) for b, x in self._blocks(self.state))
+        return cost, self._scaled_gradient()
+
+    def propose(self, mu: float) -> Step[_State] | None:
+        """Solve the damped system by eliminating anchors, edge depths and junctions."""
+        S, b = self._reduce(mu)
+        diagonal = self.H.diagonal()
+        S.diagonal().add_(mu * diagonal + _FLOOR)
+        L, info = torch.linalg.cholesky_ex(S)
+        if int(info) != 0:
+            return None
+        delta = -torch.cholesky_solve(b[:, None], L)[:, 0]
+        back = -schur.whiten(self.factor, self.g_point)
+        for chunk, Y in zip(self.chunks, self.Y, strict=True):
+            back[:, chunk.first : chunk.last] -= (delta[chunk.columns] @ Y).view(3, -1)
+        step = schur.unwhiten(self.factor, back)
+        predicted = _promise(mu, diagonal, self.g, delta) + _promise(mu, self.V[_DIAGONAL], self.g_point, step)
+        size = torch.maximum(_abs_max(delta), _abs_max(step))
+        moved = []
+        for block, x in self._blocks(self.state):
+            dx = block.step(delta)
+            predicted += _promise(mu, block.V[schur.diagonal_rows(block.size)], block.g, dx)
+            size = torch.maximum(size, _abs_max(dx))
+            moved.append((x + dx).clamp_min(INVERSE_DEPTH_MIN))
+        T = self.state.T_c_w.clone()
+        T[self.free] = lie.exp(delta.view(-1, 6)) @ T[self.free]
+        return Step(_State(T, self.state.p_w + step.mT, tuple(moved)), predicted, float(size))
+
+    # -- the rest -------------------------------------------------------------------------------------------
+
+    def refine(self) -> WindowResult:
+        """Run the loop and report."""
+        summary = minimise(self, self.config)
+        s, in_front = self._chi2(self.state)
+        M = self.n_obs
+        deficiency, covariance = -1, np.full((6, 6), np.nan)
+        if self.config.diagnostics and summary.stop is not StopReason.NOT_FINITE and len(self.free):
+            deficiency, covariance = self._diagnose()
+        stop = summary.stop if bool(in_front.any()) or self.relative else StopReason.NO_OBSERVATIONS
+        edges, junctions = {}, {}
+        for block, x in self._blocks(self.state):
+            if isinstance(block, EdgeBlocks):
+                sigma = self._edge_sigma(block) if deficiency >= 0 else torch.full_like(x[0], torch.nan)
+                edges = {
+                    "edge_inverse_depth": _restored(x[0], block.block_order),
+                    "edge_sigma": _restored(sigma, block.block_order),
+                    "edge_chi2": block.alignment_chi2(self.state.T_c_w, x).numpy(),
+                }
+            else:
+                junctions = {"junction_inverse_depth": _restored(x.mT, block.block_order)}
+        return WindowResult(
+            T_c_w=self.state.T_c_w.numpy(),
+            p_w=_restored(self.state.p_w, self.anchor_order),
+            chi2=_restored(torch.where(in_front, s, torch.inf), self.order)[:M],
+            in_front=_restored(in_front, self.order)[:M],
+            cost_before=summary.cost_before,
+            cost_after=summary.cost_after,
+            iterations=summary.iterations,
+            accepted=summary.accepted,
+            stop=stop,
+            rank_deficiency=deficiency,
+            pose_covariance=covariance,
+            **edges,
+            **junctions,
+        )
+
+    def _blocks(self, state: _State) -> list[tuple[EdgeBlocks | JunctionBlocks, Tensor]]:
+        return list(zip(self.relative, state.relative, strict=True))
+
+    def _factors(self, T: Tensor, p_w: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Whitened, weighted rows: residual, by pose (free ones), by anchor; and the robust costs."""
         r, Jp, Jl, z = reprojection_jacobians(T, p_w, self.pose, self.anchor, self.uv, self.K)
         if len(self.depth_rows):
             rows = self.depth_rows
@@ -174,82 +275,11 @@ class _Window:
         s = torch.where(in_front, (r * r).sum(0) * self.inv_sigma.square(), self.behind)
         value, weight = rho(s, self.config.kernel, self.config.delta)
         root = torch.where(in_front, weight.sqrt() * self.inv_sigma, 0.0)
+        n = self.n_free
         r, Jp, Jl = r.mul_(root), Jp[..., :n].mul_(root[:n]), Jl.mul_(root)
         if not bool(in_front.all()):  # 0 * inf where a point sits on the camera plane
             r, Jp, Jl = r.nan_to_num_(0, 0, 0), Jp.nan_to_num_(0, 0, 0), Jl.nan_to_num_(0, 0, 0)
-        self.Jp, self.Jl = Jp, Jl
-        self.H = torch.zeros(6 * F, 6 * F, dtype=T.dtype)
-        self.g = torch.zeros(6 * F, dtype=T.dtype)
-        rf = r[:, :n]
-        g_pose = torch.addcmul(Jp[0] * rf[0], Jp[1], rf[1])
-        for chunk in self.chunks:
-            for pose, lo, hi in chunk.slices:
-                block = Jp[:, :, lo:hi]
-                at = slice(6 * pose, 6 * pose + 6)
-                self.H[at, at] += (block @ block.mT).sum(0)
-                self.g[at] += g_pose[:, lo:hi].sum(1)
-        products = torch.empty(9, r.shape[1], dtype=T.dtype)
-        for row, (i, j) in enumerate(_UPPER):
-            torch.addcmul(Jl[0, i] * Jl[0, j], Jl[1, i], Jl[1, j], out=products[row])
-        torch.addcmul(Jl[0] * r[0], Jl[1], r[1], out=products[6:])
-        sums = torch.zeros(9, A, dtype=T.dtype)
-        sums.index_add_(1, self.anchor, products)
-        prior_cost = self.priors.linearise(T, self.H, self.g)
-        self.V, self.g_point = sums[:6], sums[6:]
-        return float(value.sum()) + prior_cost, self._scaled_gradient()
-
-    def propose(self, mu: float) -> Step[_State] | None:
-        """Solve the damped system by eliminating the anchors."""
-        S, b, factor = self._reduce(mu)
-        diagonal = self.H.diagonal()
-        S.diagonal().add_(mu * diagonal + _PIVOT_FLOOR)
-        L, info = torch.linalg.cholesky_ex(S)
-        if int(info) != 0:
-            return None
-        delta = -torch.cholesky_solve(b[:, None], L)[:, 0]
-        y = schur.whiten(factor, self.g_point)
-        back = -y
-        for chunk, Yc in zip(self.chunks, self.Y, strict=True):
-            back[:, chunk.first : chunk.last] -= (delta[chunk.columns] @ Yc).view(3, -1)
-        step = schur.unwhiten(factor, back)
-        damped = (diagonal * delta * delta).sum() + (self.V[_DIAGONAL] * step * step).sum()
-        predicted = float(mu * damped - self.g @ delta - (self.g_point * step).sum())
-        size = float(torch.maximum(_abs_max(delta), _abs_max(step)))
-        T = self.state.T_c_w.clone()
-        T[self.free] = lie.exp(delta.view(-1, 6)) @ T[self.free]
-        return Step(_State(T, self.state.p_w + step.mT), predicted, size)
-
-    # -- the rest -------------------------------------------------------------------------------------------
-
-    def refine(self) -> WindowResult:
-        """Run the loop and report."""
-        summary = minimise(self, self.config)
-        s, in_front = self._chi2(self.state)
-        M = self.n_obs
-        chi2, front = torch.empty_like(s), torch.empty_like(in_front)
-        chi2[self.order] = torch.where(in_front, s, torch.inf)
-        front[self.order] = in_front
-        p_w = torch.empty_like(self.state.p_w)
-        p_w[self.anchor_order] = self.state.p_w
-        stop = summary.stop
-        if not bool(in_front.any()):
-            stop = StopReason.NO_OBSERVATIONS
-        deficiency, covariance = -1, torch.full((6, 6), torch.nan)
-        if self.config.diagnostics and stop is not StopReason.NOT_FINITE and len(self.free):
-            deficiency, covariance = self._diagnose()
-        return WindowResult(
-            T_c_w=self.state.T_c_w.numpy(),
-            p_w=p_w.numpy(),
-            chi2=chi2[:M].numpy(),
-            in_front=front[:M].numpy(),
-            cost_before=summary.cost_before,
-            cost_after=summary.cost_after,
-            iterations=summary.iterations,
-            accepted=summary.accepted,
-            stop=stop,
-            rank_deficiency=deficiency,
-            pose_covariance=covariance.numpy(),
-        )
+        return r, Jp, Jl, value
 
     def _chi2(self, state: _State) -> tuple[Tensor, Tensor]:
         r, z = reprojection_residuals(state.T_c_w, state.p_w, self.pose, self.anchor, self.uv, self.K)
@@ -260,41 +290,52 @@ class _Window:
         return torch.where(in_front, (r * r).sum(0) * self.inv_sigma.square(), self.behind), in_front
 
     def _scaled_gradient(self) -> float:
-        pose = self.g / (self.H.diagonal() + _PIVOT_FLOOR).sqrt()
-        point = self.g_point / (self.V[_DIAGONAL] + _PIVOT_FLOOR).sqrt()
-        return float(torch.maximum(_abs_max(pose), _abs_max(point)))
+        parts = [(self.g, self.H.diagonal()), (self.g_point, self.V[_DIAGONAL])]
+        parts += [(b.g, b.V[schur.diagonal_rows(b.size)]) for b in self.relative]
+        return max(float(_abs_max(g / (h + _FLOOR).sqrt())) for g, h in parts)
 
-    def _reduce(self, mu: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Pose system without the anchors, its right side and the anchors' factors; fills ``Y``."""
-        factor, _ = schur.inverse_cholesky(self.V, mu)
-        y = schur.whiten(factor, self.g_point)
+    def _reduce(self, mu: float) -> tuple[Tensor, Tensor]:
+        """Pose system without its anchors, edges and junctions, and its right side; fills the ``Y``."""
+        self.factor = schur.inverse_cholesky(self.V, mu)
+        y = schur.whiten(self.factor, self.g_point)
         n = self.n_free
-        a, b_, c, d, e, f = factor.index_select(1, self.anchor[:n])
-        J = self.Jl[..., :n]
-        white = torch.stack((a * J[:, 0], b_ * J[:, 0] + c * J[:, 1], d * J[:, 0] + e * J[:, 1] + f * J[:, 2]))
-        blocks = torch.addcmul(self.Jp[0][:, None] * white[:, 0], self.Jp[1][:, None], white[:, 1])  # (6, 3, n)
-        blocks = blocks.view(18, -1)
+        white = schur.whiten(self.factor.index_select(1, self.anchor[:n]), self.Jl[..., :n])
+        entries = schur.row_products(self.Jp, white)
         S, b = self.H.clone(), self.g.clone()
-        for chunk, Yc in zip(self.chunks, self.Y, strict=True):
-            part = blocks[:, chunk.lo : chunk.hi].flatten()
-            if chunk.unique:
-                Yc.view(-1).index_copy_(0, chunk.flat, part)
-            else:
-                Yc.zero_().view(-1).index_add_(0, chunk.flat, part)
-            S[chunk.columns[:, None], chunk.columns] -= Yc @ Yc.mT
-            b[chunk.columns] -= Yc @ y[:, chunk.first : chunk.last].flatten()
-        return S, b, factor
+        for chunk, Y in zip(self.chunks, self.Y, strict=True):
+            schur.fill(Y, chunk, entries[..., chunk.lo : chunk.hi])
+            S[chunk.columns[:, None], chunk.columns] -= Y @ Y.mT
+            b[chunk.columns] -= Y @ y[:, chunk.first : chunk.last].flatten()
+        for block in self.relative:
+            block.reduce(mu, S, b)
+        return S, b
 
-    def _diagnose(self) -> tuple[int, Tensor]:
+    def _diagnose(self) -> tuple[int, FloatArray]:
         """Unobservable directions of the undamped pose system and the last free pose's covariance."""
         self.linearise()
-        S = self._reduce(0.0)[0]
-        scale = (self.H.diagonal() + _PIVOT_FLOOR).rsqrt()
+        S, _ = self._reduce(0.0)
+        scale = (self.H.diagonal() + _FLOOR).rsqrt()
         values, vectors = torch.linalg.eigh(scale[:, None] * S * scale)
-        good = values > self.config.rank_tolerance * values[-1].clamp_min(_PIVOT_FLOOR)
+        good = values > self.config.rank_tolerance * values[-1].clamp_min(_FLOOR)
         rows = vectors[-6:, good]
         covariance = (rows / values[good]) @ rows.mT * scale[-6:, None] * scale[-6:]
-        return int((~good).sum()), covariance
+        return int((~good).sum()), covariance.numpy()
+
+    @staticmethod
+    def _edge_sigma(block: EdgeBlocks) -> Tensor:
+        return block.V[0].rsqrt()
+
+
+def _promise(mu: float, diagonal: Tensor, g: Tensor, step: Tensor) -> float:
+    """Decrease of the cost that the linear model promises, ``step^T (mu D step - g)``."""
+    return float((step * (mu * diagonal * step - g)).sum())
+
+
+def _restored(x: Tensor, order: Tensor) -> np.ndarray:
+    """``x`` from the solver's order to the caller's."""
+    out = torch.empty_like(x)
+    out[order] = x
+    return out.numpy()
 
 
 def _index(*parts: IntArray) -> Tensor:
@@ -305,10 +346,12 @@ def _values(x: FloatArray) -> Tensor:
     return torch.as_tensor(np.asarray(x, dtype=np.float64))
 
 
+_FEW_POSES = 12
+"""Up to this many free poses, cutting the anchors into chunks saves less than it costs."""
+_ANCHORS_PER_CHUNK = 512
 _NO_DEPTH_PRIORS = DepthPriors(np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros(0))
-_UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-_DIAGONAL = [0, 3, 5]
-_PIVOT_FLOOR = 1e-30
+_DIAGONAL = schur.diagonal_rows(3)
+_FLOOR = 1e-30
 
 
 def _abs_max(x: Tensor) -> Tensor:

@@ -7,9 +7,9 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from edgeslam_torch.losses.robust import CHI2_2DOF_95
 from edgeslam_torch.optim.priors import inverse_left_jacobian, pose_prior_residual
 from edgeslam_torch.optim.problem import PosePrior
-from edgeslam_torch.optim.robust import CHI2_2DOF_95
 from edgeslam_torch.types import FloatArray
 
 
@@ -245,11 +245,11 @@ class _Points:
         """Normal matrix, gradient and cost over the points in use; sets ``chi2`` of all points."""
         p_c = T[:3, :3] @ self.p + T[:3, 3:]
         z = p_c[2]
-        use, behind = self.use, 0
+        use, behind = self.use, 0.0
         hidden = z <= self.config.min_depth
         if hidden.any():
             z = np.where(hidden, 1.0, z)
-            behind = np.count_nonzero(use & hidden)
+            behind = float(np.count_nonzero(use & hidden))
             use = use & ~hidden
         iz = 1.0 / z
         n = p_c[:2] * iz
@@ -264,7 +264,7 @@ class _Points:
             # s inside, 2 delta |r| - delta^2 outside; its derivative is delta / norm
             cost = np.minimum(s, chi2) + 2.0 * delta * norm
             # A point behind the camera costs as much as one a thousand pixels off.
-            total = float(cost @ use) - 2.0 * chi2 * np.count_nonzero(use) + 2000.0 * delta * behind
+            total: float = float(cost @ use) - 2.0 * chi2 * np.count_nonzero(use) + 2000.0 * delta * behind
             weight = self.weight * (np.sqrt(delta / norm) * use)
         else:
             weight = self.weight * use

@@ -6,7 +6,8 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from edgeslam_torch.optim.robust import CHI2_2DOF_95, Kernel
+from edgeslam_torch.losses.cycle import CycleForm
+from edgeslam_torch.losses.robust import CHI2_1DOF_95, CHI2_2DOF_95, Kernel
 from edgeslam_torch.types import FloatArray, IntArray
 
 
@@ -66,6 +67,79 @@ class DepthPriors:
 
 
 @dataclass(frozen=True, slots=True)
+class EdgeTerms:
+    """Edge pixels with their inverse depths, and where other poses of the window see the same edge.
+
+    ``E`` edges, ``P`` pairs (edge, target pose). The depths are refined too.
+    """
+
+    host: IntArray
+    """``(E,)`` pose that owns the pixel."""
+    uv: FloatArray
+    """``(E, 2)`` undistorted pixels."""
+    inverse_depth: FloatArray
+    """``(E,)`` start [1/m]."""
+    prior: FloatArray
+    """``(E,)`` expected inverse depth, from the network [1/m]."""
+    prior_sigma: FloatArray
+    """``(E,)`` its standard deviation; infinite for none."""
+    pair_edge: IntArray
+    """``(P,)`` edge indices."""
+    pair_pose: IntArray
+    """``(P,)`` target poses, never the host."""
+    pair_uv: FloatArray
+    """``(P, 2)`` nearest edge pixel in the target."""
+    pair_normal: FloatArray
+    """``(P, 2)`` its unit normal."""
+    pair_inv_sigma: FloatArray
+    """``(P,)`` inverse standard deviation across the edge [1/px]; zero switches alignment off."""
+    pair_inverse_depth: FloatArray
+    """``(P,)`` inverse depth that the target has there, held; zero for none (no cycle)."""
+    cycle: CycleForm = CycleForm.RELATIVE_DEPTH
+    """Form of the cycle residual; ``PARALLAX`` is for training only."""
+    cycle_sigma: float = 0.0
+    """Its standard deviation in its own unit; zero switches the cycle off."""
+
+    def __post_init__(self) -> None:
+        if self.cycle is CycleForm.PARALLAX:
+            raise ValueError("the solver knows the cycle as pixels or as relative depth, not as parallax")
+
+
+@dataclass(frozen=True, slots=True)
+class JunctionTerms:
+    """L-junctions: a corner and the ends of two straight arms, with three inverse depths each.
+
+    ``C`` junctions, ``Q`` pairs (junction, target pose).
+    """
+
+    host: IntArray
+    """``(C,)`` pose that owns it."""
+    uv: FloatArray
+    """``(C, 3, 2)`` corner, end of arm 1, end of arm 2 [px]."""
+    inverse_depth: FloatArray
+    """``(C, 3)`` start [1/m]."""
+    prior: FloatArray
+    """``(C, 3)`` expected inverse depths: along a straight arm inverse depth is linear in the image, so the
+    collinearity of its edge points (paper eq. 26) is the fit of a line to theirs, see `collinearity_prior`."""
+    prior_information: FloatArray
+    """``(C, 3, 3)`` inverse covariance of ``prior``."""
+    pair_junction: IntArray
+    """``(Q,)`` junction indices."""
+    pair_pose: IntArray
+    """``(Q,)`` target poses, never the host."""
+    pair_uv: FloatArray
+    """``(Q, 2)`` corner seen there [px]."""
+    pair_arms: FloatArray
+    """``(Q, 2, 2)`` unit directions of the arms seen there."""
+    inv_sigma_px: float = 1.0
+    """Inverse standard deviation of a corner's position [1/px]; zero switches it off."""
+    inv_sigma_angle: float = 20.0
+    """Inverse standard deviation of an angle row; zero switches it off."""
+    cosines: bool = False
+    """One cosine per junction (the paper's angle) in place of both arms' directions."""
+
+
+@dataclass(frozen=True, slots=True)
 class WindowProblem:
     """Poses and anchors to refine together; ``W`` poses, ``A`` anchors, ``M`` observations."""
 
@@ -88,6 +162,8 @@ class WindowProblem:
     pose_priors: tuple[PosePrior, ...] = ()
     scale_priors: tuple[ScalePrior, ...] = ()
     depth_priors: DepthPriors | None = None
+    edges: EdgeTerms | None = None
+    junctions: JunctionTerms | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,6 +175,10 @@ class LmConfig:
     kernel: Kernel = Kernel.HUBER
     delta: float = CHI2_2DOF_95**0.5
     """Where the kernel departs from least squares [standard deviations]."""
+    edge_delta: float = CHI2_1DOF_95**0.5
+    """The same for edge and junction rows, which are scalars."""
+    float32_edges: bool = True
+    """Edge blocks in single precision; the reduced system is always double."""
     mu: float = 1e-4
     """First damping, relative to the diagonal of the normal matrix."""
     mu_max: float = 1e8
@@ -143,6 +223,14 @@ class WindowResult:
     """Steps tried."""
     accepted: int
     stop: StopReason
+    edge_inverse_depth: FloatArray = field(default_factory=lambda: np.zeros(0))
+    """``(E,)`` refined inverse depths of the edges."""
+    edge_sigma: FloatArray = field(default_factory=lambda: np.zeros(0))
+    """``(E,)`` their standard deviations with the poses held; infinite when nothing observes them."""
+    edge_chi2: FloatArray = field(default_factory=lambda: np.zeros(0))
+    """``(P,)`` squared whitened alignment residuals; infinite behind the camera."""
+    junction_inverse_depth: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    """``(C, 3)`` refined inverse depths of the junctions."""
     rank_deficiency: int = 0
     """Unobservable directions of the free poses (1 for a free scale), -1 when not computed."""
     pose_covariance: FloatArray = field(default_factory=lambda: np.full((6, 6), np.nan))

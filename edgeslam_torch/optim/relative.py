@@ -1,0 +1,342 @@
+"""Edges and junctions: blocks that live in a host pose and are seen from target poses.
+
+Residuals are differentiated by the *relative* pose of host and target, six columns, whatever the window's size;
+blocks are eliminated in those columns, one dense product per host; only then does the adjoint map them to the two
+poses: ``xi_rel = xi_target - Ad(T_target_host) xi_host``.
+"""
+
+from abc import ABC, abstractmethod
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from edgeslam_torch.losses.cycle import CycleForm
+from edgeslam_torch.losses.edge_alignment import (
+    PairGeometry,
+    alignment_jacobians,
+    alignment_row,
+    pair_geometry,
+    relative_depth_jacobians,
+    relative_depth_row,
+    round_trip_jacobians,
+)
+from edgeslam_torch.losses.lshape import junction_rows
+from edgeslam_torch.losses.robust import rho
+from edgeslam_torch.optim import lie, schur
+from edgeslam_torch.optim.problem import EdgeTerms, JunctionTerms, LmConfig
+from edgeslam_torch.types import FloatArray, IntArray
+
+INVERSE_DEPTH_MIN = 1e-4
+"""Nothing is refined beyond this inverse depth: practically at infinity, and never behind the camera."""
+
+
+class RelativeBlocks(ABC):
+    """Host-anchored blocks of ``size`` inverse depths; subclasses write the residual rows.
+
+    Blocks are kept sorted by host, pairs by host, target, block.
+    """
+
+    size: int
+
+    def __init__(
+        self,
+        host: IntArray,
+        pair_block: IntArray,
+        pair_pose: IntArray,
+        column: Tensor,
+        config: LmConfig,
+        dtype: torch.dtype,
+    ) -> None:
+        """Sort and lay out.
+
+        Args:
+            host: ``(E,)`` host poses.
+            pair_block: ``(P,)`` blocks of the pairs.
+            pair_pose: ``(P,)`` target poses.
+            column: ``(W,)`` free-pose number of each pose, -1 for a fixed one.
+            config: Kernel and its width.
+            dtype: Of the blocks.
+        """
+        self.config, self.dtype, self.column = config, dtype, column
+        hosts = torch.as_tensor(np.asarray(host, dtype=np.int64))
+        E, W = len(hosts), len(column)
+        self.block_order = torch.argsort(hosts, stable=True)
+        rank = torch.empty_like(self.block_order)
+        rank[self.block_order] = torch.arange(E)
+        block = rank[torch.as_tensor(np.asarray(pair_block, dtype=np.int64))]
+        target = torch.as_tensor(np.asarray(pair_pose, dtype=np.int64))
+        pair_host = hosts[self.block_order][block]
+        if bool((pair_host == target).any()):
+            raise ValueError("a pair's target pose must differ from its host")
+        key = pair_host * W + target
+        self.pair_order = torch.argsort(key * max(E, 1) + block)
+        self.block = block[self.pair_order]
+        groups, self.group = torch.unique_consecutive(key[self.pair_order], return_inverse=True)
+        self.group_host, self.group_target = groups // W, groups % W
+        self.n_blocks = E
+        bounds = [0, *torch.bincount(hosts, minlength=W).cumsum(0).tolist()]
+        self.chunks = schur.plan_chunks(self.group, self.block, bounds, self.size)
+        self.Y = [torch.zeros(len(c.columns), self.size * (c.last - c.first), dtype=dtype) for c in self.chunks]
+
+    @abstractmethod
+    def rows(self, Rt: Tensor, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Whitened residuals ``(R, P)``, by relative pose ``(R, 6, P)``, by block ``(R, size, P)``, valid ``(P,)``."""
+
+    @abstractmethod
+    def residual_rows(self, Rt: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Whitened residuals ``(R, P)`` and valid ``(P,)`` alone."""
+
+    @abstractmethod
+    def prior_cost(self, x: Tensor) -> Tensor:
+        """Cost ``()`` of what is known about the blocks ``(size, E)`` beforehand."""
+
+    @abstractmethod
+    def add_prior(self, x: Tensor, V: Tensor, g: Tensor) -> None:
+        """Add the prior to the blocks' normal matrices and gradients ``(size, E)``."""
+
+    def motions(self, T_c_w: Tensor) -> tuple[Tensor, Tensor]:
+        """Relative motions of the groups ``(G, 4, 4)`` and of the pairs ``(3, 4, P)``."""
+        T = T_c_w[self.group_target] @ lie.inverse(T_c_w[self.group_host])
+        flat = T[:, :3].permute(1, 2, 0).reshape(12, -1).to(self.dtype)
+        return T, flat.index_select(1, self.group).view(3, 4, -1)
+
+    def cost(self, T_c_w: Tensor, x: Tensor) -> Tensor:
+        """Robust cost ``()``."""
+        if len(self.block) == 0:
+            return self.prior_cost(x)
+        r, valid = self.residual_rows(self.motions(T_c_w)[1], x.index_select(1, self.block).to(self.dtype))
+        value, _ = self._robust(r * r, valid)
+        return value.sum(dtype=torch.float64) + self.prior_cost(x)
+
+    def linearise(self, T_c_w: Tensor, x: Tensor, H: Tensor, g: Tensor) -> Tensor:
+        """Prepare the blocks; add the pose part to ``H (6F, 6F)`` and ``g (6F,)``; returns the cost ``()``."""
+        E = self.n_blocks
+        sums = torch.zeros(self.size * (self.size + 1) // 2 + self.size, E, dtype=torch.float64)
+        cost = self.prior_cost(x)
+        self.T_rel, Rt = self.motions(T_c_w)
+        if len(self.block):
+            r, J, Jd, valid = self.rows(Rt, x.index_select(1, self.block).to(self.dtype))
+            value, weight = self._robust(r * r, valid)
+            cost = cost + value.sum(dtype=torch.float64)
+            root = torch.where(valid, weight.sqrt(), 0.0)
+            if not bool(valid.all()):
+                r, J, Jd = (torch.where(valid, v, 0.0) for v in (r, J, Jd))
+            r, J, Jd = r * root, J.mul_(root[:, None]), Jd.mul_(root[:, None])
+            self.J, self.Jd = J, Jd
+            own = torch.cat((schur.triangle(Jd), (Jd * r[:, None]).sum(0)))
+            sums.index_add_(1, self.block, own.double())
+            g_pair = (J * r[:, None]).sum(0)
+            for chunk in self.chunks:
+                M = self._map(chunk, H.shape[0])
+                H_rel = torch.zeros(len(chunk.columns), len(chunk.columns), dtype=torch.float64)
+                g_rel = torch.zeros(len(chunk.columns), dtype=torch.float64)
+                for k, (_, lo, hi) in enumerate(chunk.slices):
+                    part = J[:, :, lo:hi]
+                    at = slice(6 * k, 6 * k + 6)
+                    H_rel[at, at] = (part @ part.mT).double().sum(0)
+                    g_rel[at] = g_pair[:, lo:hi].sum(1).double()
+                H += M.mT @ H_rel @ M
+                g += M.mT @ g_rel
+        self.V, self.g = sums[: -self.size], sums[-self.size :]
+        self.add_prior(x, self.V, self.g)
+        return cost
+
+    def reduce(self, mu: float, S: Tensor, b: Tensor) -> None:
+        """Subtract what the blocks take from the pose system ``S`` and its right side ``b``."""
+        self.factor = schur.inverse_cholesky(self.V, mu)
+        self.y = schur.whiten(self.factor, self.g)
+        if len(self.block) == 0:
+            return
+        white = schur.whiten(self.factor.to(self.dtype).index_select(1, self.block), self.Jd)
+        entries = schur.row_products(self.J, white)
+        self.maps = [self._map(chunk, S.shape[0]) for chunk in self.chunks]
+        for chunk, Y, M in zip(self.chunks, self.Y, self.maps, strict=True):
+            schur.fill(Y, chunk, entries[..., chunk.lo : chunk.hi])
+            S -= M.mT @ (Y @ Y.mT).double() @ M
+            b -= M.mT @ (Y @ self.y[:, chunk.first : chunk.last].to(self.dtype).flatten()).double()
+
+    def step(self, delta: Tensor) -> Tensor:
+        """Step of the blocks ``(size, E)`` that goes with the poses' ``delta (6F,)``."""
+        back = -self.y
+        if len(self.block):
+            for chunk, Y, M in zip(self.chunks, self.Y, self.maps, strict=True):
+                moved = ((M @ delta).to(self.dtype) @ Y).view(self.size, -1)
+                back[:, chunk.first : chunk.last] -= moved.double()
+        return schur.unwhiten(self.factor, back)
+
+    def _map(self, chunk: schur.Chunk, n: int) -> Tensor:
+        """Relative tangents of a host's groups by the pose tangents, ``(6 w, 6F)``."""
+        M = torch.zeros(len(chunk.columns), n, dtype=torch.float64)
+        for k, (group, _, _) in enumerate(chunk.slices):
+            rows = slice(6 * k, 6 * k + 6)
+            target = int(self.column[self.group_target[group]])
+            host = int(self.column[self.group_host[group]])
+            if target >= 0:
+                M[rows, 6 * target : 6 * target + 6].diagonal().add_(1.0)
+            if host >= 0:
+                M[rows, 6 * host : 6 * host + 6] -= lie.adjoint(self.T_rel[group])
+        return M
+
+    def _robust(self, s: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
+        """Costs and weights ``(R, P)`` of squared rows; what lies behind a camera costs a fixed, large amount."""
+        far = self.config.behind_px**2
+        return rho(torch.where(valid, s, far), self.config.kernel, self.config.edge_delta)
+
+
+class EdgeBlocks(RelativeBlocks):
+    """Edge pixels: alignment across the edge and the depth cycle, one inverse depth each."""
+
+    size = 1
+
+    def __init__(self, terms: EdgeTerms, K: Tensor, column: Tensor, config: LmConfig) -> None:
+        """Take the terms into the solver's order; ``K`` is fx, fy, cx, cy."""
+        dtype = torch.float32 if config.float32_edges else torch.float64
+        super().__init__(terms.host, terms.pair_edge, terms.pair_pose, column, config, dtype)
+        self.K = K.to(dtype)
+        rays = (_tensor(terms.uv).view(-1, 2) - K[2:]) / K[:2]
+        self.ray = rays[self.block_order][self.block].mT.contiguous().to(dtype)
+        self.x = _tensor(terms.inverse_depth)[self.block_order].clamp_min(INVERSE_DEPTH_MIN)[None]
+        sigma = _tensor(terms.prior_sigma)[self.block_order]
+        self.prior_weight = sigma.square().reciprocal()[None]
+        self.prior = torch.where(sigma.isfinite(), _tensor(terms.prior)[self.block_order], 0.0)[None]
+        order = self.pair_order
+        self.uv = _tensor(terms.pair_uv).view(-1, 2)[order].mT.contiguous().to(dtype)
+        self.normal = _tensor(terms.pair_normal).view(-1, 2)[order].mT.contiguous().to(dtype)
+        self.inv_sigma = _tensor(terms.pair_inv_sigma)[order].to(dtype)
+        held = _tensor(terms.pair_inverse_depth)[order].to(dtype)
+        self.form = terms.cycle
+        self.held = torch.where(held > 0, held, 1.0)
+        self.cycle_weight = torch.zeros_like(held)
+        if terms.cycle_sigma > 0:
+            self.cycle_weight[held > 0] = 1.0 / terms.cycle_sigma
+        self.has_cycle = bool((self.cycle_weight > 0).any())
+
+    def rows(self, Rt: Tensor, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """See `RelativeBlocks.rows`."""
+        g = pair_geometry(Rt, self.ray, x[0])
+        r, J, Jd = alignment_jacobians(g, self.uv, self.normal, self.K)
+        parts = [(r[None], J[None], Jd[None], self.inv_sigma)]
+        if self.has_cycle and self.form is CycleForm.PIXEL:
+            parts.append((*round_trip_jacobians(g, Rt, self.ray, self.held, self.K), self.cycle_weight))
+        elif self.has_cycle:
+            r, J, Jd = relative_depth_jacobians(g, self.held)
+            parts.append((r[None], J[None], Jd[None], self.cycle_weight))
+        rows = torch.cat([r * w for r, _, _, w in parts])
+        by_pose = torch.cat([J * w for _, J, _, w in parts])
+        by_depth = torch.cat([d * w for _, _, d, w in parts])[:, None]
+        return rows, by_pose, by_depth, g.front
+
+    def residual_rows(self, Rt: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
+        """See `RelativeBlocks.residual_rows`."""
+        g = pair_geometry(Rt, self.ray, x[0])
+        parts = [(alignment_row(g, self.uv, self.normal, self.K) * self.inv_sigma)[None]]
+        if self.has_cycle and self.form is CycleForm.PIXEL:
+            parts.append(round_trip_jacobians(g, Rt, self.ray, self.held, self.K)[0] * self.cycle_weight)
+        elif self.has_cycle:
+            parts.append((relative_depth_row(g, self.held) * self.cycle_weight)[None])
+        return torch.cat(parts), g.front
+
+    def prior_cost(self, x: Tensor) -> Tensor:
+        """See `RelativeBlocks.prior_cost`."""
+        return ((x - self.prior).square() * self.prior_weight).sum()
+
+    def add_prior(self, x: Tensor, V: Tensor, g: Tensor) -> None:
+        """See `RelativeBlocks.add_prior`."""
+        V += self.prior_weight
+        g += self.prior_weight * (x - self.prior)
+
+    def alignment_chi2(self, T_c_w: Tensor, x: Tensor) -> Tensor:
+        """Squared whitened alignment residuals in the caller's order ``(P,)``; infinite behind the camera."""
+        g = pair_geometry(self.motions(T_c_w)[1], self.ray, x.index_select(1, self.block).to(self.dtype)[0])
+        r = alignment_row(g, self.uv, self.normal, self.K) * self.inv_sigma
+        out = torch.empty_like(r)
+        out[self.pair_order] = torch.where(g.front, r * r, torch.inf)
+        return out.double()
+
+
+class JunctionBlocks(RelativeBlocks):
+    """L-junctions: corner, arms or angle, and the straightness of the arms, three inverse depths each."""
+
+    size = 3
+
+    def __init__(self, terms: JunctionTerms, K: Tensor, column: Tensor, config: LmConfig) -> None:
+        """Take the terms into the solver's order; ``K`` is fx, fy, cx, cy."""
+        super().__init__(terms.host, terms.pair_junction, terms.pair_pose, column, config, torch.float64)
+        self.K, self.cosines = K, terms.cosines
+        rays = (_tensor(terms.uv).view(-1, 3, 2) - K[2:]) / K[:2]
+        self.rays = rays[self.block_order][self.block].permute(1, 2, 0).contiguous()
+        start = _tensor(terms.inverse_depth).view(-1, 3)[self.block_order].mT
+        self.x = start.clamp_min(INVERSE_DEPTH_MIN).contiguous()
+        self.prior = _tensor(terms.prior).view(-1, 3)[self.block_order].mT.contiguous()
+        self.information = _tensor(terms.prior_information).view(-1, 3, 3)[self.block_order]
+        order = self.pair_order
+        self.uv = _tensor(terms.pair_uv).view(-1, 2)[order].mT.contiguous()
+        self.arms = _tensor(terms.pair_arms).view(-1, 2, 2)[order].permute(1, 2, 0).contiguous()
+        angles = 1 if terms.cosines else 2
+        weights = [terms.inv_sigma_px] * 2 + [terms.inv_sigma_angle] * angles
+        self.weight = torch.tensor(weights, dtype=torch.float64)[:, None]
+
+    def rows(self, Rt: Tensor, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """See `RelativeBlocks.rows`."""
+        r, J, Jd, front = junction_rows(Rt, self.rays, x, self.uv, self.arms, self.K, self.cosines)
+        return r * self.weight, J * self.weight[..., None], Jd * self.weight[..., None], front
+
+    def residual_rows(self, Rt: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
+        """See `RelativeBlocks.residual_rows`."""
+        r, _, _, front = self.rows(Rt, x)
+        return r, front
+
+    def prior_cost(self, x: Tensor) -> Tensor:
+        """See `RelativeBlocks.prior_cost`."""
+        e = (x - self.prior).mT
+        return torch.einsum("ci,cij,cj->", e, self.information, e)
+
+    def add_prior(self, x: Tensor, V: Tensor, g: Tensor) -> None:
+        """See `RelativeBlocks.add_prior`."""
+        e = (x - self.prior).mT
+        for row, (i, j) in enumerate(((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))):
+            V[row] += self.information[:, i, j]
+        g += torch.einsum("cij,cj->ic", self.information, e)
+
+
+def collinearity_prior(
+    fraction: FloatArray, inverse_depth: FloatArray, sigma: FloatArray, weak_sigma: float = 10.0
+) -> tuple[FloatArray, FloatArray]:
+    """Straight arms through the depths of their edge points: prior of a `JunctionTerms`, paper eq. (26).
+
+    A straight line in space has inverse depths that are linear along its image, so the arm is a line fitted to the
+    inverse depths of its points; their scatter about it is the collinearity residual.
+
+    Args:
+        fraction: Position of each point along its arm ``(C, 2, M)``, 0 at the corner and 1 at the arm's end; NaN
+            for no point.
+        inverse_depth: Their inverse depths ``(C, 2, M)`` [1/m].
+        sigma: Their standard deviations ``(C, 2, M)`` [1/m].
+        weak_sigma: Keeps a junction without points solvable [1/m].
+
+    Returns:
+        Expected inverse depths of corner and arm ends ``(C, 3)`` and their information ``(C, 3, 3)``.
+    """
+    s = np.asarray(fraction, dtype=np.float64)
+    given = np.isfinite(s) & np.isfinite(inverse_depth) & (np.asarray(sigma) > 0)
+    s = np.where(given, s, 0.0)
+    w = np.where(given, 1.0 / np.where(given, sigma, 1.0), 0.0)
+    z = np.where(given, inverse_depth, 0.0)
+    A = np.zeros((*s.shape, 3))
+    A[..., 0] = 1.0 - s
+    A[:, 0, :, 1], A[:, 1, :, 2] = s[:, 0], s[:, 1]
+    A = (A * w[..., None]).reshape(len(s), -1, 3)
+    right = (z * w).reshape(len(s), -1)
+    mean = z.sum((1, 2)) / np.maximum(given.sum((1, 2)), 1)
+    weak = 1.0 / weak_sigma**2
+    information = np.einsum("cki,ckj->cij", A, A) + weak * np.eye(3)
+    moment = np.einsum("cki,ck->ci", A, right) + weak * mean[:, None]
+    return np.linalg.solve(information, moment[..., None])[..., 0], information
+
+
+def _tensor(x: FloatArray) -> Tensor:
+    return torch.as_tensor(np.asarray(x, dtype=np.float64))
+
+
+__all__ = ["EdgeBlocks", "JunctionBlocks", "PairGeometry", "RelativeBlocks", "collinearity_prior"]

@@ -1,0 +1,119 @@
+"""Edge cycle consistency, paper eqs. (17)-(23)."""
+
+from enum import StrEnum
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from edgeslam_torch.losses.base import (
+    Reduction,
+    ResidualLoss,
+    Residuals,
+    back_project,
+    masked,
+    move,
+    project,
+)
+from edgeslam_torch.losses.robust import Kernel
+
+
+class CycleForm(StrEnum):
+    """What the cycle compares."""
+
+    PIXEL = "pixel"
+    """Paper eq. (23): the pixel after the round trip against the pixel before it [px]."""
+    PARALLAX = "parallax"
+    """The same divided by the parallax ``f |t| / z`` that the edge should show; no unit."""
+    RELATIVE_DEPTH = "relative depth"
+    """``(z - d_j) / (z + d_j)`` of the depth predicted in frame j; no unit."""
+
+
+class CycleLoss(ResidualLoss):
+    """Edge pixels sent from frame i to j and back.
+
+    Note:
+        The paper's pixel form is exactly zero for a camera that does not move, whatever the depths
+        (docs/decisions.md, "Cycle"); the relative depth is the default because it does not shrink the baseline.
+    """
+
+    def __init__(
+        self,
+        form: CycleForm = CycleForm.RELATIVE_DEPTH,
+        reduction: Reduction = Reduction.MEAN,
+        kernel: Kernel = Kernel.L2,
+        delta: float = 1.0,
+        max_relative: float = 0.15,
+        min_parallax_px: float = 1.0,
+    ) -> None:
+        """Choose the form.
+
+        Args:
+            form: What to compare.
+            reduction: Sum (the paper's) or mean over valid edges.
+            kernel: Robust kernel.
+            delta: Where it departs from least squares, in the residual's unit.
+            max_relative: ``(z - d_j) / (z + d_j)`` above which frame j sees something nearer: occluded. Infinite
+                with the paper's literal loss, which masks nothing.
+            min_parallax_px: Edges that should move less are not used by ``PARALLAX``.
+        """
+        super().__init__(reduction, kernel, delta)
+        self.form, self.max_relative, self.min_parallax_px = CycleForm(form), max_relative, min_parallax_px
+
+    @classmethod
+    def literal(cls) -> "CycleLoss":
+        """The paper's loss to the letter: pixels, summed, nothing masked that can be computed."""
+        return cls(CycleForm.PIXEL, Reduction.SUM, max_relative=float("inf"))
+
+    def residuals(  # type: ignore[override]
+        self, T_j_i: Tensor, uv: Tensor, depth_i: Tensor, depth_j: Tensor, K: Tensor
+    ) -> Residuals:
+        """Round-trip residuals of edge pixels.
+
+        Args:
+            T_j_i: Motion from frame i to frame j ``(4, 4)``.
+            uv: Edge pixels in frame i ``(N, 2)``.
+            depth_i: Their z-depths ``(N,)``.
+            depth_j: Depth map of frame j ``(H, W)``, or the depths ``(N,)`` already sampled there.
+            K: Calibration matrix ``(3, 3)`` [px].
+
+        Returns:
+            ``(N, 2)`` pixels or ``(N, 1)`` ratios; invalid outside the image, behind a camera, without depth, or
+            occluded in frame j.
+        """
+        p_j = move(T_j_i, back_project(uv, depth_i, K))  # eqs. (17), (18)
+        uv_j, valid = project(p_j, K)  # eq. (19)
+        if depth_j.ndim == 2:
+            d_j, inside = sample_depth(depth_j, uv_j)
+            valid = valid & inside
+        else:
+            d_j = depth_j
+        z = p_j[..., 2]
+        valid = valid & (depth_i > 0) & (d_j > 0)
+        relative = (z - d_j) / torch.where(valid, z + d_j, 1.0)
+        valid = valid & (relative.detach() < self.max_relative)
+        if self.form is CycleForm.RELATIVE_DEPTH:
+            return masked(relative[..., None], valid)
+        back = back_project(uv_j, d_j, K) - T_j_i[:3, 3]  # eqs. (20), (21)
+        round_trip, front = project(back @ T_j_i[:3, :3], K)  # eq. (22)
+        residual, valid = round_trip - uv, valid & front  # eq. (23)
+        if self.form is CycleForm.PARALLAX:
+            parallax = expected_parallax_px(T_j_i, depth_i, K)
+            valid = valid & (parallax.detach() > self.min_parallax_px)
+            residual = residual / torch.where(valid, parallax, 1.0)[..., None]
+        return masked(residual, valid)
+
+
+def expected_parallax_px(T_j_i: Tensor, depth_i: Tensor, K: Tensor) -> Tensor:
+    """Pixels ``(N,)`` that a baseline moves points at ``depth_i (N,)``, ``f |t| / z``."""
+    return K[0, 0] * (T_j_i[:3, 3].square().sum() + 1e-30).sqrt() / depth_i.clamp_min(1e-6)
+
+
+def sample_depth(depth: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
+    """Bilinear depths ``(N,)`` of a map ``(H, W)`` at pixels ``(N, 2)``, and which lie inside the map."""
+    H, W = depth.shape
+    size = torch.tensor((W - 1, H - 1), dtype=uv.dtype, device=uv.device)
+    inside = ((uv >= 0) & (uv <= size)).all(-1)
+    grid = torch.where(inside[..., None], 2.0 * uv / size - 1.0, 0.0)
+    out = F.grid_sample(depth[None, None], grid[None, None], align_corners=True, padding_mode="border")
+    return out[0, 0, 0], inside

@@ -1,0 +1,99 @@
+"""Adaptive weights: robust scales of the residuals for the solver, learned variances for training.
+
+The paper balances its terms by "adaptive weighting based on uncertainty" and gives no formula. Here every term is
+whitened by a robust standard deviation of its own residuals, so that the weights of eq. (28) are pure numbers.
+"""
+
+from dataclasses import dataclass, field, replace
+
+import torch
+from torch import Tensor, nn
+
+MAD_TO_SIGMA = 1.4826
+"""Median absolute deviation to standard deviation of a normal distribution."""
+
+
+def robust_sigma(residual: Tensor) -> Tensor:
+    """Standard deviation ``()`` of residuals about zero by their median absolute value; NaN for none.
+
+    Example:
+        >>> robust_sigma(torch.tensor([-1.0, 1.0, 1.0, -1.0, 1000.0]))
+        tensor(1.4826)
+    """
+    return MAD_TO_SIGMA * residual.abs().flatten().median()
+
+
+@dataclass(frozen=True, slots=True)
+class TermScale:
+    """Running robust standard deviation of one term."""
+
+    sigma: float
+    """Current estimate, in the residual's unit."""
+    low: float
+    """Never below: a lucky window must not make a term rule."""
+    high: float
+    """Never above: a bad window must not silence it."""
+    smoothing: float = 0.8
+    """Share of the old value (of its log) that stays at each update."""
+    min_count: int = 30
+    """Fewer residuals than this leave the scale as it is."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.low <= self.sigma <= self.high:
+            raise ValueError(f"need 0 < low <= sigma <= high, got {self.low}, {self.sigma}, {self.high}")
+        if not 0 <= self.smoothing < 1:
+            raise ValueError(f"smoothing must lie in [0, 1), got {self.smoothing}")
+
+    def updated(self, residual: Tensor) -> "TermScale":
+        """The scale after one more window's residuals (valid ones only)."""
+        if residual.numel() < self.min_count:
+            return self
+        new = float(robust_sigma(residual))
+        if not new >= 0:
+            return self
+        new = min(max(new, self.low), self.high)
+        smooth = self.sigma**self.smoothing * new ** (1.0 - self.smoothing)
+        return replace(self, sigma=min(max(smooth, self.low), self.high))
+
+
+@dataclass(frozen=True, slots=True)
+class AdaptiveScales:
+    """Scales of all terms of a window."""
+
+    terms: dict[str, TermScale] = field(
+        default_factory=lambda: {
+            "reproj": TermScale(1.0, 0.5, 3.0),
+            "edge": TermScale(1.0, 0.5, 3.0),
+            "cycle": TermScale(0.05, 0.01, 0.3),
+            "angle": TermScale(0.05, 0.01, 0.3),
+        }
+    )
+
+    def updated(self, residuals: dict[str, Tensor]) -> "AdaptiveScales":
+        """Scales after one more window; terms without residuals stay."""
+        new = {k: s.updated(residuals[k]) if k in residuals else s for k, s in self.terms.items()}
+        return replace(self, terms=new)
+
+
+class LearnedWeights(nn.Module):
+    """Bounded learned log variances (Kendall, Gal and Cipolla, CVPR 2018), for training only.
+
+    ``sum_k exp(-s_k) L_k + s_k`` with ``s_k`` kept in a range: unbounded, a term that is easily made small takes
+    an unbounded weight.
+    """
+
+    def __init__(self, names: tuple[str, ...], bound: float = 3.0) -> None:
+        """One log variance per name, kept in ``[-bound, bound]``."""
+        super().__init__()
+        self.names, self.bound = names, bound
+        self.raw = nn.Parameter(torch.zeros(len(names)))
+
+    def log_variances(self) -> Tensor:
+        """``(len(names),)`` in ``(-bound, bound)``."""
+        return self.bound * torch.tanh(self.raw / self.bound)
+
+    def forward(self, terms: dict[str, Tensor]) -> Tensor:
+        """Weighted sum ``()`` of the scalar terms that are there."""
+        s = self.log_variances()
+        parts = [torch.exp(-s[k]) * terms[n] + s[k] for k, n in enumerate(self.names) if n in terms]
+        return torch.stack(parts).sum()

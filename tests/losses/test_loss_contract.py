@@ -1,0 +1,231 @@
+"""What every loss promises: zero at the truth, forward from residuals, right gradients, quiet degenerate cases."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from edgeslam_torch.losses.base import ResidualLoss, back_project, move, project
+from edgeslam_torch.losses.cycle import CycleForm, CycleLoss
+from edgeslam_torch.losses.edge_alignment import EdgeAlignmentLoss
+from edgeslam_torch.losses.lshape import AngleForm, AngleLoss, CollinearityLoss, cosine
+from edgeslam_torch.losses.reprojection import ReprojectionLoss
+from edgeslam_torch.optim import lie
+
+K = torch.tensor([[500.0, 0.0, 320.0], [0.0, 480.0, 240.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+
+
+@dataclass(frozen=True)
+class Case:
+    """A loss as a function of the tangent and depth scale of a noise-free two-view world; the truth is zero, one."""
+
+    loss: ResidualLoss
+    arguments: Callable[[Tensor, Tensor], tuple[Tensor, ...]]
+
+
+def world(rng: np.random.Generator) -> dict[str, Tensor]:
+    def tensor(x: np.ndarray) -> Tensor:
+        return torch.tensor(x, dtype=torch.float64)
+
+    T_j_i = lie.exp(tensor(np.array([0.3, -0.1, 0.15, 0.02, -0.05, 0.08])))
+    uv = tensor(rng.uniform((80, 60), (560, 420), (24, 2)))
+    depth = tensor(rng.uniform(2, 5, 24))
+    p_j = move(T_j_i, back_project(uv, depth, K))
+    uv_j, _ = project(p_j, K)
+    normal = tensor(rng.normal(size=(24, 2)))
+    return {
+        "T_j_i": T_j_i,
+        "uv": uv,
+        "depth": depth,
+        "p_i": back_project(uv, depth, K),
+        "uv_j": uv_j,
+        "depth_j": p_j[:, 2],
+        "normal": normal / normal.norm(dim=1, keepdim=True),
+    }
+
+
+def cases(rng: np.random.Generator) -> dict[str, Case]:
+    w = world(rng)
+    eye = torch.eye(4, dtype=torch.float64)
+    corners, corner_depths = w["uv"].view(8, 3, 2), w["depth"].view(8, 3)
+    arms_j = w["uv_j"].view(8, 3, 2)
+    cos_j, _ = cosine(arms_j[:, 1] - arms_j[:, 0], arms_j[:, 2] - arms_j[:, 0])
+    steps = torch.linspace(0, 1, 5, dtype=torch.float64)[:, None]
+    starts, ends = w["p_i"][:8].view(4, 2, 1, 3), w["p_i"][8:16].view(4, 2, 1, 3)
+    lines = starts + steps * (ends - starts)
+    bend = torch.tensor(rng.normal(size=lines.shape), dtype=torch.float64)
+
+    def moved(xi: Tensor) -> Tensor:
+        return lie.exp(xi) @ w["T_j_i"]
+
+    def views(xi: Tensor, s: Tensor) -> tuple[Tensor, ...]:
+        return torch.stack((eye, moved(xi))), s * w["p_i"], torch.stack((w["uv"], w["uv_j"])), K
+
+    def cycle(xi: Tensor, s: Tensor) -> tuple[Tensor, ...]:
+        return moved(xi), w["uv"], s * w["depth"], w["depth_j"], K
+
+    def align(xi: Tensor, s: Tensor) -> tuple[Tensor, ...]:
+        return moved(xi), w["uv"], s * w["depth"], w["uv_j"], w["normal"], K
+
+    def angle(xi: Tensor, s: Tensor) -> tuple[Tensor, ...]:
+        return moved(xi), corners, s * corner_depths, cos_j, K
+
+    def arms(xi: Tensor, s: Tensor) -> tuple[Tensor, ...]:
+        return (lines + (s - 1.0) * bend + 0.0 * xi.sum(),)
+
+    out = {
+        "reprojection": Case(ReprojectionLoss(), views),
+        "reprojection, literal": Case(ReprojectionLoss(reduction="sum"), views),
+        "edge alignment": Case(EdgeAlignmentLoss(), align),
+        "angle": Case(AngleLoss(), angle),
+        "collinearity": Case(CollinearityLoss(), arms),
+        "collinearity, literal": Case(CollinearityLoss(literal=True, reduction="sum"), arms),
+        "cycle, literal": Case(CycleLoss.literal(), cycle),
+    }
+    return out | {f"cycle, {form}": Case(CycleLoss(form), cycle) for form in CycleForm}
+
+
+NAMES = list(cases(np.random.default_rng(0)))
+OFF = (torch.tensor([0.01, -0.02, 0.01, 0.004, 0.002, -0.003], dtype=torch.float64), 1.03)
+
+
+@pytest.fixture
+def case(request: pytest.FixtureRequest, rng: np.random.Generator) -> Case:
+    return cases(rng)[request.param]
+
+
+@pytest.mark.parametrize("case", NAMES, indirect=True)
+def test_zero_for_the_truth_and_not_beside_it(case):
+    zero, one = torch.zeros(6, dtype=torch.float64), torch.ones((), dtype=torch.float64)
+    assert float(case.loss(*case.arguments(zero, one))) < 1e-18
+    assert float(case.loss(*case.arguments(*OFF))) > 1e-8
+
+
+@pytest.mark.parametrize("case", NAMES, indirect=True)
+def test_forward_reduces_squared_residuals(case):
+    residuals = case.loss.residuals(*case.arguments(*OFF))
+    total = residuals.value.square().sum()
+    assert residuals.valid.any()
+    if case.loss.reduction == "mean":
+        corners = isinstance(case.loss, CollinearityLoss)
+        total = total / (len(residuals.valid) if corners else residuals.valid.sum())
+    torch.testing.assert_close(case.loss(*case.arguments(*OFF)), total)
+
+
+@pytest.mark.parametrize("case", NAMES, indirect=True)
+def test_gradient_is_twice_jacobian_times_residual(case):
+    def residual(xi: Tensor, s: Tensor) -> Tensor:
+        return case.loss.residuals(*case.arguments(xi, s)).value.flatten()
+
+    xi, s = OFF[0].clone().requires_grad_(), torch.tensor(OFF[1], dtype=torch.float64, requires_grad=True)
+    loss = case.loss(*case.arguments(xi, s))
+    gradient = torch.cat([g.flatten() for g in torch.autograd.grad(loss, (xi, s))])
+    J = torch.cat([j.reshape(len(residual(xi, s)), -1) for j in torch.func.jacrev(residual, (0, 1))(xi, s)], 1)
+    scale = loss / residual(xi, s).square().sum()
+    torch.testing.assert_close(gradient, scale * 2.0 * J.mT @ residual(xi, s), rtol=1e-9, atol=1e-12)
+
+
+# Collinearity holds its line constant for the gradient; the gradient of its scalar is checked further down.
+@pytest.mark.parametrize("case", [name for name in NAMES if "collinearity" not in name], indirect=True)
+def test_residuals_pass_gradcheck(case):
+    xi, s = OFF[0].clone().requires_grad_(), torch.tensor(OFF[1], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda a, b: case.loss.residuals(*case.arguments(a, b)).value, (xi, s))
+    at_truth = torch.zeros(6, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda a: case.loss.residuals(*case.arguments(a, s)).value, at_truth)
+
+
+def test_collinearity_scalar_passes_gradcheck_though_its_line_is_held(rng):
+    p = torch.tensor(rng.normal(size=(2, 2, 5, 3)) + [0, 0, 4], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(CollinearityLoss(literal=True), p)
+
+
+@pytest.mark.parametrize("case", NAMES, indirect=True)
+def test_empty_and_behind_give_finite_zero(case):
+    zero, one = torch.zeros(6, dtype=torch.float64), torch.ones((), dtype=torch.float64)
+    xi = zero.clone().requires_grad_()
+    behind = case.loss(*case.arguments(xi, -one))  # every depth negative: all behind
+    (gradient,) = torch.autograd.grad(behind, xi, allow_unused=True)
+    assert behind.isfinite()
+    assert gradient is None or gradient.isfinite().all()
+    if not isinstance(case.loss, CollinearityLoss):
+        residuals = case.loss.residuals(*case.arguments(zero, -one))
+        seen = residuals.valid if residuals.valid.ndim == 1 else residuals.valid[0]
+        assert not seen.any()
+
+
+def test_batch_of_views_equals_loop(rng):
+    w = world(rng)
+    T = torch.stack((torch.eye(4, dtype=torch.float64), w["T_j_i"]))
+    uv = torch.stack((w["uv"], w["uv_j"])) + 1.0
+    together = ReprojectionLoss(reduction="sum")(T, w["p_i"], uv, K)
+    alone = sum(ReprojectionLoss(reduction="sum")(T[i : i + 1], w["p_i"], uv[i : i + 1], K) for i in range(2))
+    torch.testing.assert_close(together, alone)
+
+
+def test_reprojection_worked_by_hand():
+    T, p = torch.eye(4)[None], torch.tensor([[0.4, -0.2, 2.0]])
+    K32 = torch.tensor([[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]])
+    loss = ReprojectionLoss()(T, p, torch.tensor([[[417.0, 194.0]]]), K32)  # projects to (420, 190)
+    assert float(loss) == pytest.approx(25.0, rel=1e-5)
+
+
+def test_mask_takes_observations_out(rng):
+    w = world(rng)
+    T = torch.eye(4, dtype=torch.float64)[None]
+    uv = w["uv"][None].clone()
+    uv[0, 0] += 100.0
+    mask = torch.ones(1, 24, dtype=torch.bool)
+    mask[0, 0] = False
+    assert float(ReprojectionLoss()(T, w["p_i"], uv, K, mask)) < 1e-18
+
+
+@pytest.mark.parametrize("form", [AngleForm.SAME_FRAME, AngleForm.CROSS_VIEW])
+def test_same_frame_angle_is_zero_whatever_the_depth_and_cross_view_is_not(form, rng):
+    w = world(rng)
+    corners = w["uv"].view(8, 3, 2)
+    wrong = torch.tensor(rng.uniform(1, 6, (8, 3)))
+    arms_j = w["uv_j"].view(8, 3, 2)
+    cos_j, _ = cosine(arms_j[:, 1] - arms_j[:, 0], arms_j[:, 2] - arms_j[:, 0])
+    value = float(AngleLoss(form)(w["T_j_i"], corners, wrong, cos_j, K))
+    assert value < 1e-24 if form is AngleForm.SAME_FRAME else value > 1e-3
+
+
+def test_right_angle_prior_pulls_only_nearly_square_corners():
+    def corner(degrees: float) -> tuple[Tensor, Tensor]:
+        a = np.radians(degrees)
+        p = torch.tensor([[[0.0, 0, 2], [0.5, 0, 2], [0.5 * np.cos(a), 0.5 * np.sin(a), 2]]], dtype=torch.float64)
+        return project(p, K)[0], p[..., 2]
+
+    loss = AngleLoss(AngleForm.RIGHT_ANGLE)
+    eye, none = torch.eye(4, dtype=torch.float64), torch.full((1,), torch.nan, dtype=torch.float64)
+    for degrees, expected in ((90, 0.0), (80, np.cos(np.radians(80)) ** 2), (60, 0.0)):
+        assert float(loss(eye, *corner(degrees), none, K)) == pytest.approx(expected, abs=1e-12)
+
+
+def test_collinearity_does_not_depend_on_scale_unless_literal(rng):
+    p = torch.tensor(rng.normal(size=(3, 2, 6, 3)) + [0, 0, 5], dtype=torch.float64)
+    torch.testing.assert_close(CollinearityLoss()(p), CollinearityLoss()(0.01 * p))
+    torch.testing.assert_close(CollinearityLoss(literal=True)(0.01 * p), 1e-4 * CollinearityLoss(literal=True)(p))
+
+
+def test_collinearity_of_a_known_bend():
+    # Three points of an arm of length 2, the middle one h off: offsets from the best line are h/3, 2h/3, h/3.
+    h = 0.3
+    arm = torch.tensor([[-1.0, 0, 3], [0, h, 3], [1, 0, 3]], dtype=torch.float64)
+    straight = torch.tensor([[-1.0, 0, 3], [0, 0, 3], [1, 0, 3]], dtype=torch.float64)
+    value = float(CollinearityLoss(literal=True)(torch.stack((arm, straight))[None]))
+    assert value == pytest.approx((h / 3) ** 2 * 6 / 3)
+
+
+def test_collinearity_ignores_masked_points_and_short_arms(rng):
+    line = torch.linspace(0, 1, 5, dtype=torch.float64)[:, None] * torch.tensor([1.0, 1, 1], dtype=torch.float64)
+    p = torch.stack((line, line))[None].clone()
+    p[0, 0, 4] += 9.0 * torch.tensor([1.0, 0, 0])
+    mask = torch.ones(1, 2, 5, dtype=torch.bool)
+    mask[0, 0, 4] = False
+    assert float(CollinearityLoss()(p, mask)) < 1e-18
+    mask[0, 0, 2:] = False  # two points are always on a line
+    assert not CollinearityLoss().residuals(p, mask).valid[0, 0].any()
