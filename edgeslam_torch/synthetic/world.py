@@ -140,6 +140,19 @@ class World:
             free = np.minimum(free, box.distance(p))
         return free
 
+    def floor_below(self, p_w: FloatArray) -> FloatArray:
+        """Height [m] of the highest level surface under each point ``(N, 3)``; the lower bound where there is none."""
+        p = np.asarray(p_w, dtype=np.float64)
+        height = np.full(len(p), self.bounds_w[0, 2])
+        for quad, normal in zip(self.quads, self.normals_w, strict=True):
+            if normal[2] < 0.99:
+                continue
+            basis = np.stack([quad.u_w[:2], quad.v_w[:2]], axis=1)
+            st = (p[:, :2] - quad.origin_w[:2]) @ np.linalg.inv(basis).T
+            under = (st >= 0).all(1) & (st <= 1).all(1) & (quad.origin_w[2] <= p[:, 2])
+            height[under] = np.maximum(height[under], quad.origin_w[2])
+        return height
+
     def distance_to_surface(self, p_w: FloatArray) -> FloatArray:
         """Distance [m] of points ``(N, 3)`` to the nearest quad, ``(N,)``."""
         p = np.asarray(p_w, dtype=np.float64)

@@ -1,0 +1,164 @@
+"""What a cheap camera does to a perfect image: light changes, noise, blur, vignetting, compression."""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+
+from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.types import FloatArray
+
+Rng = np.random.Generator
+
+
+@dataclass(frozen=True, slots=True)
+class CameraFaults:
+    """How bad the simulated camera is; all zero leaves images untouched.
+
+    The defaults resemble a drone's camera indoors by day.
+    """
+
+    exposure_amplitude: float = 0.06
+    """Slow brightness change, as a share (auto exposure)."""
+    exposure_period_s: float = 7.0
+    gamma: float = 1.0
+    """Exponent on brightness in [0, 1]."""
+    read_noise: float = 1.2
+    """Standard deviation [grey levels]."""
+    shot_noise: float = 0.12
+    """Standard deviation per square root of a grey level."""
+    vignetting: float = 0.15
+    """Share of light lost in the image's corners."""
+    shutter_s: float = 0.006
+    """Exposure time, for motion blur."""
+    jpeg_quality: int = 0
+    """1 to 100; 0 for none."""
+
+    def __post_init__(self) -> None:
+        if min(self.read_noise, self.shot_noise, self.shutter_s, self.vignetting) < 0 or self.gamma <= 0:
+            raise ValueError(f"noise, shutter and vignetting must not be negative and gamma positive: {self}")
+        if not 0 <= self.jpeg_quality <= 100:
+            raise ValueError(f"jpeg_quality must lie in 0..100, got {self.jpeg_quality}")
+
+
+CLEAN = CameraFaults(0.0, 7.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0)
+"""A perfect camera."""
+
+
+def with_brightness(image: np.ndarray, gain: float = 1.0, offset: float = 0.0, gamma: float = 1.0) -> np.ndarray:
+    """``255 * (image / 255) ** gamma * gain + offset`` in grey levels, clipped to 8 bits."""
+    levels = 255.0 * (np.arange(256) / 255.0) ** gamma * gain + offset
+    return cv2.LUT(image, np.clip(levels + 0.5, 0, 255).astype(np.uint8))
+
+
+def with_noise(rng: Rng, image: np.ndarray, read: float, shot: float) -> np.ndarray:
+    """Gaussian noise of variance ``read^2 + shot^2 * level`` in grey levels, a little of it shared by the channels."""
+    if read == 0 and shot == 0:
+        return image
+    # A long noise field read from a random place: as good as new noise and far cheaper.
+    table = _noise_table()
+    start = int(rng.integers(0, len(table) - image.size)) if image.size < len(table) else 0
+    noise = np.resize(table[start : start + image.size], image.shape)
+    level = np.arange(256, dtype=np.float32)
+    sigma = np.sqrt(read**2 + shot**2 * level).astype(np.float32)
+    noisy = cv2.LUT(image, sigma) * noise + image
+    return np.clip(noisy + 0.5, 0, 255).astype(np.uint8)
+
+
+@lru_cache(maxsize=1)
+def _noise_table() -> np.ndarray:
+    """Standard normal numbers from a fixed seed."""
+    return np.random.default_rng(20).standard_normal(1 << 22, dtype=np.float32)
+
+
+def with_vignetting(image: np.ndarray, loss: float) -> np.ndarray:
+    """Darkened towards the corners by ``loss`` there (quadratic in the radius)."""
+    if loss == 0:
+        return image
+    h, w = image.shape[:2]
+    x, y = (np.arange(w) - (w - 1) / 2) / (w / 2), (np.arange(h) - (h - 1) / 2) / (h / 2)
+    gain = 256.0 * (1.0 - 0.5 * loss * (x[None] ** 2 + y[:, None] ** 2))
+    mask = cv2.merge([np.clip(gain, 0, 255).astype(np.uint8)] * image.shape[2]) if image.ndim == 3 else gain
+    return cv2.multiply(image, mask.astype(np.uint8), scale=1.0 / 255.0)
+
+
+def with_jpeg(image: np.ndarray, quality: int) -> np.ndarray:
+    """Compressed and decompressed; quality 0 leaves it alone."""
+    if quality == 0:
+        return image
+    _, packed = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    return cv2.imdecode(packed, cv2.IMREAD_UNCHANGED)
+
+
+def with_motion_blur(
+    image: np.ndarray, depth_m: FloatArray, camera: Camera, twist_c: FloatArray, shutter_s: float, *, steps: int = 5
+) -> np.ndarray:
+    """Mean of ``steps`` images warped along the optical flow while the shutter is open.
+
+    Args:
+        image: ``(H, W, 3)``.
+        depth_m: ``(H, W)`` z-depth.
+        camera: Intrinsics without distortion.
+        twist_c: ``(6,)`` velocity [m/s] and rotation rate [rad/s] of the camera in its own axes.
+        shutter_s: Exposure time.
+        steps: Number of images.
+    """
+    v, omega = np.asarray(twist_c[:3], dtype=np.float64), np.asarray(twist_c[3:], dtype=np.float64)
+    if shutter_s == 0 or not np.any(twist_c):
+        return image
+    # The flow is smooth but for depth steps; a quarter of the pixels carry it.
+    h, w = depth_m.shape
+    z = cv2.resize(depth_m, (w // 4, h // 4), interpolation=cv2.INTER_NEAREST).astype(np.float64)
+    small = camera.scaled(w // 4, h // 4)
+    x = (np.arange(w // 4)[None] - small.cx) / small.fx
+    y = (np.arange(h // 4)[:, None] - small.cy) / small.fy
+    iz = np.where(z > 0.05, 1.0 / np.maximum(z, 0.05), 0.0)
+    # Image motion of a still point (Longuet-Higgins and Prazdny 1980), pixels per second.
+    du = camera.fx * ((x * v[2] - v[0]) * iz + x * y * omega[0] - (1 + x * x) * omega[1] + y * omega[2])
+    dv = camera.fy * ((y * v[2] - v[1]) * iz + (1 + y * y) * omega[0] - x * y * omega[1] - x * omega[2])
+    flow = np.stack([du, dv], axis=-1).astype(np.float32) * shutter_s
+    longest = float(np.percentile(np.linalg.norm(flow, axis=-1), 98))
+    if longest < 0.4:
+        return image
+    flow = cv2.resize(flow, (w, h), interpolation=cv2.INTER_LINEAR)
+    grid_x, grid_y = np.meshgrid(np.arange(w, dtype=np.float32), np.arange(h, dtype=np.float32))
+    total = np.zeros(image.shape, np.float32)
+    for share in np.linspace(-0.5, 0.5, steps):
+        map_x, map_y = grid_x - np.float32(share) * flow[..., 0], grid_y - np.float32(share) * flow[..., 1]
+        total += cv2.remap(image, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return (total / steps + 0.5).astype(np.uint8)
+
+
+def degraded(
+    rng: Rng,
+    image: np.ndarray,
+    depth_m: FloatArray,
+    camera: Camera,
+    faults: CameraFaults,
+    *,
+    stamp_s: float = 0.0,
+    twist_c: FloatArray | None = None,
+) -> np.ndarray:
+    """Image as the simulated camera delivers it at time ``stamp_s``, moving with ``twist_c`` (see the functions above)."""
+    if twist_c is not None:
+        image = with_motion_blur(image, depth_m, camera, twist_c, faults.shutter_s)
+    gain = 1.0 + faults.exposure_amplitude * np.sin(2 * np.pi * stamp_s / faults.exposure_period_s)
+    if gain != 1.0 or faults.gamma != 1.0:
+        image = with_brightness(image, gain=float(gain), gamma=faults.gamma)
+    image = with_vignetting(image, faults.vignetting)
+    image = with_noise(rng, image, faults.read_noise, faults.shot_noise)
+    return with_jpeg(image, faults.jpeg_quality)
+
+
+def random_faults(rng: Rng) -> CameraFaults:
+    """A camera of random quality, for training depth."""
+    return CameraFaults(
+        exposure_amplitude=0.0,
+        gamma=float(np.exp(rng.normal(0.0, 0.18))),
+        read_noise=float(rng.uniform(0.0, 3.0)),
+        shot_noise=float(rng.uniform(0.0, 0.35)),
+        vignetting=float(rng.uniform(0.0, 0.4)),
+        shutter_s=0.0,
+        jpeg_quality=int(rng.integers(50, 96)) if rng.random() < 0.5 else 0,
+    )
