@@ -225,7 +225,7 @@ def _increasing(stamps_s: FloatArray, rows: FloatArray) -> tuple[FloatArray, Flo
     stamps_s, rows = stamps_s[order], rows[order]
     first = np.concatenate([[True], np.diff(stamps_s) > 0])
     if not first.all():
-        notes.append(f"{np.count_nonzero(~first)} rows repeat a stamp: the first of each was kept")
+        notes.append(f"{np.count_nonzero(~first)} row(s) repeat a stamp: the first of each was kept")
     return stamps_s[first], rows[first], notes
 
 

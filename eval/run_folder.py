@@ -8,6 +8,7 @@ from typing import Any
 
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.formats import Trajectory, read_trajectory
+from edgeslam_torch.io.ply import read_ply
 from edgeslam_torch.types import PointCloud
 
 TRUSTED = frozenset({"initialised", "tracked", "relocalised"})
@@ -32,8 +33,6 @@ class RunFolder:
 
     def cloud(self, name: str = "edge_map.ply") -> PointCloud | None:
         """Point cloud of the folder, None when it is not there."""
-        from edgeslam_torch.io.ply import read_ply
-
         file = self.path / name
         return read_ply(file) if file.is_file() else None
 

@@ -81,6 +81,7 @@ def evaluate_run(
     depth_truth_dir: Path | str | None = None,
     max_dt_s: float = DEFAULT_MAX_DT_S,
     offset_s: float = 0.0,
+    judge_map: bool = True,
 ) -> RunScore:
     """Judge a run's output folder (or a bare trajectory file).
 
@@ -90,6 +91,7 @@ def evaluate_run(
         depth_truth_dir: Data set whose depth maps judge the map; ``dataset_dir`` when not given.
         max_dt_s: Largest time between matched poses [s].
         offset_s: Added to the run's stamps [s].
+        judge_map: Compare the edge map with the depth maps too.
 
     Raises:
         EvaluationError: If they cannot be compared; the message names the likely mistake.
@@ -105,7 +107,7 @@ def evaluate_run(
     if run.online is not None:
         online = score_trajectory(truth, run.online, AlignmentKind.SIM3, max_dt_s, offset_s).ate_m.rmse
     depth_dataset = open_dataset(depth_truth_dir) if depth_truth_dir is not None else dataset
-    map_score, map_note = _map_score(run, depth_dataset, sim3)
+    map_score, map_note = _map_score(run, depth_dataset, sim3) if judge_map else (None, "not asked for")
     one_second = sim3.relative[1]
     coverage, with_pose, first = _coverage(run, dataset, truth)
     units = _units(run)
