@@ -53,6 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action=argparse.BooleanOptionalAction,
         help="progress bar (default: when the output is a terminal; a line every few seconds otherwise)",
     )
+    parser.add_argument("--no-report", action="store_true", help="leave the page report.html away")
 
 
 def main(args: argparse.Namespace) -> int:
@@ -71,6 +72,8 @@ def main(args: argparse.Namespace) -> int:
     show_bar = sys.stderr.isatty() if args.progress is None else args.progress
     with make_progress(source.length, show_bar) as progress:
         result = run(source, out, config, mode, [progress])
+    if not args.no_report and result.failure is None:
+        _write_page(result, source)
     _report(result, source)
     if result.failure is not None:
         from edgeslam_torch.errors import OutputError
@@ -96,6 +99,17 @@ def resolved_config(args: argparse.Namespace) -> "SlamConfig":
     if args.depth is not None:
         config = replace(config, depth=replace(config.depth, weights=args.depth))
     return config
+
+
+def _write_page(result: "RunResult", source: "Source") -> None:
+    """``report.html``; a run is not lost because its page cannot be made."""
+    from edgeslam_torch.errors import EdgeSlamError
+    from edgeslam_torch.eval.report import write_report
+
+    try:
+        write_report(result.folder, source.groundtruth, judge_map=False)
+    except (EdgeSlamError, OSError) as error:
+        _say(f"warning: report.html could not be made ({error})")
 
 
 def _report(result: "RunResult", source: "Source") -> None:

@@ -1,4 +1,4 @@
-"""One picture of a run: the edge map and the trajectory from above and from the side."""
+"""One picture of a run: the edge map and the trajectory from three sides."""
 
 from pathlib import Path
 
@@ -7,17 +7,21 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from edgeslam_torch.io.atomic import write_atomically
 from edgeslam_torch.types import FloatArray, PointCloud, Units
 
 _BACKGROUND = "#11141a"
 _INK = "#c9d1d9"
 _PATH = "#ff9d2e"
-_PIXELS = 620
-"""Raster columns of one view: points are splatted into an image, so that a million of them cost what a few do."""
+_MIN_CELLS, _MAX_CELLS = 260, 700
+"""Raster cells along the longer side of a view: points are splatted, so that a million cost what a few do."""
+
+_EYE_TAN = 0.75
+"""Half width of the camera's-eye view as a slope; a little wider than the cameras it is drawn for."""
 
 
 def write_map_picture(path: Path, cloud: PointCloud, T_w_c: FloatArray, units: Units, title: str) -> None:
-    """Draw top view (from +z) and side view (horizontally, across the main direction of the scene).
+    """Draw the map from above (+z), from the side (across the scene's main direction) and as the camera saw it.
 
     Args:
         path: PNG to make.
@@ -34,18 +38,19 @@ def write_map_picture(path: Path, cloud: PointCloud, T_w_c: FloatArray, units: U
     along = _main_direction(points if len(points) > 10 else centres)
     across = np.array([-along[1], along[0], 0.0])
     up = np.array([0.0, 0.0, 1.0])
-    figure = Figure(figsize=(14, 7), dpi=110, facecolor=_BACKGROUND, layout="constrained")
+    figure = Figure(figsize=(19, 6.6), dpi=100, facecolor=_BACKGROUND, layout="constrained")
     FigureCanvasAgg(figure)
-    views = (("from above", along, across), ("from the side", along, up))
-    for axes, (name, right, upward) in zip(figure.subplots(1, 2), views, strict=True):
-        basis = np.stack([right, upward], axis=1)
+    above, side, eye = figure.subplots(1, 3)
+    unit = "m" if units is Units.METRES else "arbitrary units"
+    for axes, name, upward in ((above, "from above", across), (side, "from the side", up)):
+        basis = np.stack([along, upward], axis=1)
         _draw_view(axes, points @ basis, colour, centres @ basis)
         axes.set_title(name, color=_INK, fontsize=11)
-        unit = "m" if units is Units.METRES else "arbitrary units"
         axes.set_xlabel(f"along the scene [{unit}]", color=_INK)
         axes.set_ylabel(f"{'across' if upward is across else 'height'} [{unit}]", color=_INK)
+    _draw_eye(eye, cloud, T_w_c)
     figure.suptitle(title, color=_INK, fontsize=13)
-    figure.savefig(path, format="png", facecolor=_BACKGROUND)
+    write_atomically(path, lambda file: figure.savefig(file, format="png", facecolor=_BACKGROUND))
 
 
 def _shown(cloud: PointCloud, centres: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -56,8 +61,8 @@ def _shown(cloud: PointCloud, centres: FloatArray) -> tuple[FloatArray, FloatArr
     if len(p) < 10:
         return p, colour
     everything = np.concatenate([p, centres[np.isfinite(centres).all(axis=1)]])
-    low, high = np.percentile(p, [1.0, 99.0], axis=0)
-    margin = 0.15 * (high - low)
+    low, high = np.percentile(p, [2.0, 98.0], axis=0)
+    margin = 0.1 * (high - low)
     low = np.minimum(low - margin, everything[len(p) :].min(axis=0, initial=np.inf))
     high = np.maximum(high + margin, everything[len(p) :].max(axis=0, initial=-np.inf))
     inside = ((p >= low) & (p <= high)).all(axis=1)
@@ -93,10 +98,34 @@ def _draw_view(axes: Axes, points: FloatArray, colour: FloatArray, path: FloatAr
     axes.set_aspect("equal", adjustable="datalim")
 
 
+def _draw_eye(axes: Axes, cloud: PointCloud, T_w_c: FloatArray) -> None:
+    """The map as the camera saw it half-way through: what one should recognise."""
+    axes.set_facecolor(_BACKGROUND)
+    axes.set_xticks([])
+    axes.set_yticks([])
+    axes.set_title("as the camera saw it half-way", color=_INK, fontsize=11)
+    poses = np.asarray(T_w_c, dtype=np.float64).reshape(-1, 4, 4)
+    if len(poses) and len(cloud.p_w):
+        R, t = poses[len(poses) // 2, :3, :3], poses[len(poses) // 2, :3, 3]
+        p_c = (np.asarray(cloud.p_w, dtype=np.float64) - t) @ R
+        ahead = p_c[:, 2] > 1e-6
+        slope = np.full((len(p_c), 2), np.inf)
+        slope[ahead] = p_c[ahead, :2] / p_c[ahead, 2:]
+        seen = (np.abs(slope[:, 0]) < _EYE_TAN) & (np.abs(slope[:, 1]) < 0.75 * _EYE_TAN)
+        if seen.sum() > 1:
+            flipped = slope[seen] * [1.0, -1.0]
+            raster, extent = _splat(flipped, cloud.colour[seen].astype(np.float64) / 255.0)
+            axes.imshow(raster, extent=extent, origin="lower", interpolation="nearest")
+    axes.set_xlim(-_EYE_TAN, _EYE_TAN)
+    axes.set_ylim(-0.75 * _EYE_TAN, 0.75 * _EYE_TAN)
+    axes.set_aspect("equal")
+
+
 def _splat(points: FloatArray, colour: FloatArray) -> tuple[FloatArray, tuple[float, float, float, float]]:
     """Image ``(H, W, 4)`` of points ``(P, 2)`` in their mean colour, denser cells more opaque, and its extent."""
     low, high = points.min(axis=0), points.max(axis=0)
-    cell = max(float((high - low).max()) / _PIXELS, 1e-9)
+    cells_wide = float(np.clip(3.0 * np.sqrt(len(points)), _MIN_CELLS, _MAX_CELLS))
+    cell = max(float((high - low).max()) / cells_wide, 1e-9)
     size = np.floor((high - low) / cell).astype(int) + 1
     index = np.minimum(((points - low) / cell).astype(int), size - 1)
     flat = index[:, 1] * size[0] + index[:, 0]
