@@ -10,9 +10,8 @@ import numpy as np
 import torch
 
 from edgeslam_torch.geometry import se3
-from edgeslam_torch.losses.robust import Kernel
 from edgeslam_torch.optim.local_ba import refine_window
-from edgeslam_torch.optim.problem import EdgeTerms, JunctionTerms, LmConfig, WindowProblem, WindowResult
+from edgeslam_torch.optim.problem import EdgeTerms, JunctionTerms, LmConfig, WindowProblem
 from edgeslam_torch.types import FloatArray, IntArray
 
 K = (525.0, 525.0, 319.5, 239.5)
@@ -184,3 +183,102 @@ def _junctions(rng: np.random.Generator, T: FloatArray, size: WindowSize, noise:
         inv_sigma_px=1.0 / max(noise.px, 0.1),
         inv_sigma_angle=50.0,
     )
+
+
+def points_only(window: SeededWindow) -> SeededWindow:
+    """The same window without edges and junctions."""
+    return replace(window, problem=replace(window.problem, edges=None, junctions=None))
+
+
+def refine_with_gtsam(problem: WindowProblem, iterations: int) -> tuple[float, float, FloatArray]:
+    """The window's points-only part through gtsam's Levenberg-Marquardt, as an outside oracle.
+
+    Args:
+        problem: A window; its edges, junctions and priors are left out.
+        iterations: Steps to take.
+
+    Returns:
+        Seconds in the optimiser (building the graph not counted), robust cost as ours counts it, and the refined
+        ``(W, 4, 4)`` world-to-camera poses.
+
+    Raises:
+        ModuleNotFoundError: Without gtsam, which is a developer's tool and no dependency.
+    """
+    import gtsam
+
+    graph, initial = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    fx, fy, cx, cy = problem.K
+    calibration = gtsam.Cal3_S2(fx, fy, 0.0, cx, cy)
+    huber = gtsam.noiseModel.mEstimator.Huber.Create(LmConfig().delta)
+    noises = {
+        s: gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Isotropic.Sigma(2, 1.0 / s))
+        for s in np.unique(problem.inv_sigma)
+    }
+    for i, T in enumerate(se3.inverse(problem.T_c_w)):
+        pose = gtsam.Pose3(gtsam.Rot3(T[:3, :3]), T[:3, 3])
+        initial.insert(gtsam.symbol("x", i), pose)
+        if problem.pose_fixed[i]:
+            graph.add(gtsam.NonlinearEqualityPose3(gtsam.symbol("x", i), pose))
+    for a in np.unique(problem.obs_anchor):
+        initial.insert(gtsam.symbol("l", int(a)), problem.p_w[a])
+    for i, a, uv, s in zip(problem.obs_pose, problem.obs_anchor, problem.uv, problem.inv_sigma, strict=True):
+        x, l = gtsam.symbol("x", int(i)), gtsam.symbol("l", int(a))
+        graph.add(gtsam.GenericProjectionFactorCal3_S2(uv, noises[s], x, l, calibration))
+    params = gtsam.LevenbergMarquardtParams()
+    params.setMaxIterations(iterations)
+    params.setRelativeErrorTol(0.0)
+    params.setAbsoluteErrorTol(0.0)
+    start = time.perf_counter()
+    optimiser = gtsam.LevenbergMarquardtOptimizer(graph, initial, params)
+    result = optimiser.optimize()
+    seconds = time.perf_counter() - start
+    T_w_c = np.stack([result.atPose3(gtsam.symbol("x", i)).matrix() for i in range(len(problem.T_c_w))])
+    return seconds, 2.0 * graph.error(result), se3.inverse(T_w_c)
+
+
+def benchmark(repeats: int = 5, iterations: int = 5) -> dict[str, float | str]:
+    """Median milliseconds of the seeded window, on one thread, everything in one run.
+
+    Ours and gtsam's runs alternate, so that a busy machine slows both. Ours counts everything from arrays to
+    result; gtsam's graph is built before its clock starts.
+    """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    window = seeded_window()
+    half = seeded_window(size=WindowSize(edges=5_000, pairs=20_000))
+    config = LmConfig(max_iterations=iterations, cost_tolerance=0.0, diagnostics=False)
+    runs = {
+        "all_ms": lambda: refine_window(window.problem, config),
+        "half_edges_ms": lambda: refine_window(half.problem, config),
+        "points_ms": lambda: refine_window(points_only(window).problem, config),
+    }
+    times: dict[str, list[float]] = {name: [] for name in (*runs, "gtsam_points_ms")}
+    note = "gtsam is not installed"
+    for k in range(repeats + 1):
+        for name, run in runs.items():
+            start = time.perf_counter()
+            run()
+            times[name].append(1e3 * (time.perf_counter() - start))
+        try:
+            times["gtsam_points_ms"].append(1e3 * refine_with_gtsam(window.problem, iterations)[0])
+            note = "gtsam on the points only"
+        except ModuleNotFoundError:
+            times["gtsam_points_ms"].append(float("nan"))
+        if k == 0:  # warms caches
+            for values in times.values():
+                values.clear()
+    torch.set_num_threads(threads)
+    return {"oracle": note, **{name: round(float(np.median(values)), 1) for name, values in times.items()}}
+
+
+def main() -> None:
+    """Write the benchmark as one line of JSON."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--iterations", type=int, default=5)
+    options = parser.parse_args()
+    sys.stdout.write(json.dumps(benchmark(options.repeats, options.iterations)) + "\n")
+
+
+if __name__ == "__main__":
+    main()

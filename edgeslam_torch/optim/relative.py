@@ -58,7 +58,8 @@ class RelativeBlocks(ABC):
             config: Kernel and its width.
             dtype: Of the blocks.
         """
-        self.config, self.dtype, self.column = config, dtype, column
+        self.config, self.dtype = config, dtype
+        self.column = torch.where(column < 0, int((column >= 0).sum()), column)
         hosts = torch.as_tensor(np.asarray(host, dtype=np.int64))
         E, W = len(hosts), len(column)
         self.block_order = torch.argsort(hosts, stable=True)
@@ -80,8 +81,9 @@ class RelativeBlocks(ABC):
         self.Y = [torch.zeros(len(c.columns), self.size * (c.last - c.first), dtype=dtype) for c in self.chunks]
 
     @abstractmethod
-    def rows(self, Rt: Tensor, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Whitened residuals ``(R, P)``, by relative pose ``(R, 6, P)``, by block ``(R, size, P)``, valid ``(P,)``."""
+    def rows(self, Rt: Tensor, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Whitened derivatives by the relative pose with the residual as seventh ``(R, 7, P)``, derivatives by the
+        block ``(R, size, P)``, and valid pairs ``(P,)``."""
 
     @abstractmethod
     def residual_rows(self, Rt: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
@@ -111,36 +113,47 @@ class RelativeBlocks(ABC):
 
     def linearise(self, T_c_w: Tensor, x: Tensor, H: Tensor, g: Tensor) -> Tensor:
         """Prepare the blocks; add the pose part to ``H (6F, 6F)`` and ``g (6F,)``; returns the cost ``()``."""
-        E = self.n_blocks
-        sums = torch.zeros(self.size * (self.size + 1) // 2 + self.size, E, dtype=torch.float64)
+        sums = torch.zeros(self.size * (self.size + 1) // 2 + self.size, self.n_blocks, dtype=torch.float64)
         cost = self.prior_cost(x)
-        self.T_rel, Rt = self.motions(T_c_w)
         if len(self.block):
-            r, J, Jd, valid = self.rows(Rt, x.index_select(1, self.block).to(self.dtype))
+            T_rel, Rt = self.motions(T_c_w)
+            J, Jd, valid = self.rows(Rt, x.index_select(1, self.block).to(self.dtype))
+            r = J[:, 6]
             value, weight = self._robust(r * r, valid)
             cost = cost + value.sum(dtype=torch.float64)
-            root = torch.where(valid, weight.sqrt(), 0.0)
+            root = weight.sqrt_()
             if not bool(valid.all()):
-                r, J, Jd = (torch.where(valid, v, 0.0) for v in (r, J, Jd))
-            r, J, Jd = r * root, J.mul_(root[:, None]), Jd.mul_(root[:, None])
-            self.J, self.Jd = J, Jd
-            own = torch.cat((schur.triangle(Jd), (Jd * r[:, None]).sum(0)))
+                root, J, Jd = (torch.where(valid, v, 0.0) for v in (root, J, Jd))
+            self.J, self.Jd = J.mul_(root[:, None]), Jd.mul_(root[:, None])
+            own = torch.cat((schur.triangle(Jd), schur.row_products(Jd, J[:, 6:])[:, 0]))
             sums.index_add_(1, self.block, own.double())
-            g_pair = (J * r[:, None]).sum(0)
-            for chunk in self.chunks:
-                M = self._map(chunk, H.shape[0])
-                H_rel = torch.zeros(len(chunk.columns), len(chunk.columns), dtype=torch.float64)
-                g_rel = torch.zeros(len(chunk.columns), dtype=torch.float64)
-                for k, (_, lo, hi) in enumerate(chunk.slices):
-                    part = J[:, :, lo:hi]
-                    at = slice(6 * k, 6 * k + 6)
-                    H_rel[at, at] = (part @ part.mT).double().sum(0)
-                    g_rel[at] = g_pair[:, lo:hi].sum(1).double()
-                H += M.mT @ H_rel @ M
-                g += M.mT @ g_rel
+            self._add_poses(T_rel, H, g)
         self.V, self.g = sums[: -self.size], sums[-self.size :]
         self.add_prior(x, self.V, self.g)
         return cost
+
+    def _add_poses(self, T_rel: Tensor, H: Tensor, g: Tensor) -> None:
+        """Normal matrices of the relative poses, mapped to the poses."""
+        G, n = len(T_rel), H.shape[0]
+        normal = torch.empty(G, 7, 7, dtype=self.dtype)
+        for chunk in self.chunks:
+            for group, lo, hi in chunk.slices:
+                out = normal[group]
+                part = self.J[0, :, lo:hi]
+                torch.mm(part, part.mT, out=out)
+                for k in range(1, self.J.shape[0]):
+                    part = self.J[k, :, lo:hi]
+                    out.addmm_(part, part.mT)
+        normal = normal.double()
+        # Tangents of the groups by the poses; fixed poses share a last column that is cut off.
+        M = torch.zeros(G, n // 6 + 1, 6, 6, dtype=torch.float64)
+        each = torch.arange(G)
+        M[each, self.column[self.group_target]] += torch.eye(6, dtype=torch.float64)
+        M[each, self.column[self.group_host]] -= lie.adjoint(T_rel)
+        M = M[:, :-1].permute(0, 2, 1, 3).reshape(G, 6, n)
+        H += M.reshape(-1, n).mT @ (normal[:, :6, :6] @ M).view(-1, n)
+        g += M.reshape(-1, n).mT @ normal[:, :6, 6].flatten()
+        self.maps = [M[c.slices[0][0] : c.slices[-1][0] + 1].reshape(-1, n) for c in self.chunks]
 
     def reduce(self, mu: float, S: Tensor, b: Tensor) -> None:
         """Subtract what the blocks take from the pose system ``S`` and its right side ``b``."""
@@ -149,12 +162,12 @@ class RelativeBlocks(ABC):
         if len(self.block) == 0:
             return
         white = schur.whiten(self.factor.to(self.dtype).index_select(1, self.block), self.Jd)
-        entries = schur.row_products(self.J, white)
-        self.maps = [self._map(chunk, S.shape[0]) for chunk in self.chunks]
+        entries = schur.row_products(self.J[:, :6], white)
+        y = self.y.to(self.dtype)
         for chunk, Y, M in zip(self.chunks, self.Y, self.maps, strict=True):
             schur.fill(Y, chunk, entries[..., chunk.lo : chunk.hi])
-            S -= M.mT @ (Y @ Y.mT).double() @ M
-            b -= M.mT @ (Y @ self.y[:, chunk.first : chunk.last].to(self.dtype).flatten()).double()
+            S -= M.mT @ ((Y @ Y.mT).double() @ M)
+            b -= M.mT @ (Y @ y[:, chunk.first : chunk.last].flatten()).double()
 
     def step(self, delta: Tensor) -> Tensor:
         """Step of the blocks ``(size, E)`` that goes with the poses' ``delta (6F,)``."""
@@ -162,21 +175,8 @@ class RelativeBlocks(ABC):
         if len(self.block):
             for chunk, Y, M in zip(self.chunks, self.Y, self.maps, strict=True):
                 moved = ((M @ delta).to(self.dtype) @ Y).view(self.size, -1)
-                back[:, chunk.first : chunk.last] -= moved.double()
+                back[:, chunk.first : chunk.last] -= moved
         return schur.unwhiten(self.factor, back)
-
-    def _map(self, chunk: schur.Chunk, n: int) -> Tensor:
-        """Relative tangents of a host's groups by the pose tangents, ``(6 w, 6F)``."""
-        M = torch.zeros(len(chunk.columns), n, dtype=torch.float64)
-        for k, (group, _, _) in enumerate(chunk.slices):
-            rows = slice(6 * k, 6 * k + 6)
-            target = int(self.column[self.group_target[group]])
-            host = int(self.column[self.group_host[group]])
-            if target >= 0:
-                M[rows, 6 * target : 6 * target + 6].diagonal().add_(1.0)
-            if host >= 0:
-                M[rows, 6 * host : 6 * host + 6] -= lie.adjoint(self.T_rel[group])
-        return M
 
     def _robust(self, s: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
         """Costs and weights ``(R, P)`` of squared rows; what lies behind a camera costs a fixed, large amount."""
@@ -212,20 +212,21 @@ class EdgeBlocks(RelativeBlocks):
             self.cycle_weight[held > 0] = 1.0 / terms.cycle_sigma
         self.has_cycle = bool((self.cycle_weight > 0).any())
 
-    def rows(self, Rt: Tensor, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def rows(self, Rt: Tensor, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """See `RelativeBlocks.rows`."""
         g = pair_geometry(Rt, self.ray, x[0])
-        r, J, Jd = alignment_jacobians(g, self.uv, self.normal, self.K)
-        parts = [(r[None], J[None], Jd[None], self.inv_sigma)]
-        if self.has_cycle and self.form is CycleForm.PIXEL:
-            parts.append((*round_trip_jacobians(g, Rt, self.ray, self.held, self.K), self.cycle_weight))
+        pixel = self.form is CycleForm.PIXEL
+        n = 1 if not self.has_cycle else 3 if pixel else 2
+        J, Jd = (
+            torch.empty(n, 7, len(self.block), dtype=self.dtype),
+            torch.empty(n, 1, len(self.block), dtype=self.dtype),
+        )
+        _put(J[:1], Jd[:1], self.inv_sigma, *alignment_jacobians(g, self.uv, self.normal, self.K))
+        if self.has_cycle and pixel:
+            _put(J[1:], Jd[1:], self.cycle_weight, *round_trip_jacobians(g, Rt, self.ray, self.held, self.K))
         elif self.has_cycle:
-            r, J, Jd = relative_depth_jacobians(g, self.held)
-            parts.append((r[None], J[None], Jd[None], self.cycle_weight))
-        rows = torch.cat([r * w for r, _, _, w in parts])
-        by_pose = torch.cat([J * w for _, J, _, w in parts])
-        by_depth = torch.cat([d * w for _, _, d, w in parts])[:, None]
-        return rows, by_pose, by_depth, g.front
+            _put(J[1:], Jd[1:], self.cycle_weight, *relative_depth_jacobians(g, self.held))
+        return J, Jd, g.front
 
     def residual_rows(self, Rt: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
         """See `RelativeBlocks.residual_rows`."""
@@ -277,15 +278,15 @@ class JunctionBlocks(RelativeBlocks):
         weights = [terms.inv_sigma_px] * 2 + [terms.inv_sigma_angle] * angles
         self.weight = torch.tensor(weights, dtype=torch.float64)[:, None]
 
-    def rows(self, Rt: Tensor, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def rows(self, Rt: Tensor, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """See `RelativeBlocks.rows`."""
         r, J, Jd, front = junction_rows(Rt, self.rays, x, self.uv, self.arms, self.K, self.cosines)
-        return r * self.weight, J * self.weight[..., None], Jd * self.weight[..., None], front
+        return torch.cat((J, r[:, None]), 1) * self.weight[..., None], Jd * self.weight[..., None], front
 
     def residual_rows(self, Rt: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
         """See `RelativeBlocks.residual_rows`."""
-        r, _, _, front = self.rows(Rt, x)
-        return r, front
+        J, _, front = self.rows(Rt, x)
+        return J[:, 6], front
 
     def prior_cost(self, x: Tensor) -> Tensor:
         """See `RelativeBlocks.prior_cost`."""
@@ -333,6 +334,13 @@ def collinearity_prior(
     information = np.einsum("cki,ckj->cij", A, A) + weak * np.eye(3)
     moment = np.einsum("cki,ck->ci", A, right) + weak * mean[:, None]
     return np.linalg.solve(information, moment[..., None])[..., 0], information
+
+
+def _put(J: Tensor, Jd: Tensor, weight: Tensor, r: Tensor, by_pose: Tensor, by_depth: Tensor) -> None:
+    """Weighted rows into their places: ``J (R, 7, P)``, ``Jd (R, 1, P)``; a single row comes without its axis."""
+    torch.mul(by_pose, weight, out=J[:, :6] if by_pose.ndim == 3 else J[0, :6])
+    torch.mul(r, weight, out=J[:, 6] if r.ndim == 2 else J[0, 6])
+    torch.mul(by_depth, weight, out=Jd[:, 0] if by_depth.ndim == 2 else Jd[0, 0])
 
 
 def _tensor(x: FloatArray) -> Tensor:
