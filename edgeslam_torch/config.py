@@ -152,6 +152,20 @@ class EdgeConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class MountConfig:
+    """Where the camera sits on the drone."""
+
+    tilt_deg: float = 12.0
+    """Camera looks down by this much below the body's forward axis; a Tello's, within two degrees."""
+    forward_m: float = 0.03
+    """Camera ahead of the body's centre."""
+
+    def __post_init__(self) -> None:
+        if not -90.0 <= self.tilt_deg <= 90.0:
+            raise ValueError(f"tilt_deg must be in [-90, 90], got {self.tilt_deg}")
+
+
+@dataclass(frozen=True, slots=True)
 class SlamConfig:
     """Everything `EdgeSlam` can be told."""
 
@@ -163,4 +177,5 @@ class SlamConfig:
     initialisation: InitialisationConfig = field(default_factory=InitialisationConfig)
     mapping: MappingConfig = field(default_factory=MappingConfig)
     edges: EdgeConfig = field(default_factory=EdgeConfig)
+    mount: MountConfig = field(default_factory=MountConfig)
     fusion: FusionConfig = field(default_factory=FusionConfig)

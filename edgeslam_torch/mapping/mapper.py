@@ -1,10 +1,8 @@
 """Stage 3 and 4 for one keyframe: cull, triangulate, fuse, refine, cull keyframes."""
 
-import logging
-
 import numpy as np
 
-from edgeslam_torch.config import DepthConfig, MappingConfig, OrbConfig, TrackingConfig
+from edgeslam_torch.config import SlamConfig
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.mapping.depth_prior import depth_prior
 from edgeslam_torch.mapping.keyframe import Keyframe
@@ -15,28 +13,17 @@ from edgeslam_torch.optim.problem import LmConfig, WindowResult
 from edgeslam_torch.tracking.projection import match_projection, project_anchors
 from edgeslam_torch.types import IntArray
 
-logger = logging.getLogger(__name__)
-
 
 class Mapper:
     """Takes keyframes into the map, one at a time."""
 
-    def __init__(
-        self,
-        slam_map: SlamMap,
-        camera: Camera,
-        orb: OrbConfig,
-        tracking: TrackingConfig,
-        mapping: MappingConfig,
-        depth: DepthConfig,
-        lm: LmConfig,
-    ) -> None:
+    def __init__(self, slam_map: SlamMap, camera: Camera, config: SlamConfig, lm: LmConfig) -> None:
         self.map = slam_map
         self.camera = camera
-        self.orb = orb
-        self.tracking = tracking
-        self.config = mapping
-        self.depth = depth
+        self.orb = config.orb
+        self.tracking = config.tracking
+        self.config = config.mapping
+        self.depth = config.depth
         self.lm = lm
         self._recent: IntArray = np.zeros(0, dtype=np.int64)
 

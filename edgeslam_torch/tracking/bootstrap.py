@@ -1,0 +1,122 @@
+"""The map's first moments: track against guessed depths until two views can replace them."""
+
+import numpy as np
+
+from edgeslam_torch.config import InitialisationConfig
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.mapping.keyframe import Keyframe
+from edgeslam_torch.mapping.refinement import Window, refine
+from edgeslam_torch.mapping.slam_map import SlamMap
+from edgeslam_torch.optim.problem import LmConfig, ScalePrior
+from edgeslam_torch.tracking.initialiser import BootstrapView, TwoView, poses_of_witnesses, two_view_map
+from edgeslam_torch.tracking.tracker import Track, Tracker, View
+from edgeslam_torch.types import FloatArray
+
+WITNESS_SHARE = 0.6
+"""Share of matches in the frames between that must agree with a two-view map, or it is refused."""
+
+
+class Bootstrap:
+    """One attempt to initialise: a reference keyframe with guessed depths, and the frames that have seen it."""
+
+    def __init__(
+        self,
+        slam_map: SlamMap,
+        tracker: Tracker,
+        config: InitialisationConfig,
+        reference: Keyframe,
+        guess_depth: FloatArray,
+        colour: np.ndarray,
+    ) -> None:
+        self.map = slam_map
+        self.tracker = tracker
+        self.config = config
+        self.reference = reference
+        self.guess_depth = guess_depth
+        self.views: list[BootstrapView] = []
+        points = se3.transform(
+            reference.T_w_c, tracker.camera.back_project(reference.features.uv, guess_depth)
+        )
+        slam_map.anchors.begin_pass()
+        ids = slam_map.anchors.add(points, reference.words, reference.id, True, colour)
+        reference.anchor[:] = ids
+        slam_map.add_keyframe(reference)
+        slam_map.refresh_anchors(ids)
+        self._guessed = ids
+
+    def abandon(self) -> None:
+        """Take the guessed anchors out of the map; the keyframe stays for the poses that hang on it."""
+        self.map.remove_anchors(self._guessed)
+
+    def track(self, view: View, T_predicted: FloatArray) -> Track | None:
+        """Pose against the guessed map; the pose is rough, the matches are good."""
+        radius = 2.0 * self.tracker.config.motion_radius_px
+        return self.tracker.refine(view, T_predicted, self._guessed, radius)
+
+    def two_views(self, frame_index: int, view: View, track: Track) -> TwoView:
+        """Remember what the frame saw and try to triangulate it against the reference."""
+        keypoint_of_anchor = np.full(len(self.map.anchors.alive), -1, dtype=np.int64)
+        keypoint_of_anchor[self.reference.anchor] = np.arange(len(self.reference.anchor))
+        reference_keypoint = keypoint_of_anchor[track.matched_anchor]
+        self.views.append(
+            BootstrapView(
+                frame_index,
+                view.features.uv[track.matched_keypoint],
+                view.inv_sigma[track.matched_keypoint],
+                reference_keypoint,
+                track.T_c_w,
+            )
+        )
+        return two_view_map(
+            self.reference,
+            self.guess_depth,
+            view,
+            reference_keypoint,
+            track.matched_keypoint,
+            self.tracker.camera,
+            self.config,
+        )
+
+    def witnessed(self, two_view: TwoView) -> bool:
+        """Whether the frames in between agree with the two-view map."""
+        points = np.full((len(self.reference.anchor), 3), np.nan)
+        points[two_view.reference_keypoint] = two_view.p_w
+        _, share = poses_of_witnesses(self.views[:-1], points, self.tracker.camera)
+        return share >= WITNESS_SHARE
+
+    def replace_map(self, keyframe: Keyframe, two_view: TwoView, lm: LmConfig) -> dict[int, FloatArray]:
+        """Put the two-view map in place of the guessed one and refine it.
+
+        Args:
+            keyframe: The second view, not yet in the map.
+            two_view: Its structure.
+            lm: Solver settings.
+
+        Returns:
+            New poses of the frames in between, by frame index.
+        """
+        reference = self.reference
+        colour = self.map.anchors.colour[reference.anchor[two_view.reference_keypoint]]
+        self.map.remove_anchors(self._guessed)
+        self.map.anchors.begin_pass()
+        ids = self.map.anchors.add(
+            two_view.p_w, reference.words[two_view.reference_keypoint], reference.id, False, colour
+        )
+        self.map.observe(reference, two_view.reference_keypoint, ids)
+        keyframe.anchor[two_view.keypoint] = ids
+        self.map.add_keyframe(keyframe)
+        # The essential matrix leaves the scale to the guess: the baseline is held where the guess put it.
+        baseline = float(np.linalg.norm(keyframe.centre_w - reference.centre_w))
+        refine(
+            self.map,
+            Window([keyframe], [reference], ids),
+            self.tracker.camera,
+            lm,
+            ScalePrior(0, 1, baseline, 0.001),
+        )
+        self.map.refresh_anchors(ids[self.map.anchors.alive[ids]])
+        held = reference.keypoints_with_anchor()
+        points = np.full((len(reference.anchor), 3), np.nan)
+        points[held] = self.map.anchors.p_w[reference.anchor[held]]
+        poses, _ = poses_of_witnesses(self.views[:-1], points, self.tracker.camera)
+        return {v.frame_index: T for v, T in zip(self.views, poses, strict=False)}
