@@ -91,7 +91,8 @@ def _unit_factor(truth_s: FloatArray, estimate_s: FloatArray) -> tuple[float, li
         return 1.0, []
     for name, per_second in _UNITS.items():
         for factor, whose in ((1.0 / per_second, "the estimate's"), (per_second, "the ground truth's")):
-            if _overlap(truth_s, estimate_s * factor) > 0.1 * min(span_t, span_e * factor) > 0:
+            alike = 1 / 200 < ratio * factor < 200
+            if alike and _overlap(truth_s, estimate_s * factor) > 0.1 * min(span_t, span_e * factor):
                 return factor, [f"{whose} stamps are {name}, the other file's seconds: converted"]
     return 1.0, []
 
@@ -105,7 +106,10 @@ def _why_nothing_matches(truth_s: FloatArray, estimate_s: FloatArray, max_dt_s: 
     spans = f"ground truth {t0:.3f}..{t1:.3f} s, estimate {e0:.3f}..{e1:.3f} s"
     if _overlap(truth_s, estimate_s) >= 0:
         gap = float(np.median(np.abs(truth_s[nearest(truth_s, estimate_s)] - estimate_s)))
-        return f"no poses within {max_dt_s:g} s of each other, typically {gap:.3f} s apart; try --max-dt {2 * gap:.2g} ({spans})"
+        return (
+            f"no poses within {max_dt_s:g} s of each other, typically {gap:.3f} s apart; try --max-dt {2 * gap:.2g} "
+            f"({spans})"
+        )
     if min(t0, e0) < 1e6 < max(t0, e0):
         return (
             f"one clock starts near 0 and the other counts from 1970 ({spans}); if they start together, use "

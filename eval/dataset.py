@@ -59,7 +59,7 @@ class DepthFiles:
         raw = cv2.imread(str(self.paths[index]), cv2.IMREAD_UNCHANGED)
         if raw is None or raw.dtype != np.uint16 or raw.ndim != 2:
             raise EvaluationError(f"{self.paths[index]}: not a 16-bit depth map")
-        depth = np.where(raw == 65535, 0, raw).astype(np.float32) * np.float32(self.metres_per_unit)
+        depth: FloatArray = np.where(raw == 65535, 0, raw).astype(np.float32) * np.float32(self.metres_per_unit)
         if self.camera.is_distorted:
             maps = self.camera.undistortion_maps()
             depth = cv2.remap(depth, *maps, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
@@ -148,7 +148,8 @@ def _open_seven_scenes(folder: Path) -> EvalDataset:
 def _open_euroc(folder: Path) -> EvalDataset:
     truth = read_trajectory(folder)
     listing = folder / "mav0" / "cam0" / "data.csv"
-    stamps, images = np.zeros(0), ()
+    stamps: FloatArray = np.zeros(0)
+    images: tuple[Path, ...] = ()
     if listing.is_file():
         rows = [r.split(",") for r in listing.read_text().splitlines() if r.strip() and not r.startswith("#")]
         stamps = np.array([int(r[0]) for r in rows]) * 1e-9

@@ -52,7 +52,7 @@ def score_map(p_w: FloatArray, alignment: Alignment, truth: SurfaceTruth) -> Map
     Raises:
         EvaluationError: If the map is empty or none of it is where depth was measured.
     """
-    p = np.asarray(p_w, dtype=np.float64)
+    p: FloatArray = np.asarray(p_w, dtype=np.float64)
     p = p[np.isfinite(p).all(axis=1)]
     if len(p) == 0:
         raise EvaluationError("the map holds no finite point")

@@ -113,8 +113,8 @@ def error_note(score: RunScore) -> str:
     if score.sim3 is None:
         return ""
     return (
-        f"After Sim(3) alignment of {score.matched} poses with {score.dataset}: position RMSE {_length(score.ate_sim3_m)}, "
-        f"rotation RMSE {score.rotation_deg:.2f} deg, scale factor {score.sim3.scale:.4f}."
+        f"After Sim(3) alignment of {score.matched} poses with {score.dataset}: position RMSE "
+        f"{_length(score.ate_sim3_m)}, rotation RMSE {score.rotation_deg:.2f} deg, scale factor {score.sim3.scale:.4f}."
     )
 
 
@@ -172,7 +172,8 @@ def _scale_sentence(summary: dict[str, Any]) -> str:
     value, sigma, source = _float(scale.get("value")), _float(scale.get("sigma")), str(scale.get("source", "none"))
     if scale.get("units") == "arbitrary" or not math.isfinite(sigma) or not value:
         return "Nothing told the metric scale, so lengths are in arbitrary units."
-    return f"Lengths are in metres, with the scale known to {100 * sigma / value:.1f} % (1 sigma) from {source.replace('+', ' and ')}."
+    known = f"{100 * sigma / value:.1f} % (1 sigma) from {source.replace('+', ' and ')}"
+    return f"Lengths are in metres, with the scale known to {known}."
 
 
 def _times(count: int) -> str:

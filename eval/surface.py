@@ -161,7 +161,7 @@ def _strided(camera: Camera) -> tuple[float, float, float, float]:
 
 def _points(depth: FloatArray, camera: Camera, T_w_d: FloatArray) -> FloatArray:
     v, u = np.nonzero(depth)
-    p = camera.back_project(np.stack([u, v], axis=1), depth[v, u])
+    p = camera.back_project(np.stack([u, v], axis=1).astype(np.float64), depth[v, u])
     return se3.transform(T_w_d, p).astype(np.float32)
 
 
@@ -208,7 +208,7 @@ def _edge_points(dataset: EvalDataset, files: DepthFiles, depth: FloatArray, ind
     solid = cv2.erode(measured, np.ones((2 * _HOLE_PX + 1,) * 2, np.uint8), borderValue=0) > 0
     near = cv2.erode(np.where(depth > 0, depth, np.float32(1e3)), np.ones((2 * _NEAR_PX + 1,) * 2, np.uint8))
     v, u = np.nonzero(canny & solid & (near < MAX_EDGE_DEPTH_M))
-    p_c = camera.back_project(np.stack([u, v], axis=1), near[v, u])
+    p_c = camera.back_project(np.stack([u, v], axis=1).astype(np.float64), np.asarray(near, dtype=np.float64)[v, u])
     # The truth is the pose of the depth camera where the two differ.
     return se3.transform(T_w_image[0] @ se3.inverse(T_c_d), p_c).astype(np.float32)
 
@@ -216,7 +216,7 @@ def _edge_points(dataset: EvalDataset, files: DepthFiles, depth: FloatArray, ind
 def register_depth(depth: FloatArray, depth_camera: Camera, T_c_d: FloatArray, camera: Camera) -> FloatArray:
     """Depth map ``(H, W)`` of one camera as another sees it; 0 where nothing falls; the nearest wins."""
     v, u = np.nonzero(depth)
-    p = se3.transform(T_c_d, depth_camera.back_project(np.stack([u, v], axis=1), depth[v, u]))
+    p = se3.transform(T_c_d, depth_camera.back_project(np.stack([u, v], axis=1).astype(np.float64), depth[v, u]))
     p = p[p[:, 2] > 0.05]
     uv = np.rint(camera.project(p)).astype(np.int64)
     ok = (uv >= 0).all(axis=1) & (uv[:, 0] < camera.width) & (uv[:, 1] < camera.height)

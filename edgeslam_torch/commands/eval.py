@@ -98,7 +98,8 @@ def _details(score: Any) -> str:
         )
     for d in found.drift:
         lines.append(
-            f"drift over {d.segment_m:g} m: {d.translation_percent:.2f} %, {d.rotation_deg_per_m:.3f} deg/m ({d.segments} segments)"
+            f"drift over {d.segment_m:g} m: {d.translation_percent:.2f} %, {d.rotation_deg_per_m:.3f} deg/m "
+            f"({d.segments} segments)"
         )
     if score.map is None and score.map_note:
         lines.append(f"map not judged: {score.map_note}")

@@ -13,7 +13,10 @@ from edgeslam_torch.eval.formats import Trajectory, write_tum
 from edgeslam_torch.io.ply import write_ply
 from edgeslam_torch.types import PointCloud
 
-COLUMNS = "index stamp status reason matches inliers parallax_deg keyframe scale scale_sigma scale_source features_ms track_ms"
+COLUMNS = (
+    "index stamp status reason matches inliers parallax_deg keyframe scale scale_sigma scale_source "
+    "features_ms track_ms"
+)
 
 
 def loop_trajectory(count: int = 200, rate_hz: float = 20.0, begin_s: float = 100.0) -> Trajectory:

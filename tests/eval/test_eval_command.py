@@ -1,0 +1,95 @@
+"""``edgeslam eval`` and ``report`` from the command line's side."""
+
+import argparse
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from edgeslam_torch.commands import eval as eval_command
+from edgeslam_torch.commands import report as report_command
+from edgeslam_torch.errors import EdgeSlamError
+from edgeslam_torch.eval.run_score import evaluate_run
+
+
+def run(module: object, *words: object) -> int:
+    parser = argparse.ArgumentParser()
+    module.add_arguments(parser)  # type: ignore[attr-defined]
+    return int(module.main(parser.parse_args([str(w) for w in words])))  # type: ignore[attr-defined]
+
+
+def test_several_runs_give_a_table_with_their_median(
+    run_folder: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    truth = run_folder(tmp_path / "a")
+    run_folder(tmp_path / "b", scale=1.2)
+    runs = [tmp_path / "a", tmp_path / "b", tmp_path / "a" / "trajectory_online.txt"]
+    out = ("--json", tmp_path / "s.json", "--markdown", tmp_path / "s.md", "--plots", tmp_path / "plots")
+    assert run(eval_command, *runs, "--groundtruth", truth, *out) == 0
+    text = capsys.readouterr().out
+    assert "| a |" in text and "| b |" in text and "median of 3" in text
+    assert (tmp_path / "s.md").read_text() == text[:-1]
+    records = json.loads((tmp_path / "s.json").read_text())
+    assert [r["name"] for r in records] == ["a", "b", "trajectory_online.txt"]
+    assert records[1]["scale_error"] == pytest.approx(0.2, abs=0.01)
+    assert len(list((tmp_path / "plots").glob("*.png"))) == 3
+
+
+def test_scale_interval_of_the_run_is_checked(run_folder: Callable[..., Path], tmp_path: Path) -> None:
+    truth = run_folder(tmp_path / "a")
+    run_folder(tmp_path / "b", scale=1.2)  # says 3 %, is 20 % off
+    assert evaluate_run(tmp_path / "a", truth).scale_inside_95 is True
+    assert evaluate_run(tmp_path / "b", truth).scale_inside_95 is False
+
+
+def test_coverage_counts_frames_that_rest_on_their_own_image(run_folder: Callable[..., Path], tmp_path: Path) -> None:
+    run_folder(tmp_path / "a")
+    dataset = tmp_path / "data"
+    dataset.mkdir()
+    (tmp_path / "truth.txt").rename(dataset / "groundtruth.txt")
+    stamps = np.loadtxt(dataset / "groundtruth.txt")[:, 0]
+    rows = [f"{t:.6f} rgb/{t:.6f}.png" for t in stamps]
+    (dataset / "rgb.txt").write_text("\n".join(rows) + "\n")
+    score = evaluate_run(tmp_path / "a", dataset)
+    assert score.coverage == pytest.approx(197 / 200)  # three lost
+    assert score.with_pose == 1.0
+    assert score.map is None and "depth" in score.map_note
+
+
+@pytest.mark.parametrize("what", ["missing", "file", "no ground truth"])
+def test_wrong_folders_get_one_line(what: str, run_folder: Callable[..., Path], tmp_path: Path) -> None:
+    truth = run_folder(tmp_path / "a")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(EdgeSlamError) as caught:
+        if what == "missing":
+            run(eval_command, tmp_path / "none", "--groundtruth", truth)
+        elif what == "file":
+            run(report_command, truth)
+        else:
+            run(eval_command, tmp_path / "a", "--groundtruth", tmp_path / "empty")
+    assert "\n" not in str(caught.value) and str(tmp_path) in str(caught.value)
+
+
+def test_report_says_how_the_run_went(run_folder: Callable[..., Path], tmp_path: Path) -> None:
+    truth = run_folder(tmp_path / "a")
+    assert run(report_command, tmp_path / "a", "--groundtruth", truth) == 0
+    page = (tmp_path / "a" / "report.html").read_text(encoding="utf-8")
+    assert "98.5 % of the frames were tracked from the image itself, from the first on" in page
+    assert "lost once" in page and "few matches (7)" in page
+    assert "(7) </script>" not in page, "text of the run must not end the page's script"
+    assert "{{" not in page.split("<script")[0]
+
+
+def test_report_of_a_bare_run_is_a_page_too(run_folder: Callable[..., Path], tmp_path: Path) -> None:
+    run_folder(tmp_path / "a")
+    for name in ("status.csv", "summary.json", "edge_map.ply", "anchors.ply", "config.toml", "trajectory_online.txt"):
+        (tmp_path / "a" / name).unlink()
+    assert run(report_command, tmp_path / "a") == 0
+
+
+def test_report_of_the_largest_map_stays_below_its_limit(run_folder: Callable[..., Path], tmp_path: Path) -> None:
+    run_folder(tmp_path / "a", points=260_000)
+    run(report_command, tmp_path / "a")
+    assert (tmp_path / "a" / "report.html").stat().st_size < 5e6  # the limit is 15 MB
