@@ -64,7 +64,7 @@ def summarise(
     offered = tally.frames + dropped + len(source.problems)
     return {
         "version": __version__,
-        "source": {"name": source.name, "kind": source.kind, "location": source.location, "length": source.length},
+        "source": {"name": source.name, "kind": source.kind, "path": source.location, "length": source.length},
         "camera": _camera(source.camera),
         "frames": tally.frames,
         "tracked": tally.own_pose,

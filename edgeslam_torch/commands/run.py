@@ -73,7 +73,7 @@ def main(args: argparse.Namespace) -> int:
     with make_progress(source.length, show_bar) as progress:
         result = run(source, out, config, mode, [progress])
     if not args.no_report and result.failure is None:
-        _write_page(result, source)
+        _write_page(result)
     _report(result, source)
     if result.failure is not None:
         from edgeslam_torch.errors import OutputError
@@ -101,13 +101,13 @@ def resolved_config(args: argparse.Namespace) -> "SlamConfig":
     return config
 
 
-def _write_page(result: "RunResult", source: "Source") -> None:
+def _write_page(result: "RunResult") -> None:
     """``report.html``; a run is not lost because its page cannot be made."""
     from edgeslam_torch.errors import EdgeSlamError
     from edgeslam_torch.eval.report import write_report
 
     try:
-        write_report(result.folder, source.groundtruth, judge_map=False)
+        write_report(result.folder, judge_map=False)
     except (EdgeSlamError, OSError) as error:
         _say(f"warning: report.html could not be made ({error})")
 

@@ -142,6 +142,8 @@ def load_camera(name: str | Path) -> Camera:
         raise CalibrationError(f"no camera file or preset {str(name)!r}; presets: {', '.join(PRESETS)}")
     try:
         record = yaml.safe_load(path.read_text(encoding="utf-8").replace("%YAML:1.0", ""))
+        if not isinstance(record, dict):
+            raise ValueError("no key: value lines in it")
         return _camera_from_record(record, str(path))
     except (yaml.YAMLError, UnicodeDecodeError, KeyError, TypeError, ValueError, IndexError) as error:
         reason = " ".join(str(error).split())
@@ -151,6 +153,9 @@ def load_camera(name: str | Path) -> Camera:
 
 
 def _camera_from_record(record: dict[str, Any], source: str) -> Camera:
+    lens = str(record.get("distortion_model", "plumb_bob")).lower()
+    if lens not in ("plumb_bob", "radial-tangential", "radtan", "none"):
+        raise ValueError(f"distortion model {lens!r} is not supported, only plumb_bob (radial-tangential)")
     if "camera_matrix" in record:  # ROS camera_calibration
         k = [float(x) for x in record["camera_matrix"]["data"]]
         d = [float(x) for x in record["distortion_coefficients"]["data"]]

@@ -5,6 +5,7 @@ import json
 import math
 import os
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -82,7 +83,8 @@ class RunWriter:
             self._online = _Appender(folder / ONLINE, TRAJECTORY_HEADER)
             self._status = _Appender(folder / STATUS, _csv_line(STATUS_COLUMNS))
         except OSError as error:
-            (folder / _RESERVE).unlink(missing_ok=True)
+            with suppress(OSError):
+                (folder / _RESERVE).unlink(missing_ok=True)
             raise OutputError(f"{folder}: cannot write results there ({error.strerror or error})") from error
 
     def append(self, output: SlamOutput, step_ms: float) -> bool:

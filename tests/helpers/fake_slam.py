@@ -1,0 +1,58 @@
+"""A SLAM system that knows the answer: tests of everything around the real one need no real one."""
+
+import numpy as np
+
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.types import FrameStatus, PointCloud, ScaleEstimate, SlamOutput
+
+
+class FakeSlam:
+    """Moves 1 cm along x with every frame; black images have no pose; refined poses lie 1 m higher."""
+
+    def __init__(self, camera=None, config=None, realtime=False, on_step=None):
+        self.outputs = []
+        self.telemetry = []
+        self.finished = False
+        self.events = {"lost": 0}
+        self.scale = ScaleEstimate(1.0, 0.02, "depth")
+        self.on_step = on_step
+
+    def step(self, frame, telemetry=()):
+        if self.on_step is not None:
+            self.on_step(len(self.outputs))
+        self.telemetry.append(list(telemetry))
+        good = frame.image.max() > 0
+        T = se3.exp(np.array([0.01 * frame.index, 0, 0, 0, 0, 0.01 * frame.index]))
+        output = SlamOutput(
+            index=frame.index,
+            stamp_s=frame.stamp_s,
+            T_w_c=T,
+            status=FrameStatus.TRACKED if good else FrameStatus.PREDICTED,
+            reason="" if good else "only 0 keypoints, image is black",
+            matches=100,
+            inliers=80,
+            parallax_rad=0.01,
+            keyframe=frame.index % 5 == 0,
+            scale=self.scale,
+            stage_ms={"features": 1.0, **({"mapping": 5.0} if frame.index % 5 == 0 else {})},
+        )
+        self.outputs.append(output)
+        return output
+
+    def finish(self):
+        self.finished = True
+
+    def trajectory(self):
+        poses = np.stack([o.T_w_c for o in self.outputs])
+        poses[:, 2, 3] += 1.0
+        return np.array([o.stamp_s for o in self.outputs]), poses
+
+    def edge_map(self):
+        p = np.random.default_rng(0).random((500, 3)).astype(np.float32)
+        return PointCloud(p, (p * 255).astype(np.uint8), np.full(500, 0.01, np.float32), np.full(500, 3, np.int32))
+
+    def anchors(self):
+        return self.edge_map()
+
+    def keyframes(self):
+        return [o for o in self.outputs if o.keyframe]

@@ -1,0 +1,154 @@
+"""Imports go down only, and nothing heavy loads before it is needed. The picture is in docs/architecture.md."""
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).resolve().parent.parent / "edgeslam_torch"
+
+LAYERS: tuple[tuple[str, ...], ...] = (
+    ("errors", "types"),
+    ("geometry", "config"),
+    ("models", "synthetic"),
+    ("losses",),
+    ("optim",),
+    ("frontend", "fusion"),
+    ("mapping",),
+    ("tracking",),
+    ("trajectory",),
+    ("slam",),
+    ("io",),
+    ("progress", "run_summary"),
+    ("run",),
+    ("eval",),
+    ("train",),
+    ("viewer",),
+    ("commands",),
+    ("cli",),
+)
+"""From the bottom up; a part may import its own row's other parts only when `SAME_ROW` says so."""
+
+RANK = {part: rank for rank, row in enumerate(LAYERS) for part in row}
+
+ALLOWED_UP = {
+    ("config", "fusion"),  # fusion/config.py holds its own section, and imports nothing
+    ("mapping", "tracking"),  # the mapper looks for old anchors in a keyframe with tracking's search by projection
+}
+"""Exceptions, each with its reason."""
+
+NEVER = {"evo", "djitellopy", "open3d", "torchvision", "pypose"}
+"""GPL, or measured and found wanting (docs/decisions.md); tests may use some as outside oracles."""
+
+ORACLES = {"gtsam": "edgeslam_torch.optim.benchmark"}
+"""Packages that one module may compare with when they happen to be installed."""
+
+HEAVY = ("torch", "kornia", "cv2", "numpy", "scipy", "onnxruntime", "onnx", "matplotlib", "tensorboard", "rerun", "av")
+
+
+def sources() -> list[Path]:
+    """Every module of the package, through the links."""
+    files = [
+        p
+        for folder in (PACKAGE, *(PACKAGE / n for n in ("models", "losses", "train", "eval")))
+        for p in folder.rglob("*.py")
+    ]
+    return sorted({p for p in files if "__pycache__" not in p.parts})
+
+
+def imported(tree: ast.AST) -> Iterator[str]:
+    """Full names that a module imports, anywhere in it, except for the type checker alone."""
+    skipped: set[int] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+            skipped |= {id(inner) for inner in ast.walk(node)}
+    for node in ast.walk(tree):
+        if id(node) in skipped:
+            continue
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, "imports are by full name"
+            yield node.module or ""
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+def part_of(name: str) -> str | None:
+    """First part below the package of a full module name; None for other packages."""
+    words = name.split(".")
+    return words[1] if words[0] == "edgeslam_torch" and len(words) > 1 else None
+
+
+def module_name(path: Path) -> str:
+    """Full module name of a file in the package."""
+    return ".".join(("edgeslam_torch", *path.relative_to(PACKAGE).with_suffix("").parts))
+
+
+PARSED = {path: list(imported(ast.parse(path.read_text(encoding="utf-8")))) for path in sources()}
+
+
+@pytest.mark.parametrize("path", PARSED, ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_imports_go_down_only(path):
+    own = part_of(module_name(path))
+    if own == "__init__":
+        return
+    assert own in RANK, f"{own}: give it a place in LAYERS and in docs/architecture.md"
+    for name in PARSED[path]:
+        part = part_of(name)
+        if part is None or part not in RANK or part == own or (own, part) in ALLOWED_UP:
+            continue
+        assert RANK[part] < RANK[own], f"{module_name(path)} imports {name}, which lies on the same level or above"
+
+
+@pytest.mark.parametrize("path", PARSED, ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_packages_that_do_not_belong_are_not_imported(path):
+    tops = {name.split(".")[0] for name in PARSED[path]}
+    assert not tops & NEVER
+    assert all(ORACLES[name] == module_name(path) for name in tops & ORACLES.keys())
+    assert not tops & {"models", "losses", "train", "eval"}, "import edgeslam_torch.losses, not losses"
+
+
+def test_train_is_imported_by_commands_only():
+    users = {module_name(path) for path, names in PARSED.items() if any(part_of(n) == "train" for n in names)}
+    assert {name.split(".")[1] for name in users} <= {"train", "commands"}
+
+
+def loaded_by(statement: str) -> set[str]:
+    """Heavy packages that a fresh interpreter has after a statement."""
+    code = f"import sys; {statement}; print(' '.join(m for m in {HEAVY!r} if m in sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=PACKAGE.parent)
+    return set(done.stdout.split())
+
+
+@pytest.mark.parametrize(
+    "statement", ["import edgeslam_torch", "import edgeslam_torch.cli; edgeslam_torch.cli.available()"]
+)
+def test_nothing_heavy_is_imported_at_first(statement):
+    assert loaded_by(statement) == set()
+
+
+def test_a_command_that_only_lists_its_options_loads_no_torch():
+    help_of = (
+        "import contextlib, edgeslam_torch.cli as c\nwith contextlib.suppress(SystemExit): c.main([{!r}, '--help'])\n"
+    )
+    from edgeslam_torch.cli import available
+
+    for name in available():
+        code = (
+            help_of.format(name) + f"import sys\nsys.stderr.write(' '.join(m for m in {HEAVY!r} if m in sys.modules))"
+        )
+        done = subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=PACKAGE.parent
+        )
+        assert "torch" not in done.stderr.split(), f"edgeslam {name} --help loads torch"
+
+
+def test_root_folders_are_importable_under_the_package_only():
+    for name in ("models", "losses", "train", "eval"):
+        done = subprocess.run(
+            [sys.executable, "-c", f"import {name}"], capture_output=True, text=True, check=False, cwd=PACKAGE.parent
+        )
+        assert f"import edgeslam_torch.{name}" in done.stderr

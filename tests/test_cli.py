@@ -1,0 +1,172 @@
+"""The command line as a user meets it: every mistake gets one line that says what to do."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fake_slam import FakeSlam
+
+import edgeslam_torch.run
+from edgeslam_torch import __version__, cli
+from edgeslam_torch.geometry.camera import Camera
+
+
+@pytest.fixture
+def edgeslam(monkeypatch, capsys):
+    """Run a command line with the fake system: returns exit code, stdout, stderr."""
+    monkeypatch.setattr(edgeslam_torch.run, "_edge_slam", lambda camera, config, realtime: FakeSlam())
+
+    def call(*words):
+        try:
+            code = cli.main([str(word) for word in words])
+        except SystemExit as end:
+            code = end.code
+        out, err = capsys.readouterr()
+        return code, out, err
+
+    return call
+
+
+@pytest.fixture
+def recording(tmp_path, write_tum):
+    folder = write_tum(tmp_path / "seq", 6)
+    Camera(64, 48, 50.0, 50.0, 31.5, 23.5).save(folder / "camera.yaml")
+    return folder
+
+
+def test_run(edgeslam, recording, tmp_path):
+    code, out, err = edgeslam("run", recording, "--out", tmp_path / "out", "--no-report")
+    assert code == 0
+    assert "6 of 6 frames tracked (100.0 %), lost never" in out
+    assert "units are metres" in out
+    assert "camera.yaml" in err
+    assert np.loadtxt(tmp_path / "out" / "trajectory.txt").shape == (6, 8)
+
+
+def test_run_without_out_goes_into_runs(edgeslam, recording, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert edgeslam("run", "seq", "--no-report")[0] == 0
+    assert (tmp_path / "runs" / "seq" / "summary.json").is_file()
+
+
+def test_settings_reach_the_resolved_config(edgeslam, recording, tmp_path):
+    (tmp_path / "c.toml").write_text("seed = 1\n[orb]\nfeatures = 700\n")
+    words = ("--config", tmp_path / "c.toml", "--set", "orb.levels=6", "--seed", 9, "--depth", "none", "--no-report")
+    assert edgeslam("run", recording, "--out", tmp_path / "o", *words)[0] == 0
+    text = (tmp_path / "o" / "config.toml").read_text()
+    for line in ("seed = 9", "features = 700", "levels = 6", 'weights = "none"'):
+        assert line in text
+
+
+def test_unreadable_image_is_reported_and_the_run_goes_on(edgeslam, recording, tmp_path):
+    sorted((recording / "rgb").iterdir())[2].write_bytes(b"")
+    code, out, err = edgeslam("run", recording, "--out", tmp_path / "o", "--no-report")
+    assert code == 0
+    assert "left out:" in err
+    assert "empty file" in err
+
+
+def test_default_calibration_is_named_with_its_cost(edgeslam, recording, tmp_path):
+    (recording / "camera.yaml").unlink()
+    _, _, err = edgeslam("run", recording, "--out", tmp_path / "o", "--no-report")
+    assert "guessing a focal length" in err
+    assert "bends the trajectory" in err
+
+
+def test_progress_lines_and_bar(edgeslam, recording, tmp_path, monkeypatch):
+    monkeypatch.setattr("edgeslam_torch.progress.LINE_EVERY_S", 0.0)
+    _, _, err = edgeslam("run", recording, "--out", tmp_path / "o", "--no-report")
+    assert "6/6 frames" in err
+    assert "frames/s" in err
+    _, _, err = edgeslam("run", recording, "--out", tmp_path / "o", "--no-report", "--progress")
+    assert "100%" in err
+    assert "tracked" in err
+
+
+MISTAKES = [
+    (["run", "{tmp}/nowhere"], 1, "nowhere: no such file or folder"),
+    (["run", "{tmp}/empty"], 1, "empty: empty; give a folder of images"),
+    (["run", "{seq}", "--camera", "tum_fr7"], 1, "no camera file or preset 'tum_fr7'; presets: tum_fr1"),
+    (["run", "{seq}", "--camera", "{seq}/rgb.txt"], 1, "rgb.txt: not a camera calibration"),
+    (["run", "{seq}", "--telemetry", "{tmp}/t.csv"], 1, "t.csv: no such telemetry file"),
+    (["run", "{seq}", "--config", "{tmp}/c.toml"], 1, "c.toml: No such file"),
+    (["run", "{seq}", "--set", "orb.feature=3"], 1, "did you mean 'orb.features'"),
+    (["run", "{seq}", "--set", "orb.features=0"], 1, "features must be positive"),
+    (["run", "{seq}", "--out", "{seq}"], 1, "is the source itself"),
+    (["run", "{seq}", "--out", "{seq}/rgb.txt/x"], 1, "cannot write results there"),
+    (["run", "{seq}", "--max-frames", "0"], 2, "must be a whole number of at least 1, got '0'"),
+    (["run", "{seq}", "--max-frames", "many"], 2, "got 'many'"),
+    (["run", "{seq}", "--mode", "fast"], 2, "invalid choice"),
+    (["run", "{seq}", "--camra", "x"], 2, "no option '--camra'; did you mean '--camera'?"),
+    (["run", "{seq}", "--max", "5"], 2, "did you mean '--max-frames'?"),
+    (["run", "{seq}", "more"], 2, "unexpected 'more'"),
+    (["run"], 2, "SOURCE"),
+    (["rnu", "{seq}"], 2, "no command 'rnu'; did you mean 'run'?"),
+    (["{seq}"], 2, "did you mean 'edgeslam run"),
+    (["--verbos", "run"], 2, "did you mean '--verbose'?"),
+]
+
+
+@pytest.mark.parametrize(("words", "code", "message"), MISTAKES, ids=[" ".join(words) for words, _, _ in MISTAKES])
+def test_mistake_gets_one_line_and_no_traceback(edgeslam, recording, tmp_path, words, code, message):
+    (tmp_path / "empty").mkdir()
+    got, out, err = edgeslam(*(word.format(tmp=tmp_path, seq=recording) for word in words))
+    assert got == code
+    lines = [line for line in err.splitlines() if "error:" in line]
+    assert len(lines) == 1
+    assert message in lines[0]
+    assert "Traceback" not in err
+
+
+def test_verbose_shows_the_traceback(edgeslam, tmp_path):
+    from edgeslam_torch.errors import SourceError
+
+    with pytest.raises(SourceError):
+        edgeslam("run", tmp_path / "nowhere", "-v")
+
+
+def test_no_command_shows_help(edgeslam):
+    code, out, _ = edgeslam()
+    assert code == 2
+    assert "commands:" in out
+
+
+def test_help_and_version(edgeslam):
+    code, out, _ = edgeslam("--help")
+    assert code == 0
+    assert all(f"  {name} " in out for name in cli.available())
+    code, out, _ = edgeslam("--version")
+    assert (code, out) == (0, f"edgeslam {__version__}\n")
+
+
+def test_every_command_has_help(edgeslam):
+    for name in cli.available():
+        code, out, _ = edgeslam(name, "--help")
+        assert code == 0
+        assert out.startswith(f"usage: edgeslam {name}")
+
+
+def test_commands_without_a_module_are_not_offered(edgeslam, monkeypatch):
+    monkeypatch.setitem(cli.COMMANDS, "fly", ("edgeslam_torch.commands.fly_away", "leave"))
+    assert "fly" not in cli.available()
+    assert edgeslam("fly")[0] == 2
+
+
+def test_every_command_module_is_in_the_table():
+    folder = Path(cli.__file__).parent / "commands"
+    modules = {f"edgeslam_torch.commands.{p.stem}" for p in folder.glob("*.py") if not p.stem.startswith("_")}
+    assert modules <= {module for module, _ in cli.COMMANDS.values()}
+
+
+def test_installed_program_runs(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-m", "edgeslam_torch.cli", "run", str(tmp_path / "none")],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 1
+    assert done.stderr.startswith("edgeslam: error:")
+    assert done.stderr.count("\n") == 1

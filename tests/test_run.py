@@ -1,0 +1,197 @@
+"""The run loop around a SLAM system that knows the answer."""
+
+import json
+import os
+import signal
+import time
+
+import cv2
+import numpy as np
+import pytest
+from fake_slam import FakeSlam
+
+from edgeslam_torch.config import SlamConfig
+from edgeslam_torch.errors import SourceError
+from edgeslam_torch.io.config_file import load_config
+from edgeslam_torch.io.pace import Counter, at_their_pace
+from edgeslam_torch.io.ply import read_ply
+from edgeslam_torch.io.source import open_source
+from edgeslam_torch.run import Mode, run
+from edgeslam_torch.types import Frame, TelemetrySample
+
+FILES = {
+    "trajectory.txt",
+    "trajectory_online.txt",
+    "status.csv",
+    "edge_map.ply",
+    "anchors.ply",
+    "summary.json",
+    "config.toml",
+    "camera.yaml",
+    "map.png",
+}
+
+
+def fake(slam):
+    return lambda camera, config, realtime: slam
+
+
+def test_folder_holds_everything(tmp_path, write_tum):
+    source = open_source(write_tum(tmp_path / "seq", 12))
+    result = run(source, tmp_path / "out", SlamConfig(seed=3), make_slam=fake(FakeSlam()))
+    assert {p.name for p in result.folder.iterdir()} == FILES
+    summary = json.loads((result.folder / "summary.json").read_text())
+    wanted = "frames tracked coverage first_pose_frame lost_events fps cpu_ms_per_frame peak_rss_mb dropped_frames"
+    assert set(wanted.split()) <= set(summary)
+    assert (summary["frames"], summary["coverage"], summary["first_pose_frame"], summary["seed"]) == (12, 1.0, 0, 3)
+    assert summary["scale"] == {"value": 1.0, "sigma": 0.02, "source": "depth", "units": "metres"}
+    assert summary["map"] == {"keyframes": 3, "anchors": 500, "edge_points": 500}
+    assert summary["stage_median_ms"] == {"features": 1.0, "mapping": 5.0}
+    assert np.loadtxt(result.folder / "trajectory.txt").shape == (12, 8)
+    assert len(read_ply(result.folder / "edge_map.ply").p_w) == 500
+    assert load_config(SlamConfig(), result.folder / "config.toml") == SlamConfig(seed=3)
+    assert cv2.imread(str(result.folder / "map.png")).shape[1] > 1000
+
+
+def test_lost_frames_are_counted_once_a_loss(tmp_path, write_tum):
+    folder = write_tum(tmp_path / "seq", 10)
+    for path in sorted((folder / "rgb").iterdir())[4:7]:
+        cv2.imwrite(str(path), np.zeros((48, 64), np.uint8))
+    summary = run(open_source(folder), tmp_path / "out", make_slam=fake(FakeSlam())).summary
+    assert (summary["tracked"], summary["lost_events"], summary["coverage"]) == (7, 1, 0.7)
+    assert summary["statuses"] == {"tracked": 7, "predicted": 3}
+
+
+def test_unreadable_image_costs_coverage_and_is_named(tmp_path, write_tum):
+    folder = write_tum(tmp_path / "seq", 10)
+    sorted((folder / "rgb").iterdir())[3].write_bytes(b"")
+    summary = run(open_source(folder), tmp_path / "out", make_slam=fake(FakeSlam())).summary
+    assert (summary["frames"], summary["left_out"], summary["coverage"]) == (9, 1, 0.9)
+    assert summary["problems"][0]["reason"] == "empty file"
+
+
+def test_telemetry_comes_with_the_frame_that_follows_it(tmp_path, write_tum):
+    source = open_source(write_tum(tmp_path / "seq", 4))  # frames at 100.0, 100.1, 100.2, 100.3
+    source.telemetry.extend(TelemetrySample(stamp) for stamp in (99.0, 100.0, 100.15, 100.2, 500.0))
+    slam = FakeSlam()
+    run(source, tmp_path / "out", make_slam=fake(slam))
+    assert [[s.stamp_s for s in group] for group in slam.telemetry] == [[99.0, 100.0], [], [100.15, 100.2], []]
+
+
+def test_one_frame(tmp_path, write_tum):
+    result = run(open_source(write_tum(tmp_path / "seq", 1)), tmp_path / "out", make_slam=fake(FakeSlam()))
+    assert result.summary["frames"] == 1
+    assert np.loadtxt(result.folder / "trajectory.txt", ndmin=2).shape == (1, 8)
+
+
+def test_no_frame_at_all_is_an_error_that_says_why(tmp_path, write_tum):
+    folder = write_tum(tmp_path / "seq", 1)
+    source = open_source(folder)
+    next((folder / "rgb").iterdir()).write_bytes(b"")
+    with pytest.raises(SourceError, match="not a single frame.*empty file"):
+        run(source, tmp_path / "out", make_slam=fake(FakeSlam()))
+
+
+def test_ctrl_c_finishes_and_writes(tmp_path, write_tum):
+    def press(step):
+        if step == 5:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    slam = FakeSlam(on_step=press)
+    result = run(open_source(write_tum(tmp_path / "seq", 20)), tmp_path / "out", make_slam=fake(slam))
+    assert result.interrupted
+    assert slam.finished
+    assert {p.name for p in result.folder.iterdir()} == FILES
+    assert json.loads((result.folder / "summary.json").read_text())["interrupted"] is True
+    assert len(np.loadtxt(result.folder / "trajectory.txt")) == 6
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_second_ctrl_c_skips_the_refinement_and_still_writes(tmp_path, write_tum):
+    class Slow(FakeSlam):
+        def finish(self):
+            os.kill(os.getpid(), signal.SIGINT)
+            os.kill(os.getpid(), signal.SIGINT)
+
+    result = run(open_source(write_tum(tmp_path / "seq", 5)), tmp_path / "out", make_slam=fake(Slow()))
+    assert {p.name for p in result.folder.iterdir()} == FILES
+
+
+def test_ctrl_c_while_a_live_source_is_silent(tmp_path, write_tum):
+    source = open_source(write_tum(tmp_path / "seq", 3))
+    recorded = source.frames
+
+    def silent_after_two():
+        frames = recorded()
+        yield next(frames)
+        yield next(frames)
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(60.0)
+
+    source.frames = silent_after_two
+    result = run(source, tmp_path / "out", make_slam=fake(FakeSlam()))
+    assert result.interrupted
+    assert result.summary["frames"] == 2
+
+
+def test_source_that_fails_on_the_way_loses_nothing(tmp_path, write_tum):
+    source = open_source(write_tum(tmp_path / "seq", 5))
+    recorded = source.frames
+
+    def unplugged():
+        frames = recorded()
+        yield next(frames)
+        yield next(frames)
+        raise SourceError("webcam:0: unplugged")
+
+    source.frames = unplugged
+    with pytest.raises(SourceError, match="unplugged"):
+        run(source, tmp_path / "out", make_slam=fake(FakeSlam()))
+    assert {p.name for p in (tmp_path / "out").iterdir()} == FILES
+    assert len(np.loadtxt(tmp_path / "out" / "trajectory.txt")) == 2
+
+
+def test_error_in_the_system_itself_loses_nothing(tmp_path, write_tum):
+    def fail(step):
+        if step == 3:
+            raise RuntimeError("a bug")
+
+    with pytest.raises(RuntimeError, match="a bug"):
+        run(open_source(write_tum(tmp_path / "seq", 5)), tmp_path / "out", make_slam=fake(FakeSlam(on_step=fail)))
+    assert len(np.loadtxt(tmp_path / "out" / "trajectory.txt")) == 3
+
+
+def test_offline_twice_gives_the_same_bytes(tmp_path, write_tum):
+    folder = write_tum(tmp_path / "seq", 6)
+    for name in ("a", "b"):
+        run(open_source(folder), tmp_path / name, make_slam=fake(FakeSlam()))
+    for name in ("trajectory.txt", "edge_map.ply", "config.toml"):
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
+
+
+def frames_at(stamps):
+    image = np.zeros((4, 4), np.uint8)
+    return iter([Frame(i, stamp, image) for i, stamp in enumerate(stamps)])
+
+
+def test_realtime_keeps_pace_and_drops_the_oldest_waiting():
+    dropped = Counter()
+    frames = at_their_pace(frames_at(0.002 * i for i in range(50)), dropped, waiting=2)
+    first = next(frames)
+    until = time.monotonic() + 0.05
+    while time.monotonic() < until:
+        pass  # a slow step
+    rest = list(frames)
+    assert first.index == 0
+    assert 1 + len(rest) + dropped.value == 50
+    assert dropped.value > 5
+    assert rest[-1].index == 49
+
+
+def test_realtime_drops_nothing_when_there_is_time(tmp_path, write_tum):
+    result = run(
+        open_source(write_tum(tmp_path / "seq", 3)), tmp_path / "out", mode=Mode.REALTIME, make_slam=fake(FakeSlam())
+    )
+    assert result.summary["dropped_frames"] == 0
+    assert result.summary["frames"] == 3
+    assert result.summary["duration_s"] > 0.19
