@@ -58,12 +58,16 @@ def with_noise(rng: Rng, image: np.ndarray, read: float, shot: float) -> np.ndar
         return image
     # A long noise field read from a random place: as good as new noise and far cheaper.
     table = _noise_table()
-    start = int(rng.integers(0, len(table) - image.size)) if image.size < len(table) else 0
-    noise = np.resize(table[start : start + image.size], image.shape)
+    if image.size >= len(table):
+        noise = rng.standard_normal(image.shape, dtype=np.float32)
+    else:
+        start = int(rng.integers(0, len(table) - image.size))
+        noise = table[start : start + image.size].reshape(image.shape)
     level = np.arange(256, dtype=np.float32)
-    sigma = np.sqrt(read**2 + shot**2 * level).astype(np.float32)
-    noisy = cv2.LUT(image, sigma) * noise + image
-    return np.clip(noisy + 0.5, 0, 255).astype(np.uint8)
+    noisy = cv2.LUT(image, np.sqrt(read**2 + shot**2 * level).astype(np.float32))
+    noisy *= noise
+    noisy += image
+    return cv2.convertScaleAbs(cv2.max(noisy, 0.0))
 
 
 @lru_cache(maxsize=1)
@@ -76,11 +80,16 @@ def with_vignetting(image: np.ndarray, loss: float) -> np.ndarray:
     """Darkened towards the corners by ``loss`` there (quadratic in the radius)."""
     if loss == 0:
         return image
-    h, w = image.shape[:2]
+    channels = image.shape[2] if image.ndim == 3 else 1
+    return cv2.multiply(image, _vignette(image.shape[0], image.shape[1], channels, loss), scale=1.0 / 255.0)
+
+
+@lru_cache(maxsize=8)
+def _vignette(h: int, w: int, channels: int, loss: float) -> np.ndarray:
+    """Gain times 255, ``(h, w)`` or ``(h, w, channels)``."""
     x, y = (np.arange(w) - (w - 1) / 2) / (w / 2), (np.arange(h) - (h - 1) / 2) / (h / 2)
-    gain = 256.0 * (1.0 - 0.5 * loss * (x[None] ** 2 + y[:, None] ** 2))
-    mask = cv2.merge([np.clip(gain, 0, 255).astype(np.uint8)] * image.shape[2]) if image.ndim == 3 else gain
-    return cv2.multiply(image, mask.astype(np.uint8), scale=1.0 / 255.0)
+    gain = np.rint(255.0 * (1.0 - 0.5 * loss * (x[None] ** 2 + y[:, None] ** 2)))
+    return cv2.merge([np.clip(gain, 0, 255).astype(np.uint8)] * channels)
 
 
 def with_jpeg(image: np.ndarray, quality: int) -> np.ndarray:
@@ -92,9 +101,9 @@ def with_jpeg(image: np.ndarray, quality: int) -> np.ndarray:
 
 
 def with_motion_blur(
-    image: np.ndarray, depth_m: FloatArray, camera: Camera, twist_c: FloatArray, shutter_s: float, *, steps: int = 5
+    image: np.ndarray, depth_m: FloatArray, camera: Camera, twist_c: FloatArray, shutter_s: float
 ) -> np.ndarray:
-    """Mean of ``steps`` images warped along the optical flow while the shutter is open.
+    """Mean of three images, or five when it moves far, warped along the optical flow while the shutter is open.
 
     Args:
         image: ``(H, W, 3)``.
@@ -102,7 +111,6 @@ def with_motion_blur(
         camera: Intrinsics without distortion.
         twist_c: ``(6,)`` velocity [m/s] and rotation rate [rad/s] of the camera in its own axes.
         shutter_s: Exposure time.
-        steps: Number of images.
     """
     v, omega = np.asarray(twist_c[:3], dtype=np.float64), np.asarray(twist_c[3:], dtype=np.float64)
     if shutter_s == 0 or not np.any(twist_c):
@@ -122,12 +130,22 @@ def with_motion_blur(
     if longest < 0.4:
         return image
     flow = cv2.resize(flow, (w, h), interpolation=cv2.INTER_LINEAR)
-    grid_x, grid_y = np.meshgrid(np.arange(w, dtype=np.float32), np.arange(h, dtype=np.float32))
-    total = np.zeros(image.shape, np.float32)
-    for share in np.linspace(-0.5, 0.5, steps):
-        map_x, map_y = grid_x - np.float32(share) * flow[..., 0], grid_y - np.float32(share) * flow[..., 1]
-        total += cv2.remap(image, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return (total / steps + 0.5).astype(np.uint8)
+    grid = _pixel_grid(h, w)
+    steps = 3 if longest < 3.0 else 5
+    total = image.astype(np.float32)
+    for k in range(steps):
+        share = np.float32(k / (steps - 1) - 0.5)
+        if share == 0:
+            continue
+        moved = cv2.remap(image, cv2.scaleAdd(flow, -share, grid), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        cv2.accumulate(moved, total)
+    return cv2.convertScaleAbs(total, alpha=1.0 / steps)
+
+
+@lru_cache(maxsize=4)
+def _pixel_grid(h: int, w: int) -> np.ndarray:
+    """Pixel coordinates ``(h, w, 2)`` float32."""
+    return np.stack(np.meshgrid(np.arange(w, dtype=np.float32), np.arange(h, dtype=np.float32)), axis=-1)
 
 
 def degraded(

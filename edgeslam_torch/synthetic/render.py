@@ -254,25 +254,37 @@ def _smooth_borders(image: np.ndarray, ids: np.ndarray, polygons: list[_Polygon]
     pixel = np.flatnonzero(mixed)
     if len(pixel) == 0:
         return
-    # On a frame one pixel wider all round, corner (i, j) touches pixels (i, j), (i, j+1), (i+1, j), (i+1, j+1).
-    wide = width + 2
-    padded_ids = cv2.copyMakeBorder(ids, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=-2).ravel()
-    padded = cv2.copyMakeBorder(image, 1, 1, 1, 1, cv2.BORDER_REPLICATE).reshape(-1, 3)
     row, column = np.divmod(pixel, width)
-    own = padded[(row + 1) * wide + column + 1].astype(np.float32)
-    total = 4.0 * own
-    for dy in (0, 1):
-        for dx in (0, 1):
-            target = ids_corner[row + dy, column + dx]
-            around = (row + dy) * wide + column + dx
-            weight = np.zeros((len(pixel), 1), np.float32)
-            colour = np.zeros((len(pixel), 3), np.float32)
-            for step in (0, 1, wide, wide + 1):
-                same = (padded_ids[around + step] == target)[:, None]
-                weight += same
-                colour += same * padded[around + step]
-            total += np.where(weight > 0, colour / np.maximum(weight, 1.0), own)
-    image.reshape(-1, 3)[pixel] = (total * 0.125 + 0.5).astype(np.uint8)
+    # Corner (i, j) lies between pixels (i-1, j-1) and (i, j): on a frame one pixel wider all round, (i, j) to (i+1, j+1).
+    first = row * (width + 1) + column
+    corners_of_pixel = [first, first + 1, first + width + 1, first + width + 2]
+    touched = np.zeros((height + 1) * (width + 1), bool)
+    for index in corners_of_pixel:
+        touched[index] = True
+    sample = np.flatnonzero(touched)
+    wide = width + 2
+    around = sample + sample // (width + 1)
+    target = ids_corner.ravel()[sample]
+    padded_ids = cv2.copyMakeBorder(ids, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=-2).ravel()
+    padded = cv2.copyMakeBorder(image, 1, 1, 1, 1, cv2.BORDER_REPLICATE)
+    # The fourth channel counts: one gather gives colour and weight.
+    padded = cv2.merge([*cv2.split(padded), np.full(padded.shape[:2], 1, np.uint8)]).reshape(-1, 4)
+    total = np.zeros((len(sample), 4), np.uint16)
+    for step in (0, 1, wide, wide + 1):
+        same = padded_ids[around + step] == target
+        total += padded[around + step] * same[:, None].view(np.uint8)
+    weight = total[:, 3:]
+    colour = (total[:, :3].astype(np.float32) / np.maximum(weight, 1)).astype(np.float32)
+    lonely = weight[:, 0] == 0  # no pixel centre shows this corner's quad: leave it out
+    position = np.zeros(len(touched), np.int32)
+    position[sample] = np.arange(len(sample), dtype=np.int32)
+    flat = image.reshape(-1, 3)
+    own = flat[pixel].astype(np.float32)
+    blended = 4.0 * own
+    for index in corners_of_pixel:
+        at = position[index]
+        blended += np.where(lonely[at, None], own, colour[at])
+    flat[pixel] = (blended * 0.125 + 0.5).astype(np.uint8)
 
 
 def _render_distorted(world: World, camera: Camera, T_w_c: FloatArray, antialias: bool) -> Rendered:
