@@ -7,6 +7,7 @@ from typing import Literal
 _POSITIVE = (
     "sigma_velocity_m_s",
     "sigma_attitude_rad",
+    "velocity_step_m_s",
     "buffer_s",
     "interval_s",
     "window_s",
@@ -21,7 +22,6 @@ _NOT_NEGATIVE = (
     "beta",
     "lambda_tau",
     "floor_position_m",
-    "floor_angle_rad",
     "sigma_bias_m_s",
     "bias_walk_m_s_sqrt_s",
     "initial_sigma_position_m",
@@ -29,6 +29,7 @@ _NOT_NEGATIVE = (
     "sigma_turn_rad_sqrt_s",
     "literal_beta",
     "systematic_log",
+    "truncation_systematic_log",
     "min_speed_m_s",
     "alignment_sigma_rad",
 )
@@ -43,25 +44,29 @@ class FusionConfig:
     velocity_frame: Literal["world", "body"] = "world"
     """Frame of ``TelemetrySample.velocity_m_s``: three real flights say the power-on world, paper eq. (9) says body."""
 
+    velocity_rounding: Literal["auto", "nearest", "truncate"] = "auto"
+    """How the drone makes whole steps of its velocity. A Tello reads 0 twice as often as any other step when it flies
+    through 0, so it truncates, and reads half a step low; ``auto`` takes what fits the visual motion better."""
+    velocity_step_m_s: float = 0.1
+
     beta: float = 1.0
     """Growth of the process noise with the spent battery, paper eq. (10)."""
     lambda_tau: float = 0.5
     """Growth of the process noise with the time since the last visual update [1/s], paper eq. (10)."""
     literal_beta: float = 1e-3
     """The paper's beta, which there has the units of the whole covariance (m^2 and rad^2)."""
-    sigma_velocity_m_s: float = 0.04
-    """Error of one velocity reading: 0.1 / sqrt(12) of quantisation, and as much again for the drone's own estimate."""
-    sigma_attitude_rad: float = math.radians(0.6)
+    sigma_velocity_m_s: float = 0.033
+    """Error of one velocity reading: 0.1 / sqrt(12) of quantisation and the drone's own 0.02."""
+    sigma_attitude_rad: float = math.radians(0.36)
     """Error of one attitude reading: 1 deg / sqrt(12) of quantisation that repeats while the drone hovers."""
-    sigma_turn_rad_sqrt_s: float = 0.3
-    """Random walk of the angles between readings: the drone's own turning, which the state does not predict."""
+    sigma_turn_rad_sqrt_s: float = 0.06
+    """Random walk of the angles between readings, on top of the turning that the readings themselves show."""
     sigma_bias_m_s: float = 0.03
     """Velocity bias at the start (0 takes the bias out of the state: the paper's six states)."""
     bias_walk_m_s_sqrt_s: float = 0.005
     """Random walk of the velocity bias, before the battery factor."""
-    floor_position_m: float = 1e-4
-    """Least process noise of one step: keeps the covariance positive on a full battery."""
-    floor_angle_rad: float = 1e-4
+    floor_position_m: float = 1e-3
+    """Least process noise [m/sqrt(s)]: keeps the covariance positive whatever the other settings are."""
     initial_sigma_position_m: float = 0.0
     initial_sigma_angle_rad: float = math.radians(1.0)
     gate_probability: float = 0.95
@@ -89,6 +94,8 @@ class FusionConfig:
     """RMS metric speed below which an interval says nothing of scale (hover, turning on the spot)."""
     systematic_log: float = 0.008
     """Scale error of the drone's own velocity and range that no averaging removes."""
+    truncation_systematic_log: float = 0.03
+    """The same when readings are truncated: what happens below one step stays unknown."""
     sigma_tof_m: float = 0.015
     sigma_h_m: float = 0.06
     """SDK ``h`` moves in steps of 10 cm."""
@@ -104,6 +111,12 @@ class FusionConfig:
         _require(0.5 <= self.gate_probability < 1, "gate_probability", "in [0.5, 1)", self.gate_probability)
         _require(self.refusals_before_recovery >= 1, "refusals_before_recovery", ">= 1", self.refusals_before_recovery)
         _require(self.delay_range_s[0] < self.delay_range_s[1], "delay_range_s", "ascending", self.delay_range_s)
+        _require(
+            self.velocity_rounding in ("auto", "nearest", "truncate"),
+            "velocity_rounding",
+            "auto, nearest or truncate",
+            self.velocity_rounding,
+        )
         _require(self.velocity_frame in ("world", "body"), "velocity_frame", "world or body", self.velocity_frame)
 
 

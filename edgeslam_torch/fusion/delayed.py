@@ -9,11 +9,12 @@ import numpy as np
 
 from edgeslam_torch.fusion.config import FusionConfig
 from edgeslam_torch.fusion.ekf import Ekf, EkfState, Outcome
-from edgeslam_torch.fusion.rotations import rpy_from_matrix
+from edgeslam_torch.fusion.rotations import rpy_from_matrix, wrapped
 from edgeslam_torch.types import FloatArray, TelemetrySample
 
 _TELEMETRY, _RELATIVE, _ABSOLUTE, _CLONE = range(4)
 _SAME_S = 1e-6
+_QUANTISATION_RAD = math.radians(1.0 / math.sqrt(12.0))
 _SILENCE_S = 0.5
 """Without telemetry for so long the last velocity is no longer believed."""
 
@@ -33,6 +34,14 @@ class _Event:
     nis: float = math.nan
     velocity: FloatArray = field(default_factory=lambda: np.zeros(3))
     battery: float = math.nan
+    turn: float = 0.0
+    rpy: FloatArray | None = None
+    rpy_s: float = math.nan
+
+    def inherit(self, previous: "_Event") -> None:
+        """What holds until a reading or a clone says otherwise."""
+        self.clone_s, self.battery, self.turn = previous.clone_s, previous.battery, previous.turn
+        self.rpy, self.rpy_s = previous.rpy, previous.rpy_s
 
     @property
     def key(self) -> tuple[float, int]:
@@ -132,8 +141,8 @@ class BufferedEkf:
         event.outcome, event.nis = "", math.nan
         if index > 0:
             previous = self._events[index - 1]
-            event.clone_s, event.velocity, event.battery = previous.clone_s, previous.velocity, previous.battery
-            self._predict(previous, event.stamp_s, index)
+            event.inherit(previous)
+            event.velocity = self._predict(previous, event.stamp_s, index)
         if event.sample is not None:
             self._apply_telemetry(event, event.sample)
         elif event.kind == _CLONE:
@@ -143,25 +152,40 @@ class BufferedEkf:
             self._apply_visual(event)
         event.saved = ekf.copy_state()
 
-    def _predict(self, previous: _Event, stamp_s: float, index: int) -> None:
-        """From the event before ``index`` to ``stamp_s``, with velocity interpolated towards the next reading."""
+    def _predict(self, previous: _Event, stamp_s: float, index: int) -> FloatArray:
+        """From the event before ``index`` to ``stamp_s``; velocity is interpolated towards the next reading.
+
+        Returns:
+            The velocity at ``stamp_s`` ``(3,)``.
+        """
         dt = stamp_s - previous.stamp_s
+        velocity, turn = previous.velocity, previous.turn
         if dt <= 0:
-            return
-        velocity = previous.velocity
-        following = next((e for e in self._events[index:] if e.sample is not None), None)
-        if following is not None and following.sample is not None and not self.config.literal:
-            ahead, reach = following.sample.velocity_m_s, following.stamp_s - previous.stamp_s
-            if reach < _SILENCE_S and math.isfinite(float(ahead.sum())):
-                velocity = velocity + 0.5 * min(1.0, dt / reach) * (ahead - velocity)
-        self.ekf.predict(dt, velocity, previous.battery)
+            return velocity
+        end = velocity
+        following = self._next_reading(index)
+        if following is not None and not self.config.literal:
+            reach = following.stamp_s - previous.stamp_s
+            if reach < _SILENCE_S and math.isfinite(float(following.velocity_m_s.sum())):
+                end = velocity + min(1.0, dt / reach) * (following.velocity_m_s - velocity)
+            turn = _turn(previous, following)
+        self.ekf.predict(dt, 0.5 * (velocity + end), previous.battery, turn)
+        return end
+
+    def _next_reading(self, index: int) -> TelemetrySample | None:
+        for i in range(index, len(self._events)):
+            if (sample := self._events[i].sample) is not None:
+                return sample
+        return None
 
     def _apply_telemetry(self, event: _Event, sample: TelemetrySample) -> None:
         if math.isfinite(float(sample.velocity_m_s.sum())):
             event.velocity = sample.velocity_m_s
+        event.turn = _turn(event, sample)
         if math.isfinite(sample.battery):
             event.battery = sample.battery
         if math.isfinite(float(sample.rpy_rad.sum())):
+            event.rpy, event.rpy_s = sample.rpy_rad, sample.stamp_s
             event.outcome = self._named("attitude", self.ekf.update_attitude(sample.rpy_rad))
             event.nis = self.ekf.nis
 
@@ -198,3 +222,14 @@ class BufferedEkf:
 
 def _degrees(event: _Event) -> int:
     return 3 if event.kind == _TELEMETRY else 6
+
+
+def _turn(before: _Event, sample: TelemetrySample) -> float:
+    """Turning rate [rad/s] between the last attitude reading and this one; what it was when either is missing."""
+    dt = sample.stamp_s - before.rpy_s
+    if before.rpy is None or not dt > 0 or not math.isfinite(float(sample.rpy_rad.sum())):
+        return before.turn
+    turned = wrapped(sample.rpy_rad - before.rpy)
+    # Six readings' noise is in the sum; what is left is turning.
+    squared = float(turned @ turned) - 6.0 * _QUANTISATION_RAD**2
+    return min(math.sqrt(max(squared, 0.0)) / dt, 10.0)

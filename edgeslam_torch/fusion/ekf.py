@@ -59,8 +59,8 @@ class Ekf:
 
     def __init__(self, config: FusionConfig) -> None:
         self.config = config
-        self.x = np.zeros(_SIZE)
-        self.P = np.zeros((_SIZE, _SIZE))
+        self.x: FloatArray = np.zeros(_SIZE)
+        self.P: FloatArray = np.zeros((_SIZE, _SIZE))
         self.P[range(3), range(3)] = config.initial_sigma_position_m**2
         self.P[range(3, 6), range(3, 6)] = config.initial_sigma_angle_rad**2
         if config.sigma_bias_m_s > 0 and not config.literal:
@@ -71,15 +71,23 @@ class Ekf:
         self.nis = math.nan
         """Normalised innovation squared of the last measurement."""
         self._gate = {n: float(chi2.ppf(config.gate_probability, n)) for n in (3, 6)}
-        self._diagonal = np.arange(_SIZE)
 
     def reset_pose(self, p_w: FloatArray, rpy_rad: FloatArray) -> None:
         """Start at a known pose with the initial uncertainty."""
         self.x[_P], self.x[_A] = p_w, rpy_rad
         self.clone()
 
-    def predict(self, dt_s: float, velocity_m_s: FloatArray, battery: float = math.nan) -> None:
-        """Propagate by a velocity reading over ``dt_s``, paper eqs. (9)-(10); battery in [0, 1], NaN counts as full."""
+    def predict(
+        self, dt_s: float, velocity_m_s: FloatArray, battery: float = math.nan, turn_rad_s: float = 0.0
+    ) -> None:
+        """Propagate by a velocity reading over ``dt_s``, paper eqs. (9)-(10).
+
+        Args:
+            dt_s: Time step [s].
+            velocity_m_s: Reading ``(3,)`` in ``config.velocity_frame``.
+            battery: Charge in [0, 1]; NaN counts as full.
+            turn_rad_s: How fast the readings say the drone turns; the state has no rates, so this is process noise.
+        """
         self.tau_s += dt_s
         spent = 1.0 - battery if battery == battery else 0.0
         if self.config.literal:
@@ -100,13 +108,14 @@ class Ekf:
         P[_P] += A @ P[3:9]
         P[:, _P] += P[:, 3:9] @ A.T
         growth = 1.0 + config.beta * spent + config.lambda_tau * min(self.tau_s, 60.0)
-        noise = np.zeros(_SIZE)
-        # A reading stands for the 0.1 s around it: its error is constant over the reading, so dt * 0.1 s, not dt^2.
-        noise[_P] = dt_s * 0.1 * config.sigma_velocity_m_s**2 * growth + config.floor_position_m**2 * dt_s
-        noise[_A] = dt_s * config.sigma_turn_rad_sqrt_s**2 + config.floor_angle_rad**2 * dt_s
-        if config.sigma_bias_m_s > 0:
-            noise[_B] = dt_s * config.bias_walk_m_s_sqrt_s**2 * growth
-        P[self._diagonal, self._diagonal] += noise
+        position = dt_s * (0.1 * config.sigma_velocity_m_s**2 * growth + config.floor_position_m**2)
+        turning = dt_s * (config.sigma_turn_rad_sqrt_s**2 + dt_s * turn_rad_s**2)
+        bias = dt_s * config.bias_walk_m_s_sqrt_s**2 * growth if config.sigma_bias_m_s > 0 else 0.0
+        # A reading's error lasts as long as the reading, 0.1 s: dt * 0.1 s of variance, not dt^2.
+        diagonal = P.ravel()[:: _SIZE + 1]
+        diagonal[_P] += position
+        diagonal[_A] += turning
+        diagonal[_B] += bias
 
     def _predict_literal(self, dt_s: float, velocity_m_s: FloatArray, spent: float) -> None:
         x, P, config = self.x, self.P, self.config
@@ -119,26 +128,24 @@ class Ekf:
             P[:, _P] += P[:, _A] @ A.T
         x[_P] += dt_s * moved
         noise = config.literal_beta * (spent + config.lambda_tau * self.tau_s)
-        P[self._diagonal[_POSE], self._diagonal[_POSE]] += noise
+        P.ravel()[:: _SIZE + 1][_POSE] += noise
 
     def update_attitude(self, rpy_rad: FloatArray, sigma_rad: float | None = None) -> Outcome:
         """Euler angles from the drone, paper eqs. (11)-(12)."""
         sigma = self.config.sigma_attitude_rad if sigma_rad is None else sigma_rad
         residual = rpy_rad - self.x[_A]
         if not self.config.literal:
-            residual = wrapped(residual)
-        H = np.zeros((3, _SIZE))
-        H[0, 3] = H[1, 4] = H[2, 5] = 1.0
-        return self._update(H, residual, np.full(3, sigma**2))
+            _wrap_in_place(residual, (0, 1, 2))
+        P_Ht = self.P[:, _A]
+        return self._update(P_Ht, P_Ht[_A].copy(), residual, np.full(3, sigma**2))
 
     def update_absolute(self, p_w: FloatArray, rpy_rad: FloatArray, sigma_t_m: float, sigma_r_rad: float) -> Outcome:
         """Accumulated visual pose as a full-state measurement, paper eqs. (13)-(14)."""
         residual = np.concatenate([p_w - self.x[_P], rpy_rad - self.x[_A]])
         if not self.config.literal:
-            residual[3:] = wrapped(residual[3:])
-        H = np.zeros((6, _SIZE))
-        H[:, _POSE] = np.eye(6)
-        outcome = self._update(H, residual, _pose_noise(sigma_t_m, sigma_r_rad))
+            _wrap_in_place(residual, (3, 4, 5))
+        P_Ht = self.P[:, _POSE]
+        outcome = self._update(P_Ht, P_Ht[_POSE].copy(), residual, _pose_noise(sigma_t_m, sigma_r_rad))
         self._after_visual(outcome)
         return outcome
 
@@ -159,18 +166,19 @@ class Ekf:
         x = self.x
         R_c, R = matrix_from_rpy(x[12:15]), matrix_from_rpy(x[_A])
         step = x[_P] - x[9:12]
-        predicted_t = R_c.T @ step
+        R_c_t = R_c.T
         residual = np.empty(6)
-        residual[:3] = T_clone_b[:3, 3] - predicted_t
+        residual[:3] = T_clone_b[:3, 3] - R_c_t @ step
         residual[3:] = rotation_vector(T_clone_b[:3, :3] @ R.T @ R_c)
         E_c = euler_rate_matrix(x[12:15])
         H = np.zeros((6, _SIZE))
-        H[:3, _P] = R_c.T
-        H[:3, 9:12] = -R_c.T
-        H[:3, 12:15] = -R_c.T @ _cross_columns(E_c, step)
-        H[3:, _A] = R_c.T @ euler_rate_matrix(x[_A])
-        H[3:, 12:15] = -R_c.T @ E_c
-        outcome = self._update(H, residual, _pose_noise(sigma_t_m, sigma_r_rad))
+        H[:3, _P] = R_c_t
+        H[:3, 9:12] = -R_c_t
+        H[:3, 12:15] = -R_c_t @ _cross_columns(E_c, step)
+        H[3:, _A] = R_c_t @ euler_rate_matrix(x[_A])
+        H[3:, 12:15] = -R_c_t @ E_c
+        P_Ht = self.P @ H.T
+        outcome = self._update(P_Ht, H @ P_Ht, residual, _pose_noise(sigma_t_m, sigma_r_rad))
         self._after_visual(outcome)
         return outcome
 
@@ -178,13 +186,12 @@ class Ekf:
         if outcome in (Outcome.ACCEPTED, Outcome.RECOVERED):
             self.tau_s = 0.0
 
-    def _update(self, H: FloatArray, residual: FloatArray, noise: FloatArray) -> Outcome:
-        if not math.isfinite(float(residual.sum())):
-            return Outcome.NOT_FINITE
-        P_Ht = self.P @ H.T
+    def _update(self, P_Ht: FloatArray, S: FloatArray, residual: FloatArray, noise: FloatArray) -> Outcome:
+        """Gate and apply one measurement; ``P_Ht`` is ``P H^T`` ``(15, n)`` and ``S`` its ``H P H^T`` ``(n, n)``."""
         n = len(residual)
-        S = H @ P_Ht
-        S[range(n), range(n)] += noise
+        if not math.isfinite(float(residual @ residual)):
+            return Outcome.NOT_FINITE
+        S.flat[:: n + 1] += noise
         S_inverse = np.linalg.inv(S)
         self.nis = float(residual @ S_inverse @ residual)
         outcome = Outcome.ACCEPTED
@@ -196,18 +203,19 @@ class Ekf:
             # The filter has been sure of the wrong thing: believe it less, by what the innovation says.
             factor = min(self.nis / n, 1e4)
             self.P *= factor
-            P_Ht *= factor
+            P_Ht = P_Ht * factor
             S *= factor
-            S[range(n), range(n)] += (1.0 - factor) * noise
+            S.flat[:: n + 1] += (1.0 - factor) * noise
             S_inverse = np.linalg.inv(S)
         self.refused_in_row = 0
         K = P_Ht @ S_inverse
         self.x += K @ residual
-        self.P = self.P - K @ P_Ht.T
-        self.P = 0.5 * (self.P + self.P.T)
+        P = self.P - K @ P_Ht.T
+        P += P.T
+        P *= 0.5
+        self.P = P
         if not self.config.literal:
-            self.x[_A] = wrapped(self.x[_A])
-            self.x[12:15] = wrapped(self.x[12:15])
+            _wrap_in_place(self.x, (3, 4, 5, 12, 13, 14))
         return outcome
 
     def state(self, stamp_s: float) -> EkfState:
@@ -221,8 +229,14 @@ class Ekf:
 
     def restore(self, saved: tuple[FloatArray, FloatArray, float, int]) -> None:
         """Go back to what `copy_state` returned."""
-        self.x, self.P = saved[0].copy(), saved[1].copy()
+        self.x, self.P = np.array(saved[0]), np.array(saved[1])
         self.tau_s, self.refused_in_row = saved[2], saved[3]
+
+
+def _wrap_in_place(x: FloatArray, indices: tuple[int, ...]) -> None:
+    for i in indices:
+        if not -math.pi <= x[i] < math.pi:
+            x[i] = (x[i] + math.pi) % (2.0 * math.pi) - math.pi
 
 
 def _pose_noise(sigma_t_m: float, sigma_r_rad: float) -> FloatArray:

@@ -98,6 +98,7 @@ class MotionFusion:
         self._delay_tried_at = 0
         self._R_w_m: FloatArray | None = None
         self._fit: DisplacementFit | None = None
+        self._shortfall_m_s = 0.5 * config.velocity_step_m_s if config.velocity_rounding == "truncate" else 0.0
         self._telemetry_opinions: list[LogScale] = []
         self._fitted_s = -math.inf
         self._counts: Counter[str] = Counter()
@@ -274,7 +275,7 @@ class MotionFusion:
         gap = float(times[1] - times[0])
         if self._R_w_m is None or not math.isfinite(estimate.sigma):
             return PoseEstimate(stamp_s, T, math.inf, 0.01 + 0.01 * gap, "telemetry")
-        moved = np.diff(self._track.displacement(times), axis=0)[0]
+        moved = np.diff(self._track.displacement(times, self._shortfall_m_s), axis=0)[0]
         if self._fit is not None:
             moved = moved - self._fit.bias_m_s[-1] * gap
         moved = moved + (R_w_b[1] - R_w_b[0]) @ self.T_b_c[:3, 3]
@@ -319,17 +320,45 @@ class MotionFusion:
         if R is None:
             return
         self._R_w_m = R
-        fit = self._fit_at(self._delay_s, R)
-        if fit is None:
+        found = self._fit_roundings(R)
+        if found is None:
             return  # nothing new to say: hover, pure rotation, or telemetry missing
-        opinions = []
-        self._fit = fit
-        if fit.sigma < 0.3:
-            sigma = math.hypot(fit.sigma, self.config.systematic_log)
-            opinions.append(LogScale(fit.log_scale, sigma, "telemetry"))
-        opinions += self._height_opinions(math.exp(fit.log_scale))
+        self._fit, opinion = found
+        opinions = [opinion] if opinion.sigma < 0.3 else []
+        opinions += self._height_opinions(math.exp(opinion.log_scale))
         if opinions:
             self._telemetry_opinions = opinions
+
+    def _fit_roundings(self, R_w_m: FloatArray) -> tuple[DisplacementFit, LogScale] | None:
+        """Displacement fit for readings rounded to the nearest step or truncated, whichever leaves less unexplained.
+
+        The opinion is the mean of both, weighted by how probable each is; its sigma spans them while that is open.
+        """
+        config = self.config
+        half = 0.5 * config.velocity_step_m_s
+        systematic = {0.0: config.systematic_log, half: config.truncation_systematic_log}
+        if config.velocity_rounding != "auto":
+            fit = self._fit_at(self._delay_s, R_w_m, self._shortfall_m_s)
+            if fit is None:
+                return None
+            sigma = math.hypot(fit.sigma, systematic[self._shortfall_m_s])
+            return fit, LogScale(fit.log_scale, sigma, "telemetry")
+        nearest, truncated = (self._fit_at(self._delay_s, R_w_m, q) for q in (0.0, half))
+        if nearest is None or truncated is None:
+            return None
+
+        def unexplained(fit: DisplacementFit) -> float:  # in map units: the shortfall also changes the scale
+            return math.log(fit.rms_m) - fit.log_scale
+
+        # Neighbouring residuals are not independent: half the likelihood is what they are worth.
+        gain = 1.5 * nearest.intervals * (unexplained(nearest) - unexplained(truncated))
+        share = 1.0 / (1.0 + math.exp(-max(-50.0, min(50.0, gain))))  # probability that readings are truncated
+        self._shortfall_m_s = half if share > 0.5 else 0.0
+        log_scale = (1.0 - share) * nearest.log_scale + share * truncated.log_scale
+        between = share * (1.0 - share) * (nearest.log_scale - truncated.log_scale) ** 2
+        own = [math.hypot(f.sigma, systematic[q]) ** 2 for f, q in ((nearest, 0.0), (truncated, half))]
+        sigma = math.sqrt((1.0 - share) * own[0] + share * own[1] + between)
+        return (truncated if share > 0.5 else nearest), LogScale(log_scale, sigma, "telemetry")
 
     def _attitude_alignment(self, delay_s: float) -> FloatArray | None:
         """Mean of ``R_w_b(telemetry) R_b_c R_m_c^T`` over the remembered poses."""
@@ -343,18 +372,18 @@ class MotionFusion:
         R_w_b = self._track.attitude(stamps[inside])
         return mean_rotation(R_w_b @ self.T_b_c[:3, :3] @ np.swapaxes(R_m_c, 1, 2))
 
-    def _fit_at(self, delay_s: float, R_w_m: FloatArray, only: FloatArray | None = None) -> DisplacementFit | None:
-        """Displacement fit for a delay; ``only`` picks intervals, so that delays compare on the same ones."""
+    def _fit_at(self, delay_s: float, R_w_m: FloatArray, shortfall_m_s: float) -> DisplacementFit | None:
         if len(self._intervals) == 0:
             return None
         from_s, to_s, moved, sigma = self._visual_displacements()
-        use = self._track.covered(from_s - delay_s, to_s - delay_s) if only is None else only
+        use = self._track.covered(from_s - delay_s, to_s - delay_s)
         if use.sum() < 2:
             return None
         from_s, to_s, moved, sigma = from_s[use] - delay_s, to_s[use] - delay_s, moved[use], sigma[use]
         lever = self.T_b_c[:3, 3]
         R_from, R_to = self._track.attitude(from_s), self._track.attitude(to_s)
-        moved_m = self._track.displacement(to_s) - self._track.displacement(from_s) + (R_to - R_from) @ lever
+        told = self._track.displacement(np.concatenate([from_s, to_s]), shortfall_m_s)
+        moved_m = told[len(from_s) :] - told[: len(from_s)] + (R_to - R_from) @ lever
         moving = self._moving(moved, to_s - from_s, moved_m)
         if moving.sum() < 2:
             return None

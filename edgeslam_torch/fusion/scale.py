@@ -39,10 +39,10 @@ class DisplacementFit:
     """``(3, 3)`` small correction of the map-to-world rotation."""
     bias_m_s: FloatArray
     """``(K, 3)`` velocity bias of each block."""
-    cost: float
-    """Robust negative log-likelihood up to a constant; comparable between delays on the same intervals."""
     rms_m: float
     """Residual per axis."""
+    intervals: int
+    """Displacements used."""
 
 
 def fit_displacements(
@@ -117,12 +117,10 @@ def fit_displacements(
     effective = _effective_share(residual * weight[:, None])
     covariance = np.linalg.inv(0.5 * (information + information.T))
     sigma = math.sqrt(max(float(covariance[0, 0]), 0.0) / effective)
-    log_det = float(np.sum(1.5 * np.log(variance)))
-    cost = float(np.sum(1.5 * np.minimum(normalised, 4.0) ** 2)) + log_det
     rms = math.sqrt(float(np.sum(weight[:, None] * residual**2) / max(3.0 * float(weight.sum()), 1e-9)))
     if weight.sum() < _MIN_DISPLACEMENTS or not math.isfinite(sigma):
         return None
-    return DisplacementFit(log_scale, sigma, R, bias, cost, rms)
+    return DisplacementFit(log_scale, sigma, R, bias, rms, n)
 
 
 def _prior(K: int, alignment_sigma_rad: float, bias_sigma_m_s: float, bias_step_m_s: float) -> FloatArray:

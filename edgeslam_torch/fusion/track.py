@@ -14,6 +14,10 @@ _FROZEN_S = 1.5
 """Velocity and attitude repeated to the bit for so long, while anything but zero: the link repeats its last packet."""
 
 
+_PACKET_S = 0.15
+_UPRIGHT = math.cos(math.radians(18.0))
+
+
 class TelemetryTrack:
     """Growing arrays of telemetry with displacement and attitude interpolated between readings."""
 
@@ -57,24 +61,34 @@ class TelemetryTrack:
         return self._table
 
     def _build(self) -> FloatArray:
-        """Columns: stamp, displacement 3, unwrapped rpy 3, tof, h, baro, valid, velocity 3."""
+        """Columns: stamp, displacement 3, unwrapped rpy 3, tof, h, baro, valid, velocity 3, sign 3, integrated sign 3."""
         rows = np.array(self._rows)
         stamp, velocity = rows[:, 0], _filled(rows[:, 1:4])
         rpy = np.unwrap(_filled(rows[:, 4:7]), axis=0)
+        direction = np.sign(np.where(np.abs(velocity) > 1e-6, velocity, 0.0))
         if self._body:
-            velocity = np.einsum("nij,nj->ni", Rotation.from_euler("ZYX", rpy[:, ::-1]).as_matrix(), velocity)
+            R = Rotation.from_euler("ZYX", rpy[:, ::-1])
+            velocity, direction = R.apply(velocity), R.apply(direction)
         valid = np.isfinite(rows[:, 1:4]).all(axis=1) & np.logical_not(_frozen(stamp, rows[:, 1:7]))
-        moved = _integral(stamp, velocity)
-        return np.column_stack([stamp, moved, rpy, rows[:, 7:10], valid, velocity])
+        told = [_integral(stamp, velocity), rpy, rows[:, 7:10], valid, velocity]
+        return np.column_stack([stamp, *told, direction, _integral(stamp, direction)])
 
-    def displacement(self, stamps_s: FloatArray) -> FloatArray:
-        """Integrated velocity [m] in the power-on world, shape ``(N, 3)``; only differences mean anything."""
+    def displacement(self, stamps_s: FloatArray, shortfall_m_s: float = 0.0) -> FloatArray:
+        """Integrated velocity [m] in the power-on world, shape ``(N, 3)``; only differences mean anything.
+
+        Args:
+            stamps_s: Times ``(N,)`` [s].
+            shortfall_m_s: Added to the size of every reading that is not zero: half a step when the drone truncates.
+        """
         table = self._tables()
         if len(table) < 2:
             return np.zeros((len(stamps_s), 3))
-        inside = np.clip(stamps_s, table[0, 0], table[-1, 0])
-        after = (np.asarray(stamps_s) - inside)[:, None] * table[-1, 11:14]  # one packet ahead at the last velocity
-        return CubicHermiteSpline(table[:, 0], table[:, 1:4], table[:, 11:14])(inside) + np.clip(after, -0.5, 0.5)
+        stamp = table[:, 0]
+        path = table[:, 1:4] + shortfall_m_s * table[:, 17:20]
+        velocity = table[:, 11:14] + shortfall_m_s * table[:, 14:17]
+        inside = np.clip(stamps_s, stamp[0], stamp[-1])
+        beyond = np.clip(np.asarray(stamps_s) - stamp[-1], 0.0, _PACKET_S)  # one packet ahead at the last velocity
+        return CubicHermiteSpline(stamp, path, velocity)(inside) + beyond[:, None] * velocity[-1]
 
     def attitude(self, stamps_s: FloatArray) -> FloatArray:
         """Body to power-on world ``(N, 3, 3)``."""
@@ -99,17 +113,18 @@ class TelemetryTrack:
         return inside & (count[last] == count[first])
 
     def heights(self) -> dict[str, tuple[FloatArray, FloatArray]]:
-        """Readings of each height source: name to (stamps, metres above floor or take-off, plumb)."""
+        """Readings of each height source: name to (stamps, metres above floor or take-off)."""
         if not self._rows:
             return {}
         table = self._tables()
-        plumb = np.cos(table[:, 4]) * np.cos(table[:, 5])
-        plumb = np.where(np.isfinite(plumb), plumb, 1.0)
+        lean = np.cos(table[:, 4]) * np.cos(table[:, 5])
         sources = {}
         for column, name in ((7, "tof"), (8, "h"), (9, "baro")):
-            z = table[:, column] * (plumb if name == "tof" else 1.0)
-            # A Tello prints 10 cm on the ground and 65.53 m beyond its range.
-            good = np.isfinite(z) & ((z > 0.12) & (z < 8.0) if name == "tof" else True)
+            z = table[:, column]
+            good = np.isfinite(z)
+            if name == "tof":
+                # 10 cm on the ground, 65.53 m beyond reach, and a slanted ray when the drone leans.
+                good &= (z > 0.15) & (z < 8.0) & np.logical_not(lean < _UPRIGHT)
             if good.any():
                 sources[name] = (table[good, 0], z[good])
         return sources
@@ -120,10 +135,7 @@ def _integral(stamp: FloatArray, velocity: FloatArray) -> FloatArray:
 
     At 10 Hz the trapezoid rule loses (w h)^2 / 12 of a swing at w rad/s: more than 1 % of a hand's motion.
     """
-    if len(stamp) < 3:
-        slope = np.zeros_like(velocity)
-    else:
-        slope = np.gradient(velocity, stamp, axis=0)
+    slope = np.zeros_like(velocity) if len(stamp) < 3 else np.gradient(velocity, stamp, axis=0)
     h = np.diff(stamp)[:, None]
     h_squared = np.where(h < 0.5, h**2, 0.0)  # no curvature across a hole
     steps = 0.5 * h * (velocity[1:] + velocity[:-1]) + h_squared / 12.0 * (slope[:-1] - slope[1:])

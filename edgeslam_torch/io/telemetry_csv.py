@@ -1,0 +1,232 @@
+"""`telemetry.csv`: a flight's state messages, in the SDK's own names and units, on the clock of the frames.
+
+The reader also takes other people's logs: other column names, milliseconds, and the units and axes found from the data.
+"""
+
+import logging
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import TextIO
+
+import numpy as np
+
+from edgeslam_torch.errors import EdgeSlamError
+from edgeslam_torch.io.sdk_state import FIELDS, sample_from_sdk, to_number
+from edgeslam_torch.types import FloatArray, TelemetrySample
+
+logger = logging.getLogger(__name__)
+
+HEADER = ("stamp_s", *FIELDS)
+_STAMPS = {"stamp_s": 1.0, "timestamp": 0.0, "time_s": 1.0, "stamp": 0.0, "t": 0.0}
+"""Column names of the clock; factor 0 means the unit is told by the spacing."""
+_ALIASES = {"vx": "vgx", "vy": "vgy", "vz": "vgz", "batt": "bat", "battery": "bat", "height": "h"}
+_MAX_COLUMNS = 256
+_MAX_BYTES = 512 * 1024 * 1024
+
+
+class TelemetryError(EdgeSlamError):
+    """A telemetry file cannot be read."""
+
+
+@dataclass(frozen=True, slots=True)
+class TelemetryUnits:
+    """How to read the velocity columns."""
+
+    velocity_m_s: float = 0.1
+    """Metres per second of one unit."""
+    z_down: bool = True
+    """Axes x forward, y right, z down with yaw clockwise; otherwise x forward, y left, z up."""
+    evidence: str = "SDK default (dm/s, z down)"
+    """What it rests on, in words."""
+
+
+@dataclass(frozen=True, slots=True)
+class TelemetryTable:
+    """A telemetry file as numbers."""
+
+    stamps_s: FloatArray
+    """``(M,)`` increasing."""
+    values: dict[str, FloatArray]
+    """SDK name to ``(M,)``, NaN where missing."""
+    skipped: int
+    """Rows left out: malformed, or not newer than the row before."""
+
+    def samples(self, units: TelemetryUnits | None = None) -> list[TelemetrySample]:
+        """SI units and our axes."""
+        units = units or TelemetryUnits()
+        names = list(self.values)
+        columns = [self.values[name].tolist() for name in names]
+        rows = zip(*columns, strict=True) if columns else ([()] * len(self.stamps_s))
+        return [
+            sample_from_sdk(stamp, dict(zip(names, row, strict=True)), units.velocity_m_s, units.z_down)
+            for stamp, row in zip(self.stamps_s.tolist(), rows, strict=True)
+        ]
+
+
+def read_telemetry(path: str | Path, units: TelemetryUnits | None = None) -> list[TelemetrySample]:
+    """Telemetry of a flight in SI units, in time order.
+
+    Args:
+        path: Our ``telemetry.csv`` or another log with a header line.
+        units: How to read the velocities; found from the data when not given (`detect_units`).
+
+    Raises:
+        TelemetryError: If the file is not there, is not text, or has no clock or no known column.
+    """
+    table = read_table(path)
+    if table.skipped:
+        logger.warning("%s: %d malformed or repeated rows skipped", path, table.skipped)
+    return table.samples(units if units is not None else detect_units(table))
+
+
+def read_table(path: str | Path) -> TelemetryTable:
+    """The columns that we know, row by row; malformed rows are counted and left out.
+
+    Raises:
+        TelemetryError: As `read_telemetry`.
+    """
+    path = Path(path)
+    try:
+        if path.stat().st_size > _MAX_BYTES:
+            raise TelemetryError(f"{path}: larger than any flight; is this telemetry?")
+        text = path.read_text(encoding="utf-8-sig", errors="strict")
+    except UnicodeDecodeError as error:
+        raise TelemetryError(f"{path}: not a text file; telemetry is comma-separated text") from error
+    except OSError as error:
+        raise TelemetryError(f"{path}: cannot be read: {error.strerror or error}") from error
+    lines = text.splitlines()
+    header_at = next((i for i, line in enumerate(lines) if line.strip()), None)
+    if header_at is None:
+        raise TelemetryError(f"{path}: empty; it needs a header line such as {','.join(HEADER[:4])},...")
+    names = [name.strip().lower() for name in lines[header_at].lstrip("#").split(",")]
+    clock = next((name for name in _STAMPS if name in names), None)
+    columns = {
+        _ALIASES.get(name, name): i for i, name in enumerate(names[:_MAX_COLUMNS]) if _ALIASES.get(name, name) in FIELDS
+    }
+    if clock is None or not columns:
+        missing = f"no clock ({', '.join(_STAMPS)})" if clock is None else f"no known column ({', '.join(FIELDS)})"
+        raise TelemetryError(f"{path}: {missing} in its header line; give a telemetry.csv")
+    rows, skipped = _rows(lines[header_at + 1 :], len(names), names.index(clock), list(columns.values()))
+    table = np.array(rows, dtype=np.float64).reshape(len(rows), 1 + len(columns))
+    stamps = table[:, 0] * (_STAMPS[clock] or _seconds_per_unit(table[:, 0]))
+    values: dict[str, FloatArray] = {name: table[:, 1 + i] for i, name in enumerate(columns)}
+    return TelemetryTable(stamps, values, skipped)
+
+
+def _rows(lines: list[str], width: int, clock: int, columns: list[int]) -> tuple[list[list[float]], int]:
+    rows: list[list[float]] = []
+    skipped, last = 0, -math.inf
+    for line in lines:
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        cells = line.split(",")
+        stamp = to_number(cells[clock]) if len(cells) == width else math.nan
+        if not stamp > last or abs(stamp) > 1e19:
+            skipped += 1
+            continue
+        rows.append([stamp, *(to_number(cells[i]) for i in columns)])
+        last = stamp
+    return rows, skipped
+
+
+def _seconds_per_unit(stamps: FloatArray) -> float:
+    """A Tello speaks at 10 Hz: the spacing tells seconds, milliseconds, microseconds and nanoseconds apart."""
+    if len(stamps) < 2:
+        return 1.0
+    spacing = float(np.median(np.diff(stamps)))
+    return next((unit for unit, limit in ((1.0, 5.0), (1e-3, 5e3), (1e-6, 5e6)) if spacing < limit), 1e-9)
+
+
+def detect_units(table: TelemetryTable) -> TelemetryUnits:
+    """Unit and axes of the velocities, from how range or height changes while the drone climbs and sinks.
+
+    The slope of height over integrated ``vgz`` is -0.1 for dm/s with z down, -0.01 for cm/s, +1 for m/s with z up; the
+    nearest of these is taken when the flight's vertical motion is clear, else the SDK's default.
+    """
+    vz = table.values.get("vgz")
+    if vz is None or len(vz) < 20:
+        return TelemetryUnits()
+    for name, unit in (("tof", 0.01), ("h", 0.01), ("baro", 1.0)):
+        z = table.values.get(name)
+        if z is None:
+            continue
+        slope, correlation = _height_slope(table.stamps_s, vz, unit * z, step_m=0.25)
+        if abs(correlation) < 0.5 or slope == 0.0 or not math.isfinite(slope):
+            continue
+        size = min((0.01, 0.1, 1.0), key=lambda s: abs(math.log(abs(slope) / s)))
+        words = {0.01: "cm/s", 0.1: "dm/s", 1.0: "m/s"}[size]
+        axis = "down" if slope < 0 else "up"
+        evidence = f"{name} changes by {slope:+.3f} m per unit*s of vgz (r = {correlation:+.2f}): {words}, z {axis}"
+        return TelemetryUnits(size, slope < 0, evidence)
+    return TelemetryUnits(evidence="SDK default (dm/s, z down): too little vertical motion to tell")
+
+
+def _height_slope(stamps_s: FloatArray, vz: FloatArray, z_m: FloatArray, step_m: float) -> tuple[float, float]:
+    """Slope and correlation between one-second changes of height and of integrated ``vgz``; floor steps left out."""
+    good = np.isfinite(vz) & np.isfinite(z_m) & (z_m > 0.12) & (z_m < 8.0)
+    t, v, z = stamps_s[good], vz[good], z_m[good]
+    if len(t) < 20:
+        return math.nan, 0.0
+    path = np.concatenate([[0.0], np.cumsum(0.5 * (v[1:] + v[:-1]) * np.diff(t))])
+    jump = np.concatenate([[0], np.cumsum((np.abs(np.diff(z)) > step_m) | (np.diff(t) > 0.5))])
+    late = np.searchsorted(t, t + 1.0)
+    inside = late < len(t)
+    first, last = np.flatnonzero(inside), late[inside]
+    same = (jump[first] == jump[last]) & (t[last] - t[first] < 1.3)
+    dx, dz = (path[last] - path[first])[same], (z[last] - z[first])[same]
+    moving = np.abs(dx) > 0.3 * float(np.max(np.abs(dx), initial=0.0))
+    if moving.sum() < 10:
+        return math.nan, 0.0
+    x, y = dx[moving], dz[moving]
+    return float(np.median(y / x)), float(np.corrcoef(x, y)[0, 1])
+
+
+class TelemetryWriter:
+    """Append-only `telemetry.csv`; every row reaches the file at once, so that a crash costs at most one.
+
+    Opening an existing file goes on behind its last whole line.
+
+    Raises:
+        TelemetryError: If the file cannot be written.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        try:
+            self._file: TextIO = self.path.open("a+", encoding="utf-8", newline="\n")
+            self._file.seek(0)
+            content = self._file.read()
+            if not content:
+                self._file.write(",".join(HEADER) + "\n")
+            elif not content.endswith("\n"):
+                self._file.write("\n")  # the torn line becomes one malformed row
+            self._file.flush()
+        except (OSError, UnicodeDecodeError) as error:
+            raise TelemetryError(f"{self.path}: cannot be written: {error}") from error
+
+    def write(self, stamp_s: float, fields: Mapping[str, float | str]) -> None:
+        """One state message; missing fields stay empty."""
+        cells = [f"{stamp_s:.6f}"]
+        for name in FIELDS:
+            value = fields.get(name)
+            cells.append(f"{value:.10g}" if isinstance(value, float | int) and math.isfinite(value) else "")
+        try:
+            self._file.write(",".join(cells) + "\n")
+            self._file.flush()
+        except OSError as error:
+            raise TelemetryError(f"{self.path}: cannot be written: {error.strerror or error}") from error
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def __enter__(self) -> "TelemetryWriter":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
