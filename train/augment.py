@@ -64,7 +64,7 @@ def random_view(view: View, size: tuple[int, int], config: AugmentConfig, rng: n
     warped = warp(view, K, R, size)
     if rng.random() < config.flip:
         warped = mirrored(warped)
-    return replace(warped, image=_recolour(warped.image, config, rng))
+    return replace(warped, image=recolour(warped.image, config, rng))
 
 
 def fitted_view(view: View, size: tuple[int, int]) -> View:
@@ -130,7 +130,8 @@ def _virtual_camera(
     return K, turn @ R
 
 
-def _recolour(image: NDArray[np.uint8], config: AugmentConfig, rng: np.random.Generator) -> NDArray[np.uint8]:
+def recolour(image: NDArray[np.uint8], config: AugmentConfig, rng: np.random.Generator) -> NDArray[np.uint8]:
+    """Brightness, contrast, colour, gamma, blur and noise of another camera; ``(H, W, 3)`` BGR."""
     x = image.astype(np.float32) / 255.0
     if rng.random() < config.grey:
         x = np.repeat(x @ _LUMA, 3, axis=2)
@@ -140,9 +141,7 @@ def _recolour(image: NDArray[np.uint8], config: AugmentConfig, rng: np.random.Ge
         x = x * rng.uniform(1 - config.channel, 1 + config.channel, 3).astype(np.float32)
     mean = x.mean()
     x = (x - mean) * rng.uniform(1 - config.contrast, 1 + config.contrast) + mean
-    x = np.clip(x * rng.uniform(1 - config.brightness, 1 + config.brightness), 0, 1) ** rng.uniform(
-        *config.gamma
-    )
+    x = np.clip(x * rng.uniform(1 - config.brightness, 1 + config.brightness), 0, 1) ** rng.uniform(*config.gamma)
     if rng.random() < config.blur:
         x = _blur(x.astype(np.float32), rng)
     if rng.random() < config.noise:

@@ -28,7 +28,7 @@ class DepthFolder:
 
 
 def load_depth_folder(
-    folder: Path, width: int = 400, max_gap_s: float = 0.02, stride: int = 1
+    folder: Path, width: int = 400, max_gap_s: float = 0.02, stride: int = 1, max_frames: int | None = None
 ) -> DepthFolder:
     """Read a folder in TUM layout (``rgb.txt``, ``depth.txt``, ``camera.yaml``), undistorted and scaled to
     ``width``.
@@ -42,6 +42,7 @@ def load_depth_folder(
         width: Images are reduced to this width [px] (never enlarged).
         max_gap_s: Largest time between colour and depth [s].
         stride: Take every ``stride``-th depth map.
+        max_frames: Use only depth maps among the first colour images.
 
     Raises:
         SourceError: If a list or the calibration is missing, or nothing can be read.
@@ -50,6 +51,7 @@ def load_depth_folder(
     camera = load_camera(folder / "camera.yaml")
     scale = float(yaml.safe_load((folder / "camera.yaml").read_text()).get("depth_scale", 1000.0))
     colours, depths = read_list(folder / "rgb.txt"), read_list(folder / "depth.txt")
+    colours = colours[:max_frames]
     stamps = np.array([t for t, _ in colours])
     views, unreadable = [], []
     for stamp, depth_path in depths[::stride]:
@@ -65,19 +67,20 @@ def load_depth_folder(
         maps = camera.undistortion_maps()
         if camera.is_distorted:
             image = cv2.remap(image, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-            undistorted = cv2.remap(
-                depth, *maps, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0
-            )
+            undistorted = cv2.remap(depth, *maps, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
             depth = np.asarray(undistorted, np.float32)
         view = View(np.asarray(image, np.uint8), np.asarray(depth, np.float32), camera.K)
         views.append(_reduced(view, width))
     if not views:
         raise SourceError(f"{folder}: no image with depth could be read")
     if unreadable:
-        logger.warning(
-            "%s: %d unreadable files left out: %s", folder, len(unreadable), ", ".join(unreadable[:10])
-        )
+        logger.warning("%s: %d unreadable files left out: %s", folder, len(unreadable), ", ".join(unreadable[:10]))
     return DepthFolder(folder.name, views, tuple(unreadable))
+
+
+def has_depth(folder: Path) -> bool:
+    """Whether a folder is in TUM layout with depth maps."""
+    return all((Path(folder) / name).is_file() for name in ("rgb.txt", "depth.txt", "camera.yaml"))
 
 
 def read_list(path: Path) -> list[tuple[float, Path]]:

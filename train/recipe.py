@@ -10,7 +10,7 @@ import copy
 import json
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
@@ -21,6 +21,7 @@ from edgeslam_torch.errors import EdgeSlamError
 from edgeslam_torch.models.checkpoint import save_checkpoint
 from edgeslam_torch.models.fastdepth import FastDepth
 from edgeslam_torch.models.record import Metadata
+from edgeslam_torch.train.distributed import rank, world
 from edgeslam_torch.train.signals import Signal, Slot
 
 
@@ -114,12 +115,12 @@ def train(
         network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     state = TrainState(network, copy.deepcopy(network).eval(), build_optimiser(network, config))
     resume(state, out / "last.pt")
-    rank, world = _rank(), _world()
+    this, of = rank(), world()
     for hook in hooks:
         hook.on_start(state, config)
     reason = "all steps done"
     while state.step < config.steps:
-        losses = _step(state, signals, config, rank, world)
+        losses = _step(state, signals, config, this, of)
         for hook in hooks:
             hook.on_step(state, losses)
         last = state.step == config.steps
@@ -131,9 +132,9 @@ def train(
             if config.patience and state.stale >= config.patience:
                 reason = f"no improvement in {config.patience} validations"
                 break
-        if rank == 0 and (state.step % config.checkpoint_every == 0 or last):
+        if this == 0 and (state.step % config.checkpoint_every == 0 or last):
             save_state(state, out / "last.pt")
-    if rank == 0:
+    if this == 0:
         save_state(state, out / "last.pt")
         save_checkpoint(state.averaged, metadata, out / "final.safetensors", half=True)
     for hook in hooks:
@@ -166,9 +167,7 @@ def learning_rate_factor(step: int, config: TrainConfig) -> float:
     return 0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(progress, 1.0)))
 
 
-def _step(
-    state: TrainState, signals: Sequence[Signal], config: TrainConfig, rank: int, world: int
-) -> dict[str, float]:
+def _step(state: TrainState, signals: Sequence[Signal], config: TrainConfig, this: int, of: int) -> dict[str, float]:
     network = state.network
     _set_modes(network, config)
     factor = learning_rate_factor(state.step, config)
@@ -177,7 +176,7 @@ def _step(
     state.optimiser.zero_grad(set_to_none=True)
     named: dict[str, Tensor] = {}
     for offset, signal in enumerate(signals):
-        slots = [Slot(config.seed + 7919 * offset, state.step, i) for i in range(rank, config.batch, world)]
+        slots = [Slot(config.seed + 7919 * offset, state.step, i) for i in range(this, config.batch, of)]
         batch = signal.draw(slots)
         if config.channels_last:
             batch["image"] = batch["image"].contiguous(memory_format=torch.channels_last)
@@ -193,7 +192,7 @@ def _step(
             # Sum over this process's images, divided by the whole batch: processes add up to the global mean.
             named[f"{signal.name}/{name}"] = value.sum() / config.batch
     torch.stack(list(named.values())).sum().backward()
-    if world > 1:
+    if of > 1:
         _add_gradients(network)
     nn.utils.clip_grad_norm_([p for p in network.parameters() if p.grad is not None], config.clip_norm)
     state.optimiser.step()
@@ -216,9 +215,7 @@ def _average(state: TrainState, decay: float) -> None:
     # A short memory at first, so that the start does not linger.
     decay = min(decay, (1 + state.step) / (10 + state.step))
     with torch.no_grad():
-        for kept, new in zip(
-            state.averaged.state_dict().values(), state.network.state_dict().values(), strict=True
-        ):
+        for kept, new in zip(state.averaged.state_dict().values(), state.network.state_dict().values(), strict=True):
             if kept.is_floating_point():
                 kept.lerp_(new, 1 - decay)
             else:
@@ -240,7 +237,7 @@ def _note(state: TrainState, metrics: dict[str, float], metadata: Metadata, out:
     state.history.append({"step": float(state.step), **metrics})
     better = metrics["score"] < state.best
     state.best, state.stale = (metrics["score"], 0) if better else (state.best, state.stale + 1)
-    if _rank() != 0:
+    if rank() != 0:
         return
     if better:
         save_checkpoint(state.averaged, metadata, out / "best.safetensors", half=True)
@@ -274,16 +271,3 @@ def resume(state: TrainState, path: Path) -> bool:
     state.step, state.best, state.stale = content["step"], content["best"], content["stale"]
     state.history = content["history"]
     return True
-
-
-def _rank() -> int:
-    return dist.get_rank() if dist.is_available() and dist.is_initialized() else 0
-
-
-def _world() -> int:
-    return dist.get_world_size() if dist.is_available() and dist.is_initialized() else 1
-
-
-def config_record(config: TrainConfig) -> dict[str, float | int | bool]:
-    """The configuration as plain values."""
-    return asdict(config)

@@ -57,9 +57,7 @@ def predict_metres(network: FastDepth, metadata: Metadata, view: View) -> tuple[
     log_depth = prediction.log_depth[0, 0].numpy() + np.log(
         np.sqrt(fitted.K[0, 0] * fitted.K[1, 1]) / metadata.focal_px
     )
-    log_sigma = (
-        prediction.log_sigma[0, 0].numpy() if prediction.log_sigma is not None else np.zeros_like(log_depth)
-    )
+    log_sigma = prediction.log_sigma[0, 0].numpy() if prediction.log_sigma is not None else np.zeros_like(log_depth)
     h, w = view.image.shape[:2]
     large = cv2.resize(log_depth, (w, h), interpolation=cv2.INTER_LINEAR)
     return np.exp(large), np.exp(cv2.resize(log_sigma, (w, h), interpolation=cv2.INTER_LINEAR))

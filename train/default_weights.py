@@ -1,0 +1,184 @@
+"""The recipe of the shipped weights: ``python -m edgeslam_torch.train.default_weights --data DIR --out DIR``.
+
+1. Encoder from ImageNet, then the two real recordings alone.
+2. The same with rendered rooms mixed in, from the weights of phase 1.
+3. Calibration of the uncertainty on views of rooms held out from phase 2.
+
+Nothing here looks at the sequences the weights are judged by, except to draw the curve (``--watch``); the
+last weights
+are taken, not the best on the curve.
+"""
+
+import argparse
+import dataclasses
+import logging
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from edgeslam_torch.models.checkpoint import build_network, load_checkpoint, save_checkpoint
+from edgeslam_torch.models.fastdepth import FastDepth
+from edgeslam_torch.models.imagenet import load_imagenet_encoder
+from edgeslam_torch.models.record import Metadata
+from edgeslam_torch.train.augment import View
+from edgeslam_torch.train.calibrate_sigma import calibrate_sigma
+from edgeslam_torch.train.datasets import load_depth_folder
+from edgeslam_torch.train.recipe import Hooks, TrainConfig, TrainState, train
+from edgeslam_torch.train.rendered import load_rendered, render_rooms
+from edgeslam_torch.train.signals import Source, Supervised
+from edgeslam_torch.train.validate import score
+
+logger = logging.getLogger(__name__)
+
+IMAGENET = "mobilenet_v1_imagenet/mobilenet_v1_1.0_224_quant_embedding_extractor.tflite"
+INPUT_SIZE = (160, 224)
+"""Height and width [px]; against 192x256 a third less time, and as accurate (model card)."""
+REAL = {"tum_fr1_rpy_depth": 0.6, "icl_livingroom1": 0.4}
+"""Recordings of phase 1 and their shares."""
+MIXED = {"tum_fr1_rpy_depth": 0.35, "icl_livingroom1": 0.2, "rendered": 0.45}
+HELD_OUT_VIEWS = 150
+"""Last rendered views, whole rooms, kept out of training for the calibration."""
+LICENCE = (
+    "Apache-2.0; encoder initialised from google-coral's MobileNetV1 (Apache-2.0); trained on TUM RGB-D freiburg1_rpy "
+    "(CC BY 4.0, Sturm et al. 2012), ICL-NUIM living room 1 (CC BY 3.0, Handa et al. 2014) and rooms rendered by "
+    "this project"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Recipe:
+    """The numbers that made the shipped file."""
+
+    rooms: int = 350
+    views_per_room: int = 6
+    real: TrainConfig = TrainConfig(steps=950)
+    mixed: TrainConfig = TrainConfig(
+        steps=1200, lr=6e-4, encoder_lr=8e-5, seed=1, validate_every=300, checkpoint_every=100
+    )
+
+
+class Progress(Hooks):
+    """Logs losses and time left."""
+
+    def __init__(self, every: int = 50) -> None:
+        self.every = every
+        self.start, self.first = time.monotonic(), 0
+        self.steps = 0
+
+    def on_start(self, state: TrainState, config: TrainConfig) -> None:
+        """Note where this process begins."""
+        self.start, self.first, self.steps = time.monotonic(), state.step, config.steps
+
+    def on_step(self, state: TrainState, losses: dict[str, float]) -> None:
+        """One line every ``every`` steps."""
+        if state.step % self.every == 0:
+            rate = (time.monotonic() - self.start) / (state.step - self.first)
+            terms = " ".join(f"{k.split('/')[-1]} {v:.4f}" for k, v in losses.items())
+            logger.info(
+                "step %d/%d %s (%.0f min left)", state.step, self.steps, terms, rate * (self.steps - state.step) / 60
+            )
+
+    def on_validation(self, state: TrainState, metrics: dict[str, float]) -> None:
+        """One line each."""
+        logger.info("step %d: %s", state.step, " ".join(f"{k} {v:.4f}" for k, v in metrics.items()))
+
+
+def validation_of(metadata: Metadata, sets: dict[str, Sequence[View]]) -> "_Validation":
+    """Scores on named sets; the first one decides."""
+    return _Validation(metadata, sets)
+
+
+class _Validation:
+    def __init__(self, metadata: Metadata, sets: dict[str, Sequence[View]]) -> None:
+        self.metadata, self.sets, self.start = metadata, sets, time.monotonic()
+
+    def __call__(self, network: FastDepth) -> dict[str, float]:
+        metrics: dict[str, float] = {}
+        for name, views in self.sets.items():
+            for key, value in dataclasses.asdict(score(network, self.metadata, views)).items():
+                metrics[f"{name}/{key}"] = round(value, 4)
+        metrics["score"] = metrics[f"{next(iter(self.sets))}/abs_rel_scaled"]
+        metrics["wall_s"] = round(time.monotonic() - self.start)
+        metrics["cpu_s"] = round(time.process_time())
+        return metrics
+
+
+def make_default_weights(data: Path, out: Path, recipe: Recipe, watch: Sequence[str] = ()) -> Path:
+    """Run all phases; each resumes where it was killed.
+
+    Args:
+        data: Folder with the recordings and the ImageNet encoder.
+        out: Folder for everything.
+        recipe: Numbers.
+        watch: Recordings under ``data`` drawn into the curve, never trained on.
+
+    Returns:
+        The finished weights file.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    torch.manual_seed(0)
+    height, width = INPUT_SIZE
+    metadata = Metadata(input_height=height, input_width=width, data=("ImageNet (encoder)", *REAL), licence=LICENCE)
+    rooms = out / "rendered.npz"
+    if not rooms.is_file():
+        render_rooms(rooms, recipe.rooms, recipe.views_per_room)
+    rendered = load_rendered(rooms)
+    held_out, rendered = rendered[-HELD_OUT_VIEWS:], rendered[:-HELD_OUT_VIEWS]
+    pools: dict[str, Sequence[View]] = {name: load_depth_folder(data / name).views for name in REAL}
+    watched = {name: load_depth_folder(data / name, 640, stride=6).views for name in watch}
+    validate = validation_of(metadata, {"rendered": held_out, **watched})
+    network = build_network(metadata)
+    load_imagenet_encoder(network, data / IMAGENET)
+    _phase(network, metadata, pools, REAL, recipe.real, out / "real", validate)
+    network = load_checkpoint(out / "real" / "final.safetensors")[0]
+    metadata = dataclasses.replace(metadata, data=("ImageNet (encoder)", *MIXED))
+    pools["rendered"] = rendered
+    _phase(network, metadata, pools, MIXED, recipe.mixed, out / "mixed", validate)
+    network = load_checkpoint(out / "mixed" / "final.safetensors")[0]
+    metadata = calibrate_sigma(network, metadata, held_out)
+    save_checkpoint(network, metadata, out / "default.safetensors", half=True)
+    return out / "default.safetensors"
+
+
+def _phase(
+    network: FastDepth,
+    metadata: Metadata,
+    pools: dict[str, Sequence[View]],
+    shares: dict[str, float],
+    config: TrainConfig,
+    out: Path,
+    validate: _Validation,
+) -> None:
+    if (out / "final.safetensors").is_file():
+        logger.info("%s is there already", out / "final.safetensors")
+        return
+    sources = [Source(name, pools[name], share) for name, share in shares.items()]
+    train(network, metadata, [Supervised(sources, metadata)], config, out, validate, [Progress()])
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--data", type=Path, required=True, help="folder with the recordings")
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--watch", nargs="*", default=[], help="recordings drawn into the curve, never trained on")
+    parser.add_argument("--steps", type=int, nargs=2, metavar=("REAL", "MIXED"), help="other lengths of the phases")
+    args = parser.parse_args()
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
+    torch.set_num_threads(1)
+    recipe = Recipe()
+    if args.steps:
+        real, mixed = args.steps
+        recipe = dataclasses.replace(
+            recipe,
+            real=dataclasses.replace(recipe.real, steps=real),
+            mixed=dataclasses.replace(recipe.mixed, steps=mixed),
+        )
+    logger.info("weights: %s", make_default_weights(args.data, args.out, recipe, args.watch))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,234 @@
+"""Self-supervision from a SLAM run: photometric reprojection, map points, edge cycle, straight and square
+edges."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from edgeslam_torch.losses.base import Reduction, back_project
+from edgeslam_torch.losses.cycle import CycleForm, CycleLoss
+from edgeslam_torch.losses.depth import LaplaceNll, masked_mean
+from edgeslam_torch.losses.lshape import CollinearityLoss
+from edgeslam_torch.losses.photometric import PhotometricLoss, SmoothnessLoss
+from edgeslam_torch.losses.robust import Kernel
+from edgeslam_torch.models.fastdepth import FastDepth
+from edgeslam_torch.models.record import Metadata
+from edgeslam_torch.train.augment import AugmentConfig, View, recolour, scaled_K, warp
+from edgeslam_torch.train.posed import PosedSequence, PosedView, relative_motion
+from edgeslam_torch.train.signals import Slot
+from edgeslam_torch.train.straight import straight_edges
+from edgeslam_torch.train.validate import image_tensor
+from edgeslam_torch.types import FloatArray
+
+EDGES = 600
+"""Edge pixels per image in the cycle."""
+ARMS, ARM_POINTS = 24, 8
+"""Straight edges per image and points on each."""
+SPARSE = 1500
+"""Map points per image."""
+CLIP_LOG = 0.5
+"""Map points farther than this from the prediction (65 %) are believed to be hidden or wrong: constant
+cost."""
+
+
+@dataclass(frozen=True, slots=True)
+class SelfSupervisedWeights:
+    """Weights of the terms; 0 leaves one out."""
+
+    photometric: float = 1.0
+    points: float = 1.0
+    cycle: float = 0.5
+    straight: float = 0.1
+    smooth: float = 0.1
+    uncertainty: float = 0.1
+
+
+@dataclass
+class SelfSupervised:
+    """Pairs of posed frames without depth labels.
+
+    The scale is the run's: its map points and baselines are in metres when telemetry or the network gave
+    it metres.
+    A run in arbitrary units is brought to metres by ``log_scale``, the shift that fits the network's own
+    depth.
+    """
+
+    sequences: Sequence[PosedSequence]
+    metadata: Metadata
+    log_scale: Sequence[float] = ()
+    """Per sequence: log of metres per unit."""
+    zoom: tuple[float, float] = (1.0, 1.4)
+    augment: AugmentConfig = field(default_factory=lambda: replace(AugmentConfig(), blur=0.1, noise=0.1))
+    weights: SelfSupervisedWeights = field(default_factory=SelfSupervisedWeights)
+    name: str = "self"
+
+    def __post_init__(self) -> None:
+        self._items = [(s, i) for s, sequence in enumerate(self.sequences) for i in sequence.usable]
+        self._scale = list(self.log_scale) or [0.0] * len(self.sequences)
+        self._photometric, self._smooth, self._nll = PhotometricLoss(), SmoothnessLoss(), LaplaceNll()
+        self._cycle = CycleLoss(CycleForm.RELATIVE_DEPTH, Reduction.MEAN, Kernel.HUBER, delta=0.05)
+        self._straight = CollinearityLoss(kernel=Kernel.HUBER, delta=0.05)
+
+    def describe(self, slots: Sequence[Slot]) -> list[str]:
+        """``sequence/image`` of each slot."""
+        names = []
+        for slot in slots:
+            s, i = self._items[int(slot.rng().integers(len(self._items)))]
+            names.append(f"{self.sequences[s].name}/{self.sequences[s].views[i].name}")
+        return names
+
+    def draw(self, slots: Sequence[Slot]) -> dict[str, Tensor]:
+        """Normalised inputs of view i and of its first partner (``image``, stacked), and what the losses
+        compare."""
+        samples = [self._sample(slot) for slot in slots]
+        batch = {key: torch.stack([s[key] for s in samples]) for key in samples[0]}
+        batch["image"] = torch.cat((batch.pop("input_i"), batch.pop("input_j")))
+        return batch
+
+    def losses(self, network: FastDepth, batch: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Weighted terms, each ``(B,)``."""
+        w = self.weights
+        predicted = network.predict(batch["image"])
+        shift = batch["log_focal"].view(-1, 1, 1, 1)
+        B = shift.shape[0]
+        log_i = predicted.log_depth[:B].float() + shift
+        log_j = predicted.log_depth[B:].float() + shift
+        depth_i, K, T = log_i.exp(), batch["K"], batch["T_j_i"]
+        out: dict[str, Tensor] = {}
+        if w.photometric:
+            out["photometric"] = w.photometric * self._photometric(batch["rgb_i"], batch["rgb_j"], depth_i, T, K)
+        at_points = _at(log_i, batch["uv"])
+        residual = at_points - batch["log_z"]
+        near = batch["known"] & (residual.detach().abs() < CLIP_LOG)
+        if w.points:
+            # The near side counts fully, the clipped rest as a constant: it must not lower the loss to be
+            # far off.
+            out["points"] = w.points * masked_mean(residual.abs().clamp(max=CLIP_LOG), batch["known"])
+        if w.cycle:
+            terms = [self._cycle_term(log_i[b], log_j[b], batch, b) for b in range(B)]
+            out["cycle"] = w.cycle * torch.stack(terms)
+        if w.straight:
+            terms = [self._straight_term(log_i[b], batch, b) for b in range(B)]
+            out["straight"] = w.straight * torch.stack(terms)
+        if w.smooth:
+            out["smooth"] = w.smooth * self._smooth(log_i, batch["rgb_i"])
+        if predicted.log_sigma is not None and w.uncertainty:
+            sigma = _at(predicted.log_sigma[:B].float(), batch["uv"])
+            out["uncertainty"] = w.uncertainty * self._nll(sigma, at_points, batch["log_z"], near)
+        return out
+
+    def _cycle_term(self, log_i: Tensor, log_j: Tensor, batch: dict[str, Tensor], b: int) -> Tensor:
+        uv = batch["edges"][b]
+        depth = _at(log_i[None], uv[None])[0].exp()
+        # Padding rows have no pixel: depth 0 makes them invalid.
+        depth = torch.where(uv[:, 0] >= 0, depth, torch.zeros_like(depth))
+        loss: Tensor = self._cycle(batch["T_j_i"][b, 0], uv, depth, log_j[0].exp(), batch["K"][b])
+        return loss
+
+    def _straight_term(self, log_i: Tensor, batch: dict[str, Tensor], b: int) -> Tensor:
+        uv = batch["arms"][b]
+        known = uv[..., 0] >= 0
+        depth = _at(log_i[None], uv.reshape(1, -1, 2))[0].exp()
+        points = back_project(uv.reshape(-1, 2), depth, batch["K"][b]).reshape(-1, 2, ARM_POINTS, 3)
+        loss: Tensor = self._straight(points, known.reshape(-1, 2, ARM_POINTS))
+        return loss
+
+    def _sample(self, slot: Slot) -> dict[str, Tensor]:
+        rng = slot.rng()
+        s, i = self._items[int(rng.integers(len(self._items)))]
+        sequence, scale = self.sequences[s], float(np.exp(self._scale[s]))
+        view = sequence.views[i]
+        partners = rng.choice(sequence.partners[i], 2)
+        others = [sequence.views[int(j)] for j in partners]
+        size = (self.metadata.input_height, self.metadata.input_width)
+        K = _zoomed(view, size, self.zoom, rng)
+        images = [_seen(v, K, size) for v in (view, *others)]
+        motions = np.stack([relative_motion(view, v) for v in others])
+        motions[:, :3, 3] *= scale
+        flip = bool(rng.random() < 0.5)
+        uv = view.uv @ _affine(K, view.K)[:2, :2].T + _affine(K, view.K)[:2, 2]
+        if flip:
+            images = [np.ascontiguousarray(x[:, ::-1]) for x in images]
+            mirror = np.diag([-1.0, 1.0, 1.0, 1.0])
+            motions = mirror @ motions @ mirror
+            K[0, 2] = size[1] - 1 - K[0, 2]
+            uv = uv * (-1, 1) + (size[1] - 1, 0)
+        uv, z = _inside(uv, view.z * scale, size, rng)
+        edges, arms = straight_edges(images[0], EDGES, ARMS, ARM_POINTS, rng)
+        seed = int(rng.integers(1 << 62))
+        # Both images of a pair are recoloured alike; the photometric term sees the originals.
+        inputs = [recolour(x, self.augment, np.random.default_rng(seed)) for x in images[:2]]
+        focal = float(np.sqrt(K[0, 0] * K[1, 1]))
+        return {
+            "input_i": image_tensor(inputs[0], self.metadata),
+            "input_j": image_tensor(inputs[1], self.metadata),
+            "rgb_i": _rgb(images[0]),
+            "rgb_j": torch.stack([_rgb(x) for x in images[1:]]),
+            "K": torch.from_numpy(K).float(),
+            "T_j_i": torch.from_numpy(motions).float(),
+            "log_focal": torch.tensor(np.log(focal / self.metadata.focal_px), dtype=torch.float32),
+            "uv": torch.from_numpy(uv),
+            "log_z": torch.from_numpy(np.log(np.maximum(z, 1e-3))),
+            "known": torch.from_numpy(z > 0),
+            "edges": torch.from_numpy(edges),
+            "arms": torch.from_numpy(arms),
+        }
+
+
+def fit_log_scale(views: Sequence[PosedView], log_depths: Sequence[FloatArray]) -> float:
+    """Log of metres per map unit that makes the network's depth and the map points agree (median).
+
+    Args:
+        views: Of one run.
+        log_depths: The network's log depth [log m] at each view's points, ``(N_i,)``.
+    """
+    ratios = [d - np.log(v.z) for v, d in zip(views, log_depths, strict=True)]
+    return float(np.median(np.concatenate(ratios)))
+
+
+def _zoomed(view: PosedView, size: tuple[int, int], zoom: tuple[float, float], rng: np.random.Generator) -> FloatArray:
+    height, width = size
+    h, w = view.image.shape[:2]
+    factor = float(np.exp(rng.uniform(*np.log(zoom))))
+    K = scaled_K(view.K, width / w * factor, height / h * factor)
+    room_x, room_y = (factor - 1) * width, (factor - 1) * height
+    K[0, 2] -= rng.uniform(0, room_x)
+    K[1, 2] -= rng.uniform(0, room_y)
+    return K
+
+
+def _seen(view: PosedView, K: FloatArray, size: tuple[int, int]) -> NDArray[np.uint8]:
+    depth = np.zeros(view.image.shape[:2], np.float32)
+    return warp(View(view.image, depth, view.K), K, np.eye(3), size).image
+
+
+def _affine(K: FloatArray, K_before: FloatArray) -> FloatArray:
+    return K @ np.linalg.inv(K_before)
+
+
+def _inside(
+    uv: FloatArray, z: FloatArray, size: tuple[int, int], rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """``SPARSE`` points inside the image, padded with depth 0."""
+    height, width = size
+    kept = np.flatnonzero(((uv >= 0) & (uv <= (width - 1, height - 1))).all(1))
+    if len(kept) > SPARSE:
+        kept = rng.choice(kept, SPARSE, replace=False)
+    out_uv, out_z = np.zeros((SPARSE, 2), np.float32), np.zeros(SPARSE, np.float32)
+    out_uv[: len(kept)], out_z[: len(kept)] = uv[kept], z[kept]
+    return out_uv, out_z
+
+
+def _rgb(image: NDArray[np.uint8]) -> Tensor:
+    return torch.from_numpy(np.ascontiguousarray(image[..., ::-1].transpose(2, 0, 1))).float() / 255.0
+
+
+def _at(maps: Tensor, uv: Tensor) -> Tensor:
+    """Bilinear samples ``(B, N)`` of ``(B, 1, H, W)`` at pixels ``(B, N, 2)``."""
+    size = maps.new_tensor((maps.shape[-1] - 1, maps.shape[-2] - 1))
+    grid = (2.0 * uv / size - 1.0)[:, None]
+    return torch.nn.functional.grid_sample(maps, grid, align_corners=True, padding_mode="border")[:, 0, 0]

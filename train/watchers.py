@@ -1,0 +1,84 @@
+"""Hooks that show how training goes: a progress bar with time left, and TensorBoard."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from tqdm import tqdm
+
+from edgeslam_torch.models.record import Metadata
+from edgeslam_torch.train.augment import View
+from edgeslam_torch.train.recipe import Hooks, TrainConfig, TrainState
+from edgeslam_torch.train.validate import predict_metres
+
+PICTURE_SIZE = (320, 240)
+
+
+class ProgressBar(Hooks):
+    """One line: step, loss, learning rate, time left."""
+
+    def __init__(self) -> None:
+        self._bar: tqdm | None = None
+
+    def on_start(self, state: TrainState, config: TrainConfig) -> None:
+        """Open the bar where the run stands."""
+        self._bar = tqdm(total=config.steps, initial=state.step, unit="step", disable=None, dynamic_ncols=True)
+
+    def on_step(self, state: TrainState, losses: dict[str, float]) -> None:
+        """Advance."""
+        assert self._bar is not None
+        rate = state.optimiser.param_groups[-1]["lr"]
+        self._bar.set_postfix(loss=f"{sum(losses.values()):.4f}", lr=f"{rate:.1e}", refresh=False)
+        self._bar.update()
+
+    def on_end(self, state: TrainState, reason: str) -> None:
+        """Say why it ended."""
+        assert self._bar is not None
+        self._bar.close()
+        tqdm.write(f"stopped after step {state.step}: {reason}")
+
+
+class TensorBoard(Hooks):
+    """Losses by name at every step, metrics and pictures (input, depth, error, edges) at every validation."""
+
+    def __init__(self, folder: Path, metadata: Metadata, views: Sequence[View]) -> None:
+        from torch.utils.tensorboard import SummaryWriter
+
+        self._writer = SummaryWriter(str(folder))
+        self._metadata, self._views = metadata, views
+
+    def on_step(self, state: TrainState, losses: dict[str, float]) -> None:
+        """Scalars under ``loss/``."""
+        for name, value in losses.items():
+            self._writer.add_scalar(f"loss/{name}", value, state.step)
+        self._writer.add_scalar("loss/sum", sum(losses.values()), state.step)
+        self._writer.add_scalar("lr", state.optimiser.param_groups[-1]["lr"], state.step)
+
+    def on_validation(self, state: TrainState, metrics: dict[str, float]) -> None:
+        """Scalars under ``validation/`` and one strip of pictures per view."""
+        for name, value in metrics.items():
+            self._writer.add_scalar(f"validation/{name}", value, state.step)
+        for k, view in enumerate(self._views):
+            depth, _ = predict_metres(state.averaged, self._metadata, view)
+            self._writer.add_image(f"view {k}", picture(view, depth)[..., ::-1], state.step, dataformats="HWC")
+
+    def on_end(self, state: TrainState, reason: str) -> None:
+        """Close the file."""
+        self._writer.add_text("end", reason, state.step)
+        self._writer.close()
+
+
+def picture(view: View, depth_m: np.ndarray) -> np.ndarray:
+    """Input, predicted depth, relative error (0 to 50 %) and Canny edges side by side, BGR uint8."""
+    image = cv2.resize(view.image, PICTURE_SIZE, interpolation=cv2.INTER_AREA)
+    known = view.depth_m > 0
+    error = np.where(known, np.abs(depth_m / np.maximum(view.depth_m, 1e-3) - 1), 0.0)
+    panels = [_coloured(0.5 / np.maximum(depth_m, 0.5)), _coloured(error / 0.5)]
+    edges = np.repeat(cv2.Canny(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), 50, 150)[..., None], 3, axis=2)
+    return np.hstack([image, *panels, edges])
+
+
+def _coloured(level: np.ndarray) -> np.ndarray:
+    grey = cv2.resize((np.clip(level, 0, 1) * 255).astype(np.uint8), PICTURE_SIZE, interpolation=cv2.INTER_NEAREST)
+    return np.asarray(cv2.applyColorMap(grey, cv2.COLORMAP_TURBO))
