@@ -68,9 +68,8 @@ def pair_geometry(Rt: Tensor, ray: Tensor, inverse_depth: Tensor) -> PairGeometr
     n = q[:2] * scale
     iz = inverse_depth * scale
     t_scaled = Rt[:, 3] * scale
-    slope = torch.empty_like(q)
-    torch.addcmul(t_scaled[:2], n, t_scaled[2], value=-1.0, out=slope[:2])
-    torch.addcmul(scale, iz, t_scaled[2], value=-1.0, out=slope[2])
+    across = torch.addcmul(t_scaled[:2], n, t_scaled[2], value=-1.0)
+    slope = torch.cat((across, torch.addcmul(scale, iz, t_scaled[2], value=-1.0)[None]))
     return PairGeometry(n[0], n[1], iz, slope, front)
 
 

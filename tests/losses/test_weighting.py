@@ -15,7 +15,7 @@ def test_weight_is_the_derivative_of_the_cost(kernel):
     (derivative,) = torch.autograd.grad(cost.sum(), s)
     torch.testing.assert_close(weight, derivative)
     assert cost[0].item() == pytest.approx(0.0, abs=1e-12)
-    assert float(weight[0]) == pytest.approx(1.0)
+    assert weight[0].item() == pytest.approx(1.0)
 
 
 def test_kernels_order_by_how_little_they_listen_to_outliers():

@@ -1,0 +1,183 @@
+"""Analytic derivatives against automatic ones, at ordinary poses, at identity and at tiny angles."""
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.losses import edge_alignment as ea
+from edgeslam_torch.losses.lshape import junction_rows
+from edgeslam_torch.losses.reprojection import (
+    camera_points,
+    inverse_depth_jacobians,
+    reprojection_jacobians,
+    reprojection_residuals,
+)
+from edgeslam_torch.optim import lie
+from edgeslam_torch.optim.priors import inverse_left_jacobian, scale_prior
+from edgeslam_torch.optim.problem import ScalePrior
+
+K = torch.tensor([500.0, 480.0, 320.0, 240.0], dtype=torch.float64)
+POSES = {
+    "general": [0.3, -0.1, 0.2, 0.05, -0.2, 0.1],
+    "identity": [0.0] * 6,
+    "tiny angle": [0.1, 0.0, 0.0, 1e-9, -1e-9, 1e-9],
+    "large angle": [0.1, 0.2, 0.1, 0.1, 0.2, 2.8],
+}
+
+
+def tensor(x: object) -> Tensor:
+    return torch.tensor(np.asarray(x), dtype=torch.float64)
+
+
+@pytest.fixture(params=list(POSES))
+def T(request: pytest.FixtureRequest) -> Tensor:
+    return lie.exp(tensor(POSES[request.param]))
+
+
+def test_torch_and_numpy_agree_on_exp_and_adjoint(T, rng):
+    for xi in (*POSES.values(), 1e-5 * rng.normal(size=6)):
+        np.testing.assert_allclose(lie.exp(tensor(xi)).numpy(), se3.exp(np.asarray(xi)), atol=1e-15)
+    xi = tensor(1e-2 * rng.normal(size=6))
+    torch.testing.assert_close(T @ lie.exp(xi), lie.exp(lie.adjoint(T) @ xi) @ T)
+    torch.testing.assert_close(T @ lie.inverse(T), torch.eye(4, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("xi", [[0.0] * 6, [1e-9] * 6, [0.1, 0.2, -0.3, 0.5, -0.4, 0.3]])
+def test_exp_passes_gradcheck(xi):
+    assert torch.autograd.gradcheck(lie.exp, tensor(xi).requires_grad_())
+
+
+def test_reprojection(T, rng):
+    poses = torch.stack((T, lie.exp(tensor([0.1, 0, 0, 0, 0.1, 0])) @ T))
+    p_c = tensor(rng.uniform((-1, -1, 2), (1, 1, 5), (7, 3)))
+    p = (p_c - T[:3, 3]) @ T[:3, :3]
+    pose, anchor = torch.tensor([0, 0, 1, 1, 0]), torch.tensor([0, 3, 3, 6, 1])
+    uv = tensor(rng.uniform(0, 600, (2, 5)))
+
+    def residual(xi: Tensor, q: Tensor) -> Tensor:
+        return reprojection_residuals(lie.exp(xi) @ poses, q, pose, anchor, uv, K)[0]
+
+    by_pose, by_point = torch.func.jacrev(residual, (0, 1))(torch.zeros(2, 6, dtype=torch.float64), p)
+    ours = reprojection_jacobians(poses, p, pose, anchor, uv, K)
+    torch.testing.assert_close(ours.residual, residual(torch.zeros(2, 6, dtype=torch.float64), p))
+    each = torch.arange(5)
+    torch.testing.assert_close(ours.pose.permute(2, 0, 1), by_pose.permute(1, 2, 0, 3)[each, pose])
+    torch.testing.assert_close(ours.point.permute(2, 0, 1), by_point.permute(1, 2, 0, 3)[each, anchor])
+
+
+def test_inverse_depth_of_anchors(T, rng):
+    p = (tensor(rng.uniform((-1, -1, 2), (1, 1, 5), (6, 3))) - T[:3, 3]) @ T[:3, :3]
+    zero = torch.zeros(6, dtype=torch.long)
+
+    def inverse_depth(xi: Tensor, q: Tensor) -> Tensor:
+        return camera_points((lie.exp(xi) @ T)[None], q, zero, torch.arange(6))[1][2].reciprocal()
+
+    by_pose, by_point = torch.func.jacrev(inverse_depth, (0, 1))(torch.zeros(6, dtype=torch.float64), p)
+    value, pose, point = inverse_depth_jacobians(*camera_points(T[None], p, zero, torch.arange(6)))
+    torch.testing.assert_close(value, inverse_depth(torch.zeros(6, dtype=torch.float64), p))
+    torch.testing.assert_close(pose.mT, by_pose)
+    torch.testing.assert_close(point.mT, by_point.diagonal(0, 0, 1).mT)
+
+
+PAIRS = 6
+
+
+def pairs(T: Tensor, rng: np.random.Generator, count: int = PAIRS) -> tuple[Tensor, Tensor]:
+    """Rays and inverse depths of a host whose points lie in front of the target ``T`` too."""
+    p_j = tensor(rng.uniform((-1, -1, 3), (1, 1, 6), (count, 3)))
+    p_i = (p_j - T[:3, 3]) @ T[:3, :3]
+    sign = torch.where(p_i[:, 2] > 0, 1.0, -1.0)  # a large turn may need them behind the host: algebra all the same
+    return (p_i[:, :2] / p_i[:, 2:]).mT.contiguous(), sign / (p_i[:, 2].abs())
+
+
+def spread(T: Tensor, count: int = PAIRS) -> Tensor:
+    return T[:3, :, None].expand(3, 4, count)
+
+
+@pytest.mark.parametrize("row", ["alignment", "relative depth", "round trip"])
+@pytest.mark.parametrize("name", ["general", "identity", "tiny angle"])
+def test_edge_pairs(row, name, rng):
+    T = lie.exp(tensor(POSES[name]))
+    ray, inverse_depth = pairs(T, rng)
+    uv_j, normal = tensor(rng.uniform(0, 600, (2, PAIRS))), tensor(rng.normal(size=(2, PAIRS)))
+    held = tensor(rng.uniform(0.2, 0.3, PAIRS))
+
+    def rows(Rt: Tensor, d: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        g = ea.pair_geometry(Rt, ray, d)
+        if row == "alignment":
+            return ea.alignment_jacobians(g, uv_j, normal, K)
+        if row == "relative depth":
+            return ea.relative_depth_jacobians(g, held)
+        return ea.round_trip_jacobians(g, Rt, ray, held, K)
+
+    def residual(xi: Tensor, d: Tensor) -> Tensor:
+        Rt = spread(lie.exp(xi) @ T)
+        g = ea.pair_geometry(Rt, ray, d)
+        if row == "alignment":
+            return ea.alignment_row(g, uv_j, normal, K)
+        if row == "relative depth":
+            return ea.relative_depth_row(g, held)
+        p = torch.stack((g.x, g.y, torch.ones_like(g.x))) / held
+        back = lie.inverse(lie.exp(xi) @ T)
+        q = back[:3, :3] @ p + back[:3, 3:]
+        return (q[:2] / q[2] - ray) * K[:2, None]
+
+    zero = torch.zeros(6, dtype=torch.float64)
+    by_pose, by_depth = torch.func.jacfwd(residual, (0, 1))(zero, inverse_depth)
+    r, J, Jd = rows(spread(T), inverse_depth)
+    torch.testing.assert_close(r, residual(zero, inverse_depth))
+    torch.testing.assert_close(J, by_pose.movedim(-1, -2))
+    torch.testing.assert_close(Jd, by_depth.diagonal(0, -2, -1))
+
+
+@pytest.mark.parametrize("cosines", [False, True])
+@pytest.mark.parametrize("name", ["general", "identity", "tiny angle"])
+def test_junctions(cosines, name, rng):
+    T = lie.exp(tensor(POSES[name]))
+    ray, inverse_depth = pairs(T, rng, 3 * PAIRS)
+    rays, x = ray.view(2, 3, PAIRS).movedim(1, 0).contiguous(), inverse_depth.view(3, PAIRS)
+    uv_j = tensor(rng.uniform(0, 600, (2, PAIRS)))
+    angle = tensor(rng.uniform(0, 6, (2, PAIRS)))
+    arms = torch.stack((angle.cos(), angle.sin()), 1)
+
+    def residual(xi: Tensor, d: Tensor) -> Tensor:
+        return junction_rows(spread(lie.exp(xi) @ T), rays, d, uv_j, arms, K, cosines)[0]
+
+    zero = torch.zeros(6, dtype=torch.float64)
+    by_pose, by_depth = torch.autograd.functional.jacobian(residual, (zero, x))
+    _, J, Jd, front = junction_rows(spread(T), rays, x, uv_j, arms, K, cosines)
+    assert front.all()
+    torch.testing.assert_close(J, by_pose.movedim(-1, -2))
+    torch.testing.assert_close(Jd, by_depth.diagonal(0, 1, 3))
+
+
+def test_relative_tangent_is_target_minus_adjoint_times_host(T, rng):
+    T_i = lie.exp(tensor(0.3 * rng.normal(size=6)))
+    xi_i, xi_j = tensor(1e-6 * rng.normal(size=(2, 6)))
+    moved = (lie.exp(xi_j) @ T) @ lie.inverse(lie.exp(xi_i) @ T_i)
+    T_j_i = T @ lie.inverse(T_i)
+    predicted = lie.exp(xi_j - lie.adjoint(T_j_i) @ xi_i) @ T_j_i
+    torch.testing.assert_close(moved, predicted, rtol=0, atol=1e-11)
+
+
+def test_inverse_left_jacobian_by_differences(rng):
+    xi = 0.4 * rng.normal(size=6)
+    step = 1e-6
+    numeric = np.stack(
+        [(se3.log(se3.exp(step * e) @ se3.exp(xi)) - se3.log(se3.exp(-step * e) @ se3.exp(xi))) for e in np.eye(6)], 1
+    ) / (2 * step)
+    np.testing.assert_allclose(inverse_left_jacobian(xi), numeric, atol=1e-6)  # the series ends at xi^7
+
+
+def test_scale_prior_by_differences(rng):
+    T_i, T_j = se3.exp(0.3 * rng.normal(size=6)), se3.exp(0.3 * rng.normal(size=6))
+    prior = ScalePrior(0, 1, distance=0.4, sigma_log=0.1)
+    _, J_i, J_j = scale_prior(T_i, T_j, prior)
+    step = 1e-6
+    for J, left, right in ((J_i, 1, 0), (J_j, 0, 1)):
+        for k, e in enumerate(np.eye(6)):
+            plus = scale_prior(se3.exp(left * step * e) @ T_i, se3.exp(right * step * e) @ T_j, prior)[0]
+            minus = scale_prior(se3.exp(-left * step * e) @ T_i, se3.exp(-right * step * e) @ T_j, prior)[0]
+            assert J[k] == pytest.approx((plus - minus) / (2 * step), abs=1e-6)
