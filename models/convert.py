@@ -118,8 +118,8 @@ class RestrictedUnpickler(pickle.Unpickler):
             return _Module
         if module in ("numpy.core.multiarray", "numpy._core.multiarray") and name == "scalar":
             return _ignored
-        if module == "numpy" and name == "dtype":
-            return _IgnoredDtype
+        if (module, name) in (("numpy", "dtype"), ("metrics", "Result")):
+            return _Ignored
         raise WeightsError(f"checkpoint refers to {module}.{name}: refused, it may run code; nothing was run")
 
     def persistent_load(self, pid: Any) -> Any:
@@ -144,9 +144,11 @@ def _ignored(*_: Any) -> None:
     """numpy scalars beside the model (epoch, best result) carry nothing we need."""
 
 
-class _IgnoredDtype:
+class _Ignored:
+    """Stands in for numpy dtypes and upstream's ``best_result``."""
+
     def __init__(self, *_: Any) -> None:
-        """Takes what numpy's dtype takes and keeps nothing."""
+        """Take anything, keep nothing."""
 
     def __setstate__(self, state: Any) -> None:
         """Nothing to restore."""

@@ -23,7 +23,7 @@ from edgeslam_torch.models.checkpoint import build_network, load_checkpoint, sav
 from edgeslam_torch.models.fastdepth import FastDepth
 from edgeslam_torch.models.imagenet import load_imagenet_encoder
 from edgeslam_torch.models.record import Metadata
-from edgeslam_torch.train.augment import View
+from edgeslam_torch.train.augment import AugmentConfig, View
 from edgeslam_torch.train.calibrate_sigma import calibrate_sigma
 from edgeslam_torch.train.datasets import load_depth_folder
 from edgeslam_torch.train.recipe import Hooks, TrainConfig, TrainState, train
@@ -38,7 +38,7 @@ INPUT_SIZE = (160, 224)
 """Height and width [px]; against 192x256 a third less time, and as accurate (model card)."""
 REAL = {"tum_fr1_rpy_depth": 0.6, "icl_livingroom1": 0.4}
 """Recordings of phase 1 and their shares."""
-MIXED = {"tum_fr1_rpy_depth": 0.35, "icl_livingroom1": 0.2, "rendered": 0.45}
+MIXED = {"tum_fr1_rpy_depth": 0.4, "icl_livingroom1": 0.15, "rendered": 0.45}
 HELD_OUT_VIEWS = 150
 """Last rendered views, whole rooms, kept out of training for the calibration."""
 LICENCE = (
@@ -56,7 +56,10 @@ class Recipe:
     views_per_room: int = 6
     real: TrainConfig = TrainConfig(steps=950)
     mixed: TrainConfig = TrainConfig(
-        steps=1200, lr=6e-4, encoder_lr=8e-5, seed=1, validate_every=300, checkpoint_every=100
+        steps=1200, lr=2e-3, encoder_lr=4e-4, seed=1, validate_every=200, checkpoint_every=100
+    )
+    augment: AugmentConfig = AugmentConfig(
+        zoom=(0.9, 1.4), aspect=0.05, roll_rad=0.12, tilt_rad=0.08, shift=0.1, saturation=0.4, gamma=(0.8, 1.25)
     )
 
 
@@ -132,11 +135,11 @@ def make_default_weights(data: Path, out: Path, recipe: Recipe, watch: Sequence[
     validate = validation_of(metadata, {"rendered": held_out, **watched})
     network = build_network(metadata)
     load_imagenet_encoder(network, data / IMAGENET)
-    _phase(network, metadata, pools, REAL, recipe.real, out / "real", validate)
+    _phase(network, metadata, pools, REAL, recipe.real, recipe.augment, out / "real", validate)
     network = load_checkpoint(out / "real" / "final.safetensors")[0]
     metadata = dataclasses.replace(metadata, data=("ImageNet (encoder)", *MIXED))
     pools["rendered"] = rendered
-    _phase(network, metadata, pools, MIXED, recipe.mixed, out / "mixed", validate)
+    _phase(network, metadata, pools, MIXED, recipe.mixed, recipe.augment, out / "mixed", validate)
     network = load_checkpoint(out / "mixed" / "final.safetensors")[0]
     metadata = calibrate_sigma(network, metadata, held_out)
     save_checkpoint(network, metadata, out / "default.safetensors", half=True)
@@ -149,6 +152,7 @@ def _phase(
     pools: dict[str, Sequence[View]],
     shares: dict[str, float],
     config: TrainConfig,
+    augment: AugmentConfig,
     out: Path,
     validate: _Validation,
 ) -> None:
@@ -156,7 +160,7 @@ def _phase(
         logger.info("%s is there already", out / "final.safetensors")
         return
     sources = [Source(name, pools[name], share) for name, share in shares.items()]
-    train(network, metadata, [Supervised(sources, metadata)], config, out, validate, [Progress()])
+    train(network, metadata, [Supervised(sources, metadata, augment)], config, out, validate, [Progress()])
 
 
 def main() -> None:

@@ -1,0 +1,93 @@
+"""``edgeslam weights``: list, download, convert and inspect depth-network weights."""
+
+import argparse
+import dataclasses
+from pathlib import Path
+
+from edgeslam_torch.errors import ConfigError, OutputError
+
+HELP = "list, download, convert and inspect depth-network weights"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's options."""
+    actions = parser.add_subparsers(dest="action", required=True)
+    actions.add_parser("list", help="shipped, downloaded and downloadable weights")
+    download = actions.add_parser("download", help="fetch official FastDepth weights and convert them")
+    download.add_argument("name", help="as 'list' prints it")
+    download.add_argument("--out", "-o", type=Path, help="where to put the .safetensors (default: the cache)")
+    download.add_argument("--sha256", help="what the downloaded file must hash to")
+    convert = actions.add_parser("convert", help="turn an official .pth.tar into .safetensors, running no code in it")
+    convert.add_argument("checkpoint", type=Path)
+    convert.add_argument("--out", "-o", type=Path, required=True)
+    inspect = actions.add_parser("inspect", help="print what a weights file says about itself")
+    inspect.add_argument("weights", nargs="?", type=Path, help="default: the shipped weights")
+
+
+def main(args: argparse.Namespace) -> int:
+    """Do one of the four."""
+    {"list": _list, "download": _download, "convert": _convert, "inspect": _inspect}[args.action](args)
+    return 0
+
+
+def _list(_: argparse.Namespace) -> None:
+    from edgeslam_torch.models.download import REMOTES, cache_folder, shipped
+    from edgeslam_torch.models.record import read_header
+
+    print(f"default  {read_header(shipped()).variant}  {shipped()}")
+    for remote in REMOTES.values():
+        local = cache_folder() / f"{remote.name}.safetensors"
+        print(f"{remote.name}: {remote.about}; {remote.licence}")
+        print(f"    {local if local.is_file() else 'not downloaded: ' + remote.urls[0]}")
+
+
+def _download(args: argparse.Namespace) -> None:
+    from tqdm import tqdm
+
+    from edgeslam_torch.models.convert import convert_upstream
+    from edgeslam_torch.models.download import REMOTES, cache_folder, download
+
+    remote = REMOTES.get(args.name)
+    if remote is None:
+        raise ConfigError(f"no weights called {args.name!r}; there are {', '.join(REMOTES)}")
+    raw = cache_folder() / f"{remote.name}.pth.tar"
+    with tqdm(unit="B", unit_scale=True, desc=remote.name, disable=None) as bar:
+
+        def show(have: int, total: int) -> None:
+            bar.total = total or None
+            bar.update(have - bar.n)
+
+        digest = download(remote.urls, raw, args.sha256 or remote.sha256, show)
+    target = args.out or cache_folder() / f"{remote.name}.safetensors"
+    target.parent.mkdir(parents=True, exist_ok=True)
+    convert_upstream(raw, target)
+    if args.sha256 is None and remote.sha256 is None:
+        print(
+            f"sha256 {digest} (the publisher names none; give it to --sha256 next time to be sure it is the same file)"
+        )
+    print(target)
+
+
+def _convert(args: argparse.Namespace) -> None:
+    from edgeslam_torch.models.convert import convert_upstream
+
+    try:
+        args.out.parent.mkdir(parents=True, exist_ok=True)
+        metadata = convert_upstream(args.checkpoint, args.out)
+    except OSError as error:
+        raise OutputError(f"{args.out}: cannot be written ({error.strerror or error})") from error
+    print(f"{args.out}: {metadata.variant}")
+
+
+def _inspect(args: argparse.Namespace) -> None:
+    from edgeslam_torch.models.checkpoint import file_hash, load_checkpoint
+    from edgeslam_torch.models.complexity import measure_complexity
+    from edgeslam_torch.models.record import DEFAULT_WEIGHTS
+
+    path = args.weights or DEFAULT_WEIGHTS
+    network, metadata = load_checkpoint(path)
+    size = measure_complexity(network, metadata.input_height, metadata.input_width)
+    print(f"{path}\nsha256 {file_hash(path)}")
+    print(f"{size.parameters / 1e6:.2f} M parameters, {size.macs / 1e9:.2f} GMAC per image")
+    for field in dataclasses.fields(metadata):
+        print(f"{field.name}: {getattr(metadata, field.name)}")
