@@ -220,6 +220,7 @@ class _Run:
             "mode": str(self.mode),
             "seed": self.config.seed,
             "interrupted": self.interrupt.requested,
+            "ended_early": "interrupted" if self.interrupt.requested else self.writer.failure,
         }
         title = f"{self.source.name}: {self.tally.frames} frames, {len(edge_map.p_w)} edge points"
 

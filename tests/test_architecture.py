@@ -26,7 +26,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("run",),
     ("eval",),
     ("train",),
-    ("viewer",),
+    ("viewer", "demo"),
     ("commands",),
     ("cli",),
 )
