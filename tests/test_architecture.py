@@ -26,7 +26,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("run",),
     ("eval",),
     ("train",),
-    ("viewer", "demo"),
+    ("viewer", "demo", "emulator"),
     ("commands",),
     ("cli",),
 )
