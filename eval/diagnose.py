@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.eval.align import AlignmentKind, umeyama
-from edgeslam_torch.eval.associate import DEFAULT_MAX_DT_S, associate, match, nearest
+from edgeslam_torch.eval.associate import DEFAULT_MAX_DT_S, associate, match
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.formats import Trajectory
 from edgeslam_torch.eval.trajectory import TrajectoryScore

@@ -18,6 +18,7 @@ from edgeslam_torch.eval import report_words as words
 from edgeslam_torch.eval.associate import match
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.formats import Trajectory, read_trajectory
+from edgeslam_torch.eval.keyframe_pictures import keyframe_pictures
 from edgeslam_torch.eval.run_folder import RunFolder, open_run
 from edgeslam_torch.eval.run_score import RunScore, evaluate_run
 from edgeslam_torch.io.atomic import write_text
@@ -79,7 +80,7 @@ def render(run: RunFolder, score: RunScore | None = None, truth: Trajectory | No
     """The page as text."""
     edges = _subset(run.cloud("edge_map.ply"), MAX_POINTS)
     anchors = _subset(run.cloud("anchors.ply"), _MAX_ANCHORS)
-    turn = _upright(run.trajectory)
+    turn = _upright(run.trajectory, score, truth)
     data, packed_edges, packed_anchors = _payload(run, edges, anchors, score, truth, turn)
     text = json.dumps(data, allow_nan=False, separators=(",", ":"), default=_plain).replace("<", "\\u003c")
     page = (_PAGE / "page.html").read_text(encoding="utf-8")
@@ -180,7 +181,7 @@ def _payload(
         "floor": round(view.floor, 4),
         "gridStep": _grid_step(view.radius),
         "height": [round(float(view.lo[2]), 3), round(float(view.hi[2]), 3)],
-        "keyframes": _keyframes(run, begin),
+        "keyframes": _keyframes(run, edges, trajectory.stamps_s[table.keyframes()], begin),
         "mapScore": words.map_rows(score),
         "summary": words.flat_rows(run.summary),
         "config": _text(run.path / "config.toml"),
@@ -213,10 +214,13 @@ class _StatusTable:
             return None
         return [round(v, 5) if np.isfinite(v) else None for v in values]
 
+    def keyframes(self) -> list[int]:
+        """Poses of keyframes."""
+        return [k for k, r in enumerate(self.rows) if r.get("keyframe", "").lower() in ("1", "true", "yes")]
+
     def cameras(self) -> list[int]:
         """Poses drawn as frusta: the keyframes, thinned, or every so many poses."""
-        index = [k for k, r in enumerate(self.rows) if r.get("keyframe", "").lower() in ("1", "true", "yes")]
-        index = index or list(range(0, len(self.rows), max(1, len(self.rows) // 30)))
+        index = self.keyframes() or list(range(0, len(self.rows), max(1, len(self.rows) // 30)))
         return index[:: max(1, -(-len(index) // _MAX_FRUSTA))]
 
     def scale(self, note: str) -> dict[str, Any] | None:
@@ -239,7 +243,7 @@ class _StatusTable:
             values = np.array([_number(r, name) for r in self.all_rows])
             values = values[np.isfinite(values) & (values > 0)]
             if len(values):
-                label = name.removesuffix("_ms").replace("_", " ")
+                label = "whole step" if name == "step_ms" else name.removesuffix("_ms").replace("_", " ")
                 share = f" ({len(values)} frames)" if len(values) < 0.9 * len(self.all_rows) else ""
                 median, p95 = np.quantile(values, [0.5, 0.95])
                 out.append({"name": label + share, "median": float(median), "p95": float(p95)})
@@ -279,20 +283,27 @@ def _number(row: dict[str, str], *names: str) -> float:
     return float("nan")
 
 
-def _upright(trajectory: Trajectory) -> FloatArray:
+def _upright(trajectory: Trajectory, score: RunScore | None, truth: Trajectory | None) -> FloatArray:
     """Rotation ``(3, 3)`` that turns the run's world so that z is up on the page.
 
-    Worlds are z up by convention; a file in which the cameras' own up says otherwise (a trajectory that starts at the
-    identity, z forward) is turned.
+    A run without telemetry takes its first camera for level; ground truth knows better, when its own z is up. Else a
+    world in which the cameras' up is far from z (a trajectory that starts at the identity, z forward) is turned.
     """
+    if score is not None and score.sim3 is not None and truth is not None and _camera_up(truth)[2] > 0.2:
+        return score.sim3.alignment.R
+    up = _camera_up(trajectory)
+    if up[2] > 0.5 or not up.any():
+        return np.eye(3)
+    x = np.cross([0.0, 1.0, 0.0] if abs(up[1]) < 0.9 else [1.0, 0.0, 0.0], up)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(up, x), up])
+
+
+def _camera_up(trajectory: Trajectory) -> FloatArray:
+    """Mean up direction of the images in the world, unit length; zero when they cancel."""
     up = -trajectory.T_w_c[:, :3, 1].mean(axis=0)
     norm = float(np.linalg.norm(up))
-    if norm < 1e-6 or up[2] / norm > 0.5:
-        return np.eye(3)
-    z = up / norm
-    x = np.cross([0.0, 1.0, 0.0] if abs(z[1]) < 0.9 else [1.0, 0.0, 0.0], z)
-    x /= np.linalg.norm(x)
-    return np.stack([x, np.cross(z, x), z])
+    return up / norm if norm > 1e-6 else np.zeros(3)
 
 
 def _subset(cloud: PointCloud | None, most: int) -> PointCloud:
@@ -391,22 +402,25 @@ def _error(score: RunScore | None, begin: float) -> dict[str, Any] | None:
     }
 
 
-def _keyframes(run: RunFolder, begin: float) -> list[dict[str, str]]:
+def _keyframes(run: RunFolder, edges: PointCloud, stamps_s: FloatArray, begin: float) -> list[dict[str, str]]:
+    """Pictures that the run left in ``keyframes/``, else drawn from its source's images."""
     files = sorted((run.path / "keyframes").glob("*.jpg")) if (run.path / "keyframes").is_dir() else []
     files = files[:: max(1, -(-len(files) // _MAX_KEYFRAMES))]
-    out = []
-    for file in files:
-        image = cv2.imread(str(file))
-        if image is None:
-            continue
+    pictures = [(words.keyframe_label(file.stem, begin), cv2.imread(str(file))) for file in files]
+    if not files:
+        chosen = stamps_s[:: max(1, -(-len(stamps_s) // _MAX_KEYFRAMES))]
+        drawn = keyframe_pictures(run, edges, chosen)
+        pictures = [(f"{stamp - begin:.2f} s", image) for stamp, image in drawn]
+    return [{"src": _jpeg(image), "label": label} for label, image in pictures if image is not None]
+
+
+def _jpeg(image: np.ndarray) -> str:
+    """Small picture as a data URL."""
+    if image.shape[1] > _KEYFRAME_WIDTH_PX:
         height = round(image.shape[0] * _KEYFRAME_WIDTH_PX / image.shape[1])
-        if image.shape[1] > _KEYFRAME_WIDTH_PX:
-            image = cv2.resize(image, (_KEYFRAME_WIDTH_PX, height), interpolation=cv2.INTER_AREA)
-        ok, jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 80])
-        if ok:
-            source = "data:image/jpeg;base64," + base64.b64encode(jpeg.tobytes()).decode("ascii")
-            out.append({"src": source, "label": words.keyframe_label(file.stem, begin)})
-    return out
+        image = cv2.resize(image, (_KEYFRAME_WIDTH_PX, height), interpolation=cv2.INTER_AREA)
+    jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 80])[1]
+    return "data:image/jpeg;base64," + base64.b64encode(jpeg.tobytes()).decode("ascii")
 
 
 def _text(path: Path) -> str | None:
