@@ -1,0 +1,135 @@
+"""Pose-only refinement: exact, robust, and silent about nothing."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.optim.pose_only import PoseConfig, PoseStatus, refine_pose
+from edgeslam_torch.optim.problem import PosePrior
+
+K = (520.0, 515.0, 320.0, 240.0)
+
+
+def view(rng: np.random.Generator, n: int = 300, noise_px: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    T = se3.exp(0.2 * rng.normal(size=6))
+    p_c = rng.uniform((-1.5, -1, 2), (1.5, 1, 6), (n, 3))
+    uv = p_c[:, :2] / p_c[:, 2:] * K[:2] + np.array(K[2:]) + noise_px * rng.normal(size=(n, 2))
+    return T, se3.transform(se3.inverse(T), p_c), uv
+
+
+def away(T: np.ndarray, rng: np.random.Generator, size: float = 0.03) -> np.ndarray:
+    return se3.exp(size * rng.normal(size=6)) @ T
+
+
+def error(T: np.ndarray, true: np.ndarray) -> float:
+    return float(np.abs(se3.log(T @ se3.inverse(true))).max())
+
+
+def test_clean_view_comes_back_exactly(rng):
+    T, p, uv = view(rng)
+    result = refine_pose(away(T, rng), p, uv, np.ones(300), K)
+    assert result.status is PoseStatus.OK
+    assert result.n_inliers == 300
+    assert error(result.T_c_w, T) < 1e-6
+    assert result.chi2.max() < 1e-4
+
+
+@pytest.mark.parametrize("share", [0.2, 0.5])
+def test_outliers_are_found(share, rng):
+    T, p, uv = view(rng, 400, 1.0)
+    bad = rng.random(400) < share
+    uv = uv + bad[:, None] * rng.choice([-1, 1], (400, 2)) * rng.uniform(15, 80, (400, 2))
+    result = refine_pose(away(T, rng), p, uv, np.ones(400), K)
+    assert result.status is PoseStatus.OK
+    assert error(result.T_c_w, T) < 0.006  # five sigma of 200 points at 4 m and 1 px
+    assert not result.inliers[bad].any()
+    assert result.inliers[~bad].mean() > 0.9
+
+
+def test_covariance_matches_the_scatter():
+    whitened = []
+    for seed in range(100):
+        rng = np.random.default_rng(seed)
+        T, p, uv = view(rng, 60, 1.0)
+        result = refine_pose(away(T, rng, 0.01), p, uv, np.ones(60), K, config=PoseConfig(chi2=50.0))
+        xi = se3.log(result.T_c_w @ se3.inverse(T))
+        whitened.append(np.linalg.solve(np.linalg.cholesky(result.covariance), xi))
+    assert np.square(whitened).mean() == pytest.approx(1.0, abs=0.2)  # standard error 0.06
+
+
+def test_octave_sigma_weighs(rng):
+    T, p, uv = view(rng, 200)
+    coarse = np.arange(200) < 100
+    uv = uv + coarse[:, None] * 4.0 * rng.normal(size=(200, 2)) + 0.3 * rng.normal(size=(200, 2))
+    told = refine_pose(away(T, rng), p, uv, np.where(coarse, 1 / 4.0, 1 / 0.3), K)
+    untold = refine_pose(away(T, rng), p, uv, np.full(200, 1 / 4.0), K)
+    assert error(told.T_c_w, T) < error(untold.T_c_w, T)
+    assert told.inliers[coarse].mean() > 0.85
+
+
+def test_prior_pulls_by_its_information(rng):
+    T, p, uv = view(rng, 50, 1.0)
+    elsewhere = away(T, rng, 0.01)
+    weak = refine_pose(T, p, uv, np.ones(50), K, prior=PosePrior(0, elsewhere, 1e-3 * np.eye(6)))
+    strong = refine_pose(T, p, uv, np.ones(50), K, prior=PosePrior(0, elsewhere, 1e12 * np.eye(6)))
+    free = refine_pose(T, p, uv, np.ones(50), K)
+    assert error(weak.T_c_w, free.T_c_w) < 1e-4
+    assert error(strong.T_c_w, elsewhere) < 1e-5
+
+
+def test_points_behind_are_outliers_and_do_not_break_it(rng):
+    T, p, uv = view(rng, 200)
+    p = p.copy()
+    p[:40] = se3.transform(se3.inverse(T), se3.transform(T, p[:40]) * np.array([1, 1, -1.0]))
+    result = refine_pose(away(T, rng), p, uv, np.ones(200), K)
+    assert result.status is PoseStatus.OK
+    assert not result.inliers[:40].any()
+    assert np.isinf(result.chi2[:40]).all()
+    assert error(result.T_c_w, T) < 1e-6
+
+
+@pytest.mark.parametrize("n", [0, 1, 5])
+def test_few_points_say_so(n, rng):
+    T, p, uv = view(rng)
+    result = refine_pose(T, p[:n], uv[:n], np.ones(n), K)
+    assert result.status is PoseStatus.FEW_POINTS
+    np.testing.assert_array_equal(result.T_c_w, T)
+    assert result.inliers.shape == (n,)
+
+
+def test_points_that_do_not_fix_a_pose_say_so(rng):
+    T, p, _ = view(rng, 40)
+    p = np.repeat(p[:1], 40, 0)  # one point forty times
+    p_c = se3.transform(T, p)
+    uv = p_c[:, :2] / p_c[:, 2:] * K[:2] + np.array(K[2:])
+    result = refine_pose(T, p, uv, np.ones(40), K)
+    assert result.status is PoseStatus.DEGENERATE
+    np.testing.assert_array_equal(result.T_c_w, T)
+
+
+def test_input_that_is_not_finite_says_so(rng):
+    T, p, uv = view(rng)
+    uv[3, 0] = np.nan
+    assert refine_pose(T, p, uv, np.ones(300), K).status is PoseStatus.NOT_FINITE
+
+
+def test_all_points_behind_end_with_the_start(rng):
+    T, p, uv = view(rng)
+    turned = se3.exp(np.array([0, 0, 0, 0, np.pi, 0])) @ T
+    result = refine_pose(turned, p, uv, np.ones(300), K)
+    assert result.status is PoseStatus.FEW_POINTS
+    np.testing.assert_array_equal(result.T_c_w, turned)
+
+
+def test_lengths_must_agree(rng):
+    T, p, uv = view(rng)
+    with pytest.raises(ValueError, match="equally many"):
+        refine_pose(T, p[:-1], uv, np.ones(300), K)
+
+
+def test_one_iteration_says_that_it_did_not_converge(rng):
+    T, p, uv = view(rng, 300, 1.0)
+    config = replace(PoseConfig(), iterations=1, rounds=1)
+    assert refine_pose(away(T, rng, 0.05), p, uv, np.ones(300), K, config=config).status is PoseStatus.NOT_CONVERGED
