@@ -1,0 +1,112 @@
+"""Fly a simulated drone through a simulated house, run everything on it, and compare with the truth."""
+
+import argparse
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from edgeslam_torch.demo import DemoResult, DemoSettings
+
+EXIT_INTERRUPTED = 130
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's options."""
+    parser.add_argument("--out", type=Path, default=Path("runs/demo"), metavar="DIR", help="results (default: runs/demo)")
+    parser.add_argument("--world", default="room", help="room or corridor (default: room)")
+    parser.add_argument("--seconds", type=float, default=15.0, metavar="N", help="length of the flight (default: 15)")
+    parser.add_argument("--rate", type=float, default=20.0, metavar="HZ", help="images a second (default: 20)")
+    parser.add_argument("--seed", type=int, default=0, help="another number gives another place and flight (default: 0)")
+    parser.add_argument("--images", default="normal", help="camera quality: clean, normal or poor (default: normal)")
+    parser.add_argument("--delay", type=float, default=0.5, metavar="S", help="video delay behind telemetry (default: 0.5)")
+    parser.add_argument("--loss", type=float, default=0.0, metavar="SHARE", help="share of telemetry lost (default: 0)")
+    parser.add_argument("--battery", type=float, default=87.0, metavar="PERCENT", help="charge at take-off (default: 87)")
+    parser.add_argument("--no-telemetry", action="store_true", help="fly without telemetry: no metres from the drone")
+    parser.add_argument("--depth", metavar="FILE|none", help="weights of the depth network, or none to go without")
+    parser.add_argument("--config", type=Path, metavar="FILE.toml", help="settings of the pipeline")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="change one setting; may be repeated"
+    )
+    parser.add_argument("--record-only", action="store_true", help="only write the simulated recording, to DIR/flight")
+
+
+def main(args: argparse.Namespace) -> int:
+    """Run the demo and print how it came out."""
+    from edgeslam_torch.commands.run import resolved_config
+    from edgeslam_torch.demo import record, run_and_judge
+    from edgeslam_torch.progress import make_progress
+
+    settings = _settings(args)
+    config = resolved_config(args)
+    rendered = _Rendered(settings.frames)
+    recorded = record(args.out / "flight", settings, rendered)
+    rendered.done()
+    if args.record_only:
+        print(f"recording: {recorded.folder} (try: edgeslam run {recorded.folder})")
+        return 0
+    with make_progress(settings.frames, sys.stderr.isatty()) as progress:
+        demo = run_and_judge(args.out, recorded, settings, config, [progress])
+    print(report(demo))
+    return EXIT_INTERRUPTED if demo.run.interrupted else 0
+
+
+def report(demo: "DemoResult") -> str:
+    """What a user wants to know, in a few lines."""
+    score, summary = demo.score, demo.run.summary
+    metres = score.units == "metres"
+    scale = "unknown (arbitrary units)" if not metres else f"{100 * score.scale_error:+.1f} % off"
+    lines = [
+        f"flight:     {summary['frames']} images, {demo.path_m:.1f} m, rendered in {demo.render_s:.0f} s",
+        f"tracked:    {100 * score.coverage:.1f} % of the images, first pose at {score.first_pose_s:.2f} s",
+        f"trajectory: {100 * score.ate_sim3_m:.1f} cm ATE after Sim(3) ({100 * score.ate_sim3_m / demo.path_m:.2f} % "
+        f"of the path)" + (f", {100 * score.ate_se3_m:.1f} cm after SE(3)" if metres else ""),
+        f"scale:      {scale}" + (f", from {summary['scale']['source']}" if metres else ""),
+    ]
+    if demo.map is None:
+        lines.append("map:        empty")
+    else:
+        lines.append(
+            f"map:        {demo.map.points} edge points, {100 * demo.map.median_m:.1f} cm from the true surfaces (median), "
+            f"{100 * demo.map.within_5cm:.0f} % within 5 cm"
+        )
+    lines.append(f"speed:      {summary['fps']:.1f} images/s, {summary['cpu_ms_per_frame']:.0f} ms CPU an image")
+    look = next((n for n in ("report.html", "map.png") if (demo.run.folder / n).is_file()), "trajectory.txt")
+    lines.append(f"look at:    {demo.run.folder / look}")
+    return "\n".join(lines)
+
+
+def _settings(args: argparse.Namespace) -> "DemoSettings":
+    from edgeslam_torch.demo import DemoSettings
+    from edgeslam_torch.errors import ConfigError
+    from edgeslam_torch.synthetic.telemetry import TelemetryFaults
+
+    if args.seed < 0:
+        raise ConfigError(f"--seed must not be negative, got {args.seed}")
+    try:
+        faults = TelemetryFaults(video_delay_s=args.delay, loss=args.loss, battery_start=args.battery / 100.0)
+    except ValueError as error:
+        raise ConfigError(f"--loss must lie in [0, 1) and --battery in (0, 100]: {error}") from error
+    settings = DemoSettings(args.world, args.seconds, args.rate, args.seed, args.images)
+    return replace(settings, telemetry=None if args.no_telemetry else faults)
+
+
+class _Rendered:
+    """Says now and then how many images are rendered."""
+
+    def __init__(self, total: int) -> None:
+        self._total = total
+        self._shown = sys.stderr.isatty()
+
+    def __call__(self, done: int) -> None:
+        if self._shown and (done % 10 == 0 or done == self._total):
+            sys.stderr.write(f"\redgeslam: rendering the flight: {done}/{self._total}")
+            if done == self._total:
+                self.done()
+
+    def done(self) -> None:
+        """End the line."""
+        if self._shown:
+            sys.stderr.write("\n")
+            self._shown = False
