@@ -30,6 +30,8 @@ class Tally:
     statuses: dict[str, int] = field(default_factory=dict)
     stage_ms: dict[str, list[float]] = field(default_factory=dict)
     step_ms: list[float] = field(default_factory=list)
+    last_reason: str = ""
+    """Why the last frame that was not simply tracked has the status it has."""
     _was_lost: bool = False
 
     def add(self, output: SlamOutput, step_ms: float) -> None:
@@ -40,6 +42,7 @@ class Tally:
         is_lost = not has_pose and self.first_pose_frame is not None
         self.lost_events += is_lost and not self._was_lost
         self._was_lost = is_lost
+        self.last_reason = output.reason or self.last_reason
         self.frames += 1
         self.own_pose += has_pose
         self.statuses[str(output.status)] = self.statuses.get(str(output.status), 0) + 1
@@ -74,6 +77,7 @@ def summarise(
         "dropped_frames": dropped,
         "left_out": len(source.problems),
         "statuses": tally.statuses,
+        "last_reason": tally.last_reason,
         "duration_s": wall_s,
         "fps": tally.frames / wall_s if wall_s > 0 else None,
         "cpu_ms_per_frame": 1e3 * cpu_s / tally.frames,

@@ -108,7 +108,7 @@ def _write_page(result: "RunResult") -> None:
 
     try:
         write_report(result.folder, judge_map=False)
-    except (EdgeSlamError, OSError) as error:
+    except (EdgeSlamError, OSError, ValueError) as error:
         _say(f"warning: report.html could not be made ({error})")
 
 
@@ -119,6 +119,10 @@ def _report(result: "RunResult", source: "Source") -> None:
         _say(f"left out: {problem.file}: {problem.reason}")
     if len(source.problems) > _MAX_PROBLEMS_SHOWN:
         _say(f"left out: {len(source.problems)} in all, listed in {result.folder / 'summary.json'}")
+    if not summary["tracked"]:
+        _say(
+            f"warning: no frame could be tracked ({summary['last_reason'] or 'no reason known'}); the poses are guesses"
+        )
     print(
         f"{summary['tracked']} of {summary['frames']} frames tracked ({100 * summary['coverage']:.1f} %), "
         f"lost {_times(summary['lost_events'])}, {summary['fps']:.1f} frames/s, "
