@@ -28,7 +28,12 @@ CAMERAS = {
     "clean": CLEAN,
     "normal": CameraFaults(),
     "poor": CameraFaults(
-        exposure_amplitude=0.25, exposure_period_s=4.0, read_noise=3.0, shot_noise=0.35, vignetting=0.35, shutter_s=0.015
+        exposure_amplitude=0.25,
+        exposure_period_s=4.0,
+        read_noise=3.0,
+        shot_noise=0.35,
+        vignetting=0.35,
+        shutter_s=0.015,
     ),
 }
 """Names of ``--images``."""
@@ -138,7 +143,11 @@ def record(folder: Path, settings: DemoSettings, on_frame: Callable[[int], None]
 
 
 def run_and_judge(
-    out: Path, recorded: Recorded, settings: DemoSettings, config: SlamConfig | None = None, listeners: Sequence[Listener] = ()
+    out: Path,
+    recorded: Recorded,
+    settings: DemoSettings,
+    config: SlamConfig | None = None,
+    listeners: Sequence[Listener] = (),
 ) -> DemoResult:
     """Run the pipeline on a simulated recording into ``out`` and compare the result with the truth.
 

@@ -14,15 +14,23 @@ EXIT_INTERRUPTED = 130
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's options."""
-    parser.add_argument("--out", type=Path, default=Path("runs/demo"), metavar="DIR", help="results (default: runs/demo)")
+    parser.add_argument(
+        "--out", type=Path, default=Path("runs/demo"), metavar="DIR", help="results (default: runs/demo)"
+    )
     parser.add_argument("--world", default="room", help="room or corridor (default: room)")
     parser.add_argument("--seconds", type=float, default=15.0, metavar="N", help="length of the flight (default: 15)")
     parser.add_argument("--rate", type=float, default=20.0, metavar="HZ", help="images a second (default: 20)")
-    parser.add_argument("--seed", type=int, default=0, help="another number gives another place and flight (default: 0)")
+    parser.add_argument(
+        "--seed", type=int, default=0, help="another number gives another place and flight (default: 0)"
+    )
     parser.add_argument("--images", default="normal", help="camera quality: clean, normal or poor (default: normal)")
-    parser.add_argument("--delay", type=float, default=0.5, metavar="S", help="video delay behind telemetry (default: 0.5)")
+    parser.add_argument(
+        "--delay", type=float, default=0.5, metavar="S", help="video delay behind telemetry (default: 0.5)"
+    )
     parser.add_argument("--loss", type=float, default=0.0, metavar="SHARE", help="share of telemetry lost (default: 0)")
-    parser.add_argument("--battery", type=float, default=87.0, metavar="PERCENT", help="charge at take-off (default: 87)")
+    parser.add_argument(
+        "--battery", type=float, default=87.0, metavar="PERCENT", help="charge at take-off (default: 87)"
+    )
     parser.add_argument("--no-telemetry", action="store_true", help="fly without telemetry: no metres from the drone")
     parser.add_argument("--depth", metavar="FILE|none", help="weights of the depth network, or none to go without")
     parser.add_argument("--config", type=Path, metavar="FILE.toml", help="settings of the pipeline")

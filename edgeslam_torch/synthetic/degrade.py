@@ -137,7 +137,9 @@ def with_motion_blur(
         share = np.float32(k / (steps - 1) - 0.5)
         if share == 0:
             continue
-        moved = cv2.remap(image, cv2.scaleAdd(flow, -share, grid), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        moved = cv2.remap(
+            image, cv2.scaleAdd(flow, -share, grid), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )
         cv2.accumulate(moved, total)
     return cv2.convertScaleAbs(total, alpha=1.0 / steps)
 

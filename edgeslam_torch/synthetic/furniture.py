@@ -124,7 +124,9 @@ def bed(scene: Scene, place: Place, rng: Rng, width: float, depth: float) -> Non
     width, depth = max(width, 0.95), max(depth, 1.9)
     scene.box(place, (0, depth / 2, 0.15), (width, depth, 0.3), random_paint(rng, WOODS), "bed")
     scene.box(place, (0, 0.03, 0.5), (width, 0.06, 1.0), random_paint(rng, WOODS), "head board")
-    scene.box(place, (0, depth / 2 + 0.02, 0.38), (width * 0.98, depth - 0.06, 0.18), random_paint(rng, CLOTHS), "mattress")
+    scene.box(
+        place, (0, depth / 2 + 0.02, 0.38), (width * 0.98, depth - 0.06, 0.18), random_paint(rng, CLOTHS), "mattress"
+    )
     blanket = random_paint(rng, ("fabric",), vivid=0.1)
     scene.box(place, (0, depth * 0.64, 0.385), (width + 0.02, depth * 0.68, 0.21), blanket, "blanket")
     for x in (-0.25, 0.25):
@@ -136,7 +138,9 @@ def plant(scene: Scene, place: Place, rng: Rng, size: float = 0.0) -> None:
     """Pot, stem and leaves seen from both sides."""
     size = size or float(rng.uniform(0.5, 1.5))
     pot = 0.28 * size
-    scene.prism(place, 0.14 * size + 0.03, pot, random_paint(rng, ("plaster", "rough_plaster", "terrazzo"), vivid=0.12), "pot")
+    scene.prism(
+        place, 0.14 * size + 0.03, pot, random_paint(rng, ("plaster", "rough_plaster", "terrazzo"), vivid=0.12), "pot"
+    )
     scene.box(place, (0, 0, pot + 0.2 * size), (0.03, 0.03, 0.4 * size), Paint("wood", 0, (0.6, 0.7, 0.7)), "stem",
               faces="frbl", inside=True)  # fmt: skip
     green = float(rng.uniform(0.6, 1.2))
@@ -148,7 +152,9 @@ def plant(scene: Scene, place: Place, rng: Rng, size: float = 0.0) -> None:
         base = np.array([0, 0, pot + rng.uniform(0.1, 0.4) * size])
         paint = Paint("fabric", k % 3, (0.35 * green, 0.9 * green, 0.45 * green))
         origin = place.point(base - 0.5 * width * across)
-        scene.surface(origin, place.direction(width * across), place.direction(length * along), paint, "leaf", two_sided=True)
+        scene.surface(
+            origin, place.direction(width * across), place.direction(length * along), paint, "leaf", two_sided=True
+        )
 
 
 def floor_lamp(scene: Scene, place: Place, rng: Rng) -> None:
@@ -197,11 +203,15 @@ def clutter(
                 cover = random_paint(rng, ("plaster", "fabric"), vivid=0.15)
                 special = {"t": picture_paint(rng, "poster")} if rng.random() < 0.5 else None
                 size = (rng.uniform(0.13, 0.2), rng.uniform(0.18, 0.26), thick)
-                scene.box(at.at(0, 0, z, rng.uniform(-0.3, 0.3)), (0, 0, thick / 2), size, cover, "book", special=special)
+                scene.box(
+                    at.at(0, 0, z, rng.uniform(-0.3, 0.3)), (0, 0, thick / 2), size, cover, "book", special=special
+                )
                 z += thick
         elif kind < 0.5:
             height = min(headroom, float(rng.uniform(0.07, 0.16)))
-            scene.prism(at, rng.uniform(0.03, 0.05), height, random_paint(rng, ("plaster", "metal"), vivid=0.15), "cup", sides=6)
+            scene.prism(
+                at, rng.uniform(0.03, 0.05), height, random_paint(rng, ("plaster", "metal"), vivid=0.15), "cup", sides=6
+            )
         elif kind < 0.6:
             height = min(headroom, float(rng.uniform(0.18, 0.34)))
             scene.prism(at, 0.04, 0.7 * height, random_paint(rng, ("metal", "plaster"), vivid=0.2), "bottle", sides=6)

@@ -25,9 +25,7 @@ class PointWorld:
     """``(3, 3)`` calibration matrix [px]."""
 
 
-def box_room(
-    rng: np.random.Generator, n_points: int, dtype: DTypeLike = np.float64, *, n_views: int = 5
-) -> PointWorld:
+def box_room(rng: np.random.Generator, n_points: int, dtype: DTypeLike = np.float64, *, n_views: int = 5) -> PointWorld:
     """Points on floor, ceiling and walls of a 4 x 4 x 2.6 m room, and ``n_views`` cameras that face its +x wall.
 
     The cameras stand 0.5 m or more apart and see (in front of them) every point: all lie at x >= 0.8 m while the

@@ -197,9 +197,7 @@ def _texture_from_st(level: np.ndarray) -> FloatArray:
     return np.array([[w, 0.0, -0.5], [0.0, h, -0.5], [0.0, 0.0, 1.0]])
 
 
-def _draw(
-    image: np.ndarray, iz: FloatArray, ids: np.ndarray, polygon: _Polygon, roi: list[int], world: World
-) -> None:
+def _draw(image: np.ndarray, iz: FloatArray, ids: np.ndarray, polygon: _Polygon, roi: list[int], world: World) -> None:
     """Colour the pixels where this quad is the nearest."""
     x0, y0, x1, y1 = roi
     mine = (ids[y0:y1, x0:x1] == polygon.quad).view(np.uint8)

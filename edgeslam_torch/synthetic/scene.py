@@ -203,9 +203,7 @@ class Scene:
             # A tapered side is a trapezium; the parallelogram through its middle line is close enough.
             slope = 0.5 * (a + b) * (top - 1.0)
             v = -(lift + slope)
-            self.surface(
-                place.point(a - v), place.direction(b - a), place.direction(v), paint, name, solid=solid
-            )
+            self.surface(place.point(a - v), place.direction(b - a), place.direction(v), paint, name, solid=solid)
         path = [(ring[(k + 1) % sides] - ring[k]) * top for k in range(sides // 2)]
         start = ring[0] * top + lift
         for origin, u, v in _rhombi(start, path):

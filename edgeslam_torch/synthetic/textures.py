@@ -41,7 +41,9 @@ def fractal(rng: Rng, shape: tuple[int, int], beta: float = 1.0, stretch: float 
     return noise / max(float(noise.std()), 1e-6)
 
 
-def colour(rng: Rng, saturation: tuple[float, float] = (0.0, 0.5), value: tuple[float, float] = (0.3, 0.9)) -> FloatArray:
+def colour(
+    rng: Rng, saturation: tuple[float, float] = (0.0, 0.5), value: tuple[float, float] = (0.3, 0.9)
+) -> FloatArray:
     """Random colour, BGR in 0..255; hues as indoors: mostly warm, then blue, then anything."""
     kind = rng.random()
     hue = rng.normal(32, 14) if kind < 0.6 else rng.normal(212, 18) if kind < 0.8 else rng.uniform(0, 360)
@@ -136,7 +138,9 @@ def bricks(rng: Rng) -> np.ndarray:
     rows = 16
     columns = 8
     h, w = TILE_PX // rows, TILE_PX // columns
-    tone = colour(rng, (0.3, 0.6), (0.4, 0.7)) if rng.random() < 0.3 else np.float32([60, 75, 150]) * rng.uniform(0.6, 1.2)
+    tone = (
+        colour(rng, (0.3, 0.6), (0.4, 0.7)) if rng.random() < 0.3 else np.float32([60, 75, 150]) * rng.uniform(0.6, 1.2)
+    )
     mortar = colour(rng, (0.0, 0.1), (0.5, 0.8))
     image = np.empty((TILE_PX, TILE_PX, 3), np.float32)
     image[:] = mortar
@@ -217,7 +221,9 @@ def terrazzo(rng: Rng) -> np.ndarray:
         x, y = rng.integers(6, TILE_PX - 6, 2)
         points = np.array([x, y]) + rng.normal(0, rng.uniform(1.0, 4.0), (5, 2))
         cv2.fillConvexPoly(
-            image, cv2.convexHull(points.astype(np.float32)).astype(np.int32), colour(rng, (0, 0.4), (0.2, 0.95)).tolist()
+            image,
+            cv2.convexHull(points.astype(np.float32)).astype(np.int32),
+            colour(rng, (0, 0.4), (0.2, 0.95)).tolist(),
         )
     return image
 
@@ -429,7 +435,14 @@ def door(rng: Rng, shape: tuple[int, int]) -> np.ndarray:
     if rng.random() < 0.6:
         cv2.rectangle(image, (w // 3, h // 6), (w // 3 + w // 4, h // 6 + w // 10), (235, 235, 235), -1)
         cv2.putText(
-            image, f"{rng.integers(100, 400)}", (w // 3 + 3, h // 6 + w // 12), FONTS[1], w / 420, (40, 40, 40), 1, cv2.LINE_AA
+            image,
+            f"{rng.integers(100, 400)}",
+            (w // 3 + 3, h // 6 + w // 12),
+            FONTS[1],
+            w / 420,
+            (40, 40, 40),
+            1,
+            cv2.LINE_AA,
         )
     x, y = int(0.9 * w), int(0.53 * h)
     cv2.rectangle(image, (x - w // 40, y - h // 30), (x + w // 40, y + h // 20), (150, 155, 160), -1, cv2.LINE_AA)
@@ -526,7 +539,14 @@ def keyboard(rng: Rng, shape: tuple[int, int]) -> np.ndarray:
             width = int(rng.choice([1, 1, 1, 1, 1.6]) * w / 17)
             y0, y1 = 3 + r * (h - 6) // 5, (r + 1) * (h - 6) // 5
             cv2.rectangle(image, (x, y0), (min(x + width - 2, w - 4), y1), (60,) * 3 if dark else (240,) * 3, -1)
-            cv2.putText(image, chr(65 + int(rng.integers(26))), (x + 2, y1 - 3), FONTS[0], 0.3, (180,) * 3 if dark else (60,) * 3)
+            cv2.putText(
+                image,
+                chr(65 + int(rng.integers(26))),
+                (x + 2, y1 - 3),
+                FONTS[0],
+                0.3,
+                (180,) * 3 if dark else (60,) * 3,
+            )
             x += width
     return image
 

@@ -129,6 +129,10 @@ class World:
         self.normals_w = np.stack([q.normal_w for q in quads])
         self.texels = np.array([q.texture.image.shape[0] * q.texture.image.shape[1] for q in quads], dtype=np.float64)
         self.two_sided = np.array([q.two_sided for q in quads])
+        self._box_centre = np.array([b.centre_w for b in self.boxes]).reshape(-1, 3)
+        self._box_half = np.array([b.half_m for b in self.boxes]).reshape(-1, 3)
+        yaw = np.array([b.yaw_rad for b in self.boxes])
+        self._box_cos, self._box_sin = np.cos(yaw), np.sin(yaw)
         low, high = self.corners_w.min((0, 1)), self.corners_w.max((0, 1))
         self.bounds_w = np.stack([low, high]) if bounds_w is None else np.asarray(bounds_w, dtype=np.float64)
 
@@ -136,9 +140,13 @@ class World:
         """Distance [m] of points ``(..., 3)`` to the nearest wall or solid; negative outside the bounds."""
         p = np.asarray(p_w, dtype=np.float64)
         free = np.minimum(p - self.bounds_w[0], self.bounds_w[1] - p).min(-1)
-        for box in self.boxes:
-            free = np.minimum(free, box.distance(p))
-        return free
+        if not self.boxes:
+            return free
+        offset = p[..., None, :] - self._box_centre  # (..., B, 3)
+        x = self._box_cos * offset[..., 0] + self._box_sin * offset[..., 1]
+        y = self._box_cos * offset[..., 1] - self._box_sin * offset[..., 0]
+        out = [np.maximum(np.abs(v) - self._box_half[:, k], 0.0) for k, v in enumerate((x, y, offset[..., 2]))]
+        return np.minimum(free, np.sqrt((out[0] ** 2 + out[1] ** 2 + out[2] ** 2).min(-1)))
 
     def floor_below(self, p_w: FloatArray) -> FloatArray:
         """Height [m] of the highest level surface under each point ``(N, 3)``; the lower bound where there is none."""
