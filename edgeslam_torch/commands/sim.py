@@ -1,0 +1,70 @@
+"""``edgeslam sim``: a Tello on this machine's loopback, to try everything without a drone."""
+
+import argparse
+import math
+import signal
+import threading
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's options."""
+    parser.add_argument("--bind", default="127.0.0.1", metavar="ADDRESS", help="listen here (default: loopback only)")
+    parser.add_argument("--command-port", type=int, default=8889, metavar="PORT", help="default: 8889")
+    parser.add_argument("--state-port", type=int, default=8890, metavar="PORT", help="client's port, default: 8890")
+    parser.add_argument("--video-port", type=int, default=11111, metavar="PORT", help="client's port, default: 11111")
+    parser.add_argument("--seed", type=int, default=0, help="of the room (default: 0)")
+    parser.add_argument("--battery", type=float, default=100.0, metavar="PERCENT", help="charge at the start")
+    parser.add_argument("--drain", type=float, default=13.0, metavar="MINUTES", help="flight time of a full battery")
+    parser.add_argument("--loss", type=float, default=0.0, metavar="PERCENT", help="packets lost, each way")
+    parser.add_argument("--latency", type=float, default=3.0, metavar="MS", help="of commands and state")
+    parser.add_argument(
+        "--video-latency", type=float, default=300.0, metavar="MS", help="of the picture (default: 300)"
+    )
+    parser.add_argument("--tilt", type=float, default=12.0, metavar="DEGREES", help="of the camera, downwards")
+    parser.add_argument(
+        "--render-width", type=int, default=480, metavar="PX", help="pictures are painted this wide, sent 960 wide"
+    )
+    parser.add_argument("--sdk", choices=("1.3", "2.0"), default="2.0", help="form of the state lines")
+    parser.add_argument("--duration", type=float, metavar="S", help="stop after this time (default: until Ctrl-C)")
+
+
+def main(args: argparse.Namespace) -> int:
+    """Emulate until Ctrl-C."""
+    from edgeslam_torch.emulator.link import LinkFaults
+    from edgeslam_torch.emulator.room import furnished_drone
+    from edgeslam_torch.emulator.server import EmulatorConfig, TelloEmulator
+    from edgeslam_torch.errors import ConfigError
+
+    width = args.render_width
+    if not 64 <= width <= 960 or not 0 < args.battery <= 100 or args.drain <= 0:
+        raise ConfigError("--render-width must be 64 to 960, --battery above 0 up to 100, --drain positive")
+    try:
+        faults = LinkFaults(args.loss / 100.0, args.latency / 1e3, args.video_latency / 1e3)
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
+    ports = (args.command_port, args.state_port, args.video_port)
+    if not all(0 <= port < 65536 for port in ports):
+        raise ConfigError(f"ports must be 0 to 65535, got {ports}")
+    config = EmulatorConfig(args.bind, *ports, link=faults, seed=args.seed, mission_pads=args.sdk == "2.0")
+    size = (width, round(width * 0.75))
+    drone, paint, _ = furnished_drone(args.seed, math.radians(args.tilt), size, args.battery / 100.0)
+    drone.battery_per_s = 1.0 / (60.0 * args.drain)
+    stop = threading.Event()
+    previous = signal.signal(signal.SIGTERM, lambda *_: stop.set())
+    try:
+        with TelloEmulator(config, paint, drone) as emulator:
+            host = args.bind if args.bind != "0.0.0.0" else "this machine's address"
+            print(
+                f"Tello emulator: commands on {host}:{emulator.command_port}, state to port {args.state_port}, ", end=""
+            )
+            print(f"video to port {args.video_port}; Ctrl-C stops it", flush=True)
+            print(
+                f"try: edgeslam run tello://{args.bind}:{emulator.command_port}:{args.state_port}:{args.video_port}",
+                flush=True,
+            )
+            stop.wait(args.duration)
+    except KeyboardInterrupt:
+        return 130
+    finally:
+        signal.signal(signal.SIGTERM, previous)
+    return 0

@@ -1,0 +1,196 @@
+"""The emulated drone's body: where it is, how it moves under commands, what its sensors say."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+
+from edgeslam_torch.fusion.rotations import matrix_from_rpy, wrapped
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.types import FloatArray
+
+_GRAVITY = 9.80665
+_HOVER_M = 0.8
+_GROUND_M = 0.1
+"""The camera and the range sensor sit this high when the drone stands on the floor."""
+_TAU_S = 0.35
+"""Time constant of the velocity controller."""
+_WALL_M = 0.15
+_TURN_RAD_S = math.radians(90.0)
+
+
+class Mode(StrEnum):
+    """What the drone is doing."""
+
+    GROUND = "on the ground"
+    TAKEOFF = "taking off"
+    FLYING = "flying"
+    LANDING = "landing"
+
+
+@dataclass(slots=True)
+class DroneModel:
+    """Point mass with first-order velocity control and attitude that follows its acceleration.
+
+    World axes: x forward and y left at power-on, z up, origin on the floor below the power-on place.
+    """
+
+    clearance: Callable[[FloatArray], float] = lambda p: math.inf
+    """Free air [m] around a point of the drone's world; the drone stops short of walls."""
+    battery: float = 1.0
+    battery_per_s: float = 1.0 / 780.0
+    """13 minutes of flight on a full battery."""
+    p_w: FloatArray = field(default_factory=lambda: np.array([0.0, 0.0, _GROUND_M]))
+    velocity: FloatArray = field(default_factory=lambda: np.zeros(3))
+    acceleration: FloatArray = field(default_factory=lambda: np.zeros(3))
+    yaw: float = 0.0
+    yaw_rate: float = 0.0
+    mode: Mode = Mode.GROUND
+    motor_s: float = 0.0
+    """Time with motors on [s]."""
+    rc: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    """Sticks in [-1, 1]: right, forward, up, clockwise."""
+    _target: FloatArray | None = None
+    _target_yaw: float | None = None
+    _speed: float = 0.5
+    _busy_since: float = -1.0
+    _clock: float = 0.0
+
+    @property
+    def flying(self) -> bool:
+        """Whether it is off the ground."""
+        return self.mode is not Mode.GROUND
+
+    @property
+    def busy(self) -> bool:
+        """Whether a movement is still under way."""
+        return self.mode in (Mode.TAKEOFF, Mode.LANDING) or self._target is not None or self._target_yaw is not None
+
+    def take_off(self) -> bool:
+        """Climb to 0.8 m; False when already flying or the battery is empty."""
+        if self.flying or self.battery < 0.1:
+            return False
+        self.mode = Mode.TAKEOFF
+        self._target = np.array([self.p_w[0], self.p_w[1], _GROUND_M + _HOVER_M])
+        self._speed, self._busy_since = 0.5, self._clock
+        return True
+
+    def land(self) -> None:
+        """Sink to the floor and stop."""
+        if self.flying:
+            self.stop()
+            self.mode = Mode.LANDING
+
+    def cut(self) -> None:
+        """Emergency: motors off; it drops."""
+        self.stop()
+        self.mode, self.velocity, self.yaw_rate = Mode.GROUND, np.zeros(3), 0.0
+        self.p_w = np.array([self.p_w[0], self.p_w[1], _GROUND_M])
+
+    def stop(self) -> None:
+        """Hover here."""
+        self._target, self._target_yaw, self.rc = None, None, (0.0, 0.0, 0.0, 0.0)
+
+    def move(self, body_m: FloatArray, speed_m_s: float = 0.5) -> None:
+        """Fly by ``body_m`` ``(3,)`` forward, left, up, as seen from the present heading."""
+        c, s = math.cos(self.yaw), math.sin(self.yaw)
+        step = np.array([c * body_m[0] - s * body_m[1], s * body_m[0] + c * body_m[1], body_m[2]])
+        self._target, self._speed, self._busy_since = self.p_w + step, speed_m_s, self._clock
+
+    def turn(self, left_rad: float) -> None:
+        """Turn by an angle, counter-clockwise positive; more than half a turn is flown in full."""
+        self._target_yaw, self._busy_since = self.yaw + left_rad, self._clock
+
+    def step(self, dt: float) -> None:
+        """Advance by ``dt`` seconds."""
+        self._clock += dt
+        if not self.flying:
+            return
+        self.motor_s += dt
+        self.battery = max(0.0, self.battery - dt * self.battery_per_s)
+        if self.battery <= 0.05:
+            self.land()
+        wanted = self._wanted_velocity()
+        self.acceleration = np.clip((wanted - self.velocity) / _TAU_S, -4.0, 4.0)
+        self.velocity = self.velocity + dt * self.acceleration
+        ahead = self.p_w + dt * self.velocity
+        if self.clearance(ahead) < min(_WALL_M, self.clearance(self.p_w)):
+            self.velocity = np.array([0.0, 0.0, self.velocity[2] if self.mode is not Mode.FLYING else 0.0])
+            self._target = None if self.mode is Mode.FLYING else self._target
+            ahead = self.p_w + dt * self.velocity
+        self.p_w = ahead
+        self._step_yaw(dt)
+        self._finish()
+
+    def _wanted_velocity(self) -> FloatArray:
+        if self.mode is Mode.LANDING:
+            return np.array([0.0, 0.0, -0.4])
+        if self._target is not None:
+            error = self._target - self.p_w
+            distance = float(np.linalg.norm(error))
+            return error * (min(self._speed, 1.5 * distance + 0.02) / max(distance, 1e-9))
+        right, forward, up, _ = self.rc
+        c, s = math.cos(self.yaw), math.sin(self.yaw)
+        return np.array([c * forward + s * right, s * forward - c * right, up])
+
+    def _step_yaw(self, dt: float) -> None:
+        if self._target_yaw is not None:
+            error = self._target_yaw - self.yaw
+            wanted = math.copysign(min(_TURN_RAD_S, 3.0 * abs(error) + 0.05), error)
+        else:
+            wanted = -self.rc[3] * math.radians(100.0)
+        self.yaw_rate += dt / 0.15 * (wanted - self.yaw_rate) if dt < 0.15 else wanted - self.yaw_rate
+        self.yaw += dt * self.yaw_rate
+
+    def _finish(self) -> None:
+        late = self._clock - self._busy_since > 20.0  # pressed against a wall
+        if self._target is not None and (late or float(np.linalg.norm(self._target - self.p_w)) < 0.04):
+            self._target = None
+            self.mode = Mode.FLYING
+        if self._target_yaw is not None and (late or abs(self._target_yaw - self.yaw) < math.radians(1.0)):
+            self._target_yaw = None
+        if self.p_w[2] <= _GROUND_M:
+            self.p_w = np.array([self.p_w[0], self.p_w[1], _GROUND_M])
+            if self.mode is Mode.LANDING:
+                self.mode, self.velocity, self.yaw_rate = Mode.GROUND, np.zeros(3), 0.0
+            self.velocity = np.maximum(self.velocity, [-np.inf, -np.inf, 0.0])
+
+    def rpy(self) -> FloatArray:
+        """Roll, pitch, yaw [rad]: a multicopter leans into its acceleration."""
+        c, s = math.cos(self.yaw), math.sin(self.yaw)
+        ahead = c * self.acceleration[0] + s * self.acceleration[1] if self.flying else 0.0
+        left = -s * self.acceleration[0] + c * self.acceleration[1] if self.flying else 0.0
+        return np.array([-math.atan(left / _GRAVITY), math.atan(ahead / _GRAVITY), float(wrapped(np.array(self.yaw)))])
+
+    def T_w_b(self) -> FloatArray:
+        """Body to the drone's world, ``(4, 4)``."""
+        T = np.eye(4)
+        T[:3, :3] = matrix_from_rpy(self.rpy())
+        T[:3, 3] = self.p_w
+        return T
+
+    def specific_force(self) -> FloatArray:
+        """What the accelerometer feels, body axes [m/s^2]."""
+        force = np.array([0.0, 0.0, _GRAVITY]) + (self.acceleration if self.flying else 0.0)
+        return se3.inverse(self.T_w_b())[:3, :3] @ force
+
+
+def state_line(drone: DroneModel, temperature: int = 60, mission_pads: bool = True) -> str:
+    """What the drone sends ten times a second, in the SDK's words, units and axes.
+
+    Velocities are truncated to whole decimetres per second, as the recorded flights show.
+    """
+    rpy = np.degrees(drone.rpy())
+    v = np.trunc(10.0 * drone.velocity * [1.0, -1.0, -1.0] + 0.0).astype(int)
+    force = 1e3 / _GRAVITY * drone.specific_force() * [1.0, -1.0, -1.0]
+    height = max(0.0, drone.p_w[2] - _GROUND_M)
+    pads = "mid:-1;x:0;y:0;z:0;mpry:0,0,0;" if mission_pads else ""
+    return (
+        f"{pads}pitch:{round(-rpy[1])};roll:{round(rpy[0])};yaw:{round(-rpy[2])};"
+        f"vgx:{v[0]};vgy:{v[1]};vgz:{v[2]};templ:{temperature - 2};temph:{temperature};"
+        f"tof:{max(10, round(100 * drone.p_w[2]))};h:{10 * round(10 * height)};bat:{math.ceil(100 * drone.battery)};"
+        f"baro:{100.0 + height:.2f};time:{int(drone.motor_s)};"
+        f"agx:{force[0]:.2f};agy:{force[1]:.2f};agz:{force[2]:.2f};\r\n"
+    )
