@@ -33,24 +33,35 @@ def keyframe_pictures(run: RunFolder, cloud: PointCloud, stamps_s: FloatArray) -
 
     Only sources that are folders of images are looked at; a missing one gives no pictures, not an error.
     """
+    paths = image_paths(run, stamps_s)
+    if len(cloud.p_w) == 0 or not any(paths):
+        return []
+    try:
+        camera = load_camera(run.path / "camera.yaml")
+    except EdgeSlamError:
+        return []
+    out = []
+    for stamp, path in zip(stamps_s, paths, strict=True):
+        image = cv2.imread(str(path)) if path is not None else None
+        if image is None or image.shape[:2] != (camera.height, camera.width):
+            continue
+        pose = int(nearest(run.trajectory.stamps_s, np.array([stamp]))[0])
+        T_c_w = se3.inverse(run.trajectory.T_w_c[pose])
+        out.append((float(stamp), draw_edges(camera.undistort_image(image), camera, T_c_w, cloud)))
+    return out
+
+
+def image_paths(run: RunFolder, stamps_s: FloatArray) -> list[Path | None]:
+    """Image files of the run's source at ``stamps_s``; None where there is none, or the source has no image files."""
     try:
         entries = _entries(run)
-        camera = load_camera(run.path / "camera.yaml")
     except (EdgeSlamError, OSError):
-        return []
-    if not entries or len(stamps_s) == 0 or len(cloud.p_w) == 0:
-        return []
-    image_stamps = np.array([entry.stamp_s for entry in entries])
-    out = []
-    for stamp in stamps_s:
-        entry = entries[int(nearest(image_stamps, np.array([stamp]))[0])]
-        pose = int(nearest(run.trajectory.stamps_s, np.array([stamp]))[0])
-        image = cv2.imread(str(entry.path))
-        fits = image is not None and image.shape[:2] == (camera.height, camera.width)
-        if abs(entry.stamp_s - stamp) < 1e-3 and fits and image is not None:
-            T_c_w = se3.inverse(run.trajectory.T_w_c[pose])
-            out.append((float(stamp), draw_edges(camera.undistort_image(image), camera, T_c_w, cloud)))
-    return out
+        entries = []
+    if not entries:
+        return [None] * len(stamps_s)
+    known = np.array([entry.stamp_s for entry in entries])
+    index = nearest(known, np.asarray(stamps_s))
+    return [entries[i].path if abs(known[i] - t) < 1e-3 else None for i, t in zip(index, stamps_s, strict=True)]
 
 
 def draw_edges(image: np.ndarray, camera: Camera, T_c_w: FloatArray, cloud: PointCloud) -> np.ndarray:

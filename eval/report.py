@@ -19,7 +19,7 @@ from edgeslam_torch.eval.associate import match
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.formats import Trajectory, read_trajectory
 from edgeslam_torch.eval.keyframe_pictures import keyframe_pictures
-from edgeslam_torch.eval.run_folder import RunFolder, open_run
+from edgeslam_torch.eval.run_folder import RunFolder, is_keyframe, open_run
 from edgeslam_torch.eval.run_score import RunScore, evaluate_run
 from edgeslam_torch.io.atomic import write_text
 from edgeslam_torch.types import FloatArray, PointCloud
@@ -216,7 +216,7 @@ class _StatusTable:
 
     def keyframes(self) -> list[int]:
         """Poses of keyframes."""
-        return [k for k, r in enumerate(self.rows) if r.get("keyframe", "").lower() in ("1", "true", "yes")]
+        return [k for k, r in enumerate(self.rows) if is_keyframe(r)]
 
     def cameras(self) -> list[int]:
         """Poses drawn as frusta: the keyframes, thinned, or every so many poses."""

@@ -6,6 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from edgeslam_torch.eval.associate import nearest
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.formats import Trajectory, read_trajectory
 from edgeslam_torch.io.ply import read_ply
@@ -36,6 +39,13 @@ class RunFolder:
         file = self.path / name
         return read_ply(file) if file.is_file() else None
 
+    def keyframe_poses(self) -> list[int]:
+        """Poses of ``trajectory`` that are keyframes; every tenth without a ``status.csv`` that tells."""
+        stamps = [float(r.get("stamp_s") or "nan") for r in self.status if is_keyframe(r)]
+        index = nearest(self.trajectory.stamps_s, np.array(stamps)) if stamps else np.zeros(0, dtype=int)
+        ok = [int(i) for i, t in zip(index, stamps, strict=True) if abs(self.trajectory.stamps_s[i] - t) < 1e-3]
+        return ok or list(range(0, len(self.trajectory), 10))
+
     @property
     def trusted_frames(self) -> int:
         """Frames that `TRUSTED` counts; all poses when there is no ``status.csv``."""
@@ -63,6 +73,11 @@ def open_run(path: Path | str) -> RunFolder:
         read_status(path / "status.csv"),
         read_summary(path / "summary.json"),
     )
+
+
+def is_keyframe(row: dict[str, str]) -> bool:
+    """Whether a row of ``status.csv`` is a keyframe's."""
+    return row.get("keyframe", "").lower() in ("1", "true", "yes")
 
 
 def read_status(path: Path) -> tuple[dict[str, str], ...]:

@@ -7,8 +7,6 @@ from typing import Any
 
 from edgeslam_torch.errors import OutputError
 
-HELP = "judge runs or trajectory files against ground truth"
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's options."""

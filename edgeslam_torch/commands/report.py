@@ -5,8 +5,6 @@ from pathlib import Path
 
 from edgeslam_torch.errors import OutputError
 
-HELP = "write report.html of a run's output folder"
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's options."""

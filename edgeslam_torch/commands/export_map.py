@@ -1,0 +1,121 @@
+"""Edge map of a run to PLY, PCD, a COLMAP text model or an occupancy grid."""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from edgeslam_torch.errors import OutputError
+
+if TYPE_CHECKING:
+    from edgeslam_torch.eval.run_folder import RunFolder
+    from edgeslam_torch.types import PointCloud
+
+FORMATS = ("ply", "pcd", "colmap", "occupancy")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's options."""
+    parser.add_argument("run", type=Path, metavar="DIR", help="output folder of 'edgeslam run'")
+    parser.add_argument("--format", choices=FORMATS, required=True)
+    parser.add_argument("--out", type=Path, help="file (ply, pcd), folder (colmap) or file stem (occupancy)")
+    parser.add_argument("--max-sigma", type=float, metavar="M", help="leave out points less sure than this [m]")
+    parser.add_argument("--min-observations", type=int, default=1, metavar="N", help="leave out points seen less often")
+    parser.add_argument("--resolution", type=float, default=0.05, metavar="M", help="side of an occupancy cell [m]")
+    parser.add_argument("--min-z", type=float, metavar="M", help="lowest obstacle (default: 0.5 m below the camera)")
+    parser.add_argument("--max-z", type=float, metavar="M", help="highest obstacle (default: 0.5 m above the camera)")
+
+
+def main(args: argparse.Namespace) -> int:
+    """Write the map and say where it is."""
+    from edgeslam_torch.eval.run_folder import open_run
+
+    run = open_run(args.run)
+    cloud = _chosen(run, args)
+    try:
+        place = _WRITERS[args.format](run, cloud, args)
+    except OSError as error:
+        raise OutputError(f"{error.filename or args.out}: cannot be written ({error.strerror or error})") from error
+    print(f"{len(cloud.p_w)} points: {place}")
+    if run.summary.get("scale", {}).get("units") == "arbitrary":
+        print("the run's units are arbitrary (no metric scale): lengths in this file are not metres")
+    return 0
+
+
+def _chosen(run: "RunFolder", args: argparse.Namespace) -> "PointCloud":
+    import numpy as np
+
+    from edgeslam_torch.types import PointCloud
+
+    cloud = run.cloud()
+    if cloud is None:
+        raise OutputError(f"{run.path}: no edge_map.ply in this folder; run 'edgeslam run' first")
+    keep = np.isfinite(cloud.p_w).all(axis=1) & (cloud.observations >= args.min_observations)
+    if args.max_sigma is not None:
+        keep &= cloud.sigma_m <= args.max_sigma
+    if not keep.any():
+        raise OutputError(f"{run.path}: no point is left; relax --max-sigma or --min-observations")
+    return PointCloud(cloud.p_w[keep], cloud.colour[keep], cloud.sigma_m[keep], cloud.observations[keep])
+
+
+def _ply(run: "RunFolder", cloud: "PointCloud", args: argparse.Namespace) -> Path:
+    from edgeslam_torch.io.ply import write_ply
+
+    path: Path = args.out or run.path / "export.ply"
+    write_ply(path, cloud)
+    return path
+
+
+def _pcd(run: "RunFolder", cloud: "PointCloud", args: argparse.Namespace) -> Path:
+    from edgeslam_torch.io.pcd import write_pcd
+
+    path: Path = args.out or run.path / "edge_map.pcd"
+    write_pcd(path, cloud)
+    return path
+
+
+def _colmap(run: "RunFolder", cloud: "PointCloud", args: argparse.Namespace) -> Path:
+    from edgeslam_torch.geometry.camera import load_camera
+    from edgeslam_torch.io.colmap import write_colmap
+
+    folder: Path = args.out or run.path / "colmap"
+    camera = load_camera(run.path / "camera.yaml")
+    names, index = _images(run)
+    write_colmap(folder, camera, names, run.trajectory.T_w_c[index], cloud)
+    return folder
+
+
+def _images(run: "RunFolder") -> tuple[list[str], list[int]]:
+    """Keyframes' image names and their poses; a source without image files gets names made of the stamps."""
+    from edgeslam_torch.eval.keyframe_pictures import image_paths
+
+    index = run.keyframe_poses()
+    stamps = run.trajectory.stamps_s[index]
+    found = image_paths(run, stamps)
+    names = [p.name if p is not None else f"{t:.6f}.jpg" for p, t in zip(found, stamps, strict=True)]
+    return names, index
+
+
+def _occupancy(run: "RunFolder", cloud: "PointCloud", args: argparse.Namespace) -> Path:
+    import numpy as np
+
+    from edgeslam_torch.geometry.camera import load_camera
+    from edgeslam_torch.io.occupancy import occupancy_grid, write_occupancy
+
+    if run.summary.get("scale", {}).get("units") == "arbitrary":
+        raise OutputError(f"{run.path}: no occupancy grid without metric scale; run with a depth network or telemetry")
+    heights = None
+    if args.min_z is not None or args.max_z is not None:
+        middle = float(np.median(run.trajectory.positions[:, 2]))
+        low = args.min_z if args.min_z is not None else middle - 0.5
+        heights = (low, args.max_z if args.max_z is not None else middle + 0.5)
+    half_fov = 0.5
+    if (run.path / "camera.yaml").is_file():
+        camera = load_camera(run.path / "camera.yaml")
+        half_fov = float(np.arctan(0.5 * camera.width / camera.fx))
+    views = run.trajectory.T_w_c[run.keyframe_poses()]
+    path: Path = args.out or run.path / "occupancy"
+    write_occupancy(path, occupancy_grid(cloud.p_w, views, args.resolution, heights, half_fov_rad=half_fov))
+    return path.with_suffix(".yaml")
+
+
+_WRITERS = {"ply": _ply, "pcd": _pcd, "colmap": _colmap, "occupancy": _occupancy}

@@ -1,0 +1,47 @@
+"""Open a run's report in the browser, or its recording in the rerun viewer."""
+
+import argparse
+import webbrowser
+from pathlib import Path
+
+from edgeslam_torch.errors import OutputError
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's options."""
+    parser.add_argument("run", type=Path, metavar="DIR", help="output folder of 'edgeslam run'")
+    parser.add_argument(
+        "--viewer", action="store_true", help="the rerun viewer instead of the browser ([viewer] extra)"
+    )
+    parser.add_argument("--save-rrd", type=Path, metavar="FILE", help="write a rerun recording instead of showing it")
+    parser.add_argument("--print", action="store_true", dest="only_print", help="only say where the page is")
+
+
+def main(args: argparse.Namespace) -> int:
+    """Open the page, making it first when it is missing; without a browser, say where it is."""
+    if args.viewer or args.save_rrd is not None:
+        return _rerun(args)
+    from edgeslam_torch.eval.report import write_report
+
+    page = args.run / "report.html"
+    try:
+        page = page if page.is_file() else write_report(args.run)
+    except OSError as error:
+        raise OutputError(f"{page}: cannot be written ({error.strerror or error})") from error
+    print(page.resolve())
+    if not args.only_print and not webbrowser.open(page.resolve().as_uri()):
+        print("no browser here: copy the page to a machine that has one, it needs nothing else")
+    return 0
+
+
+def _rerun(args: argparse.Namespace) -> int:
+    from edgeslam_torch.eval.run_folder import open_run
+    from edgeslam_torch.viewer import Viewer
+
+    run = open_run(args.run)
+    viewer = Viewer(run.name, save=args.save_rrd, show=args.save_rrd is None)
+    viewer.show_run(run.trajectory.stamps_s, run.trajectory.T_w_c, run.cloud(), run.cloud("anchors.ply"))
+    viewer.close()
+    if args.save_rrd is not None:
+        print(args.save_rrd)
+    return 0

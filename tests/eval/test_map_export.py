@@ -1,0 +1,148 @@
+"""Exported maps open in other people's readers."""
+
+import argparse
+import importlib.util
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from edgeslam_torch.commands import export_map
+from edgeslam_torch.errors import EdgeSlamError
+from edgeslam_torch.geometry.camera import PRESETS, Camera
+from edgeslam_torch.io.colmap import write_colmap
+from edgeslam_torch.io.occupancy import FREE, OCCUPIED, UNKNOWN, occupancy_grid, write_occupancy
+from edgeslam_torch.io.pcd import read_pcd, write_pcd
+from edgeslam_torch.types import PointCloud
+
+
+@pytest.fixture
+def cloud(rng: np.random.Generator) -> PointCloud:
+    return PointCloud(
+        rng.normal(size=(50, 3)).astype(np.float32),
+        rng.integers(0, 256, (50, 3)).astype(np.uint8),
+        rng.uniform(0.01, 0.1, 50).astype(np.float32),
+        rng.integers(1, 9, 50).astype(np.int32),
+    )
+
+
+def test_pcd_round_trips(cloud: PointCloud, tmp_path: Path) -> None:
+    write_pcd(tmp_path / "m.pcd", cloud)
+    back = read_pcd(tmp_path / "m.pcd")
+    for name in ("p_w", "colour", "sigma_m", "observations"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(cloud, name))
+
+
+def test_pcd_is_what_the_format_page_says(cloud: PointCloud, tmp_path: Path) -> None:
+    """Read by the header alone, as any PCL reader does, not by what the writer knows."""
+    write_pcd(tmp_path / "m.pcd", cloud)
+    head, body = (tmp_path / "m.pcd").read_bytes().split(b"DATA binary\n")
+    words = {line.split()[0]: line.split()[1:] for line in head.decode().splitlines() if not line.startswith("#")}
+    kinds = {"F": "f", "I": "i", "U": "u"}
+    types = [
+        (name, f"<{kinds[kind]}{size}")
+        for name, kind, size in zip(words["FIELDS"], words["TYPE"], words["SIZE"], strict=True)
+    ]
+    points = np.frombuffer(body, np.dtype(types))
+    assert len(points) == int(words["POINTS"][0]) == int(words["WIDTH"][0]) * int(words["HEIGHT"][0]) == 50
+    np.testing.assert_array_equal(points["y"], cloud.p_w[:, 1])
+    assert points["rgb"].copy().view(np.uint32)[0] & 0xFF == cloud.colour[0, 2]
+
+
+READ_COLMAP = """
+import json, sys, pycolmap
+r = pycolmap.Reconstruction(sys.argv[1])
+image = r.images[2]
+camera = r.cameras[1]
+point = r.points3D[1].xyz
+print(json.dumps({
+    "images": len(r.images), "points": len(r.points3D), "name": image.name, "model": camera.model.name,
+    "centre": image.projection_center().tolist(), "xyz": point.tolist(),
+    "pixel": image.project_point(point).tolist(),
+}))
+"""
+
+
+@pytest.mark.parametrize("camera", [PRESETS["tum_fr1"], PRESETS["kinect"]], ids=["distorted", "pinhole"])
+def test_colmap_reads_the_model_and_projects_as_we_do(camera: Camera, cloud: PointCloud, tmp_path: Path) -> None:
+    if importlib.util.find_spec("pycolmap") is None:
+        pytest.skip("pycolmap is not installed: the COLMAP model is not read by COLMAP")
+    T = np.tile(np.eye(4), (2, 1, 1))
+    T[1, :3, 3] = [0.1, -0.2, -3.0]
+    write_colmap(tmp_path, camera, ["a.jpg", "b c.jpg"], T, cloud)
+    # In its own process: pycolmap and OpenCV each bring a zlib, and both in one process crash.
+    command = [sys.executable, "-c", READ_COLMAP, str(tmp_path)]
+    found = json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+    assert (found["images"], found["points"], found["name"]) == (2, 50, "b_c.jpg")
+    assert found["model"] == ("FULL_OPENCV" if camera.is_distorted else "PINHOLE")
+    np.testing.assert_allclose(found["centre"], T[1, :3, 3], atol=1e-9)
+    p_c = np.asarray(found["xyz"]) - T[1, :3, 3]
+    ours = cv2.projectPoints(p_c.reshape(1, 3), np.zeros(3), np.zeros(3), camera.K, np.array(camera.distortion))[0]
+    np.testing.assert_allclose(np.array(found["pixel"]) - 0.5, ours.reshape(2), atol=1e-3)
+
+
+def look_along(yaw: float, position: tuple[float, float, float]) -> np.ndarray:
+    T = np.eye(4)
+    forward = np.array([np.cos(yaw), np.sin(yaw), 0.0])
+    T[:3, 0], T[:3, 1], T[:3, 2] = np.cross(forward, [0, 0, 1.0]), [0, 0, -1.0], forward
+    T[:3, 3] = position
+    return T
+
+
+def test_occupancy_grid_has_walls_where_they_are(tmp_path: Path) -> None:
+    y = np.linspace(-1.0, 1.0, 400)
+    wall = np.stack([np.full(400, 2.02), y, np.tile([0.9, 1.1], 200)], axis=1)  # x = 2 m
+    floor = np.stack([np.linspace(0.3, 1.9, 400), y, np.zeros(400)], axis=1)  # below the heights
+    views = np.stack([look_along(0.0, (0.0, 0.0, 1.0))])
+    write_occupancy(tmp_path / "m", occupancy_grid(np.concatenate([wall, floor]), views, 0.05))
+    record = yaml.safe_load((tmp_path / "m.yaml").read_text())
+    image = cv2.imread(str(tmp_path / record["image"]), cv2.IMREAD_UNCHANGED)
+    assert record["resolution"] == 0.05 and record["negate"] == 0
+
+    def cell(x: float, y: float) -> int:
+        column = int((x - record["origin"][0]) / record["resolution"])
+        row = int((y - record["origin"][1]) / record["resolution"])
+        return int(image[image.shape[0] - 1 - row, column])
+
+    assert cell(2.02, 0.0) == OCCUPIED and cell(2.02, 0.9) == OCCUPIED
+    assert cell(1.0, 0.0) == FREE and cell(1.5, 0.3) == FREE
+    assert cell(1.0, -0.9) == UNKNOWN, "outside the field of view"
+    columns = np.flatnonzero((image == OCCUPIED).any(axis=0))
+    assert len(columns) == 1, "the wall is one cell thick"
+
+
+def export(*words: object) -> int:
+    parser = argparse.ArgumentParser()
+    export_map.add_arguments(parser)
+    return export_map.main(parser.parse_args([str(w) for w in words]))
+
+
+@pytest.mark.parametrize("form", export_map.FORMATS)
+def test_command_writes_every_format(form: str, run_folder: Callable[..., Path], tmp_path: Path) -> None:
+    run_folder(tmp_path / "a")
+    PRESETS["kinect"].save(tmp_path / "a" / "camera.yaml")
+    before = set((tmp_path / "a").rglob("*"))
+    assert export(tmp_path / "a", "--format", form, "--max-sigma", 0.05) == 0
+    assert set((tmp_path / "a").rglob("*")) > before
+
+
+def test_occupancy_needs_metres(run_folder: Callable[..., Path], tmp_path: Path) -> None:
+    run_folder(tmp_path / "a")
+    path = tmp_path / "a" / "summary.json"
+    summary = json.loads(path.read_text())
+    summary["scale"]["units"] = "arbitrary"
+    path.write_text(json.dumps(summary))
+    with pytest.raises(EdgeSlamError, match="metric scale"):
+        export(tmp_path / "a", "--format", "occupancy")
+
+
+def test_nothing_left_is_said(run_folder: Callable[..., Path], tmp_path: Path) -> None:
+    run_folder(tmp_path / "a")
+    with pytest.raises(EdgeSlamError, match="no point is left"):
+        export(tmp_path / "a", "--format", "ply", "--max-sigma", 1e-9)
