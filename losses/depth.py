@@ -43,8 +43,7 @@ class BerHu(nn.Module):
     def forward(self, log_depth: Tensor, log_target: Tensor, mask: Tensor) -> Tensor:
         """``(B,)``."""
         r = torch.where(mask, log_depth - log_target, 0.0).abs()
-        # c is a threshold, not a quantity to be learnt: no gradient through it.
-        c = (self.fraction * r.detach().flatten(1).amax(1)).clamp(min=1e-6).view(-1, *[1] * (r.ndim - 1))
+        c = (self.fraction * r.flatten(1).amax(1)).clamp(min=1e-6).view(-1, *[1] * (r.ndim - 1))
         return masked_mean(torch.where(r <= c, r, (r * r + c * c) / (2 * c)), mask)
 
 

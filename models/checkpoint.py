@@ -26,7 +26,8 @@ def save_checkpoint(network: FastDepth, metadata: Metadata, path: Path, half: bo
     """Write weights and metadata; ``half`` stores float16 (half the size, depth changes by less than 0.1
     %)."""
     tensors = {k: _stored(v, half) for k, v in network.state_dict().items()}
-    header = {HEADER_KEY: json.dumps(dataclasses.asdict(metadata)), "format": "pt"}
+    # One key only: safetensors writes several in random order, and the same weights should be the same bytes.
+    header = {HEADER_KEY: json.dumps(dataclasses.asdict(metadata))}
     temporary = path.with_name(path.name + ".part")
     safetensors.torch.save_file(tensors, temporary, metadata=header)
     temporary.replace(path)

@@ -50,9 +50,7 @@ class DepthPredictor:
             raise ValueError(f"backend must be 'onnxruntime' or 'torch', got {backend!r}")
         self.weights = DEFAULT_WEIGHTS if weights is None else Path(weights)
         if not self.weights.is_file():
-            raise WeightsError(
-                f"{self.weights}: no such weights file; `edgeslam weights list` shows what there is"
-            )
+            raise WeightsError(f"{self.weights}: no such weights file; `edgeslam weights list` shows what there is")
         self._engine = _open_engine(self.weights, backend, threads)
 
     @property
@@ -87,9 +85,7 @@ class DepthPredictor:
         small = camera.scaled(width, height)
         focal_ratio = float(np.sqrt(small.fx * small.fy)) / self.metadata.focal_px
         size = (camera.width, camera.height)
-        depth_m = cv2.resize(
-            np.exp(log_depth) * np.float32(focal_ratio), size, interpolation=cv2.INTER_LINEAR
-        )
+        depth_m = cv2.resize(np.exp(log_depth) * np.float32(focal_ratio), size, interpolation=cv2.INTER_LINEAR)
         sigma_log = cv2.resize(sigma, size, interpolation=cv2.INTER_LINEAR)
         return DepthMap(np.asarray(depth_m, np.float32), np.asarray(sigma_log, np.float32))
 
@@ -140,6 +136,7 @@ def _open_engine(weights: Path, backend: str, threads: int) -> _Engine:
 class _OnnxEngine:
     def __init__(self, weights: Path, threads: int) -> None:
         import onnxruntime
+        from onnxruntime.capi import onnxruntime_pybind11_state as ort_errors
 
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
@@ -152,7 +149,7 @@ class _OnnxEngine:
             source, self.metadata = build_graph(weights)
         try:
             self._session = onnxruntime.InferenceSession(source, options, providers=["CPUExecutionProvider"])
-        except RuntimeError as error:  # onnxruntime's own exceptions derive from it
+        except (ort_errors.Fail, ort_errors.InvalidProtobuf, ort_errors.InvalidGraph, RuntimeError) as error:
             raise WeightsError(f"{weights}: onnxruntime cannot load it ({str(error)[:160]})") from error
         if weights.suffix == ".onnx":
             record = self._session.get_modelmeta().custom_metadata_map.get("edgeslam")

@@ -1,0 +1,80 @@
+"""Photometric reprojection."""
+
+import pytest
+import torch
+from torch.autograd import gradcheck
+
+from edgeslam_torch.losses.photometric import PhotometricLoss, SmoothnessLoss, dissimilarity, warp_to
+
+K = torch.tensor([[[20.0, 0.0, 11.5], [0.0, 20.0, 7.5], [0.0, 0.0, 1.0]]], dtype=torch.float64)
+
+
+def picture(shift_px: float = 0.0) -> torch.Tensor:
+    """Smooth stripes and blobs, moved to the right."""
+    v, u = torch.meshgrid(torch.arange(16.0), torch.arange(24.0), indexing="ij")
+    u = u - shift_px
+    rgb = torch.stack((torch.sin(u * 0.7), torch.cos(u * 0.4 + v * 0.3), torch.sin(v * 0.5 - u * 0.2)))
+    return (rgb[None].double() + 1) / 2
+
+
+def sideways(x: float) -> torch.Tensor:
+    T = torch.eye(4, dtype=torch.float64)[None].clone()
+    T[0, 0, 3] = x
+    return T
+
+
+def test_warp_shifts_by_the_disparity() -> None:
+    """Camera j 0.2 to the left of i: f b / z = 20 * 0.2 / 2 = 2 px to the right."""
+    depth = torch.full((1, 1, 16, 24), 2.0, dtype=torch.float64)
+    warped, valid = warp_to(picture(2.0), depth, sideways(0.2), K)
+    inner = valid.expand_as(warped)
+    torch.testing.assert_close(warped[inner], picture()[inner], atol=1e-9, rtol=0)
+    assert valid[0, 0, :, -2:].sum() == 0
+    assert valid[0, 0, :, :-2].all()
+
+
+def test_dissimilarity_is_zero_for_equal_images_and_positive_otherwise() -> None:
+    torch.testing.assert_close(
+        dissimilarity(picture(), picture()), torch.zeros(1, 1, 16, 24).double(), atol=1e-7, rtol=0
+    )
+    assert dissimilarity(picture(), picture(3.0)).mean() > 0.05
+
+
+def test_loss_prefers_the_true_depth() -> None:
+    loss = PhotometricLoss()
+    image_i, images_j = picture(), picture(2.0)[:, None]
+    costs = [
+        loss(image_i, images_j, torch.full((1, 1, 16, 24), z).double(), sideways(0.2)[:, None], K).item()
+        for z in (1.4, 2.0, 3.2)
+    ]
+    # Not zero: SSIM looks one pixel into the strip that frame j does not see.
+    assert costs[1] < 0.01
+    assert costs[1] < min(costs[0], costs[2]) / 5
+
+
+def test_points_behind_the_camera_are_left_out() -> None:
+    T = torch.eye(4, dtype=torch.float64)[None].clone()
+    T[0, 2, 3] = -5.0
+    depth = torch.full((1, 1, 16, 24), 2.0, dtype=torch.float64, requires_grad=True)
+    value = PhotometricLoss()(picture(), picture()[:, None], depth, T[:, None], K)
+    value.sum().backward()
+    assert value.item() == 0
+    assert depth.grad is not None
+    assert torch.isfinite(depth.grad).all()
+
+
+def test_gradient_is_right() -> None:
+    torch.manual_seed(0)
+    depth = (2.0 + 0.2 * torch.rand(1, 1, 16, 24, dtype=torch.float64)).requires_grad_()
+    assert gradcheck(
+        lambda d: dissimilarity(warp_to(picture(2.0), d, sideways(0.2), K)[0], picture()).mean(), depth, fast_mode=True
+    )
+
+
+def test_smoothness_ignores_slopes_and_bends_at_contrast() -> None:
+    flat = torch.full((1, 3, 8, 8), 0.5)
+    slope = torch.linspace(0, 1, 8).expand(1, 1, 8, 8)
+    assert SmoothnessLoss()(slope, flat).item() == pytest.approx(0, abs=1e-6)
+    step = (torch.arange(8) > 3).float().expand(1, 1, 8, 8)
+    edge = (torch.arange(8) > 3).float().expand(1, 3, 8, 8)
+    assert SmoothnessLoss()(step, edge).item() < 0.01 * SmoothnessLoss()(step, flat).item()
