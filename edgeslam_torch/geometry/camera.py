@@ -68,7 +68,9 @@ class Camera:
         if not self.is_distorted or len(uv) == 0:
             return np.asarray(uv, dtype=np.float32)
         points = np.ascontiguousarray(uv, dtype=np.float64).reshape(-1, 1, 2)
-        return cv2.undistortPoints(points, self.K, np.array(self.distortion), P=self.K).reshape(-1, 2).astype(np.float32)
+        return (
+            cv2.undistortPoints(points, self.K, np.array(self.distortion), P=self.K).reshape(-1, 2).astype(np.float32)
+        )
 
     def undistort_image(self, image: np.ndarray) -> np.ndarray:
         """Image resampled to the undistorted pinhole camera of the same ``K``."""
@@ -84,7 +86,7 @@ class Camera:
         return maps[0], maps[1]
 
     def back_project(self, uv: FloatArray, depth_m: FloatArray) -> FloatArray:
-        """Points ``(N, 3)`` in the camera frame of undistorted pixels ``(N, 2)`` at z-depth ``(N,)``, paper eq. (17)."""
+        """Points ``(N, 3)`` in the camera frame of undistorted pixels ``(N, 2)`` at z-depth ``(N,)``, eq. (17)."""
         uv, z = np.asarray(uv, dtype=np.float64), np.asarray(depth_m, dtype=np.float64)
         x = (uv[:, 0] - self.cx) / self.fx * z
         y = (uv[:, 1] - self.cy) / self.fy * z
@@ -144,12 +146,31 @@ def load_camera(name: str | Path) -> Camera:
         record = yaml.safe_load(path.read_text(encoding="utf-8").replace("%YAML:1.0", ""))
         if not isinstance(record, dict):
             raise ValueError("no key: value lines in it")
-        return _camera_from_record(record, str(path))
-    except (yaml.YAMLError, UnicodeDecodeError, KeyError, TypeError, ValueError, IndexError) as error:
+        return _plausible(_camera_from_record(record, str(path)))
+    except OSError as error:
+        raise CalibrationError(f"{path}: {error.strerror or error}") from error
+    except CalibrationError as error:
+        raise CalibrationError(f"{path}: {error}") from error
+    except RecursionError as error:
+        raise CalibrationError(f"{path}: not a camera calibration, nested too deeply") from error
+    except (yaml.YAMLError, KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
         reason = " ".join(str(error).split())
         raise CalibrationError(
-            f"{path}: not a camera calibration ({type(error).__name__}: {reason}); it needs width, height, fx, fy, cx, cy"
+            f"{path}: not a camera calibration ({type(error).__name__}: {reason}); "
+            "it needs width, height, fx, fy, cx, cy"
         ) from error
+
+
+def _plausible(camera: Camera) -> Camera:
+    """The camera, unless its numbers cannot be pixels of such an image (millimetres, swapped lines)."""
+    longest = max(camera.width, camera.height)
+    inside = -longest < camera.cx < 2 * longest and -longest < camera.cy < 2 * longest
+    if not inside or not 0.05 * longest < min(camera.fx, camera.fy) <= max(camera.fx, camera.fy) < 50 * longest:
+        raise CalibrationError(
+            f"fx {camera.fx:g}, fy {camera.fy:g}, cx {camera.cx:g}, cy {camera.cy:g} cannot be pixels of a "
+            f"{camera.width}x{camera.height} image"
+        )
+    return camera
 
 
 def _camera_from_record(record: dict[str, Any], source: str) -> Camera:
@@ -169,7 +190,9 @@ def _camera_from_record(record: dict[str, Any], source: str) -> Camera:
     if model != "pinhole":
         raise ValueError(f"camera model {model!r} is not supported, only pinhole")
     fx, fy, cx, cy = (float(record[key]) for key in ("fx", "fy", "cx", "cy"))
-    return Camera(int(record["width"]), int(record["height"]), fx, fy, cx, cy, _five(record.get("distortion", [])), source)
+    return Camera(
+        int(record["width"]), int(record["height"]), fx, fy, cx, cy, _five(record.get("distortion", [])), source
+    )
 
 
 def _five(coefficients: list[float]) -> tuple[float, ...]:

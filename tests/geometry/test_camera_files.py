@@ -1,0 +1,61 @@
+"""Calibration files: the three kinds we read, and what is said about the ones we cannot."""
+
+import pytest
+
+from edgeslam_torch.errors import CalibrationError
+from edgeslam_torch.geometry.camera import PRESETS, Camera, load_camera
+
+GOOD = "width: 640\nheight: 480\nfx: 500\nfy: 501\ncx: 320\ncy: 240\n"
+ROS = (
+    "image_width: 640\nimage_height: 480\ncamera_matrix: {data: [500, 0, 320, 0, 501, 240, 0, 0, 1]}\n"
+    "distortion_model: plumb_bob\ndistortion_coefficients: {data: [0.1, 0.2, 0.3, 0.4, 0.5]}\n"
+)
+
+
+def test_own_file_round_trips(tmp_path):
+    PRESETS["tum_fr1"].save(tmp_path / "camera.yaml")
+    back = load_camera(tmp_path / "camera.yaml")
+    assert (back.fx, back.cy, back.distortion) == (517.306408, 255.313989, PRESETS["tum_fr1"].distortion)
+
+
+def test_ros_file(tmp_path):
+    (tmp_path / "ost.yaml").write_text(ROS)
+    camera = load_camera(tmp_path / "ost.yaml")
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (500.0, 501.0, 320.0, 240.0)
+    assert camera.distortion == (0.1, 0.2, 0.3, 0.4, 0.5)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_presets_load_and_say_so(name):
+    assert load_camera(name).source == f"preset {name}"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "no key: value lines"),
+        ("just words", "no key: value lines"),
+        ("[" * 3000, "not a camera calibration"),
+        (GOOD.replace("fx: 500", "fx: -500"), "must be positive"),
+        (GOOD.replace("fx: 500", "fx: .nan"), "not finite"),
+        (GOOD.replace("fx: 500", "fx: 3.6"), "cannot be pixels"),
+        (GOOD.replace("cx: 320", "cx: 99999"), "cannot be pixels"),
+        (GOOD.replace("width: 640", "width: .inf"), "not a camera calibration"),
+        (GOOD.replace("fy: 501\n", ""), "KeyError: 'fy'"),
+        (GOOD + "model: fisheye\n", "only pinhole"),
+        (GOOD + "distortion: [1, 2, 3, 4, 5, 6]\n", "6 distortion coefficients"),
+        (ROS.replace("plumb_bob", "equidistant"), "'equidistant' is not supported"),
+    ],
+)
+def test_wrong_file_is_refused_by_name(tmp_path, text, words):
+    (tmp_path / "c.yaml").write_text(text)
+    with pytest.raises(CalibrationError, match=f"c.yaml: .*{words}"):
+        load_camera(tmp_path / "c.yaml")
+
+
+def test_scaled_camera_sees_the_same_rays():
+    camera = Camera(640, 480, 500.0, 510.0, 300.0, 250.0)
+    half = camera.scaled(320, 240)
+    # the corner of the image (pixel centres at integers: -0.5) stays the corner
+    assert (-0.5 - half.cx) / half.fx == pytest.approx((-0.5 - camera.cx) / camera.fx)
+    assert (239.5 - half.cy) / half.fy == pytest.approx((479.5 - camera.cy) / camera.fy)
