@@ -95,7 +95,9 @@ def _straight_runs(edges: np.ndarray, config: JunctionConfig) -> tuple[np.ndarra
     """Contour points ``(P, 2)`` and straight runs ``(S, 4)``: first point, end, contour, next run of the contour."""
     mask = (np.asarray(edges) != 0).astype(np.uint8)
     contours, _ = cv2.findContours(mask, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
-    points, runs, at = [], [], 0
+    points: list[np.ndarray] = []
+    runs: list[tuple[int, int, int, int]] = []
+    at = 0
     for number, contour in enumerate(contours):
         n = len(contour)
         if n < 4 * config.min_arm_px:  # two arms, out and back

@@ -1,0 +1,155 @@
+"""Which edge of another keyframe an edge pixel should lie on: the nearest one that runs the same way."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.types import Edges, FloatArray, IntArray
+
+MAX_TURN_RAD = 0.44
+"""Largest angle (25 degrees) between the predicted and the seen normal of a partner."""
+
+
+@dataclass(frozen=True, slots=True)
+class EdgeField:
+    """For every pixel of one keyframe, its nearest edge pixel among those of each orientation."""
+
+    nearest: IntArray
+    """``(B, H, W)`` index into the keyframe's edges, -1 where the bin is empty, int32."""
+    edges: Edges
+    inverse_depth: FloatArray
+    """``(E,)`` inverse depths of its edges [1/m]; zero where unknown."""
+
+
+def edge_field(edges: Edges, inverse_depth: FloatArray, size: tuple[int, int], bins: int = 4) -> EdgeField:
+    """Prepare a keyframe's edges for look-up.
+
+    Args:
+        edges: Edge pixels with their normals.
+        inverse_depth: ``(E,)`` [1/m], zero where unknown.
+        size: Width and height [px].
+        bins: Directions of the normal, overlapping by what a partner may be turned; one bin ignores them.
+    """
+    width, height = size
+    u, v = np.rint(edges.uv).astype(np.int64).T
+    inside = (u >= 0) & (v >= 0) & (u < width) & (v < height)
+    which = np.flatnonzero(inside)
+    nearest = np.full((bins, height, width), -1, np.int32)
+    angle = np.arctan2(edges.normal[:, 1], edges.normal[:, 0])
+    for b in range(bins):
+        member = which
+        if bins > 1:
+            off = np.abs(np.angle(np.exp(1j * (angle[which] - 2 * np.pi * b / bins))))
+            member = which[off <= np.pi / bins + MAX_TURN_RAD]
+        if len(member) == 0:
+            continue
+        background = np.ones((height, width), np.uint8)
+        background[v[member], u[member]] = 0
+        _, labels = cv2.distanceTransformWithLabels(
+            background, cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+        )
+        index = np.full(int(labels.max()) + 1, -1, np.int32)
+        index[labels[v[member], u[member]]] = member
+        nearest[b] = index[labels]
+    return EdgeField(nearest, edges, np.asarray(inverse_depth))
+
+
+@dataclass(frozen=True, slots=True)
+class EdgePairs:
+    """Pairs of an edge pixel and its partner in another pose; fields as `EdgeTerms` takes them."""
+
+    pair_edge: IntArray
+    pair_pose: IntArray
+    pair_uv: FloatArray
+    pair_normal: FloatArray
+    pair_inverse_depth: FloatArray
+    distance_px: FloatArray
+    """``(P,)`` signed distance across the edge, predicted minus observed."""
+
+
+def associate_edges(
+    fields: Sequence[EdgeField | None],
+    T_c_w: FloatArray,
+    host: IntArray,
+    uv: FloatArray,
+    normal: FloatArray,
+    inverse_depth: FloatArray,
+    pair_edge: IntArray,
+    pair_pose: IntArray,
+    K: tuple[float, float, float, float],
+    max_px: float = 4.0,
+    max_turn_rad: float = MAX_TURN_RAD,
+    max_depth_ratio: float = 1.35,
+) -> EdgePairs:
+    """Partners of edge pixels in their target poses.
+
+    A pair is kept when the projected pixel lies in the image, an edge runs there in the same direction with the
+    same side bright, it is near across and along, and its depth, where known, agrees.
+
+    Args:
+        fields: One per pose; None for a pose that is no target.
+        T_c_w: World-to-camera poses ``(W, 4, 4)``.
+        host: ``(E,)`` pose of each edge pixel.
+        uv: ``(E, 2)`` edge pixels.
+        normal: ``(E, 2)`` their unit normals.
+        inverse_depth: ``(E,)`` [1/m].
+        pair_edge: ``(P,)`` candidate pairs: edge.
+        pair_pose: ``(P,)`` candidate pairs: target pose.
+        K: fx, fy, cx, cy [px].
+        max_px: Largest distance to the partner.
+        max_turn_rad: Largest angle between the predicted and the seen normal.
+        max_depth_ratio: Largest ratio between the predicted and the seen depth.
+    """
+    f, c = np.array(K[:2]), np.array(K[2:])
+    parts = []
+    for pose in np.unique(pair_pose):
+        field = fields[pose]
+        if field is None or len(field.edges.uv) == 0:
+            continue
+        edge = np.asarray(pair_edge)[pair_pose == pose]
+        T = T_c_w[pose] @ se3.inverse(T_c_w[host[edge]])
+        at, iz = _project(T, uv[edge], inverse_depth[edge], f, c)
+        # The normal turns with the edge: move a pixel along it, at the same depth, and see where that goes.
+        along = np.stack((-normal[edge, 1], normal[edge, 0]), 1)
+        moved, _ = _project(T, uv[edge] + along, inverse_depth[edge], f, c)
+        tangent = moved - at
+        tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-9)
+        predicted = np.stack((tangent[:, 1], -tangent[:, 0]), 1)
+        bins, height, width = field.nearest.shape
+        pixel = np.rint(np.clip(at, -1, max(width, height))).astype(np.int64)
+        inside = (iz > 0) & (pixel >= 0).all(1) & (pixel[:, 0] < width) & (pixel[:, 1] < height)
+        direction = np.arctan2(predicted[:, 1], predicted[:, 0]) * bins / (2 * np.pi)
+        b = np.rint(direction).astype(np.int64) % bins
+        x, y = np.where(inside, pixel[:, 0], 0), np.where(inside, pixel[:, 1], 0)
+        partner = field.nearest[b, y, x]
+        ok = inside & (partner >= 0)
+        partner = np.where(ok, partner, 0)
+        step = at - field.edges.uv[partner]
+        seen = field.edges.normal[partner].astype(np.float64)
+        held = field.inverse_depth[partner].astype(np.float64)
+        ok &= (step * step).sum(1) <= max_px**2
+        ok &= (seen * predicted).sum(1) >= np.cos(max_turn_rad)
+        ratio = np.where(held > 0, iz / np.where(held > 0, held, 1.0), 1.0)
+        ok &= (ratio < max_depth_ratio) & (ratio > 1.0 / max_depth_ratio)
+        k = np.flatnonzero(ok)
+        across = (step[k] * seen[k]).sum(1)
+        target = np.full(len(k), pose, dtype=np.int64)
+        parts.append((edge[k], target, field.edges.uv[partner[k]].astype(np.float64), seen[k], held[k], across))
+    if not parts:
+        none, two = np.zeros(0), np.zeros((0, 2))
+        return EdgePairs(np.zeros(0, np.int64), np.zeros(0, np.int64), two, two, none, none)
+    return EdgePairs(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def _project(
+    T: FloatArray, uv: FloatArray, inverse_depth: FloatArray, f: FloatArray, c: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Pixels ``(P, 2)`` and inverse depths ``(P,)`` in the target; not positive behind it."""
+    ray = (uv - c) / f
+    q = T[:, :3, 0] * ray[:, :1] + T[:, :3, 1] * ray[:, 1:] + T[:, :3, 2] + T[:, :3, 3] * inverse_depth[:, None]
+    front = q[:, 2] > 1e-6
+    z = np.where(front, q[:, 2], 1.0)
+    return np.where(front[:, None], q[:, :2] / z[:, None] * f + c, -1e6), np.where(front, inverse_depth / z, -1.0)

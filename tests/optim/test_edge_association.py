@@ -1,0 +1,142 @@
+"""Partners of edge pixels: the right edge, the right way round, and the pose that they give back."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.optim.edge_association import EdgeField, EdgePairs, associate_edges, edge_field
+from edgeslam_torch.optim.local_ba import refine_window
+from edgeslam_torch.optim.problem import EdgeTerms, LmConfig, WindowProblem
+from edgeslam_torch.types import Edges, FloatArray
+
+K = (500.0, 500.0, 319.5, 239.5)
+SIZE = (640, 480)
+
+
+def segments(rng: np.random.Generator, count: int = 60) -> tuple[FloatArray, FloatArray]:
+    """Points along straight 3-D segments ``(N, 3)`` and the segments' directions ``(N, 3)``."""
+    middle = rng.uniform((-1.6, -1.2, 3), (1.6, 1.2, 6), (count, 3))
+    direction = rng.normal(size=(count, 3)) * np.array([1, 1, 0.4])
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    s = np.linspace(-0.35, 0.35, 120)[None, :, None]
+    return (middle[:, None] + s * direction[:, None]).reshape(-1, 3), np.repeat(direction, 120, 0)
+
+
+def make_edges(uv: FloatArray, normal: FloatArray) -> Edges:
+    return Edges(uv.astype(np.float32), normal.astype(np.float32), np.zeros((len(uv), 3), np.uint8))
+
+
+def see(T: FloatArray, p_w: FloatArray, direction: FloatArray) -> tuple[Edges, FloatArray]:
+    """Edge pixels at whole pixels, normals to the left of the segments, and inverse depths."""
+    p, q = se3.transform(T, p_w), se3.transform(T, p_w + 1e-4 * direction)
+    uv = p[:, :2] / p[:, 2:] * K[:2] + np.array(K[2:])
+    along = q[:, :2] / q[:, 2:] * K[:2] + np.array(K[2:]) - uv
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    normal = np.stack((along[:, 1], -along[:, 0]), 1)
+    pixel, first = np.unique(np.rint(uv), axis=0, return_index=True)
+    inside = (pixel >= 0).all(1) & (pixel < np.array(SIZE)).all(1)
+    first = first[inside]
+    edges = Edges(
+        pixel[inside].astype(np.float32), normal[first].astype(np.float32), np.zeros((len(first), 3), np.uint8)
+    )
+    return edges, 1.0 / p[first, 2]
+
+
+def two_views(rng: np.random.Generator) -> tuple[FloatArray, list[EdgeField]]:
+    p_w, direction = segments(rng)
+    T = np.stack([np.eye(4), se3.exp(np.array([-0.2, 0.05, 0.1, 0.01, 0.03, 0.15]))])
+    return T, [edge_field(*see(t, p_w, direction), SIZE) for t in T]
+
+
+def pairs_of(
+    T: FloatArray, fields: list[EdgeField], inverse_depth: FloatArray | None = None, **gates: float
+) -> EdgePairs:
+    edges = fields[0].edges
+    count = len(edges.uv)
+    depth = fields[0].inverse_depth
+    everything = np.arange(count)
+    host = np.zeros(count, int)
+    return associate_edges(fields, T, host, edges.uv, edges.normal, depth, everything, np.ones(count, int), K, **gates)
+
+
+def test_at_the_true_pose_nearly_all_edges_find_a_partner_within_a_pixel(rng):
+    T, fields = two_views(rng)
+    pairs = pairs_of(T, fields)
+    assert len(pairs.pair_edge) > 0.6 * len(fields[0].edges.uv)  # the rest has left the image or is hidden
+    assert np.quantile(np.abs(pairs.distance_px), 0.9) < 1.0
+    assert (pairs.pair_pose == 1).all()
+
+
+def test_edges_that_run_the_other_way_are_no_partners(rng):
+    T, fields = two_views(rng)
+    edges = fields[1].edges
+    flipped = edge_field(replace(edges, normal=-edges.normal), fields[1].inverse_depth, SIZE)
+    assert len(pairs_of(T, [fields[0], flipped]).pair_edge) < 0.15 * len(pairs_of(T, fields).pair_edge)
+
+
+def test_depth_that_disagrees_is_no_partner(rng):
+    T, fields = two_views(rng)
+    doubled = replace(fields[1], inverse_depth=2.0 * fields[1].inverse_depth)
+    assert len(pairs_of(T, [fields[0], doubled]).pair_edge) == 0
+    unknown = replace(fields[1], inverse_depth=np.zeros_like(fields[1].inverse_depth))
+    assert len(pairs_of(T, [fields[0], unknown]).pair_edge) >= len(pairs_of(T, fields).pair_edge)
+
+
+def test_bins_find_the_right_edge_beside_a_nearer_crossing_one():
+    across = np.stack([np.full(41, 100.0), np.arange(80.0, 121.0)], 1)  # upright, normal to the right
+    lengthwise = np.stack([np.arange(104.0, 150.0), np.full(46, 100.0)], 1)  # level, normal down
+    uv = np.concatenate([across, lengthwise]).astype(np.float32)
+    normal = np.repeat(np.array([[1, 0], [0, 1]], np.float32), (41, 46), 0)
+    field = edge_field(make_edges(uv, normal), np.zeros(87), SIZE)
+    one = edge_field(make_edges(uv, normal), np.zeros(87), SIZE, bins=1)
+    assert field.nearest[0, 100, 103] == 20  # of the upright ones, though the level one is nearer
+    assert one.nearest[0, 100, 103] == 41
+
+
+def test_no_edges_no_pairs(rng):
+    T, fields = two_views(rng)
+    assert len(pairs_of(T, [fields[0], None]).pair_edge) == 0  # type: ignore[list-item]
+    empty = make_edges(np.zeros((0, 2)), np.zeros((0, 2)))
+    assert len(pairs_of(T, [fields[0], edge_field(empty, np.zeros(0), SIZE)]).pair_edge) == 0
+
+
+def test_edges_alone_bring_a_pose_back(rng):
+    T, fields = two_views(rng)
+    edges, depth = fields[0].edges, fields[0].inverse_depth
+    E = len(edges.uv)
+    start = np.stack([T[0], se3.exp(np.array([0.01, -0.01, 0.01, 0.002, -0.003, 0.004])) @ T[1]])
+    none = np.zeros(0)
+    for _ in range(4):  # associate, refine, again
+        pairs = pairs_of(start, fields, max_px=6.0)
+        terms = EdgeTerms(
+            host=np.zeros(E, int),
+            uv=edges.uv,
+            inverse_depth=depth,
+            prior=depth,
+            prior_sigma=0.02 * depth,
+            pair_edge=pairs.pair_edge,
+            pair_pose=pairs.pair_pose,
+            pair_uv=pairs.pair_uv,
+            pair_normal=pairs.pair_normal,
+            pair_inv_sigma=np.full(len(pairs.pair_edge), 2.0),
+            pair_inverse_depth=np.zeros(len(pairs.pair_edge)),
+        )
+        problem = WindowProblem(
+            start, np.array([True, False]), np.zeros((0, 3)), none, none, np.zeros((0, 2)), none, K, edges=terms
+        )
+        start = refine_window(problem, LmConfig(max_iterations=10)).T_c_w
+    # From 1 cm off. Edge pixels are whole pixels and a pixel's depth is that of the first point in it.
+    assert np.abs(se3.log(start[1] @ se3.inverse(T[1]))).max() < 3e-3
+
+
+@pytest.mark.parametrize("bins", [1, 4])
+def test_field_names_an_edge_for_every_pixel(bins, rng):
+    edges, depth = see(np.eye(4), *segments(rng))
+    field = edge_field(edges, depth, SIZE, bins)
+    assert field.nearest.shape == (bins, 480, 640)
+    assert field.nearest.min() >= 0
+    u, v = edges.uv.astype(int).T
+    own = np.stack([field.nearest[b, v, u] for b in range(bins)])
+    assert (own == np.arange(len(u))).any(0).all()
