@@ -92,11 +92,11 @@ class InitialisationConfig:
 class MappingConfig:
     """Stage 3: keyframes and anchors."""
 
-    keyframe_min_gap: int = 3
+    keyframe_min_gap: int = 5
     """Frames between keyframes at least."""
     keyframe_max_gap: int = 30
     """Frames between keyframes at most while the camera moves."""
-    keyframe_overlap: float = 0.8
+    keyframe_overlap: float = 0.7
     """A new keyframe when fewer than this share of the reference keyframe's anchors is tracked."""
     keyframe_parallax_deg: float = 4.0
     """A new keyframe when the median ray angle to the reference exceeds this."""

@@ -7,6 +7,7 @@ refinement and edges.
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -23,6 +24,7 @@ from edgeslam_torch.mapping.depth_prior import fit_to_anchors, sample
 from edgeslam_torch.mapping.edge_map import EdgeMap
 from edgeslam_torch.mapping.keyframe import Keyframe, make_keyframe
 from edgeslam_torch.mapping.mapper import Mapper
+from edgeslam_torch.mapping.refinement import refine_all
 from edgeslam_torch.mapping.slam_map import SlamMap
 from edgeslam_torch.optim.problem import LmConfig
 from edgeslam_torch.tracking.bootstrap import Bootstrap
@@ -364,6 +366,7 @@ class EdgeSlam:
 
     def finish(self) -> None:
         """Measure the last keyframes' edges and fix the published scale, once no frame follows."""
+        refine_all(self.map, self.camera, replace(self._lm, max_iterations=30))
         self._edges.update(everything=True)
         estimate = self.scale
         if np.isfinite(estimate.sigma):

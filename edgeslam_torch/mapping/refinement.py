@@ -42,6 +42,19 @@ def choose_window(slam_map: SlamMap, newest: Keyframe, free: int, fixed: int) ->
     return Window(members, frozen, slam_map.anchors_seen_by(members))
 
 
+def refine_all(slam_map: SlamMap, camera: Camera, config: LmConfig) -> WindowResult | None:
+    """Refine every keyframe of the map at once; the first pose and the map's extent hold the gauge."""
+    keyframes = [slam_map.keyframes[id] for id in sorted(slam_map.keyframes)]
+    if len(keyframes) < 3:
+        return None
+    first = keyframes[0]
+    far = max(keyframes[1:], key=lambda k: float(np.linalg.norm(k.centre_w - first.centre_w)))
+    members = [far, *(k for k in keyframes[1:] if k is not far)]
+    window = Window(members, [first], slam_map.anchors_seen_by(keyframes))
+    distance = float(np.linalg.norm(far.centre_w - first.centre_w))
+    return refine(slam_map, window, camera, config, ScalePrior(0, len(members), distance, 1e-3))
+
+
 def refine(
     slam_map: SlamMap,
     window: Window,
