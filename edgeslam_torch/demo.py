@@ -23,7 +23,7 @@ from edgeslam_torch.synthetic.telemetry import TelemetryFaults, simulate
 from edgeslam_torch.synthetic.world import World
 from edgeslam_torch.synthetic.writer import write_flight
 
-WORLDS = {"room": room, "corridor": corridor}
+WORLDS: dict[str, Callable[[np.random.Generator], World]] = {"room": room, "corridor": corridor}
 CAMERAS = {
     "clean": CLEAN,
     "normal": CameraFaults(),

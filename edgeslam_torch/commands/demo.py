@@ -76,7 +76,7 @@ def report(demo: "DemoResult") -> str:
         lines.append("map:        empty")
     else:
         lines.append(
-            f"map:        {demo.map.points} edge points, {100 * demo.map.median_m:.1f} cm from the true surfaces (median), "
+            f"map:        {demo.map.points} edge points, {100 * demo.map.median_m:.1f} cm from the true surfaces, "
             f"{100 * demo.map.within_5cm:.0f} % within 5 cm"
         )
     lines.append(f"speed:      {summary['fps']:.1f} images/s, {summary['cpu_ms_per_frame']:.0f} ms CPU an image")

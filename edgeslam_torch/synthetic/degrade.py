@@ -64,10 +64,10 @@ def with_noise(rng: Rng, image: np.ndarray, read: float, shot: float) -> np.ndar
         start = int(rng.integers(0, len(table) - image.size))
         noise = table[start : start + image.size].reshape(image.shape)
     level = np.arange(256, dtype=np.float32)
-    noisy = cv2.LUT(image, np.sqrt(read**2 + shot**2 * level).astype(np.float32))
-    noisy *= noise
-    noisy += image
-    return cv2.convertScaleAbs(cv2.max(noisy, 0.0))
+    noisy = np.asarray(cv2.LUT(image, np.sqrt(read**2 + shot**2 * level).astype(np.float32)))
+    np.multiply(noisy, noise, out=noisy)
+    np.add(noisy, image, out=noisy)
+    return cv2.convertScaleAbs(np.maximum(noisy, 0.0, out=noisy))
 
 
 @lru_cache(maxsize=1)
@@ -97,7 +97,7 @@ def with_jpeg(image: np.ndarray, quality: int) -> np.ndarray:
     if quality == 0:
         return image
     _, packed = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
-    return cv2.imdecode(packed, cv2.IMREAD_UNCHANGED)
+    return np.asarray(cv2.imdecode(packed, cv2.IMREAD_UNCHANGED))
 
 
 def with_motion_blur(
@@ -129,25 +129,25 @@ def with_motion_blur(
     longest = float(np.percentile(np.linalg.norm(flow, axis=-1), 98))
     if longest < 0.4:
         return image
-    flow = cv2.resize(flow, (w, h), interpolation=cv2.INTER_LINEAR)
-    grid = _pixel_grid(h, w)
+    flow = np.asarray(cv2.resize(flow, (w, h), interpolation=cv2.INTER_LINEAR))
+    flow_x, flow_y = np.ascontiguousarray(flow[..., 0]), np.ascontiguousarray(flow[..., 1])
+    x, y = _pixel_grid(h, w)
     steps = 3 if longest < 3.0 else 5
     total = image.astype(np.float32)
     for k in range(steps):
-        share = np.float32(k / (steps - 1) - 0.5)
+        share = k / (steps - 1) - 0.5
         if share == 0:
             continue
-        moved = cv2.remap(
-            image, cv2.scaleAdd(flow, -share, grid), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-        )
+        map_x, map_y = x - np.float32(share) * flow_x, y - np.float32(share) * flow_y
+        moved = cv2.remap(image, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         cv2.accumulate(moved, total)
     return cv2.convertScaleAbs(total, alpha=1.0 / steps)
 
 
 @lru_cache(maxsize=4)
 def _pixel_grid(h: int, w: int) -> np.ndarray:
-    """Pixel coordinates ``(h, w, 2)`` float32."""
-    return np.stack(np.meshgrid(np.arange(w, dtype=np.float32), np.arange(h, dtype=np.float32)), axis=-1)
+    """Pixel coordinates x and y, ``(2, h, w)`` float32."""
+    return np.stack(np.meshgrid(np.arange(w, dtype=np.float32), np.arange(h, dtype=np.float32)))
 
 
 def degraded(
@@ -160,7 +160,7 @@ def degraded(
     stamp_s: float = 0.0,
     twist_c: FloatArray | None = None,
 ) -> np.ndarray:
-    """Image as the simulated camera delivers it at time ``stamp_s``, moving with ``twist_c`` (see the functions above)."""
+    """Image as the simulated camera delivers it at time ``stamp_s`` while it moves with ``twist_c``."""
     if twist_c is not None:
         image = with_motion_blur(image, depth_m, camera, twist_c, faults.shutter_s)
     gain = 1.0 + faults.exposure_amplitude * np.sin(2 * np.pi * stamp_s / faults.exposure_period_s)

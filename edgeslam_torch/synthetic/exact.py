@@ -76,7 +76,7 @@ def visible_edges(
 def visible_junctions(
     world: World, camera: Camera, T_w_c: FloatArray, view: Rendered, *, arm_m: float = 0.1
 ) -> VisibleJunctions:
-    """Corners whose own place and both arms, out to ``arm_m`` or their ends, are seen; ``camera`` without distortion."""
+    """Corners that are seen with both arms, out to ``arm_m`` or their ends; ``camera`` without distortion."""
     junctions = world.junctions()
     arms = []
     for far in (junctions.arm_a_w, junctions.arm_b_w):

@@ -253,7 +253,8 @@ def _smooth_borders(image: np.ndarray, ids: np.ndarray, polygons: list[_Polygon]
     if len(pixel) == 0:
         return
     row, column = np.divmod(pixel, width)
-    # Corner (i, j) lies between pixels (i-1, j-1) and (i, j): on a frame one pixel wider all round, (i, j) to (i+1, j+1).
+    # Corner (i, j) lies between pixels (i-1, j-1) and (i, j): in an image one pixel wider all round,
+    # (i, j) to (i+1, j+1).
     first = row * (width + 1) + column
     corners_of_pixel = [first, first + 1, first + width + 1, first + width + 2]
     touched = np.zeros((height + 1) * (width + 1), bool)

@@ -203,7 +203,8 @@ def _door(scene: Scene, place: Place, rng: Rng) -> None:
     paint = random_paint(rng, ("veneer", "plaster", "metal"))
     for x in (-(width + frame) / 2, (width + frame) / 2):
         scene.box(place, (x, 0.02, height / 2), (frame, 0.04, height), paint, "door frame", faces="frl", inside=True)
-    scene.box(place, (0, 0.02, height + frame / 2), (width + 2 * frame, 0.04, frame), paint, "door frame", faces="frltu",
+    lintel = (width + 2 * frame, 0.04, frame)
+    scene.box(place, (0, 0.02, height + frame / 2), lintel, paint, "door frame", faces="frltu",
               inside=True)  # fmt: skip
 
 
@@ -345,7 +346,8 @@ def _floating_clutter(scene: Scene, rng: Rng) -> None:
             axes = rng.normal(size=(2, 3))
             u, v = (a / np.linalg.norm(a) * s for a, s in zip(axes, size[:2], strict=True))
             scene.surface(p, u, v, paint, "sheet", two_sided=True)
-    clutter(scene, Place(0.0, 0.0, 0.0), rng, *(scene.high_w - scene.low_w)[:2], 6)
+    width, depth = (scene.high_w - scene.low_w)[:2].tolist()
+    clutter(scene, Place(0.0, -0.5 * depth, 0.0), rng, width, depth, 6)
 
 
 def _lamps(scene: Scene, rng: Rng) -> None:
@@ -368,5 +370,6 @@ def _ceiling_lamp(scene: Scene, lamp: FloatArray, width: float, depth: float) ->
 
 def _rug(scene: Scene, rng: Rng, x: float, y: float) -> None:
     place = Place(float(x), float(y), float(rng.normal(0.0, 0.1)))
-    scene.box(place, (0, 0, 0.004), (2.0 * rng.uniform(0.6, 1.1), 1.4 * rng.uniform(0.6, 1.1), 0.008), Paint("fabric", 0),
-              "rug", faces="frblt", special={"t": picture_paint(rng, "rug")}, inside=True)  # fmt: skip
+    size = (float(2.0 * rng.uniform(0.6, 1.1)), float(1.4 * rng.uniform(0.6, 1.1)), 0.008)
+    top = {"t": picture_paint(rng, "rug")}
+    scene.box(place, (0, 0, 0.004), size, Paint("fabric", 0), "rug", special=top, inside=True)

@@ -1,12 +1,12 @@
 """Assembling a `World`: surfaces, solids and lamps in; light baked into every texture out."""
 
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cache, lru_cache
 
 import cv2
 import numpy as np
 
-from edgeslam_torch.synthetic import textures
+from edgeslam_torch.synthetic import materials, pictures
 from edgeslam_torch.synthetic.world import Box, Quad, Texture, World
 from edgeslam_torch.types import FloatArray
 
@@ -18,29 +18,29 @@ VARIANTS = 6
 """Tiles of each material and pictures of each kind that a process draws at most."""
 
 
-@lru_cache(maxsize=None)
+@cache
 def material_tile(kind: str, variant: int) -> Texture:
     """One of `VARIANTS` fixed tiles of a material, drawn when first wanted."""
-    rng = np.random.default_rng([list(textures.MATERIALS).index(kind), variant])
-    return Texture(textures.MATERIALS[kind](rng))
+    rng = np.random.default_rng([list(materials.MATERIALS).index(kind), variant])
+    return Texture(materials.MATERIALS[kind](rng))
 
 
 PICTURES = {
-    "poster": (textures.poster, (480, 360)),
-    "picture": (textures.poster, (360, 480)),
-    "book_spines": (textures.book_spines, (200, 700)),
-    "screen": (textures.screen, (330, 520)),
-    "door": (textures.door, (800, 380)),
-    "cabinet": (textures.cabinet, (480, 480)),
-    "window": (textures.window, (480, 520)),
-    "whiteboard": (textures.whiteboard, (480, 760)),
-    "radiator": (textures.radiator, (200, 400)),
-    "keyboard": (textures.keyboard, (110, 330)),
-    "rug": (textures.rug, (420, 600)),
+    "poster": (pictures.poster, (480, 360)),
+    "picture": (pictures.poster, (360, 480)),
+    "book_spines": (pictures.book_spines, (200, 700)),
+    "screen": (pictures.screen, (330, 520)),
+    "door": (pictures.door, (800, 380)),
+    "cabinet": (pictures.cabinet, (480, 480)),
+    "window": (pictures.window, (480, 520)),
+    "whiteboard": (pictures.whiteboard, (480, 760)),
+    "radiator": (pictures.radiator, (200, 400)),
+    "keyboard": (pictures.keyboard, (110, 330)),
+    "rug": (pictures.rug, (420, 600)),
 }
 
 
-@lru_cache(maxsize=None)
+@cache
 def picture(kind: str, variant: int) -> np.ndarray:
     """One of a fixed set of pictures of a kind, ``(H, W, 3)`` BGR, drawn when first wanted."""
     draw, shape = PICTURES[kind]
@@ -52,7 +52,7 @@ class Paint:
     """What a surface is covered with."""
 
     kind: str
-    """A name in `textures.MATERIALS` or `PICTURES`."""
+    """A name in `materials.MATERIALS` or `PICTURES`."""
     variant: int = 0
     tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """BGR gain."""
@@ -271,12 +271,13 @@ class Scene:
                 continue
             half = box.half_m.astype(np.float32)
             b = _local(box, lamp.astype(np.float32)[:, None])
-            enter, leave = np.float32(0.0), np.float32(1.0)
+            enter, leave = np.zeros(len(solid), np.float32), np.ones(len(solid), np.float32)
             for axis in range(3):
                 d = b[axis] - local[k][axis]
                 d[np.abs(d) < 1e-9] = 1e-9
                 middle, reach = -local[k][axis] / d, half[axis] / np.abs(d)
-                enter, leave = np.maximum(enter, middle - reach), np.minimum(leave, middle + reach)
+                enter = np.maximum(enter, middle - reach)
+                leave = np.minimum(leave, middle + reach)
             blocked = np.flatnonzero((enter < leave) & (leave > 1e-3) & (solid != k))
             # A ray that only grazes the solid is half lit: a soft edge for nothing.
             seen[blocked] *= 1.0 - 0.92 * np.minimum((leave - enter)[blocked] * 12.0, 1.0)
@@ -295,7 +296,8 @@ def _rhombi(start: FloatArray, path: list[FloatArray]) -> list[tuple[FloatArray,
 
     Sorting the sides into reverse order by swaps of neighbours sweeps the polygon, one parallelogram a swap.
     """
-    order, out = list(range(len(path))), []
+    order = list(range(len(path)))
+    out: list[tuple[FloatArray, FloatArray, FloatArray]] = []
     for _ in range(len(path)):
         for i in range(len(path) - 1):
             if order[i] < order[i + 1]:
@@ -322,15 +324,15 @@ def _bake(surface: Surface, light: FloatArray, scene: Scene) -> np.ndarray:
     gain = np.array(paint.tint) * (np.ones(3) if paint.glow else np.array(scene.light_bgr))
     field_ = np.full_like(light, scene.exposure) if paint.glow else light
     light8 = np.clip(UNIT_LIGHT * field_[..., None] * gain, 0, 255).astype(np.uint8)
-    size = (image.shape[1], image.shape[0])
-    return cv2.multiply(image, cv2.resize(light8, size, interpolation=cv2.INTER_LINEAR), scale=1.0 / UNIT_LIGHT)
+    smooth = cv2.resize(light8, (image.shape[1], image.shape[0]), interpolation=cv2.INTER_LINEAR)
+    return cv2.multiply(image, smooth, scale=1.0 / UNIT_LIGHT)
 
 
 @lru_cache(maxsize=256)
 def _sized_tile(kind: str, variant: int, side_px: int) -> np.ndarray:
     """A material's tile resampled to ``side_px`` (smoothed first when it shrinks)."""
     pyramid = material_tile(kind, variant)
-    level = max(0, int(2 * np.log2(textures.TILE_PX / side_px)))
+    level = max(0, int(2 * np.log2(materials.TILE_PX / side_px)))
     return cv2.resize(pyramid.level(level), (side_px, side_px), interpolation=cv2.INTER_LINEAR)
 
 
@@ -339,7 +341,7 @@ def _spread(paint: Paint, width_m: float, height_m: float, texel_m: float) -> np
     texel_m = max(texel_m, max(width_m, height_m) / 4096)
     columns, rows = max(4, round(width_m / texel_m)), max(4, round(height_m / texel_m))
     # Sizes in steps of 16 texels keep the number of resampled tiles small.
-    tile = _sized_tile(paint.kind, paint.variant, max(32, 16 * round(textures.TILE_M * paint.zoom / texel_m / 16)))
+    tile = _sized_tile(paint.kind, paint.variant, max(32, 16 * round(materials.TILE_M * paint.zoom / texel_m / 16)))
     if paint.turned:
         tile = tile.transpose(1, 0, 2)
     side = tile.shape[0]

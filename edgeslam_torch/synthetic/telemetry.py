@@ -188,7 +188,7 @@ def _floor(floor_m: FloatArray | float | None, t: FloatArray, p_w: FloatArray, m
     if floor_m is None:
         return np.full(len(moments), p_w[:, 2].min() - 0.1)
     if np.ndim(floor_m) == 0:
-        return np.full(len(moments), float(floor_m))  # type: ignore[arg-type]
+        return np.full(len(moments), float(floor_m))
     nearest = np.clip(np.searchsorted(t, moments), 0, len(t) - 1)
     return np.asarray(floor_m)[nearest]
 
