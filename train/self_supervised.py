@@ -30,6 +30,8 @@ ARMS, ARM_POINTS = 24, 8
 """Straight edges per image and points on each."""
 SPARSE = 1500
 """Map points per image."""
+FLIP = 0.5
+"""Probability of mirroring a pair."""
 CLIP_LOG = 0.5
 """Map points farther than this from the prediction (65 %) are believed to be hidden or wrong: constant
 cost."""
@@ -149,7 +151,7 @@ class SelfSupervised:
         images = [_seen(v, K, size) for v in (view, *others)]
         motions = np.stack([relative_motion(view, v) for v in others])
         motions[:, :3, 3] *= scale
-        flip = bool(rng.random() < 0.5)
+        flip = bool(rng.random() < FLIP)
         uv = view.uv @ _affine(K, view.K)[:2, :2].T + _affine(K, view.K)[:2, 2]
         if flip:
             images = [np.ascontiguousarray(x[:, ::-1]) for x in images]

@@ -1,0 +1,242 @@
+"""Self-supervision from a SLAM run, on a rendered room with known poses and depth."""
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from unittest import mock
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from edgeslam_torch.errors import SourceError
+from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.io.ply import write_ply
+from edgeslam_torch.models.checkpoint import build_network
+from edgeslam_torch.models.fastdepth import FastDepth, Prediction, Widths
+from edgeslam_torch.models.record import Metadata
+from edgeslam_torch.synthetic.render import render
+from edgeslam_torch.synthetic.rooms import look, room
+from edgeslam_torch.synthetic.world import World
+from edgeslam_torch.train.posed import PosedSequence, is_run_folder, load_run, visible_points
+from edgeslam_torch.train.self_supervised import SelfSupervised, fit_log_scale
+from edgeslam_torch.train.signals import Slot
+from edgeslam_torch.train.straight import straight_edges
+from edgeslam_torch.types import PointCloud
+
+CAMERA = Camera(128, 96, 100.0, 100.0, 63.5, 47.5)
+METADATA = Metadata(input_height=96, input_width=128, focal_px=100.0)
+FRAMES = 12
+
+
+@cache
+def world() -> World:
+    """Drawn once: it is the slowest thing here."""
+    return room(np.random.default_rng(5))
+
+
+@pytest.fixture(scope="module")
+def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording of a sideways flight through a rendered room, and the folder of a perfect run on it."""
+    root = tmp_path_factory.mktemp("flight")
+    rng = np.random.default_rng(5)
+    images, run = root / "recording", root / "run"
+    (images / "rgb").mkdir(parents=True)
+    run.mkdir()
+    poses, stamps, points = [], [], []
+    for k in range(FRAMES):
+        T_w_c = look(np.array([0.0, 0.05 * k - 0.3, 1.4]), 0.1, 0.15)
+        seen = render(world(), CAMERA, T_w_c)
+        stamp = round(k / 30.0, 6)
+        cv2.imwrite(str(images / "rgb" / f"{stamp:.6f}.png"), seen.image)
+        v, u = rng.integers(0, 96, 400), rng.integers(0, 128, 400)
+        p_c = CAMERA.back_project(np.stack([u, v], 1), seen.depth_m[v, u])
+        points.append(p_c @ T_w_c[:3, :3].T + T_w_c[:3, 3])
+        poses.append(T_w_c)
+        stamps.append(stamp)
+    (images / "rgb.txt").write_text("".join(f"{t:.6f} rgb/{t:.6f}.png\n" for t in stamps))
+    CAMERA.save(images / "camera.yaml")
+    CAMERA.save(run / "camera.yaml")
+    from edgeslam_torch.io.run_writer import tum_line
+
+    (run / "trajectory.txt").write_text("".join(tum_line(t, T) for t, T in zip(stamps, poses, strict=True)))
+    rows = ["stamp_s,status"] + [f"{t},{'lost' if k == 3 else 'tracked'}" for k, t in enumerate(stamps)]
+    (run / "status.csv").write_text("\n".join(rows) + "\n")
+    p_w = np.concatenate(points).astype(np.float32)
+    n = len(p_w)
+    cloud = PointCloud(p_w, np.zeros((n, 3), np.uint8), np.full(n, 0.01, np.float32), np.full(n, 2, np.int32))
+    write_ply(run / "anchors.ply", cloud)
+    summary = {"source": {"location": str(images)}, "scale": {"units": "metres"}}
+    (run / "summary.json").write_text(json.dumps(summary))
+    return run
+
+
+@pytest.fixture(scope="module")
+def sequence(run_folder: Path) -> PosedSequence:
+    return load_run(run_folder)
+
+
+def test_run_is_read_with_poses_points_and_partners(run_folder: Path, sequence: PosedSequence) -> None:
+    assert is_run_folder(run_folder)
+    assert not is_run_folder(run_folder.parent)
+    assert len(sequence.views) == FRAMES - 1, "the lost frame is left out"
+    assert sequence.metric
+    assert len(sequence.usable) == len(sequence.views)
+    assert all(i not in partners for i, partners in enumerate(sequence.partners))
+    assert min(len(v.z) for v in sequence.views) > 100
+
+
+def test_missing_recording_is_named(run_folder: Path, tmp_path: Path) -> None:
+    for name in ("trajectory.txt", "anchors.ply", "camera.yaml"):
+        (tmp_path / name).write_bytes((run_folder / name).read_bytes())
+    (tmp_path / "summary.json").write_text(json.dumps({"source": {"location": str(tmp_path / "gone")}}))
+    with pytest.raises(SourceError, match="gone"):
+        load_run(tmp_path)
+
+
+def test_visible_points_lie_on_the_seen_surfaces(sequence: PosedSequence) -> None:
+    view = sequence.views[4]
+    depth = render(world(), CAMERA, view.T_w_c).depth_m
+    expected = depth[np.rint(view.uv[:, 1]).astype(int), np.rint(view.uv[:, 0]).astype(int)]
+    assert np.mean(np.abs(np.log(view.z / expected)) < 0.1) > 0.9
+
+
+def test_hidden_points_are_left_out() -> None:
+    T = np.eye(4)
+    near = np.stack([np.linspace(-0.2, 0.2, 50), np.zeros(50), np.full(50, 1.0)], 1)
+    uv, z = visible_points(np.concatenate([near, near * 3.0]).astype(np.float32), CAMERA.K, T, (96, 128))
+    assert len(z) == 50
+    assert (z == 1.0).all()
+    assert len(visible_points(-near, CAMERA.K, T, (96, 128))[1]) == 0
+
+
+class _Oracle(torch.nn.Module):
+    """Stands for a network: gives chosen log depths at the training focal length."""
+
+    def __init__(self, signal: SelfSupervised, slots: list[Slot], factor: float) -> None:
+        super().__init__()
+        self.log = torch.stack([true_log_depth(signal, slot, which) for which in (0, 1) for slot in slots]) + float(
+            np.log(factor)
+        )
+
+    def predict(self, x: Tensor) -> Prediction:
+        return Prediction(self.log, torch.zeros_like(self.log))
+
+
+def true_log_depth(signal: SelfSupervised, slot: Slot, which: int) -> Tensor:
+    """Rendered depth of what `draw` shows (zoom and flips are off)."""
+    rng = slot.rng()
+    s, i = signal._items[int(rng.integers(len(signal._items)))]
+    sequence = signal.sequences[s]
+    others = rng.choice(sequence.partners[i], 2)
+    view = sequence.views[i] if which == 0 else sequence.views[int(others[0])]
+    depth = render(world(), CAMERA, view.T_w_c).depth_m
+    return torch.from_numpy(np.log(depth))[None]
+
+
+@contextmanager
+def never_flipped() -> Iterator[None]:
+    """The loss is symmetric; the oracle above is not."""
+    with mock.patch("edgeslam_torch.train.self_supervised.FLIP", 0.0):
+        yield
+
+
+def test_every_term_is_smallest_at_the_true_depth(sequence: PosedSequence) -> None:
+    signal = SelfSupervised([sequence], METADATA, zoom=(1.0, 1.0))
+    slots = [Slot(0, 0, k) for k in range(2)]
+    with never_flipped():
+        batch = signal.draw(slots)
+        at = {f: signal.losses(_Oracle(signal, slots, f), batch) for f in (0.75, 1.0, 1.3)}  # type: ignore[arg-type]
+    for term in ("photometric", "points", "cycle"):
+        wrong = min(at[0.75][term].mean(), at[1.3][term].mean())
+        assert at[1.0][term].mean() < 0.6 * wrong, term
+    assert at[1.0]["points"].max() < 0.05
+
+
+def test_batch_follows_the_slot_alone(sequence: PosedSequence) -> None:
+    signal = SelfSupervised([sequence], METADATA)
+    both = signal.draw([Slot(1, 7, 0), Slot(1, 7, 1)])
+    second = signal.draw([Slot(1, 7, 1)])
+    assert torch.equal(both["rgb_i"][1:], second["rgb_i"])
+    assert torch.equal(both["image"][1::2], second["image"])
+    assert signal.describe([Slot(1, 7, 1)])[0].startswith("run/0.")
+
+
+def test_flipped_pairs_keep_their_geometry(sequence: PosedSequence) -> None:
+    """Map points of view i move to the same colours in view j, mirrored or not."""
+    from edgeslam_torch.losses.base import back_project, move, project
+
+    signal = SelfSupervised([sequence], METADATA)
+    errors = []
+    for k in range(8):
+        b = signal.draw([Slot(3, k, 0)])
+        known = b["known"][0]
+        uv, z = b["uv"][0][known], b["log_z"][0][known].exp()
+        uv_j, front = project(move(b["T_j_i"][0, 0], back_project(uv, z, b["K"][0])), b["K"][0])
+        inside = front & ((uv_j > 1) & (uv_j < torch.tensor([126.0, 94.0]))).all(-1)
+        a = sample(b["rgb_i"], uv[inside])
+        c = sample(b["rgb_j"][:, 0], uv_j[inside])
+        errors.append(((a - c).abs().median() / (a - c[torch.randperm(len(c))]).abs().median()).item())
+    assert max(errors) < 0.5
+
+
+def sample(image: Tensor, uv: Tensor) -> Tensor:
+    grid = (2 * uv / torch.tensor([127.0, 95.0]) - 1)[None, None]
+    return torch.nn.functional.grid_sample(image, grid, align_corners=True)[0, :, 0].T
+
+
+def test_gradient_reaches_the_network(sequence: PosedSequence) -> None:
+    torch.manual_seed(0)
+    network = build_network(METADATA, Widths((4,) + (8,) * 13, (8,) * 5))
+    signal = SelfSupervised([sequence], METADATA)
+    losses = signal.losses(network, signal.draw([Slot(0, 0, 0)]))
+    assert set(losses) == {"photometric", "points", "cycle", "straight", "smooth", "uncertainty"}
+    sum(v.sum() for v in losses.values()).backward()  # type: ignore[union-attr]
+    grads = [p.grad for p in network.parameters() if p.grad is not None]
+    assert grads
+    assert all(torch.isfinite(g).all() for g in grads)
+
+
+def test_scale_of_an_arbitrary_run_is_found(sequence: PosedSequence) -> None:
+    views = [replace(v, z=v.z / 3.0) for v in sequence.views]
+    found = fit_log_scale(views, [np.log(v.z) for v in sequence.views])
+    assert np.exp(found) == pytest.approx(3.0, rel=1e-5)
+
+
+def test_straight_pieces_lie_on_straight_edges(rng: np.random.Generator) -> None:
+    image = np.full((96, 128, 3), 30, np.uint8)
+    cv2.rectangle(image, (30, 20), (90, 70), (200, 200, 200), -1)
+    edges, arms = straight_edges(image, 100, 8, 8, rng)
+    assert edges.shape == (100, 2)
+    found = arms[arms[:, 0, 0] >= 0]
+    assert len(found) >= 4
+    for piece in found:
+        centred = piece - piece.mean(0)
+        assert np.linalg.svd(centred, compute_uv=False)[1] < 0.5
+    blank_edges, blank_arms = straight_edges(np.zeros((96, 128, 3), np.uint8), 10, 4, 8, rng)
+    assert (blank_edges == -1).all()
+    assert (blank_arms == -1).all()
+
+
+def test_finetune_command_on_a_run(run_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    import argparse
+
+    from edgeslam_torch.commands import finetune
+    from edgeslam_torch.models.checkpoint import load_checkpoint, save_checkpoint
+
+    torch.manual_seed(0)
+    network: FastDepth = build_network(METADATA, Widths((4,) + (8,) * 13, (8,) * 5))
+    save_checkpoint(network, METADATA, tmp_path / "start.safetensors")
+    parser = argparse.ArgumentParser()
+    finetune.add_arguments(parser)
+    given = [str(run_folder), "--out", str(tmp_path / "out"), "--weights", str(tmp_path / "start.safetensors")]
+    assert finetune.main(parser.parse_args([*given, "--steps", "3", "--batch", "2"])) == 0
+    assert "11 posed images" in capsys.readouterr().out
+    _, metadata = load_checkpoint(tmp_path / "out" / "weights.safetensors")
+    assert metadata.data == ("run",)
+    assert list((tmp_path / "out" / "tensorboard").iterdir())
