@@ -25,7 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--fly",
         action="store_true",
-        help="let the drone move: take off, climb and sink by half a metre and turn, for scale, then hover; land at the end",
+        help="let the drone move: take off, climb and sink half a metre (for scale), turn, hover; it lands at the end",
     )
 
 

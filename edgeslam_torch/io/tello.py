@@ -15,7 +15,7 @@ from urllib.parse import urlsplit
 
 from edgeslam_torch.errors import EdgeSlamError, SourceError
 from edgeslam_torch.io.sdk_state import parse_state, sample_from_sdk
-from edgeslam_torch.io.tello_video import Picture, ArrivalClock, VideoReceiver, open_udp
+from edgeslam_torch.io.tello_video import ArrivalClock, Picture, VideoReceiver, open_udp
 from edgeslam_torch.types import TelemetrySample
 
 logger = logging.getLogger(__name__)

@@ -1,0 +1,128 @@
+"""``edgeslam calibrate``: camera.yaml from pictures of a chessboard or ChArUco board, or from a live camera."""
+
+import argparse
+import re
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from edgeslam_torch.io.calibration import Board
+
+_PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".ppm", ".pgm")
+_LIVE = ("tello://", "webcam:", "rtsp://", "udp://")
+_LIVE_GAP_S = 1.0
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's options."""
+    parser.add_argument(
+        "images", nargs="+", metavar="IMAGES", help="pictures or folders of them; or tello://HOST, webcam:N, rtsp://..."
+    )
+    parser.add_argument("--board", metavar="COLSxROWS", help="inner corners of a chessboard (default: found by trying)")
+    parser.add_argument("--charuco", metavar="COLSxROWS", help="a ChArUco board with so many squares instead")
+    parser.add_argument("--square", type=float, default=25.0, metavar="MM", help="side of a square")
+    parser.add_argument("--marker", type=float, default=18.0, metavar="MM", help="side of a ChArUco marker")
+    parser.add_argument("--dictionary", default="DICT_5X5_100", help="of the ChArUco markers (default: DICT_5X5_100)")
+    parser.add_argument("--out", type=Path, default=Path("camera.yaml"), metavar="FILE", help="default: camera.yaml")
+    parser.add_argument("--views", type=int, default=25, metavar="N", help="pictures taken from a live camera")
+
+
+def main(args: argparse.Namespace) -> int:
+    """Calibrate, write the file, and say how good it is."""
+    from edgeslam_torch.errors import ConfigError, OutputError
+    from edgeslam_torch.io.calibration import Board, calibrate
+
+    if args.board and args.charuco:
+        raise ConfigError("give --board or --charuco, not both")
+    columns, rows = _size(args.charuco or args.board)
+    board = Board(columns, rows, args.square / 1e3, bool(args.charuco), args.marker / 1e3, args.dictionary)
+    unreadable: dict[str, str] = {}
+    live = args.images[0].startswith(_LIVE)
+    if live and len(args.images) > 1:
+        raise ConfigError("give one live camera, or pictures")
+    pictures = _live_pictures(args.images[0], board, args.views) if live else _pictures(args.images, unreadable)
+    result = calibrate(pictures, board, f"calibrated from {args.images[0]}")
+    try:
+        args.out.parent.mkdir(parents=True, exist_ok=True)
+        result.camera.save(args.out)
+    except OSError as error:
+        raise OutputError(f"{args.out}: cannot be written: {error.strerror or error}") from error
+    camera, sigma = result.camera, result.sigma
+    for name, reason in {**unreadable, **result.rejected}.items():
+        print(f"left out: {name}: {reason}")
+    for name in ("fx", "fy", "cx", "cy"):
+        print(f"{name} {getattr(camera, name):9.3f} +- {sigma[name]:.3f} px")
+    print("distortion " + " ".join(f"{k:.5f}" for k in camera.distortion))
+    print(
+        f"{len(result.used)} pictures of a {result.board.columns}x{result.board.rows} board, "
+        f"reprojection error {result.rms_px:.3f} px RMS, corners in {100 * result.coverage:.0f} % of the picture, "
+        f"tilt up to {result.tilt_deg:.0f} degrees"
+    )
+    for warning in result.warnings:
+        print(f"warning: {warning}")
+    print(f"written: {args.out}")
+    return 0
+
+
+def _size(text: str | None) -> tuple[int, int]:
+    from edgeslam_torch.errors import ConfigError
+
+    if text is None:
+        return 0, 0
+    match = re.fullmatch(r"(\d{1,3})[xX](\d{1,3})", text)
+    if match is None:
+        raise ConfigError(f"a board's size is COLUMNSxROWS, such as 8x6, got {text!r}")
+    return int(match[1]), int(match[2])
+
+
+def _pictures(names: list[str], unreadable: dict[str, str]) -> "Iterator[tuple[str, np.ndarray]]":
+    import cv2
+
+    from edgeslam_torch.errors import SourceError
+
+    for name in names:
+        path = Path(name).expanduser()
+        if path.is_dir():
+            files = sorted(p for p in path.iterdir() if p.suffix.lower() in _PICTURES)
+            if not files:
+                raise SourceError(f"{path}: no pictures in it ({', '.join(_PICTURES)})")
+        elif path.is_file():
+            files = [path]
+        else:
+            raise SourceError(f"{path}: no such picture or folder")
+        for file in files:
+            grey = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+            if grey is None:
+                unreadable[str(file)] = "not a picture that can be read"
+            else:
+                yield str(file), grey
+
+
+def _live_pictures(spec: str, board: "Board", views: int) -> "Iterator[tuple[str, np.ndarray]]":
+    """Pictures in which the board is seen, a second apart; the person holding it is told what is missing."""
+    import cv2
+
+    from edgeslam_torch.io.calibration import board_size, find_board
+    from edgeslam_torch.io.live import open_live
+
+    source = open_live(spec, "tello" if spec.startswith("tello://") else None)
+    taken, last_s = 0, 0.0
+    try:
+        for frame in source.frames():
+            if time.monotonic() - last_s < _LIVE_GAP_S:
+                continue
+            grey = cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY) if frame.image.ndim == 3 else frame.image
+            seen = board_size([grey]) if board.columns == 0 else find_board("", grey, board)
+            if seen is None:
+                continue
+            taken, last_s = taken + 1, time.monotonic()
+            print(f"picture {taken} of {views}: now hold the board elsewhere, and tilted", flush=True)
+            yield f"picture {taken}", grey
+            if taken >= views:
+                return
+    finally:
+        source.close()

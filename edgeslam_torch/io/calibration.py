@@ -1,0 +1,258 @@
+"""Camera calibration from pictures of a chessboard or ChArUco board (Zhang 2000, by OpenCV)."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+
+from edgeslam_torch.errors import CalibrationError
+from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.types import FloatArray
+
+_COMMON = ((9, 6), (8, 6), (10, 7), (9, 7), (11, 8), (8, 5), (7, 6), (7, 5), (6, 5), (6, 4), (5, 4))
+"""Inner corners of boards that people print, tried when the size is not given."""
+_MIN_PICTURES = 4
+_GRID = (8, 6)
+"""Cells of the picture in which corners count as coverage."""
+_MIN_CHARUCO = 8
+
+
+@dataclass(frozen=True, slots=True)
+class Board:
+    """A printed pattern."""
+
+    columns: int = 0
+    """Chessboard: inner corners across; ChArUco: squares across. 0 finds a chessboard's size by trying."""
+    rows: int = 0
+    square_m: float = 0.025
+    """Side of a square; intrinsics do not depend on it."""
+    charuco: bool = False
+    marker_m: float = 0.018
+    dictionary: str = "DICT_5X5_100"
+    """Name of OpenCV's ArUco dictionary (ChArUco only)."""
+
+    def __post_init__(self) -> None:
+        if (self.columns, self.rows) != (0, 0) and min(self.columns, self.rows) < 3:
+            raise CalibrationError(f"a board of {self.columns}x{self.rows} is too small; 3x3 at least")
+        if self.square_m <= 0 or not 0 < self.marker_m < self.square_m:
+            raise CalibrationError("a board's square must be positive and larger than its marker")
+        if self.charuco and (self.columns == 0 or not hasattr(cv2.aruco, self.dictionary)):
+            raise CalibrationError("ChArUco needs the number of squares and one of OpenCV's dictionaries, DICT_5X5_100")
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """The board as one picture shows it."""
+
+    name: str
+    uv: FloatArray
+    """``(N, 2)`` corners [px], float32."""
+    p_board: FloatArray
+    """``(N, 3)`` the same corners on the board [m], float32."""
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationResult:
+    """What came out, and what it rests on."""
+
+    camera: Camera
+    rms_px: float
+    """Root of the mean squared distance between seen and predicted corners."""
+    sigma: dict[str, float]
+    """Standard deviations of fx fy cx cy [px]."""
+    used: dict[str, float]
+    """Picture to its own RMS [px]."""
+    rejected: dict[str, str]
+    """Picture to why it was left out."""
+    coverage: float
+    """Share of the picture's cells (8 x 6) that hold a corner."""
+    tilt_deg: float
+    """Largest angle between the board and the picture plane; below 20 the focal length is badly known."""
+    board: Board
+    warnings: list[str] = field(default_factory=list)
+
+
+def board_size(pictures: Sequence[np.ndarray]) -> tuple[int, int] | None:
+    """Inner corners of the chessboard in most of the grey pictures; None when no common size is seen."""
+    for size in _COMMON:
+        if any(_chessboard(_shrunk(picture), size, exact=False) is not None for picture in pictures):
+            return size
+    return None
+
+
+def find_board(name: str, grey: np.ndarray, board: Board) -> View | None:
+    """Corners of the board in one grey picture ``(H, W)``, to a tenth of a pixel; None when it is not all there."""
+    if board.charuco:
+        return _find_charuco(name, grey, board)
+    uv = _chessboard(grey, (board.columns, board.rows), exact=True)
+    if uv is None:
+        return None
+    grid = np.stack(np.meshgrid(np.arange(board.columns), np.arange(board.rows)), axis=-1).reshape(-1, 2)
+    p = np.column_stack([grid * board.square_m, np.zeros(len(grid))]).astype(np.float32)
+    return View(name, uv, p)
+
+
+def _shrunk(grey: np.ndarray, width: int = 640) -> np.ndarray:
+    if grey.shape[1] <= width:
+        return grey
+    height = round(grey.shape[0] * width / grey.shape[1])
+    return cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)
+
+
+def _chessboard(grey: np.ndarray, size: tuple[int, int], exact: bool) -> FloatArray | None:
+    flags = cv2.CALIB_CB_ADAPTIVE_THRESH + cv2.CALIB_CB_NORMALIZE_IMAGE + (0 if exact else cv2.CALIB_CB_FAST_CHECK)
+    if min(grey.shape) < 32:
+        return None
+    found, seen = cv2.findChessboardCorners(grey, size, flags=flags)
+    if not found:
+        return None
+    corners: FloatArray = np.asarray(seen, dtype=np.float32)
+    if not exact:
+        return corners.reshape(-1, 2)
+    uv = corners.reshape(size[1], size[0], 2)
+    spacing = min(_least_distance(uv, 0), _least_distance(uv, 1))
+    # As wide as can be without reaching the next corner: on 26 pictures of a real Tello half the spacing gives
+    # 0.32 px, a fifth of it 0.70 px.
+    half = int(np.clip(0.5 * spacing, 2, 30))
+    criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-3)
+    refined = cv2.cornerSubPix(grey, corners, (half, half), (-1, -1), criteria)
+    return np.asarray(refined, dtype=np.float32).reshape(-1, 2)
+
+
+def _least_distance(uv: FloatArray, axis: int) -> float:
+    return float(np.min(np.linalg.norm(np.diff(uv, axis=axis), axis=-1)))
+
+
+def _find_charuco(name: str, grey: np.ndarray, board: Board) -> View | None:
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
+    pattern = cv2.aruco.CharucoBoard((board.columns, board.rows), board.square_m, board.marker_m, dictionary)
+    corners, ids, _, _ = cv2.aruco.CharucoDetector(pattern).detectBoard(grey)
+    if ids is None or len(ids) < _MIN_CHARUCO:
+        return None
+    p = np.asarray(pattern.getChessboardCorners(), dtype=np.float32)[np.asarray(ids).ravel()]
+    return View(name, np.asarray(corners, dtype=np.float32).reshape(-1, 2), p)
+
+
+def calibrate(
+    pictures: Iterable[tuple[str, np.ndarray]], board: Board, source: str = "calibration"
+) -> CalibrationResult:
+    """Intrinsics and distortion from pictures.
+
+    Pictures without the board, of another size, that repeat another view, or whose corners do not fit the rest are
+    left out, by name and with the reason.
+
+    Args:
+        pictures: Name and grey picture ``(H, W)``, all of one camera.
+        board: What was photographed.
+        source: For the calibration file.
+
+    Raises:
+        CalibrationError: If fewer than four pictures are usable, or the result makes no sense.
+    """
+    rejected: dict[str, str] = {}
+    views: list[View] = []
+    size: tuple[int, int] | None = None
+    for name, grey in pictures:
+        here = (grey.shape[1], grey.shape[0])
+        if size is not None and here != size:
+            rejected[name] = f"is {here[0]}x{here[1]}, the first picture is {size[0]}x{size[1]}"
+            continue
+        size = here
+        if board.columns == 0:
+            found = board_size([grey])
+            if found is None:
+                rejected[name] = "no chessboard of a common size found"
+                continue
+            board = Board(*found, square_m=board.square_m, marker_m=board.marker_m)
+        view = find_board(name, grey, board)
+        if view is None:
+            rejected[name] = f"no {board.columns}x{board.rows} board found, or not all of it"
+            continue
+        twin = next((v.name for v in views if _same_view(v, view)), None)
+        if twin is not None:
+            rejected[name] = f"the same view as {twin}"
+            continue
+        views.append(view)
+    if size is None or len(views) < _MIN_PICTURES:
+        seen = "; ".join(f"{name}: {reason}" for name, reason in list(rejected.items())[:3])
+        raise CalibrationError(
+            f"{len(views)} usable pictures, {_MIN_PICTURES} are the least (20 are good); {seen or 'no pictures'}; "
+            "give the inner corners with --board COLUMNSxROWS"
+        )
+    return _solve(views, size, board, rejected, source)
+
+
+def _same_view(a: View, b: View) -> bool:
+    return len(a.uv) == len(b.uv) and float(np.median(np.linalg.norm(a.uv - b.uv, axis=1))) < 2.0
+
+
+def _solve(
+    views: list[View], size: tuple[int, int], board: Board, rejected: dict[str, str], source: str
+) -> CalibrationResult:
+    while True:
+        p = [np.ascontiguousarray(v.p_board, dtype=np.float32) for v in views]
+        uv = [np.ascontiguousarray(v.uv, dtype=np.float32).reshape(-1, 1, 2) for v in views]
+        try:
+            # k3 is left at zero: a board seldom reaches the corners of the picture, where alone it shows.
+            rms, K, distortion, turns, _, sigma, _, per_view = cv2.calibrateCameraExtended(
+                p, uv, size, np.eye(3), np.zeros(5), flags=cv2.CALIB_FIX_K3
+            )
+        except cv2.error as error:
+            raise CalibrationError(
+                f"these pictures do not determine a camera: {' '.join(str(error).split())}"
+            ) from error
+        errors = np.asarray(per_view).ravel()
+        limit = max(2.5 * float(np.median(errors)), 0.3)  # a view that moved: the drone's shutter rolls
+        worst = int(np.argmax(errors))
+        if errors[worst] <= limit or len(views) <= _MIN_PICTURES:
+            break
+        rejected[views[worst].name] = (
+            f"its corners miss by {errors[worst]:.2f} px, the others by {np.median(errors):.2f} px"
+        )
+        del views[worst]
+    if not (np.all(np.isfinite(K)) and 0.2 * size[0] < K[0, 0] < 20 * size[0] and K[1, 1] > 0):
+        raise CalibrationError(
+            "these pictures give a camera that cannot be; photograph the board tilted, from all sides"
+        )
+    d = np.asarray(distortion).ravel()[:5]
+    tilt = max(float(np.degrees(np.arccos(min(1.0, abs(cv2.Rodrigues(r)[0][2, 2]))))) for r in turns)
+    spread = np.asarray(sigma).ravel()
+    result = CalibrationResult(
+        Camera(*size, K[0, 0], K[1, 1], K[0, 2], K[1, 2], tuple(float(x) for x in d), source),
+        float(rms),
+        dict(zip(("fx", "fy", "cx", "cy"), (float(x) for x in spread[:4]), strict=True)),
+        {v.name: float(e) for v, e in zip(views, errors, strict=True)},
+        rejected,
+        _coverage(views, size),
+        tilt,
+        board,
+    )
+    result.warnings.extend(_doubts(result))
+    return result
+
+
+def _coverage(views: list[View], size: tuple[int, int]) -> float:
+    uv = np.concatenate([v.uv for v in views])
+    cell = np.floor(uv / np.array(size) * np.array(_GRID)).astype(int)
+    inside = np.all((cell >= 0) & (cell < np.array(_GRID)), axis=1)
+    return len(np.unique(cell[inside], axis=0)) / (_GRID[0] * _GRID[1])
+
+
+def _doubts(result: CalibrationResult) -> list[str]:
+    doubts = []
+    if result.rms_px > 1.0:
+        doubts.append(f"the corners miss by {result.rms_px:.2f} px: is the board flat, and are the pictures sharp?")
+    if result.coverage < 0.6:
+        doubts.append(
+            f"corners in {100 * result.coverage:.0f} % of the picture only: bring the board into all its corners"
+        )
+    if result.tilt_deg < 20.0:
+        doubts.append(f"the board is tilted by {result.tilt_deg:.0f} degrees at most: tilt it by 30 and more")
+    if result.sigma["fx"] > 0.01 * result.camera.fx:
+        doubts.append(
+            f"the focal length is known to {100 * result.sigma['fx'] / result.camera.fx:.1f} % only: more pictures"
+        )
+    if len(result.used) < 10:
+        doubts.append(f"{len(result.used)} pictures: 20 are good")
+    return doubts
