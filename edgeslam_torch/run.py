@@ -5,6 +5,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -75,7 +76,7 @@ class Listener(Protocol):
         """Called after every step, in the loop's thread."""
 
     def on_finish(self, slam: Slam) -> None:
-        """Called once, after the last refinement."""
+        """Called once, after the last refinement, before the results are written."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,13 +122,12 @@ def run(
         SourceError: If the source gives not a single frame, or fails on the way (after the results are written).
     """
     config = config or SlamConfig()
-    writer = RunWriter(out_dir, keep=[Path(source.location)])
-    try:
-        writer.write_config(to_toml(config))
+    with closing(source):
+        # The system first: when its weights are missing, an older run in the folder must not be gone.
         slam = (make_slam or _edge_slam)(source.camera, config, mode is Mode.REALTIME)
-        return _Run(source, writer, slam, config, mode, listeners).go()
-    finally:
-        writer.close()
+        with closing(RunWriter(out_dir, keep=[Path(source.location)])) as writer:
+            writer.write_config(to_toml(config))
+            return _Run(source, writer, slam, config, mode, listeners).go()
 
 
 class _Run:
@@ -152,6 +152,7 @@ class _Run:
         self.dropped = Counter()
         self.interrupt = _Interrupt()
         self.result: RunResult | None = None
+        self.last_index: int | None = None
 
     def go(self) -> RunResult:
         wall, cpu = time.perf_counter(), time.process_time()
@@ -172,6 +173,7 @@ class _Run:
         telemetry = _TelemetryCursor(self.source.telemetry)
         try:
             while (frame := self._next(frames)) is not None:
+                self._count_missed(frame)
                 started = time.perf_counter()
                 output = self.slam.step(frame, telemetry.until(frame.stamp_s))
                 step_ms = 1e3 * (time.perf_counter() - started)
@@ -184,6 +186,12 @@ class _Run:
             close = getattr(frames, "close", None)
             if close is not None:
                 close()
+
+    def _count_missed(self, frame: Frame) -> None:
+        """A live source gives the newest picture: those that came in between are gaps in its index."""
+        if self.source.live and self.last_index is not None:
+            self.dropped.value += max(0, frame.index - self.last_index - 1)
+        self.last_index = frame.index
 
     def _next(self, frames: Iterator[Frame]) -> Frame | None:
         """The next frame; None at the end or when the user wants to stop, also while a live source is silent."""

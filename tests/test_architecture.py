@@ -27,6 +27,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("eval",),
     ("train",),
     ("viewer", "demo", "emulator"),
+    ("live_view",),
     ("commands",),
     ("cli",),
 )

@@ -53,6 +53,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action=argparse.BooleanOptionalAction,
         help="progress bar (default: when the output is a terminal; a line every few seconds otherwise)",
     )
+    parser.add_argument("--viewer", action="store_true", help="watch it in rerun ([viewer] extra)")
+    parser.add_argument("--save-rrd", type=Path, metavar="FILE", help="save the rerun recording to a file instead")
     parser.add_argument("--no-report", action="store_true", help="leave the page report.html away")
 
 
@@ -60,7 +62,7 @@ def main(args: argparse.Namespace) -> int:
     """Run, and say in a few lines how it went."""
     from edgeslam_torch.io.source import open_source
     from edgeslam_torch.progress import make_progress
-    from edgeslam_torch.run import Mode, run
+    from edgeslam_torch.run import Listener, Mode, run
 
     config = resolved_config(args)
     source = open_source(args.source, args.camera, args.telemetry, args.max_frames)
@@ -70,8 +72,13 @@ def main(args: argparse.Namespace) -> int:
     mode = Mode(args.mode) if args.mode else (Mode.REALTIME if source.live else Mode.OFFLINE)
     out = args.out if args.out is not None else Path("runs") / source.name
     show_bar = sys.stderr.isatty() if args.progress is None else args.progress
+    listeners: list[Listener] = []
+    if args.viewer or args.save_rrd is not None:
+        from edgeslam_torch.live_view import LiveView
+
+        listeners.append(LiveView(source.name, source.camera, args.save_rrd))
     with make_progress(source.length, show_bar) as progress:
-        result = run(source, out, config, mode, [progress])
+        result = run(source, out, config, mode, [progress, *listeners])
     if not args.no_report and result.failure is None:
         _write_page(result)
     _report(result, source)

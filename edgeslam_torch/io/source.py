@@ -59,6 +59,9 @@ class Source(Protocol):
     def frames(self) -> Iterator[Frame]:
         """Frames in time order."""
 
+    def close(self) -> None:
+        """Give a device back; may be called more than once."""
+
 
 @dataclass
 class Recording:
@@ -85,6 +88,9 @@ class Recording:
         """Frames in time order; the next one is decoded while the caller works on this one."""
         self.problems[:] = self._listed
         return read_ahead(islice(self.decode(self.problems), self.max_frames))
+
+    def close(self) -> None:
+        """Nothing to give back."""
 
 
 @dataclass(frozen=True, slots=True)
