@@ -1,0 +1,128 @@
+"""Smoke runs of ``edgeslam depth``, ``export`` and ``weights`` on made-up images and small random weights."""
+
+import argparse
+import importlib
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+import torch
+
+from edgeslam_torch.errors import ConfigError, EdgeSlamError
+from edgeslam_torch.frontend.depth import DepthPredictor
+from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.models.checkpoint import build_network, save_checkpoint
+from edgeslam_torch.models.fastdepth import FastDepth, Variant, Widths
+from edgeslam_torch.models.record import Metadata
+
+CAMERA = Camera(160, 120, 130.0, 130.0, 79.5, 59.5)
+METADATA = Metadata(input_height=96, input_width=128, focal_px=105.0)
+SMALL = Widths((8, 16) + (24,) * 12, (24, 24, 24, 16, 16))
+
+
+def run(command: str, *args: str | Path) -> int:
+    module = importlib.import_module(f"edgeslam_torch.commands.{command}")
+    parser = argparse.ArgumentParser()
+    module.add_arguments(parser)
+    code: int = module.main(parser.parse_args([str(a) for a in args]))
+    return code
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    torch.manual_seed(0)
+    path = tmp_path_factory.mktemp("weights") / "small.safetensors"
+    save_checkpoint(build_network(METADATA, SMALL).eval(), METADATA, path)
+    return path
+
+
+@pytest.fixture
+def pictures(tmp_path: Path, rng: np.random.Generator) -> Path:
+    folder = tmp_path / "pictures"
+    folder.mkdir()
+    for k in range(10):
+        small = rng.integers(0, 256, (9, 12, 3), np.uint8)
+        cv2.imwrite(str(folder / f"img{k}.png"), cv2.resize(small, (160, 120), interpolation=cv2.INTER_CUBIC))
+    CAMERA.save(folder / "camera.yaml")
+    return folder
+
+
+def test_depth_of_a_folder(weights: Path, pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "out"
+    assert run("depth", pictures, "--out", out, "--weights", weights, "--sigma", "--max-frames", "3") == 0
+    assert "3 depth maps" in capsys.readouterr().out
+    assert len(list(out.iterdir())) == 12
+    metres = np.load(out / "img1.npy")
+    expected = DepthPredictor(weights)(cv2.imread(str(pictures / "img1.png")), CAMERA)
+    np.testing.assert_allclose(metres, expected.depth_m, rtol=1e-5)
+    millimetres = cv2.imread(str(out / "img1.png"), cv2.IMREAD_UNCHANGED)
+    assert millimetres.dtype == np.uint16
+    np.testing.assert_allclose(millimetres, np.clip(metres * 1000, 0, 65535), atol=0.51)
+    assert cv2.imread(str(out / "img1_colour.png")).shape == (120, 160, 3)
+
+
+def test_depth_of_one_image_uses_the_camera_beside_it(weights: Path, pictures: Path, tmp_path: Path) -> None:
+    run("depth", pictures / "img2.png", "--out", tmp_path / "a", "--weights", weights)
+    run("depth", pictures / "img2.png", "--out", tmp_path / "b", "--weights", weights, "--camera", "kinect")
+    a, b = np.load(tmp_path / "a" / "img2.npy"), np.load(tmp_path / "b" / "img2.npy")
+    np.testing.assert_allclose(b / a, 525.0 / 4 / 130.0, rtol=1e-3)
+
+
+def test_missing_image_is_one_line(weights: Path, tmp_path: Path) -> None:
+    with pytest.raises(EdgeSlamError, match=r"none\.png"):
+        run("depth", tmp_path / "none.png", "--out", tmp_path, "--weights", weights)
+
+
+def test_int8_export_is_checked_and_runs_on_the_companion_example(
+    weights: Path, pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "depth.onnx"
+    code = run("export", weights, "--out", out, "--int8", "--calibrate", pictures, "--old-runtime", "--size", "64x96")
+    assert code == 0
+    printed = capsys.readouterr().out
+    assert "| float32 |" in printed
+    assert "| int8 |" in printed
+    model = onnx.load(str(out))
+    assert model.ir_version <= 9
+    assert [o.version for o in model.opset_import if o.domain == ""] == [17]
+    kinds = {n.op_type for n in model.graph.node}
+    assert {"QuantizeLinear", "DequantizeLinear"} <= kinds
+    assert onnxruntime.InferenceSession(str(out)).get_inputs()[0].shape == [1, 3, 64, 96]
+    example = Path(__file__).parents[2] / "examples" / "depth_companion.py"
+    picture = pictures / "img0.png"
+    command = [sys.executable, str(example), str(out), "--source", str(picture), "--fx", "130", "--fy", "130"]
+    printed = subprocess.run(command, check=True, capture_output=True, text=True, timeout=120).stdout
+    z = DepthPredictor(out)(cv2.imread(str(picture)), CAMERA).depth_m
+    assert float(printed.split()[2]) == pytest.approx(float(z[58:63, 78:83].mean()), rel=0.05)
+
+
+def test_export_refuses_what_makes_no_sense(weights: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="--calibrate"):
+        run("export", weights, "--out", tmp_path / "x.onnx", "--int8")
+    with pytest.raises(ConfigError, match="multiples of 32"):
+        run("export", weights, "--out", tmp_path / "x.onnx", "--size", "100x100")
+    with pytest.raises(ConfigError, match="HEIGHTxWIDTH"):
+        run("export", weights, "--out", tmp_path / "x.onnx", "--size", "big")
+    assert not (tmp_path / "x.onnx").exists()
+
+
+def test_weights_list_inspect_convert(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("EDGESLAM_CACHE", str(tmp_path / "cache"))
+    run("weights", "list")
+    assert "mobilenet-nnconv5dw-skipadd-pruned: pruned" in capsys.readouterr().out
+    run("weights", "inspect")
+    printed = capsys.readouterr().out
+    assert "3.96 M parameters" in printed
+    assert "licence: Apache-2.0" in printed
+    torch.save(FastDepth(Variant.PRUNED).state_dict(), tmp_path / "plain.pth.tar")
+    run("weights", "convert", tmp_path / "plain.pth.tar", "--out", tmp_path / "c.safetensors")
+    assert "skipadd-pruned" in capsys.readouterr().out
+    with pytest.raises(ConfigError, match="there are"):
+        run("weights", "download", "resnet")
