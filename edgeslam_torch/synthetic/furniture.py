@@ -29,7 +29,7 @@ def table(scene: Scene, place: Place, rng: Rng, width: float, depth: float, heig
     for x in (-width / 2 + leg, width / 2 - leg):
         for y in (leg, depth - leg):
             scene.box(place, (x, y, (height - thick) / 2), (leg, leg, height - thick), metal, "leg", faces="frbl")
-    clutter(scene, place.at(0, 0, height), rng, width, depth, int(rng.integers(1, 6)))
+    clutter(scene, place.at(0, 0, height), rng, width, depth, int(rng.integers(1, 5 + 6 * width * depth)))
 
 
 def desk(scene: Scene, place: Place, rng: Rng, width: float, depth: float) -> None:
@@ -187,6 +187,57 @@ def cartons(scene: Scene, place: Place, rng: Rng) -> None:
         size *= 0.85
 
 
+def counter(scene: Scene, place: Place, rng: Rng, width: float, depth: float) -> None:
+    """Kitchen: base units, worktop, tiles, wall cupboards, hob or sink, a microwave and many small things."""
+    height, top = float(rng.uniform(0.82, 0.92)), 0.04
+    paint, worktop = random_paint(rng, WOODS), random_paint(rng, ("terrazzo", "concrete", "veneer", "metal"))
+    units = max(1, round(width / 1.2))
+    for k in range(units):
+        front = Paint("cabinet", int(rng.integers(VARIANTS)), paint.tint)
+        x = (k + 0.5) * width / units - width / 2
+        size = (width / units, depth - 0.02, height)
+        scene.box(place, (x, depth / 2 - 0.01, height / 2), size, paint, "unit", faces="frl", special={"f": front})
+    scene.box(place, (0, depth / 2, height + top / 2), (width, depth, top), worktop, "worktop", faces="frltu")
+    on_top = place.at(0, 0, height + top)
+    tall = float(rng.uniform(0.4, 0.6))
+    if rng.random() < 0.7:
+        scene.panel(
+            on_top, (0, 0.004, tall / 2), width, tall, random_paint(rng, ("tiles", "tiles", "metal")), "splashback"
+        )
+    if rng.random() < 0.7:
+        x, size = float(rng.uniform(-0.3, 0.3) * width), (0.56, 0.46, 0.006)
+        dark = Paint("metal", 0, (0.25, 0.25, 0.25)) if rng.random() < 0.5 else Paint("metal", 1, (0.8, 0.8, 0.8))
+        scene.box(on_top, (x, depth / 2, 0.003), size, dark, "hob", faces="frlt", inside=True)
+    if rng.random() < 0.6:
+        x = float(rng.uniform(-0.35, 0.35) * width)
+        case = random_paint(rng, ("metal", "plaster"))
+        door = Paint("screen", int(rng.integers(VARIANTS)), (0.5, 0.5, 0.5))
+        scene.box(on_top, (x, 0.22, 0.14), (0.48, 0.36, 0.28), case, "microwave", special={"f": door})
+    clutter(scene, on_top, rng, width, depth, int(rng.integers(2, 4 + 4 * width)))
+    if rng.random() < 0.7:
+        upper = float(rng.uniform(0.5, 0.75))
+        for k in range(units):
+            front = Paint("cabinet", int(rng.integers(VARIANTS)), paint.tint)
+            x = (k + 0.5) * width / units - width / 2
+            scene.box(on_top, (x, 0.17, tall + upper / 2), (width / units, 0.34, upper), paint, "wall unit",
+                      faces="frltu", special={"f": front})  # fmt: skip
+
+
+def laptop(scene: Scene, place: Place, rng: Rng) -> None:
+    """Base with keys and a leaning display."""
+    case = Paint("metal", int(rng.integers(VARIANTS)), (0.5, 0.5, 0.5))
+    keys = {"t": picture_paint(rng, "keyboard")}
+    scene.box(place, (0, 0, 0.01), (0.33, 0.23, 0.02), case, "laptop", special=keys)
+    lean, view = float(rng.uniform(0.1, 0.5)), picture_paint(rng, "screen")
+    up = np.array([0.0, -np.sin(lean), np.cos(lean)]) * 0.21
+    corner = np.array([0.165, -0.115, 0.02]) + up
+    u, v = place.direction(np.array([-0.33, 0.0, 0.0])), place.direction(-up)
+    glow = Paint(view.kind, view.variant, view.tint, glow=True)
+    scene.surface(place.point(corner), u, v, glow, "laptop screen")
+    back = np.array([-0.165, -0.117, 0.02]) + up
+    scene.surface(place.point(back), -u, v, case, "laptop lid")
+
+
 def clutter(
     scene: Scene, place: Place, rng: Rng, width: float, depth: float, count: int, headroom: float = 0.5
 ) -> None:
@@ -222,6 +273,8 @@ def clutter(
             special = {"f": picture_paint(rng, "picture")} if rng.random() < 0.5 else None
             h = min(h, headroom)
             scene.box(at, (0, 0, h / 2), (w, d, h), random_paint(rng, kinds, vivid=0.12), "object", special=special)
+        elif kind < 0.89 and headroom > 0.3:
+            laptop(scene, at, rng)
         else:
             scene.box(at, (0, 0, 0.0015), (0.21, 0.297, 0.003), Paint("plaster", 0), "paper", faces="t",
                       special={"t": picture_paint(rng, "poster")}, inside=True)  # fmt: skip
@@ -250,6 +303,7 @@ PIECES = {
     "table": Piece(table, (0.6, 1.8), (0.45, 0.95)),
     "shelf": Piece(shelf, (0.6, 1.4), (0.24, 0.38)),
     "cupboard": Piece(cupboard, (0.5, 1.4), (0.35, 0.6)),
+    "counter": Piece(counter, (1.2, 3.0), (0.55, 0.65)),
     "sofa": Piece(sofa, (1.2, 2.2), (0.75, 0.95)),
     "bed": Piece(bed, (0.95, 1.7), (1.9, 2.1)),
     "plant": Piece(_small(plant), (0.5, 0.6), (0.5, 0.6)),

@@ -13,9 +13,13 @@ from edgeslam_torch.synthetic.world import World
 from edgeslam_torch.types import FloatArray
 
 Rng = np.random.Generator
+CLOSE_UPS = 0.35
+"""Share of random poses that look at the top of a table or shelf from near."""
 WALLS = ("plaster", "plaster", "plaster", "rough_plaster", "wallpaper", "concrete", "bricks", "tiles", "veneer")
 FLOORS = ("wood", "wood", "carpet", "carpet", "tiles", "terrazzo", "concrete")
 CEILINGS = ("plaster", "plaster", "ceiling_panels", "concrete", "rough_plaster", "veneer")
+HOME = ("desk", "desk", "shelf", "shelf", "shelf", "cupboard", "cupboard", "sofa", "table", "plant", "lamp", "cartons")
+"""What the demo's room is furnished with: a study full of edges."""
 TEXTURED_WALLS = ("rough_plaster", "wallpaper", "bricks", "concrete", "plaster")
 
 
@@ -65,9 +69,9 @@ def room(rng: Rng, *, size_m: tuple[float, float, float] = (6.5, 5.2, 2.7)) -> W
     _lamps(scene, rng)
     scene.ambient = 0.55
     _rug(scene, rng, 0.0, 0.0)
-    for wall in range(4):
+    for wall in rng.permutation(4).tolist():
         place, length = _wall(low, high, wall)
-        _furnish_wall(scene, place, length, rng, size_m[2], density=0.95, door=wall == 0)
+        _furnish_wall(scene, place, length, rng, size_m[2], density=0.96, door=wall == 0, names=HOME)
     return scene.world("room")
 
 
@@ -104,6 +108,10 @@ def random_pose(rng: Rng, world: World) -> FloatArray:
     low, high = world.bounds_w
     best, best_clearance = 0.5 * (low + high), -np.inf
     ceiling = min(2.2, high[2] - 0.25)
+    if rng.random() < CLOSE_UPS:
+        T_w_c = _close_up(rng, world, ceiling)
+        if T_w_c is not None:
+            return T_w_c
     for _ in range(40):
         margin = np.minimum(0.3, 0.25 * (high - low))
         p = rng.uniform(low + margin, high - margin)
@@ -118,6 +126,21 @@ def random_pose(rng: Rng, world: World) -> FloatArray:
     pitch = rng.normal(0.15, 0.45 if steep else 0.18)  # positive looks down
     roll = rng.normal(0.0, 0.35 if steep else 0.06)
     return look(best, yaw, float(np.clip(pitch, -1.0, 1.3)), roll)
+
+
+def _close_up(rng: Rng, world: World, ceiling_m: float) -> FloatArray | None:
+    """A view of the top of some table, shelf or box from within arm's reach to two metres; None when none is free."""
+    tops = [b for b in world.boxes if b.half_m[:2].max() > 0.15 and 0.3 < b.centre_w[2] + b.half_m[2] < 1.4]
+    for _ in range(12 if tops else 0):
+        box = tops[int(rng.integers(len(tops)))]
+        target = box.centre_w + [*rng.uniform(-0.7, 0.7, 2) * box.half_m[:2], float(box.half_m[2])]
+        yaw, distance = rng.uniform(-np.pi, np.pi), float(np.exp(rng.uniform(np.log(0.5), np.log(2.0))))
+        down = float(rng.uniform(0.1, 1.0))
+        p = target - distance * np.array([np.cos(yaw) * np.cos(down), np.sin(yaw) * np.cos(down), -np.sin(down)])
+        if 0.3 < p[2] < ceiling_m and world.clearance(p) > 0.2:
+            aim = rng.normal(0.0, 0.12, 2)
+            return look(p, yaw + aim[0], down + aim[1], float(rng.normal(0.0, 0.15)))
+    return None
 
 
 def look(p_w: FloatArray, yaw_rad: float, down_rad: float = 0.0, roll_rad: float = 0.0) -> FloatArray:
@@ -259,7 +282,15 @@ def _decorate(
 
 
 def _furnish_wall(
-    scene: Scene, place: Place, length: float, rng: Rng, height_m: float, *, density: float, door: bool
+    scene: Scene,
+    place: Place,
+    length: float,
+    rng: Rng,
+    height_m: float,
+    *,
+    density: float,
+    door: bool,
+    names: tuple[str, ...] = tuple(PIECES),
 ) -> None:
     """Walk along a wall: door, windows, furniture where it fits, pictures above the low pieces."""
     x = -length / 2 + 0.1
@@ -278,7 +309,7 @@ def _furnish_wall(
             else:
                 x += rng.uniform(0.3, 0.9)
             continue
-        piece = PIECES[str(rng.choice(list(PIECES)))]
+        piece = PIECES[str(rng.choice(names))]
         width, depth = float(rng.uniform(*piece.width_m)), float(rng.uniform(*piece.depth_m))
         spot = place.at(x + width / 2, 0.03)
         if width > room_left or not _fits(scene, spot, width, depth + piece.front_m):
