@@ -82,7 +82,7 @@ def render(run: RunFolder, score: RunScore | None = None, truth: Trajectory | No
     anchors = _subset(run.cloud("anchors.ply"), _MAX_ANCHORS)
     turn = _upright(run.trajectory, score, truth)
     data, packed_edges, packed_anchors = _payload(run, edges, anchors, score, truth, turn)
-    text = json.dumps(data, allow_nan=False, separators=(",", ":"), default=_plain).replace("<", "\\u003c")
+    text = json.dumps(_finite(data), allow_nan=False, separators=(",", ":"), default=_plain).replace("<", "\\u003c")
     page = (_PAGE / "page.html").read_text(encoding="utf-8")
     script = "\n".join((_PAGE / name).read_text(encoding="utf-8") for name in _SCRIPTS)
     parts = {
@@ -429,6 +429,17 @@ def _text(path: Path) -> str | None:
 
 def _rounded(values: FloatArray, digits: int) -> list[Any]:
     return list(np.round(np.asarray(values, dtype=np.float64), digits).tolist())
+
+
+def _finite(value: Any) -> Any:
+    """Nested numbers that are not finite as None: JSON has no NaN, and a score of a motionless truth is one."""
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(item) for item in value]
+    if isinstance(value, (float, np.floating)) and not np.isfinite(value):
+        return None
+    return value
 
 
 def _plain(value: object) -> object:
