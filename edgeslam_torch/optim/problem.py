@@ -21,7 +21,6 @@ class StopReason(StrEnum):
     STALLED = "no step lowers the cost"
     SINGULAR = "reduced system not positive definite"
     NO_OBSERVATIONS = "no usable observations"
-    NOTHING_FREE = "nothing to refine"
     NOT_FINITE = "not finite"
 
     @property

@@ -151,9 +151,10 @@ class RelativeBlocks(ABC):
         M[each, self.column[self.group_target]] += torch.eye(6, dtype=torch.float64)
         M[each, self.column[self.group_host]] -= lie.adjoint(T_rel)
         M = M[:, :-1].permute(0, 2, 1, 3).reshape(G, 6, n)
-        H += M.reshape(-1, n).mT @ (normal[:, :6, :6] @ M).view(-1, n)
-        g += M.reshape(-1, n).mT @ normal[:, :6, 6].flatten()
-        self.maps = [M[c.slices[0][0] : c.slices[-1][0] + 1].reshape(-1, n) for c in self.chunks]
+        flat = M.view(6 * G, n)
+        H += flat.mT @ (normal[:, :6, :6] @ M).view(6 * G, n)
+        g += flat.mT @ normal[:, :6, 6].flatten()
+        self.maps = [flat[6 * c.slices[0][0] : 6 * c.slices[-1][0] + 6] for c in self.chunks]
 
     def reduce(self, mu: float, S: Tensor, b: Tensor) -> None:
         """Subtract what the blocks take from the pose system ``S`` and its right side ``b``."""

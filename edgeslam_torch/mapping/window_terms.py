@@ -1,0 +1,231 @@
+"""Edge and junction terms of a window from what its keyframes hold."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from edgeslam_torch.frontend.corners import Junctions
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.losses.cycle import CycleForm
+from edgeslam_torch.optim.edge_association import EdgeField, associate_edges
+from edgeslam_torch.optim.problem import EdgeTerms, JunctionTerms
+from edgeslam_torch.optim.relative import collinearity_prior
+from edgeslam_torch.types import FloatArray, IntArray
+
+
+@dataclass(frozen=True, slots=True)
+class Structure:
+    """Edges and junctions of one keyframe."""
+
+    field: EdgeField
+    """Its edges with their inverse depths, ready for look-up."""
+    sigma: FloatArray
+    """``(E,)`` standard deviations of those inverse depths [1/m]."""
+    junctions: Junctions | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class TermConfig:
+    """How many terms to make and how far to trust them."""
+
+    edges_per_pose: int = 800
+    targets: int = 3
+    """Poses in which each pose's edges are looked for: the nearest by baseline."""
+    max_px: float = 4.0
+    """Largest distance between a projected edge pixel and its partner."""
+    edge_sigma_px: float = 1.0
+    """Whole-pixel edges (0.3 px) that move with the light and the view."""
+    cycle: CycleForm = CycleForm.RELATIVE_DEPTH
+    cycle_sigma: float = 0.0
+    """Standard deviation of the cycle residual; zero leaves the cycle out."""
+    junction_px: float = 6.0
+    """Largest distance between a projected corner and its partner."""
+    junction_turn_rad: float = 0.35
+    """Largest angle between projected and seen arms."""
+    arm_points: int = 8
+    """Edge points along each arm whose depths are asked for."""
+    arm_px: float = 40.0
+    """Longest piece of an arm that is used."""
+
+
+def nearest_poses(T_c_w: FloatArray, count: int) -> IntArray:
+    """For each pose the ``count`` others with the nearest camera centres, ``(W, count)``."""
+    c = se3.inverse(np.asarray(T_c_w, dtype=np.float64))[:, :3, 3]
+    distance = np.linalg.norm(c[:, None] - c[None], axis=2)
+    np.fill_diagonal(distance, np.inf)
+    return np.argsort(distance, axis=1, kind="stable")[:, : min(count, len(c) - 1)]
+
+
+def edge_terms(
+    structures: Sequence[Structure],
+    T_c_w: FloatArray,
+    K: tuple[float, float, float, float],
+    config: TermConfig | None = None,
+) -> EdgeTerms | None:
+    """Edge alignment and cycle between each pose and its nearest neighbours; None when no edge finds a partner.
+
+    Args:
+        structures: One per pose.
+        T_c_w: World-to-camera poses ``(W, 4, 4)``; the association depends on them, so make the terms anew when
+            poses have moved by more than a pixel or two.
+        K: fx, fy, cx, cy [px].
+        config: Numbers and sigmas.
+    """
+    config = config or TermConfig()
+    chosen = [_spread(s.field.inverse_depth > 0, config.edges_per_pose) for s in structures]
+    host = np.repeat(np.arange(len(structures)), [len(c) for c in chosen])
+    if len(host) == 0 or len(structures) < 2:
+        return None
+    parts = list(zip(structures, chosen, strict=True))
+    uv = np.concatenate([s.field.edges.uv[c] for s, c in parts]).astype(np.float64)
+    normal = np.concatenate([s.field.edges.normal[c] for s, c in parts]).astype(np.float64)
+    inverse_depth = np.concatenate([s.field.inverse_depth[c] for s, c in parts]).astype(np.float64)
+    sigma = np.concatenate([s.sigma[c] for s, c in parts]).astype(np.float64)
+    targets = nearest_poses(T_c_w, config.targets)
+    edge = np.repeat(np.arange(len(host)), targets.shape[1])
+    fields = [s.field for s in structures]
+    pairs = associate_edges(
+        fields, T_c_w, host, uv, normal, inverse_depth, edge, targets[host].ravel(), K, max_px=config.max_px
+    )
+    used, pair_edge = np.unique(pairs.pair_edge, return_inverse=True)
+    if len(used) == 0:
+        return None
+    return EdgeTerms(
+        host=host[used],
+        uv=uv[used],
+        inverse_depth=inverse_depth[used],
+        prior=inverse_depth[used],
+        prior_sigma=sigma[used],
+        pair_edge=pair_edge,
+        pair_pose=pairs.pair_pose,
+        pair_uv=pairs.pair_uv,
+        pair_normal=pairs.pair_normal,
+        pair_inv_sigma=np.full(len(pair_edge), 1.0 / config.edge_sigma_px),
+        pair_inverse_depth=pairs.pair_inverse_depth,
+        cycle=config.cycle,
+        cycle_sigma=config.cycle_sigma,
+    )
+
+
+def junction_terms(
+    structures: Sequence[Structure],
+    T_c_w: FloatArray,
+    K: tuple[float, float, float, float],
+    config: TermConfig | None = None,
+) -> JunctionTerms | None:
+    """Junctions that are seen again from a neighbouring pose; None when there is none. Arguments as `edge_terms`."""
+    config = config or TermConfig()
+    targets = nearest_poses(T_c_w, config.targets) if len(structures) > 1 else np.zeros((len(structures), 0), int)
+    rows = []
+    ends, priors, informations, hosts = [], [], [], []
+    at = 0
+    for i, structure in enumerate(structures):
+        junctions = structure.junctions
+        if junctions is None or len(junctions) == 0:
+            continue
+        prior, information, known = _junction_depths(structure, config)
+        uv = np.concatenate([junctions.uv[:, None], junctions.arm_points(1, config.arm_px)[0][:, :, 0]], 1)
+        for j in targets[i]:
+            other = structures[j].junctions
+            if other is None or len(other) == 0:
+                continue
+            mine, theirs = _match(uv, prior, known, other, T_c_w[j] @ se3.inverse(T_c_w[i]), K, config)
+            arms = _ordered(uv[mine], prior[mine], other.arms[theirs], T_c_w[j] @ se3.inverse(T_c_w[i]), K)
+            rows.append((at + mine, np.full(len(mine), j), other.uv[theirs], arms))
+        hosts.append(np.full(len(uv), i))
+        ends.append(uv)
+        priors.append(prior)
+        informations.append(information)
+        at += len(uv)
+    if not rows or sum(len(r[0]) for r in rows) == 0:
+        return None
+    pair, pose, seen, arms = (np.concatenate(column) for column in zip(*rows, strict=True))
+    used, pair = np.unique(pair, return_inverse=True)
+    prior = np.concatenate(priors)[used]
+    return JunctionTerms(
+        host=np.concatenate(hosts)[used],
+        uv=np.concatenate(ends)[used],
+        inverse_depth=prior,
+        prior=prior,
+        prior_information=np.concatenate(informations)[used],
+        pair_junction=pair,
+        pair_pose=pose,
+        pair_uv=seen,
+        pair_arms=arms,
+    )
+
+
+def _spread(mask: np.ndarray, most: int) -> IntArray:
+    """At most ``most`` of the places where ``mask`` holds, evenly."""
+    places = np.flatnonzero(mask)
+    if len(places) <= most:
+        return places
+    return places[np.linspace(0, len(places) - 1, most).astype(np.int64)]
+
+
+def _junction_depths(structure: Structure, config: TermConfig) -> tuple[FloatArray, FloatArray, np.ndarray]:
+    """Inverse depths of corner and arm ends from the edges on the arms, their information, and which are known."""
+    junctions, field = structure.junctions, structure.field
+    assert junctions is not None
+    uv, fraction = junctions.arm_points(config.arm_points, config.arm_px)
+    _, height, width = field.nearest.shape
+    x = np.clip(np.rint(uv[..., 0]).astype(int), 0, width - 1)
+    y = np.clip(np.rint(uv[..., 1]).astype(int), 0, height - 1)
+    partner = field.nearest[:, y, x]  # (B, C, 2, M)
+    away = np.linalg.norm(field.edges.uv[partner] - uv, axis=-1) + np.where(partner < 0, np.inf, 0.0)
+    best = away.argmin(0)[None]
+    partner = np.take_along_axis(partner, best, 0)[0]
+    near = np.take_along_axis(away, best, 0)[0] <= 2.0
+    depth, sigma = field.inverse_depth[partner].astype(np.float64), structure.sigma[partner].astype(np.float64)
+    given = near & (depth > 0)
+    prior, information = collinearity_prior(np.where(given, fraction, np.nan), depth, np.where(given, sigma, 1.0))
+    known = (given.sum(2) >= 3).all(1) & (prior > 0).all(1)
+    return prior, information, known
+
+
+def _match(
+    uv: FloatArray,
+    inverse_depth: FloatArray,
+    known: np.ndarray,
+    other: Junctions,
+    T_j_i: FloatArray,
+    K: tuple[float, float, float, float],
+    config: TermConfig,
+) -> tuple[IntArray, IntArray]:
+    """Junctions with a partner in the other view, and the partners: near, arms alike, mutually best."""
+    projected, front = _project(T_j_i, uv, inverse_depth, K)
+    distance = np.linalg.norm(projected[:, None, 0] - other.uv[None], axis=2)
+    arms = _unit(projected[:, 1:] - projected[:, :1])
+    straight = np.einsum("iak,jak->ija", arms, other.arms).min(2)
+    crossed = np.einsum("iak,jak->ija", arms, other.arms[:, ::-1]).min(2)
+    alike = np.maximum(straight, crossed) > np.cos(config.junction_turn_rad)
+    distance = np.where(alike & (known & front)[:, None] & (distance < config.junction_px), distance, np.inf)
+    best = distance.argmin(1)
+    mutual = np.isfinite(distance.min(1)) & (distance.argmin(0)[best] == np.arange(len(uv)))
+    return np.flatnonzero(mutual), best[mutual]
+
+
+def _ordered(
+    uv: FloatArray, inverse_depth: FloatArray, arms: FloatArray, T_j_i: FloatArray, K: tuple[float, float, float, float]
+) -> FloatArray:
+    """Seen arms ``(Q, 2, 2)`` in the order of the host's arms: a junction seen from behind changes hands."""
+    projected, _ = _project(T_j_i, uv, inverse_depth, K)
+    mine = _unit(projected[:, 1:] - projected[:, :1])
+    swap = (mine * arms).sum(2).min(1) < (mine * arms[:, ::-1]).sum(2).min(1)
+    return np.where(swap[:, None, None], arms[:, ::-1], arms)
+
+
+def _project(
+    T: FloatArray, uv: FloatArray, inverse_depth: FloatArray, K: tuple[float, float, float, float]
+) -> tuple[FloatArray, np.ndarray]:
+    """Pixels ``(C, 3, 2)`` of corner and arm ends in the other view, and which lie in front."""
+    rays = np.concatenate([(uv - np.array(K[2:])) / K[:2], np.ones((*uv.shape[:2], 1))], 2)
+    q = rays @ T[:3, :3].T + inverse_depth[..., None] * T[:3, 3]
+    front: np.ndarray = np.all(q[..., 2] > 1e-6, axis=1)
+    z = np.where(q[..., 2] > 1e-6, q[..., 2], 1.0)
+    return q[..., :2] / z[..., None] * K[:2] + np.array(K[2:]), front
+
+
+def _unit(v: FloatArray) -> FloatArray:
+    return v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-9)

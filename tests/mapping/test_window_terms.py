@@ -1,0 +1,120 @@
+"""Edge and junction terms made from keyframes, and what they do for a window."""
+
+import numpy as np
+import pytest
+
+from edgeslam_torch.frontend.corners import Junctions
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.mapping.window_terms import Structure, TermConfig, edge_terms, junction_terms, nearest_poses
+from edgeslam_torch.optim.edge_association import edge_field
+from edgeslam_torch.optim.local_ba import refine_window
+from edgeslam_torch.optim.problem import LmConfig, WindowProblem
+from edgeslam_torch.types import Edges, FloatArray
+
+K = (500.0, 500.0, 319.5, 239.5)
+SIZE = (640, 480)
+
+
+def corners(rng: np.random.Generator, count: int = 40) -> FloatArray:
+    """Corner and two arm ends of right angles in space ``(C, 3, 3)``."""
+    p = rng.uniform((-1.6, -1.1, 3), (1.6, 1.1, 5), (count, 3))
+    a = rng.normal(size=(count, 3)) * np.array([1, 1, 0.3])
+    a /= np.linalg.norm(a, axis=1, keepdims=True)
+    b = np.cross(a, np.array([0.0, 0.0, 1.0]))
+    b /= np.linalg.norm(b, axis=1, keepdims=True)
+    return np.stack([p, p + 0.4 * a, p + 0.4 * b], 1)
+
+
+def see(T: FloatArray, world: FloatArray) -> Structure:
+    """What a keyframe would extract of the corners."""
+    s = np.linspace(0, 1, 80)[:, None]
+    arms = (world[:, :1, None] * (1 - s) + world[:, 1:, None] * s).reshape(-1, 3)
+    p = se3.transform(T, arms)
+    uv = p[:, :2] / p[:, 2:] * K[:2] + np.array(K[2:])
+    q = se3.transform(T, world.reshape(-1, 3))
+    ends = (q[:, :2] / q[:, 2:] * K[:2] + np.array(K[2:])).reshape(-1, 3, 2)
+    along = np.repeat((ends[:, 1:] - ends[:, :1]).reshape(-1, 2), 80, 0)
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    normal = np.stack([along[:, 1], -along[:, 0]], 1)
+    pixel, first = np.unique(np.rint(uv), axis=0, return_index=True)
+    inside = (pixel >= 0).all(1) & (pixel < np.array(SIZE)).all(1)
+    first = first[inside]
+    edges = Edges(
+        pixel[inside].astype(np.float32), normal[first].astype(np.float32), np.zeros((len(first), 3), np.uint8)
+    )
+    inverse_depth = 1.0 / p[first, 2]
+    arms_2d = ends[:, 1:] - ends[:, :1]
+    length = np.linalg.norm(arms_2d, axis=2)
+    arms_2d = arms_2d / length[..., None]
+    left = arms_2d[:, 0, 0] * arms_2d[:, 1, 1] - arms_2d[:, 0, 1] * arms_2d[:, 1, 0] < 0
+    arms_2d[left], length[left] = arms_2d[left][:, ::-1], length[left][:, ::-1]
+    n = len(ends)
+    junctions = Junctions(ends[:, 0], arms_2d, length, np.full(n, 1.5), np.full(n, 0.1), np.full((n, 2), 0.01))
+    return Structure(edge_field(edges, inverse_depth, SIZE), 0.05 * inverse_depth, junctions)
+
+
+@pytest.fixture
+def scene(rng: np.random.Generator) -> tuple[FloatArray, list[Structure]]:
+    world = corners(rng)
+    T = np.stack([se3.exp(np.array([-0.15 * i, 0.02 * i, 0.0, 0.0, 0.01 * i, 0.02 * i])) for i in range(4)])
+    return T, [see(t, world) for t in T]
+
+
+def test_nearest_poses_are_by_baseline():
+    T = np.stack([se3.exp(np.array([x, 0, 0, 0, 0, 0])) for x in (0.0, 1.0, 1.5, 5.0)])
+    np.testing.assert_array_equal(nearest_poses(T, 2), [[1, 2], [2, 0], [1, 0], [2, 1]])
+    assert nearest_poses(T, 9).shape == (4, 3)
+    assert nearest_poses(T[:1], 3).shape == (1, 0)
+
+
+def test_terms_fit_at_the_true_poses(scene):
+    T, structures = scene
+    edges, junctions = edge_terms(structures, T, K), junction_terms(structures, T, K)
+    assert edges is not None
+    assert junctions is not None
+    assert len(edges.pair_edge) > 1000
+    assert len(junctions.pair_junction) > 60
+    p = WindowProblem(T, np.ones(4, bool), np.zeros((0, 3)), *4 * [np.zeros(0)], K, edges=edges, junctions=junctions)
+    result = refine_window(p, LmConfig(max_iterations=0))
+    assert np.median(result.edge_chi2) < 0.5
+    # rows of a corner within 1 px and of an arm within 1 / 20 rad cost less than one each
+    assert result.cost_after < 0.7 * (len(edges.pair_edge) + 4 * len(junctions.pair_junction))
+
+
+def test_numbers_are_kept(scene):
+    T, structures = scene
+    edges = edge_terms(structures, T, K, TermConfig(edges_per_pose=100, targets=1))
+    assert edges is not None
+    assert np.bincount(edges.host).max() <= 100
+    assert np.bincount(edges.pair_edge).max() == 1
+
+
+def test_terms_bring_poses_back(scene, rng):
+    T, structures = scene
+    start = T.copy()
+    for i in (1, 2, 3):
+        start[i] = se3.exp(np.repeat([0.006, 0.002], 3) * rng.normal(size=6)) @ T[i]
+    before = max(np.abs(se3.log(a @ se3.inverse(b))).max() for a, b in zip(start, T, strict=True))
+    for _ in range(3):
+        problem = WindowProblem(
+            start,
+            np.arange(4) < 1,
+            np.zeros((0, 3)),
+            *4 * [np.zeros(0)],
+            K,
+            edges=edge_terms(structures, start, K),
+            junctions=junction_terms(structures, start, K),
+        )
+        start = refine_window(problem).T_c_w
+    after = max(np.abs(se3.log(a @ se3.inverse(b))).max() for a, b in zip(start, T, strict=True))
+    assert after < 0.4 * before
+
+
+def test_nothing_to_pair_gives_none(scene):
+    T, structures = scene
+    bare = Structure(structures[0].field, structures[0].sigma)
+    far = np.stack([np.eye(4), se3.exp(np.array([0, 0, 0, 0, np.pi, 0]))])
+    assert junction_terms([bare, bare], far, K) is None
+    assert edge_terms(structures[:2], far, K) is None
+    assert edge_terms(structures[:1], T[:1], K) is None
+    assert junction_terms(structures[:1], T[:1], K) is None
