@@ -29,7 +29,7 @@ def table(scene: Scene, place: Place, rng: Rng, width: float, depth: float, heig
     for x in (-width / 2 + leg, width / 2 - leg):
         for y in (leg, depth - leg):
             scene.box(place, (x, y, (height - thick) / 2), (leg, leg, height - thick), metal, "leg", faces="frbl")
-    clutter(scene, place.at(0, 0, height), rng, width, depth, int(rng.integers(1, 5 + 6 * width * depth)))
+    clutter(scene, place.at(0, 0, height), rng, width, depth, int(rng.integers(2, 6 + int(10 * width * depth))))
 
 
 def desk(scene: Scene, place: Place, rng: Rng, width: float, depth: float) -> None:
@@ -213,7 +213,7 @@ def counter(scene: Scene, place: Place, rng: Rng, width: float, depth: float) ->
         case = random_paint(rng, ("metal", "plaster"))
         door = Paint("screen", int(rng.integers(VARIANTS)), (0.5, 0.5, 0.5))
         scene.box(on_top, (x, 0.22, 0.14), (0.48, 0.36, 0.28), case, "microwave", special={"f": door})
-    clutter(scene, on_top, rng, width, depth, int(rng.integers(2, 4 + 4 * width)))
+    clutter(scene, on_top, rng, width, depth, int(rng.integers(3, 6 + int(5 * width))))
     if rng.random() < 0.7:
         upper = float(rng.uniform(0.5, 0.75))
         for k in range(units):
