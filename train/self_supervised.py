@@ -159,7 +159,7 @@ class SelfSupervised:
             motions = mirror @ motions @ mirror
             K[0, 2] = size[1] - 1 - K[0, 2]
             uv = uv * (-1, 1) + (size[1] - 1, 0)
-        uv, z = _inside(uv, view.z * scale, size, rng)
+        points, z = _inside(uv, view.z * scale, size, rng)
         edges, arms = straight_edges(images[0], EDGES, ARMS, ARM_POINTS, rng)
         seed = int(rng.integers(1 << 62))
         # Both images of a pair are recoloured alike; the photometric term sees the originals.
@@ -173,7 +173,7 @@ class SelfSupervised:
             "K": torch.from_numpy(K).float(),
             "T_j_i": torch.from_numpy(motions).float(),
             "log_focal": torch.tensor(np.log(focal / self.metadata.focal_px), dtype=torch.float32),
-            "uv": torch.from_numpy(uv),
+            "uv": torch.from_numpy(points),
             "log_z": torch.from_numpy(np.log(np.maximum(z, 1e-3))),
             "known": torch.from_numpy(z > 0),
             "edges": torch.from_numpy(edges),
