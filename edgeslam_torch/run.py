@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from enum import StrEnum
+from itertools import islice
 from pathlib import Path
 from types import FrameType
 from typing import Any, Protocol
@@ -15,6 +16,7 @@ from typing import Any, Protocol
 from edgeslam_torch.config import SlamConfig
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.io.camera_choice import GUESS, GUESS_COST, GUESS_WARNING
 from edgeslam_torch.io.config_file import to_toml
 from edgeslam_torch.io.pace import Counter, at_their_pace
 from edgeslam_torch.io.run_writer import CAMERA, PICTURE, RunWriter
@@ -30,6 +32,9 @@ from edgeslam_torch.types import (
 )
 
 logger = logging.getLogger(__name__)
+
+LOOKED_AT = 320
+"""Images at the start of a recording in which an unknown focal length is looked for; ten seconds at 30 Hz."""
 
 
 class Mode(StrEnum):
@@ -128,6 +133,29 @@ def run(
         with closing(RunWriter(out_dir, keep=[Path(source.location)])) as writer:
             writer.write_config(to_toml(config))
             return _Run(source, writer, slam, config, mode, listeners).go()
+
+
+def settle_camera(source: Source) -> None:
+    """Replace a guessed focal length by what the first images of a recording say, or add why they say nothing.
+
+    A live source is left alone: its images are gone once they are looked at.
+    """
+    if source.live or not source.camera.source.startswith(GUESS):
+        return
+    from edgeslam_torch.tracking.self_calibration import MAX_FRAMES, guess_camera
+
+    looked_at = min(source.length or LOOKED_AT, LOOKED_AT)
+    frames = source.frames()
+    images = [frame.image for frame in islice(frames, 0, looked_at, max(1, looked_at // MAX_FRAMES))]
+    close = getattr(frames, "close", None)
+    if close is not None:
+        close()
+    if not images:
+        return
+    source.camera = guess_camera(images, source.camera.width, source.camera.height)
+    if not source.camera.source.startswith(GUESS):
+        source.warnings[:] = [w for w in source.warnings if not w.startswith(GUESS_WARNING)]
+        source.warnings.append(f"no calibration found: {source.camera.source}; {GUESS_COST}")
 
 
 class _Run:

@@ -62,10 +62,11 @@ def main(args: argparse.Namespace) -> int:
     """Run, and say in a few lines how it went."""
     from edgeslam_torch.io.source import open_source
     from edgeslam_torch.progress import make_progress
-    from edgeslam_torch.run import Listener, Mode, run
+    from edgeslam_torch.run import Listener, Mode, run, settle_camera
 
     config = resolved_config(args)
     source = open_source(args.source, args.camera, args.telemetry, args.max_frames)
+    settle_camera(source)
     for warning in source.warnings:
         _say(f"warning: {warning}")
     _say(f"camera: {source.camera.source}, {source.camera.width}x{source.camera.height}, f {source.camera.fx:.1f} px")

@@ -12,6 +12,9 @@ CALIBRATION_FILES = ("camera.yaml", "ost.yaml", "sensor.yaml")
 _ASPECT_TOLERANCE = 0.005
 """Relative; KITTI's 1241x376 halved is off by 0.001, 4:3 and 16:9 differ by 0.33."""
 
+GUESS = "guess"
+"""How the ``source`` of a guessed camera begins."""
+GUESS_WARNING = "no calibration found: guessing"
 GUESS_COST = (
     "a focal length that is off by 10 % bends the trajectory and changes its scale by about as much; "
     "give --camera FILE (make one with: edgeslam calibrate)"
@@ -57,8 +60,8 @@ def choose_camera(
         return camera, [note]
     focal = 1.2 * max(size)
     centre = ((size[0] - 1) / 2.0, (size[1] - 1) / 2.0)
-    camera = Camera(*size, focal, focal, *centre, source=f"guess: 1.2*max(w,h) = {focal:.0f} px")
-    return camera, [f"no calibration found: guessing a focal length of {focal:.0f} px; {GUESS_COST}"]
+    camera = Camera(*size, focal, focal, *centre, source=f"{GUESS}: 1.2*max(w,h) = {focal:.0f} px")
+    return camera, [f"{GUESS_WARNING} a focal length of {focal:.0f} px; {GUESS_COST}"]
 
 
 def fitted(camera: Camera, size: tuple[int, int], name: str) -> tuple[Camera, list[str]]:
