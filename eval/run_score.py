@@ -163,8 +163,9 @@ def _map_score(run: RunFolder, dataset: EvalDataset | None, sim3: TrajectoryScor
 def _coverage(run: RunFolder, dataset: EvalDataset | None, truth: Trajectory) -> tuple[float, float, float]:
     """Share of frames with a trusted pose and with any pose, and the time of the first [s]."""
     frames = dataset.frame_stamps_s if dataset is not None else np.zeros(0)
-    limit = run.summary.get("frames")
-    if len(frames) and isinstance(limit, int) and 0 < limit < len(frames):
+    source = run.summary.get("source")
+    limit = source.get("length") if isinstance(source, dict) else None
+    if isinstance(limit, int) and 0 < limit < len(frames):
         frames = frames[:limit]  # --max-frames: the run was asked for no more
     if len(frames) == 0:
         span = float(truth.stamps_s[-1] - truth.stamps_s[0])
