@@ -1,6 +1,7 @@
 """The embedded default: a simulated drone in a simulated house, and what the whole pipeline makes of it."""
 
 import json
+import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -137,6 +138,7 @@ def record(folder: Path, settings: DemoSettings, on_frame: Callable[[int], None]
         faults=CAMERAS[settings.images],
         seed=settings.seed,
         depth_every=10,
+        threads=min(4, os.cpu_count() or 1),
         on_frame=on_frame,
     )
     return Recorded(folder, world, flight, time.perf_counter() - start)

@@ -12,12 +12,15 @@ MAX_LEVEL = 18
 
 
 class Texture:
-    """An image with its half-octave pyramid, built when a level is first asked for."""
+    """An image with its half-octave pyramid, built when a level is first asked for.
+
+    Threads may share one: at worst both build the same level.
+    """
 
     def __init__(self, image: np.ndarray) -> None:
         if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
             raise ValueError(f"a texture is (H, W, 3) uint8, got {image.shape} {image.dtype}")
-        self._levels: list[np.ndarray] = [np.ascontiguousarray(image)]
+        self._levels: dict[int, np.ndarray] = {0: np.ascontiguousarray(image)}
 
     @property
     def image(self) -> np.ndarray:
@@ -26,13 +29,13 @@ class Texture:
 
     def level(self, k: int) -> np.ndarray:
         """Level ``k``: the image shrunk by ``2 ** (k / 2)`` in width and height (area average)."""
-        while len(self._levels) <= k:
-            done = len(self._levels)
-            source = self._levels[max(done - 2, 0)]
-            shrink = 2.0 ** (-0.5 * min(done, 2))
+        found = self._levels.get(k)
+        if found is None:
+            source = self.level(max(k - 2, 0))
+            shrink = 2.0 ** (-0.5 * min(k, 2))
             size = [max(1, round(n * shrink)) for n in (source.shape[1], source.shape[0])]
-            self._levels.append(cv2.resize(source, size, interpolation=cv2.INTER_AREA))
-        return self._levels[k]
+            found = self._levels.setdefault(k, np.asarray(cv2.resize(source, size, interpolation=cv2.INTER_AREA)))
+        return found
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,6 +1,7 @@
 """A simulated flight as a folder on disk: TUM layout with telemetry, exact depth and ground truth."""
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import cv2
@@ -31,6 +32,7 @@ def write_flight(
     seed: int = 0,
     depth_every: int = 1,
     jpeg_quality: int = 95,
+    threads: int = 1,
     on_frame: Callable[[int], None] | None = None,
 ) -> Path:
     """Render a flight into ``folder`` and return it.
@@ -45,6 +47,7 @@ def write_flight(
         seed: Of the image noise; each frame has its own stream.
         depth_every: Write the exact depth of every n-th frame (0 for none).
         jpeg_quality: Of ``rgb/*.jpg``; 0 writes PNG.
+        threads: Frames drawn at a time; the bytes do not depend on it.
         on_frame: Called with the number of frames done.
 
     Raises:
@@ -62,20 +65,29 @@ def write_flight(
         _write_text(folder / "groundtruth.txt", _groundtruth_lines(flight.stamps_s, T_w_c))
         if telemetry is not None:
             telemetry.write(folder / "telemetry.csv")
-        for i, stamp in enumerate(flight.stamps_s.tolist()):
+
+        def draw(i: int) -> None:
             view = render(world, camera, T_w_c[i])
-            rng = np.random.default_rng([seed, i])
-            image = degraded(rng, view.image, view.depth_m, camera, faults, stamp_s=stamp, twist_c=flight.twist_c(i))
-            name = f"{stamp:.6f}"
+            rng, stamp = np.random.default_rng([seed, i]), float(flight.stamps_s[i])
+            twist = flight.twist_c(i)
+            image = degraded(rng, view.image, view.depth_m, camera, faults, stamp_s=stamp, twist_c=twist)
             options = [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality] if jpeg_quality else []
-            _write_image(folder / "rgb" / f"{name}{suffix}", image, options)
-            rgb.append(f"{name} rgb/{name}{suffix}")
+            _write_image(folder / "rgb" / f"{stamp:.6f}{suffix}", image, options)
             if depth_every and i % depth_every == 0:
                 steps = np.clip(np.rint(view.depth_m * DEPTH_PER_METRE), 0, 65535).astype(np.uint16)
-                _write_image(folder / "depth" / f"{name}.png", steps, [cv2.IMWRITE_PNG_COMPRESSION, 1])
-                depth.append(f"{name} depth/{name}.png")
-            if on_frame is not None:
-                on_frame(i + 1)
+                _write_image(folder / "depth" / f"{stamp:.6f}.png", steps, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+
+        pool = ThreadPoolExecutor(max_workers=threads)
+        try:
+            for i, _ in enumerate(pool.map(draw, range(len(flight.stamps_s)))):
+                name = f"{flight.stamps_s[i]:.6f}"
+                rgb.append(f"{name} rgb/{name}{suffix}")
+                if depth_every and i % depth_every == 0:
+                    depth.append(f"{name} depth/{name}.png")
+                if on_frame is not None:
+                    on_frame(i + 1)
+        finally:  # after Ctrl-C the frames that wait are not drawn
+            pool.shutdown(cancel_futures=True)
         _write_text(folder / "rgb.txt", rgb)
         if depth_every:
             _write_text(folder / "depth.txt", depth)

@@ -46,7 +46,7 @@ def test_flight_is_smooth_slow_and_clear_of_furniture(home: World, seed: int) ->
     yaw = np.unwrap(Rotation.from_matrix(flight.T_w_b[:, :3, :3]).as_euler("ZYX")[:, 0])
     assert np.abs(np.gradient(yaw, flight.stamps_s)).max() < np.deg2rad(60)
     jerk = np.diff(flight.T_w_b[:, :3, 3], 3, axis=0) * 30**3
-    assert np.abs(jerk).max() < 15.0  # a C1 path would show hundreds at 30 Hz
+    assert np.abs(jerk).max() < 30.0  # 1 m/s from one frame to the next would show 900
     flying = flight.T_w_b[:, 2, 3] > 0.9
     assert home.clearance(flight.T_w_b[flying, :3, 3]).min() > plan.clearance_m - 0.1
 
@@ -196,6 +196,15 @@ def test_written_flight_is_read_back(tmp_path: Path, home: World, flight: Flight
     np.testing.assert_allclose(stored, view.depth_m, atol=0.5 / DEPTH_PER_METRE + 1e-6)
     poses = np.loadtxt(tmp_path / "f" / "groundtruth.txt")
     np.testing.assert_allclose(se3.pose_from_tum(poses[2, 1:]), short.T_w_c[2], atol=1e-8)
+
+
+def test_threads_do_not_change_the_images(tmp_path: Path, home: World, flight: Flight) -> None:
+    short = Flight(flight.stamps_s[200:206], flight.T_w_b[200:206], flight.T_b_c, flight.velocity_w[200:206])
+    for threads in (1, 3):
+        write_flight(tmp_path / f"{threads}", home, short, CAMERA, faults=CameraFaults(), threads=threads)
+    files = sorted(p.relative_to(tmp_path / "1") for p in (tmp_path / "1").rglob("*.*"))
+    assert len(files) == 6 + 6 + 4
+    assert all((tmp_path / "1" / f).read_bytes() == (tmp_path / "3" / f).read_bytes() for f in files)
 
 
 def test_written_telemetry_has_the_sdk_header(tmp_path: Path, flight: Flight) -> None:
