@@ -34,7 +34,10 @@ class ReprojectionLoss(ResidualLoss):
 
 
 class ReprojectionJacobians(NamedTuple):
-    """Residuals with their derivatives, components first so that every row is one contiguous vector."""
+    """Residuals with their derivatives, components first so that every row is one contiguous vector.
+
+    Columns of points that are not in front of the camera hold no meaning.
+    """
 
     residual: Tensor
     """``(2, M)`` predicted minus observed [px]."""
@@ -42,8 +45,6 @@ class ReprojectionJacobians(NamedTuple):
     """``(2, 6, M)`` by the left tangent ``(rho, phi)`` of ``T_c_w``."""
     point: Tensor
     """``(2, 3, M)`` by the anchor in the world."""
-    depth: Tensor
-    """``(M,)`` z in the camera; rows with ``z <= 0`` hold no meaning."""
 
 
 def camera_points(T_c_w: Tensor, p_w: Tensor, obs_pose: Tensor, obs_anchor: Tensor) -> tuple[Tensor, Tensor]:
@@ -61,29 +62,19 @@ def camera_points(T_c_w: Tensor, p_w: Tensor, obs_pose: Tensor, obs_anchor: Tens
     return R, (R * p).sum(1) + Rt[:, 3]
 
 
-def reprojection_residuals(
-    T_c_w: Tensor, p_w: Tensor, obs_pose: Tensor, obs_anchor: Tensor, uv: Tensor, K: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Predicted minus observed pixels ``(2, M)`` and depths ``(M,)``, paper eqs. (15)-(16).
+def reprojection_residuals(p_c: Tensor, uv: Tensor, K: Tensor) -> Tensor:
+    """Predicted minus observed pixels ``(2, M)``, paper eqs. (15)-(16).
 
     Args:
-        T_c_w: World-to-camera poses ``(W, 4, 4)``.
-        p_w: Anchors ``(A, 3)``.
-        obs_pose: ``(M,)`` pose indices.
-        obs_anchor: ``(M,)`` anchor indices.
+        p_c: Points in the cameras that see them ``(3, M)``, from `camera_points`.
         uv: Observed undistorted pixels ``(2, M)``.
         K: fx, fy, cx, cy [px], shape ``(4,)``.
     """
-    _, p_c = camera_points(T_c_w, p_w, obs_pose, obs_anchor)
-    z = p_c[2]
-    return p_c[:2] / z * K[:2, None] + (K[2:, None] - uv), z
+    return p_c[:2] / p_c[2] * K[:2, None] + (K[2:, None] - uv)
 
 
-def reprojection_jacobians(
-    T_c_w: Tensor, p_w: Tensor, obs_pose: Tensor, obs_anchor: Tensor, uv: Tensor, K: Tensor
-) -> ReprojectionJacobians:
-    """`reprojection_residuals` with derivatives written out; arguments as there."""
-    R, p_c = camera_points(T_c_w, p_w, obs_pose, obs_anchor)
+def reprojection_jacobians(R: Tensor, p_c: Tensor, uv: Tensor, K: Tensor) -> ReprojectionJacobians:
+    """`reprojection_residuals` with derivatives written out; ``R (3, 3, M)`` and ``p_c`` from `camera_points`."""
     z = p_c[2]
     iz = z.reciprocal()
     n = p_c[:2] * iz  # (2, M) normalised image coordinates
@@ -103,7 +94,7 @@ def reprojection_jacobians(
     torch.mul(y * y + 1.0, -fy, out=pose[1, 3])
     torch.mul(xy, fy, out=pose[1, 4])
     torch.mul(x, fy, out=pose[1, 5])
-    return ReprojectionJacobians(residual, pose, point, z)
+    return ReprojectionJacobians(residual, pose, point)
 
 
 def inverse_depth_jacobians(R: Tensor, p_c: Tensor) -> tuple[Tensor, Tensor, Tensor]:

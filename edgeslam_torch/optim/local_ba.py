@@ -161,6 +161,7 @@ class _Window:
         if problem.junctions is not None and len(problem.junctions.host):
             self.relative.append(JunctionBlocks(problem.junctions, self.K, column, config))
         self.state = _State(T, p_w, tuple(block.x for block in self.relative))
+        self._seen: tuple[_State, Tensor, Tensor] | None = None
 
     # -- LeastSquares ---------------------------------------------------------------------------------------
 
@@ -177,8 +178,8 @@ class _Window:
 
     def linearise(self) -> tuple[float, float]:
         """Blocks of the normal equations at the current state."""
-        T, p_w, F, A = self.state.T_c_w, self.state.p_w, len(self.free), len(self.state.p_w)
-        r, Jp, Jl, value = self._factors(T, p_w)
+        T, F, A = self.state.T_c_w, len(self.free), len(self.state.p_w)
+        r, Jp, Jl, value = self._factors()
         self.Jp, self.Jl = Jp, Jl
         self.H = torch.zeros(6 * F, 6 * F, dtype=T.dtype)
         self.g = torch.zeros(6 * F, dtype=T.dtype)
@@ -262,16 +263,22 @@ class _Window:
     def _blocks(self, state: _State) -> list[tuple[EdgeBlocks | JunctionBlocks, Tensor]]:
         return list(zip(self.relative, state.relative, strict=True))
 
-    def _factors(self, T: Tensor, p_w: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def _camera_points(self, state: _State) -> tuple[Tensor, Tensor]:
+        """`camera_points` of a state; an accepted candidate is asked for twice."""
+        if self._seen is None or self._seen[0] is not state:
+            self._seen = (state, *camera_points(state.T_c_w, state.p_w, self.pose, self.anchor))
+        return self._seen[1:]
+
+    def _factors(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Whitened, weighted rows: residual, by pose (free ones), by anchor; and the robust costs."""
-        r, Jp, Jl, z = reprojection_jacobians(T, p_w, self.pose, self.anchor, self.uv, self.K)
+        R, p_c = self._camera_points(self.state)
+        r, Jp, Jl = reprojection_jacobians(R, p_c, self.uv, self.K)
         if len(self.depth_rows):
             rows = self.depth_rows
-            R, p_c = camera_points(T, p_w, self.pose[rows], self.anchor[rows])
             r[1, rows], Jp[1][:, rows], Jl[1][:, rows] = 0.0, 0.0, 0.0
-            iz, Jp[0][:, rows], Jl[0][:, rows] = inverse_depth_jacobians(R, p_c)
+            iz, Jp[0][:, rows], Jl[0][:, rows] = inverse_depth_jacobians(R[..., rows], p_c[:, rows])
             r[0, rows] = iz - self.inverse_depth
-        in_front = z > self.config.min_depth
+        in_front = p_c[2] > self.config.min_depth
         s = torch.where(in_front, (r * r).sum(0) * self.inv_sigma.square(), self.behind)
         value, weight = rho(s, self.config.kernel, self.config.delta)
         root = torch.where(in_front, weight.sqrt() * self.inv_sigma, 0.0)
@@ -282,7 +289,8 @@ class _Window:
         return r, Jp, Jl, value
 
     def _chi2(self, state: _State) -> tuple[Tensor, Tensor]:
-        r, z = reprojection_residuals(state.T_c_w, state.p_w, self.pose, self.anchor, self.uv, self.K)
+        _, p_c = self._camera_points(state)
+        r, z = reprojection_residuals(p_c, self.uv, self.K), p_c[2]
         if len(self.depth_rows):
             r[1, self.depth_rows] = 0.0
             r[0, self.depth_rows] = z[self.depth_rows].reciprocal() - self.inverse_depth

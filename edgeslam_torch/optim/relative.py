@@ -59,6 +59,7 @@ class RelativeBlocks(ABC):
             dtype: Of the blocks.
         """
         self.config, self.dtype = config, dtype
+        self._seen: tuple[Tensor, Tensor, Tensor] | None = None
         self.column = torch.where(column < 0, int((column >= 0).sum()), column)
         hosts = torch.as_tensor(np.asarray(host, dtype=np.int64))
         E, W = len(hosts), len(column)
@@ -98,10 +99,13 @@ class RelativeBlocks(ABC):
         """Add the prior to the blocks' normal matrices and gradients ``(size, E)``."""
 
     def motions(self, T_c_w: Tensor) -> tuple[Tensor, Tensor]:
-        """Relative motions of the groups ``(G, 4, 4)`` and of the pairs ``(3, 4, P)``."""
+        """Relative motions of the groups ``(G, 4, 4)`` and of the pairs ``(3, 4, P)``; kept for the same poses."""
+        if self._seen is not None and self._seen[0] is T_c_w:
+            return self._seen[1:]
         T = T_c_w[self.group_target] @ lie.inverse(T_c_w[self.group_host])
         flat = T[:, :3].permute(1, 2, 0).reshape(12, -1).to(self.dtype)
-        return T, flat.index_select(1, self.group).view(3, 4, -1)
+        self._seen = (T_c_w, T, flat.index_select(1, self.group).view(3, 4, -1))
+        return self._seen[1:]
 
     def cost(self, T_c_w: Tensor, x: Tensor) -> Tensor:
         """Robust cost ``()``."""

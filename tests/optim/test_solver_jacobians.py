@@ -57,10 +57,10 @@ def test_reprojection(T, rng):
     uv = tensor(rng.uniform(0, 600, (2, 5)))
 
     def residual(xi: Tensor, q: Tensor) -> Tensor:
-        return reprojection_residuals(lie.exp(xi) @ poses, q, pose, anchor, uv, K)[0]
+        return reprojection_residuals(camera_points(lie.exp(xi) @ poses, q, pose, anchor)[1], uv, K)
 
     by_pose, by_point = torch.func.jacrev(residual, (0, 1))(torch.zeros(2, 6, dtype=torch.float64), p)
-    ours = reprojection_jacobians(poses, p, pose, anchor, uv, K)
+    ours = reprojection_jacobians(*camera_points(poses, p, pose, anchor), uv, K)
     torch.testing.assert_close(ours.residual, residual(torch.zeros(2, 6, dtype=torch.float64), p))
     each = torch.arange(5)
     torch.testing.assert_close(ours.pose.permute(2, 0, 1), by_pose.permute(1, 2, 0, 3)[each, pose])
