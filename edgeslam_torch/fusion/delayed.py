@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from edgeslam_torch.fusion.config import FusionConfig
-from edgeslam_torch.fusion.ekf import Ekf, EkfState, Outcome
+from edgeslam_torch.fusion.ekf import Ekf, EkfState, Outcome, Saved
 from edgeslam_torch.fusion.rotations import rpy_from_matrix, wrapped
 from edgeslam_torch.types import FloatArray, TelemetrySample
 
@@ -28,7 +28,7 @@ class _Event:
     from_s: float = math.nan
     sigma_t_m: float = 0.0
     sigma_r_rad: float = 0.0
-    saved: tuple[FloatArray, FloatArray, float, int] | None = None
+    saved: Saved | None = None
     clone_s: float = math.nan
     outcome: str = ""
     nis: float = math.nan

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri  # scipy.stats takes a second of CPU to import
 
 from edgeslam_torch.fusion.config import FusionConfig
 from edgeslam_torch.fusion.rotations import euler_rate_matrix, matrix_from_rpy, rotation_vector, wrapped
@@ -22,6 +22,9 @@ from edgeslam_torch.types import FloatArray
 _P, _A, _B = slice(0, 3), slice(3, 6), slice(6, 9)
 _POSE, _CLONE = slice(0, 6), slice(9, 15)
 _SIZE = 15
+
+Saved = tuple[FloatArray, FloatArray, float, dict[int, int]]
+"""State, covariance, time since vision, refusals in a row."""
 
 
 class Outcome(StrEnum):
@@ -67,10 +70,11 @@ class Ekf:
             self.P[range(6, 9), range(6, 9)] = config.sigma_bias_m_s**2
         self.tau_s = 0.0
         """Time since the last visual update, paper eq. (10)."""
-        self.refused_in_row = 0
+        self.refused_in_row = {3: 0, 6: 0}
+        """Refusals of attitude (3 numbers) and of vision (6) since the last one that was accepted."""
         self.nis = math.nan
         """Normalised innovation squared of the last measurement."""
-        self._gate = {n: float(chi2.ppf(config.gate_probability, n)) for n in (3, 6)}
+        self._gate = {n: float(chdtri(n, 1.0 - config.gate_probability)) for n in (3, 6)}
 
     def reset_pose(self, p_w: FloatArray, rpy_rad: FloatArray) -> None:
         """Start at a known pose with the initial uncertainty."""
@@ -196,18 +200,18 @@ class Ekf:
         self.nis = float(residual @ S_inverse @ residual)
         outcome = Outcome.ACCEPTED
         if not self.config.literal and self.nis > self._gate[n]:
-            self.refused_in_row += 1
-            if self.refused_in_row < self.config.refusals_before_recovery:
+            self.refused_in_row[n] += 1
+            if self.refused_in_row[n] < self.config.refusals_before_recovery:
                 return Outcome.REFUSED
             outcome = Outcome.RECOVERED
             # The filter has been sure of the wrong thing: believe it less, by what the innovation says.
             factor = min(self.nis / n, 1e4)
-            self.P *= factor
-            P_Ht = P_Ht * factor
+            P_Ht = P_Ht * factor  # before P changes: it may be a view of it
+            self.P = self.P * factor
             S *= factor
             S.flat[:: n + 1] += (1.0 - factor) * noise
             S_inverse = np.linalg.inv(S)
-        self.refused_in_row = 0
+        self.refused_in_row[n] = 0
         K = P_Ht @ S_inverse
         self.x += K @ residual
         P = self.P - K @ P_Ht.T
@@ -223,14 +227,14 @@ class Ekf:
         x = self.x
         return EkfState(stamp_s, x[_P].copy(), x[_A].copy(), x[_B].copy(), self.P[_POSE, _POSE].copy())
 
-    def copy_state(self) -> tuple[FloatArray, FloatArray, float, int]:
+    def copy_state(self) -> Saved:
         """Everything that changes, for a later `restore`."""
-        return self.x.copy(), self.P.copy(), self.tau_s, self.refused_in_row
+        return self.x.copy(), self.P.copy(), self.tau_s, dict(self.refused_in_row)
 
-    def restore(self, saved: tuple[FloatArray, FloatArray, float, int]) -> None:
+    def restore(self, saved: Saved) -> None:
         """Go back to what `copy_state` returned."""
         self.x, self.P = np.array(saved[0]), np.array(saved[1])
-        self.tau_s, self.refused_in_row = saved[2], saved[3]
+        self.tau_s, self.refused_in_row = saved[2], dict(saved[3])
 
 
 def _wrap_in_place(x: FloatArray, indices: tuple[int, ...]) -> None:

@@ -29,6 +29,8 @@ _DELAY_GUESS_S = 0.3
 _REFIT_S = 1.0
 _DELAY_STEP_S = 0.05
 _MIN_DELAY_INTERVALS = 12
+_FEED_S = 0.09
+"""The filter takes vision at the pace of telemetry: each late increment costs a re-propagation."""
 _VISUAL_REACH_S = 0.15
 """The last visual velocity predicts better than 10 Hz readings of 0.1 m/s up to about here."""
 _VISUAL_LIMIT_S = 0.5
@@ -90,6 +92,8 @@ class MotionFusion:
         self._start: _Visual | None = None
         self._previous: _Visual | None = None
         self._last: _Visual | None = None
+        self._fed: _Visual | None = None
+        """Pose at the filter's last visual update."""
         self._depth = DepthRatio(config.depth_bias_log)
         self._ekf = BufferedEkf(config)
         self._ekf_delay: float | None = None
@@ -160,7 +164,7 @@ class MotionFusion:
             raise ValueError(f"factor must be positive, got {factor}")
         centre = np.zeros(3) if about is None else np.asarray(about, dtype=np.float64)
         seen: set[int] = set()
-        poses = [v for v in (*self._sightings, self._start, self._previous, self._last) if v is not None]
+        poses = [v for v in (*self._sightings, self._start, self._previous, self._last, self._fed) if v is not None]
         for visual in poses:
             if id(visual) not in seen:
                 seen.add(id(visual))
@@ -178,7 +182,7 @@ class MotionFusion:
         """A new map in a new gauge: visual memory and scale are forgotten, telemetry and delay are kept."""
         self._intervals.clear()
         self._sightings.clear()
-        self._start = self._previous = self._last = None
+        self._start = self._previous = self._last = self._fed = None
         self._depth = DepthRatio(self.config.depth_bias_log)
         self._telemetry_opinions = []
         self._R_w_m, self._fit, self._fitted_s, self._ekf_delay = None, None, -math.inf, None
@@ -230,13 +234,11 @@ class MotionFusion:
             return None
         gap = stamp_s - last.stamp_s
         visual = self._predict_visual(last, gap)
-        telemetry = self._predict_telemetry(last, stamp_s)
-        if telemetry is None or gap <= 0:
-            return visual
         share = float(np.clip((gap - _VISUAL_REACH_S) / _VISUAL_REACH_S, 0.0, 1.0))
         if self._previous is None:
             share = 1.0
-        if share <= 0.0:
+        telemetry = self._predict_telemetry(last, stamp_s) if share > 0.0 and gap > 0.0 else None
+        if telemetry is None:
             return visual
         if share >= 1.0:
             return telemetry
@@ -506,14 +508,18 @@ class MotionFusion:
 
     def _feed_filter(self, visual: _Visual) -> None:
         """Visual increments to the Kalman filter once they are metric."""
-        if self._previous is None or not math.isfinite(self._delay_sigma_s):
+        previous = self._fed
+        if self._previous is None or previous is None or not math.isfinite(self._delay_sigma_s):
+            self._fed = visual
             return
+        if visual.stamp_s - previous.stamp_s < _FEED_S:
+            return
+        self._fed = visual
         estimate = self.scale()
         if not estimate.sigma < 0.1 * estimate.value or not self._telemetry_opinions:
             return
         if self._ekf_delay is None or abs(self._ekf_delay - self._delay_s) > 0.1:
             self._ekf_delay = self._delay_s
-        previous = self._previous
         T_c = se3.inverse(previous.T) @ visual.T
         moved = float(np.linalg.norm(T_c[:3, 3])) * estimate.value
         T_c[:3, 3] *= estimate.value

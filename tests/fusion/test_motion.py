@@ -1,0 +1,242 @@
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from edgeslam_torch.fusion.config import FusionConfig
+from edgeslam_torch.fusion.motion import MotionFusion
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.synthetic.flight import camera_on_body
+from edgeslam_torch.synthetic.telemetry import EXACT, TelemetryFaults, simulate
+from edgeslam_torch.types import TelemetrySample, Units
+
+T_B_C = camera_on_body()
+
+
+def fused(rng, motion, replay, faults=None, config=None, **options):
+    samples = simulate(rng, motion.stamps_s, motion.T_w_c, T_B_C, faults=faults or TelemetryFaults()).samples()
+    gauge = motion.in_gauge(rng)
+    fusion = MotionFusion(config or FusionConfig(), T_B_C)
+    replay(fusion, motion, gauge, samples, **options)
+    return fusion, gauge, samples
+
+
+def test_scale_gravity_and_delay_come_out_of_a_swung_camera(rng, swinging, replay):
+    fusion, gauge, _ = fused(rng, swinging(), replay)
+    scale = fusion.scale()
+    error = scale.value / gauge.scale - 1.0
+    assert abs(error) < 0.03
+    assert abs(error) < 3.0 * scale.sigma / scale.value
+    assert scale.units is Units.METRES
+    assert "telemetry" in scale.source
+    assert fusion.delay_s == pytest.approx(0.5, abs=0.04)
+    up = gauge.T_m_w[:3, :3] @ [0.0, 0.0, 1.0]
+    assert math.degrees(math.acos(min(1.0, float(up @ fusion.gravity())))) < 0.5
+
+
+def test_scale_is_unknown_before_there_is_motion_or_telemetry(rng, swinging):
+    motion = swinging(2.0)
+    fusion = MotionFusion(FusionConfig(), T_B_C)
+    assert fusion.scale().units is Units.ARBITRARY
+    assert fusion.gravity() is None
+    assert fusion.predict(0.0) is None
+    for t, T in zip(motion.stamps_s, motion.T_w_c, strict=True):
+        fusion.add_visual(float(t), T, 0.003, 0.002)
+    assert fusion.scale().units is Units.ARBITRARY
+    assert fusion.gravity() is None
+
+
+def test_gravity_is_there_with_the_first_frame(rng, swinging):
+    motion = swinging(3.0)
+    samples = simulate(rng, motion.stamps_s, motion.T_w_c, T_B_C, faults=EXACT).samples()
+    fusion = MotionFusion(FusionConfig(delay_s=0.0), T_B_C)
+    fusion.add_telemetry(samples[:2])
+    fusion.add_visual(0.05, motion.T_w_c[1], 0.003, 0.002)
+    np.testing.assert_allclose(fusion.gravity(), [0.0, 0.0, 1.0], atol=0.02)
+
+
+def test_hovering_holds_the_scale(rng, swinging, replay):
+    motion = swinging(20.0)
+    still = replace(motion, stamps_s=np.arange(0.0, 60.0, 0.05), T_w_c=motion.T_w_c[np.minimum(np.arange(1200), 399)])
+    fusion, gauge, samples = fused(rng, motion, replay)
+    before = fusion.scale()
+    hover = [TelemetrySample(20.0 + 0.1 * k, np.zeros(3), samples[-1].rpy_rad) for k in range(400)]
+    fusion.add_telemetry(hover)
+    resting = gauge.T_m_c[-1]
+    for t in still.stamps_s[400:]:
+        T = resting.copy()
+        T[:3, 3] += rng.normal(0, gauge.sigma_t, 3)
+        fusion.add_visual(float(t), T, gauge.sigma_t, gauge.sigma_r)
+    assert fusion.scale().value == pytest.approx(before.value, rel=0.005)
+
+
+def test_depth_alone_gives_metres_with_its_own_doubt(swinging):
+    fusion = MotionFusion(FusionConfig(), T_B_C)
+    for _ in range(50):
+        fusion.add_depth_ratio(math.log(3.0), 0.05)
+    scale = fusion.scale()
+    assert (scale.source, scale.units) == ("depth", Units.METRES)
+    assert scale.value == pytest.approx(3.0)
+    assert scale.sigma / scale.value == pytest.approx(0.09, abs=0.01)
+
+
+def test_rescaling_the_map_changes_numbers_but_not_metres(rng, swinging, replay):
+    fusion, gauge, _ = fused(rng, swinging(15.0), replay)
+    fusion.add_depth_ratio(math.log(gauge.scale), 0.1)
+    before, pose = fusion.scale(), fusion.predict(15.02).T_w_c
+    centre = np.array([1.0, 2.0, 3.0])
+    fusion.rescale(before.value, centre)
+    after = fusion.scale()
+    assert after.value == pytest.approx(1.0, rel=1e-6)
+    assert after.sigma == pytest.approx(before.sigma / before.value, rel=1e-6)
+    moved = fusion.predict(15.02).T_w_c
+    np.testing.assert_allclose(moved[:3, 3], centre + before.value * (pose[:3, 3] - centre), atol=1e-9)
+
+
+def test_rescaling_in_mid_flight_leaves_the_final_scale_right(rng, swinging, replay):
+    motion = swinging(24.0)
+    samples = simulate(rng, motion.stamps_s, motion.T_w_c, T_B_C).samples()
+    gauge = motion.in_gauge(rng)
+    fusion = MotionFusion(FusionConfig(), T_B_C)
+    fusion.add_telemetry(samples)
+    factor = 1.0
+    for i, t in enumerate(motion.stamps_s):
+        if i == 240:
+            factor = fusion.scale().value
+            fusion.rescale(factor)
+        T = gauge.T_m_c[i].copy()
+        T[:3, 3] *= factor
+        fusion.add_visual(float(t), T, gauge.sigma_t * factor, gauge.sigma_r)
+    assert fusion.scale().value * factor == pytest.approx(gauge.scale, rel=0.03)
+
+
+def test_a_frozen_or_silent_link_does_not_pull_the_scale(rng, swinging, replay):
+    motion = swinging(30.0)
+    samples = simulate(rng, motion.stamps_s, motion.T_w_c, T_B_C).samples()
+    gauge = motion.in_gauge(rng)
+    last = next(s for s in samples if s.stamp_s > 12.0 and np.abs(s.velocity_m_s).max() > 0.15)
+    frozen = [replace(last, stamp_s=s.stamp_s) if 12.0 < s.stamp_s < 22.0 else s for s in samples]
+    silent = [s for s in samples if not 12.0 < s.stamp_s < 22.0]
+    for log in (frozen, silent):
+        fusion = MotionFusion(FusionConfig(), T_B_C)
+        replay(fusion, motion, gauge, log)
+        assert fusion.scale().value == pytest.approx(gauge.scale, rel=0.03)
+
+
+@pytest.mark.parametrize("gap_s", [0.05, 0.5, 1.0])
+def test_prediction_bridges_lost_vision(rng, swinging, replay, gap_s):
+    """Against standing still: what telemetry adds when the picture is gone."""
+    motion = swinging(30.0)
+    fusion, gauge, _ = fused(rng, motion, replay)
+    errors, still = [], []
+
+    def each(t, i):
+        j = i - round(gap_s * 20)
+        if t > 15.0 and i % 40 == 0 and j >= 0:
+            errors.append(np.linalg.norm(probe(fusion, gauge, motion, j, t)[:3, 3] - gauge.T_m_c[i][:3, 3]))
+            still.append(np.linalg.norm(gauge.T_m_c[j][:3, 3] - gauge.T_m_c[i][:3, 3]))
+
+    def probe(fusion, gauge, motion, j, t):
+        saved = fusion._last, fusion._previous
+        fusion._last = type(saved[0])(float(motion.stamps_s[j]), gauge.T_m_c[j], gauge.sigma_t, gauge.sigma_r)
+        fusion._previous = type(saved[0])(
+            float(motion.stamps_s[j - 1]), gauge.T_m_c[j - 1], gauge.sigma_t, gauge.sigma_r
+        )
+        T = fusion.predict(t).T_w_c
+        fusion._last, fusion._previous = saved
+        return T
+
+    for i, t in enumerate(motion.stamps_s):
+        each(float(t), i)
+    assert np.mean(errors) < (1.0 if gap_s < 0.1 else 0.4) * np.mean(still)
+
+
+def test_lost_frames_are_no_evidence(rng, swinging, replay):
+    motion = swinging(30.0)
+    samples = simulate(rng, motion.stamps_s, motion.T_w_c, T_B_C).samples()
+    gauge = motion.in_gauge(rng)
+    gauge.T_m_c[200:300, :3, 3] *= 3.0  # what a lost tracker may say
+    fusion = MotionFusion(FusionConfig(), T_B_C)
+    replay(fusion, motion, gauge, samples, tracked=lambda t: not 10.0 <= t < 15.0)
+    assert fusion.scale().value == pytest.approx(gauge.scale, rel=0.03)
+    assert fusion.statistics()["visual not tracked"] == 100
+
+
+def test_truncated_velocities_are_told_from_rounded_ones(rng, swinging, replay):
+    """A real Tello truncates: read as rounded, the scale of this motion would be 15 to 20 % low."""
+    motion = swinging(30.0)
+    exact = simulate(rng, motion.stamps_s, motion.T_w_c, T_B_C, faults=replace(EXACT, video_delay_s=0.5)).samples()
+    truncated = [
+        replace(s, velocity_m_s=np.trunc(10 * (s.velocity_m_s + rng.normal(0, 0.02, 3))) / 10, tof_m=np.nan,
+                height_m=np.nan, baro_m=np.nan)
+        for s in exact
+    ]  # fmt: skip
+    gauge = motion.in_gauge(rng)
+    errors = {}
+    for how in ("auto", "nearest"):
+        fusion = MotionFusion(FusionConfig(velocity_rounding=how), T_B_C)
+        replay(fusion, motion, gauge, truncated)
+        errors[how] = fusion.scale().value / gauge.scale - 1.0
+    assert errors["nearest"] < -0.1
+    assert abs(errors["auto"]) < 0.05
+
+
+def test_height_changes_alone_tell_the_scale_of_a_climb(rng, replay, swinging):
+    """Velocity missing, range there: the metre up and down at the start of a flight."""
+    motion = swinging(20.0)
+    T = motion.T_w_c.copy()
+    T[:, :3, 3] = [0.0, 0.0, 1.0] + np.stack([0 * motion.stamps_s, 0 * motion.stamps_s,
+                                             0.5 * np.sin(0.6 * motion.stamps_s)], axis=1)  # fmt: skip
+    climb = replace(motion, T_w_c=T)
+    fusion, gauge, _ = fused(rng, climb, replay)
+    assert "height" in fusion.scale().source
+    assert fusion.scale().value == pytest.approx(gauge.scale, rel=0.04)
+
+
+def test_filter_follows_the_flight_in_metres(rng, swinging, replay):
+    motion = swinging(30.0)
+    samples = simulate(rng, motion.stamps_s, motion.T_w_c, T_B_C).samples()
+    fusion, gauge = MotionFusion(FusionConfig(), T_B_C), motion.in_gauge(rng)
+    states = []
+
+    def each(t, i):
+        if t > 20.0 and i % 10 == 0:
+            states.append(fusion.filter_state(t - 0.8))
+
+    replay(fusion, motion, gauge, samples, each=each)
+    body = (motion.T_w_c @ se3.inverse(T_B_C))[:, :3, 3]
+    truth = np.array([body[round((s.stamp_s + 0.5) * 20)] for s in states])
+    moved = np.array([s.p_w for s in states])
+    moved, truth = moved - moved[0], truth - truth[0]
+    assert np.sqrt(np.mean(np.sum((moved - truth) ** 2, axis=1))) < 0.1
+    assert fusion.statistics()["ekf visual accepted"] > 100
+
+
+def test_statistics_are_plain_numbers(rng, swinging, replay):
+    fusion, _, _ = fused(rng, swinging(8.0), replay)
+    assert all(isinstance(v, int | float) for v in fusion.statistics().values())
+
+
+def test_a_new_map_forgets_the_old_scale_but_keeps_the_delay(rng, swinging, replay):
+    fusion, _, _ = fused(rng, swinging(20.0), replay)
+    delay = fusion.delay_s
+    fusion.reset_map()
+    assert fusion.scale().units is Units.ARBITRARY
+    assert fusion.delay_s == delay
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(("sequence", "limit"), [("tum_fr1_xyz", 0.03), ("7scenes_redkitchen", 0.045)])
+def test_scale_of_recorded_motion(data_dir, recorded, replay, rng, sequence, limit):
+    """Real hand-held motion, simulated telemetry and vision (3 mm, 2 mrad); images come in the benchmark."""
+    motion = recorded(data_dir / sequence / "groundtruth.txt")
+    ratios, errors = [], []
+    for _ in range(3):
+        fusion, gauge, _ = fused(rng, motion, replay)
+        scale = fusion.scale()
+        errors.append(scale.value / gauge.scale - 1.0)
+        ratios.append(errors[-1] / (scale.sigma / scale.value))
+    assert np.sqrt(np.mean(np.square(errors))) < 0.025
+    assert np.max(np.abs(errors)) < limit
+    assert np.sqrt(np.mean(np.square(ratios))) < 1.8
