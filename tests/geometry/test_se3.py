@@ -1,0 +1,79 @@
+"""Rigid motions in numpy."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.linalg import expm
+
+from edgeslam_torch.geometry import se3
+
+component = st.floats(-1.7, 1.7, allow_nan=False)
+tangents = st.lists(component, min_size=6, max_size=6).map(np.array)  # |phi| below 2.95 < pi
+
+
+def test_quarter_turn_about_z_worked_by_hand():
+    """One unit along x while turning 90 degrees left: a quarter circle of radius 2/pi."""
+    T = se3.exp(np.array([1.0, 0.0, 0.0, 0.0, 0.0, np.pi / 2]))
+    np.testing.assert_allclose(T[:3, :3], [[0, -1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-15)
+    np.testing.assert_allclose(T[:3, 3], [2 / np.pi, 2 / np.pi, 0.0], atol=1e-15)
+
+
+@settings(max_examples=60, deadline=None)
+@given(tangents)
+def test_exp_is_the_matrix_exponential(xi):
+    generator = np.zeros((4, 4))
+    generator[:3, :3], generator[:3, 3] = se3.hat(xi[3:]), xi[:3]
+    np.testing.assert_allclose(se3.exp(xi), expm(generator), atol=1e-12)
+
+
+@settings(max_examples=60, deadline=None)
+@given(tangents)
+def test_log_undoes_exp(xi):
+    np.testing.assert_allclose(se3.log(se3.exp(xi)), xi, atol=1e-9)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-8, 0.99e-6, 1.01e-6, 0.99e-4, 1.01e-4, 3.1])
+def test_log_undoes_exp_at_small_and_large_angles(angle):
+    xi = np.array([0.3, -2.0, 1.0, 0.6 * angle, 0.0, -0.8 * angle])
+    np.testing.assert_allclose(se3.log(se3.exp(xi)), xi, atol=1e-9)
+
+
+def test_inverse_of_a_batch_is_that_of_each(rng):
+    T = np.stack([se3.exp(rng.normal(size=6)) for _ in range(6)]).reshape(2, 3, 4, 4)
+    np.testing.assert_allclose(se3.inverse(T) @ T, np.broadcast_to(np.eye(4), T.shape), atol=1e-12)
+    np.testing.assert_array_equal(se3.inverse(T)[1, 2], se3.inverse(T[1, 2]))
+
+
+def test_hat_of_a_batch_is_the_cross_product(rng):
+    a, b = rng.normal(size=(2, 5, 3))
+    np.testing.assert_allclose((se3.hat(a) @ b[..., None])[..., 0], np.cross(a, b), atol=1e-14)
+
+
+def test_transform_moves_points_as_the_matrix_does(rng):
+    T, p = se3.exp(rng.normal(size=6)), rng.normal(size=(7, 3))
+    np.testing.assert_allclose(se3.transform(T, p), (T @ np.c_[p, np.ones(7)].T).T[:, :3], atol=1e-12)
+
+
+def test_orthonormalised_keeps_a_motion_and_mends_a_drifted_one(rng):
+    T = se3.exp(rng.normal(size=6))
+    np.testing.assert_allclose(se3.orthonormalised(T), T, atol=1e-14)
+    drifted = T.copy()
+    drifted[:3, :3] += rng.normal(0.0, 1e-4, (3, 3))
+    mended = se3.orthonormalised(drifted)
+    np.testing.assert_allclose(mended[:3, :3] @ mended[:3, :3].T, np.eye(3), atol=1e-14)
+    np.testing.assert_allclose(mended, T, atol=1e-3)
+
+
+def test_tum_row_of_a_half_turn_worked_by_hand():
+    T = np.diag([-1.0, -1.0, 1.0, 1.0])  # 180 degrees about z
+    T[:3, 3] = [1.0, 2.0, 3.0]
+    np.testing.assert_allclose(se3.pose_to_tum(T), [1, 2, 3, 0, 0, 1, 0], atol=1e-15)
+
+
+@settings(max_examples=40, deadline=None)
+@given(tangents)
+def test_tum_rows_come_back_with_a_positive_real_part(xi):
+    row = se3.pose_to_tum(se3.exp(xi))
+    assert row[6] >= 0.0
+    np.testing.assert_allclose(se3.pose_from_tum(row), se3.exp(xi), atol=1e-12)

@@ -1,0 +1,103 @@
+"""Short rendered flights with known poses and depth, made once per test session."""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.synthetic.flight import FlightPlan, fly
+from edgeslam_torch.synthetic.render import render
+from edgeslam_torch.synthetic.rooms import room
+from edgeslam_torch.synthetic.world import Quad, Texture, World
+from edgeslam_torch.types import DepthMap, Frame
+
+CAMERA = Camera(320, 240, 260.0, 260.0, 159.5, 119.5, source="test")
+
+
+@dataclass(frozen=True)
+class RenderedFlight:
+    """Frames with their truth."""
+
+    camera: Camera
+    frames: list[Frame]
+    depth_m: list[np.ndarray]
+    T_w_c: np.ndarray
+    """``(F, 4, 4)``"""
+
+    @property
+    def stamps_s(self):
+        return np.array([f.stamp_s for f in self.frames])
+
+    def depth_function(self):
+        """The exact depth of a known image, as a depth network would give it."""
+        known = {f.image.tobytes(): d for f, d in zip(self.frames, self.depth_m, strict=True)}
+
+        def depth(image, camera):
+            d = known[image.tobytes()]
+            return DepthMap(d, np.full(d.shape, 0.05, np.float32))
+
+        return depth
+
+    def with_images(self, change):
+        """Frames whose images are what ``change(index, image)`` makes of them."""
+        return [Frame(f.index, f.stamp_s, change(f.index, f.image)) for f in self.frames]
+
+
+@lru_cache(maxsize=4)
+def room_flight(frames=60, rate_hz=10.0, seed=1):
+    """A drone in a furnished room, at `CAMERA`."""
+    world = room(np.random.default_rng(3))
+    flight = fly(np.random.default_rng(seed), world, frames, rate_hz=rate_hz, plan=FlightPlan(take_off=False))
+    return film(world, CAMERA, flight.T_w_c, 1.0 / rate_hz)
+
+
+def film(world, camera, T_w_c, step_s=0.1):
+    """Render every pose."""
+    views = [render(world, camera, T) for T in T_w_c]
+    frames = [Frame(i, 100.0 + step_s * i, v.image) for i, v in enumerate(views)]
+    return RenderedFlight(camera, frames, [v.depth_m for v in views], np.asarray(T_w_c))
+
+
+def patchwork(rng, side_px=768, patches=1500):
+    """Texture ``(side, side, 3)`` of random rectangles: corners everywhere, no two alike."""
+    image = np.full((side_px, side_px, 3), 128, np.uint8)
+    for _ in range(patches):
+        x, y = rng.integers(0, side_px, 2)
+        w, h = rng.integers(6, side_px // 10, 2)
+        image[y : y + h, x : x + w] = rng.integers(20, 235, 3)
+    return image
+
+
+def wall(rng, distance_m=2.0, half_m=3.0, side_px=768):
+    """A patchwork wall across the camera's axis, for cameras near the origin that look along world z."""
+    texture = Texture(patchwork(rng, side_px))
+    u, v = np.array([2.0 * half_m, 0.0, 0.0]), np.array([0.0, 2.0 * half_m, 0.0])
+    return Quad(np.array([-half_m, -half_m, distance_m]), u, v, texture)
+
+
+@lru_cache(maxsize=1)
+def stairs_world():
+    """Patchwork panels at several depths before a wall: parallax everywhere, nothing planar."""
+    rng = np.random.default_rng(8)
+    quads = [wall(rng, 4.0, 4.0, 1024)]
+    for i in range(5):
+        for j in range(4):
+            z = rng.uniform(1.6, 3.4)
+            x, y = (i - 2.0) * 0.62 * z / 2.4, (j - 1.5) * 0.6 * z / 2.4
+            size = 0.28 * z / 2.4
+            texture = Texture(patchwork(rng, 160, 90))
+            u, v = np.array([2 * size, 0.0, 0.4 * size]), np.array([0.0, 2 * size, 0.0])
+            quads.append(Quad(np.array([x - size, y - size, z]), u, v, texture))
+    return World(quads)
+
+
+def sideways(count, step_m, *, turn_rad=0.0, forward_m=0.0):
+    """``(F, 4, 4)`` ``T_w_c``: along camera x with a bow along y, turning about y, looking along world z."""
+    poses = []
+    for i in range(count):
+        T = se3.exp(np.array([0.0, 0.0, 0.0, 0.0, turn_rad * i, 0.0]))
+        T[:3, 3] = [step_m * (i - (count - 1) / 2), 0.3 * step_m * np.sin(0.5 * i), forward_m * i]
+        poses.append(T)
+    return np.stack(poses)
