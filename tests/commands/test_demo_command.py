@@ -1,0 +1,86 @@
+"""``edgeslam demo``."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from edgeslam_torch.cli import main
+from edgeslam_torch.demo import DemoSettings, map_accuracy, record, run_and_judge, run_demo
+from edgeslam_torch.errors import ConfigError
+from edgeslam_torch.io.source import open_source
+
+
+@pytest.mark.parametrize("world", ["room", "corridor"])
+def test_record_only_leaves_a_recording_that_can_be_run(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], world: str
+) -> None:
+    assert (
+        main(["demo", "--out", str(tmp_path), "--world", world, "--seconds", "1", "--rate", "5", "--record-only"]) == 0
+    )
+    source = open_source(str(tmp_path / "flight"))
+    frames = list(source.frames())
+    assert len(frames) == 5
+    assert frames[0].image.shape == (480, 640, 3)
+    assert frames[0].image.std() > 10
+    assert source.telemetry and source.groundtruth is not None
+    assert "edgeslam run" in capsys.readouterr().out
+
+
+def test_shorter_demo_leaves_nothing_of_the_longer_one(tmp_path: Path) -> None:
+    for seconds in (2.0, 1.0):
+        record(tmp_path, DemoSettings(seconds=seconds, rate_hz=5.0, width=160, height=120))
+    assert len(list((tmp_path / "rgb").iterdir())) == 5
+
+
+def test_demo_runs_and_judges_itself(tmp_path: Path) -> None:
+    settings = DemoSettings(seconds=6.0, rate_hz=12.0, width=320, height=240)
+    recorded = record(tmp_path / "flight", settings)
+    demo = run_and_judge(tmp_path, recorded, settings)
+    assert demo.run.summary["frames"] == 72
+    assert demo.score.coverage > 0.9
+    assert demo.path_m > 1.0
+    written = json.loads((tmp_path / "demo.json").read_text())
+    assert written["frames"] == 72
+    assert written["settings"]["world"] == "room"
+    assert written["trajectory"]["ate_sim3_m"] == pytest.approx(demo.score.ate_sim3_m)
+    again = map_accuracy(tmp_path, demo.score, recorded.world)
+    assert again == demo.map
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("world", ["room", "corridor"])
+def test_demo_flight_meets_its_bars(tmp_path: Path, world: str) -> None:
+    demo = run_demo(tmp_path, DemoSettings(world=world))
+    assert demo.score.coverage > 0.99
+    assert abs(demo.score.scale_error) <= 0.02
+    assert demo.score.ate_se3_m <= 0.01 * demo.path_m
+    assert demo.map is not None
+    assert demo.map.median_m < 0.05
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--world", "castle"], "no world 'castle'; there are room, corridor"),
+        (["--seconds", "0"], "1 to 3600 seconds"),
+        (["--images", "awful"], "no image quality 'awful'"),
+        (["--loss", "1.5"], "--loss must lie in"),
+        (["--seed", "-3"], "--seed must not be negative"),
+    ],
+)
+def test_wrong_options_are_told_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
+) -> None:
+    assert main(["demo", "--out", str(tmp_path), *arguments]) == 1
+    error = capsys.readouterr().err.strip()
+    assert message in error
+    assert "\n" not in error
+
+
+def test_settings_refuse_nonsense() -> None:
+    with pytest.raises(ConfigError, match="no world"):
+        DemoSettings(world="moon")
+    assert DemoSettings(seconds=2.0, rate_hz=20.0).frames == 40
+    assert np.isclose(DemoSettings().camera.fx, 925.0 / 1.5)
