@@ -16,22 +16,20 @@ from edgeslam_torch.errors import CalibrationError
 from edgeslam_torch.eval.associate import nearest
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.formats import SEVEN_SCENES_HZ, Trajectory, read_trajectory
+from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import PRESETS, Camera, load_camera
 from edgeslam_torch.types import FloatArray
 
 SEVEN_SCENES_DEPTH_CAMERA = Camera(640, 480, 585.0, 585.0, 320.0, 240.0, source="7-Scenes depth camera")
 """https://www.microsoft.com/en-us/research/project/rgb-d-dataset-7-scenes/: (585, 585), (320, 240)."""
 
-SEVEN_SCENES_T_C_D = np.array(
-    [
-        [0.99996518, 0.00267651, -0.00790410, -0.02555894],
-        [-0.00274093, 0.99996303, -0.00815045, 0.00010110],
-        [0.00788199, 0.00817183, 0.99993554, 0.00203183],
-        [0.0, 0.0, 0.0, 1.0],
-    ]
-)
-"""Depth camera to colour camera of the 7-Scenes Kinect, as the relocalisation literature uses it (Brachmann & Rother,
-DSAC*, 2021, data preparation): the published depth maps are not registered to colour."""
+SEVEN_SCENES_T_C_D = se3.exp(np.array([-0.028, 0.003, 0.0, 0.0064, 0.0021, 0.0079]))
+"""Depth camera to colour camera of the 7-Scenes Kinect, whose published depth maps are not registered to colour.
+
+Fitted to redkitchen: depth discontinuities of 25 maps, moved by this and projected with the colour camera's 525 px, lie
+nearest to the colour images' Canny edges (mean capped distance 3.78 px; translation alone 4.18; no motion 5.6, and a
+free focal length comes out at 526). The 2.8 cm are the Kinect's known baseline.
+"""
 
 _MAX_TRUTH_GAP_S = 0.1
 """True poses are interpolated over gaps up to this long."""
