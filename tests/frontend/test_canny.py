@@ -1,0 +1,68 @@
+"""kornia's Canny and OpenCV's, held together."""
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from rendered import room_flight
+
+from edgeslam_torch.frontend.canny import canny, canny_batch, hysteresis
+
+
+def as_batch(greys):
+    return torch.from_numpy(np.stack(greys)).float()[:, None] / 255.0
+
+
+def iou(a, b):
+    return (a & b).sum() / (a | b).sum()
+
+
+@pytest.mark.parametrize("index", [0, 40])
+def test_kornia_and_opencv_mark_the_same_pixels(index):
+    grey = cv2.cvtColor(room_flight().frames[index].image, cv2.COLOR_BGR2GRAY)
+    fast = canny(grey, 40.0, 100.0)
+    reference = canny_batch(as_batch([grey]), 40.0, 100.0)[0].numpy()
+    assert fast.sum() > 2000
+    assert iou(fast, reference) >= 0.95
+
+
+def test_batch_is_each_image_by_itself():
+    greys = [cv2.cvtColor(room_flight().frames[i].image, cv2.COLOR_BGR2GRAY) for i in (0, 30)]
+    together = canny_batch(as_batch(greys), 40.0, 100.0)
+    for mask, grey in zip(together, greys, strict=True):
+        assert torch.equal(mask, canny_batch(as_batch([grey]), 40.0, 100.0)[0])
+
+
+def test_constant_image_has_no_edges():
+    grey = np.full((60, 80), 90, np.uint8)
+    assert not canny(grey, 40.0, 100.0).any()
+    assert not canny_batch(as_batch([grey]), 40.0, 100.0).any()
+
+
+def test_step_is_one_pixel_wide_and_where_it_is():
+    grey = np.full((60, 80), 60, np.uint8)
+    grey[:, 40:] = 160
+    mask = canny(grey, 40.0, 100.0)[10:-10]
+    assert (mask.sum(axis=1) == 1).all()
+    assert set(np.nonzero(mask)[1]) <= {39, 40}
+
+
+def test_step_below_the_upper_threshold_is_no_edge():
+    """Smoothed by sigma 1, the 3x3 Sobel sees 2.9 grey levels per level of a step."""
+    grey = np.full((60, 80), 60, np.uint8)
+    grey[:, 40:] = 85
+    assert not canny(grey, 40.0, 100.0).any()
+    assert canny(grey, 30.0, 50.0).any()
+
+
+def test_hysteresis_keeps_what_hangs_on_a_strong_pixel():
+    candidate = np.zeros((5, 9), bool)
+    candidate[1, 0:4] = candidate[2, 4] = True  # joined by a diagonal
+    candidate[4, 0:4] = True  # another line
+    strong = np.zeros_like(candidate)
+    strong[2, 4] = True
+    expected = candidate.copy()
+    expected[4] = False
+    np.testing.assert_array_equal(hysteresis(candidate, strong), expected)
+    assert not hysteresis(candidate, np.zeros_like(strong)).any()
+    assert not hysteresis(np.zeros_like(candidate), strong).any()

@@ -1,0 +1,62 @@
+"""Edge pixels with normals and colours."""
+
+import cv2
+import numpy as np
+import pytest
+from rendered import room_flight
+
+from edgeslam_torch.frontend.edges import extract_edges
+
+
+def test_normal_of_a_slanted_step_points_to_the_bright_side():
+    v, u = np.mgrid[0:120, 0:160]
+    direction = np.array([np.cos(0.4), np.sin(0.4)])
+    ramp = (u - 80) * direction[0] + (v - 60) * direction[1]
+    image = np.clip(120 + 60 * ramp, 50, 190).astype(np.uint8)
+    edges = extract_edges(image, 40.0, 100.0, 5000)
+    assert len(edges.uv) > 50
+    assert (edges.normal @ direction).min() > np.cos(np.deg2rad(10))
+    distance = (edges.uv - [80, 60]) @ direction
+    assert np.abs(distance).max() < 1.5
+
+
+def test_normals_are_unit_and_nothing_lies_at_the_border():
+    edges = extract_edges(room_flight().frames[0].image, 40.0, 100.0, 100_000, border_px=6)
+    np.testing.assert_allclose(np.linalg.norm(edges.normal, axis=1), 1.0, atol=1e-5)
+    assert edges.uv.min() >= 6
+    assert (edges.uv < [320 - 6, 240 - 6]).all()
+
+
+@pytest.mark.parametrize("most", [200, 1000])
+def test_thinning_keeps_the_number_and_covers_what_there_was(most):
+    image = room_flight().frames[0].image
+    every = extract_edges(image, 40.0, 100.0, 100_000).uv
+    some = extract_edges(image, 40.0, 100.0, most).uv
+    assert len(some) == most < len(every)
+    assert {tuple(p) for p in some} <= {tuple(p) for p in every}
+    cells = [{tuple(c) for c in (uv // 40).astype(int)} for uv in (every, some)]
+    # Each 40 px cell that had a fair share of edges keeps some.
+    crowded = {c for c in cells[0] if ((every // 40).astype(int) == c).all(1).sum() > 3 * len(every) / most}
+    assert crowded <= cells[1]
+
+
+def test_colour_is_rgb_of_the_pixel():
+    image = room_flight().frames[0].image
+    edges = extract_edges(image, 40.0, 100.0, 500)
+    u, v = edges.uv.astype(int).T
+    np.testing.assert_array_equal(edges.colour, image[v, u][:, ::-1])
+
+
+def test_grey_image_gives_the_same_edges_in_grey():
+    image = room_flight().frames[0].image
+    grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    a, b = extract_edges(image, 40.0, 100.0, 500), extract_edges(grey, 40.0, 100.0, 500)
+    np.testing.assert_array_equal(a.uv, b.uv)
+    assert (b.colour == b.colour[:, :1]).all()
+
+
+def test_black_image_has_none():
+    edges = extract_edges(np.zeros((60, 80, 3), np.uint8), 40.0, 100.0, 500)
+    assert edges.uv.shape == (0, 2)
+    assert edges.normal.shape == (0, 2)
+    assert edges.colour.shape == (0, 3)

@@ -1,0 +1,76 @@
+"""ORB keypoints spread over the image."""
+
+import numpy as np
+import pytest
+from rendered import CAMERA, patchwork, room_flight
+
+from edgeslam_torch.config import OrbConfig
+from edgeslam_torch.frontend.orb import OrbExtractor, spread
+from edgeslam_torch.geometry.camera import PRESETS
+
+
+@pytest.mark.parametrize("grey", [0, 128, 255])
+def test_constant_image_has_no_keypoints(grey):
+    features = OrbExtractor(OrbConfig(), CAMERA)(np.full((240, 320), grey, np.uint8))
+    assert features.uv.shape == (0, 2)
+    assert features.descriptors.shape == (0, 32)
+    assert len(features.octave) == len(features.angle_rad) == 0
+
+
+def test_keypoints_are_described_and_inside():
+    grey = room_flight().frames[0].image[..., 1].copy()
+    features = OrbExtractor(OrbConfig(features=400), CAMERA)(grey)
+    n = len(features.uv)
+    assert 300 <= n <= 400
+    assert features.descriptors.shape == (n, 32)
+    assert features.descriptors.dtype == np.uint8
+    assert features.uv.min() >= 0
+    assert (features.uv <= [319, 239]).all()
+    assert features.octave.min() >= 0
+    assert features.octave.max() < 8
+
+
+def test_same_image_gives_the_same_features():
+    grey = room_flight().frames[0].image[..., 1].copy()
+    a, b = (OrbExtractor(OrbConfig(), CAMERA)(grey) for _ in range(2))
+    np.testing.assert_array_equal(a.uv, b.uv)
+    np.testing.assert_array_equal(a.descriptors, b.descriptors)
+
+
+def test_keypoints_come_undistorted(rng):
+    grey = patchwork(rng, 768, 900)[:480, :640, 0].copy()
+    camera = PRESETS["tum_fr1"]
+    bent = OrbExtractor(OrbConfig(), camera)(grey)
+    straight = OrbExtractor(OrbConfig(), PRESETS["kinect"])(grey)
+    np.testing.assert_allclose(bent.uv, camera.undistort_points(straight.uv), atol=1e-3)
+    np.testing.assert_array_equal(bent.descriptors, straight.descriptors)
+
+
+def test_spread_keeps_the_few_of_a_poor_corner_of_the_image(rng):
+    """2000 strong corners on the left, 12 weak ones on the right: the right keeps its own."""
+    left = rng.uniform([0, 0], [300, 480], (2000, 2))
+    right = rng.uniform([500, 100], [640, 400], (12, 2))
+    uv = np.concatenate([left, right]).astype(np.float32)
+    score = np.r_[rng.uniform(50, 100, 2000), rng.uniform(1, 2, 12)]
+    keep = spread(uv, score, np.zeros(2012, int), 640, 480, 500)
+    assert len(keep) == 500
+    assert (np.diff(keep) > 0).all()
+    assert (keep >= 2000).sum() == 12
+
+
+def test_spread_takes_the_strongest_of_a_cell():
+    uv = np.tile([[10.0, 10.0]], (9, 1)).astype(np.float32)
+    assert spread(uv, np.arange(9.0), np.zeros(9, int), 640, 480, 3).tolist() == [6, 7, 8]
+
+
+def test_spread_of_few_keeps_all():
+    assert spread(np.zeros((3, 2)), np.ones(3), np.zeros(3, int), 640, 480, 5).tolist() == [0, 1, 2]
+
+
+def test_spread_is_as_even_as_the_corners_allow(rng):
+    """Evenly detected corners: no quarter of the image gets more than a third of what is kept."""
+    uv = rng.uniform([0, 0], [640, 480], (3000, 2)).astype(np.float32)
+    score = 100.0 - uv[:, 0] / 10  # the left is stronger throughout
+    keep = spread(uv, score, np.zeros(3000, int), 640, 480, 600)
+    quarter = (uv[keep] // [320, 240]) @ [1, 2]
+    assert np.bincount(quarter.astype(int), minlength=4).max() < 200
