@@ -1,5 +1,6 @@
 """Sliding-window refinement of poses and anchors, paper eq. (28) and its thread 4."""
 
+from contextlib import nullcontext
 from dataclasses import dataclass
 
 import numpy as np
@@ -67,7 +68,9 @@ def refine_window(problem: WindowProblem, config: LmConfig | None = None) -> Win
         return _unchanged(problem, StopReason.NOT_FINITE)
     if len(problem.obs_pose) == 0 and problem.edges is None and problem.junctions is None:
         return _unchanged(problem, StopReason.NO_OBSERVATIONS)
-    with torch.inference_mode():
+    # As a context, a default device costs microseconds per torch call: not for the CPU, which is the default.
+    device = nullcontext() if config.device == "cpu" else torch.device(config.device)
+    with torch.inference_mode(), device:
         return _Window(problem, config).refine()
 
 
@@ -240,12 +243,12 @@ class _Window:
                 edges = {
                     "edge_inverse_depth": _restored(x[0], block.block_order),
                     "edge_sigma": _restored(sigma, block.block_order),
-                    "edge_chi2": block.alignment_chi2(self.state.T_c_w, x).numpy(),
+                    "edge_chi2": block.alignment_chi2(self.state.T_c_w, x).cpu().numpy(),
                 }
             else:
                 junctions = {"junction_inverse_depth": _restored(x.mT, block.block_order)}
         return WindowResult(
-            T_c_w=self.state.T_c_w.numpy(),
+            T_c_w=self.state.T_c_w.cpu().numpy(),
             p_w=_restored(self.state.p_w, self.anchor_order),
             chi2=_restored(torch.where(in_front, s, torch.inf), self.order)[:M],
             in_front=_restored(in_front, self.order)[:M],
@@ -327,7 +330,7 @@ class _Window:
         good = values > self.config.rank_tolerance * values[-1].clamp_min(_FLOOR)
         rows = vectors[-6:, good]
         covariance = (rows / values[good]) @ rows.mT * scale[-6:, None] * scale[-6:]
-        return int((~good).sum()), covariance.numpy()
+        return int((~good).sum()), covariance.cpu().numpy()
 
     @staticmethod
     def _edge_sigma(block: EdgeBlocks) -> Tensor:
@@ -343,7 +346,7 @@ def _restored(x: Tensor, order: Tensor) -> np.ndarray:
     """``x`` from the solver's order to the caller's."""
     out = torch.empty_like(x)
     out[order] = x
-    return out.numpy()
+    return out.cpu().numpy()
 
 
 def _index(*parts: IntArray) -> Tensor:

@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from edgeslam_torch.geometry import se3
@@ -34,7 +35,7 @@ class PriorTerms:
         """Sum of squared whitened residuals."""
         if not self.poses and not self.scales:
             return 0.0
-        T = T_c_w.numpy()
+        T = T_c_w.cpu().numpy()
         total = 0.0
         for prior in self.poses:
             r = pose_prior_residual(T[prior.pose], prior)
@@ -47,7 +48,8 @@ class PriorTerms:
         """Add the terms to ``H (6F, 6F)`` and ``g (6F,)``; returns their cost."""
         if not self.poses and not self.scales:
             return 0.0
-        T, H_np, g_np = T_c_w.numpy(), H.numpy(), g.numpy()
+        T = T_c_w.cpu().numpy()
+        H_np, g_np = np.zeros(H.shape), np.zeros(g.shape)
         total = 0.0
         for prior in self.poses:
             r = pose_prior_residual(T[prior.pose], prior)
@@ -66,6 +68,8 @@ class PriorTerms:
                     row[k : k + 6] += J
             H_np += np.outer(row, row)
             g_np += r_s * row
+        H += torch.as_tensor(H_np)
+        g += torch.as_tensor(g_np)
         return total
 
 

@@ -176,6 +176,8 @@ class LmConfig:
     """Where the kernel departs from least squares [standard deviations]."""
     edge_delta: float = CHI2_1DOF_95**0.5
     """The same for edge and junction rows, which are scalars."""
+    device: str = "cpu"
+    """Where torch computes, ``cuda`` for instance; a window of usual size is too small to gain from it."""
     float32_edges: bool = True
     """Edge blocks in single precision; the reduced system is always double."""
     mu: float = 1e-4

@@ -13,7 +13,6 @@ from torch import Tensor
 
 from edgeslam_torch.losses.cycle import CycleForm
 from edgeslam_torch.losses.edge_alignment import (
-    PairGeometry,
     alignment_jacobians,
     alignment_row,
     pair_geometry,
@@ -350,6 +349,3 @@ def _put(J: Tensor, Jd: Tensor, weight: Tensor, r: Tensor, by_pose: Tensor, by_d
 
 def _tensor(x: FloatArray) -> Tensor:
     return torch.as_tensor(np.asarray(x, dtype=np.float64))
-
-
-__all__ = ["EdgeBlocks", "JunctionBlocks", "PairGeometry", "RelativeBlocks", "collinearity_prior"]

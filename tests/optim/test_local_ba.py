@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.losses.cycle import CycleForm
@@ -421,3 +422,11 @@ def test_gtsam_finds_the_same_minimum():
     result = refine_window(problem, TIGHT)
     assert result.cost_after == pytest.approx(cost, rel=1e-8)
     np.testing.assert_allclose(result.T_c_w, T_c_w, atol=1e-6)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_a_gpu_finds_the_same_minimum():
+    problem = replace(seeded_window(21, SMALL).problem, scale_priors=(ScalePrior(0, 5, 0.6, 0.1),))
+    here, there = refine_window(problem, TIGHT), refine_window(problem, replace(TIGHT, device="cuda"))
+    assert there.cost_after == pytest.approx(here.cost_after, rel=1e-9)
+    np.testing.assert_allclose(there.T_c_w, here.T_c_w, atol=1e-7)
