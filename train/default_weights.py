@@ -38,7 +38,10 @@ INPUT_SIZE = (160, 224)
 """Height and width [px]; against 192x256 a third less time, and as accurate (model card)."""
 REAL = {"tum_fr1_rpy_depth": 0.6, "icl_livingroom1": 0.4}
 """Recordings of phase 1 and their shares."""
-MIXED = {"tum_fr1_rpy_depth": 0.4, "icl_livingroom1": 0.15, "rendered": 0.45}
+MIXED = {"tum_fr1_rpy_depth": 0.5, "icl_livingroom1": 0.1, "rendered": 0.4}
+RENDERED_METRIC = 0.1
+"""Rendered rooms teach shape: their sizes are our invention, and with 1 the metric error on redkitchen
+had doubled after 250 steps."""
 HELD_OUT_VIEWS = 150
 """Last rendered views, whole rooms, kept out of training for the calibration."""
 LICENCE = (
@@ -56,7 +59,7 @@ class Recipe:
     views_per_room: int = 6
     real: TrainConfig = TrainConfig(steps=950)
     mixed: TrainConfig = TrainConfig(
-        steps=850, lr=1e-3, encoder_lr=1.2e-4, seed=1, validate_every=250, checkpoint_every=50
+        steps=750, lr=1e-3, encoder_lr=1.2e-4, seed=1, validate_every=250, checkpoint_every=50
     )
     augment: AugmentConfig = AugmentConfig(
         zoom=(0.9, 1.4), aspect=0.05, roll_rad=0.12, tilt_rad=0.08, shift=0.1, saturation=0.4, gamma=(0.8, 1.25)
@@ -159,7 +162,8 @@ def _phase(
     if (out / "final.safetensors").is_file():
         logger.info("%s is there already", out / "final.safetensors")
         return
-    sources = [Source(name, pools[name], share) for name, share in shares.items()]
+    metric = {"rendered": RENDERED_METRIC}
+    sources = [Source(name, pools[name], share, metric.get(name, 1.0)) for name, share in shares.items()]
     train(network, metadata, [Supervised(sources, metadata, augment)], config, out, validate, [Progress()])
 
 

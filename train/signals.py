@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from edgeslam_torch.losses.depth import BerHu, GradientMatching, LaplaceNll, MaskedL1, SILog
+from edgeslam_torch.losses.depth import BerHu, GradientMatching, LaplaceNll, MaskedL1, SILog, masked_mean
 from edgeslam_torch.models.fastdepth import FastDepth
 from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.train.augment import AugmentConfig, View, random_view
@@ -66,6 +66,8 @@ class Source:
     views: Sequence[View]
     share: float
     """Part of the batch taken from here, relative to the other sources."""
+    metric: float = 1.0
+    """How much of an image's mean log error counts: 1 teaches metres, 0 teaches shape alone."""
 
 
 @dataclass
@@ -96,23 +98,30 @@ class Supervised:
         return [f"{source.name}/{index}" for source, index in chosen]
 
     def draw(self, slots: Sequence[Slot]) -> dict[str, Tensor]:
-        """``image (B, 3, H, W)``, ``log_depth (B, 1, H, W)`` at the training focal length, ``mask``."""
-        images, targets = [], []
+        """``image (B, 3, H, W)``, ``log_depth (B, 1, H, W)`` at the training focal length, ``mask``,
+        ``metric (B,)``."""
+        images, targets, metric = [], [], []
         size = (self.metadata.input_height, self.metadata.input_width)
         for slot in slots:
             rng = slot.rng()
             source, index = self._choose(rng)
             view = random_view(source.views[index], size, self.augment, rng)
             images.append(image_tensor(view.image, self.metadata))
+            metric.append(source.metric)
             focal = float(np.sqrt(view.K[0, 0] * view.K[1, 1]))
             targets.append(torch.from_numpy(view.depth_m * (self.metadata.focal_px / focal))[None])
         depth = torch.stack(targets)
         mask = (depth > 0.05) & (depth < 30.0)
-        return {"image": torch.stack(images), "log_depth": depth.clamp(0.05, 30.0).log(), "mask": mask}
+        log_depth = depth.clamp(0.05, 30.0).log()
+        return {"image": torch.stack(images), "log_depth": log_depth, "mask": mask, "metric": torch.tensor(metric)}
 
     def losses(self, network: FastDepth, batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """Weighted terms, each ``(B,)``."""
         predicted, target, mask = network.predict(batch["image"]), batch["log_depth"], batch["mask"]
+        # Part of the mean error is taken out of the residual, with its gradient: that part of the scale is
+        # free.
+        free = (1.0 - batch["metric"]) * masked_mean(predicted.log_depth - target, mask)
+        target = target + free.view(-1, 1, 1, 1)
         out = {}
         for name, term in self._terms.items():
             weight = getattr(self.weights, name)
