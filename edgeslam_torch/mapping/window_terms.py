@@ -3,15 +3,17 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from edgeslam_torch.frontend.corners import Junctions
+from edgeslam_torch.frontend.corners import Junctions, detect_junctions
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.losses.cycle import CycleForm
-from edgeslam_torch.optim.edge_association import EdgeField, associate_edges
+from edgeslam_torch.optim.edge_association import EdgeField, associate_edges, edge_field
 from edgeslam_torch.optim.problem import EdgeTerms, JunctionTerms
 from edgeslam_torch.optim.relative import collinearity_prior
-from edgeslam_torch.types import FloatArray, IntArray
+from edgeslam_torch.types import Edges, FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,10 +36,12 @@ class TermConfig:
     """Poses in which each pose's edges are looked for: the nearest by baseline."""
     max_px: float = 4.0
     """Largest distance between a projected edge pixel and its partner."""
-    edge_sigma_px: float = 1.0
-    """Whole-pixel edges (0.3 px) that move with the light and the view."""
+    edge_sigma_px: float = 2.0
+    """Edges scatter by 0.8 px on fr1_xyz, but neighbours on one edge err together: six of them count as one."""
+    least_sigma: float = 0.003
+    """Relative depth sigma below which no single edge is believed."""
     cycle: CycleForm = CycleForm.RELATIVE_DEPTH
-    cycle_sigma: float = 0.0
+    cycle_sigma: float = 0.02
     """Standard deviation of the cycle residual; zero leaves the cycle out."""
     junction_px: float = 6.0
     """Largest distance between a projected corner and its partner."""
@@ -47,6 +51,32 @@ class TermConfig:
     """Edge points along each arm whose depths are asked for."""
     arm_px: float = 40.0
     """Longest piece of an arm that is used."""
+
+
+def make_structure(
+    grey: NDArray[np.uint8],
+    uv: FloatArray,
+    inverse_depth: FloatArray,
+    sigma: FloatArray,
+    mask: NDArray[np.bool_] | None = None,
+) -> Structure:
+    """What a keyframe's edges with known depth are for its neighbours.
+
+    Args:
+        grey: Undistorted image ``(H, W)``.
+        uv: ``(E, 2)`` edge pixels whose depth is known, at whole pixels.
+        inverse_depth: ``(E,)`` [1/m].
+        sigma: ``(E,)`` standard deviations [1/m].
+        mask: ``(H, W)`` Canny edges, for L-junctions; none are looked for without it.
+    """
+    height, width = grey.shape
+    smooth = cv2.GaussianBlur(grey, (5, 5), 1.0)
+    u, v = np.clip(np.rint(uv).astype(int), 0, np.array((width - 1, height - 1))).reshape(-1, 2).T
+    gradient = [cv2.Sobel(smooth, cv2.CV_32F, *order)[v, u] for order in ((1, 0), (0, 1))]
+    normal = _unit(np.stack(gradient, 1)).astype(np.float32)
+    edges = Edges(np.asarray(uv, dtype=np.float32).reshape(-1, 2), normal, np.repeat(grey[v, u][:, None], 3, 1))
+    junctions = None if mask is None else detect_junctions(grey, mask)
+    return Structure(edge_field(edges, inverse_depth, (width, height)), np.asarray(sigma), junctions)
 
 
 def nearest_poses(T_c_w: FloatArray, count: int) -> IntArray:
@@ -96,7 +126,7 @@ def edge_terms(
         uv=uv[used],
         inverse_depth=inverse_depth[used],
         prior=inverse_depth[used],
-        prior_sigma=sigma[used],
+        prior_sigma=np.maximum(sigma, config.least_sigma * inverse_depth)[used],
         pair_edge=pair_edge,
         pair_pose=pairs.pair_pose,
         pair_uv=pairs.pair_uv,

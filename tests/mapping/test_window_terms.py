@@ -1,11 +1,19 @@
 """Edge and junction terms made from keyframes, and what they do for a window."""
 
+import cv2
 import numpy as np
 import pytest
 
 from edgeslam_torch.frontend.corners import Junctions
 from edgeslam_torch.geometry import se3
-from edgeslam_torch.mapping.window_terms import Structure, TermConfig, edge_terms, junction_terms, nearest_poses
+from edgeslam_torch.mapping.window_terms import (
+    Structure,
+    TermConfig,
+    edge_terms,
+    junction_terms,
+    make_structure,
+    nearest_poses,
+)
 from edgeslam_torch.optim.edge_association import edge_field
 from edgeslam_torch.optim.local_ba import refine_window
 from edgeslam_torch.optim.problem import LmConfig, WindowProblem
@@ -118,3 +126,19 @@ def test_nothing_to_pair_gives_none(scene):
     assert edge_terms(structures[:2], far, K) is None
     assert edge_terms(structures[:1], T[:1], K) is None
     assert junction_terms(structures[:1], T[:1], K) is None
+
+
+def test_structure_of_an_image_points_its_normals_to_the_bright_side():
+    grey = np.full((120, 160), 40, np.uint8)
+    grey[30:90, 40:120] = 200
+    mask = cv2.Canny(cv2.GaussianBlur(grey, (5, 5), 1.0), 30, 80) > 0
+    v, u = np.nonzero(mask)
+    uv = np.stack([u, v], 1)
+    structure = make_structure(grey, uv, np.full(len(u), 0.5), np.full(len(u), 0.01), mask)
+    left = (np.abs(u - 40) <= 1) & (v > 40) & (v < 80)
+    np.testing.assert_allclose(
+        structure.field.edges.normal[left], np.broadcast_to([1.0, 0.0], (left.sum(), 2)), atol=0.05
+    )
+    assert structure.junctions is not None
+    assert len(structure.junctions) == 4
+    assert make_structure(grey, np.zeros((0, 2)), np.zeros(0), np.zeros(0)).junctions is None
