@@ -38,6 +38,8 @@ class FlightPlan:
     """Start on the floor (camera at 12 cm) and climb."""
     glance_rad: float = np.deg2rad(25.0)
     """How far the drone looks aside from where it flies."""
+    view_m: float = 1.8
+    """It turns away from what is nearer than this: an inspector does not stare at a bare wall."""
     wobble_m: float = 0.006
     wobble_rad: float = np.deg2rad(0.35)
     camera_tilt_rad: float = np.deg2rad(12.0)
@@ -132,13 +134,14 @@ def _control_points(rng: np.random.Generator, world: World, duration_s: float, p
     if plan.take_off:
         floor = float(world.floor_below(here[None])[0]) + 0.12
         climb = np.arange(floor, here[2], 0.5 * KNOT_S)
-        rows += [[here[0], here[1], floor, yaw]] * 2 + [[here[0], here[1], z, yaw] for z in climb]
+        rows += [[here[0], here[1], z, yaw] for z in climb]
     rows.append([*here, yaw])
     heading = yaw
     while len(rows) * KNOT_S < duration_s:
         there = _next_place(rng, world, here, heading, plan)
         heading = float(np.arctan2(there[1] - here[1], there[0] - here[0]))
-        target = yaw + _wrapped(heading + rng.uniform(-1, 1) * plan.glance_rad - yaw)
+        wanted = _open_view(world, there, heading + rng.uniform(-1, 1) * plan.glance_rad, plan.view_m)
+        target = yaw + _wrapped(wanted - yaw)
         distance = float(np.linalg.norm(there - here))
         seconds = max(distance / (plan.speed_m_s * rng.uniform(0.7, 1.0)), abs(target - yaw) / plan.yaw_rate_rad_s)
         steps = max(1, int(np.ceil(seconds / KNOT_S)))
@@ -147,6 +150,21 @@ def _control_points(rng: np.random.Generator, world: World, duration_s: float, p
         rows += (start + share * (end - start)).tolist()
         here, yaw = there, target
     return np.array(rows)
+
+
+def _open_view(world: World, p_w: FloatArray, yaw: float, view_m: float) -> float:
+    """The direction nearest to ``yaw`` in which the next ``view_m`` metres are free; the freest if none is."""
+    reach = np.linspace(0.4, view_m, 8)
+    best, best_free = yaw, -1
+    for turn in np.deg2rad([0, 25, -25, 50, -50, 75, -75, 105, -105, 140, -140, 180]):
+        ray = p_w + reach[:, None] * np.array([np.cos(yaw + turn), np.sin(yaw + turn), 0.0])
+        blocked = np.flatnonzero(world.clearance(ray) < 0.1)
+        free = int(blocked[0]) if len(blocked) else len(reach)
+        if free > best_free:
+            best, best_free = yaw + float(turn), free
+        if free == len(reach):
+            break
+    return best
 
 
 def _wrapped(angle: float) -> float:

@@ -71,7 +71,7 @@ def room(rng: Rng, *, size_m: tuple[float, float, float] = (6.5, 5.2, 2.7)) -> W
     _rug(scene, rng, 0.0, 0.0)
     for wall in rng.permutation(4).tolist():
         place, length = _wall(low, high, wall)
-        _furnish_wall(scene, place, length, rng, size_m[2], density=0.96, door=wall == 0, names=HOME)
+        _furnish_wall(scene, place, length, rng, size_m[2], density=0.96, door=wall == 0, pictures=0.9, names=HOME)
     return scene.world("room")
 
 
@@ -90,10 +90,10 @@ def random_room(rng: Rng, *, texel_m: float = 0.006) -> World:
     scene.exposure = float(np.exp(rng.normal(-0.05, 0.22)))
     warmth = rng.normal(0.0, 0.1)
     scene.light_bgr = (float(np.exp(-warmth)), 1.0, float(np.exp(warmth)))
-    density = float(rng.uniform(0.3, 1.0))
+    density, pictures = float(rng.uniform(0.3, 1.0)), float(rng.uniform(0.0, 0.8))
     for wall in range(4):
         place, length = _wall(low, high, wall)
-        _furnish_wall(scene, place, length, rng, size[2], density=density, door=rng.random() < 0.35)
+        _furnish_wall(scene, place, length, rng, size[2], density=density, door=rng.random() < 0.35, pictures=pictures)
     for _ in range(int(rng.poisson(size[0] * size[1] / 14.0))):
         _in_the_middle(scene, rng)
     if rng.random() < 0.4:
@@ -290,22 +290,28 @@ def _furnish_wall(
     *,
     density: float,
     door: bool,
+    pictures: float,
     names: tuple[str, ...] = tuple(PIECES),
 ) -> None:
-    """Walk along a wall: door, windows, furniture where it fits, pictures above the low pieces."""
+    """Walk along a wall: door, windows, furniture where it fits; then pictures where the upper wall is free.
+
+    ``density`` is the share of the wall that is furnished, ``pictures`` of its free upper part that is hung.
+    """
     x = -length / 2 + 0.1
     door_x = rng.uniform(-0.5, 0.5) * max(length - 1.4, 0.0) if door and length > 1.8 else np.inf
+    taken: list[tuple[float, float]] = []
     while x < length / 2 - 0.5:
         if x + 0.9 > door_x - 0.6 and x < door_x + 0.6:
             _door(scene, place.at(door_x, 0.0), rng)
+            taken.append((door_x - 0.6, door_x + 0.6))
             x = door_x + 0.65
             continue
         room_left = (length / 2 if x > door_x else min(length / 2, door_x - 0.6)) - x - 0.08
         if rng.random() > density or room_left < 0.4:
-            if rng.random() < 0.5 and room_left > 1.6:
-                x += _window(scene, place.at(x + 1.0, 0.0), rng, height_m) + 0.3
-            elif rng.random() < 0.6 and room_left > 1.9:
-                x += _decorate(scene, place, rng, x, height_m, ("poster", "picture", "whiteboard")) + 0.15
+            if rng.random() < 0.5 and room_left > 2.2:
+                width = _window(scene, place.at(x + 1.1, 0.0), rng, height_m)
+                taken.append((x + 0.7 - width / 2, x + 1.5 + width / 2))
+                x += 2.2
             else:
                 x += rng.uniform(0.3, 0.9)
             continue
@@ -318,12 +324,23 @@ def _furnish_wall(
         before = len(scene.boxes)
         piece.build(scene, spot, rng, width, depth)
         top = max((b.centre_w[2] + b.half_m[2] for b in scene.boxes[before:]), default=0.0)
-        if top < 1.25 and width > 0.75 and rng.random() < 0.75:
-            if rng.random() < 0.2 and width > 1.0:
-                _window(scene, place.at(x + width / 2, 0.0), rng, height_m)
-            else:
-                _decorate(scene, place, rng, x + 0.05, height_m, ("poster", "picture", "whiteboard"), lowest=top)
+        if top > 1.2:
+            taken.append((x, x + width))
+        elif width > 1.0 and rng.random() < 0.15:
+            pane = _window(scene, place.at(x + width / 2, 0.0), rng, height_m)
+            taken.append((x + width / 2 - pane / 2 - 0.4, x + width / 2 + pane / 2 + 0.4))
         x += width + rng.uniform(0.02, 0.5)
+    x = -length / 2 + 0.25
+    while x < length / 2 - 0.4:
+        blocked = [end for start, end in taken if start < x + 0.9 and end > x]
+        if blocked:
+            x = max(blocked) + 0.05
+        elif rng.random() < pictures:
+            ahead = min((start for start, _ in taken if start > x), default=length / 2) - x
+            kinds = ("poster", "picture", "whiteboard") if ahead > 1.9 else ("poster", "picture")
+            x += _decorate(scene, place, rng, x, height_m, kinds) + rng.uniform(0.1, 0.7)
+        else:
+            x += 0.6
 
 
 def _fits(scene: Scene, place: Place, width: float, depth: float) -> bool:

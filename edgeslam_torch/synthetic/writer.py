@@ -72,18 +72,18 @@ def write_flight(
             twist = flight.twist_c(i)
             image = degraded(rng, view.image, view.depth_m, camera, faults, stamp_s=stamp, twist_c=twist)
             options = [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality] if jpeg_quality else []
-            _write_image(folder / "rgb" / f"{stamp:.6f}{suffix}", image, options)
+            _write_image(folder / "rgb" / f"{_name(stamp)}{suffix}", image, options)
             if depth_every and i % depth_every == 0:
                 steps = np.clip(np.rint(view.depth_m * DEPTH_PER_METRE), 0, 65535).astype(np.uint16)
-                _write_image(folder / "depth" / f"{stamp:.6f}.png", steps, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+                _write_image(folder / "depth" / f"{_name(stamp)}.png", steps, [cv2.IMWRITE_PNG_COMPRESSION, 1])
 
         pool = ThreadPoolExecutor(max_workers=threads)
         try:
             for i, _ in enumerate(pool.map(draw, range(len(flight.stamps_s)))):
-                name = f"{flight.stamps_s[i]:.6f}"
-                rgb.append(f"{name} rgb/{name}{suffix}")
+                stamp = float(flight.stamps_s[i])
+                rgb.append(f"{stamp:.6f} rgb/{_name(stamp)}{suffix}")
                 if depth_every and i % depth_every == 0:
-                    depth.append(f"{name} depth/{name}.png")
+                    depth.append(f"{stamp:.6f} depth/{_name(stamp)}.png")
                 if on_frame is not None:
                     on_frame(i + 1)
         finally:  # after Ctrl-C the frames that wait are not drawn
@@ -94,6 +94,11 @@ def write_flight(
     except OSError as error:
         raise OutputError(f"{folder}: the simulated flight cannot be written ({error})") from error
     return folder
+
+
+def _name(stamp_s: float) -> str:
+    """File name that sorts by time."""
+    return f"{stamp_s:012.6f}"
 
 
 def _groundtruth_lines(stamps_s: FloatArray, T_w_c: FloatArray) -> list[str]:
