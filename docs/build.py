@@ -53,7 +53,7 @@ def main() -> int:
 
 
 def modules() -> list[str]:
-    """What lies directly in the package (pdoc goes on from there); its lazily loaded names are resolved so that pdoc finds them."""
+    """What lies directly in the package; pdoc goes on from there and finds the lazily loaded names resolved."""
     for name in edgeslam_torch.__all__:
         setattr(edgeslam_torch, name, getattr(edgeslam_torch, name))
     found = pkgutil.iter_modules(edgeslam_torch.__path__, "edgeslam_torch.")
