@@ -180,6 +180,7 @@ def figures_of(score: RunScore) -> dict[str, float | None]:
             "map_points": float(found.points),
             "map_median_m": found.median_m,
             "map_single_median_m": found.single_map_median_m,
+            "map_own_alignment_median_m": found.own_alignment_median_m,
             "map_within_6cm": found.accuracy.get(0.06),
             "map_within_10cm": found.accuracy.get(0.10),
             "edges_within_2cm": found.completeness.get(0.02),

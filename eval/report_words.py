@@ -127,6 +127,7 @@ def map_rows(score: RunScore | None) -> list[list[str]] | None:
         ["points judged", f"{found.judged_share:.1%} of {found.points}"],
         ["median distance to the measured surface", _length(found.median_m)],
         ["the same, one depth map at a time", _length(found.single_map_median_m)],
+        ["the same, after aligning the map itself", _length(found.own_alignment_median_m)],
         ["90 % of the points are nearer than", _length(found.p90_m)],
     ]
     for threshold, share in found.accuracy.items():

@@ -51,6 +51,7 @@ MAP_COLUMNS = (
     Column("judged", _map("judged_share"), "{:.0%}"),
     Column("median [m]", _map("median_m")),
     Column("one-map median [m]", _map("single_map_median_m")),
+    Column("own alignment [m]", _map("own_alignment_median_m")),
     *(Column(f"accuracy {100 * t:.0f} cm", _map("accuracy", t), "{:.0%}") for t in THRESHOLDS_M),
     *(Column(f"edges {100 * t:.0f} cm", _map("completeness", t), "{:.0%}") for t in THRESHOLDS_M),
     *(Column(f"F {100 * t:.0f} cm", _map("f_score", t), "{:.2f}") for t in THRESHOLDS_M),
