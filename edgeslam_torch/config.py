@@ -21,7 +21,7 @@ class OrbConfig:
 
     features: int = 1000
     """Keypoints kept per frame; the figure of ORB-SLAM2 for 640x480."""
-    candidates: int = 2000
+    candidates: int = 1500
     """Corners detected before the even spread."""
     scale_factor: float = 1.2
     levels: int = 8
@@ -130,11 +130,11 @@ class EdgeConfig:
     canny_low: float = 40.0
     canny_high: float = 100.0
     """Grey-level gradient thresholds, L2 norm, 3x3 Sobel."""
-    max_pixels: int = 5000
+    max_pixels: int = 4000
     """Edge pixels kept per keyframe, evenly thinned."""
     delay_keyframes: int = 3
     """Keyframes that must follow before a keyframe's edges are measured: views from both sides, refined poses."""
-    targets: int = 6
+    targets: int = 5
     """Keyframes searched for each edge."""
     max_sigma: float = 0.02
     """Relative depth sigma above which a measured edge point stays out of the map."""

@@ -86,7 +86,7 @@ class EdgeSlam:
         """Counts of what went wrong and was mended."""
         self._orb = OrbExtractor(self.config.orb, camera)
         self._tracker = Tracker(self.map, camera, self.config.orb, self.config.tracking)
-        self._lm = LmConfig(diagnostics=False)
+        self._lm = LmConfig(diagnostics=False, max_iterations=6, cost_tolerance=1e-4)
         self._mapper = Mapper(self.map, camera, self.config, self._lm)
         self._edges = EdgeMap(self.map, camera, self.config.edges, self.config.depth.prior_sigma_log)
         self._T_b_c = camera_on_body(np.deg2rad(self.config.mount.tilt_deg), self.config.mount.forward_m)

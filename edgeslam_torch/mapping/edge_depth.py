@@ -54,7 +54,7 @@ def measure_edge_depth(
     prior_sigma_log: FloatArray,
     targets: list[StereoView],
     camera: Camera,
-    hypotheses: int = 32,
+    hypotheses: int = 24,
 ) -> EdgeDepth:
     """Inverse depth of edge pixels ``(E, 2)`` of the host by multi-view search.
 

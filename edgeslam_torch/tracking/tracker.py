@@ -11,9 +11,15 @@ from edgeslam_torch.frontend.matching import words
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.mapping.keyframe import Keyframe
 from edgeslam_torch.mapping.slam_map import SlamMap
-from edgeslam_torch.optim.pose_only import refine_pose
+from edgeslam_torch.optim.pose_only import PoseConfig, refine_pose
 from edgeslam_torch.tracking.projection import match_projection, project_anchors
 from edgeslam_torch.types import FloatArray, FrameFeatures, IntArray
+
+
+ROUGH = PoseConfig(rounds=2, robust_rounds=1, iterations=5, cost_tolerance=1e-2)
+"""The first pass only has to bring the local map's anchors into their search radius."""
+
+FINE = PoseConfig(rounds=3, robust_rounds=1, cost_tolerance=1e-3)
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,9 +80,9 @@ class Tracker:
 
     def track(self, view: View, T_c_w: FloatArray, recent: IntArray) -> Track | None:
         """Pose near a predicted one: anchors of the last frame first, then the local map; None if too few agree."""
-        first = self.refine(view, T_c_w, recent, self.config.motion_radius_px)
+        first = self.refine(view, T_c_w, recent, self.config.motion_radius_px, ROUGH)
         if first is None or first.inliers < self.config.min_inliers:
-            first = self.refine(view, T_c_w, recent, 2.5 * self.config.motion_radius_px)
+            first = self.refine(view, T_c_w, recent, 2.5 * self.config.motion_radius_px, ROUGH)
         if first is None or first.inliers < 10:
             return None
         local = self.map.anchors_seen_by(self.local_keyframes(first.anchor))
@@ -92,7 +98,13 @@ class Tracker:
         return [self.map.keyframes[id] for id in ranked[: self.config.local_keyframes]]
 
     def refine(
-        self, view: View, T_c_w: FloatArray, anchor_ids: IntArray, radius_px: float, count_visible: bool = False
+        self,
+        view: View,
+        T_c_w: FloatArray,
+        anchor_ids: IntArray,
+        radius_px: float,
+        effort: PoseConfig = FINE,
+        count_visible: bool = False,
     ) -> Track | None:
         """Match the given anchors around their predicted pixels and refine the pose on what matches."""
         anchors = self.map.anchors
@@ -109,13 +121,15 @@ class Tracker:
             self.config.max_hamming,
             self.config.ratio,
         )
-        track = self.solve(view, T_c_w, matches.train, seen.anchor[matches.query])
+        track = self.solve(view, T_c_w, matches.train, seen.anchor[matches.query], effort)
         if count_visible and track is not None:
             anchors.visible[seen.anchor] += 1
             anchors.found[track.anchor] += 1
         return track
 
-    def solve(self, view: View, T_c_w: FloatArray, keypoint: IntArray, anchor: IntArray) -> Track | None:
+    def solve(
+        self, view: View, T_c_w: FloatArray, keypoint: IntArray, anchor: IntArray, effort: PoseConfig = FINE
+    ) -> Track | None:
         """Robust pose from given matches; None when there are too few to constrain it."""
         if len(keypoint) < 6:
             return None
@@ -125,6 +139,7 @@ class Tracker:
             view.features.uv[keypoint].astype(np.float64),
             view.inv_sigma[keypoint],
             (self.camera.fx, self.camera.fy, self.camera.cx, self.camera.cy),
+            config=effort,
         )
         return Track(
             T_c_w=result.T_c_w,
