@@ -1,0 +1,97 @@
+"""Anchors from the unmatched keypoints of two keyframes."""
+
+import numpy as np
+import pytest
+from point_map import CAMERA, SCALE_FACTOR, PointMap
+
+from edgeslam_torch.frontend.matching import EMPTY, Matches
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.mapping.new_anchors import epipolar_matches, triangulate_matches
+
+
+@pytest.fixture
+def points(rng):
+    return PointMap(rng, 300, 3)
+
+
+def depth_of(points, view):
+    return se3.transform(points.world.T_c_w[view], points.world.p_w)[points.point_of[view], 2]
+
+
+def matched(points, prior_depth, sigma_log=0.35):
+    a, b = points.keyframes[0], points.keyframes[1]
+    sigma = np.full(len(prior_depth), sigma_log)
+    return epipolar_matches(a, b, CAMERA, prior_depth, sigma, SCALE_FACTOR, 64, 0.85)
+
+
+def triangulated(points, matches, min_parallax_deg=1.0):
+    a, b = points.keyframes[0], points.keyframes[1]
+    return triangulate_matches(a, b, matches, CAMERA, SCALE_FACTOR, np.deg2rad(min_parallax_deg))
+
+
+def test_matches_are_right_and_nearly_complete(points, rng):
+    prior = depth_of(points, 0) * np.exp(rng.normal(0, 0.2, len(points.point_of[0])))
+    matches = matched(points, prior)
+    np.testing.assert_array_equal(points.point_of[0][matches.query], points.point_of[1][matches.train])
+    common = len(np.intersect1d(points.point_of[0], points.point_of[1]))
+    # Segments longer than the search reaches (0.6 m baseline, points at 1 m) cost some.
+    assert len(matches) > 0.7 * common
+
+
+def test_prior_that_is_far_off_finds_nothing_wrong(points):
+    matches = matched(points, 20.0 * depth_of(points, 0), 0.1)
+    assert len(matches) < 0.05 * len(points.point_of[0])
+
+
+def test_keypoints_that_have_an_anchor_are_left_alone(points):
+    points.fill()
+    assert len(matched(points, depth_of(points, 0))) == 0
+
+
+def test_unknown_prior_matches_nothing(points):
+    assert len(matched(points, np.full(len(points.point_of[0]), np.nan))) == 0
+
+
+def test_triangulated_points_are_exact(points):
+    matches = matched(points, depth_of(points, 0))
+    p_w, sigma, used = triangulated(points, matches)
+    truth = points.world.p_w[points.point_of[0][matches.query[used]]]
+    np.testing.assert_allclose(p_w, truth, atol=2e-3)  # float32 pixels: 3e-5 px over little parallax
+    assert len(used) > 0.6 * len(matches)
+    assert (sigma > 0).all()
+    assert np.isfinite(sigma).all()
+
+
+def test_sigma_along_the_ray_is_what_noise_does(rng):
+    points = PointMap(rng, 2000, 3, noise_px=1.0)
+    matches = matched(points, depth_of(points, 0))
+    p_w, sigma, used = triangulated(points, matches)
+    truth = points.world.p_w[points.point_of[0][matches.query[used]]]
+    ratio = np.linalg.norm(p_w - truth, axis=1) / sigma
+    # One pixel of noise in both images along and across; checks on reprojection cut the tails.
+    assert 0.4 < np.median(ratio) < 1.6
+
+
+def test_wrong_pairs_do_not_triangulate(points, rng):
+    common = np.intersect1d(points.point_of[0], points.point_of[1])
+    where = [{p: i for i, p in enumerate(points.point_of[v])} for v in (0, 1)]
+    query = np.array([where[0][p] for p in common])
+    train = np.roll([where[1][p] for p in common], 7)
+    _, _, used = triangulated(points, Matches(query, train, np.zeros(len(query), int)))
+    assert len(used) < 0.05 * len(query)
+
+
+def test_too_little_parallax_is_refused(points):
+    matches = matched(points, depth_of(points, 0))
+    assert len(triangulated(points, matches, 60.0)[2]) == 0
+
+
+def test_nothing_in_nothing_out(points):
+    p_w, sigma, used = triangulated(points, EMPTY)
+    assert (p_w.shape, sigma.shape, used.shape) == ((0, 3), (0,), (0,))
+
+
+def test_level_that_contradicts_the_distance_is_refused(points):
+    matches = matched(points, depth_of(points, 0))
+    points.keyframes[1].features.octave[:] = 6
+    assert len(triangulated(points, matches)[2]) == 0

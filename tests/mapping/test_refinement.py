@@ -1,0 +1,85 @@
+"""Window choice and refinement as the map sees them."""
+
+import numpy as np
+import pytest
+from point_map import CAMERA, PointMap, check_map, small_motion
+
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.mapping.refinement import Window, choose_window, refine, refine_all
+from edgeslam_torch.optim.problem import LmConfig
+
+
+@pytest.fixture
+def points(rng):
+    made = PointMap(rng, 300, 6)
+    made.fill()
+    return made
+
+
+def pose_errors(points, keyframes):
+    xi = [se3.log(k.T_c_w @ se3.inverse(points.world.T_c_w[k.id])) for k in keyframes]
+    return np.linalg.norm(xi, axis=1)
+
+
+@pytest.mark.parametrize(("free", "fixed"), [(3, 2), (4, 15), (10, 15)])
+def test_two_keyframes_at_least_hold_the_gauge(points, free, fixed):
+    newest = points.keyframes[-1]
+    window = choose_window(points.map, newest, free, fixed)
+    assert newest in window.free
+    assert 2 <= len(window.fixed) <= max(fixed, 2)
+    assert len(window.free) <= free
+    assert not {k.id for k in window.free} & {k.id for k in window.fixed}
+    np.testing.assert_array_equal(window.anchor, points.map.anchors_seen_by(window.free))
+
+
+def test_disturbed_window_comes_back_exactly(points, rng):
+    window = choose_window(points.map, points.keyframes[-1], 4, 15)
+    for keyframe in window.free:
+        keyframe.T_c_w = small_motion(rng, 0.02, 0.01) @ keyframe.T_c_w
+    points.map.anchors.p_w[window.anchor] += rng.normal(0.0, 0.02, (len(window.anchor), 3))
+    refine(points.map, window, CAMERA, LmConfig())
+    assert pose_errors(points, window.free).max() < 1e-4
+    assert pose_errors(points, window.fixed).max() < 1e-12
+    check_map(points.map)
+
+
+def test_wrong_observations_are_taken_out_of_the_map(points, rng):
+    keyframe = points.keyframes[-1]
+    wrong = rng.permutation(keyframe.keypoints_with_anchor())[:20]
+    keyframe.features.uv[wrong] += 30.0
+    window = choose_window(points.map, keyframe, 4, 15)
+    inside = np.isin(keyframe.anchor[wrong], window.anchor)
+    refine(points.map, window, CAMERA, LmConfig())
+    assert (keyframe.anchor[wrong[inside]] < 0).all()
+    right = np.setdiff1d(np.arange(len(keyframe.anchor)), wrong)
+    assert np.mean(keyframe.anchor[right] >= 0) > 0.9
+    # The robust kernel leaves a little of what twenty wrong ones of eighty pull.
+    assert pose_errors(points, window.free).max() < 0.01
+    check_map(points.map)
+
+
+def test_nothing_to_refine(points):
+    lonely = points.keyframes[-1]
+    points.map.forget_observations(lonely, lonely.keypoints_with_anchor())
+    assert refine(points.map, Window([lonely], [], np.zeros(0, np.int64)), CAMERA, LmConfig()) is None
+
+
+def test_whole_map_comes_back_up_to_its_gauge(points, rng):
+    """The first pose and the distance to the farthest keyframe are held, the rest is free."""
+    first, far = points.keyframes[0], points.keyframes[-1]
+    for keyframe in points.keyframes[1:-1]:
+        keyframe.T_c_w = small_motion(rng, 0.02, 0.01) @ keyframe.T_c_w
+    ids = np.flatnonzero(points.map.anchors.alive)
+    points.map.anchors.p_w[ids] += rng.normal(0.0, 0.02, (len(ids), 3))
+    refine_all(points.map, CAMERA, LmConfig())
+    np.testing.assert_array_equal(first.T_c_w, points.world.T_c_w[0])
+    assert pose_errors(points, points.keyframes).max() < 1e-3
+    truth = np.linalg.norm(se3.inverse(points.world.T_c_w[-1])[:3, 3] - first.centre_w)
+    assert np.linalg.norm(far.centre_w - first.centre_w) == pytest.approx(truth, rel=1e-3)
+    check_map(points.map)
+
+
+def test_map_of_two_keyframes_is_left_alone(rng):
+    points = PointMap(rng, 100, 2)
+    points.fill()
+    assert refine_all(points.map, CAMERA, LmConfig()) is None
