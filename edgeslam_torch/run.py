@@ -107,7 +107,7 @@ def run(
     config: SlamConfig | None = None,
     mode: Mode = Mode.OFFLINE,
     listeners: Sequence[Listener] = (),
-    make_slam: Callable[[Camera, SlamConfig, bool], Slam] | None = None,
+    make_slam: Callable[[Camera, SlamConfig], Slam] | None = None,
 ) -> RunResult:
     """Run the SLAM system over a source and write its folder.
 
@@ -120,7 +120,7 @@ def run(
         config: Settings; the defaults when None.
         mode: How frames are fed.
         listeners: Called after every frame.
-        make_slam: Builds the system from camera, config and whether it runs in real time.
+        make_slam: Builds the system; `EdgeSlam` when None.
 
     Raises:
         OutputError: If the folder cannot be written to at all.
@@ -129,7 +129,7 @@ def run(
     config = config or SlamConfig()
     with closing(source):
         # The system first: when its weights are missing, an older run in the folder must not be gone.
-        slam = (make_slam or _edge_slam)(source.camera, config, mode is Mode.REALTIME)
+        slam = (make_slam or _edge_slam)(source.camera, config)
         with closing(RunWriter(out_dir, keep=[Path(source.location)])) as writer:
             writer.write_config(to_toml(config))
             return _Run(source, writer, slam, config, mode, listeners).go()
@@ -319,8 +319,7 @@ class _Interrupt:
             raise KeyboardInterrupt
 
 
-def _edge_slam(camera: Camera, config: SlamConfig, realtime: bool) -> Slam:
+def _edge_slam(camera: Camera, config: SlamConfig) -> Slam:
     from edgeslam_torch.slam import EdgeSlam  # torch loads here, not on `import edgeslam_torch.run`
 
-    slam: Slam = EdgeSlam(camera, config, realtime=realtime) if realtime else EdgeSlam(camera, config)
-    return slam
+    return EdgeSlam(camera, config)

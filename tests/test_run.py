@@ -33,7 +33,7 @@ FILES = {
 
 
 def fake(slam):
-    return lambda camera, config, realtime: slam
+    return lambda camera, config: slam
 
 
 def test_folder_holds_everything(tmp_path, write_tum):

@@ -9,7 +9,7 @@ from edgeslam_torch.types import FrameStatus, PointCloud, ScaleEstimate, SlamOut
 class FakeSlam:
     """Moves 1 cm along x with every frame; black images have no pose; refined poses lie 1 m higher."""
 
-    def __init__(self, camera=None, config=None, realtime=False, on_step=None):
+    def __init__(self, camera=None, config=None, on_step=None):
         self.outputs = []
         self.telemetry = []
         self.finished = False
