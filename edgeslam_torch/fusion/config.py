@@ -45,8 +45,8 @@ class FusionConfig:
     """Frame of ``TelemetrySample.velocity_m_s``: three real flights say the power-on world, paper eq. (9) says body."""
 
     velocity_rounding: Literal["auto", "nearest", "truncate"] = "auto"
-    """How the drone makes whole steps of its velocity. A Tello reads 0 twice as often as any other step when it flies
-    through 0, so it truncates, and reads half a step low; ``auto`` takes what fits the visual motion better."""
+    """How the drone makes whole steps of its velocity. A Tello reads 0 twice as often as any other step when its
+    velocity sweeps through 0, so it truncates, and reads half a step low; ``auto`` tells from the flight itself."""
     velocity_step_m_s: float = 0.1
 
     beta: float = 1.0

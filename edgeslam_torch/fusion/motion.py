@@ -332,35 +332,31 @@ class MotionFusion:
             self._telemetry_opinions = opinions
 
     def _fit_roundings(self, R_w_m: FloatArray) -> tuple[DisplacementFit, LogScale] | None:
-        """Displacement fit for readings rounded to the nearest step or truncated, whichever leaves less unexplained.
+        """Displacement fit for readings rounded to the nearest step or truncated.
 
         The opinion is the mean of both, weighted by how probable each is; its sigma spans them while that is open.
         """
         config = self.config
         half = 0.5 * config.velocity_step_m_s
-        systematic = {0.0: config.systematic_log, half: config.truncation_systematic_log}
-        if config.velocity_rounding != "auto":
-            fit = self._fit_at(self._delay_s, R_w_m, self._shortfall_m_s)
+        share = {"nearest": 0.0, "truncate": 1.0}.get(config.velocity_rounding)
+        if share is None:
+            share = self._track.truncation_probability(config.velocity_step_m_s)
+        self._shortfall_m_s = half if share > 0.5 else 0.0
+        fits = []  # (probability, fit, its sigma)
+        for probability, q, systematic in (
+            (1.0 - share, 0.0, config.systematic_log),
+            (share, half, config.truncation_systematic_log),
+        ):
+            if probability < 1e-4:
+                continue
+            fit = self._fit_at(self._delay_s, R_w_m, q)
             if fit is None:
                 return None
-            sigma = math.hypot(fit.sigma, systematic[self._shortfall_m_s])
-            return fit, LogScale(fit.log_scale, sigma, "telemetry")
-        nearest, truncated = (self._fit_at(self._delay_s, R_w_m, q) for q in (0.0, half))
-        if nearest is None or truncated is None:
-            return None
-
-        def unexplained(fit: DisplacementFit) -> float:  # in map units: the shortfall also changes the scale
-            return math.log(fit.rms_m) - fit.log_scale
-
-        # Neighbouring residuals are not independent: half the likelihood is what they are worth.
-        gain = 1.5 * nearest.intervals * (unexplained(nearest) - unexplained(truncated))
-        share = 1.0 / (1.0 + math.exp(-max(-50.0, min(50.0, gain))))  # probability that readings are truncated
-        self._shortfall_m_s = half if share > 0.5 else 0.0
-        log_scale = (1.0 - share) * nearest.log_scale + share * truncated.log_scale
-        between = share * (1.0 - share) * (nearest.log_scale - truncated.log_scale) ** 2
-        own = [math.hypot(f.sigma, systematic[q]) ** 2 for f, q in ((nearest, 0.0), (truncated, half))]
-        sigma = math.sqrt((1.0 - share) * own[0] + share * own[1] + between)
-        return (truncated if share > 0.5 else nearest), LogScale(log_scale, sigma, "telemetry")
+            fits.append((probability, fit, math.hypot(fit.sigma, systematic)))
+        mean = sum(p * fit.log_scale for p, fit, _ in fits)
+        variance = sum(p * (sigma**2 + (fit.log_scale - mean) ** 2) for p, fit, sigma in fits)
+        likelier = max(fits, key=lambda f: f[0])[1]
+        return likelier, LogScale(mean, math.sqrt(variance), "telemetry")
 
     def _attitude_alignment(self, delay_s: float) -> FloatArray | None:
         """Mean of ``R_w_b(telemetry) R_b_c R_m_c^T`` over the remembered poses."""

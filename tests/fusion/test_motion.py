@@ -227,6 +227,16 @@ def test_a_new_map_forgets_the_old_scale_but_keeps_the_delay(rng, swinging, repl
 
 
 @pytest.mark.data
+def test_a_real_tello_truncates_its_velocities(data_dir):
+    from edgeslam_torch.fusion.track import TelemetryTrack
+    from edgeslam_torch.io.telemetry_csv import read_telemetry
+
+    track = TelemetryTrack("world", 0.35)
+    track.add(read_telemetry(data_dir / "tello_telemetry" / "flight_b.csv"))
+    assert track.truncation_probability(0.1) > 0.99
+
+
+@pytest.mark.data
 @pytest.mark.parametrize(("sequence", "limit"), [("tum_fr1_xyz", 0.03), ("7scenes_redkitchen", 0.045)])
 def test_scale_of_recorded_motion(data_dir, recorded, replay, rng, sequence, limit):
     """Real hand-held motion, simulated telemetry and vision (3 mm, 2 mrad); images come in the benchmark."""
