@@ -114,7 +114,9 @@ class MappingConfig:
     """Keyframes outside the window that hold its gauge."""
 
     def __post_init__(self) -> None:
-        _positive(self, "keyframe_min_gap", "keyframe_max_gap", "keyframe_parallax_deg", "neighbours", "min_parallax_deg")
+        _positive(
+            self, "keyframe_min_gap", "keyframe_max_gap", "keyframe_parallax_deg", "neighbours", "min_parallax_deg"
+        )
         if self.window < 2:
             raise ValueError(f"window must be at least 2, got {self.window}")
         if self.max_keyframes < self.window + self.window_fixed:
@@ -143,7 +145,7 @@ class EdgeConfig:
     voxel: float = 0.005
     """Side of the map's fusion cell relative to the median scene depth."""
     max_points: int = 400_000
-    """Points kept; beyond it the oldest are fused, then thinned."""
+    """Points kept; beyond it those that one keyframe alone saw go, then half of the oldest."""
 
     def __post_init__(self) -> None:
         _positive(self, "canny_low", "canny_high", "max_pixels", "targets", "max_sigma", "voxel", "max_points")

@@ -6,14 +6,18 @@ refinement and edges.
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import replace
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import cv2
 import numpy as np
+import torch
 
 from edgeslam_torch.config import SlamConfig
 from edgeslam_torch.errors import SourceError
+from edgeslam_torch.frontend.image import as_grey, colours_at
 from edgeslam_torch.frontend.orb import OrbExtractor
 from edgeslam_torch.fusion.motion import MotionFusion
 from edgeslam_torch.fusion.published import Published, first_pose
@@ -64,6 +68,8 @@ class EdgeSlam:
         camera: Intrinsics of the raw images.
         config: Settings.
         depth: Depth function in place of the one that the settings name.
+        realtime: Map keyframes on a worker thread while the next frames are tracked; a keyframe that would have to
+            wait is skipped and counted. Results then depend on timing.
 
     Example:
         >>> slam = EdgeSlam(source.camera)                                   # doctest: +SKIP
@@ -74,9 +80,15 @@ class EdgeSlam:
     """
 
     def __init__(
-        self, camera: Camera, config: SlamConfig | None = None, depth: DepthFunction | None = None
+        self,
+        camera: Camera,
+        config: SlamConfig | None = None,
+        depth: DepthFunction | None = None,
+        realtime: bool = False,
     ) -> None:
+        # One thread each: spinning pools slow each other down more than they help (docs/decisions.md, "Threads").
         cv2.setNumThreads(1)
+        torch.set_num_threads(1)
         self.camera = camera
         self.config = config or SlamConfig()
         self.depth = depth if depth is not None else _depth_from_config(self.config)
@@ -84,6 +96,10 @@ class EdgeSlam:
         self.log = TrajectoryLog(self.map)
         self.events = {"lost": 0, "relocalised": 0, "restarted": 0, "initialisations_refused": 0}
         """Counts of what went wrong and was mended."""
+        self._worker = ThreadPoolExecutor(1, thread_name_prefix="mapping") if realtime else None
+        self._pending: Future[_Mapped] | None = None
+        if realtime:
+            self.events["keyframes_skipped"] = 0
         self._orb = OrbExtractor(self.config.orb, camera)
         self._tracker = Tracker(self.map, camera, self.config.orb, self.config.tracking)
         self._lm = LmConfig(diagnostics=False, max_iterations=6, cost_tolerance=1e-4)
@@ -94,7 +110,7 @@ class EdgeSlam:
         self._published = Published()
         self._bootstrap: Bootstrap | None = None
         self._T_c_w = se3.inverse(first_pose(np.full(3, np.nan), self._T_b_c))
-        self._velocity = np.zeros(6)
+        self._velocity: FloatArray = np.zeros(6)
         """Tangent of the camera's motion per second, left-applied to ``T_c_w``."""
         self._stamp_s = -np.inf
         self._has_telemetry = False
@@ -120,6 +136,8 @@ class EdgeSlam:
             raise SourceError(f"{_name(frame)}: stamp {frame.stamp_s} s does not follow {self._stamp_s} s")
         self._stage_ms = {}
         grey = _grey(frame, self.camera)
+        if self._pending is not None and self._pending.done():
+            self._absorb_pending()
         with self._timed("features"):
             view = make_view(self._orb(grey), self.config.orb.scale_factor)
         with self._timed("fusion"):
@@ -137,17 +155,22 @@ class EdgeSlam:
 
     def _step_mapped(self, frame: Frame, view: View) -> SlamOutput:
         T_predicted = self._predict(frame.stamp_s)
-        with self._timed("tracking"):
-            track = None
-            if self._lost_frames == 0:
-                track = self._tracker.track(view, T_predicted, self._recent)
-            relocalised = track is None
-            if track is None:
-                tries = self.config.tracking.relocalisation_keyframes
-                track = relocalise(self._tracker, view, T_predicted, tries, self._lost_frames)
-        if track is None:
-            return self._lost(frame, view, T_predicted)
-        return self._tracked(frame, view, track, relocalised)
+        with self.map.lock:
+            with self._timed("tracking"):
+                track, relocalised = self._find(view, T_predicted)
+            if track is not None:
+                return self._tracked(frame, view, track, relocalised)
+        return self._lost(frame, view, T_predicted)
+
+    def _find(self, view: View, T_predicted: FloatArray) -> tuple[Track | None, bool]:
+        """Track near the prediction, else search the keyframes; and whether the search found it."""
+        if self._lost_frames == 0:
+            track = self._tracker.track(view, T_predicted, self._recent)
+            if track is not None:
+                return track, False
+        tries = self.config.tracking.relocalisation_keyframes
+        track = relocalise(self._tracker, view, T_predicted, tries, self._lost_frames)
+        return track, track is not None
 
     def _predict(self, stamp_s: float) -> FloatArray:
         """``T_c_w`` expected at a stamp: constant velocity over short gaps, telemetry over long ones."""
@@ -175,14 +198,15 @@ class EdgeSlam:
         parallax_rad = median_parallax(points, track.T_c_w, reference.centre_w)
         with self._timed("fusion"):
             self._see(frame.stamp_s, track)
-        wanted = self._wants_keyframe(track, reference, parallax_rad)
-        if wanted:
-            reference = self._insert_keyframe(frame, view, track)
-        else:
-            self._frames_since_keyframe += 1
+        self._frames_since_keyframe += 1
+        keyframe = None
+        if self._wants_keyframe(track, reference, parallax_rad):
+            keyframe = self._insert_keyframe(frame, view, track)
+        if keyframe is not None and keyframe.id in self.map.keyframes:
+            reference = keyframe
         status = FrameStatus.RELOCALISED if relocalised else FrameStatus.TRACKED
         reason = "found again among the keyframes" if relocalised else ""
-        return self._output(frame, reference, status, reason, track, parallax_rad, wanted)
+        return self._output(frame, reference, status, reason, track, parallax_rad, keyframe is not None)
 
     def _see(self, stamp_s: float, track: Track) -> None:
         """Tell the fusion what the image said."""
@@ -220,19 +244,19 @@ class EdgeSlam:
 
     def _start(self, frame: Frame, view: View, reason: str) -> SlamOutput:
         """Begin a piece of map at the present pose with guessed depths."""
+        self._wait()
         if self._bootstrap is not None:
             self._bootstrap.abandon()
             self._bootstrap = None
-        keyframe = make_keyframe(
-            self.map.next_keyframe_id(), frame.index, frame.stamp_s, self._T_c_w, view.features
-        )
+        keyframe = make_keyframe(self.map.next_keyframe_id(), frame.index, frame.stamp_s, self._T_c_w, view.features)
         if len(view.features.uv) < MIN_KEYPOINTS:
             if not self.map.keyframes:  # something for the poses to hang on
                 self.map.add_keyframe(keyframe)
             reason = f"only {len(view.features.uv)} keypoints, waiting for texture"
             self._lost_frames = LOST_FRAMES_BEFORE_RESTART
             return self._output(frame, self.map.latest(), FrameStatus.LOST, reason, None, 0.0, False)
-        self._look(frame, keyframe)
+        with self._timed("depth"):
+            self._look(frame, keyframe)
         guess = self._guess_depth(keyframe)
         self._bootstrap = Bootstrap(
             self.map,
@@ -240,7 +264,7 @@ class EdgeSlam:
             self.config.initialisation,
             keyframe,
             guess,
-            _colours(keyframe.image, view.features.uv),
+            colours_at(keyframe.image, view.features.uv),
         )
         self._lost_frames = 0
         self._velocity = np.zeros(6)
@@ -292,13 +316,12 @@ class EdgeSlam:
 
     def _initialise(self, frame: Frame, view: View, bootstrap: Bootstrap, two_view: TwoView) -> Keyframe:
         reference = bootstrap.reference
-        keyframe = make_keyframe(
-            self.map.next_keyframe_id(), frame.index, frame.stamp_s, two_view.T_c_w, view.features
-        )
-        self._look(frame, keyframe)
+        keyframe = make_keyframe(self.map.next_keyframe_id(), frame.index, frame.stamp_s, two_view.T_c_w, view.features)
+        with self._timed("depth"):
+            self._look(frame, keyframe)
         with self._timed("mapping"):
             between = bootstrap.replace_map(keyframe, two_view, self._lm)
-            self._mapper.triangulate_new(keyframe, [reference], _colours(keyframe.image, view.features.uv))
+            self._mapper.triangulate_new(keyframe, [reference], colours_at(keyframe.image, view.features.uv))
         self.log.replace(between, reference.id)
         self._bootstrap = None
         previous = between[max(between)] if between else reference.T_c_w
@@ -327,29 +350,56 @@ class EdgeSlam:
         )
         return few or moved or overdue
 
-    def _insert_keyframe(self, frame: Frame, view: View, track: Track) -> Keyframe:
-        keyframe = make_keyframe(
-            self.map.next_keyframe_id(), frame.index, frame.stamp_s, track.T_c_w, view.features
-        )
+    def _insert_keyframe(self, frame: Frame, view: View, track: Track) -> Keyframe | None:
+        """Map a new keyframe now, or on the worker; None when the worker is still busy with the last one."""
+        if self._pending is not None:
+            self.events["keyframes_skipped"] += 1
+            return None
+        keyframe = make_keyframe(self.map.next_keyframe_id(), frame.index, frame.stamp_s, track.T_c_w, view.features)
         keyframe.anchor[track.keypoint] = track.anchor
-        self._look(frame, keyframe)
-        with self._timed("mapping"):
-            self._mapper.insert(keyframe, _colours(keyframe.image, view.features.uv))
-        self._compare_depth(keyframe)
-        with self._timed("edges"):
+        self._frames_since_keyframe = 0
+        if self._worker is not None:
+            self._pending = self._worker.submit(self._map_keyframe, frame, keyframe)
+        else:
+            mapped = self._map_keyframe(frame, keyframe)
+            self._absorb(mapped)
+            self._recent = keyframe.anchor[keyframe.anchor >= 0]
+        return keyframe
+
+    def _map_keyframe(self, frame: Frame, keyframe: Keyframe) -> "_Mapped":
+        """Depth, mapping, refinement and edges of one keyframe; the only thing that runs on the worker."""
+        stage_ms: dict[str, float] = {}
+        T_tracked = keyframe.T_c_w
+        with _timed(stage_ms, "depth"):
+            self._look(frame, keyframe)
+        with _timed(stage_ms, "mapping"):
+            self._mapper.insert(keyframe, colours_at(keyframe.image, keyframe.features.uv))
+        with _timed(stage_ms, "edges"):
             self._edges.announce(keyframe)
             self._edges.update()
-        self._T_c_w = keyframe.T_c_w
-        self._recent = keyframe.anchor[keyframe.anchor >= 0]
-        self._frames_since_keyframe = 0
-        return keyframe
+        return _Mapped(keyframe, T_tracked, stage_ms)
+
+    def _absorb(self, mapped: "_Mapped") -> None:
+        """Carry the present pose along with what refinement did to the keyframe."""
+        correction = se3.inverse(mapped.T_tracked) @ mapped.keyframe.T_c_w
+        self._T_c_w = se3.orthonormalised(self._T_c_w @ correction)
+        self._stage_ms.update(mapped.stage_ms)
+        self._compare_depth(mapped.keyframe)
+
+    def _absorb_pending(self) -> None:
+        if self._pending is not None:
+            pending, self._pending = self._pending, None
+            self._absorb(pending.result())
+
+    def _wait(self) -> None:
+        """Let the worker finish; afterwards the map belongs to the caller alone."""
+        self._absorb_pending()
 
     def _look(self, frame: Frame, keyframe: Keyframe) -> None:
         """Give a keyframe its undistorted image and depth."""
-        with self._timed("depth"):
-            keyframe.image = self.camera.undistort_image(frame.image)
-            keyframe.grey = _as_grey(keyframe.image)
-            keyframe.depth = None if self.depth is None else self.depth(keyframe.image, self.camera)
+        keyframe.image = self.camera.undistort_image(frame.image)
+        keyframe.grey = as_grey(keyframe.image)
+        keyframe.depth = None if self.depth is None else self.depth(keyframe.image, self.camera)
 
     def _compare_depth(self, keyframe: Keyframe) -> None:
         """What the network's metres say about the map's units."""
@@ -365,7 +415,8 @@ class EdgeSlam:
     # -- results -----------------------------------------------------------------------------------------------
 
     def finish(self) -> None:
-        """Measure the last keyframes' edges and fix the published scale, once no frame follows."""
+        """Refine the whole map, measure the last edges and fix the published scale, once no frame follows."""
+        self._wait()
         refine_all(self.map, self.camera, replace(self._lm, max_iterations=30))
         self._edges.update(everything=True)
         estimate = self.scale
@@ -376,6 +427,11 @@ class EdgeSlam:
         """Stamps ``(F,)`` and refined ``T_w_c`` ``(F, 4, 4)`` of every frame stepped so far."""
         stamps, T_w_c = self.log.poses()
         return stamps, self._published.pose(T_w_c)
+
+    def close(self) -> None:
+        """Stop the worker of a real-time run."""
+        if self._worker is not None:
+            self._worker.shutdown(wait=True, cancel_futures=True)
 
     def edge_map(self) -> PointCloud:
         """Semi-dense edge points that several keyframes agree on."""
@@ -428,13 +484,27 @@ class EdgeSlam:
             stage_ms=dict(self._stage_ms),
         )
 
-    @contextmanager
-    def _timed(self, stage: str) -> Iterator[None]:
-        start = time.perf_counter()
-        try:
-            yield
-        finally:
-            self._stage_ms[stage] = self._stage_ms.get(stage, 0.0) + 1e3 * (time.perf_counter() - start)
+    def _timed(self, stage: str) -> AbstractContextManager[None]:
+        return _timed(self._stage_ms, stage)
+
+
+@dataclass(frozen=True, slots=True)
+class _Mapped:
+    """What the worker hands back."""
+
+    keyframe: Keyframe
+    T_tracked: FloatArray
+    """``T_c_w`` before refinement."""
+    stage_ms: dict[str, float]
+
+
+@contextmanager
+def _timed(stage_ms: dict[str, float], stage: str) -> Iterator[None]:
+    start = time.perf_counter()
+    try:
+        yield
+    finally:
+        stage_ms[stage] = stage_ms.get(stage, 0.0) + 1e3 * (time.perf_counter() - start)
 
 
 def _name(frame: Frame) -> str:
@@ -444,24 +514,8 @@ def _name(frame: Frame) -> str:
 def _grey(frame: Frame, camera: Camera) -> np.ndarray:
     height, width = frame.image.shape[:2]
     if (width, height) != (camera.width, camera.height):
-        raise SourceError(
-            f"{_name(frame)}: image is {width}x{height}, the calibration {camera.width}x{camera.height}"
-        )
-    return _as_grey(frame.image)
-
-
-def _as_grey(image: np.ndarray) -> np.ndarray:
-    return image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-
-
-def _colours(image: np.ndarray | None, uv: FloatArray) -> np.ndarray:
-    """RGB at the nearest pixels of ``(N, 2)``, shape ``(N, 3)`` uint8; black without an image."""
-    if image is None:
-        return np.zeros((len(uv), 3), dtype=np.uint8)
-    u = np.clip(np.rint(uv[:, 0]), 0, image.shape[1] - 1).astype(np.int64)
-    v = np.clip(np.rint(uv[:, 1]), 0, image.shape[0] - 1).astype(np.int64)
-    colour = image[v, u]
-    return np.repeat(colour[:, None], 3, axis=1) if image.ndim == 2 else colour[:, ::-1]
+        raise SourceError(f"{_name(frame)}: image is {width}x{height}, the calibration {camera.width}x{camera.height}")
+    return as_grey(frame.image)
 
 
 def _depth_from_config(config: SlamConfig) -> DepthFunction | None:
@@ -469,5 +523,5 @@ def _depth_from_config(config: SlamConfig) -> DepthFunction | None:
         return None
     from edgeslam_torch.frontend.depth import DepthPredictor
 
-    weights = None if config.depth.weights == "default" else config.depth.weights
+    weights = None if config.depth.weights == "default" else Path(config.depth.weights)
     return DepthPredictor(weights=weights, backend=config.depth.backend)

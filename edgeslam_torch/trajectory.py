@@ -29,7 +29,8 @@ class TrajectoryLog:
 
     def append(self, index: int, stamp_s: float, keyframe_id: int, T_c_w: FloatArray) -> None:
         """Record a frame's pose in the map as it is now."""
-        T_c_k = T_c_w @ se3.inverse(self.map.pose_of(keyframe_id))
+        with self.map.lock:
+            T_c_k = T_c_w @ se3.inverse(self.map.pose_of(keyframe_id))
         self.records.append(FrameRecord(index, stamp_s, keyframe_id, T_c_k))
 
     def replace(self, T_c_w_of_frame: dict[int, FloatArray], keyframe_id: int) -> None:

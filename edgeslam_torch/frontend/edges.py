@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 
 from edgeslam_torch.frontend.canny import canny
+from edgeslam_torch.frontend.image import as_grey, colours_at
 from edgeslam_torch.types import Edges, FloatArray
 
 
@@ -17,7 +18,7 @@ def extract_edges(image: np.ndarray, low: float, high: float, most: int, border_
         most: Edge pixels to keep; more are thinned evenly along the edges.
         border_px: Margin without edges, where gradients and warped patches leave the image.
     """
-    grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    grey = as_grey(image)
     mask = canny(grey, low, high)
     mask[:border_px] = mask[-border_px:] = False
     mask[:, :border_px] = mask[:, -border_px:] = False
@@ -31,7 +32,6 @@ def extract_edges(image: np.ndarray, low: float, high: float, most: int, border_
     gx = cv2.Sobel(smooth, cv2.CV_32F, 1, 0)[v, u]
     gy = cv2.Sobel(smooth, cv2.CV_32F, 0, 1)[v, u]
     norm = np.maximum(np.hypot(gx, gy), 1e-6)
-    colour = image[v, u]
-    colour = np.repeat(colour[:, None], 3, axis=1) if image.ndim == 2 else colour[:, ::-1]
     normal: FloatArray = np.stack([gx / norm, gy / norm], axis=1).astype(np.float32)
-    return Edges(np.stack([u, v], axis=1).astype(np.float32), normal, np.ascontiguousarray(colour))
+    uv: FloatArray = np.stack([u, v], axis=1).astype(np.float32)
+    return Edges(uv, normal, colours_at(image, uv))

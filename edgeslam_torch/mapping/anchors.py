@@ -69,9 +69,7 @@ class Anchors:
 
     def _grow(self) -> None:
         old = len(self.alive)
-        for name in (
-            "p_w words normal max_distance colour observations visible found born alive from_depth sigma"
-        ).split():
-            array = getattr(self, name)
-            setattr(self, name, np.concatenate([array, np.zeros_like(array)]))
+        for name, array in list(vars(self).items()):
+            if isinstance(array, np.ndarray):
+                setattr(self, name, np.concatenate([array, np.zeros_like(array)]))
         self._free.extend(range(old, 2 * old))

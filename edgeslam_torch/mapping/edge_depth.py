@@ -97,8 +97,8 @@ def measure_edge_depth(
     k = np.clip(np.argmin(fine, axis=1), 1, fine.shape[1] - 2)
     r = np.arange(len(ok))
     a, b, c = fine[r, k - 1], fine[r, k], fine[r, k + 1]
-    curvature = a - 2.0 * b + c
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore"):  # infinite cost where no target sees the edge
+        curvature = a - 2.0 * b + c
         offset = np.clip(0.5 * (a - c) / curvature, -1.0, 1.0)
     rho = fine_grid[r, k] + offset * fine_step
     sharp = (curvature > 1e-3) & np.isfinite(offset) & (b < MAX_COST)
@@ -122,7 +122,11 @@ def _bilinear(grey: NDArray[np.uint8], x: FloatArray, y: FloatArray) -> FloatArr
     for flat, values in zip(maps, (x, y), strict=True):
         flat[: x.size] = values.ravel()
     out = cv2.remap(
-        grey, maps[0].reshape(rows, _ROW), maps[1].reshape(rows, _ROW), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        grey,
+        maps[0].reshape(rows, _ROW),
+        maps[1].reshape(rows, _ROW),
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REPLICATE,
     )
     return out.ravel()[: x.size].reshape(x.shape).astype(np.float32)
 

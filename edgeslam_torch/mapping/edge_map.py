@@ -20,6 +20,8 @@ AGREE_PX = 2.0
 """An edge of another keyframe this near to a projected point may be the same edge."""
 AGREE_DEPTH = 0.04
 """Relative depth difference of the same edge measured from two keyframes."""
+RECENT_HOSTS = 40
+"""Latest keyframes whose edges a new one's are compared with."""
 
 
 @dataclass(slots=True)
@@ -36,6 +38,12 @@ class EdgePoints:
     colour: NDArray[np.uint8]
     observations: IntArray
     """``(E,)`` keyframes that measured the same point, this one included."""
+
+    def keep(self, mask: NDArray[np.bool_]) -> int:
+        """Forget the points outside a mask ``(E,)``; returns how many."""
+        for name in ("uv", "p_c", "sigma", "colour", "observations"):
+            setattr(self, name, getattr(self, name)[mask])
+        return int((~mask).sum())
 
 
 class EdgeMap:
@@ -62,7 +70,7 @@ class EdgeMap:
                 self._measure(keyframe)
 
     def _measure(self, keyframe: Keyframe) -> None:
-        if keyframe.image is None:
+        if keyframe.image is None or keyframe.grey is None:
             return
         targets = self._targets(keyframe)
         if not targets:
@@ -78,7 +86,7 @@ class EdgeMap:
             normal,
             prior[known],
             sigma[known],
-            [StereoView(t.grey, t.T_c_w) for t in targets],
+            [StereoView(t.grey, t.T_c_w) for t in targets if t.grey is not None],
             self.camera,
         )
         depth = 1.0 / measured.inverse_depth
@@ -95,6 +103,22 @@ class EdgeMap:
         for other in self._overlapping(keyframe):
             self._count_agreement(points, other)
         self.hosts.append(points)
+        self._bound()
+
+    def _bound(self) -> None:
+        """Keep to ``max_points``: first go the points that nobody will agree with any more, then half of the oldest."""
+        total = sum(len(h.uv) for h in self.hosts)
+        if total <= self.config.max_points:
+            return
+        for host in self.hosts[:-RECENT_HOSTS]:
+            total -= host.keep(host.observations >= self.config.min_observations)
+        while total > self.config.max_points:
+            for host in self.hosts:
+                total -= host.keep(
+                    np.arange(len(host.uv)) % 2 == 0 if len(host.uv) > 1 else np.zeros(len(host.uv), bool)
+                )
+                if total <= self.config.max_points:
+                    return
 
     def _targets(self, keyframe: Keyframe) -> list[Keyframe]:
         """Covisible keyframes whose baseline is long enough to measure and short enough to look alike."""
@@ -113,7 +137,7 @@ class EdgeMap:
 
     def _overlapping(self, keyframe: Keyframe) -> list[EdgePoints]:
         near = {k.id for k in self.map.covisible(keyframe, 3 * self.config.targets)}
-        return [h for h in self.hosts[-40:] if h.keyframe_id in near][-8:]
+        return [h for h in self.hosts[-RECENT_HOSTS:] if h.keyframe_id in near][-8:]
 
     def _count_agreement(self, points: EdgePoints, other: EdgePoints) -> None:
         """Raise the count of points that two keyframes measured alike: the cycle of paper eqs. (17)-(22), as a test."""
@@ -122,9 +146,7 @@ class EdgeMap:
         T = self.map.pose_of(other.keyframe_id) @ se3.inverse(self.map.pose_of(points.keyframe_id))
         p_o = se3.transform(T, points.p_c)
         front = np.flatnonzero(p_o[:, 2] > 0)
-        distance, nearest = cKDTree(other.uv).query(
-            self.camera.project(p_o[front]), distance_upper_bound=AGREE_PX
-        )
+        distance, nearest = cKDTree(other.uv).query(self.camera.project(p_o[front]), distance_upper_bound=AGREE_PX)
         found = np.isfinite(distance)
         mine, theirs = front[found], nearest[found]
         z_theirs = other.p_c[theirs, 2]
@@ -134,9 +156,7 @@ class EdgeMap:
 
     def points(self) -> PointCloud:
         """Edge points that several keyframes agree on, fused in cells, in the map's world frame."""
-        clouds = [
-            (se3.transform(se3.inverse(self.map.pose_of(h.keyframe_id)), h.p_c), h) for h in self.hosts
-        ]
+        clouds = [(se3.transform(se3.inverse(self.map.pose_of(h.keyframe_id)), h.p_c), h) for h in self.hosts]
         if not clouds:
             empty = np.zeros((0, 3), np.float32)
             return PointCloud(empty, np.zeros((0, 3), np.uint8), np.zeros(0, np.float32), np.zeros(0, np.int32))
@@ -149,9 +169,7 @@ class EdgeMap:
         return fuse(p_w[agreed], sigma[agreed], colour[agreed], count[agreed], self.config.voxel * float(depth))
 
 
-def fuse(
-    p_w: FloatArray, sigma: FloatArray, colour: NDArray[np.uint8], count: IntArray, voxel: float
-) -> PointCloud:
+def fuse(p_w: FloatArray, sigma: FloatArray, colour: NDArray[np.uint8], count: IntArray, voxel: float) -> PointCloud:
     """One point per occupied cell: the inverse-variance mean of what lies in it."""
     if len(p_w) == 0:
         return PointCloud(p_w.astype(np.float32), colour, sigma.astype(np.float32), count.astype(np.int32))

@@ -50,9 +50,7 @@ class Keyframe:
         return np.flatnonzero(self.anchor >= 0)
 
 
-def make_keyframe(
-    id: int, frame_index: int, stamp_s: float, T_c_w: FloatArray, features: FrameFeatures
-) -> Keyframe:
+def make_keyframe(id: int, frame_index: int, stamp_s: float, T_c_w: FloatArray, features: FrameFeatures) -> Keyframe:
     """Keyframe without anchors."""
     return Keyframe(
         id=id,

@@ -5,7 +5,7 @@ import numpy as np
 from edgeslam_torch.config import SlamConfig
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.mapping.depth_prior import depth_prior
-from edgeslam_torch.mapping.keyframe import Keyframe
+from edgeslam_torch.mapping.keyframe import NO_ANCHOR, Keyframe
 from edgeslam_torch.mapping.new_anchors import epipolar_matches, triangulate_matches
 from edgeslam_torch.mapping.refinement import choose_window, refine
 from edgeslam_torch.mapping.slam_map import SlamMap
@@ -37,17 +37,22 @@ class Mapper:
         Returns:
             What the window refinement reports, or None when there was nothing to refine.
         """
-        self.map.anchors.begin_pass()
-        self.map.add_keyframe(keyframe)
-        self.map.refresh_anchors(keyframe.anchor[keyframe.anchor >= 0])
-        self.cull_recent_anchors(keyframe)
-        neighbours = self.map.covisible(keyframe, self.config.neighbours)
-        self.triangulate_new(keyframe, neighbours, colour)
-        self.fuse(keyframe, self.map.covisible(keyframe, 2 * self.config.neighbours))
+        with self.map.lock:
+            self.map.anchors.begin_pass()
+            # Tracking matched the keyframe a while ago when mapping runs beside it.
+            stale = (keyframe.anchor >= 0) & ~self.map.anchors.alive[keyframe.anchor]
+            keyframe.anchor[stale] = NO_ANCHOR
+            self.map.add_keyframe(keyframe)
+            self.map.refresh_anchors(keyframe.anchor[keyframe.anchor >= 0])
+            self.cull_recent_anchors(keyframe)
+            neighbours = self.map.covisible(keyframe, self.config.neighbours)
+            self.triangulate_new(keyframe, neighbours, colour)
+            self.fuse(keyframe, self.map.covisible(keyframe, 2 * self.config.neighbours))
         window = choose_window(self.map, keyframe, self.config.window, self.config.window_fixed)
         result = refine(self.map, window, self.camera, self.lm)
-        self.map.refresh_anchors(window.anchor[self.map.anchors.alive[window.anchor]])
-        self.cull_keyframes(keyframe)
+        with self.map.lock:
+            self.map.refresh_anchors(window.anchor[self.map.anchors.alive[window.anchor]])
+            self.cull_keyframes(keyframe)
         return result
 
     def cull_recent_anchors(self, keyframe: Keyframe) -> None:
@@ -62,9 +67,7 @@ class Mapper:
 
     def triangulate_new(self, keyframe: Keyframe, neighbours: list[Keyframe], colour: np.ndarray) -> None:
         """New anchors from keypoints that neither side has an anchor for yet."""
-        prior, sigma = depth_prior(
-            keyframe, keyframe.features.uv, self.map.anchors.p_w, self.depth.prior_sigma_log
-        )
+        prior, sigma = depth_prior(keyframe, keyframe.features.uv, self.map.anchors.p_w, self.depth.prior_sigma_log)
         for other in neighbours:
             baseline = float(np.linalg.norm(other.centre_w - keyframe.centre_w))
             if baseline < 0.01 * float(np.nanmedian(prior)):
@@ -104,9 +107,7 @@ class Mapper:
         for other in neighbours:
             ids = self.map.anchors_seen_by([keyframe])
             ids = ids[~np.isin(ids, other.anchor)]
-            seen = project_anchors(
-                anchors, ids, other.T_c_w, self.camera, self.orb.scale_factor, self.orb.levels
-            )
+            seen = project_anchors(anchors, ids, other.T_c_w, self.camera, self.orb.scale_factor, self.orb.levels)
             matches = match_projection(
                 seen,
                 anchors.words[seen.anchor],

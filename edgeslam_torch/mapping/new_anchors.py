@@ -61,9 +61,7 @@ def epipolar_matches(
     sigma = scale_factor ** other.features.octave[train].astype(np.float64)
     ok = (across**2 <= CHI2_1 * sigma**2) | (length[query] < 1.0)
     query, train = query[ok], train[ok]
-    matches = best_pairs(
-        query, train, hamming(keyframe.words[free[query]], other.words[train]), max_hamming, ratio
-    )
+    matches = best_pairs(query, train, hamming(keyframe.words[free[query]], other.words[train]), max_hamming, ratio)
     return Matches(free[matches.query], matches.train, matches.distance)
 
 

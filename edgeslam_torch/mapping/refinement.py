@@ -92,13 +92,14 @@ def refine(
     result = refine_window(problem, config)
     if not np.isfinite(result.T_c_w).all() or not np.isfinite(result.p_w).all():
         return result
-    for keyframe, T_c_w in zip(keyframes, result.T_c_w, strict=True):
-        keyframe.T_c_w = T_c_w
-    slam_map.anchors.p_w[window.anchor] = result.p_w
-    bad = (result.chi2 > CHI2_2) | ~result.in_front
-    start = 0
-    for keyframe, seen in zip(keyframes, keypoint, strict=True):
-        wrong = seen[bad[start : start + len(seen)]]
-        start += len(seen)
-        slam_map.forget_observations(keyframe, wrong)
+    with slam_map.lock:
+        for keyframe, T_c_w in zip(keyframes, result.T_c_w, strict=True):
+            keyframe.T_c_w = T_c_w
+        slam_map.anchors.p_w[window.anchor] = result.p_w
+        bad = (result.chi2 > CHI2_2) | ~result.in_front
+        start = 0
+        for keyframe, seen in zip(keyframes, keypoint, strict=True):
+            wrong = seen[bad[start : start + len(seen)]]
+            start += len(seen)
+            slam_map.forget_observations(keyframe, wrong)
     return result

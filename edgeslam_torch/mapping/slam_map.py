@@ -1,5 +1,7 @@
 """Keyframes and anchors with the observations that join them."""
 
+import threading
+
 import numpy as np
 
 from edgeslam_torch.geometry import se3
@@ -21,6 +23,8 @@ class SlamMap:
         self.keyframes: dict[int, Keyframe] = {}
         self.links: dict[int, tuple[int, FloatArray]] = {}
         """Removed keyframe id -> (surviving id, ``T_removed_surviving``)."""
+        self.lock = threading.RLock()
+        """Held to change the map, and to read it from another thread than the one that changes it."""
         self._next_id = 0
 
     def next_keyframe_id(self) -> int:
@@ -119,9 +123,10 @@ class SlamMap:
     def remove_keyframe(self, keyframe: Keyframe) -> None:
         """Drop a keyframe; its frames stay tied to the nearest surviving one in time."""
         self.forget_observations(keyframe, keyframe.keypoints_with_anchor())
-        del self.keyframes[keyframe.id]
-        heir = min(self.keyframes, key=lambda id: (abs(id - keyframe.id), id))
+        others = (id for id in self.keyframes if id != keyframe.id)
+        heir = min(others, key=lambda id: (abs(id - keyframe.id), id))
         self.links[keyframe.id] = (heir, keyframe.T_c_w @ se3.inverse(self.keyframes[heir].T_c_w))
+        del self.keyframes[keyframe.id]
 
     def refresh_anchors(self, ids: IntArray) -> None:
         """Recompute viewing direction, reference distance and descriptor from the observing keyframes.

@@ -34,9 +34,7 @@ class Bootstrap:
         self.reference = reference
         self.guess_depth = guess_depth
         self.views: list[BootstrapView] = []
-        points = se3.transform(
-            reference.T_w_c, tracker.camera.back_project(reference.features.uv, guess_depth)
-        )
+        points = se3.transform(reference.T_w_c, tracker.camera.back_project(reference.features.uv, guess_depth))
         slam_map.anchors.begin_pass()
         ids = slam_map.anchors.add(points, reference.words, reference.id, True, colour)
         reference.anchor[:] = ids

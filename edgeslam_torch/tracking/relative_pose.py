@@ -40,7 +40,8 @@ def relative_pose(
     if inliers.sum() < MIN_MATCHES:
         return RelativePose(MotionKind.FEW_MATCHES, np.eye(4), inliers, 0.0)
     # Cheirality (points in front of both cameras) picks one of the four decompositions.
-    _, R, t, _ = cv2.recoverPose(E, a[inliers], b[inliers], camera.K)
+    _, rotation, t, _ = cv2.recoverPose(E, a[inliers], b[inliers], camera.K)
+    R: FloatArray = np.asarray(rotation, dtype=np.float64)
     T_j_i = np.eye(4)
     T_j_i[:3, :3], T_j_i[:3, 3] = R, t[:, 0]
     ray_i, ray_j = bearings(a[inliers], camera.K), bearings(b[inliers], camera.K)

@@ -15,7 +15,6 @@ from edgeslam_torch.optim.pose_only import PoseConfig, refine_pose
 from edgeslam_torch.tracking.projection import match_projection, project_anchors
 from edgeslam_torch.types import FloatArray, FrameFeatures, IntArray
 
-
 ROUGH = PoseConfig(rounds=2, robust_rounds=1, iterations=5, cost_tolerance=1e-2)
 """The first pass only has to bring the local map's anchors into their search radius."""
 
