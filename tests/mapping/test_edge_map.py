@@ -1,0 +1,133 @@
+"""The semi-dense map: fusion in cells, agreement between keyframes, and its bound."""
+
+import numpy as np
+import pytest
+from point_map import CAMERA, PointMap, small_motion
+
+from edgeslam_torch.config import EdgeConfig
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.mapping.edge_map import EdgeMap, EdgePoints, fuse
+
+
+def test_two_points_of_one_cell_worked_by_hand():
+    p = np.array([[0.001, 0.0, 0.0], [0.004, 0.0, 0.0], [0.5, 0.5, 0.5]])
+    colour = np.array([[0, 0, 0], [100, 50, 0], [7, 8, 9]], np.uint8)
+    cloud = fuse(p, np.array([0.02, 0.01, 0.03]), colour, np.array([2, 5, 3]), 0.01)
+    # Weights 1 : 4.
+    np.testing.assert_allclose(cloud.p_w, [[0.0034, 0.0, 0.0], [0.5, 0.5, 0.5]], atol=1e-6)
+    assert cloud.colour.tolist() == [[80, 40, 0], [7, 8, 9]]
+    np.testing.assert_allclose(cloud.sigma_m, [0.01, 0.03])
+    assert cloud.observations.tolist() == [5, 3]
+
+
+def test_fusing_nothing_gives_nothing():
+    none = np.zeros((0, 3))
+    cloud = fuse(none, np.zeros(0), none.astype(np.uint8), np.zeros(0, int), 0.01)
+    assert cloud.p_w.shape == (0, 3)
+    assert len(cloud.observations) == 0
+
+
+def test_fused_points_stay_apart_and_inside(rng):
+    p = rng.uniform(-1, 1, (5000, 3))
+    cloud = fuse(p, np.full(5000, 0.01), np.zeros((5000, 3), np.uint8), np.full(5000, 2), 0.1)
+    cells = np.floor(cloud.p_w / 0.1).astype(int)
+    assert len(np.unique(cells, axis=0)) == len(cells)
+    assert len(cells) == len(np.unique(np.floor(p / 0.1).astype(int), axis=0))
+
+
+def host(points, id, p_w, **changes):
+    T_c_w = points.map.pose_of(id)
+    p_c = se3.transform(T_c_w, p_w)
+    n = len(p_w)
+    record = {
+        "keyframe_id": id,
+        "uv": CAMERA.project(p_c).astype(np.float32),
+        "p_c": p_c,
+        "sigma": np.full(n, 0.01),
+        "colour": np.zeros((n, 3), np.uint8),
+        "observations": np.ones(n, np.int32),
+    }
+    return EdgePoints(**(record | changes))
+
+
+@pytest.fixture
+def points(rng):
+    made = PointMap(rng, 300, 3)
+    made.fill()
+    return made
+
+
+def edge_map(points, **settings):
+    return EdgeMap(points.map, CAMERA, EdgeConfig(**settings), 0.35)
+
+
+def test_points_that_two_keyframes_measured_alike_count_twice(points):
+    p_w = points.world.p_w[points.world.visible[0] & points.world.visible[1]][:60]
+    a, b = host(points, 0, p_w), host(points, 1, p_w)
+    b.p_c[:10] *= 1.2  # measured 20 % deeper: not the same point
+    edge_map(points)._count_agreement(a, b)
+    lonely = np.flatnonzero(a.observations == 1)
+    assert set(range(10)) <= set(lonely)
+    assert len(lonely) < 15  # another edge pixel may lie nearer by chance
+    assert (b.observations[:10] == 1).all()
+
+
+def test_points_behind_the_other_keyframe_do_not_count(points, rng):
+    p_w = points.world.p_w[:40]
+    a, b = host(points, 0, p_w), host(points, 1, p_w)
+    points.keyframes[1].T_c_w = se3.exp(np.array([0, 0, 0, 0, np.pi, 0])) @ points.keyframes[1].T_c_w
+    edge_map(points)._count_agreement(a, b)
+    assert (a.observations == 1).all()
+
+
+def test_edge_points_move_with_their_keyframe(points, rng):
+    p_w = points.world.p_w[points.world.visible[0]][:50]
+    slow = edge_map(points, voxel=1e-6)
+    slow.hosts.append(host(points, 0, p_w, observations=np.full(50, 3, np.int32)))
+    M = small_motion(rng, 0.2, 0.1)
+    before = slow.points().p_w
+    points.keyframes[0].T_c_w = points.keyframes[0].T_c_w @ se3.inverse(M)
+    after = slow.points().p_w
+    order = [np.lexsort(np.round(x, 4).T) for x in (after, se3.transform(M, before))]
+    np.testing.assert_allclose(after[order[0]], se3.transform(M, before)[order[1]], atol=1e-5)
+
+
+def test_only_agreed_points_are_given_out(points):
+    p_w = points.world.p_w[:30]
+    counts = np.r_[np.ones(10), np.full(20, 2)].astype(np.int32)
+    some = edge_map(points, voxel=1e-6)
+    some.hosts.append(host(points, 0, p_w, observations=counts))
+    assert len(some.points().p_w) == 20
+    assert edge_map(points).points().p_w.shape == (0, 3)
+
+
+def test_keyframe_without_image_or_partners_is_passed_over(points):
+    some = edge_map(points)
+    for keyframe in points.keyframes:
+        some.announce(keyframe)
+    points.map.remove_keyframe(points.keyframes[2])
+    some.update(everything=True)
+    assert some.hosts == []
+
+
+def test_number_of_points_is_bounded(points):
+    """Old points that one keyframe alone saw go first, then the oldest are thinned; the newest stay whole."""
+    some = edge_map(points, max_points=1000)
+    for i in range(60):
+        counts = np.r_[np.ones(20), np.full(10, 2)].astype(np.int32)
+        some.hosts.append(host(points, i % 3, points.world.p_w[:30], observations=counts))
+        some._bound()
+        assert sum(len(h.uv) for h in some.hosts) <= 1000
+    assert len(some.hosts[-1].uv) == len(some.hosts[-1].p_c) == 30
+    assert (some.hosts[0].observations >= 2).all()
+    few = edge_map(points, max_points=1)
+    few.hosts += [host(points, 0, points.world.p_w[:30]) for _ in range(3)]
+    few._bound()
+    assert sum(len(h.uv) for h in few.hosts) <= 1
+
+
+def test_bound_that_is_not_reached_changes_nothing(points):
+    some = edge_map(points, max_points=1000)
+    some.hosts.append(host(points, 0, points.world.p_w[:300]))
+    some._bound()
+    assert len(some.hosts[0].uv) == 300

@@ -1,0 +1,125 @@
+"""Taking keyframes into the map: new anchors, doubles, culling, the bound."""
+
+import numpy as np
+import pytest
+from point_map import CAMERA, PointMap, check_map, small_motion
+
+from edgeslam_torch.config import MappingConfig, SlamConfig
+from edgeslam_torch.frontend.matching import words
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.mapping.mapper import Mapper
+from edgeslam_torch.optim.problem import LmConfig
+
+
+def make_mapper(points, **mapping):
+    return Mapper(points.map, CAMERA, SlamConfig(mapping=MappingConfig(**mapping)), LmConfig(diagnostics=False))
+
+
+def insert(mapper, points, view, anchor_of):
+    """As tracking would: with the anchors that the map already has for what the keyframe sees."""
+    keyframe = points.keyframes[view]
+    known = anchor_of[points.point_of[view]]
+    keyframe.anchor[:] = np.where((known >= 0) & points.map.anchors.alive[known], known, -1)
+    return mapper.insert(keyframe, np.zeros((len(keyframe.anchor), 3), np.uint8))
+
+
+def anchor_errors(points):
+    """Distance of every anchor to the point whose descriptor it has."""
+    bits = words(points.descriptors)
+    ids = np.flatnonzero(points.map.anchors.alive)
+    point = [int(np.flatnonzero((bits == points.map.anchors.words[i]).all(1))[0]) for i in ids]
+    return np.linalg.norm(points.map.anchors.p_w[ids] - points.world.p_w[point], axis=1), np.array(point)
+
+
+def test_keyframes_grow_a_map_that_is_exact(rng):
+    points = PointMap(rng, 400, 6)
+    anchor_of = points.fill([0, 1])
+    mapper = make_mapper(points)
+    before = len(points.map.anchors)
+    for view in range(2, 6):
+        insert(mapper, points, view, anchor_of)
+        check_map(points.map)
+    error, point = anchor_errors(points)
+    assert len(error) > before + 20
+    assert np.percentile(error, 95) < 2e-3
+    assert len(np.unique(point)) == len(point), "one anchor to a point"
+    xi = [se3.log(k.T_c_w @ se3.inverse(points.world.T_c_w[k.id])) for k in points.map.keyframes.values()]
+    assert np.abs(xi).max() < 1e-3
+
+
+def test_pose_error_of_a_new_keyframe_is_refined_away(rng):
+    points = PointMap(rng, 400, 5)
+    anchor_of = points.fill([0, 1, 2, 3])
+    points.keyframes[4].T_c_w = small_motion(rng, 0.01, 0.004) @ points.keyframes[4].T_c_w
+    result = insert(make_mapper(points), points, 4, anchor_of)
+    assert result is not None
+    assert np.abs(se3.log(points.keyframes[4].T_c_w @ se3.inverse(points.world.T_c_w[4]))).max() < 1e-3
+
+
+def test_doubles_become_one(rng):
+    """Half of the points got a second anchor that only the newest two keyframes know."""
+    points = PointMap(rng, 300, 4)
+    anchor_of = points.fill()
+    keyframe, other = points.keyframes[3], points.keyframes[2]
+    both = np.intersect1d(points.point_of[3], points.point_of[2])
+    twice = both[anchor_of[both] >= 0][::2]
+    for k in (keyframe, other):
+        at = np.flatnonzero(np.isin(points.point_of[k.id], twice))
+        points.map.forget_observations(k, at)
+    twice = twice[points.map.anchors.alive[anchor_of[twice]]]
+    ids = points.map.anchors.add(
+        points.world.p_w[twice], words(points.descriptors[twice]), 3, False, np.zeros((len(twice), 3), np.uint8)
+    )
+    for k in (keyframe, other):
+        keypoint_of = {p: i for i, p in enumerate(points.point_of[k.id])}
+        points.map.observe(k, np.array([keypoint_of[p] for p in twice]), ids)
+    points.map.refresh_anchors(ids)
+    before = len(points.map.anchors)
+    make_mapper(points).fuse(keyframe, points.map.covisible(keyframe, 12))
+    check_map(points.map)
+    assert before - len(points.map.anchors) > 0.8 * len(twice)
+
+
+def test_young_anchors_that_are_not_found_again_go(rng):
+    points = PointMap(rng, 400, 3)
+    anchor_of = points.fill([0, 1])
+    mapper = make_mapper(points)
+    insert(mapper, points, 2, anchor_of)
+    young = mapper._recent
+    assert len(young) > 5
+    points.map.anchors.visible[young] = 20
+    points.map.anchors.found[young[1:]] = 3
+    points.map.anchors.found[young[0]] = 19
+    mapper.cull_recent_anchors(points.keyframes[2])
+    assert points.map.anchors.alive[young[0]]
+    assert not points.map.anchors.alive[young[1:]].any()
+    check_map(points.map)
+
+
+def test_keyframes_that_add_nothing_go_and_the_map_stays_bounded(rng):
+    points = PointMap(rng, 300, 30)
+    anchor_of = points.fill([0, 1])
+    mapper = make_mapper(points, max_keyframes=12, window=5, window_fixed=5)
+    for view in range(2, 30):
+        insert(mapper, points, view, anchor_of)
+        assert len(points.map.keyframes) <= 12
+    check_map(points.map)
+    assert 0 in points.map.keyframes or 0 in points.map.links
+    assert 29 in points.map.keyframes
+    T = [points.map.pose_of(id) @ se3.inverse(points.world.T_c_w[id]) for id in range(30)]
+    # Also the removed ones keep their place.
+    assert np.abs([se3.log(t) for t in T]).max() < 0.01
+
+
+def test_keyframe_that_nobody_shares_is_taken_in(rng):
+    points = PointMap(rng, 100, 3)
+    points.fill([0, 1])
+    insert(make_mapper(points), points, 2, np.full(100, -1))
+    check_map(points.map)
+    assert 2 in points.map.keyframes
+
+
+@pytest.mark.parametrize("settings", [{"window": 1}, {"max_keyframes": 10}, {"keyframe_overlap": 1.0}])
+def test_settings_out_of_range_are_refused(settings):
+    with pytest.raises(ValueError, match="must be"):
+        MappingConfig(**settings)
