@@ -32,7 +32,7 @@ class ExportOptions:
 
 def export_onnx(network: FastDepth, metadata: Metadata, path: Path, options: ExportOptions) -> None:
     """Write ``path`` (inputs ``image`` ``(1, 3, H, W)``; outputs ``log_depth`` and ``sigma_log`` ``(1, 1,
-    H, W)``).
+    H/2, W/2)``).
 
     Depth in metres is ``exp(log_depth) * focal / focal_px``, focal being the camera's in pixels of the
     network's input.

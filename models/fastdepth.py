@@ -69,7 +69,10 @@ FULL = Widths((32, 64, 128, 128, 256, 256, 512, 512, 512, 512, 512, 512, 1024, 1
 PRUNED = Widths((16, 56, 88, 120, 144, 256, 408, 376, 272, 288, 296, 328, 480, 512), (200, 256, 120, 56, 16))
 _SKIP_INTO = {4: 1, 3: 3, 2: 5}
 """Decoder layer -> encoder layer whose output is added after upsampling."""
-MAX_LOG_DEPTH = math.log(100.0)
+MIN_DEPTH_M, MAX_DEPTH_M = 1e-3, 100.0
+MAX_LOG_DEPTH = math.log(MAX_DEPTH_M)
+LOG_SIGMA_RANGE = (-4.0, 1.5)
+"""Of the uncertainty head: 2 % to a factor of 4.5."""
 INPUT_MULTIPLE = 32
 """Height and width of an input must be multiples of this."""
 
@@ -135,35 +138,60 @@ class FastDepth(nn.Module):
         prefix = "decode_conv" if self.variant.has_skips else "decoder.conv"
         return [self.get_submodule(f"{prefix}{i}") for i in range(1, 7)]
 
+    def predict_half(self, x: Tensor) -> Prediction:
+        """Log depth and its uncertainty for normalised RGB ``(B, 3, H, W)``, at half its size: all the
+        network knows.
+
+        Upstream upsamples its last features and then weighs them pixel by pixel; the two commute, and
+        weighing first
+        saves a sixth of the time. `predict` doubles the result, as upstream would have it.
+        """
+        features = self.features(x)
+        head = self.decoder_layers()[-1]
+        log_sigma = None if self.uncertainty is None else self.uncertainty(features).clamp(*LOG_SIGMA_RANGE)
+        return Prediction(self.log_depth_of(head[1](head[0](features))), log_sigma)  # type: ignore[index]
+
+    def log_depth_of(self, last: Tensor) -> Tensor:
+        """Log depth from the last convolution's output."""
+        if self.output is Output.LOG_DEPTH:
+            return last.clamp(-MAX_LOG_DEPTH, MAX_LOG_DEPTH)
+        return F.relu(last).clamp(MIN_DEPTH_M, MAX_DEPTH_M).log()
+
     def predict(self, x: Tensor) -> Prediction:
         """Log depth and its uncertainty for normalised RGB ``(B, 3, H, W)``, H and W multiples of 32."""
-        last, features = self._last_layer(x)
-        log_sigma = None if self.uncertainty is None else self.uncertainty(features).clamp(-4.0, 1.5)
-        if self.output is Output.LOG_DEPTH:
-            return Prediction(last.clamp(-MAX_LOG_DEPTH, MAX_LOG_DEPTH), log_sigma)
-        return Prediction(F.relu(last).clamp(1e-3, 100.0).log(), log_sigma)
+        log_depth, log_sigma = self.predict_half(x)
+        return Prediction(_doubled(log_depth), None if log_sigma is None else _doubled(log_sigma))
 
     def forward(self, x: Tensor) -> Tensor:
         """Depth at the training focal length [m], ``(B, 1, H, W)``, for normalised RGB ``(B, 3, H, W)``."""
-        last, _ = self._last_layer(x)
+        head = self.decoder_layers()[-1]
+        last = _doubled(head[1](head[0](self.features(x))))  # type: ignore[index]
         if self.output is Output.LOG_DEPTH:
             return last.clamp(-MAX_LOG_DEPTH, MAX_LOG_DEPTH).exp()
         return F.relu(last)
 
-    def _last_layer(self, x: Tensor) -> tuple[Tensor, Tensor]:
+    def features(self, x: Tensor) -> Tensor:
+        """What the last 1x1 convolution weighs, ``(B, C, H/2, W/2)``."""
         if x.shape[-1] % INPUT_MULTIPLE or x.shape[-2] % INPUT_MULTIPLE:
-            raise ValueError(f"height and width must be multiples of {INPUT_MULTIPLE}, got {tuple(x.shape[-2:])}")
+            size = tuple(x.shape[-2:])
+            raise ValueError(f"height and width must be multiples of {INPUT_MULTIPLE}, got {size}")
         kept: dict[int, Tensor] = {}
         for i, layer in enumerate(self.encoder()):
             x = layer(x)
             if self.variant.has_skips and i in _SKIP_INTO.values():
                 kept[i] = x
-        *stages, head = self.decoder_layers()
+        stages = self.decoder_layers()[:-1]
         for i, layer in enumerate(stages, start=1):
-            x = F.interpolate(layer(x), scale_factor=2.0, mode="nearest")
+            x = layer(x)
+            if i < len(stages):
+                x = _doubled(x)
             if self.variant.has_skips and i in _SKIP_INTO:
                 x = x + kept[_SKIP_INTO[i]]
-        return head[1](head[0](x)), x  # type: ignore[index]
+        return x
+
+
+def _doubled(x: Tensor) -> Tensor:
+    return F.interpolate(x, scale_factor=2.0, mode="nearest")
 
 
 def _pointwise(inputs: int, outputs: int) -> nn.Sequential:

@@ -5,24 +5,37 @@ import copy
 import torch
 from torch import Tensor, nn
 
-from edgeslam_torch.models.fastdepth import FastDepth
+from edgeslam_torch.models.fastdepth import LOG_SIGMA_RANGE, FastDepth
 from edgeslam_torch.models.record import Metadata
 
 
 class _Deployed(nn.Module):
-    """What the file computes: log depth and calibrated sigma of log depth from normalised RGB."""
+    """What a file computes: log depth and calibrated sigma of log depth at half the input's size.
+
+    Both heads are one convolution of two channels: quantised features are then read once.
+    """
 
     def __init__(self, network: FastDepth, metadata: Metadata) -> None:
         super().__init__()
         self.network = network
         self.scale, self.floor = metadata.sigma_scale, metadata.sigma_floor
+        self.heads: nn.Conv2d | None = None
+        if network.uncertainty is not None:
+            head = network.decoder_layers()[-1][0]  # type: ignore[index]
+            self.heads = nn.Conv2d(head.in_channels, 2, 1)
+            with torch.no_grad():
+                self.heads.weight.copy_(torch.cat((head.weight, network.uncertainty.weight)))
+                self.heads.bias.copy_(torch.cat((head.bias, network.uncertainty.bias)))  # type: ignore[union-attr, arg-type]
 
     def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
-        predicted = self.network.predict(image)
-        if predicted.log_sigma is None:
-            return predicted.log_depth, torch.full_like(predicted.log_depth, self.floor)
-        sigma = predicted.log_sigma.exp() * self.scale
-        return predicted.log_depth, (sigma * sigma + self.floor**2).sqrt()
+        if self.heads is None:
+            log_depth = self.network.predict_half(image).log_depth
+            return log_depth, torch.full_like(log_depth, self.floor)
+        # Slices, not a split: ONNX's converter cannot bring Split to older opsets.
+        both = self.heads(self.network.features(image))
+        last, raw = both[:, :1], both[:, 1:]
+        sigma = raw.clamp(*LOG_SIGMA_RANGE).exp() * self.scale
+        return self.network.log_depth_of(last), (sigma * sigma + self.floor**2).sqrt()
 
 
 def deployed(network: FastDepth, metadata: Metadata) -> nn.Module:

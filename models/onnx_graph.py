@@ -27,6 +27,9 @@ INPUT, LOG_DEPTH, SIGMA = "image", "log_depth", "sigma_log"
 _STRIDES = (2, 1, 2, 1, 2, 1, 2, 1, 1, 1, 1, 1, 2, 1)
 _SKIP_INTO = {4: 1, 3: 3, 2: 5}
 _EPS = 1e-5
+MIN_DEPTH_M, MAX_DEPTH_M = 1e-3, 100.0
+LOG_SIGMA_RANGE = (-4.0, 1.5)
+"""As in `fastdepth`, which needs torch to be imported."""
 OPSET, IR_VERSION = 17, 9
 """Old enough for every onnxruntime since 1.15."""
 
@@ -66,13 +69,13 @@ class _Builder:
             kept[i] = x
         for i in range(1, 6):
             x = self.decoder_layer(x, f"{decoder}{i}")
-            x = self.upsample(x)
+            if i < 5:
+                x = self.upsample(x)
             if skips and i in _SKIP_INTO:
                 x = self.node("Add", x, kept[_SKIP_INTO[i]])
-        last = self.conv(x, f"{decoder}6.0", f"{decoder}6.1")
-        self.finish(last, x)
+        self.finish(x, f"{decoder}6.0", f"{decoder}6.1")
         size: list[str | int | None] = ["batch", 3, "height", "width"]
-        out: list[str | int | None] = ["batch", 1, "height", "width"]
+        out: list[str | int | None] = ["batch", 1, "half_height", "half_width"]
         graph = helper.make_graph(
             self.nodes,
             "fastdepth",
@@ -90,39 +93,50 @@ class _Builder:
         x = self.node("Relu", self.conv(x, f"{name}.0.0", f"{name}.0.1"))
         return self.node("Relu", self.conv(x, f"{name}.1.0", f"{name}.1.1"))
 
-    def finish(self, last: str, features: str) -> None:
-        """Log depth from the last layer and calibrated sigma from the uncertainty head."""
-        limit = np.float32(np.log(100.0))
-        if self.metadata.output == "log_depth":
-            self.node("Clip", last, self.constant(-limit), self.constant(limit), name=LOG_DEPTH)
-        else:
-            clipped = self.node("Clip", last, self.constant(np.float32(1e-3)), self.constant(np.float32(100.0)))
-            self.node("Log", clipped, name=LOG_DEPTH)
-        floor = self.constant(np.float32(self.metadata.sigma_floor**2))
+    def finish(self, features: str, head: str, norm: str) -> None:
+        """Log depth and calibrated sigma; both heads are one convolution of two channels."""
+        weight, bias = self.folded(head, norm)
         if "uncertainty.weight" in self.weights:
-            raw = self.conv(features, "uncertainty", None)
-            raw = self.node("Clip", raw, self.constant(np.float32(-4.0)), self.constant(np.float32(1.5)))
-            sigma = self.node("Mul", self.node("Exp", raw), self.constant(np.float32(self.metadata.sigma_scale)))
+            both = np.concatenate((weight, self.weights["uncertainty.weight"]))
+            biases = np.concatenate((bias, self.weights["uncertainty.bias"]))
+            last, raw = f"{head}.out", "uncertainty.out"
+            split = self.convolve(features, both, biases, 1, 1, 0, 0)
+            sizes = numpy_helper.from_array(np.array([1, 1], np.int64), "head_sizes")
+            self.constants.append(sizes)
+            self.nodes.append(helper.make_node("Split", [split, "head_sizes"], [last, raw], axis=1))
+            raw = self.node("Clip", raw, self.scalar(LOG_SIGMA_RANGE[0]), self.scalar(LOG_SIGMA_RANGE[1]))
+            sigma = self.node("Mul", self.node("Exp", raw), self.scalar(self.metadata.sigma_scale))
             variance = self.node("Mul", sigma, sigma)
         else:
-            variance = self.node("Mul", LOG_DEPTH, self.constant(np.float32(0.0)))
-        self.node("Sqrt", self.node("Add", variance, floor), name=SIGMA)
-
-    def conv(self, x: str, name: str, norm: str | None, stride: int = 1) -> str:
-        """Convolution with its batch norm folded in."""
-        weight = self.weights[f"{name}.weight"]
-        if norm is None:
-            bias = self.weights[f"{name}.bias"]
+            last = self.convolve(features, weight, bias, 1, 1, 0, 0)
+            variance = self.node("Mul", last, self.scalar(0.0))
+        self.node("Sqrt", self.node("Add", variance, self.scalar(self.metadata.sigma_floor**2)), name=SIGMA)
+        if self.metadata.output == "log_depth":
+            limit = np.log(MAX_DEPTH_M)
+            self.node("Clip", last, self.scalar(-limit), self.scalar(limit), name=LOG_DEPTH)
         else:
-            gain = self.weights[f"{norm}.weight"] / np.sqrt(self.weights[f"{norm}.running_var"] + _EPS)
-            bias = self.weights[f"{norm}.bias"] - self.weights[f"{norm}.running_mean"] * gain
-            weight = weight * gain[:, None, None, None]
+            clipped = self.node("Clip", last, self.scalar(MIN_DEPTH_M), self.scalar(MAX_DEPTH_M))
+            self.node("Log", clipped, name=LOG_DEPTH)
+
+    def folded(self, name: str, norm: str) -> tuple[Array, Array]:
+        """Weight and bias of a convolution with its batch norm folded in."""
+        gain = self.weights[f"{norm}.weight"] / np.sqrt(self.weights[f"{norm}.running_var"] + _EPS)
+        bias = self.weights[f"{norm}.bias"] - self.weights[f"{norm}.running_mean"] * gain
+        return self.weights[f"{name}.weight"] * gain[:, None, None, None], bias
+
+    def conv(self, x: str, name: str, norm: str, stride: int = 1) -> str:
+        """Convolution and batch norm."""
+        weight, bias = self.folded(name, norm)
         taps = weight.shape[2]
         before = after = taps // 2
         if stride == 2 and self.metadata.padding == "tf_same":
             before = 0
         # Only depthwise convolutions have one input channel here; the stem has three.
         group = weight.shape[0] if weight.shape[1] == 1 and taps > 1 else 1
+        return self.convolve(x, weight, bias, stride, group, before, after)
+
+    def convolve(self, x: str, weight: Array, bias: Array, stride: int, group: int, before: int, after: int) -> str:
+        taps = weight.shape[2]
         return self.node(
             "Conv",
             x,
@@ -135,7 +149,7 @@ class _Builder:
         )
 
     def relu6(self, x: str) -> str:
-        return self.node("Clip", x, self.constant(np.float32(0.0)), self.constant(np.float32(6.0)))
+        return self.node("Clip", x, self.scalar(0.0), self.scalar(6.0))
 
     def upsample(self, x: str) -> str:
         scales = self.constant(np.array([1, 1, 2, 2], np.float32))
@@ -153,6 +167,9 @@ class _Builder:
         output = name or f"t{len(self.nodes)}"
         self.nodes.append(helper.make_node(op, list(inputs), [output], **attributes))
         return output
+
+    def scalar(self, value: float) -> str:
+        return self.constant(np.float32(value))
 
     def constant(self, value: Array | np.float32) -> str:
         name = f"c{len(self.constants)}"

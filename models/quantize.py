@@ -21,7 +21,8 @@ from edgeslam_torch.models.export_onnx import INPUT, LOG_DEPTH, SIGMA
 
 MIN_CALIBRATION_IMAGES = 8
 CALIBRATION_PERCENTILE = 99.99
-"""Activations above are clipped: one outlier must not take the resolution from everything else. On fr1_xyz the whole
+"""Activations above are clipped: one outlier must not take the resolution from everything else. On fr1_xyz
+the whole
 range costs 2.9 % of AbsRel, this 1.5 % (docs/model_card.md)."""
 
 

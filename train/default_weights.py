@@ -59,7 +59,7 @@ class Recipe:
     views_per_room: int = 6
     real: TrainConfig = TrainConfig(steps=950)
     mixed: TrainConfig = TrainConfig(
-        steps=750, lr=1e-3, encoder_lr=1.2e-4, seed=1, validate_every=250, checkpoint_every=50
+        steps=600, lr=1e-3, encoder_lr=1.2e-4, seed=1, validate_every=300, checkpoint_every=50
     )
     augment: AugmentConfig = AugmentConfig(
         zoom=(0.9, 1.4), aspect=0.05, roll_rad=0.12, tilt_rad=0.08, shift=0.1, saturation=0.4, gamma=(0.8, 1.25)

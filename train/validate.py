@@ -52,7 +52,7 @@ def predict_metres(network: FastDepth, metadata: Metadata, view: View) -> tuple[
     size = (metadata.input_height, metadata.input_width)
     fitted = fitted_view(view, size)
     with torch.no_grad():
-        prediction = network.predict(image_tensor(fitted.image, metadata)[None])
+        prediction = network.predict_half(image_tensor(fitted.image, metadata)[None])
     # The network sees pixels, so what counts is the focal length in its own pixels (input_width of them).
     log_depth = prediction.log_depth[0, 0].numpy() + np.log(
         np.sqrt(fitted.K[0, 0] * fitted.K[1, 1]) / metadata.focal_px

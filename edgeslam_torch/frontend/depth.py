@@ -23,7 +23,7 @@ class _Engine(Protocol):
     fixed_size: tuple[int, int] | None
 
     def run(self, image: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """``(1, 3, H, W)`` -> log depth and sigma, both ``(H, W)``."""
+        """``(1, 3, H, W)`` -> log depth and sigma, both ``(H/2, W/2)``."""
         ...
 
 
