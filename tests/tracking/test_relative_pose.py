@@ -1,0 +1,119 @@
+"""Two-view motion and the names of its degenerate cases."""
+
+import numpy as np
+import pytest
+from point_map import CAMERA
+from scipy.spatial.transform import Rotation
+
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.synthetic import box_room
+from edgeslam_torch.tracking.relative_pose import relative_pose
+from edgeslam_torch.types import MotionKind
+
+
+def seen_by_both(rng, T_j_i, p_i, noise_px=0.0, outliers=0.0):
+    """Pixels of points ``(N, 3)`` of camera i in both images, with noise and wrong matches."""
+    uv = [CAMERA.project(p_i), CAMERA.project(se3.transform(T_j_i, p_i))]
+    uv = [x + noise_px * rng.normal(size=x.shape) for x in uv]
+    wrong = rng.random(len(p_i)) < outliers
+    uv[1][wrong] = rng.uniform([0, 0], [640, 480], (int(wrong.sum()), 2))
+    return (*(x.astype(np.float32) for x in uv), wrong)
+
+
+def cloud(rng, n=300):
+    z = rng.uniform(1.5, 6.0, n)
+    return np.stack([rng.uniform(-0.8, 0.8, n) * z, rng.uniform(-0.6, 0.6, n) * z, z], axis=1)
+
+
+MOTION = se3.exp(np.array([-0.4, 0.05, 0.1, 0.02, 0.08, -0.03]))
+
+
+def errors_deg(found, truth):
+    R = Rotation.from_matrix(found[:3, :3] @ truth[:3, :3].T).magnitude()
+    a, b = found[:3, 3], truth[:3, 3]
+    return np.rad2deg([R, np.arccos(np.clip(a @ b / np.linalg.norm(a) / np.linalg.norm(b), -1, 1))])
+
+
+def test_noise_free_motion_is_exact(rng):
+    uv_i, uv_j, _ = seen_by_both(rng, MOTION, cloud(rng))
+    motion = relative_pose(uv_i, uv_j, CAMERA)
+    assert motion.kind is MotionKind.GENERAL
+    assert motion.inliers.mean() > 0.99
+    assert errors_deg(motion.T_j_i, MOTION).max() < 0.01
+    assert np.linalg.norm(motion.T_j_i[:3, 3]) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_motion_under_noise_and_a_third_of_wrong_matches(seed):
+    rng = np.random.default_rng(seed)
+    uv_i, uv_j, wrong = seen_by_both(rng, MOTION, cloud(rng), 0.5, 0.33)
+    motion = relative_pose(uv_i, uv_j, CAMERA)
+    assert motion.kind is MotionKind.GENERAL
+    rotation, direction = errors_deg(motion.T_j_i, MOTION)
+    assert rotation < 0.5
+    assert direction < 3.0
+    assert motion.inliers[~wrong].mean() > 0.7
+    assert motion.inliers[wrong].mean() < 0.1
+
+
+def test_points_of_the_room_lie_in_front_of_both(rng):
+    """Cheirality picks the right one of four decompositions for each pair of views."""
+    world = box_room(rng, 300)
+    for j in (1, 2, 4):
+        both = world.visible[0] & world.visible[j]
+        truth = world.T_c_w[j] @ se3.inverse(world.T_c_w[0])
+        motion = relative_pose(world.uv[0, both], world.uv[j, both], CAMERA)
+        assert errors_deg(motion.T_j_i, truth).max() < 0.1
+
+
+@pytest.mark.parametrize("noise_px", [0.0, 0.3])
+def test_pure_rotation_is_named(rng, noise_px):
+    turn = se3.exp(np.array([0, 0, 0, 0.03, 0.12, 0.02]))
+    uv_i, uv_j, _ = seen_by_both(rng, turn, cloud(rng), noise_px)
+    assert relative_pose(uv_i, uv_j, CAMERA).kind is MotionKind.PURE_ROTATION
+
+
+def test_plane_is_named(rng):
+    p = cloud(rng)
+    p *= (3.0 / (p @ [0.2, 0.1, 1.0]))[:, None]
+    uv_i, uv_j, _ = seen_by_both(rng, MOTION, p, 0.2)
+    assert relative_pose(uv_i, uv_j, CAMERA).kind is MotionKind.PLANAR
+
+
+@pytest.mark.parametrize("noise_px", [0.0, 0.3])
+def test_standing_still_is_named(rng, noise_px):
+    uv_i, uv_j, _ = seen_by_both(rng, np.eye(4), cloud(rng), noise_px)
+    motion = relative_pose(uv_i, uv_j, CAMERA)
+    assert motion.kind is MotionKind.NO_MOTION
+    np.testing.assert_array_equal(motion.T_j_i, np.eye(4))
+
+
+@pytest.mark.parametrize("n", [0, 1, 14])
+def test_few_matches_are_named(rng, n):
+    uv_i, uv_j, _ = seen_by_both(rng, MOTION, cloud(rng, n))
+    motion = relative_pose(uv_i, uv_j, CAMERA)
+    assert motion.kind is MotionKind.FEW_MATCHES
+    assert motion.inliers.shape == (n,)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_nonsense_is_no_motion_of_any_kind_and_no_crash(seed):
+    """Matches at random, all at one place, or on a line."""
+    rng = np.random.default_rng(seed)
+    anywhere = rng.uniform([0, 0], [640, 480], (2, 60, 2))
+    motion = relative_pose(anywhere[0], anywhere[1], CAMERA)
+    assert motion.inliers.sum() < 40
+    same = relative_pose(np.full((60, 2), 100.0), np.full((60, 2), 150.0), CAMERA)
+    line = relative_pose(np.linspace([0, 0], [600, 400], 60), np.linspace([10, 0], [600, 440], 60), CAMERA)
+    for odd in (motion, same, line):
+        assert np.isfinite(odd.T_j_i).all()
+
+
+def test_parallax_is_the_angle_between_the_rays(rng):
+    """Points 4 m ahead, 40 cm to the side: 0.1 rad less what obliqueness takes."""
+    p = cloud(rng)
+    p *= (4.0 / p[:, 2])[:, None] * rng.uniform(0.98, 1.02, (300, 1))
+    T = np.eye(4)
+    T[0, 3] = -0.4
+    uv_i, uv_j, _ = seen_by_both(rng, T, p)
+    assert relative_pose(uv_i, uv_j, CAMERA).parallax_rad == pytest.approx(0.085, abs=0.015)

@@ -1,0 +1,138 @@
+"""A frame's pose against the map, and finding it again without a prediction."""
+
+import numpy as np
+import pytest
+from point_map import CAMERA, SCALE_FACTOR, PointMap, small_motion
+
+from edgeslam_torch.config import OrbConfig, TrackingConfig
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.tracking.projection import project_anchors
+from edgeslam_torch.tracking.relocaliser import relocalise
+from edgeslam_torch.tracking.tracker import Tracker, make_view, median_parallax
+from edgeslam_torch.types import FrameFeatures
+
+
+@pytest.fixture
+def points(rng):
+    made = PointMap(rng, 400, 6)
+    made.fill()
+    return made
+
+
+def tracker_of(points, **settings):
+    return Tracker(points.map, CAMERA, OrbConfig(), TrackingConfig(**settings))
+
+
+def view_of(points, view, rng, noise_px=0.0, wrong=0):
+    """What a new frame at a keyframe's place sees; ``wrong`` keypoints have other points' descriptors."""
+    seen = np.flatnonzero(points.world.visible[view])
+    features = points.features(view, seen, noise_px * rng.normal(size=(len(seen), 2)))
+    descriptors = features.descriptors.copy()
+    descriptors[:wrong] = np.roll(descriptors[:wrong], 1, axis=0)
+    return make_view(FrameFeatures(features.uv, features.octave, features.angle_rad, descriptors), SCALE_FACTOR)
+
+
+def pose_error(points, view, T_c_w):
+    xi = se3.log(T_c_w @ se3.inverse(points.world.T_c_w[view]))
+    return np.linalg.norm(xi[:3]), np.linalg.norm(xi[3:])
+
+
+def recent(points, view):
+    keyframe = points.keyframes[view]
+    return keyframe.anchor[keyframe.anchor >= 0]
+
+
+def test_pose_of_a_noise_free_frame_is_exact(points, rng):
+    predicted = small_motion(rng, 0.02, 0.01) @ points.world.T_c_w[3]
+    track = tracker_of(points).track(view_of(points, 3, rng), predicted, recent(points, 2))
+    assert pose_error(points, 3, track.T_c_w)[0] < 1e-4
+    assert track.inliers == track.matches
+    seen = np.flatnonzero(points.world.visible[3])
+    np.testing.assert_array_equal(points.map.anchors.words[track.anchor], view_of(points, 3, rng).words[track.keypoint])
+    assert len(np.unique(track.keypoint)) == len(np.unique(track.anchor)) == track.inliers <= len(seen)
+
+
+def test_noise_of_half_a_pixel_moves_it_by_millimetres(points, rng):
+    predicted = small_motion(rng, 0.02, 0.01) @ points.world.T_c_w[3]
+    track = tracker_of(points).track(view_of(points, 3, rng, 0.5, 20), predicted, recent(points, 3))
+    translation, rotation = pose_error(points, 3, track.T_c_w)
+    assert translation < 0.01
+    assert rotation < 0.004
+    sigma = np.sqrt(np.diag(track.covariance))
+    assert (sigma > 1e-5).all()
+    assert (sigma < 0.05).all()
+
+
+def test_prediction_that_is_far_off_gives_none_rather_than_a_wrong_pose(points, rng):
+    far = se3.exp(np.array([0, 0, 0, 0, 1.2, 0])) @ points.world.T_c_w[3]
+    assert tracker_of(points).track(view_of(points, 3, rng), far, recent(points, 3)) is None
+
+
+def test_frame_without_keypoints_has_no_pose(points, rng):
+    empty = FrameFeatures(np.zeros((0, 2), np.float32), np.zeros(0, np.int32), np.zeros(0, np.float32), np.zeros((0, 32), np.uint8))  # fmt: skip  # noqa: E501
+    view = make_view(empty, SCALE_FACTOR)
+    tracker = tracker_of(points)
+    assert tracker.track(view, points.world.T_c_w[3], recent(points, 3)) is None
+    assert relocalise(tracker, view, points.world.T_c_w[3], 4, 1) is None
+
+
+def test_another_place_is_not_this_one(points, rng):
+    """A frame of random descriptors at the right pixels."""
+    seen = view_of(points, 3, rng).features
+    bits = rng.integers(0, 256, seen.descriptors.shape, dtype=np.uint8)
+    stranger = make_view(FrameFeatures(seen.uv, seen.octave, seen.angle_rad, bits), SCALE_FACTOR)
+    tracker = tracker_of(points)
+    assert tracker.track(stranger, points.world.T_c_w[3], recent(points, 3)) is None
+    assert relocalise(tracker, stranger, points.world.T_c_w[3], 6, 1) is None
+
+
+def test_anchors_that_are_seen_and_found_are_counted(points, rng):
+    anchors = points.map.anchors
+    visible, found = anchors.visible.copy(), anchors.found.copy()
+    track = tracker_of(points).track(view_of(points, 3, rng), points.world.T_c_w[3], recent(points, 3))
+    assert (anchors.found - found)[track.anchor].tolist() == [1] * track.inliers
+    assert ((anchors.visible - visible) >= (anchors.found - found)).all()
+
+
+def test_anchors_behind_outside_or_seen_from_behind_are_not_expected(points):
+    ids = np.flatnonzero(points.map.anchors.alive)
+    T = points.world.T_c_w[3]
+    seen = project_anchors(points.map.anchors, ids, T, CAMERA, SCALE_FACTOR, 8)
+    assert (seen.depth > 0).all()
+    assert (seen.uv >= 0).all()
+    assert (seen.uv < [640, 480]).all()
+    p_c = se3.transform(T, points.map.anchors.p_w[seen.anchor])
+    np.testing.assert_allclose(CAMERA.project(p_c), seen.uv, atol=1e-6)
+    turned = se3.exp(np.array([0, 0, 0, 0, np.pi, 0])) @ T
+    assert len(project_anchors(points.map.anchors, ids, turned, CAMERA, SCALE_FACTOR, 8).anchor) == 0
+    behind_wall = T.copy()
+    behind_wall[:3, 3] = T[:3, 3] - T[:3, :3] @ np.array([9.0, 0, 0])  # 9 m on along +x: all lies behind
+    assert len(project_anchors(points.map.anchors, ids, behind_wall, CAMERA, SCALE_FACTOR, 8).anchor) == 0
+    nothing = project_anchors(points.map.anchors, ids[:0], T, CAMERA, SCALE_FACTOR, 8)
+    assert nothing.uv.shape == (0, 2)
+
+
+@pytest.mark.parametrize("view", [0, 3, 5])
+def test_lost_frame_is_found_without_a_prediction(points, rng, view):
+    nowhere = se3.exp(np.array([3.0, 1.0, 2.0, 0.5, 2.0, 0.5]))
+    lost = view_of(points, view, rng, 0.5, 30)
+    track = next((t for t in (relocalise(tracker_of(points), lost, nowhere, 2, n) for n in range(1, 8)) if t), None)
+    assert track is not None, "six keyframes, two a frame, in turn"
+    assert pose_error(points, view, track.T_c_w)[0] < 0.03
+
+
+def test_relocalisation_comes_round_to_every_keyframe(points):
+    from edgeslam_torch.tracking.relocaliser import _candidates
+
+    tracker = tracker_of(points)
+    tried = {k.id for n in range(1, 8) for k in _candidates(tracker, points.world.T_c_w[0], 2, n)}
+    assert tried == set(range(6))
+    assert all(len(_candidates(tracker, points.world.T_c_w[0], 2, n)) <= 2 for n in range(8))
+
+
+def test_median_parallax_worked_by_hand():
+    p_w = np.array([[0.0, 0.0, 2.0]] * 3)
+    T_c_w = np.eye(4)
+    T_c_w[0, 3] = -2.0  # camera 2 m to the right
+    assert median_parallax(p_w, T_c_w, np.zeros(3)) == pytest.approx(np.pi / 4)
+    assert median_parallax(p_w[:0], T_c_w, np.zeros(3)) == 0.0
