@@ -50,6 +50,8 @@ class ProgressBar:
 
     def on_frame(self, frame: Frame, output: SlamOutput, slam: object) -> None:
         """Advance by one; the text is redrawn with the bar, not with every frame."""
+        if self._bar.n == 0:
+            self._bar.unpause()  # loading the network is not part of the rate
         self._bar.set_postfix_str(status_words(output), refresh=False)
         self._bar.update()
 
@@ -72,16 +74,18 @@ class ProgressLines:
         self._total = total
         self._stream = stream
         self._done = 0
-        self._begin = self._shown = time.monotonic()
+        self._begin = self._shown = 0.0
 
     def on_frame(self, frame: Frame, output: SlamOutput, slam: object) -> None:
         """Count, and write when it is time."""
-        self._done += 1
         now = time.monotonic()
+        if self._done == 0:  # loading the network is not part of the rate
+            self._begin = self._shown = now
+        self._done += 1
         if now - self._shown < LINE_EVERY_S:
             return
         self._shown = now
-        rate = self._done / (now - self._begin)
+        rate = self._done / max(now - self._begin, 1e-9)
         of = f"/{self._total}" if self._total is not None else ""
         left = f", {(self._total - self._done) / rate:.0f} s left" if self._total is not None else ""
         text = f"{self._done}{of} frames, {rate:.1f} frames/s{left}, {status_words(output)}"

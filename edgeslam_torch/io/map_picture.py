@@ -105,16 +105,17 @@ def _draw_eye(axes: Axes, cloud: PointCloud, T_w_c: FloatArray) -> None:
     axes.set_yticks([])
     axes.set_title("as the camera saw it half-way", color=_INK, fontsize=11)
     poses = np.asarray(T_w_c, dtype=np.float64).reshape(-1, 4, 4)
-    if len(poses) and len(cloud.p_w):
+    finite = np.isfinite(cloud.p_w).all(axis=1)
+    if len(poses) and finite.any():
         R, t = poses[len(poses) // 2, :3, :3], poses[len(poses) // 2, :3, 3]
-        p_c = (np.asarray(cloud.p_w, dtype=np.float64) - t) @ R
+        p_c = (np.asarray(cloud.p_w, dtype=np.float64)[finite] - t) @ R
         ahead = p_c[:, 2] > 1e-6
         slope = np.full((len(p_c), 2), np.inf)
         slope[ahead] = p_c[ahead, :2] / p_c[ahead, 2:]
         seen = (np.abs(slope[:, 0]) < _EYE_TAN) & (np.abs(slope[:, 1]) < 0.75 * _EYE_TAN)
         if seen.sum() > 1:
             flipped = slope[seen] * [1.0, -1.0]
-            raster, extent = _splat(flipped, cloud.colour[seen].astype(np.float64) / 255.0)
+            raster, extent = _splat(flipped, cloud.colour[finite][seen].astype(np.float64) / 255.0)
             axes.imshow(raster, extent=extent, origin="lower", interpolation="nearest")
     axes.set_xlim(-_EYE_TAN, _EYE_TAN)
     axes.set_ylim(-0.75 * _EYE_TAN, 0.75 * _EYE_TAN)
