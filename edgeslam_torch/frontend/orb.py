@@ -25,7 +25,7 @@ class OrbExtractor:
         """Features of a grey image ``(H, W)`` uint8 with the lens distortion still in it."""
         found = self._orb.detect(grey, None)
         if found:
-            uv = cv2.KeyPoint.convert(found)
+            uv = np.array(cv2.KeyPoint.convert(found), dtype=np.float32)
             score = np.array([k.response for k in found], dtype=np.float32)
             octave = np.array([k.octave for k in found], dtype=np.int32)
             keep = spread(uv, score, octave, grey.shape[1], grey.shape[0], self.config.features)
@@ -38,10 +38,10 @@ class OrbExtractor:
                 np.zeros((0, 32), np.uint8),
             )
         return FrameFeatures(
-            uv=self.camera.undistort_points(cv2.KeyPoint.convert(found)),
+            uv=self.camera.undistort_points(np.array(cv2.KeyPoint.convert(found), dtype=np.float32)),
             octave=np.array([k.octave for k in found], dtype=np.int32),
             angle_rad=np.deg2rad(np.array([k.angle for k in found], dtype=np.float32)),
-            descriptors=descriptors,
+            descriptors=np.asarray(descriptors, dtype=np.uint8),
         )
 
 
