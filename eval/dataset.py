@@ -57,10 +57,11 @@ class DepthFiles:
         raw = cv2.imread(str(self.paths[index]), cv2.IMREAD_UNCHANGED)
         if raw is None or raw.dtype != np.uint16 or raw.ndim != 2:
             raise EvaluationError(f"{self.paths[index]}: not a 16-bit depth map")
-        depth: FloatArray = np.where(raw == 65535, 0, raw).astype(np.float32) * np.float32(self.metres_per_unit)
+        depth: FloatArray = np.where(raw == 65535, 0, raw) * np.float32(self.metres_per_unit)
+        depth = depth.astype(np.float32)
         if self.camera.is_distorted:
             maps = self.camera.undistortion_maps()
-            depth = cv2.remap(depth, *maps, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+            return _remapped(depth, maps)
         return depth
 
 
@@ -77,6 +78,11 @@ class EvalDataset:
     camera: Camera | None
     """Colour camera, when its calibration is known."""
     depth: DepthFiles | None
+
+
+def _remapped(depth: FloatArray, maps: tuple[np.ndarray, np.ndarray]) -> FloatArray:
+    """Nearest neighbour: a mean of two depths is a point in the air."""
+    return np.asarray(cv2.remap(depth, *maps, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0))
 
 
 def open_dataset(folder: Path | str) -> EvalDataset:

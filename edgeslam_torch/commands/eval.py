@@ -23,6 +23,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--max-dt", type=float, default=0.02, help="largest time between matched poses [s]")
     parser.add_argument("--offset", type=float, default=0.0, help="added to the estimated stamps [s]")
+    parser.add_argument(
+        "--depth-maps",
+        action="store_true",
+        help="judge depth maps instead: folders or files (.npy in metres, 16-bit .png), matched by name",
+    )
+    parser.add_argument("--depth-unit", type=float, default=5000.0, metavar="N", help="PNG value of a metre (5000)")
     parser.add_argument("--json", type=Path, help="write all figures here")
     parser.add_argument("--markdown", type=Path, help="write the tables here")
     parser.add_argument("--plots", type=Path, help="write one picture per run into this folder")
@@ -39,6 +45,8 @@ def main(args: argparse.Namespace) -> int:
     from edgeslam_torch.eval.run_score import RunScore, evaluate_run
     from edgeslam_torch.eval.tables import markdown_report
 
+    if args.depth_maps:
+        return _depth_maps(args)
     scores: list[RunScore] = []
     for run in args.runs:
         scores.append(evaluate_run(run, args.groundtruth, args.depth_gt, args.max_dt, args.offset))
@@ -48,6 +56,24 @@ def main(args: argparse.Namespace) -> int:
     print(report)
     try:
         _write_files(args, scores, report)
+    except OSError as error:
+        raise OutputError(f"{error.filename}: cannot be written ({error.strerror})") from error
+    return 0
+
+
+def _depth_maps(args: argparse.Namespace) -> int:
+    from dataclasses import asdict
+
+    from edgeslam_torch.eval.depth import compare_folders, markdown_depth
+
+    reports = {str(run): compare_folders(run, args.groundtruth, 1.0 / args.depth_unit) for run in args.runs}
+    text = "\n".join(f"{name}\n\n{markdown_depth(report)}\n" for name, report in reports.items())
+    print(text)
+    try:
+        if args.markdown is not None:
+            args.markdown.write_text(text, encoding="utf-8")
+        if args.json is not None:
+            args.json.write_text(json.dumps({k: asdict(v) for k, v in reports.items()}, indent=1) + "\n")
     except OSError as error:
         raise OutputError(f"{error.filename}: cannot be written ({error.strerror})") from error
     return 0

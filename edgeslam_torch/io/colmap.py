@@ -38,6 +38,7 @@ def write_colmap(folder: Path, camera: Camera, names: Sequence[str], T_w_c: Floa
 def _camera_text(camera: Camera) -> str:
     k1, k2, p1, p2, k3 = camera.distortion
     pinhole = (camera.fx, camera.fy, camera.cx + 0.5, camera.cy + 0.5)
+    numbers: tuple[float, ...]
     if not camera.is_distorted:
         model, numbers = "PINHOLE", pinhole
     elif k3 == 0.0:

@@ -111,7 +111,7 @@ if (DATA.stages.length) {
   byId("s-stages").hidden = false;
   const most = Math.max(...DATA.stages.map(s => s.p95), 1e-9);
   for (const s of DATA.stages) {
-    make("span", s.name, byId("stages")); const bar = make("div", undefined, byId("stages")); bar.className = "bar";
+    make("span", s.name, byId("stages")).className = "name"; const bar = make("div", undefined, byId("stages")); bar.className = "bar";
     make("i", undefined, bar).style.width = 100 * s.median / most + "%"; make("u", undefined, bar).style.left = `calc(${100 * s.p95 / most}% - 2px)`;
     make("span", `${s.median.toFixed(1)} / ${s.p95.toFixed(1)} ms`, byId("stages")).className = "num";
   }

@@ -93,3 +93,22 @@ def test_report_of_the_largest_map_stays_below_its_limit(run_folder: Callable[..
     run_folder(tmp_path / "a", points=260_000)
     run(report_command, tmp_path / "a")
     assert (tmp_path / "a" / "report.html").stat().st_size < 5e6  # the limit is 15 MB
+
+
+def test_depth_maps_are_judged_by_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name, metres in (("ours", 1.1), ("truth", 1.0)):
+        (tmp_path / name).mkdir()
+        np.save(tmp_path / name / "0001.npy", np.full((4, 6), metres))
+    words = (tmp_path / "ours", "--groundtruth", tmp_path / "truth", "--depth-maps", "--json", tmp_path / "d.json")
+    assert run(eval_command, *words) == 0
+    assert "| metric | 0.1000 |" in capsys.readouterr().out
+    assert json.loads((tmp_path / "d.json").read_text())[str(tmp_path / "ours")]["median_scaled"]["delta1"] == 1.0
+
+
+def test_first_trajectory_is_converted(run_folder: Callable[..., Path], tmp_path: Path) -> None:
+    truth = run_folder(tmp_path / "a")
+    words = (tmp_path / "a", "--groundtruth", truth, "--convert")
+    assert run(eval_command, *words, "euroc", tmp_path / "t.csv") == 0
+    assert (tmp_path / "t.csv").read_text().splitlines()[1].startswith("100000000000,")
+    with pytest.raises(EdgeSlamError, match="known formats"):
+        run(eval_command, *words, "rosbag", tmp_path / "t")

@@ -72,3 +72,10 @@ def test_reversed_time_is_sorted_and_said(tmp_path: Path) -> None:
 def test_line_cut_off_at_the_end_is_left_out(tmp_path: Path) -> None:
     (tmp_path / "t.txt").write_text("\n".join([*GOOD, "0.3 1 2"]))  # killed while writing: no newline
     assert len(read_trajectory(tmp_path / "t.txt")) == 3
+
+
+def test_huge_file_is_not_read(tmp_path: Path) -> None:
+    with (tmp_path / "flight.bag").open("wb") as file:
+        file.truncate(3 << 30)  # sparse: takes no room
+    with pytest.raises(EvaluationError, match="3.2 GB is no trajectory"):
+        read_trajectory(tmp_path / "flight.bag")
