@@ -38,7 +38,7 @@ CAMERAS = {
     ),
 }
 """Names of ``--images``."""
-MAX_MAP_POINTS = 20_000
+MAX_MAP_POINTS = 8_000
 """Map points that are compared with the true surfaces, drawn with a fixed seed."""
 SCORE = "demo.json"
 
@@ -48,8 +48,8 @@ class DemoSettings:
     """What is flown."""
 
     world: str = "room"
-    seconds: float = 15.0
-    rate_hz: float = 20.0
+    seconds: float = 20.0
+    rate_hz: float = 15.0
     seed: int = 0
     images: str = "normal"
     """A name in `CAMERAS`."""

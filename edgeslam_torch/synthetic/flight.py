@@ -31,7 +31,7 @@ class FlightPlan:
     """Cruising speed; never exceeded by more than the take-off's half metre a second."""
     yaw_rate_rad_s: float = np.deg2rad(35.0)
     hover_height_m: float = 1.15
-    height_spread_m: float = 0.25
+    height_spread_m: float = 0.4
     clearance_m: float = 0.45
     """Kept from walls and furniture."""
     take_off: bool = True

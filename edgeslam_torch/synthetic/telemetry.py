@@ -33,7 +33,7 @@ class TelemetryFaults:
     """Share of packets lost."""
     outages_s: tuple[tuple[float, float], ...] = ()
     """Intervals of the video's clock without any packet."""
-    velocity_noise_m_s: float = 0.04
+    velocity_noise_m_s: float = 0.03
     velocity_walk: float = 0.003
     """Random walk of the velocity bias [m/s per sqrt(s)] on a full battery."""
     bias_memory_s: float = 12.0
