@@ -48,6 +48,8 @@ class _View:
     target: FloatArray
     radius: float
     floor: float
+    height: tuple[float, float]
+    """Heights of the points at the ends of the colour ramp."""
 
 
 def write_report(
@@ -180,7 +182,7 @@ def _payload(
         "box": {"lo": _rounded(view.lo, 4), "hi": _rounded(view.hi, 4)},
         "floor": round(view.floor, 4),
         "gridStep": _grid_step(view.radius),
-        "height": [round(float(view.lo[2]), 3), round(float(view.hi[2]), 3)],
+        "height": [round(h, 3) for h in view.height],
         "keyframes": _keyframes(run, edges, trajectory.stamps_s[table.keyframes()], begin),
         "mapScore": words.map_rows(score),
         "summary": words.flat_rows(run.summary),
@@ -364,7 +366,13 @@ def _view(points: FloatArray, positions: FloatArray) -> _View:
     extent = np.maximum(hi - lo, 1e-3)
     lo, hi = lo - 0.03 * extent, hi + 0.03 * extent
     floor = float(np.quantile(points[:, 2], 0.005)) if len(points) else float(lo[2])
-    return _View(lo, hi, (lo + hi) / 2, float(np.linalg.norm(hi - lo) / 2), max(floor, float(lo[2] - extent[2])))
+    low, high = (float(h) for h in np.quantile(points[:, 2], [0.02, 0.98])) if len(points) else (lo[2], hi[2])
+    # The far background is in the box of the flat views; the 3-D view starts on what most points are.
+    core = np.concatenate([np.quantile(points, [0.05, 0.95], axis=0), positions]) if len(points) else positions
+    a, b = core.min(axis=0), core.max(axis=0)
+    radius = max(float(np.linalg.norm(b - a) / 2), 1e-3)
+    floor = max(floor, float(lo[2] - extent[2]))
+    return _View(lo, hi, (a + b) / 2, radius, floor, (low, max(high, low + 1e-3)))
 
 
 def _yaw(rotations: FloatArray, positions: FloatArray, view: _View) -> float:
