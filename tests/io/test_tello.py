@@ -1,0 +1,332 @@
+"""Our client against the emulator, on loopback and in real time; waiting is for conditions, not for times."""
+
+import importlib
+import os
+import socket
+import threading
+import time
+from contextlib import closing
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from edgeslam_torch.emulator.drone import DroneModel, Mode
+from edgeslam_torch.emulator.link import LinkFaults
+from edgeslam_torch.emulator.server import EmulatorConfig, TelloEmulator
+from edgeslam_torch.errors import SourceError
+from edgeslam_torch.io.tello import Tello, TelloAddress, TelloError, TelloLimits
+
+av = pytest.importorskip("av", reason="PyAV is not installed: the [drone] extra")
+
+
+def free_ports(count):
+    sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(count)]
+    try:
+        for s in sockets:
+            s.bind(("127.0.0.1", 0))
+        return [s.getsockname()[1] for s in sockets]
+    finally:
+        for s in sockets:
+            s.close()
+
+
+def until(condition, seconds=10.0):
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "not in time"
+        threading.Event().wait(0.01)
+
+
+@pytest.fixture
+def emulate():
+    """Function that starts an emulator and gives it with its address; stopped after the test."""
+    running = []
+
+    def start(link=None, drone=None, **options):
+        state, video = free_ports(2)
+        config = EmulatorConfig(
+            command_port=0, state_port=state, video_port=video, width=320, height=240,
+            link=link or LinkFaults(video_latency_s=0.05), **options,
+        )  # fmt: skip
+        emulator = TelloEmulator(config, drone=drone).start()
+        running.append(emulator)
+        return emulator, TelloAddress("127.0.0.1", emulator.command_port, state, video)
+
+    yield start
+    for emulator in running:
+        emulator.stop()
+
+
+QUICK = TelloLimits(timeout_s=1.0, retries=3, keep_alive_s=0.5, state_loss_s=1.0, video_loss_s=1.5)
+
+
+def test_connects_flies_streams_and_lands(emulate):
+    emulator, address = emulate()
+    with Tello(address, allow_motion=True) as tello:
+        tello.connect()
+        video = tello.start_video()
+        first = video.wait(0, 5.0)
+        assert first.image.shape == (240, 320, 3)
+        tello.take_off()
+        assert emulator.drone.mode is Mode.FLYING
+        tello.move(0.4, 0.0, 0.2)
+        np.testing.assert_allclose(emulator.drone.p_w, [0.4, 0.0, 1.1], atol=0.12)
+        assert tello.query("battery?") == pytest.approx(100.0, abs=1.0)
+        assert video.newest.count > first.count + 20
+        assert tello.latest.sample().tof_m > 0.8
+    assert emulator.drone.mode is Mode.GROUND
+
+
+def test_nothing_moves_unless_it_was_allowed(emulate):
+    emulator, address = emulate()
+    with Tello(address) as tello:
+        tello.connect()
+        for move in (tello.take_off, lambda: tello.rc(0, 1, 0, 0), lambda: tello.send("motoron")):
+            with pytest.raises(TelloError, match="--fly"):
+                move()
+    assert not emulator.drone.flying
+    assert emulator.drone.motor_s == 0.0
+
+
+@pytest.mark.parametrize("failure", [KeyboardInterrupt, RuntimeError])
+def test_lands_whatever_ends_the_flight(emulate, failure):
+    emulator, address = emulate()
+    with pytest.raises(failure), Tello(address, allow_motion=True) as tello:
+        tello.connect()
+        tello.take_off()
+        raise failure
+    assert emulator.drone.mode is Mode.GROUND
+
+
+def test_lands_when_the_video_goes_away(emulate):
+    emulator, address = emulate()
+    with Tello(address, allow_motion=True, limits=QUICK) as tello:
+        tello.connect()
+        tello.start_video().wait(0, 5.0)
+        tello.take_off()
+        emulator.interpreter.stream = False
+        until(lambda: emulator.drone.mode is Mode.GROUND)
+        assert "no video" in tello.stop_reason
+        with pytest.raises(TelloError, match="flight has ended"):
+            tello.take_off()
+
+
+def test_lands_when_the_battery_runs_low(emulate):
+    emulator, address = emulate(drone=DroneModel(battery=0.5))
+    with Tello(address, allow_motion=True, limits=QUICK) as tello:
+        tello.connect()
+        tello.take_off()
+        emulator.drone.battery = 0.08
+        until(lambda: emulator.drone.mode is Mode.GROUND)
+        assert "battery" in tello.stop_reason
+
+
+def test_does_not_take_off_with_an_empty_battery(emulate):
+    _, address = emulate(drone=DroneModel(battery=0.065))
+    with Tello(address, allow_motion=True) as tello:
+        tello.connect()
+        with pytest.raises(TelloError, match="battery at 7 %"):
+            tello.take_off()
+
+
+def test_a_drone_that_stops_answering_lands_itself_and_says_why(emulate):
+    emulator, address = emulate()
+    limits = TelloLimits(timeout_s=0.3, retries=1, keep_alive_s=0.5, state_loss_s=0.6, video_loss_s=9.0)
+    with Tello(address, allow_motion=True, limits=limits) as tello:
+        tello.connect()
+        tello.take_off()
+        emulator.link.cut = True
+        until(lambda: "no state" in tello.stop_reason)
+        emulator.link.cut = False  # it hears again: our landing is still being asked for
+        until(lambda: emulator.drone.mode is Mode.GROUND)
+
+
+def test_bad_air_is_flown_through(emulate):
+    """5 % loss, garbage on every port."""
+    emulator, address = emulate(link=LinkFaults(loss=0.05, garbage=0.2, video_latency_s=0.02), seed=3)
+    limits = TelloLimits(timeout_s=0.5, retries=6)
+    with Tello(address, allow_motion=True, limits=limits) as tello:
+        tello.connect()
+        video = tello.start_video()
+        assert video.wait(0, 10.0) is not None
+        tello.allow_motion = True
+        try:
+            tello.take_off()
+        except TelloError as error:
+            assert "no answer" in str(error)  # the answer was lost, the drone is in the air all the same
+        until(lambda: emulator.drone.mode is Mode.FLYING)
+        count = video.newest.count
+        until(lambda: video.newest.count > count + 10)
+    assert emulator.drone.mode is Mode.GROUND
+
+
+def test_an_outage_of_the_link_is_survived(emulate):
+    emulator, address = emulate()
+    with Tello(address) as tello:
+        tello.connect()
+        video = tello.start_video()
+        video.wait(0, 5.0)
+        emulator.link.cut = True
+        gone = video.newest.count
+        threading.Event().wait(1.0)
+        emulator.link.cut = False
+        assert video.wait(gone + 3, 5.0) is not None
+        before = tello.latest.stamp_s
+        until(lambda: tello.latest.stamp_s > before)
+
+
+def test_nobody_there_is_an_error_with_a_remedy():
+    command, state, video = free_ports(3)
+    limits = TelloLimits(timeout_s=0.1, retries=1)
+    address = TelloAddress("127.0.0.1", command, state, video)
+    with Tello(address, limits=limits) as tello, pytest.raises(TelloError, match="is the drone on"):
+        tello.connect()
+
+
+def test_a_busy_port_is_an_error_that_names_it(emulate):
+    _, address = emulate()
+    with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as other:
+        other.bind(("127.0.0.1", address.state_port))
+        with pytest.raises(SourceError, match=str(address.state_port)):
+            Tello(address)
+
+
+def test_refusals_of_the_drone_are_reported(emulate):
+    _, address = emulate()
+    with Tello(address) as tello:
+        tello.connect()
+        with pytest.raises(TelloError, match="unknown command"):
+            tello.send("dance")
+        with pytest.raises(TelloError, match="not an SDK command"):
+            tello.send("battery?\nland")
+
+
+def test_sockets_stay_on_loopback(emulate):
+    _, address = emulate()
+    with Tello(address) as tello:
+        assert tello._state_socket.getsockname()[0] == "127.0.0.1"
+        assert tello._command_socket.getsockname()[0] == "127.0.0.1"
+
+
+def test_stamps_follow_the_delay_of_the_video(emulate):
+    """Pictures and state share one clock: what the picture shows happened earlier, by the delay."""
+    emulator, address = emulate(link=LinkFaults(video_latency_s=0.4))
+    with Tello(address, allow_motion=True) as tello:
+        tello.connect()
+        begin = tello.clock.now()
+        picture = tello.start_video().wait(0, 5.0)
+        assert picture.stamp_s - begin > 0.4
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("tello://127.0.0.1", ("127.0.0.1", 8889, 8890, 11111)),
+        ("tello://127.0.0.1:1:2:3", ("127.0.0.1", 1, 2, 3)),
+        ("tello://", ("192.168.10.1", 8889, 8890, 11111)),
+        ("tello://drone.local:9000/", ("drone.local", 9000, 8890, 11111)),
+    ],
+)
+def test_addresses(text, expected):
+    a = TelloAddress.parse(text)
+    assert (a.host, a.command_port, a.state_port, a.video_port) == expected
+
+
+@pytest.mark.parametrize("text", ["tello://a:b", "tello://a:0", "tello://a:1:2:3:4", "tello://a b", "tello://a:70000"])
+def test_wrong_addresses_are_refused(text):
+    with pytest.raises(SourceError):
+        TelloAddress.parse(text)
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.text(max_size=40))
+def test_any_address_is_read_or_refused(text):
+    try:
+        TelloAddress.parse("tello://" + text)
+    except SourceError as error:
+        assert len(str(error).splitlines()) <= 1 or not text.isprintable()
+
+
+def test_video_survives_a_start_in_mid_stream_lost_packets_and_garbage(rng):
+    from edgeslam_torch.emulator.encoder import Encoder
+    from edgeslam_torch.io.tello_video import PictureAssembler
+
+    encoder, assembler = Encoder(320, 240, 30), PictureAssembler()
+    picture = rng.integers(0, 255, (240, 320, 3), dtype=np.uint8)
+    shown = []
+    for k in range(95):
+        for packet in encoder.encode(np.roll(picture, 3 * k, axis=1)):
+            if k < 10 or rng.random() < 0.02:
+                continue
+            shown += assembler.feed(packet, 0.1 * k)
+            if rng.random() < 0.02:
+                shown += assembler.feed(rng.bytes(300), 0.1 * k)
+    assert len(shown) > 20
+    assert all(p.image.shape == (240, 320, 3) for p in shown)
+    assert [p.count for p in shown] == sorted({p.count for p in shown})
+
+
+def test_without_pyav_the_message_says_what_to_install(monkeypatch):
+    from edgeslam_torch.io import tello_video
+
+    def missing(name):
+        raise ImportError(name)
+
+    monkeypatch.setattr(tello_video.importlib, "import_module", missing)
+    with pytest.raises(SourceError, match=r"edgeslam-torch\[drone\]"):
+        tello_video.import_av()
+
+
+def test_djitellopy_flies_the_emulator(emulate, monkeypatch):
+    """A client that no one here wrote, its code unchanged; only the ports it uses are set."""
+    if importlib.util.find_spec("djitellopy") is None:
+        pytest.skip("djitellopy is not installed: pip install --no-deps djitellopy")
+    import djitellopy
+
+    emulator, address = emulate()
+    control = free_ports(1)[0]
+    monkeypatch.setattr(djitellopy.Tello, "CONTROL_UDP_PORT", control)
+    monkeypatch.setattr(djitellopy.Tello, "STATE_UDP_PORT", address.state_port)
+    monkeypatch.setattr(djitellopy.Tello, "VS_UDP_IP", "127.0.0.1")
+    drone = djitellopy.Tello(host="127.0.0.1", vs_udp=address.video_port)
+    drone.address = ("127.0.0.1", address.command_port)
+    drone.connect()
+    assert 90 < drone.get_battery() <= 100
+    drone.streamon()
+    reader = drone.get_frame_read()
+    until(lambda: reader.frame.shape == (240, 320, 3), 20.0)
+    drone.takeoff()
+    assert emulator.drone.mode is Mode.FLYING
+    drone.move_forward(40)
+    drone.rotate_counter_clockwise(90)
+    assert emulator.drone.p_w[0] == pytest.approx(0.4, abs=0.1)
+    assert drone.get_yaw() == pytest.approx(-90, abs=5)
+    drone.send_rc_control(0, 30, 0, 0)
+    until(lambda: emulator.drone.p_w[1] > 0.1)
+    drone.land()
+    assert emulator.drone.mode is Mode.GROUND
+    assert drone.query_battery() > 90
+    drone.end()
+
+
+@pytest.mark.skipif(os.environ.get("CI_NO_SOCKETS") == "1", reason="no sockets here")
+def test_recording_of_a_live_drone_is_a_flight_that_opens(emulate, tmp_path, capsys):
+    from edgeslam_torch.cli import main
+    from edgeslam_torch.io.source import open_source
+
+    emulator, a = emulate()
+    url = f"tello://127.0.0.1:{a.command_port}:{a.state_port}:{a.video_port}"
+    folder = tmp_path / "flight"
+    assert main(["record", url, "--out", str(folder), "--max-frames", "40", "--fly"]) == 0
+    assert emulator.drone.mode is Mode.GROUND
+    source = open_source(folder)
+    frames = list(source.frames())
+    assert len(frames) == 40
+    assert source.kind == "flight"
+    assert len(source.telemetry) > 5
+    assert source.telemetry[0].stamp_s < frames[-1].stamp_s
+    assert (folder / "state.txt").read_text().count("bat:") == len(source.telemetry)
+    assert main(["record", url, "--out", str(folder), "--max-frames", "5"]) == 1
+    assert "already" in capsys.readouterr().err
