@@ -25,6 +25,7 @@ class RenderedFlight:
     depth_m: list[np.ndarray]
     T_w_c: np.ndarray
     """``(F, 4, 4)``"""
+    world: World
 
     @property
     def stamps_s(self):
@@ -57,7 +58,7 @@ def film(world, camera, T_w_c, step_s=0.1):
     """Render every pose."""
     views = [render(world, camera, T) for T in T_w_c]
     frames = [Frame(i, 100.0 + step_s * i, v.image) for i, v in enumerate(views)]
-    return RenderedFlight(camera, frames, [v.depth_m for v in views], np.asarray(T_w_c))
+    return RenderedFlight(camera, frames, [v.depth_m for v in views], np.asarray(T_w_c), world)
 
 
 def patchwork(rng, side_px=768, patches=1500):

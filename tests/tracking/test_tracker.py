@@ -69,7 +69,8 @@ def test_prediction_that_is_far_off_gives_none_rather_than_a_wrong_pose(points, 
 
 
 def test_frame_without_keypoints_has_no_pose(points, rng):
-    empty = FrameFeatures(np.zeros((0, 2), np.float32), np.zeros(0, np.int32), np.zeros(0, np.float32), np.zeros((0, 32), np.uint8))  # fmt: skip  # noqa: E501
+    none = np.zeros(0, np.int32)
+    empty = FrameFeatures(np.zeros((0, 2), np.float32), none, none.astype(np.float32), np.zeros((0, 32), np.uint8))
     view = make_view(empty, SCALE_FACTOR)
     tracker = tracker_of(points)
     assert tracker.track(view, points.world.T_c_w[3], recent(points, 3)) is None

@@ -1,0 +1,63 @@
+"""The published world: z up, metres when known, and no jump when the scale changes."""
+
+import numpy as np
+from point_map import small_motion
+
+from edgeslam_torch.fusion.published import MIN_CHANGE, T_LEVEL, Published, first_pose
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.geometry.mount import camera_on_body
+from edgeslam_torch.types import PointCloud
+
+TILT = np.deg2rad(12.0)
+
+
+def test_change_of_scale_leaves_the_present_camera_where_it_is(rng):
+    T_w_c = np.stack([small_motion(rng, 1.0, 0.5) for _ in range(5)])
+    now = T_w_c[-1, :3, 3]
+    old = Published(1.5, small_motion(rng, 0, 1.0)[:3, :3], rng.normal(size=3))
+    new = old.with_scale(2.1, now)
+    np.testing.assert_allclose(new.pose(T_w_c)[-1], old.pose(T_w_c)[-1], atol=1e-12)
+    steps = [np.linalg.norm(np.diff(p.pose(T_w_c)[:, :3, 3], axis=0), axis=1) for p in (old, new)]
+    np.testing.assert_allclose(steps[1] / steps[0], 2.1 / 1.5)
+
+
+def test_change_too_small_to_matter_changes_nothing():
+    old = Published(2.0)
+    assert old.with_scale(2.0 * (1 + 0.5 * MIN_CHANGE), np.ones(3)) is old
+    assert old.with_scale(2.0 * (1 + 2.0 * MIN_CHANGE), np.ones(3)) is not old
+
+
+def test_map_and_trajectory_pass_through_the_same_similarity(rng):
+    """A point one unit before a camera is published one scale before the published camera."""
+    published = Published(0.7, small_motion(rng, 0, 1.0)[:3, :3], rng.normal(size=3))
+    T_w_c = small_motion(rng, 1.0, 0.5)
+    p_c = rng.normal(size=(6, 3))
+    p_w = se3.transform(T_w_c, p_c).astype(np.float32)
+    cloud = PointCloud(p_w, np.zeros((6, 3), np.uint8), np.full(6, 0.1, np.float32), np.ones(6, int))
+    out = published.cloud(cloud)
+    np.testing.assert_allclose(out.p_w, se3.transform(published.pose(T_w_c), 0.7 * p_c), atol=1e-5)
+    np.testing.assert_allclose(out.sigma_m, 0.07, rtol=1e-6)
+
+
+def test_poses_stay_rigid_motions(rng):
+    T = Published(3.0, small_motion(rng, 0, 1.0)[:3, :3]).pose(small_motion(rng, 1.0, 0.5))
+    np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
+    np.testing.assert_array_equal(T[3], [0, 0, 0, 1])
+
+
+def test_first_camera_looks_level_along_x_when_nothing_is_known():
+    np.testing.assert_array_equal(first_pose(np.full(3, np.nan), camera_on_body(TILT, 0.03)), T_LEVEL)
+    np.testing.assert_array_equal(T_LEVEL[:3, 2], [1, 0, 0])
+    np.testing.assert_array_equal(T_LEVEL[:3, 1], [0, 0, -1])  # image down is world down
+
+
+def test_first_camera_of_a_level_drone_that_faces_left():
+    T = first_pose(np.array([0.0, 0.0, np.pi / 2]), camera_on_body(TILT, 0.03))
+    np.testing.assert_allclose(T[:3, 2], [0.0, np.cos(TILT), -np.sin(TILT)], atol=1e-12)
+    np.testing.assert_allclose(T[:3, 3], 0.0, atol=1e-12)
+
+
+def test_nose_down_drone_looks_down_more():
+    """Positive pitch about body y (left) lowers the nose."""
+    T = first_pose(np.array([0.0, 0.1, 0.0]), camera_on_body(TILT, 0.0))
+    np.testing.assert_allclose(T[2, 2], -np.sin(TILT + 0.1), atol=1e-12)

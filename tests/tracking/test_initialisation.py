@@ -1,0 +1,165 @@
+"""From a guessed map to one that two views made, and what refuses a wrong one."""
+
+import numpy as np
+import pytest
+from point_map import CAMERA, SCALE_FACTOR, PointMap, check_map, small_motion
+
+from edgeslam_torch.config import InitialisationConfig, OrbConfig, TrackingConfig
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.optim.problem import LmConfig
+from edgeslam_torch.tracking.bootstrap import WITNESS_SHARE, Bootstrap
+from edgeslam_torch.tracking.initialiser import BootstrapView, poses_of_witnesses, two_view_map
+from edgeslam_torch.tracking.tracker import Tracker, make_view
+
+CONFIG = InitialisationConfig()
+
+
+@pytest.fixture
+def points(rng):
+    return PointMap(rng, 500, 6)
+
+
+def z_in(points, view):
+    return se3.transform(points.world.T_c_w[view], points.world.p_w)[points.point_of[view], 2]
+
+
+def view_of(points, view):
+    return make_view(points.keyframes[view].features, SCALE_FACTOR)
+
+
+def matches(points, i, j):
+    """Keypoints of keyframes i and j of the same points."""
+    common, a, b = np.intersect1d(points.point_of[i], points.point_of[j], return_indices=True)
+    assert len(common) > 80
+    return a, b
+
+
+def two_views(points, guess_depth, j=4):
+    a, b = matches(points, 0, j)
+    return two_view_map(points.keyframes[0], guess_depth, view_of(points, j), a, b, CAMERA, CONFIG)
+
+
+def witness(points, view, T_c_w=None):
+    a, b = matches(points, 0, view)
+    T = points.world.T_c_w[view] if T_c_w is None else T_c_w
+    return BootstrapView(view, points.keyframes[view].features.uv[b], np.ones(len(b)), a, T)
+
+
+def point_of_keypoint(points, two_view):
+    p = np.full((len(points.point_of[0]), 3), np.nan)
+    p[two_view.reference_keypoint] = two_view.p_w
+    return p
+
+
+def test_two_exact_views_give_the_exact_world(points):
+    found = two_views(points, z_in(points, 0))
+    assert found.ok
+    assert found.reason == ""
+    np.testing.assert_allclose(found.p_w, points.world.p_w[points.point_of[0][found.reference_keypoint]], atol=5e-3)
+    xi = se3.log(found.T_c_w @ se3.inverse(points.world.T_c_w[4]))
+    assert np.abs(xi).max() < 1e-3
+
+
+def test_scale_comes_from_the_guess(points):
+    """Twice the guessed depth: twice the baseline, about the first camera."""
+    one, two = (two_views(points, k * z_in(points, 0)) for k in (1.0, 2.0))
+    centre = points.keyframes[0].centre_w
+    np.testing.assert_allclose(two.p_w - centre, 2.0 * (one.p_w - centre), rtol=1e-6)
+    assert one.parallax_rad == two.parallax_rad
+
+
+def test_rotation_alone_is_refused_with_its_name(points):
+    turn = se3.exp(np.array([0, 0, 0, 0.02, 0.1, 0.0]))
+    ahead = np.flatnonzero(z_in(points, 0) > 1.0)
+    p_c = se3.transform(turn @ points.world.T_c_w[0], points.world.p_w[points.point_of[0][ahead]])
+    view = view_of(points, 0)
+    view.features.uv[ahead] = CAMERA.project(p_c)
+    reference = PointMap(np.random.default_rng(0), 10, 1).keyframes[0]
+    reference.features, reference.T_c_w = points.features(0, points.point_of[0]), points.world.T_c_w[0]
+    found = two_view_map(reference, z_in(points, 0), view, ahead, ahead, CAMERA, CONFIG)
+    assert not found.ok
+    assert found.reason == "pure rotation"
+
+
+def test_few_matches_are_refused_with_their_name(points):
+    a, b = matches(points, 0, 4)
+    view = view_of(points, 4)
+    assert (
+        two_view_map(points.keyframes[0], z_in(points, 0), view, a[:9], b[:9], CAMERA, CONFIG).reason == "few matches"
+    )
+    few = two_view_map(points.keyframes[0], z_in(points, 0), view, a[:40], b[:40], CAMERA, CONFIG)
+    assert not few.ok
+    assert "points triangulate" in few.reason
+
+
+def test_witnesses_agree_with_a_right_map_and_get_their_poses(points):
+    p = point_of_keypoint(points, two_views(points, z_in(points, 0)))
+    rough = [small_motion(np.random.default_rng(v), 0.05, 0.02) @ points.world.T_c_w[v] for v in (1, 2, 3)]
+    views = [witness(points, v, T) for v, T in zip((1, 2, 3), rough, strict=True)]
+    poses, share = poses_of_witnesses(views, p, CAMERA)
+    assert share > 0.95
+    for v, T in zip((1, 2, 3), poses, strict=True):
+        assert np.abs(se3.log(T @ se3.inverse(points.world.T_c_w[v]))).max() < 0.01
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_witnesses_refuse_a_wrong_map(points, seed):
+    """Points slid along the first camera's rays: that view still agrees with every one of them, others do not."""
+    rng = np.random.default_rng(seed)
+    p = point_of_keypoint(points, two_views(points, z_in(points, 0)))
+    centre = points.keyframes[0].centre_w
+    p = centre + (p - centre) * np.exp(rng.normal(0.0, 0.4, (len(p), 1)))
+    _, share = poses_of_witnesses([witness(points, v) for v in (1, 2, 3)], p, CAMERA)
+    assert share < WITNESS_SHARE
+
+
+def test_witness_that_sees_nothing_of_it_keeps_its_pose_and_says_nothing(points):
+    nothing = np.full((len(points.point_of[0]), 3), np.nan)
+    poses, share = poses_of_witnesses([witness(points, 1)], nothing, CAMERA)
+    np.testing.assert_array_equal(poses[0], points.world.T_c_w[1])
+    assert share == 1.0
+    assert poses_of_witnesses([], nothing, CAMERA) == ([], 1.0)
+
+
+def make_bootstrap(points, guess_depth):
+    tracker = Tracker(points.map, CAMERA, OrbConfig(), TrackingConfig(motion_radius_px=100.0))
+    reference = points.keyframes[0]
+    colour = np.zeros((len(reference.anchor), 3), np.uint8)
+    return Bootstrap(points.map, tracker, CONFIG, reference, guess_depth, colour)
+
+
+def test_guessed_map_is_replaced_and_the_map_stays_consistent(points):
+    spread = np.random.default_rng(1).normal(0.0, 0.05, len(points.point_of[0]))
+    bootstrap = make_bootstrap(points, z_in(points, 0) * np.exp(spread))
+    check_map(points.map)
+    assert points.map.anchors.from_depth[points.keyframes[0].anchor].all()
+    accepted = None
+    for view in (1, 2, 3, 4):
+        track = bootstrap.track(view_of(points, view), points.world.T_c_w[view])
+        assert track is not None
+        found = bootstrap.two_views(view, view_of(points, view), track)
+        accepted = found if found.ok and bootstrap.witnessed(found) else None
+    assert accepted is not None
+    keyframe = points.keyframes[4]
+    keyframe.T_c_w = accepted.T_c_w
+    between = bootstrap.replace_map(keyframe, accepted, LmConfig())
+    check_map(points.map)
+    alive = np.flatnonzero(points.map.anchors.alive)
+    assert len(alive) >= CONFIG.min_points
+    assert not points.map.anchors.from_depth[alive].any()
+    assert set(between) == {1, 2, 3}
+    # Up to the guess's scale, the frames between are where they were.
+    centre = points.keyframes[0].centre_w
+    moved = {v: se3.inverse(T)[:3, 3] - centre for v, T in between.items()}
+    truth = {v: se3.inverse(points.world.T_c_w[v])[:3, 3] - centre for v in between}
+    ratios = np.array([np.linalg.norm(moved[v]) / np.linalg.norm(truth[v]) for v in between])
+    assert np.ptp(ratios) / ratios.mean() < 0.03
+    assert 0.8 < ratios.mean() < 1.25
+
+
+def test_abandoned_attempt_leaves_no_guess_behind(points):
+    bootstrap = make_bootstrap(points, np.ones(len(points.point_of[0])))
+    bootstrap.abandon()
+    check_map(points.map)
+    assert len(points.map.anchors) == 0
+    assert 0 in points.map.keyframes
