@@ -265,6 +265,7 @@ class EdgeSlam:
             keyframe,
             guess,
             colours_at(keyframe.image, view.features.uv),
+            self.config.seed,
         )
         self._lost_frames = 0
         self._velocity = np.zeros(6)

@@ -68,6 +68,8 @@ class EdgeMap:
             keyframe = self.map.keyframes.get(self._waiting.pop(0))
             if keyframe is not None:  # it may have been found redundant meanwhile
                 self._measure(keyframe)
+                # Other keyframes' edges are searched in the grey image; the rest (3 MB) has done its work.
+                keyframe.image = keyframe.depth = None
 
     def _measure(self, keyframe: Keyframe) -> None:
         if keyframe.image is None or keyframe.grey is None:
@@ -126,7 +128,7 @@ class EdgeMap:
         chosen = []
         for other in self.map.covisible(keyframe, 4 * self.config.targets, min_shared=30):
             baseline = float(np.linalg.norm(other.centre_w - keyframe.centre_w)) / depth
-            if other.image is not None and 0.02 < baseline < 0.5:
+            if other.grey is not None and 0.02 < baseline < 0.5:
                 chosen.append(other)
         return chosen[: self.config.targets]
 

@@ -30,6 +30,7 @@ class Keyframe:
     tree: cKDTree
     """Over ``features.uv``."""
     depth: DepthMap | None = None
+    """Dropped, like ``image``, once the edges are measured."""
     image: NDArray[np.uint8] | None = None
     """Undistorted, ``(H, W, 3)`` BGR or ``(H, W)`` grey; for edges."""
     grey: NDArray[np.uint8] | None = None

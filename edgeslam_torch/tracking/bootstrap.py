@@ -27,10 +27,12 @@ class Bootstrap:
         reference: Keyframe,
         guess_depth: FloatArray,
         colour: np.ndarray,
+        seed: int = 0,
     ) -> None:
         self.map = slam_map
         self.tracker = tracker
         self.config = config
+        self.seed = seed
         self.reference = reference
         self.guess_depth = guess_depth
         self.views: list[BootstrapView] = []
@@ -73,6 +75,7 @@ class Bootstrap:
             track.matched_keypoint,
             self.tracker.camera,
             self.config,
+            self.seed,
         )
 
     def witnessed(self, two_view: TwoView) -> bool:

@@ -57,6 +57,7 @@ def two_view_map(
     keypoint: IntArray,
     camera: Camera,
     config: InitialisationConfig,
+    seed: int = 0,
 ) -> TwoView:
     """Try to triangulate the matches between the reference keyframe and the current frame.
 
@@ -68,9 +69,10 @@ def two_view_map(
         keypoint: ``(M,)`` their partners in the current frame.
         camera: Intrinsics.
         config: Thresholds.
+        seed: Of the essential matrix's random samples.
     """
     uv_r, uv_c = reference.features.uv[reference_keypoint], view.features.uv[keypoint]
-    motion = relative_pose(uv_r, uv_c, camera, min_parallax_rad=np.deg2rad(config.min_parallax_deg))
+    motion = relative_pose(uv_r, uv_c, camera, min_parallax_rad=np.deg2rad(config.min_parallax_deg), seed=seed)
     if motion.kind not in (MotionKind.GENERAL, MotionKind.PLANAR):
         return TwoView(False, str(motion.kind), motion.parallax_rad)
     p_r = triangulate(bearings(uv_r, camera.K), bearings(uv_c, camera.K), motion.T_j_i)

@@ -13,7 +13,12 @@ NO_MOTION_PX = 1.0
 
 
 def relative_pose(
-    uv_i: FloatArray, uv_j: FloatArray, camera: Camera, threshold_px: float = 1.0, min_parallax_rad: float = 0.01
+    uv_i: FloatArray,
+    uv_j: FloatArray,
+    camera: Camera,
+    threshold_px: float = 1.0,
+    min_parallax_rad: float = 0.01,
+    seed: int = 0,
 ) -> RelativePose:
     """Robust relative pose of matched undistorted pixels ``(M, 2)`` in two views.
 
@@ -26,6 +31,7 @@ def relative_pose(
         camera: Intrinsics.
         threshold_px: Inlier distance to the epipolar line.
         min_parallax_rad: Median ray angle below which the translation direction means nothing.
+        seed: Of the random samples.
     """
     nothing = np.zeros(len(uv_i), dtype=bool)
     if len(uv_i) < MIN_MATCHES:
@@ -33,7 +39,7 @@ def relative_pose(
     if np.median(np.linalg.norm(uv_i - uv_j, axis=1)) < NO_MOTION_PX:
         return RelativePose(MotionKind.NO_MOTION, np.eye(4), ~nothing, 0.0)
     a, b = np.ascontiguousarray(uv_i, np.float64), np.ascontiguousarray(uv_j, np.float64)
-    E, mask = cv2.findEssentialMat(a, b, camera.K, cv2.USAC_MAGSAC, 0.999, threshold_px)
+    E, mask = cv2.findEssentialMat(a, b, camera.K, camera.K, None, None, _magsac(threshold_px, seed))
     if E is None or E.shape != (3, 3):
         return RelativePose(MotionKind.DEGENERATE, np.eye(4), nothing, 0.0)
     inliers = mask.ravel().astype(bool)
@@ -48,6 +54,18 @@ def relative_pose(
     angle = float(np.median(parallax(ray_i, ray_j, R)))
     kind = _kind(ray_i, ray_j, a[inliers], b[inliers], angle, min_parallax_rad, threshold_px)
     return RelativePose(kind, T_j_i, inliers, angle)
+
+
+def _magsac(threshold_px: float, seed: int) -> cv2.UsacParams:
+    """What `cv2.USAC_MAGSAC` stands for, with a seed of its own: that flag ignores `cv2.setRNGSeed`."""
+    parameters = cv2.UsacParams()
+    parameters.randomGeneratorState = seed
+    parameters.score = cv2.SCORE_METHOD_MAGSAC
+    parameters.sampler = cv2.SAMPLING_UNIFORM
+    parameters.loMethod = cv2.LOCAL_OPTIM_SIGMA
+    parameters.loIterations, parameters.loSampleSize = 10, 20
+    parameters.threshold, parameters.confidence, parameters.maxIterations = threshold_px, 0.999, 1000
+    return parameters
 
 
 def _kind(
