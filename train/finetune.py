@@ -15,6 +15,7 @@ from edgeslam_torch.models.fastdepth import FastDepth
 from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.train.augment import View
 from edgeslam_torch.train.datasets import DepthFolder
+from edgeslam_torch.train.densify import teach
 from edgeslam_torch.train.distributed import rank
 from edgeslam_torch.train.posed import PosedSequence, PosedView
 from edgeslam_torch.train.recipe import Hooks, TrainConfig, train
@@ -115,6 +116,9 @@ def build_signals(
     usable = [s for s in posed if s.usable]
     if usable:
         scales = [0.0 if s.metric else fit_log_scale(*_points_and_depths(network, metadata, s)) for s in usable]
+        # Dense but only as good as the starting network between the map's points; then what the images themselves say.
+        taught = [Source(s.name, teach(network, metadata, s, k), 1.0) for s, k in zip(usable, scales, strict=True)]
+        signals.append(Supervised(taught, metadata, name="teacher"))
         signals.append(SelfSupervised(usable, metadata, scales))
     return signals
 

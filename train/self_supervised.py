@@ -41,7 +41,7 @@ cost."""
 class SelfSupervisedWeights:
     """Weights of the terms; 0 leaves one out."""
 
-    photometric: float = 1.0
+    photometric: float = 0.3
     points: float = 1.0
     cycle: float = 0.5
     straight: float = 0.1
