@@ -139,9 +139,10 @@ def _report(result: "RunResult", source: "Source") -> None:
     if summary["dropped_frames"]:
         print(f"{summary['dropped_frames']} frames dropped to keep up")
     if scale["units"] == "metres":
-        print(f"scale from {scale['source']}: {scale['value']:.4f} +- {scale['sigma']:.4f}, units are metres")
+        percent = 100.0 * scale["sigma"] / scale["value"]
+        print(f"units are metres: scale from {scale['source']}, good to {percent:.1f} % (one sigma)")
     else:
-        print("scale unknown (no telemetry, no depth network): units are arbitrary")
+        print("units are arbitrary: neither telemetry nor a depth network told the scale")
     counts = summary["map"]
     print(f"map: {counts['edge_points']} edge points, {counts['anchors']} anchors, {counts['keyframes']} keyframes")
     print(f"results: {result.folder} (look at {_best_view(result.folder)})")
