@@ -183,18 +183,19 @@ class _Window:
         """Blocks of the normal equations at the current state."""
         T, F, A = self.state.T_c_w, len(self.free), len(self.state.p_w)
         r, Jp, Jl, value = self._factors()
-        self.Jp, self.Jl = Jp, Jl
-        self.H = torch.zeros(6 * F, 6 * F, dtype=T.dtype)
-        self.g = torch.zeros(6 * F, dtype=T.dtype)
-        g_pose = (Jp * r[:, None, : self.n_free]).sum(0)
+        self.Jp, self.Jl = Jp[:, :6], Jl
+        normal = torch.zeros(F, 7, 7, dtype=T.dtype)
         for chunk in self.chunks:
             for pose, lo, hi in chunk.slices:
-                block = Jp[:, :, lo:hi]
-                at = slice(6 * pose, 6 * pose + 6)
-                self.H[at, at] += (block @ block.mT).sum(0)
-                self.g[at] += g_pose[:, lo:hi].sum(1)
+                for row in Jp[:, :, lo:hi]:
+                    normal[pose].addmm_(row, row.mT)
+        self.H = torch.zeros(F, 6, F, 6, dtype=T.dtype)
+        each = torch.arange(F)
+        self.H[each, :, each] = normal[:, :6, :6]
+        self.H, self.g = self.H.view(6 * F, 6 * F), normal[:, :6, 6].flatten()
         sums = torch.zeros(9, A, dtype=T.dtype)
-        sums.index_add_(1, self.anchor, torch.cat((schur.triangle(Jl), (Jl * r[:, None]).sum(0))))
+        own = torch.cat((schur.triangle(Jl), schur.row_products(Jl, r[:, None])[:, 0]))
+        sums.index_add_(1, self.anchor, own)
         self.V, self.g_point = sums[:6], sums[6:]
         cost = float(value.sum()) + self.priors.linearise(T, self.H, self.g)
         cost += sum(float(b.linearise(T, x, self.H, self.g)) for b, x in self._blocks(self.state))
@@ -273,7 +274,10 @@ class _Window:
         return self._seen[1:]
 
     def _factors(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Whitened, weighted rows: residual, by pose (free ones), by anchor; and the robust costs."""
+        """Whitened, weighted rows; and the robust costs.
+
+        Residuals ``(2, M)``, by the free poses with the residual as seventh ``(2, 7, n)``, by anchor ``(2, 3, M)``.
+        """
         R, p_c = self._camera_points(self.state)
         r, Jp, Jl = reprojection_jacobians(R, p_c, self.uv, self.K)
         if len(self.depth_rows):
@@ -285,8 +289,9 @@ class _Window:
         s = torch.where(in_front, (r * r).sum(0) * self.inv_sigma.square(), self.behind)
         value, weight = rho(s, self.config.kernel, self.config.delta)
         root = torch.where(in_front, weight.sqrt() * self.inv_sigma, 0.0)
+        r, Jl = r.mul_(root), Jl.mul_(root)
         n = self.n_free
-        r, Jp, Jl = r.mul_(root), Jp[..., :n].mul_(root[:n]), Jl.mul_(root)
+        Jp = torch.cat((Jp[..., :n].mul_(root[:n]), r[:, None, :n]), 1)
         if not bool(in_front.all()):  # 0 * inf where a point sits on the camera plane
             r, Jp, Jl = r.nan_to_num_(0, 0, 0), Jp.nan_to_num_(0, 0, 0), Jl.nan_to_num_(0, 0, 0)
         return r, Jp, Jl, value
