@@ -10,6 +10,7 @@ import numpy as np
 from edgeslam_torch.fusion.config import FusionConfig
 from edgeslam_torch.fusion.delayed import BufferedEkf
 from edgeslam_torch.fusion.ekf import EkfState
+from edgeslam_torch.fusion.mount import Mount, estimate_mount
 from edgeslam_torch.fusion.rotations import mean_rotation, rotation_vector
 from edgeslam_torch.fusion.scale import (
     DepthRatio,
@@ -288,6 +289,27 @@ class MotionFusion:
             stamp_s, T, last.sigma_t + sigma_m / estimate.value, math.radians(0.5) + 0.002 * gap, "telemetry"
         )
 
+    def mount(self) -> Mount | None:
+        """How the camera sits on the body, estimated from the flight; ``None`` without enough motion."""
+        if len(self._intervals) == 0 or len(self._track) < 2:
+            return None
+        from_s, to_s, moved, sigma = self._visual_displacements()
+        use = self._track.covered(from_s - self._delay_s, to_s - self._delay_s)
+        if not use.any():
+            return None
+        from_s, to_s = from_s[use] - self._delay_s, to_s[use] - self._delay_s
+        told = self._track.displacement(to_s, self._shortfall_m_s)
+        told -= self._track.displacement(from_s, self._shortfall_m_s)
+        R_m_c = np.array([i.T_from[:3, :3] for i in self._intervals])[use]
+        return estimate_mount(
+            np.einsum("nji,nj->ni", R_m_c, moved[use]),
+            np.einsum("nji,nj->ni", self._track.attitude(from_s), told),
+            to_s - from_s,
+            sigma[use],
+            self.config.sigma_velocity_m_s,
+            self.T_b_c[:3, :3],
+        )
+
     def statistics(self) -> dict[str, float]:
         """Counters and the state of the estimates, for the report."""
         numbers: dict[str, float] = dict(self._counts)
@@ -299,6 +321,10 @@ class MotionFusion:
         numbers["video delay sigma s"] = self._delay_sigma_s
         if self._fit is not None:
             numbers["displacement residual m"] = self._fit.rms_m
+        mount = self.mount()
+        if mount is not None:
+            numbers["camera tilt deg"] = math.degrees(mount.tilt_rad)
+            numbers["camera tilt sigma deg"] = math.degrees(mount.tilt_sigma_rad)
         for opinion in [*self._telemetry_opinions, *filter(None, [self._depth.estimate()])]:
             numbers[f"scale {opinion.source}"] = math.exp(opinion.log_scale)
             numbers[f"scale {opinion.source} sigma"] = math.exp(opinion.log_scale) * opinion.sigma

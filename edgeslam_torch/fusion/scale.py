@@ -37,6 +37,8 @@ class DisplacementFit:
     sigma: float
     rotation: FloatArray
     """``(3, 3)`` small correction of the map-to-world rotation."""
+    rotation_sigma_rad: FloatArray
+    """``(3,)`` standard deviations of it, about x, y, z."""
     bias_m_s: FloatArray
     """``(K, 3)`` velocity bias of each block."""
     rms_m: float
@@ -117,10 +119,11 @@ def fit_displacements(
     effective = _effective_share(residual * weight[:, None])
     covariance = np.linalg.inv(0.5 * (information + information.T))
     sigma = math.sqrt(max(float(covariance[0, 0]), 0.0) / effective)
+    turn_sigma = np.sqrt(np.maximum(np.diag(covariance)[1:4], 0.0) / effective)
     rms = math.sqrt(float(np.sum(weight[:, None] * residual**2) / max(3.0 * float(weight.sum()), 1e-9)))
     if weight.sum() < _MIN_DISPLACEMENTS or not math.isfinite(sigma):
         return None
-    return DisplacementFit(log_scale, sigma, R, bias, rms, n)
+    return DisplacementFit(log_scale, sigma, R, turn_sigma, bias, rms, n)
 
 
 def _prior(K: int, alignment_sigma_rad: float, bias_sigma_m_s: float, bias_step_m_s: float) -> FloatArray:

@@ -213,6 +213,20 @@ def test_filter_follows_the_flight_in_metres(rng, swinging, replay):
     assert fusion.statistics()["ekf visual accepted"] > 100
 
 
+@pytest.mark.parametrize("true_tilt_deg", [12.0, 25.0])
+def test_tilt_of_the_camera_is_estimated_from_the_flight(rng, swinging, replay, true_tilt_deg):
+    """Assumed 12 degrees; the drone carries its camera differently."""
+    base = swinging(40.0)
+    T_true = camera_on_body(math.radians(true_tilt_deg))
+    motion = replace(base, T_w_c=base.T_w_c @ se3.inverse(T_B_C) @ T_true)
+    samples = simulate(rng, motion.stamps_s, motion.T_w_c, T_true).samples()
+    fusion = MotionFusion(FusionConfig(), T_B_C)
+    replay(fusion, motion, motion.in_gauge(rng), samples)
+    mount = fusion.mount()
+    assert math.degrees(mount.tilt_rad) == pytest.approx(true_tilt_deg, abs=3.0)
+    assert math.degrees(mount.tilt_sigma_rad) < 3.0
+
+
 def test_statistics_are_plain_numbers(rng, swinging, replay):
     fusion, _, _ = fused(rng, swinging(8.0), replay)
     assert all(isinstance(v, int | float) for v in fusion.statistics().values())
