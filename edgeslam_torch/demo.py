@@ -48,8 +48,8 @@ class DemoSettings:
     """What is flown."""
 
     world: str = "room"
-    seconds: float = 20.0
-    rate_hz: float = 15.0
+    seconds: float = 16.0
+    rate_hz: float = 20.0
     seed: int = 0
     images: str = "normal"
     """A name in `CAMERAS`."""

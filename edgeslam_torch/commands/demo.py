@@ -18,8 +18,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--out", type=Path, default=Path("runs/demo"), metavar="DIR", help="results (default: runs/demo)"
     )
     parser.add_argument("--world", default="room", help="room or corridor (default: room)")
-    parser.add_argument("--seconds", type=float, default=20.0, metavar="N", help="length of the flight (default: 20)")
-    parser.add_argument("--rate", type=float, default=15.0, metavar="HZ", help="images a second (default: 15)")
+    parser.add_argument("--seconds", type=float, default=16.0, metavar="N", help="length of the flight (default: 16)")
+    parser.add_argument("--rate", type=float, default=20.0, metavar="HZ", help="images a second (default: 20)")
     parser.add_argument(
         "--seed", type=int, default=0, help="another number gives another place and flight (default: 0)"
     )

@@ -31,11 +31,13 @@ class FlightPlan:
     """Cruising speed; never exceeded by more than the take-off's half metre a second."""
     yaw_rate_rad_s: float = np.deg2rad(35.0)
     hover_height_m: float = 1.15
-    height_spread_m: float = 0.4
+    height_spread_m: float = 0.3
     clearance_m: float = 0.45
     """Kept from walls and furniture."""
     take_off: bool = True
-    """Start on the floor (camera at 12 cm) and climb."""
+    """Start low and climb to the hover height, half a metre a second."""
+    start_height_m: float = 0.4
+    """Where the climb starts: just after lift-off. On the floor a Tello's camera is at 0.07 m."""
     glance_rad: float = np.deg2rad(25.0)
     """How far the drone looks aside from where it flies."""
     view_m: float = 1.8
@@ -132,7 +134,7 @@ def _control_points(rng: np.random.Generator, world: World, duration_s: float, p
     yaw = _open_direction(rng, world, here)
     rows = []
     if plan.take_off:
-        floor = float(world.floor_below(here[None])[0]) + 0.12
+        floor = float(world.floor_below(here[None])[0]) + plan.start_height_m
         climb = np.arange(floor, here[2], 0.5 * KNOT_S)
         rows += [[here[0], here[1], z, yaw] for z in climb]
     rows.append([*here, yaw])
