@@ -4,7 +4,7 @@ The state is :math:`x = (p, \alpha)`, position and roll-pitch-yaw in the power-o
 velocity bias and a clone of the pose at the last visual update, which relative visual measurements need.
 
 Note:
-    The printed filter and the corrected default differ in seven points (docs/decisions.md, "EKF");
+    The printed filter and the corrected default differ in seven points (docs/tello.md, "The filter");
     ``FusionConfig.literal`` selects the printed one.
 """
 
