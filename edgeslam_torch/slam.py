@@ -228,7 +228,9 @@ class EdgeSlam:
         self._T_c_w = T_predicted
         self._velocity = 0.8 * self._velocity  # a prediction is worth less every frame
         self._fusion.add_visual(frame.stamp_s, se3.inverse(T_predicted), np.inf, np.inf, tracked=False)
-        if self._lost_frames >= LOST_FRAMES_BEFORE_RESTART and len(view.features.uv) >= 2 * MIN_KEYPOINTS:
+        # With nothing to come back to, as after dark first images, what starts a map at first starts one now.
+        enough = 2 * MIN_KEYPOINTS if len(self.map.anchors) > 0 else MIN_KEYPOINTS
+        if self._lost_frames >= LOST_FRAMES_BEFORE_RESTART and len(view.features.uv) >= enough:
             self.events["restarted"] += 1
             return self._start(frame, view, "new piece of map after loss, pose predicted")
         seen = len(view.features.uv)
@@ -294,22 +296,21 @@ class EdgeSlam:
         self._move(frame.stamp_s, track.T_c_w)
         with self._timed("initialisation"):
             two_view = bootstrap.two_views(frame.index, view, track)
-            accepted = two_view.ok and bootstrap.witnessed(two_view)
-        if two_view.ok and not accepted:
-            self.events["initialisations_refused"] += 1
-        if accepted:
+            if two_view.ok:
+                two_view = bootstrap.confirm(view, two_view)
+                self.events["initialisations_refused"] += not two_view.ok
+        if two_view.ok:
             keyframe = self._initialise(frame, view, bootstrap, two_view)
             return self._output(
                 frame, keyframe, FrameStatus.INITIALISED, "two views", track, two_view.parallax_rad, True
             )
         if track.inliers < HANDOVER_INLIERS:
             return self._start(frame, view, "first keyframe out of sight before parallax sufficed")
-        reason = two_view.reason or "two views refused by the frames between"
         return self._output(
             frame,
             bootstrap.reference,
             FrameStatus.INITIALISED,
-            f"initialising: {reason}",
+            f"initialising: {two_view.reason}",
             track,
             two_view.parallax_rad,
             False,

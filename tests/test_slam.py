@@ -1,0 +1,304 @@
+"""The whole system on short rendered flights."""
+
+import re
+from dataclasses import replace
+from functools import lru_cache
+
+import cv2
+import numpy as np
+import pytest
+from point_map import check_map
+from rendered import CAMERA, film, patchwork, sideways, stairs_world
+
+from edgeslam_torch.config import DepthConfig, SlamConfig
+from edgeslam_torch.errors import SourceError
+from edgeslam_torch.eval.align import umeyama
+from edgeslam_torch.fusion.published import T_LEVEL
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.slam import EdgeSlam
+from edgeslam_torch.types import Frame, FrameStatus, TelemetrySample, Units
+
+NO_NETWORK = SlamConfig(depth=DepthConfig(weights="none"))
+TRACKING = {FrameStatus.INITIALISED, FrameStatus.TRACKED, FrameStatus.RELOCALISED}
+BLACK = np.zeros((240, 320, 3), np.uint8)
+
+
+def go(frames, depth=None, config=NO_NETWORK):
+    """A system after all frames, and its outputs."""
+    slam = EdgeSlam(CAMERA, config, depth=depth)
+    outputs = [slam.step(frame) for frame in frames]
+    check_map(slam.map)
+    slam.finish()
+    check_map(slam.map)
+    return slam, outputs
+
+
+@lru_cache(maxsize=1)
+def panels():
+    """40 images past panels at many depths: 1.2 m sideways, turning by 9 degrees."""
+    return film(stairs_world(), CAMERA, sideways(40, 0.03, turn_rad=0.004))
+
+
+@lru_cache(maxsize=1)
+def panels_run():
+    return go(panels().frames)
+
+
+@lru_cache(maxsize=1)
+def metric_run():
+    return go(panels().frames, panels().depth_function())
+
+
+@lru_cache(maxsize=1)
+def short_run():
+    return go(panels().frames[:16])
+
+
+def ate(T_w_c, truth, kind="sim3"):
+    found = umeyama(T_w_c[:, :3, 3], truth[:, :3, 3], kind)
+    error = np.linalg.norm(found.points(T_w_c[:, :3, 3]) - truth[:, :3, 3], axis=1)
+    return float(np.sqrt(np.mean(error**2)))
+
+
+def statuses(outputs):
+    return [o.status for o in outputs]
+
+
+# -- what it is for ----------------------------------------------------------------------------------------------
+
+
+def test_sideways_flight_without_a_network_is_right_up_to_scale():
+    slam, outputs = panels_run()
+    stamps, T_w_c = slam.trajectory()
+    assert ate(T_w_c, panels().T_w_c) < 0.012  # 1 % of the path; 0.004 when written
+    np.testing.assert_array_equal(stamps, panels().stamps_s)
+    assert set(statuses(outputs)) <= TRACKING
+    assert slam.events["lost"] == slam.events["restarted"] == 0
+    assert slam.scale.units is Units.ARBITRARY
+    assert outputs[0].reason == "first frame, depth guessed"
+    assert [o.reason for o in outputs if o.status is FrameStatus.TRACKED] == [""] * statuses(outputs).count("tracked")
+
+
+def test_flight_with_known_depth_is_metric():
+    slam, outputs = metric_run()
+    _, T_w_c = slam.trajectory()
+    truth = panels().T_w_c
+    assert ate(T_w_c, truth) < 0.012
+    assert ate(T_w_c, truth, "se3") < 0.04
+    assert slam.scale.units is Units.METRES
+    assert slam.scale.source == "depth"
+    assert set(statuses(outputs)) <= TRACKING
+    a, b = (np.linalg.inv(T[0]) @ T[-1] for T in (T_w_c, truth))
+    assert np.rad2deg(np.linalg.norm(se3.log(a)[3:] - se3.log(b)[3:])) < 0.5
+
+
+def test_edge_map_and_anchors_lie_on_the_surfaces():
+    slam, _ = panels_run()
+    _, T_w_c = slam.trajectory()
+    aligned = umeyama(T_w_c[:, :3, 3], panels().T_w_c[:, :3, 3], "sim3")
+    for cloud, least in ((slam.edge_map(), 5000), (slam.anchors(), 300)):
+        assert len(cloud.p_w) >= least
+        distance = panels().world.distance_to_surface(aligned.points(cloud.p_w.astype(np.float64)))
+        # Half a pixel at 260 px over a baseline of 40 cm is 4 cm at 3 m and 8 cm at the wall.
+        assert np.median(distance) < 0.05
+        assert np.mean(distance < 0.2) > 0.85
+        assert cloud.observations.min() >= 2
+        assert np.isfinite(cloud.p_w).all()
+    assert slam.edge_map().colour.std() > 20
+
+
+def test_two_runs_give_the_same_bytes():
+    (a, out_a), (b, out_b) = short_run(), go(panels().frames[:16])
+    assert a.trajectory()[1].tobytes() == b.trajectory()[1].tobytes()
+    assert a.edge_map().p_w.tobytes() == b.edge_map().p_w.tobytes()
+    assert a.anchors().p_w.tobytes() == b.anchors().p_w.tobytes()
+    for x, y in zip(out_a, out_b, strict=True):
+        assert x.T_w_c.tobytes() == y.T_w_c.tobytes()
+        assert replace(x, T_w_c=y.T_w_c, stage_ms={}) == replace(y, stage_ms={})
+
+
+def test_grey_images_give_the_poses_of_colour_ones():
+    grey = [replace(f, image=cv2.cvtColor(f.image, cv2.COLOR_BGR2GRAY)) for f in panels().frames[:16]]
+    (a, _), (b, _) = short_run(), go(grey)
+    np.testing.assert_array_equal(a.trajectory()[1], b.trajectory()[1])
+    colour = b.anchors().colour
+    assert len(colour) > 0
+    assert (colour == colour[:, :1]).all()
+
+
+def test_every_pose_is_a_rigid_motion_and_every_stage_is_timed():
+    slam, outputs = metric_run()
+    for T in [*(o.T_w_c for o in outputs), *slam.trajectory()[1]]:
+        np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-9)
+        assert np.isfinite(T).all()
+    assert all({"features", "tracking"} <= set(o.stage_ms) for o in outputs[1:])
+    assert [o.index for o in outputs] == list(range(40))
+
+
+# -- how it starts -----------------------------------------------------------------------------------------------
+
+
+def test_first_camera_is_level_and_looks_along_x():
+    _, outputs = go(panels().frames[:1])
+    np.testing.assert_allclose(outputs[0].T_w_c, T_LEVEL, atol=1e-12)
+
+
+def test_first_camera_turns_as_the_drone_says():
+    """Facing left, nose level: the camera looks along y and down by its tilt, and the world's z is up."""
+    slam = EdgeSlam(CAMERA, NO_NETWORK)
+    sample = TelemetrySample(99.9, velocity_m_s=np.zeros(3), rpy_rad=np.array([0.0, 0.0, np.pi / 2]))
+    T = slam.step(panels().frames[0], [sample]).T_w_c
+    np.testing.assert_allclose(T[:3, 2], [0, np.cos(np.deg2rad(12)), -np.sin(np.deg2rad(12))], atol=1e-9)
+
+
+def test_one_frame_is_a_trajectory_of_one_and_an_empty_map():
+    slam, outputs = go(panels().frames[:1])
+    assert statuses(outputs) == [FrameStatus.INITIALISED]
+    assert slam.trajectory()[1].shape == (1, 4, 4)
+    assert slam.edge_map().p_w.shape == (0, 3)
+    assert slam.anchors().p_w.shape == (0, 3)
+
+
+def test_no_frame_at_all():
+    slam = EdgeSlam(CAMERA, NO_NETWORK)
+    slam.finish()
+    assert slam.trajectory()[1].shape == (0, 4, 4)
+    assert slam.edge_map().p_w.shape == (0, 3)
+
+
+@pytest.mark.parametrize("depth", [True, False])
+def test_standing_still_stays_put(depth):
+    first = panels().frames[0]
+    frames = [replace(first, index=i, stamp_s=0.1 * i) for i in range(12)]
+    _, outputs = go(frames, panels().depth_function() if depth else None)
+    assert {o.reason for o in outputs[1:]} == {"initialising: no motion"}
+    T = np.stack([o.T_w_c for o in outputs])
+    assert np.abs(T[:, :3, 3]).max() < 1e-3
+
+
+def test_turning_on_the_spot_is_no_initialisation():
+    """Rotation is known from the first frame; no translation is made up and no two-view map accepted."""
+    poses = sideways(10, 0.0, turn_rad=0.015)
+    turning = film(stairs_world(), CAMERA, poses)
+    slam, outputs = go(turning.frames)
+    assert all(o.reason in ("initialising: pure rotation", "initialising: no motion") for o in outputs[1:])
+    last = se3.log(se3.inverse(outputs[0].T_w_c) @ outputs[-1].T_w_c)
+    assert np.linalg.norm(last[3:] - [0.0, 0.135, 0.0]) < 0.01
+    assert np.linalg.norm(last[:3]) < 0.03  # of guessed units, everything a unit away
+    assert len(slam.anchors().p_w) == 0
+
+
+@pytest.mark.parametrize("grey", [0, 200])
+def test_constant_images_at_the_start_are_waited_out(grey):
+    frames = panels().with_images(lambda i, image: np.full_like(image, grey) if i < 4 else image)[:20]
+    slam, outputs = go(frames)
+    assert statuses(outputs)[0] is FrameStatus.LOST
+    assert "only 0 keypoints" in outputs[0].reason
+    assert all(o.status in (FrameStatus.LOST, FrameStatus.PREDICTED) for o in outputs[:4])
+    assert statuses(outputs)[4] is FrameStatus.INITIALISED
+    assert set(statuses(outputs)[4:]) <= TRACKING
+    assert ate(slam.trajectory()[1][4:], panels().T_w_c[4:20]) < 0.012
+
+
+def test_black_images_and_nothing_else():
+    frames = [Frame(i, float(i), BLACK) for i in range(30)]
+    slam, outputs = go(frames)
+    assert set(statuses(outputs)) <= {FrameStatus.LOST, FrameStatus.PREDICTED}
+    assert all("only 0 keypoints" in o.reason for o in outputs)
+    assert slam.trajectory()[1].shape == (30, 4, 4)
+    assert np.ptp(slam.trajectory()[1], axis=0).max() < 1e-9
+
+
+def test_black_image_while_initialising_costs_only_that_frame():
+    frames = panels().with_images(lambda i, image: BLACK if i == 3 else image)[:20]
+    slam, outputs = go(frames)
+    assert outputs[3].status in (FrameStatus.LOST, FrameStatus.PREDICTED)
+    assert set(statuses(outputs)[5:]) <= TRACKING
+    assert ate(slam.trajectory()[1][5:], panels().T_w_c[5:20]) < 0.012
+
+
+# -- when it goes wrong ------------------------------------------------------------------------------------------
+
+
+def test_black_stretch_is_predicted_and_then_found_again():
+    frames = panels().with_images(lambda i, image: BLACK if 18 <= i < 23 else image)[:30]
+    slam, outputs = go(frames)
+    assert statuses(outputs)[18:23] == [FrameStatus.PREDICTED] * 5
+    assert {o.reason for o in outputs[18:23]} == {"only 0 keypoints"}
+    assert statuses(outputs)[23] is FrameStatus.RELOCALISED
+    assert outputs[23].reason == "found again among the keyframes"
+    assert (slam.events["lost"], slam.events["relocalised"]) == (1, 1)
+    seen = np.r_[0:18, 23:30]
+    assert ate(slam.trajectory()[1][seen], panels().T_w_c[seen]) < 0.012
+
+
+def test_kidnapped_camera_is_found_where_it_was_put():
+    """Black, then back to where it was 12 frames ago."""
+    order = [*range(24), -1, -1, *range(12, 18)]
+    frames = [Frame(i, 0.1 * i, BLACK if k < 0 else panels().frames[k].image) for i, k in enumerate(order)]
+    slam, outputs = go(frames)
+    assert statuses(outputs)[26] is FrameStatus.RELOCALISED
+    assert set(statuses(outputs)[27:]) == {FrameStatus.TRACKED}
+    seen = np.array([i for i, k in enumerate(order) if k >= 0])
+    truth = panels().T_w_c[np.array(order)[seen]]
+    assert ate(slam.trajectory()[1][seen], truth) < 0.015
+
+
+def elsewhere():
+    """Another place that the map does not know."""
+    rng = np.random.default_rng(77)
+    images = [patchwork(rng, 400, 500) for _ in range(2)]
+
+    def image(shift):
+        far = np.roll(images[0], shift, axis=1)[:240, :320].copy()
+        far[60:180, 80 + 2 * shift : 200 + 2 * shift] = images[1][60:180, 80:200]
+        return far
+
+    return image
+
+
+def test_after_a_long_loss_a_new_piece_of_map_begins():
+    image = elsewhere()
+    frames = [*panels().frames[:16], *(Frame(i, 100 + 0.1 * i, image(0)) for i in range(16, 45))]
+    slam, outputs = go(frames)
+    lost = statuses(outputs)[16:35]
+    assert set(lost) == {FrameStatus.PREDICTED}
+    assert outputs[20].reason == "too few keypoints agree with the map"
+    restart = [o for o in outputs if o.reason == "new piece of map after loss, pose predicted"]
+    assert [o.index for o in restart] == [35]
+    assert set(statuses(outputs)[35:]) == {FrameStatus.INITIALISED}
+    assert slam.events["restarted"] == 1
+    T = slam.trajectory()[1]
+    assert ate(T[:16], panels().T_w_c[:16]) < 0.012  # what was mapped before is kept
+    assert np.linalg.norm(T[44, :3, 3] - T[35, :3, 3]) < 0.05
+    assert np.linalg.norm(T[35, :3, 3] - T[15, :3, 3]) < 1.0  # the prediction does not run away
+
+
+def test_few_keypoints_after_a_dark_start_still_begin_a_map():
+    """150 keypoints are enough for a first frame; they must be enough after black ones too."""
+    poor = replace(NO_NETWORK, orb=replace(NO_NETWORK.orb, features=150, candidates=300))
+    slam = EdgeSlam(CAMERA, poor)
+    outputs = [slam.step(Frame(i, 0.1 * i, BLACK)) for i in range(3)]
+    outputs += [slam.step(replace(f, index=3 + i, stamp_s=1.0 + f.stamp_s)) for i, f in enumerate(panels().frames[:6])]
+    assert outputs[-1].status in TRACKING
+
+
+# -- what it refuses ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("stamp_s", [100.0, 99.0])
+def test_stamp_that_does_not_increase_is_refused_and_changes_nothing(stamp_s):
+    slam = EdgeSlam(CAMERA, NO_NETWORK)
+    slam.step(panels().frames[0])
+    with pytest.raises(SourceError, match=re.escape(f"stamp {stamp_s} s does not follow 100.0 s")):
+        slam.step(replace(panels().frames[1], stamp_s=stamp_s))
+    slam.step(panels().frames[1])
+    assert len(slam.trajectory()[0]) == 2
+
+
+@pytest.mark.parametrize("shape", [(480, 640, 3), (240, 321, 3), (320, 240)])
+def test_image_of_another_size_is_refused_by_name(shape, tmp_path):
+    slam = EdgeSlam(CAMERA, NO_NETWORK)
+    with pytest.raises(SourceError, match=rf"0001.png: image is {shape[1]}x{shape[0]}, the calibration 320x240"):
+        slam.step(Frame(0, 0.0, np.zeros(shape, np.uint8), tmp_path / "0001.png"))
+    assert slam.step(panels().frames[0]).status is FrameStatus.INITIALISED
