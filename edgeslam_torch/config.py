@@ -83,6 +83,8 @@ class InitialisationConfig:
     min_points: int = 80
     """Anchors that must triangulate well."""
     max_reprojection_px: float = 2.0
+    max_direction_sigma: float = 0.05
+    """Standard deviation of the second camera's position, relative to the baseline, above which two views wait."""
 
     def __post_init__(self) -> None:
         _positive(self, "min_parallax_deg", "min_points", "max_reprojection_px")

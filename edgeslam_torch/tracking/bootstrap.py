@@ -1,5 +1,8 @@
 """The map's first moments: track against guessed depths until two views can replace them."""
 
+import logging
+from dataclasses import replace
+
 import numpy as np
 
 from edgeslam_torch.config import InitialisationConfig
@@ -8,12 +11,17 @@ from edgeslam_torch.mapping.keyframe import Keyframe
 from edgeslam_torch.mapping.refinement import Window, refine
 from edgeslam_torch.mapping.slam_map import SlamMap
 from edgeslam_torch.optim.problem import LmConfig, ScalePrior
-from edgeslam_torch.tracking.initialiser import BootstrapView, TwoView, poses_of_witnesses, two_view_map
+from edgeslam_torch.tracking.initialiser import BootstrapView, TwoView, consensus, poses_of_witnesses, two_view_map
 from edgeslam_torch.tracking.tracker import Track, Tracker, View
 from edgeslam_torch.types import FloatArray
 
+logger = logging.getLogger(__name__)
+
 WITNESS_SHARE = 0.6
 """Share of matches in the frames between that must agree with a two-view map, or it is refused."""
+
+AGREEING_SHARE = 0.8
+"""The same after all frames were refined together; 95 % would agree if every match were right."""
 
 
 class Bootstrap:
@@ -78,12 +86,20 @@ class Bootstrap:
             self.seed,
         )
 
-    def witnessed(self, two_view: TwoView) -> bool:
-        """Whether the frames in between agree with the two-view map."""
+    def confirm(self, view: View, two_view: TwoView) -> TwoView:
+        """The structure refined over all frames, or refused with the reason."""
         points = np.full((len(self.reference.anchor), 3), np.nan)
         points[two_view.reference_keypoint] = two_view.p_w
-        _, share = poses_of_witnesses(self.views[:-1], points, self.tracker.camera)
-        return share >= WITNESS_SHARE
+        poses, share = poses_of_witnesses(self.views[:-1], points, self.tracker.camera)
+        if share < WITNESS_SHARE:
+            return replace(two_view, ok=False, reason="the frames between disagree with two views")
+        joint = consensus(self.reference, two_view, view, self.views[:-1], poses, self.tracker.camera)
+        logger.debug("initialisation: %s", joint)
+        if joint.agreeing < AGREEING_SHARE or len(joint.two_view.p_w) < self.config.min_points:
+            return replace(two_view, ok=False, reason="the frames together disagree with two views")
+        if joint.direction_sigma > self.config.max_direction_sigma:
+            return replace(two_view, ok=False, reason="a turn cannot yet be told from a shift")
+        return joint.two_view
 
     def replace_map(self, keyframe: Keyframe, two_view: TwoView, lm: LmConfig) -> dict[int, FloatArray]:
         """Put the two-view map in place of the guessed one and refine it.

@@ -6,7 +6,7 @@ gives structure that owes nothing to the guess but its scale. The result is refu
 which took no part in it, agree.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -15,10 +15,15 @@ from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.triangulation import bearings, triangulate
 from edgeslam_torch.mapping.keyframe import Keyframe
+from edgeslam_torch.optim.local_ba import refine_window
 from edgeslam_torch.optim.pose_only import refine_pose
+from edgeslam_torch.optim.problem import LmConfig, ScalePrior, WindowProblem
 from edgeslam_torch.tracking.relative_pose import relative_pose
 from edgeslam_torch.tracking.tracker import View
 from edgeslam_torch.types import FloatArray, IntArray, MotionKind
+
+CHI2_2 = 5.991
+"""Chi-square, two degrees of freedom, 95 %."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,3 +134,91 @@ def poses_of_witnesses(
         poses.append(result.T_c_w)
         shares.append(float(result.inliers.mean()))
     return poses, float(np.median(shares)) if shares else 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Consensus:
+    """Two-view structure refined over all the frames that saw it."""
+
+    two_view: TwoView
+    agreeing: float
+    """Share of all observations within 95 %."""
+    direction_sigma: float
+    """Standard deviation of the newest camera's position relative to the baseline; the ambiguity between turning
+    and shifting shows here."""
+
+
+def consensus(
+    reference: Keyframe,
+    two_view: TwoView,
+    view: View,
+    views: list[BootstrapView],
+    poses: list[FloatArray],
+    camera: Camera,
+    most_views: int = 6,
+) -> Consensus:
+    """Refine the two views together with some of the frames between, which see the same points.
+
+    Two views a hand's breadth apart can hardly tell a turn from a shift, and RANSAC then picks either; the frames
+    between average the detector's noise and the covariance says whether that was enough.
+
+    Args:
+        reference: First keyframe; its pose is held.
+        two_view: From `two_view_map`.
+        view: Current frame.
+        views: Frames between, in order.
+        poses: Their world-to-camera poses against the two-view points.
+        camera: Intrinsics.
+        most_views: Frames between to take in, evenly spread.
+    """
+    chosen: IntArray = (
+        np.unique(np.linspace(0, len(views) - 1, min(most_views, len(views))).astype(int))
+        if views
+        else np.zeros(0, int)
+    )
+    row = np.full(len(reference.features.uv), -1, dtype=np.int64)
+    row[two_view.reference_keypoint] = np.arange(len(two_view.p_w))
+    pose = [np.zeros(len(two_view.p_w), dtype=np.int64)]
+    anchor = [np.arange(len(two_view.p_w))]
+    uv = [reference.features.uv[two_view.reference_keypoint]]
+    inv_sigma = [view.inv_sigma[two_view.keypoint]]  # a match joins the same pyramid level, one at most apart
+    for i, k in enumerate(chosen):
+        seen = row[views[k].reference_keypoint] >= 0
+        pose.append(np.full(int(seen.sum()), i + 1, dtype=np.int64))
+        anchor.append(row[views[k].reference_keypoint[seen]])
+        uv.append(views[k].keypoint_uv[seen])
+        inv_sigma.append(views[k].inv_sigma[seen])
+    newest = len(chosen) + 1
+    pose.append(np.full(len(two_view.p_w), newest, dtype=np.int64))
+    anchor.append(np.arange(len(two_view.p_w)))
+    uv.append(view.features.uv[two_view.keypoint])
+    inv_sigma.append(view.inv_sigma[two_view.keypoint])
+    T_c_w = np.stack([reference.T_c_w, *(poses[k] for k in chosen), two_view.T_c_w])
+    centres = se3.inverse(T_c_w)[:, :3, 3]
+    baseline = float(np.linalg.norm(centres[newest] - centres[0]))
+    problem = WindowProblem(
+        T_c_w=T_c_w,
+        pose_fixed=np.arange(newest + 1) == 0,
+        p_w=two_view.p_w,
+        obs_pose=np.concatenate(pose),
+        obs_anchor=np.concatenate(anchor),
+        uv=np.concatenate(uv).astype(np.float64),
+        inv_sigma=np.concatenate(inv_sigma),
+        K=(camera.fx, camera.fy, camera.cx, camera.cy),
+        scale_priors=(ScalePrior(0, newest, baseline, 0.001),),
+    )
+    result = refine_window(problem, LmConfig(max_iterations=20, diagnostics=True))
+    agreeing = (result.chi2 <= CHI2_2) & result.in_front
+    covariance = result.pose_covariance[:3, :3]
+    sigma = float(np.sqrt(np.trace(covariance))) / baseline if np.isfinite(covariance).all() else np.inf
+    # A point must agree in the two views that will be keyframes.
+    count = len(two_view.p_w)
+    kept = agreeing[:count] & agreeing[-count:]
+    refined = replace(
+        two_view,
+        T_c_w=result.T_c_w[newest],
+        p_w=result.p_w[kept],
+        reference_keypoint=two_view.reference_keypoint[kept],
+        keypoint=two_view.keypoint[kept],
+    )
+    return Consensus(refined, float(agreeing.mean()), sigma)
