@@ -17,7 +17,7 @@ from edgeslam_torch.eval.trajectory import score_trajectory
 from edgeslam_torch.geometry import se3
 
 
-def random_pair(rng: np.random.Generator, count: int = 24) -> tuple[Trajectory, Trajectory]:
+def random_pair(rng: np.random.Generator, count: int = 18) -> tuple[Trajectory, Trajectory]:
     """A wandering camera and an estimate of it: noisy, turned, shifted, scaled, some poses missing."""
     stamps = 1e9 + np.cumsum(rng.uniform(0.02, 0.05, count))
     R = Rotation.from_rotvec(np.cumsum(rng.normal(0, 0.05, (count, 3)), axis=0))
@@ -29,7 +29,7 @@ def random_pair(rng: np.random.Generator, count: int = 24) -> tuple[Trajectory, 
     G = se3.exp(rng.normal(0, 1.0, 6))
     E = G @ E
     E[:, :3, 3] *= rng.uniform(0.3, 3.0)
-    keep = np.sort(rng.choice(count, rng.integers(12, count), replace=False))
+    keep = np.sort(rng.choice(count, rng.integers(10, count), replace=False))
     jitter = rng.uniform(-0.004, 0.004, len(keep))
     return Trajectory(stamps, T, "truth"), Trajectory(stamps[keep] + jitter, E[keep], "estimate")
 
@@ -150,7 +150,8 @@ def test_reference_trajectories_score_what_evo_prints(name: str, data_dir: Path)
     assert score.matched == pairs
     found = (score.ate_m.rmse, score.ate_m.mean, score.ate_m.std, score.ate_m.max)
     assert found == pytest.approx((rmse, mean, std, most), abs=1e-6)
-    assert_agrees(truth, estimate, AlignmentKind.SIM3)
+    near = (truth.stamps_s > estimate.stamps_s[200]) & (truth.stamps_s < estimate.stamps_s[500])
+    assert_agrees(truth.take(near), estimate.take(slice(200, 500)), AlignmentKind.SIM3)  # evo takes its time
 
 
 def test_each_pose_of_the_shorter_list_gets_its_nearest() -> None:
