@@ -138,8 +138,8 @@ def test_guessed_map_is_replaced_and_the_map_stays_consistent(points):
         track = bootstrap.track(view_of(points, view), points.world.T_c_w[view])
         assert track is not None
         found = bootstrap.two_views(view, view_of(points, view), track)
-        accepted = found if found.ok and bootstrap.witnessed(found) else None
-    assert accepted is not None
+        accepted = bootstrap.confirm(view_of(points, view), found) if found.ok else found
+    assert accepted is not None and accepted.ok
     keyframe = points.keyframes[4]
     keyframe.T_c_w = accepted.T_c_w
     between = bootstrap.replace_map(keyframe, accepted, LmConfig())
