@@ -138,7 +138,7 @@ def run_benchmark(settings: BenchSettings, out: Path, say: Callable[[str], None]
     }
     # All runs first, then all judging: on Linux a child's peak memory starts from its parent's at the time of the
     # fork, and the measured surfaces take a gigabyte.
-    folders = {name: sequences.get(name) or _record_synthetic(out, say) for name in names}
+    folders = {name: sequences.get(name) or _record_synthetic(out, settings, say) for name in names}
     for name, folder in folders.items():
         for seed in settings.seeds:
             say(f"{name}, seed {seed} ...")
@@ -367,13 +367,15 @@ def _judge(run: dict[str, Any], out: Path, folder: Path) -> None:
     run["notes"] = list(score.notes)
 
 
-def _record_synthetic(out: Path, say: Callable[[str], None]) -> Path:
+def _record_synthetic(out: Path, settings: BenchSettings, say: Callable[[str], None]) -> Path:
     """The simulated flight, recorded once: the seeds vary the system, not the world."""
     folder = out / "synthetic"
     flight = folder / "flight"
     if not (flight / "groundtruth.txt").is_file():
         say("recording the synthetic flight ...")
         command = [sys.executable, "-m", "edgeslam_torch.cli", "demo", "--record-only", "--out", str(folder)]
+        if settings.max_frames is not None:  # no longer than what is looked at, at the demo's 20 Hz
+            command += ["--seconds", str(max(2, -(-settings.max_frames // 20)))]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode != 0:
             raise EvaluationError(f"the synthetic flight could not be recorded: {done.stderr.strip()[-300:]}")

@@ -44,7 +44,7 @@ def open_in_browser(page: Path, width: int, height: int) -> dict[str, Any]:
         "--dump-dom",
         probed.as_uri(),
     ]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=240, check=True)
     found = re.search(r'<pre id="probe">(.*?)</pre>', done.stdout, re.DOTALL)
     assert found, done.stdout[-2000:] + done.stderr[-2000:]
     return dict(json.loads(html.unescape(found.group(1))))
