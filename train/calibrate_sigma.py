@@ -1,4 +1,9 @@
-"""Makes the uncertainty honest: scale and floor of sigma such that 68 % and 95 % mean what they say."""
+"""Makes the uncertainty honest: scale and floor of sigma such that 68 % and 95 % mean what they say.
+
+Sigma describes shape, each image's median error taken out: the SLAM fits one scale per image to its
+anchors, and counts
+the uncertainty of that scale elsewhere. Adding it here would make every pixel look far worse than it is.
+"""
 
 import dataclasses
 from collections.abc import Sequence
@@ -17,7 +22,8 @@ PIXELS_PER_VIEW = 500
 def residuals_and_sigma(
     network: FastDepth, metadata: Metadata, views: Sequence[View], seed: int = 0
 ) -> tuple[FloatArray, FloatArray]:
-    """Log-depth residuals and the head's raw sigma at random valid pixels, ``(N,)`` each."""
+    """Log-depth residuals, each image's median removed, and the head's raw sigma at random valid pixels,
+    ``(N,)`` each."""
     rng = np.random.default_rng(seed)
     residuals, sigmas = [], []
     for view in views:
@@ -27,7 +33,8 @@ def residuals_and_sigma(
             continue
         pick = rng.integers(len(v), size=min(PIXELS_PER_VIEW, len(v)))
         at = v[pick], u[pick]
-        residuals.append(np.log(depth[at] / view.depth_m[at]))
+        error = np.log(depth[at] / view.depth_m[at])
+        residuals.append(error - np.median(error))
         sigmas.append(sigma[at])
     return np.concatenate(residuals), np.concatenate(sigmas)
 
