@@ -7,9 +7,8 @@ import numpy as np
 
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
-from edgeslam_torch.synthetic.flight import FlightPlan, fly
 from edgeslam_torch.synthetic.render import render
-from edgeslam_torch.synthetic.rooms import room
+from edgeslam_torch.synthetic.rooms import random_pose, room
 from edgeslam_torch.synthetic.world import Quad, Texture, World
 from edgeslam_torch.types import DepthMap, Frame
 
@@ -46,12 +45,18 @@ class RenderedFlight:
         return [Frame(f.index, f.stamp_s, change(f.index, f.image)) for f in self.frames]
 
 
-@lru_cache(maxsize=4)
-def room_flight(frames=60, rate_hz=10.0, seed=1):
-    """A drone in a furnished room, at `CAMERA`."""
-    world = room(np.random.default_rng(3))
-    flight = fly(np.random.default_rng(seed), world, frames, rate_hz=rate_hz, plan=FlightPlan(take_off=False))
-    return film(world, CAMERA, flight.T_w_c, 1.0 / rate_hz)
+@lru_cache(maxsize=1)
+def room_view():
+    """A furnished room, ``(240, 320, 3)``."""
+    rng = np.random.default_rng(3)
+    world = room(rng)
+    return render(world, CAMERA, random_pose(rng, world)).image
+
+
+@lru_cache(maxsize=1)
+def views():
+    """Three images of `stairs_world`, 30 cm apart."""
+    return [f.image for f in film(stairs_world(), CAMERA, sideways(3, 0.3)).frames]
 
 
 def film(world, camera, T_w_c, step_s=0.1):
