@@ -7,7 +7,8 @@ import importlib.util
 import logging
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import NoReturn
 
 from edgeslam_torch import __version__
@@ -109,7 +110,8 @@ def _call(name: str, entry: tuple[str, str], arguments: list[str], verbose: bool
     args, unknown = parser.parse_known_args(arguments)
     if unknown:
         parser.error(_unknown_arguments(unknown, parser.options()))
-    return int(module.main(args))
+    with _messages(verbose):
+        return int(module.main(args))
 
 
 def _top_parser(commands: dict[str, tuple[str, str]]) -> Parser:
@@ -145,12 +147,22 @@ def _unknown_arguments(unknown: list[str], options: list[str]) -> str:
     return f"no option {option!r}" + (f"; did you mean {close[0]!r}?" if close else "")
 
 
-def _start_logging(verbose: bool) -> None:
-    if verbose:
-        logging.basicConfig(format="%(asctime)s %(name)s %(levelname)s %(message)s", stream=sys.stderr)
-        logging.getLogger("edgeslam_torch").setLevel(logging.DEBUG)
-    else:
-        logging.basicConfig(format="edgeslam: %(levelname)s: %(message)s", stream=sys.stderr)
+@contextmanager
+def _messages(verbose: bool) -> Iterator[None]:
+    """Our own messages on stderr while a command runs: warnings, or everything."""
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setLevel(logging.DEBUG if verbose else logging.WARNING)
+    pattern = "%(asctime)s %(name)s %(levelname)s %(message)s" if verbose else "edgeslam: %(levelname)s: %(message)s"
+    handler.setFormatter(logging.Formatter(pattern))
+    ours = logging.getLogger("edgeslam_torch")
+    before = ours.level
+    ours.addHandler(handler)
+    ours.setLevel(handler.level)
+    try:
+        yield
+    finally:
+        ours.removeHandler(handler)
+        ours.setLevel(before)
 
 
 def _quiet_libraries(verbose: bool) -> None:
