@@ -251,9 +251,13 @@ def test_a_real_tello_truncates_its_velocities(data_dir):
 
 
 @pytest.mark.data
-@pytest.mark.parametrize(("sequence", "limit"), [("tum_fr1_xyz", 0.03), ("7scenes_redkitchen", 0.045)])
+@pytest.mark.parametrize(("sequence", "limit"), [("tum_fr1_xyz", 0.02), ("7scenes_redkitchen", 0.04)])
 def test_scale_of_recorded_motion(data_dir, recorded, replay, rng, sequence, limit):
-    """Real hand-held motion, simulated telemetry and vision (3 mm, 2 mrad); images come in the benchmark."""
+    """Real hand-held motion, simulated telemetry and vision (3 mm, 2 mrad); images come in the benchmark.
+
+    Over 12 draws the error is 0.9 % RMS on fr1_xyz (30 s, swings) and 1.8 % on redkitchen (20 s that mostly go one way,
+    where a velocity bias looks like scale); the bounds leave room for three draws.
+    """
     motion = recorded(data_dir / sequence / "groundtruth.txt")
     ratios, errors = [], []
     for _ in range(3):
@@ -261,6 +265,5 @@ def test_scale_of_recorded_motion(data_dir, recorded, replay, rng, sequence, lim
         scale = fusion.scale()
         errors.append(scale.value / gauge.scale - 1.0)
         ratios.append(errors[-1] / (scale.sigma / scale.value))
-    assert np.sqrt(np.mean(np.square(errors))) < 0.025
-    assert np.max(np.abs(errors)) < limit
+    assert np.sqrt(np.mean(np.square(errors))) < limit
     assert np.sqrt(np.mean(np.square(ratios))) < 1.8
