@@ -4,7 +4,7 @@ import logging
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from enum import StrEnum
@@ -19,6 +19,7 @@ from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.io.camera_choice import GUESS, GUESS_COST, GUESS_WARNING
 from edgeslam_torch.io.config_file import to_toml
 from edgeslam_torch.io.pace import Counter, at_their_pace
+from edgeslam_torch.io.read_ahead import read_ahead
 from edgeslam_torch.io.run_writer import CAMERA, PICTURE, RunWriter
 from edgeslam_torch.io.source import Source
 from edgeslam_torch.run_summary import Tally, summarise
@@ -51,7 +52,10 @@ class Slam(Protocol):
 
     events: dict[str, int]
 
-    def step(self, frame: Frame, telemetry: Sequence[TelemetrySample] = ()) -> SlamOutput:
+    def prepare(self, frame: Frame) -> Any:
+        """What can be done with a frame before the frames before it are through."""
+
+    def step(self, frame: Frame, telemetry: Sequence[TelemetrySample] = (), prepared: Any = None) -> SlamOutput:
         """Pose of one frame."""
 
     def finish(self) -> None:
@@ -198,12 +202,14 @@ class _Run:
         frames = self.source.frames()
         if self.mode is Mode.REALTIME and not self.source.live:
             frames = at_their_pace(frames, self.dropped)
+        prepared = self._prepared(frames)
         telemetry = _TelemetryCursor(self.source.telemetry)
         try:
-            while (frame := self._next(frames)) is not None:
+            while (item := self._next(prepared)) is not None:
+                frame, features = item
                 self._count_missed(frame)
                 started = time.perf_counter()
-                output = self.slam.step(frame, telemetry.until(frame.stamp_s))
+                output = self.slam.step(frame, telemetry.until(frame.stamp_s), features)
                 step_ms = 1e3 * (time.perf_counter() - started)
                 self.tally.add(output, step_ms)
                 if not self.writer.append(output, step_ms):
@@ -211,9 +217,22 @@ class _Run:
                 for listener in self.listeners:
                     listener.on_frame(frame, output, self.slam)
         finally:
-            close = getattr(frames, "close", None)
-            if close is not None:
-                close()
+            prepared.close()
+
+    def _prepared(self, frames: Iterator[Frame]) -> Generator[tuple[Frame, Any]]:
+        """Frames with their features; offline a second thread extracts the next ones meanwhile, in the same order."""
+        ahead = self.mode is Mode.OFFLINE and not self.source.live
+
+        def pairs() -> Generator[tuple[Frame, Any]]:
+            try:
+                for frame in frames:
+                    yield frame, self.slam.prepare(frame) if ahead else None
+            finally:
+                close = getattr(frames, "close", None)
+                if close is not None:
+                    close()
+
+        return read_ahead(pairs()) if ahead else pairs()
 
     def _count_missed(self, frame: Frame) -> None:
         """A live source gives the newest picture: those that came in between are gaps in its index."""
@@ -221,8 +240,8 @@ class _Run:
             self.dropped.value += max(0, frame.index - self.last_index - 1)
         self.last_index = frame.index
 
-    def _next(self, frames: Iterator[Frame]) -> Frame | None:
-        """The next frame; None at the end or when the user wants to stop, also while a live source is silent."""
+    def _next(self, frames: Iterator[tuple[Frame, Any]]) -> tuple[Frame, Any] | None:
+        """The next frame with its features; None at the end or when the user stops, also while a live source is silent."""
         if self.interrupt.requested:
             return None
         self.interrupt.at_once = True

@@ -122,12 +122,21 @@ class EdgeSlam:
 
     # -- one frame ---------------------------------------------------------------------------------------------
 
-    def step(self, frame: Frame, telemetry: Sequence[TelemetrySample] = ()) -> SlamOutput:
+    def prepare(self, frame: Frame) -> View:
+        """Features of a frame: all that can be done before the frames before it are through, on any one thread.
+
+        Raises:
+            SourceError: If the image is not of the camera's size.
+        """
+        return make_view(self._orb(_grey(frame, self.camera)), self.config.orb.scale_factor)
+
+    def step(self, frame: Frame, telemetry: Sequence[TelemetrySample] = (), prepared: View | None = None) -> SlamOutput:
         """Pose of one frame; frames must come in the order of their stamps.
 
         Args:
             frame: Image with the lens distortion still in it, of the camera's size.
             telemetry: State messages that arrived since the last frame.
+            prepared: What `prepare` made of the frame, if it was called; it is called here otherwise.
 
         Raises:
             SourceError: If the image is not of the camera's size, or the stamp does not increase.
@@ -135,11 +144,10 @@ class EdgeSlam:
         if frame.stamp_s <= self._stamp_s:
             raise SourceError(f"{_name(frame)}: stamp {frame.stamp_s} s does not follow {self._stamp_s} s")
         self._stage_ms = {}
-        grey = _grey(frame, self.camera)
         if self._pending is not None and self._pending.done():
             self._absorb_pending()
         with self._timed("features"):
-            view = make_view(self._orb(grey), self.config.orb.scale_factor)
+            view = prepared if prepared is not None else self.prepare(frame)
         with self._timed("fusion"):
             self._fusion.add_telemetry(telemetry)
             self._has_telemetry = self._has_telemetry or len(telemetry) > 0

@@ -128,7 +128,7 @@ def test_ctrl_c_while_a_live_source_is_silent(tmp_path, write_tum):
         os.kill(os.getpid(), signal.SIGINT)
         time.sleep(60.0)
 
-    source.frames = silent_after_two
+    source.frames, source.live = silent_after_two, True  # offline the next frames are already being prepared
     result = run(source, tmp_path / "out", make_slam=fake(FakeSlam()))
     assert result.interrupted
     assert result.summary["frames"] == 2

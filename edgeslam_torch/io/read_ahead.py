@@ -2,7 +2,7 @@
 
 import queue
 import threading
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from typing import TypeVar
 
 T = TypeVar("T")
@@ -16,7 +16,7 @@ class _End:
         self.error = error
 
 
-def read_ahead(items: Iterator[T], depth: int = 1) -> Iterator[T]:
+def read_ahead(items: Iterator[T], depth: int = 1) -> Generator[T]:
     """The same items in the same order, read by one background thread, at most ``depth`` + 1 items ahead.
 
     An exception of ``items`` is raised here, after the items that came before it. Closing the generator stops the

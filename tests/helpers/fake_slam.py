@@ -17,7 +17,10 @@ class FakeSlam:
         self.scale = ScaleEstimate(1.0, 0.02, "depth")
         self.on_step = on_step
 
-    def step(self, frame, telemetry=()):
+    def prepare(self, frame):
+        return None
+
+    def step(self, frame, telemetry=(), prepared=None):
         if self.on_step is not None:
             self.on_step(len(self.outputs))
         self.telemetry.append(list(telemetry))
