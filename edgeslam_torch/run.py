@@ -241,7 +241,7 @@ class _Run:
         self.last_index = frame.index
 
     def _next(self, frames: Iterator[tuple[Frame, Any]]) -> tuple[Frame, Any] | None:
-        """The next frame with its features; None at the end or when the user stops, also while a live source is silent."""
+        """The next frame with its features; None at the end or when the user stops, even while the source waits."""
         if self.interrupt.requested:
             return None
         self.interrupt.at_once = True
