@@ -78,7 +78,7 @@ def test_depth_alone_gives_metres_with_its_own_doubt(swinging):
     scale = fusion.scale()
     assert (scale.source, scale.units) == ("depth", Units.METRES)
     assert scale.value == pytest.approx(3.0)
-    assert scale.sigma / scale.value == pytest.approx(0.09, abs=0.01)
+    assert scale.sigma / scale.value == pytest.approx(FusionConfig().depth_bias_log, rel=0.1)
 
 
 def test_rescaling_the_map_changes_numbers_but_not_metres(rng, swinging, replay):
