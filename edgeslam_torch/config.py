@@ -94,7 +94,7 @@ class InitialisationConfig:
 class MappingConfig:
     """Stage 3: keyframes and anchors."""
 
-    keyframe_min_gap: int = 6
+    keyframe_min_gap: int = 5
     """Frames between keyframes at least."""
     keyframe_max_gap: int = 30
     """Frames between keyframes at most while the camera moves."""
