@@ -61,6 +61,9 @@ class Slam(Protocol):
     def finish(self) -> None:
         """Last refinement."""
 
+    def close(self) -> None:
+        """Stop what runs beside the loop."""
+
     def trajectory(self) -> tuple[FloatArray, FloatArray]:
         """Stamps ``(F,)`` and refined ``T_w_c`` ``(F, 4, 4)``."""
 
@@ -111,7 +114,7 @@ def run(
     config: SlamConfig | None = None,
     mode: Mode = Mode.OFFLINE,
     listeners: Sequence[Listener] = (),
-    make_slam: Callable[[Camera, SlamConfig], Slam] | None = None,
+    make_slam: Callable[[Camera, SlamConfig, bool], Slam] | None = None,
 ) -> RunResult:
     """Run the SLAM system over a source and write its folder.
 
@@ -124,7 +127,7 @@ def run(
         config: Settings; the defaults when None.
         mode: How frames are fed.
         listeners: Called after every frame.
-        make_slam: Builds the system; `EdgeSlam` when None.
+        make_slam: Builds the system from camera, settings and whether it runs in real time; `EdgeSlam` when None.
 
     Raises:
         OutputError: If the folder cannot be written to at all.
@@ -133,7 +136,7 @@ def run(
     config = config or SlamConfig()
     with closing(source):
         # The system first: when its weights are missing, an older run in the folder must not be gone.
-        slam = (make_slam or _edge_slam)(source.camera, config)
+        slam = (make_slam or _edge_slam)(source.camera, config, mode is Mode.REALTIME)
         with closing(RunWriter(out_dir, keep=[Path(source.location)])) as writer:
             writer.write_config(to_toml(config))
             return _Run(source, writer, slam, config, mode, listeners).go()
@@ -263,6 +266,7 @@ class _Run:
         edge_map, anchors, scale = self.slam.edge_map(), self.slam.anchors(), self.slam.scale
         for listener in self.listeners:
             listener.on_finish(self.slam)
+        self.slam.close()
         cpu_s = time.process_time() - cpu_start_s
         summary = {
             **summarise(self.source, self.tally, scale, self.dropped.value, wall_s, cpu_s),
@@ -338,7 +342,7 @@ class _Interrupt:
             raise KeyboardInterrupt
 
 
-def _edge_slam(camera: Camera, config: SlamConfig) -> Slam:
+def _edge_slam(camera: Camera, config: SlamConfig, realtime: bool) -> Slam:
     from edgeslam_torch.slam import EdgeSlam  # torch loads here, not on `import edgeslam_torch.run`
 
-    return EdgeSlam(camera, config)
+    return EdgeSlam(camera, config, realtime=realtime)

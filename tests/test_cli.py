@@ -16,7 +16,7 @@ from edgeslam_torch.geometry.camera import Camera
 @pytest.fixture
 def edgeslam(monkeypatch, capsys):
     """Run a command line with the fake system: returns exit code, stdout, stderr."""
-    monkeypatch.setattr(edgeslam_torch.run, "_edge_slam", lambda camera, config: FakeSlam())
+    monkeypatch.setattr(edgeslam_torch.run, "_edge_slam", lambda camera, config, realtime: FakeSlam())
 
     def call(*words):
         try:

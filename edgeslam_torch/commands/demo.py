@@ -42,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Run the demo and print how it came out."""
-    from edgeslam_torch.commands.run import resolved_config
+    from edgeslam_torch.commands.run import resolved_config, write_page
     from edgeslam_torch.demo import record, run_and_judge
     from edgeslam_torch.progress import make_progress
 
@@ -56,6 +56,7 @@ def main(args: argparse.Namespace) -> int:
         return 0
     with make_progress(settings.frames, sys.stderr.isatty()) as progress:
         demo = run_and_judge(args.out, recorded, settings, config, [progress])
+    write_page(demo.run)
     print(report(demo))
     return EXIT_INTERRUPTED if demo.run.interrupted else 0
 

@@ -81,7 +81,7 @@ def main(args: argparse.Namespace) -> int:
     with make_progress(source.length, show_bar) as progress:
         result = run(source, out, config, mode, [progress, *listeners])
     if not args.no_report and result.failure is None:
-        _write_page(result)
+        write_page(result)
     _report(result, source)
     if result.failure is not None:
         from edgeslam_torch.errors import OutputError
@@ -109,7 +109,7 @@ def resolved_config(args: argparse.Namespace) -> "SlamConfig":
     return config
 
 
-def _write_page(result: "RunResult") -> None:
+def write_page(result: "RunResult") -> None:
     """``report.html``; a run is not lost because its page cannot be made."""
     from edgeslam_torch.errors import EdgeSlamError
     from edgeslam_torch.eval.report import write_report

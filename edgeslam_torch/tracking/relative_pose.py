@@ -39,7 +39,10 @@ def relative_pose(
     if np.median(np.linalg.norm(uv_i - uv_j, axis=1)) < NO_MOTION_PX:
         return RelativePose(MotionKind.NO_MOTION, np.eye(4), ~nothing, 0.0)
     a, b = np.ascontiguousarray(uv_i, np.float64), np.ascontiguousarray(uv_j, np.float64)
-    E, mask = cv2.findEssentialMat(a, b, camera.K, camera.K, None, None, _magsac(threshold_px, seed))
+    try:
+        E, mask = cv2.findEssentialMat(a, b, camera.K, camera.K, None, None, _magsac(threshold_px, seed))
+    except cv2.error:  # OpenCV 5 asserts on some degenerate samples
+        E = None
     if E is None or E.shape != (3, 3):
         return RelativePose(MotionKind.DEGENERATE, np.eye(4), nothing, 0.0)
     inliers = mask.ravel().astype(bool)

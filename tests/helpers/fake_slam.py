@@ -45,6 +45,9 @@ class FakeSlam:
     def finish(self):
         self.finished = True
 
+    def close(self):
+        pass
+
     def trajectory(self):
         poses = np.stack([o.T_w_c for o in self.outputs])
         poses[:, 2, 3] += 1.0
