@@ -11,6 +11,9 @@ from edgeslam_torch.optim.local_ba import refine_window
 from edgeslam_torch.optim.problem import LmConfig, ScalePrior, WindowProblem, WindowResult
 from edgeslam_torch.types import IntArray
 
+MIN_EXTENT = 1e-6
+"""Map units between keyframes below which there is no scale to hold."""
+
 CHI2_2 = 5.991
 """Chi-square, two degrees of freedom, 95 %."""
 
@@ -43,15 +46,20 @@ def choose_window(slam_map: SlamMap, newest: Keyframe, free: int, fixed: int) ->
 
 
 def refine_all(slam_map: SlamMap, camera: Camera, config: LmConfig) -> WindowResult | None:
-    """Refine every keyframe of the map at once; the first pose and the map's extent hold the gauge."""
+    """Refine every keyframe of the map at once; the first pose and the map's extent hold the gauge.
+
+    None when there is nothing to refine: fewer than three keyframes, or a camera that never moved.
+    """
     keyframes = [slam_map.keyframes[id] for id in sorted(slam_map.keyframes)]
     if len(keyframes) < 3:
         return None
     first = keyframes[0]
     far = max(keyframes[1:], key=lambda k: float(np.linalg.norm(k.centre_w - first.centre_w)))
+    distance = float(np.linalg.norm(far.centre_w - first.centre_w))
+    if distance < MIN_EXTENT:
+        return None
     members = [far, *(k for k in keyframes[1:] if k is not far)]
     window = Window(members, [first], slam_map.anchors_seen_by(keyframes))
-    distance = float(np.linalg.norm(far.centre_w - first.centre_w))
     return refine(slam_map, window, camera, config, ScalePrior(0, len(members), distance, 1e-3))
 
 

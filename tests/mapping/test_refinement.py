@@ -83,3 +83,10 @@ def test_map_of_two_keyframes_is_left_alone(rng):
     points = PointMap(rng, 100, 2)
     points.fill()
     assert refine_all(points.map, CAMERA, LmConfig()) is None
+
+
+def test_map_of_a_camera_that_never_moved_is_left_alone(points):
+    """Its extent cannot hold the scale: this was a division by zero on an image folder of one place."""
+    for keyframe in points.map.keyframes.values():
+        keyframe.T_c_w = np.eye(4)
+    assert refine_all(points.map, CAMERA, LmConfig()) is None
