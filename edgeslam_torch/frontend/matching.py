@@ -1,16 +1,15 @@
 """Hamming matching of ORB descriptors: guided by a predicted pixel, or between whole frames.
 
-Candidates come from a 2-D KD-tree over keypoint positions, the distance from the descriptors' bits; a KD-tree over
-the descriptors themselves, as the paper has it, is slower and finds less (docs/decisions.md, "KD-tree").
+Candidates come from a grid over keypoint positions, the distance from the descriptors' bits; a KD-tree over the
+descriptors, as the paper has it, is slower and finds less (docs/decisions.md, "KD-tree").
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
-from edgeslam_torch.types import FloatArray, IntArray
+from edgeslam_torch.types import IntArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,15 +43,6 @@ def hamming(a: NDArray[np.uint64], b: NDArray[np.uint64]) -> IntArray:
     return np.bitwise_count(a ^ b).sum(axis=-1, dtype=np.int64)
 
 
-def pixel_pairs(query_uv: FloatArray, tree: cKDTree, radius_px: FloatArray) -> tuple[IntArray, IntArray]:
-    """All pairs (query, keypoint) closer than each query's own radius, as two index arrays."""
-    if len(query_uv) == 0 or tree.n == 0:
-        return EMPTY.query, EMPTY.train
-    pairs = cKDTree(query_uv).sparse_distance_matrix(tree, float(np.max(radius_px)), output_type="ndarray")
-    near = pairs["v"] <= radius_px[pairs["i"]]
-    return pairs["i"][near], pairs["j"][near]
-
-
 def best_pairs(query: IntArray, train: IntArray, distance: IntArray, max_hamming: int, ratio: float) -> Matches:
     """One-to-one matches from candidate pairs.
 
@@ -61,18 +51,23 @@ def best_pairs(query: IntArray, train: IntArray, distance: IntArray, max_hamming
     """
     if len(query) == 0:
         return EMPTY
-    order = np.lexsort((train, distance, query))
-    q, t, d = query[order], train[order], distance[order]
+    q, d, t = _sorted(query, distance, train)
     first = np.r_[True, q[1:] != q[:-1]]
-    has_second = np.r_[~first[1:], False] & first
-    second = np.full(len(q), np.inf)
-    second[np.flatnonzero(has_second)] = d[np.flatnonzero(has_second) + 1]
+    second = np.where(np.r_[~first[1:], False], np.r_[d[1:], 0], np.inf)  # the next row, if it is of the same query
     keep = first & (d <= max_hamming) & (d <= ratio * second)
-    q, t, d = q[keep], t[keep], d[keep]
-    order = np.lexsort((q, d, t))
-    q, t, d = q[order], t[order], d[order]
+    t, d, q = _sorted(t[keep], d[keep], q[keep])
     keep = np.r_[True, t[1:] != t[:-1]] if len(t) else np.zeros(0, bool)
     return Matches(q[keep], t[keep], d[keep])
+
+
+def _sorted(a: IntArray, b: IntArray, c: IntArray) -> tuple[IntArray, IntArray, IntArray]:
+    """Rows sorted by ``a``, then ``b``, then ``c``; packed into one integer, which sorts ten times as fast.
+
+    Each must be in [0, 2^21).
+    """
+    packed = np.sort((a << 42) | (b << 21) | c)
+    low = (1 << 21) - 1
+    return packed >> 42, (packed >> 21) & low, packed & low
 
 
 def match_all(a: NDArray[np.uint64], b: NDArray[np.uint64], max_hamming: int, ratio: float) -> Matches:

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
+from edgeslam_torch.frontend.keypoint_grid import KeypointGrid
 from edgeslam_torch.frontend.matching import words
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.types import DepthMap, FloatArray, FrameFeatures, IntArray
@@ -27,7 +27,7 @@ class Keyframe:
     """``(N,)`` anchor of each keypoint, `NO_ANCHOR` where it has none."""
     words: NDArray[np.uint64]
     """``(N, 4)`` descriptors for `hamming`."""
-    tree: cKDTree
+    grid: KeypointGrid
     """Over ``features.uv``."""
     depth: DepthMap | None = None
     """Dropped, like ``image``, once the edges are measured."""
@@ -61,5 +61,5 @@ def make_keyframe(id: int, frame_index: int, stamp_s: float, T_c_w: FloatArray, 
         features=features,
         anchor=np.full(len(features.uv), NO_ANCHOR, dtype=np.int64),
         words=words(features.descriptors),
-        tree=cKDTree(features.uv),
+        grid=KeypointGrid(features.uv),
     )

@@ -113,7 +113,7 @@ class Mapper:
                 anchors.words[seen.anchor],
                 other.words,
                 other.features.octave,
-                other.tree,
+                other.grid,
                 3.0,
                 self.orb.scale_factor,
                 50,

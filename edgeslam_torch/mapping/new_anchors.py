@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from edgeslam_torch.frontend.matching import EMPTY, Matches, best_pairs, hamming, pixel_pairs
+from edgeslam_torch.frontend.matching import EMPTY, Matches, best_pairs, hamming
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.triangulation import bearings, triangulate
@@ -50,7 +50,7 @@ def epipolar_matches(
     length = np.linalg.norm(along, axis=1)
     middle = 0.5 * (near + far)
     slack = 3.0 * scale_factor ** keyframe.features.octave[free].astype(np.float64)
-    query, train = pixel_pairs(middle, other.tree, np.minimum(0.5 * length, 80.0) + slack)
+    query, train = other.grid.near(middle, np.minimum(0.5 * length, 80.0) + slack)
     ok = other.anchor[train] < 0
     ok &= np.abs(other.features.octave[train] - keyframe.features.octave[free[query]]) <= 1
     query, train = query[ok], train[ok]

@@ -110,8 +110,10 @@ class SlamMap:
         """Sorted ids of anchors that at least one of the keyframes sees."""
         if not keyframes:
             return np.zeros(0, dtype=np.int64)
-        ids = np.unique(np.concatenate([k.anchor for k in keyframes]))
-        return ids[ids >= 0]
+        seen = np.zeros(len(self.anchors.alive) + 1, dtype=bool)  # the last row answers for NO_ANCHOR
+        for keyframe in keyframes:
+            seen[keyframe.anchor] = True
+        return np.flatnonzero(seen[:-1])
 
     # -- keyframes ---------------------------------------------------------------------------------------------
 

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
-from edgeslam_torch.frontend.matching import Matches, best_pairs, hamming, pixel_pairs
+from edgeslam_torch.frontend.keypoint_grid import KeypointGrid
+from edgeslam_torch.frontend.matching import Matches, best_pairs, hamming
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.mapping.anchors import Anchors
 from edgeslam_torch.types import FloatArray, IntArray
@@ -51,7 +51,7 @@ def match_projection(
     anchor_words: NDArray[np.uint64],
     keypoint_words: NDArray[np.uint64],
     keypoint_octave: IntArray,
-    tree: cKDTree,
+    grid: KeypointGrid,
     radius_px: float,
     scale_factor: float,
     max_hamming: int,
@@ -59,7 +59,7 @@ def match_projection(
 ) -> Matches:
     """Match projected anchors (query) to keypoints (train) inside a radius that grows with the pyramid level."""
     radius = radius_px * scale_factor ** projection.octave.astype(np.float64)
-    query, train = pixel_pairs(projection.uv, tree, radius)
+    query, train = grid.near(projection.uv, radius)
     near_octave = np.abs(keypoint_octave[train] - projection.octave[query]) <= 1
     query, train = query[near_octave], train[near_octave]
     distance = hamming(anchor_words[query], keypoint_words[train])

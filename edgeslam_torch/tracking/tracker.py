@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from edgeslam_torch.config import OrbConfig, TrackingConfig
+from edgeslam_torch.frontend.keypoint_grid import KeypointGrid
 from edgeslam_torch.frontend.matching import words
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.mapping.keyframe import Keyframe
@@ -27,7 +27,7 @@ class View:
 
     features: FrameFeatures
     words: NDArray[np.uint64]
-    tree: cKDTree
+    grid: KeypointGrid
     inv_sigma: FloatArray
     """``(N,)`` inverse standard deviation of each keypoint [1/px], from its pyramid level."""
 
@@ -63,7 +63,7 @@ def make_view(features: FrameFeatures, scale_factor: float) -> View:
     return View(
         features=features,
         words=words(features.descriptors),
-        tree=cKDTree(features.uv),
+        grid=KeypointGrid(features.uv),
         inv_sigma=scale_factor ** -features.octave.astype(np.float64),
     )
 
@@ -114,7 +114,7 @@ class Tracker:
             anchors.words[seen.anchor],
             view.words,
             view.features.octave,
-            view.tree,
+            view.grid,
             radius_px,
             self.orb.scale_factor,
             self.config.max_hamming,

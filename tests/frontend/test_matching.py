@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.spatial import cKDTree
 
-from edgeslam_torch.frontend.matching import best_pairs, hamming, match_all, pixel_pairs, words
+from edgeslam_torch.frontend.keypoint_grid import KeypointGrid
+from edgeslam_torch.frontend.matching import best_pairs, hamming, match_all, words
 
 
 def random_words(rng, n):
@@ -88,21 +88,11 @@ def test_guided_search_over_the_whole_image_finds_what_brute_force_finds(rng):
     order = rng.permutation(80)
     b = flipped(rng, a, 30)[order]
     uv = rng.uniform(0, 100, (80, 2))
-    query, train = pixel_pairs(uv, cKDTree(uv[order]), np.full(80, 200.0))
+    query, train = KeypointGrid(uv[order]).near(uv, np.full(80, 200.0))
     assert len(query) == 80 * 80
     guided = best_pairs(query, train, hamming(a[query], b[train]), 64, 0.85)
     brute = match_all(a, b, 64, 0.85)
     assert dict(zip(guided.query, guided.train, strict=True)) == dict(zip(brute.query, brute.train, strict=True))
-
-
-def test_candidates_lie_within_each_radius(rng):
-    uv, other = rng.uniform(0, 100, (2, 60, 2))
-    radius = rng.uniform(1, 30, 60)
-    query, train = pixel_pairs(uv, cKDTree(other), radius)
-    near = np.linalg.norm(uv[:, None] - other[None], axis=2) <= radius[:, None]
-    found = np.zeros_like(near)
-    found[query, train] = True
-    np.testing.assert_array_equal(found, near)
 
 
 def test_guided_search_tells_twins_apart_by_their_place(rng):
@@ -111,7 +101,7 @@ def test_guided_search_tells_twins_apart_by_their_place(rng):
     uv = np.stack(np.meshgrid(np.arange(5) * 50.0, np.arange(4) * 50.0, indexing="ij"), axis=-1).reshape(-1, 2)
     b = flipped(rng, a, 5)
     assert len(match_all(a, b, 64, 0.5)) == 0
-    query, train = pixel_pairs(uv + 3.0, cKDTree(uv), np.full(20, 15.0))
+    query, train = KeypointGrid(uv).near(uv + 3.0, np.full(20, 15.0))
     guided = best_pairs(query, train, hamming(a[query], b[train]), 64, 0.5)
     np.testing.assert_array_equal(guided.query, guided.train)
     assert len(guided) == 20

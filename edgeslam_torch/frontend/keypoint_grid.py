@@ -1,0 +1,70 @@
+"""Which keypoints lie near given pixels: a grid of cells, as keypoints are spread evenly and radii are small.
+
+Against a KD-tree it costs a third per search, because every query keeps its own radius: a tree's pair search takes one
+for all, and a single anchor of the coarsest pyramid level makes it three times too wide.
+"""
+
+import numpy as np
+
+from edgeslam_torch.types import FloatArray, IntArray
+
+CELL_PX = 16.0
+"""Side of a cell; of 8, 12, 16, 24 and 32 the fastest for a thousand keypoints in 640x480."""
+
+
+class KeypointGrid:
+    """Keypoints ``(N, 2)`` [px] sorted by cell, row by row; never changed afterwards."""
+
+    __slots__ = ("_columns", "_order", "_origin", "_rows", "_start", "_u", "_v")
+
+    def __init__(self, uv: FloatArray) -> None:
+        uv = np.asarray(uv, dtype=np.float64).reshape(-1, 2)
+        self._origin = uv.min(axis=0) if len(uv) else np.zeros(2)
+        cell = ((uv - self._origin) / CELL_PX).astype(np.int64)
+        self._columns, self._rows = (cell.max(axis=0) + 1).tolist() if len(uv) else (1, 1)
+        flat = cell[:, 1] * self._columns + cell[:, 0]
+        self._order = np.argsort(flat, kind="stable")
+        self._start = np.searchsorted(flat[self._order], np.arange(self._rows * self._columns + 1))
+        self._u, self._v = uv[self._order].T.copy()
+
+    def __len__(self) -> int:
+        return len(self._order)
+
+    def near(self, query_uv: FloatArray, radius_px: FloatArray) -> tuple[IntArray, IntArray]:
+        """All pairs (query, keypoint) no farther apart than each query's own radius, as two index arrays.
+
+        Args:
+            query_uv: Pixels ``(M, 2)``, finite, inside the image or not.
+            radius_px: ``(M,)``.
+
+        Example:
+            >>> grid = KeypointGrid(np.array([[10.0, 10.0], [100.0, 10.0]]))
+            >>> grid.near(np.array([[98.0, 10.0], [50.0, 50.0]]), np.array([3.0, 3.0]))
+            (array([0]), array([1]))
+        """
+        if len(query_uv) == 0 or len(self) == 0:
+            return np.zeros(0, np.int64), np.zeros(0, np.int64)
+        u, v = np.asarray(query_uv, dtype=np.float64).T
+        left, right = self._span(u - self._origin[0], radius_px, self._columns)
+        top, bottom = self._span(v - self._origin[1], radius_px, self._rows)
+        # Keypoints of neighbouring cells in one row lie side by side: one interval per query and row.
+        row_query, step = _unroll(bottom - top + 1)
+        first_cell = (top[row_query] + step) * self._columns
+        begin = self._start[first_cell + left[row_query]]
+        run, step = _unroll(self._start[first_cell + right[row_query] + 1] - begin)
+        query, keypoint = row_query[run], begin[run] + step
+        du, dv = self._u[keypoint] - u[query], self._v[keypoint] - v[query]
+        inside = du * du + dv * dv <= np.square(radius_px)[query]
+        return query[inside], self._order[keypoint[inside]]
+
+    def _span(self, x: FloatArray, radius_px: FloatArray, cells: int) -> tuple[IntArray, IntArray]:
+        """First and last cell along one axis that a circle around ``x`` touches."""
+        ends = np.stack([x - radius_px, x + radius_px]) / CELL_PX
+        first, last = np.clip(ends, 0, cells - 1).astype(np.int64)
+        return first, last
+
+
+def _unroll(counts: IntArray) -> tuple[IntArray, IntArray]:
+    """For intervals of given lengths: the interval of every element, and the element's place in it."""
+    interval = np.repeat(np.arange(len(counts)), counts)
+    return interval, np.arange(len(interval)) - (np.cumsum(counts) - counts)[interval]
