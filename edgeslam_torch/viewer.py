@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from edgeslam_torch.errors import ConfigError
+from edgeslam_torch.errors import ConfigError, OutputError
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.types import FloatArray, PointCloud, SlamOutput
 
@@ -21,40 +21,48 @@ _STATUS_COLOURS = {
     "lost": (200, 64, 47),
 }
 
+_SEGMENT = 100
+"""Poses in one piece of the trajectory: only the last piece is sent again with a new pose."""
+
 
 class Viewer:
-    """One rerun recording, shown in its window, saved to a file, or both.
+    """One rerun recording, shown in its window or saved to a file.
 
     Args:
         name: Title of the recording.
         save: ``.rrd`` file to write.
-        show: Start the viewer's window.
+        show: Start the viewer's window; not together with ``save``.
+        live: Lay the window out for `step` (pictures and plots beside the map); else for `show_run`.
 
     Raises:
         ConfigError: If rerun is not installed.
+        OutputError: If ``save`` cannot be written.
     """
 
-    def __init__(self, name: str, save: Path | None = None, show: bool = True) -> None:
+    def __init__(self, name: str, save: Path | None = None, show: bool = True, live: bool = True) -> None:
         try:
             self._rr: Any = importlib.import_module("rerun")
+            layout = _layout(importlib.import_module("rerun.blueprint"), live)
         except ImportError as error:
             raise ConfigError("the viewer needs rerun: pip install 'edgeslam-torch[viewer]'") from error
-        rr = self._rr
-        rr.init(f"edgeslam {name}", spawn=show and save is None)
+        self._stream: Any = self._rr.RecordingStream(f"edgeslam {name}")
         if save is not None:
-            save.parent.mkdir(parents=True, exist_ok=True)
-            rr.save(str(save))
-        rr.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        self._path: list[FloatArray] = []
+            _check_writable(save)
+            self._stream.save(str(save), default_blueprint=layout)
+        elif show:
+            self._stream.spawn(default_blueprint=layout)
+        self._log("world", self._rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        self._begin_s: float | None = None
+        self._piece: list[FloatArray] = []
+        self._piece_status = ""
+        self._pieces = 0
 
     def camera(self, camera: Camera) -> None:
         """Intrinsics of the picture under ``world/camera``."""
-        rr = self._rr
-        rr.log(
-            "world/camera/image",
-            rr.Pinhole(image_from_camera=camera.K, resolution=[camera.width, camera.height], image_plane_distance=0.2),
-            static=True,
+        pinhole = self._rr.Pinhole(
+            image_from_camera=camera.K, resolution=[camera.width, camera.height], image_plane_distance=0.2
         )
+        self._log("world/camera/image", pinhole, static=True)
 
     def step(
         self,
@@ -74,48 +82,93 @@ class Viewer:
             depth_m: Network depth ``(H, W)`` [m].
         """
         rr = self._rr
-        rr.set_time("time", duration=output.stamp_s)
+        self._time(output.stamp_s)
         self._pose(output.T_w_c)
-        self._path.append(output.T_w_c[:3, 3].copy())
-        colour = _STATUS_COLOURS[str(output.status)]
-        rr.log("world/trajectory", rr.LineStrips3D([np.array(self._path)], colors=[colour]))
+        self._extend(output.T_w_c[:3, 3], str(output.status))
         if image is not None:
             rgb = image if image.ndim == 2 else image[:, :, ::-1]
-            rr.log("world/camera/image", rr.Image(np.ascontiguousarray(rgb)).compress(jpeg_quality=75))
+            self._log("world/camera/image", rr.Image(np.ascontiguousarray(rgb)).compress(jpeg_quality=75))
         if features_uv is not None:
-            rr.log("world/camera/image/features", rr.Points2D(features_uv, colors=[(90, 200, 120)], radii=1.5))
+            self._log("world/camera/image/features", rr.Points2D(features_uv, colors=[(90, 200, 120)], radii=1.5))
         if edges_uv is not None:
-            rr.log("world/camera/image/edges", rr.Points2D(edges_uv, colors=[(240, 150, 40)], radii=0.6))
+            self._log("world/camera/image/edges", rr.Points2D(edges_uv, colors=[(240, 150, 40)], radii=0.6))
         if depth_m is not None:
-            rr.log("world/camera/depth", rr.DepthImage(depth_m, meter=1.0))
-        rr.log("status", rr.TextLog(f"{output.index}: {output.status} {output.reason}".strip()))
-        rr.log("plots/inliers", rr.Scalars(output.inliers))
-        rr.log("plots/step_ms", rr.Scalars(sum(output.stage_ms.values())))
+            millimetres = np.clip(1e3 * depth_m[::2, ::2], 0, 65535).astype(np.uint16)  # an eighth of the bytes
+            self._log("depth", rr.DepthImage(millimetres, meter=1000.0))
+        self._log("status", rr.TextLog(f"{output.index}: {output.status} {output.reason}".strip()))
+        self._log("plots/inliers", rr.Scalars(output.inliers))
+        self._log("plots/step_ms", rr.Scalars(sum(output.stage_ms.values())))
         if np.isfinite(output.scale.sigma):
-            rr.log("plots/scale", rr.Scalars(output.scale.value))
-            rr.log("plots/scale_sigma", rr.Scalars(output.scale.sigma))
+            self._log("scale/value", rr.Scalars(output.scale.value))
+            self._log("scale/sigma", rr.Scalars(output.scale.sigma))
 
     def map(self, cloud: PointCloud, entity: str = "edges") -> None:
         """Show the map as it is now."""
-        self._rr.log(f"world/{entity}", self._rr.Points3D(cloud.p_w, colors=cloud.colour))
+        self._log(f"world/{entity}", self._rr.Points3D(cloud.p_w, colors=cloud.colour))
 
     def show_run(
         self, stamps_s: FloatArray, T_w_c: FloatArray, edges: PointCloud | None, anchors: PointCloud | None
     ) -> None:
-        """Show a finished run: poses over time and the final map."""
+        """Show a finished run: poses ``(F, 4, 4)`` over time and the final map."""
         rr = self._rr
         for name, cloud in (("edges", edges), ("anchors", anchors)):
             if cloud is not None:
-                rr.log(f"world/{name}", rr.Points3D(cloud.p_w, colors=cloud.colour), static=True)
-        rr.log("world/trajectory", rr.LineStrips3D([T_w_c[:, :3, 3]], colors=[(47, 127, 184)]), static=True)
+                self._log(f"world/{name}", rr.Points3D(cloud.p_w, colors=cloud.colour), static=True)
+        colour = _STATUS_COLOURS["tracked"]
+        self._log("world/trajectory", rr.LineStrips3D([T_w_c[:, :3, 3]], colors=[colour]), static=True)
         for stamp, T in zip(stamps_s, T_w_c, strict=True):
-            rr.set_time("time", duration=float(stamp - stamps_s[0]))
+            self._time(float(stamp))
             self._pose(T)
 
     def close(self) -> None:
-        """Flush the recording."""
-        self._rr.disconnect()
+        """Write out what is still buffered and end the recording."""
+        self._stream.flush()
+        self._stream.disconnect()
+
+    def _log(self, entity: str, what: object, static: bool = False) -> None:
+        self._stream.log(entity, what, static=static)
+
+    def _time(self, stamp_s: float) -> None:
+        """Set the viewer's clock: seconds since the first frame (a clock that counts from 1970 is unreadable)."""
+        if self._begin_s is None:
+            self._begin_s = stamp_s
+        self._stream.set_time("time", duration=stamp_s - self._begin_s)
 
     def _pose(self, T_w_c: FloatArray) -> None:
-        rr = self._rr
-        rr.log("world/camera", rr.Transform3D(translation=T_w_c[:3, 3], mat3x3=T_w_c[:3, :3]))
+        self._log("world/camera", self._rr.Transform3D(translation=T_w_c[:3, 3], mat3x3=T_w_c[:3, :3]))
+
+    def _extend(self, position: FloatArray, status: str) -> None:
+        """Add a position to the trajectory, in the colour of its status."""
+        if status != self._piece_status or len(self._piece) > _SEGMENT:
+            self._piece = self._piece[-1:]  # joined to what came before
+            self._piece_status = status
+            self._pieces += 1
+        self._piece.append(np.array(position))
+        strip = self._rr.LineStrips3D([np.array(self._piece)], colors=[_STATUS_COLOURS[status]])
+        self._log(f"world/trajectory/{self._pieces:04d}", strip)
+
+
+def _layout(rrb: Any, live: bool) -> Any:
+    """What the window shows where."""
+    scene = rrb.Spatial3DView(origin="world", name="map and trajectory")
+    if not live:
+        return rrb.Blueprint(scene, collapse_panels=True)
+    pictures = rrb.Vertical(
+        rrb.Spatial2DView(origin="world/camera/image", name="camera, features, edges"),
+        rrb.Spatial2DView(origin="depth", name="depth network"),
+    )
+    plots = rrb.Vertical(
+        rrb.TimeSeriesView(origin="plots", name="inliers, milliseconds a frame"),
+        rrb.TimeSeriesView(origin="scale", name="scale and its sigma"),
+        rrb.TextLogView(origin="status", name="status"),
+    )
+    return rrb.Blueprint(rrb.Horizontal(scene, pictures, plots, column_shares=[4, 3, 3]), collapse_panels=True)
+
+
+def _check_writable(path: Path) -> None:
+    """rerun itself reports an unwritable file on a thread, long after."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.open("wb").close()
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error

@@ -36,10 +36,13 @@ def main(args: argparse.Namespace) -> int:
 
 def _rerun(args: argparse.Namespace) -> int:
     from edgeslam_torch.eval.run_folder import open_run
+    from edgeslam_torch.geometry.camera import load_camera
     from edgeslam_torch.viewer import Viewer
 
     run = open_run(args.run)
-    viewer = Viewer(run.name, save=args.save_rrd, show=args.save_rrd is None)
+    viewer = Viewer(run.name, save=args.save_rrd, show=args.save_rrd is None, live=False)
+    if (run.path / "camera.yaml").is_file():
+        viewer.camera(load_camera(run.path / "camera.yaml"))
     viewer.show_run(run.trajectory.stamps_s, run.trajectory.T_w_c, run.cloud(), run.cloud("anchors.ply"))
     viewer.close()
     if args.save_rrd is not None:
