@@ -15,6 +15,7 @@ from urllib.parse import urlsplit
 
 from edgeslam_torch.errors import EdgeSlamError, SourceError
 from edgeslam_torch.io.sdk_state import parse_state, sample_from_sdk
+from edgeslam_torch.io.tello_answers import belongs_to, is_refusal
 from edgeslam_torch.io.tello_video import ArrivalClock, Picture, VideoReceiver, open_udp
 from edgeslam_torch.types import TelemetrySample
 
@@ -24,10 +25,19 @@ TELLO_HOST = "192.168.10.1"
 _STEPS = ("up", "down", "left", "right", "forward", "back", "cw", "ccw", "go", "curve", "flip", "jump")
 _MOVES = frozenset(["takeoff", "throwfly", *_STEPS, "rc", "motoron", "speed", "stop"])
 """Commands that make a drone move, or change how it moves."""
-_NEVER_TWICE = _MOVES - {"stop", "speed", "rc"}
+_NEVER_TWICE = _MOVES - {"stop", "speed", "rc", "takeoff"}
 """A lost answer does not mean that the drone did not hear: sent again, the drone would move twice."""
-_SLOW = {"takeoff": 20.0, "land": 15.0, "throwfly": 20.0}
 _MOVE_TIMEOUT_S = 20.0
+_CLIMB_TIMEOUT_S = 20.0
+_RISE_TIMEOUT_S = 6.0
+_LAND_TRIES, _LAND_AGAIN_S = 10, 2.0
+_PARTING = ("land", "streamoff")
+"""What is still sent and waited for when the flight is over."""
+_FRESH_S = 1.0
+"""State older than this says nothing of the present."""
+_RISEN_CM = 20.0
+_STEADY_CM = 6.0
+_STEADY_S = 1.5
 
 
 class TelloError(EdgeSlamError):
@@ -159,6 +169,10 @@ class Tello:
         self._replies: queue.Queue[str] = queue.Queue()
         self._sending = threading.RLock()
         self._airborne = False
+        self._landing = threading.Event()
+        """Set while a landing is wanted: nothing else is waited for, nothing else is sent."""
+        self._leaving = threading.Event()
+        """The same for good, once `close` was called."""
         self._stopping = threading.Event()
         self._last_sent_s = -math.inf
         self._flight_begin_s = math.inf
@@ -211,8 +225,11 @@ class Tello:
         """Land if airborne, stop the video, close the sockets; never raises for a drone that is gone."""
         if self._stopping.is_set():
             return
+        self._leaving.set()  # a take-off that another thread was about to send stays unsent
         try:
-            if self._airborne:
+            with self._sending:
+                airborne = self._airborne
+            if airborne:
                 self.land()
             elif self._video is not None:
                 self.send("streamoff", retries=0, timeout_s=0.5)
@@ -244,17 +261,22 @@ class Tello:
         if name == "rc":
             self._transmit(command)
             return ""
-        tries = 1 if name in _NEVER_TWICE else 1 + (self.limits.retries if retries is None else retries)
+        if name == "takeoff":
+            self.take_off()
+            return "ok"
         moving = name in _NEVER_TWICE
-        wait = timeout_s or _SLOW.get(name) or (_MOVE_TIMEOUT_S if moving else self.limits.timeout_s)
+        tries = 1 if moving else 1 + (self.limits.retries if retries is None else retries)
+        wait = timeout_s or (_MOVE_TIMEOUT_S if moving else self.limits.timeout_s)
         with self._sending:
             for _ in range(tries):
+                self._check_motion(name)  # a landing may have begun while we waited for our turn
+                self._airborne |= name == "throwfly"
                 self._drop_old_replies()
                 self._transmit(command)
-                answer = self._answer(wait)
+                answer = self._answer(command, wait)
                 if answer is None:
                     continue
-                if answer.lower().startswith(("error", "unknown command", "out of range", "unactive")):
+                if is_refusal(answer):
                     raise TelloError(f"{self.address.host}: {command!r} was refused: {answer}")
                 return answer
         raise TelloError(
@@ -275,39 +297,64 @@ class Tello:
         return float(match.group(1))
 
     def take_off(self) -> None:
-        """Take off.
+        """Take off and wait until the climb is over.
+
+        Unlike a movement the command is sent again when nothing comes of it: a drone in the air refuses it. The climb
+        itself, seen in the state, is as good as an answer.
 
         Raises:
-            TelloError: If motion is not allowed, the battery is low, or the drone refuses.
+            TelloError: If motion is not allowed, the battery is low, the drone refuses, or nothing is heard of it.
         """
         self._check_motion("takeoff")
         reason = self._unfit()
         if reason:
             raise TelloError(f"{self.address.host}: not taking off: {reason}")
-        # Set before the answer: from here on the drone may be in the air, whatever is heard of it.
-        self._airborne, self._flight_begin_s = True, self.clock.now()
-        try:
-            self.send("takeoff")
-        except TelloError as error:
-            if "refused" in str(error):
-                self._airborne = False
-            raise
+        with self._sending:
+            ground = self._level()
+            # Set before the answer: from here on the drone may be in the air, whatever is heard of it.
+            self._airborne, self._flight_begin_s = True, self.clock.now()
+            self._drop_old_replies()
+            tries = 1 + self.limits.retries
+            for attempt in range(tries):
+                self._check_motion("takeoff")
+                self._transmit("takeoff")
+                answer = self._answer("takeoff", self.limits.timeout_s, lambda: self._risen(ground))
+                if answer is not None and not is_refusal(answer):
+                    return
+                if self._risen(ground):
+                    break
+                if answer is not None and attempt == 0:
+                    self._airborne = False
+                    raise TelloError(f"{self.address.host}: 'takeoff' was refused: {answer}")
+                if answer is not None:
+                    break  # a refusal of what is repeated: it heard us before and is about to rise
+            self._wait_for_hover(ground)
 
     def land(self) -> None:
-        """Land, insistently: an answer may be lost, a drone in the air may not.
+        """Land, insistently: an answer may be lost, a drone in the air may not. Whatever else is waited for ends.
 
         Raises:
             TelloError: If the drone neither answers nor says that it is on the ground.
         """
+        self._landing.set()
         self._transmit("rc 0 0 0 0")
-        for _ in range(4):
-            try:
-                self.send("land", timeout_s=6.0, retries=0)
-            except TelloError as error:
-                if "refused" not in str(error) and not self._grounded():
-                    continue
-            self._airborne = False
-            return
+        try:
+            with self._sending:
+                agreed = 0
+                for _ in range(_LAND_TRIES):
+                    self._drop_old_replies()
+                    self._transmit("land")
+                    answer = self._answer("land", _LAND_AGAIN_S, self._grounded)
+                    agreed += answer is not None and not is_refusal(answer)
+                    deadline = self.clock.now() + (0.0 if answer is None else 1.0)
+                    while not self._grounded() and self.clock.now() < deadline and not self._stopping.wait(0.05):
+                        pass  # what was answered shows in the state a moment later
+                    # The first "ok" may be that of the movement which the landing ended.
+                    if self._grounded() or agreed > 1 or (agreed and self._level() is None):
+                        self._airborne = False
+                        return
+        finally:
+            self._landing.clear()
         raise TelloError(f"{self.address.host}: no answer to 'land'; the drone lands by itself after 15 s of silence")
 
     def rc(self, right: float, forward: float, up: float, clockwise: float) -> None:
@@ -364,8 +411,13 @@ class Tello:
     def _check_motion(self, name: str) -> None:
         if name in _MOVES and self.stop_reason:
             raise TelloError(f"{self.address.host}: {name!r} not sent: the flight has ended: {self.stop_reason}")
+        if name in _MOVES and self._over():
+            raise TelloError(f"{self.address.host}: {name!r} not sent: landing")
         if name in _MOVES and not self.allow_motion:
             raise TelloError(f"{name!r} would move the drone; pass --fly (allow_motion=True) to let it")
+
+    def _over(self) -> bool:
+        return self._landing.is_set() or self._leaving.is_set()
 
     def _transmit(self, command: str) -> None:
         try:
@@ -382,17 +434,41 @@ class Tello:
             except queue.Empty:
                 return
 
-    def _answer(self, timeout_s: float) -> str | None:
+    def _answer(self, command: str, timeout_s: float, enough: Callable[[], bool] = lambda: False) -> str | None:
+        """The answer to a command; None when time is up, a landing is wanted, or what it should bring is seen."""
         deadline = self.clock.now() + timeout_s
-        while not self._stopping.is_set():
+        while not self._stopping.is_set() and (command in _PARTING or not self._over()):
             left = deadline - self.clock.now()
-            if left <= 0:
+            if left <= 0 or enough():
                 return None
             try:
-                return self._replies.get(timeout=min(left, 0.2))
+                answer = self._replies.get(timeout=min(left, 0.1))
             except queue.Empty:
                 continue
+            if belongs_to(command, answer):
+                return answer
         return None
+
+    def _wait_for_hover(self, ground: float | None) -> None:
+        """Until 'takeoff' is answered, or the drone has risen and its height no longer changes.
+
+        Raises:
+            TelloError: If it does not rise.
+        """
+        begin = since = self.clock.now()
+        level = self._level()
+        while self.clock.now() - begin < (_CLIMB_TIMEOUT_S if self._risen(ground) else _RISE_TIMEOUT_S):
+            self._check_motion("takeoff")
+            answer = self._answer("takeoff", 0.1)
+            if answer is not None and not is_refusal(answer):
+                return
+            now, height = self.clock.now(), self._level()
+            if height is None or level is None or abs(height - level) > _STEADY_CM:
+                level, since = height, now
+            elif now - since > _STEADY_S and self._risen(ground):
+                return
+        if not self._risen(ground):
+            raise TelloError(f"{self.address.host}: no answer to 'takeoff' and no climb seen")
 
     def _receive_replies(self) -> None:
         for packet, sender in self._packets(self._command_socket):
@@ -433,13 +509,30 @@ class Tello:
         except ValueError:
             return True  # the drone was given by name
 
+    def _fresh(self) -> dict[str, float | str]:
+        """Fields of the last state message; none when it is old."""
+        latest = self.latest
+        return latest.fields if latest is not None and self.clock.now() - latest.stamp_s < _FRESH_S else {}
+
+    def _level(self) -> float | None:
+        """Height [cm] by range sensor, else by the drone's own estimate, from fresh state."""
+        fields = self._fresh()
+        tof, h = fields.get("tof"), fields.get("h")
+        if isinstance(tof, float) and 0 < tof < 800:
+            return tof
+        return h if isinstance(h, float) else None
+
+    def _risen(self, ground: float | None) -> bool:
+        """Whether the drone is higher than it was on the ground."""
+        level = self._level()
+        return level is not None and level > (10.0 if ground is None else ground) + _RISEN_CM
+
     def _grounded(self) -> bool:
         """Whether fresh state says that the drone stands on the floor."""
-        latest = self.latest
-        if latest is None or self.clock.now() - latest.stamp_s > 1.0:
-            return False
-        tof, h = latest.fields.get("tof"), latest.fields.get("h")
-        return isinstance(tof, float) and tof <= 15 and isinstance(h, float) and h <= 10
+        fields = self._fresh()
+        tof, h = fields.get("tof"), fields.get("h")
+        low = isinstance(tof, float) and tof <= 15 and isinstance(h, float) and h <= 10
+        return low and fields.get("vgz", 0.0) == 0.0  # not while it still sinks
 
     def _unfit(self) -> str:
         """Why this drone should not fly; empty when it may."""

@@ -2,6 +2,7 @@
 
 import importlib
 import os
+import random
 import socket
 import threading
 import time
@@ -12,31 +13,51 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from edgeslam_torch.emulator.commands import Answer, Reply
 from edgeslam_torch.emulator.drone import DroneModel, Mode
 from edgeslam_torch.emulator.link import LinkFaults
 from edgeslam_torch.emulator.server import EmulatorConfig, TelloEmulator
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.io.tello import Tello, TelloAddress, TelloError, TelloLimits
+from edgeslam_torch.io.tello_answers import belongs_to
 
 av = pytest.importorskip("av", reason="PyAV is not installed: the [drone] extra")
 
 
 def free_ports(count):
-    sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(count)]
+    """Ports that are free and that the system hands to nobody who asks for any port (those begin at 32768)."""
+    sockets = []
     try:
-        for s in sockets:
-            s.bind(("127.0.0.1", 0))
+        while len(sockets) < count:
+            udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+            sockets.append(udp)
+            try:
+                udp.bind(("127.0.0.1", random.SystemRandom().randrange(12000, 32000)))
+            except OSError:
+                sockets.pop().close()
         return [s.getsockname()[1] for s in sockets]
     finally:
         for s in sockets:
             s.close()
 
 
-def until(condition, seconds=10.0):
+PATIENCE_S = 60.0
+"""For what must happen in the end, however busy the machine is; nothing waits this long when all is well."""
+
+
+def until(condition, seconds=PATIENCE_S):
     deadline = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < deadline, "not in time"
         threading.Event().wait(0.01)
+
+
+class SwiftDrone(DroneModel):
+    """Lives four times as fast, so that the tests spend less time in the air."""
+
+    def step(self, dt):
+        for _ in range(4):
+            super().step(dt)
 
 
 @pytest.fixture
@@ -50,7 +71,7 @@ def emulate():
             command_port=0, state_port=state, video_port=video, width=320, height=240,
             link=link or LinkFaults(video_latency_s=0.05), **options,
         )  # fmt: skip
-        emulator = TelloEmulator(config, drone=drone).start()
+        emulator = TelloEmulator(config, drone=drone or SwiftDrone()).start()
         running.append(emulator)
         return emulator, TelloAddress("127.0.0.1", emulator.command_port, state, video)
 
@@ -59,30 +80,30 @@ def emulate():
         emulator.stop()
 
 
-QUICK = TelloLimits(timeout_s=1.0, retries=3, keep_alive_s=0.5, state_loss_s=1.0, video_loss_s=1.5)
+QUICK = TelloLimits(timeout_s=1.0, retries=3, keep_alive_s=0.5, state_loss_s=PATIENCE_S, video_loss_s=3.0)
 
 
 def test_connects_flies_streams_and_lands(emulate):
     emulator, address = emulate()
     with Tello(address, allow_motion=True) as tello:
-        tello.connect()
+        tello.connect(PATIENCE_S)
         video = tello.start_video()
-        first = video.wait(0, 5.0)
+        first = video.wait(0, PATIENCE_S)
         assert first.image.shape == (240, 320, 3)
         tello.take_off()
         assert emulator.drone.mode is Mode.FLYING
         tello.move(0.4, 0.0, 0.2)
         np.testing.assert_allclose(emulator.drone.p_w, [0.4, 0.0, 1.1], atol=0.12)
         assert tello.query("battery?") == pytest.approx(100.0, abs=1.0)
-        assert video.newest.count > first.count + 20
-        assert tello.latest.sample().tof_m > 0.8
+        until(lambda: video.newest.count > first.count + 20)
+        until(lambda: tello.latest.sample().tof_m > 0.8)
     assert emulator.drone.mode is Mode.GROUND
 
 
 def test_nothing_moves_unless_it_was_allowed(emulate):
     emulator, address = emulate()
     with Tello(address) as tello:
-        tello.connect()
+        tello.connect(PATIENCE_S)
         for move in (tello.take_off, lambda: tello.rc(0, 1, 0, 0), lambda: tello.send("motoron")):
             with pytest.raises(TelloError, match="--fly"):
                 move()
@@ -94,7 +115,7 @@ def test_nothing_moves_unless_it_was_allowed(emulate):
 def test_lands_whatever_ends_the_flight(emulate, failure):
     emulator, address = emulate()
     with pytest.raises(failure), Tello(address, allow_motion=True) as tello:
-        tello.connect()
+        tello.connect(PATIENCE_S)
         tello.take_off()
         raise failure
     assert emulator.drone.mode is Mode.GROUND
@@ -103,8 +124,8 @@ def test_lands_whatever_ends_the_flight(emulate, failure):
 def test_lands_when_the_video_goes_away(emulate):
     emulator, address = emulate()
     with Tello(address, allow_motion=True, limits=QUICK) as tello:
-        tello.connect()
-        tello.start_video().wait(0, 5.0)
+        tello.connect(PATIENCE_S)
+        tello.start_video().wait(0, PATIENCE_S)
         tello.take_off()
         emulator.interpreter.stream = False
         until(lambda: emulator.drone.mode is Mode.GROUND)
@@ -114,9 +135,9 @@ def test_lands_when_the_video_goes_away(emulate):
 
 
 def test_lands_when_the_battery_runs_low(emulate):
-    emulator, address = emulate(drone=DroneModel(battery=0.5))
+    emulator, address = emulate(drone=SwiftDrone(battery=0.5))
     with Tello(address, allow_motion=True, limits=QUICK) as tello:
-        tello.connect()
+        tello.connect(PATIENCE_S)
         tello.take_off()
         emulator.drone.battery = 0.08
         until(lambda: emulator.drone.mode is Mode.GROUND)
@@ -124,18 +145,18 @@ def test_lands_when_the_battery_runs_low(emulate):
 
 
 def test_does_not_take_off_with_an_empty_battery(emulate):
-    _, address = emulate(drone=DroneModel(battery=0.065))
+    _, address = emulate(drone=SwiftDrone(battery=0.065))
     with Tello(address, allow_motion=True) as tello:
-        tello.connect()
+        tello.connect(PATIENCE_S)
         with pytest.raises(TelloError, match="battery at 7 %"):
             tello.take_off()
 
 
 def test_a_drone_that_stops_answering_lands_itself_and_says_why(emulate):
     emulator, address = emulate()
-    limits = TelloLimits(timeout_s=0.3, retries=1, keep_alive_s=0.5, state_loss_s=0.6, video_loss_s=9.0)
+    limits = TelloLimits(timeout_s=0.3, retries=1, keep_alive_s=0.5, state_loss_s=3.0)
     with Tello(address, allow_motion=True, limits=limits) as tello:
-        tello.connect()
+        tello.connect(PATIENCE_S)
         tello.take_off()
         emulator.link.cut = True
         until(lambda: "no state" in tello.stop_reason)
@@ -143,38 +164,96 @@ def test_a_drone_that_stops_answering_lands_itself_and_says_why(emulate):
         until(lambda: emulator.drone.mode is Mode.GROUND)
 
 
-def test_bad_air_is_flown_through(emulate):
-    """5 % loss, garbage on every port."""
-    emulator, address = emulate(link=LinkFaults(loss=0.05, garbage=0.2, video_latency_s=0.02), seed=3)
-    limits = TelloLimits(timeout_s=0.5, retries=6)
+@pytest.mark.parametrize("seed", [3, 4, 5])
+def test_bad_air_is_flown_through(emulate, seed):
+    """5 % loss, garbage on every port: what matters is said until it is heard."""
+    emulator, address = emulate(link=LinkFaults(loss=0.05, garbage=0.2, video_latency_s=0.02), seed=seed)
+    limits = TelloLimits(timeout_s=0.5, retries=20, state_loss_s=PATIENCE_S, video_loss_s=PATIENCE_S)
     with Tello(address, allow_motion=True, limits=limits) as tello:
-        tello.connect()
+        tello.connect(PATIENCE_S)
         video = tello.start_video()
-        assert video.wait(0, 10.0) is not None
-        tello.allow_motion = True
-        try:
-            tello.take_off()
-        except TelloError as error:
-            assert "no answer" in str(error)  # the answer was lost, the drone is in the air all the same
+        assert video.wait(0, PATIENCE_S) is not None
+        tello.take_off()
         until(lambda: emulator.drone.mode is Mode.FLYING)
         count = video.newest.count
         until(lambda: video.newest.count > count + 10)
+    assert tello.stop_reason == ""
     assert emulator.drone.mode is Mode.GROUND
 
 
-def test_an_outage_of_the_link_is_survived(emulate):
+def test_take_off_is_repeated_until_it_is_heard_and_needs_no_answer(emulate, monkeypatch):
+    """The first command is lost on the way there, every answer on the way back: the climb is seen in the state."""
     emulator, address = emulate()
-    with Tello(address) as tello:
-        tello.connect()
+    heard, run = [], emulator.interpreter.run
+
+    def hard_of_hearing(text):
+        heard.append(text)
+        return Reply("", Answer.NEVER) if text == "takeoff" and heard.count("takeoff") == 1 else run(text)
+
+    limits = TelloLimits(timeout_s=1.0, retries=3, state_loss_s=PATIENCE_S)
+    with Tello(address, allow_motion=True, limits=limits) as tello:
+        tello.connect(PATIENCE_S)
+        monkeypatch.setattr(emulator.interpreter, "run", hard_of_hearing)
+        monkeypatch.setattr(emulator, "_answer", lambda to, text: None)
+        tello.take_off()
+        assert heard.count("takeoff") >= 2
+        assert emulator.drone.mode is Mode.FLYING
+        tello.land()  # seen in the state, too
+        assert emulator.drone.mode is Mode.GROUND
+        assert not tello.airborne
+
+
+def test_a_landing_ends_what_another_thread_waits_for(emulate):
+    emulator, address = emulate()
+    failures = []
+
+    def fly_far():
+        try:
+            tello.move(5.0, 0.0, 0.0, 0.1)
+        except TelloError as error:
+            failures.append(str(error))
+
+    with Tello(address, allow_motion=True) as tello:
+        tello.connect(PATIENCE_S)
+        tello.take_off()
+        pilot = threading.Thread(target=fly_far)
+        pilot.start()
+        until(lambda: emulator.drone.busy)
+    pilot.join()
+    assert len(failures) == 1
+    assert emulator.drone.mode is Mode.GROUND
+    with pytest.raises(TelloError, match="landing"):
+        tello.take_off()
+
+
+def test_late_answers_and_noise_are_not_taken_for_an_answer():
+    assert belongs_to("battery?", "87")
+    assert belongs_to("sn?", "0TQDF123")
+    assert belongs_to("go 20 0 0 30", "error Not joystick")
+    for command, text in [("battery?", "ok"), ("land", "87"), ("takeoff", "x"), ("sn?", "ok"), ("land", "ok\x00")]:
+        assert not belongs_to(command, text)
+
+
+def test_an_outage_of_three_seconds_in_flight_is_survived(emulate):
+    emulator, address = emulate()
+    limits = TelloLimits(state_loss_s=PATIENCE_S, video_loss_s=PATIENCE_S)
+    with Tello(address, allow_motion=True, limits=limits) as tello:
+        tello.connect(PATIENCE_S)
         video = tello.start_video()
-        video.wait(0, 5.0)
+        video.wait(0, PATIENCE_S)
+        tello.take_off()
         emulator.link.cut = True
-        gone = video.newest.count
-        threading.Event().wait(1.0)
+        begin = tello.clock.now()
+        until(lambda: tello.clock.now() - max(begin, tello.latest.stamp_s, video.newest.stamp_s) > 3.0)
+        gone, before = video.newest.count, tello.latest.stamp_s
         emulator.link.cut = False
-        assert video.wait(gone + 3, 5.0) is not None
-        before = tello.latest.stamp_s
+        assert video.wait(gone + 3, PATIENCE_S) is not None
         until(lambda: tello.latest.stamp_s > before)
+        assert emulator.drone.mode is Mode.FLYING
+        assert tello.stop_reason == ""
+        tello.move(0.3, 0.0, 0.0)
+        np.testing.assert_allclose(emulator.drone.p_w[:2], [0.3, 0.0], atol=0.12)
+    assert emulator.drone.mode is Mode.GROUND
 
 
 def test_nobody_there_is_an_error_with_a_remedy():
@@ -196,7 +275,7 @@ def test_a_busy_port_is_an_error_that_names_it(emulate):
 def test_refusals_of_the_drone_are_reported(emulate):
     _, address = emulate()
     with Tello(address) as tello:
-        tello.connect()
+        tello.connect(PATIENCE_S)
         with pytest.raises(TelloError, match="unknown command"):
             tello.send("dance")
         with pytest.raises(TelloError, match="not an SDK command"):
@@ -214,9 +293,9 @@ def test_stamps_follow_the_delay_of_the_video(emulate):
     """Pictures and state share one clock: what the picture shows happened earlier, by the delay."""
     emulator, address = emulate(link=LinkFaults(video_latency_s=0.4))
     with Tello(address, allow_motion=True) as tello:
-        tello.connect()
+        tello.connect(PATIENCE_S)
         begin = tello.clock.now()
-        picture = tello.start_video().wait(0, 5.0)
+        picture = tello.start_video().wait(0, PATIENCE_S)
         assert picture.stamp_s - begin > 0.4
 
 
@@ -296,7 +375,7 @@ def test_djitellopy_flies_the_emulator(emulate, monkeypatch):
     assert 90 < drone.get_battery() <= 100
     drone.streamon()
     reader = drone.get_frame_read()
-    until(lambda: reader.frame.shape == (240, 320, 3), 20.0)
+    until(lambda: reader.frame.shape == (240, 320, 3))
     drone.takeoff()
     assert emulator.drone.mode is Mode.FLYING
     drone.move_forward(40)
