@@ -92,16 +92,6 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _call(name: str, entry: tuple[str, str], arguments: list[str], verbose: bool) -> int:
-    logging.basicConfig(
-        level=logging.DEBUG if verbose else logging.WARNING,
-        format="edgeslam: %(levelname)s: %(message)s"
-        if not verbose
-        else "%(asctime)s %(name)s %(levelname)s %(message)s",
-        stream=sys.stderr,
-    )
-    if verbose:
-        for library in ("matplotlib", "PIL", "numba", "onnxscript", "torch"):
-            logging.getLogger(library).setLevel(logging.INFO)
     module = importlib.import_module(entry[0])
     parser = Parser(prog=f"edgeslam {name}", description=(module.__doc__ or entry[1]).strip().splitlines()[0])
     module.add_arguments(parser)

@@ -1,5 +1,6 @@
 """The command line as a user meets it: every mistake gets one line that says what to do."""
 
+import logging
 import subprocess
 import sys
 from pathlib import Path
@@ -125,6 +126,22 @@ def test_verbose_shows_the_traceback(edgeslam, tmp_path):
 
     with pytest.raises(SourceError):
         edgeslam("run", tmp_path / "nowhere", "-v")
+
+
+@pytest.mark.parametrize("verbose", [False, True])
+def test_warnings_are_printed_once_and_other_libraries_are_left_alone(verbose, edgeslam, monkeypatch):
+    from edgeslam_torch.commands import report
+
+    def warn(args):
+        logging.getLogger("edgeslam_torch.anything").warning("look out")
+        return 0
+
+    monkeypatch.setattr(report, "main", warn)
+    loggers = [logging.getLogger(name) for name in ("", "edgeslam_torch", "torch", "matplotlib")]
+    before = [(logger.level, list(logger.handlers)) for logger in loggers]
+    code, _, err = edgeslam("report", "somewhere", *(["-v"] if verbose else []))
+    assert code == 0 and err.count("look out") == 1
+    assert [(logger.level, list(logger.handlers)) for logger in loggers] == before
 
 
 def test_no_command_shows_help(edgeslam):
