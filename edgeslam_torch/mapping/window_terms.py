@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from edgeslam_torch.frontend.corners import Junctions, detect_junctions
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.losses.cycle import CycleForm
-from edgeslam_torch.optim.edge_association import EdgeField, associate_edges, edge_field
+from edgeslam_torch.optim.edge_association import EdgeField, associate_edges, edge_field, nearest_edges
 from edgeslam_torch.optim.problem import EdgeTerms, JunctionTerms
 from edgeslam_torch.optim.relative import collinearity_prior
 from edgeslam_torch.types import Edges, FloatArray, IntArray
@@ -199,11 +199,14 @@ def _junction_depths(structure: Structure, config: TermConfig) -> tuple[FloatArr
     junctions, field = structure.junctions, structure.field
     assert junctions is not None
     uv, fraction = junctions.arm_points(config.arm_points, config.arm_px)
-    _, height, width = field.nearest.shape
-    x = np.clip(np.rint(uv[..., 0]).astype(int), 0, width - 1)
-    y = np.clip(np.rint(uv[..., 1]).astype(int), 0, height - 1)
-    partner = field.nearest[:, y, x]  # (B, C, 2, M)
-    away = np.linalg.norm(field.edges.uv[partner] - uv, axis=-1) + np.where(partner < 0, np.inf, 0.0)
+    if len(field.edges.uv) == 0:
+        nothing = np.zeros(uv.shape[:-1])
+        return *collinearity_prior(np.full_like(nothing, np.nan), nothing, nothing), np.zeros(len(uv), bool)
+    across = np.stack([-junctions.arms[..., 1], junctions.arms[..., 0]], -1)[:, :, None] * np.ones(uv.shape[2:])
+    # The bright side of an arm is not known: look on both.
+    sides = [nearest_edges(field, uv.reshape(-1, 2), sign * across.reshape(-1, 2)) for sign in (1.0, -1.0)]
+    partner = np.stack(sides).reshape(2, *uv.shape[:-1])  # (2, C, 2, M)
+    away = np.linalg.norm(field.edges.uv[partner] - uv, axis=-1)
     best = away.argmin(0)[None]
     partner = np.take_along_axis(partner, best, 0)[0]
     near = np.take_along_axis(away, best, 0)[0] <= 2.0

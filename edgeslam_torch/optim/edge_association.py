@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
+from scipy.spatial import cKDTree
 
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.types import Edges, FloatArray, IntArray
@@ -12,49 +12,42 @@ from edgeslam_torch.types import Edges, FloatArray, IntArray
 MAX_TURN_RAD = 0.44
 """Largest angle (25 degrees) between the predicted and the seen normal of a partner."""
 
+PX_PER_TURN = 9.0
+"""Pixels that a radian between the normals counts as in the search for the nearest: 25 degrees as much as 4 px."""
+
 
 @dataclass(frozen=True, slots=True)
 class EdgeField:
-    """For every pixel of one keyframe, its nearest edge pixel among those of each orientation."""
+    """The edge pixels of one keyframe, to be looked up by place and direction."""
 
-    nearest: IntArray
-    """``(B, H, W)`` index into the keyframe's edges, -1 where the bin is empty, int32."""
+    tree: cKDTree
+    """Over ``(u, v, s nx, s ny)`` with ``s`` `PX_PER_TURN`, ``(E, 4)``."""
     edges: Edges
     inverse_depth: FloatArray
     """``(E,)`` inverse depths of its edges [1/m]; zero where unknown."""
+    size: tuple[int, int]
+    """Width and height of the image [px]."""
 
 
-def edge_field(edges: Edges, inverse_depth: FloatArray, size: tuple[int, int], bins: int = 4) -> EdgeField:
+def edge_field(edges: Edges, inverse_depth: FloatArray, size: tuple[int, int]) -> EdgeField:
     """Prepare a keyframe's edges for look-up.
 
     Args:
         edges: Edge pixels with their normals.
         inverse_depth: ``(E,)`` [1/m], zero where unknown.
         size: Width and height [px].
-        bins: Directions of the normal, overlapping by what a partner may be turned; one bin ignores them.
     """
-    width, height = size
-    u, v = np.rint(edges.uv).astype(np.int64).T
-    inside = (u >= 0) & (v >= 0) & (u < width) & (v < height)
-    which = np.flatnonzero(inside)
-    nearest = np.full((bins, height, width), -1, np.int32)
-    angle = np.arctan2(edges.normal[:, 1], edges.normal[:, 0])
-    for b in range(bins):
-        member = which
-        if bins > 1:
-            off = np.abs(np.angle(np.exp(1j * (angle[which] - 2 * np.pi * b / bins))))
-            member = which[off <= np.pi / bins + MAX_TURN_RAD]
-        if len(member) == 0:
-            continue
-        background = np.ones((height, width), np.uint8)
-        background[v[member], u[member]] = 0
-        _, labels = cv2.distanceTransformWithLabels(
-            background, cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
-        )
-        index = np.full(int(labels.max()) + 1, -1, np.int32)
-        index[labels[v[member], u[member]]] = member
-        nearest[b] = index[labels]
-    return EdgeField(nearest, edges, np.asarray(inverse_depth))
+    return EdgeField(cKDTree(_place(edges.uv, edges.normal)), edges, np.asarray(inverse_depth), size)
+
+
+def nearest_edges(field: EdgeField, uv: FloatArray, normal: FloatArray) -> IntArray:
+    """Edge pixels ``(N,)`` of a field with edges that lie nearest to pixels ``(N, 2)`` and run the same way."""
+    found: IntArray = field.tree.query(_place(uv, normal))[1]
+    return found
+
+
+def _place(uv: FloatArray, normal: FloatArray) -> FloatArray:
+    return np.concatenate((np.asarray(uv, np.float64), PX_PER_TURN * np.asarray(normal, np.float64)), 1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,19 +111,13 @@ def associate_edges(
         tangent = moved - at
         tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-9)
         predicted = np.stack((tangent[:, 1], -tangent[:, 0]), 1)
-        bins, height, width = field.nearest.shape
-        pixel = np.rint(np.clip(at, -1, max(width, height))).astype(np.int64)
-        inside = (iz > 0) & (pixel >= 0).all(1) & (pixel[:, 0] < width) & (pixel[:, 1] < height)
-        direction = np.arctan2(predicted[:, 1], predicted[:, 0]) * bins / (2 * np.pi)
-        b = np.rint(direction).astype(np.int64) % bins
-        x, y = np.where(inside, pixel[:, 0], 0), np.where(inside, pixel[:, 1], 0)
-        partner = field.nearest[b, y, x]
-        ok = inside & (partner >= 0)
-        partner = np.where(ok, partner, 0)
+        ok = (iz > 0) & (at >= -0.5).all(1) & (at < np.array(field.size) - 0.5).all(1)
+        edge, at, iz, predicted = edge[ok], at[ok], iz[ok], predicted[ok]
+        partner = nearest_edges(field, at, predicted)
         step = at - field.edges.uv[partner]
         seen = field.edges.normal[partner].astype(np.float64)
         held = field.inverse_depth[partner].astype(np.float64)
-        ok &= (step * step).sum(1) <= max_px**2
+        ok = (step * step).sum(1) <= max_px**2
         ok &= (seen * predicted).sum(1) >= np.cos(max_turn_rad)
         ratio = np.where(held > 0, iz / np.where(held > 0, held, 1.0), 1.0)
         ok &= (ratio < max_depth_ratio) & (ratio > 1.0 / max_depth_ratio)

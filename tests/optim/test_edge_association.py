@@ -3,10 +3,9 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from edgeslam_torch.geometry import se3
-from edgeslam_torch.optim.edge_association import EdgeField, EdgePairs, associate_edges, edge_field
+from edgeslam_torch.optim.edge_association import EdgeField, EdgePairs, associate_edges, edge_field, nearest_edges
 from edgeslam_torch.optim.local_ba import refine_window
 from edgeslam_torch.optim.problem import EdgeTerms, LmConfig, WindowProblem
 from edgeslam_torch.types import Edges, FloatArray
@@ -84,15 +83,15 @@ def test_depth_that_disagrees_is_no_partner(rng):
     assert len(pairs_of(T, [fields[0], unknown]).pair_edge) >= len(pairs_of(T, fields).pair_edge)
 
 
-def test_bins_find_the_right_edge_beside_a_nearer_crossing_one():
+def test_the_edge_that_runs_the_same_way_is_found_beside_a_nearer_crossing_one():
     across = np.stack([np.full(41, 100.0), np.arange(80.0, 121.0)], 1)  # upright, normal to the right
     lengthwise = np.stack([np.arange(104.0, 150.0), np.full(46, 100.0)], 1)  # level, normal down
     uv = np.concatenate([across, lengthwise]).astype(np.float32)
     normal = np.repeat(np.array([[1, 0], [0, 1]], np.float32), (41, 46), 0)
     field = edge_field(make_edges(uv, normal), np.zeros(87), SIZE)
-    one = edge_field(make_edges(uv, normal), np.zeros(87), SIZE, bins=1)
-    assert field.nearest[0, 100, 103] == 20  # of the upright ones, though the level one is nearer
-    assert one.nearest[0, 100, 103] == 41
+    at = np.array([[103.0, 100.0]])  # the level one is nearer
+    assert nearest_edges(field, at, np.array([[1.0, 0.0]])) == 20
+    assert nearest_edges(field, at, np.array([[0.0, 1.0]])) == 41
 
 
 def test_no_edges_no_pairs(rng):
@@ -131,12 +130,7 @@ def test_edges_alone_bring_a_pose_back(rng):
     assert np.abs(se3.log(start[1] @ se3.inverse(T[1]))).max() < 3e-3
 
 
-@pytest.mark.parametrize("bins", [1, 4])
-def test_field_names_an_edge_for_every_pixel(bins, rng):
+def test_every_edge_finds_itself(rng):
     edges, depth = see(np.eye(4), *segments(rng))
-    field = edge_field(edges, depth, SIZE, bins)
-    assert field.nearest.shape == (bins, 480, 640)
-    assert field.nearest.min() >= 0
-    u, v = edges.uv.astype(int).T
-    own = np.stack([field.nearest[b, v, u] for b in range(bins)])
-    assert (own == np.arange(len(u))).any(0).all()
+    found = nearest_edges(edge_field(edges, depth, SIZE), edges.uv, edges.normal)
+    np.testing.assert_array_equal(found, np.arange(len(edges.uv)))
