@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.losses.robust import Kernel
 from edgeslam_torch.mapping.keyframe import Keyframe
 from edgeslam_torch.mapping.slam_map import SlamMap
 from edgeslam_torch.optim.local_ba import refine_window
@@ -46,9 +47,15 @@ def choose_window(slam_map: SlamMap, newest: Keyframe, free: int, fixed: int) ->
 
 
 def refine_all(slam_map: SlamMap, camera: Camera, config: LmConfig) -> WindowResult | None:
-    """Refine every keyframe of the map at once; the first pose and the map's extent hold the gauge.
+    """Refine every keyframe of the map at once; None when there is nothing to refine, see `whole_map`."""
+    whole = whole_map(slam_map)
+    return None if whole is None else refine(slam_map, whole[0], camera, config, whole[1])
 
-    None when there is nothing to refine: fewer than three keyframes, or a camera that never moved.
+
+def whole_map(slam_map: SlamMap) -> tuple[Window, ScalePrior] | None:
+    """All keyframes as one window; the first pose and the map's extent hold the gauge.
+
+    None for fewer than three keyframes, or a camera that never moved.
     """
     keyframes = [slam_map.keyframes[id] for id in sorted(slam_map.keyframes)]
     if len(keyframes) < 3:
@@ -60,7 +67,7 @@ def refine_all(slam_map: SlamMap, camera: Camera, config: LmConfig) -> WindowRes
         return None
     members = [far, *(k for k in keyframes[1:] if k is not far)]
     window = Window(members, [first], slam_map.anchors_seen_by(keyframes))
-    return refine(slam_map, window, camera, config, ScalePrior(0, len(members), distance, 1e-3))
+    return window, ScalePrior(0, len(members), distance, 1e-3)
 
 
 def refine(
@@ -71,6 +78,26 @@ def refine(
     scale_prior: ScalePrior | None = None,
 ) -> WindowResult | None:
     """Refine the window in place; observations that disagree with the result are taken out of the map."""
+    problem, keypoint = window_problem(slam_map, window, camera, config, scale_prior)
+    if len(problem.obs_pose) == 0:
+        return None
+    result = refine_window(problem, config)
+    take_back(slam_map, window, keypoint, result)
+    return result
+
+
+def window_problem(
+    slam_map: SlamMap,
+    window: Window,
+    camera: Camera,
+    config: LmConfig,
+    scale_prior: ScalePrior | None = None,
+) -> tuple[WindowProblem, list[IntArray]]:
+    """A window's poses, anchors and observations, and which keypoints of each keyframe the observations are.
+
+    Poses come free ones first. With plain squares (``Kernel.L2``, the paper's literal form) every keypoint counts
+    alike; otherwise it is whitened by its octave.
+    """
     keyframes = [*window.free, *window.fixed]
     row_of_anchor = np.full(len(slam_map.anchors.alive) + 1, -1, dtype=np.int64)
     row_of_anchor[window.anchor] = np.arange(len(window.anchor))
@@ -80,26 +107,29 @@ def refine(
         seen = np.flatnonzero(row_of_anchor[keyframe.anchor] >= 0)
         keypoint.append(seen)
         pose.append(np.full(len(seen), i, dtype=np.int64))
-    obs_pose = np.concatenate(pose)
-    if len(obs_pose) == 0:
-        return None
     row = np.concatenate([row_of_anchor[k.anchor[s]] for k, s in zip(keyframes, keypoint, strict=True)])
     uv = np.concatenate([k.features.uv[s] for k, s in zip(keyframes, keypoint, strict=True)])
     octave = np.concatenate([k.features.octave[s] for k, s in zip(keyframes, keypoint, strict=True)])
+    alike = config.kernel is Kernel.L2
     problem = WindowProblem(
         T_c_w=np.stack([k.T_c_w for k in keyframes]),
         pose_fixed=np.arange(len(keyframes)) >= len(window.free),
         p_w=slam_map.anchors.p_w[window.anchor],
-        obs_pose=obs_pose,
+        obs_pose=np.concatenate(pose),
         obs_anchor=row,
         uv=uv.astype(np.float64),
-        inv_sigma=slam_map.scale_factor ** -octave.astype(np.float64),
+        inv_sigma=np.ones(len(row)) if alike else slam_map.scale_factor ** -octave.astype(np.float64),
         K=(camera.fx, camera.fy, camera.cx, camera.cy),
         scale_priors=(scale_prior,) if scale_prior is not None else (),
     )
-    result = refine_window(problem, config)
+    return problem, keypoint
+
+
+def take_back(slam_map: SlamMap, window: Window, keypoint: list[IntArray], result: WindowResult) -> None:
+    """Give the map a result of `window_problem`; observations that disagree with it are taken out."""
     if not np.isfinite(result.T_c_w).all() or not np.isfinite(result.p_w).all():
-        return result
+        return
+    keyframes = [*window.free, *window.fixed]
     with slam_map.lock:
         for keyframe, T_c_w in zip(keyframes, result.T_c_w, strict=True):
             keyframe.T_c_w = T_c_w
@@ -110,4 +140,3 @@ def refine(
             wrong = seen[bad[start : start + len(seen)]]
             start += len(seen)
             slam_map.forget_observations(keyframe, wrong)
-    return result
