@@ -156,6 +156,58 @@ class EdgeConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class WindowConfig:
+    """Stage 4: which losses refine poses, anchors and edge depths, and in which form.
+
+    Each term is off, in the default form, or ``literal``: the paper's equation as printed
+    (``docs/equations.md``). Edge and corner terms take part in the last refinement, once all edges are measured.
+    """
+
+    reprojection: str = "robust"
+    """``robust``: whitened by octave, Huber kernel; ``literal``: eqs. 15-16, plain squares of pixels; ``off``: no
+    refinement while flying, and none of anchors."""
+    alignment: bool = True
+    """Distance of projected edge pixels to the edge they should lie on, along its normal; not in the paper."""
+    cycle: str = "relative"
+    """``relative`` depth, ``literal`` (eqs. 17-23: pixels, a sigma of one, no kernel on the way to it) or ``off``."""
+    angle: str = "off"
+    """Across views: directions of both ``arms`` of a corner, ``cosine`` of their angle (eqs. 24-25 across views),
+    ``literal`` (eqs. 24-25 in one frame: identically zero) or ``off``."""
+    collinearity: str = "off"
+    """Straight arms (eq. 26): by the depths' own sigma (``relative``), ``literal`` (metres, a sigma of one) or
+    ``off``."""
+    adaptive: bool = True
+    """Whiten edge and corner terms by the robust scales of their residuals (paper: "adaptive weighting")."""
+    rounds: int = 2
+    """Times that edges are paired anew and all is refined."""
+    edges_per_keyframe: int = 800
+    """Edge pixels of a keyframe that take part."""
+    targets: int = 3
+    """Neighbouring keyframes in which each is looked for."""
+
+    def __post_init__(self) -> None:
+        _positive(self, "rounds", "edges_per_keyframe", "targets")
+        for name, allowed in (
+            ("reprojection", ("robust", "literal", "off")),
+            ("cycle", ("relative", "literal", "off")),
+            ("angle", ("arms", "cosine", "literal", "off")),
+            ("collinearity", ("relative", "literal", "off")),
+        ):
+            if getattr(self, name) not in allowed:
+                raise ValueError(f"{name} must be one of {', '.join(allowed)}, got {getattr(self, name)!r}")
+
+    @property
+    def uses_edges(self) -> bool:
+        """Whether any edge term is on."""
+        return self.alignment or self.cycle != "off"
+
+    @property
+    def uses_corners(self) -> bool:
+        """Whether any corner term is on; the literal angle is zero and needs none."""
+        return self.angle in ("arms", "cosine") or self.collinearity != "off"
+
+
+@dataclass(frozen=True, slots=True)
 class MountConfig:
     """Where the camera sits on the drone."""
 
@@ -181,5 +233,6 @@ class SlamConfig:
     initialisation: InitialisationConfig = field(default_factory=InitialisationConfig)
     mapping: MappingConfig = field(default_factory=MappingConfig)
     edges: EdgeConfig = field(default_factory=EdgeConfig)
+    window: WindowConfig = field(default_factory=WindowConfig)
     mount: MountConfig = field(default_factory=MountConfig)
     fusion: FusionConfig = field(default_factory=FusionConfig)

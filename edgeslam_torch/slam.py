@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -27,10 +27,9 @@ from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.mapping.depth_prior import fit_to_anchors, sample
 from edgeslam_torch.mapping.edge_map import EdgeMap
 from edgeslam_torch.mapping.keyframe import Keyframe, make_keyframe
+from edgeslam_torch.mapping.last_refinement import last_refinement, lm_config
 from edgeslam_torch.mapping.mapper import Mapper
-from edgeslam_torch.mapping.refinement import refine_all
 from edgeslam_torch.mapping.slam_map import SlamMap
-from edgeslam_torch.optim.problem import LmConfig
 from edgeslam_torch.tracking.bootstrap import Bootstrap
 from edgeslam_torch.tracking.initialiser import TwoView
 from edgeslam_torch.tracking.relocaliser import relocalise
@@ -102,7 +101,7 @@ class EdgeSlam:
             self.events["keyframes_skipped"] = 0
         self._orb = OrbExtractor(self.config.orb, camera)
         self._tracker = Tracker(self.map, camera, self.config.orb, self.config.tracking)
-        self._lm = LmConfig(diagnostics=False, max_iterations=6, cost_tolerance=1e-4)
+        self._lm = lm_config(self.config.window)
         self._mapper = Mapper(self.map, camera, self.config, self._lm)
         self._edges = EdgeMap(self.map, camera, self.config.edges, self.config.depth.prior_sigma_log)
         self._T_b_c = camera_on_body(np.deg2rad(self.config.mount.tilt_deg), self.config.mount.forward_m)
@@ -427,8 +426,7 @@ class EdgeSlam:
     def finish(self) -> None:
         """Refine the whole map, measure the last edges and fix the published scale, once no frame follows."""
         self._wait()
-        refine_all(self.map, self.camera, replace(self._lm, max_iterations=30))
-        self._edges.update(everything=True)
+        last_refinement(self.map, self.camera, self._edges, self._lm, self.config.window)
         estimate = self.scale
         if np.isfinite(estimate.sigma):
             self._published = Published(estimate.value)

@@ -65,6 +65,7 @@ class AdaptiveScales:
             "reproj": TermScale(1.0, 0.5, 3.0),
             "edge": TermScale(1.0, 0.5, 3.0),
             "cycle": TermScale(0.05, 0.01, 0.3),
+            "corner": TermScale(1.0, 0.5, 3.0),
             "angle": TermScale(0.05, 0.01, 0.3),
         }
     )

@@ -102,7 +102,8 @@ def window_problem(
     row_of_anchor = np.full(len(slam_map.anchors.alive) + 1, -1, dtype=np.int64)
     row_of_anchor[window.anchor] = np.arange(len(window.anchor))
     row_of_anchor[-1] = -1
-    keypoint, pose = [], []
+    keypoint: list[IntArray] = []
+    pose = []
     for i, keyframe in enumerate(keyframes):
         seen = np.flatnonzero(row_of_anchor[keyframe.anchor] >= 0)
         keypoint.append(seen)

@@ -15,6 +15,9 @@ from edgeslam_torch.optim.problem import EdgeTerms, JunctionTerms
 from edgeslam_torch.optim.relative import collinearity_prior
 from edgeslam_torch.types import Edges, FloatArray, IntArray
 
+UNKNOWN_SIGMA_LOG = 0.35
+"""Relative sigma of a corner's depths that nothing but other views may tell."""
+
 
 @dataclass(frozen=True, slots=True)
 class Structure:
@@ -37,7 +40,8 @@ class TermConfig:
     max_px: float = 4.0
     """Largest distance between a projected edge pixel and its partner."""
     edge_sigma_px: float = 2.0
-    """Edges scatter by 0.8 px on fr1_xyz, but neighbours on one edge err together: six of them count as one."""
+    """Edges scatter by 0.8 px on fr1_xyz, but neighbours on one edge err together: six of them count as one. Zero
+    leaves alignment out."""
     least_sigma: float = 0.003
     """Relative depth sigma below which no single edge is believed."""
     cycle: CycleForm = CycleForm.RELATIVE_DEPTH
@@ -51,6 +55,21 @@ class TermConfig:
     """Edge points along each arm whose depths are asked for."""
     arm_px: float = 40.0
     """Longest piece of an arm that is used."""
+    collinearity: str = "relative"
+    """Straight arms: whitened by the depths' sigmas, ``literal`` (metres with a sigma of one) or ``off``."""
+    angle_sigma: float = 0.05
+    """Standard deviation of an angle row; zero leaves the angle out."""
+    cosines: bool = False
+    """The cosine of the angle (paper eq. 24 across views) in place of both arms' directions."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlacedEdges:
+    """Edge terms with the places of their edges in the keyframes' own lists."""
+
+    terms: EdgeTerms
+    index: IntArray
+    """``(E,)`` edge of the host's `Structure`."""
 
 
 def make_structure(
@@ -92,7 +111,7 @@ def edge_terms(
     T_c_w: FloatArray,
     K: tuple[float, float, float, float],
     config: TermConfig | None = None,
-) -> EdgeTerms | None:
+) -> PlacedEdges | None:
     """Edge alignment and cycle between each pose and its nearest neighbours; None when no edge finds a partner.
 
     Args:
@@ -121,7 +140,8 @@ def edge_terms(
     used, pair_edge = np.unique(pairs.pair_edge, return_inverse=True)
     if len(used) == 0:
         return None
-    return EdgeTerms(
+    alignment = 1.0 / config.edge_sigma_px if config.edge_sigma_px > 0 else 0.0
+    terms = EdgeTerms(
         host=host[used],
         uv=uv[used],
         inverse_depth=inverse_depth[used],
@@ -131,11 +151,12 @@ def edge_terms(
         pair_pose=pairs.pair_pose,
         pair_uv=pairs.pair_uv,
         pair_normal=pairs.pair_normal,
-        pair_inv_sigma=np.full(len(pair_edge), 1.0 / config.edge_sigma_px),
+        pair_inv_sigma=np.full(len(pair_edge), alignment),
         pair_inverse_depth=pairs.pair_inverse_depth,
         cycle=config.cycle,
         cycle_sigma=config.cycle_sigma,
     )
+    return PlacedEdges(terms, np.concatenate(chosen)[used])
 
 
 def junction_terms(
@@ -183,6 +204,8 @@ def junction_terms(
         pair_pose=pose,
         pair_uv=seen,
         pair_arms=arms,
+        inv_sigma_angle=1.0 / config.angle_sigma if config.angle_sigma > 0 else 0.0,
+        cosines=config.cosines,
     )
 
 
@@ -212,7 +235,12 @@ def _junction_depths(structure: Structure, config: TermConfig) -> tuple[FloatArr
     near = np.take_along_axis(away, best, 0)[0] <= 2.0
     depth, sigma = field.inverse_depth[partner].astype(np.float64), structure.sigma[partner].astype(np.float64)
     given = near & (depth > 0)
-    prior, information = collinearity_prior(np.where(given, fraction, np.nan), depth, np.where(given, sigma, 1.0))
+    if config.collinearity == "literal":  # metres off the line, all alike: d(1 / z) = dz / z^2
+        sigma = depth * depth
+    sigma = np.where(given, sigma, 1.0)
+    prior, information = collinearity_prior(np.where(given, fraction, np.nan), depth, sigma)
+    if config.collinearity == "off":  # a start, and hardly more
+        information = np.eye(3) / (UNKNOWN_SIGMA_LOG * np.maximum(prior, 1e-6)[:, :, None]) ** 2
     known = (given.sum(2) >= 3).all(1) & (prior > 0).all(1)
     return prior, information, known
 

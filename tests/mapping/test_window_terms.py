@@ -77,8 +77,11 @@ def test_nearest_poses_are_by_baseline():
 
 def test_terms_fit_at_the_true_poses(scene):
     T, structures = scene
-    edges, junctions = edge_terms(structures, T, K), junction_terms(structures, T, K)
-    assert edges is not None
+    placed, junctions = edge_terms(structures, T, K), junction_terms(structures, T, K)
+    assert placed is not None
+    edges = placed.terms
+    own = np.stack([structures[h].field.edges.uv[i] for h, i in zip(edges.host, placed.index, strict=True)])
+    np.testing.assert_array_equal(own, edges.uv)
     assert junctions is not None
     assert len(edges.pair_edge) > 1000
     assert len(junctions.pair_junction) > 60
@@ -91,8 +94,9 @@ def test_terms_fit_at_the_true_poses(scene):
 
 def test_numbers_are_kept(scene):
     T, structures = scene
-    edges = edge_terms(structures, T, K, TermConfig(edges_per_pose=100, targets=1))
-    assert edges is not None
+    placed = edge_terms(structures, T, K, TermConfig(edges_per_pose=100, targets=1))
+    assert placed is not None
+    edges = placed.terms
     assert np.bincount(edges.host).max() <= 100
     assert np.bincount(edges.pair_edge).max() == 1
 
@@ -104,13 +108,14 @@ def test_terms_bring_poses_back(scene, rng):
         start[i] = se3.exp(np.repeat([0.006, 0.002], 3) * rng.normal(size=6)) @ T[i]
     before = max(np.abs(se3.log(a @ se3.inverse(b))).max() for a, b in zip(start, T, strict=True))
     for _ in range(3):
+        placed = edge_terms(structures, start, K)
         problem = WindowProblem(
             start,
             np.arange(4) < 1,
             np.zeros((0, 3)),
             *4 * [np.zeros(0)],
             K,
-            edges=edge_terms(structures, start, K),
+            edges=None if placed is None else placed.terms,
             junctions=junction_terms(structures, start, K),
         )
         start = refine_window(problem).T_c_w

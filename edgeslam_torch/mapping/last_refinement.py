@@ -1,0 +1,151 @@
+"""Refinement of the whole map once no keyframe follows: anchors first, then edges and corners with them."""
+
+import logging
+from dataclasses import replace
+
+import numpy as np
+
+from edgeslam_torch.config import WindowConfig
+from edgeslam_torch.frontend.canny import canny
+from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.losses.cycle import CycleForm
+from edgeslam_torch.losses.robust import Kernel
+from edgeslam_torch.losses.weighting import AdaptiveScales
+from edgeslam_torch.mapping.edge_map import EdgeMap, EdgePoints
+from edgeslam_torch.mapping.keyframe import Keyframe
+from edgeslam_torch.mapping.refinement import refine_all, take_back, whole_map, window_problem
+from edgeslam_torch.mapping.slam_map import SlamMap
+from edgeslam_torch.mapping.window_terms import (
+    PlacedEdges,
+    Structure,
+    TermConfig,
+    edge_terms,
+    junction_terms,
+    make_structure,
+)
+from edgeslam_torch.optim.adaptive import term_residuals, with_scales
+from edgeslam_torch.optim.local_ba import refine_window
+from edgeslam_torch.optim.problem import LmConfig, WindowProblem, WindowResult
+from edgeslam_torch.types import FloatArray
+
+logger = logging.getLogger(__name__)
+
+ALIKE = 2.4
+"""Neighbours on one edge err together: about six count as one (the root of six)."""
+ITERATIONS = 30
+
+
+def lm_config(config: WindowConfig) -> LmConfig:
+    """How windows are minimised while flying."""
+    return LmConfig(
+        diagnostics=False,
+        max_iterations=0 if config.reprojection == "off" else 6,
+        cost_tolerance=1e-4,
+        kernel=Kernel.L2 if config.reprojection == "literal" else Kernel.HUBER,
+    )
+
+
+def last_refinement(
+    slam_map: SlamMap, camera: Camera, edges: EdgeMap, lm: LmConfig, config: WindowConfig
+) -> WindowResult | None:
+    """Refine all keyframes with all anchors, measure the last edges, and refine everything with the edges.
+
+    Returns:
+        What the last solver run reports; None when there was nothing to refine.
+    """
+    lm = replace(lm, max_iterations=ITERATIONS)
+    result = refine_all(slam_map, camera, lm) if config.reprojection != "off" else None
+    edges.update(everything=True)
+    if config.uses_edges or config.uses_corners:
+        result = refine_with_edges(slam_map, camera, edges, lm, config) or result
+    return result
+
+
+def refine_with_edges(
+    slam_map: SlamMap, camera: Camera, edges: EdgeMap, lm: LmConfig, config: WindowConfig
+) -> WindowResult | None:
+    """Refine the whole map with edge and corner terms beside its anchors; edges are paired anew every round.
+
+    Returns:
+        What the last round reports, or None for a map with nothing to refine.
+    """
+    whole = whole_map(slam_map)
+    if whole is None:
+        return None
+    window, scale_prior = whole
+    keyframes = [*window.free, *window.fixed]
+    hosts = {h.keyframe_id: h for h in edges.hosts}
+    terms = term_config(config)
+    scales = AdaptiveScales()
+    result = None
+    for _ in range(config.rounds):
+        problem, keypoint = window_problem(slam_map, window, camera, lm, scale_prior)
+        structures = [_structure(k, hosts.get(k.id), camera, config, edges) for k in keyframes]
+        placed = edge_terms(structures, problem.T_c_w, problem.K, terms) if config.uses_edges else None
+        corners = junction_terms(structures, problem.T_c_w, problem.K, terms) if config.uses_corners else None
+        problem = replace(problem, edges=None if placed is None else placed.terms, junctions=corners)
+        if config.reprojection == "off":
+            problem = _without_points(problem)
+        if problem.edges is None and problem.junctions is None:
+            return result
+        if config.adaptive:
+            scales = scales.updated(term_residuals(problem))
+            problem = with_scales(problem, scales, ALIKE)
+            logger.debug("term scales %s", {k: round(t.sigma, 4) for k, t in scales.terms.items()})
+        result = refine_window(problem, lm)
+        if config.reprojection == "off":
+            keypoint = [k[:0] for k in keypoint]
+        take_back(slam_map, window, keypoint, result)
+        if placed is not None:
+            _take_back_depths(keyframes, hosts, camera, placed, result.edge_inverse_depth)
+        logger.debug("edges and corners: %s after %d steps", result.stop, result.iterations)
+    return result
+
+
+def term_config(config: WindowConfig) -> TermConfig:
+    """What the settings mean for the terms of a window."""
+    default = TermConfig()
+    cycle_sigma = {"relative": default.cycle_sigma, "literal": 1.0, "off": 0.0}[config.cycle]
+    return TermConfig(
+        edges_per_pose=config.edges_per_keyframe,
+        targets=config.targets,
+        edge_sigma_px=default.edge_sigma_px if config.alignment else 0.0,
+        cycle=CycleForm.PIXEL if config.cycle == "literal" else CycleForm.RELATIVE_DEPTH,
+        cycle_sigma=cycle_sigma,
+        collinearity=config.collinearity,
+        # The literal angle's residual is zero whatever poses and depths are: leaving it out is the same.
+        angle_sigma=default.angle_sigma if config.angle in ("arms", "cosine") else 0.0,
+        cosines=config.angle == "cosine",
+    )
+
+
+def _structure(
+    keyframe: Keyframe, host: EdgePoints | None, camera: Camera, config: WindowConfig, edges: EdgeMap
+) -> Structure:
+    """A keyframe's measured edges; none for a keyframe whose edges were never measured."""
+    if host is None or keyframe.grey is None:
+        blank = np.zeros((camera.height, camera.width), np.uint8)
+        return make_structure(blank, np.zeros((0, 2)), np.zeros(0), np.zeros(0))
+    z = host.p_c[:, 2]
+    mask = canny(keyframe.grey, edges.config.canny_low, edges.config.canny_high) if config.uses_corners else None
+    return make_structure(keyframe.grey, host.uv, 1.0 / z, host.sigma / z**2, mask)
+
+
+def _without_points(problem: WindowProblem) -> WindowProblem:
+    none = np.zeros(0, dtype=np.int64)
+    return replace(problem, obs_pose=none, obs_anchor=none, uv=np.zeros((0, 2)), inv_sigma=np.zeros(0))
+
+
+def _take_back_depths(
+    keyframes: list[Keyframe],
+    hosts: dict[int, EdgePoints],
+    camera: Camera,
+    placed: PlacedEdges,
+    inverse_depth: FloatArray,
+) -> None:
+    """Give the keyframes' edge points their refined depths."""
+    good = np.isfinite(inverse_depth) & (inverse_depth > 0)
+    for pose in np.unique(placed.terms.host):
+        mine = np.flatnonzero((placed.terms.host == pose) & good)
+        host, index = hosts[keyframes[pose].id], placed.index[mine]
+        host.p_c[index] = camera.back_project(host.uv[index], 1.0 / inverse_depth[mine])
