@@ -178,7 +178,7 @@ class WindowConfig:
     ``off``."""
     adaptive: bool = True
     """Whiten edge and corner terms by the robust scales of their residuals (paper: "adaptive weighting")."""
-    rounds: int = 2
+    rounds: int = 1
     """Times that edges are paired anew and all is refined."""
     edges_per_keyframe: int = 800
     """Edge pixels of a keyframe that take part."""
