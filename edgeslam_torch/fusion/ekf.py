@@ -17,7 +17,8 @@ from scipy.linalg.lapack import dposv
 from scipy.special import chdtri  # scipy.stats takes a second of CPU to import
 
 from edgeslam_torch.fusion.config import FusionConfig
-from edgeslam_torch.fusion.rotations import euler_rate_matrix, matrix_from_rpy, rotation_vector, wrapped
+from edgeslam_torch.fusion.relative import relative_measurement
+from edgeslam_torch.fusion.rotations import euler_rate_matrix, matrix_from_rpy, wrapped
 from edgeslam_torch.types import FloatArray
 
 _P, _A, _B = slice(0, 3), slice(3, 6), slice(6, 9)
@@ -100,18 +101,19 @@ class Ekf:
             return
         config, x, P = self.config, self.x, self.P
         velocity = velocity_m_s - x[_B]
-        A = np.zeros((3, 6))
         if config.velocity_frame == "body":
             R = matrix_from_rpy(x[_A])
-            moved = R @ velocity
+            moved = R.dot(velocity)
+            A = np.empty((3, 6))
             A[:, :3] = dt_s * _cross_columns(euler_rate_matrix(x[_A]), moved)
             A[:, 3:] = -dt_s * R
+            P[_P] += A.dot(P[3:9])
+            P[:, _P] += P[:, 3:9].dot(A.T)
         else:
             moved = velocity
-            A[0, 3] = A[1, 4] = A[2, 5] = -dt_s
+            P[_P] -= dt_s * P[_B]
+            P[:, _P] -= dt_s * P[:, _B]
         x[_P] += dt_s * moved
-        P[_P] += A @ P[3:9]
-        P[:, _P] += P[:, 3:9] @ A.T
         growth = 1.0 + config.beta * spent + config.lambda_tau * min(self.tau_s, 60.0)
         position = dt_s * (0.1 * config.sigma_velocity_m_s**2 * growth + config.floor_position_m**2)
         turning = dt_s * (config.sigma_turn_rad_sqrt_s**2 + dt_s * turn_rad_s**2)
@@ -168,23 +170,9 @@ class Ekf:
             sigma_t_m: Standard deviation of its translation [m], per axis.
             sigma_r_rad: Standard deviation of its rotation [rad], per axis.
         """
-        x = self.x
-        R_c, R = matrix_from_rpy(x[12:15]), matrix_from_rpy(x[_A])
-        step = x[_P] - x[9:12]
-        R_c_t = R_c.T
-        residual = np.empty(6)
-        residual[:3] = T_clone_b[:3, 3] - R_c_t @ step
-        residual[3:] = rotation_vector(T_clone_b[:3, :3] @ R.T @ R_c)
-        E_c = euler_rate_matrix(x[12:15])
-        turned = R_c_t @ np.hstack([_cross_columns(E_c, step), euler_rate_matrix(x[_A]), E_c])
-        H = np.zeros((6, _SIZE))
-        H[:3, _P] = R_c_t
-        H[:3, 9:12] = -R_c_t
-        H[:3, 12:15] = -turned[:, :3]
-        H[3:, _A] = turned[:, 3:6]
-        H[3:, 12:15] = -turned[:, 6:]
-        P_Ht = self.P @ H.T
-        outcome = self._update(P_Ht, H @ P_Ht, residual, _pose_noise(sigma_t_m, sigma_r_rad))
+        residual, H = relative_measurement(self.x, T_clone_b)
+        P_Ht = self.P.dot(H.T)
+        outcome = self._update(P_Ht, H.dot(P_Ht), residual, _pose_noise(sigma_t_m, sigma_r_rad))
         self._after_visual(outcome)
         return outcome
 
@@ -195,11 +183,11 @@ class Ekf:
     def _update(self, P_Ht: FloatArray, S: FloatArray, residual: FloatArray, noise: FloatArray) -> Outcome:
         """Gate and apply one measurement; ``P_Ht`` is ``P H^T`` ``(15, n)`` and ``S`` its ``H P H^T`` ``(n, n)``."""
         n = len(residual)
-        if not math.isfinite(float(residual @ residual)):
+        if not math.isfinite(residual.dot(residual)):
             return Outcome.NOT_FINITE
-        S.flat[:: n + 1] += noise
+        S.ravel()[:: n + 1] += noise
         gain, weighted = _solved(S, P_Ht, residual)
-        self.nis = float(residual @ weighted)
+        self.nis = float(residual.dot(weighted))
         outcome = Outcome.ACCEPTED
         if not self.config.literal and self.nis > self._gate[n]:
             self.refused_in_row[n] += 1
@@ -211,14 +199,12 @@ class Ekf:
             P_Ht = P_Ht * factor  # before P changes: it may be a view of it
             self.P = self.P * factor
             S *= factor
-            S.flat[:: n + 1] += (1.0 - factor) * noise
+            S.ravel()[:: n + 1] += (1.0 - factor) * noise
             gain, weighted = _solved(S, P_Ht, residual)
         self.refused_in_row[n] = 0
-        self.x += P_Ht @ weighted
-        P = self.P - P_Ht @ gain
-        P += P.T
-        P *= 0.5
-        self.P = P
+        self.x += P_Ht.dot(weighted)
+        P = self.P - P_Ht.dot(gain)
+        self.P = 0.5 * (P + P.T)
         if not self.config.literal:
             _wrap_in_place(self.x, (3, 4, 5, 12, 13, 14))
         return outcome
@@ -253,9 +239,10 @@ def _solved(S: FloatArray, P_Ht: FloatArray, residual: FloatArray) -> tuple[Floa
 
 
 def _wrap_in_place(x: FloatArray, indices: tuple[int, ...]) -> None:
+    values = x.tolist()
     for i in indices:
-        if not -math.pi <= x[i] < math.pi:
-            x[i] = (x[i] + math.pi) % (2.0 * math.pi) - math.pi
+        if not -math.pi <= values[i] < math.pi:
+            x[i] = (values[i] + math.pi) % (2.0 * math.pi) - math.pi
 
 
 def _pose_noise(sigma_t_m: float, sigma_r_rad: float) -> FloatArray:

@@ -1,6 +1,7 @@
 """Roll, pitch, yaw and rotation vectors in scalar code: the filter turns one pose at a time, where numpy is slow."""
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -44,12 +45,17 @@ def euler_rate_matrix(rpy: FloatArray) -> FloatArray:
 
 def rotation_vector(R: FloatArray) -> FloatArray:
     """Rotation vector ``(3,)`` [rad] of ``R``, for angles below pi."""
-    x, y, z = float(R[2, 1] - R[1, 2]), float(R[0, 2] - R[2, 0]), float(R[1, 0] - R[0, 1])
+    return np.array(rotation_vector_of(R.tolist()))
+
+
+def rotation_vector_of(rows: Sequence[Sequence[float]]) -> tuple[float, float, float]:
+    """The same for plain numbers."""
+    (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = rows
+    x, y, z = r21 - r12, r02 - r20, r10 - r01
     sine = 0.5 * math.sqrt(x * x + y * y + z * z)
-    cosine = 0.5 * (float(R[0, 0] + R[1, 1] + R[2, 2]) - 1.0)
-    angle = math.atan2(sine, cosine)
+    angle = math.atan2(sine, 0.5 * (r00 + r11 + r22 - 1.0))
     scale = 0.5 if sine < 1e-9 else 0.5 * angle / sine
-    return np.array([scale * x, scale * y, scale * z])
+    return scale * x, scale * y, scale * z
 
 
 def wrapped(angle: FloatArray) -> FloatArray:
