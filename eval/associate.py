@@ -71,29 +71,38 @@ def associate(
     Raises:
         EvaluationError: If nothing matches; the message says which of the usual mistakes it looks like.
     """
-    factor, notes = _unit_factor(truth_s, estimate_s)
+    factor, notes = unit_factor(truth_s, estimate_s)
     stamps = estimate_s * factor + offset_s
     i, j = match(truth_s, stamps, max_dt_s)
     if len(i) == 0:
-        raise EvaluationError(_why_nothing_matches(truth_s, stamps, max_dt_s))
+        reasons = [_why_nothing_matches(truth_s, stamps, max_dt_s), *notes]
+        raise EvaluationError("; ".join(reasons))
     return Association(i, j, offset_s, factor, tuple(notes))
 
 
-def _unit_factor(truth_s: FloatArray, estimate_s: FloatArray) -> tuple[float, list[str]]:
-    """Factor that brings the estimated stamps to the truth's unit, when it is a power of a thousand.
+def unit_factor(truth_s: FloatArray, estimate_s: FloatArray) -> tuple[float, list[str]]:
+    """Factor that brings the estimated stamps to the truth's unit, when it is a power of a thousand, and a note of it.
 
     Clocks that start at 0 overlap in any unit, so stamps that do overlap are still suspected when one list lasts
-    more than 200 times as long as the other.
+    more than 200 times as long as the other. When no unit makes them overlap, the two clocks start at different
+    times, and how long the lists last still tells the unit.
     """
     span_t, span_e = truth_s[-1] - truth_s[0], estimate_s[-1] - estimate_s[0]
     ratio = span_e / span_t if span_t > 0 and span_e > 0 else 1.0
-    if _overlap(truth_s, estimate_s) > 0 and 1 / 200 < ratio < 200:
+    if 1 / 200 < ratio < 200 and _overlap(truth_s, estimate_s) > 0:
         return 1.0, []
-    for name, per_second in _UNITS.items():
-        for factor, whose in ((1.0 / per_second, "the estimate's"), (per_second, "the ground truth's")):
-            alike = 1 / 200 < ratio * factor < 200
-            if alike and _overlap(truth_s, estimate_s * factor) > 0.1 * min(span_t, span_e * factor):
-                return factor, [f"{whose} stamps are {name}, the other file's seconds: converted"]
+    candidates = {
+        factor: f"{whose} stamps are {name}, the other file's seconds: converted"
+        for name, per_second in _UNITS.items()
+        for factor, whose in ((1.0 / per_second, "the estimate's"), (per_second, "the ground truth's"))
+    }
+    for factor, note in candidates.items():
+        alike = 1 / 200 < ratio * factor < 200
+        if alike and _overlap(truth_s, estimate_s * factor) > 0.1 * min(span_t, span_e * factor):
+            return factor, [note]
+    likeliest = min(candidates, key=lambda factor: abs(np.log(ratio * factor)))
+    if not 1 / 200 < ratio < 200 and 1 / 30 < ratio * likeliest < 30:
+        return likeliest, [candidates[likeliest]]
     return 1.0, []
 
 

@@ -103,6 +103,42 @@ def open_dataset(folder: Path | str) -> EvalDataset:
     return _open_tum(folder)
 
 
+@dataclass(frozen=True, slots=True)
+class MeasuredDepth:
+    """A recording's depth maps beside its colour images; no true poses are needed."""
+
+    files: DepthFiles
+    frame_stamps_s: FloatArray
+    """``(F,)`` stamps of the colour images."""
+    image_paths: tuple[Path, ...]
+    camera: Camera
+    """Colour camera."""
+
+
+def open_depth(folder: Path | str) -> MeasuredDepth:
+    """Measured depth of a TUM or 7-Scenes recording.
+
+    Raises:
+        EvaluationError: If the folder has no depth maps, or its camera is not known.
+    """
+    folder = Path(folder)
+    if any(folder.glob("*.depth.png")):
+        images = tuple(sorted(folder.glob("*.color.png")))
+        camera = _camera(folder) or PRESETS["kinect"]
+        files = _seven_scenes_depth(folder)
+        stamps = _frame_stamps(images)
+    else:
+        stamps, images, _ = _read_list(folder / "rgb.txt", folder)
+        known = _camera(folder)
+        if known is None and (folder / "depth.txt").is_file():
+            raise EvaluationError(f"{folder}: the camera is not known; put a camera.yaml into the folder")
+        camera = known or PRESETS["kinect"]
+        files = _tum_depth(folder, camera)
+    if files is None or len(stamps) == 0:
+        raise EvaluationError(f"{folder}: no depth.txt and rgb.txt, nor *.depth.png, in this folder")
+    return MeasuredDepth(files, stamps, images, camera)
+
+
 def interpolate(trajectory: Trajectory, stamps_s: FloatArray) -> tuple[FloatArray, np.ndarray]:
     """Poses ``(N, 4, 4)`` at ``stamps_s`` and which of them lie within the trajectory's time and no long gap."""
     known = trajectory.stamps_s
@@ -122,28 +158,36 @@ def _open_tum(folder: Path) -> EvalDataset:
     truth = read_trajectory(folder / "groundtruth.txt")
     stamps, images, _ = _read_list(folder / "rgb.txt", folder)
     camera = _camera(folder)
-    depth = None
-    if (folder / "depth.txt").is_file() and camera is not None:
-        depth_stamps, paths, header = _read_list(folder / "depth.txt", folder)
-        divisor = re.search(r"/\s*(\d+)", header)
-        unregistered = "not registered" in header.lower()
-        depth = DepthFiles(
-            depth_stamps,
-            paths,
-            1.0 / float(divisor.group(1)) if divisor else 1.0 / 5000.0,  # TUM's file format page
-            SEVEN_SCENES_DEPTH_CAMERA if unregistered else camera,
-            SEVEN_SCENES_T_C_D if unregistered else np.eye(4),
-        )
+    depth = _tum_depth(folder, camera) if camera is not None else None
     return EvalDataset(folder.resolve().name, folder, truth, stamps, images, camera, depth)
+
+
+def _tum_depth(folder: Path, camera: Camera) -> DepthFiles | None:
+    if not (folder / "depth.txt").is_file():
+        return None
+    stamps, paths, header = _read_list(folder / "depth.txt", folder)
+    divisor = re.search(r"/\s*(\d+)", header)
+    unregistered = "not registered" in header.lower()
+    return DepthFiles(
+        stamps,
+        paths,
+        1.0 / float(divisor.group(1)) if divisor else 1.0 / 5000.0,  # TUM's file format page
+        SEVEN_SCENES_DEPTH_CAMERA if unregistered else camera,
+        SEVEN_SCENES_T_C_D if unregistered else np.eye(4),
+    )
+
+
+def _seven_scenes_depth(folder: Path) -> DepthFiles | None:
+    paths = tuple(sorted(folder.glob("*.depth.png")))
+    if not paths:
+        return None
+    return DepthFiles(_frame_stamps(paths), paths, 1e-3, SEVEN_SCENES_DEPTH_CAMERA, SEVEN_SCENES_T_C_D)
 
 
 def _open_seven_scenes(folder: Path) -> EvalDataset:
     truth = read_trajectory(folder)
     images = tuple(sorted(folder.glob("*.color.png")))
-    depths = tuple(sorted(p for p in folder.glob("*.depth.png")))
-    depth = None
-    if depths:
-        depth = DepthFiles(_frame_stamps(depths), depths, 1e-3, SEVEN_SCENES_DEPTH_CAMERA, SEVEN_SCENES_T_C_D)
+    depth = _seven_scenes_depth(folder)
     camera = _camera(folder) or PRESETS["kinect"]
     name = "_".join(folder.resolve().parts[-2:])
     return EvalDataset(name, folder, truth, _frame_stamps(images), images, camera, depth)

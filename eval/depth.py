@@ -8,7 +8,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from edgeslam_torch.eval.associate import DEFAULT_MAX_DT_S, nearest
+from edgeslam_torch.eval.dataset import open_depth
 from edgeslam_torch.eval.errors import EvaluationError
+from edgeslam_torch.eval.surface import register_depth
 from edgeslam_torch.types import FloatArray
 
 MIN_DEPTH_M = 1e-3
@@ -122,20 +125,100 @@ def read_depth(path: Path, metres_per_unit: float = 1.0 / 5000.0) -> FloatArray:
     return np.where(raw == 65535, 0, raw).astype(np.float64) * metres_per_unit
 
 
-def compare_folders(prediction: Path, truth: Path, metres_per_unit: float = 1.0 / 5000.0) -> DepthReport:
+def compare_folders(
+    prediction: Path, truth: Path, metres_per_unit: float = 1.0 / 5000.0, images: Path | None = None
+) -> DepthReport:
     """Mean figures over the maps that two folders (or files) share by name.
+
+    Args:
+        prediction: Folder or file to judge; of a name's ``.npy`` and ``.png`` the former is taken.
+        truth: Folder or file of measured depth.
+        metres_per_unit: What a PNG's value is worth [m].
+        images: Folder or file of images of the same names and size: their edge pixels are judged alone too.
 
     Raises:
         EvaluationError: If no name is in both.
     """
     if prediction.is_file() and truth.is_file():
-        return report_depth(read_depth(prediction, metres_per_unit), read_depth(truth, metres_per_unit))
-    known = {p.stem: p for p in truth.glob("*") if p.suffix in (".png", ".npy")}
-    pairs = [(p, known[p.stem]) for p in sorted(prediction.glob("*")) if p.stem in known]
+        pairs = [(prediction, truth, images)]
+    else:
+        known, pictures = _maps(truth), _images(images)
+        pairs = [(path, known[n], pictures.get(n)) for n, path in _maps(prediction).items() if n in known]
     if not pairs:
-        raise EvaluationError(f"{prediction} and {truth} share no depth map by name (.npy or 16-bit .png)")
-    reports = [report_depth(read_depth(a, metres_per_unit), read_depth(b, metres_per_unit)) for a, b in pairs]
-    return DepthReport(mean_score(r.metric for r in reports), mean_score(r.median_scaled for r in reports), None, None)
+        raise EvaluationError(
+            f"{prediction} and {truth} share no depth map by name (.npy or 16-bit .png); for predictions named after "
+            "a recording's colour images, give the recording's own folder as ground truth"
+        )
+    return mean_report(
+        report_depth(read_depth(a, metres_per_unit), read_depth(b, metres_per_unit), _read_image(image))
+        for a, b, image in pairs
+    )
+
+
+def compare_with_recording(prediction: Path, folder: Path) -> DepthReport:
+    """Mean figures over the maps of a folder, named after a recording's images, against its measured depth.
+
+    Depth maps and colour images have stamps of their own: the nearest within 20 ms is taken, undistorted, and turned to
+    the colour camera where it is not registered. The images give the edges.
+
+    Raises:
+        EvaluationError: If the recording has no depth maps, or none belongs to a prediction.
+    """
+    measured = open_depth(folder)
+    maps = _maps(prediction)
+    reports = []
+    for stamp, path in zip(measured.frame_stamps_s, measured.image_paths, strict=True):
+        index = int(nearest(measured.files.stamps_s, np.array([stamp]))[0])
+        if path.stem not in maps or abs(measured.files.stamps_s[index] - stamp) > DEFAULT_MAX_DT_S:
+            continue
+        truth = measured.files.read(index)
+        if not np.array_equal(measured.files.T_c_d, np.eye(4)):
+            truth = register_depth(truth, measured.files.camera, measured.files.T_c_d, measured.camera)
+        image = _read_image(path)
+        image = None if image is None else np.asarray(measured.camera.undistort_image(image), np.uint8)
+        reports.append(report_depth(read_depth(maps[path.stem], 1e-3), truth, image))
+    if not reports:
+        raise EvaluationError(
+            f"{prediction}: no depth map is named after an image of {folder} that has measured depth within "
+            f"{1e3 * DEFAULT_MAX_DT_S:.0f} ms ('edgeslam depth {folder} --out DIR' names them so)"
+        )
+    return mean_report(reports)
+
+
+def mean_report(reports: Iterable[DepthReport]) -> DepthReport:
+    """Mean over maps of all four figures; edges over the maps that have any."""
+    found = list(reports)
+    edges = [r.edges_metric for r in found if r.edges_metric is not None]
+    scaled = [r.edges_median_scaled for r in found if r.edges_median_scaled is not None]
+    return DepthReport(
+        mean_score(r.metric for r in found),
+        mean_score(r.median_scaled for r in found),
+        mean_score(edges) if edges else None,
+        mean_score(scaled) if scaled else None,
+    )
+
+
+def _maps(place: Path) -> dict[str, Path]:
+    """Depth maps of a folder by name; numbers win over pictures, and pictures to look at are not taken."""
+    if place.is_file():
+        return {place.stem: place}
+    found = {p.stem: p for suffix in (".png", ".npy") for p in sorted(place.glob(f"*{suffix}"))}
+    return {name: path for name, path in sorted(found.items()) if not name.endswith(("_colour", "_sigma"))}
+
+
+def _images(place: Path | None) -> dict[str, Path]:
+    if place is None:
+        return {}
+    return {p.stem: p for p in sorted(place.glob("*")) if p.suffix.lower() in (".png", ".jpg", ".jpeg")}
+
+
+def _read_image(path: Path | None) -> NDArray[np.uint8] | None:
+    if path is None:
+        return None
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    if image is None:
+        raise EvaluationError(f"{path}: not an image")
+    return np.asarray(image, dtype=np.uint8)
 
 
 def markdown_depth(report: DepthReport) -> str:

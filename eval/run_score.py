@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from edgeslam_torch.eval.align import AlignmentKind, umeyama
-from edgeslam_torch.eval.associate import DEFAULT_MAX_DT_S
+from edgeslam_torch.eval.associate import DEFAULT_MAX_DT_S, Association
 from edgeslam_torch.eval.dataset import EvalDataset, interpolate, open_dataset
 from edgeslam_torch.eval.diagnose import explain
 from edgeslam_torch.eval.edge_map import MapScore, score_map
@@ -100,6 +100,7 @@ def evaluate_run(
     dataset_dir = Path(dataset_dir)
     dataset = open_dataset(dataset_dir) if dataset_dir.is_dir() else None
     truth = dataset.truth if dataset is not None else read_trajectory(dataset_dir)
+    run = _stamped(run, dataset)
     sim3 = score_trajectory(truth, run.trajectory, AlignmentKind.SIM3, max_dt_s, offset_s)
     se3 = score_trajectory(truth, run.trajectory, AlignmentKind.SE3, max_dt_s, offset_s)
     raw = score_trajectory(truth, run.trajectory, AlignmentKind.NONE, max_dt_s, offset_s)
@@ -109,7 +110,7 @@ def evaluate_run(
     depth_dataset = open_dataset(depth_truth_dir) if depth_truth_dir is not None else dataset
     map_score, map_note = _map_score(run, depth_dataset, sim3) if judge_map else (None, "not asked for")
     one_second = sim3.relative[1]
-    coverage, with_pose, first = _coverage(run, dataset, truth)
+    coverage, with_pose, first = _coverage(run, dataset, truth, sim3.association)
     units = _units(run)
     judged = se3 if units == "metres" else sim3
     return RunScore(
@@ -139,6 +140,15 @@ def evaluate_run(
     )
 
 
+def _stamped(run: RunFolder, dataset: EvalDataset | None) -> RunFolder:
+    """A file without stamps (KITTI, 7-Scenes) that has a pose for every image gets the images' stamps."""
+    mine = run.trajectory
+    if mine.stamped or dataset is None or len(mine) != len(dataset.frame_stamps_s):
+        return run
+    note = "no stamps in the file: its poses are taken for the data set's images, in order"
+    return replace(run, trajectory=replace(mine, stamps_s=dataset.frame_stamps_s, stamped=True, notes=(note,)))
+
+
 def _map_score(run: RunFolder, dataset: EvalDataset | None, sim3: TrajectoryScore) -> tuple[MapScore | None, str]:
     if run.path.is_file():
         return None, "a trajectory alone has no map"
@@ -160,7 +170,9 @@ def _map_score(run: RunFolder, dataset: EvalDataset | None, sim3: TrajectoryScor
         return None, str(error)
 
 
-def _coverage(run: RunFolder, dataset: EvalDataset | None, truth: Trajectory) -> tuple[float, float, float]:
+def _coverage(
+    run: RunFolder, dataset: EvalDataset | None, truth: Trajectory, clock: Association
+) -> tuple[float, float, float]:
     """Share of frames with a trusted pose and with any pose, and the time of the first [s]."""
     frames = dataset.frame_stamps_s if dataset is not None else np.zeros(0)
     source = run.summary.get("source")
@@ -169,12 +181,12 @@ def _coverage(run: RunFolder, dataset: EvalDataset | None, truth: Trajectory) ->
         frames = frames[:limit]  # --max-frames: the run was asked for no more
     if len(frames) == 0:
         span = float(truth.stamps_s[-1] - truth.stamps_s[0])
-        mine = run.trajectory.stamps_s
+        mine = run.trajectory.stamps_s * clock.factor + clock.offset_s
         inside = mine[(mine >= truth.stamps_s[0] - 1.0) & (mine <= truth.stamps_s[-1] + 1.0)]
         share = min(1.0, float(inside[-1] - inside[0]) / span) if len(inside) > 1 and span > 0 else 0.0
         return share, share, float(inside[0] - truth.stamps_s[0]) if len(inside) else float("nan")
     count = len(frames)
-    first = _first_trusted(run) - float(frames[0])
+    first = _first_trusted(run) * clock.factor + clock.offset_s - float(frames[0])
     return min(1.0, run.trusted_frames / count), min(1.0, len(run.trajectory) / count), first
 
 

@@ -59,7 +59,7 @@ MAP_COLUMNS = (
 
 
 def markdown_table(scores: Sequence[RunScore], columns: Sequence[Column], title: str = "run") -> str:
-    """Table of every run; with several runs also their median and worst (largest for errors, least for shares)."""
+    """Table of every run; with several runs also their median."""
     used = [c for c in columns if any(np.isfinite(c.value(s)) for s in scores)]
     lines = ["| " + " | ".join([title, *(c.title for c in used)]) + " |", "|" + "---|" * (len(used) + 1)]
     for score in scores:
@@ -85,6 +85,8 @@ def _notes(score: RunScore) -> list[str]:
     notes = list(score.notes)
     if score.units == "arbitrary":
         notes.append("the run's units are arbitrary (no metric scale): only the Sim(3) figures mean anything")
+    if score.units == "unknown" and np.isfinite(score.scale_error) and abs(score.scale_error) > 0.2:
+        notes.append("not of the truth's size: if it is monocular, only the Sim(3) figures mean anything")
     if score.scale_inside_95 is not None:
         inside = "inside" if score.scale_inside_95 else "OUTSIDE"
         notes.append(f"the true scale is {inside} the run's own 95 % interval")

@@ -5,15 +5,16 @@ its translation part is ATE, its rotation angle APE's rotation, and ``||E - I||_
 that the paper prints as its 0.046 (eq. 30 without the lost ``- I``). RPE is Sturm et al. 2012, eq. 2.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.eval.align import Alignment, AlignmentKind, umeyama
-from edgeslam_torch.eval.associate import DEFAULT_MAX_DT_S, Association, associate, nearest
+from edgeslam_torch.eval.associate import DEFAULT_MAX_DT_S, Association, associate, nearest, unit_factor
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.formats import Trajectory
+from edgeslam_torch.eval.offset import any_offset
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.types import FloatArray, IntArray
 
@@ -117,12 +118,19 @@ def score_trajectory(
     Raises:
         EvaluationError: If the two cannot be compared.
     """
-    pairs = associate(truth.stamps_s, estimate.stamps_s, max_dt_s, offset_s)
+    try:
+        pairs = associate(truth.stamps_s, estimate.stamps_s, max_dt_s, offset_s)
+    except EvaluationError as reason:
+        hints = "".join(f"; {hint}" for hint in _clock_hints(truth, estimate))
+        raise EvaluationError(f"{estimate.source} against {truth.source}: {reason}{hints}") from reason
     if len(pairs) < 2:
         raise EvaluationError(f"{estimate.source}: {len(pairs)} pose has ground truth; a trajectory needs at least 2")
     stamps = truth.stamps_s[pairs.truth]
     T_true, T_raw = truth.T_w_c[pairs.truth], estimate.T_w_c[pairs.estimate]
-    found = umeyama(T_raw[:, :3, 3], T_true[:, :3, 3], alignment)
+    try:
+        found = umeyama(T_raw[:, :3, 3], T_true[:, :3, 3], alignment)
+    except EvaluationError as reason:
+        raise EvaluationError(f"{estimate.source}: {reason}") from reason
     scale = found.scale if found.kind is AlignmentKind.SIM3 else _scale(T_raw[:, :3, 3], T_true[:, :3, 3])
     T = found.poses(T_raw)
     error = se3.inverse(T_true) @ T
@@ -145,6 +153,18 @@ def score_trajectory(
         error_m=error_m,
         error_deg=error_deg,
     )
+
+
+def _clock_hints(truth: Trajectory, estimate: Trajectory) -> list[str]:
+    """What else is known when no stamps match: how they were made up, and the offset that the shapes ask for."""
+    hints = [f"{t.source}: {note}" for t in (truth, estimate) if not t.stamped for note in t.notes]
+    factor, _ = unit_factor(truth.stamps_s, estimate.stamps_s)
+    found = any_offset(truth, replace(estimate, stamps_s=estimate.stamps_s * factor))
+    if found.share < 0.2:
+        hints.append(f"the shapes fit best with --offset {found.shift_s:.2f} (ATE {found.ate_m:.3f} m)")
+    elif 0.5 < found.share < np.inf:
+        hints.append("no offset makes the shapes fit: probably another sequence")
+    return hints
 
 
 def relative_errors(

@@ -2,10 +2,15 @@
 
 import argparse
 import json
+import sys
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from edgeslam_torch.errors import OutputError
+from edgeslam_torch.errors import EdgeSlamError, OutputError
+
+if TYPE_CHECKING:
+    from edgeslam_torch.eval.run_score import RunScore
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -26,9 +31,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--depth-maps",
         action="store_true",
-        help="judge depth maps instead: folders or files (.npy in metres, 16-bit .png), matched by name",
+        help="judge depth maps instead: folders or files (.npy in metres, 16-bit .png), against a recording's folder "
+        "(predictions are named after its images) or against maps of the same names",
+    )
+    parser.add_argument(
+        "--images",
+        type=Path,
+        metavar="DIR",
+        help="with --depth-maps: images of the same names, to judge edges alone too",
     )
     parser.add_argument("--depth-unit", type=float, default=5000.0, metavar="N", help="PNG value of a metre (5000)")
+    parser.add_argument(
+        "--common-frames",
+        action="store_true",
+        help="also judge all of them on the frames that every one has (a system that starts late has fewer)",
+    )
     parser.add_argument("--json", type=Path, help="write all figures here")
     parser.add_argument("--markdown", type=Path, help="write the tables here")
     parser.add_argument("--plots", type=Path, help="write one picture per run into this folder")
@@ -42,15 +59,31 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Print the tables; 0 when every run could be judged."""
-    from edgeslam_torch.eval.run_score import RunScore, evaluate_run
+    from edgeslam_torch.eval.run_score import evaluate_run
     from edgeslam_torch.eval.tables import markdown_report
 
     if args.depth_maps:
         return _depth_maps(args)
     scores: list[RunScore] = []
+    judged: list[Path] = []
+    failures: list[str] = []
     for run in args.runs:
-        scores.append(evaluate_run(run, args.groundtruth, args.depth_gt, args.max_dt, args.offset))
+        try:
+            scores.append(evaluate_run(run, args.groundtruth, args.depth_gt, args.max_dt, args.offset))
+            judged.append(run)
+        except EdgeSlamError as error:
+            if len(args.runs) == 1:
+                raise
+            failures.append(str(error))
+    for failure in failures:
+        sys.stderr.write(f"edgeslam: error: {failure}\n")
+    if not scores:
+        return 1
+    args.runs = judged
+    scores = _told_apart(scores, judged)
     report = markdown_report(scores)
+    if args.common_frames and len(scores) > 1:
+        report += "\n" + _common(args, scores) + "\n"
     if len(scores) == 1:
         report += "\n" + _details(scores[0])
     print(report)
@@ -58,15 +91,34 @@ def main(args: argparse.Namespace) -> int:
         _write_files(args, scores, report)
     except OSError as error:
         raise OutputError(f"{error.filename}: cannot be written ({error.strerror})") from error
-    return 0
+    return 1 if failures else 0
+
+
+def _told_apart(scores: "list[RunScore]", runs: list[Path]) -> "list[RunScore]":
+    """Scores by their paths where the folders' names alone are the same."""
+    if len({s.name for s in scores}) == len(scores):
+        return scores
+    return [replace(score, name=str(run)) for score, run in zip(scores, runs, strict=True)]
+
+
+def _common(args: argparse.Namespace, scores: "list[RunScore]") -> str:
+    from edgeslam_torch.eval.common import markdown_common, score_common
+    from edgeslam_torch.eval.formats import read_trajectory
+
+    estimates = [(s.name, read_trajectory(run)) for s, run in zip(scores, args.runs, strict=True)]
+    return markdown_common(score_common(read_trajectory(args.groundtruth), estimates, args.max_dt, args.offset))
 
 
 def _depth_maps(args: argparse.Namespace) -> int:
     from dataclasses import asdict
 
-    from edgeslam_torch.eval.depth import compare_folders, markdown_depth
+    from edgeslam_torch.eval.depth import compare_folders, compare_with_recording, markdown_depth
 
-    reports = {str(run): compare_folders(run, args.groundtruth, 1.0 / args.depth_unit) for run in args.runs}
+    truth = args.groundtruth
+    if (truth / "depth.txt").is_file() or any(truth.glob("*.depth.png")):
+        reports = {str(run): compare_with_recording(run, truth) for run in args.runs}
+    else:
+        reports = {str(run): compare_folders(run, truth, 1.0 / args.depth_unit, args.images) for run in args.runs}
     text = "\n".join(f"{name}\n\n{markdown_depth(report)}\n" for name, report in reports.items())
     print(text)
     try:

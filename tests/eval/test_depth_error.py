@@ -2,11 +2,13 @@
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
-from edgeslam_torch.eval.depth import compare_folders, mean_score, report_depth, score_depth
+from edgeslam_torch.eval.depth import compare_folders, compare_with_recording, mean_score, report_depth, score_depth
 from edgeslam_torch.eval.errors import EvaluationError
+from edgeslam_torch.geometry.camera import Camera
 
 
 def test_error_worked_out_by_hand() -> None:
@@ -55,6 +57,47 @@ def test_folders_are_matched_by_name(tmp_path: Path) -> None:
     assert compare_folders(tmp_path / "a", tmp_path / "b").metric.rmse_m == 0.0
     with pytest.raises(EvaluationError, match="share no depth map"):
         compare_folders(tmp_path / "a", tmp_path)
+
+
+def test_numbers_win_over_pictures_of_the_same_name_and_images_give_the_edges(tmp_path: Path) -> None:
+    """A folder of ``edgeslam depth``: metres, millimetres and a coloured picture of each image."""
+    for name in ("ours", "truth", "images"):
+        (tmp_path / name).mkdir()
+    image = np.zeros((60, 60), np.uint8)
+    image[:, 30:] = 200
+    np.save(tmp_path / "ours" / "a.npy", np.full((60, 60), 1.5, np.float32))
+    cv2.imwrite(str(tmp_path / "ours" / "a.png"), np.full((60, 60), 1500, np.uint16))
+    cv2.imwrite(str(tmp_path / "ours" / "a_colour.png"), image)
+    cv2.imwrite(str(tmp_path / "truth" / "a.png"), np.full((60, 60), 5000, np.uint16))
+    cv2.imwrite(str(tmp_path / "images" / "a.jpg"), image)
+    found = compare_folders(tmp_path / "ours", tmp_path / "truth", images=tmp_path / "images")
+    assert found.metric.pixels == 3600 and found.metric.rmse_m == pytest.approx(0.5)
+    assert found.edges_metric is not None and 0 < found.edges_metric.pixels < 200
+    assert compare_folders(tmp_path / "ours", tmp_path / "truth").edges_metric is None
+
+
+def test_recording_is_matched_by_its_images_and_stamps(tmp_path: Path) -> None:
+    data, ours = tmp_path / "data", tmp_path / "ours"
+    for folder in (data / "rgb", data / "depth", ours):
+        folder.mkdir(parents=True)
+    Camera(64, 48, 50.0, 50.0, 31.5, 23.5).save(data / "camera.yaml")
+    image = np.zeros((48, 64), np.uint8)
+    image[:, 32:] = 200
+    for k in range(4):
+        cv2.imwrite(str(data / "rgb" / f"{k:.6f}.png"), image)
+        np.save(ours / f"{k:.6f}.npy", np.full((48, 64), 2.0 + k))
+    for k in (1, 3):  # measured 10 ms later, in millimetres
+        cv2.imwrite(str(data / "depth" / f"{k + 0.01:.6f}.png"), np.full((48, 64), 1000 * (2 + k), np.uint16))
+    (data / "rgb.txt").write_text("".join(f"{k:.6f} rgb/{k:.6f}.png\n" for k in range(4)))
+    rows = "".join(f"{k + 0.01:.6f} depth/{k + 0.01:.6f}.png\n" for k in (1, 3))
+    (data / "depth.txt").write_text("# metres = value / 1000\n" + rows)
+    found = compare_with_recording(ours, data)
+    assert found.metric.pixels == 2 * 48 * 64 and found.metric.rmse_m < 1e-6
+    assert found.edges_metric is not None and found.edges_metric.pixels > 40
+    with pytest.raises(EvaluationError, match="named after an image"):
+        compare_with_recording(data / "depth", data)
+    with pytest.raises(EvaluationError, match=r"no depth.txt"):
+        compare_with_recording(ours, ours)
 
 
 def test_mean_is_over_maps() -> None:

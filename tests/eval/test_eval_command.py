@@ -11,6 +11,7 @@ import pytest
 from edgeslam_torch.commands import eval as eval_command
 from edgeslam_torch.commands import report as report_command
 from edgeslam_torch.errors import EdgeSlamError
+from edgeslam_torch.eval.formats import read_trajectory, write_kitti
 from edgeslam_torch.eval.run_score import evaluate_run
 
 
@@ -35,6 +36,43 @@ def test_several_runs_give_a_table_with_their_median(
     assert [r["name"] for r in records] == ["a", "b", "trajectory_online.txt"]
     assert records[1]["scale_error"] == pytest.approx(0.2, abs=0.01)
     assert len(list((tmp_path / "plots").glob("*.png"))) == 3
+
+
+def test_one_broken_run_does_not_hide_the_others(
+    run_folder: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    truth = run_folder(tmp_path / "a")
+    (tmp_path / "empty.txt").write_text("")
+    assert run(eval_command, tmp_path / "empty.txt", tmp_path / "a", "--groundtruth", truth) == 1
+    out, err = capsys.readouterr()
+    assert "| a |" in out and "empty.txt" in err
+
+
+def test_peers_are_compared_on_common_frames_and_told_apart(
+    run_folder: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    truth = run_folder(tmp_path / "a")
+    (tmp_path / "peer").mkdir()
+    rows = (tmp_path / "a" / "trajectory.txt").read_text().splitlines(keepends=True)
+    (tmp_path / "peer" / "a").write_text("".join(rows[81:]))
+    assert run(eval_command, tmp_path / "a", tmp_path / "peer" / "a", "--groundtruth", truth, "--common-frames") == 0
+    text = capsys.readouterr().out
+    assert "On the 120 frames that all 2 have" in text
+    assert f"| {tmp_path / 'peer' / 'a'} | 120 |" in text and f"| {tmp_path / 'a'} | 200 |" in text
+
+
+def test_file_without_stamps_is_laid_on_the_images(run_folder: Callable[..., Path], tmp_path: Path) -> None:
+    run_folder(tmp_path / "a")
+    dataset = tmp_path / "data"
+    dataset.mkdir()
+    (tmp_path / "truth.txt").rename(dataset / "groundtruth.txt")
+    stamps = np.loadtxt(dataset / "groundtruth.txt")[:, 0]
+    (dataset / "rgb.txt").write_text("".join(f"{t:.6f} rgb/{t:.6f}.png\n" for t in stamps))
+    write_kitti(read_trajectory(tmp_path / "a"), tmp_path / "poses.txt")
+    (tmp_path / "times.txt").unlink()
+    score = evaluate_run(tmp_path / "poses.txt", dataset)
+    assert score.matched == 200 and score.ate_sim3_m < 0.02
+    assert "in order" in score.notes[0]
 
 
 def test_scale_interval_of_the_run_is_checked(run_folder: Callable[..., Path], tmp_path: Path) -> None:

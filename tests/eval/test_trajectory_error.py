@@ -222,6 +222,72 @@ def test_poses_in_reverse_are_recognised(loop: Trajectory, rng: np.random.Genera
     assert "backwards" in findings(loop, replace(estimate, T_w_c=estimate.T_w_c[::-1]))
 
 
+@pytest.mark.parametrize("axes", [[1, 0, 2], [0, 1, 2]], ids=["swapped", "negated"])
+def test_mirrored_positions_are_recognised(axes: list[int], loop: Trajectory, rng: np.random.Generator) -> None:
+    estimate = noisy(loop, rng)
+    T = estimate.T_w_c.copy()
+    T[:, :3, 3] = T[:, axes, 3] if axes[0] else T[:, :3, 3] * [1, 1, -1]
+    text = findings(loop, replace(estimate, T_w_c=T))
+    assert "mirrored" in text and "world-to-camera" not in text
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(100.0, "centimetres"), (1000.0, "millimetres")])
+def test_length_units_are_named(factor: float, unit: str, loop: Trajectory, rng: np.random.Generator) -> None:
+    T = noisy(loop, rng).T_w_c
+    T[:, :3, 3] *= factor
+    assert unit in findings(loop, replace(loop, T_w_c=T))
+
+
+def test_orientations_that_hardly_turn_are_judged_by_their_angle_to_the_truth(
+    loop: Trajectory, rng: np.random.Generator, tmp_path: Path
+) -> None:
+    """A recording like fr1_xyz looks one way: a wrong order of the quaternion spreads little, but is far off."""
+    estimate = noisy(loop, rng).take(slice(0, 20))
+    swapped = np.swapaxes(estimate.T_w_c[:, :3, :3], 1, 2)
+    T = estimate.T_w_c.copy()
+    T[:, :3, :3] = swapped
+    assert "inverted" in findings(loop, replace(estimate, T_w_c=T))
+    write_tum(estimate, tmp_path / "t.txt")
+    rows = np.loadtxt(tmp_path / "t.txt")
+    np.savetxt(tmp_path / "wxyz.txt", rows[:, [0, 1, 2, 3, 7, 4, 5, 6]])
+    assert "qw qx qy qz" in findings(loop, read_trajectory(tmp_path / "wxyz.txt"))
+    T[:, :3, :3] = np.eye(3)
+    assert "left the orientation out" in findings(loop, replace(estimate, T_w_c=T))
+
+
+def test_late_milliseconds_are_two_mistakes(loop: Trajectory, rng: np.random.Generator) -> None:
+    estimate = noisy(loop, rng)
+    text = findings(loop, replace(estimate, stamps_s=1e3 * (estimate.stamps_s + 1.37)))
+    assert "milliseconds" in text and "--offset -1.3" in text
+
+
+@pytest.mark.parametrize("factor", [1.0, 1e3, 1e9], ids=["s", "ms", "ns"])
+def test_clocks_that_never_meet_are_brought_together_by_shape(
+    factor: float, loop: Trajectory, rng: np.random.Generator
+) -> None:
+    truth = replace(loop, stamps_s=loop.stamps_s + 1.5e9, source="truth.txt")
+    estimate = noisy(loop, rng).take(slice(40, 160))
+    estimate = replace(estimate, stamps_s=factor * (estimate.stamps_s - estimate.stamps_s[0]), source="mine.txt")
+    with pytest.raises(EvaluationError, match=r"mine.txt against truth.txt") as caught:
+        score_trajectory(truth, estimate)
+    found = re.search(r"fit best with --offset ([\d.]+)", str(caught.value))
+    assert found is not None and float(found.group(1)) == pytest.approx(truth.stamps_s[40], abs=0.03)
+    fitted = score_trajectory(truth, estimate, offset_s=float(found.group(1)), max_dt_s=0.03)
+    assert fitted.ate_m.rmse < 0.03
+
+
+def test_no_offset_is_offered_for_another_shape(loop: Trajectory, rng: np.random.Generator) -> None:
+    T = loop.T_w_c.copy()
+    T[:, :3, 3] = np.cumsum(rng.normal(0, 0.05, (len(T), 3)), axis=0)
+    with pytest.raises(EvaluationError) as caught:
+        score_trajectory(loop, replace(loop, T_w_c=T, stamps_s=loop.stamps_s + 300.0))
+    assert "fit best" not in str(caught.value)
+
+
+def test_a_handful_of_poses_is_said_to_mean_nothing(loop: Trajectory, rng: np.random.Generator) -> None:
+    assert "only 3 poses" in findings(loop, noisy(loop, rng).take(np.array([10, 90, 150])))
+
+
 def test_another_sequence_is_recognised(loop: Trajectory, rng: np.random.Generator) -> None:
     T = loop.T_w_c.copy()
     T[:, :3, 3] = np.cumsum(rng.normal(0, 0.05, (len(T), 3)), axis=0)

@@ -32,6 +32,7 @@ GOOD = ["0.0 0 0 0 0 0 0 1", "0.1 1 0 0 0 0 0 1", "0.2 2 0 0 0 0 0 1"]
     [
         ([], "holds no poses"),
         (["# only a header"], "holds no poses"),
+        (["frame; pose"], "no line of numbers in it, the first is 'frame; pose'"),
         (["0.0 nan 0 0 0 0 0 1"], "NaN"),
         (["0.0 0 0 0", "1.0 0 0 0"], "positions without orientation"),
         (["0.0 1 2 3 10 20 30 40", "0.1 1 2 3 10 20 30 40"], "no unit quaternion"),
@@ -72,6 +73,17 @@ def test_reversed_time_is_sorted_and_said(tmp_path: Path) -> None:
 def test_line_cut_off_at_the_end_is_left_out(tmp_path: Path) -> None:
     (tmp_path / "t.txt").write_text("\n".join([*GOOD, "0.3 1 2"]))  # killed while writing: no newline
     assert len(read_trajectory(tmp_path / "t.txt")) == 3
+
+
+def test_large_files_read_the_same_as_small_ones(tmp_path: Path) -> None:
+    rows = "".join(f"{0.1 * k:.1f} {k} 0 0 0 0 0 1\n" for k in range(60_000))  # 1.3 MB: read by NumPy
+    for name, text in (("spaces", rows), ("commas", rows.replace(" ", ",")), ("header", "stamp x y z\n" + rows)):
+        (tmp_path / name).write_text(text)
+        found = read_trajectory(tmp_path / name)
+        assert len(found) == 60_000 and found.positions[-1, 0] == 59_999
+    (tmp_path / "broken").write_text(rows + "6000.0 1 2\n")
+    with pytest.raises(EvaluationError, match="line 60001 has 3 numbers"):
+        read_trajectory(tmp_path / "broken")
 
 
 def test_huge_file_is_not_read(tmp_path: Path) -> None:
