@@ -1,14 +1,43 @@
-"""What each loss does: the benchmark repeated with one thing changed at a time, and what that changed."""
+"""What each loss does: the same recordings with one thing changed at a time.
 
-from collections.abc import Callable, Sequence
+Most of what can be changed acts in the last refinement alone, after the last frame. Rows that differ only there share
+one flight: the map as it is before that refinement is copied and finished once for every row.
+"""
+
+import io
+import json
+import logging
+import pickle
+import threading
+import time
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from edgeslam_torch.eval.benchmark import BenchSettings, compare, read_record, run_benchmark
+from edgeslam_torch import __version__
+from edgeslam_torch.config import SlamConfig, WindowConfig
+from edgeslam_torch.eval.align import AlignmentKind, umeyama
+from edgeslam_torch.eval.benchmark import compare, find_sequences, machine
+from edgeslam_torch.eval.dataset import EvalDataset, interpolate, open_dataset
+from edgeslam_torch.eval.edge_map import score_map
 from edgeslam_torch.eval.errors import EvaluationError
+from edgeslam_torch.eval.formats import Trajectory
+from edgeslam_torch.eval.surface import surface_truth
+from edgeslam_torch.eval.trajectory import score_trajectory
+from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.io.config_file import load_config
+from edgeslam_torch.io.source import open_source
+from edgeslam_torch.mapping.edge_map import EdgeMap
+from edgeslam_torch.mapping.last_refinement import last_refinement
+from edgeslam_torch.mapping.slam_map import SlamMap
+from edgeslam_torch.slam import EdgeSlam
+from edgeslam_torch.trajectory import TrajectoryLog
+
+logger = logging.getLogger(__name__)
 
 DEFAULT = "default"
 """Name of the row that all others are compared with."""
@@ -61,92 +90,243 @@ ROWS = (
 )
 """The table of `edgeslam ablation`, top to bottom."""
 
+
+@dataclass(frozen=True, slots=True)
+class AblationSettings:
+    """What is run."""
+
+    data: Path
+    """Folder of recordings."""
+    seeds: tuple[int, ...] = (0, 1)
+    sequences: tuple[str, ...] = ()
+    """Names; all when empty."""
+    rows: tuple[str, ...] = ()
+    """Names of `ROWS`; all when empty. The rows they are compared with are run too."""
+    max_frames: int | None = None
+    overrides: tuple[str, ...] = ()
+    """``section.key=value`` under every row's own."""
+
+
 _COLUMNS = (
     ("ate_sim3_m", "ATE Sim(3) [mm]", 1e3, "{:.1f}"),
     ("map_median_m", "map error [mm]", 1e3, "{:.1f}"),
     ("edges_within_2cm", "edges in 2 cm", 1e2, "{:.0f} %"),
     ("scale_error_abs", "scale off", 1e2, "{:.1f} %"),
     ("cpu_ms_per_frame", "CPU [ms/frame]", 1.0, "{:.0f}"),
+    ("finish_ms", "last refinement [ms]", 1.0, "{:.0f}"),
 )
 _JUDGED = ("ate_sim3_m", "map_median_m", "edges_within_2cm")
 _SHORT = {"ate_sim3_m": "ATE", "map_median_m": "map", "edges_within_2cm": "edges found"}
 
 
-def run_ablation(
-    settings: BenchSettings, names: Sequence[str], out: Path, say: Callable[[str], None]
-) -> dict[str, dict[str, Any]]:
-    """Run the rows one after the other, each as a benchmark in its own folder.
+@dataclass(frozen=True, slots=True)
+class _Flight:
+    """A recording flown to its last frame, with nothing refined after it."""
 
-    A row that an earlier call finished in ``out``, with the same settings and commit, is read and not run again.
+    state: bytes
+    """Pickled map, edge map, log and camera: every row starts from its own copy."""
+    frames: int
+    cpu_s: float
+    metres_per_unit: float
+    """NaN while the scale is unknown."""
+
+
+def run_ablation(settings: AblationSettings, out: Path, say: Callable[[str], None]) -> dict[str, Any]:
+    """Fly every sequence with every seed and finish the flights in every way.
+
+    The record is written after every run; runs that an earlier call with the same settings left in ``out`` are not
+    repeated.
 
     Args:
-        settings: Sequences, seeds and length; its overrides go under every row's own.
-        names: Names of `ROWS`; all when empty. The rows they are compared with are run too.
-        out: Folder of the rows' folders.
-        say: Told one line before and after every run.
+        settings: What is run.
+        out: Folder of ``ablation.json``.
+        say: Told one line for every run.
 
     Returns:
-        The benchmark's record of every row, by name, in the order of `ROWS`.
+        The record: conditions, and for every row of `ROWS` by name its runs with their figures.
 
     Raises:
         EvaluationError: For a name that is no row, or a sequence that is not there.
     """
+    sequences, rows = _sequences(settings), _rows(settings.rows)
+    out.mkdir(parents=True, exist_ok=True)
+    path = out / "ablation.json"
+    record = _earlier(path, settings) or {
+        "version": __version__,
+        "made": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+        "machine": machine(),
+        "settings": _described(settings),
+        "rows": {row.name: {"runs": []} for row in ROWS},
+    }
+    for name, folder in sequences.items():
+        dataset = open_dataset(folder)
+        for seed in settings.seeds:
+            for sharing in _sharing(rows, settings, seed):
+                todo = [(row, window) for row, window in sharing.rows if not _has(record, row, name, seed)]
+                if not todo:
+                    continue
+                say(f"{name}, seed {seed}: flying for {', '.join(row.name for row, _ in todo)}")
+                flight = _fly(folder, sharing.config, settings.max_frames)
+                for row, window in todo:
+                    figures = _finish(flight, window, dataset)
+                    run = {"sequence": name, "seed": seed, "figures": figures, "error": ""}
+                    record["rows"][row.name]["runs"].append(run)
+                    path.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+                    say(f"{name}, seed {seed}, {row.name}: ATE {figures['ate_sim3_m']:.4f} m")
+    return record
+
+
+def markdown_ablation(record: dict[str, Any]) -> str:
+    """One table a sequence: medians over the seeds, and whether a row differs from the one it is compared with.
+
+    "worse" and "better" are the row's, beyond twice the seeds' scatter and the benchmark's floor (`compare`);
+    what is not named is the same.
+    """
+    records = {name: row for name, row in record["rows"].items() if row["runs"]}
+    settings = record["settings"]
+    frames = "all frames" if settings["max_frames"] is None else f"first {settings['max_frames']} frames"
+    parts = [
+        f"EdgeSLAM-Torch {record['version']}, {record['made']}, {frames}, seeds "
+        f"{' '.join(str(s) for s in settings['seeds'])}, medians; {record['machine']['cores']} x "
+        f"{record['machine']['cpu']}"
+    ]
+    for sequence in dict.fromkeys(run["sequence"] for row in records.values() for run in row["runs"]):
+        titles = ["", *(title for _, title, _, _ in _COLUMNS), "beside"]
+        parts += ["", f"### {sequence}", "", "| " + " | ".join(titles) + " |", "|" + "---|" * len(titles)]
+        for row in (row for row in ROWS if row.name in records):
+            cells = [_cell(records[row.name], sequence, *column) for column in _COLUMNS]
+            parts.append(f"| {row.title} | " + " | ".join([*cells, _verdict(records, row, sequence)]) + " |")
+    return "\n".join(parts) + "\n"
+
+
+@dataclass(frozen=True, slots=True)
+class _Sharing:
+    """Rows that one flight serves."""
+
+    config: SlamConfig
+    rows: tuple[tuple[Row, WindowConfig], ...]
+
+
+def _sharing(rows: Iterable[Row], settings: AblationSettings, seed: int) -> list[_Sharing]:
+    """Rows by what matters before the last refinement: everything but the window's edge and corner terms."""
+    groups: dict[SlamConfig, list[tuple[Row, WindowConfig]]] = {}
+    for row in rows:
+        config = load_config(replace(SlamConfig(), seed=seed), None, (*settings.overrides, *row.overrides))
+        flown = replace(config, window=WindowConfig(reprojection=config.window.reprojection))
+        groups.setdefault(flown, []).append((row, config.window))
+    return [_Sharing(config, tuple(members)) for config, members in groups.items()]
+
+
+def _fly(folder: Path, config: SlamConfig, max_frames: int | None) -> _Flight:
+    source = open_source(folder)
+    try:
+        slam = EdgeSlam(source.camera, config)
+        start, frames = time.process_time(), 0
+        for frame in islice(source.frames(), max_frames):
+            slam.step(frame)
+            frames += 1
+        cpu_s = time.process_time() - start
+    finally:
+        source.close()
+    scale = slam.scale
+    return _Flight(
+        _pickled((slam.map, slam.edges, slam.log, slam.camera)),
+        frames,
+        cpu_s,
+        scale.value if np.isfinite(scale.sigma) else float("nan"),
+    )
+
+
+def _finish(flight: _Flight, window: WindowConfig, dataset: EvalDataset) -> dict[str, float | None]:
+    """Refine a copy of the flight and judge it."""
+    state: tuple[SlamMap, EdgeMap, TrajectoryLog, Camera] = pickle.loads(flight.state)
+    slam_map, edges, log, camera = state
+    start = time.process_time()
+    last_refinement(slam_map, camera, edges, window)
+    finish_s = time.process_time() - start
+    stamps, T_w_c = log.poses()
+    estimate = Trajectory(stamps, T_w_c)
+    score = score_trajectory(dataset.truth, estimate, AlignmentKind.SIM3)
+    figures: dict[str, float | None] = {
+        "ate_sim3_m": score.ate_m.rmse,
+        "scale_error_abs": abs(score.alignment.scale / flight.metres_per_unit - 1.0),
+        "cpu_ms_per_frame": 1e3 * (flight.cpu_s + finish_s) / max(flight.frames, 1),
+        "finish_ms": 1e3 * finish_s,
+    }
+    alignment = score.alignment
+    if dataset.depth is not None:
+        if not np.array_equal(dataset.depth.T_c_d, np.eye(4)):
+            # The true poses are the depth camera's; ours are the colour camera's.
+            T, known = interpolate(dataset.truth, stamps)
+            colour = T @ np.linalg.inv(dataset.depth.T_c_d)
+            alignment = umeyama(estimate.positions[known], colour[known, :3, 3])
+        try:
+            found = score_map(edges.points().p_w, alignment, surface_truth(dataset.folder.resolve()))
+        except EvaluationError as error:
+            logger.warning("no map score: %s", error)
+        else:
+            figures |= {"map_median_m": found.median_m, "edges_within_2cm": found.completeness.get(0.02)}
+    return {k: float(v) if v is not None and np.isfinite(v) else None for k, v in figures.items()}
+
+
+class _Pickler(pickle.Pickler):
+    """Pickles a map: the copy gets a lock of its own."""
+
+    def reducer_override(self, obj: object) -> Any:
+        if isinstance(obj, type(threading.RLock())):
+            return threading.RLock, ()
+        return NotImplemented
+
+
+def _pickled(state: object) -> bytes:
+    buffer = io.BytesIO()
+    _Pickler(buffer, protocol=pickle.HIGHEST_PROTOCOL).dump(state)
+    return buffer.getvalue()
+
+
+def _sequences(settings: AblationSettings) -> dict[str, Path]:
+    found = find_sequences(settings.data)
+    missing = [name for name in settings.sequences if name not in found]
+    if missing or not found:
+        raise EvaluationError(
+            f"no sequence {missing[0] if missing else ''!r} in {settings.data}; there are {list(found)}"
+        )
+    return {name: found[name] for name in settings.sequences or found}
+
+
+def _rows(names: Sequence[str]) -> list[Row]:
     known = {row.name: row for row in ROWS}
     unknown = [name for name in names if name not in known]
     if unknown:
         raise EvaluationError(f"no row {unknown[0]!r}; there are {', '.join(known)}")
     wanted = set(names or known)
     wanted |= {known[name].against for name in wanted} | {DEFAULT}
-    records = {}
-    for row in (row for row in ROWS if row.name in wanted):
-        mine = replace(settings, overrides=(*settings.overrides, *row.overrides), micro=False)
-        say(f"{row.title} ...")
-        folder = out / row.name
-        records[row.name] = _finished(folder / "bench.json", mine) or run_benchmark(mine, folder, say)
-    return records
+    return [row for row in ROWS if row.name in wanted]
 
 
-def markdown_ablation(records: dict[str, dict[str, Any]]) -> str:
-    """One table a sequence: medians over the seeds, and whether a row differs from the one it is compared with.
-
-    "worse" and "better" are the row's, beyond twice the seeds' scatter and the benchmark's floor (`compare`);
-    what is not named is the same.
-    """
-    rows = [row for row in ROWS if row.name in records]
-    if not rows:
-        return ""
-    first = next(iter(records.values()))
-    frames = "all frames" if first["max_frames"] is None else f"first {first['max_frames']} frames"
-    parts = [
-        f"EdgeSLAM-Torch {first['version']} {first['commit']}, {first['made']}, {frames}, seeds "
-        f"{' '.join(str(s) for s in first['seeds'])}, medians; {first['machine']['cores']} x {first['machine']['cpu']}"
-    ]
-    for sequence in dict.fromkeys(run["sequence"] for run in first["runs"]):
-        titles = ["", *(title for _, title, _, _ in _COLUMNS), "beside"]
-        parts += ["", f"### {sequence}", "", "| " + " | ".join(titles) + " |", "|" + "---|" * len(titles)]
-        for row in rows:
-            cells = [_cell(records[row.name], sequence, *column) for column in _COLUMNS]
-            parts.append(f"| {row.title} | " + " | ".join([*cells, _verdict(records, row, sequence)]) + " |")
-    return "\n".join(parts) + "\n"
+def _described(settings: AblationSettings) -> dict[str, Any]:
+    """What must be the same for an earlier record to be continued."""
+    return {
+        "seeds": list(settings.seeds),
+        "max_frames": settings.max_frames,
+        "overrides": list(settings.overrides),
+    }
 
 
-def _finished(path: Path, settings: BenchSettings) -> dict[str, Any] | None:
-    """The record of an earlier call that did exactly this, to the end."""
+def _earlier(path: Path, settings: AblationSettings) -> dict[str, Any] | None:
     if not path.is_file():
         return None
-    record = read_record(path)
-    same = (
-        record["overrides"] == list(settings.overrides)
-        and record["seeds"] == list(settings.seeds)
-        and record["max_frames"] == settings.max_frames
-        and record["mode"] == settings.mode
-    )
-    sequences = {run["sequence"] for run in record["runs"]}
-    judged = all(run["figures"] or run["error"] for run in record["runs"])
-    complete = (
-        len(record["runs"]) == len(sequences) * len(settings.seeds) and set(settings.only or sequences) == sequences
-    )
-    return record if same and judged and complete else None
+    try:
+        record: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    except json.JSONDecodeError as error:
+        raise EvaluationError(f"{path}: not JSON ({error}); remove it or give another --out") from error
+    if record.get("settings") != _described(settings):
+        raise EvaluationError(f"{path}: made with other settings; give another --out")
+    return record
+
+
+def _has(record: dict[str, Any], row: Row, sequence: str, seed: int) -> bool:
+    return any(run["sequence"] == sequence and run["seed"] == seed for run in record["rows"][row.name]["runs"])
 
 
 def _cell(record: dict[str, Any], sequence: str, name: str, _title: str, factor: float, text: str) -> str:

@@ -26,6 +26,11 @@ _ROTATION_POOR_DEG = 8.0
 _FEW = 10
 """Fewer matched poses than this say next to nothing."""
 
+_MIRROR = np.diag([1.0, 1.0, -1.0, 1.0])
+_MIRRORED = "the positions are mirrored: two axes swapped, one negated, or a left-handed world"
+
+_UNEXPLAINED = "the orientations do not follow the truth's, and no usual mistake explains it: judge translation only"
+
 _LENGTH_UNITS = {0.01: "centimetres", 0.001: "millimetres"}
 
 
@@ -47,7 +52,11 @@ def explain(
     shape = _sim3_error(truth, estimate, max_dt_s)
     if np.isfinite(shape) and shape > _POOR * score.fixed_position_m:
         return notes + _shape_notes(truth, estimate, shape, score, max_dt_s)
-    return notes + _rotation_notes(truth, estimate, score)
+    found = _rotation_notes(truth, estimate, score)
+    if found == [_UNEXPLAINED]:  # in motion that is nearly flat a mirror hardly shows in the positions
+        mirrored = _sim3_error(truth, replace(estimate, T_w_c=_MIRROR @ estimate.T_w_c), max_dt_s)
+        found = [_MIRRORED] if mirrored < _BETTER * shape else found
+    return notes + found
 
 
 def _match_notes(truth: Trajectory, estimate: Trajectory, score: TrajectoryScore) -> list[str]:
@@ -80,11 +89,10 @@ def _shape_notes(
 ) -> list[str]:
     """The mistake whose undoing explains the positions best; else how bad they are."""
     T = estimate.T_w_c
-    mirror = np.diag([1.0, 1.0, -1.0, 1.0])
     undone = {
         "the poses look like world-to-camera; a trajectory must hold camera-to-world (their inverse)": se3.inverse(T),
         "the poses run backwards in time against their stamps": T[::-1],
-        "the positions are mirrored: two axes swapped, one negated, or a left-handed world": mirror @ T,
+        _MIRRORED: _MIRROR @ T,
     }
     suspects = [(_sim3_error(truth, replace(estimate, T_w_c=T), max_dt_s), text) for text, T in undone.items()]
     late = best_offset(truth, estimate)
@@ -132,7 +140,7 @@ def _rotation_notes(truth: Trajectory, estimate: Trajectory, score: TrajectorySc
             f"orientations differ by a constant {angle:.0f} deg: the two describe different bodies "
             "(camera and IMU or marker frame); only translation is comparable"
         ]
-    return []
+    return [_UNEXPLAINED] if spread > _ROTATION_POOR_DEG else []
 
 
 def _sim3_error(truth: Trajectory, estimate: Trajectory, max_dt_s: float) -> float:

@@ -226,7 +226,7 @@ def test_poses_in_reverse_are_recognised(loop: Trajectory, rng: np.random.Genera
 def test_mirrored_positions_are_recognised(axes: list[int], loop: Trajectory, rng: np.random.Generator) -> None:
     estimate = noisy(loop, rng)
     T = estimate.T_w_c.copy()
-    T[:, :3, 3] = T[:, axes, 3] if axes[0] else T[:, :3, 3] * [1, 1, -1]
+    T[:, :3, 3] = T[:, axes, 3] if axes[0] else T[:, :3, 3] * [-1, 1, 1]
     text = findings(loop, replace(estimate, T_w_c=T))
     assert "mirrored" in text and "world-to-camera" not in text
 
