@@ -21,7 +21,7 @@ class KeypointGrid:
         uv = np.asarray(uv, dtype=np.float64).reshape(-1, 2)
         self._origin = uv.min(axis=0) if len(uv) else np.zeros(2)
         cell = ((uv - self._origin) / CELL_PX).astype(np.int64)
-        self._columns, self._rows = (cell.max(axis=0) + 1).tolist() if len(uv) else (1, 1)
+        self._columns, self._rows = (int(n) for n in cell.max(axis=0, initial=0) + 1)
         flat = cell[:, 1] * self._columns + cell[:, 0]
         self._order = np.argsort(flat, kind="stable")
         self._start = np.searchsorted(flat[self._order], np.arange(self._rows * self._columns + 1))

@@ -23,13 +23,8 @@ class OrbExtractor:
 
     def __call__(self, grey: np.ndarray) -> FrameFeatures:
         """Features of a grey image ``(H, W)`` uint8 with the lens distortion still in it."""
-        found = self._orb.detect(grey, None)
-        if found:
-            uv = np.array(cv2.KeyPoint.convert(found), dtype=np.float32)
-            score = np.array([k.response for k in found], dtype=np.float32)
-            octave = np.array([k.octave for k in found], dtype=np.int32)
-            keep = spread(uv, score, octave, grey.shape[1], grey.shape[0], self.config.features)
-            found, descriptors = self._orb.compute(grey, [found[i] for i in keep])
+        # All candidates are described, in one call: a second one would build the image pyramid again.
+        found, descriptors = self._orb.detectAndCompute(grey, None)
         if not found or descriptors is None:
             return FrameFeatures(
                 np.zeros((0, 2), np.float32),
@@ -37,15 +32,19 @@ class OrbExtractor:
                 np.zeros(0, np.float32),
                 np.zeros((0, 32), np.uint8),
             )
+        uv = np.array(cv2.KeyPoint.convert(found), dtype=np.float32)
+        score = np.array([k.response for k in found], dtype=np.float32)
+        keep = spread(uv, score, grey.shape[1], grey.shape[0], self.config.features)
+        kept = [found[i] for i in keep]
         return FrameFeatures(
-            uv=self.camera.undistort_points(np.array(cv2.KeyPoint.convert(found), dtype=np.float32)),
-            octave=np.array([k.octave for k in found], dtype=np.int32),
-            angle_rad=np.deg2rad(np.array([k.angle for k in found], dtype=np.float32)),
-            descriptors=np.asarray(descriptors, dtype=np.uint8),
+            uv=self.camera.undistort_points(uv[keep]),
+            octave=np.array([k.octave for k in kept], dtype=np.int32),
+            angle_rad=np.deg2rad(np.array([k.angle for k in kept], dtype=np.float32)),
+            descriptors=np.asarray(descriptors, dtype=np.uint8)[keep],
         )
 
 
-def spread(uv: FloatArray, score: FloatArray, octave: IntArray, width: int, height: int, wanted: int) -> IntArray:
+def spread(uv: FloatArray, score: FloatArray, width: int, height: int, wanted: int) -> IntArray:
     """Indices of about ``wanted`` keypoints, the strongest of every image cell first.
 
     Cells are taken in rounds: every cell gives its best corner, then its second best, and so on, until there are

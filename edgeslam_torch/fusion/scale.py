@@ -238,21 +238,27 @@ class DepthRatio:
         self._bias = bias_log
         self._keep = keep
         self._ratios: list[tuple[float, float]] = []
+        self._estimate: LogScale | None = None
 
     def add(self, log_ratio: float, sigma_log: float) -> None:
         """One keyframe's ratio; values that are not finite are ignored."""
         if math.isfinite(log_ratio) and math.isfinite(sigma_log) and sigma_log > 0:
             self._ratios.append((log_ratio, sigma_log))
             del self._ratios[: -self._keep]
+            self._estimate = None
 
     def rescale(self, factor: float) -> None:
         """The map grew by ``factor``: metres per map unit shrink."""
         self._ratios = [(ratio - math.log(factor), sigma) for ratio, sigma in self._ratios]
+        self._estimate = None
 
     def estimate(self) -> LogScale | None:
-        """Robust mean of the ratios with the common error."""
-        if not self._ratios:
-            return None
+        """Robust mean of the ratios with the common error; asked for twice a frame, worked out once a keyframe."""
+        if self._estimate is None and self._ratios:
+            self._estimate = self._mean()
+        return self._estimate
+
+    def _mean(self) -> LogScale:
         ratio, sigma = np.array(self._ratios).T
         centre = float(np.median(ratio))
         spread = np.hypot(sigma, 1.4826 * float(np.median(np.abs(ratio - centre))) + 1e-6)

@@ -102,36 +102,45 @@ class Mapper:
 
     def fuse(self, keyframe: Keyframe, neighbours: list[Keyframe]) -> None:
         """Look for the keyframe's anchors in its neighbours: more observations, fewer doubles."""
-        anchors = self.map.anchors
-        doubles: list[tuple[IntArray, IntArray]] = []
-        for other in neighbours:
-            ids = self.map.anchors_seen_by([keyframe])
-            ids = ids[~np.isin(ids, other.anchor)]
-            seen = project_anchors(anchors, ids, other.T_c_w, self.camera, self.orb.scale_factor, self.orb.levels)
-            matches = match_projection(
-                seen,
-                anchors.words[seen.anchor],
-                other.words,
-                other.features.octave,
-                other.grid,
-                3.0,
-                self.orb.scale_factor,
-                50,
-                1.0,
-            )
-            error = seen.uv[matches.query] - other.features.uv[matches.train]
-            sigma = self.orb.scale_factor ** other.features.octave[matches.train].astype(np.float64)
-            good = (error**2).sum(1) <= 5.991 * sigma**2
-            found, keypoint = seen.anchor[matches.query[good]], matches.train[good]
-            held = other.anchor[keypoint]
-            free = held < 0
-            self.map.observe(other, keypoint[free], found[free])
-            doubles.append((found[~free], held[~free]))
-        if doubles:
-            self._merge_doubles(*(np.concatenate(side) for side in zip(*doubles, strict=True)))
+        doubles = [self._look_in(other, self.map.anchors_seen_by([keyframe])) for other in neighbours]
+        self._merge_doubles(doubles)
 
-    def _merge_doubles(self, a: IntArray, b: IntArray) -> None:
+    def fuse_all(self) -> None:
+        """Look for every anchor in every keyframe: what drift hid from each other meets once poses agree."""
+        for keyframe in self.map.keyframes.values():
+            anchors = self.map.anchors
+            self._merge_doubles([self._look_in(keyframe, np.flatnonzero(anchors.alive & ~anchors.from_depth))])
+        self.map.refresh_anchors(np.flatnonzero(self.map.anchors.alive))
+
+    def _look_in(self, keyframe: Keyframe, ids: IntArray) -> tuple[IntArray, IntArray]:
+        """Observe anchors on a keyframe's free keypoints; returns pairs of anchors that want the same keypoint."""
+        anchors = self.map.anchors
+        ids = ids[~np.isin(ids, keyframe.anchor)]
+        seen = project_anchors(anchors, ids, keyframe.T_c_w, self.camera, self.orb.scale_factor, self.orb.levels)
+        matches = match_projection(
+            seen,
+            anchors.words[seen.anchor],
+            keyframe.words,
+            keyframe.features.octave,
+            keyframe.grid,
+            3.0 * self.orb.scale_factor ** seen.octave.astype(np.float64),
+            50,
+            1.0,
+        )
+        error = seen.uv[matches.query] - keyframe.features.uv[matches.train]
+        sigma = self.orb.scale_factor ** keyframe.features.octave[matches.train].astype(np.float64)
+        good = (error**2).sum(1) <= 5.991 * sigma**2
+        found, keypoint = seen.anchor[matches.query[good]], matches.train[good]
+        held = keyframe.anchor[keypoint]
+        free = held < 0
+        self.map.observe(keyframe, keypoint[free], found[free])
+        return found[~free], held[~free]
+
+    def _merge_doubles(self, doubles: list[tuple[IntArray, IntArray]]) -> None:
         """Two ids for one point: the one with more observations stays."""
+        if not doubles:
+            return
+        a, b = (np.concatenate(side) for side in zip(*doubles, strict=True))
         keep_a = self.map.anchors.observations[a] >= self.map.anchors.observations[b]
         winners, losers = np.where(keep_a, a, b), np.where(keep_a, b, a)
         # One id may sit in several pairs; only disjoint pairs are merged now, the rest at a later keyframe.

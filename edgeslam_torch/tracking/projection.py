@@ -25,6 +25,10 @@ class Projection:
     octave: IntArray
     """``(M,)`` predicted pyramid level."""
 
+    def select(self, which: NDArray[np.bool_]) -> "Projection":
+        """Some of the anchors."""
+        return Projection(self.anchor[which], self.uv[which], self.depth[which], self.octave[which])
+
 
 def project_anchors(
     anchors: Anchors, ids: IntArray, T_c_w: FloatArray, camera: Camera, scale_factor: float, levels: int
@@ -52,14 +56,12 @@ def match_projection(
     keypoint_words: NDArray[np.uint64],
     keypoint_octave: IntArray,
     grid: KeypointGrid,
-    radius_px: float,
-    scale_factor: float,
+    radius_px: FloatArray,
     max_hamming: int,
     ratio: float,
 ) -> Matches:
-    """Match projected anchors (query) to keypoints (train) inside a radius that grows with the pyramid level."""
-    radius = radius_px * scale_factor ** projection.octave.astype(np.float64)
-    query, train = grid.near(projection.uv, radius)
+    """Match projected anchors (query) to keypoints (train) inside a radius ``(M,)`` each."""
+    query, train = grid.near(projection.uv, radius_px)
     near_octave = np.abs(keypoint_octave[train] - projection.octave[query]) <= 1
     query, train = query[near_octave], train[near_octave]
     distance = hamming(anchor_words[query], keypoint_words[train])

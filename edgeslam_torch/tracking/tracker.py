@@ -7,16 +7,19 @@ from numpy.typing import NDArray
 
 from edgeslam_torch.config import OrbConfig, TrackingConfig
 from edgeslam_torch.frontend.keypoint_grid import KeypointGrid
-from edgeslam_torch.frontend.matching import words
+from edgeslam_torch.frontend.matching import Matches, words
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.mapping.keyframe import Keyframe
 from edgeslam_torch.mapping.slam_map import SlamMap
 from edgeslam_torch.optim.pose_only import PoseConfig, refine_pose
-from edgeslam_torch.tracking.projection import match_projection, project_anchors
+from edgeslam_torch.tracking.projection import Projection, match_projection, project_anchors
 from edgeslam_torch.types import FloatArray, FrameFeatures, IntArray
 
-ROUGH = PoseConfig(rounds=2, robust_rounds=1, iterations=5, cost_tolerance=1e-2)
+ROUGH = PoseConfig(rounds=1, robust_rounds=1, iterations=5, cost_tolerance=1e-2)
 """The first pass only has to bring the local map's anchors into their search radius."""
+
+ENOUGH_FOR_ROUGH = 250
+"""Anchors of the last frame that the first pass looks for; more of them cost time and change nothing."""
 
 FINE = PoseConfig(rounds=3, robust_rounds=1, cost_tolerance=1e-3)
 
@@ -79,16 +82,14 @@ class Tracker:
 
     def track(self, view: View, T_c_w: FloatArray, recent: IntArray) -> Track | None:
         """Pose near a predicted one: anchors of the last frame first, then the local map; None if too few agree."""
-        first = self.refine(view, T_c_w, recent, self.config.motion_radius_px, ROUGH)
+        some = recent[:: 1 + len(recent) // ENOUGH_FOR_ROUGH]
+        first = self.refine(view, T_c_w, some, self.config.motion_radius_px, ROUGH)
         if first is None or first.inliers < self.config.min_inliers:
             first = self.refine(view, T_c_w, recent, 2.5 * self.config.motion_radius_px, ROUGH)
         if first is None or first.inliers < 10:
             return None
-        local = self.map.anchors_seen_by(self.local_keyframes(first.anchor))
-        self_seen = self.refine(view, first.T_c_w, local, self.config.map_radius_px, count_visible=True)
-        if self_seen is None or self_seen.inliers < self.config.min_inliers:
-            return None
-        return self_seen
+        track = self._complete(view, first)
+        return track if track is not None and track.inliers >= self.config.min_inliers else None
 
     def local_keyframes(self, anchor_ids: IntArray) -> list[Keyframe]:
         """Keyframes that see the given anchors, and of those the ones that see most."""
@@ -97,34 +98,45 @@ class Tracker:
         return [self.map.keyframes[id] for id in ranked[: self.config.local_keyframes]]
 
     def refine(
-        self,
-        view: View,
-        T_c_w: FloatArray,
-        anchor_ids: IntArray,
-        radius_px: float,
-        effort: PoseConfig = FINE,
-        count_visible: bool = False,
+        self, view: View, T_c_w: FloatArray, anchor_ids: IntArray, radius_px: float, effort: PoseConfig = FINE
     ) -> Track | None:
         """Match the given anchors around their predicted pixels and refine the pose on what matches."""
+        seen = self._expected(T_c_w, anchor_ids)
+        matches = self._match(view, seen, np.full(len(seen.anchor), radius_px))
+        return self.solve(view, T_c_w, matches.train, seen.anchor[matches.query], effort)
+
+    def _complete(self, view: View, first: Track) -> Track | None:
+        """A rough track with what else of the local map the frame sees; its inliers are not searched again."""
+        anchors = self.map.anchors
+        seen = self._expected(first.T_c_w, self.map.anchors_seen_by(self.local_keyframes(first.anchor)))
+        new = seen.select(~np.isin(seen.anchor, first.anchor))
+        radius = self.config.map_radius_px * self.orb.scale_factor ** new.octave.astype(np.float64)
+        matches = self._match(view, new, radius)
+        free = ~np.isin(matches.train, first.keypoint)
+        keypoint = np.concatenate([first.keypoint, matches.train[free]])
+        anchor = np.concatenate([first.anchor, new.anchor[matches.query[free]]])
+        track = self.solve(view, first.T_c_w, keypoint, anchor)
+        if track is not None:
+            anchors.visible[seen.anchor] += 1
+            anchors.found[track.anchor] += 1
+        return track
+
+    def _expected(self, T_c_w: FloatArray, anchor_ids: IntArray) -> Projection:
         anchors = self.map.anchors
         ids = anchor_ids[anchors.alive[anchor_ids]]
-        seen = project_anchors(anchors, ids, T_c_w, self.camera, self.orb.scale_factor, self.orb.levels)
-        matches = match_projection(
+        return project_anchors(anchors, ids, T_c_w, self.camera, self.orb.scale_factor, self.orb.levels)
+
+    def _match(self, view: View, seen: Projection, radius_px: FloatArray) -> Matches:
+        return match_projection(
             seen,
-            anchors.words[seen.anchor],
+            self.map.anchors.words[seen.anchor],
             view.words,
             view.features.octave,
             view.grid,
             radius_px,
-            self.orb.scale_factor,
             self.config.max_hamming,
             self.config.ratio,
         )
-        track = self.solve(view, T_c_w, matches.train, seen.anchor[matches.query], effort)
-        if count_visible and track is not None:
-            anchors.visible[seen.anchor] += 1
-            anchors.found[track.anchor] += 1
-        return track
 
     def solve(
         self, view: View, T_c_w: FloatArray, keypoint: IntArray, anchor: IntArray, effort: PoseConfig = FINE

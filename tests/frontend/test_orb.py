@@ -52,7 +52,7 @@ def test_spread_keeps_the_few_of_a_poor_corner_of_the_image(rng):
     right = rng.uniform([500, 100], [640, 400], (12, 2))
     uv = np.concatenate([left, right]).astype(np.float32)
     score = np.r_[rng.uniform(50, 100, 2000), rng.uniform(1, 2, 12)]
-    keep = spread(uv, score, np.zeros(2012, int), 640, 480, 500)
+    keep = spread(uv, score, 640, 480, 500)
     assert len(keep) == 500
     assert (np.diff(keep) > 0).all()
     assert (keep >= 2000).sum() == 12
@@ -60,17 +60,17 @@ def test_spread_keeps_the_few_of_a_poor_corner_of_the_image(rng):
 
 def test_spread_takes_the_strongest_of_a_cell():
     uv = np.tile([[10.0, 10.0]], (9, 1)).astype(np.float32)
-    assert spread(uv, np.arange(9.0), np.zeros(9, int), 640, 480, 3).tolist() == [6, 7, 8]
+    assert spread(uv, np.arange(9.0), 640, 480, 3).tolist() == [6, 7, 8]
 
 
 def test_spread_of_few_keeps_all():
-    assert spread(np.zeros((3, 2)), np.ones(3), np.zeros(3, int), 640, 480, 5).tolist() == [0, 1, 2]
+    assert spread(np.zeros((3, 2)), np.ones(3), 640, 480, 5).tolist() == [0, 1, 2]
 
 
 def test_spread_is_as_even_as_the_corners_allow(rng):
     """Evenly detected corners: no quarter of the image gets more than a third of what is kept."""
     uv = rng.uniform([0, 0], [640, 480], (3000, 2)).astype(np.float32)
     score = 100.0 - uv[:, 0] / 10  # the left is stronger throughout
-    keep = spread(uv, score, np.zeros(3000, int), 640, 480, 600)
+    keep = spread(uv, score, 640, 480, 600)
     quarter = (uv[keep] // [320, 240]) @ [1, 2]
     assert np.bincount(quarter.astype(int), minlength=4).max() < 200
