@@ -103,7 +103,7 @@ class EdgeSlam:
         self._tracker = Tracker(self.map, camera, self.config.orb, self.config.tracking)
         self._lm = lm_config(self.config.window)
         self._mapper = Mapper(self.map, camera, self.config, self._lm)
-        self._edges = EdgeMap(self.map, camera, self.config.edges, self.config.depth.prior_sigma_log)
+        self.edges = EdgeMap(self.map, camera, self.config.edges, self.config.depth.prior_sigma_log)
         self._T_b_c = camera_on_body(np.deg2rad(self.config.mount.tilt_deg), self.config.mount.forward_m)
         self._fusion = MotionFusion(self.config.fusion, self._T_b_c)
         self._published = Published()
@@ -339,7 +339,7 @@ class EdgeSlam:
         self._recent = keyframe.anchor[keyframe.anchor >= 0]
         self._frames_since_keyframe = 0
         for member in (reference, keyframe):
-            self._edges.announce(member)
+            self.edges.announce(member)
             self._compare_depth(member)
         return keyframe
 
@@ -384,8 +384,8 @@ class EdgeSlam:
         with _timed(stage_ms, "mapping"):
             self._mapper.insert(keyframe, colours_at(keyframe.image, keyframe.features.uv))
         with _timed(stage_ms, "edges"):
-            self._edges.announce(keyframe)
-            self._edges.update()
+            self.edges.announce(keyframe)
+            self.edges.update()
         return _Mapped(keyframe, T_tracked, stage_ms)
 
     def _absorb(self, mapped: "_Mapped") -> None:
@@ -426,7 +426,7 @@ class EdgeSlam:
     def finish(self) -> None:
         """Refine the whole map, measure the last edges and fix the published scale, once no frame follows."""
         self._wait()
-        last_refinement(self.map, self.camera, self._edges, self._lm, self.config.window)
+        last_refinement(self.map, self.camera, self.edges, self.config.window)
         estimate = self.scale
         if np.isfinite(estimate.sigma):
             self._published = Published(estimate.value)
@@ -443,7 +443,7 @@ class EdgeSlam:
 
     def edge_map(self) -> PointCloud:
         """Semi-dense edge points that several keyframes agree on."""
-        return self._published.cloud(self._edges.points())
+        return self._published.cloud(self.edges.points())
 
     def anchors(self) -> PointCloud:
         """Triangulated anchors."""

@@ -1,13 +1,12 @@
 """What each loss does: the benchmark with one thing changed at a time, as one table."""
 
 import argparse
-import json
 import os
 import sys
 import time
 from pathlib import Path
 
-from edgeslam_torch.errors import OutputError
+from edgeslam_torch.errors import OutputError, SourceError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -21,40 +20,36 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--max-frames", type=int, metavar="N", help="stop every run after N frames")
     parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="change all rows")
     parser.add_argument(
-        "--out", type=Path, metavar="DIR", help="folder for the runs; rows that it holds already are not run again"
+        "--out", type=Path, metavar="DIR", help="folder for the results; runs that it holds already are not repeated"
     )
-    parser.add_argument("--json", type=Path, metavar="FILE", help="also write the results here")
     parser.add_argument("--markdown", type=Path, metavar="FILE", help="also write the tables here")
 
 
 def main(args: argparse.Namespace) -> int:
-    """Run the rows; 1 when a run failed."""
-    from edgeslam_torch.eval.ablation import markdown_ablation, run_ablation
-    from edgeslam_torch.eval.benchmark import BenchSettings
+    """Fly, finish in every way, print the table."""
+    from edgeslam_torch.eval.ablation import AblationSettings, markdown_ablation, run_ablation
 
     data = args.data or (Path(os.environ["EDGESLAM_DATA"]) if os.environ.get("EDGESLAM_DATA") else None)
-    settings = BenchSettings(
+    if data is None:
+        raise SourceError("no recordings: give --data or set EDGESLAM_DATA")
+    settings = AblationSettings(
         data=data,
         seeds=tuple(range(max(1, args.seeds))),
-        only=tuple(args.sequence),
+        sequences=tuple(args.sequence),
+        rows=tuple(args.row),
         max_frames=args.max_frames,
         overrides=tuple(args.set),
-        micro=False,
     )
-    if data is None:
-        _say("no recordings (--data or EDGESLAM_DATA): the synthetic flight alone")
     out = args.out or Path("runs") / time.strftime("ablation-%Y%m%d-%H%M%S")
     try:
-        records = run_ablation(settings, args.row, out, _say)
-        text = markdown_ablation(records)
-        if args.json is not None:
-            args.json.write_text(json.dumps(records, indent=1, default=str) + "\n", encoding="utf-8")
+        text = markdown_ablation(run_ablation(settings, out, _say))
         if args.markdown is not None:
             args.markdown.write_text(text, encoding="utf-8")
     except OSError as error:
         raise OutputError(f"{error.filename}: cannot be written ({error.strerror or error})") from error
     print(text)
-    return 1 if any(run["error"] for record in records.values() for run in record["runs"]) else 0
+    print(f"results: {out / 'ablation.json'}")
+    return 0
 
 
 def _say(text: str) -> None:

@@ -45,15 +45,13 @@ def lm_config(config: WindowConfig) -> LmConfig:
     )
 
 
-def last_refinement(
-    slam_map: SlamMap, camera: Camera, edges: EdgeMap, lm: LmConfig, config: WindowConfig
-) -> WindowResult | None:
+def last_refinement(slam_map: SlamMap, camera: Camera, edges: EdgeMap, config: WindowConfig) -> WindowResult | None:
     """Refine all keyframes with all anchors, measure the last edges, and refine everything with the edges.
 
     Returns:
         What the last solver run reports; None when there was nothing to refine.
     """
-    lm = replace(lm, max_iterations=ITERATIONS)
+    lm = replace(lm_config(config), max_iterations=ITERATIONS)
     result = refine_all(slam_map, camera, lm) if config.reprojection != "off" else None
     edges.update(everything=True)
     if config.uses_edges or config.uses_corners:
