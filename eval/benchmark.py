@@ -38,6 +38,12 @@ _PEERS = Path(__file__).with_name("peers.toml")
 _OWN = "edgeslam"
 
 
+_NOISE_WORDS = (
+    "noise: 2 sqrt(s_a^2/n_a + s_b^2/n_b) over the seeds, and never less than the figure's floor (3 % for errors, 10 % "
+    "for CPU time, 15 % for frames a second); one seed offline gives the same trajectory and map every time"
+)
+
+
 @dataclass(frozen=True, slots=True)
 class Metric:
     """One figure of a run."""
@@ -199,7 +205,7 @@ def compare(before: dict[str, Any], after: dict[str, Any]) -> list[dict[str, Any
             a, b = _values(before, name, metric.name), _values(after, name, metric.name)
             if len(a) == 0 or len(b) == 0:
                 continue
-            noise = max(_scatter(a, b), metric.floor * abs(float(np.median(a))))
+            noise = _noise(metric, a, b)
             change = float(np.median(b) - np.median(a))
             gain = -change if metric.lower_is_better else change
             verdict = "same" if abs(change) <= noise else "better" if gain > 0 else "worse"
@@ -220,13 +226,14 @@ def compare(before: dict[str, Any], after: dict[str, Any]) -> list[dict[str, Any
 
 def markdown_bench(record: dict[str, Any]) -> str:
     """One table a sequence: every run, their median, and the peers' figures."""
-    parts = [_conditions(record)]
+    parts = [_conditions(record), "", _NOISE_WORDS]
     for name in _sequences(record):
         peers = [p for p in read_peers() if p["sequence"].startswith(name) or p["sequence"].split()[0] in name]
         runs = [r for r in record["runs"] if r["sequence"] == name]
         own = [(f"{_OWN}, seed {r['seed']}", _lists(r.get("figures", {}))) for r in runs]
         if len(runs) > 1:
             own.append((f"**{_OWN}, median of {len(runs)}**", _medians(record, name)))
+            own.append(("its noise: two of these differ by less (±)", _noise_of(record, name)))
         other = [(f"{p['system']} [{k}]", _peer_figures(p)) for k, p in enumerate(peers, start=1)]
         parts += ["", f"### {name}", "", _table([*own, *other])]
         errors = [f"- seed {r['seed']} failed: {r['error']}" for r in runs if r.get("error")]
@@ -248,7 +255,7 @@ def markdown_compare(rows: Sequence[dict[str, Any]]) -> str:
     for r in rows:
         before, after, noise = (r["text"].format(r[k]) for k in ("before", "after", "noise"))
         lines.append(f"| {r['sequence']} | {r['title']} | {before} | {after} | ±{noise} | {r['verdict']} |")
-    lines += ["", "noise: 2 sqrt(s_a^2/n_a + s_b^2/n_b) over the seeds, and never less than the figure's floor."]
+    lines += ["", _NOISE_WORDS]
     return "\n".join(lines) + "\n"
 
 
@@ -424,6 +431,20 @@ def _scatter(a: np.ndarray, b: np.ndarray) -> float:
 
 def _lists(figures: dict[str, float | None]) -> dict[str, list[float]]:
     return {k: [v] for k, v in figures.items() if v is not None}
+
+
+def _noise_of(record: dict[str, Any], name: str) -> dict[str, list[float]]:
+    """What `compare` would call no difference between this record's median and that of a second one like it."""
+    out = {}
+    for metric in METRICS:
+        values = _values(record, name, metric.name)
+        if len(values):
+            out[metric.name] = [_noise(metric, values, values)]
+    return out
+
+
+def _noise(metric: Metric, a: np.ndarray, b: np.ndarray) -> float:
+    return max(_scatter(a, b), metric.floor * abs(float(np.median(a))))
 
 
 def _medians(record: dict[str, Any], name: str) -> dict[str, list[float]]:

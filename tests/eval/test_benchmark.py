@@ -72,6 +72,7 @@ def test_table_lists_every_run_its_median_and_the_peers() -> None:
     text = markdown_bench(record([0.0100, 0.0110, 0.0130], [30, 31, 32]))
     assert text.count("| edgeslam, seed") == 3
     assert "median of 3** | 0.0110" in text
+    assert "(±) | 0.0025 |" in text, "2 sqrt(2 s^2 / 3), s = 0.0015"
     assert "ORB-SLAM2" in text and "0.0098 0.0094 0.1562" in text
     assert "tracking 5.0" in text
 
