@@ -1,17 +1,12 @@
-"""Sparse map points and a network's own depth to dense depth: the teacher for images without labels.
+"""Measured depth at some pixels and a network's own depth to dense depth.
 
-The network knows shapes between edges, the map knows where the edges are. Their log ratio at the map points, spread
-smoothly over the image, corrects the network's depth; far from any point only the image's median ratio is corrected.
+The network knows shapes, measurements know distances. Their log ratio at the measured pixels, spread smoothly over the
+image, corrects the network's depth; far from any of them only the image's median ratio is corrected.
 """
 
 import cv2
 import numpy as np
 
-from edgeslam_torch.models.fastdepth import FastDepth
-from edgeslam_torch.models.record import Metadata
-from edgeslam_torch.train.augment import View
-from edgeslam_torch.train.posed import PosedSequence, PosedView
-from edgeslam_torch.train.validate import predict_metres
 from edgeslam_torch.types import FloatArray
 
 SCALES = (0.15, 0.06, 0.025)
@@ -42,23 +37,3 @@ def densify(log_depth: FloatArray, uv: FloatArray, log_z: FloatArray) -> FloatAr
         weight = cv2.GaussianBlur(count, (0, 0), sigma) + doubt / (2 * np.pi * sigma**2)
         correction = correction + cv2.GaussianBlur(rest, (0, 0), sigma) / weight
     return log_depth + correction
-
-
-def teach(network: FastDepth, metadata: Metadata, sequence: PosedSequence, log_scale: float) -> list[View]:
-    """The views of a run with dense depth [m] made from the network's prediction and the run's map points.
-
-    Args:
-        network: The network before training.
-        metadata: Of the network.
-        sequence: The run.
-        log_scale: Log of metres per map unit.
-    """
-    network.eval()
-    return [_taught(network, metadata, view, log_scale) for view in sequence.views]
-
-
-def _taught(network: FastDepth, metadata: Metadata, view: PosedView, log_scale: float) -> View:
-    blank = np.zeros(view.image.shape[:2], np.float32)
-    depth, _ = predict_metres(network, metadata, View(view.image, blank, view.K))
-    dense = densify(np.log(depth), view.uv, np.log(view.z) + log_scale)
-    return View(view.image, np.exp(dense).astype(np.float32), view.K)

@@ -15,12 +15,12 @@ from edgeslam_torch.models.fastdepth import FastDepth
 from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.train.augment import View
 from edgeslam_torch.train.datasets import DepthFolder
-from edgeslam_torch.train.densify import teach
 from edgeslam_torch.train.distributed import rank
 from edgeslam_torch.train.posed import PosedSequence, PosedView
 from edgeslam_torch.train.recipe import Hooks, TrainConfig, train
 from edgeslam_torch.train.self_supervised import SelfSupervised, fit_log_scale
 from edgeslam_torch.train.signals import Signal, Source, Supervised
+from edgeslam_torch.train.teacher import teach
 from edgeslam_torch.train.validate import DepthScores, predict_metres, score
 from edgeslam_torch.train.watchers import ProgressBar, TensorBoard
 

@@ -48,6 +48,8 @@ class TrainConfig:
     kept."""
     weight_decay: float = 1e-2
     warmup_steps: int = 100
+    lr_end: float = 0.01
+    """Part of the peak rate left at the last step; 1 keeps it constant."""
     clip_norm: float = 1.0
     ema_decay: float = 0.998
     """Of the averaged weights that are validated and saved."""
@@ -161,11 +163,11 @@ def build_optimiser(network: FastDepth, config: TrainConfig) -> torch.optim.Opti
 
 
 def learning_rate_factor(step: int, config: TrainConfig) -> float:
-    """Linear warm-up, then half a cosine down to 1 %."""
+    """Linear warm-up, then half a cosine down to ``lr_end``."""
     if step < config.warmup_steps:
         return (step + 1) / config.warmup_steps
     progress = (step - config.warmup_steps) / max(config.steps - config.warmup_steps, 1)
-    return 0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(progress, 1.0)))
+    return config.lr_end + (1 - config.lr_end) * 0.5 * (1 + math.cos(math.pi * min(progress, 1.0)))
 
 
 def _step(state: TrainState, signals: Sequence[Signal], config: TrainConfig, this: int, of: int) -> dict[str, float]:

@@ -1,5 +1,4 @@
-"""Self-supervision from a SLAM run: photometric reprojection, map points, edge cycle, straight and square
-edges."""
+"""Self-supervision from a SLAM run: photometric reprojection, map points, edge cycle, L-shapes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -9,15 +8,16 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from edgeslam_torch.losses.base import Reduction, back_project
+from edgeslam_torch.losses.base import Reduction, back_project, move, project
 from edgeslam_torch.losses.cycle import CycleForm, CycleLoss
 from edgeslam_torch.losses.depth import LaplaceNll, masked_mean
-from edgeslam_torch.losses.lshape import CollinearityLoss
+from edgeslam_torch.losses.lshape import AngleLoss, CollinearityLoss, LShapeLoss
 from edgeslam_torch.losses.photometric import PhotometricLoss, SmoothnessLoss
 from edgeslam_torch.losses.robust import Kernel
 from edgeslam_torch.models.fastdepth import FastDepth
 from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.train.augment import AugmentConfig, View, recolour, scaled_K, warp
+from edgeslam_torch.train.junctions import junction_points, seen_cosines
 from edgeslam_torch.train.posed import PosedSequence, PosedView, relative_motion
 from edgeslam_torch.train.signals import Slot
 from edgeslam_torch.train.straight import straight_edges
@@ -28,6 +28,8 @@ EDGES = 600
 """Edge pixels per image in the cycle."""
 ARMS, ARM_POINTS = 24, 8
 """Straight edges per image and points on each."""
+JUNCTIONS = 24
+"""L-junctions per image."""
 SPARSE = 1500
 """Map points per image."""
 FLIP = 0.5
@@ -44,7 +46,7 @@ class SelfSupervisedWeights:
     photometric: float = 0.3
     points: float = 1.0
     cycle: float = 0.5
-    straight: float = 0.1
+    lshape: float = 0.1
     smooth: float = 0.1
     uncertainty: float = 0.1
 
@@ -73,7 +75,8 @@ class SelfSupervised:
         self._scale = list(self.log_scale) or [0.0] * len(self.sequences)
         self._photometric, self._smooth, self._nll = PhotometricLoss(), SmoothnessLoss(), LaplaceNll()
         self._cycle = CycleLoss(CycleForm.RELATIVE_DEPTH, Reduction.MEAN, Kernel.HUBER, delta=0.05)
-        self._straight = CollinearityLoss(kernel=Kernel.HUBER, delta=0.05)
+        angle = AngleLoss(kernel=Kernel.HUBER, delta=0.2)
+        self._lshape = LShapeLoss(angle, CollinearityLoss(kernel=Kernel.HUBER, delta=0.05))
 
     def describe(self, slots: Sequence[Slot]) -> list[str]:
         """``sequence/image`` of each slot."""
@@ -113,9 +116,9 @@ class SelfSupervised:
         if w.cycle:
             terms = [self._cycle_term(log_i[b], log_j[b], batch, b) for b in range(B)]
             out["cycle"] = w.cycle * torch.stack(terms)
-        if w.straight:
-            terms = [self._straight_term(log_i[b], batch, b) for b in range(B)]
-            out["straight"] = w.straight * torch.stack(terms)
+        if w.lshape:
+            terms = [self._lshape_term(log_i[b], batch, b) for b in range(B)]
+            out["lshape"] = w.lshape * torch.stack(terms)
         if w.smooth:
             out["smooth"] = w.smooth * self._smooth(log_i, batch["rgb_i"])
         if predicted.log_sigma is not None and w.uncertainty:
@@ -125,18 +128,18 @@ class SelfSupervised:
 
     def _cycle_term(self, log_i: Tensor, log_j: Tensor, batch: dict[str, Tensor], b: int) -> Tensor:
         uv = batch["edges"][b]
-        depth = _at(log_i[None], uv[None])[0].exp()
-        # Padding rows have no pixel: depth 0 makes them invalid.
-        depth = torch.where(uv[:, 0] >= 0, depth, torch.zeros_like(depth))
-        loss: Tensor = self._cycle(batch["T_j_i"][b, 0], uv, depth, log_j[0].exp(), batch["K"][b])
+        loss: Tensor = self._cycle(batch["T_j_i"][b, 0], uv, _depth_at(log_i, uv), log_j[0].exp(), batch["K"][b])
         return loss
 
-    def _straight_term(self, log_i: Tensor, batch: dict[str, Tensor], b: int) -> Tensor:
-        uv = batch["arms"][b]
-        known = uv[..., 0] >= 0
-        depth = _at(log_i[None], uv.reshape(1, -1, 2))[0].exp()
-        points = back_project(uv.reshape(-1, 2), depth, batch["K"][b]).reshape(-1, 2, ARM_POINTS, 3)
-        loss: Tensor = self._straight(points, known.reshape(-1, 2, ARM_POINTS))
+    def _lshape_term(self, log_i: Tensor, batch: dict[str, Tensor], b: int) -> Tensor:
+        T, K, arms, corners = batch["T_j_i"][b, 0], batch["K"][b], batch["arms"][b], batch["junctions_i"][b]
+        on_arms = back_project(arms.reshape(-1, 2), _depth_at(log_i, arms), K).reshape(-1, 2, ARM_POINTS, 3)
+        depth = _depth_at(log_i, corners).reshape(-1, 3)
+        with torch.no_grad():
+            projected, _ = project(move(T, back_project(corners, depth, K)), K)
+            cos_j = seen_cosines(projected, batch["junctions_j"][b])
+        known = arms[..., 0].reshape(-1, 2, ARM_POINTS) >= 0
+        loss: Tensor = self._lshape(T, corners, depth, cos_j, K, on_arms, known)
         return loss
 
     def _sample(self, slot: Slot) -> dict[str, Tensor]:
@@ -178,6 +181,8 @@ class SelfSupervised:
             "known": torch.from_numpy(z > 0),
             "edges": torch.from_numpy(edges),
             "arms": torch.from_numpy(arms),
+            "junctions_i": torch.from_numpy(junction_points(images[0], JUNCTIONS)),
+            "junctions_j": torch.from_numpy(junction_points(images[1], JUNCTIONS)),
         }
 
 
@@ -227,6 +232,13 @@ def _inside(
 
 def _rgb(image: NDArray[np.uint8]) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(image[..., ::-1].transpose(2, 0, 1))).float() / 255.0
+
+
+def _depth_at(log_depth: Tensor, uv: Tensor) -> Tensor:
+    """Depths ``(N,)`` of ``(1, H, W)`` at pixels ``(..., 2)``; 0, which the losses leave out, at padding (-1)."""
+    uv = uv.reshape(-1, 2)
+    depth = _at(log_depth[None], uv[None])[0].exp()
+    return torch.where(uv[:, 0] >= 0, depth, torch.zeros_like(depth))
 
 
 def _at(maps: Tensor, uv: Tensor) -> Tensor:

@@ -23,10 +23,12 @@ from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.synthetic.render import render
 from edgeslam_torch.synthetic.rooms import look, room
 from edgeslam_torch.synthetic.world import World
+from edgeslam_torch.train.junctions import junction_points, seen_cosines
 from edgeslam_torch.train.posed import PosedSequence, is_run_folder, load_run, visible_points
 from edgeslam_torch.train.self_supervised import SelfSupervised, fit_log_scale
 from edgeslam_torch.train.signals import Slot
 from edgeslam_torch.train.straight import straight_edges
+from edgeslam_torch.train.teacher import teach
 from edgeslam_torch.types import PointCloud
 
 CAMERA = Camera(128, 96, 100.0, 100.0, 63.5, 47.5)
@@ -71,7 +73,7 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     n = len(p_w)
     cloud = PointCloud(p_w, np.zeros((n, 3), np.uint8), np.full(n, 0.01, np.float32), np.full(n, 2, np.int32))
     write_ply(run / "anchors.ply", cloud)
-    summary = {"source": {"location": str(images)}, "scale": {"units": "metres"}}
+    summary = {"source": {"path": str(images)}, "scale": {"units": "metres"}}
     (run / "summary.json").write_text(json.dumps(summary))
     return run
 
@@ -94,7 +96,7 @@ def test_run_is_read_with_poses_points_and_partners(run_folder: Path, sequence: 
 def test_missing_recording_is_named(run_folder: Path, tmp_path: Path) -> None:
     for name in ("trajectory.txt", "anchors.ply", "camera.yaml"):
         (tmp_path / name).write_bytes((run_folder / name).read_bytes())
-    (tmp_path / "summary.json").write_text(json.dumps({"source": {"location": str(tmp_path / "gone")}}))
+    (tmp_path / "summary.json").write_text(json.dumps({"source": {"path": str(tmp_path / "gone")}}))
     with pytest.raises(SourceError, match="gone"):
         load_run(tmp_path)
 
@@ -195,7 +197,7 @@ def test_gradient_reaches_the_network(sequence: PosedSequence) -> None:
     network = build_network(METADATA, Widths((4,) + (8,) * 13, (8,) * 5))
     signal = SelfSupervised([sequence], METADATA)
     losses = signal.losses(network, signal.draw([Slot(0, 0, 0)]))
-    assert set(losses) == {"photometric", "points", "cycle", "straight", "smooth", "uncertainty"}
+    assert set(losses) == {"photometric", "points", "cycle", "lshape", "smooth", "uncertainty"}
     sum(v.sum() for v in losses.values()).backward()  # type: ignore[union-attr]
     grads = [p.grad for p in network.parameters() if p.grad is not None]
     assert grads
@@ -221,6 +223,33 @@ def test_straight_pieces_lie_on_straight_edges(rng: np.random.Generator) -> None
     blank_edges, blank_arms = straight_edges(np.zeros((96, 128, 3), np.uint8), 10, 4, 8, rng)
     assert (blank_edges == -1).all()
     assert (blank_arms == -1).all()
+
+
+def test_junctions_of_two_views_are_paired_by_place_and_direction() -> None:
+    image = np.full((96, 128, 3), 30, np.uint8)
+    cv2.rectangle(image, (30, 20), (90, 70), (200, 200, 200), -1)
+    found = torch.from_numpy(junction_points(image, 8))
+    known = found[:, 0, 0] >= 0
+    assert known.sum() >= 3
+    moved = found[known] + 1.5
+    assert torch.allclose(seen_cosines(moved, found), torch.zeros(len(moved)), atol=0.1)
+    assert seen_cosines(moved + 20.0, found).isnan().all(), "too far away"
+    turned = moved.clone()
+    turned[:, 1:] = 2 * moved[:, :1] - moved[:, 1:]
+    assert seen_cosines(turned, found).isnan().all(), "arms the other way"
+
+
+def test_teacher_measures_what_the_network_does_not_know(sequence: PosedSequence) -> None:
+    torch.manual_seed(0)
+    network = build_network(METADATA, Widths((4,) + (8,) * 13, (8,) * 5))
+    metres = 0.5
+    errors, shares = [], []
+    for view, taught in zip(sequence.views, teach(network, METADATA, sequence, float(np.log(metres))), strict=True):
+        error = np.abs(taught.depth_m / (metres * render(world(), CAMERA, view.T_w_c).depth_m) - 1)
+        errors.append(np.median(error))
+        shares.append(np.mean(error < 0.06))
+    assert np.median(errors) < 0.03
+    assert np.median(shares) > 0.6
 
 
 def test_finetune_command_on_a_run(run_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
