@@ -223,8 +223,8 @@ class _Run:
             prepared.close()
 
     def _prepared(self, frames: Iterator[Frame]) -> Generator[tuple[Frame, Any]]:
-        """Frames with their features; offline a second thread extracts the next ones meanwhile, in the same order."""
-        ahead = self.mode is Mode.OFFLINE and not self.source.live
+        """Frames with their features; of a recording, a second thread extracts the next ones meanwhile."""
+        ahead = not self.source.live
 
         def pairs() -> Generator[tuple[Frame, Any]]:
             try:

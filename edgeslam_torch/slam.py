@@ -91,7 +91,7 @@ class EdgeSlam:
         self.camera = camera
         self.config = config or SlamConfig()
         self.depth = depth if depth is not None else _depth_from_config(self.config)
-        self.map = SlamMap(self.config.orb.scale_factor)
+        self.map = SlamMap(self.config.orb.scale_factor, self.config.orb.levels)
         self.log = TrajectoryLog(self.map)
         self.events = {"lost": 0, "relocalised": 0, "restarted": 0, "initialisations_refused": 0}
         """Counts of what went wrong and was mended."""

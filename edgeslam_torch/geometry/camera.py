@@ -1,6 +1,7 @@
 """Pinhole camera with Brown-Conrady distortion; calibration files and presets."""
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -79,11 +80,8 @@ class Camera:
         return cv2.remap(image, *self.undistortion_maps(), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
     def undistortion_maps(self) -> tuple[np.ndarray, np.ndarray]:
-        """Fixed-point maps for `cv2.remap` from the distorted to the undistorted image."""
-        maps = cv2.initUndistortRectifyMap(
-            self.K, np.array(self.distortion), None, self.K, (self.width, self.height), cv2.CV_16SC2
-        )
-        return maps[0], maps[1]
+        """Fixed-point maps for `cv2.remap` from the distorted to the undistorted image; made once per camera."""
+        return _undistortion_maps(self)
 
     def back_project(self, uv: FloatArray, depth_m: FloatArray) -> FloatArray:
         """Points ``(N, 3)`` in the camera frame of undistorted pixels ``(N, 2)`` at z-depth ``(N,)``, eq. (17)."""
@@ -111,6 +109,16 @@ class Camera:
             "source": self.source,
         }
         Path(path).write_text(yaml.safe_dump(record, sort_keys=False))
+
+
+@lru_cache(maxsize=4)
+def _undistortion_maps(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    size = (camera.width, camera.height)
+    K = camera.K
+    maps = cv2.initUndistortRectifyMap(K, np.array(camera.distortion), None, K, size, cv2.CV_16SC2)
+    for array in maps:
+        array.setflags(write=False)  # shared by all who ask
+    return maps[0], maps[1]
 
 
 PRESETS = {

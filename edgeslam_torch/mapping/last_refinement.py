@@ -12,6 +12,7 @@ from edgeslam_torch.losses.cycle import CycleForm
 from edgeslam_torch.losses.robust import Kernel
 from edgeslam_torch.losses.weighting import AdaptiveScales
 from edgeslam_torch.mapping.edge_map import EdgeMap, EdgePoints
+from edgeslam_torch.mapping.fuse import fuse_all
 from edgeslam_torch.mapping.keyframe import Keyframe
 from edgeslam_torch.mapping.refinement import refine_all, take_back, whole_map, window_problem
 from edgeslam_torch.mapping.slam_map import SlamMap
@@ -46,13 +47,16 @@ def lm_config(config: WindowConfig) -> LmConfig:
 
 
 def last_refinement(slam_map: SlamMap, camera: Camera, edges: EdgeMap, config: WindowConfig) -> WindowResult | None:
-    """Refine all keyframes with all anchors, measure the last edges, and refine everything with the edges.
+    """Refine all keyframes with all anchors, join what then meets, measure the last edges, refine with the edges.
 
     Returns:
         What the last solver run reports; None when there was nothing to refine.
     """
     lm = replace(lm_config(config), max_iterations=ITERATIONS)
-    result = refine_all(slam_map, camera, lm) if config.reprojection != "off" else None
+    result = None
+    if config.reprojection != "off" and refine_all(slam_map, camera, lm) is not None:
+        fuse_all(slam_map, camera)
+        result = refine_all(slam_map, camera, lm)
     edges.update(everything=True)
     if config.uses_edges or config.uses_corners:
         result = refine_with_edges(slam_map, camera, edges, lm, config) or result

@@ -5,12 +5,12 @@ import numpy as np
 from edgeslam_torch.config import SlamConfig
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.mapping.depth_prior import depth_prior
+from edgeslam_torch.mapping.fuse import fuse
 from edgeslam_torch.mapping.keyframe import NO_ANCHOR, Keyframe
 from edgeslam_torch.mapping.new_anchors import epipolar_matches, triangulate_matches
 from edgeslam_torch.mapping.refinement import choose_window, refine
 from edgeslam_torch.mapping.slam_map import SlamMap
 from edgeslam_torch.optim.problem import LmConfig, WindowResult
-from edgeslam_torch.tracking.projection import match_projection, project_anchors
 from edgeslam_torch.types import IntArray
 
 
@@ -47,7 +47,7 @@ class Mapper:
             self.cull_recent_anchors(keyframe)
             neighbours = self.map.covisible(keyframe, self.config.neighbours)
             self.triangulate_new(keyframe, neighbours, colour)
-            self.fuse(keyframe, self.map.covisible(keyframe, 2 * self.config.neighbours))
+            fuse(self.map, self.camera, keyframe, self.map.covisible(keyframe, 2 * self.config.neighbours))
         window = choose_window(self.map, keyframe, self.config.window, self.config.window_fixed)
         result = refine(self.map, window, self.camera, self.lm)
         with self.map.lock:
@@ -99,56 +99,6 @@ class Mapper:
             self.map.observe(other, theirs, ids)
             self.map.refresh_anchors(ids)
             self._recent = np.concatenate([self._recent, ids])
-
-    def fuse(self, keyframe: Keyframe, neighbours: list[Keyframe]) -> None:
-        """Look for the keyframe's anchors in its neighbours: more observations, fewer doubles."""
-        doubles = [self._look_in(other, self.map.anchors_seen_by([keyframe])) for other in neighbours]
-        self._merge_doubles(doubles)
-
-    def fuse_all(self) -> None:
-        """Look for every anchor in every keyframe: what drift hid from each other meets once poses agree."""
-        for keyframe in self.map.keyframes.values():
-            anchors = self.map.anchors
-            self._merge_doubles([self._look_in(keyframe, np.flatnonzero(anchors.alive & ~anchors.from_depth))])
-        self.map.refresh_anchors(np.flatnonzero(self.map.anchors.alive))
-
-    def _look_in(self, keyframe: Keyframe, ids: IntArray) -> tuple[IntArray, IntArray]:
-        """Observe anchors on a keyframe's free keypoints; returns pairs of anchors that want the same keypoint."""
-        anchors = self.map.anchors
-        ids = ids[~np.isin(ids, keyframe.anchor)]
-        seen = project_anchors(anchors, ids, keyframe.T_c_w, self.camera, self.orb.scale_factor, self.orb.levels)
-        matches = match_projection(
-            seen,
-            anchors.words[seen.anchor],
-            keyframe.words,
-            keyframe.features.octave,
-            keyframe.grid,
-            3.0 * self.orb.scale_factor ** seen.octave.astype(np.float64),
-            50,
-            1.0,
-        )
-        error = seen.uv[matches.query] - keyframe.features.uv[matches.train]
-        sigma = self.orb.scale_factor ** keyframe.features.octave[matches.train].astype(np.float64)
-        good = (error**2).sum(1) <= 5.991 * sigma**2
-        found, keypoint = seen.anchor[matches.query[good]], matches.train[good]
-        held = keyframe.anchor[keypoint]
-        free = held < 0
-        self.map.observe(keyframe, keypoint[free], found[free])
-        return found[~free], held[~free]
-
-    def _merge_doubles(self, doubles: list[tuple[IntArray, IntArray]]) -> None:
-        """Two ids for one point: the one with more observations stays."""
-        if not doubles:
-            return
-        a, b = (np.concatenate(side) for side in zip(*doubles, strict=True))
-        keep_a = self.map.anchors.observations[a] >= self.map.anchors.observations[b]
-        winners, losers = np.where(keep_a, a, b), np.where(keep_a, b, a)
-        # One id may sit in several pairs; only disjoint pairs are merged now, the rest at a later keyframe.
-        _, first = np.unique(np.concatenate([winners, losers]), return_index=True)
-        once = np.zeros(2 * len(a), dtype=bool)
-        once[first] = True
-        disjoint = once[: len(a)] & once[len(a) :]
-        self.map.merge_anchors(losers[disjoint], winners[disjoint])
 
     def cull_keyframes(self, newest: Keyframe) -> None:
         """Remove covisible keyframes whose anchors three others see at the same or finer scale; bound the map."""

@@ -17,8 +17,10 @@ class SlamMap:
     pose that moves with the map.
     """
 
-    def __init__(self, scale_factor: float) -> None:
+    def __init__(self, scale_factor: float, levels: int = 8) -> None:
         self.scale_factor = scale_factor
+        """Of the keypoints' pyramid, with ``levels``."""
+        self.levels = levels
         self.anchors = Anchors()
         self.keyframes: dict[int, Keyframe] = {}
         self.links: dict[int, tuple[int, FloatArray]] = {}

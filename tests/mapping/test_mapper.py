@@ -56,30 +56,6 @@ def test_pose_error_of_a_new_keyframe_is_refined_away(rng):
     assert np.abs(se3.log(points.keyframes[4].T_c_w @ se3.inverse(points.world.T_c_w[4]))).max() < 1e-3
 
 
-def test_doubles_become_one(rng):
-    """Half of the points got a second anchor that only the newest two keyframes know."""
-    points = PointMap(rng, 300, 4)
-    anchor_of = points.fill()
-    keyframe, other = points.keyframes[3], points.keyframes[2]
-    both = np.intersect1d(points.point_of[3], points.point_of[2])
-    twice = both[anchor_of[both] >= 0][::2]
-    for k in (keyframe, other):
-        at = np.flatnonzero(np.isin(points.point_of[k.id], twice))
-        points.map.forget_observations(k, at)
-    twice = twice[points.map.anchors.alive[anchor_of[twice]]]
-    ids = points.map.anchors.add(
-        points.world.p_w[twice], words(points.descriptors[twice]), 3, False, np.zeros((len(twice), 3), np.uint8)
-    )
-    for k in (keyframe, other):
-        keypoint_of = {p: i for i, p in enumerate(points.point_of[k.id])}
-        points.map.observe(k, np.array([keypoint_of[p] for p in twice]), ids)
-    points.map.refresh_anchors(ids)
-    before = len(points.map.anchors)
-    make_mapper(points).fuse(keyframe, points.map.covisible(keyframe, 12))
-    check_map(points.map)
-    assert before - len(points.map.anchors) > 0.8 * len(twice)
-
-
 def test_young_anchors_that_are_not_found_again_go(rng):
     points = PointMap(rng, 400, 3)
     anchor_of = points.fill([0, 1])

@@ -1,0 +1,72 @@
+"""Look for known anchors in keyframes that do not hold them yet: more observations, fewer doubles."""
+
+import numpy as np
+
+from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.mapping.keyframe import Keyframe
+from edgeslam_torch.mapping.slam_map import SlamMap
+from edgeslam_torch.tracking.projection import match_projection, project_anchors
+from edgeslam_torch.types import IntArray
+
+RADIUS_PX = 3.0
+"""Search radius at pyramid level 0; poses and points are refined already."""
+MAX_HAMMING = 50
+"""Bits, of 256; the strict figure of ORB-SLAM2, as there is no ratio test."""
+CHI2_2 = 5.991
+"""Chi-square, two degrees of freedom, 95 %."""
+
+Pairs = tuple[IntArray, IntArray]
+"""Two ids ``(M,)`` each for what looks like one anchor."""
+
+
+def fuse(slam_map: SlamMap, camera: Camera, keyframe: Keyframe, neighbours: list[Keyframe]) -> None:
+    """Look for a keyframe's anchors in its neighbours."""
+    _merge(slam_map, [_look_in(slam_map, camera, k, slam_map.anchors_seen_by([keyframe])) for k in neighbours])
+
+
+def fuse_all(slam_map: SlamMap, camera: Camera) -> None:
+    """Look for every anchor in every keyframe: what drift hid from each other meets once all poses are refined."""
+    anchors = slam_map.anchors
+    for keyframe in slam_map.keyframes.values():
+        _merge(slam_map, [_look_in(slam_map, camera, keyframe, np.flatnonzero(anchors.alive & ~anchors.from_depth))])
+    slam_map.refresh_anchors(np.flatnonzero(anchors.alive))
+
+
+def _look_in(slam_map: SlamMap, camera: Camera, keyframe: Keyframe, ids: IntArray) -> Pairs:
+    """Observe anchors on a keyframe's free keypoints; returns those whose keypoint has another anchor, and that."""
+    anchors, growth = slam_map.anchors, slam_map.scale_factor
+    ids = ids[~np.isin(ids, keyframe.anchor)]
+    seen = project_anchors(anchors, ids, keyframe.T_c_w, camera, growth, slam_map.levels)
+    matches = match_projection(
+        seen,
+        anchors.words[seen.anchor],
+        keyframe.words,
+        keyframe.features.octave,
+        keyframe.grid,
+        RADIUS_PX * growth ** seen.octave.astype(np.float64),
+        MAX_HAMMING,
+        1.0,
+    )
+    error = seen.uv[matches.query] - keyframe.features.uv[matches.train]
+    sigma = growth ** keyframe.features.octave[matches.train].astype(np.float64)
+    good = (error**2).sum(1) <= CHI2_2 * sigma**2
+    found, keypoint = seen.anchor[matches.query[good]], matches.train[good]
+    held = keyframe.anchor[keypoint]
+    free = held < 0
+    slam_map.observe(keyframe, keypoint[free], found[free])
+    return found[~free], held[~free]
+
+
+def _merge(slam_map: SlamMap, doubles: list[Pairs]) -> None:
+    """Two ids for one point: the one with more observations stays."""
+    if not doubles:
+        return
+    a, b = (np.concatenate(side) for side in zip(*doubles, strict=True))
+    keep_a = slam_map.anchors.observations[a] >= slam_map.anchors.observations[b]
+    winners, losers = np.where(keep_a, a, b), np.where(keep_a, b, a)
+    # One id may sit in several pairs; only disjoint pairs are merged now, the rest at a later keyframe.
+    _, first = np.unique(np.concatenate([winners, losers]), return_index=True)
+    once = np.zeros(2 * len(a), dtype=bool)
+    once[first] = True
+    disjoint = once[: len(a)] & once[len(a) :]
+    slam_map.merge_anchors(losers[disjoint], winners[disjoint])
