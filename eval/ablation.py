@@ -230,7 +230,7 @@ def _fly(folder: Path, config: SlamConfig, max_frames: int | None) -> _Flight:
         source.close()
     scale = slam.scale
     return _Flight(
-        _pickled((slam.map, slam.edges, slam.log, slam.camera)),
+        pickled((slam.map, slam.edges, slam.log, slam.camera)),
         frames,
         cpu_s,
         scale.value if np.isfinite(scale.sigma) else float("nan"),
@@ -278,7 +278,8 @@ class _Pickler(pickle.Pickler):
         return NotImplemented
 
 
-def _pickled(state: object) -> bytes:
+def pickled(state: object) -> bytes:
+    """Records of a flight as bytes, maps and their locks included."""
     buffer = io.BytesIO()
     _Pickler(buffer, protocol=pickle.HIGHEST_PROTOCOL).dump(state)
     return buffer.getvalue()

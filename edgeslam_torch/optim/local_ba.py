@@ -13,8 +13,9 @@ from edgeslam_torch.losses.reprojection import (
     reprojection_jacobians,
     reprojection_residuals,
 )
-from edgeslam_torch.losses.robust import rho
+from edgeslam_torch.losses.robust import Kernel, rho
 from edgeslam_torch.optim import lie, schur
+from edgeslam_torch.optim.compiled import kernel
 from edgeslam_torch.optim.levenberg_marquardt import Step, minimise
 from edgeslam_torch.optim.priors import PriorTerms
 from edgeslam_torch.optim.problem import (
@@ -170,9 +171,7 @@ class _Window:
 
     def cost(self, state: _State) -> float:
         """Robust cost of a candidate."""
-        s, _ = self._chi2(state)
-        value, _ = rho(s, self.config.kernel, self.config.delta)
-        total = float(value.sum()) + self.priors.cost(state.T_c_w)
+        total = float(kernel(point_cost, self.config.compile)(*self._given(state)[1:])) + self.priors.cost(state.T_c_w)
         return total + sum(float(b.cost(state.T_c_w, x)) for b, x in self._blocks(state))
 
     def accept(self, state: _State) -> None:
@@ -182,8 +181,8 @@ class _Window:
     def linearise(self) -> tuple[float, float]:
         """Blocks of the normal equations at the current state."""
         T, F, A = self.state.T_c_w, len(self.free), len(self.state.p_w)
-        r, Jp, Jl, value = self._factors()
-        self.Jp, self.Jl = Jp[:, :6], Jl
+        Jp, self.Jl, own, value = kernel(point_weights, self.config.compile)(*self._given(self.state), self.n_free)
+        self.Jp = Jp[:, :6]
         normal = torch.zeros(F, 7, 7, dtype=T.dtype)
         for chunk in self.chunks:
             for pose, lo, hi in chunk.slices:
@@ -194,10 +193,9 @@ class _Window:
         self.H[each, :, each] = normal[:, :6, :6]
         self.H, self.g = self.H.view(6 * F, 6 * F), normal[:, :6, 6].flatten()
         sums = torch.zeros(9, A, dtype=T.dtype)
-        own = torch.cat((schur.triangle(Jl), schur.row_products(Jl, r[:, None])[:, 0]))
         sums.index_add_(1, self.anchor, own)
         self.V, self.g_point = sums[:6], sums[6:]
-        cost = float(value.sum()) + self.priors.linearise(T, self.H, self.g)
+        cost = float(value) + self.priors.linearise(T, self.H, self.g)
         cost += sum(float(b.linearise(T, x, self.H, self.g)) for b, x in self._blocks(self.state))
         return cost, self._scaled_gradient()
 
@@ -273,37 +271,17 @@ class _Window:
             self._seen = (state, *camera_points(state.T_c_w, state.p_w, self.pose, self.anchor))
         return self._seen[1:]
 
-    def _factors(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Whitened, weighted rows; and the robust costs.
-
-        Residuals ``(2, M)``, by the free poses with the residual as seventh ``(2, 7, n)``, by anchor ``(2, 3, M)``.
-        """
-        R, p_c = self._camera_points(self.state)
-        r, Jp, Jl = reprojection_jacobians(R, p_c, self.uv, self.K)
-        if len(self.depth_rows):
-            rows = self.depth_rows
-            r[1, rows], Jp[1][:, rows], Jl[1][:, rows] = 0.0, 0.0, 0.0
-            iz, Jp[0][:, rows], Jl[0][:, rows] = inverse_depth_jacobians(R[..., rows], p_c[:, rows])
-            r[0, rows] = iz - self.inverse_depth
-        in_front = p_c[2] > self.config.min_depth
-        s = torch.where(in_front, (r * r).sum(0) * self.inv_sigma.square(), self.behind)
-        value, weight = rho(s, self.config.kernel, self.config.delta)
-        root = torch.where(in_front, weight.sqrt() * self.inv_sigma, 0.0)
-        r, Jl = r.mul_(root), Jl.mul_(root)
-        n = self.n_free
-        Jp = torch.cat((Jp[..., :n].mul_(root[:n]), r[:, None, :n]), 1)
-        if not bool(in_front.all()):  # 0 * inf where a point sits on the camera plane
-            r, Jp, Jl = r.nan_to_num_(0, 0, 0), Jp.nan_to_num_(0, 0, 0), Jl.nan_to_num_(0, 0, 0)
-        return r, Jp, Jl, value
+    def _given(self, state: _State) -> tuple[Tensor | Kernel | float, ...]:
+        """Arguments of `point_weights` at a state, without the last; without the first too, of `point_cost`."""
+        R, p_c = self._camera_points(state)
+        c = self.config
+        data = (self.uv, self.K, self.inv_sigma, self.behind, self.depth_rows, self.inverse_depth)
+        return R, p_c, *data, c.min_depth, c.kernel, c.delta
 
     def _chi2(self, state: _State) -> tuple[Tensor, Tensor]:
         _, p_c = self._camera_points(state)
-        r, z = reprojection_residuals(p_c, self.uv, self.K), p_c[2]
-        if len(self.depth_rows):
-            r[1, self.depth_rows] = 0.0
-            r[0, self.depth_rows] = z[self.depth_rows].reciprocal() - self.inverse_depth
-        in_front = z > self.config.min_depth
-        return torch.where(in_front, (r * r).sum(0) * self.inv_sigma.square(), self.behind), in_front
+        data = (self.uv, self.K, self.inv_sigma, self.behind, self.depth_rows, self.inverse_depth)
+        return point_chi2(p_c, *data, self.config.min_depth)
 
     def _scaled_gradient(self) -> float:
         parts = [(self.g, self.H.diagonal()), (self.g_point, self.V[_DIAGONAL])]
@@ -315,8 +293,7 @@ class _Window:
         self.factor = schur.inverse_cholesky(self.V, mu)
         y = schur.whiten(self.factor, self.g_point)
         n = self.n_free
-        white = schur.whiten(self.factor.index_select(1, self.anchor[:n]), self.Jl[..., :n])
-        entries = schur.row_products(self.Jp, white)
+        entries = kernel(schur.entries, self.config.compile)(self.factor, self.anchor[:n], self.Jp, self.Jl[..., :n])
         S, b = self.H.clone(), self.g.clone()
         for chunk, Y in zip(self.chunks, self.Y, strict=True):
             schur.fill(Y, chunk, entries[..., chunk.lo : chunk.hi])
@@ -340,6 +317,94 @@ class _Window:
     @staticmethod
     def _edge_sigma(block: EdgeBlocks) -> Tensor:
         return block.V[0].rsqrt()
+
+
+def point_chi2(
+    p_c: Tensor,
+    uv: Tensor,
+    K: Tensor,
+    inv_sigma: Tensor,
+    behind: Tensor,
+    depth_rows: Tensor,
+    inverse_depth: Tensor,
+    min_depth: float,
+) -> tuple[Tensor, Tensor]:
+    """Squared whitened residuals ``(M,)`` of reprojections and depth priors, and which points lie in front.
+
+    Args:
+        p_c: Points in the cameras that see them ``(3, M)``.
+        uv: Observed pixels ``(2, M)``.
+        K: fx, fy, cx, cy ``(4,)``.
+        inv_sigma: ``(M,)``.
+        behind: What stands for a point behind the camera ``(M,)``.
+        depth_rows: ``(D,)`` factors that are depth priors.
+        inverse_depth: ``(D,)`` their expected inverse depths.
+        min_depth: Nearest depth in front of the camera.
+    """
+    in_front = p_c[2] > min_depth
+    p_c = torch.where(in_front, p_c, 1.0)
+    r = reprojection_residuals(p_c, uv, K)
+    if len(depth_rows):
+        r[1, depth_rows] = 0.0
+        r[0, depth_rows] = p_c[2, depth_rows].reciprocal() - inverse_depth
+    return torch.where(in_front, r.square().sum(0) * inv_sigma.square(), behind), in_front
+
+
+def point_cost(
+    p_c: Tensor,
+    uv: Tensor,
+    K: Tensor,
+    inv_sigma: Tensor,
+    behind: Tensor,
+    depth_rows: Tensor,
+    inverse_depth: Tensor,
+    min_depth: float,
+    robust: Kernel,
+    delta: float,
+) -> Tensor:
+    """Robust cost ``()``; arguments as `point_chi2` takes them, then the kernel and its width."""
+    s, _ = point_chi2(p_c, uv, K, inv_sigma, behind, depth_rows, inverse_depth, min_depth)
+    return rho(s, robust, delta)[0].sum()
+
+
+def point_weights(
+    R: Tensor,
+    p_c: Tensor,
+    uv: Tensor,
+    K: Tensor,
+    inv_sigma: Tensor,
+    behind: Tensor,
+    depth_rows: Tensor,
+    inverse_depth: Tensor,
+    min_depth: float,
+    robust: Kernel,
+    delta: float,
+    n: int,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Whitened rows of reprojections and depth priors times the roots of their robust weights.
+
+    Args as `point_cost` takes them, with the cameras' rotations ``(3, 3, M)`` before and, last, the number of factors
+    whose pose is free: they come first.
+
+    Returns:
+        By the free poses with the residual as seventh ``(2, 7, n)``, by anchor ``(2, 3, M)``, the anchors' own
+        normal matrices and gradients ``(9, M)``, and the cost ``()``.
+    """
+    in_front = p_c[2] > min_depth
+    p_c = torch.where(in_front, p_c, 1.0)  # finite, and weighted by zero
+    r, Jp, Jl = reprojection_jacobians(R, p_c, uv, K)
+    if len(depth_rows):
+        rows = depth_rows
+        r[1, rows], Jp[1][:, rows], Jl[1][:, rows] = 0.0, 0.0, 0.0
+        iz, Jp[0][:, rows], Jl[0][:, rows] = inverse_depth_jacobians(R[..., rows], p_c[:, rows])
+        r[0, rows] = iz - inverse_depth
+    s = torch.where(in_front, r.square().sum(0) * inv_sigma.square(), behind)
+    value, weight = rho(s, robust, delta)
+    root = torch.where(in_front, weight.sqrt() * inv_sigma, 0.0)
+    r, Jl = r * root, Jl * root
+    Jp = torch.cat((Jp[..., :n] * root[:n], r[:, None, :n]), 1)
+    own = torch.cat((schur.triangle(Jl), schur.row_products(Jl, r[:, None])[:, 0]))
+    return Jp, Jl, own, value.sum()
 
 
 def _promise(mu: float, diagonal: Tensor, g: Tensor, step: Tensor) -> float:

@@ -178,6 +178,8 @@ class LmConfig:
     """The same for edge and junction rows, which are scalars."""
     device: str = "cpu"
     """Where torch computes, ``cuda`` for instance; a window of usual size is too small to gain from it."""
+    compile: bool = False
+    """Run the hot kernels through ``torch.compile``: pays when many windows are solved, see docs/decisions.md."""
     float32_edges: bool = True
     """Edge blocks in single precision; the reduced system is always double."""
     mu: float = 1e-4

@@ -21,8 +21,9 @@ from edgeslam_torch.losses.edge_alignment import (
     round_trip_jacobians,
 )
 from edgeslam_torch.losses.lshape import junction_rows
-from edgeslam_torch.losses.robust import rho
+from edgeslam_torch.losses.robust import Kernel, rho
 from edgeslam_torch.optim import lie, schur
+from edgeslam_torch.optim.compiled import kernel
 from edgeslam_torch.optim.problem import EdgeTerms, JunctionTerms, LmConfig
 from edgeslam_torch.types import FloatArray, IntArray
 
@@ -81,13 +82,12 @@ class RelativeBlocks(ABC):
         self.Y = [torch.zeros(len(c.columns), self.size * (c.last - c.first), dtype=dtype) for c in self.chunks]
 
     @abstractmethod
-    def rows(self, Rt: Tensor, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Whitened derivatives by the relative pose with the residual as seventh ``(R, 7, P)``, derivatives by the
-        block ``(R, size, P)``, and valid pairs ``(P,)``."""
+    def weigh(self, Rt: Tensor, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Weighted rows at motions ``(3, 4, P)`` and block values ``(size, P)``, see `_weighted`."""
 
     @abstractmethod
-    def residual_rows(self, Rt: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Whitened residuals ``(R, P)`` and valid ``(P,)`` alone."""
+    def robust_cost(self, Rt: Tensor, x: Tensor) -> Tensor:
+        """Robust cost ``()`` of the rows alone; arguments as `weigh` takes them."""
 
     @abstractmethod
     def prior_cost(self, x: Tensor) -> Tensor:
@@ -110,9 +110,8 @@ class RelativeBlocks(ABC):
         """Robust cost ``()``."""
         if len(self.block) == 0:
             return self.prior_cost(x)
-        r, valid = self.residual_rows(self.motions(T_c_w)[1], x.index_select(1, self.block).to(self.dtype))
-        value, _ = self._robust(r * r, valid)
-        return value.sum(dtype=torch.float64) + self.prior_cost(x)
+        pairs = x.index_select(1, self.block).to(self.dtype)
+        return self.robust_cost(self.motions(T_c_w)[1], pairs) + self.prior_cost(x)
 
     def linearise(self, T_c_w: Tensor, x: Tensor, H: Tensor, g: Tensor) -> Tensor:
         """Prepare the blocks; add the pose part to ``H (6F, 6F)`` and ``g (6F,)``; returns the cost ``()``."""
@@ -120,16 +119,9 @@ class RelativeBlocks(ABC):
         cost = self.prior_cost(x)
         if len(self.block):
             T_rel, Rt = self.motions(T_c_w)
-            J, Jd, valid = self.rows(Rt, x.index_select(1, self.block).to(self.dtype))
-            r = J[:, 6]
-            value, weight = self._robust(r * r, valid)
-            cost = cost + value.sum(dtype=torch.float64)
-            root = weight.sqrt_()
-            if not bool(valid.all()):
-                root, J, Jd = (torch.where(valid, v, 0.0) for v in (root, J, Jd))
-            self.J, self.Jd = J.mul_(root[:, None]), Jd.mul_(root[:, None])
-            own = torch.cat((schur.triangle(Jd), schur.row_products(Jd, J[:, 6:])[:, 0]))
-            sums.index_add_(1, self.block, own.double())
+            self.J, self.Jd, own, value = self.weigh(Rt, x.index_select(1, self.block).to(self.dtype))
+            cost = cost + value
+            sums.index_add_(1, self.block, own)
             self._add_poses(T_rel, H, g)
         self.V, self.g = sums[: -self.size], sums[-self.size :]
         self.add_prior(x, self.V, self.g)
@@ -165,8 +157,9 @@ class RelativeBlocks(ABC):
         self.y = schur.whiten(self.factor, self.g)
         if len(self.block) == 0:
             return
-        white = schur.whiten(self.factor.to(self.dtype).index_select(1, self.block), self.Jd)
-        entries = schur.row_products(self.J[:, :6], white)
+        entries = kernel(schur.entries, self.config.compile)(
+            self.factor.to(self.dtype), self.block, self.J[:, :6], self.Jd
+        )
         y = self.y.to(self.dtype)
         for chunk, Y, M in zip(self.chunks, self.Y, self.maps, strict=True):
             schur.fill(Y, chunk, entries[..., chunk.lo : chunk.hi])
@@ -182,10 +175,127 @@ class RelativeBlocks(ABC):
                 back[:, chunk.first : chunk.last] -= moved
         return schur.unwhiten(self.factor, back)
 
-    def _robust(self, s: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
-        """Costs and weights ``(R, P)`` of squared rows; what lies behind a camera costs a fixed, large amount."""
-        far = self.config.behind_px**2
-        return rho(torch.where(valid, s, far), self.config.kernel, self.config.edge_delta)
+    def _kernel(self) -> tuple[Kernel, float, float]:
+        """Kernel, its width, and the squared residual of what lies behind a camera."""
+        return self.config.kernel, self.config.edge_delta, self.config.behind_px**2
+
+
+def _weighted(
+    J: Tensor, Jd: Tensor, valid: Tensor, robust: Kernel, delta: float, far: float
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Rows times the roots of their robust weights.
+
+    Args:
+        J: Whitened derivatives by the relative pose with the residual as seventh ``(R, 7, P)``, finite everywhere;
+            changed in place.
+        Jd: Derivatives by the block ``(R, size, P)``; changed in place.
+        valid: ``(P,)``; the others get weight zero and a fixed, large cost.
+        robust: Kernel.
+        delta: Its width.
+        far: Squared residual of a pair behind the camera.
+
+    Returns:
+        ``J`` and ``Jd`` weighted, the blocks' own normal matrices and gradients ``(size (size + 1) / 2 + size, P)``
+        and the cost ``()``, the latter two in double precision.
+    """
+    r = J[:, 6]
+    value, weight = rho(torch.where(valid, r * r, far), robust, delta)
+    root = torch.where(valid, weight.sqrt(), 0.0)
+    J, Jd = J.mul_(root[:, None]), Jd.mul_(root[:, None])
+    own = torch.cat((schur.triangle(Jd), schur.row_products(Jd, J[:, 6:])[:, 0]))
+    return J, Jd, own.double(), value.sum(dtype=torch.float64)
+
+
+def edge_weights(
+    Rt: Tensor,
+    x: Tensor,
+    ray: Tensor,
+    uv: Tensor,
+    normal: Tensor,
+    inv_sigma: Tensor,
+    held: Tensor,
+    cycle_weight: Tensor,
+    K: Tensor,
+    form: CycleForm | None,
+    robust: Kernel,
+    delta: float,
+    far: float,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Alignment and cycle rows of edge pairs, see `_weighted`; arguments are `EdgeBlocks`' own tensors."""
+    g = pair_geometry(Rt, ray, x[0])
+    n = 1 if form is None else 3 if form is CycleForm.PIXEL else 2
+    J = torch.empty(n, 7, ray.shape[1], dtype=ray.dtype, device=ray.device)
+    Jd = torch.empty(n, 1, ray.shape[1], dtype=ray.dtype, device=ray.device)
+    _put(J[:1], Jd[:1], inv_sigma, *alignment_jacobians(g, uv, normal, K))
+    if form is CycleForm.PIXEL:
+        _put(J[1:], Jd[1:], cycle_weight, *round_trip_jacobians(g, Rt, ray, held, K))
+    elif form is not None:
+        _put(J[1:], Jd[1:], cycle_weight, *relative_depth_jacobians(g, held))
+    return _weighted(J, Jd, g.front, robust, delta, far)
+
+
+def edge_cost(
+    Rt: Tensor,
+    x: Tensor,
+    ray: Tensor,
+    uv: Tensor,
+    normal: Tensor,
+    inv_sigma: Tensor,
+    held: Tensor,
+    cycle_weight: Tensor,
+    K: Tensor,
+    form: CycleForm | None,
+    robust: Kernel,
+    delta: float,
+    far: float,
+) -> Tensor:
+    """Robust cost ``()`` of edge pairs; arguments as `edge_weights` takes them."""
+    g = pair_geometry(Rt, ray, x[0])
+    parts = [(alignment_row(g, uv, normal, K) * inv_sigma)[None]]
+    if form is CycleForm.PIXEL:
+        parts.append(round_trip_jacobians(g, Rt, ray, held, K)[0] * cycle_weight)
+    elif form is not None:
+        parts.append((relative_depth_row(g, held) * cycle_weight)[None])
+    value, _ = rho(torch.where(g.front, torch.cat(parts).square(), far), robust, delta)
+    return value.sum(dtype=torch.float64)
+
+
+def junction_weights(
+    Rt: Tensor,
+    x: Tensor,
+    rays: Tensor,
+    uv: Tensor,
+    arms: Tensor,
+    weight: Tensor,
+    K: Tensor,
+    cosines: bool,
+    robust: Kernel,
+    delta: float,
+    far: float,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Corner and angle rows of junction pairs, see `_weighted`; arguments are `JunctionBlocks`' own tensors."""
+    r, J, Jd, front = junction_rows(Rt, rays, x, uv, arms, K, cosines)
+    J = torch.cat((J, r[:, None]), 1) * weight[..., None]
+    return _weighted(J, Jd * weight[..., None], front, robust, delta, far)
+
+
+def junction_cost(
+    Rt: Tensor,
+    x: Tensor,
+    rays: Tensor,
+    uv: Tensor,
+    arms: Tensor,
+    weight: Tensor,
+    K: Tensor,
+    cosines: bool,
+    robust: Kernel,
+    delta: float,
+    far: float,
+) -> Tensor:
+    """Robust cost ``()`` of junction pairs; arguments as `junction_weights` takes them."""
+    r, _, _, front = junction_rows(Rt, rays, x, uv, arms, K, cosines)
+    value, _ = rho(torch.where(front, (r * weight).square(), far), robust, delta)
+    return value.sum(dtype=torch.float64)
 
 
 class EdgeBlocks(RelativeBlocks):
@@ -216,31 +326,20 @@ class EdgeBlocks(RelativeBlocks):
             self.cycle_weight[held > 0] = 1.0 / terms.cycle_sigma
         self.has_cycle = bool((self.cycle_weight > 0).any())
 
-    def rows(self, Rt: Tensor, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """See `RelativeBlocks.rows`."""
-        g = pair_geometry(Rt, self.ray, x[0])
-        pixel = self.form is CycleForm.PIXEL
-        n = 1 if not self.has_cycle else 3 if pixel else 2
-        J, Jd = (
-            torch.empty(n, 7, len(self.block), dtype=self.dtype),
-            torch.empty(n, 1, len(self.block), dtype=self.dtype),
-        )
-        _put(J[:1], Jd[:1], self.inv_sigma, *alignment_jacobians(g, self.uv, self.normal, self.K))
-        if self.has_cycle and pixel:
-            _put(J[1:], Jd[1:], self.cycle_weight, *round_trip_jacobians(g, Rt, self.ray, self.held, self.K))
-        elif self.has_cycle:
-            _put(J[1:], Jd[1:], self.cycle_weight, *relative_depth_jacobians(g, self.held))
-        return J, Jd, g.front
+    def _given(self) -> tuple[Tensor | CycleForm | Kernel | float | None, ...]:
+        form = self.form if self.has_cycle else None
+        given = (self.ray, self.uv, self.normal, self.inv_sigma, self.held, self.cycle_weight, self.K)
+        return (*given, form, *self._kernel())
 
-    def residual_rows(self, Rt: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
-        """See `RelativeBlocks.residual_rows`."""
-        g = pair_geometry(Rt, self.ray, x[0])
-        parts = [(alignment_row(g, self.uv, self.normal, self.K) * self.inv_sigma)[None]]
-        if self.has_cycle and self.form is CycleForm.PIXEL:
-            parts.append(round_trip_jacobians(g, Rt, self.ray, self.held, self.K)[0] * self.cycle_weight)
-        elif self.has_cycle:
-            parts.append((relative_depth_row(g, self.held) * self.cycle_weight)[None])
-        return torch.cat(parts), g.front
+    def weigh(self, Rt: Tensor, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """See `RelativeBlocks.weigh`."""
+        out: tuple[Tensor, Tensor, Tensor, Tensor] = kernel(edge_weights, self.config.compile)(Rt, x, *self._given())
+        return out
+
+    def robust_cost(self, Rt: Tensor, x: Tensor) -> Tensor:
+        """See `RelativeBlocks.robust_cost`."""
+        out: Tensor = kernel(edge_cost, self.config.compile)(Rt, x, *self._given())
+        return out
 
     def prior_cost(self, x: Tensor) -> Tensor:
         """See `RelativeBlocks.prior_cost`."""
@@ -282,15 +381,20 @@ class JunctionBlocks(RelativeBlocks):
         weights = [terms.inv_sigma_px] * 2 + [terms.inv_sigma_angle] * angles
         self.weight = torch.tensor(weights, dtype=torch.float64)[:, None]
 
-    def rows(self, Rt: Tensor, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """See `RelativeBlocks.rows`."""
-        r, J, Jd, front = junction_rows(Rt, self.rays, x, self.uv, self.arms, self.K, self.cosines)
-        return torch.cat((J, r[:, None]), 1) * self.weight[..., None], Jd * self.weight[..., None], front
+    def _given(self) -> tuple[Tensor | bool | Kernel | float, ...]:
+        return (self.rays, self.uv, self.arms, self.weight, self.K, self.cosines, *self._kernel())
 
-    def residual_rows(self, Rt: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
-        """See `RelativeBlocks.residual_rows`."""
-        J, _, front = self.rows(Rt, x)
-        return J[:, 6], front
+    def weigh(self, Rt: Tensor, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """See `RelativeBlocks.weigh`."""
+        out: tuple[Tensor, Tensor, Tensor, Tensor] = kernel(junction_weights, self.config.compile)(
+            Rt, x, *self._given()
+        )
+        return out
+
+    def robust_cost(self, Rt: Tensor, x: Tensor) -> Tensor:
+        """See `RelativeBlocks.robust_cost`."""
+        out: Tensor = kernel(junction_cost, self.config.compile)(Rt, x, *self._given())
+        return out
 
     def prior_cost(self, x: Tensor) -> Tensor:
         """See `RelativeBlocks.prior_cost`."""

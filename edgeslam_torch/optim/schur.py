@@ -146,6 +146,18 @@ def whiten(factor: Tensor, g: Tensor) -> Tensor:
     return torch.stack((a * x, second, torch.addcmul(torch.addcmul(d * x, e, y), f, z)), -2)
 
 
+def entries(factor: Tensor, block: Tensor, Jp: Tensor, Jb: Tensor) -> Tensor:
+    """What factors put into `Chunk`'s ``Y``: ``Jp^T Jb L^-T``, ``(6, size, M)``.
+
+    Args:
+        factor: Of the blocks, as `inverse_cholesky` returns it.
+        block: ``(M,)`` each factor's block.
+        Jp: ``(R, 6, M)`` derivatives by the pose.
+        Jb: ``(R, size, M)`` by the block.
+    """
+    return row_products(Jp, whiten(factor.index_select(1, block), Jb))
+
+
 def unwhiten(factor: Tensor, y: Tensor) -> Tensor:
     """``L^-T y`` of vectors ``(size, A)``."""
     if factor.shape[0] == 1:

@@ -1,0 +1,48 @@
+"""torch.compile for the solver's hot kernels: only when asked for, and eager wherever it fails."""
+
+import functools
+import logging
+from collections.abc import Callable
+from typing import Any
+
+import torch
+
+logger = logging.getLogger(__name__)
+
+_compiled: dict[Callable[..., Any], Callable[..., Any]] = {}
+
+
+def kernel(function: Callable[..., Any], compile: bool) -> Callable[..., Any]:
+    """``function``, or its compiled form; compiled once per process, for any sizes.
+
+    Compiling takes seconds to minutes at the first call and needs a C++ compiler (on the CPU). Where it fails, a
+    warning says so once and the function runs as it is from then on.
+
+    Args:
+        function: A function of tensors without state and without branches on their values.
+        compile: Whether to compile it.
+    """
+    if not compile:
+        return function
+    if function not in _compiled:
+        _compiled[function] = _with_fallback(function, torch.compile(function, dynamic=True))
+    return _compiled[function]
+
+
+def _with_fallback(function: Callable[..., Any], fast: Callable[..., Any]) -> Callable[..., Any]:
+    from torch._dynamo.exc import TorchDynamoException
+
+    failed = False
+
+    @functools.wraps(function)
+    def call(*args: Any) -> Any:
+        nonlocal failed
+        if not failed:
+            try:
+                return fast(*args)
+            except (TorchDynamoException, RuntimeError, OSError) as error:  # no compiler, no space, not supported
+                failed = True
+                logger.warning("torch.compile failed, eager from now on: %s", str(error).strip().split("\n")[0])
+        return function(*args)
+
+    return call

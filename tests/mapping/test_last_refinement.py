@@ -1,0 +1,95 @@
+"""The refinement of the whole map with its edges, in every form that can be set."""
+
+import pickle
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from point_map import check_map
+from rendered import CAMERA, film, sideways, stairs_world
+
+from edgeslam_torch.config import DepthConfig, SlamConfig, WindowConfig
+from edgeslam_torch.eval.ablation import pickled
+from edgeslam_torch.eval.align import umeyama
+from edgeslam_torch.losses.robust import Kernel
+from edgeslam_torch.mapping.edge_map import EdgeMap
+from edgeslam_torch.mapping.last_refinement import last_refinement, lm_config
+from edgeslam_torch.mapping.slam_map import SlamMap
+from edgeslam_torch.optim.problem import WindowResult
+from edgeslam_torch.slam import EdgeSlam
+from edgeslam_torch.trajectory import TrajectoryLog
+
+POINTS = WindowConfig(alignment=False, cycle="off")
+FORMS = {
+    "default": WindowConfig(),
+    "two rounds, corners": WindowConfig(angle="arms", collinearity="relative", rounds=2),
+    "fixed weights": WindowConfig(adaptive=False),
+    "no alignment": WindowConfig(alignment=False),
+    "no cycle": WindowConfig(cycle="off"),
+    "no reprojection": WindowConfig(reprojection="off"),
+    "literal cycle": WindowConfig(cycle="literal"),
+    "literal corners": WindowConfig(angle="literal", collinearity="literal"),
+    "cosines": WindowConfig(angle="cosine", collinearity="off"),
+    "literal reprojection": WindowConfig(reprojection="literal"),
+}
+
+
+@lru_cache(maxsize=1)
+def flight() -> tuple[bytes, np.ndarray]:
+    """State after 30 images past panels at many depths, nothing refined after the last; and the true poses."""
+    filmed = film(stairs_world(), CAMERA, sideways(30, 0.03, turn_rad=0.004))
+    slam = EdgeSlam(CAMERA, SlamConfig(depth=DepthConfig(weights="none")))
+    for frame in filmed.frames:
+        slam.step(frame)
+    return pickled((slam.map, slam.edges, slam.log)), filmed.T_w_c
+
+
+def finish(config: WindowConfig) -> tuple[SlamMap, EdgeMap, TrajectoryLog, WindowResult]:
+    slam_map, edges, log = pickle.loads(flight()[0])
+    result = last_refinement(slam_map, CAMERA, edges, config)
+    assert result is not None
+    return slam_map, edges, log, result
+
+
+def ate(log: TrajectoryLog) -> float:
+    T_w_c, truth = log.poses()[1], flight()[1]
+    aligned = umeyama(T_w_c[:, :3, 3], truth[:, :3, 3]).points(T_w_c[:, :3, 3])
+    return float(np.sqrt(np.square(aligned - truth[:, :3, 3]).sum(1).mean()))
+
+
+@pytest.mark.parametrize("name", FORMS)
+def test_every_form_leaves_a_sound_map(name):
+    slam_map, edges, log, result = finish(FORMS[name])
+    check_map(slam_map)
+    assert result.cost_after <= result.cost_before
+    assert np.isfinite(log.poses()[1]).all()
+    assert all(np.isfinite(h.p_c).all() and (h.p_c[:, 2] > 0).all() for h in edges.hosts)
+    assert ate(log) < 0.02  # of 0.9 m; 0.003 to 0.006 when written
+
+
+def test_edges_take_part_and_their_depths_go_back_to_the_keyframes():
+    _, before, _, points = finish(POINTS)
+    _, after, _, both = finish(WindowConfig())
+    assert len(points.edge_inverse_depth) == 0
+    assert len(both.edge_inverse_depth) > 500
+    depths = [np.concatenate([h.p_c[:, 2] for h in e.hosts]) for e in (before, after)]
+    moved = np.abs(depths[1] / depths[0] - 1.0)
+    assert 0.05 < np.mean(moved > 0) <= 1.0
+    assert np.median(moved[moved > 0]) < 0.03
+
+
+def test_without_reprojection_anchors_stay_where_they_are():
+    start, _, _ = pickle.loads(flight()[0])
+    slam_map, _, _, _ = finish(FORMS["no reprojection"])
+    np.testing.assert_array_equal(slam_map.anchors.p_w, start.anchors.p_w)
+
+
+def test_what_the_forms_mean_while_flying():
+    assert lm_config(WindowConfig()).kernel is Kernel.HUBER
+    assert lm_config(WindowConfig(reprojection="literal")).kernel is Kernel.L2
+    assert lm_config(WindowConfig(reprojection="off")).max_iterations == 0
+
+
+def test_a_form_that_is_none_is_refused():
+    with pytest.raises(ValueError, match="cycle must be one of relative, literal, off, got 'pixels'"):
+        WindowConfig(cycle="pixels")
