@@ -6,7 +6,7 @@ The reader also takes other people's logs: other column names, milliseconds, and
 import logging
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
 from typing import TextIO
@@ -15,6 +15,7 @@ import numpy as np
 
 from edgeslam_torch.errors import EdgeSlamError
 from edgeslam_torch.io.sdk_state import FIELDS, sample_from_sdk, to_number
+from edgeslam_torch.io.velocity_frame import body_frame_evidence
 from edgeslam_torch.types import FloatArray, TelemetrySample
 
 logger = logging.getLogger(__name__)
@@ -41,6 +42,9 @@ class TelemetryUnits:
     """Axes x forward, y right, z down with yaw clockwise; otherwise x forward, y left, z up."""
     evidence: str = "SDK default (dm/s, z down)"
     """What it rests on, in words."""
+    body_frame: bool = False
+    """Whether horizontal velocities turn with the drone; otherwise they are in the world of power-on."""
+    frame_evidence: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,8 +61,9 @@ class TelemetryTable:
     def samples(self, units: TelemetryUnits | None = None) -> list[TelemetrySample]:
         """SI units and our axes."""
         units = units or TelemetryUnits()
-        names = list(self.values)
-        columns = [self.values[name].tolist() for name in names]
+        values = _turned_to_world(self.values) if units.body_frame else self.values
+        names = list(values)
+        columns = [values[name].tolist() for name in names]
         rows = zip(*columns, strict=True) if columns else ([()] * len(self.stamps_s))
         return [
             sample_from_sdk(stamp, dict(zip(names, row, strict=True)), units.velocity_m_s, units.z_down)
@@ -79,7 +84,12 @@ def read_telemetry(path: str | Path, units: TelemetryUnits | None = None) -> lis
     table = read_table(path)
     if table.skipped:
         logger.warning("%s: %d malformed or repeated rows skipped", path, table.skipped)
-    return table.samples(units if units is not None else detect_units(table))
+    if units is None:
+        units = detect_units(table)
+        logger.info(
+            "%s: velocities: %s; %s", path, units.evidence, units.frame_evidence or "frame: SDK default (world)"
+        )
+    return table.samples(units)
 
 
 def read_table(path: str | Path) -> TelemetryTable:
@@ -141,6 +151,21 @@ def _seconds_per_unit(stamps: FloatArray) -> float:
 
 
 def detect_units(table: TelemetryTable) -> TelemetryUnits:
+    """Unit, axes and frame of the velocities, from what the drone does: how its height changes, where it leans.
+
+    Without evidence they are the SDK's: dm/s, z down, world of power-on.
+    """
+    ratio, words = body_frame_evidence(table.stamps_s, table.values)
+    return replace(_vertical_units(table), body_frame=ratio > 0, frame_evidence=words)
+
+
+def _turned_to_world(values: dict[str, FloatArray]) -> dict[str, FloatArray]:
+    yaw = np.radians(values["yaw"])
+    c, s, x, y = np.cos(yaw), np.sin(yaw), values["vgx"], values["vgy"]
+    return {**values, "vgx": c * x - s * y, "vgy": s * x + c * y}
+
+
+def _vertical_units(table: TelemetryTable) -> TelemetryUnits:
     """Unit and axes of the velocities, from how range or height changes while the drone climbs and sinks.
 
     The slope of height over integrated ``vgz`` is -0.1 for dm/s with z down, -0.01 for cm/s, +1 for m/s with z up; the

@@ -359,7 +359,7 @@ def test_without_pyav_the_message_says_what_to_install(monkeypatch):
 
 
 def test_djitellopy_flies_the_emulator(emulate, monkeypatch):
-    """A client that no one here wrote, its code unchanged; only the ports it uses are set."""
+    """A client that no one here wrote, its code unchanged; only the ports it uses and its patience are set."""
     if importlib.util.find_spec("djitellopy") is None:
         pytest.skip("djitellopy is not installed: pip install --no-deps djitellopy")
     import djitellopy
@@ -367,6 +367,8 @@ def test_djitellopy_flies_the_emulator(emulate, monkeypatch):
     emulator, address = emulate()
     control = free_ports(1)[0]
     monkeypatch.setattr(djitellopy.Tello, "CONTROL_UDP_PORT", control)
+    for patience in ("RESPONSE_TIMEOUT", "TAKEOFF_TIMEOUT", "FRAME_GRAB_TIMEOUT"):
+        monkeypatch.setattr(djitellopy.Tello, patience, PATIENCE_S)
     monkeypatch.setattr(djitellopy.Tello, "STATE_UDP_PORT", address.state_port)
     monkeypatch.setattr(djitellopy.Tello, "VS_UDP_IP", "127.0.0.1")
     drone = djitellopy.Tello(host="127.0.0.1", vs_udp=address.video_port)
@@ -381,7 +383,7 @@ def test_djitellopy_flies_the_emulator(emulate, monkeypatch):
     drone.move_forward(40)
     drone.rotate_counter_clockwise(90)
     assert emulator.drone.p_w[0] == pytest.approx(0.4, abs=0.1)
-    assert drone.get_yaw() == pytest.approx(-90, abs=5)
+    until(lambda: abs(drone.get_yaw() + 90) <= 5)
     drone.send_rc_control(0, 30, 0, 0)
     until(lambda: emulator.drone.p_w[1] > 0.1)
     drone.land()
