@@ -146,7 +146,7 @@ def _payload(
     positions = trajectory.positions @ turn.T
     table = _StatusTable(run, trajectory)
     view = _view(edges.p_w @ turn.T, positions)
-    units = words.unit(run.summary)
+    units = words.unit(run)
     edge_meta, edge_bytes = _packed(edges, turn)
     anchor_meta, anchor_bytes = _packed(anchors, turn)
     rotations = np.swapaxes(turn @ trajectory.T_w_c[:, :3, :3], 1, 2)  # rows are the camera's axes in the world
@@ -329,8 +329,9 @@ def _packed(cloud: PointCloud, turn: FloatArray) -> tuple[dict[str, Any], str]:
     middle, reach = (lo + hi) / 2, np.maximum((hi - lo).max() * 1.5, 1e-6)
     lo, hi = np.maximum(p.min(axis=0), middle - reach), np.minimum(p.max(axis=0), middle + reach)
     extent = np.maximum(hi - lo, 1e-9)
-    inside = ((p >= lo) & (p <= hi)).all(axis=1)
-    p, count = p[inside], int(inside.sum())
+    inside = np.flatnonzero(((p >= lo) & (p <= hi)).all(axis=1))
+    inside = np.random.default_rng(0).permutation(inside)  # a page that cannot draw them all in time draws the first
+    p, count = p[inside], len(inside)
     position = np.round((p - lo) / extent * 65535).astype("<u2")
     sigma, sigma_range = _log_codes(cloud.sigma_m[inside])
     most = max(2.0, float(np.quantile(cloud.observations, 0.98)))

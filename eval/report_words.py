@@ -8,11 +8,9 @@ from edgeslam_torch.eval.run_folder import TRUSTED, RunFolder
 from edgeslam_torch.eval.run_score import RunScore
 
 
-def unit(summary: dict[str, Any]) -> str:
+def unit(run: RunFolder) -> str:
     """``m``, or ``units`` while the scale is unknown."""
-    scale = summary.get("scale")
-    arbitrary = isinstance(scale, dict) and scale.get("units") == "arbitrary"
-    return "units" if arbitrary else "m"
+    return "units" if run.units == "arbitrary" else "m"
 
 
 def title(run: RunFolder) -> str:

@@ -34,6 +34,12 @@ class RunFolder:
         """Folder name."""
         return self.path.resolve().name
 
+    @property
+    def units(self) -> str:
+        """``metres`` or ``arbitrary``, as the run says; ``unknown`` when it does not (a bare trajectory)."""
+        scale = self.summary.get("scale")
+        return str(scale.get("units", "unknown")) if isinstance(scale, dict) else "unknown"
+
     def cloud(self, name: str = "edge_map.ply") -> PointCloud | None:
         """Point cloud of the folder, None when it is not there."""
         file = self.path / name

@@ -111,8 +111,7 @@ def evaluate_run(
     map_score, map_note = _map_score(run, depth_dataset, sim3) if judge_map else (None, "not asked for")
     one_second = sim3.relative[1]
     coverage, with_pose, first = _coverage(run, dataset, truth, sim3.association)
-    units = _units(run)
-    judged = se3 if units == "metres" else sim3
+    judged = se3 if run.units == "metres" else sim3
     return RunScore(
         name=run.name,
         dataset=dataset.name if dataset is not None else dataset_dir.name,
@@ -133,7 +132,7 @@ def evaluate_run(
         fixed_position_m=sim3.fixed_position_m,
         map=map_score,
         map_note=map_note,
-        units=units,
+        units=run.units,
         summary=run.summary,
         notes=tuple(explain(truth, run.trajectory, judged, max_dt_s)),
         sim3=sim3,
@@ -195,11 +194,6 @@ def _first_trusted(run: RunFolder) -> float:
         if row.get("status") in ("initialised", "tracked", "relocalised"):
             return float(stamp)
     return float(run.trajectory.stamps_s[0])
-
-
-def _units(run: RunFolder) -> str:
-    scale = run.summary.get("scale")
-    return str(scale.get("units", "unknown")) if isinstance(scale, dict) else "unknown"
 
 
 def _scale_inside(run: RunFolder, scale: float) -> bool | None:

@@ -36,8 +36,10 @@ def main(args: argparse.Namespace) -> int:
     except OSError as error:
         raise OutputError(f"{error.filename or args.out}: cannot be written ({error.strerror or error})") from error
     print(f"{len(cloud.p_w)} points: {place}")
-    if run.summary.get("scale", {}).get("units") == "arbitrary":
+    if run.units == "arbitrary":
         print("the run's units are arbitrary (no metric scale): lengths in this file are not metres")
+    elif run.units == "unknown":
+        print("nothing in the folder tells whether the run is in metres: lengths are as the run has them")
     return 0
 
 
@@ -49,6 +51,8 @@ def _chosen(run: "RunFolder", args: argparse.Namespace) -> "PointCloud":
     cloud = run.cloud()
     if cloud is None:
         raise OutputError(f"{run.path}: no edge_map.ply in this folder; run 'edgeslam run' first")
+    if len(cloud.p_w) == 0:
+        raise OutputError(f"{run.path}: the edge map is empty (too short a run, or no edges seen)")
     keep = np.isfinite(cloud.p_w).all(axis=1) & (cloud.observations >= args.min_observations)
     if args.max_sigma is not None:
         keep &= cloud.sigma_m <= args.max_sigma
@@ -101,7 +105,7 @@ def _occupancy(run: "RunFolder", cloud: "PointCloud", args: argparse.Namespace) 
     from edgeslam_torch.geometry.camera import load_camera
     from edgeslam_torch.io.occupancy import occupancy_grid, write_occupancy
 
-    if run.summary.get("scale", {}).get("units") == "arbitrary":
+    if run.units == "arbitrary":
         raise OutputError(f"{run.path}: no occupancy grid without metric scale; run with a depth network or telemetry")
     heights = None
     if args.min_z is not None or args.max_z is not None:

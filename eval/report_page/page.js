@@ -44,7 +44,7 @@ function setTime(i, cursor = true) {
     viewer.lines.trajectory.count = now + 1;
     const f = frustum(now, 0.1 * DATA.home.radius);
     viewer.setLines("current", { vertices: f, colours: paint(f.length / 3, rgb("--lost")), strip: false });
-    viewer.request();
+    viewer.request(Boolean(playing));
   }
   const t = DATA.stamps[now];
   byId("time").value = Math.round(1000 * now / (DATA.positions.length - 1 || 1)); byId("time-out").textContent = t.toFixed(2) + " s";

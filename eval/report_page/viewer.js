@@ -30,6 +30,7 @@ class Viewer {
     this.canvas = canvas; this.onChange = onChange;
     this.show = { edges: true, anchors: false, trajectory: true, cameras: true, truth: true, grid: true };
     this.mode = 0; this.size = 10; this.sigmaMax = 1; this.lines = {}; this.view = "free"; this.pending = false;
+    this.moving = false; this.share = 1; this.last = 0;
     const gl = this.gl = canvas.getContext("webgl2", { antialias: true, preserveDrawingBuffer: true });
     if (!gl) return;
     this.points = this.program(POINT_VS, POINT_FS); this.line = this.program(LINE_VS, LINE_FS);
@@ -83,7 +84,7 @@ class Viewer {
     this.lines[name] = { vao, buffers, n: vertices.length / 3, strip, count: vertices.length / 3 };
   }
 
-  home() { const h = DATA.home; this.target = [...h.target]; this.radius = h.radius; this.yaw = h.yaw; this.pitch = 0.62; this.distance = 2 * h.radius; this.view = "free"; this.request(); }
+  home() { const h = DATA.home; this.target = [...h.target]; this.radius = h.radius; this.yaw = h.yaw; this.pitch = 0.62; this.distance = 1.7 * h.radius; this.view = "free"; this.request(); }
 
   setView(name) {
     this.home(); this.view = name;
@@ -132,15 +133,31 @@ class Viewer {
   turn(dx, dy) {
     this.yaw -= dx * 0.006; this.pitch = Math.min(Math.PI / 2, Math.max(-Math.PI / 2, this.pitch + dy * 0.006));
     if (this.view !== "free") { this.view = "free"; this.onChange(this); }
-    this.request();
+    this.request(true);
   }
-  zoom(f) { this.distance = Math.min(Math.max(this.distance * f, 0.02 * this.radius), 20 * this.radius); this.request(); }
+  zoom(f) { this.distance = Math.min(Math.max(this.distance * f, 0.02 * this.radius), 20 * this.radius); this.request(true); }
   pan(dx, dy) {
     const { right, up } = this.basis(), s = this.distance * 2 * Math.tan(0.42) / this.canvas.clientHeight;
-    this.target = add3(add3(this.target, right, -dx * s), up, dy * s); this.request();
+    this.target = add3(add3(this.target, right, -dx * s), up, dy * s); this.request(true);
   }
 
-  request() { if (this.gl && !this.pending) { this.pending = true; requestAnimationFrame(() => { this.pending = false; this.draw(); }); } }
+  // While something moves, a slow machine draws only a share of the points (they come in random order), and all of
+  // them once it rests.
+  request(moving = false) {
+    if (!this.gl) return;
+    if (moving) {
+      this.moving = true; clearTimeout(this.rest);
+      this.rest = setTimeout(() => { this.moving = false; this.request(); }, 250);
+    }
+    if (this.pending) return;
+    this.pending = true;
+    requestAnimationFrame(now => {
+      this.pending = false;
+      const took = now - this.last; this.last = now;
+      if (this.moving && took < 3000) this.share = Math.min(1, Math.max(0.05, this.share * (took > 45 ? 0.7 : took < 25 ? 1.25 : 1)));
+      this.draw(this.moving ? this.share : 1);
+    });
+  }
 
   matrices() {
     const { back, right, up } = this.basis(), eye = add3(this.target, back, this.distance);
@@ -152,7 +169,7 @@ class Viewer {
     return { view, projection, focal: f * this.canvas.height / 2 };
   }
 
-  draw() {
+  draw(share = 1) {
     const gl = this.gl, c = this.canvas, ratio = Math.min(devicePixelRatio || 1, 2);
     const width = Math.round(c.clientWidth * ratio), height = Math.round(c.clientHeight * ratio);
     if (!width || !height) return;
@@ -179,7 +196,7 @@ class Viewer {
       // Dark camera colours would vanish on a dark ground: lifted a little there.
       gl.uniform1f(u.u_lift, this.mode === 0 && name === "edges" && matchMedia("(prefers-color-scheme: dark)").matches ? 0.16 : 0);
       gl.uniform1f(u.u_size, this.size * 0.0004 * this.radius * focal * (name === "anchors" ? 2.2 : 1));
-      gl.bindVertexArray(k.vao); gl.drawArrays(gl.POINTS, 0, k.n);
+      gl.bindVertexArray(k.vao); gl.drawArrays(gl.POINTS, 0, Math.ceil(share * k.n));
     }
   }
 }

@@ -15,6 +15,7 @@
   if (!viewer.gl) { result.nogl = true; }
   else {
     result.start = checksum(); result.toggles = {};
+    viewer.draw(0.1); const draw = viewer.draw; viewer.draw = () => {}; result.sparse = checksum().drawn; viewer.draw = draw;
     for (const input of document.querySelectorAll("#toggles input")) {
       const before = checksum(); input.click(); const after = checksum(); input.click();
       result.toggles[input.id] = { changed: before.sum !== after.sum, restored: checksum().sum === before.sum };
@@ -33,7 +34,7 @@
     canvas.setPointerCapture = () => {};
     const still = checksum().sum;
     gesture("pointerdown", { clientX: 200, clientY: 200 }); gesture("pointermove", { clientX: 260, clientY: 220 }); gesture("pointerup", {});
-    result.turned = checksum().sum !== still;
+    result.moving = viewer.moving; result.turned = checksum().sum !== still;
     const turned = checksum().sum;
     canvas.dispatchEvent(new WheelEvent("wheel", { deltaY: -100, cancelable: true }));
     result.zoomed = checksum().sum !== turned;

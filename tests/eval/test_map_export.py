@@ -19,6 +19,7 @@ from edgeslam_torch.geometry.camera import PRESETS, Camera
 from edgeslam_torch.io.colmap import write_colmap
 from edgeslam_torch.io.occupancy import FREE, OCCUPIED, UNKNOWN, occupancy_grid, write_occupancy
 from edgeslam_torch.io.pcd import read_pcd, write_pcd
+from edgeslam_torch.io.ply import write_ply
 from edgeslam_torch.types import PointCloud
 
 
@@ -139,6 +140,29 @@ def test_occupancy_needs_metres(run_folder: Callable[..., Path], tmp_path: Path)
     summary["scale"]["units"] = "arbitrary"
     path.write_text(json.dumps(summary))
     with pytest.raises(EdgeSlamError, match="metric scale"):
+        export(tmp_path / "a", "--format", "occupancy")
+
+
+@pytest.mark.parametrize("scale", ["null", "{}", None], ids=["null", "empty", "no summary"])
+def test_unknown_units_are_said(
+    scale: str | None, run_folder: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run_folder(tmp_path / "a")
+    (tmp_path / "a" / "summary.json").unlink()
+    if scale is not None:
+        (tmp_path / "a" / "summary.json").write_text(f'{{"scale": {scale}}}')
+    assert export(tmp_path / "a", "--format", "ply") == 0
+    assert "nothing in the folder tells" in capsys.readouterr().out
+
+
+def test_empty_map_is_said(run_folder: Callable[..., Path], tmp_path: Path) -> None:
+    run_folder(tmp_path / "a")
+    empty = np.zeros((0, 3), np.float32)
+    write_ply(
+        tmp_path / "a" / "edge_map.ply",
+        PointCloud(empty, empty.astype(np.uint8), empty[:, 0], empty[:, 0].astype(np.int32)),
+    )
+    with pytest.raises(EdgeSlamError, match="edge map is empty"):
         export(tmp_path / "a", "--format", "occupancy")
 
 

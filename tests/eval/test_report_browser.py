@@ -69,6 +69,8 @@ def test_every_control_of_the_page_works(page: Path) -> None:
     if found.get("nogl"):
         pytest.skip("this browser has no WebGL 2 (no software renderer)")
     assert found["start"]["drawn"] > 2000, "the canvas is blank"
+    assert 500 < found["sparse"] < found["start"]["drawn"], "a share of the points is a thinner picture of the same map"
+    assert found["moving"], "while it is turned it may be drawn thinner"
     assert set(found["toggles"]) == {
         f"show-{n}" for n in ("edges", "anchors", "trajectory", "cameras", "truth", "grid")
     }
