@@ -14,6 +14,7 @@ from edgeslam_torch.models.export_onnx import ExportOptions, export_onnx, read_o
 from edgeslam_torch.models.fastdepth import FastDepth, Variant
 from edgeslam_torch.models.fold import deployed, fold_batch_norm
 from edgeslam_torch.models.onnx_graph import build_graph
+from edgeslam_torch.models.quantize import double_by_gather
 from edgeslam_torch.models.record import Metadata
 
 
@@ -101,3 +102,35 @@ def _plain_model() -> tuple[onnx.ModelProto, str]:
         [value("y", onnx.TensorProto.FLOAT, [1])],
     )
     return onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 18)]), "y"
+
+
+def doubling(size: list[int | str]) -> onnx.ModelProto:
+    """Nearest-neighbour doubling between two additions, as torch exports it."""
+    scales = onnx.numpy_helper.from_array(np.array([1, 1, 2, 2], np.float32), "scales")
+    one = onnx.numpy_helper.from_array(np.float32(1), "one")
+    how = {"mode": "nearest", "coordinate_transformation_mode": "asymmetric", "nearest_mode": "floor"}
+    nodes = [
+        onnx.helper.make_node("Add", ["x", "one"], ["a"]),
+        onnx.helper.make_node("Resize", ["a", "", "scales"], ["b"], **how),
+        onnx.helper.make_node("Add", ["b", "one"], ["y"]),
+    ]
+    ends = [onnx.helper.make_tensor_value_info(n, onnx.TensorProto.FLOAT, s) for n, s in (("x", size), ("y", None))]
+    graph = onnx.helper.make_graph(nodes, "doubling", ends[:1], ends[1:], [scales, one])
+    model = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 17)], ir_version=9)
+    return onnx.shape_inference.infer_shapes(model)
+
+
+def test_doubling_by_gather_copies_the_same_values() -> None:
+    model = doubling([1, 3, 4, 6])
+    x = np.random.default_rng(0).normal(size=(1, 3, 4, 6)).astype(np.float32)
+    double_by_gather(model)
+    onnx.checker.check_model(model, full_check=True)
+    assert "Resize" not in {node.op_type for node in model.graph.node}
+    (y,) = onnxruntime.InferenceSession(model.SerializeToString()).run(["y"], {"x": x})
+    np.testing.assert_array_equal(y, np.repeat(np.repeat(x + 1, 2, 2), 2, 3) + 1)
+
+
+def test_doubling_of_unknown_size_stays() -> None:
+    model = doubling([1, 3, "height", "width"])
+    double_by_gather(model)
+    assert [node.op_type for node in model.graph.node] == ["Add", "Resize", "Add"]
