@@ -71,17 +71,16 @@ def refine_with_edges(
     Returns:
         What the last round reports, or None for a map with nothing to refine.
     """
-    whole = whole_map(slam_map)
-    if whole is None:
+    window = whole_map(slam_map)
+    if window is None:
         return None
-    window, scale_prior = whole
     keyframes = [*window.free, *window.fixed]
     hosts = {h.keyframe_id: h for h in edges.hosts}
     terms = term_config(config)
     scales = AdaptiveScales()
     result = None
     for _ in range(config.rounds):
-        problem, keypoint = window_problem(slam_map, window, camera, lm, scale_prior)
+        problem, keypoint = window_problem(slam_map, window, camera, lm)
         structures = [_structure(k, hosts.get(k.id), camera, config, edges) for k in keyframes]
         placed = edge_terms(structures, problem.T_c_w, problem.K, terms) if config.uses_edges else None
         corners = junction_terms(structures, problem.T_c_w, problem.K, terms) if config.uses_corners else None

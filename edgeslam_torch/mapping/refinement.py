@@ -48,37 +48,37 @@ def choose_window(slam_map: SlamMap, newest: Keyframe, free: int, fixed: int) ->
 
 def refine_all(slam_map: SlamMap, camera: Camera, config: LmConfig) -> WindowResult | None:
     """Refine every keyframe of the map at once; None when there is nothing to refine, see `whole_map`."""
-    whole = whole_map(slam_map)
-    return None if whole is None else refine(slam_map, whole[0], camera, config, whole[1])
+    window = whole_map(slam_map)
+    return None if window is None else refine(slam_map, window, camera, config)
 
 
-def whole_map(slam_map: SlamMap) -> tuple[Window, ScalePrior] | None:
-    """All keyframes as one window; the first pose and the map's extent hold the gauge.
-
-    None for fewer than three keyframes, or a camera that never moved.
-    """
+def whole_map(slam_map: SlamMap) -> Window | None:
+    """All keyframes as one window, the first pose fixed; None for fewer than three, or a camera that never moved."""
     keyframes = [slam_map.keyframes[id] for id in sorted(slam_map.keyframes)]
     if len(keyframes) < 3:
         return None
-    first = keyframes[0]
-    far = max(keyframes[1:], key=lambda k: float(np.linalg.norm(k.centre_w - first.centre_w)))
-    distance = float(np.linalg.norm(far.centre_w - first.centre_w))
-    if distance < MIN_EXTENT:
+    window = Window(keyframes[1:], keyframes[:1], slam_map.anchors_seen_by(keyframes))
+    return window if held_extent(window) is not None else None
+
+
+def held_extent(window: Window) -> ScalePrior | None:
+    """Where one pose alone is fixed, the distance to the farthest other holds the scale; None where nothing is free.
+
+    Two fixed poses hold the scale themselves, and poses all in one place have none.
+    """
+    if len(window.fixed) != 1 or not window.free:
         return None
-    members = [far, *(k for k in keyframes[1:] if k is not far)]
-    window = Window(members, [first], slam_map.anchors_seen_by(keyframes))
-    return window, ScalePrior(0, len(members), distance, 1e-3)
+    centre = window.fixed[0].centre_w
+    distance = np.array([np.linalg.norm(k.centre_w - centre) for k in window.free])
+    far = int(distance.argmax())
+    if distance[far] < MIN_EXTENT:
+        return None
+    return ScalePrior(far, len(window.free), float(distance[far]), 1e-3)
 
 
-def refine(
-    slam_map: SlamMap,
-    window: Window,
-    camera: Camera,
-    config: LmConfig,
-    scale_prior: ScalePrior | None = None,
-) -> WindowResult | None:
+def refine(slam_map: SlamMap, window: Window, camera: Camera, config: LmConfig) -> WindowResult | None:
     """Refine the window in place; observations that disagree with the result are taken out of the map."""
-    problem, keypoint = window_problem(slam_map, window, camera, config, scale_prior)
+    problem, keypoint = window_problem(slam_map, window, camera, config)
     if len(problem.obs_pose) == 0:
         return None
     result = refine_window(problem, config)
@@ -87,11 +87,7 @@ def refine(
 
 
 def window_problem(
-    slam_map: SlamMap,
-    window: Window,
-    camera: Camera,
-    config: LmConfig,
-    scale_prior: ScalePrior | None = None,
+    slam_map: SlamMap, window: Window, camera: Camera, config: LmConfig
 ) -> tuple[WindowProblem, list[IntArray]]:
     """A window's poses, anchors and observations, and which keypoints of each keyframe the observations are.
 
@@ -112,6 +108,7 @@ def window_problem(
     uv = np.concatenate([k.features.uv[s] for k, s in zip(keyframes, keypoint, strict=True)])
     octave = np.concatenate([k.features.octave[s] for k, s in zip(keyframes, keypoint, strict=True)])
     alike = config.kernel is Kernel.L2
+    extent = held_extent(window)
     problem = WindowProblem(
         T_c_w=np.stack([k.T_c_w for k in keyframes]),
         pose_fixed=np.arange(len(keyframes)) >= len(window.free),
@@ -121,7 +118,7 @@ def window_problem(
         uv=uv.astype(np.float64),
         inv_sigma=np.ones(len(row)) if alike else slam_map.scale_factor ** -octave.astype(np.float64),
         K=(camera.fx, camera.fy, camera.cx, camera.cy),
-        scale_priors=(scale_prior,) if scale_prior is not None else (),
+        scale_priors=() if extent is None else (extent,),
     )
     return problem, keypoint
 

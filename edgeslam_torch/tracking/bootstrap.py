@@ -10,7 +10,7 @@ from edgeslam_torch.geometry import se3
 from edgeslam_torch.mapping.keyframe import Keyframe
 from edgeslam_torch.mapping.refinement import Window, refine
 from edgeslam_torch.mapping.slam_map import SlamMap
-from edgeslam_torch.optim.problem import LmConfig, ScalePrior
+from edgeslam_torch.optim.problem import LmConfig
 from edgeslam_torch.tracking.initialiser import BootstrapView, TwoView, consensus, poses_of_witnesses, two_view_map
 from edgeslam_torch.tracking.tracker import Track, Tracker, View
 from edgeslam_torch.types import FloatArray
@@ -122,15 +122,8 @@ class Bootstrap:
         self.map.observe(reference, two_view.reference_keypoint, ids)
         keyframe.anchor[two_view.keypoint] = ids
         self.map.add_keyframe(keyframe)
-        # The essential matrix leaves the scale to the guess: the baseline is held where the guess put it.
-        baseline = float(np.linalg.norm(keyframe.centre_w - reference.centre_w))
-        refine(
-            self.map,
-            Window([keyframe], [reference], ids),
-            self.tracker.camera,
-            lm,
-            ScalePrior(0, 1, baseline, 0.001),
-        )
+        # The essential matrix leaves the scale to the guess: refinement holds the baseline where the guess put it.
+        refine(self.map, Window([keyframe], [reference], ids), self.tracker.camera, lm)
         self.map.refresh_anchors(ids[self.map.anchors.alive[ids]])
         held = reference.keypoints_with_anchor()
         points = np.full((len(reference.anchor), 3), np.nan)

@@ -58,6 +58,20 @@ def test_wrong_observations_are_taken_out_of_the_map(points, rng):
     check_map(points.map)
 
 
+def test_a_window_of_two_keyframes_keeps_its_scale(rng):
+    points = PointMap(rng, 100, 2)
+    points.fill()
+    a, b = points.keyframes
+    window = choose_window(points.map, b, 10, 15)
+    assert ([k.id for k in window.free], [k.id for k in window.fixed]) == ([b.id], [a.id])
+    points.map.anchors.p_w[window.anchor] *= 1.1  # all that the points say is that the scene is larger
+    before = np.linalg.norm(b.centre_w - a.centre_w)
+    result = refine(points.map, window, CAMERA, LmConfig())
+    assert np.linalg.norm(b.centre_w - a.centre_w) == pytest.approx(before, rel=1e-3)
+    assert result.rank_deficiency == 0
+    check_map(points.map)
+
+
 def test_nothing_to_refine(points):
     lonely = points.keyframes[-1]
     points.map.forget_observations(lonely, lonely.keypoints_with_anchor())
