@@ -124,6 +124,7 @@ def run_benchmark(settings: BenchSettings, out: Path, say: Callable[[str], None]
     Raises:
         EvaluationError: If a named sequence is not there.
     """
+    begin = time.monotonic()
     out.mkdir(parents=True, exist_ok=True)
     sequences = find_sequences(settings.data)
     names = settings.only or (*sequences, SYNTHETIC)
@@ -158,6 +159,7 @@ def run_benchmark(settings: BenchSettings, out: Path, say: Callable[[str], None]
     if settings.micro:
         say("solver window and depth network ...")
         record["solver"], record["depth"] = _guarded(_solver), _guarded(depth_latency)
+    record["took_s"] = time.monotonic() - begin
     _save(record, out / "bench.json")
     return record
 
@@ -234,7 +236,7 @@ def markdown_bench(record: dict[str, Any]) -> str:
         if len(runs) > 1:
             own.append((f"**{_OWN}, median of {len(runs)}**", _medians(record, name)))
             own.append(("its noise: two of these differ by less (±)", _noise_of(record, name)))
-        other = [(f"{p['system']} [{k}]", _peer_figures(p)) for k, p in enumerate(peers, start=1)]
+        other = [(f"{_peer_name(p, name)} [{k}]", _peer_figures(p)) for k, p in enumerate(peers, start=1)]
         parts += ["", f"### {name}", "", _table([*own, *other])]
         errors = [f"- seed {r['seed']} failed: {r['error']}" for r in runs if r.get("error")]
         notes = [f"[{k}] {p['source']}; {p['conditions']}" for k, p in enumerate(peers, start=1)]
@@ -456,6 +458,11 @@ def _medians(record: dict[str, Any], name: str) -> dict[str, list[float]]:
     return out
 
 
+def _peer_name(peer: dict[str, Any], sequence: str) -> str:
+    """System, and on what, where its figure is not of this very sequence."""
+    return str(peer["system"]) if peer["sequence"] == sequence else f"{peer['system']}, {peer['sequence']}"
+
+
 def _peer_figures(peer: dict[str, Any]) -> dict[str, list[float]]:
     names = {"ate_m": "ate_sim3_m"}
     out = {}
@@ -485,7 +492,9 @@ def _conditions(record: dict[str, Any]) -> str:
     m = record["machine"]
     loads = [run["load"] for run in record["runs"] if run.get("load") is not None]
     load = f", load average {min(loads):.1f} to {max(loads):.1f} during the runs" if loads else ""
+    frames = f", only the first {record['max_frames']} frames of each sequence" if record.get("max_frames") else ""
+    took = f", took {record['took_s'] / 60:.1f} minutes in all" if record.get("took_s") else ""
     return (
-        f"EdgeSLAM-Torch {record['version']} {record['commit']}, {record['made']}, {record['mode']}, "
-        f"{m['cores']} x {m['cpu']}{load}, Python {m['python']}"
+        f"EdgeSLAM-Torch {record['version']} {record['commit']}, {record['made']}, {record['mode']}{frames}, "
+        f"{m['cores']} x {m['cpu']}{load}, Python {m['python']}{took}"
     )

@@ -77,6 +77,12 @@ def test_table_lists_every_run_its_median_and_the_peers() -> None:
     assert "tracking 5.0" in text
 
 
+def test_what_is_not_the_whole_sequence_is_said() -> None:
+    text = markdown_bench(record([0.01], [30]) | {"max_frames": 80, "took_s": 90.0})
+    assert "only the first 80 frames" in text and "1.5 minutes" in text
+    assert "| DROID-SLAM, tum_fr1 (average of 9) [" in text
+
+
 def test_peers_state_source_and_conditions() -> None:
     names = {m.name for m in METRICS} | {"ate_m", "system", "sequence", "source", "conditions"}
     for peer in read_peers():
