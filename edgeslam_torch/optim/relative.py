@@ -146,7 +146,7 @@ class RelativeBlocks(ABC):
         M[each, self.column[self.group_target]] += torch.eye(6, dtype=torch.float64)
         M[each, self.column[self.group_host]] -= lie.adjoint(T_rel)
         M = M[:, :-1].permute(0, 2, 1, 3).reshape(G, 6, n)
-        flat = M.view(6 * G, n)
+        flat = M.reshape(6 * G, n)  # one free pose: not contiguous
         H += flat.mT @ (normal[:, :6, :6] @ M).view(6 * G, n)
         g += flat.mT @ normal[:, :6, 6].flatten()
         self.maps = [flat[6 * c.slices[0][0] : 6 * c.slices[-1][0] + 6] for c in self.chunks]

@@ -11,8 +11,9 @@ from torch import Tensor
 from edgeslam_torch.losses.base import ResidualLoss, back_project, move, project
 from edgeslam_torch.losses.cycle import CycleForm, CycleLoss
 from edgeslam_torch.losses.edge_alignment import EdgeAlignmentLoss
-from edgeslam_torch.losses.lshape import AngleForm, AngleLoss, CollinearityLoss, cosine
+from edgeslam_torch.losses.lshape import AngleForm, AngleLoss, CollinearityLoss, LShapeLoss, cosine
 from edgeslam_torch.losses.reprojection import ReprojectionLoss
+from edgeslam_torch.losses.robust import Kernel, rho
 from edgeslam_torch.optim import lie
 
 K = torch.tensor([[500.0, 0.0, 320.0], [0.0, 480.0, 240.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
@@ -126,6 +127,59 @@ def test_gradient_is_twice_jacobian_times_residual(case):
     J = torch.cat([j.reshape(len(residual(xi, s)), -1) for j in torch.func.jacrev(residual, (0, 1))(xi, s)], 1)
     scale = loss / residual(xi, s).square().sum()
     torch.testing.assert_close(gradient, scale * 2.0 * J.mT @ residual(xi, s), rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("kernel", [Kernel.HUBER, Kernel.CAUCHY, Kernel.TUKEY])
+@pytest.mark.parametrize("case", NAMES, indirect=True)
+def test_gradient_under_a_kernel_is_twice_weighted_jacobian_times_residual(case, kernel):
+    loss = case.loss
+    loss.kernel, loss.delta = kernel, 0.5 * float(loss.residuals(*case.arguments(*OFF)).value.abs().max())
+
+    def residual(xi: Tensor) -> Tensor:
+        value = loss.residuals(*case.arguments(xi, OFF[1])).value
+        return value.reshape(-1, value.shape[-1])  # (N, R)
+
+    xi = OFF[0].clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(loss(*case.arguments(xi, OFF[1])), xi)
+    r, J = residual(OFF[0]), torch.func.jacrev(residual)(OFF[0])
+    cost, weight = rho(r.square().sum(-1), kernel, loss.delta)
+    expected = 2.0 * torch.einsum("n,nr,nrk->k", weight, r, J) * loss(*case.arguments(*OFF)) / cost.sum()
+    torch.testing.assert_close(gradient, expected.detach(), rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("form", [AngleForm.RIGHT_ANGLE, AngleForm.SAME_FRAME])
+def test_gradient_of_the_other_angles_is_twice_jacobian_times_residual(form, rng):
+    w = world(rng)
+    corners, depth = w["uv"].view(8, 3, 2), w["depth"].view(8, 3).clone().requires_grad_()
+    none, loss = torch.full((8,), torch.nan, dtype=torch.float64), AngleLoss(form, gate_cos=0.9)
+
+    def residual(d: Tensor) -> Tensor:
+        return loss.residuals(w["T_j_i"], corners, d, none, K).value[:, 0]
+
+    valid = loss.residuals(w["T_j_i"], corners, depth, none, K).valid
+    assert valid.sum() > 2
+    (gradient,) = torch.autograd.grad(loss(w["T_j_i"], corners, depth, none, K), depth)
+    J = torch.func.jacrev(residual)(depth.detach())
+    expected = 2.0 * torch.einsum("n,nck->ck", residual(depth.detach()), J) / valid.sum()
+    torch.testing.assert_close(gradient, expected, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("literal", [False, True])
+def test_lshape_is_the_weighted_sum_of_its_terms_and_so_is_its_gradient(literal, rng):
+    w = world(rng)
+    corners, arms_j = w["uv"].view(8, 3, 2), w["uv_j"].view(8, 3, 2)
+    cos_j, _ = cosine(arms_j[:, 1] - arms_j[:, 0], arms_j[:, 2] - arms_j[:, 0])
+    arms = torch.tensor(rng.normal(size=(4, 2, 5, 3)) + [0, 0, 4], dtype=torch.float64, requires_grad=True)
+    depth = (1.05 * w["depth"].view(8, 3)).requires_grad_()
+    loss = LShapeLoss.literal(0.3, 2.0) if literal else LShapeLoss(AngleLoss(), CollinearityLoss(), 0.3, 2.0)
+    angle = 0.3 * loss.angle(w["T_j_i"], corners, depth, cos_j, K)
+    straight = 2.0 * loss.collinearity(arms)
+    total = loss(w["T_j_i"], corners, depth, cos_j, K, arms)
+    torch.testing.assert_close(total, angle + straight)
+    torch.testing.assert_close(
+        torch.autograd.grad(total, (depth, arms)),
+        (torch.autograd.grad(angle, depth)[0], torch.autograd.grad(straight, arms)[0]),
+    )
 
 
 # Collinearity holds its line constant for the gradient; the gradient of its scalar is checked further down.

@@ -1,5 +1,6 @@
 """Window refinement: exact on clean worlds, robust on dirty ones, honest on degenerate ones."""
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +10,7 @@ import torch
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.losses.cycle import CycleForm
 from edgeslam_torch.losses.robust import Kernel
-from edgeslam_torch.optim import local_ba
+from edgeslam_torch.optim import compiled, local_ba
 from edgeslam_torch.optim.benchmark import (
     K,
     Noise,
@@ -376,6 +377,32 @@ def test_degenerate_window_ends_with_a_reason_and_a_finite_state(name, rng):
         assert result.rank_deficiency >= 1
 
 
+@pytest.mark.parametrize("name", ["pure rotation", "all behind", "one plane", "two keyframes", "nothing free"])
+def test_degenerate_window_with_edges_and_corners_ends_with_a_reason_and_a_finite_state(name):
+    size = replace(SMALL, poses=2, fixed=1) if name == "two keyframes" else SMALL
+    window = seeded_window(22, size)
+    problem = window.problem
+    T = problem.T_c_w.copy()
+    if name == "pure rotation":
+        T[:, :3, 3] = 0.0
+    if name == "all behind":
+        T[1:] = np.diag([1.0, -1.0, -1.0, 1.0]) @ T[1:]
+    if name == "nothing free":
+        problem = replace(problem, pose_fixed=np.ones(len(T), bool))
+    if name == "one plane":
+        flat = np.full(len(problem.edges.host), 0.25)
+        problem = replace(problem, edges=replace(problem.edges, inverse_depth=flat, prior=flat))
+        problem.p_w[:, 2] = 4.0
+    result = refine_window(replace(problem, T_c_w=T), LmConfig(max_iterations=25))
+    assert isinstance(result.stop, StopReason)
+    assert result.cost_after <= result.cost_before
+    for state in (result.T_c_w, result.p_w, result.edge_inverse_depth, result.junction_inverse_depth):
+        assert np.isfinite(state).all()
+    assert (result.edge_inverse_depth > 0).all()
+    R = result.T_c_w[:, :3, :3]
+    np.testing.assert_allclose(R @ np.swapaxes(R, 1, 2), np.broadcast_to(np.eye(3), R.shape), atol=1e-9)
+
+
 def test_a_window_may_hold_only_edges_or_only_junctions():
     window = seeded_window(16, SMALL)
     for left_out in ({"junctions": None}, {"edges": None}):
@@ -422,6 +449,41 @@ def test_gtsam_finds_the_same_minimum():
     result = refine_window(problem, TIGHT)
     assert result.cost_after == pytest.approx(cost, rel=1e-8)
     np.testing.assert_allclose(result.T_c_w, T_c_w, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_compiled_kernels_find_the_same_minimum():
+    if shutil.which("g++") is None and shutil.which("clang++") is None:
+        pytest.skip("no C++ compiler for torch.compile")
+    problem = seeded_window(23, SMALL).problem
+    eager, fast = refine_window(problem, TIGHT), refine_window(problem, replace(TIGHT, compile=True))
+    assert fast.cost_after == pytest.approx(eager.cost_after, rel=1e-9)
+    np.testing.assert_allclose(fast.T_c_w, eager.T_c_w, atol=1e-8)
+
+
+def test_a_compiler_that_fails_leaves_the_eager_result(monkeypatch, caplog):
+    def broken(function, dynamic):
+        def call(*args):
+            raise RuntimeError("no C++ compiler\nat all")
+
+        return call
+
+    monkeypatch.setattr(torch, "compile", broken)
+    monkeypatch.setattr(compiled, "_compiled", {})
+    problem = seeded_window(24, SMALL).problem
+    with caplog.at_level("WARNING"):
+        asked = refine_window(problem, replace(TIGHT, compile=True))
+    assert asked.T_c_w.tobytes() == refine_window(problem, TIGHT).T_c_w.tobytes()
+    messages = [r.getMessage() for r in caplog.records]
+    assert messages
+    assert set(messages) == {"torch.compile failed, eager from now on: no C++ compiler"}
+    assert len(messages) == 7  # once a kernel
+
+
+def test_the_default_device_may_be_named():
+    problem = replace(seeded_window(25, SMALL).problem, scale_priors=(ScalePrior(0, 5, 0.6, 0.1),))
+    here, named = refine_window(problem, TIGHT), refine_window(problem, replace(TIGHT, device="cpu:0"))
+    np.testing.assert_array_equal(here.T_c_w, named.T_c_w)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
