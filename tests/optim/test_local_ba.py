@@ -10,7 +10,7 @@ import torch
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.losses.cycle import CycleForm
 from edgeslam_torch.losses.robust import Kernel
-from edgeslam_torch.optim import compiled, local_ba
+from edgeslam_torch.optim import compiled, local_ba, relative, schur
 from edgeslam_torch.optim.benchmark import (
     K,
     Noise,
@@ -484,6 +484,28 @@ def test_the_default_device_may_be_named():
     problem = replace(seeded_window(25, SMALL).problem, scale_priors=(ScalePrior(0, 5, 0.6, 0.1),))
     here, named = refine_window(problem, TIGHT), refine_window(problem, replace(TIGHT, device="cpu:0"))
     np.testing.assert_array_equal(here.T_c_w, named.T_c_w)
+
+
+def test_kernels_stay_on_their_device():
+    """Meta tensors have shapes and a device but no values: an operation that mixed devices would raise here."""
+    with torch.device("meta"):
+        P, E, f = 50, 20, {"dtype": torch.float32}
+        K, Rt = torch.zeros(4, **f), torch.zeros(3, 4, P, **f)
+        one, two, block = torch.zeros(P, **f), torch.zeros(2, P, **f), torch.zeros(P, dtype=torch.int64)
+        robust = (Kernel.HUBER, 2.0, 1e6)
+        edge = (Rt, torch.zeros(1, P, **f), two, two, two, one, one, one, K)
+        arms = (Rt, torch.zeros(3, P, **f), torch.zeros(3, 2, P, **f), two, torch.zeros(2, 2, P, **f), one[:4, None], K)
+        point = (torch.zeros(3, P, **f), two, K, one, one, block[:3], one[:3], 1e-3, Kernel.HUBER, 2.0)
+        out = [*relative.edge_weights(*edge, CycleForm.RELATIVE_DEPTH, *robust)]
+        out += [*relative.edge_weights(*edge, CycleForm.PIXEL, *robust), relative.edge_cost(*edge, None, *robust)]
+        out += [*relative.junction_weights(*arms, False, *robust), relative.junction_cost(*arms, False, *robust)]
+        out += [*local_ba.point_weights(torch.zeros(3, 3, P, **f), *point, P), local_ba.point_cost(*point)]
+        for size in (1, 3):
+            V = torch.zeros(size * (size + 1) // 2, E, **f)
+            factor = schur.inverse_cholesky(V, 1e-4)
+            out += [schur.entries(factor, block, torch.zeros(2, 6, P, **f), torch.zeros(2, size, P, **f))]
+            out += [schur.unwhiten(factor, schur.whiten(factor, torch.zeros(size, E, **f)))]
+        assert {t.device.type for t in out} == {"meta"}
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
