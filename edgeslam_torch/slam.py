@@ -106,6 +106,7 @@ class EdgeSlam:
         self.edges = EdgeMap(self.map, camera, self.config.edges, self.config.depth.prior_sigma_log)
         self._T_b_c = camera_on_body(np.deg2rad(self.config.mount.tilt_deg), self.config.mount.forward_m)
         self._fusion = MotionFusion(self.config.fusion, self._T_b_c)
+        self._fusion.refined_poses = self.log.poses
         self._published = Published()
         self._bootstrap: Bootstrap | None = None
         self._T_c_w = se3.inverse(first_pose(np.full(3, np.nan), self._T_b_c))
@@ -427,6 +428,7 @@ class EdgeSlam:
         """Refine the whole map, measure the last edges and fix the published scale, once no frame follows."""
         self._wait()
         last_refinement(self.map, self.camera, self.edges, self.config.window)
+        self._fusion.revise(*self.log.poses())
         estimate = self.scale
         if np.isfinite(estimate.sigma):
             self._published = Published(estimate.value)

@@ -1,5 +1,7 @@
 """Poses of all frames, each tied to a keyframe so that it moves when the map is refined."""
 
+import bisect
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,8 +44,13 @@ class TrajectoryLog:
             record.keyframe_id = keyframe_id
             record.T_c_k = T_c_w_of_frame[record.index] @ T_w_k
 
-    def poses(self) -> tuple[FloatArray, FloatArray]:
-        """Stamps ``(F,)`` and ``T_w_c`` ``(F, 4, 4)`` in the map as it is now."""
-        stamps = np.array([r.stamp_s for r in self.records])
-        T = [se3.inverse(r.T_c_k @ self.map.pose_of(r.keyframe_id)) for r in self.records]
-        return stamps, np.stack(T) if T else np.zeros((0, 4, 4))
+    def poses(self, since_s: float = -math.inf) -> tuple[FloatArray, FloatArray]:
+        """Stamps ``(F,)`` and ``T_w_c`` ``(F, 4, 4)`` in the map as it is now, of frames not older than ``since_s``."""
+        first = bisect.bisect_left(self.records, since_s, key=lambda r: r.stamp_s)
+        records = self.records[first:]
+        if not records:
+            return np.zeros(0), np.zeros((0, 4, 4))
+        with self.map.lock:
+            T_k_w = {id: self.map.pose_of(id) for id in {r.keyframe_id for r in records}}
+        T_c_w = np.stack([r.T_c_k for r in records]) @ np.stack([T_k_w[r.keyframe_id] for r in records])
+        return np.array([r.stamp_s for r in records]), se3.inverse(T_c_w)

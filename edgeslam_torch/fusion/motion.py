@@ -2,7 +2,7 @@
 
 import math
 from collections import Counter, deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,17 +10,10 @@ import numpy as np
 from edgeslam_torch.fusion.config import FusionConfig
 from edgeslam_torch.fusion.delayed import BufferedEkf
 from edgeslam_torch.fusion.ekf import EkfState
+from edgeslam_torch.fusion.joint_scale import Evidence, displacement_evidence, height_evidence, solved
 from edgeslam_torch.fusion.mount import Mount, estimate_mount
 from edgeslam_torch.fusion.rotations import mean_rotation, rotation_vector
-from edgeslam_torch.fusion.scale import (
-    DepthRatio,
-    DisplacementFit,
-    LogScale,
-    fit_displacements,
-    fit_height,
-    floor_segments,
-    fuse,
-)
+from edgeslam_torch.fusion.scale import DepthRatio, LogScale, floor_segments, fuse
 from edgeslam_torch.fusion.track import TelemetryTrack
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.types import FloatArray, ScaleEstimate, TelemetrySample
@@ -28,6 +21,10 @@ from edgeslam_torch.types import FloatArray, ScaleEstimate, TelemetrySample
 _DELAY_GUESS_S = 0.3
 """Used until the motion says better; the short end of what Tello owners measure."""
 _REFIT_S = 1.0
+_REFIT_SHARE = 0.12
+_IMPROBABLE = 2e-3
+_GOOD_HEIGHT = 0.2
+"""Relative sigma with which a height source is good enough; the next one would say the same less well."""
 _DELAY_STEP_S = 0.05
 _MIN_DELAY_INTERVALS = 12
 _FEED_S = 0.09
@@ -86,6 +83,8 @@ class MotionFusion:
     def __init__(self, config: FusionConfig, T_b_c: FloatArray) -> None:
         self.config = config
         self.T_b_c = np.asarray(T_b_c, dtype=np.float64)
+        self.refined_poses: Callable[[float], tuple[FloatArray, FloatArray]] | None = None
+        """Gives stamps and poses of the frames since a stamp, in the map as it is now; asked before each fit."""
         self._track = TelemetryTrack(config.velocity_frame, config.max_gap_s)
         self._intervals: deque[_Interval] = deque(maxlen=max(20, int(config.window_s / config.interval_s)))
         self._sightings: deque[_Visual] = deque(maxlen=int(10 * config.window_s))
@@ -102,9 +101,11 @@ class MotionFusion:
         self._delay_sigma_s = math.inf if config.delay_s is None else 0.0
         self._delay_tried_at = 0
         self._R_w_m: FloatArray | None = None
-        self._fit: DisplacementFit | None = None
+        self._fit: Evidence | None = None
         self._shortfall_m_s = 0.5 * config.velocity_step_m_s if config.velocity_rounding == "truncate" else 0.0
-        self._telemetry_opinions: list[LogScale] = []
+        self._telemetry_opinion: LogScale | None = None
+        self._sources: dict[str, tuple[float, float]] = {}
+        """Scale and sigma of velocity and height on their own, for the report."""
         self._fitted_s = -math.inf
         self._counts: Counter[str] = Counter()
 
@@ -155,6 +156,26 @@ class MotionFusion:
             self._intervals.append(_Interval(start.stamp_s, visual.stamp_s, start.T, visual.T, sigma))
             self._start = visual
 
+    def revise(self, stamps_s: FloatArray, T_w_c: FloatArray) -> None:
+        """Later knowledge of earlier poses: a map that was refined has moved them, and its scale has drifted less.
+
+        Args:
+            stamps_s: Stamps of frames ``(F,)``, as given to `add_visual`; others are left alone.
+            T_w_c: Their poses ``(F, 4, 4)`` in the map as it is now.
+        """
+        known = dict(zip(stamps_s.tolist(), T_w_c, strict=True))
+        for visual in self._remembered():
+            visual.T = known.get(visual.stamp_s, visual.T)
+        for interval in self._intervals:
+            interval.T_from = known.get(interval.from_s, interval.T_from)
+            interval.T_to = known.get(interval.to_s, interval.T_to)
+        self._fitted_s = -math.inf
+
+    def _remembered(self) -> list[_Visual]:
+        """Each remembered pose once."""
+        held = (*self._sightings, self._start, self._previous, self._last, self._fed)
+        return list({id(visual): visual for visual in held if visual is not None}.values())
+
     def add_depth_ratio(self, log_ratio: float, sigma_log: float) -> None:
         """One keyframe's log of (network depth [m] / map depth) on its anchors."""
         self._depth.add(log_ratio, sigma_log)
@@ -164,20 +185,18 @@ class MotionFusion:
         if not (math.isfinite(factor) and factor > 0):
             raise ValueError(f"factor must be positive, got {factor}")
         centre = np.zeros(3) if about is None else np.asarray(about, dtype=np.float64)
-        seen: set[int] = set()
-        poses = [v for v in (*self._sightings, self._start, self._previous, self._last, self._fed) if v is not None]
-        for visual in poses:
-            if id(visual) not in seen:
-                seen.add(id(visual))
-                visual.T = _scaled(visual.T, factor, centre)
-                visual.sigma_t *= factor
+        for visual in self._remembered():
+            visual.T = _scaled(visual.T, factor, centre)
+            visual.sigma_t *= factor
         for interval in self._intervals:
             interval.T_from = _scaled(interval.T_from, factor, centre)
             interval.T_to = _scaled(interval.T_to, factor, centre)
             interval.sigma *= factor
         self._depth.rescale(factor)
         shift = math.log(factor)
-        self._telemetry_opinions = [LogScale(o.log_scale - shift, o.sigma, o.source) for o in self._telemetry_opinions]
+        if (held := self._telemetry_opinion) is not None:
+            self._telemetry_opinion = LogScale(held.log_scale - shift, held.sigma, held.source)
+        self._sources = {name: (s / factor, sigma / factor) for name, (s, sigma) in self._sources.items()}
 
     def reset_map(self) -> None:
         """A new map in a new gauge: visual memory and scale are forgotten, telemetry and delay are kept."""
@@ -185,7 +204,7 @@ class MotionFusion:
         self._sightings.clear()
         self._start = self._previous = self._last = self._fed = None
         self._depth = DepthRatio(self.config.depth_bias_log)
-        self._telemetry_opinions = []
+        self._telemetry_opinion, self._sources = None, {}
         self._R_w_m, self._fit, self._fitted_s, self._ekf_delay = None, None, -math.inf, None
 
     # --- output --------------------------------------------------------------------------------------------------
@@ -203,7 +222,7 @@ class MotionFusion:
     def scale(self) -> ScaleEstimate:
         """Metres per map unit with sigma and source; held while the motion says nothing new."""
         self._refit()
-        opinions = list(self._telemetry_opinions)
+        opinions = [self._telemetry_opinion] if self._telemetry_opinion is not None else []
         depth = self._depth.estimate()
         if depth is not None:
             opinions.append(depth)
@@ -280,7 +299,7 @@ class MotionFusion:
             return PoseEstimate(stamp_s, T, math.inf, 0.01 + 0.01 * gap, "telemetry")
         moved = np.diff(self._track.displacement(times, self._shortfall_m_s), axis=0)[0]
         if self._fit is not None:
-            moved = moved - self._fit.bias_m_s[-1] * gap
+            moved = moved - self._fit.bias * gap
         moved = moved + (R_w_b[1] - R_w_b[0]) @ self.T_b_c[:3, 3]
         T[:3, 3] = last.T[:3, 3] + self._R_w_m.T @ moved / estimate.value
         walk = self.config.sigma_velocity_m_s * math.sqrt(0.1 * gap) + 0.02 * gap
@@ -325,9 +344,12 @@ class MotionFusion:
         if mount is not None:
             numbers["camera tilt deg"] = math.degrees(mount.tilt_rad)
             numbers["camera tilt sigma deg"] = math.degrees(mount.tilt_sigma_rad)
-        for opinion in [*self._telemetry_opinions, *filter(None, [self._depth.estimate()])]:
-            numbers[f"scale {opinion.source}"] = math.exp(opinion.log_scale)
-            numbers[f"scale {opinion.source} sigma"] = math.exp(opinion.log_scale) * opinion.sigma
+        for name, (value, sigma) in self._sources.items():
+            numbers[f"scale {name}"], numbers[f"scale {name} sigma"] = value, sigma
+        depth = self._depth.estimate()
+        if depth is not None:
+            numbers["scale depth"] = math.exp(depth.log_scale)
+            numbers["scale depth sigma"] = math.exp(depth.log_scale) * depth.sigma
         return numbers
 
     # --- estimation ----------------------------------------------------------------------------------------------
@@ -337,8 +359,12 @@ class MotionFusion:
         last = self._last
         if last is None or len(self._track) == 0:
             return
-        if self._R_w_m is not None and last.stamp_s - self._fitted_s < _REFIT_S:
+        # Each fit costs more and changes less than the one before.
+        pause_s = max(_REFIT_S, _REFIT_SHARE * min(last.stamp_s - self._sightings[0].stamp_s, self.config.window_s))
+        if self._R_w_m is not None and last.stamp_s - self._fitted_s < pause_s:
             return
+        if self.refined_poses is not None:
+            self.revise(*self.refined_poses(last.stamp_s - self.config.window_s))
         self._fitted_s = last.stamp_s
         if self._R_w_m is None:
             self._R_w_m = self._attitude_alignment(self._delay_s)
@@ -348,19 +374,15 @@ class MotionFusion:
         if R is None:
             return
         self._R_w_m = R
-        found = self._fit_roundings(R)
-        if found is None:
-            return  # nothing new to say: hover, pure rotation, or telemetry missing
-        self._fit, opinion = found
-        opinions = [opinion] if opinion.sigma < 0.3 else []
-        opinions += self._height_opinions(math.exp(opinion.log_scale))
-        if opinions:
-            self._telemetry_opinions = opinions
+        opinion = self._opinion(R)
+        if opinion is not None and opinion.sigma < 0.3:
+            self._telemetry_opinion = opinion
+        # else nothing new to say: hover, pure rotation, or telemetry missing
 
-    def _fit_roundings(self, R_w_m: FloatArray) -> tuple[DisplacementFit, LogScale] | None:
-        """Displacement fit for readings rounded to the nearest step or truncated.
+    def _opinion(self, R_w_m: FloatArray) -> LogScale | None:
+        """Scale from displacements and height, for readings rounded to the nearest step or truncated.
 
-        The opinion is the mean of both, weighted by how probable each is; its sigma spans them while that is open.
+        The mean of both, weighted by how probable each is; its sigma spans them while that is open.
         """
         config = self.config
         half = 0.5 * config.velocity_step_m_s
@@ -368,21 +390,55 @@ class MotionFusion:
         if share is None:
             share = self._track.truncation_probability(config.velocity_step_m_s)
         self._shortfall_m_s = half if share > 0.5 else 0.0
-        fits = []  # (probability, fit, its sigma)
+        mixed = []  # (probability, opinion)
         for probability, q, systematic in (
             (1.0 - share, 0.0, config.systematic_log),
             (share, half, config.truncation_systematic_log),
         ):
-            if probability < 1e-4:
+            if probability < _IMPROBABLE:
                 continue
-            fit = self._fit_at(self._delay_s, R_w_m, q)
-            if fit is None:
-                return None
-            fits.append((probability, fit, math.hypot(fit.sigma, systematic)))
-        mean = sum(p * fit.log_scale for p, fit, _ in fits)
-        variance = sum(p * (sigma**2 + (fit.log_scale - mean) ** 2) for p, fit, sigma in fits)
-        likelier = max(fits, key=lambda f: f[0])[1]
-        return likelier, LogScale(mean, math.sqrt(variance), "telemetry")
+            opinion = self._joint_opinion(R_w_m, q, systematic, likelier=probability > 0.5)
+            if opinion is not None:
+                mixed.append((probability, opinion))
+        if not mixed:
+            return None
+        total = sum(p for p, _ in mixed)
+        mean = sum(p * o.log_scale for p, o in mixed) / total
+        variance = sum(p * (o.sigma**2 + (o.log_scale - mean) ** 2) for p, o in mixed) / total
+        return LogScale(mean, math.sqrt(variance), max(mixed, key=lambda m: m[0])[1].source)
+
+    def _joint_opinion(
+        self, R_w_m: FloatArray, shortfall_m_s: float, systematic: float, likelier: bool
+    ) -> LogScale | None:
+        tilt = self.config.alignment_sigma_rad
+        moved = self._displacement_evidence(self._delay_s, R_w_m, shortfall_m_s)
+        alone = solved([moved], tilt) if moved is not None else None
+        rough = alone[0] if alone is not None else self._held_scale()
+        if rough is None:
+            return None
+        height = self._height_evidence(R_w_m, rough)
+        given = []  # (name, evidence, scale, relative sigma)
+        for name, evidence, error in (("telemetry", moved, systematic), ("height", height, self.config.systematic_log)):
+            if evidence is None:
+                continue
+            evidence = evidence.softened(error * rough)
+            single = solved([evidence], tilt)
+            if single is not None and single[1] < 0.5:
+                given.append((name, evidence, *single))
+        together = solved([g[1] for g in given], tilt) if given else None
+        if together is None:
+            return None
+        if likelier:
+            self._fit = moved
+            self._sources = {name: (s, s * sigma) for name, _, s, sigma in given}
+        apart = 1.0
+        if len(given) == 2:  # Birge ratio: sources that disagree beyond their sigmas widen the result
+            gap = abs(math.log(given[0][2] / given[1][2]))
+            apart = max(1.0, gap / math.hypot(given[0][3], given[1][3]))
+        return LogScale(math.log(together[0]), apart * together[1], "+".join(g[0] for g in given))
+
+    def _held_scale(self) -> float | None:
+        return None if self._telemetry_opinion is None else math.exp(self._telemetry_opinion.log_scale)
 
     def _attitude_alignment(self, delay_s: float) -> FloatArray | None:
         """Mean of ``R_w_b(telemetry) R_b_c R_m_c^T`` over the remembered poses."""
@@ -396,7 +452,7 @@ class MotionFusion:
         R_w_b = self._track.attitude(stamps[inside])
         return mean_rotation(R_w_b @ self.T_b_c[:3, :3] @ np.swapaxes(R_m_c, 1, 2))
 
-    def _fit_at(self, delay_s: float, R_w_m: FloatArray, shortfall_m_s: float) -> DisplacementFit | None:
+    def _displacement_evidence(self, delay_s: float, R_w_m: FloatArray, shortfall_m_s: float) -> Evidence | None:
         if len(self._intervals) == 0:
             return None
         from_s, to_s, moved, sigma = self._visual_displacements()
@@ -412,34 +468,24 @@ class MotionFusion:
         if moving.sum() < 2:
             return None
         duration = (to_s - from_s)[moving]
-        sigma_m = self.config.sigma_velocity_m_s * np.sqrt(0.1 * duration)
-        block = ((from_s[moving] - from_s[moving][0]) // self.config.bias_knot_s).astype(int)
-        block = np.unique(block, return_inverse=True)[1]
-        return fit_displacements(
+        return displacement_evidence(
             moved[moving] @ R_w_m.T,
             moved_m[moving],
+            from_s[moving],
             duration,
             sigma[moving],
-            sigma_m,
-            block,
+            self.config.sigma_velocity_m_s * np.sqrt(0.1 * duration),
             self.config.alignment_sigma_rad,
-            self.config.sigma_bias_m_s,
-            max(1.5 * self.config.bias_walk_m_s_sqrt_s * math.sqrt(self.config.bias_knot_s), 1e-4),
         )
 
     def _moving(self, moved_map: FloatArray, duration_s: FloatArray, moved_m: FloatArray) -> FloatArray:
         """Intervals fast enough to speak of scale, judged by vision once the scale is roughly known."""
-        if self._fit is not None:
-            speed = np.linalg.norm(moved_map, axis=1) * math.exp(self._fit_log_scale()) / duration_s
+        scale = self._held_scale()
+        if scale is not None:
+            speed = np.linalg.norm(moved_map, axis=1) * scale / duration_s
         else:
             speed = np.linalg.norm(moved_m, axis=1) / duration_s
         return speed > self.config.min_speed_m_s
-
-    def _fit_log_scale(self) -> float:
-        for opinion in self._telemetry_opinions:
-            return opinion.log_scale
-        assert self._fit is not None
-        return self._fit.log_scale
 
     def _visual_displacements(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         from_s = np.array([i.from_s for i in self._intervals])
@@ -447,31 +493,34 @@ class MotionFusion:
         moved = np.array([i.T_to[:3, 3] - i.T_from[:3, 3] for i in self._intervals])
         return from_s, to_s, moved, np.array([i.sigma for i in self._intervals])
 
-    def _height_opinions(self, rough_scale: float) -> list[LogScale]:
-        """At most one opinion: the best of range, SDK height and barometer (they watch the same motion)."""
-        assert self._R_w_m is not None
+    def _height_evidence(self, R_w_m: FloatArray, scale: float) -> Evidence | None:
+        """The best of range, SDK height and barometer: they watch the same motion."""
         stamps = np.array([v.stamp_s for v in self._sightings]) - self._delay_s
-        p_m = np.array([v.T[:3, 3] for v in self._sightings])
-        up = p_m @ (self._R_w_m.T @ np.array([0.0, 0.0, 1.0]))
+        poses = np.array([v.T for v in self._sightings])
+        lever = -poses[:, :3, :3] @ (self.T_b_c[:3, :3].T @ self.T_b_c[:3, 3])  # from camera to body [m]
+        p_w = (poses[:, :3, 3] + lever / scale) @ R_w_m.T
         sigma_map = float(np.median([v.sigma_t for v in self._sightings]))
-        best: LogScale | None = None
+        best, best_sigma = None, math.inf
         for name, (times, z) in self._track.heights().items():
             if len(times) < 2:
                 continue
-            here = (stamps >= times[0]) & (stamps <= times[-1])
-            near = np.clip(np.searchsorted(times, stamps), 1, len(times) - 1)
-            here &= times[near] - times[near - 1] < self.config.max_gap_s
-            if not here.any():
+            # A reading between two sightings, not the other way round: each counts once.
+            here = (times >= stamps[0]) & (times <= stamps[-1])
+            near = np.clip(np.searchsorted(stamps, times), 1, len(stamps) - 1)
+            here &= stamps[near] - stamps[near - 1] < self.config.max_gap_s
+            if here.sum() < 2:
                 continue
+            p = np.stack([np.interp(times[here], stamps, p_w[:, k]) for k in range(3)], axis=1)
             sigma = getattr(self.config, _HEIGHT_SOURCES[name])
-            z_m = np.interp(stamps[here], times, z)
-            segment = floor_segments(stamps[here], z_m, rough_scale * up[here], step_m=max(0.08, 4.0 * sigma))
-            opinion = fit_height(up[here], z_m, segment, sigma_map, sigma)
-            if opinion is not None and (best is None or opinion.sigma < best.sigma):
-                best = opinion
-        if best is None:
-            return []
-        return [LogScale(best.log_scale, math.hypot(best.sigma, self.config.systematic_log), best.source)]
+            segment = floor_segments(times[here], z[here], scale * p[:, 2], step_m=max(0.08, 4.0 * sigma))
+            tilt = self.config.alignment_sigma_rad
+            evidence = height_evidence(p, z[here], times[here], segment, sigma_map, sigma, scale, tilt)
+            single = solved([evidence], tilt) if evidence is not None else None
+            if single is not None and single[1] < best_sigma:
+                best, best_sigma = evidence, single[1]
+            if best_sigma < _GOOD_HEIGHT:
+                break
+        return best
 
     def _estimate_delay(self) -> None:
         """Delay at which visual and telemetry displacements and turns agree best; refined as evidence grows."""
@@ -538,7 +587,7 @@ class MotionFusion:
             return
         self._fed = visual
         estimate = self.scale()
-        if not estimate.sigma < 0.1 * estimate.value or not self._telemetry_opinions:
+        if not estimate.sigma < 0.1 * estimate.value or self._telemetry_opinion is None:
             return
         if self._ekf_delay is None or abs(self._ekf_delay - self._delay_s) > 0.1:
             self._ekf_delay = self._delay_s

@@ -17,7 +17,6 @@ _HUBER = 2.5
 _TUKEY = 4.685
 """Tukey's biweight: 95 % efficiency on normal errors; a frozen or jumping reading gets no weight at all."""
 _MIN_DISPLACEMENTS = 6
-_MIN_HEIGHTS = 12
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,52 +166,6 @@ def _effective_share(residual: FloatArray) -> float:
         return 1.0
     rho = float(np.clip(np.sum(flat[1:] * flat[:-1]) / power, 0.0, 0.9))
     return (1.0 - rho) / (1.0 + rho)
-
-
-def fit_height(
-    z_map: FloatArray, z_m: FloatArray, segment: IntArray, sigma_map: float, sigma_m: float, bias_knot: int = 100
-) -> LogScale | None:
-    """Scale from height above the floor against visual height, with a free offset in each segment.
-
-    Args:
-        z_map: Visual height along gravity [map units], shape ``(N,)``.
-        z_m: Measured height [m], shape ``(N,)``.
-        segment: Number of the stretch without a floor step, from `floor_segments`, shape ``(N,)``.
-        sigma_map: Noise of ``z_map``.
-        sigma_m: Expected noise of ``z_m``.
-        bias_knot: Samples after which a segment gets a new offset, so that visual drift does not count.
-
-    Returns:
-        The opinion, or ``None`` without enough vertical motion (the spread must exceed twice the noise).
-    """
-    if len(z_map) < _MIN_HEIGHTS:
-        return None
-    position = np.arange(len(segment)) - np.searchsorted(segment, segment)
-    group = np.unique(np.stack([segment, position // bias_knot]), axis=1, return_inverse=True)[1].ravel()
-    count = np.bincount(group)
-    x = z_map - (np.bincount(group, z_map) / count)[group]
-    y = z_m - (np.bincount(group, z_m) / count)[group]
-    keep = count[group] >= _MIN_HEIGHTS // 2
-    x, y = x[keep], y[keep]
-    if len(x) < _MIN_HEIGHTS or float(np.std(y)) < 2.0 * sigma_m:
-        return None
-    weight = np.ones(len(x))
-    scale, residual, spread = 1.0, y, sigma_m
-    for _ in range(10):
-        signal = float(np.sum(weight * x * x)) - float(weight.sum()) * sigma_map**2
-        if signal <= 0:
-            return None
-        scale = float(np.sum(weight * x * y)) / signal
-        residual = y - scale * x
-        spread = max(1.4826 * float(np.median(np.abs(residual))), sigma_m)
-        weight = np.square(np.maximum(0.0, 1.0 - np.square(residual / (_TUKEY * spread))))
-    if scale <= 0:
-        return None
-    share = _effective_share((residual * weight)[:, None])
-    sigma = spread / math.sqrt(signal * share) / scale
-    if sigma > 0.3:
-        return None
-    return LogScale(math.log(scale), sigma, "height")
 
 
 def floor_segments(stamp_s: FloatArray, z_m: FloatArray, z_predicted_m: FloatArray, step_m: float) -> IntArray:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from edgeslam_torch.fusion.rotations import matrix_from_rpy, rotation_vector
-from edgeslam_torch.fusion.scale import DepthRatio, LogScale, fit_displacements, fit_height, floor_segments, fuse
+from edgeslam_torch.fusion.scale import DepthRatio, LogScale, fit_displacements, floor_segments, fuse
 from edgeslam_torch.types import Units
 
 
@@ -83,36 +83,6 @@ def test_too_few_displacements_say_nothing(rng, count):
 
 def test_no_motion_says_nothing():
     assert fit(np.zeros((30, 3)), np.zeros((30, 3))) is None
-
-
-def heights(rng, n=200, scale=0.5):
-    z = 1.0 + 0.3 * np.sin(np.arange(n) / 15)
-    return z / scale, z + 0.012 * rng.standard_normal(n)
-
-
-def test_height_gives_the_scale(rng):
-    z_map, z = heights(rng)
-    result = fit_height(z_map, z, np.zeros(200, dtype=int), 0.002, 0.015)
-    assert math.exp(result.log_scale) == pytest.approx(0.5, rel=0.02)
-    assert result.sigma < 0.02
-
-
-def test_floor_steps_are_cut_out_of_the_height(rng):
-    z_map, z = heights(rng)
-    z[60:120] -= 0.4  # a table below
-    stamps = 0.1 * np.arange(200)
-    segment = floor_segments(stamps, z, 0.5 * z_map, 0.08)
-    assert len(np.unique(segment)) == 3
-    cut = fit_height(z_map, z, segment, 0.002, 0.015)
-    whole = fit_height(z_map, z, np.zeros(200, dtype=int), 0.002, 0.015)
-    assert math.exp(cut.log_scale) == pytest.approx(0.5, rel=0.03)
-    assert whole is None or abs(whole.log_scale - math.log(0.5)) > abs(cut.log_scale - math.log(0.5))
-
-
-def test_level_flight_gives_no_scale_from_height(rng):
-    assert (
-        fit_height(np.full(100, 2.0), 1.0 + 0.01 * rng.standard_normal(100), np.zeros(100, int), 0.002, 0.015) is None
-    )
 
 
 def test_a_hole_in_time_starts_a_new_segment():

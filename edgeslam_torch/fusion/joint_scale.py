@@ -1,0 +1,287 @@
+r"""Metric scale from velocity and height together, with noise whose kind is told by the flight itself.
+
+Unknowns are :math:`\theta = (s, s\,\delta)`: metres per map unit and a small rotation of the map against the drone's
+world. Both kinds of measurement are linear in them, so each gives information on :math:`\theta` and the two add up:
+
+.. math::
+    d_i = s\,u_i + s\,\delta \times u_i + b_i L_i + \epsilon_i, \qquad
+    h_j = s\,z_j + (s\,\delta \times p_j)_z + c_k + w_j + \epsilon_j
+
+with velocity bias :math:`b` and drift of the visual position :math:`w` that forget themselves in seconds
+(Ornstein-Uhlenbeck; between the ends of an interval only the drift's change counts, so that long ways weigh more than
+swings on the spot). How large they are is chosen by the restricted likelihood of the residuals (Patterson and Thompson
+1971): a map that a tilt of half a degree or a slow drift bends must not be taken for noise that averages out, nor the
+other way round.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import cho_solve, lapack
+
+from edgeslam_torch.geometry.se3 import hat
+from edgeslam_torch.types import FloatArray, IntArray
+
+_TUKEY = 4.685
+"""Tukey's biweight: 95 % efficiency on normal errors; a frozen or jumping reading gets no weight at all."""
+_LEAST_WEIGHT = 1e-3
+_MIN_DISPLACEMENTS = 6
+_MIN_HEIGHTS = 6
+_BELIEF = 20.0
+"""Residuals that the expected noise counts for when the real one is judged."""
+_BIAS_AND_DRIFT = ((0.003, 0.002), (0.01, 0.002), (0.03, 0.002), (0.003, 0.03), (0.01, 0.03), (0.03, 0.03), (0.1, 0.03))
+"""Standard deviations of the velocity bias [m/s] and of the visual drift [m] that are tried."""
+_USUAL_BIAS_M_S = 0.01
+_BIAS_MEMORY_S = 12.0
+_DRIFT_M = (0.002, 0.006, 0.02, 0.06)
+_DRIFT_MEMORY_S = 4.0
+_BIN_S = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """What one kind of measurement says of ``theta`` ``(4,)``."""
+
+    information: FloatArray
+    """``(4, 4)``"""
+    vector: FloatArray
+    """``(4,)`` information times mean."""
+    rms_m: float
+    """Residual."""
+    bias: FloatArray
+    """``(3,)`` velocity bias at the end [m/s]; zeros for heights."""
+
+    def softened(self, sigma: float) -> "Evidence":
+        """The same with an error of the scale [m per map unit] that no averaging removes."""
+        q = sigma**2
+        column = self.information[:, 0] * (q / (1.0 + q * float(self.information[0, 0])))
+        information = self.information - np.outer(column, self.information[0])
+        return replace(self, information=information, vector=self.vector - column * self.vector[0])
+
+
+def solved(evidence: list[Evidence], tilt_sigma_rad: float) -> tuple[float, float] | None:
+    """Scale and relative standard deviation from all evidence, the rotation free within its prior."""
+    information = np.sum([e.information for e in evidence], axis=0)
+    vector = np.sum([e.vector for e in evidence], axis=0)
+    if not information[0, 0] > 0:
+        return None
+    s = abs(float(vector[0] / information[0, 0]))
+    for _ in range(2):  # the prior on s delta needs s
+        prior = np.diag([0.0, *[(max(s, 1e-12) * tilt_sigma_rad) ** -2] * 3])
+        try:
+            covariance = np.linalg.inv(information + prior)
+        except np.linalg.LinAlgError:
+            return None
+        s = float((covariance @ vector)[0])
+        if not (math.isfinite(s) and s > 1e-9 and covariance[0, 0] > 0):
+            return None
+    return s, math.sqrt(float(covariance[0, 0])) / s
+
+
+def displacement_evidence(
+    moved_map: FloatArray,
+    moved_m: FloatArray,
+    from_s: FloatArray,
+    duration_s: FloatArray,
+    sigma_map: FloatArray,
+    sigma_m: FloatArray,
+    tilt_sigma_rad: float,
+) -> Evidence | None:
+    """From visual and telemetry displacements of the same intervals.
+
+    Noise of the visual ones is allowed for by taking the likeliest true displacement as the regressor's partner (York
+    1968): plain least squares would shrink the scale by the share of noise.
+
+    Args:
+        moved_map: Visual displacements in world axes [map units], shape ``(N, 3)``.
+        moved_m: Telemetry's [m], shape ``(N, 3)``.
+        from_s: Starts of the intervals ``(N,)``.
+        duration_s: Their lengths ``(N,)``.
+        sigma_map: Standard deviation of ``moved_map`` per axis, shape ``(N,)``.
+        sigma_m: Expected standard deviation of ``moved_m`` per axis, shape ``(N,)``.
+        tilt_sigma_rad: Prior on the rotation.
+    """
+    n = len(moved_map)
+    length = float(np.sum(moved_map**2))
+    if n < _MIN_DISPLACEMENTS or not length > 0:
+        return None
+    sigma_map = np.minimum(sigma_map, 0.3 * math.sqrt(length / (3 * n)))
+    apart_s = from_s[:, None] - from_s[None]
+    bias = np.exp(-np.abs(apart_s) / _BIAS_MEMORY_S) * np.outer(duration_s, duration_s)
+    drift = _of_changes(apart_s, duration_s, _DRIFT_MEMORY_S)
+    slow = [(a, a**2 * bias, b**2 * drift, -0.5 * math.log(a / _USUAL_BIAS_M_S, 3.0) ** 2) for a, b in _BIAS_AND_DRIFT]
+    s = math.sqrt(float(np.sum(moved_m**2)) / length)
+    if not (math.isfinite(s) and s > 1e-9):
+        return None
+    J = np.concatenate([moved_map[:, :, None], -hat(moved_map)], axis=2).transpose(1, 0, 2)  # (3, N, 4)
+    target = moved_m.T[:, :, None]  # (3, N, 1)
+    weight = np.ones(n)
+    latent, fit = J, None
+    for iteration in range(5):
+        white = (sigma_m**2 + (s * sigma_map) ** 2) / np.maximum(weight, _LEAST_WEIGHT)
+        prior = np.diag([0.0, *[(s * tilt_sigma_rad) ** -2] * 3])
+        tried = (
+            [_Slow(x + y, x, log) for _, x, y, log in slow]
+            if iteration == 2
+            else [_Slow(slow[4][1] + slow[4][2], slow[4][1], 0.0) if fit is None else fit.noise]
+        )
+        fit = _best(white, tried, J, latent, target, prior)
+        if fit is None or not fit.theta[0] > 1e-9:
+            return None
+        s = float(fit.theta[0])
+        clean = fit.residual - fit.slow  # (3, N)
+        variance = sigma_m**2 + (s * sigma_map) ** 2
+        normalised = np.sqrt(np.sum(clean**2, axis=0) / (3.0 * variance))
+        spread = max(float(np.median(normalised)) / 0.888, 0.3)
+        weight = np.square(np.maximum(0.0, 1.0 - np.square(normalised / (_TUKEY * spread))))
+        partner = moved_map + ((s * sigma_map**2 / variance) * clean).T
+        latent = np.concatenate([partner[:, :, None], -hat(partner)], axis=2).transpose(1, 0, 2)
+    if fit is None or float(weight.sum()) < _MIN_DISPLACEMENTS:
+        return None
+    rms = math.sqrt(float(np.sum(weight * clean**2)) / max(3.0 * float(weight.sum()), 1e-9))
+    return Evidence(fit.information, fit.vector, rms, fit.bias[:, -1] / duration_s[-1])
+
+
+def height_evidence(
+    p_map: FloatArray,
+    z_m: FloatArray,
+    stamp_s: FloatArray,
+    segment: IntArray,
+    sigma_map: float,
+    sigma_m: float,
+    scale: float,
+    tilt_sigma_rad: float,
+) -> Evidence | None:
+    """From height above the floor against visual height, with a free offset in each stretch without a floor step.
+
+    Args:
+        p_map: Visual positions of the body, world axes (z up) [map units], shape ``(N, 3)``.
+        z_m: Measured height [m], shape ``(N,)``.
+        stamp_s: Times ``(N,)``.
+        segment: Number of the stretch, from `floor_segments`, shape ``(N,)``.
+        sigma_map: Noise of ``p_map`` per axis.
+        sigma_m: Expected noise of ``z_m``.
+        scale: Rough metres per map unit.
+        tilt_sigma_rad: Prior on the rotation.
+    """
+    if len(z_m) < 2 * _MIN_HEIGHTS:
+        return None
+    part = np.unique(np.stack([segment, ((stamp_s - stamp_s[0]) // _BIN_S).astype(int)]), axis=1, return_inverse=True)
+    key, group = part[0], part[1].ravel()
+    count = np.bincount(group).astype(np.float64)
+    p = np.stack([np.bincount(group, p_map[:, k]) / count for k in range(3)], axis=1)
+    z, t = np.bincount(group, z_m) / count, np.bincount(group, stamp_s) / count
+    stretch = np.unique(key[0], return_inverse=True)[1].ravel()
+    kept = (np.bincount(stretch) >= _MIN_HEIGHTS)[stretch]
+    if not kept.any():
+        return None
+    p, z, t, count, stretch = p[kept], z[kept], t[kept], count[kept], stretch[kept]
+    stretch = np.unique(stretch, return_inverse=True)[1].ravel()
+    size = np.bincount(stretch)
+    p = p - np.stack([np.bincount(stretch, p[:, k]) / size for k in range(3)], axis=1)[stretch]
+    n, K = len(z), len(size)
+    offsets = np.zeros((n, K))
+    offsets[np.arange(n), stretch] = 1.0
+    J = np.column_stack([p[:, 2], p[:, 1], -p[:, 0], np.zeros(n), offsets])[None]  # (delta x p)_z = dx y - dy x
+    memory = np.exp(-np.abs(t[:, None] - t[None]) / _DRIFT_MEMORY_S) * (stretch[:, None] == stretch[None])
+    prior = np.diag([0.0, *[(scale * tilt_sigma_rad) ** -2] * 3, *[1e-6] * K])
+    weight, fit = np.ones(n), None
+    for iteration in range(4):
+        white = (sigma_m**2 + (scale * sigma_map) ** 2) / count / np.maximum(weight, _LEAST_WEIGHT)
+        tried = (
+            [_Slow(a**2 * memory, 0.0 * memory, 0.0) for a in _DRIFT_M]
+            if fit is None or iteration == 2
+            else [fit.noise]
+        )
+        fit = _best(white, tried, J, J, z[None, :, None], prior)
+        if fit is None:
+            return None
+        clean = fit.residual[0] - fit.slow[0]
+        normalised = np.abs(clean) / np.sqrt((sigma_m**2 + (scale * sigma_map) ** 2) / count)
+        spread = max(1.4826 * float(np.median(normalised)), 0.3)
+        weight = np.square(np.maximum(0.0, 1.0 - np.square(normalised / (_TUKEY * spread))))
+    if fit is None:
+        return None
+    A, v = fit.information.copy(), fit.vector
+    A[0, 0] -= fit.inverse_trace * sigma_map**2 / float(np.mean(count))  # noise of the regressor is no motion
+    if not A[0, 0] > 0:
+        return None
+    inner = np.linalg.inv(A[4:, 4:] + 1e-9 * np.eye(K))  # the offsets are nobody's business
+    information = A[:4, :4] - A[:4, 4:] @ inner @ A[4:, :4]
+    vector = v[:4] - A[:4, 4:] @ inner @ v[4:]
+    rms = math.sqrt(float(np.sum(weight * clean**2)) / max(float(weight.sum()), 1e-9))
+    return Evidence(0.5 * (information + information.T), vector, rms, np.zeros(3))
+
+
+def _of_changes(apart_s: FloatArray, duration_s: FloatArray, memory_s: float) -> FloatArray:
+    """Correlation of an Ornstein-Uhlenbeck process's changes over intervals ``(N, N)``."""
+
+    def at(gap_s: FloatArray) -> FloatArray:
+        return np.asarray(np.exp(-np.abs(gap_s) / memory_s))
+
+    mine, other = duration_s[:, None], duration_s[None]
+    return at(apart_s + mine - other) + at(apart_s) - at(apart_s + mine) - at(apart_s - other)
+
+
+@dataclass(frozen=True, slots=True)
+class _Slow:
+    """Noise with a memory: covariance ``(N, N)``, the part of it that is velocity bias, log prior."""
+
+    covariance: FloatArray
+    bias: FloatArray
+    log_prior: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Fit:
+    theta: FloatArray
+    information: FloatArray
+    vector: FloatArray
+    residual: FloatArray
+    slow: FloatArray
+    """``(axes, N)``, the part of the residual that is bias or drift."""
+    bias: FloatArray
+    """``(axes, N)``, the part that is bias."""
+    noise: _Slow
+    inverse_trace: float
+
+
+def _best(
+    white: FloatArray,
+    tried: list[_Slow],
+    J: FloatArray,
+    latent: FloatArray,
+    target: FloatArray,
+    prior: FloatArray,
+) -> _Fit | None:
+    """Generalised least squares ``(axes, N, unknowns)`` with the slow noise that explains most."""
+    best, likeliest = None, -math.inf
+    n = len(white)
+    for noise in tried:
+        C = noise.covariance.copy()
+        C.flat[:: n + 1] += white
+        factor, info = lapack.dpotrf(C, lower=True)
+        if info != 0:
+            continue
+        inverse = cho_solve((factor, True), np.eye(n), check_finite=False)
+        weighted = inverse @ J  # (axes, N, unknowns)
+        A = np.einsum("anu,anv->uv", latent, weighted)
+        A = 0.5 * (A + A.T)
+        v = np.einsum("anu,anx->u", latent, inverse @ target)
+        try:
+            theta = np.linalg.solve(A + prior, v)
+        except np.linalg.LinAlgError:
+            continue
+        residual = (target[:, :, 0] - J @ theta).reshape(len(J), n)
+        whitened = residual @ inverse
+        dof = residual.size + _BELIEF
+        kappa = (float(np.sum(residual * whitened)) + _BELIEF) / dof
+        sign, logdet = np.linalg.slogdet(A + prior)
+        spent = 2.0 * len(J) * float(np.sum(np.log(np.diag(factor)))) + (float(logdet) if sign > 0 else math.inf)
+        likely = noise.log_prior - 0.5 * (dof * math.log(kappa) + spent)
+        if likely > likeliest:
+            likeliest = likely
+            slow, bias = whitened @ noise.covariance, whitened @ noise.bias
+            best = _Fit(theta, A / kappa, v / kappa, residual, slow, bias, noise, float(np.trace(inverse)) / kappa)
+    return best

@@ -1,0 +1,132 @@
+import math
+
+import numpy as np
+import pytest
+
+from edgeslam_torch.fusion.joint_scale import displacement_evidence, height_evidence, solved
+from edgeslam_torch.fusion.rotations import matrix_from_rpy
+from edgeslam_torch.fusion.scale import floor_segments
+
+TILT = math.radians(3.0)
+SCALE = 2.5
+
+
+def path(n=80, size_m=0.4):
+    """Positions every half second of a swing in three axes [m]."""
+    t = 0.5 * np.arange(n + 1)
+    return t, size_m * np.stack([np.sin(0.9 * t), np.sin(0.7 * t + 1.0), 0.6 * np.sin(1.1 * t + 2.0)], axis=1)
+
+
+def moved(rng, n=80, noise_m=0.0094, noise_map_m=0.0, bias=None, R=None):
+    t, p = path(n)
+    d = np.diff(p, axis=0)
+    seen = np.diff(p + noise_map_m * rng.standard_normal(p.shape), axis=0) / SCALE
+    told = d + noise_m * rng.standard_normal(d.shape) + (0.0 if bias is None else 0.5 * bias)
+    return t[:-1], seen if R is None else seen @ R, told
+
+
+def displaced(t, seen, told, sigma_map_m=1e-4, sigma_m=0.0094):
+    n = len(t)
+    sigma_map = np.full(n, sigma_map_m / SCALE)
+    return displacement_evidence(seen, told, t, np.full(n, 0.5), sigma_map, np.full(n, sigma_m), TILT)
+
+
+def flown(rng, n=300, noise_m=0.012, tilt=(0.0, 0.0), step=None):
+    """Heights at 10 Hz above a floor that may have furniture on it, and a map that may be tilted."""
+    t = 0.1 * np.arange(n)
+    p = 0.5 * np.stack([np.sin(0.3 * t), np.cos(0.4 * t), 0.5 * np.sin(0.5 * t)], axis=1)
+    z = p[:, 2] + 1.0 + noise_m * rng.standard_normal(n)
+    if step is not None:
+        z[step] -= 0.4
+    return t, p @ matrix_from_rpy(np.array([*tilt, 0.0])).T / SCALE, z
+
+
+def heights(t, p, z):
+    segment = floor_segments(t, z, SCALE * p[:, 2], 0.08)
+    return height_evidence(p, z, t, segment, 1e-4, 0.015, SCALE, TILT)
+
+
+def errors(draw, count):
+    """Log error of the scale and its ratio to the stated sigma, over draws."""
+    out = []
+    for _ in range(count):
+        s, sigma = solved(draw(), TILT)
+        out.append((math.log(s / SCALE), math.log(s / SCALE) / sigma))
+    return np.array(out).T
+
+
+def test_exact_displacements_give_the_exact_scale(rng):
+    assert solved([displaced(*moved(rng, noise_m=0.0))], TILT)[0] == pytest.approx(SCALE, rel=1e-4)
+
+
+def test_stated_sigma_is_that_of_the_errors(rng):
+    _, ratio = errors(lambda: [displaced(*moved(rng))], 60)
+    assert 0.6 < np.std(ratio) < 1.4  # 60 draws: one sigma of the standard deviation is 0.09
+    assert abs(np.mean(ratio)) < 0.5
+
+
+def test_noise_of_both_sides_does_not_shrink_the_scale(rng):
+    error, _ = errors(lambda: [displaced(*moved(rng, 200, noise_map_m=0.03), math.sqrt(2) * 0.03)], 30)
+    assert abs(np.mean(error)) < 0.02
+
+
+def test_a_velocity_bias_that_walks_does_not_pull_the_scale(rng):
+    def biased():
+        walk = 0.03 * rng.standard_normal(3) + 0.01 * np.cumsum(rng.standard_normal((80, 3)), axis=0) * math.sqrt(0.5)
+        return [displaced(*moved(rng, bias=walk))]
+
+    error, ratio = errors(biased, 30)
+    assert np.sqrt(np.mean(error**2)) < 0.03
+    assert np.sqrt(np.mean(ratio**2)) < 1.6
+
+
+def test_the_bias_at_the_end_is_reported(rng):
+    bias = np.array([0.05, -0.04, 0.0])
+    np.testing.assert_allclose(displaced(*moved(rng, bias=bias)).bias, bias, atol=0.02)
+
+
+def test_a_rotation_of_the_map_costs_no_scale(rng):
+    R = matrix_from_rpy(np.array([0.02, -0.03, 0.05]))
+    error, _ = errors(lambda: [displaced(*moved(rng, R=R))], 10)
+    assert abs(np.mean(error)) < 0.01
+
+
+def test_a_fifth_of_frozen_readings_does_not_pull_the_scale(rng):
+    t, seen, told = moved(rng)
+    told[20:36] = told[19]
+    assert solved([displaced(t, seen, told)], TILT)[0] == pytest.approx(SCALE, rel=0.04)
+
+
+def test_too_little_says_nothing(rng):
+    t, seen, told = moved(rng)
+    assert displaced(t[:5], seen[:5], told[:5]) is None
+    assert displaced(t, 0.0 * seen, told) is None
+    t, p, z = flown(rng)
+    assert heights(t[:8], p[:8], z[:8]) is None
+
+
+def test_height_gives_the_scale_of_a_tilted_map(rng):
+    """One degree of tilt over half a metre is a centimetre of height: left out, 4 % of this motion."""
+    error, ratio = errors(lambda: [heights(*flown(rng, tilt=(0.02, -0.02)))], 20)
+    assert np.sqrt(np.mean(error**2)) < 0.015
+    assert np.sqrt(np.mean(ratio**2)) < 1.6
+
+
+def test_furniture_below_does_not_pull_the_height(rng):
+    s, sigma = solved([heights(*flown(rng, step=slice(120, 160)))], TILT)
+    assert s == pytest.approx(SCALE, rel=0.04)
+    assert sigma < 0.05
+
+
+def test_both_together_say_more_than_either(rng):
+    moves, height = displaced(*moved(rng)), heights(*flown(rng))
+    together = solved([moves, height], TILT)[1]
+    assert together < min(solved([moves], TILT)[1], solved([height], TILT)[1])
+
+
+def test_an_error_that_no_averaging_removes_bounds_the_sigma(rng):
+    evidence = displaced(*moved(rng, 200))
+    s, sigma = solved([evidence], TILT)
+    softened = solved([evidence.softened(0.05 * SCALE)], TILT)
+    assert softened[0] == pytest.approx(s, rel=1e-3)
+    assert softened[1] == pytest.approx(math.hypot(sigma, 0.05), rel=0.02)
