@@ -1,6 +1,7 @@
 """Drive the SLAM system over a source and leave the results in a folder: what ``edgeslam run`` does."""
 
 import logging
+import math
 import signal
 import threading
 import time
@@ -75,6 +76,9 @@ class Slam(Protocol):
 
     def keyframes(self) -> Sequence[Any]:
         """Keyframes in the map."""
+
+    def telemetry_statistics(self) -> dict[str, float]:
+        """What telemetry told; empty without."""
 
     @property
     def scale(self) -> ScaleEstimate:
@@ -261,7 +265,7 @@ class _Run:
             self.slam.finish()
         except KeyboardInterrupt:
             logger.warning("stopped before the last refinement was through")
-        wall_s = loop_s + time.perf_counter() - started
+        finish_s = time.perf_counter() - started
         stamps, poses = self.slam.trajectory()
         edge_map, anchors, scale = self.slam.edge_map(), self.slam.anchors(), self.slam.scale
         for listener in self.listeners:
@@ -269,13 +273,14 @@ class _Run:
         self.slam.close()
         cpu_s = time.process_time() - cpu_start_s
         summary = {
-            **summarise(self.source, self.tally, scale, self.dropped.value, wall_s, cpu_s),
+            **summarise(self.source, self.tally, scale, self.dropped.value, loop_s, finish_s, cpu_s),
             "map": {
                 "keyframes": len(self.slam.keyframes()),
                 "anchors": len(anchors.p_w),
                 "edge_points": len(edge_map.p_w),
             },
             "events": dict(self.slam.events),
+            "fusion": {k: v for k, v in self.slam.telemetry_statistics().items() if math.isfinite(v)},
             "mode": str(self.mode),
             "seed": self.config.seed,
             "interrupted": self.interrupt.requested,

@@ -52,7 +52,7 @@ class Tally:
 
 
 def summarise(
-    source: Source, tally: Tally, scale: ScaleEstimate, dropped: int, wall_s: float, cpu_s: float
+    source: Source, tally: Tally, scale: ScaleEstimate, dropped: int, loop_s: float, finish_s: float, cpu_s: float
 ) -> dict[str, Any]:
     """The part of the summary that every run has; the caller adds what only it knows.
 
@@ -61,8 +61,9 @@ def summarise(
         tally: Of at least one frame.
         scale: At the end.
         dropped: Frames that came too late in real time.
-        wall_s: Time from the first frame to the end of the last refinement.
-        cpu_s: User and system time of the whole process, all threads, over the same.
+        loop_s: Time from the first frame to the last.
+        finish_s: Time of the last refinement, once no frame follows.
+        cpu_s: User and system time of the whole process, all threads, over both.
     """
     offered = tally.frames + dropped + len(source.problems)
     return {
@@ -78,8 +79,9 @@ def summarise(
         "left_out": len(source.problems),
         "statuses": tally.statuses,
         "last_reason": tally.last_reason,
-        "duration_s": wall_s,
-        "fps": tally.frames / wall_s if wall_s > 0 else None,
+        "duration_s": loop_s + finish_s,
+        "finish_s": finish_s,
+        "fps": tally.frames / loop_s if loop_s > 0 else None,
         "cpu_ms_per_frame": 1e3 * cpu_s / tally.frames,
         "peak_rss_mb": peak_rss_mb(),
         "step_ms": {"median": float(np.median(tally.step_ms)), "p95": float(np.percentile(tally.step_ms, 95))},
