@@ -77,7 +77,7 @@ byId("colour").addEventListener("change", e => { viewer.mode = MODES[e.target.va
 // Sigma codes are logarithmic between the two ends.
 function sigmaLimit() {
   const t = byId("sigma").value / 100, [lo, hi] = EDGES.sigma;
-  viewer.sigmaMax = t >= 1 ? 2 : t; byId("sigma-out").textContent = t >= 1 ? "any" : `${short(lo * Math.pow(hi / lo, t))} ${DATA.unit}`; viewer.request();
+  viewer.sigmaMax = t >= 1 ? 2 : t; byId("sigma-out").textContent = t >= 1 ? "off" : `${short(lo * Math.pow(hi / lo, t))} ${DATA.unit}`; viewer.request();
 }
 byId("sigma").addEventListener("input", sigmaLimit); sigmaLimit();
 byId("size").addEventListener("input", e => { viewer.size = +e.target.value; viewer.request(); });
