@@ -467,6 +467,10 @@ class EdgeSlam:
         """Metres per map unit."""
         return self._fusion.scale()
 
+    def telemetry_statistics(self) -> dict[str, float]:
+        """What the drone's telemetry told: counts, delay, tilt, each source's scale; empty without telemetry."""
+        return self._fusion.statistics() if self._has_telemetry else {}
+
     # -- helpers -----------------------------------------------------------------------------------------------
 
     def _output(

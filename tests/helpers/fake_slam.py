@@ -53,6 +53,9 @@ class FakeSlam:
         poses[:, 2, 3] += 1.0
         return np.array([o.stamp_s for o in self.outputs]), poses
 
+    def telemetry_statistics(self):
+        return {}
+
     def edge_map(self):
         p = np.random.default_rng(0).random((500, 3)).astype(np.float32)
         return PointCloud(p, (p * 255).astype(np.uint8), np.full(500, 0.01, np.float32), np.full(500, 3, np.int32))
