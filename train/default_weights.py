@@ -59,6 +59,8 @@ class Recipe:
 
     rooms: int = 350
     views_per_room: int = 6
+    with_rendered: bool = True
+    """Whether rendered rooms are trained on; without, the recordings share their part."""
     broad: TrainConfig = TrainConfig(
         steps=2200, lr=1e-3, encoder_lr=1.2e-4, lr_end=1.0, validate_every=550, checkpoint_every=100
     )
@@ -134,7 +136,11 @@ def make_default_weights(data: Path, out: Path, recipe: Recipe, watch: Sequence[
     out.mkdir(parents=True, exist_ok=True)
     torch.manual_seed(0)
     height, width = INPUT_SIZE
-    data_names = ("ImageNet (encoder)", *REAL, RENDERED)
+    broad, settle = (
+        {name: share for name, share in shares.items() if recipe.with_rendered or name != RENDERED}
+        for shares in (BROAD, SETTLE)
+    )
+    data_names = ("ImageNet (encoder)", *broad)
     metadata = Metadata(input_height=height, input_width=width, data=data_names, licence=LICENCE)
     rooms = out / "rendered.npz"
     if not rooms.is_file():
@@ -147,9 +153,9 @@ def make_default_weights(data: Path, out: Path, recipe: Recipe, watch: Sequence[
     validate = validation_of(metadata, {RENDERED: held_out, **watched})
     network = build_network(metadata)
     load_imagenet_encoder(network, data / IMAGENET)
-    _phase(network, metadata, pools, BROAD, recipe.broad, recipe.broad_augment, out / "broad", validate)
+    _phase(network, metadata, pools, broad, recipe.broad, recipe.broad_augment, out / "broad", validate)
     network = load_checkpoint(out / "broad" / "final.safetensors")[0]
-    _phase(network, metadata, pools, SETTLE, recipe.settle, recipe.settle_augment, out / "settle", validate)
+    _phase(network, metadata, pools, settle, recipe.settle, recipe.settle_augment, out / "settle", validate)
     network = load_checkpoint(out / "settle" / "final.safetensors")[0]
     metadata = calibrate_sigma(network, metadata, held_out)
     save_checkpoint(network, metadata, out / "default.safetensors", half=True)
@@ -181,10 +187,11 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--watch", nargs="*", default=[], help="recordings drawn into the curve, never trained on")
     parser.add_argument("--steps", type=int, nargs=2, metavar=("BROAD", "SETTLE"), help="other lengths of the phases")
+    parser.add_argument("--recordings-only", action="store_true", help="train on no rendered rooms, for comparison")
     args = parser.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
     torch.set_num_threads(1)
-    recipe = Recipe()
+    recipe = Recipe(with_rendered=not args.recordings_only)
     if args.steps:
         broad, settle = args.steps
         recipe = dataclasses.replace(

@@ -4,6 +4,7 @@ import dataclasses
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from enum import StrEnum
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +29,16 @@ logger = logging.getLogger(__name__)
 
 HELD_OUT = 10
 """Every tenth labelled view validates when nothing else was given."""
+
+
+class FromRuns(StrEnum):
+    """What is learnt from images without labels."""
+
+    TEACHER = "teacher"
+    """Dense depth measured with the run's poses: the best, and four times as fast as pairs (docs/model_card.md)."""
+    PAIRS = "pairs"
+    """Losses on pairs of images: photometric, map points, cycle, L-shape."""
+    BOTH = "both"
 
 
 @dataclass
@@ -66,7 +77,14 @@ class Result:
         return "\n".join([*rows, str(self.weights)])
 
 
-def finetune(network: FastDepth, metadata: Metadata, data: Data, config: TrainConfig, out: Path) -> Result:
+def finetune(
+    network: FastDepth,
+    metadata: Metadata,
+    data: Data,
+    config: TrainConfig,
+    out: Path,
+    from_runs: FromRuns = FromRuns.TEACHER,
+) -> Result:
     """Train ``network`` on ``data``; resumes a run that was killed.
 
     Raises:
@@ -74,7 +92,7 @@ def finetune(network: FastDepth, metadata: Metadata, data: Data, config: TrainCo
         NonFiniteLossError: If a loss is not finite.
     """
     labelled, held_out = _split(data)
-    signals = build_signals(network, metadata, data.posed, labelled)
+    signals = build_signals(network, metadata, data.posed, labelled, from_runs)
     if not signals:
         raise SourceError("nothing to learn from: no images with depth and no run with poses")
     names = tuple(dict.fromkeys([*metadata.data, *(f.name for f in data.labelled), *(s.name for s in data.posed)]))
@@ -107,7 +125,11 @@ def finetune(network: FastDepth, metadata: Metadata, data: Data, config: TrainCo
 
 
 def build_signals(
-    network: FastDepth, metadata: Metadata, posed: Sequence[PosedSequence], labelled: Sequence[Source]
+    network: FastDepth,
+    metadata: Metadata,
+    posed: Sequence[PosedSequence],
+    labelled: Sequence[Source],
+    from_runs: FromRuns = FromRuns.TEACHER,
 ) -> list[Signal]:
     """One signal per kind of data; runs in arbitrary units are scaled to the network's own depth."""
     signals: list[Signal] = []
@@ -116,10 +138,11 @@ def build_signals(
     usable = [s for s in posed if s.usable]
     if usable:
         scales = [0.0 if s.metric else fit_log_scale(*_points_and_depths(network, metadata, s)) for s in usable]
-        # Dense but only as good as the starting network between the map's points; then what the images themselves say.
-        taught = [Source(s.name, teach(network, metadata, s, k), 1.0) for s, k in zip(usable, scales, strict=True)]
-        signals.append(Supervised(taught, metadata, name="teacher"))
-        signals.append(SelfSupervised(usable, metadata, scales))
+        if from_runs is not FromRuns.PAIRS:
+            taught = [Source(s.name, teach(network, metadata, s, k), 1.0) for s, k in zip(usable, scales, strict=True)]
+            signals.append(Supervised(taught, metadata, name="teacher"))
+        if from_runs is not FromRuns.TEACHER:
+            signals.append(SelfSupervised(usable, metadata, scales))
     return signals
 
 

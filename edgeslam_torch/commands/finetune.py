@@ -26,9 +26,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--ignore-depth", action="store_true", help="do not use depth maps that recordings hold")
     parser.add_argument("--max-frames", type=int, help="use the first frames of each recording only")
     parser.add_argument("--validate", type=Path, nargs="*", default=[], help="recordings with depth to validate on")
-    parser.add_argument("--steps", type=int, default=600)
+    parser.add_argument("--steps", type=int, default=100, help="default: 100; more learns a run by heart")
     parser.add_argument("--batch", type=int, default=6, help="images (or pairs) per step over all processes")
     parser.add_argument("--lr", type=float, default=3e-4, help="learning rate of the decoder; the encoder's is a fifth")
+    parser.add_argument(
+        "--from-runs",
+        choices=("teacher", "pairs", "both"),
+        default="teacher",
+        help="what images without depth teach: depth measured with the run's poses (default), losses on pairs of "
+        "images, or both (four times slower)",
+    )
     parser.add_argument("--freeze-encoder", action="store_true", help="train the decoder alone (twice as fast)")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--patience", type=int, default=0, help="stop after this many validations without progress")
@@ -43,7 +50,7 @@ def main(args: argparse.Namespace) -> int:
 
     from edgeslam_torch.models.checkpoint import load_checkpoint
     from edgeslam_torch.train.distributed import process_group
-    from edgeslam_torch.train.finetune import finetune
+    from edgeslam_torch.train.finetune import FromRuns, finetune
     from edgeslam_torch.train.recipe import TrainConfig
 
     if args.steps < 1 or args.batch < 1:
@@ -62,14 +69,14 @@ def main(args: argparse.Namespace) -> int:
             encoder_lr=args.lr / 5,
             frozen_stages=14 if args.freeze_encoder else 4,
             freeze_norm=True,
-            warmup_steps=min(30, args.steps // 4),
+            warmup_steps=min(20, args.steps // 4),
             ema_decay=0.99,
             validate_every=max(args.steps // 8, 1),
             checkpoint_every=max(args.steps // 8, 1),
             patience=args.patience,
             amp=args.amp,
         )
-        result = finetune(network, metadata, data, config, args.out)
+        result = finetune(network, metadata, data, config, args.out, FromRuns(args.from_runs))
     if rank == 0:
         print(result.describe())
     return 0

@@ -264,8 +264,23 @@ def test_finetune_command_on_a_run(run_folder: Path, tmp_path: Path, capsys: pyt
     parser = argparse.ArgumentParser()
     finetune.add_arguments(parser)
     given = [str(run_folder), "--out", str(tmp_path / "out"), "--weights", str(tmp_path / "start.safetensors")]
-    assert finetune.main(parser.parse_args([*given, "--steps", "3", "--batch", "2"])) == 0
+    assert finetune.main(parser.parse_args([*given, "--steps", "3", "--batch", "2", "--from-runs", "both"])) == 0
     assert "11 posed images" in capsys.readouterr().out
     _, metadata = load_checkpoint(tmp_path / "out" / "weights.safetensors")
     assert metadata.data == ("run",)
     assert list((tmp_path / "out" / "tensorboard").iterdir())
+
+
+@pytest.mark.slow
+def test_finetune_command_runs_the_slam_on_a_flight(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from edgeslam_torch.cli import main
+    from edgeslam_torch.demo import DemoSettings, record
+    from edgeslam_torch.models.checkpoint import load_checkpoint
+
+    record(tmp_path / "flight", DemoSettings(seconds=6.0, rate_hz=12.0, width=320, height=240))
+    out = tmp_path / "out"
+    given = [str(tmp_path / "flight"), "--ignore-depth", "--out", str(out)]
+    assert main(["finetune", *given, "--steps", "2", "--batch", "2"]) == 0
+    assert "posed images without depth" in capsys.readouterr().out
+    assert is_run_folder(out / "slam" / "flight")
+    assert "flight" in load_checkpoint(out / "weights.safetensors")[1].data
