@@ -11,7 +11,14 @@ from edgeslam_torch.mapping.keyframe import Keyframe
 from edgeslam_torch.mapping.refinement import Window, refine
 from edgeslam_torch.mapping.slam_map import SlamMap
 from edgeslam_torch.optim.problem import LmConfig
-from edgeslam_torch.tracking.initialiser import BootstrapView, TwoView, consensus, poses_of_witnesses, two_view_map
+from edgeslam_torch.tracking.initialiser import (
+    BootstrapView,
+    Consensus,
+    TwoView,
+    consensus,
+    poses_of_witnesses,
+    two_view_map,
+)
 from edgeslam_torch.tracking.tracker import Track, Tracker, View
 from edgeslam_torch.types import FloatArray
 
@@ -19,6 +26,9 @@ logger = logging.getLogger(__name__)
 
 WITNESS_SHARE = 0.6
 """Share of matches in the frames between that must agree with a two-view map, or it is refused."""
+
+ALIKE_COST = 1.2
+"""Two structures whose costs differ by less than this factor both explain the images."""
 
 AGREEING_SHARE = 0.8
 """The same after all frames were refined together; 95 % would agree if every match were right."""
@@ -94,12 +104,53 @@ class Bootstrap:
         if share < WITNESS_SHARE:
             return replace(two_view, ok=False, reason="the frames between disagree with two views")
         joint = consensus(self.reference, two_view, view, self.views[:-1], poses, self.tracker.camera)
+        if self.reference.depth is not None:
+            joint = self._likelier(joint, self._from_guess(view, two_view))
         logger.debug("initialisation: %s", joint)
         if joint.agreeing < AGREEING_SHARE or len(joint.two_view.p_w) < self.config.min_points:
             return replace(two_view, ok=False, reason="the frames together disagree with two views")
         if joint.direction_sigma > self.config.max_direction_sigma:
             return replace(two_view, ok=False, reason="a turn cannot yet be told from a shift")
         return joint.two_view
+
+    def _from_guess(self, view: View, two_view: TwoView) -> Consensus:
+        """The same matches refined from where tracking against the network's depth put cameras and points."""
+        reference, keypoint = self.reference, two_view.reference_keypoint
+        p_r = self.tracker.camera.back_project(reference.features.uv[keypoint], self.guess_depth[keypoint])
+        start = replace(two_view, T_c_w=self.views[-1].T_c_w, p_w=se3.transform(reference.T_w_c, p_r))
+        tracked = [v.T_c_w for v in self.views[:-1]]
+        joint = consensus(reference, start, view, self.views[:-1], tracked, self.tracker.camera)
+        return replace(joint, two_view=self._at_guessed_scale(joint.two_view))
+
+    def _likelier(self, a: Consensus, b: Consensus) -> Consensus:
+        """Of two structures the one that fits the images; when both do, the one shaped as the network sees it.
+
+        A small turn and a small shift move the image alike, so that the cost has two minima: the right one, and a
+        flatter scene with a camera that turned more.
+        """
+        if max(a.cost, b.cost) > ALIKE_COST * min(a.cost, b.cost):
+            return a if a.cost < b.cost else b
+        return a if self._unlike_network(a) <= self._unlike_network(b) else b
+
+    def _unlike_network(self, joint: Consensus) -> float:
+        """Robust spread of the log ratio of triangulated to guessed depth; the common scale does not count."""
+        ratio = self._log_ratio(joint.two_view)
+        return float(np.median(np.abs(ratio - np.median(ratio)))) if len(ratio) else np.inf
+
+    def _log_ratio(self, two_view: TwoView) -> FloatArray:
+        """Log of triangulated over guessed depth ``(P,)``."""
+        z = se3.transform(self.reference.T_c_w, two_view.p_w)[:, 2]
+        return np.log(np.maximum(z, 1e-9) / self.guess_depth[two_view.reference_keypoint])
+
+    def _at_guessed_scale(self, two_view: TwoView) -> TwoView:
+        """Structure and baseline scaled to the guessed depths' median, as `two_view_map` does."""
+        if len(two_view.p_w) == 0:
+            return two_view
+        scale = np.exp(-np.median(self._log_ratio(two_view)))
+        T_c_r = two_view.T_c_w @ self.reference.T_w_c
+        T_c_r[:3, 3] *= scale
+        p_r = se3.transform(self.reference.T_c_w, two_view.p_w) * scale
+        return replace(two_view, T_c_w=T_c_r @ self.reference.T_c_w, p_w=se3.transform(self.reference.T_w_c, p_r))
 
     def replace_map(self, keyframe: Keyframe, two_view: TwoView, lm: LmConfig) -> dict[int, FloatArray]:
         """Put the two-view map in place of the guessed one and refine it.

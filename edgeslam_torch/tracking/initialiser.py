@@ -146,6 +146,8 @@ class Consensus:
     direction_sigma: float
     """Standard deviation of the newest camera's position relative to the baseline; the ambiguity between turning
     and shifting shows here."""
+    cost: float
+    """Robust cost of the refined structure, to be compared with another one of the same observations."""
 
 
 def consensus(
@@ -221,4 +223,4 @@ def consensus(
         reference_keypoint=two_view.reference_keypoint[kept],
         keypoint=two_view.keypoint[kept],
     )
-    return Consensus(refined, float(agreeing.mean()), sigma)
+    return Consensus(refined, float(agreeing.mean()), sigma, result.cost_after)
