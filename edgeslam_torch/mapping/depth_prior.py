@@ -8,6 +8,11 @@ from scipy.spatial import cKDTree
 from edgeslam_torch.mapping.keyframe import Keyframe
 from edgeslam_torch.types import DepthMap, FloatArray
 
+REACH_PX = 40.0
+"""Distance from an anchor at which its depth error says a third as much about the network's there."""
+NEAREST = 4
+"""Anchors that speak for a pixel."""
+
 MIN_ANCHORS = 8
 """Below this a fit to anchors says less than the network."""
 
@@ -47,8 +52,9 @@ def depth_prior(
 ) -> tuple[FloatArray, FloatArray]:
     """Expected z-depth [map units] and its log sigma at pixels ``(N, 2)`` of a keyframe, ``(N,)`` each.
 
-    With a depth map: the network's depth, brought to map units by the keyframe's own anchors. Without one: the
-    distance-weighted log depth of the nearest anchors in the image, with a wide sigma.
+    With a depth map: the network's depth, brought to map units by the keyframe's own anchors, bent towards those
+    nearby, and as uncertain as it turned out to be at them: in a room it never saw, the network is surer of itself
+    than it should be. Without one: the log depth of the nearest anchors, with a wide sigma.
 
     Args:
         keyframe: Keyframe with some anchors.
@@ -63,13 +69,39 @@ def depth_prior(
         return np.full(len(uv), np.nan), np.full(len(uv), np.inf)
     anchor_uv = keyframe.features.uv[held]
     if keyframe.depth is not None:
-        fit = fit_to_anchors(sample(keyframe.depth, anchor_uv)[0], z)
+        at_anchors, _ = sample(keyframe.depth, anchor_uv)
+        fit = fit_to_anchors(at_anchors, z)
         if fit is not None:
             network, sigma = sample(keyframe.depth, uv)
-            return network * np.exp(fit.log_ratio), np.hypot(sigma, 0.05)
-    k = min(4, len(held))
-    distance, nearest = cKDTree(anchor_uv).query(uv, k=k)
-    distance, nearest = distance.reshape(len(uv), k), nearest.reshape(len(uv), k)
-    weight = 1.0 / (distance + 5.0)
-    log_z = (weight * np.log(z)[nearest]).sum(1) / weight.sum(1)
+            known = np.isfinite(at_anchors)
+            error = np.log(z[known] / at_anchors[known]) - fit.log_ratio
+            bend, unexplained = _bend(anchor_uv[known], error, uv)
+            return network * np.exp(fit.log_ratio + bend), np.hypot(np.maximum(sigma, unexplained), 0.05)
+    log_z, _ = _nearby(cKDTree(anchor_uv), np.log(z), uv)
     return np.exp(log_z), np.full(len(uv), unknown_sigma_log)
+
+
+def _bend(anchor_uv: FloatArray, error: FloatArray, uv: FloatArray) -> tuple[FloatArray, float]:
+    """Correction of the network's log depth at pixels from its error at the anchors near them.
+
+    Returns:
+        The correction ``(N,)``, fading with the distance to the nearest anchor, and the robust spread of what it
+        leaves of each anchor's error when that anchor takes no part.
+    """
+    tree = cKDTree(anchor_uv)
+    mean, distance = _nearby(tree, error, uv)
+    mean_of_others, apart = _nearby(tree, error, anchor_uv, but_itself=True)
+    left = error - np.exp(-apart / REACH_PX) * mean_of_others
+    return np.exp(-distance / REACH_PX) * mean, 1.4826 * float(np.median(np.abs(left)))
+
+
+def _nearby(
+    tree: cKDTree, values: FloatArray, uv: FloatArray, but_itself: bool = False
+) -> tuple[FloatArray, FloatArray]:
+    """Distance-weighted mean of the values at the four nearest anchors, and the distance [px] to the nearest."""
+    k = min(NEAREST + but_itself, tree.n)
+    distance, nearest = (side.reshape(len(uv), k) for side in tree.query(uv, k=k))
+    if but_itself:
+        distance, nearest = distance[:, 1:], nearest[:, 1:]
+    weight = 1.0 / (distance + 5.0)
+    return (weight * values[nearest]).sum(1) / weight.sum(1), distance[:, 0]

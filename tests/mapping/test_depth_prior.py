@@ -86,3 +86,20 @@ def test_anchors_behind_the_camera_do_not_count(points):
     keyframe = points.keyframes[0]
     keyframe.T_c_w = se3.exp(np.array([0, 0, 0, 0, np.pi, 0])) @ keyframe.T_c_w
     assert np.isnan(depth_prior(keyframe, keyframe.features.uv[:4], points.map.anchors.p_w, 0.35)[0]).all()
+
+
+@pytest.mark.parametrize("twist", [0.0, 0.3])
+def test_network_that_errs_is_bent_towards_the_anchors_and_trusted_less(points, twist):
+    """An error that grows across the image, as in a room that the network never saw; it says one per cent."""
+    keyframe, z = points.keyframes[0], true_depth(points, 0)
+    u, v = np.rint(keyframe.features.uv).astype(int).T
+    error = twist * (u - 320) / 320
+    depth, sigma = np.full((480, 640), np.nan, np.float32), np.full((480, 640), 0.01, np.float32)
+    depth[np.clip(v, 0, 479), np.clip(u, 0, 639)] = z * np.exp(error)
+    keyframe.depth = DepthMap(depth, sigma)
+    prior, prior_sigma = depth_prior(keyframe, keyframe.features.uv, points.map.anchors.p_w, 0.35)
+    known = np.isfinite(prior)
+    left = np.abs(np.log(prior / z))[known]
+    assert np.median(left) <= 0.5 * np.median(np.abs(error)) + 0.01
+    assert np.median(prior_sigma[known]) == pytest.approx(0.051, abs=0.003) or twist > 0
+    assert np.mean(left < 2.5 * prior_sigma[known]) > 0.97

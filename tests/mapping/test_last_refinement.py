@@ -64,7 +64,7 @@ def test_every_form_leaves_a_sound_map(name):
     assert result.cost_after <= result.cost_before
     assert np.isfinite(log.poses()[1]).all()
     assert all(np.isfinite(h.p_c).all() and (h.p_c[:, 2] > 0).all() for h in edges.hosts)
-    assert ate(log) < 0.02  # of 0.9 m; 0.003 to 0.006 when written
+    assert ate(log) < 0.02  # of 0.9 m
 
 
 def test_edges_take_part_and_their_depths_go_back_to_the_keyframes():
