@@ -15,6 +15,8 @@ from edgeslam_torch.io.tello import StateMessage
 from edgeslam_torch.io.tello_answers import belongs_to, is_refusal
 from edgeslam_torch.types import Frame
 
+pytestmark = pytest.mark.timeout(1200)  # ten thousand cases on a machine that does other things too
+
 NUMBERS = st.one_of(
     st.floats(), st.integers(-(10**20), 10**20), st.sampled_from(["", "nan", "1e999", "0x3", "٣", "\0"])
 )
