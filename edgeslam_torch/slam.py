@@ -109,8 +109,6 @@ class EdgeSlam:
         self._fusion.refined_poses = self.log.poses
         self._published = Published()
         self._bootstrap: Bootstrap | None = None
-        self._starts: list[Bootstrap] = []
-        """How each piece of map began; its first frames are placed again at the end."""
         self._T_c_w = se3.inverse(first_pose(np.full(3, np.nan), self._T_b_c))
         self._velocity: FloatArray = np.zeros(6)
         """Tangent of the camera's motion per second, left-applied to ``T_c_w``."""
@@ -335,7 +333,6 @@ class EdgeSlam:
             between = bootstrap.replace_map(keyframe, two_view, self._lm)
             self._mapper.triangulate_new(keyframe, [reference], colours_at(keyframe.image, view.features.uv))
         self.log.replace(between, reference.id)
-        self._starts.append(bootstrap)
         self._bootstrap = None
         previous = between[max(between)] if between else reference.T_c_w
         self._T_c_w = previous
@@ -431,9 +428,6 @@ class EdgeSlam:
         """Refine the whole map, measure the last edges and fix the published scale, once no frame follows."""
         self._wait()
         last_refinement(self.map, self.camera, self.edges, self.config.window)
-        for start in self._starts:
-            if start.reference.id in self.map.keyframes:
-                self.log.replace(start.frames_between(), start.reference.id)
         self._fusion.revise(*self.log.poses())
         estimate = self.scale
         if np.isfinite(estimate.sigma):

@@ -36,12 +36,13 @@ class TrajectoryLog:
         self.records.append(FrameRecord(index, stamp_s, keyframe_id, T_c_k))
 
     def replace(self, T_c_w_of_frame: dict[int, FloatArray], keyframe_id: int) -> None:
-        """Give some frames, by index, new poses."""
+        """Give recent frames, by index, new poses."""
         T_w_k = se3.inverse(self.map.pose_of(keyframe_id))
-        for record in self.records:
-            if record.index in T_c_w_of_frame:
-                record.keyframe_id = keyframe_id
-                record.T_c_k = T_c_w_of_frame[record.index] @ T_w_k
+        for record in reversed(self.records):
+            if record.index not in T_c_w_of_frame:
+                break
+            record.keyframe_id = keyframe_id
+            record.T_c_k = T_c_w_of_frame[record.index] @ T_w_k
 
     def poses(self, since_s: float = -math.inf) -> tuple[FloatArray, FloatArray]:
         """Stamps ``(F,)`` and ``T_w_c`` ``(F, 4, 4)`` in the map as it is now, of frames not older than ``since_s``."""

@@ -176,17 +176,8 @@ class Bootstrap:
         # The essential matrix leaves the scale to the guess: refinement holds the baseline where the guess put it.
         refine(self.map, Window([keyframe], [reference], ids), self.tracker.camera, lm)
         self.map.refresh_anchors(ids[self.map.anchors.alive[ids]])
-        return self.frames_between()
-
-    def frames_between(self) -> dict[int, FloatArray]:
-        """``T_c_w`` of the frames between the first keyframe and the second in the map as it is now, by index.
-
-        They were tied to a baseline that refinement has changed since, so they are placed again at the end.
-        """
-        held = self.reference.keypoints_with_anchor()
-        points = np.full((len(self.reference.anchor), 3), np.nan)
-        points[held] = self.map.anchors.p_w[self.reference.anchor[held]]
-        between = self.views[:-1]
-        poses, _ = poses_of_witnesses(between, points, self.tracker.camera)
-        self.views[:-1] = [replace(view, T_c_w=T) for view, T in zip(between, poses, strict=True)]
-        return {view.frame_index: T for view, T in zip(between, poses, strict=True)}
+        held = reference.keypoints_with_anchor()
+        points = np.full((len(reference.anchor), 3), np.nan)
+        points[held] = self.map.anchors.p_w[reference.anchor[held]]
+        poses, _ = poses_of_witnesses(self.views[:-1], points, self.tracker.camera)
+        return {v.frame_index: T for v, T in zip(self.views, poses, strict=False)}
