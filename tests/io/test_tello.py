@@ -368,7 +368,7 @@ def test_djitellopy_flies_the_emulator(emulate, monkeypatch):
     control = free_ports(1)[0]
     monkeypatch.setattr(djitellopy.Tello, "CONTROL_UDP_PORT", control)
     for patience in ("RESPONSE_TIMEOUT", "TAKEOFF_TIMEOUT", "FRAME_GRAB_TIMEOUT"):
-        monkeypatch.setattr(djitellopy.Tello, patience, PATIENCE_S)
+        monkeypatch.setattr(djitellopy.Tello, patience, int(PATIENCE_S))
     monkeypatch.setattr(djitellopy.Tello, "STATE_UDP_PORT", address.state_port)
     monkeypatch.setattr(djitellopy.Tello, "VS_UDP_IP", "127.0.0.1")
     drone = djitellopy.Tello(host="127.0.0.1", vs_udp=address.video_port)
