@@ -40,7 +40,8 @@ def _with_fallback(function: Callable[..., Any], fast: Callable[..., Any]) -> Ca
         if not failed:
             try:
                 return fast(*args)
-            except (TorchDynamoException, RuntimeError, OSError) as error:  # no compiler, no space, not supported
+            # No compiler, no space, not supported; or the cache on disk gave code made for other sizes, which asserts.
+            except (TorchDynamoException, RuntimeError, OSError, AssertionError) as error:
                 failed = True
                 logger.warning("torch.compile failed, eager from now on: %s", str(error).strip().split("\n")[0])
         return function(*args)

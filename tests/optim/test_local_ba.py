@@ -452,7 +452,9 @@ def test_gtsam_finds_the_same_minimum():
 
 
 @pytest.mark.slow
-def test_compiled_kernels_find_the_same_minimum():
+def test_compiled_kernels_find_the_same_minimum(monkeypatch, tmp_path):
+    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr(compiled, "_compiled", {})
     if shutil.which("g++") is None and shutil.which("clang++") is None:
         pytest.skip("no C++ compiler for torch.compile")
     problem = seeded_window(23, SMALL).problem
