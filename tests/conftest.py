@@ -8,6 +8,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from hypothesis import settings
+
+# No deadline: how long one case takes says something about what else the machine does, not about the code.
+settings.register_profile("edgeslam", deadline=None)
+settings.load_profile("edgeslam")
 
 
 @pytest.fixture
