@@ -1,4 +1,8 @@
 // A small WebGL2 viewer: points, lines, orbit camera. World is z up.
+// A frame draws as many points as fit into it (they come in random order: the first ones are a thinner picture of the
+// same map); once nothing moves, the following frames add the rest without clearing. So no frame is long, and a slow
+// machine shows the whole map a moment later.
+const FRAME_MS = 33, FIRST_POINTS = 20000, FEWEST_POINTS = 4000, REST_MS = 120;
 const POINT_VS = `#version 300 es
 layout(location=0) in vec3 a_position; layout(location=1) in vec3 a_colour; layout(location=2) in float a_sigma; layout(location=3) in float a_obs;
 uniform mat4 u_view, u_projection; uniform vec3 u_lo, u_extent, u_flat; uniform int u_mode; uniform vec2 u_range; uniform float u_size, u_sigmaMax, u_ortho;
@@ -25,17 +29,25 @@ const cross3 = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], 
 const add3 = (a, b, s = 1) => [a[0] + s * b[0], a[1] + s * b[1], a[2] + s * b[2]];
 const unit3 = a => { const n = Math.hypot(...a) || 1; return a.map(x => x / n); };
 
+// Whether there is no graphics card: smooth lines would then cost half of every frame.
+function drawnByProcessor() {
+  const gl = document.createElement("canvas").getContext("webgl2"), info = gl && gl.getExtension("WEBGL_debug_renderer_info");
+  const name = gl ? gl.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : gl.RENDERER) : "";
+  const lose = gl && gl.getExtension("WEBGL_lose_context"); if (lose) lose.loseContext();
+  return /swiftshader|llvmpipe|softpipe|software|basic render/i.test(name);
+}
+
 class Viewer {
   constructor(canvas, onChange) {
     this.canvas = canvas; this.onChange = onChange;
     this.show = { edges: true, anchors: false, trajectory: true, cameras: true, truth: true, grid: true };
     this.mode = 0; this.size = 10; this.sigmaMax = 1; this.lines = {}; this.view = "free"; this.pending = false;
-    this.moving = false; this.share = 1; this.last = 0;
-    const gl = this.gl = canvas.getContext("webgl2", { antialias: true, preserveDrawingBuffer: true });
+    this.moving = false; this.dirty = true; this.drawn = 0; this.budget = FIRST_POINTS; this.last = 0;
+    const gl = this.gl = canvas.getContext("webgl2", { preserveDrawingBuffer: true, antialias: !drawnByProcessor() });
     if (!gl) return;
     this.points = this.program(POINT_VS, POINT_FS); this.line = this.program(LINE_VS, LINE_FS);
     this.rampTexture();
-    this.clouds = { edges: this.upload(EDGES), anchors: this.upload(ANCHORS) };
+    this.clouds = { anchors: this.upload(ANCHORS), edges: this.upload(EDGES) };
     gl.enable(gl.DEPTH_TEST);
     this.home(); this.listen();
     new ResizeObserver(() => this.request()).observe(canvas);
@@ -62,11 +74,16 @@ class Viewer {
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_S, gl.CLAMP_TO_EDGE);
   }
 
+  // One buffer of 12 bytes a point (x y z, sigma, observations, colour, nothing), one draw call.
   upload(c) {
-    const gl = this.gl, vao = gl.createVertexArray(); gl.bindVertexArray(vao);
-    [[c.position, 3, gl.UNSIGNED_SHORT], [c.colour, 3, gl.UNSIGNED_BYTE], [c.sigmaCode, 1, gl.UNSIGNED_BYTE], [c.obsCode, 1, gl.UNSIGNED_BYTE]].forEach(([data, n, type], i) => {
-      gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer()); gl.bufferData(gl.ARRAY_BUFFER, data, gl.STATIC_DRAW);
-      gl.enableVertexAttribArray(i); gl.vertexAttribPointer(i, n, type, true, 0, 0);
+    const gl = this.gl, vao = gl.createVertexArray(), buffer = new ArrayBuffer(12 * c.n), u16 = new Uint16Array(buffer), u8 = new Uint8Array(buffer);
+    for (let i = 0; i < c.n; i++) {
+      for (let k = 0; k < 3; k++) { u16[6 * i + k] = c.position[3 * i + k]; u8[12 * i + 8 + k] = c.colour[3 * i + k]; }
+      u8[12 * i + 6] = c.sigmaCode[i]; u8[12 * i + 7] = c.obsCode[i];
+    }
+    gl.bindVertexArray(vao); gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer()); gl.bufferData(gl.ARRAY_BUFFER, buffer, gl.STATIC_DRAW);
+    [[3, gl.UNSIGNED_SHORT, 0], [3, gl.UNSIGNED_BYTE, 8], [1, gl.UNSIGNED_BYTE, 6], [1, gl.UNSIGNED_BYTE, 7]].forEach(([n, type, at], i) => {
+      gl.enableVertexAttribArray(i); gl.vertexAttribPointer(i, n, type, true, 12, at);
     });
     return { vao, n: c.n, lo: c.lo, extent: c.hi.map((h, k) => h - c.lo[k]) };
   }
@@ -141,23 +158,42 @@ class Viewer {
     this.target = add3(add3(this.target, right, -dx * s), up, dy * s); this.request(true);
   }
 
-  // While something moves, a slow machine draws only a share of the points (they come in random order), and all of
-  // them once it rests.
+  // Something has changed: the next frame starts a new picture. `moving`: more changes are on their way.
   request(moving = false) {
     if (!this.gl) return;
+    this.dirty = true;
     if (moving) {
       this.moving = true; clearTimeout(this.rest);
-      this.rest = setTimeout(() => { this.moving = false; this.request(); }, 250);
+      this.rest = setTimeout(() => { this.moving = false; this.next(); }, REST_MS);
     }
-    if (this.pending) return;
-    this.pending = true;
-    requestAnimationFrame(now => {
-      this.pending = false;
-      const took = now - this.last; this.last = now;
-      if (this.moving && took < 3000) this.share = Math.min(1, Math.max(0.05, this.share * (took > 45 ? 0.7 : took < 25 ? 1.25 : 1)));
-      this.draw(this.moving ? this.share : 1);
-    });
+    this.next();
   }
+
+  next() {
+    if (this.pending) return;
+    this.pending = true; requestAnimationFrame(now => this.frame(now));
+  }
+
+  // One frame: a new picture with its first points, or further points into the present one.
+  frame(now) {
+    this.pending = false;
+    this.adapt(now);
+    const total = this.total();
+    if (this.dirty) { this.dirty = false; this.begin(); this.drawn = 0; }
+    else if (this.moving || this.drawn >= total) return;
+    this.drawPoints(this.drawn, this.drawn + this.budget); this.drawn += this.budget;
+    if (this.drawn < total && !this.moving) this.next();
+  }
+
+  // Points a frame, from the time since the last one; a gap of a second was a pause, not a frame.
+  adapt(now) {
+    const took = now - this.last; this.last = now;
+    if (took <= 0 || took > 1000) return;
+    const factor = took > 1.3 * FRAME_MS ? Math.max(0.25, FRAME_MS / took) : took < 0.75 * FRAME_MS ? 1.3 : 1;
+    this.budget = Math.round(Math.min(Math.max(this.budget * factor, FEWEST_POINTS), Math.max(this.total(), FIRST_POINTS)));
+  }
+
+  total() { return Object.entries(this.clouds).reduce((s, [name, k]) => s + (this.show[name] ? k.n : 0), 0); }
 
   matrices() {
     const { back, right, up } = this.basis(), eye = add3(this.target, back, this.distance);
@@ -169,34 +205,45 @@ class Viewer {
     return { view, projection, focal: f * this.canvas.height / 2 };
   }
 
-  draw(share = 1) {
+  // The whole picture at once.
+  draw(points = Infinity) { this.begin(); this.drawPoints(0, points); }
+
+  // Empty canvas with the lines on it.
+  begin() {
     const gl = this.gl, c = this.canvas, ratio = Math.min(devicePixelRatio || 1, 2);
     const width = Math.round(c.clientWidth * ratio), height = Math.round(c.clientHeight * ratio);
-    if (!width || !height) return;
-    if (c.width !== width || c.height !== height) { c.width = width; c.height = height; }
-    gl.viewport(0, 0, width, height);
+    if (width && height && (c.width !== width || c.height !== height)) { c.width = width; c.height = height; }
+    gl.viewport(0, 0, c.width, c.height);
     gl.clearColor(...rgb("--stage"), 1); gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
-    const { view, projection, focal } = this.matrices();
+    const { view, projection } = this.matrices();
     gl.useProgram(this.line.p);
     gl.uniformMatrix4fv(this.line.u.u_view, false, view); gl.uniformMatrix4fv(this.line.u.u_projection, false, projection);
     for (const [name, l] of Object.entries(this.lines)) {
       if (!this.show[name === "current" ? "cameras" : name] || !l.count) continue;
       gl.bindVertexArray(l.vao); gl.drawArrays(l.strip ? gl.LINE_STRIP : gl.LINES, 0, l.count);
     }
+  }
+
+  // Points from..to of what is shown, anchors (few, and easily hidden) first.
+  drawPoints(from, to) {
+    const gl = this.gl, { view, projection, focal } = this.matrices(), u = this.points.u;
     gl.useProgram(this.points.p);
-    const u = this.points.u;
     gl.uniformMatrix4fv(u.u_view, false, view); gl.uniformMatrix4fv(u.u_projection, false, projection);
     gl.uniform1f(u.u_ortho, this.view === "free" ? 0 : this.distance);
     gl.uniform2f(u.u_range, ...DATA.height); gl.uniform3f(u.u_flat, ...rgb("--predicted"));
     gl.uniform1f(u.u_sigmaMax, this.sigmaMax);
+    let before = 0;
     for (const [name, k] of Object.entries(this.clouds)) {
       if (!this.show[name] || !k.n) continue;
+      const first = Math.max(0, from - before), last = Math.min(k.n, to - before);
+      before += k.n;
+      if (last <= first) continue;
       gl.uniform3f(u.u_lo, ...k.lo); gl.uniform3f(u.u_extent, ...k.extent);
       gl.uniform1i(u.u_mode, name === "anchors" ? 4 : this.mode);
       // Dark camera colours would vanish on a dark ground: lifted a little there.
       gl.uniform1f(u.u_lift, this.mode === 0 && name === "edges" && matchMedia("(prefers-color-scheme: dark)").matches ? 0.16 : 0);
       gl.uniform1f(u.u_size, this.size * 0.0004 * this.radius * focal * (name === "anchors" ? 2.2 : 1));
-      gl.bindVertexArray(k.vao); gl.drawArrays(gl.POINTS, 0, Math.ceil(share * k.n));
+      gl.bindVertexArray(k.vao); gl.drawArrays(gl.POINTS, first, last - first);
     }
   }
 }

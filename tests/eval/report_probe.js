@@ -1,8 +1,7 @@
-// Appended to a copy of the report by test_report_browser.py: works the page and writes what happened into the DOM.
+// Evaluated in the report by test_report_browser.py: works the page and returns what happened.
 (async () => {
-  const result = { errors: window.probeErrors, ready: document.documentElement.dataset.ready };
-  const checksum = () => {
-    viewer.draw();
+  const result = { ready: document.documentElement.dataset.ready };
+  const pixels = () => {
     const gl = viewer.gl, w = gl.drawingBufferWidth, h = gl.drawingBufferHeight, px = new Uint8Array(4 * w * h);
     gl.readPixels(0, 0, w, h, gl.RGBA, gl.UNSIGNED_BYTE, px);
     let drawn = 0, sum = 0;
@@ -12,10 +11,28 @@
     }
     return { drawn, sum };
   };
+  const checksum = () => { viewer.draw(); return pixels(); };
   if (!viewer.gl) { result.nogl = true; }
   else {
+    const pending = viewer.next; viewer.next = () => {};  // frames are called from here only
     result.start = checksum(); result.toggles = {};
-    viewer.draw(0.1); const draw = viewer.draw; viewer.draw = () => {}; result.sparse = checksum().drawn; viewer.draw = draw;
+    viewer.draw(0.1 * viewer.total()); result.sparse = pixels().drawn;
+    // Points in the frames after a change, and the picture that comes of them.
+    viewer.budget = Math.ceil(viewer.total() / 7); viewer.moving = false; viewer.dirty = true;
+    const chunks = [], drawPoints = viewer.drawPoints;
+    viewer.drawPoints = function (from, to) { chunks.push([from, Math.min(to, this.total())]); drawPoints.call(this, from, to); };
+    const adapt = viewer.adapt; viewer.adapt = () => {};
+    for (let k = 0; k < 20; k++) viewer.frame(k);
+    result.chunks = chunks; result.refined = pixels().sum; viewer.drawPoints = drawPoints; viewer.adapt = adapt;
+    // A machine of its own clock: 5 ms a frame and so many microseconds a point, turned for 60 frames.
+    const turn = micros => {
+      viewer.budget = FIRST_POINTS; viewer.last = 0; let now = 5000; const gaps = [];
+      viewer.begin = () => {}; viewer.drawPoints = () => {};
+      for (let k = 0; k < 60; k++) { const took = Math.max(1000 / 60, 5 + viewer.budget * micros / 1000); gaps.push(took); viewer.dirty = viewer.moving = true; viewer.frame(now += took); }
+      delete viewer.begin; delete viewer.drawPoints; viewer.moving = false;
+      return { gaps, points: viewer.budget };
+    };
+    result.paced = { slow: turn(6), fast: turn(0.01), total: viewer.total() };
     for (const input of document.querySelectorAll("#toggles input")) {
       const before = checksum(); input.click(); const after = checksum(); input.click();
       result.toggles[input.id] = { changed: before.sum !== after.sum, restored: checksum().sum === before.sum };
@@ -45,6 +62,7 @@
     gesture("pointerup", { pointerId: 1 }); gesture("pointerup", { pointerId: 2 });
     const sigma = document.getElementById("sigma"), before = checksum();
     sigma.value = 10; sigma.dispatchEvent(new Event("input")); result.sigmaHides = checksum().drawn < before.drawn;
+    viewer.next = pending;
   }
   const flat = document.getElementById("top"), px = flat.getContext("2d").getImageData(0, 0, flat.width, flat.height).data;
   result.flatColours = new Set(Array.from({ length: px.length / 4 }, (_, i) => (px[4 * i] << 16) | (px[4 * i + 1] << 8) | px[4 * i + 2])).size;
@@ -52,5 +70,5 @@
   result.sections = [...document.querySelectorAll("section[id^=s-]:not([hidden])")].map(s => s.id);
   result.wide = document.documentElement.scrollWidth > document.documentElement.clientWidth + 1;
   result.requests = performance.getEntriesByType("resource").map(r => r.name).filter(n => !n.startsWith("data:"));
-  const pre = document.createElement("pre"); pre.id = "probe"; pre.textContent = JSON.stringify(result); document.body.append(pre);
-})();
+  return result;
+})()
