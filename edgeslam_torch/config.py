@@ -83,11 +83,15 @@ class InitialisationConfig:
     min_points: int = 80
     """Anchors that must triangulate well."""
     max_reprojection_px: float = 2.0
+    keyframe_gap: int = 5
+    """Frames between those that become keyframes once the two views have made a map."""
+    most_keyframes: int = 12
+    """Of these frames at most; each costs a pass of the depth network."""
     max_direction_sigma: float = 0.05
     """Standard deviation of the second camera's position, relative to the baseline, above which two views wait."""
 
     def __post_init__(self) -> None:
-        _positive(self, "min_parallax_deg", "min_points", "max_reprojection_px")
+        _positive(self, "min_parallax_deg", "min_points", "max_reprojection_px", "keyframe_gap", "most_keyframes")
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,13 +138,13 @@ class EdgeConfig:
     canny_low: float = 40.0
     canny_high: float = 100.0
     """Grey-level gradient thresholds, L2 norm, 3x3 Sobel."""
-    max_pixels: int = 4000
+    max_pixels: int = 5000
     """Edge pixels kept per keyframe, evenly thinned."""
     delay_keyframes: int = 3
     """Keyframes that must follow before a keyframe's edges are measured: views from both sides, refined poses."""
     targets: int = 5
     """Keyframes searched for each edge."""
-    max_sigma: float = 0.02
+    max_sigma: float = 0.03
     """Relative depth sigma above which a measured edge point stays out of the map."""
     min_observations: int = 2
     """Keyframes that must agree on a point of the exported map."""

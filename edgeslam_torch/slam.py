@@ -312,6 +312,7 @@ class EdgeSlam:
             return self._output(
                 frame, keyframe, FrameStatus.INITIALISED, "two views", track, two_view.parallax_rad, True
             )
+        bootstrap.wait(frame, view, track)
         if track.inliers < HANDOVER_INLIERS:
             return self._start(frame, view, "first keyframe out of sight before parallax sufficed")
         return self._output(
@@ -326,22 +327,17 @@ class EdgeSlam:
 
     def _initialise(self, frame: Frame, view: View, bootstrap: Bootstrap, two_view: TwoView) -> Keyframe:
         reference = bootstrap.reference
-        keyframe = make_keyframe(self.map.next_keyframe_id(), frame.index, frame.stamp_s, two_view.T_c_w, view.features)
-        with self._timed("depth"):
-            self._look(frame, keyframe)
         with self._timed("mapping"):
-            between = bootstrap.replace_map(keyframe, two_view, self._lm)
-            self._mapper.triangulate_new(keyframe, [reference], colours_at(keyframe.image, view.features.uv))
-        self.log.replace(between, reference.id)
+            started = bootstrap.replace_map(frame, view, two_view, self._lm)
         self._bootstrap = None
-        previous = between[max(between)] if between else reference.T_c_w
-        self._T_c_w = previous
+        self.log.replace(started.T_c_w, [reference, *(k for _, k in started.new)])
+        self._T_c_w = started.T_c_w[max(started.T_c_w)] if started.T_c_w else reference.T_c_w
+        keyframe = started.new[-1][1]
         self._move(frame.stamp_s, keyframe.T_c_w)
         self._recent = keyframe.anchor[keyframe.anchor >= 0]
-        self._frames_since_keyframe = 0
-        for member in (reference, keyframe):
-            self.edges.announce(member)
-            self._compare_depth(member)
+        self.edges.announce(reference)
+        self._compare_depth(reference)
+        self._map(started.new)
         return keyframe
 
     # -- keyframes ---------------------------------------------------------------------------------------------
@@ -367,34 +363,41 @@ class EdgeSlam:
             return None
         keyframe = make_keyframe(self.map.next_keyframe_id(), frame.index, frame.stamp_s, track.T_c_w, view.features)
         keyframe.anchor[track.keypoint] = track.anchor
-        self._frames_since_keyframe = 0
-        if self._worker is not None:
-            self._pending = self._worker.submit(self._map_keyframe, frame, keyframe)
-        else:
-            mapped = self._map_keyframe(frame, keyframe)
-            self._absorb(mapped)
-            self._recent = keyframe.anchor[keyframe.anchor >= 0]
+        self.map.add_keyframe(keyframe)
+        self._map([(frame, keyframe)])
         return keyframe
 
-    def _map_keyframe(self, frame: Frame, keyframe: Keyframe) -> "_Mapped":
-        """Depth, mapping, refinement and edges of one keyframe; the only thing that runs on the worker."""
+    def _map(self, new: list[tuple[Frame, Keyframe]]) -> None:
+        """Map keyframes that were put into the map, now or on the worker."""
+        self._frames_since_keyframe = 0
+        if self._worker is not None:
+            self._pending = self._worker.submit(self._map_keyframes, new)
+            return
+        self._absorb(self._map_keyframes(new))
+        newest = new[-1][1]
+        self._recent = newest.anchor[newest.anchor >= 0]
+
+    def _map_keyframes(self, new: list[tuple[Frame, Keyframe]]) -> "_Mapped":
+        """Depth, mapping, refinement and edges of keyframes; the only thing that runs on the worker."""
         stage_ms: dict[str, float] = {}
-        T_tracked = keyframe.T_c_w
-        with _timed(stage_ms, "depth"):
-            self._look(frame, keyframe)
-        with _timed(stage_ms, "mapping"):
-            self._mapper.insert(keyframe, colours_at(keyframe.image, keyframe.features.uv))
-        with _timed(stage_ms, "edges"):
-            self.edges.announce(keyframe)
-            self.edges.update()
-        return _Mapped(keyframe, T_tracked, stage_ms)
+        T_tracked = new[-1][1].T_c_w
+        for frame, keyframe in new:
+            with _timed(stage_ms, "depth"):
+                self._look(frame, keyframe)
+            with _timed(stage_ms, "mapping"):
+                self._mapper.insert(keyframe, colours_at(keyframe.image, keyframe.features.uv))
+            with _timed(stage_ms, "edges"):
+                self.edges.announce(keyframe)
+                self.edges.update()
+        return _Mapped([k for _, k in new], T_tracked, stage_ms)
 
     def _absorb(self, mapped: "_Mapped") -> None:
-        """Carry the present pose along with what refinement did to the keyframe."""
-        correction = se3.inverse(mapped.T_tracked) @ mapped.keyframe.T_c_w
+        """Carry the present pose along with what refinement did to the newest keyframe."""
+        correction = se3.inverse(mapped.T_tracked) @ mapped.keyframes[-1].T_c_w
         self._T_c_w = se3.orthonormalised(self._T_c_w @ correction)
         self._stage_ms.update(mapped.stage_ms)
-        self._compare_depth(mapped.keyframe)
+        for keyframe in mapped.keyframes:
+            self._compare_depth(keyframe)
 
     def _absorb_pending(self) -> None:
         if self._pending is not None:
@@ -506,9 +509,9 @@ class EdgeSlam:
 class _Mapped:
     """What the worker hands back."""
 
-    keyframe: Keyframe
+    keyframes: list[Keyframe]
     T_tracked: FloatArray
-    """``T_c_w`` before refinement."""
+    """``T_c_w`` of the newest before refinement."""
     stage_ms: dict[str, float]
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from edgeslam_torch.geometry import se3
+from edgeslam_torch.mapping.keyframe import Keyframe
 from edgeslam_torch.mapping.slam_map import SlamMap
 from edgeslam_torch.types import FloatArray
 
@@ -35,14 +36,15 @@ class TrajectoryLog:
             T_c_k = T_c_w @ se3.inverse(self.map.pose_of(keyframe_id))
         self.records.append(FrameRecord(index, stamp_s, keyframe_id, T_c_k))
 
-    def replace(self, T_c_w_of_frame: dict[int, FloatArray], keyframe_id: int) -> None:
-        """Give recent frames, by index, new poses."""
-        T_w_k = se3.inverse(self.map.pose_of(keyframe_id))
+    def replace(self, T_c_w_of_frame: dict[int, FloatArray], keyframes: list[Keyframe]) -> None:
+        """Give recent frames, by index, new poses, each tied to the last of the keyframes (in order) before it."""
+        indices = [k.frame_index for k in keyframes]
         for record in reversed(self.records):
             if record.index not in T_c_w_of_frame:
                 break
-            record.keyframe_id = keyframe_id
-            record.T_c_k = T_c_w_of_frame[record.index] @ T_w_k
+            keyframe = keyframes[max(bisect.bisect_right(indices, record.index) - 1, 0)]
+            record.keyframe_id = keyframe.id
+            record.T_c_k = T_c_w_of_frame[record.index] @ keyframe.T_w_c
 
     def poses(self, since_s: float = -math.inf) -> tuple[FloatArray, FloatArray]:
         """Stamps ``(F,)`` and ``T_w_c`` ``(F, 4, 4)`` in the map as it is now, of frames not older than ``since_s``."""

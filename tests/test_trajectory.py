@@ -36,8 +36,9 @@ def test_replaced_poses_are_those_of_the_newest_frames_only(rng):
     old, new = [small_motion(rng, 0.5, 0.2) for _ in range(4)], small_motion(rng, 0.5, 0.2)
     for i, T_c_w in enumerate(old):
         log.append(i, 0.1 * i, 0, T_c_w)
-    log.replace({2: new, 3: old[0]}, 1)
+    points.keyframes[1].frame_index = 3  # frame 2 comes before it and stays with the first
+    log.replace({2: new, 3: old[0]}, points.keyframes[:2])
     stamps, T_w_c = log.poses()
     np.testing.assert_allclose(stamps, [0.0, 0.1, 0.2, 0.3])
     np.testing.assert_allclose(se3.inverse(T_w_c), np.stack([old[0], old[1], new, old[0]]), atol=1e-12)
-    assert [r.keyframe_id for r in log.records] == [0, 0, 1, 1]
+    assert [r.keyframe_id for r in log.records] == [0, 0, 0, 1]

@@ -6,7 +6,7 @@ from edgeslam_torch.config import SlamConfig
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.mapping.depth_prior import depth_prior
 from edgeslam_torch.mapping.fuse import fuse
-from edgeslam_torch.mapping.keyframe import NO_ANCHOR, Keyframe
+from edgeslam_torch.mapping.keyframe import Keyframe
 from edgeslam_torch.mapping.new_anchors import epipolar_matches, triangulate_matches
 from edgeslam_torch.mapping.refinement import choose_window, refine
 from edgeslam_torch.mapping.slam_map import SlamMap
@@ -28,10 +28,10 @@ class Mapper:
         self._recent: IntArray = np.zeros(0, dtype=np.int64)
 
     def insert(self, keyframe: Keyframe, colour: np.ndarray) -> WindowResult | None:
-        """Take in a tracked keyframe that carries its matched anchors.
+        """Make the most of a new keyframe.
 
         Args:
-            keyframe: New keyframe; ``keyframe.anchor`` holds what tracking matched.
+            keyframe: Already in the map; ``keyframe.anchor`` holds what tracking matched.
             colour: RGB of each keypoint, ``(N, 3)`` uint8.
 
         Returns:
@@ -39,10 +39,6 @@ class Mapper:
         """
         with self.map.lock:
             self.map.anchors.begin_pass()
-            # Tracking matched the keyframe a while ago when mapping runs beside it.
-            stale = (keyframe.anchor >= 0) & ~self.map.anchors.alive[keyframe.anchor]
-            keyframe.anchor[stale] = NO_ANCHOR
-            self.map.add_keyframe(keyframe)
             self.map.refresh_anchors(keyframe.anchor[keyframe.anchor >= 0])
             self.cull_recent_anchors(keyframe)
             neighbours = self.map.covisible(keyframe, self.config.neighbours)

@@ -1,13 +1,13 @@
 """The map's first moments: track against guessed depths until two views can replace them."""
 
 import logging
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from edgeslam_torch.config import InitialisationConfig
 from edgeslam_torch.geometry import se3
-from edgeslam_torch.mapping.keyframe import Keyframe
+from edgeslam_torch.mapping.keyframe import Keyframe, make_keyframe
 from edgeslam_torch.mapping.refinement import Window, refine
 from edgeslam_torch.mapping.slam_map import SlamMap
 from edgeslam_torch.optim.problem import LmConfig
@@ -20,7 +20,7 @@ from edgeslam_torch.tracking.initialiser import (
     two_view_map,
 )
 from edgeslam_torch.tracking.tracker import Track, Tracker, View
-from edgeslam_torch.types import FloatArray
+from edgeslam_torch.types import FloatArray, Frame, IntArray
 
 logger = logging.getLogger(__name__)
 
@@ -32,6 +32,30 @@ ALIKE_COST = 1.2
 
 AGREEING_SHARE = 0.8
 """The same after all frames were refined together; 95 % would agree if every match were right."""
+
+
+@dataclass(frozen=True, slots=True)
+class WaitingFrame:
+    """A frame between the two views; it becomes a keyframe once the map stands."""
+
+    frame: Frame
+    view: View
+    keypoint: IntArray
+    """``(M,)`` keypoints of this frame that were matched."""
+    reference_keypoint: IntArray
+    """``(M,)`` their partners in the reference keyframe."""
+    centre_w: FloatArray
+    """``(3,)`` camera centre against the guessed map."""
+
+
+@dataclass(frozen=True, slots=True)
+class StartedMap:
+    """What initialisation put in place of the guess."""
+
+    new: list[tuple[Frame, Keyframe]]
+    """Keyframes after the reference, in order; in the map, but not yet mapped any further."""
+    T_c_w: dict[int, FloatArray]
+    """New poses of the frames in between, by frame index."""
 
 
 class Bootstrap:
@@ -54,6 +78,7 @@ class Bootstrap:
         self.reference = reference
         self.guess_depth = guess_depth
         self.views: list[BootstrapView] = []
+        self.waiting: list[WaitingFrame] = []
         points = se3.transform(reference.T_w_c, tracker.camera.back_project(reference.features.uv, guess_depth))
         slam_map.anchors.begin_pass()
         ids = slam_map.anchors.add(points, reference.words, reference.id, True, colour)
@@ -152,16 +177,28 @@ class Bootstrap:
         p_r = se3.transform(self.reference.T_c_w, two_view.p_w) * scale
         return replace(two_view, T_c_w=T_c_r @ self.reference.T_c_w, p_w=se3.transform(self.reference.T_w_c, p_r))
 
-    def replace_map(self, keyframe: Keyframe, two_view: TwoView, lm: LmConfig) -> dict[int, FloatArray]:
-        """Put the two-view map in place of the guessed one and refine it.
+    def wait(self, frame: Frame, view: View, track: Track) -> None:
+        """Keep every few frames; of too many the one that stands nearest to its neighbours goes.
+
+        Two keyframes a hand's breadth apart would be all that ever holds the map's first seconds in place.
+        """
+        last = self.waiting[-1].frame if self.waiting else None
+        if frame.index - (self.reference.frame_index if last is None else last.index) < self.config.keyframe_gap:
+            return
+        mine, theirs = track.matched_keypoint, self.views[-1].reference_keypoint
+        self.waiting.append(WaitingFrame(frame, view, mine, theirs, se3.inverse(track.T_c_w)[:3, 3]))
+        if len(self.waiting) > self.config.most_keyframes:
+            centres = np.stack([self.reference.centre_w, *(w.centre_w for w in self.waiting)])
+            self.waiting.pop(int(np.linalg.norm(centres[2:] - centres[:-2], axis=1).argmin()))
+
+    def replace_map(self, frame: Frame, view: View, two_view: TwoView, lm: LmConfig) -> StartedMap:
+        """Put the two-view map in place of the guessed one and refine it over all its keyframes.
 
         Args:
-            keyframe: The second view, not yet in the map.
-            two_view: Its structure.
+            frame: The second view.
+            view: Its features.
+            two_view: The structure, confirmed.
             lm: Solver settings.
-
-        Returns:
-            New poses of the frames in between, by frame index.
         """
         reference = self.reference
         colour = self.map.anchors.colour[reference.anchor[two_view.reference_keypoint]]
@@ -171,13 +208,30 @@ class Bootstrap:
             two_view.p_w, reference.words[two_view.reference_keypoint], reference.id, False, colour
         )
         self.map.observe(reference, two_view.reference_keypoint, ids)
-        keyframe.anchor[two_view.keypoint] = ids
-        self.map.add_keyframe(keyframe)
-        # The essential matrix leaves the scale to the guess: refinement holds the baseline where the guess put it.
-        refine(self.map, Window([keyframe], [reference], ids), self.tracker.camera, lm)
+        poses = self._poses_between()
+        new = [(w.frame, self._keyframe(w, poses[w.frame.index])) for w in self.waiting if w.frame.index in poses]
+        second = make_keyframe(self.map.next_keyframe_id(), frame.index, frame.stamp_s, two_view.T_c_w, view.features)
+        second.anchor[two_view.keypoint] = ids
+        new.append((frame, second))
+        for _, keyframe in new:
+            self.map.add_keyframe(keyframe)
+        # The essential matrix leaves the scale to the guess: refinement holds the extent where the guess put it.
+        refine(self.map, Window([k for _, k in new], [reference], ids), self.tracker.camera, lm)
         self.map.refresh_anchors(ids[self.map.anchors.alive[ids]])
-        held = reference.keypoints_with_anchor()
-        points = np.full((len(reference.anchor), 3), np.nan)
-        points[held] = self.map.anchors.p_w[reference.anchor[held]]
+        poses = self._poses_between() | {k.frame_index: k.T_c_w for _, k in new[:-1]}
+        return StartedMap(new, poses)
+
+    def _poses_between(self) -> dict[int, FloatArray]:
+        """Poses of the frames in between against the reference keyframe's anchors, by frame index."""
+        held = self.reference.keypoints_with_anchor()
+        points = np.full((len(self.reference.anchor), 3), np.nan)
+        points[held] = self.map.anchors.p_w[self.reference.anchor[held]]
         poses, _ = poses_of_witnesses(self.views[:-1], points, self.tracker.camera)
         return {v.frame_index: T for v, T in zip(self.views, poses, strict=False)}
+
+    def _keyframe(self, waiting: WaitingFrame, T_c_w: FloatArray) -> Keyframe:
+        """A frame in between as a keyframe that sees the anchors of its partners in the reference."""
+        frame = waiting.frame
+        keyframe = make_keyframe(self.map.next_keyframe_id(), frame.index, frame.stamp_s, T_c_w, waiting.view.features)
+        keyframe.anchor[waiting.keypoint] = self.reference.anchor[waiting.reference_keypoint]
+        return keyframe

@@ -20,6 +20,7 @@ def insert(mapper, points, view, anchor_of):
     keyframe = points.keyframes[view]
     known = anchor_of[points.point_of[view]]
     keyframe.anchor[:] = np.where((known >= 0) & points.map.anchors.alive[known], known, -1)
+    points.map.add_keyframe(keyframe)
     return mapper.insert(keyframe, np.zeros((len(keyframe.anchor), 3), np.uint8))
 
 

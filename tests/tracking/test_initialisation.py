@@ -10,6 +10,7 @@ from edgeslam_torch.optim.problem import LmConfig
 from edgeslam_torch.tracking.bootstrap import WITNESS_SHARE, Bootstrap
 from edgeslam_torch.tracking.initialiser import BootstrapView, poses_of_witnesses, two_view_map
 from edgeslam_torch.tracking.tracker import Tracker, make_view
+from edgeslam_torch.types import Frame
 
 CONFIG = InitialisationConfig()
 
@@ -121,40 +122,79 @@ def test_witness_that_sees_nothing_of_it_keeps_its_pose_and_says_nothing(points)
     assert poses_of_witnesses([], nothing, CAMERA) == ([], 1.0)
 
 
-def make_bootstrap(points, guess_depth):
+def make_bootstrap(points, guess_depth, config=CONFIG):
     tracker = Tracker(points.map, CAMERA, OrbConfig(), TrackingConfig(motion_radius_px=100.0))
     reference = points.keyframes[0]
     colour = np.zeros((len(reference.anchor), 3), np.uint8)
-    return Bootstrap(points.map, tracker, CONFIG, reference, guess_depth, colour)
+    return Bootstrap(points.map, tracker, config, reference, guess_depth, colour)
 
 
-def test_guessed_map_is_replaced_and_the_map_stays_consistent(points):
+def frame_of(points, view):
+    return Frame(points.keyframes[view].frame_index, 0.1 * view, np.zeros((4, 4), np.uint8))
+
+
+def started(points, **config):
+    """A map that views 0 and 4 made, with the views between waiting."""
     spread = np.random.default_rng(1).normal(0.0, 0.05, len(points.point_of[0]))
-    bootstrap = make_bootstrap(points, z_in(points, 0) * np.exp(spread))
+    config = InitialisationConfig(**config)
+    bootstrap = make_bootstrap(points, z_in(points, 0) * np.exp(spread), config)
     check_map(points.map)
     assert points.map.anchors.from_depth[points.keyframes[0].anchor].all()
     accepted = None
     for view in (1, 2, 3, 4):
         track = bootstrap.track(view_of(points, view), points.world.T_c_w[view])
         assert track is not None
-        found = bootstrap.two_views(view, view_of(points, view), track)
+        found = bootstrap.two_views(points.keyframes[view].frame_index, view_of(points, view), track)
         accepted = bootstrap.confirm(view_of(points, view), found) if found.ok else found
+        if view < 4:
+            bootstrap.wait(frame_of(points, view), view_of(points, view), track)
     assert accepted is not None and accepted.ok
-    keyframe = points.keyframes[4]
-    keyframe.T_c_w = accepted.T_c_w
-    between = bootstrap.replace_map(keyframe, accepted, LmConfig())
+    result = bootstrap.replace_map(frame_of(points, 4), view_of(points, 4), accepted, LmConfig())
     check_map(points.map)
+    return result
+
+
+def test_guessed_map_is_replaced_and_the_map_stays_consistent(points):
+    between = started(points, keyframe_gap=100).T_c_w
     alive = np.flatnonzero(points.map.anchors.alive)
     assert len(alive) >= CONFIG.min_points
     assert not points.map.anchors.from_depth[alive].any()
-    assert set(between) == {1, 2, 3}
+    index = {points.keyframes[v].frame_index: v for v in (1, 2, 3)}
+    assert set(between) == set(index)
     # Up to the guess's scale, the frames between are where they were.
     centre = points.keyframes[0].centre_w
-    moved = {v: se3.inverse(T)[:3, 3] - centre for v, T in between.items()}
-    truth = {v: se3.inverse(points.world.T_c_w[v])[:3, 3] - centre for v in between}
-    ratios = np.array([np.linalg.norm(moved[v]) / np.linalg.norm(truth[v]) for v in between])
+    moved = {i: se3.inverse(T)[:3, 3] - centre for i, T in between.items()}
+    truth = {i: se3.inverse(points.world.T_c_w[v])[:3, 3] - centre for i, v in index.items()}
+    ratios = np.array([np.linalg.norm(moved[i]) / np.linalg.norm(truth[i]) for i in between])
     assert np.ptp(ratios) / ratios.mean() < 0.03
     assert 0.8 < ratios.mean() < 1.25
+
+
+def test_frames_that_waited_become_keyframes_in_order(points):
+    result = started(points, keyframe_gap=1)
+    new = [k for _, k in result.new]
+    assert [k.frame_index for k in new] == [points.keyframes[v].frame_index for v in (1, 2, 3, 4)]
+    assert [k.id for k in new] == sorted(k.id for k in new)
+    assert all(points.map.keyframes[k.id] is k for k in new)
+    for keyframe in new[:-1]:
+        np.testing.assert_array_equal(result.T_c_w[keyframe.frame_index], keyframe.T_c_w)
+        assert len(keyframe.keypoints_with_anchor()) > 60
+    observed = points.map.anchors.observations[points.map.anchors.alive]
+    assert (observed >= 4).mean() > 0.8
+
+
+def test_of_many_waiting_frames_those_that_stand_apart_stay(points):
+    guess = z_in(points, 0)
+    bootstrap = make_bootstrap(points, guess, InitialisationConfig(keyframe_gap=1, most_keyframes=2))
+    for index, view in enumerate((1, 1, 1, 2, 3), start=1):
+        seen = view_of(points, view)
+        track = bootstrap.track(seen, points.world.T_c_w[view])
+        bootstrap.two_views(index, seen, track)
+        bootstrap.wait(Frame(index, 0.1 * index, np.zeros((4, 4), np.uint8)), seen, track)
+    assert len(bootstrap.waiting) == 2
+    standing_still = {1, 2, 3}
+    assert len(standing_still & {w.frame.index for w in bootstrap.waiting}) <= 1
+    assert bootstrap.waiting[-1].frame.index == 5
 
 
 def test_abandoned_attempt_leaves_no_guess_behind(points):
