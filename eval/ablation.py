@@ -21,7 +21,8 @@ import numpy as np
 from edgeslam_torch import __version__
 from edgeslam_torch.config import SlamConfig, WindowConfig
 from edgeslam_torch.eval.align import AlignmentKind, umeyama
-from edgeslam_torch.eval.benchmark import compare, find_sequences, machine
+from edgeslam_torch.eval.bench_compare import compare
+from edgeslam_torch.eval.benchmark import find_sequences, machine
 from edgeslam_torch.eval.dataset import EvalDataset, interpolate, open_dataset
 from edgeslam_torch.eval.edge_map import score_map
 from edgeslam_torch.eval.errors import EvaluationError

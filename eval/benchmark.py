@@ -1,8 +1,7 @@
 """The real job on every sequence at hand, several seeds, every run in its own process; kept as JSON, compared later.
 
-Noise is stated, not assumed: two sets of runs differ when their medians are farther apart than
-``2 sqrt(s_a^2/n_a + s_b^2/n_b)``, with ``s`` the sample standard deviation over the seeds, and than a floor per
-figure (times on a shared machine move by more than seeds do).
+Between the runs the same fixed work is timed (`machine_speed`), and solver and depth network alone (`bench_probes`);
+what others did to the machine meanwhile is counted. `bench_compare` makes noise and verdicts of it.
 """
 
 import json
@@ -10,11 +9,10 @@ import os
 import platform
 import subprocess
 import sys
-import tempfile
 import time
 import tomllib
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +20,23 @@ import numpy as np
 
 from edgeslam_torch import __version__
 from edgeslam_torch.errors import EdgeSlamError
+from edgeslam_torch.eval import bench_probes
+from edgeslam_torch.eval.bench_compare import (
+    ALONE,
+    FORMAT,
+    METRICS,
+    Metric,
+    alone_metrics,
+    busy_runs,
+    medians_of,
+    noise_of,
+    reference_of,
+    sequences_of,
+    stage_metrics,
+)
 from edgeslam_torch.eval.dataset import open_dataset
 from edgeslam_torch.eval.errors import EvaluationError
+from edgeslam_torch.eval.machine_speed import MachineSpeed, disturbance, read_cpu_times
 from edgeslam_torch.eval.run_score import RunScore, evaluate_run
 
 SYNTHETIC = "synthetic"
@@ -33,44 +46,15 @@ _LEAST_HZ = 15.0
 """Recordings with a lower frame rate are for training, not for tracking."""
 
 _RUN_TIMEOUT_S = 1800.0
-_FORMAT = 1
 _PEERS = Path(__file__).with_name("peers.toml")
 _OWN = "edgeslam"
 
 
 _NOISE_WORDS = (
-    "noise: 2 sqrt(s_a^2/n_a + s_b^2/n_b) over the seeds, and never less than the figure's floor (3 % for errors, 10 % "
-    "for CPU time, 15 % for frames a second); one seed offline gives the same trajectory and map every time"
-)
-
-
-@dataclass(frozen=True, slots=True)
-class Metric:
-    """One figure of a run."""
-
-    name: str
-    title: str
-    text: str
-    lower_is_better: bool
-    floor: float
-    """Relative difference below which two medians are not told apart, however little the seeds scatter."""
-
-
-METRICS = (
-    Metric("ate_sim3_m", "ATE Sim(3) [m]", "{:.4f}", True, 0.03),
-    Metric("ate_online_sim3_m", "online [m]", "{:.4f}", True, 0.03),
-    Metric("ate_se3_m", "ATE SE(3) [m]", "{:.4f}", True, 0.03),
-    Metric("scale_error_abs", "scale off", "{:.1%}", True, 0.05),
-    Metric("coverage", "coverage", "{:.1%}", False, 0.005),
-    Metric("first_pose_s", "first pose [s]", "{:.2f}", True, 0.05),
-    Metric("map_points", "map points", "{:.0f}", False, 0.05),
-    Metric("map_median_m", "map error [m]", "{:.4f}", True, 0.03),
-    Metric("map_within_6cm", "points in 6 cm", "{:.0%}", False, 0.02),
-    Metric("edges_within_2cm", "edges in 2 cm", "{:.0%}", False, 0.03),
-    Metric("edges_within_6cm", "edges in 6 cm", "{:.0%}", False, 0.02),
-    Metric("cpu_ms_per_frame", "CPU [ms/frame]", "{:.0f}", True, 0.10),
-    Metric("fps", "frames/s", "{:.1f}", False, 0.15),
-    Metric("peak_rss_mb", "memory [MB]", "{:.0f}", True, 0.05),
+    "noise: what two such medians differ by without meaning anything. Accuracy: 2 sqrt(s_a^2/n_a + s_b^2/n_b) over the "
+    "seeds; one seed offline gives the same trajectory and map every time. Times: at one machine speed (the reference "
+    "work timed beside every run), 3.75 sqrt(s_a^2/n_a + s_b^2/n_b) with the relative scatter of all sequences. Never "
+    "less than the figure's floor (3 % for errors, 10 % for CPU time, 15 % for frames a second and stages)"
 )
 
 
@@ -132,7 +116,7 @@ def run_benchmark(settings: BenchSettings, out: Path, say: Callable[[str], None]
     if missing:
         raise EvaluationError(f"no sequence {missing[0]!r}; there are {', '.join([*sequences, SYNTHETIC])}")
     record: dict[str, Any] = {
-        "format": _FORMAT,
+        "format": FORMAT,
         "version": __version__,
         "commit": _commit(),
         "made": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
@@ -146,19 +130,31 @@ def run_benchmark(settings: BenchSettings, out: Path, say: Callable[[str], None]
     # All runs first, then all judging: on Linux a child's peak memory starts from its parent's at the time of the
     # fork, and the measured surfaces take a gigabyte.
     folders = {name: sequences.get(name) or _record_synthetic(out, settings, say) for name in names}
-    for name, folder in folders.items():
-        for seed in settings.seeds:
-            say(f"{name}, seed {seed} ...")
-            record["runs"].append(_one_run(name, folder, seed, settings, out / f"{name}_seed{seed}"))
-            _save(record, out / "bench.json")
+    bouts: list[dict[str, Any]] = []
+    with MachineSpeed() as speed:
+        say("reference work ...")
+        measure = bench_probes.bout if settings.micro else bench_probes.reference_alone
+        speed.time(measure)  # loads and warms everything
+        bouts.append(speed.time(measure))
+        for name, folder in folders.items():
+            for seed in settings.seeds:
+                say(f"{name}, seed {seed} ...")
+                begun = read_cpu_times()
+                run = _one_run(name, folder, seed, settings, out / f"{name}_seed{seed}")
+                found = disturbance(begun, read_cpu_times())
+                bouts.append(speed.time(measure))
+                run["disturbance"] = asdict(found) | {"busy": found.busy} if found is not None else None
+                run["reference"] = _between(bouts[-2]["reference"], bouts[-1]["reference"])
+                record["runs"].append(run)
+                record |= bench_probes.gather(bouts)
+                _save(record, out / "bench.json")
+                if found is not None and found.busy:
+                    say(f"the machine is busy: others use {found.others:.0%}, the host {found.stolen:.0%} of it")
     for run in record["runs"]:
         name, seed = run["sequence"], run["seed"]
         _judge(run, out / f"{name}_seed{seed}", folders[name])
         say(f"{name}, seed {seed}: {_one_line(run)}")
         _save(record, out / "bench.json")
-    if settings.micro:
-        say("solver window and depth network ...")
-        record["solver"], record["depth"] = _guarded(_solver), _guarded(depth_latency)
     record["took_s"] = time.monotonic() - begin
     _save(record, out / "bench.json")
     return record
@@ -197,90 +193,35 @@ def figures_of(score: RunScore) -> dict[str, float | None]:
     return {k: float(v) if v is not None and np.isfinite(v) else None for k, v in own.items()}
 
 
-def compare(before: dict[str, Any], after: dict[str, Any]) -> list[dict[str, Any]]:
-    """Figure by figure: medians, noise and verdict (``better``, ``worse``, ``same``) of two records."""
-    rows = []
-    for name in _sequences(before):
-        if name not in _sequences(after):
-            continue
-        for metric in METRICS:
-            a, b = _values(before, name, metric.name), _values(after, name, metric.name)
-            if len(a) == 0 or len(b) == 0:
-                continue
-            noise = _noise(metric, a, b)
-            change = float(np.median(b) - np.median(a))
-            gain = -change if metric.lower_is_better else change
-            verdict = "same" if abs(change) <= noise else "better" if gain > 0 else "worse"
-            rows.append(
-                {
-                    "sequence": name,
-                    "metric": metric.name,
-                    "title": metric.title,
-                    "text": metric.text,
-                    "before": float(np.median(a)),
-                    "after": float(np.median(b)),
-                    "noise": noise,
-                    "verdict": verdict,
-                }
-            )
-    return rows
-
-
 def markdown_bench(record: dict[str, Any]) -> str:
     """One table a sequence: every run, their median, and the peers' figures."""
     parts = [_conditions(record), "", _NOISE_WORDS]
-    for name in _sequences(record):
+    for name in sequences_of(record):
         peers = [p for p in read_peers() if p["sequence"].startswith(name) or p["sequence"].split()[0] in name]
         runs = [r for r in record["runs"] if r["sequence"] == name]
         own = [(f"{_OWN}, seed {r['seed']}", _lists(r.get("figures", {}))) for r in runs]
         if len(runs) > 1:
-            own.append((f"**{_OWN}, median of {len(runs)}**", _medians(record, name)))
-            own.append(("its noise: two of these differ by less (±)", _noise_of(record, name)))
+            own.append((f"**{_OWN}, median of {len(runs)}**", medians_of(record, name)))
+            own.append(("its noise: two of these differ by less (±)", noise_of(record, name)))
         other = [(f"{_peer_name(p, name)} [{k}]", _peer_figures(p)) for k, p in enumerate(peers, start=1)]
         parts += ["", f"### {name}", "", _table([*own, *other])]
         errors = [f"- seed {r['seed']} failed: {r['error']}" for r in runs if r.get("error")]
         notes = [f"[{k}] {p['source']}; {p['conditions']}" for k, p in enumerate(peers, start=1)]
         parts += ([""] + errors if errors else []) + ([""] + notes if notes else [])
-        stages = _stages(runs)
-        if stages:
-            parts += ["", "stage, mean ms a frame: " + ", ".join(f"{k} {v:.1f}" for k, v in stages)]
-    for key, title in (("solver", "solver window, CPU ms"), ("depth", "depth network, one thread, ms an image")):
-        found = record.get(key)
-        if found:
-            parts += ["", f"{title}: " + ", ".join(f"{k} {v}" for k, v in found.items())]
+        parts += _times_line("stages, mean ms a frame, median of the runs", record, name, stage_metrics(record, name))
+    for part, title in (("solver", "solver window, CPU ms"), ("depth", "depth network, one thread, ms an image")):
+        texts = [f"{k} {v}" for k, v in (record.get(part) or {}).items() if isinstance(v, str)]
+        metrics = [m for m in alone_metrics(record) if m.name.startswith(part)]
+        parts += _times_line(", ".join([title, *texts]), record, ALONE, metrics)
+        if texts and not metrics:
+            parts += ["", f"{title}: {', '.join(texts)}"]
+    parts += ["", *_machine_lines(record)]
     return "\n".join(parts) + "\n"
-
-
-def markdown_compare(rows: Sequence[dict[str, Any]]) -> str:
-    """The comparison as a table."""
-    lines = ["| sequence | figure | before | after | noise | verdict |", "|---|---|---|---|---|---|"]
-    for r in rows:
-        before, after, noise = (r["text"].format(r[k]) for k in ("before", "after", "noise"))
-        lines.append(f"| {r['sequence']} | {r['title']} | {before} | {after} | ±{noise} | {r['verdict']} |")
-    lines += ["", _NOISE_WORDS]
-    return "\n".join(lines) + "\n"
 
 
 def read_peers(path: Path = _PEERS) -> list[dict[str, Any]]:
     """Stored figures of other systems, each with its source and conditions."""
     return list(tomllib.loads(path.read_text(encoding="utf-8"))["peer"])
-
-
-def read_record(path: Path) -> dict[str, Any]:
-    """A record that `run_benchmark` wrote.
-
-    Raises:
-        EvaluationError: If the file is missing or no such record.
-    """
-    try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise EvaluationError(f"{path}: cannot be read ({error.strerror})") from error
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise EvaluationError(f"{path}: not JSON ({error})") from error
-    if not isinstance(record, dict) or record.get("format") != _FORMAT or "runs" not in record:
-        raise EvaluationError(f"{path}: not a result of 'edgeslam bench' (format {_FORMAT})")
-    return record
 
 
 def machine() -> dict[str, Any]:
@@ -298,49 +239,9 @@ def machine() -> dict[str, Any]:
     }
 
 
-def depth_latency(repeats: int = 20) -> dict[str, float | str]:
-    """Median milliseconds of the shipped depth network in onnxruntime, float32 and int8, one thread."""
-    import onnxruntime
-
-    from edgeslam_torch.models.checkpoint import load_checkpoint
-    from edgeslam_torch.models.export_onnx import ExportOptions, export_onnx
-    from edgeslam_torch.models.quantize import quantize_int8
-
-    network, metadata = load_checkpoint(None)
-    height, width = metadata.input_height, metadata.input_width
-    rng = np.random.default_rng(0)
-    images = [rng.random((1, 3, height, width), dtype=np.float32) for _ in range(8)]
-    out: dict[str, float | str] = {"size": f"{width}x{height}"}
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = 1
-    with tempfile.TemporaryDirectory() as folder:
-        plain, small = Path(folder) / "float32.onnx", Path(folder) / "int8.onnx"
-        export_onnx(network, metadata, plain, ExportOptions(height, width))
-        quantize_int8(plain, small, images)
-        for name, path in (("fp32", plain), ("int8", small)):
-            session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-            feed = {session.get_inputs()[0].name: images[0]}
-            times = []
-            for _ in range(repeats + 3):
-                start = time.perf_counter()
-                session.run(None, feed)
-                times.append(1e3 * (time.perf_counter() - start))
-            out[name] = round(float(np.median(times[3:])), 2)
-    return out
-
-
-def _solver() -> dict[str, Any]:
-    from edgeslam_torch.optim.benchmark import benchmark
-
-    return dict(benchmark(repeats=3))
-
-
-def _guarded(measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-    """A measurement that an installation cannot make (no weights, no onnx) is left out and says why."""
-    try:
-        return measure()
-    except (EdgeSlamError, ImportError, RuntimeError, OSError) as error:
-        return {"not measured": f"{type(error).__name__}: {' '.join(str(error).split())[:120]}"}
+def _between(before: dict[str, float], after: dict[str, float]) -> dict[str, float]:
+    """The reference work's times while a run went on: the mean of right before and right after."""
+    return {key: (before[key] + after[key]) / 2 for key in before}
 
 
 def _one_run(name: str, folder: Path, seed: int, settings: BenchSettings, out: Path) -> dict[str, Any]:
@@ -417,45 +318,8 @@ def _one_line(run: dict[str, Any]) -> str:
     return text + (f", {f['cpu_ms_per_frame']:.0f} ms CPU a frame" if f.get("cpu_ms_per_frame") else "")
 
 
-def _sequences(record: dict[str, Any]) -> list[str]:
-    return list(dict.fromkeys(r["sequence"] for r in record["runs"]))
-
-
-def _values(record: dict[str, Any], sequence: str, name: str) -> np.ndarray:
-    found = [r["figures"].get(name) for r in record["runs"] if r["sequence"] == sequence]
-    return np.array([v for v in found if v is not None], dtype=np.float64)
-
-
-def _scatter(a: np.ndarray, b: np.ndarray) -> float:
-    parts = [np.var(x, ddof=1) / len(x) for x in (a, b) if len(x) > 1]
-    return float(2.0 * np.sqrt(sum(parts)))
-
-
 def _lists(figures: dict[str, float | None]) -> dict[str, list[float]]:
     return {k: [v] for k, v in figures.items() if v is not None}
-
-
-def _noise_of(record: dict[str, Any], name: str) -> dict[str, list[float]]:
-    """What `compare` would call no difference between this record's median and that of a second one like it."""
-    out = {}
-    for metric in METRICS:
-        values = _values(record, name, metric.name)
-        if len(values):
-            out[metric.name] = [_noise(metric, values, values)]
-    return out
-
-
-def _noise(metric: Metric, a: np.ndarray, b: np.ndarray) -> float:
-    return max(_scatter(a, b), metric.floor * abs(float(np.median(a))))
-
-
-def _medians(record: dict[str, Any], name: str) -> dict[str, list[float]]:
-    out = {}
-    for metric in METRICS:
-        values = _values(record, name, metric.name)
-        if len(values):
-            out[metric.name] = [float(np.median(values))]
-    return out
 
 
 def _peer_name(peer: dict[str, Any], sequence: str) -> str:
@@ -482,10 +346,28 @@ def _table(rows: Iterable[tuple[str, dict[str, list[float]]]]) -> str:
     return "\n".join(lines)
 
 
-def _stages(runs: Sequence[dict[str, Any]]) -> list[tuple[str, float]]:
-    names = dict.fromkeys(k for r in runs for k in r.get("stages", {}))
-    means = [(n, float(np.mean([r["stages"].get(n, 0.0) for r in runs if r.get("stages")]))) for n in names]
-    return sorted(means, key=lambda kv: -kv[1])
+def _times_line(title: str, record: dict[str, Any], name: str, metrics: Sequence[Metric]) -> list[str]:
+    """Medians of some times with their noise, in one line."""
+    medians, noise = medians_of(record, name, metrics), noise_of(record, name, metrics)
+    cells = [
+        f"{m.title.split(' [')[0].split(' ', 1)[-1] if name == ALONE else m.title.split(' [')[0]} "
+        f"{medians[m.name][0]:.2f} ±{noise[m.name][0]:.2f}"
+        for m in metrics
+        if m.name in medians
+    ]
+    return ["", f"{title}: " + ", ".join(cells)] if cells else []
+
+
+def _machine_lines(record: dict[str, Any]) -> list[str]:
+    """How fast and how quiet the machine was."""
+    lines = []
+    if len(found := reference_of(record, "cpu_ms")):
+        spread = float(np.std(found, ddof=1) / np.mean(found)) if len(found) > 1 else 0.0
+        lines.append(
+            f"machine: reference work {np.median(found):.1f} ms CPU ({found.min():.1f} to {found.max():.1f}, "
+            f"scatter {spread:.1%}) in {len(found)} bouts"
+        )
+    return lines + ([f"warning: {busy}"] if (busy := busy_runs(record)) else [])
 
 
 def _conditions(record: dict[str, Any]) -> str:

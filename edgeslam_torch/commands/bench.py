@@ -31,11 +31,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Run or compare; 1 when a run failed."""
-    from edgeslam_torch.eval import benchmark
+    from edgeslam_torch.eval import bench_compare, benchmark
 
     if args.compare is not None:
-        before, after = (benchmark.read_record(path) for path in args.compare)
-        print(benchmark.markdown_compare(benchmark.compare(before, after)))
+        before, after = (bench_compare.read_record(path) for path in args.compare)
+        print(bench_compare.markdown_compare(before, after))
         return 0
     data = args.data or (Path(os.environ["EDGESLAM_DATA"]) if os.environ.get("EDGESLAM_DATA") else None)
     settings = benchmark.BenchSettings(

@@ -10,17 +10,11 @@ import numpy as np
 import pytest
 
 from edgeslam_torch.commands import bench
-from edgeslam_torch.eval.benchmark import (
-    METRICS,
-    compare,
-    figures_of,
-    find_sequences,
-    markdown_bench,
-    markdown_compare,
-    read_peers,
-    read_record,
-)
+from edgeslam_torch.eval.bench_compare import METRICS, compare, markdown_compare, read_record
+from edgeslam_torch.eval.bench_probes import gather
+from edgeslam_torch.eval.benchmark import figures_of, find_sequences, markdown_bench, read_peers
 from edgeslam_torch.eval.errors import EvaluationError
+from edgeslam_torch.eval.machine_speed import CpuTimes, disturbance, read_cpu_times
 from edgeslam_torch.eval.run_score import evaluate_run
 
 
@@ -48,7 +42,7 @@ def record(ate: list[float], cpu: list[float]) -> dict[str, Any]:
 
 
 def verdicts(a: dict[str, Any], b: dict[str, Any]) -> dict[str, str]:
-    return {row["metric"]: row["verdict"] for row in compare(a, b)}
+    return {row["metric"]: row["verdict"] for row in compare(a, b) if not row["metric"].startswith("stage:")}
 
 
 def test_change_within_the_scatter_of_the_seeds_is_no_change() -> None:
@@ -60,7 +54,8 @@ def test_change_beyond_the_scatter_is_named_with_its_direction() -> None:
     a, b = record([0.010, 0.0101, 0.0102], [30, 31, 32]), record([0.013, 0.0131, 0.0132], [20, 21, 22])
     assert verdicts(a, b) == {"ate_sim3_m": "worse", "coverage": "same", "cpu_ms_per_frame": "better"}
     assert verdicts(b, a) == {"ate_sim3_m": "better", "coverage": "same", "cpu_ms_per_frame": "worse"}
-    assert "worse" in markdown_compare(compare(a, b))
+    text = markdown_compare(a, b)
+    assert "2 of 4 differences lie inside the noise; outside it: tum_fr1_xyz ATE Sim(3) [m] (worse)" in text
 
 
 def test_one_seed_is_judged_by_the_floors() -> None:
@@ -74,7 +69,7 @@ def test_table_lists_every_run_its_median_and_the_peers() -> None:
     assert "median of 3** | 0.0110" in text
     assert "(±) | 0.0025 |" in text, "2 sqrt(2 s^2 / 3), s = 0.0015"
     assert "ORB-SLAM2" in text and "0.0098 0.0094 0.1562" in text
-    assert "tracking 5.0" in text
+    assert "tracking 5.00 ±0.75" in text
 
 
 def test_what_is_not_the_whole_sequence_is_said() -> None:
@@ -95,6 +90,105 @@ def test_figures_are_plain_numbers(run_folder: Callable[..., Path], tmp_path: Pa
     found = figures_of(evaluate_run(tmp_path / "a", truth))
     assert json.loads(json.dumps(found, allow_nan=False)) == found
     assert found["ate_sim3_m"] is not None and found["cpu_ms_per_frame"] == 33.1
+
+
+def timed_record(rng: np.random.Generator, speed: float, scatter: float, factor: float = 1.0) -> dict[str, Any]:
+    """A benchmark of three sequences at this speed of the machine whose every time scatters by ``scatter``."""
+
+    def bout() -> dict[str, Any]:
+        work = {key: 50 / speed * noisy(0.01) for key in ("one_ms", "cpu_ms", "wall_ms")}
+        return {"reference": work, "solver": {"all terms": 150 * factor / speed * noisy(scatter)}}
+
+    def noisy(s: float) -> float:
+        return float(np.exp(s * rng.normal()))
+
+    bouts, runs = [bout()], []
+    for name in ("tum_fr1_xyz", "7scenes_redkitchen", "synthetic"):
+        for seed in range(3):
+            own = speed * noisy(0.05)  # of the minute, seen by the reference work too
+            bouts.append(bout())
+            cpu, step = (40 * factor / own * noisy(scatter) for _ in range(2))
+            runs.append(
+                {
+                    "sequence": name,
+                    "seed": seed,
+                    "figures": {"cpu_ms_per_frame": cpu, "fps": 1e3 / step},
+                    "stages": {"tracking": 0.3 * step, "edges": 0.2 * step},
+                    "reference": dict.fromkeys(("one_ms", "cpu_ms", "wall_ms"), 50 / own),
+                    "disturbance": {"others": 0.01, "stolen": 0.0, "busy": False},
+                    "error": "",
+                }
+            )
+    return {"format": 2, "runs": runs, "machine": {"cpu": "some"}, **gather(bouts)}
+
+
+def test_times_of_one_program_agree_at_any_speed_of_the_machine(rng: np.random.Generator) -> None:
+    rows = [
+        row
+        for _ in range(60)
+        for row in compare(timed_record(rng, 1.0, 0.04), timed_record(rng, float(rng.uniform(0.6, 1.6)), 0.04))
+    ]
+    outside = [row for row in rows if row["verdict"] != "same"]
+    assert len(rows) == 60 * 13
+    assert len(outside) <= 0.01 * len(rows), "a table of fifty times is to hold none by chance"
+
+
+def test_a_third_more_time_is_seen_at_any_speed_of_the_machine(rng: np.random.Generator) -> None:
+    for speed in (0.7, 1.0, 1.4):
+        found = compare(timed_record(rng, 1.0, 0.02), timed_record(rng, speed, 0.02, factor=1.33))
+        assert {row["verdict"] for row in found} == {"worse"}, speed
+
+
+def test_without_the_reference_a_slower_machine_is_a_slower_program(rng: np.random.Generator) -> None:
+    a, b = timed_record(rng, 1.0, 0.01), timed_record(rng, 0.6, 0.01)
+    assert {row["verdict"] for row in compare(a, b)} == {"same"}
+    for found in (a, b):
+        found["references"] = []
+    assert all(row["verdict"] == "worse" for row in compare(a, b) if row["metric"] == "cpu_ms_per_frame")
+
+
+def test_noise_grows_with_the_scatter(rng: np.random.Generator) -> None:
+    quiet, loud = (timed_record(rng, 1.0, s) for s in (0.01, 0.3))
+    noise = [{row["metric"]: row["noise"] for row in compare(r, r)}["cpu_ms_per_frame"] for r in (quiet, loud)]
+    assert noise[0] == pytest.approx(0.10 * 40, rel=0.15), "the floor"
+    assert noise[1] > 3 * noise[0]
+
+
+def test_other_conditions_and_a_busy_machine_are_named(rng: np.random.Generator) -> None:
+    a, b = timed_record(rng, 1.0, 0.02), timed_record(rng, 0.8, 0.02)
+    b["machine"], b["max_frames"] = {"cpu": "other"}, 40
+    b["runs"][2]["disturbance"] = {"others": 0.4, "stolen": 0.03, "busy": True}
+    text = markdown_compare(a, b)
+    assert "beware: cpu was some, then other" in text and "beware: max_frames was None, then 40" in text
+    assert "in the second record the machine was busy during 1 of 9 runs: other programs used up to 40%" in text
+    assert "its host took up to 3%" in text
+
+
+def test_a_part_that_cannot_be_measured_says_why() -> None:
+    found = gather(
+        [
+            {"reference": {"one_ms": 1.0}, "solver": {"points": 2.0, "beside": "no gtsam"}, "depth": {"fp32": 3.0}},
+            {
+                "reference": {"one_ms": 1.1},
+                "solver": {"points": 2.1, "beside": "no gtsam"},
+                "depth": {"not measured": "x"},
+            },
+        ]
+    )
+    assert found["solver"] == {"beside": "no gtsam", "points": [2.0, 2.1]}
+    assert found["depth"] == {"not measured": "x"}
+
+
+def test_what_others_use_is_told_from_what_we_use(tmp_path: Path) -> None:
+    stat = tmp_path / "stat"
+    stat.write_text("cpu  100 0 50 900 10 0 5 7 0 0\ncpu0 1 0 1 1\ncpu1 1 0 1 1\nintr 5\n")
+    found = read_cpu_times(stat)
+    assert found is not None and found.cores == 2 and found.busy > found.stolen > 0
+    assert read_cpu_times(tmp_path / "none") is None
+    before, after = CpuTimes(0.0, 10.0, 1.0, 3.0, 2), CpuTimes(10.0, 22.0, 1.1, 13.0, 2)
+    told = disturbance(before, after)
+    assert told is not None and told.others == pytest.approx(0.1) and told.stolen == pytest.approx(0.005)
+    assert not told.busy and disturbance(None, after) is None
 
 
 def test_only_recordings_at_camera_rate_are_benchmarked(run_folder: Callable[..., Path], tmp_path: Path) -> None:
@@ -131,7 +225,9 @@ def test_compare_reads_two_results(tmp_path: Path, capsys: pytest.CaptureFixture
     for name, ate in (("a", 0.010), ("b", 0.020)):
         (tmp_path / f"{name}.json").write_text(json.dumps(record([ate, ate], [30, 30])))
     assert run_bench("--compare", tmp_path / "a.json", tmp_path / "b.json") == 0
-    assert "| tum_fr1_xyz | ATE Sim(3) [m] | 0.0100 | 0.0200 | ±0.0003 | worse |" in capsys.readouterr().out
+    text = capsys.readouterr().out
+    assert "| tum_fr1_xyz | ATE Sim(3) [m] | 0.0100 | 0.0200 | +100.0% | ±3.0% | **worse** |" in text
+    assert "no reference work" in text
 
 
 @pytest.mark.slow
@@ -145,3 +241,5 @@ def test_synthetic_flight_is_run_and_judged(
     assert "### synthetic" in text and "edgeslam, seed 0" in text
     stored = read_record(tmp_path / "bench" / "bench.json")
     assert stored["runs"][0]["figures"]["coverage"] > 0.5
+    assert len(stored["references"]) == 2 and stored["runs"][0]["reference"]["cpu_ms"] > 0
+    assert "machine: reference work" in text

@@ -1,0 +1,154 @@
+"""How fast this machine is at the moment: fixed work, timed beside every measurement of the benchmark.
+
+Times on a shared machine follow its neighbours and its clock frequency. The same work, timed in the same minutes,
+moves with them: it tells how much of a difference is the machine's, and how sure that is. The work is made of what
+a run spends its time on (image features, arrays, small solves, the interpreter) and of nothing of this project, so
+that no commit changes it.
+"""
+
+import os
+import statistics
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+
+_REPEATS = 15
+_BUSY_SHARE = 0.10
+"""Of all cores' time: what others may use during a run before its times are called disturbed."""
+_STOLEN_SHARE = 0.02
+"""The same for time that the host took from this virtual machine."""
+
+
+@dataclass(frozen=True, slots=True)
+class CpuTimes:
+    """Counters of ``/proc/stat`` over all cores [s], and what this process and its finished children used."""
+
+    wall: float
+    busy: float
+    stolen: float
+    own: float
+    cores: int
+
+
+@dataclass(frozen=True, slots=True)
+class Disturbance:
+    """What else went on during a measurement, as shares of all cores' time."""
+
+    others: float
+    stolen: float
+
+    @property
+    def busy(self) -> bool:
+        """Whether times measured meanwhile say little."""
+        return self.others > _BUSY_SHARE or self.stolen > _STOLEN_SHARE
+
+
+def read_cpu_times(stat: Path = Path("/proc/stat")) -> CpuTimes | None:
+    """The counters now; None where the system has none (anything but Linux)."""
+    if not stat.is_file():
+        return None
+    lines = stat.read_text(encoding="ascii", errors="replace").splitlines()
+    fields = [int(x) for x in lines[0].split()[1:9]]
+    tick = os.sysconf("SC_CLK_TCK")
+    user, nice, system, _idle, _wait, irq, softirq, steal = (x / tick for x in fields)
+    own = os.times()
+    return CpuTimes(
+        wall=time.monotonic(),
+        busy=user + nice + system + irq + softirq,
+        stolen=steal,
+        own=own.user + own.system + own.children_user + own.children_system,
+        cores=max(1, sum(line.startswith("cpu") and line[3:4].isdigit() for line in lines)),
+    )
+
+
+def disturbance(before: CpuTimes | None, after: CpuTimes | None) -> Disturbance | None:
+    """What others did between two readings; None when they cannot tell."""
+    if before is None or after is None or after.wall <= before.wall:
+        return None
+    whole = (after.wall - before.wall) * after.cores
+    others = (after.busy - before.busy) - (after.own - before.own)
+    return Disturbance(max(0.0, others) / whole, max(0.0, after.stolen - before.stolen) / whole)
+
+
+class MachineSpeed:
+    """A process of its own that times the fixed work whenever it is asked, and whatever else is given to it.
+
+    Its own process, so that what it loads does not count as memory of the runs that the caller starts.
+    """
+
+    def __init__(self) -> None:
+        self._pool = ProcessPoolExecutor(max_workers=1, mp_context=get_context("spawn"))
+
+    def __enter__(self) -> "MachineSpeed":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self._pool.shutdown()
+
+    def time(self, measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+        """What a function of a module returns when called in that process."""
+        return self._pool.submit(measure).result()
+
+
+def reference() -> dict[str, float]:
+    """Milliseconds of the fixed work.
+
+    ``one_ms`` is the CPU time of one thread alone, ``cpu_ms`` that of each of two threads at once (a run has two; on
+    many machines two threads share a core), ``wall_ms`` how long the two take by the clock.
+    """
+    work = _fixed_work()
+    work()  # warms caches
+    one, cpu, wall = [], [], []
+    for _ in range(_REPEATS):
+        one.append(_thread_ms(work))
+        both: list[float] = []
+        beside = threading.Thread(target=lambda both=both: both.append(_thread_ms(work)))
+        start = time.perf_counter()
+        beside.start()
+        both.append(_thread_ms(work))
+        beside.join()
+        wall.append(1e3 * (time.perf_counter() - start))
+        cpu.append(statistics.mean(both))
+    return {"one_ms": statistics.median(one), "cpu_ms": statistics.median(cpu), "wall_ms": statistics.median(wall)}
+
+
+def _thread_ms(work: Callable[[], None]) -> float:
+    start = time.thread_time()
+    work()
+    return 1e3 * (time.thread_time() - start)
+
+
+def _fixed_work() -> Callable[[], None]:
+    """Some 100 ms of what a run does, the same every time."""
+    import cv2
+
+    cv2.setNumThreads(1)
+    rng = np.random.default_rng(0)
+    image = cv2.GaussianBlur(rng.integers(0, 256, (480, 640), dtype=np.uint8), (0, 0), 1.5)
+    image = cv2.normalize(image, None, 0, 255, cv2.NORM_MINMAX)  # type: ignore[call-overload]
+    values = rng.normal(size=200_000)
+    order = rng.permutation(len(values))
+    blocks = rng.normal(size=(2000, 6, 6))
+    blocks = blocks @ blocks.transpose(0, 2, 1) + 6 * np.eye(6)
+    vectors = rng.normal(size=(2000, 6, 1))
+
+    def work() -> None:
+        orb = cv2.ORB.create(1000)
+        for _ in range(2):
+            orb.detectAndCompute(image, None)
+        for _ in range(4):
+            np.sort(values[order])
+            np.linalg.solve(blocks, vectors)
+        total = 0.0
+        for k in range(150_000):
+            total += k * 0.5
+
+    return work
