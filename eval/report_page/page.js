@@ -118,7 +118,7 @@ if (DATA.stages.length) {
 }
 if (DATA.keyframes.length) {
   byId("s-keyframes").hidden = false;
-  for (const k of DATA.keyframes) { const f = make("figure", undefined, byId("keyframes")), img = document.createElement("img"); img.src = k.src; img.alt = k.label; img.loading = "lazy"; f.append(img); make("figcaption", k.label, f); }
+  for (const k of DATA.keyframes) { const f = make("figure", undefined, byId("keyframes")), img = document.createElement("img"); img.src = k.src; img.alt = k.label; f.append(img); make("figcaption", k.label, f); }
 }
 if (DATA.mapScore) { byId("s-map").hidden = false; for (const r of DATA.mapScore) row(byId("map-score"), r); }
 for (const r of DATA.summary) row(byId("summary"), r);
