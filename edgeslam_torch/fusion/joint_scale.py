@@ -135,7 +135,8 @@ def displacement_evidence(
         normalised = np.sqrt(np.sum(clean**2, axis=0) / (3.0 * variance))
         spread = max(float(np.median(normalised)) / 0.888, 0.3)
         weight = np.square(np.maximum(0.0, 1.0 - np.square(normalised / (_TUKEY * spread))))
-        partner = moved_map + ((s * sigma_map**2 / variance) * clean).T
+        drift = fit.slow - fit.bias  # the map's, so it is in the regressor as well
+        partner = moved_map + ((s * sigma_map**2 / variance) * clean + drift / s).T
         latent = np.concatenate([partner[:, :, None], -hat(partner)], axis=2).transpose(1, 0, 2)
     if fit is None or float(weight.sum()) < _MIN_DISPLACEMENTS:
         return None

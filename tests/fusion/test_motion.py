@@ -182,6 +182,21 @@ def test_truncated_velocities_are_told_from_rounded_ones(rng, swinging, replay):
     assert abs(errors["auto"]) < 0.05
 
 
+@pytest.mark.parametrize("truncated", [False, True])
+def test_height_decides_what_the_readings_leave_open(rng, swinging, replay, monkeypatch, truncated):
+    """Velocities alone are undecided between rounding and truncation: only one of them agrees with the range sensor."""
+    motion = swinging(30.0)
+    exact = simulate(rng, motion.stamps_s, motion.T_w_c, T_B_C, faults=replace(EXACT, video_delay_s=0.5)).samples()
+    whole = np.trunc if truncated else np.rint
+    samples = [replace(s, velocity_m_s=whole(10 * (s.velocity_m_s + rng.normal(0, 0.02, 3))) / 10) for s in exact]
+    gauge = motion.in_gauge(rng)
+    fusion = MotionFusion(FusionConfig(), T_B_C)
+    monkeypatch.setattr(fusion._track, "truncation_probability", lambda step: 0.4)
+    replay(fusion, motion, gauge, samples)
+    assert fusion.scale().value == pytest.approx(gauge.scale, rel=0.04)
+    assert fusion.scale().sigma < 0.05 * gauge.scale
+
+
 def test_height_changes_alone_tell_the_scale_of_a_climb(rng, replay, swinging):
     """Velocity missing, range there: the metre up and down at the start of a flight."""
     motion = swinging(20.0)
