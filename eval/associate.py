@@ -10,6 +10,12 @@ from edgeslam_torch.types import FloatArray, IntArray
 DEFAULT_MAX_DT_S = 0.02
 """Largest time between matched poses; the TUM tools' and evo's usual value for 30 Hz video."""
 
+_SINCE_1970_S = 1e6
+"""Stamps above this [s] count from 1970, those below from the start of something."""
+
+_FEW = 10
+"""Poses that do not tell how long a recording is."""
+
 _UNITS = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
 
 
@@ -84,13 +90,16 @@ def unit_factor(truth_s: FloatArray, estimate_s: FloatArray) -> tuple[float, lis
     """Factor that brings the estimated stamps to the truth's unit, when it is a power of a thousand, and a note of it.
 
     Clocks that start at 0 overlap in any unit, so stamps that do overlap are still suspected when one list lasts
-    more than 200 times as long as the other. When no unit makes them overlap, the two clocks start at different
+    more than 200 times as long as the other, unless both count from 1970 (they overlap by no accident then) or one
+    holds a handful of poses at a like rate. When no unit makes them overlap, the two clocks start at different
     times, and how long the lists last still tells the unit.
     """
     span_t, span_e = truth_s[-1] - truth_s[0], estimate_s[-1] - estimate_s[0]
     ratio = span_e / span_t if span_t > 0 and span_e > 0 else 1.0
-    if 1 / 200 < ratio < 200 and _overlap(truth_s, estimate_s) > 0:
-        return 1.0, []
+    if _overlap(truth_s, estimate_s) >= 0:
+        few = min(len(truth_s), len(estimate_s)) < _FEW and 1 / 200 < _gap(estimate_s) / _gap(truth_s) < 200
+        if 1 / 200 < ratio < 200 or few or min(truth_s[0], estimate_s[0]) > _SINCE_1970_S:
+            return 1.0, []
     candidates = {
         factor: f"{whose} stamps are {name}, the other file's seconds: converted"
         for name, per_second in _UNITS.items()
@@ -110,6 +119,11 @@ def _overlap(a: FloatArray, b: FloatArray) -> float:
     return float(min(a[-1], b[-1]) - max(a[0], b[0]))
 
 
+def _gap(stamps_s: FloatArray) -> float:
+    """Typical time from one stamp to the next [s]."""
+    return float(np.median(np.diff(stamps_s))) if len(stamps_s) > 1 else 1.0
+
+
 def _why_nothing_matches(truth_s: FloatArray, estimate_s: FloatArray, max_dt_s: float) -> str:
     t0, t1, e0, e1 = truth_s[0], truth_s[-1], estimate_s[0], estimate_s[-1]
     spans = f"ground truth {t0:.3f}..{t1:.3f} s, estimate {e0:.3f}..{e1:.3f} s"
@@ -119,7 +133,7 @@ def _why_nothing_matches(truth_s: FloatArray, estimate_s: FloatArray, max_dt_s: 
             f"no poses within {max_dt_s:g} s of each other, typically {gap:.3f} s apart; try --max-dt {2 * gap:.2g} "
             f"({spans})"
         )
-    if min(t0, e0) < 1e6 < max(t0, e0):
+    if min(t0, e0) < _SINCE_1970_S < max(t0, e0):
         return (
             f"one clock starts near 0 and the other counts from 1970 ({spans}); if they start together, use "
             f"--offset {t0 - e0:.6f}"

@@ -173,6 +173,14 @@ def test_stamps_in_other_units_are_converted_and_said(factor: float, unit: str, 
     assert "ground truth" in found.notes[0] or len(found) == len(truth)
 
 
+@pytest.mark.parametrize("begin", [0.0, 1.3e9])
+@pytest.mark.parametrize("poses", [[30.0], [30.0, 30.03, 30.07]])
+def test_a_handful_of_poses_are_seconds_too(begin: float, poses: list[float]) -> None:
+    truth = begin + np.arange(0.0, 60.0, 0.01)
+    found = associate(truth, begin + np.array(poses))
+    assert len(found) == len(poses) and found.factor == 1.0 and found.notes == ()
+
+
 @pytest.mark.parametrize(
     ("shift", "words"),
     [(-1.5e9, "counts from 1970"), (300.0, "constant offset"), (4e6, "days apart"), (0.05, "--max-dt")],
