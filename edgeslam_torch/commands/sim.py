@@ -26,6 +26,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--sdk", choices=("1.3", "2.0"), default="2.0", help="form of the state lines")
     parser.add_argument("--duration", type=float, metavar="S", help="stop after this time (default: until Ctrl-C)")
+    parser.add_argument("--stopwatch", action="store_true", help="show the moment of each picture in its corner")
+    parser.add_argument(
+        "--measure",
+        type=float,
+        metavar="S",
+        help="fly this emulator with our own client for so long and print pictures a second and their delay",
+    )
 
 
 def main(args: argparse.Namespace) -> int:
@@ -35,6 +42,8 @@ def main(args: argparse.Namespace) -> int:
     from edgeslam_torch.emulator.server import EmulatorConfig, TelloEmulator
     from edgeslam_torch.errors import ConfigError
 
+    if args.measure is not None:
+        return _measure(args)
     width = args.render_width
     if not 64 <= width <= 960 or not 0 < args.battery <= 100 or args.drain <= 0:
         raise ConfigError("--render-width must be 64 to 960, --battery above 0 up to 100, --drain positive")
@@ -45,7 +54,9 @@ def main(args: argparse.Namespace) -> int:
     ports = (args.command_port, args.state_port, args.video_port)
     if not all(0 <= port < 65536 for port in ports):
         raise ConfigError(f"ports must be 0 to 65535, got {ports}")
-    config = EmulatorConfig(args.bind, *ports, link=faults, seed=args.seed, mission_pads=args.sdk == "2.0")
+    config = EmulatorConfig(
+        args.bind, *ports, link=faults, seed=args.seed, mission_pads=args.sdk == "2.0", stopwatch=args.stopwatch
+    )
     size = (width, round(width * 0.75))
     drone, paint, _ = furnished_drone(args.seed, math.radians(args.tilt), size, args.battery / 100.0)
     drone.battery_per_s = 1.0 / (60.0 * args.drain)
@@ -67,4 +78,23 @@ def main(args: argparse.Namespace) -> int:
         return 130
     finally:
         signal.signal(signal.SIGTERM, previous)
+    return 0
+
+
+def _measure(args: argparse.Namespace) -> int:
+    from edgeslam_torch.emulator.measure import measure
+    from edgeslam_torch.errors import ConfigError
+
+    if not args.measure > 0:
+        raise ConfigError("--measure must be positive")
+    options = {
+        "seed": args.seed,
+        "loss": args.loss,
+        "latency": args.latency,
+        "video-latency": args.video_latency,
+        "render-width": args.render_width,
+    }
+    found = measure(args.measure, [f"--{name}={value}" for name, value in options.items()])
+    for line in found.lines(args.video_latency):
+        print(line)
     return 0

@@ -14,6 +14,7 @@ from edgeslam_torch.emulator.commands import Answer, Interpreter
 from edgeslam_torch.emulator.drone import DroneModel, state_line
 from edgeslam_torch.emulator.encoder import Encoder
 from edgeslam_torch.emulator.link import Link, LinkFaults
+from edgeslam_torch.emulator.stopwatch import draw_time
 from edgeslam_torch.io.tello_video import open_udp
 from edgeslam_torch.types import FloatArray
 
@@ -42,6 +43,8 @@ class EmulatorConfig:
     """State in the SDK 2.0 form; false gives the form of 1.3."""
     link: LinkFaults = field(default_factory=LinkFaults)
     seed: int = 0
+    stopwatch: bool = False
+    """Show in each picture the moment (`time.monotonic`) of the pose that it shows."""
 
 
 class TelloEmulator:
@@ -60,6 +63,7 @@ class TelloEmulator:
         self.frozen = False
         """The drone stops answering and sending, as after a crash of its software; it lands when told nothing."""
         self.frames_sent = 0
+        self.frames_painted = 0
         self._render = render or _test_card(config.width, config.height)
         self._socket = open_udp((config.bind, config.command_port), "command")
         self._socket.settimeout(0.1)
@@ -71,6 +75,8 @@ class TelloEmulator:
         self._pending: list[tuple[tuple[str, int], str]] = []
         self._stopping = threading.Event()
         self._picture: np.ndarray | None = None
+        self._painted = threading.Event()
+        """A picture that was not sent yet."""
         self._threads = [
             threading.Thread(target=work, name=f"emulator-{name}", daemon=True)
             for name, work in (
@@ -130,7 +136,7 @@ class TelloEmulator:
                 self._answer(sender, reply.text)
 
     def _answer(self, to: tuple[str, int], text: str) -> None:
-        self._link.send(self._socket, text.encode("ascii"), to, self.config.link.latency_s)
+        self._link.send(self._socket, text.encode("ascii", errors="replace"), to, self.config.link.latency_s)
 
     def _fly(self) -> None:
         """Body at 100 Hz, state at 10 Hz, and the landing after 15 s of silence."""
@@ -160,27 +166,36 @@ class TelloEmulator:
             self._stopping.wait(_STEP_S)
 
     def _paint(self) -> None:
-        """Pictures as fast as this machine makes them; the stream repeats the last one."""
+        """A picture at each tick, or as often as this machine manages; `_stream` encodes beside it."""
+        next_s = time.monotonic()
         while not self._stopping.is_set():
             if not self.interpreter.stream:
                 self._stopping.wait(0.02)
                 continue
+            self._stopping.wait(max(0.0, next_s - time.monotonic()))
+            next_s = max(next_s + 1.0 / self.config.rate_hz, time.monotonic())
             with self._lock:
-                T_w_b = self.drone.T_w_b()
-            begin = time.monotonic()
+                T_w_b, moment_s = self.drone.T_w_b(), time.monotonic()
             image = self._render(T_w_b)
             size = (self.config.width, self.config.height)
             if (image.shape[1], image.shape[0]) != size:
-                image = cv2.resize(image, size, interpolation=cv2.INTER_LINEAR)
+                image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_LINEAR))
+            if self.config.stopwatch:
+                draw_time(image, moment_s)
             self._picture = image
-            self._stopping.wait(max(0.0, 1.0 / self.config.rate_hz - (time.monotonic() - begin)))
+            self.frames_painted += 1
+            self._painted.set()
 
     def _stream(self) -> None:
+        """Each picture once it is painted; the last one again when the next is late, as a camera keeps its rate."""
         encoder: Encoder | None = None
+        tick_s = 1.0 / self.config.rate_hz
         next_s = time.monotonic()
         while not self._stopping.is_set():
-            next_s = max(next_s + 1.0 / self.config.rate_hz, time.monotonic() - 0.1)
-            self._stopping.wait(max(0.0, next_s - time.monotonic()))
+            self._painted.wait(max(0.0, next_s + 0.5 * tick_s - time.monotonic()))
+            self._stopping.wait(max(0.0, next_s - 0.4 * tick_s - time.monotonic()))
+            self._painted.clear()
+            next_s = max(next_s, time.monotonic() - tick_s) + tick_s
             client, picture = self._client, self._picture
             if not self.interpreter.stream or client is None or picture is None:
                 encoder = None

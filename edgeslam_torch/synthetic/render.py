@@ -36,7 +36,7 @@ class _Polygon:
     """A quad clipped to the near plane and projected."""
 
     quad: int
-    uv: list[tuple[float, float]]
+    uv: list[list[float]]
     """Three to five corners [px]."""
     st_from_uv: FloatArray
     """``(3, 3)`` homography from pixels to texture coordinates in [0, 1]; third row times (u, v, 1) is 1/z."""
@@ -69,19 +69,34 @@ def render(world: World, camera: Camera, T_w_c: FloatArray, *, antialias: bool =
     """
     if camera.is_distorted:
         return _render_distorted(world, camera, T_w_c, antialias)
+    image, iz, ids = _drawn(world, camera, T_w_c, antialias)
+    with np.errstate(divide="ignore"):
+        depth = np.where(iz > 0, np.float32(1.0) / iz, np.float32(0.0))
+    return Rendered(image, depth, ids.astype(np.int32))
+
+
+def picture(world: World, camera: Camera, T_w_c: FloatArray) -> np.ndarray:
+    """The image of `render` alone, ``(H, W, 3)`` uint8 BGR, borders not smoothed: for live pictures."""
+    if camera.is_distorted:
+        return _render_distorted(world, camera, T_w_c, antialias=False).image
+    return _drawn(world, camera, T_w_c, antialias=False)[0]
+
+
+def _drawn(
+    world: World, camera: Camera, T_w_c: FloatArray, antialias: bool
+) -> tuple[np.ndarray, FloatArray, np.ndarray]:
+    """Image, inverse depth, and quad index int16."""
     polygons = _project(world, camera, T_w_c)
     iz, ids, spans = _depth_pass(polygons, camera.width, camera.height, 0.0)
     image = np.empty((camera.height, camera.width, 3), np.uint8)
-    image[:] = world.background
+    image[:] = np.array(world.background, np.uint8)
     seen = np.bincount(ids.ravel() + 1, minlength=len(world.quads) + 1)[1:] > 0
     for polygon, roi in zip(polygons, spans.roi.tolist(), strict=True):
         if seen[polygon.quad]:
             _draw(image, iz, ids, polygon, roi, world)
     if antialias:
         _smooth_borders(image, ids, [p for p in polygons if seen[p.quad]])
-    with np.errstate(divide="ignore"):
-        depth = np.where(iz > 0, np.float32(1.0) / iz, np.float32(0.0))
-    return Rendered(image, depth, ids.astype(np.int32))
+    return image, iz, ids
 
 
 def _project(world: World, camera: Camera, T_w_c: FloatArray) -> list[_Polygon]:
@@ -105,22 +120,27 @@ def _project(world: World, camera: Camera, T_w_c: FloatArray) -> list[_Polygon]:
     # of obliqueness, cos = plane distance times iz, keeps grazing surfaces from flickering.
     texels = world.texels[index] / np.abs(np.linalg.det(frame))
     level_offset = (np.log2(texels) - 0.5 * np.log2(np.abs(side[index]))).tolist()
+    near, far = c[:, :, 2].min(1), c[:, :, 2].max(1)
+    clipped = near < NEAR_M
+    ahead = np.maximum(c[:, :, 2], NEAR_M)
+    uv_all = np.stack([camera.fx * c[:, :, 0] / ahead + camera.cx, camera.fy * c[:, :, 1] / ahead + camera.cy], axis=2)
     polygons = []
-    for row, (quad, points) in enumerate(zip(index.tolist(), c.tolist(), strict=True)):
-        points = _clip(points)
-        if len(points) < 3:
-            continue
-        uv = [(camera.fx * p[0] / p[2] + camera.cx, camera.fy * p[1] / p[2] + camera.cy) for p in points]
-        izs = [1.0 / p[2] for p in points]
-        polygons.append(_Polygon(quad, uv, st_from_uv[row], (min(izs), max(izs)), level_offset[row]))
+    for row, (quad, corners_uv) in enumerate(zip(index.tolist(), uv_all.tolist(), strict=True)):
+        iz_range = (1.0 / far[row], 1.0 / near[row])
+        if clipped[row]:
+            points = _clip(c[row].tolist())
+            if len(points) < 3:
+                continue
+            corners_uv = [[camera.fx * p[0] / p[2] + camera.cx, camera.fy * p[1] / p[2] + camera.cy] for p in points]
+            izs = [1.0 / p[2] for p in points]
+            iz_range = (min(izs), max(izs))
+        polygons.append(_Polygon(quad, corners_uv, st_from_uv[row], iz_range, level_offset[row]))
     polygons.sort(key=lambda p: -p.iz_range[1])
     return polygons
 
 
 def _clip(points: list[list[float]]) -> list[list[float]]:
     """Part of a polygon in front of the near plane (Sutherland-Hodgman)."""
-    if min(p[2] for p in points) >= NEAR_M:
-        return points
     out = []
     for a, b in zip(points, points[1:] + points[:1], strict=True):
         if a[2] >= NEAR_M:
@@ -153,7 +173,7 @@ def _depth_pass(
         rows = slice(start, start + y1 - y0)
         nearer &= xs >= spans.low[rows, None]
         nearer &= xs <= spans.high[rows, None]
-        np.copyto(target, here, where=nearer)
+        cv2.copyTo(here, nearer.view(np.uint8), target)
         np.copyto(ids[y0:y1, x0:x1], polygon.quad, where=nearer)
     return iz, ids, spans
 

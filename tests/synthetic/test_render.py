@@ -6,7 +6,7 @@ import pytest
 
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import PRESETS, Camera
-from edgeslam_torch.synthetic.render import render
+from edgeslam_torch.synthetic.render import picture, render
 from edgeslam_torch.synthetic.rooms import corridor, look, random_pose, random_room, random_view, random_views, room
 from edgeslam_torch.synthetic.world import Quad, Texture, World
 
@@ -170,3 +170,10 @@ def test_pose_looks_along_its_yaw_and_tilt() -> None:
 def test_world_without_quads_is_refused() -> None:
     with pytest.raises(ValueError, match="1 to 32767 quads"):
         World([])
+
+
+def test_a_picture_is_the_image_of_a_view_with_plain_borders(furnished):
+    T_w_c = random_pose(np.random.default_rng(5), furnished)
+    np.testing.assert_array_equal(
+        picture(furnished, CAMERA, T_w_c), render(furnished, CAMERA, T_w_c, antialias=False).image
+    )
