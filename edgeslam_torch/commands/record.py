@@ -34,6 +34,7 @@ def main(args: argparse.Namespace) -> int:
     from edgeslam_torch.errors import ConfigError
     from edgeslam_torch.io.flight_writer import FlightWriter
     from edgeslam_torch.io.live import open_live, open_tello
+    from edgeslam_torch.io.tello import TelloError
 
     is_drone = args.source.startswith("tello://")
     if args.fly and not is_drone:
@@ -49,7 +50,7 @@ def main(args: argparse.Namespace) -> int:
         source = open_live(args.source, args.camera, args.max_frames)
     for warning in source.warnings:
         print(f"warning: {warning}")
-    interrupted = False
+    interrupted, failure = False, None
     try:
         with FlightWriter(folder, source.camera, is_drone, args.lossless) as writer:
             print(f"recording to {folder}; Ctrl-C ends it", flush=True)
@@ -57,6 +58,8 @@ def main(args: argparse.Namespace) -> int:
                 _record(source, writer, messages, tello if args.fly else None, args.duration)
             except KeyboardInterrupt:
                 interrupted = True
+            except TelloError as error:  # said once the drone is down and what was recorded has been told
+                failure = error
             finally:
                 source.close()  # lands; its state messages are recorded as well
                 _write_states(writer, messages)
@@ -67,6 +70,8 @@ def main(args: argparse.Namespace) -> int:
         print(f"note: {problem.file}: {problem.reason}")
     if tello is not None and tello.stop_reason:
         print(f"note: the flight was ended: {tello.stop_reason}")
+    if failure is not None:
+        raise failure
     return EXIT_INTERRUPTED if interrupted else 0
 
 
@@ -95,19 +100,23 @@ def _write_states(writer: "FlightWriter", messages: "list[StateMessage]") -> Non
 
 def _start_pilot(tello: "Tello") -> Callable[[], None]:
     """A short flight in a thread of its own; the returned function raises what went wrong in it."""
+    import logging
     import threading
 
     from edgeslam_torch.errors import EdgeSlamError
+    from edgeslam_torch.io.tello import NoAnswer
 
     failures: list[EdgeSlamError] = []
 
     def fly() -> None:
         try:
             tello.take_off()
-            tello.move(0.0, 0.0, 0.5)
-            tello.move(0.0, 0.0, -0.5)
-            tello.turn(0.7)
-            tello.turn(-0.7)
+            for step in (lambda: tello.move(0.0, 0.0, 0.5), lambda: tello.move(0.0, 0.0, -0.5),
+                         lambda: tello.turn(0.7), lambda: tello.turn(-0.7)):  # fmt: skip
+                try:
+                    step()
+                except NoAnswer as error:  # a lost packet; the next step does not rest on this one
+                    logging.getLogger(__name__).warning("%s; going on", error)
         except EdgeSlamError as error:
             failures.append(error)
 

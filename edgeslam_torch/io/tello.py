@@ -44,6 +44,10 @@ class TelloError(EdgeSlamError):
     """The drone does not answer, refuses, or may not do what was asked."""
 
 
+class NoAnswer(TelloError):
+    """A command was sent and nothing came back: it may have been heard or not."""
+
+
 @dataclass(frozen=True, slots=True)
 class TelloAddress:
     """Where a drone and our ends of its three channels are."""
@@ -279,7 +283,8 @@ class Tello:
                 if is_refusal(answer):
                     raise TelloError(f"{self.address.host}: {command!r} was refused: {answer}")
                 return answer
-        raise TelloError(
+        self._check_motion(name)
+        raise NoAnswer(
             f"{self.address.host}: no answer to {command!r} in {tries} x {wait:.0f} s; "
             "is the drone on and this computer in its Wi-Fi?"
         )

@@ -2,7 +2,6 @@
 
 import importlib
 import os
-import random
 import socket
 import threading
 import time
@@ -10,6 +9,7 @@ from contextlib import closing
 
 import numpy as np
 import pytest
+from free_ports import free_ports
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -22,23 +22,6 @@ from edgeslam_torch.io.tello import Tello, TelloAddress, TelloError, TelloLimits
 from edgeslam_torch.io.tello_answers import belongs_to
 
 av = pytest.importorskip("av", reason="PyAV is not installed: the [drone] extra")
-
-
-def free_ports(count):
-    """Ports that are free and that the system hands to nobody who asks for any port (those begin at 32768)."""
-    sockets = []
-    try:
-        while len(sockets) < count:
-            udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-            sockets.append(udp)
-            try:
-                udp.bind(("127.0.0.1", random.SystemRandom().randrange(12000, 32000)))
-            except OSError:
-                sockets.pop().close()
-        return [s.getsockname()[1] for s in sockets]
-    finally:
-        for s in sockets:
-            s.close()
 
 
 PATIENCE_S = 60.0
