@@ -21,6 +21,7 @@ _FLAGS = (
     "--disable-gpu",
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
+    "--hide-scrollbars",
     "--host-resolver-rules=MAP * ~NOTFOUND",  # the network is off
     "--remote-debugging-pipe",
 )
@@ -61,8 +62,12 @@ class Browser:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        self._process.kill()
-        self._process.wait()
+        os.write(self._out, b'{"id": 0, "method": "Browser.close"}\0')  # its children end with it, a kill leaves them
+        try:
+            self._process.wait(timeout=20.0)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
         os.close(self._in)
         os.close(self._out)
 
