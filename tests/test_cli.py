@@ -46,6 +46,11 @@ def test_run(edgeslam, recording, tmp_path):
     assert np.loadtxt(tmp_path / "out" / "trajectory.txt").shape == (6, 8)
 
 
+def test_camera_that_stands_still_is_told_apart_from_a_missing_depth_network(recording, tmp_path, capsys):
+    assert cli.main(["run", str(recording), "--out", str(tmp_path / "out"), "--no-report"]) == 0
+    assert "no point was triangulated" in capsys.readouterr().out
+
+
 def test_run_without_out_goes_into_runs(edgeslam, recording, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert edgeslam("run", "seq", "--no-report")[0] == 0
