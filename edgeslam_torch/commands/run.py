@@ -142,7 +142,7 @@ def _report(result: "RunResult", source: "Source") -> None:
         percent = 100.0 * scale["sigma"] / scale["value"]
         print(f"units are metres: scale from {scale['source']}, good to {percent:.1f} % (one sigma)")
     elif summary["map"]["anchors"] == 0:
-        print("units are arbitrary: no point was triangulated, so that nothing can tell the scale; did the camera move?")
+        print("units are arbitrary: no point was triangulated, so nothing can tell the scale; did the camera move?")
     else:
         print("units are arbitrary: neither telemetry nor a depth network told the scale")
     counts = summary["map"]
