@@ -63,7 +63,7 @@ class TelemetryTrack:
         return self._table
 
     def _build(self) -> FloatArray:
-        """Columns: stamp, displacement 3, unwrapped rpy 3, tof, h, baro, valid, velocity 3, sign 3, its integral 3."""
+        """Columns: stamp, displacement 3, unwrapped rpy 3, tof, h, baro, valid, velocity 3, sign 3, its integral 3, frozen."""
         rows = np.array(self._rows)
         stamp, velocity = rows[:, 0], _filled(rows[:, 1:4])
         rpy = np.unwrap(_filled(rows[:, 4:7]), axis=0)
@@ -71,9 +71,10 @@ class TelemetryTrack:
         if self._body:
             R = Rotation.from_euler("ZYX", rpy[:, ::-1])
             velocity, direction = R.apply(velocity), R.apply(direction)
-        valid = np.isfinite(rows[:, 1:4]).all(axis=1) & np.logical_not(_frozen(stamp, rows[:, 1:7]))
+        frozen = _frozen(stamp, rows[:, 1:7])
+        valid = np.isfinite(rows[:, 1:4]).all(axis=1) & np.logical_not(frozen)
         told = [_integral(stamp, velocity), rpy, rows[:, 7:10], valid, velocity]
-        return np.column_stack([stamp, *told, direction, _integral(stamp, direction)])
+        return np.column_stack([stamp, *told, direction, _integral(stamp, direction), frozen])
 
     def displacement(self, stamps_s: FloatArray, shortfall_m_s: float = 0.0) -> FloatArray:
         """Integrated velocity [m] in the power-on world, shape ``(N, 3)``; only differences mean anything.
@@ -143,7 +144,7 @@ class TelemetryTrack:
         sources = {}
         for column, name in ((7, "tof"), (8, "h"), (9, "baro")):
             z = table[:, column]
-            good = np.isfinite(z)
+            good = np.isfinite(z) & (table[:, 20] == 0)
             if name == "tof":
                 # 10 cm on the ground, 65.53 m beyond reach, and a slanted ray when the drone leans.
                 good &= (z > 0.15) & (z < 8.0) & np.logical_not(lean < _UPRIGHT)
