@@ -63,7 +63,8 @@ class TelemetryTrack:
         return self._table
 
     def _build(self) -> FloatArray:
-        """Columns: stamp, displacement 3, unwrapped rpy 3, tof, h, baro, valid, velocity 3, sign 3, its integral 3, frozen."""
+        """Columns: stamp, displacement 3, unwrapped rpy 3, tof, h, baro, valid, velocity 3, sign 3, its integral 3,
+        frozen."""
         rows = np.array(self._rows)
         stamp, velocity = rows[:, 0], _filled(rows[:, 1:4])
         rpy = np.unwrap(_filled(rows[:, 4:7]), axis=0)
