@@ -20,6 +20,9 @@ from edgeslam_torch.types import FloatArray
 SEVEN_SCENES_HZ = 30.0
 """The 7-Scenes files carry no stamps; the sensor ran at 30 Hz."""
 
+_TIMES = "times.txt"
+"""Stamps beside poses whose format has none, as KITTI has them."""
+
 _LARGE_TEXT = 1 << 20
 _MAX_FILE_BYTES = 1 << 30
 """A gigabyte of poses is 80 hours at 100 Hz: larger files are something else (a bag, a video)."""
@@ -114,16 +117,23 @@ def write_kitti(trajectory: Trajectory, path: Path | str) -> None:
     """Write 12 numbers a row and the stamps to ``times.txt`` beside it."""
     path = Path(path)
     np.savetxt(path, trajectory.T_w_c[:, :3, :].reshape(-1, 12), fmt="%.9e")
-    np.savetxt(path.with_name("times.txt"), trajectory.stamps_s, fmt="%.9f")
+    np.savetxt(path.with_name(_TIMES), trajectory.stamps_s, fmt="%.9f")
 
 
 def write_seven_scenes(trajectory: Trajectory, folder: Path | str) -> None:
-    """Write one ``frame-NNNNNN.pose.txt`` a pose; the number is the stamp in 30 Hz frames."""
+    """Write one ``frame-NNNNNN.pose.txt`` a pose.
+
+    The number is the stamp in 30 Hz frames where the stamps are such (7-Scenes' own); else poses are numbered in
+    order and their stamps written to ``times.txt`` beside them, as for KITTI.
+    """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    numbers = np.round(trajectory.stamps_s * SEVEN_SCENES_HZ).astype(int)
-    if len(set(numbers.tolist())) != len(numbers) or numbers.min() < 0:
-        raise EvaluationError("7-Scenes numbers frames at 30 Hz from stamp 0; these stamps do not fit that")
+    frames = trajectory.stamps_s * SEVEN_SCENES_HZ
+    numbers = np.round(frames).astype(int)
+    own = 0 <= numbers[0] and numbers[-1] < 10**6 and np.abs(frames - numbers).max() < 0.01
+    if not own:
+        numbers = np.arange(len(numbers))
+        np.savetxt(folder / _TIMES, trajectory.stamps_s, fmt="%.9f")
     for number, T in zip(numbers, trajectory.T_w_c, strict=True):
         np.savetxt(folder / f"frame-{number:06d}.pose.txt", T, fmt="%.9e")
 
@@ -273,8 +283,8 @@ def _from_matrices(stamps_s: FloatArray, T: FloatArray, source: str, notes: list
 
 def _from_kitti(table: FloatArray, path: Path, stamps_s: FloatArray | None) -> Trajectory:
     notes: list[str] = []
-    if stamps_s is None and (path.with_name("times.txt")).is_file():
-        stamps_s = _read_table(path.with_name("times.txt"))[0][:, 0]
+    if stamps_s is None and path.with_name(_TIMES).is_file():
+        stamps_s = _read_table(path.with_name(_TIMES))[0][:, 0]
     stamped = stamps_s is not None
     if stamps_s is None:
         notes.append("no times.txt beside the KITTI poses: rows are matched by number, at 10 Hz")
@@ -295,5 +305,10 @@ def _from_seven_scenes(files: list[Path], folder: Path) -> Trajectory:
         if table.shape != (4, 4):
             raise EvaluationError(f"{file}: a 7-Scenes pose is 4x4 numbers, got {table.shape[0]}x{table.shape[1]}")
         T[i] = table
+    if (folder / _TIMES).is_file():
+        stamps_s = _read_table(folder / _TIMES)[0][:, 0]
+        if len(stamps_s) != len(files):
+            raise EvaluationError(f"{folder}: {len(files)} poses but {len(stamps_s)} stamps in {_TIMES}")
+        return _from_matrices(stamps_s, T, str(folder), [])
     note = f"7-Scenes has no stamps: frame number / {SEVEN_SCENES_HZ:g} s"
     return replace(_from_matrices(numbers / SEVEN_SCENES_HZ, T, str(folder), [note]), stamped=False)

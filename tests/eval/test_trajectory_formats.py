@@ -19,6 +19,22 @@ def test_every_format_round_trips(name: str, loop: Trajectory, tmp_path: Path) -
     np.testing.assert_allclose(back.T_w_c, start.T_w_c, atol=1e-8)
 
 
+@pytest.mark.parametrize("name", ["kitti", "7scenes"])
+def test_formats_without_stamps_keep_those_of_another_clock_beside_them(
+    name: str, loop: Trajectory, tmp_path: Path
+) -> None:
+    start = Trajectory(1.3e9 + np.sort(np.random.default_rng(0).uniform(0, 9, len(loop))), loop.T_w_c, "loop")
+    path = tmp_path / {"7scenes": "seq"}.get(name, "poses.txt")
+    WRITERS[name](start, path)
+    back = read_trajectory(path)
+    assert back.stamped
+    np.testing.assert_allclose(back.stamps_s, start.stamps_s, atol=1e-6)
+    times = next(tmp_path.rglob("times.txt"))
+    times.write_text("0.0\n0.1\n")
+    with pytest.raises(EvaluationError, match="200 poses but 2 stamps"):
+        read_trajectory(path)
+
+
 def tum(path: Path, rows: list[list[float]] | list[str]) -> Path:
     path.write_text("\n".join(r if isinstance(r, str) else " ".join(map(str, r)) for r in rows) + "\n")
     return path
