@@ -130,7 +130,7 @@ def write_seven_scenes(trajectory: Trajectory, folder: Path | str) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     frames = trajectory.stamps_s * SEVEN_SCENES_HZ
     numbers = np.round(frames).astype(int)
-    own = 0 <= numbers[0] and numbers[-1] < 10**6 and np.abs(frames - numbers).max() < 0.01
+    own = numbers[0] >= 0 and numbers[-1] < 10**6 and np.abs(frames - numbers).max() < 0.01
     if not own:
         numbers = np.arange(len(numbers))
         np.savetxt(folder / _TIMES, trajectory.stamps_s, fmt="%.9f")
