@@ -56,6 +56,25 @@ def test_pcd_is_what_the_format_page_says(cloud: PointCloud, tmp_path: Path) -> 
     assert points["rgb"].copy().view(np.uint32)[0] & 0xFF == cloud.colour[0, 2]
 
 
+def test_plyfile_reads_what_was_written(cloud: PointCloud, tmp_path: Path) -> None:
+    plyfile = pytest.importorskip("plyfile", reason="plyfile is not installed")
+    write_ply(tmp_path / "m.ply", cloud)
+    found = plyfile.PlyData.read(tmp_path / "m.ply")["vertex"]
+    np.testing.assert_array_equal(np.stack([found[k] for k in "xyz"], axis=1), cloud.p_w)
+    np.testing.assert_array_equal(np.stack([found[k] for k in ("red", "green", "blue")], axis=1), cloud.colour)
+    np.testing.assert_array_equal(found["sigma"], cloud.sigma_m)
+    np.testing.assert_array_equal(found["observations"], cloud.observations)
+
+
+def test_pypcd_reads_what_was_written(cloud: PointCloud, tmp_path: Path) -> None:
+    pypcd4 = pytest.importorskip("pypcd4", reason="pypcd4 is not installed")
+    write_pcd(tmp_path / "m.pcd", cloud)
+    found = pypcd4.PointCloud.from_path(tmp_path / "m.pcd")
+    np.testing.assert_array_equal(found.numpy(("x", "y", "z")), cloud.p_w)
+    np.testing.assert_array_equal(pypcd4.PointCloud.decode_rgb(found.pc_data["rgb"]), cloud.colour)
+    np.testing.assert_array_equal(found.pc_data["sigma"], cloud.sigma_m)
+
+
 READ_COLMAP = """
 import json, sys, pycolmap
 r = pycolmap.Reconstruction(sys.argv[1])
