@@ -38,6 +38,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="offline: every frame, repeatable; realtime: at camera pace, late frames dropped "
         "(default: offline, realtime for live sources)",
     )
+    parser.add_argument("--record", type=Path, metavar="DIR", help="keep what a live source showed, to run it again")
+    parser.add_argument("--lossless", action="store_true", help="record PNG instead of JPEG (quality 95)")
     parser.add_argument("--max-frames", type=_positive_int, metavar="N", help="stop after N frames")
     parser.add_argument("--config", type=Path, metavar="FILE.toml", help="settings; a run's config.toml is one")
     parser.add_argument(
@@ -65,7 +67,10 @@ def main(args: argparse.Namespace) -> int:
     from edgeslam_torch.run import Listener, Mode, run, settle_camera
 
     config = resolved_config(args)
-    source = open_source(args.source, args.camera, args.telemetry, args.max_frames)
+    if args.record is not None:
+        source = _recorded(args)
+    else:
+        source = open_source(args.source, args.camera, args.telemetry, args.max_frames)
     settle_camera(source)
     for warning in source.warnings:
         _say(f"warning: {warning}")
@@ -94,6 +99,22 @@ def main(args: argparse.Namespace) -> int:
         )
         return EXIT_INTERRUPTED
     return 0
+
+
+def _recorded(args: argparse.Namespace) -> "Source":
+    from edgeslam_torch.errors import ConfigError
+    from edgeslam_torch.io.live import open_live, open_tello
+    from edgeslam_torch.io.source import LIVE_SCHEMES
+    from edgeslam_torch.io.tee import RecordedLive
+
+    if not args.source.startswith(LIVE_SCHEMES):
+        raise ConfigError(f"{args.source}: --record is for live sources ({', '.join(LIVE_SCHEMES)})")
+    if args.telemetry is not None:
+        raise ConfigError("--telemetry is for recordings; a live drone sends its own")
+    if args.source.startswith("tello://"):
+        source, _, messages = open_tello(args.source, args.camera, args.max_frames)
+        return RecordedLive(source, messages, args.record, args.lossless)
+    return RecordedLive(open_live(args.source, args.camera, args.max_frames), [], args.record, args.lossless)
 
 
 def resolved_config(args: argparse.Namespace) -> "SlamConfig":

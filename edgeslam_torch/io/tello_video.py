@@ -33,14 +33,17 @@ def import_av() -> Any:
 
 
 class ArrivalClock:
-    """Seconds since 1970 that never jump: wall time at the start plus a monotonic clock."""
+    """Seconds since 1970 that never jump: wall time at the start plus a monotonic clock.
+
+    Whole microseconds, as recordings hold them: what is run again has the very same stamps.
+    """
 
     def __init__(self) -> None:
         self._offset = time.time() - time.monotonic()
 
     def now(self) -> float:
         """Now [s]."""
-        return time.monotonic() + self._offset
+        return round(time.monotonic() + self._offset, 6)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,96 @@
+"""A live source that is recorded while it is used: what was seen live can be run again."""
+
+import queue
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+from edgeslam_torch.errors import OutputError
+from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.io.flight_writer import FlightWriter
+from edgeslam_torch.io.listing import Problem
+from edgeslam_torch.io.live import LiveSource
+from edgeslam_torch.io.tello import StateMessage
+from edgeslam_torch.types import Frame, TelemetrySample
+
+_WAITING = 60
+"""Frames that may wait for the disk (two seconds, 120 MB at 960x720); beyond that the camera is taken less often."""
+
+
+class RecordedLive:
+    """Implements `edgeslam_torch.io.source.Source`: the frames that are taken from it are written beside.
+
+    Only frames that were taken are in the recording, so that running it again sees what was seen.
+    """
+
+    groundtruth: Path | None = None
+    live = True
+
+    def __init__(self, source: LiveSource, messages: list[StateMessage], folder: Path, lossless: bool) -> None:
+        """Open the folder.
+
+        Args:
+            source: What to record.
+            messages: State messages of a drone, growing; stays empty without one.
+            folder: Where to.
+            lossless: PNG, so that the pictures are the same to the bit.
+
+        Raises:
+            OutputError: If it holds a recording already or cannot be written; the source is closed.
+        """
+        self.name, self.kind, self.location = source.name, source.kind, source.location
+        self.camera: Camera = source.camera
+        self.telemetry: list[TelemetrySample] = source.telemetry
+        self.length: int | None = source.length
+        self.problems: list[Problem] = source.problems
+        self.warnings: list[str] = source.warnings
+        self._source, self._messages = source, messages
+        try:
+            self._writer = FlightWriter(folder, source.camera, source.location.startswith("tello://"), lossless)
+        except OutputError:
+            source.close()
+            raise
+        self._queue: queue.Queue[Frame | None] = queue.Queue(maxsize=_WAITING)
+        self._failure: OutputError | None = None
+        self._thread = threading.Thread(target=self._work, name="recording", daemon=True)
+        self._thread.start()
+        self._closed = False
+
+    def frames(self) -> Iterator[Frame]:
+        """As the source's; a disk that refuses ends the recording, not the flight."""
+        try:
+            for frame in self._source.frames():
+                self._queue.put(frame)
+                yield frame
+        finally:
+            self.close()
+
+    def close(self) -> None:
+        """Close the source, then write what waits."""
+        if self._closed:
+            return
+        self._closed = True
+        self._source.close()
+        self._queue.put(None)
+        self._thread.join()
+        self._write_states()
+        self._writer.close()
+        if self._failure is not None:
+            self.problems.append(Problem(str(self._writer.folder), str(self._failure)))
+
+    def _work(self) -> None:
+        while (frame := self._queue.get()) is not None:
+            if self._failure is not None:
+                continue  # emptied, so that nobody waits
+            try:
+                self._writer.add_frame(frame)
+            except OutputError as error:
+                self._failure = error
+            self._write_states()
+
+    def _write_states(self) -> None:
+        try:
+            while self._failure is None and self._writer.states < len(self._messages):
+                self._writer.add_state(self._messages[self._writer.states])
+        except OutputError as error:
+            self._failure = error
