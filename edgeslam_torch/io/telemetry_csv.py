@@ -5,8 +5,10 @@ The reader also takes other people's logs: other column names, milliseconds, and
 
 import logging
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from pathlib import Path
 from types import TracebackType
 from typing import TextIO
@@ -21,9 +23,47 @@ from edgeslam_torch.types import FloatArray, TelemetrySample
 logger = logging.getLogger(__name__)
 
 HEADER = ("stamp_s", *FIELDS)
-_STAMPS = {"stamp_s": 1.0, "timestamp": 0.0, "time_s": 1.0, "stamp": 0.0, "t": 0.0}
-"""Column names of the clock; factor 0 means the unit is told by the spacing."""
-_ALIASES = {"vx": "vgx", "vy": "vgy", "vz": "vgz", "batt": "bat", "battery": "bat", "height": "h"}
+_STAMPS = {
+    "stamp_s": 1.0,
+    "time_s": 1.0,
+    "timestamp_s": 1.0,
+    "timestamp_ms": 1e-3,
+    "time_ms": 1e-3,
+    "stamp_ms": 1e-3,
+    "ms": 1e-3,
+    "timestamp_us": 1e-6,
+    "timestamp_ns": 1e-9,
+    "timestamp": 0.0,
+    "time_stamp": 0.0,
+    "stamp": 0.0,
+    "t": 0.0,
+    "ts": 0.0,
+    "datetime": 0.0,
+    "date_time": 0.0,
+    "time": 0.0,
+}
+"""Column names of the clock, the surest first; factor 0 means the unit is told by the spacing. The SDK's own ``time``
+counts whole seconds of motor time: it serves only where there is nothing else."""
+_ALIASES = {
+    "vx": "vgx",
+    "vy": "vgy",
+    "vz": "vgz",
+    "speed_x": "vgx",
+    "speed_y": "vgy",
+    "speed_z": "vgz",
+    "ax": "agx",
+    "ay": "agy",
+    "az": "agz",
+    "batt": "bat",
+    "battery": "bat",
+    "height": "h",
+    "barometer": "baro",
+    "tof_distance": "tof",
+    "distance_tof": "tof",
+}
+_UNITS = ("cm", "dm", "m", "deg", "degrees", "pct", "percent", "%", "cm_s", "dm_s", "m_s", "mg", "c")
+"""Endings of column names that other logs write; velocities' units are found from the data all the same."""
+_SEPARATORS = ",;\t"
 _MAX_COLUMNS = 256
 _MAX_BYTES = 512 * 1024 * 1024
 
@@ -111,35 +151,68 @@ def read_table(path: str | Path) -> TelemetryTable:
     header_at = next((i for i, line in enumerate(lines) if line.strip()), None)
     if header_at is None:
         raise TelemetryError(f"{path}: empty; it needs a header line such as {','.join(HEADER[:4])},...")
-    names = [name.strip().lower() for name in lines[header_at].lstrip("#").split(",")]
+    separator = max(_SEPARATORS, key=lines[header_at].count)
+    names = [_plain(name) for name in lines[header_at].lstrip("#").split(separator)]
     clock = next((name for name in _STAMPS if name in names), None)
-    columns = {
-        _ALIASES.get(name, name): i for i, name in enumerate(names[:_MAX_COLUMNS]) if _ALIASES.get(name, name) in FIELDS
-    }
+    columns: dict[str, int] = {}
+    for i, name in enumerate(names[:_MAX_COLUMNS]):
+        known = next((n for n in (name, _ALIASES.get(name, ""), _bare(name)) if n in FIELDS), None)
+        if known is not None and name != clock:
+            columns.setdefault(known, i)
     if clock is None or not columns:
         missing = f"no clock ({', '.join(_STAMPS)})" if clock is None else f"no known column ({', '.join(FIELDS)})"
         raise TelemetryError(f"{path}: {missing} in its header line; give a telemetry.csv")
-    rows, skipped = _rows(lines[header_at + 1 :], len(names), names.index(clock), list(columns.values()))
+    rows, skipped = _rows(lines[header_at + 1 :], separator, len(names), names.index(clock), list(columns.values()))
     table = np.array(rows, dtype=np.float64).reshape(len(rows), 1 + len(columns))
     stamps = table[:, 0] * (_STAMPS[clock] or _seconds_per_unit(table[:, 0]))
     values: dict[str, FloatArray] = {name: table[:, 1 + i] for i, name in enumerate(columns)}
     return TelemetryTable(stamps, values, skipped)
 
 
-def _rows(lines: list[str], width: int, clock: int, columns: list[int]) -> tuple[list[list[float]], int]:
+def _plain(name: str) -> str:
+    """A column's name without quotes, brackets, case and slashes: ``"Tof (cm)"`` to ``tof_cm``."""
+    return "_".join(re.sub(r"[\"'()\[\]]", " ", name).replace("/", "_").lower().split())
+
+
+def _bare(name: str) -> str:
+    """The name without a unit behind it."""
+    for unit in sorted(_UNITS, key=len, reverse=True):
+        if name.endswith(f"_{unit}"):
+            short = name.removesuffix(f"_{unit}")
+            return _ALIASES.get(short, short)
+    return ""
+
+
+def _rows(
+    lines: list[str], separator: str, width: int, clock: int, columns: list[int]
+) -> tuple[list[list[float]], int]:
     rows: list[list[float]] = []
     skipped, last = 0, -math.inf
     for line in lines:
         if not line.strip() or line.lstrip().startswith("#"):
             continue
-        cells = line.split(",")
-        stamp = to_number(cells[clock]) if len(cells) == width else math.nan
+        cells = [cell.strip().strip("\"'") for cell in line.split(separator)]
+        if len(cells) == width + 1 and not cells[-1]:
+            cells.pop()  # a separator at the end of each row
+        stamp = _moment(cells[clock]) if len(cells) == width else math.nan
         if not stamp > last or abs(stamp) > 1e19:
             skipped += 1
             continue
         rows.append([stamp, *(to_number(cells[i]) for i in columns)])
         last = stamp
     return rows, skipped
+
+
+def _moment(text: str) -> float:
+    """A number, or seconds since 1970 of a date and time (taken as UTC where it does not say)."""
+    number = to_number(text)
+    if math.isfinite(number) or len(text) < 16:
+        return number
+    try:
+        moment = datetime.fromisoformat(text)
+    except ValueError:
+        return math.nan
+    return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
 
 
 def _seconds_per_unit(stamps: FloatArray) -> float:

@@ -148,6 +148,65 @@ def test_unit_and_axis_of_the_velocity_are_found_from_height(tmp_path, velocity_
     assert samples[1].stamp_s == pytest.approx(0.1)  # milliseconds, told by their spacing
 
 
+def rewritten(tmp_path, how):
+    """The climbing flight as another program might have logged it."""
+    lines = climbing(tmp_path, 0.1, -1).read_text().splitlines()
+    head, rows = lines[0].split(","), [line.split(",") for line in lines[1:]]
+    if how == "other order":
+        order = [4, 3, 0, 2, 1]
+        head, rows = [head[i] for i in order], [[row[i] for i in order] for row in rows]
+    elif how == "semicolons, units in names":
+        head = ["Timestamp [ms]", "vgx (dm/s)", "vgy (dm/s)", "vgz (dm/s)", "ToF (cm)"]
+        return write(tmp_path, "\n".join(";".join(row) for row in [head, *rows]))
+    elif how == "quoted, separator at the end":
+        head, rows = [f'"{h}"' for h in head], [[*(f'"{c}"' for c in row), ""] for row in rows]
+    elif how == "dates":
+        rows = [
+            [f"2024-05-01 12:{int(row[0]) // 60000:02d}:{int(row[0]) % 60000 / 1e3:06.3f}", *row[1:]] for row in rows
+        ]
+    elif how == "motor time beside the clock":
+        head, rows = ["time", *head], [[str(int(row[0]) // 1000), *row] for row in rows]
+    elif how == "no horizontal velocity, index in front":
+        head, rows = ["", head[0], *head[3:]], [[str(k), row[0], *row[3:]] for k, row in enumerate(rows)]
+    elif how == "h in place of tof, some missing":
+        head = [*head[:4], "height_cm"]
+        rows = [
+            [*row[:3], "" if k % 7 == 0 else row[3], "None" if k % 5 == 0 else row[4]] for k, row in enumerate(rows)
+        ]
+    elif how == "furniture below":
+        rows = [[*row[:4], str(int(row[4]) - (45 if 40 < k % 100 < 70 else 0))] for k, row in enumerate(rows)]
+    elif how == "Windows line ends and a byte order mark":
+        return write(tmp_path, "\ufeff" + "\r\n".join(",".join(row) for row in [head, *rows]))
+    return write(tmp_path, "\n".join(",".join(row) for row in [head, *rows]))
+
+
+@pytest.mark.parametrize(
+    "how",
+    [
+        "other order",
+        "semicolons, units in names",
+        "quoted, separator at the end",
+        "dates",
+        "motor time beside the clock",
+        "no horizontal velocity, index in front",
+        "h in place of tof, some missing",
+        "furniture below",
+        "Windows line ends and a byte order mark",
+    ],
+)
+def test_a_flight_that_another_program_logged_is_read_the_same(tmp_path, how):
+    table = read_table(rewritten(tmp_path, how))
+    assert len(table.stamps_s) == 300
+    assert table.skipped == 0
+    assert np.diff(table.stamps_s) == pytest.approx(np.full(299, 0.1), abs=1e-3)
+    units = detect_units(table)
+    assert (units.velocity_m_s, units.z_down, units.body_frame) == (0.1, True, False)
+    samples = table.samples(units)
+    assert samples[1].velocity_m_s[2] == pytest.approx(0.4 * math.cos(0.08), abs=0.01)
+    height = samples[1].height_m if how.startswith("h in") else samples[1].tof_m
+    assert height == pytest.approx(1.04, abs=0.011)
+
+
 def test_units_can_be_given(tmp_path):
     path = climbing(tmp_path, 0.1, -1)
     assert read_telemetry(path, TelemetryUnits(0.01))[0].velocity_m_s[2] == pytest.approx(0.04, abs=0.001)
