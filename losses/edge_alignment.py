@@ -39,116 +39,145 @@ class EdgeAlignmentLoss(ResidualLoss):
 
 
 class PairGeometry(NamedTuple):
-    """Edge pixels seen from their target frames; components first, ``P`` pairs."""
+    """Edge pixels seen from their target frames; one element per pair, in any shape ``(...)``."""
 
     x: Tensor
-    """``(P,)`` normalised image coordinate."""
+    """Normalised image coordinate."""
     y: Tensor
     iz: Tensor
-    """``(P,)`` inverse z-depth in the target frame."""
-    slope: Tensor
-    """``(3, P)`` derivatives of x, y, iz by the inverse depth in the host frame."""
+    """Inverse z-depth in the target frame."""
+    scale: Tensor
+    """Depth in the host frame over depth in the target frame."""
     front: Tensor
-    """``(P,)`` in front of the target camera."""
+    """In front of the target camera."""
 
 
 def pair_geometry(Rt: Tensor, ray: Tensor, inverse_depth: Tensor) -> PairGeometry:
-    """Edge pixels in their target frames.
+    """Edge pixels in their target frames; trailing axes broadcast.
 
     Args:
-        Rt: Each pair's relative motion ``(3, 4, P)`` from host to target.
-        ray: ``(2, P)`` normalised image coordinates in the host frame.
-        inverse_depth: ``(P,)`` in the host frame.
+        Rt: Relative motions ``(3, 4, ...)`` from host to target.
+        ray: ``(2, ...)`` normalised image coordinates in the host frame.
+        inverse_depth: ``(...)`` in the host frame.
     """
     # The point times its inverse depth: no division by it, so infinity is an ordinary value.
-    q = torch.addcmul(torch.addcmul(Rt[:, 2], Rt[:, 0], ray[0]), Rt[:, 1], ray[1])
-    q = torch.addcmul(q, Rt[:, 3], inverse_depth)
+    # Products and sums apart: torch's addcmul is ten times slower where an argument is broadcast along the last axis.
+    q = Rt[:, 0] * ray[0] + Rt[:, 1] * ray[1] + Rt[:, 3] * inverse_depth + Rt[:, 2]
     front = q[2] > 1e-6
     scale = torch.where(front, q[2], 1.0).reciprocal()
-    n = q[:2] * scale
-    iz = inverse_depth * scale
-    t_scaled = Rt[:, 3] * scale
-    across = torch.addcmul(t_scaled[:2], n, t_scaled[2], value=-1.0)
-    slope = torch.cat((across, torch.addcmul(scale, iz, t_scaled[2], value=-1.0)[None]))
-    return PairGeometry(n[0], n[1], iz, slope, front)
+    return PairGeometry(q[0] * scale, q[1] * scale, inverse_depth * scale, scale, front)
 
 
-def alignment_row(g: PairGeometry, uv_j: Tensor, normal_j: Tensor, K: Tensor) -> Tensor:
-    """Distance across the edge ``(P,)`` [px]; arguments as `alignment_jacobians` takes them."""
-    a = normal_j * K[:2, None]
-    return torch.addcmul(a[0] * g.x, a[1], g.y) + ((K[2:, None] - uv_j) * normal_j).sum(0)
+def depth_slopes(g: PairGeometry, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Derivatives of x, y and iz by the inverse depth in the host frame; ``t (3, ...)`` the relative translations."""
+    tz = t[2] * g.scale
+    return (
+        torch.addcmul(t[0] * g.scale, g.x, tz, value=-1.0),
+        torch.addcmul(t[1] * g.scale, g.y, tz, value=-1.0),
+        torch.addcmul(g.scale, g.iz, tz, value=-1.0),
+    )
 
 
-def alignment_jacobians(g: PairGeometry, uv_j: Tensor, normal_j: Tensor, K: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Distance across the edge with derivatives.
+def partner_line(uv_j: Tensor, normal_j: Tensor, inv_sigma: Tensor, K: Tensor) -> Tensor:
+    """Partners as lines ``(3, ...)`` of normalised coordinates: the whitened distance from one is ``a x + b y + c``.
+
+    Args:
+        uv_j: Partners ``(2, ...)`` [px].
+        normal_j: Their unit normals ``(2, ...)``.
+        inv_sigma: Inverse standard deviations ``(...)`` across the edge [1/px].
+        K: fx, fy, cx, cy [px], shape ``(4,)``.
+    """
+    a, b = normal_j[0] * inv_sigma, normal_j[1] * inv_sigma
+    return torch.stack((a * K[0], b * K[1], a * (K[2] - uv_j[0]) + b * (K[3] - uv_j[1])))
+
+
+def alignment_row(g: PairGeometry, line: Tensor) -> Tensor:
+    """Whitened distance across the edge ``(...)``; ``line`` from `partner_line`."""
+    return torch.addcmul(torch.addcmul(line[2], line[0], g.x), line[1], g.y)
+
+
+def alignment_jacobians(
+    g: PairGeometry, slope: tuple[Tensor, Tensor, Tensor], line: Tensor
+) -> tuple[tuple[Tensor, ...], Tensor]:
+    """Derivatives of `alignment_row`, linear in ``line``.
 
     Args:
         g: Pairs in their target frames.
-        uv_j: Partners ``(2, P)`` [px].
-        normal_j: Their unit normals ``(2, P)``.
-        K: fx, fy, cx, cy [px], shape ``(4,)``.
+        slope: Their `depth_slopes`.
+        line: ``(3, ...)`` from `partner_line`, times any weight.
 
     Returns:
-        Residual ``(P,)``, its derivatives by the relative pose's left tangent ``(6, P)`` and inverse depth ``(P,)``.
+        By the relative pose's left tangent (six of ``(...)``) and by the inverse depth ``(...)``.
     """
-    a = normal_j * K[:2, None]
-    u, v = a[0], a[1]
+    u, v = line[0], line[1]
     along = torch.addcmul(u * g.x, v, g.y)
-    J = torch.empty(6, g.x.shape[0], dtype=g.x.dtype, device=g.x.device)
-    torch.mul(a, g.iz, out=J[:2])
-    torch.mul(along, g.iz, out=J[2]).neg_()
-    torch.addcmul(-v, along, g.y, value=-1.0, out=J[3])
-    torch.addcmul(u, along, g.x, out=J[4])
-    torch.addcmul(v * g.x, u, g.y, value=-1.0, out=J[5])
-    residual = along + ((K[2:, None] - uv_j) * normal_j).sum(0)
-    return residual, J, torch.addcmul(u * g.slope[0], v, g.slope[1])
+    by_pose = (
+        u * g.iz,
+        v * g.iz,
+        -along * g.iz,
+        torch.addcmul(-v, along, g.y, value=-1.0),
+        torch.addcmul(u, along, g.x),
+        torch.addcmul(v * g.x, u, g.y, value=-1.0),
+    )
+    return by_pose, torch.addcmul(u * slope[0], v, slope[1])
 
 
 def relative_depth_row(g: PairGeometry, inverse_depth_j: Tensor) -> Tensor:
-    """``(z - d_j) / (z + d_j)`` of each pair ``(P,)``, by inverse depths."""
+    """``(z - d_j) / (z + d_j)`` of each pair ``(...)``, by inverse depths."""
     return (inverse_depth_j - g.iz) / (inverse_depth_j + g.iz)
 
 
-def relative_depth_jacobians(g: PairGeometry, inverse_depth_j: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """`relative_depth_row` with its derivatives by the relative pose ``(6, P)`` and the inverse depth ``(P,)``."""
+def relative_depth_jacobians(
+    g: PairGeometry, slope: tuple[Tensor, Tensor, Tensor], inverse_depth_j: Tensor, weight: Tensor
+) -> tuple[tuple[Tensor, ...], Tensor]:
+    """Derivatives of `relative_depth_row` times a weight ``(...)``; as `alignment_jacobians` returns them."""
     scale = (inverse_depth_j + g.iz).reciprocal()
-    residual = (inverse_depth_j - g.iz) * scale
-    by_iz = -2.0 * inverse_depth_j * scale * scale
-    J = torch.zeros(6, g.x.shape[0], dtype=g.x.dtype, device=g.x.device)
+    by_iz = inverse_depth_j * scale * scale * (-2.0 * weight)
     k = by_iz * g.iz
-    torch.mul(k, g.iz, out=J[2]).neg_()
-    torch.mul(k, g.y, out=J[3]).neg_()
-    torch.mul(k, g.x, out=J[4])
-    return residual, J, by_iz * g.slope[2]
+    none = torch.zeros_like(k)
+    return (none, none, -k * g.iz, -k * g.y, k * g.x, none), by_iz * slope[2]
+
+
+def round_trip_row(g: PairGeometry, Rt: Tensor, ray: Tensor, inverse_depth_j: Tensor, K: Tensor) -> Tensor:
+    """Residual of `round_trip_jacobians` ``(2, ...)`` [px]."""
+    back = _way_back(g, Rt, inverse_depth_j)[1]
+    front = back[2] > 1e-6
+    n = back[:2] / torch.where(front, back[2], 1.0)
+    return torch.where(front, (n - ray) * _focal(K, g), 0.0)
 
 
 def round_trip_jacobians(
-    g: PairGeometry, Rt: Tensor, ray: Tensor, inverse_depth_j: Tensor, K: Tensor
+    g: PairGeometry,
+    slope: tuple[Tensor, Tensor, Tensor],
+    Rt: Tensor,
+    ray: Tensor,
+    inverse_depth_j: Tensor,
+    K: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The paper's pixel cycle, eqs. (17)-(23), with the target's depth held, and its derivatives.
 
     Args:
         g: Pairs in their target frames.
-        Rt: Relative motions ``(3, 4, P)``.
-        ray: ``(2, P)`` normalised image coordinates in the host frame.
-        inverse_depth_j: Inverse depths ``(P,)`` that the target frame has at the projected pixel.
+        slope: Their `depth_slopes`.
+        Rt: Relative motions ``(3, 4, ...)``.
+        ray: ``(2, ...)`` normalised image coordinates in the host frame.
+        inverse_depth_j: Inverse depths ``(...)`` that the target frame has at the projected pixel.
         K: fx, fy, cx, cy [px], shape ``(4,)``.
 
     Returns:
-        Residual ``(2, P)`` [px], derivatives by the relative pose ``(2, 6, P)`` and the inverse depth ``(2, P)``.
+        Residual ``(2, ...)`` [px], derivatives by the relative pose ``(2, 6, ...)`` and the inverse depth ``(2, ...)``.
     """
-    R, t = Rt[:, :3], Rt[:, 3]
-    # Times the target's inverse depth, for the same reason as above.
-    q = torch.stack((g.x, g.y, torch.ones_like(g.x)))
-    back = (R * (q - t * inverse_depth_j)[:, None]).sum(0)
+    R = Rt[:, :3]
+    q, back = _way_back(g, Rt, inverse_depth_j)
     front = back[2] > 1e-6
     scale = torch.where(front, back[2], 1.0).reciprocal()
     n = back[:2] * scale
-    residual = (n - ray) * K[:2, None]
+    f = _focal(K, g)
+    residual = (n - ray) * f
     # d n / d q: rows of R^T minus n times its last row.
-    D = (R[:, :2].transpose(0, 1) - n[:, None] * R[:, 2]) * (scale * K[:2, None])[:, None]  # (2, 3, P)
+    D = (R[:, :2].transpose(0, 1) - n[:, None] * R[:, 2]) * (scale * f)[:, None]  # (2, 3, ...)
     # The projected pixel moves with the pose: d (x, y) / d xi; and T^-1 moves: -(rho + phi x P'_j).
-    Jn = torch.zeros(2, 6, g.x.shape[0], dtype=g.x.dtype, device=g.x.device)
+    Jn = torch.zeros(2, 6, *g.x.shape, dtype=g.x.dtype, device=g.x.device)
     Jn[0, 0], Jn[1, 1] = g.iz, g.iz
     Jn[0, 2], Jn[1, 2] = -g.x * g.iz, -g.y * g.iz
     Jn[0, 3], Jn[0, 4], Jn[0, 5] = -g.x * g.y, 1.0 + g.x * g.x, -g.y
@@ -158,5 +187,15 @@ def round_trip_jacobians(
     J[:, 3] -= D[:, 2] * q[1] - D[:, 1] * q[2]
     J[:, 4] -= D[:, 0] * q[2] - D[:, 2] * q[0]
     J[:, 5] -= D[:, 1] * q[0] - D[:, 0] * q[1]
-    by_depth = D[:, 0] * g.slope[0] + D[:, 1] * g.slope[1]
+    by_depth = D[:, 0] * slope[0] + D[:, 1] * slope[1]
     return torch.where(front, residual, 0.0), torch.where(front, J, 0.0), torch.where(front, by_depth, 0.0)
+
+
+def _way_back(g: PairGeometry, Rt: Tensor, inverse_depth_j: Tensor) -> tuple[Tensor, Tensor]:
+    """Points at the target's depth in the target frame and in the host frame ``(3, ...)``, both times its inverse."""
+    q = torch.stack((g.x, g.y, torch.ones_like(g.x)))
+    return q, (Rt[:, :3] * (q - Rt[:, 3] * inverse_depth_j)[:, None]).sum(0)
+
+
+def _focal(K: Tensor, g: PairGeometry) -> Tensor:
+    return K[:2].reshape(2, *[1] * g.x.ndim)

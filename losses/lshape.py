@@ -15,7 +15,7 @@ from edgeslam_torch.losses.base import (
     project,
     reduce,
 )
-from edgeslam_torch.losses.edge_alignment import pair_geometry
+from edgeslam_torch.losses.edge_alignment import PairGeometry, depth_slopes, pair_geometry
 from edgeslam_torch.losses.robust import Kernel
 
 
@@ -172,59 +172,83 @@ class LShapeLoss(torch.nn.Module):
         return self.lambda_theta * angle + self.lambda_col * self.collinearity(arms, arms_mask)
 
 
+def junction_residuals(
+    Rt: Tensor, rays: Tensor, inverse_depth: Tensor, uv_j: Tensor, arms_j: Tensor, K: Tensor, cosines: bool
+) -> tuple[Tensor, Tensor]:
+    """Residuals ``(R, ...)`` of `junction_rows` alone, and which pairs lie in front; arguments as it takes them."""
+    points, uv = _ends(Rt, rays, inverse_depth, K)
+    unit, _ = _arms(uv)
+    rows = _cosine(unit) - _cosine(arms_j) if cosines else _sines(arms_j, unit)
+    return torch.cat((uv[:, 0] - uv_j, rows)), points.front.all(0)
+
+
 def junction_rows(
     Rt: Tensor, rays: Tensor, inverse_depth: Tensor, uv_j: Tensor, arms_j: Tensor, K: Tensor, cosines: bool
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Residuals of L-junctions seen from their target frames, with derivatives; ``Q`` pairs.
+    """Residuals of L-junctions seen from their target frames, with derivatives; trailing axes broadcast.
 
     Args:
-        Rt: Each pair's relative motion ``(3, 4, Q)`` from host to target.
-        rays: Normalised coordinates ``(3, 2, Q)`` of corner and arm ends in the host frame.
-        inverse_depth: Their inverse depths ``(3, Q)`` there.
-        uv_j: Corner that the target sees ``(2, Q)`` [px].
-        arms_j: Unit directions of the arms that the target sees ``(2, 2, Q)``, arm first.
+        Rt: Relative motions ``(3, 4, ...)`` from host to target.
+        rays: Normalised coordinates ``(2, 3, ...)`` of corner and arm ends in the host frame.
+        inverse_depth: Their inverse depths ``(3, ...)`` there.
+        uv_j: Corner that the target sees ``(2, ...)`` [px].
+        arms_j: Unit directions of the arms that the target sees ``(2, 2, ...)``, coordinate first, then arm.
         K: fx, fy, cx, cy [px], shape ``(4,)``.
         cosines: One row, the angle's cosine (paper eq. 24 across views), in place of two, the sines of the angles
             between each projected arm and the one seen.
 
     Returns:
-        Residuals ``(R, Q)``: corner u and v [px], then one or two angle rows; derivatives by the relative pose
-        ``(R, 6, Q)`` and by the inverse depths ``(R, 3, Q)``; and which pairs lie in front ``(Q,)``.
+        Residuals ``(R, ...)``: corner u and v [px], then one or two angle rows; derivatives by the relative pose
+        ``(R, 6, ...)`` and by the inverse depths ``(R, 3, ...)``; and which pairs lie in front ``(...)``.
     """
-    points = [pair_geometry(Rt, rays[k], inverse_depth[k]) for k in range(3)]
-    f = K[:2, None]
-    uv = [torch.stack((g.x, g.y)) * f for g in points]
-    by_pose = [_point_jacobian(g.x, g.y, g.iz) * f[:, None] for g in points]
-    by_depth = [g.slope[:2] * f for g in points]
-    Q = uv_j.shape[1]
-    R = 3 if cosines else 4
-    r, J, Jd = uv_j.new_zeros(R, Q), uv_j.new_zeros(R, 6, Q), uv_j.new_zeros(R, 3, Q)
-    r[:2] = uv[0] + (K[2:, None] - uv_j)
-    J[:2], Jd[:2, 0] = by_pose[0], by_depth[0]
-    arm = [uv[1] - uv[0], uv[2] - uv[0]]
-    length = [a.square().sum(0).clamp_min(1e-12).sqrt() for a in arm]
-    unit = [a / n for a, n in zip(arm, length, strict=True)]
+    points, uv = _ends(Rt, rays, inverse_depth, K)
+    f = K[:2].reshape(2, *[1] * points.x.ndim)
+    by_pose = _point_jacobian(points.x, points.y, points.iz) * f[:, None]  # (2, 6, 3, ...)
+    by_depth = torch.stack(depth_slopes(points, Rt[:, 3, None])[:2]) * f  # (2, 3, ...)
+    unit, length = _arms(uv)
     if cosines:
-        cos = (unit[0] * unit[1]).sum(0)
-        r[2] = cos - (arms_j[0] * arms_j[1]).sum(0)
-        slopes = [(2, 0, (unit[1] - cos * unit[0]) / length[0]), (2, 1, (unit[0] - cos * unit[1]) / length[1])]
+        rows = _cosine(unit) - _cosine(arms_j)
+        slope = (unit.flip(1) - _cosine(unit) * unit) / length
     else:
-        slopes = []
-        for k in range(2):
-            d, u = arms_j[k], unit[k]
-            r[2 + k] = d[0] * u[1] - d[1] * u[0]
-            across = torch.stack((-d[1], d[0]))
-            slopes.append((2 + k, k, (across - r[2 + k] * u) / length[k]))
-    for row, k, w in slopes:
-        J[row] += (w[:, None] * (by_pose[k + 1] - by_pose[0])).sum(0)
-        Jd[row, 0] -= (w * by_depth[0]).sum(0)
-        Jd[row, k + 1] += (w * by_depth[k + 1]).sum(0)
-    front = points[0].front & points[1].front & points[2].front
-    return r, J, Jd, front
+        rows = _sines(arms_j, unit)
+        slope = (torch.stack((-arms_j[1], arms_j[0])) - rows * unit) / length
+    turn = (slope[:, None] * (by_pose[:, :, 1:] - by_pose[:, :, :1])).sum(0)  # (6, 2, ...)
+    corner, end = -(slope * by_depth[:, :1]).sum(0), (slope * by_depth[:, 1:]).sum(0)  # (2, ...)
+    none = torch.zeros_like(corner)
+    if cosines:
+        turn = turn.sum(1, keepdim=True)
+        stretch = torch.cat((corner.sum(0, keepdim=True), end))[None]
+    else:
+        stretch = torch.stack((corner, torch.stack((end[0], none[0])), torch.stack((none[0], end[1]))), 1)
+    r = torch.cat((uv[:, 0] - uv_j, rows))
+    J = torch.cat((by_pose[:, :, 0], turn.transpose(0, 1)))
+    Jd = torch.cat((torch.stack((by_depth[:, 0], none, none), 1), stretch))
+    return r, J, Jd, points.front.all(0)
+
+
+def _ends(Rt: Tensor, rays: Tensor, inverse_depth: Tensor, K: Tensor) -> tuple[PairGeometry, Tensor]:
+    """Corner and arm ends in the target frame, elements ``(3, ...)``, and their pixels ``(2, 3, ...)``."""
+    points = pair_geometry(Rt[:, :, None], rays, inverse_depth)
+    return points, torch.stack((points.x * K[0] + K[2], points.y * K[1] + K[3]))
+
+
+def _arms(uv: Tensor) -> tuple[Tensor, Tensor]:
+    """Unit directions ``(2, 2, ...)``, coordinate first, and lengths ``(2, ...)`` of both arms."""
+    arm = uv[:, 1:] - uv[:, :1]
+    length = arm.square().sum(0).clamp_min(1e-12).sqrt()
+    return arm / length, length
+
+
+def _cosine(unit: Tensor) -> Tensor:
+    return (unit[:, 0] * unit[:, 1]).sum(0, keepdim=True)
+
+
+def _sines(seen: Tensor, unit: Tensor) -> Tensor:
+    return seen[0] * unit[1] - seen[1] * unit[0]
 
 
 def _point_jacobian(x: Tensor, y: Tensor, iz: Tensor) -> Tensor:
-    """Normalised coordinates by the left tangent of the pose, ``(2, 6, Q)``."""
+    """Normalised coordinates by the left tangent of the pose, ``(2, 6, ...)``."""
     o = torch.zeros_like(x)
     rows = (iz, o, -x * iz, -x * y, 1.0 + x * x, -y, o, iz, -y * iz, -1.0 - y * y, x * y, x)
-    return torch.stack(rows).view(2, 6, -1)
+    return torch.stack(rows).view(2, 6, *x.shape)

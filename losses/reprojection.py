@@ -82,18 +82,11 @@ def reprojection_jacobians(R: Tensor, p_c: Tensor, uv: Tensor, K: Tensor) -> Rep
     residual = n * K[:2, None] + (K[2:, None] - uv)
     f_iz = K[:2, None] * iz
     point = f_iz[:, None] * (R[:2] - n[:, None] * R[2])
-    pose = torch.empty(2, 6, z.shape[0], dtype=z.dtype, device=z.device)
-    pose[0, 0], pose[0, 1] = f_iz[0], 0.0
-    pose[1, 0], pose[1, 1] = 0.0, f_iz[1]
-    torch.mul(f_iz, n, out=pose[:, 2]).neg_()
-    xy = x * y
-    fx, fy = K[0], K[1]
-    torch.mul(xy, -fx, out=pose[0, 3])
-    torch.mul(x * x + 1.0, fx, out=pose[0, 4])
-    torch.mul(y, -fx, out=pose[0, 5])
-    torch.mul(y * y + 1.0, -fy, out=pose[1, 3])
-    torch.mul(xy, fy, out=pose[1, 4])
-    torch.mul(x, fy, out=pose[1, 5])
+    none, fx, fy = torch.zeros_like(z), K[0], K[1]
+    xy, fx_iz, fy_iz = x * y, f_iz[0], f_iz[1]
+    u = (fx_iz, none, -fx_iz * x, -fx * xy, fx * (x * x + 1.0), -fx * y)
+    v = (none, fy_iz, -fy_iz * y, -fy * (y * y + 1.0), fy * xy, fy * x)
+    pose = torch.stack((*u, *v)).view(2, 6, -1)
     return ReprojectionJacobians(residual, pose, point)
 
 

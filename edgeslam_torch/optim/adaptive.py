@@ -10,10 +10,11 @@ from edgeslam_torch.losses.cycle import CycleForm
 from edgeslam_torch.losses.edge_alignment import (
     alignment_row,
     pair_geometry,
+    partner_line,
     relative_depth_row,
-    round_trip_jacobians,
+    round_trip_row,
 )
-from edgeslam_torch.losses.lshape import junction_rows
+from edgeslam_torch.losses.lshape import junction_residuals
 from edgeslam_torch.losses.reprojection import camera_points, reprojection_residuals
 from edgeslam_torch.losses.weighting import AdaptiveScales
 from edgeslam_torch.optim import lie
@@ -79,7 +80,10 @@ def _edge_residuals(terms: EdgeTerms, T_c_w: FloatArray, K: Tensor) -> dict[str,
     out = {}
     used = g.front & (_values(terms.pair_inv_sigma) > 0)
     if bool(used.any()):
-        out["edge"] = alignment_row(g, _values(terms.pair_uv).mT, _values(terms.pair_normal).mT, K)[used]
+        px = torch.ones((), dtype=torch.float64)
+        out["edge"] = alignment_row(g, partner_line(_values(terms.pair_uv).mT, _values(terms.pair_normal).mT, px, K))[
+            used
+        ]
     held = _values(terms.pair_inverse_depth)
     used = g.front & (held > 0)
     if terms.cycle_sigma > 0 and bool(used.any()):
@@ -87,17 +91,17 @@ def _edge_residuals(terms: EdgeTerms, T_c_w: FloatArray, K: Tensor) -> dict[str,
         if terms.cycle is CycleForm.RELATIVE_DEPTH:
             out["cycle"] = relative_depth_row(g, held)[used]
         else:
-            out["cycle px"] = round_trip_jacobians(g, Rt, ray, held, K)[0][:, used].flatten()
+            out["cycle px"] = round_trip_row(g, Rt, ray, held, K)[:, used].flatten()
     return out
 
 
 def _junction_residuals(terms: JunctionTerms, T_c_w: FloatArray, K: Tensor) -> dict[str, Tensor]:
     corner = _index(terms.pair_junction)
     Rt = _motions(T_c_w, np.asarray(terms.host)[terms.pair_junction], terms.pair_pose)
-    rays = ((_values(terms.uv)[corner] - K[2:]) / K[:2]).permute(1, 2, 0)
+    rays = ((_values(terms.uv)[corner] - K[2:]) / K[:2]).permute(2, 1, 0)
     depth = _values(terms.inverse_depth)[corner].mT
-    arms = _values(terms.pair_arms).permute(1, 2, 0)
-    r, _, _, front = junction_rows(Rt, rays, depth, _values(terms.pair_uv).mT, arms, K, terms.cosines)
+    arms = _values(terms.pair_arms).permute(2, 1, 0)
+    r, front = junction_residuals(Rt, rays, depth, _values(terms.pair_uv).mT, arms, K, terms.cosines)
     out = {}
     if terms.inv_sigma_px > 0:
         out["corner"] = r[:2, front].flatten()

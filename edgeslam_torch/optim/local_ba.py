@@ -1,5 +1,6 @@
 """Sliding-window refinement of poses and anchors, paper eq. (28) and its thread 4."""
 
+import math
 from contextlib import nullcontext
 from dataclasses import dataclass
 
@@ -109,7 +110,7 @@ class _State:
     p_w: Tensor
     """Anchors in the solver's order."""
     relative: tuple[Tensor, ...]
-    """Inverse depths ``(size, E)`` of edges and junctions, in the solver's order."""
+    """Inverse depths of edges and junctions in their tiles ``(size, B, L)``."""
 
 
 class _Window:
@@ -208,7 +209,7 @@ class _Window:
         if int(info) != 0:
             return None
         delta = -torch.cholesky_solve(b[:, None], L)[:, 0]
-        back = -schur.whiten(self.factor, self.g_point)
+        back = -self.y
         for chunk, Y in zip(self.chunks, self.Y, strict=True):
             back[:, chunk.first : chunk.last] -= (delta[chunk.columns] @ Y).view(3, -1)
         step = schur.unwhiten(self.factor, back)
@@ -221,7 +222,7 @@ class _Window:
             size = torch.maximum(size, _abs_max(dx))
             moved.append((x + dx).clamp_min(INVERSE_DEPTH_MIN))
         T = self.state.T_c_w.clone()
-        T[self.free] = lie.exp(delta.view(-1, 6)) @ T[self.free]
+        T[self.free] = kernel(lie.exp, self.config.compile)(delta.view(-1, 6)) @ T[self.free]
         return Step(_State(T, self.state.p_w + step.mT, tuple(moved)), predicted, float(size))
 
     # -- the rest -------------------------------------------------------------------------------------------
@@ -240,12 +241,12 @@ class _Window:
             if isinstance(block, EdgeBlocks):
                 sigma = self._edge_sigma(block) if deficiency >= 0 else torch.full_like(x[0], torch.nan)
                 edges = {
-                    "edge_inverse_depth": _restored(x[0], block.block_order),
-                    "edge_sigma": _restored(sigma, block.block_order),
-                    "edge_chi2": block.alignment_chi2(self.state.T_c_w, x).cpu().numpy(),
+                    "edge_inverse_depth": block.tiles.of_blocks(x[0]),
+                    "edge_sigma": block.tiles.of_blocks(sigma),
+                    "edge_chi2": block.alignment_chi2(self.state.T_c_w, x),
                 }
             else:
-                junctions = {"junction_inverse_depth": _restored(x.mT, block.block_order)}
+                junctions = {"junction_inverse_depth": block.tiles.of_blocks(x).T.copy()}
         return WindowResult(
             T_c_w=self.state.T_c_w.cpu().numpy(),
             p_w=_restored(self.state.p_w, self.anchor_order),
@@ -268,7 +269,8 @@ class _Window:
     def _camera_points(self, state: _State) -> tuple[Tensor, Tensor]:
         """`camera_points` of a state; an accepted candidate is asked for twice."""
         if self._seen is None or self._seen[0] is not state:
-            self._seen = (state, *camera_points(state.T_c_w, state.p_w, self.pose, self.anchor))
+            see = kernel(camera_points, self.config.compile)
+            self._seen = (state, *see(state.T_c_w, state.p_w, self.pose, self.anchor))
         return self._seen[1:]
 
     def _given(self, state: _State) -> tuple[Tensor | Kernel | float, ...]:
@@ -286,19 +288,20 @@ class _Window:
     def _scaled_gradient(self) -> float:
         parts = [(self.g, self.H.diagonal()), (self.g_point, self.V[_DIAGONAL])]
         parts += [(b.g, b.V[schur.diagonal_rows(b.size)]) for b in self.relative]
-        return max(float(_abs_max(g / (h + _FLOOR).sqrt())) for g, h in parts)
+        largest = [(g.square() / (h + _FLOOR)).max() for g, h in parts if g.numel()]
+        return math.sqrt(max(float(x) for x in largest)) if largest else 0.0
 
     def _reduce(self, mu: float) -> tuple[Tensor, Tensor]:
         """Pose system without its anchors, edges and junctions, and its right side; fills the ``Y``."""
         self.factor = schur.inverse_cholesky(self.V, mu)
-        y = schur.whiten(self.factor, self.g_point)
-        n = self.n_free
-        entries = kernel(schur.entries, self.config.compile)(self.factor, self.anchor[:n], self.Jp, self.Jl[..., :n])
+        self.y = schur.whiten(self.factor, self.g_point)
+        fill = kernel(schur.fill, self.config.compile)
         S, b = self.H.clone(), self.g.clone()
         for chunk, Y in zip(self.chunks, self.Y, strict=True):
-            schur.fill(Y, chunk, entries[..., chunk.lo : chunk.hi])
+            part = slice(chunk.lo, chunk.hi)
+            fill(Y, chunk.flat, chunk.unique, self.factor, self.anchor[part], self.Jp[..., part], self.Jl[..., part])
             S[chunk.columns[:, None], chunk.columns] -= Y @ Y.mT
-            b[chunk.columns] -= Y @ y[:, chunk.first : chunk.last].flatten()
+            b[chunk.columns] -= Y @ self.y[:, chunk.first : chunk.last].flatten()
         for block in self.relative:
             block.reduce(mu, S, b)
         return S, b
@@ -403,7 +406,7 @@ def point_weights(
     root = torch.where(in_front, weight.sqrt() * inv_sigma, 0.0)
     r, Jl = r * root, Jl * root
     Jp = torch.cat((Jp[..., :n] * root[:n], r[:, None, :n]), 1)
-    own = torch.cat((schur.triangle(Jl), schur.row_products(Jl, r[:, None])[:, 0]))
+    own = torch.stack((*schur.triangle(Jl), *(Jl * r[:, None]).sum(0)))
     return Jp, Jl, own, value.sum()
 
 

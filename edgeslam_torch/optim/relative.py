@@ -1,8 +1,8 @@
 """Edges and junctions: blocks that live in a host pose and are seen from target poses.
 
 Residuals are differentiated by the *relative* pose of host and target, six columns, whatever the window's size;
-blocks are eliminated in those columns, one dense product per host; only then does the adjoint map them to the two
-poses: ``xi_rel = xi_target - Ad(T_target_host) xi_host``.
+blocks are eliminated in those columns, one dense product per tile of blocks (`optim.tiles`); only then does the
+adjoint map them to the two poses: ``xi_rel = xi_target - Ad(T_target_host) xi_host``.
 """
 
 from abc import ABC, abstractmethod
@@ -15,16 +15,20 @@ from edgeslam_torch.losses.cycle import CycleForm
 from edgeslam_torch.losses.edge_alignment import (
     alignment_jacobians,
     alignment_row,
+    depth_slopes,
     pair_geometry,
+    partner_line,
     relative_depth_jacobians,
     relative_depth_row,
     round_trip_jacobians,
+    round_trip_row,
 )
-from edgeslam_torch.losses.lshape import junction_rows
+from edgeslam_torch.losses.lshape import junction_residuals, junction_rows
 from edgeslam_torch.losses.robust import Kernel, rho
 from edgeslam_torch.optim import lie, schur
 from edgeslam_torch.optim.compiled import kernel
 from edgeslam_torch.optim.problem import EdgeTerms, JunctionTerms, LmConfig
+from edgeslam_torch.optim.tiles import lay_out
 from edgeslam_torch.types import FloatArray, IntArray
 
 INVERSE_DEPTH_MIN = 1e-4
@@ -34,7 +38,7 @@ INVERSE_DEPTH_MIN = 1e-4
 class RelativeBlocks(ABC):
     """Host-anchored blocks of ``size`` inverse depths; subclasses write the residual rows.
 
-    Blocks are kept sorted by host, pairs by host, target, block.
+    Pairs are kept in tiles: ``B`` tiles of ``T`` targets by ``L`` blocks, values of blocks ``(size, B, L)``.
     """
 
     size: int
@@ -44,46 +48,35 @@ class RelativeBlocks(ABC):
         host: IntArray,
         pair_block: IntArray,
         pair_pose: IntArray,
+        inverse_depth: FloatArray,
         column: Tensor,
         config: LmConfig,
         dtype: torch.dtype,
     ) -> None:
-        """Sort and lay out.
+        """Lay out.
 
         Args:
             host: ``(E,)`` host poses.
             pair_block: ``(P,)`` blocks of the pairs.
             pair_pose: ``(P,)`` target poses.
+            inverse_depth: ``(size, E)`` start.
             column: ``(W,)`` free-pose number of each pose, -1 for a fixed one.
             config: Kernel and its width.
             dtype: Of the blocks.
         """
         self.config, self.dtype = config, dtype
+        self.tiles = lay_out(host, pair_block, pair_pose, len(column))
+        self.x = self.tiles.blocks(np.maximum(inverse_depth, INVERSE_DEPTH_MIN), torch.float64, 1.0)
+        # What a pair behind a camera costs; places without a pair cost nothing.
+        self.far = self.tiles.pairs(np.full(len(pair_block), config.behind_px**2), dtype)
+        F = int((column >= 0).sum())
+        column = torch.where(column < 0, F, column)  # fixed poses share a last column that is cut off
+        self.columns = column[self.tiles.host], column[self.tiles.target].flatten()
         self._seen: tuple[Tensor, Tensor, Tensor] | None = None
-        self.column = torch.where(column < 0, int((column >= 0).sum()), column)
-        hosts = torch.as_tensor(np.asarray(host, dtype=np.int64))
-        E, W = len(hosts), len(column)
-        self.block_order = torch.argsort(hosts, stable=True)
-        rank = torch.empty_like(self.block_order)
-        rank[self.block_order] = torch.arange(E)
-        block = rank[torch.as_tensor(np.asarray(pair_block, dtype=np.int64))]
-        target = torch.as_tensor(np.asarray(pair_pose, dtype=np.int64))
-        pair_host = hosts[self.block_order][block]
-        if bool((pair_host == target).any()):
-            raise ValueError("a pair's target pose must differ from its host")
-        key = pair_host * W + target
-        self.pair_order = torch.argsort(key * max(E, 1) + block)
-        self.block = block[self.pair_order]
-        groups, self.group = torch.unique_consecutive(key[self.pair_order], return_inverse=True)
-        self.group_host, self.group_target = groups // W, groups % W
-        self.n_blocks = E
-        bounds = [0, *torch.bincount(hosts, minlength=W).cumsum(0).tolist()]
-        self.chunks = schur.plan_chunks(self.group, self.block, bounds, self.size)
-        self.Y = [torch.zeros(len(c.columns), self.size * (c.last - c.first), dtype=dtype) for c in self.chunks]
 
     @abstractmethod
-    def weigh(self, Rt: Tensor, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Weighted rows at motions ``(3, 4, P)`` and block values ``(size, P)``, see `_weighted`."""
+    def weigh(self, Rt: Tensor, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """`schur.pair_products` of the weighted rows and their cost ``()``, at motions ``(3, 4, B, T, 1)``."""
 
     @abstractmethod
     def robust_cost(self, Rt: Tensor, x: Tensor) -> Tensor:
@@ -91,173 +84,171 @@ class RelativeBlocks(ABC):
 
     @abstractmethod
     def prior_cost(self, x: Tensor) -> Tensor:
-        """Cost ``()`` of what is known about the blocks ``(size, E)`` beforehand."""
+        """Cost ``()`` of what is known about the blocks ``(size, B, L)`` beforehand."""
 
     @abstractmethod
     def add_prior(self, x: Tensor, V: Tensor, g: Tensor) -> None:
-        """Add the prior to the blocks' normal matrices and gradients ``(size, E)``."""
+        """Add the prior to the blocks' normal matrices and gradients ``(size, B, L)``."""
 
     def motions(self, T_c_w: Tensor) -> tuple[Tensor, Tensor]:
-        """Relative motions of the groups ``(G, 4, 4)`` and of the pairs ``(3, 4, P)``; kept for the same poses."""
+        """Relative motions ``(B T, 4, 4)``, and in the blocks' precision ``(3, 4, B, T, 1)``; kept while T stays."""
         if self._seen is not None and self._seen[0] is T_c_w:
             return self._seen[1:]
-        T = T_c_w[self.group_target] @ lie.inverse(T_c_w[self.group_host])
-        flat = T[:, :3].permute(1, 2, 0).reshape(12, -1).to(self.dtype)
-        self._seen = (T_c_w, T, flat.index_select(1, self.group).view(3, 4, -1))
+        motions = kernel(relative_motions, self.config.compile)
+        self._seen = (T_c_w, *motions(T_c_w, self.tiles.host, self.tiles.target, self.dtype))
         return self._seen[1:]
 
     def cost(self, T_c_w: Tensor, x: Tensor) -> Tensor:
         """Robust cost ``()``."""
-        if len(self.block) == 0:
-            return self.prior_cost(x)
-        pairs = x.index_select(1, self.block).to(self.dtype)
-        return self.robust_cost(self.motions(T_c_w)[1], pairs) + self.prior_cost(x)
+        return self.robust_cost(self.motions(T_c_w)[1], x.to(self.dtype)) + self.prior_cost(x)
 
     def linearise(self, T_c_w: Tensor, x: Tensor, H: Tensor, g: Tensor) -> Tensor:
         """Prepare the blocks; add the pose part to ``H (6F, 6F)`` and ``g (6F,)``; returns the cost ``()``."""
-        sums = torch.zeros(self.size * (self.size + 1) // 2 + self.size, self.n_blocks, dtype=torch.float64)
-        cost = self.prior_cost(x)
-        if len(self.block):
-            T_rel, Rt = self.motions(T_c_w)
-            self.J, self.Jd, own, value = self.weigh(Rt, x.index_select(1, self.block).to(self.dtype))
-            cost = cost + value
-            sums.index_add_(1, self.block, own)
-            self._add_poses(T_rel, H, g)
-        self.V, self.g = sums[: -self.size], sums[-self.size :]
+        T_rel, Rt = self.motions(T_c_w)
+        normal, self.cross, V, g_block, value = self.weigh(Rt, x.to(self.dtype))
+        self.V, self.g = V.double(), g_block.double()
         self.add_prior(x, self.V, self.g)
-        return cost
+        self._add_poses(T_rel, normal, H, g)
+        return value + self.prior_cost(x)
 
-    def _add_poses(self, T_rel: Tensor, H: Tensor, g: Tensor) -> None:
-        """Normal matrices of the relative poses, mapped to the poses."""
-        G, n = len(T_rel), H.shape[0]
-        normal = torch.empty(G, 7, 7, dtype=self.dtype)
-        for chunk in self.chunks:
-            for group, lo, hi in chunk.slices:
-                out = normal[group]
-                part = self.J[0, :, lo:hi]
-                torch.mm(part, part.mT, out=out)
-                for k in range(1, self.J.shape[0]):
-                    part = self.J[k, :, lo:hi]
-                    out.addmm_(part, part.mT)
-        normal = normal.double()
-        # Tangents of the groups by the poses; fixed poses share a last column that is cut off.
-        M = torch.zeros(G, n // 6 + 1, 6, 6, dtype=torch.float64)
-        each = torch.arange(G)
-        M[each, self.column[self.group_target]] += torch.eye(6, dtype=torch.float64)
-        M[each, self.column[self.group_host]] -= lie.adjoint(T_rel)
-        M = M[:, :-1].permute(0, 2, 1, 3).reshape(G, 6, n)
-        flat = M.reshape(6 * G, n)  # one free pose: not contiguous
-        H += flat.mT @ (normal[:, :6, :6] @ M).view(6 * G, n)
-        g += flat.mT @ normal[:, :6, 6].flatten()
-        self.maps = [flat[6 * c.slices[0][0] : 6 * c.slices[-1][0] + 6] for c in self.chunks]
+    def _add_poses(self, T_rel: Tensor, normal: Tensor, H: Tensor, g: Tensor) -> None:
+        """Add the normal matrices of the relative poses ``(B, T, 7, 7)`` to the pose system."""
+        self.map, H_add, g_add = kernel(mapped, self.config.compile)(T_rel, normal, *self.columns, len(H) // 6)
+        H += H_add
+        g += g_add
 
     def reduce(self, mu: float, S: Tensor, b: Tensor) -> None:
         """Subtract what the blocks take from the pose system ``S`` and its right side ``b``."""
-        self.factor = schur.inverse_cholesky(self.V, mu)
-        self.y = schur.whiten(self.factor, self.g)
-        if len(self.block) == 0:
-            return
-        entries = kernel(schur.entries, self.config.compile)(
-            self.factor.to(self.dtype), self.block, self.J[:, :6], self.Jd
+        damping = torch.tensor(mu, dtype=torch.float64)
+        self.factor, self.y, self.Y_T, taken, right = kernel(schur.eliminate, self.config.compile)(
+            self.V, self.g, self.cross, damping
         )
-        y = self.y.to(self.dtype)
-        for chunk, Y, M in zip(self.chunks, self.Y, self.maps, strict=True):
-            schur.fill(Y, chunk, entries[..., chunk.lo : chunk.hi])
-            S -= M.mT @ ((Y @ Y.mT).double() @ M)
-            b -= M.mT @ (Y @ y[:, chunk.first : chunk.last].flatten()).double()
+        flat = self.map.flatten(0, 1)
+        S -= flat.mT @ (taken @ self.map).flatten(0, 1)
+        b -= flat.mT @ right.flatten()
 
     def step(self, delta: Tensor) -> Tensor:
-        """Step of the blocks ``(size, E)`` that goes with the poses' ``delta (6F,)``."""
-        back = -self.y
-        if len(self.block):
-            for chunk, Y, M in zip(self.chunks, self.Y, self.maps, strict=True):
-                moved = ((M @ delta).to(self.dtype) @ Y).view(self.size, -1)
-                back[:, chunk.first : chunk.last] -= moved
-        return schur.unwhiten(self.factor, back)
+        """Step of the blocks ``(size, B, L)`` that goes with the poses' ``delta (6F,)``."""
+        B, _, L = self.tiles.shape
+        moved = (self.Y_T @ (self.map @ delta).to(self.dtype)[..., None]).view(B, self.size, L)
+        return schur.unwhiten(self.factor, -self.y - moved.transpose(0, 1))
 
-    def _kernel(self) -> tuple[Kernel, float, float]:
-        """Kernel, its width, and the squared residual of what lies behind a camera."""
-        return self.config.kernel, self.config.edge_delta, self.config.behind_px**2
+    def _kernel(self) -> tuple[Tensor, Kernel, float]:
+        """Cost of what lies behind a camera, the kernel and its width."""
+        return self.far, self.config.kernel, self.config.edge_delta
 
 
-def _weighted(
-    J: Tensor, Jd: Tensor, valid: Tensor, robust: Kernel, delta: float, far: float
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Rows times the roots of their robust weights.
+def relative_motions(T_c_w: Tensor, host: Tensor, target: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    """See `RelativeBlocks.motions`; poses ``(W, 4, 4)``, hosts ``(B,)`` and targets ``(B, T)``."""
+    T = T_c_w[target] @ lie.inverse(T_c_w)[host, None]
+    return T.flatten(0, 1), T[..., :3, :].permute(2, 3, 0, 1)[..., None].to(dtype).contiguous()
+
+
+def mapped(T_rel: Tensor, normal: Tensor, host: Tensor, target: Tensor, F: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Normal equations of the relative poses as such of the free poses.
 
     Args:
-        J: Whitened derivatives by the relative pose with the residual as seventh ``(R, 7, P)``, finite everywhere;
-            changed in place.
-        Jd: Derivatives by the block ``(R, size, P)``; changed in place.
-        valid: ``(P,)``; the others get weight zero and a fixed, large cost.
-        robust: Kernel.
-        delta: Its width.
-        far: Squared residual of a pair behind the camera.
+        T_rel: Relative motions ``(B T, 4, 4)``.
+        normal: Their normal matrices and gradients ``(B, T, 7, 7)``.
+        host: Free-pose numbers ``(B,)`` of the hosts, ``F`` for a fixed pose.
+        target: The same of the targets ``(B T,)``.
+        F: Number of free poses.
 
     Returns:
-        ``J`` and ``Jd`` weighted, the blocks' own normal matrices and gradients ``(size (size + 1) / 2 + size, P)``
-        and the cost ``()``, the latter two in double precision.
+        Tangents of the relative poses by those of the free poses ``(B, 6 T, 6 F)``, and what to add to the pose
+        system ``(6 F, 6 F)`` and its gradient ``(6 F,)``.
     """
-    r = J[:, 6]
-    value, weight = rho(torch.where(valid, r * r, far), robust, delta)
-    root = torch.where(valid, weight.sqrt(), 0.0)
-    J, Jd = J.mul_(root[:, None]), Jd.mul_(root[:, None])
-    own = torch.cat((schur.triangle(Jd), schur.row_products(Jd, J[:, 6:])[:, 0]))
-    return J, Jd, own.double(), value.sum(dtype=torch.float64)
+    B, T = normal.shape[:2]
+    G, n = B * T, 6 * F
+    numbers = torch.arange(F, device=host.device)
+    of_host = host[:, None, None].expand(B, T, F).reshape(G, F) == numbers
+    by_host = of_host[:, None, :, None] * lie.adjoint(T_rel)[:, :, None]
+    eye = torch.eye(6, dtype=T_rel.dtype, device=host.device)
+    by_target = (target[:, None] == numbers)[:, None, :, None] * eye[:, None]
+    M = (by_target - by_host).view(G, 6, n)
+    flat, N = M.view(6 * G, n), normal.double().view(G, 7, 7)
+    H = flat.mT @ (N[:, :6, :6] @ M).view(6 * G, n)
+    return M.view(B, 6 * T, n), H, flat.mT @ N[:, :6, 6].flatten()
+
+
+def _robust(r: Tensor, front: Tensor, far: Tensor, robust: Kernel, delta: float) -> tuple[Tensor, Tensor]:
+    """Robust cost ``()`` in double precision of whitened residuals ``(..., B, T, L)`` and the roots of their weights.
+
+    Pairs that are not in front cost ``far`` and weigh nothing.
+    """
+    value, weight = rho(torch.where(front, r * r, far), robust, delta)
+    # Short sums in the rows' own precision, the long one in double.
+    return value.sum(-1).sum(dtype=torch.float64), torch.where(front, weight.sqrt(), 0.0)
 
 
 def edge_weights(
     Rt: Tensor,
     x: Tensor,
     ray: Tensor,
-    uv: Tensor,
-    normal: Tensor,
-    inv_sigma: Tensor,
+    line: Tensor,
     held: Tensor,
     cycle_weight: Tensor,
     K: Tensor,
     form: CycleForm | None,
+    far: Tensor,
     robust: Kernel,
     delta: float,
-    far: float,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Alignment and cycle rows of edge pairs, see `_weighted`; arguments are `EdgeBlocks`' own tensors."""
-    g = pair_geometry(Rt, ray, x[0])
-    n = 1 if form is None else 3 if form is CycleForm.PIXEL else 2
-    J = torch.empty(n, 7, ray.shape[1], dtype=ray.dtype, device=ray.device)
-    Jd = torch.empty(n, 1, ray.shape[1], dtype=ray.dtype, device=ray.device)
-    _put(J[:1], Jd[:1], inv_sigma, *alignment_jacobians(g, uv, normal, K))
-    if form is CycleForm.PIXEL:
-        _put(J[1:], Jd[1:], cycle_weight, *round_trip_jacobians(g, Rt, ray, held, K))
-    elif form is not None:
-        _put(J[1:], Jd[1:], cycle_weight, *relative_depth_jacobians(g, held))
-    return _weighted(J, Jd, g.front, robust, delta, far)
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Alignment and cycle rows of edge pairs, see `RelativeBlocks.weigh`; arguments are `EdgeBlocks`' own tensors."""
+    x = x[0, :, None]
+    g = pair_geometry(Rt, ray, x)
+    slope = depth_slopes(g, Rt[:, 3])
+    r = alignment_row(g, line)
+    value, root = _robust(r, g.front, far, robust, delta)
+    by_pose, by_depth = alignment_jacobians(g, slope, line * root)
+    J, Jd = [(*by_pose, r * root)], [(by_depth,)]
+    if form is CycleForm.RELATIVE_DEPTH:
+        r = relative_depth_row(g, held) * cycle_weight
+        cost, root = _robust(r, g.front, far, robust, delta)
+        value = value + cost
+        by_pose, by_depth = relative_depth_jacobians(g, slope, held, cycle_weight * root)
+        J.append((*by_pose, r * root))
+        Jd.append((by_depth,))
+    elif form is CycleForm.PIXEL:
+        r, by_poses, by_depths = round_trip_jacobians(g, slope, Rt, ray, held, K)
+        r = r * cycle_weight
+        cost, root = _robust(r, g.front, far, robust, delta)
+        value = value + cost
+        for k in range(2):
+            J.append((*(by_poses[k] * (cycle_weight * root[k])).unbind(0), r[k] * root[k]))
+            Jd.append((by_depths[k] * (cycle_weight * root[k]),))
+    return *schur.pair_products(J, Jd), value
 
 
 def edge_cost(
     Rt: Tensor,
     x: Tensor,
     ray: Tensor,
-    uv: Tensor,
-    normal: Tensor,
-    inv_sigma: Tensor,
+    line: Tensor,
     held: Tensor,
     cycle_weight: Tensor,
     K: Tensor,
     form: CycleForm | None,
+    far: Tensor,
     robust: Kernel,
     delta: float,
-    far: float,
 ) -> Tensor:
     """Robust cost ``()`` of edge pairs; arguments as `edge_weights` takes them."""
-    g = pair_geometry(Rt, ray, x[0])
-    parts = [(alignment_row(g, uv, normal, K) * inv_sigma)[None]]
-    if form is CycleForm.PIXEL:
-        parts.append(round_trip_jacobians(g, Rt, ray, held, K)[0] * cycle_weight)
-    elif form is not None:
-        parts.append((relative_depth_row(g, held) * cycle_weight)[None])
-    value, _ = rho(torch.where(g.front, torch.cat(parts).square(), far), robust, delta)
-    return value.sum(dtype=torch.float64)
+    g = pair_geometry(Rt, ray, x[0, :, None])
+    value, _ = _robust(alignment_row(g, line), g.front, far, robust, delta)
+    if form is CycleForm.RELATIVE_DEPTH:
+        value = value + _robust(relative_depth_row(g, held) * cycle_weight, g.front, far, robust, delta)[0]
+    elif form is CycleForm.PIXEL:
+        r = round_trip_row(g, Rt, ray, held, K) * cycle_weight
+        value = value + _robust(r, g.front, far, robust, delta)[0]
+    return value
+
+
+def alignment_chi2(Rt: Tensor, x: Tensor, ray: Tensor, line: Tensor) -> Tensor:
+    """Squared whitened alignment residuals ``(B, T, L)``; arguments as `edge_weights` takes them."""
+    g = pair_geometry(Rt, ray, x[0, :, None])
+    r = alignment_row(g, line)
+    return torch.where(g.front, r * r, torch.inf).double()
 
 
 def junction_weights(
@@ -269,14 +260,17 @@ def junction_weights(
     weight: Tensor,
     K: Tensor,
     cosines: bool,
+    far: Tensor,
     robust: Kernel,
     delta: float,
-    far: float,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Corner and angle rows of junction pairs, see `_weighted`; arguments are `JunctionBlocks`' own tensors."""
-    r, J, Jd, front = junction_rows(Rt, rays, x, uv, arms, K, cosines)
-    J = torch.cat((J, r[:, None]), 1) * weight[..., None]
-    return _weighted(J, Jd * weight[..., None], front, robust, delta, far)
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Corner and angle rows of junction pairs, see `RelativeBlocks.weigh`; arguments are `JunctionBlocks`' tensors."""
+    r, J, Jd, front = junction_rows(Rt, rays, x[:, :, None], uv, arms, K, cosines)
+    r = r * weight
+    value, root = _robust(r, front, far, robust, delta)
+    white = (root * weight)[:, None]
+    J = torch.cat((J * white, (r * root)[:, None]), 1)
+    return *schur.pair_products([row.unbind(0) for row in J], [row.unbind(0) for row in Jd * white]), value
 
 
 def junction_cost(
@@ -288,14 +282,13 @@ def junction_cost(
     weight: Tensor,
     K: Tensor,
     cosines: bool,
+    far: Tensor,
     robust: Kernel,
     delta: float,
-    far: float,
 ) -> Tensor:
     """Robust cost ``()`` of junction pairs; arguments as `junction_weights` takes them."""
-    r, _, _, front = junction_rows(Rt, rays, x, uv, arms, K, cosines)
-    value, _ = rho(torch.where(front, (r * weight).square(), far), robust, delta)
-    return value.sum(dtype=torch.float64)
+    r, front = junction_residuals(Rt, rays, x[:, :, None], uv, arms, K, cosines)
+    return _robust(r * weight, front, far, robust, delta)[0]
 
 
 class EdgeBlocks(RelativeBlocks):
@@ -304,36 +297,34 @@ class EdgeBlocks(RelativeBlocks):
     size = 1
 
     def __init__(self, terms: EdgeTerms, K: Tensor, column: Tensor, config: LmConfig) -> None:
-        """Take the terms into the solver's order; ``K`` is fx, fy, cx, cy."""
+        """Take the terms into the solver's layout; ``K`` is fx, fy, cx, cy."""
         dtype = torch.float32 if config.float32_edges else torch.float64
-        super().__init__(terms.host, terms.pair_edge, terms.pair_pose, column, config, dtype)
+        start = np.asarray(terms.inverse_depth, dtype=np.float64)[None]
+        super().__init__(terms.host, terms.pair_edge, terms.pair_pose, start, column, config, dtype)
+        tiles = self.tiles
         self.K = K.to(dtype)
-        rays = (_tensor(terms.uv).view(-1, 2) - K[2:]) / K[:2]
-        self.ray = rays[self.block_order][self.block].mT.contiguous().to(dtype)
-        self.x = _tensor(terms.inverse_depth)[self.block_order].clamp_min(INVERSE_DEPTH_MIN)[None]
-        sigma = _tensor(terms.prior_sigma)[self.block_order]
-        self.prior_weight = sigma.square().reciprocal()[None]
-        self.prior = torch.where(sigma.isfinite(), _tensor(terms.prior)[self.block_order], 0.0)[None]
-        order = self.pair_order
-        self.uv = _tensor(terms.pair_uv).view(-1, 2)[order].mT.contiguous().to(dtype)
-        self.normal = _tensor(terms.pair_normal).view(-1, 2)[order].mT.contiguous().to(dtype)
-        self.inv_sigma = _tensor(terms.pair_inv_sigma)[order].to(dtype)
-        held = _tensor(terms.pair_inverse_depth)[order].to(dtype)
-        self.form = terms.cycle
-        self.held = torch.where(held > 0, held, 1.0)
-        self.cycle_weight = torch.zeros_like(held)
-        if terms.cycle_sigma > 0:
-            self.cycle_weight[held > 0] = 1.0 / terms.cycle_sigma
-        self.has_cycle = bool((self.cycle_weight > 0).any())
+        f, c = K[:2].cpu().numpy(), K[2:].cpu().numpy()
+        self.ray = tiles.blocks(((np.asarray(terms.uv).reshape(-1, 2) - c) / f).T, dtype)[:, :, None]
+        sigma = np.asarray(terms.prior_sigma, dtype=np.float64)
+        known = np.isfinite(sigma)
+        self.prior_weight = tiles.blocks(np.where(known, sigma, np.inf)[None] ** -2.0, torch.float64)
+        self.prior = tiles.blocks(np.where(known, terms.prior, 0.0)[None], torch.float64)
+        partner, normal = (_tensor(x).view(-1, 2).mT for x in (terms.pair_uv, terms.pair_normal))
+        line = partner_line(partner, normal, _tensor(terms.pair_inv_sigma), K)
+        self.line = tiles.pairs(line.cpu().numpy(), dtype)
+        held = np.asarray(terms.pair_inverse_depth, dtype=np.float64)
+        used = (held > 0) & (terms.cycle_sigma > 0)
+        self.held = tiles.pairs(np.where(held > 0, held, 1.0), dtype, 1.0)
+        self.cycle_weight = tiles.pairs(used / max(terms.cycle_sigma, 1e-300), dtype)
+        self.form = terms.cycle if used.any() else None
 
     def _given(self) -> tuple[Tensor | CycleForm | Kernel | float | None, ...]:
-        form = self.form if self.has_cycle else None
-        given = (self.ray, self.uv, self.normal, self.inv_sigma, self.held, self.cycle_weight, self.K)
-        return (*given, form, *self._kernel())
+        return self.ray, self.line, self.held, self.cycle_weight, self.K, self.form, *self._kernel()
 
-    def weigh(self, Rt: Tensor, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def weigh(self, Rt: Tensor, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """See `RelativeBlocks.weigh`."""
-        out: tuple[Tensor, Tensor, Tensor, Tensor] = kernel(edge_weights, self.config.compile)(Rt, x, *self._given())
+        out: tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
+        out = kernel(edge_weights, self.config.compile)(Rt, x, *self._given())
         return out
 
     def robust_cost(self, Rt: Tensor, x: Tensor) -> Tensor:
@@ -350,13 +341,10 @@ class EdgeBlocks(RelativeBlocks):
         V += self.prior_weight
         g += self.prior_weight * (x - self.prior)
 
-    def alignment_chi2(self, T_c_w: Tensor, x: Tensor) -> Tensor:
+    def alignment_chi2(self, T_c_w: Tensor, x: Tensor) -> FloatArray:
         """Squared whitened alignment residuals in the caller's order ``(P,)``; infinite behind the camera."""
-        g = pair_geometry(self.motions(T_c_w)[1], self.ray, x.index_select(1, self.block).to(self.dtype)[0])
-        r = alignment_row(g, self.uv, self.normal, self.K) * self.inv_sigma
-        out = torch.empty_like(r)
-        out[self.pair_order] = torch.where(g.front, r * r, torch.inf)
-        return out.double()
+        chi2 = kernel(alignment_chi2, self.config.compile)
+        return self.tiles.of_pairs(chi2(self.motions(T_c_w)[1], x.to(self.dtype), self.ray, self.line))
 
 
 class JunctionBlocks(RelativeBlocks):
@@ -365,30 +353,30 @@ class JunctionBlocks(RelativeBlocks):
     size = 3
 
     def __init__(self, terms: JunctionTerms, K: Tensor, column: Tensor, config: LmConfig) -> None:
-        """Take the terms into the solver's order; ``K`` is fx, fy, cx, cy."""
-        super().__init__(terms.host, terms.pair_junction, terms.pair_pose, column, config, torch.float64)
+        """Take the terms into the solver's layout; ``K`` is fx, fy, cx, cy."""
+        double = torch.float64
+        start = np.asarray(terms.inverse_depth, dtype=np.float64).reshape(-1, 3).T
+        super().__init__(terms.host, terms.pair_junction, terms.pair_pose, start, column, config, double)
+        tiles = self.tiles
         self.K, self.cosines = K, terms.cosines
-        rays = (_tensor(terms.uv).view(-1, 3, 2) - K[2:]) / K[:2]
-        self.rays = rays[self.block_order][self.block].permute(1, 2, 0).contiguous()
-        start = _tensor(terms.inverse_depth).view(-1, 3)[self.block_order].mT
-        self.x = start.clamp_min(INVERSE_DEPTH_MIN).contiguous()
-        self.prior = _tensor(terms.prior).view(-1, 3)[self.block_order].mT.contiguous()
-        self.information = _tensor(terms.prior_information).view(-1, 3, 3)[self.block_order]
-        order = self.pair_order
-        self.uv = _tensor(terms.pair_uv).view(-1, 2)[order].mT.contiguous()
-        self.arms = _tensor(terms.pair_arms).view(-1, 2, 2)[order].permute(1, 2, 0).contiguous()
-        angles = 1 if terms.cosines else 2
-        weights = [terms.inv_sigma_px] * 2 + [terms.inv_sigma_angle] * angles
-        self.weight = torch.tensor(weights, dtype=torch.float64)[:, None]
+        rays = (np.asarray(terms.uv).reshape(-1, 3, 2) - K[2:].cpu().numpy()) / K[:2].cpu().numpy()
+        self.rays = tiles.blocks(rays.transpose(2, 1, 0), double)[:, :, :, None]
+        self.prior = tiles.blocks(np.asarray(terms.prior).reshape(-1, 3).T, double)
+        information = np.asarray(terms.prior_information).reshape(-1, 3, 3)
+        self.information = tiles.blocks(information.transpose(1, 2, 0), double)
+        self.uv = tiles.pairs(np.asarray(terms.pair_uv).reshape(-1, 2).T, double)
+        self.arms = tiles.pairs(np.asarray(terms.pair_arms).reshape(-1, 2, 2).transpose(2, 1, 0), double)
+        rows = [terms.inv_sigma_px] * 2 + [terms.inv_sigma_angle] * (1 if terms.cosines else 2)
+        taken = tiles.pairs(np.ones(len(terms.pair_pose)), double)
+        self.weight = torch.tensor(rows, dtype=double)[:, None, None, None] * taken
 
     def _given(self) -> tuple[Tensor | bool | Kernel | float, ...]:
-        return (self.rays, self.uv, self.arms, self.weight, self.K, self.cosines, *self._kernel())
+        return self.rays, self.uv, self.arms, self.weight, self.K, self.cosines, *self._kernel()
 
-    def weigh(self, Rt: Tensor, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def weigh(self, Rt: Tensor, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """See `RelativeBlocks.weigh`."""
-        out: tuple[Tensor, Tensor, Tensor, Tensor] = kernel(junction_weights, self.config.compile)(
-            Rt, x, *self._given()
-        )
+        out: tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
+        out = kernel(junction_weights, self.config.compile)(Rt, x, *self._given())
         return out
 
     def robust_cost(self, Rt: Tensor, x: Tensor) -> Tensor:
@@ -398,15 +386,17 @@ class JunctionBlocks(RelativeBlocks):
 
     def prior_cost(self, x: Tensor) -> Tensor:
         """See `RelativeBlocks.prior_cost`."""
-        e = (x - self.prior).mT
-        return torch.einsum("ci,cij,cj->", e, self.information, e)
+        e = x - self.prior
+        return (self._informed(e) * e).sum()
 
     def add_prior(self, x: Tensor, V: Tensor, g: Tensor) -> None:
         """See `RelativeBlocks.add_prior`."""
-        e = (x - self.prior).mT
         for row, (i, j) in enumerate(((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))):
-            V[row] += self.information[:, i, j]
-        g += torch.einsum("cij,cj->ic", self.information, e)
+            V[row] += self.information[i, j]
+        g += self._informed(x - self.prior)
+
+    def _informed(self, e: Tensor) -> Tensor:
+        return (self.information * e).sum(1)
 
 
 def collinearity_prior(
@@ -442,13 +432,6 @@ def collinearity_prior(
     information = np.einsum("cki,ckj->cij", A, A) + weak * np.eye(3)
     moment = np.einsum("cki,ck->ci", A, right) + weak * mean[:, None]
     return np.linalg.solve(information, moment[..., None])[..., 0], information
-
-
-def _put(J: Tensor, Jd: Tensor, weight: Tensor, r: Tensor, by_pose: Tensor, by_depth: Tensor) -> None:
-    """Weighted rows into their places: ``J (R, 7, P)``, ``Jd (R, 1, P)``; a single row comes without its axis."""
-    torch.mul(by_pose, weight, out=J[:, :6] if by_pose.ndim == 3 else J[0, :6])
-    torch.mul(r, weight, out=J[:, 6] if r.ndim == 2 else J[0, 6])
-    torch.mul(by_depth, weight, out=Jd[:, 0] if by_depth.ndim == 2 else Jd[0, 0])
 
 
 def _tensor(x: FloatArray) -> Tensor:

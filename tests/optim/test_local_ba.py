@@ -464,7 +464,7 @@ def test_compiled_kernels_find_the_same_minimum(monkeypatch, tmp_path):
 
 
 def test_a_compiler_that_fails_leaves_the_eager_result(monkeypatch, caplog):
-    def broken(function, dynamic):
+    def broken(function):
         def call(*args):
             raise RuntimeError("no C++ compiler\nat all")
 
@@ -472,14 +472,13 @@ def test_a_compiler_that_fails_leaves_the_eager_result(monkeypatch, caplog):
 
     monkeypatch.setattr(torch, "compile", broken)
     monkeypatch.setattr(compiled, "_compiled", {})
+    monkeypatch.setattr(compiled, "_reported", set())
     problem = seeded_window(24, SMALL).problem
     with caplog.at_level("WARNING"):
         asked = refine_window(problem, replace(TIGHT, compile=True))
     assert asked.T_c_w.tobytes() == refine_window(problem, TIGHT).T_c_w.tobytes()
     messages = [r.getMessage() for r in caplog.records]
-    assert messages
-    assert set(messages) == {"torch.compile failed, eager from now on: no C++ compiler"}
-    assert len(messages) == 7  # once a kernel
+    assert messages == ["torch.compile failed, eager from now on: no C++ compiler"]
 
 
 def test_the_default_device_may_be_named():
@@ -492,20 +491,27 @@ def test_kernels_stay_on_their_device():
     """Meta tensors have shapes and a device but no values: an operation that mixed devices would raise here."""
     with torch.device("meta"):
         P, E, f = 50, 20, {"dtype": torch.float32}
-        K, Rt = torch.zeros(4, **f), torch.zeros(3, 4, P, **f)
-        one, two, block = torch.zeros(P, **f), torch.zeros(2, P, **f), torch.zeros(P, dtype=torch.int64)
-        robust = (Kernel.HUBER, 2.0, 1e6)
-        edge = (Rt, torch.zeros(1, P, **f), two, two, two, one, one, one, K)
-        arms = (Rt, torch.zeros(3, P, **f), torch.zeros(3, 2, P, **f), two, torch.zeros(2, 2, P, **f), one[:4, None], K)
-        point = (torch.zeros(3, P, **f), two, K, one, one, block[:3], one[:3], 1e-3, Kernel.HUBER, 2.0)
+        B, T, L = 2, 3, 16
+        K, Rt = torch.zeros(4, **f), torch.zeros(3, 4, B, T, 1, **f)
+        one, pair, block = torch.zeros(P, **f), torch.zeros(B, T, L, **f), torch.zeros(P, dtype=torch.int64)
+        robust = (pair, Kernel.HUBER, 2.0)
+        line, ray = torch.zeros(3, B, T, L, **f), torch.zeros(2, B, 1, L, **f)
+        edge = (Rt, torch.zeros(1, B, L, **f), ray, line, pair, pair, K)
+        rays, arms = torch.zeros(2, 3, B, 1, L, **f), torch.zeros(2, 2, B, T, L, **f)
+        corner = (Rt, torch.zeros(3, B, L, **f), rays, line[:2], arms, torch.zeros(4, B, T, L, **f), K)
+        point = (torch.zeros(3, P, **f), torch.zeros(2, P, **f), K, one, one, block[:3], one[:3])
+        point = (*point, 1e-3, Kernel.HUBER, 2.0)
         out = [*relative.edge_weights(*edge, CycleForm.RELATIVE_DEPTH, *robust)]
         out += [*relative.edge_weights(*edge, CycleForm.PIXEL, *robust), relative.edge_cost(*edge, None, *robust)]
-        out += [*relative.junction_weights(*arms, False, *robust), relative.junction_cost(*arms, False, *robust)]
+        out += [*relative.junction_weights(*corner, False, *robust), relative.junction_cost(*corner, False, *robust)]
         out += [*local_ba.point_weights(torch.zeros(3, 3, P, **f), *point, P), local_ba.point_cost(*point)]
         for size in (1, 3):
-            V = torch.zeros(size * (size + 1) // 2, E, **f)
-            factor = schur.inverse_cholesky(V, 1e-4)
-            out += [schur.entries(factor, block, torch.zeros(2, 6, P, **f), torch.zeros(2, size, P, **f))]
+            V, g = torch.zeros(size * (size + 1) // 2, B, L, **f), torch.zeros(size, B, L, **f)
+            out += [*schur.eliminate(V, g, torch.zeros(B, T, 6, size, L, **f), torch.zeros((), **f))]
+            factor = schur.inverse_cholesky(torch.zeros(size * (size + 1) // 2, E, **f), 1e-4)
+            Y = torch.zeros(6, size * E, **f)
+            flat = torch.zeros(6 * size * P, dtype=torch.int64)
+            schur.fill(Y, flat, True, factor, block, torch.zeros(2, 6, P, **f), torch.zeros(2, size, P, **f))
             out += [schur.unwhiten(factor, schur.whiten(factor, torch.zeros(size, E, **f)))]
         assert {t.device.type for t in out} == {"meta"}
 

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.losses import edge_alignment as ea
-from edgeslam_torch.losses.lshape import junction_rows
+from edgeslam_torch.losses.lshape import junction_residuals, junction_rows
 from edgeslam_torch.losses.reprojection import (
     camera_points,
     inverse_depth_jacobians,
@@ -104,21 +104,30 @@ def test_edge_pairs(row, name, rng):
     uv_j, normal = tensor(rng.uniform(0, 600, (2, PAIRS))), tensor(rng.normal(size=(2, PAIRS)))
     held = tensor(rng.uniform(0.2, 0.3, PAIRS))
 
+    line = ea.partner_line(uv_j, normal, tensor(rng.uniform(0.5, 2, PAIRS)), K)
+    weight = tensor(rng.uniform(0.5, 2, PAIRS))
+
     def rows(Rt: Tensor, d: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         g = ea.pair_geometry(Rt, ray, d)
+        slope = ea.depth_slopes(g, Rt[:, 3])
         if row == "alignment":
-            return ea.alignment_jacobians(g, uv_j, normal, K)
+            J, Jd = ea.alignment_jacobians(g, slope, line)
+            return ea.alignment_row(g, line), torch.stack(J), Jd
         if row == "relative depth":
-            return ea.relative_depth_jacobians(g, held)
-        return ea.round_trip_jacobians(g, Rt, ray, held, K)
+            J, Jd = ea.relative_depth_jacobians(g, slope, held, weight)
+            return ea.relative_depth_row(g, held) * weight, torch.stack(J), Jd
+        torch.testing.assert_close(
+            ea.round_trip_row(g, Rt, ray, held, K), ea.round_trip_jacobians(g, slope, Rt, ray, held, K)[0]
+        )
+        return ea.round_trip_jacobians(g, slope, Rt, ray, held, K)
 
     def residual(xi: Tensor, d: Tensor) -> Tensor:
         Rt = spread(lie.exp(xi) @ T)
         g = ea.pair_geometry(Rt, ray, d)
         if row == "alignment":
-            return ea.alignment_row(g, uv_j, normal, K)
+            return ea.alignment_row(g, line)
         if row == "relative depth":
-            return ea.relative_depth_row(g, held)
+            return ea.relative_depth_row(g, held) * weight
         p = torch.stack((g.x, g.y, torch.ones_like(g.x))) / held
         back = lie.inverse(lie.exp(xi) @ T)
         q = back[:3, :3] @ p + back[:3, 3:]
@@ -137,18 +146,19 @@ def test_edge_pairs(row, name, rng):
 def test_junctions(cosines, name, rng):
     T = lie.exp(tensor(POSES[name]))
     ray, inverse_depth = pairs(T, rng, 3 * PAIRS)
-    rays, x = ray.view(2, 3, PAIRS).movedim(1, 0).contiguous(), inverse_depth.view(3, PAIRS)
+    rays, x = ray.view(2, 3, PAIRS), inverse_depth.view(3, PAIRS)
     uv_j = tensor(rng.uniform(0, 600, (2, PAIRS)))
     angle = tensor(rng.uniform(0, 6, (2, PAIRS)))
-    arms = torch.stack((angle.cos(), angle.sin()), 1)
+    arms = torch.stack((angle.cos(), angle.sin()))
 
     def residual(xi: Tensor, d: Tensor) -> Tensor:
         return junction_rows(spread(lie.exp(xi) @ T), rays, d, uv_j, arms, K, cosines)[0]
 
     zero = torch.zeros(6, dtype=torch.float64)
     by_pose, by_depth = torch.autograd.functional.jacobian(residual, (zero, x))
-    _, J, Jd, front = junction_rows(spread(T), rays, x, uv_j, arms, K, cosines)
+    r, J, Jd, front = junction_rows(spread(T), rays, x, uv_j, arms, K, cosines)
     assert front.all()
+    torch.testing.assert_close(r, junction_residuals(spread(T), rays, x, uv_j, arms, K, cosines)[0])
     torch.testing.assert_close(J, by_pose.movedim(-1, -2))
     torch.testing.assert_close(Jd, by_depth.diagonal(0, 1, 3))
 

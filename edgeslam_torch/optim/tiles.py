@@ -1,0 +1,111 @@
+"""Dense layout of blocks and of the pairs that see them: host by target by block, so that nothing is gathered.
+
+The blocks of one host are cut into tiles of equal length. A pair has its place in its block's column and in its
+target's row of that tile; places without a pair carry no weight. Sums over a block's pairs, over a target's pairs
+and the product that eliminates the blocks are then sums along an axis and batched matrix products. Edges are looked
+for in the same few targets by all of a host, so that most places are taken.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from edgeslam_torch.types import FloatArray, IntArray
+
+_MOST_LANES = 2048
+"""Blocks per tile at most: hosts may be of very different size."""
+_VECTOR = 16
+"""Tiles are a multiple of this long, the single-precision numbers in a vector register."""
+
+
+@dataclass(frozen=True, slots=True)
+class Tiles:
+    """``B`` tiles of ``T`` targets by ``L`` blocks."""
+
+    host: Tensor
+    """``(B,)`` host pose of each tile."""
+    target: Tensor
+    """``(B, T)`` target poses; the host itself where a tile has fewer."""
+    lanes: int
+    """``L``."""
+    block_place: IntArray
+    """``(E,)`` places of the blocks in ``B L``."""
+    pair_place: IntArray
+    """``(P,)`` places of the pairs in ``B T L``."""
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """``B``, ``T``, ``L``."""
+        return *self.target.shape, self.lanes
+
+    def blocks(self, values: FloatArray, dtype: torch.dtype, empty: float = 0.0) -> Tensor:
+        """Values ``(..., E)`` of the blocks in their places ``(..., B, L)``."""
+        B, _, L = self.shape
+        return _spread(values, self.block_place, (B, L), dtype, empty)
+
+    def pairs(self, values: FloatArray, dtype: torch.dtype, empty: float = 0.0) -> Tensor:
+        """Values ``(..., P)`` of the pairs in their places ``(..., B, T, L)``."""
+        return _spread(values, self.pair_place, self.shape, dtype, empty)
+
+    def of_blocks(self, values: Tensor) -> FloatArray:
+        """Back from places ``(..., B, L)`` to the blocks ``(..., E)``."""
+        out: FloatArray = values.cpu().numpy().reshape(*values.shape[:-2], -1)[..., self.block_place]
+        return out
+
+    def of_pairs(self, values: Tensor) -> FloatArray:
+        """Back from places ``(..., B, T, L)`` to the pairs ``(..., P)``."""
+        out: FloatArray = values.cpu().numpy().reshape(*values.shape[:-3], -1)[..., self.pair_place]
+        return out
+
+
+def lay_out(host: IntArray, pair_block: IntArray, pair_pose: IntArray, poses: int) -> Tiles:
+    """Give blocks and pairs their places; a host of usual size is one tile.
+
+    Args:
+        host: ``(E,)`` host poses.
+        pair_block: ``(P,)`` blocks of the pairs.
+        pair_pose: ``(P,)`` target poses.
+        poses: Number of poses.
+
+    Raises:
+        ValueError: If a pair's target is its host, or a block is paired with one target twice.
+    """
+    host, pair_block, pair_pose = (np.asarray(x, dtype=np.int64) for x in (host, pair_block, pair_pose))
+    if (host[pair_block] == pair_pose).any():
+        raise ValueError("a pair's target pose must differ from its host")
+    count = np.bincount(host, minlength=poses)
+    most = max(int(count.max(initial=0)), 1)
+    lanes = -(-most // -(-most // _MOST_LANES))
+    lanes = -(-lanes // _VECTOR) * _VECTOR
+    order = np.argsort(host, kind="stable")
+    within = np.empty_like(order)
+    within[order] = np.arange(len(host)) - np.repeat(np.cumsum(count) - count, count)
+    tiles = -(-count // lanes)
+    tile = (np.cumsum(tiles) - tiles)[host] + within // lanes
+    tile_host = np.repeat(np.arange(poses), tiles)
+    seen = np.zeros((len(tile_host), poses), dtype=bool)
+    seen[tile[pair_block], pair_pose] = True
+    slot = np.cumsum(seen, axis=1) - 1
+    slots = max(int(seen.sum(1).max(initial=0)), 1)
+    target = np.repeat(tile_host[:, None], slots, axis=1)
+    which, pose = np.nonzero(seen)
+    target[which, slot[which, pose]] = pose
+    block_place = tile * lanes + within % lanes
+    row = tile[pair_block] * slots + slot[tile[pair_block], pair_pose]
+    pair_place = row * lanes + within[pair_block] % lanes
+    taken = np.zeros(target.size * lanes, dtype=bool)
+    taken[pair_place] = True
+    if np.count_nonzero(taken) != len(pair_place):
+        raise ValueError("a block must be paired with a target pose only once")
+    return Tiles(torch.as_tensor(tile_host), torch.as_tensor(target), lanes, block_place, pair_place)
+
+
+def _spread(values: FloatArray, place: IntArray, shape: tuple[int, ...], dtype: torch.dtype, empty: float) -> Tensor:
+    rows = np.asarray(values).reshape(-1, len(place))
+    kind = np.float32 if dtype is torch.float32 else np.float64
+    out = np.full((len(rows), int(np.prod(shape))), empty, dtype=kind)
+    for to, row in zip(out, rows, strict=True):  # row by row: numpy is slow with an index behind an ellipsis
+        to[place] = row
+    return torch.as_tensor(out.reshape(*np.shape(values)[:-1], *shape))
