@@ -21,14 +21,14 @@ Pairs = tuple[IntArray, IntArray]
 
 def fuse(slam_map: SlamMap, camera: Camera, keyframe: Keyframe, neighbours: list[Keyframe]) -> None:
     """Look for a keyframe's anchors in its neighbours."""
-    _merge(slam_map, [_look_in(slam_map, camera, k, slam_map.anchors_seen_by([keyframe])) for k in neighbours])
+    merge(slam_map, [_look_in(slam_map, camera, k, slam_map.anchors_seen_by([keyframe])) for k in neighbours])
 
 
 def fuse_all(slam_map: SlamMap, camera: Camera) -> None:
     """Look for every anchor in every keyframe: what drift hid from each other meets once all poses are refined."""
     anchors = slam_map.anchors
     for keyframe in slam_map.keyframes.values():
-        _merge(slam_map, [_look_in(slam_map, camera, keyframe, np.flatnonzero(anchors.alive & ~anchors.from_depth))])
+        merge(slam_map, [_look_in(slam_map, camera, keyframe, np.flatnonzero(anchors.alive & ~anchors.from_depth))])
     slam_map.refresh_anchors(np.flatnonzero(anchors.alive))
 
 
@@ -57,7 +57,7 @@ def _look_in(slam_map: SlamMap, camera: Camera, keyframe: Keyframe, ids: IntArra
     return found[~free], held[~free]
 
 
-def _merge(slam_map: SlamMap, doubles: list[Pairs]) -> None:
+def merge(slam_map: SlamMap, doubles: list[Pairs]) -> None:
     """Two ids for one point: the one with more observations stays."""
     if not doubles:
         return

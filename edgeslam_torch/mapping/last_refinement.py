@@ -15,6 +15,7 @@ from edgeslam_torch.mapping.edge_map import EdgeMap, EdgePoints
 from edgeslam_torch.mapping.fuse import fuse_all
 from edgeslam_torch.mapping.keyframe import Keyframe
 from edgeslam_torch.mapping.refinement import refine_all, take_back, whole_map, window_problem
+from edgeslam_torch.mapping.reobserve import reobserve_all
 from edgeslam_torch.mapping.slam_map import SlamMap
 from edgeslam_torch.mapping.window_terms import (
     PlacedEdges,
@@ -55,6 +56,8 @@ def last_refinement(slam_map: SlamMap, camera: Camera, edges: EdgeMap, config: W
     lm = replace(lm_config(config), max_iterations=ITERATIONS)
     result = None
     if config.reprojection != "off" and refine_all(slam_map, camera, lm) is not None:
+        if reobserve_all(slam_map, camera):
+            refine_all(slam_map, camera, lm)
         fuse_all(slam_map, camera)
         result = refine_all(slam_map, camera, lm)
     edges.update(everything=True)

@@ -8,7 +8,8 @@ from edgeslam_torch.mapping.depth_prior import depth_prior
 from edgeslam_torch.mapping.fuse import fuse
 from edgeslam_torch.mapping.keyframe import Keyframe
 from edgeslam_torch.mapping.new_anchors import epipolar_matches, triangulate_matches
-from edgeslam_torch.mapping.refinement import choose_window, refine
+from edgeslam_torch.mapping.refinement import choose_window, refine, refine_all
+from edgeslam_torch.mapping.reobserve import reobserve
 from edgeslam_torch.mapping.slam_map import SlamMap
 from edgeslam_torch.optim.problem import LmConfig, WindowResult
 from edgeslam_torch.types import IntArray
@@ -44,6 +45,9 @@ class Mapper:
             neighbours = self.map.covisible(keyframe, self.config.neighbours)
             self.triangulate_new(keyframe, neighbours, colour)
             fuse(self.map, self.camera, keyframe, self.map.covisible(keyframe, 2 * self.config.neighbours))
+            returned = reobserve(self.map, self.camera, keyframe)
+        if returned:  # what drifted on the way lies outside the window
+            refine_all(self.map, self.camera, self.lm)
         window = choose_window(self.map, keyframe, self.config.window, self.config.window_fixed)
         result = refine(self.map, window, self.camera, self.lm)
         with self.map.lock:

@@ -1,0 +1,109 @@
+"""Old anchors seen again: two keyframes that look at one place without knowing it, because drift lies between them.
+
+A search of a few pixels (`mapping/fuse.py`) misses anchors that drift has moved farther. Here an old keyframe's anchors
+are looked for in a wide circle, and believed when one camera pose explains them together. Local in the sense that the
+poses must already be near each other: places are not recognised, and no pose graph is closed.
+"""
+
+import logging
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.mapping.fuse import MAX_HAMMING, merge
+from edgeslam_torch.mapping.keyframe import Keyframe
+from edgeslam_torch.mapping.slam_map import SlamMap
+from edgeslam_torch.optim.pose_only import refine_pose
+from edgeslam_torch.tracking.projection import match_projection, project_anchors
+from edgeslam_torch.types import FloatArray, IntArray
+
+logger = logging.getLogger(__name__)
+
+RADIUS_PX = 30.0
+"""Search radius at pyramid level 0: drift of a few per cent of the distance."""
+RATIO = 0.85
+"""Nearest over second nearest descriptor distance in that circle."""
+MIN_INLIERS = 15
+MIN_SHARE = 0.5
+"""Of the matches, to believe that the two see the same place."""
+MAX_TURN_RAD = np.deg2rad(30.0)
+MAX_SHIFT = 0.35
+"""Distance of the two cameras, relative to the newer one's median depth."""
+STRANGERS = 15
+"""Two keyframes that share at least as many anchors know each other, as in `SlamMap.covisible`."""
+
+
+def reobserve_all(slam_map: SlamMap, camera: Camera) -> int:
+    """`reobserve` for every keyframe; returns how many were joined with an old one."""
+    return sum(reobserve(slam_map, camera, keyframe) for keyframe in list(slam_map.keyframes.values()))
+
+
+def lookalike(slam_map: SlamMap, keyframe: Keyframe) -> Keyframe | None:
+    """The older keyframe nearest in place and direction of those that share few anchors with this one, or None."""
+    older = [k for k in slam_map.keyframes.values() if k.id < keyframe.id]
+    depth = _median_depth(slam_map, keyframe)
+    if not older or depth is None:
+        return None
+    cosine = np.stack([k.T_c_w[2, :3] for k in older]) @ keyframe.T_c_w[2, :3]
+    turn = np.arccos(np.clip(cosine, -1.0, 1.0)) / MAX_TURN_RAD
+    shift = np.linalg.norm(np.stack([k.centre_w for k in older]) - keyframe.centre_w, axis=1) / (MAX_SHIFT * depth)
+    counts = slam_map.shared_counts(keyframe.anchor[keyframe.anchor >= 0])
+    shared = np.array([counts.get(k.id, 0) for k in older])
+    apart = np.where((turn < 1.0) & (shift < 1.0) & (shared < STRANGERS), turn + shift, np.inf)
+    nearest = int(apart.argmin())
+    return older[nearest] if np.isfinite(apart[nearest]) else None
+
+
+def reobserve(slam_map: SlamMap, camera: Camera, keyframe: Keyframe) -> bool:
+    """Join a keyframe with an old one that saw the same place; False where there is none, or too little fits together.
+
+    The map is not refined here; joined observations disagree by the drift until it is.
+    """
+    old = lookalike(slam_map, keyframe)
+    if old is None:
+        return False
+    anchors, growth = slam_map.anchors, slam_map.scale_factor
+    ids = slam_map.anchors_seen_by([old, *slam_map.covisible(old, 5)])
+    ids = ids[anchors.alive[ids] & ~anchors.from_depth[ids] & ~np.isin(ids, keyframe.anchor)]
+    seen = project_anchors(anchors, ids, keyframe.T_c_w, camera, growth, slam_map.levels)
+    matches = match_projection(
+        seen,
+        anchors.words[seen.anchor],
+        keyframe.words,
+        keyframe.features.octave,
+        keyframe.grid,
+        np.full(len(seen.anchor), RADIUS_PX),
+        MAX_HAMMING,
+        RATIO,
+    )
+    found, keypoint = seen.anchor[matches.query], matches.train
+    if len(found) < MIN_INLIERS:
+        return False
+    inliers = _agreeing(keyframe, anchors.p_w[found], keypoint, camera, growth)
+    if inliers.sum() < MIN_INLIERS or inliers.mean() < MIN_SHARE:
+        return False
+    found, keypoint = found[inliers], keypoint[inliers]
+    held = keyframe.anchor[keypoint]
+    free = held < 0
+    slam_map.observe(keyframe, keypoint[free], found[free])
+    merge(slam_map, [(found[~free], held[~free])])
+    logger.info("keyframe of frame %d joined with that of frame %d", keyframe.frame_index, old.frame_index)
+    return True
+
+
+def _agreeing(
+    keyframe: Keyframe, p_w: FloatArray, keypoint: IntArray, camera: Camera, growth: float
+) -> NDArray[np.bool_]:
+    """Which matches one pose explains, ``(M,)``."""
+    uv = keyframe.features.uv[keypoint].astype(np.float64)
+    inv_sigma = growth ** -keyframe.features.octave[keypoint].astype(np.float64)
+    return refine_pose(keyframe.T_c_w, p_w, uv, inv_sigma, (camera.fx, camera.fy, camera.cx, camera.cy)).inliers
+
+
+def _median_depth(slam_map: SlamMap, keyframe: Keyframe) -> float | None:
+    """Of the keyframe's anchors [map units]; None without any in front."""
+    held = keyframe.anchor[keyframe.anchor >= 0]
+    z = se3.transform(keyframe.T_c_w, slam_map.anchors.p_w[held])[:, 2]
+    return float(np.median(z[z > 0])) if (z > 0).any() else None
