@@ -87,7 +87,7 @@ class InitialisationConfig:
     """Frames between those that become keyframes once the two views have made a map."""
     most_keyframes: int = 12
     """Of these frames at most; each costs a pass of the depth network."""
-    max_direction_sigma: float = 0.05
+    max_direction_sigma: float = 0.08
     """Standard deviation of the second camera's position, relative to the baseline, above which two views wait."""
 
     def __post_init__(self) -> None:
