@@ -279,6 +279,8 @@ def _height_slope(stamps_s: FloatArray, vz: FloatArray, z_m: FloatArray, step_m:
     if moving.sum() < 10:
         return math.nan, 0.0
     x, y = dx[moving], dz[moving]
+    if np.ptp(x) == 0.0 or np.ptp(y) == 0.0:  # a frozen sensor: nothing varies together
+        return math.nan, 0.0
     return float(np.median(y / x)), float(np.corrcoef(x, y)[0, 1])
 
 

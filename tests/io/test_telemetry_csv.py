@@ -148,6 +148,13 @@ def test_unit_and_axis_of_the_velocity_are_found_from_height(tmp_path, velocity_
     assert samples[1].stamp_s == pytest.approx(0.1)  # milliseconds, told by their spacing
 
 
+@pytest.mark.filterwarnings("error")
+def test_height_that_never_changes_tells_no_unit(tmp_path):
+    rows = [f"{100 * k},0,0,{2 + k % 3},100" for k in range(100)]
+    table = read_table(write(tmp_path, "\n".join(["timestamp,vx,vy,vz,tof", *rows]) + "\n"))
+    assert "too little vertical motion" in detect_units(table).evidence
+
+
 def rewritten(tmp_path, how):
     """The climbing flight as another program might have logged it."""
     lines = climbing(tmp_path, 0.1, -1).read_text().splitlines()
