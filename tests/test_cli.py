@@ -51,6 +51,12 @@ def test_camera_that_stands_still_is_told_apart_from_a_missing_depth_network(rec
     assert "no point was triangulated" in capsys.readouterr().out
 
 
+def test_lossless_without_record_is_refused(edgeslam, recording):
+    code, _, err = edgeslam("run", recording, "--lossless")
+    assert code == 1
+    assert "--lossless is for --record" in err
+
+
 def test_run_without_out_goes_into_runs(edgeslam, recording, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert edgeslam("run", "seq", "--no-report")[0] == 0

@@ -62,10 +62,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Run, and say in a few lines how it went."""
+    from edgeslam_torch.errors import ConfigError
     from edgeslam_torch.io.source import open_source
     from edgeslam_torch.progress import make_progress
     from edgeslam_torch.run import Listener, Mode, run, settle_camera
 
+    if args.lossless and args.record is None:
+        raise ConfigError("--lossless is for --record DIR")
     config = resolved_config(args)
     if args.record is not None:
         source = _recorded(args)
