@@ -6,7 +6,7 @@ from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.mapping.keyframe import Keyframe
 from edgeslam_torch.mapping.slam_map import SlamMap
 from edgeslam_torch.tracking.projection import match_projection, project_anchors
-from edgeslam_torch.types import IntArray
+from edgeslam_torch.types import FloatArray, IntArray
 
 RADIUS_PX = 3.0
 """Search radius at pyramid level 0; poses and points are refined already."""
@@ -32,29 +32,61 @@ def fuse_all(slam_map: SlamMap, camera: Camera) -> None:
     slam_map.refresh_anchors(np.flatnonzero(anchors.alive))
 
 
-def _look_in(slam_map: SlamMap, camera: Camera, keyframe: Keyframe, ids: IntArray) -> Pairs:
-    """Observe anchors on a keyframe's free keypoints; returns those whose keypoint has another anchor, and that."""
-    anchors, growth = slam_map.anchors, slam_map.scale_factor
+def look_for(
+    slam_map: SlamMap,
+    camera: Camera,
+    keyframe: Keyframe,
+    ids: IntArray,
+    radius_px: float,
+    per_level: float,
+    ratio: float,
+) -> tuple[IntArray, IntArray, FloatArray]:
+    """Anchors that a keyframe does not hold, where its pose expects them.
+
+    Args:
+        slam_map: Holds keyframe and anchors.
+        camera: Intrinsics.
+        keyframe: Where to look.
+        ids: Anchors to look for.
+        radius_px: Search radius at pyramid level 0.
+        per_level: Factor by which the radius grows with every level.
+        ratio: Nearest over second nearest descriptor distance at most.
+
+    Returns:
+        What was found ``(M,)``, on which keypoints ``(M,)``, and how far from there [px] it was expected ``(M, 2)``.
+    """
+    anchors = slam_map.anchors
     ids = ids[~np.isin(ids, keyframe.anchor)]
-    seen = project_anchors(anchors, ids, keyframe.T_c_w, camera, growth, slam_map.levels)
+    seen = project_anchors(anchors, ids, keyframe.T_c_w, camera, slam_map.scale_factor, slam_map.levels)
     matches = match_projection(
         seen,
         anchors.words[seen.anchor],
         keyframe.words,
         keyframe.features.octave,
         keyframe.grid,
-        RADIUS_PX * growth ** seen.octave.astype(np.float64),
+        radius_px * per_level ** seen.octave.astype(np.float64),
         MAX_HAMMING,
-        1.0,
+        ratio,
     )
     error = seen.uv[matches.query] - keyframe.features.uv[matches.train]
-    sigma = growth ** keyframe.features.octave[matches.train].astype(np.float64)
-    good = (error**2).sum(1) <= CHI2_2 * sigma**2
-    found, keypoint = seen.anchor[matches.query[good]], matches.train[good]
+    return seen.anchor[matches.query], matches.train, error
+
+
+def observe_or_pair(slam_map: SlamMap, keyframe: Keyframe, found: IntArray, keypoint: IntArray) -> Pairs:
+    """Observe anchors ``(M,)`` on a keyframe's free keypoints; those whose keypoint has another anchor, and that."""
     held = keyframe.anchor[keypoint]
     free = held < 0
     slam_map.observe(keyframe, keypoint[free], found[free])
     return found[~free], held[~free]
+
+
+def _look_in(slam_map: SlamMap, camera: Camera, keyframe: Keyframe, ids: IntArray) -> Pairs:
+    """Observe anchors on a keyframe's free keypoints; returns those whose keypoint has another anchor, and that."""
+    growth = slam_map.scale_factor
+    found, keypoint, error = look_for(slam_map, camera, keyframe, ids, RADIUS_PX, growth, 1.0)
+    sigma = growth ** keyframe.features.octave[keypoint].astype(np.float64)
+    good = (error**2).sum(1) <= CHI2_2 * sigma**2
+    return observe_or_pair(slam_map, keyframe, found[good], keypoint[good])
 
 
 def merge(slam_map: SlamMap, doubles: list[Pairs]) -> None:

@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
-from edgeslam_torch.mapping.fuse import MAX_HAMMING, merge
+from edgeslam_torch.mapping.fuse import look_for, merge, observe_or_pair
 from edgeslam_torch.mapping.keyframe import Keyframe
 from edgeslam_torch.mapping.slam_map import SlamMap
 from edgeslam_torch.optim.pose_only import refine_pose
-from edgeslam_torch.tracking.projection import match_projection, project_anchors
 from edgeslam_torch.types import FloatArray, IntArray
 
 logger = logging.getLogger(__name__)
@@ -66,29 +65,14 @@ def reobserve(slam_map: SlamMap, camera: Camera, keyframe: Keyframe) -> bool:
         return False
     anchors, growth = slam_map.anchors, slam_map.scale_factor
     ids = slam_map.anchors_seen_by([old, *slam_map.covisible(old, 5)])
-    ids = ids[anchors.alive[ids] & ~anchors.from_depth[ids] & ~np.isin(ids, keyframe.anchor)]
-    seen = project_anchors(anchors, ids, keyframe.T_c_w, camera, growth, slam_map.levels)
-    matches = match_projection(
-        seen,
-        anchors.words[seen.anchor],
-        keyframe.words,
-        keyframe.features.octave,
-        keyframe.grid,
-        np.full(len(seen.anchor), RADIUS_PX),
-        MAX_HAMMING,
-        RATIO,
-    )
-    found, keypoint = seen.anchor[matches.query], matches.train
+    ids = ids[anchors.alive[ids] & ~anchors.from_depth[ids]]
+    found, keypoint, _ = look_for(slam_map, camera, keyframe, ids, RADIUS_PX, 1.0, RATIO)
     if len(found) < MIN_INLIERS:
         return False
     inliers = _agreeing(keyframe, anchors.p_w[found], keypoint, camera, growth)
     if inliers.sum() < MIN_INLIERS or inliers.mean() < MIN_SHARE:
         return False
-    found, keypoint = found[inliers], keypoint[inliers]
-    held = keyframe.anchor[keypoint]
-    free = held < 0
-    slam_map.observe(keyframe, keypoint[free], found[free])
-    merge(slam_map, [(found[~free], held[~free])])
+    merge(slam_map, [observe_or_pair(slam_map, keyframe, found[inliers], keypoint[inliers])])
     logger.info("keyframe of frame %d joined with that of frame %d", keyframe.frame_index, old.frame_index)
     return True
 
