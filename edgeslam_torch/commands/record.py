@@ -102,6 +102,7 @@ def _start_pilot(tello: "Tello") -> Callable[[], None]:
     """A short flight in a thread of its own; the returned function raises what went wrong in it."""
     import logging
     import threading
+    from functools import partial
 
     from edgeslam_torch.errors import EdgeSlamError
     from edgeslam_torch.io.tello import NoAnswer
@@ -111,8 +112,8 @@ def _start_pilot(tello: "Tello") -> Callable[[], None]:
     def fly() -> None:
         try:
             tello.take_off()
-            for step in (lambda: tello.move(0.0, 0.0, 0.5), lambda: tello.move(0.0, 0.0, -0.5),
-                         lambda: tello.turn(0.7), lambda: tello.turn(-0.7)):  # fmt: skip
+            steps = [partial(tello.move, 0.0, 0.0, 0.5), partial(tello.move, 0.0, 0.0, -0.5)]
+            for step in [*steps, partial(tello.turn, 0.7), partial(tello.turn, -0.7)]:
                 try:
                     step()
                 except NoAnswer as error:  # a lost packet; the next step does not rest on this one
