@@ -19,6 +19,7 @@ from edgeslam_torch.errors import SourceError
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.io.camera_choice import GUESS, GUESS_COST, GUESS_WARNING
 from edgeslam_torch.io.config_file import to_toml
+from edgeslam_torch.io.map_picture import write_map_picture
 from edgeslam_torch.io.pace import Counter, at_their_pace
 from edgeslam_torch.io.read_ahead import read_ahead
 from edgeslam_torch.io.run_writer import CAMERA, PICTURE, RunWriter
@@ -289,8 +290,6 @@ class _Run:
         title = f"{self.source.name}: {self.tally.frames} frames, {len(edge_map.p_w)} edge points"
 
         def picture(path: Path) -> None:
-            from edgeslam_torch.io.map_picture import write_map_picture  # matplotlib: only when a run ends
-
             write_map_picture(path, edge_map, poses, scale.units, title)
 
         extras = [(CAMERA, self.source.camera.save), (PICTURE, picture)]
