@@ -1,11 +1,12 @@
 """Rigid motions as ``(4, 4)`` matrices in numpy float64; tangents ``xi = (rho, phi)``, applied on the left.
 
 The torch solver uses the same order (kornia's); these few functions serve the per-frame path, where a numpy call
-costs a tenth of a torch call.
+costs a tenth of a torch call, and ten operations on Python's own floats cost what one numpy call does.
 """
 
+import math
+
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.types import FloatArray
 
@@ -25,31 +26,45 @@ def hat(phi: FloatArray) -> FloatArray:
 
 def exp(xi: FloatArray) -> FloatArray:
     """Rigid motion ``(4, 4)`` of a tangent ``(6,)`` (Barfoot 2017, eq. 7.86)."""
-    rho, phi = np.asarray(xi[:3], dtype=np.float64), np.asarray(xi[3:], dtype=np.float64)
-    theta = float(np.linalg.norm(phi))
-    W = hat(phi)
+    u, v, w, x, y, z = (float(value) for value in xi)
+    theta2 = x * x + y * y + z * z
+    theta = math.sqrt(theta2)
     if theta < 1e-6:  # Taylor terms; the next one is below float64 resolution
-        a, b, c = 1.0 - theta**2 / 6.0, 0.5 - theta**2 / 24.0, 1.0 / 6.0 - theta**2 / 120.0
+        a, b, c = 1.0 - theta2 / 6.0, 0.5 - theta2 / 24.0, 1.0 / 6.0 - theta2 / 120.0
     else:
-        a = np.sin(theta) / theta
-        b = (1.0 - np.cos(theta)) / theta**2
-        c = (theta - np.sin(theta)) / theta**3
-    T = np.eye(4)
-    WW = W @ W
-    T[:3, :3] += a * W + b * WW
-    T[:3, 3] = rho + b * (W @ rho) + c * (WW @ rho)
-    return T
+        a = math.sin(theta) / theta
+        b = (1.0 - math.cos(theta)) / theta2
+        c = (theta - math.sin(theta)) / (theta * theta2)
+    # hat(phi) rho, and hat(phi)^2 as phi phi^T - theta^2 I.
+    p, q, r = y * w - z * v, z * u - x * w, x * v - y * u
+    along = c * (x * u + y * v + z * w)
+    rest = 1.0 - c * theta2
+    return np.array(
+        [
+            [1.0 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y, rest * u + b * p + along * x],
+            [b * x * y + a * z, 1.0 - b * (x * x + z * z), b * y * z - a * x, rest * v + b * q + along * y],
+            [b * x * z - a * y, b * y * z + a * x, 1.0 - b * (x * x + y * y), rest * w + b * r + along * z],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    )
 
 
 def log(T: FloatArray) -> FloatArray:
     """Tangent ``(6,)`` of a rigid motion ``(4, 4)``; inverse of `exp` for angles below pi."""
-    phi = Rotation.from_matrix(T[:3, :3]).as_rotvec()
-    theta = float(np.linalg.norm(phi))
-    W = hat(phi)
+    i, j, k, real = quaternion(T)
+    sine = math.sqrt(i * i + j * j + k * k)
+    theta = 2.0 * math.atan2(sine, real)
+    turn = theta / sine if sine > 1e-9 else 2.0
+    x, y, z = turn * i, turn * j, turn * k
     half = 0.5 * theta
-    c = 1.0 / 12.0 if theta < 1e-4 else (1.0 - half / np.tan(half)) / theta**2
-    rho = T[:3, 3] - 0.5 * (W @ T[:3, 3]) + c * (W @ (W @ T[:3, 3]))
-    return np.concatenate([rho, phi])
+    c = 1.0 / 12.0 if theta < 1e-4 else (1.0 - half / math.tan(half)) / theta**2
+    u, v, w = (float(value) for value in T[:3, 3])
+    p, q, r = y * w - z * v, z * u - x * w, x * v - y * u
+    along = c * (x * u + y * v + z * w)
+    rest = 1.0 - c * theta**2
+    return np.array(
+        [rest * u - 0.5 * p + along * x, rest * v - 0.5 * q + along * y, rest * w - 0.5 * r + along * z, x, y, z]
+    )
 
 
 def inverse(T: FloatArray) -> FloatArray:
@@ -70,19 +85,42 @@ def transform(T: FloatArray, p: FloatArray) -> FloatArray:
 def orthonormalised(T: FloatArray) -> FloatArray:
     """``T`` with its rotation projected to the nearest orthonormal one; long products drift without it."""
     out = T.copy()
-    out[:3, :3] = Rotation.from_matrix(T[:3, :3]).as_matrix()
+    U, _, V_t = np.linalg.svd(T[:3, :3])
+    out[:3, :3] = U @ V_t
     return out
+
+
+def quaternion(T: FloatArray) -> tuple[float, float, float, float]:
+    """Unit ``(x, y, z, w)`` of the rotation in ``T`` ``(4, 4)`` or ``(3, 3)``, with ``w >= 0``."""
+    (a, b, c), (d, e, f), (g, h, i) = T[:3, :3].tolist()
+    # Four times the squares of w, x, y, z; the largest is divided by (Shepperd 1978).
+    squares = (1.0 + a + e + i, 1.0 + a - e - i, 1.0 - a + e - i, 1.0 - a - e + i)
+    largest = squares.index(max(squares))
+    if largest == 0:
+        w, x, y, z = squares[0], h - f, c - g, d - b
+    elif largest == 1:
+        w, x, y, z = h - f, squares[1], b + d, c + g
+    elif largest == 2:
+        w, x, y, z = c - g, b + d, squares[2], f + h
+    else:
+        w, x, y, z = d - b, c + g, f + h, squares[3]
+    scale = math.copysign(1.0 / math.sqrt(w * w + x * x + y * y + z * z), w)
+    return scale * x, scale * y, scale * z, scale * w
 
 
 def pose_from_tum(row: FloatArray) -> FloatArray:
     """``(4, 4)`` from ``tx ty tz qx qy qz qw``."""
+    x, y, z, w = row[3:7] / np.linalg.norm(row[3:7])
     T = np.eye(4)
-    T[:3, :3] = Rotation.from_quat(row[3:7]).as_matrix()
+    T[:3, :3] = [
+        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)],
+        [2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)],
+        [2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)],
+    ]
     T[:3, 3] = row[:3]
     return T
 
 
 def pose_to_tum(T: FloatArray) -> FloatArray:
     """``tx ty tz qx qy qz qw`` with ``qw >= 0``, shape ``(7,)``."""
-    q = Rotation.from_matrix(T[:3, :3]).as_quat(canonical=True)
-    return np.concatenate([T[:3, 3], q])
+    return np.array([*T[:3, 3].tolist(), *quaternion(T)])
