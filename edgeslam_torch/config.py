@@ -75,6 +75,27 @@ class TrackingConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class FlowConfig:
+    """Stage 2, between keyframes: optical flow in place of matching."""
+
+    enabled: bool = True
+    """Off: keypoints are detected and matched in every frame."""
+    points: int = 350
+    """Keypoints of the last keyframe that are followed at most."""
+    window_px: int = 15
+    """Side of the patch that is looked for."""
+    levels: int = 4
+    """Images of the pyramid, each half as large as the one before."""
+    min_share: float = 0.4
+    """Below this share of keypoints found again the frame is matched instead."""
+
+    def __post_init__(self) -> None:
+        _positive(self, "points", "levels", "min_share")
+        if self.window_px < 5:
+            raise ValueError(f"window_px must be at least 5, got {self.window_px}")
+
+
+@dataclass(frozen=True, slots=True)
 class InitialisationConfig:
     """Two-view initialisation that replaces the depth-prior map of the first frame."""
 
@@ -102,13 +123,15 @@ class MappingConfig:
     """Frames between keyframes at least."""
     keyframe_max_gap: int = 30
     """Frames between keyframes at most while the camera moves."""
+    keyframe_followed: float = 0.88
+    """A new keyframe when flow finds fewer than this share of the last one's keypoints."""
     keyframe_overlap: float = 0.7
-    """A new keyframe when fewer than this share of the reference keyframe's anchors is tracked."""
-    keyframe_parallax_deg: float = 4.0
+    """A new keyframe when fewer than this share of the reference keyframe's anchors is matched."""
+    keyframe_parallax_deg: float = 3.0
     """A new keyframe when the median ray angle to the reference exceeds this."""
     max_keyframes: int = 200
     """Keyframes kept in the map; the least useful one goes first. Bounds memory and time."""
-    redundancy: float = 0.9
+    redundancy: float = 0.95
     """A keyframe goes when this share of its anchors is seen by three others."""
     neighbours: int = 6
     """Keyframes that new anchors are triangulated with."""
@@ -127,8 +150,9 @@ class MappingConfig:
             raise ValueError(f"window must be at least 2, got {self.window}")
         if self.max_keyframes < self.window + self.window_fixed:
             raise ValueError(f"max_keyframes must be at least window + window_fixed, got {self.max_keyframes}")
-        if not 0.0 < self.keyframe_overlap < 1.0:
-            raise ValueError(f"keyframe_overlap must be in (0, 1), got {self.keyframe_overlap}")
+        for name in ("keyframe_overlap", "keyframe_followed"):
+            if not 0.0 < getattr(self, name) < 1.0:
+                raise ValueError(f"{name} must be in (0, 1), got {getattr(self, name)}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -234,6 +258,7 @@ class SlamConfig:
     orb: OrbConfig = field(default_factory=OrbConfig)
     depth: DepthConfig = field(default_factory=DepthConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
+    flow: FlowConfig = field(default_factory=FlowConfig)
     initialisation: InitialisationConfig = field(default_factory=InitialisationConfig)
     mapping: MappingConfig = field(default_factory=MappingConfig)
     edges: EdgeConfig = field(default_factory=EdgeConfig)

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -31,7 +31,10 @@ from edgeslam_torch.mapping.last_refinement import last_refinement, lm_config
 from edgeslam_torch.mapping.mapper import Mapper
 from edgeslam_torch.mapping.slam_map import SlamMap
 from edgeslam_torch.tracking.bootstrap import Bootstrap
+from edgeslam_torch.tracking.flow import FlowTracker, Template, template_of_keyframe, template_of_track
 from edgeslam_torch.tracking.initialiser import TwoView
+from edgeslam_torch.tracking.keyframe_choice import few_matches, is_due, lost_sight
+from edgeslam_torch.tracking.lazy_view import LazyView
 from edgeslam_torch.tracking.relocaliser import relocalise
 from edgeslam_torch.tracking.tracker import Track, Tracker, View, make_view, median_parallax
 from edgeslam_torch.trajectory import TrajectoryLog
@@ -101,6 +104,9 @@ class EdgeSlam:
             self.events["keyframes_skipped"] = 0
         self._orb = OrbExtractor(self.config.orb, camera)
         self._tracker = Tracker(self.map, camera, self.config.orb, self.config.tracking)
+        self._flow = FlowTracker(self.map, camera, self.config.orb, self.config.flow, self.config.tracking.min_inliers)
+        self._template: Template | None = None
+        """What the next frames are followed from; none before there is a map."""
         self._lm = lm_config(self.config.window)
         self._mapper = Mapper(self.map, camera, self.config, self._lm)
         self.edges = EdgeMap(self.map, camera, self.config.edges, self.config.depth.prior_sigma_log)
@@ -122,15 +128,23 @@ class EdgeSlam:
 
     # -- one frame ---------------------------------------------------------------------------------------------
 
-    def prepare(self, frame: Frame) -> View:
-        """Features of a frame: all that can be done before the frames before it are through, on any one thread.
+    def prepare(self, frame: Frame) -> LazyView:
+        """What can be done with a frame before the frames before it are through, on any one thread.
 
         Raises:
             SourceError: If the image is not of the camera's size.
         """
-        return make_view(self._orb(_grey(frame, self.camera)), self.config.orb.scale_factor)
+        seen = LazyView(_grey(frame, self.camera), self._extract)
+        if self._template is None or not self.config.flow.enabled:  # every frame is matched
+            _ = seen.view
+        return seen
 
-    def step(self, frame: Frame, telemetry: Sequence[TelemetrySample] = (), prepared: View | None = None) -> SlamOutput:
+    def _extract(self, grey: np.ndarray) -> View:
+        return make_view(self._orb(grey), self.config.orb.scale_factor)
+
+    def step(
+        self, frame: Frame, telemetry: Sequence[TelemetrySample] = (), prepared: LazyView | None = None
+    ) -> SlamOutput:
         """Pose of one frame; frames must come in the order of their stamps.
 
         Args:
@@ -147,28 +161,68 @@ class EdgeSlam:
         if self._pending is not None and self._pending.done():
             self._absorb_pending()
         with self._timed("features"):
-            view = prepared if prepared is not None else self.prepare(frame)
+            seen = prepared if prepared is not None else self.prepare(frame)
         with self._timed("fusion"):
             self._fusion.add_telemetry(telemetry)
             self._has_telemetry = self._has_telemetry or len(telemetry) > 0
         if not self.map.keyframes:
             self._face(telemetry)
-            output = self._start(frame, view, "first frame, depth guessed")
+            output = self._start(frame, seen.view, "first frame, depth guessed")
         elif self._bootstrap is not None:
-            output = self._step_bootstrap(frame, view, self._bootstrap)
+            output = self._step_bootstrap(frame, seen, self._bootstrap)
         else:
-            output = self._step_mapped(frame, view)
+            output = self._step_mapped(frame, seen)
         self._stamp_s = frame.stamp_s
         return output
 
-    def _step_mapped(self, frame: Frame, view: View) -> SlamOutput:
+    def _step_mapped(self, frame: Frame, seen: LazyView) -> SlamOutput:
         T_predicted = self._predict(frame.stamp_s)
+        self._frames_since_keyframe += 1
         with self.map.lock:
             with self._timed("tracking"):
+                located = self._follow(seen, T_predicted)
+            if located is None or (located.due and self._pending is None):
+                located = self._match(seen, T_predicted, located)
+            if located is not None:
+                return self._tracked(frame, seen, located)
+        return self._lost(frame, seen.view, T_predicted)
+
+    def _follow(self, seen: LazyView, T_predicted: FloatArray) -> "_Located | None":
+        """By optical flow from the last keyframe."""
+        if self._template is None or self._lost_frames > 0 or not self.config.flow.enabled:
+            return None
+        followed = self._flow.follow(self._template, seen.grey, T_predicted)
+        if followed is None:
+            return None
+        reference = self.map.keyframes.get(self._template.keyframe_id, self.map.latest())
+        parallax_rad = self._parallax(followed.track, reference)
+        due = self._is_due(lost_sight(followed, self.config.mapping), parallax_rad)
+        return _Located(followed.track, reference, parallax_rad, due)
+
+    def _match(self, seen: LazyView, T_predicted: FloatArray, followed: "_Located | None") -> "_Located | None":
+        """By the frame's own keypoints: where flow finds nothing, and what a keyframe needs."""
+        with self._timed("features"):
+            view = seen.view
+        with self._timed("tracking"):
+            if followed is not None:
+                track = self._tracker.track(view, followed.track.T_c_w, followed.track.anchor)
+                relocalised = False
+            else:
                 track, relocalised = self._find(view, T_predicted)
-            if track is not None:
-                return self._tracked(frame, view, track, relocalised)
-        return self._lost(frame, view, T_predicted)
+        if track is None:  # in a blurred image flow finds what matching does not
+            return None if followed is None else replace(followed, due=False)
+        reference = self._tracker.local_keyframes(track.anchor)[0]
+        parallax_rad = self._parallax(track, reference)
+        few = few_matches(track, reference, self.map, self.config.mapping)
+        due = followed is not None or self._is_due(few, parallax_rad)
+        self._template = template_of_track(track, view, reference, seen.grey, self.camera)
+        return _Located(track, reference, parallax_rad, due, view, relocalised)
+
+    def _parallax(self, track: Track, reference: Keyframe) -> float:
+        return median_parallax(self.map.anchors.p_w[track.anchor], track.T_c_w, reference.centre_w)
+
+    def _is_due(self, changed: bool, parallax_rad: float) -> bool:
+        return is_due(changed, parallax_rad, self._frames_since_keyframe, self.config.mapping)
 
     def _find(self, view: View, T_predicted: FloatArray) -> tuple[Track | None, bool]:
         """Track near the prediction, else search the keyframes; and whether the search found it."""
@@ -194,27 +248,22 @@ class EdgeSlam:
         self._velocity = se3.log(T_c_w @ se3.inverse(self._T_c_w)) / max(stamp_s - self._stamp_s, 1e-6)
         self._T_c_w = T_c_w
 
-    def _tracked(self, frame: Frame, view: View, track: Track, relocalised: bool) -> SlamOutput:
+    def _tracked(self, frame: Frame, seen: LazyView, located: "_Located") -> SlamOutput:
+        track, reference = located.track, located.reference
         self._move(frame.stamp_s, track.T_c_w)
-        if relocalised and self._lost_frames > 0:
+        if located.relocalised and self._lost_frames > 0:
             self.events["relocalised"] += 1
             self._velocity = np.zeros(6)
         self._lost_frames = 0
         self._recent = track.anchor
-        reference = self._tracker.local_keyframes(track.anchor)[0]
-        points = self.map.anchors.p_w[track.anchor]
-        parallax_rad = median_parallax(points, track.T_c_w, reference.centre_w)
         with self._timed("fusion"):
             self._see(frame.stamp_s, track)
-        self._frames_since_keyframe += 1
-        keyframe = None
-        if self._wants_keyframe(track, reference, parallax_rad):
-            keyframe = self._insert_keyframe(frame, view, track)
+        keyframe = self._insert_keyframe(frame, seen, located) if located.due else None
         if keyframe is not None and keyframe.id in self.map.keyframes:
             reference = keyframe
-        status = FrameStatus.RELOCALISED if relocalised else FrameStatus.TRACKED
-        reason = "found again among the keyframes" if relocalised else ""
-        return self._output(frame, reference, status, reason, track, parallax_rad, keyframe is not None)
+        status = FrameStatus.RELOCALISED if located.relocalised else FrameStatus.TRACKED
+        reason = "found again among the keyframes" if located.relocalised else ""
+        return self._output(frame, reference, status, reason, track, located.parallax_rad, keyframe is not None)
 
     def _see(self, stamp_s: float, track: Track) -> None:
         """Tell the fusion what the image said."""
@@ -255,6 +304,7 @@ class EdgeSlam:
     def _start(self, frame: Frame, view: View, reason: str) -> SlamOutput:
         """Begin a piece of map at the present pose with guessed depths."""
         self._wait()
+        self._template = None
         if self._bootstrap is not None:
             self._bootstrap.abandon()
             self._bootstrap = None
@@ -294,8 +344,9 @@ class EdgeSlam:
         known = np.where(np.isfinite(network_m), network_m, np.nanmedian(network_m))
         return known / self._published.scale
 
-    def _step_bootstrap(self, frame: Frame, view: View, bootstrap: Bootstrap) -> SlamOutput:
+    def _step_bootstrap(self, frame: Frame, seen: LazyView, bootstrap: Bootstrap) -> SlamOutput:
         """Track against the guessed map and try to replace it."""
+        view = seen.view
         with self._timed("tracking"):
             track = bootstrap.track(view, self._predict(frame.stamp_s))
         if track is None or track.inliers < 15:
@@ -308,7 +359,7 @@ class EdgeSlam:
                 two_view = bootstrap.confirm(view, two_view)
                 self.events["initialisations_refused"] += not two_view.ok
         if two_view.ok:
-            keyframe = self._initialise(frame, view, bootstrap, two_view)
+            keyframe = self._initialise(frame, seen, bootstrap, two_view)
             return self._output(
                 frame, keyframe, FrameStatus.INITIALISED, "two views", track, two_view.parallax_rad, True
             )
@@ -325,16 +376,17 @@ class EdgeSlam:
             False,
         )
 
-    def _initialise(self, frame: Frame, view: View, bootstrap: Bootstrap, two_view: TwoView) -> Keyframe:
+    def _initialise(self, frame: Frame, seen: LazyView, bootstrap: Bootstrap, two_view: TwoView) -> Keyframe:
         reference = bootstrap.reference
         with self._timed("mapping"):
-            started = bootstrap.replace_map(frame, view, two_view, self._lm)
+            started = bootstrap.replace_map(frame, seen.view, two_view, self._lm)
         self._bootstrap = None
         self.log.replace(started.T_c_w, [reference, *(k for _, k in started.new)])
         self._T_c_w = started.T_c_w[max(started.T_c_w)] if started.T_c_w else reference.T_c_w
         keyframe = started.new[-1][1]
         self._move(frame.stamp_s, keyframe.T_c_w)
         self._recent = keyframe.anchor[keyframe.anchor >= 0]
+        self._template = template_of_keyframe(keyframe, seen.grey, self.camera)
         self.edges.announce(reference)
         self._compare_depth(reference)
         self._map(started.new)
@@ -342,28 +394,16 @@ class EdgeSlam:
 
     # -- keyframes ---------------------------------------------------------------------------------------------
 
-    def _wants_keyframe(self, track: Track, reference: Keyframe, parallax_rad: float) -> bool:
-        mapping = self.config.mapping
-        if self._frames_since_keyframe < mapping.keyframe_min_gap:
-            return False
-        # Anchors that two keyframes alone have seen come and go; overlap is judged by the others.
-        held = reference.anchor[reference.anchor >= 0]
-        established = int((self.map.anchors.observations[held] >= min(3, len(self.map.keyframes))).sum())
-        few = track.inliers < mapping.keyframe_overlap * established
-        moved = parallax_rad > np.deg2rad(mapping.keyframe_parallax_deg)
-        overdue = self._frames_since_keyframe >= mapping.keyframe_max_gap and parallax_rad > np.deg2rad(
-            0.25 * mapping.keyframe_parallax_deg
-        )
-        return few or moved or overdue
-
-    def _insert_keyframe(self, frame: Frame, view: View, track: Track) -> Keyframe | None:
+    def _insert_keyframe(self, frame: Frame, seen: LazyView, located: "_Located") -> Keyframe | None:
         """Map a new keyframe now, or on the worker; None when the worker is still busy with the last one."""
-        if self._pending is not None:
+        if self._pending is not None or located.view is None:
             self.events["keyframes_skipped"] += 1
             return None
-        keyframe = make_keyframe(self.map.next_keyframe_id(), frame.index, frame.stamp_s, track.T_c_w, view.features)
+        track, features = located.track, located.view.features
+        keyframe = make_keyframe(self.map.next_keyframe_id(), frame.index, frame.stamp_s, track.T_c_w, features)
         keyframe.anchor[track.keypoint] = track.anchor
         self.map.add_keyframe(keyframe)
+        self._template = template_of_keyframe(keyframe, seen.grey, self.camera)
         self._map([(frame, keyframe)])
         return keyframe
 
@@ -503,6 +543,21 @@ class EdgeSlam:
 
     def _timed(self, stage: str) -> AbstractContextManager[None]:
         return _timed(self._stage_ms, stage)
+
+
+@dataclass(frozen=True, slots=True)
+class _Located:
+    """A frame with its place in the map."""
+
+    track: Track
+    reference: Keyframe
+    parallax_rad: float
+    """Median ray angle to the reference."""
+    due: bool
+    """It should become a keyframe."""
+    view: View | None = None
+    """Its features, if it was matched; without them it cannot become one."""
+    relocalised: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,5 +1,7 @@
 """ORB keypoints spread evenly over the image (Rublee et al., ICCV 2011)."""
 
+import threading
+
 import cv2
 import numpy as np
 
@@ -20,11 +22,13 @@ class OrbExtractor:
             nlevels=config.levels,
             fastThreshold=config.fast_threshold,
         )
+        self._one_at_a_time = threading.Lock()  # OpenCV does not say that two threads may share a detector
 
     def __call__(self, grey: np.ndarray) -> FrameFeatures:
         """Features of a grey image ``(H, W)`` uint8 with the lens distortion still in it."""
         # All candidates are described, in one call: a second one would build the image pyramid again.
-        found, descriptors = self._orb.detectAndCompute(grey, None)
+        with self._one_at_a_time:
+            found, descriptors = self._orb.detectAndCompute(grey, None)
         if not found or descriptors is None:
             return FrameFeatures(
                 np.zeros((0, 2), np.float32),

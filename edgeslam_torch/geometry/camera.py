@@ -73,6 +73,15 @@ class Camera:
             cv2.undistortPoints(points, self.K, np.array(self.distortion), P=self.K).reshape(-1, 2).astype(np.float32)
         )
 
+    def distort_points(self, uv: FloatArray) -> FloatArray:
+        """Pixels ``(N, 2)`` of the camera without distortion as the lens puts them; undoes `undistort_points`."""
+        if not self.is_distorted or len(uv) == 0:
+            return np.asarray(uv, dtype=np.float32)
+        rays = self.back_project(uv, np.ones(len(uv)))
+        still = np.zeros(3)
+        pixels, _ = cv2.projectPoints(rays, still, still, self.K, np.array(self.distortion))
+        return np.asarray(pixels, dtype=np.float32).reshape(-1, 2)
+
     def undistort_image(self, image: np.ndarray) -> np.ndarray:
         """Image resampled to the undistorted pinhole camera of the same ``K``."""
         if not self.is_distorted:

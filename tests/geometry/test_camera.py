@@ -44,6 +44,14 @@ def test_camera_without_distortion_changes_nothing(rng):
     np.testing.assert_array_equal(CAMERA.undistort_points(uv), uv)
     assert CAMERA.undistort_image(image) is image
     assert CAMERA.undistort_points(np.zeros((0, 2))).shape == (0, 2)
+    np.testing.assert_array_equal(CAMERA.distort_points(uv), uv)
+    assert CAMERA.distort_points(np.zeros((0, 2))).shape == (0, 2)
+
+
+def test_distorting_undoes_undistorting(rng):
+    camera = PRESETS["tum_fr1"]
+    raw = rng.uniform((0, 0), (640, 480), (200, 2))
+    np.testing.assert_allclose(camera.distort_points(camera.undistort_points(raw)), raw, atol=0.05)
 
 
 def test_resized_camera_sees_the_corners_of_the_image_at_its_corners():

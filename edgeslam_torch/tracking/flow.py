@@ -1,0 +1,162 @@
+"""Between keyframes: keypoints of the last keyframe followed into the frame by optical flow, and the pose they tell.
+
+A frame between keyframes adds nothing to the map but its pose, and for that the corners need not be detected, described
+and matched anew: pyramidal Lucas-Kanade flow (Lucas and Kanade, IJCAI 1981; Bouguet, 2001) finds the known ones in a
+quarter of the time. It goes from the keyframe to the frame, never from frame to frame, so that nothing drifts.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from edgeslam_torch.config import FlowConfig, OrbConfig
+from edgeslam_torch.frontend.orb import spread
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.mapping.keyframe import NO_ANCHOR, Keyframe
+from edgeslam_torch.mapping.slam_map import SlamMap
+from edgeslam_torch.optim.pose_only import refine_pose
+from edgeslam_torch.tracking.tracker import FINE, Track, View
+from edgeslam_torch.types import FloatArray, FrameFeatures, IntArray
+
+MAX_DIFFERENCE = 30.0
+"""Mean grey difference of the two patches above which they are not the same."""
+
+MIN_DEPTH = 1e-3
+"""Map units; nearer anchors are not looked for."""
+
+_STOP = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 15, 0.03)
+"""Steps and pixels at which the flow of a point is done."""
+
+
+@dataclass(frozen=True, slots=True)
+class Template:
+    """An image with anchors in it, to be found again in the frames that follow."""
+
+    keyframe_id: int
+    """Keyframe that the frames' poses hang on."""
+    grey: NDArray[np.uint8]
+    """``(H, W)`` with the lens distortion still in it."""
+    uv: FloatArray
+    """``(N, 2)`` pixels of the keypoints in ``grey``, float32."""
+    octave: IntArray
+    """``(N,)``"""
+    anchor: IntArray
+    """``(N,)`` or `NO_ANCHOR`; a keyframe's own array, so that what mapping finds in it is followed too."""
+
+
+@dataclass(frozen=True, slots=True)
+class Followed:
+    """What flow says of a frame."""
+
+    track: Track
+    """Its keypoints are the template's."""
+    share: float
+    """Keypoints that were found again and agree, of those that were looked for."""
+
+
+def template_of_keyframe(keyframe: Keyframe, grey: NDArray[np.uint8], camera: Camera) -> Template:
+    """Follow all anchors of a keyframe; ``grey`` is its image as the camera gave it."""
+    return _template(keyframe.id, keyframe.features, keyframe.anchor, grey, camera)
+
+
+def template_of_track(
+    track: Track, view: View, reference: Keyframe, grey: NDArray[np.uint8], camera: Camera
+) -> Template:
+    """Follow the anchors that were matched in a frame that is no keyframe."""
+    anchor = np.full(len(view.features.uv), NO_ANCHOR, dtype=np.int64)
+    anchor[track.keypoint] = track.anchor
+    return _template(reference.id, view.features, anchor, grey, camera)
+
+
+def _template(
+    keyframe_id: int, features: FrameFeatures, anchor: IntArray, grey: NDArray[np.uint8], camera: Camera
+) -> Template:
+    return Template(keyframe_id, grey, camera.distort_points(features.uv), features.octave, anchor)
+
+
+class FlowTracker:
+    """Follows a template's anchors into a frame and refines its pose; keeps nothing between frames."""
+
+    def __init__(self, slam_map: SlamMap, camera: Camera, orb: OrbConfig, config: FlowConfig, min_inliers: int) -> None:
+        self.map = slam_map
+        self.camera = camera
+        self.orb = orb
+        self.config = config
+        self.min_inliers = min_inliers
+
+    def follow(self, template: Template, grey: NDArray[np.uint8], T_c_w: FloatArray) -> Followed | None:
+        """Pose near a predicted one, or None when too little of the template is found again.
+
+        Args:
+            template: What to look for.
+            grey: Frame ``(H, W)`` with the lens distortion still in it.
+            T_c_w: Predicted pose ``(4, 4)``.
+        """
+        anchors = self.map.anchors
+        wanted = self._wanted(template)
+        guess = self._expected(T_c_w, template.anchor[wanted])
+        in_view = np.isfinite(guess).all(axis=1)
+        visible = wanted[in_view]
+        if len(visible) < self.min_inliers:
+            return None
+        uv, found = self._flow(template, grey, visible, guess[in_view])
+        keypoint = visible[found]
+        track = self._solve(template, keypoint, uv[found], T_c_w)
+        if track.inliers < max(self.min_inliers, self.config.min_share * len(wanted)):
+            return None
+        anchors.visible[template.anchor[visible]] += 1
+        anchors.found[track.anchor] += 1
+        return Followed(track, track.inliers / len(wanted))
+
+    def _wanted(self, template: Template) -> IntArray:
+        """Keypoints to follow: of too many an even spread, those first that most keyframes have seen."""
+        anchors = self.map.anchors
+        held = np.flatnonzero(template.anchor >= 0)
+        held = held[anchors.alive[template.anchor[held]]]
+        seen_by = anchors.observations[template.anchor[held]].astype(np.float64)
+        return held[spread(template.uv[held], seen_by, self.camera.width, self.camera.height, self.config.points)]
+
+    def _expected(self, T_c_w: FloatArray, anchor: IntArray) -> FloatArray:
+        """Predicted pixels ``(M, 2)`` in the distorted image, NaN outside of it."""
+        p_c = se3.transform(T_c_w, self.map.anchors.p_w[anchor])
+        front = p_c[:, 2] > MIN_DEPTH
+        uv = self.camera.distort_points(self.camera.project(np.where(front[:, None], p_c, 1.0)))
+        size = (self.camera.width, self.camera.height)
+        inside = front & (uv > 0).all(axis=1) & (uv < size).all(axis=1)
+        return np.where(inside[:, None], uv, np.nan)
+
+    def _flow(
+        self, template: Template, grey: NDArray[np.uint8], keypoint: IntArray, guess: FloatArray
+    ) -> tuple[FloatArray, NDArray[np.bool_]]:
+        """Distorted pixels ``(M, 2)`` of the template's keypoints in the frame, and which of them were found."""
+        window = (self.config.window_px, self.config.window_px)
+        uv, status, difference = cv2.calcOpticalFlowPyrLK(
+            template.grey,
+            grey,
+            np.ascontiguousarray(template.uv[keypoint]).reshape(-1, 1, 2),
+            np.ascontiguousarray(guess, dtype=np.float32).reshape(-1, 1, 2),
+            winSize=window,
+            maxLevel=self.config.levels - 1,
+            criteria=_STOP,
+            flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+        )
+        found = (status.ravel() > 0) & (difference.ravel() < MAX_DIFFERENCE)
+        return np.asarray(uv, dtype=np.float32).reshape(-1, 2), found
+
+    def _solve(self, template: Template, keypoint: IntArray, raw_uv: FloatArray, T_c_w: FloatArray) -> Track:
+        # What a keyframe's keypoint is off by, its flow is off by too: it weighs no more than a matched one.
+        inv_sigma = self.orb.scale_factor ** -template.octave[keypoint].astype(np.float64)
+        anchor = template.anchor[keypoint]
+        result = refine_pose(
+            T_c_w,
+            self.map.anchors.p_w[anchor],
+            self.camera.undistort_points(raw_uv).astype(np.float64),
+            inv_sigma,
+            (self.camera.fx, self.camera.fy, self.camera.cx, self.camera.cy),
+            config=FINE,
+        )
+        inliers = result.inliers
+        return Track(result.T_c_w, keypoint[inliers], anchor[inliers], keypoint, anchor, result.covariance)

@@ -1,0 +1,196 @@
+"""Following the last keyframe's keypoints by optical flow."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from rendered import CAMERA, sideways, stairs_world
+
+from edgeslam_torch.config import FlowConfig, MappingConfig, OrbConfig
+from edgeslam_torch.frontend.image import as_grey
+from edgeslam_torch.frontend.orb import OrbExtractor
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.mapping.keyframe import NO_ANCHOR, make_keyframe
+from edgeslam_torch.mapping.slam_map import SlamMap
+from edgeslam_torch.synthetic.render import render
+from edgeslam_torch.tracking.flow import FlowTracker, template_of_keyframe, template_of_track
+from edgeslam_torch.tracking.keyframe_choice import few_matches, is_due, lost_sight
+from edgeslam_torch.tracking.tracker import Track, make_view
+
+ORB = OrbConfig(features=500, candidates=800)
+MIN_INLIERS = 25
+POSES = sideways(4, 0.05, turn_rad=0.01)
+
+
+class Scene:
+    """One keyframe before the panels whose anchors lie exactly where the renderer put them."""
+
+    def __init__(self, camera=CAMERA):
+        self.camera = camera
+        seen = render(stairs_world(), CAMERA, POSES[0])
+        self.grey = as_grey(seen.image)
+        features = OrbExtractor(ORB, CAMERA)(self.grey)
+        self.map = SlamMap(ORB.scale_factor, ORB.levels)
+        self.keyframe = make_keyframe(0, 0, 0.0, se3.inverse(POSES[0]), features)
+        column, row = np.rint(features.uv).astype(int).T
+        p_c = CAMERA.back_project(features.uv, seen.depth_m[row, column])
+        colour = np.zeros((len(p_c), 3), np.uint8)
+        ids = self.map.anchors.add(se3.transform(POSES[0], p_c), self.keyframe.words, 0, False, colour)
+        self.map.add_keyframe(self.keyframe)
+        self.map.observe(self.keyframe, np.arange(len(ids)), ids)
+        self.template = template_of_keyframe(self.keyframe, self.grey, CAMERA)
+
+    def tracker(self, **settings):
+        return FlowTracker(self.map, self.camera, ORB, FlowConfig(**settings), MIN_INLIERS)
+
+
+@pytest.fixture
+def scene():
+    return Scene()
+
+
+def grey_at(T_w_c):
+    return as_grey(render(stairs_world(), CAMERA, T_w_c).image)
+
+
+def error(T_c_w, T_w_c):
+    xi = se3.log(T_c_w @ T_w_c)
+    return np.linalg.norm(xi[:3]), np.linalg.norm(xi[3:])
+
+
+@pytest.mark.parametrize("frame", [0, 1, 3])
+def test_pose_to_half_a_pixel_from_a_prediction_that_is_ten_pixels_off(scene, frame):
+    """Panels 1.6 to 4 m away; at frame 3 they have moved by 10 to 30 pixels."""
+    off = se3.exp(np.array([0.02, -0.02, 0.02, 0.008, -0.008, 0.008]))
+    followed = scene.tracker().follow(scene.template, grey_at(POSES[frame]), off @ se3.inverse(POSES[frame]))
+    translation, rotation = error(followed.track.T_c_w, POSES[frame])
+    assert translation < 0.01  # half a pixel at their distance
+    assert rotation < 0.004
+    assert followed.share > 0.6
+    assert (np.sqrt(np.diag(followed.track.covariance)) < 0.02).all()
+
+
+def test_flow_is_truer_than_half_a_pixel(scene):
+    """Rendered truth of every point against where flow puts it; corners at panel borders hide things, hence 80 %."""
+    tracker = scene.tracker()
+    keypoint = scene.keyframe.keypoints_with_anchor()
+    expected = CAMERA.project(se3.transform(se3.inverse(POSES[1]), scene.map.anchors.p_w[scene.keyframe.anchor]))
+    uv, found = tracker._flow(scene.template, grey_at(POSES[1]), keypoint, expected + 3.0)
+    off = np.linalg.norm(uv - expected, axis=1)[found]
+    assert np.quantile(off, 0.8) < 0.5
+    assert found.mean() > 0.8
+
+
+def test_no_more_keypoints_are_followed_than_asked_for_and_the_rest_are_spread(scene):
+    tracker = scene.tracker(points=60)
+    track = tracker.follow(scene.template, scene.grey, scene.keyframe.T_c_w).track
+    assert track.matches <= 60
+    uv = scene.keyframe.features.uv[track.matched_keypoint]
+    assert len({(int(u // 80), int(v // 80)) for u, v in uv}) == 12  # every cell of a 4 x 3 grid
+
+
+def test_anchors_that_went_out_of_the_map_are_not_followed(scene):
+    gone = scene.keyframe.anchor[::2].copy()
+    scene.map.remove_anchors(gone)
+    track = scene.tracker(points=1000).follow(scene.template, scene.grey, scene.keyframe.T_c_w).track
+    assert not np.isin(track.matched_anchor, gone).any()
+
+
+def test_keypoints_out_of_view_count_against_the_share(scene):
+    """Turned until a part has left the image: what is left tells the pose, and the share that it is less."""
+    turned = POSES[0] @ se3.exp(np.array([0, 0, 0, 0, 0.3, 0]))
+    here = scene.tracker().follow(scene.template, scene.grey, scene.keyframe.T_c_w)
+    followed = scene.tracker(min_share=0.2).follow(scene.template, grey_at(turned), se3.inverse(turned))
+    assert followed.share < here.share - 0.2
+    assert error(followed.track.T_c_w, turned)[0] < 0.01
+    assert lost_sight(followed, MappingConfig())
+    assert not lost_sight(replace(followed, share=1.0), MappingConfig())
+
+
+@pytest.mark.parametrize("what", ["black", "noise", "elsewhere", "behind"])
+def test_an_image_that_does_not_show_the_template_has_no_pose(scene, rng, what):
+    T_c_w = scene.keyframe.T_c_w
+    image = {
+        "black": np.zeros_like(scene.grey),
+        "noise": rng.integers(0, 256, scene.grey.shape, dtype=np.uint8),
+        "elsewhere": np.ascontiguousarray(scene.grey[::-1, ::-1]),
+        "behind": scene.grey,
+    }[what]
+    if what == "behind":
+        T_c_w = se3.exp(np.array([0, 0, 0, 0, np.pi, 0])) @ T_c_w
+    before = scene.map.anchors.visible.copy()
+    assert scene.tracker().follow(scene.template, image, T_c_w) is None
+    np.testing.assert_array_equal(scene.map.anchors.visible, before)  # a blind frame says nothing about an anchor
+
+
+def test_anchors_that_are_seen_and_found_are_counted(scene):
+    anchors = scene.map.anchors
+    visible, found = anchors.visible.copy(), anchors.found.copy()
+    track = scene.tracker().follow(scene.template, grey_at(POSES[1]), se3.inverse(POSES[1])).track
+    assert (anchors.found - found)[track.anchor].tolist() == [1] * track.inliers
+    assert ((anchors.visible - visible) >= (anchors.found - found)).all()
+    assert (anchors.found - found).sum() == track.inliers
+
+
+def test_a_lens_changes_nothing_but_the_pixels(scene):
+    """The same view through a lens with the distortion of a cheap camera."""
+    lens = replace(CAMERA, distortion=(0.12, -0.2, 0.001, -0.001, 0.0))
+
+    def through(grey):
+        """Every pixel of the distorted image shows what the pinhole camera sees along its ray."""
+        v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
+        at = lens.undistort_points(np.stack([u.ravel(), v.ravel()], axis=1).astype(np.float32))
+        x, y = at.T.reshape(2, CAMERA.height, CAMERA.width)
+        return cv2.remap(grey, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+    tracker = FlowTracker(scene.map, lens, ORB, FlowConfig(), MIN_INLIERS)
+    template = template_of_keyframe(scene.keyframe, through(scene.grey), lens)
+    followed = tracker.follow(template, through(grey_at(POSES[1])), se3.inverse(POSES[1]))
+    translation, rotation = error(followed.track.T_c_w, POSES[1])
+    assert translation < 0.01  # half a pixel at their distance
+    assert rotation < 0.004
+
+
+def test_a_matched_frame_can_be_followed_without_being_a_keyframe(scene):
+    """Only what matched in it is looked for, at its own pixels."""
+    view = make_view(scene.keyframe.features, ORB.scale_factor)
+    keypoint = np.arange(0, len(view.features.uv), 2)
+    anchor = scene.keyframe.anchor[keypoint]
+    track = Track(scene.keyframe.T_c_w, keypoint, anchor, keypoint, anchor, np.eye(6))
+    template = template_of_track(track, view, scene.keyframe, scene.grey, CAMERA)
+    assert (np.flatnonzero(template.anchor != NO_ANCHOR) == keypoint).all()
+    assert template.keyframe_id == scene.keyframe.id
+    followed = scene.tracker().follow(template, grey_at(POSES[1]), se3.inverse(POSES[1]))
+    assert error(followed.track.T_c_w, POSES[1])[0] < 0.01
+
+
+# -- when a keyframe is due -----------------------------------------------------------------------------------------
+
+
+def test_keyframe_by_view_change_parallax_or_time_but_not_at_once():
+    config = MappingConfig(keyframe_min_gap=5, keyframe_max_gap=30, keyframe_parallax_deg=4.0)
+    little, some, much = np.deg2rad([0.5, 2.0, 5.0])
+    assert not is_due(True, much, 4, config)
+    assert is_due(True, little, 5, config)
+    assert is_due(False, much, 5, config)
+    assert not is_due(False, some, 29, config)
+    assert is_due(False, some, 30, config)
+    assert not is_due(False, little, 1000, config)  # a drone that hovers makes no keyframes
+
+
+def test_few_matches_are_judged_by_anchors_that_have_proved_themselves(scene):
+    """Of 500 anchors that one keyframe has seen, none counts once there are three keyframes."""
+    ids = scene.keyframe.anchor
+    track = Track(scene.keyframe.T_c_w, np.arange(30), ids[:30], np.arange(30), ids[:30], np.eye(6))
+    assert few_matches(track, scene.keyframe, scene.map, MappingConfig())
+    for id in (1, 2):
+        other = make_keyframe(id, id, float(id), se3.inverse(POSES[id]), scene.keyframe.features)
+        scene.map.add_keyframe(other)
+    assert not few_matches(track, scene.keyframe, scene.map, MappingConfig())
+
+
+@pytest.mark.parametrize("settings", [{"points": 0}, {"window_px": 3}, {"levels": 0}, {"min_share": 0.0}])
+def test_settings_out_of_range_are_refused(settings):
+    with pytest.raises(ValueError, match=next(iter(settings))):
+        FlowConfig(**settings)
