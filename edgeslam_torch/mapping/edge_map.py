@@ -1,10 +1,10 @@
 """The semi-dense edge map: edge points stay with the keyframe that measured them and move with its pose."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from edgeslam_torch.config import EdgeConfig
 from edgeslam_torch.frontend.edges import extract_edges
@@ -148,8 +148,8 @@ class EdgeMap:
         T = self.map.pose_of(other.keyframe_id) @ se3.inverse(self.map.pose_of(points.keyframe_id))
         p_o = se3.transform(T, points.p_c)
         front = np.flatnonzero(p_o[:, 2] > 0)
-        distance, nearest = cKDTree(other.uv).query(self.camera.project(p_o[front]), distance_upper_bound=AGREE_PX)
-        found = np.isfinite(distance)
+        nearest = nearest_edge(other.uv, self.camera.project(p_o[front]), (self.camera.width, self.camera.height))
+        found = nearest >= 0
         mine, theirs = front[found], nearest[found]
         z_theirs = other.p_c[theirs, 2]
         same = np.abs(p_o[mine, 2] - z_theirs) < AGREE_DEPTH * z_theirs
@@ -169,6 +169,34 @@ class EdgeMap:
         depth = np.median(np.concatenate([h.p_c[:, 2] for _, h in clouds]))
         agreed = count >= self.config.min_observations
         return fuse(p_w[agreed], sigma[agreed], colour[agreed], count[agreed], self.config.voxel * float(depth))
+
+
+def nearest_edge(edges: FloatArray, uv: FloatArray, size: tuple[int, int]) -> IntArray:
+    """Index of the edge pixel ``(E, 2)`` nearest to each of ``(N, 2)``, -1 where none is within `AGREE_PX`.
+
+    Painted into an image of ``size`` (width, height), the nearest last: a third of what a tree takes to be built and
+    asked. Queries are rounded to pixels to be looked up, so that of two edges nearly as near either may be named.
+    """
+    reach = math.ceil(AGREE_PX + 0.5)
+    width, height = (n + 2 * reach for n in size)
+    index = np.full(width * height, -1, dtype=np.int32)
+    u, v = np.rint(edges).astype(np.int64).T + reach
+    flat, order = v * width + u, np.arange(len(edges), dtype=np.int32)
+    for offset in _disc(reach, width):
+        index[flat + offset] = order
+    near = np.clip(np.rint(uv), -1, size).astype(np.int64) + reach
+    found: IntArray = index[near[:, 1] * width + near[:, 0]].astype(np.int64)
+    apart = edges[found] - uv
+    found[(apart * apart).sum(axis=1) > AGREE_PX**2] = -1
+    return found
+
+
+def _disc(radius: int, width: int) -> list[int]:
+    """Offsets of the pixels of a disc in a flat image, the farthest from its middle first."""
+    v, u = np.mgrid[-radius : radius + 1, -radius : radius + 1]
+    distance = (u * u + v * v).ravel()
+    order = np.argsort(-distance, kind="stable")
+    return [int(o) for o in (v * width + u).ravel()[order[distance[order] <= radius * radius]]]
 
 
 def fuse(p_w: FloatArray, sigma: FloatArray, colour: NDArray[np.uint8], count: IntArray, voxel: float) -> PointCloud:

@@ -6,7 +6,7 @@ from point_map import CAMERA, PointMap, small_motion
 
 from edgeslam_torch.config import EdgeConfig
 from edgeslam_torch.geometry import se3
-from edgeslam_torch.mapping.edge_map import EdgeMap, EdgePoints, fuse
+from edgeslam_torch.mapping.edge_map import AGREE_PX, EdgeMap, EdgePoints, fuse, nearest_edge
 
 
 def test_two_points_of_one_cell_worked_by_hand():
@@ -131,3 +131,17 @@ def test_bound_that_is_not_reached_changes_nothing(points):
     some.hosts.append(host(points, 0, points.world.p_w[:300]))
     some._bound()
     assert len(some.hosts[0].uv) == 300
+
+
+def test_the_nearest_edge_pixel_is_found_within_two_pixels(rng):
+    size = (160, 120)
+    edges = np.unique(rng.integers(0, size, (400, 2)), axis=0).astype(np.float32)
+    uv = np.concatenate([rng.uniform(-5, 165, (2000, 2)), [[-1e7, 4.0], [159.4, 1e9]]])
+    found = nearest_edge(edges, uv, size)
+    apart = np.linalg.norm(edges[None] - uv[:, None], axis=2)
+    nearest = apart.min(axis=1)
+    named = apart[np.arange(len(uv)), found]
+    assert (found[nearest > AGREE_PX] == -1).all()
+    assert np.mean(found[nearest <= AGREE_PX] >= 0) > 0.95
+    assert (named - nearest)[found >= 0].max() < np.sqrt(2.0)  # twice what rounding moves a query
+    assert np.mean(named[found >= 0] == nearest[found >= 0]) > 0.8
