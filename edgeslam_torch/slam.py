@@ -584,10 +584,11 @@ def _name(frame: Frame) -> str:
 
 
 def _grey(frame: Frame, camera: Camera) -> np.ndarray:
-    height, width = frame.image.shape[:2]
+    grey = as_grey(frame.image) if frame.grey is None else frame.grey
+    height, width = grey.shape
     if (width, height) != (camera.width, camera.height):
         raise SourceError(f"{_name(frame)}: image is {width}x{height}, the calibration {camera.width}x{camera.height}")
-    return as_grey(frame.image)
+    return grey
 
 
 def _depth_from_config(config: SlamConfig) -> DepthFunction | None:

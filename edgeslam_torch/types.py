@@ -28,6 +28,8 @@ class Frame:
     """``(H, W, 3)`` BGR or ``(H, W)`` grey, as OpenCV reads it, with the lens distortion still in it."""
     path: Path | None = None
     """File it came from, for messages."""
+    grey: NDArray[np.uint8] | None = None
+    """``(H, W)``, where the reader has it without the detour through ``image``; None to make it of that."""
 
 
 @dataclass(frozen=True, slots=True)

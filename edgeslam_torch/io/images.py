@@ -13,8 +13,34 @@ from edgeslam_torch.io.listing import ImageEntry, Problem, in_order, seconds_fro
 from edgeslam_torch.types import Frame
 
 SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp"})
+_JPEG = b"\xff\xd8"
 ASSUMED_HZ = 30.0
 """Rate of images whose names tell no time; what webcams, Kinects and the Tello give."""
+
+
+class JpegFrame(Frame):
+    """A JPEG's frame: its grey values are read at once, at half the cost of colours, and those when somebody asks.
+
+    Nobody does for the seven of eight frames that become no keyframe. Every time somebody asks they are read again.
+    """
+
+    __slots__ = ("_data",)
+    _data: bytes
+
+    def __init__(self, index: int, stamp_s: float, data: bytes, path: Path) -> None:
+        """Decode a file's bytes in grey.
+
+        Raises:
+            SourceError: If they are no image.
+        """
+        grey = _decoded(data, path, cv2.IMREAD_GRAYSCALE)
+        for name, value in (("index", index), ("stamp_s", stamp_s), ("path", path), ("grey", grey), ("_data", data)):
+            object.__setattr__(self, name, value)
+
+    @property
+    def image(self) -> NDArray[np.uint8]:
+        """``(H, W, 3)`` BGR, or ``(H, W)`` of a grey JPEG."""
+        return _decoded(self._data, self.path, cv2.IMREAD_ANYCOLOR)
 
 
 def read_image(path: Path) -> NDArray[np.uint8]:
@@ -23,6 +49,22 @@ def read_image(path: Path) -> NDArray[np.uint8]:
     Raises:
         SourceError: If the file is missing, empty, truncated or no image.
     """
+    return _decoded(_bytes(path), path, cv2.IMREAD_ANYCOLOR)
+
+
+def read_frame(entry: ImageEntry) -> Frame:
+    """The frame of one image file.
+
+    Raises:
+        SourceError: If the file is missing, empty, truncated or no image.
+    """
+    data = _bytes(entry.path)
+    if data.startswith(_JPEG):
+        return JpegFrame(entry.index, entry.stamp_s, data, entry.path)
+    return Frame(entry.index, entry.stamp_s, _decoded(data, entry.path, cv2.IMREAD_ANYCOLOR), entry.path)
+
+
+def _bytes(path: Path) -> bytes:
     try:
         data = path.read_bytes() if path.is_file() else None
     except OSError as error:
@@ -32,10 +74,14 @@ def read_image(path: Path) -> NDArray[np.uint8]:
     if not data:
         raise SourceError(f"{path}: empty file")
     # OpenCV 4 fills the missing part of a cut-off JPEG with grey and says nothing: look for the end marker.
-    if data[:2] == b"\xff\xd8" and data.rfind(b"\xff\xd9", max(0, len(data) - 65536)) < 0:
+    if data.startswith(_JPEG) and data.rfind(b"\xff\xd9", max(0, len(data) - 65536)) < 0:
         raise SourceError(f"{path}: truncated image")
+    return data
+
+
+def _decoded(data: bytes, path: Path | None, flags: int) -> NDArray[np.uint8]:
     try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_ANYCOLOR)
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error as error:
         raise SourceError(f"{path}: cannot be decoded as an image") from error
     if image is None:
@@ -75,15 +121,16 @@ def frames_of(entries: Sequence[ImageEntry], size: tuple[int, int], problems: li
     """
     for entry in entries:
         try:
-            image = read_image(entry.path)
+            frame = read_frame(entry)
         except SourceError as error:
             problems.append(Problem(str(entry.path), str(error).removeprefix(f"{entry.path}: ")))
             continue
-        if (image.shape[1], image.shape[0]) != size:
-            reason = f"image is {image.shape[1]}x{image.shape[0]}, the others are {size[0]}x{size[1]}"
+        height, width = (frame.image if frame.grey is None else frame.grey).shape[:2]
+        if (width, height) != size:
+            reason = f"image is {width}x{height}, the others are {size[0]}x{size[1]}"
             problems.append(Problem(str(entry.path), reason))
             continue
-        yield Frame(entry.index, entry.stamp_s, image, entry.path)
+        yield frame
 
 
 def first_size(entries: Sequence[ImageEntry], name: str) -> tuple[int, int]:
