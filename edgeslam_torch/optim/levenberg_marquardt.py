@@ -7,6 +7,8 @@ from typing import Generic, Protocol, TypeVar
 from edgeslam_torch.optim.problem import LmConfig, StopReason
 
 _MU_MIN = 1e-12
+_LIKELY_LAST = 2.0
+"""A promise of this many times the cost tolerance: a step that promises less is likely the last."""
 
 S = TypeVar("S")
 
@@ -23,23 +25,36 @@ class Step(Generic[S]):
     """Largest component of the step."""
 
 
-class LeastSquares(Protocol[S]):
-    """What the loop needs from a problem; implementations keep the state and the linear system."""
+class Linearised(Protocol):
+    """A state's cost and normal equations."""
 
-    def linearise(self) -> tuple[float, float]:
-        """Cost and largest ``|g_i| / sqrt(H_ii)`` at the current state; prepares `propose`."""
+    @property
+    def cost(self) -> float:
+        """Robust cost."""
         ...
 
-    def propose(self, mu: float) -> Step[S] | None:
+    @property
+    def gradient(self) -> float:
+        """Largest ``|g_i| / sqrt(H_ii)``."""
+        ...
+
+
+L = TypeVar("L", bound=Linearised)
+
+
+class LeastSquares(Protocol[S, L]):
+    """What the loop needs from a problem."""
+
+    def linearise(self, state: S) -> L:
+        """Cost and normal equations at a state."""
+        ...
+
+    def propose(self, system: L, mu: float) -> Step[S] | None:
         """Solve the damped system; None when it is not positive definite."""
         ...
 
     def cost(self, state: S) -> float:
-        """Robust cost of a candidate state."""
-        ...
-
-    def accept(self, state: S) -> None:
-        """Make the candidate the current state."""
+        """Robust cost of a state alone, for less than `linearise` takes."""
         ...
 
 
@@ -56,57 +71,64 @@ class LmSummary:
     """Damping at the end."""
 
 
-def minimise(problem: LeastSquares[S], config: LmConfig) -> LmSummary:
-    """Minimise a robust sum of squares.
+def minimise(problem: LeastSquares[S, L], start: S, config: LmConfig) -> tuple[S, LmSummary]:
+    """Minimise a robust sum of squares; returns the last state and how it went.
 
     The damping follows Nielsen (1999): it shrinks with the agreement between promised and real decrease, and
     grows by a doubling factor with every refusal. The state only ever changes to one of lower, finite cost.
+
+    Most steps are accepted, and then the next one needs the normal equations where this one ended: a step that
+    promises to go on is linearised at once, which yields its cost as well. One that looks like the last (no
+    iteration left, or a promise near the tolerance) is asked for its cost alone.
     """
-    cost, gradient = problem.linearise()
-    first, mu, nu, accepted, tried = cost, config.mu, 2.0, 0, 0
-    if not (math.isfinite(cost) and math.isfinite(gradient)):
-        return LmSummary(cost, cost, 0, 0, StopReason.NOT_FINITE, mu)
-    if gradient < config.gradient_tolerance:
-        return LmSummary(cost, cost, 0, 0, StopReason.GRADIENT_CONVERGED, mu)
-    stop = StopReason.MAX_ITERATIONS
+    state, system = start, problem.linearise(start)
+    cost, mu, nu, accepted, tried = system.cost, config.mu, 2.0, 0, 0
+    first = cost
+
+    def ended(stop: StopReason) -> tuple[S, LmSummary]:
+        return state, LmSummary(first, cost, tried, accepted, stop, mu)
+
+    if not (math.isfinite(cost) and math.isfinite(system.gradient)):
+        return ended(StopReason.NOT_FINITE)
+    if system.gradient < config.gradient_tolerance:
+        return ended(StopReason.GRADIENT_CONVERGED)
     solved = False
     while tried < config.max_iterations:
         tried += 1
-        step = problem.propose(mu)
-        candidate = math.inf if step is None else problem.cost(step.state)
+        step = problem.propose(system, mu)
+        trial: L | None = None
+        candidate = math.inf
         if step is not None:
             solved = True
             if step.size < config.step_tolerance:
-                stop = StopReason.STEP_CONVERGED
-                break
+                return ended(StopReason.STEP_CONVERGED)
+            if tried < config.max_iterations and step.predicted > _LIKELY_LAST * config.cost_tolerance * cost:
+                trial = problem.linearise(step.state)
+                candidate = trial.cost
+            else:
+                candidate = problem.cost(step.state)
             decrease = cost - candidate
             if math.isfinite(candidate) and decrease >= 0.0 and step.predicted > 0.0:
-                problem.accept(step.state)
-                accepted += 1
                 small = decrease <= config.cost_tolerance * cost
                 ratio = decrease / step.predicted
-                cost = candidate
+                state, cost = step.state, candidate
+                accepted += 1
                 mu = max(_MU_MIN, mu * max(1.0 / 3.0, 1.0 - (2.0 * ratio - 1.0) ** 3))
                 nu = 2.0
                 if small:
-                    stop = StopReason.COST_CONVERGED
-                    break
+                    return ended(StopReason.COST_CONVERGED)
                 if tried == config.max_iterations:
                     break
-                _, gradient = problem.linearise()
-                if not math.isfinite(gradient):
-                    stop = StopReason.NOT_FINITE
-                    break
-                if gradient < config.gradient_tolerance:
-                    stop = StopReason.GRADIENT_CONVERGED
-                    break
+                system = problem.linearise(state) if trial is None else trial
+                if not math.isfinite(system.gradient):
+                    return ended(StopReason.NOT_FINITE)
+                if system.gradient < config.gradient_tolerance:
+                    return ended(StopReason.GRADIENT_CONVERGED)
                 continue
             if abs(decrease) <= 1e-12 * cost and math.isfinite(candidate):
-                stop = StopReason.COST_CONVERGED  # the minimum, to the last digits
-                break
+                return ended(StopReason.COST_CONVERGED)  # the minimum, to the last digits
         mu *= nu
         nu *= 2.0
         if mu > config.mu_max:
-            stop = StopReason.STALLED if solved else StopReason.SINGULAR
-            break
-    return LmSummary(first, cost, tried, accepted, stop, mu)
+            return ended(StopReason.STALLED if solved else StopReason.SINGULAR)
+    return ended(StopReason.MAX_ITERATIONS)

@@ -194,7 +194,7 @@ class LmConfig:
     min_depth: float = 1e-3
     """Points nearer than this in front of a camera count as behind it (map units)."""
     behind_px: float = 1000.0
-    """Residual that stands for an observation whose point is behind the camera."""
+    """Residual that stands for an observation whose point is behind the camera; none counts for more."""
     diagnostics: bool = True
     """Report rank deficiency and the newest pose's covariance (costs one more linearisation)."""
     rank_tolerance: float = 1e-9

@@ -6,6 +6,7 @@ adjoint map them to the two poses: ``xi_rel = xi_target - Ad(T_target_host) xi_h
 """
 
 from abc import ABC, abstractmethod
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -33,6 +34,30 @@ from edgeslam_torch.types import FloatArray, IntArray
 
 INVERSE_DEPTH_MIN = 1e-4
 """Nothing is refined beyond this inverse depth: practically at infinity, and never behind the camera."""
+
+
+class RelativeSystem(NamedTuple):
+    """Normal equations of blocks at one state."""
+
+    V: Tensor
+    """Upper triangles of the blocks ``(size (size + 1) / 2, B, L)``."""
+    g: Tensor
+    """Their gradients ``(size, B, L)``."""
+    cross: Tensor
+    """What couples them with the relative poses ``(B, T, 6, size, L)``."""
+    map: Tensor
+    """Tangents of the relative poses by those of the free poses ``(B, 6 T, 6 F)``."""
+
+
+class Eliminated(NamedTuple):
+    """Blocks taken out of the pose system, for the way back."""
+
+    factor: Tensor
+    """Inverse Cholesky factors, shaped as `RelativeSystem.V`."""
+    y: Tensor
+    """Whitened gradients ``(size, B, L)``."""
+    Y_T: Tensor
+    """``(B, size L, 6 T)``."""
 
 
 class RelativeBlocks(ABC):
@@ -72,7 +97,6 @@ class RelativeBlocks(ABC):
         F = int((column >= 0).sum())
         column = torch.where(column < 0, F, column)  # fixed poses share a last column that is cut off
         self.columns = column[self.tiles.host], column[self.tiles.target].flatten()
-        self._seen: tuple[Tensor, Tensor, Tensor] | None = None
 
     @abstractmethod
     def weigh(self, Rt: Tensor, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
@@ -91,47 +115,42 @@ class RelativeBlocks(ABC):
         """Add the prior to the blocks' normal matrices and gradients ``(size, B, L)``."""
 
     def motions(self, T_c_w: Tensor) -> tuple[Tensor, Tensor]:
-        """Relative motions ``(B T, 4, 4)``, and in the blocks' precision ``(3, 4, B, T, 1)``; kept while T stays."""
-        if self._seen is not None and self._seen[0] is T_c_w:
-            return self._seen[1:]
+        """Relative motions ``(B T, 4, 4)``, and in the blocks' precision ``(3, 4, B, T, 1)``."""
         motions = kernel(relative_motions, self.config.compile)
-        self._seen = (T_c_w, *motions(T_c_w, self.tiles.host, self.tiles.target, self.dtype))
-        return self._seen[1:]
+        out: tuple[Tensor, Tensor] = motions(T_c_w, self.tiles.host, self.tiles.target, self.dtype)
+        return out
 
     def cost(self, T_c_w: Tensor, x: Tensor) -> Tensor:
         """Robust cost ``()``."""
         return self.robust_cost(self.motions(T_c_w)[1], x.to(self.dtype)) + self.prior_cost(x)
 
-    def linearise(self, T_c_w: Tensor, x: Tensor, H: Tensor, g: Tensor) -> Tensor:
-        """Prepare the blocks; add the pose part to ``H (6F, 6F)`` and ``g (6F,)``; returns the cost ``()``."""
+    def linearise(self, T_c_w: Tensor, x: Tensor, H: Tensor, g: Tensor) -> tuple[RelativeSystem, Tensor]:
+        """Normal equations and cost ``()``; adds the poses' own part to ``H (6F, 6F)`` and ``g (6F,)``."""
         T_rel, Rt = self.motions(T_c_w)
-        normal, self.cross, V, g_block, value = self.weigh(Rt, x.to(self.dtype))
-        self.V, self.g = V.double(), g_block.double()
-        self.add_prior(x, self.V, self.g)
-        self._add_poses(T_rel, normal, H, g)
-        return value + self.prior_cost(x)
-
-    def _add_poses(self, T_rel: Tensor, normal: Tensor, H: Tensor, g: Tensor) -> None:
-        """Add the normal matrices of the relative poses ``(B, T, 7, 7)`` to the pose system."""
-        self.map, H_add, g_add = kernel(mapped, self.config.compile)(T_rel, normal, *self.columns, len(H) // 6)
+        normal, cross, V, g_block, value = self.weigh(Rt, x.to(self.dtype))
+        V, g_block = V.double(), g_block.double()
+        self.add_prior(x, V, g_block)
+        to_relative, H_add, g_add = kernel(mapped, self.config.compile)(T_rel, normal, *self.columns, len(H) // 6)
         H += H_add
         g += g_add
+        return RelativeSystem(V, g_block, cross, to_relative), value + self.prior_cost(x)
 
-    def reduce(self, mu: float, S: Tensor, b: Tensor) -> None:
+    def reduce(self, system: RelativeSystem, mu: float, S: Tensor, b: Tensor) -> Eliminated:
         """Subtract what the blocks take from the pose system ``S`` and its right side ``b``."""
         damping = torch.tensor(mu, dtype=torch.float64)
-        self.factor, self.y, self.Y_T, taken, right = kernel(schur.eliminate, self.config.compile)(
-            self.V, self.g, self.cross, damping
+        *eliminated, taken, right = kernel(schur.eliminate, self.config.compile)(
+            system.V, system.g, system.cross, damping
         )
-        flat = self.map.flatten(0, 1)
-        S -= flat.mT @ (taken @ self.map).flatten(0, 1)
+        flat = system.map.flatten(0, 1)
+        S -= flat.mT @ (taken @ system.map).flatten(0, 1)
         b -= flat.mT @ right.flatten()
+        return Eliminated(*eliminated)
 
-    def step(self, delta: Tensor) -> Tensor:
+    def step(self, system: RelativeSystem, eliminated: Eliminated, delta: Tensor) -> Tensor:
         """Step of the blocks ``(size, B, L)`` that goes with the poses' ``delta (6F,)``."""
         B, _, L = self.tiles.shape
-        moved = (self.Y_T @ (self.map @ delta).to(self.dtype)[..., None]).view(B, self.size, L)
-        return schur.unwhiten(self.factor, -self.y - moved.transpose(0, 1))
+        moved = (eliminated.Y_T @ (system.map @ delta).to(self.dtype)[..., None]).view(B, self.size, L)
+        return schur.unwhiten(eliminated.factor, -eliminated.y - moved.transpose(0, 1))
 
     def _kernel(self) -> tuple[Tensor, Kernel, float]:
         """Cost of what lies behind a camera, the kernel and its width."""

@@ -1,108 +1,16 @@
 """Elimination of small blocks: anchors (3), edge depths (1), junctions (3).
 
 A factor's block derivatives are first multiplied by the inverse Cholesky factor of its block; what is subtracted
-from the pose system is then one matrix product ``Y Y^T``. Blocks are sorted by the poses that see them and cut
-into chunks, so that each chunk's ``Y`` spans only the poses seen in it: one dense product in a window, a banded
-one over a whole map. Edges and junctions lie in tiles instead (`optim.tiles`), a ``Y`` each.
+from the pose system is then one matrix product ``Y Y^T``.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 _PIVOT = 1e-12
 """A Cholesky pivot below this fraction of its diagonal entry is a direction that nothing observes."""
-
-
-@dataclass(frozen=True, slots=True)
-class Chunk:
-    """Consecutive blocks with the poses that see them; its factors are consecutive too."""
-
-    first: int
-    last: int
-    """Blocks ``first <= a < last``."""
-    lo: int
-    hi: int
-    """Factors ``lo <= m < hi``, sorted by pose, then block."""
-    flat: Tensor
-    """Places of their ``6 x size`` entries in the flattened ``Y (6 w, size (last - first))``."""
-    unique: bool
-    """Whether no pose sees a block twice: entries can then be stored without adding."""
-    columns: Tensor
-    """``(6 w,)`` scalar columns of the pose system."""
-    slices: tuple[tuple[int, int, int], ...]
-    """Pose, first and last factor of each pose's run."""
-
-
-def plan_chunks(column: Tensor, block: Tensor, bounds: Sequence[int], size: int) -> list[Chunk]:
-    """Lay out the ``Y`` of each chunk.
-
-    Args:
-        column: ``(M,)`` pose number of each factor.
-        block: ``(M,)`` its block; factors are sorted by chunk, pose, block.
-        bounds: First block of each chunk and, last, the number of blocks.
-        size: Unknowns per block.
-    """
-    edges = torch.tensor(bounds[1:], dtype=block.dtype)
-    counts = torch.bincount(torch.bucketize(block, edges, right=True), minlength=len(edges)).tolist()
-    chunks, lo = [], 0
-    for first, last, count in zip(bounds[:-1], bounds[1:], counts, strict=True):
-        if count == 0:
-            continue
-        hi, n = lo + count, last - first
-        poses, local, runs = torch.unique_consecutive(column[lo:hi], return_inverse=True, return_counts=True)
-        place = 6 * size * n * local + (block[lo:hi] - first)  # entry (0, 0)
-        inner = (size * n * torch.arange(6)[:, None] + n * torch.arange(size)).flatten()
-        ends = (lo + runs.cumsum(0)).tolist()
-        chunks.append(
-            Chunk(
-                first=first,
-                last=last,
-                lo=lo,
-                hi=hi,
-                flat=(inner[:, None] + place).flatten(),
-                unique=bool((place[1:] > place[:-1]).all()),
-                columns=(6 * poses[:, None] + torch.arange(6)).flatten(),
-                slices=tuple(zip(poses.tolist(), [lo, *ends[:-1]], ends, strict=True)),
-            )
-        )
-        lo = hi
-    return chunks
-
-
-def fill(Y: Tensor, flat: Tensor, unique: bool, factor: Tensor, block: Tensor, Jp: Tensor, Jb: Tensor) -> None:
-    """Store what a chunk's factors put into its ``Y``: ``Jp^T Jb L^-T``.
-
-    Args:
-        Y: Of the chunk; changed in place.
-        flat: `Chunk.flat`.
-        unique: `Chunk.unique`.
-        factor: Of all blocks, as `inverse_cholesky` returns it.
-        block: ``(M,)`` each factor's block.
-        Jp: ``(R, 6, M)`` derivatives by the pose.
-        Jb: ``(R, size, M)`` by the block.
-    """
-    entries = row_products(Jp, whiten(factor.index_select(1, block), Jb)).flatten()
-    if unique:
-        Y.view(-1).index_copy_(0, flat, entries)
-    else:
-        Y.zero_().view(-1).index_add_(0, flat, entries)
-
-
-def row_products(a: Tensor, b: Tensor) -> Tensor:
-    """Sum over residual rows of outer products: ``(R, m, M)`` and ``(R, n, M)`` to ``(m, n, M)``."""
-    out = a[0][:, None] * b[0]
-    for k in range(1, a.shape[0]):
-        out = torch.addcmul(out, a[k][:, None], b[k])
-    return out
-
-
-def triangle(J: Tensor) -> list[Tensor]:
-    """Upper triangles of the blocks' own normal matrices: ``(R, size, M)`` to ``size (size + 1) / 2`` of ``(M,)``."""
-    size = J.shape[1]
-    return [(J[:, i] * J[:, j]).sum(0) for i in range(size) for j in range(i, size)]
 
 
 def diagonal_rows(size: int) -> list[int]:

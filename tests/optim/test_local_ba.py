@@ -10,7 +10,7 @@ import torch
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.losses.cycle import CycleForm
 from edgeslam_torch.losses.robust import Kernel
-from edgeslam_torch.optim import compiled, local_ba, relative, schur
+from edgeslam_torch.optim import compiled, points, relative, schur
 from edgeslam_torch.optim.benchmark import (
     K,
     Noise,
@@ -107,8 +107,8 @@ def test_chi2_is_in_the_callers_order():
 def test_order_of_observations_and_of_chunks_does_not_matter(rng, monkeypatch):
     window = seeded_window(4, SMALL)
     before = refine_window(window.problem, TIGHT)
-    monkeypatch.setattr(local_ba, "_FEW_POSES", 0)
-    monkeypatch.setattr(local_ba, "_ANCHORS_PER_CHUNK", 16)
+    monkeypatch.setattr(points, "_FEW_POSES", 0)
+    monkeypatch.setattr(points, "_ANCHORS_PER_CHUNK", 16)
     after = refine_window(keep(window.problem, rng.permutation(len(window.problem.uv))), TIGHT)
     assert after.cost_after == pytest.approx(before.cost_after, rel=1e-10)
     np.testing.assert_allclose(after.T_c_w, before.T_c_w, atol=1e-7)
@@ -120,6 +120,26 @@ def test_seeing_an_anchor_twice_weighs_double():
     heavier = replace(problem, inv_sigma=np.where(np.arange(len(problem.uv)) == 0, 2**0.5, 1.0) * problem.inv_sigma)
     config = replace(TIGHT, kernel=Kernel.L2)
     np.testing.assert_allclose(refine_window(twice, config).T_c_w, refine_window(heavier, config).T_c_w, atol=1e-9)
+
+
+def test_an_anchor_practically_at_infinity_disturbs_nothing():
+    problem = points_only(seeded_window(5, SMALL)).problem
+    held = replace(problem, scale_priors=(ScalePrior(0, 5, 0.6, 0.01),))
+    near = refine_window(held, TIGHT)
+    far = np.array([[1e9, 2e9, 1e11]])  # seen by one pose, along its ray: it says nothing
+    ray = far[0] @ problem.T_c_w[0, :3, :3].T + problem.T_c_w[0, :3, 3]
+    with_far = replace(
+        held,
+        p_w=np.concatenate((problem.p_w, far)),
+        obs_pose=np.append(problem.obs_pose, 0),
+        obs_anchor=np.append(problem.obs_anchor, len(problem.p_w)),
+        uv=np.concatenate((problem.uv, (ray[:2] / ray[2] * K[:2] + np.array(K[2:]))[None])),
+        inv_sigma=np.append(problem.inv_sigma, 1.0),
+    )
+    result = refine_window(with_far, TIGHT)
+    assert result.cost_after == pytest.approx(near.cost_after, rel=1e-8)
+    np.testing.assert_allclose(result.T_c_w, near.T_c_w, atol=1e-6)
+    assert result.rank_deficiency == near.rank_deficiency
 
 
 # -- noise ----------------------------------------------------------------------------------------------------
@@ -490,28 +510,32 @@ def test_the_default_device_may_be_named():
 def test_kernels_stay_on_their_device():
     """Meta tensors have shapes and a device but no values: an operation that mixed devices would raise here."""
     with torch.device("meta"):
-        P, E, f = 50, 20, {"dtype": torch.float32}
+        E, f, g = 20, {"dtype": torch.float32}, {"dtype": torch.float64}
         B, T, L = 2, 3, 16
         K, Rt = torch.zeros(4, **f), torch.zeros(3, 4, B, T, 1, **f)
-        one, pair, block = torch.zeros(P, **f), torch.zeros(B, T, L, **f), torch.zeros(P, dtype=torch.int64)
+        pair, some = torch.zeros(B, T, L, **f), torch.zeros(3, dtype=torch.int64)
         robust = (pair, Kernel.HUBER, 2.0)
         line, ray = torch.zeros(3, B, T, L, **f), torch.zeros(2, B, 1, L, **f)
         edge = (Rt, torch.zeros(1, B, L, **f), ray, line, pair, pair, K)
         rays, arms = torch.zeros(2, 3, B, 1, L, **f), torch.zeros(2, 2, B, T, L, **f)
         corner = (Rt, torch.zeros(3, B, L, **f), rays, line[:2], arms, torch.zeros(4, B, T, L, **f), K)
-        point = (torch.zeros(3, P, **f), torch.zeros(2, P, **f), K, one, one, block[:3], one[:3])
-        point = (*point, 1e-3, Kernel.HUBER, 2.0)
+        place = torch.zeros(B, 9, L, dtype=torch.int64)
+        pixel, three = torch.zeros(B, 2, L, **g), torch.zeros(3, **g)
+        seen = points.Observed(
+            some[:B], place[:, :3], pixel, pixel, pixel[:, 0], some, three, three, three, min_depth=1e-3
+        )
+        point = (torch.zeros(4, 4, 4, **g), torch.zeros(3, E, **g), seen, Kernel.HUBER, 2.0)
         out = [*relative.edge_weights(*edge, CycleForm.RELATIVE_DEPTH, *robust)]
         out += [*relative.edge_weights(*edge, CycleForm.PIXEL, *robust), relative.edge_cost(*edge, None, *robust)]
         out += [*relative.junction_weights(*corner, False, *robust), relative.junction_cost(*corner, False, *robust)]
-        out += [*local_ba.point_weights(torch.zeros(3, 3, P, **f), *point, P), local_ba.point_cost(*point)]
+        linear = points.point_normals(*point, place.flatten(), place[:, 0].flatten(), some[:B], some)
+        system, entries, damping = points.PointSystem(*linear[:5]), place.repeat(1, 2, 1).flatten(), three[0]
+        out += [*linear, points.point_cost(*point)]
+        out += [*points.fill(torch.zeros(9, **g), entries, True, system, place[:, :6], damping)]
         for size in (1, 3):
             V, g = torch.zeros(size * (size + 1) // 2, B, L, **f), torch.zeros(size, B, L, **f)
             out += [*schur.eliminate(V, g, torch.zeros(B, T, 6, size, L, **f), torch.zeros((), **f))]
             factor = schur.inverse_cholesky(torch.zeros(size * (size + 1) // 2, E, **f), 1e-4)
-            Y = torch.zeros(6, size * E, **f)
-            flat = torch.zeros(6 * size * P, dtype=torch.int64)
-            schur.fill(Y, flat, True, factor, block, torch.zeros(2, 6, P, **f), torch.zeros(2, size, P, **f))
             out += [schur.unwhiten(factor, schur.whiten(factor, torch.zeros(size, E, **f)))]
         assert {t.device.type for t in out} == {"meta"}
 

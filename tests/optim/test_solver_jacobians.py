@@ -1,5 +1,7 @@
 """Analytic derivatives against automatic ones, at ordinary poses, at identity and at tiny angles."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -8,15 +10,12 @@ from torch import Tensor
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.losses import edge_alignment as ea
 from edgeslam_torch.losses.lshape import junction_residuals, junction_rows
-from edgeslam_torch.losses.reprojection import (
-    camera_points,
-    inverse_depth_jacobians,
-    reprojection_jacobians,
-    reprojection_residuals,
-)
+from edgeslam_torch.losses.reprojection import camera_points, reprojection_residuals
+from edgeslam_torch.losses.robust import Kernel
 from edgeslam_torch.optim import lie
+from edgeslam_torch.optim.points import PointBlocks
 from edgeslam_torch.optim.priors import inverse_left_jacobian, scale_prior
-from edgeslam_torch.optim.problem import ScalePrior
+from edgeslam_torch.optim.problem import DepthPriors, LmConfig, ScalePrior, WindowProblem
 
 K = torch.tensor([500.0, 480.0, 320.0, 240.0], dtype=torch.float64)
 POSES = {
@@ -49,36 +48,46 @@ def test_exp_passes_gradcheck(xi):
     assert torch.autograd.gradcheck(lie.exp, tensor(xi).requires_grad_())
 
 
-def test_reprojection(T, rng):
-    poses = torch.stack((T, lie.exp(tensor([0.1, 0, 0, 0, 0.1, 0])) @ T))
-    p_c = tensor(rng.uniform((-1, -1, 2), (1, 1, 5), (7, 3)))
-    p = (p_c - T[:3, 3]) @ T[:3, :3]
-    pose, anchor = torch.tensor([0, 0, 1, 1, 0]), torch.tensor([0, 3, 3, 6, 1])
-    uv = tensor(rng.uniform(0, 600, (2, 5)))
+def test_anchors_and_their_elimination(T, rng):
+    """Normal equations, reduced system and the way back, against the dense Jacobian of plain residuals."""
+    poses = torch.stack((T, lie.exp(tensor([0.1, 0, 0, 0, 0.1, 0])) @ T, lie.exp(tensor([0, 0.2, 0, 0.1, 0, 0])) @ T))
+    p = (tensor(rng.uniform((-1, -1, 2), (1, 1, 5), (7, 3))) - T[:3, 3]) @ T[:3, :3]
+    pose, anchor = (torch.as_tensor(x.ravel()) for x in np.meshgrid(np.arange(3), np.arange(7)))
+    uv, inv_sigma = tensor(rng.uniform(0, 600, (21, 2))), tensor(rng.uniform(0.5, 2.0, 21))
+    host, deep = torch.tensor([1, 2, 0, 0]), torch.tensor([0, 3, 3, 6])
+    prior, sigma = tensor(rng.uniform(0.2, 0.5, 4)), tensor(rng.uniform(0.1, 0.3, 4))
+    fixed = torch.tensor([False, True, False])
+    problem = WindowProblem(
+        poses.numpy(), fixed.numpy(), p.numpy(), pose.numpy(), anchor.numpy(), uv.numpy(), inv_sigma.numpy(), tuple(K)
+    )
+    depth = DepthPriors(deep.numpy(), host.numpy(), prior.numpy(), sigma.numpy())
+    config = LmConfig(kernel=Kernel.L2, behind_px=1e6)
 
     def residual(xi: Tensor, q: Tensor) -> Tensor:
-        return reprojection_residuals(camera_points(lie.exp(xi) @ poses, q, pose, anchor)[1], uv, K)
+        moved = poses.clone()
+        moved[~fixed] = lie.exp(xi) @ moved[~fixed]
+        r = reprojection_residuals(camera_points(moved, q, pose, anchor)[1], uv.mT, K) * inv_sigma
+        iz = camera_points(moved, q, host, deep)[1][2].reciprocal()
+        return torch.cat((r.flatten(), (iz - prior) / sigma))
 
-    by_pose, by_point = torch.func.jacrev(residual, (0, 1))(torch.zeros(2, 6, dtype=torch.float64), p)
-    ours = reprojection_jacobians(*camera_points(poses, p, pose, anchor), uv, K)
-    torch.testing.assert_close(ours.residual, residual(torch.zeros(2, 6, dtype=torch.float64), p))
-    each = torch.arange(5)
-    torch.testing.assert_close(ours.pose.permute(2, 0, 1), by_pose.permute(1, 2, 0, 3)[each, pose])
-    torch.testing.assert_close(ours.point.permute(2, 0, 1), by_point.permute(1, 2, 0, 3)[each, anchor])
-
-
-def test_inverse_depth_of_anchors(T, rng):
-    p = (tensor(rng.uniform((-1, -1, 2), (1, 1, 5), (6, 3))) - T[:3, 3]) @ T[:3, :3]
-    zero = torch.zeros(6, dtype=torch.long)
-
-    def inverse_depth(xi: Tensor, q: Tensor) -> Tensor:
-        return camera_points((lie.exp(xi) @ T)[None], q, zero, torch.arange(6))[1][2].reciprocal()
-
-    by_pose, by_point = torch.func.jacrev(inverse_depth, (0, 1))(torch.zeros(6, dtype=torch.float64), p)
-    value, pose, point = inverse_depth_jacobians(*camera_points(T[None], p, zero, torch.arange(6)))
-    torch.testing.assert_close(value, inverse_depth(torch.zeros(6, dtype=torch.float64), p))
-    torch.testing.assert_close(pose.mT, by_pose)
-    torch.testing.assert_close(point.mT, by_point.diagonal(0, 0, 1).mT)
+    still = torch.zeros(2, 6, dtype=torch.float64)
+    J = torch.cat([x.flatten(1) for x in torch.func.jacrev(residual, (0, 1))(still, p)], 1)
+    r = residual(still, p)
+    H, g = J.mT @ J, J.mT @ r
+    points = PointBlocks(replace(problem, depth_priors=depth), K, np.array([0, -1, 1]), config)
+    system, own, g_pose, cost = points.linearise(poses, points.p)
+    torch.testing.assert_close(cost, r @ r)
+    torch.testing.assert_close(own, H[:12, :12].view(2, 6, 2, 6)[[0, 1], :, [0, 1]], atol=1e-6, rtol=1e-9)
+    torch.testing.assert_close(g_pose.flatten(), g[:12], atol=1e-6, rtol=1e-9)
+    torch.testing.assert_close(system.g.mT.flatten(), g[12:], atol=1e-6, rtol=1e-9)
+    S, b = H[:12, :12].clone(), g[:12].clone()
+    eliminated = points.reduce(system, 0.0, S, b)
+    taken = H[:12, 12:] @ torch.linalg.inv(H[12:, 12:])
+    torch.testing.assert_close(S, H[:12, :12] - taken @ H[12:, :12], atol=1e-6, rtol=1e-8)
+    torch.testing.assert_close(b, g[:12] - taken @ g[12:], atol=1e-6, rtol=1e-8)
+    delta = tensor(rng.normal(size=12))
+    expected = -torch.linalg.solve(H[12:, 12:], g[12:] + H[12:, :12] @ delta)
+    torch.testing.assert_close(points.step(system, eliminated, delta).mT.flatten(), expected)
 
 
 PAIRS = 6
