@@ -94,10 +94,13 @@ def preprocess(image: NDArray[np.uint8], height: int, width: int, metadata: Meta
     """BGR or grey uint8 -> ``(1, 3, height, width)`` float32, the whole image squeezed, normalised RGB."""
     shrinks = height <= image.shape[0] and width <= image.shape[1]
     small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
-    rgb = np.repeat(small[..., None], 3, axis=2) if small.ndim == 2 else small[..., ::-1]
     gain = np.float32(1.0) / (np.float32(255.0) * np.array(metadata.std, np.float32))
     offset = np.array(metadata.mean, np.float32) / np.array(metadata.std, np.float32)
-    return np.ascontiguousarray((rgb * gain - offset).transpose(2, 0, 1)[None], dtype=np.float32)
+    planes = np.empty((1, 3, height, width), np.float32)
+    for i, plane in enumerate(planes[0]):
+        np.multiply(small if small.ndim == 2 else small[:, :, 2 - i], gain[i], out=plane)
+        plane -= offset[i]
+    return planes
 
 
 def network_size(height: int, width: int, metadata: Metadata) -> tuple[int, int]:

@@ -22,10 +22,12 @@ def extract_edges(image: np.ndarray, low: float, high: float, most: int, border_
     mask = canny(grey, low, high)
     mask[:border_px] = mask[-border_px:] = False
     mask[:, :border_px] = mask[:, -border_px:] = False
-    v, u = np.nonzero(mask)
+    at = cv2.findNonZero(mask.view(np.uint8))  # in np.nonzero's order, at a fifth of its time
+    u, v = np.zeros((2, 0), np.int32) if at is None else at.reshape(-1, 2).T
     if len(u) > most:
         # Every n-th pixel of a diagonal sweep: neighbours on an edge differ in u + v, so edges thin evenly.
-        order = np.argsort((u + v) % max(2, int(np.ceil(len(u) / most))) * 2 + (u % 2), kind="stable")[:most]
+        key = (u + v) % max(2, int(np.ceil(len(u) / most))) * 2 + (u % 2)
+        order = np.argsort(key.astype(np.uint16), kind="stable")[:most]  # which sorts 16 bits by counting
         order.sort()
         u, v = u[order], v[order]
     smooth = cv2.GaussianBlur(grey, (5, 5), 1.0)

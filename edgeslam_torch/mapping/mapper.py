@@ -68,6 +68,7 @@ class Mapper:
     def triangulate_new(self, keyframe: Keyframe, neighbours: list[Keyframe], colour: np.ndarray) -> None:
         """New anchors from keypoints that neither side has an anchor for yet."""
         prior, sigma = depth_prior(keyframe, keyframe.features.uv, self.map.anchors.p_w, self.depth.prior_sigma_log)
+        new = [self._recent[:0]]
         for other in neighbours:
             baseline = float(np.linalg.norm(other.centre_w - keyframe.centre_w))
             if baseline < 0.01 * float(np.nanmedian(prior)):
@@ -97,8 +98,10 @@ class Mapper:
             self.map.anchors.sigma[ids] = sigma_ray
             self.map.observe(keyframe, mine, ids)
             self.map.observe(other, theirs, ids)
-            self.map.refresh_anchors(ids)
-            self._recent = np.concatenate([self._recent, ids])
+            new.append(ids)
+        ids = np.concatenate(new)
+        self.map.refresh_anchors(ids)
+        self._recent = np.concatenate([self._recent, ids])
 
     def cull_keyframes(self, newest: Keyframe) -> None:
         """Remove covisible keyframes whose anchors three others see at the same or finer scale; bound the map."""

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from edgeslam_torch.frontend.keypoint_grid import KeypointGrid
 from edgeslam_torch.frontend.matching import EMPTY, Matches, best_pairs, hamming
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
@@ -31,7 +32,8 @@ def epipolar_matches(
     repeated texture along the line confuses less.
     """
     free = np.flatnonzero((keyframe.anchor < 0) & np.isfinite(prior_depth))
-    if len(free) == 0:
+    free_there = np.flatnonzero(other.anchor < 0)
+    if len(free) == 0 or len(free_there) == 0:
         return EMPTY
     T_o_k = other.T_c_w @ se3.inverse(keyframe.T_c_w)
     ray = bearings(keyframe.features.uv[free], camera.K)
@@ -50,9 +52,10 @@ def epipolar_matches(
     length = np.linalg.norm(along, axis=1)
     middle = 0.5 * (near + far)
     slack = 3.0 * scale_factor ** keyframe.features.octave[free].astype(np.float64)
-    query, train = other.grid.near(middle, np.minimum(0.5 * length, 80.0) + slack)
-    ok = other.anchor[train] < 0
-    ok &= np.abs(other.features.octave[train] - keyframe.features.octave[free[query]]) <= 1
+    # A grid of their own for the few that are free: the other keyframe's has several times as many to refuse.
+    query, train = KeypointGrid(other.features.uv[free_there]).near(middle, np.minimum(0.5 * length, 80.0) + slack)
+    train = free_there[train]
+    ok = np.abs(other.features.octave[train] - keyframe.features.octave[free[query]]) <= 1
     query, train = query[ok], train[ok]
     # Distance across the line in sigmas of the keypoint's level; a segment shorter than a pixel has no direction.
     direction = along / np.maximum(length, 1e-9)[:, None]
