@@ -26,7 +26,7 @@ MIN_ACROSS = 0.25
 """Sine of the angle between an edge and the epipolar line below which the edge slides along the line."""
 
 _OFFSETS = PROFILE_PX.astype(np.float32)[:, None]
-_CHUNK = 512
+_CHUNK = 1024
 """Edges searched at a time: what a search makes then stays in the processor's cache."""
 
 
