@@ -180,8 +180,8 @@ class LmConfig:
     """Where torch computes, ``cuda`` for instance; a window of usual size is too small to gain from it."""
     compile: bool = False
     """Run the hot kernels through ``torch.compile``: pays when many windows are solved, see docs/decisions.md."""
-    float32_edges: bool = True
-    """Edge blocks in single precision; the reduced system is always double."""
+    float32_blocks: bool = True
+    """Edge blocks, and what couples anchors with poses, in single precision; the reduced system is always double."""
     mu: float = 1e-4
     """First damping, relative to the diagonal of the normal matrix."""
     mu_max: float = 1e8

@@ -317,7 +317,7 @@ class EdgeBlocks(RelativeBlocks):
 
     def __init__(self, terms: EdgeTerms, K: Tensor, column: Tensor, config: LmConfig) -> None:
         """Take the terms into the solver's layout; ``K`` is fx, fy, cx, cy."""
-        dtype = torch.float32 if config.float32_edges else torch.float64
+        dtype = torch.float32 if config.float32_blocks else torch.float64
         start = np.asarray(terms.inverse_depth, dtype=np.float64)[None]
         super().__init__(terms.host, terms.pair_edge, terms.pair_pose, start, column, config, dtype)
         tiles = self.tiles
@@ -328,7 +328,8 @@ class EdgeBlocks(RelativeBlocks):
         known = np.isfinite(sigma)
         self.prior_weight = tiles.blocks(np.where(known, sigma, np.inf)[None] ** -2.0, torch.float64)
         self.prior = tiles.blocks(np.where(known, terms.prior, 0.0)[None], torch.float64)
-        partner, normal = (_tensor(x).view(-1, 2).mT for x in (terms.pair_uv, terms.pair_normal))
+        # Coordinates first, as contiguous rows.
+        partner, normal = (_tensor(np.asarray(x).reshape(-1, 2).T) for x in (terms.pair_uv, terms.pair_normal))
         line = partner_line(partner, normal, _tensor(terms.pair_inv_sigma), K)
         self.line = tiles.pairs(line.cpu().numpy(), dtype)
         held = np.asarray(terms.pair_inverse_depth, dtype=np.float64)
@@ -454,4 +455,4 @@ def collinearity_prior(
 
 
 def _tensor(x: FloatArray) -> Tensor:
-    return torch.as_tensor(np.asarray(x, dtype=np.float64))
+    return torch.as_tensor(np.ascontiguousarray(x, dtype=np.float64))

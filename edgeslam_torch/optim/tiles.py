@@ -73,8 +73,6 @@ def lay_out(host: IntArray, pair_block: IntArray, pair_pose: IntArray, poses: in
         ValueError: If a pair's target is its host, or a block is paired with one target twice.
     """
     host, pair_block, pair_pose = (np.asarray(x, dtype=np.int64) for x in (host, pair_block, pair_pose))
-    if (host[pair_block] == pair_pose).any():
-        raise ValueError("a pair's target pose must differ from its host")
     count = np.bincount(host, minlength=poses)
     most = max(int(count.max(initial=0)), 1)
     lanes = -(-most // -(-most // _MOST_LANES))
@@ -84,27 +82,31 @@ def lay_out(host: IntArray, pair_block: IntArray, pair_pose: IntArray, poses: in
     within[order] = np.arange(len(host)) - np.repeat(np.cumsum(count) - count, count)
     tiles = -(-count // lanes)
     tile = (np.cumsum(tiles) - tiles)[host] + within // lanes
+    lane = within % lanes
     tile_host = np.repeat(np.arange(poses), tiles)
-    seen = np.zeros((len(tile_host), poses), dtype=bool)
-    seen[tile[pair_block], pair_pose] = True
+    B = len(tile_host)
+    # Few passes over the pairs: there are many of them.
+    row = tile[pair_block] * poses + pair_pose
+    seen = (np.bincount(row, minlength=B * poses) > 0).reshape(B, poses)
+    if seen[np.arange(B), tile_host].any():
+        raise ValueError("a pair's target pose must differ from its host")
     slot = np.cumsum(seen, axis=1) - 1
     slots = max(int(seen.sum(1).max(initial=0)), 1)
     target = np.repeat(tile_host[:, None], slots, axis=1)
     which, pose = np.nonzero(seen)
     target[which, slot[which, pose]] = pose
-    block_place = tile * lanes + within % lanes
-    row = tile[pair_block] * slots + slot[tile[pair_block], pair_pose]
-    pair_place = row * lanes + within[pair_block] % lanes
+    start = (np.arange(B)[:, None] * slots + slot) * lanes
+    pair_place = start.reshape(-1)[row] + lane[pair_block]
     taken = np.zeros(target.size * lanes, dtype=bool)
     taken[pair_place] = True
     if np.count_nonzero(taken) != len(pair_place):
         raise ValueError("a block must be paired with a target pose only once")
-    return Tiles(torch.as_tensor(tile_host), torch.as_tensor(target), lanes, block_place, pair_place)
+    return Tiles(torch.as_tensor(tile_host), torch.as_tensor(target), lanes, tile * lanes + lane, pair_place)
 
 
 def _spread(values: FloatArray, place: IntArray, shape: tuple[int, ...], dtype: torch.dtype, empty: float) -> Tensor:
-    rows = np.asarray(values).reshape(-1, len(place))
     kind = np.float32 if dtype is torch.float32 else np.float64
+    rows = np.asarray(values, dtype=kind).reshape(-1, len(place))
     out = np.full((len(rows), int(np.prod(shape))), empty, dtype=kind)
     for to, row in zip(out, rows, strict=True):  # row by row: numpy is slow with an index behind an ellipsis
         to[place] = row

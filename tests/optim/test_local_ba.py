@@ -34,7 +34,7 @@ from edgeslam_torch.optim.relative import collinearity_prior
 
 SMALL = WindowSize(poses=6, fixed=2, anchors=150, observations=600, edges=200, pairs=600, junctions=20)
 CLEAN = Noise(px=0.0, depth=0.0)
-TIGHT = LmConfig(max_iterations=60, cost_tolerance=1e-13, float32_edges=False)
+TIGHT = LmConfig(max_iterations=60, cost_tolerance=1e-13, float32_blocks=False)
 
 
 def pose_error(result: WindowResult, window: SeededWindow) -> float:
@@ -166,7 +166,7 @@ def test_twenty_starts_end_in_one_minimum(rng):
 def test_single_precision_edges_end_in_the_same_minimum():
     problem = seeded_window(7, SMALL).problem
     double = refine_window(problem, TIGHT)
-    single = refine_window(problem, replace(TIGHT, float32_edges=True))
+    single = refine_window(problem, replace(TIGHT, float32_blocks=True))
     assert single.cost_after == pytest.approx(double.cost_after, rel=1e-6)
     np.testing.assert_allclose(single.T_c_w, double.T_c_w, atol=1e-5)
 
@@ -529,9 +529,9 @@ def test_kernels_stay_on_their_device():
         out += [*relative.edge_weights(*edge, CycleForm.PIXEL, *robust), relative.edge_cost(*edge, None, *robust)]
         out += [*relative.junction_weights(*corner, False, *robust), relative.junction_cost(*corner, False, *robust)]
         linear = points.point_normals(*point, place.flatten(), place[:, 0].flatten(), some[:B], some)
-        system, entries, damping = points.PointSystem(*linear[:5]), place.repeat(1, 2, 1).flatten(), three[0]
+        system, entries, damping = points.PointSystem(*linear[:5]), place[:, 0].flatten(), three[0]
         out += [*linear, points.point_cost(*point)]
-        out += [*points.fill(torch.zeros(9, **g), entries, True, system, place[:, :6], damping)]
+        out += [*points.fill(torch.zeros(18, E, **f), entries, True, system, place[:, :6], damping)]
         for size in (1, 3):
             V, g = torch.zeros(size * (size + 1) // 2, B, L, **f), torch.zeros(size, B, L, **f)
             out += [*schur.eliminate(V, g, torch.zeros(B, T, 6, size, L, **f), torch.zeros((), **f))]

@@ -61,7 +61,7 @@ def test_anchors_and_their_elimination(T, rng):
         poses.numpy(), fixed.numpy(), p.numpy(), pose.numpy(), anchor.numpy(), uv.numpy(), inv_sigma.numpy(), tuple(K)
     )
     depth = DepthPriors(deep.numpy(), host.numpy(), prior.numpy(), sigma.numpy())
-    config = LmConfig(kernel=Kernel.L2, behind_px=1e6)
+    config = LmConfig(kernel=Kernel.L2, behind_px=1e6, float32_blocks=False)
 
     def residual(xi: Tensor, q: Tensor) -> Tensor:
         moved = poses.clone()
