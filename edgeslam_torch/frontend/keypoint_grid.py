@@ -48,23 +48,32 @@ class KeypointGrid:
         left, right = self._span(u - self._origin[0], radius_px, self._columns)
         top, bottom = self._span(v - self._origin[1], radius_px, self._rows)
         # Keypoints of neighbouring cells in one row lie side by side: one interval per query and row.
-        row_query, step = _unroll(bottom - top + 1)
-        first_cell = (top[row_query] + step) * self._columns
+        row_query, row = _unroll(top, bottom - top + 1)
+        first_cell = row * self._columns
         begin = self._start[first_cell + left[row_query]]
-        run, step = _unroll(self._start[first_cell + right[row_query] + 1] - begin)
-        query, keypoint = row_query[run], begin[run] + step
-        du, dv = self._u[keypoint] - u[query], self._v[keypoint] - v[query]
-        inside = du * du + dv * dv <= np.square(radius_px)[query]
+        run, keypoint = _unroll(begin, self._start[first_cell + right[row_query] + 1] - begin)
+        query = row_query[run]
+        squared, dv = self._u[keypoint], self._v[keypoint]
+        squared -= u[query]
+        dv -= v[query]
+        squared *= squared
+        dv *= dv
+        squared += dv
+        inside = np.flatnonzero(squared <= np.square(radius_px)[query])
         return query[inside], self._order[keypoint[inside]]
 
     def _span(self, x: FloatArray, radius_px: FloatArray, cells: int) -> tuple[IntArray, IntArray]:
         """First and last cell along one axis that a circle around ``x`` touches."""
-        ends = np.stack([x - radius_px, x + radius_px]) / CELL_PX
-        first, last = np.clip(ends, 0, cells - 1).astype(np.int64)
+        ends = np.stack([x - radius_px, x + radius_px])
+        ends /= CELL_PX
+        np.maximum(ends, 0.0, out=ends)
+        np.minimum(ends, cells - 1.0, out=ends)
+        first, last = ends.astype(np.int64)
         return first, last
 
 
-def _unroll(counts: IntArray) -> tuple[IntArray, IntArray]:
-    """For intervals of given lengths: the interval of every element, and the element's place in it."""
+def _unroll(first: IntArray, counts: IntArray) -> tuple[IntArray, IntArray]:
+    """For intervals of whole numbers, by their first and how many: the interval of every number, and the number."""
     interval = np.repeat(np.arange(len(counts)), counts)
-    return interval, np.arange(len(interval)) - (np.cumsum(counts) - counts)[interval]
+    shift = first - np.cumsum(counts) + counts
+    return interval, np.arange(len(interval)) + shift[interval]
