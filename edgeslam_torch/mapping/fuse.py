@@ -56,7 +56,9 @@ def look_for(
         What was found ``(M,)``, on which keypoints ``(M,)``, and how far from there [px] it was expected ``(M, 2)``.
     """
     anchors = slam_map.anchors
-    ids = ids[~np.isin(ids, keyframe.anchor)]
+    held = np.zeros(len(anchors.alive) + 1, dtype=bool)  # the last row answers for NO_ANCHOR
+    held[keyframe.anchor] = True
+    ids = ids[~held[ids]]
     seen = project_anchors(anchors, ids, keyframe.T_c_w, camera, slam_map.scale_factor, slam_map.levels)
     matches = match_projection(
         seen,

@@ -84,7 +84,8 @@ class SlamMap:
             keypoints = np.flatnonzero(new >= 0)
             if len(keypoints) == 0:
                 continue
-            already = np.isin(new[keypoints], keyframe.anchor)  # one keypoint per anchor and keyframe
+            # One keypoint per anchor and keyframe; a handful here, for which np.isin is slow.
+            already = (new[keypoints, None] == keyframe.anchor).any(axis=1)
             keyframe.anchor[keypoints] = np.where(already, NO_ANCHOR, new[keypoints])
             self.anchors.observations[new[keypoints[~already]]] += 1
         self.anchors.found[winners] += self.anchors.found[losers]
