@@ -1,5 +1,6 @@
 """The run loop around a SLAM system that knows the answer."""
 
+import gc
 import json
 import os
 import signal
@@ -16,7 +17,7 @@ from edgeslam_torch.io.config_file import load_config
 from edgeslam_torch.io.pace import Counter, at_their_pace
 from edgeslam_torch.io.ply import read_ply
 from edgeslam_torch.io.source import open_source
-from edgeslam_torch.run import Mode, run
+from edgeslam_torch.run import Mode, _load_slam, run
 from edgeslam_torch.types import Frame, TelemetrySample
 
 FILES = {
@@ -196,3 +197,12 @@ def test_realtime_drops_nothing_when_there_is_time(tmp_path, write_tum):
     assert result.summary["dropped_frames"] == 0
     assert result.summary["frames"] == 3
     assert result.summary["duration_s"] > 0.19
+
+
+def test_loading_the_system_leaves_the_collector_as_it_was():
+    try:
+        _load_slam()
+        assert gc.isenabled()
+        assert gc.get_freeze_count() > 1000
+    finally:
+        gc.unfreeze()
