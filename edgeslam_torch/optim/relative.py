@@ -60,6 +60,23 @@ class Eliminated(NamedTuple):
     """``(B, size L, 6 T)``."""
 
 
+class Layout(NamedTuple):
+    """Tiles and the poses they belong to."""
+
+    host: Tensor
+    """``(B,)`` hosts."""
+    target: Tensor
+    """``(B, T)`` targets."""
+    host_column: Tensor
+    """``(B,)`` free-pose numbers of the hosts, ``F`` for a fixed pose."""
+    target_column: Tensor
+    """``(B T,)`` the same of the targets."""
+    free: int
+    """``F``."""
+    dtype: torch.dtype
+    """Of the blocks."""
+
+
 class RelativeBlocks(ABC):
     """Host-anchored blocks of ``size`` inverse depths; subclasses write the residual rows.
 
@@ -96,23 +113,21 @@ class RelativeBlocks(ABC):
         self.far = self.tiles.pairs(np.full(len(pair_block), config.behind_px**2), dtype)
         F = int((column >= 0).sum())
         column = torch.where(column < 0, F, column)  # fixed poses share a last column that is cut off
-        self.columns = column[self.tiles.host], column[self.tiles.target].flatten()
+        self.layout = Layout(
+            self.tiles.host, self.tiles.target, column[self.tiles.host], column[self.tiles.target].flatten(), F, dtype
+        )
 
     @abstractmethod
-    def weigh(self, Rt: Tensor, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """`schur.pair_products` of the weighted rows and their cost ``()``, at motions ``(3, 4, B, T, 1)``."""
+    def system(self, T_c_w: Tensor, x: Tensor) -> tuple[Tensor, ...]:
+        """What `_as_system` returns, at poses ``(W, 4, 4)`` and blocks ``(size, B, L)``."""
 
     @abstractmethod
     def robust_cost(self, Rt: Tensor, x: Tensor) -> Tensor:
-        """Robust cost ``()`` of the rows alone; arguments as `weigh` takes them."""
+        """Robust cost ``()`` of the rows alone, at motions ``(3, 4, B, T, 1)``."""
 
     @abstractmethod
     def prior_cost(self, x: Tensor) -> Tensor:
         """Cost ``()`` of what is known about the blocks ``(size, B, L)`` beforehand."""
-
-    @abstractmethod
-    def add_prior(self, x: Tensor, V: Tensor, g: Tensor) -> None:
-        """Add the prior to the blocks' normal matrices and gradients ``(size, B, L)``."""
 
     def motions(self, T_c_w: Tensor) -> tuple[Tensor, Tensor]:
         """Relative motions ``(B T, 4, 4)``, and in the blocks' precision ``(3, 4, B, T, 1)``."""
@@ -126,24 +141,17 @@ class RelativeBlocks(ABC):
 
     def linearise(self, T_c_w: Tensor, x: Tensor, H: Tensor, g: Tensor) -> tuple[RelativeSystem, Tensor]:
         """Normal equations and cost ``()``; adds the poses' own part to ``H (6F, 6F)`` and ``g (6F,)``."""
-        T_rel, Rt = self.motions(T_c_w)
-        normal, cross, V, g_block, value = self.weigh(Rt, x.to(self.dtype))
-        V, g_block = V.double(), g_block.double()
-        self.add_prior(x, V, g_block)
-        to_relative, H_add, g_add = kernel(mapped, self.config.compile)(T_rel, normal, *self.columns, len(H) // 6)
+        *system, H_add, g_add, value = self.system(T_c_w, x)
         H += H_add
         g += g_add
-        return RelativeSystem(V, g_block, cross, to_relative), value + self.prior_cost(x)
+        return RelativeSystem(*system), value
 
     def reduce(self, system: RelativeSystem, mu: float, S: Tensor, b: Tensor) -> Eliminated:
         """Subtract what the blocks take from the pose system ``S`` and its right side ``b``."""
         damping = torch.tensor(mu, dtype=torch.float64)
-        *eliminated, taken, right = kernel(schur.eliminate, self.config.compile)(
-            system.V, system.g, system.cross, damping
-        )
-        flat = system.map.flatten(0, 1)
-        S -= flat.mT @ (taken @ system.map).flatten(0, 1)
-        b -= flat.mT @ right.flatten()
+        *eliminated, taken, right = kernel(taken_out, self.config.compile)(system, damping)
+        S -= taken
+        b -= right
         return Eliminated(*eliminated)
 
     def step(self, system: RelativeSystem, eliminated: Eliminated, delta: Tensor) -> Tensor:
@@ -161,6 +169,13 @@ def relative_motions(T_c_w: Tensor, host: Tensor, target: Tensor, dtype: torch.d
     """See `RelativeBlocks.motions`; poses ``(W, 4, 4)``, hosts ``(B,)`` and targets ``(B, T)``."""
     T = T_c_w[target] @ lie.inverse(T_c_w)[host, None]
     return T.flatten(0, 1), T[..., :3, :].permute(2, 3, 0, 1)[..., None].to(dtype).contiguous()
+
+
+def taken_out(system: RelativeSystem, damping: Tensor) -> tuple[Tensor, ...]:
+    """The fields of `Eliminated`, and what to subtract from the pose system ``(6F, 6F)`` and its right side."""
+    factor, y, Y_T, taken, right = schur.eliminate(system.V, system.g, system.cross, damping)
+    flat = system.map.flatten(0, 1)
+    return factor, y, Y_T, flat.mT @ (taken @ system.map).flatten(0, 1), flat.mT @ right.flatten()
 
 
 def mapped(T_rel: Tensor, normal: Tensor, host: Tensor, target: Tensor, F: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -190,6 +205,24 @@ def mapped(T_rel: Tensor, normal: Tensor, host: Tensor, target: Tensor, F: int) 
     return M.view(B, 6 * T, n), H, flat.mT @ N[:, :6, 6].flatten()
 
 
+def _as_system(
+    T_rel: Tensor, layout: Layout, weighed: tuple[Tensor, ...], V_prior: Tensor, g_prior: Tensor, cost_prior: Tensor
+) -> tuple[Tensor, ...]:
+    """The fields of `RelativeSystem`, what to add to the pose system and its gradient, and the cost ``()``.
+
+    Args:
+        T_rel: Relative motions ``(B T, 4, 4)``.
+        layout: The tiles.
+        weighed: `schur.pair_products` of the weighted rows, and their cost.
+        V_prior: What is known about the blocks beforehand, as upper triangles.
+        g_prior: Its gradients ``(size, B, L)``.
+        cost_prior: Its cost ``()``.
+    """
+    normal, cross, V, g, value = weighed
+    to_relative, H, g_pose = mapped(T_rel, normal, layout.host_column, layout.target_column, layout.free)
+    return V.double() + V_prior, g.double() + g_prior, cross, to_relative, H, g_pose, value + cost_prior
+
+
 def _robust(r: Tensor, front: Tensor, far: Tensor, robust: Kernel, delta: float) -> tuple[Tensor, Tensor]:
     """Robust cost ``()`` in double precision of whitened residuals ``(..., B, T, L)`` and the roots of their weights.
 
@@ -213,7 +246,10 @@ def edge_weights(
     robust: Kernel,
     delta: float,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Alignment and cycle rows of edge pairs, see `RelativeBlocks.weigh`; arguments are `EdgeBlocks`' own tensors."""
+    """`schur.pair_products` of the alignment and cycle rows of edge pairs, and their cost ``()``.
+
+    Arguments are relative motions ``(3, 4, B, T, 1)``, blocks ``(1, B, L)`` and `EdgeBlocks`' own tensors.
+    """
     x = x[0, :, None]
     g = pair_geometry(Rt, ray, x)
     slope = depth_slopes(g, Rt[:, 3])
@@ -237,6 +273,22 @@ def edge_weights(
             J.append((*(by_poses[k] * (cycle_weight * root[k])).unbind(0), r[k] * root[k]))
             Jd.append((by_depths[k] * (cycle_weight * root[k]),))
     return *schur.pair_products(J, Jd), value
+
+
+def edge_system(
+    T_c_w: Tensor,
+    x: Tensor,
+    layout: Layout,
+    prior: Tensor,
+    prior_weight: Tensor,
+    *given: Tensor | CycleForm | Kernel | float | None,
+) -> tuple[Tensor, ...]:
+    """`_as_system` of edges; ``given`` are the arguments of `edge_weights` after the first two."""
+    T_rel, Rt = relative_motions(T_c_w, layout.host, layout.target, layout.dtype)
+    e = x - prior
+    g = prior_weight * e
+    weighed = edge_weights(Rt, x.to(layout.dtype), *given)  # type: ignore[arg-type]
+    return _as_system(T_rel, layout, weighed, prior_weight, g, (g * e).sum())
 
 
 def edge_cost(
@@ -283,13 +335,33 @@ def junction_weights(
     robust: Kernel,
     delta: float,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Corner and angle rows of junction pairs, see `RelativeBlocks.weigh`; arguments are `JunctionBlocks`' tensors."""
+    """`schur.pair_products` of the corner and angle rows of junction pairs, and their cost ``()``.
+
+    Arguments are relative motions ``(3, 4, B, T, 1)``, blocks ``(3, B, L)`` and `JunctionBlocks`' own tensors.
+    """
     r, J, Jd, front = junction_rows(Rt, rays, x[:, :, None], uv, arms, K, cosines)
     r = r * weight
     value, root = _robust(r, front, far, robust, delta)
     white = (root * weight)[:, None]
     J = torch.cat((J * white, (r * root)[:, None]), 1)
     return *schur.pair_products([row.unbind(0) for row in J], [row.unbind(0) for row in Jd * white]), value
+
+
+def junction_system(
+    T_c_w: Tensor,
+    x: Tensor,
+    layout: Layout,
+    prior: Tensor,
+    information: Tensor,
+    *given: Tensor | bool | Kernel | float,
+) -> tuple[Tensor, ...]:
+    """`_as_system` of junctions; ``given`` are the arguments of `junction_weights` after the first two."""
+    T_rel, Rt = relative_motions(T_c_w, layout.host, layout.target, layout.dtype)
+    e = x - prior
+    g = (information * e).sum(1)
+    weighed = junction_weights(Rt, x.to(layout.dtype), *given)  # type: ignore[arg-type]
+    V = torch.stack([information[i, j] for i in range(3) for j in range(i, 3)])
+    return _as_system(T_rel, layout, weighed, V, g, (g * e).sum())
 
 
 def junction_cost(
@@ -341,10 +413,10 @@ class EdgeBlocks(RelativeBlocks):
     def _given(self) -> tuple[Tensor | CycleForm | Kernel | float | None, ...]:
         return self.ray, self.line, self.held, self.cycle_weight, self.K, self.form, *self._kernel()
 
-    def weigh(self, Rt: Tensor, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """See `RelativeBlocks.weigh`."""
-        out: tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
-        out = kernel(edge_weights, self.config.compile)(Rt, x, *self._given())
+    def system(self, T_c_w: Tensor, x: Tensor) -> tuple[Tensor, ...]:
+        """See `RelativeBlocks.system`."""
+        linear = kernel(edge_system, self.config.compile)
+        out: tuple[Tensor, ...] = linear(T_c_w, x, self.layout, self.prior, self.prior_weight, *self._given())
         return out
 
     def robust_cost(self, Rt: Tensor, x: Tensor) -> Tensor:
@@ -355,11 +427,6 @@ class EdgeBlocks(RelativeBlocks):
     def prior_cost(self, x: Tensor) -> Tensor:
         """See `RelativeBlocks.prior_cost`."""
         return ((x - self.prior).square() * self.prior_weight).sum()
-
-    def add_prior(self, x: Tensor, V: Tensor, g: Tensor) -> None:
-        """See `RelativeBlocks.add_prior`."""
-        V += self.prior_weight
-        g += self.prior_weight * (x - self.prior)
 
     def alignment_chi2(self, T_c_w: Tensor, x: Tensor) -> FloatArray:
         """Squared whitened alignment residuals in the caller's order ``(P,)``; infinite behind the camera."""
@@ -393,10 +460,10 @@ class JunctionBlocks(RelativeBlocks):
     def _given(self) -> tuple[Tensor | bool | Kernel | float, ...]:
         return self.rays, self.uv, self.arms, self.weight, self.K, self.cosines, *self._kernel()
 
-    def weigh(self, Rt: Tensor, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """See `RelativeBlocks.weigh`."""
-        out: tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
-        out = kernel(junction_weights, self.config.compile)(Rt, x, *self._given())
+    def system(self, T_c_w: Tensor, x: Tensor) -> tuple[Tensor, ...]:
+        """See `RelativeBlocks.system`."""
+        linear = kernel(junction_system, self.config.compile)
+        out: tuple[Tensor, ...] = linear(T_c_w, x, self.layout, self.prior, self.information, *self._given())
         return out
 
     def robust_cost(self, Rt: Tensor, x: Tensor) -> Tensor:
@@ -407,16 +474,7 @@ class JunctionBlocks(RelativeBlocks):
     def prior_cost(self, x: Tensor) -> Tensor:
         """See `RelativeBlocks.prior_cost`."""
         e = x - self.prior
-        return (self._informed(e) * e).sum()
-
-    def add_prior(self, x: Tensor, V: Tensor, g: Tensor) -> None:
-        """See `RelativeBlocks.add_prior`."""
-        for row, (i, j) in enumerate(((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))):
-            V[row] += self.information[i, j]
-        g += self._informed(x - self.prior)
-
-    def _informed(self, e: Tensor) -> Tensor:
-        return (self.information * e).sum(1)
+        return ((self.information * e).sum(1) * e).sum()
 
 
 def collinearity_prior(
