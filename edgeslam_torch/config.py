@@ -123,7 +123,7 @@ class MappingConfig:
     """Frames between keyframes at least."""
     keyframe_max_gap: int = 30
     """Frames between keyframes at most while the camera moves."""
-    keyframe_followed: float = 0.88
+    keyframe_followed: float = 0.92
     """A new keyframe when flow finds fewer than this share of the last one's keypoints."""
     keyframe_overlap: float = 0.7
     """A new keyframe when fewer than this share of the reference keyframe's anchors is matched."""

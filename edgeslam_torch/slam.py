@@ -31,7 +31,7 @@ from edgeslam_torch.mapping.last_refinement import last_refinement, lm_config
 from edgeslam_torch.mapping.mapper import Mapper
 from edgeslam_torch.mapping.slam_map import SlamMap
 from edgeslam_torch.tracking.bootstrap import Bootstrap
-from edgeslam_torch.tracking.flow import FlowTracker, Template, template_of_keyframe, template_of_track
+from edgeslam_torch.tracking.flow import FlowTracker, Followed, Template, join, template_of_keyframe, template_of_track
 from edgeslam_torch.tracking.initialiser import TwoView
 from edgeslam_torch.tracking.keyframe_choice import few_matches, is_due, lost_sight
 from edgeslam_torch.tracking.lazy_view import LazyView
@@ -180,37 +180,37 @@ class EdgeSlam:
         self._frames_since_keyframe += 1
         with self.map.lock:
             with self._timed("tracking"):
-                located = self._follow(seen, T_predicted)
+                followed = self._follow(seen, T_predicted)
+            located = None if followed is None else self._locate_followed(followed)
             if located is None or (located.due and self._pending is None):
-                located = self._match(seen, T_predicted, located)
+                matched = self._match(seen, T_predicted, followed)
+                if matched is None and located is not None:  # in a blurred image flow finds what matching does not
+                    matched = replace(located, due=False)
+                located = matched
             if located is not None:
                 return self._tracked(frame, seen, located)
         return self._lost(frame, seen.view, T_predicted)
 
-    def _follow(self, seen: LazyView, T_predicted: FloatArray) -> "_Located | None":
+    def _follow(self, seen: LazyView, T_predicted: FloatArray) -> Followed | None:
         """By optical flow from the last keyframe."""
         if self._template is None or self._lost_frames > 0 or not self.config.flow.enabled:
             return None
-        followed = self._flow.follow(self._template, seen.grey, T_predicted)
-        if followed is None:
-            return None
-        reference = self.map.keyframes.get(self._template.keyframe_id, self.map.latest())
+        return self._flow.follow(self._template, seen.grey, T_predicted)
+
+    def _locate_followed(self, followed: Followed) -> "_Located":
+        reference = self.map.keyframes.get(followed.keyframe_id, self.map.latest())
         parallax_rad = self._parallax(followed.track, reference)
         due = self._is_due(lost_sight(followed, self.config.mapping), parallax_rad)
         return _Located(followed.track, reference, parallax_rad, due)
 
-    def _match(self, seen: LazyView, T_predicted: FloatArray, followed: "_Located | None") -> "_Located | None":
+    def _match(self, seen: LazyView, T_predicted: FloatArray, followed: Followed | None) -> "_Located | None":
         """By the frame's own keypoints: where flow finds nothing, and what a keyframe needs."""
         with self._timed("features"):
             view = seen.view
         with self._timed("tracking"):
-            if followed is not None:
-                track = self._tracker.track(view, followed.track.T_c_w, followed.track.anchor)
-                relocalised = False
-            else:
-                track, relocalised = self._find(view, T_predicted)
-        if track is None:  # in a blurred image flow finds what matching does not
-            return None if followed is None else replace(followed, due=False)
+            track, relocalised = self._find(view, T_predicted, followed)
+        if track is None:
+            return None
         reference = self._tracker.local_keyframes(track.anchor)[0]
         parallax_rad = self._parallax(track, reference)
         few = few_matches(track, reference, self.map, self.config.mapping)
@@ -224,8 +224,11 @@ class EdgeSlam:
     def _is_due(self, changed: bool, parallax_rad: float) -> bool:
         return is_due(changed, parallax_rad, self._frames_since_keyframe, self.config.mapping)
 
-    def _find(self, view: View, T_predicted: FloatArray) -> tuple[Track | None, bool]:
-        """Track near the prediction, else search the keyframes; and whether the search found it."""
+    def _find(self, view: View, T_predicted: FloatArray, followed: Followed | None) -> tuple[Track | None, bool]:
+        """Track where flow or the prediction says, else search the keyframes; and whether the search found it."""
+        if followed is not None:
+            track = self._tracker.track(view, followed.track.T_c_w, followed.track.anchor)
+            return None if track is None else join(track, followed, view, self.config.orb.scale_factor), False
         if self._lost_frames == 0:
             track = self._tracker.track(view, T_predicted, self._recent)
             if track is not None:

@@ -5,11 +5,12 @@ and matched anew: pyramidal Lucas-Kanade flow (Lucas and Kanade, IJCAI 1981; Bou
 quarter of the time. It goes from the keyframe to the frame, never from frame to frame, so that nothing drifts.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from edgeslam_torch.config import FlowConfig, OrbConfig
 from edgeslam_torch.frontend.orb import spread
@@ -26,6 +27,9 @@ MAX_DIFFERENCE = 30.0
 
 MIN_DEPTH = 1e-3
 """Map units; nearer anchors are not looked for."""
+
+JOIN_PX = 1.5
+"""At pyramid level 0: a keypoint this near to where flow puts an anchor shows that anchor."""
 
 _STOP = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 15, 0.03)
 """Steps and pixels at which the flow of a point is done."""
@@ -51,8 +55,14 @@ class Template:
 class Followed:
     """What flow says of a frame."""
 
+    keyframe_id: int
+    """Keyframe that the pose hangs on."""
     track: Track
     """Its keypoints are the template's."""
+    uv: FloatArray
+    """``(M, 2)`` undistorted pixels of the track's inliers in the frame."""
+    octave: IntArray
+    """``(M,)`` their pyramid levels."""
     share: float
     """Keypoints that were found again and agree, of those that were looked for."""
 
@@ -75,6 +85,33 @@ def _template(
     keyframe_id: int, features: FrameFeatures, anchor: IntArray, grey: NDArray[np.uint8], camera: Camera
 ) -> Template:
     return Template(keyframe_id, grey, camera.distort_points(features.uv), features.octave, anchor)
+
+
+def join(track: Track, followed: Followed, view: View, scale_factor: float) -> Track:
+    """A matched track with the anchors that flow alone found, wherever a keypoint that is still free shows them.
+
+    A descriptor fails on one corner in two from keyframe to keyframe. Flow's own pixels would do as observations, but
+    they slide by a little each time, always the same way; detected corners do not.
+    """
+    free = np.setdiff1d(np.arange(len(view.features.uv)), track.keypoint)
+    missing = ~np.isin(followed.track.anchor, track.anchor)
+    if len(free) == 0:
+        return track
+    anchor, octave = followed.track.anchor[missing], followed.octave[missing]
+    distance, nearest = cKDTree(view.features.uv[free]).query(followed.uv[missing])
+    keypoint = free[nearest]
+    near = distance < JOIN_PX * scale_factor**octave
+    near &= np.abs(view.features.octave[keypoint] - octave) <= 1
+    best_first = np.flatnonzero(near)[np.argsort(distance[near], kind="stable")]
+    keypoint, first = np.unique(keypoint[best_first], return_index=True)
+    anchor = anchor[best_first][first]
+    return replace(
+        track,
+        keypoint=np.concatenate([track.keypoint, keypoint]),
+        anchor=np.concatenate([track.anchor, anchor]),
+        matched_keypoint=np.concatenate([track.matched_keypoint, keypoint]),
+        matched_anchor=np.concatenate([track.matched_anchor, anchor]),
+    )
 
 
 class FlowTracker:
@@ -102,14 +139,16 @@ class FlowTracker:
         visible = wanted[in_view]
         if len(visible) < self.min_inliers:
             return None
-        uv, found = self._flow(template, grey, visible, guess[in_view])
-        keypoint = visible[found]
-        track = self._solve(template, keypoint, uv[found], T_c_w)
+        raw_uv, found = self._flow(template, grey, visible, guess[in_view])
+        keypoint, uv = visible[found], self.camera.undistort_points(raw_uv[found])
+        track = self._solve(template, keypoint, uv, T_c_w)
         if track.inliers < max(self.min_inliers, self.config.min_share * len(wanted)):
             return None
         anchors.visible[template.anchor[visible]] += 1
         anchors.found[track.anchor] += 1
-        return Followed(track, track.inliers / len(wanted))
+        agreeing = np.isin(keypoint, track.keypoint)
+        octave = template.octave[track.keypoint]
+        return Followed(template.keyframe_id, track, uv[agreeing], octave, track.inliers / len(wanted))
 
     def _wanted(self, template: Template) -> IntArray:
         """Keypoints to follow: of too many an even spread, those first that most keyframes have seen."""
@@ -146,14 +185,14 @@ class FlowTracker:
         found = (status.ravel() > 0) & (difference.ravel() < MAX_DIFFERENCE)
         return np.asarray(uv, dtype=np.float32).reshape(-1, 2), found
 
-    def _solve(self, template: Template, keypoint: IntArray, raw_uv: FloatArray, T_c_w: FloatArray) -> Track:
+    def _solve(self, template: Template, keypoint: IntArray, uv: FloatArray, T_c_w: FloatArray) -> Track:
         # What a keyframe's keypoint is off by, its flow is off by too: it weighs no more than a matched one.
         inv_sigma = self.orb.scale_factor ** -template.octave[keypoint].astype(np.float64)
         anchor = template.anchor[keypoint]
         result = refine_pose(
             T_c_w,
             self.map.anchors.p_w[anchor],
-            self.camera.undistort_points(raw_uv).astype(np.float64),
+            uv.astype(np.float64),
             inv_sigma,
             (self.camera.fx, self.camera.fy, self.camera.cx, self.camera.cy),
             config=FINE,

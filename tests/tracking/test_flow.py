@@ -14,7 +14,7 @@ from edgeslam_torch.geometry import se3
 from edgeslam_torch.mapping.keyframe import NO_ANCHOR, make_keyframe
 from edgeslam_torch.mapping.slam_map import SlamMap
 from edgeslam_torch.synthetic.render import render
-from edgeslam_torch.tracking.flow import FlowTracker, template_of_keyframe, template_of_track
+from edgeslam_torch.tracking.flow import FlowTracker, join, template_of_keyframe, template_of_track
 from edgeslam_torch.tracking.keyframe_choice import few_matches, is_due, lost_sight
 from edgeslam_torch.tracking.tracker import Track, make_view
 
@@ -163,6 +163,38 @@ def test_a_matched_frame_can_be_followed_without_being_a_keyframe(scene):
     assert template.keyframe_id == scene.keyframe.id
     followed = scene.tracker().follow(template, grey_at(POSES[1]), se3.inverse(POSES[1]))
     assert error(followed.track.T_c_w, POSES[1])[0] < 0.01
+
+
+def test_what_flow_finds_and_matching_does_not_goes_to_the_keypoint_that_shows_it(scene):
+    """Of a frame's keypoints every second is matched; flow gives the others to the corners under it."""
+    grey = grey_at(POSES[1])
+    view = make_view(OrbExtractor(ORB, CAMERA)(grey), ORB.scale_factor)
+    followed = scene.tracker(points=1000).follow(scene.template, grey, se3.inverse(POSES[1]))
+    nothing = np.zeros(0, dtype=np.int64)
+    T_c_w = followed.track.T_c_w
+    alone = join(Track(T_c_w, nothing, nothing, nothing, nothing, np.eye(6)), followed, view, ORB.scale_factor)
+    assert alone.inliers == alone.matches > 100
+    assert len(np.unique(alone.keypoint)) == len(np.unique(alone.anchor)) == alone.inliers
+    expected = CAMERA.project(se3.transform(se3.inverse(POSES[1]), scene.map.anchors.p_w[alone.anchor]))
+    off = np.linalg.norm(view.features.uv[alone.keypoint] - expected, axis=1)
+    assert (off < 3.0 * 1.2 ** view.features.octave[alone.keypoint]).mean() > 0.9
+
+    some = Track(T_c_w, alone.keypoint[::2], alone.anchor[::2], alone.keypoint[::2], alone.anchor[::2], np.eye(6))
+    joined = join(some, followed, view, ORB.scale_factor)
+    np.testing.assert_array_equal(joined.keypoint[: some.inliers], some.keypoint)  # what matched stays
+    assert set(zip(joined.keypoint.tolist(), joined.anchor.tolist(), strict=True)) >= set(
+        zip(alone.keypoint.tolist(), alone.anchor.tolist(), strict=True)
+    )
+    assert len(np.unique(joined.keypoint)) == len(np.unique(joined.anchor)) == joined.inliers
+
+
+def test_a_frame_whose_keypoints_are_all_matched_gains_nothing(scene):
+    view = make_view(scene.keyframe.features, ORB.scale_factor)
+    followed = scene.tracker().follow(scene.template, scene.grey, scene.keyframe.T_c_w)
+    everything = np.arange(len(view.features.uv))
+    anchor = scene.keyframe.anchor
+    full = Track(scene.keyframe.T_c_w, everything, anchor, everything, anchor, np.eye(6))
+    assert join(full, followed, view, ORB.scale_factor) is full
 
 
 # -- when a keyframe is due -----------------------------------------------------------------------------------------
