@@ -123,8 +123,10 @@ class MappingConfig:
     """Frames between keyframes at least."""
     keyframe_max_gap: int = 30
     """Frames between keyframes at most while the camera moves."""
-    keyframe_followed: float = 0.92
+    keyframe_followed: float = 0.9
     """A new keyframe when flow finds fewer than this share of the last one's keypoints."""
+    keyframe_at_once: float = 0.75
+    """Below this share it does not wait for ``keyframe_min_gap``."""
     keyframe_overlap: float = 0.7
     """A new keyframe when fewer than this share of the reference keyframe's anchors is matched."""
     keyframe_parallax_deg: float = 3.0
@@ -150,7 +152,7 @@ class MappingConfig:
             raise ValueError(f"window must be at least 2, got {self.window}")
         if self.max_keyframes < self.window + self.window_fixed:
             raise ValueError(f"max_keyframes must be at least window + window_fixed, got {self.max_keyframes}")
-        for name in ("keyframe_overlap", "keyframe_followed"):
+        for name in ("keyframe_overlap", "keyframe_followed", "keyframe_at_once"):
             if not 0.0 < getattr(self, name) < 1.0:
                 raise ValueError(f"{name} must be in (0, 1), got {getattr(self, name)}")
 

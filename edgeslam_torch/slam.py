@@ -33,7 +33,7 @@ from edgeslam_torch.mapping.slam_map import SlamMap
 from edgeslam_torch.tracking.bootstrap import Bootstrap
 from edgeslam_torch.tracking.flow import FlowTracker, Followed, Template, join, template_of_keyframe, template_of_track
 from edgeslam_torch.tracking.initialiser import TwoView
-from edgeslam_torch.tracking.keyframe_choice import few_matches, is_due, lost_sight
+from edgeslam_torch.tracking.keyframe_choice import few_matches, is_due, lost_most, lost_sight
 from edgeslam_torch.tracking.lazy_view import LazyView
 from edgeslam_torch.tracking.relocaliser import relocalise
 from edgeslam_torch.tracking.tracker import Track, Tracker, View, make_view, median_parallax
@@ -200,7 +200,8 @@ class EdgeSlam:
     def _locate_followed(self, followed: Followed) -> "_Located":
         reference = self.map.keyframes.get(followed.keyframe_id, self.map.latest())
         parallax_rad = self._parallax(followed.track, reference)
-        due = self._is_due(lost_sight(followed, self.config.mapping), parallax_rad)
+        mapping = self.config.mapping
+        due = self._is_due(lost_sight(followed, mapping), parallax_rad, lost_most(followed, mapping))
         return _Located(followed.track, reference, parallax_rad, due)
 
     def _match(self, seen: LazyView, T_predicted: FloatArray, followed: Followed | None) -> "_Located | None":
@@ -221,8 +222,8 @@ class EdgeSlam:
     def _parallax(self, track: Track, reference: Keyframe) -> float:
         return median_parallax(self.map.anchors.p_w[track.anchor], track.T_c_w, reference.centre_w)
 
-    def _is_due(self, changed: bool, parallax_rad: float) -> bool:
-        return is_due(changed, parallax_rad, self._frames_since_keyframe, self.config.mapping)
+    def _is_due(self, changed: bool, parallax_rad: float, at_once: bool = False) -> bool:
+        return is_due(changed, parallax_rad, self._frames_since_keyframe, self.config.mapping, at_once)
 
     def _find(self, view: View, T_predicted: FloatArray, followed: Followed | None) -> tuple[Track | None, bool]:
         """Track where flow or the prediction says, else search the keyframes; and whether the search found it."""

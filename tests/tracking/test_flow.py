@@ -15,7 +15,7 @@ from edgeslam_torch.mapping.keyframe import NO_ANCHOR, make_keyframe
 from edgeslam_torch.mapping.slam_map import SlamMap
 from edgeslam_torch.synthetic.render import render
 from edgeslam_torch.tracking.flow import FlowTracker, join, template_of_keyframe, template_of_track
-from edgeslam_torch.tracking.keyframe_choice import few_matches, is_due, lost_sight
+from edgeslam_torch.tracking.keyframe_choice import few_matches, is_due, lost_most, lost_sight
 from edgeslam_torch.tracking.tracker import Track, make_view
 
 ORB = OrbConfig(features=500, candidates=800)
@@ -106,6 +106,8 @@ def test_keypoints_out_of_view_count_against_the_share(scene):
     assert error(followed.track.T_c_w, turned)[0] < 0.01
     assert lost_sight(followed, MappingConfig())
     assert not lost_sight(replace(followed, share=1.0), MappingConfig())
+    assert not lost_most(replace(followed, share=0.85), MappingConfig())
+    assert lost_most(replace(followed, share=0.6), MappingConfig())
 
 
 @pytest.mark.parametrize("what", ["black", "noise", "elsewhere", "behind"])
@@ -208,6 +210,8 @@ def test_keyframe_by_view_change_parallax_or_time_but_not_at_once():
     assert is_due(False, much, 5, config)
     assert not is_due(False, some, 29, config)
     assert is_due(False, some, 30, config)
+    assert is_due(True, little, 2, config, at_once=True)
+    assert not is_due(True, little, 1, config, at_once=True)
     assert not is_due(False, little, 1000, config)  # a drone that hovers makes no keyframes
 
 
