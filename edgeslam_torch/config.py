@@ -80,9 +80,9 @@ class FlowConfig:
 
     enabled: bool = True
     """Off: keypoints are detected and matched in every frame."""
-    points: int = 350
+    points: int = 250
     """Keypoints of the last keyframe that are followed at most."""
-    window_px: int = 15
+    window_px: int = 13
     """Side of the patch that is looked for."""
     levels: int = 4
     """Images of the pyramid, each half as large as the one before."""

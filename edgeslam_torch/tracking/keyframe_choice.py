@@ -18,7 +18,7 @@ def lost_sight(followed: Followed, config: MappingConfig) -> bool:
 
 
 def lost_most(followed: Followed, config: MappingConfig) -> bool:
-    """Whether so much of the last keyframe is out of sight that the next one cannot wait: fast turns, low frame rates."""
+    """Whether so much of the last keyframe is out of sight that the next one cannot wait: a fast turn."""
     return followed.share < config.keyframe_at_once
 
 
