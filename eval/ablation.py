@@ -88,6 +88,7 @@ ROWS = (
     ),
     Row("fixed-weights", "fixed weights: no adaptive scales", ("window.adaptive=false",)),
     Row("no-depth-network", "no depth network", ("depth.weights=none",)),
+    Row("no-flow", "no optical flow: every frame matched", ("flow.enabled=false",)),
 )
 """The table of `edgeslam ablation`, top to bottom."""
 
