@@ -34,7 +34,7 @@ def flights(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list:
 
 def test_rows_that_differ_in_the_last_refinement_alone_share_a_flight(flights, tmp_path):
     record = run_ablation(AblationSettings(tmp_path, seeds=(0, 1)), tmp_path / "out", lambda line: None)
-    assert len(flights) == 2 * 4  # as it is, no refinement, literal reprojection, no network
+    assert len(flights) == 2 * 5  # as it is, no refinement, literal reprojection, no network, no flow
     assert all(len(row["runs"]) == 2 for row in record["rows"].values())
     assert record == json.loads((tmp_path / "out" / "ablation.json").read_text())
 
