@@ -80,9 +80,9 @@ class FlowConfig:
 
     enabled: bool = True
     """Off: keypoints are detected and matched in every frame."""
-    points: int = 250
+    points: int = 350
     """Keypoints of the last keyframe that are followed at most."""
-    window_px: int = 13
+    window_px: int = 15
     """Side of the patch that is looked for."""
     levels: int = 4
     """Images of the pyramid, each half as large as the one before."""
@@ -170,7 +170,7 @@ class EdgeConfig:
     """Keyframes that must follow before a keyframe's edges are measured: views from both sides, refined poses."""
     targets: int = 5
     """Keyframes searched for each edge."""
-    max_sigma: float = 0.03
+    max_sigma: float = 0.02
     """Relative depth sigma above which a measured edge point stays out of the map."""
     min_observations: int = 2
     """Keyframes that must agree on a point of the exported map."""
