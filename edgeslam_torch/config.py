@@ -170,7 +170,7 @@ class EdgeConfig:
     """Keyframes that must follow before a keyframe's edges are measured: views from both sides, refined poses."""
     targets: int = 5
     """Keyframes searched for each edge."""
-    max_sigma: float = 0.02
+    max_sigma: float = 0.025
     """Relative depth sigma above which a measured edge point stays out of the map."""
     min_observations: int = 2
     """Keyframes that must agree on a point of the exported map."""
