@@ -59,6 +59,9 @@ MIN_KEYPOINTS = 100
 HANDOVER_INLIERS = 50
 """When fewer of the first keyframe's points are left before initialisation, the next attempt starts from here."""
 
+MOST_WAITING_IN_REAL_TIME = 3
+"""Frames between the first two views that become keyframes in real time; while they are mapped, no other can be."""
+
 LOST_FRAMES_BEFORE_RESTART = 20
 """Frames without a pose after which a new piece of map is started from the predicted one."""
 
@@ -100,8 +103,11 @@ class EdgeSlam:
         """Counts of what went wrong and was mended."""
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="mapping") if realtime else None
         self._pending: Future[_Mapped] | None = None
+        self._initialisation = self.config.initialisation
         if realtime:
             self.events["keyframes_skipped"] = 0
+            most = min(MOST_WAITING_IN_REAL_TIME, self._initialisation.most_keyframes)
+            self._initialisation = replace(self._initialisation, most_keyframes=most)
         self._orb = OrbExtractor(self.config.orb, camera)
         self._tracker = Tracker(self.map, camera, self.config.orb, self.config.tracking)
         self._flow = FlowTracker(self.map, camera, self.config.orb, self.config.flow, self.config.tracking.min_inliers)
@@ -182,7 +188,8 @@ class EdgeSlam:
             with self._timed("tracking"):
                 followed = self._follow(seen, T_predicted)
             located = None if followed is None else self._locate_followed(followed)
-            if located is None or (located.due and self._pending is None):
+            # While the worker is busy no keyframe can be made; matching then finds what it has mapped meanwhile.
+            if located is None or located.due:
                 matched = self._match(seen, T_predicted, followed)
                 if matched is None and located is not None:  # in a blurred image flow finds what matching does not
                     matched = replace(located, due=False)
@@ -325,7 +332,7 @@ class EdgeSlam:
         self._bootstrap = Bootstrap(
             self.map,
             self._tracker,
-            self.config.initialisation,
+            self._initialisation,
             keyframe,
             guess,
             colours_at(keyframe.image, view.features.uv),
