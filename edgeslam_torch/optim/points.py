@@ -28,7 +28,7 @@ _LANES = 128
 """Observations per tile: shorter tiles leave fewer places empty, longer ones make fewer, larger products."""
 _FEW_POSES = 12
 """Up to this many free poses, cutting the anchors into chunks saves less than it costs."""
-_ANCHORS_PER_CHUNK = 512
+_ANCHORS_PER_CHUNK = 192
 _NO_DEPTH_PRIORS = DepthPriors(np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros(0))
 
 
@@ -92,8 +92,8 @@ class Chunk:
     """Anchors ``first <= a < last``."""
     begin: int
     end: int
-    """Places in ``Y (18, ...)``, pose by pose: ``w (last - first)``. Its rows are the anchor's three whitened
-    coordinates by the six of the pose's tangent."""
+    """Rows of ``Y (..., 6)``: the anchors' three whitened coordinates, anchor by anchor, each by the ``w`` poses;
+    read as ``(3 (last - first), 6 w)``."""
     poses: Tensor
     """``(w,)`` free-pose numbers."""
 
@@ -183,27 +183,26 @@ class PointBlocks:
         starts = np.arange(0, A, size)
         length = np.minimum(starts + size, A) - starts
         seen = np.ones((len(starts), F), dtype=bool)
-        place = column[:, None] * A + anchor
+        column = np.broadcast_to(column[:, None], anchor.shape)
+        chunk = anchor // size
         if self.anchor_order is not None:
-            chunk, columns = anchor // size, np.broadcast_to(column[:, None], anchor.shape)
             seen[:] = False
-            seen[chunk[used], columns[used]] = True
-            begin = np.cumsum(seen.sum(1) * length) - seen.sum(1) * length
-            local = np.cumsum(seen, axis=1) - 1
-            place = begin[chunk] + length[chunk] * local[chunk, columns] + anchor - size * chunk
-        ends = np.cumsum(seen.sum(1) * length)
-        width = int(ends[-1]) if len(ends) else 0
-        count = np.bincount(place[used], minlength=width + 1)
-        self.unique = int(count.max()) <= 1
-        # Places of a tile without an observation store their zeros where no pose sees the anchor.
-        waste = int(count.argmin())
-        place[~used] = waste
+            seen[chunk[used], column[used]] = True
+            column = (np.cumsum(seen, axis=1) - 1)[chunk, column]
+        width = seen.sum(1)
+        ends = np.cumsum(3 * width * length)
+        rows = int(ends[-1]) if len(ends) else 0
+        begin = ends - 3 * width * length
+        place = begin[chunk] + width[chunk] * (anchor - size * chunk) + column
+        self.unique = int(np.bincount(place[used], minlength=1).max()) <= 1
+        # Places of a tile without an observation store their zeros behind all others.
+        place = np.where(used, place, rows) + np.where(used, (width * length)[chunk], 0) * np.arange(3)[:, None, None]
         self.entry_place = torch.as_tensor(place.reshape(-1))
         self.chunks = [
             Chunk(
                 first=int(starts[c]),
                 last=int(starts[c] + length[c]),
-                begin=int(ends[c] - seen[c].sum() * length[c]),
+                begin=int(begin[c]),
                 end=int(ends[c]),
                 poses=torch.as_tensor(np.flatnonzero(seen[c])),
             )
@@ -211,7 +210,7 @@ class PointBlocks:
             if seen[c].any()
         ]
         self.dtype = torch.float32 if self.config.float32_blocks else torch.float64
-        self.Y = torch.zeros(18, max(width, waste + 1), dtype=self.dtype)
+        self.Y = torch.zeros(rows + 1, 6, dtype=self.dtype)
 
     def cost(self, T_c_w: Tensor, p: Tensor) -> Tensor:
         """Robust cost ``()`` at poses ``(W, 4, 4)`` and anchors ``(3, A)``."""
@@ -251,40 +250,31 @@ class PointBlocks:
             Y, self.entry_place, self.unique, system, self.factor_place, damping
         )
         F = self.free
-        taken, right = torch.zeros(6, F, 6, F, dtype=S.dtype), torch.zeros(6, F, dtype=S.dtype)
-        whole = len(self.chunks) == 1 and len(self.chunks[0].poses) == F
+        # Sums of 6x6 blocks and of vectors; in the precision of the products, which are long sums themselves.
+        taken, right = torch.zeros(F * F, 36, dtype=Y.dtype), torch.zeros(F, 6, dtype=Y.dtype)
         for chunk, part in self._parts(Y):
             w = len(chunk.poses)
-            # With the long axis first the product takes three quarters of the time, the copy included.
-            tall = part.mT.reshape(-1, 6 * w)
-            product = tall.mT @ tall
-            moved = y[:, chunk.first : chunk.last].reshape(-1).to(Y.dtype) @ tall
-            if whole:
-                taken, right = product.double().view(6, F, 6, F), moved.double().view(6, F)
-            else:
-                i = chunk.poses
-                taken[:, i[:, None], :, i] += product.double().view(6, w, 6, w).permute(1, 3, 0, 2)
-                right[:, i] += moved.double().view(6, w)
+            product = (part.mT @ part).view(w, 6, w, 6).transpose(1, 2).reshape(-1, 36)
+            moved = y[:, chunk.first : chunk.last].reshape(-1).to(Y.dtype) @ part
+            taken.index_add_(0, (F * chunk.poses[:, None] + chunk.poses).view(-1), product)
+            right.index_add_(0, chunk.poses, moved.view(w, 6))
         to_camera = system.to_world.mT
-        half = to_camera @ taken.permute(1, 0, 3, 2).reshape(F, 6, 6 * F)
-        full = half.view(F, 6, F, 6).transpose(1, 2) @ system.to_world
-        S -= full.transpose(1, 2).reshape(6 * F, 6 * F)
-        b -= (to_camera @ right.mT[..., None]).view(-1)
+        half = to_camera @ taken.view(F, F, 6, 6).transpose(1, 2).double().reshape(F, 6, 6 * F)
+        S -= (to_camera @ half.view(6 * F, 6 * F).mT.reshape(F, 6, 6 * F)).view(6 * F, 6 * F)  # it is symmetric
+        b -= (to_camera @ right.double()[..., None]).view(-1)
         return Eliminated(factor, y, Y)
 
     def step(self, system: PointSystem, eliminated: Eliminated, delta: Tensor) -> Tensor:
         """Step of the anchors ``(3, A)`` that goes with the poses' ``delta (6F,)``; before the next `reduce`."""
-        in_world = (system.to_world @ delta.view(-1, 6, 1))[..., 0].mT.to(eliminated.Y.dtype)
+        in_world = (system.to_world @ delta.view(-1, 6, 1))[..., 0].to(eliminated.Y.dtype)
         back = -eliminated.y
         for chunk, part in self._parts(eliminated.Y):
-            row = in_world[:, chunk.poses].reshape(1, 1, -1).expand(3, -1, -1)
-            back[:, chunk.first : chunk.last] -= torch.bmm(row, part)[:, 0]
+            back[:, chunk.first : chunk.last] -= (part @ in_world[chunk.poses].view(-1)).view(3, -1)
         return schur.unwhiten(eliminated.factor, back)
 
     def _parts(self, Y: Tensor) -> list[tuple[Chunk, Tensor]]:
-        """The chunks with their pieces of ``Y``, ``(3, 6 w, last - first)``."""
-        pieces = (Y[:, c.begin : c.end].reshape(3, 6 * len(c.poses), c.last - c.first) for c in self.chunks)
-        return list(zip(self.chunks, pieces, strict=True))
+        """The chunks with their pieces of ``Y``, ``(3 (last - first), 6 w)``."""
+        return [(c, Y[c.begin : c.end].view(-1, 6 * len(c.poses))) for c in self.chunks]
 
     def _kernel(self) -> tuple[Kernel, float]:
         return self.config.kernel, self.config.delta
@@ -407,7 +397,7 @@ def fill(
 
     Args:
         Y: All chunks; changed in place.
-        entry_place: ``(G' L)`` columns of the observations in it.
+        entry_place: ``(3 G' L)`` rows of the anchors' whitened coordinates, by the observations' poses, in it.
         unique: Whether no pose sees an anchor twice: entries can then be stored without adding.
         system: Normal equations.
         factor_place: ``(G', 6, L)`` places of the anchors' factors in ``(6, A)``.
@@ -420,24 +410,24 @@ def fill(
     f = factor.view(-1).index_select(0, factor_place.reshape(-1)).view(factor_place.shape)[:, :, None]
     a, b, c, d, e, f = f.unbind(1)
     first, second, third = system.own[:, 0:3], system.own[:, 1:6:2], system.own[:, 2:9:3]
-    x, y, z = system.position.unbind(1)
-    rows = []
-    for Z in (
-        a * first,
-        torch.addcmul(b * first, c, second),
-        torch.addcmul(torch.addcmul(d * first, e, second), f, third),
-    ):
-        u, v, w = Z.unbind(1)
-        rows += [u, v, w]
-        rows += [torch.addcmul(y * w, z, v, value=-1.0)]
-        rows += [torch.addcmul(z * u, x, w, value=-1.0)]
-        rows += [torch.addcmul(x * v, y, u, value=-1.0)]
-    # Cancellation is behind: what remains is only multiplied with itself.
-    entries = torch.stack(rows).to(Y.dtype).view(18, -1)
+    whitened = torch.stack(
+        (a * first, torch.addcmul(b * first, c, second), torch.addcmul(torch.addcmul(d * first, e, second), f, third))
+    ).to(Y.dtype)  # cancellation is behind: what remains is only multiplied with itself
+    x, y, z = system.position.to(Y.dtype).unbind(1)
+    u, v, w = whitened.unbind(2)
+    turning = torch.stack(
+        (
+            torch.addcmul(y * w, z, v, value=-1.0),
+            torch.addcmul(z * u, x, w, value=-1.0),
+            torch.addcmul(x * v, y, u, value=-1.0),
+        ),
+        2,
+    )
+    entries = torch.cat((whitened, turning), 2).mT.reshape(-1, 6)
     if unique:
-        Y.index_copy_(1, entry_place, entries)
+        Y.index_copy_(0, entry_place, entries)
     else:
-        Y.zero_().index_add_(1, entry_place, entries)
+        Y.zero_().index_add_(0, entry_place, entries)
     return factor, schur.whiten(factor, system.g)
 
 

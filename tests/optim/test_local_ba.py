@@ -529,9 +529,9 @@ def test_kernels_stay_on_their_device():
         out += [*relative.edge_weights(*edge, CycleForm.PIXEL, *robust), relative.edge_cost(*edge, None, *robust)]
         out += [*relative.junction_weights(*corner, False, *robust), relative.junction_cost(*corner, False, *robust)]
         linear = points.point_normals(*point, place.flatten(), place[:, 0].flatten(), some[:B], some)
-        system, entries, damping = points.PointSystem(*linear[:5]), place[:, 0].flatten(), three[0]
+        system, entries, damping = points.PointSystem(*linear[:5]), place[:, :3].flatten(), three[0]
         out += [*linear, points.point_cost(*point)]
-        out += [*points.fill(torch.zeros(18, E, **f), entries, True, system, place[:, :6], damping)]
+        out += [*points.fill(torch.zeros(3 * E, 6, **f), entries, True, system, place[:, :6], damping)]
         for size in (1, 3):
             V, g = torch.zeros(size * (size + 1) // 2, B, L, **f), torch.zeros(size, B, L, **f)
             out += [*schur.eliminate(V, g, torch.zeros(B, T, 6, size, L, **f), torch.zeros((), **f))]
