@@ -40,7 +40,6 @@ class Mapper:
         """
         with self.map.lock:
             self.map.anchors.begin_pass()
-            self.map.refresh_anchors(keyframe.anchor[keyframe.anchor >= 0])
             self.cull_recent_anchors(keyframe)
             neighbours = self.map.covisible(keyframe, self.config.neighbours)
             self.triangulate_new(keyframe, neighbours, colour)
@@ -51,7 +50,8 @@ class Mapper:
         window = choose_window(self.map, keyframe, self.config.window, self.config.window_fixed)
         result = refine(self.map, window, self.camera, self.lm)
         with self.map.lock:
-            self.map.refresh_anchors(window.anchor[self.map.anchors.alive[window.anchor]])
+            # Refinement moves the others by too little to see them from another side.
+            self.map.refresh_anchors(keyframe.anchor[keyframe.anchor >= 0])
             self.cull_keyframes(keyframe)
         return result
 

@@ -138,19 +138,21 @@ class SlamMap:
 
         The newest observation gives descriptor and octave; the direction is the mean over all observations.
         """
-        wanted = np.zeros(len(self.anchors.alive) + 1, dtype=bool)
+        wanted = np.zeros(len(self.anchors.alive) + 1, dtype=bool)  # the last row answers for NO_ANCHOR
         wanted[ids] = True
         wanted[-1] = False
-        self.anchors.normal[ids] = 0.0
-        for keyframe in self.keyframes.values():
-            keypoints = np.flatnonzero(wanted[keyframe.anchor])
-            if len(keypoints) == 0:
-                continue
-            held = keyframe.anchor[keypoints]
-            ray = self.anchors.p_w[held] - keyframe.centre_w
-            distance = np.linalg.norm(ray, axis=1)
-            self.anchors.normal[held] += ray / distance[:, None]
-            self.anchors.max_distance[held] = distance * self.scale_factor ** keyframe.features.octave[keypoints]
-            self.anchors.words[held] = keyframe.words[keypoints]
-        norm = np.linalg.norm(self.anchors.normal[ids], axis=1)
-        self.anchors.normal[ids] /= np.where(norm > 0, norm, 1.0)[:, None]
+        keyframes = list(self.keyframes.values())
+        held = np.concatenate([k.anchor for k in keyframes])
+        seen = np.flatnonzero(wanted[held])
+        held = held[seen]
+        host = np.repeat(np.arange(len(keyframes)), [len(k.anchor) for k in keyframes])[seen]
+        ray = self.anchors.p_w[held] - np.stack([k.centre_w for k in keyframes])[host]
+        distance = np.sqrt(np.einsum("ij,ij->i", ray, ray))
+        ray /= distance[:, None]
+        total = np.stack([np.bincount(held, ray[:, i], len(wanted)) for i in range(3)], axis=1)[ids]
+        norm = np.linalg.norm(total, axis=1)
+        self.anchors.normal[ids] = total / np.where(norm > 0, norm, 1.0)[:, None]
+        # Of several observations of one anchor the last assignment stays: the newest keyframe's.
+        octave = np.concatenate([k.features.octave for k in keyframes])[seen]
+        self.anchors.max_distance[held] = distance * self.scale_factor**octave
+        self.anchors.words[held] = np.concatenate([k.words for k in keyframes])[seen]
