@@ -2,12 +2,15 @@
 
 The depth network (or the anchors around a pixel) says roughly how deep an edge is; where exactly is measured, as in
 semi-dense mapping (Engel et al., ICCV 2013; Mur-Artal and Tardos, RSS 2015), by comparing the grey profile across
-the edge with what the other keyframes show at each hypothesis. An edge that runs along the epipolar line cannot be
+the edge with what the other keyframes show at each hypothesis: first coarsely, in smoothed images to the nearest
+pixel, then around the only good hypothesis with interpolation. An edge that runs along the epipolar line cannot be
 measured and is left out.
+
+Edges are the last axis of every array, so that everything runs over contiguous memory.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -16,17 +19,26 @@ from numpy.typing import NDArray
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.types import FloatArray, IntArray
 
-PROFILE_PX = np.array([-4.0, -2.0, 0.0, 2.0, 4.0])
-"""Offsets along the edge normal at which grey values are compared."""
+STEP_PX = 2.0
+"""Distance of the coarse search's hypotheses in the images; three quarters of the edges are searched more finely."""
+HYPOTHESES = (8, 24)
+"""Fewest and most hypotheses of the coarse search."""
+VALLEY = 2
+"""Steps of the coarse search around the best hypothesis that count as the same valley."""
+UNIQUE = 1.2
+"""How much worse every other valley must be, and a grey level more."""
+FINE_STEP = 0.3
+"""Step of the fine search in steps of the coarse one; it takes three either way."""
 TRUNCATE = 30.0
 """Grey levels; a larger difference says no more (occlusion, highlight)."""
 MAX_COST = 12.0
 """Mean grey difference of an accepted match; sensor noise and resampling give 3 to 6."""
 MIN_ACROSS = 0.25
 """Sine of the angle between an edge and the epipolar line below which the edge slides along the line."""
+MIN_SHARE = 0.5
+"""Sum of these sines over the targets that an edge needs: about two useful targets."""
 
-_OFFSETS = PROFILE_PX.astype(np.float32)[:, None]
-_CHUNK = 1024
+_CHUNK = 4096
 """Edges searched at a time: what a search makes then stays in the processor's cache."""
 
 
@@ -49,6 +61,43 @@ class EdgeDepth:
     """``(E,)`` its standard deviation."""
 
 
+@dataclass(frozen=True, slots=True)
+class _Sampling:
+    """How grey values across an edge are read."""
+
+    offsets_px: FloatArray
+    """``(P, 1, 1)`` along the edge's normal."""
+    interpolation: int
+
+
+_COARSE = _Sampling(np.array([-4.0, -1.5, 1.5, 4.0], np.float32)[:, None, None], cv2.INTER_NEAREST)
+_FINE = _Sampling(np.array([-4.0, -2.0, 0.0, 2.0, 4.0], np.float32)[:, None, None], cv2.INTER_LINEAR)
+
+
+@dataclass(frozen=True, slots=True)
+class _Lines:
+    """Epipolar lines of the host's edges in a target, which sees inverse depth ``rho`` at ``ray + rho step``."""
+
+    grey: NDArray[np.uint8]
+    ray: FloatArray
+    """``(3, E)`` homogeneous pixels of edges infinitely far away."""
+    step: FloatArray
+    """``(3,)``"""
+    normal: FloatArray
+    """``(2, E)`` unit normals of the edges."""
+
+    def of(self, edges: IntArray) -> "_Lines":
+        """The lines of some edges."""
+        return _Lines(self.grey, self.ray.take(edges, axis=1), self.step, self.normal.take(edges, axis=1))
+
+    def pixels(self, rho: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Pixels and depths ``(..., E)`` at inverse depths; the depths in units of the edge's own in the host."""
+        x, y, z = (rho * along + start for along, start in zip(self.step, self.ray, strict=True))
+        x /= z
+        y /= z
+        return x, y, z
+
+
 def measure_edge_depth(
     host: StereoView,
     uv: FloatArray,
@@ -57,7 +106,6 @@ def measure_edge_depth(
     prior_sigma_log: FloatArray,
     targets: list[StereoView],
     camera: Camera,
-    hypotheses: int = 24,
 ) -> EdgeDepth:
     """Inverse depth of edge pixels ``(E, 2)`` of the host by multi-view search.
 
@@ -69,176 +117,182 @@ def measure_edge_depth(
         prior_sigma_log: Its log standard deviation; the search spans two and a half either way.
         targets: Other keyframes with some baseline.
         camera: Intrinsics.
-        hypotheses: Samples of the coarse search.
     """
-    E = len(uv)
-    unknown = EdgeDepth(np.full(E, np.nan), np.full(E, np.nan))
-    if E == 0 or not targets:
-        return unknown
+    inverse_depth, sigma = np.full(len(uv), np.nan), np.full(len(uv), np.nan)
+    if len(uv) == 0 or not targets:
+        return EdgeDepth(inverse_depth, sigma)
+    pixel, across = uv.T.astype(np.float32), normal.T.astype(np.float32)
     reach = np.exp(2.5 * prior_sigma_log)
-    low, high = 1.0 / (prior_depth * reach), reach / prior_depth
-    step = (high - low) / (hypotheses - 1)
-    grid = low[:, None] + step[:, None] * np.arange(hypotheses)
-    rays = np.stack(
-        [(uv[:, 0] - camera.cx) / camera.fx, (uv[:, 1] - camera.cy) / camera.fy, np.ones(E)], axis=1
-    ).astype(np.float32)
-    profile = _profile(host.grey, uv, normal)
-    coarse = _cost(host, rays, normal, profile, grid, targets, camera)
-    best = np.argmin(coarse, axis=1)
-    rows = np.arange(E)
-    lowest = coarse[rows, best]
-    inner = (best > 0) & (best < hypotheses - 1)
-    # Unique: no other valley nearly as deep.
-    for column in range(-3, 4):
-        coarse[rows, np.clip(best + column, 0, hypotheses - 1)] = np.inf
-    rival = coarse.min(axis=1)
-    ok = np.flatnonzero(inner & (lowest < MAX_COST) & (rival > 1.3 * lowest + 1.0))
-    if len(ok) == 0:
-        return unknown
-    fine_step = 0.3 * step[ok]
-    fine_grid = grid[ok, best[ok]][:, None] + fine_step[:, None] * np.arange(-4, 5)
-    fine = _cost(host, rays[ok], normal[ok], profile[:, ok], fine_grid, targets, camera)
-    k = np.clip(np.argmin(fine, axis=1), 1, fine.shape[1] - 2)
-    r = np.arange(len(ok))
-    a, b, c = fine[r, k - 1], fine[r, k], fine[r, k + 1]
-    with np.errstate(divide="ignore", invalid="ignore"):  # infinite cost where no target sees the edge
-        curvature = a - 2.0 * b + c
-        offset = np.clip(0.5 * (a - c) / curvature, -1.0, 1.0)
-    rho = fine_grid[r, k] + offset * fine_step
-    sharp = (curvature > 1e-3) & np.isfinite(offset) & (b < MAX_COST)
-    inverse_depth, sigma = np.full(E, np.nan), np.full(E, np.nan)
-    inverse_depth[ok[sharp]] = rho[sharp]
-    sigma[ok[sharp]] = _sigma(host, rays[ok[sharp]], normal[ok[sharp]], rho[sharp], targets, camera)
+    low, high = ((1.0 / (prior_depth * reach)).astype(np.float32), (reach / prior_depth).astype(np.float32))
+    with np.errstate(divide="ignore", invalid="ignore"):  # pixels of edges beside or behind a target; infinite costs
+        lines = [_epipolar_lines(host, target, pixel, across, camera) for target in targets]
+        edges, rho, step = _coarse_search(_smooth(host.grey), pixel, across, lines, low, high, camera)
+        for part in _parts(len(edges)):
+            some = edges[part]
+            profile = _profile(host.grey, pixel.take(some, axis=1), across.take(some, axis=1), _FINE)
+            near = [line.of(some) for line in lines]
+            inverse_depth[some] = _fine_search(profile, near, rho[part], np.float32(FINE_STEP) * step[part], camera)
+        measured = np.flatnonzero(np.isfinite(inverse_depth))
+        sigma[measured] = _sigma([line.of(measured) for line in lines], inverse_depth[measured])
     return EdgeDepth(inverse_depth, sigma)
 
 
-def _profile(grey: NDArray[np.uint8], uv: FloatArray, normal: FloatArray) -> NDArray[np.uint8]:
-    """Grey values ``(P, E)`` across each edge."""
-    return np.concatenate(
-        [
-            _across(grey, uv[part, :1].astype(np.float32), uv[part, 1:].astype(np.float32), normal[part])[:, :, 0]
-            for part in _parts(len(uv))
-        ],
-        axis=1,
-    )
+def _smooth(grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """What rounding to a pixel does not hurt."""
+    return cv2.blur(grey, (3, 3)).astype(np.uint8, copy=False)
+
+
+def _epipolar_lines(host: StereoView, target: StereoView, uv: FloatArray, normal: FloatArray, camera: Camera) -> _Lines:
+    K = np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
+    R = target.T_c_w[:3, :3] @ host.T_c_w[:3, :3].T
+    t = target.T_c_w[:3, 3] - R @ host.T_c_w[:3, 3]
+    H = (K @ R @ np.linalg.inv(K)).astype(np.float32)
+    turned = R[:2, :2].astype(np.float32) @ normal
+    turned /= np.maximum(np.hypot(*turned), np.float32(1e-6))
+    return _Lines(target.grey, H[:, :2] @ uv + H[:, 2:], (K @ t).astype(np.float32), turned)
 
 
 def _parts(count: int) -> Iterator[slice]:
     return (slice(start, min(start + _CHUNK, count)) for start in range(0, count, _CHUNK))
 
 
-def _across(grey: NDArray[np.uint8], x: FloatArray, y: FloatArray, normal: FloatArray) -> NDArray[np.uint8]:
-    """Grey values ``(P, M, D)`` on the profiles through pixels ``(M, D)`` along normals ``(M, 2)``."""
-    shift = _OFFSETS * normal.T.astype(np.float32)[:, None]
-    maps = [pixel + offset[:, :, None] for pixel, offset in zip((x, y), shift, strict=True)]
-    # Profile first, so that every sum over it runs over contiguous memory.
-    flat = [m.reshape(len(x), -1) for m in maps]  # any shape will do; long rows cost less than short ones
-    seen = cv2.remap(grey, flat[0], flat[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return seen.reshape(maps[0].shape)
+def _coarse_search(
+    grey: NDArray[np.uint8],
+    uv: FloatArray,
+    normal: FloatArray,
+    lines: list[_Lines],
+    low: FloatArray,
+    high: FloatArray,
+    camera: Camera,
+) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Edges ``(N,)`` that look alike at one hypothesis and at no other, its inverse depth and the search's step."""
+    ends = [_measurable(line, low, high, camera) for line in lines]
+    share, length = np.stack([s for s, _ in ends]), np.stack([n for _, n in ends])
+    searched = np.flatnonzero(share.sum(axis=0) >= MIN_SHARE)
+    if len(searched) == 0:
+        return searched, low[:0], low[:0]
+    count = int(np.clip(np.quantile(length[share > 0], 0.75) / STEP_PX + 1.5, *HYPOTHESES))
+    step = (high - low) / np.float32(count - 1)
+    smooth = [_Lines(_smooth(line.grey), line.ray, line.step, line.normal) for line in lines]
+    found = []
+    for part in _parts(len(searched)):
+        some = searched[part]
+        profile = _profile(grey, uv.take(some, axis=1), normal.take(some, axis=1), _COARSE)
+        near = [line.of(some) for line in smooth]
+        cost = _cost(profile, near, share.take(some, axis=1), low[some], step[some], count, _COARSE)
+        best = cost.argmin(axis=0)
+        lowest = cost.min(axis=0)
+        # Unique: no other valley nearly as deep.
+        cost[np.abs(np.arange(count)[:, None] - best) <= VALLEY] = np.inf
+        good = (best > 0) & (best < count - 1) & (lowest < MAX_COST) & (cost.min(axis=0) > UNIQUE * lowest + 1.0)
+        found.append((some[good], low[some[good]] + best[good].astype(np.float32) * step[some[good]]))
+    edges, rho = (np.concatenate(side) for side in zip(*found, strict=True))
+    return edges, rho, step[edges]
 
 
-def _relative(host: StereoView, target: StereoView) -> tuple[FloatArray, FloatArray]:
-    R = target.T_c_w[:3, :3] @ host.T_c_w[:3, :3].T
-    return R.astype(np.float32), (target.T_c_w[:3, 3] - R @ host.T_c_w[:3, 3]).astype(np.float32)
+def _fine_search(
+    profile: NDArray[np.uint8], lines: list[_Lines], rho: FloatArray, step: FloatArray, camera: Camera
+) -> FloatArray:
+    """Inverse depth ``(E,)`` of the lowest cost around ``rho``, by a parabola; NaN where there is no good one."""
+    count = 7
+    first = rho - count // 2 * step
+    share = np.stack([_measurable(line, first, first + (count - 1) * step, camera)[0] for line in lines])
+    cost = _cost(profile, lines, share, first, step, count, _FINE)
+    k, edge = np.clip(cost.argmin(axis=0), 1, count - 2), np.arange(len(rho))
+    a, b, c = cost[k - 1, edge], cost[k, edge], cost[k + 1, edge]
+    curvature = a - 2.0 * b + c
+    offset = np.clip(0.5 * (a - c) / curvature, -1.0, 1.0)
+    sharp = (curvature > 1e-3) & np.isfinite(offset) & (b < MAX_COST)
+    refined: FloatArray = np.where(sharp, first + (k + offset) * step, np.nan)
+    return refined
+
+
+def _measurable(lines: _Lines, low: FloatArray, high: FloatArray, camera: Camera) -> tuple[FloatArray, FloatArray]:
+    """How much of each search segment crosses the edge ``(E,)``, and its length [px].
+
+    Zero where it does not cross, or where the segment is not wholly in the target.
+    """
+    (x0, y0, z0), (x1, y1, z1) = lines.pixels(low), lines.pixels(high)
+    inside = np.minimum(z0, z1) > 0
+    for p0, p1, size in ((x0, x1, camera.width), (y0, y1, camera.height)):
+        inside &= (np.minimum(p0, p1) > 5) & (np.maximum(p0, p1) < size - 6)
+    du, dv = x1 - x0, y1 - y0
+    length = np.hypot(du, dv)
+    share = np.abs(du * lines.normal[0] + dv * lines.normal[1]) / np.maximum(length, np.float32(1e-6))
+    share[~(inside & (share > MIN_ACROSS))] = 0.0
+    return share, length
 
 
 def _cost(
-    host: StereoView,
-    rays: FloatArray,
-    normal: FloatArray,
     profile: NDArray[np.uint8],
-    inverse_depth: FloatArray,
-    targets: list[StereoView],
-    camera: Camera,
+    lines: list[_Lines],
+    share: FloatArray,
+    first: FloatArray,
+    step: FloatArray,
+    count: int,
+    sampling: _Sampling,
 ) -> FloatArray:
-    """Mean truncated grey difference ``(E, D)`` over the targets that can see and measure each edge."""
-    E, D = inverse_depth.shape
-    rho = inverse_depth.astype(np.float32)
-    total = np.zeros((E, D), np.float32)
-    weight = np.full(E, 1e-6, np.float32)
-    for target in targets:
-        R, t = _relative(host, target)
-        a = rays @ R.T
-        turned = normal @ R[:2, :2].T
-        turned /= np.maximum(np.linalg.norm(turned, axis=1, keepdims=True), 1e-6)
-        seen, share = _measurable(a, rho, t, turned, camera)
-        # In pixels: the numerators of x and y.
-        a = a * np.array([camera.fx, camera.fy, 1.0], np.float32)
-        step = t * np.array([camera.fx, camera.fy, 1.0], np.float32)
-        for part in _parts(len(seen)):
-            rows, across = seen[part], share[part]
-            ray, inverse = a[rows], rho[rows]
-            z, x, y = (inverse * step[k] for k in (2, 0, 1))
-            z += ray[:, 2:]
-            x += ray[:, 0:1]
-            y += ray[:, 1:2]
-            x /= z
-            y /= z
-            x += np.float32(camera.cx)
-            y += np.float32(camera.cy)
-            grey = _across(target.grey, x, y, turned[rows])
-            total[rows] += across[:, None] * _difference(grey, profile[:, rows])
-            weight[rows] += across
-    cost = total / weight[:, None]
-    cost[weight < 0.5] = np.inf  # fewer than about two useful targets
-    return cost
+    """Mean truncated grey difference ``(D, E)`` from profiles ``(P, E)`` over the targets, weighted by ``share``.
+
+    The ``count`` hypotheses of an edge begin at the inverse depth ``first`` and are ``step`` apart.
+    """
+    total = np.zeros((count, len(first)), np.float32)
+    hypothesis = np.arange(count, dtype=np.float32)[:, None]
+    for line, across in zip(lines, share, strict=True):
+        seen = np.flatnonzero(across)
+        if len(seen) == 0:
+            continue
+        near = line.of(seen)
+        x, y, _ = near.pixels(first[seen] + hypothesis * step[seen])
+        difference = _difference(_across(near.grey, x, y, near.normal, sampling), profile.take(seen, axis=1))
+        # Spread over all edges, of which those not seen weigh nothing: a third of the time of adding at indices.
+        total += across * difference.take(np.cumsum(across > 0) - 1, axis=1)
+    weight = share.sum(axis=0)
+    total[:, weight < MIN_SHARE] = np.inf
+    total /= np.maximum(weight, MIN_SHARE)
+    return total
+
+
+def _profile(grey: NDArray[np.uint8], uv: FloatArray, normal: FloatArray, sampling: _Sampling) -> NDArray[np.uint8]:
+    """The host's grey values ``(P, E)`` across edges ``(2, E)``."""
+    exact = replace(sampling, interpolation=cv2.INTER_LINEAR)
+    return _across(grey, uv[:1], uv[1:], normal, exact)[:, 0]
+
+
+def _across(
+    grey: NDArray[np.uint8], x: FloatArray, y: FloatArray, normal: FloatArray, sampling: _Sampling
+) -> NDArray[np.uint8]:
+    """Grey values ``(P, D, E)`` on the profiles through pixels ``(D, E)`` along normals ``(2, E)``."""
+    u, v = (pixel + sampling.offsets_px * along for pixel, along in zip((x, y), normal, strict=True))
+    flat_u, flat_v = (m.reshape(-1, m.shape[-1]) for m in (u, v))
+    seen = cv2.remap(grey, flat_u, flat_v, sampling.interpolation, borderMode=cv2.BORDER_REPLICATE)
+    return seen.reshape(u.shape)
 
 
 def _difference(seen: NDArray[np.uint8], expected: NDArray[np.uint8]) -> FloatArray:
-    """Mean truncated difference ``(M, D)`` of profiles ``(P, M, D)`` from the host's ``(P, M)``, in grey levels.
+    """Mean truncated difference ``(D, E)`` of profiles ``(P, D, E)`` from the host's ``(P, E)``, in grey levels.
 
     Half of a common brightness change is taken out: exposure drifts, but brightness also tells edges apart. All of it
-    in 16-bit integers, which hold tenths of grey levels (``2 P``) exactly and are four times as fast as floats.
+    in 16-bit integers, which hold the ``2 P``-th part of a grey level exactly and are four times as fast as floats.
     """
-    tenths = 2 * len(seen)
+    parts = 2 * len(seen)
     difference = seen.astype(np.int16)
-    difference -= expected.astype(np.int16)[:, :, None]
+    difference -= expected.astype(np.int16)[:, None]
     common = difference.sum(axis=0, dtype=np.int16)
-    difference *= np.int16(tenths)
+    difference *= np.int16(parts)
     difference -= common
     np.abs(difference, out=difference)
-    np.minimum(difference, np.full_like(difference[0], tenths * TRUNCATE), out=difference)
-    return difference.sum(axis=0, dtype=np.int16) * np.float32(1.0 / (tenths * len(seen)))
+    most = np.full_like(difference[0], parts * TRUNCATE)  # the minimum with one number takes four times as long
+    np.minimum(difference, most, out=difference)
+    return difference.sum(axis=0, dtype=np.int16) * np.float32(1.0 / (parts * len(seen)))
 
 
-def _measurable(
-    rays: FloatArray, rho: FloatArray, t: FloatArray, normal: FloatArray, camera: Camera
-) -> tuple[IntArray, FloatArray]:
-    """Edges whose whole search segment lies in the target, and the share of it that crosses the edge."""
-    ends = []
-    inside = np.ones(len(rays), dtype=bool)
-    for column in (0, -1):
-        z = rays[:, 2] + rho[:, column] * t[2]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            x = camera.fx * (rays[:, 0] + rho[:, column] * t[0]) / z + camera.cx
-            y = camera.fy * (rays[:, 1] + rho[:, column] * t[1]) / z + camera.cy
-        inside &= (z > 0) & (x > 5) & (x < camera.width - 6) & (y > 5) & (y < camera.height - 6)
-        ends.append((x, y))
-    (x0, y0), (x1, y1) = ends
-    du, dv = x1 - x0, y1 - y0
-    across = np.abs(du * normal[:, 0] + dv * normal[:, 1]) / np.maximum(np.hypot(du, dv), 1e-6)
-    rows = np.flatnonzero(inside & (across > MIN_ACROSS))
-    return rows, across[rows].astype(np.float32)
-
-
-def _sigma(
-    host: StereoView,
-    rays: FloatArray,
-    normal: FloatArray,
-    rho: FloatArray,
-    targets: list[StereoView],
-    camera: Camera,
-) -> FloatArray:
+def _sigma(lines: list[_Lines], rho: FloatArray) -> FloatArray:
     """Inverse-depth sigma of half a pixel across the edge, all useful targets together."""
     information = np.full(len(rho), 1e-12)
-    for target in targets:
-        R, t = _relative(host, target)
-        a = rays @ R.T
-        z = a[:, 2] + rho * t[2]
+    for line in lines:
+        x, y, z = line.pixels(rho)
         # Derivative of the pixel by inverse depth.
-        du = camera.fx * (t[0] * a[:, 2] - a[:, 0] * t[2]) / z**2
-        dv = camera.fy * (t[1] * a[:, 2] - a[:, 1] * t[2]) / z**2
-        turned = normal @ R[:2, :2].T
-        turned /= np.maximum(np.linalg.norm(turned, axis=1, keepdims=True), 1e-6)
-        information += (du * turned[:, 0] + dv * turned[:, 1]) ** 2 / 0.5**2
+        du, dv = (line.step[0] - x * line.step[2]) / z, (line.step[1] - y * line.step[2]) / z
+        information += (du * line.normal[0] + dv * line.normal[1]) ** 2 / 0.5**2
     return 1.0 / np.sqrt(information)
