@@ -17,8 +17,18 @@ if TYPE_CHECKING:
 
 def canny(grey: NDArray[np.uint8], low: float, high: float) -> NDArray[np.bool_]:
     """Edge mask ``(H, W)`` of a grey image; thresholds in grey levels of the 3x3 Sobel gradient."""
-    smooth = cv2.GaussianBlur(grey, (5, 5), 1.0)
-    return cv2.Canny(smooth, low, high, L2gradient=True).astype(bool)
+    return canny_of_gradient(*gradient(grey), low, high)
+
+
+def gradient(grey: NDArray[np.uint8]) -> tuple[NDArray[np.int16], NDArray[np.int16]]:
+    """3x3 Sobel gradient of the smoothed image along x and y, ``(H, W)`` each: the one that `canny` looks at."""
+    gx, gy = cv2.spatialGradient(cv2.GaussianBlur(grey, (5, 5), 1.0), ksize=3, borderType=cv2.BORDER_REPLICATE)
+    return gx.astype(np.int16, copy=False), gy.astype(np.int16, copy=False)
+
+
+def canny_of_gradient(gx: NDArray[np.int16], gy: NDArray[np.int16], low: float, high: float) -> NDArray[np.bool_]:
+    """`canny` for who has the gradient already."""
+    return cv2.Canny(gx, gy, low, high, L2gradient=True).astype(bool)
 
 
 def canny_batch(images: "Tensor", low: float, high: float) -> "Tensor":

@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from edgeslam_torch.frontend.canny import canny
+from edgeslam_torch.frontend.canny import canny_of_gradient, gradient
 from edgeslam_torch.frontend.image import as_grey, colours_at
 from edgeslam_torch.types import Edges, FloatArray
 
@@ -19,7 +19,8 @@ def extract_edges(image: np.ndarray, low: float, high: float, most: int, border_
         border_px: Margin without edges, where gradients and warped patches leave the image.
     """
     grey = as_grey(image)
-    mask = canny(grey, low, high)
+    along_x, along_y = gradient(grey)
+    mask = canny_of_gradient(along_x, along_y, low, high)
     mask[:border_px] = mask[-border_px:] = False
     mask[:, :border_px] = mask[:, -border_px:] = False
     at = cv2.findNonZero(mask.view(np.uint8))  # in np.nonzero's order, at a fifth of its time
@@ -30,9 +31,7 @@ def extract_edges(image: np.ndarray, low: float, high: float, most: int, border_
         order = np.argsort(key.astype(np.uint16), kind="stable")[:most]  # which sorts 16 bits by counting
         order.sort()
         u, v = u[order], v[order]
-    smooth = cv2.GaussianBlur(grey, (5, 5), 1.0)
-    gx = cv2.Sobel(smooth, cv2.CV_32F, 1, 0)[v, u]
-    gy = cv2.Sobel(smooth, cv2.CV_32F, 0, 1)[v, u]
+    gx, gy = along_x[v, u].astype(np.float32), along_y[v, u].astype(np.float32)
     norm = np.maximum(np.hypot(gx, gy), 1e-6)
     normal: FloatArray = np.stack([gx / norm, gy / norm], axis=1).astype(np.float32)
     uv: FloatArray = np.stack([u, v], axis=1).astype(np.float32)
