@@ -23,6 +23,9 @@ AGREE_DEPTH = 0.04
 RECENT_HOSTS = 40
 """Latest keyframes whose edges a new one's are compared with."""
 
+_REACH = math.ceil(AGREE_PX + 0.5)
+"""Radius [px] of a painted edge: a query may be rounded by half a pixel."""
+
 
 @dataclass(slots=True)
 class EdgePoints:
@@ -102,8 +105,7 @@ class EdgeMap:
             colour=edges.colour[known][good],
             observations=np.ones(int(good.sum()), dtype=np.int32),
         )
-        for other in self._overlapping(keyframe):
-            self._count_agreement(points, other)
+        self._count_agreement(points, self._overlapping(keyframe))
         self.hosts.append(points)
         self._bound()
 
@@ -141,20 +143,22 @@ class EdgeMap:
         near = {k.id for k in self.map.covisible(keyframe, 3 * self.config.targets)}
         return [h for h in self.hosts[-RECENT_HOSTS:] if h.keyframe_id in near][-8:]
 
-    def _count_agreement(self, points: EdgePoints, other: EdgePoints) -> None:
+    def _count_agreement(self, points: EdgePoints, others: list[EdgePoints]) -> None:
         """Raise the count of points that two keyframes measured alike: the cycle of paper eqs. (17)-(22), as a test."""
-        if len(points.uv) == 0 or len(other.uv) == 0:
+        if len(points.uv) == 0:
             return
-        T = self.map.pose_of(other.keyframe_id) @ se3.inverse(self.map.pose_of(points.keyframe_id))
-        p_o = se3.transform(T, points.p_c)
-        front = np.flatnonzero(p_o[:, 2] > 0)
-        nearest = nearest_edge(other.uv, self.camera.project(p_o[front]), (self.camera.width, self.camera.height))
-        found = nearest >= 0
-        mine, theirs = front[found], nearest[found]
-        z_theirs = other.p_c[theirs, 2]
-        same = np.abs(p_o[mine, 2] - z_theirs) < AGREE_DEPTH * z_theirs
-        points.observations[mine[same]] += 1
-        other.observations[np.unique(theirs[same])] += 1
+        painted = PaintedEdges.of(points.uv, (self.camera.width, self.camera.height))
+        T_p_w = self.map.pose_of(points.keyframe_id)
+        for other in others:
+            p = se3.transform(T_p_w @ se3.inverse(self.map.pose_of(other.keyframe_id)), other.p_c)
+            front = np.flatnonzero(p[:, 2] > 0)
+            nearest = painted.nearest(self.camera.project(p[front]))
+            found = nearest >= 0
+            mine, theirs = nearest[found], front[found]
+            z_mine = points.p_c[mine, 2]
+            same = np.abs(p[theirs, 2] - z_mine) < AGREE_DEPTH * z_mine
+            other.observations[theirs[same]] += 1
+            points.observations[np.unique(mine[same])] += 1
 
     def points(self) -> PointCloud:
         """Edge points that several keyframes agree on, fused in cells, in the map's world frame."""
@@ -171,24 +175,37 @@ class EdgeMap:
         return fuse(p_w[agreed], sigma[agreed], colour[agreed], count[agreed], self.config.voxel * float(depth))
 
 
-def nearest_edge(edges: FloatArray, uv: FloatArray, size: tuple[int, int]) -> IntArray:
-    """Index of the edge pixel ``(E, 2)`` nearest to each of ``(N, 2)``, -1 where none is within `AGREE_PX`.
+@dataclass(frozen=True, slots=True)
+class PaintedEdges:
+    """Edge pixels painted into an image of their indices: a third of what a tree takes to be built and asked."""
 
-    Painted into an image of ``size`` (width, height), the nearest last: a third of what a tree takes to be built and
-    asked. Queries are rounded to pixels to be looked up, so that of two edges nearly as near either may be named.
-    """
-    reach = math.ceil(AGREE_PX + 0.5)
-    width, height = (n + 2 * reach for n in size)
-    index = np.full(width * height, -1, dtype=np.int32)
-    u, v = np.rint(edges).astype(np.int64).T + reach
-    flat, order = v * width + u, np.arange(len(edges), dtype=np.int32)
-    for offset in _disc(reach, width):
-        index[flat + offset] = order
-    near = np.clip(np.rint(uv), -1, size).astype(np.int64) + reach
-    found: IntArray = index[near[:, 1] * width + near[:, 0]].astype(np.int64)
-    apart = edges[found] - uv
-    found[(apart * apart).sum(axis=1) > AGREE_PX**2] = -1
-    return found
+    uv: FloatArray
+    """``(E, 2)``"""
+    index: IntArray
+    """``(H + 2 R, W + 2 R)`` edge within `AGREE_PX` of each pixel, or a little more, -1 where there is none."""
+
+    @classmethod
+    def of(cls, uv: FloatArray, size: tuple[int, int]) -> "PaintedEdges":
+        """Paint edge pixels ``(E, 2)`` of an image of ``size`` (width, height), the nearest last."""
+        width, height = (n + 2 * _REACH for n in size)
+        index = np.full(width * height, -1, dtype=np.int32)
+        u, v = np.rint(uv).astype(np.int64).T + _REACH
+        flat, order = v * width + u, np.arange(len(uv), dtype=np.int32)
+        for offset in _disc(_REACH, width):
+            index[flat + offset] = order
+        return cls(uv, index.reshape(height, width))
+
+    def nearest(self, uv: FloatArray) -> IntArray:
+        """Index of the edge pixel nearest to each of ``(N, 2)``, -1 where none is within `AGREE_PX`.
+
+        Queries are rounded to pixels to be looked up, so that of two edges nearly as near either may be named.
+        """
+        height, width = self.index.shape
+        u, v = (np.clip(np.rint(uv) + _REACH, 0, (width - 1, height - 1))).astype(np.int64).T
+        found: IntArray = self.index[v, u].astype(np.int64)
+        apart = self.uv[found] - uv
+        found[(apart * apart).sum(axis=1) > AGREE_PX**2] = -1
+        return found
 
 
 def _disc(radius: int, width: int) -> list[int]:

@@ -6,7 +6,7 @@ from point_map import CAMERA, PointMap, small_motion
 
 from edgeslam_torch.config import EdgeConfig
 from edgeslam_torch.geometry import se3
-from edgeslam_torch.mapping.edge_map import AGREE_PX, EdgeMap, EdgePoints, fuse, nearest_edge
+from edgeslam_torch.mapping.edge_map import AGREE_PX, EdgeMap, EdgePoints, PaintedEdges, fuse
 
 
 def test_two_points_of_one_cell_worked_by_hand():
@@ -65,7 +65,7 @@ def test_points_that_two_keyframes_measured_alike_count_twice(points):
     p_w = points.world.p_w[points.world.visible[0] & points.world.visible[1]][:60]
     a, b = host(points, 0, p_w), host(points, 1, p_w)
     b.p_c[:10] *= 1.2  # measured 20 % deeper: not the same point
-    edge_map(points)._count_agreement(a, b)
+    edge_map(points)._count_agreement(a, [b])
     lonely = np.flatnonzero(a.observations == 1)
     assert set(range(10)) <= set(lonely)
     assert len(lonely) < 15  # another edge pixel may lie nearer by chance
@@ -73,11 +73,12 @@ def test_points_that_two_keyframes_measured_alike_count_twice(points):
 
 
 def test_points_behind_the_other_keyframe_do_not_count(points, rng):
-    p_w = points.world.p_w[:40]
+    p_w = points.world.p_w[points.world.visible[0] & points.world.visible[1]][:40]
     a, b = host(points, 0, p_w), host(points, 1, p_w)
     points.keyframes[1].T_c_w = se3.exp(np.array([0, 0, 0, 0, np.pi, 0])) @ points.keyframes[1].T_c_w
-    edge_map(points)._count_agreement(a, b)
+    edge_map(points)._count_agreement(a, [b])
     assert (a.observations == 1).all()
+    assert (b.observations == 1).all()
 
 
 def test_edge_points_move_with_their_keyframe(points, rng):
@@ -137,7 +138,7 @@ def test_the_nearest_edge_pixel_is_found_within_two_pixels(rng):
     size = (160, 120)
     edges = np.unique(rng.integers(0, size, (400, 2)), axis=0).astype(np.float32)
     uv = np.concatenate([rng.uniform(-5, 165, (2000, 2)), [[-1e7, 4.0], [159.4, 1e9]]])
-    found = nearest_edge(edges, uv, size)
+    found = PaintedEdges.of(edges, size).nearest(uv)
     apart = np.linalg.norm(edges[None] - uv[:, None], axis=2)
     nearest = apart.min(axis=1)
     named = apart[np.arange(len(uv)), found]
