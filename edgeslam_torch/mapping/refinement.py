@@ -108,6 +108,7 @@ def window_problem(
     uv = np.concatenate([k.features.uv[s] for k, s in zip(keyframes, keypoint, strict=True)])
     octave = np.concatenate([k.features.octave[s] for k, s in zip(keyframes, keypoint, strict=True)])
     alike = config.kernel is Kernel.L2
+    shrink = slam_map.scale_factor ** -np.arange(slam_map.levels, dtype=np.float64)
     extent = held_extent(window)
     problem = WindowProblem(
         T_c_w=np.stack([k.T_c_w for k in keyframes]),
@@ -116,7 +117,7 @@ def window_problem(
         obs_pose=np.concatenate(pose),
         obs_anchor=row,
         uv=uv.astype(np.float64),
-        inv_sigma=np.ones(len(row)) if alike else slam_map.scale_factor ** -octave.astype(np.float64),
+        inv_sigma=np.ones(len(row)) if alike else shrink[octave],
         K=(camera.fx, camera.fy, camera.cx, camera.cy),
         scale_priors=() if extent is None else (extent,),
     )

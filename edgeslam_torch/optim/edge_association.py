@@ -98,12 +98,15 @@ def associate_edges(
     """
     f, c = np.array(K[:2]), np.array(K[2:])
     parts = []
-    for pose in np.unique(pair_pose):
+    order = np.argsort(pair_pose, kind="stable")
+    poses, first = np.unique(np.asarray(pair_pose)[order], return_index=True)
+    T_w_c = se3.inverse(T_c_w)
+    for pose, mine in zip(poses, np.split(order, first[1:]), strict=False):  # without pairs there is one empty piece
         field = fields[pose]
         if field is None or len(field.edges.uv) == 0:
             continue
-        edge = np.asarray(pair_edge)[pair_pose == pose]
-        T = T_c_w[pose] @ se3.inverse(T_c_w[host[edge]])
+        edge = np.asarray(pair_edge)[mine]
+        T = (T_c_w[pose] @ T_w_c)[host[edge]]
         at, iz = _project(T, uv[edge], inverse_depth[edge], f, c)
         # The normal turns with the edge: move a pixel along it, at the same depth, and see where that goes.
         along = np.stack((-normal[edge, 1], normal[edge, 0]), 1)
