@@ -252,6 +252,7 @@ def _one_run(name: str, folder: Path, seed: int, settings: BenchSettings, out: P
     for override in settings.overrides:
         command += ["--set", override]
     run: dict[str, Any] = {"sequence": name, "seed": seed, "figures": {}, "stages": {}, "error": ""}
+    before_s = _children_cpu_s()
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=_RUN_TIMEOUT_S, check=False)
     except subprocess.TimeoutExpired:
@@ -259,7 +260,14 @@ def _one_run(name: str, folder: Path, seed: int, settings: BenchSettings, out: P
     if done.returncode != 0:
         lines = (done.stderr or done.stdout).strip().splitlines()
         return run | {"error": lines[-1] if lines else f"exit code {done.returncode}"}
-    return run | {"load": os.getloadavg()[0] if hasattr(os, "getloadavg") else None}
+    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
+    return run | {"load": load, "process_cpu_s": _children_cpu_s() - before_s}
+
+
+def _children_cpu_s() -> float:
+    """User and system time of all ended child processes; always 0 on Windows."""
+    times = os.times()
+    return times.children_user + times.children_system
 
 
 def _judge(run: dict[str, Any], out: Path, folder: Path) -> None:
@@ -272,6 +280,8 @@ def _judge(run: dict[str, Any], out: Path, folder: Path) -> None:
         run["error"] = str(error)
         return
     run["figures"] = figures_of(score)
+    if run["process_cpu_s"] > 0:  # with start-up and writing, which the run itself cannot see
+        run["figures"]["cpu_ms_per_frame"] = 1e3 * run["process_cpu_s"] / score.summary["frames"]
     run["stages"] = score.summary.get("stage_mean_ms_per_frame") or {}
     run["scale_inside_95"] = score.scale_inside_95
     run["notes"] = list(score.notes)
