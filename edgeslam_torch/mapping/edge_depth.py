@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.types import FloatArray, IntArray
 
-STEP_PX = 2.0
-"""Distance of the coarse search's hypotheses in the images; three quarters of the edges are searched more finely."""
+STEP_PX = 1.75
+"""Mean distance of the coarse search's hypotheses in the images."""
 HYPOTHESES = (8, 24)
 """Fewest and most hypotheses of the coarse search."""
 VALLEY = 2
@@ -171,7 +171,7 @@ def _coarse_search(
     searched = np.flatnonzero(share.sum(axis=0) >= MIN_SHARE)
     if len(searched) == 0:
         return searched, low[:0], low[:0]
-    count = int(np.clip(np.quantile(length[share > 0], 0.75) / STEP_PX + 1.5, *HYPOTHESES))
+    count = int(np.clip(length[share > 0].mean() / STEP_PX + 1.5, *HYPOTHESES))
     step = (high - low) / np.float32(count - 1)
     smooth = [_Lines(_smooth(line.grey), line.ray, line.step, line.normal) for line in lines]
     found = []
@@ -219,8 +219,7 @@ def _measurable(lines: _Lines, low: FloatArray, high: FloatArray, camera: Camera
     du, dv = x1 - x0, y1 - y0
     length = np.hypot(du, dv)
     share = np.abs(du * lines.normal[0] + dv * lines.normal[1]) / np.maximum(length, np.float32(1e-6))
-    share[~(inside & (share > MIN_ACROSS))] = 0.0
-    return share, length
+    return np.where(inside & (share > MIN_ACROSS), share, np.float32(0.0)), length
 
 
 def _cost(

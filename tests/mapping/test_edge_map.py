@@ -6,7 +6,8 @@ from point_map import CAMERA, PointMap, small_motion
 
 from edgeslam_torch.config import EdgeConfig
 from edgeslam_torch.geometry import se3
-from edgeslam_torch.mapping.edge_map import AGREE_PX, EdgeMap, EdgePoints, PaintedEdges, fuse
+from edgeslam_torch.mapping.depth_prior import depth_prior
+from edgeslam_torch.mapping.edge_map import AGREE_PX, PRIOR_CELL_PX, EdgeMap, EdgePoints, PaintedEdges, fuse
 
 
 def test_two_points_of_one_cell_worked_by_hand():
@@ -100,6 +101,17 @@ def test_only_agreed_points_are_given_out(points):
     some.hosts.append(host(points, 0, p_w, observations=counts))
     assert len(some.points().p_w) == 20
     assert edge_map(points).points().p_w.shape == (0, 3)
+
+
+def test_edges_of_one_cell_share_a_prior_near_their_own(points, rng):
+    uv = rng.integers(0, (CAMERA.width, CAMERA.height), (600, 2)).astype(np.float32)
+    keyframe = points.keyframes[0]
+    prior, sigma = edge_map(points)._prior(keyframe, uv)
+    own, own_sigma = depth_prior(keyframe, uv, points.map.anchors.p_w, 0.35)
+    np.testing.assert_array_equal(sigma, own_sigma)
+    assert np.median(np.abs(np.log(prior / own))) < 0.05
+    _, cell = np.unique(uv // PRIOR_CELL_PX, axis=0, return_inverse=True)
+    assert len(np.unique(prior)) <= cell.max() + 1 < len(uv)
 
 
 def test_keyframe_without_image_or_partners_is_passed_over(points):
