@@ -12,6 +12,8 @@ RADIUS_PX = 3.0
 """Search radius at pyramid level 0; poses and points are refined already."""
 MAX_HAMMING = 50
 """Bits, of 256; the strict figure of ORB-SLAM2, as there is no ratio test."""
+YOUNG = 3
+"""Keyframes for which an anchor is looked for in the neighbours; what they did not show by then, they do not show."""
 CHI2_2 = 5.991
 """Chi-square, two degrees of freedom, 95 %."""
 
@@ -20,8 +22,10 @@ Pairs = tuple[IntArray, IntArray]
 
 
 def fuse(slam_map: SlamMap, camera: Camera, keyframe: Keyframe, neighbours: list[Keyframe]) -> None:
-    """Look for a keyframe's anchors in its neighbours."""
-    merge(slam_map, [_look_in(slam_map, camera, k, slam_map.anchors_seen_by([keyframe])) for k in neighbours])
+    """Look for a keyframe's young anchors in its neighbours; all of them are looked for by `fuse_all`."""
+    ids = slam_map.anchors_seen_by([keyframe])
+    young = ids[slam_map.anchors.born[ids] > keyframe.id - YOUNG]
+    merge(slam_map, [_look_in(slam_map, camera, k, young) for k in neighbours])
 
 
 def fuse_all(slam_map: SlamMap, camera: Camera) -> None:
