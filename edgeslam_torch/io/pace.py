@@ -7,8 +7,12 @@ from collections.abc import Iterator
 
 from edgeslam_torch.types import Frame
 
-REALTIME_QUEUE = 4
-"""Frames that may wait for a slow step; a keyframe takes longer than the time between two frames."""
+REALTIME_QUEUE = 15
+"""Frames that may wait for a slow step, half a second at 30 a second.
+
+The step that starts the map takes 0.3 s on a PC; tracking a frame takes a third of the time between two, so that what
+waited is soon caught up with.
+"""
 
 
 class Counter:

@@ -208,7 +208,7 @@ class Bootstrap:
             two_view.p_w, reference.words[two_view.reference_keypoint], reference.id, False, colour
         )
         self.map.observe(reference, two_view.reference_keypoint, ids)
-        poses = self._poses_between()
+        poses = self._poses_between({w.frame.index for w in self.waiting})
         new = [(w.frame, self._keyframe(w, poses[w.frame.index])) for w in self.waiting if w.frame.index in poses]
         second = make_keyframe(self.map.next_keyframe_id(), frame.index, frame.stamp_s, two_view.T_c_w, view.features)
         second.anchor[two_view.keypoint] = ids
@@ -218,16 +218,17 @@ class Bootstrap:
         # The essential matrix leaves the scale to the guess: refinement holds the extent where the guess put it.
         refine(self.map, Window([k for _, k in new], [reference], ids), self.tracker.camera, lm)
         self.map.refresh_anchors(ids[self.map.anchors.alive[ids]])
-        poses = self._poses_between() | {k.frame_index: k.T_c_w for _, k in new[:-1]}
+        poses = self._poses_between({v.frame_index for v in self.views}) | {k.frame_index: k.T_c_w for _, k in new[:-1]}
         return StartedMap(new, poses)
 
-    def _poses_between(self) -> dict[int, FloatArray]:
-        """Poses of the frames in between against the reference keyframe's anchors, by frame index."""
+    def _poses_between(self, frames: set[int]) -> dict[int, FloatArray]:
+        """Poses of some of the frames in between against the reference keyframe's anchors, by frame index."""
         held = self.reference.keypoints_with_anchor()
         points = np.full((len(self.reference.anchor), 3), np.nan)
         points[held] = self.map.anchors.p_w[self.reference.anchor[held]]
-        poses, _ = poses_of_witnesses(self.views[:-1], points, self.tracker.camera)
-        return {v.frame_index: T for v, T in zip(self.views, poses, strict=False)}
+        views = [v for v in self.views[:-1] if v.frame_index in frames]
+        poses, _ = poses_of_witnesses(views, points, self.tracker.camera)
+        return {v.frame_index: T for v, T in zip(views, poses, strict=True)}
 
     def _keyframe(self, waiting: WaitingFrame, T_c_w: FloatArray) -> Keyframe:
         """A frame in between as a keyframe that sees the anchors of its partners in the reference."""
