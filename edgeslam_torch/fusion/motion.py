@@ -433,7 +433,10 @@ class MotionFusion:
             return None
         height = self._height_evidence(R_w_m, rough)
         given = []  # (name, evidence, scale, relative sigma)
-        for name, evidence, error in (("telemetry", moved, systematic), ("height", height, self.config.systematic_log)):
+        for name, evidence, error in (
+            ("telemetry", moved, systematic),
+            ("height", height, self.config.height_systematic_log),
+        ):
             if evidence is None:
                 continue
             evidence = evidence.softened(error * rough)
