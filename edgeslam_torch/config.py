@@ -110,6 +110,8 @@ class InitialisationConfig:
     """Of these frames at most; each costs a pass of the depth network."""
     max_direction_sigma: float = 0.08
     """Standard deviation of the second camera's position, relative to the baseline, above which two views wait."""
+    max_direction_sigma_alone: float = 0.05
+    """The same without a depth network, which would tell a flat scene from a real one."""
 
     def __post_init__(self) -> None:
         _positive(self, "min_parallax_deg", "min_points", "max_reprojection_px", "keyframe_gap", "most_keyframes")

@@ -134,7 +134,9 @@ class Bootstrap:
         logger.debug("initialisation: %s", joint)
         if joint.agreeing < AGREEING_SHARE or len(joint.two_view.p_w) < self.config.min_points:
             return replace(two_view, ok=False, reason="the frames together disagree with two views")
-        if joint.direction_sigma > self.config.max_direction_sigma:
+        alone = self.reference.depth is None
+        most = self.config.max_direction_sigma_alone if alone else self.config.max_direction_sigma
+        if joint.direction_sigma > most:
             return replace(two_view, ok=False, reason="a turn cannot yet be told from a shift")
         return joint.two_view
 
