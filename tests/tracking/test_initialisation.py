@@ -10,7 +10,7 @@ from edgeslam_torch.optim.problem import LmConfig
 from edgeslam_torch.tracking.bootstrap import WITNESS_SHARE, Bootstrap
 from edgeslam_torch.tracking.initialiser import BootstrapView, poses_of_witnesses, two_view_map
 from edgeslam_torch.tracking.tracker import Tracker, make_view
-from edgeslam_torch.types import Frame
+from edgeslam_torch.types import DepthMap, Frame
 
 CONFIG = InitialisationConfig()
 
@@ -133,8 +133,8 @@ def frame_of(points, view):
     return Frame(points.keyframes[view].frame_index, 0.1 * view, np.zeros((4, 4), np.uint8))
 
 
-def started(points, **config):
-    """A map that views 0 and 4 made, with the views between waiting."""
+def attempted(points, **config):
+    """The bootstrap that saw views 0 to 4, those between waiting, and what it made of the last."""
     spread = np.random.default_rng(1).normal(0.0, 0.05, len(points.point_of[0]))
     config = InitialisationConfig(**config)
     bootstrap = make_bootstrap(points, z_in(points, 0) * np.exp(spread), config)
@@ -148,7 +148,13 @@ def started(points, **config):
         accepted = bootstrap.confirm(view_of(points, view), found) if found.ok else found
         if view < 4:
             bootstrap.wait(frame_of(points, view), view_of(points, view), track)
-    assert accepted is not None and accepted.ok
+    return bootstrap, accepted
+
+
+def started(points, **config):
+    """A map that views 0 and 4 made, with the views between waiting."""
+    bootstrap, accepted = attempted(points, **config)
+    assert accepted.ok
     result = bootstrap.replace_map(frame_of(points, 4), view_of(points, 4), accepted, LmConfig())
     check_map(points.map)
     return result
@@ -168,6 +174,17 @@ def test_guessed_map_is_replaced_and_the_map_stays_consistent(points):
     ratios = np.array([np.linalg.norm(moved[i]) / np.linalg.norm(truth[i]) for i in between])
     assert np.ptp(ratios) / ratios.mean() < 0.03
     assert 0.8 < ratios.mean() < 1.25
+
+
+@pytest.mark.parametrize("network", [False, True])
+def test_without_a_network_two_views_must_be_surer(points, network):
+    """A network tells a flat scene from a real one; alone, only a sure direction of the second camera does."""
+    if network:
+        flat = np.ones((CAMERA.height, CAMERA.width), np.float32)
+        points.keyframes[0].depth = DepthMap(flat, 0.2 * flat)
+    _, accepted = attempted(points, max_direction_sigma_alone=1e-9)
+    assert accepted.ok == network
+    assert network or accepted.reason == "a turn cannot yet be told from a shift"
 
 
 def test_frames_that_waited_become_keyframes_in_order(points):
