@@ -235,7 +235,7 @@ class EdgeSlam:
     def _find(self, view: View, T_predicted: FloatArray, followed: Followed | None) -> tuple[Track | None, bool]:
         """Track where flow or the prediction says, else search the keyframes; and whether the search found it."""
         if followed is not None:
-            track = self._tracker.track(view, followed.track.T_c_w, followed.track.anchor)
+            track = self._tracker.track_near(view, followed.track.T_c_w, followed.track.anchor)
             return None if track is None else join(track, followed, view, self.config.orb.scale_factor), False
         if self._lost_frames == 0:
             track = self._tracker.track(view, T_predicted, self._recent)

@@ -36,7 +36,8 @@ class OrbExtractor:
                 np.zeros(0, np.float32),
                 np.zeros((0, 32), np.uint8),
             )
-        uv = np.array(cv2.KeyPoint.convert(found), dtype=np.float32)
+        octave = np.array([k.octave for k in found])
+        uv = _in_image(np.array(cv2.KeyPoint.convert(found)), octave, self.config.scale_factor, grey.shape[::-1])
         score = np.array([k.response for k in found], dtype=np.float32)
         keep = spread(uv, score, grey.shape[1], grey.shape[0], self.config.features)
         kept = [found[i] for i in keep]
@@ -46,6 +47,18 @@ class OrbExtractor:
             angle_rad=np.deg2rad(np.array([k.angle for k in kept], dtype=np.float32)),
             descriptors=np.asarray(descriptors, dtype=np.uint8)[keep],
         )
+
+
+def _in_image(uv: FloatArray, octave: IntArray, scale_factor: float, size: tuple[int, int]) -> FloatArray:
+    """Pixels of the image where OpenCV found keypoints ``(N, 2)`` on the images of its pyramid.
+
+    It multiplies by the scale alone: half a pixel of the level is left out, and that a level's size is a whole number.
+    """
+    scale = scale_factor ** octave[:, None].astype(np.float64)
+    whole = np.array(size, dtype=np.float64)
+    on_level = uv / scale
+    uv0: FloatArray = ((on_level + 0.5) * (whole / np.rint(whole / scale)) - 0.5).astype(np.float32)
+    return uv0
 
 
 def spread(uv: FloatArray, score: FloatArray, width: int, height: int, wanted: int) -> IntArray:

@@ -77,10 +77,7 @@ class Camera:
         """Pixels ``(N, 2)`` of the camera without distortion as the lens puts them; undoes `undistort_points`."""
         if not self.is_distorted or len(uv) == 0:
             return np.asarray(uv, dtype=np.float32)
-        rays = self.back_project(uv, np.ones(len(uv)))
-        still = np.zeros(3)
-        pixels, _ = cv2.projectPoints(rays, still, still, self.K, np.array(self.distortion))
-        return np.asarray(pixels, dtype=np.float32).reshape(-1, 2)
+        return self.project_through_lens(self.back_project(uv, np.ones(len(uv))))
 
     def undistort_image(self, image: np.ndarray) -> np.ndarray:
         """Image resampled to the undistorted pinhole camera of the same ``K``."""
@@ -103,6 +100,14 @@ class Camera:
         """Undistorted pixels ``(N, 2)`` of camera-frame points ``(N, 3)``, paper eq. (1); callers mask ``z <= 0``."""
         z = p_c[:, 2]
         return np.stack([self.fx * p_c[:, 0] / z + self.cx, self.fy * p_c[:, 1] / z + self.cy], axis=1)
+
+    def project_through_lens(self, p_c: FloatArray) -> FloatArray:
+        """Distorted pixels ``(N, 2)`` of camera-frame points ``(N, 3)``, float32; callers mask ``z <= 0``."""
+        if not self.is_distorted or len(p_c) == 0:
+            return self.project(p_c).astype(np.float32)
+        still = np.zeros(3)
+        pixels, _ = cv2.projectPoints(p_c, still, still, self.K, np.array(self.distortion))
+        return np.asarray(pixels, dtype=np.float32).reshape(-1, 2)
 
     def save(self, path: Path) -> None:
         """Write ``camera.yaml``."""

@@ -212,10 +212,15 @@ class PaintedEdges:
         Queries are rounded to pixels to be looked up, so that of two edges nearly as near either may be named.
         """
         height, width = self.index.shape
-        u, v = (np.clip(np.rint(uv) + _REACH, 0, (width - 1, height - 1))).astype(np.int64).T
-        found: IntArray = self.index[v, u].astype(np.int64)
-        apart = self.uv[found] - uv
-        found[(apart * apart).sum(axis=1) > AGREE_PX**2] = -1
+        u, v = (uv + (_REACH + 0.5)).T  # half a pixel more, so that cutting off rounds
+        inside = np.flatnonzero((u >= 0) & (v >= 0) & (u < width) & (v < height))
+        near = self.index[v[inside].astype(np.intp), u[inside].astype(np.intp)]
+        some = np.flatnonzero(near >= 0)
+        query, edge = inside[some], near[some]
+        apart = self.uv[edge] - uv[query]
+        close = np.einsum("ij,ij->i", apart, apart) <= AGREE_PX**2
+        found = np.full(len(uv), -1, dtype=np.int64)
+        found[query[close]] = edge[close]
         return found
 
 

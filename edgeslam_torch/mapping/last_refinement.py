@@ -15,7 +15,7 @@ from edgeslam_torch.mapping.edge_map import EdgeMap, EdgePoints
 from edgeslam_torch.mapping.fuse import fuse_all
 from edgeslam_torch.mapping.keyframe import Keyframe
 from edgeslam_torch.mapping.refinement import refine_all, take_back, whole_map, window_problem
-from edgeslam_torch.mapping.reobserve import reobserve_all
+from edgeslam_torch.mapping.reobserve import MOST_DRIFT_PX, reobserve_all
 from edgeslam_torch.mapping.slam_map import SlamMap
 from edgeslam_torch.mapping.window_terms import (
     PlacedEdges,
@@ -35,7 +35,7 @@ logger = logging.getLogger(__name__)
 ALIKE = 2.4
 """Neighbours on one edge err together: about six count as one (the root of six)."""
 ITERATIONS = 30
-ROUGH = 3e-3
+ROUGH = 1e-2
 """Relative decrease of the cost below which a step is the last of a refinement that another one follows: the next would
 lower it by a few parts in a hundred thousand, which is less than one standard deviation of one value."""
 FINE = 3e-4
@@ -63,7 +63,7 @@ def last_refinement(slam_map: SlamMap, camera: Camera, edges: EdgeMap, config: W
     with_edges = config.uses_edges or config.uses_corners
     result = None
     if config.reprojection != "off" and refine_all(slam_map, camera, lm) is not None:
-        if reobserve_all(slam_map, camera):
+        if max(reobserve_all(slam_map, camera), default=0.0) > MOST_DRIFT_PX:
             refine_all(slam_map, camera, lm)
         fuse_all(slam_map, camera)
         result = refine_all(slam_map, camera, lm if with_edges else fine)

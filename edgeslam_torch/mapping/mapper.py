@@ -9,7 +9,7 @@ from edgeslam_torch.mapping.fuse import fuse
 from edgeslam_torch.mapping.keyframe import Keyframe
 from edgeslam_torch.mapping.new_anchors import epipolar_matches, triangulate_matches
 from edgeslam_torch.mapping.refinement import choose_window, refine, refine_all
-from edgeslam_torch.mapping.reobserve import reobserve
+from edgeslam_torch.mapping.reobserve import MOST_DRIFT_PX, reobserve
 from edgeslam_torch.mapping.slam_map import SlamMap
 from edgeslam_torch.optim.problem import LmConfig, WindowResult
 from edgeslam_torch.types import IntArray
@@ -44,8 +44,8 @@ class Mapper:
             neighbours = self.map.covisible(keyframe, self.config.neighbours)
             self.triangulate_new(keyframe, neighbours, colour)
             fuse(self.map, self.camera, keyframe, self.map.covisible(keyframe, 2 * self.config.neighbours))
-            returned = reobserve(self.map, self.camera, keyframe)
-        if returned:  # what drifted on the way lies outside the window
+            drift_px = reobserve(self.map, self.camera, keyframe)
+        if drift_px is not None and drift_px > MOST_DRIFT_PX:  # what drifted on the way lies outside the window
             refine_all(self.map, self.camera, self.lm)
         window = choose_window(self.map, keyframe, self.config.window, self.config.window_fixed)
         result = refine(self.map, window, self.camera, self.lm)
@@ -67,11 +67,17 @@ class Mapper:
 
     def triangulate_new(self, keyframe: Keyframe, neighbours: list[Keyframe], colour: np.ndarray) -> None:
         """New anchors from keypoints that neither side has an anchor for yet."""
-        prior, sigma = depth_prior(keyframe, keyframe.features.uv, self.map.anchors.p_w, self.depth.prior_sigma_log)
+        prior, sigma = np.full((2, len(keyframe.anchor)), np.nan)
+        free = np.flatnonzero(keyframe.anchor < 0)
+        prior[free], sigma[free] = depth_prior(
+            keyframe, keyframe.features.uv[free], self.map.anchors.p_w, self.depth.prior_sigma_log
+        )
+        if not np.isfinite(prior).any():
+            return
+        least_baseline = 0.01 * float(np.nanmedian(prior))
         new = [self._recent[:0]]
         for other in neighbours:
-            baseline = float(np.linalg.norm(other.centre_w - keyframe.centre_w))
-            if baseline < 0.01 * float(np.nanmedian(prior)):
+            if np.linalg.norm(other.centre_w - keyframe.centre_w) < least_baseline:
                 continue
             matches = epipolar_matches(
                 keyframe,

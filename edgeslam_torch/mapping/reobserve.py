@@ -30,13 +30,16 @@ MIN_SHARE = 0.5
 MAX_TURN_RAD = np.deg2rad(30.0)
 MAX_SHIFT = 0.35
 """Distance of the two cameras, relative to the newer one's median depth."""
+MOST_DRIFT_PX = 5.0
+"""Of a place seen again, above which the whole map is refined; with less, its anchors are found all the same."""
 STRANGERS = 15
 """Two keyframes that share at least as many anchors know each other, as in `SlamMap.covisible`."""
 
 
-def reobserve_all(slam_map: SlamMap, camera: Camera) -> int:
-    """`reobserve` for every keyframe; returns how many were joined with an old one."""
-    return sum(reobserve(slam_map, camera, keyframe) for keyframe in list(slam_map.keyframes.values()))
+def reobserve_all(slam_map: SlamMap, camera: Camera) -> list[float]:
+    """`reobserve` for every keyframe; returns the drift [px] of those that were joined with an old one."""
+    drifts = [reobserve(slam_map, camera, keyframe) for keyframe in list(slam_map.keyframes.values())]
+    return [d for d in drifts if d is not None]
 
 
 def lookalike(slam_map: SlamMap, keyframe: Keyframe) -> Keyframe | None:
@@ -55,26 +58,29 @@ def lookalike(slam_map: SlamMap, keyframe: Keyframe) -> Keyframe | None:
     return older[nearest] if np.isfinite(apart[nearest]) else None
 
 
-def reobserve(slam_map: SlamMap, camera: Camera, keyframe: Keyframe) -> bool:
-    """Join a keyframe with an old one that saw the same place; False where there is none, or too little fits together.
+def reobserve(slam_map: SlamMap, camera: Camera, keyframe: Keyframe) -> float | None:
+    """Join a keyframe with an old one that saw the same place, if there is one and enough fits together.
 
     The map is not refined here; joined observations disagree by the drift until it is.
+
+    Returns:
+        The drift: median distance [px] of the old anchors from where they were expected; None if nothing was joined.
     """
     old = lookalike(slam_map, keyframe)
     if old is None:
-        return False
+        return None
     anchors, growth = slam_map.anchors, slam_map.scale_factor
     ids = slam_map.anchors_seen_by([old, *slam_map.covisible(old, 5)])
     ids = ids[anchors.alive[ids] & ~anchors.from_depth[ids]]
-    found, keypoint, _ = look_for(slam_map, camera, keyframe, ids, RADIUS_PX, 1.0, RATIO)
+    found, keypoint, error = look_for(slam_map, camera, keyframe, ids, RADIUS_PX, 1.0, RATIO)
     if len(found) < MIN_INLIERS:
-        return False
+        return None
     inliers = _agreeing(keyframe, anchors.p_w[found], keypoint, camera, growth)
     if inliers.sum() < MIN_INLIERS or inliers.mean() < MIN_SHARE:
-        return False
+        return None
     merge(slam_map, [observe_or_pair(slam_map, keyframe, found[inliers], keypoint[inliers])])
     logger.info("keyframe of frame %d joined with that of frame %d", keyframe.frame_index, old.frame_index)
-    return True
+    return float(np.median(np.linalg.norm(error[inliers], axis=1)))
 
 
 def _agreeing(

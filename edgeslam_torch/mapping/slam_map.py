@@ -27,6 +27,8 @@ class SlamMap:
         """Removed keyframe id -> (surviving id, ``T_removed_surviving``)."""
         self.lock = threading.RLock()
         """Held to change the map, and to read it from another thread than the one that changes it."""
+        self.revision = 0
+        """Grows with every change of who observes what, so that who remembers something of that sees if it holds."""
         self._next_id = 0
 
     def next_keyframe_id(self) -> int:
@@ -50,11 +52,13 @@ class SlamMap:
 
     def observe(self, keyframe: Keyframe, keypoints: IntArray, anchors: IntArray) -> None:
         """Record that a keyframe's keypoints see anchors; both must be free of an earlier partner."""
+        self.revision += 1
         keyframe.anchor[keypoints] = anchors
         self.anchors.observations[anchors] += 1
 
     def forget_observations(self, keyframe: Keyframe, keypoints: IntArray) -> None:
         """Take observations back; anchors seen by fewer than two keyframes afterwards are removed."""
+        self.revision += 1
         held = keyframe.anchor[keypoints]
         keypoints, held = keypoints[held >= 0], held[held >= 0]
         keyframe.anchor[keypoints] = NO_ANCHOR
@@ -66,6 +70,7 @@ class SlamMap:
         """Remove anchors from the map and from every keyframe that holds them."""
         if len(ids) == 0:
             return
+        self.revision += 1
         gone = np.zeros(len(self.anchors.alive) + 1, dtype=bool)
         gone[ids] = True
         for keyframe in self.keyframes.values():
@@ -122,6 +127,7 @@ class SlamMap:
 
     def add_keyframe(self, keyframe: Keyframe) -> None:
         """Take a keyframe with its observations into the map."""
+        self.revision += 1
         self.keyframes[keyframe.id] = keyframe
         self.anchors.observations[keyframe.anchor[keyframe.anchor >= 0]] += 1
 

@@ -144,7 +144,11 @@ def _failed(T: FloatArray, n: int, status: PoseStatus, iterations: int = 0) -> P
 
 
 def _round(T: FloatArray, points: "_Points", robust: bool, config: PoseConfig) -> tuple[FloatArray, int, bool]:
-    """Levenberg-Marquardt with the present inliers; leaves ``points.chi2`` at the returned pose."""
+    """Levenberg-Marquardt with the present inliers; leaves ``points.chi2`` at the returned pose or a step before it.
+
+    A step that promises no progress is the last and is taken on trust: the promise is the square of its length in
+    standard deviations, a fraction of one, and what comes next linearises there in any case.
+    """
     H, g, cost = points.linearise(T, robust)
     mu, used = 1e-6, 0
     if H is None:
@@ -157,8 +161,10 @@ def _round(T: FloatArray, points: "_Points", robust: bool, config: PoseConfig) -
             delta = -np.linalg.solve(damped, g)
         except np.linalg.LinAlgError:
             return T, used, False
-        chi2 = points.chi2
         trial = _exp(delta) @ T
+        if float(-g @ delta) <= config.cost_tolerance * cost:
+            return trial, used, True
+        chi2 = points.chi2
         H_new, g_new, cost_new = points.linearise(trial, robust)
         small = float(np.abs(delta).max()) < config.step_tolerance
         if H_new is None or not cost_new <= cost:
@@ -247,7 +253,8 @@ class _Points:
         z = p_c[2]
         use, behind = self.use, 0.0
         hidden = z <= self.config.min_depth
-        if hidden.any():
+        some_hidden = bool(hidden.any())
+        if some_hidden:
             z = np.where(hidden, 1.0, z)
             behind = float(np.count_nonzero(use & hidden))
             use = use & ~hidden
@@ -256,7 +263,7 @@ class _Points:
         x, y = n
         r = n - self.xy
         s = np.square(r * self.weight).sum(0)
-        self.chi2 = np.where(hidden, np.inf, s)
+        self.chi2 = np.where(hidden, np.inf, s) if some_hidden else s
         if robust:
             chi2 = self.config.chi2
             delta = math.sqrt(chi2)

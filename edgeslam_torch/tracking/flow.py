@@ -58,6 +58,15 @@ class Template:
 
 
 @dataclass(frozen=True, slots=True)
+class _Chosen:
+    """Keypoints of a template to follow, good while neither it nor the map's observations change."""
+
+    template: Template | None
+    revision: int
+    keypoint: IntArray
+
+
+@dataclass(frozen=True, slots=True)
 class Followed:
     """What flow says of a frame."""
 
@@ -121,7 +130,7 @@ def join(track: Track, followed: Followed, view: View, scale_factor: float) -> T
 
 
 class FlowTracker:
-    """Follows a template's anchors into a frame and refines its pose; keeps nothing between frames."""
+    """Follows a template's anchors into a frame and refines its pose; of the last frame it keeps what it looked for."""
 
     def __init__(self, slam_map: SlamMap, camera: Camera, orb: OrbConfig, config: FlowConfig, min_inliers: int) -> None:
         self.map = slam_map
@@ -129,6 +138,7 @@ class FlowTracker:
         self.orb = orb
         self.config = config
         self.min_inliers = min_inliers
+        self._chosen = _Chosen(None, -1, np.zeros(0, dtype=np.int64))
 
     def follow(self, template: Template, grey: NDArray[np.uint8], T_c_w: FloatArray) -> Followed | None:
         """Pose near a predicted one, or None when too little of the template is found again.
@@ -172,20 +182,26 @@ class FlowTracker:
 
     def _wanted(self, template: Template) -> IntArray:
         """Keypoints to follow: of too many an even spread, those first that most keyframes have seen."""
+        if self._chosen.template is template and self._chosen.revision == self.map.revision:
+            return self._chosen.keypoint
         anchors = self.map.anchors
         held = np.flatnonzero(template.anchor >= 0)
         held = held[anchors.alive[template.anchor[held]]]
         seen_by = anchors.observations[template.anchor[held]].astype(np.float64)
-        return held[spread(template.uv[held], seen_by, self.camera.width, self.camera.height, self.config.points)]
+        some = spread(template.uv[held], seen_by, self.camera.width, self.camera.height, self.config.points)
+        self._chosen = _Chosen(template, self.map.revision, held[some])
+        return self._chosen.keypoint
 
     def _expected(self, T_c_w: FloatArray, anchor: IntArray) -> FloatArray:
         """Predicted pixels ``(M, 2)`` in the distorted image, NaN outside of it."""
         p_c = se3.transform(T_c_w, self.map.anchors.p_w[anchor])
         front = p_c[:, 2] > MIN_DEPTH
-        uv = self.camera.distort_points(self.camera.project(np.where(front[:, None], p_c, 1.0)))
-        size = (self.camera.width, self.camera.height)
-        inside = front & (uv > 0).all(axis=1) & (uv < size).all(axis=1)
-        return np.where(inside[:, None], uv, np.nan)
+        p_c[~front] = 1.0
+        uv = self.camera.project_through_lens(p_c)
+        u, v = uv.T
+        outside = ~front | (u <= 0) | (v <= 0) | (u >= self.camera.width) | (v >= self.camera.height)
+        uv[outside] = np.nan
+        return uv
 
     def _flow(
         self, template: Template, grey: NDArray[np.uint8], keypoint: IntArray, guess: FloatArray, levels: int

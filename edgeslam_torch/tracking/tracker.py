@@ -1,5 +1,6 @@
 """The pose of one frame against the local map, so that poses do not chain from frame to frame."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,7 +22,7 @@ ROUGH = PoseConfig(rounds=1, robust_rounds=1, iterations=5, cost_tolerance=1e-2)
 ENOUGH_FOR_ROUGH = 250
 """Anchors of the last frame that the first pass looks for; more of them cost time and change nothing."""
 
-FINE = PoseConfig(rounds=3, robust_rounds=1, cost_tolerance=1e-3)
+FINE = PoseConfig(rounds=3, robust_rounds=1, cost_tolerance=1e-2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,8 +89,11 @@ class Tracker:
             first = self.refine(view, T_c_w, recent, 2.5 * self.config.motion_radius_px, ROUGH)
         if first is None or first.inliers < 10:
             return None
-        track = self._complete(view, first)
-        return track if track is not None and track.inliers >= self.config.min_inliers else None
+        return self._complete(view, first.T_c_w, first.anchor, first.keypoint, first.anchor)
+
+    def track_near(self, view: View, T_c_w: FloatArray, recent: IntArray) -> Track | None:
+        """The same from a pose that is right to a pixel or two, which needs no first pass."""
+        return self._complete(view, T_c_w, recent, recent[:0], recent[:0])
 
     def local_keyframes(self, anchor_ids: IntArray) -> list[Keyframe]:
         """Keyframes that see the given anchors, and of those the ones that see most."""
@@ -105,21 +109,24 @@ class Tracker:
         matches = self._match(view, seen, np.full(len(seen.anchor), radius_px))
         return self.solve(view, T_c_w, matches.train, seen.anchor[matches.query], effort)
 
-    def _complete(self, view: View, first: Track) -> Track | None:
-        """A rough track with what else of the local map the frame sees; its inliers are not searched again."""
+    def _complete(
+        self, view: View, T_c_w: FloatArray, recent: IntArray, keypoint: IntArray, anchor: IntArray
+    ) -> Track | None:
+        """Track of what the frame sees of the local map around ``recent``; known matches are not searched again."""
         anchors = self.map.anchors
-        seen = self._expected(first.T_c_w, self.map.anchors_seen_by(self.local_keyframes(first.anchor)))
-        new = seen.select(~np.isin(seen.anchor, first.anchor))
+        seen = self._expected(T_c_w, self.map.anchors_seen_by(self.local_keyframes(recent)))
+        new = seen.select(~np.isin(seen.anchor, anchor))
         radius = self.config.map_radius_px * self.orb.scale_factor ** new.octave.astype(np.float64)
         matches = self._match(view, new, radius)
-        free = ~np.isin(matches.train, first.keypoint)
-        keypoint = np.concatenate([first.keypoint, matches.train[free]])
-        anchor = np.concatenate([first.anchor, new.anchor[matches.query[free]]])
-        track = self.solve(view, first.T_c_w, keypoint, anchor)
-        if track is not None:
-            anchors.visible[seen.anchor] += 1
-            anchors.found[track.anchor] += 1
-        return track
+        free = ~np.isin(matches.train, keypoint)
+        keypoint = np.concatenate([keypoint, matches.train[free]])
+        anchor = np.concatenate([anchor, new.anchor[matches.query[free]]])
+        track = self.solve(view, T_c_w, keypoint, anchor)
+        if track is None:
+            return None
+        anchors.visible[seen.anchor] += 1
+        anchors.found[track.anchor] += 1
+        return track if track.inliers >= self.config.min_inliers else None
 
     def _expected(self, T_c_w: FloatArray, anchor_ids: IntArray) -> Projection:
         anchors = self.map.anchors
@@ -168,5 +175,6 @@ def median_parallax(p_w: FloatArray, T_c_w: FloatArray, centre_w: FloatArray) ->
         return 0.0
     a = p_w + T_c_w[:3, :3].T @ T_c_w[:3, 3]
     b = p_w - centre_w
-    cosine = (a * b).sum(1) / np.maximum(np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1), 1e-12)
-    return float(np.median(np.arccos(np.clip(cosine, -1.0, 1.0))))
+    dot, aa, bb = (np.einsum("ij,ij->i", x, y) for x, y in ((a, b), (a, a), (b, b)))
+    cosine = float(np.median(dot / np.maximum(np.sqrt(aa * bb), 1e-12)))  # the angle falls as it grows
+    return math.acos(min(max(cosine, -1.0), 1.0))

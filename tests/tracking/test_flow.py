@@ -230,3 +230,16 @@ def test_few_matches_are_judged_by_anchors_that_have_proved_themselves(scene):
 def test_settings_out_of_range_are_refused(settings):
     with pytest.raises(ValueError, match=next(iter(settings))):
         FlowConfig(**settings)
+
+
+def test_keypoints_are_chosen_anew_when_the_map_changes(scene):
+    tracker, at = scene.tracker(points=1000), se3.inverse(POSES[0])
+    before = tracker.follow(scene.template, scene.grey, at).track.anchor
+    scene.map.remove_anchors(before[:50])
+    after = tracker.follow(scene.template, scene.grey, at).track.anchor
+    assert not np.isin(before[:50], after).any()
+    free = np.flatnonzero(scene.keyframe.anchor == NO_ANCHOR)[:50]
+    p_w = scene.map.anchors.p_w[before[:50]]  # a removed anchor's row still says where it was
+    ids = scene.map.anchors.add(p_w, scene.keyframe.words[free], 0, False, np.zeros((50, 3), np.uint8))
+    scene.map.observe(scene.keyframe, free, ids)
+    assert np.isin(ids, tracker.follow(scene.template, scene.grey, at).track.matched_anchor).sum() > 40
