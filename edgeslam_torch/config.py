@@ -80,7 +80,7 @@ class FlowConfig:
 
     enabled: bool = True
     """Off: keypoints are detected and matched in every frame."""
-    points: int = 280
+    points: int = 350
     """Keypoints of the last keyframe that are followed at most."""
     window_px: int = 15
     """Side of the patch that is looked for."""

@@ -300,6 +300,7 @@ class EdgeSlam:
         enough = 2 * MIN_KEYPOINTS if len(self.map.anchors) > 0 else MIN_KEYPOINTS
         if self._lost_frames >= LOST_FRAMES_BEFORE_RESTART and len(view.features.uv) >= enough:
             self.events["restarted"] += 1
+            self._velocity = np.zeros(6)
             return self._start(frame, view, "new piece of map after loss, pose predicted")
         seen = len(view.features.uv)
         reason = f"only {seen} keypoints" if seen < MIN_KEYPOINTS else "too few keypoints agree with the map"
@@ -339,7 +340,6 @@ class EdgeSlam:
             self.config.seed,
         )
         self._lost_frames = 0
-        self._velocity = np.zeros(6)
         return self._output(frame, keyframe, FrameStatus.INITIALISED, reason, None, 0.0, True)
 
     def _guess_depth(self, keyframe: Keyframe) -> FloatArray:
@@ -362,6 +362,7 @@ class EdgeSlam:
             track = bootstrap.track(view, self._predict(frame.stamp_s))
         if track is None or track.inliers < 15:
             self.events["restarted"] += 1
+            self._velocity = np.zeros(6)
             return self._start(frame, view, "lost sight of the first keyframe before parallax sufficed")
         self._move(frame.stamp_s, track.T_c_w)
         with self._timed("initialisation"):
