@@ -35,7 +35,7 @@ logger = logging.getLogger(__name__)
 ALIKE = 2.4
 """Neighbours on one edge err together: about six count as one (the root of six)."""
 ITERATIONS = 30
-ROUGH = 3e-3
+ROUGH = 1e-2
 """Relative decrease of the cost below which a step is the last of a refinement that another one follows: the next would
 lower it by a few parts in a hundred thousand, which is less than one standard deviation of one value."""
 FINE = 3e-4
