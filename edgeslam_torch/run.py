@@ -84,6 +84,9 @@ class Slam(Protocol):
     def telemetry_statistics(self) -> dict[str, float]:
         """What telemetry told; empty without."""
 
+    def warnings(self) -> list[str]:
+        """What went wrong without stopping it."""
+
     @property
     def scale(self) -> ScaleEstimate:
         """Metres per map unit."""
@@ -285,6 +288,7 @@ class _Run:
             },
             "events": dict(self.slam.events),
             "fusion": {k: v for k, v in self.slam.telemetry_statistics().items() if math.isfinite(v)},
+            "warnings": [*self.source.warnings, *self.slam.warnings()],
             "mode": str(self.mode),
             "seed": self.config.seed,
             "interrupted": self.interrupt.requested,

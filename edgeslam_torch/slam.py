@@ -5,7 +5,7 @@ refinement and edges.
 """
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
@@ -17,6 +17,7 @@ import torch
 
 from edgeslam_torch.config import SlamConfig
 from edgeslam_torch.errors import SourceError
+from edgeslam_torch.frontend.depth_check import CheckedDepth, DepthFunction
 from edgeslam_torch.frontend.image import as_grey, colours_at
 from edgeslam_torch.frontend.orb import OrbExtractor
 from edgeslam_torch.fusion.motion import MotionFusion
@@ -39,7 +40,6 @@ from edgeslam_torch.tracking.relocaliser import relocalise
 from edgeslam_torch.tracking.tracker import Track, Tracker, View, make_view, median_parallax
 from edgeslam_torch.trajectory import TrajectoryLog
 from edgeslam_torch.types import (
-    DepthMap,
     FloatArray,
     Frame,
     FrameStatus,
@@ -49,9 +49,6 @@ from edgeslam_torch.types import (
     SlamOutput,
     TelemetrySample,
 )
-
-DepthFunction = Callable[[np.ndarray, Camera], DepthMap]
-"""Undistorted image and its camera to depth."""
 
 MIN_KEYPOINTS = 100
 """Fewer keypoints than this cannot start a map."""
@@ -96,7 +93,8 @@ class EdgeSlam:
         torch.set_num_threads(1)
         self.camera = camera
         self.config = config or SlamConfig()
-        self.depth = depth if depth is not None else _depth_from_config(self.config)
+        depth = depth if depth is not None else _depth_from_config(self.config)
+        self.depth = None if depth is None else CheckedDepth(depth)
         self.map = SlamMap(self.config.orb.scale_factor, self.config.orb.levels)
         self.log = TrajectoryLog(self.map)
         self.events = {"lost": 0, "relocalised": 0, "restarted": 0, "initialisations_refused": 0}
@@ -345,13 +343,14 @@ class EdgeSlam:
     def _guess_depth(self, keyframe: Keyframe) -> FloatArray:
         """Depth [map units] of every keypoint before anything is triangulated, ``(N,)``."""
         count = len(keyframe.features.uv)
-        if keyframe.depth is None:
+        nothing = np.full(count, np.nan)
+        network_m = nothing if keyframe.depth is None else sample(keyframe.depth, keyframe.features.uv)[0]
+        if not np.isfinite(network_m).any():
             earlier = np.flatnonzero(self.map.anchors.alive & ~self.map.anchors.from_depth)
             if len(earlier) == 0:
                 return np.ones(count)
             distance = np.linalg.norm(self.map.anchors.p_w[earlier] - self.map.latest().centre_w, axis=1)
             return np.full(count, float(np.median(distance)))
-        network_m, _ = sample(keyframe.depth, keyframe.features.uv)
         known = np.where(np.isfinite(network_m), network_m, np.nanmedian(network_m))
         return known / self._published.scale
 
@@ -525,6 +524,11 @@ class EdgeSlam:
     def telemetry_statistics(self) -> dict[str, float]:
         """What the drone's telemetry told: counts, delay, tilt, each source's scale; empty without telemetry."""
         return self._fusion.statistics() if self._has_telemetry else {}
+
+    def warnings(self) -> list[str]:
+        """What went wrong without stopping the system, in sentences for the run's summary."""
+        depth = None if self.depth is None else self.depth.warning()
+        return [] if depth is None else [depth]
 
     # -- helpers -----------------------------------------------------------------------------------------------
 

@@ -54,6 +54,14 @@ def test_folder_holds_everything(tmp_path, write_tum):
     assert cv2.imread(str(result.folder / "map.png")).shape[1] > 1000
 
 
+def test_what_the_system_warns_of_is_in_the_summary_beside_the_sources_warnings(tmp_path, write_tum):
+    source, slam = open_source(write_tum(tmp_path / "seq", 2)), FakeSlam()
+    source.warnings.append("no calibration")
+    slam.warnings = lambda: ["no depth"]
+    summary = run(source, tmp_path / "out", make_slam=fake(slam)).summary
+    assert summary["warnings"][-2:] == ["no calibration", "no depth"]
+
+
 def test_lost_frames_are_counted_once_a_loss(tmp_path, write_tum):
     folder = write_tum(tmp_path / "seq", 10)
     for path in sorted((folder / "rgb").iterdir())[4:7]:

@@ -16,7 +16,7 @@ from edgeslam_torch.eval.align import umeyama
 from edgeslam_torch.fusion.published import T_LEVEL
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.slam import EdgeSlam
-from edgeslam_torch.types import Frame, FrameStatus, TelemetrySample, Units
+from edgeslam_torch.types import DepthMap, Frame, FrameStatus, TelemetrySample, Units
 
 NO_NETWORK = SlamConfig(depth=DepthConfig(weights="none"))
 TRACKING = {FrameStatus.INITIALISED, FrameStatus.TRACKED, FrameStatus.RELOCALISED}
@@ -90,6 +90,50 @@ def test_flight_with_known_depth_is_metric():
     assert set(statuses(outputs)) <= TRACKING
     a, b = (np.linalg.inv(T[0]) @ T[-1] for T in (T_w_c, truth))
     assert np.rad2deg(np.linalg.norm(se3.log(a)[3:] - se3.log(b)[3:])) < 0.5
+
+
+@pytest.mark.parametrize("metres", [np.nan, np.inf, 1e30, 0.0])
+def test_unusable_depth_is_as_no_depth(metres):
+    def depth(image, camera):
+        return DepthMap(np.full((240, 320), metres, np.float32), np.full((240, 320), 0.05, np.float32))
+
+    (a, _), (b, outputs) = short_run(), go(panels().frames[:16], depth)
+    assert a.trajectory()[1].tobytes() == b.trajectory()[1].tobytes()
+    assert a.edge_map().p_w.tobytes() == b.edge_map().p_w.tobytes()
+    assert b.scale.units is Units.ARBITRARY
+    assert len(b.warnings()) == 1
+    assert a.warnings() == []
+
+
+def test_depth_that_fails_now_and_then_costs_those_keyframes_only():
+    known, calls = panels().depth_function(), iter(range(1000))
+
+    def depth(image, camera):
+        good = known(image, camera)
+        return good if next(calls) % 2 == 0 else DepthMap(np.full_like(good.depth_m, np.nan), good.sigma_log)
+
+    slam, outputs = go(panels().frames, depth)
+    assert ate(slam.trajectory()[1], panels().T_w_c, "se3") < 0.04
+    assert slam.scale.units is Units.METRES
+    assert set(statuses(outputs)) <= TRACKING
+    assert slam.depth.refused > 0
+
+
+def test_first_depth_map_unknown_at_every_keypoint_is_no_guess():
+    def depth(image, camera):
+        z = np.full((240, 320), 3.0, np.float32)
+        if not seen:
+            seen.append(True)
+            u, v = np.rint(view.features.uv).astype(int).T
+            z[v, u] = np.nan
+        return DepthMap(z, np.full_like(z, 0.3))
+
+    seen = []
+    slam = EdgeSlam(CAMERA, NO_NETWORK, depth=depth)
+    view = slam.prepare(panels().frames[0]).view
+    outputs = [slam.step(frame) for frame in panels().frames[:16]]
+    assert all(np.isfinite(o.T_w_c).all() for o in outputs)
+    assert np.linalg.norm(outputs[-1].T_w_c[:3, 3] - outputs[0].T_w_c[:3, 3]) > 0.05
 
 
 def test_edge_map_and_anchors_lie_on_the_surfaces():

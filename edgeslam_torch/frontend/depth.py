@@ -16,6 +16,8 @@ from edgeslam_torch.types import DepthMap, FloatArray
 logger = logging.getLogger(__name__)
 
 _MULTIPLE = 32
+_LOG_RANGE = float(np.log(100.0)) - 1e-3
+"""The network clips log depth there: a value at the end of its range says "off the scale", not how far."""
 
 
 class _Engine(Protocol):
@@ -64,7 +66,7 @@ class DepthPredictor:
         return "torch" if isinstance(self._engine, _TorchEngine) else "onnxruntime"
 
     def __call__(self, image: NDArray[np.uint8], camera: Camera) -> DepthMap:
-        """Depth [m] and its uncertainty at the image's size.
+        """Depth [m] and its uncertainty at the image's size; NaN where the network's range ends (100 m, 1 cm).
 
         The network's metres hold for the focal length it was trained with; the same pixels through a lens
         twice as
@@ -82,6 +84,7 @@ class DepthPredictor:
             raise ValueError(f"image {image.shape} does not fit a camera of {camera.width}x{camera.height}")
         height, width = self._engine.fixed_size or network_size(camera.height, camera.width, self.metadata)
         log_depth, sigma = self._engine.run(preprocess(image, height, width, self.metadata))
+        log_depth = np.where(np.abs(log_depth) < _LOG_RANGE, log_depth, np.float32(np.nan))
         small = camera.scaled(width, height)
         focal_ratio = float(np.sqrt(small.fx * small.fy)) / self.metadata.focal_px
         size = (camera.width, camera.height)

@@ -56,6 +56,9 @@ class FakeSlam:
     def telemetry_statistics(self):
         return {}
 
+    def warnings(self):
+        return []
+
     def edge_map(self):
         p = np.random.default_rng(0).random((500, 3)).astype(np.float32)
         return PointCloud(p, (p * 255).astype(np.uint8), np.full(500, 0.01, np.float32), np.full(500, 3, np.int32))

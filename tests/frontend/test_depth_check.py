@@ -1,0 +1,82 @@
+"""Depth maps that cannot be meant count as none."""
+
+import logging
+
+import numpy as np
+import pytest
+from rendered import CAMERA
+
+from edgeslam_torch.frontend.depth_check import CheckedDepth, usable
+from edgeslam_torch.types import DepthMap
+
+IMAGE = np.zeros((240, 320, 3), np.uint8)
+
+
+def depth_map(metres: float, sigma: float = 0.2) -> DepthMap:
+    return DepthMap(np.full((240, 320), metres, np.float32), np.full((240, 320), sigma, np.float32))
+
+
+@pytest.mark.parametrize("metres", [0.05, 0.3, 10.0, 100.0, 200.0])
+def test_a_plausible_map_passes_untouched(metres: float) -> None:
+    depth = depth_map(metres)
+    checked = CheckedDepth(lambda image, camera: depth)
+    assert checked(IMAGE, CAMERA) is depth
+    assert checked.warning() is None
+
+
+@pytest.mark.parametrize(
+    ("metres", "sigma"),
+    [
+        (np.nan, 0.2),
+        (np.inf, 0.2),
+        (-np.inf, 0.2),
+        (0.0, 0.2),
+        (-2.0, 0.2),
+        (0.01, 0.2),
+        (1000.0, 0.2),
+        (1e30, 0.2),
+        (2.0, np.nan),
+        (2.0, np.inf),
+        (2.0, 0.0),
+        (2.0, -0.1),
+        (2.0, 1e30),
+    ],
+)
+def test_an_impossible_map_is_none(metres: float, sigma: float) -> None:
+    checked = CheckedDepth(lambda image, camera: depth_map(metres, sigma))
+    assert checked(IMAGE, CAMERA) is None
+    assert checked.refused == checked.maps == 1
+
+
+def test_single_bad_pixels_become_unknown_and_the_rest_stays() -> None:
+    depth = depth_map(2.0)
+    depth.depth_m[:100] = np.inf
+    depth.sigma_log[100:110] = np.nan
+    found = CheckedDepth(lambda image, camera: depth)(IMAGE, CAMERA)
+    assert found is not None
+    assert np.isnan(found.depth_m[:110]).all()
+    assert (found.depth_m[110:] == 2.0).all()
+    assert np.isinf(depth.depth_m[:100]).all(), "the caller's own map is left alone"
+    assert usable(found).mean() == pytest.approx(130 / 240)
+
+
+def test_a_map_of_mostly_bad_pixels_is_none() -> None:
+    depth = depth_map(2.0)
+    depth.depth_m[:121] = np.nan
+    assert CheckedDepth(lambda image, camera: depth)(IMAGE, CAMERA) is None
+
+
+def test_many_refusals_are_one_warning_with_their_count(caplog: pytest.LogCaptureFixture) -> None:
+    maps = iter([depth_map(2.0), *[depth_map(np.nan)] * 5, depth_map(3.0)])
+    checked = CheckedDepth(lambda image, camera: next(maps))
+    with caplog.at_level(logging.WARNING):
+        answers = [checked(IMAGE, CAMERA) for _ in range(7)]
+    assert [a is None for a in answers] == [False, *[True] * 5, False]
+    assert len(caplog.records) == 1
+    assert "unusable for 5 of 7 keyframes" in str(checked.warning())
+
+
+def test_a_function_that_knows_nothing_is_no_failure() -> None:
+    checked = CheckedDepth(lambda image, camera: None)
+    assert checked(IMAGE, CAMERA) is None
+    assert checked.warning() is None
