@@ -97,7 +97,7 @@ def test_unusable_depth_is_as_no_depth(metres):
     def depth(image, camera):
         return DepthMap(np.full((240, 320), metres, np.float32), np.full((240, 320), 0.05, np.float32))
 
-    (a, _), (b, outputs) = short_run(), go(panels().frames[:16], depth)
+    (a, _), (b, _) = short_run(), go(panels().frames[:16], depth)
     assert a.trajectory()[1].tobytes() == b.trajectory()[1].tobytes()
     assert a.edge_map().p_w.tobytes() == b.edge_map().p_w.tobytes()
     assert b.scale.units is Units.ARBITRARY
