@@ -31,9 +31,11 @@ from edgeslam_torch.run_summary import Tally, summarise
 from edgeslam_torch.types import (
     FloatArray,
     Frame,
+    Piece,
     PointCloud,
     ScaleEstimate,
     SlamOutput,
+    Support,
     TelemetrySample,
 )
 
@@ -84,8 +86,14 @@ class Slam(Protocol):
     def telemetry_statistics(self) -> dict[str, float]:
         """What telemetry told; empty without."""
 
+    def support(self) -> Support:
+        """What each frame's final pose rests on."""
+
+    def pieces(self) -> list[Piece]:
+        """Pieces of map that the frames belong to."""
+
     def warnings(self) -> list[str]:
-        """What went wrong without stopping it."""
+        """What limits how far the results can be believed, one line each."""
 
     @property
     def scale(self) -> ScaleEstimate:
@@ -280,7 +288,10 @@ class _Run:
         self.slam.close()
         cpu_s = time.process_time() - cpu_start_s
         summary = {
-            **summarise(self.source, self.tally, scale, self.dropped.value, loop_s, finish_s, cpu_s),
+            **summarise(
+                self.source, self.tally, self.slam.pieces(), scale, self.dropped.value, loop_s, finish_s, cpu_s
+            ),
+            "warnings": [*self.source.warnings, *self.slam.warnings()],
             "map": {
                 "keyframes": len(self.slam.keyframes()),
                 "anchors": len(anchors.p_w),
@@ -288,7 +299,6 @@ class _Run:
             },
             "events": dict(self.slam.events),
             "fusion": {k: v for k, v in self.slam.telemetry_statistics().items() if math.isfinite(v)},
-            "warnings": [*self.source.warnings, *self.slam.warnings()],
             "mode": str(self.mode),
             "seed": self.config.seed,
             "interrupted": self.interrupt.requested,
@@ -300,7 +310,7 @@ class _Run:
             write_map_picture(path, edge_map, poses, scale.units, title)
 
         extras = [(CAMERA, self.source.camera.save), (PICTURE, picture)]
-        self.writer.finish(summary, stamps, poses, edge_map, anchors, scale.units, extras)
+        self.writer.finish(summary, stamps, poses, self.slam.support(), edge_map, anchors, scale.units, extras)
         self.result = RunResult(
             self.writer.folder, summary, stamps, poses, self.interrupt.requested, self.writer.failure
         )

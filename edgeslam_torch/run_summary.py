@@ -1,7 +1,8 @@
 """``summary.json``: a run in numbers."""
 
 import sys
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -9,11 +10,7 @@ import numpy as np
 from edgeslam_torch import __version__
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.io.source import Source
-from edgeslam_torch.types import FrameStatus, ScaleEstimate, SlamOutput
-
-OWN_POSE = frozenset({FrameStatus.INITIALISED, FrameStatus.TRACKED, FrameStatus.RELOCALISED})
-"""Status of a frame whose pose rests on its own image."""
-
+from edgeslam_torch.types import Piece, ScaleEstimate, SlamOutput
 
 MAX_PROBLEMS = 100
 """Listed in the summary one by one; ``left_out`` counts them all."""
@@ -24,7 +21,8 @@ class Tally:
     """Counts over a run, enough for the summary and no more than a few numbers a frame."""
 
     frames: int = 0
-    own_pose: int = 0
+    supported: int = 0
+    """Frames whose pose, as it came out live, rested on a map that the images support."""
     lost_events: int = 0
     first_pose_frame: int | None = None
     statuses: dict[str, int] = field(default_factory=dict)
@@ -36,7 +34,7 @@ class Tally:
 
     def add(self, output: SlamOutput, step_ms: float) -> None:
         """Count one frame."""
-        has_pose = output.status in OWN_POSE
+        has_pose = output.status.supported
         if has_pose and self.first_pose_frame is None:
             self.first_pose_frame = output.index
         is_lost = not has_pose and self.first_pose_frame is not None
@@ -44,7 +42,7 @@ class Tally:
         self._was_lost = is_lost
         self.last_reason = output.reason or self.last_reason
         self.frames += 1
-        self.own_pose += has_pose
+        self.supported += has_pose
         self.statuses[str(output.status)] = self.statuses.get(str(output.status), 0) + 1
         self.step_ms.append(step_ms)
         for stage, ms in output.stage_ms.items():
@@ -52,13 +50,21 @@ class Tally:
 
 
 def summarise(
-    source: Source, tally: Tally, scale: ScaleEstimate, dropped: int, loop_s: float, finish_s: float, cpu_s: float
+    source: Source,
+    tally: Tally,
+    pieces: Sequence[Piece],
+    scale: ScaleEstimate,
+    dropped: int,
+    loop_s: float,
+    finish_s: float,
+    cpu_s: float,
 ) -> dict[str, Any]:
     """The part of the summary that every run has; the caller adds what only it knows.
 
     Args:
         source: What was run on.
         tally: Of at least one frame.
+        pieces: What the frames belong to in the end.
         scale: At the end.
         dropped: Frames that came too late in real time.
         loop_s: Time from the first frame to the last.
@@ -66,13 +72,16 @@ def summarise(
         cpu_s: User and system time of the whole process, all threads, over both.
     """
     offered = tally.frames + dropped + len(source.problems)
+    tracked = sum(piece.supported for piece in pieces)
     return {
         "version": __version__,
         "source": {"name": source.name, "kind": source.kind, "path": source.location, "length": source.length},
         "camera": _camera(source.camera),
         "frames": tally.frames,
-        "tracked": tally.own_pose,
-        "coverage": tally.own_pose / offered,
+        "tracked": tracked,
+        "tracked_live": tally.supported,
+        "coverage": tracked / offered,
+        "pieces": [asdict(piece) for piece in pieces],
         "first_pose_frame": tally.first_pose_frame,
         "lost_events": tally.lost_events,
         "dropped_frames": dropped,
@@ -89,7 +98,6 @@ def summarise(
         "stage_mean_ms_per_frame": {stage: sum(ms) / tally.frames for stage, ms in tally.stage_ms.items()},
         "scale": {"value": scale.value, "sigma": scale.sigma, "source": scale.source, "units": str(scale.units)},
         "telemetry_samples": len(source.telemetry),
-        "warnings": list(source.warnings),
         "problems": [{"file": problem.file, "reason": problem.reason} for problem in source.problems[:MAX_PROBLEMS]],
     }
 

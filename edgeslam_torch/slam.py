@@ -44,9 +44,11 @@ from edgeslam_torch.types import (
     Frame,
     FrameStatus,
     IntArray,
+    Piece,
     PointCloud,
     ScaleEstimate,
     SlamOutput,
+    Support,
     TelemetrySample,
 )
 
@@ -58,6 +60,10 @@ HANDOVER_INLIERS = 50
 
 MOST_WAITING_IN_REAL_TIME = 3
 """Frames between the first two views that become keyframes in real time; while they are mapped, no other can be."""
+
+FIRST_FRAME = "first frame, depth guessed"
+AFTER_LOSS = "new piece of map after loss: pose predicted, depth guessed"
+"""How a piece of map is begun, in words."""
 
 LOST_FRAMES_BEFORE_RESTART = 20
 """Frames without a pose after which a new piece of map is started from the predicted one."""
@@ -171,7 +177,7 @@ class EdgeSlam:
             self._has_telemetry = self._has_telemetry or len(telemetry) > 0
         if not self.map.keyframes:
             self._face(telemetry)
-            output = self._start(frame, seen.view, "first frame, depth guessed")
+            output = self._start(frame, seen.view, FIRST_FRAME)
         elif self._bootstrap is not None:
             output = self._step_bootstrap(frame, seen, self._bootstrap)
         else:
@@ -299,7 +305,7 @@ class EdgeSlam:
         if self._lost_frames >= LOST_FRAMES_BEFORE_RESTART and len(view.features.uv) >= enough:
             self.events["restarted"] += 1
             self._velocity = np.zeros(6)
-            return self._start(frame, view, "new piece of map after loss, pose predicted")
+            return self._start(frame, view, AFTER_LOSS)
         seen = len(view.features.uv)
         reason = f"only {seen} keypoints" if seen < MIN_KEYPOINTS else "too few keypoints agree with the map"
         return self._output(frame, self.map.latest(), FrameStatus.PREDICTED, reason, None, 0.0, False)
@@ -316,11 +322,12 @@ class EdgeSlam:
         self._wait()
         self._template = None
         if self._bootstrap is not None:
-            self._bootstrap.abandon()
+            self._bootstrap.forget_guess()
             self._bootstrap = None
         keyframe = make_keyframe(self.map.next_keyframe_id(), frame.index, frame.stamp_s, self._T_c_w, view.features)
         if len(view.features.uv) < MIN_KEYPOINTS:
             if not self.map.keyframes:  # something for the poses to hang on
+                self.map.begin_piece(reason)
                 self.map.add_keyframe(keyframe)
             reason = f"only {len(view.features.uv)} keypoints, waiting for texture"
             self._lost_frames = LOST_FRAMES_BEFORE_RESTART
@@ -328,6 +335,7 @@ class EdgeSlam:
         with self._timed("depth"):
             self._look(frame, keyframe)
         guess = self._guess_depth(keyframe)
+        self.map.begin_piece(reason)
         self._bootstrap = Bootstrap(
             self.map,
             self._tracker,
@@ -337,8 +345,9 @@ class EdgeSlam:
             colours_at(keyframe.image, view.features.uv),
             self.config.seed,
         )
+        self.map.remove_empty_keyframes()
         self._lost_frames = 0
-        return self._output(frame, keyframe, FrameStatus.INITIALISED, reason, None, 0.0, True)
+        return self._output(frame, keyframe, FrameStatus.STARTING, reason, None, 0.0, True)
 
     def _guess_depth(self, keyframe: Keyframe) -> FloatArray:
         """Depth [map units] of every keypoint before anything is triangulated, ``(N,)``."""
@@ -380,7 +389,7 @@ class EdgeSlam:
         return self._output(
             frame,
             bootstrap.reference,
-            FrameStatus.INITIALISED,
+            FrameStatus.STARTING,
             f"initialising: {two_view.reason}",
             track,
             two_view.parallax_rad,
@@ -393,7 +402,7 @@ class EdgeSlam:
             started = bootstrap.replace_map(frame, seen.view, two_view, self._lm)
         self._bootstrap = None
         self.log.replace(started.T_c_w, [reference, *(k for _, k in started.new)])
-        self._T_c_w = started.T_c_w[max(started.T_c_w)] if started.T_c_w else reference.T_c_w
+        self._T_c_w = started.T_c_w[max(started.T_c_w)]
         keyframe = started.new[-1][1]
         self._move(frame.stamp_s, keyframe.T_c_w)
         self._recent = keyframe.anchor[keyframe.anchor >= 0]
@@ -521,14 +530,29 @@ class EdgeSlam:
         """Metres per map unit."""
         return self._fusion.scale()
 
+    def support(self) -> Support:
+        """What the pose of every frame stepped so far rests on by now."""
+        return self.log.support()
+
+    def pieces(self) -> list[Piece]:
+        """Pieces of map that the frames belong to; where one lies relative to another is not known."""
+        return self.log.pieces()
+
     def telemetry_statistics(self) -> dict[str, float]:
         """What the drone's telemetry told: counts, delay, tilt, each source's scale; empty without telemetry."""
         return self._fusion.statistics() if self._has_telemetry else {}
 
     def warnings(self) -> list[str]:
-        """What went wrong without stopping the system, in sentences for the run's summary."""
+        """What limits how far the results can be believed, in sentences for the run's summary."""
         depth = None if self.depth is None else self.depth.warning()
-        return [] if depth is None else [depth]
+        return [warning for warning in (depth, self._warning_of_pieces()) if warning is not None]
+
+    def _warning_of_pieces(self) -> str | None:
+        pieces = [p for p in self.pieces() if p.supported > 0]
+        if len(pieces) < 2:
+            return None
+        spans = ", ".join(f"{p.number} ({p.first_s:.1f} to {p.last_s:.1f} s)" for p in pieces)
+        return f"the map is in {len(pieces)} pieces that were never joined, {spans}: poses across them do not relate"
 
     # -- helpers -----------------------------------------------------------------------------------------------
 
@@ -542,7 +566,7 @@ class EdgeSlam:
         parallax_rad: float,
         is_keyframe: bool,
     ) -> SlamOutput:
-        self.log.append(frame.index, frame.stamp_s, keyframe.id, self._T_c_w)
+        self.log.append(frame.index, frame.stamp_s, keyframe.id, self._T_c_w, status.supported)
         return SlamOutput(
             index=frame.index,
             stamp_s=frame.stamp_s,
@@ -553,6 +577,7 @@ class EdgeSlam:
             inliers=0 if track is None else track.inliers,
             parallax_rad=parallax_rad,
             keyframe=is_keyframe,
+            piece=self.map.piece_of(keyframe.id),
             scale=self.scale,
             stage_ms=dict(self._stage_ms),
         )

@@ -9,7 +9,7 @@ import numpy as np
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.mapping.keyframe import Keyframe
 from edgeslam_torch.mapping.slam_map import SlamMap
-from edgeslam_torch.types import FloatArray
+from edgeslam_torch.types import FloatArray, Piece, Support
 
 
 @dataclass(slots=True)
@@ -21,6 +21,8 @@ class FrameRecord:
     keyframe_id: int
     T_c_k: FloatArray
     """``(4, 4)``"""
+    supported: bool
+    """Whether the pose rests on a map that the images support."""
 
 
 class TrajectoryLog:
@@ -30,14 +32,17 @@ class TrajectoryLog:
         self.map = slam_map
         self.records: list[FrameRecord] = []
 
-    def append(self, index: int, stamp_s: float, keyframe_id: int, T_c_w: FloatArray) -> None:
-        """Record a frame's pose in the map as it is now."""
+    def append(self, index: int, stamp_s: float, keyframe_id: int, T_c_w: FloatArray, supported: bool) -> None:
+        """Record a frame's pose in the map as it is now, and whether the map supports it."""
         with self.map.lock:
             T_c_k = T_c_w @ se3.inverse(self.map.pose_of(keyframe_id))
-        self.records.append(FrameRecord(index, stamp_s, keyframe_id, T_c_k))
+        self.records.append(FrameRecord(index, stamp_s, keyframe_id, T_c_k, supported))
 
     def replace(self, T_c_w_of_frame: dict[int, FloatArray], keyframes: list[Keyframe]) -> None:
-        """Give recent frames, by index, new poses, each tied to the last of the keyframes (in order) before it."""
+        """Give recent frames, by index, new poses that the map supports.
+
+        Each is tied to the last of the keyframes (in order) before it.
+        """
         indices = [k.frame_index for k in keyframes]
         for record in reversed(self.records):
             if record.index not in T_c_w_of_frame:
@@ -45,6 +50,26 @@ class TrajectoryLog:
             keyframe = keyframes[max(bisect.bisect_right(indices, record.index) - 1, 0)]
             record.keyframe_id = keyframe.id
             record.T_c_k = T_c_w_of_frame[record.index] @ keyframe.T_w_c
+            record.supported = True
+
+    def support(self) -> Support:
+        """What each frame's pose rests on in the map as it is now."""
+        with self.map.lock:
+            piece_of = {id: self.map.piece_of(id) for id in {r.keyframe_id for r in self.records}}
+        piece = np.array([piece_of[r.keyframe_id] for r in self.records], dtype=np.int64)
+        return Support(piece, np.array([r.supported for r in self.records], dtype=bool))
+
+    def pieces(self) -> list[Piece]:
+        """The pieces that the frames belong to in the map as it is now, in the order of their numbers."""
+        support = self.support()
+        stamps = np.array([r.stamp_s for r in self.records])
+        pieces = []
+        for number in np.unique(support.piece):
+            mine = np.flatnonzero(support.piece == number)
+            supported = int(support.supported[mine].sum())
+            begun = self.map.begun.get(int(number), "")
+            pieces.append(Piece(int(number), len(mine), supported, stamps[mine[0]], stamps[mine[-1]], begun))
+        return pieces
 
     def poses(self, since_s: float = -math.inf) -> tuple[FloatArray, FloatArray]:
         """Stamps ``(F,)`` and ``T_w_c`` ``(F, 4, 4)`` in the map as it is now, of frames not older than ``since_s``."""

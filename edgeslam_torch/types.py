@@ -144,11 +144,45 @@ class ScaleEstimate:
 class FrameStatus(StrEnum):
     """How a frame got its pose."""
 
+    STARTING = "starting"
+    """Begins a piece of map or follows its guessed depths: nothing was triangulated yet that could contradict it."""
     INITIALISED = "initialised"
+    """The frame whose parallax made the map."""
     TRACKED = "tracked"
     RELOCALISED = "relocalised"
     PREDICTED = "predicted"
     LOST = "lost"
+
+    @property
+    def supported(self) -> bool:
+        """Whether the pose rests on a map that the images support."""
+        return self in (FrameStatus.INITIALISED, FrameStatus.TRACKED, FrameStatus.RELOCALISED)
+
+
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """Frames whose poses hang together; where one piece lies relative to another is not known."""
+
+    number: int
+    """From 0 in the order in which the pieces were begun."""
+    frames: int
+    supported: int
+    """Frames of these whose pose rests, in the end, on a map that the images support."""
+    first_s: float
+    last_s: float
+    """Stamps of its first and its last frame."""
+    begun: str
+    """What its first pose and its scale rest on, in words."""
+
+
+@dataclass(frozen=True, slots=True)
+class Support:
+    """What each frame's final pose rests on."""
+
+    piece: IntArray
+    """``(F,)`` number of the piece that it belongs to."""
+    supported: NDArray[np.bool_]
+    """``(F,)`` whether it rests on a map that the images support."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,6 +201,8 @@ class SlamOutput:
     parallax_rad: float
     """Median ray angle between this frame and its reference keyframe."""
     keyframe: bool
+    piece: int
+    """Number of the piece of map that the pose belongs to; poses of different pieces do not relate."""
     scale: ScaleEstimate
     stage_ms: dict[str, float]
     """Milliseconds of each stage in this step."""

@@ -14,6 +14,7 @@ from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.types import FloatArray, PointCloud, SlamOutput
 
 _STATUS_COLOURS = {
+    "starting": (201, 168, 106),
     "initialised": (127, 180, 216),
     "tracked": (47, 127, 184),
     "relocalised": (122, 92, 192),

@@ -24,7 +24,7 @@ from edgeslam_torch.eval.run_score import RunScore, evaluate_run
 from edgeslam_torch.io.atomic import write_text
 from edgeslam_torch.types import FloatArray, PointCloud
 
-STATUSES = ("initialised", "tracked", "relocalised", "predicted", "lost")
+STATUSES = ("starting", "initialised", "tracked", "relocalised", "predicted", "lost")
 """In the order of the page's colours."""
 
 MAX_POINTS = 200_000

@@ -4,7 +4,7 @@ import math
 from pathlib import Path
 from typing import Any
 
-from edgeslam_torch.eval.run_folder import TRUSTED, RunFolder
+from edgeslam_torch.eval.run_folder import RunFolder, is_supported
 from edgeslam_torch.eval.run_score import RunScore
 
 
@@ -31,11 +31,12 @@ def story(run: RunFolder, score: RunScore | None) -> str:
     if run.status:
         share = 100.0 * tracked / max(1, frames)
         whole = "Every frame was" if tracked >= frames else f"{share:.1f} % of the frames were"
-        sentences.append(f"{whole} tracked from the image itself" + _first(run) + ".")
+        sentences.append(f"{whole} tracked against the map" + _first(run) + ".")
         lost = summary.get("lost_events")
         if isinstance(lost, int):
             sentences.append("Tracking was never lost." if lost == 0 else f"Tracking was lost {_times(lost)}.")
     sentences.append(_scale_sentence(summary))
+    sentences.append(_pieces_sentence(summary))
     if score is not None:
         sentences.append(
             f"Against ground truth the camera is off by {_length(score.ate_sim3_m)} (RMSE after scaling; a camera that "
@@ -159,7 +160,7 @@ def keyframe_label(stem: str, begin: float) -> str:
 
 def _first(run: RunFolder) -> str:
     for index, row in enumerate(run.status):
-        if row.get("status") in TRUSTED:
+        if is_supported(row):
             return ", from the first on" if index == 0 else f", the first of them frame {index}"
     return ""
 
@@ -173,6 +174,14 @@ def _scale_sentence(summary: dict[str, Any]) -> str:
         return "Nothing told the metric scale, so lengths are in arbitrary units."
     known = f"{100 * sigma / value:.1f} % (1 sigma) from {source.replace('+', ' and ')}"
     return f"Lengths are in metres, with the scale known to {known}."
+
+
+def _pieces_sentence(summary: dict[str, Any]) -> str:
+    pieces = [p for p in summary.get("pieces") or [] if isinstance(p, dict) and p.get("supported")]
+    if len(pieces) < 2:
+        return ""
+    spans = ", ".join(f"piece {p.get('number')} from {p.get('first_s')} to {p.get('last_s')} s" for p in pieces)
+    return f"The map is in {len(pieces)} pieces whose relation is not known: {spans}. Errors across them mean nothing."
 
 
 def _times(count: int) -> str:

@@ -14,8 +14,8 @@ from edgeslam_torch.eval.formats import Trajectory, read_trajectory
 from edgeslam_torch.io.ply import read_ply
 from edgeslam_torch.types import PointCloud
 
-TRUSTED = frozenset({"initialised", "tracked", "relocalised"})
-"""Status of a frame whose pose rests on its own image."""
+_SUPPORTED = frozenset({"initialised", "tracked", "relocalised"})
+"""Status of a frame whose pose rests on the map, in tables of version 0.1, which have no column that says so."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,10 +54,8 @@ class RunFolder:
 
     @property
     def trusted_frames(self) -> int:
-        """Frames that `TRUSTED` counts; all poses when there is no ``status.csv``."""
-        if not self.status:
-            return len(self.trajectory)
-        return sum(row.get("status", "") in TRUSTED for row in self.status)
+        """Frames whose final pose rests on a map that the images support; all where no ``status.csv`` tells."""
+        return sum(map(is_supported, self.status)) if self.status else len(self.trajectory)
 
 
 def open_run(path: Path | str) -> RunFolder:
@@ -84,6 +82,12 @@ def open_run(path: Path | str) -> RunFolder:
 def is_keyframe(row: dict[str, str]) -> bool:
     """Whether a row of ``status.csv`` is a keyframe's."""
     return row.get("keyframe", "").lower() in ("1", "true", "yes")
+
+
+def is_supported(row: dict[str, str]) -> bool:
+    """Whether a row of ``status.csv`` is of a frame whose final pose rests on a map that the images support."""
+    stated = row.get("supported", "")
+    return stated == "1" if stated else row.get("status", "") in _SUPPORTED
 
 
 def read_status(path: Path) -> tuple[dict[str, str], ...]:

@@ -13,7 +13,7 @@ from edgeslam_torch.eval.diagnose import explain
 from edgeslam_torch.eval.edge_map import MapScore, score_map
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.formats import Trajectory, read_trajectory
-from edgeslam_torch.eval.run_folder import RunFolder, open_run
+from edgeslam_torch.eval.run_folder import RunFolder, is_supported, open_run
 from edgeslam_torch.eval.surface import surface_truth
 from edgeslam_torch.eval.trajectory import TrajectoryScore, score_trajectory
 
@@ -191,7 +191,7 @@ def _coverage(
 
 def _first_trusted(run: RunFolder) -> float:
     for row, stamp in zip(run.status, run.trajectory.stamps_s, strict=False):
-        if row.get("status") in ("initialised", "tracked", "relocalised"):
+        if is_supported(row):
             return float(stamp)
     return float(run.trajectory.stamps_s[0])
 

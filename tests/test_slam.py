@@ -15,11 +15,11 @@ from edgeslam_torch.errors import SourceError
 from edgeslam_torch.eval.align import umeyama
 from edgeslam_torch.fusion.published import T_LEVEL
 from edgeslam_torch.geometry import se3
-from edgeslam_torch.slam import EdgeSlam
+from edgeslam_torch.slam import AFTER_LOSS, EdgeSlam
 from edgeslam_torch.types import DepthMap, Frame, FrameStatus, TelemetrySample, Units
 
 NO_NETWORK = SlamConfig(depth=DepthConfig(weights="none"))
-TRACKING = {FrameStatus.INITIALISED, FrameStatus.TRACKED, FrameStatus.RELOCALISED}
+TRACKING = {FrameStatus.STARTING, FrameStatus.INITIALISED, FrameStatus.TRACKED, FrameStatus.RELOCALISED}
 BLACK = np.zeros((240, 320, 3), np.uint8)
 
 
@@ -73,6 +73,9 @@ def test_sideways_flight_without_a_network_is_right_up_to_scale():
     assert ate(T_w_c, panels().T_w_c) < 0.012  # 1 % of the path; 0.004 when written
     np.testing.assert_array_equal(stamps, panels().stamps_s)
     assert set(statuses(outputs)) <= TRACKING
+    assert not outputs[1].status.supported, "live, the map was still a guess"
+    assert slam.support().supported.all(), "in the end every frame hangs on the map"
+    assert [(p.number, p.frames, p.supported) for p in slam.pieces()] == [(0, 40, 40)]
     assert slam.events["lost"] == slam.events["restarted"] == 0
     assert slam.scale.units is Units.ARBITRARY
     assert outputs[0].reason == "first frame, depth guessed"
@@ -197,7 +200,8 @@ def test_first_camera_turns_as_the_drone_says():
 
 def test_one_frame_is_a_trajectory_of_one_and_an_empty_map():
     slam, outputs = go(panels().frames[:1])
-    assert statuses(outputs) == [FrameStatus.INITIALISED]
+    assert statuses(outputs) == [FrameStatus.STARTING]
+    assert not slam.support().supported.any()
     assert slam.trajectory()[1].shape == (1, 4, 4)
     assert slam.edge_map().p_w.shape == (0, 3)
     assert slam.anchors().p_w.shape == (0, 3)
@@ -226,6 +230,7 @@ def test_turning_on_the_spot_is_no_initialisation():
     turning = film(stairs_world(), CAMERA, poses)
     slam, outputs = go(turning.frames)
     assert all(o.reason in ("initialising: pure rotation", "initialising: no motion") for o in outputs[1:])
+    assert not slam.support().supported.any()
     last = se3.log(se3.inverse(outputs[0].T_w_c) @ outputs[-1].T_w_c)
     assert np.linalg.norm(last[3:] - [0.0, 0.135, 0.0]) < 0.01
     assert np.linalg.norm(last[:3]) < 0.03  # of guessed units, everything a unit away
@@ -239,7 +244,7 @@ def test_constant_images_at_the_start_are_waited_out(grey):
     assert statuses(outputs)[0] is FrameStatus.LOST
     assert "only 0 keypoints" in outputs[0].reason
     assert all(o.status in (FrameStatus.LOST, FrameStatus.PREDICTED) for o in outputs[:4])
-    assert statuses(outputs)[4] is FrameStatus.INITIALISED
+    assert statuses(outputs)[4] is FrameStatus.STARTING
     assert set(statuses(outputs)[4:]) <= TRACKING
     assert ate(slam.trajectory()[1][4:], panels().T_w_c[4:20]) < 0.012
 
@@ -308,14 +313,44 @@ def test_after_a_long_loss_a_new_piece_of_map_begins():
     lost = statuses(outputs)[16:35]
     assert set(lost) == {FrameStatus.PREDICTED}
     assert outputs[20].reason == "too few keypoints agree with the map"
-    restart = [o for o in outputs if o.reason == "new piece of map after loss, pose predicted"]
+    restart = [o for o in outputs if o.reason == AFTER_LOSS]
     assert [o.index for o in restart] == [35]
-    assert set(statuses(outputs)[35:]) == {FrameStatus.INITIALISED}
+    assert set(statuses(outputs)[35:]) == {FrameStatus.STARTING}
+    assert [(p.number, p.frames, p.supported) for p in slam.pieces()] == [(0, 35, 16), (1, 10, 0)]
+    assert [o.piece for o in outputs] == [0] * 35 + [1] * 10
     assert slam.events["restarted"] == 1
     T = slam.trajectory()[1]
     assert ate(T[:16], panels().T_w_c[:16]) < 0.012  # what was mapped before is kept
     assert np.linalg.norm(T[44, :3, 3] - T[35, :3, 3]) < 0.05
     assert np.linalg.norm(T[35, :3, 3] - T[15, :3, 3]) < 1.0  # the prediction does not run away
+
+
+def test_noise_is_never_called_tracked_and_keeps_nothing():
+    """Every frame begins a map that the next one contradicts: none is supported, and none stays in memory."""
+    rng = np.random.default_rng(5)
+    noise = [cv2.GaussianBlur(rng.integers(0, 256, (240, 320), dtype=np.uint8), (5, 5), 1.5) for _ in range(40)]
+    slam, outputs = go([Frame(i, 0.1 * i, image) for i, image in enumerate(noise)])
+    assert not any(o.status.supported for o in outputs)
+    assert not slam.support().supported.any()
+    assert slam.pieces()[0].frames == 40
+    assert len(slam.map.keyframes) == 1
+    assert len(slam.map.anchors) <= 1000
+
+
+def test_a_cut_to_another_place_leaves_two_pieces_and_says_so():
+    """Two recordings in one: the second is mapped by itself, and nothing claims to know where it lies."""
+    there = film(stairs_world(99), CAMERA, sideways(24, 0.03, turn_rad=0.004))
+    images = [f.image for f in panels().frames[:16]] + [there.frames[0].image] * 20 + [f.image for f in there.frames]
+    slam, outputs = go([Frame(i, 0.1 * i, image) for i, image in enumerate(images)])
+    first, second = slam.pieces()
+    assert (first.number, first.supported, second.number, second.begun) == (0, 16, 1, AFTER_LOSS)
+    assert second.supported > 15
+    assert [o.piece for o in outputs] == [0] * 35 + [1] * 25
+    assert slam.warnings() == [
+        "the map is in 2 pieces that were never joined, 0 (0.0 to 3.4 s), 1 (3.5 to 5.9 s): "
+        "poses across them do not relate"
+    ]
+    assert ate(slam.trajectory()[1][36:], there.T_w_c) < 0.012
 
 
 def test_few_keypoints_after_a_dark_start_still_begin_a_map():
@@ -345,4 +380,4 @@ def test_image_of_another_size_is_refused_by_name(shape, tmp_path):
     slam = EdgeSlam(CAMERA, NO_NETWORK)
     with pytest.raises(SourceError, match=rf"0001.png: image is {shape[1]}x{shape[0]}, the calibration 320x240"):
         slam.step(Frame(0, 0.0, np.zeros(shape, np.uint8), tmp_path / "0001.png"))
-    assert slam.step(panels().frames[0]).status is FrameStatus.INITIALISED
+    assert slam.step(panels().frames[0]).status is FrameStatus.STARTING

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.errors import SourceError
+from edgeslam_torch.eval.run_folder import is_supported, read_status
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.io.ply import read_ply
@@ -175,16 +176,9 @@ def _pose(row: FloatArray) -> FloatArray:
 
 
 def _tracked_stamps(folder: Path) -> set[float]:
-    """Stamps of frames whose pose was measured, not predicted."""
-    path = folder / "status.csv"
-    if not path.is_file():
-        return set()
-    lines = path.read_text().splitlines()
-    columns = lines[0].split(",")
-    stamp, status = columns.index("stamp_s"), columns.index("status")
-    good = {"tracked", "initialised", "relocalised"}
-    cells = (line.split(",") for line in lines[1:])
-    return {round(float(c[stamp]), 6) for c in cells if len(c) > status and c[status] in good}
+    """Stamps of frames whose final pose rests on the map."""
+    rows = read_status(folder / "status.csv")
+    return {round(float(row["stamp_s"]), 6) for row in rows if is_supported(row)}
 
 
 def relative_motion(view_i: PosedView, view_j: PosedView) -> FloatArray:

@@ -151,9 +151,12 @@ def _report(result: "RunResult", source: "Source") -> None:
         _say(f"left out: {problem.file}: {problem.reason}")
     if len(source.problems) > _MAX_PROBLEMS_SHOWN:
         _say(f"left out: {len(source.problems)} in all, listed in {result.folder / 'summary.json'}")
+    for warning in summary["warnings"][len(source.warnings) :]:  # the source's own were said before the run
+        _say(f"warning: {warning}")
     if not summary["tracked"]:
         _say(
-            f"warning: no frame could be tracked ({summary['last_reason'] or 'no reason known'}); the poses are guesses"
+            f"warning: no frame was tracked against a map ({summary['last_reason'] or 'no reason known'}); "
+            "the poses are guesses"
         )
     print(
         f"{summary['tracked']} of {summary['frames']} frames tracked ({100 * summary['coverage']:.1f} %), "
@@ -170,6 +173,8 @@ def _report(result: "RunResult", source: "Source") -> None:
     else:
         print("units are arbitrary: neither telemetry nor a depth network told the scale")
     counts = summary["map"]
+    if counts["edge_points"] == 0:
+        _say("warning: the edge map is empty")
     print(f"map: {counts['edge_points']} edge points, {counts['anchors']} anchors, {counts['keyframes']} keyframes")
     print(f"results: {result.folder} (look at {_best_view(result.folder)})")
 

@@ -16,7 +16,7 @@ from edgeslam_torch.errors import OutputError
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.io.atomic import write_text
 from edgeslam_torch.io.ply import write_ply
-from edgeslam_torch.types import FloatArray, PointCloud, SlamOutput, Units
+from edgeslam_torch.types import FloatArray, PointCloud, SlamOutput, Support, Units
 
 TRAJECTORY = "trajectory.txt"
 ONLINE = "trajectory_online.txt"
@@ -38,6 +38,8 @@ STATUS_COLUMNS = (
     "inliers",
     "parallax_deg",
     "keyframe",
+    "piece",
+    "supported",
     "scale",
     "scale_sigma",
     "scale_source",
@@ -110,6 +112,7 @@ class RunWriter:
         summary: dict[str, Any],
         stamps_s: FloatArray,
         T_w_c: FloatArray,
+        support: Support,
         edge_map: PointCloud,
         anchors: PointCloud,
         units: Units,
@@ -121,6 +124,7 @@ class RunWriter:
             summary: For ``summary.json``.
             stamps_s: ``(F,)`` stamps of the refined trajectory [s].
             T_w_c: ``(F, 4, 4)`` refined poses, camera to world.
+            support: What they rest on, for the columns ``piece`` and ``supported`` of ``status.csv``.
             edge_map: Semi-dense map in the same world frame.
             anchors: Triangulated anchors.
             units: Of all of these.
@@ -138,6 +142,7 @@ class RunWriter:
         rows = "".join(tum_line(stamp, T) for stamp, T in zip(stamps_s, T_w_c, strict=True))
         steps: list[tuple[str, Callable[[Path], None]]] = [
             (TRAJECTORY, lambda path: write_text(path, TRAJECTORY_HEADER + rows)),
+            (STATUS, lambda path: self._settle_status(support)),
             (SUMMARY, lambda path: write_text(path, summary_text(summary))),
             (EDGE_MAP, lambda path: write_ply(path, edge_map, comments)),
             (ANCHORS, lambda path: write_ply(path, anchors, comments)),
@@ -169,14 +174,29 @@ class RunWriter:
 
     def _widen_status(self) -> None:
         """Rewrite the table so far with columns for stages that had not run before."""
-        header = [*STATUS_COLUMNS, *(f"{stage}_ms" for stage in self._stages)]
+        self._rewrite_status(self._status_rows())
+
+    def _settle_status(self, support: Support) -> None:
+        """Say of every frame what its final pose rests on, in place of what its pose rested on when it came."""
+        rows = self._status_rows()
+        piece, supported = STATUS_COLUMNS.index("piece"), STATUS_COLUMNS.index("supported")
+        for row, number, good in zip(rows, support.piece, support.supported, strict=False):
+            row[piece], row[supported] = str(number), str(int(good))
+        self._rewrite_status(rows)
+
+    def _status_rows(self) -> list[list[str]]:
         self._status.close()
-        path = self.folder / STATUS
-        with path.open(newline="", encoding="utf-8") as file:
-            rows = list(csv.reader(file))[1:]
+        with (self.folder / STATUS).open(newline="", encoding="utf-8") as file:
+            return list(csv.reader(file))[1:]
+
+    def _rewrite_status(self, rows: list[list[str]]) -> None:
+        header = [*STATUS_COLUMNS, *(f"{stage}_ms" for stage in self._stages)]
         padded = [_csv_line(row + [""] * (len(header) - len(row))) for row in rows]
-        write_text(path, _csv_line(header) + "".join(padded))
-        self._status = _Appender(path, None)
+        path = self.folder / STATUS
+        try:
+            write_text(path, _csv_line(header) + "".join(padded))
+        finally:
+            self._status = _Appender(path, None)
 
     def _guarded(self, write: Callable[[], None]) -> None:
         try:
@@ -246,6 +266,8 @@ def _status_row(output: SlamOutput, step_ms: float) -> list[str]:
         str(output.inliers),
         _number(math.degrees(output.parallax_rad), 4),
         str(int(output.keyframe)),
+        str(output.piece),
+        str(int(output.status.supported)),
         _number(output.scale.value, 6),
         _number(output.scale.sigma, 6),
         output.scale.source,

@@ -29,6 +29,12 @@ class SlamMap:
         """Held to change the map, and to read it from another thread than the one that changes it."""
         self.revision = 0
         """Grows with every change of who observes what, so that who remembers something of that sees if it holds."""
+        self.begun: dict[int, str] = {}
+        """What the first pose and the scale of each piece rest on, by the piece's number."""
+        self._piece: dict[int, int] = {}
+        """Piece in which each keyframe, alive or removed, was made."""
+        self._joined: dict[int, int] = {}
+        """Piece -> older piece that it was found to be part of."""
         self._next_id = 0
 
     def next_keyframe_id(self) -> int:
@@ -38,11 +44,54 @@ class SlamMap:
 
     def pose_of(self, keyframe_id: int) -> FloatArray:
         """``T_c_w`` of a keyframe, alive or removed."""
+        heir, T_keyframe_heir = self._heir(keyframe_id)
+        return T_keyframe_heir @ self.keyframes[heir].T_c_w
+
+    def _heir(self, keyframe_id: int) -> tuple[int, FloatArray]:
+        """The surviving keyframe that a keyframe hangs on (itself while it lives), and the way to it."""
+        chain = []
         T = np.eye(4)
         while keyframe_id in self.links:
-            keyframe_id, T_link = self.links[keyframe_id]
-            T = T @ T_link
-        return T @ self.keyframes[keyframe_id].T_c_w
+            chain.append(keyframe_id)
+            keyframe_id = self.links[keyframe_id][0]
+        # Links of links are shortened on the way, or a thousand removed keyframes would be walked for every frame.
+        for removed in reversed(chain):
+            T = self.links[removed][1] @ T
+            self.links[removed] = (keyframe_id, T)
+        return keyframe_id, T
+
+    # -- pieces ------------------------------------------------------------------------------------------------
+
+    def begin_piece(self, begun: str) -> None:
+        """Keyframes added from now on belong to a new piece, unless the last one holds no anchor.
+
+        Args:
+            begun: What the new piece's first pose and scale rest on, in words.
+        """
+        members = (k for k in self.keyframes.values() if self._piece[k.id] == self.piece)
+        if not self.begun or any((k.anchor != NO_ANCHOR).any() for k in members):
+            self.begun[len(self.begun)] = begun
+
+    @property
+    def piece(self) -> int:
+        """Number of the piece that new keyframes belong to."""
+        return max(len(self.begun) - 1, 0)
+
+    def piece_of(self, keyframe_id: int) -> int:
+        """Number of the piece that a keyframe, alive or removed, belongs to by now."""
+        piece = self._piece[keyframe_id]
+        while piece in self._joined:
+            piece = self._joined[piece]
+        return piece
+
+    def join_pieces(self, keyframe: Keyframe, others: list[Keyframe]) -> bool:
+        """Record that a keyframe and others show the same anchors, hence are of one piece; whether that was news."""
+        mine = self.piece_of(keyframe.id)
+        found = {self.piece_of(other.id) for other in others} - {mine}
+        oldest = min(found | {mine})
+        for piece in (found | {mine}) - {oldest}:
+            self._joined[piece] = oldest
+        return bool(found)
 
     def latest(self) -> Keyframe:
         """The newest keyframe."""
@@ -129,15 +178,24 @@ class SlamMap:
         """Take a keyframe with its observations into the map."""
         self.revision += 1
         self.keyframes[keyframe.id] = keyframe
+        self._piece[keyframe.id] = self.piece
         self.anchors.observations[keyframe.anchor[keyframe.anchor >= 0]] += 1
 
     def remove_keyframe(self, keyframe: Keyframe) -> None:
         """Drop a keyframe; its frames stay tied to the nearest surviving one in time."""
         self.forget_observations(keyframe, keyframe.keypoints_with_anchor())
         others = (id for id in self.keyframes if id != keyframe.id)
-        heir = min(others, key=lambda id: (abs(id - keyframe.id), id))
+        # One of its own piece if there is any: another's may move without it.
+        mine = self.piece_of(keyframe.id)
+        heir = min(others, key=lambda id: (self.piece_of(id) != mine, abs(id - keyframe.id), id))
         self.links[keyframe.id] = (heir, keyframe.T_c_w @ se3.inverse(self.keyframes[heir].T_c_w))
         del self.keyframes[keyframe.id]
+
+    def remove_empty_keyframes(self) -> None:
+        """Drop keyframes that hold no anchor: nothing can be tracked against them."""
+        for keyframe in list(self.keyframes.values()):
+            if (keyframe.anchor == NO_ANCHOR).all() and len(self.keyframes) > 1:
+                self.remove_keyframe(keyframe)
 
     def refresh_anchors(self, ids: IntArray) -> None:
         """Recompute viewing direction, reference distance and descriptor from the observing keyframes.

@@ -55,7 +55,7 @@ class StartedMap:
     new: list[tuple[Frame, Keyframe]]
     """Keyframes after the reference, in order; in the map, but not yet mapped any further."""
     T_c_w: dict[int, FloatArray]
-    """New poses of the frames in between, by frame index."""
+    """New poses of the reference and of the frames in between, by frame index."""
 
 
 class Bootstrap:
@@ -87,8 +87,8 @@ class Bootstrap:
         slam_map.refresh_anchors(ids)
         self._guessed = ids
 
-    def abandon(self) -> None:
-        """Take the guessed anchors out of the map; the keyframe stays for the poses that hang on it."""
+    def forget_guess(self) -> None:
+        """Take the guessed anchors out of the map; the reference keyframe is left for the caller to remove."""
         self.map.remove_anchors(self._guessed)
 
     def track(self, view: View, T_predicted: FloatArray) -> Track | None:
@@ -221,7 +221,7 @@ class Bootstrap:
         refine(self.map, Window([k for _, k in new], [reference], ids), self.tracker.camera, lm)
         self.map.refresh_anchors(ids[self.map.anchors.alive[ids]])
         poses = self._poses_between({v.frame_index for v in self.views}) | {k.frame_index: k.T_c_w for _, k in new[:-1]}
-        return StartedMap(new, poses)
+        return StartedMap(new, {reference.frame_index: reference.T_c_w} | poses)
 
     def _poses_between(self, frames: set[int]) -> dict[int, FloatArray]:
         """Poses of some of the frames in between against the reference keyframe's anchors, by frame index."""

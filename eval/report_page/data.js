@@ -37,7 +37,7 @@ function make(tag, text, parent) {
   return el;
 }
 const byId = id => document.getElementById(id);
-const STATUS = ["initialised", "tracked", "relocalised", "predicted", "lost"];
+const STATUS = ["starting", "initialised", "tracked", "relocalised", "predicted", "lost"];
 
 // Perceptually even ramp from dark blue over green to yellow (viridis, 9 of its colours).
 const RAMP = [[68, 1, 84], [71, 44, 122], [59, 81, 139], [44, 113, 142], [33, 144, 141], [39, 173, 129], [92, 200, 99], [170, 220, 50], [253, 231, 37]];

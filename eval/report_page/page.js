@@ -88,7 +88,7 @@ function band() {
   const W = c.width = c.clientWidth * Math.min(devicePixelRatio || 1, 2), H = c.height = 34, g = c.getContext("2d"), [t0, t1] = DATA.time, t = DATA.stamps;
   const colours = STATUS.map(s => css("--" + s)), X = s => (s - t0) / (t1 - t0 || 1) * W;
   // The rarest status is drawn last: a single lost frame must show.
-  for (const s of [1, 0, 2, 3, 4]) for (let i = 0; i < t.length; i++) if (DATA.status[i] === s) { g.fillStyle = colours[s]; g.fillRect(X(t[i]), 0, Math.max(s === 1 ? 1 : 2, X(t[i + 1] ?? t1) - X(t[i]) + 0.5), H); }
+  for (const s of [2, 1, 0, 3, 4, 5]) for (let i = 0; i < t.length; i++) if (DATA.status[i] === s) { g.fillStyle = colours[s]; g.fillRect(X(t[i]), 0, Math.max(s === 2 ? 1 : 2, X(t[i + 1] ?? t1) - X(t[i]) + 0.5), H); }
 }
 function row(table, cells, tag = "td") { const tr = make("tr", undefined, table); for (const c of cells) make(tag, c, tr); }
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from edgeslam_torch.geometry import se3
-from edgeslam_torch.types import FrameStatus, PointCloud, ScaleEstimate, SlamOutput
+from edgeslam_torch.types import FrameStatus, Piece, PointCloud, ScaleEstimate, SlamOutput, Support
 
 
 class FakeSlam:
@@ -36,6 +36,7 @@ class FakeSlam:
             inliers=80,
             parallax_rad=0.01,
             keyframe=frame.index % 5 == 0,
+            piece=0,
             scale=self.scale,
             stage_ms={"features": 1.0, **({"mapping": 5.0} if frame.index % 5 == 0 else {})},
         )
@@ -55,6 +56,14 @@ class FakeSlam:
 
     def telemetry_statistics(self):
         return {}
+
+    def support(self):
+        return Support(np.zeros(len(self.outputs), int), np.array([o.status.supported for o in self.outputs]))
+
+    def pieces(self):
+        supported = sum(o.status.supported for o in self.outputs)
+        stamps = [o.stamp_s for o in self.outputs]
+        return [Piece(0, len(stamps), supported, stamps[0], stamps[-1], "first frame")]
 
     def warnings(self):
         return []

@@ -83,10 +83,10 @@ def wall(rng, distance_m=2.0, half_m=3.0, side_px=768):
     return Quad(np.array([-half_m, -half_m, distance_m]), u, v, texture)
 
 
-@lru_cache(maxsize=1)
-def stairs_world():
+@lru_cache(maxsize=2)
+def stairs_world(seed=8):
     """Patchwork panels at several depths before a wall: parallax everywhere, nothing planar."""
-    rng = np.random.default_rng(8)
+    rng = np.random.default_rng(seed)
     quads = [wall(rng, 4.0, 4.0, 1024)]
     for i in range(5):
         for j in range(4):

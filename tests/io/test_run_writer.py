@@ -52,7 +52,15 @@ def test_end_result(tmp_path):
         writer.append(output, 1.0)
     stamps, poses = slam.trajectory()
     assert (
-        writer.finish({"frames": 4, "sigma": math.inf}, stamps, poses, slam.edge_map(), slam.anchors(), Units.METRES)
+        writer.finish(
+            {"frames": 4, "sigma": math.inf},
+            stamps,
+            poses,
+            slam.support(),
+            slam.edge_map(),
+            slam.anchors(),
+            Units.METRES,
+        )
         == []
     )
     writer.close()
@@ -106,7 +114,7 @@ def test_full_disk_leaves_whole_lines_and_room_for_the_rest(tmp_path, monkeypatc
     assert not writer.append(frames[4], 1.0)
     assert np.loadtxt(tmp_path / "trajectory_online.txt").shape == (3, 8)
     stamps, poses = slam.trajectory()
-    assert writer.finish({}, stamps, poses, slam.edge_map(), slam.anchors(), Units.METRES) == []
+    assert writer.finish({}, stamps, poses, slam.support(), slam.edge_map(), slam.anchors(), Units.METRES) == []
     assert np.loadtxt(tmp_path / "trajectory.txt").shape == (5, 8)
 
 
@@ -122,7 +130,7 @@ def test_result_that_cannot_be_written_is_named_and_the_others_are_written(tmp_p
 
     monkeypatch.setattr(Path, "replace", refuse)
     stamps, poses = slam.trajectory()
-    missing = writer.finish({}, stamps, poses, slam.edge_map(), slam.anchors(), Units.METRES)
+    missing = writer.finish({}, stamps, poses, slam.support(), slam.edge_map(), slam.anchors(), Units.METRES)
     assert missing == ["edge_map.ply (No space left on device)"]
     assert "edge_map.ply" in writer.failure
     assert (tmp_path / "anchors.ply").exists()

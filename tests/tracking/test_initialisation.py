@@ -166,6 +166,7 @@ def test_guessed_map_is_replaced_and_the_map_stays_consistent(points):
     assert len(alive) >= CONFIG.min_points
     assert not points.map.anchors.from_depth[alive].any()
     index = {points.keyframes[v].frame_index: v for v in (1, 2, 3)}
+    np.testing.assert_array_equal(between.pop(points.keyframes[0].frame_index), points.keyframes[0].T_c_w)
     assert set(between) == set(index)
     # Up to the guess's scale, the frames between are where they were.
     centre = points.keyframes[0].centre_w
@@ -216,7 +217,7 @@ def test_of_many_waiting_frames_those_that_stand_apart_stay(points):
 
 def test_abandoned_attempt_leaves_no_guess_behind(points):
     bootstrap = make_bootstrap(points, np.ones(len(points.point_of[0])))
-    bootstrap.abandon()
+    bootstrap.forget_guess()
     check_map(points.map)
     assert len(points.map.anchors) == 0
     assert 0 in points.map.keyframes
