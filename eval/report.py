@@ -13,6 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from edgeslam_torch.atomic import write_text
 from edgeslam_torch.errors import EdgeSlamError
 from edgeslam_torch.eval import report_words as words
 from edgeslam_torch.eval.associate import match
@@ -21,7 +22,6 @@ from edgeslam_torch.eval.formats import Trajectory, read_trajectory
 from edgeslam_torch.eval.keyframe_pictures import keyframe_pictures
 from edgeslam_torch.eval.run_folder import RunFolder, is_keyframe, open_run
 from edgeslam_torch.eval.run_score import RunScore, evaluate_run
-from edgeslam_torch.io.atomic import write_text
 from edgeslam_torch.types import FloatArray, PointCloud
 
 STATUSES = ("starting", "initialised", "tracked", "relocalised", "predicted", "lost")

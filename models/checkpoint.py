@@ -11,6 +11,7 @@ import safetensors.torch
 import torch
 from torch import Tensor
 
+from edgeslam_torch.atomic import write_atomically
 from edgeslam_torch.errors import WeightsError
 from edgeslam_torch.models.fastdepth import FastDepth, Output, Variant, Widths
 from edgeslam_torch.models.mobilenet import Padding
@@ -23,14 +24,22 @@ def build_network(metadata: Metadata, widths: Widths | None = None) -> FastDepth
 
 
 def save_checkpoint(network: FastDepth, metadata: Metadata, path: Path, half: bool = False) -> None:
-    """Write weights and metadata; ``half`` stores float16 (half the size, depth changes by less than 0.1
-    %)."""
+    """Write weights and metadata, atomically.
+
+    Args:
+        network: What to store.
+        metadata: Its record.
+        path: File to write; an older one is replaced.
+        half: Store float16: half the size, depth changes by less than 0.1 %.
+
+    Raises:
+        OSError: If the disk refuses; an older file is then still there.
+    """
     tensors = {k: _stored(v, half) for k, v in network.state_dict().items()}
     # One key only: safetensors writes several in random order, and the same weights should be the same bytes.
     header = {HEADER_KEY: json.dumps(dataclasses.asdict(metadata))}
-    temporary = path.with_name(path.name + ".part")
-    safetensors.torch.save_file(tensors, temporary, metadata=header)
-    temporary.replace(path)
+    content = safetensors.torch.save(tensors, header)  # its own save_file makes files that only their owner can read
+    write_atomically(path, lambda file: file.write(content))
 
 
 def load_checkpoint(path: Path | None = None) -> tuple[FastDepth, Metadata]:

@@ -9,6 +9,7 @@ from pathlib import Path
 import onnx
 import torch
 
+from edgeslam_torch.atomic import write_atomically
 from edgeslam_torch.errors import OutputError
 from edgeslam_torch.models.fastdepth import FastDepth
 from edgeslam_torch.models.fold import deployed
@@ -66,9 +67,7 @@ def export_onnx(network: FastDepth, metadata: Metadata, path: Path, options: Exp
     model = set_opset(program.model_proto, options.opset)
     write_metadata(model, metadata, options)
     check_model(model, options.opset)
-    temporary = path.with_name(path.name + ".part")
-    onnx.save(model, str(temporary))
-    temporary.replace(path)
+    write_atomically(path, lambda file: file.write(model.SerializeToString()))
 
 
 def set_opset(model: onnx.ModelProto, opset: int) -> onnx.ModelProto:

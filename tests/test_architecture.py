@@ -11,7 +11,7 @@ import pytest
 PACKAGE = Path(__file__).resolve().parent.parent / "edgeslam_torch"
 
 LAYERS: tuple[tuple[str, ...], ...] = (
-    ("errors", "types"),
+    ("errors", "types", "atomic"),
     ("geometry", "config"),
     ("models", "synthetic"),
     ("losses",),

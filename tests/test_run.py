@@ -54,6 +54,15 @@ def test_folder_holds_everything(tmp_path, write_tum):
     assert cv2.imread(str(result.folder / "map.png")).shape[1] > 1000
 
 
+def test_every_file_has_the_rights_that_the_umask_leaves(tmp_path, write_tum):
+    before = os.umask(0o027)
+    try:
+        result = run(open_source(write_tum(tmp_path / "seq", 3)), tmp_path / "out", make_slam=fake(FakeSlam()))
+    finally:
+        os.umask(before)
+    assert {oct(p.stat().st_mode & 0o777) for p in result.folder.iterdir()} == {"0o640"}
+
+
 def test_what_the_system_warns_of_is_in_the_summary_beside_the_sources_warnings(tmp_path, write_tum):
     source, slam = open_source(write_tum(tmp_path / "seq", 2)), FakeSlam()
     source.warnings.append("no calibration")

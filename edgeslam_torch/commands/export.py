@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from edgeslam_torch.atomic import write_atomically
 from edgeslam_torch.errors import ConfigError, OutputError
 
 if TYPE_CHECKING:
@@ -70,9 +71,7 @@ def main(args: argparse.Namespace) -> int:
                     store_float16(plain, target)
                 models["int8" if args.int8 else "float16"] = _Model(target)
             print(_table(models, images[:CHECK_IMAGES]))
-            temporary = args.out.with_name(args.out.name + ".part")
-            temporary.write_bytes(target.read_bytes())
-            temporary.replace(args.out)
+            write_atomically(args.out, lambda file: file.write(target.read_bytes()))
     except OSError as error:
         raise OutputError(f"{args.out}: cannot be written ({error.strerror or error})") from error
     print(f"{args.out}: {height}x{width}, opset {opset}, focal length {metadata.focal_px:.1f} px in the input")

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
+from edgeslam_torch.atomic import write_text
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
-from edgeslam_torch.io.atomic import write_text
 from edgeslam_torch.types import FloatArray, PointCloud
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from edgeslam_torch.io.atomic import write_atomically
+from edgeslam_torch.atomic import write_atomically
 from edgeslam_torch.io.raster_axes import (
     BACKGROUND,
     Axes,

@@ -11,8 +11,8 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from edgeslam_torch.atomic import write_atomically, write_text
 from edgeslam_torch.errors import OutputError
-from edgeslam_torch.io.atomic import write_atomically, write_text
 from edgeslam_torch.types import FloatArray
 
 FREE, OCCUPIED, UNKNOWN = 254, 0, 205

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
+from edgeslam_torch.atomic import write_atomically
 from edgeslam_torch.errors import SourceError
-from edgeslam_torch.io.atomic import write_atomically
 from edgeslam_torch.types import PointCloud
 
 POINT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<f4"), ("sigma", "<f4"), ("observations", "<i4")])

@@ -5,8 +5,8 @@ from typing import BinaryIO
 
 import numpy as np
 
+from edgeslam_torch.atomic import write_atomically
 from edgeslam_torch.errors import SourceError
-from edgeslam_torch.io.atomic import write_atomically
 from edgeslam_torch.types import PointCloud
 
 VERTEX = np.dtype(

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
+from edgeslam_torch.atomic import write_text
 from edgeslam_torch.errors import OutputError
 from edgeslam_torch.geometry import se3
-from edgeslam_torch.io.atomic import write_text
 from edgeslam_torch.io.ply import write_ply
 from edgeslam_torch.types import FloatArray, PointCloud, SlamOutput, Support, Units
 

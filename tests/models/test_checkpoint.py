@@ -1,5 +1,7 @@
 """Weights on disk."""
 
+import os
+import stat
 from pathlib import Path
 
 import pytest
@@ -25,6 +27,15 @@ def test_weights_and_record_come_back(tmp_path: Path) -> None:
     x = torch.randn(1, 3, 32, 64)
     assert torch.equal(loaded(x), network(x))
     assert list(tmp_path.iterdir()) == [tmp_path / "w.safetensors"]
+
+
+def test_others_may_read_the_file_where_the_umask_lets_them(tmp_path: Path) -> None:
+    before = os.umask(0o022)
+    try:
+        save_checkpoint(*small_network(), tmp_path / "w.safetensors")
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE((tmp_path / "w.safetensors").stat().st_mode) == 0o644
 
 
 def test_half_precision_halves_the_file_and_hardly_changes_depth(tmp_path: Path) -> None:
