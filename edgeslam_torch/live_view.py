@@ -40,9 +40,9 @@ class LiveView:
             self._viewer.step(output, image)
             return
         keyframe = slam.keyframes()[-1]
-        depth = None if keyframe.depth is None else keyframe.depth.depth_m
+        depth = keyframe.depth  # read once: the mapping thread drops it when the edges are measured
         edges = extract_edges(image, self._edges.canny_low, self._edges.canny_high, _SHOWN_EDGES)
-        self._viewer.step(output, image, keyframe.features.uv, edges.uv, depth)
+        self._viewer.step(output, image, keyframe.features.uv, edges.uv, None if depth is None else depth.depth_m)
         self._keyframes += 1
         if self._keyframes % MAP_EVERY_KEYFRAMES == 1:
             self._viewer.map(slam.edge_map())

@@ -281,11 +281,11 @@ class _Run:
         except KeyboardInterrupt:
             logger.warning("stopped before the last refinement was through")
         finish_s = time.perf_counter() - started
+        self.slam.close()  # what follows is of one moment, even if the refinement was stopped
         stamps, poses = self.slam.trajectory()
         edge_map, anchors, scale = self.slam.edge_map(), self.slam.anchors(), self.slam.scale
         for listener in self.listeners:
             listener.on_finish(self.slam)
-        self.slam.close()
         cpu_s = time.process_time() - cpu_start_s
         summary = {
             **summarise(

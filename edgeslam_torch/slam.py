@@ -398,7 +398,7 @@ class EdgeSlam:
 
     def _initialise(self, frame: Frame, seen: LazyView, bootstrap: Bootstrap, two_view: TwoView) -> Keyframe:
         reference = bootstrap.reference
-        with self._timed("mapping"):
+        with self._timed("mapping"), self.map.lock:
             started = bootstrap.replace_map(frame, seen.view, two_view, self._lm)
         self._bootstrap = None
         self.log.replace(started.T_c_w, [reference, *(k for _, k in started.new)])
@@ -507,23 +507,19 @@ class EdgeSlam:
             self._worker.shutdown(wait=True, cancel_futures=True)
 
     def edge_map(self) -> PointCloud:
-        """Semi-dense edge points that several keyframes agree on."""
+        """Semi-dense edge points that several keyframes agree on, of one moment."""
         return self._published.cloud(self.edges.points())
 
     def anchors(self) -> PointCloud:
-        """Triangulated anchors."""
-        ids = np.flatnonzero(self.map.anchors.alive & ~self.map.anchors.from_depth)
-        cloud = PointCloud(
-            self.map.anchors.p_w[ids].astype(np.float32),
-            self.map.anchors.colour[ids],
-            self.map.anchors.sigma[ids].astype(np.float32),
-            self.map.anchors.observations[ids].astype(np.int32),
-        )
+        """Triangulated anchors, of one moment."""
+        with self.map.lock:
+            cloud = self.map.anchors.cloud()
         return self._published.cloud(cloud)
 
     def keyframes(self) -> list[Keyframe]:
         """Keyframes of the map, oldest first, in the map's own units."""
-        return [self.map.keyframes[id] for id in sorted(self.map.keyframes)]
+        with self.map.lock:
+            return [self.map.keyframes[id] for id in sorted(self.map.keyframes)]
 
     @property
     def scale(self) -> ScaleEstimate:

@@ -136,6 +136,26 @@ def test_second_ctrl_c_skips_the_refinement_and_still_writes(tmp_path, write_tum
     assert {p.name for p in result.folder.iterdir()} == FILES
 
 
+def test_results_are_read_once_nothing_maps_beside_any_more(tmp_path, write_tum):
+    asked = []
+
+    class Watched(FakeSlam):
+        def close(self):
+            asked.append("close")
+
+        def trajectory(self):
+            asked.append("trajectory")
+            return super().trajectory()
+
+        def edge_map(self):
+            asked.append("edge_map")
+            return super().edge_map()
+
+    run(open_source(write_tum(tmp_path / "seq", 3)), tmp_path / "out", make_slam=fake(Watched()))
+    assert asked[0] == "close"
+    assert {"trajectory", "edge_map"} <= set(asked)
+
+
 def test_ctrl_c_while_a_live_source_is_silent(tmp_path, write_tum):
     source = open_source(write_tum(tmp_path / "seq", 3))
     recorded = source.frames

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from edgeslam_torch.types import FloatArray, IntArray
+from edgeslam_torch.types import FloatArray, IntArray, PointCloud
 
 
 class Anchors:
@@ -66,6 +66,16 @@ class Anchors:
         ids = np.unique(ids[self.alive[ids]])
         self.alive[ids] = False
         self._just_removed.extend(ids.tolist())
+
+    def cloud(self) -> PointCloud:
+        """Triangulated anchors; the caller holds the map's lock."""
+        ids = np.flatnonzero(self.alive & ~self.from_depth)
+        return PointCloud(
+            self.p_w[ids].astype(np.float32),
+            self.colour[ids],
+            self.sigma[ids].astype(np.float32),
+            self.observations[ids].astype(np.int32),
+        )
 
     def _grow(self) -> None:
         old = len(self.alive)

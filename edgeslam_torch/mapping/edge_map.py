@@ -52,7 +52,7 @@ class EdgePoints:
 
 
 class EdgeMap:
-    """Measures the edges of keyframes and keeps them."""
+    """Measures the edges of keyframes and keeps them; what it keeps changes under the map's lock alone."""
 
     def __init__(self, slam_map: SlamMap, camera: Camera, config: EdgeConfig, unknown_sigma_log: float) -> None:
         self.map = slam_map
@@ -107,9 +107,14 @@ class EdgeMap:
             colour=edges.colour[known][good],
             observations=np.ones(int(good.sum()), dtype=np.int32),
         )
-        self._count_agreement(points, self._overlapping(keyframe))
-        self.hosts.append(points)
-        self._bound()
+        self.add(points)
+
+    def add(self, points: EdgePoints) -> None:
+        """Take the measured edges of a keyframe in the map, and forget others if there are too many."""
+        with self.map.lock:
+            self._count_agreement(points, self._overlapping(self.map.keyframes[points.keyframe_id]))
+            self.hosts.append(points)
+            self._bound()
 
     def _prior(self, keyframe: Keyframe, uv: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Expected depth and its log sigma ``(E,)`` at edges, the same within a cell: a third of the questions."""
@@ -172,18 +177,24 @@ class EdgeMap:
             points.observations[np.unique(mine[same])] += 1
 
     def points(self) -> PointCloud:
-        """Edge points that several keyframes agree on, fused in cells, in the map's world frame."""
-        clouds = [(se3.transform(se3.inverse(self.map.pose_of(h.keyframe_id)), h.p_c), h) for h in self.hosts]
-        if not clouds:
-            empty = np.zeros((0, 3), np.float32)
-            return PointCloud(empty, np.zeros((0, 3), np.uint8), np.zeros(0, np.float32), np.zeros(0, np.int32))
-        p_w = np.concatenate([p for p, _ in clouds])
-        sigma = np.concatenate([h.sigma for _, h in clouds])
-        colour = np.concatenate([h.colour for _, h in clouds])
-        count = np.concatenate([h.observations for _, h in clouds])
-        depth = np.median(np.concatenate([h.p_c[:, 2] for _, h in clouds]))
+        """Edge points that several keyframes agree on, fused in cells, in the map's world frame.
+
+        They are of one moment, from whatever thread they are asked for.
+        """
+        with self.map.lock:  # the arrays are copies from here on
+            if not self.hosts:
+                empty = np.zeros((0, 3), np.float32)
+                return PointCloud(empty, np.zeros((0, 3), np.uint8), np.zeros(0, np.float32), np.zeros(0, np.int32))
+            p_w = np.concatenate([se3.transform(self._T_w_c(h), h.p_c) for h in self.hosts])
+            sigma = np.concatenate([h.sigma for h in self.hosts])
+            colour = np.concatenate([h.colour for h in self.hosts])
+            count = np.concatenate([h.observations for h in self.hosts])
+            depth = np.median(np.concatenate([h.p_c[:, 2] for h in self.hosts]))
         agreed = count >= self.config.min_observations
         return fuse(p_w[agreed], sigma[agreed], colour[agreed], count[agreed], self.config.voxel * float(depth))
+
+    def _T_w_c(self, host: EdgePoints) -> FloatArray:
+        return se3.inverse(self.map.pose_of(host.keyframe_id))
 
 
 @dataclass(frozen=True, slots=True)

@@ -63,9 +63,12 @@ def last_refinement(slam_map: SlamMap, camera: Camera, edges: EdgeMap, config: W
     with_edges = config.uses_edges or config.uses_corners
     result = None
     if config.reprojection != "off" and refine_all(slam_map, camera, lm) is not None:
-        if max(reobserve_all(slam_map, camera), default=0.0) > MOST_DRIFT_PX:
+        with slam_map.lock:
+            drift_px = max(reobserve_all(slam_map, camera), default=0.0)
+        if drift_px > MOST_DRIFT_PX:
             refine_all(slam_map, camera, lm)
-        fuse_all(slam_map, camera)
+        with slam_map.lock:
+            fuse_all(slam_map, camera)
         result = refine_all(slam_map, camera, lm if with_edges else fine)
     edges.update(everything=True)
     if with_edges:
@@ -106,9 +109,10 @@ def refine_with_edges(
         result = refine_window(problem, lm)
         if config.reprojection == "off":
             keypoint = [k[:0] for k in keypoint]
-        take_back(slam_map, window, keypoint, result)
-        if placed is not None:
-            _take_back_depths(keyframes, hosts, camera, placed, result.edge_inverse_depth)
+        with slam_map.lock:  # poses and depths are of one moment for who looks on
+            take_back(slam_map, window, keypoint, result)
+            if placed is not None:
+                _take_back_depths(keyframes, hosts, camera, placed, result.edge_inverse_depth)
         logger.debug("edges and corners: %s after %d steps", result.stop, result.iterations)
     return result
 

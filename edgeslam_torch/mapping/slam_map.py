@@ -95,7 +95,8 @@ class SlamMap:
 
     def latest(self) -> Keyframe:
         """The newest keyframe."""
-        return self.keyframes[max(self.keyframes)]
+        with self.lock:
+            return self.keyframes[max(self.keyframes)]
 
     # -- observations ------------------------------------------------------------------------------------------
 

@@ -80,16 +80,18 @@ class Bootstrap:
         self.views: list[BootstrapView] = []
         self.waiting: list[WaitingFrame] = []
         points = se3.transform(reference.T_w_c, tracker.camera.back_project(reference.features.uv, guess_depth))
-        slam_map.anchors.begin_pass()
-        ids = slam_map.anchors.add(points, reference.words, reference.id, True, colour)
-        reference.anchor[:] = ids
-        slam_map.add_keyframe(reference)
-        slam_map.refresh_anchors(ids)
+        with slam_map.lock:
+            slam_map.anchors.begin_pass()
+            ids = slam_map.anchors.add(points, reference.words, reference.id, True, colour)
+            reference.anchor[:] = ids
+            slam_map.add_keyframe(reference)
+            slam_map.refresh_anchors(ids)
         self._guessed = ids
 
     def forget_guess(self) -> None:
         """Take the guessed anchors out of the map; the reference keyframe is left for the caller to remove."""
-        self.map.remove_anchors(self._guessed)
+        with self.map.lock:
+            self.map.remove_anchors(self._guessed)
 
     def track(self, view: View, T_predicted: FloatArray) -> Track | None:
         """Pose against the guessed map; the pose is rough, the matches are good."""

@@ -1,0 +1,129 @@
+"""What is read while another thread maps is of one moment.
+
+The other thread comes at the worst point, between two arrays of what is read or changed. It takes the lock if it is
+free and does its work then and there, so nothing here depends on time.
+"""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+from point_map import CAMERA, PointMap
+
+from edgeslam_torch.config import DepthConfig, EdgeConfig, SlamConfig
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.mapping.edge_map import EdgeMap, EdgePoints
+from edgeslam_torch.slam import EdgeSlam
+
+
+def beside(lock, work):
+    """Do ``work`` in another thread now, unless somebody holds the lock."""
+
+    def attempt():
+        if lock.acquire(blocking=False):
+            try:
+                work()
+            finally:
+                lock.release()
+
+    with ThreadPoolExecutor(1) as pool:
+        pool.submit(attempt).result()
+
+
+@pytest.fixture
+def points(rng):
+    made = PointMap(rng, 300, 3)
+    made.fill()
+    return made
+
+
+@pytest.fixture
+def slam(points):
+    """A system with a map of known points, 30 edges of each keyframe, numbered by their colour."""
+    slam = EdgeSlam(CAMERA, SlamConfig(depth=DepthConfig(weights="none")))
+    slam.map = points.map
+    slam.edges = EdgeMap(points.map, CAMERA, EdgeConfig(voxel=1e-6), 0.35)
+    slam.edges.hosts += [host(points, id) for id in range(3)]
+    return slam
+
+
+def host(points, id, kind=EdgePoints):
+    p_c = se3.transform(points.map.pose_of(id), numbered(points))
+    number = np.repeat(np.arange(30, dtype=np.uint8)[:, None], 3, axis=1)
+    count = np.full(30, 3, np.int32)
+    return kind(id, CAMERA.project(p_c).astype(np.float32), p_c, np.full(30, 0.01), number, count)
+
+
+def numbered(points):
+    """Thirty points that every keyframe sees."""
+    return points.world.p_w[points.world.visible[:3].all(axis=0)][:30]
+
+
+def agree(cloud, points):
+    """Whether each point has the colour of its place."""
+    return np.allclose(cloud.p_w, numbered(points)[cloud.colour[:, 0]], atol=1e-3)
+
+
+def test_edges_that_are_thinned_while_they_are_read_stay_whole(slam, points, monkeypatch):
+    pose_of = slam.map.pose_of
+    thin = np.arange(30) % 2 == 0
+
+    def meddled(id):
+        if id == 1:  # the first keyframe's points are read, their sigma, colour and count are not
+            beside(slam.map.lock, lambda: [h.keep(thin) for h in slam.edges.hosts if len(h.uv) == 30])
+        return pose_of(id)
+
+    monkeypatch.setattr(slam.map, "pose_of", meddled)
+    assert agree(slam.edge_map(), points)
+
+
+def test_edges_that_are_read_while_they_are_thinned_are_not_half_thinned(slam, points):
+    seen = []
+
+    class Thinned(EdgePoints):
+        def keep(self, mask):
+            self.uv, self.p_c = self.uv[mask], self.p_c[mask]
+            beside(slam.map.lock, lambda: seen.append(slam.edge_map()))
+            self.sigma, self.colour, self.observations = (x[mask] for x in (self.sigma, self.colour, self.observations))
+            return int((~mask).sum())
+
+    slam.edges = EdgeMap(points.map, CAMERA, EdgeConfig(voxel=1e-6, max_points=1000), 0.35)
+    slam.edges.hosts += [host(points, i % 3, Thinned) for i in range(33)]
+    slam.edges.add(host(points, 0, Thinned))
+    assert sum(len(h.uv) for h in slam.edges.hosts) <= 1000
+    assert all(agree(cloud, points) for cloud in seen)
+    assert agree(slam.edge_map(), points)
+
+
+def test_anchors_that_are_replaced_while_they_are_read_are_the_old_ones_or_the_new_ones(slam):
+    anchors = slam.map.anchors
+    alive = np.flatnonzero(anchors.alive)
+    anchors.colour[alive] = 1
+
+    def replace():
+        anchors.colour[alive] = 2
+        anchors.sigma[alive] = 2.0
+
+    class Meddled(np.ndarray):
+        def __getitem__(self, key):
+            read = super().__getitem__(key)
+            beside(slam.map.lock, replace)
+            return read
+
+    anchors.sigma[alive] = 1.0
+    anchors.colour = anchors.colour.view(Meddled)
+    cloud = slam.anchors()
+    assert np.unique(cloud.colour).tolist() == np.unique(cloud.sigma_m).tolist()
+
+
+def test_a_keyframe_that_is_removed_while_they_are_listed_is_listed_or_not(slam):
+    last = slam.map.keyframes[2]
+
+    class Meddled(dict):
+        def __getitem__(self, id):
+            if id == 0:
+                beside(slam.map.lock, lambda: slam.map.remove_keyframe(last))
+            return super().__getitem__(id)
+
+    slam.map.keyframes = Meddled(slam.map.keyframes)
+    assert [k.id for k in slam.keyframes()] in ([0, 1], [0, 1, 2])
