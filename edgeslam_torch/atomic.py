@@ -24,9 +24,9 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Put ``text`` into ``path`` as UTF-8, atomically.
+    """Put ``text`` into ``path`` as UTF-8, atomically; bytes of a file name that are no UTF-8 become question marks.
 
     Raises:
         OSError: If the disk refuses.
     """
-    write_atomically(path, lambda file: file.write(text.encode("utf-8")))
+    write_atomically(path, lambda file: file.write(text.encode("utf-8", errors="replace")))

@@ -90,10 +90,10 @@ def draw_edges(image: np.ndarray, camera: Camera, T_c_w: FloatArray, cloud: Poin
 
 
 def _entries(run: RunFolder) -> list[Any]:
-    source = run.summary.get("source")
-    if not isinstance(source, dict) or not Path(str(source.get("path", ""))).is_dir():
+    source, folder = run.summary.get("source"), run.source
+    if not isinstance(source, dict) or folder is None:
         return []
-    folder, kind = Path(str(source["path"])), str(source.get("kind"))
+    kind = str(source.get("kind"))
     if kind == "euroc":
         camera_folder = euroc.camera_folder(folder)
         return list(euroc.list_euroc(camera_folder)[0]) if camera_folder is not None else []

@@ -5,7 +5,9 @@ quantised to 11 bytes (three 16-bit coordinates, colour, logarithmic sigma, obse
 """
 
 import base64
+import html
 import json
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -85,19 +87,18 @@ def render(run: RunFolder, score: RunScore | None = None, truth: Trajectory | No
     turn = _upright(run.trajectory, score, truth)
     data, packed_edges, packed_anchors = _payload(run, edges, anchors, score, truth, turn)
     text = json.dumps(_finite(data), allow_nan=False, separators=(",", ":"), default=_plain).replace("<", "\\u003c")
-    page = (_PAGE / "page.html").read_text(encoding="utf-8")
     script = "\n".join((_PAGE / name).read_text(encoding="utf-8") for name in _SCRIPTS)
     parts = {
         "style": (_PAGE / "style.css").read_text(encoding="utf-8"),
         "script": script,
-        "title": _escaped(f"{data['title']}, EdgeSLAM-Torch"),
+        "title": html.escape(f"{data['title']}, EdgeSLAM-Torch"),
         "edges": packed_edges,
         "anchors": packed_anchors,
         "data": text,
     }
-    for name, part in parts.items():
-        page = page.replace("{{" + name + "}}", part, 1)
-    return page
+    # In one pass: a recording may itself be called {{edges}}.
+    page = (_PAGE / "page.html").read_text(encoding="utf-8")
+    return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], page)
 
 
 def _judge(
@@ -118,14 +119,11 @@ def _judge(
 
 def _source_folder(run: RunFolder) -> Path | None:
     """The recording that the run read, when it is still there and has ground truth."""
-    for key in ("source", "source_path", "input"):
-        value = run.summary.get(key)
-        if isinstance(value, dict):
-            value = value.get("path")
-        if isinstance(value, str) and value and Path(value).is_dir():
-            folder = Path(value)
-            if (folder / "groundtruth.txt").is_file() or (folder / "mav0").is_dir() or any(folder.glob("*.pose.txt")):
-                return folder
+    folder = run.source
+    if folder is not None and (
+        (folder / "groundtruth.txt").is_file() or (folder / "mav0").is_dir() or any(folder.glob("*.pose.txt"))
+    ):
+        return folder
     for name in ("groundtruth.txt", "ground_truth.txt"):
         if (run.path / name).is_file():
             return run.path / name
@@ -186,7 +184,7 @@ def _payload(
         "keyframes": _keyframes(run, edges, trajectory.stamps_s[table.keyframes()], begin),
         "mapScore": words.map_rows(score),
         "summary": words.flat_rows(run.summary),
-        "config": _text(run.path / "config.toml"),
+        "config": _config(run),
     }
     return data, edge_bytes, anchor_bytes
 
@@ -267,7 +265,7 @@ class _StatusTable:
         text = [[f"{a - begin:.2f} s", f"{b - begin:.2f} s", str(n), s, why] for a, b, n, s, why in rows[:most]]
         if len(rows) > most:
             text.append(["", "", "", "", f"and {len(rows) - most} more in status.csv"])
-        return text
+        return [[words.without_folders(cell) for cell in row] for row in text]
 
 
 def _status_code(row: dict[str, str]) -> int:
@@ -432,8 +430,9 @@ def _jpeg(image: np.ndarray) -> str:
     return "data:image/jpeg;base64," + base64.b64encode(jpeg.tobytes()).decode("ascii")
 
 
-def _text(path: Path) -> str | None:
-    return path.read_text(encoding="utf-8", errors="replace") if path.is_file() else None
+def _config(run: RunFolder) -> str | None:
+    path = run.path / "config.toml"
+    return words.without_folders(path.read_text(encoding="utf-8", errors="replace")) if path.is_file() else None
 
 
 def _rounded(values: FloatArray, digits: int) -> list[Any]:
@@ -455,7 +454,3 @@ def _plain(value: object) -> object:
     if isinstance(value, np.generic):
         return value.item()
     return str(value)
-
-
-def _escaped(text: str) -> str:
-    return text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")

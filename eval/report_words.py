@@ -1,11 +1,19 @@
 """The report's sentences and tables: what a run's numbers mean, in plain words."""
 
 import math
+import re
 from pathlib import Path
 from typing import Any
 
 from edgeslam_torch.eval.run_folder import RunFolder, is_supported
 from edgeslam_torch.eval.run_score import RunScore
+
+_ABSOLUTE = re.compile(
+    r"(?<![\w.:/\\<])"  # where a word begins: the slashes of 6/s, ../x, rtsp://host and </tag> are none
+    r"(?:[A-Za-z]:[\\/]|\\\\|/)(?=[^\s/\\])"
+    r"(?:[^/\\\n:;,'\"<>|]*[^\s/\\:;,'\"<>|][/\\])*"
+)
+"""An absolute path up to its last name; folders may have spaces in them, not at their ends."""
 
 
 def unit(run: RunFolder) -> str:
@@ -16,15 +24,26 @@ def unit(run: RunFolder) -> str:
 def title(run: RunFolder) -> str:
     """Name of the recording, else of the folder."""
     source = run.summary.get("source")
-    if isinstance(source, dict):
-        source = source.get("path")
-    return Path(source).name if isinstance(source, str) and source else run.name
+    if isinstance(source, dict) and isinstance(source.get("name"), str) and source["name"]:
+        return readable(source["name"])
+    path = source.get("path") if isinstance(source, dict) else source
+    return readable(Path(path).name if isinstance(path, str) and path else run.name)
+
+
+def readable(text: str) -> str:
+    """Text that UTF-8 can write: bytes of a file name that are no UTF-8 become question marks."""
+    return text.encode("utf-8", errors="replace").decode("utf-8")
+
+
+def without_folders(text: str) -> str:
+    """Absolute paths shortened to their last name: a page that is passed on tells nothing about the disk."""
+    return _ABSOLUTE.sub("", text)
 
 
 def story(run: RunFolder, score: RunScore | None) -> str:
     """What was run and how it went."""
     summary, sentences = run.summary, []
-    frames = int(summary.get("frames") or len(run.status) or len(run.trajectory))
+    frames = _count(summary.get("frames")) or len(run.status) or len(run.trajectory)
     seconds = float(run.trajectory.stamps_s[-1] - run.trajectory.stamps_s[0])
     tracked = run.trusted_frames
     sentences.append(f"{frames} frames, {seconds:.1f} s of recording.")
@@ -63,7 +82,7 @@ def tiles(run: RunFolder, score: RunScore | None, points: int) -> list[dict[str,
         add(f"{100 * score.ate_sim3_m:.2f}", "cm", "position error (ATE, Sim(3))")
         if score.map is not None:
             add(f"{100 * score.map.median_m:.2f}", "cm", "map error (median)")
-    frames = int(summary.get("frames") or len(run.status) or 0)
+    frames = _count(summary.get("frames")) or len(run.status)
     if frames and run.status:
         add(f"{100 * run.trusted_frames / frames:.1f}", "%", "frames tracked")
     if points:
@@ -94,7 +113,7 @@ def foot(run: RunFolder) -> str:
         if isinstance(value, dict):
             value = value.get("source")
         if value not in (None, ""):
-            parts.append(f"{key} {value}")
+            parts.append(f"{key} {without_folders(str(value))}")
     return ", ".join(parts) + "."
 
 
@@ -146,7 +165,7 @@ def flat_rows(summary: dict[str, Any], prefix: str = "") -> list[list[str]]:
         elif isinstance(value, float):
             rows.append([name, f"{value:.6g}"])
         else:
-            rows.append([name, str(value)])
+            rows.append([name, without_folders(_flat(value))])
     return rows
 
 
@@ -177,7 +196,8 @@ def _scale_sentence(summary: dict[str, Any]) -> str:
 
 
 def _pieces_sentence(summary: dict[str, Any]) -> str:
-    pieces = [p for p in summary.get("pieces") or [] if isinstance(p, dict) and p.get("supported")]
+    listed = summary.get("pieces")
+    pieces = [p for p in listed if isinstance(p, dict) and p.get("supported")] if isinstance(listed, list) else []
     if len(pieces) < 2:
         return ""
     spans = ", ".join(f"piece {p.get('number')} from {p.get('first_s')} to {p.get('last_s')} s" for p in pieces)
@@ -203,5 +223,20 @@ def _scale_words(scale_error: float) -> str:
 def _float(value: object) -> float:
     try:
         return float(value)  # type: ignore[arg-type]
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         return float("nan")
+
+
+def _flat(value: object) -> str:
+    """A list, or a list of records, without brackets and quotes."""
+    if isinstance(value, list):
+        return "; ".join(_flat(item) for item in value) or "none"
+    if isinstance(value, dict):
+        return ", ".join(f"{key} {item}" for key, item in value.items())
+    return str(value)
+
+
+def _count(value: object) -> int:
+    """A whole number; 0 for what is none."""
+    number = _float(value)
+    return int(number) if math.isfinite(number) else 0

@@ -53,6 +53,19 @@ class RunFolder:
         return ok or list(range(0, len(self.trajectory), 10))
 
     @property
+    def source(self) -> Path | None:
+        """Folder that the run read, when its summary tells and it is still there; relative names start at the run."""
+        source = self.summary.get("source")
+        name = source.get("path") if isinstance(source, dict) else source
+        if not isinstance(name, str) or not name:
+            return None
+        folder = self.path / name
+        try:
+            return folder if folder.is_dir() else None
+        except (OSError, ValueError):  # a name that no folder can have
+            return None
+
+    @property
     def trusted_frames(self) -> int:
         """Frames whose final pose rests on a map that the images support; all where no ``status.csv`` tells."""
         return sum(map(is_supported, self.status)) if self.status else len(self.trajectory)
@@ -91,11 +104,18 @@ def is_supported(row: dict[str, str]) -> bool:
 
 
 def read_status(path: Path) -> tuple[dict[str, str], ...]:
-    """Rows of ``status.csv``; empty when there is none."""
+    """Rows of ``status.csv``; empty when there is none.
+
+    Raises:
+        EvaluationError: If it is not a table of text.
+    """
     if not path.is_file():
         return ()
-    with path.open(newline="", encoding="utf-8") as file:
-        return tuple({k: v or "" for k, v in row.items() if k is not None} for row in csv.DictReader(file))
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            return tuple({k: v or "" for k, v in row.items() if k is not None} for row in csv.DictReader(file))
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise EvaluationError(f"{path}: not a table of text ({error})") from error
 
 
 def read_summary(path: Path) -> dict[str, Any]:

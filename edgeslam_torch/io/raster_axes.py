@@ -146,12 +146,13 @@ def text(
 
     Args:
         image: To write into; what lies outside is cut off.
-        words: One line.
+        words: One line; what is no Unicode (bytes of a file name) becomes a question mark.
         at: Pixel.
         size: OpenCV's font scale; 0.5 is some 15 px.
         anchor: Which part of the text lies there, from 0 (left, upper edge) to 1 (right, lower edge).
         upright: Turned, to be read from below.
     """
+    words = words.encode("utf-8", errors="replace").decode("utf-8")  # OpenCV ends the process at a lone surrogate
     width, height = text_size(words, size)
     pad = 2 + height // 2  # descenders, and what a glyph reaches beyond its box
     cover = np.zeros((height + 2 * pad, width + 2 * pad, 3), dtype=np.uint8)

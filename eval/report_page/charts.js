@@ -16,7 +16,7 @@ function niceTicks(lo, hi, count) {
 }
 function short(v) {
   const a = Math.abs(v);
-  if (a >= 10000) return v.toExponential(1);
+  if (a >= 1e6) return v.toExponential(1);
   return String(+v.toFixed(a >= 100 ? 0 : a >= 10 ? 1 : a >= 1 ? 2 : 4));
 }
 
@@ -55,8 +55,11 @@ function lineChart(box, { series, unit, zero, format = short }) {
       svg("line", { x1: L, x2: W - R, y1: Y(v), y2: Y(v), stroke: "var(--line)" }, root);
       svg("text", { x: L - 8, y: Y(v) + 4, "text-anchor": "end" }, root).textContent = short(v);
     }
-    for (const t of niceTicks(t0, t1, Math.max(2, W / 130))) svg("text", { x: X(t), y: H - 6, "text-anchor": "middle" }, root).textContent = short(t) + " s";
-    svg("text", { x: L, y: 12 }, root).textContent = unit;
+    for (const t of niceTicks(t0, t1, Math.max(2, W / 130))) {
+      const label = svg("text", { y: H - 6, "text-anchor": "middle" }, root); label.textContent = short(t) + " s";
+      label.setAttribute("x", Math.min(X(t), W - label.getComputedTextLength() / 2));
+    }
+    svg("text", { x: 0, y: 12 }, root).textContent = unit;
     series.forEach(s => {
       if (s.low) {
         const top = thin(s.x, s.high, W), bottom = thin(s.x, s.low, W).reverse();
@@ -110,6 +113,8 @@ function flatView(canvas, a, b) {
   if (DATA.truth) path(DATA.truth, css("--truth"), 1);
   path(DATA.positions, css("--tracked"), 1.6);
   const length = [0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50].find(v => v * s > 60 * ratio) || 100;
-  g.fillStyle = css("--soft"); g.fillRect(14 * ratio, H - 16 * ratio, length * s, 2 * ratio);
-  g.font = `${13 * ratio}px system-ui, sans-serif`; g.fillText(`${length} ${DATA.unit}`, 14 * ratio, H - 22 * ratio);
+  const label = `${length} ${DATA.unit}`;
+  g.font = `${13 * ratio}px system-ui, sans-serif`;
+  g.fillStyle = css("--glass"); g.fillRect(8 * ratio, H - 38 * ratio, Math.max(length * s, g.measureText(label).width) + 12 * ratio, 30 * ratio);
+  g.fillStyle = css("--soft"); g.fillRect(14 * ratio, H - 16 * ratio, length * s, 2 * ratio); g.fillText(label, 14 * ratio, H - 22 * ratio);
 }

@@ -33,11 +33,11 @@ def loop_trajectory(count: int = 200, rate_hz: float = 20.0, begin_s: float = 10
     return Trajectory(begin_s + t, T, "loop")
 
 
-def make_run_folder(folder: Path, points: int = 2000, scale: float = 1.0) -> Path:
+def make_run_folder(folder: Path, points: int = 2000, scale: float = 1.0, rate_hz: float = 20.0) -> Path:
     """Fill ``folder`` with a run's files; returns a ground-truth file beside it."""
     rng = np.random.default_rng(0)
     (folder / "keyframes").mkdir(parents=True)
-    truth = loop_trajectory()
+    truth = loop_trajectory(rate_hz=rate_hz)
     T = truth.T_w_c.copy()
     T[:, :3, 3] = (T[:, :3, 3] + rng.normal(0.0, 0.005, (len(T), 3))) / scale
     run = Trajectory(truth.stamps_s, T, "run")

@@ -1,5 +1,6 @@
 """The report in a real headless browser: no error, something drawn, every control works, no network."""
 
+import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -84,6 +85,29 @@ def test_page_fits_a_phone(page: Path, browser: Browser) -> None:
     found = browser.run(PROBE.read_text(encoding="utf-8"))
     assert browser.errors == []
     assert not found["wide"]
+
+
+@pytest.fixture(scope="module")
+def worst_page(tmp_path_factory: pytest.TempPathFactory, run_folder: Callable[..., Path]) -> Path:
+    """Every text as long as it can be and without a space, a recording of hours that ends at a tick of the charts."""
+    folder, long = tmp_path_factory.mktemp("worst") / "run", "unbroken_" * 30
+    truth = run_folder(folder, points=500, rate_hz=199 / 12000)
+    table = (folder / "status.csv").read_text().replace("features_ms", f"{long}ms").replace("few matches", long)
+    (folder / "status.csv").write_text(table)
+    summary = json.loads((folder / "summary.json").read_text())
+    summary |= {"source": f"nowhere/{long}", "command": long, long: long, "warnings": [long]}
+    (folder / "summary.json").write_text(json.dumps(summary))
+    (folder / "config.toml").write_text(long)
+    return write_report(folder, truth)
+
+
+@pytest.mark.parametrize("width", [320, 390, 1280])
+def test_no_text_of_a_run_makes_the_page_scroll_sideways(worst_page: Path, browser: Browser, width: int) -> None:
+    browser.open(worst_page, width=width, height=844, mobile=width < 700)
+    browser.run("document.querySelectorAll('details').forEach(d => d.open = true)")
+    browser.run("[0.01, 0.5, 0.99].forEach(t => moveCursor(t * DATA.time[1], byId('inliers')))")
+    assert browser.run("document.documentElement.scrollWidth") == width
+    assert browser.errors == []
 
 
 @pytest.mark.slow
