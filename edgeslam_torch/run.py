@@ -41,6 +41,9 @@ from edgeslam_torch.types import (
 
 logger = logging.getLogger(__name__)
 
+_HANG_UP: int = getattr(signal, "SIGHUP", 0)  # Windows has none
+_STOPPING = [number for number in (signal.SIGINT, signal.SIGTERM, _HANG_UP) if number]
+
 LOOKED_AT = 320
 """Images at the start of a recording in which an unknown focal length is looked for; ten seconds at 30 Hz."""
 
@@ -142,23 +145,21 @@ def run(
 
     Args:
         source: From `open_source`.
-        out_dir: Folder for the results; made when missing, an older run in it is replaced.
+        out_dir: Folder for the results; made when missing. An older run in it is replaced once a frame is through.
         config: Settings; the defaults when None.
         mode: How frames are fed.
         listeners: Called after every frame.
         make_slam: Builds the system from camera, settings and whether it runs in real time; `EdgeSlam` when None.
 
     Raises:
-        OutputError: If the folder cannot be written to at all.
+        OutputError: If the folder cannot be written to at all, holds files that no run wrote, or another run writes
+            into it.
         SourceError: If the source gives not a single frame, or fails on the way (after the results are written).
     """
     config = config or SlamConfig()
-    with closing(source):
-        # The system first: when its weights are missing, an older run in the folder must not be gone.
+    with closing(source), closing(RunWriter(out_dir, [Path(source.location)], to_toml(config))) as writer:
         slam = (make_slam or _edge_slam)(source.camera, config, mode is Mode.REALTIME)
-        with closing(RunWriter(out_dir, keep=[Path(source.location)])) as writer:
-            writer.write_config(to_toml(config))
-            return _Run(source, writer, slam, config, mode, listeners).go()
+        return _Run(source, writer, slam, config, mode, listeners).go()
 
 
 def settle_camera(source: Source) -> None:
@@ -280,6 +281,7 @@ class _Run:
             self.slam.finish()
         except KeyboardInterrupt:
             logger.warning("stopped before the last refinement was through")
+        self.interrupt.writing = True
         finish_s = time.perf_counter() - started
         self.slam.close()  # what follows is of one moment, even if the refinement was stopped
         stamps, poses = self.slam.trajectory()
@@ -338,18 +340,24 @@ class _TelemetryCursor:
 
 
 class _Interrupt:
-    """Ctrl-C as a wish to stop: the first lets everything be written, the second skips the last refinement."""
+    """Ctrl-C, a closed terminal or ``kill`` as a wish to stop: the run ends and everything is written.
+
+    A second Ctrl-C tears the main thread out of what it does, the last refinement for example, unless it writes.
+    """
 
     def __init__(self) -> None:
         self.requested = False
         self.at_once = False
         """Whether the main thread may be torn out of what it does: it only waits."""
+        self.writing = False
         self._old: dict[int, Any] = {}
 
     def __enter__(self) -> "_Interrupt":
         if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGINT, signal.SIGTERM):
+            for number in _STOPPING:
                 self._old[number] = signal.signal(number, self._on_signal)
+            if self._old.get(_HANG_UP) is signal.SIG_IGN:  # nohup
+                signal.signal(_HANG_UP, signal.SIG_IGN)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -357,9 +365,9 @@ class _Interrupt:
             signal.signal(number, handler)
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
-        again = self.requested
+        again = self.requested and number == signal.SIGINT  # a closed terminal may send its signal twice
         self.requested = True
-        if again or self.at_once:
+        if self.at_once or (again and not self.writing):
             raise KeyboardInterrupt
 
 

@@ -12,7 +12,7 @@ import pytest
 from fake_slam import FakeSlam
 
 from edgeslam_torch.config import SlamConfig
-from edgeslam_torch.errors import SourceError
+from edgeslam_torch.errors import EdgeSlamError, SourceError, WeightsError
 from edgeslam_torch.io.config_file import load_config
 from edgeslam_torch.io.pace import Counter, at_their_pace
 from edgeslam_torch.io.ply import read_ply
@@ -124,6 +124,72 @@ def test_ctrl_c_finishes_and_writes(tmp_path, write_tum):
     assert json.loads((result.folder / "summary.json").read_text())["interrupted"] is True
     assert len(np.loadtxt(result.folder / "trajectory.txt")) == 6
     assert signal.getsignal(signal.SIGINT) is handler
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_kill_and_a_closed_terminal_finish_and_write_even_when_sent_twice(tmp_path, write_tum, number):
+    def send(step):
+        if step == 5:
+            os.kill(os.getpid(), number)
+            os.kill(os.getpid(), number)
+
+    slam = FakeSlam(on_step=send)
+    handler = signal.getsignal(number)
+    result = run(open_source(write_tum(tmp_path / "seq", 20)), tmp_path / "out", make_slam=fake(slam))
+    assert result.interrupted and slam.finished
+    assert {p.name for p in result.folder.iterdir()} == FILES
+    assert len(np.loadtxt(result.folder / "trajectory.txt")) == 6
+    assert signal.getsignal(number) is handler
+
+
+def test_nohup_goes_on_when_the_terminal_closes(tmp_path, write_tum):
+    def hang_up(step):
+        os.kill(os.getpid(), signal.SIGHUP)
+
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        result = run(
+            open_source(write_tum(tmp_path / "seq", 3)), tmp_path / "out", make_slam=fake(FakeSlam(on_step=hang_up))
+        )
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    assert not result.interrupted and result.summary["frames"] == 3
+
+
+def test_ctrl_c_while_results_are_written_loses_none(tmp_path, write_tum):
+    class Watched(FakeSlam):
+        def trajectory(self):
+            os.kill(os.getpid(), signal.SIGINT)
+            os.kill(os.getpid(), signal.SIGINT)
+            return super().trajectory()
+
+    result = run(open_source(write_tum(tmp_path / "seq", 3)), tmp_path / "out", make_slam=fake(Watched()))
+    assert {p.name for p in result.folder.iterdir()} == FILES
+
+
+@pytest.mark.parametrize("end", ["no frame", "interrupt", "no weights"])
+def test_a_run_that_comes_to_nothing_leaves_the_older_run(tmp_path, write_tum, end):
+    folder = write_tum(tmp_path / "seq", 2)
+    run(open_source(folder), tmp_path / "out", make_slam=fake(FakeSlam()))
+    before = {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir()}
+    source = open_source(folder)
+
+    def nothing():
+        if end == "interrupt":
+            os.kill(os.getpid(), signal.SIGINT)
+        yield from ()
+
+    def make(camera, config, realtime):
+        if end == "no weights":
+            raise WeightsError("no such weights")
+        return FakeSlam()
+
+    source.frames = nothing
+    message = {"no frame": "not a single frame", "interrupt": "nothing was written", "no weights": "no such weights"}
+    with pytest.raises(EdgeSlamError, match=message[end]):
+        run(source, tmp_path / "out", make_slam=make)
+    assert {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir()} == before
 
 
 def test_second_ctrl_c_skips_the_refinement_and_still_writes(tmp_path, write_tum):

@@ -8,22 +8,22 @@ from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from io import StringIO
 from pathlib import Path
-from typing import Any
+from tempfile import TemporaryFile
+from typing import IO, Any
 
 import numpy as np
 
 from edgeslam_torch.atomic import write_text
 from edgeslam_torch.errors import OutputError
 from edgeslam_torch.geometry import se3
+from edgeslam_torch.io.own_folder import STATUS, SUMMARY, FolderLock, check_free
 from edgeslam_torch.io.ply import write_ply
 from edgeslam_torch.types import FloatArray, PointCloud, SlamOutput, Support, Units
 
 TRAJECTORY = "trajectory.txt"
 ONLINE = "trajectory_online.txt"
-STATUS = "status.csv"
 EDGE_MAP = "edge_map.ply"
 ANCHORS = "anchors.ply"
-SUMMARY = "summary.json"
 CONFIG = "config.toml"
 CAMERA = "camera.yaml"
 PICTURE = "map.png"
@@ -49,7 +49,8 @@ STATUS_COLUMNS = (
 
 TRAJECTORY_HEADER = "# stamp_s tx ty tz qx qy qz qw, camera to world\n"
 
-_RESERVE = ".reserve"
+_OLD_RESERVE = ".reserve"
+"""A file that killed runs of version 0.1 left behind."""
 _RESERVE_BYTES = 24 << 20
 """Held back from the disk for the final files: a map of 400 000 points (12 MB), two trajectories, a picture."""
 
@@ -57,36 +58,40 @@ _RESERVE_BYTES = 24 << 20
 class RunWriter:
     """Writes one run's folder.
 
-    After a write error (a full disk) nothing more is appended, what is there stays valid, and `failure` says what
-    happened; the space that was held back lets the final files still be written.
+    An older run in it stays until the first frame is there. After a write error (a full disk) nothing more is appended,
+    what is there stays valid, and `failure` says what happened; the space that was held back lets the final files still
+    be written.
     """
 
-    def __init__(self, folder: Path, keep: Iterable[Path] = ()) -> None:
-        """Make the folder and take away what an older run left in it.
+    def __init__(self, folder: Path, keep: Iterable[Path] = (), config_toml: str = "") -> None:
+        """Make the folder, lock it, and hold space back.
 
         Args:
             folder: Where the results go.
             keep: Folders that the results must not go into, such as the source.
+            config_toml: The resolved configuration, written beside the results.
 
         Raises:
-            OutputError: If the folder cannot be made or written to, or is one to keep.
+            OutputError: If the folder cannot be made or written to, is one to keep, holds files that no run wrote, or
+                another run writes into it.
         """
         self.folder = folder
         self.failure: str | None = None
-        self._stages: list[str] = []
+        self._config_toml = config_toml
+        self._live: _LiveFiles | None = None
         try:
+            self._made = not folder.exists()
             folder.mkdir(parents=True, exist_ok=True)
             if any(folder.samefile(other) for other in keep if other.exists()):
                 raise OutputError(f"{folder}: is the source itself; give another folder to --out")
-            for name in OUTPUTS:
-                (folder / name).unlink(missing_ok=True)
-            _reserve(folder / _RESERVE)
-            self._trajectory = _Appender(folder / TRAJECTORY, TRAJECTORY_HEADER)
-            self._online = _Appender(folder / ONLINE, TRAJECTORY_HEADER)
-            self._status = _Appender(folder / STATUS, _csv_line(STATUS_COLUMNS))
+            check_free(folder, OUTPUTS)
+            self._lock = FolderLock(folder)
+            try:
+                self._reserve = _held_back(folder)
+            except OSError:
+                self._lock.release()
+                raise
         except OSError as error:
-            with suppress(OSError):
-                (folder / _RESERVE).unlink(missing_ok=True)
             raise OutputError(f"{folder}: cannot write results there ({error.strerror or error})") from error
 
     def append(self, output: SlamOutput, step_ms: float) -> bool:
@@ -94,18 +99,13 @@ class RunWriter:
         if self.failure is not None:
             return False
         try:
-            line = tum_line(output.stamp_s, output.T_w_c)
-            self._trajectory.write(line)
-            self._online.write(line)
-            self._write_status(output, step_ms)
+            if self._live is None:
+                self._live = self._begun()
+            self._live.add(output, step_ms)
         except OSError as error:
-            self._fail(error)
+            self.failure = f"{self.folder}: cannot write any more ({error.strerror or error})"
             return False
         return True
-
-    def write_config(self, toml: str) -> None:
-        """Put the resolved configuration beside the results."""
-        self._guarded(lambda: write_text(self.folder / CONFIG, toml))
 
     def finish(
         self,
@@ -133,16 +133,17 @@ class RunWriter:
         Returns:
             What could not be written, one line each.
         """
-        (self.folder / _RESERVE).unlink(missing_ok=True)
+        self._reserve.close()
         comments = (
             f"units: {units}",
             "frame: world of trajectory.txt, z up",
             "sigma: standard deviation along the ray",
         )
         rows = "".join(tum_line(stamp, T) for stamp, T in zip(stamps_s, T_w_c, strict=True))
+        live = self._live
         steps: list[tuple[str, Callable[[Path], None]]] = [
             (TRAJECTORY, lambda path: write_text(path, TRAJECTORY_HEADER + rows)),
-            (STATUS, lambda path: self._settle_status(support)),
+            (STATUS, lambda path: live.settle(support) if live is not None else None),
             (SUMMARY, lambda path: write_text(path, summary_text(summary))),
             (EDGE_MAP, lambda path: write_ply(path, edge_map, comments)),
             (ANCHORS, lambda path: write_ply(path, anchors, comments)),
@@ -159,24 +160,53 @@ class RunWriter:
         return missing
 
     def close(self) -> None:
-        """Give back files and the space held back."""
+        """Give back files, lock and the space held back; a folder that was made for nothing goes."""
+        if self._live is not None:
+            self._live.close()
+        self._reserve.close()
+        self._lock.release()
+        if self._made and self._live is None:
+            with suppress(OSError):
+                self.folder.rmdir()
+
+    def _begun(self) -> "_LiveFiles":
+        """Take away what an older run left, and start this one's files."""
+        for name in (*OUTPUTS, *(f".{name}.part" for name in OUTPUTS), _OLD_RESERVE):
+            (self.folder / name).unlink(missing_ok=True)
+        live = _LiveFiles(self.folder)
+        write_text(self.folder / CONFIG, self._config_toml)
+        return live
+
+
+class _LiveFiles:
+    """What a run appends to with every frame: both trajectories and the status table."""
+
+    def __init__(self, folder: Path) -> None:
+        self._table = folder / STATUS
+        self._stages: list[str] = []
+        self._status = _Appender(self._table, _csv_line(STATUS_COLUMNS))
+        self._trajectory = _Appender(folder / TRAJECTORY, TRAJECTORY_HEADER)
+        self._online = _Appender(folder / ONLINE, TRAJECTORY_HEADER)
+
+    def add(self, output: SlamOutput, step_ms: float) -> None:
+        line = tum_line(output.stamp_s, output.T_w_c)
+        self._trajectory.write(line)
+        self._online.write(line)
+        self._write_status(output, step_ms)
+
+    def close(self) -> None:
         for file in (self._trajectory, self._online, self._status):
             file.close()
-        (self.folder / _RESERVE).unlink(missing_ok=True)
 
     def _write_status(self, output: SlamOutput, step_ms: float) -> None:
         new = [stage for stage in output.stage_ms if stage not in self._stages]
-        if new:
+        if new:  # columns for stages that had not run before
             self._stages += new
-            self._widen_status()
+            self._rewrite_status(self._status_rows())
         stages = [_number(output.stage_ms.get(stage, math.nan), 3) for stage in self._stages]
         self._status.write(_csv_line([*_status_row(output, step_ms), *stages]))
 
-    def _widen_status(self) -> None:
-        """Rewrite the table so far with columns for stages that had not run before."""
-        self._rewrite_status(self._status_rows())
-
-    def _settle_status(self, support: Support) -> None:
+    def settle(self, support: Support) -> None:
         """Say of every frame what its final pose rests on, in place of what its pose rested on when it came."""
         rows = self._status_rows()
         piece, supported = STATUS_COLUMNS.index("piece"), STATUS_COLUMNS.index("supported")
@@ -186,26 +216,16 @@ class RunWriter:
 
     def _status_rows(self) -> list[list[str]]:
         self._status.close()
-        with (self.folder / STATUS).open(newline="", encoding="utf-8") as file:
+        with self._table.open(newline="", encoding="utf-8") as file:
             return list(csv.reader(file))[1:]
 
     def _rewrite_status(self, rows: list[list[str]]) -> None:
         header = [*STATUS_COLUMNS, *(f"{stage}_ms" for stage in self._stages)]
         padded = [_csv_line(row + [""] * (len(header) - len(row))) for row in rows]
-        path = self.folder / STATUS
         try:
-            write_text(path, _csv_line(header) + "".join(padded))
+            write_text(self._table, _csv_line(header) + "".join(padded))
         finally:
-            self._status = _Appender(path, None)
-
-    def _guarded(self, write: Callable[[], None]) -> None:
-        try:
-            write()
-        except OSError as error:
-            self._fail(error)
-
-    def _fail(self, error: OSError) -> None:
-        self.failure = f"{self.folder}: cannot write any more ({error.strerror or error})"
+            self._status = _Appender(self._table, None)
 
 
 class _Appender:
@@ -285,10 +305,18 @@ def _csv_line(cells: Sequence[str]) -> str:
     return buffer.getvalue()
 
 
-def _reserve(path: Path) -> None:
-    """Take space on the disk; quick where the file system can promise space without writing it."""
-    with path.open("wb") as file:
+def _held_back(folder: Path) -> IO[bytes]:
+    """Space on the disk that is free again once the file is closed or the process dies: the file has no name.
+
+    Quick where the file system can promise space without writing it.
+    """
+    file = TemporaryFile(dir=folder)  # noqa: SIM115, closed by the writer
+    try:
         if hasattr(os, "posix_fallocate"):
             os.posix_fallocate(file.fileno(), 0, _RESERVE_BYTES)
         else:
             file.write(bytes(_RESERVE_BYTES))
+    except OSError:
+        file.close()
+        raise
+    return file

@@ -3,6 +3,9 @@ import errno
 import json
 import math
 import os
+import subprocess
+import sys
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +13,7 @@ import pytest
 from fake_slam import FakeSlam
 
 from edgeslam_torch.errors import OutputError
-from edgeslam_torch.io.run_writer import RunWriter
+from edgeslam_torch.io.run_writer import OUTPUTS, RunWriter
 from edgeslam_torch.types import Frame, Units
 
 
@@ -70,12 +73,98 @@ def test_end_result(tmp_path):
     assert not [p for p in tmp_path.iterdir() if p.name.startswith(".")]
 
 
-def test_an_older_run_is_replaced_and_other_files_are_kept(tmp_path):
-    (tmp_path / "edge_map.ply").write_text("old")
+def leave_run(folder, frames=2):
+    """A folder as a run of so many frames leaves it."""
+    slam, rows = outputs(frames)
+    with closing(RunWriter(folder, config_toml="seed = 1\n")) as writer:
+        for output in rows:
+            writer.append(output, 1.0)
+        stamps, poses = slam.trajectory()
+        summary = {"version": "0.1.0", "frames": frames, "statuses": {}}
+        writer.finish(summary, stamps, poses, slam.support(), slam.edge_map(), slam.anchors(), Units.METRES)
+
+
+def contents(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
+
+
+def test_an_older_run_stays_until_the_first_frame_is_there_and_other_files_stay_for_good(tmp_path):
+    leave_run(tmp_path)
     (tmp_path / "notes.txt").write_text("mine")
+    (tmp_path / ".trajectory.txt.part").write_text("left by a killed run")
+    before = contents(tmp_path)
     RunWriter(tmp_path).close()
-    assert not (tmp_path / "edge_map.ply").exists()
-    assert (tmp_path / "notes.txt").exists()
+    assert contents(tmp_path) == before
+    writer = RunWriter(tmp_path)
+    writer.append(outputs(1)[1][0], 1.0)
+    writer.close()
+    left = {"trajectory.txt", "trajectory_online.txt", "status.csv", "config.toml", "notes.txt"}
+    assert set(contents(tmp_path)) == left
+    assert np.loadtxt(tmp_path / "trajectory.txt", ndmin=2).shape == (1, 8)
+
+
+def test_folder_made_for_nothing_is_gone(tmp_path):
+    RunWriter(tmp_path / "out").close()
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("name", [*OUTPUTS, "rgb.txt", "telemetry.csv", "IMG_1.JPG", "flight.mp4"])
+def test_a_folder_with_what_no_run_wrote_is_refused_and_left_alone(tmp_path, name):
+    (tmp_path / name).write_text("version: mine\n")
+    before = contents(tmp_path)
+    with pytest.raises(OutputError, match=f"holds {name}, which no run wrote"):
+        RunWriter(tmp_path)
+    assert contents(tmp_path) == before
+
+
+def test_a_recording_is_refused_although_a_run_of_old_wrote_into_it(tmp_path):
+    leave_run(tmp_path)
+    (tmp_path / "rgb").mkdir()
+    with pytest.raises(OutputError, match="holds rgb, which no run wrote"):
+        RunWriter(tmp_path)
+
+
+@pytest.mark.parametrize("left", [["status.csv", "config.toml"], ["summary.json", "camera.yaml"]])
+def test_what_is_left_of_a_run_is_known_as_a_run(tmp_path, left):
+    leave_run(tmp_path / "run")
+    (tmp_path / "run" / "camera.yaml").write_text("")
+    for path in (tmp_path / "run").iterdir():
+        if path.name not in left:
+            path.unlink()
+    RunWriter(tmp_path / "run").close()
+
+
+def test_one_run_at_a_time(tmp_path):
+    first = RunWriter(tmp_path)
+    with pytest.raises(OutputError, match=f"process {os.getpid()} on .* since 20.* writes a run there"):
+        RunWriter(tmp_path)
+    first.close()
+    RunWriter(tmp_path).close()
+
+
+KILLED = """
+import sys, time
+from pathlib import Path
+from test_run_writer import RunWriter, outputs
+writer = RunWriter(Path(sys.argv[1]))
+writer.append(outputs(1)[1][0], 1.0)
+print("ready", flush=True)
+time.sleep(60)
+"""
+
+
+def test_a_killed_run_leaves_no_lock_and_no_space_taken(tmp_path):
+    path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
+    command = [sys.executable, "-c", KILLED, str(tmp_path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": path}) as killed:
+        assert killed.stdout.readline() == "ready\n"
+        with pytest.raises(OutputError, match=f"process {killed.pid} on"):
+            RunWriter(tmp_path)
+        killed.kill()
+    assert sum(path.stat().st_size for path in tmp_path.iterdir()) < 10_000
+    (tmp_path / ".reserve").write_bytes(bytes(99))  # as version 0.1 left it
+    leave_run(tmp_path)
+    assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
 
 
 def test_source_folder_is_not_written_into(tmp_path):
@@ -108,7 +197,7 @@ def test_full_disk_leaves_whole_lines_and_room_for_the_rest(tmp_path, monkeypatc
         def __getattr__(self, name):
             return getattr(self.file, name)
 
-    writer._online._file = Full(writer._online._file)
+    writer._live._online._file = Full(writer._live._online._file)
     assert not writer.append(frames[3], 1.0)
     assert "no space left" in writer.failure
     assert not writer.append(frames[4], 1.0)
