@@ -19,6 +19,7 @@ COMMANDS = {
     "run": ("edgeslam_torch.commands.run", "trajectory and edge map from a recording, a video or a live camera"),
     "eval": ("edgeslam_torch.commands.eval", "judge runs or trajectory files against ground truth"),
     "bench": ("edgeslam_torch.commands.bench", "accuracy and speed in one table, beside other systems"),
+    "judge": ("edgeslam_torch.commands.judge", "every recording, variant and simulated flight in one table with bars"),
     "ablation": ("edgeslam_torch.commands.ablation", "what each loss does: one table, one thing changed at a time"),
     "report": ("edgeslam_torch.commands.report", "make the report page of a run"),
     "view": ("edgeslam_torch.commands.view", "open a run's report or viewer"),

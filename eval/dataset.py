@@ -10,6 +10,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import yaml
 from scipy.spatial.transform import Rotation, Slerp
 
 from edgeslam_torch.errors import CalibrationError
@@ -30,6 +31,9 @@ Fitted to redkitchen: depth discontinuities of 25 maps, moved by this and projec
 nearest to the colour images' Canny edges (mean capped distance 3.78 px; translation alone 4.18; no motion 5.6, and a
 free focal length comes out at 526). The 2.8 cm are the Kinect's known baseline.
 """
+
+_TUM_DEPTH_PER_METRE = 5000.0
+"""Of depth maps whose folder does not say: TUM's file format page."""
 
 _MAX_TRUTH_GAP_S = 0.1
 """True poses are interpolated over gaps up to this long."""
@@ -171,10 +175,20 @@ def _tum_depth(folder: Path, camera: Camera) -> DepthFiles | None:
     return DepthFiles(
         stamps,
         paths,
-        1.0 / float(divisor.group(1)) if divisor else 1.0 / 5000.0,  # TUM's file format page
+        1.0 / (float(divisor.group(1)) if divisor else _depth_per_metre(folder)),
         SEVEN_SCENES_DEPTH_CAMERA if unregistered else camera,
         SEVEN_SCENES_T_C_D if unregistered else np.eye(4),
     )
+
+
+def _depth_per_metre(folder: Path) -> float:
+    """``depth_scale`` of the folder's camera.yaml, else the 5000 of TUM's file format page."""
+    file = folder / "camera.yaml"
+    record = yaml.safe_load(file.read_text(encoding="utf-8")) if file.is_file() else {}
+    stated = record.get("depth_scale", _TUM_DEPTH_PER_METRE)
+    if not isinstance(stated, (int, float)) or not 0 < stated < np.inf:
+        raise EvaluationError(f"{file}: depth_scale must be a positive number, got {stated!r}")
+    return float(stated)
 
 
 def _seven_scenes_depth(folder: Path) -> DepthFiles | None:

@@ -1,5 +1,6 @@
 """Edge map against measured depth: how near its points are to the surface, and how much of the edges it holds."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -49,7 +50,9 @@ class MapScore:
     """Harmonic mean of the two."""
 
 
-def score_map(p_w: FloatArray, alignment: Alignment, truth: SurfaceTruth) -> MapScore:
+def score_map(
+    p_w: FloatArray, alignment: Alignment, truth: SurfaceTruth, thresholds_m: Sequence[float] = THRESHOLDS_M
+) -> MapScore:
     """Judge map points ``(P, 3)``, in the trajectory's world, after the trajectory's own alignment.
 
     The map gets no alignment of its own: an error of the trajectory is an error of the map.
@@ -69,13 +72,13 @@ def score_map(p_w: FloatArray, alignment: Alignment, truth: SurfaceTruth) -> Map
         raise EvaluationError("no map point falls into a measured depth map: wrong trajectory or data set?")
     distance, _ = truth.tree.query(p[seen])
     single = truth.single_map_distance(p[seen][:: max(1, int(seen.sum()) // _MAX_SINGLE)])
-    accuracy = {t: float(np.mean(distance <= t)) for t in THRESHOLDS_M}
+    accuracy = {t: float(np.mean(distance <= t)) for t in thresholds_m}
     completeness, f_score = {}, {}
     if len(truth.edges_w):
         tree = cKDTree(p, balanced_tree=False, compact_nodes=False)
-        gap, _ = tree.query(truth.edges_w, distance_upper_bound=1.01 * max(THRESHOLDS_M))
-        completeness = {t: float(np.mean(gap <= t)) for t in THRESHOLDS_M}
-        f_score = {t: _harmonic(accuracy[t], completeness[t]) for t in THRESHOLDS_M}
+        gap, _ = tree.query(truth.edges_w, distance_upper_bound=1.01 * max(thresholds_m))
+        completeness = {t: float(np.mean(gap <= t)) for t in thresholds_m}
+        f_score = {t: _harmonic(accuracy[t], completeness[t]) for t in thresholds_m}
     return MapScore(
         points=len(p_w),
         judged_share=float(seen.mean()),

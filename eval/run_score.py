@@ -1,5 +1,6 @@
 """One run judged against its data set: the function that scripts call."""
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ from edgeslam_torch.eval.align import AlignmentKind, umeyama
 from edgeslam_torch.eval.associate import DEFAULT_MAX_DT_S, Association
 from edgeslam_torch.eval.dataset import EvalDataset, interpolate, open_dataset
 from edgeslam_torch.eval.diagnose import explain
-from edgeslam_torch.eval.edge_map import MapScore, score_map
+from edgeslam_torch.eval.edge_map import THRESHOLDS_M, MapScore, score_map
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.formats import Trajectory, read_trajectory
 from edgeslam_torch.eval.run_folder import RunFolder, is_supported, open_run
@@ -82,6 +83,7 @@ def evaluate_run(
     max_dt_s: float = DEFAULT_MAX_DT_S,
     offset_s: float = 0.0,
     judge_map: bool = True,
+    thresholds_m: Sequence[float] = THRESHOLDS_M,
 ) -> RunScore:
     """Judge a run's output folder (or a bare trajectory file).
 
@@ -92,6 +94,7 @@ def evaluate_run(
         max_dt_s: Largest time between matched poses [s].
         offset_s: Added to the run's stamps [s].
         judge_map: Compare the edge map with the depth maps too.
+        thresholds_m: Distances at which the map's shares are given [m].
 
     Raises:
         EvaluationError: If they cannot be compared; the message names the likely mistake.
@@ -108,7 +111,7 @@ def evaluate_run(
     if run.online is not None:
         online = score_trajectory(truth, run.online, AlignmentKind.SIM3, max_dt_s, offset_s).ate_m.rmse
     depth_dataset = open_dataset(depth_truth_dir) if depth_truth_dir is not None else dataset
-    map_score, map_note = _map_score(run, depth_dataset, sim3) if judge_map else (None, "not asked for")
+    map_score, map_note = _map_score(run, depth_dataset, sim3, thresholds_m) if judge_map else (None, "not asked for")
     one_second = sim3.relative[1]
     coverage, with_pose, first = _coverage(run, dataset, truth, sim3.association)
     judged = se3 if run.units == "metres" else sim3
@@ -148,7 +151,9 @@ def _stamped(run: RunFolder, dataset: EvalDataset | None) -> RunFolder:
     return replace(run, trajectory=replace(mine, stamps_s=dataset.frame_stamps_s, stamped=True, notes=(note,)))
 
 
-def _map_score(run: RunFolder, dataset: EvalDataset | None, sim3: TrajectoryScore) -> tuple[MapScore | None, str]:
+def _map_score(
+    run: RunFolder, dataset: EvalDataset | None, sim3: TrajectoryScore, thresholds_m: Sequence[float]
+) -> tuple[MapScore | None, str]:
     if run.path.is_file():
         return None, "a trajectory alone has no map"
     cloud = run.cloud()
@@ -164,7 +169,7 @@ def _map_score(run: RunFolder, dataset: EvalDataset | None, sim3: TrajectoryScor
         colour = T @ np.linalg.inv(dataset.depth.T_c_d)
         alignment = umeyama(run.trajectory.positions[known], colour[known, :3, 3])
     try:
-        return score_map(cloud.p_w, alignment, truth), ""
+        return score_map(cloud.p_w, alignment, truth, thresholds_m), ""
     except EvaluationError as error:
         return None, str(error)
 

@@ -1,0 +1,69 @@
+"""Every recording, its variants and simulated flights, each in its own process, as one table with bars."""
+
+import argparse
+import json
+import os
+import sys
+from pathlib import Path
+
+from edgeslam_torch.errors import OutputError
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's options."""
+    parser.add_argument(
+        "data", nargs="?", type=Path, metavar="DATA", help="folder of recordings (default: EDGESLAM_DATA)"
+    )
+    parser.add_argument(
+        "--only", action="append", default=[], metavar="GLOB", help="only cells whose names match; may be repeated"
+    )
+    parser.add_argument(
+        "--set",
+        choices=("base", "variants", "flights", "all"),
+        default="base",
+        dest="which",
+        help="recordings as they are, their variants, simulations, or all (default: base)",
+    )
+    parser.add_argument("--seeds", type=int, default=1, metavar="N", help="runs of every cell (default: 1)")
+    parser.add_argument("--jobs", type=int, default=2, metavar="N", help="processes at a time (default: 2)")
+    parser.add_argument("--timeout", type=float, default=900.0, metavar="S", help="longest cell [s] (default: 900)")
+    parser.add_argument("--max-frames", type=int, metavar="N", help="stop every run after N frames")
+    parser.add_argument(
+        "--change", action="append", default=[], metavar="SECTION.KEY=VALUE", help="change one setting of every run"
+    )
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="results; cells that it holds already are not repeated"
+    )
+    parser.add_argument("--bars", type=Path, metavar="FILE", help="limits to be kept (default: the project's own)")
+    parser.add_argument("--against", type=Path, metavar="DIR", help="also compare with another judge's --out")
+
+
+def main(args: argparse.Namespace) -> int:
+    """Run what is missing, print and write the table; 1 when a cell has no result."""
+    from edgeslam_torch.eval.judge.against import RECORD, markdown_against, read_record
+    from edgeslam_torch.eval.judge.bars import BARS, read_bars
+    from edgeslam_torch.eval.judge.cells import list_cells
+    from edgeslam_torch.eval.judge.runner import JudgeSettings, judge
+    from edgeslam_torch.eval.judge.table import markdown
+
+    data = args.data or (Path(os.environ["EDGESLAM_DATA"]) if os.environ.get("EDGESLAM_DATA") else None)
+    bars = read_bars(args.bars or BARS)
+    before = read_record(args.against) if args.against is not None else None
+    cells = list_cells(data, args.which, range(max(1, args.seeds)), args.only)
+    settings = JudgeSettings(tuple(args.change), args.max_frames, max(1, args.jobs), args.timeout)
+    try:
+        record = judge(cells, settings, args.out, _say)
+        text = markdown(record, bars)
+        if before is not None:
+            text += "\n" + markdown_against(before, record)
+        (args.out / RECORD).write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+        (args.out / "judge.md").write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"{error.filename}: cannot be written ({error.strerror or error})") from error
+    print(text)
+    print(f"results: {args.out / RECORD}")
+    return 1 if any(row["error"] for row in record["rows"]) else 0
+
+
+def _say(text: str) -> None:
+    sys.stderr.write(text + "\n")

@@ -1,0 +1,153 @@
+"""What is judged: one cell is one source with one seed."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Any
+
+from edgeslam_torch.errors import EdgeSlamError
+from edgeslam_torch.eval.dataset import open_dataset
+from edgeslam_torch.eval.errors import EvaluationError
+from edgeslam_torch.eval.judge import sources
+from edgeslam_torch.io.source import Recording
+
+SETS = ("base", "variants", "flights", "all")
+"""What ``--set`` takes: recordings as they are, their variants, simulations, everything."""
+
+LEAST_FRAMES = 30
+"""Shorter recordings, and variants that leave fewer, are not judged."""
+
+KIDNAP = ((0, 250), (420, 600), (100, 250))
+"""Frames of `KIDNAPPED`: away from a place without warning, and back to it."""
+KIDNAPPED = "7scenes_redkitchen"
+
+
+@dataclass(frozen=True, slots=True)
+class Variant:
+    """A recording seen otherwise."""
+
+    rate: int = 1
+    """Every n-th frame."""
+    shrink: int = 1
+    """Images smaller by this factor."""
+    first: int = 0
+    """Frame that it starts from."""
+    focal: float = 1.0
+    """Factor on the focal length that the system is told."""
+
+    def frames_of(self, length: int) -> int:
+        """Frames that are left of ``length``."""
+        return max(0, -(-(length - self.first) // self.rate))
+
+    def applied_to(self, recording: Recording) -> Recording:
+        """The recording, changed."""
+        if self.first:
+            recording = sources.start_at(recording, self.first)
+        if self.rate > 1:
+            recording = sources.every(recording, self.rate)
+        if self.shrink > 1:
+            recording = sources.smaller(recording, self.shrink)
+        if self.focal != 1.0:
+            recording = sources.with_focal_length(recording, self.focal)
+        return recording
+
+
+VARIANTS = {
+    "half_rate": Variant(rate=2),
+    "third_rate": Variant(rate=3),
+    "half_size": Variant(shrink=2),
+    "from_100": Variant(first=100),
+    "from_200": Variant(first=200),
+    "from_300": Variant(first=300),
+    "focal_up": Variant(focal=1.03),
+    "focal_down": Variant(focal=0.97),
+}
+"""Names after the slash in a cell's name."""
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """One run: a recording, perhaps as a variant of it."""
+
+    name: str
+    """``RECORDING`` or ``RECORDING/VARIANT``."""
+    seed: int
+    folder: str = ""
+    """Of the recording."""
+    variant: str = ""
+    """A name in `VARIANTS`, or ``kidnap``."""
+
+    @property
+    def base(self) -> str:
+        """Name of the cell that this one is a variant of; its own when it is none."""
+        return self.name.rpartition("/")[0] if self.variant else self.name
+
+    @property
+    def slug(self) -> str:
+        """Name of its folder."""
+        return f"{self.name.replace('/', '__')}-s{self.seed}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return asdict(self)
+
+
+def find_recordings(data: Path) -> dict[str, tuple[Path, int]]:
+    """Folders with a known layout, ground truth and images, and their numbers of frames, by name.
+
+    ``data`` itself, its folders and theirs are looked at.
+
+    Raises:
+        EvaluationError: If ``data`` is no folder.
+    """
+    if not data.is_dir():
+        raise EvaluationError(f"{data}: no such folder of recordings (DATA or EDGESLAM_DATA)")
+    found: dict[str, tuple[Path, int]] = {}
+    for folder in (data, *_folders(data)):
+        if any(folder.is_relative_to(other) for other, _ in found.values()):
+            continue
+        try:
+            dataset = open_dataset(folder)
+        except EdgeSlamError:
+            continue
+        if len(dataset.frame_stamps_s) >= LEAST_FRAMES:
+            name = dataset.name if dataset.name not in found else f"{folder.parent.name}_{dataset.name}"
+            found[name] = (folder.resolve(), len(dataset.frame_stamps_s))
+    return found
+
+
+def _folders(data: Path) -> list[Path]:
+    children = sorted(p for p in data.iterdir() if p.is_dir())
+    return [*children, *(g for child in children for g in sorted(child.iterdir()) if g.is_dir())]
+
+
+def list_cells(data: Path | None, which: str, seeds: Sequence[int], only: Sequence[str] = ()) -> list[Cell]:
+    """Cells of a set, seed by seed within a name.
+
+    Args:
+        data: Folder of recordings; None leaves them out.
+        which: One of `SETS`.
+        seeds: Of every cell.
+        only: Patterns such as ``tum_*``; a cell's name must match one. All when empty.
+
+    Raises:
+        EvaluationError: If nothing is left to judge.
+    """
+    if which not in SETS:
+        raise EvaluationError(f"no set {which!r}; there are {', '.join(SETS)}")
+    made: list[Cell] = []
+    recordings = find_recordings(data) if data is not None else {}
+    for name, (folder, frames) in recordings.items():
+        variants = [v for v, change in VARIANTS.items() if change.frames_of(frames) >= LEAST_FRAMES]
+        wanted = ([""] if which in ("base", "all") else []) + (variants if which in ("variants", "all") else [])
+        made += [_cell(name, folder, variant) for variant in wanted]
+    kept = [cell for cell in made if not only or any(fnmatchcase(cell.name, pattern) for pattern in only)]
+    if not kept:
+        there = ", ".join(dict.fromkeys(cell.name for cell in made)) or "none (no recordings: DATA or EDGESLAM_DATA)"
+        raise EvaluationError(f"no cell matches; there are: {there}")
+    return [Cell(c.name, seed, c.folder, c.variant) for c in kept for seed in seeds]
+
+
+def _cell(name: str, folder: Path, variant: str) -> Cell:
+    return Cell(f"{name}/{variant}" if variant else name, 0, str(folder), variant)

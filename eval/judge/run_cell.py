@@ -1,0 +1,71 @@
+"""``python -m edgeslam_torch.eval.judge.run_cell FOLDER``: run and judge the cell that ``FOLDER/cell.json`` describes.
+
+A process of its own: what it leaks, breaks or is killed for is its own, and its memory and CPU time are measurable.
+"""
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from edgeslam_torch.config import SlamConfig
+from edgeslam_torch.errors import EdgeSlamError
+from edgeslam_torch.eval.dataset import interpolate, open_dataset
+from edgeslam_torch.eval.formats import Trajectory, write_tum
+from edgeslam_torch.eval.judge import sources
+from edgeslam_torch.eval.judge.cells import KIDNAP, VARIANTS, Cell
+from edgeslam_torch.eval.judge.runner import CELL, RESULT
+from edgeslam_torch.eval.judge.score import Truth, score
+from edgeslam_torch.io.atomic import write_text
+from edgeslam_torch.io.config_file import load_config
+from edgeslam_torch.io.source import Recording, open_source
+from edgeslam_torch.run import run, settle_camera
+
+RUN = "run"
+
+
+def main(folder: Path) -> int:
+    """Leave ``result.json`` in the folder; without one, the last line on stderr says why."""
+    spec: dict[str, Any] = json.loads((folder / CELL).read_text(encoding="utf-8"))
+    cell = Cell(**spec["cell"])
+    config = load_config(replace(SlamConfig(), seed=cell.seed), None, spec["overrides"])
+    try:
+        source, truth = _opened(cell, folder, spec["max_frames"])
+        settle_camera(source)
+        result = run(source, folder / RUN, config)
+        if result.interrupted or result.failure is not None:
+            sys.stderr.write(f"{result.failure or 'interrupted'}\n")
+            return 1
+        figures, notes = score(folder / RUN, truth)
+    except EdgeSlamError as error:
+        sys.stderr.write(f"{error}\n")
+        return 1
+    write_text(folder / RESULT, json.dumps({"key": spec["key"], "figures": figures, "notes": notes}, indent=1) + "\n")
+    return 0
+
+
+def _opened(cell: Cell, folder: Path, max_frames: int | None) -> tuple[Recording, Truth]:
+    """The cell's source and what its run is compared with."""
+    source = open_source(cell.folder)
+    assert isinstance(source, Recording)
+    place = Path(cell.folder)
+    truth = Truth(place, place if open_dataset(place).depth is not None else None)
+    if cell.variant == "kidnap":
+        source, truth = _kidnapped(source, place, folder / "groundtruth.txt")
+    elif cell.variant:
+        source = VARIANTS[cell.variant].applied_to(source)
+    return source if max_frames is None else sources.first_frames(source, max_frames), truth
+
+
+def _kidnapped(source: Recording, place: Path, truth_file: Path) -> tuple[Recording, Truth]:
+    """The recording cut, and its ground truth cut alike into a file."""
+    dataset = open_dataset(place)
+    plan = sources.Cut(KIDNAP, dataset.frame_stamps_s)
+    T_w_c, known = interpolate(dataset.truth, dataset.frame_stamps_s[plan.originals])
+    write_tum(Trajectory(plan.new_stamps_s[known], T_w_c[known]), truth_file)
+    return sources.cut(source, plan), Truth(truth_file)
+
+
+if __name__ == "__main__":
+    sys.exit(main(Path(sys.argv[1])))

@@ -1,0 +1,221 @@
+"""Runs cells, each in a process of its own, some at a time; what an interrupted judge left is not done again."""
+
+import hashlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO, Any
+
+from edgeslam_torch import __version__
+from edgeslam_torch.eval.judge.cells import Cell
+from edgeslam_torch.io.atomic import write_text
+
+CELL, RESULT, LOG = "cell.json", "result.json", "log.txt"
+FORMAT = 1
+"""Of the record."""
+_POLL_S = 0.05
+_ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+
+Start = Callable[[Path, IO[str]], subprocess.Popen[str]]
+"""Starts the process of a cell's folder, which writes to a log."""
+
+
+@dataclass(frozen=True, slots=True)
+class JudgeSettings:
+    """How cells are run."""
+
+    overrides: tuple[str, ...] = ()
+    """``section.key=value`` over the default settings of every run."""
+    max_frames: int | None = None
+    jobs: int = 2
+    """Processes at a time."""
+    timeout_s: float = 900.0
+    """A cell that takes longer is ended."""
+
+
+@dataclass(slots=True)
+class _Running:
+    cell: Cell
+    process: subprocess.Popen[str]
+    log: IO[str]
+    key: str
+    begun_s: float = field(default_factory=time.monotonic)
+
+
+def judge(
+    cells: Sequence[Cell],
+    settings: JudgeSettings,
+    out: Path,
+    say: Callable[[str], None],
+    commit: str | None = None,
+    start: Start | None = None,
+) -> dict[str, Any]:
+    """Run the cells that ``out`` has no result of yet, and gather the results of all.
+
+    Args:
+        cells: What to run.
+        settings: How.
+        out: Folder for the cells' own folders.
+        say: Told one line for every cell that ends.
+        commit: State of the code; asked of git when None. A result of another state is not taken.
+        start: Starts a cell's process; `start_cell` when None.
+
+    Returns:
+        The record: conditions, and a row for every cell with its figures, or with the reason why it has none; then
+        the rows of other cells that an earlier call with the same code and settings left in ``out``.
+    """
+    commit = code_state() if commit is None else commit
+    start = start or start_cell
+    rows: dict[Cell, dict[str, Any]] = {}
+    waiting: list[Cell] = []
+    for cell in cells:
+        found = _result(out / "cells" / cell.slug, _key(cell, settings, commit))
+        if found is None:
+            waiting.append(cell)
+        else:
+            rows[cell] = _row(cell, found)
+    if rows:
+        say(f"{len(rows)} of {len(cells)} cells were done before")
+    running: list[_Running] = []
+    try:
+        while waiting or running:
+            while waiting and len(running) < settings.jobs:
+                running.append(_begin(waiting.pop(0), settings, commit, out, start))
+            time.sleep(_POLL_S)
+            for job in [j for j in running if _ended(j, settings.timeout_s)]:
+                running.remove(job)
+                rows[job.cell] = _finish(job, out, settings.timeout_s)
+                say(f"[{len(rows)}/{len(cells)}] {_one_line(rows[job.cell])}")
+    finally:  # an interrupted judge leaves no process behind
+        for job in running:
+            _kill(job)
+    return {
+        "format": FORMAT,
+        "version": __version__,
+        "commit": commit,
+        "made": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+        "overrides": list(settings.overrides),
+        "max_frames": settings.max_frames,
+        "rows": [rows[cell] for cell in cells] + _others(cells, settings, out, commit),
+    }
+
+
+def start_cell(folder: Path, log: IO[str]) -> subprocess.Popen[str]:
+    """The process that runs a cell's folder, on one thread, out of reach of the terminal's Ctrl-C."""
+    command = [sys.executable, "-m", "edgeslam_torch.eval.judge.run_cell", str(folder)]
+    environment = os.environ | _ONE_THREAD
+    return subprocess.Popen(
+        command, stdout=log, stderr=log, text=True, env=environment, start_new_session=os.name == "posix"
+    )
+
+
+def code_state() -> str:
+    """Commit of the source tree, with a digest of what was changed since; the version outside a checkout."""
+    here = Path(__file__).resolve().parent
+    head = _git(here, "rev-parse", "--short", "HEAD")
+    if not head:
+        return f"version {__version__}"
+    changes = _git(here, "diff", "HEAD") + _git(here, "status", "--porcelain")
+    return f"{head}+{hashlib.sha256(changes.encode()).hexdigest()[:8]}" if changes else head
+
+
+def _git(folder: Path, *arguments: str) -> str:
+    try:
+        done = subprocess.run(["git", "-C", str(folder), *arguments], capture_output=True, text=True, check=False)
+    except OSError:
+        return ""
+    return done.stdout.strip() if done.returncode == 0 else ""
+
+
+def _key(cell: Cell, settings: JudgeSettings, commit: str) -> str:
+    """Whatever decides a cell's result."""
+    return json.dumps([commit, list(settings.overrides), settings.max_frames, cell.to_dict()])
+
+
+def _result(folder: Path, key: str) -> dict[str, Any] | None:
+    """The result in a cell's folder, if it is whole and has this key."""
+    try:
+        found = json.loads((folder / RESULT).read_text(encoding="utf-8"))
+    except (OSError, json.JSONDecodeError, UnicodeDecodeError):
+        return None
+    return found if isinstance(found, dict) and found.get("key") == key else None
+
+
+def _others(cells: Sequence[Cell], settings: JudgeSettings, out: Path, commit: str) -> list[dict[str, Any]]:
+    """Rows of results in ``out`` of the same code and settings, of cells not asked for now."""
+    rows = []
+    for path in sorted((out / "cells").glob(f"*/{CELL}")):
+        cell = Cell(**json.loads(path.read_text(encoding="utf-8"))["cell"])
+        found = _result(path.parent, _key(cell, settings, commit))
+        if cell not in cells and found is not None:
+            rows.append(_row(cell, found))
+    return rows
+
+
+def _begin(cell: Cell, settings: JudgeSettings, commit: str, out: Path, start: Start) -> _Running:
+    folder = out / "cells" / cell.slug
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / RESULT).unlink(missing_ok=True)
+    key = _key(cell, settings, commit)
+    spec = {"key": key, "cell": cell.to_dict(), "overrides": settings.overrides, "max_frames": settings.max_frames}
+    write_text(folder / CELL, json.dumps(spec, indent=1) + "\n")
+    log = (folder / LOG).open("w", encoding="utf-8")
+    return _Running(cell, start(folder, log), log, key)
+
+
+def _ended(job: _Running, timeout_s: float) -> bool:
+    return job.process.poll() is not None or time.monotonic() - job.begun_s > timeout_s
+
+
+def _finish(job: _Running, out: Path, timeout_s: float) -> dict[str, Any]:
+    late = job.process.poll() is None
+    _kill(job)
+    folder = out / "cells" / job.cell.slug
+    found = _result(folder, job.key)
+    if found is not None:
+        return _row(job.cell, found)
+    reason = f"took longer than {timeout_s:.0f} s" if late else _reason(folder / LOG, job.process.returncode)
+    return _row(job.cell, {"error": reason})
+
+
+def _kill(job: _Running) -> None:
+    if job.process.poll() is None:
+        if os.name == "posix" and os.getpgid(job.process.pid) == job.process.pid:
+            os.killpg(job.process.pid, signal.SIGKILL)  # what the cell itself started too
+        else:
+            job.process.kill()
+    job.process.wait()
+    job.log.close()
+
+
+def _reason(log: Path, code: int) -> str:
+    """Last line that the process said, or how it ended."""
+    lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+    ended = f"killed by signal {-code}" if code < 0 else f"exit code {code}"
+    return f"{lines[-1].strip()} ({ended})" if lines else ended
+
+
+def _row(cell: Cell, found: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "cell": cell.name,
+        "base": cell.base,
+        "seed": cell.seed,
+        "figures": found.get("figures", {}),
+        "notes": found.get("notes", []),
+        "error": found.get("error", ""),
+    }
+
+
+def _one_line(row: dict[str, Any]) -> str:
+    name = f"{row['cell']} seed {row['seed']}"
+    if row["error"]:
+        return f"{name}: {row['error']}"
+    f = row["figures"]
+    ate = f"ATE {f['ate_m']:.4f} m" if f.get("ate_m") is not None else "no ATE"
+    return f"{name}: {ate}, {f['supported_end']:.0%} of {f['frames']:.0f} frames on the map"

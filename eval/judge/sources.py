@@ -1,0 +1,138 @@
+"""Variants of a recording as sources: another rate, size, start, focal length or order; no file is copied."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from itertools import islice
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.io.listing import Problem
+from edgeslam_torch.io.source import Recording
+from edgeslam_torch.types import FloatArray, Frame
+
+Size = tuple[int, int]
+
+
+class ChangedFrame(Frame):
+    """A frame under another number, time or size; its colours are still read only when somebody asks."""
+
+    __slots__ = ("_frame", "_size")
+    _frame: Frame
+    _size: Size | None
+
+    def __init__(self, frame: Frame, index: int, stamp_s: float, size: Size | None = None) -> None:
+        """Args: ``size`` ``(width, height)`` [px]; None keeps the frame's own."""
+        grey = frame.grey if frame.grey is None else _resized(frame.grey, size)
+        values = {"index": index, "stamp_s": stamp_s, "path": frame.path, "grey": grey, "_frame": frame, "_size": size}
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
+
+    @property
+    def image(self) -> NDArray[np.uint8]:
+        """``(H, W, 3)`` BGR or ``(H, W)`` grey."""
+        return _resized(self._frame.image, self._size)
+
+
+def _resized(image: NDArray[np.uint8], size: Size | None) -> NDArray[np.uint8]:
+    return image if size is None else np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+def every(recording: Recording, step: int) -> Recording:
+    """Every ``step``-th frame, numbered anew, with its own stamp."""
+    return _picked(recording, lambda frames: islice(frames, 0, None, step), _divided_up(recording.length, step))
+
+
+def start_at(recording: Recording, first: int) -> Recording:
+    """Without the first frames, and without the telemetry from before a second ahead of the first that stays."""
+    length = None if recording.length is None else max(0, recording.length - first)
+    later = _picked(recording, lambda frames: islice(frames, first, None), length)
+    start = next(later.decode([]), None) if recording.telemetry else None
+    if start is None:
+        return later
+    return replace(later, telemetry=[s for s in recording.telemetry if s.stamp_s >= start.stamp_s - 1.0])
+
+
+def first_frames(recording: Recording, count: int) -> Recording:
+    """No more than ``count`` frames."""
+    length = count if recording.length is None else min(count, recording.length)
+    return _picked(recording, lambda frames: islice(frames, count), length)
+
+
+def smaller(recording: Recording, factor: int) -> Recording:
+    """Images ``factor`` times smaller in width and height, and the camera with them."""
+    camera = recording.camera
+    size = (camera.width // factor, camera.height // factor)
+
+    def decode(problems: list[Problem]) -> Iterator[Frame]:
+        return (ChangedFrame(f, f.index, f.stamp_s, size) for f in recording.decode(problems))
+
+    return replace(recording, decode=decode, camera=camera.scaled(*size))
+
+
+def with_focal_length(recording: Recording, factor: float) -> Recording:
+    """The same images with a calibration whose focal lengths are wrong by ``factor``."""
+    camera = recording.camera
+    return replace(recording, camera=replace(camera, fx=factor * camera.fx, fy=factor * camera.fy))
+
+
+@dataclass(frozen=True, slots=True)
+class Cut:
+    """Stretches of a recording played one after the other, at one frame a period."""
+
+    segments: tuple[tuple[int, int], ...]
+    """First frame and the one after the last, by number in the recording."""
+    stamps_s: FloatArray
+    """``(F,)`` stamps of the whole recording [s]."""
+
+    @property
+    def originals(self) -> NDArray[np.int64]:
+        """Number in the recording of every frame played, ``(N,)``."""
+        return np.concatenate([np.arange(first, last) for first, last in self.segments])
+
+    @property
+    def new_stamps_s(self) -> FloatArray:
+        """Stamps under which they are played, ``(N,)``."""
+        period_s = float(np.median(np.diff(self.stamps_s)))
+        return self.stamps_s[0] + period_s * np.arange(len(self.originals))
+
+
+def cut(recording: Recording, plan: Cut) -> Recording:
+    """The stretches of ``plan`` as one recording, without telemetry; its ground truth must be cut alike."""
+    stamps = plan.new_stamps_s
+
+    def decode(problems: list[Problem]) -> Iterator[Frame]:
+        begin = 0
+        for first, last in plan.segments:
+            for frame in recording.decode(problems):
+                if frame.index >= last:
+                    break
+                if frame.index >= first:
+                    index = begin + frame.index - first
+                    yield ChangedFrame(frame, index, float(stamps[index]))
+            begin += last - first
+
+    return replace(recording, decode=decode, length=len(stamps), telemetry=[], groundtruth=None)
+
+
+def made_of(images: Callable[[int], NDArray[np.uint8]], count: int, camera: Camera, rate_hz: float) -> Recording:
+    """A recording of ``count`` images ``(H, W, 3)`` that a function makes from their numbers."""
+
+    def decode(_: list[Problem]) -> Iterator[Frame]:
+        return (Frame(i, i / rate_hz, images(i)) for i in range(count))
+
+    return Recording("made up", "images", "made up", camera, decode, count)
+
+
+def _picked(recording: Recording, pick: Callable[[Iterator[Frame]], Iterator[Frame]], length: int | None) -> Recording:
+    def decode(problems: list[Problem]) -> Iterator[Frame]:
+        for i, frame in enumerate(pick(recording.decode(problems))):
+            yield ChangedFrame(frame, i, frame.stamp_s)
+
+    return replace(recording, decode=decode, length=length)
+
+
+def _divided_up(length: int | None, step: int) -> int | None:
+    return None if length is None else -(-length // step)

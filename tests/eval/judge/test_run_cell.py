@@ -1,0 +1,111 @@
+"""A cell from recording to figures, on a tiny rendered flight."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+from rendered import CAMERA, film, sideways, stairs_world
+
+from edgeslam_torch.eval.dataset import open_dataset
+from edgeslam_torch.eval.errors import EvaluationError
+from edgeslam_torch.eval.formats import Trajectory, write_tum
+from edgeslam_torch.eval.judge import run_cell
+from edgeslam_torch.eval.judge.cells import VARIANTS, Cell, find_recordings, list_cells
+from edgeslam_torch.eval.judge.score import Truth, score
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    """A TUM-layout folder with 36 images, ground truth and every sixth depth map [mm]."""
+    folder = tmp_path_factory.mktemp("data") / "stairs"
+    flight = film(stairs_world(), CAMERA, sideways(36, 0.03))
+    (folder / "rgb").mkdir(parents=True)
+    (folder / "depth").mkdir()
+    lines, depth = [], []
+    for frame, z in zip(flight.frames, flight.depth_m, strict=True):
+        name = f"rgb/{frame.stamp_s:.3f}.png"
+        cv2.imwrite(str(folder / name), frame.image)
+        lines.append(f"{frame.stamp_s:.3f} {name}")
+        if frame.index % 6 == 0:
+            cv2.imwrite(str(folder / name.replace("rgb", "depth")), (1000 * z).astype(np.uint16))
+            depth.append(f"{frame.stamp_s:.3f} {name.replace('rgb', 'depth')}")
+    (folder / "rgb.txt").write_text("\n".join(lines) + "\n")
+    (folder / "depth.txt").write_text("\n".join(depth) + "\n")
+    CAMERA.save(folder / "camera.yaml")
+    with (folder / "camera.yaml").open("a") as file:
+        file.write("depth_scale: 1000.0\n")
+    write_tum(Trajectory(flight.stamps_s, flight.T_w_c), folder / "groundtruth.txt")
+    return folder
+
+
+def run(tmp_path, cell, **changes):
+    spec = {"key": "k", "cell": cell.to_dict(), "overrides": ["depth.weights=none"], "max_frames": None} | changes
+    (tmp_path / "cell.json").write_text(json.dumps(spec))
+    code = run_cell.main(tmp_path)
+    result = tmp_path / "result.json"
+    return code, json.loads(result.read_text()) if result.is_file() else None
+
+
+def test_recording_is_run_and_judged(recording, tmp_path):
+    code, result = run(tmp_path, Cell("stairs", 0, str(recording)))
+    figures = result["figures"]
+    assert code == 0 and result["key"] == "k" and result["notes"] == []
+    assert figures["frames"] == 36
+    assert figures["supported_end"] == 1.0
+    assert figures["supported_live"] < 1.0, "the first frames are posed against a guess"
+    assert figures["pieces"] == 1 and figures["losses"] == 0
+    assert figures["ate_m"] < 0.01 and figures["path_m"] == pytest.approx(35 * 0.03, rel=0.05)
+    assert figures["ate_percent"] == pytest.approx(100 * figures["ate_m"] / figures["path_m"])
+    assert figures["scale"] is None and figures["se3_m"] is None, "nothing told the scale"
+    assert figures["map_within_10cm"] >= figures["map_within_5cm"] > 0.7, "depth_scale of camera.yaml is heeded"
+    assert figures["cpu_ms"] > 0 and figures["memory_mb"] > 0
+
+
+def test_variant_is_judged_against_the_same_truth(recording, tmp_path):
+    code, result = run(tmp_path, Cell("stairs/half_rate", 0, str(recording), "half_rate"))
+    assert code == 0
+    assert result["figures"]["frames"] == 18
+    assert result["figures"]["path_m"] == pytest.approx(34 * 0.03, rel=0.05)
+
+
+def test_run_that_never_moves_scores_a_fixed_position(recording, tmp_path):
+    run(tmp_path, Cell("stairs", 0, str(recording)))
+    truth = open_dataset(recording).truth
+    still = Trajectory(truth.stamps_s, np.tile(np.eye(4), (len(truth), 1, 1)))
+    for name in ("trajectory.txt", "trajectory_online.txt"):
+        write_tum(still, tmp_path / "run" / name)
+    figures, notes = score(tmp_path / "run", Truth(recording))
+    spread = np.sqrt(np.sum(np.var(truth.positions, axis=0)))
+    assert figures["ate_m"] == figures["online_m"] == figures["still_m"] == pytest.approx(spread)
+    assert "never moves" in notes[0]
+
+
+def test_cell_that_cannot_run_says_why_and_leaves_no_result(tmp_path, capsys):
+    code, result = run(tmp_path, Cell("gone", 0, str(tmp_path / "gone")))
+    assert code == 1 and result is None
+    assert "no such file or folder" in capsys.readouterr().err
+
+
+def test_recordings_with_truth_are_found_and_short_variants_left_out(recording):
+    assert find_recordings(recording.parent) == {"stairs": (recording.resolve(), 36)}
+    assert find_recordings(recording) == {"stairs": (recording.resolve(), 36)}
+    names = {cell.name for cell in list_cells(recording.parent, "all", [0]) if cell.folder}
+    assert {"stairs", "stairs/half_size", "stairs/focal_up"} <= names
+    assert not names & {"stairs/half_rate", "stairs/from_100"}
+    assert VARIANTS["half_rate"].frames_of(36) == 18
+
+
+def test_cells_are_chosen_by_pattern_and_repeated_by_seed(recording):
+    cells = list_cells(recording.parent, "variants", [0, 1], ["*/focal_*"])
+    assert [(c.name, c.seed) for c in cells] == [
+        ("stairs/focal_up", 0), ("stairs/focal_up", 1), ("stairs/focal_down", 0), ("stairs/focal_down", 1)
+    ]  # fmt: skip
+    assert {c.base for c in cells} == {"stairs"}
+    with pytest.raises(EvaluationError, match="no cell matches; there are: .*stairs/half_size"):
+        list_cells(recording.parent, "variants", [0], ["nothing"])
+
+
+def test_folder_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(EvaluationError, match="no such folder of recordings"):
+        list_cells(tmp_path / "gone", "base", [0])

@@ -1,0 +1,97 @@
+"""Cells as processes: results kept, crashes and time-outs as rows; the processes here are tiny scripts."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from edgeslam_torch.eval.judge.cells import Cell
+from edgeslam_torch.eval.judge.runner import JudgeSettings, judge
+
+GOOD = (
+    "import json, sys, pathlib; f = pathlib.Path(sys.argv[1]); key = json.loads((f / 'cell.json').read_text())['key'];"
+    "figures = {'frames': 5, 'supported_end': 1.0, 'ate_m': 0.01};"
+    "(f / 'result.json').write_text(json.dumps({'key': key, 'figures': figures}))"
+)
+CRASH = "import os, sys; print('first', file=sys.stderr); print('out of luck', file=sys.stderr); os._exit(3)"
+KILLED = "import os, signal; os.kill(os.getpid(), signal.SIGKILL)"
+ENDLESS = "import time; time.sleep(60)"
+
+
+class Starter:
+    """Starts the script given for a cell's name and counts how often."""
+
+    def __init__(self, **scripts):
+        self.scripts = scripts
+        self.started = []
+
+    def __call__(self, folder, log):
+        name = json.loads((folder / "cell.json").read_text())["cell"]["name"]
+        self.started.append(name)
+        command = [sys.executable, "-S", "-c", self.scripts.get(name, GOOD), str(folder)]
+        return subprocess.Popen(command, stdout=log, stderr=log, text=True)
+
+
+def run(tmp_path, names, starter, commit="abc", **settings):
+    cells = [Cell(name, 0) for name in names]
+    return judge(cells, JudgeSettings(**settings), tmp_path, lambda _: None, commit, starter)
+
+
+def test_crash_kill_and_time_out_are_rows_and_the_rest_goes_on(tmp_path):
+    starter = Starter(crash=CRASH, killed=KILLED, endless=ENDLESS)
+    record = run(tmp_path, ["crash", "killed", "endless", "good"], starter, timeout_s=1.0, jobs=4)
+    errors = {row["cell"]: row["error"] for row in record["rows"]}
+    assert errors == {
+        "crash": "out of luck (exit code 3)",
+        "killed": "killed by signal 9",
+        "endless": "took longer than 1 s",
+        "good": "",
+    }
+    assert record["rows"][3]["figures"]["ate_m"] == 0.01
+
+
+def test_what_is_done_is_not_done_again(tmp_path):
+    starter = Starter(crash=CRASH)
+    run(tmp_path, ["a", "crash"], starter)
+    record = run(tmp_path, ["a", "crash", "b"], starter)
+    assert starter.started == ["a", "crash", "crash", "b"], "only what has a result is left alone"
+    assert [row["cell"] for row in record["rows"]] == ["a", "crash", "b"]
+
+
+@pytest.mark.parametrize("change", [{"commit": "def"}, {"overrides": ("flow.enabled=false",)}, {"max_frames": 5}])
+def test_other_code_or_settings_start_anew(tmp_path, change):
+    starter = Starter()
+    run(tmp_path, ["a"], starter)
+    run(tmp_path, ["a"], starter, **change)
+    assert starter.started == ["a", "a"]
+
+
+def test_half_written_result_is_no_result(tmp_path):
+    starter = Starter()
+    run(tmp_path, ["a"], starter)
+    (tmp_path / "cells" / "a-s0" / "result.json").write_text('{"key": ')
+    run(tmp_path, ["a"], starter)
+    assert starter.started == ["a", "a"]
+
+
+def test_record_holds_what_earlier_calls_left(tmp_path):
+    starter = Starter()
+    run(tmp_path, ["a"], starter)
+    assert [row["cell"] for row in run(tmp_path, ["b"], starter)["rows"]] == ["b", "a"]
+    assert [row["cell"] for row in run(tmp_path, ["b"], starter, commit="def")["rows"]] == ["b"]
+
+
+def test_interrupted_judge_leaves_no_process(tmp_path):
+    started = []
+
+    def start(folder, log):
+        started.append(Starter(a=ENDLESS)(folder, log))
+        if len(started) == 2:
+            raise KeyboardInterrupt
+        return started[-1]
+
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path, ["a", "b"], start)
+    assert started[0].poll() is not None
+    started[1].wait()

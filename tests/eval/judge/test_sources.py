@@ -1,0 +1,86 @@
+"""Variants of a recording, frame by frame, on numbered images."""
+
+import numpy as np
+import pytest
+
+from edgeslam_torch.eval.judge import sources
+from edgeslam_torch.eval.judge.cells import VARIANTS, Variant
+from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.io.source import open_source
+from edgeslam_torch.types import TelemetrySample
+
+CAMERA = Camera(64, 48, 60.0, 61.0, 31.5, 23.5)
+
+
+@pytest.fixture
+def numbered():
+    """Twenty images at 10 Hz, each of the grey value of its number."""
+    return sources.made_of(lambda i: np.full((48, 64, 3), i, np.uint8), 20, CAMERA, 10.0)
+
+
+def seen(recording):
+    return [(f.index, round(f.stamp_s, 3), int(f.image[0, 0, 0])) for f in recording.frames()]
+
+
+def test_every_third_frame_keeps_its_stamp_and_is_numbered_anew(numbered):
+    third = sources.every(numbered, 3)
+    assert seen(third) == [(k, round(0.3 * k, 3), 3 * k) for k in range(7)]
+    assert third.length == 7
+    assert seen(third) == seen(third), "frames can be asked for again"
+
+
+def test_start_at_leaves_the_first_frames_out(numbered):
+    later = sources.start_at(numbered, 17)
+    assert seen(later) == [(0, 1.7, 17), (1, 1.8, 18), (2, 1.9, 19)]
+    assert later.length == 3
+    assert seen(sources.start_at(numbered, 50)) == []
+
+
+def test_variant_starts_first_and_then_thins(numbered):
+    variant = Variant(first=5, rate=2)
+    assert [image for _, _, image in seen(variant.applied_to(numbered))] == list(range(5, 20, 2))
+    assert variant.frames_of(20) == 8
+
+
+def test_half_size_shrinks_images_and_camera_alike(rng):
+    image = rng.integers(0, 256, (48, 64, 3), dtype=np.uint8)
+    small = sources.smaller(sources.made_of(lambda _: image, 1, CAMERA, 10.0), 2)
+    frame = next(iter(small.frames()))
+    blocks = image.reshape(24, 2, 32, 2, 3).mean(axis=(1, 3))
+    assert np.abs(frame.image - blocks).max() <= 0.5, "the mean of two by two pixels"
+    assert (small.camera.width, small.camera.height, small.camera.fx) == (32, 24, 30.0)
+    # Pixel centres at integers: pixel 0 of the small image lies between pixels 0 and 1 of the large one.
+    point = np.array([[0.1, 0.2, 2.0]])
+    assert small.camera.project(point) == pytest.approx((CAMERA.project(point) - 0.5) / 2)
+
+
+def test_wrong_focal_length_changes_nothing_but_the_calibration(numbered):
+    wrong = sources.with_focal_length(numbered, 1.03)
+    assert (wrong.camera.fx, wrong.camera.fy) == pytest.approx((61.8, 62.83))
+    assert (wrong.camera.cx, wrong.camera.cy) == (CAMERA.cx, CAMERA.cy)
+    assert seen(wrong) == seen(numbered)
+
+
+def test_cut_plays_its_stretches_at_one_pace(numbered):
+    plan = sources.Cut(((0, 3), (10, 12), (1, 3)), 0.1 * np.arange(20))
+    assert [image for _, _, image in seen(sources.cut(numbered, plan))] == [0, 1, 2, 10, 11, 1, 2]
+    assert plan.originals.tolist() == [0, 1, 2, 10, 11, 1, 2]
+    frames = list(sources.cut(numbered, plan).frames())
+    assert [f.index for f in frames] == list(range(7))
+    assert np.allclose([f.stamp_s for f in frames], 0.1 * np.arange(7))
+
+
+def test_half_size_of_jpeg_files_has_grey_and_colour_of_one_size(tmp_path, write_images):
+    write_images(tmp_path / "rgb", ["1.000000.jpg", "1.100000.jpg"], (64, 48))
+    (tmp_path / "rgb.txt").write_text("1.0 rgb/1.000000.jpg\n1.1 rgb/1.100000.jpg\n")
+    CAMERA.save(tmp_path / "camera.yaml")
+    frames = list(VARIANTS["half_size"].applied_to(open_source(tmp_path)).frames())
+    assert [f.grey.shape for f in frames] == [(24, 32)] * 2
+    assert [f.image.shape[:2] for f in frames] == [(24, 32)] * 2
+    assert frames[0].path.name == "1.000000.jpg"
+
+
+def test_telemetry_from_long_before_the_start_is_left_out(numbered):
+    numbered.telemetry = [TelemetrySample(0.1 * k) for k in range(20)]
+    later = sources.start_at(numbered, 17)
+    assert [round(s.stamp_s, 1) for s in later.telemetry] == [round(0.1 * k, 1) for k in range(7, 20)]
