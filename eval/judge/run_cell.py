@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from edgeslam_torch.atomic import write_text
 from edgeslam_torch.config import SlamConfig
 from edgeslam_torch.errors import EdgeSlamError
 from edgeslam_torch.eval.dataset import interpolate, open_dataset
@@ -17,7 +18,6 @@ from edgeslam_torch.eval.judge import sources
 from edgeslam_torch.eval.judge.cells import KIDNAP, VARIANTS, Cell
 from edgeslam_torch.eval.judge.runner import CELL, RESULT
 from edgeslam_torch.eval.judge.score import Truth, score
-from edgeslam_torch.io.atomic import write_text
 from edgeslam_torch.io.config_file import load_config
 from edgeslam_torch.io.source import Recording, open_source
 from edgeslam_torch.run import run, settle_camera

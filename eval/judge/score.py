@@ -75,7 +75,7 @@ def _own_figures(run: RunFolder) -> dict[str, Any]:
         "supported_end": np.sum(support.at_end(run.status, run.trajectory.T_w_c, p_w, camera)) / offered,
         "supported_live": np.sum(support.live(run.status)) / offered,
         "losses": summary.get("lost_events"),
-        "pieces": counts.get("pieces", support.pieces(run.status) if len(p_w) else 0),
+        "pieces": sum(piece["supported"] > 0 for piece in summary.get("pieces") or ()),
         "metric": float(scale.get("units") == "metres"),
         "scale_sigma": float(sigma) / float(scale["value"]) if sigma else None,
         "map_points": counts.get("edge_points"),
