@@ -16,6 +16,7 @@ import numpy as np
 from edgeslam_torch.atomic import write_text
 from edgeslam_torch.errors import OutputError
 from edgeslam_torch.geometry import se3
+from edgeslam_torch.io.appender import Appender
 from edgeslam_torch.io.own_folder import STATUS, SUMMARY, FolderLock, check_free
 from edgeslam_torch.io.ply import write_ply
 from edgeslam_torch.types import FloatArray, PointCloud, SlamOutput, Support, Units
@@ -184,9 +185,9 @@ class _LiveFiles:
     def __init__(self, folder: Path) -> None:
         self._table = folder / STATUS
         self._stages: list[str] = []
-        self._status = _Appender(self._table, _csv_line(STATUS_COLUMNS))
-        self._trajectory = _Appender(folder / TRAJECTORY, TRAJECTORY_HEADER)
-        self._online = _Appender(folder / ONLINE, TRAJECTORY_HEADER)
+        self._status = Appender(self._table, _csv_line(STATUS_COLUMNS))
+        self._trajectory = Appender(folder / TRAJECTORY, TRAJECTORY_HEADER)
+        self._online = Appender(folder / ONLINE, TRAJECTORY_HEADER)
 
     def add(self, output: SlamOutput, step_ms: float) -> None:
         line = tum_line(output.stamp_s, output.T_w_c)
@@ -225,31 +226,7 @@ class _LiveFiles:
         try:
             write_text(self._table, _csv_line(header) + "".join(padded))
         finally:
-            self._status = _Appender(self._table, None)
-
-
-class _Appender:
-    """A text file that holds whole lines only, whatever the disk does."""
-
-    def __init__(self, path: Path, header: str | None) -> None:
-        self._file = path.open("ab" if header is None else "wb", buffering=0)
-        self._good = self._file.seek(0, os.SEEK_END)
-        if header is not None:
-            self.write(header)
-
-    def write(self, text: str) -> None:
-        data = text.encode("utf-8")
-        try:
-            written = self._file.write(data)
-            if written != len(data):
-                raise OSError(28, "no space left on device")
-        except OSError:
-            self._file.truncate(self._good)
-            raise
-        self._good += len(data)
-
-    def close(self) -> None:
-        self._file.close()
+            self._status = Appender(self._table, None)
 
 
 def tum_line(stamp_s: float, T_w_c: FloatArray) -> str:

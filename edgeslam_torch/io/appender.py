@@ -1,0 +1,43 @@
+"""A text file that holds whole lines only, whatever the disk does."""
+
+import errno
+import os
+from pathlib import Path
+
+
+class Appender:
+    """Appends lines; one that does not fit on the disk is taken back whole.
+
+    Args:
+        path: The file.
+        header: First lines of a new file, which replaces an old one; None goes on behind what is there.
+
+    Raises:
+        OSError: If the file cannot be opened or written.
+    """
+
+    def __init__(self, path: Path, header: str | None) -> None:
+        self._file = path.open("ab" if header is None else "wb", buffering=0)
+        self._good = self._file.seek(0, os.SEEK_END)
+        if header is not None:
+            self.write(header)
+
+    def write(self, text: str) -> None:
+        """Append whole lines.
+
+        Raises:
+            OSError: If the disk refuses; the file is as it was before.
+        """
+        data = text.encode("utf-8")
+        try:
+            written = self._file.write(data)
+            if written != len(data):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        except OSError:
+            self._file.truncate(self._good)
+            raise
+        self._good += len(data)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
