@@ -199,7 +199,7 @@ def test_full_disk_leaves_whole_lines_and_room_for_the_rest(tmp_path, monkeypatc
 
     writer._live._online._file = Full(writer._live._online._file)
     assert not writer.append(frames[3], 1.0)
-    assert "no space left" in writer.failure
+    assert "No space left" in writer.failure
     assert not writer.append(frames[4], 1.0)
     assert np.loadtxt(tmp_path / "trajectory_online.txt").shape == (3, 8)
     stamps, poses = slam.trajectory()
