@@ -103,7 +103,9 @@ def summarise(
 
 
 def _camera(camera: Camera) -> dict[str, Any]:
-    return {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy", "source")}
+    return {
+        name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy", "focal_sigma", "source")
+    }
 
 
 def peak_rss_mb() -> float | None:

@@ -121,7 +121,7 @@ class EdgeSlam:
         self._mapper = Mapper(self.map, camera, self.config, self._lm)
         self.edges = EdgeMap(self.map, camera, self.config.edges, self.config.depth.prior_sigma_log)
         self._T_b_c = camera_on_body(np.deg2rad(self.config.mount.tilt_deg), self.config.mount.forward_m)
-        self._fusion = MotionFusion(self.config.fusion, self._T_b_c)
+        self._fusion = MotionFusion(self.config.fusion, self._T_b_c, camera.focal_sigma)
         self._fusion.refined_poses = self.log.poses
         self._published = Published()
         self._bootstrap: Bootstrap | None = None

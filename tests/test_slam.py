@@ -381,3 +381,11 @@ def test_image_of_another_size_is_refused_by_name(shape, tmp_path):
     with pytest.raises(SourceError, match=rf"0001.png: image is {shape[1]}x{shape[0]}, the calibration 320x240"):
         slam.step(Frame(0, 0.0, np.zeros(shape, np.uint8), tmp_path / "0001.png"))
     assert slam.step(panels().frames[0]).status is FrameStatus.STARTING
+
+
+def test_metres_from_a_guessed_focal_length_say_that_it_is_one():
+    slam = EdgeSlam(replace(CAMERA, focal_sigma=0.45), NO_NETWORK, depth=panels().depth_function())
+    for frame in panels().frames[:20]:
+        slam.step(frame)
+    assert slam.scale.units is Units.METRES
+    assert slam.scale.sigma / slam.scale.value > 0.45

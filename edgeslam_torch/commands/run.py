@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from edgeslam_torch.config import SlamConfig
+    from edgeslam_torch.geometry.camera import Camera
     from edgeslam_torch.io.source import Source
     from edgeslam_torch.run import RunResult
 
@@ -77,7 +78,7 @@ def main(args: argparse.Namespace) -> int:
     settle_camera(source)
     for warning in source.warnings:
         _say(f"warning: {warning}")
-    _say(f"camera: {source.camera.source}, {source.camera.width}x{source.camera.height}, f {source.camera.fx:.1f} px")
+    _say(_camera_words(source.camera))
     mode = Mode(args.mode) if args.mode else (Mode.REALTIME if source.live else Mode.OFFLINE)
     out = args.out if args.out is not None else Path("runs") / source.name
     show_bar = sys.stderr.isatty() if args.progress is None else args.progress
@@ -177,6 +178,11 @@ def _report(result: "RunResult", source: "Source") -> None:
         _say("warning: the edge map is empty")
     print(f"map: {counts['edge_points']} edge points, {counts['anchors']} anchors, {counts['keyframes']} keyframes")
     print(f"results: {result.folder} (look at {_best_view(result.folder)})")
+
+
+def _camera_words(camera: "Camera") -> str:
+    doubt = f" +- {100 * camera.focal_sigma:.0f} %" if camera.focal_sigma > 0 else ""
+    return f"camera: {camera.source}, {camera.width}x{camera.height}, f {camera.fx:.1f} px{doubt}"
 
 
 def _best_view(folder: Path) -> str:

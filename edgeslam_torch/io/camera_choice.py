@@ -6,11 +6,14 @@ from dataclasses import replace
 from pathlib import Path
 
 from edgeslam_torch.errors import CalibrationError
-from edgeslam_torch.geometry.camera import PRESETS, Camera, load_camera
+from edgeslam_torch.geometry.camera import GUESSED_FOCAL_SIGMA, PRESETS, Camera, load_camera
 
 CALIBRATION_FILES = ("camera.yaml", "ost.yaml", "sensor.yaml")
 _ASPECT_TOLERANCE = 0.005
 """Relative; KITTI's 1241x376 halved is off by 0.001, 4:3 and 16:9 differ by 0.33."""
+
+_TELLO_FOCAL_SIGMA = 0.01
+"""Five measured drones lie within 1 % of their median."""
 
 GUESS = "guess"
 """How the ``source`` of a guessed camera begins."""
@@ -41,7 +44,8 @@ def choose_camera(
         is_drone: Whether there is telemetry.
 
     Returns:
-        The camera, whose ``source`` says where it is from, and warnings in words.
+        The camera, whose ``source`` says where it is from and ``focal_sigma`` how well it is known, and warnings in
+        words.
 
     Raises:
         CalibrationError: If the calibration is malformed or made for images of another shape.
@@ -55,12 +59,14 @@ def choose_camera(
         camera, notes = fitted(default, size, default.source)
         return camera, [*notes, f"no calibration found: using {camera.source}; give --camera FILE for yours"]
     if is_drone and size == (PRESETS["tello"].width, PRESETS["tello"].height):
-        camera = replace(PRESETS["tello"], source="default for a Tello (median of five drones)")
+        source = "default for a Tello (median of five drones)"
+        camera = replace(PRESETS["tello"], source=source, focal_sigma=_TELLO_FOCAL_SIGMA)
         note = f"no calibration found: using the {camera.source}; yours may differ by 1 % in focal length"
         return camera, [note]
     focal = 1.2 * max(size)
     centre = ((size[0] - 1) / 2.0, (size[1] - 1) / 2.0)
-    camera = Camera(*size, focal, focal, *centre, source=f"{GUESS}: 1.2*max(w,h) = {focal:.0f} px")
+    source = f"{GUESS}: 1.2*max(w,h) = {focal:.0f} px"
+    camera = Camera(*size, focal, focal, *centre, source=source, focal_sigma=GUESSED_FOCAL_SIGMA)
     return camera, [f"{GUESS_WARNING} a focal length of {focal:.0f} px; {GUESS_COST}"]
 
 

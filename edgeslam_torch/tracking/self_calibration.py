@@ -18,7 +18,7 @@ import numpy as np
 from edgeslam_torch.config import OrbConfig
 from edgeslam_torch.frontend.matching import match_all, words
 from edgeslam_torch.frontend.orb import OrbExtractor
-from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.geometry.camera import GUESSED_FOCAL_SIGMA, Camera
 from edgeslam_torch.types import FloatArray
 
 MAX_FRAMES = 40
@@ -108,19 +108,21 @@ def guess_camera(frames: Sequence[np.ndarray], width: int, height: int) -> Camer
         height: Of the images [px].
 
     Returns:
-        Principal point in the middle, no distortion; ``source`` says where the focal length is from.
+        Principal point in the middle, no distortion; ``source`` says where the focal length is from, ``focal_sigma``
+        how well it is known.
     """
     estimate = focal_from_matches(_matched_pairs(_spread(frames), width, height), width, height)
     if estimate.focal_px is None:
-        focal = 1.2 * max(width, height)
+        focal, sigma = 1.2 * max(width, height), GUESSED_FOCAL_SIGMA
         source = f"guess: 1.2*max(w,h) = {focal:.0f} px ({estimate.reason})"
     else:
-        focal = estimate.focal_px
+        focal, sigma = estimate.focal_px, estimate.sigma_px / estimate.focal_px
         source = (
             f"focal from the fundamental matrix: {focal:.0f} +- {estimate.sigma_px:.0f} px "
             f"over {estimate.pairs_used} pairs"
         )
-    return Camera(width, height, focal, focal, (width - 1) / 2.0, (height - 1) / 2.0, source=source)
+    centre = ((width - 1) / 2.0, (height - 1) / 2.0)
+    return Camera(width, height, focal, focal, *centre, source=source, focal_sigma=sigma)
 
 
 def _spread(frames: Sequence[np.ndarray]) -> list[np.ndarray]:

@@ -1,5 +1,7 @@
 """Calibration files: the three kinds we read, and what is said about the ones we cannot."""
 
+from dataclasses import replace
+
 import pytest
 
 from edgeslam_torch.errors import CalibrationError
@@ -16,6 +18,13 @@ def test_own_file_round_trips(tmp_path):
     PRESETS["tum_fr1"].save(tmp_path / "camera.yaml")
     back = load_camera(tmp_path / "camera.yaml")
     assert (back.fx, back.cy, back.distortion) == (517.306408, 255.313989, PRESETS["tum_fr1"].distortion)
+
+
+def test_how_well_the_focal_length_is_known_goes_with_the_file(tmp_path):
+    replace(PRESETS["kinect"], focal_sigma=0.12).save(tmp_path / "camera.yaml")
+    assert load_camera(tmp_path / "camera.yaml").focal_sigma == 0.12
+    (tmp_path / "plain.yaml").write_text(GOOD)
+    assert load_camera(tmp_path / "plain.yaml").focal_sigma == 0.0
 
 
 def test_ros_file(tmp_path):
@@ -42,6 +51,8 @@ def test_presets_load_and_say_so(name):
         (GOOD.replace("cx: 320", "cx: 99999"), "cannot be pixels"),
         (GOOD.replace("width: 640", "width: .inf"), "not a camera calibration"),
         (GOOD.replace("fy: 501\n", ""), "KeyError: 'fy'"),
+        (GOOD + "focal_sigma: -0.1\n", "focal_sigma must be at least 0"),
+        (GOOD + "focal_sigma: .nan\n", "not finite"),
         (GOOD + "model: fisheye\n", "only pinhole"),
         (GOOD + "distortion: [1, 2, 3, 4, 5, 6]\n", "6 distortion coefficients"),
         (ROS.replace("plumb_bob", "equidistant"), "'equidistant' is not supported"),

@@ -81,6 +81,7 @@ def test_image_folder_in_numeric_order_at_30_hz(tmp_path, write_images):
     assert [f.path.name for f in frames] == ["img1.jpg", "img2.jpg", "img9.jpg", "img10.jpg"]
     assert [f.stamp_s for f in frames] == pytest.approx([0, 1 / 30, 2 / 30, 3 / 30])
     assert "guess" in source.camera.source
+    assert source.camera.focal_sigma > 0.3
     assert "bends the trajectory" in source.warnings[0]
 
 

@@ -7,7 +7,7 @@ import pytest
 from rendered import film, stairs_world
 
 from edgeslam_torch.geometry import se3
-from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.geometry.camera import GUESSED_FOCAL_SIGMA, Camera
 from edgeslam_torch.synthetic import box_room
 from edgeslam_torch.tracking.self_calibration import FocalEstimate, focal_from_matches, focal_of, guess_camera
 
@@ -143,6 +143,7 @@ def test_rendered_flight_gives_it_within_fifteen_percent():
     assert (camera.cx, camera.cy) == (159.5, 119.5)
     assert camera.source.startswith(f"focal from the fundamental matrix: {camera.fx:.0f} +- ")
     assert camera.source.endswith(" pairs")
+    assert 0.02 <= camera.focal_sigma <= 0.15
     assert guess_camera(images, 320, 240) == camera
 
 
@@ -158,3 +159,4 @@ def test_black_images_fall_back():
     camera = guess_camera([np.zeros((240, 320), np.uint8)] * 12, 320, 240)
     assert camera.fx == 384.0
     assert "too few matches" in camera.source
+    assert camera.focal_sigma == GUESSED_FOCAL_SIGMA
