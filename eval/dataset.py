@@ -19,6 +19,7 @@ from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.formats import SEVEN_SCENES_HZ, Trajectory, read_trajectory
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import PRESETS, Camera, load_camera
+from edgeslam_torch.io.images import pixels_or_none
 from edgeslam_torch.types import FloatArray
 
 SEVEN_SCENES_DEPTH_CAMERA = Camera(640, 480, 585.0, 585.0, 320.0, 240.0, source="7-Scenes depth camera")
@@ -58,7 +59,7 @@ class DepthFiles:
         Raises:
             EvaluationError: If the file is not a 16-bit image.
         """
-        raw = cv2.imread(str(self.paths[index]), cv2.IMREAD_UNCHANGED)
+        raw = pixels_or_none(self.paths[index], cv2.IMREAD_UNCHANGED)
         if raw is None or raw.dtype != np.uint16 or raw.ndim != 2:
             raise EvaluationError(f"{self.paths[index]}: not a 16-bit depth map")
         depth: FloatArray = np.where(raw == 65535, 0, raw) * np.float32(self.metres_per_unit)

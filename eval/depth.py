@@ -12,6 +12,7 @@ from edgeslam_torch.eval.associate import DEFAULT_MAX_DT_S, nearest
 from edgeslam_torch.eval.dataset import open_depth
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.surface import register_depth
+from edgeslam_torch.io.images import pixels_or_none
 from edgeslam_torch.types import FloatArray
 
 MIN_DEPTH_M = 1e-3
@@ -119,7 +120,7 @@ def read_depth(path: Path, metres_per_unit: float = 1.0 / 5000.0) -> FloatArray:
             return np.squeeze(np.load(path, allow_pickle=False)).astype(np.float64)
         except (OSError, ValueError) as error:
             raise EvaluationError(f"{path}: not a NumPy array ({error})") from error
-    raw = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    raw = pixels_or_none(path, cv2.IMREAD_UNCHANGED)
     if raw is None or raw.dtype != np.uint16 or raw.ndim != 2:
         raise EvaluationError(f"{path}: not a 16-bit depth map or .npy array")
     return np.where(raw == 65535, 0, raw).astype(np.float64) * metres_per_unit
@@ -215,7 +216,7 @@ def _images(place: Path | None) -> dict[str, Path]:
 def _read_image(path: Path | None) -> NDArray[np.uint8] | None:
     if path is None:
         return None
-    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    image = pixels_or_none(path, cv2.IMREAD_GRAYSCALE)
     if image is None:
         raise EvaluationError(f"{path}: not an image")
     return np.asarray(image, dtype=np.uint8)

@@ -42,7 +42,7 @@ def keyframe_pictures(run: RunFolder, cloud: PointCloud, stamps_s: FloatArray) -
         return []
     out = []
     for stamp, path in zip(stamps_s, paths, strict=True):
-        image = cv2.imread(str(path)) if path is not None else None
+        image = images.pixels_or_none(path, cv2.IMREAD_COLOR) if path is not None else None
         if image is None or image.shape[:2] != (camera.height, camera.width):
             continue
         pose = int(nearest(run.trajectory.stamps_s, np.array([stamp]))[0])

@@ -24,6 +24,7 @@ from edgeslam_torch.eval.formats import Trajectory, read_trajectory
 from edgeslam_torch.eval.keyframe_pictures import keyframe_pictures
 from edgeslam_torch.eval.run_folder import RunFolder, is_keyframe, open_run
 from edgeslam_torch.eval.run_score import RunScore, evaluate_run
+from edgeslam_torch.io.images import pixels_or_none
 from edgeslam_torch.types import FloatArray, PointCloud
 
 STATUSES = ("starting", "initialised", "tracked", "relocalised", "predicted", "lost")
@@ -413,7 +414,7 @@ def _keyframes(run: RunFolder, edges: PointCloud, stamps_s: FloatArray, begin: f
     """Pictures that the run left in ``keyframes/``, else drawn from its source's images."""
     files = sorted((run.path / "keyframes").glob("*.jpg")) if (run.path / "keyframes").is_dir() else []
     files = files[:: max(1, -(-len(files) // _MAX_KEYFRAMES))]
-    pictures = [(words.keyframe_label(file.stem, begin), cv2.imread(str(file))) for file in files]
+    pictures = [(words.keyframe_label(file.stem, begin), pixels_or_none(file, cv2.IMREAD_COLOR)) for file in files]
     if not files:
         chosen = stamps_s[:: max(1, -(-len(stamps_s) // _MAX_KEYFRAMES))]
         drawn = keyframe_pictures(run, edges, chosen)

@@ -13,6 +13,7 @@ from edgeslam_torch.eval.dataset import DepthFiles, EvalDataset, interpolate, op
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.io.images import pixels_or_none
 from edgeslam_torch.types import FloatArray
 
 MAX_DEPTH_M = 5.0
@@ -196,7 +197,7 @@ def _edge_points(dataset: EvalDataset, files: DepthFiles, depth: FloatArray, ind
         return empty
     k = int(nearest(dataset.frame_stamps_s, files.stamps_s[index : index + 1])[0])
     T_w_image, known = interpolate(dataset.truth, dataset.frame_stamps_s[k : k + 1])
-    image = cv2.imread(str(dataset.image_paths[k]), cv2.IMREAD_GRAYSCALE)
+    image = pixels_or_none(dataset.image_paths[k], cv2.IMREAD_GRAYSCALE)
     if abs(dataset.frame_stamps_s[k] - files.stamps_s[index]) > 0.02 or not known[0] or image is None:
         return empty
     T_c_d, camera = files.T_c_d, dataset.camera

@@ -11,6 +11,7 @@ import yaml
 
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.geometry.camera import load_camera
+from edgeslam_torch.io.images import pixels_or_none
 from edgeslam_torch.train.augment import View, fitted_view
 from edgeslam_torch.types import FloatArray
 
@@ -58,8 +59,8 @@ def load_depth_folder(
         nearest = int(np.argmin(np.abs(stamps - stamp)))
         if abs(stamps[nearest] - stamp) > max_gap_s:
             continue
-        image = cv2.imread(str(colours[nearest][1]), cv2.IMREAD_COLOR)
-        raw = cv2.imread(str(depth_path), cv2.IMREAD_UNCHANGED)
+        image = pixels_or_none(colours[nearest][1], cv2.IMREAD_COLOR)
+        raw = pixels_or_none(depth_path, cv2.IMREAD_UNCHANGED)
         if image is None or raw is None or raw.ndim != 2:
             unreadable.append(str(colours[nearest][1] if image is None else depth_path))
             continue

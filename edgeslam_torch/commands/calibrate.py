@@ -83,6 +83,7 @@ def _pictures(names: list[str], unreadable: dict[str, str]) -> "Iterator[tuple[s
     import cv2
 
     from edgeslam_torch.errors import SourceError
+    from edgeslam_torch.io.images import read_pixels
 
     for name in names:
         path = Path(name).expanduser()
@@ -95,11 +96,10 @@ def _pictures(names: list[str], unreadable: dict[str, str]) -> "Iterator[tuple[s
         else:
             raise SourceError(f"{path}: no such picture or folder")
         for file in files:
-            grey = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
-            if grey is None:
-                unreadable[str(file)] = "not a picture that can be read"
-            else:
-                yield str(file), grey
+            try:
+                yield str(file), read_pixels(file, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+            except SourceError as error:
+                unreadable[str(file)] = str(error).removeprefix(f"{file}: ")
 
 
 def _live_pictures(spec: str, board: "Board", views: int) -> "Iterator[tuple[str, np.ndarray]]":

@@ -3,17 +3,24 @@
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from edgeslam_torch.errors import SourceError
+from edgeslam_torch.io.image_size import image_size
 from edgeslam_torch.io.listing import ImageEntry, Problem, in_order, seconds_from
 from edgeslam_torch.types import Frame
 
 SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp"})
+MAX_PIXELS = 50_000_000
+"""Of one image; video of today's largest size, 8K, has 33 million. A larger one is refused before it is decoded."""
+_MAX_BYTES = 8 * MAX_PIXELS
+"""Of one file; 16 bits and four channels without compression."""
 _JPEG = b"\xff\xd8"
+_EXIF = b"Exif\0\0"
 ASSUMED_HZ = 30.0
 """Rate of images whose names tell no time; what webcams, Kinects and the Tello give."""
 
@@ -31,62 +38,117 @@ class JpegFrame(Frame):
         """Decode a file's bytes in grey.
 
         Raises:
-            SourceError: If they are no image.
+            SourceError: If they are no image, or a damaged one.
         """
-        grey = _decoded(data, path, cv2.IMREAD_GRAYSCALE)
+        grey = _grey_of_jpeg(data, path)
         for name, value in (("index", index), ("stamp_s", stamp_s), ("path", path), ("grey", grey), ("_data", data)):
             object.__setattr__(self, name, value)
 
     @property
     def image(self) -> NDArray[np.uint8]:
         """``(H, W, 3)`` BGR, or ``(H, W)`` of a grey JPEG."""
-        return _decoded(self._data, self.path, cv2.IMREAD_ANYCOLOR)
+        return np.asarray(_decoded(self._data, self.path, cv2.IMREAD_ANYCOLOR), dtype=np.uint8)
 
 
 def read_image(path: Path) -> NDArray[np.uint8]:
     """``(H, W, 3)`` BGR or ``(H, W)`` grey, eight bits.
 
     Raises:
-        SourceError: If the file is missing, empty, truncated or no image.
+        SourceError: If the file is missing, empty, damaged, too large or no image.
     """
-    return _decoded(_bytes(path), path, cv2.IMREAD_ANYCOLOR)
+    return np.asarray(read_pixels(path, cv2.IMREAD_ANYCOLOR), dtype=np.uint8)
+
+
+def read_pixels(path: Path, flags: int) -> NDArray[Any]:
+    """The image as ``cv2.imread`` with these flags gives it.
+
+    Raises:
+        SourceError: If the file is missing, empty, damaged, too large or no image.
+    """
+    data = _bytes(path)
+    if data.startswith(_JPEG):
+        _grey_of_jpeg(data, path)
+    return _decoded(data, path, flags)
+
+
+def pixels_or_none(path: Path, flags: int) -> NDArray[Any] | None:
+    """As `read_pixels`; None when the file cannot be read, whatever the reason."""
+    try:
+        return read_pixels(path, flags)
+    except SourceError:
+        return None
 
 
 def read_frame(entry: ImageEntry) -> Frame:
     """The frame of one image file.
 
     Raises:
-        SourceError: If the file is missing, empty, truncated or no image.
+        SourceError: If the file is missing, empty, damaged, too large or no image.
     """
     data = _bytes(entry.path)
     if data.startswith(_JPEG):
         return JpegFrame(entry.index, entry.stamp_s, data, entry.path)
-    return Frame(entry.index, entry.stamp_s, _decoded(data, entry.path, cv2.IMREAD_ANYCOLOR), entry.path)
+    image = np.asarray(_decoded(data, entry.path, cv2.IMREAD_ANYCOLOR), dtype=np.uint8)
+    return Frame(entry.index, entry.stamp_s, image, entry.path)
+
+
+def check_size(width: int, height: int, name: str | Path | None) -> None:
+    """Whether an image of so many pixels may be decoded.
+
+    Raises:
+        SourceError: If it has more than `MAX_PIXELS`.
+    """
+    if width * height > MAX_PIXELS:
+        limit = MAX_PIXELS // 1_000_000
+        raise SourceError(f"{name}: image is {width}x{height}, more than {limit} million pixels are not read")
 
 
 def _bytes(path: Path) -> bytes:
     try:
-        data = path.read_bytes() if path.is_file() else None
+        size = path.stat().st_size if path.is_file() else None
+        if size is not None and size > _MAX_BYTES:
+            raise SourceError(f"{path}: {size / 1e6:.0f} MB are no image")
+        data = path.read_bytes() if size is not None else None
     except OSError as error:
         raise SourceError(f"{path}: {error.strerror or error}") from error
     if data is None:
         raise SourceError(f"{path}: no such file")
     if not data:
         raise SourceError(f"{path}: empty file")
-    # OpenCV 4 fills the missing part of a cut-off JPEG with grey and says nothing: look for the end marker.
-    if data.startswith(_JPEG) and data.rfind(b"\xff\xd9", max(0, len(data) - 65536)) < 0:
+    if data.startswith(_JPEG) and data.rfind(b"\xff\xd9", max(0, len(data) - 65536)) < 0:  # no end marker
         raise SourceError(f"{path}: truncated image")
+    size_px = image_size(data)
+    if size_px is None:
+        raise SourceError(f"{path}: cannot be decoded as an image")
+    check_size(*size_px, path)
     return data
 
 
-def _decoded(data: bytes, path: Path | None, flags: int) -> NDArray[np.uint8]:
+def _grey_of_jpeg(data: bytes, path: Path) -> NDArray[np.uint8]:
+    """``(H, W)``.
+
+    By the same library as OpenCV's (libjpeg-turbo) and with the same values, but its warnings are errors: OpenCV gives
+    an image for whatever garbage lies between the first byte and the last.
+    """
+    from kornia_rs.io import decode_image_jpegturbo  # 10 ms, which other sources can do without
+
+    try:
+        grey = decode_image_jpegturbo(data, "mono")
+    except Exception as error:  # it has no other class for what it refuses
+        raise SourceError(f"{path}: damaged JPEG data, or print colours (CMYK)") from error
+    if data.find(_EXIF, 0, 65536) >= 0:  # it may say that the picture is turned, which OpenCV heeds
+        return np.asarray(_decoded(data, path, cv2.IMREAD_GRAYSCALE), dtype=np.uint8)
+    return np.asarray(grey[:, :, 0], dtype=np.uint8)
+
+
+def _decoded(data: bytes, path: Path | None, flags: int) -> NDArray[Any]:
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error as error:
         raise SourceError(f"{path}: cannot be decoded as an image") from error
     if image is None:
         raise SourceError(f"{path}: cannot be decoded as an image")
-    return np.asarray(image, dtype=np.uint8)
+    return image
 
 
 def image_files(folder: Path) -> list[Path]:

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from edgeslam_torch.errors import SourceError
-from edgeslam_torch.io.images import ASSUMED_HZ
+from edgeslam_torch.io.images import ASSUMED_HZ, check_size
 from edgeslam_torch.io.listing import Problem
 from edgeslam_torch.types import Frame
 
@@ -34,6 +34,7 @@ class Video:
         self.path = path
         self.stamps_s = stamps_s
         capture = _opened(path)
+        check_size(int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT)), path)
         rate = capture.get(cv2.CAP_PROP_FPS)
         self.rate_hz = rate if math.isfinite(rate) and 0.0 < rate <= 1000.0 else ASSUMED_HZ
         count = capture.get(cv2.CAP_PROP_FRAME_COUNT)

@@ -130,6 +130,12 @@ def test_cut_off_video_gives_what_it_has(video):
     assert 0 < len(frames) < 8
 
 
+def test_video_of_too_many_pixels_is_refused(video, monkeypatch):
+    monkeypatch.setattr("edgeslam_torch.io.images.MAX_PIXELS", 64 * 48 - 1)
+    with pytest.raises(SourceError, match="clip.avi: image is 64x48, more than"):
+        open_source(video)
+
+
 @pytest.mark.parametrize("content", [b"", b"not a video at all" * 50])
 def test_broken_video_is_refused(tmp_path, content):
     path = tmp_path / "clip.mp4"
