@@ -20,6 +20,7 @@ from edgeslam_torch.errors import SourceError
 from edgeslam_torch.frontend.depth_check import CheckedDepth, DepthFunction
 from edgeslam_torch.frontend.image import as_grey, colours_at
 from edgeslam_torch.frontend.orb import OrbExtractor
+from edgeslam_torch.frontend.repeats import REPEATED, RepeatedImages
 from edgeslam_torch.fusion.motion import MotionFusion
 from edgeslam_torch.fusion.published import Published, first_pose
 from edgeslam_torch.geometry import se3
@@ -123,6 +124,9 @@ class EdgeSlam:
         self._T_b_c = camera_on_body(np.deg2rad(self.config.mount.tilt_deg), self.config.mount.forward_m)
         self._fusion = MotionFusion(self.config.fusion, self._T_b_c, camera.focal_sigma)
         self._fusion.refined_poses = self.log.poses
+        self._repeats = RepeatedImages()
+        self._is_repeat = False
+        """Whether the present image shows nothing new."""
         self._published = Published()
         self._bootstrap: Bootstrap | None = None
         self._T_c_w = se3.inverse(first_pose(np.full(3, np.nan), self._T_b_c))
@@ -172,6 +176,7 @@ class EdgeSlam:
             self._absorb_pending()
         with self._timed("features"):
             seen = prepared if prepared is not None else self.prepare(frame)
+            self._is_repeat = self._repeats.repeats(seen.grey, frame.stamp_s)
         with self._timed("fusion"):
             self._fusion.add_telemetry(telemetry)
             self._has_telemetry = self._has_telemetry or len(telemetry) > 0
@@ -271,8 +276,9 @@ class EdgeSlam:
             self._velocity = np.zeros(6)
         self._lost_frames = 0
         self._recent = track.anchor
-        with self._timed("fusion"):
-            self._see(frame.stamp_s, track)
+        if not self._is_repeat:
+            with self._timed("fusion"):
+                self._see(frame.stamp_s, track)
         keyframe = self._insert_keyframe(frame, seen, located) if located.due else None
         if keyframe is not None and keyframe.id in self.map.keyframes:
             reference = keyframe
@@ -541,7 +547,8 @@ class EdgeSlam:
     def warnings(self) -> list[str]:
         """What limits how far the results can be believed, in sentences for the run's summary."""
         depth = None if self.depth is None else self.depth.warning()
-        return [warning for warning in (depth, self._warning_of_pieces()) if warning is not None]
+        warnings = (depth, self._warning_of_pieces(), self._repeats.warning())
+        return [warning for warning in warnings if warning is not None]
 
     def _warning_of_pieces(self) -> str | None:
         pieces = [p for p in self.pieces() if p.supported > 0]
@@ -568,7 +575,7 @@ class EdgeSlam:
             stamp_s=frame.stamp_s,
             T_w_c=self._published.pose(se3.inverse(self._T_c_w)),
             status=status,
-            reason=reason,
+            reason=reason or (REPEATED if self._is_repeat else ""),
             matches=0 if track is None else track.matches,
             inliers=0 if track is None else track.inliers,
             parallax_rad=parallax_rad,

@@ -348,7 +348,9 @@ def test_a_cut_to_another_place_leaves_two_pieces_and_says_so():
     assert [o.piece for o in outputs] == [0] * 35 + [1] * 25
     assert slam.warnings() == [
         "the map is in 2 pieces that were never joined, 0 (0.0 to 3.4 s), 1 (3.5 to 5.9 s): "
-        "poses across them do not relate"
+        "poses across them do not relate",
+        "the video stood still from 1.6 to 3.6 s, the same image again and again: "
+        "where the camera moved meanwhile is not known",
     ]
     assert ate(slam.trajectory()[1][36:], there.T_w_c) < 0.012
 
@@ -389,3 +391,17 @@ def test_metres_from_a_guessed_focal_length_say_that_it_is_one():
         slam.step(frame)
     assert slam.scale.units is Units.METRES
     assert slam.scale.sigma / slam.scale.value > 0.45
+
+
+def test_a_frozen_video_says_so_and_is_no_evidence_for_the_scale(monkeypatch):
+    frames = list(panels().frames[:24])
+    frozen = [replace(frames[-1], index=24 + k, stamp_s=frames[-1].stamp_s + (k + 1) / 30) for k in range(15)]
+    slam = EdgeSlam(CAMERA, NO_NETWORK)
+    told = []
+    monkeypatch.setattr(slam._fusion, "add_visual", lambda stamp_s, *rest, **more: told.append(stamp_s))
+    outputs = [slam.step(frame) for frame in [*frames, *frozen]]
+    assert all("repeats the one before" in o.reason for o in outputs[24:])
+    assert not any("repeats" in o.reason for o in outputs[:24])
+    assert outputs[23].stamp_s in told
+    assert max(told) == outputs[23].stamp_s
+    assert any("stood still" in w for w in slam.warnings())

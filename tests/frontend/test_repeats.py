@@ -1,0 +1,83 @@
+import cv2
+import numpy as np
+import pytest
+
+from edgeslam_torch.frontend.repeats import RepeatedImages
+
+
+def room(rng, size=(240, 320)):
+    """A soft picture with grain, as a camera gives."""
+    return np.clip(cv2.GaussianBlur(rng.normal(0, 400, size), (0, 0), 6) + 128, 0, 255).astype(np.uint8)
+
+
+def noisy(rng, picture, sigma):
+    return np.clip(np.rint(picture + rng.normal(0, sigma, picture.shape)), 0, 255).astype(np.uint8)
+
+
+def seen(images, rate_hz=30.0):
+    repeats = RepeatedImages()
+    return [repeats.repeats(image, 100.0 + i / rate_hz) for i, image in enumerate(images)], repeats.warning()
+
+
+def test_a_frozen_video_is_recognised_from_its_second_image_on(rng):
+    picture = room(rng)
+    found, warning = seen([picture] * 150)
+    assert found == [False, *[True] * 149]
+    assert "stood still from 100.0 to 105.0 s" in warning
+
+
+def test_a_camera_at_rest_is_no_frozen_video(rng):
+    """Noise never repeats: half a grey level is enough."""
+    picture = room(rng)
+    found, warning = seen([noisy(rng, picture, 0.5) for _ in range(60)])
+    assert not any(found)
+    assert warning is None
+
+
+def test_copies_made_for_the_frame_rate_are_named_without_a_warning(rng):
+    """12 images a second shown at 24; a Kinect that drops images repeats some 10 %."""
+    images = [noisy(rng, room(rng), 1.0) for _ in range(12)]
+    found, warning = seen([image for image in images for _ in range(2)], 24.0)
+    assert found == [False, True] * 12
+    assert warning is None
+
+
+def test_a_motion_too_slow_for_two_images_adds_up(rng):
+    picture = room(rng)
+    x, y = (a.astype(np.float32) for a in np.meshgrid(np.arange(320), np.arange(240)))
+    images = [cv2.remap(picture, x + 0.02 * i, y, cv2.INTER_LINEAR) for i in range(100)]
+    assert float(np.abs(images[1].astype(int) - images[0])[::4, ::4].mean()) < 0.3
+    found, _ = seen(images)
+    runs = np.diff(np.flatnonzero(np.logical_not(found)))
+    assert runs.max() < 30
+
+
+def test_an_encoder_lets_a_still_picture_be_recognised(rng, tmp_path):
+    """A re-encoded frozen video is never the same to the bit."""
+    path = str(tmp_path / "frozen.mp4")
+    writer = cv2.VideoWriter(path, cv2.VideoWriter_fourcc(*"mp4v"), 30.0, (320, 240))
+    assert writer.isOpened()
+    picture = cv2.cvtColor(noisy(rng, room(rng), 2.0), cv2.COLOR_GRAY2BGR)
+    for _ in range(90):
+        writer.write(picture)
+    writer.release()
+    capture, images = cv2.VideoCapture(path), []
+    while (read := capture.read())[0]:
+        images.append(cv2.cvtColor(read[1], cv2.COLOR_BGR2GRAY))
+    assert len(images) == 90
+    assert not all((a == b).all() for a, b in zip(images, images[1:], strict=False))
+    found, warning = seen(images)
+    assert np.mean(found) > 0.9
+    assert "stood still" in warning
+
+
+def test_several_stretches_are_one_sentence(rng):
+    still, other = room(rng), room(rng)
+    _, warning = seen([still] * 30 + [other] * 45)
+    assert "stood still 2 times, the longest from 101.0 to 102.5 s" in warning
+
+
+@pytest.mark.parametrize("size", [(1, 1), (3, 5)])
+def test_tiny_images_do_not_hurt(size):
+    found, _ = seen([np.zeros(size, np.uint8)] * 3)
+    assert found == [False, True, True]
