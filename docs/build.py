@@ -1,22 +1,27 @@
-"""``make docs``: guides and API reference as a static site in ``site/``; a broken link between pages is an error.
+"""``make docs``: guides and API reference as a static site in ``site/``, to be read offline and on a phone.
 
-Guides are the Markdown files of ``docs/`` and of the root; the API reference is made by pdoc from the docstrings.
+Guides are the Markdown files of ``docs/`` and of the root; the API reference is made by pdoc from the docstrings, their
+formulas as MathML. A link between pages that leads nowhere, a formula that cannot be set and anything that a page would
+fetch from the network are errors.
 """
 
 import pkgutil
 import re
 import shutil
 import sys
+from collections.abc import Iterable
 from pathlib import Path
+from unittest.mock import patch
 
+import latex2mathml.converter
 import markdown2
 import pdoc
+import pdoc.docstrings
 import pdoc.render
 
 import edgeslam_torch
 
 ROOT = Path(__file__).resolve().parent.parent
-SITE = ROOT / "site"
 GUIDES = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")
 EXTRAS = ["tables", "fenced-code-blocks", "header-ids", "code-friendly", "strike"]
 ASSETS = {".png", ".jpg", ".svg", ".gif"}
@@ -26,30 +31,84 @@ PAGE = """<!doctype html>
 <title>{title} - EdgeSLAM-Torch</title>
 <style>
 body {{ max-width: 60rem; margin: 0 auto; padding: 1rem; font: 16px/1.55 system-ui, sans-serif; color: #1f2328; }}
-nav {{ border-bottom: 1px solid #d0d7de; padding-bottom: .6rem; margin-bottom: 1.2rem; }}
-nav a {{ margin-right: 1rem; }} a {{ color: #0a58a6; }}
-pre {{ background: #f6f8fa; padding: .8rem; overflow-x: auto; }} code {{ font-size: .92em; }}
-table {{ border-collapse: collapse; display: block; overflow-x: auto; }}
+body {{ overflow-wrap: anywhere; }}
+nav ul {{ display: flex; flex-wrap: wrap; gap: .2rem 1.1rem; margin: 0 0 1.2rem; padding: 0 0 .6rem; }}
+nav ul {{ list-style: none; border-bottom: 1px solid #d0d7de; }}
+nav a[aria-current] {{ color: inherit; font-weight: 600; }}
+a {{ color: #0a58a6; }} pre {{ background: #f6f8fa; padding: .8rem; overflow-x: auto; }} code {{ font-size: .92em; }}
+table {{ border-collapse: collapse; display: block; overflow-x: auto; overflow-wrap: break-word; }}
 td, th {{ border: 1px solid #d0d7de; padding: .3rem .6rem; vertical-align: top; }} img {{ max-width: 100%; }}
-</style></head><body><nav>{nav}</nav>{body}</body></html>
+</style></head><body><nav><ul>{nav}</ul></nav>{body}</body></html>
 """
 
 
 def main() -> int:
-    """Build the site; 1 when a link leads nowhere."""
-    shutil.rmtree(SITE, ignore_errors=True)
-    SITE.mkdir()
-    guides = [ROOT / name for name in GUIDES] + sorted((ROOT / "docs").glob("*.md"))
-    broken = [problem for guide in guides for problem in broken_links(guide)]
-    for guide in guides:
-        write_guide(guide, guides)
-    copy_assets()
-    pdoc.render.configure(docformat="google", math=True, footer_text="EdgeSLAM-Torch")
-    pdoc.pdoc(*modules(), output_directory=SITE / "api")
-    for problem in broken:
+    """Build the site; 1 when something in it is broken."""
+    site = ROOT / "site"
+    shutil.rmtree(site, ignore_errors=True)
+    guides = write_guides(site)
+    problems = [problem for guide in guides for problem in broken_links(guide)]
+    write_reference(site / "api", modules())
+    problems += network_needs(site)
+    for problem in problems:
         sys.stderr.write(f"docs: {problem}\n")
-    sys.stdout.write(f"docs: {len(guides)} guides and the API reference are in {SITE / 'index.html'}\n")
-    return 1 if broken else 0
+    sys.stdout.write(f"docs: {len(guides)} guides and the API reference are in {site / 'index.html'}\n")
+    return 1 if problems else 0
+
+
+def write_guides(site: Path) -> list[Path]:
+    """Write every guide as a page, with the pictures that they show; return the guides' files."""
+    guides = [ROOT / name for name in GUIDES] + sorted((ROOT / "docs").glob("*.md"))
+    for guide in guides:
+        write_guide(site, guide, guides)
+    copy_assets(site)
+    return guides
+
+
+def write_reference(target: Path, names: Iterable[str]) -> None:
+    """Write the API reference of modules.
+
+    Raises:
+        ValueError: If a docstring has a formula that cannot be set.
+    """
+    convert = pdoc.docstrings.convert
+
+    def with_formulas(docstring: str, docformat: str, source_file: Path | None) -> str:
+        return convert(formulas_as_mathml(docstring), docformat, source_file)
+
+    pdoc.render.configure(docformat="google", footer_text="EdgeSLAM-Torch", template_directory=ROOT / "docs" / "pdoc")
+    with patch.object(pdoc.docstrings, "convert", with_formulas):
+        pdoc.pdoc(*names, output_directory=target)
+
+
+def formulas_as_mathml(docstring: str) -> str:
+    """Docstring with its ``.. math::`` blocks and ``:math:`` roles as MathML, which browsers set by themselves."""
+    block = re.compile(r"^( *)\.\. math::(.*(?:\n(?:\1 +\S.*| *(?=\n)))*)", re.MULTILINE)
+    text = block.sub(lambda m: f'{m[1]}<span class="formula">{mathml(m[2], "block")}</span>\n', docstring)
+    return re.sub(r":math:`([^`]+)`", lambda m: mathml(m[1], "inline"), text)
+
+
+def mathml(latex: str, display: str) -> str:
+    """A formula as MathML, ``display`` inline or block.
+
+    Raises:
+        ValueError: If it has a command that is not known.
+    """
+    found = str(latex2mathml.converter.convert(" ".join(latex.split()), display=display))
+    if "\\" in found:
+        raise ValueError(f"formula has a command that latex2mathml does not know: {latex}")
+    return re.sub(r"(<mi>[a-z]{2,}</mi>)(?=<m[^o])", r'\1<mspace width="0.167em" />', found)  # log s, not logs
+
+
+def network_needs(site: Path) -> list[str]:
+    """What pages would load from elsewhere, in words."""
+    loading = re.compile(r"""<(?:script|img|link|iframe)\b[^>]*?\b(?:src|href)=["']?((?:https?:)?//[^"'\s>]+)""")
+    pages = sorted(site.rglob("*.html"))
+    return [
+        f"{page.relative_to(site)}: loads {address} from the network"
+        for page in pages
+        for address in loading.findall(page.read_text(encoding="utf-8"))
+    ]
 
 
 def modules() -> list[str]:
@@ -65,13 +124,17 @@ def page_name(guide: Path) -> str:
     return "index.html" if guide.name == "README.md" else str(guide.relative_to(ROOT).with_suffix(".html"))
 
 
-def write_guide(guide: Path, guides: list[Path]) -> None:
+def write_guide(site: Path, guide: Path, guides: list[Path]) -> None:
     """One guide as a page, with links to the others."""
-    target = SITE / page_name(guide)
+    target = site / page_name(guide)
     target.parent.mkdir(parents=True, exist_ok=True)
-    up = "" if target.parent == SITE else "../"
+    up = "" if target.parent == site else "../"
     links = [(page_name(other), other.stem.replace("_", " ").capitalize()) for other in guides]
-    nav = "".join(f'<a href="{up}{page}">{title}</a>' for page, title in [*links, ("api/index.html", "API")])
+    here = {page_name(guide): ' aria-current="page"'}
+    nav = "\n".join(
+        f'<li><a href="{up}{page}"{here.get(page, "")}>{title}</a></li>'
+        for page, title in [*links, ("api/index.html", "API")]
+    )
     body = str(markdown2.markdown(guide.read_text(encoding="utf-8"), extras=EXTRAS))
     body = re.sub(r'href="([^":]+)\.md(#[^"]*)?"', link_to_page, body)
     target.write_text(PAGE.format(title=guide.stem, nav=nav, body=body), encoding="utf-8")
@@ -83,11 +146,11 @@ def link_to_page(match: re.Match[str]) -> str:
     return f'href="{path}.html{match[2] or ""}"'
 
 
-def copy_assets() -> None:
+def copy_assets(site: Path) -> None:
     """Pictures that the guides show."""
     for path in (ROOT / "docs").rglob("*"):
         if path.suffix in ASSETS:
-            target = SITE / path.relative_to(ROOT)
+            target = site / path.relative_to(ROOT)
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(path, target)
 
