@@ -27,7 +27,7 @@ from edgeslam_torch.io.pace import Counter, at_their_pace
 from edgeslam_torch.io.read_ahead import read_ahead
 from edgeslam_torch.io.run_writer import CAMERA, PICTURE, RunWriter
 from edgeslam_torch.io.source import Source
-from edgeslam_torch.run_summary import Tally, summarise
+from edgeslam_torch.run_summary import Tally, summarise, without_folders
 from edgeslam_torch.types import (
     FloatArray,
     Frame,
@@ -306,6 +306,7 @@ class _Run:
             "interrupted": self.interrupt.requested,
             "ended_early": "interrupted" if self.interrupt.requested else self.writer.failure,
         }
+        summary = without_folders(summary, self.writer.folder)
         title = f"{self.source.name}: {self.tally.frames} frames, {len(edge_map.p_w)} edge points"
 
         def picture(path: Path) -> None:

@@ -1,8 +1,10 @@
 """``summary.json``: a run in numbers."""
 
+import os
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -71,13 +73,15 @@ def summarise(
         finish_s: Time of the last refinement, once no frame follows.
         cpu_s: User and system time of the whole process, all threads, over both.
     """
-    offered = tally.frames + dropped + len(source.problems)
+    left_out = sum(problem.frames for problem in source.problems)
+    offered = tally.frames + dropped + left_out
     tracked = sum(piece.supported for piece in pieces)
     return {
         "version": __version__,
         "source": {"name": source.name, "kind": source.kind, "path": source.location, "length": source.length},
         "camera": _camera(source.camera),
         "frames": tally.frames,
+        "offered": offered,
         "tracked": tracked,
         "tracked_live": tally.supported,
         "coverage": tracked / offered,
@@ -85,7 +89,7 @@ def summarise(
         "first_pose_frame": tally.first_pose_frame,
         "lost_events": tally.lost_events,
         "dropped_frames": dropped,
-        "left_out": len(source.problems),
+        "left_out": left_out,
         "statuses": tally.statuses,
         "last_reason": tally.last_reason,
         "duration_s": loop_s + finish_s,
@@ -100,6 +104,30 @@ def summarise(
         "telemetry_samples": len(source.telemetry),
         "problems": [{"file": problem.file, "reason": problem.reason} for problem in source.problems[:MAX_PROBLEMS]],
     }
+
+
+def without_folders(summary: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """The summary as it goes to other people: files of the recording by their names in it, and where the recording
+    lies as seen from the run's ``folder``; both stay right when the two are moved together.
+    """
+    source = summary["source"]
+    if source["kind"] == "live":
+        return summary
+    location = Path(source["path"])
+    short = _replaced_in(summary, f"{location}{os.sep}", "")
+    try:
+        short["source"]["path"] = os.path.relpath(location, folder.resolve())
+    except ValueError:  # Windows: on another drive
+        short["source"]["path"] = location.name
+    return short
+
+
+def _replaced_in(value: Any, old: str, new: str) -> Any:
+    if isinstance(value, dict):
+        return {key: _replaced_in(item, old, new) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_replaced_in(item, old, new) for item in value]
+    return value.replace(old, new) if isinstance(value, str) else value
 
 
 def _camera(camera: Camera) -> dict[str, Any]:

@@ -78,6 +78,7 @@ def test_unreadable_image_is_reported_and_the_run_goes_on(edgeslam, recording, t
     assert code == 0
     assert "left out:" in err
     assert "empty file" in err
+    assert "5 of 6 frames tracked (83.3 %; 1 left out), lost never" in out
 
 
 def test_default_calibration_is_named_with_its_cost(edgeslam, recording, tmp_path):

@@ -13,6 +13,8 @@ from fake_slam import FakeSlam
 
 from edgeslam_torch.config import SlamConfig
 from edgeslam_torch.errors import EdgeSlamError, SourceError, WeightsError
+from edgeslam_torch.eval.run_folder import open_run
+from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.io.config_file import load_config
 from edgeslam_torch.io.pace import Counter, at_their_pace
 from edgeslam_torch.io.ply import read_ply
@@ -84,8 +86,32 @@ def test_unreadable_image_costs_coverage_and_is_named(tmp_path, write_tum):
     folder = write_tum(tmp_path / "seq", 10)
     sorted((folder / "rgb").iterdir())[3].write_bytes(b"")
     summary = run(open_source(folder), tmp_path / "out", make_slam=fake(FakeSlam())).summary
-    assert (summary["frames"], summary["left_out"], summary["coverage"]) == (9, 1, 0.9)
+    assert (summary["frames"], summary["left_out"], summary["offered"], summary["coverage"]) == (9, 1, 10, 0.9)
     assert summary["problems"][0]["reason"] == "empty file"
+
+
+def test_a_list_that_runs_backwards_costs_no_coverage(tmp_path, write_tum):
+    folder = write_tum(tmp_path / "seq", 10)
+    lines = (folder / "rgb.txt").read_text().splitlines()
+    (folder / "rgb.txt").write_text("\n".join(lines[::-1]))
+    summary = run(open_source(folder), tmp_path / "out", make_slam=fake(FakeSlam())).summary
+    assert (summary["frames"], summary["left_out"], summary["coverage"]) == (10, 0, 1.0)
+    assert "from the last to the first" in summary["problems"][0]["reason"]
+
+
+def test_results_name_no_folder_of_the_disk_and_find_the_recording_when_both_move(tmp_path, write_tum):
+    folder = write_tum(tmp_path / "here" / "data" / "seq", 4)
+    Camera(64, 48, 50.0, 50.0, 31.5, 23.5).save(folder / "camera.yaml")
+    sorted((folder / "rgb").iterdir())[3].write_bytes(b"")
+    out = run(open_source(folder), tmp_path / "here" / "runs" / "a", make_slam=fake(FakeSlam())).folder
+    assert not [path.name for path in out.iterdir() if str(tmp_path).encode() in path.read_bytes()]
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["source"]["path"] == "../../data/seq"
+    assert summary["problems"][0]["file"] == "rgb/100.300000.png"
+    assert summary["camera"]["source"] == "seq/camera.yaml"
+    (tmp_path / "here").rename(tmp_path / "there")
+    found = open_run(tmp_path / "there" / "runs" / "a").source
+    assert found is not None and found.samefile(tmp_path / "there" / "data" / "seq")
 
 
 def test_telemetry_comes_with_the_frame_that_follows_it(tmp_path, write_tum):

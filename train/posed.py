@@ -91,7 +91,7 @@ def load_run(
         rows = np.loadtxt(folder / "trajectory.txt", ndmin=2)
     except (OSError, ValueError) as error:
         raise SourceError(f"{folder}: not the output of 'edgeslam run' ({error})") from error
-    recording = source if source is not None else str(summary["source"]["path"])
+    recording = source if source is not None else str(folder / summary["source"]["path"])
     points = np.concatenate(
         [read_ply(folder / n).p_w for n in ("anchors.ply", "edge_map.ply") if (folder / n).is_file()]
     )

@@ -149,9 +149,9 @@ def _report(result: "RunResult", source: "Source") -> None:
     summary = result.summary
     scale = summary["scale"]
     for problem in source.problems[:_MAX_PROBLEMS_SHOWN]:
-        _say(f"left out: {problem.file}: {problem.reason}")
+        _say(f"{'left out' if problem.frames else 'note'}: {problem.file}: {problem.reason}")
     if len(source.problems) > _MAX_PROBLEMS_SHOWN:
-        _say(f"left out: {len(source.problems)} in all, listed in {result.folder / 'summary.json'}")
+        _say(f"left out: {summary['left_out']} in all, listed in {result.folder / 'summary.json'}")
     for warning in summary["warnings"][len(source.warnings) :]:  # the source's own were said before the run
         _say(f"warning: {warning}")
     if not summary["tracked"]:
@@ -159,13 +159,16 @@ def _report(result: "RunResult", source: "Source") -> None:
             f"warning: no frame was tracked against a map ({summary['last_reason'] or 'no reason known'}); "
             "the poses are guesses"
         )
+    missed = "".join(
+        f"; {summary[key]} {words}"
+        for key, words in (("left_out", "left out"), ("dropped_frames", "dropped to keep up"))
+        if summary[key]
+    )
     print(
-        f"{summary['tracked']} of {summary['frames']} frames tracked ({100 * summary['coverage']:.1f} %), "
+        f"{summary['tracked']} of {summary['offered']} frames tracked ({100 * summary['coverage']:.1f} %{missed}), "
         f"lost {_times(summary['lost_events'])}, {summary['fps']:.1f} frames/s, "
         f"{summary['cpu_ms_per_frame']:.0f} ms CPU a frame, {summary['peak_rss_mb'] or 0:.0f} MB"
     )
-    if summary["dropped_frames"]:
-        print(f"{summary['dropped_frames']} frames dropped to keep up")
     if scale["units"] == "metres":
         percent = 100.0 * scale["sigma"] / scale["value"]
         print(f"units are metres: scale from {scale['source']}, good to {percent:.1f} % (one sigma)")

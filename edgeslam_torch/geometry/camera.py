@@ -177,7 +177,7 @@ def load_camera(name: str | Path) -> Camera:
         record = yaml.safe_load(path.read_text(encoding="utf-8").replace("%YAML:1.0", ""))
         if not isinstance(record, dict):
             raise ValueError("no key: value lines in it")
-        return _plausible(_camera_from_record(record, str(path)))
+        return _plausible(_camera_from_record(record, str(Path(*path.parts[-2:]))))
     except OSError as error:
         raise CalibrationError(f"{path}: {error.strerror or error}") from error
     except CalibrationError as error:

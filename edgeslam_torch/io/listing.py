@@ -12,10 +12,12 @@ from edgeslam_torch.types import FloatArray, IntArray
 
 
 class Problem(NamedTuple):
-    """Something in a source that was left out, and why."""
+    """Something wrong in a source: what was left out, and why, or a remark."""
 
     file: str
     reason: str
+    frames: int = 1
+    """Frames that it cost; 0 for a remark."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +52,7 @@ def in_order(entries: Sequence[ImageEntry], name: str) -> tuple[list[ImageEntry]
     """The entries with strictly increasing stamps, and a problem for each one left out.
 
     One wild stamp costs one image, wherever it lies: the longest increasing run is kept. A list that is not in
-    time order at all (less than nine tenths would stay) is sorted instead, without repeated stamps.
+    time order at all (less than nine tenths would stay) is sorted instead, without repeated stamps; a remark says so.
 
     Args:
         entries: As listed.
@@ -59,11 +61,13 @@ def in_order(entries: Sequence[ImageEntry], name: str) -> tuple[list[ImageEntry]
     stamps = np.array([entry.stamp_s for entry in entries])
     problems: list[Problem] = []
     keep = _longest_increasing(stamps)
-    if len(keep) < 0.9 * len(entries):
+    if len(keep) < 0.9 * len(entries) and np.any(np.diff(stamps) < 0):
+        falls = bool(np.all(np.diff(stamps) <= 0))
+        order = "from the last to the first" if falls else "in no order of their stamps"
+        problems.append(Problem(name, f"lists images {order}; they are used sorted by stamp", frames=0))
         entries = sorted(entries, key=lambda entry: entry.stamp_s)
         stamps = np.array([entry.stamp_s for entry in entries])
         keep = np.flatnonzero(np.diff(stamps, prepend=-np.inf) > 0)
-        problems.append(Problem(name, "images are not listed in the order of their stamps; sorted"))
     kept = set(keep.tolist())
     kept_stamps = set(stamps[keep].tolist())
     for i, entry in enumerate(entries):

@@ -81,7 +81,7 @@ class LiveSource:
             while self.length is None or given < self.length:
                 picture = self._feed.wait(last, SILENCE_S)
                 if picture is None:
-                    self.problems.append(Problem(self.location, f"no picture for {SILENCE_S:.0f} s; ended"))
+                    self.problems.append(Problem(self.location, f"no picture for {SILENCE_S:.0f} s; ended", frames=0))
                     return
                 last, given = picture.count, given + 1
                 yield Frame(picture.count - 1, picture.stamp_s, picture.image)

@@ -1,9 +1,10 @@
 """7-Scenes sequences as Microsoft publishes them: ``seq-01/frame-000000.color.png`` and ``.pose.txt``."""
 
+import re
 from pathlib import Path
 
 from edgeslam_torch.io.images import ASSUMED_HZ
-from edgeslam_torch.io.listing import ImageEntry, Problem
+from edgeslam_torch.io.listing import ImageEntry, Problem, in_order
 
 PATTERN = "frame-*.color.*"
 
@@ -19,8 +20,9 @@ def list_seven_scenes(folder: Path) -> tuple[list[ImageEntry], list[Problem]]:
     problems: list[Problem] = []
     for i, path in enumerate(sorted(folder.glob(PATTERN))):
         number = path.name.split(".")[0].removeprefix("frame-")
-        if number.isdigit():
+        if re.fullmatch("[0-9]+", number):
             entries.append(ImageEntry(i, int(number) / ASSUMED_HZ, path))
         else:
             problems.append(Problem(str(path), "no frame number in its name"))
-    return entries, problems
+    kept, more = in_order(entries, str(folder))
+    return kept, problems + more

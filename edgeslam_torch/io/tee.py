@@ -76,7 +76,7 @@ class RecordedLive:
         self._write_states()
         self._writer.close()
         if self._failure is not None:
-            self.problems.append(Problem(str(self._writer.folder), str(self._failure)))
+            self.problems.append(Problem(str(self._writer.folder), str(self._failure), frames=0))
 
     def _work(self) -> None:
         while (frame := self._queue.get()) is not None:

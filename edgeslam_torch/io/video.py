@@ -66,7 +66,7 @@ class Video:
             capture.release()
         if self.count is not None and index + 1 < 0.98 * self.count:
             reason = f"decoding ended after {index + 1} of {self.count} frames; the file is damaged"
-            problems.append(Problem(str(self.path), reason))
+            problems.append(Problem(str(self.path), reason, self.count - index - 1))
 
     def _stamp(self, index: int, container_ms: float) -> float | None:
         if self.stamps_s is not None:

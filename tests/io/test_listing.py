@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edgeslam_torch.io.listing import ImageEntry, in_order, seconds_from
+from edgeslam_torch.io.listing import ImageEntry, Problem, in_order, seconds_from
 
 
 def entries(stamps):
@@ -31,8 +31,18 @@ def test_shuffled_list_is_sorted(rng):
     stamps = rng.permutation(50)
     kept, problems = in_order(entries(stamps), "rgb.txt")
     assert [e.stamp_s for e in kept] == sorted(stamps)
-    assert problems[0].file == "rgb.txt"
-    assert "sorted" in problems[0].reason
+    assert problems == [
+        Problem("rgb.txt", "lists images in no order of their stamps; they are used sorted by stamp", 0)
+    ]
+
+
+def test_a_list_that_runs_backwards_is_used_forwards_and_costs_nothing():
+    kept, problems = in_order(entries([4, 3, 2, 2, 1]), "rgb.txt")
+    assert [e.stamp_s for e in kept] == [1, 2, 3, 4]
+    assert problems[0] == Problem(
+        "rgb.txt", "lists images from the last to the first; they are used sorted by stamp", frames=0
+    )
+    assert [p.frames for p in problems[1:]] == [1]  # the repetition
 
 
 @given(st.lists(st.floats(-1e9, 1e9), max_size=60))

@@ -50,6 +50,14 @@ def test_seven_scenes_as_published(tmp_path, write_images):
     assert "7-Scenes" in source.warnings[0]
 
 
+def test_seven_scenes_frame_that_is_there_twice_is_used_once(tmp_path, write_images):
+    names = ["frame-000000.color.png", "frame-000001.color.png", "frame-000001.color.jpg", "frame-²2.color.png"]
+    write_images(tmp_path, names, (640, 480))
+    source = open_source(tmp_path)
+    assert [round(30 * f.stamp_s) for f in source.frames()] == [0, 1]
+    assert [p.frames for p in source.problems] == [1, 1]
+
+
 @pytest.mark.parametrize("level", ["", "mav0", "mav0/cam0"])
 def test_euroc_as_published(tmp_path, write_images, level):
     cam = tmp_path / "mav0" / "cam0"
@@ -126,8 +134,8 @@ def test_recorded_video_with_its_own_stamps(video):
 def test_cut_off_video_gives_what_it_has(video):
     video.write_bytes(video.read_bytes()[: video.stat().st_size // 2])
     source = open_source(video)
-    frames = list(source.frames())
-    assert 0 < len(frames) < 8
+    assert len(list(source.frames())) + sum(problem.frames for problem in source.problems) == 8
+    assert source.problems[-1].reason.endswith("of 8 frames; the file is damaged")
 
 
 def test_video_of_too_many_pixels_is_refused(video, monkeypatch):
