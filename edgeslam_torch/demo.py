@@ -4,7 +4,7 @@ import json
 import os
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,15 +14,15 @@ from edgeslam_torch.config import SlamConfig
 from edgeslam_torch.errors import ConfigError, OutputError
 from edgeslam_torch.eval.run_folder import open_run
 from edgeslam_torch.eval.run_score import RunScore, evaluate_run
-from edgeslam_torch.geometry.camera import PRESETS, Camera
+from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.io.source import open_source
 from edgeslam_torch.run import Listener, RunResult, run
+from edgeslam_torch.synthetic.courses import record_flight, simulated_camera
 from edgeslam_torch.synthetic.degrade import CLEAN, CameraFaults
 from edgeslam_torch.synthetic.flight import Flight, FlightPlan, fly
 from edgeslam_torch.synthetic.rooms import corridor, room
-from edgeslam_torch.synthetic.telemetry import TelemetryFaults, simulate
+from edgeslam_torch.synthetic.telemetry import TelemetryFaults
 from edgeslam_torch.synthetic.world import World
-from edgeslam_torch.synthetic.writer import write_flight
 
 WORLDS: dict[str, Callable[[np.random.Generator], World]] = {"room": room, "corridor": corridor}
 CAMERAS = {
@@ -75,8 +75,7 @@ class DemoSettings:
     @property
     def camera(self) -> Camera:
         """A Tello's camera, without distortion, at the demo's size."""
-        camera = PRESETS["tello"].scaled(self.width, self.height)
-        return replace(camera, source="simulated Tello")
+        return simulated_camera(self.width, self.height)
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,19 +124,15 @@ def record(folder: Path, settings: DemoSettings, on_frame: Callable[[int], None]
     rng = np.random.default_rng(settings.seed)
     world = WORLDS[settings.world](rng)
     flight = fly(rng, world, settings.frames, rate_hz=settings.rate_hz, plan=settings.plan)
-    log = None
-    if settings.telemetry is not None:
-        floor = world.floor_below(flight.T_w_b[:, :3, 3])
-        log = simulate(rng, flight.stamps_s, flight.T_w_c, flight.T_b_c, faults=settings.telemetry, floor_m=floor)
-    write_flight(
+    record_flight(
         folder,
         world,
         flight,
+        rng,
         settings.camera,
-        telemetry=log,
-        faults=CAMERAS[settings.images],
+        settings.telemetry,
+        CAMERAS[settings.images],
         seed=settings.seed,
-        depth_every=10,
         threads=min(4, os.cpu_count() or 1),
         on_frame=on_frame,
     )

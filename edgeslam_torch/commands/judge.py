@@ -34,6 +34,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", type=Path, required=True, metavar="DIR", help="results; cells that it holds already are not repeated"
     )
+    parser.add_argument(
+        "--flights", type=Path, metavar="DIR", help="simulated flights, kept for other judges (default: in --out)"
+    )
     parser.add_argument("--bars", type=Path, metavar="FILE", help="limits to be kept (default: the project's own)")
     parser.add_argument("--against", type=Path, metavar="DIR", help="also compare with another judge's --out")
 
@@ -50,7 +53,7 @@ def main(args: argparse.Namespace) -> int:
     bars = read_bars(args.bars or BARS)
     before = read_record(args.against) if args.against is not None else None
     cells = list_cells(data, args.which, range(max(1, args.seeds)), args.only)
-    settings = JudgeSettings(tuple(args.change), args.max_frames, max(1, args.jobs), args.timeout)
+    settings = JudgeSettings(tuple(args.change), args.max_frames, max(1, args.jobs), args.timeout, args.flights)
     try:
         record = judge(cells, settings, args.out, _say)
         text = markdown(record, bars)

@@ -34,10 +34,15 @@ class CameraFaults:
     """Exposure time, for motion blur."""
     jpeg_quality: int = 0
     """1 to 100; 0 for none."""
+    gain: float = 1.0
+    """Share of the light that reaches the sensor; the noise does not shrink with it."""
 
     def __post_init__(self) -> None:
-        if min(self.read_noise, self.shot_noise, self.shutter_s, self.vignetting) < 0 or self.gamma <= 0:
-            raise ValueError(f"noise, shutter and vignetting must not be negative and gamma positive: {self}")
+        if (
+            min(self.read_noise, self.shot_noise, self.shutter_s, self.vignetting) < 0
+            or min(self.gamma, self.gain) <= 0
+        ):
+            raise ValueError(f"noise, shutter and vignetting must not be negative, gamma and gain positive: {self}")
         if not 0 <= self.jpeg_quality <= 100:
             raise ValueError(f"jpeg_quality must lie in 0..100, got {self.jpeg_quality}")
 
@@ -163,7 +168,7 @@ def degraded(
     """Image as the simulated camera delivers it at time ``stamp_s`` while it moves with ``twist_c``."""
     if twist_c is not None:
         image = with_motion_blur(image, depth_m, camera, twist_c, faults.shutter_s)
-    gain = 1.0 + faults.exposure_amplitude * np.sin(2 * np.pi * stamp_s / faults.exposure_period_s)
+    gain = faults.gain * (1.0 + faults.exposure_amplitude * np.sin(2 * np.pi * stamp_s / faults.exposure_period_s))
     if gain != 1.0 or faults.gamma != 1.0:
         image = with_brightness(image, gain=float(gain), gamma=faults.gamma)
     image = with_vignetting(image, faults.vignetting)

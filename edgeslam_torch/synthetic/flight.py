@@ -19,6 +19,10 @@ from edgeslam_torch.types import FloatArray
 GRAVITY_M_S2 = 9.81
 KNOT_S = 0.5
 DEGREE = 5
+_HOVERED_S = 3.0
+"""How long a drone has hovered when a recording that begins with a hover begins."""
+_DRIFT_M = 0.02
+"""Standard deviation of a hovering drone's drift in half a second, on each axis: 3 cm all in all."""
 CORNER_M = 0.1
 """Corners of the polyline are cut by no more than this at usual speeds; added to the clearance of its legs."""
 
@@ -104,14 +108,78 @@ def fly(
     return _sampled(rng, control, stamps, plan)
 
 
-def _sampled(rng: np.random.Generator, control: FloatArray, stamps: FloatArray, plan: FlightPlan) -> Flight:
-    """Poses along the spline of control points ``(N, 4)`` (x, y, z, yaw); roll and pitch follow the acceleration."""
+def fly_after_hover(
+    rng: np.random.Generator,
+    world: World,
+    frames: int,
+    *,
+    rate_hz: float = 30.0,
+    plan: FlightPlan | None = None,
+    turning: bool = False,
+) -> Flight:
+    """A flight whose first second is a hover, or a turn on the spot at the plan's yaw rate, and like `fly` afterwards.
+
+    Raises:
+        ValueError: If the world has no free place with the clearance asked for.
+    """
+    plan = plan or FlightPlan()
+    stamps = np.arange(frames) / rate_hz
+    here = _free_place(rng, world, plan)
+    yaw = _open_direction(rng, world, here)
+    # The recording begins in the middle of the hover: the spline itself starts from rest.
+    still = round((_HOVERED_S + 1.0) / KNOT_S)
+    step = plan.yaw_rate_rad_s * KNOT_S if turning else 0.0
+    rows = [[*here, yaw - step * (still - 1 - k)] for k in range(still)]
+    control = _cruise(rng, world, rows, stamps[-1] + _HOVERED_S + 1.0, plan)
+    return _sampled(rng, control, stamps, plan, _HOVERED_S)
+
+
+def climb(
+    rng: np.random.Generator, world: World, frames: int, *, rate_hz: float = 30.0, plan: FlightPlan | None = None
+) -> Flight:
+    """Straight up and down at one place, half a metre a second, between the plan's start height and the ceiling."""
+    plan = plan or FlightPlan()
+    stamps = np.arange(frames) / rate_hz
+    here = _free_place(rng, world, plan)
+    yaw = _open_view(world, here, _open_direction(rng, world, here), plan.view_m)
+    low = float(world.floor_below(here[None])[0]) + plan.start_height_m
+    high = float(world.bounds_w[1, 2]) - plan.clearance_m
+    steps = int((stamps[-1] + 1.0) / KNOT_S) + 1
+    risen = 0.5 * KNOT_S * np.arange(steps) % (2.0 * (high - low))
+    z = low + np.minimum(risen, 2.0 * (high - low) - risen)
+    control = np.column_stack([np.tile(here[:2], (steps, 1)), z, np.full(steps, yaw)])
+    return _sampled(rng, control, stamps, plan)
+
+
+def turn(
+    rng: np.random.Generator, world: World, frames: int, *, rate_hz: float = 30.0, plan: FlightPlan | None = None
+) -> Flight:
+    """Round and round on the spot at the plan's yaw rate, drifting some centimetres as a hovering drone does."""
+    plan = plan or FlightPlan()
+    stamps = np.arange(frames) / rate_hz
+    here = _free_place(rng, world, plan)
+    steps = int((stamps[-1] + 1.0) / KNOT_S) + 1
+    drift = np.zeros((steps, 3))
+    for k in range(1, steps):
+        drift[k] = 0.8 * drift[k - 1] + rng.normal(0.0, _DRIFT_M, 3)
+    yaw = _open_direction(rng, world, here) + plan.yaw_rate_rad_s * KNOT_S * np.arange(steps)
+    return _sampled(rng, np.column_stack([here + drift, yaw]), stamps, plan)
+
+
+def _sampled(
+    rng: np.random.Generator, control: FloatArray, stamps: FloatArray, plan: FlightPlan, begin_s: float = 0.0
+) -> Flight:
+    """Poses along the spline of control points ``(N, 4)`` (x, y, z, yaw); roll and pitch follow the acceleration.
+
+    ``begin_s`` is the spline's time at the first stamp.
+    """
     padded = np.vstack([np.repeat(control[:1], DEGREE, axis=0), control, np.repeat(control[-1:], DEGREE, axis=0)])
     knots = (np.arange(len(padded) + DEGREE + 1) - DEGREE) * KNOT_S
     spline = BSpline(knots, padded, DEGREE)
     # Sum of a few sines: the drone's own unrest, smooth and zero at the start.
-    fade = 1.0 - np.exp(-((stamps / 1.5) ** 2))
-    state, velocity, acceleration = (spline(stamps, nu=k) for k in range(3))
+    flown = stamps + begin_s
+    fade = 1.0 - np.exp(-((flown / 1.5) ** 2))
+    state, velocity, acceleration = (spline(flown, nu=k) for k in range(3))
     frequency, phase = rng.uniform(0.4, 2.2, (6, 4)), rng.uniform(0, 2 * np.pi, (6, 4))
     waves = np.sin(2 * np.pi * frequency * stamps[:, None, None] + phase).mean(2) * 2.0 * fade[:, None]  # (F, 6)
     p_w = state[:, :3] + plan.wobble_m * waves[:, :3]
@@ -135,9 +203,16 @@ def _control_points(rng: np.random.Generator, world: World, duration_s: float, p
     rows = []
     if plan.take_off:
         floor = float(world.floor_below(here[None])[0]) + plan.start_height_m
-        climb = np.arange(floor, here[2], 0.5 * KNOT_S)
-        rows += [[here[0], here[1], z, yaw] for z in climb]
+        rows += [[here[0], here[1], z, yaw] for z in np.arange(floor, here[2], 0.5 * KNOT_S)]
     rows.append([*here, yaw])
+    return _cruise(rng, world, rows, duration_s, plan)
+
+
+def _cruise(
+    rng: np.random.Generator, world: World, rows: list[list[float]], duration_s: float, plan: FlightPlan
+) -> FloatArray:
+    """Control points ``(N, 4)``: those given, and from the last of them on from place to place."""
+    here, yaw = np.array(rows[-1][:3]), rows[-1][3]
     heading = yaw
     while len(rows) * KNOT_S < duration_s:
         there = _next_place(rng, world, here, heading, plan)

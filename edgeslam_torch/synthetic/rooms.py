@@ -28,14 +28,9 @@ def corridor(rng: Rng, *, length_m: float = 14.0, width_m: float = 2.4, height_m
 
     The free space is ``[0, length] x [-width / 2, width / 2] x [0, height]``.
     """
-    low, high = np.array([0.0, -width_m / 2, 0.0]), np.array([length_m, width_m / 2, height_m])
-    scene = _shell(rng, low, high, 0.004, walls=TEXTURED_WALLS, floors=FLOORS, one_wall_paint=True)
-    scene.ambient = 0.6
-    scene.lamps_w = [np.array([x, 0.0, height_m - 0.1]) for x in np.arange(1.2, length_m, 2.6)]
-    for lamp in scene.lamps_w:
-        _ceiling_lamp(scene, lamp, 1.1, 0.3)
+    scene = _lit_corridor(rng, length_m, width_m, height_m, TEXTURED_WALLS)
     for wall in range(4):
-        place, length = _wall(low, high, wall)
+        place, length = _wall(scene.low_w, scene.high_w, wall)
         if wall in (1, 3):  # the two ends
             _door(scene, place.at(0.0, 0.0), rng)
             continue
@@ -59,6 +54,28 @@ def corridor(rng: Rng, *, length_m: float = 14.0, width_m: float = 2.4, height_m
                 x += width + 0.1
             x += rng.uniform(0.15, 0.7)
     return scene.world("corridor")
+
+
+def blank_corridor(rng: Rng, *, length_m: float = 14.0, width_m: float = 2.4, height_m: float = 2.7) -> World:
+    """The same corridor with painted walls and nothing on them but a door at each end and two or three at the sides."""
+    scene = _lit_corridor(rng, length_m, width_m, height_m, ("plaster",))
+    for wall in (1, 3):
+        _door(scene, _wall(scene.low_w, scene.high_w, wall)[0].at(0.0, 0.0), rng)
+    for _ in range(int(rng.integers(2, 4))):
+        place, length = _wall(scene.low_w, scene.high_w, int(rng.choice([0, 2])))
+        _door(scene, place.at(rng.uniform(-0.5, 0.5) * (length - 2.0), 0.0), rng)
+    return scene.world("blank corridor")
+
+
+def _lit_corridor(rng: Rng, length_m: float, width_m: float, height_m: float, walls: tuple[str, ...]) -> Scene:
+    """A corridor's shell with lamps along its ceiling."""
+    low, high = np.array([0.0, -width_m / 2, 0.0]), np.array([length_m, width_m / 2, height_m])
+    scene = _shell(rng, low, high, 0.004, walls=walls, floors=FLOORS, one_wall_paint=True)
+    scene.ambient = 0.6
+    scene.lamps_w = [np.array([x, 0.0, height_m - 0.1]) for x in np.arange(1.2, length_m, 2.6)]
+    for lamp in scene.lamps_w:
+        _ceiling_lamp(scene, lamp, 1.1, 0.3)
+    return scene
 
 
 def room(rng: Rng, *, size_m: tuple[float, float, float] = (6.5, 5.2, 2.7)) -> World:

@@ -1,7 +1,7 @@
 """What is judged: one cell is one source with one seed."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,9 @@ from edgeslam_torch.errors import EdgeSlamError
 from edgeslam_torch.eval.dataset import open_dataset
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.judge import sources
+from edgeslam_torch.eval.judge.flights import NONE
 from edgeslam_torch.io.source import Recording
+from edgeslam_torch.synthetic.courses import COURSES
 
 SETS = ("base", "variants", "flights", "all")
 """What ``--set`` takes: recordings as they are, their variants, simulations, everything."""
@@ -68,15 +70,20 @@ VARIANTS = {
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """One run: a recording, perhaps as a variant of it."""
+    """One run."""
 
     name: str
-    """``RECORDING`` or ``RECORDING/VARIANT``."""
+    """``RECORDING``, ``RECORDING/VARIANT``, ``flight/COURSE`` or ``none/KIND``."""
     seed: int
+    """Of the system; of a simulation the world's too."""
     folder: str = ""
     """Of the recording."""
     variant: str = ""
     """A name in `VARIANTS`, or ``kidnap``."""
+    course: str = ""
+    """Of a simulated flight: a name in `courses.COURSES`."""
+    nothing: str = ""
+    """What a source without anything to see shows: a name in `flights.NONE`."""
 
     @property
     def base(self) -> str:
@@ -141,12 +148,20 @@ def list_cells(data: Path | None, which: str, seeds: Sequence[int], only: Sequen
     for name, (folder, frames) in recordings.items():
         variants = [v for v, change in VARIANTS.items() if change.frames_of(frames) >= LEAST_FRAMES]
         wanted = ([""] if which in ("base", "all") else []) + (variants if which in ("variants", "all") else [])
+        wanted += ["kidnap"] if which in ("flights", "all") and _can_kidnap(name, frames) else []
         made += [_cell(name, folder, variant) for variant in wanted]
+    if which in ("flights", "all"):
+        made += [Cell(f"flight/{course}", 0, course=course) for course in COURSES]
+        made += [Cell(f"none/{kind}", 0, nothing=kind) for kind in NONE]
     kept = [cell for cell in made if not only or any(fnmatchcase(cell.name, pattern) for pattern in only)]
     if not kept:
         there = ", ".join(dict.fromkeys(cell.name for cell in made)) or "none (no recordings: DATA or EDGESLAM_DATA)"
         raise EvaluationError(f"no cell matches; there are: {there}")
-    return [Cell(c.name, seed, c.folder, c.variant) for c in kept for seed in seeds]
+    return [replace(cell, seed=seed) for cell in kept for seed in seeds]
+
+
+def _can_kidnap(name: str, frames: int) -> bool:
+    return name == KIDNAPPED and frames >= max(last for _, last in KIDNAP)
 
 
 def _cell(name: str, folder: Path, variant: str) -> Cell:

@@ -9,18 +9,22 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from edgeslam_torch.atomic import write_text
 from edgeslam_torch.config import SlamConfig
 from edgeslam_torch.errors import EdgeSlamError
 from edgeslam_torch.eval.dataset import interpolate, open_dataset
 from edgeslam_torch.eval.formats import Trajectory, write_tum
-from edgeslam_torch.eval.judge import sources
+from edgeslam_torch.eval.judge import flights, sources
 from edgeslam_torch.eval.judge.cells import KIDNAP, VARIANTS, Cell
 from edgeslam_torch.eval.judge.runner import CELL, RESULT
 from edgeslam_torch.eval.judge.score import Truth, score
 from edgeslam_torch.io.config_file import load_config
 from edgeslam_torch.io.source import Recording, open_source
 from edgeslam_torch.run import run, settle_camera
+from edgeslam_torch.synthetic.courses import COURSES
+from edgeslam_torch.types import FloatArray
 
 RUN = "run"
 
@@ -31,7 +35,9 @@ def main(folder: Path) -> int:
     cell = Cell(**spec["cell"])
     config = load_config(replace(SlamConfig(), seed=cell.seed), None, spec["overrides"])
     try:
-        source, truth = _opened(cell, folder, spec["max_frames"])
+        source, truth = _opened(cell, folder, Path(spec["flights"]))
+        if spec["max_frames"] is not None:
+            source = sources.first_frames(source, spec["max_frames"])
         settle_camera(source)
         result = run(source, folder / RUN, config)
         if result.interrupted or result.failure is not None:
@@ -45,17 +51,30 @@ def main(folder: Path) -> int:
     return 0
 
 
-def _opened(cell: Cell, folder: Path, max_frames: int | None) -> tuple[Recording, Truth]:
+def _opened(cell: Cell, folder: Path, flights_root: Path) -> tuple[Recording, Truth]:
     """The cell's source and what its run is compared with."""
-    source = open_source(cell.folder)
-    assert isinstance(source, Recording)
+    if cell.nothing:
+        return flights.nothing_to_see(cell.nothing, cell.seed), Truth(None)
+    if cell.course:
+        place = flights.flight_folder(flights_root, cell.course, cell.seed)
+        return _recording(place), Truth(place, surfaces=lambda p: _distances(cell, p))
     place = Path(cell.folder)
-    truth = Truth(place, place if open_dataset(place).depth is not None else None)
+    source = _recording(place)
     if cell.variant == "kidnap":
-        source, truth = _kidnapped(source, place, folder / "groundtruth.txt")
-    elif cell.variant:
-        source = VARIANTS[cell.variant].applied_to(source)
-    return source if max_frames is None else sources.first_frames(source, max_frames), truth
+        return _kidnapped(source, place, folder / "groundtruth.txt")
+    truth = Truth(place, place if open_dataset(place).depth is not None else None)
+    return VARIANTS[cell.variant].applied_to(source) if cell.variant else source, truth
+
+
+def _recording(place: Path) -> Recording:
+    source = open_source(place)
+    assert isinstance(source, Recording)
+    return source
+
+
+def _distances(cell: Cell, p_w: FloatArray) -> FloatArray:
+    """Distances ``(N,)`` of points to the surfaces of a simulated flight's world, built anew."""
+    return COURSES[cell.course].world(np.random.default_rng(cell.seed)).distance_to_surface(p_w)
 
 
 def _kidnapped(source: Recording, place: Path, truth_file: Path) -> tuple[Recording, Truth]:

@@ -37,6 +37,8 @@ class JudgeSettings:
     """Processes at a time."""
     timeout_s: float = 900.0
     """A cell that takes longer is ended."""
+    flights: Path | None = None
+    """Where simulated flights are recorded, to be used again; ``flights`` in the output folder when None."""
 
 
 @dataclass(slots=True)
@@ -163,7 +165,15 @@ def _begin(cell: Cell, settings: JudgeSettings, commit: str, out: Path, start: S
     folder.mkdir(parents=True, exist_ok=True)
     (folder / RESULT).unlink(missing_ok=True)
     key = _key(cell, settings, commit)
-    spec = {"key": key, "cell": cell.to_dict(), "overrides": settings.overrides, "max_frames": settings.max_frames}
+    flights = settings.flights or out / "flights"
+    flights.mkdir(parents=True, exist_ok=True)
+    spec = {
+        "key": key,
+        "cell": cell.to_dict(),
+        "overrides": settings.overrides,
+        "max_frames": settings.max_frames,
+        "flights": str(flights),
+    }
     write_text(folder / CELL, json.dumps(spec, indent=1) + "\n")
     log = (folder / LOG).open("w", encoding="utf-8")
     return _Running(cell, start(folder, log), log, key)

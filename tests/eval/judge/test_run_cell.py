@@ -1,6 +1,8 @@
 """A cell from recording to figures, on a tiny rendered flight."""
 
 import json
+import subprocess
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -9,10 +11,11 @@ from rendered import CAMERA, film, sideways, stairs_world
 
 from edgeslam_torch.eval.dataset import open_dataset
 from edgeslam_torch.eval.errors import EvaluationError
-from edgeslam_torch.eval.formats import Trajectory, write_tum
-from edgeslam_torch.eval.judge import run_cell
+from edgeslam_torch.eval.formats import Trajectory, read_trajectory, write_tum
+from edgeslam_torch.eval.judge import flights, run_cell
 from edgeslam_torch.eval.judge.cells import VARIANTS, Cell, find_recordings, list_cells
 from edgeslam_torch.eval.judge.score import Truth, score
+from edgeslam_torch.synthetic.courses import COURSES, record_course
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +43,8 @@ def recording(tmp_path_factory):
 
 
 def run(tmp_path, cell, **changes):
-    spec = {"key": "k", "cell": cell.to_dict(), "overrides": ["depth.weights=none"], "max_frames": None} | changes
+    spec = {"key": "k", "cell": cell.to_dict(), "overrides": ["depth.weights=none"], "max_frames": None}
+    spec |= {"flights": str(tmp_path / "flights")} | changes
     (tmp_path / "cell.json").write_text(json.dumps(spec))
     code = run_cell.main(tmp_path)
     result = tmp_path / "result.json"
@@ -85,6 +89,74 @@ def test_cell_that_cannot_run_says_why_and_leaves_no_result(tmp_path, capsys):
     code, result = run(tmp_path, Cell("gone", 0, str(tmp_path / "gone")))
     assert code == 1 and result is None
     assert "no such file or folder" in capsys.readouterr().err
+
+
+def test_simulated_flight_is_judged_by_its_world(tmp_path, monkeypatch):
+    folders = []
+
+    def record(root, course, seed):
+        folders.append(root / course)
+        record_course(folders[0], COURSES[course], seed, seconds=0.4)
+        return folders[0]
+
+    monkeypatch.setattr(flights, "flight_folder", record)
+    code, result = run(tmp_path, Cell("flight/hover_first", 3, course="hover_first"))
+    assert code == 0 and result["figures"]["frames"] == 8
+    assert result["figures"]["path_m"] > 0
+    assert folders == [tmp_path / "flights" / "hover_first"]
+    assert Truth(None).surfaces is None
+    surfaces = run_cell._opened(Cell("flight/room", 3, course="room"), tmp_path, tmp_path)[1].surfaces
+    floor = np.array([[0.0, 0.0, -0.25]])
+    assert surfaces(floor) == pytest.approx([0.25], abs=0.01), "the floor is at height 0, a rug 8 mm above"
+
+
+@pytest.mark.parametrize("kind", flights.NONE)
+def test_nothing_to_see_is_a_source_like_any_other(kind):
+    source = flights.nothing_to_see(kind, 1)
+    frames = [next(frames) for frames in [source.frames()] for _ in range(2)]
+    same = np.array_equal(frames[0].image, frames[1].image)
+    assert same == (kind != "noise")
+    assert frames[0].image.any() == (kind != "black")
+    assert frames[0].image.shape == (480, 640, 3) and source.length == flights.NONE_FRAMES
+
+
+def test_nothing_to_see_claims_no_map(tmp_path):
+    code, result = run(tmp_path, Cell("none/black", 0, nothing="black"), max_frames=5)
+    figures = result["figures"]
+    assert code == 0 and figures["supported_end"] == 0 and figures["map_points"] == 0 and figures["metric"] == 0
+    assert "ate_m" not in figures
+
+
+def test_kidnapped_recording_gets_the_truth_of_the_frames_played(recording, tmp_path, monkeypatch):
+    monkeypatch.setattr(run_cell, "KIDNAP", ((0, 10), (20, 30), (5, 10)))
+    source, truth = run_cell._opened(Cell("stairs/kidnap", 0, str(recording), "kidnap"), tmp_path, tmp_path)
+    played, poses = list(source.frames()), read_trajectory(truth.poses)
+    original = open_dataset(recording)
+    picked = [*range(10), *range(20, 30), *range(5, 10)]
+    assert np.allclose(poses.positions, original.truth.positions[picked], atol=1e-6)
+    assert np.allclose([f.stamp_s for f in played], poses.stamps_s)
+    for frame, number in zip(played, picked, strict=True):
+        assert frame.path == original.image_paths[number]
+
+
+def test_flight_is_recorded_once_and_only_whole(tmp_path, monkeypatch):
+    calls = []
+    monkeypatch.setattr(flights, "record_course", lambda part, course, seed: (part.mkdir(), calls.append(seed)))
+    monkeypatch.setattr(flights.subprocess, "run", lambda command, **_: finished(flights.main(*plain(command))))
+    first = flights.flight_folder(tmp_path, "room", 2)
+    assert flights.flight_folder(tmp_path, "room", 2) == first and first.is_dir() and calls == [2]
+    monkeypatch.setattr(flights.subprocess, "run", lambda *_, **__: finished(1, "no space left"))
+    with pytest.raises(EvaluationError, match="room, seed 3: could not be recorded: no space left"):
+        flights.flight_folder(tmp_path, "room", 3)
+
+
+def plain(command):
+    """Arguments of ``flights.main`` in its command line."""
+    return command[-3], int(command[-2]), Path(command[-1])
+
+
+def finished(code, stderr=""):
+    return subprocess.CompletedProcess([], code, "", stderr)
 
 
 def test_recordings_with_truth_are_found_and_short_variants_left_out(recording):

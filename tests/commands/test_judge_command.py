@@ -1,0 +1,62 @@
+"""``edgeslam judge`` from the command line, on a recording of a few small images."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+from rendered import CAMERA, film, sideways, stairs_world
+
+from edgeslam_torch import cli
+from edgeslam_torch.eval.formats import Trajectory, write_tum
+
+
+@pytest.fixture
+def data(tmp_path):
+    """A folder with one recording of 30 images."""
+    folder = tmp_path / "data" / "stairs"
+    folder.mkdir(parents=True)
+    flight = film(stairs_world(), CAMERA, sideways(30, 0.03))
+    lines = []
+    for frame in flight.frames:
+        cv2.imwrite(str(folder / f"{frame.index}.png"), frame.image)
+        lines.append(f"{frame.stamp_s:.3f} {frame.index}.png")
+    (folder / "rgb.txt").write_text("\n".join(lines) + "\n")
+    CAMERA.save(folder / "camera.yaml")
+    write_tum(Trajectory(flight.stamps_s, np.asarray(flight.T_w_c)), folder / "groundtruth.txt")
+    return folder.parent
+
+
+def test_table_is_printed_written_and_compared(data, tmp_path, capsys):
+    out = tmp_path / "out"
+    command = ["judge", str(data), "--jobs", "1", "--change", "depth.weights=none"]
+    assert cli.main([*command, "--out", str(out)]) == 0
+    printed = capsys.readouterr().out
+    assert "| stairs |" in printed and "| frames |" in printed
+    (row,) = json.loads((out / "judge.json").read_text())["rows"]
+    assert row["cell"] == "stairs" and row["figures"]["frames"] == 30
+    assert (out / "judge.md").read_text() in printed
+    assert cli.main([*command, "--out", str(out), "--against", str(out)]) == 0
+    shown = capsys.readouterr()
+    assert "1 of 1 cells were done before" in shown.err
+    assert "worse: nothing" in shown.out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--only", "desk*"], "no cell matches; there are: stairs"),
+        (["--against", "nowhere"], "cannot be read as a judge's result"),
+        (["--bars", "nowhere.toml"], "cannot be read as bars"),
+    ],
+)
+def test_mistakes_are_one_line(data, tmp_path, capsys, arguments, message):
+    assert cli.main(["judge", str(data), "--out", str(tmp_path / "out"), *arguments]) == 1
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1
+
+
+def test_without_recordings_it_says_so(tmp_path, capsys, monkeypatch):
+    monkeypatch.delenv("EDGESLAM_DATA", raising=False)
+    assert cli.main(["judge", "--out", str(tmp_path)]) == 1
+    assert "no recordings: DATA or EDGESLAM_DATA" in capsys.readouterr().err
