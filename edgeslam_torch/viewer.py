@@ -45,7 +45,7 @@ class Viewer:
             self._rr: Any = importlib.import_module("rerun")
             layout = _layout(importlib.import_module("rerun.blueprint"), live)
         except ImportError as error:
-            raise ConfigError("the viewer needs rerun: pip install 'edgeslam-torch[viewer]'") from error
+            raise ConfigError("the viewer needs rerun: pip install 'rerun-sdk>=0.23'") from error
         self._stream: Any = self._rr.RecordingStream(f"edgeslam {name}")
         if save is not None:
             _check_writable(save)

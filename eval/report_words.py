@@ -8,12 +8,12 @@ from typing import Any
 from edgeslam_torch.eval.run_folder import RunFolder, is_supported
 from edgeslam_torch.eval.run_score import RunScore
 
-_ABSOLUTE = re.compile(
-    r"(?<![\w.:/\\<])"  # where a word begins: the slashes of 6/s, ../x, rtsp://host and </tag> are none
-    r"(?:[A-Za-z]:[\\/]|\\\\|/)(?=[^\s/\\])"
+_LEADING = re.compile(
+    r"(?<![\w.:/\\<])"  # where a word begins: the slashes of 6/s, rtsp://host and </tag> are none
+    r"(?:(?:\.\.[\\/])+|[A-Za-z]:[\\/]|\\\\|/)(?=[^\s/\\:;,'\"<>|])"
     r"(?:[^/\\\n:;,'\"<>|]*[^\s/\\:;,'\"<>|][/\\])*"
 )
-"""An absolute path up to its last name; folders may have spaces in them, not at their ends."""
+"""A path from the root or from folders above, up to its last name; folders may have spaces inside their names."""
 
 
 def unit(run: RunFolder) -> str:
@@ -36,8 +36,8 @@ def readable(text: str) -> str:
 
 
 def without_folders(text: str) -> str:
-    """Absolute paths shortened to their last name: a page that is passed on tells nothing about the disk."""
-    return _ABSOLUTE.sub("", text)
+    """Paths that leave the run's folder, by their last name: a page that is passed on tells nothing about the disk."""
+    return _LEADING.sub("", text)
 
 
 def story(run: RunFolder, score: RunScore | None) -> str:

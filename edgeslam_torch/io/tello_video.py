@@ -27,7 +27,7 @@ def import_av() -> Any:
     try:
         av = importlib.import_module("av")
     except ImportError as error:
-        raise SourceError('video of a drone needs PyAV: pip install "edgeslam-torch[drone]"') from error
+        raise SourceError("video of a drone needs PyAV: pip install 'av>=12'") from error
     av.logging.set_level(None)  # a lossy stream would fill the terminal with decoder messages
     return av
 

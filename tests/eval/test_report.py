@@ -108,11 +108,12 @@ def test_page_tells_nothing_about_the_disk(run: Path) -> None:
         (r"C:\Users\Jane Doe\x.yaml: bad", "x.yaml: bad"),
         (r"\\server\share\x", "x"),
         ("edgeslam run /a/b --out /c/d", "edgeslam run b --out d"),
-        ("rgb/0001.png, ../x, 3 m/s, a / b, /", "rgb/0001.png, ../x, 3 m/s, a / b, /"),
+        ("../../home/Jane Doe/kitchen", "kitchen"),
+        ("rgb/0001.png, 3 m/s, a / b, /, ..", "rgb/0001.png, 3 m/s, a / b, /, .."),
         ("tello://192.168.10.1/x", "tello://192.168.10.1/x"),
     ],
 )
-def test_absolute_paths_keep_their_last_name_only(text: str, shown: str) -> None:
+def test_paths_that_leave_the_run_keep_their_last_name_only(text: str, shown: str) -> None:
     assert without_folders(text) == shown
 
 

@@ -45,7 +45,7 @@ def test_page_is_made_when_missing_and_opened(
 @pytest.mark.skipif(HAS_RERUN, reason="rerun is installed here")
 def test_missing_rerun_is_said_with_the_remedy(run_folder: Callable[..., Path], tmp_path: Path) -> None:
     run_folder(tmp_path / "a")
-    with pytest.raises(ConfigError, match=r"pip install 'edgeslam-torch\[viewer\]'"):
+    with pytest.raises(ConfigError, match="pip install 'rerun-sdk>=0.23'"):
         run_view(tmp_path / "a", "--viewer")
 
 
