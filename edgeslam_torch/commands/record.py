@@ -1,17 +1,20 @@
 """``edgeslam record``: a flight or a camera into a folder that every other command reads."""
 
 import argparse
+import os
+import signal
+import sys
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from types import FrameType
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from edgeslam_torch.io.flight_writer import FlightWriter
     from edgeslam_torch.io.live import LiveSource
     from edgeslam_torch.io.tello import StateMessage, Tello
-
-EXIT_INTERRUPTED = 130
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -32,65 +35,92 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     """Record until told to stop, and say what was recorded."""
     from edgeslam_torch.errors import ConfigError
-    from edgeslam_torch.io.flight_writer import FlightWriter
-    from edgeslam_torch.io.live import open_live, open_tello
-    from edgeslam_torch.io.tello import TelloError
 
     is_drone = args.source.startswith("tello://")
     if args.fly and not is_drone:
         raise ConfigError(f"{args.source}: --fly is for a drone (tello://HOST)")
     if (args.max_frames is not None and args.max_frames < 1) or (args.duration is not None and args.duration <= 0):
         raise ConfigError("--max-frames and --duration must be positive")
-    folder = args.out or Path("flights") / time.strftime("%Y%m%d-%H%M%S")
-    messages: list[StateMessage] = []
-    tello: Tello | None = None
-    if is_drone:
-        source, tello, messages = open_tello(args.source, args.camera, args.max_frames, args.fly)
-    else:
-        source = open_live(args.source, args.camera, args.max_frames)
-    for warning in source.warnings:
-        print(f"warning: {warning}")
-    interrupted, failure = False, None
-    try:
-        with FlightWriter(folder, source.camera, is_drone, args.lossless) as writer:
-            print(f"recording to {folder}; Ctrl-C ends it", flush=True)
-            try:
-                _record(source, writer, messages, tello if args.fly else None, args.duration)
-            except KeyboardInterrupt:
-                interrupted = True
-            except TelloError as error:  # said once the drone is down and what was recorded has been told
-                failure = error
-            finally:
-                source.close()  # lands; its state messages are recorded as well
-                _write_states(writer, messages)
-            print(f"{writer.frames} frames, {writer.states} state messages in {folder}")
-    finally:
-        source.close()
-    for problem in source.problems:
-        print(f"note: {problem.file}: {problem.reason}")
-    if tello is not None and tello.stop_reason:
-        print(f"note: the flight was ended: {tello.stop_reason}")
-    if failure is not None:
-        raise failure
-    return EXIT_INTERRUPTED if interrupted else 0
+    with _Signals() as signals:
+        try:
+            source, messages, tello = _open(args, is_drone)
+        except KeyboardInterrupt:
+            _say("interrupted; nothing was recorded")
+            return signals.exit_code
+        try:
+            _record(args, source, messages, tello if args.fly else None, signals)
+        finally:
+            source.close()
+    return signals.exit_code
+
+
+def _open(args: argparse.Namespace, is_drone: bool) -> "tuple[LiveSource, list[StateMessage], Tello | None]":
+    from edgeslam_torch.io.live import open_live, open_tello
+
+    if not is_drone:
+        return open_live(args.source, args.camera, args.max_frames), [], None
+    source, tello, messages = open_tello(args.source, args.camera, args.max_frames, args.fly)
+    return source, messages, tello
 
 
 def _record(
+    args: argparse.Namespace,
+    source: "LiveSource",
+    messages: "list[StateMessage]",
+    tello: "Tello | None",
+    signals: "_Signals",
+) -> None:
+    """One recording, and a few lines on it once the drone is down.
+
+    Raises:
+        EdgeSlamError: What ended it early.
+    """
+    from edgeslam_torch.errors import EdgeSlamError
+    from edgeslam_torch.io.flight_writer import FlightWriter
+
+    folder = args.out or Path("flights") / time.strftime("%Y%m%d-%H%M%S")
+    told = len(source.warnings)
+    for warning in source.warnings:
+        _say(f"warning: {warning}")
+    failure: EdgeSlamError | None = None
+    with FlightWriter(folder, source.camera, args.source.startswith("tello://"), args.lossless) as writer:
+        _say(f"recording to {folder}; Ctrl-C ends it")
+        signals.tell(source.end)  # from here on no signal interrupts anything: least of all the landing
+        try:
+            _write_frames(source, writer, messages, tello, args.duration)
+        except EdgeSlamError as error:
+            failure = error
+        finally:
+            source.close()  # lands; its state messages are recorded as well
+        try:
+            _write_states(writer, messages)
+        except EdgeSlamError as error:
+            failure = failure or error
+        _say(f"{writer.frames} frames, {writer.states} state messages in {folder}")
+    for warning in source.warnings[told:]:
+        _say(f"warning: {warning}")
+    for problem in source.problems:
+        _say(f"note: {problem.file}: {problem.reason}")
+    if failure is not None:
+        raise failure
+
+
+def _write_frames(
     source: "LiveSource",
     writer: "FlightWriter",
     messages: "list[StateMessage]",
     tello: "Tello | None",
     duration_s: float | None,
 ) -> None:
+    """Raises `TelloError` when the flight did not go as it should."""
     begin = time.monotonic()
-    pilot = _start_pilot(tello) if tello is not None else None
+    check = _start_pilot(tello) if tello is not None else lambda: None
     for frame in source.frames():
         writer.add_frame(frame)
         _write_states(writer, messages)
         if duration_s is not None and time.monotonic() - begin > duration_s:
             break
-        if pilot is not None:
-            pilot()
+        check()
 
 
 def _write_states(writer: "FlightWriter", messages: "list[StateMessage]") -> None:
@@ -101,7 +131,6 @@ def _write_states(writer: "FlightWriter", messages: "list[StateMessage]") -> Non
 def _start_pilot(tello: "Tello") -> Callable[[], None]:
     """A short flight in a thread of its own; the returned function raises what went wrong in it."""
     import logging
-    import threading
     from functools import partial
 
     from edgeslam_torch.errors import EdgeSlamError
@@ -124,7 +153,57 @@ def _start_pilot(tello: "Tello") -> Callable[[], None]:
     threading.Thread(target=fly, name="pilot", daemon=True).start()
 
     def check() -> None:
-        if failures:
+        if failures and not tello.stop_reason:  # a flight that was ended has its own reason
             raise failures[0]
 
     return check
+
+
+class _Signals:
+    """Ctrl-C, ``kill``, a closed terminal: each ends the recording, and none of them interrupts a landing.
+
+    Signals that are ignored already (``nohup``) stay ignored.
+    """
+
+    def __init__(self) -> None:
+        self.number = 0
+        """The first one that came."""
+        self._end: Callable[[], None] | None = None
+        self._old: dict[int, Any] = {}
+
+    @property
+    def exit_code(self) -> int:
+        """As a shell reports a program that a signal ended; 0 when none came."""
+        return 128 + self.number if self.number else 0
+
+    def tell(self, end: Callable[[], None]) -> None:
+        """Call ``end`` from now on, in place of interrupting what goes on; at once if one has come."""
+        self._end = end
+        if self.number:
+            end()
+
+    def __enter__(self) -> "_Signals":
+        if threading.current_thread() is threading.main_thread():
+            for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGBREAK"):  # no system has them all
+                number = getattr(signal, name, None)
+                if number is not None and signal.getsignal(number) is not signal.SIG_IGN:
+                    self._old[number] = signal.signal(number, self._on_signal)
+        return self
+
+    def __exit__(self, *unused: object) -> None:
+        for number, handler in self._old.items():
+            signal.signal(number, handler)
+
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:
+        self.number = self.number or number
+        if self._end is None:
+            raise KeyboardInterrupt
+        self._end()
+
+
+def _say(text: str) -> None:
+    """Print; a terminal or pipe that is gone is no reason to end anything."""
+    try:
+        print(text, flush=True)
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -11,7 +11,8 @@ import numpy as np
 from edgeslam_torch.emulator.stopwatch import age_s, read_time
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.io.tello import StateMessage, Tello, TelloAddress, TelloError
-from edgeslam_torch.io.tello_video import Picture, open_udp
+from edgeslam_torch.io.tello_video import Picture
+from edgeslam_torch.io.udp import open_udp
 from edgeslam_torch.types import FloatArray
 
 _START_S = 120.0

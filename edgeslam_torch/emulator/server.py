@@ -15,7 +15,7 @@ from edgeslam_torch.emulator.drone import DroneModel, state_line
 from edgeslam_torch.emulator.encoder import Encoder
 from edgeslam_torch.emulator.link import Link, LinkFaults
 from edgeslam_torch.emulator.stopwatch import draw_time
-from edgeslam_torch.io.tello_video import open_udp
+from edgeslam_torch.io.udp import open_udp
 from edgeslam_torch.types import FloatArray
 
 logger = logging.getLogger(__name__)

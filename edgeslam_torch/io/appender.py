@@ -35,6 +35,7 @@ class Appender:
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         except OSError:
             self._file.truncate(self._good)
+            self._file.seek(self._good)
             raise
         self._good += len(data)
 

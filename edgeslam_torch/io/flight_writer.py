@@ -1,12 +1,14 @@
 """Recording of a flight that is whole at any moment: what was written before a crash can be read."""
 
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
-from typing import TextIO
 
 import cv2
 
-from edgeslam_torch.errors import OutputError
+from edgeslam_torch.errors import EdgeSlamError, OutputError
 from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.io.appender import Appender
 from edgeslam_torch.io.telemetry_csv import TelemetryWriter
 from edgeslam_torch.io.tello import StateMessage
 from edgeslam_torch.types import Frame
@@ -17,7 +19,8 @@ _JPEG_QUALITY = 95
 class FlightWriter:
     """A TUM-layout folder: ``rgb/``, ``rgb.txt``, ``camera.yaml``, ``telemetry.csv``, ``state.txt`` (raw lines).
 
-    Each picture is written before its line in ``rgb.txt``, each line is flushed: nothing is listed that is not there.
+    Each picture is written before its line in ``rgb.txt``, each line as a whole: nothing is listed that is not there,
+    and what the disk had no room for is taken back.
     """
 
     def __init__(self, folder: Path, camera: Camera, with_telemetry: bool, lossless: bool = False) -> None:
@@ -35,32 +38,34 @@ class FlightWriter:
         try:
             (folder / "rgb").mkdir(parents=True, exist_ok=True)
             camera.save(folder / "camera.yaml")
-            self._list: TextIO = (folder / "rgb.txt").open("w", encoding="utf-8", newline="\n")
-            self._list.write("# stamp_s file\n")
-            self._raw: TextIO | None = None
-            self._telemetry: TelemetryWriter | None = None
-            if with_telemetry:
-                self._raw = (folder / "state.txt").open("w", encoding="utf-8", newline="\n")
-                self._telemetry = TelemetryWriter(folder / "telemetry.csv")
-        except OSError as error:
-            raise OutputError(f"{folder}: cannot be written: {error.strerror or error}") from error
+            self._list = Appender(folder / "rgb.txt", "# stamp_s file\n")
+            self._raw = Appender(folder / "state.txt", "") if with_telemetry else None
+            self._telemetry = TelemetryWriter(folder / "telemetry.csv") if with_telemetry else None
+        except (OSError, EdgeSlamError) as error:
+            raise OutputError(f"{folder}: cannot be written: {_reason(error)}") from error
 
     def add_frame(self, frame: Frame) -> None:
         """Write one picture.
 
         Raises:
-            OutputError: If the disk refuses.
+            OutputError: If the disk refuses; the recording is as it was before.
         """
         name = f"rgb/{frame.stamp_s:.6f}.{self._suffix}"
-        ok, data = cv2.imencode(f".{self._suffix}", frame.image, self._options)
-        try:
+        path = self.folder / name
+
+        def write() -> None:
+            ok, data = cv2.imencode(f".{self._suffix}", frame.image, self._options)
             if not ok:
                 raise OSError(f"cannot encode as {self._suffix}")
-            (self.folder / name).write_bytes(data.tobytes())
+            path.write_bytes(data.tobytes())
             self._list.write(f"{frame.stamp_s:.6f} {name}\n")
-            self._list.flush()
-        except OSError as error:
-            raise OutputError(f"{self.folder / name}: cannot be written: {error.strerror or error}") from error
+
+        try:
+            _guarded(path, write)
+        except OutputError:
+            with suppress(OSError):
+                path.unlink(missing_ok=True)  # half a picture that nothing lists
+            raise
         self.frames += 1
 
     def add_state(self, message: StateMessage) -> None:
@@ -71,24 +76,30 @@ class FlightWriter:
         """
         if self._raw is None or self._telemetry is None:
             return
-        try:
-            self._raw.write(f"{message.stamp_s:.6f} {message.raw}\n")
-            self._raw.flush()
-        except OSError as error:
-            raise OutputError(f"{self.folder / 'state.txt'}: cannot be written: {error.strerror or error}") from error
-        self._telemetry.write(message.stamp_s, message.fields)
+        raw, telemetry = self._raw, self._telemetry
+        _guarded(telemetry.path, lambda: telemetry.write(message.stamp_s, message.fields))
+        _guarded(self.folder / "state.txt", lambda: raw.write(f"{message.stamp_s:.6f} {message.raw}\n"))
         self.states += 1
 
     def close(self) -> None:
         """Close the files."""
-        self._list.close()
-        if self._raw is not None:
-            self._raw.close()
-        if self._telemetry is not None:
-            self._telemetry.close()
+        for file in (self._list, self._raw, self._telemetry):
+            if file is not None:
+                file.close()
 
     def __enter__(self) -> "FlightWriter":
         return self
 
     def __exit__(self, *unused: object) -> None:
         self.close()
+
+
+def _guarded(path: Path, write: Callable[[], None]) -> None:
+    try:
+        write()
+    except (OSError, EdgeSlamError, cv2.error) as error:
+        raise OutputError(f"{path}: cannot be written: {_reason(error)}") from error
+
+
+def _reason(error: Exception) -> str:
+    return getattr(error, "strerror", None) or str(error)

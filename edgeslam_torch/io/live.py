@@ -13,7 +13,7 @@ from edgeslam_torch.errors import SourceError
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.io.camera_choice import choose_camera
 from edgeslam_torch.io.listing import Problem
-from edgeslam_torch.io.tello import StateMessage, Tello, TelloAddress
+from edgeslam_torch.io.tello import StateMessage, Tello, TelloAddress, TelloError
 from edgeslam_torch.io.tello_video import ArrivalClock, Picture
 from edgeslam_torch.types import Frame, TelemetrySample
 
@@ -21,6 +21,8 @@ FIRST_PICTURE_S = 10.0
 """A Tello's first pictures cannot be decoded until a keyframe comes."""
 SILENCE_S = 10.0
 """Without a picture for so long the source has ended."""
+_SLICE_S = 0.1
+"""How long a source goes on waiting after it was told to end."""
 
 
 class Feed(Protocol):
@@ -28,6 +30,9 @@ class Feed(Protocol):
 
     def wait(self, after_count: int, timeout_s: float) -> Picture | None:
         """The newest picture once it is later than ``after_count``; None when time is up."""
+
+    def remarks(self) -> list[str]:
+        """What was amiss with what came."""
 
     def close(self) -> None:
         """Give the device back."""
@@ -61,6 +66,7 @@ class LiveSource:
         self.length = max_frames
         self.problems: list[Problem] = []
         self._feed = feed
+        self._told_to_end = self._closed = False
         first = feed.wait(0, FIRST_PICTURE_S)
         if first is None:
             feed.close()
@@ -75,22 +81,42 @@ class LiveSource:
             raise
 
     def frames(self) -> Iterator[Frame]:
-        """Pictures as they come; a slow taker misses some, which shows as gaps in the index. Closes the device."""
+        """Pictures as they come; a slow taker misses some, which shows as gaps in the index. Closes the device.
+
+        Raises:
+            TelloError: If a guard has ended our flight with a drone.
+        """
         last = given = 0
         try:
             while self.length is None or given < self.length:
-                picture = self._feed.wait(last, SILENCE_S)
+                picture = self._next(last)
                 if picture is None:
-                    self.problems.append(Problem(self.location, f"no picture for {SILENCE_S:.0f} s; ended", frames=0))
                     return
                 last, given = picture.count, given + 1
                 yield Frame(picture.count - 1, picture.stamp_s, picture.image)
         finally:
-            self._feed.close()
+            self.close()
+
+    def _next(self, last: int) -> Picture | None:
+        for _ in range(round(SILENCE_S / _SLICE_S)):
+            if self._told_to_end:
+                return None
+            picture = self._feed.wait(last, _SLICE_S)
+            if picture is not None:
+                return picture
+        self.problems.append(Problem(self.location, f"no picture for {SILENCE_S:.0f} s; ended", frames=0))
+        return None
+
+    def end(self) -> None:
+        """Let `frames` end with the picture that it has; from any thread, or a signal handler."""
+        self._told_to_end = True
 
     def close(self) -> None:
-        """Give the device back without taking a frame."""
+        """Give the device back; what was amiss with it is in `warnings` afterwards."""
         self._feed.close()
+        if not self._closed:
+            self._closed = True
+            self.warnings += [f"{self.location}: {remark}" for remark in self._feed.remarks()]
 
 
 class TelloFeed:
@@ -101,8 +127,22 @@ class TelloFeed:
         self.video = tello.start_video()
 
     def wait(self, after_count: int, timeout_s: float) -> Picture | None:
-        """As `Feed`."""
+        """As `Feed`.
+
+        Raises:
+            TelloError: If a guard has ended our flight; pictures of the floor are not what was asked for.
+        """
+        if self.tello.stop_reason:
+            raise TelloError(f"{self.tello.address.host}: the flight was ended: {self.tello.stop_reason}")
         return self.video.wait(after_count, timeout_s)
+
+    def remarks(self) -> list[str]:
+        """As `Feed`: what did not come from the drone."""
+        refused = {channel: count for channel, count in self.tello.refused.items() if count}
+        if not refused:
+            return []
+        listing = ", ".join(f"{channel} {count}" for channel, count in refused.items())
+        return [f"{sum(refused.values())} packets from others than the drone were refused ({listing})"]
 
     def close(self) -> None:
         """Land if this client took off, and leave."""
@@ -154,6 +194,10 @@ class CaptureFeed:
         with self._ready:
             self._ready.wait_for(lambda: self._ended or later(), timeout_s)
             return self._newest if later() else None
+
+    def remarks(self) -> list[str]:
+        """As `Feed`: there is nothing to say."""
+        return []
 
     def close(self) -> None:
         """Release the device."""

@@ -1,8 +1,10 @@
 """A live source that is recorded while it is used: what was seen live can be run again."""
 
+import logging
 import queue
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 from edgeslam_torch.errors import OutputError
@@ -12,6 +14,8 @@ from edgeslam_torch.io.listing import Problem
 from edgeslam_torch.io.live import LiveSource
 from edgeslam_torch.io.tello import StateMessage
 from edgeslam_torch.types import Frame, TelemetrySample
+
+logger = logging.getLogger(__name__)
 
 _WAITING = 60
 """Frames that may wait for the disk (two seconds, 120 MB at 960x720); beyond that the camera is taken less often."""
@@ -51,7 +55,7 @@ class RecordedLive:
             source.close()
             raise
         self._queue: queue.Queue[Frame | None] = queue.Queue(maxsize=_WAITING)
-        self._failure: OutputError | None = None
+        self._failure: str | None = None
         self._thread = threading.Thread(target=self._work, name="recording", daemon=True)
         self._thread.start()
         self._closed = False
@@ -76,21 +80,26 @@ class RecordedLive:
         self._write_states()
         self._writer.close()
         if self._failure is not None:
-            self.problems.append(Problem(str(self._writer.folder), str(self._failure), frames=0))
+            self.problems.append(Problem(str(self._writer.folder), self._failure, frames=0))
 
     def _work(self) -> None:
         while (frame := self._queue.get()) is not None:
-            if self._failure is not None:
-                continue  # emptied, so that nobody waits
-            try:
-                self._writer.add_frame(frame)
-            except OutputError as error:
-                self._failure = error
+            self._guarded(partial(self._writer.add_frame, frame))
             self._write_states()
 
     def _write_states(self) -> None:
+        while self._failure is None and self._writer.states < len(self._messages):
+            self._guarded(partial(self._writer.add_state, self._messages[self._writer.states]))
+
+    def _guarded(self, write: Callable[[], None]) -> None:
+        """After the first failure nothing more is written; the queue is still emptied, so that nobody waits for it."""
+        if self._failure is not None:
+            return
         try:
-            while self._failure is None and self._writer.states < len(self._messages):
-                self._writer.add_state(self._messages[self._writer.states])
+            write()
         except OutputError as error:
-            self._failure = error
+            logger.warning("the recording ends here: %s", error)
+            self._failure = str(error)
+        except Exception as error:  # a fault of ours must not hold up the frames of a drone
+            logger.exception("the recording ends here")
+            self._failure = f"{self._writer.folder}: recording failed: {error}"

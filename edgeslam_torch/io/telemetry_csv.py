@@ -11,11 +11,11 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from types import TracebackType
-from typing import TextIO
 
 import numpy as np
 
 from edgeslam_torch.errors import EdgeSlamError
+from edgeslam_torch.io.appender import Appender
 from edgeslam_torch.io.sdk_state import FIELDS, sample_from_sdk, to_number
 from edgeslam_torch.io.velocity_frame import body_frame_evidence
 from edgeslam_torch.types import FloatArray, TelemetrySample
@@ -285,7 +285,7 @@ def _height_slope(stamps_s: FloatArray, vz: FloatArray, z_m: FloatArray, step_m:
 
 
 class TelemetryWriter:
-    """Append-only `telemetry.csv`; every row reaches the file at once, so that a crash costs at most one.
+    """Append-only `telemetry.csv`; every row reaches the file at once and whole, whatever the disk does.
 
     Opening an existing file goes on behind its last whole line.
 
@@ -296,16 +296,14 @@ class TelemetryWriter:
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         try:
-            self._file: TextIO = self.path.open("a+", encoding="utf-8", newline="\n")
-            self._file.seek(0)
-            content = self._file.read()
-            if not content:
+            before = self.path.read_bytes() if self.path.exists() else b""
+            self._file = Appender(self.path, None)
+            if not before:
                 self._file.write(",".join(HEADER) + "\n")
-            elif not content.endswith("\n"):
+            elif not before.endswith(b"\n"):
                 self._file.write("\n")  # the torn line becomes one malformed row
-            self._file.flush()
-        except (OSError, UnicodeDecodeError) as error:
-            raise TelemetryError(f"{self.path}: cannot be written: {error}") from error
+        except OSError as error:
+            raise TelemetryError(f"{self.path}: cannot be written: {error.strerror or error}") from error
 
     def write(self, stamp_s: float, fields: Mapping[str, float | str]) -> None:
         """One state message; missing fields stay empty."""
@@ -315,7 +313,6 @@ class TelemetryWriter:
             cells.append(f"{value:.10g}" if isinstance(value, float | int) and math.isfinite(value) else "")
         try:
             self._file.write(",".join(cells) + "\n")
-            self._file.flush()
         except OSError as error:
             raise TelemetryError(f"{self.path}: cannot be written: {error.strerror or error}") from error
 

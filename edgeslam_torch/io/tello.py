@@ -1,27 +1,27 @@
 """Client for a DJI Tello over its text SDK (1.3 and 2.0): commands, state, video, and the will to land."""
 
-import ipaddress
 import logging
 import math
+import os
 import queue
 import re
-import socket
 import threading
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from types import TracebackType
-from urllib.parse import urlsplit
 
-from edgeslam_torch.errors import EdgeSlamError, SourceError
+from edgeslam_torch.errors import SourceError
 from edgeslam_torch.io.sdk_state import parse_state, sample_from_sdk
-from edgeslam_torch.io.tello_answers import belongs_to, is_refusal
-from edgeslam_torch.io.tello_video import ArrivalClock, Picture, VideoReceiver, open_udp
+from edgeslam_torch.io.tello_address import TelloAddress
+from edgeslam_torch.io.tello_answers import NoAnswer, TelloError, belongs_to, is_refusal
+from edgeslam_torch.io.tello_guard import Guard
+from edgeslam_torch.io.tello_sticks import Sticks
+from edgeslam_torch.io.tello_video import ArrivalClock, Picture, VideoReceiver
+from edgeslam_torch.io.udp import Inlet
 from edgeslam_torch.types import TelemetrySample
 
 logger = logging.getLogger(__name__)
 
-TELLO_HOST = "192.168.10.1"
 _STEPS = ("up", "down", "left", "right", "forward", "back", "cw", "ccw", "go", "curve", "flip", "jump")
 _MOVES = frozenset(["takeoff", "throwfly", *_STEPS, "rc", "motoron", "speed", "stop"])
 """Commands that make a drone move, or change how it moves."""
@@ -38,71 +38,6 @@ _FRESH_S = 1.0
 _RISEN_CM = 20.0
 _STEADY_CM = 6.0
 _STEADY_S = 1.5
-
-
-class TelloError(EdgeSlamError):
-    """The drone does not answer, refuses, or may not do what was asked."""
-
-
-class NoAnswer(TelloError):
-    """A command was sent and nothing came back: it may have been heard or not."""
-
-
-@dataclass(frozen=True, slots=True)
-class TelloAddress:
-    """Where a drone and our ends of its three channels are."""
-
-    host: str = TELLO_HOST
-    command_port: int = 8889
-    state_port: int = 8890
-    video_port: int = 11111
-    bind: str | None = None
-    """Our address; ``None`` takes the interface that leads to the drone, so loopback stays on loopback."""
-
-    @classmethod
-    def parse(cls, text: str) -> "TelloAddress":
-        """From ``tello://HOST[:COMMAND[:STATE[:VIDEO]]]`` or ``HOST``; no host means 192.168.10.1.
-
-        Raises:
-            SourceError: If it is no such address.
-
-        Example:
-            >>> TelloAddress.parse("tello://127.0.0.1:9000:9001:9002").video_port
-            9002
-        """
-        body = text.removeprefix("tello://").rstrip("/")
-        host, *ports = body.split(":") if body else [TELLO_HOST]
-        if (
-            len(ports) > 3
-            or not re.fullmatch(r"[A-Za-z0-9._-]*", host)
-            or urlsplit(f"//{host}").hostname != (host.lower() or None)
-        ):
-            raise SourceError(f"{text}: not a drone's address; give tello://HOST[:COMMAND[:STATE[:VIDEO]]]")
-        numbers = []
-        for port in ports:
-            if not (port.isascii() and port.isdigit() and 0 < int(port) < 65536):
-                raise SourceError(f"{text}: port {port!r} is not a number from 1 to 65535")
-            numbers.append(int(port))
-        defaults = [8889, 8890, 11111]
-        command, state, video = numbers + defaults[len(numbers) :]
-        return cls(host or TELLO_HOST, command, state, video)
-
-    def local(self) -> str:
-        """Our address towards the drone.
-
-        Raises:
-            TelloError: If there is no way to the drone.
-        """
-        if self.bind is not None:
-            return self.bind
-        try:
-            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-                probe.connect((self.host, self.command_port))  # sends nothing
-                return str(probe.getsockname()[0])
-        except OSError as error:
-            raise TelloError(
-                f"{self.host}: no way there ({error.strerror or error}); join the drone's Wi-Fi (TELLO-XXXXXX) first"
-            ) from error
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,29 +111,36 @@ class Tello:
         self._landing = threading.Event()
         """Set while a landing is wanted: nothing else is waited for, nothing else is sent."""
         self._leaving = threading.Event()
-        """The same for good, once `close` was called."""
+        """The same for good, once `close` was called: a take-off that was about to be sent stays unsent."""
         self._stopping = threading.Event()
+        self._closed = threading.Event()
         self._last_sent_s = -math.inf
         self._flight_begin_s = math.inf
-        self._events: deque[str] = deque(maxlen=100)
+        self._took_off_s = -math.inf
+        """When the last take-off was sent."""
+        self._ground: float | None = None
+        """Height [cm] before take-off."""
+        self._rose = False
+        """Whether the climb of this flight was seen in the state."""
+        self._guard: Guard | None = None
         self._video: VideoReceiver | None = None
         self._video_begin_s = math.inf
-        local = self.address.local()
-        self._command_socket = open_udp((local, 0), "command")
+        self._host, self._local = self.address.ends()
+        self._commands = Inlet((self._local, 0), "command", self._host)
         try:
-            self._state_socket = open_udp((local, self.address.state_port), "state")
+            self._states = Inlet((self._local, self.address.state_port), "state", self._host)
         except SourceError:
-            self._command_socket.close()
+            self._commands.close()
             raise
+        self._sticks = Sticks(self._transmit, self._beat)
         self._threads = [
             threading.Thread(target=self._receive_replies, name="tello-replies", daemon=True),
             threading.Thread(target=self._receive_states, name="tello-state", daemon=True),
             threading.Thread(target=self._watch, name="tello-watch", daemon=True),
         ]
-        for udp in (self._command_socket, self._state_socket):
-            udp.settimeout(0.2)
         for thread in self._threads:
             thread.start()
+        threading.Thread(target=self._close, name="tello-close", daemon=True).start()
 
     # --- session -------------------------------------------------------------------------------------------------
 
@@ -226,27 +168,58 @@ class Tello:
         self.close()
 
     def close(self) -> None:
-        """Land if airborne, stop the video, close the sockets; never raises for a drone that is gone."""
-        if self._stopping.is_set():
-            return
-        self._leaving.set()  # a take-off that another thread was about to send stays unsent
+        """Land if airborne, stop the video, close the sockets; never raises for a drone that is gone.
+
+        Ctrl-C meanwhile does not end the landing: it is raised when that is over.
+        """
+        interrupted = False
+        while not self._closed.is_set():
+            try:
+                self._leaving.set()
+                self._closed.wait(0.2)
+            except KeyboardInterrupt:
+                interrupted = True
+        if interrupted:
+            raise KeyboardInterrupt
+
+    def _close(self) -> None:
+        """What `close` does, in a thread of its own, which no Ctrl-C reaches."""
+        self._leaving.wait()
+        failure = ""
         try:
-            with self._sending:
-                airborne = self._airborne
-            if airborne:
-                self.land()
-            elif self._video is not None:
-                self.send("streamoff", retries=0, timeout_s=0.5)
-        except TelloError as failure:
-            logger.warning("while closing: %s", failure)
+            self._finish_flight()
+        except TelloError as error:
+            failure = str(error)
         finally:
-            self._stopping.set()
-            if self._video is not None:
-                self._video.stop()
-            for thread in self._threads:
-                thread.join(timeout=1.0)
-            self._command_socket.close()
-            self._state_socket.close()
+            try:
+                self._hang_up()
+                if failure:  # said once all is done: a terminal that is stopped would hold it up
+                    logger.warning("while closing: %s", failure)
+            finally:
+                self._closed.set()
+
+    def _finish_flight(self) -> None:
+        with self._sending:
+            airborne = self._airborne
+        if airborne:
+            self.land()
+        elif self._video is not None:
+            self.send("streamoff", retries=0, timeout_s=0.5)
+
+    def _hang_up(self) -> None:
+        """End the threads and give the ports back; a guard that may still be needed goes on alone."""
+        self._stopping.set()
+        self._sticks.stop()
+        if self._guard is not None:
+            self._guard.dismiss(landed=False)
+        if self._video is not None:
+            self._video.stop()
+        for inlet in (self._commands, self._states):
+            inlet.stop()
+        for thread in self._threads:
+            thread.join(timeout=1.0)
+        self._commands.close()
+        self._states.close()
 
     # --- commands ------------------------------------------------------------------------------------------------
 
@@ -263,7 +236,7 @@ class Tello:
             raise TelloError(f"not an SDK command: {command!r}")
         self._check_motion(name)
         if name == "rc":
-            self._transmit(command)
+            self._sticks.push(command, lambda: self._check_motion(name))
             return ""
         if name == "takeoff":
             self.take_off()
@@ -274,7 +247,10 @@ class Tello:
         with self._sending:
             for _ in range(tries):
                 self._check_motion(name)  # a landing may have begun while we waited for our turn
-                self._airborne |= name == "throwfly"
+                if name == "throwfly":
+                    self._begin_flight()
+                if moving or name == "stop":
+                    self._sticks.let_go()
                 self._drop_old_replies()
                 self._transmit(command)
                 answer = self._answer(command, wait)
@@ -315,25 +291,25 @@ class Tello:
         if reason:
             raise TelloError(f"{self.address.host}: not taking off: {reason}")
         with self._sending:
-            ground = self._level()
-            # Set before the answer: from here on the drone may be in the air, whatever is heard of it.
-            self._airborne, self._flight_begin_s = True, self.clock.now()
+            self._begin_flight()
+            self._sticks.let_go()
             self._drop_old_replies()
             tries = 1 + self.limits.retries
             for attempt in range(tries):
                 self._check_motion("takeoff")
+                self._took_off_s = self.clock.now()
                 self._transmit("takeoff")
-                answer = self._answer("takeoff", self.limits.timeout_s, lambda: self._risen(ground))
+                answer = self._answer("takeoff", self.limits.timeout_s, self._risen)
                 if answer is not None and not is_refusal(answer):
                     return
-                if self._risen(ground):
+                if self._risen():
                     break
                 if answer is not None and attempt == 0:
-                    self._airborne = False
+                    self._end_flight()
                     raise TelloError(f"{self.address.host}: 'takeoff' was refused: {answer}")
                 if answer is not None:
                     break  # a refusal of what is repeated: it heard us before and is about to rise
-            self._wait_for_hover(ground)
+            self._wait_for_hover()
 
     def land(self) -> None:
         """Land, insistently: an answer may be lost, a drone in the air may not. Whatever else is waited for ends.
@@ -342,24 +318,30 @@ class Tello:
             TelloError: If the drone neither answers nor says that it is on the ground.
         """
         self._landing.set()
-        self._transmit("rc 0 0 0 0")
+        self._sticks.let_go()
+        if not self._sending.acquire(blocking=False):
+            self._transmit("land")  # at once, while another thread still waits for the answer to a long move
+            self._sending.acquire()
         try:
-            with self._sending:
-                agreed = 0
-                for _ in range(_LAND_TRIES):
-                    self._drop_old_replies()
-                    self._transmit("land")
-                    answer = self._answer("land", _LAND_AGAIN_S, self._grounded)
-                    agreed += answer is not None and not is_refusal(answer)
-                    deadline = self.clock.now() + (0.0 if answer is None else 1.0)
-                    while not self._grounded() and self.clock.now() < deadline and not self._stopping.wait(0.05):
-                        pass  # what was answered shows in the state a moment later
-                    # The first "ok" may be that of the movement which the landing ended.
-                    if self._grounded() or agreed > 1 or (agreed and self._level() is None):
-                        self._airborne = False
-                        return
+            self._land_until_down()
         finally:
+            self._sending.release()
             self._landing.clear()
+
+    def _land_until_down(self) -> None:
+        agreed = 0
+        for _ in range(_LAND_TRIES):
+            self._drop_old_replies()
+            self._transmit("land")
+            answer = self._answer("land", _LAND_AGAIN_S, self._landed)
+            agreed += answer is not None and not is_refusal(answer)
+            deadline = self.clock.now() + (0.0 if answer is None else 1.0)
+            while not self._landed() and self.clock.now() < deadline and not self._stopping.wait(0.05):
+                pass  # what was answered shows in the state a moment later
+            # The first "ok" may be that of the movement which the landing ended.
+            if self._landed() or agreed > 1 or (agreed and self._level() is None):
+                self._end_flight()
+                return
         raise TelloError(f"{self.address.host}: no answer to 'land'; the drone lands by itself after 15 s of silence")
 
     def rc(self, right: float, forward: float, up: float, clockwise: float) -> None:
@@ -400,8 +382,8 @@ class Tello:
             SourceError: If PyAV is missing or the port is taken.
         """
         if self._video is None:
-            local = (self.address.local(), self.address.video_port)
-            self._video = VideoReceiver(local, self.clock, self._on_picture)
+            local = (self._local, self.address.video_port)
+            self._video = VideoReceiver(local, self.clock, self._host, self._on_picture)
         self.send("streamon")
         self._video_begin_s = self.clock.now()
         return self._video
@@ -410,6 +392,12 @@ class Tello:
     def airborne(self) -> bool:
         """Whether this client has taken off and not landed."""
         return self._airborne
+
+    @property
+    def refused(self) -> dict[str, int]:
+        """Packets on each channel that did not come from the drone, and were not listened to."""
+        video = 0 if self._video is None else self._video.refused
+        return {"video": video, "state": self._states.refused, "answers": self._commands.refused}
 
     # --- inside --------------------------------------------------------------------------------------------------
 
@@ -424,12 +412,33 @@ class Tello:
     def _over(self) -> bool:
         return self._landing.is_set() or self._leaving.is_set()
 
+    def _begin_flight(self) -> None:
+        """From here on the drone may be in the air, whatever is heard of it."""
+        self._ground, self._rose = self._level(), False
+        self._took_off_s = self._flight_begin_s = self.clock.now()
+        if self._guard is None and os.name == "posix":
+            try:
+                self._guard = Guard(self._commands.socket, (self._host, self.address.command_port))
+            except OSError as error:
+                logger.warning("no guard against the death of this program (%s); the drone then lands by itself", error)
+        self._airborne = True
+
+    def _end_flight(self) -> None:
+        self._airborne = False
+        guard, self._guard = self._guard, None
+        if guard is not None:
+            guard.dismiss(landed=True)
+
+    def _beat(self, pushed: bool) -> None:
+        guard = self._guard
+        if guard is not None:
+            guard.beat(pushed)
+
     def _transmit(self, command: str) -> None:
         try:
-            self._command_socket.sendto(command.encode("ascii"), (self.address.host, self.address.command_port))
-        except OSError as error:
-            if not self._stopping.is_set():
-                logger.warning("%s: %r not sent: %s", self.address.host, command, error)
+            self._commands.socket.sendto(command.encode("ascii"), (self._host, self.address.command_port))
+        except OSError as error:  # no network at the moment; what matters is sent again
+            logger.debug("%s: %r not sent: %s", self.address.host, command, error)
         self._last_sent_s = self.clock.now()
 
     def _drop_old_replies(self) -> None:
@@ -454,7 +463,7 @@ class Tello:
                 return answer
         return None
 
-    def _wait_for_hover(self, ground: float | None) -> None:
+    def _wait_for_hover(self) -> None:
         """Until 'takeoff' is answered, or the drone has risen and its height no longer changes.
 
         Raises:
@@ -462,7 +471,7 @@ class Tello:
         """
         begin = since = self.clock.now()
         level = self._level()
-        while self.clock.now() - begin < (_CLIMB_TIMEOUT_S if self._risen(ground) else _RISE_TIMEOUT_S):
+        while self.clock.now() - begin < (_CLIMB_TIMEOUT_S if self._risen() else _RISE_TIMEOUT_S):
             self._check_motion("takeoff")
             answer = self._answer("takeoff", 0.1)
             if answer is not None and not is_refusal(answer):
@@ -470,23 +479,19 @@ class Tello:
             now, height = self.clock.now(), self._level()
             if height is None or level is None or abs(height - level) > _STEADY_CM:
                 level, since = height, now
-            elif now - since > _STEADY_S and self._risen(ground):
+            elif now - since > _STEADY_S and self._risen():
                 return
-        if not self._risen(ground):
+        if not self._risen():
             raise TelloError(f"{self.address.host}: no answer to 'takeoff' and no climb seen")
 
     def _receive_replies(self) -> None:
-        for packet, sender in self._packets(self._command_socket):
-            if not self._is_drone(sender):
-                continue
+        for packet in self._commands.packets():
             text = packet.decode("ascii", errors="replace").strip("\x00 \r\n")
             if text and text.isascii() and text.isprintable() and len(text) < 200:
                 self._replies.put(text)
 
     def _receive_states(self) -> None:
-        for packet, sender in self._packets(self._state_socket):
-            if not self._is_drone(sender):
-                continue
+        for packet in self._states.packets():
             stamp = self.clock.now()
             fields = parse_state(packet)
             if "bat" not in fields and "pitch" not in fields:
@@ -494,25 +499,18 @@ class Tello:
                 continue
             message = StateMessage(stamp, packet.decode("ascii", errors="replace").strip(), fields)
             self.latest = message
+            self._rose |= self._airborne and self._risen()
             if self._on_state is not None:
-                self._on_state(message)
+                self._tell(message)
 
-    def _packets(self, udp: socket.socket):  # type: ignore[no-untyped-def]
-        while not self._stopping.is_set():
-            try:
-                yield udp.recvfrom(4096)
-            except TimeoutError:
-                continue
-            except ConnectionError:
-                continue  # an ICMP "port unreachable" of an earlier packet
-            except OSError:
-                return  # closed
-
-    def _is_drone(self, sender: tuple[str, int]) -> bool:
+    def _tell(self, message: StateMessage) -> None:
+        """A listener that fails must not end the state of a drone in the air."""
+        assert self._on_state is not None
         try:
-            return sender[0] == self.address.host or not ipaddress.ip_address(self.address.host)
-        except ValueError:
-            return True  # the drone was given by name
+            self._on_state(message)
+        except Exception:
+            logger.exception("what listens to state messages failed, and is not called again")
+            self._on_state = None
 
     def _fresh(self) -> dict[str, float | str]:
         """Fields of the last state message; none when it is old."""
@@ -527,10 +525,15 @@ class Tello:
             return tof
         return h if isinstance(h, float) else None
 
-    def _risen(self, ground: float | None) -> bool:
+    def _risen(self) -> bool:
         """Whether the drone is higher than it was on the ground."""
         level = self._level()
-        return level is not None and level > (10.0 if ground is None else ground) + _RISEN_CM
+        return level is not None and level > (10.0 if self._ground is None else self._ground) + _RISEN_CM
+
+    def _landed(self) -> bool:
+        """Whether the drone is on the ground to stay: one that was told to take off may be about to."""
+        came_down = self._rose or self.clock.now() - self._took_off_s > _RISE_TIMEOUT_S
+        return came_down and self._grounded()
 
     def _grounded(self) -> bool:
         """Whether fresh state says that the drone stands on the floor."""
@@ -550,20 +553,27 @@ class Tello:
         return ""
 
     def _watch(self) -> None:
-        """Keep the drone listening; end the flight when its state says so."""
+        """Keep the drone listening; end the flight when its state says so, and ask for that until it is down."""
         while not self._stopping.wait(0.1):
             now = self.clock.now()
-            reason = self._why_land(now) if self._airborne else ""
-            if reason and not self.stop_reason:
+            reason = self.stop_reason or self._why_land(now)
+            if self._airborne and reason and not self._leaving.is_set():
                 self.stop_reason = reason
-                logger.warning("%s: landing: %s", self.address.host, reason)
-                self._transmit("land")  # at once, even while another thread waits for the answer to a long move
-                try:
-                    self.land()
-                except TelloError as error:
-                    logger.error("%s", error)
+                self._land_because(reason)
             elif now - self._last_sent_s > self.limits.keep_alive_s and math.isfinite(self._last_sent_s):
                 self._keep_alive()
+
+    def _land_because(self, reason: str) -> None:
+        failure = ""
+        try:
+            self.land()
+        except TelloError as error:
+            failure = str(error)
+        # Said once it is done: a terminal that is stopped would hold up the landing.
+        if failure:
+            logger.error("%s", failure)
+        else:
+            logger.warning("%s: landed: %s", self.address.host, reason)
 
     def _why_land(self, now: float) -> str:
         state_s = self.latest.stamp_s if self.latest is not None else self._flight_begin_s
@@ -574,6 +584,8 @@ class Tello:
             picture_s = max(newest.stamp_s if newest is not None else 0.0, self._video_begin_s, self._flight_begin_s)
             if now - picture_s > self.limits.video_loss_s:
                 return f"no video for {self.limits.video_loss_s:.0f} s"
+        if self._rose and self._grounded() and not self._over():
+            return "the drone came down by itself"
         return self._unfit()
 
     def _keep_alive(self) -> None:

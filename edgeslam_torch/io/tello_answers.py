@@ -2,6 +2,17 @@
 
 import re
 
+from edgeslam_torch.errors import EdgeSlamError
+
+
+class TelloError(EdgeSlamError):
+    """The drone does not answer, refuses, or may not do what was asked."""
+
+
+class NoAnswer(TelloError):
+    """A command was sent and nothing came back: it may have been heard or not."""
+
+
 REFUSALS = (
     "error",
     "unknown command",

@@ -1,7 +1,7 @@
 """A Tello's H.264 stream: datagrams in, the newest decoded picture with its arrival time out."""
 
 import importlib
-import socket
+import logging
 import threading
 import time
 from collections.abc import Callable
@@ -11,6 +11,9 @@ from typing import Any
 import numpy as np
 
 from edgeslam_torch.errors import SourceError
+from edgeslam_torch.io.udp import Inlet
+
+logger = logging.getLogger(__name__)
 
 CHUNK = 1460
 """Bytes of a full datagram; a shorter one ends a picture."""
@@ -101,25 +104,30 @@ class PictureAssembler:
 
 
 class VideoReceiver:
-    """Socket and decoder in a thread; `newest` is the last whole picture."""
+    """Socket and decoder in a thread; `newest` is the last whole picture.
+
+    Args:
+        bind: Where to listen.
+        clock: For the stamps.
+        host: Numeric address of the drone; what anybody else sends is refused.
+        on_picture: Called for each picture, from the video thread.
+
+    Raises:
+        SourceError: If PyAV is missing or the port is taken.
+    """
 
     def __init__(
-        self, bind: tuple[str, int], clock: ArrivalClock, on_picture: Callable[[Picture], None] | None = None
+        self,
+        bind: tuple[str, int],
+        clock: ArrivalClock,
+        host: str,
+        on_picture: Callable[[Picture], None] | None = None,
     ) -> None:
-        """Open the socket.
-
-        Raises:
-            SourceError: If PyAV is missing or the port is taken.
-        """
         self._assembler = PictureAssembler()
         self._clock, self._on_picture = clock, on_picture
-        self._socket = open_udp(bind, "video")
-        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
-        self._socket.settimeout(0.2)
-        self.port = int(self._socket.getsockname()[1])
+        self._inlet = Inlet(bind, "video", host, _RECEIVE_BUFFER)
         self._ready = threading.Condition()
         self._newest: Picture | None = None
-        self.last_datagram_s: float | None = None
         self._stopping = False
         self._thread = threading.Thread(target=self._work, name="tello-video", daemon=True)
         self._thread.start()
@@ -134,6 +142,11 @@ class VideoReceiver:
         """Pictures decoded and undecodable."""
         return {"decoded": self._assembler.decoded, "undecodable": self._assembler.undecodable}
 
+    @property
+    def refused(self) -> int:
+        """Packets that did not come from the drone."""
+        return self._inlet.refused
+
     def wait(self, after_count: int, timeout_s: float) -> Picture | None:
         """The newest picture once it is later than ``after_count``; None when time is up."""
         with self._ready:
@@ -144,44 +157,28 @@ class VideoReceiver:
         return self._newest is not None and self._newest.count > count
 
     def _work(self) -> None:
-        while not self._stopping:
-            try:
-                datagram, _ = self._socket.recvfrom(65536)
-            except TimeoutError:
-                continue
-            except OSError:
-                return  # closed
-            stamp = self._clock.now()
-            self.last_datagram_s = stamp
-            for picture in self._assembler.feed(datagram, stamp):
+        for datagram in self._inlet.packets():
+            for picture in self._assembler.feed(datagram, self._clock.now()):
                 with self._ready:
                     self._newest = picture
                     self._ready.notify_all()
                 if self._on_picture is not None:
-                    self._on_picture(picture)
+                    self._tell(picture)
+
+    def _tell(self, picture: Picture) -> None:
+        """A listener that fails must not end the video of a drone in the air."""
+        assert self._on_picture is not None
+        try:
+            self._on_picture(picture)
+        except Exception:
+            logger.exception("what listens to pictures failed, and is not called again")
+            self._on_picture = None
 
     def stop(self) -> None:
         """Close the socket and end the thread."""
         self._stopping = True
+        self._inlet.stop()
         with self._ready:
             self._ready.notify_all()
         self._thread.join(timeout=2.0)
-        self._socket.close()
-
-
-def open_udp(address: tuple[str, int], purpose: str) -> socket.socket:
-    """A bound UDP socket.
-
-    Raises:
-        SourceError: If the address cannot be bound.
-    """
-    udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    try:
-        udp.bind(address)
-    except OSError as error:
-        udp.close()
-        reason = error.strerror or str(error)
-        raise SourceError(
-            f"{purpose} port {address[1]} on {address[0]}: {reason}; is another client running?"
-        ) from error
-    return udp
+        self._inlet.close()

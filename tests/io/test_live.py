@@ -20,6 +20,9 @@ class FakeFeed:
     def wait(self, after_count, timeout_s):
         return next((p for p in self.pictures if p.count > after_count), None)
 
+    def remarks(self):
+        return ["3 packets refused"]
+
     def close(self):
         self.closed += 1
 
@@ -40,6 +43,29 @@ def test_device_is_given_back_when_the_taker_stops_early():
     next(frames)
     frames.close()
     assert feed.closed == 1
+
+
+def test_a_source_that_is_told_to_end_ends_while_it_waits():
+    feed = FakeFeed([1, 2])
+    source = LiveSource("webcam:0", feed, [], None, None, is_drone=False)
+    wait = feed.wait
+
+    def silent(after_count, timeout_s):
+        if after_count == 2:
+            source.end()
+        return wait(after_count, timeout_s)
+
+    feed.wait = silent
+    assert len(list(source.frames())) == 2
+    assert source.problems == []
+    assert feed.closed == 1
+
+
+def test_remarks_on_what_came_are_warnings_once():
+    source = LiveSource("webcam:0", FakeFeed([1]), [], None, None, is_drone=False)
+    assert len(list(source.frames())) == 1
+    source.close()
+    assert [w for w in source.warnings if "refused" in w] == ["webcam:0: 3 packets refused"]
 
 
 def test_number_of_frames_can_be_limited():

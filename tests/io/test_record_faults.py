@@ -4,56 +4,22 @@ Nothing here asserts how long anything takes; what must happen in the end is wai
 """
 
 import json
+import re
 import threading
 from contextlib import closing, contextmanager
 
 import numpy as np
 import pytest
+from emulated import PATIENCE_S, emulated, on_the_floor, until
 
 from edgeslam_torch.cli import main
-from edgeslam_torch.emulator.drone import DroneModel, Mode
-from edgeslam_torch.emulator.link import LinkFaults
-from edgeslam_torch.emulator.server import EmulatorConfig, TelloEmulator
+from edgeslam_torch.emulator.drone import Mode
+from edgeslam_torch.emulator.encoder import Encoder
+from edgeslam_torch.errors import SourceError
 from edgeslam_torch.io.source import open_source
-from edgeslam_torch.io.tello_video import open_udp
+from edgeslam_torch.io.udp import open_udp
 
 pytest.importorskip("av", reason="PyAV is not installed: the [drone] extra")
-PATIENCE_S = 120.0
-
-
-class SwiftDrone(DroneModel):
-    """Lives four times as fast."""
-
-    def step(self, dt):
-        for _ in range(4):
-            super().step(dt)
-
-
-@contextmanager
-def emulated(**link):
-    """An emulator with a textured picture and the address to record from."""
-    ports = []
-    for _ in range(2):
-        with open_udp(("127.0.0.1", 0), "free") as udp:
-            ports.append(udp.getsockname()[1])
-    faults = LinkFaults(video_latency_s=0.02, **link)
-    config = EmulatorConfig(
-        command_port=0, state_port=ports[0], video_port=ports[1], width=320, height=240, link=faults
-    )
-    with TelloEmulator(config, render=speckled(), drone=SwiftDrone()) as emulator:
-        yield emulator, f"tello://127.0.0.1:{emulator.command_port}:{ports[0]}:{ports[1]}"
-
-
-def speckled():
-    """A wall of blobs that moves with the drone."""
-    rng = np.random.default_rng(0)
-    wall = np.kron(rng.integers(0, 256, (60, 80), dtype=np.uint8), np.ones((8, 8), np.uint8))
-
-    def render(T_w_b):
-        row, column = (int(np.clip(100 + 100 * x, 0, n)) for x, n in ((T_w_b[2, 3], 240), (T_w_b[1, 3], 320)))
-        return np.repeat(wall[row : row + 240, column : column + 320, None], 3, axis=2)
-
-    return render
 
 
 @contextmanager
@@ -74,16 +40,6 @@ def wait_until(condition, stop):
         pass
 
 
-def landed(emulator):
-    """Whether the drone comes to stand; one that hears nothing comes down by itself."""
-    stop = threading.Event()
-    timer = threading.Timer(PATIENCE_S, stop.set)
-    timer.start()
-    wait_until(lambda: emulator.drone.mode is Mode.GROUND, stop)
-    timer.cancel()
-    return emulator.drone.mode is Mode.GROUND
-
-
 def check_flight(folder, tmp_path, least_frames):
     """Every frame and message that was listed is there, and ``edgeslam run`` takes the folder."""
     source = open_source(folder)
@@ -101,15 +57,17 @@ def check_flight(folder, tmp_path, least_frames):
     return frames
 
 
+def record(url, folder, *options):
+    return main(["record", url, "--out", str(folder), "--fly", *options])
+
+
 @pytest.mark.slow
 def test_one_packet_in_twenty_lost(tmp_path, capsys):
     with emulated(loss=0.05) as (emulator, url):
-        code = main(["record", url, "--out", str(tmp_path / "flight"), "--fly", "--max-frames", "150"])
-        assert landed(emulator)
-    said = capsys.readouterr()
-    assert code == 0 or "no answer" in said.err or "ended" in said.out
-    assert "frames," in said.out
-    check_flight(tmp_path / "flight", tmp_path, 30)
+        assert record(url, tmp_path / "flight", "--max-frames", "150") == 0
+        assert on_the_floor(emulator)
+    assert "150 frames" in capsys.readouterr().out
+    check_flight(tmp_path / "flight", tmp_path, 150)
 
 
 @pytest.mark.slow
@@ -123,11 +81,10 @@ def test_an_outage_of_three_seconds(tmp_path, capsys):
             emulator.link.cut = False
 
         with meanwhile(cut):
-            code = main(["record", url, "--out", str(tmp_path / "flight"), "--fly", "--max-frames", "200"])
-        assert landed(emulator)
-    said = capsys.readouterr()
-    assert code == 0 or "no answer" in said.err or "ended" in said.err
-    frames = check_flight(tmp_path / "flight", tmp_path, 60)
+            assert record(url, tmp_path / "flight", "--max-frames", "200") == 0
+        assert on_the_floor(emulator)
+    assert "200 frames" in capsys.readouterr().out
+    frames = check_flight(tmp_path / "flight", tmp_path, 200)
     gap = int(np.argmax(np.diff([f.stamp_s for f in frames])))
     assert frames[gap + 1].stamp_s - frames[gap].stamp_s > 2.0
     assert gap + 2 < len(frames)  # it went on
@@ -135,6 +92,7 @@ def test_an_outage_of_three_seconds(tmp_path, capsys):
 
 @pytest.mark.slow
 def test_a_drone_that_stops_answering(tmp_path, capsys):
+    """The one flight here that fails: the drone hears us no more, and comes down by itself."""
     with emulated() as (emulator, url):
 
         def freeze(stop):
@@ -142,16 +100,16 @@ def test_a_drone_that_stops_answering(tmp_path, capsys):
             emulator.frozen = True
 
         with meanwhile(freeze):
-            main(["record", url, "--out", str(tmp_path / "flight"), "--fly"])
-        assert landed(emulator)
-    said = capsys.readouterr()
-    assert "the flight was ended: no " in said.out
-    assert "no picture for 10 s" in said.out or "ended" in said.err
+            assert record(url, tmp_path / "flight") == 1
+        until(lambda: on_the_floor(emulator))
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert re.fullmatch(r"edgeslam: error: 127.0.0.1: the flight was ended: no (state|video) for 5 s", error)
     check_flight(tmp_path / "flight", tmp_path, 5)
 
 
 @pytest.mark.slow
 def test_garbage_on_every_port(tmp_path, capsys):
+    """Sent by the drone itself, and by others on its own address, where no filter tells them apart."""
     with emulated(garbage=0.2) as (emulator, url):
         ports = [int(port) for port in url.rsplit(":", 3)[1:]]
 
@@ -163,11 +121,38 @@ def test_garbage_on_every_port(tmp_path, capsys):
                         udp.sendto(rng.bytes(int(rng.integers(1, 1400))), ("127.0.0.1", port))
 
         with meanwhile(shout):
-            code = main(["record", url, "--out", str(tmp_path / "flight"), "--fly", "--max-frames", "100"])
-        assert landed(emulator)
+            assert record(url, tmp_path / "flight", "--max-frames", "100") == 0
+        assert on_the_floor(emulator)
+    assert "100 frames" in capsys.readouterr().out
+    check_flight(tmp_path / "flight", tmp_path, 100)
+
+
+@pytest.mark.slow
+def test_strangers_change_nothing_and_are_told_of(tmp_path, capsys):
+    """A film and an empty battery from another address: the recording holds the drone's own pictures alone."""
+    try:
+        other = open_udp(("127.0.0.2", 0), "stranger")
+    except SourceError:
+        pytest.skip("this system has one loopback address")
+    film = Encoder(64, 48, 30)
+    with other, emulated() as (emulator, url):
+        state, video = (("127.0.0.1", int(port)) for port in url.rsplit(":", 2)[1:])
+
+        def shout(stop):
+            while not stop.wait(0.01):
+                other.sendto(b"pitch:0;bat:1;h:0;tof:10;vgz:0;", state)
+                for packet in film.encode(np.zeros((48, 64, 3), np.uint8)):
+                    other.sendto(packet, video)
+
+        with meanwhile(shout):
+            assert record(url, tmp_path / "flight", "--max-frames", "60") == 0
+        assert on_the_floor(emulator)
     said = capsys.readouterr()
-    assert code == 0 or "no answer" in said.err or "ended" in said.out + said.err
-    check_flight(tmp_path / "flight", tmp_path, 30)
+    assert re.search(r"warning: .* packets from others than the drone were refused \(video \d+, state \d+\)", said.out)
+    assert "video port: packets from 127.0.0.2 are refused; only 127.0.0.1 is listened to" in said.err
+    frames = check_flight(tmp_path / "flight", tmp_path, 60)
+    assert {f.image.shape for f in frames} == {(240, 320, 3)}
+    assert "bat:1;" not in (tmp_path / "flight" / "state.txt").read_text()
 
 
 @pytest.mark.slow

@@ -7,9 +7,12 @@ from free_ports import free_ports
 from edgeslam_torch.cli import main
 from edgeslam_torch.emulator.link import LinkFaults
 from edgeslam_torch.emulator.server import EmulatorConfig, TelloEmulator
-from edgeslam_torch.io.live import open_tello
+from edgeslam_torch.io import flight_writer, tee
+from edgeslam_torch.io.live import LiveSource, open_tello
 from edgeslam_torch.io.source import open_source
 from edgeslam_torch.io.tee import RecordedLive
+from edgeslam_torch.io.tello import StateMessage
+from edgeslam_torch.io.tello_video import Picture
 
 pytest.importorskip("av", reason="PyAV is not installed: the [drone] extra")
 
@@ -40,6 +43,56 @@ def test_a_recorded_live_source_gives_again_what_it_gave(address, tmp_path):
         np.testing.assert_array_equal(sample.rpy_rad, told.rpy_rad)
         assert sample.tof_m == told.tof_m
     assert again.camera.K.tolist() == live.camera.K.tolist()
+
+
+@pytest.mark.parametrize("failure", [OSError(28, "No space left on device"), RuntimeError("bug")])
+@pytest.mark.parametrize("kind", ["FlightWriter.add_frame", "TelemetryWriter.write"])
+def test_a_writer_that_fails_ends_the_recording_and_not_the_flight(tmp_path, monkeypatch, kind, failure):
+    """More frames than may wait for the disk: nobody waits for a writer that is gone."""
+    monkeypatch.setattr(tee, "_WAITING", 3)
+    owner, name = kind.split(".")
+    write, calls = getattr(getattr(flight_writer, owner), name), []
+
+    def fail(self, *args):
+        calls.append(name)
+        if len(calls) > 5:
+            raise failure
+        return write(self, *args)
+
+    monkeypatch.setattr(getattr(flight_writer, owner), name, fail)
+    feed = ManyPictures(40)
+    telemetry, messages = [], feed.messages
+    source = LiveSource("tello://test", feed, telemetry, None, 40, is_drone=True)
+    live = RecordedLive(source, messages, tmp_path / "flight", lossless=False)
+    assert len(list(live.frames())) == 40
+    assert feed.closed
+    assert len(live.problems) == 1
+    assert str(failure.args[-1]) in live.problems[0].reason
+    again = open_source(tmp_path / "flight")
+    assert len(list(again.frames())) >= 1
+    assert not again.problems
+
+
+class ManyPictures:
+    """Pictures that are there at once, each with a state message."""
+
+    def __init__(self, count):
+        self.count, self.closed = count, 0
+        self.messages = []
+
+    def wait(self, after_count, timeout_s):
+        if after_count >= self.count:
+            return None
+        stamp = 100.0 + 0.1 * after_count
+        if after_count == len(self.messages):
+            self.messages.append(StateMessage(stamp, "bat:90;", {"bat": 90.0}))
+        return Picture(stamp, np.full((48, 64, 3), after_count, np.uint8), after_count + 1)
+
+    def remarks(self):
+        return []
+
+    def close(self):
+        self.closed += 1
 
 
 def test_a_folder_that_cannot_be_written_leaves_the_drone_alone(address, tmp_path, capsys):

@@ -1,20 +1,25 @@
 """Our client against the emulator, on loopback and in real time; waiting is for conditions, not for times."""
 
+import _thread
 import importlib
 import os
 import socket
 import threading
 import time
 from contextlib import closing
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from emulated import PATIENCE_S, SwiftDrone, listen_in, until
 from free_ports import free_ports
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import edgeslam_torch.io.tello as tello_module
 from edgeslam_torch.emulator.commands import Answer, Reply
-from edgeslam_torch.emulator.drone import DroneModel, Mode
+from edgeslam_torch.emulator.drone import Mode
+from edgeslam_torch.emulator.encoder import Encoder
 from edgeslam_torch.emulator.link import LinkFaults
 from edgeslam_torch.emulator.server import EmulatorConfig, TelloEmulator
 from edgeslam_torch.errors import SourceError
@@ -22,25 +27,6 @@ from edgeslam_torch.io.tello import Tello, TelloAddress, TelloError, TelloLimits
 from edgeslam_torch.io.tello_answers import belongs_to
 
 av = pytest.importorskip("av", reason="PyAV is not installed: the [drone] extra")
-
-
-PATIENCE_S = 60.0
-"""For what must happen in the end, however busy the machine is; nothing waits this long when all is well."""
-
-
-def until(condition, seconds=PATIENCE_S):
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, "not in time"
-        threading.Event().wait(0.01)
-
-
-class SwiftDrone(DroneModel):
-    """Lives four times as fast, so that the tests spend less time in the air."""
-
-    def step(self, dt):
-        for _ in range(4):
-            super().step(dt)
 
 
 @pytest.fixture
@@ -55,6 +41,8 @@ def emulate():
             link=link or LinkFaults(video_latency_s=0.05), **options,
         )  # fmt: skip
         emulator = TelloEmulator(config, drone=drone or SwiftDrone()).start()
+        emulator.heard = []
+        listen_in(emulator, lambda text: None)
         running.append(emulator)
         return emulator, TelloAddress("127.0.0.1", emulator.command_port, state, video)
 
@@ -209,6 +197,267 @@ def test_a_landing_ends_what_another_thread_waits_for(emulate):
         tello.take_off()
 
 
+LOST = Reply("", Answer.NEVER)
+
+
+def lose(emulator, command, count):
+    """Let the next ``count`` packets with this command be lost; returns the list of those that were."""
+    lost = []
+
+    def hear(text):
+        if text == command and len(lost) < count:
+            lost.append(text)
+            return LOST
+        return None
+
+    listen_in(emulator, hear)
+    return lost
+
+
+def test_a_landing_that_is_not_heard_is_asked_for_again(emulate, monkeypatch):
+    monkeypatch.setattr(tello_module, "_LAND_AGAIN_S", 0.5)
+    emulator, address = emulate()
+    with Tello(address, allow_motion=True) as tello:
+        tello.connect(PATIENCE_S)
+        tello.take_off()
+        lost = lose(emulator, "land", 3)
+        tello.land()
+        assert emulator.drone.mode is Mode.GROUND
+    assert len(lost) == 3
+
+
+def test_a_landing_that_fails_is_tried_again_as_long_as_the_drone_flies(emulate, monkeypatch):
+    """What a guard once began it does not give up: no keep-alive, that would hold the drone in the air."""
+    monkeypatch.setattr(tello_module, "_LAND_TRIES", 1)
+    monkeypatch.setattr(tello_module, "_LAND_AGAIN_S", 0.1)
+    emulator, address = emulate()
+    with Tello(address, allow_motion=True, limits=QUICK) as tello:
+        tello.connect(PATIENCE_S)
+        tello.take_off()
+        lost = lose(emulator, "land", 12)
+        emulator.heard.clear()
+        emulator.drone.battery = 0.08
+        until(lambda: emulator.drone.mode is Mode.GROUND)
+    assert len(lost) == 12
+    assert set(emulator.heard) <= {"land", "battery?", "streamoff"}
+
+
+def test_ctrl_c_in_the_landing_is_raised_when_the_drone_is_down(emulate):
+    emulator, address = emulate()
+
+    def impatient(text):
+        if text == "land":
+            _thread.interrupt_main()
+        return
+
+    with pytest.raises(KeyboardInterrupt), Tello(address, allow_motion=True) as tello:
+        tello.connect(PATIENCE_S)
+        tello.take_off()
+        listen_in(emulator, impatient)
+    assert emulator.drone.mode is Mode.GROUND
+
+
+def test_a_drone_that_comes_down_by_itself_ends_the_flight(emulate):
+    emulator, address = emulate()
+    with Tello(address, allow_motion=True, limits=QUICK) as tello:
+        tello.connect(PATIENCE_S)
+        tello.take_off()
+        until(lambda: tello.latest.fields["h"] > 50)
+        emulator.drone.land()  # as by the phone of somebody else
+        until(lambda: not tello.airborne)
+        assert tello.stop_reason == "the drone came down by itself"
+
+
+def pushed_and_centred(emulator):
+    return [text for text in emulator.heard if text.startswith("rc ")]
+
+
+def test_sticks_that_nobody_holds_any_more_are_centred(emulate):
+    """The controller is dead: one push, then nothing. The drone stands still, whatever keeps it listening."""
+    emulator, address = emulate()
+    with Tello(address, allow_motion=True, limits=QUICK) as tello:
+        tello.connect(PATIENCE_S)
+        tello.take_off()
+        begin = time.monotonic()
+        tello.rc(0.0, 0.5, 0.0, 0.0)
+        until(lambda: "rc 0 0 0 0" in emulator.heard)
+        assert time.monotonic() - begin > 0.3
+        until(lambda: tello.query("battery?") and np.linalg.norm(emulator.drone.velocity) < 0.01)
+        assert emulator.drone.rc == (0.0, 0.0, 0.0, 0.0)
+        assert pushed_and_centred(emulator)[0] == "rc 0 50 0 0"
+        assert set(pushed_and_centred(emulator)[1:]) == {"rc 0 0 0 0"}
+
+
+def test_sticks_are_centred_while_the_controller_waits_for_an_answer(emulate):
+    """Whatever the program does: here it pushes the sticks and then hangs on a question that nobody answers."""
+    emulator, address = emulate()
+    limits = TelloLimits(timeout_s=PATIENCE_S, retries=0, keep_alive_s=PATIENCE_S)
+    with Tello(address, allow_motion=True, limits=limits) as tello:
+        tello.connect(PATIENCE_S)
+        tello.take_off()
+        lose(emulator, "sn?", 1)
+
+        def control():
+            tello.rc(0.0, 0.0, 0.0, 1.0)
+            with pytest.raises(TelloError):
+                tello.send("sn?")
+
+        controller = threading.Thread(target=control)
+        controller.start()
+        until(lambda: "rc 0 0 0 0" in emulator.heard)
+        assert controller.is_alive()
+    controller.join()
+
+
+def test_centred_sticks_that_are_lost_are_said_again(emulate):
+    emulator, address = emulate()
+    with Tello(address, allow_motion=True) as tello:
+        tello.connect(PATIENCE_S)
+        tello.take_off()
+        lost = lose(emulator, "rc 0 0 0 0", 5)
+        tello.rc(0.0, 0.5, 0.0, 0.0)
+        until(lambda: "rc 0 0 0 0" in emulator.heard)
+    assert len(lost) == 5
+
+
+def test_a_controller_that_goes_on_is_not_disturbed(emulate):
+    emulator, address = emulate()
+    with Tello(address, allow_motion=True) as tello:
+        tello.connect(PATIENCE_S)
+        tello.take_off()
+        stop = time.monotonic() + 1.0
+        while time.monotonic() < stop:
+            tello.rc(0.0, 0.0, 0.0, 0.2)
+            threading.Event().wait(0.02)
+        assert set(pushed_and_centred(emulator)) == {"rc 0 0 0 20"}
+
+
+def test_a_movement_takes_the_sticks_out_of_the_hand(emulate):
+    """One ``rc`` that centres them, then the movement, and no more ``rc`` into it."""
+    emulator, address = emulate()
+    with Tello(address, allow_motion=True) as tello:
+        tello.connect(PATIENCE_S)
+        tello.take_off()
+        tello.rc(0.0, 0.0, 0.0, 0.3)
+        tello.move(2.0, 0.0, 0.0)
+        begin = emulator.heard.index("rc 0 0 0 30")
+        assert emulator.heard[begin : begin + 3] == ["rc 0 0 0 30", "rc 0 0 0 0", "go 200 0 0 40"]
+        assert not pushed_and_centred(emulator)[2:]
+
+
+def test_sticks_cannot_be_pushed_once_a_landing_is_wanted(emulate):
+    emulator, address = emulate()
+    refused = []
+
+    def push():
+        while not refused:
+            try:
+                tello.rc(0.0, 0.0, 0.0, 0.3)
+            except TelloError as error:
+                refused.append(str(error))
+
+    with Tello(address, allow_motion=True) as tello:
+        tello.connect(PATIENCE_S)
+        tello.take_off()
+        controller = threading.Thread(target=push)
+        controller.start()
+        until(lambda: "rc 0 0 0 30" in emulator.heard)
+    controller.join()
+    assert "landing" in refused[0]
+    assert "rc 0 0 0 30" not in emulator.heard[emulator.heard.index("land") :]
+
+
+@pytest.fixture
+def stranger():
+    """A socket on another address than the drone's."""
+    with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as other:
+        try:
+            other.bind(("127.0.0.2", 0))
+        except OSError:
+            pytest.skip("this system has one loopback address")
+        yield other
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "localhost", "127.1"])
+def test_pictures_of_strangers_are_refused(emulate, stranger, caplog, host):
+    """A stranger's whole film, keyframe first, shows nowhere; that it came is counted and said once."""
+    _, address = emulate()
+    film = [packet for k in range(5) for packet in Encoder(64, 48, 30).encode(np.full((48, 64, 3), 40 * k, np.uint8))]
+    sizes = set()
+    with Tello(replace(address, host=host), on_picture=lambda p: sizes.add(p.image.shape)) as tello:
+        tello.connect(PATIENCE_S)
+        video = tello.start_video()
+        for packet in film:
+            stranger.sendto(packet, ("127.0.0.1", address.video_port))
+        until(lambda: video.refused == len(film))
+        assert video.wait(10, PATIENCE_S) is not None
+    assert sizes == {(240, 320, 3)}
+    assert tello.refused == {"video": len(film), "state": 0, "answers": 0}
+    said = [record.message for record in caplog.records if "refused" in record.message]
+    assert said == ["video port: packets from 127.0.0.2 are refused; only 127.0.0.1 is listened to"]
+
+
+def test_state_of_strangers_is_refused(emulate, stranger):
+    """Nobody else lands our drone by telling of an empty battery."""
+    _, address = emulate()
+    with Tello(address, allow_motion=True) as tello:
+        tello.connect(PATIENCE_S)
+        tello.take_off()
+        for _ in range(3):
+            stranger.sendto(b"pitch:0;bat:1;h:0;tof:10;vgz:0;", ("127.0.0.1", address.state_port))
+        until(lambda: tello.refused["state"] == 3)
+        seen = tello.latest.stamp_s
+        until(lambda: tello.latest.stamp_s > seen)
+        assert tello.airborne
+        assert tello.stop_reason == ""
+        assert tello.latest.fields["bat"] > 90
+
+
+def test_answers_of_strangers_are_refused(emulate, stranger):
+    emulator, address = emulate()
+    limits = TelloLimits(timeout_s=PATIENCE_S, retries=0)
+    with Tello(address, limits=limits) as tello:
+        tello.connect(PATIENCE_S)
+        listen_in(emulator, answer_late := Late(lambda: tello.refused["answers"] == 1))
+        port = tello._commands.port
+        asked = threading.Thread(target=lambda: until(lambda: answer_late.asked.is_set()))
+        asked.start()
+        answers = []
+        question = threading.Thread(target=lambda: answers.append(tello.query("battery?")))
+        question.start()
+        asked.join()
+        stranger.sendto(b"7", ("127.0.0.1", port))
+        question.join()
+    assert answers == [100.0]
+
+
+class Late:
+    """Answers the battery's charge once a condition holds."""
+
+    def __init__(self, condition):
+        self.condition, self.asked = condition, threading.Event()
+
+    def __call__(self, text):
+        if text == "battery?":
+            self.asked.set()
+            until(self.condition)
+
+
+def test_listeners_that_fail_do_not_end_state_or_video(emulate, caplog):
+    _, address = emulate()
+
+    def fail(what):
+        raise RuntimeError("disk on fire")
+
+    with Tello(address, on_state=fail, on_picture=fail) as tello:
+        tello.connect(PATIENCE_S)
+        video = tello.start_video()
+        assert video.wait(5, PATIENCE_S) is not None
+        seen = tello.latest.stamp_s
+        until(lambda: tello.latest.stamp_s > seen)
+    assert sum("is not called again" in record.message for record in caplog.records) == 2
+
+
 def test_late_answers_and_noise_are_not_taken_for_an_answer():
     assert belongs_to("battery?", "87")
     assert belongs_to("sn?", "0TQDF123")
@@ -268,8 +517,8 @@ def test_refusals_of_the_drone_are_reported(emulate):
 def test_sockets_stay_on_loopback(emulate):
     _, address = emulate()
     with Tello(address) as tello:
-        assert tello._state_socket.getsockname()[0] == "127.0.0.1"
-        assert tello._command_socket.getsockname()[0] == "127.0.0.1"
+        assert tello._states.socket.getsockname()[0] == "127.0.0.1"
+        assert tello._commands.socket.getsockname()[0] == "127.0.0.1"
 
 
 def test_stamps_follow_the_delay_of_the_video(emulate):
@@ -312,7 +561,6 @@ def test_any_address_is_read_or_refused(text):
 
 
 def test_video_survives_a_start_in_mid_stream_lost_packets_and_garbage(rng):
-    from edgeslam_torch.emulator.encoder import Encoder
     from edgeslam_torch.io.tello_video import PictureAssembler
 
     encoder, assembler = Encoder(320, 240, 30), PictureAssembler()

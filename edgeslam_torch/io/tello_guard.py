@@ -1,0 +1,140 @@
+"""A process of its own that lands a drone whose program is gone, and stops one whose program hangs.
+
+A program that is killed (out of memory, a fault in a decoder, ``kill -9``) can say nothing any more, and a real drone
+then flies on for 15 s with the sticks as they were last. The guard holds the program's command socket, hears a byte
+every few milliseconds through a pipe, and acts when they stay away. It runs this very file and loads nothing else.
+"""
+
+import os
+import select
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+
+_ALIVE, _PUSHED, _LANDED = b".", b"p", b"q"
+"""What the program tells: the sticks are centred; they are pushed; the drone is down and the guard may go."""
+_SILENCE_S = 0.5
+"""Without a word for so long the sticks are centred."""
+_HANGS_S = 5.0
+"""Without a word for so long the drone is landed, as without state or video."""
+_AGAIN_S = 0.5
+_LAND_TRIES = 20
+_SURE = 3
+"""Tries before an ``ok`` counts: the first may be that of an earlier command."""
+_CENTRED = b"rc 0 0 0 0"
+
+
+class Guard:
+    """The program's end.
+
+    Args:
+        commands: Socket that the drone knows us by.
+        drone: Numeric address and command port of the drone.
+
+    Raises:
+        OSError: If the process cannot be started.
+    """
+
+    def __init__(self, commands: socket.socket, drone: tuple[str, int]) -> None:
+        number = commands.fileno()
+        self._process = subprocess.Popen(
+            [sys.executable, "-I", "-S", __file__, str(number), drone[0], str(drone[1])],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            pass_fds=[number],
+            start_new_session=True,  # what the terminal sends does not reach it
+            bufsize=0,
+        )
+        assert self._process.stdin is not None
+        self._pipe = self._process.stdin
+        self._lock = threading.Lock()
+        os.set_blocking(self._pipe.fileno(), False)
+
+    def beat(self, pushed: bool) -> None:
+        """Tell that the program lives; at least every 0.2 s."""
+        self._tell(_PUSHED if pushed else _ALIVE)
+
+    def dismiss(self, landed: bool) -> None:
+        """Let it go; it still asks for a landing by itself when the drone has not landed."""
+        if landed:
+            self._tell(_LANDED)
+        with self._lock:
+            self._pipe.close()
+        if landed:
+            try:
+                self._process.wait(timeout=5.0)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+
+    def _tell(self, word: bytes) -> None:
+        with self._lock:
+            if self._pipe.closed:
+                return
+            try:
+                self._pipe.write(word)
+            except OSError:  # it was killed, or is stopped: the program is what counts then
+                return
+
+
+def watch(pipe: int, commands: socket.socket, drone: tuple[str, int]) -> None:
+    """Until the program says that the drone is down, is gone, or hangs."""
+    pushed, silent_s = False, 0.0
+    while silent_s < _HANGS_S:
+        if not select.select([pipe], [], [], _SILENCE_S)[0]:
+            silent_s += _SILENCE_S
+            if pushed:
+                _send(commands, _CENTRED, drone)
+            continue
+        silent_s, heard = 0.0, os.read(pipe, 4096)
+        if not heard:
+            break
+        if heard.endswith(_LANDED):
+            return
+        pushed = heard.endswith(_PUSHED)
+    land(commands, drone)
+
+
+def land(commands: socket.socket, drone: tuple[str, int]) -> None:
+    """Ask for a landing until it is answered, or long enough."""
+    commands.settimeout(_AGAIN_S)
+    for attempt in range(_LAND_TRIES):
+        _send(commands, _CENTRED, drone)
+        _send(commands, b"land", drone)
+        again_s = time.monotonic() + _AGAIN_S
+        while time.monotonic() < again_s:
+            if _agreed(commands, drone) and attempt >= _SURE:
+                return
+
+
+def _agreed(commands: socket.socket, drone: tuple[str, int]) -> bool:
+    try:
+        packet, sender = commands.recvfrom(2048)
+    except TimeoutError:
+        return False
+    except OSError:
+        time.sleep(_AGAIN_S)
+        return False
+    return sender[0] == drone[0] and packet.lower().startswith(b"ok")
+
+
+def _send(commands: socket.socket, packet: bytes, drone: tuple[str, int]) -> None:
+    try:
+        commands.sendto(packet, drone)
+    except OSError:
+        return  # no network at the moment; it is sent again
+
+
+def main() -> None:
+    """The guard's process: number of the inherited socket, host and port of the drone."""
+    number, host, port = sys.argv[1:]
+    for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT"):
+        signal.signal(getattr(signal, name), signal.SIG_IGN)
+    watch(sys.stdin.fileno(), socket.socket(fileno=int(number)), (host, int(port)))
+
+
+if __name__ == "__main__":
+    main()
