@@ -13,9 +13,9 @@ from edgeslam_torch.atomic import write_atomically
 from edgeslam_torch.errors import OutputError
 from edgeslam_torch.models.fastdepth import FastDepth
 from edgeslam_torch.models.fold import deployed
-from edgeslam_torch.models.record import Metadata, metadata_from_json
+from edgeslam_torch.models.onnx_file import INPUT, LOG_DEPTH, SIGMA
+from edgeslam_torch.models.record import HEADER_KEY, Metadata
 
-INPUT, LOG_DEPTH, SIGMA = "image", "log_depth", "sigma_log"
 OLD_RUNTIME_IR, OLD_RUNTIME_OPSET = 9, 17
 """onnxruntime <= 1.16 (older boards) reads IR <= 9; opset 17 is safely inside what it knows."""
 
@@ -82,16 +82,7 @@ def set_opset(model: onnx.ModelProto, opset: int) -> onnx.ModelProto:
 def write_metadata(model: onnx.ModelProto, metadata: Metadata, options: ExportOptions) -> None:
     """Put the checkpoint's record, with this file's input size, into the model's properties."""
     record = asdict(metadata) | {"export_height": options.height, "export_width": options.width}
-    onnx.helper.set_model_props(model, {"edgeslam": json.dumps(record)})
-
-
-def read_onnx_metadata(path: Path) -> Metadata:
-    """The record inside a file written by `export_onnx`."""
-    model = onnx.load(str(path), load_external_data=False)
-    for prop in model.metadata_props:
-        if prop.key == "edgeslam":
-            return metadata_from_json(prop.value)
-    raise OutputError(f"{path}: holds no EdgeSLAM metadata; export it with `edgeslam export`")
+    onnx.helper.set_model_props(model, {HEADER_KEY: json.dumps(record)})
 
 
 def check_model(model: onnx.ModelProto, opset: int) -> None:

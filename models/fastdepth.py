@@ -1,80 +1,28 @@
 """FastDepth (Wofk et al., ICRA 2019) in its four published variants, under upstream's parameter names."""
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
-from enum import StrEnum
 from typing import NamedTuple
 
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from edgeslam_torch.errors import WeightsError
-from edgeslam_torch.models.mobilenet import Padding, encoder_layers
+from edgeslam_torch.models.layout import (
+    FULL,
+    INPUT_MULTIPLE,
+    LOG_SIGMA_RANGE,
+    MAX_DEPTH_M,
+    MAX_LOG_DEPTH,
+    MIN_DEPTH_M,
+    PRUNED,
+    SKIP_INTO,
+    Output,
+    Padding,
+    Variant,
+    Widths,
+)
+from edgeslam_torch.models.mobilenet import encoder_layers
 
-
-class Variant(StrEnum):
-    """The paper's four networks."""
-
-    NNCONV5 = "mobilenet-nnconv5"
-    NNCONV5DW = "mobilenet-nnconv5dw"
-    SKIPADD = "mobilenet-nnconv5dw-skipadd"
-    PRUNED = "mobilenet-nnconv5dw-skipadd-pruned"
-
-    @property
-    def has_skips(self) -> bool:
-        """Whether encoder features are added to the decoder's."""
-        return self in (Variant.SKIPADD, Variant.PRUNED)
-
-
-class Output(StrEnum):
-    """What the last layer means."""
-
-    DEPTH = "depth"
-    """ReLU of the last layer is depth in metres (upstream)."""
-    LOG_DEPTH = "log_depth"
-    """The exponential of the last layer is depth: positive everywhere, relative errors weigh the same near
-    and far."""
-
-
-@dataclass(frozen=True, slots=True)
-class Widths:
-    """Output channels of every layer."""
-
-    encoder: tuple[int, ...]
-    """conv0 ... conv13."""
-    decoder: tuple[int, ...]
-    """decode_conv1 ... decode_conv5; decode_conv6 has one channel."""
-
-    @staticmethod
-    def of_state_dict(state: Mapping[str, Tensor]) -> "Widths":
-        """Read the widths off a checkpoint's shapes, whichever variant it is.
-
-        Raises:
-            WeightsError: If a layer is missing.
-        """
-        skips = "conv0.0.weight" in state
-        encoder, decoder = ("conv", "decode_conv") if skips else ("mobilenet.", "decoder.conv")
-        try:
-            e = [state[f"{encoder}0.0.weight"].shape[0]]
-            e += [state[f"{encoder}{i}.3.weight"].shape[0] for i in range(1, 14)]
-            point = "1.0.weight" if f"{decoder}1.1.0.weight" in state else "0.weight"
-            d = [state[f"{decoder}{i}.{point}"].shape[0] for i in range(1, 6)]
-        except KeyError as missing:
-            raise WeightsError(f"not a FastDepth checkpoint: no parameter {missing}") from None
-        return Widths(tuple(e), tuple(d))
-
-
-FULL = Widths((32, 64, 128, 128, 256, 256, 512, 512, 512, 512, 512, 512, 1024, 1024), (512, 256, 128, 64, 32))
-PRUNED = Widths((16, 56, 88, 120, 144, 256, 408, 376, 272, 288, 296, 328, 480, 512), (200, 256, 120, 56, 16))
-_SKIP_INTO = {4: 1, 3: 3, 2: 5}
-"""Decoder layer -> encoder layer whose output is added after upsampling."""
-MIN_DEPTH_M, MAX_DEPTH_M = 1e-3, 100.0
-MAX_LOG_DEPTH = math.log(MAX_DEPTH_M)
-LOG_SIGMA_RANGE = (-4.0, 1.5)
-"""Of the uncertainty head: 2 % to a factor of 4.5."""
-INPUT_MULTIPLE = 32
-"""Height and width of an input must be multiples of this."""
+__all__ = ["FULL", "PRUNED", "FastDepth", "Output", "Padding", "Prediction", "Variant", "Widths"]
 
 
 class Prediction(NamedTuple):
@@ -179,15 +127,15 @@ class FastDepth(nn.Module):
         kept: dict[int, Tensor] = {}
         for i, layer in enumerate(self.encoder()):
             x = layer(x)
-            if self.variant.has_skips and i in _SKIP_INTO.values():
+            if self.variant.has_skips and i in SKIP_INTO.values():
                 kept[i] = x
         stages = self.decoder_layers()[:-1]
         for i, layer in enumerate(stages, start=1):
             x = layer(x)
             if i < len(stages):
                 x = _doubled(x)
-            if self.variant.has_skips and i in _SKIP_INTO:
-                x = x + kept[_SKIP_INTO[i]]
+            if self.variant.has_skips and i in SKIP_INTO:
+                x = x + kept[SKIP_INTO[i]]
         return x
 
 

@@ -8,6 +8,7 @@ Field numbers below are those of TFLite's ``schema.fbs``.
 """
 
 import re
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from torch import Tensor
 
 from edgeslam_torch.errors import WeightsError
 from edgeslam_torch.models.fastdepth import FastDepth
-from edgeslam_torch.models.mobilenet import Padding
+from edgeslam_torch.models.layout import Padding
 
 _DTYPES = {2: "<i4", 3: "u1"}
 """TFLite tensor types used here: INT32 (biases) and UINT8 (weights)."""
@@ -67,6 +68,13 @@ def read_tflite_encoder(path: Path) -> dict[tuple[int, str], tuple[Tensor, Tenso
         raise WeightsError(f"{path}: cannot read the encoder weights ({error.strerror})") from error
     if data[4:8] != b"TFL3":
         raise WeightsError(f"{path}: not a TFLite file")
+    try:
+        return _encoder(data)
+    except (struct.error, ValueError, TypeError, LookupError, OverflowError) as error:  # offsets that lead nowhere
+        raise WeightsError(f"{path}: damaged TFLite file ({str(error)[:80]})") from None
+
+
+def _encoder(data: bytes) -> dict[tuple[int, str], tuple[Tensor, Tensor]]:
     model = _Node(data, encode.Get(number_types.UOffsetTFlags.packer_type, data, 0))
     buffers = [b.array(0, "u1") for b in model.nodes(4)]
     found: dict[tuple[int, str], dict[str, np.ndarray]] = {}

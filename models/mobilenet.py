@@ -1,19 +1,9 @@
 """MobileNetV1 blocks under upstream FastDepth's names: the encoder is conv0 ... conv13."""
 
-from enum import StrEnum
-
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-
-class Padding(StrEnum):
-    """How the 3x3 convolutions of the encoder pad their input."""
-
-    SYMMETRIC = "symmetric"
-    """One pixel on every side (torch, the official FastDepth weights)."""
-    TF_SAME = "tf_same"
-    """TensorFlow's SAME: at stride 2 nothing before and one pixel after (the ImageNet encoder we start
-    from)."""
+from edgeslam_torch.models.layout import STRIDES, Padding
 
 
 class SameConv2d(nn.Conv2d):
@@ -50,10 +40,6 @@ def separable(inputs: int, outputs: int, stride: int, padding: Padding) -> nn.Se
         nn.BatchNorm2d(outputs),
         nn.ReLU6(inplace=True),
     )
-
-
-STRIDES = (2, 1, 2, 1, 2, 1, 2, 1, 1, 1, 1, 1, 2, 1)
-"""Stride of conv0 ... conv13."""
 
 
 def encoder_layers(widths: tuple[int, ...], padding: Padding) -> list[nn.Sequential]:

@@ -15,21 +15,14 @@ from typing import Any
 
 import numpy as np
 import onnx
-import safetensors.numpy
-from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
-from edgeslam_torch.errors import WeightsError
-from edgeslam_torch.models.record import Metadata, read_header
+from edgeslam_torch.models.layout import LOG_SIGMA_RANGE, MAX_DEPTH_M, MIN_DEPTH_M, SKIP_INTO, STRIDES
+from edgeslam_torch.models.onnx_file import INPUT, LOG_DEPTH, SIGMA
+from edgeslam_torch.models.record import HEADER_KEY, Metadata
+from edgeslam_torch.models.weights_file import Array, read_weights
 
-Array = NDArray[np.float32]
-INPUT, LOG_DEPTH, SIGMA = "image", "log_depth", "sigma_log"
-_STRIDES = (2, 1, 2, 1, 2, 1, 2, 1, 1, 1, 1, 1, 2, 1)
-_SKIP_INTO = {4: 1, 3: 3, 2: 5}
 _EPS = 1e-5
-MIN_DEPTH_M, MAX_DEPTH_M = 1e-3, 100.0
-LOG_SIGMA_RANGE = (-4.0, 1.5)
-"""As in `fastdepth`, which needs torch to be imported."""
 OPSET, IR_VERSION = 17, 9
 """Old enough for every onnxruntime since 1.15."""
 
@@ -38,15 +31,10 @@ def build_graph(path: Path) -> tuple[bytes, Metadata]:
     """Serialised ONNX model (dynamic height and width) and the record of a safetensors file.
 
     Raises:
-        WeightsError: If the file is missing, damaged or no FastDepth.
+        WeightsError: If the file is missing, damaged, no FastDepth, or holds what no trained network can.
     """
-    metadata = read_header(path)
-    try:
-        weights = {k: v.astype(np.float32) for k, v in safetensors.numpy.load_file(path).items()}
-        model = _Builder(weights, metadata).model()
-    except KeyError as missing:
-        raise WeightsError(f"{path}: not a FastDepth checkpoint: no parameter {missing}") from None
-    return model.SerializeToString(), metadata
+    weights, metadata = read_weights(path)
+    return _Builder(weights, metadata).model().SerializeToString(), metadata
 
 
 class _Builder:
@@ -63,7 +51,7 @@ class _Builder:
         kept: dict[int, str] = {}
         x = INPUT
         for i in range(14):
-            x = self.relu6(self.conv(x, f"{encoder}{i}.0", f"{encoder}{i}.1", _STRIDES[i]))
+            x = self.relu6(self.conv(x, f"{encoder}{i}.0", f"{encoder}{i}.1", STRIDES[i]))
             if i > 0:
                 x = self.relu6(self.conv(x, f"{encoder}{i}.3", f"{encoder}{i}.4"))
             kept[i] = x
@@ -71,8 +59,8 @@ class _Builder:
             x = self.decoder_layer(x, f"{decoder}{i}")
             if i < 5:
                 x = self.upsample(x)
-            if skips and i in _SKIP_INTO:
-                x = self.node("Add", x, kept[_SKIP_INTO[i]])
+            if skips and i in SKIP_INTO:
+                x = self.node("Add", x, kept[SKIP_INTO[i]])
         self.finish(x, f"{decoder}6.0", f"{decoder}6.1")
         size: list[str | int | None] = ["batch", 3, "height", "width"]
         out: list[str | int | None] = ["batch", 1, "half_height", "half_width"]
@@ -84,7 +72,7 @@ class _Builder:
             self.constants,
         )
         model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION)
-        helper.set_model_props(model, {"edgeslam": json.dumps(asdict(self.metadata))})
+        helper.set_model_props(model, {HEADER_KEY: json.dumps(asdict(self.metadata))})
         return model
 
     def decoder_layer(self, x: str, name: str) -> str:

@@ -17,7 +17,7 @@ import onnx
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
-from edgeslam_torch.models.export_onnx import INPUT, LOG_DEPTH, SIGMA
+from edgeslam_torch.models.onnx_file import INPUT, LOG_DEPTH, SIGMA
 
 MIN_CALIBRATION_IMAGES = 8
 CALIBRATION_PERCENTILE = 99.99

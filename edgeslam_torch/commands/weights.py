@@ -3,8 +3,12 @@
 import argparse
 import dataclasses
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from edgeslam_torch.errors import ConfigError, OutputError
+
+if TYPE_CHECKING:
+    from edgeslam_torch.models.record import Metadata
 
 HELP = "list, download, convert and inspect depth-network weights"
 
@@ -21,7 +25,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     convert.add_argument("checkpoint", type=Path)
     convert.add_argument("--out", "-o", type=Path, required=True)
     inspect = actions.add_parser("inspect", help="print what a weights file says about itself")
-    inspect.add_argument("weights", nargs="?", type=Path, help="default: the shipped weights")
+    inspect.add_argument(
+        "weights", nargs="?", type=Path, help=".safetensors, .pt or .onnx (default: the shipped weights)"
+    )
 
 
 def main(args: argparse.Namespace) -> int:
@@ -32,7 +38,7 @@ def main(args: argparse.Namespace) -> int:
 
 def _list(_: argparse.Namespace) -> None:
     from edgeslam_torch.models.download import REMOTES, cache_folder, shipped
-    from edgeslam_torch.models.record import read_header
+    from edgeslam_torch.models.weights_file import read_header
 
     print(f"default  {read_header(shipped()).variant}  {shipped()}")
     for remote in REMOTES.values():
@@ -80,14 +86,30 @@ def _convert(args: argparse.Namespace) -> None:
 
 
 def _inspect(args: argparse.Namespace) -> None:
-    from edgeslam_torch.models.checkpoint import file_hash, load_checkpoint
-    from edgeslam_torch.models.complexity import measure_complexity
+    from edgeslam_torch.models.checkpoint import file_hash
     from edgeslam_torch.models.record import DEFAULT_WEIGHTS
 
     path = args.weights or DEFAULT_WEIGHTS
-    network, metadata = load_checkpoint(path)
-    size = measure_complexity(network, metadata.input_height, metadata.input_width)
-    print(f"{path}\nsha256 {file_hash(path)}")
-    print(f"{size.parameters / 1e6:.2f} M parameters, {size.macs / 1e9:.2f} GMAC per image")
+    size, metadata = _size_and_record(path)
+    print(f"{path}\nsha256 {file_hash(path)}{size}")
     for field in dataclasses.fields(metadata):
-        print(f"{field.name}: {getattr(metadata, field.name)}")
+        print(f"{field.name}: {_printable(str(getattr(metadata, field.name)))}")
+
+
+def _size_and_record(path: Path) -> "tuple[str, Metadata]":
+    if path.suffix == ".onnx":
+        from edgeslam_torch.models.onnx_file import read_onnx
+
+        return "", read_onnx(path)[1]
+    from edgeslam_torch.models.checkpoint import load_checkpoint
+    from edgeslam_torch.models.complexity import measure_complexity
+
+    network, metadata = load_checkpoint(path)
+    # Without numbers: counting needs shapes alone, whatever size of image the record names.
+    size = measure_complexity(network.to("meta"), metadata.input_height, metadata.input_width)
+    return f"\n{size.parameters / 1e6:.2f} M parameters, {size.macs / 1e9:.2f} GMAC per image", metadata
+
+
+def _printable(text: str) -> str:
+    """A stranger's text without what would steer the terminal."""
+    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)

@@ -10,13 +10,15 @@ from numpy.typing import NDArray
 
 from edgeslam_torch.errors import WeightsError
 from edgeslam_torch.geometry.camera import Camera
-from edgeslam_torch.models.record import DEFAULT_WEIGHTS, Metadata, metadata_from_json
+from edgeslam_torch.models.layout import INPUT_MULTIPLE, MAX_LOG_DEPTH
+from edgeslam_torch.models.record import DEFAULT_WEIGHTS, Metadata
 from edgeslam_torch.types import DepthMap, FloatArray
 
 logger = logging.getLogger(__name__)
 
-_MULTIPLE = 32
-_LOG_RANGE = float(np.log(100.0)) - 1e-3
+_TRIAL_SIZE = 64
+"""Side of the pictures that weights are tried on when they are loaded [px]: a few milliseconds."""
+_LOG_RANGE = MAX_LOG_DEPTH - 1e-3
 """The network clips log depth there: a value at the end of its range says "off the scale", not how far."""
 
 
@@ -38,7 +40,7 @@ class DepthPredictor:
         threads: Threads of one inference. With torch this sets the process's number of threads.
 
     Raises:
-        WeightsError: If the weights are missing or damaged.
+        WeightsError: If the weights are missing, damaged, or give no depth.
         ValueError: If the backend is unknown.
 
     Example:
@@ -51,9 +53,8 @@ class DepthPredictor:
         if backend not in ("onnxruntime", "torch"):
             raise ValueError(f"backend must be 'onnxruntime' or 'torch', got {backend!r}")
         self.weights = DEFAULT_WEIGHTS if weights is None else Path(weights)
-        if not self.weights.is_file():
-            raise WeightsError(f"{self.weights}: no such weights file; `edgeslam weights list` shows what there is")
         self._engine = _open_engine(self.weights, backend, threads)
+        _try_out(self._engine, self.weights)
 
     @property
     def metadata(self) -> Metadata:
@@ -111,8 +112,8 @@ def network_size(height: int, width: int, metadata: Metadata) -> tuple[int, int]
     area."""
     area = metadata.input_height * metadata.input_width
     best, best_cost = (metadata.input_height, metadata.input_width), np.inf
-    for h in range(_MULTIPLE, 2 * metadata.input_height + 1, _MULTIPLE):
-        for w in range(_MULTIPLE, 2 * metadata.input_width + 1, _MULTIPLE):
+    for h in range(INPUT_MULTIPLE, 2 * metadata.input_height + 1, INPUT_MULTIPLE):
+        for w in range(INPUT_MULTIPLE, 2 * metadata.input_width + 1, INPUT_MULTIPLE):
             if h * w > area:
                 continue
             # Squeezing by 10 % weighs as much as giving up 20 % of the pixels.
@@ -139,29 +140,54 @@ def _open_engine(weights: Path, backend: str, threads: int) -> _Engine:
     return _TorchEngine(weights, threads)
 
 
+def _try_out(engine: _Engine, weights: Path) -> None:
+    """Refuse weights that make no depth of two simple pictures, or the same of both.
+
+    Raises:
+        WeightsError: If so, or if they cannot be run at all.
+    """
+    height, width = engine.fixed_size or (_TRIAL_SIZE, _TRIAL_SIZE)
+    across, down = np.meshgrid(np.linspace(0, 255, width), np.linspace(0, 255, height))
+    picture = np.stack([across, down, 255 - across], axis=2).astype(np.uint8)
+    answers = []
+    for image in (picture, np.ascontiguousarray(picture[::-1])):
+        try:
+            log_depth, sigma = engine.run(preprocess(image, height, width, engine.metadata))
+        except Exception as error:  # onnxruntime's have no base of their own
+            raise WeightsError(f"{weights}: cannot be run ({_first_line(error)})") from error
+        if log_depth.shape != (height // 2, width // 2) or sigma.shape != log_depth.shape:
+            raise WeightsError(f"{weights}: gives depth of shape {log_depth.shape} for a picture of {height}x{width}")
+        known = np.isfinite(log_depth) & (np.abs(log_depth) < _LOG_RANGE) & np.isfinite(sigma) & (sigma > 0)
+        if not known.any():
+            raise WeightsError(f"{weights}: gives no depth: every pixel is not finite or at the end of its range")
+        answers.append(log_depth)
+    if np.array_equal(answers[0], answers[1], equal_nan=True):
+        raise WeightsError(f"{weights}: gives the same depth whatever it sees")
+
+
+def _first_line(error: Exception) -> str:
+    return " ".join(str(error).split())[:160]
+
+
 class _OnnxEngine:
     def __init__(self, weights: Path, threads: int) -> None:
         import onnxruntime
-        from onnxruntime.capi import onnxruntime_pybind11_state as ort_errors
 
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
-        options.log_severity_level = 3
+        options.log_severity_level = 4  # what goes wrong is raised, too
         if weights.suffix == ".onnx":
-            source: str | bytes = str(weights)
+            from edgeslam_torch.models.onnx_file import read_onnx
+
+            content, self.metadata = read_onnx(weights)
         else:
             from edgeslam_torch.models.onnx_graph import build_graph
 
-            source, self.metadata = build_graph(weights)
+            content, self.metadata = build_graph(weights)
         try:
-            self._session = onnxruntime.InferenceSession(source, options, providers=["CPUExecutionProvider"])
-        except (ort_errors.Fail, ort_errors.InvalidProtobuf, ort_errors.InvalidGraph, RuntimeError) as error:
-            raise WeightsError(f"{weights}: onnxruntime cannot load it ({str(error)[:160]})") from error
-        if weights.suffix == ".onnx":
-            record = self._session.get_modelmeta().custom_metadata_map.get("edgeslam")
-            if record is None:
-                raise WeightsError(f"{weights}: holds no EdgeSLAM metadata; export it with `edgeslam export`")
-            self.metadata = metadata_from_json(record)
+            self._session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+        except Exception as error:  # onnxruntime's have no base of their own
+            raise WeightsError(f"{weights}: onnxruntime cannot load it ({_first_line(error)})") from error
         height, width = self._session.get_inputs()[0].shape[2:]
         self.fixed_size = (height, width) if isinstance(height, int) and isinstance(width, int) else None
 

@@ -150,3 +150,51 @@ def test_shipped_weights_on_rooms_they_were_not_trained_on(
     mean = np.mean(errors, axis=0)
     assert mean[0] < scaled
     assert mean[1] < metric
+
+
+# -- weights that give no depth ------------------------------------------------------------------------------------
+
+
+def changed(tmp_path: Path, metadata: Metadata = METADATA, **tensors: float) -> Path:
+    """A network of which some tensors (``__`` for dots) hold one value everywhere."""
+    torch.manual_seed(0)
+    network = build_network(metadata).eval()
+    state = network.state_dict()
+    for name, value in tensors.items():
+        state[name.replace("__", ".")].fill_(value)
+    network.load_state_dict(state)
+    save_checkpoint(network, metadata, tmp_path / "w.safetensors")
+    return tmp_path / "w.safetensors"
+
+
+@pytest.mark.parametrize("backend", ["onnxruntime", "torch"])
+def test_weights_that_give_no_depth_are_refused_when_they_are_loaded(tmp_path: Path, backend: str) -> None:
+    with pytest.raises(WeightsError, match=r"w\.safetensors: gives no depth"):
+        DepthPredictor(changed(tmp_path, decode_conv6__1__bias=1e5), backend)
+    with pytest.raises(WeightsError, match=r"w\.safetensors: gives no depth"):
+        DepthPredictor(changed(tmp_path, decode_conv6__1__bias=-1e5), backend)
+    upstream = replace(METADATA, output="depth", uncertainty=False, sigma_floor=0.2)
+    with pytest.raises(WeightsError, match=r"w\.safetensors: gives no depth"):  # ReLU of a negative number
+        DepthPredictor(changed(tmp_path, upstream, decode_conv6__1__bias=-1.0), backend)
+
+
+@pytest.mark.parametrize("backend", ["onnxruntime", "torch"])
+def test_weights_that_see_nothing_are_refused_when_they_are_loaded(tmp_path: Path, backend: str) -> None:
+    with pytest.raises(WeightsError, match="the same depth whatever it sees"):
+        DepthPredictor(changed(tmp_path, decode_conv6__0__weight=0.0, decode_conv6__1__bias=1.0), backend)
+
+
+def test_the_end_of_the_networks_range_is_unknown_not_100_m(weights: Path, image: np.ndarray) -> None:
+    class Half:
+        metadata, fixed_size = METADATA, None
+
+        def run(self, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            log_depth = np.zeros((image.shape[2] // 2, image.shape[3] // 2), np.float32)
+            log_depth[:, : log_depth.shape[1] // 2] = np.log(100.0)
+            return log_depth, np.ones_like(log_depth)
+
+    predictor = DepthPredictor(weights)
+    predictor._engine = Half()
+    depth = predictor(image, CAMERA).depth_m
+    assert np.isnan(depth[:, :78]).all()
+    assert (depth[:, 82:] > 0.5).all()

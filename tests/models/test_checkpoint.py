@@ -2,6 +2,7 @@
 
 import os
 import stat
+from collections import OrderedDict
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,8 @@ import torch
 from edgeslam_torch.errors import WeightsError
 from edgeslam_torch.models.checkpoint import build_network, load_checkpoint, save_checkpoint
 from edgeslam_torch.models.fastdepth import FastDepth, Variant
-from edgeslam_torch.models.record import DEFAULT_WEIGHTS, Metadata, read_header
+from edgeslam_torch.models.record import DEFAULT_WEIGHTS, Metadata
+from edgeslam_torch.models.weights_file import read_header
 
 
 def small_network() -> tuple[FastDepth, Metadata]:
@@ -73,7 +75,8 @@ def test_missing_truncated_and_foreign_files_are_named(tmp_path: Path) -> None:
 
 
 def test_pickled_module_is_refused_with_the_remedy(tmp_path: Path) -> None:
-    torch.save({"model": FastDepth(Variant.PRUNED)}, tmp_path / "whole.pth.tar")
+    parts = torch.nn.Sequential(OrderedDict(FastDepth(Variant.PRUNED).named_children()))
+    torch.save({"model": parts}, tmp_path / "whole.pth.tar")
     with pytest.raises(WeightsError, match="edgeslam weights convert"):
         load_checkpoint(tmp_path / "whole.pth.tar")
 

@@ -8,11 +8,12 @@ import onnxruntime
 import pytest
 import torch
 
-from edgeslam_torch.errors import OutputError
+from edgeslam_torch.errors import WeightsError
 from edgeslam_torch.models.checkpoint import build_network, save_checkpoint
-from edgeslam_torch.models.export_onnx import ExportOptions, export_onnx, read_onnx_metadata, set_opset
+from edgeslam_torch.models.export_onnx import ExportOptions, export_onnx, set_opset
 from edgeslam_torch.models.fastdepth import FastDepth, Variant
 from edgeslam_torch.models.fold import deployed, fold_batch_norm
+from edgeslam_torch.models.onnx_file import read_onnx
 from edgeslam_torch.models.onnx_graph import build_graph
 from edgeslam_torch.models.quantize import double_by_gather
 from edgeslam_torch.models.record import Metadata
@@ -73,7 +74,7 @@ def test_exported_file_holds_opset_and_metadata_and_agrees(tmp_path: Path) -> No
     model = onnx.load(str(path))
     assert [o.version for o in model.opset_import if o.domain == ""] == [17]
     assert model.ir_version <= 9
-    assert read_onnx_metadata(path) == METADATA
+    assert read_onnx(path)[1] == METADATA
     x = torch.randn(1, 3, 64, 96)
     with torch.no_grad():
         expected = deployed(network, METADATA)(x)
@@ -84,8 +85,8 @@ def test_exported_file_holds_opset_and_metadata_and_agrees(tmp_path: Path) -> No
 def test_file_without_metadata_is_refused(tmp_path: Path) -> None:
     graph, _ = _plain_model()
     onnx.save(graph, str(tmp_path / "x.onnx"))
-    with pytest.raises(OutputError, match="no EdgeSLAM metadata"):
-        read_onnx_metadata(tmp_path / "x.onnx")
+    with pytest.raises(WeightsError, match="no EdgeSLAM metadata"):
+        read_onnx(tmp_path / "x.onnx")
 
 
 def test_opset_conversion_sets_the_ir_for_old_runtimes() -> None:

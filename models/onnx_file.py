@@ -1,0 +1,83 @@
+"""Exported ONNX files, checked before they run; importing this needs no torch."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import onnx
+from google.protobuf.message import DecodeError
+from onnx import TensorProto, numpy_helper
+
+from edgeslam_torch.errors import WeightsError
+from edgeslam_torch.models.layout import INPUT_MULTIPLE
+from edgeslam_torch.models.record import HEADER_KEY, MAX_INPUT_PX, Metadata, metadata_from_json
+from edgeslam_torch.models.weights_file import open_weights
+
+INPUT, LOG_DEPTH, SIGMA = "image", "log_depth", "sigma_log"
+MAX_VALUE = 1e9
+"""Largest constant that an exported network may have: batch norm's gain multiplies weights of up to 1e6."""
+_FLOATS = (TensorProto.FLOAT, TensorProto.FLOAT16, TensorProto.DOUBLE)
+
+
+def read_onnx(path: Path) -> tuple[bytes, Metadata]:
+    """A file written by ``edgeslam export`` and its record.
+
+    Raises:
+        WeightsError: If the file is missing, damaged, no network of ours, or holds what no trained network can.
+    """
+    try:
+        with open_weights(path) as file:
+            content = file.read()
+        model = onnx.load_model_from_string(content)
+        metadata = _record(model)
+        _check_ends(model.graph)
+        for tensor in _constants(model.graph):
+            _check_constant(tensor)
+    except OSError as error:
+        raise WeightsError(f"{path}: cannot read the weights ({error.strerror or error})") from error
+    except (DecodeError, ValueError, TypeError) as error:
+        raise WeightsError(f"{path}: damaged or not an ONNX file ({' '.join(str(error).split())[:80]})") from None
+    except WeightsError as error:
+        raise WeightsError(f"{path}: {error}") from None
+    return content, metadata
+
+
+def _record(model: onnx.ModelProto) -> Metadata:
+    record = next((p.value for p in model.metadata_props if p.key == HEADER_KEY), None)
+    if record is None:
+        raise WeightsError("holds no EdgeSLAM metadata, or is no ONNX file; export it with `edgeslam export`")
+    return metadata_from_json(record)
+
+
+def _check_ends(graph: onnx.GraphProto) -> None:
+    """Refuse a graph that does not take an image and give log depth and sigma."""
+    constants = {tensor.name for tensor in graph.initializer}
+    inputs = [value for value in graph.input if value.name not in constants]
+    outputs = {value.name for value in graph.output}
+    if [value.name for value in inputs] != [INPUT] or not outputs >= {LOG_DEPTH, SIGMA}:
+        raise WeightsError(f"not a depth network of ours: it should make {LOG_DEPTH} and {SIGMA} of {INPUT}")
+    shape = inputs[0].type.tensor_type.shape.dim
+    sides = [d.dim_value for d in shape[2:]]  # 0 where the size is open
+    good = all(0 <= side <= MAX_INPUT_PX and side % INPUT_MULTIPLE == 0 for side in sides)
+    if len(shape) != 4 or shape[1].dim_value != 3 or not good:
+        size = [d.dim_value or d.dim_param for d in shape]
+        raise WeightsError(f"its input is {size}, expected [1, 3, H, W] in multiples of {INPUT_MULTIPLE}")
+
+
+def _constants(graph: onnx.GraphProto) -> Iterator[TensorProto]:
+    yield from graph.initializer
+    for node in graph.node:
+        yield from (attribute.t for attribute in node.attribute if attribute.HasField("t"))
+
+
+def _check_constant(tensor: TensorProto) -> None:
+    """Refuse numbers outside the file, not finite or absurd."""
+    if tensor.data_location == TensorProto.EXTERNAL:
+        raise WeightsError(f"{tensor.name} lies outside the file; export it into one")
+    if tensor.data_type not in _FLOATS:
+        return
+    largest = float(np.abs(numpy_helper.to_array(tensor).astype(np.float64)).max(initial=0.0))
+    if not np.isfinite(largest):
+        raise WeightsError(f"{tensor.name} holds values that are not finite")
+    if largest > MAX_VALUE:
+        raise WeightsError(f"{tensor.name} reaches {largest:.1e}; no trained network goes beyond {MAX_VALUE:.0e}")

@@ -1,0 +1,213 @@
+"""Weights of a safetensors file as checked float32 arrays; importing this needs no torch.
+
+Nothing is read before the header's claims were compared with the file's size and the network's shapes, so that a
+hostile file costs no more than its own size.
+"""
+
+import json
+import math
+import reprlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgeslam_torch.errors import WeightsError
+from edgeslam_torch.models.layout import STEP_COUNTER, Variant, check_shapes
+from edgeslam_torch.models.record import HEADER_KEY, Metadata, metadata_from_json, upstream_metadata
+
+Array = NDArray[Any]
+MAX_FILE_BYTES = 1 << 29
+"""The largest official network has 20.7 M parameters, 83 MB; twice that with its optimiser's state."""
+MAX_HEADER_BYTES = 1 << 20
+"""FastDepth's header has 24 kB."""
+MAX_VALUE = 1e6
+"""Largest parameter that a trained network may have; float16, in which ours are stored, ends at 65504."""
+FLOATS: dict[str, np.dtype[Any]] = {
+    "F16": np.dtype("<f2"),
+    "F32": np.dtype("<f4"),
+    "F64": np.dtype("<f8"),
+    "BF16": np.dtype("<u2"),
+}
+"""Kinds of numbers that parameters may be stored as, and how to read them; bfloat16 as its bits."""
+_SIZES = {kind: dtype.itemsize for kind, dtype in FLOATS.items()} | {"I64": 8}
+
+
+class Stored(Protocol):
+    """A tensor that has not been read."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Size of every dimension."""
+
+    @property
+    def kind(self) -> str:
+        """Type of its numbers, as safetensors calls it."""
+
+    def read(self) -> bytes:
+        """Its numbers in row-major order, little endian."""
+
+
+def read_weights(path: Path) -> tuple[dict[str, Array], Metadata]:
+    """Parameters of a safetensors file in float32 and the file's record.
+
+    A file without a record is taken for one of upstream's.
+
+    Raises:
+        WeightsError: If the file is missing, damaged, of another network, or holds what no trained network can.
+    """
+    try:
+        with open_weights(path) as file:
+            metadata, entries = _read_header(file)
+            if metadata is None:
+                metadata = upstream_metadata(entries)
+            return check_weights(entries, metadata), metadata
+    except OSError as error:
+        raise WeightsError(f"{path}: cannot read the weights ({error.strerror or error})") from error
+    except WeightsError as error:
+        raise WeightsError(f"{path}: {error}") from None
+
+
+def read_header(path: Path) -> Metadata:
+    """The record in a safetensors file's header, without reading the weights.
+
+    Raises:
+        WeightsError: If the file is missing, no safetensors file, or holds no usable record.
+    """
+    try:
+        with open_weights(path) as file:
+            metadata, _ = _read_header(file)
+    except OSError as error:
+        raise WeightsError(f"{path}: cannot read the weights ({error.strerror or error})") from error
+    except WeightsError as error:
+        raise WeightsError(f"{path}: {error}") from None
+    if metadata is None:
+        raise WeightsError(f"{path}: not an EdgeSLAM weights file: it holds no record")
+    return metadata
+
+
+def open_weights(path: Path) -> BinaryIO:
+    """A weights file of any kind, opened for reading.
+
+    Raises:
+        WeightsError: If there is no such file or it is larger than any network's; without the file's name.
+        OSError: If it cannot be opened.
+    """
+    if not path.exists():
+        raise WeightsError("no such weights file; `edgeslam weights list` shows what there is")
+    if not path.is_file():
+        raise WeightsError("not a file")
+    size = path.stat().st_size
+    if size > MAX_FILE_BYTES:
+        raise WeightsError(f"{size / 2**20:.0f} MiB, more than any network of ours ({MAX_FILE_BYTES >> 20} MiB)")
+    return path.open("rb")
+
+
+def check_weights(state: Mapping[str, Stored], metadata: Metadata) -> dict[str, Array]:
+    """Read a state dict whose every name, shape, kind and value is one that the network of its record can have.
+
+    Args:
+        state: Tensors by name; those of the right shape are read, one after the other.
+        metadata: What the file says about itself.
+
+    Returns:
+        Parameters by name, float32; batch norm's step counters as int64 where there are any.
+
+    Raises:
+        WeightsError: What is wrong, without the file's name.
+    """
+    check_shapes(state, Variant(metadata.variant), metadata.uncertainty)
+    return {k: _counter(k, v) if k.endswith(STEP_COUNTER) else _as_float32(k, v) for k, v in state.items()}
+
+
+def _counter(name: str, stored: Stored) -> Array:
+    if stored.kind != "I64":
+        raise WeightsError(f"{name} holds {stored.kind} numbers, not I64")
+    return np.frombuffer(stored.read(), "<i8").astype(np.int64).reshape(())
+
+
+def _as_float32(name: str, stored: Stored) -> Array:
+    """A parameter in single precision.
+
+    Raises:
+        WeightsError: If a value is not finite, absurdly large, or a negative variance.
+    """
+    dtype = FLOATS.get(stored.kind)
+    if dtype is None:
+        raise WeightsError(f"{name} holds {stored.kind} numbers, not one of {', '.join(FLOATS)}")
+    raw = np.frombuffer(stored.read(), dtype)
+    if stored.kind == "BF16":  # the upper half of a float32
+        raw = (raw.astype("<u4") << 16).view("<f4")
+    largest = float(np.abs(raw).max(initial=0.0))
+    if not math.isfinite(largest):
+        raise WeightsError(f"{name} holds values that are not finite")
+    if largest > MAX_VALUE:
+        raise WeightsError(f"{name} reaches {largest:.1e}; no trained network goes beyond {MAX_VALUE:.0e}")
+    if name.endswith("running_var") and (raw < 0).any():
+        raise WeightsError(f"{name} holds a negative variance")
+    return raw.astype(np.float32).reshape(stored.shape)
+
+
+@dataclass(frozen=True, slots=True)
+class _Entry:
+    """A tensor in an open safetensors file."""
+
+    file: BinaryIO
+    kind: str
+    shape: tuple[int, ...]
+    start: int
+    """Position in the file."""
+    size: int
+    """Bytes."""
+
+    def read(self) -> bytes:
+        self.file.seek(self.start)
+        return self.file.read(self.size)
+
+
+def _read_header(file: BinaryIO) -> tuple[Metadata | None, dict[str, _Entry]]:
+    """Record, None when there is none, and tensors, whose bytes all lie inside the file."""
+    length = int.from_bytes(file.read(8).ljust(8, b"\xff"), "little")
+    if length > MAX_HEADER_BYTES:
+        raise WeightsError("not a safetensors file, or damaged (`edgeslam weights convert` reads torch's .pth and .pt)")
+    try:
+        header = json.loads(file.read(length))
+    except (ValueError, RecursionError):
+        raise WeightsError("not a safetensors file, or damaged: its header is no JSON") from None
+    if not isinstance(header, dict):
+        raise WeightsError("damaged: its header is no table")
+    remarks = header.pop("__metadata__", None) or {}
+    record = remarks.get(HEADER_KEY) if isinstance(remarks, dict) else None
+    if not isinstance(record, str | None):
+        raise WeightsError("its metadata cannot be used: it is no text")
+    end = file.seek(0, 2)
+    entries = {name: _entry(file, name, fields, 8 + length, end) for name, fields in header.items()}
+    _check_disjoint(entries)
+    return None if record is None else metadata_from_json(record), entries
+
+
+def _entry(file: BinaryIO, name: str, fields: Any, offset: int, end: int) -> _Entry:
+    try:
+        kind, shape, (start, stop) = fields["dtype"], tuple(fields["shape"]), fields["data_offsets"]
+    except (TypeError, KeyError, ValueError):
+        raise WeightsError(f"damaged: its header describes {name[:80]!r} wrongly") from None
+    if not isinstance(kind, str) or kind not in _SIZES:
+        raise WeightsError(f"{name[:80]} holds {reprlib.repr(kind)} numbers, not one of {', '.join(FLOATS)}")
+    numbers = (*shape, start, stop)
+    if not all(type(n) is int and 0 <= n <= end for n in numbers) or len(shape) > 4:
+        raise WeightsError(f"damaged: its header describes {name[:80]!r} wrongly")
+    if stop - start != math.prod(shape) * _SIZES[kind] or offset + stop > end:
+        raise WeightsError(f"truncated or damaged: the bytes of {name[:80]!r} are missing")
+    return _Entry(file, kind, shape, offset + start, stop - start)
+
+
+def _check_disjoint(entries: Mapping[str, _Entry]) -> None:
+    """Refuse tensors that share bytes: no writer makes them, and they are worth more memory than the file."""
+    last = 0
+    for name, entry in sorted(entries.items(), key=lambda item: item[1].start):
+        if entry.size and entry.start < last:
+            raise WeightsError(f"damaged: {name[:80]!r} lies over another tensor")
+        last = max(last, entry.start + entry.size)

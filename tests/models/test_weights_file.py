@@ -1,0 +1,337 @@
+"""Weights files that are damaged, hostile or of another network: one line, at once, whichever way they are loaded."""
+
+import json
+import struct
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from edgeslam_torch.errors import WeightsError
+from edgeslam_torch.models.checkpoint import build_network, load_checkpoint, save_checkpoint
+from edgeslam_torch.models.fastdepth import FULL, PRUNED, FastDepth, Variant, Widths
+from edgeslam_torch.models.layout import parameter_shapes
+from edgeslam_torch.models.onnx_graph import build_graph
+from edgeslam_torch.models.record import Metadata, metadata_from_json
+from edgeslam_torch.models.weights_file import read_header, read_weights
+
+METADATA = Metadata(input_height=64, input_width=96, focal_px=80.0)
+SMALL = Widths((8, 8) + (16,) * 12, (16, 16, 16, 8, 8))
+LOADERS = [load_checkpoint, build_graph, read_weights]
+"""Torch, onnxruntime, and what both stand on."""
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    torch.manual_seed(0)
+    path = tmp_path_factory.mktemp("weights") / "w.safetensors"
+    save_checkpoint(build_network(METADATA, SMALL), METADATA, path)
+    return path.read_bytes()
+
+
+class File:
+    """A safetensors file taken apart: change ``header`` or ``data`` and write it again."""
+
+    def __init__(self, content: bytes) -> None:
+        (length,) = struct.unpack("<Q", content[:8])
+        self.header: dict[str, Any] = json.loads(content[8 : 8 + length])
+        self.data = bytearray(content[8 + length :])
+
+    def array(self, name: str) -> np.ndarray:
+        """View of a float32 tensor's numbers."""
+        start, stop = self.header[name]["data_offsets"]
+        return np.frombuffer(self.data, "<f4")[start // 4 : stop // 4]
+
+    def replace(self, name: str, kind: str, shape: list[int], content: bytes) -> None:
+        """Another tensor under a name, its bytes at the end."""
+        start = len(self.data)
+        self.data += content
+        self.header[name] = {"dtype": kind, "shape": shape, "data_offsets": [start, len(self.data)]}
+
+    def write(self, path: Path) -> Path:
+        header = json.dumps(self.header).encode()
+        path.write_bytes(struct.pack("<Q", len(header)) + header + self.data)
+        return path
+
+
+@pytest.fixture
+def file(whole: bytes) -> File:
+    return File(whole)
+
+
+def refused(path: Path, match: str) -> None:
+    for load in LOADERS:
+        with pytest.raises(WeightsError, match=match) as caught:
+            load(path)
+        assert str(path) in str(caught.value)
+        assert "\n" not in str(caught.value)
+        assert len(str(caught.value)) < 400
+
+
+# -- names and shapes --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("variant", list(Variant))
+@pytest.mark.parametrize("uncertainty", [True, False])
+def test_layout_is_that_of_the_network(variant: Variant, uncertainty: bool) -> None:
+    widths = PRUNED if variant is Variant.PRUNED else FULL
+    with torch.device("meta"):
+        network = FastDepth(variant, uncertainty=uncertainty)
+    shapes = {name: tuple(tensor.shape) for name, tensor in network.state_dict().items()}
+    assert parameter_shapes(variant, widths, uncertainty) == shapes
+
+
+def test_a_whole_file_comes_back(file: File, tmp_path: Path) -> None:
+    path = file.write(tmp_path / "w.safetensors")
+    arrays, metadata = read_weights(path)
+    assert metadata == METADATA == read_header(path)
+    network, _ = load_checkpoint(path)
+    for name, tensor in network.state_dict().items():
+        np.testing.assert_array_equal(tensor.numpy(), arrays[name])
+
+
+@pytest.mark.parametrize("kind", ["F16", "F64", "BF16"])
+def test_other_precisions_are_read_as_they_are_written(file: File, tmp_path: Path, kind: str) -> None:
+    expected = torch.randn(8, 3, 3, 3)
+    stored = expected.to({"F16": torch.float16, "F64": torch.float64, "BF16": torch.bfloat16}[kind])
+    file.replace("conv0.0.weight", kind, [8, 3, 3, 3], stored.contiguous().view(torch.uint8).numpy().tobytes())
+    arrays, _ = read_weights(file.write(tmp_path / "w.safetensors"))
+    np.testing.assert_array_equal(arrays["conv0.0.weight"], stored.float().numpy())
+
+
+def test_step_counters_may_be_missing(file: File, tmp_path: Path) -> None:
+    file.header = {k: v for k, v in file.header.items() if not k.endswith("num_batches_tracked")}
+    path = file.write(tmp_path / "w.safetensors")
+    assert load_checkpoint(path)[1] == METADATA
+    assert build_graph(path)[1] == METADATA
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        (lambda f: f.header.pop("conv3.3.weight"), "no parameter 'conv3.3.weight'"),
+        (lambda f: f.header.pop("conv3.1.running_var"), "no parameter 'conv3.1.running_var'"),
+        (lambda f: f.header.pop("uncertainty.bias"), "no parameter 'uncertainty.bias'"),
+        (lambda f: f.replace("extra", "F32", [1], bytes(4)), "it has no parameter 'extra'"),
+        (lambda f: f.replace("conv3.0.weight", "F32", [16, 1, 1, 9], bytes(576)), r"conv3.0.weight is \(16, 1, 1, 9\)"),
+        (lambda f: f.replace("conv3.1.bias", "F32", [1], bytes(4)), "conv3.1.bias is"),
+        (lambda f: f.replace("conv3.3.weight", "F32", [], bytes(4)), r"conv3.3.weight has shape \(\)"),
+        (lambda f: f.replace("conv3.3.weight", "F32", [0, 16, 1, 1], b""), "conv3.3.weight has shape"),
+        (lambda f: f.replace("conv3.3.weight", "F32", [9999, 1, 1, 1], bytes(39996)), "conv3.3.weight has shape"),
+        (lambda f: f.replace("conv3.3.weight", "F32", [4000, 1, 1, 1], bytes(16000)), "conv3.3.weight is"),
+        (lambda f: f.replace("conv3.0.weight", "I32", [16, 1, 3, 3], bytes(576)), "holds 'I32' numbers"),
+        (lambda f: f.replace("conv3.0.weight", "I64", [16, 1, 3, 3], bytes(1152)), "holds I64 numbers"),
+        (lambda f: f.replace("conv3.0.weight", "F8_E4M3", [16, 1, 3, 3], bytes(144)), "holds 'F8_E4M3' numbers"),
+        (lambda f: f.replace("conv0.1.num_batches_tracked", "F32", [], bytes(4)), "holds F32 numbers, not I64"),
+    ],
+)
+def test_another_network_is_refused(file: File, tmp_path: Path, change: Callable[[File], object], match: str) -> None:
+    change(file)
+    refused(file.write(tmp_path / "w.safetensors"), match)
+
+
+def test_widths_that_cannot_be_added_are_refused(tmp_path: Path) -> None:
+    widths = Widths((8, 8) + (16,) * 12, (16, 16, 16, 4, 8))
+    torch.manual_seed(0)
+    save_checkpoint(build_network(METADATA, widths), METADATA, tmp_path / "w.safetensors")
+    refused(tmp_path / "w.safetensors", r"conv1 \(8\) cannot be added to decode_conv4 \(4\)")
+
+
+def test_record_of_another_variant_is_refused(file: File, tmp_path: Path) -> None:
+    record = asdict(METADATA) | {"variant": "mobilenet-nnconv5"}
+    file.header["__metadata__"]["edgeslam"] = json.dumps(record)
+    refused(file.write(tmp_path / "w.safetensors"), "does not fit mobilenet-nnconv5: no parameter")
+
+
+def test_a_network_far_beyond_any_fastdepth_is_refused(tmp_path: Path, file: File) -> None:
+    """Its bytes would have to be there; a header alone cannot make us build 40 GB."""
+    shapes = parameter_shapes(Variant.SKIPADD, Widths((4096,) * 14, (4096,) * 5), True)
+    file.header = {"__metadata__": file.header["__metadata__"]}
+    for name, shape in shapes.items():
+        file.header[name] = {"dtype": "F32", "shape": shape, "data_offsets": [0, 4 * int(np.prod(shape))]}
+    refused(file.write(tmp_path / "w.safetensors"), "bytes of .* are missing|wrongly")
+
+
+# -- values ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("name", ["conv0.0.weight", "conv7.1.running_mean", "uncertainty.bias"])
+def test_a_single_value_that_is_not_finite_is_refused(file: File, tmp_path: Path, name: str, value: float) -> None:
+    file.array(name)[-1:] = value
+    refused(file.write(tmp_path / "w.safetensors"), f"{name} holds values that are not finite")
+
+
+@pytest.mark.parametrize("factor", [1e30, -1e30, 1e9])
+def test_absurd_values_are_refused(file: File, tmp_path: Path, factor: float) -> None:
+    file.array("conv3.0.weight")[:] *= np.float32(factor)
+    refused(file.write(tmp_path / "w.safetensors"), "conv3.0.weight reaches .*; no trained network")
+
+
+def test_a_double_beyond_single_precision_is_refused(file: File, tmp_path: Path) -> None:
+    file.replace("conv0.1.bias", "F64", [8], np.full(8, 1e300).tobytes())
+    refused(file.write(tmp_path / "w.safetensors"), "conv0.1.bias reaches 1.0e\\+300")
+
+
+def test_a_negative_variance_is_refused(file: File, tmp_path: Path) -> None:
+    file.array("conv3.1.running_var")[0] = -1.0
+    refused(file.write(tmp_path / "w.safetensors"), "conv3.1.running_var holds a negative variance")
+
+
+# -- the record --------------------------------------------------------------------------------------------------
+
+WRONG: list[Any] = [None, [], {}, "text", "", -32, 1e5, float("nan"), float("inf"), True, 10**400, [[[]]], {"a": []}]
+FIELDS = {
+    "variant": [0, "resnet"],
+    "input_height": [0, 33, 64.0, 4096],
+    "input_width": [0, 33, 64.0, 4096],
+    "focal_px": [0, 1e-3, 1e4],
+    "mean": [0, [0.5, 0.5], [0.5, 0.5, float("nan")], ["a", "b", "c"], [0.5, 0.5, 1e9], [None] * 3],
+    "std": [0, [0, 0, 0], [0.5, 0.5, 0], [0.5, 0.5, -0.5], [0.5, 0.5, 1e-30], [0.5] * 4, [True] * 3],
+    "padding": [0, "valid"],
+    "output": [0, "disparity"],
+    "sigma_scale": [0, 1e-9],
+    "units": [0, "mm"],
+}
+
+
+@pytest.mark.parametrize("field", FIELDS)
+def test_a_record_with_a_wrong_field_is_refused(field: str) -> None:
+    for value in WRONG + FIELDS[field]:
+        text = json.dumps(asdict(METADATA) | {field: value})
+        with pytest.raises(WeightsError, match=f"metadata cannot be used: {field} must be") as caught:
+            metadata_from_json(text)
+        assert len(str(caught.value)) < 300
+
+
+@pytest.mark.parametrize("field", ["sigma_floor", "uncertainty", "licence", "notes", "data", "metrics"])
+def test_a_record_with_a_wrong_type_is_refused(field: str) -> None:
+    wrong = {"uncertainty": [0, 1, "true"], "data": ["text", [1]], "metrics": [[], {"a": "b"}]}.get(
+        field, [[], True, {}]
+    )
+    for value in [None, *wrong]:
+        with pytest.raises(WeightsError, match=f"metadata cannot be used: {field} must be"):
+            metadata_from_json(json.dumps(asdict(METADATA) | {field: value}))
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        ("", "no JSON"),
+        ("{", "no JSON"),
+        ("null", "it is None, not a table"),
+        ("[]", r"it is \[\], not a table"),
+        ("3", "it is 3"),
+        ('"text"', "it is 'text'"),
+        ("{}", "says nothing about variant"),
+        ("[" * 100_000, "nested too deeply"),
+        ('{"variant": ' + "[" * 100_000, "nested too deeply"),
+        ('{"variant": ' + "[" * 500 + "]" * 500 + "}", "says nothing about|variant must be"),
+        ('{"input_width": ' + "9" * 5000 + "}", "no JSON"),
+    ],
+)
+def test_what_is_no_record_is_refused(file: File, tmp_path: Path, text: str, match: str) -> None:
+    file.header["__metadata__"]["edgeslam"] = text
+    path = file.write(tmp_path / "w.safetensors")
+    refused(path, match)
+    with pytest.raises(WeightsError, match=match):
+        read_header(path)
+
+
+@pytest.mark.parametrize("field", ["focal_px", "mean", "input_width", "output"])
+def test_a_record_that_does_not_say_how_to_run_it_is_refused(field: str) -> None:
+    record = asdict(METADATA)
+    del record[field]
+    with pytest.raises(WeightsError, match=f"says nothing about {field}"):
+        metadata_from_json(json.dumps(record))
+
+
+def test_fields_of_newer_files_are_ignored() -> None:
+    assert metadata_from_json(json.dumps(asdict(METADATA) | {"lens": "fisheye"})) == METADATA
+
+
+def test_nobody_can_write_an_impossible_record() -> None:
+    with pytest.raises(ValueError, match="focal_px must be"):
+        Metadata(focal_px=float("nan"))
+    with pytest.raises(ValueError, match="sigma_floor must be positive"):
+        Metadata(uncertainty=False)
+
+
+# -- the container -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("header", "match"),
+    [
+        (b"", "no JSON"),
+        (b"[]", "header is no table"),
+        (b"[" * 100_000, "no JSON"),
+        (b'{"conv0.0.weight": 3}', "describes 'conv0.0.weight' wrongly"),
+        (b'{"a": {"dtype": "F32", "shape": [1], "data_offsets": [0]}}', "wrongly"),
+        (b'{"a": {"dtype": "F32", "shape": [-1], "data_offsets": [0, 4]}}', "wrongly"),
+        (b'{"a": {"dtype": "F32", "shape": [1.0], "data_offsets": [0, 4]}}', "wrongly"),
+        (b'{"a": {"dtype": "F32", "shape": ["x"], "data_offsets": [0, 4]}}', "wrongly"),
+        (b'{"a": {"dtype": ["F32"], "shape": [1], "data_offsets": [0, 4]}}', "holds"),
+        (b'{"a": {"dtype": "F32", "shape": [1], "data_offsets": [0, 1e999]}}', "wrongly"),
+        (b'{"a": {"dtype": "F32", "shape": [3000000000], "data_offsets": [0, 12000000000]}}', "wrongly"),
+        (b'{"a": {"dtype": "F32", "shape": [2], "data_offsets": [0, 4]}}', "are missing"),
+        (b'{"a": {"dtype": "F32", "shape": [9], "data_offsets": [0, 36]}}', "are missing"),
+        (b'{"__metadata__": {"edgeslam": [1]}}', "metadata cannot be used"),
+        (b'{"__metadata__": [1]}', "not a FastDepth checkpoint"),
+        (b"\xff\xfe", "no JSON"),
+    ],
+)
+def test_a_header_that_makes_no_sense_is_refused(tmp_path: Path, header: bytes, match: str) -> None:
+    path = tmp_path / "w.safetensors"
+    path.write_bytes(struct.pack("<Q", len(header)) + header + bytes(8))
+    refused(path, match)
+
+
+@pytest.mark.parametrize("length", [0, 1 << 20, (1 << 20) + 1, 1 << 40, (1 << 64) - 1])
+def test_a_header_of_any_claimed_length_is_refused(tmp_path: Path, length: int) -> None:
+    (tmp_path / "w.safetensors").write_bytes(struct.pack("<Q", length) + b'{"a": 1}')
+    refused(tmp_path / "w.safetensors", "damaged")
+
+
+def test_tensors_over_each_other_are_refused(file: File, tmp_path: Path) -> None:
+    file.header["conv2.3.weight"] = file.header["conv3.3.weight"]
+    refused(file.write(tmp_path / "w.safetensors"), "lies over another tensor")
+
+
+def test_empty_missing_and_foreign_files_are_named(tmp_path: Path) -> None:
+    refused(tmp_path / "none", "no such weights file")
+    refused(tmp_path, "not a file")
+    for content in (b"", b"x", b"hello, this is no network at all", b"\x89PNG\r\n\x1a\n" + bytes(100), bytes(100)):
+        (tmp_path / "w").write_bytes(content)
+        refused(tmp_path / "w", "safetensors|header|FastDepth")
+    with (tmp_path / "huge").open("wb") as huge:
+        huge.truncate(1 << 33)
+    refused(tmp_path / "huge", "8192 MiB, more than any network")
+
+
+def test_truncated_anywhere_is_refused(whole: bytes, tmp_path: Path, rng: np.random.Generator) -> None:
+    for cut in (1, 7, 8, 9, 1000, len(whole) - 1, *rng.integers(0, len(whole), 30)):
+        (tmp_path / "w").write_bytes(whole[:cut])
+        with pytest.raises(WeightsError, match=str(tmp_path / "w")):
+            read_weights(tmp_path / "w")
+
+
+def test_random_damage_is_refused_or_harmless(whole: bytes, tmp_path: Path, rng: np.random.Generator) -> None:
+    (length,) = struct.unpack("<Q", whole[:8])
+    refusals = 0
+    for _ in range(200):
+        damaged = bytearray(whole)
+        for at in rng.integers(0, length + 8, rng.integers(1, 6)):
+            damaged[at] = rng.integers(256)
+        (tmp_path / "w").write_bytes(damaged)
+        try:
+            arrays, _ = read_weights(tmp_path / "w")
+            assert all(np.isfinite(a).all() for a in arrays.values())
+        except WeightsError as error:
+            refusals += 1
+            assert "\n" not in str(error)
+    assert refusals > 150
