@@ -1,6 +1,7 @@
 """The documentation's site: formulas, links and pages that fit a phone and ask nothing of the network."""
 
 import importlib.util
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
@@ -94,3 +95,11 @@ def test_what_a_page_would_load_is_found(tmp_path: Path) -> None:
         "a.html: loads https://cdn.example/x.js from the network",
         "b.html: loads //cdn.example/x.css from the network",
     ]
+
+
+def test_no_guide_installs_the_package_from_an_index() -> None:
+    root = BUILD.parent.parent
+    guides = [root / name for name in build.GUIDES] + sorted((root / "docs").glob("*.md"))
+    for path in [*guides, *(root / "edgeslam_torch").rglob("*.py")]:
+        found = re.findall(r"pip install[^\n]*edgeslam.torch", path.read_text(encoding="utf-8"))
+        assert not found, f"{path}: the package is on no index; pip install ."
