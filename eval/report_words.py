@@ -67,7 +67,7 @@ def story(run: RunFolder, score: RunScore | None) -> str:
             )
     if summary.get("interrupted"):
         sentences.append("The run was interrupted; this is what was done until then.")
-    return " ".join(s for s in sentences if s)
+    return " ".join(s for s in sentences if s).replace(" %", "\u00a0%")
 
 
 def tiles(run: RunFolder, score: RunScore | None, points: int) -> list[dict[str, str]]:

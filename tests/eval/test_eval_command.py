@@ -114,7 +114,7 @@ def test_report_says_how_the_run_went(run_folder: Callable[..., Path], tmp_path:
     truth = run_folder(tmp_path / "a")
     assert run(report_command, tmp_path / "a", "--groundtruth", truth) == 0
     page = (tmp_path / "a" / "report.html").read_text(encoding="utf-8")
-    assert "98.5 % of the frames were tracked against the map, from the first on" in page
+    assert "98.5\\u00a0% of the frames were tracked against the map, from the first on" in page
     assert "lost once" in page and "few matches (7)" in page
     assert "(7) </script>" not in page, "text of the run must not end the page's script"
     assert "{{" not in page.split("<script")[0]
