@@ -1,19 +1,27 @@
-"""Weights that can be downloaded: where they are, fetched with resume, checked, never executed."""
+"""Weights that can be downloaded: where they are, fetched with resume, checked, never executed.
+
+Their publisher names no checksums and offers them over plain http. So https is tried first, and the checksum of the
+first download is kept beside the file: a later one must be the same (trust on first use).
+"""
 
 import hashlib
+import http.client
 import os
+import re
 import urllib.error
 import urllib.request
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import IO, Any
 
+from edgeslam_torch.atomic import write_text
 from edgeslam_torch.errors import WeightsError
 from edgeslam_torch.models.record import DEFAULT_WEIGHTS
+from edgeslam_torch.models.weights_file import MAX_FILE_BYTES
 
 CHUNK = 1 << 16
 TIMEOUT_S = 30.0
-MAX_BYTES = 1 << 30
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,11 +33,13 @@ class Remote:
     """Tried in order."""
     licence: str
     about: str
-    sha256: str | None = None
-    """None where the publisher gives none; the user can pin one."""
 
 
-_MIT = ("http://datasets.lids.mit.edu/fastdepth/results", "http://datasets.lids.mit.edu/fast-depth/results")
+_MIT = tuple(
+    f"{scheme}://datasets.lids.mit.edu/{folder}/results"
+    for scheme in ("https", "http")
+    for folder in ("fastdepth", "fast-depth")
+)
 REMOTES = {
     name: Remote(
         name,
@@ -60,47 +70,105 @@ def shipped() -> Path:
     return DEFAULT_WEIGHTS
 
 
+@dataclass(frozen=True, slots=True)
+class Fetched:
+    """What a download brought."""
+
+    sha256: str
+    url: str
+    """Where from."""
+
+    @property
+    def encrypted(self) -> bool:
+        """Whether nobody on the way could change it."""
+        return self.url.startswith("https:")
+
+
 def download(
     urls: tuple[str, ...], target: Path, sha256: str | None = None, progress: Callable[[int, int], None] | None = None
-) -> str:
+) -> Fetched:
     """Fetch the first URL that answers; a part left by an earlier try is continued.
 
     Args:
         urls: Where it may be.
         target: File to write; appears only when complete and right.
-        sha256: What it must hash to.
+        sha256: What it must hash to; if None, what `remember` kept of an earlier download.
         progress: Called with bytes so far and in all (0 when the server does not say).
-
-    Returns:
-        SHA-256 of the file.
 
     Raises:
         WeightsError: If no URL answers, the transfer breaks off, or the checksum differs.
+        OSError: If the file cannot be written.
     """
-    part = target.with_name(target.name + ".part")
     target.parent.mkdir(parents=True, exist_ok=True)
     reasons = []
     for url in urls:
+        # One part for each protocol: what came over http stays what may have been changed.
+        part = target.with_name(f"{target.name}.{url.split(':')[0]}.part")
         try:
             _fetch(url, part, progress)
             break
-        except (urllib.error.URLError, OSError, ValueError) as error:
-            reasons.append(f"{url} ({getattr(error, 'reason', error)})")
+        except (http.client.HTTPException, OSError, ValueError) as error:
+            reasons.append(f"{url} ({_one_line(getattr(error, 'reason', error))})")
     else:
         raise WeightsError(f"download failed: {'; '.join(reasons)}; what has come is kept, run it again to go on")
-    found = _hash(part)
-    if sha256 is not None and found != sha256.lower():
+    found, before = _hash(part), remembered(target)
+    expected = (sha256 or before or found).lower()
+    if found != expected:
         part.unlink()
-        raise WeightsError(f"{target.name}: checksum is {found}, expected {sha256.lower()}; the file was deleted")
+        if sha256 is None:
+            raise WeightsError(
+                f"{target.name}: the file at {url} has changed since it was first downloaded: its checksum is {found}, "
+                f"it was {expected}; it was not taken. If you know why, give --sha256 {found}"
+            )
+        raise WeightsError(f"{target.name}: checksum is {found}, expected {expected}; the file was deleted")
     part.replace(target)
-    return found
+    return Fetched(found, url)
+
+
+def remembered(target: Path) -> str | None:
+    """Checksum of a file's first download; None if there was none."""
+    try:
+        words = _checksum_file(target).read_text("utf-8").split()
+    except (OSError, ValueError):
+        return None
+    return words[0].lower() if words and re.fullmatch("[0-9a-fA-F]{64}", words[0]) else None
+
+
+def remember(target: Path, sha256: str) -> Path:
+    """Keep a checksum beside its file, as ``sha256sum -c`` reads it.
+
+    Raises:
+        OSError: If the disk refuses.
+    """
+    path = _checksum_file(target)
+    write_text(path, f"{sha256}  {target.name}\n")
+    return path
+
+
+def _checksum_file(target: Path) -> Path:
+    return target.with_name(f"{target.name}.sha256")
+
+
+def _one_line(reason: object) -> str:
+    return " ".join(str(reason).split())[:120] or type(reason).__name__
+
+
+class _KeepEncryption(urllib.request.HTTPRedirectHandler):
+    """Does not follow from https to anything else."""
+
+    def redirect_request(
+        self, request: urllib.request.Request, file: IO[bytes], code: int, message: str, headers: Any, url: str
+    ) -> urllib.request.Request | None:
+        if request.type == "https" and not url.startswith("https:"):
+            raise urllib.error.URLError(f"leads from https to {url[:80]}")
+        return super().redirect_request(request, file, code, message, headers, url)
 
 
 def _fetch(url: str, part: Path, progress: Callable[[int, int], None] | None) -> None:
     have = part.stat().st_size if part.is_file() else 0
     request = urllib.request.Request(url, headers={"Range": f"bytes={have}-"} if have else {})
     try:
-        response = urllib.request.urlopen(request, timeout=TIMEOUT_S)
+        response = urllib.request.build_opener(_KeepEncryption).open(request, timeout=TIMEOUT_S)
     except urllib.error.HTTPError as error:
         if error.code == 416 and have:  # nothing beyond what we have: it was complete
             return
@@ -109,13 +177,13 @@ def _fetch(url: str, part: Path, progress: Callable[[int, int], None] | None) ->
         continued = response.status == 206
         have = have if continued else 0
         total = have + int(response.headers.get("Content-Length") or 0)
-        if total > MAX_BYTES:
+        if total > MAX_FILE_BYTES:
             raise ValueError(f"the server offers {total} bytes")
         with part.open("ab" if continued else "wb") as file:
             while chunk := response.read(CHUNK):
                 file.write(chunk)
                 have += len(chunk)
-                if have > MAX_BYTES:
+                if have > MAX_FILE_BYTES:
                     raise ValueError("the server sends without end")
                 if progress is not None:
                     progress(have, total)

@@ -41,7 +41,11 @@ _ALLOWED = {
     Name("torch._utils", "_rebuild_tensor"),
     Name("torch._utils", "_rebuild_tensor_v2"),
     Name("torch._utils", "_rebuild_parameter"),
-    # Beside the model (epoch, best result), of no use to us:
+    # Beside the model (arguments, epoch, best result, optimiser), of no use to us:
+    Name("argparse", "Namespace"),
+    Name("collections", "defaultdict"),
+    Name("builtins", "dict"),
+    Name("__builtin__", "dict"),
     Name("numpy", "dtype"),
     Name("numpy.core.multiarray", "scalar"),
     Name("numpy._core.multiarray", "scalar"),
@@ -124,7 +128,7 @@ def may_refer_to(name: Name) -> bool:
     return (
         name in _ALLOWED
         or (module == "torch" and attribute in _KINDS)
-        or (module.startswith("torch.nn.modules.") and attribute[:1].isupper())
+        or (module.startswith(("torch.nn.modules.", "torch.optim.")) and attribute.lstrip("_")[:1].isupper())
         or (module in _UPSTREAM_MODULES and attribute in _UPSTREAM_CLASSES)
     )
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from edgeslam_torch.errors import ConfigError, OutputError
 
 if TYPE_CHECKING:
+    from edgeslam_torch.models.download import Fetched
     from edgeslam_torch.models.record import Metadata
 
 HELP = "list, download, convert and inspect depth-network weights"
@@ -20,7 +21,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     download = actions.add_parser("download", help="fetch official FastDepth weights and convert them")
     download.add_argument("name", help="as 'list' prints it")
     download.add_argument("--out", "-o", type=Path, help="where to put the .safetensors (default: the cache)")
-    download.add_argument("--sha256", help="what the downloaded file must hash to")
+    download.add_argument(
+        "--sha256", type=_sha256, help="what the downloaded file must hash to (default: as at the first download)"
+    )
     convert = actions.add_parser("convert", help="turn an official .pth.tar into .safetensors, running no code in it")
     convert.add_argument("checkpoint", type=Path)
     convert.add_argument("--out", "-o", type=Path, required=True)
@@ -51,7 +54,7 @@ def _download(args: argparse.Namespace) -> None:
     from tqdm import tqdm
 
     from edgeslam_torch.models.convert import convert_upstream
-    from edgeslam_torch.models.download import REMOTES, cache_folder, download
+    from edgeslam_torch.models.download import REMOTES, cache_folder, download, remember, remembered
 
     remote = REMOTES.get(args.name)
     if remote is None:
@@ -63,15 +66,33 @@ def _download(args: argparse.Namespace) -> None:
             bar.total = total or None
             bar.update(have - bar.n)
 
-        digest = download(remote.urls, raw, args.sha256 or remote.sha256, show)
-    target = args.out or cache_folder() / f"{remote.name}.safetensors"
-    target.parent.mkdir(parents=True, exist_ok=True)
-    convert_upstream(raw, target)
-    if args.sha256 is None and remote.sha256 is None:
-        print(
-            f"sha256 {digest} (the publisher names none; give it to --sha256 next time to be sure it is the same file)"
-        )
+        try:
+            before = remembered(raw)
+            fetched = download(remote.urls, raw, args.sha256, show)
+            target = args.out or cache_folder() / f"{remote.name}.safetensors"
+            target.parent.mkdir(parents=True, exist_ok=True)
+            convert_upstream(raw, target)
+            kept = remember(raw, fetched.sha256)  # only of a file that is what it should be
+        except OSError as error:
+            raise OutputError(f"{error.filename or raw}: cannot be written ({error.strerror or error})") from error
+    print(f"{fetched.url}\nsha256 {fetched.sha256}, {_trust(args.sha256, before, fetched, kept)}")
     print(target)
+
+
+def _trust(given: str | None, before: str | None, fetched: "Fetched", kept: Path) -> str:
+    """How sure it is that this is the publisher's file."""
+    if given is not None:
+        return "as you gave it"
+    if before is not None:
+        return "the same as at the first download"
+    how = "" if fetched.encrypted else ", and it came unencrypted: anybody on the way could have changed it"
+    return f"trusted because it is the first: its publisher names no checksum{how}; kept in {kept}, the next must match"
+
+
+def _sha256(text: str) -> str:
+    if len(text) != 64 or not set(text.lower()) <= set("0123456789abcdef"):
+        raise argparse.ArgumentTypeError(f"must be 64 hexadecimal digits, got {text[:80]!r}")
+    return text.lower()
 
 
 def _convert(args: argparse.Namespace) -> None:

@@ -4,6 +4,7 @@ import argparse
 import importlib
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -16,8 +17,9 @@ import torch
 from edgeslam_torch.errors import ConfigError, EdgeSlamError
 from edgeslam_torch.frontend.depth import DepthPredictor
 from edgeslam_torch.geometry.camera import Camera
-from edgeslam_torch.models.checkpoint import build_network, save_checkpoint
+from edgeslam_torch.models.checkpoint import build_network, load_checkpoint, save_checkpoint
 from edgeslam_torch.models.fastdepth import FastDepth, Variant, Widths
+from edgeslam_torch.models.onnx_graph import build_graph
 from edgeslam_torch.models.record import Metadata
 
 CAMERA = Camera(160, 120, 130.0, 130.0, 79.5, 59.5)
@@ -126,3 +128,49 @@ def test_weights_list_inspect_convert(
     assert "skipadd-pruned" in capsys.readouterr().out
     with pytest.raises(ConfigError, match="there are"):
         run("weights", "download", "resnet")
+
+
+def test_download_says_how_far_a_file_can_be_trusted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """First, again, changed: with a file in the server's place."""
+    from edgeslam_torch.models import download as module
+
+    def fetch(url: str, part: Path, progress: object) -> None:
+        part.write_bytes(content)
+
+    torch.save(FastDepth(Variant.PRUNED).state_dict(), tmp_path / "plain.pth")
+    content = (tmp_path / "plain.pth").read_bytes()
+    monkeypatch.setenv("EDGESLAM_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(module, "_fetch", fetch)
+    name = "mobilenet-nnconv5dw-skipadd-pruned"
+    run("weights", "download", name)
+    assert "trusted because it is the first" in capsys.readouterr().out
+    run("weights", "download", name)
+    assert "the same as at the first download" in capsys.readouterr().out
+    content += b"\0"
+    with pytest.raises(EdgeSlamError, match="has changed since"):
+        run("weights", "download", name)
+
+
+def test_a_download_that_is_no_network_is_not_remembered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from edgeslam_torch.models import download as module
+
+    monkeypatch.setenv("EDGESLAM_CACHE", str(tmp_path))
+    monkeypatch.setattr(module, "_fetch", lambda url, part, progress: part.write_bytes(b"<html>not found</html>"))
+    with pytest.raises(EdgeSlamError, match="checkpoint"):
+        run("weights", "download", "mobilenet-nnconv5")
+    assert not list(tmp_path.glob("*.sha256"))
+
+
+def test_inspect_reads_exported_files_and_shows_no_control_characters(
+    weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    network, metadata = load_checkpoint(weights)
+    loud = replace(metadata, notes="red \x1b[31m\nlicence: free", input_height=2048, input_width=2048, focal_px=1000.0)
+    save_checkpoint(network, loud, tmp_path / "loud.safetensors")
+    run("weights", "inspect", tmp_path / "loud.safetensors")
+    assert "notes: red \\x1b[31m\\nlicence: free" in capsys.readouterr().out
+    (tmp_path / "w.onnx").write_bytes(build_graph(weights)[0])
+    run("weights", "inspect", tmp_path / "w.onnx")
+    assert "focal_px: 105.0" in capsys.readouterr().out

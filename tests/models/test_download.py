@@ -1,7 +1,10 @@
 """Downloads: resumed, checked, and only then in place."""
 
 import hashlib
+import io
 import threading
+import urllib.error
+import urllib.request
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -9,28 +12,33 @@ from pathlib import Path
 import pytest
 
 from edgeslam_torch.errors import WeightsError
-from edgeslam_torch.models.download import cache_folder, download
+from edgeslam_torch.models.download import REMOTES, _KeepEncryption, cache_folder, download, remember, remembered
 
 CONTENT = bytes(range(256)) * 700
 
 
 class _Handler(BaseHTTPRequestHandler):
-    """Serves CONTENT with ranges; ``/short`` closes half way on the first request."""
+    """Serves ``content`` with ranges; ``/short`` closes half way on the first request, ``/garbage`` speaks no HTTP."""
 
     interrupted = False
+    content = CONTENT
 
     def do_GET(self) -> None:
         if self.path == "/missing":
             self.send_error(404)
             return
+        if self.path == "/garbage":
+            self.wfile.write(b"\x00\x01 hello\r\n\r\n")
+            return
+        content = _Handler.content
         start = int((self.headers.get("Range") or "bytes=0-").split("=")[1].split("-")[0])
         self.send_response(206 if start else 200)
-        self.send_header("Content-Length", str(len(CONTENT) - start))
+        self.send_header("Content-Length", str(len(content) - start))
         self.end_headers()
-        end = len(CONTENT)
+        end = len(content)
         if self.path == "/short" and not _Handler.interrupted:
-            _Handler.interrupted, end = True, len(CONTENT) // 2
-        self.wfile.write(CONTENT[start:end])
+            _Handler.interrupted, end = True, len(content) // 2
+        self.wfile.write(content[start:end])
 
     def log_message(self, *_: object) -> None:
         """Quiet."""
@@ -38,7 +46,7 @@ class _Handler(BaseHTTPRequestHandler):
 
 @pytest.fixture
 def server() -> Iterator[str]:
-    _Handler.interrupted = False
+    _Handler.interrupted, _Handler.content = False, CONTENT
     httpd = ThreadingHTTPServer(("127.0.0.1", 0), _Handler)
     thread = threading.Thread(target=httpd.serve_forever, daemon=True)
     thread.start()
@@ -49,11 +57,11 @@ def server() -> Iterator[str]:
 
 def test_second_url_is_tried_and_checksum_returned(server: str, tmp_path: Path) -> None:
     seen: list[tuple[int, int]] = []
-    digest = download(
+    fetched = download(
         (f"{server}/missing", f"{server}/file"), tmp_path / "w", progress=lambda have, total: seen.append((have, total))
     )
     assert (tmp_path / "w").read_bytes() == CONTENT
-    assert digest == hashlib.sha256(CONTENT).hexdigest()
+    assert fetched.sha256 == hashlib.sha256(CONTENT).hexdigest()
     assert seen[-1] == (len(CONTENT), len(CONTENT))
 
 
@@ -61,7 +69,7 @@ def test_broken_transfer_goes_on_where_it_stopped(server: str, tmp_path: Path) -
     with pytest.raises(WeightsError, match="run it again"):
         download((f"{server}/short",), tmp_path / "w")
     assert not (tmp_path / "w").exists()
-    assert 0 < (tmp_path / "w.part").stat().st_size < len(CONTENT)
+    assert 0 < (tmp_path / "w.http.part").stat().st_size < len(CONTENT)
     download((f"{server}/short",), tmp_path / "w", hashlib.sha256(CONTENT).hexdigest())
     assert (tmp_path / "w").read_bytes() == CONTENT
 
@@ -75,6 +83,72 @@ def test_wrong_checksum_leaves_nothing(server: str, tmp_path: Path) -> None:
 def test_unreachable_server_is_named(tmp_path: Path) -> None:
     with pytest.raises(WeightsError, match="download failed: http://127.0.0.1:9/x"):
         download(("http://127.0.0.1:9/x",), tmp_path / "w")
+
+
+# -- trust on first use --------------------------------------------------------------------------------------------
+
+
+def test_https_comes_before_http() -> None:
+    for remote in REMOTES.values():
+        schemes = [url.split(":")[0] for url in remote.urls]
+        assert schemes == sorted(schemes, reverse=True)
+        assert set(schemes) == {"https", "http"}
+
+
+def test_where_https_does_not_answer_http_is_taken_and_known_as_such(server: str, tmp_path: Path) -> None:
+    fetched = download((f"{server}/file".replace("http:", "https:"), f"{server}/file"), tmp_path / "w")
+    assert fetched.url == f"{server}/file"
+    assert not fetched.encrypted
+
+
+def test_a_file_that_changed_since_the_first_download_is_not_taken(server: str, tmp_path: Path) -> None:
+    first = download((f"{server}/file",), tmp_path / "w")
+    remember(tmp_path / "w", first.sha256)
+    assert download((f"{server}/file",), tmp_path / "w").sha256 == first.sha256
+    _Handler.content = CONTENT[:-1] + b"!"
+    changed = hashlib.sha256(_Handler.content).hexdigest()
+    with pytest.raises(WeightsError, match=f"has changed since .*{changed}.*{first.sha256}.*--sha256 {changed}"):
+        download((f"{server}/file",), tmp_path / "w")
+    assert (tmp_path / "w").read_bytes() == CONTENT
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["w", "w.sha256"]
+    assert download((f"{server}/file",), tmp_path / "w", changed).sha256 == changed
+
+
+def test_kept_checksum_is_what_sha256sum_reads(tmp_path: Path) -> None:
+    digest = hashlib.sha256(CONTENT).hexdigest()
+    assert remembered(tmp_path / "w") is None
+    remember(tmp_path / "w", digest)
+    assert (tmp_path / "w.sha256").read_text() == f"{digest}  w\n"
+    assert remembered(tmp_path / "w") == digest
+
+
+@pytest.mark.parametrize("content", [b"", b"nonsense", b"12 w", b"\xff\xfe", b"g" * 64])
+def test_a_kept_checksum_that_is_none_counts_as_none(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "w.sha256").write_bytes(content)
+    assert remembered(tmp_path / "w") is None
+
+
+def test_https_is_not_left_by_a_redirect() -> None:
+    handler, body = _KeepEncryption(), io.BytesIO()
+    for start, end, allowed in (
+        ("https://a/x", "https://b/x", True),
+        ("https://a/x", "http://a/x", False),
+        ("https://a/x", "ftp://a/x", False),
+        ("http://a/x", "https://a/x", True),
+        ("http://a/x", "http://b/x", True),
+    ):
+        request = urllib.request.Request(start)
+        if allowed:
+            assert handler.redirect_request(request, body, 302, "", {}, end) is not None
+        else:
+            with pytest.raises(urllib.error.URLError, match="leads from https"):
+                handler.redirect_request(request, body, 302, "", {}, end)
+
+
+def test_a_server_that_speaks_no_http_is_one_line(server: str, tmp_path: Path) -> None:
+    with pytest.raises(WeightsError, match="download failed") as caught:
+        download((f"{server}/garbage",), tmp_path / "w")
+    assert "\n" not in str(caught.value)
 
 
 def test_cache_folder_follows_the_environment(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
