@@ -1,22 +1,25 @@
 """Metric monocular SLAM with a semi-dense edge map; see README.md.
 
-Importing this package imports nothing heavy: the names below load on first use.
+Importing this package imports next to nothing: the names below load on first use.
 """
 
 import importlib
 import os
-from pathlib import Path
-from typing import Any
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:  # as type checkers read it; `typing` itself takes longer to load than all the rest here
+    from typing import Any
 
 # torch's OpenMP threads spin while they wait; with a busy second core that turns a 26 ms inference
 # into 419 ms (docs/decisions.md, "Threads"). Both must be set before torch is first imported.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 os.environ.setdefault("GOMP_SPINCOUNT", "0")
 
-_ROOT = Path(__file__).resolve().parent.parent
-if not (Path(__file__).parent / "losses" / "__init__.py").exists() and (_ROOT / "pyproject.toml").exists():
+_HERE = os.path.dirname(os.path.realpath(__file__))
+_ROOT = os.path.dirname(_HERE)
+if not os.path.exists(os.path.join(_HERE, "losses", "__init__.py")) and os.path.exists(f"{_ROOT}/pyproject.toml"):
     # A zip download or a Windows checkout has no symbolic links to models/, losses/, train/, eval/.
-    __path__.append(str(_ROOT))
+    __path__.append(_ROOT)
 
 __version__ = "0.1.0"
 
@@ -33,7 +36,7 @@ _LAZY = {
 __all__ = [*_LAZY, "__version__"]
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> "Any":
     if name in _LAZY:
         return getattr(importlib.import_module(_LAZY[name]), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -3,9 +3,24 @@
 One section per stage; `SlamConfig` holds them all. Functions take plain arguments or one section, never the whole.
 """
 
-from dataclasses import dataclass, field
+import math
+from dataclasses import dataclass, field, fields, is_dataclass
+from typing import Any
 
 from edgeslam_torch.fusion.config import FusionConfig
+
+
+def _check_numbers(config: Any, prefix: str = "") -> None:
+    """Every number finite, every integer one that OpenCV and torch take."""
+    for field_ in fields(config):
+        value, name = getattr(config, field_.name), prefix + field_.name
+        if is_dataclass(value):
+            _check_numbers(value, f"{name}.")
+        for number in value if isinstance(value, tuple) else (value,):
+            if isinstance(number, float) and not math.isfinite(number):
+                raise ValueError(f"{name} must be finite, got {number}")
+            if isinstance(number, int) and not -(2**31) <= number < 2**31:
+                raise ValueError(f"{name} must be within 32 bits, got {number}")
 
 
 def _positive(section: object, *names: str) -> None:
@@ -269,3 +284,8 @@ class SlamConfig:
     window: WindowConfig = field(default_factory=WindowConfig)
     mount: MountConfig = field(default_factory=MountConfig)
     fusion: FusionConfig = field(default_factory=FusionConfig)
+
+    def __post_init__(self) -> None:
+        _check_numbers(self)
+        if self.seed < 0:
+            raise ValueError(f"seed must be at least 0, got {self.seed}")

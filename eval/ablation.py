@@ -35,6 +35,7 @@ from edgeslam_torch.io.source import open_source
 from edgeslam_torch.mapping.edge_map import EdgeMap
 from edgeslam_torch.mapping.last_refinement import last_refinement
 from edgeslam_torch.mapping.slam_map import SlamMap
+from edgeslam_torch.record_files import read_mapping
 from edgeslam_torch.slam import EdgeSlam
 from edgeslam_torch.trajectory import TrajectoryLog
 
@@ -319,10 +320,7 @@ def _described(settings: AblationSettings) -> dict[str, Any]:
 def _earlier(path: Path, settings: AblationSettings) -> dict[str, Any] | None:
     if not path.is_file():
         return None
-    try:
-        record: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    except json.JSONDecodeError as error:
-        raise EvaluationError(f"{path}: not JSON ({error}); remove it or give another --out") from error
+    record = read_mapping(path, "JSON", EvaluationError)
     if record.get("settings") != _described(settings):
         raise EvaluationError(f"{path}: made with other settings; give another --out")
     return record

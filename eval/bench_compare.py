@@ -10,7 +10,6 @@ Three kinds of figures, three kinds of noise; docs/decisions.md ("Noise of the b
 - both: never less than a floor per figure, for what one record cannot see of itself.
 """
 
-import json
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from edgeslam_torch.eval.errors import EvaluationError
+from edgeslam_torch.record_files import read_mapping
 from edgeslam_torch.types import FloatArray
 
 FORMAT = 2
@@ -163,13 +163,8 @@ def read_record(path: Path) -> dict[str, Any]:
     Raises:
         EvaluationError: If the file is missing or no such record.
     """
-    try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise EvaluationError(f"{path}: cannot be read ({error.strerror})") from error
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise EvaluationError(f"{path}: not JSON ({error})") from error
-    if not isinstance(record, dict) or record.get("format") not in (1, FORMAT) or "runs" not in record:
+    record = read_mapping(path, "JSON", EvaluationError)
+    if record.get("format") not in (1, FORMAT) or "runs" not in record:
         raise EvaluationError(f"{path}: not a result of 'edgeslam bench' (format {FORMAT})")
     return record
 

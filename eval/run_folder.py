@@ -1,7 +1,6 @@
 """The output folder of ``edgeslam run``, read back."""
 
 import csv
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ from edgeslam_torch.eval.associate import nearest
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.formats import Trajectory, read_trajectory
 from edgeslam_torch.io.ply import read_ply
+from edgeslam_torch.record_files import read_mapping
 from edgeslam_torch.types import PointCloud
 
 _SUPPORTED = frozenset({"initialised", "tracked", "relocalised"})
@@ -124,12 +124,4 @@ def read_summary(path: Path) -> dict[str, Any]:
     Raises:
         EvaluationError: If it is not a JSON object.
     """
-    if not path.is_file():
-        return {}
-    try:
-        summary = json.loads(path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise EvaluationError(f"{path}: not JSON ({error})") from error
-    if not isinstance(summary, dict):
-        raise EvaluationError(f"{path}: not a JSON object")
-    return summary
+    return read_mapping(path, "JSON", EvaluationError) if path.is_file() else {}

@@ -12,6 +12,7 @@ PACKAGE = Path(__file__).resolve().parent.parent / "edgeslam_torch"
 
 LAYERS: tuple[tuple[str, ...], ...] = (
     ("errors", "types", "atomic"),
+    ("record_files",),
     ("geometry", "config"),
     ("models", "synthetic"),
     ("losses",),
@@ -29,6 +30,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("viewer", "demo", "emulator"),
     ("live_view",),
     ("commands",),
+    ("command_line",),
     ("cli",),
 )
 """From the bottom up; a part may import its own row's other parts only when `SAME_ROW` says so."""

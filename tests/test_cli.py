@@ -1,6 +1,7 @@
 """The command line as a user meets it: every mistake gets one line that says what to do."""
 
 import logging
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -111,6 +112,16 @@ MISTAKES = [
     (["run", "{seq}", "--out", "{seq}/rgb.txt/x"], 1, "cannot write results there"),
     (["run", "{seq}", "--max-frames", "0"], 2, "must be a whole number of at least 1, got '0'"),
     (["run", "{seq}", "--max-frames", "many"], 2, "got 'many'"),
+    (["run", "{seq}", "--max-frames", "9" * 20], 2, "whole number of at least 1"),
+    (["run", "{seq}", "--seed", "9" * 20], 2, "--seed: must be a whole number of at most 32 bits"),
+    (["run", "{seq}", "--seed=-1"], 1, "--seed: seed must be at least 0, got -1"),
+    (["run", "{seq}", "--set", "seed=" + "9" * 20], 1, "seed must be within 32 bits"),
+    (["run", "{seq}", "--set", "fusion.delay_s=nan"], 1, "fusion.delay_s must be finite, got nan"),
+    (["run", "{seq}", "--set", "orb.levels=" + "[" * 9999], 1, "orb.levels must be an integer"),
+    (["run", "{seq}", "--config", "{tmp}/deep.toml"], 1, "deep.toml: not valid TOML (nested too deeply)"),
+    (["demo", "--seconds", "nan"], 2, "--seconds: must be a finite number, got 'nan'"),
+    (["sim", "--seed=-1"], 1, "--seed must be at least 0"),
+    (["report", "{tmp}/deep"], 1, "summary.json: not valid JSON (nested too deeply)"),
     (["run", "{seq}", "--mode", "fast"], 2, "invalid choice"),
     (["run", "{seq}", "--camra", "x"], 2, "no option '--camra'; did you mean '--camera'?"),
     (["run", "{seq}", "--max", "5"], 2, "did you mean '--max-frames'?"),
@@ -122,14 +133,19 @@ MISTAKES = [
 ]
 
 
-@pytest.mark.parametrize(("words", "code", "message"), MISTAKES, ids=[" ".join(words) for words, _, _ in MISTAKES])
+@pytest.mark.parametrize(("words", "code", "message"), MISTAKES, ids=[" ".join(words)[:60] for words, _, _ in MISTAKES])
 def test_mistake_gets_one_line_and_no_traceback(edgeslam, recording, tmp_path, words, code, message):
     (tmp_path / "empty").mkdir()
+    (tmp_path / "deep").mkdir()
+    (tmp_path / "deep" / "trajectory.txt").write_text("1 0 0 0 0 0 0 1\n2 0 0 0 0 0 0 1\n")
+    (tmp_path / "deep" / "summary.json").write_text("[" * 100_000)
+    (tmp_path / "deep.toml").write_text("seed = " + "[" * 100_000)
     got, out, err = edgeslam(*(word.format(tmp=tmp_path, seq=recording) for word in words))
     assert got == code
     lines = [line for line in err.splitlines() if "error:" in line]
     assert len(lines) == 1
     assert message in lines[0]
+    assert len(lines[0]) < 500
     assert "Traceback" not in err
 
 
@@ -187,6 +203,37 @@ def test_every_command_module_is_in_the_table():
     folder = Path(cli.__file__).parent / "commands"
     modules = {f"edgeslam_torch.commands.{p.stem}" for p in folder.glob("*.py") if not p.stem.startswith("_")}
     assert modules <= {module for module, _ in cli.COMMANDS.values()}
+
+
+CTRL_C_AT_IMPORT = """
+import os, signal, sys
+
+class CtrlC:
+    def find_spec(name, path=None, target=None):
+        if name == at:
+            os.kill(os.getpid(), signal.SIGINT)
+
+at = sys.argv.pop()
+sys.meta_path.insert(0, CtrlC)
+from edgeslam_torch.cli import main
+sys.exit(main())
+"""
+
+
+# numpy makes an ImportError of a Ctrl-C that comes while it looks for datetime
+@pytest.mark.parametrize("module", ["argparse", "edgeslam_torch.commands.run", "datetime", "cv2"])
+def test_ctrl_c_while_modules_load_ends_with_one_line(recording, tmp_path, module):
+    words = ["run", str(recording), "--out", str(tmp_path / "out"), module]
+    done = subprocess.run([sys.executable, "-c", CTRL_C_AT_IMPORT, *words], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr.splitlines()[-1]) == (130, "edgeslam: interrupted")
+    assert "Traceback" not in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_program_ends_without_a_word_when_interrupted_at_its_end():
+    code = "import os, signal, sys; from edgeslam_torch.cli import main; main(); os.kill(os.getpid(), signal.SIGINT)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (-signal.SIGINT, "")
 
 
 def test_installed_program_runs(tmp_path):

@@ -124,11 +124,15 @@ def _recorded(args: argparse.Namespace) -> "Source":
 def resolved_config(args: argparse.Namespace) -> "SlamConfig":
     """Defaults, then ``--config``, then ``--set``, then the options that have a name of their own."""
     from edgeslam_torch.config import SlamConfig
+    from edgeslam_torch.errors import ConfigError
     from edgeslam_torch.io.config_file import load_config
 
     config = load_config(SlamConfig(), args.config, args.set)
     if args.seed is not None:
-        config = replace(config, seed=args.seed)
+        try:
+            config = replace(config, seed=args.seed)
+        except ValueError as error:
+            raise ConfigError(f"--seed: {error}") from error
     if args.depth is not None:
         config = replace(config, depth=replace(config.depth, weights=args.depth))
     return config
@@ -205,6 +209,6 @@ def _positive_int(text: str) -> int:
         value = int(text)
     except ValueError:
         value = 0
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"must be a whole number of at least 1, got {text!r}")
+    if not 1 <= value < 2**31:
+        raise argparse.ArgumentTypeError(f"must be a whole number of at least 1, got {text[:40]!r}")
     return value

@@ -45,6 +45,8 @@ def main(args: argparse.Namespace) -> int:
     if args.measure is not None:
         return _measure(args)
     width = args.render_width
+    if args.seed < 0:
+        raise ConfigError(f"--seed must be at least 0, got {args.seed}")
     if not 64 <= width <= 960 or not 0 < args.battery <= 100 or args.drain <= 0:
         raise ConfigError("--render-width must be 64 to 960, --battery above 0 up to 100, --drain positive")
     try:

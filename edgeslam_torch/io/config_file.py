@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from edgeslam_torch.errors import ConfigError
+from edgeslam_torch.record_files import read_mapping
 
 C = TypeVar("C")
 
@@ -30,12 +31,13 @@ def load_config(default: C, path: Path | None, overrides: Sequence[str] = ()) ->
     """
     config = default
     if path is not None:
-        config = _laid_over(config, _read(path), str(path), "")
+        config = _laid_over(config, read_mapping(path, "TOML", ConfigError), str(path), "")
     for text in overrides:
         key, equals, value = text.partition("=")
+        origin = f"--set {_cut(text)}"
         if not equals or not key.strip():
-            raise ConfigError(f"--set {text}: write it as section.key=value")
-        config = _override(config, key.strip(), value.strip(), f"--set {text}")
+            raise ConfigError(f"{origin}: write it as section.key=value")
+        config = _override(config, key.strip(), value.strip(), origin)
     return config
 
 
@@ -65,15 +67,6 @@ def keys_of(config: Any, prefix: str = "") -> list[str]:
         name = prefix + field.name
         keys += keys_of(value, f"{name}.") if dataclasses.is_dataclass(value) else [name]
     return keys
-
-
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror or error}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: not valid TOML ({error})") from error
 
 
 def _laid_over(config: C, record: Mapping[str, Any], origin: str, prefix: str) -> C:
@@ -133,7 +126,7 @@ def _parsed(text: str, hint: Any) -> Any:
     candidate = low if low in ("true", "false") else text
     try:
         return tomllib.loads(f"value = {candidate}")["value"]
-    except tomllib.TOMLDecodeError:
+    except (ValueError, RecursionError):
         return text
 
 
@@ -143,7 +136,7 @@ def _checked(value: Any, hint: Any, key: str, origin: str) -> Any:
         ok, result = _as(value, option)
         if ok:
             return result
-    raise ConfigError(f"{origin}: {key} must be {_describe(hint)}, got {value!r}")
+    raise ConfigError(f"{origin}: {key} must be {_describe(hint)}, got {_cut(repr(value))}")
 
 
 def _as(value: Any, option: Any) -> tuple[bool, Any]:
@@ -177,7 +170,14 @@ def _as_tuple(value: Any, hints: tuple[Any, ...]) -> tuple[bool, Any]:
 
 
 def _float(value: Any) -> float:
-    return float(value) if isinstance(value, (int, float)) else math.nan
+    try:
+        return float(value) if isinstance(value, (int, float)) else math.nan
+    except OverflowError:
+        return math.inf
+
+
+def _cut(text: str) -> str:
+    return text if len(text) <= 80 else f"{text[:80]}..."
 
 
 def _options(hint: Any) -> tuple[Any, ...]:

@@ -1,10 +1,11 @@
 import math
 from dataclasses import dataclass, field
+from operator import attrgetter
 from typing import Literal
 
 import pytest
 
-from edgeslam_torch.config import SlamConfig
+from edgeslam_torch.config import EdgeConfig, OrbConfig, SlamConfig
 from edgeslam_torch.errors import ConfigError
 from edgeslam_torch.io.config_file import keys_of, load_config, to_toml
 
@@ -118,6 +119,24 @@ def test_options_win_over_the_file(tmp_path):
     (tmp_path / "c.toml").write_text("seed = 1\n[inner]\ncount = 5\n")
     config = load_config(Outer(), tmp_path / "c.toml", ["seed=2"])
     assert (config.seed, config.inner.count) == (2, 5)
+
+
+FLOATS = [key for key in keys_of(SlamConfig()) if isinstance(attrgetter(key)(SlamConfig()), float)]
+
+
+@pytest.mark.parametrize("key", [*FLOATS, "fusion.delay_s", "fusion.delay_range_s"])
+def test_no_number_may_be_infinite_or_none(key):
+    assert len(FLOATS) > 40
+    for value in ("nan", "inf", "-inf", "1e999"):
+        with pytest.raises(ConfigError, match=key.split(".")[-1]):
+            load_config(SlamConfig(), None, [f"{key}=[{value}, 1.0]" if key.endswith("range_s") else f"{key}={value}"])
+
+
+def test_numbers_are_checked_in_code_too():
+    with pytest.raises(ValueError, match="edges.canny_high must be finite, got inf"):
+        SlamConfig(edges=EdgeConfig(canny_high=math.inf))
+    with pytest.raises(ValueError, match="orb.features must be within 32 bits"):
+        SlamConfig(orb=OrbConfig(features=2**31))
 
 
 def test_every_key_of_the_real_config_has_a_checkable_type():

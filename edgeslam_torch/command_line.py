@@ -1,0 +1,164 @@
+"""What ``edgeslam`` does with its words: find the command, parse its options, run it, report errors in one line."""
+
+import argparse
+import difflib
+import importlib
+import logging
+import math
+import os
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import NoReturn
+
+from edgeslam_torch import __version__
+from edgeslam_torch.errors import EdgeSlamError
+
+Commands = Mapping[str, tuple[str, str]]
+"""Name: (module, one line of help)."""
+
+EXIT_ERROR = 1
+EXIT_USAGE = 2
+
+
+class Parser(argparse.ArgumentParser):
+    """Says what the user may have meant; no option can be abbreviated, so that adding one breaks no script."""
+
+    def __init__(self, *args: object, **kwargs: object) -> None:
+        kwargs.setdefault("allow_abbrev", False)
+        super().__init__(*args, **kwargs)  # type: ignore[arg-type]
+        self.register("type", int, _whole_number)
+        self.register("type", float, _finite_number)
+
+    def error(self, message: str) -> NoReturn:
+        """One line, and exit."""
+        sys.stderr.write(f"{self.prog}: error: {message}; see {self.prog} --help\n")
+        sys.exit(EXIT_USAGE)
+
+    def options(self) -> list[str]:
+        """Every option that can be given."""
+        return [name for action in self._actions for name in action.option_strings]
+
+
+def _whole_number(text: str) -> int:
+    """What every ``type=int`` of a command takes."""
+    try:
+        value = int(text)
+    except ValueError:
+        value = None
+    if value is None or not -(2**31) <= value < 2**31:
+        raise argparse.ArgumentTypeError(f"must be a whole number of at most 32 bits, got {text[:40]!r}")
+    return value
+
+
+def _finite_number(text: str) -> float:
+    """What every ``type=float`` of a command takes."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"must be a finite number, got {text[:40]!r}")
+    return value
+
+
+def run_command(arguments: list[str], commands: Commands) -> int:
+    """Run one of the commands; returns the exit code."""
+    parser = _top_parser(commands)
+    split = next((i for i, word in enumerate(arguments) if not word.startswith("-")), len(arguments))
+    top, unknown = parser.parse_known_args(arguments[:split])
+    if unknown:
+        parser.error(_unknown_arguments(unknown, parser.options()))
+    if split == len(arguments):
+        parser.print_help()
+        return EXIT_USAGE
+    name, rest = arguments[split], arguments[split + 1 :]
+    if name not in commands:
+        parser.error(_unknown_command(name, commands))
+    verbose = top.verbose or any(word in ("-v", "--verbose") for word in rest)
+    _quiet_libraries(verbose)
+    try:
+        return _call(name, commands[name], rest, verbose)
+    except EdgeSlamError as error:
+        if verbose:
+            raise
+        sys.stderr.write(f"edgeslam: error: {_one_line(error)}\n")
+        return EXIT_ERROR
+    except BrokenPipeError:  # the reader of a pipe, such as head, has enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+
+
+def _call(name: str, entry: tuple[str, str], arguments: list[str], verbose: bool) -> int:
+    module = importlib.import_module(entry[0])
+    parser = Parser(prog=f"edgeslam {name}", description=(module.__doc__ or entry[1]).strip().splitlines()[0])
+    module.add_arguments(parser)
+    if "--verbose" not in parser.options():
+        parser.add_argument("-v", "--verbose", action="store_true", help="debug messages, and tracebacks of errors")
+    args, unknown = parser.parse_known_args(arguments)
+    if unknown:
+        parser.error(_unknown_arguments(unknown, parser.options()))
+    with _messages(verbose):
+        return int(module.main(args))
+
+
+def _top_parser(commands: Commands) -> Parser:
+    width = max((len(name) for name in commands), default=0)
+    listing = "\n".join(f"  {name:<{width}}  {entry[1]}" for name, entry in commands.items())
+    parser = Parser(
+        prog="edgeslam",
+        usage="edgeslam [-v] COMMAND ...",
+        description="Metric monocular SLAM with a semi-dense edge map.",
+        epilog=f"commands:\n{listing}\n\n'edgeslam COMMAND --help' tells the options of one.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--version", action="version", version=f"edgeslam {__version__}")
+    parser.add_argument("-v", "--verbose", action="store_true", help="debug messages, and tracebacks of errors")
+    return parser
+
+
+def _unknown_command(name: str, commands: Commands) -> str:
+    close = difflib.get_close_matches(name, commands, n=1, cutoff=0.5)
+    if close:
+        return f"no command {name!r}; did you mean {close[0]!r}?"
+    if os.path.exists(name):
+        return f"no command {name!r}; did you mean 'edgeslam run {name}'?"
+    return f"no command {name!r}; there are {', '.join(commands)}"
+
+
+def _unknown_arguments(unknown: list[str], options: list[str]) -> str:
+    word = unknown[0]
+    if not word.startswith("-"):
+        return f"unexpected {word!r}"
+    option = word.split("=", 1)[0]
+    close = difflib.get_close_matches(option, options, n=1, cutoff=0.5)
+    return f"no option {option!r}" + (f"; did you mean {close[0]!r}?" if close else "")
+
+
+@contextmanager
+def _messages(verbose: bool) -> Iterator[None]:
+    """Our own messages on stderr while a command runs: warnings, or everything."""
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setLevel(logging.DEBUG if verbose else logging.WARNING)
+    pattern = "%(asctime)s %(name)s %(levelname)s %(message)s" if verbose else "edgeslam: %(levelname)s: %(message)s"
+    handler.setFormatter(logging.Formatter(pattern))
+    ours = logging.getLogger("edgeslam_torch")
+    before = ours.level
+    ours.addHandler(handler)
+    ours.setLevel(handler.level)
+    try:
+        yield
+    finally:
+        ours.removeHandler(handler)
+        ours.setLevel(before)
+
+
+def _quiet_libraries(verbose: bool) -> None:
+    """OpenCV and FFmpeg report damaged images themselves, on top of what we say about them."""
+    if not verbose:
+        os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
+        os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split()) or type(error).__name__

@@ -1,0 +1,39 @@
+"""JSON and TOML files, read so that whatever lies in one ends in a single line."""
+
+import json
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from edgeslam_torch.errors import EdgeSlamError
+
+MAX_BYTES = 64 << 20
+"""Of one file; a benchmark of a thousand runs takes 2 MB."""
+_PARSERS: dict[str, Callable[[str], Any]] = {"JSON": json.loads, "TOML": tomllib.loads}
+
+
+def read_mapping(path: Path, kind: str, error: type[EdgeSlamError]) -> dict[str, Any]:
+    """What a file of one record holds.
+
+    Args:
+        path: The file.
+        kind: ``JSON`` or ``TOML``.
+        error: What to raise.
+
+    Raises:
+        EdgeSlamError: ``error``, with the file's name, if it cannot be read, is malformed, or holds no record.
+    """
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise error(f"{path}: not {kind} of ours ({path.stat().st_size / 1e6:.0f} MB)")
+        record = _PARSERS[kind](path.read_text(encoding="utf-8"))
+    except OSError as reason:
+        raise error(f"{path}: {reason.strerror or reason}") from reason
+    except RecursionError as reason:
+        raise error(f"{path}: not valid {kind} (nested too deeply)") from reason
+    except ValueError as reason:  # malformed, not UTF-8, a number of thousands of digits
+        raise error(f"{path}: not valid {kind} ({reason})") from reason
+    if not isinstance(record, dict):
+        raise error(f"{path}: not a {kind} object")
+    return record
