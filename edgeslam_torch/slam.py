@@ -38,6 +38,7 @@ from edgeslam_torch.tracking.initialiser import TwoView
 from edgeslam_torch.tracking.keyframe_choice import few_matches, is_due, lost_most, lost_sight
 from edgeslam_torch.tracking.lazy_view import LazyView
 from edgeslam_torch.tracking.relocaliser import relocalise
+from edgeslam_torch.tracking.self_calibration import calibration_warning
 from edgeslam_torch.tracking.tracker import Track, Tracker, View, make_view, median_parallax
 from edgeslam_torch.trajectory import TrajectoryLog
 from edgeslam_torch.types import (
@@ -125,6 +126,7 @@ class EdgeSlam:
         self._fusion = MotionFusion(self.config.fusion, self._T_b_c, camera.focal_sigma)
         self._fusion.refined_poses = self.log.poses
         self._repeats = RepeatedImages()
+        self._calibration_warning: str | None = None
         self._is_repeat = False
         """Whether the present image shows nothing new."""
         self._published = Published()
@@ -501,6 +503,7 @@ class EdgeSlam:
         estimate = self.scale
         if np.isfinite(estimate.sigma):
             self._published = Published(estimate.value)
+        self._calibration_warning = calibration_warning(self.camera, self.keyframes())
 
     def trajectory(self) -> tuple[FloatArray, FloatArray]:
         """Stamps ``(F,)`` and refined ``T_w_c`` ``(F, 4, 4)`` of every frame stepped so far."""
@@ -547,7 +550,7 @@ class EdgeSlam:
     def warnings(self) -> list[str]:
         """What limits how far the results can be believed, in sentences for the run's summary."""
         depth = None if self.depth is None else self.depth.warning()
-        warnings = (depth, self._warning_of_pieces(), self._repeats.warning())
+        warnings = (depth, self._warning_of_pieces(), self._repeats.warning(), self._calibration_warning)
         return [warning for warning in warnings if warning is not None]
 
     def _warning_of_pieces(self) -> str | None:

@@ -1,5 +1,6 @@
 """Focal length of an unknown camera."""
 
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -8,8 +9,17 @@ from rendered import film, stairs_world
 
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import GUESSED_FOCAL_SIGMA, Camera
+from edgeslam_torch.mapping.keyframe import make_keyframe
 from edgeslam_torch.synthetic import box_room
-from edgeslam_torch.tracking.self_calibration import FocalEstimate, focal_from_matches, focal_of, guess_camera
+from edgeslam_torch.tracking.self_calibration import (
+    FocalEstimate,
+    calibration_warning,
+    contradicts,
+    focal_from_matches,
+    focal_of,
+    guess_camera,
+)
+from edgeslam_torch.types import FrameFeatures
 
 WIDTH, HEIGHT = 640, 480
 
@@ -160,3 +170,80 @@ def test_black_images_fall_back():
     assert camera.fx == 384.0
     assert "too few matches" in camera.source
     assert camera.focal_sigma == GUESSED_FOCAL_SIGMA
+
+
+TRUE_LENS = Camera(WIDTH, HEIGHT, 500.0, 510.0, 310.0, 250.0)
+
+
+def walked_keyframes(rng, count=14, still=False):
+    """Keyframes of a camera that walks and turns before a cloud, each keypoint with the anchor of its point."""
+    p, T = cloud(rng), np.eye(4)
+    keyframes = []
+    for k in range(count):
+        p_c = se3.transform(T, p)
+        uv = TRUE_LENS.project(p_c) + 0.3 * rng.normal(size=(len(p), 2))
+        order = rng.permutation(len(p))
+        nothing = np.zeros(len(p))
+        features = FrameFeatures(uv[order], nothing.astype(int), nothing, rng.integers(0, 256, (len(p), 32), np.uint8))
+        keyframes.append(make_keyframe(k, k, 0.1 * k, T, features))
+        keyframes[-1].anchor[:] = np.where(order % 10 == 0, -1, order)
+        T = T if still else motion(rng) @ T if k % 2 == 0 else se3.inverse(motion(rng)) @ T
+    return keyframes
+
+
+def another_lens(factor, **more):
+    return replace(TRUE_LENS, fx=factor * 500.0, fy=factor * 510.0, source="camera.yaml", **more)
+
+
+@pytest.mark.parametrize("factor", [0.7, 1.3])
+def test_a_calibration_of_another_lens_is_contradicted(rng, factor):
+    warning = calibration_warning(another_lens(factor), walked_keyframes(rng))
+    assert "contradict the calibration" in warning
+    assert f"camera.yaml says {500 * factor:.0f} px" in warning
+    suggested = float(warning.split("focal length of ")[1].split(" ")[0])
+    assert suggested == pytest.approx(500.0, rel=0.06)
+
+
+def test_the_right_calibration_is_left_in_peace(rng):
+    assert calibration_warning(TRUE_LENS, walked_keyframes(rng)) is None
+
+
+def test_a_guess_that_says_so_is_not_contradicted(rng):
+    assert calibration_warning(another_lens(1.3, focal_sigma=GUESSED_FOCAL_SIGMA), walked_keyframes(rng)) is None
+
+
+@pytest.mark.parametrize("count", [0, 1, 14])
+def test_without_motion_nothing_is_said(rng, count):
+    assert calibration_warning(another_lens(1.3), walked_keyframes(rng, count, still=True)) is None
+
+
+@pytest.mark.parametrize(
+    ("focal", "sigma", "pairs", "is_doubted"),
+    [
+        (600.0, 20.0, 30, True),
+        (600.0, 50.0, 30, False),  # two sigmas
+        (565.0, 5.0, 30, False),  # sure, but 13 %
+        (600.0, 20.0, 9, False),
+        (400.0, 20.0, 30, True),
+    ],
+)
+def test_only_a_sure_and_large_difference_counts(focal, sigma, pairs, is_doubted):
+    assert contradicts(FocalEstimate(focal, sigma, pairs, ""), TRUE_LENS) is is_doubted
+
+
+@pytest.mark.slow
+@pytest.mark.data
+@pytest.mark.parametrize(("factor", "is_doubted"), [(1.0, False), (0.7, True)])
+def test_redkitchen_with_another_lens(data_dir, factor, is_doubted):
+    """Measured on the first 250 frames; 0.7 times bends the trajectory from 3 cm to 17."""
+    from edgeslam_torch.config import DepthConfig, SlamConfig
+    from edgeslam_torch.io.source import open_source
+    from edgeslam_torch.slam import EdgeSlam
+
+    source = open_source(data_dir / "7scenes_redkitchen", max_frames=250)
+    camera = replace(source.camera, fx=factor * source.camera.fx, fy=factor * source.camera.fy)
+    slam = EdgeSlam(camera, SlamConfig(depth=DepthConfig(weights="none")))
+    for frame in source.frames():
+        slam.step(frame)
+    slam.finish()
+    assert any("contradict the calibration" in w for w in slam.warnings()) is is_doubted
