@@ -8,7 +8,10 @@ from pathlib import Path
 
 import pytest
 
-PACKAGE = Path(__file__).resolve().parent.parent / "edgeslam_torch"
+ROOT = Path(__file__).resolve().parent.parent
+PACKAGE = ROOT / "edgeslam_torch"
+LINKED = ("models", "losses", "train", "eval")
+"""Folders at the root that are parts of the package, by links where the checkout has them."""
 
 LAYERS: tuple[tuple[str, ...], ...] = (
     ("errors", "types", "atomic"),
@@ -53,12 +56,8 @@ HEAVY = ("torch", "kornia", "cv2", "numpy", "scipy", "onnxruntime", "onnx", "mat
 
 
 def sources() -> list[Path]:
-    """Every module of the package, through the links."""
-    files = [
-        p
-        for folder in (PACKAGE, *(PACKAGE / n for n in ("models", "losses", "train", "eval")))
-        for p in folder.rglob("*.py")
-    ]
+    """Every module of the package, each once."""
+    files = [p for folder in (PACKAGE, *(ROOT / name for name in LINKED)) for p in folder.rglob("*.py")]
     return sorted({p for p in files if "__pycache__" not in p.parts})
 
 
@@ -87,13 +86,14 @@ def part_of(name: str) -> str | None:
 
 def module_name(path: Path) -> str:
     """Full module name of a file in the package."""
-    return ".".join(("edgeslam_torch", *path.relative_to(PACKAGE).with_suffix("").parts))
+    folder = PACKAGE if path.is_relative_to(PACKAGE) else ROOT
+    return ".".join(("edgeslam_torch", *path.relative_to(folder).with_suffix("").parts))
 
 
 PARSED = {path: list(imported(ast.parse(path.read_text(encoding="utf-8")))) for path in sources()}
 
 
-@pytest.mark.parametrize("path", PARSED, ids=lambda p: str(p.relative_to(PACKAGE)))
+@pytest.mark.parametrize("path", PARSED, ids=lambda p: str(p.relative_to(ROOT)))
 def test_imports_go_down_only(path):
     own = part_of(module_name(path))
     if own == "__init__":
@@ -106,7 +106,7 @@ def test_imports_go_down_only(path):
         assert RANK[part] < RANK[own], f"{module_name(path)} imports {name}, which lies on the same level or above"
 
 
-@pytest.mark.parametrize("path", PARSED, ids=lambda p: str(p.relative_to(PACKAGE)))
+@pytest.mark.parametrize("path", PARSED, ids=lambda p: str(p.relative_to(ROOT)))
 def test_packages_that_do_not_belong_are_not_imported(path):
     tops = {name.split(".")[0] for name in PARSED[path]}
     assert not tops & NEVER
@@ -122,7 +122,7 @@ def test_train_is_imported_by_commands_only():
 def loaded_by(statement: str) -> set[str]:
     """Heavy packages that a fresh interpreter has after a statement."""
     code = f"import sys; {statement}; print(' '.join(m for m in {HEAVY!r} if m in sys.modules))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=PACKAGE.parent)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
     return set(done.stdout.split())
 
 
@@ -140,12 +140,12 @@ def test_commands_that_only_list_their_options_load_no_torch():
         "    with contextlib.suppress(SystemExit): cli.main([name, '--help'])\n"
         "    assert 'torch' not in sys.modules, f'edgeslam {name} --help loads torch'\n"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=PACKAGE.parent)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=ROOT)
     assert done.returncode == 0, done.stderr
 
 
 def test_root_folders_are_importable_under_the_package_only():
-    for name in ("models", "losses", "train", "eval"):
-        code = (PACKAGE / name / "__init__.py").read_text(encoding="utf-8")
+    for name in LINKED:
+        code = (ROOT / name / "__init__.py").read_text(encoding="utf-8")
         with pytest.raises(ImportError, match=f"import edgeslam_torch.{name}, not {name}"):
             exec(compile(code, f"{name}/__init__.py", "exec"), {"__name__": name})
