@@ -85,12 +85,15 @@ def _record(
     failure: EdgeSlamError | None = None
     with FlightWriter(folder, source.camera, args.source.startswith("tello://"), args.lossless) as writer:
         _say(f"recording to {folder}; Ctrl-C ends it")
-        signals.tell(source.end)  # from here on no signal interrupts anything: least of all the landing
+        # From here on no signal interrupts anything, least of all a landing; without one a second signal does.
+        signals.tell(source.end, patient=tello is not None)
         try:
             _write_frames(source, writer, messages, tello, args.duration)
         except EdgeSlamError as error:
             failure = error
         finally:
+            if tello is not None and tello.airborne:  # aside: a terminal that is stopped must not hold up the landing
+                threading.Thread(target=_say, args=("landing",), daemon=True).start()
             source.close()  # lands; its state messages are recorded as well
         try:
             _write_states(writer, messages)
@@ -160,7 +163,7 @@ def _start_pilot(tello: "Tello") -> Callable[[], None]:
 
 
 class _Signals:
-    """Ctrl-C, ``kill``, a closed terminal: each ends the recording, and none of them interrupts a landing.
+    """Ctrl-C, ``kill``, a closed terminal: each ends the recording, none interrupts a landing, however often it comes.
 
     Signals that are ignored already (``nohup``) stay ignored.
     """
@@ -169,6 +172,7 @@ class _Signals:
         self.number = 0
         """The first one that came."""
         self._end: Callable[[], None] | None = None
+        self._patient = False
         self._old: dict[int, Any] = {}
 
     @property
@@ -176,11 +180,9 @@ class _Signals:
         """As a shell reports a program that a signal ended; 0 when none came."""
         return 128 + self.number if self.number else 0
 
-    def tell(self, end: Callable[[], None]) -> None:
-        """Call ``end`` from now on, in place of interrupting what goes on; at once if one has come."""
-        self._end = end
-        if self.number:
-            end()
+    def tell(self, end: Callable[[], None], patient: bool) -> None:
+        """Call ``end`` from now on, in place of interrupting what goes on; always when ``patient``, else once."""
+        self._end, self._patient = end, patient
 
     def __enter__(self) -> "_Signals":
         if threading.current_thread() is threading.main_thread():
@@ -195,8 +197,8 @@ class _Signals:
             signal.signal(number, handler)
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
-        self.number = self.number or number
-        if self._end is None:
+        again, self.number = self.number != 0, self.number or number
+        if self._end is None or (again and not self._patient):
             raise KeyboardInterrupt
         self._end()
 
@@ -206,4 +208,5 @@ def _say(text: str) -> None:
     try:
         print(text, flush=True)
     except OSError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        with open(os.devnull, "wb") as nowhere:
+            os.dup2(nowhere.fileno(), sys.stdout.fileno())

@@ -137,12 +137,15 @@ class TelloFeed:
         return self.video.wait(after_count, timeout_s)
 
     def remarks(self) -> list[str]:
-        """As `Feed`: what did not come from the drone."""
+        """As `Feed`: what did not come from the drone, or could not be read."""
+        remarks = []
         refused = {channel: count for channel, count in self.tello.refused.items() if count}
-        if not refused:
-            return []
-        listing = ", ".join(f"{channel} {count}" for channel, count in refused.items())
-        return [f"{sum(refused.values())} packets from others than the drone were refused ({listing})"]
+        if refused:
+            listing = ", ".join(f"{channel} {count}" for channel, count in refused.items())
+            remarks.append(f"{sum(refused.values())} packets from others than the drone were refused ({listing})")
+        if self.tello.malformed:
+            remarks.append(f"{self.tello.malformed} state messages could not be read")
+        return remarks
 
     def close(self) -> None:
         """Land if this client took off, and leave."""

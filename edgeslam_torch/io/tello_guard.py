@@ -39,6 +39,8 @@ class Guard:
     """
 
     def __init__(self, commands: socket.socket, drone: tuple[str, int]) -> None:
+        if not sys.executable or getattr(sys, "frozen", False):
+            raise OSError("no Python interpreter to run it")
         number = commands.fileno()
         self._process = subprocess.Popen(
             [sys.executable, "-I", "-S", __file__, str(number), drone[0], str(drone[1])],

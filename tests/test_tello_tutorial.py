@@ -1,0 +1,58 @@
+"""The first three commands of docs/tello.md, as a user types them: only the ports are free ones."""
+
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from free_ports import free_ports
+
+pytest.importorskip("av", reason="PyAV is not installed: the [drone] extra")
+GUIDE = Path(__file__).resolve().parent.parent / "docs" / "tello.md"
+
+
+def commands():
+    """The words of the guide's first block, comments left out."""
+    block = GUIDE.read_text(encoding="utf-8").split("## Without a drone")[1].split("\n\n")[1]
+    return [shlex.split(line, comments=True) for line in block.splitlines()]
+
+
+def edgeslam(words):
+    return [sys.executable, "-m", "edgeslam_torch.cli", *words[1:]]
+
+
+def test_the_guide_begins_with_these_commands():
+    assert [words[:2] for words in commands()] == [["edgeslam", name] for name in ("sim", "record", "run")]
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(580)
+def test_the_guide_can_be_followed(tmp_path):
+    """A flight, and either a map that frames were tracked against, or the plain word that there is none."""
+    sim, record, run = commands()
+    command, state, video = free_ports(3)
+    sim += [f"--command-port={command}", f"--state-port={state}", f"--video-port={video}"]
+    record[record.index("tello://127.0.0.1")] += f":{command}:{state}:{video}"
+    where = {"cwd": tmp_path, "env": os.environ | {"PYTHONPATH": str(GUIDE.parent.parent)}, "text": True}
+    with subprocess.Popen(edgeslam(sim), stdout=subprocess.PIPE, **where) as drone:
+        try:
+            assert "Tello emulator" in drone.stdout.readline()
+            flown = subprocess.run(edgeslam(record), capture_output=True, **where)
+        finally:
+            drone.terminate()
+    assert flown.returncode == 0, flown.stderr
+    folder = record[record.index("--out") + 1]
+    height_cm = [int(h) for h in re.findall(r";h:(-?\d+);", (tmp_path / folder / "state.txt").read_text())]
+    assert max(height_cm) >= 100
+    assert height_cm[-1] == 0
+    done = subprocess.run(edgeslam(run), capture_output=True, **where)
+    assert done.returncode == 0, done.stderr
+    summary = json.loads((tmp_path / "runs" / Path(folder).name / "summary.json").read_text())
+    assert f"{summary['frames']} frames" in flown.stdout
+    assert f"{summary['tracked']} of {summary['frames']} frames tracked" in done.stdout
+    assert summary["tracked"] or "no frame was tracked against a map" in done.stderr
+    assert summary["map"]["edge_points"] or "the edge map is empty" in done.stderr
