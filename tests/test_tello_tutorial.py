@@ -48,7 +48,6 @@ def test_the_guide_can_be_followed(tmp_path):
     folder = record[record.index("--out") + 1]
     height_cm = [int(h) for h in re.findall(r";h:(-?\d+);", (tmp_path / folder / "state.txt").read_text())]
     assert max(height_cm) >= 100
-    assert height_cm[-1] == 0
     done = subprocess.run(edgeslam(run), capture_output=True, **where)
     assert done.returncode == 0, done.stderr
     summary = json.loads((tmp_path / "runs" / Path(folder).name / "summary.json").read_text())

@@ -585,7 +585,7 @@ def test_without_pyav_the_message_says_what_to_install(monkeypatch):
         raise ImportError(name)
 
     monkeypatch.setattr(tello_video.importlib, "import_module", missing)
-    with pytest.raises(SourceError, match=r"edgeslam-torch\[drone\]"):
+    with pytest.raises(SourceError, match=r"pip install 'av"):
         tello_video.import_av()
 
 
