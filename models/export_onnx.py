@@ -16,6 +16,8 @@ from edgeslam_torch.models.fold import deployed
 from edgeslam_torch.models.onnx_file import INPUT, LOG_DEPTH, SIGMA
 from edgeslam_torch.models.record import HEADER_KEY, Metadata
 
+OLDEST_OPSET = 14
+"""ONNX's converter brings our network no further down."""
 OLD_RUNTIME_IR, OLD_RUNTIME_OPSET = 9, 17
 """onnxruntime <= 1.16 (older boards) reads IR <= 9; opset 17 is safely inside what it knows."""
 
@@ -47,8 +49,9 @@ def export_onnx(network: FastDepth, metadata: Metadata, path: Path, options: Exp
     if options.dynamic:
         h, w = torch.export.Dim("h32", min=1, max=64), torch.export.Dim("w32", min=1, max=64)
         shapes = ({2: 32 * h, 3: 32 * w},)
-    # The exporter warns about operators of torchvision, which we do not use.
-    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
+    # They warn about operators of torchvision, which we do not use, and about whose version converter is used.
+    for name in ("torch.onnx", "onnxscript"):
+        logging.getLogger(name).setLevel(logging.ERROR)
     with warnings.catch_warnings(), torch.no_grad():
         warnings.simplefilter("ignore")
         program = torch.onnx.export(
@@ -71,9 +74,16 @@ def export_onnx(network: FastDepth, metadata: Metadata, path: Path, options: Exp
 
 
 def set_opset(model: onnx.ModelProto, opset: int) -> onnx.ModelProto:
-    """The exporter writes opset 18 or later; older ones come from ONNX's own version converter."""
+    """The exporter writes opset 18 or later; older ones come from ONNX's own version converter.
+
+    Raises:
+        OutputError: If that cannot.
+    """
     if opset != model.opset_import[0].version:
-        model = onnx.version_converter.convert_version(model, opset)
+        try:
+            model = onnx.version_converter.convert_version(model, opset)
+        except RuntimeError as error:
+            raise OutputError(f"onnx cannot convert to opset {opset} ({' '.join(str(error).split())[-120:]})") from None
     if opset <= OLD_RUNTIME_OPSET:
         model.ir_version = OLD_RUNTIME_IR
     return model

@@ -1,4 +1,4 @@
-"""``edgeslam depth``: metric depth of images, folders and videos."""
+"""Metric depth of images, folders and videos."""
 
 import argparse
 from collections.abc import Iterable
@@ -13,23 +13,32 @@ if TYPE_CHECKING:
     from edgeslam_torch.geometry.camera import Camera
     from edgeslam_torch.types import DepthMap, Frame
 
-HELP = "metric depth of images, a folder or a video"
-
+FILES = """\
+files written for every image STEM.jpg, pixel for pixel, lens distortion removed:
+  STEM.npy         depth along the optical axis in metres, float32; NaN where the network says nothing
+  STEM.png         the same in millimetres, 16 bit; 0 where nothing is known, 65535 for 65.5 m and beyond
+  STEM_colour.png  to look at: near is red, far is blue, unknown is black; the bar below tells the metres
+  STEM_sigma.npy   with --sigma: standard deviation of the logarithm of depth, float32; 0.1 is about 10 %
+"""
 MAX_MILLIMETRES = 65535
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's options."""
-    parser.add_argument("source", help="an image, a folder, a recording or a video")
-    parser.add_argument("--out", "-o", type=Path, required=True, help="folder for the results")
-    parser.add_argument("--camera", help="calibration file or preset (found by itself where the source has one)")
-    parser.add_argument("--weights", type=Path, help="weights (.safetensors) or an exported model (.onnx)")
-    parser.add_argument("--backend", choices=("onnxruntime", "torch"), default="onnxruntime")
-    parser.add_argument("--threads", type=int, default=1, help="threads of one inference")
-    parser.add_argument("--max-frames", type=int, help="stop after this many images")
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = FILES
+    parser.add_argument("source", metavar="SOURCE", help="an image, a folder, a recording or a video")
+    parser.add_argument("--out", "-o", type=Path, metavar="DIR", required=True, help="folder for the files below")
     parser.add_argument(
-        "--sigma", action="store_true", help="also write STEM_sigma.npy: standard deviation of log depth"
+        "--camera", metavar="FILE|PRESET", help="calibration (default: the source's own camera.yaml); metres follow it"
     )
+    parser.add_argument(
+        "--weights", type=Path, metavar="FILE", help=".safetensors, or .onnx of edgeslam export (default: the shipped)"
+    )
+    parser.add_argument("--backend", choices=("onnxruntime", "torch"), default="onnxruntime", help="what runs it")
+    parser.add_argument("--threads", type=_positive, default=1, metavar="N", help="threads of one inference")
+    parser.add_argument("--max-frames", type=_positive, metavar="N", help="stop after N images")
+    parser.add_argument("--sigma", action="store_true", help="write STEM_sigma.npy, too")
 
 
 def main(args: argparse.Namespace) -> int:
@@ -38,23 +47,29 @@ def main(args: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from edgeslam_torch.frontend.depth import DepthPredictor
+    from edgeslam_torch.frontend.depth_check import MIN_SHARE
 
     predictor = DepthPredictor(args.weights, args.backend, args.threads)
     camera, frames, length, warnings = _frames(args.source, args.camera, args.max_frames)
     for warning in warnings:
         print(f"note: {warning}")
-    args.out.mkdir(parents=True, exist_ok=True)
-    count = 0
-    for frame in tqdm(frames, total=length, unit="image", disable=None):
-        depth = predictor(np.asarray(camera.undistort_image(frame.image), np.uint8), camera)
-        stem = frame.path.stem if frame.path is not None else f"frame_{frame.index:06d}"
-        try:
-            write_depth(args.out, stem, depth, args.sigma)
-        except OSError as error:
-            raise OutputError(f"{args.out}/{stem}: cannot be written ({error.strerror})") from error
-        count += 1
+    shares: list[float] = []
+    stems: set[str] = set()
+    try:
+        args.out.mkdir(parents=True, exist_ok=True)
+        for frame in tqdm(frames, total=length, unit="image", disable=None):
+            _spare_the_source(args.out, frame.path)
+            depth = predictor(np.asarray(camera.undistort_image(frame.image), np.uint8), camera)
+            depth, share = _believable(depth)
+            shares.append(share)
+            write_depth(args.out, _stem(frame, stems), depth, args.sigma)
+    except OSError as error:
+        raise OutputError(f"{error.filename or args.out}: cannot be written ({error.strerror or error})") from error
+    unknown = sum(share < MIN_SHARE for share in shares)
+    if unknown:
+        print(f"note: {unknown} of {len(shares)} depth maps are mostly unknown: these weights do not fit these images")
     lens = ", lens distortion removed" if camera.is_distorted else ""
-    print(f"{count} depth maps in {args.out} (metres for {camera.source}{lens}; {predictor.backend})")
+    print(f"{len(shares)} depth maps in {args.out} (metres for {camera.source}{lens}; {predictor.backend})")
     return 0
 
 
@@ -66,6 +81,8 @@ def write_depth(folder: Path, stem: str, depth: "DepthMap", with_sigma: bool = F
     """
     import cv2
 
+    from edgeslam_torch.io.depth_picture import colour
+
     np.save(folder / f"{stem}.npy", depth.depth_m)
     millimetres = np.clip(np.nan_to_num(depth.depth_m) * 1000.0 + 0.5, 0, MAX_MILLIMETRES).astype(np.uint16)
     for name, image in ((f"{stem}.png", millimetres), (f"{stem}_colour.png", colour(depth.depth_m))):
@@ -75,18 +92,38 @@ def write_depth(folder: Path, stem: str, depth: "DepthMap", with_sigma: bool = F
         np.save(folder / f"{stem}_sigma.npy", depth.sigma_log)
 
 
-def colour(depth_m: np.ndarray) -> np.ndarray:
-    """Inverse depth as colours, near red and far blue, ``(H, W, 3)`` BGR; unknown depth is black."""
-    import cv2
+def _believable(depth: "DepthMap") -> "tuple[DepthMap, float]":
+    """The map with NaN where it cannot be meant, and the share of the pixels that can."""
+    from edgeslam_torch.frontend.depth_check import usable
+    from edgeslam_torch.types import DepthMap
 
-    known = np.isfinite(depth_m) & (depth_m > 0)
-    inverse = np.zeros(depth_m.shape, np.float32)
-    inverse[known] = 1.0 / depth_m[known]
-    low, high = np.percentile(inverse[known], (2, 98)) if known.any() else (0.0, 1.0)
-    level = np.clip((inverse - low) / max(high - low, 1e-6) * 255.0, 0, 255).astype(np.uint8)
-    picture = np.asarray(cv2.applyColorMap(level, cv2.COLORMAP_TURBO))
-    picture[~known] = 0
-    return picture
+    good = usable(depth)
+    return DepthMap(np.where(good, depth.depth_m, np.float32(np.nan)), depth.sigma_log), float(good.mean())
+
+
+def _spare_the_source(out: Path, image: Path | None) -> None:
+    """Refuse to write depth maps among the images: ``STEM.png`` would take their place.
+
+    Raises:
+        OutputError: If the folder is the image's own.
+    """
+    if image is not None and out.resolve() == image.resolve().parent:
+        raise OutputError(f"{out}: holds the images themselves, which depth maps of the same names would overwrite")
+
+
+def _stem(frame: "Frame", taken: set[str]) -> str:
+    """What the files of an image are called; with its suffix when another image has the same name without."""
+    if frame.path is None:
+        return f"frame_{frame.index:06d}"
+    stem = frame.path.stem if frame.path.stem not in taken else frame.path.name
+    taken.add(stem)
+    return stem
+
+
+def _positive(text: str) -> int:
+    if not text.isascii() or not text.isdecimal() or len(text) > 9 or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"must be a whole number of at least 1, got {text[:40]!r}")
+    return int(text)
 
 
 def _frames(

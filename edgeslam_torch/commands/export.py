@@ -1,4 +1,4 @@
-"""``edgeslam export``: depth network to ONNX for other computers, checked and measured."""
+"""Depth network to ONNX for other computers, checked and measured."""
 
 import argparse
 import time
@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--fp16", action="store_true", help="store weights as float16")
     parser.add_argument("--calibrate", help="images, recording or video like those it will see")
     parser.add_argument("--size", metavar="HxW", help="input size, multiples of 32 (default: as trained)")
-    parser.add_argument("--opset", type=int, default=18, help="ONNX operator set")
+    parser.add_argument("--opset", type=int, default=18, help="ONNX operator set (default: 18)")
     parser.add_argument(
         "--old-runtime", action="store_true", help="for onnxruntime before 1.17: opset 17 and IR version 9"
     )
@@ -45,7 +45,7 @@ def main(args: argparse.Namespace) -> int:
     from edgeslam_torch.models.checkpoint import load_checkpoint
     from edgeslam_torch.models.export_onnx import OLD_RUNTIME_OPSET, ExportOptions, export_onnx
     from edgeslam_torch.models.fold import deployed
-    from edgeslam_torch.models.quantize import quantize_int8, store_float16
+    from edgeslam_torch.models.quantize import MIN_CALIBRATION_IMAGES, quantize_int8, store_float16
 
     if args.int8 and args.fp16:
         raise ConfigError("--int8 and --fp16 exclude each other")
@@ -53,8 +53,10 @@ def main(args: argparse.Namespace) -> int:
         raise ConfigError("--int8 needs --calibrate DATA: real frames like those the network will see")
     network, metadata = load_checkpoint(args.weights)
     height, width = _size(args.size, metadata)
-    opset = min(args.opset, OLD_RUNTIME_OPSET) if args.old_runtime else args.opset
+    opset = _opset(min(args.opset, OLD_RUNTIME_OPSET) if args.old_runtime else args.opset)
     images = _images(args.calibrate, height, width, metadata)
+    if args.int8 and len(images) < MIN_CALIBRATION_IMAGES:
+        raise ConfigError(f"{args.calibrate}: --int8 needs {MIN_CALIBRATION_IMAGES} images, there are {len(images)}")
     try:
         args.out.parent.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory() as folder:
@@ -79,15 +81,30 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _size(text: str | None, metadata: "Metadata") -> tuple[int, int]:
+    from edgeslam_torch.models.layout import INPUT_MULTIPLE
+    from edgeslam_torch.models.record import MAX_INPUT_PX
+
     if text is None:
         return metadata.input_height, metadata.input_width
     try:
         height, width = (int(n) for n in text.lower().split("x"))
     except ValueError:
         raise ConfigError(f"--size {text}: expected HEIGHTxWIDTH, for example 192x256") from None
-    if height % 32 or width % 32 or height < 32 or width < 32:
-        raise ConfigError(f"--size {text}: height and width must be multiples of 32")
+    sides = (height, width)
+    if any(side % INPUT_MULTIPLE or not INPUT_MULTIPLE <= side <= MAX_INPUT_PX for side in sides):
+        raise ConfigError(f"--size {text}: height and width must be multiples of {INPUT_MULTIPLE} up to {MAX_INPUT_PX}")
     return height, width
+
+
+def _opset(wanted: int) -> int:
+    import onnx
+
+    from edgeslam_torch.models.export_onnx import OLDEST_OPSET
+
+    newest = onnx.defs.onnx_opset_version()
+    if not OLDEST_OPSET <= wanted <= newest:
+        raise ConfigError(f"--opset {wanted}: must be from {OLDEST_OPSET} to {newest}")
+    return wanted
 
 
 def _images(source: str | None, height: int, width: int, metadata: "Metadata") -> "list[FloatArray]":
@@ -143,9 +160,16 @@ class _Model:
         import onnxruntime
 
         options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads, options.inter_op_num_threads, options.log_severity_level = 1, 1, 3
+        options.intra_op_num_threads, options.inter_op_num_threads = 1, 1
         self.megabytes = path.stat().st_size / 1e6
-        self._session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+        options.log_severity_level = 4  # what goes wrong is raised, too
+        try:
+            self._session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+        except Exception as error:  # onnxruntime's have no base of their own
+            reason = " ".join(str(error).split())[-160:]
+            raise OutputError(
+                f"onnxruntime {onnxruntime.__version__} cannot load what was exported ({reason})"
+            ) from None
 
     def log_depth(self, image: "FloatArray") -> "FloatArray":
         """``(1, 1, H, W)``."""

@@ -1,4 +1,4 @@
-"""``edgeslam weights``: list, download, convert and inspect depth-network weights."""
+"""List, download, convert and inspect depth-network weights."""
 
 import argparse
 import dataclasses

@@ -21,6 +21,7 @@ from edgeslam_torch.models.checkpoint import build_network, load_checkpoint, sav
 from edgeslam_torch.models.fastdepth import FastDepth, Variant, Widths
 from edgeslam_torch.models.onnx_graph import build_graph
 from edgeslam_torch.models.record import Metadata
+from edgeslam_torch.types import DepthMap
 
 CAMERA = Camera(160, 120, 130.0, 130.0, 79.5, 59.5)
 METADATA = Metadata(input_height=96, input_width=128, focal_px=105.0)
@@ -65,7 +66,61 @@ def test_depth_of_a_folder(weights: Path, pictures: Path, tmp_path: Path, capsys
     millimetres = cv2.imread(str(out / "img1.png"), cv2.IMREAD_UNCHANGED)
     assert millimetres.dtype == np.uint16
     np.testing.assert_allclose(millimetres, np.clip(metres * 1000, 0, 65535), atol=0.51)
-    assert cv2.imread(str(out / "img1_colour.png")).shape == (120, 160, 3)
+    assert cv2.imread(str(out / "img1_colour.png")).shape == (150, 160, 3)  # the bar below has 30 rows
+
+
+def test_depth_maps_never_take_the_images_place(weights: Path, pictures: Path) -> None:
+    before = {p.name: p.read_bytes() for p in pictures.iterdir()}
+    with pytest.raises(EdgeSlamError, match="holds the images themselves"):
+        run("depth", pictures, "--out", pictures, "--weights", weights)
+    assert {p.name: p.read_bytes() for p in pictures.iterdir()} == before
+
+
+def test_two_images_of_one_name_are_two_depth_maps(weights: Path, pictures: Path, tmp_path: Path) -> None:
+    for old in pictures.glob("*.png"):
+        if old.name != "img0.png":
+            old.unlink()
+    cv2.imwrite(str(pictures / "img0.jpg"), cv2.imread(str(pictures / "img0.png"))[::-1])
+    run("depth", pictures, "--out", tmp_path / "out", "--weights", weights)
+    maps = sorted((tmp_path / "out").glob("*.npy"))
+    assert len(maps) == 2
+    assert not np.array_equal(np.load(maps[0]), np.load(maps[1]))
+
+
+def test_depth_into_a_file_is_one_line(weights: Path, pictures: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(EdgeSlamError, match="file: cannot be written"):
+        run("depth", pictures, "--out", tmp_path / "file", "--weights", weights)
+
+
+def test_depth_maps_that_cannot_be_meant_are_unknown_and_counted(
+    weights: Path, pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def far(self: DepthPredictor, image: np.ndarray, camera: Camera) -> DepthMap:
+        return DepthMap(np.full(image.shape[:2], 1e30, np.float32), np.ones(image.shape[:2], np.float32))
+
+    monkeypatch.setattr(DepthPredictor, "__call__", far)
+    run("depth", pictures, "--out", tmp_path / "out", "--weights", weights, "--max-frames", "2")
+    assert "2 of 2 depth maps are mostly unknown" in capsys.readouterr().out
+    assert np.isnan(np.load(tmp_path / "out" / "img0.npy")).all()
+    assert not cv2.imread(str(tmp_path / "out" / "img0.png"), cv2.IMREAD_UNCHANGED).any()
+
+
+def test_help_of_depth_names_every_file_and_its_unit(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        run("depth", "--help")
+    said = capsys.readouterr().out
+    for word in ("STEM.npy", "STEM.png", "STEM_colour.png", "STEM_sigma.npy", "metres", "millimetres", "NaN"):
+        assert word in said
+
+
+@pytest.mark.parametrize("option", ["--threads", "--max-frames"])
+@pytest.mark.parametrize("value", ["0", "-3", "1.5", "many", "9" * 30, "٣"])
+def test_counts_must_be_whole_and_positive(option: str, value: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        run("depth", "x", "--out", "y", f"{option}={value}")
+    assert ended.value.code == 2
+    assert "at least 1" in capsys.readouterr().err
 
 
 def test_depth_of_one_image_uses_the_camera_beside_it(weights: Path, pictures: Path, tmp_path: Path) -> None:
@@ -81,12 +136,13 @@ def test_missing_image_is_one_line(weights: Path, tmp_path: Path) -> None:
 
 
 def test_int8_export_is_checked_and_runs_on_the_companion_example(
-    weights: Path, pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    weights: Path, pictures: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "depth.onnx"
     code = run("export", weights, "--out", out, "--int8", "--calibrate", pictures, "--old-runtime", "--size", "64x96")
     assert code == 0
-    printed = capsys.readouterr().out
+    printed, complaints = capfd.readouterr()
+    assert complaints == ""
     assert "| float32 |" in printed
     assert "| int8 |" in printed
     model = onnx.load(str(out))
@@ -110,7 +166,19 @@ def test_export_refuses_what_makes_no_sense(weights: Path, tmp_path: Path) -> No
         run("export", weights, "--out", tmp_path / "x.onnx", "--size", "100x100")
     with pytest.raises(ConfigError, match="HEIGHTxWIDTH"):
         run("export", weights, "--out", tmp_path / "x.onnx", "--size", "big")
+    with pytest.raises(ConfigError, match="up to 2048"):
+        run("export", weights, "--out", tmp_path / "x.onnx", "--size", "99999968x32")
+    for opset in ("-1", "3", "99"):
+        with pytest.raises(ConfigError, match=f"--opset {opset}: must be from 14 to"):
+            run("export", weights, "--out", tmp_path / "x.onnx", "--opset", opset)
     assert not (tmp_path / "x.onnx").exists()
+
+
+def test_int8_export_needs_enough_pictures(weights: Path, pictures: Path, tmp_path: Path) -> None:
+    for k in range(5):
+        (pictures / f"img{k}.png").unlink()
+    with pytest.raises(ConfigError, match="--int8 needs 8 images, there are 5"):
+        run("export", weights, "--out", tmp_path / "x.onnx", "--int8", "--calibrate", pictures)
 
 
 def test_weights_list_inspect_convert(
