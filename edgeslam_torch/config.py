@@ -119,8 +119,8 @@ class InitialisationConfig:
     min_points: int = 80
     """Anchors that must triangulate well."""
     max_reprojection_px: float = 2.0
-    keyframe_gap: int = 5
-    """Frames between those that become keyframes once the two views have made a map."""
+    keyframe_gap_s: float = 0.15
+    """Time between frames that become keyframes once the two views have made a map."""
     most_keyframes: int = 12
     """Of these frames at most; each costs a pass of the depth network."""
     max_direction_sigma: float = 0.08
@@ -129,21 +129,21 @@ class InitialisationConfig:
     """The same without a depth network, which would tell a flat scene from a real one."""
 
     def __post_init__(self) -> None:
-        _positive(self, "min_parallax_deg", "min_points", "max_reprojection_px", "keyframe_gap", "most_keyframes")
+        _positive(self, "min_parallax_deg", "min_points", "max_reprojection_px", "keyframe_gap_s", "most_keyframes")
 
 
 @dataclass(frozen=True, slots=True)
 class MappingConfig:
     """Stage 3: keyframes and anchors."""
 
-    keyframe_min_gap: int = 5
-    """Frames between keyframes at least."""
-    keyframe_max_gap: int = 30
-    """Frames between keyframes at most while the camera moves."""
+    keyframe_min_gap_s: float = 0.15
+    """Time between keyframes at least; shorter ones add work and no view."""
+    keyframe_max_gap_s: float = 0.98
+    """Time between keyframes at most while the camera moves."""
     keyframe_followed: float = 0.9
     """A new keyframe when flow finds fewer than this share of the last one's keypoints."""
     keyframe_at_once: float = 0.75
-    """Below this share it does not wait for ``keyframe_min_gap``."""
+    """Below this share it does not wait for ``keyframe_min_gap_s``."""
     keyframe_overlap: float = 0.7
     """A new keyframe when fewer than this share of the reference keyframe's anchors is matched."""
     keyframe_parallax_deg: float = 3.0
@@ -163,7 +163,12 @@ class MappingConfig:
 
     def __post_init__(self) -> None:
         _positive(
-            self, "keyframe_min_gap", "keyframe_max_gap", "keyframe_parallax_deg", "neighbours", "min_parallax_deg"
+            self,
+            "keyframe_min_gap_s",
+            "keyframe_max_gap_s",
+            "keyframe_parallax_deg",
+            "neighbours",
+            "min_parallax_deg",
         )
         if self.window < 2:
             raise ValueError(f"window must be at least 2, got {self.window}")

@@ -32,7 +32,8 @@ from edgeslam_torch.mapping.keyframe import Keyframe, make_keyframe
 from edgeslam_torch.mapping.last_refinement import last_refinement, lm_config
 from edgeslam_torch.mapping.mapper import Mapper
 from edgeslam_torch.mapping.slam_map import SlamMap
-from edgeslam_torch.tracking.bootstrap import Bootstrap
+from edgeslam_torch.optim.problem import PosePrior
+from edgeslam_torch.tracking.bootstrap import Bootstrap, StartedMap
 from edgeslam_torch.tracking.flow import FlowTracker, Followed, Template, join, template_of_keyframe, template_of_track
 from edgeslam_torch.tracking.initialiser import TwoView
 from edgeslam_torch.tracking.keyframe_choice import few_matches, is_due, lost_most, lost_sight
@@ -57,6 +58,16 @@ from edgeslam_torch.types import (
 MIN_KEYPOINTS = 100
 """Fewer keypoints than this cannot start a map."""
 
+ADOPT_SHARE = 0.6
+"""When fewer of the first keyframe's points agree than this share of the most so far, the view has changed: the map
+that the depth network made is taken as it is, since parallax may never come (a turn, a climb, a hover)."""
+
+ACCELERATION_M_S2 = 3.0
+ANGULAR_ACCELERATION_RAD_S2 = 20.0
+"""Standard deviations of what a hand or a small drone does: a lean of 17 degrees; half a turn a second in 0.15 s."""
+
+DEPTH_MAP = "map from the depth network, no parallax yet"
+
 HANDOVER_INLIERS = 50
 """When fewer of the first keyframe's points are left before initialisation, the next attempt starts from here."""
 
@@ -67,8 +78,8 @@ FIRST_FRAME = "first frame, depth guessed"
 AFTER_LOSS = "new piece of map after loss: pose predicted, depth guessed"
 """How a piece of map is begun, in words."""
 
-LOST_FRAMES_BEFORE_RESTART = 20
-"""Frames without a pose after which a new piece of map is started from the predicted one."""
+LOST_BEFORE_RESTART_S = 0.65
+"""Time without a pose after which a new piece of map is started from the predicted one."""
 
 
 class EdgeSlam:
@@ -136,9 +147,14 @@ class EdgeSlam:
         """Tangent of the camera's motion per second, left-applied to ``T_c_w``."""
         self._stamp_s = -np.inf
         self._has_telemetry = False
+        self._has_depth = False
+        """Whether the depth network has said something usable yet."""
         self._recent: IntArray = np.zeros(0, dtype=np.int64)
         self._lost_frames = 0
-        self._frames_since_keyframe = 0
+        self._lost_since_s = np.inf
+        """Stamp of the first frame of the present loss; infinite while not lost."""
+        self._keyframe_s = -np.inf
+        """Stamp of the newest keyframe."""
         self._stage_ms: dict[str, float] = {}
         cv2.setRNGSeed(self.config.seed)
 
@@ -194,14 +210,13 @@ class EdgeSlam:
 
     def _step_mapped(self, frame: Frame, seen: LazyView) -> SlamOutput:
         T_predicted = self._predict(frame.stamp_s)
-        self._frames_since_keyframe += 1
         with self.map.lock:
             with self._timed("tracking"):
-                followed = self._follow(seen, T_predicted)
-            located = None if followed is None else self._locate_followed(followed)
+                followed = self._follow(seen, T_predicted, frame.stamp_s)
+            located = None if followed is None else self._locate_followed(followed, frame.stamp_s)
             # While the worker is busy no keyframe can be made; matching then finds what it has mapped meanwhile.
             if located is None or located.due:
-                matched = self._match(seen, T_predicted, followed)
+                matched = self._match(seen, T_predicted, followed, frame.stamp_s)
                 if matched is None and located is not None:  # in a blurred image flow finds what matching does not
                     matched = replace(located, due=False)
                 located = matched
@@ -209,47 +224,52 @@ class EdgeSlam:
                 return self._tracked(frame, seen, located)
         return self._lost(frame, seen.view, T_predicted)
 
-    def _follow(self, seen: LazyView, T_predicted: FloatArray) -> Followed | None:
+    def _follow(self, seen: LazyView, T_predicted: FloatArray, stamp_s: float) -> Followed | None:
         """By optical flow from the last keyframe."""
         if self._template is None or self._lost_frames > 0 or not self.config.flow.enabled:
             return None
-        return self._flow.follow(self._template, seen.grey, T_predicted)
+        return self._flow.follow(self._template, seen.grey, T_predicted, self._expectation(stamp_s, T_predicted))
 
-    def _locate_followed(self, followed: Followed) -> "_Located":
+    def _locate_followed(self, followed: Followed, stamp_s: float) -> "_Located":
         reference = self.map.keyframes.get(followed.keyframe_id, self.map.latest())
         parallax_rad = self._parallax(followed.track, reference)
         mapping = self.config.mapping
-        due = self._is_due(lost_sight(followed, mapping), parallax_rad, lost_most(followed, mapping))
+        due = self._is_due(stamp_s, lost_sight(followed, mapping), parallax_rad, lost_most(followed, mapping))
         return _Located(followed.track, reference, parallax_rad, due)
 
-    def _match(self, seen: LazyView, T_predicted: FloatArray, followed: Followed | None) -> "_Located | None":
+    def _match(
+        self, seen: LazyView, T_predicted: FloatArray, followed: Followed | None, stamp_s: float
+    ) -> "_Located | None":
         """By the frame's own keypoints: where flow finds nothing, and what a keyframe needs."""
         with self._timed("features"):
             view = seen.view
         with self._timed("tracking"):
-            track, relocalised = self._find(view, T_predicted, followed)
+            track, relocalised = self._find(view, T_predicted, followed, stamp_s)
         if track is None:
             return None
         reference = self._tracker.local_keyframes(track.anchor)[0]
         parallax_rad = self._parallax(track, reference)
         few = few_matches(track, reference, self.map, self.config.mapping)
-        due = followed is not None or self._is_due(few, parallax_rad)
+        due = followed is not None or self._is_due(stamp_s, few, parallax_rad)
         self._template = template_of_track(track, view, reference, seen.grey, self.camera)
         return _Located(track, reference, parallax_rad, due, view, relocalised)
 
     def _parallax(self, track: Track, reference: Keyframe) -> float:
         return median_parallax(self.map.anchors.p_w[track.anchor], track.T_c_w, reference.centre_w)
 
-    def _is_due(self, changed: bool, parallax_rad: float, at_once: bool = False) -> bool:
-        return is_due(changed, parallax_rad, self._frames_since_keyframe, self.config.mapping, at_once)
+    def _is_due(self, stamp_s: float, changed: bool, parallax_rad: float, at_once: bool = False) -> bool:
+        return is_due(changed, parallax_rad, stamp_s - self._keyframe_s, self.config.mapping, at_once)
 
-    def _find(self, view: View, T_predicted: FloatArray, followed: Followed | None) -> tuple[Track | None, bool]:
+    def _find(
+        self, view: View, T_predicted: FloatArray, followed: Followed | None, stamp_s: float
+    ) -> tuple[Track | None, bool]:
         """Track where flow or the prediction says, else search the keyframes; and whether the search found it."""
+        expected = self._expectation(stamp_s, T_predicted)
         if followed is not None:
-            track = self._tracker.track_near(view, followed.track.T_c_w, followed.track.anchor)
+            track = self._tracker.track_near(view, followed.track.T_c_w, followed.track.anchor, expected)
             return None if track is None else join(track, followed, view, self.config.orb.scale_factor), False
         if self._lost_frames == 0:
-            track = self._tracker.track(view, T_predicted, self._recent)
+            track = self._tracker.track(view, T_predicted, self._recent, expected)
             if track is not None:
                 return track, False
         tries = self.config.tracking.relocalisation_keyframes
@@ -264,6 +284,15 @@ class EdgeSlam:
                 return se3.inverse(estimate.T_w_c)
         # Every product doubles a rotation's rounding error; left alone it reaches centimetres in forty frames.
         return se3.orthonormalised(se3.exp(self._velocity * (stamp_s - self._stamp_s)) @ self._T_c_w)
+
+    def _expectation(self, stamp_s: float, T_predicted: FloatArray) -> PosePrior | None:
+        """The predicted pose with what accelerations allow it to be off; None where nothing tells metres."""
+        if not self._has_depth:
+            return None
+        dt = stamp_s - self._stamp_s
+        sigma_t = 0.5 * ACCELERATION_M_S2 * dt**2 / self._published.scale
+        sigma_r = 0.5 * ANGULAR_ACCELERATION_RAD_S2 * dt**2
+        return PosePrior(0, T_predicted, np.diag([sigma_t**-2] * 3 + [sigma_r**-2] * 3))
 
     def _move(self, stamp_s: float, T_c_w: FloatArray) -> None:
         """Take a visual pose as the present one."""
@@ -304,13 +333,14 @@ class EdgeSlam:
     def _lost(self, frame: Frame, view: View, T_predicted: FloatArray) -> SlamOutput:
         if self._lost_frames == 0:
             self.events["lost"] += 1
+            self._lost_since_s = frame.stamp_s
         self._lost_frames += 1
         self._T_c_w = T_predicted
         self._velocity = 0.8 * self._velocity  # a prediction is worth less every frame
         self._fusion.add_visual(frame.stamp_s, se3.inverse(T_predicted), np.inf, np.inf, tracked=False)
         # With nothing to come back to, as after dark first images, what starts a map at first starts one now.
         enough = 2 * MIN_KEYPOINTS if len(self.map.anchors) > 0 else MIN_KEYPOINTS
-        if self._lost_frames >= LOST_FRAMES_BEFORE_RESTART and len(view.features.uv) >= enough:
+        if frame.stamp_s - self._lost_since_s >= LOST_BEFORE_RESTART_S and len(view.features.uv) >= enough:
             self.events["restarted"] += 1
             self._velocity = np.zeros(6)
             return self._start(frame, view, AFTER_LOSS)
@@ -338,7 +368,7 @@ class EdgeSlam:
                 self.map.begin_piece(reason)
                 self.map.add_keyframe(keyframe)
             reason = f"only {len(view.features.uv)} keypoints, waiting for texture"
-            self._lost_frames = LOST_FRAMES_BEFORE_RESTART
+            self._lost_frames, self._lost_since_s = 1, -np.inf
             return self._output(frame, self.map.latest(), FrameStatus.LOST, reason, None, 0.0, False)
         with self._timed("depth"):
             self._look(frame, keyframe)
@@ -358,24 +388,34 @@ class EdgeSlam:
         return self._output(frame, keyframe, FrameStatus.STARTING, reason, None, 0.0, True)
 
     def _guess_depth(self, keyframe: Keyframe) -> FloatArray:
-        """Depth [map units] of every keypoint before anything is triangulated, ``(N,)``."""
-        count = len(keyframe.features.uv)
-        nothing = np.full(count, np.nan)
-        network_m = nothing if keyframe.depth is None else sample(keyframe.depth, keyframe.features.uv)[0]
-        if not np.isfinite(network_m).any():
-            earlier = np.flatnonzero(self.map.anchors.alive & ~self.map.anchors.from_depth)
-            if len(earlier) == 0:
-                return np.ones(count)
-            distance = np.linalg.norm(self.map.anchors.p_w[earlier] - self.map.latest().centre_w, axis=1)
-            return np.full(count, float(np.median(distance)))
-        known = np.where(np.isfinite(network_m), network_m, np.nanmedian(network_m))
-        return known / self._published.scale
+        """Depth [map units] of every keypoint before anything is triangulated and its log sigma, ``(N, 2)``."""
+        guess = np.full((len(keyframe.features.uv), 2), self.config.depth.prior_sigma_log)
+        network_m, sigma_log = np.full((2, len(guess)), np.nan)
+        if keyframe.depth is not None:
+            network_m, sigma_log = sample(keyframe.depth, keyframe.features.uv)
+        known = np.isfinite(network_m)
+        if not known.any():
+            guess[:, 0] = self._earlier_depth()
+            return guess
+        guess[:, 0] = np.where(known, network_m, np.nanmedian(network_m)) / self._published.scale
+        guess[known, 1] = sigma_log[known]
+        return guess
+
+    def _earlier_depth(self) -> float:
+        """Median distance of what was triangulated before from the newest keyframe [map units]; 1 where nothing was."""
+        earlier = np.flatnonzero(self.map.anchors.alive & ~self.map.anchors.from_depth)
+        if len(earlier) == 0:
+            return 1.0
+        return float(np.median(np.linalg.norm(self.map.anchors.p_w[earlier] - self.map.latest().centre_w, axis=1)))
 
     def _step_bootstrap(self, frame: Frame, seen: LazyView, bootstrap: Bootstrap) -> SlamOutput:
         """Track against the guessed map and try to replace it."""
         view = seen.view
         with self._timed("tracking"):
-            track = bootstrap.track(view, self._predict(frame.stamp_s))
+            T_predicted = self._predict(frame.stamp_s)
+            track = bootstrap.track(view, T_predicted, self._expectation(frame.stamp_s, T_predicted))
+            if track is None or track.inliers < self.config.tracking.min_inliers:  # a fast turn: look everywhere
+                track = relocalise(self._tracker, view, T_predicted, 1, 0)
         if track is None or track.inliers < 15:
             self.events["restarted"] += 1
             self._velocity = np.zeros(6)
@@ -391,6 +431,9 @@ class EdgeSlam:
             return self._output(
                 frame, keyframe, FrameStatus.INITIALISED, "two views", track, two_view.parallax_rad, True
             )
+        if track.inliers < ADOPT_SHARE * bootstrap.most_matched and bootstrap.reference.depth is not None:
+            keyframe = self._adopt(frame, seen, bootstrap, track)
+            return self._output(frame, keyframe, FrameStatus.INITIALISED, DEPTH_MAP, track, two_view.parallax_rad, True)
         bootstrap.wait(frame, view, track)
         if track.inliers < HANDOVER_INLIERS:
             return self._start(frame, view, "first keyframe out of sight before parallax sufficed")
@@ -405,9 +448,18 @@ class EdgeSlam:
         )
 
     def _initialise(self, frame: Frame, seen: LazyView, bootstrap: Bootstrap, two_view: TwoView) -> Keyframe:
-        reference = bootstrap.reference
         with self._timed("mapping"), self.map.lock:
             started = bootstrap.replace_map(frame, seen.view, two_view, self._lm)
+        return self._begin_tracking(frame, seen, bootstrap.reference, started)
+
+    def _adopt(self, frame: Frame, seen: LazyView, bootstrap: Bootstrap, track: Track) -> Keyframe:
+        """The view changed before parallax came: go on with the map that the depth network made."""
+        with self._timed("mapping"), self.map.lock:
+            started = bootstrap.adopt(frame, seen.view, track)
+        return self._begin_tracking(frame, seen, bootstrap.reference, started)
+
+    def _begin_tracking(self, frame: Frame, seen: LazyView, reference: Keyframe, started: StartedMap) -> Keyframe:
+        """Leave initialisation with a map that stands."""
         self._bootstrap = None
         self.log.replace(started.T_c_w, [reference, *(k for _, k in started.new)])
         self._T_c_w = started.T_c_w[max(started.T_c_w)]
@@ -437,7 +489,7 @@ class EdgeSlam:
 
     def _map(self, new: list[tuple[Frame, Keyframe]]) -> None:
         """Map keyframes that were put into the map, now or on the worker."""
-        self._frames_since_keyframe = 0
+        self._keyframe_s = new[-1][1].stamp_s
         if self._worker is not None:
             self._pending = self._worker.submit(self._map_keyframes, new)
             return
@@ -481,12 +533,14 @@ class EdgeSlam:
         keyframe.image = self.camera.undistort_image(frame.image)
         keyframe.grey = as_grey(keyframe.image)
         keyframe.depth = None if self.depth is None else self.depth(keyframe.image, self.camera)
+        self._has_depth = self._has_depth or keyframe.depth is not None
 
     def _compare_depth(self, keyframe: Keyframe) -> None:
         """What the network's metres say about the map's units."""
         if keyframe.depth is None:
             return
         held = keyframe.keypoints_with_anchor()
+        held = held[~self.map.anchors.from_depth[keyframe.anchor[held]]]  # their depth is the network's own word
         p_w = self.map.anchors.p_w[keyframe.anchor[held]]
         z = (p_w @ keyframe.T_c_w[:3, :3].T + keyframe.T_c_w[:3, 3])[:, 2]
         fit = fit_to_anchors(sample(keyframe.depth, keyframe.features.uv[held])[0], z)

@@ -26,7 +26,13 @@ class Anchors:
         """Keyframe id of creation."""
         self.alive: NDArray[np.bool_] = np.zeros(capacity, dtype=bool)
         self.from_depth: NDArray[np.bool_] = np.zeros(capacity, dtype=bool)
-        """Position is a depth guess, not a triangulation."""
+        """The depth rests on a prior, not on parallax: `host`, `prior` and `origin` tell which."""
+        self.host: IntArray = np.full(capacity, -1, dtype=np.int64)
+        """Keyframe id along whose ray the prior holds."""
+        self.origin: FloatArray = np.zeros((capacity, 3))
+        """Camera centre of that keyframe when the anchor was made [map units]."""
+        self.prior: FloatArray = np.zeros((capacity, 2))
+        """Expected inverse z-depth in the host and its standard deviation [1/map unit]."""
         self.sigma: FloatArray = np.zeros(capacity)
         """Standard deviation along the ray [map units]."""
         self._free: list[int] = list(range(capacity))
@@ -60,6 +66,20 @@ class Anchors:
         self.sigma[ids] = np.inf
         self.alive[ids] = True
         return ids
+
+    def rest_on_prior(self, ids: IntArray, host: int, origin: FloatArray, prior: FloatArray) -> None:
+        """Say on which expectation the depths of anchors ``(M,)`` rest.
+
+        Args:
+            ids: Anchors, ``from_depth``.
+            host: Keyframe id.
+            origin: Its camera centre ``(3,)``.
+            prior: Expected inverse z-depths in it and their standard deviations ``(M, 2)``.
+        """
+        self.host[ids] = host
+        self.origin[ids] = origin
+        self.prior[ids] = prior
+        self.sigma[ids] = prior[:, 1] / prior[:, 0] * np.linalg.norm(self.p_w[ids] - origin, axis=1)
 
     def remove(self, ids: IntArray) -> None:
         """Forget anchors; the caller has taken them out of the keyframes."""

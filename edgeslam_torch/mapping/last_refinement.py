@@ -95,8 +95,9 @@ def refine_with_edges(
     for _ in range(config.rounds):
         problem, keypoint = window_problem(slam_map, window, camera, lm)
         structures = [_structure(k, hosts.get(k.id), camera, config, edges) for k in keyframes]
-        placed = edge_terms(structures, problem.T_c_w, problem.K, terms) if config.uses_edges else None
-        corners = junction_terms(structures, problem.T_c_w, problem.K, terms) if config.uses_corners else None
+        T_c_w = problem.T_c_w[: len(keyframes)]
+        placed = edge_terms(structures, T_c_w, problem.K, terms) if config.uses_edges else None
+        corners = junction_terms(structures, T_c_w, problem.K, terms) if config.uses_corners else None
         problem = replace(problem, edges=None if placed is None else placed.terms, junctions=corners)
         if config.reprojection == "off":
             problem = _without_points(problem)
@@ -148,7 +149,9 @@ def _structure(
 
 def _without_points(problem: WindowProblem) -> WindowProblem:
     none = np.zeros(0, dtype=np.int64)
-    return replace(problem, obs_pose=none, obs_anchor=none, uv=np.zeros((0, 2)), inv_sigma=np.zeros(0))
+    return replace(
+        problem, obs_pose=none, obs_anchor=none, uv=np.zeros((0, 2)), inv_sigma=np.zeros(0), depth_priors=None
+    )
 
 
 def _take_back_depths(

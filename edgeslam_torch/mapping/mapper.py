@@ -3,16 +3,31 @@
 import numpy as np
 
 from edgeslam_torch.config import SlamConfig
+from edgeslam_torch.frontend.keypoint_grid import KeypointGrid
+from edgeslam_torch.frontend.matching import Matches
+from edgeslam_torch.frontend.orb import spread
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.mapping.depth_prior import depth_prior
 from edgeslam_torch.mapping.fuse import fuse
-from edgeslam_torch.mapping.keyframe import Keyframe
-from edgeslam_torch.mapping.new_anchors import epipolar_matches, triangulate_matches
+from edgeslam_torch.mapping.keyframe import NO_ANCHOR, Keyframe
+from edgeslam_torch.mapping.new_anchors import CHI2_2, epipolar_matches, triangulate_matches
+from edgeslam_torch.mapping.prior_anchors import (
+    add_on_prior,
+    drop_needless_priors,
+    inverse_depth_with_prior,
+    prior_of,
+    rays,
+)
 from edgeslam_torch.mapping.refinement import choose_window, refine, refine_all
 from edgeslam_torch.mapping.reobserve import MOST_DRIFT_PX, reobserve
 from edgeslam_torch.mapping.slam_map import SlamMap
 from edgeslam_torch.optim.problem import LmConfig, WindowResult
-from edgeslam_torch.types import IntArray
+from edgeslam_torch.types import FloatArray, IntArray
+
+ENOUGH_ANCHORS = 300
+"""Anchors of a keyframe below which empty places of its image are filled on the prior alone."""
+EMPTY_RADIUS_PX = 25.0
+"""Distance to the next anchor from which on a keypoint counts as being in an empty place."""
 
 
 class Mapper:
@@ -53,6 +68,7 @@ class Mapper:
         with self.map.lock:
             # Refinement moves the others by too little to see them from another side.
             self.map.refresh_anchors(keyframe.anchor[keyframe.anchor >= 0])
+            drop_needless_priors(self.map, keyframe, np.deg2rad(self.config.min_parallax_deg))
             self.cull_keyframes(keyframe)
         return result
 
@@ -77,9 +93,8 @@ class Mapper:
             return
         least_baseline = 0.01 * float(np.nanmedian(prior))
         new = [self._recent[:0]]
+        far: list[tuple[Keyframe, Matches]] = []
         for other in neighbours:
-            if np.linalg.norm(other.centre_w - keyframe.centre_w) < least_baseline:
-                continue
             matches = epipolar_matches(
                 keyframe,
                 other,
@@ -90,6 +105,9 @@ class Mapper:
                 self.tracking.max_hamming,
                 self.tracking.ratio,
             )
+            far.append((other, matches))
+            if np.linalg.norm(other.centre_w - keyframe.centre_w) < least_baseline:
+                continue
             p_w, sigma_ray, used = triangulate_matches(
                 keyframe,
                 other,
@@ -106,9 +124,69 @@ class Mapper:
             self.map.observe(keyframe, mine, ids)
             self.map.observe(other, theirs, ids)
             new.append(ids)
+        known = prior_of(prior, sigma)
+        for other, matches in far:
+            if self.missing(keyframe) > 0:
+                new.append(self.place_far(keyframe, other, matches, known, colour))
+        new.append(self.fill_empty_places(keyframe, known, colour))
         ids = np.concatenate(new)
         self.map.refresh_anchors(ids)
         self._recent = np.concatenate([self._recent, ids])
+
+    def place_far(
+        self, keyframe: Keyframe, other: Keyframe, matches: Matches, prior: FloatArray, colour: np.ndarray
+    ) -> IntArray:
+        """Anchors on matches with too little parallax to be triangulated: prior and images together tell the depth.
+
+        Args:
+            keyframe: The new one, which becomes their host.
+            other: The keyframe that it was matched with.
+            matches: Of its keypoints; those that have an anchor by now are left out.
+            prior: Expected inverse depth and standard deviation of every keypoint ``(N, 2)`` [1/map unit].
+            colour: RGB ``(N, 3)``.
+
+        Returns:
+            Their ids.
+        """
+        free = np.flatnonzero((keyframe.anchor[matches.query] < 0) & (other.anchor[matches.train] < 0))
+        mine, theirs = matches.query[free], matches.train[free]
+        if len(mine) == 0:
+            return mine
+        sigma_px = self.orb.scale_factor ** other.features.octave[theirs].astype(np.float64)
+        T_o_k = other.T_c_w @ keyframe.T_w_c
+        ray, uv = rays(keyframe, mine, self.camera), other.features.uv[theirs].astype(np.float64)
+        found, chi2 = inverse_depth_with_prior(ray, uv, sigma_px, T_o_k, self.camera, prior[mine])
+        good = chi2 <= CHI2_2
+        mine, theirs, found = mine[good], theirs[good], found[good]
+        ids = add_on_prior(self.map, self.camera, keyframe, mine, found[:, 0], prior[mine], colour[mine])
+        self.map.observe(other, theirs, ids)
+        return ids
+
+    def missing(self, keyframe: Keyframe) -> int:
+        """How many anchors a keyframe holds too few."""
+        return max(0, ENOUGH_ANCHORS - int(np.count_nonzero(keyframe.anchor != NO_ANCHOR)))
+
+    def fill_empty_places(self, keyframe: Keyframe, prior: FloatArray, colour: np.ndarray) -> IntArray:
+        """Anchors where a keyframe has too few to be tracked by, on the prior alone.
+
+        Args:
+            keyframe: The new one, which becomes their host.
+            prior: Expected inverse depth and standard deviation of every keypoint ``(N, 2)`` [1/map unit].
+            colour: RGB ``(N, 3)``.
+
+        Returns:
+            Their ids.
+        """
+        missing = self.missing(keyframe)
+        free = np.flatnonzero((keyframe.anchor == NO_ANCHOR) & np.isfinite(prior).all(1))
+        if missing <= 0 or keyframe.depth is None or len(free) == 0:
+            return free[:0]
+        uv = keyframe.features.uv
+        taken = KeypointGrid(uv[keyframe.anchor != NO_ANCHOR])
+        lonely, _ = taken.near(uv[free], np.full(len(free), EMPTY_RADIUS_PX))
+        free = np.delete(free, np.unique(lonely))
+        chosen = free[spread(uv[free], -prior[free, 1], self.camera.width, self.camera.height, missing)]
+        return add_on_prior(self.map, self.camera, keyframe, chosen, prior[chosen, 0], prior[chosen], colour[chosen])
 
     def cull_keyframes(self, newest: Keyframe) -> None:
         """Remove covisible keyframes whose anchors three others see at the same or finer scale; bound the map."""

@@ -7,6 +7,7 @@ import numpy as np
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.losses.robust import Kernel
 from edgeslam_torch.mapping.keyframe import Keyframe
+from edgeslam_torch.mapping.prior_anchors import depth_priors
 from edgeslam_torch.mapping.slam_map import SlamMap
 from edgeslam_torch.optim.local_ba import refine_window
 from edgeslam_torch.optim.problem import LmConfig, ScalePrior, WindowProblem, WindowResult
@@ -91,8 +92,8 @@ def window_problem(
 ) -> tuple[WindowProblem, list[IntArray]]:
     """A window's poses, anchors and observations, and which keypoints of each keyframe the observations are.
 
-    Poses come free ones first. With plain squares (``Kernel.L2``, the paper's literal form) every keypoint counts
-    alike; otherwise it is whitened by its octave.
+    Poses come free ones first, those of hosts outside the window last. With plain squares (``Kernel.L2``, the paper's
+    literal form) every keypoint counts alike; otherwise it is whitened by its octave.
     """
     keyframes = [*window.free, *window.fixed]
     row_of_anchor = np.full(len(slam_map.anchors.alive) + 1, -1, dtype=np.int64)
@@ -109,10 +110,13 @@ def window_problem(
     octave = np.concatenate([k.features.octave[s] for k, s in zip(keyframes, keypoint, strict=True)])
     alike = config.kernel is Kernel.L2
     shrink = slam_map.scale_factor ** -np.arange(slam_map.levels, dtype=np.float64)
-    extent = held_extent(window)
+    unsure = slam_map.anchors.from_depth[window.anchor]
+    # Where most depths rest on priors, these hold the scale; the way between poses that only turn is noise.
+    extent = None if unsure.sum() > 0.5 * len(unsure) else held_extent(window)
+    priors, hosts = depth_priors(slam_map, window.anchor, [k.id for k in keyframes])
     problem = WindowProblem(
-        T_c_w=np.stack([k.T_c_w for k in keyframes]),
-        pose_fixed=np.arange(len(keyframes)) >= len(window.free),
+        T_c_w=np.stack([*(k.T_c_w for k in keyframes), *(slam_map.pose_of(id) for id in hosts)]),
+        pose_fixed=np.arange(len(keyframes) + len(hosts)) >= len(window.free),
         p_w=slam_map.anchors.p_w[window.anchor],
         obs_pose=np.concatenate(pose),
         obs_anchor=row,
@@ -120,6 +124,7 @@ def window_problem(
         inv_sigma=np.ones(len(row)) if alike else shrink[octave],
         K=(camera.fx, camera.fy, camera.cx, camera.cy),
         scale_priors=() if extent is None else (extent,),
+        depth_priors=priors,
     )
     return problem, keypoint
 
@@ -130,7 +135,7 @@ def take_back(slam_map: SlamMap, window: Window, keypoint: list[IntArray], resul
         return
     keyframes = [*window.free, *window.fixed]
     with slam_map.lock:
-        for keyframe, T_c_w in zip(keyframes, result.T_c_w, strict=True):
+        for keyframe, T_c_w in zip(keyframes, result.T_c_w, strict=False):  # hosts outside the window follow
             keyframe.T_c_w = T_c_w
         slam_map.anchors.p_w[window.anchor] = result.p_w
         bad = (result.chi2 > CHI2_2) | ~result.in_front

@@ -107,13 +107,16 @@ class SlamMap:
         self.anchors.observations[anchors] += 1
 
     def forget_observations(self, keyframe: Keyframe, keypoints: IntArray) -> None:
-        """Take observations back; anchors seen by fewer than two keyframes afterwards are removed."""
+        """Take observations back.
+
+        Anchors seen by fewer than two keyframes afterwards are removed; one is enough where a prior tells the depth.
+        """
         self.revision += 1
         held = keyframe.anchor[keypoints]
         keypoints, held = keypoints[held >= 0], held[held >= 0]
         keyframe.anchor[keypoints] = NO_ANCHOR
         self.anchors.observations[held] -= 1
-        poor = held[(self.anchors.observations[held] < 2) & ~self.anchors.from_depth[held]]
+        poor = held[self.anchors.observations[held] < np.where(self.anchors.from_depth[held], 1, 2)]
         self.remove_anchors(poor)
 
     def remove_anchors(self, ids: IntArray) -> None:

@@ -73,6 +73,7 @@ def refine_pose(
     inv_sigma: FloatArray,
     K: tuple[float, float, float, float],
     *,
+    slack_px: FloatArray | None = None,
     prior: PosePrior | None = None,
     config: PoseConfig | None = None,
 ) -> PoseResult:
@@ -84,6 +85,8 @@ def refine_pose(
         uv: Their undistorted pixels ``(N, 2)``.
         inv_sigma: Inverse standard deviations ``(N,)`` [1/px].
         K: fx, fy, cx, cy [px].
+        slack_px: One standard deviation of what a point may be off beside that, along one direction ``(N, 2)`` [px]:
+            how an uncertain depth shows. The covariance is ``I / inv_sigma^2 + slack slack^T``.
         prior: Predicted pose with its information; ``prior.pose`` is not used.
         config: Rounds, thresholds.
 
@@ -102,7 +105,7 @@ def refine_pose(
     """
     config = config or PoseConfig()
     start: FloatArray = np.array(T_c_w, dtype=np.float64)
-    points = _Points(p_w, uv, inv_sigma, K, prior, config)
+    points = _Points(p_w, uv, inv_sigma, K, slack_px, prior, config)
     n = len(points.use)
     if n < config.min_points:
         return _failed(start, n, PoseStatus.FEW_POINTS)
@@ -217,6 +220,14 @@ def _exp(xi: FloatArray) -> FloatArray:
     )
 
 
+def _slack(slack_px: FloatArray, inv_sigma: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Unit directions ``(2, N)``, and the same by the share of a row along them that an uncertain depth explains."""
+    s = np.asarray(slack_px, dtype=np.float64).reshape(-1, 2).T * inv_sigma
+    length2 = (s * s).sum(0)
+    along = s / np.sqrt(np.maximum(length2, 1e-30))
+    return along, along * (1.0 - 1.0 / np.sqrt(1.0 + length2))
+
+
 class _Points:
     """Points of one refinement and the scratch rows of their Jacobian."""
 
@@ -226,6 +237,7 @@ class _Points:
         uv: FloatArray,
         inv_sigma: FloatArray,
         K: tuple[float, float, float, float],
+        slack_px: FloatArray | None,
         prior: PosePrior | None,
         config: PoseConfig,
     ) -> None:
@@ -238,6 +250,7 @@ class _Points:
         # In units of the focal length the Jacobian needs no intrinsics; they go into the weights.
         self.xy = np.stack(((uv64[:, 0] - cx) / fx, (uv64[:, 1] - cy) / fy))
         self.weight = np.array([[fx], [fy]]) * np.asarray(inv_sigma, dtype=np.float64)
+        self.slack = None if slack_px is None else _slack(slack_px, inv_sigma)
         self.prior, self.config = prior, config
         self.use = np.ones(n, dtype=bool)
         self.chi2 = np.full(n, np.inf)
@@ -246,6 +259,13 @@ class _Points:
     def finite(self) -> bool:
         """Whether every input is finite."""
         return bool(np.isfinite(self.p).all() and np.isfinite(self.xy).all() and np.isfinite(self.weight).all())
+
+    def _relaxed(self, rows: FloatArray) -> FloatArray:
+        """Rows ``(..., 2, N)`` in standard deviations of the keypoints, weakened along each point's slack."""
+        if self.slack is None:
+            return rows
+        along, weaken = self.slack
+        return rows - (rows * along).sum(-2, keepdims=True) * weaken
 
     def linearise(self, T: FloatArray, robust: bool) -> tuple[FloatArray | None, FloatArray, float]:
         """Normal matrix, gradient and cost over the points in use; sets ``chi2`` of all points."""
@@ -262,7 +282,7 @@ class _Points:
         n = p_c[:2] * iz
         x, y = n
         r = n - self.xy
-        s = np.square(r * self.weight).sum(0)
+        s = np.square(self._relaxed(r * self.weight)).sum(0)
         self.chi2 = np.where(hidden, np.inf, s) if some_hidden else s
         if robust:
             chi2 = self.config.chi2
@@ -285,7 +305,7 @@ class _Points:
         np.negative(y, out=rows[5, 0])
         np.subtract(-1.0, y * y, out=rows[3, 1])
         rows[4, 1], rows[5, 1], rows[6] = xy, x, r
-        B = (rows * weight).reshape(7, -1)
+        B = self._relaxed(rows * weight).reshape(7, -1)
         G = B @ B.T
         H, g = G[:6, :6], G[:6, 6].copy()
         if self.prior is not None:

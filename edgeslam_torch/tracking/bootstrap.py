@@ -8,9 +8,10 @@ import numpy as np
 from edgeslam_torch.config import InitialisationConfig
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.mapping.keyframe import Keyframe, make_keyframe
+from edgeslam_torch.mapping.prior_anchors import prior_of
 from edgeslam_torch.mapping.refinement import Window, refine
 from edgeslam_torch.mapping.slam_map import SlamMap
-from edgeslam_torch.optim.problem import LmConfig
+from edgeslam_torch.optim.problem import LmConfig, PosePrior
 from edgeslam_torch.tracking.initialiser import (
     BootstrapView,
     Consensus,
@@ -67,22 +68,36 @@ class Bootstrap:
         tracker: Tracker,
         config: InitialisationConfig,
         reference: Keyframe,
-        guess_depth: FloatArray,
+        guess: FloatArray,
         colour: np.ndarray,
         seed: int = 0,
     ) -> None:
+        """Begin with a map of guessed depths.
+
+        Args:
+            slam_map: Takes the reference and its guessed anchors.
+            tracker: Finds them in the frames that follow.
+            config: Thresholds.
+            reference: First keyframe.
+            guess: Depth of its keypoints [map units] and log standard deviation ``(N, 2)``.
+            colour: RGB of its keypoints ``(N, 3)``.
+            seed: Of the essential matrix's random samples.
+        """
         self.map = slam_map
         self.tracker = tracker
         self.config = config
         self.seed = seed
         self.reference = reference
-        self.guess_depth = guess_depth
+        self.guess_depth = guess_depth = guess[:, 0]
+        self.most_matched = 0
+        """Inliers of the frame that agreed best with the guess."""
         self.views: list[BootstrapView] = []
         self.waiting: list[WaitingFrame] = []
         points = se3.transform(reference.T_w_c, tracker.camera.back_project(reference.features.uv, guess_depth))
         with slam_map.lock:
             slam_map.anchors.begin_pass()
             ids = slam_map.anchors.add(points, reference.words, reference.id, True, colour)
+            slam_map.anchors.rest_on_prior(ids, reference.id, reference.centre_w, prior_of(*guess.T))
             reference.anchor[:] = ids
             slam_map.add_keyframe(reference)
             slam_map.refresh_anchors(ids)
@@ -93,10 +108,13 @@ class Bootstrap:
         with self.map.lock:
             self.map.remove_anchors(self._guessed)
 
-    def track(self, view: View, T_predicted: FloatArray) -> Track | None:
+    def track(self, view: View, T_predicted: FloatArray, expected: PosePrior | None = None) -> Track | None:
         """Pose against the guessed map; the pose is rough, the matches are good."""
         radius = 2.0 * self.tracker.config.motion_radius_px
-        return self.tracker.refine(view, T_predicted, self._guessed, radius)
+        track = self.tracker.refine(view, T_predicted, self._guessed, radius, expected=expected)
+        if track is not None:
+            self.most_matched = max(self.most_matched, track.inliers)
+        return track
 
     def two_views(self, frame_index: int, view: View, track: Track) -> TwoView:
         """Remember what the frame saw and try to triangulate it against the reference."""
@@ -187,7 +205,7 @@ class Bootstrap:
         Two keyframes a hand's breadth apart would be all that ever holds the map's first seconds in place.
         """
         last = self.waiting[-1].frame if self.waiting else None
-        if frame.index - (self.reference.frame_index if last is None else last.index) < self.config.keyframe_gap:
+        if frame.stamp_s - (self.reference.stamp_s if last is None else last.stamp_s) < self.config.keyframe_gap_s:
             return
         mine, theirs = track.matched_keypoint, self.views[-1].reference_keypoint
         self.waiting.append(WaitingFrame(frame, view, mine, theirs, se3.inverse(track.T_c_w)[:3, 3]))
@@ -224,6 +242,24 @@ class Bootstrap:
         self.map.refresh_anchors(ids[self.map.anchors.alive[ids]])
         poses = self._poses_between({v.frame_index for v in self.views}) | {k.frame_index: k.T_c_w for _, k in new[:-1]}
         return StartedMap(new, {reference.frame_index: reference.T_c_w} | poses)
+
+    def adopt(self, frame: Frame, view: View, track: Track) -> StartedMap:
+        """Keep the guessed map, with the frames so far as its keyframes: its depths rest on their priors for now.
+
+        Args:
+            frame: The present frame.
+            view: Its features.
+            track: Its pose against the guess.
+        """
+        T_c_w = {v.frame_index: v.T_c_w for v in self.views[:-1]}
+        new = [(w.frame, self._keyframe(w, T_c_w[w.frame.index])) for w in self.waiting if w.frame is not frame]
+        newest = make_keyframe(self.map.next_keyframe_id(), frame.index, frame.stamp_s, track.T_c_w, view.features)
+        newest.anchor[track.keypoint] = track.anchor
+        new.append((frame, newest))
+        for _, keyframe in new:
+            self.map.add_keyframe(keyframe)
+        self.map.refresh_anchors(self._guessed)
+        return StartedMap(new, {self.reference.frame_index: self.reference.T_c_w} | T_c_w)
 
     def _poses_between(self, frames: set[int]) -> dict[int, FloatArray]:
         """Poses of some of the frames in between against the reference keyframe's anchors, by frame index."""

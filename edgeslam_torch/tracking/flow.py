@@ -17,8 +17,10 @@ from edgeslam_torch.frontend.orb import spread
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.mapping.keyframe import NO_ANCHOR, Keyframe
+from edgeslam_torch.mapping.prior_anchors import depth_slack_px, mostly_on_priors
 from edgeslam_torch.mapping.slam_map import SlamMap
 from edgeslam_torch.optim.pose_only import refine_pose
+from edgeslam_torch.optim.problem import PosePrior
 from edgeslam_torch.tracking.tracker import FINE, Track, View
 from edgeslam_torch.types import FloatArray, FrameFeatures, IntArray
 
@@ -140,13 +142,16 @@ class FlowTracker:
         self.min_inliers = min_inliers
         self._chosen = _Chosen(None, -1, np.zeros(0, dtype=np.int64))
 
-    def follow(self, template: Template, grey: NDArray[np.uint8], T_c_w: FloatArray) -> Followed | None:
+    def follow(
+        self, template: Template, grey: NDArray[np.uint8], T_c_w: FloatArray, expected: PosePrior | None = None
+    ) -> Followed | None:
         """Pose near a predicted one, or None when too little of the template is found again.
 
         Args:
             template: What to look for.
             grey: Frame ``(H, W)`` with the lens distortion still in it.
             T_c_w: Predicted pose ``(4, 4)``.
+            expected: What is known of it beforehand, for when depths are not.
         """
         wanted = self._wanted(template)
         guess = self._expected(T_c_w, template.anchor[wanted])
@@ -155,9 +160,9 @@ class FlowTracker:
         if len(visible) < self.min_inliers:
             return None
         near = min(NEAR_LEVELS, self.config.levels)
-        track, uv = self._locate(template, grey, visible, guess, T_c_w, near)
+        track, uv = self._locate(template, grey, visible, guess, T_c_w, near, expected)
         if track.inliers < NEAR_SHARE * len(wanted) and near < self.config.levels:
-            track, uv = self._locate(template, grey, visible, guess, T_c_w, self.config.levels)
+            track, uv = self._locate(template, grey, visible, guess, T_c_w, self.config.levels, expected)
         if track.inliers < max(self.min_inliers, self.config.min_share * len(wanted)):
             return None
         self.map.anchors.visible[template.anchor[visible]] += 1
@@ -173,11 +178,12 @@ class FlowTracker:
         guess: FloatArray,
         T_c_w: FloatArray,
         levels: int,
+        expected: PosePrior | None,
     ) -> tuple[Track, FloatArray]:
         """Pose from the flow over so many images of the pyramid, and the inliers' undistorted pixels."""
         raw_uv, found = self._flow(template, grey, keypoint, guess, levels)
         keypoint, uv = keypoint[found], self.camera.undistort_points(raw_uv[found])
-        track = self._solve(template, keypoint, uv, T_c_w)
+        track = self._solve(template, keypoint, uv, T_c_w, expected)
         return track, uv[np.isin(keypoint, track.keypoint)]
 
     def _wanted(self, template: Template) -> IntArray:
@@ -221,16 +227,20 @@ class FlowTracker:
         found = (status.ravel() > 0) & (difference.ravel() < MAX_DIFFERENCE)
         return np.asarray(uv, dtype=np.float32).reshape(-1, 2), found
 
-    def _solve(self, template: Template, keypoint: IntArray, uv: FloatArray, T_c_w: FloatArray) -> Track:
+    def _solve(
+        self, template: Template, keypoint: IntArray, uv: FloatArray, T_c_w: FloatArray, expected: PosePrior | None
+    ) -> Track:
         # What a keyframe's keypoint is off by, its flow is off by too: it weighs no more than a matched one.
-        inv_sigma = self.orb.scale_factor ** -template.octave[keypoint].astype(np.float64)
         anchor = template.anchor[keypoint]
+        inv_sigma = self.orb.scale_factor ** -template.octave[keypoint].astype(np.float64)
         result = refine_pose(
             T_c_w,
             self.map.anchors.p_w[anchor],
             uv.astype(np.float64),
             inv_sigma,
             (self.camera.fx, self.camera.fy, self.camera.cx, self.camera.cy),
+            slack_px=depth_slack_px(self.map.anchors, anchor, T_c_w, self.camera),
+            prior=expected if mostly_on_priors(self.map.anchors, anchor) else None,
             config=FINE,
         )
         inliers = result.inliers

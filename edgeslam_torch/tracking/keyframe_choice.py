@@ -8,8 +8,8 @@ from edgeslam_torch.mapping.slam_map import SlamMap
 from edgeslam_torch.tracking.flow import Followed
 from edgeslam_torch.tracking.tracker import Track
 
-SHORTEST_GAP = 2
-"""Frames between keyframes however much the view changes."""
+SHORTEST_GAP_S = 0.04
+"""Time between keyframes however much the view changes: every second frame at 30 Hz, every frame at 20."""
 
 
 def lost_sight(followed: Followed, config: MappingConfig) -> bool:
@@ -31,21 +31,21 @@ def few_matches(track: Track, reference: Keyframe, slam_map: SlamMap, config: Ma
 
 
 def is_due(
-    changed: bool, parallax_rad: float, frames_since_keyframe: int, config: MappingConfig, at_once: bool = False
+    changed: bool, parallax_rad: float, since_keyframe_s: float, config: MappingConfig, at_once: bool = False
 ) -> bool:
     """Whether a frame should become a keyframe.
 
     Args:
         changed: What it sees differs from the reference keyframe: `lost_sight` or `few_matches`.
         parallax_rad: Median ray angle to the reference keyframe.
-        frames_since_keyframe: Frames since the last one.
+        since_keyframe_s: Time since the last one.
         config: Thresholds.
-        at_once: No time to wait for ``keyframe_min_gap``: `lost_most`.
+        at_once: No time to wait for ``keyframe_min_gap_s``: `lost_most`.
     """
-    if frames_since_keyframe < (SHORTEST_GAP if at_once else config.keyframe_min_gap):
+    if since_keyframe_s < (SHORTEST_GAP_S if at_once else config.keyframe_min_gap_s):
         return False
     moved = parallax_rad > np.deg2rad(config.keyframe_parallax_deg)
-    overdue = frames_since_keyframe >= config.keyframe_max_gap and parallax_rad > np.deg2rad(
+    overdue = since_keyframe_s >= config.keyframe_max_gap_s and parallax_rad > np.deg2rad(
         0.25 * config.keyframe_parallax_deg
     )
     return changed or moved or overdue

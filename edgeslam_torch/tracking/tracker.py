@@ -11,8 +11,10 @@ from edgeslam_torch.frontend.keypoint_grid import KeypointGrid
 from edgeslam_torch.frontend.matching import Matches, words
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.mapping.keyframe import Keyframe
+from edgeslam_torch.mapping.prior_anchors import depth_slack_px, mostly_on_priors
 from edgeslam_torch.mapping.slam_map import SlamMap
 from edgeslam_torch.optim.pose_only import PoseConfig, refine_pose
+from edgeslam_torch.optim.problem import PosePrior
 from edgeslam_torch.tracking.projection import Projection, match_projection, project_anchors
 from edgeslam_torch.types import FloatArray, FrameFeatures, IntArray
 
@@ -81,19 +83,21 @@ class Tracker:
         self.orb = orb
         self.config = config
 
-    def track(self, view: View, T_c_w: FloatArray, recent: IntArray) -> Track | None:
+    def track(self, view: View, T_c_w: FloatArray, recent: IntArray, expected: PosePrior | None = None) -> Track | None:
         """Pose near a predicted one: anchors of the last frame first, then the local map; None if too few agree."""
         some = recent[:: 1 + len(recent) // ENOUGH_FOR_ROUGH]
-        first = self.refine(view, T_c_w, some, self.config.motion_radius_px, ROUGH)
+        first = self.refine(view, T_c_w, some, self.config.motion_radius_px, ROUGH, expected)
         if first is None or first.inliers < self.config.min_inliers:
-            first = self.refine(view, T_c_w, recent, 2.5 * self.config.motion_radius_px, ROUGH)
+            first = self.refine(view, T_c_w, recent, 2.5 * self.config.motion_radius_px, ROUGH, expected)
         if first is None or first.inliers < 10:
             return None
-        return self._complete(view, first.T_c_w, first.anchor, first.keypoint, first.anchor)
+        return self._complete(view, first.T_c_w, first.anchor, first.keypoint, first.anchor, expected)
 
-    def track_near(self, view: View, T_c_w: FloatArray, recent: IntArray) -> Track | None:
+    def track_near(
+        self, view: View, T_c_w: FloatArray, recent: IntArray, expected: PosePrior | None = None
+    ) -> Track | None:
         """The same from a pose that is right to a pixel or two, which needs no first pass."""
-        return self._complete(view, T_c_w, recent, recent[:0], recent[:0])
+        return self._complete(view, T_c_w, recent, recent[:0], recent[:0], expected)
 
     def local_keyframes(self, anchor_ids: IntArray) -> list[Keyframe]:
         """Keyframes that see the given anchors, and of those the ones that see most."""
@@ -102,15 +106,27 @@ class Tracker:
         return [self.map.keyframes[id] for id in ranked[: self.config.local_keyframes]]
 
     def refine(
-        self, view: View, T_c_w: FloatArray, anchor_ids: IntArray, radius_px: float, effort: PoseConfig = FINE
+        self,
+        view: View,
+        T_c_w: FloatArray,
+        anchor_ids: IntArray,
+        radius_px: float,
+        effort: PoseConfig = FINE,
+        expected: PosePrior | None = None,
     ) -> Track | None:
         """Match the given anchors around their predicted pixels and refine the pose on what matches."""
         seen = self._expected(T_c_w, anchor_ids)
         matches = self._match(view, seen, np.full(len(seen.anchor), radius_px))
-        return self.solve(view, T_c_w, matches.train, seen.anchor[matches.query], effort)
+        return self.solve(view, T_c_w, matches.train, seen.anchor[matches.query], effort, expected)
 
     def _complete(
-        self, view: View, T_c_w: FloatArray, recent: IntArray, keypoint: IntArray, anchor: IntArray
+        self,
+        view: View,
+        T_c_w: FloatArray,
+        recent: IntArray,
+        keypoint: IntArray,
+        anchor: IntArray,
+        expected: PosePrior | None,
     ) -> Track | None:
         """Track of what the frame sees of the local map around ``recent``; known matches are not searched again."""
         anchors = self.map.anchors
@@ -121,7 +137,7 @@ class Tracker:
         free = ~np.isin(matches.train, keypoint)
         keypoint = np.concatenate([keypoint, matches.train[free]])
         anchor = np.concatenate([anchor, new.anchor[matches.query[free]]])
-        track = self.solve(view, T_c_w, keypoint, anchor)
+        track = self.solve(view, T_c_w, keypoint, anchor, FINE, expected)
         if track is None:
             return None
         anchors.visible[seen.anchor] += 1
@@ -146,7 +162,13 @@ class Tracker:
         )
 
     def solve(
-        self, view: View, T_c_w: FloatArray, keypoint: IntArray, anchor: IntArray, effort: PoseConfig = FINE
+        self,
+        view: View,
+        T_c_w: FloatArray,
+        keypoint: IntArray,
+        anchor: IntArray,
+        effort: PoseConfig = FINE,
+        expected: PosePrior | None = None,
     ) -> Track | None:
         """Robust pose from given matches; None when there are too few to constrain it."""
         if len(keypoint) < 6:
@@ -157,6 +179,8 @@ class Tracker:
             view.features.uv[keypoint].astype(np.float64),
             view.inv_sigma[keypoint],
             (self.camera.fx, self.camera.fy, self.camera.cx, self.camera.cy),
+            slack_px=depth_slack_px(self.map.anchors, anchor, T_c_w, self.camera),
+            prior=expected if mostly_on_priors(self.map.anchors, anchor) else None,
             config=effort,
         )
         return Track(

@@ -133,3 +133,33 @@ def test_one_iteration_says_that_it_did_not_converge(rng):
     T, p, uv = view(rng, 300, 1.0)
     config = replace(PoseConfig(), iterations=1, rounds=1)
     assert refine_pose(away(T, rng, 0.05), p, uv, np.ones(300), K, config=config).status is PoseStatus.NOT_CONVERGED
+
+
+def test_slack_is_the_covariance_that_it_says(rng):
+    """Against Gauss-Newton with every point's full 2x2 covariance, near the solution."""
+    p = rng.uniform((-1, -1, 2), (1, 1, 4), (60, 3))
+    slack = rng.normal(0.0, 8.0, (60, 2))
+    uv = 500 * p[:, :2] / p[:, 2:] + rng.normal(0.0, 1.0, (60, 1)) * slack + rng.normal(0.0, 0.5, (60, 2))
+    result = refine_pose(
+        np.eye(4),
+        p,
+        uv,
+        np.full(60, 2.0),
+        (500.0, 500.0, 0.0, 0.0),
+        slack_px=slack,
+        config=PoseConfig(rounds=1, robust_rounds=0, chi2=1e9, iterations=50, cost_tolerance=1e-15),
+    )
+    T = np.eye(4)
+    for _ in range(20):
+        H, g = np.zeros((6, 6)), np.zeros(6)
+        for point, pixel, s in zip(p, uv, slack, strict=True):
+            x, y, z = (T @ np.r_[point, 1.0])[:3]
+            J_uv = 500 * np.array([[1 / z, 0, -x / z**2], [0, 1 / z, -y / z**2]])
+            J = J_uv @ np.hstack([np.eye(3), -se3.hat(np.array([x, y, z]))])
+            W = np.linalg.inv(0.25 * np.eye(2) + np.outer(s, s))
+            r = 500 * np.array([x / z, y / z]) - pixel
+            H += J.T @ W @ J
+            g += J.T @ W @ r
+        T = se3.exp(-np.linalg.solve(H, g)) @ T
+    np.testing.assert_allclose(result.T_c_w, T, atol=1e-7)
+    np.testing.assert_allclose(result.covariance, np.linalg.inv(H), rtol=1e-4)

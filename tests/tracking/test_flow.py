@@ -203,16 +203,16 @@ def test_a_frame_whose_keypoints_are_all_matched_gains_nothing(scene):
 
 
 def test_keyframe_by_view_change_parallax_or_time_but_not_at_once():
-    config = MappingConfig(keyframe_min_gap=5, keyframe_max_gap=30, keyframe_parallax_deg=4.0)
+    config = MappingConfig(keyframe_min_gap_s=0.15, keyframe_max_gap_s=1.0, keyframe_parallax_deg=4.0)
     little, some, much = np.deg2rad([0.5, 2.0, 5.0])
-    assert not is_due(True, much, 4, config)
-    assert is_due(True, little, 5, config)
-    assert is_due(False, much, 5, config)
-    assert not is_due(False, some, 29, config)
-    assert is_due(False, some, 30, config)
-    assert is_due(True, little, 2, config, at_once=True)
-    assert not is_due(True, little, 1, config, at_once=True)
-    assert not is_due(False, little, 1000, config)  # a drone that hovers makes no keyframes
+    assert not is_due(True, much, 0.13, config)
+    assert is_due(True, little, 0.17, config)
+    assert is_due(False, much, 0.17, config)
+    assert not is_due(False, some, 0.97, config)
+    assert is_due(False, some, 1.0, config)
+    assert is_due(True, little, 0.067, config, at_once=True)
+    assert not is_due(True, little, 0.033, config, at_once=True)
+    assert not is_due(False, little, 33.0, config)  # a drone that hovers makes no keyframes
 
 
 def test_few_matches_are_judged_by_anchors_that_have_proved_themselves(scene):

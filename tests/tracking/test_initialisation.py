@@ -126,7 +126,8 @@ def make_bootstrap(points, guess_depth, config=CONFIG):
     tracker = Tracker(points.map, CAMERA, OrbConfig(), TrackingConfig(motion_radius_px=100.0))
     reference = points.keyframes[0]
     colour = np.zeros((len(reference.anchor), 3), np.uint8)
-    return Bootstrap(points.map, tracker, config, reference, guess_depth, colour)
+    guess = np.stack([guess_depth, np.full(len(guess_depth), 0.35)], axis=1)
+    return Bootstrap(points.map, tracker, config, reference, guess, colour)
 
 
 def frame_of(points, view):
@@ -161,7 +162,7 @@ def started(points, **config):
 
 
 def test_guessed_map_is_replaced_and_the_map_stays_consistent(points):
-    between = started(points, keyframe_gap=100).T_c_w
+    between = started(points, keyframe_gap_s=100.0).T_c_w
     alive = np.flatnonzero(points.map.anchors.alive)
     assert len(alive) >= CONFIG.min_points
     assert not points.map.anchors.from_depth[alive].any()
@@ -189,7 +190,7 @@ def test_without_a_network_two_views_must_be_surer(points, network):
 
 
 def test_frames_that_waited_become_keyframes_in_order(points):
-    result = started(points, keyframe_gap=1)
+    result = started(points, keyframe_gap_s=0.01)
     new = [k for _, k in result.new]
     assert [k.frame_index for k in new] == [points.keyframes[v].frame_index for v in (1, 2, 3, 4)]
     assert [k.id for k in new] == sorted(k.id for k in new)
@@ -203,7 +204,7 @@ def test_frames_that_waited_become_keyframes_in_order(points):
 
 def test_of_many_waiting_frames_those_that_stand_apart_stay(points):
     guess = z_in(points, 0)
-    bootstrap = make_bootstrap(points, guess, InitialisationConfig(keyframe_gap=1, most_keyframes=2))
+    bootstrap = make_bootstrap(points, guess, InitialisationConfig(keyframe_gap_s=0.01, most_keyframes=2))
     for index, view in enumerate((1, 1, 1, 2, 3), start=1):
         seen = view_of(points, view)
         track = bootstrap.track(seen, points.world.T_c_w[view])
