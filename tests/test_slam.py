@@ -36,7 +36,7 @@ def go(frames, depth=None, config=NO_NETWORK):
 @lru_cache(maxsize=1)
 def panels():
     """40 images past panels at many depths: 1.2 m sideways, turning by 9 degrees."""
-    return film(stairs_world(), CAMERA, sideways(40, 0.03, turn_rad=0.004))
+    return film(stairs_world(), CAMERA, sideways(40, 0.03, turn_rad=0.004), step_s=1 / 30)
 
 
 @lru_cache(maxsize=1)

@@ -17,7 +17,7 @@ from edgeslam_torch.optim.problem import DepthPriors
 from edgeslam_torch.types import FloatArray, IntArray
 
 STEPS = 4
-"""Gauss-Newton steps in one variable, starting from the prior; the third hardly changes anything."""
+"""Gauss-Newton steps in one variable, starting from the prior."""
 MIN_SIGMA_LOG = 0.5
 """Relative uncertainty of an expected depth at least. A network flattens scenes that it was not taught: in a hall it saw
 a quarter of the log depth that was there, and its own sigma says nothing of it (docs/decisions.md, "One map")."""
