@@ -77,6 +77,8 @@ class StateMessage:
 class Tello:
     """One drone. Use it as a context manager: leaving it for whatever reason lands a drone that took off with it.
 
+    A `Guard` lands it when this program dies or hangs in flight, `Sticks` centre the sticks when no fresh ``rc`` comes,
+    and what others than the drone send is not listened to.
     Nothing that makes the drone move is sent unless ``allow_motion`` is true.
 
     Args:
@@ -345,7 +347,7 @@ class Tello:
         raise TelloError(f"{self.address.host}: no answer to 'land'; the drone lands by itself after 15 s of silence")
 
     def rc(self, right: float, forward: float, up: float, clockwise: float) -> None:
-        """Sticks in [-1, 1]; not answered, so send it again and again.
+        """Sticks in [-1, 1]. Send it at least every 0.3 s: sticks that are older are centred (`Sticks`).
 
         Raises:
             TelloError: If motion is not allowed.
