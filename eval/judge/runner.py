@@ -69,8 +69,8 @@ def judge(
         start: Starts a cell's process; `start_cell` when None.
 
     Returns:
-        The record: conditions, and a row for every cell with its figures, or with the reason why it has none; then
-        the rows of other cells that an earlier call with the same code and settings left in ``out``.
+        The record: conditions, and a row for every cell with its figures, or with the reason why it has none; the
+        cells that an earlier call with the same code and settings left in ``out`` are among them.
     """
     commit = code_state() if commit is None else commit
     start = start or start_cell
@@ -104,8 +104,13 @@ def judge(
         "made": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
         "overrides": list(settings.overrides),
         "max_frames": settings.max_frames,
-        "rows": [rows[cell] for cell in cells] + _others(cells, settings, out, commit),
+        "rows": sorted([*rows.values(), *_others(cells, settings, out, commit)], key=_order),
     }
+
+
+def _order(row: dict[str, Any]) -> tuple[bool, str, int]:
+    """Recordings, each before its variants, then simulations."""
+    return row["cell"].startswith(("flight/", "none/")), row["cell"], row["seed"]
 
 
 def start_cell(folder: Path, log: IO[str]) -> subprocess.Popen[str]:

@@ -55,7 +55,7 @@ def score(run_dir: Path, truth: Truth) -> tuple[Figures, list[str]]:
         try:
             figures |= _against_truth(run, truth, notes)
         except EvaluationError as error:
-            notes.append(str(error))
+            notes.append(str(error).removeprefix(f"{run.trajectory.source}: "))
             figures |= _standing_still(run, truth.poses)
     return {k: float(v) if v is not None and np.isfinite(v) else None for k, v in figures.items()}, notes
 

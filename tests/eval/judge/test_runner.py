@@ -48,7 +48,14 @@ def test_crash_kill_and_time_out_are_rows_and_the_rest_goes_on(tmp_path):
         "endless": "took longer than 1 s",
         "good": "",
     }
-    assert record["rows"][3]["figures"]["ate_m"] == 0.01
+    (good,) = (row for row in record["rows"] if row["cell"] == "good")
+    assert good["figures"]["ate_m"] == 0.01
+
+
+def test_variants_follow_their_recording_and_simulations_come_last(tmp_path):
+    names = ["flight/room", "desk/half_rate", "wood", "none/black", "desk"]
+    record = run(tmp_path, names, Starter(), jobs=5)
+    assert [row["cell"] for row in record["rows"]] == ["desk", "desk/half_rate", "wood", "flight/room", "none/black"]
 
 
 def test_what_is_done_is_not_done_again(tmp_path):
@@ -56,7 +63,7 @@ def test_what_is_done_is_not_done_again(tmp_path):
     run(tmp_path, ["a", "crash"], starter)
     record = run(tmp_path, ["a", "crash", "b"], starter)
     assert starter.started == ["a", "crash", "crash", "b"], "only what has a result is left alone"
-    assert [row["cell"] for row in record["rows"]] == ["a", "crash", "b"]
+    assert [row["cell"] for row in record["rows"]] == ["a", "b", "crash"]
 
 
 @pytest.mark.parametrize("change", [{"commit": "def"}, {"overrides": ("flow.enabled=false",)}, {"max_frames": 5}])
@@ -78,7 +85,7 @@ def test_half_written_result_is_no_result(tmp_path):
 def test_record_holds_what_earlier_calls_left(tmp_path):
     starter = Starter()
     run(tmp_path, ["a"], starter)
-    assert [row["cell"] for row in run(tmp_path, ["b"], starter)["rows"]] == ["b", "a"]
+    assert [row["cell"] for row in run(tmp_path, ["b"], starter)["rows"]] == ["a", "b"]
     assert [row["cell"] for row in run(tmp_path, ["b"], starter, commit="def")["rows"]] == ["b"]
 
 
