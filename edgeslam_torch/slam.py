@@ -326,9 +326,7 @@ class EdgeSlam:
         self._publish(track.T_c_w)
 
     def _publish(self, T_c_w: FloatArray) -> None:
-        estimate = self.scale
-        if np.isfinite(estimate.sigma):
-            self._published = self._published.with_scale(estimate.value, se3.inverse(T_c_w)[:3, 3])
+        self._published = self._published.revised(self.scale, se3.inverse(T_c_w)[:3, 3])
 
     def _lost(self, frame: Frame, view: View, T_predicted: FloatArray) -> SlamOutput:
         if self._lost_frames == 0:
@@ -639,8 +637,15 @@ class EdgeSlam:
             keyframe=is_keyframe,
             piece=self.map.piece_of(keyframe.id),
             scale=self.scale,
+            metric=self._is_metric(),
+            revision=self._published.revision,
             stage_ms=dict(self._stage_ms),
         )
+
+    def _is_metric(self) -> bool:
+        """Whether the published units are metres to within what the estimate says."""
+        estimate = self.scale
+        return bool(np.isfinite(estimate.sigma)) and not self._published.contradicts(estimate)
 
     def _timed(self, stage: str) -> AbstractContextManager[None]:
         return _timed(self._stage_ms, stage)

@@ -204,6 +204,12 @@ class SlamOutput:
     piece: int
     """Number of the piece of map that the pose belongs to; poses of different pieces do not relate."""
     scale: ScaleEstimate
+    """Metres per unit of the map, as estimated now; poses are published in units that change by revisions alone."""
+    metric: bool
+    """Whether the unit of ``T_w_c`` is a metre to within the scale's uncertainty."""
+    revision: int
+    """How often the unit of ``T_w_c`` was changed so far: where it differs from the frame's before, earlier poses and
+    points must be read anew."""
     stage_ms: dict[str, float]
     """Milliseconds of each stage in this step."""
 

@@ -1,23 +1,32 @@
 """From the map's own units and axes to the world that is published: metres when they are known, z up.
 
-The map itself is never rescaled. When the scale estimate changes, the similarity that publishes it turns about the
-present camera: the live pose does not jump, and map and trajectory stay consistent, because both pass through the
-same similarity at any moment. The final results use the final scale throughout.
+The map itself is never rescaled, and while flying its units are published as they are: the depth network's metres at
+its start, or arbitrary ones. Only sensors of the drone that are sure and contradict what is published revise it, and
+each revision is an event that the output counts: a scale that follows every new estimate would bend the trajectory.
+The similarity then turns about the present camera, so that the live pose does not jump. The final results use the
+final scale throughout.
 """
 
+import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.geometry import se3
-from edgeslam_torch.types import FloatArray, PointCloud
+from edgeslam_torch.types import FloatArray, PointCloud, ScaleEstimate
 
 T_LEVEL = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 """``T_w_c`` of a level camera that looks along world x: the first pose when nothing tells the attitude."""
 
-MIN_CHANGE = 1e-3
-"""Relative change of the scale that is worth publishing."""
+SURE = 0.1
+"""Relative sigma of a scale that may revise what is published: better than any depth network in a new place."""
+
+CONTRADICTION = 2.0
+"""Sigmas that the published scale may be off before it is revised."""
+
+MEASURED = frozenset({"telemetry", "height"})
+"""Sources that measure metres; a depth network has guessed them at the start already."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,6 +36,8 @@ class Published:
     scale: float = 1.0
     R: FloatArray = field(default_factory=lambda: np.eye(3))
     offset: FloatArray = field(default_factory=lambda: np.zeros(3))
+    revision: int = 0
+    """How often the scale was revised so far."""
 
     def pose(self, T_w_c: FloatArray) -> FloatArray:
         """Poses ``(..., 4, 4)`` of the map as published."""
@@ -44,11 +55,23 @@ class Published:
         p = self.points(cloud.p_w.astype(np.float64)).astype(np.float32)
         return replace(cloud, p_w=p, sigma_m=(self.scale * cloud.sigma_m).astype(np.float32))
 
-    def with_scale(self, scale: float, centre_map: FloatArray) -> "Published":
-        """The same, at another scale, with one map point published where it was."""
-        if abs(scale / self.scale - 1.0) < MIN_CHANGE:
+    def contradicts(self, estimate: ScaleEstimate) -> bool:
+        """Whether an estimate [metres per map unit] leaves no room for the published scale."""
+        sigma = estimate.sigma / estimate.value
+        return bool(abs(math.log(estimate.value / self.scale)) > CONTRADICTION * sigma)
+
+    def revised(self, estimate: ScaleEstimate, centre_map: FloatArray) -> "Published":
+        """The same at an estimated scale, if that is measured, sure and contradicts the published one.
+
+        Args:
+            estimate: Metres per map unit.
+            centre_map: Point of the map ``(3,)`` that stays where it is published.
+        """
+        measured = not MEASURED.isdisjoint(estimate.source.split("+"))
+        if not (measured and estimate.sigma < SURE * estimate.value and self.contradicts(estimate)):
             return self
-        return Published(scale, self.R, self.offset + (self.scale - scale) * (self.R @ centre_map))
+        offset = self.offset + (self.scale - estimate.value) * (self.R @ centre_map)
+        return Published(estimate.value, self.R, offset, self.revision + 1)
 
 
 def first_pose(rpy_rad: FloatArray, T_b_c: FloatArray) -> FloatArray:

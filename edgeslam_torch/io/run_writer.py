@@ -44,6 +44,8 @@ STATUS_COLUMNS = (
     "scale",
     "scale_sigma",
     "scale_source",
+    "metric",
+    "revision",
     "step_ms",
 )
 """Of ``status.csv``; one column ``<stage>_ms`` for every stage follows."""
@@ -268,6 +270,8 @@ def _status_row(output: SlamOutput, step_ms: float) -> list[str]:
         _number(output.scale.value, 6),
         _number(output.scale.sigma, 6),
         output.scale.source,
+        str(int(output.metric)),
+        str(output.revision),
         _number(step_ms, 3),
     ]
 

@@ -1,30 +1,47 @@
 """The published world: z up, metres when known, and no jump when the scale changes."""
 
 import numpy as np
+import pytest
 from point_map import small_motion
 
-from edgeslam_torch.fusion.published import MIN_CHANGE, T_LEVEL, Published, first_pose
+from edgeslam_torch.fusion.published import T_LEVEL, Published, first_pose
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.mount import camera_on_body
-from edgeslam_torch.types import PointCloud
+from edgeslam_torch.types import PointCloud, ScaleEstimate
 
 TILT = np.deg2rad(12.0)
 
 
-def test_change_of_scale_leaves_the_present_camera_where_it_is(rng):
+def test_revision_leaves_the_present_camera_where_it_is(rng):
     T_w_c = np.stack([small_motion(rng, 1.0, 0.5) for _ in range(5)])
     now = T_w_c[-1, :3, 3]
     old = Published(1.5, small_motion(rng, 0, 1.0)[:3, :3], rng.normal(size=3))
-    new = old.with_scale(2.1, now)
+    new = old.revised(ScaleEstimate(2.1, 0.05, "telemetry+height"), now)
+    assert (new.revision, old.revision) == (1, 0)
     np.testing.assert_allclose(new.pose(T_w_c)[-1], old.pose(T_w_c)[-1], atol=1e-12)
     steps = [np.linalg.norm(np.diff(p.pose(T_w_c)[:, :3, 3], axis=0), axis=1) for p in (old, new)]
     np.testing.assert_allclose(steps[1] / steps[0], 2.1 / 1.5)
 
 
-def test_change_too_small_to_matter_changes_nothing():
+@pytest.mark.parametrize(
+    ("value", "sigma", "source"),
+    [
+        (3.0, 0.1, "depth"),  # the network guessed already, and has nothing new to say
+        (3.0, 0.31, "telemetry"),  # not sure enough
+        (2.05, 0.05, "height+depth"),  # within its own uncertainty
+        (1.0, np.inf, "none"),
+    ],
+)
+def test_what_is_not_measured_not_sure_or_no_news_revises_nothing(value, sigma, source):
     old = Published(2.0)
-    assert old.with_scale(2.0 * (1 + 0.5 * MIN_CHANGE), np.ones(3)) is old
-    assert old.with_scale(2.0 * (1 + 2.0 * MIN_CHANGE), np.ones(3)) is not old
+    assert old.revised(ScaleEstimate(value, sigma, source), np.ones(3)) is old
+
+
+def test_contradiction_is_counted_in_sigmas_of_the_logarithm():
+    published = Published(1.0)
+    for factor in (1.1, 1 / 1.1):
+        assert published.contradicts(ScaleEstimate(factor, 0.04 * factor, "depth"))
+        assert not published.contradicts(ScaleEstimate(factor, 0.06 * factor, "depth"))
 
 
 def test_map_and_trajectory_pass_through_the_same_similarity(rng):

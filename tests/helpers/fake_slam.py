@@ -38,6 +38,8 @@ class FakeSlam:
             keyframe=frame.index % 5 == 0,
             piece=0,
             scale=self.scale,
+            metric=True,
+            revision=0,
             stage_ms={"features": 1.0, **({"mapping": 5.0} if frame.index % 5 == 0 else {})},
         )
         self.outputs.append(output)
