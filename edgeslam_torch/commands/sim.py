@@ -3,7 +3,10 @@
 import argparse
 import math
 import signal
-import threading
+import time
+
+_POLL_S = 0.1
+"""A signal that the system gives to another thread does not wake the main one, in which alone it is dealt with."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -62,8 +65,8 @@ def main(args: argparse.Namespace) -> int:
     size = (width, round(width * 0.75))
     drone, paint, _ = furnished_drone(args.seed, math.radians(args.tilt), size, args.battery / 100.0)
     drone.battery_per_s = 1.0 / (60.0 * args.drain)
-    stop = threading.Event()
-    previous = signal.signal(signal.SIGTERM, lambda *_: stop.set())
+    told: list[int] = []
+    previous = signal.signal(signal.SIGTERM, lambda number, _: told.append(number))
     try:
         with TelloEmulator(config, paint, drone) as emulator:
             host = args.bind if args.bind != "0.0.0.0" else "this machine's address"
@@ -75,7 +78,9 @@ def main(args: argparse.Namespace) -> int:
                 f"try: edgeslam run tello://{args.bind}:{emulator.command_port}:{args.state_port}:{args.video_port}",
                 flush=True,
             )
-            stop.wait(args.duration)
+            end_s = math.inf if args.duration is None else time.monotonic() + args.duration
+            while not told and (left_s := end_s - time.monotonic()) > 0:
+                time.sleep(min(left_s, _POLL_S))
     except KeyboardInterrupt:
         return 130
     finally:

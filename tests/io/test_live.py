@@ -1,3 +1,4 @@
+import signal
 import threading
 
 import cv2
@@ -5,6 +6,7 @@ import numpy as np
 import pytest
 
 from edgeslam_torch.cli import main
+from edgeslam_torch.emulator.server import TelloEmulator
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.io.live import CaptureFeed, LiveSource, open_live
 from edgeslam_torch.io.tello_video import Picture
@@ -104,6 +106,21 @@ def test_emulator_command_starts_and_stops(capsys):
     arguments = ["--command-port", "0", "--state-port", "1", "--video-port", "1", "--duration", "0.1"]
     assert main(["sim", *arguments, "--render-width", "64"]) == 0
     assert "127.0.0.1" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(120)
+@pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="signals as POSIX has them")
+def test_emulator_ends_whichever_of_its_threads_gets_the_signal(capsys, monkeypatch):
+    start = TelloEmulator.start
+
+    def shot(emulator):
+        threading.Timer(0.5, lambda: signal.pthread_kill(threading.get_ident(), signal.SIGTERM)).start()
+        return start(emulator)
+
+    monkeypatch.setattr(TelloEmulator, "start", shot)
+    ports = ["--command-port", "0", "--state-port", "1", "--video-port", "1"]
+    assert main(["sim", *ports, "--render-width", "64"]) == 0
 
 
 @pytest.mark.parametrize("wrong", [["--loss", "100"], ["--battery", "0"], ["--render-width", "5000"]])
