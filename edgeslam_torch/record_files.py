@@ -1,4 +1,4 @@
-"""JSON and TOML files, read so that whatever lies in one ends in a single line."""
+"""JSON, TOML and YAML files, read so that whatever lies in one ends in a single line."""
 
 import json
 import tomllib
@@ -10,7 +10,30 @@ from edgeslam_torch.errors import EdgeSlamError
 
 MAX_BYTES = 64 << 20
 """Of one file; a benchmark of a thousand runs takes 2 MB."""
-_PARSERS: dict[str, Callable[[str], Any]] = {"JSON": json.loads, "TOML": tomllib.loads}
+
+
+def plain_yaml(text: str) -> Any:
+    """YAML without aliases, of which a few lines can make gigabytes, and with OpenCV's first line.
+
+    Raises:
+        ValueError: If it is malformed.
+        RecursionError: If it is nested too deeply.
+    """
+    import yaml
+
+    class Loader(yaml.SafeLoader):
+        def compose_node(self, parent: Any, index: Any) -> Any:
+            if self.check_event(yaml.AliasEvent):
+                raise ValueError("aliases are not read")
+            return super().compose_node(parent, index)
+
+    try:
+        return yaml.load(text.replace("%YAML:1.0", ""), Loader)
+    except yaml.YAMLError as error:
+        raise ValueError(" ".join(str(error).split())) from error
+
+
+_PARSERS: dict[str, Callable[[str], Any]] = {"JSON": json.loads, "TOML": tomllib.loads, "YAML": plain_yaml}
 
 
 def read_mapping(path: Path, kind: str, error: type[EdgeSlamError]) -> dict[str, Any]:
@@ -18,7 +41,7 @@ def read_mapping(path: Path, kind: str, error: type[EdgeSlamError]) -> dict[str,
 
     Args:
         path: The file.
-        kind: ``JSON`` or ``TOML``.
+        kind: ``JSON``, ``TOML`` or ``YAML``.
         error: What to raise.
 
     Raises:

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import yaml
 from scipy.spatial.transform import Rotation, Slerp
 
 from edgeslam_torch.errors import CalibrationError
@@ -20,6 +19,7 @@ from edgeslam_torch.eval.formats import SEVEN_SCENES_HZ, Trajectory, read_trajec
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import PRESETS, Camera, load_camera
 from edgeslam_torch.io.images import pixels_or_none
+from edgeslam_torch.record_files import read_mapping
 from edgeslam_torch.types import FloatArray
 
 SEVEN_SCENES_DEPTH_CAMERA = Camera(640, 480, 585.0, 585.0, 320.0, 240.0, source="7-Scenes depth camera")
@@ -185,7 +185,7 @@ def _tum_depth(folder: Path, camera: Camera) -> DepthFiles | None:
 def _depth_per_metre(folder: Path) -> float:
     """``depth_scale`` of the folder's camera.yaml, else the 5000 of TUM's file format page."""
     file = folder / "camera.yaml"
-    record = yaml.safe_load(file.read_text(encoding="utf-8")) if file.is_file() else {}
+    record = read_mapping(file, "YAML", EvaluationError) if file.is_file() else {}
     stated = record.get("depth_scale", _TUM_DEPTH_PER_METRE)
     if not isinstance(stated, (int, float)) or not 0 < stated < np.inf:
         raise EvaluationError(f"{file}: depth_scale must be a positive number, got {stated!r}")

@@ -10,6 +10,8 @@ import numpy as np
 import yaml
 
 from edgeslam_torch.errors import CalibrationError
+from edgeslam_torch.geometry.lens import check_camera
+from edgeslam_torch.record_files import plain_yaml
 from edgeslam_torch.types import FloatArray
 
 GUESSED_FOCAL_SIGMA = 0.45
@@ -166,7 +168,8 @@ def load_camera(name: str | Path) -> Camera:
     ``sensor.yaml`` (``intrinsics``).
 
     Raises:
-        CalibrationError: If there is neither such a preset nor such a file, or the file is malformed.
+        CalibrationError: If there is neither such a preset nor such a file, the file is malformed, or its numbers
+            cannot be a camera's.
     """
     if str(name) in PRESETS:
         return replace(PRESETS[str(name)], source=f"preset {name}")
@@ -174,39 +177,29 @@ def load_camera(name: str | Path) -> Camera:
     if not path.is_file():
         raise CalibrationError(f"no camera file or preset {str(name)!r}; presets: {', '.join(PRESETS)}")
     try:
-        record = yaml.safe_load(path.read_text(encoding="utf-8").replace("%YAML:1.0", ""))
+        record = plain_yaml(path.read_text(encoding="utf-8"))
         if not isinstance(record, dict):
             raise ValueError("no key: value lines in it")
-        return _plausible(_camera_from_record(record, str(Path(*path.parts[-2:]))))
+        camera = _camera_from_record(record, str(Path(*path.parts[-2:])))
+        check_camera(camera)
+        return camera
     except OSError as error:
         raise CalibrationError(f"{path}: {error.strerror or error}") from error
     except CalibrationError as error:
         raise CalibrationError(f"{path}: {error}") from error
     except RecursionError as error:
         raise CalibrationError(f"{path}: not a camera calibration, nested too deeply") from error
-    except (yaml.YAMLError, KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
-        reason = " ".join(str(error).split())
+    except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
+        reason = " ".join(str(error).split())[:200]
         raise CalibrationError(
             f"{path}: not a camera calibration ({type(error).__name__}: {reason}); "
             "it needs width, height, fx, fy, cx, cy"
         ) from error
 
 
-def _plausible(camera: Camera) -> Camera:
-    """The camera, unless its numbers cannot be pixels of such an image (millimetres, swapped lines)."""
-    longest = max(camera.width, camera.height)
-    inside = -longest < camera.cx < 2 * longest and -longest < camera.cy < 2 * longest
-    if not inside or not 0.05 * longest < min(camera.fx, camera.fy) <= max(camera.fx, camera.fy) < 50 * longest:
-        raise CalibrationError(
-            f"fx {camera.fx:g}, fy {camera.fy:g}, cx {camera.cx:g}, cy {camera.cy:g} cannot be pixels of a "
-            f"{camera.width}x{camera.height} image"
-        )
-    return camera
-
-
 def _camera_from_record(record: dict[str, Any], source: str) -> Camera:
-    lens = str(record.get("distortion_model", "plumb_bob")).lower()
-    if lens not in ("plumb_bob", "radial-tangential", "radtan", "none"):
+    lens = record.get("distortion_model") or "plumb_bob"
+    if not isinstance(lens, str) or lens.lower() not in ("plumb_bob", "radial-tangential", "radtan", "none"):
         raise ValueError(f"distortion model {lens!r} is not supported, only plumb_bob (radial-tangential)")
     if "camera_matrix" in record:  # ROS camera_calibration
         k = [float(x) for x in record["camera_matrix"]["data"]]

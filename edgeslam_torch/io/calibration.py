@@ -8,6 +8,7 @@ import numpy as np
 
 from edgeslam_torch.errors import CalibrationError
 from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.geometry.lens import check_camera, unique_share
 from edgeslam_torch.types import FloatArray
 
 _COMMON = ((9, 6), (8, 6), (10, 7), (9, 7), (11, 8), (8, 5), (7, 6), (7, 5), (6, 5), (6, 4), (5, 4))
@@ -211,15 +212,11 @@ def _solve(
             f"its corners miss by {errors[worst]:.2f} px, the others by {np.median(errors):.2f} px"
         )
         del views[worst]
-    if not (np.all(np.isfinite(K)) and 0.2 * size[0] < K[0, 0] < 20 * size[0] and K[1, 1] > 0):
-        raise CalibrationError(
-            "these pictures give a camera that cannot be; photograph the board tilted, from all sides"
-        )
-    d = np.asarray(distortion).ravel()[:5]
+    camera = _camera_of(np.asarray(K, float), np.asarray(distortion, float).ravel()[:5], size, source)
     tilt = max(float(np.degrees(np.arccos(min(1.0, abs(cv2.Rodrigues(r)[0][2, 2]))))) for r in turns)
     spread = np.asarray(sigma).ravel()
     result = CalibrationResult(
-        Camera(*size, K[0, 0], K[1, 1], K[0, 2], K[1, 2], tuple(float(x) for x in d), source),
+        camera,
         float(rms),
         dict(zip(("fx", "fy", "cx", "cy"), (float(x) for x in spread[:4]), strict=True)),
         {v.name: float(e) for v, e in zip(views, errors, strict=True)},
@@ -230,6 +227,18 @@ def _solve(
     )
     result.warnings.extend(_doubts(result))
     return result
+
+
+def _camera_of(K: FloatArray, distortion: FloatArray, size: tuple[int, int], source: str) -> Camera:
+    try:
+        fx, fy, cx, cy = (float(x) for x in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
+        camera = Camera(*size, fx, fy, cx, cy, tuple(float(k) for k in distortion), source)
+        check_camera(camera)
+    except CalibrationError as error:
+        raise CalibrationError(
+            f"these pictures give a camera that cannot be ({error}); photograph the board tilted, from all sides"
+        ) from error
+    return camera
 
 
 def _coverage(views: list[View], size: tuple[int, int]) -> float:
@@ -253,6 +262,9 @@ def _doubts(result: CalibrationResult) -> list[str]:
         doubts.append(
             f"the focal length is known to {100 * result.sigma['fx'] / result.camera.fx:.1f} % only: more pictures"
         )
+    share = unique_share(result.camera)
+    if share < 1.0:
+        doubts.append(f"the distortion turns back at {100 * share:.0f} % of the way to the border: fill the corners")
     if len(result.used) < 10:
         doubts.append(f"{len(result.used)} pictures: 20 are good")
     return doubts

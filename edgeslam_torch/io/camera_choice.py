@@ -7,6 +7,7 @@ from pathlib import Path
 
 from edgeslam_torch.errors import CalibrationError
 from edgeslam_torch.geometry.camera import GUESSED_FOCAL_SIGMA, PRESETS, Camera, load_camera
+from edgeslam_torch.geometry.lens import unique_share
 
 CALIBRATION_FILES = ("camera.yaml", "ost.yaml", "sensor.yaml")
 _ASPECT_TOLERANCE = 0.005
@@ -50,11 +51,10 @@ def choose_camera(
     Raises:
         CalibrationError: If the calibration is malformed or made for images of another shape.
     """
-    if given is not None:
-        return fitted(load_camera(given), size, str(given))
-    found = _calibration_in(folders)
+    found = given if given is not None else _calibration_in(folders)
     if found is not None:
-        return fitted(load_camera(found), size, str(found))
+        camera, notes = fitted(load_camera(found), size, str(found))
+        return camera, [*notes, *_lens_doubts(camera, str(found))]
     if default is not None:
         camera, notes = fitted(default, size, default.source)
         return camera, [*notes, f"no calibration found: using {camera.source}; give --camera FILE for yours"]
@@ -68,6 +68,16 @@ def choose_camera(
     source = f"{GUESS}: 1.2*max(w,h) = {focal:.0f} px"
     camera = Camera(*size, focal, focal, *centre, source=source, focal_sigma=GUESSED_FOCAL_SIGMA)
     return camera, [f"{GUESS_WARNING} a focal length of {focal:.0f} px; {GUESS_COST}"]
+
+
+def _lens_doubts(camera: Camera, name: str) -> list[str]:
+    share = unique_share(camera)
+    if share == 1.0:
+        return []
+    return [
+        f"{name}: its distortion turns back at {100 * share:.0f} % of the way to the border, pixels beyond are "
+        "misplaced; calibrate with pictures in which the board reaches the corners"
+    ]
 
 
 def fitted(camera: Camera, size: tuple[int, int], name: str) -> tuple[Camera, list[str]]:

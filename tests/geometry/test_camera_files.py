@@ -10,8 +10,9 @@ from edgeslam_torch.geometry.camera import PRESETS, Camera, load_camera
 GOOD = "width: 640\nheight: 480\nfx: 500\nfy: 501\ncx: 320\ncy: 240\n"
 ROS = (
     "image_width: 640\nimage_height: 480\ncamera_matrix: {data: [500, 0, 320, 0, 501, 240, 0, 0, 1]}\n"
-    "distortion_model: plumb_bob\ndistortion_coefficients: {data: [0.1, 0.2, 0.3, 0.4, 0.5]}\n"
+    "distortion_model: plumb_bob\ndistortion_coefficients: {data: [0.1, -0.2, 0.003, 0.004, 0.05]}\n"
 )
+LAUGHS = "a: &a [x, x, x]\n" + "".join(f"{n}: &{n} [*{m}, *{m}, *{m}]\n" for m, n in ("ab", "bc", "cd"))
 
 
 def test_own_file_round_trips(tmp_path):
@@ -31,7 +32,7 @@ def test_ros_file(tmp_path):
     (tmp_path / "ost.yaml").write_text(ROS)
     camera = load_camera(tmp_path / "ost.yaml")
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (500.0, 501.0, 320.0, 240.0)
-    assert camera.distortion == (0.1, 0.2, 0.3, 0.4, 0.5)
+    assert camera.distortion == (0.1, -0.2, 0.003, 0.004, 0.05)
 
 
 @pytest.mark.parametrize("name", PRESETS)
@@ -49,6 +50,16 @@ def test_presets_load_and_say_so(name):
         (GOOD.replace("fx: 500", "fx: .nan"), "not finite"),
         (GOOD.replace("fx: 500", "fx: 3.6"), "cannot be pixels"),
         (GOOD.replace("cx: 320", "cx: 99999"), "cannot be pixels"),
+        (GOOD.replace("fx: 500", "fx: 30"), "cannot be pixels"),
+        (GOOD.replace("fy: 501", "fy: 13000"), "cannot be pixels"),
+        (GOOD.replace("fy: 501", "fy: 100"), "cannot be pixels"),
+        (GOOD.replace("cy: 240", "cy: 721"), "cannot be pixels"),
+        (GOOD + "distortion: [1.0e+300, 0, 0, 0, 0]\n", "cannot be a lens's"),
+        (GOOD + "distortion: [-2, 0, 0, 0, 0]\n", "cannot be a lens's"),
+        (GOOD + "distortion: [0, 0, 0.5, 0, 0]\n", "cannot be a lens's"),
+        (GOOD + "distortion: [.inf, 0, 0, 0, 0]\n", "not finite"),
+        (GOOD + LAUGHS + "distortion_model: *d\n", "aliases are not read"),
+        (GOOD + "fx: " + "9" * 5000 + "\n", "not a camera calibration"),
         (GOOD.replace("width: 640", "width: .inf"), "not a camera calibration"),
         (GOOD.replace("fy: 501\n", ""), "KeyError: 'fy'"),
         (GOOD + "focal_sigma: -0.1\n", "focal_sigma must be at least 0"),
@@ -62,6 +73,12 @@ def test_wrong_file_is_refused_by_name(tmp_path, text, words):
     (tmp_path / "c.yaml").write_text(text)
     with pytest.raises(CalibrationError, match=f"c.yaml: .*{words}"):
         load_camera(tmp_path / "c.yaml")
+
+
+@pytest.mark.parametrize("line", ["", "distortion_model:\n", "distortion_model: none\n"])
+def test_a_lens_that_nobody_describes_has_no_distortion(tmp_path, line):
+    (tmp_path / "c.yaml").write_text(GOOD + line)
+    assert not load_camera(tmp_path / "c.yaml").is_distorted
 
 
 def test_scaled_camera_sees_the_same_rays():

@@ -88,13 +88,8 @@ def test_few_or_flat_views_are_doubted(rng):
     for k in range(5):
         H = flat.K @ np.array([[scale, 0, -0.14 + 0.02 * k], [0, scale, -0.1 + 0.01 * k], [0, 0, 0.4 + 0.03 * k]])
         pictures.append((f"flat{k}", cv2.warpPerspective(board, H, (640, 480), borderValue=150)))
-    try:
-        result = calibrate(pictures, Board(8, 6))
-    except CalibrationError as error:
-        assert "tilted" in str(error)
-        return
-    assert any("tilt" in w for w in result.warnings)
-    assert any("5 pictures" in w for w in result.warnings)
+    with pytest.raises(CalibrationError, match="cannot be.*photograph the board tilted"):
+        calibrate(pictures, Board(8, 6))
 
 
 def test_no_board_at_all_is_an_error_that_says_what_to_do(rng):

@@ -295,6 +295,19 @@ def test_calibration_of_another_shape_is_refused_naming_both_sizes(tmp_path, wri
         open_source(write_tum(tmp_path, 2, (960, 540)), camera="kinect")
 
 
+def test_lens_that_turns_back_in_the_corners_is_used_with_a_warning(tmp_path, write_tum):
+    folder = write_tum(tmp_path, 2)
+    Camera(64, 48, 40.0, 40.0, 31.5, 23.5, (-0.3, 0.0, 0.0, 0.0, 0.0)).save(folder / "camera.yaml")
+    assert "turns back at 70 % of the way to the border" in open_source(folder).warnings[0]
+
+
+def test_impossible_lens_is_refused(tmp_path, write_tum):
+    folder = write_tum(tmp_path, 2)
+    Camera(64, 48, 40.0, 40.0, 31.5, 23.5, (1e300, 0.0, 0.0, 0.0, 0.0)).save(folder / "camera.yaml")
+    with pytest.raises(CalibrationError, match="camera.yaml: distortion .* cannot be a lens's"):
+        open_source(folder)
+
+
 def test_unknown_preset(tmp_path, write_tum):
     with pytest.raises(CalibrationError, match="tum_fr1"):
         open_source(write_tum(tmp_path, 2), camera="tum_fr9")

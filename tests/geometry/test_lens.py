@@ -1,0 +1,71 @@
+"""Which calibrations can be a camera's."""
+
+import numpy as np
+import pytest
+
+from edgeslam_torch.errors import CalibrationError
+from edgeslam_torch.geometry.camera import PRESETS, Camera
+from edgeslam_torch.geometry.lens import check_camera, unique_share
+
+REAL = {
+    # TUM RGB-D, KITTI raw 2011_09_26 camera 0, EuRoC cam0, a Tello by ROS camera_calibration: as published.
+    "fr1": PRESETS["tum_fr1"],
+    "fr2": PRESETS["tum_fr2"],
+    "kitti": Camera(
+        1392, 512, 984.2439, 980.8141, 690.0, 233.1966, (-0.3728755, 0.2037299, 0.002219, 0.001384, -0.07233722)
+    ),
+    "euroc": Camera(752, 480, 458.654, 457.296, 367.215, 248.375, (-0.28340811, 0.07395907, 0.00019359, 1.76e-05, 0.0)),
+    "tello": Camera(960, 720, 924.87, 923.5, 487.0, 364.3, (-0.034749, 0.071514, 0.000363, 0.003131, 0.0)),
+}
+
+
+@pytest.mark.parametrize("name", REAL)
+def test_real_lenses_are_one_to_one_over_the_whole_image(name):
+    assert unique_share(REAL[name]) == 1.0
+    check_camera(REAL[name])
+
+
+@pytest.mark.parametrize("k1", [-0.1, -0.25, -0.35, -0.6])
+def test_share_of_a_barrel_is_where_its_radius_turns_back(k1):
+    """r (1 + k1 r^2) is largest at r = 1 / sqrt(-3 k1): two thirds of that."""
+    camera = Camera(640, 480, 400.0, 400.0, 319.5, 239.5, (k1, 0.0, 0.0, 0.0, 0.0))
+    turn = 2.0 / 3.0 / np.sqrt(-3.0 * k1)
+    corner = np.hypot(320.0, 240.0) / 400.0
+    assert unique_share(camera) == pytest.approx(min(1.0, turn / corner), abs=0.01)
+
+
+@pytest.mark.parametrize(
+    "distortion",
+    [
+        (1e300, 0.0, 0.0, 0.0, 0.0),
+        (-1e300, 0.0, 0.0, 0.0, 0.0),
+        (1e300, -1e300, 0.0, 0.0, 0.0),
+        (0.0, 0.0, 1e300, 0.0, 0.0),
+        (30.0, 0.0, 0.0, 0.0, 0.0),
+        (-1.0, 0.0, 0.0, 0.0, 0.0),
+        (0.0, 0.0, 0.5, 0.0, 0.0),
+        (0.0, 0.0, 0.0, 0.0, -5.0),
+    ],
+)
+def test_what_no_lens_does_is_refused(distortion):
+    with pytest.raises(CalibrationError, match="cannot be a lens's"):
+        check_camera(Camera(640, 480, 400.0, 400.0, 320.0, 240.0, distortion))
+
+
+@pytest.mark.parametrize(
+    "numbers",
+    [
+        (63.0, 500.0, 320.0, 240.0),
+        (500.0, 12801.0, 320.0, 240.0),
+        (500.0, 1501.0, 320.0, 240.0),
+        (500.0, 500.0, -321.0, 240.0),
+        (500.0, 500.0, 320.0, 721.0),
+    ],
+)
+def test_what_cannot_be_pixels_is_refused(numbers):
+    with pytest.raises(CalibrationError, match="cannot be pixels of a 640x480 image"):
+        check_camera(Camera(640, 480, *numbers))
+
+
+def test_a_cropped_image_may_have_its_principal_point_outside():
+    check_camera(Camera(640, 480, 500.0, 500.0, 800.0, 240.0, (-0.1, 0.02, 0.0, 0.0, 0.0)))
