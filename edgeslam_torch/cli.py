@@ -5,6 +5,10 @@ Nothing is imported before `main` has Ctrl-C in hand, and nothing heavy before a
 
 import sys
 
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from types import FrameType
+
 COMMANDS = {
     "demo": ("edgeslam_torch.commands.demo", "fly a simulated drone through a simulated house; needs no data"),
     "run": ("edgeslam_torch.commands.run", "trajectory and edge map from a recording, a video or a live camera"),
@@ -43,45 +47,57 @@ def main(argv: list[str] | None = None) -> int:
     Args:
         argv: The words after ``edgeslam``; those that the program was called with when None.
     """
+    ctrl_c = _CtrlC()
     try:
         if argv is None:
-            _interrupt_between_imports()
+            ctrl_c.take()
         from edgeslam_torch.command_line import run_command
 
         return run_command(sys.argv[1:] if argv is None else argv, available())
-    except KeyboardInterrupt:
+    except BaseException as error:
+        # What a library makes of a Ctrl-C in the middle of its work has many names.
+        if not isinstance(error, KeyboardInterrupt) and (isinstance(error, SystemExit) or not ctrl_c.raised):
+            raise
         sys.stderr.write("edgeslam: interrupted\n")
         return EXIT_INTERRUPTED
     finally:
-        if argv is None:
-            _interrupt_at_once()
+        ctrl_c.give_back()
 
 
-def _interrupt_between_imports() -> None:
-    """Let Ctrl-C wait while a module loads: numpy makes another error of it, and a weak reference's end swallows it."""
-    import _thread
-    import signal
-    import threading
-    from types import FrameType
+class _CtrlC:
+    """Ctrl-C as ever, but it waits while a module loads: numpy makes another error of it, a weak reference's end
+    swallows it, and who can do without the module goes on without."""
 
-    def on_signal(number: int, frame: FrameType | None) -> None:
+    def __init__(self) -> None:
+        self.raised = False
+        self._taken = False
+
+    def take(self) -> None:
+        """Handle Ctrl-C from here on, unless somebody else does or it is ignored."""
+        import signal
+
+        if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+            signal.signal(signal.SIGINT, self._on_signal)
+            self._taken = True
+
+    def give_back(self) -> None:
+        """Let Ctrl-C end the program without a word: all is done, the interpreter only clears up."""
+        if self._taken:
+            import signal
+
+            signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+    def _on_signal(self, number: int, frame: "FrameType | None") -> None:
+        import _thread
+        import threading
+
         while frame is not None:
             if frame.f_code.co_filename == _IMPORTING:
                 threading.Timer(_AGAIN_S, _thread.interrupt_main).start()
                 return
             frame = frame.f_back
+        self.raised = True
         raise KeyboardInterrupt
-
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not where it is ignored, and only once
-        signal.signal(signal.SIGINT, on_signal)
-
-
-def _interrupt_at_once() -> None:
-    """Let Ctrl-C end the program without a word: all is done, the interpreter only clears up."""
-    import signal
-
-    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
-        signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 if __name__ == "__main__":
