@@ -15,8 +15,8 @@ from edgeslam_torch.eval.judge.table import aligned
 
 RECORD = "judge.json"
 _SIGMAS = 2.0
-_ONE_SEED = 0.05
-"""Relative difference taken for noise when there is one seed: what the median recording scatters over seeds."""
+_MOST_NAMED = 8
+"""Cells that only one of two records has are named up to this many."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,20 +29,23 @@ class Compared:
     lower_is_better: bool
     floor: float
     """Difference below which two medians are not told apart: relative for errors, absolute for shares."""
+    one_seed: float
+    """The same where a record has one seed: two sigma of a difference of two runs, measured on tum_fr1_xyz and
+    7scenes_redkitchen with three seeds each (0ecd978); a recording on which runs get lost scatters more."""
     relative: bool = True
 
 
 COMPARED = (
-    Compared("supported_end", "end", "{:.1%}", False, 0.005, relative=False),
-    Compared("supported_live", "live", "{:.1%}", False, 0.005, relative=False),
-    Compared("losses", "lost", "{:.0f}", True, 0.5, relative=False),
-    Compared("ate_m", "ATE", "{:.4f}", True, 0.03),
-    Compared("online_m", "online", "{:.4f}", True, 0.03),
-    Compared("rotation_deg", "rot °", "{:.2f}", True, 0.03),
-    Compared("map_points", "points", "{:.0f}", False, 0.05),
-    Compared("map_median_m", "median", "{:.4f}", True, 0.03),
-    Compared("map_within_5cm", "5 cm", "{:.0%}", False, 0.02, relative=False),
-    Compared("cpu_ms", "CPU ms", "{:.1f}", True, 0.10),
+    Compared("supported_end", "end", "{:.1%}", False, 0.005, 0.005, relative=False),
+    Compared("supported_live", "live", "{:.1%}", False, 0.005, 0.01, relative=False),
+    Compared("losses", "lost", "{:.0f}", True, 0.5, 0.5, relative=False),
+    Compared("ate_m", "ATE", "{:.4f}", True, 0.03, 0.05),
+    Compared("online_m", "online", "{:.4f}", True, 0.03, 0.16),
+    Compared("rotation_deg", "rot °", "{:.2f}", True, 0.03, 0.28),
+    Compared("map_points", "points", "{:.0f}", False, 0.05, 0.05),
+    Compared("map_median_m", "median", "{:.4f}", True, 0.03, 0.80),
+    Compared("map_within_5cm", "5 cm", "{:.0%}", False, 0.02, 0.08, relative=False),
+    Compared("cpu_ms", "CPU ms", "{:.1f}", True, 0.10, 0.10),
 )
 
 
@@ -70,7 +73,7 @@ def verdict(compared: Compared, before: Sequence[float], after: Sequence[float])
     a, b = np.asarray(before, dtype=np.float64), np.asarray(after, dtype=np.float64)
     first, second = float(np.median(a)), float(np.median(b))
     size = abs(first) if compared.relative else 1.0
-    floor = max(compared.floor, _ONE_SEED if min(len(a), len(b)) == 1 and compared.relative else 0.0) * size
+    floor = size * (compared.one_seed if min(len(a), len(b)) == 1 else compared.floor)
     scatter = sum(float(np.var(x, ddof=1)) / len(x) for x in (a, b) if len(x) > 1)
     change = second - first
     if abs(change) <= max(floor, _SIGMAS * float(np.sqrt(scatter))):
@@ -87,10 +90,13 @@ def markdown_against(before: dict[str, Any], after: dict[str, Any]) -> str:
     parts = [f"{before['commit']} -> {after['commit']}, medians, ratio; ! worse, + better by more than the noise"]
     parts += ["", aligned(header, lines), ""]
     missing = sorted(set(_names(before)) ^ set(_names(after)))
-    parts += [f"only in one of the two: {', '.join(missing)}"] if missing else []
+    named = ", ".join(missing) if len(missing) <= _MOST_NAMED else f"{len(missing)} cells"
+    parts += [f"only in one of the two: {named}"] if missing else []
     parts += [f"worse: {', '.join(worse) if worse else 'nothing'}"]
     if any(len(_rows(record, name)) == 1 for record in (before, after) for name in names):
-        parts += [f"cells with one seed: their noise is not known, {_ONE_SEED:.0%} is taken for it"]
+        parts += [
+            "cells with one seed: that of two recordings is taken for their noise; CPU also follows the machine's load"
+        ]
     return "\n".join(parts) + "\n"
 
 

@@ -7,7 +7,7 @@ from edgeslam_torch.eval.judge.against import Compared, markdown_against, verdic
 from edgeslam_torch.eval.judge.bars import read_bars, verdicts_of_cell, verdicts_of_groups
 from edgeslam_torch.eval.judge.table import COLUMNS, markdown
 
-ATE = Compared("ate_m", "ATE", "{:.4f}", True, 0.03)
+ATE = Compared("ate_m", "ATE", "{:.4f}", True, 0.03, 0.05)
 
 
 def row(cell, seed=0, error="", **figures):
@@ -104,7 +104,8 @@ def test_difference_within_the_scatter_of_the_seeds_is_no_difference():
     assert verdict(ATE, [0.010, 0.0101, 0.0102], [0.013, 0.0131, 0.0132]) == "worse"
     assert verdict(ATE, [0.013, 0.0131, 0.0132], [0.010, 0.0101, 0.0102]) == "better"
     assert verdict(ATE, [0.0100], [0.0104]) == "same", "one seed: 5 % are taken for noise"
-    share = Compared("supported_end", "end", "{:.0%}", False, 0.005, relative=False)
+    assert verdict(ATE, [0.0100, 0.0101], [0.0104, 0.0105]) == "worse", "two seeds that scatter little tell 4 %"
+    share = Compared("supported_end", "end", "{:.0%}", False, 0.005, 0.005, relative=False)
     assert verdict(share, [1.0], [0.9]) == "worse"
 
 
