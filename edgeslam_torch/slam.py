@@ -480,7 +480,7 @@ class EdgeSlam:
         track, features = located.track, located.view.features
         keyframe = make_keyframe(self.map.next_keyframe_id(), frame.index, frame.stamp_s, track.T_c_w, features)
         keyframe.anchor[track.keypoint] = track.anchor
-        self.map.add_keyframe(keyframe)
+        self.map.add_keyframe(keyframe, located.reference)
         self._template = template_of_keyframe(keyframe, seen.grey, self.camera)
         self._map([(frame, keyframe)])
         return keyframe

@@ -178,11 +178,16 @@ class SlamMap:
 
     # -- keyframes ---------------------------------------------------------------------------------------------
 
-    def add_keyframe(self, keyframe: Keyframe) -> None:
-        """Take a keyframe with its observations into the map."""
+    def add_keyframe(self, keyframe: Keyframe, reference: Keyframe | None = None) -> None:
+        """Take a keyframe with its observations into the map.
+
+        Args:
+            keyframe: The new one.
+            reference: Keyframe that it was tracked against, whose piece it belongs to; the newest piece without one.
+        """
         self.revision += 1
         self.keyframes[keyframe.id] = keyframe
-        self._piece[keyframe.id] = self.piece
+        self._piece[keyframe.id] = self.piece if reference is None else self._piece[reference.id]
         self.anchors.observations[keyframe.anchor[keyframe.anchor >= 0]] += 1
 
     def remove_keyframe(self, keyframe: Keyframe) -> None:

@@ -146,3 +146,28 @@ def test_refreshed_anchor_faces_its_cameras_and_knows_its_distance(rng):
     np.testing.assert_allclose(points.map.anchors.normal[id], mean / np.linalg.norm(mean), atol=1e-9)
     newest = np.linalg.norm(rays[-1])  # at octave 0
     np.testing.assert_allclose(points.map.anchors.max_distance[id], newest)
+
+
+def test_a_keyframe_belongs_to_the_piece_that_it_was_tracked_in(rng):
+    """Found again in the first piece while a second one exists: that joins nothing."""
+    points = PointMap(rng, 300, 3)
+    first, second, again = points.keyframes
+    points.map.begin_piece("first")
+    points.map.add_keyframe(first)
+    ids = points.map.anchors.add(np.zeros((1, 3)), first.words[:1], 0, True, np.zeros((1, 3), np.uint8))
+    points.map.observe(first, np.array([0]), ids)
+    points.map.begin_piece("second")
+    points.map.add_keyframe(second)
+    points.map.add_keyframe(again, first)
+    assert [points.map.piece_of(k.id) for k in points.keyframes] == [0, 1, 0]
+    assert not points.map.join_pieces(again, [first])
+    assert points.map.join_pieces(again, [second])
+    assert [points.map.piece_of(k.id) for k in points.keyframes] == [0, 0, 0]
+
+
+def test_a_piece_that_holds_nothing_gives_its_number_to_the_next(rng):
+    points = PointMap(rng, 300, 2)
+    for begun in ("dark", "still dark"):
+        points.map.begin_piece(begun)
+        points.map.add_keyframe(points.keyframes[points.map.piece])
+    assert points.map.piece == 0
