@@ -42,9 +42,11 @@ class OrbConfig:
     levels: int = 8
     fast_threshold: int = 12
     """Grey levels; low, because the spread keeps the strongest of every cell."""
+    fast_faint: int = 4
+    """The same where the image has few corners: cloth, white walls, little light. About twice a camera's noise."""
 
     def __post_init__(self) -> None:
-        _positive(self, "features", "candidates", "levels", "fast_threshold")
+        _positive(self, "features", "candidates", "levels", "fast_threshold", "fast_faint")
         if not 1.0 < self.scale_factor <= 2.0:
             raise ValueError(f"scale_factor must be in (1, 2], got {self.scale_factor}")
 

@@ -9,6 +9,9 @@ from edgeslam_torch.config import OrbConfig
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.types import FloatArray, FrameFeatures, IntArray
 
+FAINT_SHARE = 0.5
+"""Share of the keypoints asked for below which fainter corners are looked for as well."""
+
 
 class OrbExtractor:
     """Detects more corners than asked for, keeps the best of every cell, describes those."""
@@ -16,19 +19,25 @@ class OrbExtractor:
     def __init__(self, config: OrbConfig, camera: Camera) -> None:
         self.config = config
         self.camera = camera
-        self._orb = cv2.ORB.create(
-            nfeatures=config.candidates,
-            scaleFactor=config.scale_factor,
-            nlevels=config.levels,
-            fastThreshold=config.fast_threshold,
-        )
+        self._detectors = [self._detector(threshold) for threshold in (config.fast_threshold, config.fast_faint)]
         self._one_at_a_time = threading.Lock()  # OpenCV does not say that two threads may share a detector
+
+    def _detector(self, fast_threshold: int) -> cv2.ORB:
+        return cv2.ORB.create(
+            nfeatures=self.config.candidates,
+            scaleFactor=self.config.scale_factor,
+            nlevels=self.config.levels,
+            fastThreshold=fast_threshold,
+        )
 
     def __call__(self, grey: np.ndarray) -> FrameFeatures:
         """Features of a grey image ``(H, W)`` uint8 with the lens distortion still in it."""
         # All candidates are described, in one call: a second one would build the image pyramid again.
         with self._one_at_a_time:
-            found, descriptors = self._orb.detectAndCompute(grey, None)
+            for detector in self._detectors:  # the faint ones only where there is little else: bare walls, little light
+                found, descriptors = detector.detectAndCompute(grey, None)
+                if len(found) >= FAINT_SHARE * self.config.features:
+                    break
         if not found or descriptors is None:
             return FrameFeatures(
                 np.zeros((0, 2), np.float32),

@@ -31,6 +31,20 @@ def test_keypoints_are_described_and_inside():
     assert features.octave.max() < 8
 
 
+def test_faint_corners_are_found_where_there_is_little_else():
+    """A tenth of the contrast of a textured image: few corners pass the usual threshold, most the faint one."""
+    faint = (128 + 0.1 * (views()[0][..., 1].astype(float) - 128)).astype(np.uint8)
+    usual = OrbExtractor(OrbConfig(fast_faint=12), CAMERA)(faint)
+    assert len(OrbExtractor(OrbConfig(), CAMERA)(faint).uv) > 2 * len(usual.uv) + 50
+
+
+def test_where_corners_abound_faint_ones_change_nothing():
+    grey = views()[0][..., 1].copy()
+    config = OrbConfig(features=400)
+    a, b = (OrbExtractor(c, CAMERA)(grey) for c in (config, OrbConfig(features=400, fast_faint=12)))
+    np.testing.assert_array_equal(a.uv, b.uv)
+
+
 def test_same_image_gives_the_same_features():
     grey = views()[0][..., 1].copy()
     a, b = (OrbExtractor(OrbConfig(), CAMERA)(grey) for _ in range(2))
