@@ -2,6 +2,7 @@
 
 import argparse
 import difflib
+import errno
 import importlib
 import logging
 import math
@@ -9,7 +10,7 @@ import os
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import NoReturn
+from typing import NoReturn, TextIO
 
 from edgeslam_torch import __version__
 from edgeslam_torch.errors import EdgeSlamError
@@ -19,6 +20,7 @@ Commands = Mapping[str, tuple[str, str]]
 
 EXIT_ERROR = 1
 EXIT_USAGE = 2
+EXIT_HUNG_UP = 129
 
 
 class Parser(argparse.ArgumentParser):
@@ -85,8 +87,20 @@ def run_command(arguments: list[str], commands: Commands) -> int:
         sys.stderr.write(f"edgeslam: error: {_one_line(error)}\n")
         return EXIT_ERROR
     except BrokenPipeError:  # the reader of a pipe, such as head, has enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _mute(sys.stdout)
         return 0
+    except OSError as error:
+        if error.errno != errno.EIO or sys.stderr.isatty():
+            raise
+        _mute(sys.stdout, sys.stderr)  # the terminal was closed; what was done is on the disk
+        return EXIT_HUNG_UP
+
+
+def _mute(*streams: TextIO) -> None:
+    """Let what is still written go nowhere."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    for stream in streams:
+        os.dup2(nowhere, stream.fileno())
 
 
 def _call(name: str, entry: tuple[str, str], arguments: list[str], verbose: bool) -> int:

@@ -1,9 +1,13 @@
 """The command line as a user meets it: every mistake gets one line that says what to do."""
 
+import json
 import logging
+import os
+import pty
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -246,3 +250,36 @@ def test_installed_program_runs(tmp_path):
     assert done.returncode == 1
     assert done.stderr.startswith("edgeslam: error:")
     assert done.stderr.count("\n") == 1
+
+
+IN_A_TERMINAL = """
+import fcntl, sys, termios
+fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+import edgeslam_torch.run
+from edgeslam_torch.cli import main
+from fake_slam import FakeSlam
+edgeslam_torch.run._edge_slam = lambda camera, config, realtime: FakeSlam()
+sys.exit(main())
+"""
+
+
+def test_closed_terminal_leaves_a_map(write_tum, tmp_path):
+    """The program runs in a terminal of its own, which is closed once the first frame is through."""
+    out = tmp_path / "out"
+    words = ["run", str(write_tum(tmp_path / "seq", 50)), "--out", str(out), "--no-report", "--mode", "realtime"]
+    ours, its = pty.openpty()
+    child = subprocess.Popen(
+        [sys.executable, "-c", IN_A_TERMINAL, *words],
+        stdin=its,
+        stdout=its,
+        stderr=its,
+        start_new_session=True,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+    )
+    os.close(its)
+    while child.poll() is None and not (out / "status.csv").exists():
+        time.sleep(0.01)
+    os.close(ours)
+    assert child.wait() == 129
+    assert (out / "edge_map.ply").is_file()
+    assert json.loads((out / "summary.json").read_text())["ended_early"] == "interrupted"
