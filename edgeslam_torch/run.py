@@ -22,6 +22,7 @@ from edgeslam_torch.errors import SourceError
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.io.camera_choice import GUESS, GUESS_COST, GUESS_WARNING
 from edgeslam_torch.io.config_file import to_toml
+from edgeslam_torch.io.flight import telemetry_gap
 from edgeslam_torch.io.map_picture import write_map_picture
 from edgeslam_torch.io.pace import Counter, at_their_pace
 from edgeslam_torch.io.read_ahead import read_ahead
@@ -293,7 +294,7 @@ class _Run:
             **summarise(
                 self.source, self.tally, self.slam.pieces(), scale, self.dropped.value, loop_s, finish_s, cpu_s
             ),
-            "warnings": [*self.source.warnings, *self.slam.warnings()],
+            "warnings": [*self.source.warnings, *self.slam.warnings(), *self._telemetry_gap(stamps)],
             "map": {
                 "keyframes": len(self.slam.keyframes()),
                 "anchors": len(anchors.p_w),
@@ -317,6 +318,10 @@ class _Run:
         self.result = RunResult(
             self.writer.folder, summary, stamps, poses, self.interrupt.requested, self.writer.failure
         )
+
+    def _telemetry_gap(self, stamps_s: FloatArray) -> list[str]:
+        gap = telemetry_gap(self.source.telemetry, float(stamps_s[0]), float(stamps_s[-1]))
+        return [] if gap is None else [gap]
 
     def _no_frame(self) -> str:
         if self.interrupt.requested:

@@ -603,7 +603,8 @@ class EdgeSlam:
         """What limits how far the results can be believed, in sentences for the run's summary."""
         depth = None if self.depth is None else self.depth.warning()
         warnings = (depth, self._warning_of_pieces(), self._repeats.warning(), self._calibration_warning)
-        return [warning for warning in warnings if warning is not None]
+        telemetry = self._fusion.warnings() if self._has_telemetry else []
+        return [warning for warning in warnings if warning is not None] + telemetry
 
     def _warning_of_pieces(self) -> str | None:
         pieces = [p for p in self.pieces() if p.supported > 0]

@@ -152,6 +152,7 @@ def _payload(
     data: dict[str, Any] = {
         "title": words.title(run),
         "story": words.story(run, score),
+        "warnings": words.warnings(run.summary),
         "tiles": words.tiles(run, score, len(edges.p_w)),
         "foot": words.foot(run),
         "unit": units,

@@ -70,6 +70,12 @@ def story(run: RunFolder, score: RunScore | None) -> str:
     return " ".join(s for s in sentences if s).replace(" %", "\u00a0%")
 
 
+def warnings(summary: dict[str, Any]) -> list[str]:
+    """What the run warned of."""
+    said = summary.get("warnings")
+    return [without_folders(str(sentence)) for sentence in said] if isinstance(said, list) else []
+
+
 def tiles(run: RunFolder, score: RunScore | None, points: int) -> list[dict[str, str]]:
     """Key figures at the top of the page."""
     summary = run.summary

@@ -73,6 +73,14 @@ def test_what_the_system_warns_of_is_in_the_summary_beside_the_sources_warnings(
     assert summary["warnings"][-2:] == ["no calibration", "no depth"]
 
 
+def test_telemetry_of_another_time_is_a_warning_of_the_run(tmp_path, write_tum):
+    """Frames from 100 s on: what is stamped later never reaches the system, which cannot know that it is there."""
+    source, slam = open_source(write_tum(tmp_path / "seq", 4)), FakeSlam()
+    source.telemetry = [TelemetrySample(500.0 + 0.1 * k) for k in range(50)]
+    summary = run(source, tmp_path / "out", make_slam=fake(slam)).summary
+    assert any("stamped after the frames" in w for w in summary["warnings"])
+
+
 def test_lost_frames_are_counted_once_a_loss(tmp_path, write_tum):
     folder = write_tum(tmp_path / "seq", 10)
     for path in sorted((folder / "rgb").iterdir())[4:7]:

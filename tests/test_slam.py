@@ -421,3 +421,13 @@ def test_a_frozen_video_says_so_and_is_no_evidence_for_the_scale(monkeypatch):
     assert outputs[23].stamp_s in told
     assert max(told) == outputs[23].stamp_s
     assert any("stood still" in w for w in slam.warnings())
+
+
+def test_telemetry_that_the_images_do_not_bear_out_is_a_warning_of_the_system():
+    """4 s of flight with velocities of 0."""
+    slam = EdgeSlam(CAMERA, NO_NETWORK, depth=panels().depth_function())
+    for frame in panels().frames:
+        slam.step(frame, [TelemetrySample(frame.stamp_s, np.zeros(3), np.zeros(3))])
+    slam.finish()
+    assert slam.scale.source == "depth"
+    assert any("velocities are not used" in w for w in slam.warnings())

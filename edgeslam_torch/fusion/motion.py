@@ -6,17 +6,19 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.fusion.config import FusionConfig
 from edgeslam_torch.fusion.delayed import BufferedEkf
 from edgeslam_torch.fusion.ekf import EkfState
 from edgeslam_torch.fusion.joint_scale import Evidence, displacement_evidence, height_evidence, solved
 from edgeslam_torch.fusion.mount import Mount, estimate_mount
+from edgeslam_torch.fusion.plausibility import Agreement, Reading, Trust, Verdict, agreement, changes
 from edgeslam_torch.fusion.rotations import mean_rotation, rotation_vector
 from edgeslam_torch.fusion.scale import DepthRatio, LogScale, floor_segments, fuse
 from edgeslam_torch.fusion.track import TelemetryTrack
 from edgeslam_torch.geometry import se3
-from edgeslam_torch.types import FloatArray, ScaleEstimate, TelemetrySample
+from edgeslam_torch.types import FloatArray, IntArray, ScaleEstimate, TelemetrySample
 
 _DELAY_GUESS_S = 0.3
 """Used until the motion says better; the short end of what Tello owners measure."""
@@ -27,6 +29,15 @@ _GOOD_HEIGHT = 0.2
 """Relative sigma with which a height source is good enough; the next one would say the same less well."""
 _DELAY_STEP_S = 0.05
 _MIN_DELAY_INTERVALS = 12
+_WIDE_DELAYS_S = (-3.0, 3.0)
+_WIDE_STEP_S = 0.1
+"""Delays beyond those allowed are looked at where telemetry does not fit well: a wrong clock is said, not used."""
+_FITS_WELL = 0.9
+_MUCH_LIKELIER = 6.0
+"""Log likelihood ratio; half the intervals count as independent."""
+_LEAST_TURN_RAD_S = math.radians(2.0)
+"""Whole degrees twice a second are noise below."""
+_HEIGHT_BIN_S = 0.5
 _MANY_INTERVALS = 16
 _FEED_S = 0.09
 """The filter takes vision at the pace of telemetry: each late increment costs a re-propagation."""
@@ -38,6 +49,13 @@ _FOCAL_SHARE = 0.4
 """How much of a focal length's error the scale from telemetry takes on: with 0.7 to 1.5 times the right one the root
 mean square over fr1_xyz, redkitchen and euroc_mh05_a is 0.4 in the logarithm."""
 _HEIGHT_SOURCES = {"tof": "sigma_tof_m", "h": "sigma_h_m", "baro": "sigma_baro_m"}
+_LEAST_CLIMB_M = 0.05
+_LEAST_CLIMB_SIGMAS = 2.0
+_MOST_STEPS = 0.3
+"""Share of height readings that may step: more is not furniture passing below."""
+_AT_ODDS = 5.0
+_AT_ODDS_LOG = math.log(2.0)
+"""Sigmas and factor between the scales of velocities and height beyond which one of them is nonsense."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,6 +145,8 @@ class MotionFusion:
         self._sources: dict[str, tuple[float, float]] = {}
         """Scale and sigma of velocity and height on their own, for the report."""
         self._fitted_s = -math.inf
+        self._trust = Trust()
+        self._looked_wide_at = 0
         self._counts: Counter[str] = Counter()
 
     # --- input ---------------------------------------------------------------------------------------------------
@@ -309,7 +329,7 @@ class MotionFusion:
         return PoseEstimate(last.stamp_s + gap, T, sigma_t, last.sigma_r_rad + growth * max(turn, 0.005), "visual")
 
     def _predict_telemetry(self, last: _Visual, stamp_s: float) -> PoseEstimate | None:
-        if len(self._track) < 2:
+        if len(self._track) < 2 or not self._trust.motion:
             return None
         times = np.array([last.stamp_s, stamp_s]) - self._delay_s
         # Telemetry runs ahead of a late video; one packet of extrapolation is allowed.
@@ -336,7 +356,7 @@ class MotionFusion:
 
     def mount(self) -> Mount | None:
         """How the camera sits on the body, estimated from the flight; ``None`` without enough motion."""
-        if len(self._intervals) == 0 or len(self._track) < 2:
+        if len(self._intervals) == 0 or len(self._track) < 2 or not self._trust.velocity:
             return None
         from_s, to_s, moved, sigma = self._visual_displacements()
         use = self._track.covered(from_s - self._delay_s, to_s - self._delay_s)
@@ -366,6 +386,7 @@ class MotionFusion:
         numbers["video delay sigma s"] = self._delay_sigma_s
         if self._fit is not None:
             numbers["displacement residual m"] = self._fit.rms_m
+        numbers.update({f"agreement {reading}": found.share for reading, found in self._trust.latest.items()})
         mount = self.mount()
         if mount is not None:
             numbers["camera tilt deg"] = math.degrees(mount.tilt_rad)
@@ -400,10 +421,95 @@ class MotionFusion:
         if R is None:
             return
         self._R_w_m = R
+        self._judge(R)
+        self._trust.at_odds = None
         opinion = self._opinion(R)
         if opinion is not None and opinion.sigma < 0.3:
             self._telemetry_opinion = opinion
+        elif not self._still_trusted():
+            self._telemetry_opinion, self._sources, self._fit = None, {}, None
         # else nothing new to say: hover, pure rotation, or telemetry missing
+
+    # --- plausibility --------------------------------------------------------------------------------------------
+
+    def warnings(self) -> list[str]:
+        """What telemetry tells that the images do not bear out, in sentences; such readings are not used."""
+        told, depth = self._telemetry_opinion, self._depth.estimate()
+        said = self._trust.warnings() + self._track.warnings()
+        if told is not None and depth is not None and _at_odds(told, depth):
+            said.append(
+                f"telemetry and the depth network contradict each other: {math.exp(told.log_scale):.3g} and "
+                f"{math.exp(depth.log_scale):.3g} metres per map unit"
+            )
+        return said
+
+    def _still_trusted(self) -> bool:
+        """Whether all that the held opinion rests on may still tell the scale."""
+        heights = [Reading(name) for name in _HEIGHT_SOURCES]
+        trusted = {"telemetry": self._trust.velocity, "height": any(map(self._trust.height, heights))}
+        return self._trust.at_odds is None and all(trusted[source] for source in self._sources)
+
+    def _judge(self, R_w_m: FloatArray) -> None:
+        """Compare velocities and attitude with the images, at the delay in use and, if that fits badly, at others."""
+        used = self._compared(self._delay_s, R_w_m)
+        for reading, found in used.items():
+            self._trust.judge(reading, found)
+        now, n = used[Reading.VELOCITY], len(self._intervals)
+        if now.correlation >= _FITS_WELL:
+            self._trust.elsewhere_s = None
+        elif now.count >= _MIN_DELAY_INTERVALS and n >= 1.3 * self._looked_wide_at:
+            self._looked_wide_at = n
+            self._trust.elsewhere_s = self._fits_elsewhere(now)
+
+    def _fits_elsewhere(self, now: Agreement) -> float | None:
+        """The delay at which telemetry surely fits better than now, if that is one which is not allowed."""
+        fixed = self.config.delay_s
+        low, high = self.config.delay_range_s if fixed is None else (fixed - 0.15, fixed + 0.15)
+        best, best_s = now, self._delay_s
+        for delay_s in np.arange(_WIDE_DELAYS_S[0], _WIDE_DELAYS_S[1] + 1e-9, _WIDE_STEP_S).tolist():
+            R = self._attitude_alignment(delay_s)
+            found = None if R is None else self._compared(delay_s, R)[Reading.VELOCITY]
+            if found is not None and found.count >= now.count // 2 and found.correlation > best.correlation:
+                best, best_s = found, delay_s
+        left, left_now = (1.0 - max(a.correlation, 0.0) ** 2 for a in (best, now))
+        likelier = 0.25 * now.count * math.log(left_now / max(left, 1e-6))
+        sure = best.verdict is Verdict.AGREES and likelier > _MUCH_LIKELIER
+        return best_s if sure and not low <= best_s <= high else None
+
+    def _compared(self, delay_s: float, R_w_m: FloatArray) -> dict[Reading, Agreement]:
+        """How velocities and attitude go with the images under one delay.
+
+        Without the camera's lever: where velocities say nothing, turns must not speak for them.
+        """
+        from_s, to_s, moved, _ = self._visual_displacements()
+        use = self._track.covered(from_s - delay_s, to_s - delay_s)
+        if not use.any():
+            return {Reading.VELOCITY: Agreement()}
+        duration = (to_s - from_s)[use, None]
+        from_s, to_s = from_s[use] - delay_s, to_s[use] - delay_s
+        told = self._track.displacement(to_s) - self._track.displacement(from_s)
+        slow = self.config.min_speed_m_s
+        rough = self._rough_scale()
+        least_seen = math.inf if rough is None else 2.0 * slow / rough
+        found = {Reading.VELOCITY: agreement(moved[use] @ R_w_m.T / duration, told / duration, least_seen, slow)}
+        if self._track.has_attitude:
+            seen, told = (Rotation.from_matrix(R).as_rotvec() / duration for R in self._turns(from_s, to_s, use))
+            found[Reading.ATTITUDE] = agreement(seen, told, _LEAST_TURN_RAD_S, 1.5 * _LEAST_TURN_RAD_S)
+        return found
+
+    def _turns(self, from_s: FloatArray, to_s: FloatArray, use: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Rotations ``(N, 3, 3)`` in body axes over intervals on telemetry's clock, by the images and by telemetry."""
+        R_from = np.array([i.T_from[:3, :3] for i in self._intervals])[use]
+        R_to = np.array([i.T_to[:3, :3] for i in self._intervals])[use]
+        R_b_c = self.T_b_c[:3, :3]
+        seen = R_b_c @ np.swapaxes(R_from, 1, 2) @ R_to @ R_b_c.T
+        told = np.swapaxes(self._track.attitude(from_s), 1, 2) @ self._track.attitude(to_s)
+        return seen, told
+
+    def _rough_scale(self) -> float | None:
+        """Metres per map unit, for what counts as motion."""
+        depth = self._depth.estimate()
+        return math.exp(depth.log_scale) if depth is not None else self._held_scale()
 
     def _opinion(self, R_w_m: FloatArray) -> LogScale | None:
         """Scale from displacements and height, for readings rounded to the nearest step or truncated.
@@ -437,9 +543,11 @@ class MotionFusion:
 
     def _joint_opinion(self, R_w_m: FloatArray, shortfall_m_s: float, systematic: float) -> _Opinion | None:
         tilt = self.config.alignment_sigma_rad
-        moved = self._displacement_evidence(self._delay_s, R_w_m, shortfall_m_s)
+        moved = None
+        if self._trust.velocity:
+            moved = self._displacement_evidence(self._delay_s, R_w_m, shortfall_m_s)
         alone = solved([moved], tilt) if moved is not None else None
-        rough = alone[0] if alone is not None else self._held_scale()
+        rough = alone[0] if alone is not None else self._rough_scale()
         if rough is None:
             return None
         height = self._height_evidence(R_w_m, rough)
@@ -459,7 +567,11 @@ class MotionFusion:
             return None
         gap = 0.0
         if len(given) == 2:
-            gap = abs(math.log(given[0][2] / given[1][2])) / math.hypot(given[0][3], given[1][3])
+            one, other = (LogScale(math.log(s), sigma, name) for name, _, s, sigma in given)
+            gap = abs(one.log_scale - other.log_scale) / math.hypot(one.sigma, other.sigma)
+            if _at_odds(one, other):
+                self._trust.at_odds = given[0][2], given[1][2]
+                return None
         sources = {name: (s, s * sigma) for name, _, s, sigma in given}
         # Birge ratio: sources that disagree beyond their sigmas widen the result.
         sigma = max(1.0, gap) * together[1]
@@ -561,6 +673,9 @@ class MotionFusion:
             p = np.stack([np.interp(times[here], stamps, p_w[:, k]) for k in range(3)], axis=1)
             sigma = getattr(self.config, _HEIGHT_SOURCES[name])
             segment = floor_segments(times[here], z[here], scale * p[:, 2], step_m=max(0.08, 4.0 * sigma))
+            self._judge_height(Reading(name), p[:, 2:], z[here, None], times[here], segment, scale)
+            if not self._trust.height(Reading(name)):
+                continue
             tilt = self.config.alignment_sigma_rad
             evidence = height_evidence(p, z[here], times[here], segment, sigma_map, sigma, scale, tilt)
             single = solved([evidence], tilt) if evidence is not None else None
@@ -569,6 +684,22 @@ class MotionFusion:
             if best_sigma < _GOOD_HEIGHT:
                 break
         return best
+
+    def _judge_height(
+        self,
+        reading: Reading,
+        z_map: FloatArray,
+        z_m: FloatArray,
+        stamps_s: FloatArray,
+        segment: IntArray,
+        scale: float,
+    ) -> None:
+        """Compare changes of one height over a second with the images'; a height that only jumps has no excuse."""
+        if segment[-1] > _MOST_STEPS * len(segment):
+            segment = np.zeros_like(segment)
+        least = max(_LEAST_CLIMB_M, _LEAST_CLIMB_SIGMAS * getattr(self.config, _HEIGHT_SOURCES[reading]))
+        seen, told = (changes(z, stamps_s, segment, _HEIGHT_BIN_S) for z in (z_map, z_m))
+        self._trust.judge(reading, agreement(seen, told, least / scale, least))
 
     def _estimate_delay(self) -> None:
         """Delay at which visual and telemetry displacements and turns agree best; refined as evidence grows."""
@@ -615,11 +746,7 @@ class MotionFusion:
         return cost + self._turn_cost(from_s, to_s, only)
 
     def _turn_cost(self, from_s: FloatArray, to_s: FloatArray, only: FloatArray) -> float:
-        R_from = np.array([i.T_from[:3, :3] for i in self._intervals])[only]
-        R_to = np.array([i.T_to[:3, :3] for i in self._intervals])[only]
-        R_b_c = self.T_b_c[:3, :3]
-        seen = R_b_c @ np.swapaxes(R_from, 1, 2) @ R_to @ R_b_c.T
-        told = np.swapaxes(self._track.attitude(from_s), 1, 2) @ self._track.attitude(to_s)
+        seen, told = self._turns(from_s, to_s, only)
         trace = np.einsum("nij,nij->n", seen, told)
         angle = np.sort(np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0)))[: max(3, int(0.9 * len(trace)))]
         floor = (0.5 * self.config.sigma_attitude_rad) ** 2
@@ -648,6 +775,12 @@ class MotionFusion:
         sigma_r = max(math.sqrt(2.0) * visual.sigma_r_rad, 1e-4)
         delay = self._ekf_delay
         self._ekf.add_relative(previous.stamp_s - delay, visual.stamp_s - delay, T_b, sigma_t, sigma_r)
+
+
+def _at_odds(a: LogScale, b: LogScale) -> bool:
+    """Whether one of two opinions must be nonsense, not merely off by more than it says."""
+    apart = abs(a.log_scale - b.log_scale)
+    return apart > max(_AT_ODDS_LOG, _AT_ODDS * math.hypot(a.sigma, b.sigma))
 
 
 def _scaled(T: FloatArray, factor: float, centre: FloatArray) -> FloatArray:

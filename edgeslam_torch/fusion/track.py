@@ -135,6 +135,26 @@ class TelemetryTrack:
                     log_odds += math.log(1.5) * int(np.sum(size == 0)) + math.log(0.75) * int(np.sum(size == 1))
         return 1.0 / (1.0 + math.exp(-max(-50.0, min(50.0, log_odds))))
 
+    @property
+    def has_attitude(self) -> bool:
+        """Whether any sample tells roll, pitch and yaw."""
+        return any(np.isfinite(row[4:7]).all() for row in self._rows)
+
+    def warnings(self) -> list[str]:
+        """What the readings alone give away, in sentences."""
+        if len(self._rows) < 2:
+            return []
+        table = self._tables()
+        frozen = table[:, 20] != 0
+        if not frozen.any():
+            return []
+        between = np.diff(table[:, 0])
+        length_s = float(between[frozen[1:] & frozen[:-1]].sum())
+        first_s = float(table[np.argmax(frozen), 0])
+        return [
+            f"telemetry repeats one message to the bit for {length_s:.1f} s in all, first at {first_s:.1f} s: ignored"
+        ]
+
     def heights(self) -> dict[str, tuple[FloatArray, FloatArray]]:
         """Readings of each height source: name to (stamps, metres above floor or take-off)."""
         if not self._rows:

@@ -9,6 +9,8 @@ from edgeslam_torch.io.tum import read_list
 from edgeslam_torch.types import TelemetrySample
 
 TELEMETRY = "telemetry.csv"
+_HOLE_S = 1.0
+_HOLE_SHARE = 0.05
 
 
 def telemetry_file(folders: Sequence[Path], given: str | Path | None) -> Path | None:
@@ -25,11 +27,40 @@ def telemetry_file(folders: Sequence[Path], given: str | Path | None) -> Path | 
     return next((folder / TELEMETRY for folder in folders if (folder / TELEMETRY).is_file()), None)
 
 
-def read_samples(path: Path) -> list[TelemetrySample]:
-    """Telemetry in time order."""
-    from edgeslam_torch.io.telemetry_csv import read_telemetry  # only flights need it
+def read_samples(path: Path) -> tuple[list[TelemetrySample], list[str]]:
+    """Telemetry in time order, and what is wrong with the file, in words."""
+    from edgeslam_torch.io.telemetry_csv import read_table, samples_of  # only flights need it
 
-    return sorted(read_telemetry(path), key=lambda sample: sample.stamp_s)
+    table = read_table(path)
+    return samples_of(path, table), table.warnings(path.name)
+
+
+def telemetry_gap(samples: Sequence[TelemetrySample], first_s: float, last_s: float) -> str | None:
+    """How much of a video has no telemetry, in words; None when there is hardly a gap or no telemetry at all.
+
+    Args:
+        samples: In time order.
+        first_s: Stamp of the first frame.
+        last_s: Stamp of the last frame.
+    """
+    if not samples:
+        return None
+    begin_s, end_s = samples[0].stamp_s, samples[-1].stamp_s
+    if end_s < first_s or begin_s > last_s:
+        where = "before" if end_s < first_s else "after"
+        return (
+            f"no telemetry during the video: all of it ({begin_s:.1f} to {end_s:.1f} s) is stamped {where} the frames "
+            f"({first_s:.1f} to {last_s:.1f} s), and none is used; do both clocks count the same seconds?"
+        )
+    inside = [first_s, *(s.stamp_s for s in samples if first_s <= s.stamp_s <= last_s), last_s]
+    steps = (after - before for before, after in zip(inside, inside[1:], strict=False))
+    missing_s = sum(step for step in steps if step > _HOLE_S)
+    if missing_s <= _HOLE_SHARE * (last_s - first_s):
+        return None
+    return (
+        f"no telemetry during {missing_s:.1f} of {last_s - first_s:.1f} s of video "
+        f"(it runs from {begin_s:.1f} to {end_s:.1f} s, the frames from {first_s:.1f} to {last_s:.1f} s)"
+    )
 
 
 def find_video(folder: Path) -> Path | None:

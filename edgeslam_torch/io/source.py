@@ -134,7 +134,7 @@ def open_source(
     content = _content(path)
     folders = [path, content.folder] if path.is_dir() else [content.folder]
     telemetry_file = flight.telemetry_file(folders, telemetry)
-    samples = flight.read_samples(telemetry_file) if telemetry_file is not None else []
+    samples, remarks = flight.read_samples(telemetry_file) if telemetry_file is not None else ([], [])
     default = content.default_camera
     chosen, warnings = choose_camera(content.size, camera, folders, default, bool(samples))
     length = content.length
@@ -150,7 +150,7 @@ def open_source(
         telemetry=samples,
         groundtruth=content.groundtruth,
         problems=content.problems,
-        warnings=warnings,
+        warnings=[*warnings, *remarks],
         max_frames=max_frames,
     )
 

@@ -63,6 +63,8 @@ _ALIASES = {
 }
 _UNITS = ("cm", "dm", "m", "deg", "degrees", "pct", "percent", "%", "cm_s", "dm_s", "m_s", "mg", "c")
 """Endings of column names that other logs write; velocities' units are found from the data all the same."""
+_VELOCITY = ("vgx", "vgy", "vgz")
+_ATTITUDE = ("pitch", "roll", "yaw")
 _SEPARATORS = ",;\t"
 _MAX_COLUMNS = 256
 _MAX_BYTES = 512 * 1024 * 1024
@@ -110,6 +112,21 @@ class TelemetryTable:
             for stamp, row in zip(self.stamps_s.tolist(), rows, strict=True)
         ]
 
+    def warnings(self, name: str) -> list[str]:
+        """What is missing in the file ``name``, in sentences."""
+        if len(self.stamps_s) == 0:
+            return [f"{name}: holds no state message, so the run goes without telemetry"]
+        said = []
+        if self.skipped:
+            rows = len(self.stamps_s) + self.skipped
+            said.append(f"{name}: {self.skipped} of {rows} rows left out, malformed or not newer than the row before")
+        for what, names in (("velocity", _VELOCITY), ("attitude", _ATTITUDE)):
+            columns = [self.values.get(n) for n in names]
+            known = [c is not None and bool(np.isfinite(c).any()) for c in columns]
+            if not all(known):
+                said.append(f"{name}: holds no {what} ({', '.join(names)}), which the scale from telemetry needs")
+        return said
+
 
 def read_telemetry(path: str | Path, units: TelemetryUnits | None = None) -> list[TelemetrySample]:
     """Telemetry of a flight in SI units, in time order.
@@ -122,8 +139,13 @@ def read_telemetry(path: str | Path, units: TelemetryUnits | None = None) -> lis
         TelemetryError: If the file is not there, is not text, or has no clock or no known column.
     """
     table = read_table(path)
-    if table.skipped:
-        logger.warning("%s: %d malformed or repeated rows skipped", path, table.skipped)
+    for warning in table.warnings(str(path)):
+        logger.warning("%s", warning)
+    return samples_of(path, table, units)
+
+
+def samples_of(path: str | Path, table: TelemetryTable, units: TelemetryUnits | None = None) -> list[TelemetrySample]:
+    """As `read_telemetry`, of a table read before."""
     if units is None:
         units = detect_units(table)
         logger.info(

@@ -1,6 +1,7 @@
 // Fills the page from DATA.
 byId("title").textContent = DATA.title;
 byId("story").textContent = DATA.story;
+for (const text of DATA.warnings) make("li", text, byId("warnings"));
 byId("foot").textContent = DATA.foot;
 for (const t of DATA.tiles) { const li = make("li", undefined, byId("tiles")), b = make("b", t.value, li); if (t.unit) make("small", t.unit, b); make("span", t.label, li); }
 

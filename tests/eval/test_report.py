@@ -83,6 +83,13 @@ def test_no_reason_or_setting_breaks_the_page(run: Path, name: str) -> None:
     assert page.data["events"][0][4] == name
 
 
+def test_warnings_of_the_run_stand_under_its_story(run: Path) -> None:
+    said = ["telemetry's velocities are not used", "the video stood still </script>"]
+    file = write_report(with_summary(run, warnings=said))
+    assert Page(file).data["warnings"] == said
+    assert '<ul id="warnings"' in file.read_text(encoding="utf-8")
+
+
 def test_page_tells_nothing_about_the_disk(run: Path) -> None:
     secret = "/home/Jane Doe/projects"
     with_summary(

@@ -305,3 +305,26 @@ def test_ten_thousand_files_are_read_or_refused(tmp_path, data):
 @given(st.one_of(st.binary(max_size=300), st.text(max_size=200).map(lambda s: s.encode("utf-8", "surrogatepass"))))
 def test_ten_thousand_packets_give_samples(packet):
     sample_from_sdk(0.0, parse_state(packet))
+
+
+def flown(tmp_path, rows, header="stamp_s,vgx,vgy,vgz,pitch,roll,yaw"):
+    (tmp_path / "t.csv").write_text("\n".join([header, *rows]) + "\n")
+    return read_table(tmp_path / "t.csv").warnings("t.csv")
+
+
+def test_a_whole_file_is_read_without_a_word(tmp_path):
+    assert flown(tmp_path, [f"{0.1 * k:.1f},1,2,3,0,0,{k}" for k in range(5)]) == []
+
+
+@pytest.mark.parametrize(
+    ("rows", "words"),
+    [
+        ([], "t.csv: holds no state message, so the run goes without telemetry"),
+        (["0.0,1,2,3,0,0,0", "torn", "0.1,1,2,3,0,0,0", "0.1,1,2,3,0,0,0"], "t.csv: 2 of 4 rows left out"),
+        (["0.0,,,,0,0,0", "0.1,,,,0,0,0"], "holds no velocity (vgx, vgy, vgz)"),
+        (["0.0,1,2,3,,,0", "0.1,1,2,3,,,0"], "holds no attitude (pitch, roll, yaw)"),
+    ],
+)
+def test_what_a_file_does_not_hold_is_said(tmp_path, rows, words):
+    (warning,) = flown(tmp_path, rows)
+    assert words in warning

@@ -1,0 +1,259 @@
+"""Telemetry that is not of this flight, or not of this time, tells no scale and is named."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from edgeslam_torch.fusion.config import FusionConfig
+from edgeslam_torch.fusion.motion import MotionFusion
+from edgeslam_torch.fusion.plausibility import Agreement, Reading, Trust, Verdict, agreement, changes
+from edgeslam_torch.synthetic.flight import camera_on_body
+from edgeslam_torch.synthetic.telemetry import TelemetryFaults, simulate
+
+T_B_C = camera_on_body()
+DEPTH_LOG = 0.1
+"""Error of the depth network in these tests."""
+
+
+# --- the comparison itself -----------------------------------------------------------------------------------------
+
+
+def test_the_same_motion_in_other_units_agrees_in_full(rng):
+    told = rng.normal(size=(20, 3))
+    found = agreement(told / 7.0, told, 0.0, 0.0)
+    assert found.correlation == pytest.approx(1.0)
+    assert (found.share, found.verdict) == (pytest.approx(1.0), Verdict.AGREES)
+
+
+def test_correlation_of_small_numbers_by_hand():
+    seen, told = np.array([[1.0], [-1.0], [2.0], [-2.0]]), np.array([[1.0], [1.0], [3.0], [-5.0]])
+    assert agreement(seen, told, 0.0, 0.0).correlation == pytest.approx(16 / math.sqrt(10 * 36))
+
+
+def test_agreement_and_contradiction_must_both_be_proven():
+    assert Agreement(0.99, 5).verdict is Verdict.OPEN
+    assert Agreement(0.95, 6).verdict is Verdict.AGREES
+    assert Agreement(0.80, 6).verdict is Verdict.OPEN
+    assert Agreement(0.70, 40).verdict is Verdict.AGREES
+    assert Agreement(0.10, 11).verdict is Verdict.OPEN
+    assert Agreement(0.10, 12).verdict is Verdict.CONTRADICTS
+    assert Agreement(0.90, 12, dimensions=1).verdict is Verdict.OPEN  # one axis proves less
+
+
+def test_an_even_flight_proves_nothing_either_way(rng):
+    """Straight on at one speed: what noise does about the mean must not count against it."""
+    seen = np.array([0.3, 0.0, 0.0]) + rng.normal(0, 0.01, (40, 3))
+    found = agreement(seen, np.tile([0.5, 0.0, 0.0], (40, 1)), 0.0, 0.06)
+    assert found.verdict is Verdict.OPEN
+
+
+def test_standing_still_while_the_images_move_contradicts(rng):
+    found = agreement(rng.normal(size=(20, 3)), np.zeros((20, 3)), 0.1, 0.06)
+    assert found.correlation == 0.0
+    assert found.verdict is Verdict.CONTRADICTS
+
+
+def test_hovering_says_nothing(rng):
+    found = agreement(rng.normal(0, 0.01, (60, 3)), rng.choice([0.0, 0.05], (60, 3), p=[0.9, 0.1]), 0.1, 0.1)
+    assert found.count == 0
+    assert found.verdict is Verdict.OPEN
+
+
+def test_one_wild_reading_does_not_decide(rng):
+    told = rng.normal(size=(30, 3))
+    seen = told.copy()
+    told[7] = 1000.0
+    assert agreement(seen, told, 0.0, 0.0).verdict is Verdict.AGREES
+
+
+def test_changes_stay_within_a_stretch():
+    stamps = np.arange(0.25, 4.0, 0.5)
+    segment = np.array([0, 0, 0, 0, 1, 1, 1, 1])
+    z = np.array([0.0, 1.0, 2.0, 3.0, 10.0, 10.5, 11.0, 11.5])[:, None]
+    np.testing.assert_allclose(np.sort(changes(z, stamps, segment, 0.5).ravel()), [1.0, 1.0, 2.0, 2.0])
+    assert changes(z[:0], stamps[:0], segment[:0], 0.5).shape == (0, 1)
+
+
+def test_a_verdict_is_kept_until_the_opposite_is_proven():
+    trust = Trust()
+    assert not trust.velocity
+    trust.judge(Reading.VELOCITY, Agreement(0.95, 20))
+    trust.judge(Reading.VELOCITY, Agreement(0.6, 7))  # a hover
+    assert trust.velocity
+    trust.judge(Reading.VELOCITY, Agreement(0.1, 20))
+    assert not trust.velocity
+
+
+# --- flights -------------------------------------------------------------------------------------------------------
+
+
+def smooth(rng, count, size):
+    """Velocities of another flight: as slow as a drone's, with no relation to this one."""
+    kernel = np.exp(-0.5 * (np.arange(-20, 21) / 6.0) ** 2)
+    noise = rng.normal(0, size, (count + 40, 3))
+    return np.stack([np.convolve(n, kernel / np.linalg.norm(kernel), "valid") for n in noise.T], axis=1)
+
+
+def with_velocities(samples, v):
+    return [replace(s, velocity_m_s=np.rint(10 * x) / 10) for s, x in zip(samples, v, strict=True)]
+
+
+def no_heights(samples):
+    return [replace(s, tof_m=math.nan, height_m=math.nan, baro_m=math.nan) for s in samples]
+
+
+def white(rng, samples, motion):
+    return with_velocities(no_heights(samples), rng.normal(0, 0.3, (len(samples), 3)))
+
+
+def unrelated(rng, samples, motion):
+    return with_velocities(no_heights(samples), smooth(rng, len(samples), 0.3))
+
+
+def another_flight(rng, samples, motion):
+    """All of it: velocities, attitude and heights."""
+    T, t = motion.T_w_c.copy(), motion.stamps_s
+    T[:, :3, 3] = 0.25 * np.stack([np.sin(1.1 * t + 2.0), np.sin(2.3 * t), np.sin(0.8 * t + 1.0)], axis=1) + [0, 0, 1.2]
+    turns = np.stack([0.3 * np.sin(0.43 * t + 1.0), 0.08 * np.sin(1.9 * t), 0.0 * t], axis=1)
+    T[:, :3, :3] = Rotation.from_euler("ZYX", turns).as_matrix() @ T_B_C[:3, :3]
+    return simulate(rng, t, T, T_B_C).samples()
+
+
+def mirrored(rng, samples, motion):
+    """y to the right taken for y to the left, and x backwards."""
+    return with_velocities(no_heights(samples), [s.velocity_m_s * [-1, -1, 1] for s in samples])
+
+
+def standing(rng, samples, motion):
+    return with_velocities(no_heights(samples), np.zeros((len(samples), 3)))
+
+
+def constant(rng, samples, motion):
+    return with_velocities(no_heights(samples), np.tile([0.3, 0.1, 0.0], (len(samples), 1)))
+
+
+def told_of(rng, replay, motion, spoil, **options):
+    """Scale without telemetry, fusion with it, and the true scale."""
+    gauge = motion.in_gauge(rng)
+    samples = simulate(rng, motion.stamps_s, motion.T_w_c, T_B_C, faults=TelemetryFaults()).samples()
+    fusions = []
+    for told in ([], spoil(rng, samples, motion)):
+        fusion = MotionFusion(FusionConfig(), T_B_C)
+        for _ in range(20):
+            fusion.add_depth_ratio(math.log(gauge.scale) + DEPTH_LOG, 0.05)
+        replay(fusion, motion, gauge, told, **options)
+        fusions.append(fusion)
+    without, fusion = fusions
+    return without.scale(), fusion, gauge
+
+
+@pytest.mark.parametrize("spoil", [white, unrelated, another_flight, mirrored, standing, constant])
+def test_velocities_of_no_such_flight_are_not_believed(rng, swinging, replay, spoil):
+    without, fusion, _ = told_of(rng, replay, swinging(25.0), spoil)
+    scale = fusion.scale()
+    assert "telemetry" not in scale.source
+    assert scale.sigma / scale.value >= 0.999 * without.sigma / without.value
+    assert any("velocities are not used" in w for w in fusion.warnings())
+    assert fusion.statistics()["agreement velocities"] < 0.3
+
+
+@pytest.mark.parametrize("truncated", [False, True])
+def test_right_telemetry_is_used_without_a_word(rng, swinging, replay, truncated):
+    def spoil(rng, samples, motion):
+        whole = np.trunc if truncated else np.rint
+        return [replace(s, velocity_m_s=whole(10 * s.velocity_m_s) / 10) for s in samples]
+
+    without, fusion, gauge = told_of(rng, replay, swinging(25.0), spoil)
+    scale = fusion.scale()
+    assert "telemetry" in scale.source
+    assert scale.sigma / scale.value < 0.5 * without.sigma / without.value
+    assert scale.value == pytest.approx(gauge.scale, rel=0.06)
+    assert fusion.warnings() == []
+    assert fusion.statistics()["agreement velocities"] > 0.8
+    assert fusion.statistics()["agreement attitude"] > 0.8
+
+
+def test_attitude_of_another_flight_is_named_and_takes_the_heights_with_it(rng, swinging, replay):
+    def spoil(rng, samples, motion):
+        turns = smooth(rng, len(samples), 0.2)
+        return [replace(s, rpy_rad=s.rpy_rad * 0.0 + x) for s, x in zip(samples, turns, strict=True)]
+
+    _, fusion, _ = told_of(rng, replay, swinging(25.0), spoil)
+    assert "height" not in fusion.scale().source
+    assert any("roll, pitch and yaw explain" in w for w in fusion.warnings())
+
+
+@pytest.mark.parametrize("late_s", [1.2, -2.0])
+def test_a_wrong_clock_is_said_with_what_would_mend_it(rng, swinging, replay, late_s):
+    """The video is 0.5 s late by itself: stamps 1.2 s late make a delay of -0.7 s, which nobody searches."""
+
+    def spoil(rng, samples, motion):
+        return [replace(s, stamp_s=s.stamp_s + late_s) for s in samples]
+
+    without, fusion, _ = told_of(rng, replay, swinging(25.0), spoil)
+    scale = fusion.scale()
+    assert scale.source == "depth"
+    assert scale.sigma == pytest.approx(without.sigma, rel=1e-3)
+    (warning,) = fusion.warnings()
+    delay_s = float(warning.split("stamps are ")[1].split(" s ")[0])
+    assert delay_s == pytest.approx(abs(0.5 - late_s), abs=0.15)
+    assert ("late" if late_s > 0.5 else "early") in warning
+
+
+def test_velocities_in_the_wrong_unit_are_at_odds_with_the_rest(rng, swinging, replay):
+    def spoil(rng, samples, motion):
+        return [replace(s, velocity_m_s=10.0 * s.velocity_m_s) for s in samples]
+
+    without, fusion, _ = told_of(rng, replay, swinging(25.0, size_m=0.5), spoil)
+    scale = fusion.scale()
+    assert scale.sigma / scale.value >= 0.999 * without.sigma / without.value
+    assert any("contradict each other" in w for w in fusion.warnings())
+
+
+@pytest.mark.parametrize("how", ["random", "stuck"])
+def test_heights_that_do_not_climb_with_the_images_are_not_used(rng, swinging, replay, how):
+    def spoil(rng, samples, motion):
+        z = rng.uniform(0.3, 2.0, len(samples)) if how == "random" else np.full(len(samples), 1.0)
+        return [replace(s, tof_m=x, height_m=x, baro_m=x) for s, x in zip(samples, z.tolist(), strict=True)]
+
+    _, fusion, gauge = told_of(rng, replay, swinging(25.0, size_m=0.5), spoil)
+    scale = fusion.scale()
+    assert "height" not in scale.source
+    assert scale.value == pytest.approx(gauge.scale, rel=0.06)  # the velocities are right
+    assert any("height (tof) is not used" in w for w in fusion.warnings())
+
+
+def test_telemetry_that_froze_is_named(rng, swinging, replay):
+    def spoil(rng, samples, motion):
+        last = next(s for s in samples if s.stamp_s > 12.0 and np.abs(s.velocity_m_s).max() > 0.15)
+        return [s if s.stamp_s < 12.0 else replace(last, stamp_s=s.stamp_s) for s in samples]
+
+    _, fusion, gauge = told_of(rng, replay, swinging(25.0), spoil)
+    assert fusion.scale().value == pytest.approx(gauge.scale, rel=0.06)
+    (warning,) = fusion.warnings()
+    assert "repeats one message" in warning
+    seconds = float(warning.split("for ")[1].split(" s")[0])
+    assert seconds == pytest.approx(12.5, abs=0.5)
+
+
+def test_lies_that_begin_in_flight_take_the_scale_back(rng, swinging, replay):
+    """Right for a while, then of another flight for three times as long: what was believed is dropped."""
+
+    def spoil(rng, samples, motion):
+        lies = smooth(rng, len(samples), 0.4)
+        spoilt = with_velocities(no_heights(samples), lies)
+        return [s if s.stamp_s < 10.0 else t for s, t in zip(no_heights(samples), spoilt, strict=True)]
+
+    without, fusion, _ = told_of(rng, replay, swinging(50.0), spoil)
+    scale = fusion.scale()
+    assert "telemetry" not in scale.source
+    assert scale.sigma == pytest.approx(without.sigma, rel=1e-3)
+
+
+def test_implausible_telemetry_does_not_carry_the_pose_on(rng, swinging, replay):
+    for spoil, source in ((white, "visual"), (lambda rng, samples, motion: samples, "telemetry")):
+        _, fusion, _ = told_of(rng, replay, swinging(25.0), spoil, tracked=lambda t: t < 20.0)
+        assert fusion.predict(20.5).source == source
