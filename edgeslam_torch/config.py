@@ -30,6 +30,14 @@ def _positive(section: object, *names: str) -> None:
             raise ValueError(f"{name} must be positive, got {value}")
 
 
+def _at_most(section: object, **limits: float) -> None:
+    """Where more makes no sense and costs gigabytes or hours."""
+    for name, limit in limits.items():
+        value = getattr(section, name)
+        if value > limit:
+            raise ValueError(f"{name} must be at most {limit}, got {value}")
+
+
 @dataclass(frozen=True, slots=True)
 class OrbConfig:
     """Stage 1: keypoints."""
@@ -47,6 +55,7 @@ class OrbConfig:
 
     def __post_init__(self) -> None:
         _positive(self, "features", "candidates", "levels", "fast_threshold", "fast_faint")
+        _at_most(self, features=100_000, candidates=1_000_000, levels=20)
         if not 1.0 < self.scale_factor <= 2.0:
             raise ValueError(f"scale_factor must be in (1, 2], got {self.scale_factor}")
 
@@ -108,6 +117,7 @@ class FlowConfig:
 
     def __post_init__(self) -> None:
         _positive(self, "points", "levels", "min_share")
+        _at_most(self, levels=10, window_px=255)
         if self.window_px < 5:
             raise ValueError(f"window_px must be at least 5, got {self.window_px}")
 
@@ -205,6 +215,8 @@ class EdgeConfig:
 
     def __post_init__(self) -> None:
         _positive(self, "canny_low", "canny_high", "max_pixels", "targets", "max_sigma", "voxel", "max_points")
+        if self.delay_keyframes < 0:
+            raise ValueError(f"delay_keyframes must be at least 0, got {self.delay_keyframes}")
         if self.canny_high < self.canny_low:
             raise ValueError(f"canny_high must not be below canny_low, got {self.canny_high} < {self.canny_low}")
 
@@ -241,6 +253,7 @@ class WindowConfig:
 
     def __post_init__(self) -> None:
         _positive(self, "rounds", "edges_per_keyframe", "targets")
+        _at_most(self, rounds=100)
         for name, allowed in (
             ("reprojection", ("robust", "literal", "off")),
             ("cycle", ("relative", "literal", "off")),

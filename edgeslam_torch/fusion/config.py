@@ -112,6 +112,7 @@ class FusionConfig:
             _require(getattr(self, name) > 0, name, "positive", getattr(self, name))
         for name in _NOT_NEGATIVE:
             _require(getattr(self, name) >= 0, name, "at least 0", getattr(self, name))
+        _require(self.window_s >= 2 * self.interval_s, "window_s", "at least two interval_s", self.window_s)
         _require(0.5 <= self.gate_probability < 1, "gate_probability", "in [0.5, 1)", self.gate_probability)
         _require(self.refusals_before_recovery >= 1, "refusals_before_recovery", ">= 1", self.refusals_before_recovery)
         _require(self.delay_range_s[0] < self.delay_range_s[1], "delay_range_s", "ascending", self.delay_range_s)

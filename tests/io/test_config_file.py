@@ -5,7 +5,7 @@ from typing import Literal
 
 import pytest
 
-from edgeslam_torch.config import EdgeConfig, OrbConfig, SlamConfig
+from edgeslam_torch.config import EdgeConfig, SlamConfig
 from edgeslam_torch.errors import ConfigError
 from edgeslam_torch.io.config_file import keys_of, load_config, to_toml
 
@@ -132,11 +132,20 @@ def test_no_number_may_be_infinite_or_none(key):
             load_config(SlamConfig(), None, [f"{key}=[{value}, 1.0]" if key.endswith("range_s") else f"{key}={value}"])
 
 
+@pytest.mark.parametrize(
+    "option",
+    ["orb.levels=21", "orb.candidates=2000000000", "flow.window_px=1000000", "flow.levels=99", "window.rounds=999"],
+)
+def test_what_costs_gigabytes_or_hours_is_refused(option):
+    with pytest.raises(ConfigError, match="must be at most"):
+        load_config(SlamConfig(), None, [option])
+
+
 def test_numbers_are_checked_in_code_too():
     with pytest.raises(ValueError, match="edges.canny_high must be finite, got inf"):
         SlamConfig(edges=EdgeConfig(canny_high=math.inf))
-    with pytest.raises(ValueError, match="orb.features must be within 32 bits"):
-        SlamConfig(orb=OrbConfig(features=2**31))
+    with pytest.raises(ValueError, match="edges.targets must be within 32 bits"):
+        SlamConfig(edges=EdgeConfig(targets=2**31))
 
 
 def test_every_key_of_the_real_config_has_a_checkable_type():
