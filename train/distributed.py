@@ -1,41 +1,147 @@
-"""Several processes under ``torchrun``; a single one needs nothing of this."""
+"""Several processes under ``torchrun``; a single one needs nothing of this.
 
+They share their files: every process must see the same data and output folder.
+"""
+
+import importlib
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from datetime import timedelta
+from typing import Any, TypeVar
 
+import torch
 import torch.distributed as dist
+from torch import Tensor
+
+from edgeslam_torch.errors import ConfigError, EdgeSlamError
+
+T = TypeVar("T")
+
+PATIENCE = timedelta(hours=12)
+"""How long a process waits for the others: the first may run the SLAM on a long recording. One that died is noticed at
+once, by its closed connections."""
+
+
+class ProcessError(EdgeSlamError):
+    """Another process of the group failed or is gone."""
 
 
 @contextmanager
 def process_group() -> Iterator[int]:
-    """Join the group that ``torchrun`` describes in the environment (gloo); yields the rank, 0 when alone."""
+    """Join the group that ``torchrun`` describes in the environment (gloo); yields the rank, 0 when alone.
+
+    Raises:
+        ConfigError: If the environment describes no group that can be joined.
+    """
     if "RANK" not in os.environ or "WORLD_SIZE" not in os.environ:
         yield 0
         return
-    dist.init_process_group("gloo")
+    # Imported later, as torch's optimisers do, default arguments in it would hold the group's threads till after the
+    # interpreter's end, where one in thirty processes aborted (pytorch issue 190489).
+    importlib.import_module("torch._dynamo")
+    try:
+        dist.init_process_group("gloo", timeout=PATIENCE)
+    except (ValueError, RuntimeError) as error:
+        why = " ".join(str(error).split())[:160]
+        raise ConfigError(f"RANK and WORLD_SIZE are set, but the processes cannot be joined ({why})") from error
     try:
         yield dist.get_rank()
     finally:
         dist.destroy_process_group()
 
 
-@contextmanager
-def wait_for_first(rank: int) -> Iterator[None]:
-    """Let process 0 do the block before the others (which then find its results)."""
-    together = dist.is_available() and dist.is_initialized()
-    if together and rank != 0:
-        dist.barrier()
-    yield
-    if together and rank == 0:
-        dist.barrier()
-
-
 def rank() -> int:
     """This process's number, 0 when alone."""
-    return dist.get_rank() if dist.is_available() and dist.is_initialized() else 0
+    return dist.get_rank() if _together() else 0
 
 
 def world() -> int:
     """Number of processes."""
-    return dist.get_world_size() if dist.is_available() and dist.is_initialized() else 1
+    return dist.get_world_size() if _together() else 1
+
+
+def by_first(work: Callable[[], T]) -> T:
+    """What ``work`` gives in process 0, which alone does it; must pickle.
+
+    Raises:
+        Exception: In process 0, what ``work`` raised.
+        ProcessError: In the others, when ``work`` failed in process 0 or that is gone.
+    """
+    if not _together():
+        return work()
+    answer: list[Any] = [None, None]
+    failure: Exception | None = None
+    if rank() == 0:
+        try:
+            answer[0] = work()
+        except Exception as error:
+            failure, answer[1] = error, f"{error}"
+    with _lost_is_said():
+        dist.broadcast_object_list(answer)
+    if failure is not None:
+        raise failure
+    if answer[1] is not None:
+        raise ProcessError(f"stopped with the first process: {answer[1]}")
+    return answer[0]
+
+
+def share_of(items: Sequence[T]) -> Sequence[T]:
+    """This process's part of a list."""
+    return items[rank() :: world()]
+
+
+def wait_for_all() -> None:
+    """Return when every process has come here.
+
+    Raises:
+        ProcessError: If one is gone.
+    """
+    if _together():
+        with _lost_is_said():
+            dist.barrier()
+
+
+def everyones(messages: Sequence[str]) -> list[str]:
+    """The messages of all processes.
+
+    Raises:
+        ProcessError: If one is gone.
+    """
+    if not _together():
+        return list(messages)
+    gathered: list[list[str]] = [[] for _ in range(world())]
+    with _lost_is_said():
+        dist.all_gather_object(gathered, list(messages))
+    return [message for part in gathered for message in part]
+
+
+def add_up(tensors: Sequence[Tensor]) -> None:
+    """Replace each tensor by its sum over the processes, all as one message.
+
+    Raises:
+        ProcessError: If one is gone.
+    """
+    if not _together():
+        return
+    flat = torch.cat([t.flatten() for t in tensors])
+    with _lost_is_said():
+        dist.all_reduce(flat)
+    start = 0
+    for t in tensors:
+        t.copy_(flat[start : start + t.numel()].view_as(t))
+        start += t.numel()
+
+
+def _together() -> bool:
+    return dist.is_available() and dist.is_initialized()
+
+
+@contextmanager
+def _lost_is_said() -> Iterator[None]:
+    """Gloo says of a dead neighbour that a connection is closed, in an error of its own class."""
+    try:
+        yield
+    except RuntimeError as error:
+        why = " ".join(str(error).split())[:120]
+        raise ProcessError(f"another process of this training ended ({why})") from error

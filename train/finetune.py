@@ -1,11 +1,15 @@
 """Fine-tuning on recordings with depth, without, or both."""
 
+import copy
 import dataclasses
 import logging
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from scipy.ndimage import map_coordinates
@@ -16,19 +20,23 @@ from edgeslam_torch.models.fastdepth import FastDepth
 from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.train.augment import View
 from edgeslam_torch.train.datasets import DepthFolder
-from edgeslam_torch.train.distributed import rank
+from edgeslam_torch.train.distributed import by_first, rank
+from edgeslam_torch.train.given import Given, labelled_set, posed_set, weights_name
+from edgeslam_torch.train.out_folder import TEACHER, TENSORBOARD, WEIGHTS, OutFolder
+from edgeslam_torch.train.outcome import Outcome
 from edgeslam_torch.train.posed import PosedSequence, PosedView
-from edgeslam_torch.train.recipe import Hooks, TrainConfig, train
+from edgeslam_torch.train.recipe import BEST, FINAL, Hooks, TrainConfig, TrainState, train
 from edgeslam_torch.train.self_supervised import SelfSupervised, fit_log_scale
 from edgeslam_torch.train.signals import Signal, Source, Supervised
-from edgeslam_torch.train.teacher import teach
+from edgeslam_torch.train.teacher import Taught, teach
 from edgeslam_torch.train.validate import DepthScores, predict_metres, score
 from edgeslam_torch.train.watchers import ProgressBar, TensorBoard
 
 logger = logging.getLogger(__name__)
 
 HELD_OUT = 10
-"""Every tenth labelled view validates when nothing else was given."""
+"""Every tenth view with depth validates when nothing else was given."""
+OWN_DATA = "; fine-tuned on the user's data"
 
 
 class FromRuns(StrEnum):
@@ -53,28 +61,26 @@ class Data:
         """One line per folder, and the files left out."""
         lines = [f"{f.name}: {len(f.views)} images with depth" for f in self.labelled]
         lines += [f"{s.name}: {len(s.usable)} posed images without depth" for s in self.posed]
+        lines += [f"{f.name}: {len(f.views)} images to validate on" for f in self.validation]
         for folder in (*self.labelled, *self.validation):
-            lines += [f"left out, unreadable: {name}" for name in folder.unreadable]
+            lines += [f"left out: {name}" for name in folder.left_out]
         return lines
 
+    def usable(self) -> "Data":
+        """Without runs that no pair of images with a useful baseline comes from.
 
-@dataclass(frozen=True, slots=True)
-class Result:
-    """What fine-tuning changed."""
-
-    weights: Path
-    before: DepthScores | None
-    after: DepthScores | None
-    """On the validation views; None when there are none with depth."""
-
-    def describe(self) -> str:
-        """A short table."""
-        if self.before is None or self.after is None:
-            return f"{self.weights} (no depth to validate on)"
-        rows = ["| | AbsRel | AbsRel, median scaled | delta1 |", "|---|---|---|---|"]
-        for name, s in (("before", self.before), ("after", self.after)):
-            rows.append(f"| {name} | {s.abs_rel:.4f} | {s.abs_rel_scaled:.4f} | {s.delta1:.4f} |")
-        return "\n".join([*rows, str(self.weights)])
+        Raises:
+            SourceError: If nothing is left.
+        """
+        posed = [s for s in self.posed if s.usable]
+        if not (self.labelled or posed):
+            raise SourceError(
+                "nothing to learn from: no images with depth, and no run with two images of the same place from apart"
+            )
+        for s in self.posed:
+            if not s.usable:
+                logger.warning("%s: no two images of the same place from apart; nothing is learnt from it", s.name)
+        return Data(self.labelled, posed, self.validation)
 
 
 def finetune(
@@ -82,75 +88,168 @@ def finetune(
     metadata: Metadata,
     data: Data,
     config: TrainConfig,
-    out: Path,
+    out: OutFolder,
     from_runs: FromRuns = FromRuns.TEACHER,
-) -> Result:
-    """Train ``network`` on ``data``; resumes a run that was killed.
+    reading: Mapping[str, Any] = MappingProxyType({}),
+) -> Outcome:
+    """Train ``network`` on ``data``; goes on with a training in ``out`` that was given the same.
+
+    ``out/weights.safetensors`` holds the best validated weights, those that training began with included; without
+    anything to validate on, the last ones.
+
+    Args:
+        network: To begin with; changed in place.
+        metadata: Its record.
+        data: What to learn from.
+        config: Of the recipe.
+        out: From `out_folder`.
+        from_runs: What is learnt from images without labels.
+        reading: How the data was read, plain values by name: a training is gone on with only where they are the same.
 
     Raises:
-        SourceError: If there is nothing to learn from.
-        NonFiniteLossError: If a loss is not finite.
+        SourceError: If there is nothing to learn from, or to validate on.
+        ConfigError: If ``out`` holds another training.
+        DivergedError: If a loss is not finite, or the network's depth becomes absurd.
+        OSError: If the disk refuses.
     """
-    labelled, held_out = _split(data)
-    signals = build_signals(network, metadata, data.posed, labelled, from_runs)
-    if not signals:
-        raise SourceError("nothing to learn from: no images with depth and no run with poses")
-    names = tuple(dict.fromkeys([*metadata.data, *(f.name for f in data.labelled), *(s.name for s in data.posed)]))
-    metadata = dataclasses.replace(
-        metadata,
-        data=names,
-        metrics={},
-        licence=f"{metadata.licence}; fine-tuned on the user's data",
-        notes="edgeslam finetune",
+    data = data.usable()
+    given = Given(
+        weights_name(network, metadata),
+        (*map(labelled_set, data.labelled), *map(posed_set, data.posed)),
+        tuple(map(labelled_set, data.validation)),
+        settings_of(config, from_runs, reading),
     )
-    before = score(network, metadata, held_out) if held_out and rank() == 0 else None
+    if (done := by_first(lambda: out.finished(given))) is not None:
+        return dataclasses.replace(done, nothing_to_do=True)
+    by_first(lambda: out.begin(given))
+    start = copy.deepcopy(network).eval()
+    signals, held_out = _prepared(start, metadata, data, from_runs, out.path / TEACHER)
+    before = by_first(lambda: score(start, metadata, held_out)) if held_out else None
+    tuned = _tuned_metadata(metadata, data)
     hooks: list[Hooks] = []
     if rank() == 0:
-        hooks = [ProgressBar(), TensorBoard(out / "tensorboard", metadata, _pictures(data, labelled))]
+        hooks = [ProgressBar(), TensorBoard(out.path / TENSORBOARD, tuned, _pictures(data, held_out))]
 
     def validate(averaged: FastDepth) -> dict[str, float]:
-        if not held_out:
-            return {"score": 0.0}
-        scores = dataclasses.asdict(score(averaged, metadata, held_out))
-        return {"score": scores["abs_rel_scaled"], **scores}
+        return _metrics(score(averaged, metadata, held_out))
 
-    train(network, metadata, signals, config, out, validate, hooks)
-    weights = out / ("best.safetensors" if held_out and config.patience else "final.safetensors")
-    tuned, _ = load_checkpoint(weights)
-    after = score(tuned, metadata, held_out) if held_out and rank() == 0 else None
-    if rank() == 0:
-        metrics = {k: round(v, 4) for k, v in dataclasses.asdict(after).items()} if after is not None else {}
-        save_checkpoint(tuned, dataclasses.replace(metadata, metrics=metrics), out / "weights.safetensors", half=True)
-    return Result(out / "weights.safetensors", before, after)
+    state = train(
+        network,
+        tuned,
+        signals,
+        config,
+        out.path,
+        validate if held_out else None,
+        hooks,
+        None if before is None else _metrics(before),
+    )
+    return by_first(lambda: _conclude(state, start, metadata, tuned, before, held_out, out))
 
 
-def build_signals(
-    network: FastDepth,
-    metadata: Metadata,
-    posed: Sequence[PosedSequence],
-    labelled: Sequence[Source],
-    from_runs: FromRuns = FromRuns.TEACHER,
-) -> list[Signal]:
-    """One signal per kind of data; runs in arbitrary units are scaled to the network's own depth."""
+def settings_of(config: TrainConfig, from_runs: FromRuns, reading: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings by name, plain values, as ``finetune.json`` keeps them."""
+    return {**dataclasses.asdict(config), "from_runs": str(from_runs), **reading}
+
+
+def _prepared(
+    start: FastDepth, metadata: Metadata, data: Data, from_runs: FromRuns, teacher: Path
+) -> tuple[list[Signal], list[View]]:
+    """What each step learns from, and the views to validate on.
+
+    Runs in arbitrary units are scaled to the network's own depth.
+    """
     signals: list[Signal] = []
+    labelled, held_out = _split(data.labelled, keep_all=bool(data.validation))
     if labelled:
         signals.append(Supervised(labelled, metadata))
-    usable = [s for s in posed if s.usable]
-    if usable:
-        scales = [0.0 if s.metric else fit_log_scale(*_points_and_depths(network, metadata, s)) for s in usable]
+    if data.posed:
+        scales = [0.0 if s.metric else fit_log_scale(*_points_and_depths(start, metadata, s)) for s in data.posed]
         if from_runs is not FromRuns.PAIRS:
-            taught = [Source(s.name, teach(network, metadata, s, k), 1.0) for s, k in zip(usable, scales, strict=True)]
-            signals.append(Supervised(taught, metadata, name="teacher"))
+            sources = []
+            for k, (sequence, scale) in enumerate(zip(data.posed, scales, strict=True)):
+                taught = teach(start, metadata, sequence, scale, teacher / f"{k}-{sequence.name}")
+                if not (data.validation or labelled):
+                    held_out += [_measured_only(t) for t in taught[::HELD_OUT] if t.measured.any()]
+                    taught = [t for i, t in enumerate(taught) if i % HELD_OUT]
+                sources.append(Source(sequence.name, [t.view for t in taught], 1.0))
+            signals.append(Supervised(sources, metadata, name="teacher"))
         if from_runs is not FromRuns.TEACHER:
-            signals.append(SelfSupervised(usable, metadata, scales))
-    return signals
+            signals.append(SelfSupervised(data.posed, metadata, scales))
+    if data.validation:
+        held_out = [v for f in data.validation for v in f.views]
+    return signals, held_out
+
+
+def _split(folders: Sequence[DepthFolder], keep_all: bool) -> tuple[list[Source], list[View]]:
+    """Training sources, and every tenth view to validate on unless all are kept for training."""
+    held_out: list[View] = []
+    sources = []
+    for folder in folders:
+        views = list(folder.views)
+        if not keep_all and len(views) > 1:
+            held_out += views[::HELD_OUT]
+            views = [v for i, v in enumerate(views) if i % HELD_OUT]
+        sources.append(Source(folder.name, views, 1.0))
+    return sources, held_out
+
+
+def _measured_only(taught: Taught) -> View:
+    return dataclasses.replace(taught.view, depth_m=np.where(taught.measured, taught.view.depth_m, 0.0))
+
+
+def _tuned_metadata(metadata: Metadata, data: Data) -> Metadata:
+    """The record of weights that learnt from ``data``."""
+    names = [*metadata.data, *(f.name for f in data.labelled), *(s.name for s in data.posed)]
+    return dataclasses.replace(
+        metadata,
+        data=tuple(dict.fromkeys(names)),
+        metrics={},
+        licence=metadata.licence if metadata.licence.endswith(OWN_DATA) else metadata.licence + OWN_DATA,
+        notes="edgeslam finetune",
+    )
+
+
+def _conclude(
+    state: TrainState,
+    start: FastDepth,
+    metadata: Metadata,
+    tuned: Metadata,
+    before: DepthScores | None,
+    held_out: Sequence[View],
+    out: OutFolder,
+) -> Outcome:
+    """Write the better weights, with a record of what they are, and say what came of it."""
+    path = out.path / WEIGHTS
+    if before is None:
+        outcome = Outcome(path, state.step)
+        save_checkpoint(state.averaged, outcome.noted_in(tuned), path, half=True)
+    elif state.best_step == 0:
+        last, _ = load_checkpoint(out.path / FINAL)
+        outcome = Outcome(path, state.step, 0, before, score(last, metadata, held_out), before)
+        # Not halved: the very tensors that were given, under their own record.
+        save_checkpoint(start, outcome.noted_in(metadata), path)
+    else:
+        last, best = (load_checkpoint(out.path / name)[0] for name in (FINAL, BEST))
+        kept = score(best, metadata, held_out)
+        outcome = Outcome(path, state.step, state.best_step, before, score(last, metadata, held_out), kept)
+        record = dataclasses.replace(tuned, metrics={k: round(v, 4) for k, v in _metrics(kept).items() if k != "score"})
+        save_checkpoint(best, outcome.noted_in(record), path, half=True)
+    out.finish(outcome)
+    for warning in outcome.warnings():
+        logger.warning("%s", warning)
+    return outcome
+
+
+def _metrics(scores: DepthScores) -> dict[str, float]:
+    """By name; ``score`` is what decides. A figure that no image has is left out."""
+    found = {k: v for k, v in dataclasses.asdict(scores).items() if math.isfinite(v)}
+    return {"score": scores.abs_rel_scaled, **found}
 
 
 def _points_and_depths(
     network: FastDepth, metadata: Metadata, sequence: PosedSequence, most: int = 24
 ) -> tuple[list[PosedView], list[np.ndarray]]:
     """Some views, and the network's log depth at their map points."""
-    network.eval()
     chosen = np.linspace(0, len(sequence.views) - 1, min(most, len(sequence.views))).astype(int)
     views = [sequence.views[int(i)] for i in chosen]
     return views, [_at_points(network, metadata, v) for v in views]
@@ -161,21 +260,10 @@ def _at_points(network: FastDepth, metadata: Metadata, view: PosedView) -> np.nd
     return np.log(map_coordinates(depth, view.uv[:, ::-1].T, order=1, mode="nearest"))
 
 
-def _split(data: Data) -> tuple[list[Source], list[View]]:
-    """Training sources and validation views."""
-    if data.validation:
-        return [Source(f.name, f.views, 1.0) for f in data.labelled], [v for f in data.validation for v in f.views]
-    held_out = [v for f in data.labelled for v in f.views[::HELD_OUT]]
-    sources = []
-    for folder in data.labelled:
-        kept = [v for i, v in enumerate(folder.views) if i % HELD_OUT]
-        sources.append(Source(folder.name, kept or folder.views, 1.0))
-    return sources, held_out
-
-
-def _pictures(data: Data, labelled: Sequence[Source]) -> list[View]:
+def _pictures(data: Data, held_out: Sequence[View]) -> list[View]:
     """Up to four views for TensorBoard, those with depth first."""
-    views = [f.views[len(f.views) // 2] for f in data.validation] + [s.views[len(s.views) // 2] for s in labelled]
+    views = list(held_out[:: max(len(held_out) // 4, 1)])
+    views += [f.views[len(f.views) // 2] for f in data.labelled]
     for sequence in data.posed:
         v = sequence.views[len(sequence.views) // 2]
         views.append(View(v.image, np.zeros(v.image.shape[:2], np.float32), v.K))

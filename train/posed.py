@@ -2,7 +2,9 @@
 
 import json
 import logging
+import os
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +20,7 @@ from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.io.ply import read_ply
 from edgeslam_torch.io.source import open_source
 from edgeslam_torch.train.augment import View, fitted_view
+from edgeslam_torch.train.counting import Count
 from edgeslam_torch.types import FloatArray
 
 logger = logging.getLogger(__name__)
@@ -28,7 +31,8 @@ MAX_ROTATION_RAD = 0.35
 _CELL = 20
 """Side of the cells [px of the reduced image] in which the nearest point hides those well behind it."""
 _BEHIND = 1.2
-MIN_POINTS = 30
+MIN_POINTS, MIN_VIEWS = 30, 8
+"""Map points that a view must see, and views of a run, for anything to be learnt from them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,8 +77,11 @@ def load_run(
     width: int = 320,
     max_views: int = 600,
     stamps: tuple[float, float] | None = None,
+    max_frames: int | None = None,
 ) -> PosedSequence:
     """Images of the recording that a run was made from, with the run's poses and map.
+
+    Of a run in several pieces, which do not relate to one another, the one with the most frames.
 
     Args:
         folder: Output of ``edgeslam run``.
@@ -82,37 +89,46 @@ def load_run(
         width: Images are reduced to this width.
         max_views: Views kept, evenly spread.
         stamps: Use only frames between these stamps [s].
+        max_frames: Use only the first frames of the recording.
 
     Raises:
         SourceError: If the folder is no run's, the recording is gone, or too few views have points.
     """
+    folder = Path(os.path.abspath(folder))
     try:
         summary = json.loads((folder / "summary.json").read_text())
         rows = np.loadtxt(folder / "trajectory.txt", ndmin=2)
-    except (OSError, ValueError) as error:
-        raise SourceError(f"{folder}: not the output of 'edgeslam run' ({error})") from error
-    recording = source if source is not None else str(folder / summary["source"]["path"])
-    points = np.concatenate(
-        [read_ply(folder / n).p_w for n in ("anchors.ply", "edge_map.ply") if (folder / n).is_file()]
-    )
-    poses = {round(row[0], 6): _pose(row) for row in rows}
-    tracked = _tracked_stamps(folder)
-    opened = open_source(recording, camera=folder / "camera.yaml" if (folder / "camera.yaml").is_file() else None)
-    step = max(len(rows) // max_views, 1)
+        recording = source if source is not None else str(folder.resolve() / summary["source"]["path"])
+        poses = {round(float(row[0]), 6): _pose(row) for row in rows}
+        trusted = _trusted_stamps(folder)
+    except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
+        why = " ".join(str(error).split())
+        raise SourceError(f"{folder}: not the output of 'edgeslam run' ({type(error).__name__}: {why})") from error
+    clouds = [read_ply(folder / n).p_w for n in ("anchors.ply", "edge_map.ply") if (folder / n).is_file()]
+    points = np.concatenate(clouds) if clouds else np.zeros((0, 3), np.float32)
+    kept = {t: T for t, T in poses.items() if trusted is None or t in trusted}
+    if stamps is not None:
+        kept = {t: T for t, T in kept.items() if stamps[0] <= t <= stamps[1]}
+    camera = folder / "camera.yaml"
+    opened = open_source(recording, camera if camera.is_file() else None, max_frames=max_frames)
+    step = max(len(poses) // max_views, 1)
+    count = Count(opened.length or len(poses), f"reading {folder.name}", "image")
     views = []
-    for frame in opened.frames():
-        T_w_c = poses.get(round(frame.stamp_s, 6))
-        outside = stamps is not None and not stamps[0] <= frame.stamp_s <= stamps[1]
-        if T_w_c is None or outside or frame.index % step or (tracked and round(frame.stamp_s, 6) not in tracked):
-            continue
-        views.append(
-            _view(frame.path.name if frame.path else str(frame.index), frame.image, opened.camera, T_w_c, points, width)
-        )
+    with closing(opened), closing(count):
+        for frame in opened.frames():
+            T_w_c = kept.get(round(frame.stamp_s, 6))
+            if T_w_c is not None and frame.index % step == 0:
+                name = frame.path.name if frame.path else str(frame.index)
+                views.append(_view(name, frame.image, opened.camera, T_w_c, points, width))
+            count.advance()
     views = [v for v in views if len(v.z) >= MIN_POINTS]
-    if len(views) < 8:
-        raise SourceError(f"{folder}: only {len(views)} frames of {recording} have a pose and map points")
+    if len(views) < MIN_VIEWS:
+        raise SourceError(
+            f"{folder}: only {len(views)} frames of {recording} have a pose and {MIN_POINTS} map points in view, "
+            f"{MIN_VIEWS} are needed"
+        )
     metric = summary.get("scale", {}).get("units") == "metres"
-    return PosedSequence(f"{folder.name}", views, find_partners(views), metric)
+    return PosedSequence(folder.name, views, find_partners(views), metric)
 
 
 def find_partners(views: Sequence[PosedView], reach: int = 40, most: int = 8) -> list[tuple[int, ...]]:
@@ -175,10 +191,25 @@ def _pose(row: FloatArray) -> FloatArray:
     return T
 
 
-def _tracked_stamps(folder: Path) -> set[float]:
-    """Stamps of frames whose final pose rests on the map."""
+def _trusted_stamps(folder: Path) -> set[float] | None:
+    """Stamps of the largest piece's frames whose final pose rests on the map; None where no table tells."""
     rows = read_status(folder / "status.csv")
-    return {round(float(row["stamp_s"]), 6) for row in rows if is_supported(row)}
+    if not rows:
+        return None
+    pieces: dict[str, set[float]] = {}
+    for row in rows:
+        if is_supported(row):
+            pieces.setdefault(row.get("piece", ""), set()).add(round(float(row["stamp_s"]), 6))
+    largest = max(pieces.values(), key=len, default=set())
+    if len(pieces) > 1:
+        logger.warning(
+            "%s: %d pieces whose relation is not known; learning from the largest, %d of %d frames",
+            folder,
+            len(pieces),
+            len(largest),
+            sum(map(len, pieces.values())),
+        )
+    return largest
 
 
 def relative_motion(view_i: PosedView, view_j: PosedView) -> FloatArray:

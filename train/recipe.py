@@ -1,31 +1,44 @@
 """The training recipe, read from top to bottom; `Hooks` is where others join in.
 
-A step is a function of (seed, step): nothing random is carried from one to the next, so a run killed
-anywhere goes on
-from its last checkpoint exactly as if it had never stopped, and a batch split over processes is the same
-batch.
+A step is a function of (seed, step): nothing random is carried from one to the next, so a run killed anywhere goes on
+from its last checkpoint exactly as if it had never stopped, and a batch split over processes is the same batch.
 """
 
 import copy
+import io
 import json
+import logging
 import math
-from collections.abc import Callable, Sequence
+import pickle
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
-import torch.distributed as dist
 from torch import Tensor, nn
 
-from edgeslam_torch.errors import EdgeSlamError
+from edgeslam_torch.atomic import write_atomically, write_text
+from edgeslam_torch.errors import ConfigError, EdgeSlamError, WeightsError
 from edgeslam_torch.models.checkpoint import save_checkpoint
 from edgeslam_torch.models.fastdepth import FastDepth
 from edgeslam_torch.models.record import Metadata
-from edgeslam_torch.train.distributed import rank, world
+from edgeslam_torch.train.distributed import add_up, by_first, everyones, rank, world
 from edgeslam_torch.train.signals import Signal, Slot
 
+logger = logging.getLogger(__name__)
 
-class NonFiniteLossError(EdgeSlamError):
+LAST, BEST, FINAL, CURVE = "last.pt", "best.safetensors", "final.safetensors", "curve.jsonl"
+"""Files of `train`: its whole state, the best validated and the last averaged weights, the validations."""
+NO_ROOM_M = (0.02, 90.0)
+"""A network whose depth lies mostly outside of this has diverged: no camera sees such a room."""
+
+
+class DivergedError(EdgeSlamError):
+    """Training has destroyed the network; the message says what is kept."""
+
+
+class NonFiniteLossError(DivergedError):
     """A loss was NaN or infinite; the message names the batch."""
 
 
@@ -61,18 +74,36 @@ class TrainConfig:
     """bfloat16 autocast."""
     channels_last: bool = True
 
+    def __post_init__(self) -> None:
+        for name in ("steps", "batch", "validate_every", "checkpoint_every"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        for name in ("lr", "encoder_lr"):
+            # Adam moves every weight by about this much a step, and weights are about 0.05.
+            if not 0.0 < getattr(self, name) <= 1.0:
+                raise ValueError(f"{name} must be above 0 and at most 1, got {getattr(self, name)}")
+        for name in ("seed", "patience", "warmup_steps", "frozen_stages"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name} must not be negative, got {getattr(self, name)}")
+
 
 @dataclass
 class TrainState:
-    """Everything that changes during a run; a checkpoint holds all of it."""
+    """Everything that changes during a run; a checkpoint holds all of it but the last two."""
 
     network: FastDepth
     averaged: FastDepth
     optimiser: torch.optim.Optimizer
     step: int = 0
     best: float = math.inf
+    best_step: int = 0
+    """After which the best weights were validated; 0: none was better than the weights training began with."""
     stale: int = 0
     history: list[dict[str, float]] = field(default_factory=list)
+    shown: Tensor | None = None
+    """Some images of the last batch ``(B, 3, H, W)``."""
+    whole: bool = True
+    """False while a step changes the weights."""
 
 
 class Hooks:
@@ -88,7 +119,10 @@ class Hooks:
         """After each validation of the averaged weights."""
 
     def on_end(self, state: TrainState, reason: str) -> None:
-        """Once, however the run ends normally."""
+        """Once, when the run ends normally."""
+
+    def close(self) -> None:
+        """Last, however the run ends: let go of files and of the terminal."""
 
 
 Validation = Callable[[FastDepth], dict[str, float]]
@@ -103,46 +137,139 @@ def train(
     out: Path,
     validate: Validation | None = None,
     hooks: Sequence[Hooks] = (),
+    before: dict[str, float] | None = None,
 ) -> TrainState:
     """Train until ``config.steps``, early stopping or an error; resumes when ``out/last.pt`` exists.
 
-    Writes ``out/last.pt`` (everything), ``out/best.safetensors`` and ``out/final.safetensors`` (averaged
-    weights) and
-    ``out/curve.jsonl``.
+    Writes ``out/last.pt`` (everything), ``out/best.safetensors`` and ``out/final.safetensors`` (averaged weights) and
+    ``out/curve.jsonl``. ``last.pt`` holds a working network whatever happens: a state is looked at before it replaces
+    the one before. An interrupt, or a hook that fails, saves the step that was done last.
+
+    Args:
+        network: Changed in place.
+        metadata: Of the trained weights.
+        signals: What to learn from.
+        config: Of the recipe.
+        out: Folder, made when missing.
+        validate: Metrics of a network, asked for in process 0 alone.
+        hooks: Called in order.
+        before: Metrics of ``network`` as given. When there are any, only better weights become the best.
 
     Raises:
         NonFiniteLossError: If a loss is not finite; names the images of the batch.
+        DivergedError: If the network's depth has become absurd.
+        ConfigError: If ``out`` holds more steps than asked for, or there are more processes than images in a batch.
+        WeightsError: If ``out/last.pt`` is damaged or of another network.
+        OSError: If the disk refuses.
     """
+    if world() > config.batch:
+        raise ConfigError(f"{world()} processes for a batch of {config.batch}: every one needs an image")
     out.mkdir(parents=True, exist_ok=True)
     if config.channels_last:
         network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     state = TrainState(network, copy.deepcopy(network).eval(), build_optimiser(network, config))
-    resume(state, out / "last.pt")
-    this, of = rank(), world()
-    for hook in hooks:
-        hook.on_start(state, config)
-    reason = "all steps done"
-    while state.step < config.steps:
-        losses = _step(state, signals, config, this, of)
+    if not resume(state, out / LAST) and before is not None:
+        state.best, state.history = before["score"], [{"step": 0.0, **before}]
+    if state.step > config.steps:
+        raise ConfigError(f"{out / LAST}: has {state.step} steps behind it, so it cannot end after {config.steps}")
+    with ExitStack() as closing:
         for hook in hooks:
-            hook.on_step(state, losses)
-        last = state.step == config.steps
-        if validate is not None and (state.step % config.validate_every == 0 or last):
-            metrics = validate(state.averaged)
+            closing.callback(hook.close)
+        try:
+            for hook in hooks:
+                hook.on_start(state, config)
+            reason = _loop(state, signals, config, metadata, out, validate, hooks)
+        except DivergedError as error:
+            raise type(error)(f"{error}; {_kept(out)}") from None
+        except BaseException:
+            _rescue(state, out)
+            raise
+        by_first(lambda: _finish(state, metadata, out))
+        for hook in hooks:
+            hook.on_end(state, reason)
+    return state
+
+
+def _loop(
+    state: TrainState,
+    signals: Sequence[Signal],
+    config: TrainConfig,
+    metadata: Metadata,
+    out: Path,
+    validate: Validation | None,
+    hooks: Sequence[Hooks],
+) -> str:
+    """All steps; why it ended."""
+    while True:
+        if validate is not None and _validation_is_due(state, config):
+            metrics = by_first(lambda: validate(state.averaged))
             _note(state, metrics, metadata, out)
             for hook in hooks:
                 hook.on_validation(state, metrics)
-            if config.patience and state.stale >= config.patience:
-                reason = f"no improvement in {config.patience} validations"
-                break
-        if this == 0 and (state.step % config.checkpoint_every == 0 or last):
-            save_state(state, out / "last.pt")
-    if this == 0:
-        save_state(state, out / "last.pt")
-        save_checkpoint(state.averaged, metadata, out / "final.safetensors", half=True)
-    for hook in hooks:
-        hook.on_end(state, reason)
-    return state
+        if config.patience and state.stale >= config.patience:
+            return f"no improvement in {config.patience} validations"
+        if state.step >= config.steps:
+            return "all steps done"
+        losses = _step(state, signals, config, rank(), world())
+        for hook in hooks:
+            hook.on_step(state, losses)
+        if state.step % config.checkpoint_every == 0 or state.step == config.steps:
+            by_first(lambda: _save_good(state, out))
+
+
+def _validation_is_due(state: TrainState, config: TrainConfig) -> bool:
+    """Also after a resume between the step and its validation; never twice for a step."""
+    noted = state.history[-1]["step"] if state.history else 0.0
+    return state.step > noted and (state.step % config.validate_every == 0 or state.step == config.steps)
+
+
+def _finish(state: TrainState, metadata: Metadata, out: Path) -> None:
+    save_state(state, out / LAST)
+    save_checkpoint(state.averaged, metadata, out / FINAL, half=True)
+
+
+def _save_good(state: TrainState, out: Path) -> None:
+    if _has_diverged(state):
+        low, high = NO_ROOM_M
+        raise DivergedError(
+            f"step {state.step}: training has diverged, most of the depth is nearer than {low:g} m, farther than "
+            f"{high:g} m or no number"
+        )
+    save_state(state, out / LAST)
+
+
+def _has_diverged(state: TrainState) -> bool:
+    """Whether the network or its average gives absurd depths for images of the last batch."""
+    if state.shown is None:
+        return False
+    low, high = (math.log(x) for x in NO_ROOM_M)
+    return any(_share_between(network, state.shown, low, high) < 0.5 for network in (state.network, state.averaged))
+
+
+def _share_between(network: FastDepth, images: Tensor, low: float, high: float) -> float:
+    was_training = network.training
+    network.eval()
+    with torch.no_grad():
+        log_depth = network.predict_half(images).log_depth
+    network.train(was_training)
+    return float(((log_depth > low) & (log_depth < high)).float().mean())
+
+
+def _rescue(state: TrainState, out: Path) -> None:
+    """Save the last whole step on the way out of an interrupt or a failure, which matters more than this."""
+    if rank() != 0 or not state.whole or state.shown is None:
+        return
+    try:
+        _save_good(state, out)
+    except (DivergedError, OSError) as error:
+        logger.info("step %d is not saved: %s", state.step, error)
+
+
+def _kept(out: Path) -> str:
+    """What a failed run leaves, and what helps."""
+    if not saved_step(out / LAST):
+        return "nothing was saved before; try a smaller learning rate"
+    return f"{out / LAST} holds step {saved_step(out / LAST)}, the last good one; try a smaller learning rate"
 
 
 def build_optimiser(network: FastDepth, config: TrainConfig) -> torch.optim.Optimizer:
@@ -178,29 +305,34 @@ def _step(state: TrainState, signals: Sequence[Signal], config: TrainConfig, thi
         group["lr"] = group["peak"] * factor
     state.optimiser.zero_grad(set_to_none=True)
     named: dict[str, Tensor] = {}
+    bad: list[str] = []
     for offset, signal in enumerate(signals):
         slots = [Slot(config.seed + 7919 * offset, state.step, i) for i in range(this, config.batch, of)]
         batch = signal.draw(slots)
         if config.channels_last:
             batch["image"] = batch["image"].contiguous(memory_format=torch.channels_last)
+        state.shown = batch["image"][:2]
         with torch.autocast("cpu", torch.bfloat16, enabled=config.amp):
             losses = signal.losses(network, batch)
         for name, value in losses.items():
             if not torch.isfinite(value).all():
-                bad = [d for d, v in zip(signal.describe(slots), value, strict=True) if not torch.isfinite(v)]
-                raise NonFiniteLossError(
-                    f"step {state.step}: loss {signal.name}/{name} is not finite for {', '.join(bad)}; "
-                    "the last checkpoint is intact"
-                )
+                images = [d for d, v in zip(signal.describe(slots), value, strict=True) if not torch.isfinite(v)]
+                bad.append(f"loss {signal.name}/{name} is not finite for {', '.join(images)}")
             # Sum over this process's images, divided by the whole batch: processes add up to the global mean.
             named[f"{signal.name}/{name}"] = value.sum() / config.batch
     torch.stack(list(named.values())).sum().backward()
-    if of > 1:
-        _add_gradients(network)
-    nn.utils.clip_grad_norm_([p for p in network.parameters() if p.grad is not None], config.clip_norm)
+    gradients = [p.grad for p in network.parameters() if p.grad is not None]
+    add_up(gradients)
+    if failures := everyones(bad):
+        raise NonFiniteLossError(f"step {state.step}: {failures[0]}")
+    norm = nn.utils.clip_grad_norm_([p for p in network.parameters() if p.grad is not None], config.clip_norm)
+    if not torch.isfinite(norm):
+        raise NonFiniteLossError(f"step {state.step}: the gradient is not finite")
+    state.whole = False
     state.optimiser.step()
     _average(state, config.ema_decay)
     state.step += 1
+    state.whole = True
     return {k: float(v.detach()) for k, v in named.items()}
 
 
@@ -225,52 +357,78 @@ def _average(state: TrainState, decay: float) -> None:
                 kept.copy_(new)
 
 
-def _add_gradients(network: nn.Module) -> None:
-    """Sum gradients over processes as one message."""
-    grads = [p.grad for p in network.parameters() if p.grad is not None]
-    flat = torch.cat([g.flatten() for g in grads])
-    dist.all_reduce(flat)
-    start = 0
-    for g in grads:
-        g.copy_(flat[start : start + g.numel()].view_as(g))
-        start += g.numel()
-
-
 def _note(state: TrainState, metrics: dict[str, float], metadata: Metadata, out: Path) -> None:
+    """The file first: an interrupt in between leaves a step that is validated again after the resume."""
+    if metrics["score"] < state.best:
+        if rank() == 0:
+            save_checkpoint(state.averaged, metadata, out / BEST, half=True)
+        state.best, state.best_step, state.stale = metrics["score"], state.step, 0
+    else:
+        state.stale += 1
     state.history.append({"step": float(state.step), **metrics})
-    better = metrics["score"] < state.best
-    state.best, state.stale = (metrics["score"], 0) if better else (state.best, state.stale + 1)
-    if rank() != 0:
-        return
-    if better:
-        save_checkpoint(state.averaged, metadata, out / "best.safetensors", half=True)
-    (out / "curve.jsonl").write_text("".join(json.dumps(row) + "\n" for row in state.history))
+    if rank() == 0:
+        write_text(out / CURVE, "".join(json.dumps(row) + "\n" for row in state.history))
 
 
 def save_state(state: TrainState, path: Path) -> None:
-    """Write all of a run's state, atomically: a kill during writing leaves the previous file."""
+    """Write all of a run's state, atomically: a kill during writing leaves the previous file.
+
+    Raises:
+        OSError: If the disk refuses.
+    """
     content = {
         "network": state.network.state_dict(),
         "averaged": state.averaged.state_dict(),
         "optimiser": state.optimiser.state_dict(),
         "step": state.step,
         "best": state.best,
+        "best_step": state.best_step,
         "stale": state.stale,
         "history": state.history,
     }
-    temporary = path.with_suffix(".part")
-    torch.save(content, temporary)
-    temporary.replace(path)
+    # By way of memory: torch hides the disk's refusal behind an error of its own.
+    buffer = io.BytesIO()
+    torch.save(content, buffer)
+    write_atomically(path, lambda file: file.write(buffer.getbuffer()))
 
 
 def resume(state: TrainState, path: Path) -> bool:
-    """Load a run's state if there is one."""
+    """Load a run's state if there is one; learning rates stay those that ``state`` was made with.
+
+    Raises:
+        WeightsError: If the file is damaged or of another network.
+    """
     if not path.is_file():
         return False
-    content = torch.load(path, map_location="cpu", weights_only=True)
-    state.network.load_state_dict(content["network"])
-    state.averaged.load_state_dict(content["averaged"])
-    state.optimiser.load_state_dict(content["optimiser"])
-    state.step, state.best, state.stale = content["step"], content["best"], content["stale"]
-    state.history = content["history"]
+    peaks = [group["peak"] for group in state.optimiser.param_groups]
+    with _damage_is_named(path):
+        content = torch.load(path, map_location="cpu", weights_only=True)
+        state.network.load_state_dict(content["network"])
+        state.averaged.load_state_dict(content["averaged"])
+        state.optimiser.load_state_dict(content["optimiser"])
+        state.step, state.best, state.stale = content["step"], content["best"], content["stale"]
+        state.best_step, state.history = content["best_step"], content["history"]
+    for group, peak in zip(state.optimiser.param_groups, peaks, strict=True):
+        group["peak"] = peak
     return True
+
+
+def saved_step(path: Path) -> int:
+    """Steps behind a saved state, 0 when there is none.
+
+    Raises:
+        WeightsError: If the file is damaged.
+    """
+    if not path.is_file():
+        return 0
+    with _damage_is_named(path):
+        return int(torch.load(path, map_location="cpu", weights_only=True, mmap=True)["step"])
+
+
+@contextmanager
+def _damage_is_named(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except (RuntimeError, EOFError, ValueError, KeyError, TypeError, pickle.UnpicklingError) as error:
+        why = " ".join(str(error).split())[:160]
+        raise WeightsError(f"{path}: damaged or of another network, training cannot go on from it ({why})") from error

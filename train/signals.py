@@ -12,6 +12,7 @@ from edgeslam_torch.losses.depth import BerHu, GradientMatching, LaplaceNll, Mas
 from edgeslam_torch.models.fastdepth import FastDepth
 from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.train.augment import AugmentConfig, View, random_view
+from edgeslam_torch.train.datasets import FAR_M, NEAR_M
 from edgeslam_torch.train.validate import image_tensor
 
 
@@ -111,8 +112,8 @@ class Supervised:
             focal = float(np.sqrt(view.K[0, 0] * view.K[1, 1]))
             targets.append(torch.from_numpy(view.depth_m * (self.metadata.focal_px / focal))[None])
         depth = torch.stack(targets)
-        mask = (depth > 0.05) & (depth < 30.0)
-        log_depth = depth.clamp(0.05, 30.0).log()
+        mask = (depth > NEAR_M) & (depth < FAR_M)
+        log_depth = depth.clamp(NEAR_M, FAR_M).log()
         return {"image": torch.stack(images), "log_depth": log_depth, "mask": mask, "metric": torch.tensor(metric)}
 
     def losses(self, network: FastDepth, batch: dict[str, Tensor]) -> dict[str, Tensor]:

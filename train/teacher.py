@@ -7,16 +7,19 @@ The rest is the network's depth brought to pass near those pixels and the map's 
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
+from edgeslam_torch.atomic import write_atomically
 from edgeslam_torch.models.fastdepth import FastDepth
 from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.train.augment import View, fitted_view
+from edgeslam_torch.train.counting import counted
 from edgeslam_torch.train.densify import densify
+from edgeslam_torch.train.distributed import share_of, wait_for_all
 from edgeslam_torch.train.plane_sweep import sweep_depth
 from edgeslam_torch.train.posed import PosedSequence, PosedView, relative_motion
 from edgeslam_torch.train.validate import predict_metres
@@ -49,31 +52,59 @@ class Swept:
     T_w_c: FloatArray
 
 
-def teach(network: FastDepth, metadata: Metadata, sequence: PosedSequence, log_scale: float) -> list[View]:
-    """Views of a run with dense depth [m].
+@dataclass(frozen=True, slots=True)
+class Taught:
+    """One view with depth everywhere."""
+
+    view: View
+    measured: NDArray[np.bool_]
+    """``(H, W)``: where its depth was measured; elsewhere the network's own was completed."""
+
+
+def teach(
+    network: FastDepth, metadata: Metadata, sequence: PosedSequence, log_scale: float, folder: Path
+) -> list[Taught]:
+    """Views of a run with dense depth [m]; the processes of a group share the work by way of ``folder``.
+
+    What is there already is not made again, so an interrupted teacher goes on where it was.
 
     Args:
         network: Before training; fills what could not be measured.
         metadata: Of the network.
         sequence: The run.
         log_scale: Log of metres per map unit.
+        folder: For the depth maps of this run, this network and this scale alone; made when missing.
+
+    Raises:
+        OSError: If the disk refuses.
+        ProcessError: If another process of the group is gone.
     """
     network.eval()
+    folder.mkdir(parents=True, exist_ok=True)
     count = min(MOST, len(sequence.views))
     chosen = np.unique(np.linspace(0, len(sequence.views) - 1, count).astype(int)).tolist()
-    bar = tqdm(chosen, desc=f"dense depth of {sequence.name}", unit="image", disable=None)
-    swept = {i: _sweep(sequence, i) for i in bar if sequence.partners[i]}
-    views, shares = [], []
-    for i in chosen:
-        view = sequence.views[i]
-        measured = _confirmed(swept, i) if i in swept else np.zeros((1, 1), np.float32)
-        shares.append(float((measured > 0).mean()))
-        views.append(_completed(network, metadata, view, measured, log_scale))
-    logger.info("%s: %.0f %% of %d images measured", sequence.name, 100 * float(np.mean(shares)), len(views))
-    return views
+    with_partners = [i for i in chosen if sequence.partners[i]]
+    for i in counted(share_of(with_partners), f"{sequence.name}: depth by the run's poses", "image"):
+        if not (path := folder / f"swept_{i}.npy").is_file():
+            _save(path, _sweep(sequence, i))
+    wait_for_all()
+    swept = {i: _swept(sequence.views[i], np.load(folder / f"swept_{i}.npy")) for i in with_partners}
+    for i in counted(share_of(chosen), f"{sequence.name}: depth elsewhere", "image"):
+        if not (path := folder / f"dense_{i}.npy").is_file():
+            measured = _confirmed(swept, i) if i in swept else np.zeros((1, 1), np.float32)
+            _save(path, _completed(network, metadata, sequence.views[i], measured, log_scale))
+    wait_for_all()
+    taught = [_taught(sequence.views[i], np.load(folder / f"dense_{i}.npy")) for i in chosen]
+    share = float(np.mean([t.measured.mean() for t in taught]))
+    logger.info("%s: %.0f %% of %d images measured", sequence.name, 100 * share, len(taught))
+    return taught
 
 
-def _sweep(sequence: PosedSequence, i: int) -> Swept:
+def _save(path: Path, array: FloatArray) -> None:
+    write_atomically(path, lambda file: np.save(file, array))
+
+
+def _sweep(sequence: PosedSequence, i: int) -> FloatArray:
     view = sequence.views[i]
     partners = sequence.partners[i]
     pick = np.unique(np.linspace(0, len(partners) - 1, min(NEIGHBOURS, len(partners))).astype(int))
@@ -82,8 +113,15 @@ def _sweep(sequence: PosedSequence, i: int) -> Swept:
     low, high = np.percentile(view.z, (1, 99))
     inverse = np.linspace(1.0 / (FAR * high), 1.0 / (NEAR * low), PLANES)
     motions = [relative_motion(view, other) for other in others]
-    depth = sweep_depth(_grey(small), [_grey(_small(other)) for other in others], motions, small.K, inverse)
-    return Swept(depth, small.K, view.T_w_c)
+    return sweep_depth(_grey(small), [_grey(_small(other)) for other in others], motions, small.K, inverse)
+
+
+def _swept(view: PosedView, depth: FloatArray) -> Swept:
+    return Swept(depth, _small(view).K, view.T_w_c)
+
+
+def _taught(view: PosedView, signed: FloatArray) -> Taught:
+    return Taught(View(view.image, np.abs(signed), view.K), signed > 0)
 
 
 def _confirmed(swept: Mapping[int, Swept], i: int) -> FloatArray:
@@ -118,7 +156,10 @@ def _nearest(swept: Mapping[int, Swept], i: int) -> list[int]:
     return sorted(others, key=distance)[:ASKED]
 
 
-def _completed(network: FastDepth, metadata: Metadata, view: PosedView, measured: FloatArray, log_scale: float) -> View:
+def _completed(
+    network: FastDepth, metadata: Metadata, view: PosedView, measured: FloatArray, log_scale: float
+) -> FloatArray:
+    """Depth [m] of every pixel ``(H, W)`` float32, negative where it was not measured."""
     height, width = view.image.shape[:2]
     measured = np.asarray(cv2.resize(measured, (width, height), interpolation=cv2.INTER_NEAREST), np.float32)
     predicted, _ = predict_metres(network, metadata, View(view.image, np.zeros_like(measured), view.K))
@@ -127,8 +168,7 @@ def _completed(network: FastDepth, metadata: Metadata, view: PosedView, measured
     uv = np.concatenate([view.uv, np.stack([u, v], 1).astype(np.float32)])
     log_z = np.log(np.concatenate([view.z, measured[v, u]])) + log_scale
     dense = np.exp(densify(np.log(predicted), uv, log_z))
-    depth = np.where(measured > 0, measured * np.exp(log_scale), dense)
-    return View(view.image, depth.astype(np.float32), view.K)
+    return np.where(measured > 0, measured * np.exp(log_scale), -dense).astype(np.float32)
 
 
 def _small(view: PosedView) -> View:

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from edgeslam_torch.errors import SourceError
 from edgeslam_torch.models.fastdepth import FastDepth
 from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.train.augment import View, fitted_view
@@ -64,20 +65,27 @@ def predict_metres(network: FastDepth, metadata: Metadata, view: View) -> tuple[
 
 
 def score(network: FastDepth, metadata: Metadata, views: Sequence[View]) -> DepthScores:
-    """Evaluate on views with depth; images without a valid pixel are skipped."""
+    """Evaluate on views with depth; images without a valid pixel are skipped.
+
+    Raises:
+        SourceError: If no image has one.
+    """
     was_training = network.training
     network.eval()
-    rows = []
-    for view in views:
-        predicted, _ = predict_metres(network, metadata, view)
-        row = _scores_of(predicted, view)
-        if row is not None:
-            rows.append(row)
+    rows = [row for view in views if (row := _scores_of(predict_metres(network, metadata, view)[0], view)) is not None]
     network.train(was_training)
+    if not rows:
+        raise SourceError(f"no depth between {MIN_DEPTH_M:g} and {MAX_DEPTH_M:g} m in any image to validate on")
     table = np.array(rows)
-    means = [float(x) for x in np.nanmean(table, axis=0)]
+    means = [_mean(column) for column in table.T]
     means[-1] = float(np.std(table[:, -1]))
     return DepthScores(*means)
+
+
+def _mean(column: FloatArray) -> float:
+    """Of what is known: an image without edges has no error there."""
+    known = column[~np.isnan(column)]
+    return float(known.mean()) if len(known) else float("nan")
 
 
 def _scores_of(predicted: FloatArray, view: View) -> tuple[float, ...] | None:

@@ -1,14 +1,15 @@
-"""Hooks that show how training goes: a progress bar with time left, and TensorBoard."""
+"""Hooks that show how training goes: progress with time left, and TensorBoard."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import cv2
 import numpy as np
-from tqdm import tqdm
 
 from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.train.augment import View
+from edgeslam_torch.train.counting import Count
 from edgeslam_torch.train.recipe import Hooks, TrainConfig, TrainState
 from edgeslam_torch.train.validate import predict_metres
 
@@ -16,37 +17,38 @@ PICTURE_SIZE = (320, 240)
 
 
 class ProgressBar(Hooks):
-    """One line: step, loss, learning rate, time left."""
+    """Step, loss, learning rate, time left: a bar on a terminal, a line every few seconds elsewhere."""
 
     def __init__(self) -> None:
-        self._bar: tqdm | None = None
+        self._count: Count | None = None
 
     def on_start(self, state: TrainState, config: TrainConfig) -> None:
-        """Open the bar where the run stands."""
-        self._bar = tqdm(total=config.steps, initial=state.step, unit="step", disable=None, dynamic_ncols=True)
+        """Begin where the run stands."""
+        self._count = Count(config.steps, "training", "step", done=state.step)
 
     def on_step(self, state: TrainState, losses: dict[str, float]) -> None:
         """Advance."""
-        assert self._bar is not None
+        assert self._count is not None
         rate = state.optimiser.param_groups[-1]["lr"]
-        self._bar.set_postfix(loss=f"{sum(losses.values()):.4f}", lr=f"{rate:.1e}", refresh=False)
-        self._bar.update()
+        self._count.advance(f"loss {sum(losses.values()):.4f}, lr {rate:.1e}")
 
-    def on_end(self, state: TrainState, reason: str) -> None:
-        """Say why it ended."""
-        assert self._bar is not None
-        self._bar.close()
-        tqdm.write(f"stopped after step {state.step}: {reason}")
+    def close(self) -> None:
+        """Leave the terminal's line."""
+        if self._count is not None:
+            self._count.close()
 
 
 class TensorBoard(Hooks):
     """Losses by name at every step, metrics and pictures (input, depth, error, edges) at every validation."""
 
     def __init__(self, folder: Path, metadata: Metadata, views: Sequence[View]) -> None:
+        self._folder, self._metadata, self._views = folder, metadata, views
+
+    def on_start(self, state: TrainState, config: TrainConfig) -> None:
+        """Open the file; what an interrupted process wrote of later steps counts no more."""
         from torch.utils.tensorboard import SummaryWriter
 
-        self._writer = SummaryWriter(str(folder))
-        self._metadata, self._views = metadata, views
+        self._writer = SummaryWriter(str(self._folder), purge_step=state.step + 1)
 
     def on_step(self, state: TrainState, losses: dict[str, float]) -> None:
         """Scalars under ``loss/``."""
@@ -64,9 +66,13 @@ class TensorBoard(Hooks):
             self._writer.add_image(f"view {k}", picture(view, depth)[..., ::-1], state.step, dataformats="HWC")
 
     def on_end(self, state: TrainState, reason: str) -> None:
-        """Close the file."""
+        """Note why."""
         self._writer.add_text("end", reason, state.step)
-        self._writer.close()
+
+    def close(self) -> None:
+        """Close the file; a full disk was reported by the step that met it."""
+        with suppress(OSError, AttributeError):
+            self._writer.close()
 
 
 def picture(view: View, depth_m: np.ndarray) -> np.ndarray:

@@ -1,16 +1,31 @@
 """``edgeslam finetune``: adapt the depth network to one's own camera and rooms."""
 
 import argparse
-from dataclasses import replace
+import logging
+import os
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
+from types import FrameType
 from typing import TYPE_CHECKING
 
 from edgeslam_torch.errors import ConfigError, SourceError
 
 if TYPE_CHECKING:
+    from edgeslam_torch.models.fastdepth import FastDepth
+    from edgeslam_torch.models.record import Metadata
     from edgeslam_torch.train.finetune import Data
+    from edgeslam_torch.train.out_folder import OutFolder
+    from edgeslam_torch.train.outcome import Outcome
+    from edgeslam_torch.train.recipe import TrainConfig
 
 HELP = "adapt the depth network to recordings: labelled, unlabelled or output folders of 'edgeslam run'"
+
+EXIT_INTERRUPTED = 130
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -22,10 +37,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="recordings (TUM, 7-Scenes, EuRoC, flights, videos) or output folders of 'edgeslam run', in any mix",
     )
     parser.add_argument("--out", "-o", type=Path, required=True, help="folder for weights, curve and checkpoints")
+    again = parser.add_mutually_exclusive_group()
+    again.add_argument(
+        "--resume",
+        action="store_true",
+        help="go on in --out, also at another --lr; an error when there is nothing (without this: go on when data, "
+        "weights and settings are the same, with more --steps too)",
+    )
+    again.add_argument("--overwrite", action="store_true", help="replace an older fine-tuning in --out")
     parser.add_argument("--weights", type=Path, help="weights to start from (default: the shipped ones)")
     parser.add_argument("--ignore-depth", action="store_true", help="do not use depth maps that recordings hold")
     parser.add_argument("--max-frames", type=int, help="use the first frames of each recording only")
-    parser.add_argument("--validate", type=Path, nargs="*", default=[], help="recordings with depth to validate on")
+    parser.add_argument(
+        "--validate",
+        type=Path,
+        nargs="*",
+        default=[],
+        help="recordings with depth to validate on (default: every tenth image with depth, measured by the teacher "
+        "where there is no other, which is then not learnt from)",
+    )
     parser.add_argument("--steps", type=int, default=100, help="default: 100; more learns a run by heart")
     parser.add_argument("--batch", type=int, default=6, help="images (or pairs) per step over all processes")
     parser.add_argument("--lr", type=float, default=3e-4, help="learning rate of the decoder; the encoder's is a fifth")
@@ -46,22 +76,96 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Prepare the data, train, print what came of it."""
+    for name in ("threads", "max_frames"):
+        if getattr(args, name) is not None and getattr(args, name) < 1:
+            raise ConfigError(f"--{name.replace('_', '-')} must be at least 1, got {getattr(args, name)}")
+    items = _items(args)
+
     import torch
 
     from edgeslam_torch.models.checkpoint import load_checkpoint
     from edgeslam_torch.train.distributed import process_group
-    from edgeslam_torch.train.finetune import FromRuns, finetune
+    from edgeslam_torch.train.out_folder import Existing, out_folder
+
+    torch.set_num_threads(args.threads)
+    config = _config(args)
+    network, metadata = load_checkpoint(args.weights)
+    existing = Existing.RESUME if args.resume else Existing.OVERWRITE if args.overwrite else Existing.SAME
+    with _signals_interrupt(), process_group() as rank:
+        if rank:  # what goes for all is said once
+            logging.getLogger("edgeslam_torch").setLevel(logging.ERROR)
+        with out_folder(args.out, existing) as out:
+            try:
+                outcome = _finetune(args, items, network, metadata, config, out)
+            except KeyboardInterrupt:
+                if rank == 0:
+                    sys.stderr.write(f"edgeslam: interrupted; {_left(out)}\n")
+                return EXIT_INTERRUPTED
+    if rank == 0:
+        print(outcome.describe())
+    return 0
+
+
+@contextmanager
+def _signals_interrupt() -> Iterator[None]:
+    """``timeout``, ``torchrun`` and a closed terminal end training like Ctrl-C: after a step that is saved."""
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    in_main = threading.current_thread() is threading.main_thread()
+    # What is ignored stays so: nohup.
+    taken = [n for n in numbers if in_main and signal.getsignal(n) is signal.SIG_DFL]
+    for number in taken:
+        signal.signal(number, interrupt)
+    try:
+        yield
+    finally:
+        for number in taken:
+            signal.signal(number, signal.SIG_DFL)
+
+
+@dataclass(frozen=True, slots=True)
+class _Item:
+    """One of the folders to learn from."""
+
+    path: Path
+    kind: str
+    """``depth``, ``run``, or ``recording``, which the SLAM makes a run of."""
+    name: str
+    """Of the data set; of the run's folder for a recording."""
+
+
+def _items(args: argparse.Namespace) -> list[_Item]:
+    """What the arguments name, sorted by kind."""
+    from edgeslam_torch.train.datasets import has_depth
+    from edgeslam_torch.train.posed import is_run_folder
+
+    items: list[_Item] = []
+    for path in args.data:
+        if not path.exists():
+            raise SourceError(f"{path}: no such recording or folder")
+        if path.is_dir() and args.out.is_dir() and path.samefile(args.out):
+            raise ConfigError(f"{path}: is to be learnt from; give another --out")
+        name = os.path.basename(os.path.abspath(path))
+        kind = "run" if is_run_folder(path) else "depth" if has_depth(path) and not args.ignore_depth else "recording"
+        if kind == "recording":  # of two recordings with one name each gets a run of its own
+            same = sum(item.kind == kind and item.path.name == path.name for item in items)
+            name = f"{name}-{same + 1}" if same else name
+        items.append(_Item(path, kind, name))
+    for path in args.validate:
+        if not has_depth(path):
+            raise SourceError(f"{path}: no recording with depth (rgb.txt, depth.txt and camera.yaml) to validate on")
+    return sorted(items, key=lambda item: item.kind != "depth")
+
+
+def _config(args: argparse.Namespace) -> "TrainConfig":
     from edgeslam_torch.train.recipe import TrainConfig
 
-    if args.steps < 1 or args.batch < 1:
-        raise ConfigError("--steps and --batch must be at least 1")
-    torch.set_num_threads(args.threads)
-    network, metadata = load_checkpoint(args.weights)
-    with process_group() as rank:
-        data = _data(args, rank)
-        for line in data.describe() if rank == 0 else ():
-            print(line)
-        config = TrainConfig(
+    every = max(args.steps // 8, 1)
+    try:
+        return TrainConfig(
             steps=args.steps,
             batch=args.batch,
             seed=args.seed,
@@ -69,51 +173,74 @@ def main(args: argparse.Namespace) -> int:
             encoder_lr=args.lr / 5,
             frozen_stages=14 if args.freeze_encoder else 4,
             freeze_norm=True,
-            warmup_steps=min(20, args.steps // 4),
+            warmup_steps=max(min(20, args.steps // 4), 0),
             ema_decay=0.99,
-            validate_every=max(args.steps // 8, 1),
-            checkpoint_every=max(args.steps // 8, 1),
+            validate_every=every,
+            checkpoint_every=every,
             patience=args.patience,
             amp=args.amp,
         )
-        result = finetune(network, metadata, data, config, args.out, FromRuns(args.from_runs))
-    if rank == 0:
-        print(result.describe())
-    return 0
+    except ValueError as error:
+        raise ConfigError(f"--{error}") from error
 
 
-def _data(args: argparse.Namespace, rank: int) -> "Data":
-    """Sort the folders by what they hold; unlabelled recordings are sent through the SLAM first."""
-    from edgeslam_torch.train.datasets import has_depth, load_depth_folder
-    from edgeslam_torch.train.distributed import wait_for_first
+def _finetune(
+    args: argparse.Namespace,
+    items: list[_Item],
+    network: "FastDepth",
+    metadata: "Metadata",
+    config: "TrainConfig",
+    out: "OutFolder",
+) -> "Outcome":
+    from edgeslam_torch.train.distributed import by_first, rank
+    from edgeslam_torch.train.finetune import FromRuns, finetune, settings_of
+    from edgeslam_torch.train.given import DataSet, Given, weights_name
+
+    from_runs = FromRuns(args.from_runs)
+    reading = {name: getattr(args, name) for name in ("ignore_depth", "max_frames", "camera")}
+    expected = Given(
+        weights_name(network, metadata),
+        tuple(DataSet(item.name, "depth" if item.kind == "depth" else "run") for item in items),
+        tuple(DataSet(os.path.basename(os.path.abspath(path)), "depth") for path in args.validate),
+        settings_of(config, from_runs, reading),
+    )
+    by_first(lambda: out.check(expected))  # before the SLAM is run for nothing
+    if args.weights is not None and out.holds(args.weights):
+        raise ConfigError(f"{args.weights}: would be replaced while it is trained further; give another --out")
+    data = _data(args, items, out)
+    if rank() == 0:
+        for line in data.describe():
+            print(line, flush=True)
+        if not args.overwrite and 0 < out.step < args.steps:
+            print(f"{out.path}: goes on after step {out.step}", flush=True)
+    return finetune(network, metadata, data, config, out, from_runs, reading)
+
+
+def _data(args: argparse.Namespace, items: list[_Item], out: "OutFolder") -> "Data":
+    """Read the folders; recordings without labels are sent through the SLAM first."""
+    from edgeslam_torch.train.datasets import load_depth_folder
+    from edgeslam_torch.train.distributed import by_first
     from edgeslam_torch.train.finetune import Data
-    from edgeslam_torch.train.posed import is_run_folder, load_run
+    from edgeslam_torch.train.posed import load_run
+    from edgeslam_torch.train.slam_runs import ensure_run
 
     data = Data()
-    for folder in args.data:
-        if not folder.exists():
-            raise SourceError(f"{folder}: no such recording or folder")
-        if is_run_folder(folder):
-            data.posed.append(load_run(folder))
-        elif has_depth(folder) and not args.ignore_depth:
-            data.labelled.append(load_depth_folder(folder, max_frames=args.max_frames))
-        else:
-            run_folder = args.out / "slam" / folder.name
-            with wait_for_first(rank):
-                if not is_run_folder(run_folder):
-                    _run_slam(folder, run_folder, args)
-            data.posed.append(load_run(run_folder))
-    for folder in args.validate:
-        data.validation.append(load_depth_folder(folder, width=640))
+    for item in items:
+        if item.kind == "depth":
+            data.labelled.append(load_depth_folder(item.path, max_frames=args.max_frames))
+            continue
+        folder = item.path
+        if item.kind == "recording":
+            folder = out.path / "slam" / item.name
+            by_first(lambda: ensure_run(item.path, folder, args.weights, args.camera, args.max_frames, out.path))  # noqa: B023
+        data.posed.append(load_run(folder, max_frames=args.max_frames))
+    for path in args.validate:
+        data.validation.append(load_depth_folder(path, width=640))
     return data
 
 
-def _run_slam(folder: Path, out: Path, args: argparse.Namespace) -> None:
-    from edgeslam_torch.config import DepthConfig, SlamConfig
-    from edgeslam_torch.io.source import open_source
-    from edgeslam_torch.run import run
-
-    config = SlamConfig()
-    if args.weights is not None:
-        config = replace(config, depth=DepthConfig(weights=str(args.weights)))
-    run(open_source(folder, args.camera, max_frames=args.max_frames), out, config)
+def _left(out: "OutFolder") -> str:
+    """What an interrupt leaves."""
+    if out.step:
+        return f"{out.path} holds step {out.step}, and the same command goes on from there"
+    return "no step was saved"

@@ -1,44 +1,15 @@
 """Folders with depth: paired, undistorted, holes kept, unreadable files named."""
 
-import argparse
 from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-import torch
+from depth_folder import CAMERA, write_folder
 
-from edgeslam_torch.errors import SourceError
-from edgeslam_torch.geometry.camera import Camera
-from edgeslam_torch.models.checkpoint import build_network, load_checkpoint, save_checkpoint
-from edgeslam_torch.models.fastdepth import Widths
-from edgeslam_torch.models.record import Metadata
+from edgeslam_torch.errors import CalibrationError, SourceError
 from edgeslam_torch.train.datasets import has_depth, load_depth_folder, read_list
-
-CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
-
-
-def write_folder(folder: Path, count: int = 12, camera: Camera = CAMERA) -> Path:
-    rng = np.random.default_rng(0)
-    (folder / "rgb").mkdir(parents=True)
-    (folder / "depth").mkdir()
-    lines: dict[str, list[str]] = {"rgb": ["# comment"], "depth": []}
-    depth = np.tile(np.linspace(1000, 3000, 64).astype(np.uint16), (48, 1))
-    depth[:10] = 0
-    depth[10:12] = 65535
-    for k in range(count):
-        t = 100 + k / 30
-        cv2.imwrite(str(folder / "rgb" / f"{k}.png"), rng.integers(0, 256, (48, 64, 3), np.uint8))
-        cv2.imwrite(str(folder / "depth" / f"{k}.png"), depth)
-        lines["rgb"].append(f"{t:.6f} rgb/{k}.png")
-        lines["depth"].append(f"{t + 0.004:.6f} depth/{k}.png")
-    for name, rows in lines.items():
-        (folder / f"{name}.txt").write_text("\n".join(rows) + "\n")
-    camera.save(folder / "camera.yaml")
-    with (folder / "camera.yaml").open("a") as file:
-        file.write("depth_scale: 1000.0\n")
-    return folder
 
 
 def test_depth_is_metres_and_holes_are_zero(tmp_path: Path) -> None:
@@ -69,7 +40,10 @@ def test_unreadable_files_are_listed_and_the_rest_is_used(tmp_path: Path) -> Non
     (folder / "depth" / "5.png").unlink()
     loaded = load_depth_folder(folder)
     assert len(loaded.views) == 10
-    assert [Path(p).parent.name + "/" + Path(p).name for p in loaded.unreadable] == ["rgb/3.png", "depth/5.png"]
+    assert [Path(p).parent.name + "/" + Path(p).name for p in loaded.left_out] == [
+        "rgb/3.png: unreadable",
+        "depth/5.png: unreadable",
+    ]
 
 
 def test_missing_and_malformed_lists_are_named(tmp_path: Path) -> None:
@@ -83,25 +57,52 @@ def test_missing_and_malformed_lists_are_named(tmp_path: Path) -> None:
         read_list(folder / "none.txt")
 
 
-def test_finetune_on_labelled_images_reports_before_and_after(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    from edgeslam_torch.commands import finetune
-
-    metadata = Metadata(input_height=32, input_width=64, focal_px=60.0)
-    torch.manual_seed(0)
-    save_checkpoint(build_network(metadata, Widths((4,) + (8,) * 13, (8,) * 5)), metadata, tmp_path / "s.safetensors")
+def test_images_of_another_size_and_maps_without_depth_are_left_out(tmp_path: Path) -> None:
     folder = write_folder(tmp_path / "a")
-    (folder / "rgb" / "3.png").write_bytes(b"broken")
-    parser = argparse.ArgumentParser()
-    finetune.add_arguments(parser)
-    given = [str(folder), "--out", str(tmp_path / "out"), "--weights", str(tmp_path / "s.safetensors")]
-    assert finetune.main(parser.parse_args([*given, "--steps", "60", "--batch", "2", "--lr", "0.01"])) == 0
-    printed = capsys.readouterr().out
-    assert "a: 11 images with depth" in printed
-    assert "left out, unreadable" in printed
-    rows = [line.split("|") for line in printed.splitlines() if line.startswith(("| before", "| after"))]
-    assert float(rows[1][2]) < float(rows[0][2])
-    assert "abs_rel" in load_checkpoint(tmp_path / "out" / "weights.safetensors")[1].metrics
-    with pytest.raises(SourceError, match="no such recording"):
-        finetune.main(parser.parse_args([str(tmp_path / "gone"), "--out", str(tmp_path / "o2")]))
+    cv2.imwrite(str(folder / "rgb" / "2.png"), np.zeros((24, 32, 3), np.uint8))
+    cv2.imwrite(str(folder / "depth" / "7.png"), np.zeros((48, 64), np.uint16))
+    loaded = load_depth_folder(folder)
+    assert len(loaded.views) == 10
+    assert "rgb/2.png: 32x24 px, calibrated for 64x48" in loaded.left_out[0]
+    assert "depth/7.png: no depth between 0.05 and 30 m" in loaded.left_out[1]
+
+
+def test_folder_of_nothing_but_holes_is_refused(tmp_path: Path) -> None:
+    folder = write_folder(tmp_path / "a", 3)
+    for path in (folder / "depth").iterdir():
+        cv2.imwrite(str(path), np.zeros((48, 64), np.uint16))
+    with pytest.raises(SourceError, match="no image with depth could be read .*no depth between"):
+        load_depth_folder(folder)
+
+
+def test_stamps_that_match_nothing_are_said(tmp_path: Path) -> None:
+    folder = write_folder(tmp_path / "a", 3)
+    (folder / "rgb.txt").write_text("5.0 rgb/0.png\n")
+    with pytest.raises(SourceError, match="no image within 0.02 s of a depth map"):
+        load_depth_folder(folder)
+    (folder / "rgb.txt").write_text("")
+    with pytest.raises(SourceError, match="no image within"):
+        load_depth_folder(folder)
+
+
+@pytest.mark.parametrize("stamp", ["nan", "inf", "later"])
+def test_stamp_that_is_no_number_is_refused(tmp_path: Path, stamp: str) -> None:
+    folder = write_folder(tmp_path / "a", 3)
+    with (folder / "rgb.txt").open("a") as file:
+        file.write(f"{stamp} rgb/0.png\n")
+    with pytest.raises(SourceError, match=r"rgb\.txt:5"):
+        load_depth_folder(folder)
+
+
+@pytest.mark.parametrize("scale", ["0", "-1", "five", ".nan", "[1]"])
+def test_absurd_depth_scale_is_refused(tmp_path: Path, scale: str) -> None:
+    folder = write_folder(tmp_path / "a", 3)
+    text = (folder / "camera.yaml").read_text().replace("depth_scale: 1000.0", f"depth_scale: {scale}")
+    (folder / "camera.yaml").write_text(text)
+    with pytest.raises(CalibrationError, match="depth_scale must be a positive number"):
+        load_depth_folder(folder)
+
+
+def test_folder_has_its_name_from_within(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(write_folder(tmp_path / "kitchen", 2))
+    assert load_depth_folder(Path()).name == "kitchen"

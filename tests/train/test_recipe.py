@@ -1,6 +1,8 @@
 """The recipe: exact resume, one-batch overfit, named failures, several processes."""
 
+import errno
 import os
+import shutil
 import socket
 import subprocess
 import sys
@@ -13,11 +15,22 @@ import pytest
 import torch
 from torch import Tensor
 
+from edgeslam_torch.errors import ConfigError, WeightsError
 from edgeslam_torch.models.checkpoint import build_network, load_checkpoint
 from edgeslam_torch.models.fastdepth import FastDepth, Widths
 from edgeslam_torch.models.record import Metadata
+from edgeslam_torch.train import recipe
 from edgeslam_torch.train.augment import AugmentConfig, View
-from edgeslam_torch.train.recipe import Hooks, NonFiniteLossError, TrainConfig, TrainState, learning_rate_factor, train
+from edgeslam_torch.train.recipe import (
+    DivergedError,
+    Hooks,
+    NonFiniteLossError,
+    TrainConfig,
+    TrainState,
+    learning_rate_factor,
+    saved_step,
+    train,
+)
 from edgeslam_torch.train.signals import Slot, Source, Supervised, SupervisedWeights
 
 METADATA = Metadata(input_height=32, input_width=64, focal_px=50.0)
@@ -46,30 +59,131 @@ def run(out: Path, config: TrainConfig = CONFIG, hooks: Sequence[Hooks] = ()) ->
     return train(network(), METADATA, [signal()], config, out, lambda n: {"score": 1.0}, hooks)
 
 
-class _Killed(RuntimeError):
-    """Stands for the signal that ends a process."""
+class _SnapshotAt(Hooks):
+    """What a SIGKILL right after a step would leave."""
 
-
-class _KillAt(Hooks):
-    def __init__(self, step: int) -> None:
-        self.step = step
+    def __init__(self, step: int, folder: Path, snapshot: Path) -> None:
+        self.step, self.folder, self.snapshot = step, folder, snapshot
 
     def on_step(self, state: TrainState, losses: dict[str, float]) -> None:
         if state.step == self.step:
-            raise _Killed
+            shutil.copytree(self.folder, self.snapshot)
+
+
+class _RaiseAt(Hooks):
+    def __init__(self, step: int, error: BaseException) -> None:
+        self.step, self.error = step, error
+        self.closed = False
+
+    def on_step(self, state: TrainState, losses: dict[str, float]) -> None:
+        if state.step == self.step:
+            raise self.error
+
+    def close(self) -> None:
+        self.closed = True
+
+
+def assert_same(whole: TrainState, other: TrainState) -> None:
+    assert other.step == whole.step
+    for mine, theirs in ((whole.network, other.network), (whole.averaged, other.averaged)):
+        for (name, a), b in zip(mine.state_dict().items(), theirs.state_dict().values(), strict=True):
+            assert torch.equal(a, b), name
+    assert whole.history == other.history
+    assert (whole.best, whole.best_step) == (other.best, other.best_step)
 
 
 @pytest.mark.parametrize("step", [1, 2, 3, 5, 6])
 def test_killed_and_resumed_run_ends_with_the_same_weights(tmp_path: Path, step: int) -> None:
+    whole = run(tmp_path / "whole", hooks=[_SnapshotAt(step, tmp_path / "whole", tmp_path / "killed")])
+    assert_same(whole, run(tmp_path / "killed"))
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), RuntimeError("a broken hook")])
+def test_interrupt_and_broken_hook_lose_no_step(tmp_path: Path, error: BaseException) -> None:
     whole = run(tmp_path / "whole")
-    with pytest.raises(_Killed):
-        run(tmp_path / "killed", hooks=[_KillAt(step)])
-    resumed = run(tmp_path / "killed")
-    assert resumed.step == whole.step == 6
-    for mine, other in ((whole.network, resumed.network), (whole.averaged, resumed.averaged)):
-        for (name, a), b in zip(mine.state_dict().items(), other.state_dict().values(), strict=True):
-            assert torch.equal(a, b), name
-    assert whole.history == resumed.history
+    hook = _RaiseAt(5, error)
+    with pytest.raises(type(error)):
+        run(tmp_path / "stopped", hooks=[hook])
+    assert hook.closed
+    assert saved_step(tmp_path / "stopped" / "last.pt") == 5
+    assert_same(whole, run(tmp_path / "stopped"))
+
+
+def test_interrupt_in_the_validation_is_validated_after_the_resume(tmp_path: Path) -> None:
+    def interrupted(_: FastDepth) -> dict[str, float]:
+        raise KeyboardInterrupt
+
+    whole = run(tmp_path / "whole")
+    with pytest.raises(KeyboardInterrupt):
+        train(network(), METADATA, [signal()], CONFIG, tmp_path / "stopped", interrupted)
+    assert saved_step(tmp_path / "stopped" / "last.pt") == 3
+    assert_same(whole, run(tmp_path / "stopped"))
+
+
+def test_interrupt_between_two_weights_of_a_step_saves_the_step_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = run(tmp_path / "whole")
+    steps = []
+    real = torch.optim.AdamW.step
+
+    def interrupted(self: torch.optim.AdamW, *args: object) -> object:
+        steps.append(real(self, *args))
+        if len(steps) == 4:
+            raise KeyboardInterrupt
+        return steps[-1]
+
+    with monkeypatch.context() as patch:
+        patch.setattr(torch.optim.AdamW, "step", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            run(tmp_path / "stopped")
+    assert saved_step(tmp_path / "stopped" / "last.pt") == 2, "the last checkpoint"
+    assert_same(whole, run(tmp_path / "stopped"))
+
+
+def test_full_disk_keeps_the_checkpoint_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    class FullAt3(Hooks):
+        def on_step(self, state: TrainState, losses: dict[str, float]) -> None:
+            if state.step == 3:
+                monkeypatch.setattr(recipe, "write_atomically", full)
+
+    with pytest.raises(OSError, match="No space left"):
+        run(tmp_path, hooks=[FullAt3()])
+    assert saved_step(tmp_path / "last.pt") == 2
+    monkeypatch.undo()
+    assert run(tmp_path).step == 6
+
+
+def test_more_steps_go_on_where_fewer_ended(tmp_path: Path) -> None:
+    run(tmp_path)
+    state = run(tmp_path, replace(CONFIG, steps=9))
+    assert state.step == 9
+    assert [row["step"] for row in state.history] == [3, 6, 9]
+    with pytest.raises(ConfigError, match="has 9 steps behind it"):
+        run(tmp_path, replace(CONFIG, steps=8))
+
+
+def test_learning_rate_after_a_resume_is_the_one_asked_for(tmp_path: Path) -> None:
+    run(tmp_path)
+    slower = replace(CONFIG, steps=9, lr=1e-5, encoder_lr=2e-6, lr_end=1.0)
+    state = run(tmp_path, slower)
+    assert [group["lr"] for group in state.optimiser.param_groups] == [2e-6, 1e-5]
+
+
+@pytest.mark.parametrize("content", [b"", b"no torch file", b"PK\x03\x04 cut off"])
+def test_damaged_state_is_named(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "last.pt").write_bytes(content)
+    with pytest.raises(WeightsError, match=r"last\.pt: damaged"):
+        run(tmp_path)
+
+
+def test_state_of_another_network_is_named(tmp_path: Path) -> None:
+    run(tmp_path)
+    with pytest.raises(WeightsError, match=r"last\.pt: .*another network"):
+        train(build_network(METADATA, Widths((8,) * 14, (8,) * 5)), METADATA, [signal()], CONFIG, tmp_path)
 
 
 def test_finished_run_is_not_trained_further(tmp_path: Path) -> None:
@@ -97,18 +211,105 @@ def test_one_batch_is_learnt_almost_to_zero(tmp_path: Path) -> None:
     assert np.mean(losses[-20:]) < 0.03
 
 
-def test_not_finite_loss_stops_and_names_the_images(tmp_path: Path) -> None:
-    class Poisoned(Supervised):
-        def losses(self, network: FastDepth, batch: dict[str, Tensor]) -> dict[str, Tensor]:
-            found = super().losses(network, batch)
-            found["l1"] = found["l1"].clone()
-            found["l1"][2] = torch.nan
-            return found
+class _PoisonedAt(Supervised):
+    """Its loss of the third image is NaN from a step on."""
 
-    poisoned = Poisoned([Source("made", views(), 1.0)], METADATA)
-    named = poisoned.describe([Slot(0, 0, 2)])[0]
-    with pytest.raises(NonFiniteLossError, match=f"step 0: loss supervised/l1 is not finite for {named};"):
+    step = 0
+
+    def draw(self, slots: Sequence[Slot]) -> dict[str, Tensor]:
+        self.poisoned = slots[0].step >= self.step
+        return super().draw(slots)
+
+    def losses(self, network: FastDepth, batch: dict[str, Tensor]) -> dict[str, Tensor]:
+        found = super().losses(network, batch)
+        found["l1"] = found["l1"].clone()
+        if self.poisoned:
+            found["l1"][2] = torch.nan
+        return found
+
+
+@pytest.mark.parametrize(("step", "kept"), [(0, "nothing was saved"), (5, "last.pt holds step 4, the last good one")])
+def test_not_finite_loss_stops_and_names_the_images(tmp_path: Path, step: int, kept: str) -> None:
+    poisoned = _PoisonedAt([Source("made", views(), 1.0)], METADATA)
+    poisoned.step = step
+    named = poisoned.describe([Slot(0, step, 2)])[0]
+    expected = f"step {step}: loss supervised/l1 is not finite for {named}; .*{kept}"
+    with pytest.raises(NonFiniteLossError, match=expected):
         train(network(), METADATA, [poisoned], CONFIG, tmp_path)
+    assert saved_step(tmp_path / "last.pt") == (4 if step else 0)
+
+
+class _ExplodeAt(Hooks):
+    """What a learning rate far too large does, at a chosen step."""
+
+    def __init__(self, step: int, factor: float) -> None:
+        self.step, self.factor = step, factor
+
+    def on_step(self, state: TrainState, losses: dict[str, float]) -> None:
+        if state.step == self.step:
+            with torch.no_grad():
+                for parameter in state.network.parameters():
+                    parameter.mul_(self.factor)
+
+
+@pytest.mark.parametrize("factor", [1e3, 1e30, torch.nan])
+@pytest.mark.parametrize("step", [4, 5])
+def test_last_state_is_a_working_network_after_a_divergence(tmp_path: Path, factor: float, step: int) -> None:
+    config = replace(CONFIG, steps=8)
+    with pytest.raises(DivergedError, match=r"last\.pt holds step [24], the last good one"):
+        run(tmp_path, config, hooks=[_ExplodeAt(step, factor)])
+    assert saved_step(tmp_path / "last.pt") == (2 if step == 4 else 4)
+    assert_same(run(tmp_path / "other", config), run(tmp_path, config))
+
+
+def test_interrupt_after_an_explosion_saves_no_ruin(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path, hooks=[_ExplodeAt(3, 1e30), _RaiseAt(3, KeyboardInterrupt())])
+    assert saved_step(tmp_path / "last.pt") == 2
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"lr": 0.0},
+        {"lr": -1e-3},
+        {"lr": float("nan")},
+        {"lr": float("inf")},
+        {"lr": 2.0},
+        {"encoder_lr": 0.0},
+        {"steps": 0},
+        {"batch": 0},
+        {"seed": -1},
+        {"patience": -1},
+        {"validate_every": 0},
+    ],
+)
+def test_settings_that_cannot_train_are_refused(wrong: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match=f"^{next(iter(wrong))} must"):
+        replace(CONFIG, **wrong)
+
+
+def test_only_what_beats_the_weights_before_is_the_best(tmp_path: Path) -> None:
+    scores = iter([0.6, 0.7])
+    state = train(
+        network(),
+        METADATA,
+        [signal()],
+        CONFIG,
+        tmp_path,
+        lambda n: {"score": next(scores)},
+        before={"score": 0.5},
+    )
+    assert (state.best, state.best_step, state.stale) == (0.5, 0, 2)
+    assert not (tmp_path / "best.safetensors").exists()
+    assert [row["step"] for row in state.history] == [0, 3, 6]
+
+
+def test_stopped_early_means_stopped_after_a_resume_too(tmp_path: Path) -> None:
+    config = replace(CONFIG, steps=50, validate_every=1, patience=2)
+    for _ in range(2):
+        state = train(network(), METADATA, [signal()], config, tmp_path, lambda n: {"score": 1.0})
+        assert state.step == 3
 
 
 def test_early_stopping_counts_validations_without_progress(tmp_path: Path) -> None:
@@ -162,6 +363,8 @@ with process_group() as rank:
     state = train(network(), METADATA, [signal()], config, Path(sys.argv[1]))
     if rank == 0:
         torch.save(state.network.state_dict(), sys.argv[2])
+threads = [path.read_text() for path in Path("/proc/self/task").glob("*/comm")]
+assert not [name for name in threads if "gloo" in name], "the group's threads would abort the process at its end"
 """
 
 

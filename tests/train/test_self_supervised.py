@@ -4,7 +4,6 @@ import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 from unittest import mock
 
@@ -12,70 +11,22 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from posed_run import CAMERA, FRAMES, world
 from torch import Tensor
 
 from edgeslam_torch.errors import SourceError
-from edgeslam_torch.geometry.camera import Camera
-from edgeslam_torch.io.ply import write_ply
 from edgeslam_torch.models.checkpoint import build_network
-from edgeslam_torch.models.fastdepth import FastDepth, Prediction, Widths
+from edgeslam_torch.models.fastdepth import Prediction, Widths
 from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.synthetic.render import render
-from edgeslam_torch.synthetic.rooms import look, room
-from edgeslam_torch.synthetic.world import World
 from edgeslam_torch.train.junctions import junction_points, seen_cosines
 from edgeslam_torch.train.posed import PosedSequence, is_run_folder, load_run, visible_points
 from edgeslam_torch.train.self_supervised import SelfSupervised, fit_log_scale
 from edgeslam_torch.train.signals import Slot
 from edgeslam_torch.train.straight import straight_edges
 from edgeslam_torch.train.teacher import teach
-from edgeslam_torch.types import PointCloud
 
-CAMERA = Camera(128, 96, 100.0, 100.0, 63.5, 47.5)
 METADATA = Metadata(input_height=96, input_width=128, focal_px=100.0)
-FRAMES = 12
-
-
-@cache
-def world() -> World:
-    """Drawn once: it is the slowest thing here."""
-    return room(np.random.default_rng(5))
-
-
-@pytest.fixture(scope="module")
-def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A recording of a sideways flight through a rendered room, and the folder of a perfect run on it."""
-    root = tmp_path_factory.mktemp("flight")
-    rng = np.random.default_rng(5)
-    images, run = root / "recording", root / "run"
-    (images / "rgb").mkdir(parents=True)
-    run.mkdir()
-    poses, stamps, points = [], [], []
-    for k in range(FRAMES):
-        T_w_c = look(np.array([0.0, 0.05 * k - 0.3, 1.4]), 0.1, 0.15)
-        seen = render(world(), CAMERA, T_w_c)
-        stamp = round(k / 30.0, 6)
-        cv2.imwrite(str(images / "rgb" / f"{stamp:.6f}.png"), seen.image)
-        v, u = rng.integers(0, 96, 400), rng.integers(0, 128, 400)
-        p_c = CAMERA.back_project(np.stack([u, v], 1), seen.depth_m[v, u])
-        points.append(p_c @ T_w_c[:3, :3].T + T_w_c[:3, 3])
-        poses.append(T_w_c)
-        stamps.append(stamp)
-    (images / "rgb.txt").write_text("".join(f"{t:.6f} rgb/{t:.6f}.png\n" for t in stamps))
-    CAMERA.save(images / "camera.yaml")
-    CAMERA.save(run / "camera.yaml")
-    from edgeslam_torch.io.run_writer import tum_line
-
-    (run / "trajectory.txt").write_text("".join(tum_line(t, T) for t, T in zip(stamps, poses, strict=True)))
-    rows = ["stamp_s,status"] + [f"{t},{'lost' if k == 3 else 'tracked'}" for k, t in enumerate(stamps)]
-    (run / "status.csv").write_text("\n".join(rows) + "\n")
-    p_w = np.concatenate(points).astype(np.float32)
-    n = len(p_w)
-    cloud = PointCloud(p_w, np.zeros((n, 3), np.uint8), np.full(n, 0.01, np.float32), np.full(n, 2, np.int32))
-    write_ply(run / "anchors.ply", cloud)
-    summary = {"source": {"path": str(images)}, "scale": {"units": "metres"}}
-    (run / "summary.json").write_text(json.dumps(summary))
-    return run
 
 
 @pytest.fixture(scope="module")
@@ -239,36 +190,18 @@ def test_junctions_of_two_views_are_paired_by_place_and_direction() -> None:
     assert seen_cosines(turned, found).isnan().all(), "arms the other way"
 
 
-def test_teacher_measures_what_the_network_does_not_know(sequence: PosedSequence) -> None:
+def test_teacher_measures_what_the_network_does_not_know(sequence: PosedSequence, tmp_path: Path) -> None:
     torch.manual_seed(0)
     network = build_network(METADATA, Widths((4,) + (8,) * 13, (8,) * 5))
     metres = 0.5
     errors, shares = [], []
-    for view, taught in zip(sequence.views, teach(network, METADATA, sequence, float(np.log(metres))), strict=True):
-        error = np.abs(taught.depth_m / (metres * render(world(), CAMERA, view.T_w_c).depth_m) - 1)
+    dense = teach(network, METADATA, sequence, float(np.log(metres)), tmp_path)
+    for view, taught in zip(sequence.views, dense, strict=True):
+        error = np.abs(taught.view.depth_m / (metres * render(world(), CAMERA, view.T_w_c).depth_m) - 1)
         errors.append(np.median(error))
         shares.append(np.mean(error < 0.06))
     assert np.median(errors) < 0.03
     assert np.median(shares) > 0.6
-
-
-def test_finetune_command_on_a_run(run_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    import argparse
-
-    from edgeslam_torch.commands import finetune
-    from edgeslam_torch.models.checkpoint import load_checkpoint, save_checkpoint
-
-    torch.manual_seed(0)
-    network: FastDepth = build_network(METADATA, Widths((4,) + (8,) * 13, (8,) * 5))
-    save_checkpoint(network, METADATA, tmp_path / "start.safetensors")
-    parser = argparse.ArgumentParser()
-    finetune.add_arguments(parser)
-    given = [str(run_folder), "--out", str(tmp_path / "out"), "--weights", str(tmp_path / "start.safetensors")]
-    assert finetune.main(parser.parse_args([*given, "--steps", "3", "--batch", "2", "--from-runs", "both"])) == 0
-    assert "11 posed images" in capsys.readouterr().out
-    _, metadata = load_checkpoint(tmp_path / "out" / "weights.safetensors")
-    assert metadata.data == ("run",)
-    assert list((tmp_path / "out" / "tensorboard").iterdir())
 
 
 @pytest.mark.slow
@@ -283,4 +216,4 @@ def test_finetune_command_runs_the_slam_on_a_flight(tmp_path: Path, capsys: pyte
     assert main(["finetune", *given, "--steps", "2", "--batch", "2"]) == 0
     assert "posed images without depth" in capsys.readouterr().out
     assert is_run_folder(out / "slam" / "flight")
-    assert "flight" in load_checkpoint(out / "weights.safetensors")[1].data
+    assert "flight" in load_checkpoint(out / "final.safetensors")[1].data

@@ -1,0 +1,330 @@
+"""``edgeslam finetune``: what the folder holds is what was trained on, and the better weights are kept."""
+
+import io
+import json
+import os
+import shutil
+import signal
+from collections.abc import Callable
+from contextlib import redirect_stderr, redirect_stdout
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from depth_folder import write_folder
+
+from edgeslam_torch import cli
+from edgeslam_torch.io.own_folder import FolderLock
+from edgeslam_torch.models.checkpoint import build_network, load_checkpoint, save_checkpoint
+from edgeslam_torch.models.fastdepth import Widths
+from edgeslam_torch.models.record import Metadata
+from edgeslam_torch.train import recipe
+from edgeslam_torch.train.recipe import TrainState, saved_step
+from edgeslam_torch.train.watchers import ProgressBar
+
+METADATA = Metadata(
+    input_height=32, input_width=64, focal_px=60.0, data=("rooms",), licence="Apache-2.0", metrics={"abs_rel": 0.2}
+)
+COMMON = ("--batch", "2", "--lr", "0.01")
+
+Finetune = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two recordings with depth, and weights to begin with."""
+    root = tmp_path_factory.mktemp("recordings")
+    write_folder(root / "kitchen")
+    write_folder(root / "hall", 8)
+    torch.manual_seed(0)
+    network = build_network(METADATA, Widths((4,) + (8,) * 13, (8,) * 5))
+    save_checkpoint(network, METADATA, root / "start.safetensors")
+    return root
+
+
+@pytest.fixture
+def finetune(recordings: Path, tmp_path: Path) -> Finetune:
+    """Runs the command on recordings by name, into ``tmp_path/out``; exit code, stdout and stderr."""
+
+    def call(*words: str, steps: int = 8, out: Path = tmp_path / "out") -> tuple[int, str, str]:
+        given = [str(recordings / w) if (recordings / w).exists() else w for w in words]
+        if "--weights" not in given:
+            given += ["--weights", str(recordings / "start.safetensors")]
+        stdout, stderr = io.StringIO(), io.StringIO()
+        with redirect_stdout(stdout), redirect_stderr(stderr):
+            code = cli.main(["finetune", *COMMON, *given, "--out", str(out), "--steps", str(steps)])
+        return code, stdout.getvalue(), stderr.getvalue()
+
+    return call
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def refused(answer: tuple[int, str, str], *words: str) -> None:
+    code, _, stderr = answer
+    assert code == 1
+    errors = [line for line in stderr.splitlines() if line.startswith("edgeslam: error:")]
+    assert len(errors) == 1, stderr
+    for word in words:
+        assert word in errors[0]
+
+
+def test_before_and_after_are_reported_and_weights_say_what_they_are(
+    finetune: Finetune, recordings: Path, tmp_path: Path
+) -> None:
+    folder = shutil.copytree(recordings / "kitchen", tmp_path / "kitchen")
+    (folder / "rgb" / "3.png").write_bytes(b"broken")
+    code, stdout, _ = finetune(str(folder), steps=60)
+    assert code == 0
+    assert "kitchen: 11 images with depth" in stdout
+    assert "rgb/3.png: unreadable" in stdout
+    rows = [line.split("|") for line in stdout.splitlines() if line.startswith(("| before", "| after"))]
+    assert float(rows[1][3]) < float(rows[0][3])
+    metadata = load_checkpoint(tmp_path / "out" / "weights.safetensors")[1]
+    assert metadata.data == ("rooms", "kitchen")
+    assert metadata.licence == "Apache-2.0; fine-tuned on the user's data"
+    assert metadata.metrics["abs_rel_scaled"] == pytest.approx(float(rows[1][3]), abs=0.02)
+    assert "the best validated" in metadata.notes
+    umask = os.umask(0)
+    os.umask(umask)
+    modes = {p.name: oct(p.stat().st_mode & 0o777) for p in (tmp_path / "out").iterdir() if p.is_file()}
+    assert set(modes.values()) == {oct(0o666 & ~umask)}, modes
+
+
+def test_other_data_into_the_same_folder_is_refused_and_nothing_changes(finetune: Finetune, tmp_path: Path) -> None:
+    assert finetune("kitchen")[0] == 0
+    before = contents(tmp_path / "out")
+    refused(finetune("hall"), "data: kitchen (depth) then, hall (depth) now", "--overwrite")
+    refused(finetune("kitchen", "hall"), "kitchen (depth), hall (depth) now")
+    refused(finetune("hall", "--resume"), "data: kitchen")
+    refused(finetune("kitchen", "--validate", "hall"), "validation: none then, hall (depth) now")
+    refused(finetune("kitchen", "--max-frames", "5"), "max_frames: None then, 5 now")
+    refused(finetune("kitchen", "--seed", "3"), "seed: 0 then, 3 now")
+    refused(finetune("kitchen", "--weights", "out/weights.safetensors"), "out/weights.safetensors")
+    assert contents(tmp_path / "out") == before
+
+
+def test_other_weights_are_refused(finetune: Finetune, recordings: Path, tmp_path: Path) -> None:
+    finetune("kitchen")
+    torch.manual_seed(1)
+    network = build_network(METADATA, Widths((4,) + (8,) * 13, (8,) * 5))
+    save_checkpoint(network, METADATA, tmp_path / "other.safetensors")
+    refused(finetune("kitchen", "--weights", str(tmp_path / "other.safetensors")), "weights: ")
+    own = tmp_path / "out" / "weights.safetensors"
+    refused(finetune("kitchen", "--weights", str(own), "--overwrite"), "would be replaced")
+    assert own.is_file()
+
+
+def test_data_that_changed_on_disk_is_refused(finetune: Finetune, recordings: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(recordings / "kitchen", tmp_path / "kitchen")
+    finetune(str(folder))
+    before = contents(tmp_path / "out")
+    cv2.imwrite(str(folder / "rgb" / "4.png"), np.zeros((48, 64, 3), np.uint8))
+    refused(finetune(str(folder), steps=10), "kitchen: images, depth or calibration have changed")
+    (folder / "rgb" / "4.png").unlink()
+    refused(finetune(str(folder), steps=10), "kitchen: 12 images then, 11 now")
+    assert contents(tmp_path / "out") == before
+
+
+def test_moved_data_and_folder_go_on(finetune: Finetune, recordings: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(recordings / "kitchen", tmp_path / "here" / "kitchen")
+    finetune(str(folder), out=tmp_path / "first")
+    shutil.move(tmp_path / "here", tmp_path / "there")
+    shutil.move(tmp_path / "first", tmp_path / "second")
+    code, stdout, _ = finetune(str(tmp_path / "there" / "kitchen"), out=tmp_path / "second", steps=10)
+    assert code == 0
+    assert "goes on after step 8" in stdout
+
+
+def test_same_command_again_trains_nothing_and_says_so(finetune: Finetune, tmp_path: Path) -> None:
+    _, first, _ = finetune("kitchen")
+    before = contents(tmp_path / "out")
+    code, second, _ = finetune("kitchen")
+    assert code == 0
+    assert "nothing was left to train" in second
+    assert first.splitlines()[-1] in second
+    assert contents(tmp_path / "out") == before
+
+
+def test_more_steps_go_on_and_fewer_are_refused(finetune: Finetune, tmp_path: Path) -> None:
+    finetune("kitchen")
+    code, stdout, _ = finetune("kitchen", steps=12)
+    assert code == 0
+    assert "goes on after step 8" in stdout
+    assert saved_step(tmp_path / "out" / "last.pt") == 12
+    curve = [json.loads(line)["step"] for line in (tmp_path / "out" / "curve.jsonl").read_text().splitlines()]
+    assert curve == [*range(9), *range(9, 13)]
+    refused(finetune("kitchen", steps=6), "has 12 steps behind it, so it cannot end after 6")
+    sessions = json.loads((tmp_path / "out" / "finetune.json").read_text())["sessions"]
+    assert [(s["from_step"], s["steps"]) for s in sessions] == [(0, 8), (8, 12)]
+
+
+def test_resume_takes_another_rate_and_needs_something_to_resume(finetune: Finetune, tmp_path: Path) -> None:
+    refused(finetune("kitchen", "--resume"), "nothing to resume")
+    assert not (tmp_path / "out").exists()
+    finetune("kitchen")
+    refused(finetune("kitchen", "--lr", "0.001", steps=10), "lr: 0.01 then, 0.001 now", "--resume")
+    assert finetune("kitchen", "--lr", "0.001", "--resume", steps=10)[0] == 0
+
+
+def test_overwrite_begins_anew_and_keeps_the_old_one_until_the_data_is_read(finetune: Finetune, tmp_path: Path) -> None:
+    finetune("kitchen", steps=10)
+    before = contents(tmp_path / "out")
+    broken = write_folder(tmp_path / "broken", 2)
+    (broken / "depth.txt").write_text("5.0 depth/0.png\n")
+    refused(finetune(str(broken), "--overwrite"), "no image with depth")
+    assert contents(tmp_path / "out") == before
+    assert finetune("hall", "--overwrite")[0] == 0
+    assert load_checkpoint(tmp_path / "out" / "weights.safetensors")[1].data == ("rooms", "hall")
+    assert saved_step(tmp_path / "out" / "last.pt") == 8
+
+
+def test_files_that_no_finetuning_wrote_are_left_alone(finetune: Finetune, recordings: Path, tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "weights.safetensors").write_bytes(b"somebody's")
+    for words in (("kitchen",), ("kitchen", "--overwrite")):
+        refused(finetune(*words), "holds weights.safetensors, but no finetune.json")
+    assert contents(tmp_path / "out") == {"weights.safetensors": b"somebody's"}
+    own = shutil.copytree(recordings / "hall", tmp_path / "hall")
+    before = contents(own)
+    refused(finetune(str(own), out=own), "is to be learnt from; give another --out")
+    refused(finetune("kitchen", out=own), "holds rgb.txt")
+    assert contents(own) == before
+
+
+def test_damaged_record_is_named(finetune: Finetune, tmp_path: Path) -> None:
+    finetune("kitchen")
+    for text in ("", "{}", "[1]", '{"given": {"weights": 1, "data": 5}}', "[" * 100_000):
+        (tmp_path / "out" / "finetune.json").write_text(text)
+        refused(finetune("kitchen"), "finetune.json: unreadable")
+
+
+def test_two_at_the_same_time_are_refused(finetune: Finetune, tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    lock = FolderLock(tmp_path / "out")
+    refused(finetune("kitchen"), f"process {os.getpid()}")
+    lock.release()
+    assert finetune("kitchen")[0] == 0
+
+
+def test_out_that_cannot_be_written_is_one_line(finetune: Finetune, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("a file")
+    refused(finetune("kitchen", out=tmp_path / "file"), str(tmp_path / "file"), "exists")
+    refused(finetune("kitchen", out=tmp_path / "file" / "below"), "Not a directory")
+    (tmp_path / "out" / "last.pt").mkdir(parents=True)
+    refused(finetune("kitchen"), "last.pt")
+
+
+def test_full_disk_is_one_line_and_goes_on_later(
+    finetune: Finetune, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    saved = []
+    real = recipe.write_atomically
+
+    def full(path: Path, write: Callable) -> None:
+        saved.append(path)
+        if len(saved) > 3:
+            raise OSError(28, "No space left on device", str(path))
+        real(path, write)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(recipe, "write_atomically", full)
+        refused(finetune("kitchen"), "last.pt: No space left on device")
+    assert saved_step(tmp_path / "out" / "last.pt") == 3
+    code, stdout, _ = finetune("kitchen")
+    assert code == 0
+    assert "goes on after step 3" in stdout
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        (("--lr", "0"), "--lr must be above 0"),
+        (("--lr", "-1"), "--lr must be above 0"),
+        (("--lr", "1e9"), "--lr must be above 0 and at most 1"),
+        (("--batch", "0"), "--batch must be at least 1"),
+        (("--seed", "-5"), "--seed must not be negative"),
+        (("--patience", "-1"), "--patience must not be negative"),
+        (("--threads", "0"), "--threads must be at least 1"),
+        (("--max-frames", "0"), "--max-frames must be at least 1"),
+        (("gone",), "gone: no such recording"),
+        (("--validate", "start.safetensors"), "no recording with depth"),
+    ],
+)
+def test_mistakes_are_named_before_anything_is_written(
+    finetune: Finetune, tmp_path: Path, wrong: tuple[str, ...], said: str
+) -> None:
+    refused(finetune("kitchen", *wrong), said)
+    assert not (tmp_path / "out").exists()
+
+
+def test_no_step_is_a_mistake(finetune: Finetune) -> None:
+    refused(finetune("kitchen", steps=0), "--steps must be at least 1")
+    refused(finetune("kitchen", steps=-3), "--steps must be at least 1")
+
+
+def test_what_made_nothing_better_keeps_the_weights_it_began_with(
+    finetune: Finetune, recordings: Path, tmp_path: Path
+) -> None:
+    finetune("kitchen", steps=40, out=tmp_path / "good")
+    good = tmp_path / "good" / "weights.safetensors"
+    noise = shutil.copytree(recordings / "kitchen", tmp_path / "noise")
+    rng = np.random.default_rng(1)
+    for path in (noise / "depth").iterdir():
+        cv2.imwrite(str(path), rng.integers(500, 9000, (48, 64)).astype(np.uint16))
+    code, stdout, stderr = finetune(
+        str(noise), "--validate", "kitchen", "--weights", str(good), "--lr", "0.05", steps=4
+    )
+    assert code == 0
+    assert "WARNING: fine-tuning made nothing better (median-scaled AbsRel" in stderr
+    assert "the weights that fine-tuning began with, unchanged" in stdout
+    before, after = (load_checkpoint(p) for p in (good, tmp_path / "out" / "weights.safetensors"))
+    for (name, a), b in zip(before[0].state_dict().items(), after[0].state_dict().values(), strict=True):
+        assert torch.equal(a, b), name
+    assert after[1].data == before[1].data == ("rooms", "kitchen")
+    assert (after[1].metrics, after[1].licence) == (before[1].metrics, before[1].licence)
+    assert "fine-tuning made nothing better" in after[1].notes
+    assert json.loads((tmp_path / "out" / "finetune.json").read_text())["outcome"]["kept_step"] == 0
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_signal_says_what_is_kept_and_the_same_command_goes_on(
+    finetune: Finetune, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
+) -> None:
+    def stopped(self: ProgressBar, state: TrainState, losses: dict[str, float]) -> None:
+        if state.step == 5:
+            signal.raise_signal(number)
+
+    before = signal.getsignal(number)
+    with monkeypatch.context() as patch:
+        patch.setattr(ProgressBar, "on_step", stopped)
+        code, _, stderr = finetune("kitchen")
+    assert code == 130
+    assert signal.getsignal(number) is before
+    assert stderr.splitlines()[-1].endswith("holds step 5, and the same command goes on from there")
+    whole, resumed = tmp_path / "whole", tmp_path / "out"
+    assert "goes on after step 5" in finetune("kitchen")[1]
+    finetune("kitchen", out=whole)
+    for name in ("weights.safetensors", "final.safetensors", "curve.jsonl"):
+        assert (whole / name).read_bytes() == (resumed / name).read_bytes(), name
+
+
+def test_divergence_is_one_line_and_a_smaller_rate_goes_on(
+    finetune: Finetune, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def explode(self: ProgressBar, state: TrainState, losses: dict[str, float]) -> None:
+        if state.step == 4:
+            with torch.no_grad():
+                for parameter in state.network.parameters():
+                    parameter.mul_(1e20)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(ProgressBar, "on_step", explode)
+        refused(finetune("kitchen"), "step 4: training has diverged", "last.pt holds step 3, the last good one")
+    code, stdout, _ = finetune("kitchen", "--lr", "0.001", "--resume")
+    assert code == 0
+    assert "goes on after step 3" in stdout

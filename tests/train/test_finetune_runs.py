@@ -1,0 +1,230 @@
+"""``edgeslam finetune`` on runs: the teacher's work is kept, what is of no use is named, the SLAM runs once."""
+
+import argparse
+import json
+import logging
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from edgeslam_torch.commands import finetune as command
+from edgeslam_torch.errors import OutputError, SourceError
+from edgeslam_torch.models.checkpoint import build_network, load_checkpoint, save_checkpoint
+from edgeslam_torch.models.fastdepth import FastDepth, Widths
+from edgeslam_torch.models.record import Metadata
+from edgeslam_torch.train import posed, slam_runs, teacher
+from edgeslam_torch.train.finetune import Data
+from edgeslam_torch.train.posed import PosedSequence, load_run
+from edgeslam_torch.train.slam_runs import ensure_run
+
+METADATA = Metadata(input_height=96, input_width=128, focal_px=100.0)
+
+
+def network() -> FastDepth:
+    torch.manual_seed(0)
+    return build_network(METADATA, Widths((4,) + (8,) * 13, (8,) * 5))
+
+
+def arguments(tmp_path: Path, *words: object) -> argparse.Namespace:
+    if not (tmp_path / "start.safetensors").exists():
+        save_checkpoint(network(), METADATA, tmp_path / "start.safetensors")
+    parser = argparse.ArgumentParser()
+    command.add_arguments(parser)
+    fixed = ("--out", tmp_path / "out", "--weights", tmp_path / "start.safetensors", "--steps", "3", "--batch", "2")
+    return parser.parse_args([str(w) for w in (*fixed, *words)])
+
+
+def changed(run_folder: Path, tmp_path: Path) -> Path:
+    """A copy of the run that a test may change."""
+    shutil.copytree(run_folder.parent / "recording", tmp_path / "recording")
+    folder = shutil.copytree(run_folder, tmp_path / "run")
+    summary = json.loads((folder / "summary.json").read_text())
+    summary["source"]["path"] = str(tmp_path / "recording")
+    (folder / "summary.json").write_text(json.dumps(summary))
+    return folder
+
+
+def test_run_is_learnt_from_and_validated_on_what_the_teacher_measured(
+    run_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert command.main(arguments(tmp_path, run_folder, "--from-runs", "both")) == 0
+    printed = capsys.readouterr().out
+    assert "11 posed images" in printed
+    assert "| before |" in printed
+    metadata = load_checkpoint(tmp_path / "out" / "weights.safetensors")[1]
+    assert "run" in metadata.data or "fine-tuning made nothing better" in metadata.notes
+    assert list((tmp_path / "out" / "tensorboard").iterdir())
+
+
+def test_pairs_alone_leave_nothing_to_validate_on_and_that_is_said(
+    run_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert command.main(arguments(tmp_path, run_folder, "--from-runs", "pairs")) == 0
+    assert "weights after 3 steps, not validated" in capsys.readouterr().out
+    metadata = load_checkpoint(tmp_path / "out" / "weights.safetensors")[1]
+    assert metadata.data == ("run",)
+    assert "not validated" in metadata.notes
+
+
+def test_interrupted_teacher_goes_on_where_it_was(
+    run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    swept: list[int] = []
+    real = teacher._sweep
+
+    def sweep(sequence: PosedSequence, i: int) -> object:
+        if len(swept) == 5:
+            swept.append(-1)
+            raise KeyboardInterrupt
+        swept.append(i)
+        return real(sequence, i)
+
+    monkeypatch.setattr(teacher, "_sweep", sweep)
+    assert command.main(arguments(tmp_path, run_folder)) == command.EXIT_INTERRUPTED
+    assert "no step was saved" in capsys.readouterr().err
+    assert command.main(arguments(tmp_path, run_folder)) == 0
+    assert [i for i in swept if i >= 0] == list(range(11)), "each view is swept once"
+    monkeypatch.undo()
+    assert command.main(arguments(tmp_path, run_folder, "--out", tmp_path / "whole")) == 0
+    for name in ("final.safetensors", "curve.jsonl"):
+        assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+
+
+def test_teacher_of_other_weights_is_made_anew(
+    run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(teacher, "_completed", interrupted)
+        assert command.main(arguments(tmp_path, run_folder)) == command.EXIT_INTERRUPTED
+    stale = tmp_path / "out" / "teacher" / "0-run" / "swept_0.npy"
+    stale.write_bytes(b"of the weights before")
+    torch.manual_seed(7)
+    other = build_network(METADATA, Widths((4,) + (8,) * 13, (8,) * 5))
+    save_checkpoint(other, METADATA, tmp_path / "start.safetensors")
+    assert command.main(arguments(tmp_path, run_folder)) == 0
+    assert stale.stat().st_size > 1000
+
+
+def test_run_without_a_useful_pair_is_named_and_gives_no_name(
+    run_folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    sequence = load_run(run_folder)
+    still = replace(sequence, name="hovering", partners=[()] * len(sequence.views))
+    with pytest.raises(SourceError, match="no run with two images of the same place from apart"):
+        Data(posed=[still]).usable()
+    with caplog.at_level(logging.WARNING):
+        kept = Data(posed=[still, sequence]).usable()
+    assert [s.name for s in kept.posed] == ["run"]
+    assert "hovering: no two images" in caplog.text
+
+
+def test_frames_that_rest_on_nothing_teach_nothing(run_folder: Path, tmp_path: Path) -> None:
+    folder = changed(run_folder, tmp_path)
+    table = (folder / "status.csv").read_text()
+    (folder / "status.csv").write_text(table.replace("tracked", "starting"))
+    with pytest.raises(SourceError, match="only 0 frames .* have a pose"):
+        load_run(folder)
+
+
+def test_largest_of_several_pieces_is_taken(run_folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    folder = changed(run_folder, tmp_path)
+    rows = [line.split(",") for line in (folder / "status.csv").read_text().splitlines()[1:]]
+    lines = ["stamp_s,status,piece,supported"]
+    lines += [f"{stamp},tracked,{0 if k < 3 else 1},1" for k, (stamp, _) in enumerate(rows)]
+    (folder / "status.csv").write_text("\n".join(lines) + "\n")
+    sequence = load_run(folder)
+    assert len(sequence.views) == 9
+    assert "2 pieces whose relation is not known; learning from the largest, 9 of 12 frames" in caplog.text
+
+
+def test_first_frames_alone_are_used_when_asked(run_folder: Path) -> None:
+    assert len(load_run(run_folder, max_frames=10).views) == 9, "one of the ten is lost"
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("summary.json", "[]"),
+        ("summary.json", '{"source": null}'),
+        ("summary.json", "no json"),
+        ("trajectory.txt", "1 2 3\n"),
+        ("trajectory.txt", "0 0 0 0 0 0 0 0\n"),
+        ("status.csv", "stamp_s,status\nlater,tracked\n"),
+        ("anchors.ply", "no ply"),
+    ],
+)
+def test_damaged_run_is_named(run_folder: Path, tmp_path: Path, name: str, content: str) -> None:
+    folder = changed(run_folder, tmp_path)
+    (folder / name).write_text(content)
+    with pytest.raises(SourceError, match=f"{folder}"):
+        load_run(folder)
+
+
+def test_two_recordings_with_one_name_get_a_run_each(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        (tmp_path / name / "flight").mkdir(parents=True)
+    items = command._items(arguments(tmp_path, tmp_path / "a" / "flight", tmp_path / "b" / "flight"))
+    assert [(item.kind, item.name) for item in items] == [("recording", "flight"), ("recording", "flight-2")]
+
+
+class _FakeSlam:
+    """Stands for `run`: writes what makes a run folder, and counts."""
+
+    def __init__(self) -> None:
+        self.calls = 0
+        self.result = SimpleNamespace(interrupted=False, failure=None)
+
+    def __call__(self, source: object, out: Path, *_: object, **__: object) -> SimpleNamespace:
+        self.calls += 1
+        out.mkdir(parents=True, exist_ok=True)
+        for name in ("summary.json", "trajectory.txt"):
+            (out / name).write_text("{}")
+        return self.result
+
+
+@pytest.fixture
+def slam(monkeypatch: pytest.MonkeyPatch) -> _FakeSlam:
+    fake = _FakeSlam()
+    monkeypatch.setattr(slam_runs, "run", fake)
+    return fake
+
+
+def test_slam_runs_once_for_the_same_recording_and_again_for_another(
+    run_folder: Path, tmp_path: Path, slam: _FakeSlam
+) -> None:
+    recording = shutil.copytree(run_folder.parent / "recording", tmp_path / "flight")
+    out = tmp_path / "flight" / "tuned" / "slam" / "flight"
+
+    def ensure(**more: object) -> int:
+        ensure_run(recording, out, apart=tmp_path / "flight" / "tuned", **more)  # type: ignore[arg-type]
+        return slam.calls
+
+    assert [ensure(), ensure()] == [1, 1]
+    assert [ensure(max_frames=5), ensure(max_frames=5)] == [2, 2]
+    assert ensure() == 3
+    image = next((recording / "rgb").iterdir())
+    image.write_bytes(image.read_bytes() + b"\0")
+    assert [ensure(), ensure()] == [4, 4]
+    (out / "trajectory.txt").unlink()
+    assert ensure() == 5
+
+
+def test_interrupted_and_failed_slam_is_not_taken_for_a_run(run_folder: Path, tmp_path: Path, slam: _FakeSlam) -> None:
+    recording, out = run_folder.parent / "recording", tmp_path / "slam" / "flight"
+    slam.result.interrupted = True
+    with pytest.raises(KeyboardInterrupt):
+        ensure_run(recording, out)
+    slam.result = SimpleNamespace(interrupted=False, failure="disk full")
+    with pytest.raises(OutputError, match="disk full"):
+        ensure_run(recording, out)
+    slam.result.failure = None
+    ensure_run(recording, out)
+    assert slam.calls == 3
+    assert posed.is_run_folder(out)

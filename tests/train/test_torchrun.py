@@ -1,0 +1,120 @@
+"""``edgeslam finetune`` in two processes, as docs/training.md starts it."""
+
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from edgeslam_torch.models.checkpoint import build_network, load_checkpoint, save_checkpoint
+from edgeslam_torch.models.fastdepth import Widths
+from edgeslam_torch.models.record import Metadata
+from edgeslam_torch.train.recipe import saved_step
+
+pytestmark = pytest.mark.slow
+
+METADATA = Metadata(input_height=96, input_width=128, focal_px=100.0)
+TORCHRUN = (sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2")
+MODULE = ("-m", "edgeslam_torch.cli")
+ENVIRONMENT = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_THREADS": "1"}
+
+
+@pytest.fixture
+def weights(tmp_path: Path) -> Path:
+    torch.manual_seed(0)
+    save_checkpoint(build_network(METADATA, Widths((4,) + (8,) * 13, (8,) * 5)), METADATA, tmp_path / "w.safetensors")
+    return tmp_path / "w.safetensors"
+
+
+def words(run_folder: Path, weights: Path, out: Path, steps: int) -> list[str]:
+    given = (run_folder, "--weights", weights, "--out", out, "--steps", steps, "--batch", 4, "--lr", 0.01)
+    return ["finetune", *map(str, given)]
+
+
+def run(*command: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, timeout=280, check=False)
+
+
+def assert_close(first: Path, second: Path) -> None:
+    """The same images and terms, added up in another order, stored in half precision."""
+    one, other = (load_checkpoint(p)[0].state_dict() for p in (first, second))
+    for name, value in one.items():
+        torch.testing.assert_close(other[name], value, rtol=4e-3, atol=1e-3, msg=name)
+
+
+def test_two_processes_give_the_weights_of_one(run_folder: Path, weights: Path, tmp_path: Path) -> None:
+    alone, together = tmp_path / "alone", tmp_path / "together"
+    assert run(sys.executable, *MODULE, *words(run_folder, weights, alone, 8)).returncode == 0
+    for _ in range(2):  # the second finds all of it done
+        done = run(*TORCHRUN, *MODULE, *words(run_folder, weights, together, 8))
+        assert done.returncode == 0, done.stderr
+        assert done.stdout.count("| before |") == 1, "the first process alone reports"
+    for name in ("weights.safetensors", "final.safetensors"):
+        assert_close(alone / name, together / name)
+    assert len(list((together / "teacher").rglob("swept_*.npy"))) == 11
+
+
+def test_entry_script_under_torchrun(run_folder: Path, weights: Path, tmp_path: Path) -> None:
+    script = shutil.which("edgeslam", path=str(Path(sys.executable).parent))
+    if script is None:
+        pytest.skip("the package is not installed: no edgeslam beside this Python")
+    done = run(*TORCHRUN, "--no-python", script, *words(run_folder, weights, tmp_path / "out", 4))
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "out" / "weights.safetensors").is_file()
+
+
+def test_refusal_is_said_once_by_each_process(run_folder: Path, weights: Path, tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "last.pt").write_bytes(b"somebody's")
+    done = run(*TORCHRUN, *MODULE, *words(run_folder, weights, tmp_path / "out", 4))
+    assert done.returncode == 1
+    assert "holds last.pt, but no finetune.json" in done.stderr
+    assert "edgeslam_torch/train" not in done.stderr, "no traceback of ours"
+
+
+def test_more_processes_than_images_are_refused(run_folder: Path, weights: Path, tmp_path: Path) -> None:
+    done = run(*TORCHRUN, *MODULE, *words(run_folder, weights, tmp_path / "out", 4), "--batch", "1")
+    assert done.returncode == 1
+    assert "2 processes for a batch of 1" in done.stderr
+
+
+@pytest.mark.parametrize("killed", [0, 1])
+def test_killed_process_ends_the_other_clearly_and_training_goes_on(
+    run_folder: Path, weights: Path, tmp_path: Path, killed: int
+) -> None:
+    out = tmp_path / "out"
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    command = [sys.executable, *MODULE, *words(run_folder, weights, out, 400)]
+    group = {"WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
+    workers = [
+        subprocess.Popen(command, env=ENVIRONMENT | group | {"RANK": str(rank)}, stderr=subprocess.PIPE, text=True)
+        for rank in range(2)
+    ]
+    try:
+        deadline = time.monotonic() + 200
+        while not (out / "last.pt").is_file() and time.monotonic() < deadline:
+            time.sleep(0.05)
+        workers[killed].send_signal(signal.SIGKILL)
+        _, stderr = workers[1 - killed].communicate(timeout=60)
+    finally:
+        for worker in workers:
+            worker.kill()
+            worker.communicate()
+    assert workers[1 - killed].returncode == 1, stderr
+    errors = [line for line in stderr.splitlines() if "error" in line]
+    assert len(errors) == 1
+    assert "another process of this training ended" in errors[0]
+    step = saved_step(out / "last.pt")
+    assert 50 <= step < 400
+    done = run(*TORCHRUN, *MODULE, *words(run_folder, weights, out, 400))
+    assert done.returncode == 0, done.stderr
+    assert f"goes on after step {step}" in done.stdout
+    assert saved_step(out / "last.pt") == 400

@@ -1,0 +1,192 @@
+"""The folder of a fine-tuning: whose it is, and whether training may go on in it.
+
+``finetune.json`` in it says what its tensors were trained on. Nothing is resumed that was given anything else.
+"""
+
+import dataclasses
+import errno
+import json
+import shutil
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+from edgeslam_torch import __version__
+from edgeslam_torch.atomic import write_text
+from edgeslam_torch.errors import ConfigError, OutputError
+from edgeslam_torch.io.own_folder import FolderLock, check_free
+from edgeslam_torch.train.distributed import by_first, rank, world
+from edgeslam_torch.train.given import NOT_COMPARED, Given, given_from_json
+from edgeslam_torch.train.outcome import Outcome
+from edgeslam_torch.train.recipe import BEST, CURVE, FINAL, LAST, saved_step
+
+RECORD, WEIGHTS = "finetune.json", "weights.safetensors"
+TENSORBOARD, TEACHER = "tensorboard", "teacher"
+FILES = (LAST, BEST, FINAL, WEIGHTS, CURVE, TENSORBOARD, TEACHER)
+"""What training leaves beside the record."""
+WITH_RESUME = (*NOT_COMPARED, "lr", "encoder_lr")
+"""Settings that may differ when the user asks for a resume: what diverged goes on at a smaller rate."""
+
+
+class Existing(StrEnum):
+    """What to do with a fine-tuning that the folder holds already."""
+
+    SAME = "same"
+    """Go on with it when it was given the same, refuse otherwise."""
+    RESUME = "resume"
+    """Go on with it, also at another learning rate; refuse when there is none."""
+    OVERWRITE = "overwrite"
+    """Replace it, once the data is read."""
+
+
+class OutFolder:
+    """One fine-tuning's folder; the first process of a group alone writes.
+
+    Args:
+        path: The folder, which exists.
+        existing: What to do with an older fine-tuning.
+    """
+
+    def __init__(self, path: Path, existing: Existing = Existing.SAME) -> None:
+        self.path, self.existing = path, existing
+
+    @property
+    def step(self) -> int:
+        """Steps that were trained and saved."""
+        return saved_step(self.path / LAST)
+
+    def holds(self, file: Path) -> bool:
+        """Whether a file is one that training here writes."""
+        return any((self.path / name).is_file() and file.samefile(self.path / name) for name in FILES)
+
+    def check(self, given: Given) -> None:
+        """Whether training with ``given`` may go on or begin here; writes nothing.
+
+        Raises:
+            ConfigError: If the folder holds another training, or none where one is to be resumed.
+            OutputError: If it holds files that no fine-tuning wrote.
+        """
+        record = self._record()
+        if record is None:
+            strange = next((name for name in FILES if (self.path / name).exists()), None)
+            if strange is not None:
+                raise OutputError(
+                    f"{self.path}: holds {strange}, but no {RECORD} that says where it is from; give another --out"
+                )
+            check_free(self.path, ())
+            if self.existing is Existing.RESUME:
+                raise ConfigError(f"{self.path}: nothing to resume there")
+            return
+        if self.existing is Existing.OVERWRITE or not self.step:
+            return
+        steps = given.settings["steps"]
+        if self.step > steps:
+            raise ConfigError(f"{self.path}: has {self.step} steps behind it, so it cannot end after {steps}")
+        ignored = WITH_RESUME if self.existing is Existing.RESUME else NOT_COMPARED
+        different = given_from_json(record["given"]).differences(given, ignored)
+        if different:
+            only_rate = not given_from_json(record["given"]).differences(given, WITH_RESUME)
+            way_out = "--resume to go on like this" if only_rate else "--overwrite to replace it"
+            raise ConfigError(
+                f"{self.path}: holds another fine-tuning ({'; '.join(different)}); give another --out, or {way_out}"
+            )
+
+    def begin(self, given: Given) -> int:
+        """Note what is trained on, and take away what is not of this training.
+
+        Returns:
+            The step that training goes on from, 0 for a new one.
+
+        Raises:
+            ConfigError, OutputError: As for `check`.
+            OSError: If the disk refuses.
+        """
+        self.check(given)
+        record = self._record()
+        kept = record is not None and self.existing is not Existing.OVERWRITE
+        if kept and record is not None and not self.step:  # interrupted early: the teacher may be there
+            kept = not given_from_json(record["given"]).differences(given, WITH_RESUME)
+        if not kept:
+            self._clear()
+        step = self.step
+        session = {"from_step": step, "processes": world(), "version": __version__}
+        session |= {name: given.settings[name] for name in WITH_RESUME}
+        sessions = [*record["sessions"], session] if kept and record is not None else [session]
+        self._write({"given": dataclasses.asdict(given), "sessions": sessions, "outcome": None})
+        return step
+
+    def finished(self, given: Given) -> Outcome | None:
+        """What came of the training, when exactly this was done before."""
+        record = self._record()
+        if record is None or record["outcome"] is None or self.existing is Existing.OVERWRITE:
+            return None
+        if not (self.path / WEIGHTS).is_file():
+            return None
+        if given_from_json(record["given"]).differences(given, ()):
+            return None
+        return Outcome.from_json(record["outcome"], self.path / WEIGHTS)
+
+    def finish(self, outcome: Outcome) -> None:
+        """Note what came of it.
+
+        Raises:
+            OSError: If the disk refuses.
+        """
+        self._write({**(self._record() or {}), "outcome": outcome.to_json()})
+
+    def _clear(self) -> None:
+        """The record stays till it is written anew: without it the rest would be a stranger's."""
+        for name in FILES:
+            path = self.path / name
+            if path.is_dir():
+                shutil.rmtree(path)
+            else:
+                path.unlink(missing_ok=True)
+
+    def _write(self, record: dict[str, Any]) -> None:
+        write_text(self.path / RECORD, json.dumps(record, indent=2) + "\n")
+
+    def _record(self) -> dict[str, Any] | None:
+        path = self.path / RECORD
+        if not path.is_file():
+            return None
+        try:
+            record = json.loads(path.read_text(encoding="utf-8"))
+            given_from_json(record["given"])
+            if record["outcome"] is not None:
+                Outcome.from_json(record["outcome"], self.path / WEIGHTS)
+            return {"given": record["given"], "sessions": list(record["sessions"]), "outcome": record["outcome"]}
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
+            raise OutputError(f"{path}: unreadable ({type(error).__name__}); give another --out") from error
+
+
+@contextmanager
+def out_folder(path: Path, existing: Existing = Existing.SAME) -> Iterator[OutFolder]:
+    """Make and lock a folder for fine-tuning; errors of the disk get one line.
+
+    Raises:
+        OutputError: If it cannot be written to, or another process writes there.
+    """
+    held: list[FolderLock] = []
+    try:
+        made = not path.exists()
+        by_first(lambda: held.append(_locked(path)))
+        try:
+            yield OutFolder(path, existing)
+        finally:
+            for lock in held:
+                lock.release()
+            if made and rank() == 0 and not any(path.iterdir()):
+                path.rmdir()
+    except OSError as error:
+        if isinstance(error, BrokenPipeError) or (error.errno == errno.EIO and sys.stderr.isatty()):
+            raise  # of the terminal, not of the disk
+        raise OutputError(f"{error.filename or path}: {error.strerror or error}") from error
+
+
+def _locked(path: Path) -> FolderLock:
+    path.mkdir(parents=True, exist_ok=True)
+    return FolderLock(path)
