@@ -14,6 +14,7 @@ from edgeslam_torch.io.tello import StateMessage
 from edgeslam_torch.types import Frame
 
 _JPEG_QUALITY = 95
+_FILES = ("rgb.txt", "camera.yaml", "state.txt", "telemetry.csv")
 
 
 class FlightWriter:
@@ -27,14 +28,15 @@ class FlightWriter:
         """Make the folder.
 
         Raises:
-            OutputError: If it holds a recording already or cannot be written.
+            OutputError: If it holds a recording or a run already or cannot be written.
         """
         self.folder = folder
         self.frames = self.states = 0
         self._suffix = "png" if lossless else "jpg"
         self._options = [] if lossless else [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
-        if (folder / "rgb.txt").exists():
-            raise OutputError(f"{folder}: holds a recording already; give another --out")
+        held = next((name for name in _FILES if (folder / name).exists()), None)
+        if held is not None:
+            raise OutputError(f"{folder}: holds {held} already, of a recording or a run; give another folder")
         try:
             (folder / "rgb").mkdir(parents=True, exist_ok=True)
             camera.save(folder / "camera.yaml")

@@ -23,7 +23,7 @@ SUMMARY = "summary.json"
 _STATUS_BEGIN = "index,stamp_s,status,"
 """What the status table of every version begins with; a run writes it with its first frame."""
 _SUMMARY_KEYS = frozenset({"version", "frames", "statuses"})
-_RECORDING = ("rgb.txt", "rgb", "mav0", "cam0", "telemetry.csv")
+_RECORDING = ("rgb.txt", "rgb", "mav0", "cam0", "data.csv", "sensor.yaml", "ost.yaml", "telemetry.csv")
 """Names in recordings that no run gives."""
 _LOCK = ".lock"
 

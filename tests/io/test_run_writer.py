@@ -108,7 +108,7 @@ def test_folder_made_for_nothing_is_gone(tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("name", [*OUTPUTS, "rgb.txt", "telemetry.csv", "IMG_1.JPG", "flight.mp4"])
+@pytest.mark.parametrize("name", [*OUTPUTS, "rgb.txt", "telemetry.csv", "sensor.yaml", "IMG_1.JPG", "flight.mp4"])
 def test_a_folder_with_what_no_run_wrote_is_refused_and_left_alone(tmp_path, name):
     (tmp_path / name).write_text("version: mine\n")
     before = contents(tmp_path)

@@ -7,6 +7,8 @@ from free_ports import free_ports
 from edgeslam_torch.cli import main
 from edgeslam_torch.emulator.link import LinkFaults
 from edgeslam_torch.emulator.server import EmulatorConfig, TelloEmulator
+from edgeslam_torch.errors import OutputError
+from edgeslam_torch.geometry.camera import PRESETS
 from edgeslam_torch.io import flight_writer, tee
 from edgeslam_torch.io.live import LiveSource, open_tello
 from edgeslam_torch.io.source import open_source
@@ -98,7 +100,15 @@ class ManyPictures:
 def test_a_folder_that_cannot_be_written_leaves_the_drone_alone(address, tmp_path, capsys):
     (tmp_path / "rgb.txt").write_text("")
     assert main(["run", address, "--record", str(tmp_path), "--out", str(tmp_path / "run")]) == 1
-    assert "holds a recording already" in capsys.readouterr().err
+    assert "holds rgb.txt already" in capsys.readouterr().err
+
+
+def test_a_run_or_half_a_recording_is_not_written_over(tmp_path):
+    (tmp_path / "camera.yaml").write_text("mine")
+    with pytest.raises(OutputError, match="holds camera.yaml already"):
+        flight_writer.FlightWriter(tmp_path, PRESETS["tello"], with_telemetry=True)
+    assert [path.name for path in tmp_path.iterdir()] == ["camera.yaml"]
+    assert (tmp_path / "camera.yaml").read_text() == "mine"
 
 
 def test_a_recording_is_not_recorded_again(tmp_path, capsys):
