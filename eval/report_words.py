@@ -43,10 +43,13 @@ def without_folders(text: str) -> str:
 def story(run: RunFolder, score: RunScore | None) -> str:
     """What was run and how it went."""
     summary, sentences = run.summary, []
-    frames = _count(summary.get("frames")) or len(run.status) or len(run.trajectory)
+    frames = _offered(run) or len(run.trajectory)
     seconds = float(run.trajectory.stamps_s[-1] - run.trajectory.stamps_s[0])
     tracked = run.trusted_frames
     sentences.append(f"{frames} frames, {seconds:.1f} s of recording.")
+    for key, words in (("left_out", "left out: they could not be used"), ("dropped_frames", "dropped to keep up")):
+        if _count(summary.get(key)):
+            sentences.append(f"{_count(summary.get(key))} of them were {words}.")
     if run.status:
         share = 100.0 * tracked / max(1, frames)
         whole = "Every frame was" if tracked >= frames else f"{share:.1f} % of the frames were"
@@ -88,7 +91,7 @@ def tiles(run: RunFolder, score: RunScore | None, points: int) -> list[dict[str,
         add(f"{100 * score.ate_sim3_m:.2f}", "cm", "position error (ATE, Sim(3))")
         if score.map is not None:
             add(f"{100 * score.map.median_m:.2f}", "cm", "map error (median)")
-    frames = _count(summary.get("frames")) or len(run.status)
+    frames = _offered(run)
     if frames and run.status:
         add(f"{100 * run.trusted_frames / frames:.1f}", "%", "frames tracked")
     if points:
@@ -240,6 +243,11 @@ def _flat(value: object) -> str:
     if isinstance(value, dict):
         return ", ".join(f"{key} {item}" for key, item in value.items())
     return str(value)
+
+
+def _offered(run: RunFolder) -> int:
+    """Frames that the source had: run through, left out and dropped; as the terminal counts them."""
+    return _count(run.summary.get("offered")) or _count(run.summary.get("frames")) or len(run.status)
 
 
 def _count(value: object) -> int:

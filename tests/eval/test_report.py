@@ -124,7 +124,17 @@ def test_paths_that_leave_the_run_keep_their_last_name_only(text: str, shown: st
     assert without_folders(text) == shown
 
 
-@pytest.mark.parametrize("key", ["frames", "fps", "peak_rss_mb", "scale", "source", "lost_events", "pieces"])
+def test_page_counts_the_frames_that_the_terminal_counts(run: Path) -> None:
+    page = Page(write_report(with_summary(run, offered=400, left_out=150, dropped_frames=50), judge_map=False))
+    assert "400 frames," in page.data["story"]
+    assert "150 of them were left out" in page.data["story"]
+    assert "50 of them were dropped to keep up." in page.data["story"]
+    assert "49.2\u00a0% of the frames were tracked" in page.data["story"]  # 197 of 400
+
+
+@pytest.mark.parametrize(
+    "key", ["offered", "left_out", "frames", "fps", "peak_rss_mb", "scale", "source", "lost_events", "pieces"]
+)
 @pytest.mark.parametrize("value", [None, "text", [1], {"value": []}, -1, 10**400, True])
 def test_summary_of_wrong_types_is_a_page_all_the_same(run: Path, key: str, value: Any) -> None:
     page = Page(write_report(with_summary(run, **{key: value}), judge_map=False))
