@@ -20,6 +20,8 @@ from edgeslam_torch.types import FloatArray
 
 logger = logging.getLogger(__name__)
 
+MAX_SHOWN = 3
+"""Files left out that are named in a message."""
 NEAR_M, FAR_M = 0.05, 30.0
 """Depth that is learnt from."""
 
@@ -69,7 +71,8 @@ def load_depth_folder(
         why = f" ({left_out[0]})" if left_out else f" (no image within {max_gap_s:g} s of a depth map)"
         raise SourceError(f"{folder}: no image with depth could be read{why}")
     if left_out:
-        logger.warning("%s: %d of %d images with depth left out: %s", folder, len(left_out), len(pairs), left_out[0])
+        shown = ", ".join(left_out[:MAX_SHOWN]) + (", ..." if len(left_out) > MAX_SHOWN else "")
+        logger.warning("%s: %d of %d images with depth left out: %s", folder, len(left_out), len(pairs), shown)
     return DepthFolder(folder.name, views, tuple(left_out))
 
 

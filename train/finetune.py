@@ -29,7 +29,7 @@ from edgeslam_torch.train.recipe import BEST, FINAL, Hooks, TrainConfig, TrainSt
 from edgeslam_torch.train.self_supervised import SelfSupervised, fit_log_scale
 from edgeslam_torch.train.signals import Signal, Source, Supervised
 from edgeslam_torch.train.teacher import Taught, teach
-from edgeslam_torch.train.validate import DepthScores, predict_metres, score
+from edgeslam_torch.train.validate import DepthScores, can_be_scored, predict_metres, score
 from edgeslam_torch.train.watchers import ProgressBar, TensorBoard
 
 logger = logging.getLogger(__name__)
@@ -58,12 +58,10 @@ class Data:
     validation: list[DepthFolder] = field(default_factory=list)
 
     def describe(self) -> list[str]:
-        """One line per folder, and the files left out."""
+        """One line per folder."""
         lines = [f"{f.name}: {len(f.views)} images with depth" for f in self.labelled]
         lines += [f"{s.name}: {len(s.usable)} posed images without depth" for s in self.posed]
         lines += [f"{f.name}: {len(f.views)} images to validate on" for f in self.validation]
-        for folder in (*self.labelled, *self.validation):
-            lines += [f"left out: {name}" for name in folder.left_out]
         return lines
 
     def usable(self) -> "Data":
@@ -169,15 +167,15 @@ def _prepared(
             for k, (sequence, scale) in enumerate(zip(data.posed, scales, strict=True)):
                 taught = teach(start, metadata, sequence, scale, teacher / f"{k}-{sequence.name}")
                 if not (data.validation or labelled):
-                    held_out += [_measured_only(t) for t in taught[::HELD_OUT] if t.measured.any()]
+                    held_out += [_measured_only(t) for t in taught[::HELD_OUT]]
                     taught = [t for i, t in enumerate(taught) if i % HELD_OUT]
                 sources.append(Source(sequence.name, [t.view for t in taught], 1.0))
             signals.append(Supervised(sources, metadata, name="teacher"))
         if from_runs is not FromRuns.TEACHER:
             signals.append(SelfSupervised(data.posed, metadata, scales))
     if data.validation:
-        held_out = [v for f in data.validation for v in f.views]
-    return signals, held_out
+        return signals, [v for f in data.validation for v in f.views]
+    return signals, [v for v in held_out if can_be_scored(v)]  # none: of a flight high above the ground
 
 
 def _split(folders: Sequence[DepthFolder], keep_all: bool) -> tuple[list[Source], list[View]]:

@@ -30,6 +30,8 @@ logger = logging.getLogger(__name__)
 
 LAST, BEST, FINAL, CURVE = "last.pt", "best.safetensors", "final.safetensors", "curve.jsonl"
 """Files of `train`: its whole state, the best validated and the last averaged weights, the validations."""
+MAX_BATCH = 1024
+"""Images: tens of gigabytes."""
 NO_ROOM_M = (0.02, 90.0)
 """A network whose depth lies mostly outside of this has diverged: no camera sees such a room."""
 
@@ -78,6 +80,8 @@ class TrainConfig:
         for name in ("steps", "batch", "validate_every", "checkpoint_every"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if self.batch > MAX_BATCH:
+            raise ValueError(f"batch must be at most {MAX_BATCH}, got {self.batch}")
         for name in ("lr", "encoder_lr"):
             # Adam moves every weight by about this much a step, and weights are about 0.05.
             if not 0.0 < getattr(self, name) <= 1.0:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import nn
 
 from edgeslam_torch.errors import SourceError
@@ -82,6 +83,15 @@ def score(network: FastDepth, metadata: Metadata, views: Sequence[View]) -> Dept
     return DepthScores(*means)
 
 
+def can_be_scored(view: View) -> bool:
+    """Whether it has depth that counts."""
+    return bool(_counted(view).any())
+
+
+def _counted(view: View) -> NDArray[np.bool_]:
+    return (view.depth_m > MIN_DEPTH_M) & (view.depth_m < MAX_DEPTH_M)
+
+
 def _mean(column: FloatArray) -> float:
     """Of what is known: an image without edges has no error there."""
     known = column[~np.isnan(column)]
@@ -89,7 +99,7 @@ def _mean(column: FloatArray) -> float:
 
 
 def _scores_of(predicted: FloatArray, view: View) -> tuple[float, ...] | None:
-    mask = (view.depth_m > MIN_DEPTH_M) & (view.depth_m < MAX_DEPTH_M)
+    mask = _counted(view)
     if not mask.any():
         return None
     p, t = predicted[mask], view.depth_m[mask]

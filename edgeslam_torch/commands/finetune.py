@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 HELP = "adapt the depth network to recordings: labelled, unlabelled or output folders of 'edgeslam run'"
 
 EXIT_INTERRUPTED = 130
+MAX_THREADS = 256
+"""With tens of thousands OpenMP ends in a segmentation fault."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -76,9 +78,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Prepare the data, train, print what came of it."""
-    for name in ("threads", "max_frames"):
-        if getattr(args, name) is not None and getattr(args, name) < 1:
-            raise ConfigError(f"--{name.replace('_', '-')} must be at least 1, got {getattr(args, name)}")
+    if not 1 <= args.threads <= MAX_THREADS:
+        raise ConfigError(f"--threads must be 1 to {MAX_THREADS}, got {args.threads}")
+    if args.max_frames is not None and args.max_frames < 1:
+        raise ConfigError(f"--max-frames must be at least 1, got {args.max_frames}")
     items = _items(args)
 
     import torch
@@ -157,6 +160,8 @@ def _items(args: argparse.Namespace) -> list[_Item]:
     for path in args.validate:
         if not has_depth(path):
             raise SourceError(f"{path}: no recording with depth (rgb.txt, depth.txt and camera.yaml) to validate on")
+        if any(item.kind == "depth" and item.path.samefile(path) for item in items):
+            raise ConfigError(f"{path}: is learnt from, so it cannot tell whether that helps; leave --validate away")
     return sorted(items, key=lambda item: item.kind != "depth")
 
 

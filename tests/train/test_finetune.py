@@ -78,10 +78,11 @@ def test_before_and_after_are_reported_and_weights_say_what_they_are(
 ) -> None:
     folder = shutil.copytree(recordings / "kitchen", tmp_path / "kitchen")
     (folder / "rgb" / "3.png").write_bytes(b"broken")
-    code, stdout, _ = finetune(str(folder), steps=60)
+    code, stdout, stderr = finetune(str(folder), steps=60)
     assert code == 0
     assert "kitchen: 11 images with depth" in stdout
-    assert "rgb/3.png: unreadable" in stdout
+    assert "1 of 12 images with depth left out" in stderr
+    assert "rgb/3.png: unreadable" in stderr
     rows = [line.split("|") for line in stdout.splitlines() if line.startswith(("| before", "| after"))]
     assert float(rows[1][3]) < float(rows[0][3])
     metadata = load_checkpoint(tmp_path / "out" / "weights.safetensors")[1]
@@ -249,7 +250,10 @@ def test_full_disk_is_one_line_and_goes_on_later(
         (("--batch", "0"), "--batch must be at least 1"),
         (("--seed", "-5"), "--seed must not be negative"),
         (("--patience", "-1"), "--patience must not be negative"),
-        (("--threads", "0"), "--threads must be at least 1"),
+        (("--batch", "1000000"), "--batch must be at most 1024"),
+        (("--threads", "0"), "--threads must be 1 to 256"),
+        (("--threads", "100000"), "--threads must be 1 to 256"),
+        (("--validate", "kitchen"), "is learnt from, so it cannot tell"),
         (("--max-frames", "0"), "--max-frames must be at least 1"),
         (("gone",), "gone: no such recording"),
         (("--validate", "start.safetensors"), "no recording with depth"),
@@ -260,6 +264,18 @@ def test_mistakes_are_named_before_anything_is_written(
 ) -> None:
     refused(finetune("kitchen", *wrong), said)
     assert not (tmp_path / "out").exists()
+
+
+def test_depth_too_far_to_validate_on_is_learnt_from_all_the_same(
+    finetune: Finetune, recordings: Path, tmp_path: Path
+) -> None:
+    far = shutil.copytree(recordings / "kitchen", tmp_path / "far")
+    for path in (far / "depth").iterdir():
+        cv2.imwrite(str(path), np.full((48, 64), 20_000, np.uint16))
+    code, stdout, _ = finetune(str(far))
+    assert code == 0
+    assert "not validated" in stdout
+    refused(finetune("kitchen", "--validate", str(far), out=tmp_path / "other"), "no depth between 0.1 and 10 m")
 
 
 def test_no_step_is_a_mistake(finetune: Finetune) -> None:

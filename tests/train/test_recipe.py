@@ -212,9 +212,9 @@ def test_one_batch_is_learnt_almost_to_zero(tmp_path: Path) -> None:
 
 
 class _PoisonedAt(Supervised):
-    """Its loss of the third image is NaN from a step on."""
+    """Its loss of one image is NaN from a step on."""
 
-    step = 0
+    step, image = 0, 2
 
     def draw(self, slots: Sequence[Slot]) -> dict[str, Tensor]:
         self.poisoned = slots[0].step >= self.step
@@ -224,7 +224,7 @@ class _PoisonedAt(Supervised):
         found = super().losses(network, batch)
         found["l1"] = found["l1"].clone()
         if self.poisoned:
-            found["l1"][2] = torch.nan
+            found["l1"][self.image] = torch.nan
         return found
 
 
@@ -351,6 +351,7 @@ def test_mixed_precision_trains(tmp_path: Path) -> None:
     assert all(torch.isfinite(p).all() for p in state.network.parameters())
 
 
+ENVIRONMENT = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_THREADS": "1"}
 SCRIPT = """
 import sys, torch
 from pathlib import Path
@@ -368,22 +369,59 @@ assert not [name for name in threads if "gloo" in name], "the group's threads wo
 """
 
 
+def in_two_processes(script: Path, *words: str) -> list[tuple[int, str]]:
+    """Exit code and stderr of each process of a group that runs a script."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    group = {"WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
+    command = [sys.executable, str(script), *words]
+    workers = [
+        subprocess.Popen(command, env=ENVIRONMENT | group | {"RANK": str(rank)}, stderr=subprocess.PIPE, text=True)
+        for rank in range(2)
+    ]
+    said = [worker.communicate(timeout=200)[1] for worker in workers]
+    return [(worker.returncode, text) for worker, text in zip(workers, said, strict=True)]
+
+
 def test_two_processes_give_the_single_process_result(tmp_path: Path) -> None:
     script = tmp_path / "script.py"
     script.write_text(SCRIPT.format(folder=str(Path(__file__).parent), module=Path(__file__).stem))
     alone, together = tmp_path / "alone.pt", tmp_path / "together.pt"
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, str(script)]
-    subprocess.run([*command, str(tmp_path / "a"), str(alone)], check=True, env=environment, timeout=200)
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    workers = []
-    for rank in range(2):
-        given = {"RANK": str(rank), "WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
-        workers.append(subprocess.Popen([*command, str(tmp_path / "b"), str(together)], env=environment | given))
-    assert [w.wait(timeout=200) for w in workers] == [0, 0]
+    command = [sys.executable, str(script), str(tmp_path / "a"), str(alone)]
+    subprocess.run(command, check=True, env=ENVIRONMENT, timeout=200)
+    ended = in_two_processes(script, str(tmp_path / "b"), str(together))
+    assert [code for code, _ in ended] == [0, 0], ended
     first, second = torch.load(alone), torch.load(together)
     for name, value in first.items():
         # The same images and terms, added up in another order.
         torch.testing.assert_close(second[name], value, rtol=1e-3, atol=2e-5, msg=name)
+
+
+POISONED = """
+import sys, torch
+from pathlib import Path
+from edgeslam_torch.train.distributed import process_group, rank
+sys.path.insert(0, {folder!r})
+from {module} import CONFIG, METADATA, NonFiniteLossError, Source, _PoisonedAt, network, replace, train, views
+torch.set_num_threads(1)
+with process_group() as rank:
+    poisoned = _PoisonedAt([Source("made", views(), 1.0)], METADATA)
+    poisoned.step, poisoned.image = 3 if rank else 99, 0
+    try:
+        train(network(), METADATA, [poisoned], replace(CONFIG, freeze_norm=True), Path(sys.argv[1]))
+    except NonFiniteLossError as error:
+        sys.exit(str(error))
+"""
+
+
+@pytest.mark.slow
+def test_loss_that_is_not_finite_in_one_process_stops_all_with_its_name(tmp_path: Path) -> None:
+    script = tmp_path / "script.py"
+    script.write_text(POISONED.format(folder=str(Path(__file__).parent), module=Path(__file__).stem))
+    ended = in_two_processes(script, str(tmp_path / "out"))
+    named = Supervised([Source("made", views(), 1.0)], METADATA).describe([Slot(0, 3, 1)])[0]
+    for code, said in ended:
+        assert code == 1
+        assert f"step 3: loss supervised/l1 is not finite for {named}; " in said
+        assert "last.pt holds step 2, the last good one" in said
