@@ -31,9 +31,11 @@ from edgeslam_torch.mapping.edge_map import EdgeMap
 from edgeslam_torch.mapping.keyframe import Keyframe, make_keyframe
 from edgeslam_torch.mapping.last_refinement import last_refinement, lm_config
 from edgeslam_torch.mapping.mapper import Mapper
+from edgeslam_torch.mapping.prior_anchors import depth_slack_px
 from edgeslam_torch.mapping.slam_map import SlamMap
 from edgeslam_torch.optim.problem import PosePrior
 from edgeslam_torch.tracking.bootstrap import Bootstrap, StartedMap
+from edgeslam_torch.tracking.edge_tracker import MIN_EDGES, EdgeTracker, PointsInFrame
 from edgeslam_torch.tracking.flow import FlowTracker, Followed, Template, join, template_of_keyframe, template_of_track
 from edgeslam_torch.tracking.initialiser import TwoView
 from edgeslam_torch.tracking.keyframe_choice import few_matches, is_due, lost_most, lost_sight
@@ -77,6 +79,9 @@ MOST_WAITING_IN_REAL_TIME = 3
 FIRST_FRAME = "first frame, depth guessed"
 AFTER_LOSS = "new piece of map after loss: pose predicted, depth guessed"
 """How a piece of map is begun, in words."""
+
+FEW_INLIERS = 100
+"""Keypoints below which edges take part in a frame's pose: as many as start a map."""
 
 LOST_BEFORE_RESTART_S = 0.65
 """Time without a pose after which a new piece of map is started from the predicted one."""
@@ -133,6 +138,7 @@ class EdgeSlam:
         self._lm = lm_config(self.config.window)
         self._mapper = Mapper(self.map, camera, self.config, self._lm)
         self.edges = EdgeMap(self.map, camera, self.config.edges, self.config.depth.prior_sigma_log)
+        self._edge_tracker = EdgeTracker(self.map, self.edges, camera)
         self._T_b_c = camera_on_body(np.deg2rad(self.config.mount.tilt_deg), self.config.mount.forward_m)
         self._fusion = MotionFusion(self.config.fusion, self._T_b_c, camera.focal_sigma)
         self._fusion.refined_poses = self.log.poses
@@ -220,6 +226,9 @@ class EdgeSlam:
                 if matched is None and located is not None:  # in a blurred image flow finds what matching does not
                     matched = replace(located, due=False)
                 located = matched
+            if located is None or located.track.inliers < FEW_INLIERS:
+                with self._timed("edges"):
+                    located = self._with_edges(frame, seen, T_predicted, located)
             if located is not None:
                 return self._tracked(frame, seen, located)
         return self._lost(frame, seen.view, T_predicted)
@@ -235,7 +244,8 @@ class EdgeSlam:
         parallax_rad = self._parallax(followed.track, reference)
         mapping = self.config.mapping
         due = self._is_due(stamp_s, lost_sight(followed, mapping), parallax_rad, lost_most(followed, mapping))
-        return _Located(followed.track, reference, parallax_rad, due)
+        inv_sigma = self.config.orb.scale_factor ** -followed.octave.astype(np.float64)
+        return _Located(followed.track, reference, parallax_rad, due, followed.uv, inv_sigma)
 
     def _match(
         self, seen: LazyView, T_predicted: FloatArray, followed: Followed | None, stamp_s: float
@@ -252,7 +262,34 @@ class EdgeSlam:
         few = few_matches(track, reference, self.map, self.config.mapping)
         due = followed is not None or self._is_due(stamp_s, few, parallax_rad)
         self._template = template_of_track(track, view, reference, seen.grey, self.camera)
-        return _Located(track, reference, parallax_rad, due, view, relocalised)
+        uv, inv_sigma = view.features.uv[track.keypoint], view.inv_sigma[track.keypoint]
+        return _Located(track, reference, parallax_rad, due, uv, inv_sigma, view, relocalised)
+
+    def _with_edges(
+        self, frame: Frame, seen: LazyView, T_predicted: FloatArray, located: "_Located | None"
+    ) -> "_Located | None":
+        """The pose from edges beside few points, or from edges alone where no point holds it."""
+        expected = self._expectation(frame.stamp_s, T_predicted)
+        if located is None:
+            alone = None if self._lost_frames > 0 else self._edge_tracker.refine(seen.grey, T_predicted, None, expected)
+            if alone is None or not alone.is_fixed:
+                return None
+            none = np.zeros(0, dtype=np.int64)
+            track = Track(alone.T_c_w, none, none, none, none, alone.covariance)
+            return _Located(track, self.map.latest(), 0.0, False, np.zeros((0, 2)), np.zeros(0), edges=alone.edges)
+        anchor = located.track.anchor
+        slack = depth_slack_px(self.map.anchors, anchor, located.track.T_c_w, self.camera)
+        points = PointsInFrame(
+            self.map.anchors.p_w[anchor],
+            located.uv.astype(np.float64),
+            located.inv_sigma,
+            np.zeros((len(anchor), 2)) if slack is None else slack,
+        )
+        both = self._edge_tracker.refine(seen.grey, located.track.T_c_w, points, expected)
+        if both is None or both.edges < MIN_EDGES or both.points.mean() < 0.5:
+            return located
+        track = replace(located.track, T_c_w=both.T_c_w, covariance=both.covariance)
+        return replace(located, track=track, edges=both.edges)
 
     def _parallax(self, track: Track, reference: Keyframe) -> float:
         return median_parallax(self.map.anchors.p_w[track.anchor], track.T_c_w, reference.centre_w)
@@ -306,7 +343,7 @@ class EdgeSlam:
             self.events["relocalised"] += 1
             self._velocity = np.zeros(6)
         self._lost_frames = 0
-        self._recent = track.anchor
+        self._recent = track.anchor if track.inliers else self._recent
         if not self._is_repeat:
             with self._timed("fusion"):
                 self._see(frame.stamp_s, track)
@@ -315,6 +352,8 @@ class EdgeSlam:
             reference = keyframe
         status = FrameStatus.RELOCALISED if located.relocalised else FrameStatus.TRACKED
         reason = "found again among the keyframes" if located.relocalised else ""
+        if located.edges:
+            reason = f"by {located.edges} edge points" + (f" beside {track.inliers} keypoints" if track.inliers else "")
         return self._output(frame, reference, status, reason, track, located.parallax_rad, keyframe is not None)
 
     def _see(self, stamp_s: float, track: Track) -> None:
@@ -662,9 +701,15 @@ class _Located:
     """Median ray angle to the reference."""
     due: bool
     """It should become a keyframe."""
+    uv: FloatArray
+    """``(M, 2)`` undistorted pixels of the track's inliers."""
+    inv_sigma: FloatArray
+    """``(M,)`` their inverse standard deviations [1/px]."""
     view: View | None = None
     """Its features, if it was matched; without them it cannot become one."""
     relocalised: bool = False
+    edges: int = 0
+    """Edge points that had a part in the pose."""
 
 
 @dataclass(frozen=True, slots=True)

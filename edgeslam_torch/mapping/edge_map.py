@@ -36,6 +36,8 @@ class EdgePoints:
     keyframe_id: int
     uv: FloatArray
     """``(E, 2)``"""
+    normal: FloatArray
+    """``(E, 2)`` unit image gradients there."""
     p_c: FloatArray
     """``(E, 3)``"""
     sigma: FloatArray
@@ -46,7 +48,7 @@ class EdgePoints:
 
     def keep(self, mask: NDArray[np.bool_]) -> int:
         """Forget the points outside a mask ``(E,)``; returns how many."""
-        for name in ("uv", "p_c", "sigma", "colour", "observations"):
+        for name in ("uv", "normal", "p_c", "sigma", "colour", "observations"):
             setattr(self, name, getattr(self, name)[mask])
         return int((~mask).sum())
 
@@ -102,6 +104,7 @@ class EdgeMap:
         points = EdgePoints(
             keyframe_id=keyframe.id,
             uv=uv[good],
+            normal=normal[good],
             p_c=self.camera.back_project(uv[good], depth[good]),
             sigma=(relative * depth)[good],
             colour=edges.colour[known][good],

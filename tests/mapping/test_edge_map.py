@@ -43,6 +43,7 @@ def host(points, id, p_w, **changes):
     record = {
         "keyframe_id": id,
         "uv": CAMERA.project(p_c).astype(np.float32),
+        "normal": np.tile(np.float32([1.0, 0.0]), (n, 1)),
         "p_c": p_c,
         "sigma": np.full(n, 0.01),
         "colour": np.zeros((n, 3), np.uint8),

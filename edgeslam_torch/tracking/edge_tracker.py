@@ -1,0 +1,242 @@
+"""The pose of a frame from edges: where corners are few, the measured edges of keyframes hold it.
+
+An edge pixel tells where the camera is across the edge and nothing along it. Edge points of nearby keyframes are
+projected into the frame, the nearest Canny pixel is taken for the same edge, and its position counts across that edge
+alone: `refine_pose` takes a slack along it. Points, where there are any, take part beside them. REVO (Schenk and
+Fraundorfer, ICRA 2017) and the edgelets of SVO track by the same distance.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from edgeslam_torch.frontend.canny import canny_of_gradient, gradient
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.mapping.edge_map import EdgeMap
+from edgeslam_torch.mapping.keyframe import Keyframe
+from edgeslam_torch.mapping.slam_map import SlamMap
+from edgeslam_torch.optim.pose_only import PoseConfig, PoseResult, refine_pose
+from edgeslam_torch.optim.problem import PosePrior
+from edgeslam_torch.types import FloatArray, IntArray
+
+HOSTS = 5
+"""Keyframes whose edges are looked for: the nearest ones in place and direction."""
+POINTS = 600
+"""Edge points looked for at most, evenly thinned."""
+SIGMA_PX = 2.0
+"""Across the edge: edges scatter by 0.8 px, but neighbours on one edge err together, six of them count as one."""
+ALONG_PX = 1e3
+"""Slack along the edge: nothing is known there."""
+REACH_PX = (12.0, 4.0, 4.0)
+"""Distance in which the nearest edge is looked for, round by round: the prediction is off by more than its result."""
+AGREE_PX = 1.5
+"""Distance across the edge within which the result and the image agree: two sigmas of a single edge pixel."""
+ALIKE = np.cos(np.deg2rad(30.0))
+"""Cosine between a projected edge's normal and that of its partner. An edge as near and as alike lies by chance where
+every tenth point of a cluttered image falls."""
+MIN_EDGES = 80
+"""Edge points that must agree before edges alone are believed."""
+MIN_SHARE = 0.5
+"""Of the edge points in view that must agree, for edges alone."""
+MAX_SIGMA = 0.05
+"""Standard deviation of the position relative to the edges' depth, and of the rotation [rad], above which edges alone
+do not fix a pose: parallel lines leave one direction free."""
+EFFORT = PoseConfig(rounds=2, robust_rounds=1, cost_tolerance=1e-3)
+
+
+@dataclass(frozen=True, slots=True)
+class PointsInFrame:
+    """Points with their pixels in the frame, ``M`` of them."""
+
+    p_w: FloatArray
+    """``(M, 3)``"""
+    uv: FloatArray
+    """``(M, 2)`` undistorted pixels."""
+    inv_sigma: FloatArray
+    """``(M,)`` [1/px]."""
+    slack_px: FloatArray
+    """``(M, 2)`` see `refine_pose`."""
+
+    @classmethod
+    def none(cls) -> "PointsInFrame":
+        """No point at all."""
+        return cls(np.zeros((0, 3)), np.zeros((0, 2)), np.zeros(0), np.zeros((0, 2)))
+
+
+@dataclass(frozen=True, slots=True)
+class EdgePose:
+    """A pose that edges had a part in."""
+
+    T_c_w: FloatArray
+    """``(4, 4)``"""
+    covariance: FloatArray
+    """``(6, 6)`` of its left tangent."""
+    points: NDArray[np.bool_]
+    """``(M,)`` of the points given, those that agree."""
+    edges: int
+    """Edge points that agree."""
+    in_view: int
+    """Edge points that should be seen."""
+    depth: float
+    """Median depth of those [map units]."""
+
+    @property
+    def is_fixed(self) -> bool:
+        """Whether the edges alone would fix the pose."""
+        if self.edges < max(MIN_EDGES, MIN_SHARE * self.in_view) or not np.isfinite(self.covariance).all():
+            return False
+        sigma = np.sqrt(np.diag(self.covariance))
+        return bool(sigma[:3].max() < MAX_SIGMA * self.depth and sigma[3:].max() < MAX_SIGMA)
+
+
+class EdgeTracker:
+    """Finds the edge map in a frame; keeps nothing between frames."""
+
+    def __init__(self, slam_map: SlamMap, edges: EdgeMap, camera: Camera) -> None:
+        self.map = slam_map
+        self.edges = edges
+        self.camera = camera
+
+    def refine(
+        self,
+        grey: NDArray[np.uint8],
+        T_c_w: FloatArray,
+        points: PointsInFrame | None = None,
+        expected: PosePrior | None = None,
+    ) -> EdgePose | None:
+        """Pose near a predicted one from edges, beside points; None where no edge was measured or too few agree.
+
+        Args:
+            grey: Frame ``(H, W)`` with the lens distortion still in it.
+            T_c_w: Predicted pose ``(4, 4)``.
+            points: Anchors found in the frame.
+            expected: What is known of the pose beforehand.
+        """
+        points = points or PointsInFrame.none()
+        known = self._edges_near(T_c_w)
+        if known is None:
+            return None
+        seen = EdgeImage.of(grey, self.edges.config.canny_low, self.edges.config.canny_high)
+        if seen is None:
+            return None
+        count = len(points.uv)
+        for reach in REACH_PX:
+            edges, _ = self._match(seen, known, T_c_w, reach)
+            if count + len(edges.uv) < EFFORT.min_points:
+                return None
+            result = self._solve(T_c_w, points, edges, expected)
+            T_c_w = result.T_c_w
+        edges, in_view = self._match(seen, known, T_c_w, AGREE_PX)
+        z = se3.transform(T_c_w, known.p_w)[:, 2]
+        depth = float(np.median(z[z > 0])) if (z > 0).any() else 1.0
+        return EdgePose(T_c_w, result.covariance, result.inliers[:count], len(edges.uv), in_view, depth)
+
+    def _solve(
+        self, T_c_w: FloatArray, points: PointsInFrame, edges: PointsInFrame, expected: PosePrior | None
+    ) -> PoseResult:
+        camera = self.camera
+        return refine_pose(
+            T_c_w,
+            np.concatenate([points.p_w, edges.p_w]),
+            np.concatenate([points.uv, edges.uv]),
+            np.concatenate([points.inv_sigma, edges.inv_sigma]),
+            (camera.fx, camera.fy, camera.cx, camera.cy),
+            slack_px=np.concatenate([points.slack_px, edges.slack_px]),
+            prior=expected,
+            config=EFFORT,
+        )
+
+    def _edges_near(self, T_c_w: FloatArray) -> "KnownEdges | None":
+        """Edges of the keyframes that look at the same place, as they would look from here."""
+        hosts = {h.keyframe_id: h for h in self.edges.hosts if h.keyframe_id in self.map.keyframes and len(h.uv)}
+        if not hosts:
+            return None
+        near = _nearest([self.map.keyframes[id] for id in hosts], T_c_w)
+        p_w = np.concatenate([se3.transform(k.T_w_c, hosts[k.id].p_c) for k in near])
+        turns = [(T_c_w[:3, :3] @ k.T_w_c[:3, :3])[:2, :2] for k in near]
+        normal = np.concatenate([hosts[k.id].normal @ turn.T for k, turn in zip(near, turns, strict=True)])
+        some = slice(None, None, 1 + len(p_w) // POINTS)
+        length = np.maximum(np.linalg.norm(normal[some], axis=1, keepdims=True), 1e-9)
+        return KnownEdges(p_w[some], normal[some] / length)
+
+    def _match(
+        self, seen: "EdgeImage", known: "KnownEdges", T_c_w: FloatArray, reach_px: float
+    ) -> tuple[PointsInFrame, int]:
+        """Edge points with the nearest edge pixel of the frame that runs alike, and how many should be in view."""
+        p_c = se3.transform(T_c_w, known.p_w)
+        front = np.flatnonzero(p_c[:, 2] > 1e-3)
+        uv = self.camera.project_through_lens(p_c[front])
+        inside = seen.contains(uv)
+        front, uv = front[inside], uv[inside]
+        pixel, normal, near = seen.nearest(uv, reach_px)
+        near &= np.einsum("ij,ij->i", normal, known.normal[front]) > ALIKE  # the same side is the bright one
+        tangent = np.stack([-normal[:, 1], normal[:, 0]], axis=1)
+        pixels = self.camera.undistort_points(pixel[near].astype(np.float32)).astype(np.float64)
+        count = int(near.sum())
+        found = PointsInFrame(known.p_w[front[near]], pixels, np.full(count, 1.0 / SIGMA_PX), ALONG_PX * tangent[near])
+        return found, len(front)
+
+
+@dataclass(frozen=True, slots=True)
+class KnownEdges:
+    """Edge points of the map, ``E`` of them."""
+
+    p_w: FloatArray
+    """``(E, 3)``"""
+    normal: FloatArray
+    """``(E, 2)`` unit gradients as the frame should show them."""
+
+
+@dataclass(frozen=True, slots=True)
+class EdgeImage:
+    """Canny edges of a frame, with the nearest one of every pixel."""
+
+    distance: FloatArray
+    """``(H, W)`` to the nearest edge pixel [px]."""
+    label: IntArray
+    """``(H, W)`` which one that is: row of the others."""
+    pixel: IntArray
+    """``(L, 2)`` edge pixels."""
+    normal: FloatArray
+    """``(L, 2)`` unit gradients."""
+
+    @classmethod
+    def of(cls, grey: NDArray[np.uint8], low: float, high: float) -> "EdgeImage | None":
+        """Edges of an image ``(H, W)``; None when it has none."""
+        gx, gy = gradient(grey)
+        mask = canny_of_gradient(gx, gy, low, high)
+        if not mask.any():
+            return None
+        distance, label = cv2.distanceTransformWithLabels(
+            (~mask).astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL
+        )
+        v, u = np.nonzero(mask)
+        row = np.zeros(int(label.max()) + 1, dtype=np.int64)
+        row[label[v, u]] = np.arange(len(u))
+        normal = np.stack([gx[v, u], gy[v, u]], axis=1).astype(np.float64)
+        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
+        return cls(np.asarray(distance), row[label], np.stack([u, v], axis=1), normal)
+
+    def contains(self, uv: FloatArray) -> NDArray[np.bool_]:
+        """Which pixels ``(N, 2)`` lie inside, ``(N,)``."""
+        height, width = self.distance.shape
+        return (uv[:, 0] > 0) & (uv[:, 1] > 0) & (uv[:, 0] < width - 1) & (uv[:, 1] < height - 1)
+
+    def nearest(self, uv: FloatArray, reach_px: float) -> tuple[IntArray, FloatArray, NDArray[np.bool_]]:
+        """Nearest edge pixels ``(N, 2)`` with their normals ``(N, 2)``, and which are near enough ``(N,)``."""
+        u, v = np.rint(uv).astype(np.int64).T
+        row = self.label[v, u]
+        return self.pixel[row], self.normal[row], self.distance[v, u] <= reach_px
+
+
+def _nearest(keyframes: list[Keyframe], T_c_w: FloatArray) -> list[Keyframe]:
+    """Of keyframes those that stand nearest and look the same way."""
+    centre = -T_c_w[:3, :3].T @ T_c_w[:3, 3]
+    turn = [np.arccos(np.clip(k.T_c_w[2, :3] @ T_c_w[2, :3], -1.0, 1.0)) for k in keyframes]
+    apart = [float(np.linalg.norm(k.centre_w - centre)) for k in keyframes]
+    scale = max(float(np.median(apart)), 1e-9)
+    order = np.argsort(np.array(turn) + np.array(apart) / scale, kind="stable")
+    return [keyframes[i] for i in order[:HOSTS]]
