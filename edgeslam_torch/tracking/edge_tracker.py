@@ -39,7 +39,7 @@ ALIKE = np.cos(np.deg2rad(30.0))
 every tenth point of a cluttered image falls."""
 MIN_EDGES = 80
 """Edge points that must agree before edges alone are believed."""
-MIN_SHARE = 0.5
+MIN_SHARE = 0.7
 """Of the edge points in view that must agree, for edges alone."""
 MAX_SIGMA = 0.05
 """Standard deviation of the position relative to the edges' depth, and of the rotation [rad], above which edges alone

@@ -51,7 +51,8 @@ def host(points, id, kind=EdgePoints):
     p_c = se3.transform(points.map.pose_of(id), numbered(points))
     number = np.repeat(np.arange(30, dtype=np.uint8)[:, None], 3, axis=1)
     count = np.full(30, 3, np.int32)
-    return kind(id, CAMERA.project(p_c).astype(np.float32), p_c, np.full(30, 0.01), number, count)
+    uv, normal = CAMERA.project(p_c).astype(np.float32), np.tile(np.float32([1.0, 0.0]), (30, 1))
+    return kind(id, uv, normal, p_c, np.full(30, 0.01), number, count)
 
 
 def numbered(points):
