@@ -71,6 +71,7 @@ class _CtrlC:
     def __init__(self) -> None:
         self.raised = False
         self._taken = False
+        self._postponed = False
 
     def take(self) -> None:
         """Handle Ctrl-C from here on, unless somebody else does or it is ignored."""
@@ -88,16 +89,27 @@ class _CtrlC:
             signal.signal(signal.SIGINT, signal.SIG_DFL)
 
     def _on_signal(self, number: int, frame: "FrameType | None") -> None:
-        import _thread
-        import threading
-
         while frame is not None:
             if frame.f_code.co_filename == _IMPORTING:
-                threading.Timer(_AGAIN_S, _thread.interrupt_main).start()
+                self._postpone()
                 return
             frame = frame.f_back
         self.raised = True
         raise KeyboardInterrupt
+
+    def _postpone(self) -> None:
+        """Ask for the signal again, once however many came: a thread for each would use them all up."""
+        import threading
+
+        if not self._postponed:
+            self._postponed = True
+            threading.Timer(_AGAIN_S, self._again).start()
+
+    def _again(self) -> None:
+        import _thread
+
+        self._postponed = False
+        _thread.interrupt_main()
 
 
 if __name__ == "__main__":

@@ -8,8 +8,10 @@ from typing import Any
 
 from edgeslam_torch.errors import EdgeSlamError
 
-MAX_BYTES = 64 << 20
-"""Of one file; a benchmark of a thousand runs takes 2 MB."""
+MAX_BYTES = {"JSON": 64 << 20, "TOML": 256 << 10, "YAML": 1 << 20}
+"""Of one file; a benchmark of a thousand runs takes 2 MB, settings and cameras a few kB."""
+MAX_DOTS = 300
+"""In a line of TOML; the time for a dotted key grows with the square of its parts."""
 
 
 def plain_yaml(text: str) -> Any:
@@ -33,7 +35,13 @@ def plain_yaml(text: str) -> Any:
         raise ValueError(" ".join(str(error).split())) from error
 
 
-_PARSERS: dict[str, Callable[[str], Any]] = {"JSON": json.loads, "TOML": tomllib.loads, "YAML": plain_yaml}
+def _toml(text: str) -> dict[str, Any]:
+    if any(line.count(".") > MAX_DOTS for line in text.split("\n")):
+        raise RecursionError
+    return tomllib.loads(text)
+
+
+_PARSERS: dict[str, Callable[[str], Any]] = {"JSON": json.loads, "TOML": _toml, "YAML": plain_yaml}
 
 
 def read_mapping(path: Path, kind: str, error: type[EdgeSlamError]) -> dict[str, Any]:
@@ -48,8 +56,9 @@ def read_mapping(path: Path, kind: str, error: type[EdgeSlamError]) -> dict[str,
         EdgeSlamError: ``error``, with the file's name, if it cannot be read, is malformed, or holds no record.
     """
     try:
-        if path.stat().st_size > MAX_BYTES:
-            raise error(f"{path}: not {kind} of ours ({path.stat().st_size / 1e6:.0f} MB)")
+        size = path.stat().st_size
+        if size > MAX_BYTES[kind]:
+            raise error(f"{path}: not {kind} of ours ({size / 1e6:.1f} MB)")
         record = _PARSERS[kind](path.read_text(encoding="utf-8"))
     except OSError as reason:
         raise error(f"{path}: {reason.strerror or reason}") from reason

@@ -55,7 +55,7 @@ def story(run: RunFolder, score: RunScore | None) -> str:
         whole = "Every frame was" if tracked >= frames else f"{share:.1f} % of the frames were"
         sentences.append(f"{whole} tracked against the map" + _first(run) + ".")
         lost = summary.get("lost_events")
-        if isinstance(lost, int):
+        if isinstance(lost, int) and (lost or tracked):
             sentences.append("Tracking was never lost." if lost == 0 else f"Tracking was lost {_times(lost)}.")
     sentences.append(_scale_sentence(summary))
     sentences.append(_pieces_sentence(summary))
@@ -209,7 +209,10 @@ def _pieces_sentence(summary: dict[str, Any]) -> str:
     pieces = [p for p in listed if isinstance(p, dict) and p.get("supported")] if isinstance(listed, list) else []
     if len(pieces) < 2:
         return ""
-    spans = ", ".join(f"piece {p.get('number')} from {p.get('first_s')} to {p.get('last_s')} s" for p in pieces)
+    spans = ", ".join(
+        f"piece {p.get('number')} from {_float(p.get('first_s')):.1f} to {_float(p.get('last_s')):.1f} s"
+        for p in pieces
+    )
     return f"The map is in {len(pieces)} pieces whose relation is not known: {spans}. Errors across them mean nothing."
 
 

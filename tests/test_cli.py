@@ -10,6 +10,7 @@ import sys
 import time
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from fake_slam import FakeSlam
@@ -54,6 +55,15 @@ def test_run(edgeslam, recording, tmp_path):
 def test_camera_that_stands_still_is_told_apart_from_a_missing_depth_network(recording, tmp_path, capsys):
     assert cli.main(["run", str(recording), "--out", str(tmp_path / "out"), "--no-report"]) == 0
     assert "no point was triangulated" in capsys.readouterr().out
+
+
+def test_what_was_never_tracked_was_not_never_lost(edgeslam, recording, tmp_path):
+    for image in (recording / "rgb").iterdir():
+        cv2.imwrite(str(image), np.zeros((48, 64), np.uint8))
+    code, out, _ = edgeslam("run", recording, "--out", tmp_path / "out", "--no-report")
+    assert code == 0
+    assert "0 of 6 frames tracked (0.0 %), " in out
+    assert "lost" not in out
 
 
 def test_lossless_without_record_is_refused(edgeslam, recording):
@@ -232,6 +242,30 @@ def test_ctrl_c_while_modules_load_ends_with_one_line(recording, tmp_path, modul
     assert (done.returncode, done.stderr.splitlines()[-1]) == (130, "edgeslam: interrupted")
     assert "Traceback" not in done.stderr
     assert not (tmp_path / "out").exists()
+
+
+def test_a_storm_of_ctrl_c_while_modules_load_takes_one_thread(recording, tmp_path):
+    """A thread for every signal used up all that a process may have, and ended in a traceback."""
+    code = """
+import os, signal, sys, threading
+
+class Storm:
+    def find_spec(name, path=None, target=None):
+        if name == "argparse":
+            before = threading.active_count()
+            for _ in range(200):
+                os.kill(os.getpid(), signal.SIGINT)
+            print(threading.active_count() - before)
+
+sys.meta_path.insert(0, Storm)
+from edgeslam_torch.cli import main
+sys.exit(main())
+"""
+    words = ["run", str(recording), "--out", str(tmp_path / "out")]
+    done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (130, "1\n")
+    assert done.stderr.splitlines()[-1] == "edgeslam: interrupted"
+    assert "Traceback" not in done.stderr
 
 
 def test_program_ends_without_a_word_when_interrupted_at_its_end():

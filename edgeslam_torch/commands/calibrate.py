@@ -33,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Calibrate, write the file, and say how good it is."""
-    from edgeslam_torch.errors import ConfigError, OutputError
+    from edgeslam_torch.errors import CalibrationError, ConfigError, OutputError
     from edgeslam_torch.io.calibration import Board, calibrate
 
     if args.board and args.charuco:
@@ -45,7 +45,13 @@ def main(args: argparse.Namespace) -> int:
     if live and len(args.images) > 1:
         raise ConfigError("give one live camera, or pictures")
     pictures = _live_pictures(args.images[0], board, args.views) if live else _pictures(args.images, unreadable)
-    result = calibrate(pictures, board, f"calibrated from {args.images[0]}")
+    try:
+        result = calibrate(pictures, board, f"calibrated from {args.images[0]}")
+    except CalibrationError as error:
+        if not unreadable:
+            raise
+        name, reason = next(iter(unreadable.items()))
+        raise CalibrationError(f"{error}; {len(unreadable)} could not be read (the first: {name}: {reason})") from error
     try:
         args.out.parent.mkdir(parents=True, exist_ok=True)
         result.camera.save(args.out)

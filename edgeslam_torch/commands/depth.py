@@ -11,6 +11,7 @@ from edgeslam_torch.errors import OutputError
 
 if TYPE_CHECKING:
     from edgeslam_torch.geometry.camera import Camera
+    from edgeslam_torch.io.listing import Problem
     from edgeslam_torch.types import DepthMap, Frame
 
 FILES = """\
@@ -21,6 +22,7 @@ files written for every image STEM.jpg, pixel for pixel, lens distortion removed
   STEM_sigma.npy   with --sigma: standard deviation of the logarithm of depth, float32; 0.1 is about 10 %
 """
 MAX_MILLIMETRES = 65535
+_MAX_PROBLEMS_SHOWN = 10
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -50,7 +52,7 @@ def main(args: argparse.Namespace) -> int:
     from edgeslam_torch.frontend.depth_check import MIN_SHARE
 
     predictor = DepthPredictor(args.weights, args.backend, args.threads)
-    camera, frames, length, warnings = _frames(args.source, args.camera, args.max_frames)
+    camera, frames, length, warnings, problems = _frames(args.source, args.camera, args.max_frames)
     for warning in warnings:
         print(f"note: {warning}")
     shares: list[float] = []
@@ -65,6 +67,10 @@ def main(args: argparse.Namespace) -> int:
             write_depth(args.out, _stem(frame, stems), depth, args.sigma)
     except OSError as error:
         raise OutputError(f"{error.filename or args.out}: cannot be written ({error.strerror or error})") from error
+    for problem in problems[:_MAX_PROBLEMS_SHOWN]:
+        print(f"{'left out' if problem.frames else 'note'}: {problem.file}: {problem.reason}")
+    if len(problems) > _MAX_PROBLEMS_SHOWN:
+        print(f"left out: {sum(problem.frames for problem in problems)} in all")
     unknown = sum(share < MIN_SHARE for share in shares)
     if unknown:
         print(f"note: {unknown} of {len(shares)} depth maps are mostly unknown: these weights do not fit these images")
@@ -128,7 +134,8 @@ def _positive(text: str) -> int:
 
 def _frames(
     source: str, camera: str | None, max_frames: int | None
-) -> "tuple[Camera, Iterable[Frame], int | None, list[str]]":
+) -> "tuple[Camera, Iterable[Frame], int | None, list[str], list[Problem]]":
+    """Camera, images, how many, what to say before, and the list that what is left out goes into."""
     from edgeslam_torch.io.camera_choice import choose_camera
     from edgeslam_torch.io.images import SUFFIXES, read_image
     from edgeslam_torch.io.source import open_source
@@ -139,6 +146,6 @@ def _frames(
         image = read_image(path)
         size = (image.shape[1], image.shape[0])
         chosen, warnings = choose_camera(size, camera, [path.parent, path.absolute().parent.parent])
-        return chosen, [Frame(0, 0.0, image, path)], 1, warnings
+        return chosen, [Frame(0, 0.0, image, path)], 1, warnings, []
     opened = open_source(source, camera, max_frames=max_frames)
-    return opened.camera, opened.frames(), opened.length, opened.warnings
+    return opened.camera, opened.frames(), opened.length, opened.warnings, opened.problems

@@ -4,7 +4,7 @@ import argparse
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from edgeslam_torch.config import SlamConfig
@@ -170,7 +170,7 @@ def _report(result: "RunResult", source: "Source") -> None:
     )
     print(
         f"{summary['tracked']} of {summary['offered']} frames tracked ({100 * summary['coverage']:.1f} %{missed}), "
-        f"lost {_times(summary['lost_events'])}, {summary['fps']:.1f} frames/s, "
+        f"{_lost_words(summary)}{summary['fps']:.1f} frames/s, "
         f"{summary['cpu_ms_per_frame']:.0f} ms CPU a frame, {summary['peak_rss_mb'] or 0:.0f} MB"
     )
     if scale["units"] == "metres":
@@ -194,6 +194,13 @@ def _camera_words(camera: "Camera") -> str:
 
 def _best_view(folder: Path) -> str:
     return next((name for name in ("report.html", "map.png") if (folder / name).is_file()), "trajectory.txt")
+
+
+def _lost_words(summary: dict[str, Any]) -> str:
+    """How often tracking was lost; nothing where there was none that could be."""
+    if not summary["tracked"] and not summary["lost_events"]:
+        return ""
+    return f"lost {_times(summary['lost_events'])}, "
 
 
 def _times(count: int) -> str:

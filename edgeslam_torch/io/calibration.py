@@ -176,9 +176,9 @@ def calibrate(
             continue
         views.append(view)
     if size is None or len(views) < _MIN_PICTURES:
-        seen = "; ".join(f"{name}: {reason}" for name, reason in list(rejected.items())[:3])
+        seen = "; ".join(f"{name}: {reason}" for name, reason in list(rejected.items())[:3]) or "no picture was read"
         raise CalibrationError(
-            f"{len(views)} usable pictures, {_MIN_PICTURES} are the least (20 are good); {seen or 'no pictures'}; "
+            f"{len(views)} usable pictures, {_MIN_PICTURES} are the least (20 are good); {seen}; "
             "give the inner corners with --board COLUMNSxROWS"
         )
     return _solve(views, size, board, rejected, source)

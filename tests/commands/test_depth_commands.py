@@ -55,6 +55,16 @@ def pictures(tmp_path: Path, rng: np.random.Generator) -> Path:
     return folder
 
 
+def test_depth_names_the_images_that_it_left_out(
+    weights: Path, pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (pictures / "img1.png").write_bytes(b"\x89PNG")
+    assert run("depth", pictures, "--out", tmp_path / "out", "--weights", weights, "--max-frames", "3") == 0
+    said = capsys.readouterr().out
+    assert "left out: " in said
+    assert "img1.png: " in said
+
+
 def test_depth_of_a_folder(weights: Path, pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
     assert run("depth", pictures, "--out", out, "--weights", weights, "--sigma", "--max-frames", "3") == 0

@@ -83,6 +83,24 @@ def test_no_reason_or_setting_breaks_the_page(run: Path, name: str) -> None:
     assert page.data["events"][0][4] == name
 
 
+def test_pieces_are_named_with_their_seconds(run: Path) -> None:
+    spans = ((0.0, 8.133333), (8.166667, 11.466667))
+    pieces = [{"number": k, "supported": 5, "first_s": a, "last_s": b} for k, (a, b) in enumerate(spans)]
+    story = Page(write_report(with_summary(run, pieces=pieces))).data["story"]
+    assert "piece 0 from 0.0 to 8.1 s, piece 1 from 8.2 to 11.5 s" in story
+
+
+def test_a_run_that_never_tracked_was_not_never_lost(run: Path) -> None:
+    lines = (run / "status.csv").read_text().splitlines()
+    at = lines[0].split(",").index("status")
+    rows = [line.split(",") for line in lines[1:]]
+    kept = [",".join([*row[:at], "starting", *row[at + 1 :]]) for row in rows]
+    (run / "status.csv").write_text("\n".join([lines[0], *kept]) + "\n")
+    story = Page(write_report(with_summary(run, lost_events=0))).data["story"]
+    assert "of the frames were tracked" in story
+    assert "lost" not in story
+
+
 def test_warnings_of_the_run_stand_under_its_story(run: Path) -> None:
     said = ["telemetry's velocities are not used", "the video stood still </script>"]
     file = write_report(with_summary(run, warnings=said))

@@ -121,6 +121,14 @@ def test_command_writes_a_file_that_every_command_reads(rng, tmp_path, capsys):
     assert "reprojection error" in text
 
 
+def test_pictures_that_cannot_be_read_are_named_when_too_few_are_left(tmp_path, capsys):
+    (tmp_path / "bomb.pgm").write_bytes(b"P5 17000 17000 255\n")
+    assert main(["calibrate", str(tmp_path), "--board", "8x6", "--out", str(tmp_path / "c.yaml")]) == 1
+    said = capsys.readouterr().err
+    assert "1 could not be read (the first: " in said
+    assert "bomb.pgm: image is 17000x17000" in said
+
+
 @pytest.mark.parametrize("arguments", [["nowhere"], ["--board", "8by6"], ["--board", "8x6", "--charuco", "9x7"]])
 def test_command_refuses_in_one_line(arguments, tmp_path, capsys):
     given = arguments if arguments == ["nowhere"] else [str(tmp_path), *arguments]
