@@ -1,6 +1,7 @@
 """Fixtures that every test folder shares."""
 
 import os
+import signal
 import zlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -13,6 +14,17 @@ from hypothesis import settings
 # No deadline: how long one case takes says something about what else the machine does, not about the code.
 settings.register_profile("edgeslam", deadline=None)
 settings.load_profile("edgeslam")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Hear signals that whoever started us ignores, as shells do for what runs in the background.
+
+    The programs under test would inherit that, and heed it, as `nohup` wants it.
+    """
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    for name in ("SIGTERM", "SIGHUP", "SIGQUIT"):
+        if hasattr(signal, name):
+            signal.signal(getattr(signal, name), signal.SIG_DFL)
 
 
 @pytest.fixture

@@ -185,7 +185,7 @@ class EdgeMap:
         They are of one moment, from whatever thread they are asked for.
         """
         with self.map.lock:  # the arrays are copies from here on
-            if not self.hosts:
+            if not any(len(h.uv) for h in self.hosts):
                 empty = np.zeros((0, 3), np.float32)
                 return PointCloud(empty, np.zeros((0, 3), np.uint8), np.zeros(0, np.float32), np.zeros(0, np.int32))
             p_w = np.concatenate([se3.transform(self._T_w_c(h), h.p_c) for h in self.hosts])

@@ -104,7 +104,7 @@ def test_recording_of_a_live_run_holds_pictures_plots_and_the_growing_map(tmp_pa
     for k in range(250):
         T[0, 3] = 0.01 * k
         status = FrameStatus.TRACKED if k < 200 else FrameStatus.LOST
-        output = SlamOutput(k, 1e9 + k / 30, T, status, "", 9, 8 + k, 0.1, True, scale, {"tracking": 4.0})
+        output = SlamOutput(k, 1e9 + k / 30, T, status, "", 9, 8 + k, 0.1, True, 0, scale, True, 0, {"tracking": 4.0})
         pictures = (np.full((480, 640, 3), 100, np.uint8), np.ones((5, 2)), np.ones((7, 2)), np.ones((48, 64)))
         viewer.step(output, *(pictures if k < 3 else ()))
         if k in (50, 100):

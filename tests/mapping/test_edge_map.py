@@ -1,5 +1,7 @@
 """The semi-dense map: fusion in cells, agreement between keyframes, and its bound."""
 
+import warnings
+
 import numpy as np
 import pytest
 from point_map import CAMERA, PointMap, small_motion
@@ -159,3 +161,14 @@ def test_the_nearest_edge_pixel_is_found_within_two_pixels(rng):
     assert np.mean(found[nearest <= AGREE_PX] >= 0) > 0.95
     assert (named - nearest)[found >= 0].max() < np.sqrt(2.0)  # twice what rounding moves a query
     assert np.mean(named[found >= 0] == nearest[found >= 0]) > 0.8
+
+
+def test_keyframes_without_a_measured_edge_are_an_empty_map(rng):
+    """No median of nothing: numpy warns, and a warning here fails."""
+    points = PointMap(rng, 300, 3)
+    points.fill()
+    edges = EdgeMap(points.map, CAMERA, EdgeConfig(), 0.35)
+    edges.hosts.append(host(points, 0, np.zeros((0, 3))))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert edges.points().p_w.shape == (0, 3)
