@@ -10,16 +10,29 @@ from edgeslam_torch.run import run
 pytestmark = [pytest.mark.data, pytest.mark.slow, pytest.mark.timeout(3600)]
 
 
-@pytest.mark.parametrize(
-    ("name", "ate_m", "points"), [("tum_fr1_xyz", 0.020, 30_000), ("7scenes_redkitchen", 0.050, 1)]
-)
-def test_sequence_is_within_its_bar(data_dir, tmp_path, name, ate_m, points):
+BARS = {
+    # name: final and live ATE [m], share of the frames on the map, edge points; the worst of five seeds and a tenth more
+    "tum_fr1_xyz": (0.0112, 0.0120, 1.0, 95_000),
+    "7scenes_redkitchen": (0.0390, 0.0420, 1.0, 78_000),
+    "tum_fr1_rpy_depth": (0.0260, 0.0330, 0.97, 38_000),
+    "euroc_mh05_a": (0.0450, 0.0500, 1.0, 38_000),
+    "fr3_notexture_a": (0.0160, 0.0200, 0.99, 4_400),
+    "tartan_hospital": (0.2200, 0.2200, 0.98, 75_000),
+}
+
+
+@pytest.mark.parametrize("name", BARS)
+def test_sequence_is_within_its_bar(data_dir, tmp_path, name):
+    """Figures of today with a margin; those that a user's flight is like beside those that were tuned on."""
+    ate_m, live_m, share, points = BARS[name]
     result = run(open_source(data_dir / name), tmp_path / "out", SlamConfig())
     score = evaluate_run(result.folder, data_dir / name, judge_map=False)
     assert score.ate_sim3_m <= ate_m
-    assert score.coverage >= 0.99
-    assert result.summary["first_pose_frame"] == 0
+    assert score.ate_online_sim3_m <= live_m
+    assert score.coverage >= share
     assert result.summary["map"]["edge_points"] >= points
+    assert [p for p in result.summary["pieces"] if p["supported"]] == result.summary["pieces"]
+    assert len(result.summary["pieces"]) == 1
 
 
 def test_two_runs_of_a_recording_give_the_same_bytes(data_dir, tmp_path):
