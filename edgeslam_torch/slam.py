@@ -62,9 +62,9 @@ MIN_KEYPOINTS = 100
 
 ADOPT_SHARE = 0.6
 """When fewer of the first keyframe's points agree than this share of the most so far, the view has changed: the map
-that the depth network made is taken as it is, since parallax may never come (a turn, a climb, a hover). At 0.4 two views
-come first on redkitchen and its map is better (median 3.7 against 4.2 cm); on bare boards they come first in some seeds,
-and are wrong (ATE .011 to .030 m, .0105 in all five seeds at 0.6)."""
+that the depth network made is taken as it is, since parallax may never come (a turn, a climb, a hover). At 0.4 two
+views come first on redkitchen and its map is better (median 3.7 against 4.2 cm); on bare boards they come first in
+some seeds, and are wrong (ATE .011 to .030 m; .0105 in all five seeds at 0.6)."""
 
 ACCELERATION_M_S2 = 3.0
 ANGULAR_ACCELERATION_RAD_S2 = 20.0

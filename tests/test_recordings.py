@@ -11,7 +11,7 @@ pytestmark = [pytest.mark.data, pytest.mark.slow, pytest.mark.timeout(3600)]
 
 
 BARS = {
-    # name: final and live ATE [m], share of the frames on the map, edge points; the worst of five seeds and a tenth more
+    # name: final and live ATE [m], share of the frames on the map, edge points; today's worst and a tenth more
     "tum_fr1_xyz": (0.0112, 0.0120, 1.0, 95_000),
     "7scenes_redkitchen": (0.0390, 0.0420, 1.0, 78_000),
     "tum_fr1_rpy_depth": (0.0260, 0.0330, 0.97, 38_000),

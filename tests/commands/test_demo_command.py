@@ -39,7 +39,7 @@ def test_demo_runs_and_judges_itself(tmp_path: Path) -> None:
     recorded = record(tmp_path / "flight", settings)
     demo = run_and_judge(tmp_path, recorded, settings)
     assert demo.run.summary["frames"] == 72
-    # Six seconds in small pictures: .031 m of 2.03, scale 7.6 % off (8 s of climb are missing), map 5.9 cm when written.
+    # Six seconds in small pictures; .031 m of 2.03, scale 7.6 % off, map 5.9 cm when written.
     assert demo.score.coverage == 1.0
     assert demo.path_m == pytest.approx(2.03, abs=0.01)
     assert demo.score.ate_sim3_m < 0.045
