@@ -58,7 +58,7 @@ def main() -> int:
 
 def write_guides(site: Path) -> list[Path]:
     """Write every guide as a page, with the pictures that they show; return the guides' files."""
-    guides = [ROOT / name for name in GUIDES] + sorted((ROOT / "docs").glob("*.md"))
+    guides = [ROOT / name for name in GUIDES] + sorted((ROOT / "docs").rglob("*.md"))
     for guide in guides:
         write_guide(site, guide, guides)
     copy_assets(site)
@@ -120,16 +120,28 @@ def modules() -> list[str]:
 
 
 def page_name(guide: Path) -> str:
-    """Where a guide goes, relative to the site."""
-    return "index.html" if guide.name == "README.md" else str(guide.relative_to(ROOT).with_suffix(".html"))
+    """Path of a guide's page, relative to the site."""
+    path = guide.relative_to(ROOT)
+    return str(path.with_name("index.html") if path.name == "README.md" else path.with_suffix(".html"))
+
+
+def is_in_menu(guide: Path) -> bool:
+    """Whether every page links to a guide; a folder's index links to the pages below it."""
+    return guide.name == "README.md" or guide.parent in (ROOT, ROOT / "docs")
+
+
+def menu_title(guide: Path) -> str:
+    """Title of a guide in the menu; of a folder's index, the folder's name."""
+    folder = guide.parent.name if guide.name == "README.md" and guide.parent != ROOT else guide.stem
+    return folder.replace("_", " ").capitalize()
 
 
 def write_guide(site: Path, guide: Path, guides: list[Path]) -> None:
     """One guide as a page, with links to the others."""
     target = site / page_name(guide)
     target.parent.mkdir(parents=True, exist_ok=True)
-    up = "" if target.parent == site else "../"
-    links = [(page_name(other), other.stem.replace("_", " ").capitalize()) for other in guides]
+    up = "../" * len(target.parent.relative_to(site).parts)
+    links = [(page_name(other), menu_title(other)) for other in guides if is_in_menu(other)]
     here = {page_name(guide): ' aria-current="page"'}
     nav = "\n".join(
         f'<li><a href="{up}{page}"{here.get(page, "")}>{title}</a></li>'
@@ -137,12 +149,12 @@ def write_guide(site: Path, guide: Path, guides: list[Path]) -> None:
     )
     body = str(markdown2.markdown(guide.read_text(encoding="utf-8"), extras=EXTRAS))
     body = re.sub(r'href="([^":]+)\.md(#[^"]*)?"', link_to_page, body)
-    target.write_text(PAGE.format(title=guide.stem, nav=nav, body=body), encoding="utf-8")
+    target.write_text(PAGE.format(title=menu_title(guide), nav=nav, body=body), encoding="utf-8")
 
 
 def link_to_page(match: re.Match[str]) -> str:
     """A link to a Markdown file as a link to its page."""
-    path = "index" if match[1].split("/")[-1] == "README" else match[1]
+    path = re.sub(r"(^|/)README$", r"\1index", match[1])
     return f'href="{path}.html{match[2] or ""}"'
 
 

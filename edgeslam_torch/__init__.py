@@ -11,7 +11,7 @@ if TYPE_CHECKING:  # as type checkers read it; `typing` itself takes longer to l
     from typing import Any
 
 # torch's OpenMP threads spin while they wait; with a busy second core that turns a 26 ms inference
-# into 419 ms (docs/decisions.md, "Threads"). Both must be set before torch is first imported.
+# into 419 ms (docs/decisions/0025-threads-and-seeds.md). Both must be set before torch is first imported.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 os.environ.setdefault("GOMP_SPINCOUNT", "0")
 

@@ -114,7 +114,7 @@ class EdgeSlam:
         depth: DepthFunction | None = None,
         realtime: bool = False,
     ) -> None:
-        # One thread each: spinning pools slow each other down more than they help (docs/decisions.md, "Threads").
+        # One thread each: spinning pools slow each other down more than they help (docs/decisions/0025).
         cv2.setNumThreads(1)
         torch.set_num_threads(1)
         self.camera = camera

@@ -1,6 +1,6 @@
 """The benchmark's figures, what they may differ by without meaning anything, and the comparison of two records.
 
-Three kinds of figures, three kinds of noise; docs/decisions.md ("Noise of the benchmark") argues them:
+Three kinds of figures, three kinds of noise; docs/decisions/0026-benchmark-noise.md gives the reasons:
 
 - accuracy: offline the same seed gives the same bytes, so what differs is the seed. Two medians differ by chance by
   ``2 sqrt(s_a^2/n_a + s_b^2/n_b)``, with ``s`` the sample standard deviation over the seeds;

@@ -35,7 +35,7 @@ class AngleLoss(ResidualLoss):
 
     Note:
         The cosine is computed directly; the paper's cos(arccos(.)) has an infinite derivative at straight angles
-        (docs/decisions.md, "L-shape").
+        (docs/decisions/0014-l-shape-loss.md).
     """
 
     def __init__(
@@ -91,7 +91,7 @@ class CollinearityLoss(ResidualLoss):
 
     Note:
         Offsets are divided by the arm's length unless ``literal``: in metres they vanish with the depth
-        (docs/decisions.md, "L-shape"). The line is a constant for the gradient; at the best fit its own
+        (docs/decisions/0014-l-shape-loss.md). The line is a constant for the gradient; at the best fit its own
         derivative drops out.
     """
 

@@ -47,7 +47,7 @@ ALLOWED_UP = {
 """Exceptions, each with its reason."""
 
 NEVER = {"evo", "djitellopy", "open3d", "torchvision", "pypose"}
-"""GPL, or measured and found wanting (docs/decisions.md); tests may use some as outside oracles."""
+"""GPL, or measured and found wanting (docs/decisions/0028); tests may use some as outside oracles."""
 
 ORACLES = {"gtsam": "edgeslam_torch.optim.benchmark"}
 """Packages that one module may compare with when they happen to be installed."""

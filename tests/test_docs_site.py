@@ -99,7 +99,7 @@ def test_what_a_page_would_load_is_found(tmp_path: Path) -> None:
 
 def test_no_guide_installs_the_package_from_an_index() -> None:
     root = BUILD.parent.parent
-    guides = [root / name for name in build.GUIDES] + sorted((root / "docs").glob("*.md"))
+    guides = [root / name for name in build.GUIDES] + sorted((root / "docs").rglob("*.md"))
     for path in [*guides, *(root / "edgeslam_torch").rglob("*.py")]:
         found = re.findall(r"pip install[^\n]*edgeslam.torch", path.read_text(encoding="utf-8"))
         assert not found, f"{path}: the package is on no index; pip install ."

@@ -1,7 +1,7 @@
 """Hamming matching of ORB descriptors: guided by a predicted pixel, or between whole frames.
 
 Candidates come from a grid over keypoint positions, the distance from the descriptors' bits; a KD-tree over the
-descriptors, as the paper has it, is slower and finds less (docs/decisions.md, "KD-tree").
+descriptors, as the paper has it, is slower and finds less (docs/decisions/0018-no-kd-tree-for-descriptors.md).
 """
 
 from dataclasses import dataclass

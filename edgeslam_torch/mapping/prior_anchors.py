@@ -20,7 +20,7 @@ STEPS = 4
 """Gauss-Newton steps in one variable, starting from the prior."""
 MIN_SIGMA_LOG = 0.5
 """Relative uncertainty of an expected depth at least. A network flattens scenes that it was not taught: in a hall it
-saw a quarter of the log depth that was there, and its own sigma says nothing of it (docs/decisions.md, "One map")."""
+saw a quarter of the log depth that was there, and its own sigma says nothing of it (docs/decisions/0006)."""
 MIN_SHARE = 0.05
 """Inverse depth, relative to the prior's, below which a step does not lead: still in front of the camera."""
 

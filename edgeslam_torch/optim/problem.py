@@ -179,7 +179,7 @@ class LmConfig:
     device: str = "cpu"
     """Where torch computes, ``cuda`` for instance; a window of usual size is too small to gain from it."""
     compile: bool = False
-    """Run the hot kernels through ``torch.compile``: pays when many windows are solved, see docs/decisions.md."""
+    """Run the hot kernels through ``torch.compile``: pays when many windows are solved."""
     float32_blocks: bool = True
     """Edge blocks, and what couples anchors with poses, in single precision; the reduced system is always double."""
     mu: float = 1e-4
