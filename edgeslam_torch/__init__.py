@@ -31,7 +31,7 @@ _LAZY = {
     "SlamConfig": "edgeslam_torch.config",
     "SlamOutput": "edgeslam_torch.types",
     "TelemetrySample": "edgeslam_torch.types",
-    "open_source": "edgeslam_torch.io.source",
+    "open_source": "edgeslam_torch.readers.source",
 }
 __all__ = [*_LAZY, "__version__"]
 

@@ -12,10 +12,16 @@ if TYPE_CHECKING:
 COMMANDS = {
     "demo": ("edgeslam_torch.commands.demo", "fly a simulated drone through a simulated house; needs no data"),
     "run": ("edgeslam_torch.commands.run", "trajectory and edge map from a recording, a video or a live camera"),
-    "eval": ("edgeslam_torch.commands.eval", "judge runs or trajectory files against ground truth"),
-    "bench": ("edgeslam_torch.commands.bench", "accuracy and speed in one table, beside other systems"),
-    "judge": ("edgeslam_torch.commands.judge", "every recording, variant and simulated flight in one table with bars"),
-    "ablation": ("edgeslam_torch.commands.ablation", "what each loss does: one table, one thing changed at a time"),
+    "eval": ("edgeslam_torch.commands.judging.eval", "judge runs or trajectory files against ground truth"),
+    "bench": ("edgeslam_torch.commands.judging.bench", "accuracy and speed in one table, beside other systems"),
+    "judge": (
+        "edgeslam_torch.commands.judging.judge",
+        "every recording, variant and simulated flight in one table with bars",
+    ),
+    "ablation": (
+        "edgeslam_torch.commands.judging.ablation",
+        "what each loss does: one table, one thing changed at a time",
+    ),
     "report": ("edgeslam_torch.commands.report", "make the report page of a run"),
     "view": ("edgeslam_torch.commands.view", "open a run's report or viewer"),
     "depth": ("edgeslam_torch.commands.depth", "depth maps of images, folders or videos"),

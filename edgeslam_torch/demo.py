@@ -12,17 +12,17 @@ import numpy as np
 
 from edgeslam_torch.config import SlamConfig
 from edgeslam_torch.errors import ConfigError, OutputError
-from edgeslam_torch.eval.run_folder import open_run
-from edgeslam_torch.eval.run_score import RunScore, evaluate_run
+from edgeslam_torch.eval.inputs.run_folder import open_run
+from edgeslam_torch.eval.metrics.run_score import RunScore, evaluate_run
 from edgeslam_torch.geometry.camera import Camera
-from edgeslam_torch.io.source import open_source
+from edgeslam_torch.readers.source import open_source
 from edgeslam_torch.run import Listener, RunResult, run
-from edgeslam_torch.synthetic.courses import record_flight, simulated_camera
-from edgeslam_torch.synthetic.degrade import CLEAN, CameraFaults
-from edgeslam_torch.synthetic.flight import Flight, FlightPlan, fly
-from edgeslam_torch.synthetic.rooms import corridor, room
-from edgeslam_torch.synthetic.telemetry import TelemetryFaults
-from edgeslam_torch.synthetic.world import World
+from edgeslam_torch.synthetic.flights.courses import record_flight, simulated_camera
+from edgeslam_torch.synthetic.flights.degrade import CLEAN, CameraFaults
+from edgeslam_torch.synthetic.flights.flight import Flight, FlightPlan, fly
+from edgeslam_torch.synthetic.flights.telemetry import TelemetryFaults
+from edgeslam_torch.synthetic.house.rooms import corridor, room
+from edgeslam_torch.synthetic.house.world import World
 
 WORLDS: dict[str, Callable[[np.random.Generator], World]] = {"room": room, "corridor": corridor}
 CAMERAS = {

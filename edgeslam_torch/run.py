@@ -17,17 +17,15 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, Protocol
 
+from edgeslam_torch.calibration.camera_choice import GUESS, GUESS_COST, GUESS_WARNING
 from edgeslam_torch.config import SlamConfig
 from edgeslam_torch.errors import SourceError
+from edgeslam_torch.files.config_file import to_toml
 from edgeslam_torch.geometry.camera import Camera
-from edgeslam_torch.io.camera_choice import GUESS, GUESS_COST, GUESS_WARNING
-from edgeslam_torch.io.config_file import to_toml
-from edgeslam_torch.io.flight import telemetry_gap
-from edgeslam_torch.io.map_picture import write_map_picture
-from edgeslam_torch.io.pace import Counter, at_their_pace
-from edgeslam_torch.io.read_ahead import read_ahead
-from edgeslam_torch.io.run_writer import CAMERA, PICTURE, RunWriter
-from edgeslam_torch.io.source import Source
+from edgeslam_torch.readers.layouts.flight import telemetry_gap
+from edgeslam_torch.readers.pace import Counter, at_their_pace
+from edgeslam_torch.readers.read_ahead import read_ahead
+from edgeslam_torch.readers.source import Source
 from edgeslam_torch.run_summary import Tally, summarise, without_folders
 from edgeslam_torch.types import (
     FloatArray,
@@ -39,6 +37,8 @@ from edgeslam_torch.types import (
     Support,
     TelemetrySample,
 )
+from edgeslam_torch.writers.map_picture import write_map_picture
+from edgeslam_torch.writers.run_writer import CAMERA, PICTURE, RunWriter
 
 logger = logging.getLogger(__name__)
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from edgeslam_torch import __version__
 from edgeslam_torch.geometry.camera import Camera
-from edgeslam_torch.io.source import Source
+from edgeslam_torch.readers.source import Source
 from edgeslam_torch.types import Piece, ScaleEstimate, SlamOutput
 
 MAX_PROBLEMS = 100

@@ -26,13 +26,14 @@ from edgeslam_torch.fusion.published import Published, first_pose
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.mount import camera_on_body
-from edgeslam_torch.mapping.depth_prior import fit_to_anchors, sample
+from edgeslam_torch.map.depth_prior import fit_to_anchors, sample
+from edgeslam_torch.map.keyframe import Keyframe, make_keyframe
+from edgeslam_torch.map.slam_map import SlamMap
+from edgeslam_torch.map.trajectory import TrajectoryLog
 from edgeslam_torch.mapping.edge_map import EdgeMap
-from edgeslam_torch.mapping.keyframe import Keyframe, make_keyframe
 from edgeslam_torch.mapping.last_refinement import last_refinement, lm_config
 from edgeslam_torch.mapping.mapper import Mapper
 from edgeslam_torch.mapping.prior_anchors import depth_slack_px
-from edgeslam_torch.mapping.slam_map import SlamMap
 from edgeslam_torch.optim.problem import PosePrior
 from edgeslam_torch.tracking.bootstrap import Bootstrap, StartedMap
 from edgeslam_torch.tracking.edge_tracker import MIN_EDGES, EdgeTracker, PointsInFrame
@@ -43,7 +44,6 @@ from edgeslam_torch.tracking.lazy_view import LazyView
 from edgeslam_torch.tracking.relocaliser import relocalise
 from edgeslam_torch.tracking.self_calibration import calibration_warning
 from edgeslam_torch.tracking.tracker import Track, Tracker, View, make_view, median_parallax
-from edgeslam_torch.trajectory import TrajectoryLog
 from edgeslam_torch.types import (
     FloatArray,
     Frame,
@@ -748,7 +748,7 @@ def _grey(frame: Frame, camera: Camera) -> np.ndarray:
 def _depth_from_config(config: SlamConfig) -> DepthFunction | None:
     if config.depth.weights == "none":
         return None
-    from edgeslam_torch.frontend.depth import DepthPredictor
+    from edgeslam_torch.frontend.depth_network import DepthPredictor
 
     weights = None if config.depth.weights == "default" else Path(config.depth.weights)
     return DepthPredictor(weights=weights, backend=config.depth.backend)

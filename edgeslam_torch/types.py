@@ -37,7 +37,7 @@ class TelemetrySample:
     """One state message of the drone in SI units; a missing field is NaN.
 
     Velocity is in the frame that was fixed at power-on, turned to our world axes (x forward at power-on, y left,
-    z up); `io/tello.py` makes this from the SDK's north-east-down decimetres.
+    z up); `drone/tello.py` makes this from the SDK's north-east-down decimetres.
     """
 
     stamp_s: float

@@ -10,8 +10,8 @@ import safetensors.torch
 import torch
 from torch import Tensor
 
-from edgeslam_torch.atomic import write_atomically
 from edgeslam_torch.errors import WeightsError
+from edgeslam_torch.files.atomic import write_atomically
 from edgeslam_torch.models.fastdepth import FastDepth
 from edgeslam_torch.models.layout import STEP_COUNTER, Widths
 from edgeslam_torch.models.record import (

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
-from edgeslam_torch.atomic import write_text
 from edgeslam_torch.errors import WeightsError
+from edgeslam_torch.files.atomic import write_text
 from edgeslam_torch.models.record import DEFAULT_WEIGHTS
 from edgeslam_torch.models.weights_file import MAX_FILE_BYTES
 

@@ -14,24 +14,25 @@ LINKED = ("models", "losses", "train", "eval")
 """Folders at the root that are parts of the package, by links where the checkout has them."""
 
 LAYERS: tuple[tuple[str, ...], ...] = (
-    ("errors", "types", "atomic"),
-    ("record_files",),
+    ("errors", "types"),
+    ("files",),
     ("geometry", "config"),
     ("models", "synthetic"),
     ("losses",),
     ("optim",),
     ("frontend", "fusion"),
+    ("map",),
     ("mapping",),
     ("tracking",),
-    ("trajectory",),
     ("slam",),
-    ("io",),
+    ("drone", "calibration"),
+    ("readers",),
+    ("writers",),
     ("progress", "run_summary"),
     ("run",),
     ("eval",),
     ("train",),
-    ("viewer", "demo", "emulator"),
-    ("live_view",),
+    ("viewer", "demo"),
     ("commands",),
     ("command_line",),
     ("cli",),
@@ -42,7 +43,6 @@ RANK = {part: rank for rank, row in enumerate(LAYERS) for part in row}
 
 ALLOWED_UP = {
     ("config", "fusion"),  # fusion/config.py holds its own section, and imports nothing
-    ("mapping", "tracking"),  # the mapper looks for old anchors in a keyframe with tracking's search by projection
 }
 """Exceptions, each with its reason."""
 

@@ -215,7 +215,8 @@ def test_commands_without_a_module_are_not_offered(edgeslam, monkeypatch):
 
 def test_every_command_module_is_in_the_table():
     folder = Path(cli.__file__).parent / "commands"
-    modules = {f"edgeslam_torch.commands.{p.stem}" for p in folder.glob("*.py") if not p.stem.startswith("_")}
+    files = [p.relative_to(folder).with_suffix("") for p in folder.rglob("*.py") if not p.stem.startswith("_")]
+    modules = {".".join(("edgeslam_torch.commands", *p.parts)) for p in files}
     assert modules <= {module for module, _ in cli.COMMANDS.values()}
 
 

@@ -3,8 +3,8 @@
 import pytest
 
 from edgeslam_torch.config import SlamConfig
-from edgeslam_torch.eval.run_score import evaluate_run
-from edgeslam_torch.io.source import open_source
+from edgeslam_torch.eval.metrics.run_score import evaluate_run
+from edgeslam_torch.readers.source import open_source
 from edgeslam_torch.run import run
 
 pytestmark = [pytest.mark.data, pytest.mark.slow, pytest.mark.timeout(3600)]

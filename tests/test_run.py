@@ -13,14 +13,14 @@ from fake_slam import FakeSlam
 
 from edgeslam_torch.config import SlamConfig
 from edgeslam_torch.errors import EdgeSlamError, SourceError, WeightsError
-from edgeslam_torch.eval.run_folder import open_run
+from edgeslam_torch.eval.inputs.run_folder import open_run
+from edgeslam_torch.files.config_file import load_config
 from edgeslam_torch.geometry.camera import Camera
-from edgeslam_torch.io.config_file import load_config
-from edgeslam_torch.io.pace import Counter, at_their_pace
-from edgeslam_torch.io.ply import read_ply
-from edgeslam_torch.io.source import open_source
+from edgeslam_torch.readers.pace import Counter, at_their_pace
+from edgeslam_torch.readers.source import open_source
 from edgeslam_torch.run import Mode, _load_slam, run
 from edgeslam_torch.types import Frame, TelemetrySample
+from edgeslam_torch.writers.ply import read_ply
 
 FILES = {
     "trajectory.txt",

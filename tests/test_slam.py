@@ -12,7 +12,7 @@ from rendered import CAMERA, film, patchwork, sideways, stairs_world
 
 from edgeslam_torch.config import DepthConfig, SlamConfig
 from edgeslam_torch.errors import SourceError
-from edgeslam_torch.eval.align import umeyama
+from edgeslam_torch.eval.metrics.align import umeyama
 from edgeslam_torch.fusion.published import T_LEVEL
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.slam import AFTER_LOSS, EdgeSlam

@@ -12,8 +12,8 @@ import numpy as np
 
 from edgeslam_torch.models.fastdepth import FastDepth
 from edgeslam_torch.models.record import Metadata
-from edgeslam_torch.train.augment import View
 from edgeslam_torch.train.validate import MAX_DEPTH_M, MIN_DEPTH_M, predict_metres
+from edgeslam_torch.train.views.augment import View
 from edgeslam_torch.types import FloatArray
 
 PIXELS_PER_VIEW = 500

@@ -22,13 +22,13 @@ from edgeslam_torch.models.checkpoint import build_network, load_checkpoint, sav
 from edgeslam_torch.models.fastdepth import FastDepth
 from edgeslam_torch.models.imagenet import load_imagenet_encoder
 from edgeslam_torch.models.record import Metadata
-from edgeslam_torch.train.augment import AugmentConfig, View
 from edgeslam_torch.train.calibrate_sigma import calibrate_sigma
-from edgeslam_torch.train.datasets import load_depth_folder
 from edgeslam_torch.train.recipe import Hooks, TrainConfig, TrainState, train
-from edgeslam_torch.train.rendered import load_rendered, render_rooms
 from edgeslam_torch.train.signals import Source, Supervised
 from edgeslam_torch.train.validate import score
+from edgeslam_torch.train.views.augment import AugmentConfig, View
+from edgeslam_torch.train.views.datasets import load_depth_folder
+from edgeslam_torch.train.views.rendered import load_rendered, render_rooms
 
 logger = logging.getLogger(__name__)
 

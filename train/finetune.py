@@ -18,18 +18,18 @@ from edgeslam_torch.errors import SourceError
 from edgeslam_torch.models.checkpoint import load_checkpoint, save_checkpoint
 from edgeslam_torch.models.fastdepth import FastDepth
 from edgeslam_torch.models.record import Metadata
-from edgeslam_torch.train.augment import View
-from edgeslam_torch.train.datasets import DepthFolder
-from edgeslam_torch.train.distributed import by_first, rank
 from edgeslam_torch.train.given import Given, labelled_set, posed_set, weights_name
 from edgeslam_torch.train.out_folder import TEACHER, TENSORBOARD, WEIGHTS, OutFolder
 from edgeslam_torch.train.outcome import Outcome
-from edgeslam_torch.train.posed import PosedSequence, PosedView
+from edgeslam_torch.train.processes.distributed import by_first, rank
 from edgeslam_torch.train.recipe import BEST, FINAL, Hooks, TrainConfig, TrainState, train
 from edgeslam_torch.train.self_supervised import SelfSupervised, fit_log_scale
 from edgeslam_torch.train.signals import Signal, Source, Supervised
 from edgeslam_torch.train.teacher import Taught, teach
 from edgeslam_torch.train.validate import DepthScores, can_be_scored, predict_metres, score
+from edgeslam_torch.train.views.augment import View
+from edgeslam_torch.train.views.datasets import DepthFolder
+from edgeslam_torch.train.views.posed import PosedSequence, PosedView
 from edgeslam_torch.train.watchers import ProgressBar, TensorBoard
 
 logger = logging.getLogger(__name__)

@@ -11,8 +11,8 @@ import numpy as np
 
 from edgeslam_torch.models.fastdepth import FastDepth
 from edgeslam_torch.models.record import Metadata
-from edgeslam_torch.train.datasets import DepthFolder
-from edgeslam_torch.train.posed import PosedSequence
+from edgeslam_torch.train.views.datasets import DepthFolder
+from edgeslam_torch.train.views.posed import PosedSequence
 
 NOT_COMPARED = ("steps", "patience", "validate_every", "checkpoint_every", "warmup_steps")
 """Settings that say how far training goes: more of the same."""

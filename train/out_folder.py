@@ -15,13 +15,13 @@ from pathlib import Path
 from typing import Any
 
 from edgeslam_torch import __version__
-from edgeslam_torch.atomic import write_text
 from edgeslam_torch.errors import ConfigError, OutputError
-from edgeslam_torch.io.own_folder import FolderLock, check_free
-from edgeslam_torch.train.distributed import by_first, rank, world
+from edgeslam_torch.files.atomic import write_text
 from edgeslam_torch.train.given import NOT_COMPARED, Given, given_from_json
 from edgeslam_torch.train.outcome import Outcome
+from edgeslam_torch.train.processes.distributed import by_first, rank, world
 from edgeslam_torch.train.recipe import BEST, CURVE, FINAL, LAST, saved_step
+from edgeslam_torch.writers.own_folder import FolderLock, check_free
 
 RECORD, WEIGHTS = "finetune.json", "weights.safetensors"
 TENSORBOARD, TEACHER = "tensorboard", "teacher"

@@ -18,12 +18,12 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from edgeslam_torch.atomic import write_atomically, write_text
 from edgeslam_torch.errors import ConfigError, EdgeSlamError, WeightsError
+from edgeslam_torch.files.atomic import write_atomically, write_text
 from edgeslam_torch.models.checkpoint import save_checkpoint
 from edgeslam_torch.models.fastdepth import FastDepth
 from edgeslam_torch.models.record import Metadata
-from edgeslam_torch.train.distributed import add_up, by_first, everyones, rank, world
+from edgeslam_torch.train.processes.distributed import add_up, by_first, everyones, rank, world
 from edgeslam_torch.train.signals import Signal, Slot
 
 logger = logging.getLogger(__name__)

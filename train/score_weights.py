@@ -10,10 +10,10 @@ import torch
 from edgeslam_torch.models.checkpoint import load_checkpoint
 from edgeslam_torch.models.fastdepth import FastDepth
 from edgeslam_torch.models.record import Metadata
-from edgeslam_torch.train.augment import View
 from edgeslam_torch.train.calibrate_sigma import coverage, residuals_and_sigma
-from edgeslam_torch.train.datasets import load_depth_folder
 from edgeslam_torch.train.validate import score
+from edgeslam_torch.train.views.augment import View
+from edgeslam_torch.train.views.datasets import load_depth_folder
 
 HEADER = (
     "| weights | recording | images | AbsRel | scaled | RMSE [m] | delta1 | delta1 scaled | AbsRel at edges "

@@ -10,18 +10,18 @@ from torch import Tensor
 
 from edgeslam_torch.losses.base import Reduction, back_project, move, project
 from edgeslam_torch.losses.cycle import CycleForm, CycleLoss
-from edgeslam_torch.losses.depth import LaplaceNll, masked_mean
+from edgeslam_torch.losses.depth_terms import LaplaceNll, masked_mean
 from edgeslam_torch.losses.lshape import AngleLoss, CollinearityLoss, LShapeLoss
 from edgeslam_torch.losses.photometric import PhotometricLoss, SmoothnessLoss
 from edgeslam_torch.losses.robust import Kernel
 from edgeslam_torch.models.fastdepth import FastDepth
 from edgeslam_torch.models.record import Metadata
-from edgeslam_torch.train.augment import AugmentConfig, View, recolour, scaled_K, warp
-from edgeslam_torch.train.junctions import junction_points, seen_cosines
-from edgeslam_torch.train.posed import PosedSequence, PosedView, relative_motion
 from edgeslam_torch.train.signals import Slot
-from edgeslam_torch.train.straight import straight_edges
 from edgeslam_torch.train.validate import image_tensor
+from edgeslam_torch.train.views.augment import AugmentConfig, View, recolour, scaled_K, warp
+from edgeslam_torch.train.views.junctions import junction_points, seen_cosines
+from edgeslam_torch.train.views.posed import PosedSequence, PosedView, relative_motion
+from edgeslam_torch.train.views.straight import straight_edges
 from edgeslam_torch.types import FloatArray
 
 EDGES = 600

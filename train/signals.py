@@ -8,12 +8,12 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from edgeslam_torch.losses.depth import BerHu, GradientMatching, LaplaceNll, MaskedL1, SILog, masked_mean
+from edgeslam_torch.losses.depth_terms import BerHu, GradientMatching, LaplaceNll, MaskedL1, SILog, masked_mean
 from edgeslam_torch.models.fastdepth import FastDepth
 from edgeslam_torch.models.record import Metadata
-from edgeslam_torch.train.augment import AugmentConfig, View, random_view
-from edgeslam_torch.train.datasets import FAR_M, NEAR_M
 from edgeslam_torch.train.validate import image_tensor
+from edgeslam_torch.train.views.augment import AugmentConfig, View, random_view
+from edgeslam_torch.train.views.datasets import FAR_M, NEAR_M
 
 
 @dataclass(frozen=True, slots=True)

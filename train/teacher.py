@@ -13,16 +13,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from edgeslam_torch.atomic import write_atomically
+from edgeslam_torch.files.atomic import write_atomically
 from edgeslam_torch.models.fastdepth import FastDepth
 from edgeslam_torch.models.record import Metadata
-from edgeslam_torch.train.augment import View, fitted_view
-from edgeslam_torch.train.counting import counted
-from edgeslam_torch.train.densify import densify
-from edgeslam_torch.train.distributed import share_of, wait_for_all
-from edgeslam_torch.train.plane_sweep import sweep_depth
-from edgeslam_torch.train.posed import PosedSequence, PosedView, relative_motion
+from edgeslam_torch.train.processes.counting import counted
+from edgeslam_torch.train.processes.distributed import share_of, wait_for_all
 from edgeslam_torch.train.validate import predict_metres
+from edgeslam_torch.train.views.augment import View, fitted_view
+from edgeslam_torch.train.views.densify import densify
+from edgeslam_torch.train.views.plane_sweep import sweep_depth
+from edgeslam_torch.train.views.posed import PosedSequence, PosedView, relative_motion
 from edgeslam_torch.types import FloatArray
 
 logger = logging.getLogger(__name__)

@@ -12,7 +12,7 @@ from torch import nn
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.models.fastdepth import FastDepth
 from edgeslam_torch.models.record import Metadata
-from edgeslam_torch.train.augment import View, fitted_view
+from edgeslam_torch.train.views.augment import View, fitted_view
 from edgeslam_torch.types import FloatArray
 
 MIN_DEPTH_M, MAX_DEPTH_M = 0.1, 10.0

@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 
 from edgeslam_torch.models.record import Metadata
-from edgeslam_torch.train.augment import View
-from edgeslam_torch.train.counting import Count
+from edgeslam_torch.train.processes.counting import Count
 from edgeslam_torch.train.recipe import Hooks, TrainConfig, TrainState
 from edgeslam_torch.train.validate import predict_metres
+from edgeslam_torch.train.views.augment import View
 
 PICTURE_SIZE = (320, 240)
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     import numpy as np
 
-    from edgeslam_torch.io.calibration import Board
+    from edgeslam_torch.calibration.board import Board
 
 _PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".ppm", ".pgm")
 _LIVE = ("tello://", "webcam:", "rtsp://", "udp://")
@@ -33,8 +33,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Calibrate, write the file, and say how good it is."""
+    from edgeslam_torch.calibration.board import Board, calibrate
     from edgeslam_torch.errors import CalibrationError, ConfigError, OutputError
-    from edgeslam_torch.io.calibration import Board, calibrate
 
     if args.board and args.charuco:
         raise ConfigError("give --board or --charuco, not both")
@@ -89,7 +89,7 @@ def _pictures(names: list[str], unreadable: dict[str, str]) -> "Iterator[tuple[s
     import cv2
 
     from edgeslam_torch.errors import SourceError
-    from edgeslam_torch.io.images import read_pixels
+    from edgeslam_torch.readers.images import read_pixels
 
     for name in names:
         path = Path(name).expanduser()
@@ -112,8 +112,8 @@ def _live_pictures(spec: str, board: "Board", views: int) -> "Iterator[tuple[str
     """Pictures in which the board is seen, a second apart; the person holding it is told what is missing."""
     import cv2
 
-    from edgeslam_torch.io.calibration import board_size, find_board
-    from edgeslam_torch.io.live import open_live
+    from edgeslam_torch.calibration.board import board_size, find_board
+    from edgeslam_torch.readers.live import open_live
 
     source = open_live(spec, "tello" if spec.startswith("tello://") else None)
     taken, last_s = 0, 0.0

@@ -89,7 +89,7 @@ def report(demo: "DemoResult") -> str:
 def _settings(args: argparse.Namespace) -> "DemoSettings":
     from edgeslam_torch.demo import DemoSettings
     from edgeslam_torch.errors import ConfigError
-    from edgeslam_torch.synthetic.telemetry import TelemetryFaults
+    from edgeslam_torch.synthetic.flights.telemetry import TelemetryFaults
 
     if args.seed < 0:
         raise ConfigError(f"--seed must not be negative, got {args.seed}")

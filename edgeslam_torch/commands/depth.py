@@ -11,7 +11,7 @@ from edgeslam_torch.errors import OutputError
 
 if TYPE_CHECKING:
     from edgeslam_torch.geometry.camera import Camera
-    from edgeslam_torch.io.listing import Problem
+    from edgeslam_torch.readers.listing import Problem
     from edgeslam_torch.types import DepthMap, Frame
 
 FILES = """\
@@ -48,8 +48,8 @@ def main(args: argparse.Namespace) -> int:
     image."""
     from tqdm import tqdm
 
-    from edgeslam_torch.frontend.depth import DepthPredictor
     from edgeslam_torch.frontend.depth_check import MIN_SHARE
+    from edgeslam_torch.frontend.depth_network import DepthPredictor
 
     predictor = DepthPredictor(args.weights, args.backend, args.threads)
     camera, frames, length, warnings, problems = _frames(args.source, args.camera, args.max_frames)
@@ -87,7 +87,7 @@ def write_depth(folder: Path, stem: str, depth: "DepthMap", with_sigma: bool = F
     """
     import cv2
 
-    from edgeslam_torch.io.depth_picture import colour
+    from edgeslam_torch.writers.depth_picture import colour
 
     np.save(folder / f"{stem}.npy", depth.depth_m)
     millimetres = np.clip(np.nan_to_num(depth.depth_m) * 1000.0 + 0.5, 0, MAX_MILLIMETRES).astype(np.uint16)
@@ -136,9 +136,9 @@ def _frames(
     source: str, camera: str | None, max_frames: int | None
 ) -> "tuple[Camera, Iterable[Frame], int | None, list[str], list[Problem]]":
     """Camera, images, how many, what to say before, and the list that what is left out goes into."""
-    from edgeslam_torch.io.camera_choice import choose_camera
-    from edgeslam_torch.io.images import SUFFIXES, read_image
-    from edgeslam_torch.io.source import open_source
+    from edgeslam_torch.calibration.camera_choice import choose_camera
+    from edgeslam_torch.readers.images import SUFFIXES, read_image
+    from edgeslam_torch.readers.source import open_source
     from edgeslam_torch.types import Frame
 
     path = Path(source)

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from edgeslam_torch.atomic import write_atomically
 from edgeslam_torch.errors import ConfigError, OutputError
+from edgeslam_torch.files.atomic import write_atomically
 
 if TYPE_CHECKING:
     from torch import nn
@@ -43,9 +43,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     """Export, compare with torch on real frames, print the table."""
     from edgeslam_torch.models.checkpoint import load_checkpoint
-    from edgeslam_torch.models.export_onnx import OLD_RUNTIME_OPSET, ExportOptions, export_onnx
-    from edgeslam_torch.models.fold import deployed
-    from edgeslam_torch.models.quantize import MIN_CALIBRATION_IMAGES, quantize_int8, store_float16
+    from edgeslam_torch.models.onnx.export import OLD_RUNTIME_OPSET, ExportOptions, export_onnx
+    from edgeslam_torch.models.onnx.fold import deployed
+    from edgeslam_torch.models.onnx.quantize import MIN_CALIBRATION_IMAGES, quantize_int8, store_float16
 
     if args.int8 and args.fp16:
         raise ConfigError("--int8 and --fp16 exclude each other")
@@ -99,7 +99,7 @@ def _size(text: str | None, metadata: "Metadata") -> tuple[int, int]:
 def _opset(wanted: int) -> int:
     import onnx
 
-    from edgeslam_torch.models.export_onnx import OLDEST_OPSET
+    from edgeslam_torch.models.onnx.export import OLDEST_OPSET
 
     newest = onnx.defs.onnx_opset_version()
     if not OLDEST_OPSET <= wanted <= newest:
@@ -109,13 +109,13 @@ def _opset(wanted: int) -> int:
 
 def _images(source: str | None, height: int, width: int, metadata: "Metadata") -> "list[FloatArray]":
     """Preprocessed frames, spread evenly over the source; noise-free ramps when there is none."""
-    from edgeslam_torch.frontend.depth import preprocess
+    from edgeslam_torch.frontend.depth_network import preprocess
 
     if source is None:
         ramp = np.linspace(0, 255, 640 * 480 * 3).reshape(480, 640, 3).astype(np.uint8)
         flips = (ramp, np.ascontiguousarray(ramp[::-1]), np.ascontiguousarray(ramp[:, ::-1]))
         return [preprocess(image, height, width, metadata) for image in flips]
-    from edgeslam_torch.io.source import open_source
+    from edgeslam_torch.readers.source import open_source
 
     opened = open_source(source)
     step = max((opened.length or CALIBRATION_IMAGES) // CALIBRATION_IMAGES, 1)

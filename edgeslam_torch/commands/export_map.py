@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from edgeslam_torch.errors import OutputError
 
 if TYPE_CHECKING:
-    from edgeslam_torch.eval.run_folder import RunFolder
+    from edgeslam_torch.eval.inputs.run_folder import RunFolder
     from edgeslam_torch.types import PointCloud
 
 FORMATS = ("ply", "pcd", "colmap", "occupancy")
@@ -27,7 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Write the map and say where it is."""
-    from edgeslam_torch.eval.run_folder import open_run
+    from edgeslam_torch.eval.inputs.run_folder import open_run
 
     run = open_run(args.run)
     cloud = _chosen(run, args)
@@ -62,7 +62,7 @@ def _chosen(run: "RunFolder", args: argparse.Namespace) -> "PointCloud":
 
 
 def _ply(run: "RunFolder", cloud: "PointCloud", args: argparse.Namespace) -> Path:
-    from edgeslam_torch.io.ply import write_ply
+    from edgeslam_torch.writers.ply import write_ply
 
     path: Path = args.out or run.path / "export.ply"
     write_ply(path, cloud)
@@ -70,7 +70,7 @@ def _ply(run: "RunFolder", cloud: "PointCloud", args: argparse.Namespace) -> Pat
 
 
 def _pcd(run: "RunFolder", cloud: "PointCloud", args: argparse.Namespace) -> Path:
-    from edgeslam_torch.io.pcd import write_pcd
+    from edgeslam_torch.writers.pcd import write_pcd
 
     path: Path = args.out or run.path / "edge_map.pcd"
     write_pcd(path, cloud)
@@ -79,7 +79,7 @@ def _pcd(run: "RunFolder", cloud: "PointCloud", args: argparse.Namespace) -> Pat
 
 def _colmap(run: "RunFolder", cloud: "PointCloud", args: argparse.Namespace) -> Path:
     from edgeslam_torch.geometry.camera import load_camera
-    from edgeslam_torch.io.colmap import write_colmap
+    from edgeslam_torch.writers.colmap import write_colmap
 
     folder: Path = args.out or run.path / "colmap"
     camera = load_camera(run.path / "camera.yaml")
@@ -90,7 +90,7 @@ def _colmap(run: "RunFolder", cloud: "PointCloud", args: argparse.Namespace) -> 
 
 def _images(run: "RunFolder") -> tuple[list[str], list[int]]:
     """Keyframes' image names and their poses; a source without image files gets names made of the stamps."""
-    from edgeslam_torch.eval.keyframe_pictures import image_paths
+    from edgeslam_torch.eval.report.keyframe_pictures import image_paths
 
     index = run.keyframe_poses()
     stamps = run.trajectory.stamps_s[index]
@@ -103,7 +103,7 @@ def _occupancy(run: "RunFolder", cloud: "PointCloud", args: argparse.Namespace) 
     import numpy as np
 
     from edgeslam_torch.geometry.camera import load_camera
-    from edgeslam_torch.io.occupancy import occupancy_grid, write_occupancy
+    from edgeslam_torch.writers.occupancy import occupancy_grid, write_occupancy
 
     if run.units == "arbitrary":
         raise OutputError(f"{run.path}: no occupancy grid without metric scale; run with a depth network or telemetry")

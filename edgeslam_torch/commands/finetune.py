@@ -87,8 +87,8 @@ def main(args: argparse.Namespace) -> int:
     import torch
 
     from edgeslam_torch.models.checkpoint import load_checkpoint
-    from edgeslam_torch.train.distributed import process_group
     from edgeslam_torch.train.out_folder import Existing, out_folder
+    from edgeslam_torch.train.processes.distributed import process_group
 
     torch.set_num_threads(args.threads)
     config = _config(args)
@@ -142,8 +142,8 @@ class _Item:
 
 def _items(args: argparse.Namespace) -> list[_Item]:
     """What the arguments name, sorted by kind."""
-    from edgeslam_torch.train.datasets import has_depth
-    from edgeslam_torch.train.posed import is_run_folder
+    from edgeslam_torch.train.views.datasets import has_depth
+    from edgeslam_torch.train.views.posed import is_run_folder
 
     items: list[_Item] = []
     for path in args.data:
@@ -197,9 +197,9 @@ def _finetune(
     config: "TrainConfig",
     out: "OutFolder",
 ) -> "Outcome":
-    from edgeslam_torch.train.distributed import by_first, rank
     from edgeslam_torch.train.finetune import FromRuns, finetune, settings_of
     from edgeslam_torch.train.given import DataSet, Given, weights_name
+    from edgeslam_torch.train.processes.distributed import by_first, rank
 
     from_runs = FromRuns(args.from_runs)
     reading = {name: getattr(args, name) for name in ("ignore_depth", "max_frames", "camera")}
@@ -223,11 +223,11 @@ def _finetune(
 
 def _data(args: argparse.Namespace, items: list[_Item], out: "OutFolder") -> "Data":
     """Read the folders; recordings without labels are sent through the SLAM first."""
-    from edgeslam_torch.train.datasets import load_depth_folder
-    from edgeslam_torch.train.distributed import by_first
     from edgeslam_torch.train.finetune import Data
-    from edgeslam_torch.train.posed import load_run
-    from edgeslam_torch.train.slam_runs import ensure_run
+    from edgeslam_torch.train.processes.distributed import by_first
+    from edgeslam_torch.train.views.datasets import load_depth_folder
+    from edgeslam_torch.train.views.posed import load_run
+    from edgeslam_torch.train.views.slam_runs import ensure_run
 
     data = Data()
     for item in items:

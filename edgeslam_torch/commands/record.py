@@ -12,9 +12,9 @@ from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from edgeslam_torch.io.flight_writer import FlightWriter
-    from edgeslam_torch.io.live import LiveSource
-    from edgeslam_torch.io.tello import StateMessage, Tello
+    from edgeslam_torch.drone.tello import StateMessage, Tello
+    from edgeslam_torch.readers.live import LiveSource
+    from edgeslam_torch.writers.flight_writer import FlightWriter
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -55,7 +55,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _open(args: argparse.Namespace, is_drone: bool) -> "tuple[LiveSource, list[StateMessage], Tello | None]":
-    from edgeslam_torch.io.live import open_live, open_tello
+    from edgeslam_torch.readers.live import open_live, open_tello
 
     if not is_drone:
         return open_live(args.source, args.camera, args.max_frames), [], None
@@ -76,7 +76,7 @@ def _record(
         EdgeSlamError: What ended it early.
     """
     from edgeslam_torch.errors import EdgeSlamError
-    from edgeslam_torch.io.flight_writer import FlightWriter
+    from edgeslam_torch.writers.flight_writer import FlightWriter
 
     folder = args.out or Path("flights") / time.strftime("%Y%m%d-%H%M%S")
     told = len(source.warnings)
@@ -136,8 +136,8 @@ def _start_pilot(tello: "Tello") -> Callable[[], None]:
     import logging
     from functools import partial
 
+    from edgeslam_torch.drone.tello import NoAnswer
     from edgeslam_torch.errors import EdgeSlamError
-    from edgeslam_torch.io.tello import NoAnswer
 
     failures: list[EdgeSlamError] = []
 

@@ -22,7 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Write each report and say where it is."""
-    from edgeslam_torch.eval.report import write_report
+    from edgeslam_torch.eval.report.page import write_report
 
     for run in args.runs:
         try:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from edgeslam_torch.config import SlamConfig
     from edgeslam_torch.geometry.camera import Camera
-    from edgeslam_torch.io.source import Source
+    from edgeslam_torch.readers.source import Source
     from edgeslam_torch.run import RunResult
 
 EXIT_INTERRUPTED = 130
@@ -64,8 +64,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     """Run, and say in a few lines how it went."""
     from edgeslam_torch.errors import ConfigError
-    from edgeslam_torch.io.source import open_source
     from edgeslam_torch.progress import make_progress
+    from edgeslam_torch.readers.source import open_source
     from edgeslam_torch.run import Listener, Mode, run, settle_camera
 
     if args.lossless and args.record is None:
@@ -84,7 +84,7 @@ def main(args: argparse.Namespace) -> int:
     show_bar = sys.stderr.isatty() if args.progress is None else args.progress
     listeners: list[Listener] = []
     if args.viewer or args.save_rrd is not None:
-        from edgeslam_torch.live_view import LiveView
+        from edgeslam_torch.viewer.live_view import LiveView
 
         listeners.append(LiveView(source.name, source.camera, args.save_rrd))
     with make_progress(source.length, show_bar) as progress:
@@ -107,9 +107,9 @@ def main(args: argparse.Namespace) -> int:
 
 def _recorded(args: argparse.Namespace) -> "Source":
     from edgeslam_torch.errors import ConfigError
-    from edgeslam_torch.io.live import open_live, open_tello
-    from edgeslam_torch.io.source import LIVE_SCHEMES
-    from edgeslam_torch.io.tee import RecordedLive
+    from edgeslam_torch.readers.live import open_live, open_tello
+    from edgeslam_torch.readers.source import LIVE_SCHEMES
+    from edgeslam_torch.writers.tee import RecordedLive
 
     if not args.source.startswith(LIVE_SCHEMES):
         raise ConfigError(f"{args.source}: --record is for live sources ({', '.join(LIVE_SCHEMES)})")
@@ -125,7 +125,7 @@ def resolved_config(args: argparse.Namespace) -> "SlamConfig":
     """Defaults, then ``--config``, then ``--set``, then the options that have a name of their own."""
     from edgeslam_torch.config import SlamConfig
     from edgeslam_torch.errors import ConfigError
-    from edgeslam_torch.io.config_file import load_config
+    from edgeslam_torch.files.config_file import load_config
 
     config = load_config(SlamConfig(), args.config, args.set)
     if args.seed is not None:
@@ -141,7 +141,7 @@ def resolved_config(args: argparse.Namespace) -> "SlamConfig":
 def write_page(result: "RunResult") -> None:
     """``report.html``; a run is not lost because its page cannot be made."""
     from edgeslam_torch.errors import EdgeSlamError
-    from edgeslam_torch.eval.report import write_report
+    from edgeslam_torch.eval.report.page import write_report
 
     try:
         write_report(result.folder, judge_map=False)

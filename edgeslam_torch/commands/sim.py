@@ -40,9 +40,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Emulate until Ctrl-C."""
-    from edgeslam_torch.emulator.link import LinkFaults
-    from edgeslam_torch.emulator.room import furnished_drone
-    from edgeslam_torch.emulator.server import EmulatorConfig, TelloEmulator
+    from edgeslam_torch.drone.emulator.link import LinkFaults
+    from edgeslam_torch.drone.emulator.room import furnished_drone
+    from edgeslam_torch.drone.emulator.server import EmulatorConfig, TelloEmulator
     from edgeslam_torch.errors import ConfigError
 
     if args.measure is not None:
@@ -89,7 +89,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _measure(args: argparse.Namespace) -> int:
-    from edgeslam_torch.emulator.measure import measure
+    from edgeslam_torch.drone.emulator.measure import measure
     from edgeslam_torch.errors import ConfigError
 
     if not args.measure > 0:

@@ -21,7 +21,7 @@ def main(args: argparse.Namespace) -> int:
     """Open the page, making it first when it is missing; without a browser, say where it is."""
     if args.viewer or args.save_rrd is not None:
         return _rerun(args)
-    from edgeslam_torch.eval.report import write_report
+    from edgeslam_torch.eval.report.page import write_report
 
     page = args.run / "report.html"
     try:
@@ -35,9 +35,9 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _rerun(args: argparse.Namespace) -> int:
-    from edgeslam_torch.eval.run_folder import open_run
+    from edgeslam_torch.eval.inputs.run_folder import open_run
     from edgeslam_torch.geometry.camera import load_camera
-    from edgeslam_torch.viewer import Viewer
+    from edgeslam_torch.viewer.rerun_viewer import Viewer
 
     run = open_run(args.run)
     viewer = Viewer(run.name, save=args.save_rrd, show=args.save_rrd is None, live=False)

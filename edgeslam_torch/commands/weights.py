@@ -119,7 +119,7 @@ def _inspect(args: argparse.Namespace) -> None:
 
 def _size_and_record(path: Path) -> "tuple[str, Metadata]":
     if path.suffix == ".onnx":
-        from edgeslam_torch.models.onnx_file import read_onnx
+        from edgeslam_torch.models.onnx.file import read_onnx
 
         return "", read_onnx(path)[1]
     from edgeslam_torch.models.checkpoint import load_checkpoint

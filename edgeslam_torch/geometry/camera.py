@@ -10,8 +10,8 @@ import numpy as np
 import yaml
 
 from edgeslam_torch.errors import CalibrationError
+from edgeslam_torch.files.record_files import plain_yaml
 from edgeslam_torch.geometry.lens import check_camera
-from edgeslam_torch.record_files import plain_yaml
 from edgeslam_torch.types import FloatArray
 
 GUESSED_FOCAL_SIGMA = 0.45

@@ -10,10 +10,10 @@ from edgeslam_torch.config import EdgeConfig
 from edgeslam_torch.frontend.edges import extract_edges
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
-from edgeslam_torch.mapping.depth_prior import depth_prior
+from edgeslam_torch.map.depth_prior import depth_prior
+from edgeslam_torch.map.keyframe import Keyframe
+from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.mapping.edge_depth import StereoView, measure_edge_depth
-from edgeslam_torch.mapping.keyframe import Keyframe
-from edgeslam_torch.mapping.slam_map import SlamMap
 from edgeslam_torch.types import FloatArray, IntArray, PointCloud
 
 AGREE_PX = 2.0

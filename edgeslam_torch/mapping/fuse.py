@@ -3,9 +3,9 @@
 import numpy as np
 
 from edgeslam_torch.geometry.camera import Camera
-from edgeslam_torch.mapping.keyframe import Keyframe
-from edgeslam_torch.mapping.slam_map import SlamMap
-from edgeslam_torch.tracking.projection import match_projection, project_anchors
+from edgeslam_torch.map.keyframe import Keyframe
+from edgeslam_torch.map.projection import match_projection, project_anchors
+from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.types import FloatArray, IntArray
 
 RADIUS_PX = 3.0

@@ -11,12 +11,12 @@ from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.losses.cycle import CycleForm
 from edgeslam_torch.losses.robust import Kernel
 from edgeslam_torch.losses.weighting import AdaptiveScales
+from edgeslam_torch.map.keyframe import Keyframe
+from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.mapping.edge_map import EdgeMap, EdgePoints
 from edgeslam_torch.mapping.fuse import fuse_all
-from edgeslam_torch.mapping.keyframe import Keyframe
 from edgeslam_torch.mapping.refinement import refine_all, take_back, whole_map, window_problem
 from edgeslam_torch.mapping.reobserve import MOST_DRIFT_PX, reobserve_all
-from edgeslam_torch.mapping.slam_map import SlamMap
 from edgeslam_torch.mapping.window_terms import (
     PlacedEdges,
     Structure,

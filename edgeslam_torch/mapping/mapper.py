@@ -7,9 +7,10 @@ from edgeslam_torch.frontend.keypoint_grid import KeypointGrid
 from edgeslam_torch.frontend.matching import Matches
 from edgeslam_torch.frontend.orb import spread
 from edgeslam_torch.geometry.camera import Camera
-from edgeslam_torch.mapping.depth_prior import depth_prior
+from edgeslam_torch.map.depth_prior import depth_prior
+from edgeslam_torch.map.keyframe import NO_ANCHOR, Keyframe
+from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.mapping.fuse import fuse
-from edgeslam_torch.mapping.keyframe import NO_ANCHOR, Keyframe
 from edgeslam_torch.mapping.new_anchors import CHI2_2, epipolar_matches, triangulate_matches
 from edgeslam_torch.mapping.prior_anchors import (
     add_on_prior,
@@ -20,7 +21,6 @@ from edgeslam_torch.mapping.prior_anchors import (
 )
 from edgeslam_torch.mapping.refinement import choose_window, refine, refine_all
 from edgeslam_torch.mapping.reobserve import MOST_DRIFT_PX, reobserve
-from edgeslam_torch.mapping.slam_map import SlamMap
 from edgeslam_torch.optim.problem import LmConfig, WindowResult
 from edgeslam_torch.types import FloatArray, IntArray
 

@@ -7,7 +7,7 @@ from edgeslam_torch.frontend.matching import EMPTY, Matches, best_pairs, hamming
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.triangulation import bearings, triangulate
-from edgeslam_torch.mapping.keyframe import Keyframe
+from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.types import FloatArray, IntArray
 
 CHI2_1 = 3.841

@@ -10,9 +10,9 @@ import numpy as np
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.triangulation import bearings
-from edgeslam_torch.mapping.anchors import Anchors
-from edgeslam_torch.mapping.keyframe import Keyframe
-from edgeslam_torch.mapping.slam_map import SlamMap
+from edgeslam_torch.map.anchors import Anchors
+from edgeslam_torch.map.keyframe import Keyframe
+from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.optim.problem import DepthPriors
 from edgeslam_torch.types import FloatArray, IntArray
 

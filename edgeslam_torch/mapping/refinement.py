@@ -6,9 +6,9 @@ import numpy as np
 
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.losses.robust import Kernel
-from edgeslam_torch.mapping.keyframe import Keyframe
+from edgeslam_torch.map.keyframe import Keyframe
+from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.mapping.prior_anchors import depth_priors
-from edgeslam_torch.mapping.slam_map import SlamMap
 from edgeslam_torch.optim.local_ba import refine_window
 from edgeslam_torch.optim.problem import LmConfig, ScalePrior, WindowProblem, WindowResult
 from edgeslam_torch.types import IntArray

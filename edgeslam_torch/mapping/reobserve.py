@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.map.keyframe import Keyframe
+from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.mapping.fuse import look_for, merge, observe_or_pair
-from edgeslam_torch.mapping.keyframe import Keyframe
-from edgeslam_torch.mapping.slam_map import SlamMap
 from edgeslam_torch.optim.pose_only import refine_pose
 from edgeslam_torch.types import FloatArray, IntArray
 

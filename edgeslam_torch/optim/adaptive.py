@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from edgeslam_torch.geometry import se3_torch as lie
 from edgeslam_torch.losses.cycle import CycleForm
 from edgeslam_torch.losses.edge_alignment import (
     alignment_row,
@@ -17,7 +18,6 @@ from edgeslam_torch.losses.edge_alignment import (
 from edgeslam_torch.losses.lshape import junction_residuals
 from edgeslam_torch.losses.reprojection import camera_points, reprojection_residuals
 from edgeslam_torch.losses.weighting import AdaptiveScales
-from edgeslam_torch.optim import lie
 from edgeslam_torch.optim.problem import EdgeTerms, JunctionTerms, WindowProblem
 from edgeslam_torch.types import FloatArray, IntArray
 

@@ -8,10 +8,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from edgeslam_torch.optim import lie, points, relative, schur
-from edgeslam_torch.optim.compiled import kernel
+from edgeslam_torch.geometry import se3_torch as lie
+from edgeslam_torch.optim.kernels import edges_junctions as relative
+from edgeslam_torch.optim.kernels import points, schur
+from edgeslam_torch.optim.kernels.compiled import kernel
+from edgeslam_torch.optim.kernels.edges_junctions import INVERSE_DEPTH_MIN, EdgeBlocks, JunctionBlocks, RelativeSystem
+from edgeslam_torch.optim.kernels.points import PointBlocks, PointSystem
 from edgeslam_torch.optim.levenberg_marquardt import Step, minimise
-from edgeslam_torch.optim.points import PointBlocks, PointSystem
 from edgeslam_torch.optim.priors import PriorTerms
 from edgeslam_torch.optim.problem import (
     DepthPriors,
@@ -24,7 +27,6 @@ from edgeslam_torch.optim.problem import (
     WindowProblem,
     WindowResult,
 )
-from edgeslam_torch.optim.relative import INVERSE_DEPTH_MIN, EdgeBlocks, JunctionBlocks, RelativeSystem
 from edgeslam_torch.types import FloatArray
 
 __all__ = [

@@ -7,10 +7,10 @@ import numpy as np
 
 from edgeslam_torch.config import InitialisationConfig
 from edgeslam_torch.geometry import se3
-from edgeslam_torch.mapping.keyframe import Keyframe, make_keyframe
+from edgeslam_torch.map.keyframe import Keyframe, make_keyframe
+from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.mapping.prior_anchors import prior_of
 from edgeslam_torch.mapping.refinement import Window, refine
-from edgeslam_torch.mapping.slam_map import SlamMap
 from edgeslam_torch.optim.problem import LmConfig, PosePrior
 from edgeslam_torch.tracking.initialiser import (
     BootstrapView,

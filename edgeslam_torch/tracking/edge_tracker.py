@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from edgeslam_torch.frontend.canny import canny_of_gradient, gradient
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.map.keyframe import Keyframe
+from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.mapping.edge_map import EdgeMap
-from edgeslam_torch.mapping.keyframe import Keyframe
-from edgeslam_torch.mapping.slam_map import SlamMap
 from edgeslam_torch.optim.pose_only import PoseConfig, PoseResult, refine_pose
 from edgeslam_torch.optim.problem import PosePrior
 from edgeslam_torch.types import FloatArray, IntArray

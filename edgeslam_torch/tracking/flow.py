@@ -16,9 +16,9 @@ from edgeslam_torch.config import FlowConfig, OrbConfig
 from edgeslam_torch.frontend.orb import spread
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
-from edgeslam_torch.mapping.keyframe import NO_ANCHOR, Keyframe
+from edgeslam_torch.map.keyframe import NO_ANCHOR, Keyframe
+from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.mapping.prior_anchors import depth_slack_px, mostly_on_priors
-from edgeslam_torch.mapping.slam_map import SlamMap
 from edgeslam_torch.optim.pose_only import refine_pose
 from edgeslam_torch.optim.problem import PosePrior
 from edgeslam_torch.tracking.tracker import FINE, Track, View

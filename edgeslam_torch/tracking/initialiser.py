@@ -14,7 +14,7 @@ from edgeslam_torch.config import InitialisationConfig
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.triangulation import bearings, triangulate
-from edgeslam_torch.mapping.keyframe import Keyframe
+from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.optim.local_ba import refine_window
 from edgeslam_torch.optim.pose_only import refine_pose
 from edgeslam_torch.optim.problem import LmConfig, ScalePrior, WindowProblem

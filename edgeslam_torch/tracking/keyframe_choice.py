@@ -3,8 +3,8 @@
 import numpy as np
 
 from edgeslam_torch.config import MappingConfig
-from edgeslam_torch.mapping.keyframe import Keyframe
-from edgeslam_torch.mapping.slam_map import SlamMap
+from edgeslam_torch.map.keyframe import Keyframe
+from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.tracking.flow import Followed
 from edgeslam_torch.tracking.tracker import Track
 

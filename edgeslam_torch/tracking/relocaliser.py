@@ -5,7 +5,7 @@ import numpy as np
 
 from edgeslam_torch.frontend.matching import match_all
 from edgeslam_torch.geometry import se3
-from edgeslam_torch.mapping.keyframe import Keyframe
+from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.tracking.tracker import Track, Tracker, View
 from edgeslam_torch.types import FloatArray
 

@@ -22,7 +22,7 @@ from edgeslam_torch.config import OrbConfig
 from edgeslam_torch.frontend.matching import match_all, words
 from edgeslam_torch.frontend.orb import OrbExtractor
 from edgeslam_torch.geometry.camera import GUESSED_FOCAL_SIGMA, Camera
-from edgeslam_torch.mapping.keyframe import Keyframe
+from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.types import FloatArray, IntArray
 
 MAX_FRAMES = 40

@@ -10,12 +10,12 @@ from edgeslam_torch.config import OrbConfig, TrackingConfig
 from edgeslam_torch.frontend.keypoint_grid import KeypointGrid
 from edgeslam_torch.frontend.matching import Matches, words
 from edgeslam_torch.geometry.camera import Camera
-from edgeslam_torch.mapping.keyframe import Keyframe
+from edgeslam_torch.map.keyframe import Keyframe
+from edgeslam_torch.map.projection import Projection, match_projection, project_anchors
+from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.mapping.prior_anchors import depth_slack_px, mostly_on_priors
-from edgeslam_torch.mapping.slam_map import SlamMap
 from edgeslam_torch.optim.pose_only import PoseConfig, refine_pose
 from edgeslam_torch.optim.problem import PosePrior
-from edgeslam_torch.tracking.projection import Projection, match_projection, project_anchors
 from edgeslam_torch.types import FloatArray, FrameFeatures, IntArray
 
 ROUGH = PoseConfig(rounds=1, robust_rounds=1, iterations=5, cost_tolerance=1e-2)

@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from edgeslam_torch.errors import EdgeSlamError
-from edgeslam_torch.eval.dataset import open_dataset
 from edgeslam_torch.eval.errors import EvaluationError
+from edgeslam_torch.eval.inputs.dataset import open_dataset
 from edgeslam_torch.eval.judge import sources
 from edgeslam_torch.eval.judge.flights import NONE
-from edgeslam_torch.io.source import Recording
-from edgeslam_torch.synthetic.courses import COURSES
+from edgeslam_torch.readers.source import Recording
+from edgeslam_torch.synthetic.flights.courses import COURSES
 
 SETS = ("base", "variants", "flights", "all")
 """What ``--set`` takes: recordings as they are, their variants, simulations, everything."""

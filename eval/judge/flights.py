@@ -15,9 +15,9 @@ import numpy as np
 from edgeslam_torch import synthetic
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.judge.sources import made_of
-from edgeslam_torch.io.source import Recording
-from edgeslam_torch.synthetic.courses import COURSES, RATE_HZ, flown, record_course, simulated_camera
-from edgeslam_torch.synthetic.render import render
+from edgeslam_torch.readers.source import Recording
+from edgeslam_torch.synthetic.flights.courses import COURSES, RATE_HZ, flown, record_course, simulated_camera
+from edgeslam_torch.synthetic.house.render import render
 
 NONE = ("noise", "black", "frozen")
 """Sources that show nothing to make a map of."""
@@ -60,7 +60,7 @@ def _noise(seed: list[int], shape: tuple[int, ...]) -> np.ndarray:
 def _simulator() -> str:
     """Digest of the simulator's code."""
     digest = hashlib.sha256()
-    for path in sorted(Path(synthetic.__file__).parent.glob("*.py")):
+    for path in sorted(Path(synthetic.__file__).parent.rglob("*.py")):
         digest.update(path.read_bytes())
     return digest.hexdigest()[:8]
 

@@ -11,19 +11,19 @@ from typing import Any
 
 import numpy as np
 
-from edgeslam_torch.atomic import write_text
 from edgeslam_torch.config import SlamConfig
 from edgeslam_torch.errors import EdgeSlamError
-from edgeslam_torch.eval.dataset import interpolate, open_dataset
-from edgeslam_torch.eval.formats import Trajectory, write_tum
+from edgeslam_torch.eval.inputs.dataset import interpolate, open_dataset
+from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, write_tum
 from edgeslam_torch.eval.judge import flights, sources
 from edgeslam_torch.eval.judge.cells import KIDNAP, VARIANTS, Cell
 from edgeslam_torch.eval.judge.runner import CELL, RESULT
 from edgeslam_torch.eval.judge.score import Truth, score
-from edgeslam_torch.io.config_file import load_config
-from edgeslam_torch.io.source import Recording, open_source
+from edgeslam_torch.files.atomic import write_text
+from edgeslam_torch.files.config_file import load_config
+from edgeslam_torch.readers.source import Recording, open_source
 from edgeslam_torch.run import run, settle_camera
-from edgeslam_torch.synthetic.courses import COURSES
+from edgeslam_torch.synthetic.flights.courses import COURSES
 from edgeslam_torch.types import FloatArray
 
 RUN = "run"

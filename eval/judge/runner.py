@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import IO, Any
 
 from edgeslam_torch import __version__
-from edgeslam_torch.atomic import write_text
 from edgeslam_torch.eval.judge.cells import Cell
+from edgeslam_torch.files.atomic import write_text
 
 CELL, RESULT, LOG = "cell.json", "result.json", "log.txt"
 FORMAT = 1

@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from edgeslam_torch.eval.associate import match
-from edgeslam_torch.eval.dataset import open_dataset
 from edgeslam_torch.eval.errors import EvaluationError
-from edgeslam_torch.eval.formats import Trajectory, read_trajectory
+from edgeslam_torch.eval.inputs.associate import match
+from edgeslam_torch.eval.inputs.dataset import open_dataset
+from edgeslam_torch.eval.inputs.run_folder import RunFolder, open_run
+from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, read_trajectory
 from edgeslam_torch.eval.judge import support
-from edgeslam_torch.eval.run_folder import RunFolder, open_run
-from edgeslam_torch.eval.run_score import RunScore, evaluate_run
-from edgeslam_torch.eval.trajectory import TrajectoryScore
+from edgeslam_torch.eval.metrics.run_score import RunScore, evaluate_run
+from edgeslam_torch.eval.metrics.trajectory_error import TrajectoryScore
 from edgeslam_torch.geometry.camera import load_camera
 from edgeslam_torch.types import FloatArray
 

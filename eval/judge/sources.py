@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgeslam_torch.geometry.camera import Camera
-from edgeslam_torch.io.listing import Problem
-from edgeslam_torch.io.source import Recording
+from edgeslam_torch.readers.listing import Problem
+from edgeslam_torch.readers.source import Recording
 from edgeslam_torch.types import FloatArray, Frame
 
 Size = tuple[int, int]

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from edgeslam_torch.eval.run_folder import is_supported
+from edgeslam_torch.eval.inputs.run_folder import is_supported
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.types import FloatArray, FrameStatus

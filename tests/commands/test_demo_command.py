@@ -9,7 +9,7 @@ import pytest
 from edgeslam_torch.cli import main
 from edgeslam_torch.demo import DemoSettings, map_accuracy, record, run_and_judge, run_demo
 from edgeslam_torch.errors import ConfigError
-from edgeslam_torch.io.source import open_source
+from edgeslam_torch.readers.source import open_source
 
 
 @pytest.mark.parametrize("world", ["room", "corridor"])

@@ -15,11 +15,11 @@ import pytest
 import torch
 
 from edgeslam_torch.errors import ConfigError, EdgeSlamError
-from edgeslam_torch.frontend.depth import DepthPredictor
+from edgeslam_torch.frontend.depth_network import DepthPredictor
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.models.checkpoint import build_network, load_checkpoint, save_checkpoint
 from edgeslam_torch.models.fastdepth import FastDepth, Variant, Widths
-from edgeslam_torch.models.onnx_graph import build_graph
+from edgeslam_torch.models.onnx.graph import build_graph
 from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.types import DepthMap
 

@@ -8,7 +8,7 @@ import pytest
 from rendered import CAMERA, film, sideways, stairs_world
 
 from edgeslam_torch import cli
-from edgeslam_torch.eval.formats import Trajectory, write_tum
+from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, write_tum
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""What a signal does to ``edgeslam record``, without a drone; `tests/io/test_ways_out.py` has one."""
+"""What a signal does to ``edgeslam record``, without a drone; `tests/drone/test_ways_out.py` has one."""
 
 import os
 import signal

@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 import pytest
 
-from edgeslam_torch.eval.formats import Trajectory, write_tum
-from edgeslam_torch.io.ply import write_ply
+from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, write_tum
 from edgeslam_torch.types import PointCloud
+from edgeslam_torch.writers.ply import write_ply
 
 COLUMNS = (
     "index stamp status reason matches inliers parallax_deg keyframe scale scale_sigma scale_source "

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from edgeslam_torch.commands import eval as eval_command
 from edgeslam_torch.commands import report as report_command
+from edgeslam_torch.commands.judging import eval as eval_command
 from edgeslam_torch.errors import EdgeSlamError
-from edgeslam_torch.eval.formats import read_trajectory, write_kitti
-from edgeslam_torch.eval.run_score import evaluate_run
+from edgeslam_torch.eval.inputs.trajectory_files import read_trajectory, write_kitti
+from edgeslam_torch.eval.metrics.run_score import evaluate_run
 
 
 def run(module: object, *words: object) -> int:

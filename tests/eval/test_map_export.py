@@ -16,11 +16,11 @@ import yaml
 from edgeslam_torch.commands import export_map
 from edgeslam_torch.errors import EdgeSlamError
 from edgeslam_torch.geometry.camera import PRESETS, Camera
-from edgeslam_torch.io.colmap import write_colmap
-from edgeslam_torch.io.occupancy import FREE, OCCUPIED, UNKNOWN, occupancy_grid, write_occupancy
-from edgeslam_torch.io.pcd import read_pcd, write_pcd
-from edgeslam_torch.io.ply import write_ply
 from edgeslam_torch.types import PointCloud
+from edgeslam_torch.writers.colmap import write_colmap
+from edgeslam_torch.writers.occupancy import FREE, OCCUPIED, UNKNOWN, occupancy_grid, write_occupancy
+from edgeslam_torch.writers.pcd import read_pcd, write_pcd
+from edgeslam_torch.writers.ply import write_ply
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ import pytest
 
 from edgeslam_torch.commands import view
 from edgeslam_torch.errors import ConfigError, OutputError
-from edgeslam_torch.eval.run_folder import open_run
+from edgeslam_torch.eval.inputs.run_folder import open_run
 from edgeslam_torch.geometry.camera import PRESETS
 from edgeslam_torch.types import FrameStatus, PointCloud, ScaleEstimate, SlamOutput
 
@@ -50,7 +50,7 @@ def test_missing_rerun_is_said_with_the_remedy(run_folder: Callable[..., Path], 
 
 
 def test_rerun_is_not_imported_by_the_module() -> None:
-    code = "import sys, edgeslam_torch.viewer; sys.exit('rerun' in sys.modules)"
+    code = "import sys, edgeslam_torch.viewer.rerun_viewer; sys.exit('rerun' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
@@ -95,7 +95,7 @@ def test_recording_of_a_finished_run_holds_its_map_and_poses(run_folder: Callabl
 
 @needs_rerun
 def test_recording_of_a_live_run_holds_pictures_plots_and_the_growing_map(tmp_path: Path) -> None:
-    from edgeslam_torch.viewer import Viewer
+    from edgeslam_torch.viewer.rerun_viewer import Viewer
 
     viewer = Viewer("live", save=tmp_path / "live.rrd", show=False)
     viewer.camera(PRESETS["kinect"])

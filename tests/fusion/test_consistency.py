@@ -12,7 +12,7 @@ from edgeslam_torch.fusion.config import FusionConfig
 from edgeslam_torch.fusion.delayed import BufferedEkf
 from edgeslam_torch.fusion.rotations import matrix_from_rpy, rpy_from_matrix
 from edgeslam_torch.geometry import se3
-from edgeslam_torch.io.telemetry_csv import read_telemetry
+from edgeslam_torch.readers.telemetry_csv import read_telemetry
 from edgeslam_torch.types import FloatArray, TelemetrySample
 
 SIGMA_T, SIGMA_R = 0.005, np.deg2rad(0.1)

@@ -7,8 +7,8 @@ import pytest
 from edgeslam_torch.fusion.config import FusionConfig
 from edgeslam_torch.fusion.motion import MotionFusion
 from edgeslam_torch.geometry import se3
-from edgeslam_torch.synthetic.flight import camera_on_body
-from edgeslam_torch.synthetic.telemetry import EXACT, TelemetryFaults, simulate
+from edgeslam_torch.synthetic.flights.flight import camera_on_body
+from edgeslam_torch.synthetic.flights.telemetry import EXACT, TelemetryFaults, simulate
 from edgeslam_torch.types import TelemetrySample, Units
 
 T_B_C = camera_on_body()
@@ -288,7 +288,7 @@ def test_a_new_map_forgets_the_old_scale_but_keeps_the_delay(rng, swinging, repl
 @pytest.mark.data
 def test_a_real_tello_truncates_its_velocities(data_dir):
     from edgeslam_torch.fusion.track import TelemetryTrack
-    from edgeslam_torch.io.telemetry_csv import read_telemetry
+    from edgeslam_torch.readers.telemetry_csv import read_telemetry
 
     track = TelemetryTrack("world", 0.35)
     track.add(read_telemetry(data_dir / "tello_telemetry" / "flight_b.csv"))

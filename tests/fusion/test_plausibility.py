@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 from edgeslam_torch.fusion.config import FusionConfig
 from edgeslam_torch.fusion.motion import MotionFusion
 from edgeslam_torch.fusion.plausibility import Agreement, Reading, Trust, Verdict, agreement, changes
-from edgeslam_torch.synthetic.flight import camera_on_body
-from edgeslam_torch.synthetic.telemetry import TelemetryFaults, simulate
+from edgeslam_torch.synthetic.flights.flight import camera_on_body
+from edgeslam_torch.synthetic.flights.telemetry import TelemetryFaults, simulate
 
 T_B_C = camera_on_body()
 DEPTH_LOG = 0.1

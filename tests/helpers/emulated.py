@@ -7,9 +7,9 @@ from contextlib import contextmanager
 import numpy as np
 from free_ports import free_ports
 
-from edgeslam_torch.emulator.drone import DroneModel, Mode
-from edgeslam_torch.emulator.link import LinkFaults
-from edgeslam_torch.emulator.server import EmulatorConfig, TelloEmulator
+from edgeslam_torch.drone.emulator.drone import DroneModel, Mode
+from edgeslam_torch.drone.emulator.link import LinkFaults
+from edgeslam_torch.drone.emulator.server import EmulatorConfig, TelloEmulator
 
 PATIENCE_S = 120.0
 """For what must happen in the end, however busy the machine is; nothing waits this long when all is well."""

@@ -5,8 +5,8 @@ import numpy as np
 from edgeslam_torch.frontend.matching import words
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
-from edgeslam_torch.mapping.keyframe import make_keyframe
-from edgeslam_torch.mapping.slam_map import SlamMap
+from edgeslam_torch.map.keyframe import make_keyframe
+from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.synthetic import box_room
 from edgeslam_torch.types import FrameFeatures
 

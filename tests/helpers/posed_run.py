@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 
 from edgeslam_torch.geometry.camera import Camera
-from edgeslam_torch.io.ply import write_ply
-from edgeslam_torch.io.run_writer import tum_line
-from edgeslam_torch.synthetic.render import render
-from edgeslam_torch.synthetic.rooms import look, room
-from edgeslam_torch.synthetic.world import World
+from edgeslam_torch.synthetic.house.render import render
+from edgeslam_torch.synthetic.house.rooms import look, room
+from edgeslam_torch.synthetic.house.world import World
 from edgeslam_torch.types import PointCloud
+from edgeslam_torch.writers.ply import write_ply
+from edgeslam_torch.writers.run_writer import tum_line
 
 CAMERA = Camera(128, 96, 100.0, 100.0, 63.5, 47.5)
 FRAMES = 12

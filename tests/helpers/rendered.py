@@ -7,9 +7,9 @@ import numpy as np
 
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
-from edgeslam_torch.synthetic.render import render
-from edgeslam_torch.synthetic.rooms import random_pose, room
-from edgeslam_torch.synthetic.world import Quad, Texture, World
+from edgeslam_torch.synthetic.house.render import render
+from edgeslam_torch.synthetic.house.rooms import random_pose, room
+from edgeslam_torch.synthetic.house.world import Quad, Texture, World
 from edgeslam_torch.types import DepthMap, Frame
 
 CAMERA = Camera(320, 240, 260.0, 260.0, 159.5, 119.5, source="test")

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
+from edgeslam_torch.geometry import se3_torch as lie
 from edgeslam_torch.losses.base import back_project, move, project
 from edgeslam_torch.losses.cycle import CycleForm, CycleLoss, sample_depth
-from edgeslam_torch.optim import lie
 
 K = torch.tensor([[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
 

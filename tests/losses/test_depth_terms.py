@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from torch.autograd import gradcheck
 
-from edgeslam_torch.losses.depth import BerHu, GradientMatching, LaplaceNll, MaskedL1, SILog, masked_mean
+from edgeslam_torch.losses.depth_terms import BerHu, GradientMatching, LaplaceNll, MaskedL1, SILog, masked_mean
 
 TERMS = [MaskedL1(), BerHu(), SILog(), GradientMatching(scales=2)]
 

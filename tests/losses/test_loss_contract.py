@@ -8,13 +8,13 @@ import pytest
 import torch
 from torch import Tensor
 
+from edgeslam_torch.geometry import se3_torch as lie
 from edgeslam_torch.losses.base import ResidualLoss, back_project, move, project
 from edgeslam_torch.losses.cycle import CycleForm, CycleLoss
 from edgeslam_torch.losses.edge_alignment import EdgeAlignmentLoss
 from edgeslam_torch.losses.lshape import AngleForm, AngleLoss, CollinearityLoss, LShapeLoss, cosine
 from edgeslam_torch.losses.reprojection import ReprojectionLoss
 from edgeslam_torch.losses.robust import Kernel, rho
-from edgeslam_torch.optim import lie
 
 K = torch.tensor([[500.0, 0.0, 320.0], [0.0, 480.0, 240.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
 

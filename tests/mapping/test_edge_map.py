@@ -8,7 +8,7 @@ from point_map import CAMERA, PointMap, small_motion
 
 from edgeslam_torch.config import EdgeConfig
 from edgeslam_torch.geometry import se3
-from edgeslam_torch.mapping.depth_prior import depth_prior
+from edgeslam_torch.map.depth_prior import depth_prior
 from edgeslam_torch.mapping.edge_map import AGREE_PX, PRIOR_CELL_PX, EdgeMap, EdgePoints, PaintedEdges, fuse
 
 

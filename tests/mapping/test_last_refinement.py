@@ -9,15 +9,15 @@ from point_map import check_map
 from rendered import CAMERA, film, sideways, stairs_world
 
 from edgeslam_torch.config import DepthConfig, SlamConfig, WindowConfig
-from edgeslam_torch.eval.ablation import pickled
-from edgeslam_torch.eval.align import umeyama
+from edgeslam_torch.eval.benchmark.ablation import pickled
+from edgeslam_torch.eval.metrics.align import umeyama
 from edgeslam_torch.losses.robust import Kernel
+from edgeslam_torch.map.slam_map import SlamMap
+from edgeslam_torch.map.trajectory import TrajectoryLog
 from edgeslam_torch.mapping.edge_map import EdgeMap
 from edgeslam_torch.mapping.last_refinement import last_refinement, lm_config
-from edgeslam_torch.mapping.slam_map import SlamMap
 from edgeslam_torch.optim.problem import WindowResult
 from edgeslam_torch.slam import EdgeSlam
-from edgeslam_torch.trajectory import TrajectoryLog
 
 POINTS = WindowConfig(alignment=False, cycle="off")
 FORMS = {

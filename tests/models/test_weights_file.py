@@ -15,7 +15,7 @@ from edgeslam_torch.errors import WeightsError
 from edgeslam_torch.models.checkpoint import build_network, load_checkpoint, save_checkpoint
 from edgeslam_torch.models.fastdepth import FULL, PRUNED, FastDepth, Variant, Widths
 from edgeslam_torch.models.layout import parameter_shapes
-from edgeslam_torch.models.onnx_graph import build_graph
+from edgeslam_torch.models.onnx.graph import build_graph
 from edgeslam_torch.models.record import Metadata, metadata_from_json
 from edgeslam_torch.models.weights_file import read_header, read_weights
 

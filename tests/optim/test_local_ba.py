@@ -10,7 +10,6 @@ import torch
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.losses.cycle import CycleForm
 from edgeslam_torch.losses.robust import Kernel
-from edgeslam_torch.optim import compiled, points, relative, schur
 from edgeslam_torch.optim.benchmark import (
     K,
     Noise,
@@ -20,6 +19,9 @@ from edgeslam_torch.optim.benchmark import (
     refine_with_gtsam,
     seeded_window,
 )
+from edgeslam_torch.optim.kernels import compiled, points, schur
+from edgeslam_torch.optim.kernels import edges_junctions as relative
+from edgeslam_torch.optim.kernels.edges_junctions import collinearity_prior
 from edgeslam_torch.optim.local_ba import refine_window
 from edgeslam_torch.optim.problem import (
     DepthPriors,
@@ -30,7 +32,6 @@ from edgeslam_torch.optim.problem import (
     WindowProblem,
     WindowResult,
 )
-from edgeslam_torch.optim.relative import collinearity_prior
 
 SMALL = WindowSize(poses=6, fixed=2, anchors=150, observations=600, edges=200, pairs=600, junctions=20)
 CLEAN = Noise(px=0.0, depth=0.0)

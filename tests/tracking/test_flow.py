@@ -11,9 +11,9 @@ from edgeslam_torch.config import FlowConfig, MappingConfig, OrbConfig
 from edgeslam_torch.frontend.image import as_grey
 from edgeslam_torch.frontend.orb import OrbExtractor
 from edgeslam_torch.geometry import se3
-from edgeslam_torch.mapping.keyframe import NO_ANCHOR, make_keyframe
-from edgeslam_torch.mapping.slam_map import SlamMap
-from edgeslam_torch.synthetic.render import render
+from edgeslam_torch.map.keyframe import NO_ANCHOR, make_keyframe
+from edgeslam_torch.map.slam_map import SlamMap
+from edgeslam_torch.synthetic.house.render import render
 from edgeslam_torch.tracking.flow import FlowTracker, join, template_of_keyframe, template_of_track
 from edgeslam_torch.tracking.keyframe_choice import few_matches, is_due, lost_most, lost_sight
 from edgeslam_torch.tracking.tracker import Track, make_view

@@ -9,7 +9,7 @@ from rendered import film, stairs_world
 
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import GUESSED_FOCAL_SIGMA, Camera
-from edgeslam_torch.mapping.keyframe import make_keyframe
+from edgeslam_torch.map.keyframe import make_keyframe
 from edgeslam_torch.synthetic import box_room
 from edgeslam_torch.tracking.self_calibration import (
     FocalEstimate,
@@ -237,7 +237,7 @@ def test_only_a_sure_and_large_difference_counts(focal, sigma, pairs, is_doubted
 def test_redkitchen_with_another_lens(data_dir, factor, is_doubted):
     """Measured on the first 250 frames; 0.7 times bends the trajectory from 3 cm to 17."""
     from edgeslam_torch.config import DepthConfig, SlamConfig
-    from edgeslam_torch.io.source import open_source
+    from edgeslam_torch.readers.source import open_source
     from edgeslam_torch.slam import EdgeSlam
 
     source = open_source(data_dir / "7scenes_redkitchen", max_frames=250)

@@ -6,7 +6,7 @@ from point_map import CAMERA, SCALE_FACTOR, PointMap, small_motion
 
 from edgeslam_torch.config import OrbConfig, TrackingConfig
 from edgeslam_torch.geometry import se3
-from edgeslam_torch.tracking.projection import project_anchors
+from edgeslam_torch.map.projection import project_anchors
 from edgeslam_torch.tracking.relocaliser import relocalise
 from edgeslam_torch.tracking.tracker import Tracker, make_view, median_parallax
 from edgeslam_torch.types import FrameFeatures

@@ -16,13 +16,13 @@ import torch
 from depth_folder import write_folder
 
 from edgeslam_torch import cli
-from edgeslam_torch.io.own_folder import FolderLock
 from edgeslam_torch.models.checkpoint import build_network, load_checkpoint, save_checkpoint
 from edgeslam_torch.models.fastdepth import Widths
 from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.train import recipe
 from edgeslam_torch.train.recipe import TrainState, saved_step
 from edgeslam_torch.train.watchers import ProgressBar
+from edgeslam_torch.writers.own_folder import FolderLock
 
 METADATA = Metadata(
     input_height=32, input_width=64, focal_px=60.0, data=("rooms",), licence="Apache-2.0", metrics={"abs_rel": 0.2}

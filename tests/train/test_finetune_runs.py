@@ -16,10 +16,11 @@ from edgeslam_torch.errors import OutputError, SourceError
 from edgeslam_torch.models.checkpoint import build_network, load_checkpoint, save_checkpoint
 from edgeslam_torch.models.fastdepth import FastDepth, Widths
 from edgeslam_torch.models.record import Metadata
-from edgeslam_torch.train import posed, slam_runs, teacher
+from edgeslam_torch.train import teacher
 from edgeslam_torch.train.finetune import Data
-from edgeslam_torch.train.posed import PosedSequence, load_run
-from edgeslam_torch.train.slam_runs import ensure_run
+from edgeslam_torch.train.views import posed, slam_runs
+from edgeslam_torch.train.views.posed import PosedSequence, load_run
+from edgeslam_torch.train.views.slam_runs import ensure_run
 
 METADATA = Metadata(input_height=96, input_width=128, focal_px=100.0)
 

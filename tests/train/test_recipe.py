@@ -20,7 +20,6 @@ from edgeslam_torch.models.checkpoint import build_network, load_checkpoint
 from edgeslam_torch.models.fastdepth import FastDepth, Widths
 from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.train import recipe
-from edgeslam_torch.train.augment import AugmentConfig, View
 from edgeslam_torch.train.recipe import (
     DivergedError,
     Hooks,
@@ -32,6 +31,7 @@ from edgeslam_torch.train.recipe import (
     train,
 )
 from edgeslam_torch.train.signals import Slot, Source, Supervised, SupervisedWeights
+from edgeslam_torch.train.views.augment import AugmentConfig, View
 
 METADATA = Metadata(input_height=32, input_width=64, focal_px=50.0)
 TINY = Widths((4,) + (8,) * 13, (8,) * 5)
@@ -355,7 +355,7 @@ ENVIRONMENT = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_TH
 SCRIPT = """
 import sys, torch
 from pathlib import Path
-from edgeslam_torch.train.distributed import process_group
+from edgeslam_torch.train.processes.distributed import process_group
 sys.path.insert(0, {folder!r})
 from {module} import CONFIG, METADATA, network, replace, signal, train
 torch.set_num_threads(1)
@@ -401,7 +401,7 @@ def test_two_processes_give_the_single_process_result(tmp_path: Path) -> None:
 POISONED = """
 import sys, torch
 from pathlib import Path
-from edgeslam_torch.train.distributed import process_group, rank
+from edgeslam_torch.train.processes.distributed import process_group, rank
 sys.path.insert(0, {folder!r})
 from {module} import CONFIG, METADATA, NonFiniteLossError, Source, _PoisonedAt, network, replace, train, views
 torch.set_num_threads(1)

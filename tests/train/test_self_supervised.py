@@ -18,13 +18,13 @@ from edgeslam_torch.errors import SourceError
 from edgeslam_torch.models.checkpoint import build_network
 from edgeslam_torch.models.fastdepth import Prediction, Widths
 from edgeslam_torch.models.record import Metadata
-from edgeslam_torch.synthetic.render import render
-from edgeslam_torch.train.junctions import junction_points, seen_cosines
-from edgeslam_torch.train.posed import PosedSequence, is_run_folder, load_run, visible_points
+from edgeslam_torch.synthetic.house.render import render
 from edgeslam_torch.train.self_supervised import SelfSupervised, fit_log_scale
 from edgeslam_torch.train.signals import Slot
-from edgeslam_torch.train.straight import straight_edges
 from edgeslam_torch.train.teacher import teach
+from edgeslam_torch.train.views.junctions import junction_points, seen_cosines
+from edgeslam_torch.train.views.posed import PosedSequence, is_run_folder, load_run, visible_points
+from edgeslam_torch.train.views.straight import straight_edges
 
 METADATA = Metadata(input_height=96, input_width=128, focal_px=100.0)
 

@@ -12,9 +12,9 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from edgeslam_torch.models.checkpoint import build_network
 from edgeslam_torch.models.fastdepth import Widths
 from edgeslam_torch.models.record import Metadata
-from edgeslam_torch.train.augment import View
 from edgeslam_torch.train.recipe import Hooks, TrainConfig, TrainState, train
 from edgeslam_torch.train.signals import Source, Supervised
+from edgeslam_torch.train.views.augment import View
 from edgeslam_torch.train.watchers import ProgressBar, TensorBoard
 
 METADATA = Metadata(input_height=32, input_width=64, focal_px=50.0)

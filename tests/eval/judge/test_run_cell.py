@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from rendered import CAMERA, film, sideways, stairs_world
 
-from edgeslam_torch.eval.dataset import open_dataset
 from edgeslam_torch.eval.errors import EvaluationError
-from edgeslam_torch.eval.formats import Trajectory, read_trajectory, write_tum
+from edgeslam_torch.eval.inputs.dataset import open_dataset
+from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, read_trajectory, write_tum
 from edgeslam_torch.eval.judge import flights, run_cell
 from edgeslam_torch.eval.judge.cells import VARIANTS, Cell, find_recordings, list_cells
 from edgeslam_torch.eval.judge.score import Truth, score
-from edgeslam_torch.synthetic.courses import COURSES, record_course
+from edgeslam_torch.synthetic.flights.courses import COURSES, record_course
 
 
 @pytest.fixture(scope="module")

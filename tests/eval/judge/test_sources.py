@@ -6,7 +6,7 @@ import pytest
 from edgeslam_torch.eval.judge import sources
 from edgeslam_torch.eval.judge.cells import VARIANTS, Variant
 from edgeslam_torch.geometry.camera import Camera
-from edgeslam_torch.io.source import open_source
+from edgeslam_torch.readers.source import open_source
 from edgeslam_torch.types import TelemetrySample
 
 CAMERA = Camera(64, 48, 60.0, 61.0, 31.5, 23.5)

@@ -1,0 +1,1 @@
+"""Calibrate a camera (`board`), and choose the calibration that a source gets (`camera_choice`)."""

@@ -1,0 +1,69 @@
+"""Accuracy and speed of the real job on the recordings at hand, beside what other systems score."""
+
+import argparse
+import json
+import os
+import sys
+import time
+from pathlib import Path
+
+from edgeslam_torch.errors import OutputError
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's options."""
+    parser.add_argument("--data", type=Path, metavar="DIR", help="folder of recordings (default: EDGESLAM_DATA)")
+    parser.add_argument("--seeds", type=int, default=3, metavar="N", help="runs of every sequence (default: 3)")
+    parser.add_argument(
+        "--sequence", action="append", default=[], metavar="NAME", help="only this one; may be repeated"
+    )
+    parser.add_argument("--max-frames", type=int, metavar="N", help="stop every run after N frames")
+    parser.add_argument("--mode", choices=("offline", "realtime"), default="offline")
+    parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="change one setting")
+    parser.add_argument("--no-micro", action="store_true", help="leave out the solver's and the depth network's times")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the runs (default: runs/bench-TIME)")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="also write the results here")
+    parser.add_argument("--markdown", type=Path, metavar="FILE", help="also write the tables here")
+    parser.add_argument(
+        "--compare", nargs=2, type=Path, metavar=("A", "B"), help="only compare two results, A before B"
+    )
+
+
+def main(args: argparse.Namespace) -> int:
+    """Run or compare; 1 when a run failed."""
+    from edgeslam_torch.eval.benchmark import benchmark
+    from edgeslam_torch.eval.benchmark import compare as bench_compare
+
+    if args.compare is not None:
+        before, after = (bench_compare.read_record(path) for path in args.compare)
+        print(bench_compare.markdown_compare(before, after))
+        return 0
+    data = args.data or (Path(os.environ["EDGESLAM_DATA"]) if os.environ.get("EDGESLAM_DATA") else None)
+    settings = benchmark.BenchSettings(
+        data=data,
+        seeds=tuple(range(max(1, args.seeds))),
+        only=tuple(args.sequence),
+        max_frames=args.max_frames,
+        mode=args.mode,
+        overrides=tuple(args.set),
+        micro=not args.no_micro,
+    )
+    if data is None:
+        _say("no recordings (--data or EDGESLAM_DATA): the synthetic flight alone")
+    out = args.out or Path("runs") / time.strftime("bench-%Y%m%d-%H%M%S")
+    try:
+        record = benchmark.run_benchmark(settings, out, _say)
+        text = benchmark.markdown_bench(record)
+        if args.json is not None:
+            args.json.write_text(json.dumps(record, indent=1, default=str) + "\n", encoding="utf-8")
+        if args.markdown is not None:
+            args.markdown.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"{error.filename}: cannot be written ({error.strerror or error})") from error
+    print(text)
+    print(f"results: {out / 'bench.json'}")
+    return 1 if any(run["error"] for run in record["runs"]) else 0
+
+
+def _say(text: str) -> None:
+    sys.stderr.write(text + "\n")

@@ -1,0 +1,601 @@
+"""Client for a DJI Tello over its text SDK (1.3 and 2.0): commands, state, video, and the will to land."""
+
+import logging
+import math
+import os
+import queue
+import re
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from types import TracebackType
+
+from edgeslam_torch.drone.address import TelloAddress
+from edgeslam_torch.drone.answers import NoAnswer, TelloError, belongs_to, is_refusal
+from edgeslam_torch.drone.guard import Guard
+from edgeslam_torch.drone.sdk_state import parse_state, sample_from_sdk
+from edgeslam_torch.drone.sticks import Sticks
+from edgeslam_torch.drone.udp import Inlet
+from edgeslam_torch.drone.video import ArrivalClock, Picture, VideoReceiver
+from edgeslam_torch.errors import SourceError
+from edgeslam_torch.types import TelemetrySample
+
+logger = logging.getLogger(__name__)
+
+_STEPS = ("up", "down", "left", "right", "forward", "back", "cw", "ccw", "go", "curve", "flip", "jump")
+_MOVES = frozenset(["takeoff", "throwfly", *_STEPS, "rc", "motoron", "speed", "stop"])
+"""Commands that make a drone move, or change how it moves."""
+_NEVER_TWICE = _MOVES - {"stop", "speed", "rc", "takeoff"}
+"""A lost answer does not mean that the drone did not hear: sent again, the drone would move twice."""
+_MOVE_TIMEOUT_S = 20.0
+_CLIMB_TIMEOUT_S = 20.0
+_RISE_TIMEOUT_S = 6.0
+_LAND_TRIES, _LAND_AGAIN_S = 10, 2.0
+_PARTING = ("land", "streamoff")
+"""What is still sent and waited for when the flight is over."""
+_FRESH_S = 1.0
+"""State older than this says nothing of the present."""
+_RISEN_CM = 20.0
+_STEADY_CM = 6.0
+_STEADY_S = 1.5
+
+
+@dataclass(frozen=True, slots=True)
+class TelloLimits:
+    """Timeouts and the conditions under which a flight ends by itself."""
+
+    timeout_s: float = 3.0
+    retries: int = 3
+    keep_alive_s: float = 5.0
+    """A Tello lands by itself after 15 s without a command."""
+    min_battery: float = 0.10
+    max_temperature_c: float = 95.0
+    state_loss_s: float = 5.0
+    """Without state for so long in flight: land."""
+    video_loss_s: float = 5.0
+    """Without a picture for so long in flight, once the stream has been asked for: land."""
+
+    def __post_init__(self) -> None:
+        if min(self.timeout_s, self.keep_alive_s, self.state_loss_s, self.video_loss_s) <= 0 or self.retries < 0:
+            raise ValueError(f"times must be positive and retries not negative: {self}")
+
+
+@dataclass(frozen=True, slots=True)
+class StateMessage:
+    """One state packet."""
+
+    stamp_s: float
+    """Arrival."""
+    raw: str
+    fields: dict[str, float | str]
+
+    def sample(self) -> TelemetrySample:
+        """In SI units and our axes."""
+        return sample_from_sdk(self.stamp_s, self.fields)
+
+
+class Tello:
+    """One drone. Use it as a context manager: leaving it for whatever reason lands a drone that took off with it.
+
+    A `Guard` lands it when this program dies or hangs in flight, `Sticks` centre the sticks when no fresh ``rc`` comes,
+    and what others than the drone send is not listened to.
+    Nothing that makes the drone move is sent unless ``allow_motion`` is true.
+
+    Args:
+        address: Where it is.
+        allow_motion: Whether motion commands are let through (``--fly`` on the command line).
+        limits: Timeouts and guards.
+        on_state: Called for each state message, from the receiving thread.
+        on_picture: Called for each picture, from the video thread.
+    """
+
+    def __init__(
+        self,
+        address: TelloAddress | None = None,
+        allow_motion: bool = False,
+        limits: TelloLimits | None = None,
+        on_state: Callable[[StateMessage], None] | None = None,
+        on_picture: Callable[[Picture], None] | None = None,
+    ) -> None:
+        self.address = address or TelloAddress()
+        self.allow_motion = allow_motion
+        self.limits = limits or TelloLimits()
+        self.clock = ArrivalClock()
+        self.stop_reason = ""
+        """Why a guard ended the flight; empty while none did."""
+        self.latest: StateMessage | None = None
+        self.malformed = 0
+        """State packets without a single readable field."""
+        self._on_state, self._on_picture = on_state, on_picture
+        self._replies: queue.Queue[str] = queue.Queue()
+        self._sending = threading.RLock()
+        self._airborne = False
+        self._landing = threading.Event()
+        """Set while a landing is wanted: nothing else is waited for, nothing else is sent."""
+        self._leaving = threading.Event()
+        """The same for good, once `close` was called: a take-off that was about to be sent stays unsent."""
+        self._stopping = threading.Event()
+        self._closed = threading.Event()
+        self._last_sent_s = -math.inf
+        self._flight_begin_s = math.inf
+        self._took_off_s = -math.inf
+        """When the last take-off was sent."""
+        self._ground: float | None = None
+        """Height [cm] before take-off."""
+        self._rose = False
+        """Whether the climb of this flight was seen in the state."""
+        self._guard: Guard | None = None
+        self._video: VideoReceiver | None = None
+        self._video_begin_s = math.inf
+        self._host, self._local = self.address.ends()
+        self._commands = Inlet((self._local, 0), "command", self._host)
+        try:
+            self._states = Inlet((self._local, self.address.state_port), "state", self._host)
+        except SourceError:
+            self._commands.close()
+            raise
+        self._sticks = Sticks(self._transmit, self._beat)
+        self._threads = [
+            threading.Thread(target=self._receive_replies, name="tello-replies", daemon=True),
+            threading.Thread(target=self._receive_states, name="tello-state", daemon=True),
+            threading.Thread(target=self._watch, name="tello-watch", daemon=True),
+        ]
+        for thread in self._threads:
+            thread.start()
+        threading.Thread(target=self._close, name="tello-close", daemon=True).start()
+
+    # --- session -------------------------------------------------------------------------------------------------
+
+    def connect(self, state_timeout_s: float = 3.0) -> None:
+        """Enter SDK mode and wait for the first state message.
+
+        Raises:
+            TelloError: If the drone does not answer or sends no state.
+        """
+        self.send("command")
+        begin = self.clock.now()
+        while self.latest is None:
+            if self.clock.now() - begin > state_timeout_s or self._stopping.wait(0.02):
+                raise TelloError(
+                    f"{self.address.host}: answers commands but sends no state to port {self.address.state_port}; "
+                    "is a firewall in between?"
+                )
+
+    def __enter__(self) -> "Tello":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Land if airborne, stop the video, close the sockets; never raises for a drone that is gone.
+
+        Ctrl-C meanwhile does not end the landing: it is raised when that is over.
+        """
+        interrupted = False
+        while not self._closed.is_set():
+            try:
+                self._leaving.set()
+                self._closed.wait(0.2)
+            except KeyboardInterrupt:
+                interrupted = True
+        if interrupted:
+            raise KeyboardInterrupt
+
+    def _close(self) -> None:
+        """What `close` does, in a thread of its own, which no Ctrl-C reaches."""
+        self._leaving.wait()
+        failure = ""
+        try:
+            self._finish_flight()
+        except TelloError as error:
+            failure = str(error)
+        finally:
+            try:
+                self._hang_up()
+                if failure:  # said once all is done: a terminal that is stopped would hold it up
+                    logger.warning("while closing: %s", failure)
+            finally:
+                self._closed.set()
+
+    def _finish_flight(self) -> None:
+        with self._sending:
+            airborne = self._airborne
+        if airborne:
+            self.land()
+        elif self._video is not None:
+            self.send("streamoff", retries=0, timeout_s=0.5)
+
+    def _hang_up(self) -> None:
+        """End the threads and give the ports back; a guard that may still be needed goes on alone."""
+        self._stopping.set()
+        self._sticks.stop()
+        if self._guard is not None:
+            self._guard.dismiss(landed=False)
+        if self._video is not None:
+            self._video.stop()
+        for inlet in (self._commands, self._states):
+            inlet.stop()
+        for thread in self._threads:
+            thread.join(timeout=1.0)
+        self._commands.close()
+        self._states.close()
+
+    # --- commands ------------------------------------------------------------------------------------------------
+
+    def send(self, command: str, timeout_s: float | None = None, retries: int | None = None) -> str:
+        """Send one command and return the answer.
+
+        A command that moves the drone is sent once: its answer may be lost, not the command.
+
+        Raises:
+            TelloError: If there is no answer, the drone answers with an error, or motion is not allowed.
+        """
+        name = command.split(maxsplit=1)[0] if command.strip() else ""
+        if not command.isascii() or not command.isprintable() or not name:
+            raise TelloError(f"not an SDK command: {command!r}")
+        self._check_motion(name)
+        if name == "rc":
+            self._sticks.push(command, lambda: self._check_motion(name))
+            return ""
+        if name == "takeoff":
+            self.take_off()
+            return "ok"
+        moving = name in _NEVER_TWICE
+        tries = 1 if moving else 1 + (self.limits.retries if retries is None else retries)
+        wait = timeout_s or (_MOVE_TIMEOUT_S if moving else self.limits.timeout_s)
+        with self._sending:
+            for _ in range(tries):
+                self._check_motion(name)  # a landing may have begun while we waited for our turn
+                if name == "throwfly":
+                    self._begin_flight()
+                if moving or name == "stop":
+                    self._sticks.let_go()
+                self._drop_old_replies()
+                self._transmit(command)
+                answer = self._answer(command, wait)
+                if answer is None:
+                    continue
+                if is_refusal(answer):
+                    raise TelloError(f"{self.address.host}: {command!r} was refused: {answer}")
+                return answer
+        self._check_motion(name)
+        raise NoAnswer(
+            f"{self.address.host}: no answer to {command!r} in {tries} x {wait:.0f} s; "
+            "is the drone on and this computer in its Wi-Fi?"
+        )
+
+    def query(self, name: str) -> float:
+        """Number that a read command (``battery?``) answers, without its unit.
+
+        Raises:
+            TelloError: If there is no number in the answer.
+        """
+        answer = self.send(name)
+        match = re.match(r"\s*(-?\d+(?:\.\d+)?)", answer)
+        if match is None:
+            raise TelloError(f"{self.address.host}: {name} was answered with {answer[:40]!r}")
+        return float(match.group(1))
+
+    def take_off(self) -> None:
+        """Take off and wait until the climb is over.
+
+        Unlike a movement the command is sent again when nothing comes of it: a drone in the air refuses it. The climb
+        itself, seen in the state, is as good as an answer.
+
+        Raises:
+            TelloError: If motion is not allowed, the battery is low, the drone refuses, or nothing is heard of it.
+        """
+        self._check_motion("takeoff")
+        reason = self._unfit()
+        if reason:
+            raise TelloError(f"{self.address.host}: not taking off: {reason}")
+        with self._sending:
+            self._begin_flight()
+            self._sticks.let_go()
+            self._drop_old_replies()
+            tries = 1 + self.limits.retries
+            for attempt in range(tries):
+                self._check_motion("takeoff")
+                self._took_off_s = self.clock.now()
+                self._transmit("takeoff")
+                answer = self._answer("takeoff", self.limits.timeout_s, self._risen)
+                if answer is not None and not is_refusal(answer):
+                    return
+                if self._risen():
+                    break
+                if answer is not None and attempt == 0:
+                    self._end_flight()
+                    raise TelloError(f"{self.address.host}: 'takeoff' was refused: {answer}")
+                if answer is not None:
+                    break  # a refusal of what is repeated: it heard us before and is about to rise
+            self._wait_for_hover()
+
+    def land(self) -> None:
+        """Land, insistently: an answer may be lost, a drone in the air may not. Whatever else is waited for ends.
+
+        Raises:
+            TelloError: If the drone neither answers nor says that it is on the ground.
+        """
+        self._landing.set()
+        self._sticks.let_go()
+        if not self._sending.acquire(blocking=False):
+            self._transmit("land")  # at once, while another thread still waits for the answer to a long move
+            self._sending.acquire()
+        try:
+            self._land_until_down()
+        finally:
+            self._sending.release()
+            self._landing.clear()
+
+    def _land_until_down(self) -> None:
+        agreed = 0
+        for _ in range(_LAND_TRIES):
+            self._drop_old_replies()
+            self._transmit("land")
+            answer = self._answer("land", _LAND_AGAIN_S, self._landed)
+            agreed += answer is not None and not is_refusal(answer)
+            deadline = self.clock.now() + (0.0 if answer is None else 1.0)
+            while not self._landed() and self.clock.now() < deadline and not self._stopping.wait(0.05):
+                pass  # what was answered shows in the state a moment later
+            # The first "ok" may be that of the movement which the landing ended.
+            if self._landed() or agreed > 1 or (agreed and self._level() is None):
+                self._end_flight()
+                return
+        raise TelloError(f"{self.address.host}: no answer to 'land'; the drone lands by itself after 15 s of silence")
+
+    def rc(self, right: float, forward: float, up: float, clockwise: float) -> None:
+        """Sticks in [-1, 1]. Send it at least every 0.3 s: sticks that are older are centred (`Sticks`).
+
+        Raises:
+            TelloError: If motion is not allowed.
+        """
+        sticks = [
+            round(100 * max(-1.0, min(1.0, s if math.isfinite(s) else 0.0))) for s in (right, forward, up, clockwise)
+        ]
+        self.send("rc " + " ".join(str(s) for s in sticks))
+
+    def move(self, forward_m: float, left_m: float, up_m: float, speed_m_s: float = 0.4) -> None:
+        """Fly by a vector in body axes and wait until it is done.
+
+        Raises:
+            TelloError: As `send`.
+        """
+        cm = [round(100 * x) for x in (forward_m, left_m, up_m)]
+        self.send(f"go {cm[0]} {cm[1]} {cm[2]} {round(100 * speed_m_s)}")
+
+    def turn(self, left_rad: float) -> None:
+        """Turn on the spot, counter-clockwise positive, and wait until it is done.
+
+        Raises:
+            TelloError: As `send`.
+        """
+        degrees = round(math.degrees(abs(left_rad)))
+        if degrees:
+            self.send(f"{'ccw' if left_rad > 0 else 'cw'} {degrees}")
+
+    def start_video(self) -> VideoReceiver:
+        """Ask for the stream and receive it.
+
+        Raises:
+            TelloError: If the drone refuses.
+            SourceError: If PyAV is missing or the port is taken.
+        """
+        if self._video is None:
+            local = (self._local, self.address.video_port)
+            self._video = VideoReceiver(local, self.clock, self._host, self._on_picture)
+        self.send("streamon")
+        self._video_begin_s = self.clock.now()
+        return self._video
+
+    @property
+    def airborne(self) -> bool:
+        """Whether this client has taken off and not landed."""
+        return self._airborne
+
+    @property
+    def refused(self) -> dict[str, int]:
+        """Packets on each channel that did not come from the drone, and were not listened to."""
+        video = 0 if self._video is None else self._video.refused
+        return {"video": video, "state": self._states.refused, "answers": self._commands.refused}
+
+    # --- inside --------------------------------------------------------------------------------------------------
+
+    def _check_motion(self, name: str) -> None:
+        if name in _MOVES and self.stop_reason:
+            raise TelloError(f"{self.address.host}: {name!r} not sent: the flight has ended: {self.stop_reason}")
+        if name in _MOVES and self._over():
+            raise TelloError(f"{self.address.host}: {name!r} not sent: landing")
+        if name in _MOVES and not self.allow_motion:
+            raise TelloError(f"{name!r} would move the drone; pass --fly (allow_motion=True) to let it")
+
+    def _over(self) -> bool:
+        return self._landing.is_set() or self._leaving.is_set()
+
+    def _begin_flight(self) -> None:
+        """From here on the drone may be in the air, whatever is heard of it."""
+        self._ground, self._rose = self._level(), False
+        self._took_off_s = self._flight_begin_s = self.clock.now()
+        if self._guard is None and os.name == "posix":
+            try:
+                self._guard = Guard(self._commands.socket, (self._host, self.address.command_port))
+            except OSError as error:
+                logger.warning("no guard against the death of this program (%s); the drone then lands by itself", error)
+        self._airborne = True
+
+    def _end_flight(self) -> None:
+        self._airborne = False
+        guard, self._guard = self._guard, None
+        if guard is not None:
+            guard.dismiss(landed=True)
+
+    def _beat(self, pushed: bool) -> None:
+        guard = self._guard
+        if guard is not None:
+            guard.beat(pushed)
+
+    def _transmit(self, command: str) -> None:
+        try:
+            self._commands.socket.sendto(command.encode("ascii"), (self._host, self.address.command_port))
+        except OSError as error:  # no network at the moment; what matters is sent again
+            logger.debug("%s: %r not sent: %s", self.address.host, command, error)
+        self._last_sent_s = self.clock.now()
+
+    def _drop_old_replies(self) -> None:
+        while True:
+            try:
+                self._replies.get_nowait()
+            except queue.Empty:
+                return
+
+    def _answer(self, command: str, timeout_s: float, enough: Callable[[], bool] = lambda: False) -> str | None:
+        """The answer to a command; None when time is up, a landing is wanted, or what it should bring is seen."""
+        deadline = self.clock.now() + timeout_s
+        while not self._stopping.is_set() and (command in _PARTING or not self._over()):
+            left = deadline - self.clock.now()
+            if left <= 0 or enough():
+                return None
+            try:
+                answer = self._replies.get(timeout=min(left, 0.1))
+            except queue.Empty:
+                continue
+            if belongs_to(command, answer):
+                return answer
+        return None
+
+    def _wait_for_hover(self) -> None:
+        """Until 'takeoff' is answered, or the drone has risen and its height no longer changes.
+
+        Raises:
+            TelloError: If it does not rise.
+        """
+        begin = since = self.clock.now()
+        level = self._level()
+        while self.clock.now() - begin < (_CLIMB_TIMEOUT_S if self._risen() else _RISE_TIMEOUT_S):
+            self._check_motion("takeoff")
+            answer = self._answer("takeoff", 0.1)
+            if answer is not None and not is_refusal(answer):
+                return
+            now, height = self.clock.now(), self._level()
+            if height is None or level is None or abs(height - level) > _STEADY_CM:
+                level, since = height, now
+            elif now - since > _STEADY_S and self._risen():
+                return
+        if not self._risen():
+            raise TelloError(f"{self.address.host}: no answer to 'takeoff' and no climb seen")
+
+    def _receive_replies(self) -> None:
+        for packet in self._commands.packets():
+            text = packet.decode("ascii", errors="replace").strip("\x00 \r\n")
+            if text and text.isascii() and text.isprintable() and len(text) < 200:
+                self._replies.put(text)
+
+    def _receive_states(self) -> None:
+        for packet in self._states.packets():
+            stamp = self.clock.now()
+            fields = parse_state(packet)
+            if "bat" not in fields and "pitch" not in fields:
+                self.malformed += 1
+                continue
+            message = StateMessage(stamp, packet.decode("ascii", errors="replace").strip(), fields)
+            self.latest = message
+            self._rose |= self._airborne and self._risen()
+            if self._on_state is not None:
+                self._tell(message)
+
+    def _tell(self, message: StateMessage) -> None:
+        """A listener that fails must not end the state of a drone in the air."""
+        assert self._on_state is not None
+        try:
+            self._on_state(message)
+        except Exception:
+            logger.exception("what listens to state messages failed, and is not called again")
+            self._on_state = None
+
+    def _fresh(self) -> dict[str, float | str]:
+        """Fields of the last state message; none when it is old."""
+        latest = self.latest
+        return latest.fields if latest is not None and self.clock.now() - latest.stamp_s < _FRESH_S else {}
+
+    def _level(self) -> float | None:
+        """Height [cm] by range sensor, else by the drone's own estimate, from fresh state."""
+        fields = self._fresh()
+        tof, h = fields.get("tof"), fields.get("h")
+        if isinstance(tof, float) and 0 < tof < 800:
+            return tof
+        return h if isinstance(h, float) else None
+
+    def _risen(self) -> bool:
+        """Whether the drone is higher than it was on the ground."""
+        level = self._level()
+        return level is not None and level > (10.0 if self._ground is None else self._ground) + _RISEN_CM
+
+    def _landed(self) -> bool:
+        """Whether the drone is on the ground to stay: one that was told to take off may be about to."""
+        came_down = self._rose or self.clock.now() - self._took_off_s > _RISE_TIMEOUT_S
+        return came_down and self._grounded()
+
+    def _grounded(self) -> bool:
+        """Whether fresh state says that the drone stands on the floor."""
+        fields = self._fresh()
+        tof, h = fields.get("tof"), fields.get("h")
+        low = isinstance(tof, float) and tof <= 15 and isinstance(h, float) and h <= 10
+        return low and fields.get("vgz", 0.0) == 0.0  # not while it still sinks
+
+    def _unfit(self) -> str:
+        """Why this drone should not fly; empty when it may."""
+        fields = self.latest.fields if self.latest is not None else {}
+        battery, heat = fields.get("bat"), fields.get("temph")
+        if isinstance(battery, float) and battery < 100 * self.limits.min_battery:
+            return f"battery at {battery:.0f} %"
+        if isinstance(heat, float) and heat > self.limits.max_temperature_c:
+            return f"temperature {heat:.0f} C"
+        return ""
+
+    def _watch(self) -> None:
+        """Keep the drone listening; end the flight when its state says so, and ask for that until it is down."""
+        while not self._stopping.wait(0.1):
+            now = self.clock.now()
+            reason = self.stop_reason or self._why_land(now)
+            if self._airborne and reason and not self._leaving.is_set():
+                self.stop_reason = reason
+                self._land_because(reason)
+            elif now - self._last_sent_s > self.limits.keep_alive_s and math.isfinite(self._last_sent_s):
+                self._keep_alive()
+
+    def _land_because(self, reason: str) -> None:
+        failure = ""
+        try:
+            self.land()
+        except TelloError as error:
+            failure = str(error)
+        # Said once it is done: a terminal that is stopped would hold up the landing.
+        if failure:
+            logger.error("%s", failure)
+        else:
+            logger.warning("%s: landed: %s", self.address.host, reason)
+
+    def _why_land(self, now: float) -> str:
+        state_s = self.latest.stamp_s if self.latest is not None else self._flight_begin_s
+        if now - max(state_s, self._flight_begin_s) > self.limits.state_loss_s:
+            return f"no state for {self.limits.state_loss_s:.0f} s"
+        if self._video is not None:
+            newest = self._video.newest
+            picture_s = max(newest.stamp_s if newest is not None else 0.0, self._video_begin_s, self._flight_begin_s)
+            if now - picture_s > self.limits.video_loss_s:
+                return f"no video for {self.limits.video_loss_s:.0f} s"
+        if self._rose and self._grounded() and not self._over():
+            return "the drone came down by itself"
+        return self._unfit()
+
+    def _keep_alive(self) -> None:
+        if not self._sending.acquire(blocking=False):
+            return  # another thread is talking to the drone anyway
+        try:
+            self.send("battery?", timeout_s=1.0, retries=0)
+        except TelloError:
+            logger.debug("keep-alive was not answered")
+        finally:
+            self._sending.release()

@@ -1,0 +1,184 @@
+"""A Tello's H.264 stream: datagrams in, the newest decoded picture with its arrival time out."""
+
+import importlib
+import logging
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from edgeslam_torch.drone.udp import Inlet
+from edgeslam_torch.errors import SourceError
+
+logger = logging.getLogger(__name__)
+
+CHUNK = 1460
+"""Bytes of a full datagram; a shorter one ends a picture."""
+_MAX_PICTURE = 4 * 1024 * 1024
+_RECEIVE_BUFFER = 4 * 1024 * 1024
+
+
+def import_av() -> Any:
+    """PyAV, or a word on how to get it.
+
+    Raises:
+        SourceError: If it is not installed.
+    """
+    try:
+        av = importlib.import_module("av")
+    except ImportError as error:
+        raise SourceError("video of a drone needs PyAV: pip install 'av>=12'") from error
+    av.logging.set_level(None)  # a lossy stream would fill the terminal with decoder messages
+    return av
+
+
+class ArrivalClock:
+    """Seconds since 1970 that never jump: wall time at the start plus a monotonic clock.
+
+    Whole microseconds, as recordings hold them: what is run again has the very same stamps.
+    """
+
+    def __init__(self) -> None:
+        self._offset = time.time() - time.monotonic()
+
+    def now(self) -> float:
+        """Now [s]."""
+        return round(time.monotonic() + self._offset, 6)
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """One decoded picture."""
+
+    stamp_s: float
+    """Arrival of its last datagram."""
+    image: np.ndarray
+    """``(H, W, 3)`` BGR."""
+    count: int
+    """Pictures decoded so far, this one included."""
+
+
+class PictureAssembler:
+    """Datagrams to pictures. Survives a start in mid-stream, lost datagrams and garbage; never raises for data."""
+
+    def __init__(self) -> None:
+        av = import_av()
+        self._av = av
+        self._errors: tuple[type[BaseException], ...] = (av.error.FFmpegError, ValueError)
+        self._context = self._new_context()
+        self._buffer = bytearray()
+        self._first_s = 0.0
+        self.decoded = 0
+        self.undecodable = 0
+        """Pictures lost to missing datagrams or before the first keyframe."""
+
+    def _new_context(self) -> Any:
+        context = self._av.CodecContext.create("h264", "r")
+        context.thread_count = 1  # frame threads would hold pictures back
+        context.options = {"flags": "low_delay"}
+        return context
+
+    def feed(self, datagram: bytes, stamp_s: float) -> list[Picture]:
+        """Pictures completed by one datagram; usually none or one."""
+        self._buffer += datagram
+        if len(datagram) == CHUNK and len(self._buffer) < _MAX_PICTURE:
+            return []
+        data, self._buffer = bytes(self._buffer), bytearray()
+        try:
+            frames = self._context.decode(self._av.Packet(data))
+            whole = [frame for frame in frames if not frame.is_corrupt]
+            images = [np.asarray(frame.to_ndarray(format="bgr24")) for frame in whole]
+        except self._errors:
+            self.undecodable += 1
+            return []
+        if not images:
+            self.undecodable += 1
+        pictures = []
+        for image in images:
+            self.decoded += 1
+            pictures.append(Picture(stamp_s, image, self.decoded))
+        return pictures
+
+
+class VideoReceiver:
+    """Socket and decoder in a thread; `newest` is the last whole picture.
+
+    Args:
+        bind: Where to listen.
+        clock: For the stamps.
+        host: Numeric address of the drone; what anybody else sends is refused.
+        on_picture: Called for each picture, from the video thread.
+
+    Raises:
+        SourceError: If PyAV is missing or the port is taken.
+    """
+
+    def __init__(
+        self,
+        bind: tuple[str, int],
+        clock: ArrivalClock,
+        host: str,
+        on_picture: Callable[[Picture], None] | None = None,
+    ) -> None:
+        self._assembler = PictureAssembler()
+        self._clock, self._on_picture = clock, on_picture
+        self._inlet = Inlet(bind, "video", host, _RECEIVE_BUFFER)
+        self._ready = threading.Condition()
+        self._newest: Picture | None = None
+        self._stopping = False
+        self._thread = threading.Thread(target=self._work, name="tello-video", daemon=True)
+        self._thread.start()
+
+    @property
+    def newest(self) -> Picture | None:
+        """The last whole picture; None before the first."""
+        return self._newest
+
+    @property
+    def statistics(self) -> dict[str, int]:
+        """Pictures decoded and undecodable."""
+        return {"decoded": self._assembler.decoded, "undecodable": self._assembler.undecodable}
+
+    @property
+    def refused(self) -> int:
+        """Packets that did not come from the drone."""
+        return self._inlet.refused
+
+    def wait(self, after_count: int, timeout_s: float) -> Picture | None:
+        """The newest picture once it is later than ``after_count``; None when time is up."""
+        with self._ready:
+            self._ready.wait_for(lambda: self._stopping or self._later(after_count), timeout_s)
+            return self._newest if self._later(after_count) else None
+
+    def _later(self, count: int) -> bool:
+        return self._newest is not None and self._newest.count > count
+
+    def _work(self) -> None:
+        for datagram in self._inlet.packets():
+            for picture in self._assembler.feed(datagram, self._clock.now()):
+                with self._ready:
+                    self._newest = picture
+                    self._ready.notify_all()
+                if self._on_picture is not None:
+                    self._tell(picture)
+
+    def _tell(self, picture: Picture) -> None:
+        """A listener that fails must not end the video of a drone in the air."""
+        assert self._on_picture is not None
+        try:
+            self._on_picture(picture)
+        except Exception:
+            logger.exception("what listens to pictures failed, and is not called again")
+            self._on_picture = None
+
+    def stop(self) -> None:
+        """Close the socket and end the thread."""
+        self._stopping = True
+        self._inlet.stop()
+        with self._ready:
+            self._ready.notify_all()
+        self._thread.join(timeout=2.0)
+        self._inlet.close()

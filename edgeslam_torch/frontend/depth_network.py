@@ -1,0 +1,217 @@
+"""Stage 1, depth: FastDepth on one thread, in metres for the camera at hand."""
+
+import logging
+from pathlib import Path
+from typing import Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from edgeslam_torch.errors import WeightsError
+from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.models.layout import INPUT_MULTIPLE, MAX_LOG_DEPTH
+from edgeslam_torch.models.record import DEFAULT_WEIGHTS, Metadata
+from edgeslam_torch.types import DepthMap, FloatArray
+
+logger = logging.getLogger(__name__)
+
+_TRIAL_SIZE = 64
+"""Side of the pictures that weights are tried on when they are loaded [px]: a few milliseconds."""
+_LOG_RANGE = MAX_LOG_DEPTH - 1e-3
+"""The network clips log depth there: a value at the end of its range says "off the scale", not how far."""
+
+
+class _Engine(Protocol):
+    metadata: Metadata
+    fixed_size: tuple[int, int] | None
+
+    def run(self, image: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """``(1, 3, H, W)`` -> log depth and sigma, both ``(H/2, W/2)``."""
+        ...
+
+
+class DepthPredictor:
+    """Depth of an undistorted image.
+
+    Args:
+        weights: A ``.safetensors`` file or an exported ``.onnx`` file; the shipped weights by default.
+        backend: ``"onnxruntime"`` (falls back to torch when it is not installed) or ``"torch"``.
+        threads: Threads of one inference. With torch this sets the process's number of threads.
+
+    Raises:
+        WeightsError: If the weights are missing, damaged, or give no depth.
+        ValueError: If the backend is unknown.
+
+    Example:
+        >>> predictor = DepthPredictor()  # doctest: +SKIP
+        >>> predictor(image, camera).depth_m.shape  # doctest: +SKIP
+        (480, 640)
+    """
+
+    def __init__(self, weights: Path | None = None, backend: str = "onnxruntime", threads: int = 1) -> None:
+        if backend not in ("onnxruntime", "torch"):
+            raise ValueError(f"backend must be 'onnxruntime' or 'torch', got {backend!r}")
+        self.weights = DEFAULT_WEIGHTS if weights is None else Path(weights)
+        self._engine = _open_engine(self.weights, backend, threads)
+        _try_out(self._engine, self.weights)
+
+    @property
+    def metadata(self) -> Metadata:
+        """What the weights say about themselves."""
+        return self._engine.metadata
+
+    @property
+    def backend(self) -> str:
+        """What actually runs."""
+        return "torch" if isinstance(self._engine, _TorchEngine) else "onnxruntime"
+
+    def __call__(self, image: NDArray[np.uint8], camera: Camera) -> DepthMap:
+        """Depth [m] and its uncertainty at the image's size; NaN where the network's range ends (100 m, 1 cm).
+
+        The network's metres hold for the focal length it was trained with; the same pixels through a lens
+        twice as
+        long are twice as far away, so depth is multiplied by the ratio of focal lengths, both measured in the
+        network's own pixels.
+
+        Args:
+            image: ``(H, W, 3)`` BGR or ``(H, W)`` grey, undistorted.
+            camera: Intrinsics of that image.
+
+        Raises:
+            ValueError: If the image's size is not the camera's or it has neither one nor three channels.
+        """
+        if image.shape[:2] != (camera.height, camera.width) or image.ndim not in (2, 3):
+            raise ValueError(f"image {image.shape} does not fit a camera of {camera.width}x{camera.height}")
+        height, width = self._engine.fixed_size or network_size(camera.height, camera.width, self.metadata)
+        log_depth, sigma = self._engine.run(preprocess(image, height, width, self.metadata))
+        log_depth = np.where(np.abs(log_depth) < _LOG_RANGE, log_depth, np.float32(np.nan))
+        small = camera.scaled(width, height)
+        focal_ratio = float(np.sqrt(small.fx * small.fy)) / self.metadata.focal_px
+        size = (camera.width, camera.height)
+        depth_m = cv2.resize(np.exp(log_depth) * np.float32(focal_ratio), size, interpolation=cv2.INTER_LINEAR)
+        sigma_log = cv2.resize(sigma, size, interpolation=cv2.INTER_LINEAR)
+        return DepthMap(np.asarray(depth_m, np.float32), np.asarray(sigma_log, np.float32))
+
+
+def preprocess(image: NDArray[np.uint8], height: int, width: int, metadata: Metadata) -> FloatArray:
+    """BGR or grey uint8 -> ``(1, 3, height, width)`` float32, the whole image squeezed, normalised RGB."""
+    shrinks = height <= image.shape[0] and width <= image.shape[1]
+    small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+    gain = np.float32(1.0) / (np.float32(255.0) * np.array(metadata.std, np.float32))
+    offset = np.array(metadata.mean, np.float32) / np.array(metadata.std, np.float32)
+    planes = np.empty((1, 3, height, width), np.float32)
+    for i, plane in enumerate(planes[0]):
+        np.multiply(small if small.ndim == 2 else small[:, :, 2 - i], gain[i], out=plane)
+        plane -= offset[i]
+    return planes
+
+
+def network_size(height: int, width: int, metadata: Metadata) -> tuple[int, int]:
+    """Input size ``(height, width)``: multiples of 32 close to the image's shape, at most the training
+    area."""
+    area = metadata.input_height * metadata.input_width
+    best, best_cost = (metadata.input_height, metadata.input_width), np.inf
+    for h in range(INPUT_MULTIPLE, 2 * metadata.input_height + 1, INPUT_MULTIPLE):
+        for w in range(INPUT_MULTIPLE, 2 * metadata.input_width + 1, INPUT_MULTIPLE):
+            if h * w > area:
+                continue
+            # Squeezing by 10 % weighs as much as giving up 20 % of the pixels.
+            cost = abs(np.log((w / h) / (width / height))) + 0.5 * np.log(area / (h * w))
+            if cost < best_cost - 1e-9:
+                best, best_cost = (h, w), cost
+    return best
+
+
+def _open_engine(weights: Path, backend: str, threads: int) -> _Engine:
+    if backend == "onnxruntime":
+        try:
+            import onnxruntime  # noqa: F401 - only to see whether it is there
+        except ImportError:
+            if weights.suffix == ".onnx":
+                raise WeightsError(
+                    f"{weights}: running an ONNX file needs onnxruntime (pip install onnxruntime)"
+                ) from None
+            logger.warning("onnxruntime is not installed: depth runs in torch, about twice as slow")
+        else:
+            return _OnnxEngine(weights, threads)
+    if weights.suffix == ".onnx":
+        raise WeightsError(f"{weights}: an ONNX file runs in onnxruntime only, not with backend 'torch'")
+    return _TorchEngine(weights, threads)
+
+
+def _try_out(engine: _Engine, weights: Path) -> None:
+    """Refuse weights that make no depth of two simple pictures, or the same of both.
+
+    Raises:
+        WeightsError: If so, or if they cannot be run at all.
+    """
+    height, width = engine.fixed_size or (_TRIAL_SIZE, _TRIAL_SIZE)
+    across, down = np.meshgrid(np.linspace(0, 255, width), np.linspace(0, 255, height))
+    picture = np.stack([across, down, 255 - across], axis=2).astype(np.uint8)
+    answers = []
+    for image in (picture, np.ascontiguousarray(picture[::-1])):
+        try:
+            log_depth, sigma = engine.run(preprocess(image, height, width, engine.metadata))
+        except Exception as error:  # onnxruntime's have no base of their own
+            raise WeightsError(f"{weights}: cannot be run ({_first_line(error)})") from error
+        if log_depth.shape != (height // 2, width // 2) or sigma.shape != log_depth.shape:
+            raise WeightsError(f"{weights}: gives depth of shape {log_depth.shape} for a picture of {height}x{width}")
+        known = np.isfinite(log_depth) & (np.abs(log_depth) < _LOG_RANGE) & np.isfinite(sigma) & (sigma > 0)
+        if not known.any():
+            raise WeightsError(f"{weights}: gives no depth: every pixel is not finite or at the end of its range")
+        answers.append(log_depth)
+    if np.array_equal(answers[0], answers[1], equal_nan=True):
+        raise WeightsError(f"{weights}: gives the same depth whatever it sees")
+
+
+def _first_line(error: Exception) -> str:
+    return " ".join(str(error).split())[:160]
+
+
+class _OnnxEngine:
+    def __init__(self, weights: Path, threads: int) -> None:
+        import onnxruntime
+
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
+        options.log_severity_level = 4  # what goes wrong is raised, too
+        if weights.suffix == ".onnx":
+            from edgeslam_torch.models.onnx.file import read_onnx
+
+            content, self.metadata = read_onnx(weights)
+        else:
+            from edgeslam_torch.models.onnx.graph import build_graph
+
+            content, self.metadata = build_graph(weights)
+        try:
+            self._session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+        except Exception as error:  # onnxruntime's have no base of their own
+            raise WeightsError(f"{weights}: onnxruntime cannot load it ({_first_line(error)})") from error
+        height, width = self._session.get_inputs()[0].shape[2:]
+        self.fixed_size = (height, width) if isinstance(height, int) and isinstance(width, int) else None
+
+    def run(self, image: FloatArray) -> tuple[FloatArray, FloatArray]:
+        log_depth, sigma = self._session.run(["log_depth", "sigma_log"], {"image": image})
+        return log_depth[0, 0], sigma[0, 0]
+
+
+class _TorchEngine:
+    fixed_size: tuple[int, int] | None = None
+
+    def __init__(self, weights: Path, threads: int) -> None:
+        import torch
+
+        from edgeslam_torch.models.checkpoint import load_checkpoint
+        from edgeslam_torch.models.onnx.fold import deployed
+
+        torch.set_num_threads(threads)
+        network, self.metadata = load_checkpoint(weights)
+        self._network = deployed(network, self.metadata).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+
+    def run(self, image: FloatArray) -> tuple[FloatArray, FloatArray]:
+        import torch
+
+        with torch.inference_mode():
+            log_depth, sigma = self._network(torch.from_numpy(image).to(memory_format=torch.channels_last))
+        return log_depth[0, 0].numpy(), sigma[0, 0].numpy()

@@ -1,1 +1,0 @@
-"""Readers that give frames and telemetry, writers that take records."""

@@ -1,0 +1,107 @@
+"""How deep a keypoint probably is before it is triangulated: depth network and anchors under one scale."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from edgeslam_torch.map.keyframe import Keyframe
+from edgeslam_torch.types import DepthMap, FloatArray
+
+REACH_PX = 40.0
+"""Distance from an anchor at which its depth error says a third as much about the network's there."""
+NEAREST = 4
+"""Anchors that speak for a pixel."""
+
+MIN_ANCHORS = 8
+"""Below this a fit to anchors says less than the network."""
+
+
+@dataclass(frozen=True, slots=True)
+class DepthFit:
+    """Map units per network metre, from the anchors that one keyframe sees."""
+
+    log_ratio: float
+    sigma_log: float
+    """Robust spread of single anchors around the fit."""
+    anchors: int
+
+
+def sample(depth: DepthMap, uv: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Depth [m] and its log sigma at the nearest pixels of ``(N, 2)``; NaN where the network says nothing."""
+    height, width = depth.depth_m.shape
+    u = np.clip(np.rint(uv[:, 0]), 0, width - 1).astype(np.int64)
+    v = np.clip(np.rint(uv[:, 1]), 0, height - 1).astype(np.int64)
+    z = depth.depth_m[v, u].astype(np.float64)
+    return np.where(z > 0, z, np.nan), depth.sigma_log[v, u].astype(np.float64)
+
+
+def fit_to_anchors(network_m: FloatArray, anchor_depth: FloatArray) -> DepthFit | None:
+    """Robust scale between network depth and anchor depth at the same pixels, both ``(A,)``."""
+    usable = np.isfinite(network_m) & (network_m > 0) & (anchor_depth > 0)
+    if usable.sum() < MIN_ANCHORS:
+        return None
+    log_ratio = np.log(anchor_depth[usable] / network_m[usable])
+    centre = float(np.median(log_ratio))
+    spread = 1.4826 * float(np.median(np.abs(log_ratio - centre)))
+    return DepthFit(centre, max(spread, 0.02), int(usable.sum()))
+
+
+def depth_prior(
+    keyframe: Keyframe, uv: FloatArray, anchor_p_w: FloatArray, unknown_sigma_log: float
+) -> tuple[FloatArray, FloatArray]:
+    """Expected z-depth [map units] and its log sigma at pixels ``(N, 2)`` of a keyframe, ``(N,)`` each.
+
+    With a depth map: the network's depth, brought to map units by the keyframe's own anchors, bent towards those
+    nearby, and as uncertain as it turned out to be at them: in a room it never saw, the network is surer of itself
+    than it should be. Without one: the log depth of the nearest anchors, with a wide sigma.
+
+    Args:
+        keyframe: Keyframe with some anchors.
+        uv: Undistorted pixels.
+        anchor_p_w: ``(A, 3)`` positions of all anchors, indexed by id.
+        unknown_sigma_log: Sigma where no network speaks.
+    """
+    held = keyframe.keypoints_with_anchor()
+    z = (anchor_p_w[keyframe.anchor[held]] @ keyframe.T_c_w[:3, :3].T + keyframe.T_c_w[:3, 3])[:, 2]
+    held, z = held[z > 0], z[z > 0]
+    if len(held) == 0:
+        return np.full(len(uv), np.nan), np.full(len(uv), np.inf)
+    anchor_uv = keyframe.features.uv[held]
+    if keyframe.depth is not None:
+        at_anchors, _ = sample(keyframe.depth, anchor_uv)
+        fit = fit_to_anchors(at_anchors, z)
+        if fit is not None:
+            network, sigma = sample(keyframe.depth, uv)
+            known = np.isfinite(at_anchors)
+            error = np.log(z[known] / at_anchors[known]) - fit.log_ratio
+            bend, unexplained = _bend(anchor_uv[known], error, uv)
+            return network * np.exp(fit.log_ratio + bend), np.hypot(np.maximum(sigma, unexplained), 0.05)
+    log_z, _ = _nearby(cKDTree(anchor_uv), np.log(z), uv)
+    return np.exp(log_z), np.full(len(uv), unknown_sigma_log)
+
+
+def _bend(anchor_uv: FloatArray, error: FloatArray, uv: FloatArray) -> tuple[FloatArray, float]:
+    """Correction of the network's log depth at pixels from its error at the anchors near them.
+
+    Returns:
+        The correction ``(N,)``, fading with the distance to the nearest anchor, and the robust spread of what it
+        leaves of each anchor's error when that anchor takes no part.
+    """
+    tree = cKDTree(anchor_uv)
+    mean, distance = _nearby(tree, error, uv)
+    mean_of_others, apart = _nearby(tree, error, anchor_uv, but_itself=True)
+    left = error - np.exp(-apart / REACH_PX) * mean_of_others
+    return np.exp(-distance / REACH_PX) * mean, 1.4826 * float(np.median(np.abs(left)))
+
+
+def _nearby(
+    tree: cKDTree, values: FloatArray, uv: FloatArray, but_itself: bool = False
+) -> tuple[FloatArray, FloatArray]:
+    """Distance-weighted mean of the values at the four nearest anchors, and the distance [px] to the nearest."""
+    k = min(NEAREST + but_itself, tree.n)
+    distance, nearest = (side.reshape(len(uv), k) for side in tree.query(uv, k=k))
+    if but_itself:
+        distance, nearest = distance[:, 1:], nearest[:, 1:]
+    weight = 1.0 / (distance + 5.0)
+    return (weight * values[nearest]).sum(1) / weight.sum(1), distance[:, 0]

@@ -1,0 +1,231 @@
+"""Keyframes and anchors with the observations that join them."""
+
+import threading
+
+import numpy as np
+
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.map.anchors import Anchors
+from edgeslam_torch.map.keyframe import NO_ANCHOR, Keyframe
+from edgeslam_torch.types import FloatArray, IntArray
+
+
+class SlamMap:
+    """The map that tracking reads and mapping writes.
+
+    Keyframes that were removed live on as a rigid link to a surviving one, so that every frame ever tracked keeps a
+    pose that moves with the map.
+    """
+
+    def __init__(self, scale_factor: float, levels: int = 8) -> None:
+        self.scale_factor = scale_factor
+        """Of the keypoints' pyramid, with ``levels``."""
+        self.levels = levels
+        self.anchors = Anchors()
+        self.keyframes: dict[int, Keyframe] = {}
+        self.links: dict[int, tuple[int, FloatArray]] = {}
+        """Removed keyframe id -> (surviving id, ``T_removed_surviving``)."""
+        self.lock = threading.RLock()
+        """Held to change the map, and to read it from another thread than the one that changes it."""
+        self.revision = 0
+        """Grows with every change of who observes what, so that who remembers something of that sees if it holds."""
+        self.begun: dict[int, str] = {}
+        """What the first pose and the scale of each piece rest on, by the piece's number."""
+        self._piece: dict[int, int] = {}
+        """Piece in which each keyframe, alive or removed, was made."""
+        self._joined: dict[int, int] = {}
+        """Piece -> older piece that it was found to be part of."""
+        self._next_id = 0
+
+    def next_keyframe_id(self) -> int:
+        """A keyframe id never used before."""
+        self._next_id += 1
+        return self._next_id - 1
+
+    def pose_of(self, keyframe_id: int) -> FloatArray:
+        """``T_c_w`` of a keyframe, alive or removed."""
+        heir, T_keyframe_heir = self._heir(keyframe_id)
+        return T_keyframe_heir @ self.keyframes[heir].T_c_w
+
+    def _heir(self, keyframe_id: int) -> tuple[int, FloatArray]:
+        """The surviving keyframe that a keyframe hangs on (itself while it lives), and the way to it."""
+        chain = []
+        T = np.eye(4)
+        while keyframe_id in self.links:
+            chain.append(keyframe_id)
+            keyframe_id = self.links[keyframe_id][0]
+        # Links of links are shortened on the way, or a thousand removed keyframes would be walked for every frame.
+        for removed in reversed(chain):
+            T = self.links[removed][1] @ T
+            self.links[removed] = (keyframe_id, T)
+        return keyframe_id, T
+
+    # -- pieces ------------------------------------------------------------------------------------------------
+
+    def begin_piece(self, begun: str) -> None:
+        """Keyframes added from now on belong to a new piece, unless the last one holds no anchor.
+
+        Args:
+            begun: What the new piece's first pose and scale rest on, in words.
+        """
+        members = (k for k in self.keyframes.values() if self._piece[k.id] == self.piece)
+        if not self.begun or any((k.anchor != NO_ANCHOR).any() for k in members):
+            self.begun[len(self.begun)] = begun
+
+    @property
+    def piece(self) -> int:
+        """Number of the piece that new keyframes belong to."""
+        return max(len(self.begun) - 1, 0)
+
+    def piece_of(self, keyframe_id: int) -> int:
+        """Number of the piece that a keyframe, alive or removed, belongs to by now."""
+        piece = self._piece[keyframe_id]
+        while piece in self._joined:
+            piece = self._joined[piece]
+        return piece
+
+    def join_pieces(self, keyframe: Keyframe, others: list[Keyframe]) -> bool:
+        """Record that a keyframe and others show the same anchors, hence are of one piece; whether that was news."""
+        mine = self.piece_of(keyframe.id)
+        found = {self.piece_of(other.id) for other in others} - {mine}
+        oldest = min(found | {mine})
+        for piece in (found | {mine}) - {oldest}:
+            self._joined[piece] = oldest
+        return bool(found)
+
+    def latest(self) -> Keyframe:
+        """The newest keyframe."""
+        with self.lock:
+            return self.keyframes[max(self.keyframes)]
+
+    # -- observations ------------------------------------------------------------------------------------------
+
+    def observe(self, keyframe: Keyframe, keypoints: IntArray, anchors: IntArray) -> None:
+        """Record that a keyframe's keypoints see anchors; both must be free of an earlier partner."""
+        self.revision += 1
+        keyframe.anchor[keypoints] = anchors
+        self.anchors.observations[anchors] += 1
+
+    def forget_observations(self, keyframe: Keyframe, keypoints: IntArray) -> None:
+        """Take observations back.
+
+        Anchors seen by fewer than two keyframes afterwards are removed; one is enough where a prior tells the depth.
+        """
+        self.revision += 1
+        held = keyframe.anchor[keypoints]
+        keypoints, held = keypoints[held >= 0], held[held >= 0]
+        keyframe.anchor[keypoints] = NO_ANCHOR
+        self.anchors.observations[held] -= 1
+        poor = held[self.anchors.observations[held] < np.where(self.anchors.from_depth[held], 1, 2)]
+        self.remove_anchors(poor)
+
+    def remove_anchors(self, ids: IntArray) -> None:
+        """Remove anchors from the map and from every keyframe that holds them."""
+        if len(ids) == 0:
+            return
+        self.revision += 1
+        gone = np.zeros(len(self.anchors.alive) + 1, dtype=bool)
+        gone[ids] = True
+        for keyframe in self.keyframes.values():
+            keyframe.anchor[gone[keyframe.anchor]] = NO_ANCHOR
+        self.anchors.observations[ids] = 0
+        self.anchors.remove(ids)
+
+    def merge_anchors(self, losers: IntArray, winners: IntArray) -> None:
+        """Give every observation of ``losers`` to ``winners``, ``(M,)`` each, one-to-one and disjoint."""
+        if len(losers) == 0:
+            return
+        target = np.full(len(self.anchors.alive) + 1, NO_ANCHOR)  # the last row answers for NO_ANCHOR
+        target[losers] = winners
+        for keyframe in self.keyframes.values():
+            new = target[keyframe.anchor]
+            keypoints = np.flatnonzero(new >= 0)
+            if len(keypoints) == 0:
+                continue
+            # One keypoint per anchor and keyframe; a handful here, for which np.isin is slow.
+            already = (new[keypoints, None] == keyframe.anchor).any(axis=1)
+            keyframe.anchor[keypoints] = np.where(already, NO_ANCHOR, new[keypoints])
+            self.anchors.observations[new[keypoints[~already]]] += 1
+        self.anchors.found[winners] += self.anchors.found[losers]
+        self.anchors.visible[winners] += self.anchors.visible[losers]
+        self.remove_anchors(losers)
+
+    # -- covisibility ------------------------------------------------------------------------------------------
+
+    def shared_counts(self, anchor_ids: IntArray) -> dict[int, int]:
+        """Number of the given anchors that each keyframe sees; keyframes that see none are left out."""
+        mark = np.zeros(len(self.anchors.alive) + 1, dtype=bool)  # the last row answers for NO_ANCHOR
+        mark[anchor_ids] = True
+        mark[-1] = False
+        counts = {id: int(np.count_nonzero(mark[k.anchor])) for id, k in self.keyframes.items()}
+        return {id: count for id, count in counts.items() if count > 0}
+
+    def covisible(self, keyframe: Keyframe, most: int, min_shared: int = 15) -> list[Keyframe]:
+        """Other keyframes by number of shared anchors, best first."""
+        counts = self.shared_counts(keyframe.anchor[keyframe.anchor >= 0])
+        counts.pop(keyframe.id, None)
+        ranked = sorted(counts, key=lambda id: (-counts[id], -id))
+        return [self.keyframes[id] for id in ranked if counts[id] >= min_shared][:most]
+
+    def anchors_seen_by(self, keyframes: list[Keyframe]) -> IntArray:
+        """Sorted ids of anchors that at least one of the keyframes sees."""
+        if not keyframes:
+            return np.zeros(0, dtype=np.int64)
+        seen = np.zeros(len(self.anchors.alive) + 1, dtype=bool)  # the last row answers for NO_ANCHOR
+        for keyframe in keyframes:
+            seen[keyframe.anchor] = True
+        return np.flatnonzero(seen[:-1])
+
+    # -- keyframes ---------------------------------------------------------------------------------------------
+
+    def add_keyframe(self, keyframe: Keyframe, reference: Keyframe | None = None) -> None:
+        """Take a keyframe with its observations into the map.
+
+        Args:
+            keyframe: The new one.
+            reference: Keyframe that it was tracked against, whose piece it belongs to; the newest piece without one.
+        """
+        self.revision += 1
+        self.keyframes[keyframe.id] = keyframe
+        self._piece[keyframe.id] = self.piece if reference is None else self._piece[reference.id]
+        self.anchors.observations[keyframe.anchor[keyframe.anchor >= 0]] += 1
+
+    def remove_keyframe(self, keyframe: Keyframe) -> None:
+        """Drop a keyframe; its frames stay tied to the nearest surviving one in time."""
+        self.forget_observations(keyframe, keyframe.keypoints_with_anchor())
+        others = (id for id in self.keyframes if id != keyframe.id)
+        # One of its own piece if there is any: another's may move without it.
+        mine = self.piece_of(keyframe.id)
+        heir = min(others, key=lambda id: (self.piece_of(id) != mine, abs(id - keyframe.id), id))
+        self.links[keyframe.id] = (heir, keyframe.T_c_w @ se3.inverse(self.keyframes[heir].T_c_w))
+        del self.keyframes[keyframe.id]
+
+    def remove_empty_keyframes(self) -> None:
+        """Drop keyframes that hold no anchor: nothing can be tracked against them."""
+        for keyframe in list(self.keyframes.values()):
+            if (keyframe.anchor == NO_ANCHOR).all() and len(self.keyframes) > 1:
+                self.remove_keyframe(keyframe)
+
+    def refresh_anchors(self, ids: IntArray) -> None:
+        """Recompute viewing direction, reference distance and descriptor from the observing keyframes.
+
+        The newest observation gives descriptor and octave; the direction is the mean over all observations.
+        """
+        wanted = np.zeros(len(self.anchors.alive) + 1, dtype=bool)  # the last row answers for NO_ANCHOR
+        wanted[ids] = True
+        wanted[-1] = False
+        keyframes = list(self.keyframes.values())
+        held = np.concatenate([k.anchor for k in keyframes])
+        seen = np.flatnonzero(wanted[held])
+        held = held[seen]
+        host = np.repeat(np.arange(len(keyframes)), [len(k.anchor) for k in keyframes])[seen]
+        ray = self.anchors.p_w[held] - np.stack([k.centre_w for k in keyframes])[host]
+        distance = np.sqrt(np.einsum("ij,ij->i", ray, ray))
+        ray /= distance[:, None]
+        total = np.stack([np.bincount(held, ray[:, i], len(wanted)) for i in range(3)], axis=1)[ids]
+        norm = np.linalg.norm(total, axis=1)
+        self.anchors.normal[ids] = total / np.where(norm > 0, norm, 1.0)[:, None]
+        # Of several observations of one anchor the last assignment stays: the newest keyframe's.
+        octave = np.concatenate([k.features.octave for k in keyframes])[seen]
+        self.anchors.max_distance[held] = distance * self.scale_factor**octave
+        self.anchors.words[held] = np.concatenate([k.words for k in keyframes])[seen]

@@ -1,0 +1,493 @@
+"""Anchors of a window: reprojections and depth priors, their normal equations and their elimination.
+
+An observation's residual depends on the anchor and on the pose through one point, the anchor in the camera. With the
+pose's tangent taken in the world, about a centre ``c`` near the anchors, both derivatives are the same rows: with
+``B = (d r / d p_c) R`` by the anchor and ``B [I, -hat(p_w - c)]`` by the pose. So an observation is summed up by
+``B^T B`` and ``B^T r``, nine numbers; the anchor's block is their sum, the pose's a sum of their products with
+powers of the anchor's position, and what couples the two is ``[I; hat(p_w - c)] B^T B``. The adjoint brings the
+pose system to the tangents of the cameras, where the solver damps and steps.
+
+Observations lie in tiles of one pose each, so that a pose's rotation is a factor of a batched product; places that
+a tile has left weigh nothing.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from edgeslam_torch.losses.robust import Kernel, rho
+from edgeslam_torch.optim.kernels import schur
+from edgeslam_torch.optim.kernels.compiled import kernel
+from edgeslam_torch.optim.problem import DepthPriors, LmConfig, WindowProblem
+from edgeslam_torch.types import FloatArray, IntArray
+
+_LANES = 128
+"""Observations per tile: shorter tiles leave fewer places empty, longer ones make fewer, larger products."""
+_FEW_POSES = 12
+"""Up to this many free poses, cutting the anchors into chunks saves less than it costs."""
+_ANCHORS_PER_CHUNK = 192
+_NO_DEPTH_PRIORS = DepthPriors(np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros(0))
+
+
+class Observed(NamedTuple):
+    """What observations in ``G`` tiles of ``L`` are measured against."""
+
+    pose: Tensor
+    """``(G,)`` pose of each tile."""
+    place: Tensor
+    """``(G, 3, L)`` places of the anchors' coordinates in ``(3, A)``."""
+    uv: Tensor
+    """``(G, 2, L)`` pixels from the principal point, whitened."""
+    focal: Tensor
+    """``(G, 2, L)`` focal lengths, whitened."""
+    far: Tensor
+    """``(G, L)`` cost of a point behind the camera."""
+    depth_row: Tensor
+    """``(D,)`` places of the depth priors in ``G L``; their ``focal`` is zero."""
+    inverse_depth: Tensor
+    """``(D,)`` expected inverse depths, whitened."""
+    inv_sigma: Tensor
+    """``(D,)`` their inverse standard deviations."""
+    centre: Tensor
+    """``(3,)`` of the anchors: these are kept from here."""
+    min_depth: float
+    """Nearest depth in front of a camera."""
+
+
+class PointSystem(NamedTuple):
+    """Normal equations of the anchors at one state."""
+
+    V: Tensor
+    """``(6, A)`` upper triangles of the anchors' blocks."""
+    g: Tensor
+    """``(3, A)`` their gradients."""
+    own: Tensor
+    """``(G', 9, L)`` what each observation of a free pose adds to its anchor's block and gradient, see `rotated`."""
+    position: Tensor
+    """``(G', 3, L)`` the anchors of those observations."""
+    to_world: Tensor
+    """``(F, 6, 6)`` tangents in the world by tangents in the camera."""
+
+
+class Eliminated(NamedTuple):
+    """The anchors taken out of the pose system, for the way back."""
+
+    factor: Tensor
+    """``(6, A)`` inverse Cholesky factors."""
+    y: Tensor
+    """``(3, A)`` whitened gradients."""
+    Y: Tensor
+    """What couples the poses with the whitened anchors, all chunks, see `Chunk`."""
+
+
+@dataclass(frozen=True, slots=True)
+class Chunk:
+    """Consecutive anchors with the ``w`` free poses that see them."""
+
+    first: int
+    last: int
+    """Anchors ``first <= a < last``."""
+    begin: int
+    end: int
+    """Rows of ``Y (..., 6)``: the anchors' three whitened coordinates, anchor by anchor, each by the ``w`` poses;
+    read as ``(3 (last - first), 6 w)``."""
+    poses: Tensor
+    """``(w,)`` free-pose numbers."""
+
+
+class PointBlocks:
+    """Layout of a window's anchors and observations."""
+
+    def __init__(self, problem: WindowProblem, K: Tensor, column: IntArray, config: LmConfig) -> None:
+        """Lay out.
+
+        Args:
+            problem: A window.
+            K: fx, fy, cx, cy.
+            column: ``(W,)`` free-pose number of each pose, -1 for a fixed one.
+            config: Kernel, its width and what counts as behind a camera.
+        """
+        self.config = config
+        depth = problem.depth_priors or _NO_DEPTH_PRIORS
+        self.n_obs, A = len(problem.obs_pose), len(problem.p_w)
+        self.free = F = int((column >= 0).sum())
+        pose = np.concatenate((_index(problem.obs_pose), _index(depth.pose)))
+        anchor = np.concatenate((_index(problem.obs_anchor), _index(depth.anchor)))
+        rank_of_pose = np.where(column < 0, F, column)
+        self.anchor_order = _by_poses(rank_of_pose[pose], anchor, A, F) if F > _FEW_POSES else None
+        if self.anchor_order is not None:
+            rank = np.empty(A, dtype=np.int64)
+            rank[self.anchor_order] = np.arange(A)
+            anchor = rank[anchor]
+        # Tiles by pose, those of free poses first.
+        pose_rank = np.empty(len(column), dtype=np.int16 if len(column) < 2**15 else np.int64)
+        by_column = np.argsort(rank_of_pose, kind="stable")
+        pose_rank[by_column] = np.arange(len(column))
+        run = pose_rank[pose]
+        order = np.argsort(run, kind="stable")
+        count = np.bincount(run, minlength=len(column))
+        tiles = -(-count // _LANES)
+        self.free_tiles = int(tiles[:F].sum())
+        G = int(tiles.sum())
+        gap = (np.cumsum(tiles) - tiles) * _LANES - (np.cumsum(count) - count)
+        self.place = np.empty(len(order), dtype=np.int64)  # of each factor, in the caller's order
+        self.place[order] = np.arange(len(order)) + np.repeat(gap, count)
+        tile_run = np.repeat(np.arange(len(column)), tiles)
+        # Data; places without an observation weigh nothing, and act on the first anchor.
+        lane_anchor = np.zeros(G * _LANES, dtype=np.int64)
+        lane_anchor[self.place] = anchor
+        uv, focal = np.zeros((2, G * _LANES)), np.zeros((2, G * _LANES))
+        inv_sigma = np.concatenate((np.asarray(problem.inv_sigma, float), 1.0 / np.asarray(depth.sigma, float)))
+        seen = self.place[: self.n_obs]
+        k = K.cpu().numpy()
+        pixels = np.asarray(problem.uv, dtype=np.float64).reshape(-1, 2)
+        for i in range(2):
+            uv[i, seen] = (pixels[:, i] - k[2 + i]) * inv_sigma[: self.n_obs]
+            focal[i, seen] = k[i] * inv_sigma[: self.n_obs]
+        far = np.zeros(G * _LANES)
+        far[self.place] = np.square(config.behind_px * inv_sigma)
+        p_w = np.asarray(problem.p_w, dtype=np.float64).reshape(-1, 3)
+        centre = np.median(p_w, axis=0) if A else np.zeros(3)  # some anchors may be practically at infinity
+        p = (p_w if self.anchor_order is None else p_w[self.anchor_order]) - centre
+        self.p = torch.as_tensor(np.ascontiguousarray(p.T))
+        anchors: IntArray = lane_anchor.reshape(G, _LANES)
+        self.seen = Observed(
+            pose=torch.as_tensor(by_column[tile_run]),
+            place=torch.as_tensor(anchors[:, None] + A * np.arange(3)[:, None]),
+            uv=_tiled(uv),
+            focal=_tiled(focal),
+            far=torch.as_tensor(far).view(G, _LANES),
+            depth_row=torch.as_tensor(self.place[self.n_obs :]),
+            inverse_depth=torch.as_tensor(np.asarray(depth.inverse_depth, dtype=np.float64) * inv_sigma[self.n_obs :]),
+            inv_sigma=torch.as_tensor(inv_sigma[self.n_obs :]),
+            centre=torch.as_tensor(centre),
+            min_depth=config.min_depth,
+        )
+        self.free_pose = torch.as_tensor(by_column[:F])
+        self.tile_column = torch.as_tensor(tile_run[: self.free_tiles])
+        self.own_place = torch.as_tensor((anchors[:, None] + A * np.arange(9)[:, None]).reshape(-1))
+        free_anchor = anchors[: self.free_tiles]
+        self.free_anchor = torch.as_tensor(free_anchor.reshape(-1))
+        self.factor_place = torch.as_tensor(free_anchor[:, None] + A * np.arange(6)[:, None])
+        used = np.zeros(G * _LANES, dtype=bool)
+        used[self.place] = True
+        self._plan(free_anchor, tile_run[: self.free_tiles], used.reshape(G, _LANES)[: self.free_tiles], A)
+
+    def _plan(self, anchor: IntArray, column: IntArray, used: np.ndarray, A: int) -> None:
+        """Lay out the ``Y``: one over few poses, else a band of them."""
+        F = self.free
+        size = max(A, 1) if self.anchor_order is None else _ANCHORS_PER_CHUNK
+        starts = np.arange(0, A, size)
+        length = np.minimum(starts + size, A) - starts
+        seen = np.ones((len(starts), F), dtype=bool)
+        column = np.broadcast_to(column[:, None], anchor.shape)
+        chunk = anchor // size
+        if self.anchor_order is not None:
+            seen[:] = False
+            seen[chunk[used], column[used]] = True
+            column = (np.cumsum(seen, axis=1) - 1)[chunk, column]
+        width = seen.sum(1)
+        ends = np.cumsum(3 * width * length)
+        rows = int(ends[-1]) if len(ends) else 0
+        begin = ends - 3 * width * length
+        place = begin[chunk] + width[chunk] * (anchor - size * chunk) + column
+        self.unique = int(np.bincount(place[used], minlength=1).max()) <= 1
+        # Places of a tile without an observation store their zeros behind all others.
+        place = np.where(used, place, rows) + np.where(used, (width * length)[chunk], 0) * np.arange(3)[:, None, None]
+        self.entry_place = torch.as_tensor(place.reshape(-1))
+        self.chunks = [
+            Chunk(
+                first=int(starts[c]),
+                last=int(starts[c] + length[c]),
+                begin=int(begin[c]),
+                end=int(ends[c]),
+                poses=torch.as_tensor(np.flatnonzero(seen[c])),
+            )
+            for c in range(len(starts))
+            if seen[c].any()
+        ]
+        self.dtype = torch.float32 if self.config.float32_blocks else torch.float64
+        self.Y = torch.zeros(rows + 1, 6, dtype=self.dtype)
+
+    def cost(self, T_c_w: Tensor, p: Tensor) -> Tensor:
+        """Robust cost ``()`` at poses ``(W, 4, 4)`` and anchors ``(3, A)``."""
+        out: Tensor = kernel(point_cost, self.config.compile)(T_c_w, p, self.seen, *self._kernel())
+        return out
+
+    def chi2(self, T_c_w: Tensor, p: Tensor) -> tuple[FloatArray, np.ndarray]:
+        """Squared whitened residuals ``(M,)`` of the observations and which lie in front, in the caller's order."""
+        s, front, *_ = evaluate(T_c_w, p, self.seen)
+        at = self.place[: self.n_obs]
+        in_front: np.ndarray = front.cpu().numpy().reshape(-1)[at]
+        return np.where(in_front, s.cpu().numpy().reshape(-1)[at], np.inf), in_front
+
+    def in_callers_order(self, p: Tensor) -> FloatArray:
+        """Anchors ``(3, A)`` as ``(A, 3)`` in the world."""
+        ours = (p + self.seen.centre[:, None]).mT.cpu().numpy()
+        if self.anchor_order is None:
+            return np.ascontiguousarray(ours)
+        out: FloatArray = np.empty_like(ours)
+        out[self.anchor_order] = ours
+        return out
+
+    def linearise(self, T_c_w: Tensor, p: Tensor) -> tuple[PointSystem, Tensor, Tensor, Tensor]:
+        """Normal equations, with the free poses' own blocks ``(F, 6, 6)``, gradients ``(F, 6)`` and the cost ``()``."""
+        linear = kernel(point_normals, self.config.compile)
+        *system, H, g, value = linear(
+            T_c_w, p, self.seen, *self._kernel(), self.own_place, self.free_anchor, self.tile_column, self.free_pose
+        )
+        return PointSystem(*system), H, g, value
+
+    def reduce(self, system: PointSystem, mu: float, S: Tensor, b: Tensor) -> Eliminated:
+        """Subtract what the anchors take from the pose system ``S (6F, 6F)`` and its right side ``b (6F,)``."""
+        exact = mu == 0.0 and self.dtype is not torch.float64  # not to step, but to say what is observed
+        Y = self.Y.double() if exact else self.Y
+        damping = torch.tensor(mu, dtype=torch.float64)
+        factor, y = kernel(fill, self.config.compile)(
+            Y, self.entry_place, self.unique, system, self.factor_place, damping
+        )
+        F = self.free
+        # Sums of 6x6 blocks and of vectors; in the precision of the products, which are long sums themselves.
+        taken, right = torch.zeros(F * F, 36, dtype=Y.dtype), torch.zeros(F, 6, dtype=Y.dtype)
+        for chunk, part in self._parts(Y):
+            w = len(chunk.poses)
+            product = (part.mT @ part).view(w, 6, w, 6).transpose(1, 2).reshape(-1, 36)
+            moved = y[:, chunk.first : chunk.last].reshape(-1).to(Y.dtype) @ part
+            taken.index_add_(0, (F * chunk.poses[:, None] + chunk.poses).view(-1), product)
+            right.index_add_(0, chunk.poses, moved.view(w, 6))
+        to_camera = system.to_world.mT
+        half = to_camera @ taken.view(F, F, 6, 6).transpose(1, 2).double().reshape(F, 6, 6 * F)
+        S -= (to_camera @ half.view(6 * F, 6 * F).mT.reshape(F, 6, 6 * F)).view(6 * F, 6 * F)  # it is symmetric
+        b -= (to_camera @ right.double()[..., None]).view(-1)
+        return Eliminated(factor, y, Y)
+
+    def step(self, system: PointSystem, eliminated: Eliminated, delta: Tensor) -> Tensor:
+        """Step of the anchors ``(3, A)`` that goes with the poses' ``delta (6F,)``; before the next `reduce`."""
+        in_world = (system.to_world @ delta.view(-1, 6, 1))[..., 0].to(eliminated.Y.dtype)
+        back = -eliminated.y
+        for chunk, part in self._parts(eliminated.Y):
+            back[:, chunk.first : chunk.last] -= (part @ in_world[chunk.poses].view(-1)).view(3, -1)
+        return schur.unwhiten(eliminated.factor, back)
+
+    def _parts(self, Y: Tensor) -> list[tuple[Chunk, Tensor]]:
+        """The chunks with their pieces of ``Y``, ``(3 (last - first), 6 w)``."""
+        return [(c, Y[c.begin : c.end].view(-1, 6 * len(c.poses))) for c in self.chunks]
+
+    def _kernel(self) -> tuple[Kernel, float]:
+        return self.config.kernel, self.config.delta
+
+
+def evaluate(T_c_w: Tensor, p: Tensor, seen: Observed) -> tuple[Tensor, ...]:
+    """Squared whitened residuals of all places.
+
+    Args:
+        T_c_w: World-to-camera poses ``(W, 4, 4)``.
+        p: Anchors from their centre ``(3, A)``.
+        seen: The observations.
+
+    Returns:
+        Squares ``(G, L)``, which lie in front, which weigh anything, inverse depths ``(G, L)``, normalised coordinates
+        ``(G, 2, L)``, residuals ``(G, 2, L)`` (zero for depth priors), the depth priors' ``(D,)``, and the anchors
+        ``(G, 3, L)``. No square exceeds what a point behind the camera costs: points seen so far outside the image
+        weigh nothing (nor would their squares of slopes fit into double precision).
+    """
+    R, t = T_c_w[:, :3, :3], T_c_w[:, :3, 3:]
+    position = p.reshape(-1).index_select(0, seen.place.reshape(-1)).view(seen.place.shape)
+    p_c = torch.baddbmm((R @ seen.centre[:, None] + t)[seen.pose], R[seen.pose], position)
+    front = p_c[:, 2] > seen.min_depth
+    iz = torch.where(front, p_c[:, 2], 1.0).reciprocal()
+    n = p_c[:, :2] * iz[:, None]
+    r = n * seen.focal - seen.uv
+    s = torch.addcmul(r[:, 0] * r[:, 0], r[:, 1], r[:, 1])
+    r_depth = seen.inverse_depth
+    if len(seen.depth_row):
+        r_depth = iz.view(-1)[seen.depth_row] * seen.inv_sigma - seen.inverse_depth
+        s = s.view(-1).index_add(0, seen.depth_row, r_depth.square()).view(s.shape)
+    used = front & (s < seen.far)
+    return torch.where(used, s, seen.far), front, used, iz, n, r, r_depth, position
+
+
+def point_cost(T_c_w: Tensor, p: Tensor, seen: Observed, robust: Kernel, delta: float) -> Tensor:
+    """Robust cost ``()``; arguments as `evaluate` takes them, then the kernel and its width."""
+    return rho(evaluate(T_c_w, p, seen)[0], robust, delta)[0].sum()
+
+
+def point_normals(
+    T_c_w: Tensor,
+    p: Tensor,
+    seen: Observed,
+    robust: Kernel,
+    delta: float,
+    own_place: Tensor,
+    free_anchor: Tensor,
+    tile_column: Tensor,
+    free_pose: Tensor,
+) -> tuple[Tensor, ...]:
+    """The fields of `PointSystem`, the free poses' blocks ``(F, 6, 6)`` and gradients ``(F, 6)``, and the cost ``()``.
+
+    Args:
+        T_c_w: World-to-camera poses ``(W, 4, 4)``.
+        p: Anchors from their centre ``(3, A)``.
+        seen: The observations.
+        robust: Kernel.
+        delta: Its width.
+        own_place: ``(9 G L)`` places of an observation's sums in ``(9, A)``.
+        free_anchor: ``(G' L)`` anchors of the free poses' tiles, which come first.
+        tile_column: ``(G',)`` free-pose numbers of these.
+        free_pose: ``(F,)`` the free poses.
+    """
+    s, _, used, iz, n, r, r_depth, position = evaluate(T_c_w, p, seen)
+    value, weight = rho(s, robust, delta)
+    weight = torch.where(used, weight, 0.0)
+    slope = seen.focal * iz[:, None]
+    weighted = slope * weight[:, None]
+    ab, q = weighted * slope, weighted * r
+    abn = ab * n
+    mzz = torch.addcmul(abn[:, 0] * n[:, 0], abn[:, 1], n[:, 1])
+    qz = torch.addcmul(q[:, 0] * n[:, 0], q[:, 1], n[:, 1])
+    if len(seen.depth_row):
+        row = seen.depth_row
+        slope_depth = iz.view(-1)[row].square() * seen.inv_sigma
+        weighted_depth = weight.view(-1)[row] * slope_depth
+        mzz = mzz.view(-1).index_add(0, row, weighted_depth * slope_depth).view(mzz.shape)
+        qz = qz.view(-1).index_add(0, row, weighted_depth * r_depth).view(qz.shape)
+    own = rotated(T_c_w)[seen.pose] @ torch.cat((ab, abn, mzz[:, None], q, qz[:, None]), 1)
+    A, F, G = p.shape[1], len(free_pose), len(tile_column)
+    sums = torch.zeros(9 * A, dtype=p.dtype, device=p.device).scatter_add_(0, own_place, own.view(-1)).view(9, A)
+    # A pose's block: sums of products with 1, x, y, z, xx, xy, xz, yy, yz, zz.
+    x, y, z = p[:1], p[1:2], p[2:]
+    powers = torch.cat((torch.ones_like(x), p, x * p, y * p[1:], z * z)).mT.contiguous()
+    products = own[:G] @ powers.index_select(0, free_anchor).view(*own[:G, 0].shape, 10)
+    moments = torch.zeros(F, 90, dtype=p.dtype, device=p.device).index_add_(0, tile_column, products.view(G, 90))
+    in_world = (moments @ _MOMENTS.to(p.device)).view(F, 6, 7)
+    to_world = tangents_in_world(T_c_w.index_select(0, free_pose), seen.centre)
+    in_camera = to_world.mT @ in_world
+    H = in_camera[..., :6] @ to_world
+    V, g = sums.index_select(0, _UPPER.to(p.device)), sums.index_select(0, _GRADIENT.to(p.device))
+    return V, g, own[:G], position[:G], to_world, H, in_camera[..., 6], value.sum()
+
+
+def tangents_in_world(T_c_w: Tensor, centre: Tensor) -> Tensor:
+    """``(F, 6, 6)`` with ``exp(xi) T C = T C exp(M xi)``, ``C`` being the shift by the centre ``(3,)``."""
+    R_t = T_c_w[:, :3, :3].mT
+    t = T_c_w[:, :3, 3] + centre @ R_t
+    turn = R_t @ (t @ _MINUS_HAT.to(t.device)).view(-1, 3, 3)
+    return torch.cat((torch.cat((R_t, turn), 2), torch.cat((torch.zeros_like(turn), R_t), 2)), 1)
+
+
+def rotated(T_c_w: Tensor) -> Tensor:
+    """What turns sums in the cameras to sums in the world, ``(W, 9, 8)`` for poses ``(W, 4, 4)``.
+
+    In: ``J^T J`` of an observation by the point in its camera, as xx, yy, -xz, -yz, zz (xy is zero), then its
+    ``J^T r`` as x, y, -z. Out: ``R^T J^T J R`` and ``R^T J^T r`` as xx, xy, xz, yy, x, yz, y, z, zz, an order in which
+    each row of the matrix is a slice: 0 to 2 by one, 1 to 5 by two, 2 to 8 by three.
+    """
+    R = T_c_w[:, :3, :3]
+    squares = (R[:, :, None, :, None] * R[:, None, :, None, :]).flatten(1)
+    return (torch.cat((squares, R.flatten(1)), 1) @ _ROTATED.to(R.device)).view(-1, 9, 8)
+
+
+def fill(
+    Y: Tensor, entry_place: Tensor, unique: bool, system: PointSystem, factor_place: Tensor, damping: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Write what couples the free poses with the whitened anchors into the ``Y``.
+
+    Args:
+        Y: All chunks; changed in place.
+        entry_place: ``(3 G' L)`` rows of the anchors' whitened coordinates, by the observations' poses, in it.
+        unique: Whether no pose sees an anchor twice: entries can then be stored without adding.
+        system: Normal equations.
+        factor_place: ``(G', 6, L)`` places of the anchors' factors in ``(6, A)``.
+        damping: Relative to the diagonal ``()``.
+
+    Returns:
+        Inverse Cholesky factors ``(6, A)`` and whitened gradients ``(3, A)`` of the anchors.
+    """
+    factor = schur.inverse_cholesky(system.V, damping)
+    f = factor.view(-1).index_select(0, factor_place.reshape(-1)).view(factor_place.shape)[:, :, None]
+    a, b, c, d, e, f = f.unbind(1)
+    first, second, third = system.own[:, 0:3], system.own[:, 1:6:2], system.own[:, 2:9:3]
+    whitened = torch.stack(
+        (a * first, torch.addcmul(b * first, c, second), torch.addcmul(torch.addcmul(d * first, e, second), f, third))
+    ).to(Y.dtype)  # cancellation is behind: what remains is only multiplied with itself
+    x, y, z = system.position.to(Y.dtype).unbind(1)
+    u, v, w = whitened.unbind(2)
+    turning = torch.stack(
+        (
+            torch.addcmul(y * w, z, v, value=-1.0),
+            torch.addcmul(z * u, x, w, value=-1.0),
+            torch.addcmul(x * v, y, u, value=-1.0),
+        ),
+        2,
+    )
+    entries = torch.cat((whitened, turning), 2).mT.reshape(-1, 6)
+    if unique:
+        Y.index_copy_(0, entry_place, entries)
+    else:
+        Y.zero_().index_add_(0, entry_place, entries)
+    return factor, schur.whiten(factor, system.g)
+
+
+_MATRIX = [[0, 1, 2], [1, 3, 5], [2, 5, 8]]
+"""Where the entries of ``R^T J^T J R`` are in what `rotated` gives."""
+_VECTOR = [4, 6, 7]
+"""Where those of ``R^T J^T r`` are."""
+_UPPER = torch.tensor([0, 1, 2, 3, 5, 8])
+_GRADIENT = torch.tensor(_VECTOR)
+
+
+def _rotation_map() -> Tensor:
+    """``(90, 72)``: from the products of a rotation's entries and from these to what `rotated` gives."""
+    squares, vectors = np.zeros((3, 3, 3, 3, 9, 8)), np.zeros((3, 3, 9, 8))  # R_ak R_bl, R_ak
+    for k in range(3):
+        for a, sign in enumerate((1.0, 1.0, -1.0)):
+            vectors[a, k, _VECTOR[k], 5 + a] = sign
+        for m in range(k, 3):
+            for a, b, column, sign in ((0, 0, 0, 1), (1, 1, 1, 1), (0, 2, 2, -1), (2, 0, 2, -1)):
+                squares[a, b, k, m, _MATRIX[k][m], column] = sign
+            for a, b, column, sign in ((1, 2, 3, -1), (2, 1, 3, -1), (2, 2, 4, 1)):
+                squares[a, b, k, m, _MATRIX[k][m], column] = sign
+    return torch.as_tensor(np.concatenate((squares.reshape(81, 72), vectors.reshape(9, 72))))
+
+
+def _moment_map() -> Tensor:
+    """``(90, 42)``: from products of an observation's nine sums with 1, x, y, z, xx, xy, xz, yy, yz, zz to H | g."""
+    power = np.array([[0, 1, 2, 3], [1, 4, 5, 6], [2, 5, 7, 8], [3, 6, 8, 9]])
+    G = np.zeros((3, 6, 4))  # [I, -hat(p)] by 1, x, y, z
+    G[range(3), range(3), 0] = 1.0
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        G[i, 3 + j, 1 + k], G[j, 3 + i, 1 + k] = 1.0, -1.0
+    out = np.zeros((9, 10, 6, 7))
+    for i in range(3):
+        out[_VECTOR[i], :4, :, 6] += G[i].T
+        for j in range(3):
+            for s in range(4):
+                for t in range(4):
+                    out[_MATRIX[i][j], power[s, t], :, :6] += np.outer(G[i, :, s], G[j, :, t])
+    return torch.as_tensor(out.reshape(90, 42))
+
+
+_ROTATED = _rotation_map()
+_MOMENTS = _moment_map()
+_MINUS_HAT = torch.zeros(3, 9, dtype=torch.float64)  # of a vector, row by row
+_MINUS_HAT[[2, 1, 2, 0, 1, 0], [1, 2, 3, 5, 6, 7]] = torch.tensor([1, -1, -1, 1, 1, -1], dtype=torch.float64)
+
+
+def _by_poses(column: IntArray, anchor: IntArray, A: int, F: int) -> IntArray:
+    """Anchors by the first and last free pose that sees them: chunks then span few poses."""
+    first, last = np.full(A, F), np.full(A, -1)
+    np.minimum.at(first, anchor, column)
+    np.maximum.at(last, anchor, np.where(column < F, column, -1))
+    return np.argsort(first * (F + 1) + last, kind="stable")
+
+
+def _tiled(rows: FloatArray) -> Tensor:
+    """``(n, G L)`` as ``(G, n, L)``."""
+    return torch.as_tensor(np.ascontiguousarray(rows.reshape(len(rows), -1, _LANES).transpose(1, 0, 2)))
+
+
+def _index(x: IntArray) -> IntArray:
+    return np.asarray(x, dtype=np.int64)

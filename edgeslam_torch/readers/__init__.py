@@ -1,0 +1,1 @@
+"""Readers that give frames and telemetry: call `source.open_source`."""

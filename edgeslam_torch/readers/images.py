@@ -1,0 +1,233 @@
+"""Image files: decoding one, and a folder of them as a source."""
+
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from edgeslam_torch.errors import SourceError
+from edgeslam_torch.readers.image_size import image_size
+from edgeslam_torch.readers.listing import ImageEntry, Problem, in_order, seconds_from
+from edgeslam_torch.types import Frame
+
+SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp"})
+MAX_PIXELS = 50_000_000
+"""Of one image; video of today's largest size, 8K, has 33 million. A larger one is refused before it is decoded."""
+_MAX_BYTES = 8 * MAX_PIXELS
+"""Of one file; 16 bits and four channels without compression."""
+_JPEG = b"\xff\xd8"
+_EXIF = b"Exif\0\0"
+ASSUMED_HZ = 30.0
+"""Rate of images whose names tell no time; what webcams, Kinects and the Tello give."""
+
+
+class JpegFrame(Frame):
+    """A JPEG's frame: its grey values are read at once, at half the cost of colours, and those when somebody asks.
+
+    Nobody does for the seven of eight frames that become no keyframe. Every time somebody asks they are read again.
+    """
+
+    __slots__ = ("_data",)
+    _data: bytes
+
+    def __init__(self, index: int, stamp_s: float, data: bytes, path: Path) -> None:
+        """Decode a file's bytes in grey.
+
+        Raises:
+            SourceError: If they are no image, or a damaged one.
+        """
+        grey = _grey_of_jpeg(data, path)
+        for name, value in (("index", index), ("stamp_s", stamp_s), ("path", path), ("grey", grey), ("_data", data)):
+            object.__setattr__(self, name, value)
+
+    @property
+    def image(self) -> NDArray[np.uint8]:
+        """``(H, W, 3)`` BGR, or ``(H, W)`` of a grey JPEG."""
+        return np.asarray(_decoded(self._data, self.path, cv2.IMREAD_ANYCOLOR), dtype=np.uint8)
+
+
+def read_image(path: Path) -> NDArray[np.uint8]:
+    """``(H, W, 3)`` BGR or ``(H, W)`` grey, eight bits.
+
+    Raises:
+        SourceError: If the file is missing, empty, damaged, too large or no image.
+    """
+    return np.asarray(read_pixels(path, cv2.IMREAD_ANYCOLOR), dtype=np.uint8)
+
+
+def read_pixels(path: Path, flags: int) -> NDArray[Any]:
+    """The image as ``cv2.imread`` with these flags gives it.
+
+    Raises:
+        SourceError: If the file is missing, empty, damaged, too large or no image.
+    """
+    data = _bytes(path)
+    if data.startswith(_JPEG):
+        _grey_of_jpeg(data, path)
+    return _decoded(data, path, flags)
+
+
+def pixels_or_none(path: Path, flags: int) -> NDArray[Any] | None:
+    """As `read_pixels`; None when the file cannot be read, whatever the reason."""
+    try:
+        return read_pixels(path, flags)
+    except SourceError:
+        return None
+
+
+def read_frame(entry: ImageEntry) -> Frame:
+    """The frame of one image file.
+
+    Raises:
+        SourceError: If the file is missing, empty, damaged, too large or no image.
+    """
+    data = _bytes(entry.path)
+    if data.startswith(_JPEG):
+        return JpegFrame(entry.index, entry.stamp_s, data, entry.path)
+    image = np.asarray(_decoded(data, entry.path, cv2.IMREAD_ANYCOLOR), dtype=np.uint8)
+    return Frame(entry.index, entry.stamp_s, image, entry.path)
+
+
+def check_size(width: int, height: int, name: str | Path | None) -> None:
+    """Whether an image of so many pixels may be decoded.
+
+    Raises:
+        SourceError: If it has more than `MAX_PIXELS`.
+    """
+    if width * height > MAX_PIXELS:
+        limit = MAX_PIXELS // 1_000_000
+        raise SourceError(f"{name}: image is {width}x{height}, more than {limit} million pixels are not read")
+
+
+def _bytes(path: Path) -> bytes:
+    try:
+        size = path.stat().st_size if path.is_file() else None
+        if size is not None and size > _MAX_BYTES:
+            raise SourceError(f"{path}: {size / 1e6:.0f} MB are no image")
+        data = path.read_bytes() if size is not None else None
+    except OSError as error:
+        raise SourceError(f"{path}: {error.strerror or error}") from error
+    if data is None:
+        raise SourceError(f"{path}: no such file")
+    if not data:
+        raise SourceError(f"{path}: empty file")
+    if data.startswith(_JPEG) and data.rfind(b"\xff\xd9", max(0, len(data) - 65536)) < 0:  # no end marker
+        raise SourceError(f"{path}: truncated image")
+    size_px = image_size(data)
+    if size_px is None:
+        raise SourceError(f"{path}: cannot be decoded as an image")
+    check_size(*size_px, path)
+    return data
+
+
+def _grey_of_jpeg(data: bytes, path: Path) -> NDArray[np.uint8]:
+    """``(H, W)``.
+
+    By the same library as OpenCV's (libjpeg-turbo) and with the same values, but its warnings are errors: OpenCV gives
+    an image for whatever garbage lies between the first byte and the last.
+    """
+    from kornia_rs.io import decode_image_jpegturbo  # 10 ms, which other sources can do without
+
+    try:
+        grey = decode_image_jpegturbo(data, "mono")
+    except Exception as error:  # it has no other class for what it refuses
+        raise SourceError(f"{path}: damaged JPEG data, or print colours (CMYK)") from error
+    if data.find(_EXIF, 0, 65536) >= 0:  # it may say that the picture is turned, which OpenCV heeds
+        return np.asarray(_decoded(data, path, cv2.IMREAD_GRAYSCALE), dtype=np.uint8)
+    return np.asarray(grey[:, :, 0], dtype=np.uint8)
+
+
+def _decoded(data: bytes, path: Path | None, flags: int) -> NDArray[Any]:
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error as error:
+        raise SourceError(f"{path}: cannot be decoded as an image") from error
+    if image is None:
+        raise SourceError(f"{path}: cannot be decoded as an image")
+    return image
+
+
+def image_files(folder: Path) -> list[Path]:
+    """Image files directly in a folder, ``img10`` after ``img9``; hidden files are passed over."""
+    files = (p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and not p.name.startswith("."))
+    return sorted((p for p in files if p.is_file()), key=_natural)
+
+
+def entries_from_names(files: Sequence[Path]) -> list[ImageEntry]:
+    """Entries with stamps read from names like ``1305031102.175304.png`` or ``1403636579763555584.png``.
+
+    Names that tell no time (``frame_0012.png``) get 30 Hz in their order.
+    """
+    stamps = _stamps_in_names(files)
+    if stamps is None:
+        stamps = [i / ASSUMED_HZ for i in range(len(files))]
+    return [ImageEntry(i, stamp, path) for i, (stamp, path) in enumerate(zip(stamps, files, strict=True))]
+
+
+def list_image_folder(folder: Path) -> tuple[list[ImageEntry], list[Problem]]:
+    """Images of a folder that has no list of its own."""
+    return in_order(entries_from_names(image_files(folder)), str(folder))
+
+
+def frames_of(entries: Sequence[ImageEntry], size: tuple[int, int], problems: list[Problem]) -> Iterator[Frame]:
+    """Frames in order, without images that cannot be read or have another size.
+
+    Args:
+        entries: In time order.
+        size: ``(width, height)`` that the camera is calibrated for.
+        problems: Gets a line for each image left out.
+    """
+    for entry in entries:
+        try:
+            frame = read_frame(entry)
+        except SourceError as error:
+            problems.append(Problem(str(entry.path), str(error).removeprefix(f"{entry.path}: ")))
+            continue
+        height, width = (frame.image if frame.grey is None else frame.grey).shape[:2]
+        if (width, height) != size:
+            reason = f"image is {width}x{height}, the others are {size[0]}x{size[1]}"
+            problems.append(Problem(str(entry.path), reason))
+            continue
+        yield frame
+
+
+def first_size(entries: Sequence[ImageEntry], name: str) -> tuple[int, int]:
+    """``(width, height)`` of the first image that can be read.
+
+    Raises:
+        SourceError: If none can.
+    """
+    first = ""
+    for entry in entries:
+        try:
+            image = read_image(entry.path)
+        except SourceError as error:
+            first = first or str(error)
+            continue
+        return image.shape[1], image.shape[0]
+    raise SourceError(f"{name}: none of its images can be read ({len(entries)} listed; the first: {first})")
+
+
+def _stamps_in_names(files: Sequence[Path]) -> list[float] | None:
+    stems = [path.stem for path in files]
+    if not stems or not all(re.fullmatch(r"\d+(\.\d+)?", stem) for stem in stems):
+        return None
+    has_point = any("." in stem for stem in stems)
+    stamps, unit = seconds_from([float(stem) for stem in stems])
+    if not has_point and unit == "s" and float(np.median(stamps)) < 1e9:
+        return None  # 000012.png counts frames
+    gaps = np.diff(np.sort(stamps))
+    if len(gaps) and not 1e-4 < float(np.median(gaps)) < 60.0:
+        return None
+    return stamps.tolist()
+
+
+def _natural(path: Path) -> tuple[list[int | str], str]:
+    """Sort key under which ``img10`` comes after ``img9``."""
+    # Text and digits alternate, so that position by position like is compared with like.
+    parts = re.split(r"(\d+)", path.stem)
+    return [int(part) if i % 2 else part for i, part in enumerate(parts)], path.name

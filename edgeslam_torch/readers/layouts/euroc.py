@@ -1,0 +1,43 @@
+"""EuRoC MAV sequences as ETH publishes them: ``mav0/cam0/data.csv``, ``data/*.png``, ``sensor.yaml``."""
+
+from pathlib import Path
+
+from edgeslam_torch.errors import SourceError
+from edgeslam_torch.readers.images import entries_from_names, image_files
+from edgeslam_torch.readers.layouts.tum import read_list
+from edgeslam_torch.readers.listing import ImageEntry, Problem, in_order
+
+
+def camera_folder(folder: Path) -> Path | None:
+    """``mav0/cam0`` of a sequence, whichever of its levels was named; None when it is no EuRoC sequence."""
+    for candidate in (folder / "mav0" / "cam0", folder / "cam0", folder):
+        named = (candidate / "data.csv").is_file() or candidate.name.startswith("cam")
+        if named and (candidate / "data").is_dir():
+            return candidate
+    return None
+
+
+def groundtruth_of(folder: Path) -> Path | None:
+    """The ground truth beside ``cam0``, of the body, nanosecond stamps."""
+    for name in ("state_groundtruth_estimate0", "mocap0", "leica0"):
+        path = folder.parent / name / "data.csv"
+        if path.is_file():
+            return path
+    return None
+
+
+def list_euroc(folder: Path) -> tuple[list[ImageEntry], list[Problem]]:
+    """Images of one ``camN`` folder in time order.
+
+    Raises:
+        SourceError: If there is none.
+    """
+    listing = folder / "data.csv"
+    if not listing.is_file():
+        return in_order(entries_from_names(image_files(folder / "data")), str(folder / "data"))
+    rows, problems = read_list(listing)
+    if not rows:
+        raise SourceError(f"{listing}: lists no image; each line is 'nanoseconds,file name'")
+    entries = [ImageEntry(i, stamp * 1e-9, folder / "data" / name) for i, (stamp, name) in enumerate(rows)]
+    kept, more = in_order(entries, str(listing))
+    return kept, problems + more

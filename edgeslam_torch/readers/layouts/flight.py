@@ -1,0 +1,84 @@
+"""Our own flight recordings: a TUM-layout folder or a video with ``camera.yaml`` and ``telemetry.csv``."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from edgeslam_torch.errors import SourceError
+from edgeslam_torch.readers import video
+from edgeslam_torch.readers.layouts.tum import read_list
+from edgeslam_torch.types import TelemetrySample
+
+TELEMETRY = "telemetry.csv"
+_HOLE_S = 1.0
+_HOLE_SHARE = 0.05
+
+
+def telemetry_file(folders: Sequence[Path], given: str | Path | None) -> Path | None:
+    """The file that was given, or the source's own ``telemetry.csv``.
+
+    Raises:
+        SourceError: If the given file does not exist.
+    """
+    if given is not None:
+        path = Path(given).expanduser()
+        if not path.is_file():
+            raise SourceError(f"{path}: no such telemetry file")
+        return path
+    return next((folder / TELEMETRY for folder in folders if (folder / TELEMETRY).is_file()), None)
+
+
+def read_samples(path: Path) -> tuple[list[TelemetrySample], list[str]]:
+    """Telemetry in time order, and what is wrong with the file, in words."""
+    from edgeslam_torch.readers.telemetry_csv import read_table, samples_of  # only flights need it
+
+    table = read_table(path)
+    return samples_of(path, table), table.warnings(path.name)
+
+
+def telemetry_gap(samples: Sequence[TelemetrySample], first_s: float, last_s: float) -> str | None:
+    """How much of a video has no telemetry, in words; None when there is hardly a gap or no telemetry at all.
+
+    Args:
+        samples: In time order.
+        first_s: Stamp of the first frame.
+        last_s: Stamp of the last frame.
+    """
+    if not samples:
+        return None
+    begin_s, end_s = samples[0].stamp_s, samples[-1].stamp_s
+    if end_s < first_s or begin_s > last_s:
+        where = "before" if end_s < first_s else "after"
+        return (
+            f"no telemetry during the video: all of it ({begin_s:.1f} to {end_s:.1f} s) is stamped {where} the frames "
+            f"({first_s:.1f} to {last_s:.1f} s), and none is used; do both clocks count the same seconds?"
+        )
+    inside = [first_s, *(s.stamp_s for s in samples if first_s <= s.stamp_s <= last_s), last_s]
+    steps = (after - before for before, after in zip(inside, inside[1:], strict=False))
+    missing_s = sum(step for step in steps if step > _HOLE_S)
+    if missing_s <= _HOLE_SHARE * (last_s - first_s):
+        return None
+    return (
+        f"no telemetry during {missing_s:.1f} of {last_s - first_s:.1f} s of video "
+        f"(it runs from {begin_s:.1f} to {end_s:.1f} s, the frames from {first_s:.1f} to {last_s:.1f} s)"
+    )
+
+
+def find_video(folder: Path) -> Path | None:
+    """The folder's only video; None when it has none.
+
+    Raises:
+        SourceError: If it has several.
+    """
+    files = sorted(p for p in folder.iterdir() if p.suffix.lower() in video.SUFFIXES and p.is_file())
+    if len(files) > 1:
+        raise SourceError(f"{folder}: {len(files)} videos in it; give one of them, such as {files[0]}")
+    return files[0] if files else None
+
+
+def video_stamps(path: Path) -> list[float] | None:
+    """Stamps of a recorded video's frames, from ``<video>_stamps.txt`` beside it (``stamp index`` a line)."""
+    listing = path.with_name(f"{path.stem}_stamps.txt")
+    if not listing.is_file():
+        return None
+    rows, _ = read_list(listing)
+    return [stamp for stamp, _ in rows]

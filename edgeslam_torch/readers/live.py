@@ -1,0 +1,257 @@
+"""Live sources: a Tello, a webcam, a network stream. They give the newest picture, never a queue of old ones."""
+
+import re
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Protocol
+
+import cv2
+import numpy as np
+
+from edgeslam_torch.calibration.camera_choice import choose_camera
+from edgeslam_torch.drone.tello import StateMessage, Tello, TelloAddress, TelloError
+from edgeslam_torch.drone.video import ArrivalClock, Picture
+from edgeslam_torch.errors import SourceError
+from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.readers.listing import Problem
+from edgeslam_torch.types import Frame, TelemetrySample
+
+FIRST_PICTURE_S = 10.0
+"""A Tello's first pictures cannot be decoded until a keyframe comes."""
+SILENCE_S = 10.0
+"""Without a picture for so long the source has ended."""
+_SLICE_S = 0.1
+"""How long a source goes on waiting after it was told to end."""
+
+
+class Feed(Protocol):
+    """Where pictures come from."""
+
+    def wait(self, after_count: int, timeout_s: float) -> Picture | None:
+        """The newest picture once it is later than ``after_count``; None when time is up."""
+
+    def remarks(self) -> list[str]:
+        """What was amiss with what came."""
+
+    def close(self) -> None:
+        """Give the device back."""
+
+
+class LiveSource:
+    """A camera that goes on by itself; implements `edgeslam_torch.readers.source.Source`."""
+
+    kind = "live"
+    groundtruth: Path | None = None
+    live = True
+
+    def __init__(
+        self,
+        location: str,
+        feed: Feed,
+        telemetry: list[TelemetrySample],
+        camera: str | Path | None,
+        max_frames: int | None,
+        is_drone: bool,
+    ) -> None:
+        """Wait for the first picture, which tells the size.
+
+        Raises:
+            SourceError: If none comes.
+            CalibrationError: If the calibration does not fit.
+        """
+        self.location = location
+        self.name = re.sub(r"[^A-Za-z0-9.-]+", "_", location).strip("_") or "live"
+        self.telemetry = telemetry
+        self.length = max_frames
+        self.problems: list[Problem] = []
+        self._feed = feed
+        self._told_to_end = self._closed = False
+        first = feed.wait(0, FIRST_PICTURE_S)
+        if first is None:
+            feed.close()
+            raise SourceError(f"{location}: no picture in {FIRST_PICTURE_S:.0f} s")
+        size = (first.image.shape[1], first.image.shape[0])
+        try:
+            self.camera: Camera
+            self.warnings: list[str]
+            self.camera, self.warnings = choose_camera(size, camera, (), None, is_drone)
+        except BaseException:
+            feed.close()
+            raise
+
+    def frames(self) -> Iterator[Frame]:
+        """Pictures as they come; a slow taker misses some, which shows as gaps in the index. Closes the device.
+
+        Raises:
+            TelloError: If a guard has ended our flight with a drone.
+        """
+        last = given = 0
+        try:
+            while self.length is None or given < self.length:
+                picture = self._next(last)
+                if picture is None:
+                    return
+                last, given = picture.count, given + 1
+                yield Frame(picture.count - 1, picture.stamp_s, picture.image)
+        finally:
+            self.close()
+
+    def _next(self, last: int) -> Picture | None:
+        for _ in range(round(SILENCE_S / _SLICE_S)):
+            if self._told_to_end:
+                return None
+            picture = self._feed.wait(last, _SLICE_S)
+            if picture is not None:
+                return picture
+        self.problems.append(Problem(self.location, f"no picture for {SILENCE_S:.0f} s; ended", frames=0))
+        return None
+
+    def end(self) -> None:
+        """Let `frames` end with the picture that it has; from any thread, or a signal handler."""
+        self._told_to_end = True
+
+    def close(self) -> None:
+        """Give the device back; what was amiss with it is in `warnings` afterwards."""
+        self._feed.close()
+        if not self._closed:
+            self._closed = True
+            self.warnings += [f"{self.location}: {remark}" for remark in self._feed.remarks()]
+
+
+class TelloFeed:
+    """Pictures and telemetry of a drone."""
+
+    def __init__(self, tello: Tello) -> None:
+        self.tello = tello
+        self.video = tello.start_video()
+
+    def wait(self, after_count: int, timeout_s: float) -> Picture | None:
+        """As `Feed`.
+
+        Raises:
+            TelloError: If a guard has ended our flight; pictures of the floor are not what was asked for.
+        """
+        if self.tello.stop_reason:
+            raise TelloError(f"{self.tello.address.host}: the flight was ended: {self.tello.stop_reason}")
+        return self.video.wait(after_count, timeout_s)
+
+    def remarks(self) -> list[str]:
+        """As `Feed`: what did not come from the drone, or could not be read."""
+        remarks = []
+        refused = {channel: count for channel, count in self.tello.refused.items() if count}
+        if refused:
+            listing = ", ".join(f"{channel} {count}" for channel, count in refused.items())
+            remarks.append(f"{sum(refused.values())} packets from others than the drone were refused ({listing})")
+        if self.tello.malformed:
+            remarks.append(f"{self.tello.malformed} state messages could not be read")
+        return remarks
+
+    def close(self) -> None:
+        """Land if this client took off, and leave."""
+        self.tello.close()
+
+
+class CaptureFeed:
+    """OpenCV's capture in a thread that keeps only the newest picture."""
+
+    def __init__(self, device: int | str, name: str) -> None:
+        """Open the device.
+
+        Raises:
+            SourceError: If it cannot be opened.
+        """
+        self._capture = cv2.VideoCapture(device)
+        if not self._capture.isOpened():
+            self._capture.release()
+            raise SourceError(f"{name}: cannot be opened; is it there, and free?")
+        self._clock = ArrivalClock()
+        self._ready = threading.Condition()
+        self._newest: Picture | None = None
+        self._stopping = False
+        self._ended = False
+        self._thread = threading.Thread(target=self._work, name="capture", daemon=True)
+        self._thread.start()
+
+    def _work(self) -> None:
+        count = 0
+        while not self._stopping:
+            ok, image = self._capture.read()
+            stamp = self._clock.now()
+            with self._ready:
+                if not ok:
+                    self._ended = True
+                else:
+                    count += 1
+                    self._newest = Picture(stamp, np.asarray(image, dtype=np.uint8), count)
+                self._ready.notify_all()
+            if not ok:
+                return
+
+    def wait(self, after_count: int, timeout_s: float) -> Picture | None:
+        """As `Feed`."""
+
+        def later() -> bool:
+            return self._newest is not None and self._newest.count > after_count
+
+        with self._ready:
+            self._ready.wait_for(lambda: self._ended or later(), timeout_s)
+            return self._newest if later() else None
+
+    def remarks(self) -> list[str]:
+        """As `Feed`: there is nothing to say."""
+        return []
+
+    def close(self) -> None:
+        """Release the device."""
+        self._stopping = True
+        self._thread.join(timeout=2.0)
+        self._capture.release()
+
+
+def open_live(spec: str, camera: str | Path | None = None, max_frames: int | None = None) -> LiveSource:
+    """Open ``tello://HOST[:PORTS]``, ``webcam:N``, ``rtsp://...`` or ``udp://...``.
+
+    A Tello is only listened to: nothing that makes it move is sent.
+
+    Raises:
+        SourceError: If it cannot be reached or gives no picture.
+        TelloError: If the drone does not answer.
+        CalibrationError: If the calibration does not fit.
+    """
+    if spec.startswith("tello://"):
+        return open_tello(spec, camera, max_frames)[0]
+    device: int | str = spec
+    if spec.startswith("webcam:"):
+        number = spec.removeprefix("webcam:")
+        if not (number.isascii() and number.isdigit()):
+            raise SourceError(f"{spec}: give webcam:N with a number, such as webcam:0")
+        device = int(number)
+    return LiveSource(spec, CaptureFeed(device, spec), [], camera, max_frames, is_drone=False)
+
+
+def open_tello(
+    spec: str, camera: str | Path | None = None, max_frames: int | None = None, allow_motion: bool = False
+) -> tuple[LiveSource, Tello, list[StateMessage]]:
+    """A drone as a source, with its client and the growing list of its state messages.
+
+    Raises:
+        SourceError: If PyAV is missing, a port is taken, or no picture comes.
+        TelloError: If the drone does not answer.
+        CalibrationError: If the calibration does not fit.
+    """
+    telemetry: list[TelemetrySample] = []
+    messages: list[StateMessage] = []
+
+    def keep(message: StateMessage) -> None:
+        messages.append(message)
+        telemetry.append(message.sample())
+
+    tello = Tello(TelloAddress.parse(spec), allow_motion, on_state=keep)
+    try:
+        tello.connect()
+        feed = TelloFeed(tello)
+    except BaseException:
+        tello.close()
+        raise
+    return LiveSource(spec, feed, telemetry, camera, max_frames, is_drone=True), tello, messages

@@ -1,0 +1,263 @@
+"""`open_source`: a recording, an image folder, a video or a live stream as frames with a camera."""
+
+import importlib
+import importlib.util
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from itertools import islice
+from pathlib import Path
+from typing import Protocol
+
+from edgeslam_torch.calibration.camera_choice import choose_camera
+from edgeslam_torch.errors import SourceError
+from edgeslam_torch.geometry.camera import PRESETS, Camera
+from edgeslam_torch.readers import images, video
+from edgeslam_torch.readers.layouts import euroc, flight, seven_scenes, tum
+from edgeslam_torch.readers.listing import ImageEntry, Problem
+from edgeslam_torch.readers.read_ahead import read_ahead
+from edgeslam_torch.types import Frame, TelemetrySample
+
+LIVE_SCHEMES = ("tello://", "webcam:", "rtsp://", "udp://")
+
+SEVEN_SCENES_CAMERA = replace(
+    PRESETS["kinect"], cx=320.0, cy=240.0, source="the 7-Scenes default (Kinect colour camera, 525 px)"
+)
+
+ARCHIVES = {
+    ".bag": "a ROS bag: extract its images first",
+    ".db3": "a ROS bag: extract its images first",
+    ".mcap": "a ROS bag: extract its images first",
+    ".zip": "an archive: unpack it first",
+    ".tgz": "an archive: unpack it first",
+    ".gz": "an archive: unpack it first",
+    ".tar": "an archive: unpack it first",
+    ".7z": "an archive: unpack it first",
+}
+
+
+class Source(Protocol):
+    """What the run loop needs of any source, recorded or live."""
+
+    name: str
+    """For messages and file names."""
+    kind: str
+    """``tum``, ``7scenes``, ``euroc``, ``images``, ``video``, ``flight`` or ``live``."""
+    location: str
+    """Absolute path, or the address of a live source."""
+    camera: Camera
+    telemetry: list[TelemetrySample]
+    """In time order; a live source appends to it while it runs."""
+    groundtruth: Path | None
+    length: int | None
+    """Frames at most; None when nobody knows."""
+    problems: list[Problem]
+    """What was left out so far, and why."""
+    warnings: list[str]
+    """What the user should know before looking at the result."""
+    live: bool
+    """Whether frames come at their own pace and are lost when nobody takes them."""
+
+    def frames(self) -> Iterator[Frame]:
+        """Frames in time order."""
+
+    def close(self) -> None:
+        """Give a device back; may be called more than once."""
+
+
+@dataclass
+class Recording:
+    """A source that lies on disk; `frames` may be called again and gives the same."""
+
+    name: str
+    kind: str
+    location: str
+    camera: Camera
+    decode: Callable[[list[Problem]], Iterator[Frame]]
+    """Frames, decoded as they are asked for; appends what it leaves out."""
+    length: int | None
+    telemetry: list[TelemetrySample] = field(default_factory=list)
+    groundtruth: Path | None = None
+    problems: list[Problem] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+    live: bool = False
+    max_frames: int | None = None
+
+    def __post_init__(self) -> None:
+        self._listed = tuple(self.problems)
+
+    def frames(self) -> Iterator[Frame]:
+        """Frames in time order; the next one is decoded while the caller works on this one."""
+        self.problems[:] = self._listed
+        return read_ahead(islice(self.decode(self.problems), self.max_frames))
+
+    def close(self) -> None:
+        """Nothing to give back."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Content:
+    """What a reader found, before a camera is chosen."""
+
+    kind: str
+    decode: Callable[[tuple[int, int], list[Problem]], Iterator[Frame]]
+    size: tuple[int, int]
+    length: int | None
+    problems: list[Problem]
+    folder: Path
+    groundtruth: Path | None = None
+    default_camera: Camera | None = None
+
+
+def open_source(
+    spec: str | Path,
+    camera: str | Path | None = None,
+    telemetry: str | Path | None = None,
+    max_frames: int | None = None,
+) -> Source:
+    """Open whatever ``spec`` names.
+
+    Args:
+        spec: A TUM-layout, 7-Scenes, EuRoC or image folder, a video file, a flight recording, or a live
+            source (``tello://HOST``, ``webcam:0``, ``rtsp://...``).
+        camera: Calibration file or preset; found by itself when the source has one.
+        telemetry: ``telemetry.csv`` of the flight; found by itself in the source.
+        max_frames: Frames given at most.
+
+    Raises:
+        SourceError: If there is nothing usable; the message names the file and what to do.
+        CalibrationError: If the calibration does not fit.
+    """
+    if max_frames is not None and max_frames < 1:
+        raise SourceError(f"max_frames must be at least 1, got {max_frames}")
+    if str(spec).startswith(LIVE_SCHEMES):
+        return _open_live(str(spec), camera, telemetry, max_frames)
+    path = Path(spec).expanduser()
+    content = _content(path)
+    folders = [path, content.folder] if path.is_dir() else [content.folder]
+    telemetry_file = flight.telemetry_file(folders, telemetry)
+    samples, remarks = flight.read_samples(telemetry_file) if telemetry_file is not None else ([], [])
+    default = content.default_camera
+    chosen, warnings = choose_camera(content.size, camera, folders, default, bool(samples))
+    length = content.length
+    if max_frames is not None:
+        length = max_frames if length is None else min(length, max_frames)
+    return Recording(
+        name=path.resolve().name,
+        kind="flight" if samples and content.kind in ("tum", "video") else content.kind,
+        location=str(path.resolve()),
+        camera=chosen,
+        decode=lambda problems: content.decode(content.size, problems),
+        length=length,
+        telemetry=samples,
+        groundtruth=content.groundtruth,
+        problems=content.problems,
+        warnings=[*warnings, *remarks],
+        max_frames=max_frames,
+    )
+
+
+def _content(path: Path) -> _Content:
+    try:
+        if path.is_dir():
+            return _folder_content(path)
+        if path.is_file():
+            return _file_content(path)
+    except OSError as error:
+        raise SourceError(f"{error.filename or path}: {error.strerror or error}") from error
+    if path.exists():
+        raise SourceError(f"{path}: neither a file nor a folder")
+    raise SourceError(f"{path}: no such file or folder")
+
+
+def _file_content(path: Path) -> _Content:
+    suffix = path.suffix.lower()
+    if suffix in images.SUFFIXES:
+        return _listed("images", [ImageEntry(0, 0.0, path)], [], path, None)
+    if suffix in ARCHIVES:
+        raise SourceError(f"{path}: {ARCHIVES[suffix]}, then give the folder")
+    if path.name in tum.LISTS:
+        return _folder_content(path.parent)
+    return _video_content(path, None)
+
+
+def _folder_content(folder: Path) -> _Content:
+    camera_folder = euroc.camera_folder(folder)
+    if camera_folder is not None:
+        truth = euroc.groundtruth_of(camera_folder)
+        return _listed("euroc", *euroc.list_euroc(camera_folder), camera_folder, truth)
+    if seven_scenes.is_seven_scenes(folder):
+        truth = folder if next(folder.glob("*.pose.txt"), None) is not None else None
+        return _listed("7scenes", *seven_scenes.list_seven_scenes(folder), folder, truth, SEVEN_SCENES_CAMERA)
+    truth = folder / "groundtruth.txt" if (folder / "groundtruth.txt").is_file() else None
+    if tum.is_tum(folder):
+        return _listed("tum", *tum.list_tum(folder), folder, truth, tum.default_camera(folder.resolve().name))
+    recorded = flight.find_video(folder)
+    if recorded is not None:
+        return _video_content(recorded, truth)
+    return _listed("images", *images.list_image_folder(folder), folder, truth)
+
+
+def _video_content(path: Path, groundtruth: Path | None) -> _Content:
+    clip = video.Video(path, flight.video_stamps(path))
+
+    def decode(_: tuple[int, int], problems: list[Problem]) -> Iterator[Frame]:
+        return clip.frames(problems)
+
+    return _Content("video", decode, clip.size, clip.count, [], path.parent, groundtruth)
+
+
+def _listed(
+    kind: str,
+    entries: list[ImageEntry],
+    problems: list[Problem],
+    folder: Path,
+    groundtruth: Path | None,
+    default_camera: Camera | None = None,
+) -> _Content:
+    if not entries:
+        raise SourceError(_nothing_in(folder))
+    return _Content(
+        kind,
+        lambda size, found: images.frames_of(entries, size, found),
+        images.first_size(entries, str(folder)),
+        len(entries),
+        problems,
+        folder if folder.is_dir() else folder.parent,
+        groundtruth,
+        default_camera,
+    )
+
+
+def _nothing_in(folder: Path) -> str:
+    """Why a folder is no source, with what the user may have meant."""
+    children = sorted(folder.iterdir()) if folder.is_dir() else []
+    if not children:
+        return f"{folder}: empty; give a folder of images, a TUM, 7-Scenes or EuRoC sequence, or a video"
+    sequences = [child.name for child in children if child.is_dir() and _looks_like_sequence(child)]
+    if sequences:
+        more = ", ..." if len(sequences) > 5 else ""
+        names = ", ".join(sequences[:5]) + more
+        return f"{folder}: holds no images itself, but these folders in it do: {names}; give one of them"
+    suffixes = sorted({child.suffix.lower() or child.name for child in children})
+    found = ", ".join(suffixes[:5])
+    return f"{folder}: no images or video in it (found {found}); images must be .png or .jpg"
+
+
+def _looks_like_sequence(folder: Path) -> bool:
+    return (
+        euroc.camera_folder(folder) is not None
+        or seven_scenes.is_seven_scenes(folder)
+        or tum.is_tum(folder)
+        or bool(images.image_files(folder))
+    )
+
+
+def _open_live(spec: str, camera: str | Path | None, telemetry: str | Path | None, max_frames: int | None) -> Source:
+    """Hand over to the live sources, which need sockets and (for a drone) the ``[drone]`` extra."""
+    if telemetry is not None:
+        raise SourceError(f"{spec}: a live source brings its own telemetry; leave --telemetry away")
+    if importlib.util.find_spec("edgeslam_torch.readers.live") is None:
+        raise SourceError(f"{spec}: this installation has no live sources")
+    live = importlib.import_module("edgeslam_torch.readers.live")
+    source: Source = live.open_live(spec, camera=camera, max_frames=max_frames)
+    return source

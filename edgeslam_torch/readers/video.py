@@ -1,0 +1,90 @@
+"""Video files as a source."""
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from edgeslam_torch.errors import SourceError
+from edgeslam_torch.readers.images import ASSUMED_HZ, check_size
+from edgeslam_torch.readers.listing import Problem
+from edgeslam_torch.types import Frame
+
+SUFFIXES = frozenset(
+    f".{name}"
+    for name in ["mp4", "avi", "mov", "mkv", "webm", "m4v", "mpg", "mpeg", "ts", "h264", "264", "mjpeg", "wmv", "flv"]
+)
+
+
+class Video:
+    """One video file: its size and length known, its frames decoded on demand."""
+
+    def __init__(self, path: Path, stamps_s: list[float] | None = None) -> None:
+        """Open a video and look at its first frame.
+
+        Args:
+            path: Any file that OpenCV's FFmpeg reads.
+            stamps_s: Time of each frame [s] when the recording knows better than the container.
+
+        Raises:
+            SourceError: If the file cannot be decoded.
+        """
+        self.path = path
+        self.stamps_s = stamps_s
+        capture = _opened(path)
+        check_size(int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT)), path)
+        rate = capture.get(cv2.CAP_PROP_FPS)
+        self.rate_hz = rate if math.isfinite(rate) and 0.0 < rate <= 1000.0 else ASSUMED_HZ
+        count = capture.get(cv2.CAP_PROP_FRAME_COUNT)
+        self.count = int(count) if math.isfinite(count) and count > 0 else None
+        ok, image = capture.read()
+        capture.release()
+        if not ok:
+            raise SourceError(f"{path}: no frame of this video can be decoded")
+        self.size = (image.shape[1], image.shape[0])
+
+    def frames(self, problems: list[Problem]) -> Iterator[Frame]:
+        """Frames with strictly increasing stamps; what is left out is added to ``problems``."""
+        capture = _opened(self.path)
+        last, index = -math.inf, -1
+        try:
+            while True:
+                ok, image = capture.read()
+                if not ok:
+                    break
+                index += 1
+                stamp = self._stamp(index, capture.get(cv2.CAP_PROP_POS_MSEC))
+                if stamp is None or stamp <= last:
+                    reason = "has no stamp" if stamp is None else f"stamp {stamp:.6f} does not increase"
+                    problems.append(Problem(f"{self.path}, frame {index}", f"{reason}; image left out"))
+                    continue
+                last = stamp
+                yield Frame(index, stamp, np.asarray(image, dtype=np.uint8), self.path)
+        finally:
+            capture.release()
+        if self.count is not None and index + 1 < 0.98 * self.count:
+            reason = f"decoding ended after {index + 1} of {self.count} frames; the file is damaged"
+            problems.append(Problem(str(self.path), reason, self.count - index - 1))
+
+    def _stamp(self, index: int, container_ms: float) -> float | None:
+        if self.stamps_s is not None:
+            return self.stamps_s[index] if index < len(self.stamps_s) else None
+        if math.isfinite(container_ms) and (container_ms > 0.0 or index == 0):
+            return container_ms * 1e-3
+        return index / self.rate_hz
+
+
+def _opened(path: Path) -> "cv2.VideoCapture":
+    if path.suffix.lower() not in SUFFIXES:
+        raise SourceError(f"{path}: not a folder of images and not a video ({', '.join(sorted(SUFFIXES))})")
+    if path.stat().st_size == 0:
+        raise SourceError(f"{path}: empty file")
+    # FFmpeg by name: OpenCV's other readers would take any file with digits in its name for an image sequence.
+    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    if not capture.isOpened():
+        raise SourceError(
+            f"{path}: not a video that can be decoded; convert it to H.264 in .mp4, or to a folder of images"
+        )
+    return capture

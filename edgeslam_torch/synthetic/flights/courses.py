@@ -1,0 +1,136 @@
+"""Named kinds of simulated flights: where, how and with which camera a drone flies."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from edgeslam_torch.geometry.camera import PRESETS, Camera
+from edgeslam_torch.synthetic.flights.degrade import CameraFaults
+from edgeslam_torch.synthetic.flights.flight import Flight, FlightPlan, climb, fly, fly_after_hover, turn
+from edgeslam_torch.synthetic.flights.telemetry import TelemetryFaults, simulate
+from edgeslam_torch.synthetic.flights.writer import write_flight
+from edgeslam_torch.synthetic.house.rooms import blank_corridor, corridor, room
+from edgeslam_torch.synthetic.house.world import World
+
+Rng = np.random.Generator
+
+
+class Pilot(Protocol):
+    """Flies through a world, as `fly` does."""
+
+    def __call__(
+        self, rng: Rng, world: World, frames: int, *, rate_hz: float, plan: FlightPlan | None = None
+    ) -> Flight:
+        """A flight of ``frames`` frames."""
+
+
+@dataclass(frozen=True, slots=True)
+class Course:
+    """One kind of flight; the seed decides place, furniture, path and noise."""
+
+    world: Callable[[Rng], World] = room
+    pilot: Pilot = fly
+    faults: CameraFaults = field(default_factory=CameraFaults)
+    telemetry: TelemetryFaults | None = field(default_factory=TelemetryFaults)
+    """None flies without telemetry."""
+
+
+LOW_LIGHT = CameraFaults(gain=0.2, read_noise=2.5, shot_noise=0.35, vignetting=0.3, shutter_s=0.02)
+"""A fifth of the light at a slow shutter: walls at about 40 grey levels, noise of 3, blur of some pixels in a turn."""
+
+COURSES = {
+    "room": Course(),
+    "corridor": Course(corridor),
+    "blank_corridor": Course(blank_corridor),
+    "climb": Course(pilot=climb),
+    "yaw": Course(pilot=turn),
+    "low_light": Course(faults=LOW_LIGHT),
+    "turn_first": Course(pilot=partial(fly_after_hover, turning=True)),
+    "hover_first": Course(pilot=fly_after_hover),
+}
+"""By name; the first two are the demo's."""
+
+SECONDS, RATE_HZ = 16.0, 20.0
+"""Length and frame rate of a course, and of the demo."""
+DEPTH_EVERY = 10
+"""Frames from one exact depth map to the next."""
+
+
+def simulated_camera(width: int = 640, height: int = 480) -> Camera:
+    """A Tello's camera, without distortion, at another size."""
+    return replace(PRESETS["tello"].scaled(width, height), source="simulated Tello")
+
+
+def flown(course: Course, seed: int, seconds: float = SECONDS, rate_hz: float = RATE_HZ) -> tuple[World, Flight, Rng]:
+    """World and flight of a course, and the generator that goes on with its telemetry.
+
+    Raises:
+        ValueError: If the world has no free place to fly in.
+    """
+    rng = np.random.default_rng(seed)
+    world = course.world(rng)
+    return world, course.pilot(rng, world, round(seconds * rate_hz), rate_hz=rate_hz), rng
+
+
+def record_course(folder: Path, course: Course, seed: int, seconds: float = SECONDS, threads: int = 1) -> None:
+    """Fly a course and leave its recording in ``folder``.
+
+    Raises:
+        OutputError: If the folder cannot be written to.
+    """
+    world, flight, rng = flown(course, seed, seconds)
+    record_flight(
+        folder, world, flight, rng, simulated_camera(), course.telemetry, course.faults, seed=seed, threads=threads
+    )
+
+
+def record_flight(
+    folder: Path,
+    world: World,
+    flight: Flight,
+    rng: Rng,
+    camera: Camera,
+    telemetry: TelemetryFaults | None,
+    faults: CameraFaults,
+    *,
+    seed: int,
+    threads: int = 1,
+    on_frame: Callable[[int], None] | None = None,
+) -> None:
+    """Write a flight's images, truth, exact depth and telemetry into ``folder``.
+
+    Args:
+        folder: Made when missing.
+        world: What is seen.
+        flight: Where from.
+        rng: Of the telemetry's noise.
+        camera: Intrinsics.
+        telemetry: How bad the telemetry is; None for none.
+        faults: What the camera does to the images.
+        seed: Of the image noise.
+        threads: Frames drawn at a time.
+        on_frame: Called with the number of frames done.
+
+    Raises:
+        OutputError: If something cannot be written.
+    """
+    log = None
+    if telemetry is not None:
+        floor = world.floor_below(flight.T_w_b[:, :3, 3])
+        log = simulate(rng, flight.stamps_s, flight.T_w_c, flight.T_b_c, faults=telemetry, floor_m=floor)
+    write_flight(
+        folder,
+        world,
+        flight,
+        camera,
+        telemetry=log,
+        faults=faults,
+        seed=seed,
+        depth_every=DEPTH_EVERY,
+        threads=threads,
+        on_frame=on_frame,
+    )

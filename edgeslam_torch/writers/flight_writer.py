@@ -1,0 +1,107 @@
+"""Recording of a flight that is whole at any moment: what was written before a crash can be read."""
+
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+import cv2
+
+from edgeslam_torch.drone.tello import StateMessage
+from edgeslam_torch.errors import EdgeSlamError, OutputError
+from edgeslam_torch.files.appender import Appender
+from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.readers.telemetry_csv import TelemetryWriter
+from edgeslam_torch.types import Frame
+
+_JPEG_QUALITY = 95
+_FILES = ("rgb.txt", "camera.yaml", "state.txt", "telemetry.csv")
+
+
+class FlightWriter:
+    """A TUM-layout folder: ``rgb/``, ``rgb.txt``, ``camera.yaml``, ``telemetry.csv``, ``state.txt`` (raw lines).
+
+    Each picture is written before its line in ``rgb.txt``, each line as a whole: nothing is listed that is not there,
+    and what the disk had no room for is taken back.
+    """
+
+    def __init__(self, folder: Path, camera: Camera, with_telemetry: bool, lossless: bool = False) -> None:
+        """Make the folder.
+
+        Raises:
+            OutputError: If it holds a recording or a run already or cannot be written.
+        """
+        self.folder = folder
+        self.frames = self.states = 0
+        self._suffix = "png" if lossless else "jpg"
+        self._options = [] if lossless else [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
+        held = next((name for name in _FILES if (folder / name).exists()), None)
+        if held is not None:
+            raise OutputError(f"{folder}: holds {held} already, of a recording or a run; give another folder")
+        try:
+            (folder / "rgb").mkdir(parents=True, exist_ok=True)
+            camera.save(folder / "camera.yaml")
+            self._list = Appender(folder / "rgb.txt", "# stamp_s file\n")
+            self._raw = Appender(folder / "state.txt", "") if with_telemetry else None
+            self._telemetry = TelemetryWriter(folder / "telemetry.csv") if with_telemetry else None
+        except (OSError, EdgeSlamError) as error:
+            raise OutputError(f"{folder}: cannot be written: {_reason(error)}") from error
+
+    def add_frame(self, frame: Frame) -> None:
+        """Write one picture.
+
+        Raises:
+            OutputError: If the disk refuses; the recording is as it was before.
+        """
+        name = f"rgb/{frame.stamp_s:.6f}.{self._suffix}"
+        path = self.folder / name
+
+        def write() -> None:
+            ok, data = cv2.imencode(f".{self._suffix}", frame.image, self._options)
+            if not ok:
+                raise OSError(f"cannot encode as {self._suffix}")
+            path.write_bytes(data.tobytes())
+            self._list.write(f"{frame.stamp_s:.6f} {name}\n")
+
+        try:
+            _guarded(path, write)
+        except OutputError:
+            with suppress(OSError):
+                path.unlink(missing_ok=True)  # half a picture that nothing lists
+            raise
+        self.frames += 1
+
+    def add_state(self, message: StateMessage) -> None:
+        """Write one state message.
+
+        Raises:
+            OutputError: If the disk refuses.
+        """
+        if self._raw is None or self._telemetry is None:
+            return
+        raw, telemetry = self._raw, self._telemetry
+        _guarded(telemetry.path, lambda: telemetry.write(message.stamp_s, message.fields))
+        _guarded(self.folder / "state.txt", lambda: raw.write(f"{message.stamp_s:.6f} {message.raw}\n"))
+        self.states += 1
+
+    def close(self) -> None:
+        """Close the files."""
+        for file in (self._list, self._raw, self._telemetry):
+            if file is not None:
+                file.close()
+
+    def __enter__(self) -> "FlightWriter":
+        return self
+
+    def __exit__(self, *unused: object) -> None:
+        self.close()
+
+
+def _guarded(path: Path, write: Callable[[], None]) -> None:
+    try:
+        write()
+    except (OSError, EdgeSlamError, cv2.error) as error:
+        raise OutputError(f"{path}: cannot be written: {_reason(error)}") from error
+
+
+def _reason(error: Exception) -> str:
+    return getattr(error, "strerror", None) or str(error)

@@ -1,0 +1,118 @@
+"""Which folder a run may write into: an empty one, or one of its own kind, and one run at a time."""
+
+import json
+import os
+import socket
+import time
+from collections.abc import Collection
+from contextlib import suppress
+from pathlib import Path
+from typing import TextIO
+
+from edgeslam_torch.errors import OutputError
+from edgeslam_torch.readers.images import image_files
+from edgeslam_torch.readers.video import SUFFIXES as VIDEOS
+
+try:
+    import fcntl
+except ImportError:  # Windows: two runs into one folder go unnoticed there
+    fcntl = None  # type: ignore[assignment]
+
+STATUS = "status.csv"
+SUMMARY = "summary.json"
+_STATUS_BEGIN = "index,stamp_s,status,"
+"""What the status table of every version begins with; a run writes it with its first frame."""
+_SUMMARY_KEYS = frozenset({"version", "frames", "statuses"})
+_RECORDING = ("rgb.txt", "rgb", "mav0", "cam0", "data.csv", "sensor.yaml", "ost.yaml", "telemetry.csv")
+"""Names in recordings that no run gives."""
+_LOCK = ".lock"
+
+
+def check_free(folder: Path, outputs: Collection[str]) -> None:
+    """Whether results named ``outputs`` may go into the existing ``folder``.
+
+    Files of other names are nobody's business: a log, notes, a flight in a folder of its own.
+
+    Raises:
+        OutputError: If a result would replace a file that no run wrote, or would lie among a recording's files.
+    """
+    part = next((name for name in _RECORDING if (folder / name).exists()), None)
+    if part is None and not _is_run(folder):
+        part = _foreign(folder, outputs)
+    if part is not None:
+        raise OutputError(f"{folder}: holds {part}, which no run wrote; give another folder to --out")
+
+
+def _foreign(folder: Path, outputs: Collection[str]) -> str | None:
+    """A file that results would replace, or that makes the folder a recording."""
+    name = next((name for name in outputs if (folder / name).exists()), None)
+    if name is not None:
+        return name
+    media = [*image_files(folder), *(path for path in folder.iterdir() if path.suffix.lower() in VIDEOS)]
+    return media[0].name if media else None
+
+
+def _is_run(folder: Path) -> bool:
+    """Whether a run wrote here, also one of an older version or one that was killed."""
+    try:
+        with (folder / STATUS).open(encoding="utf-8") as file:
+            if file.readline(200).startswith(_STATUS_BEGIN):
+                return True
+    except (OSError, UnicodeDecodeError):
+        pass
+    try:
+        summary = json.loads((folder / SUMMARY).read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return False
+    return isinstance(summary, dict) and summary.keys() >= _SUMMARY_KEYS
+
+
+class FolderLock:
+    """Held by one process at a time; the system gives it back when the process dies, however it does.
+
+    The file says who holds it. Where the system or the file system has no locks nothing is locked.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        """Take the lock.
+
+        Raises:
+            OutputError: If another run holds it.
+            OSError: If the folder cannot be written to.
+        """
+        self._path = folder / _LOCK
+        self._file = self._open()
+        while not self._is_there():  # the run before gave it back between our opening and our locking
+            self._file.close()
+            self._file = self._open()
+        self._file.truncate(0)
+        self._file.write(f"process {os.getpid()} on {socket.gethostname()} since {time.strftime('%Y-%m-%d %H:%M:%S')}")
+        self._file.flush()
+
+    def release(self) -> None:
+        """Give the lock back; may be called more than once."""
+        if not self._file.closed:
+            with suppress(OSError):
+                self._path.unlink()
+            self._file.close()
+
+    def _open(self) -> TextIO:
+        file = self._path.open("a+", encoding="utf-8")
+        try:
+            if fcntl is not None:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            file.seek(0)
+            holder = file.read(200) or "another process"
+            file.close()
+            folder = self._path.parent
+            raise OutputError(f"{folder}: {holder} writes a run there; give another folder to --out") from None
+        except OSError:
+            pass  # a file system without locks
+        return file
+
+    def _is_there(self) -> bool:
+        try:
+            return os.path.samestat(os.fstat(self._file.fileno()), self._path.stat())
+        except FileNotFoundError:
+            return False

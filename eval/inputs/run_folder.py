@@ -1,0 +1,127 @@
+"""The output folder of ``edgeslam run``, read back."""
+
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from edgeslam_torch.eval.errors import EvaluationError
+from edgeslam_torch.eval.inputs.associate import nearest
+from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, read_trajectory
+from edgeslam_torch.files.record_files import read_mapping
+from edgeslam_torch.types import PointCloud
+from edgeslam_torch.writers.ply import read_ply
+
+_SUPPORTED = frozenset({"initialised", "tracked", "relocalised"})
+"""Status of a frame whose pose rests on the map, in tables of version 0.1, which have no column that says so."""
+
+
+@dataclass(frozen=True, slots=True)
+class RunFolder:
+    """What a run left; a part that is missing is None or empty."""
+
+    path: Path
+    trajectory: Trajectory
+    online: Trajectory | None
+    status: tuple[dict[str, str], ...]
+    """Rows of ``status.csv``."""
+    summary: dict[str, Any]
+
+    @property
+    def name(self) -> str:
+        """Folder name."""
+        return self.path.resolve().name
+
+    @property
+    def units(self) -> str:
+        """``metres`` or ``arbitrary``, as the run says; ``unknown`` when it does not (a bare trajectory)."""
+        scale = self.summary.get("scale")
+        return str(scale.get("units", "unknown")) if isinstance(scale, dict) else "unknown"
+
+    def cloud(self, name: str = "edge_map.ply") -> PointCloud | None:
+        """Point cloud of the folder, None when it is not there."""
+        file = self.path / name
+        return read_ply(file) if file.is_file() else None
+
+    def keyframe_poses(self) -> list[int]:
+        """Poses of ``trajectory`` that are keyframes; every tenth without a ``status.csv`` that tells."""
+        stamps = [float(r.get("stamp_s") or "nan") for r in self.status if is_keyframe(r)]
+        index = nearest(self.trajectory.stamps_s, np.array(stamps)) if stamps else np.zeros(0, dtype=int)
+        ok = [int(i) for i, t in zip(index, stamps, strict=True) if abs(self.trajectory.stamps_s[i] - t) < 1e-3]
+        return ok or list(range(0, len(self.trajectory), 10))
+
+    @property
+    def source(self) -> Path | None:
+        """Folder that the run read, when its summary tells and it is still there; relative names start at the run."""
+        source = self.summary.get("source")
+        name = source.get("path") if isinstance(source, dict) else source
+        if not isinstance(name, str) or not name:
+            return None
+        folder = self.path / name
+        try:
+            return folder if folder.is_dir() else None
+        except (OSError, ValueError):  # a name that no folder can have
+            return None
+
+    @property
+    def trusted_frames(self) -> int:
+        """Frames whose final pose rests on a map that the images support; all where no ``status.csv`` tells."""
+        return sum(map(is_supported, self.status)) if self.status else len(self.trajectory)
+
+
+def open_run(path: Path | str) -> RunFolder:
+    """Run folder, or a single trajectory file taken as one.
+
+    Raises:
+        EvaluationError: If it holds no trajectory or a part is malformed.
+    """
+    path = Path(path)
+    if path.is_file():
+        return RunFolder(path, read_trajectory(path), None, (), {})
+    if not path.exists():
+        raise EvaluationError(f"{path}: no such run folder or trajectory file")
+    online = path / "trajectory_online.txt"
+    return RunFolder(
+        path,
+        read_trajectory(path),
+        read_trajectory(online) if online.is_file() else None,
+        read_status(path / "status.csv"),
+        read_summary(path / "summary.json"),
+    )
+
+
+def is_keyframe(row: dict[str, str]) -> bool:
+    """Whether a row of ``status.csv`` is a keyframe's."""
+    return row.get("keyframe", "").lower() in ("1", "true", "yes")
+
+
+def is_supported(row: dict[str, str]) -> bool:
+    """Whether a row of ``status.csv`` is of a frame whose final pose rests on a map that the images support."""
+    stated = row.get("supported", "")
+    return stated == "1" if stated else row.get("status", "") in _SUPPORTED
+
+
+def read_status(path: Path) -> tuple[dict[str, str], ...]:
+    """Rows of ``status.csv``; empty when there is none.
+
+    Raises:
+        EvaluationError: If it is not a table of text.
+    """
+    if not path.is_file():
+        return ()
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            return tuple({k: v or "" for k, v in row.items() if k is not None} for row in csv.DictReader(file))
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise EvaluationError(f"{path}: not a table of text ({error})") from error
+
+
+def read_summary(path: Path) -> dict[str, Any]:
+    """``summary.json``; empty when there is none.
+
+    Raises:
+        EvaluationError: If it is not a JSON object.
+    """
+    return read_mapping(path, "JSON", EvaluationError) if path.is_file() else {}

@@ -1,0 +1,264 @@
+"""Depth maps against measured depth: the figures of Eigen et al. 2014, metric and median-scaled, and at edges alone."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from edgeslam_torch.eval.errors import EvaluationError
+from edgeslam_torch.eval.inputs.associate import DEFAULT_MAX_DT_S, nearest
+from edgeslam_torch.eval.inputs.dataset import open_depth
+from edgeslam_torch.eval.metrics.surface import register_depth
+from edgeslam_torch.readers.images import pixels_or_none
+from edgeslam_torch.types import FloatArray
+
+MIN_DEPTH_M = 1e-3
+"""Predictions are not taken below this: log and ratio need a positive depth."""
+
+
+@dataclass(frozen=True, slots=True)
+class DepthScore:
+    """Errors over the measured pixels of one or more depth maps."""
+
+    pixels: int
+    abs_rel: float
+    """Mean of ``|d - d*| / d*``."""
+    rmse_m: float
+    log_rmse: float
+    """RMSE of ``ln d - ln d*``."""
+    delta1: float
+    """Share of pixels with ``max(d/d*, d*/d) < 1.25``."""
+    delta2: float
+    """The same below ``1.25^2``."""
+    delta3: float
+    """The same below ``1.25^3``."""
+    scale: float
+    """What the prediction was multiplied by: 1 for metric figures, the ratio of medians for scaled ones."""
+
+
+@dataclass(frozen=True, slots=True)
+class DepthReport:
+    """One prediction judged four ways."""
+
+    metric: DepthScore
+    median_scaled: DepthScore
+    """Each map multiplied by the ratio of medians first: what is left when the scale comes from elsewhere."""
+    edges_metric: DepthScore | None
+    """Edge pixels alone; None without an image."""
+    edges_median_scaled: DepthScore | None
+
+
+def score_depth(
+    prediction: FloatArray,
+    truth: FloatArray,
+    mask: NDArray[np.bool_] | None = None,
+    median_scaled: bool = False,
+) -> DepthScore:
+    """Errors of one depth map.
+
+    Args:
+        prediction: Depth ``(H, W)`` [m].
+        truth: Measured depth ``(H, W)`` [m]; 0, negative or not finite where nothing was measured.
+        mask: Pixels ``(H, W)`` to look at; all measured ones by default.
+        median_scaled: Multiply the prediction by ``median(truth) / median(prediction)`` of those pixels first.
+
+    Raises:
+        EvaluationError: If the shapes differ or no pixel is left.
+
+    Example:
+        >>> score_depth(np.full((2, 2), 1.1), np.ones((2, 2))).abs_rel
+        0.10000000000000009
+    """
+    prediction, truth = np.squeeze(prediction), np.squeeze(truth)
+    if prediction.shape != truth.shape:
+        raise EvaluationError(f"the predicted depth map is {prediction.shape}, the measured one {truth.shape}")
+    valid = np.isfinite(truth) & (truth > 0) & np.isfinite(prediction)
+    if mask is not None:
+        valid &= mask
+    return _score(prediction[valid], truth[valid], median_scaled)
+
+
+def report_depth(prediction: FloatArray, truth: FloatArray, image: NDArray[np.uint8] | None = None) -> DepthReport:
+    """All four figures of one map; ``image`` ``(H, W[, 3])`` of the same size gives the edges."""
+    edges = edge_mask(image) if image is not None else None
+    has_edges = edges is not None and bool((edges & (np.squeeze(truth) > 0)).any())
+    return DepthReport(
+        score_depth(prediction, truth),
+        score_depth(prediction, truth, median_scaled=True),
+        score_depth(prediction, truth, edges) if has_edges else None,
+        score_depth(prediction, truth, edges, median_scaled=True) if has_edges else None,
+    )
+
+
+def edge_mask(image: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Canny edges ``(H, W)`` of an 8-bit image, the thresholds of the map evaluation."""
+    grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    return cv2.Canny(cv2.GaussianBlur(grey, (0, 0), 1.0), 50.0, 150.0, L2gradient=True) > 0
+
+
+def mean_score(scores: Iterable[DepthScore]) -> DepthScore:
+    """Mean over maps, as the literature averages; pixels are summed."""
+    found = list(scores)
+    if not found:
+        raise EvaluationError("no depth map was judged")
+    names = ("abs_rel", "rmse_m", "log_rmse", "delta1", "delta2", "delta3", "scale")
+    means = {name: float(np.mean([getattr(s, name) for s in found])) for name in names}
+    return DepthScore(pixels=sum(s.pixels for s in found), **means)
+
+
+def read_depth(path: Path, metres_per_unit: float = 1.0 / 5000.0) -> FloatArray:
+    """Depth map ``(H, W)`` [m] from ``.npy`` (metres) or a 16-bit PNG.
+
+    Raises:
+        EvaluationError: If the file is neither.
+    """
+    if path.suffix == ".npy":
+        try:
+            return np.squeeze(np.load(path, allow_pickle=False)).astype(np.float64)
+        except (OSError, ValueError) as error:
+            raise EvaluationError(f"{path}: not a NumPy array ({error})") from error
+    raw = pixels_or_none(path, cv2.IMREAD_UNCHANGED)
+    if raw is None or raw.dtype != np.uint16 or raw.ndim != 2:
+        raise EvaluationError(f"{path}: not a 16-bit depth map or .npy array")
+    return np.where(raw == 65535, 0, raw).astype(np.float64) * metres_per_unit
+
+
+def compare_folders(
+    prediction: Path, truth: Path, metres_per_unit: float = 1.0 / 5000.0, images: Path | None = None
+) -> DepthReport:
+    """Mean figures over the maps that two folders (or files) share by name.
+
+    Args:
+        prediction: Folder or file to judge; of a name's ``.npy`` and ``.png`` the former is taken.
+        truth: Folder or file of measured depth.
+        metres_per_unit: What a PNG's value is worth [m].
+        images: Folder or file of images of the same names and size: their edge pixels are judged alone too.
+
+    Raises:
+        EvaluationError: If no name is in both.
+    """
+    if prediction.is_file() and truth.is_file():
+        pairs = [(prediction, truth, images)]
+    else:
+        known, pictures = _maps(truth), _images(images)
+        pairs = [(path, known[n], pictures.get(n)) for n, path in _maps(prediction).items() if n in known]
+    if not pairs:
+        raise EvaluationError(
+            f"{prediction} and {truth} share no depth map by name (.npy or 16-bit .png); for predictions named after "
+            "a recording's colour images, give the recording's own folder as ground truth"
+        )
+    return mean_report(
+        report_depth(read_depth(a, metres_per_unit), read_depth(b, metres_per_unit), _read_image(image))
+        for a, b, image in pairs
+    )
+
+
+def compare_with_recording(prediction: Path, folder: Path) -> DepthReport:
+    """Mean figures over the maps of a folder, named after a recording's images, against its measured depth.
+
+    Depth maps and colour images have stamps of their own: the nearest within 20 ms is taken, undistorted, and turned to
+    the colour camera where it is not registered. The images give the edges.
+
+    Raises:
+        EvaluationError: If the recording has no depth maps, or none belongs to a prediction.
+    """
+    measured = open_depth(folder)
+    maps = _maps(prediction)
+    reports = []
+    for stamp, path in zip(measured.frame_stamps_s, measured.image_paths, strict=True):
+        index = int(nearest(measured.files.stamps_s, np.array([stamp]))[0])
+        if path.stem not in maps or abs(measured.files.stamps_s[index] - stamp) > DEFAULT_MAX_DT_S:
+            continue
+        truth = measured.files.read(index)
+        if not np.array_equal(measured.files.T_c_d, np.eye(4)):
+            truth = register_depth(truth, measured.files.camera, measured.files.T_c_d, measured.camera)
+        image = _read_image(path)
+        image = None if image is None else np.asarray(measured.camera.undistort_image(image), np.uint8)
+        reports.append(report_depth(read_depth(maps[path.stem], 1e-3), truth, image))
+    if not reports:
+        raise EvaluationError(
+            f"{prediction}: no depth map is named after an image of {folder} that has measured depth within "
+            f"{1e3 * DEFAULT_MAX_DT_S:.0f} ms ('edgeslam depth {folder} --out DIR' names them so)"
+        )
+    return mean_report(reports)
+
+
+def mean_report(reports: Iterable[DepthReport]) -> DepthReport:
+    """Mean over maps of all four figures; edges over the maps that have any."""
+    found = list(reports)
+    edges = [r.edges_metric for r in found if r.edges_metric is not None]
+    scaled = [r.edges_median_scaled for r in found if r.edges_median_scaled is not None]
+    return DepthReport(
+        mean_score(r.metric for r in found),
+        mean_score(r.median_scaled for r in found),
+        mean_score(edges) if edges else None,
+        mean_score(scaled) if scaled else None,
+    )
+
+
+def _maps(place: Path) -> dict[str, Path]:
+    """Depth maps of a folder by name; numbers win over pictures, and pictures to look at are not taken."""
+    if place.is_file():
+        return {place.stem: place}
+    found = {p.stem: p for suffix in (".png", ".npy") for p in sorted(place.glob(f"*{suffix}"))}
+    return {name: path for name, path in sorted(found.items()) if not name.endswith(("_colour", "_sigma"))}
+
+
+def _images(place: Path | None) -> dict[str, Path]:
+    if place is None:
+        return {}
+    return {p.stem: p for p in sorted(place.glob("*")) if p.suffix.lower() in (".png", ".jpg", ".jpeg")}
+
+
+def _read_image(path: Path | None) -> NDArray[np.uint8] | None:
+    if path is None:
+        return None
+    image = pixels_or_none(path, cv2.IMREAD_GRAYSCALE)
+    if image is None:
+        raise EvaluationError(f"{path}: not an image")
+    return np.asarray(image, dtype=np.uint8)
+
+
+def markdown_depth(report: DepthReport) -> str:
+    """The figures as a table."""
+    lines = [
+        "| pixels | AbsRel | RMSE [m] | log RMSE | delta1 | delta2 | delta3 | scale |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for name, s in (
+        ("metric", report.metric),
+        ("median-scaled", report.median_scaled),
+        ("edges, metric", report.edges_metric),
+        ("edges, median-scaled", report.edges_median_scaled),
+    ):
+        if s is not None:
+            lines.append(
+                f"| {name} | {s.abs_rel:.4f} | {s.rmse_m:.4f} | {s.log_rmse:.4f} | {s.delta1:.4f} | {s.delta2:.4f} "
+                f"| {s.delta3:.4f} | {s.scale:.4f} |"
+            )
+    return "\n".join(lines)
+
+
+def _score(d: FloatArray, truth: FloatArray, median_scaled: bool) -> DepthScore:
+    if len(d) == 0:
+        raise EvaluationError("no pixel has both a measured and a predicted depth")
+    d, truth = d.astype(np.float64), truth.astype(np.float64)
+    middle = float(np.median(d))
+    if median_scaled and middle <= 0:
+        raise EvaluationError("the predicted depth map is not positive")
+    scale = float(np.median(truth)) / middle if median_scaled else 1.0
+    d = np.maximum(d * scale, MIN_DEPTH_M)
+    ratio = np.maximum(d / truth, truth / d)
+    return DepthScore(
+        pixels=len(d),
+        abs_rel=float(np.mean(np.abs(d - truth) / truth)),
+        rmse_m=float(np.sqrt(np.mean((d - truth) ** 2))),
+        log_rmse=float(np.sqrt(np.mean((np.log(d) - np.log(truth)) ** 2))),
+        delta1=float(np.mean(ratio < 1.25)),
+        delta2=float(np.mean(ratio < 1.25**2)),
+        delta3=float(np.mean(ratio < 1.25**3)),
+        scale=scale,
+    )

@@ -1,0 +1,210 @@
+"""One run judged against its data set: the function that scripts call."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from edgeslam_torch.eval.errors import EvaluationError
+from edgeslam_torch.eval.inputs.associate import DEFAULT_MAX_DT_S, Association
+from edgeslam_torch.eval.inputs.dataset import EvalDataset, interpolate, open_dataset
+from edgeslam_torch.eval.inputs.run_folder import RunFolder, is_supported, open_run
+from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, read_trajectory
+from edgeslam_torch.eval.metrics.align import AlignmentKind, umeyama
+from edgeslam_torch.eval.metrics.diagnose import explain
+from edgeslam_torch.eval.metrics.edge_map_score import THRESHOLDS_M, MapScore, score_map
+from edgeslam_torch.eval.metrics.surface import surface_truth
+from edgeslam_torch.eval.metrics.trajectory_error import TrajectoryScore, score_trajectory
+
+
+@dataclass(frozen=True, slots=True)
+class RunScore:
+    """Everything measured about one run; lengths in metres, angles in degrees."""
+
+    name: str
+    dataset: str
+    ate_sim3_m: float
+    """ATE RMSE after Sim(3), all poses of ``trajectory.txt``: what monocular systems are compared by."""
+    ate_se3_m: float
+    """ATE RMSE after SE(3): what a metric run is judged by."""
+    ate_raw_m: float
+    """ATE RMSE without any alignment: only for runs that share the truth's world frame."""
+    ate_online_sim3_m: float
+    """The same as the first for ``trajectory_online.txt``; NaN without one."""
+    scale_error: float
+    """``s - 1`` where ``s`` is what the estimate must be multiplied by."""
+    scale_inside_95: bool | None
+    """Whether the true scale lies inside the run's own 95 % interval; None when it states none."""
+    coverage: float
+    """Frames of the source whose pose rests on their own image (initialised, tracked, relocalised)."""
+    with_pose: float
+    """Frames of the source that have any pose."""
+    first_pose_s: float
+    """Time from the first image to the first pose."""
+    matched: int
+    rotation_deg: float
+    """RMSE of the orientation after alignment."""
+    rpe_1s_m: float
+    rpe_1s_deg: float
+    full_transform: float
+    """RMSE of ``||E - I||_F``, unitless: the paper's figure."""
+    fixed_position_m: float
+    """What a camera standing still would score."""
+    map: MapScore | None
+    map_note: str
+    """Why there is no map score."""
+    units: str
+    """``metres`` or ``arbitrary``, as the run says; ``unknown`` for a bare trajectory."""
+    summary: dict[str, Any] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    """Findings of `explain`."""
+    sim3: TrajectoryScore | None = field(default=None, repr=False, compare=False)
+    """The full Sim(3) score, for plots; not part of `to_dict`."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers and strings for JSON."""
+        record = asdict(replace(self, sim3=None))
+        record.pop("sim3")
+        if self.sim3 is not None:
+            record["relative"] = [asdict(r) for r in self.sim3.relative]
+            record["drift"] = [asdict(d) for d in self.sim3.drift]
+            record["ate_sim3"] = asdict(self.sim3.ate_m)
+            record["rotation"] = asdict(self.sim3.rotation_deg)
+            record["truth_path_m"] = self.sim3.truth_path_m
+        return record
+
+
+def evaluate_run(
+    run_dir: Path | str,
+    dataset_dir: Path | str,
+    depth_truth_dir: Path | str | None = None,
+    max_dt_s: float = DEFAULT_MAX_DT_S,
+    offset_s: float = 0.0,
+    judge_map: bool = True,
+    thresholds_m: Sequence[float] = THRESHOLDS_M,
+) -> RunScore:
+    """Judge a run's output folder (or a bare trajectory file).
+
+    Args:
+        run_dir: Output folder of ``edgeslam run``, or a trajectory file.
+        dataset_dir: Data set folder with ground truth, or a ground-truth trajectory file.
+        depth_truth_dir: Data set whose depth maps judge the map; ``dataset_dir`` when not given.
+        max_dt_s: Largest time between matched poses [s].
+        offset_s: Added to the run's stamps [s].
+        judge_map: Compare the edge map with the depth maps too.
+        thresholds_m: Distances at which the map's shares are given [m].
+
+    Raises:
+        EvaluationError: If they cannot be compared; the message names the likely mistake.
+    """
+    run = open_run(run_dir)
+    dataset_dir = Path(dataset_dir)
+    dataset = open_dataset(dataset_dir) if dataset_dir.is_dir() else None
+    truth = dataset.truth if dataset is not None else read_trajectory(dataset_dir)
+    run = _stamped(run, dataset)
+    sim3 = score_trajectory(truth, run.trajectory, AlignmentKind.SIM3, max_dt_s, offset_s)
+    se3 = score_trajectory(truth, run.trajectory, AlignmentKind.SE3, max_dt_s, offset_s)
+    raw = score_trajectory(truth, run.trajectory, AlignmentKind.NONE, max_dt_s, offset_s)
+    online = float("nan")
+    if run.online is not None:
+        online = score_trajectory(truth, run.online, AlignmentKind.SIM3, max_dt_s, offset_s).ate_m.rmse
+    depth_dataset = open_dataset(depth_truth_dir) if depth_truth_dir is not None else dataset
+    map_score, map_note = _map_score(run, depth_dataset, sim3, thresholds_m) if judge_map else (None, "not asked for")
+    one_second = sim3.relative[1]
+    coverage, with_pose, first = _coverage(run, dataset, truth, sim3.association)
+    judged = se3 if run.units == "metres" else sim3
+    return RunScore(
+        name=run.name,
+        dataset=dataset.name if dataset is not None else dataset_dir.name,
+        ate_sim3_m=sim3.ate_m.rmse,
+        ate_se3_m=se3.ate_m.rmse,
+        ate_raw_m=raw.ate_m.rmse,
+        ate_online_sim3_m=online,
+        scale_error=sim3.scale - 1.0,
+        scale_inside_95=_scale_inside(run, sim3.scale),
+        coverage=coverage,
+        with_pose=with_pose,
+        first_pose_s=first,
+        matched=sim3.matched,
+        rotation_deg=sim3.rotation_deg.rmse,
+        rpe_1s_m=one_second.translation_m.rmse,
+        rpe_1s_deg=one_second.rotation_deg.rmse,
+        full_transform=sim3.full_transform.rmse,
+        fixed_position_m=sim3.fixed_position_m,
+        map=map_score,
+        map_note=map_note,
+        units=run.units,
+        summary=run.summary,
+        notes=tuple(explain(truth, run.trajectory, judged, max_dt_s)),
+        sim3=sim3,
+    )
+
+
+def _stamped(run: RunFolder, dataset: EvalDataset | None) -> RunFolder:
+    """A file without stamps (KITTI, 7-Scenes) that has a pose for every image gets the images' stamps."""
+    mine = run.trajectory
+    if mine.stamped or dataset is None or len(mine) != len(dataset.frame_stamps_s):
+        return run
+    note = "no stamps in the file: its poses are taken for the data set's images, in order"
+    return replace(run, trajectory=replace(mine, stamps_s=dataset.frame_stamps_s, stamped=True, notes=(note,)))
+
+
+def _map_score(
+    run: RunFolder, dataset: EvalDataset | None, sim3: TrajectoryScore, thresholds_m: Sequence[float]
+) -> tuple[MapScore | None, str]:
+    if run.path.is_file():
+        return None, "a trajectory alone has no map"
+    cloud = run.cloud()
+    if cloud is None:
+        return None, f"{run.path}: no edge_map.ply"
+    if dataset is None or dataset.depth is None:
+        return None, "the data set has no depth maps"
+    truth = surface_truth(dataset.folder.resolve())
+    alignment = sim3.alignment
+    if not np.array_equal(dataset.depth.T_c_d, np.eye(4)):
+        # The true poses are the depth camera's; the run's are the colour camera's, 2.6 cm beside it.
+        T, known = interpolate(dataset.truth, run.trajectory.stamps_s)
+        colour = T @ np.linalg.inv(dataset.depth.T_c_d)
+        alignment = umeyama(run.trajectory.positions[known], colour[known, :3, 3])
+    try:
+        return score_map(cloud.p_w, alignment, truth, thresholds_m), ""
+    except EvaluationError as error:
+        return None, str(error)
+
+
+def _coverage(
+    run: RunFolder, dataset: EvalDataset | None, truth: Trajectory, clock: Association
+) -> tuple[float, float, float]:
+    """Share of frames with a trusted pose and with any pose, and the time of the first [s]."""
+    frames = dataset.frame_stamps_s if dataset is not None else np.zeros(0)
+    source = run.summary.get("source")
+    limit = source.get("length") if isinstance(source, dict) else None
+    if isinstance(limit, int) and 0 < limit < len(frames):
+        frames = frames[:limit]  # --max-frames: the run was asked for no more
+    if len(frames) == 0:
+        span = float(truth.stamps_s[-1] - truth.stamps_s[0])
+        mine = run.trajectory.stamps_s * clock.factor + clock.offset_s
+        inside = mine[(mine >= truth.stamps_s[0] - 1.0) & (mine <= truth.stamps_s[-1] + 1.0)]
+        share = min(1.0, float(inside[-1] - inside[0]) / span) if len(inside) > 1 and span > 0 else 0.0
+        return share, share, float(inside[0] - truth.stamps_s[0]) if len(inside) else float("nan")
+    count = len(frames)
+    first = _first_trusted(run) * clock.factor + clock.offset_s - float(frames[0])
+    return min(1.0, run.trusted_frames / count), min(1.0, len(run.trajectory) / count), first
+
+
+def _first_trusted(run: RunFolder) -> float:
+    for row, stamp in zip(run.status, run.trajectory.stamps_s, strict=False):
+        if is_supported(row):
+            return float(stamp)
+    return float(run.trajectory.stamps_s[0])
+
+
+def _scale_inside(run: RunFolder, scale: float) -> bool | None:
+    """The run's metres are its best guess; its sigma, relative to its value, says how far off they may be."""
+    stated = run.summary.get("scale")
+    if not isinstance(stated, dict) or not stated.get("sigma") or not stated.get("value"):
+        return None
+    relative = float(stated["sigma"]) / float(stated["value"])
+    return bool(abs(scale - 1.0) <= 1.96 * relative) if np.isfinite(relative) else None

@@ -1,0 +1,227 @@
+"""The measured world: a fused cloud and the 3-D edge points of a data set's depth maps."""
+
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+from scipy.spatial import cKDTree
+
+from edgeslam_torch.eval.errors import EvaluationError
+from edgeslam_torch.eval.inputs.associate import nearest
+from edgeslam_torch.eval.inputs.dataset import DepthFiles, EvalDataset, interpolate, open_dataset
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.readers.images import pixels_or_none
+from edgeslam_torch.types import FloatArray
+
+MAX_DEPTH_M = 5.0
+"""A Kinect's noise grows with the square of the distance: 7 cm at 5 m (Khoshelham & Elberink 2012)."""
+
+MAX_EDGE_DEPTH_M = 4.0
+"""Edge points farther away are not asked for: their measured depth is worse than the 6 cm they are judged by."""
+
+_STRIDE = 2
+"""Every second pixel of both directions: 8 mm at 2 m."""
+
+_VOXEL_M = 0.005
+"""The fused cloud keeps one point of each cube of this size."""
+
+_EDGE_VOXEL_M = 0.015
+"""Edge points of several depth maps in one cube of this size are one edge point, at their mean."""
+
+_EDGE_MAPS = 3
+"""An edge is asked for when this many depth maps put it in the same cube: not the flicker of Canny, nor noisy depth."""
+
+_EDGE_FRAMES = 40
+"""Depth maps whose edges are asked for, spread evenly over the sequence."""
+
+_SINGLE_FRAMES = 30
+"""Depth maps that judge a point one by one, spread evenly over the sequence."""
+
+_HIDDEN_M = 0.1
+"""A point this far behind a depth map's surface is hidden there, and that map says nothing about it."""
+
+_CANNY = (50.0, 150.0)
+"""Thresholds of the edges asked for, on the grey image smoothed with sigma 1, L2 gradient."""
+
+_HOLE_PX = 4
+"""Edge pixels this near to an unmeasured pixel are not asked for: their depth is unsure."""
+
+_NEAR_PX = 2
+"""Depth of an edge is the nearest within this many pixels: the edge belongs to the occluding side."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SurfaceTruth:
+    """Measured surface and edges in the ground truth's world frame."""
+
+    tree: cKDTree
+    """Over the fused cloud ``(P, 3)`` [m]."""
+    edges_w: FloatArray
+    """``(Q, 3)`` edge points [m]."""
+    depth_m: FloatArray
+    """``(D, H/2, W/2)`` depth maps, 0 where nothing was measured."""
+    T_d_w: FloatArray
+    """``(D, 4, 4)`` world to depth camera."""
+    camera: Camera
+    """Depth camera at the maps' reduced size, without distortion."""
+
+    def observed(self, p_w: FloatArray) -> np.ndarray:
+        """Which points ``(N, 3)`` fall on a measured pixel of at least one depth map, at whatever depth.
+
+        A point behind the measured surface counts as observed: it may be an error, and is judged as one.
+        """
+        seen = np.zeros(len(p_w), dtype=bool)
+        for depth, T in zip(self.depth_m, self.T_d_w, strict=True):
+            rest = np.flatnonzero(~seen)
+            if len(rest) == 0:
+                break
+            index, _ = self._readings(depth, se3.transform(T, p_w[rest]))
+            seen[rest[index]] = True
+        return seen
+
+    def single_map_distance(self, p_w: FloatArray) -> FloatArray:
+        """Distance ``(N,)`` [m] of points to the surface of one depth map: the median over the maps that see them.
+
+        The nearest of *all* maps' points flatters: a hundred noisy maps fill a shell around every surface, and a
+        point with 1 cm error finds a neighbour in it. One map is one layer. A map sees a point that falls on a
+        measured pixel and is not hidden behind it; a point hidden in all maps gets its least distance to any.
+        NaN where no map measured anything.
+        """
+        step = max(1, len(self.depth_m) // _SINGLE_FRAMES)
+        found = np.full((len(p_w), len(self.depth_m[::step])), np.nan, dtype=np.float32)
+        hidden = np.full(len(p_w), np.inf, dtype=np.float32)
+        for k, (depth, T) in enumerate(zip(self.depth_m[::step], self.T_d_w[::step], strict=True)):
+            p_d = se3.transform(T, p_w)
+            index, reading = self._readings(depth, p_d)
+            tree = cKDTree(_points(depth, self.camera, np.eye(4)), balanced_tree=False, compact_nodes=False)
+            distance = tree.query(p_d[index])[0].astype(np.float32)
+            behind = p_d[index, 2] > reading + _HIDDEN_M
+            found[index[~behind], k] = distance[~behind]
+            hidden[index[behind]] = np.minimum(hidden[index[behind]], distance[behind])
+        out = np.full(len(p_w), np.nan, dtype=np.float32)
+        some = ~np.isnan(found).all(axis=1)
+        out[some] = np.nanmedian(found[some], axis=1)
+        rest = ~some & np.isfinite(hidden)
+        out[rest] = hidden[rest]
+        return out
+
+    def _readings(self, depth: FloatArray, p_d: FloatArray) -> tuple[np.ndarray, FloatArray]:
+        """Which points ``(N, 3)`` of the depth camera's frame fall on a measured pixel, and the depth there."""
+        index = np.flatnonzero(p_d[:, 2] > 0.1)
+        uv = np.rint(self.camera.project(p_d[index])).astype(np.int64)
+        height, width = depth.shape
+        inside = (uv[:, 0] >= 0) & (uv[:, 0] < width) & (uv[:, 1] >= 0) & (uv[:, 1] < height)
+        index, uv = index[inside], uv[inside]
+        reading = depth[uv[:, 1], uv[:, 0]]
+        return index[reading > 0], reading[reading > 0]
+
+
+@lru_cache(maxsize=2)
+def surface_truth(folder: Path) -> SurfaceTruth:
+    """Measured surface of a data set; kept for the next run on the same one.
+
+    Raises:
+        EvaluationError: If the data set has no depth maps with known poses.
+    """
+    return build_surface(open_dataset(folder))
+
+
+def build_surface(dataset: EvalDataset) -> SurfaceTruth:
+    """Fuse a data set's depth maps with its true poses (see `surface_truth`)."""
+    files = dataset.depth
+    if files is None or len(files.paths) == 0:
+        raise EvaluationError(f"{dataset.folder}: no depth maps (depth.txt and a camera.yaml are needed)")
+    T_w_d, known = interpolate(dataset.truth, files.stamps_s)
+    index = np.flatnonzero(known)
+    if len(index) == 0:
+        raise EvaluationError(f"{dataset.folder}: no depth map has a true pose at its time")
+    edge_index = set(index[:: max(1, len(index) // _EDGE_FRAMES)].tolist())
+    small = files.camera.scaled(files.camera.width // _STRIDE, files.camera.height // _STRIDE)
+    # Pixels are taken, not averaged: sub-pixel phase 0 of every stride, hence the plain division below.
+    small = Camera(small.width, small.height, *_strided(files.camera), source=files.camera.source)
+    clouds, edges, maps = [], [], []
+    for i in index:
+        depth = files.read(int(i))
+        depth[depth > MAX_DEPTH_M] = 0.0
+        maps.append(depth[::_STRIDE, ::_STRIDE].copy())
+        clouds.append(_thinned(_points(maps[-1], small, T_w_d[i]), _VOXEL_M))
+        if i in edge_index:
+            edges.append(_edge_points(dataset, files, depth, int(i)))
+    cloud = _thinned(np.concatenate(clouds), _VOXEL_M)
+    edge_cloud = _agreed(edges)
+    tree = cKDTree(cloud, balanced_tree=False, compact_nodes=False)
+    return SurfaceTruth(tree, edge_cloud, np.stack(maps), se3.inverse(T_w_d[index]), small)
+
+
+def _strided(camera: Camera) -> tuple[float, float, float, float]:
+    return camera.fx / _STRIDE, camera.fy / _STRIDE, camera.cx / _STRIDE, camera.cy / _STRIDE
+
+
+def _points(depth: FloatArray, camera: Camera, T_w_d: FloatArray) -> FloatArray:
+    v, u = np.nonzero(depth)
+    p = camera.back_project(np.stack([u, v], axis=1).astype(np.float64), depth[v, u])
+    return se3.transform(T_w_d, p).astype(np.float32)
+
+
+def _thinned(p: FloatArray, voxel_m: float) -> FloatArray:
+    """One point of each cube; the first in order."""
+    return p[np.sort(np.unique(_cells(p, voxel_m), return_index=True)[1])]
+
+
+def _cells(p: FloatArray, voxel_m: float) -> np.ndarray:
+    """One integer a cube."""
+    cell = np.floor(p / voxel_m).astype(np.int64)
+    return (cell[:, 0] * 1_000_003 + cell[:, 1]) * 1_000_003 + cell[:, 2]
+
+
+def _agreed(edges: list[FloatArray]) -> FloatArray:
+    """Mean of the edge points in each cube that enough maps agree on, ``(Q, 3)``."""
+    p = np.concatenate(edges)
+    if len(p) == 0:
+        return p
+    frame = np.repeat(np.arange(len(edges)), [len(e) for e in edges])
+    _, cell = np.unique(_cells(p, _EDGE_VOXEL_M), return_inverse=True)
+    maps = np.bincount(np.unique(cell * len(edges) + frame) // len(edges))
+    total = np.bincount(cell)
+    mean = np.stack([np.bincount(cell, weights=p[:, axis]) for axis in range(3)], axis=1) / total[:, None]
+    return mean[maps >= min(_EDGE_MAPS, len(edges))].astype(np.float32)
+
+
+def _edge_points(dataset: EvalDataset, files: DepthFiles, depth: FloatArray, index: int) -> FloatArray:
+    """World points ``(N, 3)`` of the colour image's edges that have a measured depth."""
+    empty = np.zeros((0, 3), dtype=np.float32)
+    if dataset.camera is None or len(dataset.frame_stamps_s) == 0:
+        return empty
+    k = int(nearest(dataset.frame_stamps_s, files.stamps_s[index : index + 1])[0])
+    T_w_image, known = interpolate(dataset.truth, dataset.frame_stamps_s[k : k + 1])
+    image = pixels_or_none(dataset.image_paths[k], cv2.IMREAD_GRAYSCALE)
+    if abs(dataset.frame_stamps_s[k] - files.stamps_s[index]) > 0.02 or not known[0] or image is None:
+        return empty
+    T_c_d, camera = files.T_c_d, dataset.camera
+    if not np.array_equal(T_c_d, np.eye(4)):
+        depth = register_depth(depth, files.camera, T_c_d, camera)
+    image = camera.undistort_image(image)
+    canny = cv2.Canny(cv2.GaussianBlur(image, (0, 0), 1.0), *_CANNY, L2gradient=True) > 0
+    measured = np.where(depth > 0, 1, 0).astype(np.uint8)
+    solid = cv2.erode(measured, np.ones((2 * _HOLE_PX + 1,) * 2, np.uint8), borderValue=0) > 0
+    near = cv2.erode(np.where(depth > 0, depth, np.float32(1e3)), np.ones((2 * _NEAR_PX + 1,) * 2, np.uint8))
+    v, u = np.nonzero(canny & solid & (near < MAX_EDGE_DEPTH_M))
+    p_c = camera.back_project(np.stack([u, v], axis=1).astype(np.float64), np.asarray(near, dtype=np.float64)[v, u])
+    # The truth is the pose of the depth camera where the two differ.
+    return se3.transform(T_w_image[0] @ se3.inverse(T_c_d), p_c).astype(np.float32)
+
+
+def register_depth(depth: FloatArray, depth_camera: Camera, T_c_d: FloatArray, camera: Camera) -> FloatArray:
+    """Depth map ``(H, W)`` of one camera as another sees it; 0 where nothing falls; the nearest wins."""
+    v, u = np.nonzero(depth)
+    p = se3.transform(T_c_d, depth_camera.back_project(np.stack([u, v], axis=1).astype(np.float64), depth[v, u]))
+    p = p[p[:, 2] > 0.05]
+    uv = np.rint(camera.project(p)).astype(np.int64)
+    ok = (uv >= 0).all(axis=1) & (uv[:, 0] < camera.width) & (uv[:, 1] < camera.height)
+    out = np.full((camera.height, camera.width), np.inf, dtype=np.float32)
+    np.minimum.at(out, (uv[ok, 1], uv[ok, 0]), p[ok, 2].astype(np.float32))
+    out[np.isinf(out)] = 0.0
+    return out

@@ -1,0 +1,1 @@
+"""Figures for people: call `page.write_report` for a run's page, `tables` for Markdown."""

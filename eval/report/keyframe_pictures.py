@@ -1,0 +1,101 @@
+"""Keyframes with the map's edges drawn in, coloured by depth: does the map lie on the image?"""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from edgeslam_torch.errors import EdgeSlamError
+from edgeslam_torch.eval.inputs.associate import nearest
+from edgeslam_torch.eval.inputs.run_folder import RunFolder
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.geometry.camera import Camera, load_camera
+from edgeslam_torch.readers import images
+from edgeslam_torch.readers.layouts import euroc, seven_scenes, tum
+from edgeslam_torch.types import FloatArray, PointCloud
+
+_LISTS: dict[str, Callable[[Path], Any]] = {
+    "tum": tum.list_tum,
+    "7scenes": seven_scenes.list_seven_scenes,
+    "images": images.list_image_folder,
+}
+
+_CELL_PX = 8
+"""Side of the cells in which nearer points hide farther ones."""
+
+_HIDDEN = 1.08
+"""A point this much farther than its cell's nearest is behind it."""
+
+
+def keyframe_pictures(run: RunFolder, cloud: PointCloud, stamps_s: FloatArray) -> list[tuple[float, np.ndarray]]:
+    """Stamp and BGR picture of the keyframes at ``stamps_s`` whose images can still be read.
+
+    Only sources that are folders of images are looked at; a missing one gives no pictures, not an error.
+    """
+    paths = image_paths(run, stamps_s)
+    if len(cloud.p_w) == 0 or not any(paths):
+        return []
+    try:
+        camera = load_camera(run.path / "camera.yaml")
+    except EdgeSlamError:
+        return []
+    out = []
+    for stamp, path in zip(stamps_s, paths, strict=True):
+        image = images.pixels_or_none(path, cv2.IMREAD_COLOR) if path is not None else None
+        if image is None or image.shape[:2] != (camera.height, camera.width):
+            continue
+        pose = int(nearest(run.trajectory.stamps_s, np.array([stamp]))[0])
+        T_c_w = se3.inverse(run.trajectory.T_w_c[pose])
+        out.append((float(stamp), draw_edges(camera.undistort_image(image), camera, T_c_w, cloud)))
+    return out
+
+
+def image_paths(run: RunFolder, stamps_s: FloatArray) -> list[Path | None]:
+    """Image files of the run's source at ``stamps_s``; None where there is none, or the source has no image files."""
+    try:
+        entries = _entries(run)
+    except (EdgeSlamError, OSError):
+        entries = []
+    if not entries:
+        return [None] * len(stamps_s)
+    known = np.array([entry.stamp_s for entry in entries])
+    index = nearest(known, np.asarray(stamps_s))
+    return [entries[i].path if abs(known[i] - t) < 1e-3 else None for i, t in zip(index, stamps_s, strict=True)]
+
+
+def draw_edges(image: np.ndarray, camera: Camera, T_c_w: FloatArray, cloud: PointCloud) -> np.ndarray:
+    """The undistorted image ``(H, W, 3)``, dimmed, with the visible map points in it."""
+    p = se3.transform(T_c_w, np.asarray(cloud.p_w, dtype=np.float64))
+    p = p[p[:, 2] > 1e-3]
+    uv = np.rint(camera.project(p)).astype(np.int64)
+    inside = (uv >= 0).all(axis=1) & (uv[:, 0] < camera.width - 1) & (uv[:, 1] < camera.height - 1)
+    uv, z = uv[inside], p[inside, 2]
+    out = (0.4 * image).astype(np.uint8)
+    if len(z) == 0:
+        return out
+    columns = -(-camera.width // _CELL_PX)
+    cell = uv[:, 1] // _CELL_PX * columns + uv[:, 0] // _CELL_PX
+    front = np.full(int(cell.max()) + 1, np.inf)
+    np.minimum.at(front, cell, z)
+    seen = z < _HIDDEN * front[cell]
+    uv, z = uv[seen], z[seen]
+    near, far = np.quantile(1.0 / z, [0.97, 0.03])
+    code = np.clip((1.0 / z - far) / max(near - far, 1e-9), 0, 1) * 215 + 20  # without turbo's dark ends
+    colour = cv2.applyColorMap(code.astype(np.uint8).reshape(-1, 1), cv2.COLORMAP_TURBO).reshape(-1, 3)
+    order = np.argsort(-z)
+    for dv, du in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        out[uv[order, 1] + dv, uv[order, 0] + du] = colour[order]
+    return out
+
+
+def _entries(run: RunFolder) -> list[Any]:
+    source, folder = run.summary.get("source"), run.source
+    if not isinstance(source, dict) or folder is None:
+        return []
+    kind = str(source.get("kind"))
+    if kind == "euroc":
+        camera_folder = euroc.camera_folder(folder)
+        return list(euroc.list_euroc(camera_folder)[0]) if camera_folder is not None else []
+    return list(_LISTS[kind](folder)[0]) if kind in _LISTS else []

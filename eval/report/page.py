@@ -1,0 +1,458 @@
+"""``report.html``: one self-contained page about a run, readable offline and on a phone.
+
+The page's own text, style and script lie in ``template/``; this file packs a run's numbers into it. Points are
+quantised to 11 bytes (three 16-bit coordinates, colour, logarithmic sigma, observations) and travel as base64.
+"""
+
+import base64
+import html
+import json
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from edgeslam_torch.errors import EdgeSlamError
+from edgeslam_torch.eval.errors import EvaluationError
+from edgeslam_torch.eval.inputs.associate import match
+from edgeslam_torch.eval.inputs.run_folder import RunFolder, is_keyframe, open_run
+from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, read_trajectory
+from edgeslam_torch.eval.metrics.run_score import RunScore, evaluate_run
+from edgeslam_torch.eval.report import words
+from edgeslam_torch.eval.report.keyframe_pictures import keyframe_pictures
+from edgeslam_torch.files.atomic import write_text
+from edgeslam_torch.readers.images import pixels_or_none
+from edgeslam_torch.types import FloatArray, PointCloud
+
+STATUSES = ("starting", "initialised", "tracked", "relocalised", "predicted", "lost")
+"""In the order of the page's colours."""
+
+MAX_POINTS = 200_000
+"""More edge points than this are thinned at random (fixed seed) so that the page stays smooth and small."""
+
+_MAX_ANCHORS = 50_000
+_MAX_POSES = 6000
+_MAX_KEYFRAMES = 12
+_KEYFRAME_WIDTH_PX = 480
+_MAX_FRUSTA = 60
+_PAGE = Path(__file__).parent / "template"
+_SCRIPTS = ("data.js", "viewer.js", "charts.js", "page.js")
+
+
+@dataclass(frozen=True, slots=True)
+class _View:
+    """Where the page's camera starts and how far the scene reaches, robust against stray points."""
+
+    lo: FloatArray
+    hi: FloatArray
+    target: FloatArray
+    radius: float
+    floor: float
+    height: tuple[float, float]
+    """Heights of the points at the ends of the colour ramp."""
+
+
+def write_report(
+    run_dir: Path | str,
+    groundtruth: Path | str | None = None,
+    out: Path | str | None = None,
+    judge_map: bool = True,
+) -> Path:
+    """Write the report of a run and return its path.
+
+    Args:
+        run_dir: Output folder of ``edgeslam run``.
+        groundtruth: Data set folder or trajectory file; None looks into the run's own source folder.
+        out: File to write; ``report.html`` in the run's folder by default.
+        judge_map: Compare the map with the data set's depth maps too (some ten seconds).
+
+    Raises:
+        EdgeSlamError: If the folder holds no run, or the given ground truth does not fit it.
+    """
+    run = open_run(run_dir)
+    if run.path.is_file():
+        raise EvaluationError(f"{run.path}: a report needs a run's folder, this is a single file")
+    out = Path(out) if out is not None else run.path / "report.html"
+    score, truth = _judge(run, groundtruth, judge_map)
+    write_text(out, render(run, score, truth))
+    return out
+
+
+def render(run: RunFolder, score: RunScore | None = None, truth: Trajectory | None = None) -> str:
+    """The page as text."""
+    edges = _subset(run.cloud("edge_map.ply"), MAX_POINTS)
+    anchors = _subset(run.cloud("anchors.ply"), _MAX_ANCHORS)
+    turn = _upright(run.trajectory, score, truth)
+    data, packed_edges, packed_anchors = _payload(run, edges, anchors, score, truth, turn)
+    text = json.dumps(_finite(data), allow_nan=False, separators=(",", ":"), default=_plain).replace("<", "\\u003c")
+    script = "\n".join((_PAGE / name).read_text(encoding="utf-8") for name in _SCRIPTS)
+    parts = {
+        "style": (_PAGE / "style.css").read_text(encoding="utf-8"),
+        "script": script,
+        "title": html.escape(f"{data['title']}, EdgeSLAM-Torch"),
+        "edges": packed_edges,
+        "anchors": packed_anchors,
+        "data": text,
+    }
+    # In one pass: a recording may itself be called {{edges}}.
+    page = (_PAGE / "page.html").read_text(encoding="utf-8")
+    return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], page)
+
+
+def _judge(
+    run: RunFolder, groundtruth: Path | str | None, judge_map: bool
+) -> tuple[RunScore | None, Trajectory | None]:
+    """Score and true trajectory; without a given ground truth, what the source folder offers, if anything."""
+    given = groundtruth is not None
+    place = Path(groundtruth) if groundtruth is not None else _source_folder(run)
+    if place is None:
+        return None, None
+    try:
+        return evaluate_run(run.path, place, judge_map=judge_map), read_trajectory(place)
+    except EdgeSlamError:
+        if given:
+            raise
+        return None, None
+
+
+def _source_folder(run: RunFolder) -> Path | None:
+    """The recording that the run read, when it is still there and has ground truth."""
+    folder = run.source
+    if folder is not None and (
+        (folder / "groundtruth.txt").is_file() or (folder / "mav0").is_dir() or any(folder.glob("*.pose.txt"))
+    ):
+        return folder
+    for name in ("groundtruth.txt", "ground_truth.txt"):
+        if (run.path / name).is_file():
+            return run.path / name
+    return None
+
+
+def _payload(
+    run: RunFolder,
+    edges: PointCloud,
+    anchors: PointCloud,
+    score: RunScore | None,
+    truth: Trajectory | None,
+    turn: FloatArray,
+) -> tuple[dict[str, Any], str, str]:
+    step = max(1, -(-len(run.trajectory) // _MAX_POSES))
+    trajectory = run.trajectory.take(slice(None, None, step))
+    begin = float(run.trajectory.stamps_s[0])
+    positions = trajectory.positions @ turn.T
+    table = _StatusTable(run, trajectory)
+    view = _view(edges.p_w @ turn.T, positions)
+    units = words.unit(run)
+    edge_meta, edge_bytes = _packed(edges, turn)
+    anchor_meta, anchor_bytes = _packed(anchors, turn)
+    rotations = np.swapaxes(turn @ trajectory.T_w_c[:, :3, :3], 1, 2)  # rows are the camera's axes in the world
+    data: dict[str, Any] = {
+        "title": words.title(run),
+        "story": words.story(run, score),
+        "warnings": words.warnings(run.summary),
+        "tiles": words.tiles(run, score, len(edges.p_w)),
+        "foot": words.foot(run),
+        "unit": units,
+        "edges": edge_meta,
+        "anchors": anchor_meta,
+        "positions": _rounded(positions, 4),
+        "rotations": _rounded(rotations, 4),
+        "stamps": _rounded(trajectory.stamps_s - begin, 4),
+        "time": [0.0, float(run.trajectory.stamps_s[-1] - begin)],
+        "status": table.codes,
+        "statusCounts": table.counts,
+        "hasStatus": bool(run.status),
+        "events": table.events(begin),
+        "matches": table.column("matches"),
+        "inliers": table.column("inliers"),
+        "cameras": table.cameras(),
+        "fov": [0.62, 0.46],
+        "scale": table.scale(words.scale_note(run.summary)),
+        "stages": table.stages(),
+        "truth": _truth_in_run(truth, score, turn),
+        "error": _error(score, begin),
+        "home": {
+            "target": _rounded(view.target, 4),
+            "radius": round(view.radius, 4),
+            "yaw": _yaw(rotations, positions, view),
+        },
+        "box": {"lo": _rounded(view.lo, 4), "hi": _rounded(view.hi, 4)},
+        "floor": round(view.floor, 4),
+        "gridStep": _grid_step(view.radius),
+        "height": [round(h, 3) for h in view.height],
+        "keyframes": _keyframes(run, edges, trajectory.stamps_s[table.keyframes()], begin),
+        "mapScore": words.map_rows(score),
+        "summary": words.flat_rows(run.summary),
+        "config": _config(run),
+    }
+    return data, edge_bytes, anchor_bytes
+
+
+class _StatusTable:
+    """``status.csv`` beside the poses that the page shows; any column may be missing."""
+
+    def __init__(self, run: RunFolder, trajectory: Trajectory) -> None:
+        self.all_rows = run.status
+        self.all_stamps = np.array([_number(r, "stamp", "stamp_s", "timestamp") for r in run.status], dtype=np.float64)
+        self.rows: list[dict[str, str]] = []
+        if len(self.all_stamps) and np.isfinite(self.all_stamps).all():
+            order = np.argsort(self.all_stamps, kind="stable")
+            i, j = match(self.all_stamps[order], trajectory.stamps_s, 1e-3)
+            found = dict(zip(j.tolist(), order[i].tolist(), strict=True))
+            self.rows = [run.status[found[k]] if k in found else {} for k in range(len(trajectory))]
+        else:
+            self.rows = [{}] * len(trajectory)
+        self.codes = [_status_code(r) for r in self.rows]
+        everything = [_status_code(r) for r in run.status] or self.codes
+        self.counts = [everything.count(k) for k in range(len(STATUSES))]
+
+    def column(self, *names: str) -> list[float | None] | None:
+        """Numbers of a column, None where missing; None when the file lacks it."""
+        values = [_number(r, *names) for r in self.rows]
+        if not any(np.isfinite(values)):
+            return None
+        return [round(v, 5) if np.isfinite(v) else None for v in values]
+
+    def keyframes(self) -> list[int]:
+        """Poses of keyframes."""
+        return [k for k, r in enumerate(self.rows) if is_keyframe(r)]
+
+    def cameras(self) -> list[int]:
+        """Poses drawn as frusta: the keyframes, thinned, or every so many poses."""
+        index = self.keyframes() or list(range(0, len(self.rows), max(1, len(self.rows) // 30)))
+        return index[:: max(1, -(-len(index) // _MAX_FRUSTA))]
+
+    def scale(self, note: str) -> dict[str, Any] | None:
+        """Scale over time with its 95 % interval, when the run had one."""
+        value = self.column("scale", "scale_value")
+        sigma = self.column("scale_sigma", "sigma", "sigma_scale")
+        if value is None or sigma is None:
+            return None
+        both = list(zip(value, sigma, strict=True))
+        known = [v if v is not None and s is not None else None for v, s in both]
+        low = [round(v - 1.96 * s, 5) if v is not None and s is not None else None for v, s in both]
+        high = [round(v + 1.96 * s, 5) if v is not None and s is not None else None for v, s in both]
+        return {"value": known, "low": low, "high": high, "note": note}
+
+    def stages(self) -> list[dict[str, Any]]:
+        """Median and 95th percentile of every ``*_ms`` column over the frames in which the stage ran."""
+        names = [n for n in (self.all_rows[0] if self.all_rows else {}) if n.endswith("_ms")]
+        out = []
+        for name in names:
+            values = np.array([_number(r, name) for r in self.all_rows])
+            values = values[np.isfinite(values) & (values > 0)]
+            if len(values):
+                label = "whole step" if name == "step_ms" else name.removesuffix("_ms").replace("_", " ")
+                share = f" ({len(values)} frames)" if len(values) < 0.9 * len(self.all_rows) else ""
+                median, p95 = np.quantile(values, [0.5, 0.95])
+                out.append({"name": label + share, "median": float(median), "p95": float(p95)})
+        return sorted(out, key=lambda s: -s["median"])
+
+    def events(self, begin: float, most: int = 40) -> list[list[str]]:
+        """Stretches that were not plainly tracked: from, to, frames, status, reason."""
+        out: list[list[Any]] = []
+        for row, stamp in zip(self.all_rows, self.all_stamps, strict=True):
+            status, reason = row.get("status", ""), row.get("reason", "")
+            if status == "tracked" and not reason:
+                out.append([])
+                continue
+            if out and out[-1] and out[-1][3] == status and out[-1][4] == reason:
+                out[-1][1], out[-1][2] = stamp, out[-1][2] + 1
+            else:
+                out.append([stamp, stamp, 1, status, reason])
+        rows = [r for r in out if r and (r[3] != "tracked" or r[2] > 2)]
+        text = [[f"{a - begin:.2f} s", f"{b - begin:.2f} s", str(n), s, why] for a, b, n, s, why in rows[:most]]
+        if len(rows) > most:
+            text.append(["", "", "", "", f"and {len(rows) - most} more in status.csv"])
+        return [[words.without_folders(cell) for cell in row] for row in text]
+
+
+def _status_code(row: dict[str, str]) -> int:
+    status = row.get("status", "tracked")
+    return STATUSES.index(status) if status in STATUSES else STATUSES.index("lost")
+
+
+def _number(row: dict[str, str], *names: str) -> float:
+    for name in names:
+        try:
+            value = float(row.get(name, ""))
+        except ValueError:
+            continue
+        return value if np.isfinite(value) else float("nan")
+    return float("nan")
+
+
+def _upright(trajectory: Trajectory, score: RunScore | None, truth: Trajectory | None) -> FloatArray:
+    """Rotation ``(3, 3)`` that turns the run's world so that z is up on the page.
+
+    A run without telemetry takes its first camera for level; ground truth knows better, when its own z is up. Else a
+    world in which the cameras' up is far from z (a trajectory that starts at the identity, z forward) is turned.
+    """
+    if score is not None and score.sim3 is not None and truth is not None and _camera_up(truth)[2] > 0.2:
+        return score.sim3.alignment.R
+    up = _camera_up(trajectory)
+    if up[2] > 0.5 or not up.any():
+        return np.eye(3)
+    x = np.cross([0.0, 1.0, 0.0] if abs(up[1]) < 0.9 else [1.0, 0.0, 0.0], up)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(up, x), up])
+
+
+def _camera_up(trajectory: Trajectory) -> FloatArray:
+    """Mean up direction of the images in the world, unit length; zero when they cancel."""
+    up = -trajectory.T_w_c[:, :3, 1].mean(axis=0)
+    norm = float(np.linalg.norm(up))
+    return up / norm if norm > 1e-6 else np.zeros(3)
+
+
+def _subset(cloud: PointCloud | None, most: int) -> PointCloud:
+    if cloud is None:
+        empty = np.zeros((0, 3), dtype=np.float32)
+        return PointCloud(empty, empty.astype(np.uint8), empty[:, 0], empty[:, 0].astype(np.int32))
+    keep = np.flatnonzero(np.isfinite(cloud.p_w).all(axis=1))
+    if len(keep) > most:
+        keep = np.sort(np.random.default_rng(0).choice(keep, most, replace=False))
+    return PointCloud(cloud.p_w[keep], cloud.colour[keep], cloud.sigma_m[keep], cloud.observations[keep])
+
+
+def _packed(cloud: PointCloud, turn: FloatArray) -> tuple[dict[str, Any], str]:
+    """Range of the quantised values, and the bytes in base64."""
+    p = np.asarray(cloud.p_w, dtype=np.float64) @ turn.T
+    count = len(p)
+    if count == 0:
+        return {"count": 0, "lo": [0, 0, 0], "hi": [1, 1, 1], "sigma": [0.01, 1.0], "observations": [1, 2]}, ""
+    # A handful of points flung far away must not cost the others their resolution: 65 536 steps over the range.
+    lo, hi = np.quantile(p, [0.001, 0.999], axis=0)
+    middle, reach = (lo + hi) / 2, np.maximum((hi - lo).max() * 1.5, 1e-6)
+    lo, hi = np.maximum(p.min(axis=0), middle - reach), np.minimum(p.max(axis=0), middle + reach)
+    extent = np.maximum(hi - lo, 1e-9)
+    inside = np.flatnonzero(((p >= lo) & (p <= hi)).all(axis=1))
+    inside = np.random.default_rng(0).permutation(inside)  # a page that cannot draw them all in time draws the first
+    p, count = p[inside], len(inside)
+    position = np.round((p - lo) / extent * 65535).astype("<u2")
+    sigma, sigma_range = _log_codes(cloud.sigma_m[inside])
+    most = max(2.0, float(np.quantile(cloud.observations, 0.98)))
+    age = np.clip((cloud.observations[inside] - 1) / (most - 1) * 255, 0, 255).astype(np.uint8)
+    packed = position.tobytes() + cloud.colour[inside].astype(np.uint8).tobytes() + sigma.tobytes() + age.tobytes()
+    meta = {
+        "count": count,
+        "lo": _rounded(lo, 6),
+        "hi": _rounded(lo + extent, 6),
+        "sigma": sigma_range,
+        "observations": [1, round(most)],
+    }
+    return meta, base64.b64encode(packed).decode("ascii")
+
+
+def _log_codes(sigma: FloatArray) -> tuple[np.ndarray, list[float]]:
+    """Sigma in 256 logarithmic steps between its 2 % and 98 % quantiles."""
+    known = sigma[np.isfinite(sigma) & (sigma > 0)]
+    if len(known) == 0:
+        return np.full(len(sigma), 255, dtype=np.uint8), [0.01, 1.0]
+    lo, hi = (float(v) for v in np.quantile(known, [0.02, 0.98]))
+    hi = max(hi, 1.05 * lo)
+    safe = np.where(np.isfinite(sigma) & (sigma > 0), sigma, hi)
+    codes = np.clip(np.log(np.maximum(safe, 1e-12) / lo) / np.log(hi / lo), 0, 1) * 255
+    return codes.astype(np.uint8), [float(f"{lo:.4g}"), float(f"{hi:.4g}")]
+
+
+def _view(points: FloatArray, positions: FloatArray) -> _View:
+    lo, hi = positions.min(axis=0), positions.max(axis=0)
+    if len(points):
+        a, b = np.quantile(points, [0.02, 0.98], axis=0)
+        lo, hi = np.minimum(lo, a), np.maximum(hi, b)
+    extent = np.maximum(hi - lo, 1e-3)
+    lo, hi = lo - 0.03 * extent, hi + 0.03 * extent
+    floor = float(np.quantile(points[:, 2], 0.005)) if len(points) else float(lo[2])
+    low, high = (float(h) for h in np.quantile(points[:, 2], [0.02, 0.98])) if len(points) else (lo[2], hi[2])
+    # The far background is in the box of the flat views; the 3-D view starts on what most points are.
+    core = np.concatenate([np.quantile(points, [0.05, 0.95], axis=0), positions]) if len(points) else positions
+    a, b = core.min(axis=0), core.max(axis=0)
+    radius = max(float(np.linalg.norm(b - a) / 2), 1e-3)
+    floor = max(floor, float(lo[2] - extent[2]))
+    return _View(lo, hi, (a + b) / 2, radius, floor, (low, max(high, low + 1e-3)))
+
+
+def _yaw(rotations: FloatArray, positions: FloatArray, view: _View) -> float:
+    """Start behind the cameras, a little to the side: the map is seen as they saw it."""
+    forward = rotations[:, 2].mean(axis=0)
+    back = -forward if np.linalg.norm(forward[:2]) > 0.2 else positions.mean(axis=0) - view.target
+    return round(float(np.arctan2(back[1], back[0])) + 0.5, 4)
+
+
+def _grid_step(radius: float) -> float:
+    return float(next((s for s in (0.05, 0.1, 0.25, 0.5, 1, 2, 5, 10, 25, 50) if s > radius / 6), 100))
+
+
+def _truth_in_run(truth: Trajectory | None, score: RunScore | None, turn: FloatArray) -> list[list[float]] | None:
+    """True positions moved into the run's world, so that the map stays as the run made it."""
+    if truth is None or score is None or score.sim3 is None:
+        return None
+    found = score.sim3
+    inside = (truth.stamps_s >= found.stamps_s[0]) & (truth.stamps_s <= found.stamps_s[-1])
+    p = truth.positions[inside]
+    p = (p - found.alignment.t) @ found.alignment.R / found.alignment.scale
+    return _rounded(p[:: max(1, -(-len(p) // _MAX_POSES))] @ turn.T, 4)
+
+
+def _error(score: RunScore | None, begin: float) -> dict[str, Any] | None:
+    if score is None or score.sim3 is None:
+        return None
+    found = score.sim3
+    # Drawn against the run's own clock; where that was in other units the matched times still span it.
+    return {
+        "t": _rounded(found.stamps_s - (begin * found.association.factor + found.association.offset_s), 4),
+        "cm": _rounded(100 * found.error_m, 3),
+        "deg": _rounded(found.error_deg, 3),
+        "note": words.error_note(score),
+    }
+
+
+def _keyframes(run: RunFolder, edges: PointCloud, stamps_s: FloatArray, begin: float) -> list[dict[str, str]]:
+    """Pictures that the run left in ``keyframes/``, else drawn from its source's images."""
+    files = sorted((run.path / "keyframes").glob("*.jpg")) if (run.path / "keyframes").is_dir() else []
+    files = files[:: max(1, -(-len(files) // _MAX_KEYFRAMES))]
+    pictures = [(words.keyframe_label(file.stem, begin), pixels_or_none(file, cv2.IMREAD_COLOR)) for file in files]
+    if not files:
+        chosen = stamps_s[:: max(1, -(-len(stamps_s) // _MAX_KEYFRAMES))]
+        drawn = keyframe_pictures(run, edges, chosen)
+        pictures = [(f"{stamp - begin:.2f} s", image) for stamp, image in drawn]
+    return [{"src": _jpeg(image), "label": label} for label, image in pictures if image is not None]
+
+
+def _jpeg(image: np.ndarray) -> str:
+    """Small picture as a data URL."""
+    if image.shape[1] > _KEYFRAME_WIDTH_PX:
+        height = round(image.shape[0] * _KEYFRAME_WIDTH_PX / image.shape[1])
+        image = cv2.resize(image, (_KEYFRAME_WIDTH_PX, height), interpolation=cv2.INTER_AREA)
+    jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 80])[1]
+    return "data:image/jpeg;base64," + base64.b64encode(jpeg.tobytes()).decode("ascii")
+
+
+def _config(run: RunFolder) -> str | None:
+    path = run.path / "config.toml"
+    return words.without_folders(path.read_text(encoding="utf-8", errors="replace")) if path.is_file() else None
+
+
+def _rounded(values: FloatArray, digits: int) -> list[Any]:
+    return list(np.round(np.asarray(values, dtype=np.float64), digits).tolist())
+
+
+def _finite(value: Any) -> Any:
+    """Nested numbers that are not finite as None: JSON has no NaN, and a score of a motionless truth is one."""
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(item) for item in value]
+    if isinstance(value, (float, np.floating)) and not np.isfinite(value):
+        return None
+    return value
+
+
+def _plain(value: object) -> object:
+    if isinstance(value, np.generic):
+        return value.item()
+    return str(value)

@@ -1,0 +1,259 @@
+"""The report's sentences and tables: what a run's numbers mean, in plain words."""
+
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+from edgeslam_torch.eval.inputs.run_folder import RunFolder, is_supported
+from edgeslam_torch.eval.metrics.run_score import RunScore
+
+_LEADING = re.compile(
+    r"(?<![\w.:/\\<])"  # where a word begins: the slashes of 6/s, rtsp://host and </tag> are none
+    r"(?:(?:\.\.[\\/])+|[A-Za-z]:[\\/]|\\\\|/)(?=[^\s/\\:;,'\"<>|])"
+    r"(?:[^/\\\n:;,'\"<>|]*[^\s/\\:;,'\"<>|][/\\])*"
+)
+"""A path from the root or from folders above, up to its last name; folders may have spaces inside their names."""
+
+
+def unit(run: RunFolder) -> str:
+    """``m``, or ``units`` while the scale is unknown."""
+    return "units" if run.units == "arbitrary" else "m"
+
+
+def title(run: RunFolder) -> str:
+    """Name of the recording, else of the folder."""
+    source = run.summary.get("source")
+    if isinstance(source, dict) and isinstance(source.get("name"), str) and source["name"]:
+        return readable(source["name"])
+    path = source.get("path") if isinstance(source, dict) else source
+    return readable(Path(path).name if isinstance(path, str) and path else run.name)
+
+
+def readable(text: str) -> str:
+    """Text that UTF-8 can write: bytes of a file name that are no UTF-8 become question marks."""
+    return text.encode("utf-8", errors="replace").decode("utf-8")
+
+
+def without_folders(text: str) -> str:
+    """Paths that leave the run's folder, by their last name: a page that is passed on tells nothing about the disk."""
+    return _LEADING.sub("", text)
+
+
+def story(run: RunFolder, score: RunScore | None) -> str:
+    """What was run and how it went."""
+    summary, sentences = run.summary, []
+    frames = _offered(run) or len(run.trajectory)
+    seconds = float(run.trajectory.stamps_s[-1] - run.trajectory.stamps_s[0])
+    tracked = run.trusted_frames
+    sentences.append(f"{frames} frames, {seconds:.1f} s of recording.")
+    for key, words in (("left_out", "left out: they could not be used"), ("dropped_frames", "dropped to keep up")):
+        if _count(summary.get(key)):
+            sentences.append(f"{_count(summary.get(key))} of them were {words}.")
+    if run.status:
+        share = 100.0 * tracked / max(1, frames)
+        whole = "Every frame was" if tracked >= frames else f"{share:.1f} % of the frames were"
+        sentences.append(f"{whole} tracked against the map" + _first(run) + ".")
+        lost = summary.get("lost_events")
+        if isinstance(lost, int) and (lost or tracked):
+            sentences.append("Tracking was never lost." if lost == 0 else f"Tracking was lost {_times(lost)}.")
+    sentences.append(_scale_sentence(summary))
+    sentences.append(_pieces_sentence(summary))
+    if score is not None:
+        sentences.append(
+            f"Against ground truth the camera is off by {_length(score.ate_sim3_m)} (RMSE after scaling; a camera that "
+            f"never moved would score {_length(score.fixed_position_m)})."
+        )
+        if score.units == "metres":
+            sentences.append(
+                f"Without scaling it is {_length(score.ate_se3_m)}; lengths are {_scale_words(score.scale_error)}."
+            )
+    if summary.get("interrupted"):
+        sentences.append("The run was interrupted; this is what was done until then.")
+    return " ".join(s for s in sentences if s).replace(" %", "\u00a0%")
+
+
+def warnings(summary: dict[str, Any]) -> list[str]:
+    """What the run warned of."""
+    said = summary.get("warnings")
+    return [without_folders(str(sentence)) for sentence in said] if isinstance(said, list) else []
+
+
+def tiles(run: RunFolder, score: RunScore | None, points: int) -> list[dict[str, str]]:
+    """Key figures at the top of the page."""
+    summary = run.summary
+    out: list[dict[str, str]] = []
+
+    def add(value: str, unit_: str, label: str) -> None:
+        out.append({"value": value, "unit": unit_, "label": label})
+
+    if score is not None:
+        add(f"{100 * score.ate_sim3_m:.2f}", "cm", "position error (ATE, Sim(3))")
+        if score.map is not None:
+            add(f"{100 * score.map.median_m:.2f}", "cm", "map error (median)")
+    frames = _offered(run)
+    if frames and run.status:
+        add(f"{100 * run.trusted_frames / frames:.1f}", "%", "frames tracked")
+    if points:
+        add(f"{points:,}".replace(",", "\u2009"), "", "map points shown")
+    scale = summary.get("scale")
+    if isinstance(scale, dict):
+        value, sigma = _float(scale.get("value")), _float(scale.get("sigma"))
+        if scale.get("units") == "arbitrary" or not math.isfinite(sigma):
+            add("unknown", "", "scale")
+        else:
+            add(f"\u00b1{100 * sigma / value:.1f}" if value else "?", "%", "scale, 1 sigma")
+    for key, name, text in (
+        ("fps", "frames a second", "{:.1f}"),
+        ("cpu_ms_per_frame", "CPU a frame", "{:.0f}"),
+        ("peak_rss_mb", "memory", "{:.0f}"),
+    ):
+        value = _float(summary.get(key))
+        if math.isfinite(value):
+            add(text.format(value), {"fps": "", "cpu_ms_per_frame": "ms", "peak_rss_mb": "MB"}[key], name)
+    return out
+
+
+def foot(run: RunFolder) -> str:
+    """How the run was made."""
+    parts = ["Made by EdgeSLAM-Torch"]
+    for key in ("version", "commit", "mode", "seed", "camera", "command", "started"):
+        value = run.summary.get(key)
+        if isinstance(value, dict):
+            value = value.get("source")
+        if value not in (None, ""):
+            parts.append(f"{key} {without_folders(str(value))}")
+    return ", ".join(parts) + "."
+
+
+def scale_note(summary: dict[str, Any]) -> str:
+    """Where the scale comes from."""
+    scale = summary.get("scale")
+    if not isinstance(scale, dict):
+        return ""
+    source = str(scale.get("source", "none"))
+    return "No source of metric scale." if source == "none" else f"Source: {source.replace('+', ' and ')}."
+
+
+def error_note(score: RunScore) -> str:
+    """What the error charts show."""
+    if score.sim3 is None:
+        return ""
+    return (
+        f"After Sim(3) alignment of {score.matched} poses with {score.dataset}: position RMSE "
+        f"{_length(score.ate_sim3_m)}, rotation RMSE {score.rotation_deg:.2f} deg, scale factor {score.sim3.scale:.4f}."
+    )
+
+
+def map_rows(score: RunScore | None) -> list[list[str]] | None:
+    """Rows of the map table."""
+    if score is None or score.map is None:
+        return None
+    found = score.map
+    rows = [
+        ["points judged", f"{found.judged_share:.1%} of {found.points}"],
+        ["median distance to the measured surface", _length(found.median_m)],
+        ["the same, one depth map at a time", _length(found.single_map_median_m)],
+        ["the same, after aligning the map itself", _length(found.own_alignment_median_m)],
+        ["90 % of the points are nearer than", _length(found.p90_m)],
+    ]
+    for threshold, share in found.accuracy.items():
+        gap = found.completeness.get(threshold)
+        edges = f", {gap:.0%} of the true edges have a point that near" if gap is not None else ""
+        rows.append([f"within {100 * threshold:.0f} cm", f"{share:.0%} of the points{edges}"])
+    return rows
+
+
+def flat_rows(summary: dict[str, Any], prefix: str = "") -> list[list[str]]:
+    """``summary.json`` as rows of name and value."""
+    rows: list[list[str]] = []
+    for key, value in summary.items():
+        name = f"{prefix}{key}".replace("_", " ")
+        if isinstance(value, dict):
+            rows += flat_rows(value, f"{prefix}{key}: ")
+        elif isinstance(value, float):
+            rows.append([name, f"{value:.6g}"])
+        else:
+            rows.append([name, without_folders(_flat(value))])
+    return rows
+
+
+def keyframe_label(stem: str, begin: float) -> str:
+    """Caption of a keyframe picture: its time into the run when its name is a stamp."""
+    value = _float(stem)
+    if math.isfinite(value) and "." in stem and value >= begin:
+        return f"{value - begin:.2f} s"
+    return stem.replace("_", " ")
+
+
+def _first(run: RunFolder) -> str:
+    for index, row in enumerate(run.status):
+        if is_supported(row):
+            return ", from the first on" if index == 0 else f", the first of them frame {index}"
+    return ""
+
+
+def _scale_sentence(summary: dict[str, Any]) -> str:
+    scale = summary.get("scale")
+    if not isinstance(scale, dict):
+        return ""
+    value, sigma, source = _float(scale.get("value")), _float(scale.get("sigma")), str(scale.get("source", "none"))
+    if scale.get("units") == "arbitrary" or not math.isfinite(sigma) or not value:
+        return "Nothing told the metric scale, so lengths are in arbitrary units."
+    known = f"{100 * sigma / value:.1f} % (1 sigma) from {source.replace('+', ' and ')}"
+    return f"Lengths are in metres, with the scale known to {known}."
+
+
+def _pieces_sentence(summary: dict[str, Any]) -> str:
+    listed = summary.get("pieces")
+    pieces = [p for p in listed if isinstance(p, dict) and p.get("supported")] if isinstance(listed, list) else []
+    if len(pieces) < 2:
+        return ""
+    spans = ", ".join(
+        f"piece {p.get('number')} from {_float(p.get('first_s')):.1f} to {_float(p.get('last_s')):.1f} s"
+        for p in pieces
+    )
+    return f"The map is in {len(pieces)} pieces whose relation is not known: {spans}. Errors across them mean nothing."
+
+
+def _times(count: int) -> str:
+    return {1: "once", 2: "twice"}.get(count, f"{count} times")
+
+
+def _length(metres: float) -> str:
+    if not math.isfinite(metres):
+        return "unknown"
+    return f"{100 * metres:.1f}\u00a0cm" if metres < 1.0 else f"{metres:.2f}\u00a0m"
+
+
+def _scale_words(scale_error: float) -> str:
+    """The estimate must be multiplied by ``1 + scale_error``: a positive one means that it is too small."""
+    off = abs(1.0 / (1.0 + scale_error) - 1.0)
+    return f"{100 * off:.1f} % too {'small' if scale_error > 0 else 'large'}"
+
+
+def _float(value: object) -> float:
+    try:
+        return float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError, OverflowError):
+        return float("nan")
+
+
+def _flat(value: object) -> str:
+    """A list, or a list of records, without brackets and quotes."""
+    if isinstance(value, list):
+        return "; ".join(_flat(item) for item in value) or "none"
+    if isinstance(value, dict):
+        return ", ".join(f"{key} {item}" for key, item in value.items())
+    return str(value)
+
+
+def _offered(run: RunFolder) -> int:
+    """Frames that the source had: run through, left out and dropped; as the terminal counts them."""
+    return _count(run.summary.get("offered")) or _count(run.summary.get("frames")) or len(run.status)
+
+
+def _count(value: object) -> int:
+    """A whole number; 0 for what is none."""
+    number = _float(value)
+    return int(number) if math.isfinite(number) else 0

@@ -1,0 +1,1 @@
+"""FastDepth as ONNX: exported, folded, quantised, and read back with checks."""

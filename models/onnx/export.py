@@ -1,0 +1,110 @@
+"""FastDepth to ONNX: one graph, checked before it is called done."""
+
+import json
+import logging
+import warnings
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import onnx
+import torch
+
+from edgeslam_torch.errors import OutputError
+from edgeslam_torch.files.atomic import write_atomically
+from edgeslam_torch.models.fastdepth import FastDepth
+from edgeslam_torch.models.onnx.file import INPUT, LOG_DEPTH, SIGMA
+from edgeslam_torch.models.onnx.fold import deployed
+from edgeslam_torch.models.record import HEADER_KEY, Metadata
+
+OLDEST_OPSET = 14
+"""ONNX's converter brings our network no further down."""
+OLD_RUNTIME_IR, OLD_RUNTIME_OPSET = 9, 17
+"""onnxruntime <= 1.16 (older boards) reads IR <= 9; opset 17 is safely inside what it knows."""
+
+
+@dataclass(frozen=True, slots=True)
+class ExportOptions:
+    """How to export."""
+
+    height: int = 192
+    width: int = 256
+    opset: int = 18
+    dynamic: bool = False
+    """Leave height and width open (multiples of 32); a fixed size lets runtimes plan better."""
+
+
+def export_onnx(network: FastDepth, metadata: Metadata, path: Path, options: ExportOptions) -> None:
+    """Write ``path`` (inputs ``image`` ``(1, 3, H, W)``; outputs ``log_depth`` and ``sigma_log`` ``(1, 1,
+    H/2, W/2)``).
+
+    Depth in metres is ``exp(log_depth) * focal / focal_px``, focal being the camera's in pixels of the
+    network's input.
+
+    Raises:
+        OutputError: If the file written is not what was asked for (opset, checker).
+    """
+    module = deployed(network, metadata)
+    example = torch.zeros(1, 3, options.height, options.width)
+    shapes = None
+    if options.dynamic:
+        h, w = torch.export.Dim("h32", min=1, max=64), torch.export.Dim("w32", min=1, max=64)
+        shapes = ({2: 32 * h, 3: 32 * w},)
+    # They warn about operators of torchvision, which we do not use, and about whose version converter is used.
+    for name in ("torch.onnx", "onnxscript"):
+        logging.getLogger(name).setLevel(logging.ERROR)
+    with warnings.catch_warnings(), torch.no_grad():
+        warnings.simplefilter("ignore")
+        program = torch.onnx.export(
+            module,
+            (example,),
+            dynamo=True,
+            opset_version=max(options.opset, 18),
+            input_names=[INPUT],
+            output_names=[LOG_DEPTH, SIGMA],
+            dynamic_shapes=shapes,
+            optimize=True,
+            verbose=False,
+        )
+    if program is None:
+        raise OutputError(f"{path}: the exporter returned nothing")
+    model = set_opset(program.model_proto, options.opset)
+    write_metadata(model, metadata, options)
+    check_model(model, options.opset)
+    write_atomically(path, lambda file: file.write(model.SerializeToString()))
+
+
+def set_opset(model: onnx.ModelProto, opset: int) -> onnx.ModelProto:
+    """The exporter writes opset 18 or later; older ones come from ONNX's own version converter.
+
+    Raises:
+        OutputError: If that cannot.
+    """
+    if opset != model.opset_import[0].version:
+        try:
+            model = onnx.version_converter.convert_version(model, opset)
+        except RuntimeError as error:
+            raise OutputError(f"onnx cannot convert to opset {opset} ({' '.join(str(error).split())[-120:]})") from None
+    if opset <= OLD_RUNTIME_OPSET:
+        model.ir_version = OLD_RUNTIME_IR
+    return model
+
+
+def write_metadata(model: onnx.ModelProto, metadata: Metadata, options: ExportOptions) -> None:
+    """Put the checkpoint's record, with this file's input size, into the model's properties."""
+    record = asdict(metadata) | {"export_height": options.height, "export_width": options.width}
+    onnx.helper.set_model_props(model, {HEADER_KEY: json.dumps(record)})
+
+
+def check_model(model: onnx.ModelProto, opset: int) -> None:
+    """ONNX's checker, and the opset that was asked for.
+
+    Raises:
+        OutputError: If either fails.
+    """
+    written = {o.domain: o.version for o in model.opset_import}.get("", 0)
+    if written != opset:
+        raise OutputError(f"asked for opset {opset}, the exporter wrote {written}")
+    try:
+        onnx.checker.check_model(model, full_check=True)
+    except (onnx.checker.ValidationError, onnx.shape_inference.InferenceError) as error:
+        raise OutputError(f"exported model fails ONNX's checker: {' '.join(str(error).split())[:200]}") from error

@@ -1,0 +1,49 @@
+import time
+
+import numpy as np
+import pytest
+
+from edgeslam_torch.drone.emulator.room import furnished_drone
+from edgeslam_torch.drone.emulator.stopwatch import PERIOD_S, age_s, draw_time, read_time
+
+
+@pytest.mark.parametrize("time_s", [0.0, 0.001, 12.345, 65.535])
+def test_a_time_is_read_back_from_a_noisy_picture(rng, time_s):
+    image = rng.integers(0, 256, (240, 320, 3), dtype=np.uint8)
+    draw_time(image, time_s)
+    noisy = np.clip(image + rng.normal(0, 25, image.shape), 0, 255).astype(np.uint8)
+    assert read_time(noisy) == pytest.approx(time_s)
+
+
+def test_a_picture_without_a_stopwatch_shows_no_time(rng):
+    assert read_time(rng.integers(0, 256, (720, 960, 3), dtype=np.uint8)) is None
+    assert read_time(np.full((720, 960, 3), 90, np.uint8)) is None
+
+
+def test_ages_pass_over_the_end_of_the_period():
+    shown = 7 * PERIOD_S - 0.010
+    assert age_s(shown % PERIOD_S, shown + 0.35) == pytest.approx(0.35)
+
+
+def test_the_room_is_painted_where_the_drone_is():
+    drone, paint, camera = furnished_drone(0, 0.2, (160, 120))
+    first = paint(drone.T_w_b())
+    assert first.shape == (120, 160, 3)
+    assert camera.width == 160
+    drone.p_w = drone.p_w + [0.3, 0.0, 0.8]
+    assert np.abs(paint(drone.T_w_b()).astype(float) - first).mean() > 3.0
+    assert drone.clearance(drone.p_w) > 0.0
+
+
+@pytest.mark.slow
+def test_our_client_measures_the_delay_of_the_emulated_video():
+    pytest.importorskip("av", reason="PyAV is not installed: the [drone] extra")
+    from edgeslam_torch.drone.emulator.measure import measure
+
+    begin = time.monotonic()
+    found = measure(2.0, ["--video-latency=200", "--render-width=160"])
+    took = time.monotonic() - begin
+    assert 0 < found.fresh <= found.pictures
+    assert found.states > 0
+    assert 0.2 <= np.median(found.delay_s) < took
+    assert "pictures/s" in found.lines(200.0)[0]

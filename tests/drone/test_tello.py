@@ -1,0 +1,644 @@
+"""Our client against the emulator, on loopback and in real time; waiting is for conditions, not for times."""
+
+import _thread
+import importlib
+import os
+import socket
+import threading
+import time
+from contextlib import closing
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from emulated import PATIENCE_S, SwiftDrone, listen_in, until
+from free_ports import free_ports
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import edgeslam_torch.drone.tello as tello_module
+from edgeslam_torch.drone.answers import belongs_to
+from edgeslam_torch.drone.emulator.commands import Answer, Reply
+from edgeslam_torch.drone.emulator.drone import Mode
+from edgeslam_torch.drone.emulator.encoder import Encoder
+from edgeslam_torch.drone.emulator.link import LinkFaults
+from edgeslam_torch.drone.emulator.server import EmulatorConfig, TelloEmulator
+from edgeslam_torch.drone.tello import Tello, TelloAddress, TelloError, TelloLimits
+from edgeslam_torch.errors import SourceError
+
+av = pytest.importorskip("av", reason="PyAV is not installed: the [drone] extra")
+
+
+@pytest.fixture
+def emulate():
+    """Function that starts an emulator and gives it with its address; stopped after the test."""
+    running = []
+
+    def start(link=None, drone=None, **options):
+        state, video = free_ports(2)
+        config = EmulatorConfig(
+            command_port=0, state_port=state, video_port=video, width=320, height=240,
+            link=link or LinkFaults(video_latency_s=0.05), **options,
+        )  # fmt: skip
+        emulator = TelloEmulator(config, drone=drone or SwiftDrone()).start()
+        emulator.heard = []
+        listen_in(emulator, lambda text: None)
+        running.append(emulator)
+        return emulator, TelloAddress("127.0.0.1", emulator.command_port, state, video)
+
+    yield start
+    for emulator in running:
+        emulator.stop()
+
+
+QUICK = TelloLimits(timeout_s=1.0, retries=3, keep_alive_s=0.5, state_loss_s=PATIENCE_S, video_loss_s=3.0)
+
+
+def test_connects_flies_streams_and_lands(emulate):
+    emulator, address = emulate()
+    with Tello(address, allow_motion=True) as tello:
+        tello.connect(PATIENCE_S)
+        video = tello.start_video()
+        first = video.wait(0, PATIENCE_S)
+        assert first.image.shape == (240, 320, 3)
+        tello.take_off()
+        assert emulator.drone.mode is Mode.FLYING
+        tello.move(0.4, 0.0, 0.2)
+        np.testing.assert_allclose(emulator.drone.p_w, [0.4, 0.0, 1.1], atol=0.12)
+        assert tello.query("battery?") == pytest.approx(100.0, abs=1.0)
+        until(lambda: video.newest.count > first.count + 20)
+        until(lambda: tello.latest.sample().tof_m > 0.8)
+    assert emulator.drone.mode is Mode.GROUND
+
+
+def test_nothing_moves_unless_it_was_allowed(emulate):
+    emulator, address = emulate()
+    with Tello(address) as tello:
+        tello.connect(PATIENCE_S)
+        for move in (tello.take_off, lambda: tello.rc(0, 1, 0, 0), lambda: tello.send("motoron")):
+            with pytest.raises(TelloError, match="--fly"):
+                move()
+    assert not emulator.drone.flying
+    assert emulator.drone.motor_s == 0.0
+
+
+@pytest.mark.parametrize("failure", [KeyboardInterrupt, RuntimeError])
+def test_lands_whatever_ends_the_flight(emulate, failure):
+    emulator, address = emulate()
+    with pytest.raises(failure), Tello(address, allow_motion=True) as tello:
+        tello.connect(PATIENCE_S)
+        tello.take_off()
+        raise failure
+    assert emulator.drone.mode is Mode.GROUND
+
+
+def test_lands_when_the_video_goes_away(emulate):
+    emulator, address = emulate()
+    with Tello(address, allow_motion=True, limits=QUICK) as tello:
+        tello.connect(PATIENCE_S)
+        tello.start_video().wait(0, PATIENCE_S)
+        tello.take_off()
+        emulator.interpreter.stream = False
+        until(lambda: emulator.drone.mode is Mode.GROUND)
+        assert "no video" in tello.stop_reason
+        with pytest.raises(TelloError, match="flight has ended"):
+            tello.take_off()
+
+
+def test_lands_when_the_battery_runs_low(emulate):
+    emulator, address = emulate(drone=SwiftDrone(battery=0.5))
+    with Tello(address, allow_motion=True, limits=QUICK) as tello:
+        tello.connect(PATIENCE_S)
+        tello.take_off()
+        emulator.drone.battery = 0.08
+        until(lambda: emulator.drone.mode is Mode.GROUND)
+        assert "battery" in tello.stop_reason
+
+
+def test_does_not_take_off_with_an_empty_battery(emulate):
+    _, address = emulate(drone=SwiftDrone(battery=0.065))
+    with Tello(address, allow_motion=True) as tello:
+        tello.connect(PATIENCE_S)
+        with pytest.raises(TelloError, match="battery at 7 %"):
+            tello.take_off()
+
+
+def test_a_drone_that_stops_answering_lands_itself_and_says_why(emulate):
+    emulator, address = emulate()
+    limits = TelloLimits(timeout_s=0.3, retries=1, keep_alive_s=0.5, state_loss_s=3.0)
+    with Tello(address, allow_motion=True, limits=limits) as tello:
+        tello.connect(PATIENCE_S)
+        tello.take_off()
+        emulator.link.cut = True
+        until(lambda: "no state" in tello.stop_reason)
+        emulator.link.cut = False  # it hears again: our landing is still being asked for
+        until(lambda: emulator.drone.mode is Mode.GROUND)
+
+
+@pytest.mark.parametrize("seed", [3, 4, 5])
+def test_bad_air_is_flown_through(emulate, seed):
+    """5 % loss, garbage on every port: what matters is said until it is heard."""
+    emulator, address = emulate(link=LinkFaults(loss=0.05, garbage=0.2, video_latency_s=0.02), seed=seed)
+    limits = TelloLimits(timeout_s=0.5, retries=20, state_loss_s=PATIENCE_S, video_loss_s=PATIENCE_S)
+    with Tello(address, allow_motion=True, limits=limits) as tello:
+        tello.connect(PATIENCE_S)
+        video = tello.start_video()
+        assert video.wait(0, PATIENCE_S) is not None
+        tello.take_off()
+        until(lambda: emulator.drone.mode is Mode.FLYING)
+        count = video.newest.count
+        until(lambda: video.newest.count > count + 10)
+    assert tello.stop_reason == ""
+    assert emulator.drone.mode is Mode.GROUND
+
+
+def test_take_off_is_repeated_until_it_is_heard_and_needs_no_answer(emulate, monkeypatch):
+    """The first command is lost on the way there, every answer on the way back: the climb is seen in the state."""
+    emulator, address = emulate()
+    heard, run = [], emulator.interpreter.run
+
+    def hard_of_hearing(text):
+        heard.append(text)
+        return Reply("", Answer.NEVER) if text == "takeoff" and heard.count("takeoff") == 1 else run(text)
+
+    limits = TelloLimits(timeout_s=1.0, retries=3, state_loss_s=PATIENCE_S)
+    with Tello(address, allow_motion=True, limits=limits) as tello:
+        tello.connect(PATIENCE_S)
+        monkeypatch.setattr(emulator.interpreter, "run", hard_of_hearing)
+        monkeypatch.setattr(emulator, "_answer", lambda to, text: None)
+        tello.take_off()
+        assert heard.count("takeoff") >= 2
+        assert emulator.drone.mode is Mode.FLYING
+        tello.land()  # seen in the state, too
+        assert emulator.drone.mode is Mode.GROUND
+        assert not tello.airborne
+
+
+def test_a_landing_ends_what_another_thread_waits_for(emulate):
+    emulator, address = emulate()
+    failures = []
+
+    def fly_far():
+        try:
+            tello.move(5.0, 0.0, 0.0, 0.1)
+        except TelloError as error:
+            failures.append(str(error))
+
+    with Tello(address, allow_motion=True) as tello:
+        tello.connect(PATIENCE_S)
+        tello.take_off()
+        pilot = threading.Thread(target=fly_far)
+        pilot.start()
+        until(lambda: emulator.drone.busy)
+    pilot.join()
+    assert len(failures) == 1
+    assert emulator.drone.mode is Mode.GROUND
+    with pytest.raises(TelloError, match="landing"):
+        tello.take_off()
+
+
+LOST = Reply("", Answer.NEVER)
+
+
+def lose(emulator, command, count):
+    """Let the next ``count`` packets with this command be lost; returns the list of those that were."""
+    lost = []
+
+    def hear(text):
+        if text == command and len(lost) < count:
+            lost.append(text)
+            return LOST
+        return None
+
+    listen_in(emulator, hear)
+    return lost
+
+
+def test_a_landing_that_is_not_heard_is_asked_for_again(emulate, monkeypatch):
+    monkeypatch.setattr(tello_module, "_LAND_AGAIN_S", 0.5)
+    emulator, address = emulate()
+    with Tello(address, allow_motion=True) as tello:
+        tello.connect(PATIENCE_S)
+        tello.take_off()
+        lost = lose(emulator, "land", 3)
+        tello.land()
+        assert emulator.drone.mode is Mode.GROUND
+    assert len(lost) == 3
+
+
+def test_a_landing_that_fails_is_tried_again_as_long_as_the_drone_flies(emulate, monkeypatch):
+    """What a guard once began it does not give up: no keep-alive, that would hold the drone in the air."""
+    monkeypatch.setattr(tello_module, "_LAND_TRIES", 1)
+    monkeypatch.setattr(tello_module, "_LAND_AGAIN_S", 0.1)
+    emulator, address = emulate()
+    with Tello(address, allow_motion=True, limits=QUICK) as tello:
+        tello.connect(PATIENCE_S)
+        tello.take_off()
+        lost = lose(emulator, "land", 12)
+        emulator.heard.clear()
+        emulator.drone.battery = 0.08
+        until(lambda: emulator.drone.mode is Mode.GROUND)
+    assert len(lost) == 12
+    assert set(emulator.heard) <= {"land", "battery?", "streamoff"}
+
+
+def test_ctrl_c_in_the_landing_is_raised_when_the_drone_is_down(emulate):
+    emulator, address = emulate()
+
+    def impatient(text):
+        if text == "land":
+            _thread.interrupt_main()
+        return
+
+    with pytest.raises(KeyboardInterrupt), Tello(address, allow_motion=True) as tello:
+        tello.connect(PATIENCE_S)
+        tello.take_off()
+        listen_in(emulator, impatient)
+    assert emulator.drone.mode is Mode.GROUND
+
+
+def test_a_drone_that_comes_down_by_itself_ends_the_flight(emulate):
+    emulator, address = emulate()
+    with Tello(address, allow_motion=True, limits=QUICK) as tello:
+        tello.connect(PATIENCE_S)
+        tello.take_off()
+        until(lambda: tello.latest.fields["h"] > 50)
+        emulator.drone.land()  # as by the phone of somebody else
+        until(lambda: not tello.airborne)
+        assert tello.stop_reason == "the drone came down by itself"
+
+
+def pushed_and_centred(emulator):
+    return [text for text in emulator.heard if text.startswith("rc ")]
+
+
+def test_sticks_that_nobody_holds_any_more_are_centred(emulate):
+    """The controller is dead: one push, then nothing. The drone stands still, whatever keeps it listening."""
+    emulator, address = emulate()
+    with Tello(address, allow_motion=True, limits=QUICK) as tello:
+        tello.connect(PATIENCE_S)
+        tello.take_off()
+        begin = time.monotonic()
+        tello.rc(0.0, 0.5, 0.0, 0.0)
+        until(lambda: "rc 0 0 0 0" in emulator.heard)
+        assert time.monotonic() - begin > 0.3
+        until(lambda: tello.query("battery?") and np.linalg.norm(emulator.drone.velocity) < 0.01)
+        assert emulator.drone.rc == (0.0, 0.0, 0.0, 0.0)
+        assert pushed_and_centred(emulator)[0] == "rc 0 50 0 0"
+        assert set(pushed_and_centred(emulator)[1:]) == {"rc 0 0 0 0"}
+
+
+def test_sticks_are_centred_while_the_controller_waits_for_an_answer(emulate):
+    """Whatever the program does: here it pushes the sticks and then hangs on a question that nobody answers."""
+    emulator, address = emulate()
+    limits = TelloLimits(timeout_s=PATIENCE_S, retries=0, keep_alive_s=PATIENCE_S)
+    with Tello(address, allow_motion=True, limits=limits) as tello:
+        tello.connect(PATIENCE_S)
+        tello.take_off()
+        lose(emulator, "sn?", 1)
+
+        def control():
+            tello.rc(0.0, 0.0, 0.0, 1.0)
+            with pytest.raises(TelloError):
+                tello.send("sn?")
+
+        controller = threading.Thread(target=control)
+        controller.start()
+        until(lambda: "rc 0 0 0 0" in emulator.heard)
+        assert controller.is_alive()
+    controller.join()
+
+
+def test_centred_sticks_that_are_lost_are_said_again(emulate):
+    emulator, address = emulate()
+    with Tello(address, allow_motion=True) as tello:
+        tello.connect(PATIENCE_S)
+        tello.take_off()
+        lost = lose(emulator, "rc 0 0 0 0", 5)
+        tello.rc(0.0, 0.5, 0.0, 0.0)
+        until(lambda: "rc 0 0 0 0" in emulator.heard)
+    assert len(lost) == 5
+
+
+def test_a_controller_that_goes_on_is_not_disturbed(emulate):
+    emulator, address = emulate()
+    with Tello(address, allow_motion=True) as tello:
+        tello.connect(PATIENCE_S)
+        tello.take_off()
+        stop = time.monotonic() + 1.0
+        while time.monotonic() < stop:
+            tello.rc(0.0, 0.0, 0.0, 0.2)
+            threading.Event().wait(0.02)
+        assert set(pushed_and_centred(emulator)) == {"rc 0 0 0 20"}
+
+
+def test_a_movement_takes_the_sticks_out_of_the_hand(emulate):
+    """One ``rc`` that centres them, then the movement, and no more ``rc`` into it."""
+    emulator, address = emulate()
+    with Tello(address, allow_motion=True) as tello:
+        tello.connect(PATIENCE_S)
+        tello.take_off()
+        tello.rc(0.0, 0.0, 0.0, 0.3)
+        tello.move(2.0, 0.0, 0.0)
+        begin = emulator.heard.index("rc 0 0 0 30")
+        assert emulator.heard[begin : begin + 3] == ["rc 0 0 0 30", "rc 0 0 0 0", "go 200 0 0 40"]
+        assert not pushed_and_centred(emulator)[2:]
+
+
+def test_sticks_cannot_be_pushed_once_a_landing_is_wanted(emulate):
+    emulator, address = emulate()
+    refused = []
+
+    def push():
+        while not refused:
+            try:
+                tello.rc(0.0, 0.0, 0.0, 0.3)
+            except TelloError as error:
+                refused.append(str(error))
+
+    with Tello(address, allow_motion=True) as tello:
+        tello.connect(PATIENCE_S)
+        tello.take_off()
+        controller = threading.Thread(target=push)
+        controller.start()
+        until(lambda: "rc 0 0 0 30" in emulator.heard)
+    controller.join()
+    assert "landing" in refused[0]
+    assert "rc 0 0 0 30" not in emulator.heard[emulator.heard.index("land") :]
+
+
+@pytest.fixture
+def stranger():
+    """A socket on another address than the drone's."""
+    with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as other:
+        try:
+            other.bind(("127.0.0.2", 0))
+        except OSError:
+            pytest.skip("this system has one loopback address")
+        yield other
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "localhost", "127.1"])
+def test_pictures_of_strangers_are_refused(emulate, stranger, caplog, host):
+    """A stranger's whole film, keyframe first, shows nowhere; that it came is counted and said once."""
+    _, address = emulate()
+    film = [packet for k in range(5) for packet in Encoder(64, 48, 30).encode(np.full((48, 64, 3), 40 * k, np.uint8))]
+    sizes = set()
+    with Tello(replace(address, host=host), on_picture=lambda p: sizes.add(p.image.shape)) as tello:
+        tello.connect(PATIENCE_S)
+        video = tello.start_video()
+        for packet in film:
+            stranger.sendto(packet, ("127.0.0.1", address.video_port))
+        until(lambda: video.refused == len(film))
+        assert video.wait(10, PATIENCE_S) is not None
+    assert sizes == {(240, 320, 3)}
+    assert tello.refused == {"video": len(film), "state": 0, "answers": 0}
+    said = [record.message for record in caplog.records if "refused" in record.message]
+    assert said == ["video port: packets from 127.0.0.2 are refused; only 127.0.0.1 is listened to"]
+
+
+def test_state_of_strangers_is_refused(emulate, stranger):
+    """Nobody else lands our drone by telling of an empty battery."""
+    _, address = emulate()
+    with Tello(address, allow_motion=True) as tello:
+        tello.connect(PATIENCE_S)
+        tello.take_off()
+        for _ in range(3):
+            stranger.sendto(b"pitch:0;bat:1;h:0;tof:10;vgz:0;", ("127.0.0.1", address.state_port))
+        until(lambda: tello.refused["state"] == 3)
+        seen = tello.latest.stamp_s
+        until(lambda: tello.latest.stamp_s > seen)
+        assert tello.airborne
+        assert tello.stop_reason == ""
+        assert tello.latest.fields["bat"] > 90
+
+
+def test_answers_of_strangers_are_refused(emulate, stranger):
+    emulator, address = emulate()
+    limits = TelloLimits(timeout_s=PATIENCE_S, retries=0)
+    with Tello(address, limits=limits) as tello:
+        tello.connect(PATIENCE_S)
+        listen_in(emulator, answer_late := Late(lambda: tello.refused["answers"] == 1))
+        port = tello._commands.port
+        asked = threading.Thread(target=lambda: until(lambda: answer_late.asked.is_set()))
+        asked.start()
+        answers = []
+        question = threading.Thread(target=lambda: answers.append(tello.query("battery?")))
+        question.start()
+        asked.join()
+        stranger.sendto(b"7", ("127.0.0.1", port))
+        question.join()
+    assert answers == [100.0]
+
+
+class Late:
+    """Answers the battery's charge once a condition holds."""
+
+    def __init__(self, condition):
+        self.condition, self.asked = condition, threading.Event()
+
+    def __call__(self, text):
+        if text == "battery?":
+            self.asked.set()
+            until(self.condition)
+
+
+def test_listeners_that_fail_do_not_end_state_or_video(emulate, caplog):
+    _, address = emulate()
+
+    def fail(what):
+        raise RuntimeError("disk on fire")
+
+    with Tello(address, on_state=fail, on_picture=fail) as tello:
+        tello.connect(PATIENCE_S)
+        video = tello.start_video()
+        assert video.wait(5, PATIENCE_S) is not None
+        seen = tello.latest.stamp_s
+        until(lambda: tello.latest.stamp_s > seen)
+    assert sum("is not called again" in record.message for record in caplog.records) == 2
+
+
+def test_late_answers_and_noise_are_not_taken_for_an_answer():
+    assert belongs_to("battery?", "87")
+    assert belongs_to("sn?", "0TQDF123")
+    assert belongs_to("go 20 0 0 30", "error Not joystick")
+    for command, text in [("battery?", "ok"), ("land", "87"), ("takeoff", "x"), ("sn?", "ok"), ("land", "ok\x00")]:
+        assert not belongs_to(command, text)
+
+
+def test_an_outage_of_three_seconds_in_flight_is_survived(emulate):
+    emulator, address = emulate()
+    limits = TelloLimits(state_loss_s=PATIENCE_S, video_loss_s=PATIENCE_S)
+    with Tello(address, allow_motion=True, limits=limits) as tello:
+        tello.connect(PATIENCE_S)
+        video = tello.start_video()
+        video.wait(0, PATIENCE_S)
+        tello.take_off()
+        emulator.link.cut = True
+        begin = tello.clock.now()
+        until(lambda: tello.clock.now() - max(begin, tello.latest.stamp_s, video.newest.stamp_s) > 3.0)
+        gone, before = video.newest.count, tello.latest.stamp_s
+        emulator.link.cut = False
+        assert video.wait(gone + 3, PATIENCE_S) is not None
+        until(lambda: tello.latest.stamp_s > before)
+        assert emulator.drone.mode is Mode.FLYING
+        assert tello.stop_reason == ""
+        tello.move(0.3, 0.0, 0.0)
+        np.testing.assert_allclose(emulator.drone.p_w[:2], [0.3, 0.0], atol=0.12)
+    assert emulator.drone.mode is Mode.GROUND
+
+
+def test_nobody_there_is_an_error_with_a_remedy():
+    command, state, video = free_ports(3)
+    limits = TelloLimits(timeout_s=0.1, retries=1)
+    address = TelloAddress("127.0.0.1", command, state, video)
+    with Tello(address, limits=limits) as tello, pytest.raises(TelloError, match="is the drone on"):
+        tello.connect()
+
+
+def test_a_busy_port_is_an_error_that_names_it(emulate):
+    _, address = emulate()
+    with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as other:
+        other.bind(("127.0.0.1", address.state_port))
+        with pytest.raises(SourceError, match=str(address.state_port)):
+            Tello(address)
+
+
+def test_refusals_of_the_drone_are_reported(emulate):
+    _, address = emulate()
+    with Tello(address) as tello:
+        tello.connect(PATIENCE_S)
+        with pytest.raises(TelloError, match="unknown command"):
+            tello.send("dance")
+        with pytest.raises(TelloError, match="not an SDK command"):
+            tello.send("battery?\nland")
+
+
+def test_sockets_stay_on_loopback(emulate):
+    _, address = emulate()
+    with Tello(address) as tello:
+        assert tello._states.socket.getsockname()[0] == "127.0.0.1"
+        assert tello._commands.socket.getsockname()[0] == "127.0.0.1"
+
+
+def test_stamps_follow_the_delay_of_the_video(emulate):
+    """Pictures and state share one clock: what the picture shows happened earlier, by the delay."""
+    emulator, address = emulate(link=LinkFaults(video_latency_s=0.4))
+    with Tello(address, allow_motion=True) as tello:
+        tello.connect(PATIENCE_S)
+        begin = tello.clock.now()
+        picture = tello.start_video().wait(0, PATIENCE_S)
+        assert picture.stamp_s - begin > 0.4
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("tello://127.0.0.1", ("127.0.0.1", 8889, 8890, 11111)),
+        ("tello://127.0.0.1:1:2:3", ("127.0.0.1", 1, 2, 3)),
+        ("tello://", ("192.168.10.1", 8889, 8890, 11111)),
+        ("tello://drone.local:9000/", ("drone.local", 9000, 8890, 11111)),
+    ],
+)
+def test_addresses(text, expected):
+    a = TelloAddress.parse(text)
+    assert (a.host, a.command_port, a.state_port, a.video_port) == expected
+
+
+@pytest.mark.parametrize("text", ["tello://a:b", "tello://a:0", "tello://a:1:2:3:4", "tello://a b", "tello://a:70000"])
+def test_wrong_addresses_are_refused(text):
+    with pytest.raises(SourceError):
+        TelloAddress.parse(text)
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.text(max_size=40))
+def test_any_address_is_read_or_refused(text):
+    try:
+        TelloAddress.parse("tello://" + text)
+    except SourceError as error:
+        assert len(str(error).splitlines()) <= 1 or not text.isprintable()
+
+
+def test_video_survives_a_start_in_mid_stream_lost_packets_and_garbage(rng):
+    from edgeslam_torch.drone.video import PictureAssembler
+
+    encoder, assembler = Encoder(320, 240, 30), PictureAssembler()
+    picture = rng.integers(0, 255, (240, 320, 3), dtype=np.uint8)
+    shown = []
+    for k in range(95):
+        for packet in encoder.encode(np.roll(picture, 3 * k, axis=1)):
+            if k < 10 or rng.random() < 0.02:
+                continue
+            shown += assembler.feed(packet, 0.1 * k)
+            if rng.random() < 0.02:
+                shown += assembler.feed(rng.bytes(300), 0.1 * k)
+    assert len(shown) > 20
+    assert all(p.image.shape == (240, 320, 3) for p in shown)
+    assert [p.count for p in shown] == sorted({p.count for p in shown})
+
+
+def test_without_pyav_the_message_says_what_to_install(monkeypatch):
+    from edgeslam_torch.drone import video as tello_video
+
+    def missing(name):
+        raise ImportError(name)
+
+    monkeypatch.setattr(tello_video.importlib, "import_module", missing)
+    with pytest.raises(SourceError, match=r"pip install 'av"):
+        tello_video.import_av()
+
+
+def test_djitellopy_flies_the_emulator(emulate, monkeypatch):
+    """A client that no one here wrote, its code unchanged; only the ports it uses and its patience are set."""
+    if importlib.util.find_spec("djitellopy") is None:
+        pytest.skip("djitellopy is not installed: pip install --no-deps djitellopy")
+    import djitellopy
+
+    emulator, address = emulate()
+    control = free_ports(1)[0]
+    monkeypatch.setattr(djitellopy.Tello, "CONTROL_UDP_PORT", control)
+    for patience in ("RESPONSE_TIMEOUT", "TAKEOFF_TIMEOUT", "FRAME_GRAB_TIMEOUT"):
+        monkeypatch.setattr(djitellopy.Tello, patience, int(PATIENCE_S))
+    monkeypatch.setattr(djitellopy.Tello, "STATE_UDP_PORT", address.state_port)
+    monkeypatch.setattr(djitellopy.Tello, "VS_UDP_IP", "127.0.0.1")
+    drone = djitellopy.Tello(host="127.0.0.1", vs_udp=address.video_port)
+    drone.address = ("127.0.0.1", address.command_port)
+    drone.connect()
+    assert 90 < drone.get_battery() <= 100
+    drone.streamon()
+    reader = drone.get_frame_read()
+    until(lambda: reader.frame.shape == (240, 320, 3))
+    drone.takeoff()
+    assert emulator.drone.mode is Mode.FLYING
+    drone.move_forward(40)
+    drone.rotate_counter_clockwise(90)
+    assert emulator.drone.p_w[0] == pytest.approx(0.4, abs=0.1)
+    until(lambda: abs(drone.get_yaw() + 90) <= 5)
+    drone.send_rc_control(0, 30, 0, 0)
+    until(lambda: emulator.drone.p_w[1] > 0.1)
+    drone.land()
+    assert emulator.drone.mode is Mode.GROUND
+    assert drone.query_battery() > 90
+    drone.end()
+
+
+@pytest.mark.skipif(os.environ.get("CI_NO_SOCKETS") == "1", reason="no sockets here")
+def test_recording_of_a_live_drone_is_a_flight_that_opens(emulate, tmp_path, capsys):
+    from edgeslam_torch.cli import main
+    from edgeslam_torch.readers.source import open_source
+
+    emulator, a = emulate()
+    url = f"tello://127.0.0.1:{a.command_port}:{a.state_port}:{a.video_port}"
+    folder = tmp_path / "flight"
+    assert main(["record", url, "--out", str(folder), "--max-frames", "40", "--fly"]) == 0
+    assert emulator.drone.mode is Mode.GROUND
+    source = open_source(folder)
+    frames = list(source.frames())
+    assert len(frames) == 40
+    assert source.kind == "flight"
+    assert len(source.telemetry) > 5
+    assert source.telemetry[0].stamp_s < frames[-1].stamp_s
+    assert (folder / "state.txt").read_text().count("bat:") == len(source.telemetry)
+    assert main(["record", url, "--out", str(folder), "--max-frames", "5"]) == 1
+    assert "already" in capsys.readouterr().err

@@ -1,0 +1,109 @@
+"""Trajectory files are read back as written, and refused with the likely mistake when they are none."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from edgeslam_torch.eval.errors import EvaluationError
+from edgeslam_torch.eval.inputs.trajectory_files import WRITERS, Trajectory, read_trajectory
+
+
+@pytest.mark.parametrize("name", sorted(WRITERS))
+def test_every_format_round_trips(name: str, loop: Trajectory, tmp_path: Path) -> None:
+    start = Trajectory(np.arange(len(loop)) / 30.0, loop.T_w_c, "loop")
+    path = tmp_path / {"euroc": "data.csv", "7scenes": "seq"}.get(name, "poses.txt")
+    WRITERS[name](start, path)
+    back = read_trajectory(path)
+    np.testing.assert_allclose(back.stamps_s, start.stamps_s, atol=1e-6)
+    np.testing.assert_allclose(back.T_w_c, start.T_w_c, atol=1e-8)
+
+
+@pytest.mark.parametrize("name", ["kitti", "7scenes"])
+def test_formats_without_stamps_keep_those_of_another_clock_beside_them(
+    name: str, loop: Trajectory, tmp_path: Path
+) -> None:
+    start = Trajectory(1.3e9 + np.sort(np.random.default_rng(0).uniform(0, 9, len(loop))), loop.T_w_c, "loop")
+    path = tmp_path / {"7scenes": "seq"}.get(name, "poses.txt")
+    WRITERS[name](start, path)
+    back = read_trajectory(path)
+    assert back.stamped
+    np.testing.assert_allclose(back.stamps_s, start.stamps_s, atol=1e-6)
+    times = next(tmp_path.rglob("times.txt"))
+    times.write_text("0.0\n0.1\n")
+    with pytest.raises(EvaluationError, match="200 poses but 2 stamps"):
+        read_trajectory(path)
+
+
+def tum(path: Path, rows: list[list[float]] | list[str]) -> Path:
+    path.write_text("\n".join(r if isinstance(r, str) else " ".join(map(str, r)) for r in rows) + "\n")
+    return path
+
+
+GOOD = ["0.0 0 0 0 0 0 0 1", "0.1 1 0 0 0 0 0 1", "0.2 2 0 0 0 0 0 1"]
+
+
+@pytest.mark.parametrize(
+    ("rows", "words"),
+    [
+        ([], "holds no poses"),
+        (["# only a header"], "holds no poses"),
+        (["frame; pose"], "no line of numbers in it, the first is 'frame; pose'"),
+        (["0.0 nan 0 0 0 0 0 1"], "NaN"),
+        (["0.0 0 0 0", "1.0 0 0 0"], "positions without orientation"),
+        (["0.0 1 2 3 10 20 30 40", "0.1 1 2 3 10 20 30 40"], "no unit quaternion"),
+        ([*GOOD, "0.3 1 2"], "line 4 has 3 numbers"),
+        ([*GOOD, "0.3 one 0 0 0 0 0 1"], "line 4 is not numbers"),
+    ],
+)
+def test_what_is_no_trajectory_is_named(rows: list[str], words: str, tmp_path: Path) -> None:
+    with pytest.raises(EvaluationError, match=words) as caught:
+        read_trajectory(tum(tmp_path / "t.txt", rows))
+    assert "t.txt" in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_missing_binary_and_empty_folders_are_named(tmp_path: Path) -> None:
+    (tmp_path / "b.txt").write_bytes(bytes(range(256)))
+    with pytest.raises(EvaluationError, match="not a text file"):
+        read_trajectory(tmp_path / "b.txt")
+    with pytest.raises(EvaluationError, match="no such trajectory"):
+        read_trajectory(tmp_path / "none.txt")
+    with pytest.raises(EvaluationError, match="no trajectory in this folder"):
+        read_trajectory(tmp_path)
+
+
+def test_mended_rows_are_reported(tmp_path: Path) -> None:
+    rows = [GOOD[2], GOOD[1], GOOD[1], GOOD[0], "0.3 inf 0 0 0 0 0 1"]
+    found = read_trajectory(tum(tmp_path / "t.txt", rows))
+    assert found.stamps_s.tolist() == [0.0, 0.1, 0.2]
+    notes = " ".join(found.notes)
+    assert "not finite" in notes and "out of order" in notes and "repeat a stamp" in notes
+
+
+def test_reversed_time_is_sorted_and_said(tmp_path: Path) -> None:
+    found = read_trajectory(tum(tmp_path / "t.txt", GOOD[::-1]))
+    assert found.positions[:, 0].tolist() == [0.0, 1.0, 2.0]
+    assert "backwards" in found.notes[0]
+
+
+def test_line_cut_off_at_the_end_is_left_out(tmp_path: Path) -> None:
+    (tmp_path / "t.txt").write_text("\n".join([*GOOD, "0.3 1 2"]))  # killed while writing: no newline
+    assert len(read_trajectory(tmp_path / "t.txt")) == 3
+
+
+def test_large_files_read_the_same_as_small_ones(tmp_path: Path) -> None:
+    rows = "".join(f"{0.1 * k:.1f} {k} 0 0 0 0 0 1\n" for k in range(60_000))  # 1.3 MB: read by NumPy
+    for name, text in (("spaces", rows), ("commas", rows.replace(" ", ",")), ("header", "stamp x y z\n" + rows)):
+        (tmp_path / name).write_text(text)
+        found = read_trajectory(tmp_path / name)
+        assert len(found) == 60_000 and found.positions[-1, 0] == 59_999
+    (tmp_path / "broken").write_text(rows + "6000.0 1 2\n")
+    with pytest.raises(EvaluationError, match="line 60001 has 3 numbers"):
+        read_trajectory(tmp_path / "broken")
+
+
+def test_huge_file_is_not_read(tmp_path: Path) -> None:
+    with (tmp_path / "flight.bag").open("wb") as file:
+        file.truncate(3 << 30)  # sparse: takes no room
+    with pytest.raises(EvaluationError, match="3.2 GB is no trajectory"):
+        read_trajectory(tmp_path / "flight.bag")

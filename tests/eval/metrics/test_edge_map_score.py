@@ -1,0 +1,141 @@
+"""Map accuracy and completeness against measured depth, on a rendered wall whose distances are known."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from edgeslam_torch.eval.errors import EvaluationError
+from edgeslam_torch.eval.inputs.dataset import SEVEN_SCENES_T_C_D, open_dataset
+from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, write_tum
+from edgeslam_torch.eval.metrics.align import Alignment
+from edgeslam_torch.eval.metrics.edge_map_score import score_map
+from edgeslam_torch.eval.metrics.surface import SurfaceTruth, build_surface, register_depth
+from edgeslam_torch.geometry.camera import Camera
+
+CAMERA = Camera(160, 120, 130.0, 130.0, 79.5, 59.5)
+NEAR_M, FAR_M = 1.5, 3.0
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A camera slides along x in front of a wall at 3 m with a white board at 1.5 m before it."""
+    out = tmp_path_factory.mktemp("wall")
+    (out / "rgb").mkdir()
+    (out / "depth").mkdir()
+    stamps = 10.0 + np.arange(8) / 10.0
+    T = np.tile(np.eye(4), (8, 1, 1))
+    T[:, 0, 3] = np.linspace(-0.1, 0.1, 8)
+    write_tum(Trajectory(stamps, T), out / "groundtruth.txt")
+    CAMERA.save(out / "camera.yaml")
+    for name in ("rgb", "depth"):
+        comment = "# metres = value / 5000\n" if name == "depth" else "# images\n"
+        rows = "".join(f"{t:.6f} {name}/{t:.6f}.png\n" for t in stamps)
+        (out / f"{name}.txt").write_text(comment + rows)
+    u, v = np.meshgrid(np.arange(160), np.arange(120))
+    for t, pose in zip(stamps, T, strict=True):
+        x = (u - CAMERA.cx) / CAMERA.fx * NEAR_M + pose[0, 3]
+        y = (v - CAMERA.cy) / CAMERA.fy * NEAR_M
+        board = (np.abs(x) < 0.4) & (np.abs(y) < 0.3)
+        cv2.imwrite(str(out / "rgb" / f"{t:.6f}.png"), np.where(board, 220, 40).astype(np.uint8))
+        depth = np.where(board, NEAR_M, FAR_M)
+        depth[:6, :6] = 0.0
+        cv2.imwrite(str(out / "depth" / f"{t:.6f}.png"), np.round(depth * 5000).astype(np.uint16))
+    return out
+
+
+@pytest.fixture(scope="module")
+def truth(folder: Path) -> SurfaceTruth:
+    return build_surface(open_dataset(folder))
+
+
+def board_outline(step_m: float = 0.005) -> np.ndarray:
+    a, b = np.arange(-0.4, 0.4, step_m), np.arange(-0.3, 0.3, step_m)
+    sides = [np.stack([a, np.full_like(a, s * 0.3)], 1) for s in (-1, 1)]
+    sides += [np.stack([np.full_like(b, s * 0.4), b], 1) for s in (-1, 1)]
+    xy = np.concatenate(sides)
+    return np.column_stack([xy, np.full(len(xy), NEAR_M)])
+
+
+def test_true_edges_lie_on_the_near_side_of_the_board(truth: SurfaceTruth) -> None:
+    edges = truth.edges_w
+    assert len(edges) > 50
+    assert np.abs(edges[:, 2] - NEAR_M).max() < 0.01, "an edge belongs to what is in front"
+    outline = np.maximum(np.abs(edges[:, 0]) / 0.4, np.abs(edges[:, 1]) / 0.3)
+    np.testing.assert_allclose(outline, 1.0, atol=0.06)  # a pixel is 1.2 cm there
+
+
+def test_perfect_map_is_accurate_and_complete(truth: SurfaceTruth) -> None:
+    found = score_map(board_outline(), Alignment(), truth)
+    assert found.judged_share == 1.0
+    assert found.median_m < 0.015  # pixels of the reduced depth map are 2.3 cm apart
+    assert found.completeness[0.06] == 1.0 and found.f_score[0.06] > 0.99
+
+
+def test_depth_error_of_the_map_is_measured(truth: SurfaceTruth) -> None:
+    found = score_map(np.array([[0.0, 0.0, NEAR_M - 0.08]] * 200), Alignment(), truth)
+    assert found.median_m == pytest.approx(0.08, abs=0.01)
+    assert found.single_map_median_m == pytest.approx(0.08, abs=0.01)
+    assert found.accuracy[0.06] == 0.0 and found.accuracy[0.10] == 1.0
+
+
+def test_half_the_edges_make_half_the_completeness(truth: SurfaceTruth) -> None:
+    outline = board_outline()
+    found = score_map(outline[outline[:, 0] < 0], Alignment(), truth)
+    assert found.completeness[0.02] < 0.65
+    assert 0.4 < found.completeness[0.06] < 0.65
+    assert found.accuracy[0.06] == 1.0
+
+
+def test_points_that_no_depth_map_sees_are_not_judged_but_counted(truth: SurfaceTruth) -> None:
+    behind_camera = np.array([[0.0, 0.0, -2.0]] * 60)
+    found = score_map(np.concatenate([board_outline(), behind_camera]), Alignment(), truth)
+    count = len(board_outline())
+    assert found.points == count + 60
+    assert found.judged_share == pytest.approx(count / (count + 60))
+    with pytest.raises(EvaluationError, match="no map point"):
+        score_map(behind_camera, Alignment(), truth)
+
+
+def test_points_behind_the_surface_are_judged(truth: SurfaceTruth) -> None:
+    found = score_map(np.array([[0.0, 0.0, FAR_M + 1.0]] * 20), Alignment(), truth)
+    assert found.judged_share == 1.0 and found.median_m > 0.9
+
+
+def test_map_follows_the_trajectorys_alignment(truth: SurfaceTruth) -> None:
+    found = score_map(board_outline() / 2.0 - [0, 0, 1.0], Alignment(scale=2.0, t=np.array([0.0, 0.0, 2.0])), truth)
+    assert found.median_m < 0.015
+
+
+def test_own_alignment_takes_the_trajectorys_error_out(truth: SurfaceTruth, rng: np.random.Generator) -> None:
+    board = np.column_stack([rng.uniform(-0.35, 0.35, 400), rng.uniform(-0.25, 0.25, 400), np.full(400, NEAR_M)])
+    wall = np.column_stack([rng.choice([-1, 1], 400) * 1.2, rng.uniform(-1, 1, 400), np.full(400, FAR_M)])
+    found = score_map(np.concatenate([board, wall]) + [0.0, 0.0, 0.05], Alignment(), truth)
+    assert found.median_m == pytest.approx(0.05, abs=0.01)
+    assert found.own_alignment_median_m < 0.02
+
+
+def test_depth_is_registered_to_another_camera() -> None:
+    depth = np.full((120, 160), 2.0, np.float32)
+    T = np.eye(4)
+    T[0, 3] = -0.1
+    moved = register_depth(depth, CAMERA, T, CAMERA)
+    shift = 0.1 * CAMERA.fx / 2.0  # 6.5 px to the left
+    filled = np.flatnonzero(moved[60] > 0)
+    assert filled.max() == pytest.approx(159 - shift, abs=1.0)
+    assert SEVEN_SCENES_T_C_D[0, 3] == pytest.approx(-0.028, abs=1e-3)
+
+
+def test_data_set_without_depth_is_refused(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "groundtruth.txt").write_text((folder / "groundtruth.txt").read_text())
+    with pytest.raises(EvaluationError, match="no depth maps"):
+        build_surface(open_dataset(tmp_path))
+
+
+@pytest.mark.data
+def test_measured_surface_of_a_recording_is_its_own_best_map(data_dir: Path) -> None:
+    truth = build_surface(open_dataset(data_dir / "tum_fr1_xyz"))
+    found = score_map(truth.edges_w, Alignment(), truth)
+    assert found.truth_edges > 5000
+    assert found.median_m < 0.005 and found.completeness[0.02] == 1.0

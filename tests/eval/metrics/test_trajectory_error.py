@@ -1,0 +1,326 @@
+"""Trajectory errors: by hand, against evo, and with the usual mistakes made on purpose."""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from edgeslam_torch.eval.errors import EvaluationError
+from edgeslam_torch.eval.inputs.associate import associate, match
+from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, read_trajectory, write_tum
+from edgeslam_torch.eval.metrics.align import AlignmentKind, umeyama
+from edgeslam_torch.eval.metrics.diagnose import explain
+from edgeslam_torch.eval.metrics.trajectory_error import score_trajectory
+from edgeslam_torch.geometry import se3
+
+
+def random_pair(rng: np.random.Generator, count: int = 18) -> tuple[Trajectory, Trajectory]:
+    """A wandering camera and an estimate of it: noisy, turned, shifted, scaled, some poses missing."""
+    stamps = 1e9 + np.cumsum(rng.uniform(0.02, 0.05, count))
+    R = Rotation.from_rotvec(np.cumsum(rng.normal(0, 0.05, (count, 3)), axis=0))
+    T = np.tile(np.eye(4), (count, 1, 1))
+    T[:, :3, :3], T[:, :3, 3] = R.as_matrix(), np.cumsum(rng.normal(0, 0.08, (count, 3)), axis=0)
+    E = T.copy()
+    E[:, :3, :3] = (Rotation.from_rotvec(rng.normal(0, 0.02, (count, 3))) * R).as_matrix()
+    E[:, :3, 3] += rng.normal(0, 0.02, (count, 3))
+    G = se3.exp(rng.normal(0, 1.0, 6))
+    E = G @ E
+    E[:, :3, 3] *= rng.uniform(0.3, 3.0)
+    keep = np.sort(rng.choice(count, rng.integers(10, count), replace=False))
+    jitter = rng.uniform(-0.004, 0.004, len(keep))
+    return Trajectory(stamps, T, "truth"), Trajectory(stamps[keep] + jitter, E[keep], "estimate")
+
+
+def test_umeyama_recovers_what_was_applied(rng: np.random.Generator) -> None:
+    p = rng.normal(size=(30, 3))
+    R, t = Rotation.from_rotvec([0.3, -1.0, 0.5]).as_matrix(), np.array([1.0, 2.0, -3.0])
+    found = umeyama(p, 2.5 * p @ R.T + t)
+    assert found.scale == pytest.approx(2.5, abs=1e-12)
+    np.testing.assert_allclose(found.R, R, atol=1e-12)
+    np.testing.assert_allclose(found.t, t, atol=1e-12)
+
+
+def test_umeyama_never_mirrors(rng: np.random.Generator) -> None:
+    p = rng.normal(size=(30, 3))
+    found = umeyama(p, p * [1.0, 1.0, -1.0])
+    assert np.linalg.det(found.R) == pytest.approx(1.0)
+
+
+def test_error_worked_out_by_hand() -> None:
+    T = np.tile(np.eye(4), (3, 1, 1))
+    T[:, 0, 3] = [0.0, 1.0, 2.0]
+    E = T.copy()
+    E[:, 1, 3] = [0.3, 0.0, -0.3]
+    stamps = np.arange(3.0)
+    score = score_trajectory(Trajectory(stamps, T), Trajectory(stamps, E), "none")
+    assert score.ate_m.rmse == pytest.approx(np.sqrt(0.18 / 3))
+    assert score.full_transform.rmse == pytest.approx(np.sqrt(0.18 / 3))
+    assert score.rotation_deg.max == 0.0
+    assert score.relative[0].translation_m.rmse == pytest.approx(0.3)
+    assert score.truth_path_m == 2.0
+    quarter = E.copy()
+    quarter[:, :3, :3] = Rotation.from_euler("z", 90, degrees=True).as_matrix()
+    turned = score_trajectory(Trajectory(stamps, T), Trajectory(stamps, quarter), "none")
+    assert turned.rotation_deg.rmse == pytest.approx(90.0)
+    # ||R - I||_F of 90 degrees is 2, its square 4, and the translation's 0.06 on the mean.
+    assert turned.full_transform.rmse == pytest.approx(np.sqrt(4.0 + 0.06))
+
+
+def evo_figures(truth: Trajectory, estimate: Trajectory, kind: AlignmentKind) -> dict[str, float]:
+    """What evo finds for the same pair."""
+    sync = pytest.importorskip("evo.core.sync", reason="evo is not installed: no outside oracle")
+    from evo.core import metrics
+    from evo.core.trajectory import PoseTrajectory3D
+
+    a, b = (PoseTrajectory3D(poses_se3=list(t.T_w_c), timestamps=t.stamps_s) for t in (truth, estimate))
+    a, b = sync.associate_trajectories(a, b, max_diff=0.02)
+    if kind is not AlignmentKind.NONE:
+        b.align(a, correct_scale=kind is AlignmentKind.SIM3)
+    out: dict[str, float] = {"pairs": a.num_poses}
+    relations = metrics.PoseRelation
+    for name, relation in (
+        ("translation", relations.translation_part),
+        ("rotation", relations.rotation_angle_deg),
+        ("full", relations.full_transformation),
+    ):
+        ape = metrics.APE(relation)
+        ape.process_data((a, b))
+        out[name] = ape.get_statistic(metrics.StatisticsType.rmse)
+        out[name + " max"] = ape.get_statistic(metrics.StatisticsType.max)
+    for unit, all_pairs in ((metrics.Unit.frames, True), (metrics.Unit.meters, True)):
+        for name, relation in (("rpe", relations.translation_part), ("rpe angle", relations.rotation_angle_deg)):
+            rpe = metrics.RPE(relation, 1.0, unit, rel_delta_tol=0.1, all_pairs=all_pairs, pairs_from_reference=True)
+            try:
+                rpe.process_data((a, b))
+            except metrics.filters.FilterException:
+                continue
+            out[f"{name} {unit.value}"] = rpe.get_statistic(metrics.StatisticsType.rmse)
+    return out
+
+
+def our_figures(truth: Trajectory, estimate: Trajectory, kind: AlignmentKind) -> dict[str, float]:
+    score = score_trajectory(truth, estimate, kind)
+    out: dict[str, float] = {"pairs": score.matched}
+    for name, stats in (
+        ("translation", score.ate_m),
+        ("rotation", score.rotation_deg),
+        ("full", score.full_transform),
+    ):
+        out[name], out[name + " max"] = stats.rmse, stats.max
+    for relative, unit in ((score.relative[0], "frames"), (score.relative[2], "m")):
+        out[f"rpe {unit}"], out[f"rpe angle {unit}"] = relative.translation_m.rmse, relative.rotation_deg.rmse
+    return out
+
+
+def assert_agrees(truth: Trajectory, estimate: Trajectory, kind: AlignmentKind) -> None:
+    theirs, ours = evo_figures(truth, estimate, kind), our_figures(truth, estimate, kind)
+    for name, value in theirs.items():
+        assert ours[name] == pytest.approx(value, abs=1e-6, rel=1e-9), name
+
+
+@pytest.mark.parametrize("kind", list(AlignmentKind))
+def test_agrees_with_evo_on_random_trajectories(kind: AlignmentKind, rng: np.random.Generator) -> None:
+    for _ in range(67):  # three alignments: 201 trajectories
+        assert_agrees(*random_pair(rng), kind)
+
+
+REFERENCES = {  # rmse, mean, std, max, pairs: evo 1.38, Sim(3), max dt 0.02 s (shared recordings' README)
+    "freiburg1_xyz-rgbdslam_drift.txt": ("tum_fr1_xyz/groundtruth.txt", 0.013394, 0.011993, 0.005964, 0.034810, 786),
+    "fr2_desk_ORB.txt": (
+        "reference_trajectories/fr2_desk_groundtruth.txt",
+        0.006187,
+        0.005642,
+        0.002539,
+        0.021576,
+        2225,
+    ),
+}
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("name", sorted(REFERENCES))
+def test_reference_trajectories_score_what_evo_prints(name: str, data_dir: Path) -> None:
+    truth_name, rmse, mean, std, most, pairs = REFERENCES[name]
+    truth = read_trajectory(data_dir / truth_name)
+    estimate = read_trajectory(data_dir / "reference_trajectories" / name)
+    score = score_trajectory(truth, estimate)
+    assert score.matched == pairs
+    found = (score.ate_m.rmse, score.ate_m.mean, score.ate_m.std, score.ate_m.max)
+    assert found == pytest.approx((rmse, mean, std, most), abs=1e-6)
+    near = (truth.stamps_s > estimate.stamps_s[200]) & (truth.stamps_s < estimate.stamps_s[500])
+    assert_agrees(truth.take(near), estimate.take(slice(200, 500)), AlignmentKind.SIM3)  # evo takes its time
+
+
+def test_each_pose_of_the_shorter_list_gets_its_nearest() -> None:
+    truth, estimate = np.array([0.0, 0.1, 0.2, 0.3]), np.array([0.11, 0.29, 5.0])
+    i, j = match(truth, estimate, 0.02)
+    assert i.tolist() == [1, 3] and j.tolist() == [0, 1]
+    i, j = match(estimate, truth, 0.02)
+    assert i.tolist() == [0, 1] and j.tolist() == [1, 3]
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(1e3, "milliseconds"), (1e6, "microseconds"), (1e9, "nanoseconds")])
+@pytest.mark.parametrize("begin", [0.0, 1.6e9])
+def test_stamps_in_other_units_are_converted_and_said(factor: float, unit: str, begin: float) -> None:
+    truth = begin + np.arange(0.0, 20.0, 0.05)
+    found = associate(truth, truth * factor)
+    assert len(found) == len(truth)
+    assert unit in found.notes[0] and "estimate" in found.notes[0]
+    found = associate(truth * factor, truth * factor / factor)
+    assert "ground truth" in found.notes[0] or len(found) == len(truth)
+
+
+@pytest.mark.parametrize("begin", [0.0, 1.3e9])
+@pytest.mark.parametrize("poses", [[30.0], [30.0, 30.03, 30.07]])
+def test_a_handful_of_poses_are_seconds_too(begin: float, poses: list[float]) -> None:
+    truth = begin + np.arange(0.0, 60.0, 0.01)
+    found = associate(truth, begin + np.array(poses))
+    assert len(found) == len(poses) and found.factor == 1.0 and found.notes == ()
+
+
+@pytest.mark.parametrize(
+    ("shift", "words"),
+    [(-1.5e9, "counts from 1970"), (300.0, "constant offset"), (4e6, "days apart"), (0.05, "--max-dt")],
+)
+def test_stamps_that_never_meet_are_explained(shift: float, words: str) -> None:
+    truth = 1.5e9 + np.arange(0.0, 20.0, 0.1)
+    with pytest.raises(EvaluationError, match=words):
+        associate(truth, truth + shift)
+
+
+def findings(truth: Trajectory, estimate: Trajectory, kind: str = "sim3", **options: float) -> str:
+    score = score_trajectory(truth, estimate, kind, **options)
+    return " | ".join(explain(truth, estimate, score))
+
+
+def noisy(loop: Trajectory, rng: np.random.Generator) -> Trajectory:
+    T = loop.T_w_c.copy()
+    T[:, :3, 3] += rng.normal(0.0, 0.004, (len(T), 3))
+    return replace(loop, T_w_c=T)
+
+
+def test_a_good_trajectory_gets_no_findings(loop: Trajectory, rng: np.random.Generator) -> None:
+    assert findings(loop, noisy(loop, rng)) == ""
+
+
+def test_world_to_camera_is_recognised(loop: Trajectory, rng: np.random.Generator) -> None:
+    estimate = noisy(loop, rng)
+    assert "world-to-camera" in findings(loop, replace(estimate, T_w_c=se3.inverse(estimate.T_w_c)))
+
+
+def test_quaternion_order_is_recognised(loop: Trajectory, rng: np.random.Generator, tmp_path: Path) -> None:
+    write_tum(noisy(loop, rng), tmp_path / "t.txt")
+    rows = np.loadtxt(tmp_path / "t.txt")
+    np.savetxt(tmp_path / "wxyz.txt", rows[:, [0, 1, 2, 3, 7, 4, 5, 6]])
+    assert "qw qx qy qz" in findings(loop, read_trajectory(tmp_path / "wxyz.txt"))
+
+
+def test_late_stamps_are_measured(loop: Trajectory, rng: np.random.Generator) -> None:
+    estimate = noisy(loop, rng)
+    text = findings(loop, replace(estimate, stamps_s=estimate.stamps_s + 1.37))
+    found = re.search(r"--offset (-[\d.]+)", text)
+    assert found is not None and float(found.group(1)) == pytest.approx(-1.37, abs=0.025)  # half a frame
+
+
+def test_poses_in_reverse_are_recognised(loop: Trajectory, rng: np.random.Generator) -> None:
+    estimate = noisy(loop, rng)
+    assert "backwards" in findings(loop, replace(estimate, T_w_c=estimate.T_w_c[::-1]))
+
+
+@pytest.mark.parametrize("axes", [[1, 0, 2], [0, 1, 2]], ids=["swapped", "negated"])
+def test_mirrored_positions_are_recognised(axes: list[int], loop: Trajectory, rng: np.random.Generator) -> None:
+    estimate = noisy(loop, rng)
+    T = estimate.T_w_c.copy()
+    T[:, :3, 3] = T[:, axes, 3] if axes[0] else T[:, :3, 3] * [-1, 1, 1]
+    text = findings(loop, replace(estimate, T_w_c=T))
+    assert "mirrored" in text and "world-to-camera" not in text
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(100.0, "centimetres"), (1000.0, "millimetres")])
+def test_length_units_are_named(factor: float, unit: str, loop: Trajectory, rng: np.random.Generator) -> None:
+    T = noisy(loop, rng).T_w_c
+    T[:, :3, 3] *= factor
+    assert unit in findings(loop, replace(loop, T_w_c=T))
+
+
+def test_orientations_that_hardly_turn_are_judged_by_their_angle_to_the_truth(
+    loop: Trajectory, rng: np.random.Generator, tmp_path: Path
+) -> None:
+    """A recording like fr1_xyz looks one way: a wrong order of the quaternion spreads little, but is far off."""
+    estimate = noisy(loop, rng).take(slice(0, 20))
+    swapped = np.swapaxes(estimate.T_w_c[:, :3, :3], 1, 2)
+    T = estimate.T_w_c.copy()
+    T[:, :3, :3] = swapped
+    assert "inverted" in findings(loop, replace(estimate, T_w_c=T))
+    write_tum(estimate, tmp_path / "t.txt")
+    rows = np.loadtxt(tmp_path / "t.txt")
+    np.savetxt(tmp_path / "wxyz.txt", rows[:, [0, 1, 2, 3, 7, 4, 5, 6]])
+    assert "qw qx qy qz" in findings(loop, read_trajectory(tmp_path / "wxyz.txt"))
+    T[:, :3, :3] = np.eye(3)
+    assert "left the orientation out" in findings(loop, replace(estimate, T_w_c=T))
+
+
+def test_late_milliseconds_are_two_mistakes(loop: Trajectory, rng: np.random.Generator) -> None:
+    estimate = noisy(loop, rng)
+    text = findings(loop, replace(estimate, stamps_s=1e3 * (estimate.stamps_s + 1.37)))
+    assert "milliseconds" in text and "--offset -1.3" in text
+
+
+@pytest.mark.parametrize("factor", [1.0, 1e3, 1e9], ids=["s", "ms", "ns"])
+def test_clocks_that_never_meet_are_brought_together_by_shape(
+    factor: float, loop: Trajectory, rng: np.random.Generator
+) -> None:
+    truth = replace(loop, stamps_s=loop.stamps_s + 1.5e9, source="truth.txt")
+    estimate = noisy(loop, rng).take(slice(40, 160))
+    estimate = replace(estimate, stamps_s=factor * (estimate.stamps_s - estimate.stamps_s[0]), source="mine.txt")
+    with pytest.raises(EvaluationError, match=r"mine.txt against truth.txt") as caught:
+        score_trajectory(truth, estimate)
+    found = re.search(r"fit best with --offset ([\d.]+)", str(caught.value))
+    assert found is not None and float(found.group(1)) == pytest.approx(truth.stamps_s[40], abs=0.03)
+    fitted = score_trajectory(truth, estimate, offset_s=float(found.group(1)), max_dt_s=0.03)
+    assert fitted.ate_m.rmse < 0.03
+
+
+def test_no_offset_is_offered_for_another_shape(loop: Trajectory, rng: np.random.Generator) -> None:
+    T = loop.T_w_c.copy()
+    T[:, :3, 3] = np.cumsum(rng.normal(0, 0.05, (len(T), 3)), axis=0)
+    with pytest.raises(EvaluationError) as caught:
+        score_trajectory(loop, replace(loop, T_w_c=T, stamps_s=loop.stamps_s + 300.0))
+    assert "fit best" not in str(caught.value)
+
+
+def test_a_handful_of_poses_is_said_to_mean_nothing(loop: Trajectory, rng: np.random.Generator) -> None:
+    assert "only 3 poses" in findings(loop, noisy(loop, rng).take(np.array([10, 90, 150])))
+
+
+def test_another_sequence_is_recognised(loop: Trajectory, rng: np.random.Generator) -> None:
+    T = loop.T_w_c.copy()
+    T[:, :3, 3] = np.cumsum(rng.normal(0, 0.05, (len(T), 3)), axis=0)
+    assert "another sequence" in findings(loop, replace(loop, T_w_c=T)) or "drifted" in findings(
+        loop, replace(loop, T_w_c=T)
+    )
+
+
+def test_monocular_run_judged_without_scale_is_warned_about(loop: Trajectory, rng: np.random.Generator) -> None:
+    T = noisy(loop, rng).T_w_c
+    T[:, :3, 3] *= 0.4
+    assert "without scale" in findings(loop, replace(loop, T_w_c=T), "se3")
+    assert "without scale" not in findings(loop, replace(loop, T_w_c=T), "sim3")
+
+
+def test_one_pose_and_a_standing_camera_are_refused(loop: Trajectory) -> None:
+    with pytest.raises(EvaluationError, match="at least 2"):
+        score_trajectory(loop, loop.take(slice(10, 11)))
+    still = replace(loop, T_w_c=np.tile(np.eye(4), (len(loop), 1, 1)))
+    with pytest.raises(EvaluationError, match="never moves"):
+        score_trajectory(loop, still)
+
+
+def test_motion_along_a_line_is_pointed_out() -> None:
+    T = np.tile(np.eye(4), (50, 1, 1))
+    T[:, 0, 3] = np.linspace(0, 3, 50)
+    line = Trajectory(np.arange(50) / 10.0, T)
+    assert "along a line" in findings(line, line)

@@ -1,0 +1,175 @@
+"""What ``report.html`` says, and that no name or number of a run can break it."""
+
+import json
+from collections.abc import Callable
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from edgeslam_torch.eval.errors import EvaluationError
+from edgeslam_torch.eval.inputs.run_folder import open_run
+from edgeslam_torch.eval.report.page import write_report
+from edgeslam_torch.eval.report.words import without_folders
+
+NAMES = (
+    "{{edges}}",
+    "{{data}} {{title}} {{script}}",
+    "</script><script>document.title = 'broken'</script>",
+    "</title><b>bold</b>",
+    "<!--<script>",
+    '"&quot;\\u003c',
+    r"\1 \g<0>",
+    "line\u2028line",
+    "bytes \udcff of no encoding",
+)
+
+
+class Page(HTMLParser):
+    """Title, number of elements of each kind and texts of scripts by id, as a browser's parser splits them."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.text: dict[str, str] = {}
+        self.tags: list[str] = []
+        self._in = ""
+        self.feed(path.read_text(encoding="utf-8"))
+        self.data: dict[str, Any] = json.loads(self.text["data"])
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self._in = dict(attrs).get("id") or tag
+
+    def handle_endtag(self, tag: str) -> None:
+        self._in = ""
+
+    def handle_data(self, data: str) -> None:
+        self.text[self._in] = self.text.get(self._in, "") + data
+
+
+def with_summary(folder: Path, **changes: Any) -> Path:
+    file = folder / "summary.json"
+    file.write_text(json.dumps({**json.loads(file.read_text()), **changes}))
+    return folder
+
+
+@pytest.fixture
+def run(run_folder: Callable[..., Path], tmp_path: Path) -> Path:
+    run_folder(tmp_path / "run", points=100)
+    return tmp_path / "run"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_no_name_of_a_recording_breaks_the_page(run: Path, name: str) -> None:
+    plain = Page(write_report(with_summary(run, source={"name": "plain"})))
+    page = Page(write_report(with_summary(run, source={"name": name, "path": f"/nowhere/{name}"})))
+    shown = name.replace("\udcff", "?")
+    assert page.data["title"] == shown
+    assert page.text["title"] == f"{shown}, EdgeSLAM-Torch"
+    assert page.tags == plain.tags, "the name made elements"
+    assert page.text["edges-data"] == plain.text["edges-data"]
+    assert page.text["script"] == plain.text["script"]
+
+
+@pytest.mark.parametrize("name", NAMES[:5])
+def test_no_reason_or_setting_breaks_the_page(run: Path, name: str) -> None:
+    plain = Page(write_report(run))
+    (run / "config.toml").write_text(name)
+    (run / "status.csv").write_text(f'stamp,status,reason\n100.0,lost,"{name}"\n')
+    page = Page(write_report(run))
+    assert page.tags == plain.tags
+    assert page.data["config"] == name
+    assert page.data["events"][0][4] == name
+
+
+def test_pieces_are_named_with_their_seconds(run: Path) -> None:
+    spans = ((0.0, 8.133333), (8.166667, 11.466667))
+    pieces = [{"number": k, "supported": 5, "first_s": a, "last_s": b} for k, (a, b) in enumerate(spans)]
+    story = Page(write_report(with_summary(run, pieces=pieces))).data["story"]
+    assert "piece 0 from 0.0 to 8.1 s, piece 1 from 8.2 to 11.5 s" in story
+
+
+def test_a_run_that_never_tracked_was_not_never_lost(run: Path) -> None:
+    lines = (run / "status.csv").read_text().splitlines()
+    at = lines[0].split(",").index("status")
+    rows = [line.split(",") for line in lines[1:]]
+    kept = [",".join([*row[:at], "starting", *row[at + 1 :]]) for row in rows]
+    (run / "status.csv").write_text("\n".join([lines[0], *kept]) + "\n")
+    story = Page(write_report(with_summary(run, lost_events=0))).data["story"]
+    assert "of the frames were tracked" in story
+    assert "lost" not in story
+
+
+def test_warnings_of_the_run_stand_under_its_story(run: Path) -> None:
+    said = ["telemetry's velocities are not used", "the video stood still </script>"]
+    file = write_report(with_summary(run, warnings=said))
+    assert Page(file).data["warnings"] == said
+    assert '<ul id="warnings"' in file.read_text(encoding="utf-8")
+
+
+def test_page_tells_nothing_about_the_disk(run: Path) -> None:
+    secret = "/home/Jane Doe/projects"
+    with_summary(
+        run,
+        source={"name": "kitchen", "path": f"{secret}/kitchen"},
+        camera={"width": 640, "source": f"{secret}/kitchen/camera.yaml"},
+        command=f"edgeslam run {secret}/kitchen",
+        warnings=[f"{secret}/kitchen/telemetry.csv: no sample overlaps a frame"],
+        problems=[{"file": f"{secret}/kitchen/1.png", "reason": "cannot be read"}],
+    )
+    (run / "config.toml").write_text(f'[depth]\nweights = "{secret}/weights.safetensors"\n')
+    (run / "status.csv").write_text(f"stamp,status,reason\n100.0,lost,{secret}/kitchen/1.png: dark\n")
+    page = write_report(run).read_text(encoding="utf-8")
+    assert "Jane" not in page and "projects" not in page
+    for kept in ("camera.yaml", "telemetry.csv: no sample", "1.png, reason cannot", "weights.safetensors", "kitchen"):
+        assert kept in page
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("/data/a b/camera.yaml, 640x480", "camera.yaml, 640x480"),
+        (r"C:\Users\Jane Doe\x.yaml: bad", "x.yaml: bad"),
+        (r"\\server\share\x", "x"),
+        ("edgeslam run /a/b --out /c/d", "edgeslam run b --out d"),
+        ("../../home/Jane Doe/kitchen", "kitchen"),
+        ("rgb/0001.png, 3 m/s, a / b, /, ..", "rgb/0001.png, 3 m/s, a / b, /, .."),
+        ("tello://192.168.10.1/x", "tello://192.168.10.1/x"),
+    ],
+)
+def test_paths_that_leave_the_run_keep_their_last_name_only(text: str, shown: str) -> None:
+    assert without_folders(text) == shown
+
+
+def test_page_counts_the_frames_that_the_terminal_counts(run: Path) -> None:
+    page = Page(write_report(with_summary(run, offered=400, left_out=150, dropped_frames=50), judge_map=False))
+    assert "400 frames," in page.data["story"]
+    assert "150 of them were left out" in page.data["story"]
+    assert "50 of them were dropped to keep up." in page.data["story"]
+    assert "49.2\u00a0% of the frames were tracked" in page.data["story"]  # 197 of 400
+
+
+@pytest.mark.parametrize(
+    "key", ["offered", "left_out", "frames", "fps", "peak_rss_mb", "scale", "source", "lost_events", "pieces"]
+)
+@pytest.mark.parametrize("value", [None, "text", [1], {"value": []}, -1, 10**400, True])
+def test_summary_of_wrong_types_is_a_page_all_the_same(run: Path, key: str, value: Any) -> None:
+    page = Page(write_report(with_summary(run, **{key: value}), judge_map=False))
+    assert page.data["title"]
+
+
+@pytest.mark.parametrize("content", [b"stamp,status\n1,\xff\n", b'stamp,status\n1,"' + b"x" * 200_000])
+def test_status_that_is_no_table_is_refused_in_one_line(run: Path, content: bytes) -> None:
+    (run / "status.csv").write_bytes(content)
+    with pytest.raises(EvaluationError, match="status.csv: not a table of text"):
+        open_run(run)
+
+
+def test_source_beside_the_run_is_found_by_its_relative_name(run: Path) -> None:
+    recording = run.parent / "recording"
+    recording.mkdir()
+    assert open_run(with_summary(run, source={"path": "../recording"})).source == run / "../recording"
+    assert open_run(with_summary(run, source={"path": str(recording)})).source == recording
+    assert open_run(with_summary(run, source={"path": "x" * 5000})).source is None
+    assert open_run(with_summary(run, source={"path": "\0"})).source is None

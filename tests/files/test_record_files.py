@@ -1,0 +1,49 @@
+"""Whatever lies in a file of settings or results ends in one line."""
+
+import pytest
+
+from edgeslam_torch.errors import ConfigError
+from edgeslam_torch.files.record_files import MAX_BYTES, read_mapping
+
+
+def test_a_record_is_read(tmp_path):
+    (tmp_path / "a").write_text('{"x": [1, 2]}')
+    (tmp_path / "b").write_text("x = [1, 2]")
+    assert read_mapping(tmp_path / "a", "JSON", ConfigError) == read_mapping(tmp_path / "b", "TOML", ConfigError)
+
+
+@pytest.mark.parametrize("kind", ["JSON", "TOML"])
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b'x = "', "not valid"),
+        (b"\xff\xfe", "not valid"),
+        (b"9" * 5000, "not valid"),
+        (b"x = " + b"[" * 100_000, "not valid"),
+        (b"[" * 100_000, "not valid"),
+        (None, "No such file"),
+    ],
+)
+def test_what_is_no_record_is_refused_by_name(tmp_path, kind, content, words):
+    path = tmp_path / "settings"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(ConfigError, match=f"^{path}: {words}") as caught:
+        read_mapping(path, kind, ConfigError)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("line", ["x" + ".x" * 100_000 + " = 1", "[x" + ".x" * 50_000 + "]", "x = {y" + ".y" * 50_000])
+def test_toml_keys_of_endless_parts_are_refused_at_once(tmp_path, line):
+    (tmp_path / "settings").write_text(f"a = 1\n{line}\n")
+    with pytest.raises(ConfigError, match="nested too deeply"):
+        read_mapping(tmp_path / "settings", "TOML", ConfigError)
+
+
+def test_json_of_another_kind_a_folder_and_a_huge_file_are_refused(tmp_path):
+    (tmp_path / "list").write_text("[1]")
+    with (tmp_path / "huge").open("wb") as file:
+        file.truncate(MAX_BYTES["JSON"] + 1)
+    for name, words in (("list", "not a JSON object"), (".", "Is a directory"), ("huge", "67.1 MB")):
+        with pytest.raises(ConfigError, match=words):
+            read_mapping(tmp_path / name, "JSON", ConfigError)

@@ -1,0 +1,200 @@
+"""The depth stage: metres for the camera at hand, at the image's size, on one thread."""
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from edgeslam_torch.errors import WeightsError
+from edgeslam_torch.frontend.depth_network import DepthPredictor, network_size, preprocess
+from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.models.checkpoint import build_network, save_checkpoint
+from edgeslam_torch.models.fastdepth import Variant
+from edgeslam_torch.models.record import Metadata
+
+CAMERA = Camera(160, 120, 131.25, 131.25, 79.5, 59.5)
+METADATA = Metadata(variant=Variant.PRUNED.value, input_height=96, input_width=128, focal_px=105.0)
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    torch.manual_seed(0)
+    path = tmp_path_factory.mktemp("weights") / "w.safetensors"
+    save_checkpoint(build_network(METADATA).eval(), METADATA, path)
+    return path
+
+
+@pytest.fixture
+def image(rng: np.random.Generator) -> np.ndarray:
+    return cv2.resize(rng.integers(0, 256, (15, 20, 3), np.uint8), (160, 120), interpolation=cv2.INTER_CUBIC)
+
+
+@pytest.mark.parametrize("backend", ["onnxruntime", "torch"])
+def test_depth_has_the_images_size_and_is_positive(weights: Path, image: np.ndarray, backend: str) -> None:
+    predictor = DepthPredictor(weights, backend)
+    depth = predictor(image, CAMERA)
+    assert predictor.backend == backend
+    for field in (depth.depth_m, depth.sigma_log):
+        assert field.shape == (120, 160)
+        assert field.dtype == np.float32
+        assert (field > 0).all()
+
+
+def test_backends_agree(weights: Path, image: np.ndarray) -> None:
+    a, b = (DepthPredictor(weights, backend)(image, CAMERA) for backend in ("onnxruntime", "torch"))
+    np.testing.assert_allclose(a.depth_m, b.depth_m, rtol=1e-4)
+    np.testing.assert_allclose(a.sigma_log, b.sigma_log, rtol=1e-3)
+
+
+def test_depth_follows_the_focal_length(weights: Path, image: np.ndarray) -> None:
+    """The same pixels through a lens 1.2 times as long are 1.2 times as far away."""
+    predictor = DepthPredictor(weights)
+    long = predictor(image, replace(CAMERA, fx=1.2 * CAMERA.fx, fy=1.2 * CAMERA.fy))
+    np.testing.assert_allclose(long.depth_m, 1.2 * predictor(image, CAMERA).depth_m, rtol=1e-5)
+
+
+def test_resolution_does_not_change_the_metres(weights: Path, image: np.ndarray) -> None:
+    large = cv2.resize(image, (480, 360), interpolation=cv2.INTER_NEAREST)
+    predictor = DepthPredictor(weights)
+    a = predictor(image, CAMERA).depth_m.mean()
+    assert predictor(large, CAMERA.scaled(480, 360)).depth_m.mean() == pytest.approx(a, rel=0.05)
+
+
+def test_grey_image_equals_its_three_channel_copy(weights: Path, image: np.ndarray) -> None:
+    grey = np.ascontiguousarray(image[..., 0])
+    predictor = DepthPredictor(weights)
+    a, b = predictor(grey, CAMERA), predictor(np.repeat(grey[..., None], 3, 2), CAMERA)
+    np.testing.assert_array_equal(a.depth_m, b.depth_m)
+
+
+def test_preprocessing_is_whole_image_rgb_in_minus_one_to_one() -> None:
+    image = np.zeros((64, 64, 3), np.uint8)
+    image[:, :32, 0] = 255  # left half blue
+    x = preprocess(image, 32, 32, Metadata())
+    assert x.shape == (1, 3, 32, 32)
+    assert x.dtype == np.float32
+    np.testing.assert_allclose(x[0, 2, :, :16], 1.0, atol=1e-6)
+    np.testing.assert_allclose(x[0, 2, :, 16:], -1.0, atol=1e-6)
+    np.testing.assert_allclose(x[0, 0], -1.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("size", [(480, 640), (480, 752), (720, 960), (1080, 1920), (640, 480), (240, 320)])
+def test_network_sees_about_the_images_shape_at_the_training_area(size: tuple[int, int]) -> None:
+    metadata = Metadata(input_height=192, input_width=256)
+    h, w = network_size(*size, metadata)
+    assert h % 32 == 0
+    assert w % 32 == 0
+    assert 0.6 * 192 * 256 <= h * w <= 192 * 256
+    assert abs(np.log((w / h) / (size[1] / size[0]))) < 0.12
+
+
+def test_training_shape_is_used_for_the_training_cameras() -> None:
+    assert network_size(480, 640, Metadata(input_height=192, input_width=256)) == (192, 256)
+
+
+def test_wrong_size_backend_and_files_are_refused(weights: Path, image: np.ndarray, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="does not fit"):
+        DepthPredictor(weights)(image[:60], CAMERA)
+    with pytest.raises(ValueError, match="backend"):
+        DepthPredictor(weights, "tensorflow")
+    with pytest.raises(WeightsError, match="no such weights"):
+        DepthPredictor(tmp_path / "none.safetensors")
+    (tmp_path / "bad.onnx").write_bytes(b"not an onnx file")
+    with pytest.raises(WeightsError, match=r"bad\.onnx"):
+        DepthPredictor(tmp_path / "bad.onnx")
+
+
+def test_falls_back_to_torch_without_onnxruntime(
+    weights: Path, image: np.ndarray, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    predictor = DepthPredictor(weights)
+    assert predictor.backend == "torch"
+    assert "onnxruntime is not installed" in caplog.text
+    assert predictor(image, CAMERA).depth_m.shape == (120, 160)
+
+
+def test_onnxruntime_backend_never_imports_torch(weights: Path) -> None:
+    program = (
+        "import sys; from pathlib import Path; from edgeslam_torch.frontend.depth_network import DepthPredictor;"
+        f"DepthPredictor(Path({str(weights)!r})); sys.exit('torch' in sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=120)
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(
+    ("folder", "stride", "scaled", "metric"),
+    [("tum_fr1_xyz", 20, 0.10, 0.12), ("7scenes_redkitchen", 40, 0.23, 0.32)],
+)
+def test_shipped_weights_on_rooms_they_were_not_trained_on(
+    data_dir: Path, folder: str, stride: int, scaled: float, metric: float
+) -> None:
+    """A smoke bound well above the model card's figures: catches broken preprocessing or a wrong focal length."""
+    from edgeslam_torch.train.views.datasets import load_depth_folder
+
+    predictor = DepthPredictor()
+    errors = []
+    for view in load_depth_folder(data_dir / folder, width=640, stride=stride).views:
+        K = view.K
+        h, w = view.depth_m.shape
+        z = predictor(view.image, Camera(w, h, K[0, 0], K[1, 1], K[0, 2], K[1, 2])).depth_m
+        m = (view.depth_m > 0.1) & (view.depth_m < 10)
+        ratio = np.median(view.depth_m[m]) / np.median(z[m])
+        errors.append([np.abs(z[m] * s / view.depth_m[m] - 1).mean() for s in (ratio, 1.0)])
+    mean = np.mean(errors, axis=0)
+    assert mean[0] < scaled
+    assert mean[1] < metric
+
+
+# -- weights that give no depth ------------------------------------------------------------------------------------
+
+
+def changed(tmp_path: Path, metadata: Metadata = METADATA, **tensors: float) -> Path:
+    """A network of which some tensors (``__`` for dots) hold one value everywhere."""
+    torch.manual_seed(0)
+    network = build_network(metadata).eval()
+    state = network.state_dict()
+    for name, value in tensors.items():
+        state[name.replace("__", ".")].fill_(value)
+    network.load_state_dict(state)
+    save_checkpoint(network, metadata, tmp_path / "w.safetensors")
+    return tmp_path / "w.safetensors"
+
+
+@pytest.mark.parametrize("backend", ["onnxruntime", "torch"])
+def test_weights_that_give_no_depth_are_refused_when_they_are_loaded(tmp_path: Path, backend: str) -> None:
+    with pytest.raises(WeightsError, match=r"w\.safetensors: gives no depth"):
+        DepthPredictor(changed(tmp_path, decode_conv6__1__bias=1e5), backend)
+    with pytest.raises(WeightsError, match=r"w\.safetensors: gives no depth"):
+        DepthPredictor(changed(tmp_path, decode_conv6__1__bias=-1e5), backend)
+    upstream = replace(METADATA, output="depth", uncertainty=False, sigma_floor=0.2)
+    with pytest.raises(WeightsError, match=r"w\.safetensors: gives no depth"):  # ReLU of a negative number
+        DepthPredictor(changed(tmp_path, upstream, decode_conv6__1__bias=-1.0), backend)
+
+
+@pytest.mark.parametrize("backend", ["onnxruntime", "torch"])
+def test_weights_that_see_nothing_are_refused_when_they_are_loaded(tmp_path: Path, backend: str) -> None:
+    with pytest.raises(WeightsError, match="the same depth whatever it sees"):
+        DepthPredictor(changed(tmp_path, decode_conv6__0__weight=0.0, decode_conv6__1__bias=1.0), backend)
+
+
+def test_the_end_of_the_networks_range_is_unknown_not_100_m(weights: Path, image: np.ndarray) -> None:
+    class Half:
+        metadata, fixed_size = METADATA, None
+
+        def run(self, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            log_depth = np.zeros((image.shape[2] // 2, image.shape[3] // 2), np.float32)
+            log_depth[:, : log_depth.shape[1] // 2] = np.log(100.0)
+            return log_depth, np.ones_like(log_depth)
+
+    predictor = DepthPredictor(weights)
+    predictor._engine = Half()
+    depth = predictor(image, CAMERA).depth_m
+    assert np.isnan(depth[:, :78]).all()
+    assert (depth[:, 82:] > 0.5).all()

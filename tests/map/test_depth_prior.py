@@ -1,0 +1,105 @@
+"""How deep a pixel probably is, from the network and the anchors."""
+
+import numpy as np
+import pytest
+from point_map import PointMap
+
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.map.depth_prior import depth_prior, fit_to_anchors, sample
+from edgeslam_torch.types import DepthMap
+
+
+def test_sample_takes_the_nearest_pixel_and_knows_holes():
+    depth = np.array([[1.0, 2.0, 0.0], [4.0, np.nan, 6.0]], np.float32)
+    sigma = np.full((2, 3), 0.25, np.float32)
+    uv = np.array([[0.4, 0.4], [0.6, 0.0], [2.0, 0.0], [1.0, 1.0], [9.0, 9.0], [-3.0, 1.0]])
+    z, s = sample(DepthMap(depth, sigma), uv)
+    np.testing.assert_array_equal(z, [1.0, 2.0, np.nan, np.nan, 6.0, 4.0])
+    np.testing.assert_allclose(s, 0.25)
+
+
+def test_fit_finds_the_ratio_despite_a_third_of_outliers(rng):
+    network = rng.uniform(0.5, 5.0, 60)
+    anchors = 2.5 * network
+    anchors[:20] *= rng.uniform(0.2, 0.6, 20)
+    fit = fit_to_anchors(network, anchors)
+    assert fit.anchors == 60
+    assert fit.log_ratio == pytest.approx(np.log(2.5))
+    assert fit.sigma_log == 0.02  # its floor: most agree exactly
+
+
+def test_fit_says_how_far_anchors_scatter(rng):
+    network = rng.uniform(0.5, 5.0, 4000)
+    fit = fit_to_anchors(network, network * np.exp(rng.normal(0.3, 0.2, 4000)))
+    assert fit.log_ratio == pytest.approx(0.3, abs=0.02)
+    assert fit.sigma_log == pytest.approx(0.2, rel=0.1)
+
+
+@pytest.mark.parametrize("bad", [np.nan, 0.0, -1.0])
+def test_too_few_usable_anchors_give_no_fit(bad):
+    network = np.r_[np.ones(7), np.full(20, bad)]
+    assert fit_to_anchors(network, np.ones(27)) is None
+    assert fit_to_anchors(np.ones(27), np.r_[np.ones(7), np.full(20, -1.0)]) is None
+
+
+@pytest.fixture
+def points(rng):
+    made = PointMap(rng, 300, 3)
+    made.fill()
+    return made
+
+
+def true_depth(points, view):
+    return se3.transform(points.world.T_c_w[view], points.world.p_w)[points.point_of[view], 2]
+
+
+def test_network_is_brought_to_map_units(points):
+    keyframe, z = points.keyframes[0], true_depth(points, 0)
+    depth = np.full((480, 640), np.nan, np.float32)
+    u, v = np.rint(keyframe.features.uv).astype(int).T
+    depth[np.clip(v, 0, 479), np.clip(u, 0, 639)] = z / 3.0  # the network's metre is three map units
+    keyframe.depth = DepthMap(depth, np.full((480, 640), 0.12, np.float32))
+    prior, sigma = depth_prior(keyframe, keyframe.features.uv, points.map.anchors.p_w, 0.35)
+    np.testing.assert_allclose(np.median(prior / z), 1.0, rtol=1e-5)
+    np.testing.assert_allclose(sigma, np.hypot(0.12, 0.05), rtol=1e-6)
+
+
+def test_without_a_network_anchors_nearby_tell(points):
+    keyframe, z = points.keyframes[0], true_depth(points, 0)
+    prior, sigma = depth_prior(keyframe, keyframe.features.uv, points.map.anchors.p_w, 0.35)
+    assert (sigma == 0.35).all()
+    assert prior.min() >= z.min() * 0.999
+    assert prior.max() <= z.max() * 1.001
+    # Smooth walls: what the prior claims as its sigma holds for two thirds.
+    assert np.mean(np.abs(np.log(prior / z)) < 0.35) > 0.68
+
+
+def test_keyframe_without_anchors_knows_nothing(points):
+    keyframe = points.keyframes[0]
+    keyframe.anchor[:] = -1
+    prior, sigma = depth_prior(keyframe, keyframe.features.uv[:4], points.map.anchors.p_w, 0.35)
+    assert np.isnan(prior).all()
+    assert np.isinf(sigma).all()
+
+
+def test_anchors_behind_the_camera_do_not_count(points):
+    keyframe = points.keyframes[0]
+    keyframe.T_c_w = se3.exp(np.array([0, 0, 0, 0, np.pi, 0])) @ keyframe.T_c_w
+    assert np.isnan(depth_prior(keyframe, keyframe.features.uv[:4], points.map.anchors.p_w, 0.35)[0]).all()
+
+
+@pytest.mark.parametrize("twist", [0.0, 0.3])
+def test_network_that_errs_is_bent_towards_the_anchors_and_trusted_less(points, twist):
+    """An error that grows across the image, as in a room that the network never saw; it says one per cent."""
+    keyframe, z = points.keyframes[0], true_depth(points, 0)
+    u, v = np.rint(keyframe.features.uv).astype(int).T
+    error = twist * (u - 320) / 320
+    depth, sigma = np.full((480, 640), np.nan, np.float32), np.full((480, 640), 0.01, np.float32)
+    depth[np.clip(v, 0, 479), np.clip(u, 0, 639)] = z * np.exp(error)
+    keyframe.depth = DepthMap(depth, sigma)
+    prior, prior_sigma = depth_prior(keyframe, keyframe.features.uv, points.map.anchors.p_w, 0.35)
+    known = np.isfinite(prior)
+    left = np.abs(np.log(prior / z))[known]
+    assert np.median(left) <= 0.5 * np.median(np.abs(error)) + 0.01
+    assert np.median(prior_sigma[known]) == pytest.approx(0.051, abs=0.003) or twist > 0
+    assert np.mean(left < 2.5 * prior_sigma[known]) > 0.97

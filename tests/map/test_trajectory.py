@@ -1,0 +1,45 @@
+"""Poses of frames hang on keyframes."""
+
+import numpy as np
+from point_map import PointMap, small_motion
+
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.map.trajectory import TrajectoryLog
+
+
+def test_frames_move_with_their_keyframe_also_when_it_is_gone(rng):
+    """Refinement moves the heir of a removed keyframe by M: the frames tied to either follow rigidly."""
+    points = PointMap(rng, 200, 3)
+    points.fill()
+    log = TrajectoryLog(points.map)
+    poses = [small_motion(rng, 0.5, 0.2) for _ in range(4)]
+    for i, T_c_w in enumerate(poses):
+        log.append(i, 0.1 * i, min(i, 2), T_c_w, True)
+    np.testing.assert_allclose(log.poses()[1], se3.inverse(np.stack(poses)), atol=1e-12)
+    points.map.remove_keyframe(points.keyframes[1])
+    np.testing.assert_allclose(log.poses()[1], se3.inverse(np.stack(poses)), atol=1e-12)
+    M = small_motion(rng, 0.1, 0.1)
+    heir = points.map.keyframes[points.map.links[1][0]]
+    heir.T_c_w = heir.T_c_w @ M
+    moved = log.poses()[1]
+    np.testing.assert_allclose(moved[1], se3.inverse(poses[1] @ M), atol=1e-12)
+    np.testing.assert_allclose(
+        moved[0 if heir.id == 2 else 2], se3.inverse(poses[0 if heir.id == 2 else 2]), atol=1e-12
+    )
+
+
+def test_replaced_poses_are_those_of_the_newest_frames_only(rng):
+    points = PointMap(rng, 200, 3)
+    points.fill()
+    log = TrajectoryLog(points.map)
+    assert log.poses()[1].shape == (0, 4, 4)
+    old, new = [small_motion(rng, 0.5, 0.2) for _ in range(4)], small_motion(rng, 0.5, 0.2)
+    for i, T_c_w in enumerate(old):
+        log.append(i, 0.1 * i, 0, T_c_w, False)
+    points.keyframes[1].frame_index = 3  # frame 2 comes before it and stays with the first
+    log.replace({2: new, 3: old[0]}, points.keyframes[:2])
+    stamps, T_w_c = log.poses()
+    np.testing.assert_allclose(stamps, [0.0, 0.1, 0.2, 0.3])
+    np.testing.assert_allclose(se3.inverse(T_w_c), np.stack([old[0], old[1], new, old[0]]), atol=1e-12)
+    assert [r.keyframe_id for r in log.records] == [0, 0, 0, 1]
+    assert log.support().supported.tolist() == [False, False, True, True]

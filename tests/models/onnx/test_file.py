@@ -1,0 +1,153 @@
+"""ONNX files that are damaged, hostile or not ours are refused before they run."""
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import pytest
+import torch
+from onnx import TensorProto, helper, numpy_helper
+
+from edgeslam_torch.errors import WeightsError
+from edgeslam_torch.frontend.depth_network import DepthPredictor
+from edgeslam_torch.models.checkpoint import build_network, save_checkpoint
+from edgeslam_torch.models.layout import Widths
+from edgeslam_torch.models.onnx.file import read_onnx
+from edgeslam_torch.models.onnx.graph import build_graph
+from edgeslam_torch.models.record import Metadata
+
+METADATA = Metadata(input_height=64, input_width=96, focal_px=80.0)
+SMALL = Widths((8, 8) + (16,) * 12, (16, 16, 16, 8, 8))
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    torch.manual_seed(0)
+    path = tmp_path_factory.mktemp("weights") / "w.safetensors"
+    save_checkpoint(build_network(METADATA, SMALL).eval(), METADATA, path)
+    return build_graph(path)[0]
+
+
+def with_record(model: onnx.ModelProto, text: str) -> None:
+    helper.set_model_props(model, {"edgeslam": text})
+
+
+def with_field(**fields: Any) -> Callable[[onnx.ModelProto], None]:
+    return lambda model: with_record(model, json.dumps(asdict(METADATA) | fields))
+
+
+def with_constant(array: np.ndarray) -> Callable[[onnx.ModelProto], None]:
+    def change(model: onnx.ModelProto) -> None:
+        model.graph.initializer[0].CopyFrom(numpy_helper.from_array(array, model.graph.initializer[0].name))
+
+    return change
+
+
+def with_input(*shape: int | str) -> Callable[[onnx.ModelProto], None]:
+    def change(model: onnx.ModelProto) -> None:
+        model.graph.input[0].CopyFrom(helper.make_tensor_value_info("image", TensorProto.FLOAT, shape))
+
+    return change
+
+
+def claims_more_than_it_holds(model: onnx.ModelProto) -> None:
+    model.graph.initializer[0].dims[:] = [1 << 40]
+
+
+def outside_the_file(model: onnx.ModelProto) -> None:
+    tensor = model.graph.initializer[0]
+    tensor.ClearField("raw_data")
+    tensor.data_location = TensorProto.EXTERNAL
+    tensor.external_data.add(key="location", value="../../etc/passwd")
+
+
+def test_a_whole_file_is_read(whole: bytes, tmp_path: Path) -> None:
+    (tmp_path / "w.onnx").write_bytes(whole)
+    assert read_onnx(tmp_path / "w.onnx") == (whole, METADATA)
+    assert DepthPredictor(tmp_path / "w.onnx").metadata == METADATA
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        (lambda m: m.ClearField("metadata_props"), "no EdgeSLAM metadata"),
+        (lambda m: with_record(m, ""), "no JSON"),
+        (lambda m: with_record(m, "null"), "not a table"),
+        (lambda m: with_record(m, "[" * 100_000), "nested too deeply"),
+        (with_field(std=[0, 0, 0]), "std must be"),
+        (with_field(focal_px=float("nan")), "focal_px must be"),
+        (with_field(focal_px=None), "focal_px must be"),
+        (with_field(mean="text"), "mean must be"),
+        (with_field(input_width=-32), "input_width must be"),
+        (with_field(input_height=1e5), "input_height must be"),
+        (with_constant(np.array([np.nan], np.float32)), "not finite"),
+        (with_constant(np.array([1e30], np.float32)), "reaches 1.0e\\+30"),
+        (with_constant(np.array([np.inf], np.float16)), "not finite"),
+        (claims_more_than_it_holds, "damaged"),
+        (outside_the_file, "outside the file"),
+        (with_input(1, 3, 64, 100), "its input is"),
+        (with_input(1, 3, 1 << 40, 64), "its input is"),
+        (with_input(1, 3, -32, 64), "its input is"),
+        (with_input(1, 1, 64, 64), "its input is"),
+        (with_input(3, 64, 64), "its input is"),
+        (with_input(), "its input is"),
+        (lambda m: m.graph.input.add(name="secret"), "not a depth network of ours"),
+        (lambda m: m.graph.output.pop(), "not a depth network of ours"),
+        (lambda m: m.ClearField("graph"), "not a depth network of ours"),
+    ],
+)
+def test_what_cannot_be_meant_is_refused(
+    whole: bytes, tmp_path: Path, change: Callable[[onnx.ModelProto], object], match: str
+) -> None:
+    model = onnx.load_model_from_string(whole)
+    change(model)
+    path = tmp_path / "w.onnx"
+    path.write_bytes(model.SerializeToString())
+    for load in (read_onnx, DepthPredictor):
+        with pytest.raises(WeightsError, match=match) as caught:
+            load(path)
+        assert str(path) in str(caught.value)
+        assert "\n" not in str(caught.value)
+
+
+def test_a_graph_that_does_not_fit_together_is_one_line(
+    whole: bytes, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    model = onnx.load_model_from_string(whole)
+    with_constant(np.zeros((3, 3, 3), np.float32))(model)
+    (tmp_path / "w.onnx").write_bytes(model.SerializeToString())
+    with pytest.raises(WeightsError, match=r"w\.onnx: (onnxruntime cannot load it|cannot be run)") as caught:
+        DepthPredictor(tmp_path / "w.onnx")
+    assert "\n" not in str(caught.value)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_empty_missing_and_foreign_files_are_named(tmp_path: Path) -> None:
+    path = tmp_path / "w.onnx"
+    with pytest.raises(WeightsError, match=r"w\.onnx: no such weights file"):
+        read_onnx(path)
+    path.mkdir()
+    with pytest.raises(WeightsError, match=r"w\.onnx: not a file"):
+        read_onnx(path)
+    path.rmdir()
+    for content in (b"", b"x", b"hello, this is no network", bytes(1000), b"\x89PNG\r\n\x1a\n" + bytes(100)):
+        path.write_bytes(content)
+        with pytest.raises(WeightsError, match=r"w\.onnx: (holds no EdgeSLAM|damaged)"):
+            DepthPredictor(path)
+
+
+def test_random_damage_is_refused_or_harmless(whole: bytes, tmp_path: Path, rng: np.random.Generator) -> None:
+    path = tmp_path / "w.onnx"
+    for k in range(150):
+        damaged = bytearray(whole)
+        for at in rng.integers(0, len(whole), rng.integers(1, 20)):
+            damaged[at] = rng.integers(256)
+        path.write_bytes(damaged if k % 2 else damaged[: rng.integers(len(damaged))])
+        try:
+            assert isinstance(read_onnx(path)[1], Metadata)
+        except WeightsError as error:
+            assert "\n" not in str(error)

@@ -1,0 +1,110 @@
+"""Whatever a crash, a thief of bytes or another program leaves in a flight folder, and whatever a drone answers."""
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from edgeslam_torch.drone.answers import belongs_to, is_refusal
+from edgeslam_torch.drone.emulator.commands import Interpreter
+from edgeslam_torch.drone.emulator.drone import DroneModel
+from edgeslam_torch.drone.sdk_state import FIELDS
+from edgeslam_torch.drone.tello import StateMessage
+from edgeslam_torch.errors import EdgeSlamError
+from edgeslam_torch.geometry.camera import PRESETS
+from edgeslam_torch.readers.source import open_source
+from edgeslam_torch.types import Frame
+from edgeslam_torch.writers.flight_writer import FlightWriter
+
+pytestmark = pytest.mark.timeout(1200)  # ten thousand cases on a machine that does other things too
+
+NUMBERS = st.one_of(
+    st.floats(), st.integers(-(10**20), 10**20), st.sampled_from(["", "nan", "1e999", "0x3", "٣", "\0"])
+)
+ROWS = st.lists(st.lists(NUMBERS.map(str), min_size=12, max_size=15).map(",".join), max_size=6).map("\n".join)
+HEADERS = st.sampled_from(["stamp_s," + ",".join(FIELDS), "timestamp,vx,vy,vz,tof", "a,b", ""])
+TELEMETRY = st.one_of(st.tuples(HEADERS, ROWS).map("\n".join).map(str.encode), st.binary(max_size=120))
+LISTINGS = st.lists(st.tuples(NUMBERS, st.text(max_size=12)).map(lambda p: f"{p[0]} {p[1]}"), max_size=5).map("\n".join)
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory, request):
+    """A recording of three pictures, as `edgeslam record` leaves it."""
+    import numpy as np
+
+    folder = tmp_path_factory.mktemp("fuzz") / "flight"
+    camera = PRESETS["tello"].scaled(64, 48)
+    with FlightWriter(folder, camera, with_telemetry=True) as writer:
+        for k in range(3):
+            writer.add_frame(Frame(k, 100.0 + 0.1 * k, np.full((48, 64, 3), 60 * k, np.uint8)))
+            writer.add_state(StateMessage(100.0 + 0.1 * k, "vgx:1;tof:80;bat:90;", {"vgx": 1.0, "tof": 80.0}))
+    return folder
+
+
+def opens_or_refuses(folder):
+    try:
+        source = open_source(folder)
+        stamps = [frame.stamp_s for frame in source.frames()]
+        told = [sample.stamp_s for sample in source.telemetry]
+    except EdgeSlamError as error:
+        assert 0 < len(str(error)) < 2000
+        return
+    assert all(b > a for a, b in zip(stamps, stamps[1:], strict=False))
+    assert told == sorted(told)
+
+
+def damaged(flight, name, data):
+    path = flight / name
+    whole = path.read_bytes()
+    path.write_bytes(data)
+    try:
+        opens_or_refuses(flight)
+    finally:
+        path.write_bytes(whole)
+
+
+@pytest.mark.slow
+@settings(max_examples=4000, deadline=None, suppress_health_check=list(HealthCheck))
+@given(data=TELEMETRY)
+def test_any_telemetry_in_a_flight(flight, data):
+    damaged(flight, "telemetry.csv", data)
+
+
+@pytest.mark.slow
+@settings(max_examples=3000, deadline=None, suppress_health_check=list(HealthCheck))
+@given(name=st.sampled_from(["rgb.txt", "camera.yaml", "telemetry.csv", "state.txt"]), share=st.floats(0.0, 1.0))
+def test_a_flight_cut_off_anywhere(flight, name, share):
+    whole = (flight / name).read_bytes()
+    damaged(flight, name, whole[: int(share * len(whole))])
+
+
+@pytest.mark.slow
+@settings(max_examples=3000, deadline=None, suppress_health_check=list(HealthCheck))
+@given(text=st.one_of(LISTINGS, st.text(max_size=60)), name=st.sampled_from(["rgb.txt", "camera.yaml", "state.txt"]))
+def test_any_listing_or_calibration_in_a_flight(flight, text, name):
+    damaged(flight, name, text.encode("utf-8", "surrogatepass"))
+
+
+COMMANDS = st.sampled_from(["takeoff", "land", "go 20 0 0 30", "battery?", "attitude?", "sn?", "wifi?", "command"])
+
+
+@pytest.mark.slow
+@settings(max_examples=10_000, deadline=None)
+@given(
+    command=COMMANDS, answer=st.one_of(st.text(max_size=60), st.binary(max_size=60).map(lambda b: b.decode("latin1")))
+)
+def test_ten_thousand_answers_belong_or_do_not(command, answer):
+    if belongs_to(command, answer) and not is_refusal(answer) and not command.endswith("?"):
+        assert answer.lower().startswith(("ok", "forced stop"))
+
+
+@pytest.mark.slow
+@settings(max_examples=10_000, deadline=None)
+@given(lines=st.lists(st.one_of(st.text(max_size=40), COMMANDS), max_size=6))
+def test_ten_thousand_conversations_are_answered_in_the_drones_own_words(lines):
+    interpreter = Interpreter(DroneModel())
+    interpreter.run("command")
+    for line in lines:
+        reply = interpreter.run(line)
+        if reply.text and line.strip() and line == line.strip() and line.isascii() and line.isprintable():
+            assert belongs_to(line, reply.text.strip()), (line, reply.text)
+        interpreter.drone.step(0.05)

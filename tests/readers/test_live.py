@@ -1,0 +1,134 @@
+import signal
+import threading
+
+import cv2
+import numpy as np
+import pytest
+
+from edgeslam_torch.cli import main
+from edgeslam_torch.drone.emulator.server import TelloEmulator
+from edgeslam_torch.drone.video import Picture
+from edgeslam_torch.errors import SourceError
+from edgeslam_torch.readers.live import CaptureFeed, LiveSource, open_live
+
+
+class FakeFeed:
+    """Pictures that are there at once, numbered with gaps, as a slow taker sees them."""
+
+    def __init__(self, counts):
+        self.pictures = [Picture(0.1 * c, np.full((48, 64, 3), c, np.uint8), c) for c in counts]
+        self.closed = 0
+
+    def wait(self, after_count, timeout_s):
+        return next((p for p in self.pictures if p.count > after_count), None)
+
+    def remarks(self):
+        return ["3 packets refused"]
+
+    def close(self):
+        self.closed += 1
+
+
+def test_frames_carry_the_gaps_of_what_was_missed():
+    feed = FakeFeed([1, 2, 5])
+    source = LiveSource("webcam:0", feed, [], None, None, is_drone=False)
+    assert [f.index for f in source.frames()] == [0, 1, 4]
+    assert "no picture" in source.problems[0].reason
+    assert feed.closed == 1
+    assert source.live
+    assert source.length is None
+
+
+def test_device_is_given_back_when_the_taker_stops_early():
+    feed = FakeFeed(range(1, 50))
+    frames = LiveSource("webcam:0", feed, [], None, None, is_drone=False).frames()
+    next(frames)
+    frames.close()
+    assert feed.closed == 1
+
+
+def test_a_source_that_is_told_to_end_ends_while_it_waits():
+    feed = FakeFeed([1, 2])
+    source = LiveSource("webcam:0", feed, [], None, None, is_drone=False)
+    wait = feed.wait
+
+    def silent(after_count, timeout_s):
+        if after_count == 2:
+            source.end()
+        return wait(after_count, timeout_s)
+
+    feed.wait = silent
+    assert len(list(source.frames())) == 2
+    assert source.problems == []
+    assert feed.closed == 1
+
+
+def test_remarks_on_what_came_are_warnings_once():
+    source = LiveSource("webcam:0", FakeFeed([1]), [], None, None, is_drone=False)
+    assert len(list(source.frames())) == 1
+    source.close()
+    assert [w for w in source.warnings if "refused" in w] == ["webcam:0: 3 packets refused"]
+
+
+def test_number_of_frames_can_be_limited():
+    source = LiveSource("webcam:0", FakeFeed(range(1, 50)), [], None, 3, is_drone=False)
+    assert len(list(source.frames())) == 3
+
+
+def test_no_picture_is_an_error_and_gives_the_device_back():
+    feed = FakeFeed([])
+    with pytest.raises(SourceError, match="no picture"):
+        LiveSource("rtsp://somewhere", feed, [], None, None, is_drone=False)
+    assert feed.closed == 1
+
+
+def test_capture_gives_pictures_with_arrival_times(tmp_path):
+    path = tmp_path / "clip.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 30, (64, 48))
+    for k in range(10):
+        writer.write(np.full((48, 64, 3), 20 * k, np.uint8))
+    writer.release()
+    feed = CaptureFeed(str(path), "clip")
+    picture = feed.wait(0, 5.0)
+    assert picture.image.shape == (48, 64, 3)
+    feed.close()
+    assert threading.active_count() < 50
+
+
+@pytest.mark.parametrize("spec", ["webcam:", "webcam:front", "webcam:-1"])
+def test_webcams_are_numbered(spec):
+    with pytest.raises(SourceError, match="webcam:N"):
+        open_live(spec)
+
+
+@pytest.mark.slow
+def test_emulator_command_starts_and_stops(capsys):
+    arguments = ["--command-port", "0", "--state-port", "1", "--video-port", "1", "--duration", "0.1"]
+    assert main(["sim", *arguments, "--render-width", "64"]) == 0
+    assert "127.0.0.1" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(120)
+@pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="signals as POSIX has them")
+def test_emulator_ends_whichever_of_its_threads_gets_the_signal(capsys, monkeypatch):
+    start = TelloEmulator.start
+
+    def shot(emulator):
+        threading.Timer(0.5, lambda: signal.pthread_kill(threading.get_ident(), signal.SIGTERM)).start()
+        return start(emulator)
+
+    monkeypatch.setattr(TelloEmulator, "start", shot)
+    ports = ["--command-port", "0", "--state-port", "1", "--video-port", "1"]
+    assert main(["sim", *ports, "--render-width", "64"]) == 0
+
+
+@pytest.mark.parametrize("wrong", [["--loss", "100"], ["--battery", "0"], ["--render-width", "5000"]])
+def test_emulator_command_refuses_in_one_line(wrong, capsys):
+    assert main(["sim", *wrong]) == 1
+    assert len(capsys.readouterr().err.strip().splitlines()) == 1
+
+
+def test_flying_needs_a_drone(capsys):
+    assert main(["record", "webcam:0", "--fly"]) == 1
+    assert "--fly" in capsys.readouterr().err

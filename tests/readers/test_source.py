@@ -1,0 +1,333 @@
+"""Every kind of source, good and bad."""
+
+import threading
+
+import cv2
+import numpy as np
+import pytest
+
+from edgeslam_torch.errors import CalibrationError, SourceError
+from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.readers.source import open_source
+
+
+def test_tum_folder(tmp_path, write_tum):
+    folder = write_tum(tmp_path / "seq", 5)
+    (folder / "groundtruth.txt").write_text("")
+    Camera(64, 48, 50.0, 50.0, 31.5, 23.5).save(folder / "camera.yaml")
+    source = open_source(folder)
+    frames = list(source.frames())
+    assert [f.index for f in frames] == [0, 1, 2, 3, 4]
+    assert frames[3].stamp_s == pytest.approx(100.3)
+    assert frames[0].image.shape == (48, 64)
+    assert (source.kind, source.length, source.problems, source.warnings) == ("tum", 5, [], [])
+    assert source.groundtruth == folder / "groundtruth.txt"
+    assert source.camera.fx == 50.0
+    assert "camera.yaml" in source.camera.source
+
+
+def test_frames_can_be_had_again_and_are_the_same(tmp_path, write_tum):
+    source = open_source(write_tum(tmp_path, 4))
+    first, second = list(source.frames()), list(source.frames())
+    assert all(np.array_equal(a.image, b.image) and a.stamp_s == b.stamp_s for a, b in zip(first, second, strict=True))
+
+
+def test_max_frames(tmp_path, write_tum):
+    source = open_source(write_tum(tmp_path, 6), max_frames=2)
+    assert source.length == 2
+    assert len(list(source.frames())) == 2
+
+
+def test_seven_scenes_as_published(tmp_path, write_images):
+    folder = tmp_path / "seq-01"
+    write_images(folder, [f"frame-{i:06d}.{kind}.png" for i in range(3) for kind in ("color", "depth")], (640, 480))
+    np.savetxt(folder / "frame-000000.pose.txt", np.eye(4))
+    source = open_source(folder)
+    assert source.kind == "7scenes"
+    assert [round(30 * f.stamp_s) for f in source.frames()] == [0, 1, 2]
+    assert source.camera.fx == 525.0
+    assert source.groundtruth == folder
+    assert "7-Scenes" in source.warnings[0]
+
+
+def test_seven_scenes_frame_that_is_there_twice_is_used_once(tmp_path, write_images):
+    names = ["frame-000000.color.png", "frame-000001.color.png", "frame-000001.color.jpg", "frame-²2.color.png"]
+    write_images(tmp_path, names, (640, 480))
+    source = open_source(tmp_path)
+    assert [round(30 * f.stamp_s) for f in source.frames()] == [0, 1]
+    assert [p.frames for p in source.problems] == [1, 1]
+
+
+@pytest.mark.parametrize("level", ["", "mav0", "mav0/cam0"])
+def test_euroc_as_published(tmp_path, write_images, level):
+    cam = tmp_path / "mav0" / "cam0"
+    stamps = [1403636579763555584 + i * 50_000_000 for i in range(3)]
+    write_images(cam / "data", [f"{s}.png" for s in stamps], (752, 480))
+    cam.joinpath("data.csv").write_text("#timestamp [ns],filename\r\n" + "".join(f"{s},{s}.png\r\n" for s in stamps))
+    cam.joinpath("sensor.yaml").write_text(
+        "sensor_type: camera\nresolution: [752, 480]\ncamera_model: pinhole\n"
+        "intrinsics: [458.654, 457.296, 367.215, 248.375]\ndistortion_model: radial-tangential\n"
+        "distortion_coefficients: [-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05]\n"
+    )
+    truth = tmp_path / "mav0" / "state_groundtruth_estimate0" / "data.csv"
+    truth.parent.mkdir()
+    truth.write_text("")
+    source = open_source(tmp_path / level)
+    frames = list(source.frames())
+    assert source.kind == "euroc"
+    assert frames[1].stamp_s - frames[0].stamp_s == pytest.approx(0.05, abs=1e-6)
+    assert source.camera.fx == 458.654
+    assert source.camera.distortion[0] == -0.28340811
+    assert source.groundtruth == truth
+
+
+def test_image_folder_in_numeric_order_at_30_hz(tmp_path, write_images):
+    write_images(tmp_path, [f"img{i}.jpg" for i in (1, 2, 10, 9)])
+    (tmp_path / "notes.txt").write_text("x")
+    source = open_source(tmp_path)
+    frames = list(source.frames())
+    assert [f.path.name for f in frames] == ["img1.jpg", "img2.jpg", "img9.jpg", "img10.jpg"]
+    assert [f.stamp_s for f in frames] == pytest.approx([0, 1 / 30, 2 / 30, 3 / 30])
+    assert "guess" in source.camera.source
+    assert source.camera.focal_sigma > 0.3
+    assert "bends the trajectory" in source.warnings[0]
+
+
+@pytest.mark.parametrize(
+    ("names", "gap"),
+    [
+        (["1305031102.175304.png", "1305031102.211214.png"], 0.03591),
+        (["1403636579763555584.png", "1403636579813555456.png"], 0.05),
+        (["000010.png", "000011.png"], 1 / 30),
+        (["0.0.png", "0.05.png", "0.1.png"], 0.05),
+    ],
+)
+def test_stamps_from_file_names(tmp_path, write_images, names, gap):
+    write_images(tmp_path, names)
+    frames = list(open_source(tmp_path).frames())
+    assert frames[1].stamp_s - frames[0].stamp_s == pytest.approx(gap, abs=1e-5)
+
+
+@pytest.fixture
+def video(tmp_path, rng):
+    path = tmp_path / "clip.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 25.0, (64, 48))
+    for _ in range(8):
+        writer.write(rng.integers(0, 256, (48, 64, 3), dtype=np.uint8))
+    writer.release()
+    return path
+
+
+def test_video(video):
+    source = open_source(video)
+    frames = list(source.frames())
+    assert [f.stamp_s for f in frames] == pytest.approx([0.04 * i for i in range(8)])
+    assert (source.kind, source.length) == ("video", 8)
+    assert frames[0].image.shape == (48, 64, 3)
+
+
+def test_recorded_video_with_its_own_stamps(video):
+    video.with_name("clip_stamps.txt").write_text("".join(f"{5.0 + 0.1 * i} {i}\n" for i in range(8)))
+    assert [f.stamp_s for f in open_source(video.parent).frames()] == pytest.approx([5.0 + 0.1 * i for i in range(8)])
+
+
+def test_cut_off_video_gives_what_it_has(video):
+    video.write_bytes(video.read_bytes()[: video.stat().st_size // 2])
+    source = open_source(video)
+    assert len(list(source.frames())) + sum(problem.frames for problem in source.problems) == 8
+    assert source.problems[-1].reason.endswith("of 8 frames; the file is damaged")
+
+
+def test_video_of_too_many_pixels_is_refused(video, monkeypatch):
+    monkeypatch.setattr("edgeslam_torch.readers.images.MAX_PIXELS", 64 * 48 - 1)
+    with pytest.raises(SourceError, match="clip.avi: image is 64x48, more than"):
+        open_source(video)
+
+
+@pytest.mark.parametrize("content", [b"", b"not a video at all" * 50])
+def test_broken_video_is_refused(tmp_path, content):
+    path = tmp_path / "clip.mp4"
+    path.write_bytes(content)
+    with pytest.raises(SourceError, match="clip.mp4"):
+        open_source(path)
+
+
+# -- images that cannot be used ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+@pytest.mark.parametrize("damage", ["empty", "truncated", "garbage", "missing"])
+def test_unusable_image_is_left_out_and_leaves_a_gap(tmp_path, write_images, suffix, damage):
+    names = [f"{i}{suffix}" for i in range(4)]
+    paths = write_images(tmp_path / "rgb", names)
+    (tmp_path / "rgb.txt").write_text("".join(f"{i} rgb/{n}\n" for i, n in enumerate(names)))
+    if damage == "missing":
+        paths[2].unlink()
+    else:
+        whole = paths[2].read_bytes()
+        paths[2].write_bytes({"empty": b"", "truncated": whole[: len(whole) // 2], "garbage": b"hello" * 99}[damage])
+    source = open_source(tmp_path)
+    assert [f.index for f in source.frames()] == [0, 1, 3]
+    assert [p.file for p in source.problems] == [str(paths[2])]
+
+
+def test_first_image_unreadable_is_no_obstacle(tmp_path, write_tum):
+    folder = write_tum(tmp_path, 3)
+    next(iter(sorted((folder / "rgb").iterdir()))).write_bytes(b"")
+    assert [f.index for f in open_source(folder).frames()] == [1, 2]
+
+
+def test_image_of_another_size_is_left_out(tmp_path, write_images):
+    write_images(tmp_path, ["1.png", "2.png"])
+    write_images(tmp_path, ["3.png"], (32, 24))
+    source = open_source(tmp_path)
+    assert len(list(source.frames())) == 2
+    assert "32x24" in source.problems[0].reason
+
+
+def test_malformed_lines_of_a_list_are_named(tmp_path, write_tum):
+    folder = write_tum(tmp_path, 3)
+    with (folder / "rgb.txt").open("a") as file:
+        file.write("what is this\n101.0\nnan rgb/x.png\n")
+    source = open_source(folder)
+    assert source.length == 3
+    assert len(source.problems) == 3
+    assert source.problems[0].file.endswith("rgb.txt:5")
+
+
+def test_sixteen_bit_and_alpha_images_become_eight_bit(tmp_path):
+    cv2.imwrite(str(tmp_path / "1.png"), np.full((48, 64), 0x8000, dtype=np.uint16))
+    cv2.imwrite(str(tmp_path / "2.png"), np.full((48, 64, 4), 7, dtype=np.uint8))
+    frames = list(open_source(tmp_path).frames())
+    assert frames[0].image.dtype == np.uint8
+    assert frames[0].image[0, 0] == 128
+    assert frames[1].image.shape == (48, 64, 3)
+
+
+# -- sources that cannot be used ---------------------------------------------------------------------------------
+
+
+def test_missing_folder(tmp_path):
+    with pytest.raises(SourceError, match="no such file or folder"):
+        open_source(tmp_path / "nowhere")
+
+
+def test_empty_folder(tmp_path):
+    with pytest.raises(SourceError, match="empty; give a folder of images"):
+        open_source(tmp_path)
+
+
+def test_folder_without_images(tmp_path):
+    (tmp_path / "letter.docx").write_text("x")
+    with pytest.raises(SourceError, match=r"found \.docx"):
+        open_source(tmp_path)
+
+
+def test_folder_of_sequences_names_them(tmp_path, write_tum):
+    write_tum(tmp_path / "desk", 2)
+    with pytest.raises(SourceError, match="desk"):
+        open_source(tmp_path)
+
+
+def test_empty_list(tmp_path, write_images):
+    write_images(tmp_path / "rgb", ["1.png"])
+    (tmp_path / "rgb.txt").write_text("# nothing\n")
+    with pytest.raises(SourceError, match="lists no image"):
+        open_source(tmp_path)
+
+
+def test_list_that_is_not_text(tmp_path):
+    (tmp_path / "rgb.txt").write_bytes(bytes(range(256)))
+    with pytest.raises(SourceError, match="rgb.txt"):
+        open_source(tmp_path)
+
+
+def test_no_image_can_be_read(tmp_path):
+    for name in ("1.png", "2.png"):
+        (tmp_path / name).write_bytes(b"nonsense")
+    with pytest.raises(SourceError, match="none of its images can be read.*1.png"):
+        open_source(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("name", "advice"), [("a.bag", "extract"), ("a.zip", "unpack"), ("a.pdf", "not a folder of images")]
+)
+def test_other_files_get_advice(tmp_path, name, advice):
+    (tmp_path / name).write_bytes(b"x")
+    with pytest.raises(SourceError, match=advice):
+        open_source(tmp_path / name)
+
+
+def test_one_image_is_a_source(tmp_path, write_images):
+    (path,) = write_images(tmp_path, ["only.png"])
+    assert [f.index for f in open_source(path).frames()] == [0]
+
+
+def test_missing_telemetry_file(tmp_path, write_tum):
+    with pytest.raises(SourceError, match="no such telemetry file"):
+        open_source(write_tum(tmp_path, 2), telemetry=tmp_path / "t.csv")
+
+
+# -- calibration -------------------------------------------------------------------------------------------------
+
+
+def test_given_calibration_wins_over_the_sources_own(tmp_path, write_tum):
+    folder = write_tum(tmp_path, 2, (640, 480))
+    Camera(640, 480, 50.0, 50.0, 320.0, 240.0).save(folder / "camera.yaml")
+    assert open_source(folder, camera="kinect").camera.fx == 525.0
+
+
+def test_folder_name_tells_the_benchmarks_camera(tmp_path, write_tum):
+    source = open_source(write_tum(tmp_path / "rgbd_dataset_freiburg2_desk", 2, (640, 480)))
+    assert source.camera.fx == 520.908620
+    assert "freiburg2" in source.camera.source
+
+
+def test_calibration_of_another_resolution_is_scaled_and_says_so(tmp_path, write_tum):
+    source = open_source(write_tum(tmp_path, 2, (320, 240)), camera="kinect")
+    assert source.camera.fx == pytest.approx(262.5)
+    assert "scaled from 640x480 to 320x240" in source.camera.source
+    assert source.warnings
+
+
+def test_calibration_of_another_shape_is_refused_naming_both_sizes(tmp_path, write_tum):
+    with pytest.raises(CalibrationError, match="640x480.*960x540"):
+        open_source(write_tum(tmp_path, 2, (960, 540)), camera="kinect")
+
+
+def test_lens_that_turns_back_in_the_corners_is_used_with_a_warning(tmp_path, write_tum):
+    folder = write_tum(tmp_path, 2)
+    Camera(64, 48, 40.0, 40.0, 31.5, 23.5, (-0.3, 0.0, 0.0, 0.0, 0.0)).save(folder / "camera.yaml")
+    assert "turns back at 70 % of the way to the border" in open_source(folder).warnings[0]
+
+
+def test_impossible_lens_is_refused(tmp_path, write_tum):
+    folder = write_tum(tmp_path, 2)
+    Camera(64, 48, 40.0, 40.0, 31.5, 23.5, (1e300, 0.0, 0.0, 0.0, 0.0)).save(folder / "camera.yaml")
+    with pytest.raises(CalibrationError, match="camera.yaml: distortion .* cannot be a lens's"):
+        open_source(folder)
+
+
+def test_unknown_preset(tmp_path, write_tum):
+    with pytest.raises(CalibrationError, match="tum_fr1"):
+        open_source(write_tum(tmp_path, 2), camera="tum_fr9")
+
+
+# -- read-ahead --------------------------------------------------------------------------------------------------
+
+
+def test_leaving_early_leaves_no_thread(tmp_path, write_tum):
+    before = threading.active_count()
+    frames = open_source(write_tum(tmp_path, 20)).frames()
+    next(frames)
+    frames.close()
+    assert threading.active_count() == before
+
+
+@pytest.mark.data
+def test_real_sequence_opens_without_complaint(data_dir):
+    source = open_source(data_dir / "tum_fr1_xyz", max_frames=3)
+    frames = list(source.frames())
+    assert frames[0].stamp_s == pytest.approx(1305031102.175304)
+    assert frames[0].image.shape == (480, 640, 3)
+    assert (source.problems, source.warnings) == ([], [])

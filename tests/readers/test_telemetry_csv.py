@@ -1,0 +1,330 @@
+import math
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from edgeslam_torch.drone.sdk_state import FIELDS, parse_state, sample_from_sdk
+from edgeslam_torch.readers.telemetry_csv import (
+    HEADER,
+    TelemetryError,
+    TelemetryUnits,
+    TelemetryWriter,
+    detect_units,
+    read_table,
+    read_telemetry,
+)
+from edgeslam_torch.synthetic.flights.flight import camera_on_body
+from edgeslam_torch.synthetic.flights.telemetry import simulate
+
+REAL = (
+    "mid:-1;x:0;y:0;z:0;mpry:0,0,0;pitch:3;roll:-1;yaw:0;vgx:0;vgy:0;vgz:0;templ:50;temph:54;tof:10;h:0;bat:51;"
+    "baro:147.94;time:0;agx:54.00;agy:28.00;agz:-1004.00;\r\n"
+)
+
+
+def write(tmp_path, text):
+    path = tmp_path / "telemetry.csv"
+    path.write_text(text)
+    return path
+
+
+def test_a_real_state_line_is_parsed():
+    fields = parse_state(REAL.encode())
+    assert fields["agz"] == -1004.0
+    assert fields["mpry"] == "0,0,0"
+    sample = sample_from_sdk(5.0, fields)
+    assert sample.battery == pytest.approx(0.51)
+    assert sample.baro_m == pytest.approx(147.94)
+    assert sample.acceleration_m_s2[2] == pytest.approx(9.846, abs=1e-3)  # specific force points up when level
+    np.testing.assert_allclose(np.degrees(sample.rpy_rad), [-1.0, -3.0, 0.0])
+
+
+def test_sdk_1_3_form_is_parsed():
+    fields = parse_state(
+        "pitch:0;roll:0;yaw:10;vgx:5;vgy:-2;vgz:1;templ:60;temph:62;tof:90;h:80;bat:77;baro:1.5;time:9;"
+    )
+    sample = sample_from_sdk(0.0, fields)
+    np.testing.assert_allclose(sample.velocity_m_s, [0.5, 0.2, -0.1])  # forward, right, down to forward, left, up
+    assert np.degrees(sample.rpy_rad[2]) == pytest.approx(-10.0)  # clockwise to counter-clockwise
+    assert np.isnan(sample.acceleration_m_s2).all()
+
+
+@pytest.mark.parametrize(
+    "packet", [b"", b"ok", b"\xff\xfe\x00", b";;;:::", b"vgx:;bat:nan;tof:inf;yaw:1_0", b"a" * 9000]
+)
+def test_malformed_packets_give_missing_values(packet):
+    sample = sample_from_sdk(0.0, parse_state(packet))
+    assert np.isnan(sample.velocity_m_s).all()
+    assert math.isnan(sample.battery)
+
+
+def test_readings_no_tello_gives_are_missing():
+    sample = sample_from_sdk(0.0, {"tof": 6553.0, "bat": 300.0, "vgx": 1e6, "vgy": 0.0, "vgz": 0.0})
+    assert math.isnan(sample.tof_m)
+    assert math.isnan(sample.battery)
+    assert math.isnan(sample.velocity_m_s[0])
+
+
+def test_what_is_written_is_read_back(tmp_path):
+    path = tmp_path / "telemetry.csv"
+    fields = parse_state(REAL)
+    with TelemetryWriter(path) as writer:
+        writer.write(12.5, fields)
+        writer.write(12.6, {**fields, "vgx": 4.0, "tof": "soon"})
+    assert path.read_text().splitlines()[0] == ",".join(HEADER)
+    first, second = read_telemetry(path)
+    assert first.stamp_s == 12.5
+    assert second.velocity_m_s[0] == pytest.approx(0.4)
+    assert math.isnan(second.tof_m)
+
+
+def test_a_row_torn_by_a_crash_costs_that_row_only(tmp_path):
+    path = tmp_path / "telemetry.csv"
+    with TelemetryWriter(path) as writer:
+        writer.write(1.0, {"vgx": 1.0})
+    with path.open("a") as file:
+        file.write("1.1,3")  # the power went
+    with TelemetryWriter(path) as writer:
+        writer.write(1.2, {"vgx": 2.0})
+    table = read_table(path)
+    np.testing.assert_array_equal(table.stamps_s, [1.0, 1.2])
+    assert table.skipped == 1
+
+
+def test_rows_without_order_or_numbers_are_skipped_and_counted(tmp_path):
+    path = write(tmp_path, "stamp_s,vgx,bat\n1,1,90\n1,2,90\nx,3,90\n0.5,4,90\n2,,90\n3,5\n\n# note\n4,6,90\n")
+    table = read_table(path)
+    np.testing.assert_array_equal(table.stamps_s, [1.0, 2.0, 4.0])
+    assert table.skipped == 4
+    assert math.isnan(table.values["vgx"][1])
+
+
+@pytest.mark.parametrize(
+    ("text", "word"),
+    [("", "empty"), ("a,b\n1,2\n", "no clock"), ("stamp_s,colour\n1,2\n", "no known column")],
+)
+def test_files_that_are_no_telemetry_are_refused_in_one_line(tmp_path, text, word):
+    path = write(tmp_path, text)
+    with pytest.raises(TelemetryError, match=word) as caught:
+        read_telemetry(path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_missing_and_binary_files_are_refused(tmp_path):
+    with pytest.raises(TelemetryError, match="cannot be read"):
+        read_telemetry(tmp_path / "nothing.csv")
+    path = tmp_path / "picture.csv"
+    path.write_bytes(bytes(range(256)))
+    with pytest.raises(TelemetryError, match="not a text file"):
+        read_telemetry(path)
+
+
+def test_a_file_with_a_header_only_gives_no_samples(tmp_path):
+    assert read_telemetry(write(tmp_path, "stamp_s,vgx\n")) == []
+
+
+def climbing(tmp_path, velocity_unit, sign):
+    """A log whose drone climbs and sinks by half a metre."""
+    lines = ["timestamp,vx,vy,vz,tof"]
+    for k in range(300):
+        t = 0.1 * k
+        z, v = 1.0 + 0.5 * math.sin(0.8 * t), 0.4 * math.cos(0.8 * t)
+        lines.append(f"{1000 * t:.0f},0,0,{round(sign * v / velocity_unit, 3)},{round(100 * z)}")
+    return write(tmp_path, "\n".join(lines) + "\n")
+
+
+@pytest.mark.parametrize("velocity_unit", [0.1, 0.01, 1.0])
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_unit_and_axis_of_the_velocity_are_found_from_height(tmp_path, velocity_unit, sign):
+    table = read_table(climbing(tmp_path, velocity_unit, sign))
+    units = detect_units(table)
+    assert units.velocity_m_s == velocity_unit
+    assert units.z_down == (sign < 0)
+    samples = table.samples(units)
+    assert samples[0].velocity_m_s[2] == pytest.approx(0.4, abs=0.01)
+    assert samples[1].stamp_s == pytest.approx(0.1)  # milliseconds, told by their spacing
+
+
+@pytest.mark.filterwarnings("error")
+def test_height_that_never_changes_tells_no_unit(tmp_path):
+    rows = [f"{100 * k},0,0,{2 + k % 3},100" for k in range(100)]
+    table = read_table(write(tmp_path, "\n".join(["timestamp,vx,vy,vz,tof", *rows]) + "\n"))
+    assert "too little vertical motion" in detect_units(table).evidence
+
+
+def rewritten(tmp_path, how):
+    """The climbing flight as another program might have logged it."""
+    lines = climbing(tmp_path, 0.1, -1).read_text().splitlines()
+    head, rows = lines[0].split(","), [line.split(",") for line in lines[1:]]
+    if how == "other order":
+        order = [4, 3, 0, 2, 1]
+        head, rows = [head[i] for i in order], [[row[i] for i in order] for row in rows]
+    elif how == "semicolons, units in names":
+        head = ["Timestamp [ms]", "vgx (dm/s)", "vgy (dm/s)", "vgz (dm/s)", "ToF (cm)"]
+        return write(tmp_path, "\n".join(";".join(row) for row in [head, *rows]))
+    elif how == "quoted, separator at the end":
+        head, rows = [f'"{h}"' for h in head], [[*(f'"{c}"' for c in row), ""] for row in rows]
+    elif how == "dates":
+        rows = [
+            [f"2024-05-01 12:{int(row[0]) // 60000:02d}:{int(row[0]) % 60000 / 1e3:06.3f}", *row[1:]] for row in rows
+        ]
+    elif how == "motor time beside the clock":
+        head, rows = ["time", *head], [[str(int(row[0]) // 1000), *row] for row in rows]
+    elif how == "no horizontal velocity, index in front":
+        head, rows = ["", head[0], *head[3:]], [[str(k), row[0], *row[3:]] for k, row in enumerate(rows)]
+    elif how == "h in place of tof, some missing":
+        head = [*head[:4], "height_cm"]
+        rows = [
+            [*row[:3], "" if k % 7 == 0 else row[3], "None" if k % 5 == 0 else row[4]] for k, row in enumerate(rows)
+        ]
+    elif how == "furniture below":
+        rows = [[*row[:4], str(int(row[4]) - (45 if 40 < k % 100 < 70 else 0))] for k, row in enumerate(rows)]
+    elif how == "Windows line ends and a byte order mark":
+        return write(tmp_path, "\ufeff" + "\r\n".join(",".join(row) for row in [head, *rows]))
+    return write(tmp_path, "\n".join(",".join(row) for row in [head, *rows]))
+
+
+@pytest.mark.parametrize(
+    "how",
+    [
+        "other order",
+        "semicolons, units in names",
+        "quoted, separator at the end",
+        "dates",
+        "motor time beside the clock",
+        "no horizontal velocity, index in front",
+        "h in place of tof, some missing",
+        "furniture below",
+        "Windows line ends and a byte order mark",
+    ],
+)
+def test_a_flight_that_another_program_logged_is_read_the_same(tmp_path, how):
+    table = read_table(rewritten(tmp_path, how))
+    assert len(table.stamps_s) == 300
+    assert table.skipped == 0
+    assert np.diff(table.stamps_s) == pytest.approx(np.full(299, 0.1), abs=1e-3)
+    units = detect_units(table)
+    assert (units.velocity_m_s, units.z_down, units.body_frame) == (0.1, True, False)
+    samples = table.samples(units)
+    assert samples[1].velocity_m_s[2] == pytest.approx(0.4 * math.cos(0.08), abs=0.01)
+    height = samples[1].height_m if how.startswith("h in") else samples[1].tof_m
+    assert height == pytest.approx(1.04, abs=0.011)
+
+
+def test_units_can_be_given(tmp_path):
+    path = climbing(tmp_path, 0.1, -1)
+    assert read_telemetry(path, TelemetryUnits(0.01))[0].velocity_m_s[2] == pytest.approx(0.04, abs=0.001)
+
+
+def test_simulated_telemetry_is_read_as_its_maker_reads_it(rng, tmp_path):
+    t = np.arange(0.0, 12.0, 1 / 30)
+    T = np.tile(np.eye(4), (len(t), 1, 1))
+    T[:, 2, 3] = 1.0 + 0.3 * np.sin(t)
+    T[:, 0, 3] = 0.3 * np.sin(0.7 * t)
+    T_b_c = camera_on_body()
+    log = simulate(rng, t, T @ T_b_c, T_b_c)
+    log.write(tmp_path / "telemetry.csv")
+    for read, made in zip(read_telemetry(tmp_path / "telemetry.csv"), log.samples(), strict=True):
+        np.testing.assert_allclose(read.velocity_m_s, made.velocity_m_s, atol=1e-9)
+        np.testing.assert_allclose(read.rpy_rad, made.rpy_rad, atol=1e-9)
+        assert read.height_m == pytest.approx(made.height_m)
+        np.testing.assert_allclose(read.acceleration_m_s2, made.acceleration_m_s2, rtol=1e-3, atol=1e-6)
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(("name", "count", "seconds"), [("flight_a", 2498, 253), ("flight_b", 2711, 275)])
+def test_real_flights_are_read_with_their_clock_and_units(data_dir, name, count, seconds):
+    table = read_table(data_dir / "tello_telemetry" / f"{name}.csv")
+    assert (len(table.stamps_s), table.skipped) == (count, 0)
+    assert table.stamps_s[-1] - table.stamps_s[0] == pytest.approx(seconds, abs=1.0)
+    units = detect_units(table)
+    assert (units.velocity_m_s, units.z_down) == (0.1, True)
+    samples = table.samples(units)
+    assert all(0.0 < s.battery <= 1.0 for s in samples)
+
+
+cells = st.one_of(
+    st.floats(allow_nan=True, allow_infinity=True).map(str),
+    st.sampled_from(["", "-", "1e999", "nan", "0x10", "1_0", "６", " 5 ", '"', "None"]),
+    st.text(max_size=6),
+)
+lines = st.one_of(
+    st.lists(cells, max_size=16).map(",".join),
+    st.just(",".join(HEADER)),
+    st.text(max_size=60),
+)
+
+
+def _reads_or_refuses(folder, data):
+    path = folder / "fuzz.csv"
+    path.write_bytes(data)
+    try:
+        samples = read_telemetry(path)
+    except TelemetryError as error:
+        assert "\n" not in str(error)
+        return
+    stamps = [s.stamp_s for s in samples]
+    assert all(b > a for a, b in zip(stamps, stamps[1:], strict=False))
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.lists(lines, max_size=12))
+def test_any_csv_is_read_or_refused(tmp_path, rows):
+    _reads_or_refuses(tmp_path, "\n".join([",".join(HEADER), *rows]).encode("utf-8", "surrogatepass"))
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.binary(max_size=300))
+def test_any_bytes_are_read_or_refused(tmp_path, data):
+    _reads_or_refuses(tmp_path, data)
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.one_of(st.binary(max_size=300), st.lists(st.tuples(st.sampled_from(FIELDS), cells)).map(
+    lambda pairs: ";".join(f"{k}:{v}" for k, v in pairs).encode("utf-8", "surrogatepass"))))  # fmt: skip
+def test_any_packet_gives_a_sample(packet):
+    sample = sample_from_sdk(0.0, parse_state(packet))
+    assert sample.velocity_m_s.shape == (3,)
+    assert not np.isinf(sample.velocity_m_s).any()
+    assert math.isnan(sample.battery) or 0.0 <= sample.battery <= 1.0
+
+
+@pytest.mark.slow
+@settings(max_examples=10_000, deadline=None, suppress_health_check=list(HealthCheck))
+@given(st.one_of(st.binary(max_size=300), st.lists(lines, max_size=8).map(
+    lambda rows: "\n".join([",".join(HEADER), *rows]).encode("utf-8", "surrogatepass"))))  # fmt: skip
+def test_ten_thousand_files_are_read_or_refused(tmp_path, data):
+    _reads_or_refuses(tmp_path, data)
+
+
+@pytest.mark.slow
+@settings(max_examples=10_000, deadline=None)
+@given(st.one_of(st.binary(max_size=300), st.text(max_size=200).map(lambda s: s.encode("utf-8", "surrogatepass"))))
+def test_ten_thousand_packets_give_samples(packet):
+    sample_from_sdk(0.0, parse_state(packet))
+
+
+def flown(tmp_path, rows, header="stamp_s,vgx,vgy,vgz,pitch,roll,yaw"):
+    (tmp_path / "t.csv").write_text("\n".join([header, *rows]) + "\n")
+    return read_table(tmp_path / "t.csv").warnings("t.csv")
+
+
+def test_a_whole_file_is_read_without_a_word(tmp_path):
+    assert flown(tmp_path, [f"{0.1 * k:.1f},1,2,3,0,0,{k}" for k in range(5)]) == []
+
+
+@pytest.mark.parametrize(
+    ("rows", "words"),
+    [
+        ([], "t.csv: holds no state message, so the run goes without telemetry"),
+        (["0.0,1,2,3,0,0,0", "torn", "0.1,1,2,3,0,0,0", "0.1,1,2,3,0,0,0"], "t.csv: 2 of 4 rows left out"),
+        (["0.0,,,,0,0,0", "0.1,,,,0,0,0"], "holds no velocity (vgx, vgy, vgz)"),
+        (["0.0,1,2,3,,,0", "0.1,1,2,3,,,0"], "holds no attitude (pitch, roll, yaw)"),
+    ],
+)
+def test_what_a_file_does_not_hold_is_said(tmp_path, rows, words):
+    (warning,) = flown(tmp_path, rows)
+    assert words in warning

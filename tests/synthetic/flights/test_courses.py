@@ -1,0 +1,90 @@
+"""Kinds of simulated flights: what each of them is there for."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from edgeslam_torch import demo
+from edgeslam_torch.synthetic.flights.courses import (
+    COURSES,
+    LOW_LIGHT,
+    RATE_HZ,
+    SECONDS,
+    flown,
+    record_course,
+    simulated_camera,
+)
+from edgeslam_torch.synthetic.flights.degrade import degraded
+from edgeslam_torch.synthetic.flights.flight import FlightPlan
+from edgeslam_torch.synthetic.house.render import render
+
+
+def flight_of(name, seed=1, seconds=16.0):
+    world, flight, _ = flown(COURSES[name], seed, seconds)
+    return world, flight
+
+
+def turned_deg(flight):
+    """Angle from each frame to the next [deg]."""
+    R = flight.T_w_c[:, :3, :3]
+    return np.degrees(Rotation.from_matrix(np.swapaxes(R[:-1], 1, 2) @ R[1:]).magnitude())
+
+
+def path_m(flight):
+    return float(np.linalg.norm(np.diff(flight.T_w_b[:, :3, 3], axis=0), axis=1).sum())
+
+
+@pytest.mark.parametrize("name", COURSES)
+def test_course_keeps_clear_of_walls_and_furniture(name):
+    world, flight = flight_of(name)
+    assert world.clearance(flight.T_w_b[:, :3, 3]).min() > 0.3
+    assert len(flight.stamps_s) == 320 and flight.stamps_s[0] == 0
+
+
+def test_climb_is_straight_up_and_down():
+    _, flight = flight_of("climb")
+    p = flight.T_w_b[:, :3, 3]
+    wobble = 3 * FlightPlan().wobble_m
+    assert np.ptp(p[:, :2], axis=0).max() < 2 * wobble
+    assert p[:, 2].min() < 0.45 and p[:, 2].max() > 1.9
+    assert path_m(flight) > 5
+
+
+def test_yaw_turns_more_than_once_on_the_spot():
+    _, flight = flight_of("yaw")
+    assert turned_deg(flight).sum() > 400
+    assert np.ptp(flight.T_w_b[:, :3, 3], axis=0).max() < 0.25
+
+
+@pytest.mark.parametrize(("name", "least_deg", "most_deg"), [("turn_first", 30, 40), ("hover_first", 0, 6)])
+def test_first_second_goes_nowhere_and_the_rest_is_a_flight(name, least_deg, most_deg):
+    _, flight = flight_of(name)
+    second = round(RATE_HZ)
+    p = flight.T_w_b[:, :3, 3]
+    assert np.ptp(p[: second + 1], axis=0).max() < 0.03
+    assert least_deg <= turned_deg(flight)[:second].sum() <= most_deg
+    assert np.linalg.norm(p[-1] - p[0]) > 0.5 or path_m(flight) > 5
+
+
+def test_blank_corridor_has_nothing_on_its_walls_but_doors():
+    names = {quad.name for quad in flight_of("blank_corridor", seconds=1.0)[0].quads}
+    assert names == {"floor", "ceiling", "wall", "skirting", "door", "door frame", "lamp"}
+
+
+def test_low_light_is_dark_and_noisy(rng):
+    world, flight = flight_of("low_light", seconds=1.0)
+    view = render(world, simulated_camera(160, 120), flight.T_w_c[0])
+    day = degraded(rng, view.image, view.depth_m, simulated_camera(160, 120), COURSES["room"].faults)
+    night = degraded(rng, view.image, view.depth_m, simulated_camera(160, 120), LOW_LIGHT)
+    assert night.mean() == pytest.approx(0.2 * day.mean(), rel=0.1)
+    assert night.max() < 70
+
+
+def test_room_and_corridor_are_the_demos(tmp_path):
+    settings = demo.DemoSettings("corridor", seconds=1.0, seed=4)
+    record_course(tmp_path / "course", COURSES["corridor"], 4, seconds=1.0)
+    demo.record(tmp_path / "demo", settings)
+    for file in ("groundtruth.txt", "telemetry.csv", "camera.yaml", "rgb/00000.500000.jpg"):
+        assert (tmp_path / "course" / file).read_bytes() == (tmp_path / "demo" / file).read_bytes()
+    assert {name: COURSES[name].world for name in demo.WORLDS} == demo.WORLDS
+    assert (demo.DemoSettings().seconds, settings.rate_hz) == (SECONDS, RATE_HZ)

@@ -1,0 +1,99 @@
+"""Camera faults."""
+
+import numpy as np
+import pytest
+
+from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.synthetic.flights.degrade import (
+    CLEAN,
+    CameraFaults,
+    degraded,
+    random_faults,
+    with_brightness,
+    with_jpeg,
+    with_motion_blur,
+    with_noise,
+    with_vignetting,
+)
+
+CAMERA = Camera(160, 120, 130.0, 130.0, 79.5, 59.5)
+DEPTH = np.full((120, 160), 2.0, np.float32)
+
+
+def step_image() -> np.ndarray:
+    image = np.full((120, 160, 3), 40, np.uint8)
+    image[:, 80:] = 200
+    return image
+
+
+def test_clean_camera_changes_nothing(rng: np.random.Generator) -> None:
+    image = rng.integers(0, 256, (120, 160, 3), dtype=np.uint8)
+    twist = np.array([0.5, 0.1, 0.2, 0.3, 0.1, 0.2])
+    out = degraded(rng, image, DEPTH, CAMERA, CLEAN, stamp_s=3.0, twist_c=twist)
+    np.testing.assert_array_equal(out, image)
+
+
+def test_noise_has_the_stated_variance_and_no_bias(rng: np.random.Generator) -> None:
+    for level in (40, 160):
+        image = np.full((240, 320, 3), level, np.uint8)
+        noise = with_noise(rng, image, 2.0, 0.3).astype(float) - level
+        assert noise.mean() == pytest.approx(0.0, abs=0.05)
+        assert noise.var() == pytest.approx(4.0 + 0.09 * level + 1 / 12, rel=0.05)
+
+
+def test_noise_differs_from_frame_to_frame(rng: np.random.Generator) -> None:
+    image = np.full((120, 160, 3), 120, np.uint8)
+    a, b = (with_noise(rng, image, 2.0, 0.0).astype(float) - 120 for _ in range(2))
+    assert abs(np.corrcoef(a.ravel(), b.ravel())[0, 1]) < 0.05
+
+
+def test_brightness_follows_gain_and_gamma() -> None:
+    image = np.array([[[0, 100, 255]]], np.uint8)
+    np.testing.assert_array_equal(with_brightness(image, gain=1.2)[0, 0], [0, 120, 255])
+    np.testing.assert_array_equal(with_brightness(image, gamma=2.0)[0, 0], [0, 39, 255])
+
+
+def test_vignetting_darkens_the_corners_only() -> None:
+    image = np.full((121, 161, 3), 200, np.uint8)
+    out = with_vignetting(image, 0.3)
+    assert out[60, 80, 0] == 200
+    assert float(out[0, 0, 0]) == pytest.approx(140, abs=3)
+
+
+def test_motion_blur_smears_along_the_motion_by_its_length() -> None:
+    twist = np.array([1.0, 0, 0, 0, 0, 0])  # 1 m/s to the right at 2 m: 65 px/s to the left
+    out = with_motion_blur(step_image(), DEPTH, CAMERA, twist, 0.1)[60, :, 0].astype(float)
+    changed = np.flatnonzero((out != 40) & (out != 200))
+    assert 5 <= len(changed) <= 8  # 6.5 px
+    assert abs(changed.mean() - 79.5) < 0.6  # exposure is centred on the stamp
+    across = with_motion_blur(step_image(), DEPTH, CAMERA, np.array([0, 1.0, 0, 0, 0, 0]), 0.1)
+    np.testing.assert_array_equal(across[20:100], step_image()[20:100])
+
+
+def test_rotation_blurs_regardless_of_depth() -> None:
+    twist = np.array([0, 0, 0, 0, 0.5, 0])
+    a, b = (with_motion_blur(step_image(), DEPTH * k, CAMERA, twist, 0.1) for k in (1, 10))
+    np.testing.assert_array_equal(a, b)
+    assert not np.array_equal(a, step_image())
+
+
+def test_jpeg_is_close_and_optional() -> None:
+    image = step_image()
+    assert with_jpeg(image, 0) is image
+    assert np.abs(with_jpeg(image, 90).astype(int) - image).mean() < 3
+
+
+def test_degrading_is_repeatable_for_a_seed() -> None:
+    out = []
+    for _ in range(2):
+        rng = np.random.default_rng(9)
+        faults = random_faults(rng)
+        out.append(degraded(rng, step_image(), DEPTH, CAMERA, faults, stamp_s=1.0))
+    np.testing.assert_array_equal(out[0], out[1])
+
+
+def test_impossible_faults_are_refused() -> None:
+    with pytest.raises(ValueError, match="must not be negative"):
+        CameraFaults(read_noise=-1.0)
+    with pytest.raises(ValueError, match="jpeg_quality"):
+        CameraFaults(jpeg_quality=101)

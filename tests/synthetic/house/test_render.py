@@ -1,0 +1,187 @@
+"""The renderer's depth, geometry and determinism."""
+
+import cv2
+import numpy as np
+import pytest
+
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.geometry.camera import PRESETS, Camera
+from edgeslam_torch.synthetic.house.render import picture, render
+from edgeslam_torch.synthetic.house.rooms import (
+    corridor,
+    look,
+    random_pose,
+    random_room,
+    random_view,
+    random_views,
+    room,
+)
+from edgeslam_torch.synthetic.house.world import Quad, Texture, World
+
+CAMERA = Camera(320, 240, 260.0, 255.0, 161.3, 118.2)
+
+
+@pytest.fixture(scope="module")
+def furnished() -> World:
+    return room(np.random.default_rng(3))
+
+
+def cast_rays(world: World, T_w_c: np.ndarray, rays_c: np.ndarray) -> np.ndarray:
+    """z-depth of rays with unit z by intersecting every quad, float64: the independent reference."""
+    best = np.full(len(rays_c), np.inf)
+    rays_w, origin = rays_c @ T_w_c[:3, :3].T, T_w_c[:3, 3]
+    for quad in world.quads:
+        n = np.cross(quad.v_w, quad.u_w)
+        facing = rays_w @ n
+        with np.errstate(divide="ignore", invalid="ignore"):
+            z = (quad.origin_w - origin) @ n / facing
+            hit = origin + z[:, None] * rays_w - quad.origin_w
+            basis = np.stack([quad.u_w, quad.v_w], axis=1)
+            st = hit @ np.linalg.pinv(basis).T
+            ok = (z > 0.02) & ((facing < 0) | quad.two_sided) & (st >= 0).all(1) & (st <= 1).all(1)
+        best = np.where(ok & (z < best), z, best)
+    return best
+
+
+def pixel_rays(camera: Camera, uv: np.ndarray) -> np.ndarray:
+    ideal = camera.undistort_points(uv).astype(np.float64)
+    return camera.back_project(ideal, np.ones(len(uv)))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_depth_equals_analytic_ray_cast(furnished: World, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    T_w_c = random_pose(rng, furnished)
+    uv = rng.integers(0, [CAMERA.width, CAMERA.height], (600, 2))
+    view = render(furnished, CAMERA, T_w_c)
+    truth = cast_rays(furnished, T_w_c, pixel_rays(CAMERA, uv))
+    np.testing.assert_allclose(view.depth_m[uv[:, 1], uv[:, 0]], truth, rtol=2e-6)
+
+
+def test_depth_of_a_distorted_camera_is_that_of_the_distorted_pixels(furnished: World) -> None:
+    camera = PRESETS["tum_fr1"].scaled(320, 240)
+    rng = np.random.default_rng(0)
+    T_w_c = random_pose(rng, furnished)
+    view = render(furnished, camera, T_w_c)
+    uv = rng.integers(0, [320, 240], (500, 2))
+    truth = cast_rays(furnished, T_w_c, pixel_rays(camera, uv))
+    error = np.abs(view.depth_m[uv[:, 1], uv[:, 0]] / truth - 1)
+    # Within half a pixel of an occluding border the plane of the neighbour is taken.
+    assert np.mean(error < 1e-4) > 0.95
+    assert np.median(error) < 1e-6
+
+
+def test_plane_straight_ahead_has_constant_depth() -> None:
+    grey = Texture(np.full((8, 8, 3), 100, np.uint8))
+    wall = Quad(np.array([3.0, 5.0, 5.0]), np.array([0.0, -10.0, 0.0]), np.array([0.0, 0.0, -10.0]), grey)
+    view = render(World([wall]), CAMERA, look(np.zeros(3), 0.0))
+    assert np.all(view.depth_m == np.float32(3.0)) or np.allclose(view.depth_m, 3.0, rtol=1e-6)
+    assert np.all(view.image == 100)
+    assert np.all(view.quad_id == 0)
+
+
+def test_quad_is_unseen_from_behind_unless_two_sided() -> None:
+    grey = Texture(np.full((8, 8, 3), 100, np.uint8))
+    wall = Quad(np.array([-3.0, 5.0, 5.0]), np.array([0.0, -10.0, 0.0]), np.array([0.0, 0.0, -10.0]), grey)
+    behind = look(np.zeros(3), np.pi)
+    assert np.all(render(World([wall]), CAMERA, behind).quad_id == -1)
+    both = Quad(wall.origin_w, wall.u_w, wall.v_w, grey, two_sided=True)
+    assert np.all(render(World([both]), CAMERA, behind).quad_id == 0)
+
+
+def test_texture_corner_is_drawn_where_it_projects() -> None:
+    """A chequered wall seen obliquely: sub-pixel corners of the drawing against projected 3-D corners."""
+    cells, px = 8, 64
+    board = (np.indices((cells, cells)).sum(0) % 2 * 200 + 25).astype(np.uint8)
+    image = cv2.cvtColor(np.kron(board, np.ones((px, px), np.uint8)), cv2.COLOR_GRAY2BGR)
+    image = cv2.GaussianBlur(image, (0, 0), 2.0)  # smooth, so that the corner finder is better than the bound
+    wall = Quad(np.array([3.0, 1.2, 2.2]), np.array([0.0, -2.4, 0.0]), np.array([0.0, 0.0, -2.4]), Texture(image))
+    camera = Camera(640, 480, 500.0, 500.0, 321.4, 237.8)
+    T_w_c = look(np.array([0.2, 0.9, 1.4]), -0.32, 0.1, 0.15)
+    view = render(World([wall]), camera, T_w_c)
+    k = np.arange(1, cells) / cells
+    s, t = (g.ravel() for g in np.meshgrid(k, k))
+    p_w = wall.origin_w + s[:, None] * wall.u_w + t[:, None] * wall.v_w
+    uv = camera.project(se3.transform(se3.inverse(T_w_c), p_w))
+    inside = np.all((uv > 15) & (uv < [624, 464]), axis=1)
+    grey = cv2.cvtColor(view.image, cv2.COLOR_BGR2GRAY)
+    found = uv[inside].astype(np.float32).reshape(-1, 1, 2).copy()
+    cv2.cornerSubPix(grey, found, (6, 6), (-1, -1), (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-4))
+    error = np.linalg.norm(found[:, 0] - uv[inside], axis=1)
+    assert inside.sum() > 25
+    assert error.max() < 0.1, (error.max(), np.mean(found[:, 0] - uv[inside], axis=0))
+    assert np.linalg.norm(np.mean(found[:, 0] - uv[inside], axis=0)) < 0.02  # no systematic half pixel
+
+
+def test_quad_border_is_drawn_where_it_projects() -> None:
+    """The blend at a vertical border puts the edge within 0.1 px (five samples a pixel)."""
+    white, black = (Texture(np.full((8, 8, 3), g, np.uint8)) for g in (220, 20))
+    far = Quad(np.array([4.0, 9.0, 9.0]), np.array([0.0, -18.0, 0.0]), np.array([0.0, 0.0, -18.0]), black)
+    for y in (0.11, 0.2037, -0.3):
+        near = Quad(np.array([2.0, y, 9.0]), np.array([0.0, -9.0, 0.0]), np.array([0.0, 0.0, -18.0]), white)
+        T_w_c = look(np.zeros(3), 0.0, roll_rad=0.1)
+        view = render(World([far, near]), CAMERA, T_w_c)
+        ends = np.array([[2.0, y, 0.3], [2.0, y, -0.3]])
+        a, b = CAMERA.project(se3.transform(se3.inverse(T_w_c), ends))
+        rows = np.arange(int(min(a[1], b[1])) + 1, int(max(a[1], b[1])))
+        covered = (view.image[rows, :, 0].astype(float) - 20) / 200
+        edge = CAMERA.width - 0.5 - covered.sum(1)
+        truth = a[0] + (rows - a[1]) / (b[1] - a[1]) * (b[0] - a[0])
+        assert abs(np.mean(edge - truth)) < 0.05
+        assert np.abs(edge - truth).max() < 0.4
+
+
+def test_nearer_quad_hides_farther_one(furnished: World) -> None:
+    view = render(furnished, CAMERA, look(np.array([0.0, 0.0, 1.4]), 0.3))
+    v, u = np.mgrid[0 : CAMERA.height, 0 : CAMERA.width]
+    uv = np.stack([u.ravel(), v.ravel()], axis=1)
+    p_w = se3.transform(
+        look(np.array([0.0, 0.0, 1.4]), 0.3), CAMERA.back_project(uv, view.depth_m.ravel().astype(np.float64))
+    )
+    sample = slice(None, None, 997)
+    assert np.all(furnished.distance_to_surface(p_w[sample]) < 1e-4)
+
+
+@pytest.mark.parametrize("make", [corridor, room, random_room])
+def test_same_seed_gives_the_same_bytes(make) -> None:
+    views = []
+    for _ in range(2):
+        rng = np.random.default_rng(11)
+        world = make(rng)
+        views.append(render(world, CAMERA, random_pose(rng, world)))
+    assert views[0].image.tobytes() == views[1].image.tobytes()
+    assert views[0].depth_m.tobytes() == views[1].depth_m.tobytes()
+
+
+def test_another_seed_gives_another_world() -> None:
+    a, b = (random_view(np.random.default_rng(seed), CAMERA) for seed in (0, 1))
+    assert np.mean(np.abs(a.image.astype(int) - b.image.astype(int))) > 5
+
+
+def test_random_views_are_closed_sensible_and_textured() -> None:
+    stream = random_views(np.random.default_rng(5), CAMERA, views_per_room=4)
+    views = [next(stream) for _ in range(20)]
+    depth = np.stack([v.depth_m for v in views])
+    assert np.all(depth > 0.02), "a room has no holes"
+    assert 0.9 < np.median(depth) < 4.0
+    assert np.percentile(depth, 99) < 12.0
+    assert np.mean([v.image.std() > 8 for v in views]) > 0.9
+
+
+def test_pose_looks_along_its_yaw_and_tilt() -> None:
+    T_w_c = look(np.array([1.0, 2.0, 3.0]), np.pi / 2, 0.2)
+    np.testing.assert_allclose(T_w_c[:3, 2], [0, np.cos(0.2), -np.sin(0.2)], atol=1e-12)
+    np.testing.assert_allclose(np.linalg.det(T_w_c[:3, :3]), 1.0)
+    assert T_w_c[2, 1] < 0  # image down is world down
+
+
+def test_world_without_quads_is_refused() -> None:
+    with pytest.raises(ValueError, match="1 to 32767 quads"):
+        World([])
+
+
+def test_a_picture_is_the_image_of_a_view_with_plain_borders(furnished):
+    T_w_c = random_pose(np.random.default_rng(5), furnished)
+    np.testing.assert_array_equal(
+        picture(furnished, CAMERA, T_w_c), render(furnished, CAMERA, T_w_c, antialias=False).image
+    )

@@ -1,0 +1,108 @@
+"""Folders with depth: paired, undistorted, holes kept, unreadable files named."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from depth_folder import CAMERA, write_folder
+
+from edgeslam_torch.errors import CalibrationError, SourceError
+from edgeslam_torch.train.views.datasets import has_depth, load_depth_folder, read_list
+
+
+def test_depth_is_metres_and_holes_are_zero(tmp_path: Path) -> None:
+    folder = load_depth_folder(write_folder(tmp_path / "a"))
+    assert len(folder.views) == 12
+    depth = folder.views[0].depth_m
+    assert (depth[:12] == 0).all()
+    np.testing.assert_allclose(depth[20], np.linspace(1, 3, 64), atol=1e-3)
+    assert len(load_depth_folder(tmp_path / "a", stride=3, max_frames=9).views) == 3
+
+
+def test_reduced_image_has_reduced_intrinsics(tmp_path: Path) -> None:
+    view = load_depth_folder(write_folder(tmp_path / "a", 1), width=32).views[0]
+    assert view.image.shape == (24, 32, 3)
+    np.testing.assert_allclose(view.K, CAMERA.scaled(32, 24).K)
+
+
+def test_distorted_lens_is_straightened_without_mixing_depths(tmp_path: Path) -> None:
+    bent = replace(CAMERA, distortion=(0.3, 0.0, 0.0, 0.0, 0.0))
+    depth = load_depth_folder(write_folder(tmp_path / "a", 1, bent)).views[0].depth_m
+    levels = np.round(np.linspace(1000, 3000, 64)) / 1000
+    assert np.abs(depth[depth > 0][:, None] - levels).min(1).max() < 2e-3
+
+
+def test_unreadable_files_are_listed_and_the_rest_is_used(tmp_path: Path) -> None:
+    folder = write_folder(tmp_path / "a")
+    (folder / "rgb" / "3.png").write_bytes(b"broken")
+    (folder / "depth" / "5.png").unlink()
+    loaded = load_depth_folder(folder)
+    assert len(loaded.views) == 10
+    assert [Path(p).parent.name + "/" + Path(p).name for p in loaded.left_out] == [
+        "rgb/3.png: unreadable",
+        "depth/5.png: unreadable",
+    ]
+
+
+def test_missing_and_malformed_lists_are_named(tmp_path: Path) -> None:
+    folder = write_folder(tmp_path / "a", 1)
+    assert has_depth(folder)
+    assert not has_depth(tmp_path)
+    (folder / "depth.txt").write_text("not a list\n")
+    with pytest.raises(SourceError, match=r"depth\.txt:1"):
+        load_depth_folder(folder)
+    with pytest.raises(SourceError, match="cannot read the list"):
+        read_list(folder / "none.txt")
+
+
+def test_images_of_another_size_and_maps_without_depth_are_left_out(tmp_path: Path) -> None:
+    folder = write_folder(tmp_path / "a")
+    cv2.imwrite(str(folder / "rgb" / "2.png"), np.zeros((24, 32, 3), np.uint8))
+    cv2.imwrite(str(folder / "depth" / "7.png"), np.zeros((48, 64), np.uint16))
+    loaded = load_depth_folder(folder)
+    assert len(loaded.views) == 10
+    assert "rgb/2.png: 32x24 px, calibrated for 64x48" in loaded.left_out[0]
+    assert "depth/7.png: no depth between 0.05 and 30 m" in loaded.left_out[1]
+
+
+def test_folder_of_nothing_but_holes_is_refused(tmp_path: Path) -> None:
+    folder = write_folder(tmp_path / "a", 3)
+    for path in (folder / "depth").iterdir():
+        cv2.imwrite(str(path), np.zeros((48, 64), np.uint16))
+    with pytest.raises(SourceError, match="no image with depth could be read .*no depth between"):
+        load_depth_folder(folder)
+
+
+def test_stamps_that_match_nothing_are_said(tmp_path: Path) -> None:
+    folder = write_folder(tmp_path / "a", 3)
+    (folder / "rgb.txt").write_text("5.0 rgb/0.png\n")
+    with pytest.raises(SourceError, match="no image within 0.02 s of a depth map"):
+        load_depth_folder(folder)
+    (folder / "rgb.txt").write_text("")
+    with pytest.raises(SourceError, match="no image within"):
+        load_depth_folder(folder)
+
+
+@pytest.mark.parametrize("stamp", ["nan", "inf", "later"])
+def test_stamp_that_is_no_number_is_refused(tmp_path: Path, stamp: str) -> None:
+    folder = write_folder(tmp_path / "a", 3)
+    with (folder / "rgb.txt").open("a") as file:
+        file.write(f"{stamp} rgb/0.png\n")
+    with pytest.raises(SourceError, match=r"rgb\.txt:5"):
+        load_depth_folder(folder)
+
+
+@pytest.mark.parametrize("scale", ["0", "-1", "five", ".nan", "[1]"])
+def test_absurd_depth_scale_is_refused(tmp_path: Path, scale: str) -> None:
+    folder = write_folder(tmp_path / "a", 3)
+    text = (folder / "camera.yaml").read_text().replace("depth_scale: 1000.0", f"depth_scale: {scale}")
+    (folder / "camera.yaml").write_text(text)
+    with pytest.raises(CalibrationError, match="depth_scale must be a positive number"):
+        load_depth_folder(folder)
+
+
+def test_folder_has_its_name_from_within(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(write_folder(tmp_path / "kitchen", 2))
+    assert load_depth_folder(Path()).name == "kitchen"

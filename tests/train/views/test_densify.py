@@ -1,0 +1,37 @@
+"""Dense teacher from sparse map points and a network's depth."""
+
+import numpy as np
+import pytest
+
+from edgeslam_torch.train.views.densify import densify
+
+
+def scene() -> tuple[np.ndarray, np.ndarray]:
+    """Log depth of a tilted wall, and a network's view of it: 30 % too far on the left, right on the right."""
+    true = np.log(np.linspace(1.5, 3.0, 160, dtype=np.float32))[None].repeat(120, 0)
+    wrong = true + np.linspace(0.3, 0.0, 160, dtype=np.float32)[None]
+    return true, wrong
+
+
+def test_points_correct_the_network_smoothly(rng: np.random.Generator) -> None:
+    true, wrong = scene()
+    uv = np.stack([rng.uniform(0, 159, 600), rng.uniform(0, 119, 600)], 1)
+    log_z = true[np.rint(uv[:, 1]).astype(int), np.rint(uv[:, 0]).astype(int)]
+    out = densify(wrong, uv, log_z)
+    assert np.abs(out - true).mean() < 0.2 * np.abs(wrong - true).mean()
+    assert np.abs(np.diff(out - wrong, axis=1)).max() < 0.02, "no steps at the points"
+
+
+def test_one_outlier_changes_little(rng: np.random.Generator) -> None:
+    true, _ = scene()
+    uv = np.stack([rng.uniform(0, 159, 300), rng.uniform(0, 119, 300)], 1)
+    log_z = true[np.rint(uv[:, 1]).astype(int), np.rint(uv[:, 0]).astype(int)].copy()
+    log_z[7] += 1.5
+    assert np.abs(densify(true, uv, log_z) - true).max() < 0.02
+
+
+def test_far_from_points_the_median_ratio_is_used() -> None:
+    wrong = np.zeros((120, 160), np.float32)
+    uv = np.stack([np.linspace(5, 20, 40), np.linspace(5, 20, 40)], 1)
+    out = densify(wrong, uv, np.full(40, 0.25))
+    assert out[110, 150] == pytest.approx(0.25, abs=1e-3)

@@ -1,0 +1,164 @@
+"""``edgeslam record`` in bad air: it ends by itself, says why, leaves the drone on the floor and a flight that runs.
+
+Nothing here asserts how long anything takes; what must happen in the end is waited for.
+"""
+
+import json
+import re
+import threading
+from contextlib import closing, contextmanager
+
+import numpy as np
+import pytest
+from emulated import PATIENCE_S, emulated, on_the_floor, until
+
+from edgeslam_torch.cli import main
+from edgeslam_torch.drone.emulator.drone import Mode
+from edgeslam_torch.drone.emulator.encoder import Encoder
+from edgeslam_torch.drone.udp import open_udp
+from edgeslam_torch.errors import SourceError
+from edgeslam_torch.readers.source import open_source
+
+pytest.importorskip("av", reason="PyAV is not installed: the [drone] extra")
+
+
+@contextmanager
+def meanwhile(work):
+    """``work(stop)`` in a thread beside the block."""
+    stop = threading.Event()
+    thread = threading.Thread(target=work, args=(stop,), daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join(PATIENCE_S)
+
+
+def wait_until(condition, stop):
+    while not condition() and not stop.wait(0.02):
+        pass
+
+
+def check_flight(folder, tmp_path, least_frames):
+    """Every frame and message that was listed is there, and ``edgeslam run`` takes the folder."""
+    source = open_source(folder)
+    with closing(source):
+        frames = list(source.frames())
+        listed = [line for line in (folder / "rgb.txt").read_text().splitlines() if not line.startswith("#")]
+        assert len(frames) == len(listed) >= least_frames
+        assert not source.problems
+        assert len(source.telemetry) == (folder / "state.txt").read_text().count("\n") > 0
+    assert all(np.diff([f.stamp_s for f in frames]) > 0)
+    out = tmp_path / "run"
+    assert main(["run", str(folder), "--out", str(out), "--max-frames", "30", "--no-report", "--no-progress"]) == 0
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["frames"] == min(30, len(frames))
+    return frames
+
+
+def record(url, folder, *options):
+    return main(["record", url, "--out", str(folder), "--fly", *options])
+
+
+@pytest.mark.slow
+def test_one_packet_in_twenty_lost(tmp_path, capsys):
+    with emulated(loss=0.05) as (emulator, url):
+        assert record(url, tmp_path / "flight", "--max-frames", "150") == 0
+        assert on_the_floor(emulator)
+    assert "150 frames" in capsys.readouterr().out
+    check_flight(tmp_path / "flight", tmp_path, 150)
+
+
+@pytest.mark.slow
+def test_an_outage_of_three_seconds(tmp_path, capsys):
+    with emulated() as (emulator, url):
+
+        def cut(stop):
+            wait_until(lambda: emulator.drone.mode is Mode.FLYING, stop)
+            emulator.link.cut = True
+            stop.wait(3.0)
+            emulator.link.cut = False
+
+        with meanwhile(cut):
+            assert record(url, tmp_path / "flight", "--max-frames", "200") == 0
+        assert on_the_floor(emulator)
+    assert "200 frames" in capsys.readouterr().out
+    frames = check_flight(tmp_path / "flight", tmp_path, 200)
+    gap = int(np.argmax(np.diff([f.stamp_s for f in frames])))
+    assert frames[gap + 1].stamp_s - frames[gap].stamp_s > 2.0
+    assert gap + 2 < len(frames)  # it went on
+
+
+@pytest.mark.slow
+def test_a_drone_that_stops_answering(tmp_path, capsys):
+    """The one flight here that fails: the drone hears us no more, and comes down by itself."""
+    with emulated() as (emulator, url):
+
+        def freeze(stop):
+            wait_until(lambda: emulator.drone.mode is Mode.FLYING, stop)
+            emulator.frozen = True
+
+        with meanwhile(freeze):
+            assert record(url, tmp_path / "flight") == 1
+        until(lambda: on_the_floor(emulator))
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert re.fullmatch(r"edgeslam: error: 127.0.0.1: the flight was ended: no (state|video) for 5 s", error)
+    check_flight(tmp_path / "flight", tmp_path, 5)
+
+
+@pytest.mark.slow
+def test_garbage_on_every_port(tmp_path, capsys):
+    """Sent by the drone itself, and by others on its own address, where no filter tells them apart."""
+    with emulated(garbage=0.2) as (emulator, url):
+        ports = [int(port) for port in url.rsplit(":", 3)[1:]]
+
+        def shout(stop):
+            rng = np.random.default_rng(1)
+            with open_udp(("127.0.0.1", 0), "noise") as udp:
+                while not stop.wait(0.02):
+                    for port in ports:
+                        udp.sendto(rng.bytes(int(rng.integers(1, 1400))), ("127.0.0.1", port))
+
+        with meanwhile(shout):
+            assert record(url, tmp_path / "flight", "--max-frames", "100") == 0
+        assert on_the_floor(emulator)
+    assert "100 frames" in capsys.readouterr().out
+    check_flight(tmp_path / "flight", tmp_path, 100)
+
+
+@pytest.mark.slow
+def test_strangers_change_nothing_and_are_told_of(tmp_path, capsys):
+    """A film and an empty battery from another address: the recording holds the drone's own pictures alone."""
+    try:
+        other = open_udp(("127.0.0.2", 0), "stranger")
+    except SourceError:
+        pytest.skip("this system has one loopback address")
+    film = Encoder(64, 48, 30)
+    with other, emulated() as (emulator, url):
+        state, video = (("127.0.0.1", int(port)) for port in url.rsplit(":", 2)[1:])
+
+        def shout(stop):
+            while not stop.wait(0.01):
+                other.sendto(b"pitch:0;bat:1;h:0;tof:10;vgz:0;", state)
+                for packet in film.encode(np.zeros((48, 64, 3), np.uint8)):
+                    other.sendto(packet, video)
+
+        with meanwhile(shout):
+            assert record(url, tmp_path / "flight", "--max-frames", "60") == 0
+        assert on_the_floor(emulator)
+    said = capsys.readouterr()
+    assert re.search(r"warning: .* packets from others than the drone were refused \(video \d+, state \d+\)", said.out)
+    assert "video port: packets from 127.0.0.2 are refused; only 127.0.0.1 is listened to" in said.err
+    frames = check_flight(tmp_path / "flight", tmp_path, 60)
+    assert {f.image.shape for f in frames} == {(240, 320, 3)}
+    assert "bat:1;" not in (tmp_path / "flight" / "state.txt").read_text()
+
+
+@pytest.mark.slow
+def test_a_drone_that_is_not_there(tmp_path, capsys):
+    with emulated() as (emulator, url):
+        emulator.frozen = True
+        assert main(["record", url, "--out", str(tmp_path / "flight"), "--fly"]) == 1
+    assert "is the drone on" in capsys.readouterr().err
+    assert not (tmp_path / "flight" / "rgb.txt").exists()

@@ -1,0 +1,87 @@
+"""Runs of the SLAM on recordings without depth, kept in the fine-tuning's folder for the next time."""
+
+import hashlib
+import json
+import logging
+import sys
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+from edgeslam_torch.config import DepthConfig, SlamConfig
+from edgeslam_torch.errors import OutputError
+from edgeslam_torch.files.atomic import write_text
+from edgeslam_torch.progress import make_progress
+from edgeslam_torch.readers.source import open_source
+from edgeslam_torch.run import run, settle_camera
+from edgeslam_torch.train.views.posed import is_run_folder
+
+logger = logging.getLogger(__name__)
+
+
+def ensure_run(
+    recording: Path,
+    out: Path,
+    weights: Path | None = None,
+    camera: str | None = None,
+    max_frames: int | None = None,
+    apart: Path | None = None,
+) -> None:
+    """Run the SLAM on a recording, unless ``out`` holds this very run from before.
+
+    Args:
+        recording: Folder or video file.
+        out: Folder of the run; ``out.json`` beside it says what it was made from.
+        weights: Of the depth network; the shipped ones when None.
+        camera: Calibration file or preset; the recording's own when None.
+        max_frames: Use only the first frames.
+        apart: A folder that is no part of the recording although it may lie in it.
+
+    Raises:
+        SourceError: If the recording cannot be read.
+        OutputError: If the run could not be written.
+        KeyboardInterrupt: If the user stopped it; the next call begins anew.
+    """
+    made_from = {
+        "recording": _signature(recording, apart),
+        "weights": _signature(weights) if weights is not None else None,
+        "camera": _signature(Path(camera)) if camera is not None and Path(camera).is_file() else camera,
+        "max_frames": max_frames,
+    }
+    note = out.with_name(out.name + ".json")
+    if is_run_folder(out) and _read(note) == made_from:
+        return
+    note.unlink(missing_ok=True)
+    config = SlamConfig()
+    if weights is not None:
+        config = replace(config, depth=DepthConfig(weights=str(weights)))
+    source = open_source(recording, camera, max_frames=max_frames)
+    settle_camera(source)
+    for warning in source.warnings:
+        logger.warning("%s: %s", source.name, warning)
+    with make_progress(source.length, sys.stderr.isatty()) as progress:
+        result = run(source, out, config, listeners=[progress])
+    if result.interrupted:
+        raise KeyboardInterrupt
+    if result.failure is not None:
+        raise OutputError(result.failure)
+    write_text(note, json.dumps(made_from) + "\n")
+
+
+def _signature(path: Path, apart: Path | None = None) -> str:
+    """Changes when a file is added, taken away, changed or renamed; reads none of them."""
+    files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
+    digest = hashlib.sha256()
+    for file in files:
+        if apart is None or not file.is_relative_to(apart):
+            state = file.stat()
+            digest.update(f"{file.relative_to(path)} {state.st_size} {state.st_mtime_ns}\n".encode())
+    return digest.hexdigest()
+
+
+def _read(note: Path) -> Mapping[str, object] | None:
+    try:
+        content = json.loads(note.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return None
+    return content if isinstance(content, dict) else None
