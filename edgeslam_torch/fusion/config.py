@@ -15,7 +15,6 @@ _POSITIVE = (
     "sigma_h_m",
     "sigma_baro_m",
     "depth_bias_log",
-    "bias_knot_s",
     "max_gap_s",
 )
 _NOT_NEGATIVE = (
@@ -87,8 +86,6 @@ class FusionConfig:
     """Displacements older than this are forgotten."""
     max_gap_s: float = 0.35
     """A longer hole in telemetry or tracking ends a displacement."""
-    bias_knot_s: float = 5.0
-    """Spacing of the piecewise-constant velocity bias in the scale fit."""
     alignment_sigma_rad: float = math.radians(3.0)
     """How far the attitude-derived rotation from map to power-on world may be corrected by displacements."""
     min_speed_m_s: float = 0.06

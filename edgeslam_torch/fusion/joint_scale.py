@@ -7,7 +7,7 @@ world. Both kinds of measurement are linear in them, so each gives information o
     d_i = s\,u_i + s\,\delta \times u_i + b_i L_i + \epsilon_i, \qquad
     h_j = s\,z_j + (s\,\delta \times p_j)_z + c_k + w_j + \epsilon_j
 
-with velocity bias :math:`b` and drift of the visual position :math:`w` that forget themselves in seconds
+with velocity bias :math:`b` and drift of the visual position :math:`w` that decorrelate in seconds
 (Ornstein-Uhlenbeck; between the ends of an interval only the drift's change counts, so that long ways weigh more than
 swings on the spot). How large they are is chosen by the restricted likelihood of the residuals (Patterson and Thompson
 1971): a map that a tilt of half a degree or a slow drift bends must not be taken for noise that averages out, nor the
@@ -30,13 +30,19 @@ _MIN_DISPLACEMENTS = 6
 _MIN_HEIGHTS = 6
 _BELIEF = 20.0
 """Residuals that the expected noise counts for when the real one is judged."""
-_BIAS_AND_DRIFT = ((0.003, 0.002), (0.01, 0.002), (0.03, 0.002), (0.003, 0.03), (0.01, 0.03), (0.03, 0.03), (0.1, 0.03))
-"""Standard deviations of the velocity bias [m/s] and of the visual drift [m] that are tried."""
 _USUAL_BIAS_M_S = 0.01
+_USUAL = (_USUAL_BIAS_M_S, 0.03)
+"""Standard deviations of the velocity bias [m/s] and of the visual drift [m] before any are told apart."""
+_BIAS_AND_DRIFT = ((0.003, 0.002), (0.01, 0.002), (0.03, 0.002), (0.003, 0.03), _USUAL, (0.03, 0.03), (0.1, 0.03))
+"""Those that are tried."""
 _BIAS_MEMORY_S = 12.0
 _DRIFT_M = (0.002, 0.006, 0.02, 0.06)
 _DRIFT_MEMORY_S = 4.0
 _BIN_S = 0.5
+_SCALE, _THETA, _OFFSETS = 0, slice(0, 4), slice(4, None)
+"""Places in the vector of unknowns; heights have an offset for each stretch behind theta."""
+_WHEN_TOLD_APART = 2
+"""Iteration in which the noise is chosen: the weights have seen the worst outliers by then."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,28 +61,33 @@ class Evidence:
     def softened(self, sigma: float) -> "Evidence":
         """The same with an error of the scale [m per map unit] that no averaging removes."""
         q = sigma**2
-        column = self.information[:, 0] * (q / (1.0 + q * float(self.information[0, 0])))
-        information = self.information - np.outer(column, self.information[0])
-        return replace(self, information=information, vector=self.vector - column * self.vector[0])
+        column = self.information[:, _SCALE] * (q / (1.0 + q * float(self.information[_SCALE, _SCALE])))
+        information = self.information - np.outer(column, self.information[_SCALE])
+        return replace(self, information=information, vector=self.vector - column * self.vector[_SCALE])
 
 
 def solved(evidence: list[Evidence], tilt_sigma_rad: float) -> tuple[float, float] | None:
     """Scale and relative standard deviation from all evidence, the rotation free within its prior."""
     information = np.sum([e.information for e in evidence], axis=0)
     vector = np.sum([e.vector for e in evidence], axis=0)
-    if not information[0, 0] > 0:
+    if not information[_SCALE, _SCALE] > 0:
         return None
-    s = abs(float(vector[0] / information[0, 0]))
+    s = abs(float(vector[_SCALE] / information[_SCALE, _SCALE]))
     for _ in range(2):  # the prior on s delta needs s
-        prior = np.diag([0.0, *[(max(s, 1e-12) * tilt_sigma_rad) ** -2] * 3])
+        prior = _tilt_prior(max(s, 1e-12), tilt_sigma_rad)
         try:
             covariance = np.linalg.inv(information + prior)
         except np.linalg.LinAlgError:
             return None
-        s = float((covariance @ vector)[0])
-        if not (math.isfinite(s) and s > 1e-9 and covariance[0, 0] > 0):
+        s = float((covariance @ vector)[_SCALE])
+        if not (math.isfinite(s) and s > 1e-9 and covariance[_SCALE, _SCALE] > 0):
             return None
-    return s, math.sqrt(float(covariance[0, 0])) / s
+    return s, math.sqrt(float(covariance[_SCALE, _SCALE])) / s
+
+
+def _tilt_prior(s: float, tilt_sigma_rad: float, offsets: int = 0) -> FloatArray:
+    """Information on the unknowns before any measurement: the scale is free, offsets nearly."""
+    return np.diag([0.0, *[(s * tilt_sigma_rad) ** -2] * 3, *[1e-6] * offsets])
 
 
 def displacement_evidence(
@@ -110,7 +121,8 @@ def displacement_evidence(
     apart_s = from_s[:, None] - from_s[None]
     bias = np.exp(-np.abs(apart_s) / _BIAS_MEMORY_S) * np.outer(duration_s, duration_s)
     drift = _of_changes(apart_s, duration_s, _DRIFT_MEMORY_S)
-    slow = [(a, a**2 * bias, b**2 * drift, -0.5 * math.log(a / _USUAL_BIAS_M_S, 3.0) ** 2) for a, b in _BIAS_AND_DRIFT]
+    possible = {(a, b): _slow(a**2 * bias, b**2 * drift, a) for a, b in _BIAS_AND_DRIFT}
+    noise = replace(possible[_USUAL], log_prior=0.0)
     s = math.sqrt(float(np.sum(moved_m**2)) / length)
     if not (math.isfinite(s) and s > 1e-9):
         return None
@@ -120,16 +132,11 @@ def displacement_evidence(
     latent, fit = J, None
     for iteration in range(5):
         white = (sigma_m**2 + (s * sigma_map) ** 2) / np.maximum(weight, _LEAST_WEIGHT)
-        prior = np.diag([0.0, *[(s * tilt_sigma_rad) ** -2] * 3])
-        tried = (
-            [_Slow(x + y, x, log) for _, x, y, log in slow]
-            if iteration == 2
-            else [_Slow(slow[4][1] + slow[4][2], slow[4][1], 0.0) if fit is None else fit.noise]
-        )
-        fit = _best(white, tried, J, latent, target, prior)
-        if fit is None or not fit.theta[0] > 1e-9:
+        tried = list(possible.values()) if iteration == _WHEN_TOLD_APART else [noise]
+        fit = _best(white, tried, J, latent, target, _tilt_prior(s, tilt_sigma_rad))
+        if fit is None or not fit.theta[_SCALE] > 1e-9:
             return None
-        s = float(fit.theta[0])
+        noise, s = fit.noise, float(fit.theta[_SCALE])
         clean = fit.residual - fit.slow  # (3, N)
         variance = sigma_m**2 + (s * sigma_map) ** 2
         normalised = np.sqrt(np.sum(clean**2, axis=0) / (3.0 * variance))
@@ -186,13 +193,13 @@ def height_evidence(
     offsets[np.arange(n), stretch] = 1.0
     J = np.column_stack([p[:, 2], p[:, 1], -p[:, 0], np.zeros(n), offsets])[None]  # (delta x p)_z = dx y - dy x
     memory = np.exp(-np.abs(t[:, None] - t[None]) / _DRIFT_MEMORY_S) * (stretch[:, None] == stretch[None])
-    prior = np.diag([0.0, *[(scale * tilt_sigma_rad) ** -2] * 3, *[1e-6] * K])
+    prior = _tilt_prior(scale, tilt_sigma_rad, K)
     weight, fit = np.ones(n), None
     for iteration in range(4):
         white = (sigma_m**2 + (scale * sigma_map) ** 2) / count / np.maximum(weight, _LEAST_WEIGHT)
         tried = (
             [_Slow(a**2 * memory, 0.0 * memory, 0.0) for a in _DRIFT_M]
-            if fit is None or iteration == 2
+            if fit is None or iteration == _WHEN_TOLD_APART
             else [fit.noise]
         )
         fit = _best(white, tried, J, J, z[None, :, None], prior)
@@ -205,12 +212,12 @@ def height_evidence(
     if fit is None:
         return None
     A, v = fit.information.copy(), fit.vector
-    A[0, 0] -= fit.inverse_trace * sigma_map**2 / float(np.mean(count))  # noise of the regressor is no motion
-    if not A[0, 0] > 0:
+    A[_SCALE, _SCALE] -= fit.inverse_trace * sigma_map**2 / float(np.mean(count))  # noise of the regressor is no motion
+    if not A[_SCALE, _SCALE] > 0:
         return None
-    inner = np.linalg.inv(A[4:, 4:] + 1e-9 * np.eye(K))  # the offsets are nobody's business
-    information = A[:4, :4] - A[:4, 4:] @ inner @ A[4:, :4]
-    vector = v[:4] - A[:4, 4:] @ inner @ v[4:]
+    inner = np.linalg.inv(A[_OFFSETS, _OFFSETS] + 1e-9 * np.eye(K))  # the offsets are marginalised
+    information = A[_THETA, _THETA] - A[_THETA, _OFFSETS] @ inner @ A[_OFFSETS, _THETA]
+    vector = v[_THETA] - A[_THETA, _OFFSETS] @ inner @ v[_OFFSETS]
     rms = math.sqrt(float(np.sum(weight * clean**2)) / max(float(weight.sum()), 1e-9))
     return Evidence(0.5 * (information + information.T), vector, rms, np.zeros(3))
 
@@ -232,6 +239,10 @@ class _Slow:
     covariance: FloatArray
     bias: FloatArray
     log_prior: float
+
+
+def _slow(bias: FloatArray, drift: FloatArray, sigma_bias_m_s: float) -> _Slow:
+    return _Slow(bias + drift, bias, -0.5 * math.log(sigma_bias_m_s / _USUAL_BIAS_M_S, 3.0) ** 2)
 
 
 @dataclass(frozen=True, slots=True)

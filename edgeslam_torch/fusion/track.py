@@ -2,8 +2,10 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.fusion.rotations import matrix_from_rpy
@@ -19,14 +21,45 @@ _PACKET_S = 0.15
 _UPRIGHT = math.cos(math.radians(18.0))
 
 
+@dataclass(frozen=True, slots=True)
+class Readings:
+    """Telemetry as arrays; ``N`` readings in the order of their stamps."""
+
+    stamp_s: FloatArray
+    """``(N,)``"""
+    velocity: FloatArray
+    """``(N, 3)`` [m/s] in the power-on world, missing ones filled with the last known."""
+    path: FloatArray
+    """``(N, 3)`` its integral [m]; only differences mean anything."""
+    sign: FloatArray
+    """``(N, 3)`` signs of the reading's numbers, turned like the velocity: the way in which truncation falls short."""
+    sign_path: FloatArray
+    """``(N, 3)`` its integral [s]."""
+    rpy: FloatArray
+    """``(N, 3)`` roll, pitch, yaw without jumps [rad]."""
+    tof: FloatArray
+    height: FloatArray
+    baro: FloatArray
+    """``(N,)`` each [m], NaN where missing."""
+    has_velocity: NDArray[np.bool_]
+    """``(N,)``"""
+    frozen: NDArray[np.bool_]
+    """``(N,)`` part of a run that repeats one message to the bit."""
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """``(N,)`` whether the velocity may be used."""
+        return self.has_velocity & ~self.frozen
+
+
 class TelemetryTrack:
     """Growing arrays of telemetry with displacement and attitude interpolated between readings."""
 
     def __init__(self, velocity_frame: str, max_gap_s: float, keep_s: float = 900.0) -> None:
         self._body = velocity_frame == "body"
         self._max_gap_s, self._keep_s = max_gap_s, keep_s
-        self._rows: list[FloatArray] = []
-        self._table: FloatArray | None = None
+        self._samples: list[TelemetrySample] = []
+        self._cached: Readings | None = None
         self.refused = 0
         """Samples left out because they were not newer than the last one or held neither velocity nor attitude."""
 
@@ -34,47 +67,58 @@ class TelemetryTrack:
         """Append samples; returns those that were used."""
         used = []
         for sample in samples:
-            last = self._rows[-1][0] if self._rows else -math.inf
             known = np.isfinite(sample.velocity_m_s).all() or np.isfinite(sample.rpy_rad).all()
-            if not (math.isfinite(sample.stamp_s) and sample.stamp_s > last and known):
+            if not (math.isfinite(sample.stamp_s) and sample.stamp_s > self.last_s and known):
                 self.refused += 1
                 continue
-            heights = [sample.tof_m, sample.height_m, sample.baro_m]
-            self._rows.append(np.concatenate([[sample.stamp_s], sample.velocity_m_s, sample.rpy_rad, heights]))
+            self._samples.append(sample)
             used.append(sample)
         if used:
-            self._table = None
-            while self._rows[-1][0] - self._rows[0][0] > self._keep_s:
-                del self._rows[: max(1, len(self._rows) // 10)]
+            self._cached = None
+            while self._samples[-1].stamp_s - self._samples[0].stamp_s > self._keep_s:
+                del self._samples[: max(1, len(self._samples) // 10)]
         return used
 
     def __len__(self) -> int:
-        return len(self._rows)
+        return len(self._samples)
 
     @property
     def last_s(self) -> float:
         """Stamp of the newest sample, minus infinity before the first."""
-        return float(self._rows[-1][0]) if self._rows else -math.inf
+        return float(self._samples[-1].stamp_s) if self._samples else -math.inf
 
-    def _tables(self) -> FloatArray:
-        if self._table is None:
-            self._table = self._build()
-        return self._table
+    @property
+    def readings(self) -> Readings:
+        """All samples as arrays; there must be one."""
+        if self._cached is None:
+            self._cached = self._build()
+        return self._cached
 
-    def _build(self) -> FloatArray:
-        """Columns: stamp, displacement 3, unwrapped rpy 3, tof, h, baro, valid, velocity 3, sign 3, its integral 3,
-        frozen."""
-        rows = np.array(self._rows)
-        stamp, velocity = rows[:, 0], _filled(rows[:, 1:4])
-        rpy = np.unwrap(_filled(rows[:, 4:7]), axis=0)
-        direction = np.sign(np.where(np.abs(velocity) > 1e-6, velocity, 0.0))
+    def _build(self) -> Readings:
+        samples = self._samples
+
+        def column(name: str) -> FloatArray:
+            return np.array([getattr(s, name) for s in samples], dtype=np.float64)
+
+        stamp, told, raw_rpy = column("stamp_s"), column("velocity_m_s"), column("rpy_rad")
+        velocity, rpy = _filled(told), np.unwrap(_filled(raw_rpy), axis=0)
+        sign = np.sign(np.where(np.abs(velocity) > 1e-6, velocity, 0.0))
         if self._body:
             R = Rotation.from_euler("ZYX", rpy[:, ::-1])
-            velocity, direction = R.apply(velocity), R.apply(direction)
-        frozen = _frozen(stamp, rows[:, 1:7])
-        valid = np.isfinite(rows[:, 1:4]).all(axis=1) & np.logical_not(frozen)
-        told = [_integral(stamp, velocity), rpy, rows[:, 7:10], valid, velocity]
-        return np.column_stack([stamp, *told, direction, _integral(stamp, direction), frozen])
+            velocity, sign = R.apply(velocity), R.apply(sign)
+        return Readings(
+            stamp_s=stamp,
+            velocity=velocity,
+            path=_integral(stamp, velocity),
+            sign=sign,
+            sign_path=_integral(stamp, sign),
+            rpy=rpy,
+            tof=column("tof_m"),
+            height=column("height_m"),
+            baro=column("baro_m"),
+            has_velocity=np.asarray(np.isfinite(told).all(axis=1)),
+            frozen=_frozen(stamp, told, raw_rpy),
+        )
 
     def displacement(self, stamps_s: FloatArray, shortfall_m_s: float = 0.0) -> FloatArray:
         """Integrated velocity [m] in the power-on world, shape ``(N, 3)``; only differences mean anything.
@@ -83,31 +127,30 @@ class TelemetryTrack:
             stamps_s: Times ``(N,)`` [s].
             shortfall_m_s: Added to the size of every reading that is not zero: half a step when the drone truncates.
         """
-        table = self._tables()
-        if len(table) < 2:
+        if len(self._samples) < 2:
             return np.zeros((len(stamps_s), 3))
-        stamp = table[:, 0]
-        path = table[:, 1:4] + shortfall_m_s * table[:, 17:20]
-        velocity = table[:, 11:14] + shortfall_m_s * table[:, 14:17]
+        told = self.readings
+        stamp = told.stamp_s
+        path = told.path + shortfall_m_s * told.sign_path
+        velocity = told.velocity + shortfall_m_s * told.sign
         inside = np.clip(stamps_s, stamp[0], stamp[-1])
         beyond = np.clip(np.asarray(stamps_s) - stamp[-1], 0.0, _PACKET_S)  # one packet ahead at the last velocity
         return _hermite(stamp, path, velocity, inside) + beyond[:, None] * velocity[-1]
 
     def attitude(self, stamps_s: FloatArray) -> FloatArray:
         """Body to power-on world ``(N, 3, 3)``."""
-        table = self._tables()
-        rpy = np.stack([np.interp(stamps_s, table[:, 0], table[:, 4 + i]) for i in range(3)], axis=-1)
+        told = self.readings
+        rpy = np.stack([np.interp(stamps_s, told.stamp_s, angle) for angle in told.rpy.T], axis=-1)
         if len(rpy) == 1:
             return matrix_from_rpy(rpy[0])[None]
         return Rotation.from_euler("ZYX", rpy[:, ::-1]).as_matrix()
 
-    def covered(self, from_s: FloatArray, to_s: FloatArray) -> FloatArray:
+    def covered(self, from_s: FloatArray, to_s: FloatArray) -> NDArray[np.bool_]:
         """Whether each interval lies within readings without a hole, a frozen stretch or a missing velocity."""
-        if len(self._rows) < 2:
+        if len(self._samples) < 2:
             return np.zeros(len(from_s), dtype=bool)
-        table = self._tables()
-        stamp = table[:, 0]
-        bad = (np.diff(stamp) > self._max_gap_s) | (table[1:, 10] == 0) | (table[:-1, 10] == 0)
+        stamp, valid = self.readings.stamp_s, self.readings.valid
+        bad = (np.diff(stamp) > self._max_gap_s) | ~valid[1:] | ~valid[:-1]
         count = np.concatenate([[0], np.cumsum(bad)])  # holes before each reading
         first = np.searchsorted(stamp, from_s, side="right") - 1
         last = np.searchsorted(stamp, to_s, side="left")
@@ -122,12 +165,12 @@ class TelemetryTrack:
         truncating drone then reads 0 over two steps, so twice as often as +1 or -1, a rounding one over one step. A
         recorded flight has 92 zeros to 90 readings of one step: odds of 90 000 to 1, against the prior of 1 to 55.
         """
-        if len(self._rows) < 20:
+        if len(self._samples) < 20:
             return 0.0
-        table = np.array(self._rows)
-        stamp, steps = table[:, 0], np.rint(np.nan_to_num(table[:, 1:4]) / step_m_s)
+        stamp = self.readings.stamp_s
+        told = np.array([s.velocity_m_s for s in self._samples], dtype=np.float64)
         log_odds = _TRUNCATION_PRIOR
-        for v in steps.T:
+        for v in np.rint(np.nan_to_num(told) / step_m_s).T:
             far = np.flatnonzero(np.abs(v) >= 3)
             for i, j in zip(far[:-1], far[1:], strict=True):
                 if v[i] * v[j] < 0 and j - i > 1 and stamp[j] - stamp[i] < 4.0:
@@ -138,38 +181,36 @@ class TelemetryTrack:
     @property
     def has_attitude(self) -> bool:
         """Whether any sample tells roll, pitch and yaw."""
-        return any(np.isfinite(row[4:7]).all() for row in self._rows)
+        return any(np.isfinite(sample.rpy_rad).all() for sample in self._samples)
 
     def warnings(self) -> list[str]:
         """What the readings alone give away, in sentences."""
-        if len(self._rows) < 2:
+        if len(self._samples) < 2:
             return []
-        table = self._tables()
-        frozen = table[:, 20] != 0
+        frozen = self.readings.frozen
         if not frozen.any():
             return []
-        between = np.diff(table[:, 0])
+        between = np.diff(self.readings.stamp_s)
         length_s = float(between[frozen[1:] & frozen[:-1]].sum())
-        first_s = float(table[np.argmax(frozen), 0])
+        first_s = float(self.readings.stamp_s[np.argmax(frozen)])
         return [
             f"telemetry repeats one message to the bit for {length_s:.1f} s in all, first at {first_s:.1f} s: ignored"
         ]
 
     def heights(self) -> dict[str, tuple[FloatArray, FloatArray]]:
         """Readings of each height source: name to (stamps, metres above floor or take-off)."""
-        if not self._rows:
+        if not self._samples:
             return {}
-        table = self._tables()
-        lean = np.cos(table[:, 4]) * np.cos(table[:, 5])
+        told = self.readings
+        lean = np.cos(told.rpy[:, 0]) * np.cos(told.rpy[:, 1])
         sources = {}
-        for column, name in ((7, "tof"), (8, "h"), (9, "baro")):
-            z = table[:, column]
-            good = np.isfinite(z) & (table[:, 20] == 0)
+        for name, z in (("tof", told.tof), ("h", told.height), ("baro", told.baro)):
+            good = np.isfinite(z) & ~told.frozen
             if name == "tof":
                 # 10 cm on the ground, 65.53 m beyond reach, and a slanted ray when the drone leans.
                 good &= (z > 0.15) & (z < 8.0) & np.logical_not(lean < _UPRIGHT)
             if good.any():
-                sources[name] = (table[good, 0], z[good])
+                sources[name] = (told.stamp_s[good], z[good])
         return sources
 
 
@@ -210,9 +251,9 @@ def _hermite(stamp: FloatArray, p: FloatArray, v: FloatArray, at: FloatArray) ->
     return start + s**2 * ((3.0 - 2.0 * s) * p[left + 1] - (1.0 - s) * step * v[left + 1])
 
 
-def _frozen(stamp: FloatArray, readings: FloatArray) -> FloatArray:
+def _frozen(stamp: FloatArray, velocity: FloatArray, rpy: FloatArray) -> NDArray[np.bool_]:
     """Which readings belong to a run of identical ones, not all zero, that is too long to be flight."""
-    same = (readings[1:] == readings[:-1]).all(axis=1)
+    same = (velocity[1:] == velocity[:-1]).all(axis=1) & (rpy[1:] == rpy[:-1]).all(axis=1)
     run = np.concatenate([[0], np.cumsum(~same)])
     first, last = np.searchsorted(run, run, side="left"), np.searchsorted(run, run, side="right") - 1
-    return (readings[:, :3] != 0).any(axis=1) & (stamp[last] - stamp[first] > _FROZEN_S)
+    return (velocity != 0).any(axis=1) & (stamp[last] - stamp[first] > _FROZEN_S)

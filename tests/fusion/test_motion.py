@@ -6,6 +6,7 @@ import pytest
 
 from edgeslam_torch.fusion.config import FusionConfig
 from edgeslam_torch.fusion.motion import MotionFusion
+from edgeslam_torch.fusion.visual_memory import VisualPose
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.synthetic.flights.flight import camera_on_body
 from edgeslam_torch.synthetic.flights.telemetry import EXACT, TelemetryFaults, simulate
@@ -168,13 +169,13 @@ def test_prediction_bridges_lost_vision(rng, swinging, replay, gap_s):
             still.append(np.linalg.norm(gauge.T_m_c[j][:3, 3] - gauge.T_m_c[i][:3, 3]))
 
     def probe(fusion, gauge, motion, j, t):
-        saved = fusion._last, fusion._previous
-        fusion._last = type(saved[0])(float(motion.stamps_s[j]), gauge.T_m_c[j], gauge.sigma_t, gauge.sigma_r)
-        fusion._previous = type(saved[0])(
-            float(motion.stamps_s[j - 1]), gauge.T_m_c[j - 1], gauge.sigma_t, gauge.sigma_r
+        memory = fusion._memory
+        saved = memory.last, memory.previous
+        memory.last, memory.previous = (
+            VisualPose(float(motion.stamps_s[k]), gauge.T_m_c[k], gauge.sigma_t, gauge.sigma_r) for k in (j, j - 1)
         )
         T = fusion.predict(t).T_w_c
-        fusion._last, fusion._previous = saved
+        memory.last, memory.previous = saved
         return T
 
     for i, t in enumerate(motion.stamps_s):

@@ -1,0 +1,97 @@
+"""Velocities and attitude held against the images, at the delay in use and at others."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from edgeslam_torch.fusion.alignment import map_to_world, turns
+from edgeslam_torch.fusion.config import FusionConfig
+from edgeslam_torch.fusion.delay import GROWTH, MIN_DISPLACEMENTS, Delay
+from edgeslam_torch.fusion.plausibility import Agreement, Reading, Trust, Verdict, agreement
+from edgeslam_torch.fusion.track import TelemetryTrack
+from edgeslam_torch.fusion.visual_memory import VisualMemory
+from edgeslam_torch.types import FloatArray
+
+_WIDE_DELAYS_S = (-3.0, 3.0)
+_WIDE_STEP_S = 0.1
+"""Delays beyond those allowed are looked at where telemetry does not fit well: a wrong clock is said, not used."""
+_FIXED_REACH_S = 0.15
+"""A configured delay may be so far off before the clock is called wrong."""
+_FITS_WELL = 0.9
+_MUCH_LIKELIER = 6.0
+"""Log likelihood ratio; half the intervals count as independent."""
+_LEAST_TURN_RAD_S = math.radians(2.0)
+"""Whole degrees twice a second are noise below."""
+
+
+@dataclass(frozen=True, slots=True)
+class Present:
+    """What a comparison needs to know of the moment."""
+
+    memory: VisualMemory
+    track: TelemetryTrack
+    R_b_c: FloatArray
+    """Camera in the body ``(3, 3)``."""
+    rough_scale: float | None
+    """Metres per map unit, for what counts as motion."""
+
+
+class Comparison:
+    """Passes verdicts on velocities and attitude to `Trust`; remembers when it last looked at other delays."""
+
+    def __init__(self, config: FusionConfig) -> None:
+        self._config = config
+        self._looked_wide_at = 0
+
+    def judge(self, trust: Trust, present: Present, delay: Delay, R_w_m: FloatArray) -> None:
+        """Compare at the delay in use and, if that fits badly, at others."""
+        used = self._compared(present, delay.value_s, R_w_m)
+        for reading, found in used.items():
+            trust.judge(reading, found)
+        now, n = used[Reading.VELOCITY], present.memory.count
+        if now.correlation >= _FITS_WELL:
+            trust.elsewhere_s = None
+        elif now.count >= MIN_DISPLACEMENTS and n >= GROWTH * self._looked_wide_at:
+            self._looked_wide_at = n
+            trust.elsewhere_s = self._fits_elsewhere(present, now, delay.value_s)
+
+    def _fits_elsewhere(self, present: Present, now: Agreement, used_s: float) -> float | None:
+        """The delay at which telemetry surely fits better than now, if that is one which is not allowed."""
+        fixed = self._config.delay_s
+        low, high = self._config.delay_range_s if fixed is None else (fixed - _FIXED_REACH_S, fixed + _FIXED_REACH_S)
+        best, best_s = now, used_s
+        for delay_s in np.arange(_WIDE_DELAYS_S[0], _WIDE_DELAYS_S[1] + 1e-9, _WIDE_STEP_S).tolist():
+            R = map_to_world(present.memory.sightings(), present.track, delay_s, present.R_b_c)
+            found = None if R is None else self._compared(present, delay_s, R)[Reading.VELOCITY]
+            if found is not None and found.count >= now.count // 2 and found.correlation > best.correlation:
+                best, best_s = found, delay_s
+        left, left_now = (1.0 - max(a.correlation, 0.0) ** 2 for a in (best, now))
+        likelier = 0.25 * now.count * math.log(left_now / max(left, 1e-6))
+        sure = best.verdict is Verdict.AGREES and likelier > _MUCH_LIKELIER
+        return best_s if sure and not low <= best_s <= high else None
+
+    def _compared(self, present: Present, delay_s: float, R_w_m: FloatArray) -> dict[Reading, Agreement]:
+        """How velocities and attitude go with the images under one delay.
+
+        Without the camera's lever: where velocities say nothing, turns must not speak for them.
+        """
+        track = present.track
+        moved = present.memory.displacements()
+        use = track.covered(moved.from_s - delay_s, moved.to_s - delay_s)
+        if not use.any():
+            return {Reading.VELOCITY: Agreement()}
+        moved = moved.only(use)
+        duration = moved.duration_s[:, None]
+        moved = moved.on_telemetry_clock(delay_s)
+        told = track.displacement(moved.to_s) - track.displacement(moved.from_s)
+        slow = self._config.min_speed_m_s
+        least_seen = math.inf if present.rough_scale is None else 2.0 * slow / present.rough_scale
+        velocity = agreement(moved.moved @ R_w_m.T / duration, told / duration, least_seen, slow)
+        found = {Reading.VELOCITY: velocity}
+        if track.has_attitude:
+            both = turns(moved, track, present.R_b_c)
+            seen, told = (Rotation.from_matrix(R).as_rotvec() / duration for R in (both.seen, both.told))
+            found[Reading.ATTITUDE] = agreement(seen, told, _LEAST_TURN_RAD_S, 1.5 * _LEAST_TURN_RAD_S)
+        return found
