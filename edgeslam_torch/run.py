@@ -61,7 +61,8 @@ class Mode(StrEnum):
 class Slam(Protocol):
     """What the loop needs of `EdgeSlam`."""
 
-    events: dict[str, int]
+    @property
+    def events(self) -> dict[str, int]: ...
 
     def prepare(self, frame: Frame) -> Any:
         """What can be done with a frame before the frames before it are through."""

@@ -14,7 +14,7 @@ LINKED = ("models", "losses", "train", "eval")
 """Folders at the root that are parts of the package, by links where the checkout has them."""
 
 LAYERS: tuple[tuple[str, ...], ...] = (
-    ("errors", "types"),
+    ("errors", "types", "stage_times"),
     ("files",),
     ("geometry", "config"),
     ("models", "synthetic"),
@@ -24,6 +24,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("map",),
     ("mapping",),
     ("tracking",),
+    ("states",),
     ("slam",),
     ("drone", "calibration"),
     ("readers",),

@@ -15,7 +15,8 @@ from edgeslam_torch.errors import SourceError
 from edgeslam_torch.eval.metrics.align import umeyama
 from edgeslam_torch.fusion.published import T_LEVEL
 from edgeslam_torch.geometry import se3
-from edgeslam_torch.slam import AFTER_LOSS, EdgeSlam
+from edgeslam_torch.slam import EdgeSlam
+from edgeslam_torch.states.starting import AFTER_LOSS
 from edgeslam_torch.types import DepthMap, Frame, FrameStatus, TelemetrySample, Units
 
 NO_NETWORK = SlamConfig(depth=DepthConfig(weights="none"))
@@ -414,7 +415,7 @@ def test_a_frozen_video_says_so_and_is_no_evidence_for_the_scale(monkeypatch):
     frozen = [replace(frames[-1], index=24 + k, stamp_s=frames[-1].stamp_s + (k + 1) / 30) for k in range(15)]
     slam = EdgeSlam(CAMERA, NO_NETWORK)
     told = []
-    monkeypatch.setattr(slam._fusion, "add_visual", lambda stamp_s, *rest, **more: told.append(stamp_s))
+    monkeypatch.setattr(slam._system.fusion, "add_visual", lambda stamp_s, *rest, **more: told.append(stamp_s))
     outputs = [slam.step(frame) for frame in [*frames, *frozen]]
     assert all("repeats the one before" in o.reason for o in outputs[24:])
     assert not any("repeats" in o.reason for o in outputs[:24])

@@ -1,0 +1,101 @@
+"""From a frame that became a keyframe to its part in the map: image, depth, anchors, refinement, edges.
+
+At once, or on the one thread of an executor while the next frames are tracked.
+"""
+
+from concurrent.futures import Executor, Future
+from dataclasses import dataclass
+
+from edgeslam_torch.frontend.depth_check import CheckedDepth
+from edgeslam_torch.frontend.image import as_grey, colours_at
+from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.map.keyframe import Keyframe
+from edgeslam_torch.mapping.edge_map import EdgeMap
+from edgeslam_torch.mapping.mapper import Mapper
+from edgeslam_torch.stage_times import timed
+from edgeslam_torch.types import FloatArray, Frame
+
+
+@dataclass(frozen=True, slots=True)
+class Mapped:
+    """Keyframes whose mapping is done."""
+
+    keyframes: list[Keyframe]
+    T_tracked: FloatArray
+    """``T_c_w`` of the newest before refinement ``(4, 4)``."""
+    stage_ms: dict[str, float]
+
+
+class MappingPipeline:
+    """Maps keyframes, one lot at a time.
+
+    Args:
+        mapper: Anchors and refinement.
+        edges: Edge map.
+        camera: Of the frames.
+        depth: Depth network, if there is one.
+        executor: With one thread, for real time; None to map at once.
+    """
+
+    def __init__(
+        self,
+        mapper: Mapper,
+        edges: EdgeMap,
+        camera: Camera,
+        depth: CheckedDepth | None,
+        executor: Executor | None,
+    ) -> None:
+        self.mapper = mapper
+        self.edges = edges
+        self.camera = camera
+        self.depth = depth
+        self.has_depth = False
+        """Whether the depth network has said something usable yet."""
+        self._executor = executor
+        self._pending: Future[Mapped] | None = None
+
+    @property
+    def busy(self) -> bool:
+        """Whether keyframes are being mapped, or are mapped and not yet collected."""
+        return self._pending is not None
+
+    def submit(self, new: list[tuple[Frame, Keyframe]]) -> Mapped | None:
+        """Map keyframes that were put into the map; None when that happens while others go on."""
+        if self._executor is None:
+            return self._run(new)
+        self._pending = self._executor.submit(self._run, new)
+        return None
+
+    def collect(self, wait: bool = False) -> Mapped | None:
+        """What was submitted, once it is done; None before, or when nothing was."""
+        if self._pending is None or not (wait or self._pending.done()):
+            return None
+        pending, self._pending = self._pending, None
+        return pending.result()
+
+    def close(self) -> None:
+        """Stop the executor."""
+        if self._executor is not None:
+            self._executor.shutdown(wait=True, cancel_futures=True)
+
+    def look(self, frame: Frame, keyframe: Keyframe) -> None:
+        """Give a keyframe its undistorted image and depth."""
+        keyframe.image = self.camera.undistort_image(frame.image)
+        keyframe.grey = as_grey(keyframe.image)
+        keyframe.depth = None if self.depth is None else self.depth(keyframe.image, self.camera)
+        self.has_depth = self.has_depth or keyframe.depth is not None
+
+    def _run(self, new: list[tuple[Frame, Keyframe]]) -> Mapped:
+        """The only thing that runs on the executor."""
+        stage_ms: dict[str, float] = {}
+        T_tracked = new[-1][1].T_c_w
+        for frame, keyframe in new:
+            with timed(stage_ms, "depth"):
+                self.look(frame, keyframe)
+            assert keyframe.image is not None
+            with timed(stage_ms, "mapping"):
+                self.mapper.insert(keyframe, colours_at(keyframe.image, keyframe.features.uv))
+            with timed(stage_ms, "edges"):
+                self.edges.announce(keyframe)
+                self.edges.update()
+        return Mapped([k for _, k in new], T_tracked, stage_ms)

@@ -1,0 +1,55 @@
+"""The pose is a prediction: every frame searches the keyframes, and after a while a new piece of map is begun."""
+
+import numpy as np
+
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.states.machine import Event, Machine
+from edgeslam_torch.states.starting import AFTER_LOSS, Starting
+from edgeslam_torch.states.step import Step
+from edgeslam_torch.states.system import MIN_KEYPOINTS, System
+from edgeslam_torch.states.tracking import Tracking
+from edgeslam_torch.tracking.lazy_view import LazyView
+from edgeslam_torch.tracking.tracker import View
+from edgeslam_torch.types import FloatArray, Frame, FrameStatus
+
+LOST_BEFORE_RESTART_S = 0.65
+"""Time without a pose after which a new piece of map is started from the predicted one."""
+
+
+class Lost:
+    """The state without a pose."""
+
+    def __init__(self, system: System, tracking: Tracking, starting: Starting) -> None:
+        self.system = system
+        self.tracking = tracking
+        self.starting = starting
+
+    def step(self, frame: Frame, seen: LazyView, machine: Machine) -> Step:
+        """Search for the frame; go on by prediction, or begin anew, where that fails."""
+        T_predicted = self.system.predict(frame.stamp_s, lost=True)
+        found = self.tracking.search(frame, seen, T_predicted, machine.lost_frames)
+        if found is None:
+            return self.miss(frame, seen.view, T_predicted, machine.lost_since_s)
+        self.system.events["relocalised"] += 1
+        self.system.motion.stop()
+        return found
+
+    def begin(self, frame: Frame, view: View) -> Step:
+        """The first frame that nothing says the place of."""
+        self.system.events["lost"] += 1
+        return self.miss(frame, view, self.system.predict(frame.stamp_s, lost=False), np.inf)
+
+    def miss(self, frame: Frame, view: View, T_predicted: FloatArray, lost_since_s: float) -> Step:
+        """Take the prediction, or begin a new piece of map there when the loss has lasted."""
+        system = self.system
+        system.motion.drift(T_predicted)
+        system.fusion.add_visual(frame.stamp_s, se3.inverse(T_predicted), np.inf, np.inf, tracked=False)
+        seen = len(view.features.uv)
+        # With nothing to come back to, as after dark first images, what starts a map at first starts one now.
+        enough = 2 * MIN_KEYPOINTS if len(system.map.anchors) > 0 else MIN_KEYPOINTS
+        if frame.stamp_s - lost_since_s >= LOST_BEFORE_RESTART_S and seen >= enough:
+            system.events["restarted"] += 1
+            system.motion.stop()
+            return self.starting.begin(frame, view, AFTER_LOSS)
+        reason = f"only {seen} keypoints" if seen < MIN_KEYPOINTS else "too few keypoints agree with the map"
+        return Step(Event.NOTHING, system.map.latest(), FrameStatus.PREDICTED, reason)

@@ -1,0 +1,174 @@
+"""A piece of map begins: depths are guessed at its first keyframe, until two views or a changed view let it stand."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from edgeslam_torch.frontend.image import colours_at
+from edgeslam_torch.map.depth_prior import sample
+from edgeslam_torch.map.keyframe import Keyframe, make_keyframe
+from edgeslam_torch.optim.problem import LmConfig
+from edgeslam_torch.states.machine import Event
+from edgeslam_torch.states.step import Step
+from edgeslam_torch.states.system import MIN_KEYPOINTS, System
+from edgeslam_torch.states.tracking import Tracking
+from edgeslam_torch.tracking.bootstrap import Bootstrap, StartedMap
+from edgeslam_torch.tracking.initialiser import TwoView
+from edgeslam_torch.tracking.lazy_view import LazyView
+from edgeslam_torch.tracking.relocaliser import relocalise
+from edgeslam_torch.tracking.tracker import Track, View
+from edgeslam_torch.types import FloatArray, Frame, FrameStatus
+
+ADOPT_SHARE = 0.6
+"""When fewer of the first keyframe's points agree than this share of the most so far, the view has changed: the map
+that the depth network made is taken as it is, since parallax may never come (a turn, a climb, a hover). At 0.4 two
+views come first on redkitchen and its map is better (median 3.7 against 4.2 cm); on bare boards they come first in
+some seeds, and are wrong (ATE .011 to .030 m; .0105 in all five seeds at 0.6)."""
+
+MIN_INLIERS = 15
+"""Fewer of the first keyframe's points than this could agree with a wrong pose: it is out of sight."""
+
+HANDOVER_INLIERS = 50
+"""When fewer of the first keyframe's points are left before the map stands, the next attempt starts from here."""
+
+MOST_WAITING_IN_REAL_TIME = 3
+"""Frames between the first two views that become keyframes in real time; while they are mapped, no other can be."""
+
+FIRST_FRAME = "first frame, depth guessed"
+AFTER_LOSS = "new piece of map after loss: pose predicted, depth guessed"
+"""How a piece of map is begun, in words."""
+
+DEPTH_MAP = "map from the depth network, no parallax yet"
+
+
+class Starting:
+    """The state before a map stands.
+
+    Args:
+        system: Shared parts.
+        tracking: Takes over once the map stands.
+        lm: Solver settings.
+        realtime: Fewer frames wait for the map to stand.
+    """
+
+    def __init__(self, system: System, tracking: Tracking, lm: LmConfig, realtime: bool) -> None:
+        self.system = system
+        self.tracking = tracking
+        self.lm = lm
+        self.config = system.config.initialisation
+        if realtime:
+            most = min(MOST_WAITING_IN_REAL_TIME, self.config.most_keyframes)
+            self.config = replace(self.config, most_keyframes=most)
+        self._attempt: Bootstrap | None = None
+
+    def begin(self, frame: Frame, view: View, reason: str) -> Step:
+        """Begin a piece of map at the present pose with guessed depths.
+
+        Args:
+            frame: Present frame.
+            view: Its features.
+            reason: How the piece is begun, in words.
+        """
+        system, slam_map = self.system, self.system.map
+        system.collect(wait=True)
+        self.tracking.forget()
+        if self._attempt is not None:
+            self._attempt.forget_guess()
+            self._attempt = None
+        T_c_w = system.motion.T_c_w
+        keyframe = make_keyframe(slam_map.next_keyframe_id(), frame.index, frame.stamp_s, T_c_w, view.features)
+        if len(view.features.uv) < MIN_KEYPOINTS:
+            if not slam_map.keyframes:  # something for the poses to hang on
+                slam_map.begin_piece(reason)
+                slam_map.add_keyframe(keyframe)
+            reason = f"only {len(view.features.uv)} keypoints, waiting for texture"
+            return Step(Event.NO_TEXTURE, slam_map.latest(), FrameStatus.LOST, reason)
+        with system.timed("depth"):
+            system.mapping.look(frame, keyframe)
+        guess = self._guess_depth(keyframe)
+        slam_map.begin_piece(reason)
+        colour = colours_at(keyframe.image, view.features.uv)
+        self._attempt = Bootstrap(slam_map, system.tracker, self.config, keyframe, guess, colour, system.config.seed)
+        slam_map.remove_empty_keyframes()
+        return Step(Event.BEGUN, keyframe, FrameStatus.STARTING, reason, is_keyframe=True)
+
+    def step(self, frame: Frame, seen: LazyView) -> Step:
+        """Follow the guessed depths and try to put a better map in their place."""
+        attempt = self._attempt
+        assert attempt is not None
+        view = seen.view
+        with self.system.timed("tracking"):
+            track = self._track(attempt, frame, view)
+        if track is None or track.inliers < MIN_INLIERS:
+            self.system.events["restarted"] += 1
+            self.system.motion.stop()
+            return self.begin(frame, view, "lost sight of the first keyframe before parallax sufficed")
+        self.system.motion.move(frame.stamp_s, track.T_c_w)
+        with self.system.timed("initialisation"):
+            two_view = attempt.two_views(frame.index, view, track)
+            if two_view.ok:
+                two_view = attempt.confirm(view, two_view)
+                self.system.events["initialisations_refused"] += not two_view.ok
+        if two_view.ok:
+            with self.system.timed("mapping"), self.system.map.lock:
+                started = attempt.replace_map(frame, view, two_view, self.lm)
+            return self._stands(frame, seen, started, "two views", track, two_view)
+        if track.inliers < ADOPT_SHARE * attempt.most_matched and attempt.reference.depth is not None:
+            with self.system.timed("mapping"), self.system.map.lock:
+                started = attempt.adopt(frame, view, track)
+            return self._stands(frame, seen, started, DEPTH_MAP, track, two_view)
+        attempt.wait(frame, view, track)
+        if track.inliers < HANDOVER_INLIERS:
+            return self.begin(frame, view, "first keyframe out of sight before parallax sufficed")
+        reason = f"initialising: {two_view.reason}"
+        return Step(
+            Event.WAITING, attempt.reference, FrameStatus.STARTING, reason, track, parallax_rad=two_view.parallax_rad
+        )
+
+    def _track(self, attempt: Bootstrap, frame: Frame, view: View) -> Track | None:
+        system = self.system
+        T_predicted = system.predict(frame.stamp_s, lost=False)
+        track = attempt.track(view, T_predicted, system.expectation(frame.stamp_s, T_predicted))
+        if track is None or track.inliers < system.config.tracking.min_inliers:  # a fast turn: look everywhere
+            track = relocalise(system.tracker, view, T_predicted, 1, 0)
+        return track
+
+    def _stands(
+        self, frame: Frame, seen: LazyView, started: StartedMap, reason: str, track: Track, two_view: TwoView
+    ) -> Step:
+        """Hand over to tracking, with a map that stands."""
+        assert self._attempt is not None
+        reference, keyframe = self._attempt.reference, started.new[-1][1]
+        self._attempt = None
+        system = self.system
+        system.log.replace(started.T_c_w, [reference, *(k for _, k in started.new)])
+        system.motion.T_c_w = started.T_c_w[max(started.T_c_w)]
+        system.motion.move(frame.stamp_s, keyframe.T_c_w)
+        system.edges.announce(reference)
+        system.compare_depth(reference)
+        self.tracking.begin(seen, started.new)
+        return Step(
+            Event.MAP_STANDS, keyframe, FrameStatus.INITIALISED, reason, track, two_view.parallax_rad, is_keyframe=True
+        )
+
+    def _guess_depth(self, keyframe: Keyframe) -> FloatArray:
+        """Depth [map units] of every keypoint before anything is triangulated and its log sigma, ``(N, 2)``."""
+        guess = np.full((len(keyframe.features.uv), 2), self.system.config.depth.prior_sigma_log)
+        network_m, sigma_log = np.full((2, len(guess)), np.nan)
+        if keyframe.depth is not None:
+            network_m, sigma_log = sample(keyframe.depth, keyframe.features.uv)
+        known = np.isfinite(network_m)
+        if not known.any():
+            guess[:, 0] = self._earlier_depth()
+            return guess
+        guess[:, 0] = np.where(known, network_m, np.nanmedian(network_m)) / self.system.published.scale
+        guess[known, 1] = sigma_log[known]
+        return guess
+
+    def _earlier_depth(self) -> float:
+        """Median distance of what was triangulated before from the newest keyframe [map units]; 1 where nothing was."""
+        anchors, latest = self.system.map.anchors, self.system.map.latest
+        earlier = np.flatnonzero(anchors.alive & ~anchors.from_depth)
+        if len(earlier) == 0:
+            return 1.0
+        return float(np.median(np.linalg.norm(anchors.p_w[earlier] - latest().centre_w, axis=1)))

@@ -1,0 +1,44 @@
+"""What one frame brought, as the states hand it over."""
+
+from dataclasses import dataclass
+
+from edgeslam_torch.map.keyframe import Keyframe
+from edgeslam_torch.states.machine import Event
+from edgeslam_torch.tracking.tracker import Track, View
+from edgeslam_torch.types import FloatArray, FrameStatus
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One frame's ending."""
+
+    event: Event
+    keyframe: Keyframe
+    """That the frame's pose is tied to."""
+    status: FrameStatus
+    reason: str = ""
+    """Why the status is what it is, in words."""
+    track: Track | None = None
+    parallax_rad: float = 0.0
+    is_keyframe: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Located:
+    """A frame with its place in the map."""
+
+    track: Track
+    reference: Keyframe
+    parallax_rad: float
+    """Median ray angle to the reference."""
+    due: bool
+    """It should become a keyframe."""
+    uv: FloatArray
+    """``(M, 2)`` undistorted pixels of the track's inliers."""
+    inv_sigma: FloatArray
+    """``(M,)`` their inverse standard deviations [1/px]."""
+    view: View | None = None
+    """Its features, if it was matched; without them it cannot become a keyframe."""
+    relocalised: bool = False
+    edges: int = 0
+    """Edge points that had a part in the pose."""

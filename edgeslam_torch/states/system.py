@@ -1,0 +1,122 @@
+"""What all states work on: map, motion, metres, and the making of keyframes."""
+
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from edgeslam_torch.config import SlamConfig
+from edgeslam_torch.fusion.motion import MotionFusion
+from edgeslam_torch.fusion.published import Published
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.map.depth_prior import fit_to_anchors, sample
+from edgeslam_torch.map.keyframe import Keyframe
+from edgeslam_torch.map.slam_map import SlamMap
+from edgeslam_torch.map.trajectory import TrajectoryLog
+from edgeslam_torch.mapping.edge_map import EdgeMap
+from edgeslam_torch.mapping.pipeline import Mapped, MappingPipeline
+from edgeslam_torch.optim.problem import PosePrior
+from edgeslam_torch.stage_times import timed
+from edgeslam_torch.tracking.motion_model import MotionModel
+from edgeslam_torch.tracking.tracker import Track, Tracker
+from edgeslam_torch.types import FloatArray, Frame
+
+MIN_KEYPOINTS = 100
+"""Fewer keypoints than this cannot start a map."""
+
+UNKNOWN_SIGMA = 0.01
+"""Standard deviation of a visual pose [map units, rad] whose solver could not tell it."""
+
+
+@dataclass(slots=True)
+class System:
+    """The parts that outlive a state; a state changes them only through what they offer."""
+
+    camera: Camera
+    config: SlamConfig
+    map: SlamMap
+    log: TrajectoryLog
+    tracker: Tracker
+    edges: EdgeMap
+    mapping: MappingPipeline
+    fusion: MotionFusion
+    motion: MotionModel
+    published: Published = field(default_factory=Published)
+    events: dict[str, int] = field(
+        default_factory=lambda: {"lost": 0, "relocalised": 0, "restarted": 0, "initialisations_refused": 0}
+    )
+    """Counts of what went wrong and was mended."""
+    has_telemetry: bool = False
+    keyframe_s: float = -np.inf
+    """Stamp of the newest keyframe."""
+    shows_nothing_new: bool = False
+    """Whether the present image repeats the one before."""
+    stage_ms: dict[str, float] = field(default_factory=dict)
+    """Of the present frame."""
+
+    def timed(self, stage: str) -> AbstractContextManager[None]:
+        """Add the time spent inside to a stage of the present frame."""
+        return timed(self.stage_ms, stage)
+
+    # -- motion ------------------------------------------------------------------------------------------------
+
+    def predict(self, stamp_s: float, lost: bool) -> FloatArray:
+        """``T_c_w`` expected at a stamp: constant velocity over short gaps, telemetry over long ones."""
+        if self.has_telemetry and (lost or self.motion.stands):
+            estimate = self.fusion.predict(stamp_s)
+            if estimate is not None:
+                return se3.inverse(estimate.T_w_c)
+        return self.motion.predict(stamp_s)
+
+    def expectation(self, stamp_s: float, T_predicted: FloatArray) -> PosePrior | None:
+        """The predicted pose with what accelerations allow it to be off; None where nothing tells metres."""
+        if not self.mapping.has_depth:
+            return None
+        return self.motion.expectation(stamp_s, T_predicted, self.published.scale)
+
+    def see(self, stamp_s: float, track: Track) -> None:
+        """Tell the fusion what the image said, and publish what follows for the scale."""
+        if self.shows_nothing_new:
+            return
+        variance = np.diag(track.covariance)
+        known = bool(np.isfinite(variance).all())
+        sigma_t = float(np.sqrt(np.mean(variance[:3]))) if known else UNKNOWN_SIGMA
+        sigma_r = float(np.sqrt(np.mean(variance[3:]))) if known else UNKNOWN_SIGMA
+        T_w_c = se3.inverse(track.T_c_w)
+        with self.timed("fusion"):
+            self.fusion.add_visual(stamp_s, T_w_c, sigma_t, sigma_r)
+            self.published = self.published.revised(self.fusion.scale(), T_w_c[:3, 3])
+
+    # -- keyframes ---------------------------------------------------------------------------------------------
+
+    def map_keyframes(self, new: list[tuple[Frame, Keyframe]]) -> bool:
+        """Map keyframes that were put into the map, and whether that is done."""
+        self.keyframe_s = new[-1][1].stamp_s
+        return self.absorb(self.mapping.submit(new))
+
+    def collect(self, wait: bool = False) -> None:
+        """Take what real-time mapping has finished; with ``wait`` the map belongs to the caller alone afterwards."""
+        self.absorb(self.mapping.collect(wait))
+
+    def absorb(self, mapped: Mapped | None) -> bool:
+        """Carry the present pose along with what refinement did to the newest keyframe."""
+        if mapped is None:
+            return False
+        self.motion.correct(se3.inverse(mapped.T_tracked) @ mapped.keyframes[-1].T_c_w)
+        self.stage_ms.update(mapped.stage_ms)
+        for keyframe in mapped.keyframes:
+            self.compare_depth(keyframe)
+        return True
+
+    def compare_depth(self, keyframe: Keyframe) -> None:
+        """What the network's metres say about the map's units."""
+        if keyframe.depth is None:
+            return
+        held = keyframe.keypoints_with_anchor()
+        held = held[~self.map.anchors.from_depth[keyframe.anchor[held]]]  # their depth is the network's own word
+        p_w = self.map.anchors.p_w[keyframe.anchor[held]]
+        z = (p_w @ keyframe.T_c_w[:3, :3].T + keyframe.T_c_w[:3, 3])[:, 2]
+        fit = fit_to_anchors(sample(keyframe.depth, keyframe.features.uv[held])[0], z)
+        if fit is not None:
+            self.fusion.add_depth_ratio(-fit.log_ratio, fit.sigma_log)

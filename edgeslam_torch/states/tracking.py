@@ -1,0 +1,231 @@
+"""A frame finds its place in the map: by flow, by matching, by edges where points are few; some become keyframes."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from edgeslam_torch.map.keyframe import Keyframe, make_keyframe
+from edgeslam_torch.mapping.prior_anchors import depth_slack_px
+from edgeslam_torch.states.machine import Event
+from edgeslam_torch.states.step import Located, Step
+from edgeslam_torch.states.system import System
+from edgeslam_torch.tracking.edge_tracker import MIN_EDGES, EdgeTracker, PointsInFrame
+from edgeslam_torch.tracking.flow import FlowTracker, Followed, Template, join, template_of_keyframe, template_of_track
+from edgeslam_torch.tracking.keyframe_choice import few_matches, is_due, lost_most, lost_sight
+from edgeslam_torch.tracking.lazy_view import LazyView
+from edgeslam_torch.tracking.relocaliser import relocalise
+from edgeslam_torch.tracking.tracker import Track, View, median_parallax
+from edgeslam_torch.types import FloatArray, Frame, FrameStatus, IntArray
+
+FEW_INLIERS = 100
+"""Keypoints below which edges take part in a frame's pose: as many as start a map."""
+
+
+class Tracking:
+    """The states in which the map carries the pose, by points or by edges."""
+
+    def __init__(self, system: System) -> None:
+        self.system = system
+        self._flow = FlowTracker(
+            system.map, system.camera, system.config.orb, system.config.flow, system.config.tracking.min_inliers
+        )
+        self._edge_tracker = EdgeTracker(system.map, system.edges, system.camera)
+        self._template: Template | None = None
+        """What the next frames are followed from; none before there is a map."""
+        self._recent: IntArray = np.zeros(0, dtype=np.int64)
+        """Anchors that the last frame found, or the newest keyframe holds."""
+
+    @property
+    def needs_features(self) -> bool:
+        """Whether the next frame is matched by its keypoints, come what may."""
+        return self._template is None or not self.system.config.flow.enabled
+
+    def begin(self, seen: LazyView, new: list[tuple[Frame, Keyframe]]) -> None:
+        """Go on from keyframes of a map that has just begun to stand, the last one of the present frame."""
+        newest = new[-1][1]
+        self._recent = newest.anchor[newest.anchor >= 0]
+        self._follow_from(newest, seen)
+        self._map(new)
+
+    def forget(self) -> None:
+        """Follow nothing any more."""
+        self._template = None
+
+    def step(self, frame: Frame, seen: LazyView) -> Step | None:
+        """Find the frame near where it is expected; None when nothing says where it is."""
+        system = self.system
+        T_predicted = system.predict(frame.stamp_s, lost=False)
+        with system.map.lock:
+            with system.timed("tracking"):
+                followed = self._follow(seen, T_predicted, frame.stamp_s)
+            located = None if followed is None else self._locate_followed(followed, frame.stamp_s)
+            # While the worker is busy no keyframe can be made; matching then finds what it has mapped meanwhile.
+            if located is None or located.due:
+                matched = self._match(seen, T_predicted, followed, frame.stamp_s)
+                if matched is None and located is not None:  # in a blurred image flow finds what matching does not
+                    matched = replace(located, due=False)
+                located = matched
+            if located is None:
+                located = self._by_edges(frame, seen, T_predicted)
+            return None if located is None else self.arrive(frame, seen, T_predicted, located)
+
+    def search(self, frame: Frame, seen: LazyView, T_predicted: FloatArray, lost_frames: int) -> Step | None:
+        """Find a frame that may be anywhere, among the keyframes; None when none of those asked now shows it."""
+        with self.system.map.lock:
+            with self.system.timed("features"):
+                view = seen.view
+            with self.system.timed("tracking"):
+                track = self._relocalise(view, T_predicted, lost_frames)
+            if track is None:
+                return None
+            located = self._located(track, view, seen, frame.stamp_s, None, relocalised=True)
+            return self.arrive(frame, seen, T_predicted, located)
+
+    def arrive(self, frame: Frame, seen: LazyView, T_predicted: FloatArray, located: Located) -> Step:
+        """Take the place that was found for the frame's, and make it a keyframe if one is due."""
+        system = self.system
+        if located.track.inliers < FEW_INLIERS and not located.edges:
+            located = self._with_edges(frame, seen, T_predicted, located)
+        track, reference = located.track, located.reference
+        system.motion.move(frame.stamp_s, track.T_c_w)
+        self._recent = track.anchor if track.inliers else self._recent
+        system.see(frame.stamp_s, track)
+        keyframe = self._insert_keyframe(frame, seen, located) if located.due else None
+        if keyframe is not None and keyframe.id in system.map.keyframes:
+            reference = keyframe
+        return Step(
+            Event.POINTS if track.inliers else Event.EDGES,
+            reference,
+            FrameStatus.RELOCALISED if located.relocalised else FrameStatus.TRACKED,
+            _in_words(located),
+            track,
+            located.parallax_rad,
+            keyframe is not None,
+        )
+
+    # -- by points ---------------------------------------------------------------------------------------------
+
+    def _follow(self, seen: LazyView, T_predicted: FloatArray, stamp_s: float) -> Followed | None:
+        """By optical flow from the last keyframe."""
+        if self._template is None or not self.system.config.flow.enabled:
+            return None
+        return self._flow.follow(self._template, seen.grey, T_predicted, self.system.expectation(stamp_s, T_predicted))
+
+    def _locate_followed(self, followed: Followed, stamp_s: float) -> Located:
+        reference = self.system.map.keyframes.get(followed.keyframe_id, self.system.map.latest())
+        parallax_rad = self._parallax(followed.track, reference)
+        mapping = self.system.config.mapping
+        due = self._is_due(stamp_s, lost_sight(followed, mapping), parallax_rad, lost_most(followed, mapping))
+        inv_sigma = self.system.config.orb.scale_factor ** -followed.octave.astype(np.float64)
+        return Located(followed.track, reference, parallax_rad, due, followed.uv, inv_sigma)
+
+    def _match(
+        self, seen: LazyView, T_predicted: FloatArray, followed: Followed | None, stamp_s: float
+    ) -> Located | None:
+        """By the frame's own keypoints: where flow finds nothing, and what a keyframe needs."""
+        with self.system.timed("features"):
+            view = seen.view
+        with self.system.timed("tracking"):
+            track, relocalised = self._find(view, T_predicted, followed, stamp_s)
+        return None if track is None else self._located(track, view, seen, stamp_s, followed, relocalised)
+
+    def _located(
+        self, track: Track, view: View, seen: LazyView, stamp_s: float, followed: Followed | None, relocalised: bool
+    ) -> Located:
+        """The place of a frame that was matched; the next frames are followed from it."""
+        system = self.system
+        reference = system.tracker.local_keyframes(track.anchor)[0]
+        parallax_rad = self._parallax(track, reference)
+        few = few_matches(track, reference, system.map, system.config.mapping)
+        due = followed is not None or self._is_due(stamp_s, few, parallax_rad)
+        self._template = template_of_track(track, view, reference, seen.grey, system.camera)
+        uv, inv_sigma = view.features.uv[track.keypoint], view.inv_sigma[track.keypoint]
+        return Located(track, reference, parallax_rad, due, uv, inv_sigma, view, relocalised)
+
+    def _find(
+        self, view: View, T_predicted: FloatArray, followed: Followed | None, stamp_s: float
+    ) -> tuple[Track | None, bool]:
+        """Track where flow or the prediction says, else search the keyframes; and whether the search found it."""
+        tracker, expected = self.system.tracker, self.system.expectation(stamp_s, T_predicted)
+        if followed is not None:
+            track = tracker.track_near(view, followed.track.T_c_w, followed.track.anchor, expected)
+            return None if track is None else join(track, followed, view, self.system.config.orb.scale_factor), False
+        track = tracker.track(view, T_predicted, self._recent, expected)
+        if track is not None:
+            return track, False
+        track = self._relocalise(view, T_predicted, 0)
+        return track, track is not None
+
+    def _relocalise(self, view: View, T_predicted: FloatArray, lost_frames: int) -> Track | None:
+        tries = self.system.config.tracking.relocalisation_keyframes
+        return relocalise(self.system.tracker, view, T_predicted, tries, lost_frames)
+
+    # -- by edges ----------------------------------------------------------------------------------------------
+
+    def _by_edges(self, frame: Frame, seen: LazyView, T_predicted: FloatArray) -> Located | None:
+        """The pose from edges alone, where no point holds it."""
+        with self.system.timed("edges"):
+            expected = self.system.expectation(frame.stamp_s, T_predicted)
+            alone = self._edge_tracker.refine(seen.grey, T_predicted, None, expected)
+        if alone is None or not alone.is_fixed:
+            return None
+        none = np.zeros(0, dtype=np.int64)
+        track = Track(alone.T_c_w, none, none, none, none, alone.covariance)
+        return Located(track, self.system.map.latest(), 0.0, False, np.zeros((0, 2)), np.zeros(0), edges=alone.edges)
+
+    def _with_edges(self, frame: Frame, seen: LazyView, T_predicted: FloatArray, located: Located) -> Located:
+        """The pose from edges beside few points."""
+        system, anchor = self.system, located.track.anchor
+        slack = depth_slack_px(system.map.anchors, anchor, located.track.T_c_w, system.camera)
+        points = PointsInFrame(
+            system.map.anchors.p_w[anchor],
+            located.uv.astype(np.float64),
+            located.inv_sigma,
+            np.zeros((len(anchor), 2)) if slack is None else slack,
+        )
+        with system.timed("edges"):
+            expected = system.expectation(frame.stamp_s, T_predicted)
+            both = self._edge_tracker.refine(seen.grey, located.track.T_c_w, points, expected)
+        if both is None or both.edges < MIN_EDGES or both.points.mean() < 0.5:
+            return located
+        track = replace(located.track, T_c_w=both.T_c_w, covariance=both.covariance)
+        return replace(located, track=track, edges=both.edges)
+
+    # -- keyframes ---------------------------------------------------------------------------------------------
+
+    def _insert_keyframe(self, frame: Frame, seen: LazyView, located: Located) -> Keyframe | None:
+        """Map a new keyframe; None when real-time mapping is still busy with the last one."""
+        system = self.system
+        if system.mapping.busy or located.view is None:
+            system.events["keyframes_skipped"] = system.events.get("keyframes_skipped", 0) + 1
+            return None
+        track, features = located.track, located.view.features
+        keyframe = make_keyframe(system.map.next_keyframe_id(), frame.index, frame.stamp_s, track.T_c_w, features)
+        keyframe.anchor[track.keypoint] = track.anchor
+        system.map.add_keyframe(keyframe, located.reference)
+        self._follow_from(keyframe, seen)
+        self._map([(frame, keyframe)])
+        return keyframe
+
+    def _follow_from(self, keyframe: Keyframe, seen: LazyView) -> None:
+        self._template = template_of_keyframe(keyframe, seen.grey, self.system.camera)
+
+    def _map(self, new: list[tuple[Frame, Keyframe]]) -> None:
+        if self.system.map_keyframes(new):
+            newest = new[-1][1]
+            self._recent = newest.anchor[newest.anchor >= 0]
+
+    def _parallax(self, track: Track, reference: Keyframe) -> float:
+        return median_parallax(self.system.map.anchors.p_w[track.anchor], track.T_c_w, reference.centre_w)
+
+    def _is_due(self, stamp_s: float, changed: bool, parallax_rad: float, at_once: bool = False) -> bool:
+        since_s = stamp_s - self.system.keyframe_s
+        return is_due(changed, parallax_rad, since_s, self.system.config.mapping, at_once)
+
+
+def _in_words(located: Located) -> str:
+    """What a pose rests on, where that is not simply the keypoints of the map."""
+    inliers = located.track.inliers
+    if located.edges:
+        return f"by {located.edges} edge points" + (f" beside {inliers} keypoints" if inliers else "")
+    return "found again among the keyframes" if located.relocalised else ""

@@ -1,0 +1,56 @@
+"""Constant velocity, and how far a prediction may be off."""
+
+import numpy as np
+
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.tracking.motion_model import MotionModel
+
+
+def at(x: float) -> np.ndarray:
+    """``T_c_w`` of a camera at ``x`` on the world's first axis."""
+    T = np.eye(4)
+    T[0, 3] = -x
+    return T
+
+
+def moving() -> MotionModel:
+    """At 1 at 10 s, at 1.5 at 10.5 s."""
+    model = MotionModel(at(1.0))
+    model.stamp_s = 10.0
+    model.move(10.5, at(1.5))
+    model.stamp_s = 10.5
+    return model
+
+
+def test_goes_on_as_it_moved():
+    assert np.allclose(se3.inverse(moving().predict(12.5))[:3, 3], [3.5, 0, 0])
+    assert not moving().stands
+
+
+def test_a_prediction_taken_for_a_pose_fades_and_a_stop_stands():
+    model = moving()
+    model.drift(model.predict(11.5))
+    model.stamp_s = 11.5
+    x = se3.inverse(model.predict(12.5))[0, 3]
+    assert 2.5 < x < 3.5
+    model.stop()
+    assert model.stands
+    assert np.allclose(model.predict(99.0), at(2.5))
+
+
+def test_a_correction_of_the_keyframe_moves_the_pose_in_the_keyframes_frame():
+    """The map turns by a quarter about its origin: the camera goes with it, whatever its pose relative to that is."""
+    model = MotionModel(at(2.0))
+    turn = se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, np.pi / 2]))
+    keyframe = at(1.0)
+    model.correct(se3.inverse(keyframe) @ (keyframe @ turn))
+    assert np.allclose(model.T_c_w, at(2.0) @ turn)
+
+
+def test_expectation_grows_with_the_square_of_time_and_is_in_map_units():
+    model = moving()
+    near, far = (model.expectation(10.5 + dt, at(1.5), 2.0).information for dt in (0.1, 0.2))
+    assert np.allclose(np.sqrt(np.diag(near) / np.diag(far)), 4.0)
+    metres = model.expectation(10.6, at(1.5), 1.0).information
+    assert np.allclose(np.sqrt(np.diag(near)[:3] / np.diag(metres)[:3]), 2.0)  # a unit is two metres
+    assert np.allclose(np.diag(near)[3:], np.diag(metres)[3:])
