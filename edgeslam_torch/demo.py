@@ -161,12 +161,6 @@ def run_and_judge(
     return demo
 
 
-def run_demo(out: Path, settings: DemoSettings | None = None, config: SlamConfig | None = None) -> DemoResult:
-    """Record a simulated flight into ``out/flight``, run the pipeline on it into ``out``, compare with the truth."""
-    settings = settings or DemoSettings()
-    return run_and_judge(out, record(Path(out) / "flight", settings), settings, config)
-
-
 def map_accuracy(out: Path, score: RunScore, world: World) -> MapAccuracy | None:
     """Compare ``edge_map.ply`` with the world's surfaces."""
     cloud = open_run(out).cloud()

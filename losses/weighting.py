@@ -1,4 +1,4 @@
-"""Adaptive weights: robust scales of the residuals for the solver, learned variances for training.
+"""Adaptive weights: robust scales of the residuals.
 
 The paper balances its terms by "adaptive weighting based on uncertainty" and gives no formula. Here every term is
 whitened by a robust standard deviation of its own residuals, so that the weights of eq. (28) are pure numbers.
@@ -6,8 +6,7 @@ whitened by a robust standard deviation of its own residuals, so that the weight
 
 from dataclasses import dataclass, field, replace
 
-import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 MAD_TO_SIGMA = 1.4826
 """Median absolute deviation to standard deviation of a normal distribution."""
@@ -74,27 +73,3 @@ class AdaptiveScales:
         """Scales after one more window; terms without residuals stay."""
         new = {k: s.updated(residuals[k]) if k in residuals else s for k, s in self.terms.items()}
         return replace(self, terms=new)
-
-
-class LearnedWeights(nn.Module):
-    """Bounded learned log variances (Kendall, Gal and Cipolla, CVPR 2018), for training only.
-
-    ``sum_k exp(-s_k) L_k + s_k`` with ``s_k`` kept in a range: unbounded, a term that is easily made small takes
-    an unbounded weight.
-    """
-
-    def __init__(self, names: tuple[str, ...], bound: float = 3.0) -> None:
-        """One log variance per name, kept in ``[-bound, bound]``."""
-        super().__init__()
-        self.names, self.bound = names, bound
-        self.raw = nn.Parameter(torch.zeros(len(names)))
-
-    def log_variances(self) -> Tensor:
-        """``(len(names),)`` in ``(-bound, bound)``."""
-        return self.bound * torch.tanh(self.raw / self.bound)
-
-    def forward(self, terms: dict[str, Tensor]) -> Tensor:
-        """Weighted sum ``()`` of the scalar terms that are there."""
-        s = self.log_variances()
-        parts = [torch.exp(-s[k]) * terms[n] + s[k] for k, n in enumerate(self.names) if n in terms]
-        return torch.stack(parts).sum()

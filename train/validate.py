@@ -7,7 +7,6 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import nn
 
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.models.fastdepth import FastDepth
@@ -40,13 +39,6 @@ def image_tensor(image: np.ndarray, metadata: Metadata) -> torch.Tensor:
     rgb = image[..., ::-1].astype(np.float32) / 255.0
     normalised = (rgb - np.array(metadata.mean, np.float32)) / np.array(metadata.std, np.float32)
     return torch.from_numpy(np.ascontiguousarray(normalised.transpose(2, 0, 1)))
-
-
-def log_focal_ratio(K: FloatArray, width: int, metadata: Metadata) -> float:
-    """Log of this view's focal length over the training one at the same image width: metres = canonical *
-    ratio."""
-    mean_focal = float(np.sqrt(K[0, 0] * K[1, 1]))
-    return float(np.log(mean_focal / metadata.focal_px * (metadata.input_width / width)))
 
 
 def predict_metres(network: FastDepth, metadata: Metadata, view: View) -> tuple[FloatArray, FloatArray]:
@@ -115,10 +107,3 @@ def _scores_of(predicted: FloatArray, view: View) -> tuple[float, ...] | None:
         float(at_edges),
         float(np.log(ratio)),
     )
-
-
-def set_training(network: nn.Module, frozen: Sequence[nn.Module], fixed_norm: Sequence[nn.Module]) -> None:
-    """Training mode, but frozen parts and the batch norms of ``fixed_norm`` keep their statistics."""
-    network.train()
-    for part in (*frozen, *fixed_norm):
-        part.eval()

@@ -108,19 +108,6 @@ def quaternion(T: FloatArray) -> tuple[float, float, float, float]:
     return scale * x, scale * y, scale * z, scale * w
 
 
-def pose_from_tum(row: FloatArray) -> FloatArray:
-    """``(4, 4)`` from ``tx ty tz qx qy qz qw``."""
-    x, y, z, w = row[3:7] / np.linalg.norm(row[3:7])
-    T = np.eye(4)
-    T[:3, :3] = [
-        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)],
-        [2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)],
-        [2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)],
-    ]
-    T[:3, 3] = row[:3]
-    return T
-
-
 def pose_to_tum(T: FloatArray) -> FloatArray:
     """``tx ty tz qx qy qz qw`` with ``qw >= 0``, shape ``(7,)``."""
     return np.array([*T[:3, 3].tolist(), *quaternion(T)])

@@ -59,8 +59,6 @@ class EdgePairs:
     pair_uv: FloatArray
     pair_normal: FloatArray
     pair_inverse_depth: FloatArray
-    distance_px: FloatArray
-    """``(P,)`` signed distance across the edge, predicted minus observed."""
 
 
 def associate_edges(
@@ -125,12 +123,11 @@ def associate_edges(
         ratio = np.where(held > 0, iz / np.where(held > 0, held, 1.0), 1.0)
         ok &= (ratio < max_depth_ratio) & (ratio > 1.0 / max_depth_ratio)
         k = np.flatnonzero(ok)
-        across = (step[k] * seen[k]).sum(1)
         target = np.full(len(k), pose, dtype=np.int64)
-        parts.append((edge[k], target, field.edges.uv[partner[k]].astype(np.float64), seen[k], held[k], across))
+        parts.append((edge[k], target, field.edges.uv[partner[k]].astype(np.float64), seen[k], held[k]))
     if not parts:
         none, two = np.zeros(0), np.zeros((0, 2))
-        return EdgePairs(np.zeros(0, np.int64), np.zeros(0, np.int64), two, two, none, none)
+        return EdgePairs(np.zeros(0, np.int64), np.zeros(0, np.int64), two, two, none)
     return EdgePairs(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 

@@ -60,11 +60,6 @@ class PoseResult:
     iterations: int
     status: PoseStatus
 
-    @property
-    def n_inliers(self) -> int:
-        """Number of inliers."""
-        return int(np.count_nonzero(self.inliers))
-
 
 def refine_pose(
     T_c_w: FloatArray,

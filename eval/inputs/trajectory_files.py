@@ -53,11 +53,6 @@ class Trajectory:
         """Camera centres ``(N, 3)``."""
         return self.T_w_c[:, :3, 3]
 
-    @property
-    def path_length(self) -> float:
-        """Sum of the steps between consecutive positions."""
-        return float(np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum())
-
     def take(self, index: NDArray[np.integer] | NDArray[np.bool_] | slice) -> "Trajectory":
         """The poses at ``index``."""
         rows = None if self.rows is None else self.rows[index]

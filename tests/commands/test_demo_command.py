@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from edgeslam_torch.cli import main
-from edgeslam_torch.demo import DemoSettings, map_accuracy, record, run_and_judge, run_demo
+from edgeslam_torch.demo import DemoSettings, map_accuracy, record, run_and_judge
 from edgeslam_torch.errors import ConfigError
 from edgeslam_torch.readers.source import open_source
 
@@ -61,7 +61,8 @@ def test_demo_runs_and_judges_itself(tmp_path: Path) -> None:
     [("room", 0.02, 0.01), ("corridor", 0.02, 0.01)],
 )
 def test_demo_flight_meets_its_bars(tmp_path: Path, world: str, scale_bar: float, ate_bar: float) -> None:
-    demo = run_demo(tmp_path, DemoSettings(world=world))
+    settings = DemoSettings(world=world)
+    demo = run_and_judge(tmp_path, record(tmp_path / "flight", settings), settings)
     assert demo.score.coverage > 0.99
     assert abs(demo.score.scale_error) <= scale_bar
     assert demo.score.ate_se3_m <= ate_bar * demo.path_m
