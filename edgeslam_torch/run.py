@@ -91,6 +91,9 @@ class Slam(Protocol):
     def telemetry_statistics(self) -> dict[str, float]:
         """What telemetry told; empty without."""
 
+    def losses(self) -> dict[str, float]:
+        """Losses of the final map by name; empty before `finish`."""
+
     def support(self) -> Support:
         """What each frame's final pose rests on."""
 
@@ -301,6 +304,7 @@ class _Run:
                 "anchors": len(anchors.p_w),
                 "edge_points": len(edge_map.p_w),
             },
+            "losses": {k: v for k, v in self.slam.losses().items() if math.isfinite(v)},
             "events": dict(self.slam.events),
             "fusion": {k: v for k, v in self.slam.telemetry_statistics().items() if math.isfinite(v)},
             "mode": str(self.mode),

@@ -92,6 +92,7 @@ class EdgeSlam:
         self._orb = OrbExtractor(config.orb, camera)
         self._repeats = RepeatedImages()
         self._calibration_warning: str | None = None
+        self._losses: dict[str, float] = {}
         self._T_b_c = camera_on_body(np.deg2rad(config.mount.tilt_deg), config.mount.forward_m)
         if executor is None and realtime:
             executor = ThreadPoolExecutor(1, thread_name_prefix="mapping")
@@ -191,7 +192,8 @@ class EdgeSlam:
     def finish(self) -> None:
         """Refine the whole map, measure the last edges and fix the published scale, once no frame follows."""
         self._system.collect(wait=True)
-        last_refinement(self.map, self.camera, self.edges, self.config.window)
+        result = last_refinement(self.map, self.camera, self.edges, self.config.window)
+        self._losses = {} if result is None else result.losses
         self._system.fusion.revise(*self.log.poses())
         estimate = self.scale
         if np.isfinite(estimate.sigma):
@@ -238,6 +240,10 @@ class EdgeSlam:
     def telemetry_statistics(self) -> dict[str, float]:
         """What the drone's telemetry told: counts, delay, tilt, each source's scale; empty without telemetry."""
         return self._system.fusion.statistics() if self._system.has_telemetry else {}
+
+    def losses(self) -> dict[str, float]:
+        """The paper's losses of the final map by name, see `window_losses`; empty before `finish`."""
+        return dict(self._losses)
 
     def warnings(self) -> list[str]:
         """What limits how far the results can be believed, in sentences for the run's summary."""

@@ -59,7 +59,7 @@ def last_refinement(slam_map: SlamMap, camera: Camera, edges: EdgeMap, config: W
         What the last solver run reports; None when there was nothing to refine.
     """
     lm = replace(lm_config(config), max_iterations=ITERATIONS)
-    fine = replace(lm, cost_tolerance=FINE)
+    fine = replace(lm, cost_tolerance=FINE, losses=True)
     with_edges = config.uses_edges or config.uses_corners
     result = None
     if config.reprojection != "off" and refine_all(slam_map, camera, lm) is not None:

@@ -2,7 +2,7 @@
 
 import math
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -15,6 +15,7 @@ from edgeslam_torch.optim.kernels.compiled import kernel
 from edgeslam_torch.optim.kernels.edges_junctions import INVERSE_DEPTH_MIN, EdgeBlocks, JunctionBlocks, RelativeSystem
 from edgeslam_torch.optim.kernels.points import PointBlocks, PointSystem
 from edgeslam_torch.optim.levenberg_marquardt import Step, minimise
+from edgeslam_torch.optim.objective import refined, window_losses
 from edgeslam_torch.optim.priors import PriorTerms
 from edgeslam_torch.optim.problem import (
     DepthPriors,
@@ -69,7 +70,8 @@ def refine_window(problem: WindowProblem, config: LmConfig | None = None) -> Win
     # As a context, a default device costs microseconds per torch call: not for the CPU, which is the default.
     device = nullcontext() if config.device == "cpu" else torch.device(config.device)
     with torch.inference_mode(), device:
-        return _Window(problem, config).refine()
+        result = _Window(problem, config).refine()
+    return replace(result, losses=window_losses(refined(problem, result))) if config.losses else result
 
 
 def _check(problem: WindowProblem) -> None:

@@ -195,6 +195,8 @@ class LmConfig:
     """Points nearer than this in front of a camera count as behind it (map units)."""
     behind_px: float = 1000.0
     """Residual that stands for an observation whose point is behind the camera; none counts for more."""
+    losses: bool = False
+    """Report the losses of the result, evaluated by the loss modules (a tenth of a second for a whole map)."""
     diagnostics: bool = True
     """Report rank deficiency and the newest pose's covariance (costs one more linearisation)."""
     rank_tolerance: float = 1e-9
@@ -236,5 +238,7 @@ class WindowResult:
     """``(C, 3)`` refined inverse depths of the junctions."""
     rank_deficiency: int = 0
     """Unobservable directions of the free poses (1 for a free scale), -1 when not computed."""
+    losses: dict[str, float] = field(default_factory=dict)
+    """The losses of the result by name, as `window_losses` states them; empty unless asked for."""
     pose_covariance: FloatArray = field(default_factory=lambda: np.full((6, 6), np.nan))
     """``(6, 6)`` of the last free pose, left tangent, anchors marginalised; NaN when not computed."""

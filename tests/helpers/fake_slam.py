@@ -56,6 +56,9 @@ class FakeSlam:
         poses[:, 2, 3] += 1.0
         return np.array([o.stamp_s for o in self.outputs]), poses
 
+    def losses(self):
+        return {}
+
     def telemetry_statistics(self):
         return {}
 

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.eval.inputs.dataset import open_dataset
-from edgeslam_torch.eval.inputs.formats import read_trajectory
+from edgeslam_torch.eval.inputs.trajectory_files import read_trajectory
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera, load_camera
 from edgeslam_torch.readers.source import open_source
