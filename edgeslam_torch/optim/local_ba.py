@@ -3,6 +3,7 @@
 import math
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -206,7 +207,8 @@ class _Window:
             deficiency, covariance = self._diagnose(system)
             edge_V = [part.V for part, b in zip(system.relative, self.relative, strict=True) if b.size == 1]
         stop = summary.stop if bool(in_front.any()) or self.relative else StopReason.NO_OBSERVATIONS
-        edges, junctions = {}, {}
+        edges: dict[str, Any] = {}
+        junctions: dict[str, Any] = {}
         for block, x in self._blocks(state):
             if isinstance(block, EdgeBlocks):
                 sigma = edge_V[0][0].rsqrt() if edge_V else torch.full_like(x[0], torch.nan)
