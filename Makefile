@@ -9,13 +9,14 @@ BIN := $(VENV)/bin
 PIP_ARGS ?=
 PYTEST_ARGS ?=
 DEMO_ARGS ?= --out runs/demo
+MUTANTS_ARGS ?=
 STAMP := $(VENV)/.installed
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help install demo test test-slow lint docs wheel clean
+.PHONY: help install demo test test-slow mutants lint docs wheel clean
 
 help:
-	@echo "make demo | test | test-slow | lint | docs | wheel | clean"
+	@echo "make demo | test | test-slow | mutants | lint | docs | wheel | clean"
 
 install: $(STAMP)
 
@@ -36,6 +37,11 @@ test: $(STAMP)
 
 test-slow: $(STAMP)
 	$(BIN)/python -m pytest -m slow $(PYTEST_ARGS)
+
+# Puts single-line faults (tests/mutants/*.toml) into a copy, one at a time: those that no test notices are printed.
+#   make mutants MUTANTS_ARGS="--only fusion"
+mutants: $(STAMP)
+	$(BIN)/python tests/mutants/run_mutants.py $(MUTANTS_ARGS)
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

@@ -27,7 +27,7 @@ from edgeslam_torch.mapping.window_terms import (
 )
 from edgeslam_torch.optim.adaptive import term_residuals, with_scales
 from edgeslam_torch.optim.local_ba import refine_window
-from edgeslam_torch.optim.problem import LmConfig, WindowProblem, WindowResult
+from edgeslam_torch.optim.problem import LmConfig, StopReason, WindowProblem, WindowResult
 from edgeslam_torch.types import FloatArray
 
 logger = logging.getLogger(__name__)
@@ -108,6 +108,8 @@ def refine_with_edges(
             problem = with_scales(problem, scales, ALIKE)
             logger.debug("term scales %s", {k: round(t.sigma, 4) for k, t in scales.terms.items()})
         result = refine_window(problem, lm)
+        if result.stop is StopReason.NOT_FINITE:
+            return result
         if config.reprojection == "off":
             keypoint = [k[:0] for k in keypoint]
         with slam_map.lock:  # poses and depths are of one moment for who looks on

@@ -10,7 +10,7 @@ from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.mapping.prior_anchors import depth_priors
 from edgeslam_torch.optim.local_ba import refine_window
-from edgeslam_torch.optim.problem import LmConfig, ScalePrior, WindowProblem, WindowResult
+from edgeslam_torch.optim.problem import LmConfig, ScalePrior, StopReason, WindowProblem, WindowResult
 from edgeslam_torch.types import IntArray
 
 MIN_EXTENT = 1e-6
@@ -131,7 +131,7 @@ def window_problem(
 
 def take_back(slam_map: SlamMap, window: Window, keypoint: list[IntArray], result: WindowResult) -> None:
     """Give the map a result of `window_problem`; observations that disagree with it are taken out."""
-    if not np.isfinite(result.T_c_w).all() or not np.isfinite(result.p_w).all():
+    if result.stop is StopReason.NOT_FINITE:  # its residuals say nothing, so no observation disagrees
         return
     keyframes = [*window.free, *window.fixed]
     with slam_map.lock:

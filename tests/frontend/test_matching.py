@@ -105,3 +105,10 @@ def test_guided_search_tells_twins_apart_by_their_place(rng):
     guided = best_pairs(query, train, hamming(a[query], b[train]), 64, 0.5)
     np.testing.assert_array_equal(guided.query, guided.train)
     assert len(guided) == 20
+
+
+def test_whole_images_match_both_ways_or_not_at_all():
+    """The second is nearest to both; the first has no other, but is not what the second is nearest to."""
+    bits = [[0] * 4, [3, 0, 0, 0], [1, 0, 0, 0], [2**64 - 1] * 4]
+    a, b = np.array([bits[1], bits[0]], np.uint64), np.array([bits[0], bits[3]], np.uint64)
+    assert dict(zip(match_all(a, b, 64, 0.8).query, match_all(a, b, 64, 0.8).train, strict=True)) == {1: 0}

@@ -151,3 +151,28 @@ def test_an_error_that_no_averaging_removes_bounds_the_sigma(rng):
     softened = solved([evidence.softened(0.05 * SCALE)], TILT)
     assert softened[0] == pytest.approx(s, rel=1e-3)
     assert softened[1] == pytest.approx(math.hypot(sigma, 0.05), rel=0.02)
+
+
+def test_a_noisy_map_does_not_shrink_the_scale_from_height(rng):
+    """A climb of 12 cm to and fro, seen with 5 cm of noise: as a regressor it would shrink the scale by 8 %."""
+
+    def noisy():
+        t, p, z = flown(rng, 600)
+        p[:, 2] *= 0.5
+        z = 1.0 + SCALE * p[:, 2] + 0.012 * rng.standard_normal(len(z))
+        seen = p + 0.05 / SCALE * rng.standard_normal(p.shape)
+        segment = np.zeros(len(t), dtype=np.int64)
+        return [height_evidence(seen, z, t, segment, 0.05 / SCALE, 0.015, SCALE, TILT)]
+
+    error, _ = errors(noisy, 40)
+    assert abs(np.mean(error)) < 0.03
+
+
+def test_height_and_displacements_mean_the_same_tilt(rng):
+    """A map that leans by three degrees: what the way says of the lean must help the height, not double it."""
+    lean = matrix_from_rpy(np.array([0.05, -0.05, 0.0]))
+    t, p, z = flown(rng, 300, tilt=(0.05, -0.05))
+    moves = displaced(*moved(rng, 200, noise_m=0.002, R=lean.T), sigma_m=0.002)
+    together = solved([moves.softened(0.2 * SCALE), heights(t, p, z)], TILT)
+    assert together[0] == pytest.approx(SCALE, rel=0.02)
+    assert together[1] < 0.02

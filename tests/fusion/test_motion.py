@@ -240,6 +240,34 @@ def test_height_changes_alone_tell_the_scale_of_a_climb(rng, replay, swinging):
     assert fusion.scale().value == pytest.approx(gauge.scale, rel=0.04)
 
 
+def test_velocities_and_heights_that_disagree_widen_sigma(rng, swinging, replay):
+    """Heights 15 % too large: neither is nonsense, and the scale may be that of either."""
+    motion = swinging(30.0)
+    gauge = motion.in_gauge(rng)
+    stated = []
+    for factor in (1.0, 1.15):
+        exact = simulate(rng, motion.stamps_s, motion.T_w_c, T_B_C, faults=EXACT, floor_m=0.0).samples()
+        told = [replace(s, tof_m=factor * s.tof_m, height_m=factor * s.height_m, baro_m=np.nan) for s in exact]
+        fusion = MotionFusion(FusionConfig(delay_s=0.0), T_B_C)
+        replay(fusion, motion, gauge, told)
+        assert fusion.scale().source == "telemetry+height"
+        stated.append(fusion.scale().sigma / fusion.scale().value)
+    assert stated[0] < 0.02
+    assert stated[1] > 0.3 * math.log(1.15)
+
+
+def test_a_pose_that_is_no_number_is_no_evidence(rng, swinging, replay):
+    motion = swinging(20.0)
+    gauge = motion.in_gauge(rng)
+    samples = simulate(rng, motion.stamps_s, motion.T_w_c, T_B_C).samples()
+    gauge.T_m_c[100:110, 0, 3] = np.nan
+    fusion = MotionFusion(FusionConfig(), T_B_C)
+    replay(fusion, motion, gauge, samples)
+    assert fusion.scale().value == pytest.approx(gauge.scale, rel=0.04)
+    assert np.isfinite(fusion.predict(20.3).T_w_c).all()
+    assert fusion.statistics()["visual not tracked"] == 10
+
+
 def test_filter_follows_the_flight_in_metres(rng, swinging, replay):
     motion = swinging(30.0)
     samples = simulate(rng, motion.stamps_s, motion.T_w_c, T_B_C).samples()

@@ -13,7 +13,7 @@ from edgeslam_torch.losses.base import ResidualLoss, back_project, move, project
 from edgeslam_torch.losses.cycle import CycleForm, CycleLoss
 from edgeslam_torch.losses.edge_alignment import EdgeAlignmentLoss
 from edgeslam_torch.losses.lshape import AngleForm, AngleLoss, CollinearityLoss, LShapeLoss, cosine
-from edgeslam_torch.losses.reprojection import ReprojectionLoss
+from edgeslam_torch.losses.reprojection import ReprojectionLoss, reprojection_residuals
 from edgeslam_torch.losses.robust import Kernel, rho
 
 K = torch.tensor([[500.0, 0.0, 320.0], [0.0, 480.0, 240.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
@@ -283,3 +283,23 @@ def test_collinearity_ignores_masked_points_and_short_arms(rng):
     assert float(CollinearityLoss()(p, mask)) < 1e-18
     mask[0, 0, 2:] = False  # two points are always on a line
     assert not CollinearityLoss().residuals(p, mask).valid[0, 0].any()
+
+
+def test_residuals_are_predicted_minus_observed():
+    """A point seen at (417, 194) and at (427, 186) that projects to (420, 190): 3 and -7 px in u, -4 and 4 in v."""
+    T, p = torch.eye(4, dtype=torch.float64), torch.tensor([[0.4, -0.2, 2.0]], dtype=torch.float64)
+    K = torch.tensor([[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    seen = torch.tensor([[417.0, 194.0], [427.0, 186.0]], dtype=torch.float64)
+    right = torch.tensor([[3.0, -4.0], [-7.0, 4.0]], dtype=torch.float64)
+    window = ReprojectionLoss().residuals(torch.stack((T, T)), p, seen[:, None], K)
+    torch.testing.assert_close(window.value[:, 0], right)
+    rows = reprojection_residuals(p.mT.expand(3, 2), seen.mT, torch.tensor([500.0, 500.0, 320.0, 240.0]))
+    torch.testing.assert_close(rows, right.mT)
+    across = torch.tensor([[0.6, 0.8]], dtype=torch.float64)
+    edge = EdgeAlignmentLoss().residuals(T, torch.tensor([[420.0, 190.0]]), p[:, 2], seen[1:], across, K)
+    torch.testing.assert_close(edge.value, right[1:] @ across.mT)  # -7 * 0.6 + 4 * 0.8
+    behind = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
+    nearer = CycleLoss(max_relative=1.0).residuals(
+        T, torch.tensor([[320.0, 240.0]]), behind[:, 2] * 3.0, behind[:, 2], K
+    )
+    assert float(nearer.value) == pytest.approx(0.5)  # frame j sees 1 m where 3 m are predicted

@@ -171,3 +171,37 @@ def test_a_piece_that_holds_nothing_gives_its_number_to_the_next(rng):
         points.map.begin_piece(begun)
         points.map.add_keyframe(points.keyframes[points.map.piece])
     assert points.map.piece == 0
+
+
+def test_frames_of_a_removed_keyframe_stay_in_their_piece(rng):
+    """The keyframe next in time is of another piece, which may move without this one."""
+    points = PointMap(rng, 300, 3)
+    first, other, mine = points.keyframes
+    points.map.begin_piece("first")
+    points.map.add_keyframe(first)
+    ids = points.map.anchors.add(np.zeros((1, 3)), first.words[:1], 0, True, np.zeros((1, 3), np.uint8))
+    points.map.observe(first, np.array([0]), ids)
+    points.map.begin_piece("second")
+    points.map.add_keyframe(other)
+    points.map.add_keyframe(mine, first)
+    points.map.remove_keyframe(mine)
+    assert points.map.links[mine.id][0] == first.id
+    moved = small_motion(rng, 1.0, 0.5)
+    before = points.map.pose_of(mine.id)
+    other.T_c_w = other.T_c_w @ moved
+    np.testing.assert_allclose(points.map.pose_of(mine.id), before)
+    first.T_c_w = first.T_c_w @ moved
+    np.testing.assert_allclose(points.map.pose_of(mine.id), before @ moved, atol=1e-12)
+
+
+def test_an_anchor_seen_at_a_coarse_level_is_seen_at_the_finest_from_farther_off(rng):
+    """Level 3 of a pyramid of 1.2: the same patch fills level 0 at 1.728 times the distance."""
+    points = PointMap(rng, 100, 2)
+    last = points.keyframes[1]
+    last.features.octave[:] = 3
+    anchor_of = points.fill()
+    seen = last.keypoints_with_anchor()
+    assert len(seen) > 10
+    distance = np.linalg.norm(points.world.p_w[points.point_of[1][seen]] - last.centre_w, axis=1)
+    np.testing.assert_allclose(points.map.anchors.max_distance[last.anchor[seen]], 1.2**3 * distance)
+    assert (anchor_of[points.point_of[1][seen]] == last.anchor[seen]).all()

@@ -127,3 +127,52 @@ def test_brightness_change_between_views_hardly_matters():
     known = np.isfinite(result.inverse_depth)
     assert known.mean() > 0.25
     assert np.median(np.abs(result.inverse_depth * truth - 1.0)[known]) < 0.01
+
+
+@lru_cache(maxsize=1)
+def pickets():
+    """Upright stripes, 4 cm light and 4 cm dark, on a wall 2 m away; cameras 6 cm to either side."""
+    stripes = np.repeat(np.tile(np.uint8([60, 200]), 75), 8)
+    texture = Texture(np.repeat(np.repeat(stripes[None], 1200, axis=0)[..., None], 3, axis=2))
+    u, v = np.array([6.0, 0.0, 0.0]), np.array([0.0, 6.0, 0.0])
+    world = World([Quad(np.array([-3.0, -3.0, 2.0]), u, v, texture)])
+    poses = sideways(3, 0.06)
+    poses[:, 1, 3] = 0.0
+    return film(world, CAMERA, poses)
+
+
+def at_middle(flight, sigma_log):
+    """Edges of the middle view searched in the other two."""
+    views = views_of(flight)
+    edges = extract_edges(flight.frames[1].image, 40.0, 100.0, 600)
+    u, v = edges.uv.astype(int).T
+    truth = flight.depth_m[1][v, u].astype(np.float64)
+    others = [views[0], views[2]]
+    sigma = np.full(len(truth), sigma_log)
+    return edges, truth, measure_edge_depth(views[1], edges.uv, edges.normal, truth, sigma, others, CAMERA)
+
+
+def test_a_picket_fence_is_measured_only_where_the_prior_tells_pickets_apart():
+    """A picket is 10.4 px, a disparity 7.8 px: up to 27 px there are two that look alike, up to 9.5 px only one."""
+    _, truth, wide = at_middle(pickets(), 0.5)
+    assert len(truth) > 300
+    assert np.isfinite(wide.inverse_depth).mean() < 0.2
+    _, truth, narrow = at_middle(pickets(), 0.08)
+    known = np.isfinite(narrow.inverse_depth)
+    assert known.mean() > 0.5
+    assert np.median(np.abs(narrow.inverse_depth * truth - 1.0)[known]) < 0.01
+
+
+def test_sigma_is_half_a_pixel_across_the_edge_worked_by_hand():
+    """Cameras that moved by b without turning see an inverse depth at f b: half a pixel of that along the normal."""
+    flight = slanted_wall()
+    poses = flight.T_w_c.copy()
+    moved = film(flight.world, CAMERA, np.stack([poses[2] @ se3.exp(np.r_[b, np.zeros(3)]) for b in BASELINES]))
+    edges, _, found = at_middle(moved, 0.35)
+    known = np.isfinite(found.inverse_depth)
+    assert known.sum() > 100
+    across = CAMERA.fx * edges.normal[known] @ np.array(BASELINES)[[0, 2], :2].T.astype(np.float64)
+    np.testing.assert_allclose(found.sigma[known], 0.5 / np.sqrt((across**2).sum(1)), rtol=1e-3)
+
+
+BASELINES = [[0.06, 0.05, 0.0], [0.0, 0.0, 0.0], [-0.05, -0.07, 0.0]]

@@ -172,3 +172,18 @@ def test_keyframes_without_a_measured_edge_are_an_empty_map(rng):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert edges.points().p_w.shape == (0, 3)
+
+
+def test_the_same_pixel_at_another_depth_is_another_edge(points):
+    """Measured by the second keyframe a fifth deeper along the first one's rays: same pixels there, another depth."""
+    p_w = points.world.p_w[points.world.visible[0] & points.world.visible[1]][:60]
+    centre = points.keyframes[0].centre_w
+    deeper = centre + 1.2 * (p_w - centre)
+    counts = []
+    for theirs in (p_w, deeper):
+        edges = edge_map(points)
+        edges.add(host(points, 1, theirs))
+        edges.add(host(points, 0, p_w))
+        counts.append((edges.hosts[1].observations == 2).mean())
+    assert counts[0] > 0.9
+    assert counts[1] < 0.1

@@ -1,11 +1,14 @@
 """Looking for known anchors in keyframes that do not hold them yet."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from point_map import CAMERA, PointMap, check_map
 
+from edgeslam_torch.frontend.keypoint_grid import KeypointGrid
 from edgeslam_torch.frontend.matching import words
-from edgeslam_torch.mapping.fuse import fuse, fuse_all
+from edgeslam_torch.mapping.fuse import fuse, fuse_all, merge
 
 
 def among_neighbours(points, keyframe):
@@ -53,3 +56,37 @@ def test_forgotten_observations_are_found_again(rng):
     check_map(points.map)
     assert np.mean(last.anchor[alive] == held[alive]) > 0.8
     assert not np.any((last.anchor >= 0) & (last.anchor != held)), "nothing wrong beside it"
+
+
+def test_of_two_anchors_for_one_point_the_better_observed_stays(rng):
+    points = PointMap(rng, 200, 5)
+    anchor_of = points.fill()
+    observations = points.map.anchors.observations
+    well = anchor_of[(anchor_of >= 0)]
+    well = well[observations[well] >= 4][:20]
+    doubles = points.map.anchors.add(
+        points.map.anchors.p_w[well], points.map.anchors.words[well], 4, False, np.zeros((len(well), 3), np.uint8)
+    )
+    half = len(well) // 2
+    pairs = [(well[:half], doubles[:half]), (doubles[half:], well[half:])]  # whichever of the two is named first
+    merge(points.map, pairs)
+    assert points.map.anchors.alive[well].all()
+    assert not points.map.anchors.alive[doubles].any()
+    check_map(points.map)
+
+
+@pytest.mark.parametrize(("off_px", "found"), [(2.2, True), (2.8, False)])
+def test_what_lies_beyond_95_percent_is_another_point(rng, off_px, found):
+    """Two degrees of freedom, one pixel: 2.45 px."""
+    points = PointMap(rng, 300, 4)
+    points.fill()
+    last = points.keyframes[3]
+    held = last.anchor.copy()
+    points.map.forget_observations(last, last.keypoints_with_anchor())
+    alive = (held >= 0) & points.map.anchors.alive[held]
+    shifted = last.features.uv + np.float32([off_px, 0.0])
+    last.features = replace(last.features, uv=shifted)
+    last.grid = KeypointGrid(shifted)
+    fuse_all(points.map, CAMERA)
+    assert (np.mean(last.anchor[alive] == held[alive]) > 0.5) == found
+    assert found or not (last.anchor >= 0).any()

@@ -16,7 +16,7 @@ from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.map.trajectory import TrajectoryLog
 from edgeslam_torch.mapping.edge_map import EdgeMap
 from edgeslam_torch.mapping.last_refinement import last_refinement, lm_config
-from edgeslam_torch.optim.problem import WindowResult
+from edgeslam_torch.optim.problem import StopReason, WindowResult
 from edgeslam_torch.slam import EdgeSlam
 
 POINTS = WindowConfig(alignment=False, cycle="off")
@@ -82,6 +82,17 @@ def test_without_reprojection_anchors_stay_where_they_are():
     start, _, _ = pickle.loads(flight()[0])
     slam_map, _, _, _ = finish(FORMS["no reprojection"])
     np.testing.assert_allclose(slam_map.anchors.p_w, start.anchors.p_w, rtol=0, atol=1e-12)
+
+
+def test_one_anchor_that_is_no_number_costs_the_refinement_and_not_the_map():
+    slam_map, edges, log = pickle.loads(flight()[0])
+    held = int(slam_map.latest().anchor.max())
+    slam_map.anchors.p_w[held] = np.nan
+    before = log.poses()[1]
+    assert last_refinement(slam_map, CAMERA, edges, WindowConfig()).stop is StopReason.NOT_FINITE
+    check_map(slam_map)
+    np.testing.assert_allclose(log.poses()[1], before, atol=1e-12)
+    assert len(slam_map.anchors) > 300
 
 
 def test_what_the_forms_mean_while_flying():

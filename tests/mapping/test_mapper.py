@@ -73,19 +73,40 @@ def test_young_anchors_that_are_not_found_again_go(rng):
     check_map(points.map)
 
 
-def test_keyframes_that_add_nothing_go_and_the_map_stays_bounded(rng):
+def test_a_full_map_forgets_the_keyframe_that_is_farthest_away(rng):
+    """Thirty cameras in a row, of which no one is redundant: twelve stay, and the window is left alone."""
     points = PointMap(rng, 300, 30)
     anchor_of = points.fill([0, 1])
-    mapper = make_mapper(points, max_keyframes=12, window=5, window_fixed=5)
+    mapper = make_mapper(points, max_keyframes=12, window=5, window_fixed=5, redundancy=1.0)
+    centre = se3.inverse(points.world.T_c_w)[:, :3, 3]
     for view in range(2, 30):
+        before = set(points.map.keyframes)
         insert(mapper, points, view, anchor_of)
-        assert len(points.map.keyframes) <= 12
+        gone = before - set(points.map.keyframes)
+        assert len(gone) == max(0, len(before) + 1 - 12)
+        away = {id: np.linalg.norm(centre[id] - centre[view]) for id in before if id <= view - 5}
+        assert all(away[id] == max(away.values()) for id in gone)
     check_map(points.map)
-    assert 0 in points.map.keyframes or 0 in points.map.links
-    assert 29 in points.map.keyframes
     T = [points.map.pose_of(id) @ se3.inverse(points.world.T_c_w[id]) for id in range(30)]
     # Also the removed ones keep their place.
     assert np.abs([se3.log(t) for t in T]).max() < 0.01
+
+
+def test_keyframes_whose_anchors_others_see_go_but_the_first_and_the_last_stay(rng):
+    """Every point is seen from almost everywhere: of sixteen keyframes a few would do."""
+    points = PointMap(rng, 300, 16)
+    anchor_of = points.fill([0, 1])
+    mapper = make_mapper(points, redundancy=0.6)
+    for view in range(2, 16):
+        insert(mapper, points, view, anchor_of)
+    check_map(points.map)
+    left = set(points.map.keyframes)
+    assert {0, 13, 14, 15} <= left
+    assert len(left) <= 10
+    for id in set(range(16)) - left:
+        seen = points.map.anchors_seen_by(list(points.map.keyframes.values()))
+        missed = np.setdiff1d(anchor_of[points.point_of[id]], seen)
+        assert len(missed[missed >= 0]) < 0.4 * len(points.point_of[id])
 
 
 def test_keyframe_that_nobody_shares_is_taken_in(rng):

@@ -6,7 +6,9 @@ from point_map import CAMERA, SCALE_FACTOR, PointMap
 
 from edgeslam_torch.frontend.matching import EMPTY, Matches
 from edgeslam_torch.geometry import se3
+from edgeslam_torch.map.keyframe import make_keyframe
 from edgeslam_torch.mapping.new_anchors import epipolar_matches, triangulate_matches
+from edgeslam_torch.types import FrameFeatures
 
 
 @pytest.fixture
@@ -95,3 +97,46 @@ def test_level_that_contradicts_the_distance_is_refused(points):
     matches = matched(points, depth_of(points, 0))
     points.keyframes[1].features.octave[:] = 6
     assert len(triangulated(points, matches)[2]) == 0
+
+
+def test_a_twin_off_the_epipolar_line_is_not_matched(points, rng):
+    """Six pixels beside every keypoint sits one with the very descriptor; the right one differs in 20 bits."""
+    a, b = points.keyframes[0], points.keyframes[1]
+    T = b.T_c_w @ se3.inverse(a.T_c_w)
+    depth = depth_of(points, 0)
+    common, at_a, at_b = np.intersect1d(points.point_of[0], points.point_of[1], return_indices=True)
+    p = CAMERA.back_project(a.features.uv[at_a], depth[at_a])
+    along = CAMERA.project(se3.transform(T, 1.01 * p)) - CAMERA.project(se3.transform(T, p))
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    twin_uv = b.features.uv[at_b] + 6.0 * np.stack([-along[:, 1], along[:, 0]], axis=1)
+    bits = b.features.descriptors[at_b].copy()
+    for row in bits:
+        row[rng.permutation(32)[:20]] ^= 1
+    n = len(common)
+    uv = np.concatenate([b.features.uv[at_b], twin_uv]).astype(np.float32)
+    descriptors = np.concatenate([bits, b.features.descriptors[at_b]])
+    none = np.zeros(2 * n, np.int32)
+    features = FrameFeatures(uv, none, none.astype(np.float32), descriptors)
+    twins = make_keyframe(1, 10, 1.0, b.T_c_w, features)
+    sigma = np.full(len(depth), 0.05)
+    found = epipolar_matches(a, twins, CAMERA, depth, sigma, SCALE_FACTOR, 64, 0.85)
+    right = dict(zip(at_a.tolist(), range(n), strict=True))
+    chosen = [right[q] == t for q, t in zip(found.query.tolist(), found.train.tolist(), strict=True) if t < 2 * n]
+    assert len(chosen) > 0.7 * n
+    assert np.mean(chosen) > 0.95
+
+
+def test_a_point_must_reproject_in_the_sharper_of_two_views(points):
+    """Six pixels across the line, half of them in each view: nothing at level 2, too much at level 0."""
+    a, b = points.keyframes[0], points.keyframes[1]
+    matches = matched(points, depth_of(points, 0))
+    b.features.octave[:] = 2
+    assert len(triangulated(points, matches)[2]) > 0.6 * len(matches)
+    T = b.T_c_w @ se3.inverse(a.T_c_w)
+    p = CAMERA.back_project(a.features.uv, depth_of(points, 0))
+    along = CAMERA.project(se3.transform(T, 1.01 * p)) - CAMERA.project(se3.transform(T, p))
+    along = (along / np.linalg.norm(along, axis=1, keepdims=True))[matches.query]
+    b.features.uv[matches.train] += (6.0 * np.stack([-along[:, 1], along[:, 0]], axis=1)).astype(np.float32)
+    assert len(triangulated(points, matches)[2]) < 0.1 * len(matches)
+    b.features.uv[matches.train] -= (3.0 * np.stack([-along[:, 1], along[:, 0]], axis=1)).astype(np.float32)
+    assert len(triangulated(points, matches)[2]) > 0.5 * len(matches)

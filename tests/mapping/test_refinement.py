@@ -5,8 +5,9 @@ import pytest
 from point_map import CAMERA, PointMap, check_map, small_motion
 
 from edgeslam_torch.geometry import se3
-from edgeslam_torch.mapping.refinement import Window, choose_window, refine, refine_all
-from edgeslam_torch.optim.problem import LmConfig
+from edgeslam_torch.losses.robust import Kernel
+from edgeslam_torch.mapping.refinement import Window, choose_window, refine, refine_all, window_problem
+from edgeslam_torch.optim.problem import LmConfig, StopReason
 
 
 @pytest.fixture
@@ -41,6 +42,37 @@ def test_disturbed_window_comes_back_exactly(points, rng):
     assert pose_errors(points, window.free).max() < 1e-4
     assert pose_errors(points, window.fixed).max() < 1e-12
     check_map(points.map)
+
+
+@pytest.mark.parametrize("what", ["anchor", "pixel"])
+def test_a_window_that_cannot_be_refined_is_left_as_it_is(points, what):
+    """One number that is none: poses, anchors and observations stay, whatever the solver hands back."""
+    window = choose_window(points.map, points.keyframes[-1], 4, 15)
+    if what == "anchor":
+        points.map.anchors.p_w[window.anchor[3]] = np.nan
+    else:
+        points.keyframes[-1].features.uv[points.keyframes[-1].keypoints_with_anchor()[0]] = np.inf
+    held = [k.anchor.copy() for k in points.keyframes]
+    result = refine(points.map, window, CAMERA, LmConfig())
+    assert result.stop is StopReason.NOT_FINITE
+    for keyframe, before in zip(points.keyframes, held, strict=True):
+        np.testing.assert_array_equal(keyframe.anchor, before)
+        np.testing.assert_array_equal(keyframe.T_c_w, points.world.T_c_w[keyframe.id])
+    check_map(points.map)
+
+
+@pytest.mark.parametrize(("kernel", "sigma_px"), [(Kernel.HUBER, 1.2**3), (Kernel.L2, 1.0)])
+def test_keypoints_count_as_precisely_as_their_level_tells(points, kernel, sigma_px):
+    """A keypoint of level 3 scatters by 1.728 px; in the paper's plain squares all count alike."""
+    window = choose_window(points.map, points.keyframes[-1], 4, 15)
+    coarse = points.keyframes[-1]
+    coarse.features.octave[:] = 3
+    problem, keypoint = window_problem(points.map, window, CAMERA, LmConfig(kernel=kernel))
+    pose = [*window.free, *window.fixed].index(coarse)
+    mine = problem.obs_pose == pose
+    assert mine.sum() == len(keypoint[pose]) > 20
+    np.testing.assert_allclose(1.0 / problem.inv_sigma[mine], sigma_px)
+    np.testing.assert_allclose(problem.inv_sigma[~mine], 1.0)
 
 
 def test_wrong_observations_are_taken_out_of_the_map(points, rng):

@@ -1,9 +1,12 @@
 """A camera that returns finds its old anchors again, however drift has moved them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from point_map import CAMERA, PointMap, check_map, small_motion
 
+from edgeslam_torch.frontend.keypoint_grid import KeypointGrid
 from edgeslam_torch.frontend.matching import words
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.mapping.refinement import refine_all
@@ -91,3 +94,27 @@ def test_keyframe_without_anchors_has_no_lookalike(rng):
     points.fill()
     points.map.forget_observations(points.keyframes[2], points.keyframes[2].keypoints_with_anchor())
     assert lookalike(points.map, points.keyframes[2]) is None
+
+
+def test_a_place_of_which_most_does_not_fit_is_not_joined(rng, drift):
+    """Two keypoints in three were moved anywhere nearby: enough of the rest agree, but that is not the place."""
+    points = drifted(rng, drift)
+    last = points.keyframes[5]
+    moved = rng.permutation(len(last.anchor))[: 2 * len(last.anchor) // 3]
+    uv = last.features.uv.copy()
+    uv[moved] += rng.uniform(-18, 18, (len(moved), 2)).astype(np.float32)
+    last.features = replace(last.features, uv=uv)
+    last.grid = KeypointGrid(uv)
+    held = last.anchor.copy()
+    assert reobserve(points.map, CAMERA, last) is None
+    np.testing.assert_array_equal(last.anchor, held)
+
+
+def test_a_keyframe_that_shares_the_anchors_of_its_neighbour_is_no_revisit(rng):
+    """It stands where another stood, and they know each other: nothing is to be joined."""
+    points = drifted(rng, np.eye(4))
+    last, first = points.keyframes[5], points.keyframes[1]
+    assert lookalike(points.map, last) is first
+    shared = np.flatnonzero((last.anchor >= 0) & (first.anchor >= 0))[:20]
+    points.map.merge_anchors(last.anchor[shared], first.anchor[shared])
+    assert lookalike(points.map, last) is not first

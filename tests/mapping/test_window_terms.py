@@ -1,5 +1,7 @@
 """Edge and junction terms made from keyframes, and what they do for a window."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -121,6 +123,19 @@ def test_terms_bring_poses_back(scene, rng):
         start = refine_window(problem).T_c_w
     after = max(np.abs(se3.log(a @ se3.inverse(b))).max() for a, b in zip(start, T, strict=True))
     assert after < 0.4 * before
+
+
+def test_a_corner_whose_arms_run_another_way_is_another_corner(scene):
+    """At the right pixels, but turned by 60 degrees: what one view sees there the others do not."""
+    T, structures = scene
+    true = junction_terms(structures, T, K)
+    c, s = np.cos(np.pi / 3), np.sin(np.pi / 3)
+    junctions = structures[2].junctions
+    turned = replace(junctions, arms=junctions.arms @ np.array([[c, s], [-s, c]]))
+    terms = junction_terms([*structures[:2], replace(structures[2], junctions=turned), structures[3]], T, K)
+    pairs = [np.sum((t.pair_pose == 2) & (t.host[t.pair_junction] != 2)) for t in (true, terms)]
+    assert pairs[0] > 20
+    assert pairs[1] < 0.1 * pairs[0]
 
 
 def test_nothing_to_pair_gives_none(scene):

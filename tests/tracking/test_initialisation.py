@@ -1,11 +1,15 @@
 """From a guessed map to one that two views made, and what refuses a wrong one."""
 
+from dataclasses import replace
+
+import cv2
 import numpy as np
 import pytest
 from point_map import CAMERA, SCALE_FACTOR, PointMap, check_map, small_motion
 
 from edgeslam_torch.config import InitialisationConfig, OrbConfig, TrackingConfig
 from edgeslam_torch.geometry import se3
+from edgeslam_torch.map.keyframe import make_keyframe
 from edgeslam_torch.optim.problem import LmConfig
 from edgeslam_torch.tracking.bootstrap import WITNESS_SHARE, Bootstrap
 from edgeslam_torch.tracking.initialiser import BootstrapView, poses_of_witnesses, two_view_map
@@ -222,3 +226,196 @@ def test_abandoned_attempt_leaves_no_guess_behind(points):
     check_map(points.map)
     assert len(points.map.anchors) == 0
     assert 0 in points.map.keyframes
+
+
+# -- what may become the map -----------------------------------------------------------------------------------------
+
+
+def offered(points, between=(1, 2, 3), wrong_between=0.0, **config):
+    """The bootstrap that has seen some views, and the right two-view map that view 4 offers.
+
+    Args:
+        wrong_between: Share of the matches in the views between that point anywhere.
+    """
+    bootstrap = make_bootstrap(points, z_in(points, 0), InitialisationConfig(**config))
+    rng = np.random.default_rng(3)
+    for view in (*between, 4):
+        seen = view_of(points, view)
+        track = bootstrap.track(seen, points.world.T_c_w[view])
+        found = bootstrap.two_views(points.keyframes[view].frame_index, seen, track)
+        if view != 4:
+            uv = bootstrap.views[-1].keypoint_uv
+            wrong = rng.permutation(len(uv))[: round(wrong_between * len(uv))]
+            uv[wrong] = rng.uniform((0, 0), (640, 480), (len(wrong), 2))
+    assert found.ok
+    return bootstrap, found
+
+
+def slid(points, two_view, spread=0.4):
+    """The same two views with points that lie elsewhere on the first camera's rays."""
+    rng = np.random.default_rng(4)
+    centre = points.keyframes[0].centre_w
+    return replace(
+        two_view, p_w=centre + (two_view.p_w - centre) * np.exp(rng.normal(0, spread, (len(two_view.p_w), 1)))
+    )
+
+
+def with_network(points):
+    """A depth network has seen the first view; what it says of the keypoints is the guess."""
+    flat = np.ones((CAMERA.height, CAMERA.width), np.float32)
+    points.keyframes[0].depth = DepthMap(flat, 0.2 * flat)
+
+
+def test_a_map_that_the_frames_between_refute_is_refused(points):
+    bootstrap, found = offered(points)
+    assert bootstrap.confirm(view_of(points, 4), found).ok
+    refused = bootstrap.confirm(view_of(points, 4), slid(points, found))
+    assert (refused.ok, refused.reason) == (False, "the frames between disagree with two views")
+
+
+def test_a_map_that_too_many_observations_refute_is_refused(points):
+    """38 % of the matches between are wrong: 62 % of each witness agree, and 77 % of all observations."""
+    bootstrap, found = offered(points, wrong_between=0.38)
+    refused = bootstrap.confirm(view_of(points, 4), found)
+    assert (refused.ok, refused.reason) == (False, "the frames together disagree with two views")
+
+
+def test_of_two_structures_the_one_that_fits_becomes_the_map(points):
+    """Nobody between: a structure that fits nothing, and the one that starts at the network's depth."""
+    with_network(points)
+    bootstrap, found = offered(points, between=())
+    away = se3.exp(np.array([0.8, 0.0, 0.3, 0.0, 0.5, 0.2]))
+    lost = replace(slid(points, found, 1.0), T_c_w=away @ found.T_c_w)
+    chosen = bootstrap.confirm(view_of(points, 4), lost)
+    assert chosen.ok
+    assert np.abs(se3.log(chosen.T_c_w @ se3.inverse(points.world.T_c_w[4]))).max() < 0.01
+
+
+def test_structure_from_the_networks_depth_keeps_its_scale(points):
+    """Tracked with half as long again a baseline: the structure that starts there comes back to the guessed depths."""
+    with_network(points)
+    bootstrap, found = offered(points, between=())
+    first = points.world.T_c_w[0]
+    T = points.world.T_c_w[4] @ se3.inverse(first)
+    T[:3, 3] *= 1.5
+    bootstrap.views[-1] = replace(bootstrap.views[-1], T_c_w=T @ first)
+    away = se3.exp(np.array([0.8, 0.0, 0.3, 0.0, 0.5, 0.2]))
+    chosen = bootstrap.confirm(view_of(points, 4), replace(slid(points, found, 1.0), T_c_w=away @ found.T_c_w))
+    assert chosen.ok
+    z = se3.transform(first, chosen.p_w)[:, 2]
+    assert np.median(z / z_in(points, 0)[chosen.reference_keypoint]) == pytest.approx(1.0, abs=0.02)
+    assert np.linalg.norm(se3.inverse(chosen.T_c_w)[:3, 3] - points.keyframes[0].centre_w) == pytest.approx(
+        np.linalg.norm(points.keyframes[4].centre_w - points.keyframes[0].centre_w), rel=0.02
+    )
+
+
+def test_a_turn_that_may_be_a_shift_is_refused(points):
+    bootstrap, found = offered(points, max_direction_sigma_alone=1e-9)
+    refused = bootstrap.confirm(view_of(points, 4), found)
+    assert (refused.ok, refused.reason) == (False, "a turn cannot yet be told from a shift")
+
+
+def test_points_behind_either_camera_do_not_triangulate(points):
+    """Matches turned about the epipole meet behind the second camera: none of them is in the map."""
+    a, b = matches(points, 0, 4)
+    view = view_of(points, 4)
+    T = points.world.T_c_w[4] @ se3.inverse(points.world.T_c_w[0])
+    turned = np.arange(len(b)) % 7 == 0
+    p_c = se3.transform(points.world.T_c_w[4], points.world.p_w[points.point_of[4][b[turned]]])
+    view.features.uv[b[turned]] = CAMERA.project(2.0 * T[:3, 3] - p_c).astype(np.float32)  # beyond the other centre
+    found = two_view_map(points.keyframes[0], z_in(points, 0), view, a, b, CAMERA, CONFIG)
+    assert found.ok
+    assert not np.isin(found.keypoint, b[turned]).any()
+    for T_c_w in (points.world.T_c_w[0], found.T_c_w):
+        assert (se3.transform(T_c_w, found.p_w)[:, 2] > 0).all()
+
+
+@pytest.mark.parametrize("seed", [1, 3])
+def test_a_plane_seen_by_two_views_is_mapped_as_the_network_sees_it(seed):
+    """A plane's two views have two explanations that fit alike; only the shape of the guess tells them apart."""
+    points = on_a_plane(PointMap(np.random.default_rng(seed), 400, 6))
+    with_network(points)
+    bootstrap, found = offered(points, between=(), max_direction_sigma=10.0)
+    T, p_w = other_explanation(points, found)
+    wrong = replace(found, T_c_w=T, p_w=p_w)
+    true = points.world.T_c_w[4]
+    assert np.abs(se3.log(T @ se3.inverse(true))).max() > 0.1, "it is another one"
+    seen = CAMERA.project(se3.transform(T, p_w)) - view_of(points, 4).features.uv[found.keypoint]
+    assert np.abs(seen).max() < 3.0, "and it fits"
+    for offer in (
+        wrong,
+        replace(found, T_c_w=true, p_w=points.world.p_w[points.point_of[0][found.reference_keypoint]]),
+    ):
+        chosen = bootstrap.confirm(view_of(points, 4), offer)
+        assert chosen.ok, chosen.reason
+        assert np.abs(se3.log(chosen.T_c_w @ se3.inverse(true))).max() < 0.05
+
+
+def on_a_plane(points, noise_px=0.3):
+    """The same views of points that lie on one slanted plane, with a little noise."""
+    rng = np.random.default_rng(6)
+    world = points.world
+    first = se3.inverse(world.T_c_w[0])
+    uv = rng.uniform((200, 140), (440, 340), (len(world.p_w), 2))
+    rays = CAMERA.back_project(uv, np.ones(len(uv)))
+    normal = np.array([0.5, 0.3, 1.0])
+    world.p_w[:] = se3.transform(first, rays * (2.5 / (rays @ normal))[:, None])
+    for view, T in enumerate(world.T_c_w):
+        p_c = se3.transform(T, world.p_w)
+        world.uv[view] = CAMERA.project(p_c)
+        inside = (p_c[:, 2] > 0.1) & (world.uv[view] > 0).all(1) & (world.uv[view] < (639, 479)).all(1)
+        points.point_of[view] = np.flatnonzero(inside)
+        features = points.features(view, points.point_of[view], rng.normal(0, noise_px, (inside.sum(), 2)))
+        keyframe = points.keyframes[view]
+        points.keyframes[view] = make_keyframe(keyframe.id, keyframe.frame_index, keyframe.stamp_s, T, features)
+    return points
+
+
+def other_explanation(points, found):
+    """Pose and points of the other decomposition of the plane's homography, at the truth's baseline."""
+    uv_r = points.keyframes[0].features.uv[found.reference_keypoint]
+    uv_c = view_of(points, 4).features.uv[found.keypoint]
+    H, _ = cv2.findHomography(uv_r, uv_c)
+    _, turns, shifts, normals = cv2.decomposeHomographyMat(H, CAMERA.K)
+    T_true = points.world.T_c_w[4] @ se3.inverse(points.world.T_c_w[0])
+    rays = CAMERA.back_project(uv_r, np.ones(len(uv_r)))
+    best, apart = None, 0.0
+    for R, t, n in zip(turns, shifts, normals, strict=True):
+        z = 1.0 / (rays @ n[:, 0])  # the plane n p = 1
+        p = rays * z[:, None]
+        if (z <= 0).any() or ((p @ R.T + t[:, 0])[:, 2] <= 0).any():
+            continue
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = R, t[:, 0]
+        grown = np.linalg.norm(T_true[:3, 3]) / np.linalg.norm(t)
+        T[:3, 3] *= grown
+        off = np.linalg.norm(se3.log(T @ se3.inverse(T_true)))
+        if off > apart:
+            first = points.world.T_c_w[0]
+            best, apart = (T @ first, se3.transform(se3.inverse(first), p * grown)), off
+    return best
+
+
+def test_a_guessed_map_that_is_adopted_keeps_what_was_matched(points):
+    """Turned away before parallax came: the frames so far hang on the guess, each with its own matches."""
+    with_network(points)
+    bootstrap = make_bootstrap(points, z_in(points, 0), InitialisationConfig(keyframe_gap_s=0.01))
+    for view in (1, 2, 3):
+        seen = view_of(points, view)
+        track = bootstrap.track(seen, points.world.T_c_w[view])
+        bootstrap.two_views(points.keyframes[view].frame_index, seen, track)
+        bootstrap.wait(frame_of(points, view), seen, track)
+    seen = view_of(points, 4)
+    track = bootstrap.track(seen, points.world.T_c_w[4])
+    bootstrap.two_views(points.keyframes[4].frame_index, seen, track)
+    adopted = bootstrap.adopt(frame_of(points, 4), seen, track)
+    check_map(points.map)
+    assert [k.frame_index for _, k in adopted.new] == [points.keyframes[v].frame_index for v in (1, 2, 3, 4)]
+    assert set(adopted.T_c_w) == {points.keyframes[v].frame_index for v in (0, 1, 2, 3)}
+    point_of_anchor = dict(zip(points.keyframes[0].anchor.tolist(), points.point_of[0].tolist(), strict=True))
+    for view, (_, keyframe) in zip((1, 2, 3, 4), adopted.new, strict=True):
+        held = keyframe.keypoints_with_anchor()
+        assert len(held) > 60
+        told = [point_of_anchor[a] for a in keyframe.anchor[held].tolist()]
+        np.testing.assert_array_equal(told, points.point_of[view][held])
+        assert np.abs(se3.log(keyframe.T_c_w @ se3.inverse(points.world.T_c_w[view]))).max() < 0.02

@@ -1,0 +1,58 @@
+"""An executor whose work is done when a test says so, in place of a thread."""
+
+from collections.abc import Callable
+from concurrent.futures import Executor, Future
+from typing import Any
+
+
+class Job(Future):
+    """Work that was handed over; asking for its result before it is done does it."""
+
+    def __init__(self, work: Callable[[], Any]) -> None:
+        super().__init__()
+        self._work = work
+
+    def run(self) -> None:
+        """Do it now, in the caller's thread."""
+        try:
+            self.set_result(self._work())
+        except BaseException as error:
+            self.set_exception(error)
+
+    def result(self, timeout: float | None = None) -> Any:
+        """What came out."""
+        if not self.done():
+            self.run()
+        return super().result(timeout)
+
+
+class Scheduler(Executor):
+    """Keeps what is submitted until `work`; with ``at_once`` it is done when it is submitted."""
+
+    def __init__(self, at_once: bool = False) -> None:
+        self.at_once = at_once
+        self.jobs: list[Job] = []
+        self.is_shut = False
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Job:
+        """Keep a call for later."""
+        assert not self.is_shut
+        job = Job(lambda: fn(*args, **kwargs))
+        self.jobs.append(job)
+        if self.at_once:
+            job.run()
+        return job
+
+    @property
+    def waiting(self) -> list[Job]:
+        """What is not done yet."""
+        return [job for job in self.jobs if not job.done()]
+
+    def work(self) -> None:
+        """Do all that waits."""
+        for job in self.waiting:
+            job.run()
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """No more work."""
+        self.is_shut = True

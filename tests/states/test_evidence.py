@@ -1,0 +1,127 @@
+"""What counts as evidence for the scale, with which sign and how surely, from image to metres."""
+
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from rendered import CAMERA, film, sideways, stairs_world
+
+from edgeslam_torch.config import DepthConfig, SlamConfig
+from edgeslam_torch.eval.metrics.align import umeyama
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.slam import EdgeSlam
+from edgeslam_torch.types import DepthMap, TelemetrySample, Units
+
+NO_NETWORK = SlamConfig(depth=DepthConfig(weights="none"))
+
+
+@lru_cache(maxsize=1)
+def panels():
+    return film(stairs_world(), CAMERA, sideways(30, 0.03, turn_rad=0.004), step_s=1 / 30)
+
+
+def length(T_w_c):
+    return np.linalg.norm(np.diff(T_w_c[:, :3, 3], axis=0), axis=1).sum()
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_a_first_depth_map_that_is_off_is_put_right_by_those_that_follow(factor):
+    """The first map sets the map's unit; a dozen later ones say what that is in metres."""
+    known, calls = panels().depth_function(), []
+
+    def depth(image, camera):
+        right = known(image, camera)
+        calls.append(image)
+        return DepthMap(right.depth_m * factor, right.sigma_log) if len(calls) == 1 else right
+
+    slam = EdgeSlam(CAMERA, NO_NETWORK, depth=depth)
+    for frame in panels().frames:
+        slam.step(frame)
+    assert slam.scale.value == pytest.approx(1.0 / factor, rel=0.1)
+    live = length(slam.trajectory()[1])
+    slam.finish()
+    assert length(slam.trajectory()[1]) == pytest.approx(length(panels().T_w_c), rel=0.1)
+    assert live == pytest.approx(factor * length(panels().T_w_c), rel=0.1), "live units do not follow a guess"
+
+
+def test_depths_that_the_network_gave_do_not_confirm_the_network():
+    """A camera that only turns: every anchor lies where the network put it, which says nothing of the network."""
+    turn = np.linspace(0.0, 0.5, 30)
+    poses = np.stack([se3.exp(np.array([0.0, 0.0, 0.0, 0.0, a, 0.0])) for a in turn])
+    turning = film(stairs_world(), CAMERA, poses)
+    slam = EdgeSlam(CAMERA, NO_NETWORK, depth=turning.depth_function())
+    told = spied(slam, "add_depth_ratio")
+    for frame in turning.frames:
+        slam.step(frame)
+    assert len(slam.map.anchors) > 300
+    assert slam.map.anchors.from_depth[slam.map.anchors.alive].mean() > 0.95
+    assert told == []
+
+
+def spied(slam, name):
+    """Arguments of all calls of one of fusion's methods from now on."""
+    fusion, calls = slam._system.fusion, []
+    inner = getattr(fusion, name)
+
+    def method(*arguments, **named):
+        calls.append((*arguments, *named.values()))
+        return inner(*arguments, **named)
+
+    setattr(fusion, name, method)
+    return calls
+
+
+def test_visual_sigma_is_that_of_the_visual_errors():
+    """From one frame to the next, in map units: within a factor of three, be it too large or too small."""
+    slam = EdgeSlam(CAMERA, NO_NETWORK)
+    told = spied(slam, "add_visual")
+    for frame in panels().frames:
+        slam.step(frame)
+    T = np.stack([call[1] for call in told])
+    index = [int(np.abs(panels().stamps_s - call[0]).argmin()) for call in told]
+    truth = panels().T_w_c[index]
+    aligned = umeyama(T[:, :3, 3], truth[:, :3, 3])
+    error = (aligned.points(T[:, :3, 3]) - truth[:, :3, 3]) / aligned.scale
+    jitter = np.diff(error, axis=0)
+    off = np.sqrt(np.median(jitter**2) / 2.0) / 0.6745
+    sigma = np.median([call[2] for call in told])
+    assert off / 3.0 < sigma < 3.0 * off + 0.002
+
+
+def test_frames_that_were_lost_are_counted_and_are_no_evidence():
+    black = np.zeros((240, 320, 3), np.uint8)
+    frames = panels().with_images(lambda i, image: black if 18 <= i < 23 else image)
+    slam = EdgeSlam(CAMERA, NO_NETWORK)
+    for frame in frames:
+        slam.step(frame, [TelemetrySample(frame.stamp_s, np.zeros(3), np.zeros(3))])
+    assert slam.telemetry_statistics()["visual not tracked"] == 5
+
+
+def test_the_last_word_on_the_scale_rests_on_the_refined_poses():
+    slam = EdgeSlam(CAMERA, NO_NETWORK, depth=panels().depth_function())
+    for frame in panels().frames:
+        slam.step(frame)
+    before = slam.log.poses()[1].copy()
+    told = spied(slam, "revise")
+    slam.finish()
+    ((stamps, T_w_c),) = told
+    np.testing.assert_array_equal(stamps, panels().stamps_s)
+    np.testing.assert_array_equal(T_w_c, slam.log.poses()[1])
+    assert np.abs(T_w_c - before).max() > 1e-6, "refinement has moved them"
+    assert slam.scale.units is Units.METRES
+
+
+def test_one_scale_for_all_of_a_frozen_stretch():
+    """A video that stands still gives its last new image once, and nothing until it moves again."""
+    frames = list(panels().frames[:24])
+    frozen = [replace(frames[-1], index=24 + k, stamp_s=frames[-1].stamp_s + (k + 1) / 30) for k in range(5)]
+    later = [replace(f, stamp_s=f.stamp_s + 5 / 30, index=f.index + 5) for f in panels().frames[24:]]
+    slam = EdgeSlam(CAMERA, NO_NETWORK)
+    told = spied(slam, "add_visual")
+    for frame in [*frames, *frozen, *later]:
+        slam.step(frame)
+    stamps = [call[0] for call in told]
+    assert frames[-1].stamp_s in stamps
+    assert not set(stamps) & {f.stamp_s for f in frozen}
+    assert later[-1].stamp_s in stamps

@@ -1,0 +1,170 @@
+"""Mapping on another thread while frames are tracked: with a scheduler that the test turns, nothing depends on time."""
+
+import threading
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from point_map import check_map
+from rendered import CAMERA, film, sideways, stairs_world
+from scheduler import Scheduler
+
+from edgeslam_torch.config import DepthConfig, SlamConfig
+from edgeslam_torch.eval.metrics.align import umeyama
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.slam import EdgeSlam
+from edgeslam_torch.states.machine import State
+from edgeslam_torch.types import FrameStatus
+
+NO_NETWORK = SlamConfig(depth=DepthConfig(weights="none"))
+SUPPORTED = {FrameStatus.INITIALISED, FrameStatus.TRACKED}
+
+
+@lru_cache(maxsize=1)
+def panels():
+    """40 images past panels at many depths, 1.2 m sideways."""
+    return film(stairs_world(), CAMERA, sideways(40, 0.03, turn_rad=0.004), step_s=1 / 30)
+
+
+def realtime(scheduler, depth=None):
+    return EdgeSlam(CAMERA, NO_NETWORK, depth=depth, realtime=True, executor=scheduler)
+
+
+def to_the_map(slam, scheduler):
+    """Steps until a map stands; the frames that are left."""
+    frames = iter(panels().frames)
+    for frame in frames:
+        if slam.step(frame).status is FrameStatus.INITIALISED:
+            assert len(scheduler.jobs) == 1
+            return frames
+    raise AssertionError("the map never stands")
+
+
+def ate(T_w_c, truth):
+    aligned = umeyama(T_w_c[:, :3, 3], truth[:, :3, 3]).points(T_w_c[:, :3, 3])
+    return float(np.sqrt(np.mean(np.sum((aligned - truth[:, :3, 3]) ** 2, axis=1))))
+
+
+def move_the_map(slam, M):
+    """What a refinement of everything may do: all of the map, rigidly, by ``p' = M p``."""
+    anchors, R = slam.map.anchors, M[:3, :3]
+    anchors.p_w[:] = se3.transform(M, anchors.p_w)
+    anchors.origin[:] = se3.transform(M, anchors.origin)
+    anchors.normal[:] = anchors.normal @ R.T
+    for keyframe in slam.map.keyframes.values():
+        keyframe.T_c_w = keyframe.T_c_w @ se3.inverse(M)
+
+
+def test_a_worker_that_is_done_at_once_maps_as_well_as_none():
+    scheduler = Scheduler(at_once=True)
+    slam = realtime(scheduler)
+    outputs = [slam.step(frame) for frame in panels().frames]
+    slam.finish()
+    check_map(slam.map)
+    assert ate(slam.trajectory()[1], panels().T_w_c) < 0.012
+    assert slam.support().supported.all()
+    assert set(slam.events.values()) == {0}
+    assert "keyframes_skipped" in slam.events
+    assert sum(o.keyframe for o in outputs) == len(scheduler.jobs) + 1  # the first one starts alone
+    assert len(slam.edge_map().p_w) > 3000
+
+
+def test_what_refinement_did_to_the_newest_keyframe_carries_the_camera_along():
+    """While frames are tracked against the old map, all of it is moved by 60 cm and 20 degrees."""
+    M = se3.exp(np.array([0.4, -0.3, 0.3, 0.1, 0.3, -0.15]))
+    scheduler = Scheduler()
+    slam = realtime(scheduler)
+    frames = to_the_map(slam, scheduler)
+    before = [slam.step(next(frames)) for _ in range(3)]
+    scheduler.work()
+    move_the_map(slam, M)
+    after = [slam.step(next(frames)) for _ in range(3)]
+    assert {o.status for o in after} == {FrameStatus.TRACKED}
+    assert slam.events["lost"] == slam.events["relocalised"] == 0
+    # Each camera to the next one as in truth, up to the map's scale, across the leap as well.
+    first = before[0].index
+    truth = se3.inverse(panels().T_w_c[first]) @ panels().T_w_c[first + 5]
+    found = se3.inverse(M @ before[0].T_w_c) @ after[-1].T_w_c
+    assert np.linalg.norm(se3.log(found)[3:] - se3.log(truth)[3:]) < np.deg2rad(0.5)
+    cosine = found[:3, 3] @ truth[:3, 3] / np.linalg.norm(found[:3, 3]) / np.linalg.norm(truth[:3, 3])
+    assert cosine > np.cos(np.deg2rad(5.0))
+
+
+def test_while_the_worker_is_busy_no_other_keyframe_is_made_and_each_is_counted():
+    scheduler = Scheduler()
+    slam = realtime(scheduler)
+    frames = to_the_map(slam, scheduler)
+    busy = [slam.step(next(frames)) for _ in range(12)]
+    assert {o.status for o in busy} == {FrameStatus.TRACKED}
+    assert slam.state is State.TRACKING
+    assert len(scheduler.jobs) == 1
+    assert not any(o.keyframe for o in busy)
+    skipped = slam.events["keyframes_skipped"]
+    assert skipped >= 1
+    assert len(slam.map.keyframes) == 2 + len(scheduler.jobs[0].result().keyframes) - 1
+    after = [slam.step(next(frames)) for _ in range(8)]
+    assert any(o.keyframe for o in after)
+    assert len(scheduler.jobs) == 2
+    slam.finish()
+    check_map(slam.map)
+    assert ate(slam.trajectory()[1], panels().T_w_c[: len(slam.trajectory()[1])]) < 0.02
+
+
+def test_the_end_waits_for_what_is_being_mapped():
+    scheduler = Scheduler()
+    slam = realtime(scheduler)
+    frames = to_the_map(slam, scheduler)
+    for _ in range(4):
+        slam.step(next(frames))
+    assert scheduler.waiting
+    slam.finish()
+    assert not scheduler.waiting
+    newest = slam.keyframes()[-1]
+    assert newest in scheduler.jobs[-1].result().keyframes
+    assert len(newest.keypoints_with_anchor()) > 100
+    assert len(slam.edge_map().p_w) > 0, "edges are measured at the end, the last keyframe's too"
+    slam.close()
+    assert scheduler.is_shut
+
+
+def test_a_fault_of_the_mapping_is_raised_where_the_frames_are_stepped():
+    def depth(image, camera):
+        if scheduler.jobs:
+            raise RuntimeError("the network broke")
+
+    scheduler = Scheduler()
+    slam = realtime(scheduler, depth)
+    frames = to_the_map(slam, scheduler)
+    scheduler.work()
+    with pytest.raises(RuntimeError, match="the network broke"):
+        slam.step(next(frames))
+
+
+def test_maps_are_read_and_frames_are_tracked_while_the_network_runs():
+    """A real thread stands still inside of the depth network until the others have done all that they may want."""
+    inside, go_on = threading.Event(), threading.Event()
+
+    def depth(image, camera):
+        if threading.current_thread() is not threading.main_thread():
+            inside.set()
+            assert go_on.wait(120.0)
+
+    scheduler = Scheduler()
+    slam = realtime(scheduler, depth)
+    frames = to_the_map(slam, scheduler)
+    worker = threading.Thread(target=scheduler.work, daemon=True)
+    worker.start()
+    assert inside.wait(120.0)
+    step = slam.step(next(frames))
+    stamps, T_w_c = slam.trajectory()
+    anchors, edges, keyframes = slam.anchors(), slam.edge_map(), slam.keyframes()
+    assert scheduler.waiting, "all of that while the worker was at it"
+    go_on.set()
+    worker.join(120.0)
+    assert step.status is FrameStatus.TRACKED
+    assert len(stamps) == len(T_w_c) == step.index + 1
+    assert np.isfinite(T_w_c).all()
+    assert len({len(x) for x in (anchors.p_w, anchors.colour, anchors.sigma_m, anchors.observations)}) == 1
+    assert len(anchors.p_w) > 100
+    assert len(edges.p_w) == 0
+    assert [k.id for k in keyframes] == sorted(k.id for k in keyframes)
