@@ -99,6 +99,16 @@ def fitted(camera: Camera, size: tuple[int, int], name: str) -> tuple[Camera, li
     return replace(camera.scaled(*size), source=source), [note]
 
 
+def known_camera(folders: Sequence[Path], default: Camera | None = None) -> Camera | None:
+    """Calibration that a recording has: a file in one of its folders, else its data set's own; None without either.
+
+    Raises:
+        CalibrationError: If the file is malformed.
+    """
+    found = _calibration_in(folders)
+    return default if found is None else load_camera(found)
+
+
 def _calibration_in(folders: Sequence[Path]) -> Path | None:
     candidates = (folder / name for folder in folders for name in CALIBRATION_FILES)
     return next((path for path in candidates if path.is_file()), None)

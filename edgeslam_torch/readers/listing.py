@@ -1,5 +1,6 @@
 """Lists of images with stamps, and what is wrong with them."""
 
+import math
 from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from edgeslam_torch.errors import SourceError
 from edgeslam_torch.types import FloatArray, IntArray
 
 
@@ -46,6 +48,39 @@ def seconds_from(stamps: Sequence[float]) -> tuple[FloatArray, str]:
         if size >= limit:
             return array * factor, unit
     return array, "s"
+
+
+def read_list(path: Path) -> tuple[list[tuple[float, str]], list[Problem]]:
+    """Rows ``stamp path`` of a list; lines that are not such a row become problems.
+
+    Raises:
+        SourceError: If the file is not text.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except (UnicodeDecodeError, OSError) as error:
+        raise SourceError(f"{path}: cannot be read as a text list of images ({error})") from error
+    rows: list[tuple[float, str]] = []
+    problems: list[Problem] = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        line = line.strip()
+        if not line or line.startswith("#"):
+            continue
+        stamp, _, name = line.replace(",", " ", 1).partition(" ")
+        value = _finite(stamp)
+        if value is None or not name.strip():
+            problems.append(Problem(f"{path}:{number}", f"not 'stamp path': {line[:60]!r}"))
+            continue
+        rows.append((value, name.strip()))
+    return rows, problems
+
+
+def _finite(text: str) -> float | None:
+    try:
+        value = float(text)
+    except ValueError:
+        return None
+    return value if math.isfinite(value) else None
 
 
 def in_order(entries: Sequence[ImageEntry], name: str) -> tuple[list[ImageEntry], list[Problem]]:

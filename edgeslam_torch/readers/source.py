@@ -3,25 +3,22 @@
 import importlib
 import importlib.util
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
 from typing import Protocol
 
 from edgeslam_torch.calibration.camera_choice import choose_camera
 from edgeslam_torch.errors import SourceError
-from edgeslam_torch.geometry.camera import PRESETS, Camera
-from edgeslam_torch.readers import images, video
-from edgeslam_torch.readers.layouts import euroc, flight, seven_scenes, tum
+from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.readers import flight, images, video
+from edgeslam_torch.readers.layouts import layout_of, read_sequence, tum
 from edgeslam_torch.readers.listing import ImageEntry, Problem
 from edgeslam_torch.readers.read_ahead import read_ahead
+from edgeslam_torch.readers.sequence import Sequence
 from edgeslam_torch.types import Frame, TelemetrySample
 
 LIVE_SCHEMES = ("tello://", "webcam:", "rtsp://", "udp://")
-
-SEVEN_SCENES_CAMERA = replace(
-    PRESETS["kinect"], cx=320.0, cy=240.0, source="the 7-Scenes default (Kinect colour camera, 525 px)"
-)
 
 ARCHIVES = {
     ".bag": "a ROS bag: extract its images first",
@@ -41,7 +38,7 @@ class Source(Protocol):
     name: str
     """For messages and file names."""
     kind: str
-    """``tum``, ``7scenes``, ``euroc``, ``images``, ``video``, ``flight`` or ``live``."""
+    """A layout's ``KIND``, or ``images``, ``video``, ``flight``, ``live``."""
     location: str
     """Absolute path, or the address of a live source."""
     camera: Camera
@@ -172,7 +169,7 @@ def _content(path: Path) -> _Content:
 def _file_content(path: Path) -> _Content:
     suffix = path.suffix.lower()
     if suffix in images.SUFFIXES:
-        return _listed("images", [ImageEntry(0, 0.0, path)], [], path, None)
+        return _listed(Sequence("images", path.parent, (ImageEntry(0, 0.0, path),)), path)
     if suffix in ARCHIVES:
         raise SourceError(f"{path}: {ARCHIVES[suffix]}, then give the folder")
     if path.name in tum.LISTS:
@@ -181,20 +178,15 @@ def _file_content(path: Path) -> _Content:
 
 
 def _folder_content(folder: Path) -> _Content:
-    camera_folder = euroc.camera_folder(folder)
-    if camera_folder is not None:
-        truth = euroc.groundtruth_of(camera_folder)
-        return _listed("euroc", *euroc.list_euroc(camera_folder), camera_folder, truth)
-    if seven_scenes.is_seven_scenes(folder):
-        truth = folder if next(folder.glob("*.pose.txt"), None) is not None else None
-        return _listed("7scenes", *seven_scenes.list_seven_scenes(folder), folder, truth, SEVEN_SCENES_CAMERA)
+    sequence = read_sequence(folder)
+    if sequence is not None:
+        return _listed(sequence, sequence.folder)
     truth = folder / "groundtruth.txt" if (folder / "groundtruth.txt").is_file() else None
-    if tum.is_tum(folder):
-        return _listed("tum", *tum.list_tum(folder), folder, truth, tum.default_camera(folder.resolve().name))
     recorded = flight.find_video(folder)
     if recorded is not None:
         return _video_content(recorded, truth)
-    return _listed("images", *images.list_image_folder(folder), folder, truth)
+    found, problems = images.list_image_folder(folder)
+    return _listed(Sequence("images", folder, tuple(found), tuple(problems), truth), folder)
 
 
 def _video_content(path: Path, groundtruth: Path | None) -> _Content:
@@ -206,25 +198,19 @@ def _video_content(path: Path, groundtruth: Path | None) -> _Content:
     return _Content("video", decode, clip.size, clip.count, [], path.parent, groundtruth)
 
 
-def _listed(
-    kind: str,
-    entries: list[ImageEntry],
-    problems: list[Problem],
-    folder: Path,
-    groundtruth: Path | None,
-    default_camera: Camera | None = None,
-) -> _Content:
-    if not entries:
-        raise SourceError(_nothing_in(folder))
+def _listed(sequence: Sequence, place: Path) -> _Content:
+    """Images of a sequence that was found in ``place``, which messages name."""
+    if not sequence.images:
+        raise SourceError(_nothing_in(place))
     return _Content(
-        kind,
-        lambda size, found: images.frames_of(entries, size, found),
-        images.first_size(entries, str(folder)),
-        len(entries),
-        problems,
-        folder if folder.is_dir() else folder.parent,
-        groundtruth,
-        default_camera,
+        sequence.kind,
+        lambda size, found: images.frames_of(sequence.images, size, found),
+        images.first_size(sequence.images, str(place)),
+        len(sequence.images),
+        list(sequence.problems),
+        sequence.folder,
+        sequence.groundtruth,
+        sequence.camera,
     )
 
 
@@ -244,12 +230,7 @@ def _nothing_in(folder: Path) -> str:
 
 
 def _looks_like_sequence(folder: Path) -> bool:
-    return (
-        euroc.camera_folder(folder) is not None
-        or seven_scenes.is_seven_scenes(folder)
-        or tum.is_tum(folder)
-        or bool(images.image_files(folder))
-    )
+    return layout_of(folder) is not None or bool(images.image_files(folder))
 
 
 def _open_live(spec: str, camera: str | Path | None, telemetry: str | Path | None, max_frames: int | None) -> Source:

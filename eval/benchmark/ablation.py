@@ -258,7 +258,7 @@ def _finish(flight: _Flight, window: WindowConfig, dataset: EvalDataset) -> dict
     }
     alignment = score.alignment
     if dataset.depth is not None:
-        if not np.array_equal(dataset.depth.T_c_d, np.eye(4)):
+        if not dataset.depth.is_registered:
             # The true poses are the depth camera's; ours are the colour camera's.
             T, known = interpolate(dataset.truth, stamps)
             colour = T @ np.linalg.inv(dataset.depth.T_c_d)

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.inputs.associate import DEFAULT_MAX_DT_S, nearest
 from edgeslam_torch.eval.inputs.dataset import open_depth
-from edgeslam_torch.eval.metrics.surface import register_depth
 from edgeslam_torch.readers.images import pixels_or_none
 from edgeslam_torch.types import FloatArray
 
@@ -169,12 +168,10 @@ def compare_with_recording(prediction: Path, folder: Path) -> DepthReport:
     maps = _maps(prediction)
     reports = []
     for stamp, path in zip(measured.frame_stamps_s, measured.image_paths, strict=True):
-        index = int(nearest(measured.files.stamps_s, np.array([stamp]))[0])
-        if path.stem not in maps or abs(measured.files.stamps_s[index] - stamp) > DEFAULT_MAX_DT_S:
+        index = int(nearest(measured.maps.stamps_s, np.array([stamp]))[0])
+        if path.stem not in maps or abs(measured.maps.stamps_s[index] - stamp) > DEFAULT_MAX_DT_S:
             continue
-        truth = measured.files.read(index)
-        if not np.array_equal(measured.files.T_c_d, np.eye(4)):
-            truth = register_depth(truth, measured.files.camera, measured.files.T_c_d, measured.camera)
+        truth = measured.maps.read_registered(index, measured.camera)
         image = _read_image(path)
         image = None if image is None else np.asarray(measured.camera.undistort_image(image), np.uint8)
         reports.append(report_depth(read_depth(maps[path.stem], 1e-3), truth, image))

@@ -163,7 +163,7 @@ def _map_score(
         return None, "the data set has no depth maps"
     truth = surface_truth(dataset.folder.resolve())
     alignment = sim3.alignment
-    if not np.array_equal(dataset.depth.T_c_d, np.eye(4)):
+    if not dataset.depth.is_registered:
         # The true poses are the depth camera's; the run's are the colour camera's, 2.6 cm beside it.
         T, known = interpolate(dataset.truth, run.trajectory.stamps_s)
         colour = T @ np.linalg.inv(dataset.depth.T_c_d)

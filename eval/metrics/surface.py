@@ -10,10 +10,11 @@ from scipy.spatial import cKDTree
 
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.inputs.associate import nearest
-from edgeslam_torch.eval.inputs.dataset import DepthFiles, EvalDataset, interpolate, open_dataset
+from edgeslam_torch.eval.inputs.dataset import EvalDataset, interpolate, open_dataset
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.readers.images import pixels_or_none
+from edgeslam_torch.readers.sequence import DepthMaps, register_depth
 from edgeslam_torch.types import FloatArray
 
 MAX_DEPTH_M = 5.0
@@ -131,25 +132,26 @@ def surface_truth(folder: Path) -> SurfaceTruth:
 
 def build_surface(dataset: EvalDataset) -> SurfaceTruth:
     """Fuse a data set's depth maps with its true poses (see `surface_truth`)."""
-    files = dataset.depth
-    if files is None or len(files.paths) == 0:
+    measured, colour = dataset.depth, dataset.camera
+    if measured is None or colour is None or len(measured.paths) == 0:
         raise EvaluationError(f"{dataset.folder}: no depth maps (depth.txt and a camera.yaml are needed)")
-    T_w_d, known = interpolate(dataset.truth, files.stamps_s)
+    T_w_d, known = interpolate(dataset.truth, measured.stamps_s)
     index = np.flatnonzero(known)
     if len(index) == 0:
         raise EvaluationError(f"{dataset.folder}: no depth map has a true pose at its time")
     edge_index = set(index[:: max(1, len(index) // _EDGE_FRAMES)].tolist())
-    small = files.camera.scaled(files.camera.width // _STRIDE, files.camera.height // _STRIDE)
+    camera = measured.taken_by(colour)
+    small = camera.scaled(camera.width // _STRIDE, camera.height // _STRIDE)
     # Pixels are taken, not averaged: sub-pixel phase 0 of every stride, hence the plain division below.
-    small = Camera(small.width, small.height, *_strided(files.camera), source=files.camera.source)
+    small = Camera(small.width, small.height, *_strided(camera), source=camera.source)
     clouds, edges, maps = [], [], []
     for i in index:
-        depth = files.read(int(i))
+        depth = measured.read(int(i), colour)
         depth[depth > MAX_DEPTH_M] = 0.0
         maps.append(depth[::_STRIDE, ::_STRIDE].copy())
         clouds.append(_thinned(_points(maps[-1], small, T_w_d[i]), _VOXEL_M))
         if i in edge_index:
-            edges.append(_edge_points(dataset, files, depth, int(i)))
+            edges.append(_edge_points(dataset, measured, depth, int(i)))
     cloud = _thinned(np.concatenate(clouds), _VOXEL_M)
     edge_cloud = _agreed(edges)
     tree = cKDTree(cloud, balanced_tree=False, compact_nodes=False)
@@ -190,38 +192,25 @@ def _agreed(edges: list[FloatArray]) -> FloatArray:
     return mean[maps >= min(_EDGE_MAPS, len(edges))].astype(np.float32)
 
 
-def _edge_points(dataset: EvalDataset, files: DepthFiles, depth: FloatArray, index: int) -> FloatArray:
+def _edge_points(dataset: EvalDataset, measured: DepthMaps, depth: FloatArray, index: int) -> FloatArray:
     """World points ``(N, 3)`` of the colour image's edges that have a measured depth."""
     empty = np.zeros((0, 3), dtype=np.float32)
     if dataset.camera is None or len(dataset.frame_stamps_s) == 0:
         return empty
-    k = int(nearest(dataset.frame_stamps_s, files.stamps_s[index : index + 1])[0])
+    k = int(nearest(dataset.frame_stamps_s, measured.stamps_s[index : index + 1])[0])
     T_w_image, known = interpolate(dataset.truth, dataset.frame_stamps_s[k : k + 1])
     image = pixels_or_none(dataset.image_paths[k], cv2.IMREAD_GRAYSCALE)
-    if abs(dataset.frame_stamps_s[k] - files.stamps_s[index]) > 0.02 or not known[0] or image is None:
+    if abs(dataset.frame_stamps_s[k] - measured.stamps_s[index]) > 0.02 or not known[0] or image is None:
         return empty
-    T_c_d, camera = files.T_c_d, dataset.camera
-    if not np.array_equal(T_c_d, np.eye(4)):
-        depth = register_depth(depth, files.camera, T_c_d, camera)
+    T_c_d, camera = measured.T_c_d, dataset.camera
+    if not measured.is_registered:
+        depth = register_depth(depth, measured.taken_by(camera), T_c_d, camera)
     image = camera.undistort_image(image)
     canny = cv2.Canny(cv2.GaussianBlur(image, (0, 0), 1.0), *_CANNY, L2gradient=True) > 0
-    measured = np.where(depth > 0, 1, 0).astype(np.uint8)
-    solid = cv2.erode(measured, np.ones((2 * _HOLE_PX + 1,) * 2, np.uint8), borderValue=0) > 0
+    has_depth = np.where(depth > 0, 1, 0).astype(np.uint8)
+    solid = cv2.erode(has_depth, np.ones((2 * _HOLE_PX + 1,) * 2, np.uint8), borderValue=0) > 0
     near = cv2.erode(np.where(depth > 0, depth, np.float32(1e3)), np.ones((2 * _NEAR_PX + 1,) * 2, np.uint8))
     v, u = np.nonzero(canny & solid & (near < MAX_EDGE_DEPTH_M))
     p_c = camera.back_project(np.stack([u, v], axis=1).astype(np.float64), np.asarray(near, dtype=np.float64)[v, u])
     # The truth is the pose of the depth camera where the two differ.
     return se3.transform(T_w_image[0] @ se3.inverse(T_c_d), p_c).astype(np.float32)
-
-
-def register_depth(depth: FloatArray, depth_camera: Camera, T_c_d: FloatArray, camera: Camera) -> FloatArray:
-    """Depth map ``(H, W)`` of one camera as another sees it; 0 where nothing falls; the nearest wins."""
-    v, u = np.nonzero(depth)
-    p = se3.transform(T_c_d, depth_camera.back_project(np.stack([u, v], axis=1).astype(np.float64), depth[v, u]))
-    p = p[p[:, 2] > 0.05]
-    uv = np.rint(camera.project(p)).astype(np.int64)
-    ok = (uv >= 0).all(axis=1) & (uv[:, 0] < camera.width) & (uv[:, 1] < camera.height)
-    out = np.full((camera.height, camera.width), np.inf, dtype=np.float32)
-    np.minimum.at(out, (uv[ok, 1], uv[ok, 0]), p[ok, 2].astype(np.float32))
-    out[np.isinf(out)] = 0.0
-    return out

@@ -1,8 +1,6 @@
 """Keyframes with the map's edges drawn in, coloured by depth: does the map lie on the image?"""
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -13,14 +11,9 @@ from edgeslam_torch.eval.inputs.run_folder import RunFolder
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera, load_camera
 from edgeslam_torch.readers import images
-from edgeslam_torch.readers.layouts import euroc, seven_scenes, tum
+from edgeslam_torch.readers.layouts import layout_of
+from edgeslam_torch.readers.listing import ImageEntry
 from edgeslam_torch.types import FloatArray, PointCloud
-
-_LISTS: dict[str, Callable[[Path], Any]] = {
-    "tum": tum.list_tum,
-    "7scenes": seven_scenes.list_seven_scenes,
-    "images": images.list_image_folder,
-}
 
 _CELL_PX = 8
 """Side of the cells in which nearer points hide farther ones."""
@@ -90,12 +83,12 @@ def draw_edges(image: np.ndarray, camera: Camera, T_c_w: FloatArray, cloud: Poin
     return out
 
 
-def _entries(run: RunFolder) -> list[Any]:
+def _entries(run: RunFolder) -> list[ImageEntry]:
     source, folder = run.summary.get("source"), run.source
     if not isinstance(source, dict) or folder is None:
         return []
     kind = str(source.get("kind"))
-    if kind == "euroc":
-        camera_folder = euroc.camera_folder(folder)
-        return list(euroc.list_euroc(camera_folder)[0]) if camera_folder is not None else []
-    return list(_LISTS[kind](folder)[0]) if kind in _LISTS else []
+    if kind == "images":
+        return images.list_image_folder(folder)[0]
+    layout = layout_of(folder)
+    return list(layout.read(folder).images) if layout is not None and kind == layout.KIND else []

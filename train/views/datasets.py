@@ -1,7 +1,6 @@
-"""Training images with depth: folders in TUM layout, and anything that yields the same views."""
+"""Training images with depth: recordings in any layout, and anything that yields the same views."""
 
 import logging
-import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,11 +8,14 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import yaml
 
+from edgeslam_torch.calibration.camera_choice import known_camera
 from edgeslam_torch.errors import CalibrationError, SourceError
-from edgeslam_torch.geometry.camera import Camera, load_camera
+from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.readers.images import pixels_or_none
+from edgeslam_torch.readers.layouts import read_sequence
+from edgeslam_torch.readers.listing import Problem
+from edgeslam_torch.readers.sequence import DepthMaps
 from edgeslam_torch.train.processes.counting import counted
 from edgeslam_torch.train.views.augment import View, fitted_view
 from edgeslam_torch.types import FloatArray
@@ -39,30 +41,35 @@ class DepthFolder:
 def load_depth_folder(
     folder: Path, width: int = 400, max_gap_s: float = 0.02, stride: int = 1, max_frames: int | None = None
 ) -> DepthFolder:
-    """Read a folder in TUM layout (``rgb.txt``, ``depth.txt``, ``camera.yaml``), undistorted and scaled to ``width``.
+    """Read a recording with depth maps, undistorted and scaled to ``width``.
 
-    Each depth map is paired with the colour image nearest in time; depth is undistorted by nearest neighbour and holes
-    (0, 65535) become 0.
+    Each depth map is paired with the colour image nearest in time, and turned to its camera where it is not registered.
 
     Args:
-        folder: The recording.
+        folder: The recording, in any layout.
         width: Images are reduced to this width [px] (never enlarged).
         max_gap_s: Largest time between colour and depth [s].
         stride: Take every ``stride``-th depth map.
         max_frames: Use only depth maps among the first colour images.
 
     Raises:
-        SourceError: If a list is missing, or nothing can be learnt from.
+        SourceError: If there are no depth maps, or nothing can be learnt from.
         CalibrationError: If the calibration is missing or malformed.
     """
     folder = Path(os.path.abspath(folder))
-    camera = load_camera(folder / "camera.yaml")
-    scale = _depth_scale(folder / "camera.yaml")
-    colours, depths = read_list(folder / "rgb.txt")[:max_frames], read_list(folder / "depth.txt")[::stride]
-    pairs = _pairs(colours, depths, max_gap_s)
-    views, left_out = [], []
-    for colour_path, depth_path in counted(pairs, f"reading {folder.name}", "image"):
-        view = _read_view(colour_path, depth_path, camera, scale)
+    sequence = read_sequence(folder)
+    if sequence is None or sequence.depth is None:
+        raise SourceError(f"{folder}: no recording with depth maps (rgb.txt, depth.txt and camera.yaml)")
+    camera = known_camera((folder, sequence.folder), sequence.camera)
+    if camera is None:
+        raise CalibrationError(f"{folder}: the camera is not known; put a camera.yaml into the folder")
+    maps = sequence.depth()
+    colours = sequence.images[:max_frames]
+    pairs = _pairs(np.array([entry.stamp_s for entry in colours]), maps.stamps_s, stride, max_gap_s)
+    left_out = [_words(problem) for problem in (*sequence.problems, *maps.problems) if problem.frames]
+    views = []
+    for colour, depth in counted(pairs, f"reading {folder.name}", "image"):
+        view = _read_view(colours[colour].path, maps, depth, camera)
         if isinstance(view, str):
             left_out.append(view)
         else:
@@ -70,91 +77,60 @@ def load_depth_folder(
     if not views:
         why = f" ({left_out[0]})" if left_out else f" (no image within {max_gap_s:g} s of a depth map)"
         raise SourceError(f"{folder}: no image with depth could be read{why}")
+    for remark in (_words(problem) for problem in maps.problems if not problem.frames):
+        logger.warning("%s", remark)
     if left_out:
         shown = ", ".join(left_out[:MAX_SHOWN]) + (", ..." if len(left_out) > MAX_SHOWN else "")
-        logger.warning("%s: %d of %d images with depth left out: %s", folder, len(left_out), len(pairs), shown)
+        logger.warning("%s: %d images or depth maps left out: %s", folder, len(left_out), shown)
     return DepthFolder(folder.name, views, tuple(left_out))
 
 
+def has_depth(folder: Path) -> bool:
+    """Whether a folder is a recording with depth maps, of a camera that is known.
+
+    Raises:
+        SourceError: If what names its images is malformed.
+        CalibrationError: If its calibration is.
+    """
+    sequence = read_sequence(folder) if folder.is_dir() else None
+    if sequence is None or sequence.depth is None:
+        return False
+    return known_camera((folder, sequence.folder), sequence.camera) is not None
+
+
 def _pairs(
-    colours: Sequence[tuple[float, Path]], depths: Sequence[tuple[float, Path]], max_gap_s: float
-) -> list[tuple[Path, Path]]:
-    """Colour image and depth map, for each depth map with a colour image near it."""
-    if not colours:
+    colour_stamps_s: FloatArray, depth_stamps_s: FloatArray, stride: int, max_gap_s: float
+) -> list[tuple[int, int]]:
+    """Index of colour image and depth map, for each depth map with a colour image near it."""
+    if not len(colour_stamps_s):
         return []
-    stamps = np.array([t for t, _ in colours])
-    nearest = [int(np.argmin(np.abs(stamps - stamp))) for stamp, _ in depths]
+    depths = range(0, len(depth_stamps_s), stride)
+    nearest = [int(np.argmin(np.abs(colour_stamps_s - depth_stamps_s[d]))) for d in depths]
     found = zip(nearest, depths, strict=True)
-    return [(colours[n][1], path) for n, (stamp, path) in found if abs(stamps[n] - stamp) <= max_gap_s]
+    return [(c, d) for c, d in found if abs(colour_stamps_s[c] - depth_stamps_s[d]) <= max_gap_s]
 
 
-def _read_view(colour_path: Path, depth_path: Path, camera: Camera, scale: float) -> View | str:
+def _read_view(colour_path: Path, maps: DepthMaps, index: int, camera: Camera) -> View | str:
     """One image with its depth [m], undistorted; or which file is of no use, and why."""
     image = pixels_or_none(colour_path, cv2.IMREAD_COLOR)
-    raw = pixels_or_none(depth_path, cv2.IMREAD_UNCHANGED)
     if image is None:
         return f"{colour_path}: unreadable"
-    if raw is None or raw.ndim != 2:
-        return f"{depth_path}: unreadable"
-    for path, shape in ((colour_path, image.shape[:2]), (depth_path, raw.shape)):
-        if shape != (camera.height, camera.width):
-            return f"{path}: {shape[1]}x{shape[0]} px, calibrated for {camera.width}x{camera.height}"
-    depth: FloatArray = np.where(raw == 65535, 0, raw).astype(np.float32) / scale
+    if image.shape[:2] != (camera.height, camera.width):
+        return f"{colour_path}: {image.shape[1]}x{image.shape[0]} px, calibrated for {camera.width}x{camera.height}"
+    try:
+        depth = maps.read_registered(index, camera)
+    except SourceError as error:
+        return str(error)
     if not ((depth > NEAR_M) & (depth < FAR_M)).any():
-        return f"{depth_path}: no depth between {NEAR_M:g} and {FAR_M:g} m"
+        return f"{maps.paths[index]}: no depth between {NEAR_M:g} and {FAR_M:g} m"
     if camera.is_distorted:
-        maps = camera.undistortion_maps()
-        image = cv2.remap(image, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        undistorted = cv2.remap(depth, *maps, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
-        depth = np.asarray(undistorted, np.float32)
+        undistortion = camera.undistortion_maps()
+        image = cv2.remap(image, *undistortion, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return View(np.asarray(image, np.uint8), np.asarray(depth, np.float32), camera.K)
 
 
-def _depth_scale(calibration: Path) -> float:
-    """Levels of a depth map per metre."""
-    given = yaml.safe_load(calibration.read_text()).get("depth_scale", 1000.0)
-    if not isinstance(given, int | float) or not np.isfinite(given) or given <= 0:
-        raise CalibrationError(f"{calibration}: depth_scale must be a positive number, got {given!r}")
-    return float(given)
-
-
-def has_depth(folder: Path) -> bool:
-    """Whether a folder is in TUM layout with depth maps."""
-    return all((Path(folder) / name).is_file() for name in ("rgb.txt", "depth.txt", "camera.yaml"))
-
-
-def read_list(path: Path) -> list[tuple[float, Path]]:
-    """``timestamp filename`` lines of a TUM list, paths made absolute.
-
-    Raises:
-        SourceError: If the file is missing or a line cannot be parsed.
-    """
-    try:
-        lines = path.read_text().splitlines()
-    except OSError as error:
-        raise SourceError(f"{path}: cannot read the list ({error.strerror})") from error
-    entries = []
-    for number, line in enumerate(lines, start=1):
-        if not line.strip() or line.startswith("#"):
-            continue
-        try:
-            stamp, name = line.split()[:2]
-            entries.append((_finite(stamp), path.parent / name))
-        except ValueError:
-            raise SourceError(f"{path}:{number}: expected 'timestamp filename', got {line[:60]!r}") from None
-    return entries
-
-
-def _finite(text: str) -> float:
-    """A number.
-
-    Raises:
-        ValueError: If it is none, or not finite.
-    """
-    value = float(text)
-    if not math.isfinite(value):
-        raise ValueError(text)
-    return value
+def _words(problem: Problem) -> str:
+    return f"{problem.file}: {problem.reason}"
 
 
 def _reduced(view: View, width: int) -> View:

@@ -4,8 +4,10 @@ from pathlib import Path
 
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.readers.images import entries_from_names, image_files
-from edgeslam_torch.readers.layouts.tum import read_list
-from edgeslam_torch.readers.listing import ImageEntry, Problem, in_order
+from edgeslam_torch.readers.listing import ImageEntry, Problem, in_order, read_list
+from edgeslam_torch.readers.sequence import Sequence
+
+KIND = "euroc"
 
 
 def camera_folder(folder: Path) -> Path | None:
@@ -26,7 +28,21 @@ def groundtruth_of(folder: Path) -> Path | None:
     return None
 
 
-def list_euroc(folder: Path) -> tuple[list[ImageEntry], list[Problem]]:
+def recognises(folder: Path) -> bool:
+    """Whether it is a sequence, or its ``mav0`` or ``cam0``."""
+    return camera_folder(folder) is not None
+
+
+def read(folder: Path) -> Sequence:
+    """Images of camera 0; the ground truth is the body's."""
+    cam = camera_folder(folder)
+    if cam is None:
+        raise SourceError(f"{folder}: no mav0/cam0/data in it")
+    images, problems = _images(cam)
+    return Sequence(KIND, cam, tuple(images), tuple(problems), groundtruth_of(cam), name=folder.resolve().name)
+
+
+def _images(folder: Path) -> tuple[list[ImageEntry], list[Problem]]:
     """Images of one ``camN`` folder in time order.
 
     Raises:

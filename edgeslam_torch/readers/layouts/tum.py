@@ -1,19 +1,28 @@
-"""Folders in the layout of the TUM RGB-D benchmark: ``rgb.txt`` lists stamps and image files."""
+"""Folders in the layout of the TUM RGB-D benchmark: ``rgb.txt`` lists stamps and images, ``depth.txt`` depth maps."""
 
 import math
 import re
 from dataclasses import replace
 from pathlib import Path
 
-from edgeslam_torch.errors import SourceError
+import numpy as np
+
+from edgeslam_torch.errors import CalibrationError, SourceError
+from edgeslam_torch.files.record_files import read_mapping
 from edgeslam_torch.geometry.camera import PRESETS, Camera
 from edgeslam_torch.readers.images import entries_from_names, image_files
-from edgeslam_torch.readers.listing import ImageEntry, Problem, in_order, seconds_from
+from edgeslam_torch.readers.layouts import seven_scenes
+from edgeslam_torch.readers.listing import ImageEntry, Problem, in_order, read_list, seconds_from
+from edgeslam_torch.readers.sequence import DepthMaps, Sequence
 
+KIND = "tum"
 LISTS = ("rgb.txt", "images.txt")
+DEPTH_LIST = "depth.txt"
+_TUM_UNITS_PER_METRE = 5000.0
+"""https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats"""
 
 
-def is_tum(folder: Path) -> bool:
+def recognises(folder: Path) -> bool:
     """Whether the folder has an image list, or an ``rgb/`` folder with images."""
     return find_list(folder) is not None or ((folder / "rgb").is_dir() and bool(image_files(folder / "rgb")))
 
@@ -31,12 +40,26 @@ def default_camera(name: str) -> Camera | None:
     return replace(PRESETS[f"tum_fr{match[1]}"], source=f"the benchmark's calibration of freiburg{match[1]}")
 
 
-def list_tum(folder: Path) -> tuple[list[ImageEntry], list[Problem]]:
-    """Images of the folder in time order, and what had to be left out.
+def read(folder: Path) -> Sequence:
+    """Images by ``rgb.txt`` or ``images.txt``, else by the names in ``rgb/``.
 
     Raises:
         SourceError: If the list holds no image.
     """
+    images, problems = _images(folder)
+    truth = folder / "groundtruth.txt"
+    return Sequence(
+        KIND,
+        folder,
+        tuple(images),
+        tuple(problems),
+        groundtruth=truth if truth.is_file() else None,
+        camera=default_camera(folder.resolve().name),
+        depth=(lambda: _depth(folder)) if (folder / DEPTH_LIST).is_file() else None,
+    )
+
+
+def _images(folder: Path) -> tuple[list[ImageEntry], list[Problem]]:
     listing = find_list(folder)
     if listing is None:
         return in_order(entries_from_names(image_files(folder / "rgb")), str(folder / "rgb"))
@@ -49,34 +72,35 @@ def list_tum(folder: Path) -> tuple[list[ImageEntry], list[Problem]]:
     return kept, problems + more
 
 
-def read_list(path: Path) -> tuple[list[tuple[float, str]], list[Problem]]:
-    """Rows ``stamp path`` of a list; lines that are not such a row become problems.
-
-    Raises:
-        SourceError: If the file is not text.
-    """
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (UnicodeDecodeError, OSError) as error:
-        raise SourceError(f"{path}: cannot be read as a text list of images ({error})") from error
-    rows: list[tuple[float, str]] = []
-    problems: list[Problem] = []
-    for number, line in enumerate(text.splitlines(), start=1):
-        line = line.strip()
-        if not line or line.startswith("#"):
-            continue
-        stamp, _, name = line.replace(",", " ", 1).partition(" ")
-        value = _finite(stamp)
-        if value is None or not name.strip():
-            problems.append(Problem(f"{path}:{number}", f"not 'stamp path': {line[:60]!r}"))
-            continue
-        rows.append((value, name.strip()))
-    return rows, problems
+def _depth(folder: Path) -> DepthMaps:
+    """Maps of ``depth.txt``, whose comments may say ``value / 1000`` and ``not registered`` (then 7-Scenes' Kinect)."""
+    listing = folder / DEPTH_LIST
+    rows, problems = read_list(listing)
+    stamps, _ = seconds_from([stamp for stamp, _ in rows])
+    entries = [ImageEntry(i, float(stamps[i]), folder / name) for i, (_, name) in enumerate(rows)]
+    kept, more = in_order(entries, str(listing))
+    said = " ".join(line for line in listing.read_text("utf-8-sig").splitlines() if line.startswith("#")).lower()
+    stated = re.search(r"value\s*/\s*(\d+)", said)
+    units, remarks = (float(stated[1]), []) if stated else _units_per_metre(folder)
+    other = "not registered" in said
+    return DepthMaps(
+        np.array([entry.stamp_s for entry in kept]),
+        tuple(entry.path for entry in kept),
+        1.0 / units,
+        seven_scenes.DEPTH_CAMERA if other else None,
+        seven_scenes.T_COLOUR_DEPTH if other else np.eye(4),
+        (*problems, *more, *remarks),
+    )
 
 
-def _finite(text: str) -> float | None:
-    try:
-        value = float(text)
-    except ValueError:
-        return None
-    return value if math.isfinite(value) else None
+def _units_per_metre(folder: Path) -> tuple[float, list[Problem]]:
+    """``depth_scale`` of the folder's camera.yaml, else the 5000 of TUM's file format page and a remark."""
+    file = folder / "camera.yaml"
+    record = read_mapping(file, "YAML", CalibrationError) if file.is_file() else {}
+    if "depth_scale" not in record:
+        reason = f"does not say the unit of its depth maps; taken as TUM's, {_TUM_UNITS_PER_METRE:.0f} to a metre"
+        return _TUM_UNITS_PER_METRE, [Problem(str(folder / DEPTH_LIST), reason, frames=0)]
+    stated = record["depth_scale"]
+    if isinstance(stated, bool) or not isinstance(stated, int | float) or not 0 < stated < math.inf:
+        raise CalibrationError(f"{file}: depth_scale must be a positive number, got {stated!r}")
+    return float(stated), []

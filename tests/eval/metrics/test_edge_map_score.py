@@ -7,12 +7,14 @@ import numpy as np
 import pytest
 
 from edgeslam_torch.eval.errors import EvaluationError
-from edgeslam_torch.eval.inputs.dataset import SEVEN_SCENES_T_C_D, open_dataset
+from edgeslam_torch.eval.inputs.dataset import open_dataset
 from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, write_tum
 from edgeslam_torch.eval.metrics.align import Alignment
 from edgeslam_torch.eval.metrics.edge_map_score import score_map
-from edgeslam_torch.eval.metrics.surface import SurfaceTruth, build_surface, register_depth
+from edgeslam_torch.eval.metrics.surface import SurfaceTruth, build_surface
 from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.readers.layouts.seven_scenes import T_COLOUR_DEPTH
+from edgeslam_torch.readers.sequence import register_depth
 
 CAMERA = Camera(160, 120, 130.0, 130.0, 79.5, 59.5)
 NEAR_M, FAR_M = 1.5, 3.0
@@ -124,7 +126,7 @@ def test_depth_is_registered_to_another_camera() -> None:
     shift = 0.1 * CAMERA.fx / 2.0  # 6.5 px to the left
     filled = np.flatnonzero(moved[60] > 0)
     assert filled.max() == pytest.approx(159 - shift, abs=1.0)
-    assert SEVEN_SCENES_T_C_D[0, 3] == pytest.approx(-0.028, abs=1e-3)
+    assert T_COLOUR_DEPTH[0, 3] == pytest.approx(-0.028, abs=1e-3)
 
 
 def test_data_set_without_depth_is_refused(folder: Path, tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import pytest
 from depth_folder import CAMERA, write_folder
 
 from edgeslam_torch.errors import CalibrationError, SourceError
-from edgeslam_torch.train.views.datasets import has_depth, load_depth_folder, read_list
+from edgeslam_torch.train.views.datasets import has_depth, load_depth_folder
 
 
 def test_depth_is_metres_and_holes_are_zero(tmp_path: Path) -> None:
@@ -42,19 +42,53 @@ def test_unreadable_files_are_listed_and_the_rest_is_used(tmp_path: Path) -> Non
     assert len(loaded.views) == 10
     assert [Path(p).parent.name + "/" + Path(p).name for p in loaded.left_out] == [
         "rgb/3.png: unreadable",
-        "depth/5.png: unreadable",
+        "depth/5.png: no such file",
     ]
 
 
-def test_missing_and_malformed_lists_are_named(tmp_path: Path) -> None:
+def test_recording_with_depth_is_told_from_one_without(tmp_path: Path) -> None:
     folder = write_folder(tmp_path / "a", 1)
     assert has_depth(folder)
-    assert not has_depth(tmp_path)
+    assert not has_depth(tmp_path) and not has_depth(tmp_path / "none")
+    (folder / "camera.yaml").unlink()
+    assert not has_depth(folder)
+    with pytest.raises(CalibrationError, match="the camera is not known"):
+        load_depth_folder(folder)
+    (folder / "depth.txt").unlink()
+    with pytest.raises(SourceError, match="no recording with depth maps"):
+        load_depth_folder(folder)
+
+
+def test_line_that_is_none_is_left_out_by_name(tmp_path: Path) -> None:
+    folder = write_folder(tmp_path / "a", 2)
+    with (folder / "depth.txt").open("a") as file:
+        file.write("not a list\n")
+    loaded = load_depth_folder(folder)
+    assert len(loaded.views) == 2 and "depth.txt:3: not 'stamp path'" in loaded.left_out[0]
     (folder / "depth.txt").write_text("not a list\n")
     with pytest.raises(SourceError, match=r"depth\.txt:1"):
         load_depth_folder(folder)
-    with pytest.raises(SourceError, match="cannot read the list"):
-        read_list(folder / "none.txt")
+
+
+def test_unit_that_nobody_states_is_tums_and_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    folder = write_folder(tmp_path / "a", 1)
+    CAMERA.save(folder / "camera.yaml")
+    depth = load_depth_folder(folder).views[0].depth_m
+    np.testing.assert_allclose(depth[20], np.linspace(0.2, 0.6, 64), atol=2e-4)
+    assert "does not say the unit of its depth maps" in caplog.text
+
+
+def test_maps_of_another_camera_are_turned_to_the_colour_camera(tmp_path: Path) -> None:
+    folder = tmp_path / "seq-01"
+    folder.mkdir()
+    image = np.zeros((480, 640, 3), np.uint8)
+    cv2.imwrite(str(folder / "frame-000000.color.png"), image)
+    cv2.imwrite(str(folder / "frame-000000.depth.png"), np.full((480, 640), 2000, np.uint16))
+    view = load_depth_folder(folder, width=640).views[0]
+    # 585 px of the depth camera are 525 px of the colour camera: the wall ends 640/2 * 525/585 px from the centre.
+    columns = np.flatnonzero((view.depth_m > 0).any(axis=0))
+    assert np.ptp(columns) == pytest.approx(640 * 525 / 585, abs=6)
+    assert np.median(view.depth_m[view.depth_m > 0]) == pytest.approx(2.0, abs=0.02)
 
 
 def test_images_of_another_size_and_maps_without_depth_are_left_out(tmp_path: Path) -> None:
@@ -81,17 +115,17 @@ def test_stamps_that_match_nothing_are_said(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="no image within 0.02 s of a depth map"):
         load_depth_folder(folder)
     (folder / "rgb.txt").write_text("")
-    with pytest.raises(SourceError, match="no image within"):
+    with pytest.raises(SourceError, match="lists no image"):
         load_depth_folder(folder)
 
 
 @pytest.mark.parametrize("stamp", ["nan", "inf", "later"])
-def test_stamp_that_is_no_number_is_refused(tmp_path: Path, stamp: str) -> None:
+def test_stamp_that_is_no_number_is_left_out(tmp_path: Path, stamp: str) -> None:
     folder = write_folder(tmp_path / "a", 3)
     with (folder / "rgb.txt").open("a") as file:
         file.write(f"{stamp} rgb/0.png\n")
-    with pytest.raises(SourceError, match=r"rgb\.txt:5"):
-        load_depth_folder(folder)
+    loaded = load_depth_folder(folder)
+    assert len(loaded.views) == 3 and "rgb.txt:5" in loaded.left_out[0]
 
 
 @pytest.mark.parametrize("scale", ["0", "-1", "five", ".nan", "[1]"])

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.readers import video
-from edgeslam_torch.readers.layouts.tum import read_list
+from edgeslam_torch.readers.listing import read_list
 from edgeslam_torch.types import TelemetrySample
 
 TELEMETRY = "telemetry.csv"

@@ -1,0 +1,74 @@
+"""KITTI odometry: ``sequences/00/image_2/000000.png``, ``times.txt`` and ``calib.txt``; truth in ``poses/00.txt``.
+
+https://www.cvlibs.net/datasets/kitti/eval_odometry.php. The left colour camera (``image_2``) is taken where there is
+one, else the left grey one (``image_0``). The true poses are the grey camera's, 6 cm beside the colour camera.
+"""
+
+import math
+from pathlib import Path
+
+from edgeslam_torch.errors import CalibrationError, SourceError
+from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.readers.images import first_size, image_files
+from edgeslam_torch.readers.listing import ImageEntry, Problem, in_order
+from edgeslam_torch.readers.sequence import Sequence
+
+KIND = "kitti"
+
+_CAMERAS = {"image_2": "P2", "image_0": "P0"}
+"""Image folder: its projection matrix in ``calib.txt``."""
+
+
+def recognises(folder: Path) -> bool:
+    """Whether the folder has KITTI's clock and one of its left cameras."""
+    return (folder / "times.txt").is_file() and any((folder / name).is_dir() for name in _CAMERAS)
+
+
+def read(folder: Path) -> Sequence:
+    """Images with the stamps of ``times.txt``, whose line is the number in an image's name."""
+    name = next(name for name in _CAMERAS if (folder / name).is_dir())
+    stamps = _times(folder / "times.txt")
+    entries: list[ImageEntry] = []
+    problems: list[Problem] = []
+    for path in image_files(folder / name):
+        number = int(path.stem) if path.stem.isdecimal() else -1
+        if 0 <= number < len(stamps):
+            entries.append(ImageEntry(len(entries), stamps[number], path))
+        else:
+            problems.append(Problem(str(path), "its name is no line of times.txt"))
+    kept, more = in_order(entries, str(folder / name))
+    truth = folder.resolve().parent.parent / "poses" / f"{folder.resolve().name}.txt"
+    return Sequence(
+        KIND,
+        folder,
+        tuple(kept),
+        (*problems, *more),
+        groundtruth=truth if truth.is_file() else None,
+        groundtruth_stamps_s=tuple(stamps),
+        camera=_camera(folder / "calib.txt", _CAMERAS[name], kept),
+    )
+
+
+def _times(path: Path) -> list[float]:
+    try:
+        stamps = [float(word) for word in path.read_text(encoding="utf-8").split()]
+    except (ValueError, OSError) as error:
+        raise SourceError(f"{path}: each line must be seconds since the first image ({error})") from error
+    if not all(math.isfinite(stamp) for stamp in stamps):
+        raise SourceError(f"{path}: a stamp is not finite")
+    return stamps
+
+
+def _camera(path: Path, matrix: str, images: list[ImageEntry]) -> Camera | None:
+    """Rectified pinhole camera from the line ``P2: fx 0 cx tx 0 fy cy ty 0 0 1 tz``; None without the file."""
+    if not path.is_file() or not images:
+        return None
+    lines = dict(line.split(":", 1) for line in path.read_text(encoding="utf-8").splitlines() if ":" in line)
+    try:
+        p = [float(word) for word in lines[matrix].split()]
+        fx, cx, fy, cy = p[0], p[2], p[5], p[6]
+    except (KeyError, ValueError, IndexError) as error:
+        raise CalibrationError(f"{path}: no line '{matrix}:' with the 12 numbers of a projection matrix") from error
+    if not (0 < fx < math.inf and 0 < fy < math.inf and math.isfinite(cx) and math.isfinite(cy)):
+        raise CalibrationError(f"{path}: {matrix} is no camera's projection matrix")
+    return Camera(*first_size(images, str(path.parent)), fx, fy, cx, cy, source=f"KITTI's calibration {matrix}")
