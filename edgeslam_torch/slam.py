@@ -249,8 +249,7 @@ class EdgeSlam:
         """What limits how far the results can be believed, in sentences for the run's summary."""
         depth = None if self.depth is None else self.depth.warning()
         warnings = (depth, self._warning_of_pieces(), self._repeats.warning(), self._calibration_warning)
-        telemetry = self._system.fusion.warnings() if self._system.has_telemetry else []
-        return [warning for warning in warnings if warning is not None] + telemetry
+        return [warning for warning in warnings if warning is not None] + self._system.fusion.warnings()
 
     def _warning_of_pieces(self) -> str | None:
         pieces = [p for p in self.pieces() if p.supported > 0]

@@ -100,9 +100,9 @@ class FusionConfig:
     sigma_h_m: float = 0.06
     """SDK ``h`` moves in steps of 10 cm."""
     sigma_baro_m: float = 0.15
-    depth_bias_log: float = 0.15
-    """Error of the depth network that all keyframes of a scene share: it does not average out. The shipped weights were
-    0.05 off in a room they had seen and 0.24 in one they had not (README)."""
+    depth_bias_log: float = 0.1
+    """Error of the depth network's scale that all keyframes of a scene share and nothing gives away; what does give it
+    away comes on top (`fusion/depth_scale.py`)."""
 
     def __post_init__(self) -> None:
         for name in _POSITIVE:

@@ -16,12 +16,13 @@ from edgeslam_torch.fusion.alignment import map_to_world
 from edgeslam_torch.fusion.comparison import Comparison, Present
 from edgeslam_torch.fusion.config import FusionConfig
 from edgeslam_torch.fusion.delay import DelaySearch
+from edgeslam_torch.fusion.depth_scale import DepthRatio, DepthRatios, DepthScale
 from edgeslam_torch.fusion.ekf import EkfState
 from edgeslam_torch.fusion.filter_feed import FilterFeed
 from edgeslam_torch.fusion.mount import Mount, estimate_mount
 from edgeslam_torch.fusion.plausibility import HEIGHTS, Trust
 from edgeslam_torch.fusion.prediction import VISUAL_REACH_S, Carried, PoseEstimate, between, by_vision
-from edgeslam_torch.fusion.scale import DepthRatio, LogScale, fuse
+from edgeslam_torch.fusion.scale import LogScale, fuse
 from edgeslam_torch.fusion.telemetry_scale import TelemetryFit, TelemetryScale, at_odds, rescaled
 from edgeslam_torch.fusion.track import TelemetryTrack
 from edgeslam_torch.fusion.visual_memory import VisualMemory, VisualPose
@@ -57,7 +58,7 @@ class MotionFusion:
         self._focal_sigma = focal_sigma
         self._track = TelemetryTrack(config.velocity_frame, config.max_gap_s)
         self._memory = VisualMemory(config.interval_s, config.window_s, config.max_gap_s)
-        self._depth = self._new_depth_ratio()
+        self._depth = DepthRatios(self.config.depth_bias_log)
         self._delay = DelaySearch(config, self.T_b_c[:3, :3])
         self._comparison = Comparison(config)
         self._filter = FilterFeed(config, self.T_b_c)
@@ -121,9 +122,9 @@ class MotionFusion:
         if (held := self._filter.pose) is not None:
             self._filter.change(held.revised(dict(zip(stamps_s.tolist(), T_w_c, strict=True))))
 
-    def add_depth_ratio(self, log_ratio: float, sigma_log: float) -> None:
-        """One keyframe's log of (network depth [m] / map depth) on its anchors."""
-        self._depth.add(log_ratio, sigma_log)
+    def add_depth_ratio(self, ratio: DepthRatio) -> None:
+        """How one keyframe's network depth compares with the map's."""
+        self._depth.add(ratio)
 
     def rescale(self, factor: float, about: FloatArray | None = None) -> None:
         """The map was scaled: ``p' = about + factor (p - about)``; everything remembered follows."""
@@ -142,7 +143,7 @@ class MotionFusion:
         """A new map in a new gauge: visual memory and scale are forgotten, telemetry and delay are kept."""
         self._memory.clear()
         self._filter.clear()
-        self._depth = self._new_depth_ratio()
+        self._depth = DepthRatios(self.config.depth_bias_log)
         self._forget_scale()
         self._R_w_m, self._fitted_s = None, -math.inf
 
@@ -166,14 +167,14 @@ class MotionFusion:
         opinions = []
         if (told := self._by_telemetry) is not None:
             opinions.append(replace(told, sigma=math.hypot(told.sigma, _FOCAL_SHARE * self._focal_sigma)))
-        depth = self._depth.estimate()
-        if depth is not None:
-            opinions.append(depth)
+        depth = self._depth.scale()
+        if depth is not None and depth.in_domain:
+            opinions.append(self._with_focal(depth))
         return fuse(opinions)
 
-    def _new_depth_ratio(self) -> DepthRatio:
+    def _with_focal(self, depth: DepthScale) -> LogScale:
         """Map depth, and the network's metres, go with the focal length: its whole uncertainty is the ratio's too."""
-        return DepthRatio(math.hypot(self.config.depth_bias_log, self._focal_sigma))
+        return replace(depth.opinion, sigma=math.hypot(depth.sigma, self._focal_sigma))
 
     def gravity(self) -> FloatArray | None:
         """Unit vector ``(3,)`` that points up, in the map frame; ``None`` without telemetry attitude."""
@@ -249,17 +250,18 @@ class MotionFusion:
             numbers["camera tilt sigma deg"] = math.degrees(mount.tilt_sigma_rad)
         for name, source in self._fit.sources.items():
             numbers[f"scale {name}"], numbers[f"scale {name} sigma"] = source.value, source.sigma
-        depth = self._depth.estimate()
+        depth = self._depth.scale()
         if depth is not None:
-            numbers["scale depth"] = math.exp(depth.log_scale)
-            numbers["scale depth sigma"] = math.exp(depth.log_scale) * depth.sigma
+            numbers |= depth.statistics()
         return numbers
 
     def warnings(self) -> list[str]:
-        """What telemetry tells that the images do not bear out, in sentences; such readings are not used."""
-        told, depth = self._by_telemetry, self._depth.estimate()
+        """What the depth network or telemetry tells that the images do not bear out, in sentences; it is not used."""
+        told, depth = self._by_telemetry, self._depth.scale()
         said = self._trust.warnings() + self._track.warnings()
-        if told is not None and depth is not None and at_odds(told, depth):
+        if depth is not None and (out_of_domain := depth.warning()) is not None:
+            said.append(out_of_domain)
+        if told is not None and depth is not None and at_odds(told, depth.opinion):
             said.append(
                 f"telemetry and the depth network contradict each other: {math.exp(told.log_scale):.3g} and "
                 f"{math.exp(depth.log_scale):.3g} metres per map unit"
@@ -305,7 +307,7 @@ class MotionFusion:
 
     def _rough_scale(self) -> float | None:
         """Metres per map unit, for what counts as motion."""
-        depth = self._depth.estimate()
+        depth = self._depth.scale()
         return math.exp(depth.log_scale) if depth is not None else self._held_scale()
 
     def _held_scale(self) -> float | None:

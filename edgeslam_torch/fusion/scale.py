@@ -181,46 +181,6 @@ def floor_segments(stamp_s: FloatArray, z_m: FloatArray, z_predicted_m: FloatArr
     return np.concatenate([[0], np.cumsum(jump | hole)]).astype(np.int64)
 
 
-class DepthRatio:
-    """Network depth over map depth, one log ratio per keyframe.
-
-    Keyframes of one scene share the network's error, so the mean keeps ``bias_log`` however many there are.
-    """
-
-    def __init__(self, bias_log: float, keep: int = 200) -> None:
-        self._bias = bias_log
-        self._keep = keep
-        self._ratios: list[tuple[float, float]] = []
-        self._estimate: LogScale | None = None
-
-    def add(self, log_ratio: float, sigma_log: float) -> None:
-        """One keyframe's ratio; values that are not finite are ignored."""
-        if math.isfinite(log_ratio) and math.isfinite(sigma_log) and sigma_log > 0:
-            self._ratios.append((log_ratio, sigma_log))
-            del self._ratios[: -self._keep]
-            self._estimate = None
-
-    def rescale(self, factor: float) -> None:
-        """The map grew by ``factor``: metres per map unit shrink."""
-        self._ratios = [(ratio - math.log(factor), sigma) for ratio, sigma in self._ratios]
-        self._estimate = None
-
-    def estimate(self) -> LogScale | None:
-        """Robust mean of the ratios with the common error; asked for twice a frame, worked out once a keyframe."""
-        if self._estimate is None and self._ratios:
-            self._estimate = self._mean()
-        return self._estimate
-
-    def _mean(self) -> LogScale:
-        ratio, sigma = np.array(self._ratios).T
-        centre = float(np.median(ratio))
-        spread = np.hypot(sigma, 1.4826 * float(np.median(np.abs(ratio - centre))) + 1e-6)
-        for _ in range(5):
-            weight = np.minimum(1.0, 1.5 * spread / np.maximum(np.abs(ratio - centre), 1e-12)) / spread**2
-            centre = float(np.sum(weight * ratio) / np.sum(weight))
-        return LogScale(centre, math.hypot(1.0 / math.sqrt(float(np.sum(weight))), self._bias), "depth")
-
-
 def fuse(opinions: Sequence[LogScale]) -> ScaleEstimate:
     """Information-weighted mean of independent opinions; sigma grows with their disagreement."""
     if not opinions:

@@ -6,11 +6,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from edgeslam_torch.config import SlamConfig
+from edgeslam_torch.fusion.depth_scale import compared
 from edgeslam_torch.fusion.motion import MotionFusion
 from edgeslam_torch.fusion.published import Published
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
-from edgeslam_torch.map.depth_prior import fit_to_anchors, sample
+from edgeslam_torch.map.depth_prior import sample
 from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.map.trajectory import TrajectoryLog
@@ -117,6 +118,6 @@ class System:
         held = held[~self.map.anchors.from_depth[keyframe.anchor[held]]]  # their depth is the network's own word
         p_w = self.map.anchors.p_w[keyframe.anchor[held]]
         z = (p_w @ keyframe.T_c_w[:3, :3].T + keyframe.T_c_w[:3, 3])[:, 2]
-        fit = fit_to_anchors(sample(keyframe.depth, keyframe.features.uv[held])[0], z)
-        if fit is not None:
-            self.fusion.add_depth_ratio(-fit.log_ratio, fit.sigma_log)
+        ratio = compared(sample(keyframe.depth, keyframe.features.uv[held])[0], z)
+        if ratio is not None:
+            self.fusion.add_depth_ratio(ratio)

@@ -8,6 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.fusion.config import FusionConfig
+from edgeslam_torch.fusion.depth_scale import DepthRatio
 from edgeslam_torch.fusion.motion import MotionFusion
 from edgeslam_torch.fusion.plausibility import Agreement, Reading, Trust, Verdict, agreement, changes
 from edgeslam_torch.synthetic.flights.flight import camera_on_body
@@ -143,7 +144,7 @@ def told_of(rng, replay, motion, spoil, **options):
     for told in ([], spoil(rng, samples, motion)):
         fusion = MotionFusion(FusionConfig(), T_B_C)
         for _ in range(20):
-            fusion.add_depth_ratio(math.log(gauge.scale) + DEPTH_LOG, 0.05)
+            fusion.add_depth_ratio(DepthRatio(math.log(gauge.scale) + DEPTH_LOG, 0.05))
         replay(fusion, motion, gauge, told, **options)
         fusions.append(fusion)
     without, fusion = fusions

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from edgeslam_torch.fusion.rotations import matrix_from_rpy, rotation_vector
-from edgeslam_torch.fusion.scale import DepthRatio, LogScale, fit_displacements, floor_segments, fuse
+from edgeslam_torch.fusion.scale import LogScale, fit_displacements, floor_segments, fuse
 from edgeslam_torch.types import Units
 
 
@@ -87,29 +87,6 @@ def test_no_motion_says_nothing():
 
 def test_a_hole_in_time_starts_a_new_segment():
     np.testing.assert_array_equal(floor_segments(np.array([0.0, 0.1, 2.0]), np.ones(3), np.ones(3), 0.1), [0, 0, 1])
-
-
-def test_depth_ratios_of_one_scene_do_not_average_below_their_common_error(rng):
-    ratios = DepthRatio(0.09)
-    for x in rng.normal(0.2, 0.1, 500):
-        ratios.add(x, 0.1)
-    estimate = ratios.estimate()
-    assert estimate.log_scale == pytest.approx(0.2, abs=0.03)
-    assert 0.09 <= estimate.sigma < 0.1
-
-
-def test_depth_ratios_that_are_no_numbers_are_ignored():
-    ratios = DepthRatio(0.09)
-    for pair in [(math.nan, 0.1), (0.0, math.inf), (0.1, 0.0)]:
-        ratios.add(*pair)
-    assert ratios.estimate() is None
-
-
-def test_rescaled_ratios_follow_the_map():
-    ratios = DepthRatio(0.09)
-    ratios.add(math.log(2.0), 0.1)
-    ratios.rescale(4.0)
-    assert math.exp(ratios.estimate().log_scale) == pytest.approx(0.5)
 
 
 def test_no_opinion_is_arbitrary_units():

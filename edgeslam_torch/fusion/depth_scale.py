@@ -1,0 +1,193 @@
+r"""Metric scale from the depth network, and how far it may be wrong.
+
+Each keyframe gives the median of log (network depth [m] / map depth [map units]) over its triangulated anchors. All
+keyframes of a scene share the network's error, so the mean of their ratios is no surer than the network is of the
+scene. How sure that is, the keyframes themselves tell: by the slope :math:`b` of log network depth on log map depth
+inside a keyframe (1: the network follows depth; 0: it says the same of everything), by the spread :math:`s` of single
+anchors around their keyframe's ratio, and by how much the ratios wander, :math:`w`, from keyframe to keyframe:
+
+.. math:: \sigma^2 = \sigma_0^2 + a_b^2 (1 - b)^2 + a_s^2 s^2 + a_w^2 w^2
+
+The coefficients are fitted to the true errors over recordings, simulated flights and spoilt images of both
+(docs/decisions/0050-sigma-of-the-depth-network.md). Where the sum is too large the network is out of its domain.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from edgeslam_torch.fusion.scale import LogScale
+from edgeslam_torch.types import FloatArray
+
+SLOPE_SIGMA = 0.4
+SPREAD_SIGMA = 2.0
+WANDER_SIGMA = 1.0
+"""Log error of the scale per unit of missing slope, of spread and of wandering."""
+
+MOST_SIGMA = 0.5
+"""Beyond it the scale is no measurement: two sigmas are a factor of e each way, which is a cupboard or a hall."""
+
+_MAP_NOISE_LOG = 0.05
+"""Error of triangulated depth: in a scene of one depth the slope is not taken from noise but counted as 0."""
+_USUAL_WANDER_LOG = 0.15
+_USUAL_COUNTS = 4
+"""What a few keyframes do not tell yet: the median over the calibration's runs, in place of so many keyframes."""
+_KEPT = 200
+_LEAST_ANCHORS = 8
+_LEAST_SPREAD_LOG = 0.02
+
+
+@dataclass(frozen=True, slots=True)
+class DepthRatio:
+    """How one keyframe's network depth compares with its anchors."""
+
+    log_ratio: float
+    """Median of log (network depth [m] / map depth [map units])."""
+    spread_log: float
+    """Robust standard deviation of single anchors around it."""
+    slope: float = 1.0
+    """Of log network depth on log map depth."""
+    depth_spread_log: float = 0.3
+    """Standard deviation of the anchors' log depth: without any, the slope is noise."""
+    points: int = 100
+
+    @property
+    def usable(self) -> bool:
+        """Whether all of it are numbers."""
+        numbers = (self.log_ratio, self.spread_log, self.slope, self.depth_spread_log)
+        return all(map(math.isfinite, numbers)) and self.spread_log > 0 and self.points > 0
+
+
+def compared(network_m: FloatArray, map_depth: FloatArray) -> DepthRatio | None:
+    """Ratio, spread and slope between network and triangulated z-depth of one keyframe's anchors.
+
+    Args:
+        network_m: Network depth at the anchors ``(A,)`` [m], NaN where it says nothing.
+        map_depth: Their depth in the map ``(A,)`` [map units].
+
+    Returns:
+        ``None`` with fewer than eight usable anchors.
+    """
+    usable = np.isfinite(network_m) & (network_m > 0) & (map_depth > 0)
+    if usable.sum() < _LEAST_ANCHORS:
+        return None
+    x, y = np.log(map_depth[usable]), np.log(network_m[usable])
+    spread = max(_robust_deviation(y - x), _LEAST_SPREAD_LOG)
+    slope, depth_spread = _slope(x, y)
+    return DepthRatio(float(np.median(y - x)), spread, slope, depth_spread, len(x))
+
+
+def _slope(x: FloatArray, y: FloatArray) -> tuple[float, float]:
+    """Huber's slope of ``y`` on ``x``, both ``(A,)``, and the standard deviation of the ``x`` that it rests on."""
+    weight, slope, power = np.ones(len(x)), 0.0, 0.0
+    for _ in range(10):
+        share = weight / weight.sum()
+        u, v = x - share @ x, y - share @ y
+        power = float(share @ u**2)
+        slope = float(share @ (u * v)) / max(power, 1e-12)
+        left = v - slope * u
+        weight = np.minimum(1.0, 1.5 * (_robust_deviation(left) + 1e-9) / np.maximum(np.abs(left), 1e-12))
+    return slope, math.sqrt(power)
+
+
+@dataclass(frozen=True, slots=True)
+class DepthScale:
+    """The network's opinion on a map's scale, with what its sigma rests on."""
+
+    log_scale: float
+    """Log of metres per map unit."""
+    sigma: float
+    """Of ``log_scale``."""
+    slope: float
+    spread_log: float
+    wander_log: float
+
+    @property
+    def in_domain(self) -> bool:
+        """Whether the network knows scenes like this one well enough to tell metres."""
+        return self.sigma <= MOST_SIGMA
+
+    @property
+    def opinion(self) -> LogScale:
+        """For fusion with other sources."""
+        return LogScale(self.log_scale, self.sigma, "depth")
+
+    def statistics(self) -> dict[str, float]:
+        """For the report."""
+        value = math.exp(self.log_scale)
+        return {
+            "scale depth": value,
+            "scale depth sigma": value * self.sigma,
+            "depth network slope": self.slope,
+            "depth network spread": self.spread_log,
+            "depth network wander": self.wander_log,
+        }
+
+    def warning(self) -> str | None:
+        """What the user should know; None when there is nothing to say."""
+        if self.in_domain:
+            return None
+        return (
+            f"the depth network is out of its domain here: inside pictures its depth follows the map's with slope "
+            f"{self.slope:.2f} (1 is right) and spreads by {100 * self.spread_log:.0f} %, from picture to picture its "
+            f"scale wanders by {100 * self.wander_log:.0f} %; its metres may be wrong by a factor of "
+            f"{math.exp(2.0 * self.sigma):.1f} and are not used"
+        )
+
+
+class DepthRatios:
+    """The ratios of a map's keyframes.
+
+    Args:
+        least_sigma: Log error of the scale that a network may have without any sign of it.
+    """
+
+    def __init__(self, least_sigma: float) -> None:
+        self._least_sigma = least_sigma
+        self._ratios: list[DepthRatio] = []
+        self._scale: DepthScale | None = None
+
+    def add(self, ratio: DepthRatio) -> None:
+        """One keyframe's ratio; one that is not finite is ignored."""
+        if ratio.usable:
+            self._ratios.append(ratio)
+            del self._ratios[:-_KEPT]
+            self._scale = None
+
+    def rescale(self, factor: float) -> None:
+        """The map grew by ``factor``: metres per map unit shrink."""
+        self._ratios = [replace(r, log_ratio=r.log_ratio - math.log(factor)) for r in self._ratios]
+        self._scale = None
+
+    def scale(self) -> DepthScale | None:
+        """The opinion of all keyframes; asked for twice a frame, worked out once a keyframe."""
+        if self._scale is None and self._ratios:
+            self._scale = self._summed_up()
+        return self._scale
+
+    def _summed_up(self) -> DepthScale:
+        table = [(r.log_ratio, r.spread_log, r.slope, r.depth_spread_log, r.points) for r in self._ratios]
+        ratio, spread, slope, depth_spread, points = np.array(table).T
+        mean, statistical = _robust_mean(ratio, spread)
+        weight = points * depth_spread**2
+        pooled = float(np.sum(weight * slope) / np.sum(weight + points * _MAP_NOISE_LOG**2))
+        usual = float(np.median(spread))
+        seen = _USUAL_COUNTS * _USUAL_WANDER_LOG**2 + len(ratio) * _robust_deviation(ratio) ** 2
+        wander = math.sqrt(seen / (_USUAL_COUNTS + len(ratio)))
+        doubts = (SLOPE_SIGMA * (1.0 - pooled), SPREAD_SIGMA * usual, WANDER_SIGMA * wander)
+        return DepthScale(mean, math.hypot(self._least_sigma, statistical, *doubts), pooled, usual, wander)
+
+
+def _robust_mean(x: FloatArray, sigma: FloatArray) -> tuple[float, float]:
+    """Huber's mean of ``(N,)`` and its standard deviation, were their errors independent."""
+    centre = float(np.median(x))
+    spread = np.hypot(sigma, _robust_deviation(x) + 1e-6)
+    for _ in range(5):
+        weight = np.minimum(1.0, 1.5 * spread / np.maximum(np.abs(x - centre), 1e-12)) / spread**2
+        centre = float(np.sum(weight * x) / np.sum(weight))
+    return centre, 1.0 / math.sqrt(float(np.sum(weight)))
+
+
+def _robust_deviation(x: FloatArray) -> float:
+    return 1.4826 * float(np.median(np.abs(x - np.median(x))))
