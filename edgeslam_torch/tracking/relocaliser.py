@@ -1,35 +1,195 @@
-"""Find the pose of a frame with no useful prediction, from keyframes it looks like."""
+"""Find the pose of a frame with no useful prediction, and believe it only when the image bears it out.
+
+A repeated pattern (tiles, shelves, the doors of a corridor) fits in the wrong place with dozens of inliers, and whoever
+maps from there confirms himself. So a count of inliers is no proof. What tells the right place from a wrong one that
+looks alike is how much of what should be seen there is seen, over how much of the image, whether the camera can have
+come there in the time, whether another place would do as well, and whether the frames that follow agree.
+"""
+
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from edgeslam_torch.frontend.matching import match_all
 from edgeslam_torch.geometry import se3
+from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.tracking.tracker import Track, Tracker, View
 from edgeslam_torch.types import FloatArray
 
 MIN_MATCHES = 20
+LIKELY_SHARE = 0.12
+"""Anchors found, of those that should be seen (or of the frame's keypoints, if they are fewer), from which on a place
+is likely. Wrong places reach 0.09 in a corridor whose doors repeat, 0.12 on bare boards and 0.06 in furnished rooms;
+right ones have 0.2 and more in 95 % of redkitchen's frames (docs/decisions/0050-relocalisation.md)."""
+SURE_SHARE = 0.2
+"""The same for a place that needs no further frame to confirm it."""
+GRID = (8, 6)
+"""Cells across and down in which the spread over the image is counted."""
+MIN_CELLS = 6
+"""Cells with an inlier: one picture on the wall fills four."""
+LIKELY_SPREAD = 0.3
+"""Cells with an inlier, of those with an anchor to be seen: 0.24 at a wrong place of the boards, 0.4 and more at right
+ones."""
+AGREEING_FRAMES = 3
+"""Frames in a row that must agree on a likely place."""
+RIVAL = 0.6
+"""Share of the best place's inliers from which on another place is as good."""
+APART = 0.15
+"""Distance of two poses, relative to the depth seen there, up to which they are one place: a frame's step as well."""
+MAX_APART_RAD = np.deg2rad(20.0)
+ACCELERATION_M_S2 = 9.0
+ANGULAR_ACCELERATION_RAD_S2 = 60.0
+"""What a hand or a small drone hardly exceeds: three times the standard deviations that tracking expects."""
 
 
-def relocalise(tracker: Tracker, view: View, T_predicted: FloatArray, keyframes: int, attempt: int) -> Track | None:
-    """Try some keyframes: the newest and the ones nearest to the prediction first, then all others in turn.
+@dataclass(frozen=True, slots=True)
+class Reach:
+    """Where the camera can be by now."""
+
+    T_c_w: FloatArray
+    """``(4, 4)`` expected pose: by the last velocity, or by telemetry."""
+    shift_m: float
+    """Farthest from there."""
+    turn_rad: float
+    metre: float | None = None
+    """Its length [map units]; where nothing tells it, a third of the depth seen will do."""
+
+    def holds(self, place: "Place") -> bool:
+        """Whether a place is within reach, or as good as there."""
+        shift, turn = _apart(place.track.T_c_w, self.T_c_w)
+        near = shift <= self._shift(place.depth) + APART * place.depth
+        return near and turn <= self.turn_rad + MAX_APART_RAD
+
+    def is_one_place(self, depth: float) -> bool:
+        """Whether all that is within reach is one place, for a camera that looks at something so far away."""
+        return self._shift(depth) <= APART * depth
+
+    def _shift(self, depth: float) -> float:
+        return self.shift_m * (self.metre or depth / 3.0)
+
+
+def reach_after(seconds: float, T_predicted: FloatArray, metre: float | None) -> Reach:
+    """What motion allows some time after the last pose."""
+    half = 0.5 * seconds**2
+    return Reach(T_predicted, half * ACCELERATION_M_S2, half * ANGULAR_ACCELERATION_RAD_S2, metre)
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where a frame may be, with what speaks for it."""
+
+    track: Track
+    share: float
+    """Anchors found, of those that could be."""
+    cells: int
+    """Cells of the image with an inlier."""
+    spread: float
+    """Cells with an inlier, of those with an anchor that should be seen."""
+    depth: float
+    """Median depth of the anchors that should be seen [map units]."""
+
+    def is_as(self, other: "Place") -> bool:
+        """Whether two poses are one place."""
+        shift, turn = _apart(self.track.T_c_w, other.track.T_c_w)
+        return shift <= APART * min(self.depth, other.depth) and turn <= MAX_APART_RAD
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """A frame that is found again, with the frames before it that confirmed it."""
+
+    track: Track
+    earlier: dict[int, FloatArray]
+    """``T_c_w`` of frames before this one, by their index: they were at this place already."""
+
+
+class Relocaliser:
+    """Asks keyframes where a lost frame is; between frames it remembers a place that is likely but not proven."""
+
+    def __init__(self, tracker: Tracker) -> None:
+        self.tracker = tracker
+        self._waiting: list[tuple[int, Place]] = []
+        """Index and place of the last frames, which agree with each other."""
+
+    def forget(self) -> None:
+        """Nothing is likely any more: the camera was found, or the map begins anew."""
+        self._waiting = []
+
+    @property
+    def waiting(self) -> int:
+        """Frames in a row that agree on a likely place."""
+        return len(self._waiting)
+
+    def find(self, index: int, view: View, candidates: list[Keyframe], reach: Reach) -> Found | None:
+        """Pose of a lost frame, once it is proven.
+
+        Args:
+            index: Of the frame.
+            view: Its features.
+            candidates: Keyframes that it may show the place of.
+            reach: Where motion allows it to be.
+        """
+        place = self._only_place(self._places(view, candidates), reach)
+        if place is None:
+            self.forget()
+            return None
+        if self._waiting and not place.is_as(self._waiting[-1][1]):
+            self.forget()
+        self._waiting.append((index, place))
+        sure = place.share >= SURE_SHARE and reach.holds(place.track.T_c_w)
+        if not sure and len(self._waiting) < AGREEING_FRAMES:
+            return None
+        earlier = {i: p.track.T_c_w for i, p in self._waiting[:-1]}
+        self.forget()
+        return Found(place.track, earlier)
+
+    def _places(self, view: View, candidates: list[Keyframe]) -> list[Place]:
+        tracks = [match_keyframe(self.tracker, view, keyframe) for keyframe in candidates]
+        if self._waiting:
+            last = self._waiting[-1][1].track
+            tracks.append(self.tracker.track(view, last.T_c_w, last.anchor))
+        return [place_of(self.tracker, view, track) for track in tracks if track is not None]
+
+    def _only_place(self, places: list[Place], reach: Reach) -> Place | None:
+        """The best place if it is likely and no other one would do; of two that would, the one within reach."""
+        places = sorted(places, key=lambda place: -place.track.inliers)
+        rivals = [p for p in places if p.track.inliers > RIVAL * places[0].track.inliers]
+        if not all(p.is_as(rivals[0]) for p in rivals):
+            rivals = [p for p in rivals if reach.holds(p.track.T_c_w)]
+        if not rivals or not all(p.is_as(rivals[0]) for p in rivals):
+            return None
+        best = rivals[0]
+        enough = best.track.inliers >= 2 * self.tracker.config.min_inliers
+        wide = best.cells >= MIN_CELLS and best.spread >= LIKELY_SPREAD
+        return best if enough and wide and best.share >= LIKELY_SHARE else None
+
+
+def place_of(tracker: Tracker, view: View, track: Track) -> Place:
+    """What speaks for a pose."""
+    seen = tracker.expected(track.T_c_w, tracker.map.anchors_seen_by(tracker.local_keyframes(track.anchor)))
+    possible = max(1, min(len(seen.anchor), len(view.features.uv)))
+    depth = float(np.median(seen.depth)) if len(seen.depth) else 0.0
+    filled, could = _cells(tracker.camera, view.features.uv[track.keypoint]), _cells(tracker.camera, seen.uv)
+    return Place(track, track.inliers / possible, len(filled), len(filled) / max(1, len(could)), depth)
+
+
+def _cells(camera: Camera, uv: FloatArray) -> set[tuple[int, int]]:
+    """Cells of the image that hold a pixel."""
+    cells = (uv // (np.array([camera.width, camera.height]) / GRID)).astype(np.int64)
+    return set(map(tuple, cells.tolist()))
+
+
+def candidates(tracker: Tracker, T_predicted: FloatArray, count: int, attempt: int) -> list[Keyframe]:
+    """Keyframes to ask: some of the nearest to the prediction first, then all in turn.
 
     Args:
         tracker: With the map to look in.
-        view: Frame without a pose.
         T_predicted: ``(4, 4)`` world-to-camera guess.
-        keyframes: How many to try now.
+        count: How many to ask now.
         attempt: Frames lost so far; shifts the turn.
     """
-    for keyframe in _candidates(tracker, T_predicted, keyframes, attempt):
-        track = _against(tracker, view, keyframe)
-        if track is not None:
-            return track
-    return None
-
-
-def _candidates(tracker: Tracker, T_predicted: FloatArray, count: int, attempt: int) -> list[Keyframe]:
     all_keyframes = sorted(tracker.map.keyframes.values(), key=lambda k: -k.id)
     if len(all_keyframes) <= count:
         return all_keyframes
@@ -41,7 +201,8 @@ def _candidates(tracker: Tracker, T_predicted: FloatArray, count: int, attempt: 
     return list({k.id: k for k in [*near[:half], *turn]}.values())
 
 
-def _against(tracker: Tracker, view: View, keyframe: Keyframe) -> Track | None:
+def match_keyframe(tracker: Tracker, view: View, keyframe: Keyframe) -> Track | None:
+    """Pose of a frame from one keyframe that it looks like, completed with what the map has there."""
     held = keyframe.keypoints_with_anchor()
     if len(held) < MIN_MATCHES:
         return None
@@ -62,6 +223,11 @@ def _against(tracker: Tracker, view: View, keyframe: Keyframe) -> Track | None:
     first = tracker.solve(view, T_c_w, matches.train[kept], ids[kept])
     if first is None or first.inliers < 10:
         return None
-    track = tracker.track(view, first.T_c_w, first.anchor)
-    # A wrong pose rarely explains much more of the map than the matches that made it.
-    return track if track is not None and track.inliers >= 2 * config.min_inliers else None
+    return tracker.track(view, first.T_c_w, first.anchor)
+
+
+def _apart(T_c_w: FloatArray, other: FloatArray) -> tuple[float, float]:
+    """Distance of two cameras [map units] and the turn between them [rad]."""
+    centre, there = (-T[:3, :3].T @ T[:3, 3] for T in (T_c_w, other))
+    cosine = 0.5 * (float(np.trace(T_c_w[:3, :3] @ other[:3, :3].T)) - 1.0)
+    return float(np.linalg.norm(centre - there)), float(np.arccos(np.clip(cosine, -1.0, 1.0)))

@@ -115,7 +115,7 @@ class Tracker:
         expected: PosePrior | None = None,
     ) -> Track | None:
         """Match the given anchors around their predicted pixels and refine the pose on what matches."""
-        seen = self._expected(T_c_w, anchor_ids)
+        seen = self.expected(T_c_w, anchor_ids)
         matches = self._match(view, seen, np.full(len(seen.anchor), radius_px))
         return self.solve(view, T_c_w, matches.train, seen.anchor[matches.query], effort, expected)
 
@@ -130,7 +130,7 @@ class Tracker:
     ) -> Track | None:
         """Track of what the frame sees of the local map around ``recent``; known matches are not searched again."""
         anchors = self.map.anchors
-        seen = self._expected(T_c_w, self.map.anchors_seen_by(self.local_keyframes(recent)))
+        seen = self.expected(T_c_w, self.map.anchors_seen_by(self.local_keyframes(recent)))
         new = seen.select(~np.isin(seen.anchor, anchor))
         radius = self.config.map_radius_px * self.orb.scale_factor ** new.octave.astype(np.float64)
         matches = self._match(view, new, radius)
@@ -144,7 +144,8 @@ class Tracker:
         anchors.found[track.anchor] += 1
         return track if track.inliers >= self.config.min_inliers else None
 
-    def _expected(self, T_c_w: FloatArray, anchor_ids: IntArray) -> Projection:
+    def expected(self, T_c_w: FloatArray, anchor_ids: IntArray) -> Projection:
+        """Those of the given anchors that a camera should see."""
         anchors = self.map.anchors
         ids = anchor_ids[anchors.alive[anchor_ids]]
         return project_anchors(anchors, ids, T_c_w, self.camera, self.orb.scale_factor, self.orb.levels)

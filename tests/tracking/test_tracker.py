@@ -7,7 +7,7 @@ from point_map import CAMERA, SCALE_FACTOR, PointMap, small_motion
 from edgeslam_torch.config import OrbConfig, TrackingConfig
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.map.projection import project_anchors
-from edgeslam_torch.tracking.relocaliser import relocalise
+from edgeslam_torch.tracking.relocaliser import match_keyframe
 from edgeslam_torch.tracking.tracker import Tracker, make_view, median_parallax
 from edgeslam_torch.types import FrameFeatures
 
@@ -74,7 +74,7 @@ def test_frame_without_keypoints_has_no_pose(points, rng):
     view = make_view(empty, SCALE_FACTOR)
     tracker = tracker_of(points)
     assert tracker.track(view, points.world.T_c_w[3], recent(points, 3)) is None
-    assert relocalise(tracker, view, points.world.T_c_w[3], 4, 1) is None
+    assert match_keyframe(tracker, view, points.keyframes[3]) is None
 
 
 def test_another_place_is_not_this_one(points, rng):
@@ -84,7 +84,7 @@ def test_another_place_is_not_this_one(points, rng):
     stranger = make_view(FrameFeatures(seen.uv, seen.octave, seen.angle_rad, bits), SCALE_FACTOR)
     tracker = tracker_of(points)
     assert tracker.track(stranger, points.world.T_c_w[3], recent(points, 3)) is None
-    assert relocalise(tracker, stranger, points.world.T_c_w[3], 6, 1) is None
+    assert all(match_keyframe(tracker, stranger, keyframe) is None for keyframe in points.keyframes)
 
 
 def test_anchors_that_are_seen_and_found_are_counted(points, rng):
@@ -111,24 +111,6 @@ def test_anchors_behind_outside_or_seen_from_behind_are_not_expected(points):
     assert len(project_anchors(points.map.anchors, ids, behind_wall, CAMERA, SCALE_FACTOR, 8).anchor) == 0
     nothing = project_anchors(points.map.anchors, ids[:0], T, CAMERA, SCALE_FACTOR, 8)
     assert nothing.uv.shape == (0, 2)
-
-
-@pytest.mark.parametrize("view", [0, 3, 5])
-def test_lost_frame_is_found_without_a_prediction(points, rng, view):
-    nowhere = se3.exp(np.array([3.0, 1.0, 2.0, 0.5, 2.0, 0.5]))
-    lost = view_of(points, view, rng, 0.5, 30)
-    track = next((t for t in (relocalise(tracker_of(points), lost, nowhere, 2, n) for n in range(1, 8)) if t), None)
-    assert track is not None, "six keyframes, two a frame, in turn"
-    assert pose_error(points, view, track.T_c_w)[0] < 0.03
-
-
-def test_relocalisation_comes_round_to_every_keyframe(points):
-    from edgeslam_torch.tracking.relocaliser import _candidates
-
-    tracker = tracker_of(points)
-    tried = {k.id for n in range(1, 8) for k in _candidates(tracker, points.world.T_c_w[0], 2, n)}
-    assert tried == set(range(6))
-    assert all(len(_candidates(tracker, points.world.T_c_w[0], 2, n)) <= 2 for n in range(8))
 
 
 def test_median_parallax_worked_by_hand():

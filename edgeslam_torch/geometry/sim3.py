@@ -1,0 +1,111 @@
+"""Similarities ``p' = s R p + t``: how one piece of a monocular map lies in another.
+
+Tangents are ``(rho, phi, sigma)``: translation, rotation, log of the scale, applied on the left (Strasdat, Montiel and
+Davison, RSS 2010). A similarity is kept as a ``(4, 4)`` matrix with ``s R`` in its upper left block, so that products
+and inverses are those of matrices.
+"""
+
+import math
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from edgeslam_torch.types import FloatArray
+
+IDENTITY = np.eye(4)
+SMALL = 1e-5
+"""Angle [rad] and log scale below which series take the place of quotients of tiny numbers."""
+
+
+def compose(scale: float, R: FloatArray, t: FloatArray) -> FloatArray:
+    """``(4, 4)`` from a scale, a rotation ``(3, 3)`` and a translation ``(3,)``."""
+    S = np.eye(4)
+    S[:3, :3] = scale * R
+    S[:3, 3] = t
+    return S
+
+
+def scale_of(S: FloatArray) -> float:
+    """Scale of a similarity ``(4, 4)``."""
+    return float(np.cbrt(np.linalg.det(S[:3, :3])))
+
+
+def parts(S: FloatArray) -> tuple[float, FloatArray, FloatArray]:
+    """Scale, rotation ``(3, 3)`` and translation ``(3,)`` of a similarity."""
+    scale = scale_of(S)
+    return scale, S[:3, :3] / scale, S[:3, 3]
+
+
+def inverse(S: FloatArray) -> FloatArray:
+    """Inverse of a similarity ``(4, 4)``."""
+    scale, R, t = parts(S)
+    return compose(1.0 / scale, R.T, -(R.T @ t) / scale)
+
+
+def transform(S: FloatArray, p: FloatArray) -> FloatArray:
+    """Points ``(N, 3)`` moved by a similarity."""
+    return p @ S[:3, :3].T + S[:3, 3]
+
+
+def moved_camera(S: FloatArray, T_c_w: FloatArray) -> FloatArray:
+    """``T_c_w`` of a camera whose world was moved by a similarity; a camera has no scale of its own."""
+    scale, R, t = parts(S)
+    T = np.eye(4)
+    T[:3, :3] = T_c_w[:3, :3] @ R.T
+    T[:3, 3] = scale * T_c_w[:3, 3] - T[:3, :3] @ t
+    return T
+
+
+def exp(xi: FloatArray) -> FloatArray:
+    """Similarity ``(4, 4)`` of a tangent ``(7,)``.
+
+    Example:
+        >>> exp(np.array([0.0, 0, 0, 0, 0, 0, math.log(2.0)]))[0, 0]
+        2.0
+    """
+    rho, phi, sigma = xi[:3], xi[3:6], float(xi[6])
+    return compose(math.exp(sigma), Rotation.from_rotvec(phi).as_matrix(), _left(phi, sigma) @ rho)
+
+
+def log(S: FloatArray) -> FloatArray:
+    """Tangent ``(7,)`` of a similarity; inverse of `exp` for angles below pi."""
+    scale, R, t = parts(S)
+    phi, sigma = Rotation.from_matrix(R).as_rotvec(), math.log(scale)
+    return np.concatenate([np.linalg.solve(_left(phi, sigma), t), phi, [sigma]])
+
+
+def fit(a: FloatArray, b: FloatArray) -> FloatArray | None:
+    """Similarity that takes points ``a`` to ``b``, ``(N, 3)`` each, with the least squared distance.
+
+    Umeyama, PAMI 1991. None for fewer than three points or for points on one line, which leave a turn free.
+    """
+    if len(a) < 3:
+        return None
+    mean_a, mean_b = a.mean(axis=0), b.mean(axis=0)
+    spread = float(((a - mean_a) ** 2).sum()) / len(a)
+    U, d, V_t = np.linalg.svd((b - mean_b).T @ (a - mean_a) / len(a))
+    if spread < 1e-18 or d[1] < 1e-9 * d[0]:
+        return None
+    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(U) * np.linalg.det(V_t))])
+    scale = float((d * sign).sum()) / spread
+    if not scale > 0:
+        return None
+    R = (U * sign) @ V_t
+    return compose(scale, R, mean_b - scale * R @ mean_a)
+
+
+def _left(phi: FloatArray, sigma: float) -> FloatArray:
+    """Integral of ``exp(u (sigma + hat(phi)))`` over ``u`` from 0 to 1, ``(3, 3)``: what turns rho into t."""
+    theta = float(np.linalg.norm(phi))
+    hat = np.array([[0.0, -phi[2], phi[1]], [phi[2], 0.0, -phi[0]], [-phi[1], phi[0], 0.0]])
+    scale = math.exp(sigma)
+    whole = math.expm1(sigma) / sigma if abs(sigma) > SMALL else 1.0 + 0.5 * sigma
+    if theta < SMALL:
+        # Integral of u exp(u sigma).
+        first = (scale * (sigma - 1.0) + 1.0) / sigma**2 if abs(sigma) > 1e-3 else 0.5 + sigma / 3.0
+        return whole * np.eye(3) + first * hat
+    # Integrals of exp(u sigma) sin(u theta) and of exp(u sigma) cos(u theta).
+    both = sigma**2 + theta**2
+    sine = (scale * (sigma * math.sin(theta) - theta * math.cos(theta)) + theta) / both
+    cosine = (scale * (sigma * math.cos(theta) + theta * math.sin(theta)) - sigma) / both
+    return whole * np.eye(3) + sine / theta * hat + (whole - cosine) / theta**2 * (hat @ hat)
