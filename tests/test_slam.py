@@ -16,6 +16,7 @@ from edgeslam_torch.eval.metrics.align import umeyama
 from edgeslam_torch.fusion.published import T_LEVEL
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.slam import EdgeSlam
+from edgeslam_torch.states.lost import UNCONFIRMED
 from edgeslam_torch.states.starting import AFTER_LOSS
 from edgeslam_torch.types import DepthMap, Frame, FrameStatus, TelemetrySample, Units
 

@@ -15,6 +15,9 @@ from edgeslam_torch.types import FloatArray, Frame, FrameStatus
 LOST_BEFORE_RESTART_S = 0.65
 """Time without a pose after which a new piece of map is started from the predicted one."""
 
+UNCONFIRMED = "looks like a known place, the next frames must agree"
+"""Why a frame is not found yet, in words."""
+
 
 class Lost:
     """The state without a pose."""
@@ -47,9 +50,11 @@ class Lost:
         seen = len(view.features.uv)
         # With nothing to come back to, as after dark first images, what starts a map at first starts one now.
         enough = 2 * MIN_KEYPOINTS if len(system.map.anchors) > 0 else MIN_KEYPOINTS
-        if frame.stamp_s - lost_since_s >= LOST_BEFORE_RESTART_S and seen >= enough:
+        waiting = self.tracking.relocaliser.waiting > 0
+        if frame.stamp_s - lost_since_s >= LOST_BEFORE_RESTART_S and seen >= enough and not waiting:
             system.events["restarted"] += 1
             system.motion.stop()
             return self.starting.begin(frame, view, AFTER_LOSS)
         reason = f"only {seen} keypoints" if seen < MIN_KEYPOINTS else "too few keypoints agree with the map"
+        reason = UNCONFIRMED if waiting else reason
         return Step(Event.NOTHING, system.map.latest(), FrameStatus.PREDICTED, reason)

@@ -15,7 +15,7 @@ from edgeslam_torch.states.tracking import Tracking
 from edgeslam_torch.tracking.bootstrap import Bootstrap, StartedMap
 from edgeslam_torch.tracking.initialiser import TwoView
 from edgeslam_torch.tracking.lazy_view import LazyView
-from edgeslam_torch.tracking.relocaliser import relocalise
+from edgeslam_torch.tracking.relocaliser import candidates, match_keyframe
 from edgeslam_torch.tracking.tracker import Track, View
 from edgeslam_torch.types import FloatArray, Frame, FrameStatus
 
@@ -130,7 +130,10 @@ class Starting:
         T_predicted = system.predict(frame.stamp_s, lost=False)
         track = attempt.track(view, T_predicted, system.expectation(frame.stamp_s, T_predicted))
         if track is None or track.inliers < system.config.tracking.min_inliers:  # a fast turn: look everywhere
-            track = relocalise(system.tracker, view, T_predicted, 1, 0)
+            newest = candidates(system.tracker, T_predicted, 1, 0)
+            track = next(filter(None, (match_keyframe(system.tracker, view, k) for k in newest)), None)
+            if track is not None and track.inliers < 2 * system.config.tracking.min_inliers:
+                return None
         return track
 
     def _stands(

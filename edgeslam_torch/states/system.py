@@ -20,6 +20,7 @@ from edgeslam_torch.mapping.pipeline import Mapped, MappingPipeline
 from edgeslam_torch.optim.problem import PosePrior
 from edgeslam_torch.stage_times import timed
 from edgeslam_torch.tracking.motion_model import MotionModel
+from edgeslam_torch.tracking.relocaliser import Reach, reach_after
 from edgeslam_torch.tracking.tracker import Track, Tracker
 from edgeslam_torch.types import FloatArray, Frame
 
@@ -75,6 +76,11 @@ class System:
         if not self.mapping.has_depth:
             return None
         return self.motion.expectation(stamp_s, T_predicted, self.published.scale)
+
+    def reach(self, stamp_s: float, T_predicted: FloatArray) -> Reach:
+        """Where the camera can be by now, after frames without a pose."""
+        metre = 1.0 / self.published.scale if self.mapping.has_depth else None
+        return reach_after(stamp_s - self.motion.seen_s, T_predicted, metre)
 
     def see(self, stamp_s: float, track: Track) -> None:
         """Tell the fusion what the image said, and publish what follows for the scale."""

@@ -13,7 +13,7 @@ from edgeslam_torch.tracking.edge_tracker import MIN_EDGES, EdgeTracker, PointsI
 from edgeslam_torch.tracking.flow import FlowTracker, Followed, Template, join, template_of_keyframe, template_of_track
 from edgeslam_torch.tracking.keyframe_choice import few_matches, is_due, lost_most, lost_sight
 from edgeslam_torch.tracking.lazy_view import LazyView
-from edgeslam_torch.tracking.relocaliser import relocalise
+from edgeslam_torch.tracking.relocaliser import Relocaliser, candidates
 from edgeslam_torch.tracking.tracker import Track, View, median_parallax
 from edgeslam_torch.types import FloatArray, Frame, FrameStatus, IntArray
 
@@ -30,6 +30,7 @@ class Tracking:
             system.map, system.camera, system.config.orb, system.config.flow, system.config.tracking.min_inliers
         )
         self._edge_tracker = EdgeTracker(system.map, system.edges, system.camera)
+        self.relocaliser = Relocaliser(system.tracker)
         self._template: Template | None = None
         """What the next frames are followed from; none before there is a map."""
         self._recent: IntArray = np.zeros(0, dtype=np.int64)
@@ -48,8 +49,9 @@ class Tracking:
         self._map(new)
 
     def forget(self) -> None:
-        """Follow nothing any more."""
+        """Follow nothing any more, and search nothing."""
         self._template = None
+        self.relocaliser.forget()
 
     def step(self, frame: Frame, seen: LazyView) -> Step | None:
         """Find the frame near where it is expected; None when nothing says where it is."""
@@ -61,7 +63,7 @@ class Tracking:
             located = None if followed is None else self._locate_followed(followed, frame.stamp_s)
             # While the worker is busy no keyframe can be made; matching then finds what it has mapped meanwhile.
             if located is None or located.due:
-                matched = self._match(seen, T_predicted, followed, frame.stamp_s)
+                matched = self._match(frame, seen, T_predicted, followed)
                 if matched is None and located is not None:  # in a blurred image flow finds what matching does not
                     matched = replace(located, due=False)
                 located = matched
@@ -75,7 +77,7 @@ class Tracking:
             with self.system.timed("features"):
                 view = seen.view
             with self.system.timed("tracking"):
-                track = self._relocalise(view, T_predicted, lost_frames)
+                track = self._relocalise(frame, view, T_predicted, lost_frames)
             if track is None:
                 return None
             located = self._located(track, view, seen, frame.stamp_s, None, relocalised=True)
@@ -88,6 +90,7 @@ class Tracking:
             located = self._with_edges(frame, seen, T_predicted, located)
         track, reference = located.track, located.reference
         system.motion.move(frame.stamp_s, track.T_c_w)
+        self.relocaliser.forget()
         self._recent = track.anchor if track.inliers else self._recent
         system.see(frame.stamp_s, track)
         keyframe = self._insert_keyframe(frame, seen, located) if located.due else None
@@ -120,14 +123,14 @@ class Tracking:
         return Located(followed.track, reference, parallax_rad, due, followed.uv, inv_sigma)
 
     def _match(
-        self, seen: LazyView, T_predicted: FloatArray, followed: Followed | None, stamp_s: float
+        self, frame: Frame, seen: LazyView, T_predicted: FloatArray, followed: Followed | None
     ) -> Located | None:
         """By the frame's own keypoints: where flow finds nothing, and what a keyframe needs."""
         with self.system.timed("features"):
             view = seen.view
         with self.system.timed("tracking"):
-            track, relocalised = self._find(view, T_predicted, followed, stamp_s)
-        return None if track is None else self._located(track, view, seen, stamp_s, followed, relocalised)
+            track, relocalised = self._find(frame, view, T_predicted, followed)
+        return None if track is None else self._located(track, view, seen, frame.stamp_s, followed, relocalised)
 
     def _located(
         self, track: Track, view: View, seen: LazyView, stamp_s: float, followed: Followed | None, relocalised: bool
@@ -143,22 +146,30 @@ class Tracking:
         return Located(track, reference, parallax_rad, due, uv, inv_sigma, view, relocalised)
 
     def _find(
-        self, view: View, T_predicted: FloatArray, followed: Followed | None, stamp_s: float
+        self, frame: Frame, view: View, T_predicted: FloatArray, followed: Followed | None
     ) -> tuple[Track | None, bool]:
         """Track where flow or the prediction says, else search the keyframes; and whether the search found it."""
-        tracker, expected = self.system.tracker, self.system.expectation(stamp_s, T_predicted)
+        tracker, expected = self.system.tracker, self.system.expectation(frame.stamp_s, T_predicted)
         if followed is not None:
             track = tracker.track_near(view, followed.track.T_c_w, followed.track.anchor, expected)
             return None if track is None else join(track, followed, view, self.system.config.orb.scale_factor), False
         track = tracker.track(view, T_predicted, self._recent, expected)
         if track is not None:
             return track, False
-        track = self._relocalise(view, T_predicted, 0)
+        track = self._relocalise(frame, view, T_predicted, 0)
         return track, track is not None
 
-    def _relocalise(self, view: View, T_predicted: FloatArray, lost_frames: int) -> Track | None:
-        tries = self.system.config.tracking.relocalisation_keyframes
-        return relocalise(self.system.tracker, view, T_predicted, tries, lost_frames)
+    def _relocalise(self, frame: Frame, view: View, T_predicted: FloatArray, lost_frames: int) -> Track | None:
+        """Search the keyframes; the frames before that waited for a confirmation get their poses too."""
+        system = self.system
+        tries = system.config.tracking.relocalisation_keyframes
+        asked = candidates(system.tracker, T_predicted, tries, lost_frames)
+        found = self.relocaliser.find(frame.index, view, asked, system.reach(frame.stamp_s, T_predicted))
+        if found is None:
+            return None
+        if found.earlier:
+            system.log.replace(found.earlier, system.tracker.local_keyframes(found.track.anchor)[:1])
+        return found.track
 
     # -- by edges ----------------------------------------------------------------------------------------------
 

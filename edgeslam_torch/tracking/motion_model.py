@@ -22,6 +22,8 @@ class MotionModel:
         """``(4, 4)`` present pose."""
         self.stamp_s = -np.inf
         """Stamp of the newest frame."""
+        self.seen_s = -np.inf
+        """Stamp of the newest measured pose."""
         self._velocity: FloatArray = np.zeros(6)
         """Tangent of the camera's motion per second, left-applied to ``T_c_w``."""
 
@@ -46,6 +48,7 @@ class MotionModel:
         """Take a measured pose as the present one; the velocity is what led to it."""
         self._velocity = se3.log(T_c_w @ se3.inverse(self.T_c_w)) / max(stamp_s - self.stamp_s, 1e-6)
         self.T_c_w = T_c_w
+        self.seen_s = stamp_s
 
     def drift(self, T_predicted: FloatArray) -> None:
         """Take a prediction as the present pose and believe the velocity less."""

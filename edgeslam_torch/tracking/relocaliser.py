@@ -21,10 +21,11 @@ from edgeslam_torch.types import FloatArray
 MIN_MATCHES = 20
 LIKELY_SHARE = 0.12
 """Anchors found, of those that should be seen (or of the frame's keypoints, if they are fewer), from which on a place
-is likely. Wrong places reach 0.09 in a corridor whose doors repeat, 0.12 on bare boards and 0.06 in furnished rooms;
-right ones have 0.2 and more in 95 % of redkitchen's frames (docs/decisions/0050-relocalisation.md)."""
+is likely. Wrong places reach 0.09 in a corridor whose doors repeat and 0.06 in furnished rooms; right ones have 0.2 and
+more in 95 % of redkitchen's frames (docs/decisions/0050-relocalisation.md)."""
 SURE_SHARE = 0.2
-"""The same for a place that needs no further frame to confirm it."""
+"""The same for a place within reach that needs no further frame to confirm it. While reach is but one place, as in the
+first 0.2 s, a likely one is it."""
 GRID = (8, 6)
 """Cells across and down in which the spread over the image is counted."""
 MIN_CELLS = 6
@@ -138,7 +139,7 @@ class Relocaliser:
         if self._waiting and not place.is_as(self._waiting[-1][1]):
             self.forget()
         self._waiting.append((index, place))
-        sure = place.share >= SURE_SHARE and reach.holds(place.track.T_c_w)
+        sure = reach.holds(place) and (place.share >= SURE_SHARE or reach.is_one_place(place.depth))
         if not sure and len(self._waiting) < AGREEING_FRAMES:
             return None
         earlier = {i: p.track.T_c_w for i, p in self._waiting[:-1]}
@@ -157,7 +158,7 @@ class Relocaliser:
         places = sorted(places, key=lambda place: -place.track.inliers)
         rivals = [p for p in places if p.track.inliers > RIVAL * places[0].track.inliers]
         if not all(p.is_as(rivals[0]) for p in rivals):
-            rivals = [p for p in rivals if reach.holds(p.track.T_c_w)]
+            rivals = [p for p in rivals if reach.holds(p)]
         if not rivals or not all(p.is_as(rivals[0]) for p in rivals):
             return None
         best = rivals[0]

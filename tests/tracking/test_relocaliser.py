@@ -11,6 +11,7 @@ from edgeslam_torch.map.keyframe import make_keyframe
 from edgeslam_torch.tracking.relocaliser import (
     AGREEING_FRAMES,
     GRID,
+    Place,
     Reach,
     Relocaliser,
     candidates,
@@ -18,7 +19,7 @@ from edgeslam_torch.tracking.relocaliser import (
     place_of,
     reach_after,
 )
-from edgeslam_torch.tracking.tracker import Tracker, make_view
+from edgeslam_torch.tracking.tracker import Track, Tracker, make_view
 from edgeslam_torch.types import FrameFeatures
 
 SOMEWHERE = Reach(np.eye(4), 100.0, np.pi)
@@ -77,6 +78,14 @@ def test_lost_frame_is_found_at_once_where_motion_allows_it(points, rng, view):
     assert found.earlier == {}
 
 
+def test_while_only_one_place_is_in_reach_a_likely_one_is_it(points, rng):
+    """Every sixth keypoint is known: enough at once where the camera can hardly have moved, not after seconds."""
+    tracker, view = tracker_of(points), view_of(points, 3, rng, lambda uv: (uv // 10).sum(axis=1) % 6 == 0)
+    for shift, at_once in ((0.1, True), (100.0, False)):
+        reach = Reach(points.world.T_c_w[3], shift, 0.2, 1.0)
+        assert (Relocaliser(tracker).find(0, view, [points.keyframes[3]], reach) is not None) is at_once
+
+
 def test_beyond_reach_the_next_frames_must_agree(points, rng):
     relocaliser = Relocaliser(tracker_of(points))
     seen = view_of(points, 3, rng)
@@ -125,7 +134,7 @@ def test_of_two_places_alike_none_is_believed_but_the_one_within_reach(rng):
     seen = view_of(points, 1, rng)
     for index in range(2 * AGREEING_FRAMES):
         assert relocaliser.find(index, seen, points.keyframes, SOMEWHERE) is None
-    near = Reach(points.keyframes[4].T_c_w, 1.0, 0.5)
+    near = Reach(points.keyframes[4].T_c_w, 1.0, 0.5, 1.0)
     found = relocaliser.find(99, seen, points.keyframes, near)
     assert pose_error(found.track.T_c_w, points.keyframes[4].T_c_w)[0] < 0.03
 
@@ -147,10 +156,26 @@ def test_evidence_of_a_place(points, rng):
 def test_reach_grows_with_the_square_of_time():
     """Half of 9 m/s^2 over 0.2 s is 18 cm, and half of 60 rad/s^2 1.2 rad."""
     reach = reach_after(0.2, np.eye(4), metre=2.0)
-    assert reach.shift == pytest.approx(0.36)
+    assert reach.shift_m == pytest.approx(0.18)
     assert reach.turn_rad == pytest.approx(1.2)
-    for xi, inside in (([0.35, 0, 0, 0, 0, 0], True), ([0, -0.37, 0, 0, 0, 0], False), ([0, 0, 0, 0, 1.21, 0], False)):
-        assert reach.holds(se3.exp(np.array(xi, dtype=float))) is inside
+    assert reach.is_one_place(2.5)
+    assert not reach.is_one_place(2.0)
+    unknown = reach_after(0.2, np.eye(4), metre=None)  # 6 % of the depth
+    assert unknown.is_one_place(2.0)
+    assert not reach_after(0.4, np.eye(4), metre=None).is_one_place(2.0)
+
+
+@pytest.mark.parametrize(
+    ("xi", "inside"),
+    [([0.65, 0, 0, 0, 0, 0], True), ([0, -0.67, 0, 0, 0, 0], False), ([0, 0, 0, 0, 0.54, 0], True)]
+    + [([0, 0, 0, 0, 0, -0.56], False)],
+)
+def test_within_reach_is_as_good_as_there(xi, inside):
+    """36 cm and 15 % of a depth of 2 m, and 0.2 rad and 20 degrees."""
+    none = np.zeros(0, dtype=np.int64)
+    T_c_w = se3.exp(np.array(xi, dtype=float))
+    place = Place(Track(T_c_w, none, none, none, none, np.eye(6)), 1.0, 48, 1.0, depth=2.0)
+    assert Reach(np.eye(4), 0.36, 0.2, 1.0).holds(place) == inside
 
 
 def test_every_keyframe_is_asked_in_turn(points):
