@@ -1,6 +1,6 @@
 """``edgeslam``: the command line.
 
-Nothing is imported before `main` has Ctrl-C in hand, and nothing heavy before a command needs it.
+Nothing is imported before `main` handles Ctrl-C, and nothing heavy before a command needs it.
 """
 
 import sys
@@ -16,11 +16,11 @@ COMMANDS = {
     "bench": ("edgeslam_torch.commands.judging.bench", "accuracy and speed in one table, beside other systems"),
     "judge": (
         "edgeslam_torch.commands.judging.judge",
-        "every recording, variant and simulated flight in one table with bars",
+        "every recording, variant and simulated flight in one table with limits",
     ),
     "ablation": (
         "edgeslam_torch.commands.judging.ablation",
-        "what each loss does: one table, one thing changed at a time",
+        "contribution of each loss: one table, one change at a time",
     ),
     "report": ("edgeslam_torch.commands.report", "make the report page of a run"),
     "view": ("edgeslam_torch.commands.view", "open a run's report or viewer"),
@@ -33,16 +33,16 @@ COMMANDS = {
     "sim": ("edgeslam_torch.commands.sim", "a simulated Tello on this machine's loopback"),
     "export-map": ("edgeslam_torch.commands.export_map", "edge map to PLY, PCD, COLMAP or an occupancy grid"),
 }
-"""Name: (module, one line of help). A command whose module is not there is not offered."""
+"""Name: (module, one line of help). A command whose module is missing is not offered."""
 
 EXIT_INTERRUPTED = 130
 _IMPORTING = "<frozen importlib._bootstrap>"
 _AGAIN_S = 0.005
-"""Short beside what a command does between its last import and its first file."""
+"""Short against the time between a command's last import and its first file."""
 
 
 def available() -> dict[str, tuple[str, str]]:
-    """The commands that this installation has."""
+    """Commands of this installation."""
     from importlib.util import find_spec
 
     return {name: entry for name, entry in COMMANDS.items() if find_spec(entry[0]) is not None}
@@ -52,7 +52,7 @@ def main(argv: list[str] | None = None) -> int:
     """Run one command; returns the exit code.
 
     Args:
-        argv: The words after ``edgeslam``; those that the program was called with when None.
+        argv: Arguments after ``edgeslam``; those of the process when None.
     """
     ctrl_c = _CtrlC()
     try:
@@ -62,7 +62,7 @@ def main(argv: list[str] | None = None) -> int:
 
         return run_command(sys.argv[1:] if argv is None else argv, available())
     except BaseException as error:
-        # What a library makes of a Ctrl-C in the middle of its work has many names.
+        # Libraries convert a Ctrl-C into many exceptions.
         if not isinstance(error, KeyboardInterrupt) and (isinstance(error, SystemExit) or not ctrl_c.raised):
             raise
         sys.stderr.write("edgeslam: interrupted\n")
@@ -72,8 +72,8 @@ def main(argv: list[str] | None = None) -> int:
 
 
 class _CtrlC:
-    """Ctrl-C as ever, but it waits while a module loads: numpy makes another error of it, a weak reference's end
-    swallows it, and who can do without the module goes on without."""
+    """Ctrl-C, delayed while modules load: numpy converts it to another error, weak-reference callbacks swallow it,
+    and optional imports would treat it as a missing module."""
 
     def __init__(self) -> None:
         self.raised = False
@@ -81,7 +81,7 @@ class _CtrlC:
         self._postponed = False
 
     def take(self) -> None:
-        """Handle Ctrl-C from here on, unless somebody else does or it is ignored."""
+        """Install the handler unless there is another one or Ctrl-C is ignored."""
         import signal
 
         if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
@@ -89,7 +89,7 @@ class _CtrlC:
             self._taken = True
 
     def give_back(self) -> None:
-        """Let Ctrl-C end the program without a word: all is done, the interpreter only clears up."""
+        """Let Ctrl-C end the program silently: only interpreter shutdown is left."""
         if self._taken:
             import signal
 
@@ -105,7 +105,7 @@ class _CtrlC:
         raise KeyboardInterrupt
 
     def _postpone(self) -> None:
-        """Ask for the signal again, once however many came: a thread for each would use them all up."""
+        """Request the signal again, once for any number of signals: one thread each would exhaust them."""
         import threading
 
         if not self._postponed:

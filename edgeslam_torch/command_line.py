@@ -1,4 +1,4 @@
-"""What ``edgeslam`` does with its words: find the command, parse its options, run it, report errors in one line."""
+"""Command-line parsing: find the command, parse its options, run it, report errors in one line."""
 
 import argparse
 import difflib
@@ -24,7 +24,7 @@ EXIT_HUNG_UP = 129
 
 
 class Parser(argparse.ArgumentParser):
-    """Says what the user may have meant; no option can be abbreviated, so that adding one breaks no script."""
+    """Suggests corrections; options cannot be abbreviated, so that new options break no script."""
 
     def __init__(self, *args: object, **kwargs: object) -> None:
         kwargs.setdefault("allow_abbrev", False)
@@ -38,12 +38,12 @@ class Parser(argparse.ArgumentParser):
         sys.exit(EXIT_USAGE)
 
     def options(self) -> list[str]:
-        """Every option that can be given."""
+        """All options."""
         return [name for action in self._actions for name in action.option_strings]
 
 
 def _whole_number(text: str) -> int:
-    """What every ``type=int`` of a command takes."""
+    """Argument type for integers."""
     try:
         value = int(text)
     except ValueError:
@@ -54,7 +54,7 @@ def _whole_number(text: str) -> int:
 
 
 def _finite_number(text: str) -> float:
-    """What every ``type=float`` of a command takes."""
+    """Argument type for finite floats."""
     try:
         value = float(text)
     except ValueError:
@@ -86,18 +86,18 @@ def run_command(arguments: list[str], commands: Commands) -> int:
             raise
         sys.stderr.write(f"edgeslam: error: {_one_line(error)}\n")
         return EXIT_ERROR
-    except BrokenPipeError:  # the reader of a pipe, such as head, has enough
+    except BrokenPipeError:  # the reader of the pipe, such as head, has closed it
         _mute(sys.stdout)
         return 0
     except OSError as error:
         if error.errno != errno.EIO or sys.stderr.isatty():
             raise
-        _mute(sys.stdout, sys.stderr)  # the terminal was closed; what was done is on the disk
+        _mute(sys.stdout, sys.stderr)  # the terminal was closed; results so far are on disk
         return EXIT_HUNG_UP
 
 
 def _mute(*streams: TextIO) -> None:
-    """Let what is still written go nowhere."""
+    """Discard further output."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     for stream in streams:
         os.dup2(nowhere, stream.fileno())
@@ -151,7 +151,7 @@ def _unknown_arguments(unknown: list[str], options: list[str]) -> str:
 
 @contextmanager
 def _messages(verbose: bool) -> Iterator[None]:
-    """Our own messages on stderr while a command runs: warnings, or everything."""
+    """Log our messages to stderr while a command runs: warnings, or everything."""
     handler = logging.StreamHandler(sys.stderr)
     handler.setLevel(logging.DEBUG if verbose else logging.WARNING)
     pattern = "%(asctime)s %(name)s %(levelname)s %(message)s" if verbose else "edgeslam: %(levelname)s: %(message)s"
@@ -168,7 +168,7 @@ def _messages(verbose: bool) -> Iterator[None]:
 
 
 def _quiet_libraries(verbose: bool) -> None:
-    """OpenCV and FFmpeg report damaged images themselves, on top of what we say about them."""
+    """OpenCV and FFmpeg report damaged images themselves, in addition to our messages."""
     if not verbose:
         os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
         os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")

@@ -1,6 +1,6 @@
-"""Every setting of the SLAM system with its unit, default and reason. TOML in, dataclass inside.
+"""Every setting of the SLAM system with its unit, default and reason. Read from TOML into frozen dataclasses.
 
-One section per stage; `SlamConfig` holds them all. Functions take plain arguments or one section, never the whole.
+One section per stage, collected in `SlamConfig`. Functions take plain arguments or one section, never the whole.
 """
 
 import math
@@ -11,7 +11,7 @@ from edgeslam_torch.fusion.config import FusionConfig
 
 
 def _check_numbers(config: Any, prefix: str = "") -> None:
-    """Every number finite, every integer one that OpenCV and torch take."""
+    """Require finite numbers, and integers that OpenCV and torch accept."""
     for field_ in fields(config):
         value, name = getattr(config, field_.name), prefix + field_.name
         if is_dataclass(value):
@@ -31,7 +31,7 @@ def _positive(section: object, *names: str) -> None:
 
 
 def _at_most(section: object, **limits: float) -> None:
-    """Where more makes no sense and costs gigabytes or hours."""
+    """Upper bounds where larger values only cost gigabytes or hours."""
     for name, limit in limits.items():
         value = getattr(section, name)
         if value > limit:
@@ -43,15 +43,16 @@ class OrbConfig:
     """Stage 1: keypoints."""
 
     features: int = 1000
-    """Keypoints kept per frame; the figure of ORB-SLAM2 for 640x480."""
+    """Keypoints kept per frame; as in ORB-SLAM2 for 640x480."""
     candidates: int = 1500
-    """Corners detected before the even spread."""
+    """Corners detected before they are spread evenly."""
     scale_factor: float = 1.2
     levels: int = 8
     fast_threshold: int = 12
-    """Grey levels; low, because the spread keeps the strongest of every cell."""
+    """FAST threshold in grey levels; low, because the strongest corners of every cell are kept."""
     fast_faint: int = 4
-    """The same where the image has few corners: cloth, white walls, little light. About twice a camera's noise."""
+    """FAST threshold where the image has few corners (cloth, white walls, low light); about twice a camera's
+    noise."""
 
     def __post_init__(self) -> None:
         _positive(self, "features", "candidates", "levels", "fast_threshold", "fast_faint")
@@ -69,7 +70,7 @@ class DepthConfig:
     backend: str = "onnxruntime"
     """``onnxruntime`` or ``torch``."""
     prior_sigma_log: float = 0.35
-    """Spread of log depth assumed where no network speaks; wide enough for a desk and a wall behind it."""
+    """Standard deviation of log depth without a network; wide enough for a desk and the wall behind it."""
 
     def __post_init__(self) -> None:
         _positive(self, "prior_sigma_log")
@@ -92,9 +93,9 @@ class TrackingConfig:
     min_inliers: int = 25
     """Below this a pose is not trusted."""
     local_keyframes: int = 30
-    """Keyframes whose anchors are looked for in a frame."""
+    """Maximum number of keyframes in the local map."""
     relocalisation_keyframes: int = 4
-    """Keyframes tried per lost frame."""
+    """Keyframes tried in each lost frame."""
 
     def __post_init__(self) -> None:
         _positive(self, "motion_radius_px", "map_radius_px", "max_hamming", "ratio", "min_inliers", "local_keyframes")
@@ -102,18 +103,18 @@ class TrackingConfig:
 
 @dataclass(frozen=True, slots=True)
 class FlowConfig:
-    """Stage 2, between keyframes: optical flow in place of matching."""
+    """Stage 2, between keyframes: optical flow instead of matching."""
 
     enabled: bool = True
-    """Off: keypoints are detected and matched in every frame."""
+    """If off, keypoints are detected and matched in every frame."""
     points: int = 350
-    """Keypoints of the last keyframe that are followed at most."""
+    """Maximum number of keypoints tracked from the last keyframe."""
     window_px: int = 15
-    """Side of the patch that is looked for."""
+    """Side of the tracked patch."""
     levels: int = 4
-    """Images of the pyramid, each half as large as the one before."""
+    """Pyramid levels, each half the size of the previous one."""
     min_share: float = 0.4
-    """Below this share of keypoints found again the frame is matched instead."""
+    """Below this share of tracked keypoints, the frame is matched instead."""
 
     def __post_init__(self) -> None:
         _positive(self, "points", "levels", "min_share")
@@ -124,21 +125,22 @@ class FlowConfig:
 
 @dataclass(frozen=True, slots=True)
 class InitialisationConfig:
-    """Two-view initialisation that replaces the depth-prior map of the first frame."""
+    """Two-view initialisation, which replaces the map of the first frame's predicted depths."""
 
     min_parallax_deg: float = 1.5
-    """Median ray angle of the inliers before two views are tried."""
+    """Median parallax of the inliers before two views are tried."""
     min_points: int = 80
-    """Anchors that must triangulate well."""
+    """Minimum number of well triangulated anchors."""
     max_reprojection_px: float = 2.0
     keyframe_gap_s: float = 0.15
-    """Time between frames that become keyframes once the two views have made a map."""
+    """Minimum time between the intermediate frames that become keyframes after initialisation."""
     most_keyframes: int = 12
-    """Of these frames at most; each costs a pass of the depth network."""
+    """Maximum number of these frames; each costs an inference of the depth network."""
     max_direction_sigma: float = 0.08
-    """Standard deviation of the second camera's position, relative to the baseline, above which two views wait."""
+    """Standard deviation of the second camera's position relative to the baseline above which initialisation
+    waits."""
     max_direction_sigma_alone: float = 0.05
-    """The same without a depth network, which would tell a flat scene from a real one."""
+    """The same without a depth network to resolve the two-fold ambiguity of a small motion."""
 
     def __post_init__(self) -> None:
         _positive(self, "min_parallax_deg", "min_points", "max_reprojection_px", "keyframe_gap_s", "most_keyframes")
@@ -149,29 +151,30 @@ class MappingConfig:
     """Stage 3: keyframes and anchors."""
 
     keyframe_min_gap_s: float = 0.15
-    """Time between keyframes at least; shorter ones add work and no view."""
+    """Minimum time between keyframes: a camera moved by hand or in slow flight has then gained about a degree of
+    parallax."""
     keyframe_max_gap_s: float = 0.98
-    """Time between keyframes at most while the camera moves."""
+    """Maximum time between keyframes while the camera moves."""
     keyframe_followed: float = 0.9
-    """A new keyframe when flow finds fewer than this share of the last one's keypoints."""
+    """Insert a keyframe when flow tracks fewer than this share of the last one's keypoints."""
     keyframe_at_once: float = 0.75
-    """Below this share it does not wait for ``keyframe_min_gap_s``."""
+    """Below this share, do not wait for ``keyframe_min_gap_s``."""
     keyframe_overlap: float = 0.7
-    """A new keyframe when fewer than this share of the reference keyframe's anchors is matched."""
+    """Insert a keyframe when fewer than this share of the reference keyframe's anchors is matched."""
     keyframe_parallax_deg: float = 3.0
-    """A new keyframe when the median ray angle to the reference exceeds this."""
+    """Insert a keyframe when the median parallax to the reference exceeds this."""
     max_keyframes: int = 200
-    """Keyframes kept in the map; the least useful one goes first. Bounds memory and time."""
+    """Maximum number of keyframes in the map; the least useful one is removed first. Bounds memory and time."""
     redundancy: float = 0.95
-    """A keyframe goes when this share of its anchors is seen by three others."""
+    """A keyframe is redundant when this share of its anchors is observed by three others."""
     neighbours: int = 6
-    """Keyframes that new anchors are triangulated with."""
+    """Neighbouring keyframes used to triangulate new anchors."""
     min_parallax_deg: float = 1.0
-    """Smallest ray angle of a triangulated anchor."""
+    """Minimum parallax of a triangulated anchor."""
     window: int = 10
     """Keyframes refined together (the paper says "short")."""
     window_fixed: int = 15
-    """Keyframes outside the window that hold its gauge."""
+    """Fixed keyframes outside the window, which hold its gauge."""
 
     def __post_init__(self) -> None:
         _positive(
@@ -201,17 +204,18 @@ class EdgeConfig:
     max_pixels: int = 5000
     """Edge pixels kept per keyframe, evenly thinned."""
     delay_keyframes: int = 3
-    """Keyframes that must follow before a keyframe's edges are measured: views from both sides, refined poses."""
+    """Keyframes that must follow before a keyframe's edges are measured: then there are views from both sides, with
+    refined poses."""
     targets: int = 5
     """Keyframes searched for each edge."""
     max_sigma: float = 0.025
-    """Relative depth sigma above which a measured edge point stays out of the map."""
+    """Maximum relative depth sigma of an edge point in the map."""
     min_observations: int = 2
     """Keyframes that must agree on a point of the exported map."""
     voxel: float = 0.005
-    """Side of the map's fusion cell relative to the median scene depth."""
+    """Side of a fusion cell relative to the median scene depth."""
     max_points: int = 400_000
-    """Points kept; beyond it those that one keyframe alone saw go, then half of the oldest."""
+    """Maximum number of points; points of a single keyframe are removed first, then half of the oldest."""
 
     def __post_init__(self) -> None:
         _positive(self, "canny_low", "canny_high", "max_pixels", "targets", "max_sigma", "voxel", "max_points")
@@ -226,16 +230,16 @@ class WindowConfig:
     """Stage 4: which losses refine poses, anchors and edge depths, and in which form.
 
     Each term is off, in the default form, or ``literal``: the paper's equation as printed
-    (``docs/equations.md``). Edge and corner terms take part in the last refinement, once all edges are measured.
+    (``docs/equations.md``). Edge and corner terms join the last refinement, after all edges are measured.
     """
 
     reprojection: str = "robust"
-    """``robust``: whitened by octave, Huber kernel; ``literal``: eqs. 15-16, plain squares of pixels; ``off``: no
-    refinement while flying, and none of anchors."""
+    """``robust``: whitened by octave, Huber kernel; ``literal``: eqs. 15-16, plain squared pixels; ``off``: no
+    refinement while flying, and anchors are not refined."""
     alignment: bool = True
-    """Distance of projected edge pixels to the edge they should lie on, along its normal; not in the paper."""
+    """Distance of projected edge pixels from their partner edge, along its normal; not in the paper."""
     cycle: str = "relative"
-    """``relative`` depth, ``literal`` (eqs. 17-23: pixels, a sigma of one, no kernel on the way to it) or ``off``."""
+    """``relative`` depth, ``literal`` (eqs. 17-23: pixels, unit sigma, no kernel) or ``off``."""
     angle: str = "off"
     """Across views: directions of both ``arms`` of a corner, ``cosine`` of their angle (eqs. 24-25 across views),
     ``literal`` (eqs. 24-25 in one frame: identically zero) or ``off``."""
@@ -245,11 +249,11 @@ class WindowConfig:
     adaptive: bool = True
     """Whiten edge and corner terms by the robust scales of their residuals (paper: "adaptive weighting")."""
     rounds: int = 1
-    """Times that edges are paired anew and all is refined."""
+    """Rounds of edge association and refinement."""
     edges_per_keyframe: int = 800
-    """Edge pixels of a keyframe that take part."""
+    """Edge pixels used per keyframe."""
     targets: int = 3
-    """Neighbouring keyframes in which each is looked for."""
+    """Neighbouring keyframes in which each edge pixel is associated."""
 
     def __post_init__(self) -> None:
         _positive(self, "rounds", "edges_per_keyframe", "targets")
@@ -270,18 +274,18 @@ class WindowConfig:
 
     @property
     def uses_corners(self) -> bool:
-        """Whether any corner term is on; the literal angle is zero and needs none."""
+        """Whether any corner term is on; the literal angle is identically zero and needs no corners."""
         return self.angle in ("arms", "cosine") or self.collinearity != "off"
 
 
 @dataclass(frozen=True, slots=True)
 class MountConfig:
-    """Where the camera sits on the drone."""
+    """Camera mount on the drone."""
 
     tilt_deg: float = 12.0
-    """Camera looks down by this much below the body's forward axis; a Tello's, within two degrees."""
+    """Downward tilt of the camera against the body's forward axis; a Tello's within two degrees."""
     forward_m: float = 0.03
-    """Camera ahead of the body's centre."""
+    """Distance of the camera ahead of the body's centre."""
 
     def __post_init__(self) -> None:
         if not -90.0 <= self.tilt_deg <= 90.0:
@@ -290,10 +294,10 @@ class MountConfig:
 
 @dataclass(frozen=True, slots=True)
 class SlamConfig:
-    """Everything `EdgeSlam` can be told."""
+    """All settings of `EdgeSlam`."""
 
     seed: int = 0
-    """Of the robust estimators; the same seed and input give the same bytes out."""
+    """Seed of the robust estimators; the same seed and input give the same bytes out."""
     orb: OrbConfig = field(default_factory=OrbConfig)
     depth: DepthConfig = field(default_factory=DepthConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)

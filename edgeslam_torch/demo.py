@@ -1,4 +1,4 @@
-"""The embedded default: a simulated drone in a simulated house, and what the whole pipeline makes of it."""
+"""The demo: a simulated drone in a simulated house, processed by the whole pipeline and compared with the truth."""
 
 import json
 import os
@@ -39,13 +39,13 @@ CAMERAS = {
 }
 """Names of ``--images``."""
 MAX_MAP_POINTS = 8_000
-"""Map points that are compared with the true surfaces, drawn with a fixed seed."""
+"""Maximum number of map points compared with the true surfaces, sampled with a fixed seed."""
 SCORE = "demo.json"
 
 
 @dataclass(frozen=True, slots=True)
 class DemoSettings:
-    """What is flown."""
+    """Settings of the demo flight."""
 
     world: str = "room"
     seconds: float = 16.0

@@ -1,8 +1,8 @@
-"""What can go wrong that a user can mend; the command line prints the message in one line and exits 1."""
+"""Errors that a user can fix; the command line prints one line and exits with 1."""
 
 
 class EdgeSlamError(Exception):
-    """Base of every error that a user's input can cause."""
+    """Base class of errors caused by user input."""
 
 
 class SourceError(EdgeSlamError):
@@ -10,7 +10,7 @@ class SourceError(EdgeSlamError):
 
 
 class CalibrationError(EdgeSlamError):
-    """A camera calibration is missing, malformed or does not fit the images."""
+    """A camera calibration is missing, malformed or does not match the images."""
 
 
 class ConfigError(EdgeSlamError):
@@ -18,7 +18,7 @@ class ConfigError(EdgeSlamError):
 
 
 class WeightsError(EdgeSlamError):
-    """Network weights are missing, damaged or of another network."""
+    """Network weights are missing, damaged or belong to another network."""
 
 
 class OutputError(EdgeSlamError):

@@ -1,4 +1,4 @@
-"""How far a run is: a bar on a terminal, a line every few seconds elsewhere."""
+"""Progress of a run: a bar on a terminal, a line every few seconds elsewhere."""
 
 import sys
 import time
@@ -11,13 +11,13 @@ LINE_EVERY_S = 5.0
 
 
 class Progress(Protocol):
-    """A listener of `edgeslam_torch.run.run` that shows something."""
+    """A listener of `edgeslam_torch.run.run` that shows progress."""
 
     def on_frame(self, frame: Frame, output: SlamOutput, slam: object) -> None:
-        """One more frame is done."""
+        """Called after each frame."""
 
     def on_finish(self, slam: object) -> None:
-        """The last refinement is done."""
+        """Called after the last refinement."""
 
     def __enter__(self) -> "Progress":
         """Start showing."""
@@ -32,7 +32,7 @@ def make_progress(total: int | None, show_bar: bool, stream: TextIO | None = Non
     """A bar or lines, on stderr unless told otherwise.
 
     Args:
-        total: Frames to come; None when nobody knows.
+        total: Expected number of frames; None if unknown.
         show_bar: Whether the output is a terminal that can redraw a line.
         stream: Where to show it.
     """
@@ -49,14 +49,14 @@ class ProgressBar:
         self._bar = tqdm(total=total, unit="frame", file=stream, dynamic_ncols=True, smoothing=0.1)
 
     def on_frame(self, frame: Frame, output: SlamOutput, slam: object) -> None:
-        """Advance by one; the text is redrawn with the bar, not with every frame."""
+        """Advance by one; the text is redrawn with the bar only."""
         if self._bar.n == 0:
             self._bar.unpause()  # loading the network is not part of the rate
         self._bar.set_postfix_str(status_words(output), refresh=False)
         self._bar.update()
 
     def on_finish(self, slam: object) -> None:
-        """Nothing more to show."""
+        """Nothing to show."""
 
     def __enter__(self) -> "ProgressBar":
         return self
@@ -77,7 +77,7 @@ class ProgressLines:
         self._begin = self._shown = 0.0
 
     def on_frame(self, frame: Frame, output: SlamOutput, slam: object) -> None:
-        """Count, and write when it is time."""
+        """Count, and print a line when due."""
         now = time.monotonic()
         if self._done == 0:  # loading the network is not part of the rate
             self._begin = self._shown = now
@@ -105,6 +105,6 @@ class ProgressLines:
 
 
 def status_words(output: SlamOutput) -> str:
-    """Status of one frame and why, short."""
+    """Status of one frame with its reason, short."""
     reason = f" ({output.reason})" if output.reason else ""
     return f"{output.status}{reason}, {output.inliers} inliers"

@@ -1,4 +1,4 @@
-"""Drive the SLAM system over a source and leave the results in a folder: what ``edgeslam run`` does."""
+"""Run the SLAM system on a source and write the results to a folder: ``edgeslam run``."""
 
 import gc
 import importlib
@@ -46,26 +46,26 @@ _HANG_UP: int = getattr(signal, "SIGHUP", 0)  # Windows has none
 _STOPPING = [number for number in (signal.SIGINT, signal.SIGTERM, _HANG_UP) if number]
 
 LOOKED_AT = 320
-"""Images at the start of a recording in which an unknown focal length is looked for; ten seconds at 30 Hz."""
+"""Images at the start of a recording used to estimate an unknown focal length; ten seconds at 30 Hz."""
 
 
 class Mode(StrEnum):
-    """How frames are fed."""
+    """How frames are fed to the system."""
 
     OFFLINE = "offline"
-    """One after the other, none lost; the same input gives the same bytes out."""
+    """Sequentially, none dropped; the same input gives the same bytes out."""
     REALTIME = "realtime"
-    """At the pace of their stamps; those that nobody has time for are dropped and counted."""
+    """At the pace of their stamps; frames that cannot be processed in time are dropped and counted."""
 
 
 class Slam(Protocol):
-    """What the loop needs of `EdgeSlam`."""
+    """The part of `EdgeSlam` that the loop uses."""
 
     @property
     def events(self) -> dict[str, int]: ...
 
     def prepare(self, frame: Frame) -> Any:
-        """What can be done with a frame before the frames before it are through."""
+        """Feature extraction that does not depend on earlier frames."""
 
     def step(self, frame: Frame, telemetry: Sequence[TelemetrySample] = (), prepared: Any = None) -> SlamOutput:
         """Pose of one frame."""
@@ -74,7 +74,7 @@ class Slam(Protocol):
         """Last refinement."""
 
     def close(self) -> None:
-        """Stop what runs beside the loop."""
+        """Stop background threads."""
 
     def trajectory(self) -> tuple[FloatArray, FloatArray]:
         """Stamps ``(F,)`` and refined ``T_w_c`` ``(F, 4, 4)``."""
@@ -89,19 +89,19 @@ class Slam(Protocol):
         """Keyframes in the map."""
 
     def telemetry_statistics(self) -> dict[str, float]:
-        """What telemetry told; empty without."""
+        """Telemetry statistics; empty without telemetry."""
 
     def losses(self) -> dict[str, float]:
         """Losses of the final map by name; empty before `finish`."""
 
     def support(self) -> Support:
-        """What each frame's final pose rests on."""
+        """What supports each frame's final pose."""
 
     def pieces(self) -> list[Piece]:
         """Pieces of map that the frames belong to."""
 
     def warnings(self) -> list[str]:
-        """What limits how far the results can be believed, one line each."""
+        """Limits of the results, one line each."""
 
     @property
     def scale(self) -> ScaleEstimate:
@@ -109,7 +109,7 @@ class Slam(Protocol):
 
 
 class Listener(Protocol):
-    """Somebody who looks on: a progress bar, a viewer."""
+    """Observer of a run: a progress bar, a viewer."""
 
     def on_frame(self, frame: Frame, output: SlamOutput, slam: Slam) -> None:
         """Called after every step, in the loop's thread."""
@@ -120,7 +120,7 @@ class Listener(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class RunResult:
-    """What a run left."""
+    """Result of a run."""
 
     folder: Path
     summary: dict[str, Any]
@@ -132,7 +132,7 @@ class RunResult:
     interrupted: bool
     """Whether Ctrl-C ended it."""
     failure: str | None
-    """What could not be written; None when everything was."""
+    """Output that could not be written; None if all was."""
 
 
 def run(
@@ -145,12 +145,12 @@ def run(
 ) -> RunResult:
     """Run the SLAM system over a source and write its folder.
 
-    Whatever ends the run early (Ctrl-C, a full disk, a live source that goes away), trajectory, map and summary of
-    what was done are written.
+    If the run ends early (Ctrl-C, full disk, lost live source), trajectory, map and summary of the processed frames
+    are written.
 
     Args:
         source: From `open_source`.
-        out_dir: Folder for the results; made when missing. An older run in it is replaced once a frame is through.
+        out_dir: Folder for the results; made when missing. An older run in it is replaced after the first frame.
         config: Settings; the defaults when None.
         mode: How frames are fed.
         listeners: Called after every frame.
@@ -159,7 +159,7 @@ def run(
     Raises:
         OutputError: If the folder cannot be written to at all, holds files that no run wrote, or another run writes
             into it.
-        SourceError: If the source gives not a single frame, or fails on the way (after the results are written).
+        SourceError: If the source provides no frame, or fails during the run (after the results are written).
     """
     config = config or SlamConfig()
     with closing(source), closing(RunWriter(out_dir, [Path(source.location)], to_toml(config))) as writer:
@@ -168,9 +168,9 @@ def run(
 
 
 def settle_camera(source: Source) -> None:
-    """Replace a guessed focal length by what the first images of a recording say, or add why they say nothing.
+    """Replace a guessed focal length by an estimate from the first images, or record why there is none.
 
-    A live source is left alone: its images are gone once they are looked at.
+    Not for live sources, whose images cannot be read twice.
     """
     if source.live or not source.camera.source.startswith(GUESS):
         return
@@ -191,7 +191,7 @@ def settle_camera(source: Source) -> None:
 
 
 class _Run:
-    """One pass over a source."""
+    """One run over a source."""
 
     def __init__(
         self,
@@ -219,7 +219,7 @@ class _Run:
         with self.interrupt:
             try:
                 self._loop()
-            finally:  # also when the source fails on the way: nothing done so far may be lost
+            finally:  # also when the source fails: keep what was done so far
                 if self.tally.frames:
                     self._write(time.perf_counter() - wall, cpu)
         if self.result is None:
@@ -248,7 +248,7 @@ class _Run:
             prepared.close()
 
     def _prepared(self, frames: Iterator[Frame]) -> Generator[tuple[Frame, Any]]:
-        """Frames with their features; of a recording, a second thread extracts the next ones meanwhile."""
+        """Frames with their features; for recordings, a second thread extracts the next ones."""
         ahead = not self.source.live
 
         def pairs() -> Generator[tuple[Frame, Any]]:
@@ -263,13 +263,13 @@ class _Run:
         return read_ahead(pairs()) if ahead else pairs()
 
     def _count_missed(self, frame: Frame) -> None:
-        """A live source gives the newest picture: those that came in between are gaps in its index."""
+        """A live source provides the newest image; skipped ones are gaps in its index."""
         if self.source.live and self.last_index is not None:
             self.dropped.value += max(0, frame.index - self.last_index - 1)
         self.last_index = frame.index
 
     def _next(self, frames: Iterator[tuple[Frame, Any]]) -> tuple[Frame, Any] | None:
-        """The next frame with its features; None at the end or when the user stops, even while the source waits."""
+        """The next frame with its features; None at the end or when the user stops, even if the source is waiting."""
         if self.interrupt.requested:
             return None
         self.interrupt.at_once = True
@@ -285,10 +285,10 @@ class _Run:
         try:
             self.slam.finish()
         except KeyboardInterrupt:
-            logger.warning("stopped before the last refinement was through")
+            logger.warning("stopped before the last refinement finished")
         self.interrupt.writing = True
         finish_s = time.perf_counter() - started
-        self.slam.close()  # what follows is of one moment, even if the refinement was stopped
+        self.slam.close()  # a consistent snapshot follows, even if the refinement was stopped
         stamps, poses = self.slam.trajectory()
         edge_map, anchors, scale = self.slam.edge_map(), self.slam.anchors(), self.slam.scale
         for listener in self.listeners:
@@ -333,11 +333,11 @@ class _Run:
             return f"{self.source.name}: interrupted before the first frame; nothing was written"
         first = self.source.problems[0] if self.source.problems else None
         why = f" ({first.file}: {first.reason})" if first is not None else ""
-        return f"{self.source.name}: gave not a single frame{why}"
+        return f"{self.source.name}: provided no frame{why}"
 
 
 class _TelemetryCursor:
-    """Telemetry that arrived since the last frame; the list may grow while it is read."""
+    """Telemetry that arrived since the last frame; the list may grow concurrently."""
 
     def __init__(self, samples: list[TelemetrySample]) -> None:
         self._samples = samples
@@ -351,15 +351,15 @@ class _TelemetryCursor:
 
 
 class _Interrupt:
-    """Ctrl-C, a closed terminal or ``kill`` as a wish to stop: the run ends and everything is written.
+    """Ctrl-C, a closed terminal or ``kill`` request a stop: the run ends and writes its results.
 
-    A second Ctrl-C tears the main thread out of what it does, the last refinement for example, unless it writes.
+    A second Ctrl-C interrupts the main thread at once, for example during the last refinement, except while writing.
     """
 
     def __init__(self) -> None:
         self.requested = False
         self.at_once = False
-        """Whether the main thread may be torn out of what it does: it only waits."""
+        """Whether the main thread may be interrupted at once because it only waits."""
         self.writing = False
         self._old: dict[int, Any] = {}
 
@@ -376,7 +376,7 @@ class _Interrupt:
             signal.signal(number, handler)
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
-        again = self.requested and number == signal.SIGINT  # a closed terminal may send its signal twice
+        again = self.requested and number == signal.SIGINT  # a closing terminal may send its signal twice
         self.requested = True
         if self.at_once or (again and not self.writing):
             raise KeyboardInterrupt
@@ -391,10 +391,10 @@ def _edge_slam(camera: Camera, config: SlamConfig, realtime: bool) -> Slam:
 
 
 def _load_slam() -> None:
-    """Import the system, torch with it, and keep the garbage collector from what that makes.
+    """Import the system including torch, and freeze the garbage collector afterwards.
 
-    Torch's half a million objects stay till the process ends; walking them while they load, again and again during the
-    run and once more at the end takes 0.6 s of CPU.
+    torch creates half a million permanent objects; collecting while they load, during the run and at exit costs 0.6 s
+    of CPU.
     """
     was_on = gc.isenabled()
     gc.disable()

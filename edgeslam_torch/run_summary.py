@@ -20,18 +20,18 @@ MAX_PROBLEMS = 100
 
 @dataclass(slots=True)
 class Tally:
-    """Counts over a run, enough for the summary and no more than a few numbers a frame."""
+    """Counts over a run, a few numbers per frame."""
 
     frames: int = 0
     supported: int = 0
-    """Frames whose pose, as it came out live, rested on a map that the images support."""
+    """Frames whose live pose was supported by the map."""
     lost_events: int = 0
     first_pose_frame: int | None = None
     statuses: dict[str, int] = field(default_factory=dict)
     stage_ms: dict[str, list[float]] = field(default_factory=dict)
     step_ms: list[float] = field(default_factory=list)
     last_reason: str = ""
-    """Why the last frame that was not simply tracked has the status it has."""
+    """Reason of the last frame that was not ordinarily tracked."""
     _was_lost: bool = False
 
     def add(self, output: SlamOutput, step_ms: float) -> None:
@@ -61,17 +61,17 @@ def summarise(
     finish_s: float,
     cpu_s: float,
 ) -> dict[str, Any]:
-    """The part of the summary that every run has; the caller adds what only it knows.
+    """The common part of the summary; the caller adds the rest.
 
     Args:
         source: What was run on.
         tally: Of at least one frame.
-        pieces: What the frames belong to in the end.
+        pieces: Final pieces.
         scale: At the end.
-        dropped: Frames that came too late in real time.
+        dropped: Frames dropped in real time.
         loop_s: Time from the first frame to the last.
-        finish_s: Time of the last refinement, once no frame follows.
-        cpu_s: User and system time of the whole process, all threads, over both.
+        finish_s: Time of the last refinement.
+        cpu_s: User and system time of the whole process, all threads, over both intervals.
     """
     left_out = sum(problem.frames for problem in source.problems)
     offered = tally.frames + dropped + left_out
@@ -107,8 +107,8 @@ def summarise(
 
 
 def without_folders(summary: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """The summary as it goes to other people: files of the recording by their names in it, and where the recording
-    lies as seen from the run's ``folder``; both stay right when the two are moved together.
+    """The summary without absolute paths: files by their names within the recording, and the recording relative to
+    the run's ``folder``; both stay valid when the two are moved together.
     """
     source = summary["source"]
     if source["kind"] == "live":
@@ -137,7 +137,7 @@ def _camera(camera: Camera) -> dict[str, Any]:
 
 
 def peak_rss_mb() -> float | None:
-    """Largest memory of this process so far [MB]; None where the system does not tell."""
+    """Largest memory of this process so far [MB]; None where unavailable."""
     try:
         import resource
     except ImportError:  # Windows

@@ -1,7 +1,7 @@
 """EdgeSlam: one camera and a drone's telemetry in, a metric pose for every frame and an edge map out.
 
-Read `types.py` first, then `states/machine.py`. `EdgeSlam` puts the parts together, hands every frame to the present
-state, and answers for the results.
+Read `types.py` first, then `states/machine.py`. `EdgeSlam` assembles the parts, passes every frame to the current
+state, and returns the results.
 """
 
 from collections.abc import Sequence
@@ -58,10 +58,10 @@ class EdgeSlam:
     Args:
         camera: Intrinsics of the raw images.
         config: Settings.
-        depth: Depth function in place of the one that the settings name.
-        realtime: Map keyframes on a worker thread while the next frames are tracked; a keyframe that would have to
-            wait is skipped and counted. Results then depend on timing.
-        executor: With one thread, in place of the one that ``realtime`` makes.
+        depth: Depth function instead of the configured one.
+        realtime: Map keyframes on a worker thread while tracking continues; a keyframe that would have to wait is
+            skipped and counted. Results then depend on timing.
+        executor: Single-thread executor instead of the one that ``realtime`` creates.
 
     Example:
         >>> slam = EdgeSlam(source.camera)                                   # doctest: +SKIP
@@ -79,7 +79,7 @@ class EdgeSlam:
         realtime: bool = False,
         executor: Executor | None = None,
     ) -> None:
-        # One thread each: spinning pools slow each other down more than they help (docs/decisions/0025).
+        # One thread each: spinning thread pools slow each other down (docs/decisions/0025).
         cv2.setNumThreads(1)
         torch.set_num_threads(1)
         self.camera = camera
@@ -120,18 +120,18 @@ class EdgeSlam:
 
     @property
     def state(self) -> State:
-        """What carries the pose of the newest frame."""
+        """Current state: what the newest pose is based on."""
         return self._machine.state
 
     @property
     def events(self) -> dict[str, int]:
-        """Counts of what went wrong and was mended."""
+        """Counts of losses, relocalisations, restarts and refused initialisations."""
         return self._system.events
 
     # -- one frame ---------------------------------------------------------------------------------------------
 
     def prepare(self, frame: Frame) -> LazyView:
-        """What can be done with a frame before the frames before it are through, on any one thread.
+        """Feature extraction that does not depend on earlier frames; may run on another thread.
 
         Raises:
             SourceError: If the image is not of the camera's size.
@@ -151,8 +151,8 @@ class EdgeSlam:
 
         Args:
             frame: Image with the lens distortion still in it, of the camera's size.
-            telemetry: State messages that arrived since the last frame.
-            prepared: What `prepare` made of the frame, if it was called; it is called here otherwise.
+            telemetry: State messages received since the last frame.
+            prepared: Result of `prepare`, if it was called.
 
         Raises:
             SourceError: If the image is not of the camera's size, or the stamp does not increase.
@@ -178,7 +178,7 @@ class EdgeSlam:
         return self._output(frame, step)
 
     def _step(self, frame: Frame, seen: LazyView) -> Step:
-        """What the present state makes of a frame."""
+        """Process a frame in the current state."""
         if not self.map.keyframes:
             return self._starting.begin(frame, seen.view, FIRST_FRAME)
         if self.state is State.STARTING:
@@ -190,7 +190,7 @@ class EdgeSlam:
     # -- results -----------------------------------------------------------------------------------------------
 
     def finish(self) -> None:
-        """Refine the whole map, measure the last edges and fix the published scale, once no frame follows."""
+        """Refine the whole map, measure the remaining edges and fix the published scale after the last frame."""
         self._system.collect(wait=True)
         result = last_refinement(self.map, self.camera, self.edges, self.config.window)
         self._losses = {} if result is None else result.losses
@@ -201,7 +201,7 @@ class EdgeSlam:
         self._calibration_warning = calibration_warning(self.camera, self.keyframes())
 
     def trajectory(self) -> tuple[FloatArray, FloatArray]:
-        """Stamps ``(F,)`` and refined ``T_w_c`` ``(F, 4, 4)`` of every frame stepped so far."""
+        """Stamps ``(F,)`` and refined ``T_w_c`` ``(F, 4, 4)`` of all frames so far."""
         stamps, T_w_c = self.log.poses()
         return stamps, self._system.published.pose(T_w_c)
 
@@ -210,17 +210,17 @@ class EdgeSlam:
         self._system.mapping.close()
 
     def edge_map(self) -> PointCloud:
-        """Semi-dense edge points that several keyframes agree on, of one moment."""
+        """Semi-dense edge points confirmed by several keyframes, as a consistent snapshot."""
         return self._system.published.cloud(self.edges.points())
 
     def anchors(self) -> PointCloud:
-        """Triangulated anchors, of one moment."""
+        """Triangulated anchors, as a consistent snapshot."""
         with self.map.lock:
             cloud = self.map.anchors.cloud()
         return self._system.published.cloud(cloud)
 
     def keyframes(self) -> list[Keyframe]:
-        """Keyframes of the map, oldest first, in the map's own units."""
+        """Keyframes of the map, oldest first, in map units."""
         with self.map.lock:
             return [self.map.keyframes[id] for id in sorted(self.map.keyframes)]
 
@@ -230,15 +230,15 @@ class EdgeSlam:
         return self._system.fusion.scale()
 
     def support(self) -> Support:
-        """What the pose of every frame stepped so far rests on by now."""
+        """What supports the pose of each frame so far."""
         return self.log.support()
 
     def pieces(self) -> list[Piece]:
-        """Pieces of map that the frames belong to; where one lies relative to another is not known."""
+        """Pieces of map that the frames belong to; the transforms between them are unknown."""
         return self.log.pieces()
 
     def telemetry_statistics(self) -> dict[str, float]:
-        """What the drone's telemetry told: counts, delay, tilt, each source's scale; empty without telemetry."""
+        """Telemetry statistics: counts, delay, tilt, scale by source; empty without telemetry."""
         return self._system.fusion.statistics() if self._system.has_telemetry else {}
 
     def losses(self) -> dict[str, float]:
@@ -246,7 +246,7 @@ class EdgeSlam:
         return dict(self._losses)
 
     def warnings(self) -> list[str]:
-        """What limits how far the results can be believed, in sentences for the run's summary."""
+        """Limits of the results, in sentences for the run's summary."""
         depth = None if self.depth is None else self.depth.warning()
         warnings = (depth, self._warning_of_pieces(), self._repeats.warning(), self._calibration_warning)
         return [warning for warning in warnings if warning is not None] + self._system.fusion.warnings()
@@ -282,7 +282,7 @@ class EdgeSlam:
         )
 
     def _is_metric(self) -> bool:
-        """Whether the published units are metres to within what the estimate says."""
+        """Whether the published unit is a metre within the uncertainty of the estimate."""
         estimate = self.scale
         return bool(np.isfinite(estimate.sigma)) and not self._system.published.contradicts(estimate)
 

@@ -21,7 +21,7 @@ class Frame:
     """One camera image."""
 
     index: int
-    """Position in the source, from 0; a gap means a dropped or unreadable image."""
+    """Position in the source, from 0; a gap is a dropped or unreadable image."""
     stamp_s: float
     """Time of exposure [s]."""
     image: NDArray[np.uint8]
@@ -29,15 +29,15 @@ class Frame:
     path: Path | None = None
     """File it came from, for messages."""
     grey: NDArray[np.uint8] | None = None
-    """``(H, W)``, where the reader has it without the detour through ``image``; None to make it of that."""
+    """``(H, W)`` if the reader decodes it directly; None to derive it from ``image``."""
 
 
 @dataclass(frozen=True, slots=True)
 class TelemetrySample:
     """One state message of the drone in SI units; a missing field is NaN.
 
-    Velocity is in the frame that was fixed at power-on, turned to our world axes (x forward at power-on, y left,
-    z up); `drone/tello.py` makes this from the SDK's north-east-down decimetres.
+    Velocity is in the frame fixed at power-on, rotated to our world axes (x forward at power-on, y left, z up);
+    `drone/tello.py` converts the SDK's north-east-down decimetres.
     """
 
     stamp_s: float
@@ -95,7 +95,7 @@ class DepthMap:
 
 
 class MotionKind(StrEnum):
-    """What two views say about the motion between them."""
+    """Kind of motion between two views."""
 
     GENERAL = "general"
     PURE_ROTATION = "pure rotation"
@@ -111,9 +111,10 @@ class RelativePose:
 
     kind: MotionKind
     T_j_i: FloatArray
-    """``(4, 4)``, takes coordinates of view i to view j; translation has unit length unless the kind says none."""
+    """``(4, 4)``, takes coordinates of view i to view j; translation of unit length, unless ``kind`` says that there
+    is none."""
     inliers: NDArray[np.bool_]
-    """``(M,)`` matches that agree."""
+    """``(M,)`` inlier matches."""
     parallax_rad: float
     """Median ray angle of the inliers, rotation removed."""
 
@@ -133,7 +134,7 @@ class ScaleEstimate:
     sigma: float = np.inf
     """Standard deviation of ``value``; infinite while unknown."""
     source: str = "none"
-    """What it rests on: ``none``, ``depth``, ``telemetry``, ``height``, or several joined by ``+``."""
+    """Sources: ``none``, ``depth``, ``telemetry``, ``height``, or several, joined by ``+``."""
 
     @property
     def units(self) -> Units:
@@ -145,9 +146,10 @@ class FrameStatus(StrEnum):
     """How a frame got its pose."""
 
     STARTING = "starting"
-    """Begins a piece of map or follows its guessed depths: nothing was triangulated yet that could contradict it."""
+    """Begins a piece of map, or is tracked on its guessed depths: nothing is triangulated yet that could contradict
+    them."""
     INITIALISED = "initialised"
-    """The frame whose parallax made the map."""
+    """The frame with enough parallax to create the map."""
     TRACKED = "tracked"
     RELOCALISED = "relocalised"
     PREDICTED = "predicted"
@@ -155,63 +157,62 @@ class FrameStatus(StrEnum):
 
     @property
     def supported(self) -> bool:
-        """Whether the pose rests on a map that the images support."""
+        """Whether the pose is tracked on a map that agrees with the images."""
         return self in (FrameStatus.INITIALISED, FrameStatus.TRACKED, FrameStatus.RELOCALISED)
 
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """Frames whose poses hang together; where one piece lies relative to another is not known."""
+    """Frames tracked on one connected map; the transform between pieces is unknown."""
 
     number: int
-    """From 0 in the order in which the pieces were begun."""
+    """From 0, in the order of creation."""
     frames: int
     supported: int
-    """Frames of these whose pose rests, in the end, on a map that the images support."""
+    """Frames whose final pose is supported by the map."""
     first_s: float
     last_s: float
     """Stamps of its first and its last frame."""
     begun: str
-    """What its first pose and its scale rest on, in words."""
+    """Where its first pose and scale come from, in words."""
 
 
 @dataclass(frozen=True, slots=True)
 class Support:
-    """What each frame's final pose rests on."""
+    """What supports each frame's final pose."""
 
     piece: IntArray
-    """``(F,)`` number of the piece that it belongs to."""
+    """``(F,)`` piece that the frame belongs to."""
     supported: NDArray[np.bool_]
-    """``(F,)`` whether it rests on a map that the images support."""
+    """``(F,)`` whether the map supports its pose."""
 
 
 @dataclass(frozen=True, slots=True)
 class SlamOutput:
-    """What `EdgeSlam.step` knows about one frame when it returns."""
+    """Result of `EdgeSlam.step` for one frame."""
 
     index: int
     stamp_s: float
     T_w_c: FloatArray
-    """``(4, 4)`` camera to world; always finite, see ``status`` for what it is worth."""
+    """``(4, 4)`` camera to world; always finite; ``status`` says how reliable it is."""
     status: FrameStatus
     reason: str
-    """Why the status is what it is, in words; empty when tracked well."""
+    """Reason for the status, in words; empty for ordinary tracking."""
     matches: int
     inliers: int
     parallax_rad: float
     """Median ray angle between this frame and its reference keyframe."""
     keyframe: bool
     piece: int
-    """Number of the piece of map that the pose belongs to; poses of different pieces do not relate."""
+    """Piece of map that the pose belongs to; poses of different pieces are unrelated."""
     scale: ScaleEstimate
-    """Metres per unit of the map, as estimated now; poses are published in units that change by revisions alone."""
+    """Metres per map unit, current estimate; published units change only by revisions."""
     metric: bool
-    """Whether the unit of ``T_w_c`` is a metre to within the scale's uncertainty."""
+    """Whether the unit of ``T_w_c`` is a metre within the uncertainty of the scale."""
     revision: int
-    """How often the unit of ``T_w_c`` was changed so far: where it differs from the frame's before, earlier poses and
-    points must be read anew."""
+    """Changes of the unit of ``T_w_c`` so far; after a change, read earlier poses and points again."""
     stage_ms: dict[str, float]
-    """Milliseconds of each stage in this step."""
+    """Time of each stage in this step [ms]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -225,4 +226,4 @@ class PointCloud:
     sigma_m: FloatArray
     """``(P,)`` standard deviation along the viewing ray, float32."""
     observations: IntArray
-    """``(P,)`` frames that agree on the point, int32."""
+    """``(P,)`` keyframes that observed the point, int32."""

@@ -140,7 +140,7 @@ def test_no_frame_at_all_is_an_error_that_says_why(tmp_path, write_tum):
     folder = write_tum(tmp_path / "seq", 1)
     source = open_source(folder)
     next((folder / "rgb").iterdir()).write_bytes(b"")
-    with pytest.raises(SourceError, match="not a single frame.*empty file"):
+    with pytest.raises(SourceError, match="provided no frame.*empty file"):
         run(source, tmp_path / "out", make_slam=fake(FakeSlam()))
 
 
@@ -220,7 +220,7 @@ def test_a_run_that_comes_to_nothing_leaves_the_older_run(tmp_path, write_tum, e
         return FakeSlam()
 
     source.frames = nothing
-    message = {"no frame": "not a single frame", "interrupt": "nothing was written", "no weights": "no such weights"}
+    message = {"no frame": "provided no frame", "interrupt": "nothing was written", "no weights": "no such weights"}
     with pytest.raises(EdgeSlamError, match=message[end]):
         run(source, tmp_path / "out", make_slam=make)
     assert {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir()} == before

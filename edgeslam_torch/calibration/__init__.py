@@ -1,1 +1,1 @@
-"""Calibrate a camera (`board`), and choose the calibration that a source gets (`camera_choice`)."""
+"""Camera calibration (`board`) and the choice of a calibration for a source (`camera_choice`)."""

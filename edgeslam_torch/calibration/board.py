@@ -12,10 +12,10 @@ from edgeslam_torch.geometry.lens import check_camera, unique_share
 from edgeslam_torch.types import FloatArray
 
 _COMMON = ((9, 6), (8, 6), (10, 7), (9, 7), (11, 8), (8, 5), (7, 6), (7, 5), (6, 5), (6, 4), (5, 4))
-"""Inner corners of boards that people print, tried when the size is not given."""
+"""Inner corners of common boards, tried when the size is not given."""
 _MIN_PICTURES = 4
 _GRID = (8, 6)
-"""Cells of the picture in which corners count as coverage."""
+"""Grid of cells for measuring coverage."""
 _MIN_CHARUCO = 8
 
 
@@ -24,7 +24,7 @@ class Board:
     """A printed pattern."""
 
     columns: int = 0
-    """Chessboard: inner corners across; ChArUco: squares across. 0 finds a chessboard's size by trying."""
+    """Chessboard: inner corners across; ChArUco: squares across. 0 detects a chessboard's size."""
     rows: int = 0
     square_m: float = 0.025
     """Side of a square; intrinsics do not depend on it."""
@@ -44,7 +44,7 @@ class Board:
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """The board as one picture shows it."""
+    """Detected corners of one picture."""
 
     name: str
     uv: FloatArray
@@ -55,27 +55,27 @@ class View:
 
 @dataclass(frozen=True, slots=True)
 class CalibrationResult:
-    """What came out, and what it rests on."""
+    """Result of a calibration with its quality."""
 
     camera: Camera
     rms_px: float
-    """Root of the mean squared distance between seen and predicted corners."""
+    """RMS distance between detected and predicted corners."""
     sigma: dict[str, float]
     """Standard deviations of fx fy cx cy [px]."""
     used: dict[str, float]
-    """Picture to its own RMS [px]."""
+    """RMS of each picture [px]."""
     rejected: dict[str, str]
-    """Picture to why it was left out."""
+    """Reason for each rejected picture."""
     coverage: float
-    """Share of the picture's cells (8 x 6) that hold a corner."""
+    """Share of the cells (8 x 6) that contain a corner."""
     tilt_deg: float
-    """Largest angle between the board and the picture plane; below 20 the focal length is badly known."""
+    """Maximum angle between board and image plane; below 20 the focal length is poorly constrained."""
     board: Board
     warnings: list[str] = field(default_factory=list)
 
 
 def board_size(pictures: Sequence[np.ndarray]) -> tuple[int, int] | None:
-    """Inner corners of the chessboard in most of the grey pictures; None when no common size is seen."""
+    """Inner corners of the chessboard found in most of the grey pictures; None without a common size."""
     for size in _COMMON:
         if any(_chessboard(_shrunk(picture), size, exact=False) is not None for picture in pictures):
             return size
@@ -83,7 +83,8 @@ def board_size(pictures: Sequence[np.ndarray]) -> tuple[int, int] | None:
 
 
 def find_board(name: str, grey: np.ndarray, board: Board) -> View | None:
-    """Corners of the board in one grey picture ``(H, W)``, to a tenth of a pixel; None when it is not all there."""
+    """Corners of the board in one grey picture ``(H, W)``, to a tenth of a pixel; None if it is not completely
+    visible."""
     if board.charuco:
         return _find_charuco(name, grey, board)
     uv = _chessboard(grey, (board.columns, board.rows), exact=True)
@@ -113,8 +114,8 @@ def _chessboard(grey: np.ndarray, size: tuple[int, int], exact: bool) -> FloatAr
         return corners.reshape(-1, 2)
     uv = corners.reshape(size[1], size[0], 2)
     spacing = min(_least_distance(uv, 0), _least_distance(uv, 1))
-    # As wide as can be without reaching the next corner: on 26 pictures of a real Tello half the spacing gives
-    # 0.32 px, a fifth of it 0.70 px.
+    # As wide as possible without reaching the next corner: on 26 pictures of a real Tello, half the spacing gives
+    # 0.32 px RMS, a fifth of it 0.70 px.
     half = int(np.clip(0.5 * spacing, 2, 30))
     criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-3)
     refined = cv2.cornerSubPix(grey, corners, (half, half), (-1, -1), criteria)
@@ -140,12 +141,12 @@ def calibrate(
 ) -> CalibrationResult:
     """Intrinsics and distortion from pictures.
 
-    Pictures without the board, of another size, that repeat another view, or whose corners do not fit the rest are
-    left out, by name and with the reason.
+    Pictures without the board, of another size, that repeat another view, or whose corners are outliers are rejected
+    with a reason.
 
     Args:
         pictures: Name and grey picture ``(H, W)``, all of one camera.
-        board: What was photographed.
+        board: Pattern in the pictures.
         source: For the calibration file.
 
     Raises:
@@ -195,7 +196,7 @@ def _solve(
         p = [np.ascontiguousarray(v.p_board, dtype=np.float32) for v in views]
         uv = [np.ascontiguousarray(v.uv, dtype=np.float32).reshape(-1, 1, 2) for v in views]
         try:
-            # k3 is left at zero: a board seldom reaches the corners of the picture, where alone it shows.
+            # k3 stays zero: it matters only in the image corners, which a board seldom reaches.
             rms, K, distortion, turns, _, sigma, _, per_view = cv2.calibrateCameraExtended(
                 p, uv, size, np.eye(3), np.zeros(5), flags=cv2.CALIB_FIX_K3
             )
@@ -204,7 +205,7 @@ def _solve(
                 f"these pictures do not determine a camera: {' '.join(str(error).split())}"
             ) from error
         errors = np.asarray(per_view).ravel()
-        limit = max(2.5 * float(np.median(errors)), 0.3)  # a view that moved: the drone's shutter rolls
+        limit = max(2.5 * float(np.median(errors)), 0.3)  # motion blur and the drone's rolling shutter
         worst = int(np.argmax(errors))
         if errors[worst] <= limit or len(views) <= _MIN_PICTURES:
             break

@@ -1,4 +1,4 @@
-"""Which calibration a source gets, and what it costs when there is none."""
+"""Choice of the calibration for a source, with warnings when there is none."""
 
 import math
 from collections.abc import Sequence
@@ -17,10 +17,10 @@ _TELLO_FOCAL_SIGMA = 0.01
 """Five measured drones lie within 1 % of their median."""
 
 GUESS = "guess"
-"""How the ``source`` of a guessed camera begins."""
+"""Prefix of the ``source`` of a guessed camera."""
 GUESS_WARNING = "no calibration found: guessing"
 GUESS_COST = (
-    "a focal length that is off by 10 % bends the trajectory and changes its scale by about as much; "
+    "a focal length error of 10 % bends the trajectory and changes its scale by about as much; "
     "give --camera FILE (make one with: edgeslam calibrate)"
 )
 
@@ -32,10 +32,10 @@ def choose_camera(
     default: Camera | None = None,
     is_drone: bool = False,
 ) -> tuple[Camera, list[str]]:
-    """Calibration for images of one size; the paper's ``E = K^T F K`` needs K, so it cannot give it.
+    """Calibration for images of one size; the paper's ``E = K^T F K`` needs K and cannot provide it.
 
-    What was given, else a calibration file in the source, else the data set's own default, else the Tello's
-    when it looks like one, else a guess. A focal length from F may replace a guess later.
+    In this order: the given one, a calibration file in the source, the data set's default, the Tello's if the source
+    looks like one, a guess. A focal length from F may replace a guess later.
 
     Args:
         size: ``(width, height)`` of the images [px].
@@ -45,8 +45,7 @@ def choose_camera(
         is_drone: Whether there is telemetry.
 
     Returns:
-        The camera, whose ``source`` says where it is from and ``focal_sigma`` how well it is known, and warnings in
-        words.
+        The camera, with its origin in ``source`` and its uncertainty in ``focal_sigma``, and warnings in words.
 
     Raises:
         CalibrationError: If the calibration is malformed or made for images of another shape.
@@ -84,7 +83,7 @@ def fitted(camera: Camera, size: tuple[int, int], name: str) -> tuple[Camera, li
     """The calibration for images of ``size``, scaled when only the resolution differs.
 
     Raises:
-        CalibrationError: If the aspect ratio differs: nobody can say what was cropped.
+        CalibrationError: If the aspect ratio differs: the crop is unknown.
     """
     if (camera.width, camera.height) == size:
         return camera, []

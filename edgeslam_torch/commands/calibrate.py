@@ -32,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Calibrate, write the file, and say how good it is."""
+    """Calibrate, write the file, and print its quality."""
     from edgeslam_torch.calibration.board import Board, calibrate
     from edgeslam_torch.errors import CalibrationError, ConfigError, OutputError
 
@@ -109,7 +109,7 @@ def _pictures(names: list[str], unreadable: dict[str, str]) -> "Iterator[tuple[s
 
 
 def _live_pictures(spec: str, board: "Board", views: int) -> "Iterator[tuple[str, np.ndarray]]":
-    """Pictures in which the board is seen, a second apart; the person holding it is told what is missing."""
+    """Pictures with a visible board, a second apart; prints what the user should change."""
     import cv2
 
     from edgeslam_torch.calibration.board import board_size, find_board

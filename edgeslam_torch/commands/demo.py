@@ -1,4 +1,4 @@
-"""Fly a simulated drone through a simulated house, run everything on it, and compare with the truth."""
+"""Fly a simulated drone through a simulated house, run the pipeline, and compare with the truth."""
 
 import argparse
 import sys
@@ -32,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--battery", type=float, default=87.0, metavar="PERCENT", help="charge at take-off (default: 87)"
     )
     parser.add_argument("--no-telemetry", action="store_true", help="fly without telemetry: no metres from the drone")
-    parser.add_argument("--depth", metavar="FILE|none", help="weights of the depth network, or none to go without")
+    parser.add_argument("--depth", metavar="FILE|none", help="weights of the depth network, or none")
     parser.add_argument("--config", type=Path, metavar="FILE.toml", help="settings of the pipeline")
     parser.add_argument(
         "--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="change one setting; may be repeated"
@@ -41,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Run the demo and print how it came out."""
+    """Run the demo and print the results."""
     from edgeslam_torch.commands.run import resolved_config, write_page
     from edgeslam_torch.demo import record, run_and_judge
     from edgeslam_torch.progress import make_progress
@@ -62,7 +62,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 def report(demo: "DemoResult") -> str:
-    """What a user wants to know, in a few lines."""
+    """The results in a few lines."""
     score, summary = demo.score, demo.run.summary
     metres = score.units == "metres"
     scale = "unknown (arbitrary units)" if not metres else f"{100 * score.scale_error:+.1f} % off"
@@ -102,7 +102,7 @@ def _settings(args: argparse.Namespace) -> "DemoSettings":
 
 
 class _Rendered:
-    """Says now and then how many images are rendered."""
+    """Reports the progress of rendering."""
 
     def __init__(self, total: int) -> None:
         self._total = total

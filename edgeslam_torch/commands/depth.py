@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 FILES = """\
 files written for every image STEM.jpg, pixel for pixel, lens distortion removed:
-  STEM.npy         depth along the optical axis in metres, float32; NaN where the network says nothing
+  STEM.npy         depth along the optical axis in metres, float32; NaN where unknown
   STEM.png         the same in millimetres, 16 bit; 0 where nothing is known, 65535 for 65.5 m and beyond
   STEM_colour.png  to look at: near is red, far is blue, unknown is black; the bar below tells the metres
   STEM_sigma.npy   with --sigma: standard deviation of the logarithm of depth, float32; 0.1 is about 10 %
@@ -99,7 +99,7 @@ def write_depth(folder: Path, stem: str, depth: "DepthMap", with_sigma: bool = F
 
 
 def _believable(depth: "DepthMap") -> "tuple[DepthMap, float]":
-    """The map with NaN where it cannot be meant, and the share of the pixels that can."""
+    """The map with NaN at implausible pixels, and the share of plausible ones."""
     from edgeslam_torch.frontend.depth_check import usable
     from edgeslam_torch.types import DepthMap
 
@@ -108,7 +108,7 @@ def _believable(depth: "DepthMap") -> "tuple[DepthMap, float]":
 
 
 def _spare_the_source(out: Path, image: Path | None) -> None:
-    """Refuse to write depth maps among the images: ``STEM.png`` would take their place.
+    """Refuse to write depth maps beside the images: ``STEM.png`` would overwrite them.
 
     Raises:
         OutputError: If the folder is the image's own.
@@ -118,7 +118,7 @@ def _spare_the_source(out: Path, image: Path | None) -> None:
 
 
 def _stem(frame: "Frame", taken: set[str]) -> str:
-    """What the files of an image are called; with its suffix when another image has the same name without."""
+    """Stem of an image's output files; includes the suffix if another image has the same stem."""
     if frame.path is None:
         return f"frame_{frame.index:06d}"
     stem = frame.path.stem if frame.path.stem not in taken else frame.path.name
@@ -135,7 +135,7 @@ def _positive(text: str) -> int:
 def _frames(
     source: str, camera: str | None, max_frames: int | None
 ) -> "tuple[Camera, Iterable[Frame], int | None, list[str], list[Problem]]":
-    """Camera, images, how many, what to say before, and the list that what is left out goes into."""
+    """Camera, images, their number, warnings, and the list that unreadable images are added to."""
     from edgeslam_torch.calibration.camera_choice import choose_camera
     from edgeslam_torch.readers.images import SUFFIXES, read_image
     from edgeslam_torch.readers.source import open_source

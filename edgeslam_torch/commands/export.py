@@ -1,4 +1,4 @@
-"""Depth network to ONNX for other computers, checked and measured."""
+"""Export the depth network to ONNX, verified and timed."""
 
 import argparse
 import time
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 HELP = "export the depth network to ONNX (float32, float16 or int8)"
 
 PARITY_RTOL = 1e-4
-"""Largest relative difference of depth between torch and onnxruntime in float32."""
+"""Maximum relative difference of depth between torch and onnxruntime in float32."""
 CALIBRATION_IMAGES = 96
 CHECK_IMAGES = 16
 TIMED_RUNS = 40
@@ -142,7 +142,7 @@ def _table(models: "dict[str, _Model]", images: "list[FloatArray]") -> str:
         "|---|---|---|---|---|",
     ]
     reference = [models["float32"].log_depth(image) for image in images]
-    # Taken in turns, so that a busy machine is equally unfair to all.
+    # Interleaved, so that other load affects all models equally.
     times = [[model.milliseconds(images[0]) for model in models.values()] for _ in range(TIMED_RUNS + 3)][3:]
     for (name, model), ms in zip(models.items(), np.median(times, axis=0), strict=True):
         pairs = zip(images, reference, strict=True)
@@ -162,13 +162,13 @@ class _Model:
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads, options.inter_op_num_threads = 1, 1
         self.megabytes = path.stat().st_size / 1e6
-        options.log_severity_level = 4  # what goes wrong is raised, too
+        options.log_severity_level = 4  # errors are raised anyway
         try:
             self._session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-        except Exception as error:  # onnxruntime's have no base of their own
+        except Exception as error:  # onnxruntime's errors have no common base class
             reason = " ".join(str(error).split())[-160:]
             raise OutputError(
-                f"onnxruntime {onnxruntime.__version__} cannot load what was exported ({reason})"
+                f"onnxruntime {onnxruntime.__version__} cannot load the exported file ({reason})"
             ) from None
 
     def log_depth(self, image: "FloatArray") -> "FloatArray":
@@ -176,7 +176,7 @@ class _Model:
         return np.asarray(self._session.run(["log_depth"], {"image": image})[0])
 
     def milliseconds(self, image: "FloatArray") -> float:
-        """Processor time of one run; the calling thread does all the work."""
+        """CPU time of one run; the calling thread does all the work."""
         start = time.thread_time()
         self._session.run(None, {"image": image})
         return 1e3 * (time.thread_time() - start)

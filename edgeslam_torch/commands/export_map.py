@@ -18,15 +18,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("run", type=Path, metavar="DIR", help="output folder of 'edgeslam run'")
     parser.add_argument("--format", choices=FORMATS, required=True)
     parser.add_argument("--out", type=Path, help="file (ply, pcd), folder (colmap) or file stem (occupancy)")
-    parser.add_argument("--max-sigma", type=float, metavar="M", help="leave out points less sure than this [m]")
-    parser.add_argument("--min-observations", type=int, default=1, metavar="N", help="leave out points seen less often")
+    parser.add_argument("--max-sigma", type=float, metavar="M", help="omit points with a larger sigma than this [m]")
+    parser.add_argument(
+        "--min-observations", type=int, default=1, metavar="N", help="omit points with fewer observations"
+    )
     parser.add_argument("--resolution", type=float, default=0.05, metavar="M", help="side of an occupancy cell [m]")
     parser.add_argument("--min-z", type=float, metavar="M", help="lowest obstacle (default: 0.5 m below the camera)")
     parser.add_argument("--max-z", type=float, metavar="M", help="highest obstacle (default: 0.5 m above the camera)")
 
 
 def main(args: argparse.Namespace) -> int:
-    """Write the map and say where it is."""
+    """Write the map and print its path."""
     from edgeslam_torch.eval.inputs.run_folder import open_run
 
     run = open_run(args.run)
@@ -39,7 +41,7 @@ def main(args: argparse.Namespace) -> int:
     if run.units == "arbitrary":
         print("the run's units are arbitrary (no metric scale): lengths in this file are not metres")
     elif run.units == "unknown":
-        print("nothing in the folder tells whether the run is in metres: lengths are as the run has them")
+        print("the folder does not say whether the run is metric: lengths are in its own units")
     return 0
 
 
@@ -89,7 +91,7 @@ def _colmap(run: "RunFolder", cloud: "PointCloud", args: argparse.Namespace) -> 
 
 
 def _images(run: "RunFolder") -> tuple[list[str], list[int]]:
-    """Keyframes' image names and their poses; a source without image files gets names made of the stamps."""
+    """Keyframes' image names and poses; without image files the names are made from stamps."""
     from edgeslam_torch.eval.report.keyframe_pictures import image_paths
 
     index = run.keyframe_poses()

@@ -1,4 +1,4 @@
-"""``edgeslam finetune``: adapt the depth network to one's own camera and rooms."""
+"""``edgeslam finetune``: adapt the depth network to your camera and rooms."""
 
 import argparse
 import logging
@@ -27,7 +27,7 @@ HELP = "adapt the depth network to recordings: labelled, unlabelled or output fo
 
 EXIT_INTERRUPTED = 130
 MAX_THREADS = 256
-"""With tens of thousands OpenMP ends in a segmentation fault."""
+"""Tens of thousands crash OpenMP."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -43,12 +43,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     again.add_argument(
         "--resume",
         action="store_true",
-        help="go on in --out, also at another --lr; an error when there is nothing (without this: go on when data, "
-        "weights and settings are the same, with more --steps too)",
+        help="resume in --out, also at another --lr; an error if there is nothing to resume (without this option: resume "
+        "if data, weights and settings are the same; more --steps are allowed)",
     )
     again.add_argument("--overwrite", action="store_true", help="replace an older fine-tuning in --out")
     parser.add_argument("--weights", type=Path, help="weights to start from (default: the shipped ones)")
-    parser.add_argument("--ignore-depth", action="store_true", help="do not use depth maps that recordings hold")
+    parser.add_argument("--ignore-depth", action="store_true", help="ignore depth maps of recordings")
     parser.add_argument("--max-frames", type=int, help="use the first frames of each recording only")
     parser.add_argument(
         "--validate",
@@ -58,14 +58,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="recordings with depth to validate on (default: every tenth image with depth, measured by the teacher "
         "where there is no other, which is then not learnt from)",
     )
-    parser.add_argument("--steps", type=int, default=100, help="default: 100; more learns a run by heart")
+    parser.add_argument("--steps", type=int, default=100, help="default: 100; more overfits a single run")
     parser.add_argument("--batch", type=int, default=6, help="images (or pairs) per step over all processes")
     parser.add_argument("--lr", type=float, default=3e-4, help="learning rate of the decoder; the encoder's is a fifth")
     parser.add_argument(
         "--from-runs",
         choices=("teacher", "pairs", "both"),
         default="teacher",
-        help="what images without depth teach: depth measured with the run's poses (default), losses on pairs of "
+        help="supervision for images without depth: depth measured with the run's poses (default), losses on pairs of "
         "images, or both (four times slower)",
     )
     parser.add_argument("--freeze-encoder", action="store_true", help="train the decoder alone (twice as fast)")
@@ -73,11 +73,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--patience", type=int, default=0, help="stop after this many validations without progress")
     parser.add_argument("--amp", action="store_true", help="bfloat16 arithmetic where the processor has it")
     parser.add_argument("--threads", type=int, default=1, help="threads of each process")
-    parser.add_argument("--camera", help="calibration for recordings that hold none")
+    parser.add_argument("--camera", help="calibration for recordings without one")
 
 
 def main(args: argparse.Namespace) -> int:
-    """Prepare the data, train, print what came of it."""
+    """Prepare the data, train, and print the results."""
     if not 1 <= args.threads <= MAX_THREADS:
         raise ConfigError(f"--threads must be 1 to {MAX_THREADS}, got {args.threads}")
     if args.max_frames is not None and args.max_frames < 1:
@@ -95,7 +95,7 @@ def main(args: argparse.Namespace) -> int:
     network, metadata = load_checkpoint(args.weights)
     existing = Existing.RESUME if args.resume else Existing.OVERWRITE if args.overwrite else Existing.SAME
     with _signals_interrupt(), process_group() as rank:
-        if rank:  # what goes for all is said once
+        if rank:  # common warnings are printed once
             logging.getLogger("edgeslam_torch").setLevel(logging.ERROR)
         with out_folder(args.out, existing) as out:
             try:
@@ -118,7 +118,7 @@ def _signals_interrupt() -> Iterator[None]:
 
     numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
     in_main = threading.current_thread() is threading.main_thread()
-    # What is ignored stays so: nohup.
+    # Ignored signals stay ignored (nohup).
     taken = [n for n in numbers if in_main and signal.getsignal(n) is signal.SIG_DFL]
     for number in taken:
         signal.signal(number, interrupt)
@@ -131,17 +131,17 @@ def _signals_interrupt() -> Iterator[None]:
 
 @dataclass(frozen=True, slots=True)
 class _Item:
-    """One of the folders to learn from."""
+    """One training folder."""
 
     path: Path
     kind: str
-    """``depth``, ``run``, or ``recording``, which the SLAM makes a run of."""
+    """``depth``, ``run``, or ``recording``, on which SLAM is run first."""
     name: str
     """Of the data set; of the run's folder for a recording."""
 
 
 def _items(args: argparse.Namespace) -> list[_Item]:
-    """What the arguments name, sorted by kind."""
+    """Training folders of the arguments, by kind."""
     from edgeslam_torch.train.views.datasets import has_depth
     from edgeslam_torch.train.views.posed import is_run_folder
 
@@ -150,7 +150,7 @@ def _items(args: argparse.Namespace) -> list[_Item]:
         if not path.exists():
             raise SourceError(f"{path}: no such recording or folder")
         if path.is_dir() and args.out.is_dir() and path.samefile(args.out):
-            raise ConfigError(f"{path}: is to be learnt from; give another --out")
+            raise ConfigError(f"{path}: is a training folder; give another --out")
         name = os.path.basename(os.path.abspath(path))
         kind = "run" if is_run_folder(path) else "depth" if has_depth(path) and not args.ignore_depth else "recording"
         if kind == "recording":  # of two recordings with one name each gets a run of its own
@@ -161,7 +161,7 @@ def _items(args: argparse.Namespace) -> list[_Item]:
         if not has_depth(path):
             raise SourceError(f"{path}: no recording with depth (rgb.txt, depth.txt and camera.yaml) to validate on")
         if any(item.kind == "depth" and item.path.samefile(path) for item in items):
-            raise ConfigError(f"{path}: is learnt from, so it cannot tell whether that helps; leave --validate away")
+            raise ConfigError(f"{path}: is used for training and cannot validate; omit --validate")
     return sorted(items, key=lambda item: item.kind != "depth")
 
 
@@ -209,9 +209,9 @@ def _finetune(
         tuple(DataSet(os.path.basename(os.path.abspath(path)), "depth") for path in args.validate),
         settings_of(config, from_runs, reading),
     )
-    by_first(lambda: out.check(expected))  # before the SLAM is run for nothing
+    by_first(lambda: out.check(expected))  # fail before running SLAM
     if args.weights is not None and out.holds(args.weights):
-        raise ConfigError(f"{args.weights}: would be replaced while it is trained further; give another --out")
+        raise ConfigError(f"{args.weights}: would be overwritten by its own fine-tuning; give another --out")
     data = _data(args, items, out)
     if rank() == 0:
         for line in data.describe():
@@ -222,7 +222,7 @@ def _finetune(
 
 
 def _data(args: argparse.Namespace, items: list[_Item], out: "OutFolder") -> "Data":
-    """Read the folders; recordings without labels are sent through the SLAM first."""
+    """Read the folders; SLAM is run on recordings without labels first."""
     from edgeslam_torch.train.finetune import Data
     from edgeslam_torch.train.processes.distributed import by_first
     from edgeslam_torch.train.views.datasets import load_depth_folder
@@ -245,7 +245,7 @@ def _data(args: argparse.Namespace, items: list[_Item], out: "OutFolder") -> "Da
 
 
 def _left(out: "OutFolder") -> str:
-    """What an interrupt leaves."""
+    """Message after an interrupt."""
     if out.step:
         return f"{out.path} holds step {out.step}, and the same command goes on from there"
     return "no step was saved"

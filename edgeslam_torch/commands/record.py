@@ -1,4 +1,4 @@
-"""``edgeslam record``: a flight or a camera into a folder that every other command reads."""
+"""``edgeslam record``: record a flight or a camera into a folder that all other commands read."""
 
 import argparse
 import os
@@ -28,12 +28,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--fly",
         action="store_true",
-        help="let the drone move: take off, climb and sink half a metre (for scale), turn, hover; it lands at the end",
+        help="fly: take off, climb and descend half a metre (for scale), turn, hover, land",
     )
 
 
 def main(args: argparse.Namespace) -> int:
-    """Record until told to stop, and say what was recorded."""
+    """Record until stopped, and print a summary."""
     from edgeslam_torch.errors import ConfigError
 
     is_drone = args.source.startswith("tello://")
@@ -70,10 +70,10 @@ def _record(
     tello: "Tello | None",
     signals: "_Signals",
 ) -> None:
-    """One recording, and a few lines on it once the drone is down.
+    """One recording, with a summary after landing.
 
     Raises:
-        EdgeSlamError: What ended it early.
+        EdgeSlamError: If the recording ended early.
     """
     from edgeslam_torch.errors import EdgeSlamError
     from edgeslam_torch.writers.flight_writer import FlightWriter
@@ -85,16 +85,16 @@ def _record(
     failure: EdgeSlamError | None = None
     with FlightWriter(folder, source.camera, args.source.startswith("tello://"), args.lossless) as writer:
         _say(f"recording to {folder}; Ctrl-C ends it")
-        # From here on no signal interrupts anything, least of all a landing; without one a second signal does.
+        # From here on no signal interrupts a flight or its landing; without a flight, a second signal does.
         signals.tell(source.end, patient=tello is not None)
         try:
             _write_frames(source, writer, messages, tello, args.duration)
         except EdgeSlamError as error:
             failure = error
         finally:
-            if tello is not None and tello.airborne:  # aside: a terminal that is stopped must not hold up the landing
+            if tello is not None and tello.airborne:  # in a thread: a stopped terminal must not delay the landing
                 threading.Thread(target=_say, args=("landing",), daemon=True).start()
-            source.close()  # lands; its state messages are recorded as well
+            source.close()  # lands; its state messages are recorded too
         try:
             _write_states(writer, messages)
         except EdgeSlamError as error:
@@ -132,7 +132,7 @@ def _write_states(writer: "FlightWriter", messages: "list[StateMessage]") -> Non
 
 
 def _start_pilot(tello: "Tello") -> Callable[[], None]:
-    """A short flight in a thread of its own; the returned function raises what went wrong in it."""
+    """Start a short flight in its own thread; the returned function raises its error, if any."""
     import logging
     from functools import partial
 
@@ -148,7 +148,7 @@ def _start_pilot(tello: "Tello") -> Callable[[], None]:
             for step in [*steps, partial(tello.turn, 0.7), partial(tello.turn, -0.7)]:
                 try:
                     step()
-                except NoAnswer as error:  # a lost packet; the next step does not rest on this one
+                except NoAnswer as error:  # a lost packet; the next step does not depend on it
                     logging.getLogger(__name__).warning("%s; going on", error)
         except EdgeSlamError as error:
             failures.append(error)
@@ -156,37 +156,37 @@ def _start_pilot(tello: "Tello") -> Callable[[], None]:
     threading.Thread(target=fly, name="pilot", daemon=True).start()
 
     def check() -> None:
-        if failures and not tello.stop_reason:  # a flight that was ended has its own reason
+        if failures and not tello.stop_reason:  # an aborted flight has its own reason
             raise failures[0]
 
     return check
 
 
 class _Signals:
-    """Ctrl-C, ``kill``, a closed terminal: each ends the recording, none interrupts a landing, however often it comes.
+    """Ctrl-C, ``kill``, a closed terminal: each ends the recording, none interrupts a landing.
 
     Signals that are ignored already (``nohup``) stay ignored.
     """
 
     def __init__(self) -> None:
         self.number = 0
-        """The first one that came."""
+        """First signal received."""
         self._end: Callable[[], None] | None = None
         self._patient = False
         self._old: dict[int, Any] = {}
 
     @property
     def exit_code(self) -> int:
-        """As a shell reports a program that a signal ended; 0 when none came."""
+        """Exit code as for a program ended by a signal; 0 without a signal."""
         return 128 + self.number if self.number else 0
 
     def tell(self, end: Callable[[], None], patient: bool) -> None:
-        """Call ``end`` from now on, in place of interrupting what goes on; always when ``patient``, else once."""
+        """Call ``end`` on a signal instead of interrupting: always if ``patient``, else once."""
         self._end, self._patient = end, patient
 
     def __enter__(self) -> "_Signals":
         if threading.current_thread() is threading.main_thread():
-            for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGBREAK"):  # no system has them all
+            for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGBREAK"):  # no platform has all of them
                 number = getattr(signal, name, None)
                 if number is not None and signal.getsignal(number) is not signal.SIG_IGN:
                     self._old[number] = signal.signal(number, self._on_signal)
@@ -204,7 +204,7 @@ class _Signals:
 
 
 def _say(text: str) -> None:
-    """Print; a terminal or pipe that is gone is no reason to end anything."""
+    """Print; ignore a closed terminal or pipe."""
     try:
         print(text, flush=True)
     except OSError:

@@ -21,7 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Write each report and say where it is."""
+    """Write each report and print its path."""
     from edgeslam_torch.eval.report.page import write_report
 
     for run in args.runs:

@@ -32,14 +32,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--telemetry", type=Path, metavar="FILE", help="telemetry.csv of the flight (default: SOURCE's own)"
     )
-    parser.add_argument("--depth", metavar="FILE|none", help="weights of the depth network, or none to go without")
+    parser.add_argument("--depth", metavar="FILE|none", help="weights of the depth network, or none")
     parser.add_argument(
         "--mode",
         choices=("offline", "realtime"),
         help="offline: every frame, repeatable; realtime: at camera pace, late frames dropped "
         "(default: offline, realtime for live sources)",
     )
-    parser.add_argument("--record", type=Path, metavar="DIR", help="keep what a live source showed, to run it again")
+    parser.add_argument("--record", type=Path, metavar="DIR", help="record a live source, to run it again")
     parser.add_argument("--lossless", action="store_true", help="record PNG instead of JPEG (quality 95)")
     parser.add_argument("--max-frames", type=_positive_int, metavar="N", help="stop after N frames")
     parser.add_argument("--config", type=Path, metavar="FILE.toml", help="settings; a run's config.toml is one")
@@ -58,11 +58,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--viewer", action="store_true", help="watch it in rerun ([viewer] extra)")
     parser.add_argument("--save-rrd", type=Path, metavar="FILE", help="save the rerun recording to a file instead")
-    parser.add_argument("--no-report", action="store_true", help="leave the page report.html away")
+    parser.add_argument("--no-report", action="store_true", help="do not write the page report.html")
 
 
 def main(args: argparse.Namespace) -> int:
-    """Run, and say in a few lines how it went."""
+    """Run, and print a short summary."""
     from edgeslam_torch.errors import ConfigError
     from edgeslam_torch.progress import make_progress
     from edgeslam_torch.readers.source import open_source
@@ -122,7 +122,7 @@ def _recorded(args: argparse.Namespace) -> "Source":
 
 
 def resolved_config(args: argparse.Namespace) -> "SlamConfig":
-    """Defaults, then ``--config``, then ``--set``, then the options that have a name of their own."""
+    """Defaults overridden by ``--config``, ``--set`` and named options, in this order."""
     from edgeslam_torch.config import SlamConfig
     from edgeslam_torch.errors import ConfigError
     from edgeslam_torch.files.config_file import load_config
@@ -139,7 +139,7 @@ def resolved_config(args: argparse.Namespace) -> "SlamConfig":
 
 
 def write_page(result: "RunResult") -> None:
-    """``report.html``; a run is not lost because its page cannot be made."""
+    """``report.html``; failure to make the page does not fail the run."""
     from edgeslam_torch.errors import EdgeSlamError
     from edgeslam_torch.eval.report.page import write_report
 
@@ -156,7 +156,7 @@ def _report(result: "RunResult", source: "Source") -> None:
         _say(f"{'left out' if problem.frames else 'note'}: {problem.file}: {problem.reason}")
     if len(source.problems) > _MAX_PROBLEMS_SHOWN:
         _say(f"left out: {summary['left_out']} in all, listed in {result.folder / 'summary.json'}")
-    for warning in summary["warnings"][len(source.warnings) :]:  # the source's own were said before the run
+    for warning in summary["warnings"][len(source.warnings) :]:  # the source's warnings were printed before the run
         _say(f"warning: {warning}")
     if not summary["tracked"]:
         _say(
@@ -177,9 +177,9 @@ def _report(result: "RunResult", source: "Source") -> None:
         percent = 100.0 * scale["sigma"] / scale["value"]
         print(f"units are metres: scale from {scale['source']}, good to {percent:.1f} % (one sigma)")
     elif summary["map"]["anchors"] == 0:
-        print("units are arbitrary: no point was triangulated, so nothing can tell the scale; did the camera move?")
+        print("units are arbitrary: no point was triangulated, so the scale is unknown; did the camera move?")
     else:
-        print("units are arbitrary: neither telemetry nor a depth network told the scale")
+        print("units are arbitrary: neither telemetry nor a depth network provided the scale")
     counts = summary["map"]
     if counts["edge_points"] == 0:
         _say("warning: the edge map is empty")
@@ -197,7 +197,7 @@ def _best_view(folder: Path) -> str:
 
 
 def _lost_words(summary: dict[str, Any]) -> str:
-    """How often tracking was lost; nothing where there was none that could be."""
+    """How often tracking was lost; empty if there was no tracking."""
     if not summary["tracked"] and not summary["lost_events"]:
         return ""
     return f"lost {_times(summary['lost_events'])}, "

@@ -1,4 +1,4 @@
-"""``edgeslam sim``: a Tello on this machine's loopback, to try everything without a drone."""
+"""``edgeslam sim``: a simulated Tello on the loopback interface."""
 
 import argparse
 import math
@@ -6,7 +6,7 @@ import signal
 import time
 
 _POLL_S = 0.1
-"""A signal that the system gives to another thread does not wake the main one, in which alone it is dealt with."""
+"""A signal delivered to another thread does not wake the main thread, which handles it."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -29,12 +29,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--sdk", choices=("1.3", "2.0"), default="2.0", help="form of the state lines")
     parser.add_argument("--duration", type=float, metavar="S", help="stop after this time (default: until Ctrl-C)")
-    parser.add_argument("--stopwatch", action="store_true", help="show the moment of each picture in its corner")
+    parser.add_argument("--stopwatch", action="store_true", help="show the time of each picture in its corner")
     parser.add_argument(
         "--measure",
         type=float,
         metavar="S",
-        help="fly this emulator with our own client for so long and print pictures a second and their delay",
+        help="fly the emulator with our client for this time and print frame rate and delay",
     )
 
 

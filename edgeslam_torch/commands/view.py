@@ -14,11 +14,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--viewer", action="store_true", help="the rerun viewer instead of the browser ([viewer] extra)"
     )
     parser.add_argument("--save-rrd", type=Path, metavar="FILE", help="write a rerun recording instead of showing it")
-    parser.add_argument("--print", action="store_true", dest="only_print", help="only say where the page is")
+    parser.add_argument("--print", action="store_true", dest="only_print", help="only print the path of the page")
 
 
 def main(args: argparse.Namespace) -> int:
-    """Open the page, making it first when it is missing; without a browser, say where it is."""
+    """Open the page, writing it first if missing; without a browser, print its path."""
     if args.viewer or args.save_rrd is not None:
         return _rerun(args)
     from edgeslam_torch.eval.report.page import write_report
@@ -30,7 +30,7 @@ def main(args: argparse.Namespace) -> int:
         raise OutputError(f"{page}: cannot be written ({error.strerror or error})") from error
     print(page.resolve())
     if not args.only_print and not webbrowser.open(page.resolve().as_uri()):
-        print("no browser here: copy the page to a machine that has one, it needs nothing else")
+        print("no browser here: copy the page to a machine with one; it is self-contained")
     return 0
 
 

@@ -22,19 +22,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     download.add_argument("name", help="as 'list' prints it")
     download.add_argument("--out", "-o", type=Path, help="where to put the .safetensors (default: the cache)")
     download.add_argument(
-        "--sha256", type=_sha256, help="what the downloaded file must hash to (default: as at the first download)"
+        "--sha256", type=_sha256, help="expected SHA-256 of the download (default: that of the first download)"
     )
-    convert = actions.add_parser("convert", help="turn an official .pth.tar into .safetensors, running no code in it")
+    convert = actions.add_parser("convert", help="convert an official .pth.tar to .safetensors without executing it")
     convert.add_argument("checkpoint", type=Path)
     convert.add_argument("--out", "-o", type=Path, required=True)
-    inspect = actions.add_parser("inspect", help="print what a weights file says about itself")
+    inspect = actions.add_parser("inspect", help="print the metadata of a weights file")
     inspect.add_argument(
         "weights", nargs="?", type=Path, help=".safetensors, .pt or .onnx (default: the shipped weights)"
     )
 
 
 def main(args: argparse.Namespace) -> int:
-    """Do one of the four."""
+    """Run one of the four subcommands."""
     {"list": _list, "download": _download, "convert": _convert, "inspect": _inspect}[args.action](args)
     return 0
 
@@ -72,7 +72,7 @@ def _download(args: argparse.Namespace) -> None:
             target = args.out or cache_folder() / f"{remote.name}.safetensors"
             target.parent.mkdir(parents=True, exist_ok=True)
             convert_upstream(raw, target)
-            kept = remember(raw, fetched.sha256)  # only of a file that is what it should be
+            kept = remember(raw, fetched.sha256)  # remember the checksum of valid files only
         except OSError as error:
             raise OutputError(f"{error.filename or raw}: cannot be written ({error.strerror or error})") from error
     print(f"{fetched.url}\nsha256 {fetched.sha256}, {_trust(args.sha256, before, fetched, kept)}")
@@ -80,13 +80,13 @@ def _download(args: argparse.Namespace) -> None:
 
 
 def _trust(given: str | None, before: str | None, fetched: "Fetched", kept: Path) -> str:
-    """How sure it is that this is the publisher's file."""
+    """How far the file's origin is verified."""
     if given is not None:
         return "as you gave it"
     if before is not None:
         return "the same as at the first download"
-    how = "" if fetched.encrypted else ", and it came unencrypted: anybody on the way could have changed it"
-    return f"trusted because it is the first: its publisher names no checksum{how}; kept in {kept}, the next must match"
+    how = "" if fetched.encrypted else ", and it came unencrypted: it may have been changed on the way"
+    return f"trusted on first use: its publisher states no checksum{how}; kept in {kept}, the next must match"
 
 
 def _sha256(text: str) -> str:
@@ -126,11 +126,11 @@ def _size_and_record(path: Path) -> "tuple[str, Metadata]":
     from edgeslam_torch.models.complexity import measure_complexity
 
     network, metadata = load_checkpoint(path)
-    # Without numbers: counting needs shapes alone, whatever size of image the record names.
+    # On the meta device: counting needs only shapes, whatever image size the record states.
     size = measure_complexity(network.to("meta"), metadata.input_height, metadata.input_width)
     return f"\n{size.parameters / 1e6:.2f} M parameters, {size.macs / 1e9:.2f} GMAC per image", metadata
 
 
 def _printable(text: str) -> str:
-    """A stranger's text without what would steer the terminal."""
+    """Untrusted text without terminal control characters."""
     return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)

@@ -1,1 +1,1 @@
-"""Files in general: written whole or not at all, appended to line by line, read or refused in one line."""
+"""Files in general: atomic writing, appending whole lines, reading with one-line errors."""

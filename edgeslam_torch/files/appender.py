@@ -1,4 +1,4 @@
-"""A text file that holds whole lines only, whatever the disk does."""
+"""A text file that contains only whole lines, even on a full disk."""
 
 import errno
 import os
@@ -6,11 +6,11 @@ from pathlib import Path
 
 
 class Appender:
-    """Appends lines; one that does not fit on the disk is taken back whole.
+    """Appends lines; a line that does not fit on the disk is removed completely.
 
     Args:
         path: The file.
-        header: First lines of a new file, which replaces an old one; None goes on behind what is there.
+        header: First lines of a new file, which replaces an old one; None appends to an existing file.
 
     Raises:
         OSError: If the file cannot be opened or written.
@@ -26,7 +26,7 @@ class Appender:
         """Append whole lines.
 
         Raises:
-            OSError: If the disk refuses; the file is as it was before.
+            OSError: If the disk is full; the file is unchanged.
         """
         data = text.encode("utf-8")
         try:

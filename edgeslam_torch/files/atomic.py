@@ -1,4 +1,4 @@
-"""Files that are either the old one or the new one, never half of one."""
+"""Atomic file writing: a reader sees the old or the new file, never half of one."""
 
 import os
 from collections.abc import Callable
@@ -7,10 +7,10 @@ from typing import BinaryIO
 
 
 def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
-    """Let ``write`` fill a file beside ``path`` and put it in its place when it is whole.
+    """Let ``write`` fill a temporary file beside ``path``, then move it into place.
 
     Raises:
-        OSError: If the disk refuses; an older file at ``path`` is then still there.
+        OSError: If writing fails; an older file at ``path`` is kept.
     """
     partial = path.with_name(f".{path.name}.part")
     try:
@@ -24,9 +24,9 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Put ``text`` into ``path`` as UTF-8, atomically; bytes of a file name that are no UTF-8 become question marks.
+    """Write ``text`` to ``path`` as UTF-8, atomically; undecodable bytes of file names become question marks.
 
     Raises:
-        OSError: If the disk refuses.
+        OSError: If writing fails.
     """
     write_atomically(path, lambda file: file.write(text.encode("utf-8", errors="replace")))

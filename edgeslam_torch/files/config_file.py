@@ -1,4 +1,4 @@
-"""Configuration between nested frozen dataclasses and TOML, for any of the project's configs."""
+"""Configuration as nested frozen dataclasses and TOML."""
 
 import dataclasses
 import difflib
@@ -18,12 +18,12 @@ C = TypeVar("C")
 
 
 def load_config(default: C, path: Path | None, overrides: Sequence[str] = ()) -> C:
-    """``default`` with a TOML file and then ``section.key=value`` options laid over it.
+    """``default`` overridden by a TOML file and then by ``section.key=value`` options.
 
     Args:
         default: A frozen dataclass, with sections that are frozen dataclasses too.
         path: TOML file; None for no file.
-        overrides: As given to ``--set``.
+        overrides: As for ``--set``.
 
     Raises:
         ConfigError: If the file cannot be read, a key is unknown, or a value has the wrong type or range; the
@@ -42,7 +42,7 @@ def load_config(default: C, path: Path | None, overrides: Sequence[str] = ()) ->
 
 
 def to_toml(config: Any) -> str:
-    """A config as TOML that `load_config` reads back to an equal one; a None is left out.
+    """A config as TOML that `load_config` reads back to an equal one; None values are omitted.
 
     Example:
         >>> from dataclasses import dataclass
@@ -70,7 +70,7 @@ def keys_of(config: Any, prefix: str = "") -> list[str]:
 
 
 def _laid_over(config: C, record: Mapping[str, Any], origin: str, prefix: str) -> C:
-    """``config`` with the values of a TOML table."""
+    """``config`` overridden by a TOML table."""
     hints = typing.get_type_hints(type(config))
     changes: dict[str, Any] = {}
     for name, value in record.items():
@@ -88,7 +88,7 @@ def _laid_over(config: C, record: Mapping[str, Any], origin: str, prefix: str) -
 
 
 def _override(config: C, key: str, text: str, origin: str, prefix: str = "") -> C:
-    """``config`` with one dotted key set from text."""
+    """``config`` with one dotted key parsed from text."""
     name, dot, rest = key.partition(".")
     hints = typing.get_type_hints(type(config))
     if name not in hints:
@@ -116,7 +116,7 @@ def _replaced(config: C, changes: dict[str, Any], origin: str, prefix: str) -> C
 
 
 def _parsed(text: str, hint: Any) -> Any:
-    """A value from the command line: TOML where it is TOML, a bare word where the type is text."""
+    """A value from the command line: TOML, or a bare word for strings."""
     if str in _options(hint) or any(isinstance(option, str) for option in _options(hint)):
         quoted = len(text) >= 2 and text[0] == text[-1] and text[0] in "\"'"
         return text[1:-1] if quoted else text
@@ -131,7 +131,7 @@ def _parsed(text: str, hint: Any) -> Any:
 
 
 def _checked(value: Any, hint: Any, key: str, origin: str) -> Any:
-    """The value as the field's type."""
+    """The value converted to the field's type."""
     for option in _options(hint):
         ok, result = _as(value, option)
         if ok:
@@ -181,7 +181,7 @@ def _cut(text: str) -> str:
 
 
 def _options(hint: Any) -> tuple[Any, ...]:
-    """What a field accepts: the members of a union, the values of a Literal, or the type itself."""
+    """Accepted types or values: members of a union, values of a Literal, or the type itself."""
     origin = typing.get_origin(hint)
     if origin in (typing.Union, types.UnionType):
         return tuple(option for member in typing.get_args(hint) for option in _options(member))

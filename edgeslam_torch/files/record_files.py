@@ -1,4 +1,4 @@
-"""JSON, TOML and YAML files, read so that whatever lies in one ends in a single line."""
+"""JSON, TOML and YAML files, read safely: any content gives a record or a one-line error."""
 
 import json
 import tomllib
@@ -9,13 +9,13 @@ from typing import Any
 from edgeslam_torch.errors import EdgeSlamError
 
 MAX_BYTES = {"JSON": 64 << 20, "TOML": 256 << 10, "YAML": 1 << 20}
-"""Of one file; a benchmark of a thousand runs takes 2 MB, settings and cameras a few kB."""
+"""Maximum file size; a benchmark of a thousand runs takes 2 MB, settings and cameras a few kB."""
 MAX_DOTS = 300
-"""In a line of TOML; the time for a dotted key grows with the square of its parts."""
+"""Maximum number of dots in a line of TOML; parsing a dotted key takes quadratic time."""
 
 
 def plain_yaml(text: str) -> Any:
-    """YAML without aliases, of which a few lines can make gigabytes, and with OpenCV's first line.
+    """Parse YAML without aliases, which can expand to gigabytes; OpenCV's header line is accepted.
 
     Raises:
         ValueError: If it is malformed.
@@ -45,12 +45,12 @@ _PARSERS: dict[str, Callable[[str], Any]] = {"JSON": json.loads, "TOML": _toml, 
 
 
 def read_mapping(path: Path, kind: str, error: type[EdgeSlamError]) -> dict[str, Any]:
-    """What a file of one record holds.
+    """Read a file that contains one record.
 
     Args:
         path: The file.
         kind: ``JSON``, ``TOML`` or ``YAML``.
-        error: What to raise.
+        error: Exception class to raise.
 
     Raises:
         EdgeSlamError: ``error``, with the file's name, if it cannot be read, is malformed, or holds no record.
@@ -64,7 +64,7 @@ def read_mapping(path: Path, kind: str, error: type[EdgeSlamError]) -> dict[str,
         raise error(f"{path}: {reason.strerror or reason}") from reason
     except RecursionError as reason:
         raise error(f"{path}: not valid {kind} (nested too deeply)") from reason
-    except ValueError as reason:  # malformed, not UTF-8, a number of thousands of digits
+    except ValueError as reason:  # malformed, not UTF-8, or a number with thousands of digits
         raise error(f"{path}: not valid {kind} ({reason})") from reason
     if not isinstance(record, dict):
         raise error(f"{path}: not a {kind} object")

@@ -1,8 +1,8 @@
-"""Canny edges twice: kornia's for batches, devices and training, OpenCV's for the CPU in real time.
+"""Canny edges: OpenCV's for the CPU in real time, and a batched reference on kornia's gradient.
 
-Both use the 3x3 Sobel gradient with the L2 norm, so that a kornia threshold ``t`` is OpenCV's ``255 t``; a test holds
-them together. kornia's own hysteresis walks the edges pixel by pixel in Python (1.4 s a frame); connected components
-give the same pixels in 3 ms.
+Both use the 3x3 Sobel gradient with the L2 norm, so that a kornia threshold ``t`` is OpenCV's ``255 t``; a test
+compares them. kornia's own hysteresis iterates over pixels in Python (1.4 s per frame); connected components give the
+same pixels in 3 ms.
 """
 
 from typing import TYPE_CHECKING
@@ -21,13 +21,13 @@ def canny(grey: NDArray[np.uint8], low: float, high: float) -> NDArray[np.bool_]
 
 
 def gradient(grey: NDArray[np.uint8]) -> tuple[NDArray[np.int16], NDArray[np.int16]]:
-    """3x3 Sobel gradient of the smoothed image along x and y, ``(H, W)`` each: the one that `canny` looks at."""
+    """3x3 Sobel gradient of the smoothed image along x and y, ``(H, W)`` each: as `canny` uses it."""
     gx, gy = cv2.spatialGradient(cv2.GaussianBlur(grey, (5, 5), 1.0), ksize=3, borderType=cv2.BORDER_REPLICATE)
     return gx.astype(np.int16, copy=False), gy.astype(np.int16, copy=False)
 
 
 def canny_of_gradient(gx: NDArray[np.int16], gy: NDArray[np.int16], low: float, high: float) -> NDArray[np.bool_]:
-    """`canny` for who has the gradient already."""
+    """`canny` from a given gradient."""
     return cv2.Canny(gx, gy, low, high, L2gradient=True).astype(bool)
 
 
@@ -49,7 +49,7 @@ def canny_batch(images: "Tensor", low: float, high: float) -> "Tensor":
 
 
 def hysteresis(candidate: NDArray[np.bool_], strong: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Candidate pixels that hang together (8 neighbours) with a strong one."""
+    """Candidate pixels connected to a strong one (8-neighbourhood)."""
     count, labels = cv2.connectedComponents(candidate.astype(np.uint8), connectivity=8)
     keep = np.zeros(count, dtype=bool)
     keep[labels[strong & candidate]] = True

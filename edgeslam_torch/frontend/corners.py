@@ -1,4 +1,4 @@
-"""L-junctions: two straight Canny edges that end in one corner, paper section on the L-shape loss (fig. 2)."""
+"""L-junctions: two straight Canny edges that meet in a corner, paper section on the L-shape loss (fig. 2)."""
 
 from dataclasses import dataclass
 
@@ -17,11 +17,11 @@ class Junctions:
     arms: FloatArray
     """``(C, 2, 2)`` unit directions away from the corner, clockwise as seen (u right, v down)."""
     length_px: FloatArray
-    """``(C, 2)`` how far each arm is straight."""
+    """``(C, 2)`` straight length of each arm [px]."""
     angle_rad: FloatArray
     """``(C,)`` angle between the arms, in (0, pi)."""
     sigma_px: FloatArray
-    """``(C,)`` standard deviation of the corner, per coordinate."""
+    """``(C,)`` standard deviation of the corner per coordinate [px]."""
     sigma_rad: FloatArray
     """``(C, 2)`` standard deviation of each arm's direction."""
 
@@ -41,34 +41,34 @@ class Junctions:
 
 @dataclass(frozen=True, slots=True)
 class JunctionConfig:
-    """What counts as an L-junction."""
+    """Thresholds of an L-junction."""
 
     min_arm_px: float = 14.0
-    """A shorter arm has a direction worse than about 2 degrees."""
+    """Shorter arms have a direction sigma above about 2 degrees."""
     angle_min_rad: float = np.radians(35.0)
     angle_max_rad: float = np.radians(145.0)
-    """Flatter angles are bends of one edge."""
+    """Flatter angles are bends of a single edge."""
     bend_px: float = 1.5
-    """Distance from its chord up to which a contour is straight."""
+    """Maximum distance of a straight contour from its chord."""
     trim_px: int = 4
-    """Pixels left out at each end of an arm: the smoothing before Canny rounds corners."""
+    """Pixels ignored at each end of an arm, where smoothing rounds the corner."""
     rms_px: float = 0.5
-    """Worst scatter of an arm about its line."""
+    """Maximum RMS distance of an arm's pixels from its line."""
     gap_px: float = 5.0
-    """Worst distance of the lines' meeting point from where the contour turns."""
+    """Maximum distance of the lines' intersection from the contour's turning point."""
     most: int = 150
 
 
 def detect_junctions(grey: np.ndarray, edges: np.ndarray, config: JunctionConfig | None = None) -> Junctions:
     """Find L-junctions in Canny contours.
 
-    Contours are cut into straight pieces; a line is fitted to each piece's edge points, located to a fraction of a
-    pixel on the gradient's ridge; two pieces that follow each other make a junction where their lines meet.
+    Contours are split into straight segments; a line is fitted to the sub-pixel edge points of each; consecutive
+    segments form a junction where their lines intersect.
 
     Args:
         grey: Undistorted image ``(H, W)`` uint8.
-        edges: Its Canny edges ``(H, W)``, nonzero on edges.
-        config: Gates.
+        edges: Its Canny edges ``(H, W)``, non-zero on edges.
+        config: Thresholds.
     """
     config = config or JunctionConfig()
     points, runs = _straight_runs(edges, config)
@@ -105,7 +105,7 @@ def _straight_runs(edges: np.ndarray, config: JunctionConfig) -> tuple[np.ndarra
         turns = _turning_points(contour, config.bend_px)
         if len(turns) < 2:
             continue
-        # Begin at a turning point, and go round once.
+        # Start at a turning point and go round once.
         rolled = np.roll(contour[:, 0], -turns[0], axis=0)
         places = [*(turns - turns[0]), n]
         first = len(runs)
@@ -125,7 +125,8 @@ def _turning_points(contour: np.ndarray, bend_px: float) -> np.ndarray:
     code = contour[:, 0, 0].astype(np.int64) * 65536 + contour[:, 0, 1]
     order = np.argsort(code, kind="stable")
     wanted = corners[:, 0] * 65536 + corners[:, 1]
-    # A thin line is traced out and back, so a pixel can stand twice in its contour: take the visit that keeps order.
+    # A thin line is traced in both directions, so a pixel may occur twice in its contour: take the occurrence that
+    # keeps the order.
     lo, hi = np.searchsorted(code[order], wanted), np.searchsorted(code[order], wanted, side="right")
     places, last = [], -1
     shift = int(order[lo[0]])
@@ -140,10 +141,10 @@ def _turning_points(contour: np.ndarray, bend_px: float) -> np.ndarray:
 
 
 def _on_ridge(grey: np.ndarray, points: np.ndarray) -> FloatArray:
-    """Edge points ``(P, 2)`` moved along the gradient to where it is strongest, by a parabola through 3 samples."""
+    """Edge points ``(P, 2)`` moved along the gradient to its maximum, by a parabola through 3 samples."""
     smooth = cv2.GaussianBlur(np.asarray(grey), (5, 5), 1.0)
     gx, gy = cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1)
-    strength = np.sqrt(gx * gx + gy * gy)  # cv2.magnitude's last bits change from call to call
+    strength = np.sqrt(gx * gx + gy * gy)  # the last bits of cv2.magnitude vary between calls
     u, v = points[:, 0].astype(int), points[:, 1].astype(int)
     norm = np.maximum(strength[v, u], 1e-6)
     n = np.stack((gx[v, u] / norm, gy[v, u] / norm), 1)
@@ -155,7 +156,7 @@ def _on_ridge(grey: np.ndarray, points: np.ndarray) -> FloatArray:
 
 def _sample(image: np.ndarray, uv: FloatArray) -> FloatArray:
     out = []
-    for part in np.array_split(uv.astype(np.float32), len(uv) // 30000 + 1):  # remap indexes with 16 bits
+    for part in np.array_split(uv.astype(np.float32), len(uv) // 30000 + 1):  # cv2.remap indexes with 16 bits
         x, y = np.ascontiguousarray(part[:, :1]), np.ascontiguousarray(part[:, 1:])
         out.append(cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).ravel())
     return np.concatenate(out).astype(np.float64)
@@ -176,8 +177,8 @@ def _fit_lines(points: FloatArray, runs: np.ndarray, config: JunctionConfig) -> 
     spread = np.hypot(0.5 * (sxx - syy), sxy)
     mean = 0.5 * (sxx + syy)
     across = np.sqrt(np.maximum(mean - spread, 0.0))
-    # Smoothing ties about 3 neighbours together, so a third of the points count; 0.1 px is what a ridge fit does
-    # on a noise-free edge.
+    # Smoothing correlates about 3 neighbours, so a third of the points count; 0.1 px is the error on a noise-free
+    # edge.
     sigma = np.maximum(across, 0.1) / np.sqrt(count / 3.0)
     return _Lines(
         centre=np.stack((mx, my), 1) + origin,
@@ -189,8 +190,8 @@ def _fit_lines(points: FloatArray, runs: np.ndarray, config: JunctionConfig) -> 
 
 
 def _corners(points: np.ndarray, runs: np.ndarray, fit: _Lines, config: JunctionConfig) -> list[FloatArray]:
-    """Rows of `_pack` for pairs of runs that follow each other."""
-    # A rounded corner can leave a short piece of its own between its arms: look past it.
+    """Rows of `_pack` for pairs of consecutive runs."""
+    # A rounded corner may leave a short segment between its arms: skip it.
     following = runs[:, 3]
     short = runs[:, 1] - runs[:, 0] <= config.gap_px
     following = np.where(short[following], following[following], following)
@@ -232,7 +233,7 @@ def _corners(points: np.ndarray, runs: np.ndarray, fit: _Lines, config: Junction
 
 
 def _pack(rows: list[FloatArray], config: JunctionConfig) -> Junctions:
-    """Records without doubles (a thin line is traced on both sides), longest arms first."""
+    """Unique junctions (a thin line is traced on both sides), longest arms first."""
     table = np.array(rows).reshape(-1, 12)
     flip = table[:, 2] * table[:, 5] - table[:, 3] * table[:, 4] < 0  # second arm anticlockwise of the first
     table[flip] = table[flip][:, [0, 1, 4, 5, 2, 3, 7, 6, 8, 9, 11, 10]]

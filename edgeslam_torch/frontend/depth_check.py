@@ -1,4 +1,4 @@
-"""Stage 1, depth: which pixels of a depth map can be meant, and maps of which too few can."""
+"""Stage 1, depth: plausibility of a depth map's pixels, and rejection of maps with too few plausible ones."""
 
 import logging
 from collections.abc import Callable
@@ -12,16 +12,16 @@ from edgeslam_torch.types import DepthMap
 logger = logging.getLogger(__name__)
 
 DepthFunction = Callable[[np.ndarray, Camera], DepthMap | None]
-"""Undistorted image and its camera to depth; None where nothing can be said."""
+"""Maps an undistorted image and its camera to depth; None if there is none."""
 
 PLAUSIBLE_M = (0.05, 200.0)
-"""Cheap fixed-focus lenses show nothing sharp nearer than 5 cm. The network's range ends at 100 m for the lens it was
-trained with, at 200 m for one twice as long; what lies beyond is an overflow, not a distance."""
+"""Cheap fixed-focus lenses are out of focus below 5 cm. The network's range ends at 100 m for its training focal
+length, at 200 m for one twice as long; values beyond are overflows."""
 MAX_SIGMA_LOG = 5.0
-"""A depth that may be wrong by a factor of 150 is none."""
+"""log(150): a depth that uncertain is unknown."""
 MIN_SHARE = 0.5
-"""Of the pixels. Sky and windows take part of a picture; a network that fails on most of it cannot be trusted with the
-rest."""
+"""Minimum share of plausible pixels. Sky and windows cover part of an image; a network that fails on most of it
+cannot be trusted on the rest."""
 
 
 def usable(depth: DepthMap) -> NDArray[np.bool_]:
@@ -32,7 +32,7 @@ def usable(depth: DepthMap) -> NDArray[np.bool_]:
 
 
 class CheckedDepth:
-    """A depth function that says nothing where the one inside cannot be meant.
+    """Wraps a depth function and discards implausible pixels and maps.
 
     Args:
         depth: Function to check.
@@ -41,12 +41,12 @@ class CheckedDepth:
     def __init__(self, depth: DepthFunction) -> None:
         self.depth = depth
         self.maps = 0
-        """Depth maps asked for."""
+        """Depth maps requested."""
         self.refused = 0
-        """Maps of which less than `MIN_SHARE` was usable."""
+        """Maps with less than `MIN_SHARE` usable pixels."""
 
     def __call__(self, image: np.ndarray, camera: Camera) -> DepthMap | None:
-        """The depth map with NaN where it is not usable; None when too little is."""
+        """The depth map with NaN where it is not usable; None if too few pixels are."""
         depth = self.depth(image, camera)
         self.maps += 1
         if depth is None:
@@ -60,7 +60,7 @@ class CheckedDepth:
 
     def _refuse(self, share: float) -> None:
         self.refused += 1
-        if self.refused == 1:  # a hundred alike would hide everything else
+        if self.refused == 1:  # log once; repeats would hide everything else
             logger.warning(
                 "the depth network's output is unusable (%.0f %% of the pixels are finite and between %g and %g m); "
                 "such keyframes are mapped without depth",
@@ -69,7 +69,7 @@ class CheckedDepth:
             )
 
     def warning(self) -> str | None:
-        """What a run should say about refused maps; None when there were none."""
+        """Warning about rejected maps; None if there were none."""
         if not self.refused:
             return None
         return (

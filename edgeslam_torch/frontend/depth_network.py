@@ -17,9 +17,9 @@ from edgeslam_torch.types import DepthMap, FloatArray
 logger = logging.getLogger(__name__)
 
 _TRIAL_SIZE = 64
-"""Side of the pictures that weights are tried on when they are loaded [px]: a few milliseconds."""
+"""Side of the test images for newly loaded weights [px]; takes a few milliseconds."""
 _LOG_RANGE = MAX_LOG_DEPTH - 1e-3
-"""The network clips log depth there: a value at the end of its range says "off the scale", not how far."""
+"""The network clips log depth to this range: values at its ends mean out of range."""
 
 
 class _Engine(Protocol):
@@ -37,7 +37,7 @@ class DepthPredictor:
     Args:
         weights: A ``.safetensors`` file or an exported ``.onnx`` file; the shipped weights by default.
         backend: ``"onnxruntime"`` (falls back to torch when it is not installed) or ``"torch"``.
-        threads: Threads of one inference. With torch this sets the process's number of threads.
+        threads: Threads per inference. With torch this sets the number of threads of the process.
 
     Raises:
         WeightsError: If the weights are missing, damaged, or give no depth.
@@ -58,21 +58,19 @@ class DepthPredictor:
 
     @property
     def metadata(self) -> Metadata:
-        """What the weights say about themselves."""
+        """Metadata of the weights."""
         return self._engine.metadata
 
     @property
     def backend(self) -> str:
-        """What actually runs."""
+        """Backend in use."""
         return "torch" if isinstance(self._engine, _TorchEngine) else "onnxruntime"
 
     def __call__(self, image: NDArray[np.uint8], camera: Camera) -> DepthMap:
         """Depth [m] and its uncertainty at the image's size; NaN where the network's range ends (100 m, 1 cm).
 
-        The network's metres hold for the focal length it was trained with; the same pixels through a lens
-        twice as
-        long are twice as far away, so depth is multiplied by the ratio of focal lengths, both measured in the
-        network's own pixels.
+        The network predicts metres for its training focal length. The same image through a lens twice as long shows a
+        scene twice as far away, so depth is multiplied by the ratio of focal lengths in network pixels.
 
         Args:
             image: ``(H, W, 3)`` BGR or ``(H, W)`` grey, undistorted.
@@ -116,7 +114,7 @@ def network_size(height: int, width: int, metadata: Metadata) -> tuple[int, int]
         for w in range(INPUT_MULTIPLE, 2 * metadata.input_width + 1, INPUT_MULTIPLE):
             if h * w > area:
                 continue
-            # Squeezing by 10 % weighs as much as giving up 20 % of the pixels.
+            # A 10 % change of aspect ratio counts as much as losing 20 % of the pixels.
             cost = abs(np.log((w / h) / (width / height))) + 0.5 * np.log(area / (h * w))
             if cost < best_cost - 1e-9:
                 best, best_cost = (h, w), cost
@@ -141,10 +139,10 @@ def _open_engine(weights: Path, backend: str, threads: int) -> _Engine:
 
 
 def _try_out(engine: _Engine, weights: Path) -> None:
-    """Refuse weights that make no depth of two simple pictures, or the same of both.
+    """Reject weights that predict no depth for two simple images, or the same for both.
 
     Raises:
-        WeightsError: If so, or if they cannot be run at all.
+        WeightsError: If they are rejected or cannot be run.
     """
     height, width = engine.fixed_size or (_TRIAL_SIZE, _TRIAL_SIZE)
     across, down = np.meshgrid(np.linspace(0, 255, width), np.linspace(0, 255, height))
@@ -153,7 +151,7 @@ def _try_out(engine: _Engine, weights: Path) -> None:
     for image in (picture, np.ascontiguousarray(picture[::-1])):
         try:
             log_depth, sigma = engine.run(preprocess(image, height, width, engine.metadata))
-        except Exception as error:  # onnxruntime's have no base of their own
+        except Exception as error:  # onnxruntime's errors have no common base class
             raise WeightsError(f"{weights}: cannot be run ({_first_line(error)})") from error
         if log_depth.shape != (height // 2, width // 2) or sigma.shape != log_depth.shape:
             raise WeightsError(f"{weights}: gives depth of shape {log_depth.shape} for a picture of {height}x{width}")
@@ -175,7 +173,7 @@ class _OnnxEngine:
 
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
-        options.log_severity_level = 4  # what goes wrong is raised, too
+        options.log_severity_level = 4  # errors are raised anyway
         if weights.suffix == ".onnx":
             from edgeslam_torch.models.onnx.file import read_onnx
 

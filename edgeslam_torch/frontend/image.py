@@ -1,4 +1,4 @@
-"""The two conversions that stages need of a raw image."""
+"""Conversions of raw images."""
 
 import cv2
 import numpy as np

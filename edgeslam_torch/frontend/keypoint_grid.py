@@ -1,7 +1,7 @@
-"""Which keypoints lie near given pixels: a grid of cells, as keypoints are spread evenly and radii are small.
+"""Radius search over keypoints: a grid of cells, since keypoints are spread evenly and radii are small.
 
-Against a KD-tree it costs a third per search, because every query keeps its own radius: a tree's pair search takes one
-for all, and a single anchor of the coarsest pyramid level makes it three times too wide.
+A search takes a third of a k-d tree's time because every query has its own radius: a tree's pair search uses one
+radius for all, which a single anchor of the coarsest pyramid level makes three times too wide.
 """
 
 import numpy as np
@@ -9,11 +9,11 @@ import numpy as np
 from edgeslam_torch.types import FloatArray, IntArray
 
 CELL_PX = 16.0
-"""Side of a cell; of 8, 12, 16, 24 and 32 the fastest for a thousand keypoints in 640x480."""
+"""Side of a cell; the fastest of 8, 12, 16, 24 and 32 for a thousand keypoints in 640x480."""
 
 
 class KeypointGrid:
-    """Keypoints ``(N, 2)`` [px] sorted by cell, row by row; never changed afterwards."""
+    """Keypoints ``(N, 2)`` [px] sorted by cell, row by row; immutable."""
 
     __slots__ = ("_columns", "_order", "_origin", "_rows", "_start", "_u", "_v")
 
@@ -31,7 +31,7 @@ class KeypointGrid:
         return len(self._order)
 
     def near(self, query_uv: FloatArray, radius_px: FloatArray) -> tuple[IntArray, IntArray]:
-        """All pairs (query, keypoint) no farther apart than each query's own radius, as two index arrays.
+        """All pairs (query, keypoint) within each query's own radius, as two index arrays.
 
         Args:
             query_uv: Pixels ``(M, 2)``, finite, inside the image or not.
@@ -47,7 +47,7 @@ class KeypointGrid:
         u, v = np.asarray(query_uv, dtype=np.float64).T
         left, right = self._span(u - self._origin[0], radius_px, self._columns)
         top, bottom = self._span(v - self._origin[1], radius_px, self._rows)
-        # Keypoints of neighbouring cells in one row lie side by side: one interval per query and row.
+        # Keypoints of neighbouring cells in a row are contiguous: one interval per query and row.
         row_query, row = _unroll(top, bottom - top + 1)
         first_cell = row * self._columns
         begin = self._start[first_cell + left[row_query]]
@@ -63,7 +63,7 @@ class KeypointGrid:
         return query[inside], self._order[keypoint[inside]]
 
     def _span(self, x: FloatArray, radius_px: FloatArray, cells: int) -> tuple[IntArray, IntArray]:
-        """First and last cell along one axis that a circle around ``x`` touches."""
+        """First and last cell along one axis within the radius around ``x``."""
         ends = np.stack([x - radius_px, x + radius_px])
         ends /= CELL_PX
         np.maximum(ends, 0.0, out=ends)
@@ -73,7 +73,7 @@ class KeypointGrid:
 
 
 def _unroll(first: IntArray, counts: IntArray) -> tuple[IntArray, IntArray]:
-    """For intervals of whole numbers, by their first and how many: the interval of every number, and the number."""
+    """Expand integer intervals, given by first element and length, to (interval index, element) pairs."""
     interval = np.repeat(np.arange(len(counts)), counts)
     shift = first - np.cumsum(counts) + counts
     return interval, np.arange(len(interval)) + shift[interval]

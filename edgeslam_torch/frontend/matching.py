@@ -1,4 +1,4 @@
-"""Hamming matching of ORB descriptors: guided by a predicted pixel, or between whole frames.
+"""Hamming matching of ORB descriptors, guided by predicted pixels or between whole frames.
 
 Candidates come from a grid over keypoint positions, the distance from the descriptors' bits; a KD-tree over the
 descriptors, as the paper has it, is slower and finds less (docs/decisions/0018-no-kd-tree-for-descriptors.md).
@@ -46,14 +46,14 @@ def hamming(a: NDArray[np.uint64], b: NDArray[np.uint64]) -> IntArray:
 def best_pairs(query: IntArray, train: IntArray, distance: IntArray, max_hamming: int, ratio: float) -> Matches:
     """One-to-one matches from candidate pairs.
 
-    A query keeps its nearest candidate when that is within ``max_hamming`` and below ``ratio`` times the second
-    nearest; a keypoint wanted by several queries goes to the nearest.
+    A query keeps its nearest candidate if it is within ``max_hamming`` and below ``ratio`` times the second nearest;
+    of several queries for one keypoint the nearest wins.
     """
     if len(query) == 0:
         return EMPTY
     q, d, t = _sorted(query, distance, train)
     first = np.r_[True, q[1:] != q[:-1]]
-    second = np.where(np.r_[~first[1:], False], np.r_[d[1:], 0], np.inf)  # the next row, if it is of the same query
+    second = np.where(np.r_[~first[1:], False], np.r_[d[1:], 0], np.inf)  # the next row of the same query
     keep = first & (d <= max_hamming) & (d <= ratio * second)
     t, d, q = _sorted(t[keep], d[keep], q[keep])
     keep = np.r_[True, t[1:] != t[:-1]] if len(t) else np.zeros(0, bool)

@@ -10,17 +10,17 @@ from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.types import FloatArray, FrameFeatures, IntArray
 
 FAINT_SHARE = 0.5
-"""Share of the keypoints asked for below which fainter corners are looked for as well."""
+"""Share of the requested keypoints below which the image is searched again for fainter corners."""
 
 
 class OrbExtractor:
-    """Detects more corners than asked for, keeps the best of every cell, describes those."""
+    """Detects more corners than requested, keeps the best of every cell, and describes those."""
 
     def __init__(self, config: OrbConfig, camera: Camera) -> None:
         self.config = config
         self.camera = camera
         self._detectors = [self._detector(threshold) for threshold in (config.fast_threshold, config.fast_faint)]
-        self._one_at_a_time = threading.Lock()  # OpenCV does not say that two threads may share a detector
+        self._one_at_a_time = threading.Lock()  # OpenCV does not document detectors as thread-safe
 
     def _detector(self, fast_threshold: int) -> cv2.ORB:
         return cv2.ORB.create(
@@ -32,9 +32,9 @@ class OrbExtractor:
 
     def __call__(self, grey: np.ndarray) -> FrameFeatures:
         """Features of a grey image ``(H, W)`` uint8 with the lens distortion still in it."""
-        # All candidates are described, in one call: a second one would build the image pyramid again.
+        # All candidates are described, in one call: a second call would build the image pyramid again.
         with self._one_at_a_time:
-            for detector in self._detectors:  # the faint ones only where there is little else: bare walls, little light
+            for detector in self._detectors:  # faint corners only where there are few others: bare walls, low light
                 found, descriptors = detector.detectAndCompute(grey, None)
                 if len(found) >= FAINT_SHARE * self.config.features:
                     break
@@ -59,9 +59,9 @@ class OrbExtractor:
 
 
 def _in_image(uv: FloatArray, octave: IntArray, scale_factor: float, size: tuple[int, int]) -> FloatArray:
-    """Pixels of the image where OpenCV found keypoints ``(N, 2)`` on the images of its pyramid.
+    """Image pixels of the keypoints ``(N, 2)`` that OpenCV detects on its pyramid levels.
 
-    It multiplies by the scale alone: half a pixel of the level is left out, and that a level's size is a whole number.
+    OpenCV only multiplies by the scale; this adds the half-pixel offset of the level and the rounding of its size.
     """
     scale = scale_factor ** octave[:, None].astype(np.float64)
     whole = np.array(size, dtype=np.float64)
@@ -73,13 +73,13 @@ def _in_image(uv: FloatArray, octave: IntArray, scale_factor: float, size: tuple
 def spread(uv: FloatArray, score: FloatArray, width: int, height: int, wanted: int) -> IntArray:
     """Indices of about ``wanted`` keypoints, the strongest of every image cell first.
 
-    Cells are taken in rounds: every cell gives its best corner, then its second best, and so on, until there are
-    enough; within the last round the strongest win. Weakly textured parts of the image keep their few corners,
-    which hold the pose in rotation and depth.
+    Cells are visited in rounds: each contributes its best corner, then its second best, and so on, until there are
+    enough; in the last round the strongest win. Weakly textured regions keep their few corners, which constrain
+    rotation and depth.
     """
     if len(uv) <= wanted:
         return np.arange(len(uv))
-    side = np.sqrt(width * height / wanted * 4.0)  # four corners to a cell on average
+    side = np.sqrt(width * height / wanted * 4.0)  # four corners per cell on average
     columns = int(np.ceil(width / side))
     cell = (uv[:, 1] // side).astype(np.int64) * columns + (uv[:, 0] // side).astype(np.int64)
     order = np.lexsort((-score, cell))

@@ -1,33 +1,33 @@
-"""Images that repeat the one before them: a camera that hangs, a stuck encoder, a frame rate made higher by copies."""
+"""Images that repeat the one before them: a frozen camera, a stuck encoder, or a frame rate raised by copies."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 REPEATED = "the image repeats the one before"
-"""Reason of such a frame."""
+"""Reason in the frame's status."""
 
 _GRID = 4
 """Every fourth pixel of every fourth row is compared: 30 us a frame of 640x480."""
 _LEAST_CHANGE = 0.3
-"""Mean absolute difference [grey levels] from which on two images differ. Noise of one level alone makes 1.1, and over
-nine recordings, slow ones and bare walls among them, 0.99 is the least. A still picture that went through an MPEG-4
-encoder is never the same to the bit, but within 0.26, save for a key picture now and then."""
+"""Mean absolute difference [grey levels] above which two images differ. Sensor noise of one level gives 1.1; the
+minimum over nine recordings, including slow ones and bare walls, is 0.99. A still scene through an MPEG-4 encoder
+stays within 0.26, except for key frames."""
 _LONG_S = 0.3
-"""A stretch of so long is no copy made for the frame rate: 5 images a second shown at 30 repeat for 0.17 s."""
+"""Longer repeats are not copies for the frame rate: 5 images per second played at 30 repeat for 0.17 s."""
 
 
 class RepeatedImages:
-    """Recognises images without news; one instance follows one stream."""
+    """Detects repeated images; one instance per stream."""
 
     def __init__(self) -> None:
         self._reference: NDArray[np.int16] | None = None
-        """The present stretch's first image: against it a slow motion adds up."""
+        """First image of the current stretch, against which slow motion accumulates."""
         self._since_s = 0.0
         self._long: dict[float, float] = {}
-        """First stamp to last of the long stretches."""
+        """First to last stamp of long stretches."""
 
     def repeats(self, grey: NDArray[np.uint8], stamp_s: float) -> bool:
-        """Whether an image ``(H, W)`` shows what the images since some earlier one have shown."""
+        """Whether an image ``(H, W)`` repeats the current stretch."""
         grid = grey[::_GRID, ::_GRID].astype(np.int16)
         if self._reference is None or _change(self._reference, grid) >= _LEAST_CHANGE:
             self._reference, self._since_s = grid, stamp_s
@@ -37,7 +37,7 @@ class RepeatedImages:
         return True
 
     def warning(self) -> str | None:
-        """The long stretches in a sentence; None without any."""
+        """Warning about long stretches; None without any."""
         if not self._long:
             return None
         first, last = max(self._long.items(), key=lambda stretch: stretch[1] - stretch[0])

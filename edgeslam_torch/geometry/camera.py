@@ -15,8 +15,8 @@ from edgeslam_torch.geometry.lens import check_camera
 from edgeslam_torch.types import FloatArray
 
 GUESSED_FOCAL_SIGMA = 0.45
-"""Relative standard deviation of the guess 1.2 times the longer side: the root mean square of log(guess / calibrated)
-is 0.47 over nine cameras from 0.5 to 0.96 sides."""
+"""Relative standard deviation of guessing 1.2 times the longer side: the RMS of log(guess / calibrated) is 0.47 over
+nine cameras with 0.5 to 0.96 times their longer side."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,11 +36,12 @@ class Camera:
     cx: float
     cy: float
     distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
-    """k1 k2 p1 p2 k3, as OpenCV orders them."""
+    """k1 k2 p1 p2 k3, in OpenCV's order."""
     source: str = "given"
-    """Where the numbers come from, in words; goes into every summary."""
+    """Where the calibration comes from, in words; part of every summary."""
     focal_sigma: float = 0.0
-    """Relative standard deviation of the focal lengths; 0 for a calibration: its error is small beside the scale's."""
+    """Relative standard deviation of the focal lengths; 0 for a calibration, whose error is negligible against the
+    scale's."""
 
     def __post_init__(self) -> None:
         numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion, self.focal_sigma)
@@ -75,7 +76,7 @@ class Camera:
         )
 
     def undistort_points(self, uv: FloatArray) -> FloatArray:
-        """Pixels ``(N, 2)`` as the same camera without distortion would see them."""
+        """Undistorted pixels ``(N, 2)`` of distorted ones."""
         if not self.is_distorted or len(uv) == 0:
             return np.asarray(uv, dtype=np.float32)
         points = np.ascontiguousarray(uv, dtype=np.float64).reshape(-1, 1, 2)
@@ -84,7 +85,7 @@ class Camera:
         )
 
     def distort_points(self, uv: FloatArray) -> FloatArray:
-        """Pixels ``(N, 2)`` of the camera without distortion as the lens puts them; undoes `undistort_points`."""
+        """Distorted pixels ``(N, 2)`` of undistorted ones; inverse of `undistort_points`."""
         if not self.is_distorted or len(uv) == 0:
             return np.asarray(uv, dtype=np.float32)
         return self.project_through_lens(self.back_project(uv, np.ones(len(uv))))
@@ -96,7 +97,7 @@ class Camera:
         return cv2.remap(image, *self.undistortion_maps(), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
     def undistortion_maps(self) -> tuple[np.ndarray, np.ndarray]:
-        """Fixed-point maps for `cv2.remap` from the distorted to the undistorted image; made once per camera."""
+        """Fixed-point maps for `cv2.remap` from the distorted to the undistorted image; cached per camera."""
         return _undistortion_maps(self)
 
     def back_project(self, uv: FloatArray, depth_m: FloatArray) -> FloatArray:
@@ -142,7 +143,7 @@ def _undistortion_maps(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     K = camera.K
     maps = cv2.initUndistortRectifyMap(K, np.array(camera.distortion), None, K, size, cv2.CV_16SC2)
     for array in maps:
-        array.setflags(write=False)  # shared by all who ask
+        array.setflags(write=False)  # shared by all callers
     return maps[0], maps[1]
 
 

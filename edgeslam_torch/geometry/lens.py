@@ -1,4 +1,4 @@
-"""Whether a calibration can be a camera's: numbers mistyped, in other units, or fitted to too few pictures."""
+"""Plausibility of a calibration: mistyped numbers, wrong units, or a fit to too few pictures."""
 
 from typing import TYPE_CHECKING
 
@@ -11,22 +11,22 @@ if TYPE_CHECKING:
     from edgeslam_torch.geometry.camera import Camera
 
 FOCAL = (0.1, 20.0)
-"""Focal lengths over the image's longer side; 168 and 3 degrees of view."""
+"""Plausible focal lengths relative to the image's longer side: 168 and 3 degrees of view."""
 _ASPECT = 3.0
-"""Largest ratio of the two focal lengths."""
+"""Maximum ratio of the two focal lengths."""
 _MARGIN = 0.5
-"""Width or height of the image by which the principal point may lie outside."""
+"""How far outside the image the principal point may lie, relative to its width or height."""
 _MOST_PULLED = 0.5
-"""A pixel at the border, undistorted, is no nearer to the principal point than this share of its distance."""
+"""Minimum ratio of undistorted to distorted distance from the principal point, at the border."""
 _FARTHEST = 10.0
-"""And no farther than so many times its distance."""
+"""Maximum ratio of undistorted to distorted distance, at the border."""
 UNIQUE = 2 / 3
-"""Share of the way to the border up to which every pixel must have one undistorted place. A third of the image may lie
-beyond: real lenses modelled with k1 alone (EuRoC's with -0.3) turn back at 0.7 of the way to the corners."""
+"""Share of the distance to the border within which the distortion must be invertible. Not 1, because real lenses
+modelled with k1 alone (EuRoC's with -0.3) fold at 0.7 of the distance to the corners."""
 
 
 def check_camera(camera: "Camera") -> None:
-    """Whether images of this camera can be.
+    """Reject calibrations that no camera has.
 
     Raises:
         CalibrationError: If focal length, principal point or distortion are impossible.
@@ -48,9 +48,9 @@ def check_camera(camera: "Camera") -> None:
 
 
 def unique_share(camera: "Camera") -> float:
-    """Share of the way from the principal point to the border up to which every pixel has one undistorted place.
+    """Share of the distance from the principal point to the border within which the distortion is invertible.
 
-    1 when all have. Where the lens model turns back, two pixels share a ray, and beyond it no ray has a pixel.
+    1 if everywhere. Where the model folds, two pixels share a ray; beyond, rays have no pixel.
     """
     if not camera.is_distorted:
         return 1.0
@@ -65,13 +65,14 @@ def unique_share(camera: "Camera") -> float:
 
 
 def _sides(camera: "Camera") -> tuple[float, float, float, float]:
-    """Left, right, upper and lower border as seen from the principal point [px], one beyond it at least."""
+    """Left, right, upper and lower border relative to the principal point [px], at least one pixel."""
     right, down = max(camera.width - 0.5 - camera.cx, 1.0), max(camera.height - 0.5 - camera.cy, 1.0)
     return min(-0.5 - camera.cx, -1.0), right, min(-0.5 - camera.cy, -1.0), down
 
 
 def _border(camera: "Camera") -> FloatArray:
-    """Points ``(2, R)`` of the plane z = 1 that a lens without distortion puts on the border, corners among them."""
+    """Points ``(2, R)`` of the plane z = 1 that project to the image border without distortion, including the
+    corners."""
     left, right, up, down = _sides(camera)
     u, v = np.linspace(left, right, 25), np.linspace(up, down, 25)
     across = [np.stack([u, np.full_like(u, side)]) for side in (up, down)]
@@ -80,14 +81,14 @@ def _border(camera: "Camera") -> FloatArray:
 
 
 def _progress(camera: "Camera", xy: FloatArray) -> FloatArray:
-    """Where points ``(2, ...)`` of the plane z = 1 lie between the principal point, 0, and the border, 1."""
+    """Position of points ``(2, ...)`` of the plane z = 1 between the principal point (0) and the border (1)."""
     left, right, up, down = _sides(camera)
     u, v = camera.fx * xy[0], camera.fy * xy[1]
     return np.maximum(np.where(u > 0, u / right, u / left), np.where(v > 0, v / down, v / up))
 
 
 def _distorted(camera: "Camera", xy: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Where the lens puts points ``(2, ...)`` of the plane z = 1, and the determinant of that map's Jacobian."""
+    """Distorted points ``(2, ...)`` of the plane z = 1, and the determinant of the distortion's Jacobian."""
     k1, k2, p1, p2, k3 = camera.distortion
     x, y = xy
     s = x * x + y * y

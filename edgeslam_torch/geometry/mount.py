@@ -1,4 +1,4 @@
-"""Where the camera sits on the drone's body."""
+"""Camera mount on the drone's body."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from edgeslam_torch.types import FloatArray
 
 
 def camera_on_body(tilt_rad: float, forward_m: float) -> FloatArray:
-    """``T_b_c`` ``(4, 4)`` of a forward camera that looks down by ``tilt_rad``.
+    """``T_b_c`` ``(4, 4)`` of a forward-looking camera tilted down by ``tilt_rad``.
 
     Example:
         >>> bool(np.allclose(camera_on_body(0.0, 0.0)[:3, 2], [1.0, 0.0, 0.0]))  # optical axis along body x

@@ -1,7 +1,7 @@
 """Rigid motions as ``(4, 4)`` matrices in numpy float64; tangents ``xi = (rho, phi)``, applied on the left.
 
-The torch solver uses the same order (kornia's); these few functions serve the per-frame path, where a numpy call
-costs a tenth of a torch call, and ten operations on Python's own floats cost what one numpy call does.
+Same order as the torch solver and kornia. These functions serve the per-frame path, where a numpy call costs a tenth
+of a torch call and ten operations on Python floats cost one numpy call.
 """
 
 import math
@@ -78,12 +78,12 @@ def inverse(T: FloatArray) -> FloatArray:
 
 
 def transform(T: FloatArray, p: FloatArray) -> FloatArray:
-    """Points ``(N, 3)`` moved by ``T`` ``(4, 4)``."""
+    """Points ``(N, 3)`` transformed by ``T`` ``(4, 4)``."""
     return p @ T[:3, :3].T + T[:3, 3]
 
 
 def orthonormalised(T: FloatArray) -> FloatArray:
-    """``T`` with its rotation projected to the nearest orthonormal one; long products drift without it."""
+    """``T`` with its rotation projected to the nearest orthonormal matrix; long products drift without it."""
     out = T.copy()
     U, _, V_t = np.linalg.svd(T[:3, :3])
     out[:3, :3] = U @ V_t

@@ -1,4 +1,4 @@
-"""SE(3) in torch, batched and differentiable; the same order and side as `geometry.se3`."""
+"""SE(3) in torch, batched and differentiable; same conventions as `geometry.se3`."""
 
 import torch
 from torch import Tensor

@@ -1,4 +1,4 @@
-"""Points from two views, paper eq. (6): linear start, then the checks that make a point worth keeping."""
+"""Points from two views, paper eq. (6): linear triangulation and parallax."""
 
 import numpy as np
 
@@ -32,7 +32,7 @@ def triangulate(ray_i: FloatArray, ray_j: FloatArray, T_j_i: FloatArray) -> Floa
 
 
 def parallax(ray_i: FloatArray, ray_j: FloatArray, R_j_i: FloatArray) -> FloatArray:
-    """Angle [rad] between matched rays once the rotation is taken out, shape ``(N,)``."""
+    """Angle [rad] between matched rays after removing the rotation, shape ``(N,)``."""
     a = (R_j_i @ ray_i[..., None])[..., 0]
     sine = np.linalg.norm(np.cross(a, ray_j), axis=-1)
     return np.arctan2(sine, (a * ray_j).sum(-1))

@@ -223,7 +223,7 @@ def test_download_says_how_far_a_file_can_be_trusted(
     monkeypatch.setattr(module, "_fetch", fetch)
     name = "mobilenet-nnconv5dw-skipadd-pruned"
     run("weights", "download", name)
-    assert "trusted because it is the first" in capsys.readouterr().out
+    assert "trusted on first use" in capsys.readouterr().out
     run("weights", "download", name)
     assert "the same as at the first download" in capsys.readouterr().out
     content += b"\0"

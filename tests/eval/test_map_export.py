@@ -171,7 +171,7 @@ def test_unknown_units_are_said(
     if scale is not None:
         (tmp_path / "a" / "summary.json").write_text(f'{{"scale": {scale}}}')
     assert export(tmp_path / "a", "--format", "ply") == 0
-    assert "nothing in the folder tells" in capsys.readouterr().out
+    assert "the folder does not say" in capsys.readouterr().out
 
 
 def test_empty_map_is_said(run_folder: Callable[..., Path], tmp_path: Path) -> None:

@@ -116,7 +116,7 @@ def test_other_weights_are_refused(finetune: Finetune, recordings: Path, tmp_pat
     save_checkpoint(network, METADATA, tmp_path / "other.safetensors")
     refused(finetune("kitchen", "--weights", str(tmp_path / "other.safetensors")), "weights: ")
     own = tmp_path / "out" / "weights.safetensors"
-    refused(finetune("kitchen", "--weights", str(own), "--overwrite"), "would be replaced")
+    refused(finetune("kitchen", "--weights", str(own), "--overwrite"), "would be overwritten")
     assert own.is_file()
 
 
@@ -192,7 +192,7 @@ def test_files_that_no_finetuning_wrote_are_left_alone(finetune: Finetune, recor
     assert contents(tmp_path / "out") == {"weights.safetensors": b"somebody's"}
     own = shutil.copytree(recordings / "hall", tmp_path / "hall")
     before = contents(own)
-    refused(finetune(str(own), out=own), "is to be learnt from; give another --out")
+    refused(finetune(str(own), out=own), "is a training folder; give another --out")
     refused(finetune("kitchen", out=own), "holds rgb.txt")
     assert contents(own) == before
 
@@ -253,7 +253,7 @@ def test_full_disk_is_one_line_and_goes_on_later(
         (("--batch", "1000000"), "--batch must be at most 1024"),
         (("--threads", "0"), "--threads must be 1 to 256"),
         (("--threads", "100000"), "--threads must be 1 to 256"),
-        (("--validate", "kitchen"), "is learnt from, so it cannot tell"),
+        (("--validate", "kitchen"), "is used for training and cannot validate"),
         (("--max-frames", "0"), "--max-frames must be at least 1"),
         (("gone",), "gone: no such recording"),
         (("--validate", "start.safetensors"), "no recording with depth"),

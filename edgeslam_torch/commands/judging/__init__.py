@@ -1,1 +1,1 @@
-"""The commands that judge: `eval`, `bench`, `ablation`, `judge`."""
+"""Evaluation commands: `eval`, `bench`, `ablation`, `judge`."""

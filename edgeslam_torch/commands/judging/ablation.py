@@ -1,4 +1,4 @@
-"""What each loss does: the benchmark with one thing changed at a time, as one table."""
+"""Ablation: the benchmark with one change at a time, as one table."""
 
 import argparse
 import os
@@ -20,13 +20,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--max-frames", type=int, metavar="N", help="stop every run after N frames")
     parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="change all rows")
     parser.add_argument(
-        "--out", type=Path, metavar="DIR", help="folder for the results; runs that it holds already are not repeated"
+        "--out", type=Path, metavar="DIR", help="folder for the results; finished runs are not repeated"
     )
     parser.add_argument("--markdown", type=Path, metavar="FILE", help="also write the tables here")
 
 
 def main(args: argparse.Namespace) -> int:
-    """Fly, finish in every way, print the table."""
+    """Run all variants and print the table."""
     from edgeslam_torch.eval.benchmark.ablation import AblationSettings, markdown_ablation, run_ablation
 
     data = args.data or (Path(os.environ["EDGESLAM_DATA"]) if os.environ.get("EDGESLAM_DATA") else None)

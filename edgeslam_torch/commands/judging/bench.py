@@ -1,4 +1,4 @@
-"""Accuracy and speed of the real job on the recordings at hand, beside what other systems score."""
+"""Accuracy and speed on recordings, beside published figures of other systems."""
 
 import argparse
 import json
@@ -20,7 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--max-frames", type=int, metavar="N", help="stop every run after N frames")
     parser.add_argument("--mode", choices=("offline", "realtime"), default="offline")
     parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="change one setting")
-    parser.add_argument("--no-micro", action="store_true", help="leave out the solver's and the depth network's times")
+    parser.add_argument("--no-micro", action="store_true", help="omit the times of solver and depth network")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the runs (default: runs/bench-TIME)")
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write the results here")
     parser.add_argument("--markdown", type=Path, metavar="FILE", help="also write the tables here")

@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--depth-gt", type=Path, help="data set whose depth maps judge the map (default: --groundtruth)"
     )
-    parser.add_argument("--max-dt", type=float, default=0.02, help="largest time between matched poses [s]")
+    parser.add_argument("--max-dt", type=float, default=0.02, help="maximum time between matched poses [s]")
     parser.add_argument("--offset", type=float, default=0.0, help="added to the estimated stamps [s]")
     parser.add_argument(
         "--depth-maps",
@@ -44,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--common-frames",
         action="store_true",
-        help="also judge all of them on the frames that every one has (a system that starts late has fewer)",
+        help="also evaluate all of them on their common frames (a system that starts late has fewer)",
     )
     parser.add_argument("--json", type=Path, help="write all figures here")
     parser.add_argument("--markdown", type=Path, help="write the tables here")
@@ -95,7 +95,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _told_apart(scores: "list[RunScore]", runs: list[Path]) -> "list[RunScore]":
-    """Scores by their paths where the folders' names alone are the same."""
+    """Scores by their paths if folder names are ambiguous."""
     if len({s.name for s in scores}) == len(scores):
         return scores
     return [replace(score, name=str(run)) for score, run in zip(scores, runs, strict=True)]
@@ -159,7 +159,7 @@ def _plot(folder: Path, args: argparse.Namespace, scores: list[Any]) -> None:
 
 
 def _details(score: Any) -> str:
-    """What one run's table has no room for."""
+    """Details that do not fit into the table of one run."""
     found = score.sim3
     lines = [
         f"alignment none {score.ate_raw_m:.4f} m, SE(3) {score.ate_se3_m:.4f} m, Sim(3) {score.ate_sim3_m:.4f} m "

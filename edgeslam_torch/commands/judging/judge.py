@@ -1,4 +1,4 @@
-"""Every recording, its variants and simulated flights, each in its own process, as one table with bars."""
+"""Every recording, its variants and simulated flights, each in its own process, as one table with limits."""
 
 import argparse
 import json
@@ -32,17 +32,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--change", action="append", default=[], metavar="SECTION.KEY=VALUE", help="change one setting of every run"
     )
     parser.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="results; cells that it holds already are not repeated"
+        "--out", type=Path, required=True, metavar="DIR", help="results; finished cells are not repeated"
     )
-    parser.add_argument(
-        "--flights", type=Path, metavar="DIR", help="simulated flights, kept for other judges (default: in --out)"
-    )
-    parser.add_argument("--bars", type=Path, metavar="FILE", help="limits to be kept (default: the project's own)")
+    parser.add_argument("--flights", type=Path, metavar="DIR", help="cache of simulated flights (default: in --out)")
+    parser.add_argument("--bars", type=Path, metavar="FILE", help="limits to check (default: the project's own)")
     parser.add_argument("--against", type=Path, metavar="DIR", help="also compare with another judge's --out")
 
 
 def main(args: argparse.Namespace) -> int:
-    """Run what is missing, print and write the table; 1 when a cell has no result."""
+    """Run the missing cells, print and write the table; 1 when a cell has no result."""
     from edgeslam_torch.eval.judge.against import RECORD, markdown_against, read_record
     from edgeslam_torch.eval.judge.bars import BARS, read_bars
     from edgeslam_torch.eval.judge.cells import list_cells
