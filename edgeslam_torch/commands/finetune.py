@@ -43,8 +43,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     again.add_argument(
         "--resume",
         action="store_true",
-        help="resume in --out, also at another --lr; an error if there is nothing to resume (without this option: resume "
-        "if data, weights and settings are the same; more --steps are allowed)",
+        help="resume in --out, also at another --lr; an error if there is nothing to resume (without this option: "
+        "resume if data, weights and settings are the same; more --steps are allowed)",
     )
     again.add_argument("--overwrite", action="store_true", help="replace an older fine-tuning in --out")
     parser.add_argument("--weights", type=Path, help="weights to start from (default: the shipped ones)")
