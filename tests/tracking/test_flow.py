@@ -243,3 +243,41 @@ def test_keypoints_are_chosen_anew_when_the_map_changes(scene):
     ids = scene.map.anchors.add(p_w, scene.keyframe.words[free], 0, False, np.zeros((50, 3), np.uint8))
     scene.map.observe(scene.keyframe, free, ids)
     assert np.isin(ids, tracker.follow(scene.template, scene.grey, at).track.matched_anchor).sum() > 40
+
+
+def test_what_does_not_look_alike_was_not_found(scene, rng):
+    """The left half of the frame is noise: flow ends somewhere there too, but nothing of it counts as found."""
+    image = scene.grey.copy()
+    image[:, :160] = rng.integers(0, 256, (240, 160), dtype=np.uint8)
+    followed = scene.tracker(min_share=0.2, points=1000).follow(scene.template, image, scene.keyframe.T_c_w)
+    looked_for = scene.keyframe.features.uv[scene.keyframe.keypoints_with_anchor()]
+    found = scene.keyframe.features.uv[followed.track.matched_keypoint]
+    assert (found[:, 0] > 170).sum() > 0.9 * (looked_for[:, 0] > 170).sum()
+    assert (found[:, 0] < 150).sum() < 0.1 * (looked_for[:, 0] < 150).sum()
+
+
+def test_flow_weighs_keypoints_by_their_level(scene):
+    """The same image again: every pixel fits, and keypoints of level 3 tell the pose 1.728 times less precisely."""
+    covariances = []
+    for octave in (0, 3):
+        template = replace(scene.template, octave=np.full_like(scene.template.octave, octave))
+        followed = scene.tracker().follow(template, scene.grey, scene.keyframe.T_c_w)
+        assert followed.track.inliers == followed.track.matches
+        covariances.append(followed.track.covariance)
+    np.testing.assert_allclose(covariances[1], 1.2**6 * covariances[0], rtol=1e-3, atol=1e-12)
+
+
+@pytest.mark.parametrize(("off_px", "shows_it"), [(1.0, True), (3.0, False)])
+def test_a_free_keypoint_shows_an_anchor_where_flow_puts_it_and_not_beside(scene, off_px, shows_it):
+    """At level 0, 1.5 px count as the same place."""
+    all_found = scene.tracker().follow(scene.template, scene.grey, scene.keyframe.T_c_w)
+    one, none = np.array([5]), np.zeros(0, np.int64)
+    anchor = all_found.track.anchor[one]
+    found = replace(all_found, track=replace(all_found.track, anchor=anchor), uv=all_found.uv[one], octave=0 * one)
+    features = OrbExtractor(ORB, CAMERA)(scene.grey)
+    uv = np.full_like(features.uv, -1000.0)
+    uv[7] = found.uv[0] + np.float32([off_px, 0.0])
+    view = make_view(replace(features, uv=uv, octave=np.zeros_like(features.octave)), ORB.scale_factor)
+    joined = join(Track(np.eye(4), none, none, none, none, np.eye(6)), found, view, ORB.scale_factor)
+    assert joined.keypoint.tolist() == ([7] if shows_it else [])
+    assert joined.anchor.tolist() == (anchor.tolist() if shows_it else [])

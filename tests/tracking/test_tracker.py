@@ -7,6 +7,7 @@ from point_map import CAMERA, SCALE_FACTOR, PointMap, small_motion
 from edgeslam_torch.config import OrbConfig, TrackingConfig
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.map.projection import project_anchors
+from edgeslam_torch.optim.problem import PosePrior
 from edgeslam_torch.tracking.relocaliser import match_keyframe
 from edgeslam_torch.tracking.tracker import Tracker, make_view, median_parallax
 from edgeslam_torch.types import FrameFeatures
@@ -119,3 +120,64 @@ def test_median_parallax_worked_by_hand():
     T_c_w[0, 3] = -2.0  # camera 2 m to the right
     assert median_parallax(p_w, T_c_w, np.zeros(3)) == pytest.approx(np.pi / 4)
     assert median_parallax(p_w[:0], T_c_w, np.zeros(3)) == 0.0
+
+
+def test_median_parallax_counts_from_where_the_camera_is():
+    """A point 1 m right and 2 m ahead: straight ahead of a camera 1 m right, not of one 1 m left."""
+    p_w = np.array([[1.0, 0.0, 2.0]] * 3)
+    for x, angle in ((1.0, np.arctan2(1.0, 2.0)), (-1.0, np.arctan2(2.0, 2.0) - np.arctan2(1.0, 2.0))):
+        T_c_w = np.eye(4)
+        T_c_w[0, 3] = -x
+        assert median_parallax(p_w, T_c_w, np.zeros(3)) == pytest.approx(angle)
+
+
+def test_an_anchor_is_expected_at_the_level_that_its_distance_tells(points):
+    """Seen at level 0 from its reference distance; at 1 / 1.44 of that it fills level 2."""
+    anchors = points.map.anchors
+    ids = np.flatnonzero(anchors.alive)
+    T = points.world.T_c_w[3]
+    distance = np.linalg.norm(se3.transform(T, anchors.p_w[ids]), axis=1)
+    for level, factor in ((0, 1.0), (2, SCALE_FACTOR**2), (5, SCALE_FACTOR**5)):
+        anchors.max_distance[ids] = factor * distance
+        seen = project_anchors(anchors, ids, T, CAMERA, SCALE_FACTOR, 8)
+        assert len(seen.anchor) > 50
+        assert (seen.octave == level).all()
+    anchors.max_distance[ids] = distance / SCALE_FACTOR**4  # four levels beyond the coarsest of the detector: too far
+    assert len(project_anchors(anchors, ids, T, CAMERA, SCALE_FACTOR, 8).anchor) == 0
+
+
+@pytest.mark.parametrize(("off_deg", "expected"), [(0.0, True), (55.0, True), (65.0, False), (180.0, False)])
+def test_an_anchor_is_expected_within_60_degrees_of_how_it_was_seen(points, off_deg, expected):
+    anchors = points.map.anchors
+    ids = np.flatnonzero(anchors.alive)
+    T = points.world.T_c_w[3]
+    ray = anchors.p_w[ids] - se3.inverse(T)[:3, 3]
+    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    side = np.cross(ray, [0.0, 0.0, 1.0])
+    side /= np.linalg.norm(side, axis=1, keepdims=True)
+    angle = np.deg2rad(off_deg)
+    anchors.normal[ids] = np.cos(angle) * ray + np.sin(angle) * side
+    anchors.max_distance[ids] = np.linalg.norm(anchors.p_w[ids] - se3.inverse(T)[:3, 3], axis=1)
+    assert (len(project_anchors(anchors, ids, T, CAMERA, SCALE_FACTOR, 8).anchor) > 50) == expected
+
+
+def test_on_guessed_depths_the_expected_motion_holds_the_pose(points, rng):
+    """Every depth is a guess: images hardly tell a turn from a shift, and what accelerations allow has a say."""
+    anchors = points.map.anchors
+    ids = np.flatnonzero(anchors.alive)
+    host = points.keyframes[3]
+    anchors.from_depth[ids] = True
+    z = se3.transform(host.T_c_w, anchors.p_w[ids])[:, 2]
+    anchors.rest_on_prior(ids, host.id, host.centre_w, np.stack([1.0 / z, 0.5 / np.abs(z)], axis=1))
+    T = points.world.T_c_w[3]
+    sigma = np.array([5e-4] * 3 + [1e-2] * 3)
+    expected = PosePrior(0, T, np.diag(sigma**-2))
+    tracker, view = tracker_of(points), view_of(points, 3, rng, 0.5)
+    shift = se3.exp(np.array([0.05, 0.0, 0.0, 0.0, 0.0, 0.0])) @ T
+    held, free = (tracker.track(view, shift, recent(points, 3), e) for e in (expected, None))
+    assert np.sqrt(np.diag(held.covariance))[:3].max() <= 5.01e-4
+    assert np.sqrt(np.diag(free.covariance))[:3].max() > 1.5e-3
+    assert pose_error(points, 3, held.T_c_w)[0] < 2e-3
+    anchors.from_depth[ids] = False
+    sure = tracker.track(view, shift, recent(points, 3), PosePrior(0, shift, np.diag(sigma**-2)))
+    assert pose_error(points, 3, sure.T_c_w)[0] < 0.01, "triangulated points need no such help"
