@@ -34,7 +34,7 @@ class MotionModel:
 
     def predict(self, stamp_s: float) -> FloatArray:
         """``T_c_w`` at a stamp, at constant velocity."""
-        # Every product doubles a rotation's rounding error; left alone it reaches centimetres in forty frames.
+        # Each pose is a product with the one before: projected back, rounding does not add up over a flight.
         return se3.orthonormalised(se3.exp(self._velocity * (stamp_s - self.stamp_s)) @ self.T_c_w)
 
     def expectation(self, stamp_s: float, T_predicted: FloatArray, metres_per_unit: float) -> PosePrior:

@@ -101,3 +101,27 @@ def test_sticks_that_nobody_pushes_are_left_alone_while_the_program_hangs(quick)
     assert [guard.hear(), guard.hear()] == [CENTRED, LAND]  # the landing's own
     os.close(guard.pipe)
     assert guard.is_done()
+
+
+class Loud:
+    """A socket in whose answers somebody says ok at once, again and again."""
+
+    def __init__(self, sender):
+        self.sender, self.sent = sender, []
+
+    def settimeout(self, seconds):
+        pass
+
+    def sendto(self, packet, address):
+        self.sent.append(packet)
+
+    def recvfrom(self, size):
+        return b"ok", (self.sender, 4000)
+
+
+@pytest.mark.parametrize(("sender", "asked"), [("192.168.10.1", 4), ("192.168.10.2", 20)])
+def test_only_the_drone_itself_ends_the_asking_for_a_landing(quick, sender, asked):
+    """Its ok counts from the fourth request on; that of anybody else in its Wi-Fi never."""
+    commands = Loud(sender)
+    tello_guard.land(commands, ("192.168.10.1", 8889))
+    assert commands.sent.count(LAND) == commands.sent.count(CENTRED) == asked

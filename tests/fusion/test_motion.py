@@ -297,6 +297,18 @@ def test_filter_follows_the_flight_in_metres(rng, swinging, replay):
     assert fusion.statistics()["ekf visual accepted"] > 100
 
 
+@pytest.mark.parametrize("noise_m", [0.003, 0.02])
+def test_filter_takes_vision_for_as_noisy_as_it_is(rng, swinging, replay, noise_m):
+    """Where the stated sigma is right, 95 % of the increments pass the gate, whatever the noise."""
+    motion = swinging(30.0)
+    samples = simulate(rng, motion.stamps_s, motion.T_w_c, T_B_C).samples()
+    fusion = MotionFusion(FusionConfig(), T_B_C)
+    replay(fusion, motion, motion.in_gauge(rng, noise_m=noise_m), samples)
+    told = fusion.statistics()
+    assert told["ekf visual accepted"] > 100
+    assert told.get("ekf visual refused", 0) < 0.1 * told["ekf visual accepted"]
+
+
 @pytest.mark.parametrize("true_tilt_deg", [12.0, 25.0])
 def test_tilt_of_the_camera_is_estimated_from_the_flight(rng, swinging, replay, true_tilt_deg):
     """Assumed 12 degrees; the drone carries its camera differently."""

@@ -54,3 +54,17 @@ def test_expectation_grows_with_the_square_of_time_and_is_in_map_units():
     metres = model.expectation(10.6, at(1.5), 1.0).information
     assert np.allclose(np.sqrt(np.diag(near)[:3] / np.diag(metres)[:3]), 2.0)  # a unit is two metres
     assert np.allclose(np.diag(near)[3:], np.diag(metres)[3:])
+
+
+def test_predictions_that_become_poses_stay_rigid_motions():
+    """Each pose comes from the one before: an error that doubled would be as large as the pose after fifty."""
+    model = MotionModel(np.eye(4))
+    model.stamp_s = 0.0
+    T = se3.exp(np.array([0.02, 0.01, 0.0, 0.03, -0.02, 0.04]))
+    for i in range(1, 81):
+        model.move(0.1 * i, T)
+        model.stamp_s = 0.1 * i
+        T = model.predict(0.1 * (i + 1))
+        np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
+    steady = se3.exp(81 * np.array([0.02, 0.01, 0.0, 0.03, -0.02, 0.04]))
+    np.testing.assert_allclose(T, steady, atol=1e-6)

@@ -111,6 +111,29 @@ def test_every_term_is_smallest_at_the_true_depth(sequence: PosedSequence) -> No
     assert at[1.0]["points"].max() < 0.05
 
 
+@pytest.mark.parametrize("k", range(6))
+def test_what_is_drawn_is_the_run_in_metres(sequence: PosedSequence, k: int) -> None:
+    """Brought to metres, baselines and depths are twice as long; points lie where the zoom puts them."""
+    slot = Slot(3, 0, k)
+    batches = [SelfSupervised([sequence], METADATA, log_scale=[s]).draw([slot]) for s in (0.0, float(np.log(2.0)))]
+    units, metres = ({name: value[0].double() for name, value in b.items() if name != "image"} for b in batches)
+    known = units["known"].bool()
+    torch.testing.assert_close(metres["T_j_i"][:, :3, 3], 2.0 * units["T_j_i"][:, :3, 3])
+    torch.testing.assert_close(metres["T_j_i"][:, :3, :3], units["T_j_i"][:, :3, :3])
+    longer = (metres["log_z"] - units["log_z"])[known].numpy()
+    np.testing.assert_allclose(longer, np.log(2.0), atol=1e-5)
+    # The same points seen by the view itself: one of its own projections for each, mirrored or not.
+    rng = slot.rng()
+    view = sequence.views[sequence.usable[int(rng.integers(len(sequence.usable)))]]
+    rays = np.column_stack([view.uv, np.ones(len(view.uv))]) @ np.linalg.inv(view.K).T
+    K = units["K"].numpy()
+    seen = rays[:, :2] * K[[0, 1], [0, 1]] + K[:2, 2]
+    mirrored = rays[:, :2] * [-K[0, 0], K[1, 1]] + K[:2, 2]
+    drawn = units["uv"][known].numpy()
+    off = [np.abs(drawn[:, None] - p[None]).max(2).min(1).max() for p in (seen, mirrored)]
+    assert min(off) < 0.01
+
+
 def test_batch_follows_the_slot_alone(sequence: PosedSequence) -> None:
     signal = SelfSupervised([sequence], METADATA)
     both = signal.draw([Slot(1, 7, 0), Slot(1, 7, 1)])

@@ -5,6 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.inputs.dataset import open_dataset
@@ -103,6 +104,20 @@ def test_points_that_no_depth_map_sees_are_not_judged_but_counted(truth: Surface
 def test_points_behind_the_surface_are_judged(truth: SurfaceTruth) -> None:
     found = score_map(np.array([[0.0, 0.0, FAR_M + 1.0]] * 20), Alignment(), truth)
     assert found.judged_share == 1.0 and found.median_m > 0.9
+
+
+def test_a_map_that_hides_a_point_says_nothing_about_it() -> None:
+    """A wall at 3 m, a door before it in one depth map of three: a point 40 cm before the wall is 40 cm off."""
+    wall, door = np.full((30, 40), 3.0, np.float32), np.full((30, 40), 1.0, np.float32)
+    camera = Camera(40, 30, 32.0, 32.0, 19.5, 14.5)
+    surface = SurfaceTruth(cKDTree(np.zeros((1, 3))), np.zeros((0, 3)), np.stack([wall, wall, door]), EYES, camera)
+    before, on_door, behind = surface.single_map_distance(np.array([[0, 0, 2.6], [0, 0, 1.0], [0, 0, 5.0]]))
+    assert before == pytest.approx(0.4, abs=0.01)
+    assert on_door == pytest.approx(2.0, abs=0.05)  # median of 2, 2 and 0 m
+    assert behind == pytest.approx(2.0, abs=0.05)  # hidden in all: the least distance to any
+
+
+EYES = np.tile(np.eye(4), (3, 1, 1))
 
 
 def test_map_follows_the_trajectorys_alignment(truth: SurfaceTruth) -> None:
