@@ -22,16 +22,16 @@ class Reduction(StrEnum):
     """How elements become a scalar."""
 
     SUM = "sum"
-    """The paper's."""
+    """Sum over valid elements, as in the paper."""
     MEAN = "mean"
-    """Over valid elements, so that masking does not lower the loss."""
+    """Mean over valid elements, so that masking does not lower the loss."""
 
 
 class ResidualLoss(nn.Module):
     """Base of the losses: a subclass writes `residuals`, `forward` follows from it."""
 
     def __init__(self, reduction: Reduction = Reduction.MEAN, kernel: Kernel = Kernel.L2, delta: float = 1.0) -> None:
-        """Choose the scalar.
+        """Choose how residuals are reduced.
 
         Args:
             reduction: Sum, or mean over the valid elements.
@@ -102,5 +102,5 @@ def project(p_c: Tensor, K: Tensor, min_depth: float = 1e-6) -> tuple[Tensor, Te
 
 
 def move(T: Tensor, p: Tensor) -> Tensor:
-    """Points ``(..., N, 3)`` moved by rigid motions ``(..., 4, 4)``."""
+    """Points ``(..., N, 3)`` transformed by rigid motions ``(..., 4, 4)``."""
     return p @ T[..., :3, :3].mT + T[..., None, :3, 3]

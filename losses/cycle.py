@@ -24,13 +24,13 @@ class CycleForm(StrEnum):
     PIXEL = "pixel"
     """Paper eq. (23): the pixel after the round trip against the pixel before it [px]."""
     PARALLAX = "parallax"
-    """The same divided by the parallax ``f |t| / z`` that the edge should show; no unit."""
+    """The same divided by the expected parallax ``f |t| / z``; no unit."""
     RELATIVE_DEPTH = "relative depth"
     """``(z - d_j) / (z + d_j)`` of the depth predicted in frame j; no unit."""
 
 
 class CycleLoss(ResidualLoss):
-    """Edge pixels sent from frame i to j and back.
+    """Round trip of edge pixels from frame i to frame j and back.
 
     Note:
         The paper's pixel form is exactly zero for a camera that does not move, whatever the depths
@@ -53,16 +53,16 @@ class CycleLoss(ResidualLoss):
             reduction: Sum (the paper's) or mean over valid edges.
             kernel: Robust kernel.
             delta: Where it departs from least squares, in the residual's unit.
-            max_relative: ``(z - d_j) / (z + d_j)`` above which frame j sees something nearer: occluded. Infinite
-                with the paper's literal loss, which masks nothing.
-            min_parallax_px: Edges that should move less are not used by ``PARALLAX``.
+            max_relative: ``(z - d_j) / (z + d_j)`` above which the pixel is occluded in frame j. Infinite in the
+                paper's form, which masks nothing.
+            min_parallax_px: Minimum expected parallax of an edge in the form ``PARALLAX``.
         """
         super().__init__(reduction, kernel, delta)
         self.form, self.max_relative, self.min_parallax_px = CycleForm(form), max_relative, min_parallax_px
 
     @classmethod
     def literal(cls) -> "CycleLoss":
-        """The paper's loss to the letter: pixels, summed, nothing masked that can be computed."""
+        """The paper's loss as printed: pixels, summed, without occlusion masks."""
         return cls(CycleForm.PIXEL, Reduction.SUM, max_relative=float("inf"))
 
     def residuals(  # type: ignore[override]
@@ -105,12 +105,12 @@ class CycleLoss(ResidualLoss):
 
 
 def expected_parallax_px(T_j_i: Tensor, depth_i: Tensor, K: Tensor) -> Tensor:
-    """Pixels ``(N,)`` that a baseline moves points at ``depth_i (N,)``, ``f |t| / z``."""
+    """Expected parallax ``f |t| / z`` of points at ``depth_i (N,)`` [px], ``(N,)``."""
     return K[0, 0] * (T_j_i[:3, 3].square().sum() + 1e-30).sqrt() / depth_i.clamp_min(1e-6)
 
 
 def sample_depth(depth: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
-    """Bilinear depths ``(N,)`` of a map ``(H, W)`` at pixels ``(N, 2)``, and which lie inside the map."""
+    """Bilinear depths ``(N,)`` of a map ``(H, W)`` at pixels ``(N, 2)``, and which pixels lie inside."""
     H, W = depth.shape
     size = torch.tensor((W - 1, H - 1), dtype=uv.dtype, device=uv.device)
     inside = ((uv >= 0) & (uv <= size)).all(-1)

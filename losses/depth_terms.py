@@ -1,5 +1,4 @@
-"""Training-only depth terms: every one takes log depth ``(B, 1, H, W)`` and a mask, and returns one value
-per image.
+"""Training-only depth terms: each takes log depth ``(B, 1, H, W)`` and a mask, and returns one value per image.
 
 Per-image means (not means over the batch's pixels) make the loss of a batch the mean of its images'
 losses, so the
@@ -18,7 +17,7 @@ def masked_mean(x: Tensor, mask: Tensor) -> Tensor:
 
 
 class MaskedL1(nn.Module):
-    """Mean absolute difference of log depth: a relative error that weighs near and far alike."""
+    """Mean absolute difference of log depth: a relative error, weighted equally near and far."""
 
     def residuals(self, log_depth: Tensor, log_target: Tensor) -> Tensor:
         """Predicted minus observed log depth, ``(B, 1, H, W)``."""
@@ -78,7 +77,7 @@ class GradientMatching(nn.Module):
 
     def forward(self, log_depth: Tensor, log_target: Tensor, mask: Tensor) -> Tensor:
         """``(B,)``."""
-        # Invalid targets may be anything, NaN included: zero them before differences mix them in.
+        # Invalid targets may be NaN: set them to zero before differences spread them.
         r = torch.where(mask, log_depth - log_target, torch.zeros_like(log_depth))
         total = r.new_zeros(r.shape[0])
         for scale in range(self.scales):
@@ -94,7 +93,7 @@ class GradientMatching(nn.Module):
 class LaplaceNll(nn.Module):
     """Negative log likelihood of a Laplace distribution: trains the uncertainty head.
 
-    The residual is a constant here, so that the head describes the error and does not excuse it.
+    The residual is detached, so that the head describes the error without reducing its penalty.
     """
 
     def forward(self, log_sigma: Tensor, log_depth: Tensor, log_target: Tensor, mask: Tensor) -> Tensor:

@@ -1,7 +1,7 @@
-"""Distance of a projected edge pixel to the edge it should lie on, along that edge's normal.
+"""Distance of a projected edge pixel from its partner edge, along that edge's normal.
 
-Not in the paper. An edge tells nothing about motion along itself, so only the component across it counts; unlike
-the cycle, this observes the pose (REVO, SVO's edgelets). All pairs of a window are evaluated at once, with their
+Not in the paper. An edge does not constrain motion along itself, so only the component across it counts; unlike the
+cycle, this constrains the pose (REVO, SVO's edgelets). All pairs of a window are evaluated at once, with their
 derivatives by the *relative* pose (six columns) and the inverse depth (one); the solver maps the former to the two
 poses by the adjoint.
 """
@@ -60,8 +60,8 @@ def pair_geometry(Rt: Tensor, ray: Tensor, inverse_depth: Tensor) -> PairGeometr
         ray: ``(2, ...)`` normalised image coordinates in the host frame.
         inverse_depth: ``(...)`` in the host frame.
     """
-    # The point times its inverse depth: no division by it, so infinity is an ordinary value.
-    # Products and sums apart: torch's addcmul is ten times slower where an argument is broadcast along the last axis.
+    # The point times its inverse depth, so that points at infinity need no special case.
+    # Separate products and sums: torch's addcmul is ten times slower if an argument is broadcast along the last axis.
     q = Rt[:, 0] * ray[0] + Rt[:, 1] * ray[1] + Rt[:, 3] * inverse_depth + Rt[:, 2]
     front = q[2] > 1e-6
     scale = torch.where(front, q[2], 1.0).reciprocal()
@@ -154,7 +154,7 @@ def round_trip_jacobians(
     inverse_depth_j: Tensor,
     K: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The paper's pixel cycle, eqs. (17)-(23), with the target's depth held, and its derivatives.
+    """The paper's pixel cycle, eqs. (17)-(23), with the target's depth held constant, and its derivatives.
 
     Args:
         g: Pairs in their target frames.
@@ -192,7 +192,8 @@ def round_trip_jacobians(
 
 
 def _way_back(g: PairGeometry, Rt: Tensor, inverse_depth_j: Tensor) -> tuple[Tensor, Tensor]:
-    """Points at the target's depth in the target frame and in the host frame ``(3, ...)``, both times its inverse."""
+    """Points at the target's depth in the target frame and in the host frame ``(3, ...)``, both scaled by its
+    inverse."""
     q = torch.stack((g.x, g.y, torch.ones_like(g.x)))
     return q, (Rt[:, :3] * (q - Rt[:, 3] * inverse_depth_j)[:, None]).sum(0)
 

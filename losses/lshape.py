@@ -20,14 +20,14 @@ from edgeslam_torch.losses.robust import Kernel
 
 
 class AngleForm(StrEnum):
-    """Which angle is expected to equal which."""
+    """Which two angles are compared."""
 
     CROSS_VIEW = "cross view"
     """Arms of frame i projected into frame j against the angle seen there."""
     SAME_FRAME = "same frame"
-    """Paper eqs. (24), (25) to the letter: back-projected and projected into the same frame; identically zero."""
+    """Paper eqs. (24), (25) as printed: back-projected and projected into the same frame; identically zero."""
     RIGHT_ANGLE = "right angle"
-    """The arms' angle in space against 90 degrees, only where it is nearly that."""
+    """The arms' 3-D angle against 90 degrees, only where it is nearly right."""
 
 
 class AngleLoss(ResidualLoss):
@@ -59,7 +59,7 @@ class AngleLoss(ResidualLoss):
             T_j_i: Motion from frame i to frame j ``(4, 4)``.
             uv: Corner, end of arm 1, end of arm 2 in frame i ``(C, 3, 2)`` [px].
             depth_i: Their z-depths ``(C, 3)``.
-            cos_j: Cosine of the angle that frame j sees ``(C,)``; NaN where it sees none. Not used by
+            cos_j: Cosine of the angle observed in frame j ``(C,)``; NaN if not observed. Not used by
                 ``SAME_FRAME`` and ``RIGHT_ANGLE``.
             K: Calibration matrix ``(3, 3)`` [px].
 
@@ -90,7 +90,7 @@ class CollinearityLoss(ResidualLoss):
     """Perpendicular offsets of edge points from the best-fit 3-D line of their arm, paper eq. (26).
 
     Note:
-        Offsets are divided by the arm's length unless ``literal``: in metres they vanish with the depth
+        Offsets are divided by the arm's length unless ``literal``: in metres they shrink with the depth
         (docs/decisions/0014-l-shape-loss.md). The line is a constant for the gradient; at the best fit its own
         derivative drops out.
     """
@@ -154,7 +154,7 @@ class LShapeLoss(torch.nn.Module):
 
     @classmethod
     def literal(cls, lambda_theta: float = 1.0, lambda_col: float = 1.0) -> "LShapeLoss":
-        """The paper's terms to the letter."""
+        """The paper's terms as printed."""
         return cls(AngleLoss(AngleForm.SAME_FRAME), CollinearityLoss(literal=True), lambda_theta, lambda_col)
 
     def forward(
@@ -191,11 +191,11 @@ def junction_rows(
         Rt: Relative motions ``(3, 4, ...)`` from host to target.
         rays: Normalised coordinates ``(2, 3, ...)`` of corner and arm ends in the host frame.
         inverse_depth: Their inverse depths ``(3, ...)`` there.
-        uv_j: Corner that the target sees ``(2, ...)`` [px].
-        arms_j: Unit directions of the arms that the target sees ``(2, 2, ...)``, coordinate first, then arm.
+        uv_j: Corner observed in the target ``(2, ...)`` [px].
+        arms_j: Unit directions of the arms observed in the target ``(2, 2, ...)``, coordinate first, then arm.
         K: fx, fy, cx, cy [px], shape ``(4,)``.
-        cosines: One row, the angle's cosine (paper eq. 24 across views), in place of two, the sines of the angles
-            between each projected arm and the one seen.
+        cosines: One row, the angle's cosine (paper eq. 24 across views), instead of two, the sines of the angles
+            between projected and observed arms.
 
     Returns:
         Residuals ``(R, ...)``: corner u and v [px], then one or two angle rows; derivatives by the relative pose

@@ -10,7 +10,7 @@ _C1, _C2 = 0.01**2, 0.03**2
 
 
 def warp_to(image_j: Tensor, depth_i: Tensor, T_j_i: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
-    """View i as frame j's colours show it.
+    """View i synthesised from frame j.
 
     Args:
         image_j: ``(B, 3, H, W)`` in [0, 1].
@@ -34,7 +34,7 @@ def warp_to(image_j: Tensor, depth_i: Tensor, T_j_i: Tensor, K: Tensor) -> tuple
     uv = (K @ (p_j / z))[:, :2]
     grid = torch.stack((2 * uv[:, 0] / (W - 1) - 1, 2 * uv[:, 1] / (H - 1) - 1), -1).reshape(B, H, W, 2)
     valid = (grid.abs() <= 1).all(-1) & (p_j[:, 2] > 1e-3).reshape(B, H, W)
-    # Far outside values would overflow float32 in the sampler's derivative.
+    # Values far outside would overflow float32 in the sampler's derivative.
     warped = F.grid_sample(image_j, grid.clamp(-2, 2), padding_mode="border", align_corners=True)
     return warped, valid[:, None]
 
@@ -54,8 +54,7 @@ def dissimilarity(a: Tensor, b: Tensor) -> Tensor:
 
 
 class PhotometricLoss(nn.Module):
-    """Smallest dissimilarity over the source frames; pixels that match better without any motion are left
-    out."""
+    """Smallest dissimilarity over the source frames; pixels that match better without motion are masked."""
 
     def forward(self, image_i: Tensor, images_j: Tensor, depth_i: Tensor, T_j_i: Tensor, K: Tensor) -> Tensor:
         """Mean per image ``(B,)``.
@@ -79,7 +78,7 @@ class PhotometricLoss(nn.Module):
 
 
 class SmoothnessLoss(nn.Module):
-    """Second-order smoothness of log depth where the image is smooth: straight slopes cost nothing."""
+    """Second-order smoothness of log depth where the image is smooth; planes in log depth are free."""
 
     def forward(self, log_depth: Tensor, image: Tensor) -> Tensor:
         """``(B, 1, H, W)`` and ``(B, 3, H, W)`` -> ``(B,)``."""

@@ -25,7 +25,7 @@ def rho(s: Tensor, kernel: Kernel, delta: float) -> tuple[Tensor, Tensor]:
 
     Args:
         s: Squared whitened residuals, any shape, ``>= 0``.
-        kernel: Shape; every one behaves like ``s`` near zero.
+        kernel: Shape; all behave like ``s`` near zero.
         delta: Where the kernel departs from ``s``, in standard deviations.
 
     Returns:

@@ -29,13 +29,13 @@ class TermScale:
     sigma: float
     """Current estimate, in the residual's unit."""
     low: float
-    """Never below: a lucky window must not make a term rule."""
+    """Lower bound: a lucky window must not make a term dominate."""
     high: float
-    """Never above: a bad window must not silence it."""
+    """Upper bound: a bad window must not silence a term."""
     smoothing: float = 0.8
-    """Share of the old value (of its log) that stays at each update."""
+    """Weight of the old value (in its logarithm) at each update."""
     min_count: int = 30
-    """Fewer residuals than this leave the scale as it is."""
+    """Minimum number of residuals for an update."""
 
     def __post_init__(self) -> None:
         if not 0 < self.low <= self.sigma <= self.high:
@@ -44,7 +44,7 @@ class TermScale:
             raise ValueError(f"smoothing must lie in [0, 1), got {self.smoothing}")
 
     def updated(self, residual: Tensor) -> "TermScale":
-        """The scale after one more window's residuals (valid ones only)."""
+        """The scale updated with one window's valid residuals."""
         if residual.numel() < self.min_count:
             return self
         new = float(robust_sigma(residual))
@@ -70,6 +70,6 @@ class AdaptiveScales:
     )
 
     def updated(self, residuals: dict[str, Tensor]) -> "AdaptiveScales":
-        """Scales after one more window; terms without residuals stay."""
+        """Scales updated with one window; terms without residuals are unchanged."""
         new = {k: s.updated(residuals[k]) if k in residuals else s for k, s in self.terms.items()}
         return replace(self, terms=new)

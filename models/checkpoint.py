@@ -26,7 +26,7 @@ from edgeslam_torch.models.weights_file import Array, check_weights, read_weight
 
 
 def build_network(metadata: Metadata, widths: Widths | None = None) -> FastDepth:
-    """A network of this description with fresh weights."""
+    """A newly initialised network for this description."""
     return FastDepth(metadata.variant, widths, metadata.padding, metadata.output, metadata.uncertainty)
 
 
@@ -34,18 +34,18 @@ def save_checkpoint(network: FastDepth, metadata: Metadata, path: Path, half: bo
     """Write weights and metadata, atomically.
 
     Args:
-        network: What to store.
-        metadata: Its record.
+        network: Network to store.
+        metadata: Its metadata.
         path: File to write; an older one is replaced.
         half: Store float16: half the size, depth changes by less than 0.1 %.
 
     Raises:
-        OSError: If the disk refuses; an older file is then still there.
+        OSError: If writing fails; an older file is kept.
     """
     tensors = {k: _stored(v, half) for k, v in network.state_dict().items()}
-    # One key only: safetensors writes several in random order, and the same weights should be the same bytes.
+    # A single key, because safetensors writes several in random order and equal weights should give equal bytes.
     header = {HEADER_KEY: json.dumps(dataclasses.asdict(metadata))}
-    content = safetensors.torch.save(tensors, header)  # its own save_file makes files that only their owner can read
+    content = safetensors.torch.save(tensors, header)  # safetensors' save_file creates files with mode 0600
     write_atomically(path, lambda file: file.write(content))
 
 
@@ -55,7 +55,7 @@ def load_checkpoint(path: Path | None = None) -> tuple[FastDepth, Metadata]:
     Also reads torch files (zip) that hold ``{"state_dict": ..., "metadata": ...}`` or a bare state_dict.
 
     Raises:
-        WeightsError: If the file is missing, damaged, of another network, or holds what no trained network can.
+        WeightsError: If the file is missing, damaged, of another network, or has implausible values.
     """
     path = DEFAULT_WEIGHTS if path is None else Path(path)
     state, metadata = _read_torch(path) if _is_torch_zip(path) else read_weights(path)
@@ -63,7 +63,7 @@ def load_checkpoint(path: Path | None = None) -> tuple[FastDepth, Metadata]:
 
 
 def network_of(state: Mapping[str, Array], metadata: Metadata) -> FastDepth:
-    """Network in evaluation mode with these parameters, which `check_weights` has let through."""
+    """Network in evaluation mode with parameters validated by `check_weights`."""
     network = build_network(metadata, Widths.of_state_dict(state))
     counters = {k: v for k, v in network.state_dict().items() if k.endswith(STEP_COUNTER)}
     network.load_state_dict(counters | {k: torch.from_numpy(v) for k, v in state.items()})

@@ -16,8 +16,8 @@ class Complexity:
 
 
 def measure_complexity(network: nn.Module, height: int, width: int) -> Complexity:
-    """Count what one forward pass over ``(1, 3, height, width)`` costs; biases and batch norm are not
-    MACs."""
+    """Count parameters and multiply-accumulates of one forward pass over ``(1, 3, height, width)``; biases and batch
+    norm are not counted."""
     macs = 0
 
     def count(module: nn.Module, _: tuple[Tensor, ...], output: Tensor) -> None:

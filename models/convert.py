@@ -1,4 +1,4 @@
-"""Upstream's checkpoints, which are pickles of whole modules, turned into plain tensors without running them."""
+"""Conversion of upstream's checkpoints, pickles of whole modules, to plain tensors without executing them."""
 
 from pathlib import Path
 
@@ -9,7 +9,8 @@ from edgeslam_torch.models.weights_file import Array, check_weights
 
 
 def read_upstream(path: Path) -> tuple[dict[str, Array], Metadata]:
-    """Parameters of an official checkpoint (``checkpoint['model']``, a bare module, or a state dict) and what it is.
+    """Parameters of an official checkpoint (``checkpoint['model']``, a bare module, or a state dict) and its
+    metadata.
 
     Raises:
         WeightsError: If the file is damaged, refers to anything but tensors and modules, or holds no FastDepth.

@@ -1,7 +1,7 @@
-"""Weights that can be downloaded: where they are, fetched with resume, checked, never executed.
+"""Downloadable weights: sources, resumable download, verification; nothing is executed.
 
-Their publisher names no checksums and offers them over plain http. So https is tried first, and the checksum of the
-first download is kept beside the file: a later one must be the same (trust on first use).
+Their publisher states no checksums and serves plain http. So https is tried first, and the checksum of the first
+download is stored beside the file and required of later ones (trust on first use).
 """
 
 import hashlib
@@ -26,7 +26,7 @@ TIMEOUT_S = 30.0
 
 @dataclass(frozen=True, slots=True)
 class Remote:
-    """A file somebody else publishes."""
+    """A file published by others."""
 
     name: str
     urls: tuple[str, ...]
@@ -72,28 +72,28 @@ def shipped() -> Path:
 
 @dataclass(frozen=True, slots=True)
 class Fetched:
-    """What a download brought."""
+    """Result of a download."""
 
     sha256: str
     url: str
-    """Where from."""
+    """Address that it came from."""
 
     @property
     def encrypted(self) -> bool:
-        """Whether nobody on the way could change it."""
+        """Whether the transfer was encrypted."""
         return self.url.startswith("https:")
 
 
 def download(
     urls: tuple[str, ...], target: Path, sha256: str | None = None, progress: Callable[[int, int], None] | None = None
 ) -> Fetched:
-    """Fetch the first URL that answers; a part left by an earlier try is continued.
+    """Fetch from the first URL that answers, resuming a partial download.
 
     Args:
-        urls: Where it may be.
-        target: File to write; appears only when complete and right.
-        sha256: What it must hash to; if None, what `remember` kept of an earlier download.
-        progress: Called with bytes so far and in all (0 when the server does not say).
+        urls: Addresses, tried in order.
+        target: File to write; appears only when complete and verified.
+        sha256: Expected checksum; None for the one that `remember` stored.
+        progress: Called with bytes so far and in total (0 if unknown).
 
     Raises:
         WeightsError: If no URL answers, the transfer breaks off, or the checksum differs.
@@ -102,7 +102,7 @@ def download(
     target.parent.mkdir(parents=True, exist_ok=True)
     reasons = []
     for url in urls:
-        # One part for each protocol: what came over http stays what may have been changed.
+        # One partial file per protocol: bytes received over http stay untrusted.
         part = target.with_name(f"{target.name}.{url.split(':')[0]}.part")
         try:
             _fetch(url, part, progress)
@@ -135,10 +135,10 @@ def remembered(target: Path) -> str | None:
 
 
 def remember(target: Path, sha256: str) -> Path:
-    """Keep a checksum beside its file, as ``sha256sum -c`` reads it.
+    """Store a checksum beside its file, in the format of ``sha256sum -c``.
 
     Raises:
-        OSError: If the disk refuses.
+        OSError: If the file cannot be written.
     """
     path = _checksum_file(target)
     write_text(path, f"{sha256}  {target.name}\n")
@@ -154,7 +154,7 @@ def _one_line(reason: object) -> str:
 
 
 class _KeepEncryption(urllib.request.HTTPRedirectHandler):
-    """Does not follow from https to anything else."""
+    """Refuses redirects from https to other protocols."""
 
     def redirect_request(
         self, request: urllib.request.Request, file: IO[bytes], code: int, message: str, headers: Any, url: str
@@ -170,7 +170,7 @@ def _fetch(url: str, part: Path, progress: Callable[[int, int], None] | None) ->
     try:
         response = urllib.request.build_opener(_KeepEncryption).open(request, timeout=TIMEOUT_S)
     except urllib.error.HTTPError as error:
-        if error.code == 416 and have:  # nothing beyond what we have: it was complete
+        if error.code == 416 and have:  # the partial file was complete
             return
         raise
     with response:

@@ -26,7 +26,7 @@ __all__ = ["FULL", "PRUNED", "FastDepth", "Output", "Padding", "Prediction", "Va
 
 
 class Prediction(NamedTuple):
-    """What the network says about a batch; all ``(B, 1, H, W)``."""
+    """Prediction for a batch; all ``(B, 1, H, W)``."""
 
     log_depth: Tensor
     """Natural logarithm of depth at the training focal length [log m]."""
@@ -40,7 +40,7 @@ class FastDepth(nn.Module):
     Args:
         variant: One of the four networks.
         widths: Channels; by default those published for the variant.
-        padding: Of the encoder's strided convolutions, see `Padding`.
+        padding: Padding of the encoder's strided convolutions, see `Padding`.
         output: Meaning of the last layer.
         uncertainty: Adds a 1x1 head (``uncertainty``) on the last features; upstream has none.
     """
@@ -87,13 +87,10 @@ class FastDepth(nn.Module):
         return [self.get_submodule(f"{prefix}{i}") for i in range(1, 7)]
 
     def predict_half(self, x: Tensor) -> Prediction:
-        """Log depth and its uncertainty for normalised RGB ``(B, 3, H, W)``, at half its size: all the
-        network knows.
+        """Log depth and its uncertainty for normalised RGB ``(B, 3, H, W)``, at half its size.
 
-        Upstream upsamples its last features and then weighs them pixel by pixel; the two commute, and
-        weighing first
-        saves about a tenth of the time (profile of onnxruntime, 160x224). `predict` doubles the result, as
-        upstream would have it.
+        Upstream upsamples its last features and then applies a 1x1 convolution; the two commute, and convolving first
+        saves about a tenth of the time (onnxruntime, 160x224). `predict` doubles the result as upstream does.
         """
         features = self.features(x)
         head = self.decoder_layers()[-1]
@@ -120,7 +117,7 @@ class FastDepth(nn.Module):
         return F.relu(last)
 
     def features(self, x: Tensor) -> Tensor:
-        """What the last 1x1 convolution weighs, ``(B, C, H/2, W/2)``."""
+        """Input of the last 1x1 convolution, ``(B, C, H/2, W/2)``."""
         if x.shape[-1] % INPUT_MULTIPLE or x.shape[-2] % INPUT_MULTIPLE:
             size = tuple(x.shape[-2:])
             raise ValueError(f"height and width must be multiples of {INPUT_MULTIPLE}, got {size}")
@@ -163,6 +160,6 @@ def _separable5(inputs: int, outputs: int) -> nn.Sequential:
 
 
 def _initialise(module: nn.Module) -> None:
-    """He initialisation (fan out); keeps activations alive through 13 ReLUs."""
+    """He initialisation (fan out), which preserves activations through 13 ReLUs."""
     if isinstance(module, nn.Conv2d):
         nn.init.kaiming_normal_(module.weight, mode="fan_out")

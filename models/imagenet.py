@@ -29,8 +29,7 @@ _LAYER = re.compile(r"MobilenetV1/Conv2d_(\d+)(?:_(depthwise|pointwise))?/")
 def load_imagenet_encoder(network: FastDepth, path: Path) -> None:
     """Overwrite the encoder of ``network`` with the TFLite file's weights.
 
-    The network must use TF padding and inputs ``x / 127.5 - 1`` (RGB 0..255) to see what the weights were
-    trained on.
+    The network must use TF padding and inputs ``x / 127.5 - 1`` (RGB 0..255) to match the weights' training.
 
     Raises:
         WeightsError: If the file is no MobileNetV1 1.0 or the network's encoder has other widths.
@@ -70,7 +69,7 @@ def read_tflite_encoder(path: Path) -> dict[tuple[int, str], tuple[Tensor, Tenso
         raise WeightsError(f"{path}: not a TFLite file")
     try:
         return _encoder(data)
-    except (struct.error, ValueError, TypeError, LookupError, OverflowError) as error:  # offsets that lead nowhere
+    except (struct.error, ValueError, TypeError, LookupError, OverflowError) as error:  # invalid offsets
         raise WeightsError(f"{path}: damaged TFLite file ({str(error)[:80]})") from None
 
 

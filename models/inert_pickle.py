@@ -1,8 +1,8 @@
 """The part of the pickle language that torch writes, interpreted without importing or calling anything.
 
 A pickle is a program: ``GLOBAL`` and ``REDUCE`` call whatever it names. Here a name stays a `Name` and a call a `Call`:
-the result is a tree of plain values that its reader may look through. Every instruction costs time and memory in
-proportion to its own bytes, and their number is bounded, so that no program runs for longer than a second.
+the result is a tree of plain values for the caller to inspect. Every instruction costs time and memory in proportion
+to its own bytes, and their number is bounded, so that no input takes longer than a second.
 """
 
 import struct
@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 from edgeslam_torch.errors import WeightsError
 
 MAX_STEPS = 300_000
-"""Instructions of one pickle; a whole module of FastDepth has 24 000."""
+"""Maximum number of instructions; a FastDepth module has 24 000."""
 _MARK = object()
 
 
@@ -26,14 +26,14 @@ class Name(NamedTuple):
 
 
 class Call(NamedTuple):
-    """What a pickle would have called."""
+    """A call that a pickle would have made."""
 
     name: Name
     arguments: tuple[Any, ...]
 
 
 class External(NamedTuple):
-    """Something that lies outside the pickle, such as a tensor's bytes."""
+    """A reference to data outside the pickle, such as a tensor's bytes."""
 
     id: Any
 
@@ -47,12 +47,12 @@ class Instance:
 
 
 class InertPickle:
-    """One pickle after the other out of a block of bytes.
+    """Interprets consecutive pickles in a block of bytes.
 
     Args:
         data: The block.
         start: Where the first pickle begins.
-        allowed: Says of every name whether a pickle may refer to it.
+        allowed: Predicate for the names that a pickle may refer to.
     """
 
     def __init__(self, data: bytes | mmap, allowed: Callable[[Name], bool], start: int = 0) -> None:
@@ -61,7 +61,7 @@ class InertPickle:
         self.position = start
         """Where the next pickle begins."""
         self.externals: list[External] = []
-        """What all pickles so far refer to outside themselves."""
+        """External references of all pickles so far."""
         self._stack: list[Any] = []
         self._memo: dict[int, Any] = {}
 
@@ -138,10 +138,10 @@ class InertPickle:
 
     def _set(self, items: list[Any]) -> None:
         target = self._stack[-1]
-        if isinstance(target, Call | Instance):  # a dictionary of a class of its own
+        if isinstance(target, Call | Instance):  # an instance of a dict subclass
             return
         for key, value in zip(items[::2], items[1::2], strict=True):
-            if not isinstance(key, str | int):  # hashing a nested tuple can take for ever
+            if not isinstance(key, str | int):  # hashing a nested tuple may take unbounded time
                 raise TypeError
             target[key] = value
 
@@ -186,7 +186,7 @@ class InertPickle:
     def _external(self) -> None:
         id = self._stack.pop()
         if isinstance(id, tuple) and len(id) == 4 and id[0] == "module" and isinstance(id[1], Name):
-            self._stack.append(id[1])  # old torch wraps a class into ("module", class, file, source)
+            self._stack.append(id[1])  # old torch wraps a class as ("module", class, file, source)
             return
         self.externals.append(External(id))
         self._stack.append(self.externals[-1])
@@ -231,7 +231,7 @@ _INSTRUCTIONS: dict[bytes, Callable[[InertPickle], object]] = {
     b"]": lambda m: m._push([]),
     b"a": lambda m: m._extend([m._stack.pop()]),
     b"e": lambda m: m._extend(m._pop_to_mark()),
-    b"\x8f": lambda m: m._push([]),  # a set; nothing we need is in one
+    b"\x8f": lambda m: m._push([]),  # a set; not needed
     b"\x90": lambda m: m._extend(m._pop_to_mark()),
     b"\x91": lambda m: m._push(tuple(m._pop_to_mark())),
     b"}": lambda m: m._push({}),
@@ -250,4 +250,4 @@ _INSTRUCTIONS: dict[bytes, Callable[[InertPickle], object]] = {
     b"b": lambda m: m._build(),
     b"Q": lambda m: m._external(),
 }
-"""Protocols 2 to 5 as torch.save writes them; protocols 0 and 1, which it never wrote, are not read."""
+"""Protocols 2 to 5 as torch.save writes them; it never wrote protocols 0 and 1."""

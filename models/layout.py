@@ -9,9 +9,9 @@ from typing import Protocol
 from edgeslam_torch.errors import WeightsError
 
 MAX_WIDTH = 4096
-"""Channels of a layer; the published networks have up to 1024."""
+"""Maximum channels of a layer; the published networks have up to 1024."""
 MAX_PARAMETERS = 1 << 25
-"""Of a whole network; the largest published one has 20.7 M."""
+"""Maximum parameters of a network; the largest published one has 20.7 M."""
 SKIP_INTO = {4: 1, 3: 3, 2: 5}
 """Decoder layer -> encoder layer whose output is added after upsampling."""
 STRIDES = (2, 1, 2, 1, 2, 1, 2, 1, 1, 1, 1, 1, 2, 1)
@@ -19,7 +19,7 @@ STRIDES = (2, 1, 2, 1, 2, 1, 2, 1, 1, 1, 1, 1, 2, 1)
 MIN_DEPTH_M, MAX_DEPTH_M = 1e-3, 100.0
 MAX_LOG_DEPTH = math.log(MAX_DEPTH_M)
 LOG_SIGMA_RANGE = (-4.0, 1.5)
-"""Of the uncertainty head: 2 % to a factor of 4.5."""
+"""Output range of the uncertainty head: 2 % to a factor of 4.5."""
 INPUT_MULTIPLE = 32
 """Height and width of an input must be multiples of this."""
 STEP_COUNTER = "num_batches_tracked"
@@ -51,7 +51,7 @@ class Variant(StrEnum):
 
 
 class Output(StrEnum):
-    """What the last layer means."""
+    """Meaning of the last layer."""
 
     DEPTH = "depth"
     """ReLU of the last layer is depth in metres (upstream)."""
@@ -106,7 +106,7 @@ PRUNED = Widths((16, 56, 88, 120, 144, 256, 408, 376, 272, 288, 296, 328, 480, 5
 
 
 def variant_of(state: Mapping[str, HasShape]) -> Variant:
-    """The variant whose names and widths a checkpoint without a record has.
+    """The variant of a checkpoint without a record, by its names and widths.
 
     Raises:
         WeightsError: If it is no FastDepth checkpoint.
@@ -146,10 +146,10 @@ def parameter_shapes(variant: Variant, widths: Widths, uncertainty: bool) -> dic
 
 
 def check_shapes(state: Mapping[str, HasShape], variant: Variant, uncertainty: bool) -> None:
-    """Refuse a checkpoint whose names or shapes are not those of its variant.
+    """Reject a checkpoint whose names or shapes do not match its variant.
 
     Raises:
-        WeightsError: What differs, the first of it.
+        WeightsError: The first difference.
     """
     widths = Widths.of_state_dict(state)
     expected = parameter_shapes(variant, widths, uncertainty)

@@ -9,9 +9,8 @@ from edgeslam_torch.models.layout import STRIDES, Padding
 class SameConv2d(nn.Conv2d):
     """A 3x3 convolution of stride 2 padded as TensorFlow does for even sizes: right and bottom only.
 
-    With symmetric padding output ``i`` is centred on input ``2i``, here on ``2i + 1``: weights learnt one
-    way see an
-    image shifted by up to 31 pixels at the end of the encoder when they are run the other way.
+    With symmetric padding output ``i`` is centred on input ``2i``, here on ``2i + 1``: weights trained with one and
+    run with the other see the image shifted by up to 31 pixels at the end of the encoder.
     """
 
     def forward(self, x: Tensor) -> Tensor:

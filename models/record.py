@@ -1,4 +1,4 @@
-"""What a weights file says about itself; importing this needs no torch."""
+"""Metadata of weights files; importing this needs no torch."""
 
 import dataclasses
 import json
@@ -15,21 +15,21 @@ from edgeslam_torch.models.layout import INPUT_MULTIPLE, HasShape, Output, Paddi
 HEADER_KEY = "edgeslam"
 DEFAULT_WEIGHTS = Path(__file__).parent / "weights" / "default.safetensors"
 MAX_INPUT_PX = 2048
-"""Of height and width; four times the side that the networks are trained with."""
+"""Maximum height and width; four times the training size."""
 FOCAL_RANGE = (0.05, 20.0)
-"""Of ``focal_px`` relative to ``input_width``: from a field of view of 169 degrees to one of 3."""
+"""Range of ``focal_px`` relative to ``input_width``: fields of view from 169 to 3 degrees."""
 STD_RANGE = (1e-3, 1e3)
-"""Of ``std``; ImageNet's is 0.2, upstream's 1."""
+"""Range of ``std``; ImageNet's is 0.2, upstream's 1."""
 _REQUIRED = ("variant", "input_height", "input_width", "focal_px", "mean", "std", "padding", "output", "uncertainty")
-"""Without one of these a record does not say how to run the weights; the others have neutral defaults."""
+"""Required fields; the others have neutral defaults."""
 
 
 @dataclass(frozen=True, slots=True)
 class Metadata:
-    """Everything needed to run the weights correctly, and what they are worth.
+    """Everything needed to run the weights correctly, and their accuracy.
 
     Raises:
-        ValueError: If a field has the wrong type or a value that cannot be meant.
+        ValueError: If a field has the wrong type or an implausible value.
     """
 
     variant: str = "mobilenet-nnconv5dw-skipadd"
@@ -37,8 +37,8 @@ class Metadata:
     input_width: int = 256
     """Size of the training images [px]."""
     focal_px: float = 210.0
-    """Focal length at ``input_width`` for which the network's metres hold; other cameras are corrected by
-    the ratio."""
+    """Focal length at ``input_width`` for which the network predicts metres; other cameras are corrected by the
+    ratio."""
     mean: tuple[float, float, float] = (0.5, 0.5, 0.5)
     std: tuple[float, float, float] = (0.5, 0.5, 0.5)
     """Input is ``(rgb - mean) / std`` with rgb in [0, 1]."""
@@ -50,7 +50,7 @@ class Metadata:
     """Calibrated standard deviation of log depth: ``hypot(sigma_scale * sigma, sigma_floor)``."""
     units: str = "m"
     data: tuple[str, ...] = ()
-    """Data sets it was trained on."""
+    """Training data sets."""
     licence: str = ""
     metrics: dict[str, float] = field(default_factory=dict)
     notes: str = ""
@@ -102,10 +102,10 @@ def _is_number(value: object, low: float, high: float) -> bool:
 
 
 def metadata_from_json(text: str) -> Metadata:
-    """Parse a file's record; unknown keys are ignored so that newer files still load.
+    """Parse the metadata of a file; unknown keys are ignored so that newer files load.
 
     Raises:
-        WeightsError: What is wrong with it; the caller adds the file's name.
+        WeightsError: With the reason; the caller adds the file's name.
     """
     try:
         return metadata_from_record(json.loads(text))
@@ -135,7 +135,7 @@ def metadata_from_record(record: object) -> Metadata:
 
 
 def upstream_metadata(state: Mapping[str, HasShape]) -> Metadata:
-    """What an official checkpoint without a record is: NYU Depth v2, 224x224, RGB in [0, 1], depth in metres.
+    """Metadata of an official checkpoint: NYU Depth v2, 224x224, RGB in [0, 1], depth in metres.
 
     The focal length is that of NYU's Kinect (518.86 px at 640) in upstream's preprocessing: 640x480 scaled to height
     250, centre-cropped to 304x228, then squeezed to 224x224.

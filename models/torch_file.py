@@ -1,4 +1,4 @@
-"""Torch's checkpoint files, zip or legacy: tensors found by name without running anything that the file holds."""
+"""Torch's checkpoint files, zip or legacy: tensors located by name without executing the file."""
 
 import math
 import struct
@@ -30,7 +30,7 @@ _KINDS = {
     "ByteStorage": ("U8", 1),
     "BoolStorage": ("BOOL", 1),
 }
-"""Storage class: what safetensors calls its numbers, and their bytes."""
+"""Storage class: safetensors' name of its type, and bytes per number."""
 _UPSTREAM_CLASSES = {"MobileNet", "MobileNetSkipAdd", "MobileNetSkipConcat", "NNConv", "Identity"}
 _UPSTREAM_MODULES = {"models", "imagenet.mobilenet", "__main__"}
 _ALLOWED = {
@@ -41,7 +41,7 @@ _ALLOWED = {
     Name("torch._utils", "_rebuild_tensor"),
     Name("torch._utils", "_rebuild_tensor_v2"),
     Name("torch._utils", "_rebuild_parameter"),
-    # Beside the model (arguments, epoch, best result, optimiser), of no use to us:
+    # Beside the model (arguments, epoch, best result, optimiser), unused:
     Name("argparse", "Namespace"),
     Name("collections", "defaultdict"),
     Name("builtins", "dict"),
@@ -53,18 +53,18 @@ _ALLOWED = {
     Name("metrics", "Result"),
 }
 MAX_PARTS = 5000
-"""Modules and tensors of a network; FastDepth has 130 and 300, and a module may be there under many names."""
+"""Maximum modules and tensors of a network; FastDepth has 130 and 300, and a module may occur under several names."""
 MAX_DIRECTORY_BYTES = 1 << 20
-"""Of a zip's list of contents; FastDepth's has 20 kB."""
+"""Maximum size of a zip's directory; FastDepth's has 20 kB."""
 
 
 @dataclass(frozen=True, slots=True)
 class TorchTensor:
-    """A tensor that has not been read; it lies inside its storage, and is no larger."""
+    """A tensor that is not yet read; it lies within its storage and is not larger."""
 
     shape: tuple[int, ...]
     kind: str
-    """Type of its numbers, as safetensors calls it."""
+    """Type of its numbers, in safetensors' notation."""
     stride: tuple[int, ...]
     offset: int
     item_bytes: int
@@ -74,7 +74,7 @@ class TorchTensor:
         """Its numbers in row-major order, little endian.
 
         Raises:
-            WeightsError: If the bytes are not there.
+            WeightsError: If bytes are missing.
         """
         items = np.frombuffer(self.storage(), f"<u{self.item_bytes}")[self.offset :]
         steps = tuple(s * self.item_bytes for s in self.stride)
@@ -82,14 +82,14 @@ class TorchTensor:
 
 
 class Checkpoint(NamedTuple):
-    """What a torch file holds."""
+    """Contents of a torch file."""
 
     state: Mapping[str, TorchTensor]
-    """Tensors by name; ``module.``, which DataParallel puts before every name, is taken away."""
+    """Tensors by name, without DataParallel's prefix ``module.``."""
     record: Any
-    """What stands beside them as ``metadata``; None where nothing does."""
+    """Value of ``metadata`` beside them, or None."""
     is_module: bool
-    """It was a whole pickled network, not a state dict."""
+    """Whether it was a whole pickled network, not a state dict."""
 
 
 @contextmanager
@@ -117,13 +117,13 @@ def open_checkpoint(path: Path) -> Iterator[Checkpoint]:
 
 
 def is_zip(file: BinaryIO) -> bool:
-    """Whether a file begins as torch's zip files do."""
+    """Whether a file starts like torch's zip files."""
     file.seek(0)
     return file.read(4) == b"PK\x03\x04"
 
 
 def may_refer_to(name: Name) -> bool:
-    """Whether a checkpoint of a network has any business with a class or function."""
+    """Whether a network checkpoint may refer to a class or function."""
     module, attribute = name
     return (
         name in _ALLOWED
@@ -192,7 +192,7 @@ class _LegacyReader:
         return self._data[start : start + count * storage.item_bytes]
 
     def _locate(self, reader: InertPickle) -> None:
-        """Where each storage's bytes begin, and how many numbers there are."""
+        """Offset and length of each storage."""
         storages = {s.key: s for s in map(_as_storage, reader.externals) if s is not None}
         keys = reader.load()
         position = reader.position
@@ -208,7 +208,7 @@ class _LegacyReader:
 
 
 def _open_zip(file: BinaryIO) -> zipfile.ZipFile:
-    """An archive as torch writes it: uncompressed, its parts no larger than the file."""
+    """Open an archive as written by torch: uncompressed, entries not larger than the file."""
     size = file.seek(0, 2)
     reads = _Reads(file)
     try:
@@ -225,7 +225,7 @@ def _open_zip(file: BinaryIO) -> zipfile.ZipFile:
 
 
 class _Reads:
-    """A file that refuses long reads: `zipfile` takes a list of contents of any length in one piece."""
+    """A file that limits the length of reads: `zipfile` reads a directory of any length at once."""
 
     def __init__(self, file: BinaryIO) -> None:
         self._file = file
@@ -233,7 +233,7 @@ class _Reads:
         self.limit = MAX_DIRECTORY_BYTES
 
     def read(self, count: int = -1) -> bytes:
-        """As of any file.
+        """As of any file object.
 
         Raises:
             WeightsError: If there is more than the limit.
@@ -283,7 +283,7 @@ def _collect(root: Instance, bytes_of: Callable[[_Storage], bytes], tensors: dic
 
 
 def _as_tensor(value: Any, bytes_of: Callable[[_Storage], bytes]) -> TorchTensor | None:
-    """The tensor that a call would have rebuilt; None for anything else."""
+    """The tensor that a call would have rebuilt, or None."""
     if isinstance(value, Call) and value.name.name == "_rebuild_parameter" and value.arguments:
         value = value.arguments[0]
     if not isinstance(value, Call) or not value.name.name.startswith("_rebuild_tensor"):
@@ -302,7 +302,7 @@ def _as_tensor(value: Any, bytes_of: Callable[[_Storage], bytes]) -> TorchTensor
 
 
 def _as_storage(value: Any) -> _Storage | None:
-    """What a pickle calls ``("storage", class, key, location, count, view)``; None for anything else."""
+    """Decode ``("storage", class, key, location, count, view)``; None for anything else."""
     fields = value.id if isinstance(value, External) else None
     if not isinstance(fields, tuple) or len(fields) < 5 or fields[0] != "storage" or not isinstance(fields[1], Name):
         return None

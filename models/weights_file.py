@@ -1,7 +1,7 @@
 """Weights of a safetensors file as checked float32 arrays; importing this needs no torch.
 
-Nothing is read before the header's claims were compared with the file's size and the network's shapes, so that a
-hostile file costs no more than its own size.
+Nothing is read before the header is checked against the file's size and the network's shapes, so that a hostile file
+costs at most its own size.
 """
 
 import json
@@ -21,23 +21,23 @@ from edgeslam_torch.models.record import HEADER_KEY, Metadata, metadata_from_jso
 
 Array = NDArray[Any]
 MAX_FILE_BYTES = 1 << 29
-"""The largest official network has 20.7 M parameters, 83 MB; twice that with its optimiser's state."""
+"""Maximum file size. The largest official network has 20.7 M parameters, 83 MB; twice that with optimiser state."""
 MAX_HEADER_BYTES = 1 << 20
-"""FastDepth's header has 24 kB."""
+"""Maximum header size; FastDepth's has 24 kB."""
 MAX_VALUE = 1e6
-"""Largest parameter that a trained network may have; float16, in which ours are stored, ends at 65504."""
+"""Maximum absolute value of a parameter; float16, our storage type, ends at 65504."""
 FLOATS: dict[str, np.dtype[Any]] = {
     "F16": np.dtype("<f2"),
     "F32": np.dtype("<f4"),
     "F64": np.dtype("<f8"),
     "BF16": np.dtype("<u2"),
 }
-"""Kinds of numbers that parameters may be stored as, and how to read them; bfloat16 as its bits."""
+"""Storage types of parameters and how to read them; bfloat16 as its bits."""
 _SIZES = {kind: dtype.itemsize for kind, dtype in FLOATS.items()} | {"I64": 8}
 
 
 class Stored(Protocol):
-    """A tensor that has not been read."""
+    """A tensor that is not yet read."""
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -45,19 +45,19 @@ class Stored(Protocol):
 
     @property
     def kind(self) -> str:
-        """Type of its numbers, as safetensors calls it."""
+        """Type of its numbers, in safetensors' notation."""
 
     def read(self) -> bytes:
         """Its numbers in row-major order, little endian."""
 
 
 def read_weights(path: Path) -> tuple[dict[str, Array], Metadata]:
-    """Parameters of a safetensors file in float32 and the file's record.
+    """Parameters of a safetensors file in float32 and its metadata.
 
-    A file without a record is taken for one of upstream's.
+    A file without metadata is assumed to be upstream's.
 
     Raises:
-        WeightsError: If the file is missing, damaged, of another network, or holds what no trained network can.
+        WeightsError: If the file is missing, damaged, of another network, or has implausible values.
     """
     try:
         with open_weights(path) as file:
@@ -75,7 +75,7 @@ def read_header(path: Path) -> Metadata:
     """The record in a safetensors file's header, without reading the weights.
 
     Raises:
-        WeightsError: If the file is missing, no safetensors file, or holds no usable record.
+        WeightsError: If the file is missing, no safetensors file, or has no usable metadata.
     """
     try:
         with open_weights(path) as file:
@@ -90,10 +90,10 @@ def read_header(path: Path) -> Metadata:
 
 
 def open_weights(path: Path) -> BinaryIO:
-    """A weights file of any kind, opened for reading.
+    """Open a weights file for reading.
 
     Raises:
-        WeightsError: If there is no such file or it is larger than any network's; without the file's name.
+        WeightsError: If the file is missing or too large; without the file's name.
         OSError: If it cannot be opened.
     """
     if not path.exists():
@@ -107,17 +107,17 @@ def open_weights(path: Path) -> BinaryIO:
 
 
 def check_weights(state: Mapping[str, Stored], metadata: Metadata) -> dict[str, Array]:
-    """Read a state dict whose every name, shape, kind and value is one that the network of its record can have.
+    """Read and validate a state dict: names, shapes, types and values.
 
     Args:
-        state: Tensors by name; those of the right shape are read, one after the other.
-        metadata: What the file says about itself.
+        state: Tensors by name; those of the right shape are read one by one.
+        metadata: Metadata of the file.
 
     Returns:
-        Parameters by name, float32; batch norm's step counters as int64 where there are any.
+        Parameters by name, float32; batch norm's step counters, if any, as int64.
 
     Raises:
-        WeightsError: What is wrong, without the file's name.
+        WeightsError: With the reason, without the file's name.
     """
     check_shapes(state, Variant(metadata.variant), metadata.uncertainty)
     return {k: _counter(k, v) if k.endswith(STEP_COUNTER) else _as_float32(k, v) for k, v in state.items()}
@@ -169,7 +169,7 @@ class _Entry:
 
 
 def _read_header(file: BinaryIO) -> tuple[Metadata | None, dict[str, _Entry]]:
-    """Record, None when there is none, and tensors, whose bytes all lie inside the file."""
+    """Metadata, if any, and tensors, whose bytes all lie within the file."""
     length = int.from_bytes(file.read(8).ljust(8, b"\xff"), "little")
     if length > MAX_HEADER_BYTES:
         raise WeightsError("not a safetensors file, or damaged (`edgeslam weights convert` reads torch's .pth and .pt)")
@@ -205,7 +205,7 @@ def _entry(file: BinaryIO, name: str, fields: Any, offset: int, end: int) -> _En
 
 
 def _check_disjoint(entries: Mapping[str, _Entry]) -> None:
-    """Refuse tensors that share bytes: no writer makes them, and they are worth more memory than the file."""
+    """Reject tensors that share bytes: no writer creates them, and they would need more memory than the file."""
     last = 0
     for name, entry in sorted(entries.items(), key=lambda item: item[1].start):
         if entry.size and entry.start < last:

@@ -108,7 +108,7 @@ def finetune(
         SourceError: If there is nothing to learn from, or to validate on.
         ConfigError: If ``out`` holds another training.
         DivergedError: If a loss is not finite, or the network's depth becomes absurd.
-        OSError: If the disk refuses.
+        OSError: If the file cannot be written.
     """
     data = data.usable()
     given = Given(

@@ -102,7 +102,7 @@ class OutFolder:
 
         Raises:
             ConfigError, OutputError: As for `check`.
-            OSError: If the disk refuses.
+            OSError: If the file cannot be written.
         """
         self.check(given)
         record = self._record()
@@ -133,7 +133,7 @@ class OutFolder:
         """Note what came of it.
 
         Raises:
-            OSError: If the disk refuses.
+            OSError: If the file cannot be written.
         """
         self._write({**(self._record() or {}), "outcome": outcome.to_json()})
 

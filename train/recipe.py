@@ -164,7 +164,7 @@ def train(
         DivergedError: If the network's depth has become absurd.
         ConfigError: If ``out`` holds more steps than asked for, or there are more processes than images in a batch.
         WeightsError: If ``out/last.pt`` is damaged or of another network.
-        OSError: If the disk refuses.
+        OSError: If the file cannot be written.
     """
     if world() > config.batch:
         raise ConfigError(f"{world()} processes for a batch of {config.batch}: every one needs an image")
@@ -378,7 +378,7 @@ def save_state(state: TrainState, path: Path) -> None:
     """Write all of a run's state, atomically: a kill during writing leaves the previous file.
 
     Raises:
-        OSError: If the disk refuses.
+        OSError: If the file cannot be written.
     """
     content = {
         "network": state.network.state_dict(),

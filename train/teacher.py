@@ -76,7 +76,7 @@ def teach(
         folder: For the depth maps of this run, this network and this scale alone; made when missing.
 
     Raises:
-        OSError: If the disk refuses.
+        OSError: If the file cannot be written.
         ProcessError: If another process of the group is gone.
     """
     network.eval()

@@ -19,7 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--world", default="room", help="room or corridor (default: room)")
     parser.add_argument("--seconds", type=float, default=16.0, metavar="N", help="length of the flight (default: 16)")
-    parser.add_argument("--rate", type=float, default=20.0, metavar="HZ", help="images a second (default: 20)")
+    parser.add_argument("--rate", type=float, default=20.0, metavar="HZ", help="images per second (default: 20)")
     parser.add_argument(
         "--seed", type=int, default=0, help="another number gives another place and flight (default: 0)"
     )
@@ -80,7 +80,7 @@ def report(demo: "DemoResult") -> str:
             f"map:        {demo.map.points} edge points, {100 * demo.map.median_m:.1f} cm from the true surfaces, "
             f"{100 * demo.map.within_5cm:.0f} % within 5 cm"
         )
-    lines.append(f"speed:      {summary['fps']:.1f} images/s, {summary['cpu_ms_per_frame']:.0f} ms CPU an image")
+    lines.append(f"speed:      {summary['fps']:.1f} images/s, {summary['cpu_ms_per_frame']:.0f} ms CPU per image")
     look = next((n for n in ("report.html", "map.png") if (demo.run.folder / n).is_file()), "trajectory.txt")
     lines.append(f"look at:    {demo.run.folder / look}")
     return "\n".join(lines)

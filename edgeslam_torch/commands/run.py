@@ -171,7 +171,7 @@ def _report(result: "RunResult", source: "Source") -> None:
     print(
         f"{summary['tracked']} of {summary['offered']} frames tracked ({100 * summary['coverage']:.1f} %{missed}), "
         f"{_lost_words(summary)}{summary['fps']:.1f} frames/s, "
-        f"{summary['cpu_ms_per_frame']:.0f} ms CPU a frame, {summary['peak_rss_mb'] or 0:.0f} MB"
+        f"{summary['cpu_ms_per_frame']:.0f} ms CPU per frame, {summary['peak_rss_mb'] or 0:.0f} MB"
     )
     if scale["units"] == "metres":
         percent = 100.0 * scale["sigma"] / scale["value"]

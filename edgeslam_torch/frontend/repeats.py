@@ -7,7 +7,7 @@ REPEATED = "the image repeats the one before"
 """Reason in the frame's status."""
 
 _GRID = 4
-"""Every fourth pixel of every fourth row is compared: 30 us a frame of 640x480."""
+"""Every fourth pixel of every fourth row is compared: 30 us per frame of 640x480."""
 _LEAST_CHANGE = 0.3
 """Mean absolute difference [grey levels] above which two images differ. Sensor noise of one level gives 1.1; the
 minimum over nine recordings, including slow ones and bare walls, is 0.99. A still scene through an MPEG-4 encoder

@@ -32,7 +32,7 @@ _MAP_NOISE_LOG = 0.05
 """Error of triangulated depth: in a scene of one depth the slope is not taken from noise but counted as 0."""
 _USUAL_WANDER_LOG = 0.15
 _USUAL_COUNTS = 4
-"""What a few keyframes do not tell yet: the median over the calibration's runs, in place of so many keyframes."""
+"""What a few keyframes do not tell yet: the median over the calibration's runs, instead of so many keyframes."""
 _KEPT = 200
 _LEAST_ANCHORS = 8
 _LEAST_SPREAD_LOG = 0.02

@@ -60,7 +60,7 @@ class TermConfig:
     angle_sigma: float = 0.05
     """Standard deviation of an angle row; zero leaves the angle out."""
     cosines: bool = False
-    """The cosine of the angle (paper eq. 24 across views) in place of both arms' directions."""
+    """The cosine of the angle (paper eq. 24 across views) instead of both arms' directions."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -135,7 +135,7 @@ class JunctionTerms:
     inv_sigma_angle: float = 20.0
     """Inverse standard deviation of an angle row; zero switches it off."""
     cosines: bool = False
-    """One cosine per junction (the paper's angle) in place of both arms' directions."""
+    """One cosine per junction (the paper's angle) instead of both arms' directions."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -51,7 +51,7 @@ class WaitingFrame:
 
 @dataclass(frozen=True, slots=True)
 class StartedMap:
-    """What initialisation put in place of the guess."""
+    """What initialisation put instead of the guess."""
 
     new: list[tuple[Frame, Keyframe]]
     """Keyframes after the reference, in order; in the map, but not yet mapped any further."""
@@ -214,7 +214,7 @@ class Bootstrap:
             self.waiting.pop(int(np.linalg.norm(centres[2:] - centres[:-2], axis=1).argmin()))
 
     def replace_map(self, frame: Frame, view: View, two_view: TwoView, lm: LmConfig) -> StartedMap:
-        """Put the two-view map in place of the guessed one and refine it over all its keyframes.
+        """Put the two-view map instead of the guessed one and refine it over all its keyframes.
 
         Args:
             frame: The second view.

@@ -20,14 +20,14 @@ def write_colmap(folder: Path, camera: Camera, names: Sequence[str], T_w_c: Floa
     """Write the model.
 
     Args:
-        folder: Made when missing.
+        folder: Created if missing.
         camera: Of all images; distortion is kept.
         names: ``N`` image files, relative to the image folder that COLMAP is given.
         T_w_c: Camera to world ``(N, 4, 4)``.
-        cloud: Map points; their sigma goes where COLMAP has the reprojection error [px], as pixels at 1 m.
+        cloud: Map points; their sigma is stored as COLMAP's reprojection error, in pixels at 1 m.
 
     Raises:
-        OSError: If the disk refuses.
+        OSError: If the file cannot be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
     write_text(folder / "cameras.txt", _camera_text(camera))

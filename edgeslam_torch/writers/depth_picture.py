@@ -1,4 +1,4 @@
-"""Depth as a picture with a bar that tells the metres."""
+"""Depth as a picture with a scale bar in metres."""
 
 import math
 
@@ -9,12 +9,12 @@ from edgeslam_torch.types import FloatArray
 from edgeslam_torch.writers.raster_axes import BACKGROUND, INK, Image, text, text_size
 
 BAR_PX, LABELS_PX = 12, 18
-"""Height of the colour bar and of the metres below it."""
+"""Heights of the colour bar and of its labels."""
 _LABEL_SIZE = 0.4
 
 
 def colour(depth_m: FloatArray) -> Image:
-    """Inverse depth as colours above a bar that tells the metres.
+    """Inverse depth in colours above a scale bar in metres.
 
     Args:
         depth_m: ``(H, W)`` [m]; unknown depth, which is black, is not finite or not positive.
@@ -26,7 +26,7 @@ def colour(depth_m: FloatArray) -> Image:
     inverse = np.zeros(depth_m.shape, np.float32)
     inverse[known] = 1.0 / depth_m[known]
     low, high = np.percentile(inverse[known], (2, 98)) if known.any() else (0.0, 1.0)
-    if high < 1.01 * low:  # all at one depth
+    if high < 1.01 * low:  # a single depth
         low, high = low / 1.005, high * 1.005
     level = np.clip((inverse - low) / (high - low) * 255.0, 0, 255).astype(np.uint8)
     picture = np.asarray(cv2.applyColorMap(level, cv2.COLORMAP_TURBO))

@@ -1,4 +1,4 @@
-"""Recording of a flight that is whole at any moment: what was written before a crash can be read."""
+"""Recording of a flight that is consistent at any moment, also after a crash."""
 
 from collections.abc import Callable
 from contextlib import suppress
@@ -20,8 +20,8 @@ _FILES = ("rgb.txt", "camera.yaml", "state.txt", "telemetry.csv")
 class FlightWriter:
     """A TUM-layout folder: ``rgb/``, ``rgb.txt``, ``camera.yaml``, ``telemetry.csv``, ``state.txt`` (raw lines).
 
-    Each picture is written before its line in ``rgb.txt``, each line as a whole: nothing is listed that is not there,
-    and what the disk had no room for is taken back.
+    Each picture is written before its line in ``rgb.txt``, and lines are written whole: every listed picture exists,
+    and partial writes are removed.
     """
 
     def __init__(self, folder: Path, camera: Camera, with_telemetry: bool, lossless: bool = False) -> None:
@@ -50,7 +50,7 @@ class FlightWriter:
         """Write one picture.
 
         Raises:
-            OutputError: If the disk refuses; the recording is as it was before.
+            OutputError: If writing fails; the recording is unchanged.
         """
         name = f"rgb/{frame.stamp_s:.6f}.{self._suffix}"
         path = self.folder / name
@@ -66,7 +66,7 @@ class FlightWriter:
             _guarded(path, write)
         except OutputError:
             with suppress(OSError):
-                path.unlink(missing_ok=True)  # half a picture that nothing lists
+                path.unlink(missing_ok=True)  # partial picture that is not listed
             raise
         self.frames += 1
 
@@ -74,7 +74,7 @@ class FlightWriter:
         """Write one state message.
 
         Raises:
-            OutputError: If the disk refuses.
+            OutputError: If the file cannot be written.
         """
         if self._raw is None or self._telemetry is None:
             return

@@ -29,10 +29,10 @@ _TOP = 52
 _LEFT = (66, 722, 1310)
 """Where the views begin."""
 _MIN_CELLS, _MAX_CELLS = 260, 700
-"""Squares along the longer side of a view: few points are drawn larger."""
+"""Squares along the longer side of a view; fewer points are drawn larger."""
 
 _EYE_TAN = 0.75
-"""Half width of the camera's-eye view as a slope; a little wider than the cameras it is drawn for."""
+"""Tangent of half the camera's-eye view angle; slightly wider than common cameras."""
 
 
 def write_map_picture(path: Path, cloud: PointCloud, T_w_c: FloatArray, units: Units, title: str) -> None:
@@ -42,8 +42,8 @@ def write_map_picture(path: Path, cloud: PointCloud, T_w_c: FloatArray, units: U
         path: PNG to make.
         cloud: Edge map.
         T_w_c: ``(F, 4, 4)`` trajectory.
-        units: For the axes.
-        title: Over both.
+        units: Labels of the axes.
+        title: Title of the picture.
 
     Raises:
         OSError: If the file cannot be written.
@@ -71,7 +71,7 @@ def write_map_picture(path: Path, cloud: PointCloud, T_w_c: FloatArray, units: U
 
 
 def _shown(cloud: PointCloud, centres: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Points worth showing: finite, the far stragglers left out so that they do not set the picture's size."""
+    """Finite points without far outliers, which would determine the picture's scale."""
     p = np.asarray(cloud.p_w, dtype=np.float64)
     finite = np.isfinite(p).all(axis=1)
     p, colour = p[finite], np.asarray(cloud.colour)[finite].astype(np.float64) / 255.0
@@ -93,7 +93,7 @@ def _main_direction(p: FloatArray) -> FloatArray:
         return np.array([1.0, 0.0, 0.0])
     _, vectors = np.linalg.eigh(np.cov(flat.T))
     x, y = vectors[:, -1]
-    sign = 1.0 if (x if abs(x) > abs(y) else y) > 0 else -1.0  # the eigenvector's own sign is arbitrary
+    sign = 1.0 if (x if abs(x) > abs(y) else y) > 0 else -1.0  # the sign of an eigenvector is arbitrary
     return np.array([sign * x, sign * y, 0.0])
 
 
@@ -117,7 +117,7 @@ def _draw_view(
 
 
 def _draw_eye(picture: Image, cloud: PointCloud, T_w_c: FloatArray) -> None:
-    """The map as the camera saw it half-way through: what one should recognise."""
+    """The map as the camera saw it half-way through the run."""
     size = (_BOX[0], round(0.75 * _BOX[0]))
     corner = (_LEFT[2], _TOP + (_BOX[1] - size[1]) // 2)
     text(picture, "as the camera saw it half-way", (corner[0] + size[0] / 2, corner[1] - 12), 0.5, anchor=(0.5, 0.5))
@@ -139,6 +139,6 @@ def _draw_eye(picture: Image, cloud: PointCloud, T_w_c: FloatArray) -> None:
 
 
 def _cell_px(axes: Axes, points: FloatArray) -> int:
-    """Side of the squares that points ``(N, 2)`` are drawn as: smaller, the more there are."""
+    """Side of the squares that represent points ``(N, 2)``; smaller for more points."""
     span_px = axes.scale * float(np.ptp(points, axis=0).max())
     return max(1, round(span_px / np.clip(3.0 * np.sqrt(len(points)), _MIN_CELLS, _MAX_CELLS)))

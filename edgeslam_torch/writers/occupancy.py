@@ -17,10 +17,10 @@ from edgeslam_torch.types import FloatArray
 
 FREE, OCCUPIED, UNKNOWN = 254, 0, 205
 MAX_CELLS = 50_000_000
-"""A grid beyond this is a mistake of scale or resolution: 7 km at 1 m, 350 m at 5 cm."""
+"""Maximum number of cells: 7 km at 1 m, 350 m at 5 cm; more is a mistake of scale or resolution."""
 
 _AZIMUTHS = 720
-"""Half a degree: one ray of each camera's fan."""
+"""One ray per half degree of a camera's fan."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,19 +44,19 @@ def occupancy_grid(
     least_points: int = 2,
     half_fov_rad: float = 0.5,
 ) -> OccupancyGrid:
-    """Project obstacles on the floor and free what the cameras looked through.
+    """Project obstacles to the floor and mark the space that cameras looked through as free.
 
     Args:
         p_w: Map points ``(P, 3)`` [m], z up.
         T_w_c: Camera to world ``(N, 4, 4)`` of the views that free space.
         resolution_m: Side of a cell.
         z_range_m: Heights of obstacles; half a metre below to half a metre above the median camera by default, where
-            a drone that flies this path would hit them.
-        least_points: Points that make a cell occupied; one alone may be an outlier.
+            a drone on this path would hit them.
+        least_points: Minimum number of points of an occupied cell; a single one may be an outlier.
         half_fov_rad: Half the horizontal field of view of a camera.
 
     Raises:
-        OutputError: If nothing lies in the heights or the grid would be absurdly large.
+        OutputError: If no point lies within the heights or the grid would be too large.
     """
     if resolution_m <= 0:
         raise OutputError(f"the resolution must be positive, got {resolution_m} m")
@@ -90,7 +90,7 @@ def write_occupancy(path: Path, grid: OccupancyGrid) -> None:
     """Write ``path`` with ``.pgm`` and ``.yaml``.
 
     Raises:
-        OSError: If the disk refuses.
+        OSError: If the file cannot be written.
     """
     picture, record = path.with_suffix(".pgm"), path.with_suffix(".yaml")
     height, width = grid.cells.shape
@@ -117,9 +117,10 @@ def _free_fan(
     resolution_m: float,
     half_fov_rad: float,
 ) -> None:
-    """Free the cells between a camera and the nearest obstacle of each ray; a ray that hits nothing frees nothing."""
+    """Mark cells between a camera and the nearest obstacle of each ray as free; rays without an obstacle mark
+    none."""
     position, forward = T[:2, 3], T[:2, 2]
-    if np.linalg.norm(forward) < 0.2:  # looks straight down or up: no fan
+    if np.linalg.norm(forward) < 0.2:  # looks straight up or down: no fan
         return
     offset = solid - position
     distance = np.linalg.norm(offset, axis=1)

@@ -1,4 +1,4 @@
-"""Which folder a run may write into: an empty one, or one of its own kind, and one run at a time."""
+"""Folders that a run may write into: empty ones or those of earlier runs, one run at a time."""
 
 import json
 import os
@@ -15,26 +15,26 @@ from edgeslam_torch.readers.video import SUFFIXES as VIDEOS
 
 try:
     import fcntl
-except ImportError:  # Windows: two runs into one folder go unnoticed there
+except ImportError:  # Windows: concurrent runs into one folder are not detected
     fcntl = None  # type: ignore[assignment]
 
 STATUS = "status.csv"
 SUMMARY = "summary.json"
 _STATUS_BEGIN = "index,stamp_s,status,"
-"""What the status table of every version begins with; a run writes it with its first frame."""
+"""Header of the status table in every version; written with the first frame."""
 _SUMMARY_KEYS = frozenset({"version", "frames", "statuses"})
 _RECORDING = ("rgb.txt", "rgb", "mav0", "cam0", "data.csv", "sensor.yaml", "ost.yaml", "telemetry.csv")
-"""Names in recordings that no run gives."""
+"""File names that only recordings have."""
 _LOCK = ".lock"
 
 
 def check_free(folder: Path, outputs: Collection[str]) -> None:
-    """Whether results named ``outputs`` may go into the existing ``folder``.
+    """Check that results named ``outputs`` may be written to the existing ``folder``.
 
-    Files of other names are nobody's business: a log, notes, a flight in a folder of its own.
+    Files of other names are ignored: a log, notes, a flight in a subfolder.
 
     Raises:
-        OutputError: If a result would replace a file that no run wrote, or would lie among a recording's files.
+        OutputError: If a result would replace a file that no run wrote, or would lie among the files of a recording.
     """
     part = next((name for name in _RECORDING if (folder / name).exists()), None)
     if part is None and not _is_run(folder):
@@ -44,7 +44,7 @@ def check_free(folder: Path, outputs: Collection[str]) -> None:
 
 
 def _foreign(folder: Path, outputs: Collection[str]) -> str | None:
-    """A file that results would replace, or that makes the folder a recording."""
+    """A file that results would replace, or that marks a recording."""
     name = next((name for name in outputs if (folder / name).exists()), None)
     if name is not None:
         return name
@@ -53,7 +53,7 @@ def _foreign(folder: Path, outputs: Collection[str]) -> str | None:
 
 
 def _is_run(folder: Path) -> bool:
-    """Whether a run wrote here, also one of an older version or one that was killed."""
+    """Whether a run wrote here, including older versions and killed runs."""
     try:
         with (folder / STATUS).open(encoding="utf-8") as file:
             if file.readline(200).startswith(_STATUS_BEGIN):
@@ -68,9 +68,9 @@ def _is_run(folder: Path) -> bool:
 
 
 class FolderLock:
-    """Held by one process at a time; the system gives it back when the process dies, however it does.
+    """A lock held by one process; released by the system when the process dies.
 
-    The file says who holds it. Where the system or the file system has no locks nothing is locked.
+    The file names its holder. Without support for locks nothing is locked.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -82,7 +82,7 @@ class FolderLock:
         """
         self._path = folder / _LOCK
         self._file = self._open()
-        while not self._is_there():  # the run before gave it back between our opening and our locking
+        while not self._is_there():  # the previous run released it between opening and locking
             self._file.close()
             self._file = self._open()
         self._file.truncate(0)
@@ -90,7 +90,7 @@ class FolderLock:
         self._file.flush()
 
     def release(self) -> None:
-        """Give the lock back; may be called more than once."""
+        """Release the lock; may be called repeatedly."""
         if not self._file.closed:
             with suppress(OSError):
                 self._path.unlink()

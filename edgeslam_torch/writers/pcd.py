@@ -9,14 +9,14 @@ from edgeslam_torch.files.atomic import write_atomically
 from edgeslam_torch.types import PointCloud
 
 POINT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<f4"), ("sigma", "<f4"), ("observations", "<i4")])
-"""``rgb`` is 0x00RRGGBB in the bits of a float, as PCL has it."""
+"""``rgb`` is 0x00RRGGBB in the bits of a float, as in PCL."""
 
 
 def write_pcd(path: Path, cloud: PointCloud) -> None:
     """Write a cloud, atomically.
 
     Raises:
-        OSError: If the disk refuses.
+        OSError: If the file cannot be written.
     """
     points = np.empty(len(cloud.p_w), dtype=POINT)
     for axis, name in enumerate(("x", "y", "z")):
@@ -44,7 +44,7 @@ def write_pcd(path: Path, cloud: PointCloud) -> None:
 
 
 def read_pcd(path: Path) -> PointCloud:
-    """Read a cloud that `write_pcd` made.
+    """Read a cloud written by `write_pcd`.
 
     Raises:
         SourceError: If the file is missing, of another layout or cut off.

@@ -21,7 +21,7 @@ VERTEX = np.dtype(
         ("observations", "<i4"),
     ]
 )
-"""One point as the file holds it; ``sigma`` in metres, or map units while the scale is unknown."""
+"""One point of the file; ``sigma`` in metres, or map units while the scale is unknown."""
 
 _PLY_TYPES = {
     "char": "i1",
@@ -46,7 +46,7 @@ _MAX_HEADER_BYTES = 65536
 
 
 def write_ply(path: Path, cloud: PointCloud, comments: tuple[str, ...] = ()) -> None:
-    """Write a cloud, atomically; every viewer opens it, and those that know more show ``sigma`` too.
+    """Write a cloud, atomically; extra properties such as ``sigma`` are ignored by other viewers.
 
     Args:
         path: File to make.
@@ -54,7 +54,7 @@ def write_ply(path: Path, cloud: PointCloud, comments: tuple[str, ...] = ()) -> 
         comments: Lines for the header, such as the units.
 
     Raises:
-        OSError: If the disk refuses.
+        OSError: If the file cannot be written.
     """
     vertices = np.empty(len(cloud.p_w), dtype=VERTEX)
     for axis, name in enumerate(("x", "y", "z")):
@@ -76,9 +76,9 @@ def write_ply(path: Path, cloud: PointCloud, comments: tuple[str, ...] = ()) -> 
 
 
 def read_ply(path: Path) -> PointCloud:
-    """Read a cloud that `write_ply` made, or any little-endian or ASCII PLY with points.
+    """Read a cloud written by `write_ply`, or any little-endian or ASCII PLY with points.
 
-    What the file does not have is filled in: grey, infinite sigma, one observation.
+    Defaults for missing properties: grey, infinite sigma, one observation.
 
     Raises:
         SourceError: If the file is missing, no PLY, of an unsupported kind or cut off.

@@ -1,4 +1,4 @@
-"""Axes drawn into an image: what a picture of a map needs of a plotting library, in a tenth of its start-up time."""
+"""Axes drawn into an image, with a tenth of a plotting library's start-up time."""
 
 import math
 from dataclasses import dataclass
@@ -18,20 +18,20 @@ INK: Colour = (201, 209, 217)
 FRAME: Colour = (58, 65, 77)
 GRID: Colour = (38, 44, 54)
 
-_FONT = cv2.FONT_HERSHEY_SIMPLEX  # OpenCV 5 draws its TrueType font for it
+_FONT = cv2.FONT_HERSHEY_SIMPLEX  # OpenCV 5 draws its TrueType font for this constant
 _SUBPIXEL_BITS = 4
 _FAR_PX = 1e5
-"""Nothing is drawn farther out; OpenCV's coordinates are 32-bit fixed point."""
+"""Clipping distance; OpenCV's coordinates are 32-bit fixed point."""
 _TICK_GAP_PX = 62
-"""Least distance of two ticks."""
+"""Minimum distance between ticks."""
 
 
 @dataclass(frozen=True, slots=True)
 class Axes:
-    """A rectangle of an image with the same scale along both of its axes; y points up."""
+    """A rectangle of an image with equal scale on both axes; y points up."""
 
     image: Image
-    """The rectangle itself, a view into the whole picture."""
+    """View of the rectangle within the picture."""
     low: FloatArray
     """``(2,)`` data at the lower left corner."""
     scale: float
@@ -60,7 +60,7 @@ def draw_grid(axes: Axes, picture: Image, corner: tuple[int, int]) -> None:
 
     Args:
         axes: Part of ``picture``.
-        picture: The whole picture, for what lies outside the axes.
+        picture: The whole picture, for labels outside the axes.
         corner: Upper left pixel of the axes in the picture.
     """
     height, width = axes.image.shape[:2]
@@ -98,7 +98,7 @@ def draw_points(axes: Axes, points: FloatArray, colour: FloatArray, cell_px: int
     rgb = np.empty((len(full), 3))
     for channel in range(3):
         rgb[:, channel] = np.bincount(flat, weights=colour[inside, channel], minlength=rows * columns)[full] / many
-    rgb = 255.0 * (0.30 + 0.70 * rgb)  # dark edges on a dark page would not be seen: lift them, keeping their hue
+    rgb = 255.0 * (0.30 + 0.70 * rgb)  # lighten dark colours, keeping their hue, to be visible on the dark background
     alpha = (0.45 + 0.55 * np.minimum(many / 3.0, 1.0))[:, None]
     v, u = np.divmod(full, columns)
     for dv, du in np.ndindex(cell_px, cell_px):
@@ -109,7 +109,7 @@ def draw_points(axes: Axes, points: FloatArray, colour: FloatArray, cell_px: int
 
 
 def draw_path(axes: Axes, points: FloatArray, colour: Colour, width_px: int) -> None:
-    """A line through points ``(N, 2)``; what is not finite is left out."""
+    """A line through points ``(N, 2)``; non-finite points are skipped."""
     fixed = _fixed(axes.pixels(points[np.isfinite(points).all(axis=1)]))
     if len(fixed) > 1:
         cv2.polylines(axes.image, [fixed[:, None]], False, colour, width_px, cv2.LINE_AA, _SUBPIXEL_BITS)
@@ -145,16 +145,16 @@ def text(
     """Write in `INK`.
 
     Args:
-        image: To write into; what lies outside is cut off.
-        words: One line; what is no Unicode (bytes of a file name) becomes a question mark.
+        image: Image to write into; text outside is clipped.
+        words: One line; undecodable bytes of file names become question marks.
         at: Pixel.
         size: OpenCV's font scale; 0.5 is some 15 px.
-        anchor: Which part of the text lies there, from 0 (left, upper edge) to 1 (right, lower edge).
-        upright: Turned, to be read from below.
+        anchor: Anchor within the text, from 0 (left, top) to 1 (right, bottom).
+        upright: Rotated by 90 degrees.
     """
-    words = words.encode("utf-8", errors="replace").decode("utf-8")  # OpenCV ends the process at a lone surrogate
+    words = words.encode("utf-8", errors="replace").decode("utf-8")  # OpenCV aborts on a lone surrogate
     width, height = text_size(words, size)
-    pad = 2 + height // 2  # descenders, and what a glyph reaches beyond its box
+    pad = 2 + height // 2  # descenders and glyph overhang
     cover = np.zeros((height + 2 * pad, width + 2 * pad, 3), dtype=np.uint8)
     cv2.putText(cover, words, (pad, pad + height), _FONT, size, (255, 255, 255), 1, cv2.LINE_AA)
     if upright:
@@ -184,7 +184,7 @@ def _fixed(pixels: FloatArray) -> NDArray[np.int32]:
 
 
 def _tick_step(least: float) -> float:
-    """The smallest of 1, 2, 5 times a power of ten that is not below ``least``."""
+    """The smallest of 1, 2, 5 times a power of ten that is at least ``least``."""
     power = 10.0 ** math.floor(math.log10(least))
     return next(factor * power for factor in (1.0, 2.0, 5.0, 10.0) if factor * power >= least * (1 - 1e-9))
 

@@ -1,4 +1,4 @@
-"""The output folder of a run: appended to while it goes, rewritten with refined results at the end."""
+"""The output folder of a run: appended to during the run, rewritten with refined results at the end."""
 
 import csv
 import json
@@ -48,30 +48,29 @@ STATUS_COLUMNS = (
     "revision",
     "step_ms",
 )
-"""Of ``status.csv``; one column ``<stage>_ms`` for every stage follows."""
+"""Columns of ``status.csv``, followed by one column ``<stage>_ms`` per stage."""
 
 TRAJECTORY_HEADER = "# stamp_s tx ty tz qx qy qz qw, camera to world\n"
 
 _OLD_RESERVE = ".reserve"
-"""A file that killed runs of version 0.1 left behind."""
+"""Reserve file left by killed runs of version 0.1."""
 _RESERVE_BYTES = 24 << 20
-"""Held back from the disk for the final files: a map of 400 000 points (12 MB), two trajectories, a picture."""
+"""Disk space reserved for the final files: a map of 400 000 points (12 MB), two trajectories, a picture."""
 
 
 class RunWriter:
     """Writes one run's folder.
 
-    An older run in it stays until the first frame is there. After a write error (a full disk) nothing more is appended,
-    what is there stays valid, and `failure` says what happened; the space that was held back lets the final files still
-    be written.
+    An older run is kept until the first frame. After a write error (full disk) nothing more is appended, existing
+    files stay valid, and `failure` has the reason; the reserved space still allows the final files to be written.
     """
 
     def __init__(self, folder: Path, keep: Iterable[Path] = (), config_toml: str = "") -> None:
-        """Make the folder, lock it, and hold space back.
+        """Create and lock the folder, and reserve space.
 
         Args:
-            folder: Where the results go.
-            keep: Folders that the results must not go into, such as the source.
+            folder: Folder of the results.
+            keep: Folders that must not be written to, such as the source.
             config_toml: The resolved configuration, written beside the results.
 
         Raises:
@@ -98,7 +97,7 @@ class RunWriter:
             raise OutputError(f"{folder}: cannot write results there ({error.strerror or error})") from error
 
     def append(self, output: SlamOutput, step_ms: float) -> bool:
-        """Add one frame to the trajectories and the status table; False when nothing can be written any more."""
+        """Add one frame to the trajectories and the status table; False after a write error."""
         if self.failure is not None:
             return False
         try:
@@ -121,20 +120,20 @@ class RunWriter:
         units: Units,
         extras: Sequence[tuple[str, Callable[[Path], None]]] = (),
     ) -> list[str]:
-        """Write the refined results, the most valuable first.
+        """Write the refined results, the most important first.
 
         Args:
             summary: For ``summary.json``.
             stamps_s: ``(F,)`` stamps of the refined trajectory [s].
             T_w_c: ``(F, 4, 4)`` refined poses, camera to world.
-            support: What they rest on, for the columns ``piece`` and ``supported`` of ``status.csv``.
+            support: What supports them, for the columns ``piece`` and ``supported`` of ``status.csv``.
             edge_map: Semi-dense map in the same world frame.
             anchors: Triangulated anchors.
             units: Of all of these.
-            extras: File names and functions that make them, such as the picture.
+            extras: File names and functions that write them, such as the picture.
 
         Returns:
-            What could not be written, one line each.
+            Failures, one line each.
         """
         self._reserve.close()
         comments = (
@@ -163,7 +162,7 @@ class RunWriter:
         return missing
 
     def close(self) -> None:
-        """Give back files, lock and the space held back; a folder that was made for nothing goes."""
+        """Close files, release lock and reserved space, and remove a folder that stayed empty."""
         if self._live is not None:
             self._live.close()
         self._reserve.close()
@@ -173,7 +172,7 @@ class RunWriter:
                 self.folder.rmdir()
 
     def _begun(self) -> "_LiveFiles":
-        """Take away what an older run left, and start this one's files."""
+        """Remove the files of an older run, and open this run's files."""
         for name in (*OUTPUTS, *(f".{name}.part" for name in OUTPUTS), _OLD_RESERVE):
             (self.folder / name).unlink(missing_ok=True)
         live = _LiveFiles(self.folder)
@@ -182,7 +181,7 @@ class RunWriter:
 
 
 class _LiveFiles:
-    """What a run appends to with every frame: both trajectories and the status table."""
+    """Files that grow with every frame: the live trajectories and the status table."""
 
     def __init__(self, folder: Path) -> None:
         self._table = folder / STATUS
@@ -203,14 +202,14 @@ class _LiveFiles:
 
     def _write_status(self, output: SlamOutput, step_ms: float) -> None:
         new = [stage for stage in output.stage_ms if stage not in self._stages]
-        if new:  # columns for stages that had not run before
+        if new:  # columns for stages that ran later
             self._stages += new
             self._rewrite_status(self._status_rows())
         stages = [_number(output.stage_ms.get(stage, math.nan), 3) for stage in self._stages]
         self._status.write(_csv_line([*_status_row(output, step_ms), *stages]))
 
     def settle(self, support: Support) -> None:
-        """Say of every frame what its final pose rests on, in place of what its pose rested on when it came."""
+        """Replace each frame's live support by that of its final pose."""
         rows = self._status_rows()
         piece, supported = STATUS_COLUMNS.index("piece"), STATUS_COLUMNS.index("supported")
         for row, number, good in zip(rows, support.piece, support.supported, strict=False):
@@ -237,7 +236,7 @@ def tum_line(stamp_s: float, T_w_c: FloatArray) -> str:
 
 
 def summary_text(summary: dict[str, Any]) -> str:
-    """JSON that every reader takes: numbers that are not finite become null."""
+    """Strict JSON: non-finite numbers become null."""
     return json.dumps(_plain(summary), indent=2, ensure_ascii=False) + "\n"
 
 
@@ -287,9 +286,9 @@ def _csv_line(cells: Sequence[str]) -> str:
 
 
 def _held_back(folder: Path) -> IO[bytes]:
-    """Space on the disk that is free again once the file is closed or the process dies: the file has no name.
+    """Reserved disk space, freed when the anonymous file is closed or the process dies.
 
-    Quick where the file system can promise space without writing it.
+    Fast where the file system can allocate without writing.
     """
     file = TemporaryFile(dir=folder)  # noqa: SIM115, closed by the writer
     try:

@@ -1,4 +1,4 @@
-"""A live source that is recorded while it is used: what was seen live can be run again."""
+"""Recording of a live source while it is used."""
 
 import logging
 import queue
@@ -18,13 +18,13 @@ from edgeslam_torch.writers.flight_writer import FlightWriter
 logger = logging.getLogger(__name__)
 
 _WAITING = 60
-"""Frames that may wait for the disk (two seconds, 120 MB at 960x720); beyond that the camera is taken less often."""
+"""Maximum queue of frames for the disk (two seconds, 120 MB at 960x720); beyond, camera frames are skipped."""
 
 
 class RecordedLive:
-    """Implements `edgeslam_torch.readers.source.Source`: the frames that are taken from it are written beside.
+    """Implements `edgeslam_torch.readers.source.Source`: frames taken from it are also recorded.
 
-    Only frames that were taken are in the recording, so that running it again sees what was seen.
+    Only frames that were taken are recorded, so that a replay processes the same frames.
     """
 
     groundtruth: Path | None = None
@@ -34,10 +34,10 @@ class RecordedLive:
         """Open the folder.
 
         Args:
-            source: What to record.
-            messages: State messages of a drone, growing; stays empty without one.
-            folder: Where to.
-            lossless: PNG, so that the pictures are the same to the bit.
+            source: Source to record.
+            messages: Growing list of a drone's state messages; empty without a drone.
+            folder: Folder of the recording.
+            lossless: PNG, so that the pictures are bit-identical.
 
         Raises:
             OutputError: If it holds a recording already or cannot be written; the source is closed.
@@ -61,7 +61,7 @@ class RecordedLive:
         self._closed = False
 
     def frames(self) -> Iterator[Frame]:
-        """As the source's; a disk that refuses ends the recording, not the flight."""
+        """Frames of the source; a write error ends the recording, not the flight."""
         try:
             for frame in self._source.frames():
                 self._queue.put(frame)
@@ -70,7 +70,7 @@ class RecordedLive:
             self.close()
 
     def close(self) -> None:
-        """Close the source, then write what waits."""
+        """Close the source, then write the queued frames."""
         if self._closed:
             return
         self._closed = True
@@ -92,7 +92,8 @@ class RecordedLive:
             self._guarded(partial(self._writer.add_state, self._messages[self._writer.states]))
 
     def _guarded(self, write: Callable[[], None]) -> None:
-        """After the first failure nothing more is written; the queue is still emptied, so that nobody waits for it."""
+        """After the first failure nothing more is written; the queue is still drained, so that the producer never
+        blocks."""
         if self._failure is not None:
             return
         try:
@@ -100,6 +101,6 @@ class RecordedLive:
         except OutputError as error:
             logger.warning("the recording ends here: %s", error)
             self._failure = str(error)
-        except Exception as error:  # a fault of ours must not hold up the frames of a drone
+        except Exception as error:  # an error here must not block a drone's frames
             logger.exception("the recording ends here")
             self._failure = f"{self._writer.folder}: recording failed: {error}"

@@ -54,7 +54,7 @@ _NOISE_WORDS = (
     "noise: what two such medians differ by without meaning anything. Accuracy: 2 sqrt(s_a^2/n_a + s_b^2/n_b) over the "
     "seeds; one seed offline gives the same trajectory and map every time. Times: at one machine speed (the reference "
     "work timed beside every run), 3.75 sqrt(s_a^2/n_a + s_b^2/n_b) with the relative scatter of all sequences. Never "
-    "less than the figure's floor (3 % for errors, 10 % for CPU time, 15 % for frames a second and stages)"
+    "less than the figure's floor (3 % for errors, 10 % for CPU time, 15 % for frames per second and stages)"
 )
 
 
@@ -208,7 +208,7 @@ def markdown_bench(record: dict[str, Any]) -> str:
         errors = [f"- seed {r['seed']} failed: {r['error']}" for r in runs if r.get("error")]
         notes = [f"[{k}] {p['source']}; {p['conditions']}" for k, p in enumerate(peers, start=1)]
         parts += ([""] + errors if errors else []) + ([""] + notes if notes else [])
-        parts += _times_line("stages, mean ms a frame, median of the runs", record, name, stage_metrics(record, name))
+        parts += _times_line("stages, mean ms per frame, median of the runs", record, name, stage_metrics(record, name))
     for part, title in (("solver", "solver window, CPU ms"), ("depth", "depth network, one thread, ms an image")):
         texts = [f"{k} {v}" for k, v in (record.get(part) or {}).items() if isinstance(v, str)]
         metrics = [m for m in alone_metrics(record) if m.name.startswith(part)]
@@ -325,7 +325,7 @@ def _one_line(run: dict[str, Any]) -> str:
     text = f"ATE {f['ate_sim3_m']:.4f} m, coverage {f['coverage']:.1%}"
     if f.get("map_median_m") is not None:
         text += f", map {f['map_points']:.0f} points, {f['map_median_m']:.4f} m"
-    return text + (f", {f['cpu_ms_per_frame']:.0f} ms CPU a frame" if f.get("cpu_ms_per_frame") else "")
+    return text + (f", {f['cpu_ms_per_frame']:.0f} ms CPU per frame" if f.get("cpu_ms_per_frame") else "")
 
 
 def _lists(figures: dict[str, float | None]) -> dict[str, list[float]]:

@@ -141,7 +141,7 @@ def stage_metrics(record: dict[str, Any], name: str) -> list[Metric]:
         stage: float(np.mean([s.get(stage, 0.0) for s in runs])) for stage in dict.fromkeys(k for s in runs for k in s)
     }
     return [
-        Metric(f"stage:{stage}", f"{stage} [ms a frame]", "{:.2f}", True, _STAGE_FLOOR, "wall_ms")
+        Metric(f"stage:{stage}", f"{stage} [ms per frame]", "{:.2f}", True, _STAGE_FLOOR, "wall_ms")
         for stage, mean in sorted(means.items(), key=lambda kv: -kv[1])
         if mean >= _SHORTEST_STAGE_MS
     ]

@@ -39,7 +39,7 @@ class Truth:
     depth: Path | None = None
     """Data set whose depth maps judge the map."""
     surfaces: Surfaces | None = None
-    """Of a simulated world, in place of depth maps."""
+    """Of a simulated world, instead of depth maps."""
 
 
 def score(run_dir: Path, truth: Truth) -> tuple[Figures, list[str]]:

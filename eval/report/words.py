@@ -104,8 +104,8 @@ def tiles(run: RunFolder, score: RunScore | None, points: int) -> list[dict[str,
         else:
             add(f"\u00b1{100 * sigma / value:.1f}" if value else "?", "%", "scale, 1 sigma")
     for key, name, text in (
-        ("fps", "frames a second", "{:.1f}"),
-        ("cpu_ms_per_frame", "CPU a frame", "{:.0f}"),
+        ("fps", "frames per second", "{:.1f}"),
+        ("cpu_ms_per_frame", "CPU per frame", "{:.0f}"),
         ("peak_rss_mb", "memory", "{:.0f}"),
     ):
         value = _float(summary.get(key))

@@ -1,1 +1,1 @@
-"""FastDepth as ONNX: exported, folded, quantised, and read back with checks."""
+"""FastDepth as ONNX: export, batch-norm folding, quantisation, and validated reading."""

@@ -1,4 +1,4 @@
-"""FastDepth to ONNX: one graph, checked before it is called done."""
+"""Export of FastDepth to a checked ONNX graph."""
 
 import json
 import logging
@@ -17,20 +17,20 @@ from edgeslam_torch.models.onnx.fold import deployed
 from edgeslam_torch.models.record import HEADER_KEY, Metadata
 
 OLDEST_OPSET = 14
-"""ONNX's converter brings our network no further down."""
+"""Oldest opset that ONNX's version converter reaches for this network."""
 OLD_RUNTIME_IR, OLD_RUNTIME_OPSET = 9, 17
-"""onnxruntime <= 1.16 (older boards) reads IR <= 9; opset 17 is safely inside what it knows."""
+"""onnxruntime <= 1.16 (older boards) reads IR <= 9; opset 17 is supported by it."""
 
 
 @dataclass(frozen=True, slots=True)
 class ExportOptions:
-    """How to export."""
+    """Export options."""
 
     height: int = 192
     width: int = 256
     opset: int = 18
     dynamic: bool = False
-    """Leave height and width open (multiples of 32); a fixed size lets runtimes plan better."""
+    """Leave height and width dynamic (multiples of 32); runtimes optimise a fixed size better."""
 
 
 def export_onnx(network: FastDepth, metadata: Metadata, path: Path, options: ExportOptions) -> None:
@@ -41,7 +41,7 @@ def export_onnx(network: FastDepth, metadata: Metadata, path: Path, options: Exp
     network's input.
 
     Raises:
-        OutputError: If the file written is not what was asked for (opset, checker).
+        OutputError: If the written file has another opset or fails the checker.
     """
     module = deployed(network, metadata)
     example = torch.zeros(1, 3, options.height, options.width)
@@ -49,7 +49,7 @@ def export_onnx(network: FastDepth, metadata: Metadata, path: Path, options: Exp
     if options.dynamic:
         h, w = torch.export.Dim("h32", min=1, max=64), torch.export.Dim("w32", min=1, max=64)
         shapes = ({2: 32 * h, 3: 32 * w},)
-    # They warn about operators of torchvision, which we do not use, and about whose version converter is used.
+    # They warn about torchvision operators, which are not used, and about the choice of version converter.
     for name in ("torch.onnx", "onnxscript"):
         logging.getLogger(name).setLevel(logging.ERROR)
     with warnings.catch_warnings(), torch.no_grad():
@@ -77,7 +77,7 @@ def set_opset(model: onnx.ModelProto, opset: int) -> onnx.ModelProto:
     """The exporter writes opset 18 or later; older ones come from ONNX's own version converter.
 
     Raises:
-        OutputError: If that cannot.
+        OutputError: If the conversion fails.
     """
     if opset != model.opset_import[0].version:
         try:
@@ -90,13 +90,13 @@ def set_opset(model: onnx.ModelProto, opset: int) -> onnx.ModelProto:
 
 
 def write_metadata(model: onnx.ModelProto, metadata: Metadata, options: ExportOptions) -> None:
-    """Put the checkpoint's record, with this file's input size, into the model's properties."""
+    """Store the checkpoint's metadata, with this file's input size, in the model's properties."""
     record = asdict(metadata) | {"export_height": options.height, "export_width": options.width}
     onnx.helper.set_model_props(model, {HEADER_KEY: json.dumps(record)})
 
 
 def check_model(model: onnx.ModelProto, opset: int) -> None:
-    """ONNX's checker, and the opset that was asked for.
+    """Run ONNX's checker and verify the opset.
 
     Raises:
         OutputError: If either fails.

@@ -15,7 +15,7 @@ from edgeslam_torch.models.weights_file import open_weights
 
 INPUT, LOG_DEPTH, SIGMA = "image", "log_depth", "sigma_log"
 MAX_VALUE = 1e9
-"""Largest constant that an exported network may have: batch norm's gain multiplies weights of up to 1e6."""
+"""Maximum constant of an exported network: batch norm multiplies weights of up to 1e6."""
 _FLOATS = (TensorProto.FLOAT, TensorProto.FLOAT16, TensorProto.DOUBLE)
 
 
@@ -23,7 +23,7 @@ def read_onnx(path: Path) -> tuple[bytes, Metadata]:
     """A file written by ``edgeslam export`` and its record.
 
     Raises:
-        WeightsError: If the file is missing, damaged, no network of ours, or holds what no trained network can.
+        WeightsError: If the file is missing, damaged, not from this project, or has implausible values.
     """
     try:
         with open_weights(path) as file:
@@ -50,14 +50,14 @@ def _record(model: onnx.ModelProto) -> Metadata:
 
 
 def _check_ends(graph: onnx.GraphProto) -> None:
-    """Refuse a graph that does not take an image and give log depth and sigma."""
+    """Reject a graph without image input and outputs for log depth and sigma."""
     constants = {tensor.name for tensor in graph.initializer}
     inputs = [value for value in graph.input if value.name not in constants]
     outputs = {value.name for value in graph.output}
     if [value.name for value in inputs] != [INPUT] or not outputs >= {LOG_DEPTH, SIGMA}:
         raise WeightsError(f"not a depth network of ours: it should make {LOG_DEPTH} and {SIGMA} of {INPUT}")
     shape = inputs[0].type.tensor_type.shape.dim
-    sides = [d.dim_value for d in shape[2:]]  # 0 where the size is open
+    sides = [d.dim_value for d in shape[2:]]  # 0 for a dynamic size
     good = all(0 <= side <= MAX_INPUT_PX and side % INPUT_MULTIPLE == 0 for side in sides)
     if len(shape) != 4 or shape[1].dim_value != 3 or not good:
         size = [d.dim_value or d.dim_param for d in shape]
@@ -71,7 +71,7 @@ def _constants(graph: onnx.GraphProto) -> Iterator[TensorProto]:
 
 
 def _check_constant(tensor: TensorProto) -> None:
-    """Refuse numbers outside the file, not finite or absurd."""
+    """Reject external, non-finite or implausible constants."""
     if tensor.data_location == TensorProto.EXTERNAL:
         raise WeightsError(f"{tensor.name} lies outside the file; export it into one")
     if tensor.data_type not in _FLOATS:

@@ -1,4 +1,4 @@
-"""The network as it is deployed: batch norm folded into the convolutions, sigma calibrated."""
+"""The deployed network: batch norm folded into the convolutions, calibrated sigma."""
 
 import copy
 
@@ -10,7 +10,7 @@ from edgeslam_torch.models.record import Metadata
 
 
 class _Deployed(nn.Module):
-    """What a file computes: log depth and calibrated sigma of log depth at half the input's size.
+    """Computation of an exported file: log depth and its calibrated sigma at half the input's size.
 
     Both heads are one convolution of two channels: quantised features are then read once.
     """
@@ -31,7 +31,7 @@ class _Deployed(nn.Module):
         if self.heads is None:
             log_depth = self.network.predict_half(image).log_depth
             return log_depth, torch.full_like(log_depth, self.floor)
-        # Slices, not a split: ONNX's converter cannot bring Split to older opsets.
+        # Slices instead of a split: ONNX's converter cannot convert Split to older opsets.
         both = self.heads(self.network.features(image))
         last, raw = both[:, :1], both[:, 1:]
         sigma = raw.clamp(*LOG_SIGMA_RANGE).exp() * self.scale

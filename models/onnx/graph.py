@@ -1,10 +1,7 @@
-"""FastDepth as an ONNX graph straight from a weights file, without torch: what the SLAM runs.
+"""FastDepth as an ONNX graph straight from a weights file, without torch: for the SLAM's depth stage.
 
-`export_onnx` goes through torch's exporter and makes files for other people's runtimes; it takes seconds
-and needs
-torch in memory. The SLAM's depth stage wants neither, and the graph is a chain of convolutions, so it is
-written here
-node by node (a test holds the two together).
+`export_onnx` goes through torch's exporter and creates files for other runtimes; it takes seconds and needs torch in
+memory. The graph is a chain of convolutions, so it is built here node by node (a test compares the two).
 """
 
 import json
@@ -31,14 +28,14 @@ def build_graph(path: Path) -> tuple[bytes, Metadata]:
     """Serialised ONNX model (dynamic height and width) and the record of a safetensors file.
 
     Raises:
-        WeightsError: If the file is missing, damaged, no FastDepth, or holds what no trained network can.
+        WeightsError: If the file is missing, damaged, no FastDepth, or has implausible values.
     """
     weights, metadata = read_weights(path)
     return _Builder(weights, metadata).model().SerializeToString(), metadata
 
 
 class _Builder:
-    """Appends nodes; each method returns the name of what it computes."""
+    """Appends nodes; each method returns the name of its output."""
 
     def __init__(self, weights: Mapping[str, Array], metadata: Metadata) -> None:
         self.weights, self.metadata = weights, metadata

@@ -21,22 +21,20 @@ from edgeslam_torch.models.onnx.file import INPUT, LOG_DEPTH, SIGMA
 
 MIN_CALIBRATION_IMAGES = 8
 CALIBRATION_PERCENTILE = 99.99
-"""Activations above are clipped: one outlier must not take the resolution from everything else. On fr1_xyz
-the whole
+"""Percentile at which activations are clipped, so that outliers do not reduce the resolution. On fr1_xyz the full
 range costs 2.9 % of AbsRel, this 1.5 % (docs/model_card.md)."""
 
 
 def quantize_int8(source: Path, target: Path, images: Iterable[NDArray[np.float32]]) -> None:
     """Write an int8 version of ``source``.
 
-    The last convolution and what follows it stay in float32: they turn 32 features into the depth itself,
-    cost
-    nothing, and 256 levels of log depth would be visible as steps.
+    The last convolution and what follows stay float32: they are cheap, and 256 levels of log depth would be visible
+    as steps.
 
     Args:
         source: File written by `export_onnx`.
         target: Where to write.
-        images: Preprocessed inputs ``(1, 3, H, W)`` of real frames like those it will see.
+        images: Preprocessed inputs ``(1, 3, H, W)`` of representative real frames.
 
     Raises:
         ValueError: If there are fewer than 8 images.
@@ -50,7 +48,7 @@ def quantize_int8(source: Path, target: Path, images: Iterable[NDArray[np.float3
     properties = {p.key: p.value for p in onnx.load(str(source)).metadata_props}
     logger = logging.getLogger()
     level = logger.level
-    # onnxruntime talks to stdout and the root logger about what we already do.
+    # onnxruntime logs irrelevant advice to stdout and the root logger.
     with TemporaryDirectory() as folder, redirect_stdout(StringIO()):
         prepared = Path(folder) / "prepared.onnx"
         logger.setLevel(logging.ERROR)
@@ -101,13 +99,13 @@ def store_float16(source: Path, target: Path) -> None:
 
 
 def double_by_gather(model: onnx.ModelProto) -> None:
-    """Write each doubling by nearest neighbours as two gathers, in place; the values are the same.
+    """Replace each nearest-neighbour upsampling by two gathers, in place; the values are the same.
 
-    onnxruntime's uint8 Resize is slow, a quarter of the whole network's time; copying rows of channels costs nothing,
-    and the transposes around it cancel against those that int8 convolutions bring.
+    onnxruntime's uint8 Resize is slow, a quarter of the whole network's time; copying rows of channels is cheap, and
+    the transposes cancel against those of int8 convolutions.
 
     Args:
-        model: With inferred shapes; where a size is not fixed, the doubling stays as it is.
+        model: With inferred shapes; upsampling of dynamic sizes is left unchanged.
     """
     known = {v.name: [d.dim_value for d in v.type.tensor_type.shape.dim] for v in model.graph.value_info}
     nodes = []
@@ -129,7 +127,7 @@ def double_by_gather(model: onnx.ModelProto) -> None:
         ]
     del model.graph.node[:]
     model.graph.node.extend(nodes)
-    # The doublings' scale factors are of no use any more, and onnxruntime says so of each on the terminal.
+    # The scale factors are unused now; onnxruntime would print a warning for each.
     used = {name for node in nodes for name in node.input}
     kept = [tensor for tensor in model.graph.initializer if tensor.name in used]
     del model.graph.initializer[:]

@@ -1,4 +1,4 @@
-"""What the guard sends, to a socket in place of a drone; `test_ways_out.py` has it beside a whole program."""
+"""What the guard sends, to a socket instead of a drone; `test_ways_out.py` has it beside a whole program."""
 
 import os
 import socket

@@ -1,4 +1,4 @@
-"""An executor whose work is done when a test says so, in place of a thread."""
+"""An executor whose work is done when a test says so, instead of a thread."""
 
 from collections.abc import Callable
 from concurrent.futures import Executor, Future

@@ -175,7 +175,7 @@ def rewritten(tmp_path, how):
         head, rows = ["time", *head], [[str(int(row[0]) // 1000), *row] for row in rows]
     elif how == "no horizontal velocity, index in front":
         head, rows = ["", head[0], *head[3:]], [[str(k), row[0], *row[3:]] for k, row in enumerate(rows)]
-    elif how == "h in place of tof, some missing":
+    elif how == "h instead of tof, some missing":
         head = [*head[:4], "height_cm"]
         rows = [
             [*row[:3], "" if k % 7 == 0 else row[3], "None" if k % 5 == 0 else row[4]] for k, row in enumerate(rows)
@@ -196,7 +196,7 @@ def rewritten(tmp_path, how):
         "dates",
         "motor time beside the clock",
         "no horizontal velocity, index in front",
-        "h in place of tof, some missing",
+        "h instead of tof, some missing",
         "furniture below",
         "Windows line ends and a byte order mark",
     ],

@@ -24,7 +24,7 @@
     const adapt = viewer.adapt; viewer.adapt = () => {};
     for (let k = 0; k < 20; k++) viewer.frame(k);
     result.chunks = chunks; result.refined = pixels().sum; viewer.drawPoints = drawPoints; viewer.adapt = adapt;
-    // A machine of its own clock: 5 ms a frame and so many microseconds a point, turned for 60 frames.
+    // A machine of its own clock: 5 ms per frame and so many microseconds a point, turned for 60 frames.
     const turn = micros => {
       viewer.budget = FIRST_POINTS; viewer.last = 0; let now = 5000; const gaps = [];
       viewer.begin = () => {}; viewer.drawPoints = () => {};

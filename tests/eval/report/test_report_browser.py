@@ -125,6 +125,6 @@ def test_largest_map_is_turned_in_short_frames(run_folder: Callable[..., Path], 
         assert drawn[0] >= drawn[1] >= 199_000, "at rest everything is there"
         gaps = np.array(turned["gaps"])
         print(
-            f"\n{name}, 200 000 points, no graphics card: {np.median(gaps):.0f} ms a frame while turned, 95 % within "
+            f"\n{name}, 200 000 points, no graphics card: {np.median(gaps):.0f} ms per frame while turned, 95 % within "
             f"{np.quantile(gaps, 0.95):.0f} ms, {turned['points']} points each; all of them {rest_ms:.0f} ms after"
         )
