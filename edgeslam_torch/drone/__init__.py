@@ -1,1 +1,1 @@
-"""A DJI Tello: the client that flies it (`tello.Tello`), its video, its state messages, and an emulator."""
+"""A DJI Tello: client (`tello.Tello`), video, state messages, and an emulator."""

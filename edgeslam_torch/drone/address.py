@@ -1,4 +1,4 @@
-"""Where a Tello is, and our ends of its three channels."""
+"""Addresses of a Tello's three channels, remote and local."""
 
 import re
 import socket
@@ -13,14 +13,14 @@ TELLO_HOST = "192.168.10.1"
 
 @dataclass(frozen=True, slots=True)
 class TelloAddress:
-    """Where a drone and our ends of its three channels are."""
+    """Addresses of a drone's three channels, remote and local."""
 
     host: str = TELLO_HOST
     command_port: int = 8889
     state_port: int = 8890
     video_port: int = 11111
     bind: str | None = None
-    """Our address; ``None`` takes the interface that leads to the drone, so loopback stays on loopback."""
+    """Local address; ``None`` selects the interface that routes to the drone."""
 
     @classmethod
     def parse(cls, text: str) -> "TelloAddress":
@@ -51,10 +51,10 @@ class TelloAddress:
         return cls(host or TELLO_HOST, command, state, video)
 
     def ends(self) -> tuple[str, str]:
-        """The drone's numeric address, and ours towards it.
+        """Numeric addresses of the drone and of the local interface.
 
         Raises:
-            TelloError: If the drone's name is not known, or there is no way to it.
+            TelloError: If the drone's name cannot be resolved or there is no route to it.
         """
         try:
             with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:

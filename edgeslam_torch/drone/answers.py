@@ -1,4 +1,4 @@
-"""What a Tello answers to a command: which text belongs to which command, and what is a refusal."""
+"""A Tello's answers: which text answers which command, and what is a refusal."""
 
 import re
 
@@ -6,11 +6,11 @@ from edgeslam_torch.errors import EdgeSlamError
 
 
 class TelloError(EdgeSlamError):
-    """The drone does not answer, refuses, or may not do what was asked."""
+    """The drone does not answer, refuses, or is not allowed to execute a command."""
 
 
 class NoAnswer(TelloError):
-    """A command was sent and nothing came back: it may have been heard or not."""
+    """A command was not answered; the drone may have received it or not."""
 
 
 REFUSALS = (
@@ -24,21 +24,21 @@ REFUSALS = (
     "run timeout",
     "auto land",
 )
-"""Beginnings of answers that mean "no", as SDK 1.3, 2.0 and the drones themselves word them."""
+"""Prefixes of refusals in SDK 1.3, SDK 2.0 and observed answers."""
 _AGREEMENTS = ("ok", "forced stop")
 _WORDS = ("sn?", "hardware?", "active?", "sdk?", "ssid?", "wifiversion?", "ap?")
-"""Questions whose answer need not hold a number."""
+"""Queries whose answer need not contain a number."""
 
 
 def is_refusal(answer: str) -> bool:
-    """Whether the drone will not do it."""
+    """Whether an answer is a refusal."""
     return answer.lower().startswith(REFUSALS)
 
 
 def belongs_to(command: str, answer: str) -> bool:
-    """Whether a datagram can be the answer to a command.
+    """Whether a datagram may answer a command.
 
-    Answers carry no number of what they answer: a late ``ok`` of the command before, or noise, must not pass for one.
+    Answers do not identify their command: a late ``ok`` of the previous one, or noise, must not count.
 
     Example:
         >>> belongs_to("battery?", "87"), belongs_to("battery?", "ok"), belongs_to("land", "87")

@@ -1,8 +1,8 @@
-"""A process of its own that lands a drone whose program is gone, and stops one whose program hangs.
+"""A watchdog process that lands a drone whose program died, and stops one whose program hangs.
 
-A program that is killed (out of memory, a fault in a decoder, ``kill -9``) can say nothing any more, and a real drone
-then flies on for 15 s with the sticks as they were last. The guard holds the program's command socket, hears a byte
-every few milliseconds through a pipe, and acts when they stay away. It runs this very file and loads nothing else.
+A program that is killed (out of memory, a fault in a decoder, ``kill -9``) sends nothing any more, and a real drone
+then flies on for 15 s with its last stick positions. The guard shares the program's command socket, receives a
+heartbeat through a pipe, and acts when it stops. It runs this file and imports nothing else of the package.
 """
 
 import os
@@ -15,23 +15,23 @@ import threading
 import time
 
 _ALIVE, _PUSHED, _LANDED = b".", b"p", b"q"
-"""What the program tells: the sticks are centred; they are pushed; the drone is down and the guard may go."""
+"""Messages of the program: sticks centred; sticks pushed; landed, the guard may exit."""
 _SILENCE_S = 0.5
-"""Without a word for so long the sticks are centred."""
+"""Without a heartbeat for this time the sticks are centred."""
 _HANGS_S = 5.0
-"""Without a word for so long the drone is landed, as without state or video."""
+"""Without a heartbeat for this time the drone is landed, as without state or video."""
 _AGAIN_S = 0.5
 _LAND_TRIES = 20
 _SURE = 3
-"""Tries before an ``ok`` counts: the first may be that of an earlier command."""
+"""Tries before an ``ok`` counts: the first may answer an earlier command."""
 _CENTRED = b"rc 0 0 0 0"
 
 
 class Guard:
-    """The program's end.
+    """The program's side of the guard.
 
     Args:
-        commands: Socket that the drone knows us by.
+        commands: Command socket.
         drone: Numeric address and command port of the drone.
 
     Raises:
@@ -48,7 +48,7 @@ class Guard:
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
             pass_fds=[number],
-            start_new_session=True,  # what the terminal sends does not reach it
+            start_new_session=True,  # signals of the terminal do not reach it
             bufsize=0,
         )
         assert self._process.stdin is not None
@@ -57,11 +57,11 @@ class Guard:
         os.set_blocking(self._pipe.fileno(), False)
 
     def beat(self, pushed: bool) -> None:
-        """Tell that the program lives; at least every 0.2 s."""
+        """Send a heartbeat; at least every 0.2 s."""
         self._tell(_PUSHED if pushed else _ALIVE)
 
     def dismiss(self, landed: bool) -> None:
-        """Let it go; it still asks for a landing by itself when the drone has not landed."""
+        """Dismiss the guard; it still requests a landing if the drone has not landed."""
         if landed:
             self._tell(_LANDED)
         with self._lock:
@@ -78,12 +78,12 @@ class Guard:
                 return
             try:
                 self._pipe.write(word)
-            except OSError:  # it was killed, or is stopped: the program is what counts then
+            except OSError:  # it was killed or stopped: the program continues without it
                 return
 
 
 def watch(pipe: int, commands: socket.socket, drone: tuple[str, int]) -> None:
-    """Until the program says that the drone is down, is gone, or hangs."""
+    """Watch until the program reports a landing, dies, or hangs."""
     pushed, silent_s = False, 0.0
     while silent_s < _HANGS_S:
         if not select.select([pipe], [], [], _SILENCE_S)[0]:
@@ -101,7 +101,7 @@ def watch(pipe: int, commands: socket.socket, drone: tuple[str, int]) -> None:
 
 
 def land(commands: socket.socket, drone: tuple[str, int]) -> None:
-    """Ask for a landing until it is answered, or long enough."""
+    """Request a landing until it is answered or the tries are used up."""
     commands.settimeout(_AGAIN_S)
     for attempt in range(_LAND_TRIES):
         _send(commands, _CENTRED, drone)
@@ -127,7 +127,7 @@ def _send(commands: socket.socket, packet: bytes, drone: tuple[str, int]) -> Non
     try:
         commands.sendto(packet, drone)
     except OSError:
-        return  # no network at the moment; it is sent again
+        return  # no network at the moment; will be repeated
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""The Tello SDK's own words: state lines, units and axes. Degrees, centimetres and decimetres exist only here."""
+"""The Tello SDK's state messages, units and axes. Degrees, centimetres and decimetres exist only here."""
 
 import math
 from collections.abc import Mapping
@@ -22,12 +22,12 @@ _RANGES = {
     "baro": (-1000.0, 10_000.0),
     "bat": (0.0, 100.0),
 }
-"""What a value can be; anything else (such as tof 6553, "out of reach") counts as missing."""
+"""Valid ranges; other values (such as tof 6553, out of range) count as missing."""
 _MAX_LINE = 2048
 
 
 def parse_state(packet: bytes | str) -> dict[str, float | str]:
-    """Fields of one state message; what cannot be read is left out, so the worst packet gives an empty dictionary.
+    """Fields of one state message; unreadable fields are omitted, so the worst packet gives an empty dictionary.
 
     Reads both forms: SDK 1.3 (``pitch:0;roll:0;...``) and SDK 2.0 with mission pads (``mid:-1;...;mpry:0,0,0;...``).
 
@@ -67,7 +67,7 @@ def sample_from_sdk(
     Args:
         stamp_s: Arrival time [s].
         fields: SDK names to values; text, NaN and values that no Tello sends count as missing.
-        velocity_unit_m_s: Metres per second of one unit of ``vgx``; three real flights say 0.1.
+        velocity_unit_m_s: Metres per second of one unit of ``vgx``; 0.1 according to three real flights.
         z_down: Whether the SDK's axes are north-east-down like (x forward, y right, z down, yaw clockwise), as the
             flights say; False keeps the numbers (x forward, y left, z up).
     """

@@ -1,19 +1,19 @@
-"""The sticks of a drone, and the hand that lets go of them: a dead-man's switch."""
+"""The sticks of a drone with a dead-man's switch."""
 
 import threading
 import time
 from collections.abc import Callable
 
 FRESH_S = 0.3
-"""An ``rc`` that is older is no longer what the controller wants."""
+"""Maximum age of an ``rc`` command."""
 _TICK_S = 0.05
 _AGAIN_S = 0.1
-"""Centred sticks are said again this often: a packet may be lost, and nothing answers an ``rc``."""
+"""Interval at which centred sticks are repeated: ``rc`` is not acknowledged and packets may be lost."""
 CENTRED = "rc 0 0 0 0"
 
 
 class Sticks:
-    """Passes ``rc`` commands on, and centres the sticks when no fresh one comes, whatever became of who sent them.
+    """Forwards ``rc`` commands, and centres the sticks when no fresh one arrives.
 
     Args:
         transmit: Sends a command; never blocks, never raises.
@@ -24,7 +24,7 @@ class Sticks:
         self._transmit, self._on_tick = transmit, on_tick
         self._lock = threading.Lock()
         self._pushed_s: float | None = None
-        """When the last ``rc`` was sent; None while nobody holds the sticks."""
+        """Time of the last ``rc``; None while the sticks are released."""
         self._centred_s: float | None = None
         """When they were last centred; None while they are held."""
         self._stopping = threading.Event()
@@ -32,14 +32,14 @@ class Sticks:
         self._thread.start()
 
     def push(self, command: str, allowed: Callable[[], None]) -> None:
-        """Send an ``rc`` command unless ``allowed`` raises; nothing else is sent in between."""
+        """Send an ``rc`` command unless ``allowed`` raises, atomically."""
         with self._lock:
             allowed()
             self._pushed_s, self._centred_s = time.monotonic(), None
             self._transmit(command)
 
     def let_go(self) -> None:
-        """Centre the sticks if somebody has held them, and leave them alone from then on."""
+        """Centre the sticks if they were held, and stop repeating."""
         with self._lock:
             if self._pushed_s is not None:
                 self._transmit(CENTRED)

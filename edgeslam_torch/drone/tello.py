@@ -1,4 +1,4 @@
-"""Client for a DJI Tello over its text SDK (1.3 and 2.0): commands, state, video, and the will to land."""
+"""Client for a DJI Tello over its text SDK (1.3 and 2.0): commands, state, video, and safe landing."""
 
 import logging
 import math
@@ -24,17 +24,18 @@ logger = logging.getLogger(__name__)
 
 _STEPS = ("up", "down", "left", "right", "forward", "back", "cw", "ccw", "go", "curve", "flip", "jump")
 _MOVES = frozenset(["takeoff", "throwfly", *_STEPS, "rc", "motoron", "speed", "stop"])
-"""Commands that make a drone move, or change how it moves."""
+"""Commands that move the drone or change how it moves."""
 _NEVER_TWICE = _MOVES - {"stop", "speed", "rc", "takeoff"}
-"""A lost answer does not mean that the drone did not hear: sent again, the drone would move twice."""
+"""Commands that are not repeated: the answer may be lost although the drone received the command, and it would move
+twice."""
 _MOVE_TIMEOUT_S = 20.0
 _CLIMB_TIMEOUT_S = 20.0
 _RISE_TIMEOUT_S = 6.0
 _LAND_TRIES, _LAND_AGAIN_S = 10, 2.0
 _PARTING = ("land", "streamoff")
-"""What is still sent and waited for when the flight is over."""
+"""Commands still allowed after a flight has ended."""
 _FRESH_S = 1.0
-"""State older than this says nothing of the present."""
+"""Maximum age of state messages."""
 _RISEN_CM = 20.0
 _STEADY_CM = 6.0
 _STEADY_S = 1.5
@@ -42,18 +43,18 @@ _STEADY_S = 1.5
 
 @dataclass(frozen=True, slots=True)
 class TelloLimits:
-    """Timeouts and the conditions under which a flight ends by itself."""
+    """Timeouts and conditions that end a flight."""
 
     timeout_s: float = 3.0
     retries: int = 3
     keep_alive_s: float = 5.0
-    """A Tello lands by itself after 15 s without a command."""
+    """Keep-alive interval; a Tello lands after 15 s without a command."""
     min_battery: float = 0.10
     max_temperature_c: float = 95.0
     state_loss_s: float = 5.0
-    """Without state for so long in flight: land."""
+    """Land after this time without state in flight."""
     video_loss_s: float = 5.0
-    """Without a picture for so long in flight, once the stream has been asked for: land."""
+    """Land after this time without a picture in flight, once the stream was requested."""
 
     def __post_init__(self) -> None:
         if min(self.timeout_s, self.keep_alive_s, self.state_loss_s, self.video_loss_s) <= 0 or self.retries < 0:
@@ -75,15 +76,15 @@ class StateMessage:
 
 
 class Tello:
-    """One drone. Use it as a context manager: leaving it for whatever reason lands a drone that took off with it.
+    """One drone. Use it as a context manager: leaving it always lands a drone that took off with it.
 
     A `Guard` lands it when this program dies or hangs in flight, `Sticks` centre the sticks when no fresh ``rc`` comes,
-    and what others than the drone send is not listened to.
-    Nothing that makes the drone move is sent unless ``allow_motion`` is true.
+    and packets of other senders are ignored.
+    No motion command is sent unless ``allow_motion`` is true.
 
     Args:
         address: Where it is.
-        allow_motion: Whether motion commands are let through (``--fly`` on the command line).
+        allow_motion: Whether motion commands are allowed (``--fly`` on the command line).
         limits: Timeouts and guards.
         on_state: Called for each state message, from the receiving thread.
         on_picture: Called for each picture, from the video thread.
@@ -102,7 +103,7 @@ class Tello:
         self.limits = limits or TelloLimits()
         self.clock = ArrivalClock()
         self.stop_reason = ""
-        """Why a guard ended the flight; empty while none did."""
+        """Reason why a guard ended the flight; empty otherwise."""
         self.latest: StateMessage | None = None
         self.malformed = 0
         """State packets without a single readable field."""
@@ -111,9 +112,9 @@ class Tello:
         self._sending = threading.RLock()
         self._airborne = False
         self._landing = threading.Event()
-        """Set while a landing is wanted: nothing else is waited for, nothing else is sent."""
+        """Set while landing: no other command is sent or waited for."""
         self._leaving = threading.Event()
-        """The same for good, once `close` was called: a take-off that was about to be sent stays unsent."""
+        """The same permanently after `close`: a pending take-off is not sent."""
         self._stopping = threading.Event()
         self._closed = threading.Event()
         self._last_sent_s = -math.inf
@@ -185,7 +186,7 @@ class Tello:
             raise KeyboardInterrupt
 
     def _close(self) -> None:
-        """What `close` does, in a thread of its own, which no Ctrl-C reaches."""
+        """The work of `close`, in a thread that Ctrl-C does not reach."""
         self._leaving.wait()
         failure = ""
         try:
@@ -195,7 +196,7 @@ class Tello:
         finally:
             try:
                 self._hang_up()
-                if failure:  # said once all is done: a terminal that is stopped would hold it up
+                if failure:  # logged at the end: a stopped terminal would block it
                     logger.warning("while closing: %s", failure)
             finally:
                 self._closed.set()
@@ -209,7 +210,7 @@ class Tello:
             self.send("streamoff", retries=0, timeout_s=0.5)
 
     def _hang_up(self) -> None:
-        """End the threads and give the ports back; a guard that may still be needed goes on alone."""
+        """End the threads and release the ports; a guard that may still be needed continues alone."""
         self._stopping.set()
         self._sticks.stop()
         if self._guard is not None:
@@ -228,7 +229,7 @@ class Tello:
     def send(self, command: str, timeout_s: float | None = None, retries: int | None = None) -> str:
         """Send one command and return the answer.
 
-        A command that moves the drone is sent once: its answer may be lost, not the command.
+        A motion command is sent once: only its answer may have been lost.
 
         Raises:
             TelloError: If there is no answer, the drone answers with an error, or motion is not allowed.
@@ -268,7 +269,7 @@ class Tello:
         )
 
     def query(self, name: str) -> float:
-        """Number that a read command (``battery?``) answers, without its unit.
+        """Number in the answer to a query (``battery?``), without its unit.
 
         Raises:
             TelloError: If there is no number in the answer.
@@ -282,8 +283,8 @@ class Tello:
     def take_off(self) -> None:
         """Take off and wait until the climb is over.
 
-        Unlike a movement the command is sent again when nothing comes of it: a drone in the air refuses it. The climb
-        itself, seen in the state, is as good as an answer.
+        Unlike a movement, the command is repeated when it has no effect: a flying drone refuses it. A climb seen in
+        the state counts as an answer.
 
         Raises:
             TelloError: If motion is not allowed, the battery is low, the drone refuses, or nothing is heard of it.
@@ -314,7 +315,7 @@ class Tello:
             self._wait_for_hover()
 
     def land(self) -> None:
-        """Land, insistently: an answer may be lost, a drone in the air may not. Whatever else is waited for ends.
+        """Land, repeating the command until confirmed. Other waits are aborted.
 
         Raises:
             TelloError: If the drone neither answers nor says that it is on the ground.
@@ -339,8 +340,8 @@ class Tello:
             agreed += answer is not None and not is_refusal(answer)
             deadline = self.clock.now() + (0.0 if answer is None else 1.0)
             while not self._landed() and self.clock.now() < deadline and not self._stopping.wait(0.05):
-                pass  # what was answered shows in the state a moment later
-            # The first "ok" may be that of the movement which the landing ended.
+                pass  # the answer shows in the state a moment later
+            # The first "ok" may answer the movement that the landing interrupted.
             if self._landed() or agreed > 1 or (agreed and self._level() is None):
                 self._end_flight()
                 return
@@ -397,7 +398,7 @@ class Tello:
 
     @property
     def refused(self) -> dict[str, int]:
-        """Packets on each channel that did not come from the drone, and were not listened to."""
+        """Packets of other senders that were ignored, per channel."""
         video = 0 if self._video is None else self._video.refused
         return {"video": video, "state": self._states.refused, "answers": self._commands.refused}
 
@@ -415,7 +416,7 @@ class Tello:
         return self._landing.is_set() or self._leaving.is_set()
 
     def _begin_flight(self) -> None:
-        """From here on the drone may be in the air, whatever is heard of it."""
+        """From here on the drone may be in the air, even without an answer."""
         self._ground, self._rose = self._level(), False
         self._took_off_s = self._flight_begin_s = self.clock.now()
         if self._guard is None and os.name == "posix":
@@ -506,12 +507,12 @@ class Tello:
                 self._tell(message)
 
     def _tell(self, message: StateMessage) -> None:
-        """A listener that fails must not end the state of a drone in the air."""
+        """A failing listener must not interrupt state messages in flight."""
         assert self._on_state is not None
         try:
             self._on_state(message)
         except Exception:
-            logger.exception("what listens to state messages failed, and is not called again")
+            logger.exception("the listener for state messages failed and is not called again")
             self._on_state = None
 
     def _fresh(self) -> dict[str, float | str]:
@@ -533,7 +534,7 @@ class Tello:
         return level is not None and level > (10.0 if self._ground is None else self._ground) + _RISEN_CM
 
     def _landed(self) -> bool:
-        """Whether the drone is on the ground to stay: one that was told to take off may be about to."""
+        """Whether the drone has landed for good; after a take-off command it may be about to rise."""
         came_down = self._rose or self.clock.now() - self._took_off_s > _RISE_TIMEOUT_S
         return came_down and self._grounded()
 
@@ -545,7 +546,7 @@ class Tello:
         return low and fields.get("vgz", 0.0) == 0.0  # not while it still sinks
 
     def _unfit(self) -> str:
-        """Why this drone should not fly; empty when it may."""
+        """Reason why this drone should not fly; empty if it may."""
         fields = self.latest.fields if self.latest is not None else {}
         battery, heat = fields.get("bat"), fields.get("temph")
         if isinstance(battery, float) and battery < 100 * self.limits.min_battery:
@@ -555,7 +556,7 @@ class Tello:
         return ""
 
     def _watch(self) -> None:
-        """Keep the drone listening; end the flight when its state says so, and ask for that until it is down."""
+        """Send keep-alives; end the flight when the state requires it, repeating the landing until down."""
         while not self._stopping.wait(0.1):
             now = self.clock.now()
             reason = self.stop_reason or self._why_land(now)
@@ -571,7 +572,7 @@ class Tello:
             self.land()
         except TelloError as error:
             failure = str(error)
-        # Said once it is done: a terminal that is stopped would hold up the landing.
+        # Logged afterwards: a stopped terminal would delay the landing.
         if failure:
             logger.error("%s", failure)
         else:

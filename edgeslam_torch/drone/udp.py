@@ -1,4 +1,4 @@
-"""UDP ports, and ports that listen to one host alone."""
+"""UDP ports, optionally restricted to one sender."""
 
 import logging
 import socket
@@ -14,16 +14,16 @@ _MAX_PACKET = 65536
 
 
 class Inlet:
-    """A port that gives the packets of one host; those of anybody else are refused, counted and reported once.
+    """A port that accepts the packets of one host; others are ignored, counted and reported once.
 
     Args:
         address: Where to listen.
         purpose: For messages: "state", "video".
         host: Numeric address of the only sender that is listened to.
-        buffer: Bytes that the system may hold back for us; its default when 0.
+        buffer: Size of the receive buffer; 0 for the system's default.
 
     Raises:
-        SourceError: If the port cannot be had.
+        SourceError: If the port cannot be opened.
     """
 
     def __init__(self, address: tuple[str, int], purpose: str, host: str, buffer: int = 0) -> None:

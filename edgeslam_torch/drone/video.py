@@ -22,7 +22,7 @@ _RECEIVE_BUFFER = 4 * 1024 * 1024
 
 
 def import_av() -> Any:
-    """PyAV, or a word on how to get it.
+    """Import PyAV.
 
     Raises:
         SourceError: If it is not installed.
@@ -31,14 +31,14 @@ def import_av() -> Any:
         av = importlib.import_module("av")
     except ImportError as error:
         raise SourceError("video of a drone needs PyAV: pip install 'av>=12'") from error
-    av.logging.set_level(None)  # a lossy stream would fill the terminal with decoder messages
+    av.logging.set_level(None)  # a lossy stream would flood the terminal with decoder messages
     return av
 
 
 class ArrivalClock:
     """Seconds since 1970 that never jump: wall time at the start plus a monotonic clock.
 
-    Whole microseconds, as recordings hold them: what is run again has the very same stamps.
+    Whole microseconds, as in recordings, so that a replay has the same stamps.
     """
 
     def __init__(self) -> None:
@@ -62,7 +62,7 @@ class Picture:
 
 
 class PictureAssembler:
-    """Datagrams to pictures. Survives a start in mid-stream, lost datagrams and garbage; never raises for data."""
+    """Datagrams to pictures. Handles a start in mid-stream, lost datagrams and garbage; never raises for bad data."""
 
     def __init__(self) -> None:
         av = import_av()
@@ -77,7 +77,7 @@ class PictureAssembler:
 
     def _new_context(self) -> Any:
         context = self._av.CodecContext.create("h264", "r")
-        context.thread_count = 1  # frame threads would hold pictures back
+        context.thread_count = 1  # frame threads would delay pictures
         context.options = {"flags": "low_delay"}
         return context
 
@@ -109,7 +109,7 @@ class VideoReceiver:
     Args:
         bind: Where to listen.
         clock: For the stamps.
-        host: Numeric address of the drone; what anybody else sends is refused.
+        host: Numeric address of the drone; packets of other senders are ignored.
         on_picture: Called for each picture, from the video thread.
 
     Raises:
@@ -148,7 +148,7 @@ class VideoReceiver:
         return self._inlet.refused
 
     def wait(self, after_count: int, timeout_s: float) -> Picture | None:
-        """The newest picture once it is later than ``after_count``; None when time is up."""
+        """The newest picture after ``after_count``; None after the timeout."""
         with self._ready:
             self._ready.wait_for(lambda: self._stopping or self._later(after_count), timeout_s)
             return self._newest if self._later(after_count) else None
@@ -166,12 +166,12 @@ class VideoReceiver:
                     self._tell(picture)
 
     def _tell(self, picture: Picture) -> None:
-        """A listener that fails must not end the video of a drone in the air."""
+        """A failing listener must not interrupt video in flight."""
         assert self._on_picture is not None
         try:
             self._on_picture(picture)
         except Exception:
-            logger.exception("what listens to pictures failed, and is not called again")
+            logger.exception("the listener for pictures failed and is not called again")
             self._on_picture = None
 
     def stop(self) -> None:

@@ -14,7 +14,7 @@ _HOLE_SHARE = 0.05
 
 
 def telemetry_file(folders: Sequence[Path], given: str | Path | None) -> Path | None:
-    """The file that was given, or the source's own ``telemetry.csv``.
+    """The given file, or the source's own ``telemetry.csv``.
 
     Raises:
         SourceError: If the given file does not exist.
@@ -28,7 +28,7 @@ def telemetry_file(folders: Sequence[Path], given: str | Path | None) -> Path | 
 
 
 def read_samples(path: Path) -> tuple[list[TelemetrySample], list[str]]:
-    """Telemetry in time order, and what is wrong with the file, in words."""
+    """Telemetry in time order, and warnings about the file."""
     from edgeslam_torch.readers.telemetry_csv import read_table, samples_of  # only flights need it
 
     table = read_table(path)
@@ -36,7 +36,7 @@ def read_samples(path: Path) -> tuple[list[TelemetrySample], list[str]]:
 
 
 def telemetry_gap(samples: Sequence[TelemetrySample], first_s: float, last_s: float) -> str | None:
-    """How much of a video has no telemetry, in words; None when there is hardly a gap or no telemetry at all.
+    """Warning about the part of a video without telemetry; None for small gaps or without any telemetry.
 
     Args:
         samples: In time order.

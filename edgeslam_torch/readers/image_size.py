@@ -1,4 +1,4 @@
-"""Width and height of an image file by its header: a few hundred kilobytes can ask for gigabytes of pixels."""
+"""Width and height of an image file from its header: a small file may claim gigabytes of pixels."""
 
 import re
 import struct
@@ -55,7 +55,7 @@ def _bmp(data: bytes) -> tuple[int, int]:
 
 
 def _tiff(data: bytes, order: str) -> tuple[int, int] | None:
-    """TIFF 6.0, section 2: a directory of (tag, type, count, value); a tag that comes twice counts with the larger."""
+    """TIFF 6.0, section 2: a directory of (tag, type, count, value); of a repeated tag the larger value counts."""
     at = struct.unpack_from(order + "I", data, 4)[0]
     size = {256: 0, 257: 0}
     for i in range(struct.unpack_from(order + "H", data, at)[0]):

@@ -16,19 +16,19 @@ from edgeslam_torch.types import Frame
 
 SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp"})
 MAX_PIXELS = 50_000_000
-"""Of one image; video of today's largest size, 8K, has 33 million. A larger one is refused before it is decoded."""
+"""Maximum pixels of an image; 8K video has 33 million. Larger ones are rejected before decoding."""
 _MAX_BYTES = 8 * MAX_PIXELS
-"""Of one file; 16 bits and four channels without compression."""
+"""Maximum size of a file: 16 bits and four channels, uncompressed."""
 _JPEG = b"\xff\xd8"
 _EXIF = b"Exif\0\0"
 ASSUMED_HZ = 30.0
-"""Rate of images whose names tell no time; what webcams, Kinects and the Tello give."""
+"""Assumed rate of images without time stamps; that of webcams, Kinects and the Tello."""
 
 
 class JpegFrame(Frame):
-    """A JPEG's frame: its grey values are read at once, at half the cost of colours, and those when somebody asks.
+    """A JPEG frame: grey values are decoded at once, at half the cost of colours; colours on demand.
 
-    Nobody does for the seven of eight frames that become no keyframe. Every time somebody asks they are read again.
+    Seven of eight frames become no keyframe and need none. Every access decodes again.
     """
 
     __slots__ = ("_data",)
@@ -60,7 +60,7 @@ def read_image(path: Path) -> NDArray[np.uint8]:
 
 
 def read_pixels(path: Path, flags: int) -> NDArray[Any]:
-    """The image as ``cv2.imread`` with these flags gives it.
+    """The image as returned by ``cv2.imread`` with these flags.
 
     Raises:
         SourceError: If the file is missing, empty, damaged, too large or no image.
@@ -72,7 +72,7 @@ def read_pixels(path: Path, flags: int) -> NDArray[Any]:
 
 
 def pixels_or_none(path: Path, flags: int) -> NDArray[Any] | None:
-    """As `read_pixels`; None when the file cannot be read, whatever the reason."""
+    """As `read_pixels`; None if the file cannot be read."""
     try:
         return read_pixels(path, flags)
     except SourceError:
@@ -93,7 +93,7 @@ def read_frame(entry: ImageEntry) -> Frame:
 
 
 def check_size(width: int, height: int, name: str | Path | None) -> None:
-    """Whether an image of so many pixels may be decoded.
+    """Reject images with too many pixels.
 
     Raises:
         SourceError: If it has more than `MAX_PIXELS`.
@@ -127,16 +127,16 @@ def _bytes(path: Path) -> bytes:
 def _grey_of_jpeg(data: bytes, path: Path) -> NDArray[np.uint8]:
     """``(H, W)``.
 
-    By the same library as OpenCV's (libjpeg-turbo) and with the same values, but its warnings are errors: OpenCV gives
-    an image for whatever garbage lies between the first byte and the last.
+    By OpenCV's library (libjpeg-turbo) with the same values, but warnings are errors: OpenCV returns an image for
+    garbage between the first and the last byte.
     """
-    from kornia_rs.io import decode_image_jpegturbo  # 10 ms, which other sources can do without
+    from kornia_rs.io import decode_image_jpegturbo  # 10 ms that other sources do not need
 
     try:
         grey = decode_image_jpegturbo(data, "mono")
-    except Exception as error:  # it has no other class for what it refuses
+    except Exception as error:  # it has no other exception class
         raise SourceError(f"{path}: damaged JPEG data, or print colours (CMYK)") from error
-    if data.find(_EXIF, 0, 65536) >= 0:  # it may say that the picture is turned, which OpenCV heeds
+    if data.find(_EXIF, 0, 65536) >= 0:  # it may contain an orientation, which OpenCV applies
         return np.asarray(_decoded(data, path, cv2.IMREAD_GRAYSCALE), dtype=np.uint8)
     return np.asarray(grey[:, :, 0], dtype=np.uint8)
 
@@ -152,7 +152,7 @@ def _decoded(data: bytes, path: Path | None, flags: int) -> NDArray[Any]:
 
 
 def image_files(folder: Path) -> list[Path]:
-    """Image files directly in a folder, ``img10`` after ``img9``; hidden files are passed over."""
+    """Image files directly in a folder, ``img10`` after ``img9``; hidden files are ignored."""
     files = (p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and not p.name.startswith("."))
     return sorted((p for p in files if p.is_file()), key=_natural)
 
@@ -160,7 +160,7 @@ def image_files(folder: Path) -> list[Path]:
 def entries_from_names(files: Sequence[Path]) -> list[ImageEntry]:
     """Entries with stamps read from names like ``1305031102.175304.png`` or ``1403636579763555584.png``.
 
-    Names that tell no time (``frame_0012.png``) get 30 Hz in their order.
+    Names without a time (``frame_0012.png``) are numbered at 30 Hz.
     """
     stamps = _stamps_in_names(files)
     if stamps is None:
@@ -169,17 +169,17 @@ def entries_from_names(files: Sequence[Path]) -> list[ImageEntry]:
 
 
 def list_image_folder(folder: Path) -> tuple[list[ImageEntry], list[Problem]]:
-    """Images of a folder that has no list of its own."""
+    """Images of a folder without a list."""
     return in_order(entries_from_names(image_files(folder)), str(folder))
 
 
 def frames_of(entries: Sequence[ImageEntry], size: tuple[int, int], problems: list[Problem]) -> Iterator[Frame]:
-    """Frames in order, without images that cannot be read or have another size.
+    """Frames in order, skipping images that cannot be read or have another size.
 
     Args:
         entries: In time order.
         size: ``(width, height)`` that the camera is calibrated for.
-        problems: Gets a line for each image left out.
+        problems: List to which each skipped image is added.
     """
     for entry in entries:
         try:
@@ -228,6 +228,6 @@ def _stamps_in_names(files: Sequence[Path]) -> list[float] | None:
 
 def _natural(path: Path) -> tuple[list[int | str], str]:
     """Sort key under which ``img10`` comes after ``img9``."""
-    # Text and digits alternate, so that position by position like is compared with like.
+    # Text and digits alternate, so that equal positions have equal types.
     parts = re.split(r"(\d+)", path.stem)
     return [int(part) if i % 2 else part for i, part in enumerate(parts)], path.name

@@ -1,4 +1,4 @@
-"""Lists of images with stamps, and what is wrong with them."""
+"""Lists of images with stamps, and their defects."""
 
 import math
 from bisect import bisect_left
@@ -14,17 +14,17 @@ from edgeslam_torch.types import FloatArray, IntArray
 
 
 class Problem(NamedTuple):
-    """Something wrong in a source: what was left out, and why, or a remark."""
+    """A defect of a source: what was skipped and why, or a remark."""
 
     file: str
     reason: str
     frames: int = 1
-    """Frames that it cost; 0 for a remark."""
+    """Skipped frames; 0 for a remark."""
 
 
 @dataclass(frozen=True, slots=True)
 class ImageEntry:
-    """One image that a source says it has."""
+    """One listed image."""
 
     index: int
     """Position in the source, from 0."""
@@ -33,10 +33,9 @@ class ImageEntry:
 
 
 def seconds_from(stamps: Sequence[float]) -> tuple[FloatArray, str]:
-    """Stamps in seconds and the unit that they were in, told by their size.
+    """Stamps in seconds and their original unit, inferred from their magnitude.
 
-    A clock that counts from 1970 reads about 2e9 s now; no unit reaches the next one's numbers before the year
-    5138.
+    Unix time is about 2e9 s now; the ranges of the units do not overlap before the year 5138.
 
     Example:
         >>> seconds_from([1403636579763555584.0])[1]
@@ -51,7 +50,7 @@ def seconds_from(stamps: Sequence[float]) -> tuple[FloatArray, str]:
 
 
 def read_list(path: Path) -> tuple[list[tuple[float, str]], list[Problem]]:
-    """Rows ``stamp path`` of a list; lines that are not such a row become problems.
+    """Rows ``stamp path`` of a list; other lines become problems.
 
     Raises:
         SourceError: If the file is not text.
@@ -84,9 +83,9 @@ def _finite(text: str) -> float | None:
 
 
 def in_order(entries: Sequence[ImageEntry], name: str) -> tuple[list[ImageEntry], list[Problem]]:
-    """The entries with strictly increasing stamps, and a problem for each one left out.
+    """The entries with strictly increasing stamps, and a problem for each skipped one.
 
-    One wild stamp costs one image, wherever it lies: the longest increasing run is kept. A list that is not in
+    A wild stamp costs one image: the longest increasing subsequence is kept. A list that is not in
     time order at all (less than nine tenths would stay) is sorted instead, without repeated stamps; a remark says so.
 
     Args:

@@ -1,4 +1,4 @@
-"""Live sources: a Tello, a webcam, a network stream. They give the newest picture, never a queue of old ones."""
+"""Live sources: a Tello, a webcam, a network stream. They provide the newest picture, never a queue."""
 
 import re
 import threading
@@ -20,26 +20,26 @@ from edgeslam_torch.types import Frame, TelemetrySample
 FIRST_PICTURE_S = 10.0
 """A Tello's first pictures cannot be decoded until a keyframe comes."""
 SILENCE_S = 10.0
-"""Without a picture for so long the source has ended."""
+"""After this time without a picture the source has ended."""
 _SLICE_S = 0.1
-"""How long a source goes on waiting after it was told to end."""
+"""Polling interval of a waiting source."""
 
 
 class Feed(Protocol):
-    """Where pictures come from."""
+    """Source of pictures."""
 
     def wait(self, after_count: int, timeout_s: float) -> Picture | None:
-        """The newest picture once it is later than ``after_count``; None when time is up."""
+        """The newest picture after ``after_count``; None after the timeout."""
 
     def remarks(self) -> list[str]:
-        """What was amiss with what came."""
+        """Warnings about the received data."""
 
     def close(self) -> None:
-        """Give the device back."""
+        """Release the device."""
 
 
 class LiveSource:
-    """A camera that goes on by itself; implements `edgeslam_torch.readers.source.Source`."""
+    """A free-running camera; implements `edgeslam_torch.readers.source.Source`."""
 
     kind = "live"
     groundtruth: Path | None = None
@@ -54,7 +54,7 @@ class LiveSource:
         max_frames: int | None,
         is_drone: bool,
     ) -> None:
-        """Wait for the first picture, which tells the size.
+        """Wait for the first picture, which has the size.
 
         Raises:
             SourceError: If none comes.
@@ -81,10 +81,11 @@ class LiveSource:
             raise
 
     def frames(self) -> Iterator[Frame]:
-        """Pictures as they come; a slow taker misses some, which shows as gaps in the index. Closes the device.
+        """Pictures as they arrive; a slow consumer misses some, visible as gaps in the index. Closes the device at
+        the end.
 
         Raises:
-            TelloError: If a guard has ended our flight with a drone.
+            TelloError: If a guard has ended the flight.
         """
         last = given = 0
         try:
@@ -108,11 +109,11 @@ class LiveSource:
         return None
 
     def end(self) -> None:
-        """Let `frames` end with the picture that it has; from any thread, or a signal handler."""
+        """End `frames` after the current picture; callable from any thread or a signal handler."""
         self._told_to_end = True
 
     def close(self) -> None:
-        """Give the device back; what was amiss with it is in `warnings` afterwards."""
+        """Release the device; `warnings` is complete afterwards."""
         self._feed.close()
         if not self._closed:
             self._closed = True
@@ -130,14 +131,14 @@ class TelloFeed:
         """As `Feed`.
 
         Raises:
-            TelloError: If a guard has ended our flight; pictures of the floor are not what was asked for.
+            TelloError: If a guard has ended the flight.
         """
         if self.tello.stop_reason:
             raise TelloError(f"{self.tello.address.host}: the flight was ended: {self.tello.stop_reason}")
         return self.video.wait(after_count, timeout_s)
 
     def remarks(self) -> list[str]:
-        """As `Feed`: what did not come from the drone, or could not be read."""
+        """As `Feed`: packets of other senders or unreadable ones."""
         remarks = []
         refused = {channel: count for channel, count in self.tello.refused.items() if count}
         if refused:
@@ -199,7 +200,7 @@ class CaptureFeed:
             return self._newest if later() else None
 
     def remarks(self) -> list[str]:
-        """As `Feed`: there is nothing to say."""
+        """As `Feed`; none."""
         return []
 
     def close(self) -> None:
@@ -212,7 +213,7 @@ class CaptureFeed:
 def open_live(spec: str, camera: str | Path | None = None, max_frames: int | None = None) -> LiveSource:
     """Open ``tello://HOST[:PORTS]``, ``webcam:N``, ``rtsp://...`` or ``udp://...``.
 
-    A Tello is only listened to: nothing that makes it move is sent.
+    A Tello is only observed: no motion command is sent.
 
     Raises:
         SourceError: If it cannot be reached or gives no picture.

@@ -1,4 +1,4 @@
-"""A recording played at the pace it was recorded at."""
+"""Playback of a recording at its original rate."""
 
 import queue
 import threading
@@ -16,19 +16,19 @@ waited is soon caught up with.
 
 
 class Counter:
-    """A number that a feeding thread counts up."""
+    """A counter shared with the feeding thread."""
 
     def __init__(self) -> None:
         self.value = 0
 
 
 def at_their_pace(frames: Iterator[Frame], dropped: Counter, waiting: int = REALTIME_QUEUE) -> Iterator[Frame]:
-    """Frames of a recording as a camera would give them: at their stamps, the oldest waiting one lost when it is late.
+    """Frames of a recording as from a camera: at their stamps; when the queue is full the oldest is dropped.
 
     Args:
         frames: Of a recording.
-        dropped: Counts the lost ones.
-        waiting: Frames that may wait.
+        dropped: Counts dropped frames.
+        waiting: Length of the queue.
     """
     buffer: queue.Queue[Frame | None] = queue.Queue()
     stop = threading.Event()
@@ -49,7 +49,7 @@ def at_their_pace(frames: Iterator[Frame], dropped: Counter, waiting: int = REAL
                         break
                     dropped.value += 1
                 buffer.put(frame)
-        except BaseException as error:  # handed over whole: the consumer's thread raises it
+        except BaseException as error:  # passed on: raised in the consumer's thread
             failure.append(error)
         finally:
             buffer.put(None)

@@ -8,7 +8,7 @@ from typing import TypeVar
 T = TypeVar("T")
 
 _POLL_S = 0.2
-"""How often a waiting reader looks whether it is still wanted."""
+"""Interval at which a waiting reader checks whether to stop."""
 
 
 class _End:
@@ -45,7 +45,7 @@ def _fill(items: Iterator[T], buffer: "queue.Queue[T | _End]", stop: threading.E
         for item in items:
             if not _offer(buffer, item, stop):
                 return
-    except BaseException as caught:  # handed over whole: the consumer's thread raises it
+    except BaseException as caught:  # passed on: raised in the consumer's thread
         error = caught
     finally:
         close = getattr(items, "close", None)

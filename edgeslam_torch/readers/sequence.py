@@ -1,4 +1,4 @@
-"""A recording on disk as its layout describes it: images with stamps, and what lies beside them.
+"""A recording on disk as its layout describes it: images with stamps, and the files beside them.
 
 SLAM, evaluation and training all read recordings through this record; `edgeslam_torch.readers.layouts` makes it.
 """
@@ -17,7 +17,7 @@ from edgeslam_torch.readers.listing import ImageEntry, Problem
 from edgeslam_torch.types import FloatArray
 
 NOTHING_MEASURED = (0, 65535)
-"""Levels of a depth map that are no depth."""
+"""Values of a depth map that mean "no measurement"."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,11 +33,11 @@ class DepthMaps:
     T_c_d: FloatArray = field(default_factory=lambda: np.eye(4))
     """``(4, 4)`` depth camera to colour camera; identity when they are registered."""
     problems: tuple[Problem, ...] = ()
-    """What their list leaves out, and why; remarks."""
+    """Skipped entries with reasons, and remarks."""
 
     @property
     def is_registered(self) -> bool:
-        """Whether the maps show depth at the colour images' pixels."""
+        """Whether the maps are aligned with the colour images."""
         return self.camera is None
 
     def taken_by(self, colour: Camera) -> Camera:
@@ -61,7 +61,7 @@ class DepthMaps:
         metres = np.where(np.isin(raw, NOTHING_MEASURED), 0, raw) * np.float32(self.metres_per_unit)
         if not camera.is_distorted:
             return np.asarray(metres, np.float32)
-        # Nearest neighbour: a mean of two depths is a point in the air.
+        # Nearest neighbour: averaging two depths creates points in the air.
         maps, flat = camera.undistortion_maps(), metres.astype(np.float32)
         straight = cv2.remap(flat, *maps, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
         return np.asarray(straight, np.float32)
@@ -83,19 +83,19 @@ class Sequence:
     kind: str
     """Name of its layout."""
     folder: Path
-    """Where the images' calibration would lie."""
+    """Folder of the images' calibration file."""
     images: tuple[ImageEntry, ...]
     """In time order."""
     problems: tuple[Problem, ...] = ()
-    """What was left out, and why; remarks."""
+    """Skipped images with reasons, and remarks."""
     groundtruth: Path | None = None
     """A file of true poses, or a folder of them; `edgeslam_torch.eval.inputs.trajectory_files` reads it."""
     groundtruth_stamps_s: tuple[float, ...] | None = None
-    """Of the rows of a ground truth whose file has none."""
+    """Stamps of a ground truth whose file has none."""
     camera: Camera | None = None
-    """The data set's own calibration; a calibration file in the folder goes before it."""
+    """The data set's default calibration; a calibration file in the folder takes precedence."""
     depth: Callable[[], DepthMaps] | None = None
-    """Lists the measured depth maps, for who needs them; None when there are none."""
+    """Function that lists the measured depth maps; None without any."""
     name: str = ""
     """The folder's name by default."""
 
@@ -104,12 +104,12 @@ class Sequence:
             object.__setattr__(self, "name", self.folder.resolve().name)
 
     def first(self, count: int | None) -> "Sequence":
-        """The recording without all but its first ``count`` images."""
+        """The recording's first ``count`` images."""
         return self if count is None else replace(self, images=self.images[:count])
 
 
 def register_depth(depth: FloatArray, depth_camera: Camera, T_c_d: FloatArray, camera: Camera) -> FloatArray:
-    """Depth map ``(H, W)`` of one camera as another sees it; 0 where nothing falls; the nearest wins."""
+    """Depth map ``(H, W)`` of one camera rendered in another; 0 where empty; the nearest depth wins."""
     v, u = np.nonzero(depth)
     p_d = depth_camera.back_project(np.stack([u, v], axis=1).astype(np.float64), depth[v, u])
     p = p_d @ T_c_d[:3, :3].T + T_c_d[:3, 3]

@@ -33,44 +33,44 @@ ARCHIVES = {
 
 
 class Source(Protocol):
-    """What the run loop needs of any source, recorded or live."""
+    """Interface of a source, recorded or live."""
 
     name: str
-    """For messages and file names."""
+    """Name for messages and file names."""
     kind: str
     """A layout's ``KIND``, or ``images``, ``video``, ``flight``, ``live``."""
     location: str
     """Absolute path, or the address of a live source."""
     camera: Camera
     telemetry: list[TelemetrySample]
-    """In time order; a live source appends to it while it runs."""
+    """Telemetry in time order; grows during a live run."""
     groundtruth: Path | None
     length: int | None
-    """Frames at most; None when nobody knows."""
+    """Maximum number of frames; None if unknown."""
     problems: list[Problem]
-    """What was left out so far, and why."""
+    """Skipped items so far, with reasons."""
     warnings: list[str]
-    """What the user should know before looking at the result."""
+    """Warnings about the source."""
     live: bool
-    """Whether frames come at their own pace and are lost when nobody takes them."""
+    """Whether frames arrive at their own rate and are dropped if not taken."""
 
     def frames(self) -> Iterator[Frame]:
         """Frames in time order."""
 
     def close(self) -> None:
-        """Give a device back; may be called more than once."""
+        """Release the device; may be called repeatedly."""
 
 
 @dataclass
 class Recording:
-    """A source that lies on disk; `frames` may be called again and gives the same."""
+    """A source on disk; `frames` may be called repeatedly."""
 
     name: str
     kind: str
     location: str
     camera: Camera
     decode: Callable[[list[Problem]], Iterator[Frame]]
-    """Frames, decoded as they are asked for; appends what it leaves out."""
+    """Frames, decoded on demand; appends skipped ones to ``problems``."""
     length: int | None
     telemetry: list[TelemetrySample] = field(default_factory=list)
     groundtruth: Path | None = None
@@ -88,12 +88,12 @@ class Recording:
         return read_ahead(islice(self.decode(self.problems), self.max_frames))
 
     def close(self) -> None:
-        """Nothing to give back."""
+        """Nothing to release."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Content:
-    """What a reader found, before a camera is chosen."""
+    """Contents of a source before a camera is chosen."""
 
     kind: str
     decode: Callable[[tuple[int, int], list[Problem]], Iterator[Frame]]
@@ -111,14 +111,14 @@ def open_source(
     telemetry: str | Path | None = None,
     max_frames: int | None = None,
 ) -> Source:
-    """Open whatever ``spec`` names.
+    """Open the source that ``spec`` names.
 
     Args:
         spec: A TUM-layout, 7-Scenes, EuRoC or image folder, a video file, a flight recording, or a live
             source (``tello://HOST``, ``webcam:0``, ``rtsp://...``).
-        camera: Calibration file or preset; found by itself when the source has one.
-        telemetry: ``telemetry.csv`` of the flight; found by itself in the source.
-        max_frames: Frames given at most.
+        camera: Calibration file or preset; default: the source's own.
+        telemetry: ``telemetry.csv`` of the flight; default: the source's own.
+        max_frames: Maximum number of frames.
 
     Raises:
         SourceError: If there is nothing usable; the message names the file and what to do.
@@ -215,7 +215,7 @@ def _listed(sequence: Sequence, place: Path) -> _Content:
 
 
 def _nothing_in(folder: Path) -> str:
-    """Why a folder is no source, with what the user may have meant."""
+    """Error for a folder that is no source, with a suggestion."""
     children = sorted(folder.iterdir()) if folder.is_dir() else []
     if not children:
         return f"{folder}: empty; give a folder of images, a TUM, 7-Scenes or EuRoC sequence, or a video"
@@ -234,7 +234,7 @@ def _looks_like_sequence(folder: Path) -> bool:
 
 
 def _open_live(spec: str, camera: str | Path | None, telemetry: str | Path | None, max_frames: int | None) -> Source:
-    """Hand over to the live sources, which need sockets and (for a drone) the ``[drone]`` extra."""
+    """Open a live source, which needs sockets and (for a drone) the ``[drone]`` extra."""
     if telemetry is not None:
         raise SourceError(f"{spec}: a live source brings its own telemetry; leave --telemetry away")
     if importlib.util.find_spec("edgeslam_torch.readers.live") is None:

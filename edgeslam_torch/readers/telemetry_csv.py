@@ -1,6 +1,6 @@
 """`telemetry.csv`: a flight's state messages, in the SDK's own names and units, on the clock of the frames.
 
-The reader also takes other people's logs: other column names, milliseconds, and the units and axes found from the data.
+The reader also accepts other logs: other column names, milliseconds, units and axes inferred from the data.
 """
 
 import logging
@@ -42,8 +42,8 @@ _STAMPS = {
     "date_time": 0.0,
     "time": 0.0,
 }
-"""Column names of the clock, the surest first; factor 0 means the unit is told by the spacing. The SDK's own ``time``
-counts whole seconds of motor time: it serves only where there is nothing else."""
+"""Column names of the clock, most reliable first; factor 0: unit inferred from the spacing. The SDK's ``time`` counts
+whole seconds of motor time and is the last resort."""
 _ALIASES = {
     "vx": "vgx",
     "vy": "vgy",
@@ -62,7 +62,7 @@ _ALIASES = {
     "distance_tof": "tof",
 }
 _UNITS = ("cm", "dm", "m", "deg", "degrees", "pct", "percent", "%", "cm_s", "dm_s", "m_s", "mg", "c")
-"""Endings of column names that other logs write; velocities' units are found from the data all the same."""
+"""Unit suffixes of column names in other logs; the unit of velocities is inferred from the data regardless."""
 _VELOCITY = ("vgx", "vgy", "vgz")
 _ATTITUDE = ("pitch", "roll", "yaw")
 _SEPARATORS = ",;\t"
@@ -83,22 +83,22 @@ class TelemetryUnits:
     z_down: bool = True
     """Axes x forward, y right, z down with yaw clockwise; otherwise x forward, y left, z up."""
     evidence: str = "SDK default (dm/s, z down)"
-    """What it rests on, in words."""
+    """Evidence, in words."""
     body_frame: bool = False
-    """Whether horizontal velocities turn with the drone; otherwise they are in the world of power-on."""
+    """Whether horizontal velocities are in body axes; otherwise in the power-on world."""
     frame_evidence: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class TelemetryTable:
-    """A telemetry file as numbers."""
+    """Numeric contents of a telemetry file."""
 
     stamps_s: FloatArray
     """``(M,)`` increasing."""
     values: dict[str, FloatArray]
     """SDK name to ``(M,)``, NaN where missing."""
     skipped: int
-    """Rows left out: malformed, or not newer than the row before."""
+    """Skipped rows: malformed, or not newer than the previous one."""
 
     def samples(self, units: TelemetryUnits | None = None) -> list[TelemetrySample]:
         """SI units and our axes."""
@@ -113,7 +113,7 @@ class TelemetryTable:
         ]
 
     def warnings(self, name: str) -> list[str]:
-        """What is missing in the file ``name``, in sentences."""
+        """Warnings about the file ``name``."""
         if len(self.stamps_s) == 0:
             return [f"{name}: holds no state message, so the run goes without telemetry"]
         said = []
@@ -133,7 +133,7 @@ def read_telemetry(path: str | Path, units: TelemetryUnits | None = None) -> lis
 
     Args:
         path: Our ``telemetry.csv`` or another log with a header line.
-        units: How to read the velocities; found from the data when not given (`detect_units`).
+        units: How to read the velocities; default: `detect_units`.
 
     Raises:
         TelemetryError: If the file is not there, is not text, or has no clock or no known column.
@@ -145,7 +145,7 @@ def read_telemetry(path: str | Path, units: TelemetryUnits | None = None) -> lis
 
 
 def samples_of(path: str | Path, table: TelemetryTable, units: TelemetryUnits | None = None) -> list[TelemetrySample]:
-    """As `read_telemetry`, of a table read before."""
+    """As `read_telemetry`, from a table."""
     if units is None:
         units = detect_units(table)
         logger.info(
@@ -155,7 +155,7 @@ def samples_of(path: str | Path, table: TelemetryTable, units: TelemetryUnits | 
 
 
 def read_table(path: str | Path) -> TelemetryTable:
-    """The columns that we know, row by row; malformed rows are counted and left out.
+    """The known columns, row by row; malformed rows are counted and skipped.
 
     Raises:
         TelemetryError: As `read_telemetry`.
@@ -197,7 +197,7 @@ def _plain(name: str) -> str:
 
 
 def _bare(name: str) -> str:
-    """The name without a unit behind it."""
+    """The name without its unit."""
     for unit in sorted(_UNITS, key=len, reverse=True):
         if name.endswith(f"_{unit}"):
             short = name.removesuffix(f"_{unit}")
@@ -226,7 +226,7 @@ def _rows(
 
 
 def _moment(text: str) -> float:
-    """A number, or seconds since 1970 of a date and time (taken as UTC where it does not say)."""
+    """A number, or Unix seconds of a date and time (UTC unless stated)."""
     number = to_number(text)
     if math.isfinite(number) or len(text) < 16:
         return number
@@ -238,7 +238,7 @@ def _moment(text: str) -> float:
 
 
 def _seconds_per_unit(stamps: FloatArray) -> float:
-    """A Tello speaks at 10 Hz: the spacing tells seconds, milliseconds, microseconds and nanoseconds apart."""
+    """A Tello sends at 10 Hz: the spacing distinguishes seconds, milliseconds, microseconds and nanoseconds."""
     if len(stamps) < 2:
         return 1.0
     spacing = float(np.median(np.diff(stamps)))
@@ -285,7 +285,7 @@ def _vertical_units(table: TelemetryTable) -> TelemetryUnits:
 
 
 def _height_slope(stamps_s: FloatArray, vz: FloatArray, z_m: FloatArray, step_m: float) -> tuple[float, float]:
-    """Slope and correlation between one-second changes of height and of integrated ``vgz``; floor steps left out."""
+    """Slope and correlation between one-second changes of height and of integrated ``vgz``, without floor steps."""
     good = np.isfinite(vz) & np.isfinite(z_m) & (z_m > 0.12) & (z_m < 8.0)
     t, v, z = stamps_s[good], vz[good], z_m[good]
     if len(t) < 20:
@@ -301,15 +301,15 @@ def _height_slope(stamps_s: FloatArray, vz: FloatArray, z_m: FloatArray, step_m:
     if moving.sum() < 10:
         return math.nan, 0.0
     x, y = dx[moving], dz[moving]
-    if np.ptp(x) == 0.0 or np.ptp(y) == 0.0:  # a frozen sensor: nothing varies together
+    if np.ptp(x) == 0.0 or np.ptp(y) == 0.0:  # a frozen sensor: no covariance
         return math.nan, 0.0
     return float(np.median(y / x)), float(np.corrcoef(x, y)[0, 1])
 
 
 class TelemetryWriter:
-    """Append-only `telemetry.csv`; every row reaches the file at once and whole, whatever the disk does.
+    """Append-only `telemetry.csv`; every row is flushed at once and whole.
 
-    Opening an existing file goes on behind its last whole line.
+    An existing file is continued after its last whole line.
 
     Raises:
         TelemetryError: If the file cannot be written.
@@ -323,7 +323,7 @@ class TelemetryWriter:
             if not before:
                 self._file.write(",".join(HEADER) + "\n")
             elif not before.endswith(b"\n"):
-                self._file.write("\n")  # the torn line becomes one malformed row
+                self._file.write("\n")  # a partial line becomes one malformed row
         except OSError as error:
             raise TelemetryError(f"{self.path}: cannot be written: {error.strerror or error}") from error
 

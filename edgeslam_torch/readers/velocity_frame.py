@@ -1,7 +1,7 @@
-"""Whether a log's velocities are in the world of power-on or in the body's axes: told by how the drone leans.
+"""Whether a log's velocities are in the power-on world or in body axes, inferred from how the drone leans.
 
-A multicopter accelerates where it leans. Velocities that are read in the right frame and turned to the world change as
-the lean says; the lean's median is how body and camera are mounted, and pushes nowhere.
+A multicopter accelerates where it leans. In the right frame, velocities rotated to the world change as the lean
+predicts. The median lean is the mounting angle and exerts no force.
 """
 
 import math
@@ -12,12 +12,12 @@ import numpy as np
 from edgeslam_torch.types import FloatArray
 
 _SPAN_S = 0.5
-"""Change of velocity and mean lean over so long."""
+"""Interval of velocity changes and mean leans."""
 _LEAST_TURN_RAD = math.radians(20.0)
-"""Without turning both frames are the same but for a constant."""
+"""Minimum turn: without turning, both frames differ only by a constant."""
 _DECISIVE = 12.0
-"""Log likelihood ratio that is believed: wind and control move a drone, too, and half of a real flight reaches
-11 the wrong way. The whole flights reach 18 and 39."""
+"""Decisive log likelihood ratio: wind and control move a drone too, and half of a real flight reaches 11 for the
+wrong frame. Whole flights reach 18 and 39."""
 
 
 def body_frame_evidence(stamps_s: FloatArray, values: Mapping[str, FloatArray]) -> tuple[float, str]:
@@ -28,7 +28,7 @@ def body_frame_evidence(stamps_s: FloatArray, values: Mapping[str, FloatArray]) 
         values: SDK name to ``(M,)`` in the SDK's units; ``vgx vgy pitch roll yaw`` are needed.
 
     Returns:
-        0 when the flight does not tell.
+        0 without evidence.
     """
     names = ("vgx", "vgy", "pitch", "roll", "yaw")
     if any(name not in values for name in names) or len(stamps_s) < 50:
@@ -72,5 +72,5 @@ def _explained(t: FloatArray, v: FloatArray, push: FloatArray, span: int) -> flo
     power, own = float(np.sum(mean**2)), float(np.sum(change**2))
     if power <= 0 or own <= 0:
         return 0.0
-    together = max(0.0, float(np.sum(mean * change)))  # a drone that accelerates against its lean does not fly
+    together = max(0.0, float(np.sum(mean * change)))  # accelerating against the lean is impossible
     return min(together**2 / (power * own), 0.999)

@@ -19,14 +19,14 @@ SUFFIXES = frozenset(
 
 
 class Video:
-    """One video file: its size and length known, its frames decoded on demand."""
+    """One video file of known size and length; frames are decoded on demand."""
 
     def __init__(self, path: Path, stamps_s: list[float] | None = None) -> None:
-        """Open a video and look at its first frame.
+        """Open a video and decode its first frame.
 
         Args:
             path: Any file that OpenCV's FFmpeg reads.
-            stamps_s: Time of each frame [s] when the recording knows better than the container.
+            stamps_s: Time of each frame [s] if the recording is more precise than the container.
 
         Raises:
             SourceError: If the file cannot be decoded.
@@ -46,7 +46,7 @@ class Video:
         self.size = (image.shape[1], image.shape[0])
 
     def frames(self, problems: list[Problem]) -> Iterator[Frame]:
-        """Frames with strictly increasing stamps; what is left out is added to ``problems``."""
+        """Frames with strictly increasing stamps; skipped ones are added to ``problems``."""
         capture = _opened(self.path)
         last, index = -math.inf, -1
         try:
@@ -81,7 +81,7 @@ def _opened(path: Path) -> "cv2.VideoCapture":
         raise SourceError(f"{path}: not a folder of images and not a video ({', '.join(sorted(SUFFIXES))})")
     if path.stat().st_size == 0:
         raise SourceError(f"{path}: empty file")
-    # FFmpeg by name: OpenCV's other readers would take any file with digits in its name for an image sequence.
+    # FFmpeg explicitly: OpenCV's other backends treat any file name with digits as an image sequence.
     capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     if not capture.isOpened():
         raise SourceError(

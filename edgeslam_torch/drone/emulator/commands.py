@@ -1,4 +1,4 @@
-"""The SDK's command language: what each command does to the drone and what is answered, and when."""
+"""The SDK's command language: effect, answer and time of answer of each command."""
 
 import math
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ _PLAIN = ("mon", "moff", "motoron", "motoroff", "keepalive", "reboot")
 
 
 class Answer(StrEnum):
-    """When a command is answered."""
+    """Time at which a command is answered."""
 
     NOW = "now"
     WHEN_DONE = "when done"
@@ -30,14 +30,14 @@ class Answer(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Reply:
-    """Text of an answer and its moment."""
+    """Text and time of an answer."""
 
     text: str
     when: Answer = Answer.NOW
 
 
 class Interpreter:
-    """SDK 2.0 as far as one drone without expansion board needs it."""
+    """The part of SDK 2.0 for a drone without expansion board."""
 
     def __init__(self, drone: DroneModel, fly: bool = True) -> None:
         self.drone = drone
@@ -56,7 +56,7 @@ class Interpreter:
             self.sdk_mode = True
             return Reply("ok")
         if not self.sdk_mode:
-            return Reply("", Answer.NEVER)  # a real drone is silent until it hears "command"
+            return Reply("", Answer.NEVER)  # a real drone is silent until it receives "command"
         if name.endswith("?"):
             return self._query(name)
         if name == "rc":

@@ -1,4 +1,4 @@
-"""The emulated drone's body: where it is, how it moves under commands, what its sensors say."""
+"""The emulated drone's body: position, motion under commands, sensors."""
 
 import math
 from collections.abc import Callable
@@ -14,7 +14,7 @@ from edgeslam_torch.types import FloatArray
 _GRAVITY = 9.80665
 _HOVER_M = 0.8
 _GROUND_M = 0.1
-"""The camera and the range sensor sit this high when the drone stands on the floor."""
+"""Height of camera and range sensor when the drone stands on the floor."""
 _TAU_S = 0.35
 """Time constant of the velocity controller."""
 _WALL_M = 0.15
@@ -78,7 +78,7 @@ class DroneModel:
         return True
 
     def land(self) -> None:
-        """Sink to the floor and stop."""
+        """Descend to the floor and stop."""
         if self.flying:
             self.stop()
             self.mode = Mode.LANDING
@@ -94,7 +94,7 @@ class DroneModel:
         self._target, self._target_yaw, self.rc = None, None, (0.0, 0.0, 0.0, 0.0)
 
     def move(self, body_m: FloatArray, speed_m_s: float = 0.5) -> None:
-        """Fly by ``body_m`` ``(3,)`` forward, left, up, as seen from the present heading."""
+        """Fly by ``body_m`` ``(3,)`` forward, left, up, relative to the current heading."""
         c, s = math.cos(self.yaw), math.sin(self.yaw)
         step = np.array([c * body_m[0] - s * body_m[1], s * body_m[0] + c * body_m[1], body_m[2]])
         self._target, self._speed, self._busy_since = self.p_w + step, speed_m_s, self._clock
@@ -172,13 +172,13 @@ class DroneModel:
         return T
 
     def specific_force(self) -> FloatArray:
-        """What the accelerometer feels, body axes [m/s^2]."""
+        """Specific force in body axes [m/s^2]."""
         force = np.array([0.0, 0.0, _GRAVITY]) + (self.acceleration if self.flying else 0.0)
         return se3.inverse(self.T_w_b())[:3, :3] @ force
 
 
 def state_line(drone: DroneModel, temperature: int = 60, mission_pads: bool = True) -> str:
-    """What the drone sends ten times a second, in the SDK's words, units and axes.
+    """State message in the SDK's format, units and axes.
 
     Velocities are truncated to whole decimetres per second, as the recorded flights show.
     """

@@ -1,4 +1,4 @@
-"""A wireless link on loopback: packets are delayed, lost, or not delivered at all for a while."""
+"""A wireless link on loopback: delays, losses, outages."""
 
 import heapq
 import itertools
@@ -14,15 +14,15 @@ Address = tuple[str, int]
 
 @dataclass(frozen=True, slots=True)
 class LinkFaults:
-    """How bad the link is."""
+    """Faults of the link."""
 
     loss: float = 0.0
     """Share of packets lost, each way."""
     latency_s: float = 0.003
     video_latency_s: float = 0.3
-    """A Tello's picture is 0.3 to 0.8 s old when it arrives."""
+    """Latency of video; a Tello's is 0.3 to 0.8 s."""
     outages_s: tuple[tuple[float, float], ...] = ()
-    """Intervals since the start of the emulator in which nothing passes."""
+    """Outages, in seconds since the emulator's start."""
     garbage: float = 0.0
     """Share of packets followed by one of random bytes."""
 
@@ -43,12 +43,12 @@ class Link:
         self._wake = threading.Condition()
         self._stopping = False
         self.cut = False
-        """Nothing passes while true."""
+        """Complete outage while true."""
         self._thread = threading.Thread(target=self._work, name="tello-link", daemon=True)
         self._thread.start()
 
     def passes(self) -> bool:
-        """Whether one packet gets through now."""
+        """Whether a packet is delivered."""
         now = time.monotonic() - self._begin
         dark = self.cut or any(a <= now < b for a, b in self.faults.outages_s)
         return not dark and not (self.faults.loss > 0 and self._rng.random() < self.faults.loss)
@@ -61,7 +61,7 @@ class Link:
             self._wake.notify()
 
     def stop(self) -> None:
-        """End the thread; what is queued is lost."""
+        """End the thread; queued packets are lost."""
         with self._wake:
             self._stopping = True
             self._wake.notify()
@@ -86,4 +86,4 @@ def _send(sender: socket.socket, packet: bytes, to: Address) -> None:
     try:
         sender.sendto(packet, to)
     except OSError:
-        return  # nobody listens, or the emulator is being closed: as on the air
+        return  # no receiver, or the emulator is closing

@@ -1,4 +1,4 @@
-"""Pictures a second and their delay at our own client, while it flies an emulator that runs in a process of its own."""
+"""Frame rate and delay at our client while it flies an emulator in another process."""
 
 import subprocess
 import sys
@@ -16,26 +16,26 @@ from edgeslam_torch.errors import SourceError
 from edgeslam_torch.types import FloatArray
 
 _START_S = 120.0
-"""Patience with a busy machine: a room takes seconds to furnish."""
+"""Timeout for the start; building a room takes seconds."""
 _STICKS_S = 0.2
 
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """What the client saw."""
+    """Measurement at the client."""
 
     duration_s: float
     pictures: int
     """Decoded."""
     fresh: int
-    """With a moment that no picture before showed; the rest repeat the one before."""
+    """Pictures with a new time; the rest are repeats."""
     delay_s: FloatArray
     """``(pictures,)`` from the moment that a picture shows to the arrival of its last packet."""
     states: int
     undecodable: int
 
     def lines(self, video_latency_ms: float) -> list[str]:
-        """For the terminal."""
+        """Lines for the terminal."""
         rate, fresh, states = (n / self.duration_s for n in (self.pictures, self.fresh, self.states))
         lines = [
             f"{rate:.1f} pictures/s decoded, {fresh:.1f} of them new, {self.undecodable} undecodable, "

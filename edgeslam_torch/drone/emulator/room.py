@@ -53,8 +53,8 @@ def furnished_drone(
 
 
 def _plainer(world: World) -> World:
-    """A world quick enough to paint 30 times a second: without its smallest surfaces, and with all levels of its
-    textures made beforehand, which would hold up the pictures that first need them by a tenth of a second."""
+    """A world fast enough for 30 frames per second: without its smallest surfaces, and with all texture levels
+    precomputed, which would otherwise delay their first use by a tenth of a second."""
     quads = [q for q in world.quads if float(np.linalg.norm(np.cross(q.u_w, q.v_w))) > _LEAST_AREA_M2]
     for quad in quads:
         quad.texture.level(MAX_LEVEL)

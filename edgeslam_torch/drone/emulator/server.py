@@ -44,7 +44,7 @@ class EmulatorConfig:
     link: LinkFaults = field(default_factory=LinkFaults)
     seed: int = 0
     stopwatch: bool = False
-    """Show in each picture the moment (`time.monotonic`) of the pose that it shows."""
+    """Draw the time (`time.monotonic`) of the rendered pose into each picture."""
 
 
 class TelloEmulator:
@@ -61,7 +61,7 @@ class TelloEmulator:
         self.drone = drone or DroneModel()
         self.interpreter = Interpreter(self.drone)
         self.frozen = False
-        """The drone stops answering and sending, as after a crash of its software; it lands when told nothing."""
+        """Stops answering and sending, like crashed firmware; the drone lands without commands."""
         self.frames_sent = 0
         self.frames_painted = 0
         self._render = render or _test_card(config.width, config.height)
@@ -166,7 +166,7 @@ class TelloEmulator:
             self._stopping.wait(_STEP_S)
 
     def _paint(self) -> None:
-        """A picture at each tick, or as often as this machine manages; `_stream` encodes beside it."""
+        """Render at each tick, or as fast as possible; `_stream` encodes concurrently."""
         next_s = time.monotonic()
         while not self._stopping.is_set():
             if not self.interpreter.stream:
@@ -187,7 +187,7 @@ class TelloEmulator:
             self._painted.set()
 
     def _stream(self) -> None:
-        """Each picture once it is painted; the last one again when the next is late, as a camera keeps its rate."""
+        """Send each new picture; repeat the last one if the next is late, keeping the rate."""
         encoder: Encoder | None = None
         tick_s = 1.0 / self.config.rate_hz
         next_s = time.monotonic()

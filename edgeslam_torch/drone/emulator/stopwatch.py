@@ -1,7 +1,7 @@
 """A stopwatch in the corner of the picture, as filming a clock measures the delay of a real drone's video.
 
-Sixteen squares hold the milliseconds modulo 65.536 s, white for one, most significant first; below each stands its
-opposite, so that anything else is not taken for a time.
+Sixteen squares hold the milliseconds modulo 65.536 s, white for one, most significant first; below each is its
+complement, so that other content is not mistaken for a time.
 """
 
 import numpy as np
@@ -9,7 +9,7 @@ import numpy as np
 _BITS = 16
 PERIOD_S = 2**_BITS / 1e3
 _SHARE = 40
-"""A square is this part of the picture's width."""
+"""Side of a square relative to the picture's width."""
 
 
 def draw_time(image: np.ndarray, time_s: float) -> None:
@@ -36,7 +36,7 @@ def read_time(image: np.ndarray) -> float | None:
 
 
 def age_s(shown_s: float, now_s: float) -> float:
-    """Time [s] from the shown moment to ``now_s`` on the same clock; right up to `PERIOD_S`."""
+    """Time [s] from the shown time to ``now_s`` on the same clock, modulo `PERIOD_S`."""
     return (now_s - shown_s) % PERIOD_S
 
 

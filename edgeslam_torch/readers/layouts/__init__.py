@@ -1,7 +1,7 @@
-"""One module a data set: how its folder is recognised, and where its images, clock, camera, truth and depth are.
+"""One module per data set: how its folder is recognised, and where its images, stamps, camera, truth and depth are.
 
 A module in this folder is a layout. It has ``KIND``, ``recognises(folder)`` and ``read(folder)`` as `Layout` says; no
-other file needs to know of it. The first module, by name, that recognises a folder reads it.
+other file refers to it. The first module, by name, that recognises a folder reads it.
 """
 
 import importlib
@@ -14,21 +14,21 @@ from edgeslam_torch.readers.sequence import Sequence
 
 
 class Layout(Protocol):
-    """What a module here offers."""
+    """Interface of a layout module."""
 
     KIND: str
     """Short name, as in ``summary.json``."""
 
     @staticmethod
     def recognises(folder: Path) -> bool:
-        """Whether a folder is laid out this way; looks at names alone."""
+        """Whether a folder has this layout; looks at file names only."""
 
     @staticmethod
     def read(folder: Path) -> Sequence:
-        """The recording in a folder that was recognised.
+        """The recording in a recognised folder.
 
         Raises:
-            SourceError: If what names the images is missing or malformed.
+            SourceError: If the list of images is missing or malformed.
         """
 
 

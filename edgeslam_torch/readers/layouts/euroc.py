@@ -11,7 +11,7 @@ KIND = "euroc"
 
 
 def camera_folder(folder: Path) -> Path | None:
-    """``mav0/cam0`` of a sequence, whichever of its levels was named; None when it is no EuRoC sequence."""
+    """``mav0/cam0`` of a sequence, given any of its levels; None if it is no EuRoC sequence."""
     for candidate in (folder / "mav0" / "cam0", folder / "cam0", folder):
         named = (candidate / "data.csv").is_file() or candidate.name.startswith("cam")
         if named and (candidate / "data").is_dir():

@@ -1,7 +1,7 @@
 """KITTI odometry: ``sequences/00/image_2/000000.png``, ``times.txt`` and ``calib.txt``; truth in ``poses/00.txt``.
 
-https://www.cvlibs.net/datasets/kitti/eval_odometry.php. The left colour camera (``image_2``) is taken where there is
-one, else the left grey one (``image_0``). The true poses are the grey camera's, 6 cm beside the colour camera.
+https://www.cvlibs.net/datasets/kitti/eval_odometry.php. Uses the left colour camera (``image_2``) if present, else
+the left grey one (``image_0``). True poses are those of the grey camera, 6 cm beside the colour camera.
 """
 
 import math

@@ -24,9 +24,10 @@ DEPTH_CAMERA = Camera(640, 480, 585.0, 585.0, 320.0, 240.0, source="7-Scenes dep
 T_COLOUR_DEPTH = exp(np.array([-0.028, 0.003, 0.0, 0.0064, 0.0021, 0.0079]))
 """Depth camera to colour camera of the 7-Scenes Kinect, whose published depth maps are not registered to colour.
 
-Fitted to redkitchen: depth discontinuities of 25 maps, moved by this and projected with the colour camera's 525 px, lie
-nearest to the colour images' Canny edges (mean capped distance 3.78 px; translation alone 4.18; no motion 5.6, and a
-free focal length comes out at 526). The 2.8 cm are the Kinect's known baseline.
+Fitted to redkitchen: depth discontinuities of 25 maps, transformed by this and projected with the colour camera's 525
+px, are nearest to the Canny edges of its colour images (mean capped distance 3.78 px; translation alone 4.18; no
+motion 5.6, and a free focal length is estimated at 526). Figures that compare redkitchen's maps with its depth
+therefore rest on a fit to its own images. The 2.8 cm are the Kinect's known baseline.
 """
 
 _COLOUR = "frame-*.color.*"
@@ -38,7 +39,7 @@ def recognises(folder: Path) -> bool:
 
 
 def read(folder: Path) -> Sequence:
-    """Stamps are the files' numbers at 30 Hz; they carry no others."""
+    """Stamps are the files' numbers at 30 Hz; the data set has no others."""
     images, problems = _numbered(folder, _COLOUR)
     has_poses = next(folder.glob("*.pose.txt"), None) is not None
     has_depth = next(folder.glob("*.depth.png"), None) is not None

@@ -33,7 +33,8 @@ def find_list(folder: Path) -> Path | None:
 
 
 def default_camera(name: str) -> Camera | None:
-    """The benchmark's calibration when the folder's name tells its camera (``freiburg1_xyz``, ``tum_fr2_desk``)."""
+    """The benchmark's calibration if the folder's name identifies its camera (``freiburg1_xyz``,
+    ``tum_fr2_desk``)."""
     match = re.search(r"(?:freiburg|fr)([123])(?!\d)", name.lower())
     if match is None:
         return None
