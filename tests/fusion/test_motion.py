@@ -7,7 +7,6 @@ import pytest
 from edgeslam_torch.fusion.config import FusionConfig
 from edgeslam_torch.fusion.depth_scale import DepthRatio
 from edgeslam_torch.fusion.motion import MotionFusion
-from edgeslam_torch.fusion.visual_memory import VisualPose
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.synthetic.flights.flight import camera_on_body
 from edgeslam_torch.synthetic.flights.telemetry import EXACT, TelemetryFaults, simulate
@@ -169,27 +168,25 @@ def test_a_frozen_or_silent_link_does_not_pull_the_scale(rng, swinging, replay):
 def test_prediction_bridges_lost_vision(rng, swinging, replay, gap_s):
     """Against standing still: what telemetry adds when the picture is gone."""
     motion = swinging(30.0)
-    fusion, gauge, _ = fused(rng, motion, replay)
     errors, still = [], []
+    last = {}
+
+    def seen(t):
+        """From 12 s on the picture is gone for ``gap_s`` every two seconds."""
+        return t < 12.0 or t % 2.0 > gap_s - 0.01
 
     def each(t, i):
-        j = i - round(gap_s * 20)
-        if t > 15.0 and i % 40 == 0 and j >= 0:
-            errors.append(np.linalg.norm(probe(fusion, gauge, motion, j, t)[:3, 3] - gauge.T_m_c[i][:3, 3]))
-            still.append(np.linalg.norm(gauge.T_m_c[j][:3, 3] - gauge.T_m_c[i][:3, 3]))
+        if not seen(t) and seen(t + 0.05):
+            errors.append(np.linalg.norm(fusion.predict(t).T_w_c[:3, 3] - gauge.T_m_c[i][:3, 3]))
+            still.append(np.linalg.norm(gauge.T_m_c[last["seen"]][:3, 3] - gauge.T_m_c[i][:3, 3]))
+        if seen(t):
+            last["seen"] = i
 
-    def probe(fusion, gauge, motion, j, t):
-        memory = fusion._memory
-        saved = memory.last, memory.previous
-        memory.last, memory.previous = (
-            VisualPose(float(motion.stamps_s[k]), gauge.T_m_c[k], gauge.sigma_t, gauge.sigma_r) for k in (j, j - 1)
-        )
-        T = fusion.predict(t).T_w_c
-        memory.last, memory.previous = saved
-        return T
-
-    for i, t in enumerate(motion.stamps_s):
-        each(float(t), i)
+    samples = simulate(rng, motion.stamps_s, motion.T_w_c, T_B_C, faults=TelemetryFaults()).samples()
+    gauge = motion.in_gauge(rng)
+    fusion = MotionFusion(FusionConfig(), T_B_C)
+    replay(fusion, motion, gauge, samples, tracked=seen, each=each)
+    assert len(errors) >= 8
     assert np.mean(errors) < (1.0 if gap_s < 0.1 else 0.4) * np.mean(still)
 
 
@@ -224,18 +221,22 @@ def test_truncated_velocities_are_told_from_rounded_ones(rng, swinging, replay):
 
 
 @pytest.mark.parametrize("truncated", [False, True])
-def test_height_decides_what_the_readings_leave_open(rng, swinging, replay, monkeypatch, truncated):
-    """Velocities alone are undecided between rounding and truncation: only one of them agrees with the range sensor."""
-    motion = swinging(30.0)
+def test_height_decides_what_the_readings_leave_open(rng, swinging, replay, truncated):
+    """No velocity reaches three steps, so they do not tell rounding from truncation: the range sensor does."""
+    motion = swinging(40.0, size_m=0.13)
     exact = simulate(rng, motion.stamps_s, motion.T_w_c, T_B_C, faults=replace(EXACT, video_delay_s=0.5)).samples()
     whole = np.trunc if truncated else np.rint
     samples = [replace(s, velocity_m_s=whole(10 * (s.velocity_m_s + rng.normal(0, 0.02, 3))) / 10) for s in exact]
     gauge = motion.in_gauge(rng)
-    fusion = MotionFusion(FusionConfig(), T_B_C)
-    monkeypatch.setattr(fusion._track, "truncation_probability", lambda step: 0.4)
-    replay(fusion, motion, gauge, samples)
-    assert fusion.scale().value == pytest.approx(gauge.scale, rel=0.04)
-    assert fusion.scale().sigma < 0.05 * gauge.scale
+    scales = []
+    for told in (samples, [replace(s, tof_m=np.nan, height_m=np.nan, baro_m=np.nan) for s in samples]):
+        fusion = MotionFusion(FusionConfig(), T_B_C)
+        replay(fusion, motion, gauge, told)
+        scales.append(fusion.scale())
+    with_height, without = scales
+    assert with_height.value == pytest.approx(gauge.scale, rel=0.04)
+    assert with_height.sigma < 0.05 * gauge.scale
+    assert (without.value < 0.8 * gauge.scale) == truncated  # velocities alone are taken for rounded
 
 
 def test_height_changes_alone_tell_the_scale_of_a_climb(rng, replay, swinging):
