@@ -10,6 +10,7 @@ from edgeslam_torch.fusion.alignment import map_to_world, turns
 from edgeslam_torch.fusion.config import FusionConfig
 from edgeslam_torch.fusion.delay import GROWTH, MIN_DISPLACEMENTS, Delay
 from edgeslam_torch.fusion.plausibility import Agreement, Reading, Trust, Verdict, agreement
+from edgeslam_torch.fusion.scale import LogScale
 from edgeslam_torch.fusion.track import TelemetryTrack
 from edgeslam_torch.fusion.visual_memory import VisualMemory
 from edgeslam_torch.types import FloatArray
@@ -36,6 +37,8 @@ class Present:
     """Camera in the body ``(3, 3)``."""
     rough_scale: float | None
     """Metres per map unit, for what counts as motion."""
+    network: LogScale | None = None
+    """Scale by the depth network, a witness where velocities and heights contradict each other."""
 
 
 class Comparison:

@@ -18,6 +18,9 @@ GROWTH = 1.3
 _GUESS_S = 0.3
 """Used until the motion says better; the short end of what Tello owners measure."""
 _STEP_S = 0.05
+_MARGIN_S = 0.1
+"""Searched and used beyond the configured range, so that a delay at its end is found, and one beyond that is seen to be
+outside by `comparison`, which steps by as much."""
 _MOST_SIGMA_S = 0.05
 _VALLEY_S = 0.15
 _CLEARLY = 6.0
@@ -51,7 +54,7 @@ class DelaySearch:
         if self._config.delay_s is not None or n < MIN_DISPLACEMENTS or n < GROWTH * self._tried_at:
             return
         self._tried_at = n
-        low, high = self._config.delay_range_s
+        low, high = self._config.delay_range_s[0] - _MARGIN_S, self._config.delay_range_s[1] + _MARGIN_S
         moved = memory.displacements()
         common = track.covered(moved.from_s - high, moved.to_s - low)
         if common.sum() < MIN_DISPLACEMENTS:

@@ -15,6 +15,7 @@ import numpy as np
 from edgeslam_torch.fusion.alignment import map_to_world
 from edgeslam_torch.fusion.comparison import Comparison, Present
 from edgeslam_torch.fusion.config import FusionConfig
+from edgeslam_torch.fusion.consensus import Settled, settled_with_network
 from edgeslam_torch.fusion.delay import DelaySearch
 from edgeslam_torch.fusion.depth_scale import DepthRatio, DepthRatios, DepthScale
 from edgeslam_torch.fusion.ekf import EkfState
@@ -23,7 +24,7 @@ from edgeslam_torch.fusion.mount import Mount, estimate_mount
 from edgeslam_torch.fusion.plausibility import HEIGHTS, Trust
 from edgeslam_torch.fusion.prediction import VISUAL_REACH_S, Carried, PoseEstimate, between, by_vision
 from edgeslam_torch.fusion.scale import LogScale, fuse
-from edgeslam_torch.fusion.telemetry_scale import TelemetryFit, TelemetryScale, at_odds, rescaled
+from edgeslam_torch.fusion.telemetry_scale import TelemetryFit, TelemetryScale, rescaled
 from edgeslam_torch.fusion.track import TelemetryTrack
 from edgeslam_torch.fusion.visual_memory import VisualMemory, VisualPose
 from edgeslam_torch.types import FloatArray, ScaleEstimate, TelemetrySample
@@ -164,13 +165,15 @@ class MotionFusion:
 
     def scale(self) -> ScaleEstimate:
         """Metres per map unit with sigma and source; held while the motion says nothing new."""
-        opinions = []
-        if (told := self._by_telemetry) is not None:
-            opinions.append(replace(told, sigma=math.hypot(told.sigma, _FOCAL_SHARE * self._focal_sigma)))
-        depth = self._depth.scale()
-        if depth is not None and depth.in_domain:
-            opinions.append(self._with_focal(depth))
-        return fuse(opinions)
+        return fuse(self._settled().used)
+
+    def _settled(self) -> Settled:
+        """Opinions that may be averaged."""
+        told, depth = self._by_telemetry, self._depth.scale()
+        if told is not None:
+            told = replace(told, sigma=math.hypot(told.sigma, _FOCAL_SHARE * self._focal_sigma))
+        network = None if depth is None else self._with_focal(depth)
+        return settled_with_network(told, network, depth is not None and depth.in_domain)
 
     def _with_focal(self, depth: DepthScale) -> LogScale:
         """Map depth, and the network's metres, go with the focal length: its whole uncertainty is the ratio's too."""
@@ -257,16 +260,9 @@ class MotionFusion:
 
     def warnings(self) -> list[str]:
         """What the depth network or telemetry tells that the images do not bear out, in sentences; it is not used."""
-        told, depth = self._by_telemetry, self._depth.scale()
-        said = self._trust.warnings() + self._track.warnings()
-        if depth is not None and (out_of_domain := depth.warning()) is not None:
-            said.append(out_of_domain)
-        if told is not None and depth is not None and at_odds(told, depth.opinion):
-            said.append(
-                f"telemetry and the depth network contradict each other: {math.exp(told.log_scale):.3g} and "
-                f"{math.exp(depth.log_scale):.3g} metres per map unit"
-            )
-        return said
+        depth, contradiction = self._depth.scale(), self._settled().warning
+        own = (None if depth is None else depth.warning(), contradiction)
+        return self._trust.warnings() + self._track.warnings() + [said for said in own if said is not None]
 
     # --- estimation ----------------------------------------------------------------------------------------------
 
@@ -287,7 +283,9 @@ class MotionFusion:
         if R_w_m is None:
             return
         self._R_w_m = R_w_m
-        present = Present(self._memory, self._track, self.T_b_c[:3, :3], self._rough_scale())
+        depth = self._depth.scale()
+        network = None if depth is None else self._with_focal(depth)
+        present = Present(self._memory, self._track, self.T_b_c[:3, :3], self._rough_scale(), network)
         self._comparison.judge(self._trust, present, self._delay.delay, R_w_m)
         self._trust.at_odds = None
         scale = TelemetryScale(self.config, self.T_b_c, present, self._trust, self.delay_s, R_w_m, self._held_scale())
@@ -316,4 +314,5 @@ class MotionFusion:
     def _still_trusted(self) -> bool:
         """Whether all that the held opinion rests on may still tell the scale."""
         trusted = {"telemetry": self._trust.velocity, "height": any(map(self._trust.height, HEIGHTS))}
-        return self._trust.at_odds is None and all(trusted[source] for source in self._fit.sources)
+        settled = self._trust.at_odds is None or self._trust.at_odds.kept is not None
+        return settled and all(trusted[source] for source in self._fit.sources)

@@ -126,6 +126,28 @@ def _correlation(x: FloatArray, y: FloatArray) -> float:
     return float(np.sum(x * y)) / math.sqrt(power) if power > 1e-24 else 0.0
 
 
+@dataclass(frozen=True, slots=True)
+class AtOdds:
+    """Scales [metres per map unit] that cannot both be right."""
+
+    by_velocity: float
+    by_height: float
+    kept: str | None
+    """``telemetry`` (velocities) or ``height``, whichever the depth network confirms; None when it confirms neither."""
+
+    def warning(self) -> str:
+        """What is not used, and why."""
+        said = (
+            f"telemetry's velocities and heights contradict each other, {self.by_velocity:.3g} and "
+            f"{self.by_height:.3g} m per map unit"
+        )
+        if self.kept is None:
+            return f"{said}, and neither is used: are the velocities in the right unit?"
+        if self.kept == "height":
+            return f"{said}; the depth network confirms the heights, so the velocities are not used: the wrong unit?"
+        return f"{said}; the depth network confirms the velocities, so the heights are not used"
+
+
 class Trust:
     """Verdicts on a flight's readings, each kept until the opposite is proven."""
 
@@ -133,7 +155,7 @@ class Trust:
         self.latest: dict[Reading, Agreement] = {}
         self.elsewhere_s: float | None = None
         """Video delay at which telemetry fits the images, when that is none of the delays allowed."""
-        self.at_odds: tuple[float, float] | None = None
+        self.at_odds: AtOdds | None = None
         """Scales by velocities and by height where these cannot both be right."""
         self._verdicts: dict[Reading, Verdict] = {}
 
@@ -188,11 +210,7 @@ class Trust:
             if height is not None and self.verdict(reading) is Verdict.CONTRADICTS:
                 said.append(f"telemetry's height ({reading}) is not used: {_why(height, 'climbing and sinking')}")
         if self.at_odds is not None:
-            by_velocity, by_height = self.at_odds
-            said.append(
-                f"telemetry's velocities and heights contradict each other, {by_velocity:.3g} and {by_height:.3g} m "
-                "per map unit, and neither is used: are the velocities in the right unit?"
-            )
+            said.append(self.at_odds.warning())
         return said
 
 

@@ -7,8 +7,9 @@ import numpy as np
 
 from edgeslam_torch.fusion.comparison import Present
 from edgeslam_torch.fusion.config import FusionConfig
+from edgeslam_torch.fusion.consensus import at_odds, contradict, sided_with
 from edgeslam_torch.fusion.joint_scale import Evidence, displacement_evidence, height_evidence, solved
-from edgeslam_torch.fusion.plausibility import Reading, Trust, agreement, changes
+from edgeslam_torch.fusion.plausibility import AtOdds, Reading, Trust, agreement, changes
 from edgeslam_torch.fusion.scale import LogScale, floor_segments
 from edgeslam_torch.fusion.visual_memory import Displacements
 from edgeslam_torch.types import FloatArray, IntArray
@@ -26,9 +27,6 @@ _LEAST_CLIMB_M = 0.05
 _LEAST_CLIMB_SIGMAS = 2.0
 _MOST_STEPS = 0.3
 """Share of height readings that may step: more is not furniture passing below."""
-_AT_ODDS = 5.0
-_AT_ODDS_LOG = math.log(2.0)
-"""Sigmas and factor between two scales beyond which one of them is nonsense."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,11 +75,10 @@ class _Given:
     sigma: float
     """Relative."""
 
-
-def at_odds(a: LogScale, b: LogScale) -> bool:
-    """Whether one of two opinions must be nonsense, not merely off by more than it says."""
-    apart = abs(a.log_scale - b.log_scale)
-    return apart > max(_AT_ODDS_LOG, _AT_ODDS * math.hypot(a.sigma, b.sigma))
+    @property
+    def opinion(self) -> LogScale:
+        """In logarithms."""
+        return LogScale(math.log(self.scale), self.sigma, self.name)
 
 
 class TelemetryScale:
@@ -143,36 +140,55 @@ class TelemetryScale:
     def _together(self, shortfall_m_s: float, systematic: float) -> _Hypothesis | None:
         tilt = self._config.alignment_sigma_rad
         moved = self._by_displacements(shortfall_m_s) if self._trust.velocity else None
-        alone = solved([moved], tilt) if moved is not None else None
-        rough = alone[0] if alone is not None else self._present.rough_scale
+        rough = self._rough(moved)
         if rough is None:
             return None
         height = self._by_height(rough)
-        given = []
-        for name, evidence, error in (
-            ("telemetry", moved, systematic),
-            ("height", height, self._config.height_systematic_log),
-        ):
-            if evidence is None:
-                continue
-            evidence = evidence.softened(error * rough)
-            single = solved([evidence], tilt)
-            if single is not None and single[1] < _MOST_SIGMA:
-                given.append(_Given(name, evidence, *single))
+        given = [
+            g
+            for g in (
+                self._alone("telemetry", moved, systematic, rough),
+                self._alone("height", height, self._config.height_systematic_log, rough),
+            )
+            if g is not None
+        ]
+        if len(given) == 2 and at_odds(given[0].opinion, given[1].opinion):
+            given = self._settled(*given)
         together = solved([g.evidence for g in given], tilt) if given else None
         if together is None:
             return None
         gap = 0.0
         if len(given) == 2:
-            one, other = (LogScale(math.log(g.scale), g.sigma, g.name) for g in given)
+            one, other = (g.opinion for g in given)
             gap = abs(one.log_scale - other.log_scale) / math.hypot(one.sigma, other.sigma)
-            if at_odds(one, other):
-                self._trust.at_odds = given[0].scale, given[1].scale
-                return None
         sources = {g.name: SourceScale(g.scale, g.scale * g.sigma) for g in given}
         # Birge ratio: sources that disagree beyond their sigmas widen the result.
         sigma = max(1.0, gap) * together[1]
+        moved = moved if "telemetry" in sources else None
         return _Hypothesis(math.log(together[0]), sigma, gap, TelemetryFit(moved, sources, shortfall_m_s))
+
+    def _alone(self, name: str, evidence: Evidence | None, systematic: float, rough: float) -> _Given | None:
+        """What one kind of evidence says, with the error that no averaging removes."""
+        if evidence is None:
+            return None
+        evidence = evidence.softened(systematic * rough)
+        single = solved([evidence], self._config.alignment_sigma_rad)
+        return None if single is None or single[1] >= _MOST_SIGMA else _Given(name, evidence, *single)
+
+    def _settled(self, velocity: _Given, height: _Given) -> list[_Given]:
+        """Of velocities and heights that cannot both be right the one that the depth network confirms, if it does."""
+        kept = sided_with(velocity.opinion, height.opinion, self._present.network)
+        self._trust.at_odds = AtOdds(velocity.scale, height.scale, None if kept is None else kept.source)
+        return [given for given in (velocity, height) if kept is not None and given.name == kept.source]
+
+    def _rough(self, moved: Evidence | None) -> float | None:
+        """Metres per map unit to look for floor steps with: by velocities, unless the network contradicts them."""
+        network = self._present.network
+        alone = None if moved is None else solved([moved], self._config.alignment_sigma_rad)
+        if alone is None:
+            return self._present.rough_scale
+        wrong = network is not None and contradict(LogScale(math.log(alone[0]), alone[1], "telemetry"), network)
+        return self._present.rough_scale if wrong else alone[0]
 
     def _by_displacements(self, shortfall_m_s: float) -> Evidence | None:
         track, config = self._present.track, self._config

@@ -204,14 +204,50 @@ def test_a_wrong_clock_is_said_with_what_would_mend_it(rng, swinging, replay, la
     assert ("late" if late_s > 0.5 else "early") in warning
 
 
-def test_velocities_in_the_wrong_unit_are_at_odds_with_the_rest(rng, swinging, replay):
+def test_velocities_in_the_wrong_unit_are_named_and_dropped(rng, swinging, replay):
+    """The depth network confirms the heights: what remains is no surer than heights without any velocities."""
+    motion = swinging(25.0, size_m=0.5)
+
     def spoil(rng, samples, motion):
         return [replace(s, velocity_m_s=10.0 * s.velocity_m_s) for s in samples]
 
-    without, fusion, _ = told_of(rng, replay, swinging(25.0, size_m=0.5), spoil)
+    def white_velocities(rng, samples, motion):
+        return with_velocities(samples, rng.normal(0, 0.3, (len(samples), 3)))
+
+    _, fusion, gauge = told_of(np.random.default_rng(1), replay, motion, spoil)
+    _, heights, _ = told_of(np.random.default_rng(1), replay, motion, white_velocities)
     scale = fusion.scale()
-    assert scale.sigma / scale.value >= 0.999 * without.sigma / without.value
-    assert any("contradict each other" in w for w in fusion.warnings())
+    assert scale.source == heights.scale().source == "height+depth"
+    assert scale.sigma >= 0.9 * heights.scale().sigma
+    assert abs(scale.value - gauge.scale) < 2 * scale.sigma
+    (warning,) = (w for w in fusion.warnings() if "contradict each other" in w)
+    assert "velocities are not used" in warning
+
+
+def test_velocities_in_the_wrong_unit_with_nothing_beside_them_give_no_metres(rng, swinging, replay):
+    """The depth network alone speaks against them: one of the two is nonsense, and nobody knows which."""
+
+    def spoil(rng, samples, motion):
+        return [replace(s, velocity_m_s=10.0 * s.velocity_m_s) for s in no_heights(samples)]
+
+    _, fusion, _ = told_of(rng, replay, swinging(25.0), spoil)
+    assert not math.isfinite(fusion.scale().sigma)
+    assert any("right unit" in w for w in fusion.warnings())
+
+
+@pytest.mark.parametrize("late_s", [0.68, 0.72, 0.77, 0.83])
+def test_a_delay_at_the_end_of_the_range_is_found_or_said(rng, swinging, replay, late_s):
+    """Delays of -0.18 to -0.33 s where -0.2 is the least that is allowed: no guess in place of what was found."""
+
+    def spoil(rng, samples, motion):
+        return [replace(s, stamp_s=s.stamp_s + late_s) for s in samples]
+
+    _, fusion, gauge = told_of(rng, replay, swinging(25.0), spoil)
+    if "telemetry" in fusion.scale().source:
+        assert fusion.delay_s == pytest.approx(0.5 - late_s, abs=0.03)
+        assert fusion.scale().value == pytest.approx(gauge.scale, rel=0.06)
+    else:
+        assert any("stamps are" in w for w in fusion.warnings())
 
 
 @pytest.mark.parametrize("how", ["random", "stuck"])
