@@ -1,1 +1,1 @@
-"""The map: anchors, keyframes, which anchors a camera should see, and the poses tied to keyframes."""
+"""The map: anchors, keyframes, projection of anchors, and frame poses relative to keyframes."""

@@ -7,7 +7,7 @@ from edgeslam_torch.types import FloatArray, IntArray, PointCloud
 
 
 class Anchors:
-    """All anchors of the map. Rows of removed anchors are used again from the next `begin_pass` on."""
+    """All anchors of the map. Rows of removed anchors are reused after the next `begin_pass`."""
 
     def __init__(self, capacity: int = 4096) -> None:
         self.p_w: FloatArray = np.zeros((capacity, 3))
@@ -18,19 +18,19 @@ class Anchors:
         """Distance at which the anchor would be seen at pyramid level 0."""
         self.colour: NDArray[np.uint8] = np.zeros((capacity, 3), dtype=np.uint8)
         self.observations: IntArray = np.zeros(capacity, dtype=np.int64)
-        """Keyframes that hold the anchor."""
+        """Number of keyframes that observe the anchor."""
         self.visible: IntArray = np.zeros(capacity, dtype=np.int64)
         self.found: IntArray = np.zeros(capacity, dtype=np.int64)
-        """Frames in which it should have been, and was, seen."""
+        """Frames in which it was predicted and found, respectively."""
         self.born: IntArray = np.zeros(capacity, dtype=np.int64)
         """Keyframe id of creation."""
         self.alive: NDArray[np.bool_] = np.zeros(capacity, dtype=bool)
         self.from_depth: NDArray[np.bool_] = np.zeros(capacity, dtype=bool)
-        """The depth rests on a prior, not on parallax: `host`, `prior` and `origin` tell which."""
+        """Whether the depth comes from a prior instead of parallax; see `host`, `prior` and `origin`."""
         self.host: IntArray = np.full(capacity, -1, dtype=np.int64)
-        """Keyframe id along whose ray the prior holds."""
+        """Id of the host keyframe of the prior."""
         self.origin: FloatArray = np.zeros((capacity, 3))
-        """Camera centre of that keyframe when the anchor was made [map units]."""
+        """Camera centre of the host at creation [map units]."""
         self.prior: FloatArray = np.zeros((capacity, 2))
         """Expected inverse z-depth in the host and its standard deviation [1/map unit]."""
         self.sigma: FloatArray = np.zeros(capacity)
@@ -42,7 +42,7 @@ class Anchors:
         return int(self.alive.sum())
 
     def begin_pass(self) -> None:
-        """Open the rows that the last mapping pass removed; nobody refers to them any more."""
+        """Free the rows that the last mapping pass removed; they are no longer referenced."""
         self._free.extend(self._just_removed)
         self._just_removed.clear()
 
@@ -68,7 +68,7 @@ class Anchors:
         return ids
 
     def rest_on_prior(self, ids: IntArray, host: int, origin: FloatArray, prior: FloatArray) -> None:
-        """Say on which expectation the depths of anchors ``(M,)`` rest.
+        """Set the depth priors of anchors ``(M,)``.
 
         Args:
             ids: Anchors, ``from_depth``.
@@ -82,7 +82,7 @@ class Anchors:
         self.sigma[ids] = prior[:, 1] / prior[:, 0] * np.linalg.norm(self.p_w[ids] - origin, axis=1)
 
     def remove(self, ids: IntArray) -> None:
-        """Forget anchors; the caller has taken them out of the keyframes."""
+        """Remove anchors; the caller has removed their observations."""
         ids = np.unique(ids[self.alive[ids]])
         self.alive[ids] = False
         self._just_removed.extend(ids.tolist())

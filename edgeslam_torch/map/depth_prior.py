@@ -1,4 +1,4 @@
-"""How deep a keypoint probably is before it is triangulated: depth network and anchors under one scale."""
+"""Depth prior of keypoints before triangulation, from the depth network and the anchors nearby."""
 
 from dataclasses import dataclass
 
@@ -9,17 +9,17 @@ from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.types import DepthMap, FloatArray
 
 REACH_PX = 40.0
-"""Distance from an anchor at which its depth error says a third as much about the network's there."""
+"""Distance at which an anchor's correction of the network's depth has decayed to 1/e."""
 NEAREST = 4
-"""Anchors that speak for a pixel."""
+"""Number of nearest anchors used per pixel."""
 
 MIN_ANCHORS = 8
-"""Below this a fit to anchors says less than the network."""
+"""Minimum number of anchors for a fit."""
 
 
 @dataclass(frozen=True, slots=True)
 class DepthFit:
-    """Map units per network metre, from the anchors that one keyframe sees."""
+    """Map units per network metre, from the anchors of one keyframe."""
 
     log_ratio: float
     sigma_log: float
@@ -28,7 +28,7 @@ class DepthFit:
 
 
 def sample(depth: DepthMap, uv: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Depth [m] and its log sigma at the nearest pixels of ``(N, 2)``; NaN where the network says nothing."""
+    """Depth [m] and its log sigma at the nearest pixels of ``(N, 2)``; NaN where unknown."""
     height, width = depth.depth_m.shape
     u = np.clip(np.rint(uv[:, 0]), 0, width - 1).astype(np.int64)
     v = np.clip(np.rint(uv[:, 1]), 0, height - 1).astype(np.int64)
@@ -52,15 +52,15 @@ def depth_prior(
 ) -> tuple[FloatArray, FloatArray]:
     """Expected z-depth [map units] and its log sigma at pixels ``(N, 2)`` of a keyframe, ``(N,)`` each.
 
-    With a depth map: the network's depth, brought to map units by the keyframe's own anchors, bent towards those
-    nearby, and as uncertain as it turned out to be at them: in a room it never saw, the network is surer of itself
-    than it should be. Without one: the log depth of the nearest anchors, with a wide sigma.
+    With a depth map: the network's depth in map units by the keyframe's anchors, corrected by those nearby, with at
+    least the sigma observed at them, since the network is overconfident in unseen rooms. Without one: the log depth
+    of the nearest anchors, with a wide sigma.
 
     Args:
         keyframe: Keyframe with some anchors.
         uv: Undistorted pixels.
         anchor_p_w: ``(A, 3)`` positions of all anchors, indexed by id.
-        unknown_sigma_log: Sigma where no network speaks.
+        unknown_sigma_log: Sigma without a network.
     """
     held = keyframe.keypoints_with_anchor()
     z = (anchor_p_w[keyframe.anchor[held]] @ keyframe.T_c_w[:3, :3].T + keyframe.T_c_w[:3, 3])[:, 2]
@@ -85,8 +85,8 @@ def _bend(anchor_uv: FloatArray, error: FloatArray, uv: FloatArray) -> tuple[Flo
     """Correction of the network's log depth at pixels from its error at the anchors near them.
 
     Returns:
-        The correction ``(N,)``, fading with the distance to the nearest anchor, and the robust spread of what it
-        leaves of each anchor's error when that anchor takes no part.
+        The correction ``(N,)``, fading with the distance to the nearest anchor, and the robust spread of the anchors'
+        leave-one-out residuals.
     """
     tree = cKDTree(anchor_uv)
     mean, distance = _nearby(tree, error, uv)

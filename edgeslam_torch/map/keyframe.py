@@ -28,13 +28,13 @@ class Keyframe:
     words: NDArray[np.uint64]
     """``(N, 4)`` descriptors for `hamming`."""
     grid: KeypointGrid
-    """Over ``features.uv``."""
+    """Index of ``features.uv``."""
     depth: DepthMap | None = None
-    """Dropped, like ``image``, once the edges are measured."""
+    """Released, like ``image``, after the edges are measured."""
     image: NDArray[np.uint8] | None = None
     """Undistorted, ``(H, W, 3)`` BGR or ``(H, W)`` grey; for edges."""
     grey: NDArray[np.uint8] | None = None
-    """``(H, W)`` undistorted, as other keyframes' edges are searched in it."""
+    """``(H, W)`` undistorted, searched for other keyframes' edges."""
 
     @property
     def T_w_c(self) -> FloatArray:

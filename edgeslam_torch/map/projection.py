@@ -1,4 +1,4 @@
-"""Which anchors a camera should see, and which keypoints are they."""
+"""Projection of anchors into a camera and matching to its keypoints."""
 
 from dataclasses import dataclass
 
@@ -33,7 +33,8 @@ class Projection:
 def project_anchors(
     anchors: Anchors, ids: IntArray, T_c_w: FloatArray, camera: Camera, scale_factor: float, levels: int
 ) -> Projection:
-    """Anchors that are in front, inside the image, at a distance and angle near enough to those seen before."""
+    """Anchors that are in front, inside the image, at a distance and viewing angle similar to earlier
+    observations."""
     p_w = anchors.p_w[ids]
     p_c = p_w @ T_c_w[:3, :3].T + T_c_w[:3, 3]
     z = np.maximum(p_c[:, 2], 1e-9)
@@ -45,7 +46,7 @@ def project_anchors(
     octave = np.log(np.maximum(anchors.max_distance[ids], 1e-12) / np.maximum(distance, 1e-12)) / np.log(scale_factor)
     level = np.clip(np.rint(octave), 0, levels - 1).astype(np.int64)
     seen = (p_c[:, 2] > 1e-3 * distance) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-    # Beyond 60 degrees, or two pyramid levels outside the detector's range, ORB does not match any more.
+    # ORB does not match beyond 60 degrees or two pyramid levels outside the detector's range.
     seen &= (cosine > 0.5) & (octave > -2.5) & (octave < levels + 1.5)
     return Projection(ids[seen], np.stack([u, v], axis=1)[seen], p_c[seen, 2], level[seen])
 

@@ -13,8 +13,7 @@ from edgeslam_torch.types import FloatArray, IntArray
 class SlamMap:
     """The map that tracking reads and mapping writes.
 
-    Keyframes that were removed live on as a rigid link to a surviving one, so that every frame ever tracked keeps a
-    pose that moves with the map.
+    Removed keyframes are kept as rigid links to a surviving one, so that the pose of every frame moves with the map.
     """
 
     def __init__(self, scale_factor: float, levels: int = 8) -> None:
@@ -48,13 +47,13 @@ class SlamMap:
         return T_keyframe_heir @ self.keyframes[heir].T_c_w
 
     def _heir(self, keyframe_id: int) -> tuple[int, FloatArray]:
-        """The surviving keyframe that a keyframe hangs on (itself while it lives), and the way to it."""
+        """The surviving keyframe that a keyframe is linked to (itself if alive), and the transform to it."""
         chain = []
         T = np.eye(4)
         while keyframe_id in self.links:
             chain.append(keyframe_id)
             keyframe_id = self.links[keyframe_id][0]
-        # Links of links are shortened on the way, or a thousand removed keyframes would be walked for every frame.
+        # Path compression: without it, a thousand links would be followed for every frame.
         for removed in reversed(chain):
             T = self.links[removed][1] @ T
             self.links[removed] = (keyframe_id, T)

@@ -20,26 +20,30 @@ from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.types import FloatArray, IntArray
 
 STEP_PX = 1.75
-"""Mean distance of the coarse search's hypotheses in the images."""
+"""Mean spacing of the coarse search's hypotheses in the images: half the width of the cost valley of an edge whose
+profile is sampled 1.5 px to either side."""
 HYPOTHESES = (8, 24)
-"""Fewest and most hypotheses of the coarse search."""
+"""Minimum and maximum number of hypotheses of the coarse search."""
 VALLEY = 2
-"""Steps of the coarse search around the best hypothesis that count as the same valley."""
+"""Half width of a cost valley in steps of the coarse search."""
 UNIQUE = 1.2
-"""How much worse every other valley must be, and a grey level more."""
+"""Minimum ratio of every other valley's cost to the best one, plus a grey level: a standard deviation of the mean
+absolute noise of four samples in five targets (0.76 / sqrt(20))."""
 FINE_STEP = 0.3
 """Step of the fine search in steps of the coarse one; it takes three either way."""
 TRUNCATE = 30.0
-"""Grey levels; a larger difference says no more (occlusion, highlight)."""
+"""Truncation in grey levels, five to ten times the difference at a right match: beyond are occlusions and
+highlights."""
 MAX_COST = 12.0
-"""Mean grey difference of an accepted match; sensor noise and resampling give 3 to 6."""
+"""Maximum mean grey difference of a match, twice that of right ones: sensor noise and resampling give 3 to 6."""
 MIN_ACROSS = 0.25
-"""Sine of the angle between an edge and the epipolar line below which the edge slides along the line."""
+"""Minimum sine of the angle between edge and epipolar line: below, half a pixel across the edge is two along the
+line."""
 MIN_SHARE = 0.5
-"""Sum of these sines over the targets that an edge needs: about two useful targets."""
+"""Minimum sum of these sines over the targets."""
 
 _CHUNK = 4096
-"""Edges searched at a time: what a search makes then stays in the processor's cache."""
+"""Edges searched at a time, so that temporaries fit the processor's cache."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,7 +142,7 @@ def measure_edge_depth(
 
 
 def _smooth(grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """What rounding to a pixel does not hurt."""
+    """Smoothed image, insensitive to rounding to pixels."""
     return cv2.blur(grey, (3, 3)).astype(np.uint8, copy=False)
 
 
@@ -165,7 +169,7 @@ def _coarse_search(
     high: FloatArray,
     camera: Camera,
 ) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Edges ``(N,)`` that look alike at one hypothesis and at no other, its inverse depth and the search's step."""
+    """Edges ``(N,)`` with a unique minimum, its inverse depth and the search's step."""
     ends = [_measurable(line, low, high, camera) for line in lines]
     share, length = np.stack([s for s, _ in ends]), np.stack([n for _, n in ends])
     searched = np.flatnonzero(share.sum(axis=0) >= MIN_SHARE)
@@ -208,7 +212,7 @@ def _fine_search(
 
 
 def _measurable(lines: _Lines, low: FloatArray, high: FloatArray, camera: Camera) -> tuple[FloatArray, FloatArray]:
-    """How much of each search segment crosses the edge ``(E,)``, and its length [px].
+    """Sine of the angle between each search segment and its edge ``(E,)``, and the segment's length [px].
 
     Zero where it does not cross, or where the segment is not wholly in the target.
     """
@@ -244,7 +248,7 @@ def _cost(
         near = line.of(seen)
         x, y, _ = near.pixels(first[seen] + hypothesis * step[seen])
         difference = _difference(_across(near.grey, x, y, near.normal, sampling), profile.take(seen, axis=1))
-        # Spread over all edges, of which those not seen weigh nothing: a third of the time of adding at indices.
+        # Expanded to all edges with zero weight where unseen: a third of the time of indexed addition.
         total += across * difference.take(np.cumsum(across > 0) - 1, axis=1)
     weight = share.sum(axis=0)
     total[:, weight < MIN_SHARE] = np.inf
@@ -271,7 +275,7 @@ def _across(
 def _difference(seen: NDArray[np.uint8], expected: NDArray[np.uint8]) -> FloatArray:
     """Mean truncated difference ``(D, E)`` of profiles ``(P, D, E)`` from the host's ``(P, E)``, in grey levels.
 
-    Half of a common brightness change is taken out: exposure drifts, but brightness also tells edges apart. All of it
+    Half of a common brightness change is removed: exposure drifts, but brightness also distinguishes edges. All of it
     in 16-bit integers, which hold the ``2 P``-th part of a grey level exactly and are four times as fast as floats.
     """
     parts = 2 * len(seen)
@@ -287,7 +291,7 @@ def _difference(seen: NDArray[np.uint8], expected: NDArray[np.uint8]) -> FloatAr
 
 
 def _sigma(lines: list[_Lines], rho: FloatArray) -> FloatArray:
-    """Inverse-depth sigma of half a pixel across the edge, all useful targets together."""
+    """Inverse-depth sigma for half a pixel across the edge, combining all targets."""
     information = np.full(len(rho), 1e-12)
     for line in lines:
         x, y, z = line.pixels(rho)

@@ -17,13 +17,13 @@ from edgeslam_torch.mapping.edge_depth import StereoView, measure_edge_depth
 from edgeslam_torch.types import FloatArray, IntArray, PointCloud
 
 AGREE_PX = 2.0
-"""An edge of another keyframe this near to a projected point may be the same edge."""
+"""Maximum distance of a projected edge point from the same edge in another keyframe."""
 AGREE_DEPTH = 0.04
-"""Relative depth difference of the same edge measured from two keyframes."""
+"""Maximum relative depth difference of the same edge in two keyframes."""
 RECENT_HOSTS = 40
-"""Latest keyframes whose edges a new one's are compared with."""
+"""Number of latest keyframes compared with a new one."""
 PRIOR_CELL_PX = 8
-"""Side of the cells whose edges are searched around the same depth."""
+"""Side of the cells whose edges share a depth prior."""
 
 _REACH = math.ceil(AGREE_PX + 0.5)
 """Radius [px] of a painted edge: a query may be rounded by half a pixel."""
@@ -47,14 +47,14 @@ class EdgePoints:
     """``(E,)`` keyframes that measured the same point, this one included."""
 
     def keep(self, mask: NDArray[np.bool_]) -> int:
-        """Forget the points outside a mask ``(E,)``; returns how many."""
+        """Remove the points outside a mask ``(E,)``; returns their number."""
         for name in ("uv", "normal", "p_c", "sigma", "colour", "observations"):
             setattr(self, name, getattr(self, name)[mask])
         return int((~mask).sum())
 
 
 class EdgeMap:
-    """Measures the edges of keyframes and keeps them; what it keeps changes under the map's lock alone."""
+    """Measures and stores the edges of keyframes; modified under the map's lock only."""
 
     def __init__(self, slam_map: SlamMap, camera: Camera, config: EdgeConfig, unknown_sigma_log: float) -> None:
         self.map = slam_map
@@ -69,13 +69,13 @@ class EdgeMap:
         self._waiting.append(keyframe.id)
 
     def update(self, everything: bool = False) -> None:
-        """Measure the keyframes that have waited long enough, or all of them."""
+        """Measure the keyframes that are due, or all of them."""
         keep = 0 if everything else self.config.delay_keyframes
         while len(self._waiting) > keep:
             keyframe = self.map.keyframes.get(self._waiting.pop(0))
             if keyframe is not None:  # it may have been found redundant meanwhile
                 self._measure(keyframe)
-                # Other keyframes' edges are searched in the grey image; the rest (3 MB) has done its work.
+                # The grey image is kept for other keyframes' edges; the rest (3 MB) is released.
                 keyframe.image = keyframe.depth = None
 
     def _measure(self, keyframe: Keyframe) -> None:
@@ -113,14 +113,14 @@ class EdgeMap:
         self.add(points)
 
     def add(self, points: EdgePoints) -> None:
-        """Take the measured edges of a keyframe in the map, and forget others if there are too many."""
+        """Add the measured edges of a keyframe, and remove others beyond the limit."""
         with self.map.lock:
             self._count_agreement(points, self._overlapping(self.map.keyframes[points.keyframe_id]))
             self.hosts.append(points)
             self._bound()
 
     def _prior(self, keyframe: Keyframe, uv: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Expected depth and its log sigma ``(E,)`` at edges, the same within a cell: a third of the questions."""
+        """Expected depth and its log sigma ``(E,)`` at edges, shared within a cell, to reduce queries."""
         across = -(-self.camera.width // PRIOR_CELL_PX)
         u, v = (uv // PRIOR_CELL_PX).astype(np.int64).T
         cells, cell_of = np.unique(v * across + u, return_inverse=True)
@@ -129,7 +129,7 @@ class EdgeMap:
         return prior[cell_of], sigma[cell_of]
 
     def _bound(self) -> None:
-        """Keep to ``max_points``: first go the points that nobody will agree with any more, then half of the oldest."""
+        """Keep to ``max_points``: first remove old points of a single keyframe, then half of the oldest."""
         total = sum(len(h.uv) for h in self.hosts)
         if total <= self.config.max_points:
             return
@@ -182,7 +182,7 @@ class EdgeMap:
     def points(self) -> PointCloud:
         """Edge points that several keyframes agree on, fused in cells, in the map's world frame.
 
-        They are of one moment, from whatever thread they are asked for.
+        A consistent snapshot, callable from any thread.
         """
         with self.map.lock:  # the arrays are copies from here on
             if not any(len(h.uv) for h in self.hosts):
@@ -202,7 +202,7 @@ class EdgeMap:
 
 @dataclass(frozen=True, slots=True)
 class PaintedEdges:
-    """Edge pixels painted into an image of their indices: a third of what a tree takes to be built and asked."""
+    """Edge pixels rendered into an index image: a third of the time to build and query a tree."""
 
     uv: FloatArray
     """``(E, 2)``"""
@@ -223,7 +223,7 @@ class PaintedEdges:
     def nearest(self, uv: FloatArray) -> IntArray:
         """Index of the edge pixel nearest to each of ``(N, 2)``, -1 where none is within `AGREE_PX`.
 
-        Queries are rounded to pixels to be looked up, so that of two edges nearly as near either may be named.
+        Queries are rounded to pixels, so that of two edges at nearly the same distance either may be returned.
         """
         height, width = self.index.shape
         u, v = (uv + (_REACH + 0.5)).T  # half a pixel more, so that cutting off rounds
@@ -261,7 +261,7 @@ def fuse(p_w: FloatArray, sigma: FloatArray, colour: NDArray[np.uint8], count: I
     rgb = np.stack([np.bincount(group, weight * colour[:, i]) / total for i in range(3)], axis=1)
     most = np.zeros(len(size), dtype=np.int64)
     np.maximum.at(most, group, count)
-    # Errors of one cell's points share their poses: the best single sigma, not the sum of informations.
+    # Errors within a cell are correlated through the poses: take the smallest sigma, not the sum of informations.
     best = np.full(len(size), np.inf)
     np.minimum.at(best, group, sigma)
     return PointCloud(

@@ -1,4 +1,4 @@
-"""Look for known anchors in keyframes that do not hold them yet: more observations, fewer doubles."""
+"""Search known anchors in keyframes that do not observe them yet: more observations, fewer duplicates."""
 
 import numpy as np
 
@@ -13,23 +13,23 @@ RADIUS_PX = 3.0
 MAX_HAMMING = 50
 """Bits, of 256; the strict figure of ORB-SLAM2, as there is no ratio test."""
 YOUNG = 3
-"""Keyframes for which an anchor is looked for in the neighbours; what they did not show by then, they do not show."""
+"""Number of keyframes during which a new anchor is searched in its neighbours."""
 CHI2_2 = 5.991
 """Chi-square, two degrees of freedom, 95 %."""
 
 Pairs = tuple[IntArray, IntArray]
-"""Two ids ``(M,)`` each for what looks like one anchor."""
+"""Ids ``(M,)`` of pairs of anchors that may be duplicates."""
 
 
 def fuse(slam_map: SlamMap, camera: Camera, keyframe: Keyframe, neighbours: list[Keyframe]) -> None:
-    """Look for a keyframe's young anchors in its neighbours; all of them are looked for by `fuse_all`."""
+    """Search a keyframe's young anchors in its neighbours; `fuse_all` searches all."""
     ids = slam_map.anchors_seen_by([keyframe])
     young = ids[slam_map.anchors.born[ids] > keyframe.id - YOUNG]
     merge(slam_map, [_look_in(slam_map, camera, k, young) for k in neighbours])
 
 
 def fuse_all(slam_map: SlamMap, camera: Camera) -> None:
-    """Look for every anchor in every keyframe: what drift hid from each other meets once all poses are refined."""
+    """Search every anchor in every keyframe, after all poses are refined."""
     anchors = slam_map.anchors
     for keyframe in slam_map.keyframes.values():
         merge(slam_map, [_look_in(slam_map, camera, keyframe, np.flatnonzero(anchors.alive & ~anchors.from_depth))])
@@ -45,7 +45,7 @@ def look_for(
     per_level: float,
     ratio: float,
 ) -> tuple[IntArray, IntArray, FloatArray]:
-    """Anchors that a keyframe does not hold, where its pose expects them.
+    """Search anchors that a keyframe does not observe around their projections.
 
     Args:
         slam_map: Holds keyframe and anchors.
@@ -54,13 +54,13 @@ def look_for(
         ids: Anchors to look for.
         radius_px: Search radius at pyramid level 0.
         per_level: Factor by which the radius grows with every level.
-        ratio: Nearest over second nearest descriptor distance at most.
+        ratio: Maximum ratio of nearest to second nearest descriptor distance.
 
     Returns:
-        What was found ``(M,)``, on which keypoints ``(M,)``, and how far from there [px] it was expected ``(M, 2)``.
+        Found anchors ``(M,)``, their keypoints ``(M,)``, and predicted minus observed pixels ``(M, 2)``.
     """
     anchors = slam_map.anchors
-    held = np.zeros(len(anchors.alive) + 1, dtype=bool)  # the last row answers for NO_ANCHOR
+    held = np.zeros(len(anchors.alive) + 1, dtype=bool)  # the last row stands for NO_ANCHOR
     held[keyframe.anchor] = True
     ids = ids[~held[ids]]
     seen = project_anchors(anchors, ids, keyframe.T_c_w, camera, slam_map.scale_factor, slam_map.levels)
@@ -79,7 +79,8 @@ def look_for(
 
 
 def observe_or_pair(slam_map: SlamMap, keyframe: Keyframe, found: IntArray, keypoint: IntArray) -> Pairs:
-    """Observe anchors ``(M,)`` on a keyframe's free keypoints; those whose keypoint has another anchor, and that."""
+    """Observe anchors ``(M,)`` on a keyframe's free keypoints; returns the others with the anchors of their
+    keypoints."""
     held = keyframe.anchor[keypoint]
     free = held < 0
     slam_map.observe(keyframe, keypoint[free], found[free])
@@ -87,7 +88,7 @@ def observe_or_pair(slam_map: SlamMap, keyframe: Keyframe, found: IntArray, keyp
 
 
 def _look_in(slam_map: SlamMap, camera: Camera, keyframe: Keyframe, ids: IntArray) -> Pairs:
-    """Observe anchors on a keyframe's free keypoints; returns those whose keypoint has another anchor, and that."""
+    """Search and observe anchors in a keyframe; returns duplicates as pairs."""
     growth = slam_map.scale_factor
     found, keypoint, error = look_for(slam_map, camera, keyframe, ids, RADIUS_PX, growth, 1.0)
     sigma = growth ** keyframe.features.octave[keypoint].astype(np.float64)
@@ -96,7 +97,7 @@ def _look_in(slam_map: SlamMap, camera: Camera, keyframe: Keyframe, ids: IntArra
 
 
 def merge(slam_map: SlamMap, doubles: list[Pairs]) -> None:
-    """Two ids for one point: the one with more observations stays."""
+    """Merge duplicate anchors; the one with more observations is kept."""
     if not doubles:
         return
     a, b = (np.concatenate(side) for side in zip(*doubles, strict=True))

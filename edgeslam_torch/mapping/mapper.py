@@ -25,13 +25,13 @@ from edgeslam_torch.optim.problem import LmConfig, WindowResult
 from edgeslam_torch.types import FloatArray, IntArray
 
 ENOUGH_ANCHORS = 300
-"""Anchors of a keyframe below which empty places of its image are filled on the prior alone."""
+"""Number of anchors below which empty regions of a keyframe are filled from the depth prior alone."""
 EMPTY_RADIUS_PX = 25.0
-"""Distance to the next anchor from which on a keypoint counts as being in an empty place."""
+"""Minimum distance of a keypoint in an empty region from the next anchor."""
 
 
 class Mapper:
-    """Takes keyframes into the map, one at a time."""
+    """Inserts keyframes into the map, one at a time."""
 
     def __init__(self, slam_map: SlamMap, camera: Camera, config: SlamConfig, lm: LmConfig) -> None:
         self.map = slam_map
@@ -44,7 +44,7 @@ class Mapper:
         self._recent: IntArray = np.zeros(0, dtype=np.int64)
 
     def insert(self, keyframe: Keyframe, colour: np.ndarray) -> WindowResult | None:
-        """Make the most of a new keyframe.
+        """Insert a new keyframe: cull, triangulate, fuse, rejoin, refine.
 
         Args:
             keyframe: Already in the map; ``keyframe.anchor`` holds what tracking matched.
@@ -61,19 +61,19 @@ class Mapper:
             fuse(self.map, self.camera, keyframe, self.map.covisible(keyframe, 2 * self.config.neighbours))
             drift_px = reobserve(self.map, self.camera, keyframe)
             self.map.join_pieces(keyframe, self.map.covisible(keyframe, len(self.map.keyframes)))
-        if drift_px is not None and drift_px > MOST_DRIFT_PX:  # what drifted on the way lies outside the window
+        if drift_px is not None and drift_px > MOST_DRIFT_PX:  # the drift lies outside the window
             refine_all(self.map, self.camera, self.lm)
         window = choose_window(self.map, keyframe, self.config.window, self.config.window_fixed)
         result = refine(self.map, window, self.camera, self.lm)
         with self.map.lock:
-            # Refinement moves the others by too little to see them from another side.
+            # Refinement moves the other keyframes too little to change viewing directions.
             self.map.refresh_anchors(keyframe.anchor[keyframe.anchor >= 0])
             drop_needless_priors(self.map, keyframe, np.deg2rad(self.config.min_parallax_deg))
             self.cull_keyframes(keyframe)
         return result
 
     def cull_recent_anchors(self, keyframe: Keyframe) -> None:
-        """Remove young anchors that tracking does not find again or that only two keyframes ever saw."""
+        """Remove young anchors that tracking rarely finds or that only two keyframes observe."""
         anchors = self.map.anchors
         recent = self._recent[anchors.alive[self._recent]]
         age = keyframe.id - anchors.born[recent]
@@ -83,7 +83,7 @@ class Mapper:
         self._recent = recent[~(rarely_found | lonely) & (age < 3)]
 
     def triangulate_new(self, keyframe: Keyframe, neighbours: list[Keyframe], colour: np.ndarray) -> None:
-        """New anchors from keypoints that neither side has an anchor for yet."""
+        """Triangulate keypoints without an anchor in either keyframe."""
         prior, sigma = np.full((2, len(keyframe.anchor)), np.nan)
         free = np.flatnonzero(keyframe.anchor < 0)
         prior[free], sigma[free] = depth_prior(
@@ -136,12 +136,13 @@ class Mapper:
     def place_far(
         self, keyframe: Keyframe, other: Keyframe, matches: Matches, prior: FloatArray, colour: np.ndarray
     ) -> IntArray:
-        """Anchors on matches with too little parallax to be triangulated: prior and images together tell the depth.
+        """Anchors on matches with too little parallax to be triangulated: their depth is estimated from prior and
+        images together.
 
         Args:
             keyframe: The new one, which becomes their host.
             other: The keyframe that it was matched with.
-            matches: Of its keypoints; those that have an anchor by now are left out.
+            matches: Matches of its keypoints; those with an anchor are skipped.
             prior: Expected inverse depth and standard deviation of every keypoint ``(N, 2)`` [1/map unit].
             colour: RGB ``(N, 3)``.
 
@@ -163,11 +164,11 @@ class Mapper:
         return ids
 
     def missing(self, keyframe: Keyframe) -> int:
-        """How many anchors a keyframe holds too few."""
+        """Number of anchors missing to `ENOUGH_ANCHORS`."""
         return max(0, ENOUGH_ANCHORS - int(np.count_nonzero(keyframe.anchor != NO_ANCHOR)))
 
     def fill_empty_places(self, keyframe: Keyframe, prior: FloatArray, colour: np.ndarray) -> IntArray:
-        """Anchors where a keyframe has too few to be tracked by, on the prior alone.
+        """Fill empty regions of a keyframe with anchors on the depth prior alone.
 
         Args:
             keyframe: The new one, which becomes their host.

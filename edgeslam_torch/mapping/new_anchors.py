@@ -26,10 +26,10 @@ def epipolar_matches(
     max_hamming: int,
     ratio: float,
 ) -> Matches:
-    """Unmatched keypoints of two keyframes that lie on each other's epipolar line where the depth prior says.
+    """Match keypoints without anchors along epipolar segments given by the depth prior.
 
-    The prior turns the line into a segment (two sigma either way), so that few candidates are compared and
-    repeated texture along the line confuses less.
+    The prior turns the line into a segment (two sigma either way), so that few candidates are compared and repeated
+    texture along the line matters less.
     """
     free = np.flatnonzero((keyframe.anchor < 0) & np.isfinite(prior_depth))
     free_there = np.flatnonzero(other.anchor < 0)
@@ -52,7 +52,7 @@ def epipolar_matches(
     length = np.linalg.norm(along, axis=1)
     middle = 0.5 * (near + far)
     slack = 3.0 * scale_factor ** keyframe.features.octave[free].astype(np.float64)
-    # A grid of their own for the few that are free: the other keyframe's has several times as many to refuse.
+    # A grid of the free keypoints only: the other keyframe's grid has several times as many.
     query, train = KeypointGrid(other.features.uv[free_there]).near(middle, np.minimum(0.5 * length, 80.0) + slack)
     train = free_there[train]
     ok = np.abs(other.features.octave[train] - keyframe.features.octave[free[query]]) <= 1
@@ -76,7 +76,7 @@ def triangulate_matches(
     scale_factor: float,
     min_parallax_rad: float,
 ) -> tuple[FloatArray, FloatArray, IntArray]:
-    """World points of matches that pass every check.
+    """Triangulated matches that pass all checks.
 
     In front of both cameras, enough parallax, reprojection inside 95 % in both, and a distance ratio that agrees
     with the pyramid levels.

@@ -2,7 +2,7 @@
 
 Such an anchor has a host keyframe, along whose ray the depth network (or its neighbours) expects it at an inverse depth
 with a standard deviation. Refinement takes the expectation as one more measurement, as a stereo camera would give it;
-once two keyframes see the anchor with enough parallax, the images speak for themselves and the prior is dropped.
+once two keyframes see the anchor with enough parallax, the prior is dropped.
 """
 
 import numpy as np
@@ -19,10 +19,10 @@ from edgeslam_torch.types import FloatArray, IntArray
 STEPS = 4
 """Gauss-Newton steps in one variable, starting from the prior."""
 MIN_SIGMA_LOG = 0.5
-"""Relative uncertainty of an expected depth at least. A network flattens scenes that it was not taught: in a hall it
-saw a quarter of the log depth that was there, and its own sigma says nothing of it (docs/decisions/0006)."""
+"""Minimum relative sigma of a predicted depth. A network compresses the depth of unseen scenes (in a hall, to a
+quarter of the range of log depth), which its own sigma does not show (docs/decisions/0006)."""
 MIN_SHARE = 0.05
-"""Inverse depth, relative to the prior's, below which a step does not lead: still in front of the camera."""
+"""Lower bound of the inverse depth relative to the prior's, in front of the camera."""
 
 
 def inverse_depth_with_prior(
@@ -114,12 +114,12 @@ def depth_priors(slam_map: SlamMap, anchor: IntArray, poses: list[int]) -> tuple
 
 
 def drop_needless_priors(slam_map: SlamMap, keyframe: Keyframe, min_parallax_rad: float) -> None:
-    """Let go of the priors of anchors that a keyframe sees from another direction than their host did.
+    """Drop the priors of anchors that a keyframe observes from a different direction than their host.
 
     Args:
         slam_map: Holds the anchors.
         keyframe: Sees some of them.
-        min_parallax_rad: Angle between the two rays from which on the images tell the depth.
+        min_parallax_rad: Parallax from which on the images determine the depth.
     """
     anchors = slam_map.anchors
     ids = keyframe.anchor[keyframe.anchor >= 0]
@@ -131,10 +131,10 @@ def drop_needless_priors(slam_map: SlamMap, keyframe: Keyframe, min_parallax_rad
 
 
 def depth_slack_px(anchors: Anchors, ids: IntArray, T_c_w: FloatArray, camera: Camera) -> FloatArray | None:
-    """How far in the image anchors may be off because their depths rest on priors, one sigma ``(M, 2)`` [px].
+    """Image uncertainty of anchors whose depths rest on priors, one sigma ``(M, 2)`` [px].
 
-    Along the epipolar line of the ray that the prior holds along, and by the angle between that ray and the one that
-    looks now: nothing while a camera only turns. None when no depth rests on a prior.
+    Along the epipolar line of the host's ray; proportional to the parallax, hence zero for a rotating camera. None
+    when no depth rests on a prior.
     """
     unsure = np.flatnonzero(anchors.from_depth[ids])
     if len(unsure) == 0:
@@ -150,7 +150,7 @@ def depth_slack_px(anchors: Anchors, ids: IntArray, T_c_w: FloatArray, camera: C
 
 
 def mostly_on_priors(anchors: Anchors, ids: IntArray) -> bool:
-    """Whether the depths of most of the anchors rest on priors: images alone then hardly tell a turn from a shift."""
+    """Whether most of the anchors rest on priors: images then hardly distinguish rotation from translation."""
     return int(np.count_nonzero(anchors.from_depth[ids])) > 0.5 * len(ids)
 
 

@@ -1,8 +1,8 @@
-"""Old anchors seen again: two keyframes that look at one place without knowing it, because drift lies between them.
+"""Rejoining of old anchors: two keyframes that observe the same place but share no anchors because of drift.
 
-A search of a few pixels (`mapping/fuse.py`) misses anchors that drift has moved farther. Here an old keyframe's anchors
-are looked for in a wide circle, and believed when one camera pose explains them together. Local in the sense that the
-poses must already be near each other: places are not recognised, and no pose graph is closed.
+A search of a few pixels (`mapping/fuse.py`) misses anchors that drift has moved farther. Here an old keyframe's
+anchors are searched in a larger radius and accepted if one camera pose explains them. The poses must already be near
+each other: there is no place recognition and no pose graph.
 """
 
 import logging
@@ -21,29 +21,30 @@ from edgeslam_torch.types import FloatArray, IntArray
 logger = logging.getLogger(__name__)
 
 RADIUS_PX = 30.0
-"""Search radius at pyramid level 0: drift of a few per cent of the distance."""
+"""Search radius at pyramid level 0: 3 degrees at 525 px, drift of 6 % of the depth."""
 RATIO = 0.85
-"""Nearest over second nearest descriptor distance in that circle."""
+"""Maximum ratio of nearest to second nearest descriptor distance."""
 MIN_INLIERS = 15
 MIN_SHARE = 0.5
-"""Of the matches, to believe that the two see the same place."""
+"""Minimum share of inliers: the majority of the matches."""
 MAX_TURN_RAD = np.deg2rad(30.0)
 MAX_SHIFT = 0.35
-"""Distance of the two cameras, relative to the newer one's median depth."""
+"""Maximum distance of the two cameras relative to the newer one's median depth: 20 degrees of parallax."""
 MOST_DRIFT_PX = 5.0
-"""Of a place seen again, above which the whole map is refined; with less, its anchors are found all the same."""
+"""Drift above which the whole map is refined; below, tracking finds the anchors within its ``map_radius_px``."""
 STRANGERS = 15
-"""Two keyframes that share at least as many anchors know each other, as in `SlamMap.covisible`."""
+"""Number of shared anchors from which on two keyframes are covisible, as in `SlamMap.covisible`."""
 
 
 def reobserve_all(slam_map: SlamMap, camera: Camera) -> list[float]:
-    """`reobserve` for every keyframe; returns the drift [px] of those that were joined with an old one."""
+    """`reobserve` for every keyframe; returns the drift [px] of the rejoined ones."""
     drifts = [reobserve(slam_map, camera, keyframe) for keyframe in list(slam_map.keyframes.values())]
     return [d for d in drifts if d is not None]
 
 
 def lookalike(slam_map: SlamMap, keyframe: Keyframe) -> Keyframe | None:
-    """The older keyframe nearest in place and direction of those that share few anchors with this one, or None."""
+    """Revisit candidate: the older keyframe nearest in position and direction that shares few anchors with this one,
+    or None."""
     older = [k for k in slam_map.keyframes.values() if k.id < keyframe.id]
     depth = _median_depth(slam_map, keyframe)
     if not older or depth is None:
@@ -59,12 +60,12 @@ def lookalike(slam_map: SlamMap, keyframe: Keyframe) -> Keyframe | None:
 
 
 def reobserve(slam_map: SlamMap, camera: Camera, keyframe: Keyframe) -> float | None:
-    """Join a keyframe with an old one that saw the same place, if there is one and enough fits together.
+    """Rejoin a keyframe with an old one that observed the same place, if one is found and verified.
 
-    The map is not refined here; joined observations disagree by the drift until it is.
+    The map is not refined here; until then, joined observations disagree by the drift.
 
     Returns:
-        The drift: median distance [px] of the old anchors from where they were expected; None if nothing was joined.
+        The drift: median distance [px] of the old anchors from their projections; None if nothing was joined.
     """
     old = lookalike(slam_map, keyframe)
     if old is None:
@@ -86,7 +87,7 @@ def reobserve(slam_map: SlamMap, camera: Camera, keyframe: Keyframe) -> float | 
 def _agreeing(
     keyframe: Keyframe, p_w: FloatArray, keypoint: IntArray, camera: Camera, growth: float
 ) -> NDArray[np.bool_]:
-    """Which matches one pose explains, ``(M,)``."""
+    """Inliers of one camera pose, ``(M,)``."""
     uv = keyframe.features.uv[keypoint].astype(np.float64)
     inv_sigma = growth ** -keyframe.features.octave[keypoint].astype(np.float64)
     return refine_pose(keyframe.T_c_w, p_w, uv, inv_sigma, (camera.fx, camera.fy, camera.cx, camera.cy)).inliers

@@ -23,12 +23,12 @@ from edgeslam_torch.types import FloatArray, IntArray
 
 
 def term_residuals(problem: WindowProblem) -> dict[str, Tensor]:
-    """Residuals of every term of a window at its present state, by name of its scale.
+    """Residuals of every term of a window at its current state, by name of its scale.
 
     Returns:
         ``reproj`` [px of the finest octave], ``edge`` [px], ``cycle`` (relative depth, or px in the paper's form),
-        ``corner`` [px] and ``angle`` (sine or cosine), each ``(N,)``; terms that are off, and elements behind a
-        camera, are left out.
+        ``corner`` [px] and ``angle`` (sine or cosine), each ``(N,)``; terms that are off and elements behind a camera
+        are omitted.
     """
     out = {}
     K = torch.tensor(problem.K, dtype=torch.float64)
@@ -50,8 +50,8 @@ def with_scales(problem: WindowProblem, scales: AdaptiveScales, alike: float = 1
     Args:
         problem: A window.
         scales: As `AdaptiveScales.updated` makes them of `term_residuals`.
-        alike: Factor on the sigmas of edge terms: neighbours on one edge err together, so ``alike**2`` of them
-            count as one.
+        alike: Factor on the sigmas of edge terms: neighbours on one edge have correlated errors, so ``alike**2`` of
+            them count as one.
     """
     sigma = {name: term.sigma for name, term in scales.terms.items()}
     problem = replace(problem, inv_sigma=problem.inv_sigma / sigma["reproj"])

@@ -1,4 +1,4 @@
-"""A seeded window for the solver, and its time beside gtsam's: ``python -m edgeslam_torch.optim.benchmark``."""
+"""Solver benchmark on a seeded window, beside gtsam: ``python -m edgeslam_torch.optim.benchmark``."""
 
 import argparse
 import json
@@ -21,7 +21,7 @@ SIZE = (640, 480)
 
 @dataclass(frozen=True, slots=True)
 class WindowSize:
-    """How much a seeded window holds; the default is the window that issue 4 names."""
+    """Size of a seeded window."""
 
     poses: int = 10
     fixed: int = 1
@@ -34,7 +34,7 @@ class WindowSize:
 
 @dataclass(frozen=True, slots=True)
 class Noise:
-    """Standard deviations of what a seeded window measures and starts from."""
+    """Standard deviations of a seeded window's measurements and initial state."""
 
     px: float = 0.7
     depth: float = 0.1
@@ -55,7 +55,7 @@ class SeededWindow:
 
 
 def seeded_window(seed: int = 0, size: WindowSize | None = None, noise: Noise | None = None) -> SeededWindow:
-    """A camera that slides past a cloud of points, edges and corners; everything follows from ``seed``."""
+    """A camera moving past a cloud of points, edges and corners, determined by ``seed``."""
     size, noise = size or WindowSize(), noise or Noise()
     rng = np.random.default_rng(seed)
     W = size.poses
@@ -203,7 +203,7 @@ def refine_with_gtsam(problem: WindowProblem, iterations: int) -> tuple[float, f
         ``(W, 4, 4)`` world-to-camera poses.
 
     Raises:
-        ModuleNotFoundError: Without gtsam, which is a developer's tool and no dependency.
+        ModuleNotFoundError: Without gtsam, which is a development tool.
     """
     import gtsam
 
@@ -241,9 +241,9 @@ def refine_with_gtsam(problem: WindowProblem, iterations: int) -> tuple[float, f
 def benchmark(repeats: int = 5, iterations: int = 5) -> dict[str, float | str]:
     """Median CPU milliseconds of the seeded window, on one thread, everything in one run.
 
-    Ours and gtsam's runs alternate, so that a busy machine slows both; CPU time (user and system, all threads of
-    the process) because wall time on a shared machine is the others'. Ours counts everything from arrays to
-    result; gtsam's graph is built before its clock starts.
+    Runs are interleaved, so that other load affects both; CPU time (user and system, all threads) because wall time
+    depends on other load. Ours covers everything from arrays to result; gtsam's graph is built before its timing
+    starts.
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)

@@ -1,4 +1,4 @@
-"""Which edge of another keyframe an edge pixel should lie on: the nearest one that runs the same way."""
+"""Association of edge pixels with the nearest edge of another keyframe that has the same direction."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,15 +10,15 @@ from edgeslam_torch.geometry import se3
 from edgeslam_torch.types import Edges, FloatArray, IntArray
 
 MAX_TURN_RAD = 0.44
-"""Largest angle (25 degrees) between the predicted and the seen normal of a partner."""
+"""Maximum angle (25 degrees) between predicted and observed normal."""
 
 PX_PER_TURN = 9.0
-"""Pixels that a radian between the normals counts as in the search for the nearest: 25 degrees as much as 4 px."""
+"""Weight of the angle between normals in the nearest-neighbour search [px/rad]: 25 degrees count as 4 px."""
 
 
 @dataclass(frozen=True, slots=True)
 class EdgeField:
-    """The edge pixels of one keyframe, to be looked up by place and direction."""
+    """Edge pixels of a keyframe, indexed by position and direction."""
 
     tree: cKDTree
     """Over ``(u, v, s nx, s ny)`` with ``s`` `PX_PER_TURN`, ``(E, 4)``."""
@@ -30,7 +30,7 @@ class EdgeField:
 
 
 def edge_field(edges: Edges, inverse_depth: FloatArray, size: tuple[int, int]) -> EdgeField:
-    """Prepare a keyframe's edges for look-up.
+    """Index a keyframe's edges.
 
     Args:
         edges: Edge pixels with their normals.
@@ -41,7 +41,7 @@ def edge_field(edges: Edges, inverse_depth: FloatArray, size: tuple[int, int]) -
 
 
 def nearest_edges(field: EdgeField, uv: FloatArray, normal: FloatArray) -> IntArray:
-    """Edge pixels ``(N,)`` of a field with edges that lie nearest to pixels ``(N, 2)`` and run the same way."""
+    """Indices ``(N,)`` of the edge pixels nearest to pixels ``(N, 2)`` in position and direction."""
     found: IntArray = field.tree.query(_place(uv, normal))[1]
     return found
 
@@ -99,14 +99,14 @@ def associate_edges(
     order = np.argsort(pair_pose, kind="stable")
     poses, first = np.unique(np.asarray(pair_pose)[order], return_index=True)
     T_w_c = se3.inverse(T_c_w)
-    for pose, mine in zip(poses, np.split(order, first[1:]), strict=False):  # without pairs there is one empty piece
+    for pose, mine in zip(poses, np.split(order, first[1:]), strict=False):  # without pairs there is one empty group
         field = fields[pose]
         if field is None or len(field.edges.uv) == 0:
             continue
         edge = np.asarray(pair_edge)[mine]
         T = (T_c_w[pose] @ T_w_c)[host[edge]]
         at, iz = _project(T, uv[edge], inverse_depth[edge], f, c)
-        # The normal turns with the edge: move a pixel along it, at the same depth, and see where that goes.
+        # The normal rotates with the edge: project a second point one pixel along the edge at the same depth.
         along = np.stack((-normal[edge, 1], normal[edge, 0]), 1)
         moved, _ = _project(T, uv[edge] + along, inverse_depth[edge], f, c)
         tangent = moved - at

@@ -8,7 +8,7 @@ from edgeslam_torch.optim.problem import LmConfig, StopReason
 
 _MU_MIN = 1e-12
 _LIKELY_LAST = 2.0
-"""A promise of this many times the cost tolerance: a step that promises less is likely the last."""
+"""Factor on the cost tolerance: a step with a smaller predicted decrease is likely the last."""
 
 S = TypeVar("S")
 
@@ -20,7 +20,7 @@ class Step(Generic[S]):
     state: S
     """The state after the step."""
     predicted: float
-    """Decrease of the cost that the linear model promises."""
+    """Decrease of the cost predicted by the linear model."""
     size: float
     """Largest component of the step."""
 
@@ -43,7 +43,7 @@ L = TypeVar("L", bound=Linearised)
 
 
 class LeastSquares(Protocol[S, L]):
-    """What the loop needs from a problem."""
+    """Interface of a least-squares problem."""
 
     def linearise(self, state: S) -> L:
         """Cost and normal equations at a state."""
@@ -60,7 +60,7 @@ class LeastSquares(Protocol[S, L]):
 
 @dataclass(frozen=True, slots=True)
 class LmSummary:
-    """How a minimisation went."""
+    """Summary of a minimisation."""
 
     cost_before: float
     cost_after: float
@@ -68,18 +68,18 @@ class LmSummary:
     accepted: int
     stop: StopReason
     mu: float
-    """Damping at the end."""
+    """Final damping."""
 
 
 def minimise(problem: LeastSquares[S, L], start: S, config: LmConfig) -> tuple[S, LmSummary]:
     """Minimise a robust sum of squares; returns the last state and how it went.
 
-    The damping follows Nielsen (1999): it shrinks with the agreement between promised and real decrease, and
-    grows by a doubling factor with every refusal. The state only ever changes to one of lower, finite cost.
+    The damping follows Nielsen (1999): it shrinks with the agreement of predicted and actual decrease, and grows by a
+    doubling factor with every rejected step. Only states of lower, finite cost are accepted.
 
-    Most steps are accepted, and then the next one needs the normal equations where this one ended: a step that
-    promises to go on is linearised at once, which yields its cost as well. One that looks like the last (no
-    iteration left, or a promise near the tolerance) is asked for its cost alone.
+    Most steps are accepted, and the next one then needs the normal equations at the new state: so a step is
+    linearised at once, which yields its cost as well. For a step that looks like the last (no iteration left, or a
+    predicted decrease near the tolerance) only the cost is evaluated.
     """
     state, system = start, problem.linearise(start)
     cost, mu, nu, accepted, tried = system.cost, config.mu, 2.0, 0, 0

@@ -49,12 +49,12 @@ def refine_window(problem: WindowProblem, config: LmConfig | None = None) -> Win
     """Refine the free poses of a window with its anchors, edge depths and junctions.
 
     Args:
-        problem: Poses, anchors, observations and what is known beforehand.
+        problem: Poses, anchors, observations and priors.
         config: How to minimise.
 
     Returns:
-        The refined window. Whatever the input, poses and points are finite if they were finite on entry, and
-        ``stop`` says why the solver ended.
+        The refined window. Whatever the input, poses and points are finite if they were finite on entry, and ``stop``
+        is the reason for stopping.
 
     Raises:
         ValueError: If array lengths disagree or an index points outside.
@@ -68,7 +68,7 @@ def refine_window(problem: WindowProblem, config: LmConfig | None = None) -> Win
         return _unchanged(problem, StopReason.NOT_FINITE)
     if len(problem.obs_pose) == 0 and problem.edges is None and problem.junctions is None:
         return _unchanged(problem, StopReason.NO_OBSERVATIONS)
-    # As a context, a default device costs microseconds per torch call: not for the CPU, which is the default.
+    # A default-device context costs microseconds per torch call; skip it for the CPU.
     device = nullcontext() if config.device == "cpu" else torch.device(config.device)
     with torch.inference_mode(), device:
         result = _Window(problem, config).refine()
@@ -241,7 +241,7 @@ class _Window:
     def _reduce(
         self, system: _System, mu: float
     ) -> tuple[Tensor, Tensor, points.Eliminated, tuple[relative.Eliminated, ...]]:
-        """Pose system without its anchors, edges and junctions, its right side, and what was taken out."""
+        """Reduced pose system, its right side, and the eliminated blocks."""
         S, b = system.H.clone(), system.g.clone()
         anchors = self.points.reduce(system.points, mu, S, b)
         blocks = zip(self.relative, system.relative, strict=True)
@@ -267,7 +267,7 @@ def _scaled_gradient(H: Tensor, g: Tensor, *blocks: PointSystem | RelativeSystem
 
 
 def _promise(mu: float, diagonal: Tensor, g: Tensor, step: Tensor) -> float:
-    """Decrease of the cost that the linear model promises, ``step^T (mu D step - g)``."""
+    """Decrease of the cost predicted by the linear model, ``step^T (mu D step - g)``."""
     return float((step * (mu * diagonal * step - g)).sum())
 
 

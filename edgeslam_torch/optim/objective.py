@@ -1,7 +1,7 @@
 """The losses of a window as the paper defines them, evaluated by the loss modules.
 
 The solver minimises the same residuals with kernels of its own, which are fast and hold analytic derivatives. This is
-the plain form: it states what a refined map is worth (``summary.json``), and tests compare the kernels with it.
+the plain form: it measures refined maps (``summary.json``), and tests compare the kernels with it.
 """
 
 from collections.abc import Iterator
@@ -76,7 +76,7 @@ def _reprojection(problem: WindowProblem, K: Tensor) -> Iterator[Residuals]:
 
 def _edges(terms: EdgeTerms, T_c_w: FloatArray, K: Tensor) -> dict[str, list[Residuals]]:
     alignment = EdgeAlignmentLoss()
-    # Pairs were chosen by their depths already: what disagrees by now counts.
+    # No occlusion mask: pairs were selected by depth, and the solver counts all of them.
     cycle = CycleLoss(terms.cycle, max_relative=float("inf"))
     out: dict[str, list[Residuals]] = {}
     names = {"alignment_px2": bool((terms.pair_inv_sigma > 0).any())}

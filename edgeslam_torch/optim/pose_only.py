@@ -14,7 +14,7 @@ from edgeslam_torch.types import FloatArray
 
 
 class PoseStatus(StrEnum):
-    """What a refined pose is worth."""
+    """Status of a refined pose."""
 
     OK = "ok"
     FEW_POINTS = "few points"
@@ -25,12 +25,12 @@ class PoseStatus(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class PoseConfig:
-    """How to refine a pose."""
+    """Settings of the refinement."""
 
     rounds: int = 4
-    """Outliers are chosen anew after each round."""
+    """Rounds; outliers are selected again after each."""
     robust_rounds: int = 2
-    """Rounds with a Huber kernel; the later ones trust the inliers, as in ORB-SLAM."""
+    """Rounds with a Huber kernel; later rounds are least squares on the inliers, as in ORB-SLAM."""
     iterations: int = 10
     """Steps per round."""
     chi2: float = CHI2_2DOF_95
@@ -42,7 +42,7 @@ class PoseConfig:
     min_points: int = 6
     min_depth: float = 1e-3
     condition_max: float = 1e12
-    """Ratio of extreme eigenvalues of the scaled normal matrix above which the points do not fix a pose."""
+    """Condition number of the scaled normal matrix above which the pose is degenerate."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +52,7 @@ class PoseResult:
     T_c_w: FloatArray
     """``(4, 4)`` world to camera; the start when the status is not OK or NOT_CONVERGED."""
     inliers: NDArray[np.bool_]
-    """``(N,)`` points that agree with the pose."""
+    """``(N,)`` inliers."""
     chi2: FloatArray
     """``(N,)`` squared whitened residuals; infinite behind the camera."""
     covariance: FloatArray
@@ -80,8 +80,8 @@ def refine_pose(
         uv: Their undistorted pixels ``(N, 2)``.
         inv_sigma: Inverse standard deviations ``(N,)`` [1/px].
         K: fx, fy, cx, cy [px].
-        slack_px: One standard deviation of what a point may be off beside that, along one direction ``(N, 2)`` [px]:
-            how an uncertain depth shows. The covariance is ``I / inv_sigma^2 + slack slack^T``.
+        slack_px: Additional standard deviation along one direction ``(N, 2)`` [px], caused by an uncertain depth. The
+            covariance is ``I / inv_sigma^2 + slack slack^T``.
         prior: Predicted pose with its information; ``prior.pose`` is not used.
         config: Rounds, thresholds.
 
@@ -142,10 +142,10 @@ def _failed(T: FloatArray, n: int, status: PoseStatus, iterations: int = 0) -> P
 
 
 def _round(T: FloatArray, points: "_Points", robust: bool, config: PoseConfig) -> tuple[FloatArray, int, bool]:
-    """Levenberg-Marquardt with the present inliers; leaves ``points.chi2`` at the returned pose or a step before it.
+    """Levenberg-Marquardt on the current inliers; ``points.chi2`` is that of the returned pose or one step before.
 
-    A step that promises no progress is the last and is taken on trust: the promise is the square of its length in
-    standard deviations, a fraction of one, and what comes next linearises there in any case.
+    A step with a predicted decrease below the tolerance is applied without evaluating its cost: the prediction is the
+    squared step length in standard deviations, a fraction of one, and the next round linearises there anyway.
     """
     H, g, cost = points.linearise(T, robust)
     mu, used = 1e-6, 0
@@ -216,7 +216,8 @@ def _exp(xi: FloatArray) -> FloatArray:
 
 
 def _slack(slack_px: FloatArray, inv_sigma: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Unit directions ``(2, N)``, and the same by the share of a row along them that an uncertain depth explains."""
+    """Unit directions ``(2, N)``, and the same scaled by the share of the residual along them that an uncertain depth
+    explains."""
     s = np.asarray(slack_px, dtype=np.float64).reshape(-1, 2).T * inv_sigma
     length2 = (s * s).sum(0)
     along = s / np.sqrt(np.maximum(length2, 1e-30))
@@ -242,7 +243,7 @@ class _Points:
         n = len(uv64)
         if self.p.shape[1] != n or len(inv_sigma) != n:
             raise ValueError(f"{self.p.shape[1]} points, {n} pixels and {len(inv_sigma)} sigmas must be equally many")
-        # In units of the focal length the Jacobian needs no intrinsics; they go into the weights.
+        # In normalised coordinates the Jacobian is free of intrinsics, which go into the weights.
         self.xy = np.stack(((uv64[:, 0] - cx) / fx, (uv64[:, 1] - cy) / fy))
         self.weight = np.array([[fx], [fy]]) * np.asarray(inv_sigma, dtype=np.float64)
         self.slack = None if slack_px is None else _slack(slack_px, inv_sigma)
@@ -256,7 +257,7 @@ class _Points:
         return bool(np.isfinite(self.p).all() and np.isfinite(self.xy).all() and np.isfinite(self.weight).all())
 
     def _relaxed(self, rows: FloatArray) -> FloatArray:
-        """Rows ``(..., 2, N)`` in standard deviations of the keypoints, weakened along each point's slack."""
+        """Rows ``(..., 2, N)`` whitened by the keypoints' sigma and by each point's slack."""
         if self.slack is None:
             return rows
         along, weaken = self.slack
@@ -285,7 +286,7 @@ class _Points:
             norm = np.sqrt(np.maximum(s, chi2))
             # s inside, 2 delta |r| - delta^2 outside; its derivative is delta / norm
             cost = np.minimum(s, chi2) + 2.0 * delta * norm
-            # A point behind the camera costs as much as one a thousand pixels off.
+            # A point behind the camera costs as much as an error of a thousand pixels.
             total: float = float(cost @ use) - 2.0 * chi2 * np.count_nonzero(use) + 2000.0 * delta * behind
             weight = self.weight * (np.sqrt(delta / norm) * use)
         else:

@@ -1,4 +1,4 @@
-"""What is known beforehand about the poses, as residuals of the window."""
+"""Priors on poses and scale as residuals of the window."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""What goes into a refinement and what comes out: numpy records, no behaviour."""
+"""Input and output records of a refinement, in numpy."""
 
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -25,13 +25,13 @@ class StopReason(StrEnum):
 
     @property
     def converged(self) -> bool:
-        """Whether the state is a minimum to within the tolerances."""
+        """Whether the state is a minimum within the tolerances."""
         return self in (self.COST_CONVERGED, self.STEP_CONVERGED, self.GRADIENT_CONVERGED)
 
 
 @dataclass(frozen=True, slots=True)
 class PosePrior:
-    """What is known beforehand about one pose: ``log(T_c_w T_prior^-1) ~ N(0, information^-1)``."""
+    """Prior on one pose: ``log(T_c_w T_prior^-1) ~ N(0, information^-1)``."""
 
     pose: int
     T_c_w: FloatArray
@@ -53,7 +53,7 @@ class ScalePrior:
 
 @dataclass(frozen=True, slots=True)
 class DepthPriors:
-    """Expected inverse z-depths of anchors in host poses, as a depth network gives them."""
+    """Expected inverse z-depths of anchors in host poses, as from a depth network."""
 
     anchor: IntArray
     """``(D,)`` anchor indices."""
@@ -67,9 +67,9 @@ class DepthPriors:
 
 @dataclass(frozen=True, slots=True)
 class EdgeTerms:
-    """Edge pixels with their inverse depths, and where other poses of the window see the same edge.
+    """Edge pixels with inverse depths, and their partners in other poses of the window.
 
-    ``E`` edges, ``P`` pairs (edge, target pose). The depths are refined too.
+    ``E`` edges, ``P`` pairs (edge, target pose). Their depths are refined too.
     """
 
     host: IntArray
@@ -93,7 +93,7 @@ class EdgeTerms:
     pair_inv_sigma: FloatArray
     """``(P,)`` inverse standard deviation across the edge [1/px]; zero switches alignment off."""
     pair_inverse_depth: FloatArray
-    """``(P,)`` inverse depth that the target has there, held; zero for none (no cycle)."""
+    """``(P,)`` inverse depth of the target there, held constant; zero if unknown (no cycle)."""
     cycle: CycleForm = CycleForm.RELATIVE_DEPTH
     """Form of the cycle residual; ``PARALLAX`` is for training only."""
     cycle_sigma: float = 0.0
@@ -167,34 +167,35 @@ class WindowProblem:
 
 @dataclass(frozen=True, slots=True)
 class LmConfig:
-    """How to minimise."""
+    """Settings of the solver."""
 
     max_iterations: int = 10
-    """Steps tried, accepted or not."""
+    """Maximum number of steps, accepted or not."""
     kernel: Kernel = Kernel.HUBER
     delta: float = CHI2_2DOF_95**0.5
     """Where the kernel departs from least squares [standard deviations]."""
     edge_delta: float = CHI2_1DOF_95**0.5
     """The same for edge and junction rows, which are scalars."""
     device: str = "cpu"
-    """Where torch computes, ``cuda`` for instance; a window of usual size is too small to gain from it."""
+    """Device of torch, such as ``cuda``; windows of usual size are too small to gain from it."""
     compile: bool = False
     """Run the hot kernels through ``torch.compile``: pays when many windows are solved."""
     float32_blocks: bool = True
-    """Edge blocks, and what couples anchors with poses, in single precision; the reduced system is always double."""
+    """Single precision for edge blocks and for the coupling of anchors and poses; the reduced system is always
+    double."""
     mu: float = 1e-4
-    """First damping, relative to the diagonal of the normal matrix."""
+    """Initial damping, relative to the diagonal of the normal matrix."""
     mu_max: float = 1e8
     cost_tolerance: float = 1e-5
     """Relative decrease of the cost below which an accepted step is the last."""
     step_tolerance: float = 1e-9
     """Largest tangent component below which a step is the last."""
     gradient_tolerance: float = 1e-9
-    """Largest gradient component, in units of its own curvature, below which nothing is tried."""
+    """Largest gradient component, in units of its curvature, below which no step is tried."""
     min_depth: float = 1e-3
     """Points nearer than this in front of a camera count as behind it (map units)."""
     behind_px: float = 1000.0
-    """Residual that stands for an observation whose point is behind the camera; none counts for more."""
+    """Residual of an observation behind the camera, and upper limit of all residuals."""
     losses: bool = False
     """Report the losses of the result, evaluated by the loss modules (a tenth of a second for a whole map)."""
     diagnostics: bool = True
@@ -211,7 +212,7 @@ class LmConfig:
 
 @dataclass(frozen=True, slots=True)
 class WindowResult:
-    """Refined state and what is known about it."""
+    """Refined state and diagnostics."""
 
     T_c_w: FloatArray
     """``(W, 4, 4)`` refined world-to-camera poses."""
@@ -231,7 +232,7 @@ class WindowResult:
     edge_inverse_depth: FloatArray = field(default_factory=lambda: np.zeros(0))
     """``(E,)`` refined inverse depths of the edges."""
     edge_sigma: FloatArray = field(default_factory=lambda: np.zeros(0))
-    """``(E,)`` their standard deviations with the poses held; infinite when nothing observes them."""
+    """``(E,)`` their standard deviations with the poses held; infinite if unobserved."""
     edge_chi2: FloatArray = field(default_factory=lambda: np.zeros(0))
     """``(P,)`` squared whitened alignment residuals; infinite behind the camera."""
     junction_inverse_depth: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))

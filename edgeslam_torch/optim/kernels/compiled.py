@@ -1,4 +1,4 @@
-"""torch.compile for the solver's hot kernels: only when asked for, and eager wherever it fails."""
+"""torch.compile for the solver's hot kernels: opt-in, with eager fallback."""
 
 import functools
 import logging
@@ -14,10 +14,10 @@ _reported: set[str] = set()
 
 
 def kernel(function: Callable[..., Any], compile: bool) -> Callable[..., Any]:
-    """``function``, or its compiled form; compiled for the sizes it first sees, then once more for any sizes.
+    """``function``, or its compiled form: compiled for the first sizes, then once more for dynamic sizes.
 
-    Compiling takes seconds to minutes at the first call and needs a C++ compiler (on the CPU). Where it fails, a
-    warning says so once and the function runs as it is from then on.
+    Compiling takes seconds to minutes at the first call and needs a C++ compiler (on the CPU). On failure, a warning
+    is logged once and the function runs eagerly from then on.
 
     Args:
         function: A function of tensors without state and without branches on their values.
@@ -41,7 +41,7 @@ def _with_fallback(function: Callable[..., Any], fast: Callable[..., Any]) -> Ca
         if not failed:
             try:
                 return fast(*args)
-            # No compiler, no space, not supported; or the cache on disk gave code made for other sizes, which asserts.
+            # No compiler, no space, unsupported; or cached code for other sizes, which asserts.
             except (TorchDynamoException, RuntimeError, OSError, AssertionError) as error:
                 failed = True
                 cause = str(error).strip().split("\n")[0]

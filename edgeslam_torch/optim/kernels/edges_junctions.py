@@ -1,4 +1,4 @@
-"""Edges and junctions: blocks that live in a host pose and are seen from target poses.
+"""Edges and junctions: blocks anchored in a host pose and observed from target poses.
 
 Residuals are differentiated by the *relative* pose of host and target, six columns, whatever the window's size;
 blocks are eliminated in those columns, one dense product per tile of blocks (`optim.kernels.tiles`); only then does the
@@ -34,7 +34,7 @@ from edgeslam_torch.optim.problem import EdgeTerms, JunctionTerms, LmConfig
 from edgeslam_torch.types import FloatArray, IntArray
 
 INVERSE_DEPTH_MIN = 1e-4
-"""Nothing is refined beyond this inverse depth: practically at infinity, and never behind the camera."""
+"""Lower bound of refined inverse depths: practically at infinity, never behind the camera."""
 
 
 class RelativeSystem(NamedTuple):
@@ -45,13 +45,13 @@ class RelativeSystem(NamedTuple):
     g: Tensor
     """Their gradients ``(size, B, L)``."""
     cross: Tensor
-    """What couples them with the relative poses ``(B, T, 6, size, L)``."""
+    """Their coupling with the relative poses ``(B, T, 6, size, L)``."""
     map: Tensor
     """Tangents of the relative poses by those of the free poses ``(B, 6 T, 6 F)``."""
 
 
 class Eliminated(NamedTuple):
-    """Blocks taken out of the pose system, for the way back."""
+    """Blocks eliminated from the pose system, for back-substitution."""
 
     factor: Tensor
     """Inverse Cholesky factors, shaped as `RelativeSystem.V`."""
@@ -110,7 +110,7 @@ class RelativeBlocks(ABC):
         self.config, self.dtype = config, dtype
         self.tiles = lay_out(host, pair_block, pair_pose, len(column))
         self.x = self.tiles.blocks(np.maximum(inverse_depth, INVERSE_DEPTH_MIN), torch.float64, 1.0)
-        # What a pair behind a camera costs; places without a pair cost nothing.
+        # Cost of a pair behind a camera; empty slots cost nothing.
         self.far = self.tiles.pairs(np.full(len(pair_block), config.behind_px**2), dtype)
         F = int((column >= 0).sum())
         column = torch.where(column < 0, F, column)  # fixed poses share a last column that is cut off
@@ -124,11 +124,11 @@ class RelativeBlocks(ABC):
 
     @abstractmethod
     def robust_cost(self, Rt: Tensor, x: Tensor) -> Tensor:
-        """Robust cost ``()`` of the rows alone, at motions ``(3, 4, B, T, 1)``."""
+        """Robust cost ``()`` of the residual rows, at motions ``(3, 4, B, T, 1)``."""
 
     @abstractmethod
     def prior_cost(self, x: Tensor) -> Tensor:
-        """Cost ``()`` of what is known about the blocks ``(size, B, L)`` beforehand."""
+        """Cost ``()`` of the priors on the blocks ``(size, B, L)``."""
 
     def motions(self, T_c_w: Tensor) -> tuple[Tensor, Tensor]:
         """Relative motions ``(B T, 4, 4)``, and in the blocks' precision ``(3, 4, B, T, 1)``."""
@@ -148,7 +148,7 @@ class RelativeBlocks(ABC):
         return RelativeSystem(*system), value
 
     def reduce(self, system: RelativeSystem, mu: float, S: Tensor, b: Tensor) -> Eliminated:
-        """Subtract what the blocks take from the pose system ``S`` and its right side ``b``."""
+        """Eliminate the blocks from the pose system ``S`` and its right side ``b``."""
         damping = torch.tensor(mu, dtype=torch.float64)
         *eliminated, taken, right = kernel(taken_out, self.config.compile)(system, damping)
         S -= taken
@@ -156,7 +156,7 @@ class RelativeBlocks(ABC):
         return Eliminated(*eliminated)
 
     def step(self, system: RelativeSystem, eliminated: Eliminated, delta: Tensor) -> Tensor:
-        """Step of the blocks ``(size, B, L)`` that goes with the poses' ``delta (6F,)``."""
+        """Back-substitution: step of the blocks ``(size, B, L)`` for the poses' ``delta (6F,)``."""
         B, _, L = self.tiles.shape
         moved = (eliminated.Y_T @ (system.map @ delta).to(self.dtype)[..., None]).view(B, self.size, L)
         return schur.unwhiten(eliminated.factor, -eliminated.y - moved.transpose(0, 1))
@@ -173,14 +173,15 @@ def relative_motions(T_c_w: Tensor, host: Tensor, target: Tensor, dtype: torch.d
 
 
 def taken_out(system: RelativeSystem, damping: Tensor) -> tuple[Tensor, ...]:
-    """The fields of `Eliminated`, and what to subtract from the pose system ``(6F, 6F)`` and its right side."""
+    """The fields of `Eliminated`, and the Schur terms to subtract from the pose system ``(6F, 6F)`` and its right
+    side."""
     factor, y, Y_T, taken, right = schur.eliminate(system.V, system.g, system.cross, damping)
     flat = system.map.flatten(0, 1)
     return factor, y, Y_T, flat.mT @ (taken @ system.map).flatten(0, 1), flat.mT @ right.flatten()
 
 
 def mapped(T_rel: Tensor, normal: Tensor, host: Tensor, target: Tensor, F: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Normal equations of the relative poses as such of the free poses.
+    """Normal equations of the relative poses, mapped to the free poses.
 
     Args:
         T_rel: Relative motions ``(B T, 4, 4)``.
@@ -215,7 +216,7 @@ def _as_system(
         T_rel: Relative motions ``(B T, 4, 4)``.
         layout: The tiles.
         weighed: `schur.pair_products` of the weighted rows, and their cost.
-        V_prior: What is known about the blocks beforehand, as upper triangles.
+        V_prior: Prior information of the blocks, as upper triangles.
         g_prior: Its gradients ``(size, B, L)``.
         cost_prior: Its cost ``()``.
     """
@@ -227,10 +228,10 @@ def _as_system(
 def _robust(r: Tensor, front: Tensor, far: Tensor, robust: Kernel, delta: float) -> tuple[Tensor, Tensor]:
     """Robust cost ``()`` in double precision of whitened residuals ``(..., B, T, L)`` and the roots of their weights.
 
-    Pairs that are not in front cost ``far`` and weigh nothing.
+    Pairs behind the camera cost ``far`` and have zero weight.
     """
     value, weight = rho(torch.where(front, r * r, far), robust, delta)
-    # Short sums in the rows' own precision, the long one in double.
+    # Short sums in the rows' precision, the long sum in double.
     return value.sum(-1).sum(dtype=torch.float64), torch.where(front, weight.sqrt(), 0.0)
 
 
@@ -389,7 +390,7 @@ class EdgeBlocks(RelativeBlocks):
     size = 1
 
     def __init__(self, terms: EdgeTerms, K: Tensor, column: Tensor, config: LmConfig) -> None:
-        """Take the terms into the solver's layout; ``K`` is fx, fy, cx, cy."""
+        """Arrange the terms in the solver's layout; ``K`` is fx, fy, cx, cy."""
         dtype = torch.float32 if config.float32_blocks else torch.float64
         start = np.asarray(terms.inverse_depth, dtype=np.float64)[None]
         super().__init__(terms.host, terms.pair_edge, terms.pair_pose, start, column, config, dtype)
@@ -488,10 +489,10 @@ def collinearity_prior(
 
     Args:
         fraction: Position of each point along its arm ``(C, 2, M)``, 0 at the corner and 1 at the arm's end; NaN
-            for no point.
+            without a point.
         inverse_depth: Their inverse depths ``(C, 2, M)`` [1/m].
         sigma: Their standard deviations ``(C, 2, M)`` [1/m].
-        weak_sigma: Keeps a junction without points solvable [1/m].
+        weak_sigma: Weak prior for junctions without points [1/m].
 
     Returns:
         Expected inverse depths of corner and arm ends ``(C, 3)`` and their information ``(C, 3, 3)``.

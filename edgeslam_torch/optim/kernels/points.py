@@ -2,13 +2,13 @@
 
 An observation's residual depends on the anchor and on the pose through one point, the anchor in the camera. With the
 pose's tangent taken in the world, about a centre ``c`` near the anchors, both derivatives are the same rows: with
-``B = (d r / d p_c) R`` by the anchor and ``B [I, -hat(p_w - c)]`` by the pose. So an observation is summed up by
-``B^T B`` and ``B^T r``, nine numbers; the anchor's block is their sum, the pose's a sum of their products with
-powers of the anchor's position, and what couples the two is ``[I; hat(p_w - c)] B^T B``. The adjoint brings the
-pose system to the tangents of the cameras, where the solver damps and steps.
+``B = (d r / d p_c) R`` by the anchor and ``B [I, -hat(p_w - c)]`` by the pose. So an observation is summarised by
+``B^T B`` and ``B^T r``, nine numbers; the anchor's block is their sum, the pose's block a sum of their products with
+powers of the anchor's position, and their coupling is ``[I; hat(p_w - c)] B^T B``. The adjoint maps the pose system
+to the cameras' tangents, in which the solver damps and steps.
 
-Observations lie in tiles of one pose each, so that a pose's rotation is a factor of a batched product; places that
-a tile has left weigh nothing.
+Observations lie in tiles of one pose each, so that a pose's rotation is a factor of a batched product; empty slots
+have zero weight.
 """
 
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ from edgeslam_torch.optim.problem import DepthPriors, LmConfig, WindowProblem
 from edgeslam_torch.types import FloatArray, IntArray
 
 _LANES = 128
-"""Observations per tile: shorter tiles leave fewer places empty, longer ones make fewer, larger products."""
+"""Observations per tile: shorter tiles have fewer empty slots, longer ones give fewer, larger products."""
 _FEW_POSES = 12
 """Up to this many free poses, cutting the anchors into chunks saves less than it costs."""
 _ANCHORS_PER_CHUNK = 192
@@ -33,12 +33,12 @@ _NO_DEPTH_PRIORS = DepthPriors(np.zeros(0, int), np.zeros(0, int), np.zeros(0), 
 
 
 class Observed(NamedTuple):
-    """What observations in ``G`` tiles of ``L`` are measured against."""
+    """Observations in ``G`` tiles of ``L``."""
 
     pose: Tensor
     """``(G,)`` pose of each tile."""
     place: Tensor
-    """``(G, 3, L)`` places of the anchors' coordinates in ``(3, A)``."""
+    """``(G, 3, L)`` indices of the anchors' coordinates in ``(3, A)``."""
     uv: Tensor
     """``(G, 2, L)`` pixels from the principal point, whitened."""
     focal: Tensor
@@ -46,7 +46,7 @@ class Observed(NamedTuple):
     far: Tensor
     """``(G, L)`` cost of a point behind the camera."""
     depth_row: Tensor
-    """``(D,)`` places of the depth priors in ``G L``; their ``focal`` is zero."""
+    """``(D,)`` indices of the depth priors in ``G L``; their ``focal`` is zero."""
     inverse_depth: Tensor
     """``(D,)`` expected inverse depths, whitened."""
     inv_sigma: Tensor
@@ -73,14 +73,14 @@ class PointSystem(NamedTuple):
 
 
 class Eliminated(NamedTuple):
-    """The anchors taken out of the pose system, for the way back."""
+    """Anchors eliminated from the pose system, for back-substitution."""
 
     factor: Tensor
     """``(6, A)`` inverse Cholesky factors."""
     y: Tensor
     """``(3, A)`` whitened gradients."""
     Y: Tensor
-    """What couples the poses with the whitened anchors, all chunks, see `Chunk`."""
+    """Coupling of poses and whitened anchors, all chunks, see `Chunk`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,7 +136,7 @@ class PointBlocks:
         self.place = np.empty(len(order), dtype=np.int64)  # of each factor, in the caller's order
         self.place[order] = np.arange(len(order)) + np.repeat(gap, count)
         tile_run = np.repeat(np.arange(len(column)), tiles)
-        # Data; places without an observation weigh nothing, and act on the first anchor.
+        # Empty slots have zero weight and point to the first anchor.
         lane_anchor = np.zeros(G * _LANES, dtype=np.int64)
         lane_anchor[self.place] = anchor
         uv, focal = np.zeros((2, G * _LANES)), np.zeros((2, G * _LANES))
@@ -242,8 +242,8 @@ class PointBlocks:
         return PointSystem(*system), H, g, value
 
     def reduce(self, system: PointSystem, mu: float, S: Tensor, b: Tensor) -> Eliminated:
-        """Subtract what the anchors take from the pose system ``S (6F, 6F)`` and its right side ``b (6F,)``."""
-        exact = mu == 0.0 and self.dtype is not torch.float64  # not to step, but to say what is observed
+        """Eliminate the anchors from the pose system ``S (6F, 6F)`` and its right side ``b (6F,)``."""
+        exact = mu == 0.0 and self.dtype is not torch.float64  # for diagnostics only
         Y = self.Y.double() if exact else self.Y
         damping = torch.tensor(mu, dtype=torch.float64)
         factor, y = kernel(fill, self.config.compile)(
@@ -265,7 +265,8 @@ class PointBlocks:
         return Eliminated(factor, y, Y)
 
     def step(self, system: PointSystem, eliminated: Eliminated, delta: Tensor) -> Tensor:
-        """Step of the anchors ``(3, A)`` that goes with the poses' ``delta (6F,)``; before the next `reduce`."""
+        """Back-substitution: step of the anchors ``(3, A)`` for the poses' ``delta (6F,)``; call before the next
+        `reduce`."""
         in_world = (system.to_world @ delta.view(-1, 6, 1))[..., 0].to(eliminated.Y.dtype)
         back = -eliminated.y
         for chunk, part in self._parts(eliminated.Y):
@@ -281,7 +282,7 @@ class PointBlocks:
 
 
 def evaluate(T_c_w: Tensor, p: Tensor, seen: Observed) -> tuple[Tensor, ...]:
-    """Squared whitened residuals of all places.
+    """Squared whitened residuals of all slots.
 
     Args:
         T_c_w: World-to-camera poses ``(W, 4, 4)``.
@@ -289,10 +290,10 @@ def evaluate(T_c_w: Tensor, p: Tensor, seen: Observed) -> tuple[Tensor, ...]:
         seen: The observations.
 
     Returns:
-        Squares ``(G, L)``, which lie in front, which weigh anything, inverse depths ``(G, L)``, normalised coordinates
+        Squares ``(G, L)``, which lie in front, which have weight, inverse depths ``(G, L)``, normalised coordinates
         ``(G, 2, L)``, residuals ``(G, 2, L)`` (zero for depth priors), the depth priors' ``(D,)``, and the anchors
-        ``(G, 3, L)``. No square exceeds what a point behind the camera costs: points seen so far outside the image
-        weigh nothing (nor would their squares of slopes fit into double precision).
+        ``(G, 3, L)``. Squares are limited to the cost of a point behind the camera: points that far outside the image
+        have zero weight (their squared slopes would overflow double precision).
     """
     R, t = T_c_w[:, :3, :3], T_c_w[:, :3, 3:]
     position = p.reshape(-1).index_select(0, seen.place.reshape(-1)).view(seen.place.shape)
@@ -379,7 +380,7 @@ def tangents_in_world(T_c_w: Tensor, centre: Tensor) -> Tensor:
 
 
 def rotated(T_c_w: Tensor) -> Tensor:
-    """What turns sums in the cameras to sums in the world, ``(W, 9, 8)`` for poses ``(W, 4, 4)``.
+    """Matrices that map sums in camera coordinates to world coordinates, ``(W, 9, 8)`` for poses ``(W, 4, 4)``.
 
     In: ``J^T J`` of an observation by the point in its camera, as xx, yy, -xz, -yz, zz (xy is zero), then its
     ``J^T r`` as x, y, -z. Out: ``R^T J^T J R`` and ``R^T J^T r`` as xx, xy, xz, yy, x, yz, y, z, zz, an order in which
@@ -393,7 +394,7 @@ def rotated(T_c_w: Tensor) -> Tensor:
 def fill(
     Y: Tensor, entry_place: Tensor, unique: bool, system: PointSystem, factor_place: Tensor, damping: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Write what couples the free poses with the whitened anchors into the ``Y``.
+    """Write the coupling of free poses and whitened anchors into ``Y``.
 
     Args:
         Y: All chunks; changed in place.
@@ -412,7 +413,7 @@ def fill(
     first, second, third = system.own[:, 0:3], system.own[:, 1:6:2], system.own[:, 2:9:3]
     whitened = torch.stack(
         (a * first, torch.addcmul(b * first, c, second), torch.addcmul(torch.addcmul(d * first, e, second), f, third))
-    ).to(Y.dtype)  # cancellation is behind: what remains is only multiplied with itself
+    ).to(Y.dtype)  # after the cancellation: the rest is only multiplied with itself
     x, y, z = system.position.to(Y.dtype).unbind(1)
     u, v, w = whitened.unbind(2)
     turning = torch.stack(
@@ -432,9 +433,9 @@ def fill(
 
 
 _MATRIX = [[0, 1, 2], [1, 3, 5], [2, 5, 8]]
-"""Where the entries of ``R^T J^T J R`` are in what `rotated` gives."""
+"""Indices of ``R^T J^T J R`` in the output of `rotated`."""
 _VECTOR = [4, 6, 7]
-"""Where those of ``R^T J^T r`` are."""
+"""Indices of ``R^T J^T r`` in it."""
 _UPPER = torch.tensor([0, 1, 2, 3, 5, 8])
 _GRADIENT = torch.tensor(_VECTOR)
 

@@ -1,7 +1,7 @@
 """Elimination of small blocks: anchors (3), edge depths (1), junctions (3).
 
-A factor's block derivatives are first multiplied by the inverse Cholesky factor of its block; what is subtracted
-from the pose system is then one matrix product ``Y Y^T``.
+A factor's block derivatives are first multiplied by the inverse Cholesky factor of its block; the Schur term of the
+pose system is then one matrix product ``Y Y^T``.
 """
 
 from collections.abc import Sequence
@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 _PIVOT = 1e-12
-"""A Cholesky pivot below this fraction of its diagonal entry is a direction that nothing observes."""
+"""A Cholesky pivot below this fraction of its diagonal entry is an unobservable direction."""
 
 
 def diagonal_rows(size: int) -> list[int]:
@@ -26,8 +26,8 @@ def inverse_cholesky(V: Tensor, damping: float | Tensor) -> Tensor:
         damping: Relative to the diagonal.
 
     Returns:
-        ``(1, ...)`` or ``(6, ...)``: a, b, c, d, e, f with ``L^-1 = [[a, 0, 0], [b, c, 0], [d, e, f]]``; zero in a
-        direction that nothing observes, so that it neither moves nor acts on the poses.
+        ``(1, ...)`` or ``(6, ...)``: a, b, c, d, e, f with ``L^-1 = [[a, 0, 0], [b, c, 0], [d, e, f]]``; zero in
+        unobservable directions, which neither move nor affect the poses.
     """
     grow = 1.0 + damping
     if V.shape[0] == 1:
@@ -80,7 +80,7 @@ def pair_products(
         gradients ``(size, B, L)``.
     """
     size = len(Jd[0])
-    if torch.compiler.is_compiling():  # one pass over the pairs, nothing of their length written but the cross products
+    if torch.compiler.is_compiling():  # a single pass over the pairs that writes only the cross products
         upper = torch.stack([_summed(J, k, J, m).sum(-1) for k in range(7) for m in range(k, 7)], -1)
         normal = upper[..., torch.tensor(_PLACES, device=upper.device)]
         cross = torch.stack([_summed(J, k, Jd, m) for k in range(6) for m in range(size)], 2).unflatten(2, (6, size))
@@ -98,7 +98,7 @@ def pair_products(
 
 
 _PLACES = [[min(k, m) * (13 - min(k, m)) // 2 + max(k, m) for m in range(7)] for k in range(7)]
-"""Where the entries of a symmetric 7x7 matrix lie in its upper triangle, row by row."""
+"""Indices of a symmetric 7x7 matrix in its upper triangle, row by row."""
 
 
 def _summed(a: Sequence[Sequence[Tensor]], i: int, b: Sequence[Sequence[Tensor]], j: int) -> Tensor:
@@ -110,7 +110,7 @@ def _summed(a: Sequence[Sequence[Tensor]], i: int, b: Sequence[Sequence[Tensor]]
 
 
 def eliminate(V: Tensor, g: Tensor, cross: Tensor, damping: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Take blocks in tiles out of the pose system.
+    """Eliminate blocks in tiles from the pose system.
 
     Args:
         V: Upper triangles ``(size (size + 1) / 2, B, L)``.
@@ -120,7 +120,8 @@ def eliminate(V: Tensor, g: Tensor, cross: Tensor, damping: Tensor) -> tuple[Ten
 
     Returns:
         Inverse Cholesky factors of the blocks, their whitened gradients ``(size, B, L)``, ``Y^T (B, size L, 6 T)``,
-        and what to subtract from the tiles' pose systems ``Y Y^T (B, 6 T, 6 T)`` and right sides ``(B, 6 T)``.
+        and the Schur terms to subtract from the tiles' pose systems ``Y Y^T (B, 6 T, 6 T)`` and right sides ``(B, 6
+        T)``.
     """
     factor = inverse_cholesky(V, damping)
     y = whiten(factor, g, 0)

@@ -1,9 +1,9 @@
-"""Dense layout of blocks and of the pairs that see them: host by target by block, so that nothing is gathered.
+"""Dense layout of blocks and of the pairs that see them: host by target by block, without gathers or scatters.
 
-The blocks of one host are cut into tiles of equal length. A pair has its place in its block's column and in its
-target's row of that tile; places without a pair carry no weight. Sums over a block's pairs, over a target's pairs
-and the product that eliminates the blocks are then sums along an axis and batched matrix products. Edges are looked
-for in the same few targets by all of a host, so that most places are taken.
+The blocks of one host are cut into tiles of equal length. A pair lies in its block's column and its target's row of
+that tile; empty slots have zero weight. Sums over a block's pairs, over a target's pairs and the product that
+eliminates the blocks are then sums along an axis and batched matrix products. All edges of a host share the same few
+targets, so most slots are occupied.
 """
 
 from dataclasses import dataclass
@@ -15,9 +15,9 @@ from torch import Tensor
 from edgeslam_torch.types import FloatArray, IntArray
 
 _MOST_LANES = 2048
-"""Blocks per tile at most: hosts may be of very different size."""
+"""Maximum blocks per tile, since hosts differ in size."""
 _VECTOR = 16
-"""Tiles are a multiple of this long, the single-precision numbers in a vector register."""
+"""Tile lengths are a multiple of this: single-precision numbers per vector register."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,9 +31,9 @@ class Tiles:
     lanes: int
     """``L``."""
     block_place: IntArray
-    """``(E,)`` places of the blocks in ``B L``."""
+    """``(E,)`` indices of the blocks in ``B L``."""
     pair_place: IntArray
-    """``(P,)`` places of the pairs in ``B T L``."""
+    """``(P,)`` indices of the pairs in ``B T L``."""
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -41,27 +41,27 @@ class Tiles:
         return *self.target.shape, self.lanes
 
     def blocks(self, values: FloatArray, dtype: torch.dtype, empty: float = 0.0) -> Tensor:
-        """Values ``(..., E)`` of the blocks in their places ``(..., B, L)``."""
+        """Values ``(..., E)`` of the blocks arranged as ``(..., B, L)``."""
         B, _, L = self.shape
         return _spread(values, self.block_place, (B, L), dtype, empty)
 
     def pairs(self, values: FloatArray, dtype: torch.dtype, empty: float = 0.0) -> Tensor:
-        """Values ``(..., P)`` of the pairs in their places ``(..., B, T, L)``."""
+        """Values ``(..., P)`` of the pairs arranged as ``(..., B, T, L)``."""
         return _spread(values, self.pair_place, self.shape, dtype, empty)
 
     def of_blocks(self, values: Tensor) -> FloatArray:
-        """Back from places ``(..., B, L)`` to the blocks ``(..., E)``."""
+        """Values ``(..., B, L)`` back in the order of the blocks ``(..., E)``."""
         out: FloatArray = values.cpu().numpy().reshape(*values.shape[:-2], -1)[..., self.block_place]
         return out
 
     def of_pairs(self, values: Tensor) -> FloatArray:
-        """Back from places ``(..., B, T, L)`` to the pairs ``(..., P)``."""
+        """Values ``(..., B, T, L)`` back in the order of the pairs ``(..., P)``."""
         out: FloatArray = values.cpu().numpy().reshape(*values.shape[:-3], -1)[..., self.pair_place]
         return out
 
 
 def lay_out(host: IntArray, pair_block: IntArray, pair_pose: IntArray, poses: int) -> Tiles:
-    """Give blocks and pairs their places; a host of usual size is one tile.
+    """Assign blocks and pairs to slots; a host of usual size is one tile.
 
     Args:
         host: ``(E,)`` host poses.
@@ -85,7 +85,7 @@ def lay_out(host: IntArray, pair_block: IntArray, pair_pose: IntArray, poses: in
     lane = within % lanes
     tile_host = np.repeat(np.arange(poses), tiles)
     B = len(tile_host)
-    # Few passes over the pairs: there are many of them.
+    # Few passes, since there are many pairs.
     row = tile[pair_block] * poses + pair_pose
     seen = (np.bincount(row, minlength=B * poses) > 0).reshape(B, poses)
     if seen[np.arange(B), tile_host].any():
