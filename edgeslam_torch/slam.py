@@ -263,7 +263,7 @@ class EdgeSlam:
     def _output(self, frame: Frame, step: Step) -> SlamOutput:
         system, track = self._system, step.track
         T_c_w = system.motion.T_c_w
-        self.log.append(frame.index, frame.stamp_s, step.keyframe.id, T_c_w, step.status.supported)
+        self.log.append(frame.index, frame.stamp_s, step.keyframe.id, T_c_w, step.status.supported, step.T_c_before)
         return SlamOutput(
             index=frame.index,
             stamp_s=frame.stamp_s,

@@ -23,6 +23,9 @@ class FrameRecord:
     """``(4, 4)``"""
     supported: bool
     """Whether the pose rests on a map that the images support."""
+    T_c_before: FloatArray | None = None
+    """``(4, 4)`` of a frame that became a keyframe: its pose as tracked, relative to the keyframe of the frame before;
+    refinement has moved it since."""
 
 
 class TrajectoryLog:
@@ -32,11 +35,35 @@ class TrajectoryLog:
         self.map = slam_map
         self.records: list[FrameRecord] = []
 
-    def append(self, index: int, stamp_s: float, keyframe_id: int, T_c_w: FloatArray, supported: bool) -> None:
-        """Record a frame's pose in the map as it is now, and whether the map supports it."""
+    def append(
+        self,
+        index: int,
+        stamp_s: float,
+        keyframe_id: int,
+        T_c_w: FloatArray,
+        supported: bool,
+        T_c_before: FloatArray | None = None,
+    ) -> None:
+        """Record a frame's pose in the map as it is now, and whether the map supports it.
+
+        Args:
+            index: Of the frame.
+            stamp_s: Its stamp.
+            keyframe_id: Keyframe that it is tied to.
+            T_c_w: Its pose ``(4, 4)``.
+            supported: Whether the map supports it.
+            T_c_before: For a new keyframe, what `relative_to_last` gave before refinement.
+        """
         with self.map.lock:
             T_c_k = T_c_w @ se3.inverse(self.map.pose_of(keyframe_id))
-        self.records.append(FrameRecord(index, stamp_s, keyframe_id, T_c_k, supported))
+        self.records.append(FrameRecord(index, stamp_s, keyframe_id, T_c_k, supported, T_c_before))
+
+    def relative_to_last(self, T_c_w: FloatArray) -> FloatArray | None:
+        """A tracked pose ``(4, 4)`` relative to the keyframe that the last frame is tied to; None without a frame."""
+        if not self.records:
+            return None
+        with self.map.lock:
+            return T_c_w @ se3.inverse(self.map.pose_of(self.records[-1].keyframe_id))
 
     def replace(self, T_c_w_of_frame: dict[int, FloatArray], keyframes: list[Keyframe]) -> None:
         """Give recent frames, by index, new poses that the map supports.
@@ -80,4 +107,38 @@ class TrajectoryLog:
         with self.map.lock:
             T_k_w = {id: self.map.pose_of(id) for id in {r.keyframe_id for r in records}}
         T_c_w = np.stack([r.T_c_k for r in records]) @ np.stack([T_k_w[r.keyframe_id] for r in records])
+        _close_gaps(records, T_c_w, T_k_w)
         return np.array([r.stamp_s for r in records]), se3.inverse(T_c_w)
+
+
+def _close_gaps(records: list[FrameRecord], T_c_w: FloatArray, T_k_w: dict[int, FloatArray]) -> None:
+    """Spread over the frames between two keyframes, in place, what refinement changed from one to the other.
+
+    A frame keeps the way from its keyframe as it was tracked, in the scale that the map had just there. Where
+    refinement then moved the next keyframe, all frames before it would be off by more and more, and jump back at it.
+
+    Args:
+        records: Of consecutive frames.
+        T_c_w: Their poses ``(F, 4, 4)`` by their own keyframes.
+        T_k_w: World-to-camera pose of each keyframe.
+    """
+    begin = 0
+    for i, record in enumerate(records):
+        if record.T_c_before is None:
+            continue
+        held = records[begin].keyframe_id  # frames tied to another one need not be right where that one begins
+        if i - begin > 1 and all(r.supported and r.keyframe_id == held for r in records[begin:i]):
+            tracked = record.T_c_before @ T_k_w[records[i - 1].keyframe_id]
+            moved = se3.log(T_c_w[i] @ se3.inverse(tracked))
+            way = _way(np.concatenate([T_c_w[begin:i], tracked[None]]))
+            for k in range(begin + 1, i):
+                T_c_w[k] = se3.exp(way[k - begin] / way[-1] * moved) @ T_c_w[k]
+        begin = i
+
+
+def _way(T_c_w: FloatArray) -> FloatArray:
+    """Length of the way to each of some poses ``(F,)``; a wrong scale grows with it. Equal steps where none moved."""
+    steps = np.linalg.norm(np.diff(se3.inverse(T_c_w)[:, :3, 3], axis=0), axis=1)
+    if not steps.any():
+        steps = np.ones_like(steps)
+    return np.concatenate([[0.0], np.cumsum(steps)])

@@ -21,6 +21,8 @@ class Step:
     track: Track | None = None
     parallax_rad: float = 0.0
     is_keyframe: bool = False
+    T_c_before: FloatArray | None = None
+    """``(4, 4)`` of a new keyframe: as tracked, relative to the keyframe of the frame before."""
 
 
 @dataclass(frozen=True, slots=True)

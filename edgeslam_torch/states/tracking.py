@@ -93,6 +93,7 @@ class Tracking:
         self.relocaliser.forget()
         self._recent = track.anchor if track.inliers else self._recent
         system.see(frame.stamp_s, track)
+        before = system.log.relative_to_last(track.T_c_w)
         keyframe = self._insert_keyframe(frame, seen, located) if located.due else None
         if keyframe is not None and keyframe.id in system.map.keyframes:
             reference = keyframe
@@ -104,6 +105,7 @@ class Tracking:
             track,
             located.parallax_rad,
             keyframe is not None,
+            None if keyframe is None else before,
         )
 
     # -- by points ---------------------------------------------------------------------------------------------

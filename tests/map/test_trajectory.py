@@ -43,3 +43,28 @@ def test_replaced_poses_are_those_of_the_newest_frames_only(rng):
     np.testing.assert_allclose(se3.inverse(T_w_c), np.stack([old[0], old[1], new, old[0]]), atol=1e-12)
     assert [r.keyframe_id for r in log.records] == [0, 0, 0, 1]
     assert log.support().supported.tolist() == [False, False, True, True]
+
+
+def test_frames_follow_the_next_keyframe_where_refinement_moved_it(rng):
+    """Tracked twice as far as it was: halved between the keyframes, and no frame jumps."""
+    points = PointMap(rng, 200, 2)
+    points.fill()
+    a, b = points.keyframes
+    a.T_c_w = np.eye(4)
+
+    def forward(x):
+        T = np.eye(4)
+        T[0, 3] = -x
+        return T
+
+    log = TrajectoryLog(points.map)
+    log.append(0, 0.0, a.id, a.T_c_w, True, np.eye(4))
+    for i, x in enumerate((0.2, 0.4, 0.6), 1):
+        log.append(i, 0.1 * i, a.id, forward(x), True)
+    before = log.relative_to_last(forward(0.8))
+    b.T_c_w = forward(0.4)
+    log.append(4, 0.4, b.id, b.T_c_w, True, before)
+    log.append(5, 0.5, b.id, forward(0.5), True)
+    np.testing.assert_allclose(log.poses()[1][:, 0, 3], [0.0, 0.1, 0.2, 0.3, 0.4, 0.5], atol=1e-12)
+    log.records[2].supported = False  # a predicted frame between them: nobody knows which way it went
+    np.testing.assert_allclose(log.poses()[1][:, 0, 3], [0.0, 0.2, 0.4, 0.6, 0.4, 0.5], atol=1e-12)
