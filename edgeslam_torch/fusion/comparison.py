@@ -1,7 +1,7 @@
 """Velocities and attitude held against the images, at the delay in use and at others."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation
 from edgeslam_torch.fusion.alignment import map_to_world, turns
 from edgeslam_torch.fusion.config import FusionConfig
 from edgeslam_torch.fusion.delay import GROWTH, MIN_DISPLACEMENTS, Delay
-from edgeslam_torch.fusion.plausibility import Agreement, Reading, Trust, Verdict, agreement
+from edgeslam_torch.fusion.plausibility import Agreement, Reading, Reread, Trust, Verdict, agreement
 from edgeslam_torch.fusion.scale import LogScale
-from edgeslam_torch.fusion.track import TelemetryTrack
+from edgeslam_torch.fusion.track import TelemetryTrack, Turn
 from edgeslam_torch.fusion.visual_memory import VisualMemory
 from edgeslam_torch.types import FloatArray
 
@@ -49,16 +49,37 @@ class Comparison:
         self._looked_wide_at = 0
 
     def judge(self, trust: Trust, present: Present, delay: Delay, R_w_m: FloatArray) -> None:
-        """Compare at the delay in use and, if that fits badly, at others."""
+        """Compare at the delay in use and, if that fits badly, read in other frames and at other delays.
+
+        Velocities that surely fit better in another frame are read so from now on: the images have the last word on
+        what the settings or the reader of a log took them for.
+        """
         used = self._compared(present, delay.value_s, R_w_m)
-        for reading, found in used.items():
-            trust.judge(reading, found)
         now, n = used[Reading.VELOCITY], present.memory.count
         if now.correlation >= _FITS_WELL:
             trust.elsewhere_s = None
         elif now.count >= MIN_DISPLACEMENTS and n >= GROWTH * self._looked_wide_at:
             self._looked_wide_at = n
-            trust.elsewhere_s = self._fits_elsewhere(present, now, delay.value_s)
+            turn = self._fits_turned(present, now, delay.value_s, R_w_m)
+            if turn is not None:
+                trust.reread = Reread(turn, now)
+                present.track.read_as(turn)
+                used = self._compared(present, delay.value_s, R_w_m)
+                trust.forget(Reading.VELOCITY)
+            trust.elsewhere_s = self._fits_elsewhere(present, used[Reading.VELOCITY], delay.value_s)
+        for reading, found in used.items():
+            trust.judge(reading, found)
+
+    def _fits_turned(self, present: Present, now: Agreement, delay_s: float, R_w_m: FloatArray) -> Turn | None:
+        """The frame in which the velocities surely fit better than in the one they are read in."""
+        best, best_turn = now, None
+        for turn in Turn:
+            if turn is not present.track.turn:
+                other = replace(present, track=present.track.as_if(turn))
+                found = self._compared(other, delay_s, R_w_m)[Reading.VELOCITY]
+                if found.correlation > best.correlation:
+                    best, best_turn = found, turn
+        return best_turn if _surely_better(best, now) else None
 
     def _fits_elsewhere(self, present: Present, now: Agreement, used_s: float) -> float | None:
         """The delay at which telemetry surely fits better than now, if that is one which is not allowed."""
@@ -70,10 +91,7 @@ class Comparison:
             found = None if R is None else self._compared(present, delay_s, R)[Reading.VELOCITY]
             if found is not None and found.count >= now.count // 2 and found.correlation > best.correlation:
                 best, best_s = found, delay_s
-        left, left_now = (1.0 - max(a.correlation, 0.0) ** 2 for a in (best, now))
-        likelier = 0.25 * now.count * math.log(left_now / max(left, 1e-6))
-        sure = best.verdict is Verdict.AGREES and likelier > _MUCH_LIKELIER
-        return best_s if sure and not low <= best_s <= high else None
+        return best_s if _surely_better(best, now) and not low <= best_s <= high else None
 
     def _compared(self, present: Present, delay_s: float, R_w_m: FloatArray) -> dict[Reading, Agreement]:
         """How velocities and attitude go with the images under one delay.
@@ -98,3 +116,9 @@ class Comparison:
             seen, told = (Rotation.from_matrix(R).as_rotvec() / duration for R in (both.seen, both.told))
             found[Reading.ATTITUDE] = agreement(seen, told, _LEAST_TURN_RAD_S, 1.5 * _LEAST_TURN_RAD_S)
         return found
+
+
+def _surely_better(best: Agreement, now: Agreement) -> bool:
+    """Whether one reading of the same telemetry is proven, and much likelier than another."""
+    left, left_now = (1.0 - max(a.correlation, 0.0) ** 2 for a in (best, now))
+    return best.verdict is Verdict.AGREES and 0.25 * now.count * math.log(left_now / max(left, 1e-6)) > _MUCH_LIKELIER

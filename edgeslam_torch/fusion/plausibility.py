@@ -13,6 +13,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from edgeslam_torch.fusion.track import Turn
 from edgeslam_torch.types import FloatArray, IntArray
 
 _LEAST_COUNT = 6
@@ -148,6 +149,26 @@ class AtOdds:
         return f"{said}; the depth network confirms the velocities, so the heights are not used"
 
 
+@dataclass(frozen=True, slots=True)
+class Reread:
+    """Velocities are read in another frame than the settings and the reader of the log say."""
+
+    turn: Turn
+    before: Agreement
+    """How they went with the images as they had been read."""
+
+    def warning(self, now: Agreement | None) -> str:
+        """What is done, and why."""
+        frame = {
+            Turn.AS_READ: "as they were given",
+            Turn.FROM_BODY: "in body axes",
+            Turn.BACK: "in the world of power-on, without the turn by yaw that they were given",
+        }[self.turn]
+        share = "" if now is None else f" ({100 * now.share:.0f} % of the motion explained, "
+        share += "" if now is None else f"{100 * self.before.share:.0f} % before)"
+        return f"telemetry's velocities fit the images only {frame}{share}, and are read so"
+
+
 class Trust:
     """Verdicts on a flight's readings, each kept until the opposite is proven."""
 
@@ -157,6 +178,8 @@ class Trust:
         """Video delay at which telemetry fits the images, when that is none of the delays allowed."""
         self.at_odds: AtOdds | None = None
         """Scales by velocities and by height where these cannot both be right."""
+        self.reread: Reread | None = None
+        """Set when velocities are read in another frame than they were given in."""
         self._verdicts: dict[Reading, Verdict] = {}
 
     def judge(self, reading: Reading, found: Agreement) -> None:
@@ -164,6 +187,10 @@ class Trust:
         self.latest[reading] = found
         if found.verdict is not Verdict.OPEN:
             self._verdicts[reading] = found.verdict
+
+    def forget(self, reading: Reading) -> None:
+        """Begin anew with a reading that is read in another way."""
+        self._verdicts.pop(reading, None)
 
     def verdict(self, reading: Reading) -> Verdict:
         """What is known of a reading."""
@@ -195,14 +222,14 @@ class Trust:
                 f"telemetry is not used: it fits the images if its stamps are {abs(self.elsewhere_s):.1f} s {late}, "
                 "which fusion.delay_range_s (or delay_s) excludes"
             ]
-        said = []
+        velocity = self.latest.get(Reading.VELOCITY)
+        said = [] if self.reread is None else [self.reread.warning(velocity)]
         attitude = self.latest.get(Reading.ATTITUDE)
         if attitude is not None and self.verdict(Reading.ATTITUDE) is Verdict.CONTRADICTS:
             said.append(
                 f"telemetry's roll, pitch and yaw explain {100 * attitude.share:.0f} % of the turns in the images: "
                 "its heights are not used, and the vertical may be wrong"
             )
-        velocity = self.latest.get(Reading.VELOCITY)
         if velocity is not None and not self.velocity:
             said.append(f"telemetry's velocities are not used: {_why(velocity, 'motion')}")
         for reading in HEIGHTS:

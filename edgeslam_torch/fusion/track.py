@@ -2,7 +2,9 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, replace
+from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,6 +54,16 @@ class Readings:
         return self.has_velocity & ~self.frozen
 
 
+class Turn(IntEnum):
+    """How often velocities are turned by yaw to get into the world of power-on, beyond what the settings say."""
+
+    AS_READ = 0
+    FROM_BODY = 1
+    """They are in the axes of the body, though nobody said so."""
+    BACK = -1
+    """They were in the world before whoever read them turned them."""
+
+
 class TelemetryTrack:
     """Growing arrays of telemetry with displacement and attitude interpolated between readings."""
 
@@ -60,11 +72,12 @@ class TelemetryTrack:
         self._max_gap_s, self._keep_s = max_gap_s, keep_s
         self._samples: list[TelemetrySample] = []
         self._cached: Readings | None = None
+        self._turn = Turn.AS_READ
         self.refused = 0
         """Samples left out because they were not newer than the last one or held neither velocity nor attitude."""
 
     def add(self, samples: Sequence[TelemetrySample]) -> list[TelemetrySample]:
-        """Append samples; returns those that were used."""
+        """Append samples; returns those that were used, as they are read by now."""
         used = []
         for sample in samples:
             known = np.isfinite(sample.velocity_m_s).all() or np.isfinite(sample.rpy_rad).all()
@@ -72,12 +85,34 @@ class TelemetryTrack:
                 self.refused += 1
                 continue
             self._samples.append(sample)
-            used.append(sample)
+            used.append(self._turned(sample))
         if used:
             self._cached = None
             while self._samples[-1].stamp_s - self._samples[0].stamp_s > self._keep_s:
                 del self._samples[: max(1, len(self._samples) // 10)]
         return used
+
+    @property
+    def turn(self) -> Turn:
+        """How velocities are read."""
+        return self._turn
+
+    def read_as(self, turn: Turn) -> None:
+        """Read all velocities, those to come as well, in another frame."""
+        if turn is not self._turn:
+            self._turn, self._cached = turn, None
+
+    def as_if(self, turn: Turn) -> "TelemetryTrack":
+        """The same telemetry read in another frame, to compare."""
+        other = copy(self)
+        other.read_as(turn)
+        return other
+
+    def _turned(self, sample: TelemetrySample) -> TelemetrySample:
+        if self._turn is Turn.AS_READ or not math.isfinite(sample.rpy_rad[2]):
+            return sample
+        R = Rotation.from_euler("z", self._turn * float(sample.rpy_rad[2]))
+        return replace(sample, velocity_m_s=R.apply(sample.velocity_m_s))
 
     def __len__(self) -> int:
         return len(self._samples)
@@ -102,7 +137,12 @@ class TelemetryTrack:
 
         stamp, told, raw_rpy = column("stamp_s"), column("velocity_m_s"), column("rpy_rad")
         velocity, rpy = _filled(told), np.unwrap(_filled(raw_rpy), axis=0)
+        by_yaw = Rotation.from_euler("z", self._turn * rpy[:, 2:])
+        if self._turn is Turn.BACK:
+            velocity = by_yaw.apply(velocity)
         sign = np.sign(np.where(np.abs(velocity) > 1e-6, velocity, 0.0))
+        if self._turn is Turn.FROM_BODY:
+            velocity, sign = by_yaw.apply(velocity), by_yaw.apply(sign)
         if self._body:
             R = Rotation.from_euler("ZYX", rpy[:, ::-1])
             velocity, sign = R.apply(velocity), R.apply(sign)

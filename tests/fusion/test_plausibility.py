@@ -204,6 +204,57 @@ def test_a_wrong_clock_is_said_with_what_would_mend_it(rng, swinging, replay, la
     assert ("late" if late_s > 0.5 else "early") in warning
 
 
+def circling(swinging):
+    """A drone that swings and turns round and round."""
+    motion = swinging(30.0)
+    R = Rotation.from_euler("z", 0.25 * motion.stamps_s[:, None]).as_matrix()
+    T = motion.T_w_c.copy()
+    T[:, :3, :3] = R @ T[:, :3, :3]
+    return replace(motion, T_w_c=T)
+
+
+def turned_by_yaw(samples, times):
+    """Velocities in other axes, as whole dm/s."""
+    return with_velocities(
+        samples, [Rotation.from_euler("z", times * s.rpy_rad[2]).apply(s.velocity_m_s) for s in samples]
+    )
+
+
+@pytest.mark.parametrize(("times", "frame"), [(-1, "in body axes"), (1, "without the turn by yaw")])
+def test_images_have_the_last_word_on_the_velocities_frame(rng, swinging, replay, times, frame):
+    """Body axes though nobody said so; world axes that the reader of the log took for the body's and turned."""
+
+    def spoil(rng, samples, motion):
+        return turned_by_yaw(no_heights(samples), times)
+
+    _, fusion, gauge = told_of(rng, replay, circling(swinging), spoil)
+    scale = fusion.scale()
+    assert scale.source == "telemetry+depth"
+    assert scale.value == pytest.approx(gauge.scale, rel=0.06)
+    (warning,) = fusion.warnings()
+    assert frame in warning
+
+
+def test_velocities_read_in_another_frame_carry_the_pose_on(rng, swinging, replay):
+    """What the filter and the prediction get is turned as well."""
+    motion = circling(swinging)
+
+    def spoil(rng, samples, motion):
+        return turned_by_yaw(samples, -1)
+
+    _, fusion, gauge = told_of(rng, replay, motion, spoil, tracked=lambda t: t < 28.0)
+    told = fusion.predict(29.0)
+    assert "telemetry" in told.source
+    moved_m = gauge.scale * np.linalg.norm(told.T_w_c[:3, 3] - gauge.T_m_c[motion.stamps_s.searchsorted(29.0), :3, 3])
+    assert moved_m < 0.1
+
+
+def test_right_velocities_of_a_turning_drone_stay_as_they_are(rng, swinging, replay):
+    _, fusion, gauge = told_of(rng, replay, circling(swinging), lambda rng, samples, motion: samples)
+    assert fusion.warnings() == []
+    assert fusion.scale().value == pytest.approx(gauge.scale, rel=0.06)
+
+
 def test_velocities_in_the_wrong_unit_are_named_and_dropped(rng, swinging, replay):
     """The depth network confirms the heights: what remains is no surer than heights without any velocities."""
     motion = swinging(25.0, size_m=0.5)
