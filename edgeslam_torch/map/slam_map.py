@@ -1,4 +1,4 @@
-"""Keyframes and anchors with the observations that join them."""
+"""Keyframes and anchors with their observations."""
 
 import threading
 
@@ -18,26 +18,26 @@ class SlamMap:
 
     def __init__(self, scale_factor: float, levels: int = 8) -> None:
         self.scale_factor = scale_factor
-        """Of the keypoints' pyramid, with ``levels``."""
+        """Scale factor between pyramid levels."""
         self.levels = levels
         self.anchors = Anchors()
         self.keyframes: dict[int, Keyframe] = {}
         self.links: dict[int, tuple[int, FloatArray]] = {}
         """Removed keyframe id -> (surviving id, ``T_removed_surviving``)."""
         self.lock = threading.RLock()
-        """Held to change the map, and to read it from another thread than the one that changes it."""
+        """Held to modify the map, and to read it from other threads."""
         self.revision = 0
-        """Grows with every change of who observes what, so that who remembers something of that sees if it holds."""
+        """Incremented with every change of observations, to invalidate caches."""
         self.begun: dict[int, str] = {}
-        """What the first pose and the scale of each piece rest on, by the piece's number."""
+        """Origin of the first pose and scale of each piece, by its number."""
         self._piece: dict[int, int] = {}
-        """Piece in which each keyframe, alive or removed, was made."""
+        """Piece in which each keyframe, alive or removed, was created."""
         self._joined: dict[int, int] = {}
-        """Piece -> older piece that it was found to be part of."""
+        """Piece -> older piece that it was joined to."""
         self._next_id = 0
 
     def next_keyframe_id(self) -> int:
-        """A keyframe id never used before."""
+        """A new keyframe id."""
         self._next_id += 1
         return self._next_id - 1
 
@@ -65,7 +65,7 @@ class SlamMap:
         """Keyframes added from now on belong to a new piece, unless the last one holds no anchor.
 
         Args:
-            begun: What the new piece's first pose and scale rest on, in words.
+            begun: Origin of the new piece's first pose and scale, in words.
         """
         members = (k for k in self.keyframes.values() if self._piece[k.id] == self.piece)
         if not self.begun or any((k.anchor != NO_ANCHOR).any() for k in members):
@@ -77,14 +77,15 @@ class SlamMap:
         return max(len(self.begun) - 1, 0)
 
     def piece_of(self, keyframe_id: int) -> int:
-        """Number of the piece that a keyframe, alive or removed, belongs to by now."""
+        """Number of the piece that a keyframe, alive or removed, currently belongs to."""
         piece = self._piece[keyframe_id]
         while piece in self._joined:
             piece = self._joined[piece]
         return piece
 
     def join_pieces(self, keyframe: Keyframe, others: list[Keyframe]) -> bool:
-        """Record that a keyframe and others show the same anchors, hence are of one piece; whether that was news."""
+        """Record that a keyframe and others share anchors, hence belong to one piece; returns whether pieces were
+        joined."""
         mine = self.piece_of(keyframe.id)
         found = {self.piece_of(other.id) for other in others} - {mine}
         oldest = min(found | {mine})
@@ -100,15 +101,15 @@ class SlamMap:
     # -- observations ------------------------------------------------------------------------------------------
 
     def observe(self, keyframe: Keyframe, keypoints: IntArray, anchors: IntArray) -> None:
-        """Record that a keyframe's keypoints see anchors; both must be free of an earlier partner."""
+        """Add observations of anchors by a keyframe's keypoints; both must be free."""
         self.revision += 1
         keyframe.anchor[keypoints] = anchors
         self.anchors.observations[anchors] += 1
 
     def forget_observations(self, keyframe: Keyframe, keypoints: IntArray) -> None:
-        """Take observations back.
+        """Remove observations.
 
-        Anchors seen by fewer than two keyframes afterwards are removed; one is enough where a prior tells the depth.
+        Anchors with fewer than two observations afterwards are removed; one suffices with a depth prior.
         """
         self.revision += 1
         held = keyframe.anchor[keypoints]
@@ -119,7 +120,7 @@ class SlamMap:
         self.remove_anchors(poor)
 
     def remove_anchors(self, ids: IntArray) -> None:
-        """Remove anchors from the map and from every keyframe that holds them."""
+        """Remove anchors from the map and from all keyframes."""
         if len(ids) == 0:
             return
         self.revision += 1
@@ -131,17 +132,17 @@ class SlamMap:
         self.anchors.remove(ids)
 
     def merge_anchors(self, losers: IntArray, winners: IntArray) -> None:
-        """Give every observation of ``losers`` to ``winners``, ``(M,)`` each, one-to-one and disjoint."""
+        """Move all observations of ``losers`` to ``winners``, ``(M,)`` each, one-to-one and disjoint."""
         if len(losers) == 0:
             return
-        target = np.full(len(self.anchors.alive) + 1, NO_ANCHOR)  # the last row answers for NO_ANCHOR
+        target = np.full(len(self.anchors.alive) + 1, NO_ANCHOR)  # the last row stands for NO_ANCHOR
         target[losers] = winners
         for keyframe in self.keyframes.values():
             new = target[keyframe.anchor]
             keypoints = np.flatnonzero(new >= 0)
             if len(keypoints) == 0:
                 continue
-            # One keypoint per anchor and keyframe; a handful here, for which np.isin is slow.
+            # One keypoint per anchor and keyframe; few here, for which np.isin is slow.
             already = (new[keypoints, None] == keyframe.anchor).any(axis=1)
             keyframe.anchor[keypoints] = np.where(already, NO_ANCHOR, new[keypoints])
             self.anchors.observations[new[keypoints[~already]]] += 1
@@ -152,7 +153,7 @@ class SlamMap:
     # -- covisibility ------------------------------------------------------------------------------------------
 
     def shared_counts(self, anchor_ids: IntArray) -> dict[int, int]:
-        """Number of the given anchors that each keyframe sees; keyframes that see none are left out."""
+        """Number of the given anchors that each keyframe observes; keyframes without any are omitted."""
         mark = np.zeros(len(self.anchors.alive) + 1, dtype=bool)  # the last row answers for NO_ANCHOR
         mark[anchor_ids] = True
         mark[-1] = False
@@ -167,7 +168,7 @@ class SlamMap:
         return [self.keyframes[id] for id in ranked if counts[id] >= min_shared][:most]
 
     def anchors_seen_by(self, keyframes: list[Keyframe]) -> IntArray:
-        """Sorted ids of anchors that at least one of the keyframes sees."""
+        """Sorted ids of anchors observed by at least one of the keyframes."""
         if not keyframes:
             return np.zeros(0, dtype=np.int64)
         seen = np.zeros(len(self.anchors.alive) + 1, dtype=bool)  # the last row answers for NO_ANCHOR
@@ -178,7 +179,7 @@ class SlamMap:
     # -- keyframes ---------------------------------------------------------------------------------------------
 
     def add_keyframe(self, keyframe: Keyframe, reference: Keyframe | None = None) -> None:
-        """Take a keyframe with its observations into the map.
+        """Add a keyframe with its observations.
 
         Args:
             keyframe: The new one.
@@ -190,17 +191,17 @@ class SlamMap:
         self.anchors.observations[keyframe.anchor[keyframe.anchor >= 0]] += 1
 
     def remove_keyframe(self, keyframe: Keyframe) -> None:
-        """Drop a keyframe; its frames stay tied to the nearest surviving one in time."""
+        """Remove a keyframe; its frames are linked to the nearest surviving one in time."""
         self.forget_observations(keyframe, keyframe.keypoints_with_anchor())
         others = (id for id in self.keyframes if id != keyframe.id)
-        # One of its own piece if there is any: another's may move without it.
+        # Prefer its own piece: another piece may move independently.
         mine = self.piece_of(keyframe.id)
         heir = min(others, key=lambda id: (self.piece_of(id) != mine, abs(id - keyframe.id), id))
         self.links[keyframe.id] = (heir, keyframe.T_c_w @ se3.inverse(self.keyframes[heir].T_c_w))
         del self.keyframes[keyframe.id]
 
     def remove_empty_keyframes(self) -> None:
-        """Drop keyframes that hold no anchor: nothing can be tracked against them."""
+        """Remove keyframes without anchors, which cannot be tracked."""
         for keyframe in list(self.keyframes.values()):
             if (keyframe.anchor == NO_ANCHOR).all() and len(self.keyframes) > 1:
                 self.remove_keyframe(keyframe)
@@ -224,7 +225,7 @@ class SlamMap:
         total = np.stack([np.bincount(held, ray[:, i], len(wanted)) for i in range(3)], axis=1)[ids]
         norm = np.linalg.norm(total, axis=1)
         self.anchors.normal[ids] = total / np.where(norm > 0, norm, 1.0)[:, None]
-        # Of several observations of one anchor the last assignment stays: the newest keyframe's.
+        # Of several observations of one anchor the last assignment is kept: the newest keyframe's.
         octave = np.concatenate([k.features.octave for k in keyframes])[seen]
         self.anchors.max_distance[held] = distance * self.scale_factor**octave
         self.anchors.words[held] = np.concatenate([k.words for k in keyframes])[seen]

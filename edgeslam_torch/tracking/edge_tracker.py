@@ -1,9 +1,8 @@
-"""The pose of a frame from edges: where corners are few, the measured edges of keyframes hold it.
+"""The pose of a frame from edges, used where corners are few.
 
-An edge pixel tells where the camera is across the edge and nothing along it. Edge points of nearby keyframes are
-projected into the frame, the nearest Canny pixel is taken for the same edge, and its position counts across that edge
-alone: `refine_pose` takes a slack along it. Points, where there are any, take part beside them. REVO (Schenk and
-Fraundorfer, ICRA 2017) and the edgelets of SVO track by the same distance.
+An edge pixel constrains the pose across the edge but not along it. Edge points of nearby keyframes are projected into
+the frame and associated with the nearest Canny pixel; `refine_pose` gets a large slack along the edge. Points are
+used beside them, if any. REVO (Schenk and Fraundorfer, ICRA 2017) and the edgelets of SVO track by the same distance.
 """
 
 from dataclasses import dataclass
@@ -23,27 +22,27 @@ from edgeslam_torch.optim.problem import PosePrior
 from edgeslam_torch.types import FloatArray, IntArray
 
 HOSTS = 5
-"""Keyframes whose edges are looked for: the nearest ones in place and direction."""
+"""Number of keyframes whose edges are used: the nearest in position and direction."""
 POINTS = 600
-"""Edge points looked for at most, evenly thinned."""
+"""Maximum number of edge points, evenly thinned."""
 SIGMA_PX = 2.0
-"""Across the edge: edges scatter by 0.8 px, but neighbours on one edge err together, six of them count as one."""
+"""Sigma across the edge: edges scatter by 0.8 px, but errors of neighbours are correlated: six count as one."""
 ALONG_PX = 1e3
-"""Slack along the edge: nothing is known there."""
+"""Slack along the edge, which is unconstrained."""
 REACH_PX = (12.0, 4.0, 4.0)
-"""Distance in which the nearest edge is looked for, round by round: the prediction is off by more than its result."""
+"""Association distance in each round; larger for the prediction than for its refinements."""
 AGREE_PX = 1.5
-"""Distance across the edge within which the result and the image agree: two sigmas of a single edge pixel."""
+"""Maximum distance across the edge of an inlier: two sigmas of a single edge pixel."""
 ALIKE = np.cos(np.deg2rad(30.0))
-"""Cosine between a projected edge's normal and that of its partner. An edge as near and as alike lies by chance where
-every tenth point of a cluttered image falls."""
+"""Minimum cosine between the normals of a projected edge and its partner (30 degrees). In a cluttered image, one
+point in ten has such an edge by chance."""
 MIN_EDGES = 80
-"""Edge points that must agree before edges alone are believed."""
+"""Minimum number of inliers for a pose from edges alone."""
 MIN_SHARE = 0.7
-"""Of the edge points in view that must agree, for edges alone."""
+"""Minimum share of inliers among edge points in view, for a pose from edges alone."""
 MAX_SIGMA = 0.05
-"""Standard deviation of the position relative to the edges' depth, and of the rotation [rad], above which edges alone
-do not fix a pose: parallel lines leave one direction free."""
+"""Maximum sigma of position relative to depth, and of rotation [rad] (3 degrees), for a pose from edges alone:
+parallel lines leave one direction unconstrained."""
 EFFORT = PoseConfig(rounds=2, robust_rounds=1, cost_tolerance=1e-3)
 
 
@@ -62,30 +61,30 @@ class PointsInFrame:
 
     @classmethod
     def none(cls) -> "PointsInFrame":
-        """No point at all."""
+        """Without points."""
         return cls(np.zeros((0, 3)), np.zeros((0, 2)), np.zeros(0), np.zeros((0, 2)))
 
 
 @dataclass(frozen=True, slots=True)
 class EdgePose:
-    """A pose that edges had a part in."""
+    """A pose refined with edges."""
 
     T_c_w: FloatArray
     """``(4, 4)``"""
     covariance: FloatArray
     """``(6, 6)`` of its left tangent."""
     points: NDArray[np.bool_]
-    """``(M,)`` of the points given, those that agree."""
+    """``(M,)`` inliers of the given points."""
     edges: int
-    """Edge points that agree."""
+    """Number of edge inliers."""
     in_view: int
-    """Edge points that should be seen."""
+    """Number of edge points in view."""
     depth: float
-    """Median depth of those [map units]."""
+    """Median depth of these [map units]."""
 
     @property
     def is_fixed(self) -> bool:
-        """Whether the edges alone would fix the pose."""
+        """Whether the edges alone constrain the pose."""
         if self.edges < max(MIN_EDGES, MIN_SHARE * self.in_view) or not np.isfinite(self.covariance).all():
             return False
         sigma = np.sqrt(np.diag(self.covariance))
@@ -93,7 +92,7 @@ class EdgePose:
 
 
 class EdgeTracker:
-    """Finds the edge map in a frame; keeps nothing between frames."""
+    """Tracks the edge map in a frame; stateless."""
 
     def __init__(self, slam_map: SlamMap, edges: EdgeMap, camera: Camera) -> None:
         self.map = slam_map
@@ -107,13 +106,13 @@ class EdgeTracker:
         points: PointsInFrame | None = None,
         expected: PosePrior | None = None,
     ) -> EdgePose | None:
-        """Pose near a predicted one from edges, beside points; None where no edge was measured or too few agree.
+        """Pose near a predicted one from edges, beside points; None without measured edges or with too few inliers.
 
         Args:
             grey: Frame ``(H, W)`` with the lens distortion still in it.
             T_c_w: Predicted pose ``(4, 4)``.
             points: Anchors found in the frame.
-            expected: What is known of the pose beforehand.
+            expected: Prior of the pose.
         """
         points = points or PointsInFrame.none()
         known = self._edges_near(T_c_w)
@@ -150,7 +149,7 @@ class EdgeTracker:
         )
 
     def _edges_near(self, T_c_w: FloatArray) -> "KnownEdges | None":
-        """Edges of the keyframes that look at the same place, as they would look from here."""
+        """Edges of nearby keyframes with their predicted normals."""
         hosts = {h.keyframe_id: h for h in self.edges.hosts if h.keyframe_id in self.map.keyframes and len(h.uv)}
         if not hosts:
             return None
@@ -165,14 +164,14 @@ class EdgeTracker:
     def _match(
         self, seen: "EdgeImage", known: "KnownEdges", T_c_w: FloatArray, reach_px: float
     ) -> tuple[PointsInFrame, int]:
-        """Edge points with the nearest edge pixel of the frame that runs alike, and how many should be in view."""
+        """Edge points with their partners in the frame, and the number of edge points in view."""
         p_c = se3.transform(T_c_w, known.p_w)
         front = np.flatnonzero(p_c[:, 2] > 1e-3)
         uv = self.camera.project_through_lens(p_c[front])
         inside = seen.contains(uv)
         front, uv = front[inside], uv[inside]
         pixel, normal, near = seen.nearest(uv, reach_px)
-        near &= np.einsum("ij,ij->i", normal, known.normal[front]) > ALIKE  # the same side is the bright one
+        near &= np.einsum("ij,ij->i", normal, known.normal[front]) > ALIKE  # the same side must be bright
         tangent = np.stack([-normal[:, 1], normal[:, 0]], axis=1)
         pixels = self.camera.undistort_points(pixel[near].astype(np.float32)).astype(np.float64)
         count = int(near.sum())
@@ -187,7 +186,7 @@ class KnownEdges:
     p_w: FloatArray
     """``(E, 3)``"""
     normal: FloatArray
-    """``(E, 2)`` unit gradients as the frame should show them."""
+    """``(E, 2)`` unit gradients predicted in the frame."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,7 +196,7 @@ class EdgeImage:
     distance: FloatArray
     """``(H, W)`` to the nearest edge pixel [px]."""
     label: IntArray
-    """``(H, W)`` which one that is: row of the others."""
+    """``(H, W)`` index of the nearest edge pixel."""
     pixel: IntArray
     """``(L, 2)`` edge pixels."""
     normal: FloatArray
@@ -233,7 +232,7 @@ class EdgeImage:
 
 
 def _nearest(keyframes: list[Keyframe], T_c_w: FloatArray) -> list[Keyframe]:
-    """Of keyframes those that stand nearest and look the same way."""
+    """The keyframes nearest in position and direction."""
     centre = -T_c_w[:3, :3].T @ T_c_w[:3, 3]
     turn = [np.arccos(np.clip(k.T_c_w[2, :3] @ T_c_w[2, :3], -1.0, 1.0)) for k in keyframes]
     apart = [float(np.linalg.norm(k.centre_w - centre)) for k in keyframes]

@@ -1,8 +1,8 @@
-"""Between keyframes: keypoints of the last keyframe followed into the frame by optical flow, and the pose they tell.
+"""Tracking between keyframes: optical flow of the last keyframe's keypoints, and the pose from it.
 
-A frame between keyframes adds nothing to the map but its pose, and for that the corners need not be detected, described
-and matched anew: pyramidal Lucas-Kanade flow (Lucas and Kanade, IJCAI 1981; Bouguet, 2001) finds the known ones in a
-quarter of the time. It goes from the keyframe to the frame, never from frame to frame, so that nothing drifts.
+A frame between keyframes contributes only its pose, for which corners need not be detected, described and matched:
+pyramidal Lucas-Kanade flow (Lucas and Kanade, IJCAI 1981; Bouguet, 2001) tracks the known ones in a quarter of the
+time. It goes from the keyframe to the frame, never from frame to frame, to avoid drift.
 """
 
 from dataclasses import dataclass, replace
@@ -25,30 +25,30 @@ from edgeslam_torch.tracking.tracker import FINE, Track, View
 from edgeslam_torch.types import FloatArray, FrameFeatures, IntArray
 
 MAX_DIFFERENCE = 30.0
-"""Mean grey difference of the two patches above which they are not the same."""
+"""Maximum mean grey difference of corresponding patches."""
 
 MIN_DEPTH = 1e-3
-"""Map units; nearer anchors are not looked for."""
+"""Minimum depth of a tracked anchor [map units]."""
 
 JOIN_PX = 1.5
-"""At pyramid level 0: a keypoint this near to where flow puts an anchor shows that anchor."""
+"""Maximum distance between a keypoint and a tracked anchor that are the same, at pyramid level 0."""
 
 NEAR_LEVELS = 2
-"""Images of the pyramid that suffice where the prediction is good to 14 pixels; they take half the time of four."""
+"""Pyramid levels that suffice for predictions within 14 pixels, at half the time of four."""
 
 NEAR_SHARE = 0.75
-"""Below this share of keypoints found with them, the whole pyramid is tried."""
+"""Below this share of tracked keypoints, all pyramid levels are used."""
 
 _STOP = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 15, 0.03)
-"""Steps and pixels at which the flow of a point is done; after 0.1 px already, it lags towards the prediction."""
+"""Termination: steps and pixels per step; at 0.1 px the result is biased towards the prediction."""
 
 
 @dataclass(frozen=True, slots=True)
 class Template:
-    """An image with anchors in it, to be found again in the frames that follow."""
+    """An image with anchors, tracked into the following frames."""
 
     keyframe_id: int
-    """Keyframe that the frames' poses hang on."""
+    """Reference keyframe of the frames' poses."""
     grey: NDArray[np.uint8]
     """``(H, W)`` with the lens distortion still in it."""
     uv: FloatArray
@@ -56,12 +56,12 @@ class Template:
     octave: IntArray
     """``(N,)``"""
     anchor: IntArray
-    """``(N,)`` or `NO_ANCHOR`; a keyframe's own array, so that what mapping finds in it is followed too."""
+    """``(N,)`` or `NO_ANCHOR`; a keyframe's own array, so that anchors added by mapping are tracked too."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Chosen:
-    """Keypoints of a template to follow, good while neither it nor the map's observations change."""
+    """Selected keypoints of a template, valid while template and observations are unchanged."""
 
     template: Template | None
     revision: int
@@ -70,29 +70,29 @@ class _Chosen:
 
 @dataclass(frozen=True, slots=True)
 class Followed:
-    """What flow says of a frame."""
+    """Result of optical flow in a frame."""
 
     keyframe_id: int
-    """Keyframe that the pose hangs on."""
+    """Reference keyframe of the pose."""
     track: Track
-    """Its keypoints are the template's."""
+    """Pose and matches; keypoint indices are the template's."""
     uv: FloatArray
     """``(M, 2)`` undistorted pixels of the track's inliers in the frame."""
     octave: IntArray
     """``(M,)`` their pyramid levels."""
     share: float
-    """Keypoints that were found again and agree, of those that were looked for."""
+    """Share of inliers among the selected keypoints."""
 
 
 def template_of_keyframe(keyframe: Keyframe, grey: NDArray[np.uint8], camera: Camera) -> Template:
-    """Follow all anchors of a keyframe; ``grey`` is its image as the camera gave it."""
+    """Template of a keyframe's anchors; ``grey`` is its distorted image."""
     return _template(keyframe.id, keyframe.features, keyframe.anchor, grey, camera)
 
 
 def template_of_track(
     track: Track, view: View, reference: Keyframe, grey: NDArray[np.uint8], camera: Camera
 ) -> Template:
-    """Follow the anchors that were matched in a frame that is no keyframe."""
+    """Template of the anchors matched in a frame that is not a keyframe."""
     anchor = np.full(len(view.features.uv), NO_ANCHOR, dtype=np.int64)
     anchor[track.keypoint] = track.anchor
     return _template(reference.id, view.features, anchor, grey, camera)
@@ -105,10 +105,10 @@ def _template(
 
 
 def join(track: Track, followed: Followed, view: View, scale_factor: float) -> Track:
-    """A matched track with the anchors that flow alone found, wherever a keypoint that is still free shows them.
+    """Extend a matched track by anchors that only flow found, on free keypoints.
 
-    A descriptor fails on one corner in two from keyframe to keyframe. Flow's own pixels would do as observations, but
-    they slide by a little each time, always the same way; detected corners do not.
+    Descriptors match every second corner from keyframe to keyframe. Flow's own pixels are not used as observations,
+    because they drift in one direction; detected corners do not.
     """
     free = np.setdiff1d(np.arange(len(view.features.uv)), track.keypoint)
     missing = ~np.isin(followed.track.anchor, track.anchor)
@@ -132,7 +132,7 @@ def join(track: Track, followed: Followed, view: View, scale_factor: float) -> T
 
 
 class FlowTracker:
-    """Follows a template's anchors into a frame and refines its pose; of the last frame it keeps what it looked for."""
+    """Tracks a template's anchors into a frame and refines its pose; caches the selected keypoints."""
 
     def __init__(self, slam_map: SlamMap, camera: Camera, orb: OrbConfig, config: FlowConfig, min_inliers: int) -> None:
         self.map = slam_map
@@ -145,13 +145,13 @@ class FlowTracker:
     def follow(
         self, template: Template, grey: NDArray[np.uint8], T_c_w: FloatArray, expected: PosePrior | None = None
     ) -> Followed | None:
-        """Pose near a predicted one, or None when too little of the template is found again.
+        """Pose near a predicted one, or None if too few keypoints are tracked.
 
         Args:
-            template: What to look for.
+            template: Template to track.
             grey: Frame ``(H, W)`` with the lens distortion still in it.
             T_c_w: Predicted pose ``(4, 4)``.
-            expected: What is known of it beforehand, for when depths are not.
+            expected: Prior of the pose, used while depths are uncertain.
         """
         wanted = self._wanted(template)
         guess = self._expected(T_c_w, template.anchor[wanted])
@@ -180,14 +180,14 @@ class FlowTracker:
         levels: int,
         expected: PosePrior | None,
     ) -> tuple[Track, FloatArray]:
-        """Pose from the flow over so many images of the pyramid, and the inliers' undistorted pixels."""
+        """Pose from flow over the given pyramid levels, and the inliers' undistorted pixels."""
         raw_uv, found = self._flow(template, grey, keypoint, guess, levels)
         keypoint, uv = keypoint[found], self.camera.undistort_points(raw_uv[found])
         track = self._solve(template, keypoint, uv, T_c_w, expected)
         return track, uv[np.isin(keypoint, track.keypoint)]
 
     def _wanted(self, template: Template) -> IntArray:
-        """Keypoints to follow: of too many an even spread, those first that most keyframes have seen."""
+        """Keypoints to track: evenly spread, preferring those with most observations."""
         if self._chosen.template is template and self._chosen.revision == self.map.revision:
             return self._chosen.keypoint
         anchors = self.map.anchors
@@ -230,7 +230,7 @@ class FlowTracker:
     def _solve(
         self, template: Template, keypoint: IntArray, uv: FloatArray, T_c_w: FloatArray, expected: PosePrior | None
     ) -> Track:
-        # What a keyframe's keypoint is off by, its flow is off by too: it weighs no more than a matched one.
+        # Flow inherits the localisation error of the keyframe's keypoint: same weight as a match.
         anchor = template.anchor[keypoint]
         inv_sigma = self.orb.scale_factor ** -template.octave[keypoint].astype(np.float64)
         result = refine_pose(

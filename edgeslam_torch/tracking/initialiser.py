@@ -1,9 +1,8 @@
-"""From a map that a depth guess made to one that two views made.
+"""Two-view initialisation of a map that starts with predicted depths.
 
-The first frame gets a map at once: every keypoint at the depth that the network (or, without one, a constant)
-gives it. Frames are tracked against that until one has enough parallax; then the essential matrix between the two
-gives structure that owes nothing to the guess but its scale. The result is refused unless the frames in between,
-which took no part in it, agree.
+The first frame gets a map at once: every keypoint at the depth predicted by the network (or a constant without one).
+Frames are tracked against it until one has enough parallax; the essential matrix then gives structure that depends on
+the prediction only by its scale. It is rejected unless the frames in between, which are independent of it, agree.
 """
 
 from dataclasses import dataclass, field, replace
@@ -28,7 +27,7 @@ CHI2_2 = 5.991
 
 @dataclass(frozen=True, slots=True)
 class BootstrapView:
-    """What one frame saw of the first keyframe."""
+    """Matches of one frame with the first keyframe."""
 
     frame_index: int
     keypoint_uv: FloatArray
@@ -38,12 +37,12 @@ class BootstrapView:
     reference_keypoint: IntArray
     """``(M,)`` keypoints of the reference keyframe."""
     T_c_w: FloatArray
-    """Pose against the guessed map."""
+    """Pose in the predicted map."""
 
 
 @dataclass(frozen=True, slots=True)
 class TwoView:
-    """Structure from the reference keyframe and the current frame; ``reason`` says why when there is none."""
+    """Structure from the reference keyframe and the current frame; ``reason`` says why there is none."""
 
     ok: bool
     reason: str
@@ -68,13 +67,13 @@ def two_view_map(
 
     Args:
         reference: First keyframe.
-        guess_depth: ``(N,)`` depth guess at its keypoints; sets the scale through the median ratio.
+        guess_depth: ``(N,)`` predicted depth at its keypoints; sets the scale by the median ratio.
         view: Current frame.
         reference_keypoint: ``(M,)`` matched keypoints of the reference.
         keypoint: ``(M,)`` their partners in the current frame.
         camera: Intrinsics.
         config: Thresholds.
-        seed: Of the essential matrix's random samples.
+        seed: Seed of the essential matrix's random samples.
     """
     uv_r, uv_c = reference.features.uv[reference_keypoint], view.features.uv[keypoint]
     motion = relative_pose(uv_r, uv_c, camera, min_parallax_rad=np.deg2rad(config.min_parallax_deg), seed=seed)
@@ -110,7 +109,7 @@ def two_view_map(
 def poses_of_witnesses(
     views: list[BootstrapView], point_of_keypoint: FloatArray, camera: Camera
 ) -> tuple[list[FloatArray], float]:
-    """Poses of the frames in between against the new points, and the median share of matches that agree.
+    """Poses of the frames in between against the new points, and their median share of inliers.
 
     Args:
         views: Frames tracked since the reference keyframe.
@@ -138,16 +137,16 @@ def poses_of_witnesses(
 
 @dataclass(frozen=True, slots=True)
 class Consensus:
-    """Two-view structure refined over all the frames that saw it."""
+    """Two-view structure refined over all frames that observe it."""
 
     two_view: TwoView
     agreeing: float
-    """Share of all observations within 95 %."""
+    """Share of observations within the 95 % quantile."""
     direction_sigma: float
-    """Standard deviation of the newest camera's position relative to the baseline; the ambiguity between turning
-    and shifting shows here."""
+    """Standard deviation of the newest camera's position relative to the baseline; large if rotation and translation
+    are ambiguous."""
     cost: float
-    """Robust cost of the refined structure, to be compared with another one of the same observations."""
+    """Robust cost of the refined structure, comparable for the same observations."""
 
 
 def consensus(
@@ -159,10 +158,10 @@ def consensus(
     camera: Camera,
     most_views: int = 6,
 ) -> Consensus:
-    """Refine the two views together with some of the frames between, which see the same points.
+    """Refine the two views jointly with some of the frames between, which observe the same points.
 
-    Two views a hand's breadth apart can hardly tell a turn from a shift, and RANSAC then picks either; the frames
-    between average the detector's noise and the covariance says whether that was enough.
+    Two views with a short baseline hardly distinguish rotation from translation, and RANSAC picks either; the frames
+    between average the detector's noise, and the covariance shows whether that suffices.
 
     Args:
         reference: First keyframe; its pose is held.
@@ -171,7 +170,7 @@ def consensus(
         views: Frames between, in order.
         poses: Their world-to-camera poses against the two-view points.
         camera: Intrinsics.
-        most_views: Frames between to take in, evenly spread.
+        most_views: Maximum number of frames between, evenly spread.
     """
     chosen: IntArray = (
         np.unique(np.linspace(0, len(views) - 1, min(most_views, len(views))).astype(int))
@@ -183,7 +182,7 @@ def consensus(
     pose = [np.zeros(len(two_view.p_w), dtype=np.int64)]
     anchor = [np.arange(len(two_view.p_w))]
     uv = [reference.features.uv[two_view.reference_keypoint]]
-    inv_sigma = [view.inv_sigma[two_view.keypoint]]  # a match joins the same pyramid level, one at most apart
+    inv_sigma = [view.inv_sigma[two_view.keypoint]]  # matches differ by at most one pyramid level
     for i, k in enumerate(chosen):
         seen = row[views[k].reference_keypoint] >= 0
         pose.append(np.full(int(seen.sum()), i + 1, dtype=np.int64))
@@ -213,7 +212,7 @@ def consensus(
     agreeing = (result.chi2 <= CHI2_2) & result.in_front
     covariance = result.pose_covariance[:3, :3]
     sigma = float(np.sqrt(np.trace(covariance))) / baseline if np.isfinite(covariance).all() else np.inf
-    # A point must agree in the two views that will be keyframes.
+    # A point must be an inlier in the two views that become keyframes.
     count = len(two_view.p_w)
     kept = agreeing[:count] & agreeing[-count:]
     refined = replace(

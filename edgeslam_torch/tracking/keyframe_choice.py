@@ -1,4 +1,4 @@
-"""When a tracked frame should become a keyframe: by view change and parallax, not by time."""
+"""Keyframe selection by change of view and parallax."""
 
 import numpy as np
 
@@ -9,22 +9,22 @@ from edgeslam_torch.tracking.flow import Followed
 from edgeslam_torch.tracking.tracker import Track
 
 SHORTEST_GAP_S = 0.04
-"""Time between keyframes however much the view changes: every second frame at 30 Hz, every frame at 20."""
+"""Minimum time between keyframes whatever the change of view: every second frame at 30 Hz, every frame at 20."""
 
 
 def lost_sight(followed: Followed, config: MappingConfig) -> bool:
-    """Whether flow finds too little of the last keyframe."""
+    """Whether flow tracks too few keypoints of the last keyframe."""
     return followed.share < config.keyframe_followed
 
 
 def lost_most(followed: Followed, config: MappingConfig) -> bool:
-    """Whether so much of the last keyframe is out of sight that the next one cannot wait: a fast turn."""
+    """Whether so few keypoints of the last keyframe are tracked that the next one cannot wait: a fast rotation."""
     return followed.share < config.keyframe_at_once
 
 
 def few_matches(track: Track, reference: Keyframe, slam_map: SlamMap, config: MappingConfig) -> bool:
-    """Whether matching finds too few of the reference keyframe's anchors."""
-    # Anchors that two keyframes alone have seen come and go; overlap is judged by the others.
+    """Whether too few of the reference keyframe's anchors are matched."""
+    # Anchors of only two keyframes are unstable; overlap is measured on the others.
     held = reference.anchor[reference.anchor >= 0]
     established = int((slam_map.anchors.observations[held] >= min(3, len(slam_map.keyframes))).sum())
     return track.inliers < config.keyframe_overlap * established
@@ -36,11 +36,11 @@ def is_due(
     """Whether a frame should become a keyframe.
 
     Args:
-        changed: What it sees differs from the reference keyframe: `lost_sight` or `few_matches`.
+        changed: The view differs from the reference keyframe: `lost_sight` or `few_matches`.
         parallax_rad: Median ray angle to the reference keyframe.
         since_keyframe_s: Time since the last one.
         config: Thresholds.
-        at_once: No time to wait for ``keyframe_min_gap_s``: `lost_most`.
+        at_once: Do not wait for ``keyframe_min_gap_s``: `lost_most`.
     """
     if since_keyframe_s < (SHORTEST_GAP_S if at_once else config.keyframe_min_gap_s):
         return False

@@ -1,4 +1,4 @@
-"""Two-view motion from the essential matrix, paper eqs. (2)-(5), with the degenerate cases named."""
+"""Two-view motion from the essential matrix, paper eqs. (2)-(5), with degenerate cases classified."""
 
 import cv2
 import numpy as np
@@ -9,7 +9,7 @@ from edgeslam_torch.types import FloatArray, MotionKind, RelativePose
 
 MIN_MATCHES = 15
 NO_MOTION_PX = 1.0
-"""Median displacement below which two views are the same to within the detector's noise."""
+"""Median displacement below which two views differ only by the detector's noise."""
 
 
 def relative_pose(
@@ -22,16 +22,16 @@ def relative_pose(
 ) -> RelativePose:
     """Robust relative pose of matched undistorted pixels ``(M, 2)`` in two views.
 
-    The essential matrix comes from MAGSAC++ (Barath et al., CVPR 2020). A homography fitted to the same matches
-    tells a rotation from a plane: a rotation explains all matches with ``K R K^-1``.
+    The essential matrix comes from MAGSAC++ (Barath et al., CVPR 2020). A rotation alone explains all matches by ``K
+    R K^-1``, a plane by a homography.
 
     Args:
         uv_i: Undistorted pixels in view i.
         uv_j: The same points in view j.
         camera: Intrinsics.
         threshold_px: Inlier distance to the epipolar line.
-        min_parallax_rad: Median ray angle below which the translation direction means nothing.
-        seed: Of the random samples.
+        min_parallax_rad: Median parallax below which the translation direction is undetermined.
+        seed: Seed of the random samples.
     """
     nothing = np.zeros(len(uv_i), dtype=bool)
     if len(uv_i) < MIN_MATCHES:
@@ -60,7 +60,7 @@ def relative_pose(
 
 
 def _magsac(threshold_px: float, seed: int) -> cv2.UsacParams:
-    """What `cv2.USAC_MAGSAC` stands for, with a seed of its own: that flag ignores `cv2.setRNGSeed`."""
+    """Parameters of `cv2.USAC_MAGSAC` with a seed, because that flag ignores `cv2.setRNGSeed`."""
     parameters = cv2.UsacParams()
     parameters.randomGeneratorState = seed
     parameters.score = cv2.SCORE_METHOD_MAGSAC
@@ -82,7 +82,7 @@ def _kind(
 ) -> MotionKind:
     if angle < min_parallax_rad:
         return MotionKind.PURE_ROTATION
-    # The best rotation alone (Kabsch on unit rays): if it explains the matches there is no usable translation.
+    # The best rotation (Kabsch on unit rays): if it explains the matches, the translation is undetermined.
     unit_i = ray_i / np.linalg.norm(ray_i, axis=1, keepdims=True)
     unit_j = ray_j / np.linalg.norm(ray_j, axis=1, keepdims=True)
     u, _, vt = np.linalg.svd(unit_j.T @ unit_i)

@@ -5,8 +5,8 @@ For an unknown camera it takes the place of a guess; a calibration is checked wi
 The paper takes K as known when it needs it to turn F into E. With the principal point at the image's centre, square
 pixels and one focal length for all images, F of one pair determines the focal length: the two non-zero singular
 values of ``K^T F K`` are equal (Mendonca and Cipolla, CVPR 1999; Sturm, CVPR 2001, gives the same zero in closed
-form). One pair is off by 5 to 50 %, a median over tens of pairs by a few percent, thus planes, rotations, forward
-motion and pairs whose halves disagree are refused first.
+form). One pair is off by 5 to 50 %, the median of tens of pairs by a few per cent; planes, rotations, forward motion
+and pairs whose halves disagree are rejected first.
 """
 
 import math
@@ -27,20 +27,21 @@ from edgeslam_torch.types import FloatArray, IntArray
 
 MAX_FRAMES = 40
 MIN_PAIRS = 5
-"""Usable pairs below which nothing is said."""
+"""Minimum number of usable pairs."""
 MAX_RELATIVE_SIGMA = 0.15
-"""Above this the estimate is no better than the guess that it would replace."""
+"""Maximum relative sigma of an estimate; above, it is no better than the guess."""
 
 _CHECKED_PAIRS = 120
-"""Pairs of keyframes looked at to check a calibration: half a second of CPU, once a run."""
+"""Number of keyframe pairs for checking a calibration: half a second of CPU, once per run."""
 _CHECKED_GAPS = (1, 2, 3)
 _LEAST_CHECKED = 10
-"""Usable pairs below which a calibration is not doubted: to seven pairs of tum_fr1_xyz the right one looks 25 % off."""
+"""Minimum number of pairs to contradict a calibration: seven pairs of tum_fr1_xyz suggest an error of 25 % for the
+right one."""
 _CONTRADICTION_SIGMAS = 2.5
 _CONTRADICTION = 0.15
-"""Relative difference. Over eight recordings right focal lengths came out at most 7 % (1.9 sigma) off. Of those made
-0.7 and 1.3 times as long 10 in 15 are found; the others are those of tum_fr1_xyz, where the camera hardly turns, one of
-icsl_corridor (planes), and euroc_mh05_a's, where a strong distortion, undone for the wrong length, hides them."""
+"""Minimum relative difference of a contradiction. On eight recordings, right focal lengths are estimated within 7 %
+(1.9 sigma). Of lengths scaled by 0.7 and 1.3, 10 in 15 are detected; not on tum_fr1_xyz (hardly any rotation), one
+start of icsl_corridor (planes), and euroc_mh05_a, whose strong distortion compensates a wrong length."""
 
 _GAPS = (1, 2, 3, 5, 8)
 """Frames between the two images of a pair."""
@@ -48,20 +49,21 @@ _MIN_MATCHES = 50
 _MIN_MOTION = 0.02
 """Median displacement relative to the longer image side."""
 _MAX_EXPLAINED = 0.8
-"""Share of the inliers that a homography may explain; a plane or a rotation explains all of them."""
+"""Maximum share of inliers explained by a homography; planes and rotations reach 1."""
 _FORWARD = 0.1
-"""Distance of both epipoles to the centre, relative to the longer side, below which the axes coincide."""
+"""Distance of both epipoles from the centre, relative to the longer side, below which the motion is along the
+axis."""
 _HALVES = 6
 _MAX_SPREAD = 0.15
 """Standard deviation of the log focal lengths of random halves of a pair's inliers."""
 _SHARED = 4.0
-"""Pairs that share frames are not independent: so many count as one."""
+"""Correlated pairs that count as one, since pairs share frames."""
 _GRID = np.exp(np.linspace(np.log(0.3), np.log(3.0), 120))
-"""Focal lengths tried, relative to the longer side: from a 120 degree lens to a tele."""
+"""Focal lengths tried, relative to the longer side: from 120 degrees to a telephoto lens."""
 
 
 class Refused(StrEnum):
-    """Why a pair of images says nothing about the focal length."""
+    """Reasons why a pair of images does not determine the focal length."""
 
     FEW_MATCHES = "too few matches"
     LOW_PARALLAX = "hardly any motion"
@@ -75,19 +77,19 @@ class FocalEstimate:
     """Focal length found in pairs of images."""
 
     focal_px: float | None
-    """None when there is nothing usable."""
+    """None without usable pairs."""
     sigma_px: float
-    """Standard deviation; infinite when there is nothing usable."""
+    """Standard deviation; infinite without usable pairs."""
     pairs_used: int
     reason: str
-    """Why there is no estimate; empty when there is one."""
+    """Reason for a missing estimate; empty otherwise."""
 
 
 def focal_from_matches(pairs: Sequence[tuple[FloatArray, FloatArray]], width: int, height: int) -> FocalEstimate:
     """Median focal length over pairs of images.
 
     Args:
-        pairs: Matched pixels ``(M, 2)`` in both images of each pair, wrong matches among them.
+        pairs: Matched pixels ``(M, 2)`` in both images of each pair, including outliers.
         width: Of the images [px].
         height: Of the images [px].
     """
@@ -105,7 +107,7 @@ def focal_from_matches(pairs: Sequence[tuple[FloatArray, FloatArray]], width: in
     logs = np.log(found)
     centre = float(np.median(logs))
     spread = 1.4826 * float(np.median(np.abs(logs - centre)))
-    # The median of n normal numbers scatters by 1.2533 sigma / sqrt(n); 2 % for what all pairs share (lens, centre).
+    # The median of n normal samples has a sigma of 1.2533 sigma / sqrt(n); 2 % for common errors (lens, centre).
     relative = float(np.hypot(1.2533 * spread / np.sqrt(len(found) / _SHARED), 0.02))
     if relative > MAX_RELATIVE_SIGMA:
         return FocalEstimate(None, np.inf, len(found), f"{len(found)} image pairs disagree by {100 * spread:.0f} %")
@@ -117,14 +119,14 @@ def guess_camera(frames: Sequence[np.ndarray], width: int, height: int) -> Camer
     """Camera for images of an unknown lens.
 
     Args:
-        frames: Some images ``(H, W, 3)`` BGR or ``(H, W)`` grey from the start of a recording, in order, far enough
-            apart to show motion and near enough to overlap; `MAX_FRAMES` of them are looked at.
+        frames: Some images ``(H, W, 3)`` BGR or ``(H, W)`` grey from the start of a recording, in order, with motion
+            and overlap; `MAX_FRAMES` of them are used.
         width: Of the images [px].
         height: Of the images [px].
 
     Returns:
-        Principal point in the middle, no distortion; ``source`` says where the focal length is from, ``focal_sigma``
-        how well it is known.
+        Principal point in the middle, no distortion; ``source`` has the origin of the focal length, ``focal_sigma``
+        its uncertainty.
     """
     estimate = focal_from_matches(_matched_pairs(_spread(frames), width, height), width, height)
     if estimate.focal_px is None:
@@ -141,18 +143,17 @@ def guess_camera(frames: Sequence[np.ndarray], width: int, height: int) -> Camer
 
 
 def calibration_warning(camera: Camera, keyframes: Sequence[Keyframe]) -> str | None:
-    """What the images of a run say against its calibration.
+    """Check a calibration against the images of its run.
 
-    The matches are those of the map's anchors, at hand without another search. Most came by optical flow, which knows
-    no calibration.
+    The matches are the map's anchors. Most come from optical flow, which is independent of the calibration.
 
     Args:
         camera: As the run used it.
         keyframes: In order, keypoints undistorted with that camera.
 
     Returns:
-        A sentence when the focal length that the fundamental matrices of neighbours tell is surely another one; None
-        when it agrees or the motion does not tell.
+        A warning if fundamental matrices of neighbours contradict the focal length; None if they agree or the motion
+        is insufficient.
     """
     pairs = [(i, i + gap) for i in range(len(keyframes)) for gap in _CHECKED_GAPS if i + gap < len(keyframes)]
     chosen = np.unique(np.linspace(0, len(pairs) - 1, min(len(pairs), _CHECKED_PAIRS)).round().astype(int))
@@ -172,7 +173,7 @@ def calibration_warning(camera: Camera, keyframes: Sequence[Keyframe]) -> str | 
 
 
 def contradicts(estimate: FocalEstimate, camera: Camera) -> bool:
-    """Whether an estimate is surely another focal length than the camera's, as far as that one is known."""
+    """Whether an estimate contradicts the camera's focal length within its own uncertainty."""
     if estimate.focal_px is None or estimate.pairs_used < _LEAST_CHECKED:
         return False
     difference = abs(math.log(estimate.focal_px / camera.fx))
@@ -181,13 +182,13 @@ def contradicts(estimate: FocalEstimate, camera: Camera) -> bool:
 
 
 def _centred(uv: FloatArray, camera: Camera) -> FloatArray:
-    """Pixels as a camera sees them whose pixels are square and whose principal point is the image's centre."""
+    """Pixels of a camera with square pixels and centred principal point."""
     centre = [(camera.width - 1) / 2.0, (camera.height - 1) / 2.0]
     return (np.asarray(uv, np.float64) - [camera.cx, camera.cy]) * [1.0, camera.fx / camera.fy] + centre
 
 
 def _same_anchors(a: Keyframe, b: Keyframe) -> tuple[IntArray, IntArray]:
-    """Keypoints of both that see the same anchors."""
+    """Keypoints of both that observe the same anchors."""
     held_a, held_b = a.keypoints_with_anchor(), b.keypoints_with_anchor()
     _, at_a, at_b = np.intersect1d(a.anchor[held_a], b.anchor[held_b], return_indices=True)
     return held_a[at_a], held_b[at_b]
@@ -212,7 +213,7 @@ def _matched_pairs(frames: list[np.ndarray], width: int, height: int) -> list[tu
 
 
 def _focal_of_pair(uv_i: FloatArray, uv_j: FloatArray, width: int, height: int) -> float | Refused:
-    """Focal length [px] of one pair, or why it gives none."""
+    """Focal length [px] of one pair, or the reason why there is none."""
     if len(uv_i) < _MIN_MATCHES:
         return Refused.FEW_MATCHES
     centre, side = np.array([(width - 1) / 2.0, (height - 1) / 2.0]), float(max(width, height))
@@ -221,7 +222,7 @@ def _focal_of_pair(uv_i: FloatArray, uv_j: FloatArray, width: int, height: int) 
         return Refused.LOW_PARALLAX
     try:
         F, mask = cv2.findFundamentalMat(a, b, cv2.USAC_MAGSAC, 1.0, 0.999, 5000)
-    except cv2.error:  # OpenCV 5.0 trips over its own empty model when no sample fits anything
+    except cv2.error:  # OpenCV 5.0 fails on an empty model when no sample fits
         return Refused.FEW_MATCHES
     if F is None or F.shape != (3, 3) or mask.sum() < _MIN_MATCHES:
         return Refused.FEW_MATCHES
@@ -231,7 +232,7 @@ def _focal_of_pair(uv_i: FloatArray, uv_j: FloatArray, width: int, height: int) 
         return Refused.HOMOGRAPHY
     if max(_epipole_distance(F), _epipole_distance(F.T)) < _FORWARD * side:
         return Refused.FORWARD
-    rng = np.random.default_rng(len(inliers))  # of this pair alone: the order of pairs changes nothing
+    rng = np.random.default_rng(len(inliers))  # seeded per pair: independent of the order of pairs
     halves = []
     for _ in range(_HALVES):
         half = rng.permutation(inliers)[: len(inliers) // 2]

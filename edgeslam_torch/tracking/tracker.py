@@ -19,17 +19,17 @@ from edgeslam_torch.optim.problem import PosePrior
 from edgeslam_torch.types import FloatArray, FrameFeatures, IntArray
 
 ROUGH = PoseConfig(rounds=1, robust_rounds=1, iterations=5, cost_tolerance=1e-2)
-"""The first pass only has to bring the local map's anchors into their search radius."""
+"""The first pass only brings the local map's anchors into their search radius."""
 
 ENOUGH_FOR_ROUGH = 250
-"""Anchors of the last frame that the first pass looks for; more of them cost time and change nothing."""
+"""Maximum number of the last frame's anchors in the first pass; more only cost time."""
 
 FINE = PoseConfig(rounds=3, robust_rounds=1, cost_tolerance=1e-2)
 
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """Features of one frame with what matching needs."""
+    """Features of one frame, indexed for matching."""
 
     features: FrameFeatures
     words: NDArray[np.uint64]
@@ -40,7 +40,7 @@ class View:
 
 @dataclass(frozen=True, slots=True)
 class Track:
-    """A pose with the matches that carry it."""
+    """A pose with its matches."""
 
     T_c_w: FloatArray
     keypoint: IntArray
@@ -49,18 +49,18 @@ class Track:
     """``(M,)`` their anchors."""
     matched_keypoint: IntArray
     matched_anchor: IntArray
-    """All matches, before outliers were thrown out."""
+    """All matches, including outliers."""
     covariance: FloatArray
     """``(6, 6)`` of the left tangent of ``T_c_w``."""
 
     @property
     def matches(self) -> int:
-        """Number of matches before outliers were thrown out."""
+        """Number of matches, including outliers."""
         return len(self.matched_anchor)
 
     @property
     def inliers(self) -> int:
-        """Number of matches that agree with the pose."""
+        """Number of inliers."""
         return len(self.anchor)
 
 
@@ -75,7 +75,7 @@ def make_view(features: FrameFeatures, scale_factor: float) -> View:
 
 
 class Tracker:
-    """Finds anchors in a frame and refines its pose; keeps nothing between frames."""
+    """Matches anchors in a frame and refines its pose; stateless."""
 
     def __init__(self, slam_map: SlamMap, camera: Camera, orb: OrbConfig, config: TrackingConfig) -> None:
         self.map = slam_map
@@ -84,7 +84,8 @@ class Tracker:
         self.config = config
 
     def track(self, view: View, T_c_w: FloatArray, recent: IntArray, expected: PosePrior | None = None) -> Track | None:
-        """Pose near a predicted one: anchors of the last frame first, then the local map; None if too few agree."""
+        """Pose near a predicted one: anchors of the last frame first, then the local map; None with too few
+        inliers."""
         some = recent[:: 1 + len(recent) // ENOUGH_FOR_ROUGH]
         first = self.refine(view, T_c_w, some, self.config.motion_radius_px, ROUGH, expected)
         if first is None or first.inliers < self.config.min_inliers:
@@ -96,11 +97,11 @@ class Tracker:
     def track_near(
         self, view: View, T_c_w: FloatArray, recent: IntArray, expected: PosePrior | None = None
     ) -> Track | None:
-        """The same from a pose that is right to a pixel or two, which needs no first pass."""
+        """The same from a pose accurate to a pixel or two, without the first pass."""
         return self._complete(view, T_c_w, recent, recent[:0], recent[:0], expected)
 
     def local_keyframes(self, anchor_ids: IntArray) -> list[Keyframe]:
-        """Keyframes that see the given anchors, and of those the ones that see most."""
+        """Keyframes that observe most of the given anchors."""
         counts = self.map.shared_counts(anchor_ids)
         ranked = sorted(counts, key=lambda id: (-counts[id], -id))
         return [self.map.keyframes[id] for id in ranked[: self.config.local_keyframes]]
@@ -128,7 +129,7 @@ class Tracker:
         anchor: IntArray,
         expected: PosePrior | None,
     ) -> Track | None:
-        """Track of what the frame sees of the local map around ``recent``; known matches are not searched again."""
+        """Track against the local map around ``recent``; known matches are kept."""
         anchors = self.map.anchors
         seen = self.expected(T_c_w, self.map.anchors_seen_by(self.local_keyframes(recent)))
         new = seen.select(~np.isin(seen.anchor, anchor))
@@ -145,7 +146,7 @@ class Tracker:
         return track if track.inliers >= self.config.min_inliers else None
 
     def expected(self, T_c_w: FloatArray, anchor_ids: IntArray) -> Projection:
-        """Those of the given anchors that a camera should see."""
+        """The given anchors that are predicted in view."""
         anchors = self.map.anchors
         ids = anchor_ids[anchors.alive[anchor_ids]]
         return project_anchors(anchors, ids, T_c_w, self.camera, self.orb.scale_factor, self.orb.levels)
@@ -171,7 +172,7 @@ class Tracker:
         effort: PoseConfig = FINE,
         expected: PosePrior | None = None,
     ) -> Track | None:
-        """Robust pose from given matches; None when there are too few to constrain it."""
+        """Robust pose from given matches; None with too few of them."""
         if len(keypoint) < 6:
             return None
         result = refine_pose(
@@ -201,5 +202,5 @@ def median_parallax(p_w: FloatArray, T_c_w: FloatArray, centre_w: FloatArray) ->
     a = p_w + T_c_w[:3, :3].T @ T_c_w[:3, 3]
     b = p_w - centre_w
     dot, aa, bb = (np.einsum("ij,ij->i", x, y) for x, y in ((a, b), (a, a), (b, b)))
-    cosine = float(np.median(dot / np.maximum(np.sqrt(aa * bb), 1e-12)))  # the angle falls as it grows
+    cosine = float(np.median(dot / np.maximum(np.sqrt(aa * bb), 1e-12)))  # the angle decreases with it
     return math.acos(min(max(cosine, -1.0), 1.0))

@@ -1,4 +1,4 @@
-"""Shows a run in rerun while it goes: `--viewer` and `--save-rrd`."""
+"""Shows a running system in rerun: `--viewer` and `--save-rrd`."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from edgeslam_torch.run import Slam
 
 MAP_EVERY_KEYFRAMES = 3
-"""The whole map is sent again this often; every keyframe would cost more than the mapping itself."""
+"""Interval for sending the whole map; every keyframe would cost more than mapping."""
 
 _SHOWN_EDGES = 20_000
 
@@ -34,13 +34,13 @@ class LiveView:
         self._keyframes = 0
 
     def on_frame(self, frame: Frame, output: SlamOutput, slam: "Slam") -> None:
-        """Show pose and picture; with a keyframe its features, edges and depth too, and now and then the map."""
+        """Show pose and picture; for keyframes also features, edges and depth, and periodically the map."""
         image = self._camera.undistort_image(frame.image)
         if not output.keyframe:
             self._viewer.step(output, image)
             return
         keyframe = slam.keyframes()[-1]
-        depth = keyframe.depth  # read once: the mapping thread drops it when the edges are measured
+        depth = keyframe.depth  # read once: the mapping thread releases it after measuring edges
         edges = extract_edges(image, self._edges.canny_low, self._edges.canny_high, _SHOWN_EDGES)
         self._viewer.step(output, image, keyframe.features.uv, edges.uv, None if depth is None else depth.depth_m)
         self._keyframes += 1

@@ -1,6 +1,6 @@
 """Live view in rerun (https://rerun.io, the ``[viewer]`` extra): image, edges, depth, map, trajectory, scale.
 
-Nothing else imports this module, and it imports rerun only when a viewer is made.
+rerun is imported only when a viewer is created.
 """
 
 import importlib
@@ -23,7 +23,7 @@ _STATUS_COLOURS = {
 }
 
 _SEGMENT = 100
-"""Poses in one piece of the trajectory: only the last piece is sent again with a new pose."""
+"""Poses per trajectory segment: only the last segment is sent again with a new pose."""
 
 
 class Viewer:
@@ -73,7 +73,7 @@ class Viewer:
         edges_uv: FloatArray | None = None,
         depth_m: FloatArray | None = None,
     ) -> None:
-        """Show one frame: pose, status, and whatever of the pictures is at hand.
+        """Show one frame: pose, status, and the available pictures.
 
         Args:
             output: What `EdgeSlam.step` returned.
@@ -104,7 +104,7 @@ class Viewer:
             self._log("scale/sigma", rr.Scalars(output.scale.sigma))
 
     def map(self, cloud: PointCloud, entity: str = "edges") -> None:
-        """Show the map as it is now."""
+        """Show the current map."""
         self._log(f"world/{entity}", self._rr.Points3D(cloud.p_w, colors=cloud.colour))
 
     def show_run(
@@ -122,7 +122,7 @@ class Viewer:
             self._pose(T)
 
     def close(self) -> None:
-        """Write out what is still buffered and end the recording."""
+        """Flush and end the recording."""
         self._stream.flush()
         self._stream.disconnect()
 
@@ -130,7 +130,7 @@ class Viewer:
         self._stream.log(entity, what, static=static)
 
     def _time(self, stamp_s: float) -> None:
-        """Set the viewer's clock: seconds since the first frame (a clock that counts from 1970 is unreadable)."""
+        """Set the viewer's clock: seconds since the first frame (Unix time is unreadable)."""
         if self._begin_s is None:
             self._begin_s = stamp_s
         self._stream.set_time("time", duration=stamp_s - self._begin_s)
@@ -141,7 +141,7 @@ class Viewer:
     def _extend(self, position: FloatArray, status: str) -> None:
         """Add a position to the trajectory, in the colour of its status."""
         if status != self._piece_status or len(self._piece) > _SEGMENT:
-            self._piece = self._piece[-1:]  # joined to what came before
+            self._piece = self._piece[-1:]  # joined to the previous segment
             self._piece_status = status
             self._pieces += 1
         self._piece.append(np.array(position))
@@ -150,7 +150,7 @@ class Viewer:
 
 
 def _layout(rrb: Any, live: bool) -> Any:
-    """What the window shows where."""
+    """Layout of the window."""
     scene = rrb.Spatial3DView(origin="world", name="map and trajectory")
     if not live:
         return rrb.Blueprint(scene, collapse_panels=True)
@@ -167,7 +167,7 @@ def _layout(rrb: Any, live: bool) -> Any:
 
 
 def _check_writable(path: Path) -> None:
-    """rerun itself reports an unwritable file on a thread, long after."""
+    """rerun itself reports an unwritable file late, on a thread."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.open("wb").close()

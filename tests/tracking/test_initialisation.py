@@ -190,7 +190,7 @@ def test_without_a_network_two_views_must_be_surer(points, network):
         points.keyframes[0].depth = DepthMap(flat, 0.2 * flat)
     _, accepted = attempted(points, max_direction_sigma_alone=1e-9)
     assert accepted.ok == network
-    assert network or accepted.reason == "a turn cannot yet be told from a shift"
+    assert network or accepted.reason == "rotation and translation are not yet distinguishable"
 
 
 def test_frames_that_waited_become_keyframes_in_order(points):
@@ -312,7 +312,7 @@ def test_structure_from_the_networks_depth_keeps_its_scale(points):
 def test_a_turn_that_may_be_a_shift_is_refused(points):
     bootstrap, found = offered(points, max_direction_sigma_alone=1e-9)
     refused = bootstrap.confirm(view_of(points, 4), found)
-    assert (refused.ok, refused.reason) == (False, "a turn cannot yet be told from a shift")
+    assert (refused.ok, refused.reason) == (False, "rotation and translation are not yet distinguishable")
 
 
 @pytest.mark.parametrize("seed", [1, 3])
