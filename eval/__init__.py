@@ -1,7 +1,7 @@
 """Evaluation of trajectories, depth and maps.
 
-`metrics.run_score.evaluate_run` judges one run, `report.page.write_report` makes its page,
-`benchmark.benchmark.run_benchmark` times the real job, and `judge` runs everything there is.
+`metrics.run_score.evaluate_run` scores one run, `report.page.write_report` writes its page,
+`benchmark.benchmark.run_benchmark` measures accuracy and speed, and `judge` runs all recordings and simulations.
 """
 
 if __name__ == "eval":

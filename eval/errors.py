@@ -1,4 +1,4 @@
-"""What makes an evaluation impossible, said in words that name the likely mistake."""
+"""Errors of evaluation, naming the likely mistake."""
 
 from edgeslam_torch.errors import EdgeSlamError
 

@@ -1,8 +1,7 @@
-"""Makes the uncertainty honest: scale and floor of sigma such that 68 % and 95 % mean what they say.
+"""Calibration of the predicted uncertainty: scale and floor of sigma such that intervals have 68 % and 95 % coverage.
 
-Sigma describes shape, each image's median error taken out: the SLAM fits one scale per image to its
-anchors, and counts
-the uncertainty of that scale elsewhere. Adding it here would make every pixel look far worse than it is.
+Sigma describes shape, with each image's median error removed: SLAM fits one scale per image to its anchors and models
+that scale's uncertainty separately.
 """
 
 import dataclasses
@@ -40,7 +39,7 @@ def residuals_and_sigma(
 
 
 def coverage(residuals: FloatArray, sigma: FloatArray) -> tuple[float, float]:
-    """Part of the residuals within 1 and within 1.96 sigma; 0.683 and 0.95 for a calibrated normal sigma."""
+    """Share of the residuals within 1 and 1.96 sigma; 0.683 and 0.95 if calibrated."""
     z = np.abs(residuals) / sigma
     return float((z < 1.0).mean()), float((z < 1.96).mean())
 

@@ -4,8 +4,8 @@
 2. Fewer rendered rooms and gentler augmentation, the rate falling to nothing.
 3. Calibration of the uncertainty on views of rooms held out from both.
 
-Nothing here looks at the sequences the weights are judged by, except to draw the curve (``--watch``); the last weights
-are taken, not the best on the curve.
+The evaluation sequences are not used, except to plot the curve (``--watch``); the last weights are kept, not the best
+on the curve.
 """
 
 import argparse
@@ -34,16 +34,16 @@ logger = logging.getLogger(__name__)
 
 IMAGENET = "mobilenet_v1_imagenet/mobilenet_v1_1.0_224_quant_embedding_extractor.tflite"
 INPUT_SIZE = (160, 224)
-"""Height and width [px]; against 192x256 a third less time, and as accurate (model card)."""
+"""Height and width [px]; a third faster than 192x256 and as accurate (model card)."""
 REAL = ("tum_fr1_rpy_depth", "icl_livingroom1")
 RENDERED = "rendered"
 BROAD = {"tum_fr1_rpy_depth": 0.5, "icl_livingroom1": 0.15, RENDERED: 0.35}
 """Shares of the batch in phase 1."""
 SETTLE = {"tum_fr1_rpy_depth": 0.65, "icl_livingroom1": 0.15, RENDERED: 0.2}
-"""Shares of the batch in phase 2: nearer to what cameras see."""
+"""Shares of the batch in phase 2, closer to real cameras."""
 RENDERED_METRIC = 0.1
-"""Rendered rooms teach shape: their sizes are our invention, and with 1 the metric error on redkitchen
-had doubled after 250 steps."""
+"""Rendered rooms supervise shape only: their sizes are invented, and with 1 the metric error on redkitchen doubled
+within 250 steps."""
 HELD_OUT_VIEWS = 150
 """Last rendered views, whole rooms, kept out of training for the calibration."""
 LICENCE = (
@@ -55,7 +55,7 @@ LICENCE = (
 
 @dataclass(frozen=True, slots=True)
 class Recipe:
-    """The numbers that made the shipped file."""
+    """Settings of the shipped weights."""
 
     rooms: int = 350
     views_per_room: int = 6

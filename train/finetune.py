@@ -35,15 +35,16 @@ from edgeslam_torch.train.watchers import ProgressBar, TensorBoard
 logger = logging.getLogger(__name__)
 
 HELD_OUT = 10
-"""Every tenth view with depth validates when nothing else was given."""
+"""Every tenth view with depth is used for validation by default."""
 OWN_DATA = "; fine-tuned on the user's data"
 
 
 class FromRuns(StrEnum):
-    """What is learnt from images without labels."""
+    """Supervision for images without labels."""
 
     TEACHER = "teacher"
-    """Dense depth measured with the run's poses: the best, and four times as fast as pairs (docs/model_card.md)."""
+    """Dense depth measured with the run's poses: most accurate, and four times as fast as pairs
+    (docs/model_card.md)."""
     PAIRS = "pairs"
     """Losses on pairs of images: photometric, map points, cycle, L-shape."""
     BOTH = "both"
@@ -51,7 +52,7 @@ class FromRuns(StrEnum):
 
 @dataclass
 class Data:
-    """What to learn from."""
+    """Training data."""
 
     labelled: list[DepthFolder] = field(default_factory=list)
     posed: list[PosedSequence] = field(default_factory=list)
@@ -65,7 +66,7 @@ class Data:
         return lines
 
     def usable(self) -> "Data":
-        """Without runs that no pair of images with a useful baseline comes from.
+        """The data without runs that have no pair of images with a useful baseline.
 
         Raises:
             SourceError: If nothing is left.
@@ -77,7 +78,7 @@ class Data:
             )
         for s in self.posed:
             if not s.usable:
-                logger.warning("%s: no two images of the same place from apart; nothing is learnt from it", s.name)
+                logger.warning("%s: no two images of the same place from apart; it is not used", s.name)
         return Data(self.labelled, posed, self.validation)
 
 
@@ -90,10 +91,10 @@ def finetune(
     from_runs: FromRuns = FromRuns.TEACHER,
     reading: Mapping[str, Any] = MappingProxyType({}),
 ) -> Outcome:
-    """Train ``network`` on ``data``; goes on with a training in ``out`` that was given the same.
+    """Train ``network`` on ``data``; resumes a training in ``out`` with the same inputs.
 
-    ``out/weights.safetensors`` holds the best validated weights, those that training began with included; without
-    anything to validate on, the last ones.
+    ``out/weights.safetensors`` holds the best validated weights, including the initial ones; without validation data,
+    the last ones.
 
     Args:
         network: To begin with; changed in place.
@@ -102,7 +103,7 @@ def finetune(
         config: Of the recipe.
         out: From `out_folder`.
         from_runs: What is learnt from images without labels.
-        reading: How the data was read, plain values by name: a training is gone on with only where they are the same.
+        reading: How the data was read, plain values by name; a training is resumed only if they are the same.
 
     Raises:
         SourceError: If there is nothing to learn from, or to validate on.
@@ -152,7 +153,7 @@ def settings_of(config: TrainConfig, from_runs: FromRuns, reading: Mapping[str, 
 def _prepared(
     start: FastDepth, metadata: Metadata, data: Data, from_runs: FromRuns, teacher: Path
 ) -> tuple[list[Signal], list[View]]:
-    """What each step learns from, and the views to validate on.
+    """Training signals, and the views to validate on.
 
     Runs in arbitrary units are scaled to the network's own depth.
     """
@@ -175,7 +176,7 @@ def _prepared(
             signals.append(SelfSupervised(data.posed, metadata, scales))
     if data.validation:
         return signals, [v for f in data.validation for v in f.views]
-    return signals, [v for v in held_out if can_be_scored(v)]  # none: of a flight high above the ground
+    return signals, [v for v in held_out if can_be_scored(v)]  # none, for a flight high above the ground
 
 
 def _split(folders: Sequence[DepthFolder], keep_all: bool) -> tuple[list[Source], list[View]]:
@@ -216,7 +217,7 @@ def _conclude(
     held_out: Sequence[View],
     out: OutFolder,
 ) -> Outcome:
-    """Write the better weights, with a record of what they are, and say what came of it."""
+    """Write the better weights with their metadata, and return the outcome."""
     path = out.path / WEIGHTS
     if before is None:
         outcome = Outcome(path, state.step)
@@ -224,7 +225,7 @@ def _conclude(
     elif state.best_step == 0:
         last, _ = load_checkpoint(out.path / FINAL)
         outcome = Outcome(path, state.step, 0, before, score(last, metadata, held_out), before)
-        # Not halved: the very tensors that were given, under their own record.
+        # Not converted to float16: the initial tensors with their own metadata.
         save_checkpoint(start, outcome.noted_in(metadata), path)
     else:
         last, best = (load_checkpoint(out.path / name)[0] for name in (FINAL, BEST))
@@ -239,7 +240,7 @@ def _conclude(
 
 
 def _metrics(scores: DepthScores) -> dict[str, float]:
-    """By name; ``score`` is what decides. A figure that no image has is left out."""
+    """By name; ``score`` is what decides. Figures without any image are omitted."""
     found = {k: v for k, v in dataclasses.asdict(scores).items() if math.isfinite(v)}
     return {"score": scores.abs_rel_scaled, **found}
 

@@ -1,4 +1,4 @@
-"""What a fine-tuning is given: data, weights and settings, as a record that tells two of them apart."""
+"""Inputs of a fine-tuning: data, weights and settings, as a comparable record."""
 
 import dataclasses
 import hashlib
@@ -15,7 +15,7 @@ from edgeslam_torch.train.views.datasets import DepthFolder
 from edgeslam_torch.train.views.posed import PosedSequence
 
 NOT_COMPARED = ("steps", "patience", "validate_every", "checkpoint_every", "warmup_steps")
-"""Settings that say how far training goes: more of the same."""
+"""Settings of the length of training, which may differ."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,21 +28,21 @@ class DataSet:
     images: int | None = None
     """None, like the hash, before it is read."""
     sha256: str | None = None
-    """Of all that is learnt from: images, calibration, depth or poses and map points."""
+    """Hash of all training inputs: images, calibration, depth or poses and map points."""
 
 
 @dataclass(frozen=True, slots=True)
 class Given:
-    """Everything that decides what comes out."""
+    """Everything that determines the result."""
 
     weights: str
-    """Name and hash of what training begins with."""
+    """Name and hash of the initial weights."""
     data: tuple[DataSet, ...]
     validation: tuple[DataSet, ...]
     settings: dict[str, Any]
 
     def differences(self, other: "Given", ignored: Sequence[str] = NOT_COMPARED) -> list[str]:
-        """How ``other`` (now) differs from this (then), a few words each; what was not read yet is not compared.
+        """Differences between ``other`` (now) and this (then), in words; unread inputs are not compared.
 
         Args:
             other: What is given now.

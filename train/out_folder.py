@@ -1,6 +1,6 @@
-"""The folder of a fine-tuning: whose it is, and whether training may go on in it.
+"""The output folder of a fine-tuning, and whether training may resume in it.
 
-``finetune.json`` in it says what its tensors were trained on. Nothing is resumed that was given anything else.
+``finetune.json`` records the inputs of its tensors. Training resumes only with the same inputs.
 """
 
 import dataclasses
@@ -26,24 +26,24 @@ from edgeslam_torch.writers.own_folder import FolderLock, check_free
 RECORD, WEIGHTS = "finetune.json", "weights.safetensors"
 TENSORBOARD, TEACHER = "tensorboard", "teacher"
 FILES = (LAST, BEST, FINAL, WEIGHTS, CURVE, TENSORBOARD, TEACHER)
-"""What training leaves beside the record."""
+"""Files of training beside the record."""
 WITH_RESUME = (*NOT_COMPARED, "lr", "encoder_lr")
-"""Settings that may differ when the user asks for a resume: what diverged goes on at a smaller rate."""
+"""Settings that may differ with ``--resume``: after a divergence, training continues at a smaller rate."""
 
 
 class Existing(StrEnum):
-    """What to do with a fine-tuning that the folder holds already."""
+    """What to do with an existing fine-tuning."""
 
     SAME = "same"
-    """Go on with it when it was given the same, refuse otherwise."""
+    """Resume if the inputs are the same, else refuse."""
     RESUME = "resume"
-    """Go on with it, also at another learning rate; refuse when there is none."""
+    """Resume, also at another learning rate; refuse if there is none."""
     OVERWRITE = "overwrite"
     """Replace it, once the data is read."""
 
 
 class OutFolder:
-    """One fine-tuning's folder; the first process of a group alone writes.
+    """Folder of a fine-tuning; only the first process of a group writes.
 
     Args:
         path: The folder, which exists.
@@ -55,15 +55,15 @@ class OutFolder:
 
     @property
     def step(self) -> int:
-        """Steps that were trained and saved."""
+        """Number of saved steps."""
         return saved_step(self.path / LAST)
 
     def holds(self, file: Path) -> bool:
-        """Whether a file is one that training here writes."""
+        """Whether training here writes this file."""
         return any((self.path / name).is_file() and file.samefile(self.path / name) for name in FILES)
 
     def check(self, given: Given) -> None:
-        """Whether training with ``given`` may go on or begin here; writes nothing.
+        """Check whether training with ``given`` may begin or resume here; writes nothing.
 
         Raises:
             ConfigError: If the folder holds another training, or none where one is to be resumed.
@@ -95,10 +95,10 @@ class OutFolder:
             )
 
     def begin(self, given: Given) -> int:
-        """Note what is trained on, and take away what is not of this training.
+        """Record the inputs, and remove files of other trainings.
 
         Returns:
-            The step that training goes on from, 0 for a new one.
+            The step to resume from, 0 for a new training.
 
         Raises:
             ConfigError, OutputError: As for `check`.
@@ -107,7 +107,7 @@ class OutFolder:
         self.check(given)
         record = self._record()
         kept = record is not None and self.existing is not Existing.OVERWRITE
-        if kept and record is not None and not self.step:  # interrupted early: the teacher may be there
+        if kept and record is not None and not self.step:  # interrupted early: the teacher's depth may exist
             kept = not given_from_json(record["given"]).differences(given, WITH_RESUME)
         if not kept:
             self._clear()
@@ -119,7 +119,7 @@ class OutFolder:
         return step
 
     def finished(self, given: Given) -> Outcome | None:
-        """What came of the training, when exactly this was done before."""
+        """Outcome of the training, if exactly this was done before."""
         record = self._record()
         if record is None or record["outcome"] is None or self.existing is Existing.OVERWRITE:
             return None
@@ -130,7 +130,7 @@ class OutFolder:
         return Outcome.from_json(record["outcome"], self.path / WEIGHTS)
 
     def finish(self, outcome: Outcome) -> None:
-        """Note what came of it.
+        """Record the outcome.
 
         Raises:
             OSError: If the file cannot be written.
@@ -138,7 +138,7 @@ class OutFolder:
         self._write({**(self._record() or {}), "outcome": outcome.to_json()})
 
     def _clear(self) -> None:
-        """The record stays till it is written anew: without it the rest would be a stranger's."""
+        """The record is kept until rewritten: it marks the folder as ours."""
         for name in FILES:
             path = self.path / name
             if path.is_dir():
@@ -165,7 +165,7 @@ class OutFolder:
 
 @contextmanager
 def out_folder(path: Path, existing: Existing = Existing.SAME) -> Iterator[OutFolder]:
-    """Make and lock a folder for fine-tuning; errors of the disk get one line.
+    """Create and lock a folder for fine-tuning, with one-line errors.
 
     Raises:
         OutputError: If it cannot be written to, or another process writes there.
@@ -183,7 +183,7 @@ def out_folder(path: Path, existing: Existing = Existing.SAME) -> Iterator[OutFo
                 path.rmdir()
     except OSError as error:
         if isinstance(error, BrokenPipeError) or (error.errno == errno.EIO and sys.stderr.isatty()):
-            raise  # of the terminal, not of the disk
+            raise  # from the terminal, not the disk
         raise OutputError(f"{error.filename or path}: {error.strerror or error}") from error
 
 

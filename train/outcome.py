@@ -1,4 +1,4 @@
-"""What came of a fine-tuning, in numbers and in words."""
+"""Outcome of a fine-tuning, in numbers and words."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -17,12 +17,12 @@ class Outcome:
     """The file that was written."""
     steps: int
     kept_step: int | None = None
-    """After which the weights in the file were validated; 0: they are those that training began with."""
+    """Step at which the kept weights were validated; 0 for the initial weights."""
     before: DepthScores | None = None
     last: DepthScores | None = None
     kept: DepthScores | None = None
     nothing_to_do: bool = False
-    """Whether an earlier call had done all of it."""
+    """Whether an earlier call had completed it."""
 
     def to_json(self) -> dict[str, Any]:
         """Plain values, without the place of the file."""
@@ -32,10 +32,10 @@ class Outcome:
 
     @staticmethod
     def from_json(record: dict[str, Any], weights: Path) -> "Outcome":
-        """What `to_json` made.
+        """Inverse of `to_json`.
 
         Raises:
-            KeyError, TypeError: If it is something else.
+            KeyError, TypeError: If the record is another one.
         """
         before, last, kept = (record[k] and DepthScores(**record[k]) for k in ("before", "last", "kept"))
         return Outcome(weights, record["steps"], record["kept_step"], before, last, kept)
@@ -53,12 +53,12 @@ class Outcome:
         return "\n".join([*table, f"{done}{self.weights}: {self._words()}"])
 
     def warnings(self) -> list[str]:
-        """What is not as it was hoped for."""
+        """Warnings about the outcome."""
         if self.before is None or self.last is None or self.kept is None:
             return []
         change = f"median-scaled AbsRel {self.before.abs_rel_scaled:.4f} before, {self.last.abs_rel_scaled:.4f} after"
         if self.kept_step == 0:
-            return [f"fine-tuning made nothing better ({change}); the weights it began with are kept"]
+            return [f"fine-tuning improved nothing ({change}); the weights it began with are kept"]
         found = []
         if self.last.abs_rel_scaled > self.before.abs_rel_scaled:
             found.append(f"in the end fine-tuning made depth worse ({change}); step {self.kept_step} is kept")
@@ -68,7 +68,7 @@ class Outcome:
         return found
 
     def noted_in(self, metadata: Metadata) -> Metadata:
-        """The record of the kept weights, with what was found in its notes."""
+        """Metadata of the kept weights, with the outcome in its notes."""
         notes = [metadata.notes] if self.kept_step == 0 and metadata.notes else ["edgeslam finetune"]
         return dataclasses.replace(metadata, notes="; ".join([*notes, self._words(), *self.warnings()]))
 

@@ -1,7 +1,7 @@
-"""The training recipe, read from top to bottom; `Hooks` is where others join in.
+"""The training recipe; `Hooks` are its extension points.
 
-A step is a function of (seed, step): nothing random is carried from one to the next, so a run killed anywhere goes on
-from its last checkpoint exactly as if it had never stopped, and a batch split over processes is the same batch.
+A step is a function of (seed, step): no random state is carried over, so a killed run resumes exactly from its last
+checkpoint, and a batch split over processes is the same batch.
 """
 
 import copy
@@ -33,11 +33,11 @@ LAST, BEST, FINAL, CURVE = "last.pt", "best.safetensors", "final.safetensors", "
 MAX_BATCH = 1024
 """Images: tens of gigabytes."""
 NO_ROOM_M = (0.02, 90.0)
-"""A network whose depth lies mostly outside of this has diverged: no camera sees such a room."""
+"""Plausible median depth; a network mostly outside of it has diverged."""
 
 
 class DivergedError(EdgeSlamError):
-    """Training has destroyed the network; the message says what is kept."""
+    """Training has diverged; the message says what is kept."""
 
 
 class NonFiniteLossError(DivergedError):
@@ -46,7 +46,7 @@ class NonFiniteLossError(DivergedError):
 
 @dataclass(frozen=True, slots=True)
 class TrainConfig:
-    """What the recipe needs to know."""
+    """Settings of the recipe."""
 
     steps: int = 2000
     batch: int = 8
@@ -55,7 +55,8 @@ class TrainConfig:
     lr: float = 1e-3
     """Peak learning rate of the decoder."""
     encoder_lr: float = 1e-4
-    """Small: with batch norm folded in, pretrained weights are about 0.05, and Adam moves each by this per step."""
+    """Learning rate of the encoder; small because its weights, with batch norm folded in, are about 0.05, and Adam
+    moves each by this per step."""
     frozen_stages: int = 4
     """conv0 ... conv(n-1) are not trained; 14 freezes the encoder."""
     freeze_norm: bool = False
@@ -64,10 +65,10 @@ class TrainConfig:
     weight_decay: float = 1e-2
     warmup_steps: int = 100
     lr_end: float = 0.01
-    """Part of the peak rate left at the last step; 1 keeps it constant."""
+    """Final share of the peak rate; 1 keeps it constant."""
     clip_norm: float = 1.0
     ema_decay: float = 0.998
-    """Of the averaged weights that are validated and saved."""
+    """Decay of the averaged weights that are validated and saved."""
     validate_every: int = 250
     checkpoint_every: int = 250
     patience: int = 0
@@ -83,7 +84,7 @@ class TrainConfig:
         if self.batch > MAX_BATCH:
             raise ValueError(f"batch must be at most {MAX_BATCH}, got {self.batch}")
         for name in ("lr", "encoder_lr"):
-            # Adam moves every weight by about this much a step, and weights are about 0.05.
+            # Adam moves every weight by about this per step, and weights are about 0.05.
             if not 0.0 < getattr(self, name) <= 1.0:
                 raise ValueError(f"{name} must be above 0 and at most 1, got {getattr(self, name)}")
         for name in ("seed", "patience", "warmup_steps", "frozen_stages"):
@@ -126,7 +127,7 @@ class Hooks:
         """Once, when the run ends normally."""
 
     def close(self) -> None:
-        """Last, however the run ends: let go of files and of the terminal."""
+        """Called last in any case: release files and the terminal."""
 
 
 Validation = Callable[[FastDepth], dict[str, float]]
@@ -146,8 +147,8 @@ def train(
     """Train until ``config.steps``, early stopping or an error; resumes when ``out/last.pt`` exists.
 
     Writes ``out/last.pt`` (everything), ``out/best.safetensors`` and ``out/final.safetensors`` (averaged weights) and
-    ``out/curve.jsonl``. ``last.pt`` holds a working network whatever happens: a state is looked at before it replaces
-    the one before. An interrupt, or a hook that fails, saves the step that was done last.
+    ``out/curve.jsonl``. ``last.pt`` always holds a working network: a state is validated before it replaces the
+    previous one. On an interrupt or a failing hook, the last completed step is saved.
 
     Args:
         network: Changed in place.
@@ -203,7 +204,7 @@ def _loop(
     validate: Validation | None,
     hooks: Sequence[Hooks],
 ) -> str:
-    """All steps; why it ended."""
+    """Run all steps; returns the reason for stopping."""
     while True:
         if validate is not None and _validation_is_due(state, config):
             metrics = by_first(lambda: validate(state.averaged))
@@ -222,7 +223,7 @@ def _loop(
 
 
 def _validation_is_due(state: TrainState, config: TrainConfig) -> bool:
-    """Also after a resume between the step and its validation; never twice for a step."""
+    """Also after a resume between a step and its validation; at most once per step."""
     noted = state.history[-1]["step"] if state.history else 0.0
     return state.step > noted and (state.step % config.validate_every == 0 or state.step == config.steps)
 
@@ -260,7 +261,7 @@ def _share_between(network: FastDepth, images: Tensor, low: float, high: float) 
 
 
 def _rescue(state: TrainState, out: Path) -> None:
-    """Save the last whole step on the way out of an interrupt or a failure, which matters more than this."""
+    """Save the last completed step during an interrupt or failure, without masking it."""
     if rank() != 0 or not state.whole or state.shown is None:
         return
     try:
@@ -270,7 +271,7 @@ def _rescue(state: TrainState, out: Path) -> None:
 
 
 def _kept(out: Path) -> str:
-    """What a failed run leaves, and what helps."""
+    """Message about what a failed run keeps and what to do."""
     if not saved_step(out / LAST):
         return "nothing was saved before; try a smaller learning rate"
     return f"{out / LAST} holds step {saved_step(out / LAST)}, the last good one; try a smaller learning rate"
@@ -351,7 +352,7 @@ def _set_modes(network: FastDepth, config: TrainConfig) -> None:
 
 
 def _average(state: TrainState, decay: float) -> None:
-    # A short memory at first, so that the start does not linger.
+    # Short averaging window at first, so that initial weights fade quickly.
     decay = min(decay, (1 + state.step) / (10 + state.step))
     with torch.no_grad():
         for kept, new in zip(state.averaged.state_dict().values(), state.network.state_dict().values(), strict=True):
@@ -362,7 +363,7 @@ def _average(state: TrainState, decay: float) -> None:
 
 
 def _note(state: TrainState, metrics: dict[str, float], metadata: Metadata, out: Path) -> None:
-    """The file first: an interrupt in between leaves a step that is validated again after the resume."""
+    """Write the file first: after an interrupt in between, the step is validated again."""
     if metrics["score"] < state.best:
         if rank() == 0:
             save_checkpoint(state.averaged, metadata, out / BEST, half=True)
@@ -390,7 +391,7 @@ def save_state(state: TrainState, path: Path) -> None:
         "stale": state.stale,
         "history": state.history,
     }
-    # By way of memory: torch hides the disk's refusal behind an error of its own.
+    # Serialised in memory first: torch masks disk errors.
     buffer = io.BytesIO()
     torch.save(content, buffer)
     write_atomically(path, lambda file: file.write(buffer.getbuffer()))

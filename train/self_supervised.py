@@ -35,8 +35,7 @@ SPARSE = 1500
 FLIP = 0.5
 """Probability of mirroring a pair."""
 CLIP_LOG = 0.5
-"""Map points farther than this from the prediction (65 %) are believed to be hidden or wrong: constant
-cost."""
+"""Map points farther than this from the prediction (65 %) are treated as occluded or wrong: constant cost."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,8 +56,7 @@ class SelfSupervised:
 
     The scale is the run's: its map points and baselines are in metres when telemetry or the network gave
     it metres.
-    A run in arbitrary units is brought to metres by ``log_scale``, the shift that fits the network's own
-    depth.
+    A run in arbitrary units is scaled to metres by ``log_scale``, which fits the network's own depth.
     """
 
     sequences: Sequence[PosedSequence]
@@ -87,8 +85,8 @@ class SelfSupervised:
         return names
 
     def draw(self, slots: Sequence[Slot]) -> dict[str, Tensor]:
-        """Normalised inputs of view i and of its first partner (``image``, stacked), and what the losses
-        compare."""
+        """Normalised inputs of view i and of its first partner (``image``, stacked), and the targets of the
+        losses."""
         samples = [self._sample(slot) for slot in slots]
         batch = {key: torch.stack([s[key] for s in samples]) for key in samples[0]}
         batch["image"] = torch.cat((batch.pop("input_i"), batch.pop("input_j")))
@@ -110,8 +108,7 @@ class SelfSupervised:
         residual = at_points - batch["log_z"]
         near = batch["known"] & (residual.detach().abs() < CLIP_LOG)
         if w.points:
-            # The near side counts fully, the clipped rest as a constant: it must not lower the loss to be
-            # far off.
+            # Residuals are clipped to a constant beyond the limit, so that larger errors do not lower the loss.
             out["points"] = w.points * masked_mean(residual.abs().clamp(max=CLIP_LOG), batch["known"])
         if w.cycle:
             terms = [self._cycle_term(log_i[b], log_j[b], batch, b) for b in range(B)]

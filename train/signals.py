@@ -1,4 +1,4 @@
-"""Where a training step's loss comes from. A signal draws its part of a batch and returns named losses."""
+"""Sources of supervision: a signal draws its part of a batch and returns named losses."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -18,15 +18,14 @@ from edgeslam_torch.train.views.datasets import FAR_M, NEAR_M
 
 @dataclass(frozen=True, slots=True)
 class Slot:
-    """One image's place in the global batch of a step; everything random about it follows from these three
-    numbers."""
+    """One image's place in the global batch of a step; all its randomness is derived from these three numbers."""
 
     seed: int
     step: int
     index: int
 
     def rng(self) -> np.random.Generator:
-        """The slot's own generator: the same on every machine, after any restart, in any process."""
+        """The slot's own generator: identical on every machine, after restarts and in any process."""
         return np.random.default_rng((self.seed, self.step, self.index))
 
 
@@ -68,7 +67,7 @@ class Source:
     share: float
     """Part of the batch taken from here, relative to the other sources."""
     metric: float = 1.0
-    """How much of an image's mean log error counts: 1 teaches metres, 0 teaches shape alone."""
+    """Weight of an image's mean log error: 1 supervises metric depth, 0 shape only."""
 
 
 @dataclass
@@ -119,8 +118,7 @@ class Supervised:
     def losses(self, network: FastDepth, batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """Weighted terms, each ``(B,)``."""
         predicted, target, mask = network.predict(batch["image"]), batch["log_depth"], batch["mask"]
-        # Part of the mean error is taken out of the residual, with its gradient: that part of the scale is
-        # free.
+        # Part of the mean error is removed from the residual, including its gradient, leaving scale partly free.
         free = (1.0 - batch["metric"]) * masked_mean(predicted.log_depth - target, mask)
         target = target + free.view(-1, 1, 1, 1)
         out = {}

@@ -1,7 +1,7 @@
-"""The teacher for images without labels: dense depth that a run's poses and map give, completed by the network's own.
+"""The teacher for images without labels: dense depth from a run's poses and map, completed by the network.
 
-Each view is swept against its neighbours (`plane_sweep`); pixels whose depth other views confirm are kept as they are.
-The rest is the network's depth brought to pass near those pixels and the map's points (`densify`).
+Each view is swept against its neighbours (`plane_sweep`); pixels whose depth is confirmed by other views are kept.
+The rest is the network's depth, corrected towards those pixels and the map's points (`densify`).
 """
 
 import logging
@@ -28,7 +28,7 @@ from edgeslam_torch.types import FloatArray
 logger = logging.getLogger(__name__)
 
 MOST = 100
-"""Views taught of one sequence, evenly spread; 0.7 s of one core each."""
+"""Maximum number of views per sequence, evenly spread; 0.7 s of one core each."""
 WIDTH, PLANES, NEIGHBOURS = 240, 48, 6
 """Of a sweep: image width [px], hypotheses, images compared with. 320 px, 64 planes: 2.3 times the cost, confirming
 as much (redkitchen: 5.3 instead of 5.9 % off, 73 instead of 77 % of the pixels)."""
@@ -37,7 +37,7 @@ NEAR, FAR = 0.7, 1.5
 CONFIRMING, TOLERANCE = 2, 0.05
 """Other views that must see a pixel at its depth, within this relative difference."""
 ASKED = 6
-"""Other views asked, the nearest ones."""
+"""Number of nearest views used for confirmation."""
 SPACING = 4
 """Every n-th confirmed pixel corrects the network's depth around it."""
 
@@ -66,10 +66,10 @@ def teach(
 ) -> list[Taught]:
     """Views of a run with dense depth [m]; the processes of a group share the work by way of ``folder``.
 
-    What is there already is not made again, so an interrupted teacher goes on where it was.
+    Existing files are reused, so an interrupted teacher resumes.
 
     Args:
-        network: Before training; fills what could not be measured.
+        network: Network before training; fills unmeasured pixels.
         metadata: Of the network.
         sequence: The run.
         log_scale: Log of metres per map unit.

@@ -31,7 +31,7 @@ class DepthScores:
     abs_rel_edges: float
     """Metric, Canny edge pixels alone."""
     log_scale_std: float
-    """Spread over images of the log of the median ratio: how much the scale wanders."""
+    """Standard deviation over images of the log median ratio: variation of scale."""
 
 
 def image_tensor(image: np.ndarray, metadata: Metadata) -> torch.Tensor:
@@ -85,7 +85,7 @@ def _counted(view: View) -> NDArray[np.bool_]:
 
 
 def _mean(column: FloatArray) -> float:
-    """Of what is known: an image without edges has no error there."""
+    """Mean of the known values: images without edges have none."""
     known = column[~np.isnan(column)]
     return float(known.mean()) if len(known) else float("nan")
 

@@ -1,4 +1,4 @@
-"""Hooks that show how training goes: progress with time left, and TensorBoard."""
+"""Hooks that report training: progress with time left, and TensorBoard."""
 
 from collections.abc import Sequence
 from contextlib import suppress
@@ -45,7 +45,7 @@ class TensorBoard(Hooks):
         self._folder, self._metadata, self._views = folder, metadata, views
 
     def on_start(self, state: TrainState, config: TrainConfig) -> None:
-        """Open the file; what an interrupted process wrote of later steps counts no more."""
+        """Open the file; later steps of an interrupted process are purged."""
         from torch.utils.tensorboard import SummaryWriter
 
         self._writer = SummaryWriter(str(self._folder), purge_step=state.step + 1)

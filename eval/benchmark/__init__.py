@@ -1,1 +1,1 @@
-"""The real job again and again, timed: call `benchmark.run_benchmark`; `compare` tells noise from change."""
+"""Repeated timed runs: `benchmark.run_benchmark`; `compare` separates change from noise."""

@@ -1,7 +1,7 @@
-"""What each loss does: the same recordings with one thing changed at a time.
+"""Ablation: the same recordings with one change at a time.
 
-Most of what can be changed acts in the last refinement alone, after the last frame. Rows that differ only there share
-one flight: the map as it is before that refinement is copied and finished once for every row.
+Most changes affect only the last refinement. Rows that differ only there share one run: the map before that
+refinement is copied and refined once per row.
 """
 
 import io
@@ -135,7 +135,7 @@ class _Flight:
 
 
 def run_ablation(settings: AblationSettings, out: Path, say: Callable[[str], None]) -> dict[str, Any]:
-    """Fly every sequence with every seed and finish the flights in every way.
+    """Run every sequence with every seed, and refine it for every row.
 
     The record is written after every run; runs that an earlier call with the same settings left in ``out`` are not
     repeated.
@@ -309,7 +309,7 @@ def _rows(names: Sequence[str]) -> list[Row]:
 
 
 def _described(settings: AblationSettings) -> dict[str, Any]:
-    """What must be the same for an earlier record to be continued."""
+    """Conditions that must match to continue an earlier record."""
     return {
         "seeds": list(settings.seeds),
         "max_frames": settings.max_frames,

@@ -1,7 +1,7 @@
-"""The real job on every sequence at hand, several seeds, every run in its own process; kept as JSON, compared later.
+"""Runs on every available sequence with several seeds, each in its own process; stored as JSON for comparison.
 
 Between the runs the same fixed work is timed (`machine_speed`), and solver and depth network alone (`bench_probes`);
-what others did to the machine meanwhile is counted. `bench_compare` makes noise and verdicts of it.
+other load is measured. `compare` derives noise and verdicts.
 """
 
 import json
@@ -225,7 +225,7 @@ def read_peers(path: Path = _PEERS) -> list[dict[str, Any]]:
 
 
 def machine() -> dict[str, Any]:
-    """What the times depend on."""
+    """Conditions that times depend on."""
     model = ""
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.is_file():
@@ -288,7 +288,7 @@ def _judge(run: dict[str, Any], out: Path, folder: Path) -> None:
 
 
 def _record_synthetic(out: Path, settings: BenchSettings, say: Callable[[str], None]) -> Path:
-    """The simulated flight, recorded once: the seeds vary the system, not the world."""
+    """The simulated flight, recorded once: seeds vary the system, not the world."""
     folder = out / "synthetic"
     flight = folder / "flight"
     if not (flight / "groundtruth.txt").is_file():
@@ -369,7 +369,7 @@ def _times_line(title: str, record: dict[str, Any], name: str, metrics: Sequence
 
 
 def _machine_lines(record: dict[str, Any]) -> list[str]:
-    """How fast and how quiet the machine was."""
+    """Speed and load of the machine."""
     lines = []
     if len(found := reference_of(record, "cpu_ms")):
         spread = float(np.std(found, ddof=1) / np.mean(found)) if len(found) > 1 else 0.0

@@ -1,4 +1,4 @@
-"""The benchmark's figures, what they may differ by without meaning anything, and the comparison of two records.
+"""The benchmark's figures, their noise, and the comparison of two records.
 
 Three kinds of figures, three kinds of noise; docs/decisions/0026-benchmark-noise.md gives the reasons:
 
@@ -42,7 +42,7 @@ class Metric:
     text: str
     lower_is_better: bool
     floor: float
-    """Relative difference below which two medians are not told apart, however little they scatter."""
+    """Relative difference below which two medians count as equal, whatever their scatter."""
     clock: str = ""
     """Which time of the reference work it follows (`machine_speed.reference`); empty when it is no time."""
 
@@ -114,7 +114,7 @@ def compare(before: dict[str, Any], after: dict[str, Any]) -> list[dict[str, Any
 
 
 def noise_of(record: dict[str, Any], name: str, metrics: Sequence[Metric] = METRICS) -> dict[str, list[float]]:
-    """What `compare` would call no difference between this record's medians and those of a second one like it."""
+    """Differences that `compare` would not consider significant for a second record like this one."""
     out = {}
     for metric in metrics:
         found = _series(record, name, metric)
@@ -189,7 +189,7 @@ def markdown_compare(before: dict[str, Any], after: dict[str, Any]) -> str:
 
 
 def differences_of_conditions(before: dict[str, Any], after: dict[str, Any]) -> list[str]:
-    """What makes two records hard to compare, a line each."""
+    """Differences of conditions, one line each."""
     lines = []
     for key in ("machine", "seeds", "mode", "max_frames", "overrides"):
         a, b = before.get(key), after.get(key)
@@ -204,7 +204,7 @@ def differences_of_conditions(before: dict[str, Any], after: dict[str, Any]) -> 
 
 
 def busy_runs(record: dict[str, Any]) -> str:
-    """Which runs' times others disturbed; empty when none, or when nobody looked."""
+    """Warning about runs under other load; empty without any, or if unknown."""
     looked = [r["disturbance"] for r in record["runs"] if r.get("disturbance")]
     busy = [d for d in looked if d["busy"]]
     if not busy:
@@ -283,7 +283,7 @@ def _pooled(groups: Iterable[FloatArray], references: FloatArray) -> float:
 
 
 def _chance(metric: Metric, a: _Series, b: _Series) -> float:
-    """How far apart two medians come by chance, in the figure's unit."""
+    """Difference of two medians by chance, in the figure's unit."""
     parts = [(s.scatter * abs(float(np.median(s.level)))) ** 2 / len(s.raw) for s in (a, b)]
     return (_TIMED_SIGMAS if metric.clock else _SIGMAS) * float(np.sqrt(sum(parts)))
 

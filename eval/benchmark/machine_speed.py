@@ -1,9 +1,8 @@
-"""How fast this machine is at the moment: fixed work, timed beside every measurement of the benchmark.
+"""Current speed of this machine: fixed reference work, timed beside every measurement.
 
-Times on a shared machine follow its neighbours and its clock frequency. The same work, timed in the same minutes,
-moves with them: it tells how much of a difference is the machine's, and how sure that is. The work is made of what
-a run spends its time on (image features, arrays, small solves, the interpreter) and of nothing of this project, so
-that no commit changes it.
+Times on a shared machine depend on other load and clock frequency. Reference work timed in the same minutes is
+affected alike, and so measures how much of a difference is the machine's. It consists of what a run spends its time
+on (image features, arrays, small solves, the interpreter), without code of this project.
 """
 
 import os
@@ -22,7 +21,7 @@ import numpy as np
 
 _REPEATS = 15
 _BUSY_SHARE = 0.10
-"""Of all cores' time: what others may use during a run before its times are called disturbed."""
+"""Share of all cores' time used by others above which times count as disturbed."""
 _STOLEN_SHARE = 0.02
 """The same for time that the host took from this virtual machine."""
 
@@ -40,14 +39,14 @@ class CpuTimes:
 
 @dataclass(frozen=True, slots=True)
 class Disturbance:
-    """What else went on during a measurement, as shares of all cores' time."""
+    """Other load during a measurement, as shares of all cores' time."""
 
     others: float
     stolen: float
 
     @property
     def busy(self) -> bool:
-        """Whether times measured meanwhile say little."""
+        """Whether times measured meanwhile are unreliable."""
         return self.others > _BUSY_SHARE or self.stolen > _STOLEN_SHARE
 
 
@@ -70,7 +69,7 @@ def read_cpu_times(stat: Path = Path("/proc/stat")) -> CpuTimes | None:
 
 
 def disturbance(before: CpuTimes | None, after: CpuTimes | None) -> Disturbance | None:
-    """What others did between two readings; None when they cannot tell."""
+    """Other load between two readings; None if unknown."""
     if before is None or after is None or after.wall <= before.wall:
         return None
     whole = (after.wall - before.wall) * after.cores
@@ -79,9 +78,9 @@ def disturbance(before: CpuTimes | None, after: CpuTimes | None) -> Disturbance 
 
 
 class MachineSpeed:
-    """A process of its own that times the fixed work whenever it is asked, and whatever else is given to it.
+    """A separate process that times the reference work and other functions on request.
 
-    Its own process, so that what it loads does not count as memory of the runs that the caller starts.
+    Separate, so that its imports do not count as memory of the caller's runs.
     """
 
     def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""The solver's window and the depth network alone, timed again and again all through a benchmark.
+"""Solver and depth network alone, timed repeatedly during a benchmark.
 
 Functions here run in the process of `machine_speed.MachineSpeed`, each call right after the reference work, so that
 every figure has as many values as the benchmark has pauses between runs.
@@ -48,7 +48,7 @@ def gather(bouts: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _guarded(measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-    """A measurement that an installation cannot make (no weights, no onnx) is left out and says why."""
+    """A measurement that an installation cannot make (no weights, no onnx) is skipped with a reason."""
     try:
         return measure()
     except (EdgeSlamError, ImportError, RuntimeError, OSError) as error:
@@ -57,7 +57,7 @@ def _guarded(measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
 
 @lru_cache(maxsize=1)
 def _problems() -> tuple[Any, Any]:
-    """The seeded window that issue 4 names, whole and with its points alone, solved once to warm caches."""
+    """The seeded window, complete and with points only, solved once to warm caches."""
     import torch
 
     from edgeslam_torch.optim.benchmark import points_only, seeded_window

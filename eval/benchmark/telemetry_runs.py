@@ -1,7 +1,7 @@
-"""Metric scale on real images: a recording's ground truth flown by a simulated drone, the whole pipeline on top.
+"""Metric scale on real images: telemetry simulated along a recording's ground truth, processed by the whole pipeline.
 
 The state messages are those of a Tello (10 Hz, whole dm/s, degrees and centimetres, drift that grows as the battery
-drains), half a second ahead of the video. The outages ask whether the run goes on when they stop or repeat::
+drains), half a second ahead of the video. Outages test runs whose telemetry stops or repeats::
 
     python -m edgeslam_torch.eval.benchmark.telemetry_runs data/tum_fr1_xyz data/7scenes_redkitchen --seeds 5
 """
@@ -38,7 +38,7 @@ class Outage(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class TelemetryRun:
-    """How one run came out."""
+    """Result of one run."""
 
     sequence: str
     seed: int
@@ -99,7 +99,7 @@ def fly(
     result = run(open_source(sequence, telemetry=telemetry), out / "run", config or SlamConfig())
     score = evaluate_run(result.folder, sequence, judge_map=False)
     scale = result.summary["scale"]
-    error = 1.0 / (1.0 + score.scale_error) - 1.0  # of the estimate, not of what mends it
+    error = 1.0 / (1.0 + score.scale_error) - 1.0  # error of the estimate, not of the correction factor
     sigma = scale["sigma"] / scale["value"]
     return TelemetryRun(
         sequence.name, seed, outage, error, sigma, score.ate_se3_m, score.ate_sim3_m, score.coverage, scale["source"]

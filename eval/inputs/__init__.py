@@ -1,1 +1,1 @@
-"""What is judged and by what: trajectory files, run folders, data sets with ground truth, and poses matched by time."""
+"""Inputs of an evaluation: trajectory files, run folders, data sets with ground truth, and association by time."""

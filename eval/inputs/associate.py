@@ -1,4 +1,4 @@
-"""Which estimated pose belongs to which true one: by time, with the usual time mistakes recognised and named."""
+"""Association of estimated and true poses by time; detects the usual mistakes of time stamps."""
 
 from dataclasses import dataclass
 
@@ -14,7 +14,7 @@ _SINCE_1970_S = 1e6
 """Stamps above this [s] count from 1970, those below from the start of something."""
 
 _FEW = 10
-"""Poses that do not tell how long a recording is."""
+"""Number of poses too small to infer the length of a recording."""
 
 _UNITS = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
 

@@ -1,4 +1,4 @@
-"""What an evaluation needs of a data set: true poses, image stamps, measured depth maps.
+"""Ground truth of a data set: poses, image stamps, measured depth maps.
 
 `edgeslam_torch.readers.layouts` reads the folder, as it does for SLAM and training; the poses are read here.
 """

@@ -20,7 +20,7 @@ _SUPPORTED = frozenset({"initialised", "tracked", "relocalised"})
 
 @dataclass(frozen=True, slots=True)
 class RunFolder:
-    """What a run left; a part that is missing is None or empty."""
+    """Contents of a run folder; missing parts are None or empty."""
 
     path: Path
     trajectory: Trajectory
@@ -62,12 +62,12 @@ class RunFolder:
         folder = self.path / name
         try:
             return folder if folder.is_dir() else None
-        except (OSError, ValueError):  # a name that no folder can have
+        except (OSError, ValueError):  # an impossible folder name
             return None
 
     @property
     def trusted_frames(self) -> int:
-        """Frames whose final pose rests on a map that the images support; all where no ``status.csv`` tells."""
+        """Frames whose final pose is supported by the map; all without ``status.csv``."""
         return sum(map(is_supported, self.status)) if self.status else len(self.trajectory)
 
 
@@ -98,7 +98,7 @@ def is_keyframe(row: dict[str, str]) -> bool:
 
 
 def is_supported(row: dict[str, str]) -> bool:
-    """Whether a row of ``status.csv`` is of a frame whose final pose rests on a map that the images support."""
+    """Whether a row of ``status.csv`` has a final pose supported by the map."""
     stated = row.get("supported", "")
     return stated == "1" if stated else row.get("status", "") in _SUPPORTED
 

@@ -39,7 +39,7 @@ class Trajectory:
     source: str = "trajectory"
     """File it came from, for messages."""
     notes: tuple[str, ...] = ()
-    """What the reader had to mend or assume."""
+    """What the reader corrected or assumed."""
     rows: FloatArray | None = None
     """``(N, 7)`` position and quaternion as the file gives them, so that a wrong order can be recognised."""
     stamped: bool = True
@@ -183,7 +183,7 @@ def _read_table(path: Path) -> tuple[FloatArray, int]:
         first_line = first_line or number
         if len(rows[-1]) != len(rows[0]):
             if number == len(lines) and not text.endswith("\n"):
-                rows.pop()  # the writer was cut off in the middle of a line
+                rows.pop()  # the last line is incomplete
                 break
             raise EvaluationError(
                 f"{path}: line {number} has {len(rows[-1])} numbers, line {first_line} has {len(rows[0])}"
@@ -212,7 +212,7 @@ def _read_text(path: Path) -> str:
 
 
 def _quickly(text: str) -> FloatArray | None:
-    """The table as NumPy's own reader sees it, ten times as fast; None when it finds something to complain about."""
+    """The table by NumPy's reader, ten times as fast; None on any irregularity."""
     commas = "," in text[: text.find("\n", len(text) // 2)].rsplit("\n", 1)[-1]
     try:
         return np.loadtxt(io.StringIO(text), dtype=np.float64, delimiter="," if commas else None, ndmin=2)

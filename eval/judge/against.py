@@ -1,4 +1,4 @@
-"""Two records side by side: ratios of medians, and what got worse by more than the seeds scatter."""
+"""Two records side by side: ratios of medians, and what got worse by more than the noise of seeds."""
 
 import json
 from collections.abc import Sequence
@@ -16,19 +16,19 @@ from edgeslam_torch.eval.judge.table import aligned
 RECORD = "judge.json"
 _SIGMAS = 2.0
 _MOST_NAMED = 8
-"""Cells that only one of two records has are named up to this many."""
+"""Maximum number of cells of only one record that are named."""
 
 
 @dataclass(frozen=True, slots=True)
 class Compared:
-    """A figure that is put side by side."""
+    """A compared figure."""
 
     figure: str
     title: str
     text: str
     lower_is_better: bool
     floor: float
-    """Difference below which two medians are not told apart: relative for errors, absolute for shares."""
+    """Difference below which two medians count as equal: relative for errors, absolute for shares."""
     one_seed: float
     """The same where a record has one seed: two sigma of a difference of two runs, measured on tum_fr1_xyz and
     7scenes_redkitchen with three seeds each (0ecd978); a recording on which runs get lost scatters more."""

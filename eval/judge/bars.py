@@ -1,4 +1,4 @@
-"""The bars: limits for the figures of cells, as data, and what passes them."""
+"""Limits of the figures of cells, as data, and their evaluation."""
 
 import operator
 import tomllib
@@ -58,13 +58,13 @@ class Bar:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """How the runs of some cells stand to a bar."""
+    """Result of a limit for the runs of some cells."""
 
     bar: Bar
     passed: int
     runs: int
     worst: float | None
-    """The figure of the run farthest on the wrong side; None when one run has none."""
+    """The worst figure; None if a run has none."""
 
     @property
     def ok(self) -> bool:
@@ -77,7 +77,7 @@ class Verdict:
 
 
 def read_bars(path: Path = BARS) -> list[Bar]:
-    """Bars of a TOML file; its head says how they are written.
+    """Limits of a TOML file; its header describes the format.
 
     Raises:
         EvaluationError: If it cannot be read or holds something else.

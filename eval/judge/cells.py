@@ -1,4 +1,4 @@
-"""What is judged: one cell is one source with one seed."""
+"""Cells of the judge: one source with one seed each."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -27,7 +27,7 @@ KIDNAPPED = "7scenes_redkitchen"
 
 @dataclass(frozen=True, slots=True)
 class Variant:
-    """A recording seen otherwise."""
+    """A modified recording."""
 
     rate: int = 1
     """Every n-th frame."""
@@ -36,7 +36,7 @@ class Variant:
     first: int = 0
     """Frame that it starts from."""
     focal: float = 1.0
-    """Factor on the focal length that the system is told."""
+    """Factor on the focal length given to the system."""
 
     def frames_of(self, length: int) -> int:
         """Frames that are left of ``length``."""

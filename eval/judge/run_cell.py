@@ -1,6 +1,6 @@
 """``python -m edgeslam_torch.eval.judge.run_cell FOLDER``: run and judge the cell that ``FOLDER/cell.json`` describes.
 
-A process of its own: what it leaks, breaks or is killed for is its own, and its memory and CPU time are measurable.
+In a separate process, so that failures are isolated and memory and CPU time are measurable.
 """
 
 import json

@@ -1,4 +1,4 @@
-"""Runs cells, each in a process of its own, some at a time; what an interrupted judge left is not done again."""
+"""Runs cells in separate processes, some at a time; an interrupted judge resumes."""
 
 import hashlib
 import json
@@ -58,7 +58,7 @@ def judge(
     commit: str | None = None,
     start: Start | None = None,
 ) -> dict[str, Any]:
-    """Run the cells that ``out`` has no result of yet, and gather the results of all.
+    """Run the cells without a result in ``out``, and gather all results.
 
     Args:
         cells: What to run.
@@ -141,7 +141,7 @@ def _git(folder: Path, *arguments: str) -> str:
 
 
 def _key(cell: Cell, settings: JudgeSettings, commit: str) -> str:
-    """Whatever decides a cell's result."""
+    """Everything that determines a cell's result."""
     return json.dumps([commit, list(settings.overrides), settings.max_frames, cell.to_dict()])
 
 
@@ -210,7 +210,7 @@ def _kill(job: _Running) -> None:
 
 
 def _reason(log: Path, code: int) -> str:
-    """Last line that the process said, or how it ended."""
+    """Last line of the process's output, or how it ended."""
     lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
     ended = f"killed by signal {-code}" if code < 0 else f"exit code {code}"
     return f"{lines[-1].strip()} ({ended})" if lines else ended

@@ -23,7 +23,7 @@ MAP_THRESHOLDS_M = (0.02, 0.05, 0.06, 0.10)
 _MAX_POINTS = 20_000
 """Points compared with a simulated world's surfaces, drawn with a fixed seed."""
 _BEGIN_S = 1.0
-"""What counts as a run's beginning."""
+"""Length of a run's beginning."""
 
 Figures = dict[str, float | None]
 Surfaces = Callable[[FloatArray], FloatArray]
@@ -32,7 +32,7 @@ Surfaces = Callable[[FloatArray], FloatArray]
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """What a run is compared with."""
+    """Ground truth of a run."""
 
     poses: Path | None
     """Data set folder or trajectory file; None when there is nothing to compare with."""
@@ -43,7 +43,7 @@ class Truth:
 
 
 def score(run_dir: Path, truth: Truth) -> tuple[Figures, list[str]]:
-    """Figures of a run and remarks about them; a figure that cannot be had is None.
+    """Figures of a run and remarks; unavailable figures are None.
 
     Raises:
         EvaluationError: If the folder holds no run.
@@ -61,7 +61,7 @@ def score(run_dir: Path, truth: Truth) -> tuple[Figures, list[str]]:
 
 
 def _own_figures(run: RunFolder) -> dict[str, Any]:
-    """What the run itself tells."""
+    """Figures from the run's own output."""
     summary = run.summary
     clouds = [cloud for name in ("edge_map.ply", "anchors.ply") if (cloud := run.cloud(name)) is not None]
     p_w = np.concatenate([c.p_w for c in clouds]) if clouds else np.zeros((0, 3))
@@ -124,7 +124,7 @@ def _own_sigma(run: RunFolder) -> float | None:
 
 
 def _beginning(found: TrajectoryScore) -> tuple[float, float]:
-    """RMS error of the first second's poses [m], and how many times that of the others it is."""
+    """RMS error of the first second's poses [m], and its ratio to that of the others."""
     first = found.stamps_s < found.stamps_s[0] + _BEGIN_S
     if first.all():
         return float("nan"), float("nan")

@@ -17,7 +17,7 @@ Size = tuple[int, int]
 
 
 class ChangedFrame(Frame):
-    """A frame under another number, time or size; its colours are still read only when somebody asks."""
+    """A frame under another number, time or size; colours are still decoded on demand."""
 
     __slots__ = ("_frame", "_size")
     _frame: Frame

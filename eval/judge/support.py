@@ -1,4 +1,4 @@
-"""Which frames' poses rest on the map: what the run says, and whether the map that it left lies in their view."""
+"""Frames whose poses are supported by the map: according to the run, and with enough of the delivered map in view."""
 
 from collections.abc import Sequence
 
@@ -11,9 +11,9 @@ from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.types import FloatArray, FrameStatus
 
 LEAST_POINTS = 30
-"""Points of the delivered map that must lie in a frame's view for its pose to rest on that map."""
+"""Minimum number of points of the delivered map in view of a supported frame."""
 _SAMPLE = 10_000
-"""Map points that are looked for, drawn with a fixed seed."""
+"""Maximum number of sampled map points."""
 _NEAREST_SHARE = 1e-3
 """Points nearer than this share of the map's median distance are not in view."""
 
@@ -21,15 +21,15 @@ Status = Sequence[dict[str, str]]
 
 
 def live(rows: Status) -> NDArray[np.bool_]:
-    """Frames ``(F,)`` whose pose rested on a map that the images support when they came."""
+    """Frames ``(F,)`` whose live pose was supported by the map."""
     supported = {str(status) for status in FrameStatus if status.supported}
     return np.array([row.get("status") in supported for row in rows], dtype=bool)
 
 
 def at_end(rows: Status, T_w_c: FloatArray, p_w: FloatArray, camera: Camera) -> NDArray[np.bool_]:
-    """Frames ``(F,)`` whose final pose rests on the delivered map.
+    """Frames ``(F,)`` whose final pose is supported by the delivered map.
 
-    Those of which the run says so, if at least `LEAST_POINTS` points of the map lie in their view.
+    Those stated by the run, with at least `LEAST_POINTS` points of the map in view.
 
     Args:
         rows: Of ``status.csv``, one a frame.

@@ -37,7 +37,7 @@ def best_offset(truth: Trajectory, estimate: Trajectory, reach_s: float = NEAR_S
 
 
 def any_offset(truth: Trajectory, estimate: Trajectory) -> Offset:
-    """The same over every offset that lets the two overlap: for clocks that have nothing to do with each other."""
+    """The same over all offsets with overlap, for unrelated clocks."""
     span = float(np.ptp(estimate.stamps_s))
     first = float(truth.stamps_s[0] - estimate.stamps_s[-1]) + _LEAST_SHARE * span
     last = float(truth.stamps_s[-1] - estimate.stamps_s[0]) - _LEAST_SHARE * span

@@ -44,7 +44,7 @@ class DepthReport:
 
     metric: DepthScore
     median_scaled: DepthScore
-    """Each map multiplied by the ratio of medians first: what is left when the scale comes from elsewhere."""
+    """After median scaling of each map: the error if scale comes from elsewhere."""
     edges_metric: DepthScore | None
     """Edge pixels alone; None without an image."""
     edges_median_scaled: DepthScore | None
@@ -197,7 +197,7 @@ def mean_report(reports: Iterable[DepthReport]) -> DepthReport:
 
 
 def _maps(place: Path) -> dict[str, Path]:
-    """Depth maps of a folder by name; numbers win over pictures, and pictures to look at are not taken."""
+    """Depth maps of a folder by name; ``.npy`` before ``.png``; coloured pictures are ignored."""
     if place.is_file():
         return {place.stem: place}
     found = {p.stem: p for suffix in (".png", ".npy") for p in sorted(place.glob(f"*{suffix}"))}

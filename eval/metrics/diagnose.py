@@ -1,4 +1,4 @@
-"""What is probably wrong with a trajectory whose error is large: each finding names the mistake and the remedy."""
+"""Diagnosis of large trajectory errors: each finding names the mistake and its remedy."""
 
 from dataclasses import replace
 
@@ -24,7 +24,7 @@ _ROTATION_POOR_DEG = 8.0
 """Orientation error above which the quaternions are suspected; working systems stay below 3."""
 
 _FEW = 10
-"""Fewer matched poses than this say next to nothing."""
+"""Minimum number of matched poses for a diagnosis."""
 
 _MIRROR = np.diag([1.0, 1.0, -1.0, 1.0])
 _MIRRORED = "the positions are mirrored: two axes swapped, one negated, or a left-handed world"
@@ -125,7 +125,7 @@ def _rotation_notes(truth: Trajectory, estimate: Trajectory, score: TrajectorySc
     mended = {
         "the orientations look inverted (world-to-camera rotation with camera-to-world positions)": np.swapaxes(R, 1, 2)
     }
-    if estimate.rows is not None:  # what stands in the file as qw qx qy qz
+    if estimate.rows is not None:  # the file's columns read as qw qx qy qz
         swapped = Rotation.from_quat(estimate.rows[:, [4, 5, 6, 3]]).as_matrix()
         mended["the quaternions look like qw qx qy qz; TUM files need qx qy qz qw"] = swapped
     errors = {text: _rotation_error(truth, R_mended, score) for text, R_mended in mended.items()}

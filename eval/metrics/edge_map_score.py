@@ -1,4 +1,4 @@
-"""Edge map against measured depth: how near its points are to the surface, and how much of the edges it holds."""
+"""Edge map against measured depth: accuracy of its points and completeness of the edges."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""One run judged against its data set: the function that scripts call."""
+"""Evaluation of one run against its data set."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -21,7 +21,7 @@ from edgeslam_torch.eval.metrics.trajectory_error import TrajectoryScore, score_
 
 @dataclass(frozen=True, slots=True)
 class RunScore:
-    """Everything measured about one run; lengths in metres, angles in degrees."""
+    """All scores of one run; lengths in metres, angles in degrees."""
 
     name: str
     dataset: str
@@ -51,7 +51,7 @@ class RunScore:
     full_transform: float
     """RMSE of ``||E - I||_F``, unitless: the paper's figure."""
     fixed_position_m: float
-    """What a camera standing still would score."""
+    """ATE of the best fixed position."""
     map: MapScore | None
     map_note: str
     """Why there is no map score."""
@@ -182,7 +182,7 @@ def _coverage(
     source = run.summary.get("source")
     limit = source.get("length") if isinstance(source, dict) else None
     if isinstance(limit, int) and 0 < limit < len(frames):
-        frames = frames[:limit]  # --max-frames: the run was asked for no more
+        frames = frames[:limit]  # with --max-frames the run has fewer
     if len(frames) == 0:
         span = float(truth.stamps_s[-1] - truth.stamps_s[0])
         mine = run.trajectory.stamps_s * clock.factor + clock.offset_s
@@ -202,7 +202,7 @@ def _first_trusted(run: RunFolder) -> float:
 
 
 def _scale_inside(run: RunFolder, scale: float) -> bool | None:
-    """The run's metres are its best guess; its sigma, relative to its value, says how far off they may be."""
+    """Whether the true scale lies within the run's stated interval."""
     stated = run.summary.get("scale")
     if not isinstance(stated, dict) or not stated.get("sigma") or not stated.get("value"):
         return None

@@ -296,14 +296,14 @@ def test_what_made_nothing_better_keeps_the_weights_it_began_with(
         str(noise), "--validate", "kitchen", "--weights", str(good), "--lr", "0.05", steps=4
     )
     assert code == 0
-    assert "WARNING: fine-tuning made nothing better (median-scaled AbsRel" in stderr
+    assert "WARNING: fine-tuning improved nothing (median-scaled AbsRel" in stderr
     assert "the weights that fine-tuning began with, unchanged" in stdout
     before, after = (load_checkpoint(p) for p in (good, tmp_path / "out" / "weights.safetensors"))
     for (name, a), b in zip(before[0].state_dict().items(), after[0].state_dict().values(), strict=True):
         assert torch.equal(a, b), name
     assert after[1].data == before[1].data == ("rooms", "kitchen")
     assert (after[1].metrics, after[1].licence) == (before[1].metrics, before[1].licence)
-    assert "fine-tuning made nothing better" in after[1].notes
+    assert "fine-tuning improved nothing" in after[1].notes
     assert json.loads((tmp_path / "out" / "finetune.json").read_text())["outcome"]["kept_step"] == 0
 
 

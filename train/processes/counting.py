@@ -1,4 +1,4 @@
-"""Long work that says how far it is: a bar on a terminal, a line every few seconds elsewhere."""
+"""Progress of long work: a bar on a terminal, a line every few seconds elsewhere."""
 
 import sys
 import time
@@ -17,12 +17,12 @@ class Count:
     """Counts towards a total; only the first process of a group shows anything.
 
     Args:
-        total: Where it ends.
-        what: What is done, such as "training".
+        total: Total count.
+        what: Name of the work, such as "training".
         unit: What is counted.
-        done: How much was done before, by another process; not part of the rate.
+        done: Count done before by another process; not part of the rate.
         stream: Where to show it; stderr when None.
-        clock: Seconds that pass.
+        clock: Clock [s].
     """
 
     def __init__(
@@ -46,10 +46,10 @@ class Count:
             )
 
     def advance(self, text: str = "") -> None:
-        """One more is done.
+        """Count one item.
 
         Args:
-            text: How it went, shown with the count.
+            text: Text shown with the count.
         """
         self._done += 1
         if self._bar is not None:
@@ -59,7 +59,7 @@ class Count:
             self._line(text)
 
     def close(self) -> None:
-        """Take the bar away."""
+        """Remove the bar."""
         if self._bar is not None:
             self._bar.close()
 
@@ -73,7 +73,7 @@ class Count:
 
 
 def counted(items: Sequence[T], what: str, unit: str) -> Iterator[T]:
-    """The items, one after the other, counted on stderr."""
+    """The items, with progress on stderr."""
     count = Count(len(items), what, unit)
     try:
         for item in items:

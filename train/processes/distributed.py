@@ -1,4 +1,4 @@
-"""Several processes under ``torchrun``; a single one needs nothing of this.
+"""Several processes under ``torchrun``; a single process needs none of it.
 
 They share their files: every process must see the same data and output folder.
 """
@@ -19,8 +19,8 @@ from edgeslam_torch.errors import ConfigError, EdgeSlamError
 T = TypeVar("T")
 
 PATIENCE = timedelta(hours=12)
-"""How long a process waits for the others: the first may run the SLAM on a long recording. One that died is noticed at
-once, by its closed connections."""
+"""Timeout for other processes: the first may run SLAM on a long recording. A dead process is noticed at once by its
+closed connections."""
 
 
 class ProcessError(EdgeSlamError):
@@ -62,7 +62,7 @@ def world() -> int:
 
 
 def by_first(work: Callable[[], T]) -> T:
-    """What ``work`` gives in process 0, which alone does it; must pickle.
+    """Result of ``work``, executed in process 0 only; must pickle.
 
     Raises:
         Exception: In process 0, what ``work`` raised.
@@ -92,7 +92,7 @@ def share_of(items: Sequence[T]) -> Sequence[T]:
 
 
 def wait_for_all() -> None:
-    """Return when every process has come here.
+    """Barrier for all processes.
 
     Raises:
         ProcessError: If one is gone.
@@ -139,7 +139,7 @@ def _together() -> bool:
 
 @contextmanager
 def _lost_is_said() -> Iterator[None]:
-    """Gloo says of a dead neighbour that a connection is closed, in an error of its own class."""
+    """Gloo reports a dead peer as a closed connection."""
     try:
         yield
     except RuntimeError as error:

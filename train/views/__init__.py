@@ -1,1 +1,1 @@
-"""What the network learns from: images with depth, posed images of a run, and what is computed from them."""
+"""Training views: images with depth, posed images of a run, and quantities computed from them."""

@@ -1,4 +1,4 @@
-"""Augmentation that knows the camera: image, depth and intrinsics change together."""
+"""Geometric augmentation: image, depth and intrinsics change consistently."""
 
 from dataclasses import dataclass, replace
 

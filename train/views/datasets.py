@@ -23,9 +23,9 @@ from edgeslam_torch.types import FloatArray
 logger = logging.getLogger(__name__)
 
 MAX_SHOWN = 3
-"""Files left out that are named in a message."""
+"""Maximum number of skipped files named in a message."""
 NEAR_M, FAR_M = 0.05, 30.0
-"""Depth that is learnt from."""
+"""Range of depth used for training [m]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +35,7 @@ class DepthFolder:
     name: str
     views: Sequence[View]
     left_out: tuple[str, ...]
-    """Files of no use, and why; training goes on without them."""
+    """Skipped files with reasons."""
 
 
 def load_depth_folder(

@@ -1,7 +1,7 @@
 """Measured depth at some pixels and a network's own depth to dense depth.
 
-The network knows shapes, measurements know distances. Their log ratio at the measured pixels, spread smoothly over the
-image, corrects the network's depth; far from any of them only the image's median ratio is corrected.
+The network provides shape, measurements provide distance. Their log ratio at the measured pixels, interpolated
+smoothly, corrects the network's depth; far from measurements only the median ratio is applied.
 """
 
 import cv2
@@ -12,9 +12,9 @@ from edgeslam_torch.types import FloatArray
 SCALES = (0.15, 0.06, 0.025)
 """Standard deviations of the spreading, in image widths, coarse to fine."""
 SHRINK = (0.3, 0.5, 1.0)
-"""Points' worth of doubt at each scale: a correction needs more evidence the finer it is."""
+"""Prior weight at each scale, in points: finer corrections need more evidence."""
 MAX_LOG_RATIO = 0.5
-"""Points farther than this from the image's median ratio are hidden or wrong."""
+"""Points farther than this from the image's median ratio are occluded or wrong."""
 
 
 def densify(log_depth: FloatArray, uv: FloatArray, log_z: FloatArray) -> FloatArray:

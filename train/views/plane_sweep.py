@@ -1,8 +1,8 @@
 """Dense depth of one posed image from its neighbours: a plane sweep and semi-global aggregation.
 
-Every hypothesis is a plane parallel to the image, so a neighbour is warped by a homography whatever way the camera
-moved: no rectification, and forward motion is a case like any other (Collins, CVPR 1996). What bare surfaces leave open
-is settled by semi-global matching (Hirschmueller, PAMI 2008), four paths.
+Every hypothesis is a plane parallel to the image, so a neighbour is warped by a homography for any motion, including
+forward motion, without rectification (Collins, CVPR 1996). Ambiguities of textureless surfaces are resolved by
+semi-global matching (Hirschmueller, PAMI 2008), four paths.
 """
 
 from collections.abc import Sequence
@@ -15,9 +15,9 @@ from edgeslam_torch.types import FloatArray
 WINDOW = 5
 """Side [px] of the windows that are compared."""
 NOISE = 4.0
-"""Variance of grey values [levels^2] below which a window says nothing: its correlation tends to 0."""
+"""Variance of grey values [levels^2] below which a window is textureless: its correlation tends to 0."""
 BEST = 0.5
-"""Part of the neighbours, those that agree best, that counts: the others do not see the point."""
+"""Share of the best neighbours that counts: the others may be occluded."""
 STEP_COST, JUMP_COST = 0.06, 0.5
 """Of neighbouring pixels one plane apart and farther apart; correlations cost 0 to 1."""
 CONTRAST = 8.0
@@ -32,7 +32,7 @@ def sweep_depth(
     K: FloatArray,
     inverse_depths: FloatArray,
 ) -> FloatArray:
-    """Depth ``(H, W)`` float32 of every pixel, right or wrong: the caller drops what other views do not confirm.
+    """Depth ``(H, W)`` float32 of every pixel, unverified: the caller drops pixels that other views do not confirm.
 
     Args:
         reference: Grey image ``(H, W)`` float32, undistorted.
@@ -72,7 +72,7 @@ def matching_cost(
             seen_mean, seen_spread = _statistics(seen)
             together = cv2.blur(reference * seen, (WINDOW, WINDOW)) - mean * seen_mean
             costs[k] = np.clip(1.0 - together / (spread * seen_spread), 0.0, 1.0)
-            # A window that reaches outside has a mean below black.
+            # A window that reaches outside has a negative mean.
             costs[k][seen_mean < 0] = 1.0
         out[d] = np.partition(costs, used - 1, axis=0)[:used].mean(0)
     return out

@@ -1,4 +1,4 @@
-"""What a SLAM run knows about its images: poses and sparse depth, the teacher of self-supervised training."""
+"""Poses and sparse depth of a SLAM run, for self-supervised training."""
 
 import json
 import logging
@@ -26,13 +26,13 @@ from edgeslam_torch.writers.ply import read_ply
 logger = logging.getLogger(__name__)
 
 MIN_PARALLAX, MAX_PARALLAX = 0.02, 0.2
-"""Baseline over median depth of useful pairs: below, depth does not show; above, too much is hidden."""
+"""Baseline over median depth of useful pairs: below, parallax is too small; above, too much is occluded."""
 MAX_ROTATION_RAD = 0.35
 _CELL = 20
 """Side of the cells [px of the reduced image] in which the nearest point hides those well behind it."""
 _BEHIND = 1.2
 MIN_POINTS, MIN_VIEWS = 30, 8
-"""Map points that a view must see, and views of a run, for anything to be learnt from them."""
+"""Minimum map points per view, and views per run."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,11 +81,11 @@ def load_run(
 ) -> PosedSequence:
     """Images of the recording that a run was made from, with the run's poses and map.
 
-    Of a run in several pieces, which do not relate to one another, the one with the most frames.
+    Of a run in several unrelated pieces, the one with the most frames.
 
     Args:
         folder: Output of ``edgeslam run``.
-        source: The recording; by default where the run's summary says it was.
+        source: The recording; by default the location in the run's summary.
         width: Images are reduced to this width.
         max_views: Views kept, evenly spread.
         stamps: Use only frames between these stamps [s].
@@ -151,9 +151,8 @@ def visible_points(
 ) -> tuple[FloatArray, FloatArray]:
     """Pixels ``(N, 2)`` and depths ``(N,)`` of the map points that a view ``size = (height, width)`` sees.
 
-    A run does not store who saw what. A point is taken as hidden when another one in its cell or the eight
-    around it
-    is much nearer; this loses background beside foreground, and keeps what training may lean on.
+    A run does not store observations. A point counts as occluded when another one in its cell or the eight around it
+    is much nearer; this discards background beside foreground.
     """
     height, width = size
     p_c = (p_w - T_w_c[:3, 3]) @ T_w_c[:3, :3]

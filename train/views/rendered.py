@@ -14,9 +14,9 @@ WIDTH, HEIGHT = 320, 240
 FOCAL_PX = (210.0, 360.0)
 """Of the 320 pixel wide images: 75 to 48 degrees across."""
 MIN_SPREAD = 1.5
-"""90th over 10th percentile of depth; below, a view stares at one surface and teaches little."""
+"""90th over 10th percentile of depth; below, a view shows a single surface."""
 KEEP_FLAT = 0.3
-"""Part of those kept: drones do look at walls."""
+"""Share of such views kept: drones do look at walls."""
 
 
 def render_rooms(path: Path, rooms: int, views_per_room: int = 6, seed: int = 7) -> None:
