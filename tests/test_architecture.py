@@ -24,6 +24,8 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("map",),
     ("mapping",),
     ("tracking",),
+    ("atlas",),
+    ("atlas",),
     ("states",),
     ("slam",),
     ("drone", "calibration"),

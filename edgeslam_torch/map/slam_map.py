@@ -93,6 +93,14 @@ class SlamMap:
             self._joined[piece] = oldest
         return bool(found)
 
+    def scale_links(self, piece: int, scale: float) -> None:
+        """Follow a piece that was scaled: the ways from its removed keyframes to the surviving ones."""
+        for removed, (heir, T_removed_heir) in self.links.items():
+            if self.piece_of(removed) == piece:
+                T = T_removed_heir.copy()
+                T[:3, 3] *= scale
+                self.links[removed] = (heir, T)
+
     def latest(self) -> Keyframe:
         """The newest keyframe."""
         with self.lock:

@@ -79,6 +79,13 @@ class TrajectoryLog:
             record.T_c_k = T_c_w_of_frame[record.index] @ keyframe.T_w_c
             record.supported = True
 
+    def scale(self, piece: int, scale: float) -> None:
+        """Follow a piece of map that was scaled: the ways from its keyframes to their frames."""
+        for record in self.records:
+            if self.map.piece_of(record.keyframe_id) == piece:
+                record.T_c_k = record.T_c_k.copy()
+                record.T_c_k[:3, 3] *= scale
+
     def support(self) -> Support:
         """What each frame's pose rests on in the map as it is now."""
         with self.map.lock:

@@ -29,10 +29,12 @@ def fuse(slam_map: SlamMap, camera: Camera, keyframe: Keyframe, neighbours: list
 
 
 def fuse_all(slam_map: SlamMap, camera: Camera) -> None:
-    """Search every anchor in every keyframe, after all poses are refined."""
+    """Search every anchor in every keyframe of its piece, after all poses are refined."""
     anchors = slam_map.anchors
     for keyframe in slam_map.keyframes.values():
-        merge(slam_map, [_look_in(slam_map, camera, keyframe, np.flatnonzero(anchors.alive & ~anchors.from_depth))])
+        piece = slam_map.piece_of(keyframe.id)
+        ids = slam_map.anchors_seen_by([k for k in slam_map.keyframes.values() if slam_map.piece_of(k.id) == piece])
+        merge(slam_map, [_look_in(slam_map, camera, keyframe, ids[~anchors.from_depth[ids]])])
     slam_map.refresh_anchors(np.flatnonzero(anchors.alive))
 
 

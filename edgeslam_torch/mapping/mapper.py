@@ -60,7 +60,6 @@ class Mapper:
             self.triangulate_new(keyframe, neighbours, colour)
             fuse(self.map, self.camera, keyframe, self.map.covisible(keyframe, 2 * self.config.neighbours))
             drift_px = reobserve(self.map, self.camera, keyframe)
-            self.map.join_pieces(keyframe, self.map.covisible(keyframe, len(self.map.keyframes)))
         if drift_px is not None and drift_px > MOST_DRIFT_PX:  # the drift lies outside the window
             refine_all(self.map, self.camera, self.lm)
         window = choose_window(self.map, keyframe, self.config.window, self.config.window_fixed)

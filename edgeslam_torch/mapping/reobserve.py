@@ -45,7 +45,8 @@ def reobserve_all(slam_map: SlamMap, camera: Camera) -> list[float]:
 def lookalike(slam_map: SlamMap, keyframe: Keyframe) -> Keyframe | None:
     """Revisit candidate: the older keyframe nearest in position and direction that shares few anchors with this one,
     or None."""
-    older = [k for k in slam_map.keyframes.values() if k.id < keyframe.id]
+    piece = slam_map.piece_of(keyframe.id)  # poses of another one do not relate
+    older = [k for k in slam_map.keyframes.values() if k.id < keyframe.id and slam_map.piece_of(k.id) == piece]
     depth = _median_depth(slam_map, keyframe)
     if not older or depth is None:
         return None

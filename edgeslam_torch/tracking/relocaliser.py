@@ -59,7 +59,7 @@ class Reach:
 
     def holds(self, place: "Place") -> bool:
         """Whether a place is within reach, or as good as there."""
-        shift, turn = _apart(place.track.T_c_w, self.T_c_w)
+        shift, turn = apart(place.track.T_c_w, self.T_c_w)
         near = shift <= self._shift(place.depth) + APART * place.depth
         return near and turn <= self.turn_rad + MAX_APART_RAD
 
@@ -93,7 +93,7 @@ class Place:
 
     def is_as(self, other: "Place") -> bool:
         """Whether two poses are one place."""
-        shift, turn = _apart(self.track.T_c_w, other.track.T_c_w)
+        shift, turn = apart(self.track.T_c_w, other.track.T_c_w)
         return shift <= APART * min(self.depth, other.depth) and turn <= MAX_APART_RAD
 
 
@@ -227,7 +227,7 @@ def match_keyframe(tracker: Tracker, view: View, keyframe: Keyframe) -> Track | 
     return tracker.track(view, first.T_c_w, first.anchor)
 
 
-def _apart(T_c_w: FloatArray, other: FloatArray) -> tuple[float, float]:
+def apart(T_c_w: FloatArray, other: FloatArray) -> tuple[float, float]:
     """Distance of two cameras [map units] and the turn between them [rad]."""
     centre, there = (-T[:3, :3].T @ T[:3, 3] for T in (T_c_w, other))
     cosine = 0.5 * (float(np.trace(T_c_w[:3, :3] @ other[:3, :3].T)) - 1.0)

@@ -1,0 +1,171 @@
+"""The pieces of the map and the search for what joins them.
+
+One false join bends everything; a missed one leaves two pieces that say so. Hence two pieces are joined on two pairs of
+keyframes that have no keyframe in common and agree about the similarity, never on one.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from edgeslam_torch.atlas.links import Link, link
+from edgeslam_torch.atlas.places import lookalikes
+from edgeslam_torch.atlas.weld import move_piece, weld
+from edgeslam_torch.geometry import sim3
+from edgeslam_torch.map.keyframe import NO_ANCHOR, Keyframe
+from edgeslam_torch.map.trajectory import TrajectoryLog
+from edgeslam_torch.mapping.edge_map import EdgeMap
+from edgeslam_torch.optim.problem import LmConfig
+from edgeslam_torch.tracking.tracker import Tracker
+from edgeslam_torch.types import FloatArray
+
+CLOSER_LOOKS = 3
+"""Keyframes of other pieces that a new keyframe is compared with."""
+AGREEING_LINKS = 2
+MIN_BASELINE = 0.02
+"""Distance between the keyframes of two links, relative to their depth, from which on they are two witnesses."""
+WITNESSES = 4
+"""Earlier keyframes of the same piece that are asked at once when one has found a link."""
+
+
+@dataclass(frozen=True, slots=True)
+class Join:
+    """Two pieces that were found to be one."""
+
+    stamp_s: float
+    """Of the keyframe that settled it."""
+    piece: int
+    """Number of the piece that is left."""
+    absorbed: int
+    """Number that no longer exists."""
+    moved: int
+    """Which of the two was moved to the other's place and size."""
+    S: FloatArray
+    """``(4, 4)`` similarity that moved it."""
+    sigma_log: float
+    """Standard deviation of its log scale."""
+    links: int
+    """Keyframes that agreed."""
+    matches: int
+    """Keypoints of these that show the other piece."""
+
+    def in_words(self) -> str:
+        """For `status.csv` and the summary."""
+        scale = sim3.scale_of(self.S)
+        return (
+            f"piece {self.absorbed} joined piece {self.piece}: {self.links} keyframes agree, {self.matches} keypoints, "
+            f"piece {self.moved} scaled by {scale:.3f} (sigma {100 * self.sigma_log:.1f} %)"
+        )
+
+
+class Atlas:
+    """Asks every new keyframe whether it shows a piece that it does not belong to."""
+
+    def __init__(self, tracker: Tracker, edges: EdgeMap, log: TrajectoryLog, lm: LmConfig) -> None:
+        self.tracker = tracker
+        self.map = tracker.map
+        self.edges = edges
+        self.log = log
+        self.lm = lm
+        self.joins: list[Join] = []
+        self._links: list[Link] = []
+        """Found so far, between pieces that are still apart."""
+        self._asked = -1
+        """Newest keyframe that was asked."""
+
+    def strangers(self, piece: int) -> list[Keyframe]:
+        """Keyframes of other pieces that have something to be recognised by."""
+        return [k for k in self.map.keyframes.values() if self.map.piece_of(k.id) != piece and _is_mapped(k)]
+
+    def update(self) -> Join | None:
+        """Ask the keyframes that are new since the last call; the join that follows, if one does.
+
+        The map must belong to the caller.
+        """
+        new = [k for id, k in sorted(self.map.keyframes.items()) if id > self._asked]
+        if new:
+            self._asked = new[-1].id
+        for keyframe in new:
+            join = self._ask(keyframe)
+            if join is not None:
+                return join
+        return None
+
+    def _ask(self, keyframe: Keyframe) -> Join | None:
+        piece = self.map.piece_of(keyframe.id)
+        others = self.strangers(piece)
+        if not others or not _is_mapped(keyframe):
+            return None
+        for candidate in lookalikes(self.map, keyframe.words, others, CLOSER_LOOKS):
+            found = link(self.tracker, keyframe, candidate)
+            if found is not None:
+                return self._settle(found)
+        return None
+
+    def _settle(self, found: Link) -> Join | None:
+        """Join the two pieces of a link if another one agrees; earlier keyframes are asked for it."""
+        agreeing = [found]
+        for witness in self._witnesses(found):
+            if witness.agrees(found) and all(_apart_enough(witness, other) for other in agreeing):
+                agreeing.append(witness)
+        self._links.append(found)
+        if len(agreeing) < AGREEING_LINKS:
+            return None
+        return self._join(agreeing)
+
+    def _witnesses(self, found: Link) -> list[Link]:
+        """Links between the same two pieces: those found before, and those of keyframes nearby."""
+        pieces = self._pieces(found)
+        known = [one for one in self._links if self._stands(one) and self._pieces(one) == pieces]
+        theirs = [k for k in self.strangers(pieces[0]) if self.map.piece_of(k.id) == pieces[1] and k is not found.other]
+        new = []
+        for keyframe in self.map.covisible(found.keyframe, WITNESSES):
+            for candidate in lookalikes(self.map, keyframe.words, theirs, 1):
+                new.append(link(self.tracker, keyframe, candidate))
+        return [*known, *(one for one in new if one is not None)]
+
+    def _pieces(self, one: Link) -> tuple[int, int]:
+        return self.map.piece_of(one.keyframe.id), self.map.piece_of(one.other.id)
+
+    def _stands(self, one: Link) -> bool:
+        """Whether both ends of a link are still in the map."""
+        return all(self.map.keyframes.get(k.id) is k for k in (one.keyframe, one.other))
+
+    def _join(self, links: list[Link]) -> Join:
+        best = max(links, key=lambda one: len(one.keypoint))
+        mine, theirs = self._pieces(best)
+        moved, S = mine, best.S
+        if self._size(mine) > self._size(theirs):  # the smaller one moves
+            moved, S = theirs, sim3.inverse(best.S)
+        move_piece(self.map, self.edges, self.log, moved, S)
+        weld(self.map, self.tracker.camera, links, self.lm)
+        join = Join(
+            max(one.keyframe.stamp_s for one in links),
+            min(mine, theirs),
+            max(mine, theirs),
+            moved,
+            S,
+            best.sigma_log,
+            len(links),
+            sum(len(one.keypoint) for one in links),
+        )
+        self.joins.append(join)
+        self._links = []  # their similarities hold for pieces as they were
+        return join
+
+    def _size(self, piece: int) -> int:
+        return sum(self.map.piece_of(id) == piece for id in self.map.keyframes)
+
+
+def _is_mapped(keyframe: Keyframe) -> bool:
+    return bool((keyframe.anchor != NO_ANCHOR).any())
+
+
+def _apart_enough(one: Link, other: Link) -> bool:
+    """Whether two links' keyframes are two witnesses, not one image twice."""
+    if one.keyframe.id == other.keyframe.id or one.other.id == other.other.id:
+        return False
+    scale = sim3.scale_of(one.S)
+    baseline = float(np.linalg.norm(one.keyframe.centre_w - other.keyframe.centre_w)) * scale
+    turn = float(np.arccos(np.clip(one.keyframe.T_c_w[2, :3] @ other.keyframe.T_c_w[2, :3], -1.0, 1.0)))
+    return baseline > MIN_BASELINE * one.depth or turn > np.deg2rad(3.0)

@@ -1,0 +1,121 @@
+"""Proof that a keyframe shows another piece of map, and the similarity between its own piece and that one.
+
+The keyframe is searched in the other piece as a lost frame is (`tracking/relocaliser.py`), which gives its pose there on
+the evidence of hundreds of keypoints. What a pose leaves open is the scale: keypoints that have an anchor on both sides
+have two depths, and these must not only tell a scale but agree about it, since they come from two reconstructions that
+know nothing of each other. At last the way back must close: the other keyframe, searched in the first piece, has to be
+where the similarity says.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from edgeslam_torch.geometry import se3, sim3
+from edgeslam_torch.map.keyframe import Keyframe
+from edgeslam_torch.tracking.relocaliser import LIKELY_SHARE, LIKELY_SPREAD, Place, apart, match_keyframe, place_of
+from edgeslam_torch.tracking.tracker import Track, Tracker, View
+from edgeslam_torch.types import FloatArray, IntArray
+
+MIN_INLIERS = 50
+MIN_COMMON = 25
+"""Keypoints with a triangulated anchor on both sides."""
+AGREE_LOG = 0.15
+"""Difference of a keypoint's two depths from the common scale up to which they agree: three sigmas of 5 %, what
+triangulation over one or two degrees is good for."""
+MIN_AGREEING = 0.6
+"""Share of those keypoints that must agree on the scale; of depths that have nothing to do with each other a quarter
+does."""
+MAX_SIGMA_LOG = 0.03
+"""Standard deviation of the common log scale."""
+MAX_SHIFT = 0.1
+"""Distance of two estimates of one camera, relative to the depth that it sees."""
+MAX_TURN_RAD = np.deg2rad(5.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Link:
+    """A keyframe of one piece seen in another."""
+
+    keyframe: Keyframe
+    other: Keyframe
+    """Of the other piece."""
+    S: FloatArray
+    """``(4, 4)`` similarity that takes the keyframe's piece to the other."""
+    sigma_log: float
+    """Standard deviation of its log scale."""
+    keypoint: IntArray
+    """``(M,)`` keypoints of the keyframe that show ..."""
+    anchor: IntArray
+    """... these anchors of the other piece."""
+    depth: float
+    """Median depth that the keyframe sees there [units of the other piece]."""
+
+    def agrees(self, other: "Link") -> bool:
+        """Whether another link between the same pieces says the same of where this keyframe is, and how large."""
+        here, there = (sim3.moved_camera(S, self.keyframe.T_c_w) for S in (self.S, other.S))
+        shift, turn = apart(here, there)
+        scales = np.log(sim3.scale_of(self.S) / sim3.scale_of(other.S))
+        same = abs(scales) <= 3.0 * float(np.hypot(self.sigma_log, other.sigma_log)) + 0.02
+        return bool(same and shift <= MAX_SHIFT * self.depth and turn <= MAX_TURN_RAD)
+
+
+def view_of(keyframe: Keyframe, scale_factor: float) -> View:
+    """A keyframe as a frame to be searched."""
+    inv_sigma = scale_factor ** -keyframe.features.octave.astype(np.float64)
+    return View(keyframe.features, keyframe.words, keyframe.grid, inv_sigma)
+
+
+def link(tracker: Tracker, keyframe: Keyframe, other: Keyframe) -> Link | None:
+    """A keyframe's place in another keyframe's piece; None unless all of it is proven."""
+    there = _place(tracker, keyframe, other)
+    if there is None:
+        return None
+    scale = common_scale(tracker, keyframe, there.track)
+    if scale is None:
+        return None
+    S = _similarity(keyframe.T_c_w, there.track.T_c_w, scale[0])
+    back = _place(tracker, other, keyframe)
+    if back is None:
+        return None
+    shift, turn = apart(back.track.T_c_w, sim3.moved_camera(sim3.inverse(S), other.T_c_w))
+    if shift > MAX_SHIFT * back.depth or turn > MAX_TURN_RAD:
+        return None
+    return Link(keyframe, other, S, scale[1], there.track.keypoint, there.track.anchor, there.depth)
+
+
+def _place(tracker: Tracker, keyframe: Keyframe, other: Keyframe) -> Place | None:
+    """Where a keyframe is in the piece of another, if it looks as if it were there."""
+    view = view_of(keyframe, tracker.orb.scale_factor)
+    track = match_keyframe(tracker, view, other)
+    if track is None or track.inliers < MIN_INLIERS:
+        return None
+    place = place_of(tracker, view, track)
+    return place if place.share >= LIKELY_SHARE and place.spread >= LIKELY_SPREAD else None
+
+
+def common_scale(tracker: Tracker, keyframe: Keyframe, track: Track) -> tuple[float, float] | None:
+    """Size of the track's piece relative to the keyframe's own, and the standard deviation of its log.
+
+    None where too few depths are known on both sides or they do not agree.
+    """
+    anchors = tracker.map.anchors
+    own = keyframe.anchor[track.keypoint]
+    both = (own >= 0) & ~anchors.from_depth[own] & ~anchors.from_depth[track.anchor]
+    z_own = se3.transform(keyframe.T_c_w, anchors.p_w[own[both]])[:, 2]
+    z_there = se3.transform(track.T_c_w, anchors.p_w[track.anchor[both]])[:, 2]
+    front = (z_own > 0) & (z_there > 0)
+    if front.sum() < MIN_COMMON:
+        return None
+    ratio = np.log(z_there[front] / z_own[front])
+    middle = float(np.median(ratio))
+    agreeing = ratio[np.abs(ratio - middle) <= AGREE_LOG]
+    sigma = 1.4826 * float(np.median(np.abs(ratio - middle))) / np.sqrt(len(ratio))
+    if len(agreeing) < MIN_AGREEING * len(ratio) or sigma > MAX_SIGMA_LOG:
+        return None
+    return float(np.exp(np.mean(agreeing))), max(sigma, 1e-3)
+
+
+def _similarity(T_c_own: FloatArray, T_c_there: FloatArray, scale: float) -> FloatArray:
+    """What takes the world of one pose of a camera, scaled, to the world of its other pose."""
+    return se3.inverse(T_c_there) @ sim3.compose(scale, np.eye(3), np.zeros(3)) @ T_c_own

@@ -1,0 +1,50 @@
+"""Which keyframes look like an image: its keypoints vote for the anchors that resemble them.
+
+A vote costs one pass over the descriptors of the map (256 bits each, 200 keypoints against 10 000 anchors: 12 ms on one
+core). It needs no vocabulary and no state of its own, forgets what the map forgets, and cannot be out of date.
+"""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from edgeslam_torch.map.keyframe import Keyframe
+from edgeslam_torch.map.slam_map import SlamMap
+from edgeslam_torch.types import IntArray
+
+MOST_VOTERS = 200
+MAX_HAMMING = 50
+"""Bits, of 256; the strict figure of ORB-SLAM2: a vote counts though nothing else is known."""
+RATIO = 0.9
+"""Nearest over second nearest anchor."""
+MIN_VOTES = 8
+"""Votes from which on a keyframe is worth a closer look: wrong places of other rooms get 4 at most."""
+
+
+def lookalikes(slam_map: SlamMap, words: NDArray[np.uint64], among: list[Keyframe], most: int) -> list[Keyframe]:
+    """Keyframes that see most of the anchors that an image's keypoints resemble, best first.
+
+    Args:
+        slam_map: Holds the anchors.
+        words: Descriptors of the image ``(N, 4)``.
+        among: Keyframes that may be named.
+        most: How many at most.
+    """
+    votes = votes_for(slam_map, words, slam_map.anchors_seen_by(among))
+    allowed = {keyframe.id for keyframe in among}
+    counts = {id: n for id, n in slam_map.shared_counts(votes).items() if id in allowed and n >= MIN_VOTES}
+    ranked = sorted(counts, key=lambda id: (-counts[id], -id))
+    return [slam_map.keyframes[id] for id in ranked[:most]]
+
+
+def votes_for(slam_map: SlamMap, words: NDArray[np.uint64], anchors: IntArray) -> IntArray:
+    """Those of the anchors ``(A,)`` that keypoints of an image resemble, each once."""
+    voters = words[:: 1 + (len(words) - 1) // MOST_VOTERS] if len(words) else words
+    if len(voters) == 0 or len(anchors) < 2:
+        return anchors[:0]
+    known = np.ascontiguousarray(slam_map.anchors.words[anchors]).view(np.uint8)
+    distance, nearest = cv2.batchDistance(
+        np.ascontiguousarray(voters).view(np.uint8), known, cv2.CV_32S, normType=cv2.NORM_HAMMING, K=2
+    )
+    good = (distance[:, 0] <= MAX_HAMMING) & (distance[:, 0] <= RATIO * distance[:, 1])
+    return np.unique(anchors[nearest[good, 0]])

@@ -1,0 +1,192 @@
+"""Two pieces of one place are found to be one, with exact truth; two places never are."""
+
+import numpy as np
+import pytest
+from point_map import CAMERA, SCALE_FACTOR, PointMap, check_map
+
+from edgeslam_torch.atlas.atlas import Atlas
+from edgeslam_torch.atlas.links import common_scale, link, view_of
+from edgeslam_torch.atlas.places import lookalikes
+from edgeslam_torch.atlas.weld import move_piece
+from edgeslam_torch.config import EdgeConfig, OrbConfig, TrackingConfig
+from edgeslam_torch.frontend.matching import words
+from edgeslam_torch.geometry import se3, sim3
+from edgeslam_torch.map.trajectory import TrajectoryLog
+from edgeslam_torch.mapping.edge_map import EdgeMap, EdgePoints
+from edgeslam_torch.optim.problem import LmConfig
+from edgeslam_torch.tracking.relocaliser import match_keyframe
+from edgeslam_torch.tracking.tracker import Tracker
+
+MISPLACED = sim3.exp(np.array([0.5, -0.8, 0.3, 0.4, -0.3, 0.6, np.log(1.4)]))
+"""Where the second piece believes to be."""
+
+
+class Pieces:
+    """Views 0 to 3 in one piece, 4 to 7 in another, which has anchors of its own and lies elsewhere."""
+
+    def __init__(self, rng, same_place=True, noise_px=0.3):
+        points = self.points = PointMap(rng, 1200, 8, noise_px)
+        self.map = points.map
+        self.map.begin_piece("first")
+        points.fill(range(4))
+        self.map.begin_piece("second")
+        if not same_place:
+            points.descriptors = rng.integers(0, 256, points.descriptors.shape, dtype=np.uint8)
+        later = points.keyframes[4:]
+        known = np.unique(np.concatenate(points.point_of[4:]))
+        anchor_of = np.full(len(points.world.p_w), -1)
+        anchor_of[known] = self.map.anchors.add(
+            sim3.transform(MISPLACED, points.world.p_w[known]),
+            words(points.descriptors[known]),
+            4,
+            False,
+            np.zeros((len(known), 3), np.uint8),
+        )
+        for keyframe, seen in zip(later, points.point_of[4:], strict=True):
+            keyframe.words = words(points.descriptors[seen])
+            keyframe.T_c_w = sim3.moved_camera(MISPLACED, keyframe.T_c_w)
+            keyframe.anchor[:] = anchor_of[seen]
+            self.map.add_keyframe(keyframe)
+        self.map.refresh_anchors(anchor_of[known])
+        self.keyframes = points.keyframes
+        self.tracker = Tracker(self.map, CAMERA, OrbConfig(), TrackingConfig())
+        self.edges = EdgeMap(self.map, CAMERA, EdgeConfig(), 0.3)
+        self.log = TrajectoryLog(self.map)
+        for keyframe in self.keyframes:
+            self.log.append(keyframe.frame_index, keyframe.stamp_s, keyframe.id, keyframe.T_c_w, True)
+
+    def atlas(self):
+        return Atlas(self.tracker, self.edges, self.log, LmConfig(diagnostics=False))
+
+    def position_error(self):
+        """Of all keyframes after the one similarity that fits them best."""
+        found = np.stack([k.centre_w for k in self.keyframes])
+        truth = np.stack([-T[:3, :3].T @ T[:3, 3] for T in self.points.world.T_c_w])
+        return np.linalg.norm(sim3.transform(sim3.fit(found, truth), found) - truth, axis=1).max()
+
+
+def test_two_pieces_of_one_place_become_one(rng):
+    pieces = Pieces(rng)
+    assert pieces.position_error() > 0.2
+    join = pieces.atlas().update()
+    assert (join.piece, join.absorbed, join.links >= 2) == (0, 1, True)
+    assert sim3.scale_of(join.S) == pytest.approx(1 / 1.4 if join.moved == 1 else 1.4, rel=0.02)
+    assert "piece 1 joined piece 0" in join.in_words()
+    check_map(pieces.map)
+    assert {pieces.map.piece_of(k.id) for k in pieces.keyframes} == {0}
+    assert pieces.position_error() < 0.01
+    shared = pieces.map.shared_counts(pieces.keyframes[1].anchor[pieces.keyframes[1].anchor >= 0])
+    assert max(shared.get(k.id, 0) for k in pieces.keyframes[4:]) > 200
+    assert pieces.log.support().piece.tolist() == [0] * 8
+
+
+def test_a_piece_is_asked_again_only_by_new_keyframes(rng):
+    pieces = Pieces(rng)
+    atlas = pieces.atlas()
+    assert atlas.update() is not None
+    assert atlas.update() is None
+    assert len(atlas.joins) == 1
+
+
+def test_two_places_stay_two_pieces(rng):
+    pieces = Pieces(rng, same_place=False)
+    before = [k.T_c_w.copy() for k in pieces.keyframes]
+    assert pieces.atlas().update() is None
+    assert [pieces.map.piece_of(k.id) for k in pieces.keyframes] == [0] * 4 + [1] * 4
+    for keyframe, T_c_w in zip(pieces.keyframes, before, strict=True):
+        np.testing.assert_array_equal(keyframe.T_c_w, T_c_w)
+
+
+def test_one_keyframe_alone_joins_nothing(rng):
+    pieces = Pieces(rng)
+    for keyframe in pieces.keyframes[5:]:
+        pieces.map.forget_observations(keyframe, keyframe.keypoints_with_anchor())
+    assert pieces.atlas().update() is None
+    assert pieces.map.piece_of(pieces.keyframes[4].id) == 1
+
+
+def test_links_that_disagree_join_nothing(rng):
+    """Half of the second piece has come apart from the other half: no two links say the same."""
+    pieces = Pieces(rng)
+    anchors = pieces.map.anchors
+    for n, keyframe in enumerate(pieces.keyframes[4:]):
+        own = keyframe.anchor[keyframe.anchor >= 0]
+        ids = anchors.add(anchors.p_w[own], anchors.words[own], 9, False, np.zeros((len(own), 3), np.uint8))
+        pieces.map.forget_observations(keyframe, keyframe.keypoints_with_anchor()[:0])
+        S = sim3.exp(np.array([0, 0, 0, 0, 0, 0, 0.25 * n]))
+        anchors.p_w[ids] = sim3.transform(S, anchors.p_w[own])
+        anchors.observations[own] -= 1
+        keyframe.anchor[keyframe.anchor >= 0] = ids
+        anchors.observations[ids] += 1
+        keyframe.T_c_w = sim3.moved_camera(S, keyframe.T_c_w)
+        pieces.map.refresh_anchors(ids)
+    assert pieces.atlas().update() is None
+
+
+def test_link_tells_the_similarity(rng):
+    pieces = Pieces(rng)
+    found = link(pieces.tracker, pieces.keyframes[4], pieces.keyframes[3])
+    error = sim3.log(found.S @ MISPLACED)
+    assert np.abs(error[3:6]).max() < 0.005
+    assert abs(error[6]) < 0.01
+    assert np.abs(error[:3]).max() < 0.03
+    assert found.sigma_log < 0.01
+    assert found.agrees(link(pieces.tracker, pieces.keyframes[5], pieces.keyframes[3]))
+
+
+def test_depths_that_do_not_agree_are_no_scale(rng):
+    """The same pictures on a wall that stands elsewhere in every direction: a pose fits, the depths do not."""
+    pieces = Pieces(rng)
+    keyframe = pieces.keyframes[4]
+    track = match_keyframe(pieces.tracker, view_of(keyframe, SCALE_FACTOR), pieces.keyframes[3])
+    scale, _ = common_scale(pieces.tracker, keyframe, track)
+    assert scale == pytest.approx(1 / 1.4, rel=0.01)
+    own = keyframe.anchor[keyframe.anchor >= 0]
+    away = pieces.map.anchors.p_w[own] - keyframe.centre_w
+    pieces.map.anchors.p_w[own] = keyframe.centre_w + away * np.exp(rng.normal(0.0, 0.4, (len(own), 1)))
+    assert common_scale(pieces.tracker, keyframe, track) is None
+
+
+def test_lookalikes_are_the_keyframes_that_see_the_same(rng):
+    pieces = Pieces(rng)
+    found = lookalikes(pieces.map, pieces.keyframes[4].words, pieces.keyframes[:4], 3)
+    assert len(found) == 3
+    stranger = rng.integers(0, 2**63, (500, 4)).astype(np.uint64)
+    assert lookalikes(pieces.map, stranger, pieces.keyframes[:4], 3) == []
+    assert lookalikes(pieces.map, stranger[:0], pieces.keyframes[:4], 3) == []
+    assert lookalikes(pieces.map, stranger, [], 3) == []
+
+
+def test_moving_a_piece_changes_nothing_that_its_cameras_see(rng):
+    pieces = Pieces(rng)
+    slam_map, anchors = pieces.map, pieces.map.anchors
+    first, last = pieces.keyframes[0], pieces.keyframes[7]
+    p_c = np.array([[0.1, 0.2, 2.0]])
+    none = np.zeros((1, 3), np.uint8)
+    for keyframe in (first, last):
+        one = np.ones(1)
+        pieces.edges.hosts.append(
+            EdgePoints(keyframe.id, p_c[:, :2], p_c[:, :2], p_c.copy(), 0.1 * one, none, one.astype(np.int32))
+        )
+    held = last.anchor[last.anchor >= 0]
+    anchors.from_depth[held[0]] = True
+    anchors.rest_on_prior(held[:1], last.id, last.centre_w, np.array([[0.5, 0.1]]))
+    slam_map.remove_keyframe(pieces.keyframes[6])
+    seen = [CAMERA.project(se3.transform(k.T_c_w, anchors.p_w[k.anchor[k.anchor >= 0]])) for k in (first, last)]
+    stamps, T_before = pieces.log.poses()
+    S = sim3.exp(rng.normal(size=7))
+    scale = sim3.scale_of(S)
+    move_piece(slam_map, pieces.edges, pieces.log, 1, S)
+    check_map(slam_map)
+    for keyframe, uv in zip((first, last), seen, strict=True):
+        ids = keyframe.anchor[keyframe.anchor >= 0]
+        np.testing.assert_allclose(CAMERA.project(se3.transform(keyframe.T_c_w, anchors.p_w[ids])), uv, atol=1e-6)
+    np.testing.assert_allclose(anchors.prior[held[0]], np.array([0.5, 0.1]) / scale)
+    np.testing.assert_allclose(anchors.origin[held[0]], last.centre_w)
+    np.testing.assert_allclose(pieces.edges.hosts[0].p_c, p_c)
+    np.testing.assert_allclose(pieces.edges.hosts[1].p_c, scale * p_c)
+    assert pieces.edges.hosts[1].sigma[0] == pytest.approx(0.1 * scale)
+    _, T_after = pieces.log.poses()
+    np.testing.assert_allclose(T_after[:4], T_before[:4])
+    np.testing.assert_allclose(T_after[4:, :3, 3], sim3.transform(S, T_before[4:, :3, 3]), atol=1e-9)
+    np.testing.assert_allclose(T_after[4:, :3, :3], sim3.parts(S)[1] @ T_before[4:, :3, :3], atol=1e-9)
