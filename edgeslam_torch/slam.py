@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import torch
 
+from edgeslam_torch.atlas.atlas import Atlas, Join
 from edgeslam_torch.config import SlamConfig
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.frontend.depth_check import CheckedDepth, DepthFunction
@@ -30,6 +31,7 @@ from edgeslam_torch.mapping.edge_map import EdgeMap
 from edgeslam_torch.mapping.last_refinement import last_refinement, lm_config
 from edgeslam_torch.mapping.mapper import Mapper
 from edgeslam_torch.mapping.pipeline import MappingPipeline
+from edgeslam_torch.states.joining import Joining
 from edgeslam_torch.states.lost import Lost
 from edgeslam_torch.states.machine import Machine, State
 from edgeslam_torch.states.starting import FIRST_FRAME, Starting
@@ -113,8 +115,10 @@ class EdgeSlam:
         if realtime:
             self.events["keyframes_skipped"] = 0
         self._machine = Machine()
+        atlas = Atlas(self._system.tracker, self.edges, self.log, lm)
+        self._joining = Joining(self._system, atlas)
         self._tracking = Tracking(self._system)
-        self._starting = Starting(self._system, self._tracking, lm, realtime)
+        self._starting = Starting(self._system, self._tracking, atlas, lm, realtime)
         self._lost = Lost(self._system, self._tracking, self._starting)
         cv2.setRNGSeed(config.seed)
 
@@ -164,6 +168,8 @@ class EdgeSlam:
         system = self._system
         system.stage_ms = {}
         system.collect()
+        with system.timed("joining"):
+            joined = self._joining.update()
         with system.timed("features"):
             seen = prepared if prepared is not None else self.prepare(frame)
             system.shows_nothing_new = self._repeats.repeats(seen.grey, frame.stamp_s)
@@ -175,7 +181,7 @@ class EdgeSlam:
         step = self._step(frame, seen)
         self._machine.meet(step.event, frame.stamp_s)
         system.motion.stamp_s = frame.stamp_s
-        return self._output(frame, step)
+        return self._output(frame, step, joined)
 
     def _step(self, frame: Frame, seen: LazyView) -> Step:
         """Process a frame in the current state."""
@@ -192,6 +198,7 @@ class EdgeSlam:
     def finish(self) -> None:
         """Refine the whole map, measure the remaining edges and fix the published scale after the last frame."""
         self._system.collect(wait=True)
+        self._joining.finish()
         result = last_refinement(self.map, self.camera, self.edges, self.config.window)
         self._losses = {} if result is None else result.losses
         self._system.fusion.revise(*self.log.poses())
@@ -237,6 +244,10 @@ class EdgeSlam:
         """Pieces of map that the frames belong to; the transforms between them are unknown."""
         return self.log.pieces()
 
+    def joins(self) -> list[Join]:
+        """Pieces that were found to be one, with the evidence, in the order of time."""
+        return list(self._joining.atlas.joins)
+
     def telemetry_statistics(self) -> dict[str, float]:
         """Telemetry statistics: counts, delay, tilt, scale by source; empty without telemetry."""
         return self._system.fusion.statistics() if self._system.has_telemetry else {}
@@ -260,7 +271,7 @@ class EdgeSlam:
 
     # -- helpers -----------------------------------------------------------------------------------------------
 
-    def _output(self, frame: Frame, step: Step) -> SlamOutput:
+    def _output(self, frame: Frame, step: Step, joined: str) -> SlamOutput:
         system, track = self._system, step.track
         T_c_w = system.motion.T_c_w
         self.log.append(frame.index, frame.stamp_s, step.keyframe.id, T_c_w, step.status.supported, step.T_c_before)
@@ -269,7 +280,7 @@ class EdgeSlam:
             stamp_s=frame.stamp_s,
             T_w_c=system.published.pose(se3.inverse(T_c_w)),
             status=step.status,
-            reason=step.reason or (REPEATED if system.shows_nothing_new else ""),
+            reason="; ".join(filter(None, (joined, step.reason))) or (REPEATED if system.shows_nothing_new else ""),
             matches=0 if track is None else track.matches,
             inliers=0 if track is None else track.inliers,
             parallax_rad=step.parallax_rad,

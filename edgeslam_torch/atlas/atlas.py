@@ -82,14 +82,16 @@ class Atlas:
 
         The map must belong to the caller.
         """
-        new = [k for id, k in sorted(self.map.keyframes.items()) if id > self._asked]
-        if new:
-            self._asked = new[-1].id
-        for keyframe in new:
-            join = self._ask(keyframe)
+        for id in sorted(id for id in self.map.keyframes if id > self._asked):
+            self._asked = id
+            join = self._ask(self.map.keyframes[id])
             if join is not None:
                 return join
         return None
+
+    def ask_all_again(self) -> None:
+        """Let the next `update` ask every keyframe."""
+        self._asked = -1
 
     def _ask(self, keyframe: Keyframe) -> Join | None:
         piece = self.map.piece_of(keyframe.id)

@@ -1,10 +1,10 @@
 """Proof that a keyframe shows another piece of map, and the similarity between its own piece and that one.
 
-The keyframe is searched in the other piece as a lost frame is (`tracking/relocaliser.py`), which gives its pose there on
-the evidence of hundreds of keypoints. What a pose leaves open is the scale: keypoints that have an anchor on both sides
-have two depths, and these must not only tell a scale but agree about it, since they come from two reconstructions that
-know nothing of each other. At last the way back must close: the other keyframe, searched in the first piece, has to be
-where the similarity says.
+The keyframe is searched in the other piece as a lost frame is (`tracking/relocaliser.py`), which gives its pose there
+on the evidence of hundreds of keypoints. What a pose leaves open is the scale: keypoints that have an anchor on both
+sides have two depths, and these must not only tell a scale but agree about it, since they come from two reconstructions
+that know nothing of each other. At last the way back must close: the other keyframe, searched in the first piece, has
+to be where the similarity says.
 """
 
 from dataclasses import dataclass

@@ -31,11 +31,7 @@ class Lost:
         """Search for the frame; go on by prediction, or begin anew, where that fails."""
         T_predicted = self.system.predict(frame.stamp_s, lost=True)
         found = self.tracking.search(frame, seen, T_predicted, machine.lost_frames)
-        if found is None:
-            return self.miss(frame, seen.view, T_predicted, machine.lost_since_s)
-        self.system.events["relocalised"] += 1
-        self.system.motion.stop()
-        return found
+        return found or self.miss(frame, seen.view, T_predicted, machine.lost_since_s)
 
     def begin(self, frame: Frame, view: View) -> Step:
         """The first frame that nothing says the place of."""

@@ -2,7 +2,7 @@
 
 ::
 
-              two views, map from depth                    edges alone
+       two views, map from depth, earlier piece            edges alone
     STARTING ---------------------------> TRACKING <----------------------> EDGES_ONLY
       ^   ^ \\                              |    ^           points             |
       |   |  \\ too little texture          |    |                              |
@@ -38,6 +38,7 @@ class Event(StrEnum):
     WAITING = "waiting for parallax"
     MAP_STANDS = "map stands"
     """From two views, or from the depth network where the view changed before parallax came."""
+    RETURNED = "found in an earlier piece of map"
     POINTS = "found by points"
     EDGES = "found by edges alone"
     NOTHING = "not found"
@@ -51,6 +52,7 @@ TRANSITIONS: dict[State, dict[Event, State]] = {
         Event.BEGUN: State.STARTING,  # the guess went out of sight: the next attempt
         Event.NO_TEXTURE: State.LOST,
         Event.MAP_STANDS: State.TRACKING,
+        Event.RETURNED: State.TRACKING,
     },
     State.TRACKING: _FOUND,
     State.EDGES_ONLY: _FOUND,

@@ -4,6 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from edgeslam_torch.atlas.atlas import CLOSER_LOOKS, Atlas
+from edgeslam_torch.atlas.places import lookalikes
 from edgeslam_torch.frontend.image import colours_at
 from edgeslam_torch.map.depth_prior import sample
 from edgeslam_torch.map.keyframe import Keyframe, make_keyframe
@@ -15,7 +17,7 @@ from edgeslam_torch.states.tracking import Tracking
 from edgeslam_torch.tracking.bootstrap import Bootstrap, StartedMap
 from edgeslam_torch.tracking.initialiser import TwoView
 from edgeslam_torch.tracking.lazy_view import LazyView
-from edgeslam_torch.tracking.relocaliser import candidates, match_keyframe
+from edgeslam_torch.tracking.relocaliser import Reach, candidates, match_keyframe
 from edgeslam_torch.tracking.tracker import Track, View
 from edgeslam_torch.types import FloatArray, Frame, FrameStatus
 
@@ -38,6 +40,9 @@ FIRST_FRAME = "first frame, depth guessed"
 AFTER_LOSS = "new piece of map after loss: pose predicted, depth guessed"
 """How a piece of map is begun, in words."""
 
+NOWHERE = Reach(np.eye(4), -np.inf, -np.inf)
+"""Of a camera that may be in another piece of map: no place is expected, so that several frames must agree."""
+
 DEPTH_MAP = "map from the depth network, no parallax yet"
 
 
@@ -47,13 +52,15 @@ class Starting:
     Args:
         system: Shared parts.
         tracking: Takes over once the map stands.
+        atlas: Knows the earlier pieces.
         lm: Solver settings.
         realtime: Fewer frames wait for the map to stand.
     """
 
-    def __init__(self, system: System, tracking: Tracking, lm: LmConfig, realtime: bool) -> None:
+    def __init__(self, system: System, tracking: Tracking, atlas: Atlas, lm: LmConfig, realtime: bool) -> None:
         self.system = system
         self.tracking = tracking
+        self.atlas = atlas
         self.lm = lm
         self.config = system.config.initialisation
         if realtime:
@@ -72,9 +79,7 @@ class Starting:
         system, slam_map = self.system, self.system.map
         system.collect(wait=True)
         self.tracking.forget()
-        if self._attempt is not None:
-            self._attempt.forget_guess()
-            self._attempt = None
+        self._give_up()
         T_c_w = system.motion.T_c_w
         keyframe = make_keyframe(slam_map.next_keyframe_id(), frame.index, frame.stamp_s, T_c_w, view.features)
         if len(view.features.uv) < MIN_KEYPOINTS:
@@ -98,7 +103,11 @@ class Starting:
         assert attempt is not None
         view = seen.view
         with self.system.timed("tracking"):
-            track = self._track(attempt, frame, view)
+            back = self._find_earlier_piece(attempt, frame, view)
+            track = self._track(attempt, frame, view) if back is None else None
+        if back is not None:
+            self._give_up()
+            return replace(self.tracking.return_to(frame, seen, back.T_c_w, back), event=Event.RETURNED)
         if track is None or track.inliers < MIN_INLIERS:
             self.system.events["restarted"] += 1
             self.system.motion.stop()
@@ -124,6 +133,20 @@ class Starting:
         return Step(
             Event.WAITING, attempt.reference, FrameStatus.STARTING, reason, track, parallax_rad=two_view.parallax_rad
         )
+
+    def _give_up(self) -> None:
+        """Take the present attempt's guesses out of the map."""
+        if self._attempt is not None:
+            self._attempt.forget_guess()
+            self._attempt = None
+
+    def _find_earlier_piece(self, attempt: Bootstrap, frame: Frame, view: View) -> Track | None:
+        """The place of the frame, if it is one of an earlier piece; where that lies from here nobody knows."""
+        strangers = self.atlas.strangers(self.system.map.piece_of(attempt.reference.id))
+        if not strangers:
+            return None
+        asked = lookalikes(self.system.map, view.words, strangers, CLOSER_LOOKS)
+        return self.tracking.find(frame, view, asked, NOWHERE)
 
     def _track(self, attempt: Bootstrap, frame: Frame, view: View) -> Track | None:
         system = self.system

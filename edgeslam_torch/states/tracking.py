@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from edgeslam_torch.atlas.places import lookalikes
 from edgeslam_torch.map.keyframe import Keyframe, make_keyframe
 from edgeslam_torch.mapping.prior_anchors import depth_slack_px
 from edgeslam_torch.states.machine import Event
@@ -13,7 +14,7 @@ from edgeslam_torch.tracking.edge_tracker import MIN_EDGES, EdgeTracker, PointsI
 from edgeslam_torch.tracking.flow import FlowTracker, Followed, Template, join, template_of_keyframe, template_of_track
 from edgeslam_torch.tracking.keyframe_choice import few_matches, is_due, lost_most, lost_sight
 from edgeslam_torch.tracking.lazy_view import LazyView
-from edgeslam_torch.tracking.relocaliser import Relocaliser, candidates
+from edgeslam_torch.tracking.relocaliser import Reach, Relocaliser, candidates
 from edgeslam_torch.tracking.tracker import Track, View, median_parallax
 from edgeslam_torch.types import FloatArray, Frame, FrameStatus, IntArray
 
@@ -78,10 +79,15 @@ class Tracking:
                 view = seen.view
             with self.system.timed("tracking"):
                 track = self._relocalise(frame, view, T_predicted, lost_frames)
-            if track is None:
-                return None
-            located = self._located(track, view, seen, frame.stamp_s, None, relocalised=True)
-            return self.arrive(frame, seen, T_predicted, located)
+            return None if track is None else self.return_to(frame, seen, T_predicted, track)
+
+    def return_to(self, frame: Frame, seen: LazyView, T_predicted: FloatArray, track: Track) -> Step:
+        """Go on in the map at a place that was found again."""
+        self.system.events["relocalised"] += 1
+        located = self._located(track, seen.view, seen, frame.stamp_s, None, relocalised=True)
+        step = self.arrive(frame, seen, T_predicted, located)
+        self.system.motion.stop()
+        return step
 
     def arrive(self, frame: Frame, seen: LazyView, T_predicted: FloatArray, located: Located) -> Step:
         """Take the place that was found for the frame's, and make it a keyframe if one is due."""
@@ -162,11 +168,18 @@ class Tracking:
         return track, track is not None
 
     def _relocalise(self, frame: Frame, view: View, T_predicted: FloatArray, lost_frames: int) -> Track | None:
-        """Search the keyframes; the frames before that waited for a confirmation get their poses too."""
+        """Search keyframes near the prediction and those that look alike."""
         system = self.system
         tries = system.config.tracking.relocalisation_keyframes
-        asked = candidates(system.tracker, T_predicted, tries, lost_frames)
-        found = self.relocaliser.find(frame.index, view, asked, system.reach(frame.stamp_s, T_predicted))
+        near = candidates(system.tracker, T_predicted, tries - tries // 2, lost_frames)
+        others = [k for k in system.map.keyframes.values() if not any(k is n for n in near)]
+        alike = lookalikes(system.map, view.words, others, tries // 2)
+        return self.find(frame, view, [*near, *alike], system.reach(frame.stamp_s, T_predicted))
+
+    def find(self, frame: Frame, view: View, asked: list[Keyframe], reach: Reach) -> Track | None:
+        """Search keyframes for a frame; frames before it that waited for a confirmation get their poses too."""
+        system = self.system
+        found = self.relocaliser.find(frame.index, view, asked, reach)
         if found is None:
             return None
         if found.earlier:

@@ -59,6 +59,11 @@ class MotionModel:
         """Forget the velocity: the pose came by a leap."""
         self._velocity = np.zeros(6)
 
+    def carry(self, T_c_w: FloatArray, scale: float) -> None:
+        """Go along with a map that was moved and scaled."""
+        self.T_c_w = se3.orthonormalised(T_c_w)
+        self._velocity = self._velocity * np.array([scale] * 3 + [1.0] * 3)
+
     def correct(self, T_c_c: FloatArray) -> None:
         """Carry the present pose along with a refinement that moved its keyframe by ``(4, 4)`` on the right."""
         self.T_c_w = se3.orthonormalised(self.T_c_w @ T_c_c)

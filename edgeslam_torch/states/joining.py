@@ -1,0 +1,45 @@
+"""Between two frames: pieces of map that new keyframes show to be one are joined, and the present pose goes along."""
+
+from dataclasses import replace
+
+from edgeslam_torch.atlas.atlas import Atlas, Join
+from edgeslam_torch.geometry import se3, sim3
+from edgeslam_torch.states.system import System
+
+
+class Joining:
+    """Asks the atlas while nobody else works on the map."""
+
+    def __init__(self, system: System, atlas: Atlas) -> None:
+        self.system = system
+        self.atlas = atlas
+
+    def update(self) -> str:
+        """Join what the newest keyframes show to be one; the joins in words, empty when there were none."""
+        if self.system.mapping.busy:
+            return ""
+        return "; ".join(join.in_words() for join in iter(self._once, None))
+
+    def finish(self) -> None:
+        """Ask every keyframe once more: pieces have grown since they were asked."""
+        self.atlas.ask_all_again()
+        self.update()
+
+    def _once(self) -> Join | None:
+        system = self.system
+        if not system.log.records:
+            return None
+        last = system.log.records[-1].keyframe_id
+        piece, T_k_w = system.map.piece_of(last), system.map.pose_of(last)
+        join = self.atlas.update()
+        if join is None:
+            return None
+        T_c_k = system.motion.T_c_w @ se3.inverse(T_k_w)
+        scale = sim3.scale_of(join.S) if join.moved == piece else 1.0
+        T_c_k[:3, 3] *= scale
+        system.motion.carry(T_c_k @ system.map.pose_of(last), scale)
+        system.fusion.revise(*system.log.poses())
+        # Poses published before are those of a piece that has moved since, or that lies elsewhere than was guessed.
+        system.published = replace(system.published, revision=system.published.revision + 1)
+        system.events["joined"] = system.events.get("joined", 0) + 1
+        return join
