@@ -387,6 +387,25 @@ def test_a_cut_to_another_place_leaves_two_pieces_and_says_so():
     assert ate(slam.trajectory()[1][36:], there.T_w_c) < 0.012
 
 
+def test_two_pieces_are_joined_when_the_second_comes_to_the_place_of_the_first():
+    """Along the panels, a leap to their far end, and back: where the second piece lies is known once they meet."""
+    long = film(stairs_world(), CAMERA, sideways(60, 0.06))
+    order = [*range(20), *range(59, 10, -1)]
+    slam, outputs = go([Frame(i, 0.1 * i, long.frames[k].image) for i, k in enumerate(order)])
+    (join,) = slam.joins()
+    told = [o for o in outputs if "piece 1 joined piece 0" in o.reason]
+    assert [o.stamp_s > join.stamp_s for o in told] == [True]
+    assert slam.events["joined"] == 1
+    assert [o.piece for o in outputs] == [0] * 27 + [1] * (told[0].index - 27) + [0] * (len(order) - told[0].index)
+    assert told[0].revision == outputs[told[0].index - 1].revision + 1, "poses said before are to be read anew"
+    assert [(p.number, p.supported) for p in slam.pieces()] == [(0, len(order))], "lost frames got their poses too"
+    assert slam.warnings() == []
+    assert ate(slam.trajectory()[1], long.T_w_c[order]) < 0.03  # of 3.3 m; a second piece at the prediction: 0.5
+    # The live pose went along with its piece.
+    after = np.stack([o.T_w_c for o in outputs[told[0].index :]])
+    assert ate(after, long.T_w_c[order][told[0].index :]) < 0.01
+
+
 def test_few_keypoints_after_a_dark_start_still_begin_a_map():
     """150 keypoints are enough for a first frame; they must be enough after black ones too."""
     poor = replace(NO_NETWORK, orb=replace(NO_NETWORK.orb, features=150, candidates=300))

@@ -71,12 +71,16 @@ class TrajectoryLog:
         Each is tied to the last of the keyframes (in order) before it.
         """
         indices = [k.frame_index for k in keyframes]
+        left = dict(T_c_w_of_frame)
         for record in reversed(self.records):
-            if record.index not in T_c_w_of_frame:
+            if not left:
                 break
+            T_c_w = left.pop(record.index, None)
+            if T_c_w is None:
+                continue
             keyframe = keyframes[max(bisect.bisect_right(indices, record.index) - 1, 0)]
             record.keyframe_id = keyframe.id
-            record.T_c_k = T_c_w_of_frame[record.index] @ keyframe.T_w_c
+            record.T_c_k = T_c_w @ keyframe.T_w_c
             record.supported = True
 
     def scale(self, piece: int, scale: float) -> None:

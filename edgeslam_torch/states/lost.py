@@ -41,6 +41,7 @@ class Lost:
     def miss(self, frame: Frame, view: View, T_predicted: FloatArray, lost_since_s: float) -> Step:
         """Take the prediction, or begin a new piece of map there when the loss has lasted."""
         system = self.system
+        self.tracking.backfill.keep(frame, view)
         system.motion.drift(T_predicted)
         system.fusion.add_visual(frame.stamp_s, se3.inverse(T_predicted), np.inf, np.inf, tracked=False)
         seen = len(view.features.uv)

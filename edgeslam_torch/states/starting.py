@@ -173,6 +173,7 @@ class Starting:
         system.edges.announce(reference)
         system.compare_depth(reference)
         self.tracking.begin(seen, started.new)
+        self.tracking.backfill.place(reference, reference.T_c_w, reference.anchor[reference.anchor >= 0])
         return Step(
             Event.MAP_STANDS, keyframe, FrameStatus.INITIALISED, reason, track, two_view.parallax_rad, is_keyframe=True
         )

@@ -7,6 +7,7 @@ import numpy as np
 from edgeslam_torch.atlas.places import lookalikes
 from edgeslam_torch.map.keyframe import Keyframe, make_keyframe
 from edgeslam_torch.mapping.prior_anchors import depth_slack_px
+from edgeslam_torch.states.backfill import Backfill
 from edgeslam_torch.states.machine import Event
 from edgeslam_torch.states.step import Located, Step
 from edgeslam_torch.states.system import System
@@ -32,6 +33,7 @@ class Tracking:
         )
         self._edge_tracker = EdgeTracker(system.map, system.edges, system.camera)
         self.relocaliser = Relocaliser(system.tracker)
+        self.backfill = Backfill(system)
         self._template: Template | None = None
         """What the next frames are followed from; none before there is a map."""
         self._recent: IntArray = np.zeros(0, dtype=np.int64)
@@ -87,6 +89,7 @@ class Tracking:
         located = self._located(track, seen.view, seen, frame.stamp_s, None, relocalised=True)
         step = self.arrive(frame, seen, T_predicted, located)
         self.system.motion.stop()
+        self.backfill.place(step.keyframe, track.T_c_w, track.anchor)
         return step
 
     def arrive(self, frame: Frame, seen: LazyView, T_predicted: FloatArray, located: Located) -> Step:

@@ -1,0 +1,52 @@
+"""Frames without a pose get one when the map that they show is there: backwards in time from where it was found.
+
+A camera that was carried away sees its new place at once, but the map of it begins later, or is recognised later.
+"""
+
+from edgeslam_torch.map.keyframe import Keyframe
+from edgeslam_torch.states.system import System
+from edgeslam_torch.tracking.relocaliser import LIKELY_SHARE, place_of
+from edgeslam_torch.tracking.tracker import View
+from edgeslam_torch.types import FloatArray, Frame, IntArray
+
+MOST_FRAMES = 60
+"""Lost frames whose features are kept (3 MB): two seconds at 30 Hz."""
+MISSES = 2
+"""Frames in a row that are not found, after which the earlier ones are given up."""
+
+
+class Backfill:
+    """Remembers the frames of the present loss."""
+
+    def __init__(self, system: System) -> None:
+        self.system = system
+        self._lost: list[tuple[int, View]] = []
+
+    def keep(self, frame: Frame, view: View) -> None:
+        """Remember a frame without a pose; of too many the oldest is forgotten."""
+        self._lost = [*self._lost[1 - MOST_FRAMES :], (frame.index, view)]
+
+    def place(self, keyframe: Keyframe, T_c_w: FloatArray, anchors: IntArray) -> int:
+        """Find the lost frames one by one, the newest first.
+
+        Args:
+            keyframe: Their poses are tied to it.
+            T_c_w: ``(4, 4)`` pose of the frame that followed them.
+            anchors: What that frame sees.
+
+        Returns:
+            How many were found.
+        """
+        tracker, poses, missed = self.system.tracker, {}, 0
+        for index, view in reversed(self._lost):
+            track = tracker.track(view, T_c_w, anchors)
+            if track is None or place_of(tracker, view, track).share < LIKELY_SHARE:
+                missed += 1
+                if missed >= MISSES:
+                    break
+                continue
+            T_c_w, anchors, missed = track.T_c_w, track.anchor, 0
+            poses[index] = T_c_w
+        self._lost = []
+        self.system.log.replace(poses, [keyframe])
+        return len(poses)
