@@ -100,6 +100,9 @@ class Slam(Protocol):
     def pieces(self) -> list[Piece]:
         """Pieces of map that the frames belong to."""
 
+    def joins(self) -> Sequence[Any]:
+        """Pieces that were joined; ``in_words`` gives the evidence."""
+
     def warnings(self) -> list[str]:
         """Limits of the results, one line each."""
 
@@ -306,6 +309,7 @@ class _Run:
             },
             "losses": {k: v for k, v in self.slam.losses().items() if math.isfinite(v)},
             "events": dict(self.slam.events),
+            "joins": [join.in_words() for join in self.slam.joins()],
             "fusion": {k: v for k, v in self.slam.telemetry_statistics().items() if math.isfinite(v)},
             "mode": str(self.mode),
             "seed": self.config.seed,
@@ -313,13 +317,14 @@ class _Run:
             "ended_early": "interrupted" if self.interrupt.requested else self.writer.failure,
         }
         summary = without_folders(summary, self.writer.folder)
+        support = self.slam.support()
         title = f"{self.source.name}: {self.tally.frames} frames, {len(edge_map.p_w)} edge points"
 
         def picture(path: Path) -> None:
-            write_map_picture(path, edge_map, poses, scale.units, title)
+            write_map_picture(path, edge_map, poses[support.whole()], scale.units, title)
 
         extras = [(CAMERA, self.source.camera.save), (PICTURE, picture)]
-        self.writer.finish(summary, stamps, poses, self.slam.support(), edge_map, anchors, scale.units, extras)
+        self.writer.finish(summary, stamps, poses, support, edge_map, anchors, scale.units, extras)
         self.result = RunResult(
             self.writer.folder, summary, stamps, poses, self.interrupt.requested, self.writer.failure
         )

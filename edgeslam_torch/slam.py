@@ -114,6 +114,7 @@ class EdgeSlam:
         self._system.fusion.refined_poses = self.log.poses
         if realtime:
             self.events["keyframes_skipped"] = 0
+        self._finished = False
         self._machine = Machine()
         atlas = Atlas(self._system.tracker, self.edges, self.log, lm)
         self._joining = Joining(self._system, atlas)
@@ -199,6 +200,7 @@ class EdgeSlam:
         """Refine the whole map, measure the remaining edges and fix the published scale after the last frame."""
         self._system.collect(wait=True)
         self._joining.finish()
+        self._finished = True
         result = last_refinement(self.map, self.camera, self.edges, self.config.window)
         self._losses = {} if result is None else result.losses
         self._system.fusion.revise(*self.log.poses())
@@ -218,13 +220,21 @@ class EdgeSlam:
 
     def edge_map(self) -> PointCloud:
         """Semi-dense edge points confirmed by several keyframes, as a consistent snapshot."""
-        return self._system.published.cloud(self.edges.points())
+        return self._system.published.cloud(self.edges.points(self._shown_piece()))
 
     def anchors(self) -> PointCloud:
         """Triangulated anchors, as a consistent snapshot."""
         with self.map.lock:
-            cloud = self.map.anchors.cloud()
+            shown = self._shown_piece()
+            seen_by = [k for id, k in self.map.keyframes.items() if self.map.piece_of(id) == shown]
+            cloud = self.map.anchors.cloud(self.map.anchors_seen_by(seen_by))
         return self._system.published.cloud(cloud)
+
+    def _shown_piece(self) -> int | None:
+        """Number of the piece whose map is given out: the camera's while flying, in the end the largest."""
+        if not self.log.records:
+            return None
+        return self.support().largest() if self._finished else self.map.piece_of(self.log.records[-1].keyframe_id)
 
     def keyframes(self) -> list[Keyframe]:
         """Keyframes of the map, oldest first, in map units."""

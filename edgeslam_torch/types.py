@@ -186,6 +186,19 @@ class Support:
     supported: NDArray[np.bool_]
     """``(F,)`` whether the map supports its pose."""
 
+    def largest(self) -> int:
+        """Number of the piece with most supported frames; the oldest of equals."""
+        numbers, frames = np.unique(self.piece[self.supported], return_counts=True)
+        return int(numbers[frames.argmax()]) if len(numbers) else 0
+
+    def others(self) -> list[int]:
+        """Numbers of the other pieces with supported frames."""
+        return [int(n) for n in np.unique(self.piece[self.supported]) if n != self.largest()]
+
+    def whole(self) -> NDArray[np.bool_]:
+        """``(F,)`` frames of the largest piece, and those of no piece: predictions from it."""
+        return ~np.isin(self.piece, self.others())
+
 
 @dataclass(frozen=True, slots=True)
 class SlamOutput:

@@ -87,9 +87,9 @@ class Anchors:
         self.alive[ids] = False
         self._just_removed.extend(ids.tolist())
 
-    def cloud(self) -> PointCloud:
-        """Triangulated anchors; the caller holds the map's lock."""
-        ids = np.flatnonzero(self.alive & ~self.from_depth)
+    def cloud(self, ids: IntArray) -> PointCloud:
+        """Those of the given anchors that are triangulated; the caller holds the map's lock."""
+        ids = ids[self.alive[ids] & ~self.from_depth[ids]]
         return PointCloud(
             self.p_w[ids].astype(np.float32),
             self.colour[ids],

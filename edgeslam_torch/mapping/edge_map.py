@@ -179,20 +179,24 @@ class EdgeMap:
             other.observations[theirs[same]] += 1
             points.observations[np.unique(mine[same])] += 1
 
-    def points(self) -> PointCloud:
+    def points(self, piece: int | None = None) -> PointCloud:
         """Edge points that several keyframes agree on, fused in cells, in the map's world frame.
 
         A consistent snapshot, callable from any thread.
+
+        Args:
+            piece: Number of the piece of map whose edges are wanted; None for all.
         """
         with self.map.lock:  # the arrays are copies from here on
-            if not any(len(h.uv) for h in self.hosts):
+            hosts = [h for h in self.hosts if piece is None or self.map.piece_of(h.keyframe_id) == piece]
+            if not any(len(h.uv) for h in hosts):
                 empty = np.zeros((0, 3), np.float32)
                 return PointCloud(empty, np.zeros((0, 3), np.uint8), np.zeros(0, np.float32), np.zeros(0, np.int32))
-            p_w = np.concatenate([se3.transform(self._T_w_c(h), h.p_c) for h in self.hosts])
-            sigma = np.concatenate([h.sigma for h in self.hosts])
-            colour = np.concatenate([h.colour for h in self.hosts])
-            count = np.concatenate([h.observations for h in self.hosts])
-            depth = np.median(np.concatenate([h.p_c[:, 2] for h in self.hosts]))
+            p_w = np.concatenate([se3.transform(self._T_w_c(h), h.p_c) for h in hosts])
+            sigma = np.concatenate([h.sigma for h in hosts])
+            colour = np.concatenate([h.colour for h in hosts])
+            count = np.concatenate([h.observations for h in hosts])
+            depth = np.median(np.concatenate([h.p_c[:, 2] for h in hosts]))
         agreed = count >= self.config.min_observations
         return fuse(p_w[agreed], sigma[agreed], colour[agreed], count[agreed], self.config.voxel * float(depth))
 

@@ -28,6 +28,8 @@ ANCHORS = "anchors.ply"
 CONFIG = "config.toml"
 CAMERA = "camera.yaml"
 PICTURE = "map.png"
+PIECE = "trajectory_piece_{}.txt"
+"""Of pieces that were never joined with the largest, which is in `TRAJECTORY`."""
 OUTPUTS = (TRAJECTORY, ONLINE, STATUS, EDGE_MAP, ANCHORS, SUMMARY, CONFIG, CAMERA, PICTURE, "report.html")
 
 STATUS_COLUMNS = (
@@ -141,10 +143,12 @@ class RunWriter:
             "frame: world of trajectory.txt, z up",
             "sigma: standard deviation along the ray",
         )
-        rows = "".join(tum_line(stamp, T) for stamp, T in zip(stamps_s, T_w_c, strict=True))
+        rows = [tum_line(stamp, T) for stamp, T in zip(stamps_s, T_w_c, strict=True)]
+        whole = [row for row, inside in zip(rows, support.whole(), strict=True) if inside]
         live = self._live
         steps: list[tuple[str, Callable[[Path], None]]] = [
-            (TRAJECTORY, lambda path: write_text(path, TRAJECTORY_HEADER + rows)),
+            (TRAJECTORY, lambda path: write_text(path, TRAJECTORY_HEADER + "".join(whole))),
+            *(_piece_file(number, rows, support) for number in support.others()),
             (STATUS, lambda path: live.settle(support) if live is not None else None),
             (SUMMARY, lambda path: write_text(path, summary_text(summary))),
             (EDGE_MAP, lambda path: write_ply(path, edge_map, comments)),
@@ -175,6 +179,8 @@ class RunWriter:
         """Remove the files of an older run, and open this run's files."""
         for name in (*OUTPUTS, *(f".{name}.part" for name in OUTPUTS), _OLD_RESERVE):
             (self.folder / name).unlink(missing_ok=True)
+        for path in self.folder.glob(PIECE.format("*")):
+            path.unlink(missing_ok=True)
         live = _LiveFiles(self.folder)
         write_text(self.folder / CONFIG, self._config_toml)
         return live
@@ -228,6 +234,12 @@ class _LiveFiles:
             write_text(self._table, _csv_line(header) + "".join(padded))
         finally:
             self._status = Appender(self._table, None)
+
+
+def _piece_file(number: int, rows: Sequence[str], support: Support) -> tuple[str, Callable[[Path], None]]:
+    """Name and writer of the trajectory of a piece whose place in the others is unknown."""
+    mine = "".join(row for row, piece in zip(rows, support.piece, strict=True) if piece == number)
+    return PIECE.format(number), lambda path: write_text(path, TRAJECTORY_HEADER + mine)
 
 
 def tum_line(stamp_s: float, T_w_c: FloatArray) -> str:

@@ -213,7 +213,10 @@ def _pieces_sentence(summary: dict[str, Any]) -> str:
         f"piece {p.get('number')} from {_float(p.get('first_s')):.1f} to {_float(p.get('last_s')):.1f} s"
         for p in pieces
     )
-    return f"The map is in {len(pieces)} pieces whose relation is not known: {spans}. Errors across them mean nothing."
+    return (
+        f"The map is in {len(pieces)} pieces whose relation is not known: {spans}. This page is about the largest; "
+        "the others have trajectory files of their own."
+    )
 
 
 def _times(count: int) -> str:

@@ -70,6 +70,9 @@ class FakeSlam:
         stamps = [o.stamp_s for o in self.outputs]
         return [Piece(0, len(stamps), supported, stamps[0], stamps[-1], "first frame")]
 
+    def joins(self):
+        return []
+
     def warnings(self):
         return []
 

@@ -13,7 +13,7 @@ import pytest
 from fake_slam import FakeSlam
 
 from edgeslam_torch.errors import OutputError
-from edgeslam_torch.types import Frame, Units
+from edgeslam_torch.types import Frame, Support, Units
 from edgeslam_torch.writers.run_writer import OUTPUTS, RunWriter
 
 
@@ -71,6 +71,25 @@ def test_end_result(tmp_path):
     np.testing.assert_allclose(refined[:, 3] - online[:, 3], 1.0, atol=1e-8)
     assert json.loads((tmp_path / "summary.json").read_text()) == {"frames": 4, "sigma": None}
     assert not [p for p in tmp_path.iterdir() if p.name.startswith(".")]
+
+
+def test_pieces_that_were_never_joined_have_files_of_their_own(tmp_path):
+    """Frames 0 to 2 and 5 in the largest piece, 3 and 4 in another; 6 belongs to one that never stood."""
+    piece, supported = np.array([0, 0, 0, 1, 1, 0, 2]), np.array([1, 1, 1, 1, 1, 0, 0], bool)
+    (tmp_path / "trajectory_piece_7.txt").write_text("an older run's")
+    slam, frames = outputs(7)
+    with closing(RunWriter(tmp_path)) as writer:
+        for output in frames:
+            writer.append(output, 1.0)
+        stamps, poses = slam.trajectory()
+        support = Support(piece, supported)
+        assert (support.largest(), support.others()) == (0, [1])
+        writer.finish({}, stamps, poses, support, slam.edge_map(), slam.anchors(), Units.METRES)
+    whole, other = (np.loadtxt(tmp_path / name) for name in ("trajectory.txt", "trajectory_piece_1.txt"))
+    np.testing.assert_allclose(whole[:, 0], stamps[[0, 1, 2, 5, 6]], atol=1e-6)
+    np.testing.assert_allclose(other[:, 0], stamps[3:5], atol=1e-6)
+    np.testing.assert_allclose(other[:, 1:4], poses[3:5, :3, 3], atol=1e-8)
+    assert sorted(p.name for p in tmp_path.glob("trajectory_piece*")) == ["trajectory_piece_1.txt"]
 
 
 def leave_run(folder, frames=2):
