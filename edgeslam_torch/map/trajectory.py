@@ -87,8 +87,9 @@ class TrajectoryLog:
         """Follow a piece of map that was scaled: the ways from its keyframes to their frames."""
         for record in self.records:
             if self.map.piece_of(record.keyframe_id) == piece:
-                record.T_c_k = record.T_c_k.copy()
-                record.T_c_k[:3, 3] *= scale
+                record.T_c_k = _scaled(record.T_c_k, scale)
+                if record.T_c_before is not None:
+                    record.T_c_before = _scaled(record.T_c_before, scale)
 
     def support(self) -> Support:
         """What each frame's pose rests on in the map as it is now."""
@@ -120,6 +121,12 @@ class TrajectoryLog:
         T_c_w = np.stack([r.T_c_k for r in records]) @ np.stack([T_k_w[r.keyframe_id] for r in records])
         _close_gaps(records, T_c_w, T_k_w)
         return np.array([r.stamp_s for r in records]), se3.inverse(T_c_w)
+
+
+def _scaled(T: FloatArray, scale: float) -> FloatArray:
+    out = T.copy()
+    out[:3, 3] *= scale
+    return out
 
 
 def _close_gaps(records: list[FrameRecord], T_c_w: FloatArray, T_k_w: dict[int, FloatArray]) -> None:

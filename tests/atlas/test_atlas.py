@@ -173,7 +173,10 @@ def test_moving_a_piece_changes_nothing_that_its_cameras_see(rng):
     anchors.rest_on_prior(held[:1], last.id, last.centre_w, np.array([[0.5, 0.1]]))
     slam_map.remove_keyframe(pieces.keyframes[6])
     seen = [CAMERA.project(se3.transform(k.T_c_w, anchors.p_w[k.anchor[k.anchor >= 0]])) for k in (first, last)]
-    stamps, T_before = pieces.log.poses()
+    for i, near in enumerate((0.02, 0.04, 0.06)):  # frames between two keyframes; refinement has moved the second
+        T_c_w = se3.exp(np.array([near, 0, 0, 0, 0, 0])) @ last.T_c_w
+        pieces.log.append(80 + i, 8.0 + i, last.id, T_c_w, True, None if i < 2 else se3.exp(np.full(6, 0.01)))
+    _, T_before = pieces.log.poses()
     S = sim3.exp(rng.normal(size=7))
     scale = sim3.scale_of(S)
     move_piece(slam_map, pieces.edges, pieces.log, 1, S)
