@@ -81,7 +81,7 @@ def test_before_and_after_are_reported_and_weights_say_what_they_are(
     code, stdout, stderr = finetune(str(folder), steps=60)
     assert code == 0
     assert "kitchen: 11 images with depth" in stdout
-    assert "1 of 12 images with depth left out" in stderr
+    assert "1 images or depth maps left out" in stderr
     assert "rgb/3.png: unreadable" in stderr
     rows = [line.split("|") for line in stdout.splitlines() if line.startswith(("| before", "| after"))]
     assert float(rows[1][3]) < float(rows[0][3])
