@@ -66,7 +66,7 @@ def test_stated_sigma_is_that_of_the_errors(rng):
 
 
 def test_noise_of_both_sides_does_not_shrink_the_scale(rng):
-    error, _ = errors(lambda: [displaced(*moved(rng, 200, noise_map_m=0.03), math.sqrt(2) * 0.03)], 30)
+    error, _ = errors(lambda: [displaced(*moved(rng, 100, noise_map_m=0.03), math.sqrt(2) * 0.03)], 30)
     assert abs(np.mean(error)) < 0.02
 
 

@@ -61,8 +61,9 @@ def test_young_anchors_that_are_not_found_again_go(rng):
     points = PointMap(rng, 400, 3)
     anchor_of = points.fill([0, 1])
     mapper = make_mapper(points)
+    old = points.map.anchors.alive.copy()
     insert(mapper, points, 2, anchor_of)
-    young = mapper._recent
+    young = np.flatnonzero(points.map.anchors.alive & ~old)
     assert len(young) > 5
     points.map.anchors.visible[young] = 20
     points.map.anchors.found[young[1:]] = 3

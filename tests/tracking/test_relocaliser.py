@@ -65,9 +65,36 @@ def test_a_picture_that_hangs_elsewhere_too_is_no_place(points, rng):
     view = view_of(points, 3, rng, poster)
     wrong = match_keyframe(tracker, view, points.keyframes[3])
     assert wrong.inliers >= 2 * tracker.config.min_inliers, "enough by number"
-    for index in range(20):
+    for index in range(2 * AGREEING_FRAMES):
         assert relocaliser.find(index, view, points.keyframes, SOMEWHERE) is None
     assert relocaliser.waiting == 0
+
+
+def test_a_picture_alone_in_the_dark_is_no_place(points, rng):
+    """All that the frame sees is found, in one corner: whatever share of it agrees, it may hang anywhere."""
+    relocaliser = Relocaliser(tracker_of(points))
+    whole = view_of(points, 3, rng).features
+    inside = poster(whole.uv)
+    view = make_view(
+        FrameFeatures(whole.uv[inside], whole.octave[inside], whole.angle_rad[inside], whole.descriptors[inside]),
+        SCALE_FACTOR,
+    )
+    place = place_of(relocaliser.tracker, view, match_keyframe(relocaliser.tracker, view, points.keyframes[3]))
+    assert place.share > 0.8
+    for index in range(2 * AGREEING_FRAMES):
+        assert relocaliser.find(index, view, points.keyframes, SOMEWHERE) is None
+
+
+def test_a_pattern_that_fits_here_and_there_is_no_place(points, rng):
+    """One keypoint of twelve agrees, all over the image: doors that repeat do as well in the wrong place."""
+    tracker = tracker_of(points)
+    relocaliser = Relocaliser(tracker)
+    view = view_of(points, 3, rng, lambda uv: (uv // 10).sum(axis=1) % 12 == 0)
+    wrong = match_keyframe(tracker, view, points.keyframes[3])
+    assert wrong.inliers >= 2 * tracker.config.min_inliers, "enough by number"
+    assert place_of(tracker, view, wrong).spread > 0.5, "and wide enough"
+    for index in range(2 * AGREEING_FRAMES):
+        assert relocaliser.find(index, view, points.keyframes, SOMEWHERE) is None
 
 
 @pytest.mark.parametrize("view", [0, 3, 5])
