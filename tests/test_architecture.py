@@ -1,10 +1,12 @@
-"""Imports go down only, and nothing heavy loads before it is needed. The picture is in docs/architecture.md."""
+"""Imports go down only, as the table in docs/architecture.md says, and nothing heavy loads before it is needed."""
 
 import ast
+import re
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 
@@ -13,41 +15,41 @@ PACKAGE = ROOT / "edgeslam_torch"
 LINKED = ("models", "losses", "train", "eval")
 """Folders at the root that are parts of the package, by links where the checkout has them."""
 
-LAYERS: tuple[tuple[str, ...], ...] = (
-    ("errors", "types", "stage_times"),
-    ("files",),
-    ("geometry", "config"),
-    ("models", "synthetic"),
-    ("losses",),
-    ("optim",),
-    ("frontend", "fusion"),
-    ("map",),
-    ("mapping",),
-    ("tracking",),
-    ("atlas",),
-    ("atlas",),
-    ("states",),
-    ("slam",),
-    ("drone", "calibration"),
-    ("readers",),
-    ("writers",),
-    ("progress", "run_summary"),
-    ("run",),
-    ("eval",),
-    ("train",),
-    ("viewer", "demo"),
-    ("commands",),
-    ("command_line",),
-    ("cli",),
-)
-"""From the bottom up; a part may import its own row's other parts only when `SAME_ROW` says so."""
+TABLE = ROOT / "docs" / "architecture.md"
 
-RANK = {part: rank for rank, row in enumerate(LAYERS) for part in row}
 
-ALLOWED_UP = {
-    ("config", "fusion"),  # fusion/config.py holds its own section, and imports nothing
-}
-"""Exceptions, each with its reason."""
+class Row(NamedTuple):
+    """A layer: parts of the package, and the parts that each of them may import."""
+
+    parts: tuple[str, ...]
+    may_use: frozenset[str]
+    is_all: bool
+    """Whether it says "all above" instead of names."""
+
+
+def layer_table(text: str) -> list[Row]:
+    """Rows of the table below ``| layer |``, from the bottom of the house up."""
+    rows: list[Row] = []
+    below: list[str] = []
+    for line in text.split("| layer |", 1)[1].splitlines()[2:]:
+        if not line.startswith("|"):
+            break
+        parts, _, may_use = (cell.strip() for cell in line.strip("|").split("|"))
+        names = _names(parts)
+        is_all = may_use == "all above"
+        rows.append(Row(names, frozenset(below if is_all else _names(may_use)), is_all))
+        below += names
+    return rows
+
+
+def _names(cell: str) -> tuple[str, ...]:
+    return tuple(name.strip("/") for name in re.findall(r"`([\w/]+)`", cell))
+
+
+LAYERS = layer_table(TABLE.read_text(encoding="utf-8"))
+PARTS = [part for row in LAYERS for part in row.parts]
+MAY_USE = {part: row.may_use | set(LAYERS[0].parts) for row in LAYERS for part in row.parts}
+"""Everybody may use the first row."""
 
 NEVER = {"evo", "djitellopy", "open3d", "torchvision", "pypose"}
 """GPL, or measured and found wanting (docs/decisions/0028); tests may use some as outside oracles."""
@@ -64,8 +66,13 @@ def sources() -> list[Path]:
     return sorted({p for p in files if "__pycache__" not in p.parts})
 
 
-def imported(tree: ast.AST) -> Iterator[str]:
-    """Full names that a module imports, anywhere in it, except for the type checker alone."""
+def imported(tree: ast.AST, known: frozenset[str] = frozenset()) -> Iterator[str]:
+    """Full names that a module imports, anywhere in it, except for the type checker alone.
+
+    Args:
+        tree: The parsed module.
+        known: Modules; of ``from package import module`` the module counts, not the package.
+    """
     skipped: set[int] = set()
     for node in ast.walk(tree):
         if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
@@ -77,36 +84,82 @@ def imported(tree: ast.AST) -> Iterator[str]:
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, "imports are by full name"
-            yield node.module or ""
-            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+            names = {f"{node.module}.{alias.name}" for alias in node.names}
+            yield from names & known
+            if names - known:
+                yield node.module or ""
 
 
 def part_of(name: str) -> str | None:
-    """First part below the package of a full module name; None for other packages."""
+    """The table's part that a full module name belongs to, the most particular one; None for other packages."""
     words = name.split(".")
-    return words[1] if words[0] == "edgeslam_torch" and len(words) > 1 else None
+    if words[0] != "edgeslam_torch" or len(words) == 1:
+        return None
+    path = "/".join(words[1:])
+    found = [part for part in PARTS if path == part or path.startswith(f"{part}/")]
+    return max(found, key=len, default=f"{path}, which is not in the table")
+
+
+def forbidden(module: str, names: Iterable[str]) -> list[str]:
+    """Imports of a module that the table does not allow."""
+    own = part_of(module)
+    if own is None:
+        return []
+    allowed = MAY_USE.get(own, frozenset())
+    return [name for name in names if part_of(name) not in {None, own, *allowed}]
 
 
 def module_name(path: Path) -> str:
     """Full module name of a file in the package."""
     folder = PACKAGE if path.is_relative_to(PACKAGE) else ROOT
-    return ".".join(("edgeslam_torch", *path.relative_to(folder).with_suffix("").parts))
+    return ".".join(("edgeslam_torch", *path.relative_to(folder).with_suffix("").parts)).removesuffix(".__init__")
 
 
-PARSED = {path: list(imported(ast.parse(path.read_text(encoding="utf-8")))) for path in sources()}
+MODULES = frozenset(module_name(path) for path in sources())
+PARSED = {path: list(imported(ast.parse(path.read_text(encoding="utf-8")), MODULES)) for path in sources()}
+
+
+def test_table_names_every_part_once_and_nothing_else():
+    assert len(PARTS) == len(set(PARTS)) > 30
+    homes = {part_of(module) for module in MODULES} - {None}
+    assert homes == set(PARTS), "docs/architecture.md and the folders differ"
+
+
+def test_table_has_no_arrow_up():
+    for i, row in enumerate(LAYERS):
+        below = {part for lower in LAYERS[:i] for part in lower.parts}
+        assert row.may_use <= below, f"{row.parts} may use {set(row.may_use - below)}, which does not lie below"
 
 
 @pytest.mark.parametrize("path", PARSED, ids=lambda p: str(p.relative_to(ROOT)))
-def test_imports_go_down_only(path):
-    own = part_of(module_name(path))
-    if own == "__init__":
-        return
-    assert own in RANK, f"{own}: give it a place in LAYERS and in docs/architecture.md"
-    for name in PARSED[path]:
-        part = part_of(name)
-        if part is None or part not in RANK or part == own or (own, part) in ALLOWED_UP:
-            continue
-        assert RANK[part] < RANK[own], f"{module_name(path)} imports {name}, which lies on the same level or above"
+def test_imports_are_those_of_the_table(path):
+    assert forbidden(module_name(path), PARSED[path]) == [], "docs/architecture.md does not allow it"
+
+
+def test_table_allows_nothing_that_nobody_uses():
+    used = {(part_of(module_name(path)), part_of(name)) for path, names in PARSED.items() for name in names}
+    rows = [row for row in LAYERS if not row.is_all]
+    needless = [
+        (row.parts, other) for row in rows for other in row.may_use if not used & {(p, other) for p in row.parts}
+    ]
+    assert needless == []
+
+
+@pytest.mark.parametrize(
+    ("module", "name"),
+    [
+        ("writers.ply", "mapping.mapper"),
+        ("geometry.se3", "optim.problem"),
+        ("optim.kernels.points", "optim.local_ba"),
+        ("readers.layouts.tum", "readers.source"),
+        ("files.atomic", "geometry.se3"),
+        ("eval.metrics.align", "eval.judge.cells"),
+    ],
+)
+def test_import_that_the_table_does_not_allow_is_noticed(module, name):
+    found = imported(ast.parse(f"from edgeslam_torch.{name} import thing"), MODULES)
+    assert forbidden(f"edgeslam_torch.{module}", found) == [f"edgeslam_torch.{name}"]
+    assert forbidden(f"edgeslam_torch.{module}", ["edgeslam_torch.errors", "numpy.linalg"]) == []
 
 
 @pytest.mark.parametrize("path", PARSED, ids=lambda p: str(p.relative_to(ROOT)))
@@ -118,7 +171,9 @@ def test_packages_that_do_not_belong_are_not_imported(path):
 
 
 def test_train_is_imported_by_commands_only():
-    users = {module_name(path) for path, names in PARSED.items() if any(part_of(n) == "train" for n in names)}
+    users = {
+        module_name(path) for path, names in PARSED.items() if any(n.startswith("edgeslam_torch.train") for n in names)
+    }
     assert {name.split(".")[1] for name in users} <= {"train", "commands"}
 
 

@@ -10,10 +10,11 @@ import torch
 from torch import Tensor
 
 from edgeslam_torch.geometry import se3_torch as lie
-from edgeslam_torch.optim.kernels import edges_junctions as relative
-from edgeslam_torch.optim.kernels import points, schur
+from edgeslam_torch.optim.kernels import pairs, points, schur
 from edgeslam_torch.optim.kernels.compiled import kernel
-from edgeslam_torch.optim.kernels.edges_junctions import INVERSE_DEPTH_MIN, EdgeBlocks, JunctionBlocks, RelativeSystem
+from edgeslam_torch.optim.kernels.edges import EdgeBlocks
+from edgeslam_torch.optim.kernels.junctions import JunctionBlocks
+from edgeslam_torch.optim.kernels.pairs import INVERSE_DEPTH_MIN, RelativeSystem
 from edgeslam_torch.optim.kernels.points import PointBlocks, PointSystem
 from edgeslam_torch.optim.levenberg_marquardt import Step, minimise
 from edgeslam_torch.optim.objective import refined, window_losses
@@ -157,18 +158,18 @@ class _Window:
     def linearise(self, state: _State) -> _System:
         """Cost and blocks of the normal equations at a state."""
         T, F = state.T_c_w, len(self.free)
-        points, own, g, value = self.points.linearise(T, state.p)
+        anchors = self.points.linearise(T, state.p)
         H = torch.zeros(F, 6, F, 6, dtype=T.dtype)
-        H.diagonal(dim1=0, dim2=2).copy_(own.permute(1, 2, 0))
-        H, g = H.view(6 * F, 6 * F), g.flatten()
-        cost = float(value) + self.priors.linearise(T, H, g)
+        H.diagonal(dim1=0, dim2=2).copy_(anchors.H.permute(1, 2, 0))
+        H, g = H.view(6 * F, 6 * F), anchors.g.flatten()
+        cost = float(anchors.cost) + self.priors.linearise(T, H, g)
         relative = []
         for block, x in self._blocks(state):
             system, value = block.linearise(T, x, H, g)
             relative.append(system)
             cost += float(value)
-        gradient = _scaled_gradient(H, g, points, *relative)
-        return _System(state, cost, gradient, H, g, points, tuple(relative))
+        gradient = _scaled_gradient(H, g, anchors.system, *relative)
+        return _System(state, cost, gradient, H, g, anchors.system, tuple(relative))
 
     def propose(self, system: _System, mu: float) -> Step[_State] | None:
         """Solve the damped system by eliminating anchors, edge depths and junctions."""
@@ -240,7 +241,7 @@ class _Window:
 
     def _reduce(
         self, system: _System, mu: float
-    ) -> tuple[Tensor, Tensor, points.Eliminated, tuple[relative.Eliminated, ...]]:
+    ) -> tuple[Tensor, Tensor, points.Eliminated, tuple[pairs.Eliminated, ...]]:
         """Reduced pose system, its right side, and the eliminated blocks."""
         S, b = system.H.clone(), system.g.clone()
         anchors = self.points.reduce(system.points, mu, S, b)

@@ -20,8 +20,14 @@ from edgeslam_torch.optim.benchmark import (
     seeded_window,
 )
 from edgeslam_torch.optim.kernels import compiled, points, schur
-from edgeslam_torch.optim.kernels import edges_junctions as relative
-from edgeslam_torch.optim.kernels.edges_junctions import collinearity_prior
+from edgeslam_torch.optim.kernels.edges import EdgePairs, edge_cost, edge_weights
+from edgeslam_torch.optim.kernels.junctions import (
+    JunctionPairs,
+    collinearity_prior,
+    junction_cost,
+    junction_weights,
+)
+from edgeslam_torch.optim.kernels.pairs import Robust
 from edgeslam_torch.optim.local_ba import refine_window
 from edgeslam_torch.optim.problem import (
     DepthPriors,
@@ -515,24 +521,27 @@ def test_kernels_stay_on_their_device():
         B, T, L = 2, 3, 16
         K, Rt = torch.zeros(4, **f), torch.zeros(3, 4, B, T, 1, **f)
         pair, some = torch.zeros(B, T, L, **f), torch.zeros(3, dtype=torch.int64)
-        robust = (pair, Kernel.HUBER, 2.0)
+        robust = Robust(pair, Kernel.HUBER, 2.0)
         line, ray = torch.zeros(3, B, T, L, **f), torch.zeros(2, B, 1, L, **f)
-        edge = (Rt, torch.zeros(1, B, L, **f), ray, line, pair, pair, K)
+        edge, edges = torch.zeros(1, B, L, **f), EdgePairs(ray, line, pair, pair, K, None, robust)
         rays, arms = torch.zeros(2, 3, B, 1, L, **f), torch.zeros(2, 2, B, T, L, **f)
-        corner = (Rt, torch.zeros(3, B, L, **f), rays, line[:2], arms, torch.zeros(4, B, T, L, **f), K)
+        weight = torch.zeros(4, B, T, L, **f)
+        corner, corners = torch.zeros(3, B, L, **f), JunctionPairs(rays, line[:2], arms, weight, K, False, robust)
         place = torch.zeros(B, 9, L, dtype=torch.int64)
         pixel, three = torch.zeros(B, 2, L, **g), torch.zeros(3, **g)
         seen = points.Observed(
             some[:B], place[:, :3], pixel, pixel, pixel[:, 0], some, three, three, three, min_depth=1e-3
         )
-        point = (torch.zeros(4, 4, 4, **g), torch.zeros(3, E, **g), seen, Kernel.HUBER, 2.0)
-        out = [*relative.edge_weights(*edge, CycleForm.RELATIVE_DEPTH, *robust)]
-        out += [*relative.edge_weights(*edge, CycleForm.PIXEL, *robust), relative.edge_cost(*edge, None, *robust)]
-        out += [*relative.junction_weights(*corner, False, *robust), relative.junction_cost(*corner, False, *robust)]
-        linear = points.point_normals(*point, place.flatten(), place[:, 0].flatten(), some[:B], some)
-        system, entries, damping = points.PointSystem(*linear[:5]), place[:, :3].flatten(), three[0]
-        out += [*linear, points.point_cost(*point)]
-        out += [*points.fill(torch.zeros(3 * E, 6, **f), entries, True, system, place[:, :6], damping)]
+        places = points.Places(
+            place.flatten(), place[:, 0].flatten(), some[:B], some, place[:, :6], place[:, :3].flatten(), 3 * E, True
+        )
+        point = (torch.zeros(4, 4, 4, **g), torch.zeros(3, E, **g), seen)
+        out = [*edge_weights(Rt, edge, edges._replace(form=CycleForm.RELATIVE_DEPTH))]
+        out += [*edge_weights(Rt, edge, edges._replace(form=CycleForm.PIXEL)), edge_cost(Rt, edge, edges)]
+        out += [*junction_weights(Rt, corner, corners), junction_cost(Rt, corner, corners)]
+        linear = points.point_normals(*point, places, Kernel.HUBER, 2.0)
+        out += [*linear.system, *linear[1:], points.point_cost(*point, Kernel.HUBER, 2.0)]
+        out += [*points.coupled(linear.system, places, three[0], torch.float32)]
         for size in (1, 3):
             V, g = torch.zeros(size * (size + 1) // 2, B, L, **f), torch.zeros(size, B, L, **f)
             out += [*schur.eliminate(V, g, torch.zeros(B, T, 6, size, L, **f), torch.zeros((), **f))]

@@ -5,7 +5,7 @@ pose's tangent taken in the world, about a centre ``c`` near the anchors, both d
 ``B = (d r / d p_c) R`` by the anchor and ``B [I, -hat(p_w - c)]`` by the pose. So an observation is summarised by
 ``B^T B`` and ``B^T r``, nine numbers; the anchor's block is their sum, the pose's block a sum of their products with
 powers of the anchor's position, and their coupling is ``[I; hat(p_w - c)] B^T B``. The adjoint maps the pose system
-to the cameras' tangents, in which the solver damps and steps.
+to the cameras' tangents, in which the solver damps and steps. docs/solver.md derives it.
 
 Observations lie in tiles of one pose each, so that a pose's rotation is a factor of a batched product; empty slots
 have zero weight.
@@ -55,6 +55,39 @@ class Observed(NamedTuple):
     """``(3,)`` of the anchors: these are kept from here."""
     min_depth: float
     """Nearest depth in front of a camera."""
+
+
+class Places(NamedTuple):
+    """Where the sums of the observations go. Tiles of free poses come first, ``G'`` of ``G``."""
+
+    own: Tensor
+    """``(9 G L)`` of an observation's nine sums in ``(9, A)``."""
+    anchor: Tensor
+    """``(G' L)`` the anchors that free poses see."""
+    column: Tensor
+    """``(G',)`` free-pose numbers of their tiles."""
+    free_pose: Tensor
+    """``(F,)`` the free poses."""
+    factor: Tensor
+    """``(G', 6, L)`` of the anchors' factors in ``(6, A)``."""
+    entry: Tensor
+    """``(3 G' L)`` rows of the anchors' whitened coordinates, by the observations' poses, in `Eliminated.Y`."""
+    entries: int
+    """Rows of `Eliminated.Y`; the last takes what places without an observation store."""
+    unique: bool
+    """Whether no pose sees an anchor twice: entries can then be stored without adding."""
+
+
+class Normals(NamedTuple):
+    """A `PointSystem`, and what the anchors add to the pose system."""
+
+    system: "PointSystem"
+    H: Tensor
+    """``(F, 6, 6)`` the free poses' own blocks."""
+    g: Tensor
+    """``(F, 6)``."""
+    cost: Tensor
+    """``()``."""
 
 
 class PointSystem(NamedTuple):
@@ -111,6 +144,7 @@ class PointBlocks:
             config: Kernel, its width and what counts as behind a camera.
         """
         self.config = config
+        self.dtype = torch.float32 if config.float32_blocks else torch.float64
         depth = problem.depth_priors or _NO_DEPTH_PRIORS
         self.n_obs, A = len(problem.obs_pose), len(problem.p_w)
         self.free = F = int((column >= 0).sum())
@@ -130,7 +164,7 @@ class PointBlocks:
         order = np.argsort(run, kind="stable")
         count = np.bincount(run, minlength=len(column))
         tiles = -(-count // _LANES)
-        self.free_tiles = int(tiles[:F].sum())
+        free_tiles = int(tiles[:F].sum())
         G = int(tiles.sum())
         gap = (np.cumsum(tiles) - tiles) * _LANES - (np.cumsum(count) - count)
         self.place = np.empty(len(order), dtype=np.int64)  # of each factor, in the caller's order
@@ -166,18 +200,23 @@ class PointBlocks:
             centre=torch.as_tensor(centre),
             min_depth=config.min_depth,
         )
-        self.free_pose = torch.as_tensor(by_column[:F])
-        self.tile_column = torch.as_tensor(tile_run[: self.free_tiles])
-        self.own_place = torch.as_tensor((anchors[:, None] + A * np.arange(9)[:, None]).reshape(-1))
-        free_anchor = anchors[: self.free_tiles]
-        self.free_anchor = torch.as_tensor(free_anchor.reshape(-1))
-        self.factor_place = torch.as_tensor(free_anchor[:, None] + A * np.arange(6)[:, None])
+        free_anchor, tile_column = anchors[:free_tiles], tile_run[:free_tiles]
         used = np.zeros(G * _LANES, dtype=bool)
         used[self.place] = True
-        self._plan(free_anchor, tile_run[: self.free_tiles], used.reshape(G, _LANES)[: self.free_tiles], A)
+        entry, entries, unique = self._plan(free_anchor, tile_column, used.reshape(G, _LANES)[:free_tiles], A)
+        self.places = Places(
+            own=torch.as_tensor((anchors[:, None] + A * np.arange(9)[:, None]).reshape(-1)),
+            anchor=torch.as_tensor(free_anchor.reshape(-1)),
+            column=torch.as_tensor(tile_column),
+            free_pose=torch.as_tensor(by_column[:F]),
+            factor=torch.as_tensor(free_anchor[:, None] + A * np.arange(6)[:, None]),
+            entry=torch.as_tensor(entry),
+            entries=entries,
+            unique=unique,
+        )
 
-    def _plan(self, anchor: IntArray, column: IntArray, used: np.ndarray, A: int) -> None:
-        """Lay out the ``Y``: one over few poses, else a band of them."""
+    def _plan(self, anchor: IntArray, column: IntArray, used: np.ndarray, A: int) -> tuple[IntArray, int, bool]:
+        """Lay out the ``Y``: one over few poses, else a band of them; see `Places` for what is returned."""
         F = self.free
         size = max(A, 1) if self.anchor_order is None else _ANCHORS_PER_CHUNK
         starts = np.arange(0, A, size)
@@ -194,10 +233,9 @@ class PointBlocks:
         rows = int(ends[-1]) if len(ends) else 0
         begin = ends - 3 * width * length
         place = begin[chunk] + width[chunk] * (anchor - size * chunk) + column
-        self.unique = int(np.bincount(place[used], minlength=1).max()) <= 1
+        unique = int(np.bincount(place[used], minlength=1).max()) <= 1
         # Places of a tile without an observation store their zeros behind all others.
         place = np.where(used, place, rows) + np.where(used, (width * length)[chunk], 0) * np.arange(3)[:, None, None]
-        self.entry_place = torch.as_tensor(place.reshape(-1))
         self.chunks = [
             Chunk(
                 first=int(starts[c]),
@@ -209,8 +247,7 @@ class PointBlocks:
             for c in range(len(starts))
             if seen[c].any()
         ]
-        self.dtype = torch.float32 if self.config.float32_blocks else torch.float64
-        self.Y = torch.zeros(rows + 1, 6, dtype=self.dtype)
+        return place.reshape(-1), rows + 1, unique
 
     def cost(self, T_c_w: Tensor, p: Tensor) -> Tensor:
         """Robust cost ``()`` at poses ``(W, 4, 4)`` and anchors ``(3, A)``."""
@@ -233,22 +270,19 @@ class PointBlocks:
         out[self.anchor_order] = ours
         return out
 
-    def linearise(self, T_c_w: Tensor, p: Tensor) -> tuple[PointSystem, Tensor, Tensor, Tensor]:
-        """Normal equations, with the free poses' own blocks ``(F, 6, 6)``, gradients ``(F, 6)`` and the cost ``()``."""
+    def linearise(self, T_c_w: Tensor, p: Tensor) -> Normals:
+        """Normal equations at poses ``(W, 4, 4)`` and anchors ``(3, A)``."""
         linear = kernel(point_normals, self.config.compile)
-        *system, H, g, value = linear(
-            T_c_w, p, self.seen, *self._kernel(), self.own_place, self.free_anchor, self.tile_column, self.free_pose
-        )
-        return PointSystem(*system), H, g, value
+        out: Normals = linear(T_c_w, p, self.seen, self.places, *self._kernel())
+        return out
 
     def reduce(self, system: PointSystem, mu: float, S: Tensor, b: Tensor) -> Eliminated:
         """Eliminate the anchors from the pose system ``S (6F, 6F)`` and its right side ``b (6F,)``."""
-        exact = mu == 0.0 and self.dtype is not torch.float64  # for diagnostics only
-        Y = self.Y.double() if exact else self.Y
+        exact = mu == 0.0  # not to step, but to say what is observed
         damping = torch.tensor(mu, dtype=torch.float64)
-        factor, y = kernel(fill, self.config.compile)(
-            Y, self.entry_place, self.unique, system, self.factor_place, damping
-        )
+        whitened = kernel(coupled, self.config.compile)
+        eliminated: Eliminated = whitened(system, self.places, damping, torch.float64 if exact else self.dtype)
+        y, Y = eliminated.y, eliminated.Y
         F = self.free
         # Sums of 6x6 blocks and of vectors; in the precision of the products, which are long sums themselves.
         taken, right = torch.zeros(F * F, 36, dtype=Y.dtype), torch.zeros(F, 6, dtype=Y.dtype)
@@ -262,11 +296,10 @@ class PointBlocks:
         half = to_camera @ taken.view(F, F, 6, 6).transpose(1, 2).double().reshape(F, 6, 6 * F)
         S -= (to_camera @ half.view(6 * F, 6 * F).mT.reshape(F, 6, 6 * F)).view(6 * F, 6 * F)  # it is symmetric
         b -= (to_camera @ right.double()[..., None]).view(-1)
-        return Eliminated(factor, y, Y)
+        return eliminated
 
     def step(self, system: PointSystem, eliminated: Eliminated, delta: Tensor) -> Tensor:
-        """Back-substitution: step of the anchors ``(3, A)`` for the poses' ``delta (6F,)``; call before the next
-        `reduce`."""
+        """Back-substitution: step of the anchors ``(3, A)`` for the poses' ``delta (6F,)``."""
         in_world = (system.to_world @ delta.view(-1, 6, 1))[..., 0].to(eliminated.Y.dtype)
         back = -eliminated.y
         for chunk, part in self._parts(eliminated.Y):
@@ -316,30 +349,8 @@ def point_cost(T_c_w: Tensor, p: Tensor, seen: Observed, robust: Kernel, delta: 
     return rho(evaluate(T_c_w, p, seen)[0], robust, delta)[0].sum()
 
 
-def point_normals(
-    T_c_w: Tensor,
-    p: Tensor,
-    seen: Observed,
-    robust: Kernel,
-    delta: float,
-    own_place: Tensor,
-    free_anchor: Tensor,
-    tile_column: Tensor,
-    free_pose: Tensor,
-) -> tuple[Tensor, ...]:
-    """The fields of `PointSystem`, the free poses' blocks ``(F, 6, 6)`` and gradients ``(F, 6)``, and the cost ``()``.
-
-    Args:
-        T_c_w: World-to-camera poses ``(W, 4, 4)``.
-        p: Anchors from their centre ``(3, A)``.
-        seen: The observations.
-        robust: Kernel.
-        delta: Its width.
-        own_place: ``(9 G L)`` places of an observation's sums in ``(9, A)``.
-        free_anchor: ``(G' L)`` anchors of the free poses' tiles, which come first.
-        tile_column: ``(G',)`` free-pose numbers of these.
-        free_pose: ``(F,)`` the free poses.
-    """
+def point_normals(T_c_w: Tensor, p: Tensor, seen: Observed, places: Places, robust: Kernel, delta: float) -> Normals:
+    """Normal equations; arguments as `point_cost` takes them, and where the sums go."""
     s, _, used, iz, n, r, r_depth, position = evaluate(T_c_w, p, seen)
     value, weight = rho(s, robust, delta)
     weight = torch.where(used, weight, 0.0)
@@ -356,19 +367,19 @@ def point_normals(
         mzz = mzz.view(-1).index_add(0, row, weighted_depth * slope_depth).view(mzz.shape)
         qz = qz.view(-1).index_add(0, row, weighted_depth * r_depth).view(qz.shape)
     own = rotated(T_c_w)[seen.pose] @ torch.cat((ab, abn, mzz[:, None], q, qz[:, None]), 1)
-    A, F, G = p.shape[1], len(free_pose), len(tile_column)
-    sums = torch.zeros(9 * A, dtype=p.dtype, device=p.device).scatter_add_(0, own_place, own.view(-1)).view(9, A)
+    A, F, G = p.shape[1], len(places.free_pose), len(places.column)
+    sums = torch.zeros(9 * A, dtype=p.dtype, device=p.device).scatter_add_(0, places.own, own.view(-1)).view(9, A)
     # A pose's block: sums of products with 1, x, y, z, xx, xy, xz, yy, yz, zz.
     x, y, z = p[:1], p[1:2], p[2:]
     powers = torch.cat((torch.ones_like(x), p, x * p, y * p[1:], z * z)).mT.contiguous()
-    products = own[:G] @ powers.index_select(0, free_anchor).view(*own[:G, 0].shape, 10)
-    moments = torch.zeros(F, 90, dtype=p.dtype, device=p.device).index_add_(0, tile_column, products.view(G, 90))
+    products = own[:G] @ powers.index_select(0, places.anchor).view(*own[:G, 0].shape, 10)
+    moments = torch.zeros(F, 90, dtype=p.dtype, device=p.device).index_add_(0, places.column, products.view(G, 90))
     in_world = (moments @ _MOMENTS.to(p.device)).view(F, 6, 7)
-    to_world = tangents_in_world(T_c_w.index_select(0, free_pose), seen.centre)
+    to_world = tangents_in_world(T_c_w.index_select(0, places.free_pose), seen.centre)
     in_camera = to_world.mT @ in_world
     H = in_camera[..., :6] @ to_world
     V, g = sums.index_select(0, _UPPER.to(p.device)), sums.index_select(0, _GRADIENT.to(p.device))
-    return V, g, own[:G], position[:G], to_world, H, in_camera[..., 6], value.sum()
+    return Normals(PointSystem(V, g, own[:G], position[:G], to_world), H, in_camera[..., 6], value.sum())
 
 
 def tangents_in_world(T_c_w: Tensor, centre: Tensor) -> Tensor:
@@ -386,35 +397,41 @@ def rotated(T_c_w: Tensor) -> Tensor:
     ``J^T r`` as x, y, -z. Out: ``R^T J^T J R`` and ``R^T J^T r`` as xx, xy, xz, yy, x, yz, y, z, zz, an order in which
     each row of the matrix is a slice: 0 to 2 by one, 1 to 5 by two, 2 to 8 by three.
     """
-    R = T_c_w[:, :3, :3]
-    squares = (R[:, :, None, :, None] * R[:, None, :, None, :]).flatten(1)
-    return (torch.cat((squares, R.flatten(1)), 1) @ _ROTATED.to(R.device)).view(-1, 9, 8)
+    x, y, z = T_c_w[:, :3, :3].unbind(1)  # the camera's axes in the world
+
+    def product(a: Tensor, b: Tensor) -> Tensor:
+        return a[:, _ROW] * b[:, _COLUMN]
+
+    squares = (
+        product(x, x),
+        product(y, y),
+        -product(x, z) - product(z, x),
+        -product(y, z) - product(z, y),
+        product(z, z),
+    )
+    out = torch.zeros(len(x), 9, 8, dtype=x.dtype, device=x.device)
+    out[:, _UPPER.to(x.device), :5] = torch.stack(squares, 2)
+    out[:, _GRADIENT.to(x.device), 5:] = torch.stack((x, y, -z), 2)
+    return out
 
 
-def fill(
-    Y: Tensor, entry_place: Tensor, unique: bool, system: PointSystem, factor_place: Tensor, damping: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Write the coupling of free poses and whitened anchors into ``Y``.
+def coupled(system: PointSystem, places: Places, damping: Tensor, dtype: torch.dtype) -> Eliminated:
+    """Whitened anchors and their coupling with the free poses.
 
     Args:
-        Y: All chunks; changed in place.
-        entry_place: ``(3 G' L)`` rows of the anchors' whitened coordinates, by the observations' poses, in it.
-        unique: Whether no pose sees an anchor twice: entries can then be stored without adding.
         system: Normal equations.
-        factor_place: ``(G', 6, L)`` places of the anchors' factors in ``(6, A)``.
+        places: Where the couplings go.
         damping: Relative to the diagonal ``()``.
-
-    Returns:
-        Inverse Cholesky factors ``(6, A)`` and whitened gradients ``(3, A)`` of the anchors.
+        dtype: Of the coupling: it comes after the cancellation and is only multiplied with itself.
     """
     factor = schur.inverse_cholesky(system.V, damping)
-    f = factor.view(-1).index_select(0, factor_place.reshape(-1)).view(factor_place.shape)[:, :, None]
+    f = factor.view(-1).index_select(0, places.factor.reshape(-1)).view(places.factor.shape)[:, :, None]
     a, b, c, d, e, f = f.unbind(1)
     first, second, third = system.own[:, 0:3], system.own[:, 1:6:2], system.own[:, 2:9:3]
     whitened = torch.stack(
         (a * first, torch.addcmul(b * first, c, second), torch.addcmul(torch.addcmul(d * first, e, second), f, third))
-    ).to(Y.dtype)  # after the cancellation: the rest is only multiplied with itself
-    x, y, z = system.position.to(Y.dtype).unbind(1)
+    ).to(dtype)
+    x, y, z = system.position.to(dtype).unbind(1)
     u, v, w = whitened.unbind(2)
     turning = torch.stack(
         (
@@ -425,53 +442,41 @@ def fill(
         2,
     )
     entries = torch.cat((whitened, turning), 2).mT.reshape(-1, 6)
-    if unique:
-        Y.index_copy_(0, entry_place, entries)
+    Y = torch.zeros(places.entries, 6, dtype=dtype, device=entries.device)
+    if places.unique:
+        Y.index_copy_(0, places.entry, entries)
     else:
-        Y.zero_().index_add_(0, entry_place, entries)
-    return factor, schur.whiten(factor, system.g)
+        Y.index_add_(0, places.entry, entries)
+    return Eliminated(factor, schur.whiten(factor, system.g), Y)
 
 
-_MATRIX = [[0, 1, 2], [1, 3, 5], [2, 5, 8]]
+_MATRIX = np.array([[0, 1, 2], [1, 3, 5], [2, 5, 8]])
 """Indices of ``R^T J^T J R`` in the output of `rotated`."""
-_VECTOR = [4, 6, 7]
+_VECTOR = np.array([4, 6, 7])
 """Indices of ``R^T J^T r`` in it."""
-_UPPER = torch.tensor([0, 1, 2, 3, 5, 8])
-_GRADIENT = torch.tensor(_VECTOR)
-
-
-def _rotation_map() -> Tensor:
-    """``(90, 72)``: from the products of a rotation's entries and from these to what `rotated` gives."""
-    squares, vectors = np.zeros((3, 3, 3, 3, 9, 8)), np.zeros((3, 3, 9, 8))  # R_ak R_bl, R_ak
-    for k in range(3):
-        for a, sign in enumerate((1.0, 1.0, -1.0)):
-            vectors[a, k, _VECTOR[k], 5 + a] = sign
-        for m in range(k, 3):
-            for a, b, column, sign in ((0, 0, 0, 1), (1, 1, 1, 1), (0, 2, 2, -1), (2, 0, 2, -1)):
-                squares[a, b, k, m, _MATRIX[k][m], column] = sign
-            for a, b, column, sign in ((1, 2, 3, -1), (2, 1, 3, -1), (2, 2, 4, 1)):
-                squares[a, b, k, m, _MATRIX[k][m], column] = sign
-    return torch.as_tensor(np.concatenate((squares.reshape(81, 72), vectors.reshape(9, 72))))
+_ROW, _COLUMN = np.triu_indices(3)
+_UPPER = torch.as_tensor(_MATRIX[_ROW, _COLUMN])
+_GRADIENT = torch.as_tensor(_VECTOR)
+_POWER = np.array([[0, 1, 2, 3], [1, 4, 5, 6], [2, 5, 7, 8], [3, 6, 8, 9]])
+"""Where the product of two of 1, x, y, z is in 1, x, y, z, xx, xy, xz, yy, yz, zz."""
 
 
 def _moment_map() -> Tensor:
-    """``(90, 42)``: from products of an observation's nine sums with 1, x, y, z, xx, xy, xz, yy, yz, zz to H | g."""
-    power = np.array([[0, 1, 2, 3], [1, 4, 5, 6], [2, 5, 7, 8], [3, 6, 8, 9]])
-    G = np.zeros((3, 6, 4))  # [I, -hat(p)] by 1, x, y, z
-    G[range(3), range(3), 0] = 1.0
+    """``(90, 42)``: from products of an observation's nine sums with the ten powers of its anchor's position to H | g.
+
+    With ``D = [I, -hat(p)]``, linear in 1, x, y, z, the pose's block is the sum of ``D^T M D`` and its gradient that of
+    ``D^T v``: entry by entry, sums and powers that are multiplied.
+    """
+    D = np.zeros((3, 6, 4))
+    D[range(3), range(3), 0] = 1.0
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        G[i, 3 + j, 1 + k], G[j, 3 + i, 1 + k] = 1.0, -1.0
-    out = np.zeros((9, 10, 6, 7))
-    for i in range(3):
-        out[_VECTOR[i], :4, :, 6] += G[i].T
-        for j in range(3):
-            for s in range(4):
-                for t in range(4):
-                    out[_MATRIX[i][j], power[s, t], :, :6] += np.outer(G[i, :, s], G[j, :, t])
-    return torch.as_tensor(out.reshape(90, 42))
+        D[i, 3 + j, 1 + k], D[j, 3 + i, 1 + k] = 1.0, -1.0
+    matrix, vector, power = np.eye(9)[_MATRIX], np.eye(9)[_VECTOR], np.eye(10)[_POWER]
+    H = np.einsum("ics,jdt,ijm,stp->mpcd", D, D, matrix, power)
+    g = np.einsum("ics,im,sp->mpc", D, vector, power[0])
+    return torch.as_tensor(np.concatenate((H, g[..., None]), 3).reshape(90, 42))
 
 
-_ROTATED = _rotation_map()
 _MOMENTS = _moment_map()
 _MINUS_HAT = torch.zeros(3, 9, dtype=torch.float64)  # of a vector, row by row
 _MINUS_HAT[[2, 1, 2, 0, 1, 0], [1, 2, 3, 5, 6, 7]] = torch.tensor([1, -1, -1, 1, 1, -1], dtype=torch.float64)
