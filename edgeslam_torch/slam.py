@@ -21,6 +21,7 @@ from edgeslam_torch.frontend.orb import OrbExtractor
 from edgeslam_torch.frontend.repeats import REPEATED, RepeatedImages
 from edgeslam_torch.fusion.motion import MotionFusion
 from edgeslam_torch.fusion.published import Published, first_pose
+from edgeslam_torch.fusion.snapshot import Present
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.mount import camera_on_body
@@ -47,6 +48,7 @@ from edgeslam_torch.types import (
     Frame,
     Piece,
     PointCloud,
+    PoseNow,
     ScaleEstimate,
     SlamOutput,
     Support,
@@ -115,6 +117,8 @@ class EdgeSlam:
         if realtime:
             self.events["keyframes_skipped"] = 0
         self._finished = False
+        self._present = Present()
+        """What `pose_now` rests on: replaced as a whole, never changed."""
         self._machine = Machine()
         atlas = Atlas(self._system.tracker, self.edges, self.log, lm)
         self._joining = Joining(self._system, atlas)
@@ -182,7 +186,23 @@ class EdgeSlam:
         step = self._step(frame, seen)
         self._machine.meet(step.event, frame.stamp_s)
         system.motion.stamp_s = frame.stamp_s
+        self._present = Present(system.fusion.snapshot(), system.published, self._is_metric())
         return self._output(frame, step, joined)
+
+    def pose_now(self, stamp_s: float, telemetry: Sequence[TelemetrySample] = ()) -> PoseNow | None:
+        """Where the camera is at a moment after the newest frame; callable from any thread while frames are stepped.
+
+        With telemetry the video's delay is made up for: the frame stamped ``t`` shows the world at ``t - delay``, and
+        what telemetry told since carries the pose on to the present.
+
+        Args:
+            stamp_s: The moment, on the clock that stamps frames and telemetry.
+            telemetry: State messages that arrived since the last call of `step`.
+
+        Returns:
+            The pose in the world of `SlamOutput.T_w_c`; ``None`` before the first frame with a place in a map.
+        """
+        return self._present.pose_at(stamp_s, telemetry)
 
     def _step(self, frame: Frame, seen: LazyView) -> Step:
         """Process a frame in the current state."""

@@ -229,6 +229,33 @@ class SlamOutput:
 
 
 @dataclass(frozen=True, slots=True)
+class PoseNow:
+    """Where the camera is at a moment, with the delay of the video made up for.
+
+    Frame: the world of `SlamOutput.T_w_c`. Unit: metres where ``metric``, else the unit of the published trajectory.
+    """
+
+    stamp_s: float
+    """The moment, on the clock on which frames and telemetry arrive."""
+    T_w_c: FloatArray
+    """``(4, 4)`` camera to world."""
+    velocity_w: FloatArray
+    """``(3,)`` of the drone's body, or of the camera without a drone [unit/s]."""
+    covariance: FloatArray
+    """``(9, 9)`` of position, rotation vector [rad] and velocity in world axes, with respect to the map: what the map
+    itself is off is not in it."""
+    source: str
+    """``filter``: Kalman filter, the video's delay is made up for. ``visual``: constant velocity from the last frames,
+    as if the video were not late."""
+    seen_s: float
+    """Stamp of the last frame whose place in the map is known."""
+    metric: bool
+    """Whether the unit is a metre to within the scale's uncertainty."""
+    revision: int
+    """As in `SlamOutput`."""
+
+
+@dataclass(frozen=True, slots=True)
 class PointCloud:
     """Points with colour and uncertainty, in the trajectory's world frame."""
 

@@ -63,7 +63,7 @@ class FusionConfig:
     """Random walk of the angles between readings, on top of the turning that the readings themselves show."""
     sigma_bias_m_s: float = 0.03
     """Velocity bias at the start (0 takes the bias out of the state: the paper's six states)."""
-    bias_walk_m_s_sqrt_s: float = 0.005
+    bias_walk_m_s_sqrt_s: float = 0.015
     """Random walk of the velocity bias, before the battery factor."""
     floor_position_m: float = 1e-3
     """Least process noise [m/sqrt(s)]: keeps the covariance positive whatever the other settings are."""

@@ -84,11 +84,18 @@ class DelaySearch:
         return cost + self._turn_cost(moved, track)
 
     def _turn_cost(self, moved: Displacements, track: TelemetryTrack) -> float:
+        """Log-likelihood of the turns with their own spread.
+
+        An attitude between two readings is less noisy than one at a reading. Unless that is allowed for, the best delay
+        is one that puts all intervals between readings: 0.04 s wrong at 10 Hz whatever the flight.
+        """
         both = turns(moved, track, self._R_b_c)
         trace = np.einsum("nij,nij->n", both.seen, both.told)
-        angle = np.sort(np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0)))[: max(3, int(_KEPT * len(trace)))]
+        share = 0.5 * (track.interpolation_variance(moved.from_s) + track.interpolation_variance(moved.to_s))
+        squared = np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0)) ** 2 / share
+        kept = np.sort(squared)[: max(3, int(_KEPT * len(trace)))]
         floor = (0.5 * self._config.sigma_attitude_rad) ** 2
-        return 1.5 * len(trace) * math.log(float(np.mean(angle**2)) / 3.0 + floor)
+        return 1.5 * len(trace) * math.log(float(np.mean(kept)) / 3.0 + floor)
 
 
 def _least(delays_s: FloatArray, cost: FloatArray) -> Delay | None:

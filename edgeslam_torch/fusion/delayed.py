@@ -3,20 +3,41 @@
 import bisect
 import math
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from edgeslam_torch.fusion.config import FusionConfig
-from edgeslam_torch.fusion.ekf import Ekf, EkfState, Outcome, Saved
+from edgeslam_torch.fusion.ekf import Ekf, EkfState, Outcome, Relative, Saved
 from edgeslam_torch.fusion.rotations import rpy_from_matrix, wrapped
 from edgeslam_torch.types import FloatArray, TelemetrySample
 
 _TELEMETRY, _RELATIVE, _ABSOLUTE, _CLONE = range(4)
 _SAME_S = 1e-6
-_QUANTISATION_RAD = math.radians(1.0 / math.sqrt(12.0))
 _SILENCE_S = 0.5
-"""Without telemetry for so long the last velocity is no longer believed."""
+"""Readings further apart are not interpolated."""
+_PACKET_S = 0.15
+"""A turn is believed to go on for so long after the last reading."""
+_EXACT = 1e-6
+"""Jitter of what has none [m], [rad]: keeps the covariance of an innovation invertible."""
+
+
+@dataclass(frozen=True, slots=True)
+class PoseSigma:
+    """Standard deviations of a pose or of an increment, per axis."""
+
+    t_m: float = 0.0
+    r_rad: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Moved:
+    """What the filter knows of the body since vision last saw it."""
+
+    from_s: float
+    """Telemetry's stamp of the last visual pose."""
+    to_s: float
+    relative: Relative
 
 
 @dataclass(slots=True)
@@ -26,21 +47,23 @@ class _Event:
     sample: TelemetrySample | None = None
     T: FloatArray | None = None
     from_s: float = math.nan
-    sigma_t_m: float = 0.0
-    sigma_r_rad: float = 0.0
+    noise: PoseSigma = PoseSigma()
+    """Drift of an increment, error of an absolute pose."""
+    jitter: PoseSigma = PoseSigma()
     saved: Saved | None = None
     clone_s: float = math.nan
     outcome: str = ""
     nis: float = math.nan
     velocity: FloatArray = field(default_factory=lambda: np.zeros(3))
     battery: float = math.nan
-    turn: float = 0.0
+    rate: FloatArray = field(default_factory=lambda: np.zeros(3))
+    """Of roll, pitch and yaw [rad/s], by the last two readings."""
     rpy: FloatArray | None = None
     rpy_s: float = math.nan
 
     def inherit(self, previous: "_Event") -> None:
         """What holds until a reading or a clone says otherwise."""
-        self.clone_s, self.battery, self.turn = previous.clone_s, previous.battery, previous.turn
+        self.clone_s, self.battery, self.rate = previous.clone_s, previous.battery, previous.rate
         self.rpy, self.rpy_s = previous.rpy, previous.rpy_s
 
     @property
@@ -52,13 +75,14 @@ class BufferedEkf:
     """`Ekf` with a clock: measurements of the last ``config.buffer_s`` may come in any order.
 
     A late one goes to its place among the kept events; the filter is restored to the state before it and everything
-    behind it is applied again. Velocities between two readings are interpolated once both are there.
+    behind it is applied again. Velocities and angles between two readings are interpolated once both are there.
     """
 
     def __init__(self, config: FusionConfig) -> None:
         self.config = config
         self.ekf = Ekf(config)
         self._events: list[_Event] = []
+        self._telemetry_s = -math.inf
         self._done: Counter[str] = Counter()
         self._nis: list[tuple[int, float]] = []
 
@@ -67,40 +91,90 @@ class BufferedEkf:
         """Time of the newest event, ``None`` before the first."""
         return self._events[-1].stamp_s if self._events else None
 
+    @property
+    def telemetry_s(self) -> float:
+        """Stamp of the newest state message, minus infinity before the first."""
+        return self._telemetry_s
+
     def add_telemetry(self, sample: TelemetrySample) -> None:
         """Velocity (predicts up to the next reading) and attitude of one state message; NaN fields are left out."""
         if math.isfinite(sample.stamp_s):
+            self._telemetry_s = max(self._telemetry_s, sample.stamp_s)
             self._insert(_Event(sample.stamp_s, _TELEMETRY, sample=sample))
 
+    def see(self, stamp_s: float) -> None:
+        """Vision sees the body, where is not known: the start of the increments that follow."""
+        if math.isfinite(stamp_s):
+            self._insert(_Event(stamp_s, _CLONE))
+
     def add_relative(
-        self, from_s: float, to_s: float, T_from_to: FloatArray, sigma_t_m: float, sigma_r_rad: float
+        self, from_s: float, to_s: float, T_from_to: FloatArray, drift: PoseSigma, jitter: PoseSigma | None = None
     ) -> None:
-        """Visual motion of the body between two stamps: pose at ``to_s`` in the body frame at ``from_s`` [m]."""
+        """Visual motion of the body between two stamps.
+
+        Args:
+            from_s: Where the increment before ended; a gap starts anew.
+            to_s: End.
+            T_from_to: Pose at ``to_s`` in the body frame at ``from_s`` [m], shape ``(4, 4)``.
+            drift: Error of the increment that adds up from one to the next.
+            jitter: Error of the visual pose at its end, which does not.
+        """
         if not math.isfinite(from_s + to_s) or to_s <= from_s:
             self._done["out of order"] += 1
             return
-        if not any(abs(e.stamp_s - from_s) < _SAME_S and e.kind != _TELEMETRY for e in reversed(self._events)):
-            self._insert(_Event(from_s, _CLONE))
-        self._insert(_Event(to_s, _RELATIVE, T=T_from_to, from_s=from_s, sigma_t_m=sigma_t_m, sigma_r_rad=sigma_r_rad))
+        before = self._go_to(to_s)
+        if before is None or not abs(before.clone_s - from_s) < _SAME_S:
+            self.see(from_s)
+        jitter = jitter or PoseSigma()
+        self._insert(_Event(to_s, _RELATIVE, T=T_from_to, from_s=from_s, noise=drift, jitter=jitter))
 
-    def add_absolute(self, stamp_s: float, T_w_b: FloatArray, sigma_t_m: float, sigma_r_rad: float) -> None:
+    def add_absolute(self, stamp_s: float, T_w_b: FloatArray, sigma: PoseSigma) -> None:
         """Accumulated visual pose of the body in the power-on world [m], paper eq. (14)."""
         if math.isfinite(stamp_s):
-            self._insert(_Event(stamp_s, _ABSOLUTE, T=T_w_b, sigma_t_m=sigma_t_m, sigma_r_rad=sigma_r_rad))
+            self._insert(_Event(stamp_s, _ABSOLUTE, T=T_w_b, noise=sigma))
 
     def state_at(self, stamp_s: float) -> EkfState | None:
         """State at a stamp inside the buffer or ahead of it; ``None`` before the first event."""
-        index = bisect.bisect_right(self._events, (stamp_s, _CLONE + 1), key=lambda e: e.key)
-        if index == 0:
+        event = self._go_to(stamp_s)
+        if event is None:
             return None
-        event = self._events[index - 1]
         present = self.ekf.copy_state()
-        assert event.saved is not None
-        self.ekf.restore(event.saved)
-        self._predict(event, stamp_s, index)
+        self._advance(event, stamp_s)
         state = self.ekf.state(stamp_s)
         self.ekf.restore(present)
         return state
+
+    def since_visual(self, stamp_s: float) -> Moved | None:
+        """Motion of the body from the last visual pose before a stamp to the stamp; ``None`` without one."""
+        event = self._go_to(stamp_s)
+        if event is None or not math.isfinite(event.clone_s):
+            return None
+        present = self.ekf.copy_state()
+        velocity = self._advance(event, stamp_s)
+        moved = Moved(event.clone_s, stamp_s, self.ekf.since_clone(velocity))
+        self.ekf.restore(present)
+        return moved
+
+    def _go_to(self, stamp_s: float) -> _Event | None:
+        """The last event not after a stamp."""
+        index = bisect.bisect_right(self._events, (stamp_s, _CLONE + 1), key=lambda e: e.key)
+        return self._events[index - 1] if index > 0 else None
+
+    def _advance(self, event: _Event, stamp_s: float) -> FloatArray:
+        """Put the filter to where it was at an event and propagate it; gives the velocity there."""
+        assert event.saved is not None
+        self.ekf.restore(event.saved)
+        return self._predict(event, stamp_s, bisect.bisect_right(self._events, event.key, key=lambda e: e.key))
+
+    def resumed(self) -> "BufferedEkf":
+        """A filter of its own that goes on from the newest event; what it is told does not come back here."""
+        other = BufferedEkf(self.config)
+        if self._events:
+            other._events.append(replace(self._events[-1]))
+            other._telemetry_s = self._telemetry_s
+            assert other._events[0].saved is not None
+            other.ekf.restore(other._events[0].saved)
+        return other
 
     def statistics(self) -> dict[str, int]:
         """How many measurements were accepted, refused, recovered, late."""
@@ -153,23 +227,30 @@ class BufferedEkf:
         event.saved = ekf.copy_state()
 
     def _predict(self, previous: _Event, stamp_s: float, index: int) -> FloatArray:
-        """From the event before ``index`` to ``stamp_s``; velocity is interpolated towards the next reading.
+        """From the event before ``index`` to ``stamp_s``; velocity and angles are interpolated to the next reading.
 
         Returns:
             The velocity at ``stamp_s`` ``(3,)``.
         """
         dt = stamp_s - previous.stamp_s
-        velocity, turn = previous.velocity, previous.turn
+        velocity = previous.velocity
         if dt <= 0:
+            return velocity
+        if self.config.literal:
+            self.ekf.predict(dt, velocity, previous.battery)
             return velocity
         end = velocity
         following = self._next_reading(index)
-        if following is not None and not self.config.literal:
+        # The printed filter holds a reading until the next one.
+        if following is not None:
             reach = following.stamp_s - previous.stamp_s
             if reach < _SILENCE_S and math.isfinite(float(following.velocity_m_s.sum())):
                 end = velocity + min(1.0, dt / reach) * (following.velocity_m_s - velocity)
-            turn = _turn(previous, following)
-        self.ekf.predict(dt, 0.5 * (velocity + end), previous.battery, turn)
+            rate = _rate(previous, following)
+        else:
+            left_s = previous.rpy_s + _PACKET_S - previous.stamp_s if math.isfinite(previous.rpy_s) else 0.0
+            rate = previous.rate * min(1.0, max(0.0, left_s) / dt)
+        self.ekf.predict(dt, 0.5 * (velocity + end), previous.battery, rate)
         return end
 
     def _next_reading(self, index: int) -> TelemetrySample | None:
@@ -181,7 +262,7 @@ class BufferedEkf:
     def _apply_telemetry(self, event: _Event, sample: TelemetrySample) -> None:
         if math.isfinite(float(sample.velocity_m_s.sum())):
             event.velocity = sample.velocity_m_s
-        event.turn = _turn(event, sample)
+        event.rate = _rate(event, sample)
         if math.isfinite(sample.battery):
             event.battery = sample.battery
         if math.isfinite(float(sample.rpy_rad.sum())):
@@ -194,14 +275,18 @@ class BufferedEkf:
         assert event.T is not None
         if event.kind == _ABSOLUTE:
             rpy = rpy_from_matrix(event.T[:3, :3])
-            outcome = ekf.update_absolute(event.T[:3, 3], rpy, event.sigma_t_m, event.sigma_r_rad)
+            outcome = ekf.update_absolute(event.T[:3, 3], rpy, event.noise.t_m, event.noise.r_rad)
+            ekf.clone()
         elif not abs(event.clone_s - event.from_s) < _SAME_S:
             outcome = Outcome.NO_CLONE
+            ekf.clone()
         else:
-            outcome = ekf.update_relative(event.T, event.sigma_t_m, event.sigma_r_rad)
+            ekf.carry_clone(event.T, event.noise.t_m, event.noise.r_rad)
+            outcome = ekf.update_clone(max(event.jitter.t_m, _EXACT), max(event.jitter.r_rad, _EXACT))
+            if outcome is Outcome.REFUSED:  # what follows may be right again
+                ekf.clone()
         event.outcome = self._named("visual", outcome)
         event.nis = ekf.nis if outcome is not Outcome.NO_CLONE else math.nan
-        ekf.clone()
         event.clone_s = event.stamp_s
 
     @staticmethod
@@ -224,12 +309,9 @@ def _degrees(event: _Event) -> int:
     return 3 if event.kind == _TELEMETRY else 6
 
 
-def _turn(before: _Event, sample: TelemetrySample) -> float:
-    """Turning rate [rad/s] between the last attitude reading and this one; what it was when either is missing."""
+def _rate(before: _Event, sample: TelemetrySample) -> FloatArray:
+    """Rates of the angles [rad/s] between the last attitude reading and this one; zero when they are far apart."""
     dt = sample.stamp_s - before.rpy_s
-    if before.rpy is None or not dt > 0 or not math.isfinite(float(sample.rpy_rad.sum())):
-        return before.turn
-    turned = wrapped(sample.rpy_rad - before.rpy)
-    # Six readings' noise is in the sum; what is left is turning.
-    squared = float(turned @ turned) - 6.0 * _QUANTISATION_RAD**2
-    return min(math.sqrt(max(squared, 0.0)) / dt, 10.0)
+    if before.rpy is None or not 0.0 < dt < _SILENCE_S or not math.isfinite(float(sample.rpy_rad.sum())):
+        return np.zeros(3)
+    return wrapped(sample.rpy_rad - before.rpy) / dt

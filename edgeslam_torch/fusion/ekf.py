@@ -1,7 +1,9 @@
 r"""Extended Kalman filter of the drone's position and attitude, paper eqs. (8)-(14).
 
 The state is :math:`x = (p, \alpha)`, position and roll-pitch-yaw in the power-on world, eq. (8); behind it lie a
-velocity bias and a clone of the pose at the last visual update, which relative visual measurements need.
+velocity bias and a clone: where vision last saw the body. The clone is carried along by visual increments and compared
+with the pose. Thus the jitter of a visual pose counts once, and not in the increment before it and in the one after it,
+as it would if increments were independent measurements; only the drift of the map adds up.
 
 Note:
     The printed filter and the corrected default differ in seven points (docs/tello.md, "The filter");
@@ -18,12 +20,15 @@ from scipy.special import chdtri  # scipy.stats takes a second of CPU to import
 
 from edgeslam_torch.fusion.config import FusionConfig
 from edgeslam_torch.fusion.relative import relative_measurement
-from edgeslam_torch.fusion.rotations import euler_rate_matrix, matrix_from_rpy, wrapped
+from edgeslam_torch.fusion.rotations import euler_rate_matrix, matrix_from_rpy, rpy_from_matrix, wrapped
 from edgeslam_torch.types import FloatArray
 
 _P, _A, _B = slice(0, 3), slice(3, 6), slice(6, 9)
 _POSE, _CLONE = slice(0, 6), slice(9, 15)
+_CLONE_P, _CLONE_A = slice(9, 12), slice(12, 15)
 _SIZE = 15
+_NO_RATE = np.zeros(3)
+_IDENTITY = np.eye(4)
 
 Saved = tuple[FloatArray, FloatArray, float, dict[int, int]]
 """State, covariance, time since vision, refusals in a row."""
@@ -59,6 +64,18 @@ class EkfState:
         return float(error @ np.linalg.solve(self.covariance, error))
 
 
+@dataclass(frozen=True, slots=True)
+class Relative:
+    """Motion of the body since vision last saw it, in its axes at that moment."""
+
+    T: FloatArray
+    """``(4, 4)`` pose [m]."""
+    velocity_m_s: FloatArray
+    """``(3,)``"""
+    covariance: FloatArray
+    """``(9, 9)`` of translation [m], rotation vector [rad] and velocity [m/s]."""
+
+
 class Ekf:
     """The filter proper: it knows no clock and no buffer, see `BufferedEkf` for late measurements."""
 
@@ -84,7 +101,7 @@ class Ekf:
         self.clone()
 
     def predict(
-        self, dt_s: float, velocity_m_s: FloatArray, battery: float = math.nan, turn_rad_s: float = 0.0
+        self, dt_s: float, velocity_m_s: FloatArray, battery: float = math.nan, rpy_rate_rad_s: FloatArray = _NO_RATE
     ) -> None:
         """Propagate by a velocity reading over ``dt_s``, paper eqs. (9)-(10).
 
@@ -92,7 +109,8 @@ class Ekf:
             dt_s: Time step [s].
             velocity_m_s: Reading ``(3,)`` in ``config.velocity_frame``.
             battery: Charge in [0, 1]; NaN counts as full.
-            turn_rad_s: How fast the readings say the drone turns; the state has no rates, so this is process noise.
+            rpy_rate_rad_s: Rates of roll, pitch and yaw ``(3,)`` by the attitude readings around; the printed filter
+                has none.
         """
         self.tau_s += dt_s
         spent = 1.0 - battery if battery == battery else 0.0
@@ -116,7 +134,8 @@ class Ekf:
         x[_P] += dt_s * moved
         growth = 1.0 + config.beta * spent + config.lambda_tau * min(self.tau_s, 60.0)
         position = dt_s * (0.1 * config.sigma_velocity_m_s**2 * growth + config.floor_position_m**2)
-        turning = dt_s * (config.sigma_turn_rad_sqrt_s**2 + dt_s * turn_rad_s**2)
+        x[_A] += dt_s * rpy_rate_rad_s
+        turning = dt_s * config.sigma_turn_rad_sqrt_s**2
         bias = dt_s * config.bias_walk_m_s_sqrt_s**2 * growth if config.sigma_bias_m_s > 0 else 0.0
         # A reading's error lasts as long as the reading, 0.1 s: dt * 0.1 s of variance, not dt^2.
         diagonal = P.ravel()[:: _SIZE + 1]
@@ -157,13 +176,40 @@ class Ekf:
         return outcome
 
     def clone(self) -> None:
-        """Remember the present pose as the one the next relative measurement starts from."""
+        """Vision sees the body where the filter has it: a start without knowledge of its own."""
         self.x[_CLONE] = self.x[_POSE]
         self.P[_CLONE] = self.P[_POSE]
         self.P[:, _CLONE] = self.P[:, _POSE]
 
+    def carry_clone(self, T: FloatArray, sigma_t_m: float, sigma_r_rad: float) -> None:
+        r"""Move the clone by a visual increment, :math:`\Delta T_{rel}` of paper eq. (13).
+
+        Args:
+            T: Body pose in the cloned body frame ``(4, 4)`` [m].
+            sigma_t_m: Drift of its translation [m], per axis.
+            sigma_r_rad: Drift of its rotation [rad], per axis.
+        """
+        x, P = self.x, self.P
+        R = matrix_from_rpy(x[_CLONE_A])
+        E = euler_rate_matrix(x[_CLONE_A])
+        moved = R.dot(T[:3, 3])
+        x[_CLONE_P] += moved
+        x[_CLONE_A] = rpy_from_matrix(R.dot(T[:3, :3]))
+        to_rates = np.linalg.inv(euler_rate_matrix(x[_CLONE_A]))
+        G = np.eye(6)  # of the clone's change by its error before
+        G[:3, 3:] = _cross_columns(E, moved)
+        G[3:, 3:] = to_rates.dot(E)
+        P[_CLONE] = G.dot(P[_CLONE])
+        P[:, _CLONE] = P[:, _CLONE].dot(G.T)
+        P[_CLONE_P, _CLONE_P] += sigma_t_m**2 * np.eye(3)
+        P[_CLONE_A, _CLONE_A] += sigma_r_rad**2 * to_rates.dot(to_rates.T)
+
+    def update_clone(self, sigma_t_m: float, sigma_r_rad: float) -> Outcome:
+        """The body is where vision sees it, to within the jitter of one visual pose [m], [rad], per axis."""
+        return self.update_relative(_IDENTITY, sigma_t_m, sigma_r_rad)
+
     def update_relative(self, T_clone_b: FloatArray, sigma_t_m: float, sigma_r_rad: float) -> Outcome:
-        r"""Visual motion since the clone, :math:`\Delta T_{rel}` of paper eq. (13), as a measurement of both poses.
+        """Motion since the clone, measured independently of everything else; the clone stays where it is.
 
         Args:
             T_clone_b: Body pose in the cloned body frame [m], shape ``(4, 4)``.
@@ -175,6 +221,29 @@ class Ekf:
         outcome = self._update(P_Ht, H.dot(P_Ht), residual, _pose_noise(sigma_t_m, sigma_r_rad))
         self._after_visual(outcome)
         return outcome
+
+    def since_clone(self, velocity_m_s: FloatArray) -> "Relative":
+        """Pose and velocity in the axes of the body where vision last saw it.
+
+        Args:
+            velocity_m_s: Reading ``(3,)`` that holds now, in ``config.velocity_frame``.
+        """
+        x, config = self.x, self.config
+        seen, H = relative_measurement(x, _IDENTITY)
+        R_c = matrix_from_rpy(x[_CLONE_A])
+        T = np.eye(4)
+        T[:3, :3] = R_c.T @ matrix_from_rpy(x[_A])
+        T[:3, 3] = -seen[:3]
+        bias = np.zeros(3) if config.literal else x[_B]
+        turned = matrix_from_rpy(x[_A]) if config.velocity_frame == "body" else np.eye(3)
+        velocity_w = turned @ (velocity_m_s - bias)
+        J = np.zeros((9, _SIZE))
+        J[:6] = H
+        J[6:, _B] = -R_c.T @ turned
+        J[6:, _CLONE_A] = -R_c.T @ _cross_columns(euler_rate_matrix(x[_CLONE_A]), velocity_w)
+        covariance = J @ self.P @ J.T
+        covariance[range(6, 9), range(6, 9)] += config.sigma_velocity_m_s**2
+        return Relative(T, R_c.T @ velocity_w, 0.5 * (covariance + covariance.T))
 
     def _after_visual(self, outcome: Outcome) -> None:
         if outcome in (Outcome.ACCEPTED, Outcome.RECOVERED):

@@ -19,11 +19,20 @@ from edgeslam_torch.fusion.consensus import Settled, settled_with_network
 from edgeslam_torch.fusion.delay import DelaySearch
 from edgeslam_torch.fusion.depth_scale import DepthRatio, DepthRatios, DepthScale
 from edgeslam_torch.fusion.ekf import EkfState
-from edgeslam_torch.fusion.filter_feed import FilterFeed
+from edgeslam_torch.fusion.filter_feed import FilterFeed, Metric
 from edgeslam_torch.fusion.mount import Mount, estimate_mount
 from edgeslam_torch.fusion.plausibility import HEIGHTS, Trust
-from edgeslam_torch.fusion.prediction import VISUAL_REACH_S, Carried, PoseEstimate, between, by_vision
+from edgeslam_torch.fusion.prediction import (
+    VISUAL_REACH_S,
+    Carried,
+    PoseEstimate,
+    between,
+    by_filter,
+    by_vision,
+    with_velocity,
+)
 from edgeslam_torch.fusion.scale import LogScale, fuse
+from edgeslam_torch.fusion.snapshot import Snapshot
 from edgeslam_torch.fusion.telemetry_scale import TelemetryFit, TelemetryScale, rescaled
 from edgeslam_torch.fusion.track import TelemetryTrack
 from edgeslam_torch.fusion.visual_memory import VisualMemory, VisualPose
@@ -77,7 +86,7 @@ class MotionFusion:
     def add_telemetry(self, samples: Sequence[TelemetrySample]) -> None:
         """State messages in the order of arrival."""
         for sample in self._track.add(samples):
-            self._filter.ekf.add_telemetry(sample)
+            self._filter.add_telemetry(sample, self._fit.shortfall_m_s)
 
     def add_visual(
         self, stamp_s: float, T_w_c: FloatArray, sigma_t: float, sigma_r_rad: float, tracked: bool = True
@@ -105,8 +114,10 @@ class MotionFusion:
             if self.refined_poses is not None:
                 self._remember(*self.refined_poses(stamp_s - self.config.window_s))
             self._refit()
-        follows = self._memory.previous is not None
-        self._filter.see(visual, follows, self._delay.delay, self.scale(), self._by_telemetry is not None)
+        if self._trust.velocity and self._trust.motion:
+            self._filter.see(visual, Metric(self.scale(), self._delay.delay))
+        else:
+            self._filter.clear()
 
     def revise(self, stamps_s: FloatArray, T_w_c: FloatArray) -> None:
         """Later knowledge of earlier poses: a map that was refined has moved them, and its scale has drifted less.
@@ -120,8 +131,19 @@ class MotionFusion:
 
     def _remember(self, stamps_s: FloatArray, T_w_c: FloatArray) -> None:
         self._memory.revise(stamps_s, T_w_c)
-        if (held := self._filter.pose) is not None:
-            self._filter.change(held.revised(dict(zip(stamps_s.tolist(), T_w_c, strict=True))))
+        if (seen := self._filter.seen) is not None:
+            self._filter.move_map(seen.revised(dict(zip(stamps_s.tolist(), T_w_c, strict=True))))
+
+    def map_moved(self, T: FloatArray) -> None:
+        """The map around the newest frame was moved, ``T_w_c' = T T_w_c`` with ``(4, 4)``; the camera was not."""
+        self._memory.move_newest(T)
+        if (seen := self._filter.seen) is not None:
+            self._filter.move_map(seen.moved(T))
+
+    def begin_piece(self) -> None:
+        """A new piece of map begins at a predicted pose: what moves between the pieces is not the camera."""
+        self._filter.clear()
+        self._memory.interrupt()
 
     def add_depth_ratio(self, ratio: DepthRatio) -> None:
         """How one keyframe's network depth compares with the map's."""
@@ -133,8 +155,8 @@ class MotionFusion:
             raise ValueError(f"factor must be positive, got {factor}")
         centre = np.zeros(3) if about is None else np.asarray(about, dtype=np.float64)
         self._memory.rescale(factor, centre)
-        if (held := self._filter.pose) is not None:
-            self._filter.change(held.rescaled(factor, centre))
+        if (seen := self._filter.seen) is not None:
+            self._filter.move_map(seen.rescaled(factor, centre))
         self._depth.rescale(factor)
         if (told := self._by_telemetry) is not None:
             self._by_telemetry = replace(told, log_scale=told.log_scale - math.log(factor))
@@ -188,6 +210,11 @@ class MotionFusion:
         """``R_w_m`` ``(3, 3)``: map axes to the drone's power-on world; ``None`` without telemetry attitude."""
         return self._R_w_m
 
+    @property
+    def filtering(self) -> bool:
+        """Whether the Kalman filter is fed by vision: it then predicts the camera."""
+        return self._filter.seen is not None
+
     def filter_state(self, stamp_s: float | None = None) -> EkfState | None:
         """The Kalman filter's body pose in the power-on world, on the telemetry clock."""
         ekf = self._filter.ekf
@@ -195,7 +222,7 @@ class MotionFusion:
         return None if stamp is None else ekf.state_at(stamp)
 
     def predict(self, stamp_s: float) -> PoseEstimate | None:
-        """Camera pose at a frame's stamp from the last visual pose, visual velocity and telemetry.
+        """Camera pose at a frame's stamp from what vision saw last and what telemetry has told since.
 
         Returns:
             The estimate in map units, or ``None`` before the first tracked frame.
@@ -203,6 +230,21 @@ class MotionFusion:
         last, previous = self._memory.last, self._memory.previous
         if last is None:
             return None
+        view = self._filter.view(stamp_s) if stamp_s > last.stamp_s else None
+        if view is not None:
+            told = by_filter(view, self.scale(), self.delay_sigma_s)
+            return with_velocity(told, last, previous, self.scale())
+        return self._predict_unfiltered(last, previous, stamp_s)
+
+    def snapshot(self) -> Snapshot | None:
+        """What is known of the present motion, for other threads; ``None`` before the first tracked frame."""
+        last = self._memory.last
+        if last is None:
+            return None
+        return Snapshot(last, self._memory.previous, self._filter.frozen(), self.scale(), self.delay_sigma_s)
+
+    def _predict_unfiltered(self, last: VisualPose, previous: VisualPose | None, stamp_s: float) -> PoseEstimate:
+        """While the filter knows no scale or no delay, telemetry has a hole, or does not go with the images."""
         gap = stamp_s - last.stamp_s
         visual = by_vision(last, previous, stamp_s)
         share = 1.0 if previous is None else float(np.clip((gap - VISUAL_REACH_S) / VISUAL_REACH_S, 0.0, 1.0))

@@ -185,6 +185,14 @@ class TelemetryTrack:
             return matrix_from_rpy(rpy[0])[None]
         return Rotation.from_euler("ZYX", rpy[:, ::-1]).as_matrix()
 
+    def interpolation_variance(self, stamps_s: FloatArray) -> FloatArray:
+        """Variance of `attitude` ``(N,)`` in units of one reading's: 1 at a reading, a half between two."""
+        stamp = self.readings.stamp_s
+        left = np.clip(np.searchsorted(stamp, stamps_s, side="right") - 1, 0, max(len(stamp) - 2, 0))
+        right = np.minimum(left + 1, len(stamp) - 1)
+        share = np.clip((stamps_s - stamp[left]) / np.maximum(stamp[right] - stamp[left], 1e-9), 0.0, 1.0)
+        return share**2 + (1.0 - share) ** 2
+
     def covered(self, from_s: FloatArray, to_s: FloatArray) -> NDArray[np.bool_]:
         """Whether each interval lies within readings without a hole, a frozen stretch or a missing velocity."""
         if len(self._samples) < 2:

@@ -29,6 +29,10 @@ class VisualPose:
         """The same after ``p' = centre + factor (p - centre)``."""
         return replace(self, T=_scaled(self.T, factor, centre), sigma_t=self.sigma_t * factor)
 
+    def moved(self, T: FloatArray) -> "VisualPose":
+        """The same in a map that was moved by ``T`` ``(4, 4)``."""
+        return replace(self, T=T @ self.T)
+
     def revised(self, known: dict[float, FloatArray]) -> "VisualPose":
         """The same frame at its refined pose, where that is known."""
         T = known.get(self.stamp_s)
@@ -158,6 +162,10 @@ class VisualMemory:
     def rescale(self, factor: float, centre: FloatArray) -> None:
         """The map was scaled about a point ``(3,)``."""
         self._each(lambda visual: visual.rescaled(factor, centre))
+
+    def move_newest(self, T: FloatArray) -> None:
+        """The map around the newest frames was moved by ``T`` ``(4, 4)``: ``T_w_c' = T T_w_c``; older ones stay."""
+        self.last, self.previous = (None if v is None else v.moved(T) for v in (self.last, self.previous))
 
     def clear(self) -> None:
         """A new map in a new gauge."""

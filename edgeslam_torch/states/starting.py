@@ -92,6 +92,7 @@ class Starting:
             system.mapping.look(frame, keyframe)
         guess = self._guess_depth(keyframe)
         slam_map.begin_piece(reason)
+        system.fusion.begin_piece()
         colour = colours_at(keyframe.image, view.features.uv)
         self._attempt = Bootstrap(slam_map, system.tracker, self.config, keyframe, guess, colour, system.config.seed)
         slam_map.remove_empty_keyframes()

@@ -64,8 +64,11 @@ class System:
     # -- motion ------------------------------------------------------------------------------------------------
 
     def predict(self, stamp_s: float, lost: bool) -> FloatArray:
-        """``T_c_w`` expected at a stamp: constant velocity over short gaps, telemetry over long ones."""
-        if self.has_telemetry and (lost or self.motion.stands):
+        """``T_c_w`` expected at a stamp: by the Kalman filter where it is fed, else at constant velocity.
+
+        Before the filter knows scale and delay, telemetry alone carries the pose where vision has no velocity.
+        """
+        if self.has_telemetry and (self.fusion.filtering or lost or self.motion.stands):
             estimate = self.fusion.predict(stamp_s)
             if estimate is not None:
                 return se3.inverse(estimate.T_w_c)
@@ -110,7 +113,10 @@ class System:
         """Carry the present pose along with what refinement did to the newest keyframe."""
         if mapped is None:
             return False
-        self.motion.correct(se3.inverse(mapped.T_tracked) @ mapped.keyframes[-1].T_c_w)
+        T_c_c = se3.inverse(mapped.T_tracked) @ mapped.keyframes[-1].T_c_w
+        before = self.motion.T_c_w
+        self.motion.correct(T_c_c)
+        self.fusion.map_moved(se3.inverse(self.motion.T_c_w) @ before)
         self.stage_ms.update(mapped.stage_ms)
         for keyframe in mapped.keyframes:
             self.compare_depth(keyframe)

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from scipy.stats import chi2
 
 from edgeslam_torch.fusion.config import FusionConfig
-from edgeslam_torch.fusion.delayed import BufferedEkf
+from edgeslam_torch.fusion.delayed import BufferedEkf, PoseSigma
 from edgeslam_torch.fusion.rotations import matrix_from_rpy, rpy_from_matrix
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.readers.telemetry_csv import read_telemetry
@@ -100,9 +100,9 @@ def fly(s: Scene, config: FusionConfig, absolute: bool = False) -> Score:
                     pose = np.eye(4)
                     pose[:3, :3], pose[:3, 3] = matrix_from_rpy(start.rpy_rad), start.p_w
                 pose = pose @ step
-                ekf.add_absolute(to_s, pose, SIGMA_T, SIGMA_R)
+                ekf.add_absolute(to_s, pose, PoseSigma(SIGMA_T, SIGMA_R))
             else:
-                ekf.add_relative(from_s, to_s, step, SIGMA_T, SIGMA_R)
+                ekf.add_relative(from_s, to_s, step, PoseSigma(SIGMA_T, SIGMA_R))
             fed += 1
         if k % 10 == 9:
             state = ekf.state_at(sample.stamp_s)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from edgeslam_torch.fusion.config import FusionConfig
-from edgeslam_torch.fusion.delayed import BufferedEkf
+from edgeslam_torch.fusion.delayed import BufferedEkf, PoseSigma
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.types import TelemetrySample
 
@@ -33,7 +33,7 @@ def run(samples, visual, delay):
         if kind == 0:
             ekf.add_telemetry(item)
         else:
-            ekf.add_relative(item[0], item[1], item[2], 0.004, 0.003)
+            ekf.add_relative(item[0], item[1], item[2], PoseSigma(0.004, 0.003))
     return ekf
 
 
@@ -55,7 +55,7 @@ def test_any_order_inside_the_buffer_gives_the_same_state(rng):
         shuffled.add_telemetry(samples[k])
     for ekf in (ordered, shuffled):
         for v in visual:
-            ekf.add_relative(*v, 0.004, 0.003)
+            ekf.add_relative(*v, PoseSigma(0.004, 0.003))
     np.testing.assert_allclose(ordered.state_at(1.9).p_w, shuffled.state_at(1.9).p_w, atol=1e-12)
 
 
@@ -72,7 +72,7 @@ def test_counts_say_what_was_accepted_and_refused(rng):
     assert counts["visual accepted"] >= 16
     wild = np.eye(4)
     wild[:3, 3] = [3.0, 0.0, 0.0]
-    ekf.add_relative(3.43, 3.63, wild, 0.004, 0.003)
+    ekf.add_relative(3.43, 3.63, wild, PoseSigma(0.004, 0.003))
     assert ekf.statistics()["visual refused"] == counts.get("visual refused", 0) + 1
 
 
@@ -83,7 +83,7 @@ def test_vision_that_disagrees_for_long_is_believed_in_the_end(rng):
     for k in range(40):
         ekf.add_telemetry(TelemetrySample(0.1 * k, np.zeros(3), np.zeros(3), battery=1.0))
         if k >= 20:
-            ekf.add_relative(0.1 * (k - 1), 0.1 * k, T, 0.004, 0.003)
+            ekf.add_relative(0.1 * (k - 1), 0.1 * k, T, PoseSigma(0.004, 0.003))
     counts = ekf.statistics()
     assert counts["visual refused"] >= CONFIG.refusals_before_recovery - 1
     assert counts["visual recovered"] >= 1
@@ -97,7 +97,7 @@ def test_bias_of_the_velocity_is_found_from_relative_poses(rng):
     for k in range(200):
         ekf.add_telemetry(TelemetrySample(0.1 * k, np.array([0.38, 0.0, 0.0]), np.zeros(3), battery=1.0))
         if k > 0:
-            ekf.add_relative(0.1 * (k - 1), 0.1 * k, T, 0.003, 0.003)
+            ekf.add_relative(0.1 * (k - 1), 0.1 * k, T, PoseSigma(0.003, 0.003))
     assert ekf.state_at(19.9).velocity_bias_m_s[0] == pytest.approx(0.08, abs=0.01)
 
 
@@ -123,14 +123,14 @@ def test_increments_with_a_hole_start_from_a_fresh_clone(rng):
     ekf = run(telemetry(rng, 30), [], 0.0)
     T = np.eye(4)
     T[:3, 3] = [0.1, 0.0, 0.0]
-    ekf.add_relative(0.5, 0.7, T, 0.004, 0.003)
-    ekf.add_relative(1.5, 1.7, T, 0.004, 0.003)
+    ekf.add_relative(0.5, 0.7, T, PoseSigma(0.004, 0.003))
+    ekf.add_relative(1.5, 1.7, T, PoseSigma(0.004, 0.003))
     assert ekf.statistics()["visual accepted"] == 2
 
 
 def test_increments_backwards_in_time_are_refused():
     ekf = BufferedEkf(CONFIG)
-    ekf.add_relative(1.0, 0.5, np.eye(4), 0.01, 0.01)
+    ekf.add_relative(1.0, 0.5, np.eye(4), PoseSigma(0.01, 0.01))
     assert ekf.statistics() == {"out of order": 1}
     assert ekf.state_at(1.0) is None
 
@@ -140,5 +140,5 @@ def test_absolute_update_pulls_towards_the_accumulated_pose(rng):
     here = ekf.state_at(1.9)
     T = se3.exp(np.r_[here.p_w, 0, 0, 0])
     T[:3, 3] = here.p_w + [0.02, 0.0, 0.0]
-    ekf.add_absolute(1.9, T, 0.005, 0.01)
+    ekf.add_absolute(1.9, T, PoseSigma(0.005, 0.01))
     assert 0.005 < ekf.state_at(1.9).p_w[0] - here.p_w[0] < 0.02
