@@ -113,9 +113,8 @@ class System:
         """Carry the present pose along with what refinement did to the newest keyframe."""
         if mapped is None:
             return False
-        T_c_c = se3.inverse(mapped.T_tracked) @ mapped.keyframes[-1].T_c_w
         before = self.motion.T_c_w
-        self.motion.correct(T_c_c)
+        self.motion.correct(se3.inverse(mapped.T_tracked) @ mapped.keyframes[-1].T_c_w)
         self.fusion.map_moved(se3.inverse(self.motion.T_c_w) @ before)
         self.stage_ms.update(mapped.stage_ms)
         for keyframe in mapped.keyframes:

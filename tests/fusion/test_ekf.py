@@ -195,7 +195,7 @@ CHI2_95 = {3: 7.815, 6: 12.592}
 def test_gate_is_the_95_percent_quantile(degrees, share, outcome):
     """One attitude, or one pose, whose innovation is a little within or a little beyond that ellipsoid."""
     ekf = Ekf(CONFIG)
-    ekf.predict(0.5, np.zeros(3), turn_rad_s=0.1)
+    ekf.predict(0.5, np.zeros(3))
     P = ekf.state(0.0).covariance
     if degrees == 3:
         sigma = math.sqrt(P[3, 3] + CONFIG.sigma_attitude_rad**2)
