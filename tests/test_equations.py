@@ -126,7 +126,7 @@ def test_every_equation_of_the_paper_has_a_row() -> None:
 
 def test_only_what_is_said_to_run_nowhere_has_no_name() -> None:
     empty = [row[0] for row in rows() if re.fullmatch(r"[\d, ]+", row[0]) and "`" not in row[2]]
-    assert empty == ["14"]
+    assert empty == []
 
 
 @pytest.mark.parametrize("name", named())

@@ -28,6 +28,8 @@ from edgeslam_torch.types import FloatArray, PoseNow, TelemetrySample
 
 _DIFFERENCE_S = 0.05
 """The true velocity is the mean over twice this time."""
+_LEAST_ANSWERS = 20
+"""A second of a flight; fewer cannot be aligned."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +46,7 @@ class Errors:
     """Of all answers that rest on the filter; lists of the same length."""
 
     absolute_m: list[float] = field(default_factory=list)
-    """In the world of the trajectory, which is aligned with the truth as a whole without scale."""
+    """In the world of the trajectory, which is aligned with the truth as a whole, without scale."""
     since_seen_m: list[float] = field(default_factory=list)
     """Of the motion since the frame that the answer rests on: what the filter does wrong, without the map."""
     late_m: list[float] = field(default_factory=list)
@@ -111,17 +113,19 @@ def ask(recording: Recording, telemetry: Sequence[TelemetrySample], config: Slam
 
 
 def judge(answers: Sequence[Asked], truth: Truth, delay_s: float) -> Errors:
-    """Compare metric answers of the last revision with the truth at the moment that they speak of."""
-    revision = answers[-1].now.revision if answers else 0
-    used = [a for a in answers if a.now.metric and a.now.revision == revision]
-    used = [a for a in used if a.now.stamp_s + delay_s + _DIFFERENCE_S <= truth.stamps_s[-1]]
+    """Compare metric answers of the filter with the truth at the moment that they speak of.
+
+    Each revision of the published units is aligned by itself: it is an event, and poses across it do not compare.
+    """
     errors = Errors(asked=len(answers))
-    if len(used) < 3:
-        return errors
-    seen = np.array([a.T_w_seen[:3, 3] for a in used])
-    alignment = umeyama(seen, np.array([truth.at(a.now.seen_s)[:3, 3] for a in used]), AlignmentKind.SE3)
-    for answer in used:
-        if answer.now.source == "filter":
+    for revision in {a.now.revision for a in answers}:
+        used = [a for a in answers if a.now.metric and a.now.source == "filter" and a.now.revision == revision]
+        used = [a for a in used if a.now.stamp_s + delay_s + _DIFFERENCE_S <= truth.stamps_s[-1]]
+        if len(used) < _LEAST_ANSWERS:
+            continue
+        seen = np.array([a.T_w_seen[:3, 3] for a in used])
+        alignment = umeyama(seen, np.array([truth.at(a.now.seen_s)[:3, 3] for a in used]), AlignmentKind.SE3)
+        for answer in used:
             _judge_one(errors, answer, truth, answer.now.stamp_s + delay_s, alignment)
     return errors
 
