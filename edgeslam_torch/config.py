@@ -135,7 +135,7 @@ class InitialisationConfig:
     max_reprojection_px: float = 2.0
     keyframe_gap_s: float = 0.15
     """Minimum time between the intermediate frames that become keyframes after initialisation."""
-    most_keyframes: int = 12
+    max_keyframes: int = 12
     """Maximum number of these frames; each costs an inference of the depth network."""
     max_direction_sigma: float = 0.08
     """Standard deviation of the second camera's position relative to the baseline above which initialisation waits:
@@ -144,7 +144,7 @@ class InitialisationConfig:
     """The same without a depth network to resolve the two-fold ambiguity of a small motion."""
 
     def __post_init__(self) -> None:
-        _positive(self, "min_parallax_deg", "min_points", "max_reprojection_px", "keyframe_gap_s", "most_keyframes")
+        _positive(self, "min_parallax_deg", "min_points", "max_reprojection_px", "keyframe_gap_s", "max_keyframes")
 
 
 @dataclass(frozen=True, slots=True)

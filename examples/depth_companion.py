@@ -16,8 +16,8 @@ import sys
 import time
 from collections.abc import Iterator
 
-_MOST_PIXELS = "OPENCV_IO_MAX_IMAGE_PIXELS"
-os.environ.setdefault(_MOST_PIXELS, "50000000")  # a picture of a few kilobytes can ask for gigabytes
+_MAX_PIXELS = "OPENCV_IO_MAX_IMAGE_PIXELS"
+os.environ.setdefault(_MAX_PIXELS, "50000000")  # a picture of a few kilobytes can ask for gigabytes
 
 import cv2  # noqa: E402, it reads the limit while it loads
 import numpy as np  # noqa: E402
@@ -71,7 +71,7 @@ def frames(source: str) -> Iterator[np.ndarray]:
     try:
         picture = None if camera else cv2.imread(source)
     except cv2.error as error:
-        raise ValueError(f"{source}: more than {os.environ[_MOST_PIXELS]} pixels") from error
+        raise ValueError(f"{source}: more than {os.environ[_MAX_PIXELS]} pixels") from error
     if picture is not None:
         yield picture
         return

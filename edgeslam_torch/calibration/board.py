@@ -113,7 +113,7 @@ def _chessboard(grey: np.ndarray, size: tuple[int, int], exact: bool) -> FloatAr
     if not exact:
         return corners.reshape(-1, 2)
     uv = corners.reshape(size[1], size[0], 2)
-    spacing = min(_least_distance(uv, 0), _least_distance(uv, 1))
+    spacing = min(_min_distance(uv, 0), _min_distance(uv, 1))
     # As wide as possible without reaching the next corner: on 26 pictures of a real Tello, half the spacing gives
     # 0.32 px RMS, a fifth of it 0.70 px.
     half = int(np.clip(0.5 * spacing, 2, 30))
@@ -122,7 +122,7 @@ def _chessboard(grey: np.ndarray, size: tuple[int, int], exact: bool) -> FloatAr
     return np.asarray(refined, dtype=np.float32).reshape(-1, 2)
 
 
-def _least_distance(uv: FloatArray, axis: int) -> float:
+def _min_distance(uv: FloatArray, axis: int) -> float:
     return float(np.min(np.linalg.norm(np.diff(uv, axis=axis), axis=-1)))
 
 

@@ -28,13 +28,13 @@ class Junctions:
     def __len__(self) -> int:
         return len(self.uv)
 
-    def arm_points(self, count: int, most_px: float = 40.0) -> tuple[FloatArray, FloatArray]:
+    def arm_points(self, count: int, max_px: float = 40.0) -> tuple[FloatArray, FloatArray]:
         """Points along the arms, for their depths: pixels ``(C, 2, count, 2)`` and fractions ``(C, 2, count)``.
 
-        Fractions are 0 at the corner and 1 at the last point, at most ``most_px`` away.
+        Fractions are 0 at the corner and 1 at the last point, at most ``max_px`` away.
         """
         fraction = np.broadcast_to(np.linspace(1.0 / count, 1.0, count), (len(self), 2, count))
-        reach = np.minimum(self.length_px, most_px)[..., None, None]
+        reach = np.minimum(self.length_px, max_px)[..., None, None]
         uv = self.uv[:, None, None] + self.arms[:, :, None] * fraction[..., None] * reach
         return uv, fraction
 

@@ -8,7 +8,7 @@ REPEATED = "the image repeats the one before"
 
 _GRID = 4
 """Every fourth pixel of every fourth row is compared: 30 us per frame of 640x480."""
-_LEAST_CHANGE = 0.3
+_MIN_CHANGE = 0.3
 """Mean absolute difference [grey levels] above which two images differ. Sensor noise of one level gives 1.1; the
 minimum over nine recordings, including slow ones and bare walls, is 0.99. A still scene through an MPEG-4 encoder
 stays within 0.26, except for key frames."""
@@ -29,7 +29,7 @@ class RepeatedImages:
     def repeats(self, grey: NDArray[np.uint8], stamp_s: float) -> bool:
         """Whether an image ``(H, W)`` repeats the current stretch."""
         grid = grey[::_GRID, ::_GRID].astype(np.int16)
-        if self._reference is None or _change(self._reference, grid) >= _LEAST_CHANGE:
+        if self._reference is None or _change(self._reference, grid) >= _MIN_CHANGE:
             self._reference, self._since_s = grid, stamp_s
             return False
         if stamp_s - self._since_s >= _LONG_S:

@@ -16,7 +16,7 @@ _ASPECT = 3.0
 """Maximum ratio of the two focal lengths."""
 _MARGIN = 0.5
 """How far outside the image the principal point may lie, relative to its width or height."""
-_MOST_PULLED = 0.5
+_MAX_PULLED = 0.5
 """Minimum ratio of undistorted to distorted distance from the principal point, at the border."""
 _FARTHEST = 10.0
 """Maximum ratio of undistorted to distorted distance, at the border."""
@@ -59,7 +59,7 @@ def unique_share(camera: "Camera") -> float:
         xy, det = _distorted(camera, _border(camera)[:, :, None] * t)  # (2, R, T), (R, T)
         progress = _progress(camera, xy)
         good = np.logical_and.accumulate((det > 0.0) & np.isfinite(progress), axis=1)
-        torn = bool(np.any(progress[:, t <= _MOST_PULLED] > 1.0))
+        torn = bool(np.any(progress[:, t <= _MAX_PULLED] > 1.0))
     farthest = np.max(np.where(good, progress, 0.0), axis=1)
     return 0.0 if torn else float(min(1.0, farthest.min()))
 

@@ -15,8 +15,8 @@ from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.mapping.edge_map import EdgeMap, EdgePoints
 from edgeslam_torch.mapping.fuse import fuse_all
-from edgeslam_torch.mapping.refinement import refine_all, take_back, whole_map, window_problem
-from edgeslam_torch.mapping.reobserve import MOST_DRIFT_PX, reobserve_all
+from edgeslam_torch.mapping.refinement import refine_all, whole_map, window_problem, write_back
+from edgeslam_torch.mapping.reobserve import MAX_DRIFT_PX, reobserve_all
 from edgeslam_torch.mapping.window_terms import (
     PlacedEdges,
     Structure,
@@ -65,7 +65,7 @@ def last_refinement(slam_map: SlamMap, camera: Camera, edges: EdgeMap, config: W
     if config.reprojection != "off" and refine_all(slam_map, camera, lm) is not None:
         with slam_map.lock:
             drift_px = max(reobserve_all(slam_map, camera), default=0.0)
-        if drift_px > MOST_DRIFT_PX:
+        if drift_px > MAX_DRIFT_PX:
             refine_all(slam_map, camera, lm)
         with slam_map.lock:
             fuse_all(slam_map, camera)
@@ -113,9 +113,9 @@ def refine_with_edges(
         if config.reprojection == "off":
             keypoint = [k[:0] for k in keypoint]
         with slam_map.lock:  # poses and depths are of one moment for who looks on
-            take_back(slam_map, window, keypoint, result)
+            write_back(slam_map, window, keypoint, result)
             if placed is not None:
-                _take_back_depths(keyframes, hosts, camera, placed, result.edge_inverse_depth)
+                _write_back_depths(keyframes, hosts, camera, placed, result.edge_inverse_depth)
         logger.debug("edges and corners: %s after %d steps", result.stop, result.iterations)
     return result
 
@@ -156,7 +156,7 @@ def _without_points(problem: WindowProblem) -> WindowProblem:
     )
 
 
-def _take_back_depths(
+def _write_back_depths(
     keyframes: list[Keyframe],
     hosts: dict[int, EdgePoints],
     camera: Camera,

@@ -20,7 +20,7 @@ from edgeslam_torch.mapping.prior_anchors import (
     rays,
 )
 from edgeslam_torch.mapping.refinement import choose_window, refine, refine_all
-from edgeslam_torch.mapping.reobserve import MOST_DRIFT_PX, reobserve
+from edgeslam_torch.mapping.reobserve import MAX_DRIFT_PX, reobserve
 from edgeslam_torch.optim.problem import LmConfig, WindowResult
 from edgeslam_torch.types import FloatArray, IntArray
 
@@ -60,7 +60,7 @@ class Mapper:
             self.triangulate_new(keyframe, neighbours, colour)
             fuse(self.map, self.camera, keyframe, self.map.covisible(keyframe, 2 * self.config.neighbours))
             drift_px = reobserve(self.map, self.camera, keyframe)
-        if drift_px is not None and drift_px > MOST_DRIFT_PX:  # the drift lies outside the window
+        if drift_px is not None and drift_px > MAX_DRIFT_PX:  # the drift lies outside the window
             refine_all(self.map, self.camera, self.lm)
         window = choose_window(self.map, keyframe, self.config.window, self.config.window_fixed)
         result = refine(self.map, window, self.camera, self.lm)
@@ -90,7 +90,7 @@ class Mapper:
         )
         if not np.isfinite(prior).any():
             return
-        least_baseline = 0.01 * float(np.nanmedian(prior))
+        min_baseline = 0.01 * float(np.nanmedian(prior))
         new = [self._recent[:0]]
         far: list[tuple[Keyframe, Matches]] = []
         for other in neighbours:
@@ -105,7 +105,7 @@ class Mapper:
                 self.tracking.ratio,
             )
             far.append((other, matches))
-            if np.linalg.norm(other.centre_w - keyframe.centre_w) < least_baseline:
+            if np.linalg.norm(other.centre_w - keyframe.centre_w) < min_baseline:
                 continue
             p_w, sigma_ray, used = triangulate_matches(
                 keyframe,

@@ -83,7 +83,7 @@ def refine(slam_map: SlamMap, window: Window, camera: Camera, config: LmConfig) 
     if len(problem.obs_pose) == 0:
         return None
     result = refine_window(problem, config)
-    take_back(slam_map, window, keypoint, result)
+    write_back(slam_map, window, keypoint, result)
     return result
 
 
@@ -129,7 +129,7 @@ def window_problem(
     return problem, keypoint
 
 
-def take_back(slam_map: SlamMap, window: Window, keypoint: list[IntArray], result: WindowResult) -> None:
+def write_back(slam_map: SlamMap, window: Window, keypoint: list[IntArray], result: WindowResult) -> None:
     """Give the map a result of `window_problem`; observations that disagree with it are taken out."""
     if result.stop is StopReason.NOT_FINITE:  # its residuals say nothing, so no observation disagrees
         return

@@ -30,9 +30,9 @@ MIN_SHARE = 0.5
 MAX_TURN_RAD = np.deg2rad(30.0)
 MAX_SHIFT = 0.35
 """Maximum distance of the two cameras relative to the newer one's median depth: 20 degrees of parallax."""
-MOST_DRIFT_PX = 5.0
+MAX_DRIFT_PX = 5.0
 """Drift above which the whole map is refined; below, tracking finds the anchors within its ``map_radius_px``."""
-STRANGERS = 15
+MIN_SHARED = 15
 """Number of shared anchors from which on two keyframes are covisible, as in `SlamMap.covisible`."""
 
 
@@ -42,7 +42,7 @@ def reobserve_all(slam_map: SlamMap, camera: Camera) -> list[float]:
     return [d for d in drifts if d is not None]
 
 
-def lookalike(slam_map: SlamMap, keyframe: Keyframe) -> Keyframe | None:
+def revisit_candidate(slam_map: SlamMap, keyframe: Keyframe) -> Keyframe | None:
     """Revisit candidate: the older keyframe nearest in position and direction that shares few anchors with this one,
     or None."""
     piece = slam_map.piece_of(keyframe.id)  # poses of another one do not relate
@@ -55,7 +55,7 @@ def lookalike(slam_map: SlamMap, keyframe: Keyframe) -> Keyframe | None:
     shift = np.linalg.norm(np.stack([k.centre_w for k in older]) - keyframe.centre_w, axis=1) / (MAX_SHIFT * depth)
     counts = slam_map.shared_counts(keyframe.anchor[keyframe.anchor >= 0])
     shared = np.array([counts.get(k.id, 0) for k in older])
-    apart = np.where((turn < 1.0) & (shift < 1.0) & (shared < STRANGERS), turn + shift, np.inf)
+    apart = np.where((turn < 1.0) & (shift < 1.0) & (shared < MIN_SHARED), turn + shift, np.inf)
     nearest = int(apart.argmin())
     return older[nearest] if np.isfinite(apart[nearest]) else None
 
@@ -68,7 +68,7 @@ def reobserve(slam_map: SlamMap, camera: Camera, keyframe: Keyframe) -> float | 
     Returns:
         The drift: median distance [px] of the old anchors from their projections; None if nothing was joined.
     """
-    old = lookalike(slam_map, keyframe)
+    old = revisit_candidate(slam_map, keyframe)
     if old is None:
         return None
     anchors, growth = slam_map.anchors, slam_map.scale_factor

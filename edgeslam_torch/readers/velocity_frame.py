@@ -13,7 +13,7 @@ from edgeslam_torch.types import FloatArray
 
 _SPAN_S = 0.5
 """Interval of velocity changes and mean leans."""
-_LEAST_TURN_RAD = math.radians(20.0)
+_MIN_TURN_RAD = math.radians(20.0)
 """Minimum turn: without turning, both frames differ only by a constant."""
 _DECISIVE = 12.0
 """Decisive log likelihood ratio: wind and control move a drone too, and half of a real flight reaches 11 for the
@@ -40,7 +40,7 @@ def body_frame_evidence(stamps_s: FloatArray, values: Mapping[str, FloatArray]) 
         return 0.0, ""
     lean = np.tan(np.radians(np.clip(np.stack([-columns[:, 2], columns[:, 3]], axis=1), -60.0, 60.0)))
     yaw = np.unwrap(np.radians(columns[:, 4]))
-    if float(np.std(yaw)) < _LEAST_TURN_RAD:
+    if float(np.std(yaw)) < _MIN_TURN_RAD:
         return 0.0, ""
     span = max(2, round(_SPAN_S / max(float(np.median(np.diff(t))), 1e-3)))
     push = _turned(lean - np.median(lean, axis=0), yaw)

@@ -9,7 +9,7 @@ from edgeslam_torch.tracking.relocaliser import LIKELY_SHARE, place_of
 from edgeslam_torch.tracking.tracker import View
 from edgeslam_torch.types import FloatArray, Frame, IntArray
 
-MOST_FRAMES = 60
+MAX_FRAMES = 60
 """Lost frames whose features are kept (3 MB): two seconds at 30 Hz."""
 MISSES = 2
 """Frames in a row that are not found, after which the earlier ones are given up."""
@@ -24,7 +24,7 @@ class Backfill:
 
     def keep(self, frame: Frame, view: View) -> None:
         """Remember a frame without a pose; of too many the oldest is forgotten."""
-        self._lost = [*self._lost[1 - MOST_FRAMES :], (frame.index, view)]
+        self._lost = [*self._lost[1 - MAX_FRAMES :], (frame.index, view)]
 
     def place(self, keyframe: Keyframe, T_c_w: FloatArray, anchors: IntArray) -> int:
         """Find the lost frames one by one, the newest first.

@@ -33,7 +33,7 @@ MIN_INLIERS = 15
 HANDOVER_INLIERS = 50
 """When fewer of the first keyframe's points are left before the map stands, the next attempt starts from here."""
 
-MOST_WAITING_IN_REAL_TIME = 3
+MAX_WAITING_IN_REAL_TIME = 3
 """Frames between the first two views that become keyframes in real time; while they are mapped, no other can be."""
 
 FIRST_FRAME = "first frame, depth guessed"
@@ -64,8 +64,8 @@ class Starting:
         self.lm = lm
         self.config = system.config.initialisation
         if realtime:
-            most = min(MOST_WAITING_IN_REAL_TIME, self.config.most_keyframes)
-            self.config = replace(self.config, most_keyframes=most)
+            most = min(MAX_WAITING_IN_REAL_TIME, self.config.max_keyframes)
+            self.config = replace(self.config, max_keyframes=most)
         self._attempt: Bootstrap | None = None
 
     def begin(self, frame: Frame, view: View, reason: str) -> Step:
@@ -123,7 +123,7 @@ class Starting:
             with self.system.timed("mapping"), self.system.map.lock:
                 started = attempt.replace_map(frame, view, two_view, self.lm)
             return self._stands(frame, seen, started, "two views", track, two_view)
-        if track.inliers < ADOPT_SHARE * attempt.most_matched and attempt.reference.depth is not None:
+        if track.inliers < ADOPT_SHARE * attempt.max_matched and attempt.reference.depth is not None:
             with self.system.timed("mapping"), self.system.map.lock:
                 started = attempt.adopt(frame, view, track)
             return self._stands(frame, seen, started, DEPTH_MAP, track, two_view)

@@ -90,7 +90,7 @@ class Bootstrap:
         self.seed = seed
         self.reference = reference
         self.guess_depth = guess_depth = guess[:, 0]
-        self.most_matched = 0
+        self.max_matched = 0
         """Maximum number of inliers so far."""
         self.views: list[BootstrapView] = []
         self.waiting: list[WaitingFrame] = []
@@ -114,7 +114,7 @@ class Bootstrap:
         radius = 2.0 * self.tracker.config.motion_radius_px
         track = self.tracker.refine(view, T_predicted, self._guessed, radius, expected=expected)
         if track is not None:
-            self.most_matched = max(self.most_matched, track.inliers)
+            self.max_matched = max(self.max_matched, track.inliers)
         return track
 
     def two_views(self, frame_index: int, view: View, track: Track) -> TwoView:
@@ -210,7 +210,7 @@ class Bootstrap:
             return
         mine, theirs = track.matched_keypoint, self.views[-1].reference_keypoint
         self.waiting.append(WaitingFrame(frame, view, mine, theirs, se3.inverse(track.T_c_w)[:3, 3]))
-        if len(self.waiting) > self.config.most_keyframes:
+        if len(self.waiting) > self.config.max_keyframes:
             centres = np.stack([self.reference.centre_w, *(w.centre_w for w in self.waiting)])
             self.waiting.pop(int(np.linalg.norm(centres[2:] - centres[:-2], axis=1).argmin()))
 

@@ -156,7 +156,7 @@ def consensus(
     views: list[BootstrapView],
     poses: list[FloatArray],
     camera: Camera,
-    most_views: int = 6,
+    max_views: int = 6,
 ) -> Consensus:
     """Refine the two views jointly with some of the frames between, which observe the same points.
 
@@ -170,12 +170,10 @@ def consensus(
         views: Frames between, in order.
         poses: Their world-to-camera poses against the two-view points.
         camera: Intrinsics.
-        most_views: Maximum number of frames between, evenly spread.
+        max_views: Maximum number of frames between, evenly spread.
     """
     chosen: IntArray = (
-        np.unique(np.linspace(0, len(views) - 1, min(most_views, len(views))).astype(int))
-        if views
-        else np.zeros(0, int)
+        np.unique(np.linspace(0, len(views) - 1, min(max_views, len(views))).astype(int)) if views else np.zeros(0, int)
     )
     row = np.full(len(reference.features.uv), -1, dtype=np.int64)
     row[two_view.reference_keypoint] = np.arange(len(two_view.p_w))

@@ -34,7 +34,7 @@ MAX_RELATIVE_SIGMA = 0.15
 _CHECKED_PAIRS = 120
 """Number of keyframe pairs for checking a calibration: half a second of CPU, once per run."""
 _CHECKED_GAPS = (1, 2, 3)
-_LEAST_CHECKED = 10
+_MIN_CHECKED = 10
 """Minimum number of pairs to contradict a calibration: seven pairs of tum_fr1_xyz suggest an error of 25 % for the
 right one."""
 _CONTRADICTION_SIGMAS = 2.5
@@ -174,7 +174,7 @@ def calibration_warning(camera: Camera, keyframes: Sequence[Keyframe]) -> str | 
 
 def contradicts(estimate: FocalEstimate, camera: Camera) -> bool:
     """Whether an estimate contradicts the camera's focal length within its own uncertainty."""
-    if estimate.focal_px is None or estimate.pairs_used < _LEAST_CHECKED:
+    if estimate.focal_px is None or estimate.pairs_used < _MIN_CHECKED:
         return False
     difference = abs(math.log(estimate.focal_px / camera.fx))
     sigma = math.hypot(estimate.sigma_px / estimate.focal_px, camera.focal_sigma)

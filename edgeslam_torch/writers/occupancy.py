@@ -41,7 +41,7 @@ def occupancy_grid(
     T_w_c: FloatArray,
     resolution_m: float = 0.05,
     z_range_m: tuple[float, float] | None = None,
-    least_points: int = 2,
+    min_points: int = 2,
     half_fov_rad: float = 0.5,
 ) -> OccupancyGrid:
     """Project obstacles to the floor and mark the space that cameras looked through as free.
@@ -52,7 +52,7 @@ def occupancy_grid(
         resolution_m: Side of a cell.
         z_range_m: Heights of obstacles; half a metre below to half a metre above the median camera by default, where
             a drone on this path would hit them.
-        least_points: Minimum number of points of an occupied cell; a single one may be an outlier.
+        min_points: Minimum number of points of an occupied cell; a single one may be an outlier.
         half_fov_rad: Half the horizontal field of view of a camera.
 
     Raises:
@@ -76,7 +76,7 @@ def occupancy_grid(
     cell = np.floor((p[:, :2] - lower) / resolution_m).astype(int)
     inside = (cell >= 0).all(axis=1) & (cell[:, 0] < width) & (cell[:, 1] < height)
     np.add.at(counts, (cell[inside, 1], cell[inside, 0]), 1)
-    occupied = counts >= least_points
+    occupied = counts >= min_points
     grid = np.full((height, width), UNKNOWN, dtype=np.uint8)
     solid = (np.argwhere(occupied)[:, ::-1] + 0.5) * resolution_m + lower
     for T in T_w_c:

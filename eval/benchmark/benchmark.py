@@ -42,7 +42,7 @@ from edgeslam_torch.eval.metrics.run_score import RunScore, evaluate_run
 SYNTHETIC = "synthetic"
 """Name of the simulated flight among the sequences."""
 
-_LEAST_HZ = 15.0
+_MIN_HZ = 15.0
 """Recordings with a lower frame rate are for training, not for tracking."""
 
 _RUN_TIMEOUT_S = 1800.0
@@ -92,7 +92,7 @@ def find_sequences(data: Path | None) -> dict[str, Path]:
         except EdgeSlamError:
             continue
         stamps = dataset.frame_stamps_s
-        if len(stamps) > 30 and 1.0 / float(np.median(np.diff(stamps))) >= _LEAST_HZ:
+        if len(stamps) > 30 and 1.0 / float(np.median(np.diff(stamps))) >= _MIN_HZ:
             found[dataset.name] = folder
     return found
 

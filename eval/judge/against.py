@@ -15,7 +15,7 @@ from edgeslam_torch.eval.judge.table import aligned
 
 RECORD = "judge.json"
 _SIGMAS = 2.0
-_MOST_NAMED = 8
+_MAX_NAMED = 8
 """Maximum number of cells of only one record that are named."""
 
 
@@ -90,7 +90,7 @@ def markdown_against(before: dict[str, Any], after: dict[str, Any]) -> str:
     parts = [f"{before['commit']} -> {after['commit']}, medians, ratio; ! worse, + better by more than the noise"]
     parts += ["", aligned(header, lines), ""]
     missing = sorted(set(_names(before)) ^ set(_names(after)))
-    named = ", ".join(missing) if len(missing) <= _MOST_NAMED else f"{len(missing)} cells"
+    named = ", ".join(missing) if len(missing) <= _MAX_NAMED else f"{len(missing)} cells"
     parts += [f"only in one of the two: {named}"] if missing else []
     parts += [f"worse: {', '.join(worse) if worse else 'nothing'}"]
     if any(len(_rows(record, name)) == 1 for record in (before, after) for name in names):

@@ -17,7 +17,7 @@ from edgeslam_torch.synthetic.flights.courses import COURSES
 SETS = ("base", "variants", "flights", "all")
 """What ``--set`` takes: recordings as they are, their variants, simulations, everything."""
 
-LEAST_FRAMES = 30
+MIN_FRAMES = 30
 """Shorter recordings, and variants that leave fewer, are not judged."""
 
 KIDNAP = ((0, 250), (420, 600), (100, 250))
@@ -118,7 +118,7 @@ def find_recordings(data: Path) -> dict[str, tuple[Path, int]]:
             dataset = open_dataset(folder)
         except EdgeSlamError:
             continue
-        if len(dataset.frame_stamps_s) >= LEAST_FRAMES:
+        if len(dataset.frame_stamps_s) >= MIN_FRAMES:
             name = dataset.name if dataset.name not in found else f"{folder.parent.name}_{dataset.name}"
             found[name] = (folder.resolve(), len(dataset.frame_stamps_s))
     return found
@@ -146,7 +146,7 @@ def list_cells(data: Path | None, which: str, seeds: Sequence[int], only: Sequen
     made: list[Cell] = []
     recordings = find_recordings(data) if data is not None else {}
     for name, (folder, frames) in recordings.items():
-        variants = [v for v, change in VARIANTS.items() if change.frames_of(frames) >= LEAST_FRAMES]
+        variants = [v for v, change in VARIANTS.items() if change.frames_of(frames) >= MIN_FRAMES]
         wanted = ([""] if which in ("base", "all") else []) + (variants if which in ("variants", "all") else [])
         wanted += ["kidnap"] if which in ("flights", "all") and _can_kidnap(name, frames) else []
         made += [_cell(name, folder, variant) for variant in wanted]

@@ -10,7 +10,7 @@ from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.types import FloatArray, FrameStatus
 
-LEAST_POINTS = 30
+MIN_POINTS = 30
 """Minimum number of points of the delivered map in view of a supported frame."""
 _SAMPLE = 10_000
 """Maximum number of sampled map points."""
@@ -29,7 +29,7 @@ def live(rows: Status) -> NDArray[np.bool_]:
 def at_end(rows: Status, T_w_c: FloatArray, p_w: FloatArray, camera: Camera) -> NDArray[np.bool_]:
     """Frames ``(F,)`` whose final pose is supported by the delivered map.
 
-    Those stated by the run, with at least `LEAST_POINTS` points of the map in view.
+    Those stated by the run, with at least `MIN_POINTS` points of the map in view.
 
     Args:
         rows: Of ``status.csv``, one a frame.
@@ -38,7 +38,7 @@ def at_end(rows: Status, T_w_c: FloatArray, p_w: FloatArray, camera: Camera) -> 
         camera: Of the run; its lens distortion is neglected.
     """
     said = np.array([is_supported(row) for row in rows], dtype=bool)
-    return said & (points_in_view(T_w_c, p_w, camera) >= LEAST_POINTS)
+    return said & (points_in_view(T_w_c, p_w, camera) >= MIN_POINTS)
 
 
 def points_in_view(T_w_c: FloatArray, p_w: FloatArray, camera: Camera) -> NDArray[np.int64]:

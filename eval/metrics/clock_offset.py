@@ -11,10 +11,10 @@ from edgeslam_torch.eval.metrics.align import umeyama
 NEAR_S = 10.0
 """Offsets looked at when the clocks do overlap."""
 
-_MOST_POSES = 200
-_MOST_TRIALS = 2000
+_MAX_POSES = 200
+_MAX_TRIALS = 2000
 _STEP_S = 0.1
-_LEAST_SHARE = 0.4
+_MIN_SHARE = 0.4
 """Share of the estimate that must lie within the truth's time."""
 
 
@@ -39,14 +39,14 @@ def best_offset(truth: Trajectory, estimate: Trajectory, reach_s: float = NEAR_S
 def any_offset(truth: Trajectory, estimate: Trajectory) -> Offset:
     """The same over all offsets with overlap, for unrelated clocks."""
     span = float(np.ptp(estimate.stamps_s))
-    first = float(truth.stamps_s[0] - estimate.stamps_s[-1]) + _LEAST_SHARE * span
-    last = float(truth.stamps_s[-1] - estimate.stamps_s[0]) - _LEAST_SHARE * span
+    first = float(truth.stamps_s[0] - estimate.stamps_s[-1]) + _MIN_SHARE * span
+    last = float(truth.stamps_s[-1] - estimate.stamps_s[0]) - _MIN_SHARE * span
     return _search(truth, estimate, first, last)
 
 
 def _search(truth: Trajectory, estimate: Trajectory, first: float, last: float) -> Offset:
-    few = estimate.take(slice(None, None, max(1, -(-len(estimate) // _MOST_POSES))))
-    step = max(_STEP_S, (last - first) / _MOST_TRIALS)
+    few = estimate.take(slice(None, None, max(1, -(-len(estimate) // _MAX_POSES))))
+    step = max(_STEP_S, (last - first) / _MAX_TRIALS)
     trials = np.arange(first, last + step / 2, step)
     best = Offset(0.0, float("inf"), float("inf"))
     while True:
@@ -62,7 +62,7 @@ def _search(truth: Trajectory, estimate: Trajectory, first: float, last: float) 
 def _fit(truth: Trajectory, estimate: Trajectory, shift: float) -> Offset:
     stamps = estimate.stamps_s + shift
     inside = (stamps >= truth.stamps_s[0]) & (stamps <= truth.stamps_s[-1])
-    if inside.sum() < max(10, _LEAST_SHARE * len(stamps)):
+    if inside.sum() < max(10, _MIN_SHARE * len(stamps)):
         return Offset(shift, float("inf"), float("inf"))
     p = estimate.positions[inside]
     q = np.stack([np.interp(stamps[inside], truth.stamps_s, axis) for axis in truth.positions.T], axis=1)

@@ -10,7 +10,7 @@ from edgeslam_torch.frontend.keypoint_grid import KeypointGrid
 from edgeslam_torch.frontend.matching import words
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.mapping.refinement import refine_all
-from edgeslam_torch.mapping.reobserve import lookalike, reobserve, reobserve_all
+from edgeslam_torch.mapping.reobserve import reobserve, reobserve_all, revisit_candidate
 from edgeslam_torch.optim.problem import LmConfig
 
 LATER = (3, 4, 5)
@@ -56,7 +56,7 @@ def drift(rng):
 def test_returning_camera_is_joined_and_the_drift_goes(rng, drift):
     points = drifted(rng, drift)
     last = points.keyframes[5]
-    assert lookalike(points.map, last) is points.keyframes[1]
+    assert revisit_candidate(points.map, last) is points.keyframes[1]
     before = len(points.map.anchors)
     held = points.keyframes[1].keypoints_with_anchor()
     p_w = points.map.anchors.p_w[points.keyframes[1].anchor[held]]
@@ -84,16 +84,16 @@ def test_another_place_that_looks_different_is_not_joined(rng, drift):
 def test_keyframes_that_know_each_other_are_left_alone(rng):
     points = PointMap(rng, 300, 4)
     points.fill()
-    assert lookalike(points.map, points.keyframes[0]) is None, "none is older"
+    assert revisit_candidate(points.map, points.keyframes[0]) is None, "none is older"
     assert reobserve_all(points.map, CAMERA) == []
     check_map(points.map)
 
 
-def test_keyframe_without_anchors_has_no_lookalike(rng):
+def test_keyframe_without_anchors_has_no_revisit_candidate(rng):
     points = PointMap(rng, 300, 3)
     points.fill()
     points.map.forget_observations(points.keyframes[2], points.keyframes[2].keypoints_with_anchor())
-    assert lookalike(points.map, points.keyframes[2]) is None
+    assert revisit_candidate(points.map, points.keyframes[2]) is None
 
 
 def test_a_place_of_which_most_does_not_fit_is_not_joined(rng, drift):
@@ -114,7 +114,7 @@ def test_a_keyframe_that_shares_the_anchors_of_its_neighbour_is_no_revisit(rng):
     """It stands where another stood, and they know each other: nothing is to be joined."""
     points = drifted(rng, np.eye(4))
     last, first = points.keyframes[5], points.keyframes[1]
-    assert lookalike(points.map, last) is first
+    assert revisit_candidate(points.map, last) is first
     shared = np.flatnonzero((last.anchor >= 0) & (first.anchor >= 0))[:20]
     points.map.merge_anchors(last.anchor[shared], first.anchor[shared])
-    assert lookalike(points.map, last) is not first
+    assert revisit_candidate(points.map, last) is not first

@@ -27,7 +27,7 @@ from pathlib import Path
 import pytest
 from faults import ROOT, Fault, FaultError, applied, load, pytest_arguments, sources
 
-MOST_SURVIVORS = 0.10
+MAX_SURVIVORS = 0.10
 _PROCESSES = multiprocessing.get_context("forkserver")
 _LOADED_ONCE = ["numpy", "cv2", "scipy.spatial.transform", "torch", "pytest", "hypothesis"]
 LEFT_OUT = shutil.ignore_patterns(
@@ -195,7 +195,7 @@ def _report(verdicts: list[Verdict]) -> int:
     share = len(survivors) / len(verdicts)
     print(f"\n{len(verdicts) - len(survivors)} of {len(verdicts)} killed, {100 * share:.0f} % survived")
     unexplained = any(not v.fault.survives for v in survivors)
-    return int(share > MOST_SURVIVORS or unexplained)
+    return int(share > MAX_SURVIVORS or unexplained)
 
 
 if __name__ == "__main__":

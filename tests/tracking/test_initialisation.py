@@ -208,7 +208,7 @@ def test_frames_that_waited_become_keyframes_in_order(points):
 
 def test_of_many_waiting_frames_those_that_stand_apart_stay(points):
     guess = z_in(points, 0)
-    bootstrap = make_bootstrap(points, guess, InitialisationConfig(keyframe_gap_s=0.01, most_keyframes=2))
+    bootstrap = make_bootstrap(points, guess, InitialisationConfig(keyframe_gap_s=0.01, max_keyframes=2))
     for index, view in enumerate((1, 1, 1, 2, 3), start=1):
         seen = view_of(points, view)
         track = bootstrap.track(seen, points.world.T_c_w[view])
@@ -426,7 +426,7 @@ def test_points_behind_the_second_camera_do_not_triangulate(rng):
 
 def test_of_two_waiting_frames_in_one_place_one_goes_and_the_first_stays(points):
     """One step, another, and no step: the frame between two of one place is the one that tells least."""
-    bootstrap = make_bootstrap(points, z_in(points, 0), InitialisationConfig(keyframe_gap_s=0.01, most_keyframes=2))
+    bootstrap = make_bootstrap(points, z_in(points, 0), InitialisationConfig(keyframe_gap_s=0.01, max_keyframes=2))
     for index, view in enumerate((1, 2, 2), start=1):
         seen = view_of(points, view)
         track = bootstrap.track(seen, points.world.T_c_w[view])

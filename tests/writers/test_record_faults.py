@@ -40,13 +40,13 @@ def wait_until(condition, stop):
         pass
 
 
-def check_flight(folder, tmp_path, least_frames):
+def check_flight(folder, tmp_path, min_frames):
     """Every frame and message that was listed is there, and ``edgeslam run`` takes the folder."""
     source = open_source(folder)
     with closing(source):
         frames = list(source.frames())
         listed = [line for line in (folder / "rgb.txt").read_text().splitlines() if not line.startswith("#")]
-        assert len(frames) == len(listed) >= least_frames
+        assert len(frames) == len(listed) >= min_frames
         assert not source.problems
         assert len(source.telemetry) == (folder / "state.txt").read_text().count("\n") > 0
     assert all(np.diff([f.stamp_s for f in frames]) > 0)

@@ -12,7 +12,7 @@ from edgeslam_torch.synthetic.house.rooms import room
 from edgeslam_torch.synthetic.house.world import MAX_LEVEL, World
 from edgeslam_torch.types import FloatArray
 
-_LEAST_AREA_M2 = 0.01
+_MIN_AREA_M2 = 0.01
 """Smaller surfaces (handles, legs, cups) are left out: half the surfaces, a third of the painting time."""
 
 
@@ -55,7 +55,7 @@ def furnished_drone(
 def _plainer(world: World) -> World:
     """A world fast enough for 30 frames per second: without its smallest surfaces, and with all texture levels
     precomputed, which would otherwise delay their first use by a tenth of a second."""
-    quads = [q for q in world.quads if float(np.linalg.norm(np.cross(q.u_w, q.v_w))) > _LEAST_AREA_M2]
+    quads = [q for q in world.quads if float(np.linalg.norm(np.cross(q.u_w, q.v_w))) > _MIN_AREA_M2]
     for quad in quads:
         quad.texture.level(MAX_LEVEL)
         quad.texture.level(MAX_LEVEL - 1)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from edgeslam_torch.types import FloatArray, IntArray
 
-_MOST_LANES = 2048
+_MAX_LANES = 2048
 """Maximum blocks per tile, since hosts differ in size."""
 _VECTOR = 16
 """Tile lengths are a multiple of this: single-precision numbers per vector register."""
@@ -75,7 +75,7 @@ def lay_out(host: IntArray, pair_block: IntArray, pair_pose: IntArray, poses: in
     host, pair_block, pair_pose = (np.asarray(x, dtype=np.int64) for x in (host, pair_block, pair_pose))
     count = np.bincount(host, minlength=poses)
     most = max(int(count.max(initial=0)), 1)
-    lanes = -(-most // -(-most // _MOST_LANES))
+    lanes = -(-most // -(-most // _MAX_LANES))
     lanes = -(-lanes // _VECTOR) * _VECTOR
     order = np.argsort(host, kind="stable")
     within = np.empty_like(order)

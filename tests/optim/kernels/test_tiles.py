@@ -12,7 +12,7 @@ POSES = 7
 
 @pytest.fixture(params=[2048, 16], ids=["a tile a host", "several tiles a host"])
 def scene(request, rng, monkeypatch) -> tuple[Tiles, np.ndarray, np.ndarray, np.ndarray]:
-    monkeypatch.setattr(tiles_module, "_MOST_LANES", request.param)
+    monkeypatch.setattr(tiles_module, "_MAX_LANES", request.param)
     host = rng.choice([0, 1, 1, 1, 4, 6], 90)  # unsorted, of very different number, some poses host nothing
     block, pose = np.divmod(rng.permutation(90 * POSES)[:250], POSES)
     seen = host[block] != pose

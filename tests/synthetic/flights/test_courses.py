@@ -56,13 +56,13 @@ def test_yaw_turns_more_than_once_on_the_spot():
     assert np.ptp(flight.T_w_b[:, :3, 3], axis=0).max() < 0.25
 
 
-@pytest.mark.parametrize(("name", "least_deg", "most_deg"), [("turn_first", 30, 40), ("hover_first", 0, 6)])
-def test_first_second_goes_nowhere_and_the_rest_is_a_flight(name, least_deg, most_deg):
+@pytest.mark.parametrize(("name", "min_deg", "max_deg"), [("turn_first", 30, 40), ("hover_first", 0, 6)])
+def test_first_second_goes_nowhere_and_the_rest_is_a_flight(name, min_deg, max_deg):
     _, flight = flight_of(name)
     second = round(RATE_HZ)
     p = flight.T_w_b[:, :3, 3]
     assert np.ptp(p[: second + 1], axis=0).max() < 0.03
-    assert least_deg <= turned_deg(flight)[:second].sum() <= most_deg
+    assert min_deg <= turned_deg(flight)[:second].sum() <= max_deg
     assert np.linalg.norm(p[-1] - p[0]) > 0.5 or path_m(flight) > 5
 
 
