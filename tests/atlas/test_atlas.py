@@ -11,6 +11,7 @@ from edgeslam_torch.atlas.weld import move_piece
 from edgeslam_torch.config import EdgeConfig, OrbConfig, TrackingConfig
 from edgeslam_torch.frontend.matching import words
 from edgeslam_torch.geometry import se3, sim3
+from edgeslam_torch.map.keyframe import make_keyframe
 from edgeslam_torch.map.trajectory import TrajectoryLog
 from edgeslam_torch.mapping.edge_map import EdgeMap, EdgePoints
 from edgeslam_torch.optim.problem import LmConfig
@@ -193,3 +194,78 @@ def test_moving_a_piece_changes_nothing_that_its_cameras_see(rng):
     np.testing.assert_allclose(T_after[:4], T_before[:4])
     np.testing.assert_allclose(T_after[4:, :3, 3], sim3.transform(S, T_before[4:, :3, 3]), atol=1e-9)
     np.testing.assert_allclose(T_after[4:, :3, :3], sim3.parts(S)[1] @ T_before[4:, :3, :3], atol=1e-9)
+
+
+@pytest.mark.parametrize("smaller", [0, 1])
+def test_the_smaller_piece_comes_to_the_larger(rng, smaller):
+    pieces = Pieces(rng)
+    there = {k.id: centre for k, centre in zip(pieces.keyframes, se3.inverse(pieces.points.world.T_c_w), strict=True)}
+    for keyframe in pieces.keyframes[:2] if smaller == 0 else pieces.keyframes[6:]:
+        pieces.map.remove_keyframe(keyframe)
+    left = list(pieces.map.keyframes.values())
+    larger = np.array([pieces.map.piece_of(k.id) != smaller for k in left])
+    truth = np.stack([there[k.id][:3, 3] for k in left])
+    before = np.stack([k.centre_w for k in left])
+    join = pieces.atlas().update()
+    after = np.stack([k.centre_w for k in left])
+    assert (join.piece, join.absorbed, join.moved) == (0, 1, smaller)
+    to_larger = sim3.fit(truth[larger], before[larger])
+    np.testing.assert_allclose(after, sim3.transform(to_larger, truth), atol=0.03)
+
+
+def test_a_camera_that_stands_is_one_witness(rng):
+    """The same image twice proves no more than once."""
+    pieces = Pieces(rng)
+    slam_map, anchors, atlas = pieces.map, pieces.map.anchors, pieces.atlas()
+    only = pieces.keyframes[4]
+    held = only.keypoints_with_anchor()
+    p_w, its_words = anchors.p_w[only.anchor[held]].copy(), anchors.words[only.anchor[held]].copy()
+    for keyframe in pieces.keyframes[4:]:
+        slam_map.forget_observations(keyframe, keyframe.keypoints_with_anchor())
+    assert atlas.update() is None
+    ids = anchors.add(p_w, its_words, 8, False, np.zeros((len(held), 3), np.uint8))
+    twins = [make_keyframe(slam_map.next_keyframe_id() + i, 50 + i, 5.0, only.T_c_w, only.features) for i in (0, 1)]
+    for twin in twins:
+        twin.words = only.words
+        twin.anchor[held] = ids
+        slam_map.add_keyframe(twin)
+    slam_map.refresh_anchors(ids)
+    for twin, other in zip(twins, pieces.keyframes[2:4], strict=True):
+        assert link(pieces.tracker, twin, other) is not None
+    assert atlas.update() is None
+
+
+@pytest.mark.parametrize("guessed_there", [False, True])
+def test_guessed_depths_tell_no_scale(rng, guessed_there):
+    pieces = Pieces(rng)
+    keyframe, anchors = pieces.keyframes[4], pieces.map.anchors
+    track = match_keyframe(pieces.tracker, view_of(keyframe, SCALE_FACTOR), pieces.keyframes[3])
+    anchors.from_depth[track.anchor if guessed_there else keyframe.anchor[keyframe.anchor >= 0]] = True
+    assert common_scale(pieces.tracker, keyframe, track) is None
+
+
+def test_the_way_back_must_close(rng):
+    """Ten degrees of roll between a keyframe and its own anchors: all depths agree, the poses do not."""
+    pieces = Pieces(rng)
+    keyframe, other = pieces.keyframes[4], pieces.keyframes[3]
+    assert link(pieces.tracker, keyframe, other) is not None
+    keyframe.T_c_w = se3.exp(np.array([0, 0, 0, 0, 0, np.deg2rad(10.0)])) @ keyframe.T_c_w
+    assert link(pieces.tracker, keyframe, other) is None
+
+
+def test_moved_anchors_are_searched_as_before(rng):
+    """Where an anchor may be seen from is told relative to its distance, and so is what is known of its depth."""
+    pieces = Pieces(rng)
+    anchors, last = pieces.map.anchors, pieces.keyframes[7]
+    ids = last.anchor[last.anchor >= 0]
+    anchors.sigma[ids] = rng.uniform(0.01, 0.1, len(ids))
+
+    def looks():
+        away = anchors.p_w[ids] - last.centre_w
+        distance = np.linalg.norm(away, axis=1)
+        cosine = np.einsum("ni,ni->n", away, anchors.normal[ids]) / distance
+        return np.stack([anchors.max_distance[ids] / distance, anchors.sigma[ids] / distance, cosine])
+
+    before = looks()
+    move_piece(pieces.map, pieces.edges, pieces.log, 1, MISPLACED)
+    np.testing.assert_allclose(looks(), before, rtol=1e-5, atol=1e-6)

@@ -1,6 +1,7 @@
 """Mapping on another thread while frames are tracked: with a scheduler that the test turns, nothing depends on time."""
 
 import threading
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -168,3 +169,42 @@ def test_maps_are_read_and_frames_are_tracked_while_the_network_runs():
     assert len(anchors.p_w) > 100
     assert len(edges.p_w) == 0
     assert [k.id for k in keyframes] == sorted(k.id for k in keyframes)
+
+
+def dark(frame):
+    """The same moment with nothing to see."""
+    return replace(frame, image=np.zeros_like(frame.image))
+
+
+def test_a_lost_frame_is_found_again_while_the_worker_is_busy():
+    scheduler = Scheduler()
+    slam = realtime(scheduler)
+    frames = to_the_map(slam, scheduler)
+    slam.step(next(frames))
+    lost = [slam.step(dark(next(frames))) for _ in range(3)]
+    assert {o.status for o in lost} == {FrameStatus.PREDICTED}
+    assert slam.state is State.LOST
+    found = next(o for o in map(slam.step, frames) if o.status is not FrameStatus.PREDICTED)
+    assert found.status is FrameStatus.RELOCALISED
+    assert slam.state is State.TRACKING
+    assert len(scheduler.waiting) == 1
+    assert not found.keyframe
+
+
+def test_a_new_piece_of_map_begins_after_what_is_being_mapped():
+    """Lost for too long, then in front of something else: two threads never write to the map."""
+    scheduler = Scheduler()
+    slam = realtime(scheduler)
+    frames = to_the_map(slam, scheduler)
+    reached = slam.step(next(frames)).index
+    elsewhere = film(stairs_world(seed=1), CAMERA, sideways(40, 0.03), step_s=1 / 30).frames
+    for frame in elsewhere[reached + 1 :]:
+        assert len(scheduler.waiting) == 1
+        output = slam.step(frame)
+        if slam.state is State.STARTING:
+            break
+        assert output.status is FrameStatus.PREDICTED
+    assert frame.stamp_s - elsewhere[reached + 1].stamp_s == pytest.approx(0.65, abs=0.04)
+    assert slam.events["restarted"] == 1
+    assert output.keyframe
+    assert not scheduler.waiting

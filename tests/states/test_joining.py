@@ -1,0 +1,102 @@
+"""The live pose goes along when the piece of map that it hangs on is moved."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from edgeslam_torch.atlas.atlas import Join
+from edgeslam_torch.fusion.published import Published
+from edgeslam_torch.geometry import se3, sim3
+from edgeslam_torch.states.joining import Joining
+from edgeslam_torch.tracking.motion_model import MotionModel
+
+S = sim3.exp(np.array([0.4, -0.2, 0.7, 0.3, -0.5, 0.2, np.log(1.5)]))
+KEYFRAME = 7
+
+
+class Pieces:
+    """A map of two pieces; the camera's one is number 1."""
+
+    def __init__(self, T_k_w):
+        self.T_k_w, self.piece = T_k_w, 1
+        self.asked = 0
+
+    def piece_of(self, keyframe_id):
+        assert keyframe_id == KEYFRAME
+        return self.piece
+
+    def pose_of(self, keyframe_id):
+        assert keyframe_id == KEYFRAME
+        return self.T_k_w
+
+    def atlas(self, moved):
+        """Finds one join, of which the camera's piece is moved if it is number ``moved``."""
+
+        def update():
+            self.asked += 1
+            if self.piece == 0:
+                return None
+            self.piece = 0
+            if moved == 1:
+                self.T_k_w = sim3.moved_camera(S, self.T_k_w)
+            return Join(1.0, 0, 1, moved, S if moved == 1 else sim3.inverse(S), 0.01, 2, 300)
+
+        return SimpleNamespace(update=update, ask_all_again=lambda: None)
+
+
+def system_of(pieces, motion, busy=False):
+    log = SimpleNamespace(records=[SimpleNamespace(keyframe_id=KEYFRAME)], poses=lambda: ("stamps", "poses"))
+    revised = []
+    fusion = SimpleNamespace(revise=lambda *poses: revised.append(poses), revised=revised)
+    mapping = SimpleNamespace(busy=busy)
+    return SimpleNamespace(
+        log=log, map=pieces, motion=motion, fusion=fusion, mapping=mapping, published=Published(2.0), events={}
+    )
+
+
+def moving(rng):
+    """A camera with a velocity, some way from its keyframe."""
+    T_k_w = se3.exp(rng.normal(size=6))
+    motion = MotionModel(se3.exp(0.1 * rng.normal(size=6)) @ T_k_w)
+    motion.stamp_s = 1.0
+    motion.move(1.1, se3.exp(0.1 * rng.normal(size=6)) @ motion.T_c_w)
+    motion.stamp_s = 1.1
+    return T_k_w, motion
+
+
+def test_the_pose_and_its_future_go_along_with_their_piece(rng):
+    """What the camera sees of its piece, now and by prediction, is the same picture, scaled."""
+    T_k_w, motion = moving(rng)
+    p = rng.normal(size=(20, 3))
+    before = [se3.transform(T, p) for T in (motion.T_c_w, motion.predict(1.3))]
+    system = system_of(Pieces(T_k_w), motion)
+    words = Joining(system, system.map.atlas(moved=1)).update()
+    assert words.startswith("piece 1 joined piece 0")
+    after = [se3.transform(T, sim3.transform(S, p)) for T in (motion.T_c_w, motion.predict(1.3))]
+    np.testing.assert_allclose(after, 1.5 * np.array(before), atol=1e-9)
+    assert (system.published.scale, system.published.revision) == (2.0, 1)
+    assert system.events == {"joined": 1}
+    assert system.fusion.revised == [("stamps", "poses")]
+    assert system.map.asked == 2, "until there is no other join"
+
+
+def test_the_pose_stays_where_the_other_piece_comes_to_it(rng):
+    T_k_w, motion = moving(rng)
+    before = motion.T_c_w, motion.predict(1.3)
+    system = system_of(Pieces(T_k_w), motion)
+    Joining(system, system.map.atlas(moved=0)).update()
+    np.testing.assert_allclose((motion.T_c_w, motion.predict(1.3)), before, atol=1e-12)
+
+
+@pytest.mark.parametrize("finish", [False, True])
+def test_nothing_is_joined_while_the_worker_maps(rng, finish):
+    T_k_w, motion = moving(rng)
+    system = system_of(Pieces(T_k_w), motion, busy=True)
+    joining = Joining(system, system.map.atlas(moved=1))
+    if finish:
+        joining.finish()
+    else:
+        assert joining.update() == ""
+    assert system.map.asked == 0
+    assert system.events == {}
