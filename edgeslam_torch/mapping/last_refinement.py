@@ -1,4 +1,4 @@
-"""Refinement of the whole map once no keyframe follows: anchors first, then edges and corners with them."""
+"""Refinement of the whole map after the last keyframe: anchors first, then with edges and corners."""
 
 import logging
 from dataclasses import replace
@@ -33,17 +33,17 @@ from edgeslam_torch.types import FloatArray
 logger = logging.getLogger(__name__)
 
 ALIKE = 2.4
-"""Neighbours on one edge err together: about six count as one (the root of six)."""
+"""Errors of neighbours on one edge are correlated: about six count as one (the root of six)."""
 ITERATIONS = 30
 ROUGH = 1e-2
-"""Relative decrease of the cost below which a step is the last of a refinement that another one follows: the next would
-lower it by a few parts in a hundred thousand, which is less than one standard deviation of one value."""
+"""Relative decrease of the cost at which a refinement stops that another one follows: by quadratic convergence the
+next step would lower the cost by a few 1e-5, less than one residual changes by one standard deviation."""
 FINE = 3e-4
-"""The same for the last one."""
+"""The same for the last refinement."""
 
 
 def lm_config(config: WindowConfig) -> LmConfig:
-    """How windows are minimised while flying."""
+    """Solver settings of windows while flying."""
     return LmConfig(
         diagnostics=False,
         max_iterations=0 if config.reprojection == "off" else 6,
@@ -53,10 +53,10 @@ def lm_config(config: WindowConfig) -> LmConfig:
 
 
 def last_refinement(slam_map: SlamMap, camera: Camera, edges: EdgeMap, config: WindowConfig) -> WindowResult | None:
-    """Refine all keyframes with all anchors, join what then meets, measure the last edges, refine with the edges.
+    """Refine all keyframes and anchors, merge duplicates, measure the remaining edges, refine with edges.
 
     Returns:
-        What the last solver run reports; None when there was nothing to refine.
+        Result of the last solver run; None if there was nothing to refine.
     """
     lm = replace(lm_config(config), max_iterations=ITERATIONS)
     fine = replace(lm, cost_tolerance=FINE, losses=True)
@@ -79,10 +79,10 @@ def last_refinement(slam_map: SlamMap, camera: Camera, edges: EdgeMap, config: W
 def refine_with_edges(
     slam_map: SlamMap, camera: Camera, edges: EdgeMap, lm: LmConfig, config: WindowConfig
 ) -> WindowResult | None:
-    """Refine the whole map with edge and corner terms beside its anchors; edges are paired anew every round.
+    """Refine the whole map with edge and corner terms beside its anchors; edges are associated again in every round.
 
     Returns:
-        What the last round reports, or None for a map with nothing to refine.
+        Result of the last round; None if there was nothing to refine.
     """
     window = whole_map(slam_map)
     if window is None:
@@ -112,7 +112,7 @@ def refine_with_edges(
             return result
         if config.reprojection == "off":
             keypoint = [k[:0] for k in keypoint]
-        with slam_map.lock:  # poses and depths are of one moment for who looks on
+        with slam_map.lock:  # a consistent snapshot for readers
             write_back(slam_map, window, keypoint, result)
             if placed is not None:
                 _write_back_depths(keyframes, hosts, camera, placed, result.edge_inverse_depth)
@@ -121,7 +121,7 @@ def refine_with_edges(
 
 
 def term_config(config: WindowConfig) -> TermConfig:
-    """What the settings mean for the terms of a window."""
+    """Terms of a window for the given settings."""
     default = TermConfig()
     cycle_sigma = {"relative": default.cycle_sigma, "literal": 1.0, "off": 0.0}[config.cycle]
     return TermConfig(
@@ -131,7 +131,7 @@ def term_config(config: WindowConfig) -> TermConfig:
         cycle=CycleForm.PIXEL if config.cycle == "literal" else CycleForm.RELATIVE_DEPTH,
         cycle_sigma=cycle_sigma,
         collinearity=config.collinearity,
-        # The literal angle's residual is zero whatever poses and depths are: leaving it out is the same.
+        # The literal angle's residual is identically zero: omitting it is equivalent.
         angle_sigma=default.angle_sigma if config.angle in ("arms", "cosine") else 0.0,
         cosines=config.angle == "cosine",
     )
@@ -140,7 +140,7 @@ def term_config(config: WindowConfig) -> TermConfig:
 def _structure(
     keyframe: Keyframe, host: EdgePoints | None, camera: Camera, config: WindowConfig, edges: EdgeMap
 ) -> Structure:
-    """A keyframe's measured edges; none for a keyframe whose edges were never measured."""
+    """A keyframe's measured edges; empty if they were not measured."""
     if host is None or keyframe.grey is None:
         blank = np.zeros((camera.height, camera.width), np.uint8)
         return make_structure(blank, np.zeros((0, 2)), np.zeros(0), np.zeros(0))
@@ -163,7 +163,7 @@ def _write_back_depths(
     placed: PlacedEdges,
     inverse_depth: FloatArray,
 ) -> None:
-    """Give the keyframes' edge points their refined depths."""
+    """Write refined depths back to the keyframes' edge points."""
     good = np.isfinite(inverse_depth) & (inverse_depth > 0)
     for pose in np.unique(placed.terms.host):
         mine = np.flatnonzero((placed.terms.host == pose) & good)

@@ -1,4 +1,4 @@
-"""Stage 4 as the map sees it: choose a window, refine it, take the result back, drop what disagrees."""
+"""Stage 4 on the map: select a window, refine it, write the result back, remove outliers."""
 
 from dataclasses import dataclass
 
@@ -14,7 +14,7 @@ from edgeslam_torch.optim.problem import LmConfig, ScalePrior, StopReason, Windo
 from edgeslam_torch.types import IntArray
 
 MIN_EXTENT = 1e-6
-"""Map units between keyframes below which there is no scale to hold."""
+"""Minimum distance between keyframes that defines a scale [map units]."""
 
 CHI2_2 = 5.991
 """Chi-square, two degrees of freedom, 95 %."""
@@ -32,7 +32,7 @@ class Window:
 def choose_window(slam_map: SlamMap, newest: Keyframe, free: int, fixed: int) -> Window:
     """The newest keyframe, its best covisible ones, and the next best as fixed poses.
 
-    The oldest of the window is fixed when nothing outside sees its anchors, so that the gauge never floats.
+    The oldest of the window is fixed if no outside keyframe observes its anchors, so that the gauge is always fixed.
     """
     members = [newest, *slam_map.covisible(newest, free - 1)]
     anchor = slam_map.anchors_seen_by(members)
@@ -40,7 +40,7 @@ def choose_window(slam_map: SlamMap, newest: Keyframe, free: int, fixed: int) ->
     inside = {k.id for k in members}
     outside = sorted((id for id in counts if id not in inside), key=lambda id: (-counts[id], -id))[:fixed]
     frozen = [slam_map.keyframes[id] for id in outside]
-    if len(frozen) < 2:  # one fixed pose leaves the scale free, two hold it
+    if len(frozen) < 2:  # one fixed pose leaves the scale free, two fix it
         members.sort(key=lambda k: -k.id)
         while len(frozen) < 2 and len(members) > 1:
             frozen.append(members.pop())
@@ -63,9 +63,9 @@ def whole_map(slam_map: SlamMap) -> Window | None:
 
 
 def held_extent(window: Window) -> ScalePrior | None:
-    """Where one pose alone is fixed, the distance to the farthest other holds the scale; None where nothing is free.
+    """Scale prior if only one pose is fixed: the distance to the farthest other pose. None if no pose is free.
 
-    Two fixed poses hold the scale themselves, and poses all in one place have none.
+    Two fixed poses fix the scale themselves; coincident poses have none.
     """
     if len(window.fixed) != 1 or not window.free:
         return None
@@ -78,7 +78,7 @@ def held_extent(window: Window) -> ScalePrior | None:
 
 
 def refine(slam_map: SlamMap, window: Window, camera: Camera, config: LmConfig) -> WindowResult | None:
-    """Refine the window in place; observations that disagree with the result are taken out of the map."""
+    """Refine the window in place; outlier observations are removed from the map."""
     problem, keypoint = window_problem(slam_map, window, camera, config)
     if len(problem.obs_pose) == 0:
         return None
@@ -90,10 +90,10 @@ def refine(slam_map: SlamMap, window: Window, camera: Camera, config: LmConfig) 
 def window_problem(
     slam_map: SlamMap, window: Window, camera: Camera, config: LmConfig
 ) -> tuple[WindowProblem, list[IntArray]]:
-    """A window's poses, anchors and observations, and which keypoints of each keyframe the observations are.
+    """A window's poses, anchors and observations, and the observations' keypoints of each keyframe.
 
     Poses come free ones first, those of hosts outside the window last. With plain squares (``Kernel.L2``, the paper's
-    literal form) every keypoint counts alike; otherwise it is whitened by its octave.
+    literal form) keypoints have equal weight; otherwise they are whitened by their octave.
     """
     keyframes = [*window.free, *window.fixed]
     row_of_anchor = np.full(len(slam_map.anchors.alive) + 1, -1, dtype=np.int64)
@@ -111,7 +111,7 @@ def window_problem(
     alike = config.kernel is Kernel.L2
     shrink = slam_map.scale_factor ** -np.arange(slam_map.levels, dtype=np.float64)
     unsure = slam_map.anchors.from_depth[window.anchor]
-    # Where most depths rest on priors, these hold the scale; the way between poses that only turn is noise.
+    # If most depths rest on priors, these fix the scale; the distance between poses of a rotating camera is noise.
     extent = None if unsure.sum() > 0.5 * len(unsure) else held_extent(window)
     priors, hosts = depth_priors(slam_map, window.anchor, [k.id for k in keyframes])
     problem = WindowProblem(
@@ -130,7 +130,7 @@ def window_problem(
 
 
 def write_back(slam_map: SlamMap, window: Window, keypoint: list[IntArray], result: WindowResult) -> None:
-    """Give the map a result of `window_problem`; observations that disagree with it are taken out."""
+    """Write the result of `window_problem` back to the map; outlier observations are removed."""
     if result.stop is StopReason.NOT_FINITE:  # its residuals say nothing, so no observation disagrees
         return
     keyframes = [*window.free, *window.fixed]

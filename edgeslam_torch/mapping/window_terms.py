@@ -1,4 +1,4 @@
-"""Edge and junction terms of a window from what its keyframes hold."""
+"""Edge and junction terms of a window from its keyframes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from edgeslam_torch.optim.problem import EdgeTerms, JunctionTerms
 from edgeslam_torch.types import Edges, FloatArray, IntArray
 
 UNKNOWN_SIGMA_LOG = 0.35
-"""Relative sigma of a corner's depths that nothing but other views may tell."""
+"""Relative sigma of a corner's depths without a measurement."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,7 +24,7 @@ class Structure:
     """Edges and junctions of one keyframe."""
 
     field: EdgeField
-    """Its edges with their inverse depths, ready for look-up."""
+    """Its edges with inverse depths, indexed."""
     sigma: FloatArray
     """``(E,)`` standard deviations of those inverse depths [1/m]."""
     junctions: Junctions | None = None
@@ -32,40 +32,40 @@ class Structure:
 
 @dataclass(frozen=True, slots=True)
 class TermConfig:
-    """How many terms to make and how far to trust them."""
+    """Number and weights of the terms."""
 
     edges_per_pose: int = 800
     targets: int = 3
-    """Poses in which each pose's edges are looked for: the nearest by baseline."""
+    """Number of target poses per host: those with the smallest baseline."""
     max_px: float = 4.0
-    """Largest distance between a projected edge pixel and its partner."""
+    """Maximum distance between a projected edge pixel and its partner."""
     edge_sigma_px: float = 2.0
-    """Edges scatter by 0.8 px on fr1_xyz, but neighbours on one edge err together: six of them count as one. Zero
-    leaves alignment out."""
+    """Edges scatter by 0.8 px on fr1_xyz, but errors of neighbours are correlated: six count as one. Zero disables
+    alignment."""
     least_sigma: float = 0.003
-    """Relative depth sigma below which no single edge is believed."""
+    """Minimum relative depth sigma of an edge."""
     cycle: CycleForm = CycleForm.RELATIVE_DEPTH
     cycle_sigma: float = 0.02
-    """Standard deviation of the cycle residual; zero leaves the cycle out."""
+    """Standard deviation of the cycle residual; zero disables the cycle."""
     junction_px: float = 6.0
-    """Largest distance between a projected corner and its partner."""
+    """Maximum distance between a projected corner and its partner."""
     junction_turn_rad: float = 0.35
-    """Largest angle between projected and seen arms."""
+    """Maximum angle between projected and observed arms."""
     arm_points: int = 8
-    """Edge points along each arm whose depths are asked for."""
+    """Edge points along each arm whose depths are used."""
     arm_px: float = 40.0
-    """Longest piece of an arm that is used."""
+    """Maximum used length of an arm."""
     collinearity: str = "relative"
     """Straight arms: whitened by the depths' sigmas, ``literal`` (metres with a sigma of one) or ``off``."""
     angle_sigma: float = 0.05
-    """Standard deviation of an angle row; zero leaves the angle out."""
+    """Standard deviation of an angle row; zero disables the angle."""
     cosines: bool = False
     """The cosine of the angle (paper eq. 24 across views) instead of both arms' directions."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlacedEdges:
-    """Edge terms with the places of their edges in the keyframes' own lists."""
+    """Edge terms with the indices of their edges in the keyframes' lists."""
 
     terms: EdgeTerms
     index: IntArray
@@ -79,14 +79,14 @@ def make_structure(
     sigma: FloatArray,
     mask: NDArray[np.bool_] | None = None,
 ) -> Structure:
-    """What a keyframe's edges with known depth are for its neighbours.
+    """Index a keyframe's edges of known depth for its neighbours.
 
     Args:
         grey: Undistorted image ``(H, W)``.
         uv: ``(E, 2)`` edge pixels whose depth is known, at whole pixels.
         inverse_depth: ``(E,)`` [1/m].
         sigma: ``(E,)`` standard deviations [1/m].
-        mask: ``(H, W)`` Canny edges, for L-junctions; none are looked for without it.
+        mask: ``(H, W)`` Canny edges, for L-junctions; without it none are detected.
     """
     height, width = grey.shape
     smooth = cv2.GaussianBlur(grey, (5, 5), 1.0)
@@ -116,10 +116,10 @@ def edge_terms(
 
     Args:
         structures: One per pose.
-        T_c_w: World-to-camera poses ``(W, 4, 4)``; the association depends on them, so make the terms anew when
-            poses have moved by more than a pixel or two.
+        T_c_w: World-to-camera poses ``(W, 4, 4)``; the association depends on them, so create the terms again after
+            poses moved by more than a pixel or two.
         K: fx, fy, cx, cy [px].
-        config: Numbers and sigmas.
+        config: Numbers and weights.
     """
     config = config or TermConfig()
     chosen = [_spread(s.field.inverse_depth > 0, config.edges_per_pose) for s in structures]
@@ -165,7 +165,7 @@ def junction_terms(
     K: tuple[float, float, float, float],
     config: TermConfig | None = None,
 ) -> JunctionTerms | None:
-    """Junctions that are seen again from a neighbouring pose; None when there is none. Arguments as `edge_terms`."""
+    """Junctions observed from neighbouring poses; None without any. Arguments as `edge_terms`."""
     config = config or TermConfig()
     targets = nearest_poses(T_c_w, config.targets) if len(structures) > 1 else np.zeros((len(structures), 0), int)
     rows = []
@@ -210,7 +210,7 @@ def junction_terms(
 
 
 def _spread(mask: np.ndarray, most: int) -> IntArray:
-    """At most ``most`` of the places where ``mask`` holds, evenly."""
+    """At most ``most`` indices at which ``mask`` is true, evenly spread."""
     places = np.flatnonzero(mask)
     if len(places) <= most:
         return places
@@ -226,7 +226,7 @@ def _junction_depths(structure: Structure, config: TermConfig) -> tuple[FloatArr
         nothing = np.zeros(uv.shape[:-1])
         return *collinearity_prior(np.full_like(nothing, np.nan), nothing, nothing), np.zeros(len(uv), bool)
     across = np.stack([-junctions.arms[..., 1], junctions.arms[..., 0]], -1)[:, :, None] * np.ones(uv.shape[2:])
-    # The bright side of an arm is not known: look on both.
+    # The bright side of an arm is unknown: search both.
     sides = [nearest_edges(field, uv.reshape(-1, 2), sign * across.reshape(-1, 2)) for sign in (1.0, -1.0)]
     partner = np.stack(sides).reshape(2, *uv.shape[:-1])  # (2, C, 2, M)
     away = np.linalg.norm(field.edges.uv[partner] - uv, axis=-1)
@@ -239,7 +239,7 @@ def _junction_depths(structure: Structure, config: TermConfig) -> tuple[FloatArr
         sigma = depth * depth
     sigma = np.where(given, sigma, 1.0)
     prior, information = collinearity_prior(np.where(given, fraction, np.nan), depth, sigma)
-    if config.collinearity == "off":  # a start, and hardly more
+    if config.collinearity == "off":  # a weak prior
         information = np.eye(3) / (UNKNOWN_SIGMA_LOG * np.maximum(prior, 1e-6)[:, :, None]) ** 2
     known = (given.sum(2) >= 3).all(1) & (prior > 0).all(1)
     return prior, information, known
@@ -254,7 +254,7 @@ def _match(
     K: tuple[float, float, float, float],
     config: TermConfig,
 ) -> tuple[IntArray, IntArray]:
-    """Junctions with a partner in the other view, and the partners: near, arms alike, mutually best."""
+    """Junctions with a partner in the other view, and the partners: near, with similar arms, mutually best."""
     projected, front = _project(T_j_i, uv, inverse_depth, K)
     distance = np.linalg.norm(projected[:, None, 0] - other.uv[None], axis=2)
     arms = _unit(projected[:, 1:] - projected[:, :1])
@@ -270,7 +270,7 @@ def _match(
 def _ordered(
     uv: FloatArray, inverse_depth: FloatArray, arms: FloatArray, T_j_i: FloatArray, K: tuple[float, float, float, float]
 ) -> FloatArray:
-    """Seen arms ``(Q, 2, 2)`` in the order of the host's arms: a junction seen from behind changes hands."""
+    """Seen arms ``(Q, 2, 2)`` in the order of the host's arms: seen from behind, the order is reversed."""
     projected, _ = _project(T_j_i, uv, inverse_depth, K)
     mine = _unit(projected[:, 1:] - projected[:, :1])
     swap = (mine * arms).sum(2).min(1) < (mine * arms[:, ::-1]).sum(2).min(1)

@@ -1,6 +1,6 @@
-"""What the system is doing, and what a frame makes of it: `machine.py` has the whole table of states and events.
+"""States of the system: `machine.py` has the table of states and events.
 
-Every state turns a frame into a `Step` and names the event that it met: `starting.py` follows guessed depths until a
-map stands, `tracking.py` finds frames in the map and makes keyframes, `lost.py` searches and at last starts anew. What
-they share (map, motion, metres, mapping) is `system.py`.
+Every state turns a frame into a `Step` with an event: `starting.py` tracks predicted depths until there is a map,
+`tracking.py` tracks the map and creates keyframes, `lost.py` relocalises and eventually starts a new piece. Shared
+parts (map, motion, scale, mapping) are in `system.py`.
 """

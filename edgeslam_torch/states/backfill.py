@@ -1,6 +1,6 @@
-"""Frames without a pose get one when the map that they show is there: backwards in time from where it was found.
+"""Poses for lost frames, computed backwards in time once the map that they show exists.
 
-A camera that was carried away sees its new place at once, but the map of it begins later, or is recognised later.
+A kidnapped camera sees its new place at once, but that place is mapped or recognised later.
 """
 
 from edgeslam_torch.map.keyframe import Keyframe
@@ -10,24 +10,24 @@ from edgeslam_torch.tracking.tracker import View
 from edgeslam_torch.types import FloatArray, Frame, IntArray
 
 MAX_FRAMES = 60
-"""Lost frames whose features are kept (3 MB): two seconds at 30 Hz."""
+"""Maximum number of lost frames whose features are kept (3 MB): two seconds at 30 Hz."""
 MISSES = 2
-"""Frames in a row that are not found, after which the earlier ones are given up."""
+"""Consecutive failures after which earlier frames are given up."""
 
 
 class Backfill:
-    """Remembers the frames of the present loss."""
+    """Stores the frames of the current loss."""
 
     def __init__(self, system: System) -> None:
         self.system = system
         self._lost: list[tuple[int, View]] = []
 
     def keep(self, frame: Frame, view: View) -> None:
-        """Remember a frame without a pose; of too many the oldest is forgotten."""
+        """Store a frame without a pose; beyond the limit the oldest is dropped."""
         self._lost = [*self._lost[1 - MAX_FRAMES :], (frame.index, view)]
 
     def place(self, keyframe: Keyframe, T_c_w: FloatArray, anchors: IntArray) -> int:
-        """Find the lost frames one by one, the newest first.
+        """Track the lost frames one by one, newest first.
 
         Args:
             keyframe: Their poses are tied to it.

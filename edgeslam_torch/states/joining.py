@@ -1,4 +1,4 @@
-"""Between two frames: pieces of map that new keyframes show to be one are joined, and the present pose goes along."""
+"""Joining of pieces between two frames, when new keyframes connect them; the current pose is transformed along."""
 
 from dataclasses import replace
 
@@ -8,20 +8,20 @@ from edgeslam_torch.states.system import System
 
 
 class Joining:
-    """Asks the atlas while nobody else works on the map."""
+    """Queries the atlas while the map is not in use elsewhere."""
 
     def __init__(self, system: System, atlas: Atlas) -> None:
         self.system = system
         self.atlas = atlas
 
     def update(self) -> str:
-        """Join what the newest keyframes show to be one; the joins in words, empty when there were none."""
+        """Join pieces that the newest keyframes connect; returns the joins in words, empty without any."""
         if self.system.mapping.busy:
             return ""
         return "; ".join(join.in_words() for join in iter(self._once, None))
 
     def finish(self) -> None:
-        """Ask every keyframe once more: pieces have grown since they were asked."""
+        """Query every keyframe again, since the pieces have grown."""
         self.atlas.ask_all_again()
         self.update()
 
@@ -39,7 +39,7 @@ class Joining:
         T_c_k[:3, 3] *= scale
         system.motion.carry(T_c_k @ system.map.pose_of(last), scale)
         system.fusion.revise(*system.log.poses())
-        # Poses published before are those of a piece that has moved since, or that lies elsewhere than was guessed.
+        # Poses published before belong to a piece that has moved since.
         system.published = replace(system.published, revision=system.published.revision + 1)
         system.events["joined"] = system.events.get("joined", 0) + 1
         return join

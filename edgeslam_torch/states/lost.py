@@ -1,4 +1,4 @@
-"""The pose is a prediction: every frame searches the keyframes, and after a while a new piece of map is begun."""
+"""Lost: the pose is predicted, every frame tries to relocalise, and after a while a new piece of map is started."""
 
 import numpy as np
 
@@ -16,7 +16,7 @@ LOST_BEFORE_RESTART_S = 0.65
 """Time without a pose after which a new piece of map is started from the predicted one."""
 
 UNCONFIRMED = "looks like a known place, the next frames must agree"
-"""Why a frame is not found yet, in words."""
+"""Reason of an unconfirmed relocalisation, in words."""
 
 
 class Lost:
@@ -28,24 +28,24 @@ class Lost:
         self.starting = starting
 
     def step(self, frame: Frame, seen: LazyView, machine: Machine) -> Step:
-        """Search for the frame; go on by prediction, or begin anew, where that fails."""
+        """Relocalise the frame, else predict its pose or start a new piece."""
         T_predicted = self.system.predict(frame.stamp_s, lost=True)
         found = self.tracking.search(frame, seen, T_predicted, machine.lost_frames)
         return found or self.miss(frame, seen.view, T_predicted, machine.lost_since_s)
 
     def begin(self, frame: Frame, view: View) -> Step:
-        """The first frame that nothing says the place of."""
+        """The first lost frame."""
         self.system.events["lost"] += 1
         return self.miss(frame, view, self.system.predict(frame.stamp_s, lost=False), np.inf)
 
     def miss(self, frame: Frame, view: View, T_predicted: FloatArray, lost_since_s: float) -> Step:
-        """Take the prediction, or begin a new piece of map there when the loss has lasted."""
+        """Predict the pose, or start a new piece of map there after a longer loss."""
         system = self.system
         self.tracking.backfill.keep(frame, view)
         system.motion.drift(T_predicted)
         system.fusion.add_visual(frame.stamp_s, se3.inverse(T_predicted), np.inf, np.inf, tracked=False)
         seen = len(view.features.uv)
-        # With nothing to come back to, as after dark first images, what starts a map at first starts one now.
+        # Without a map to return to, as after dark first images, the conditions of a first map apply.
         enough = 2 * MIN_KEYPOINTS if len(system.map.anchors) > 0 else MIN_KEYPOINTS
         waiting = self.tracking.relocaliser.waiting > 0
         if frame.stamp_s - lost_since_s >= LOST_BEFORE_RESTART_S and seen >= enough and not waiting:

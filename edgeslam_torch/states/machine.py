@@ -1,4 +1,4 @@
-"""The states of the system and every way from one to another.
+"""The states of the system and all transitions.
 
 ::
 
@@ -17,10 +17,10 @@ from enum import StrEnum
 
 
 class State(StrEnum):
-    """What carries the present pose."""
+    """What the current pose is based on."""
 
     STARTING = "starting"
-    """Depths guessed at the first keyframe of a piece of map; nothing was triangulated yet."""
+    """Predicted depths of the first keyframe of a piece; nothing is triangulated yet."""
     TRACKING = "tracking"
     """Keypoints of the map, with or without edges beside them."""
     EDGES_ONLY = "edges only"
@@ -30,14 +30,14 @@ class State(StrEnum):
 
 
 class Event(StrEnum):
-    """What a frame brought."""
+    """Outcome of a frame."""
 
     BEGUN = "begun"
-    """A piece of map was begun with guessed depths."""
+    """A piece of map was started with predicted depths."""
     NO_TEXTURE = "too little texture to begin"
     WAITING = "waiting for parallax"
     MAP_STANDS = "map stands"
-    """From two views, or from the depth network where the view changed before parallax came."""
+    """A map exists, from two views or from the depth network if the view changed before there was parallax."""
     RETURNED = "found in an earlier piece of map"
     POINTS = "found by points"
     EDGES = "found by edges alone"
@@ -58,11 +58,11 @@ TRANSITIONS: dict[State, dict[Event, State]] = {
     State.EDGES_ONLY: _FOUND,
     State.LOST: {Event.POINTS: State.TRACKING, Event.NOTHING: State.LOST, Event.BEGUN: State.STARTING},
 }
-"""Where each event leads; an event that is not listed cannot happen."""
+"""Transitions; other events cannot happen."""
 
 
 class Machine:
-    """The present state and how long the pose has been a prediction.
+    """The current state and the duration of a loss.
 
     Example:
         >>> machine = Machine()
@@ -77,13 +77,13 @@ class Machine:
         self.lost_frames = 0
         """Frames in a row without a pose."""
         self.lost_since_s = math.inf
-        """Stamp of the first of them; infinite while not lost, minus infinity where there is nothing to find again."""
+        """Stamp of the first of them; infinite while not lost, minus infinity without a map to return to."""
 
     def meet(self, event: Event, stamp_s: float) -> None:
-        """Go where an event leads.
+        """Apply an event.
 
         Raises:
-            KeyError: If the event cannot happen in the present state.
+            KeyError: If the event is invalid in the current state.
         """
         self.state = TRANSITIONS[self.state][event]
         if self.state is not State.LOST:

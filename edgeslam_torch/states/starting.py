@@ -1,4 +1,5 @@
-"""A piece of map begins: depths are guessed at its first keyframe, until two views or a changed view let it stand."""
+"""Start of a piece of map: predicted depths at its first keyframe, until two views or a changed view establish the
+map."""
 
 from dataclasses import replace
 
@@ -22,23 +23,24 @@ from edgeslam_torch.tracking.tracker import Track, View
 from edgeslam_torch.types import FloatArray, Frame, FrameStatus
 
 ADOPT_SHARE = 0.6
-"""When fewer of the first keyframe's points agree than this share of the most so far, the view has changed: the map
-that the depth network made is taken as it is, since parallax may never come (a turn, a climb, a hover). At 0.4 two
-views come first on redkitchen and its map is better (median 3.7 against 4.2 cm); on bare boards they come first in
-some seeds, and are wrong (ATE .011 to .030 m; .0105 in all five seeds at 0.6)."""
+"""Share of the maximum number of inliers below which the view has changed, and the depth network's map is adopted,
+since parallax may never come (rotation, climb, hover). At 0.4 two views come first on redkitchen and its map is
+better (median 3.7 against 4.2 cm); on bare boards they come first in some seeds, and are wrong (ATE .011 to .030 m;
+.0105 in all five seeds at 0.6)."""
 
 MIN_INLIERS = 15
-"""Fewer of the first keyframe's points than this could agree with a wrong pose: it is out of sight."""
+"""Minimum number of inliers; fewer could agree with a wrong pose."""
 
 HANDOVER_INLIERS = 50
-"""When fewer of the first keyframe's points are left before the map stands, the next attempt starts from here."""
+"""Number of inliers below which the next attempt starts from the current frame."""
 
 MAX_WAITING_IN_REAL_TIME = 3
-"""Frames between the first two views that become keyframes in real time; while they are mapped, no other can be."""
+"""Maximum number of intermediate frames that become keyframes in real time; while they are mapped, no other keyframe
+can be."""
 
 FIRST_FRAME = "first frame, depth guessed"
 AFTER_LOSS = "new piece of map after loss: pose predicted, depth guessed"
-"""How a piece of map is begun, in words."""
+"""How a piece of map was started, in words."""
 
 NOWHERE = Reach(np.eye(4), -np.inf, -np.inf)
 """Of a camera that may be in another piece of map: no place is expected, so that several frames must agree."""
@@ -51,10 +53,10 @@ class Starting:
 
     Args:
         system: Shared parts.
-        tracking: Takes over once the map stands.
-        atlas: Knows the earlier pieces.
+        tracking: State that takes over once there is a map.
+        atlas: Atlas of the earlier pieces.
         lm: Solver settings.
-        realtime: Fewer frames wait for the map to stand.
+        realtime: Limits the number of waiting frames.
     """
 
     def __init__(self, system: System, tracking: Tracking, atlas: Atlas, lm: LmConfig, realtime: bool) -> None:
@@ -69,7 +71,7 @@ class Starting:
         self._attempt: Bootstrap | None = None
 
     def begin(self, frame: Frame, view: View, reason: str) -> Step:
-        """Begin a piece of map at the present pose with guessed depths.
+        """Start a piece of map at the current pose with predicted depths.
 
         Args:
             frame: Present frame.
@@ -83,7 +85,7 @@ class Starting:
         T_c_w = system.motion.T_c_w
         keyframe = make_keyframe(slam_map.next_keyframe_id(), frame.index, frame.stamp_s, T_c_w, view.features)
         if len(view.features.uv) < MIN_KEYPOINTS:
-            if not slam_map.keyframes:  # something for the poses to hang on
+            if not slam_map.keyframes:  # a reference for the poses
                 slam_map.begin_piece(reason)
                 slam_map.add_keyframe(keyframe)
             reason = f"only {len(view.features.uv)} keypoints, waiting for texture"
@@ -99,7 +101,7 @@ class Starting:
         return Step(Event.BEGUN, keyframe, FrameStatus.STARTING, reason, is_keyframe=True)
 
     def step(self, frame: Frame, seen: LazyView) -> Step:
-        """Follow the guessed depths and try to put a better map in their place."""
+        """Track the predicted depths and try to replace them by a better map."""
         attempt = self._attempt
         assert attempt is not None
         view = seen.view
@@ -136,13 +138,13 @@ class Starting:
         )
 
     def _give_up(self) -> None:
-        """Take the present attempt's guesses out of the map."""
+        """Remove the current attempt's anchors from the map."""
         if self._attempt is not None:
             self._attempt.forget_guess()
             self._attempt = None
 
     def _find_earlier_piece(self, attempt: Bootstrap, frame: Frame, view: View) -> Track | None:
-        """The place of the frame, if it is one of an earlier piece; where that lies from here nobody knows."""
+        """Relocalise the frame in an earlier piece, whose relative pose is unknown."""
         strangers = self.atlas.strangers(self.system.map.piece_of(attempt.reference.id))
         if not strangers:
             return None
@@ -153,7 +155,7 @@ class Starting:
         system = self.system
         T_predicted = system.predict(frame.stamp_s, lost=False)
         track = attempt.track(view, T_predicted, system.expectation(frame.stamp_s, T_predicted))
-        if track is None or track.inliers < system.config.tracking.min_inliers:  # a fast turn: look everywhere
+        if track is None or track.inliers < system.config.tracking.min_inliers:  # a fast rotation: search everywhere
             newest = candidates(system.tracker, T_predicted, 1, 0)
             track = next(filter(None, (match_keyframe(system.tracker, view, k) for k in newest)), None)
             if track is not None and track.inliers < 2 * system.config.tracking.min_inliers:
@@ -163,7 +165,7 @@ class Starting:
     def _stands(
         self, frame: Frame, seen: LazyView, started: StartedMap, reason: str, track: Track, two_view: TwoView
     ) -> Step:
-        """Hand over to tracking, with a map that stands."""
+        """Hand over to tracking with the new map."""
         assert self._attempt is not None
         reference, keyframe = self._attempt.reference, started.new[-1][1]
         self._attempt = None
@@ -180,7 +182,7 @@ class Starting:
         )
 
     def _guess_depth(self, keyframe: Keyframe) -> FloatArray:
-        """Depth [map units] of every keypoint before anything is triangulated and its log sigma, ``(N, 2)``."""
+        """Predicted depth [map units] of every keypoint and its log sigma, ``(N, 2)``."""
         guess = np.full((len(keyframe.features.uv), 2), self.system.config.depth.prior_sigma_log)
         network_m, sigma_log = np.full((2, len(guess)), np.nan)
         if keyframe.depth is not None:
@@ -194,7 +196,7 @@ class Starting:
         return guess
 
     def _earlier_depth(self) -> float:
-        """Median distance of what was triangulated before from the newest keyframe [map units]; 1 where nothing was."""
+        """Median distance of triangulated anchors from the newest keyframe [map units]; 1 without any."""
         anchors, latest = self.system.map.anchors, self.system.map.latest
         earlier = np.flatnonzero(anchors.alive & ~anchors.from_depth)
         if len(earlier) == 0:

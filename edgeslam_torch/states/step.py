@@ -1,4 +1,4 @@
-"""What one frame brought, as the states hand it over."""
+"""Result of a state for one frame."""
 
 from dataclasses import dataclass
 
@@ -10,14 +10,14 @@ from edgeslam_torch.types import FloatArray, FrameStatus
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One frame's ending."""
+    """Result for one frame."""
 
     event: Event
     keyframe: Keyframe
-    """That the frame's pose is tied to."""
+    """Reference keyframe of the pose."""
     status: FrameStatus
     reason: str = ""
-    """Why the status is what it is, in words."""
+    """Reason for the status, in words."""
     track: Track | None = None
     parallax_rad: float = 0.0
     is_keyframe: bool = False
@@ -27,14 +27,14 @@ class Step:
 
 @dataclass(frozen=True, slots=True)
 class Located:
-    """A frame with its place in the map."""
+    """A frame localised in the map."""
 
     track: Track
     reference: Keyframe
     parallax_rad: float
     """Median ray angle to the reference."""
     due: bool
-    """It should become a keyframe."""
+    """Whether it should become a keyframe."""
     uv: FloatArray
     """``(M, 2)`` undistorted pixels of the track's inliers."""
     inv_sigma: FloatArray
@@ -43,4 +43,4 @@ class Located:
     """Its features, if it was matched; without them it cannot become a keyframe."""
     relocalised: bool = False
     edges: int = 0
-    """Edge points that had a part in the pose."""
+    """Number of edge points used for the pose."""

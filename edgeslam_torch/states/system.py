@@ -1,4 +1,4 @@
-"""What all states work on: map, motion, metres, and the making of keyframes."""
+"""Parts shared by all states: map, motion, scale, and the creation of keyframes."""
 
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
@@ -28,12 +28,12 @@ MIN_KEYPOINTS = 100
 """Fewer keypoints than this cannot start a map."""
 
 UNKNOWN_SIGMA = 0.01
-"""Standard deviation of a visual pose [map units, rad] whose solver could not tell it."""
+"""Standard deviation of a visual pose without a covariance [map units, rad]."""
 
 
 @dataclass(slots=True)
 class System:
-    """The parts that outlive a state; a state changes them only through what they offer."""
+    """Parts that outlive a state; states modify them only through their interfaces."""
 
     camera: Camera
     config: SlamConfig
@@ -48,17 +48,17 @@ class System:
     events: dict[str, int] = field(
         default_factory=lambda: {"lost": 0, "relocalised": 0, "restarted": 0, "initialisations_refused": 0}
     )
-    """Counts of what went wrong and was mended."""
+    """Counts of losses, relocalisations, restarts and refused initialisations."""
     has_telemetry: bool = False
     keyframe_s: float = -np.inf
     """Stamp of the newest keyframe."""
     shows_nothing_new: bool = False
-    """Whether the present image repeats the one before."""
+    """Whether the current image repeats the previous one."""
     stage_ms: dict[str, float] = field(default_factory=dict)
-    """Of the present frame."""
+    """Times of the current frame."""
 
     def timed(self, stage: str) -> AbstractContextManager[None]:
-        """Add the time spent inside to a stage of the present frame."""
+        """Add the time spent inside to a stage of the current frame."""
         return timed(self.stage_ms, stage)
 
     # -- motion ------------------------------------------------------------------------------------------------
@@ -75,18 +75,18 @@ class System:
         return self.motion.predict(stamp_s)
 
     def expectation(self, stamp_s: float, T_predicted: FloatArray) -> PosePrior | None:
-        """The predicted pose with what accelerations allow it to be off; None where nothing tells metres."""
+        """The predicted pose with the uncertainty due to accelerations; None without a scale."""
         if not self.mapping.has_depth:
             return None
         return self.motion.expectation(stamp_s, T_predicted, self.published.scale)
 
     def reach(self, stamp_s: float, T_predicted: FloatArray) -> Reach:
-        """Where the camera can be by now, after frames without a pose."""
+        """Region that the camera can have reached during frames without a pose."""
         metre = 1.0 / self.published.scale if self.mapping.has_depth else None
         return reach_after(stamp_s - self.motion.seen_s, T_predicted, metre)
 
     def see(self, stamp_s: float, track: Track) -> None:
-        """Tell the fusion what the image said, and publish what follows for the scale."""
+        """Pass the visual pose to the fusion, and publish the resulting scale."""
         if self.shows_nothing_new:
             return
         variance = np.diag(track.covariance)
@@ -101,16 +101,16 @@ class System:
     # -- keyframes ---------------------------------------------------------------------------------------------
 
     def map_keyframes(self, new: list[tuple[Frame, Keyframe]]) -> bool:
-        """Map keyframes that were put into the map, and whether that is done."""
+        """Map new keyframes; returns whether that is complete."""
         self.keyframe_s = new[-1][1].stamp_s
         return self.absorb(self.mapping.submit(new))
 
     def collect(self, wait: bool = False) -> None:
-        """Take what real-time mapping has finished; with ``wait`` the map belongs to the caller alone afterwards."""
+        """Collect finished results of real-time mapping; with ``wait`` the caller owns the map afterwards."""
         self.absorb(self.mapping.collect(wait))
 
     def absorb(self, mapped: Mapped | None) -> bool:
-        """Carry the present pose along with what refinement did to the newest keyframe."""
+        """Apply the refinement of the newest keyframe to the current pose."""
         if mapped is None:
             return False
         before = self.motion.T_c_w
@@ -122,11 +122,11 @@ class System:
         return True
 
     def compare_depth(self, keyframe: Keyframe) -> None:
-        """What the network's metres say about the map's units."""
+        """Compare the network's depth with the map's units."""
         if keyframe.depth is None:
             return
         held = keyframe.keypoints_with_anchor()
-        held = held[~self.map.anchors.from_depth[keyframe.anchor[held]]]  # their depth is the network's own word
+        held = held[~self.map.anchors.from_depth[keyframe.anchor[held]]]  # their depth comes from the network itself
         p_w = self.map.anchors.p_w[keyframe.anchor[held]]
         z = (p_w @ keyframe.T_c_w[:3, :3].T + keyframe.T_c_w[:3, 3])[:, 2]
         ratio = compared(sample(keyframe.depth, keyframe.features.uv[held])[0], z)

@@ -1,4 +1,4 @@
-"""A frame finds its place in the map: by flow, by matching, by edges where points are few; some become keyframes."""
+"""Tracking in the map by flow, by matching, and by edges where points are few; creation of keyframes."""
 
 from dataclasses import replace
 
@@ -24,7 +24,7 @@ FEW_INLIERS = 100
 
 
 class Tracking:
-    """The states in which the map carries the pose, by points or by edges."""
+    """The states in which the pose is tracked on the map, by points or by edges."""
 
     def __init__(self, system: System) -> None:
         self.system = system
@@ -35,39 +35,39 @@ class Tracking:
         self.relocaliser = Relocaliser(system.tracker)
         self.backfill = Backfill(system)
         self._template: Template | None = None
-        """What the next frames are followed from; none before there is a map."""
+        """Template for tracking the next frames; None without a map."""
         self._recent: IntArray = np.zeros(0, dtype=np.int64)
-        """Anchors that the last frame found, or the newest keyframe holds."""
+        """Anchors of the last frame, or of the newest keyframe."""
 
     @property
     def needs_features(self) -> bool:
-        """Whether the next frame is matched by its keypoints, come what may."""
+        """Whether the next frame is certainly matched by keypoints."""
         return self._template is None or not self.system.config.flow.enabled
 
     def begin(self, seen: LazyView, new: list[tuple[Frame, Keyframe]]) -> None:
-        """Go on from keyframes of a map that has just begun to stand, the last one of the present frame."""
+        """Start tracking on the keyframes of a new map, the last one of the current frame."""
         newest = new[-1][1]
         self._recent = newest.anchor[newest.anchor >= 0]
         self._follow_from(newest, seen)
         self._map(new)
 
     def forget(self) -> None:
-        """Follow nothing any more, and search nothing."""
+        """Reset template and recent anchors."""
         self._template = None
         self.relocaliser.forget()
 
     def step(self, frame: Frame, seen: LazyView) -> Step | None:
-        """Find the frame near where it is expected; None when nothing says where it is."""
+        """Track the frame near its prediction; None if that fails."""
         system = self.system
         T_predicted = system.predict(frame.stamp_s, lost=False)
         with system.map.lock:
             with system.timed("tracking"):
                 followed = self._follow(seen, T_predicted, frame.stamp_s)
             located = None if followed is None else self._locate_followed(followed, frame.stamp_s)
-            # While the worker is busy no keyframe can be made; matching then finds what it has mapped meanwhile.
+            # While the worker is busy no keyframe can be created; matching then finds newly mapped anchors.
             if located is None or located.due:
                 matched = self._match(frame, seen, T_predicted, followed)
-                if matched is None and located is not None:  # in a blurred image flow finds what matching does not
+                if matched is None and located is not None:  # in a blurred image flow may work where matching fails
                     matched = replace(located, due=False)
                 located = matched
             if located is None:
@@ -75,7 +75,7 @@ class Tracking:
             return None if located is None else self.arrive(frame, seen, T_predicted, located)
 
     def search(self, frame: Frame, seen: LazyView, T_predicted: FloatArray, lost_frames: int) -> Step | None:
-        """Find a frame that may be anywhere, among the keyframes; None when none of those asked now shows it."""
+        """Relocalise a frame among keyframes; None without success."""
         with self.system.map.lock:
             with self.system.timed("features"):
                 view = seen.view
@@ -84,7 +84,7 @@ class Tracking:
             return None if track is None else self.return_to(frame, seen, T_predicted, track)
 
     def return_to(self, frame: Frame, seen: LazyView, T_predicted: FloatArray, track: Track) -> Step:
-        """Go on in the map at a place that was found again."""
+        """Continue in the map at a relocalised place."""
         self.system.events["relocalised"] += 1
         located = self._located(track, seen.view, seen, frame.stamp_s, None, relocalised=True)
         step = self.arrive(frame, seen, T_predicted, located)
@@ -93,7 +93,7 @@ class Tracking:
         return step
 
     def arrive(self, frame: Frame, seen: LazyView, T_predicted: FloatArray, located: Located) -> Step:
-        """Take the place that was found for the frame's, and make it a keyframe if one is due."""
+        """Accept the frame's pose, and insert a keyframe if one is due."""
         system = self.system
         if located.track.inliers < FEW_INLIERS and not located.edges:
             located = self._with_edges(frame, seen, T_predicted, located)
@@ -136,7 +136,7 @@ class Tracking:
     def _match(
         self, frame: Frame, seen: LazyView, T_predicted: FloatArray, followed: Followed | None
     ) -> Located | None:
-        """By the frame's own keypoints: where flow finds nothing, and what a keyframe needs."""
+        """By the frame's own keypoints: where flow fails, and for keyframes."""
         with self.system.timed("features"):
             view = seen.view
         with self.system.timed("tracking"):
@@ -146,7 +146,7 @@ class Tracking:
     def _located(
         self, track: Track, view: View, seen: LazyView, stamp_s: float, followed: Followed | None, relocalised: bool
     ) -> Located:
-        """The place of a frame that was matched; the next frames are followed from it."""
+        """The pose of a matched frame, which becomes the template for the next ones."""
         system = self.system
         reference = system.tracker.local_keyframes(track.anchor)[0]
         parallax_rad = self._parallax(track, reference)
@@ -159,7 +159,7 @@ class Tracking:
     def _find(
         self, frame: Frame, view: View, T_predicted: FloatArray, followed: Followed | None
     ) -> tuple[Track | None, bool]:
-        """Track where flow or the prediction says, else search the keyframes; and whether the search found it."""
+        """Track near flow's result or the prediction, else relocalise; and whether it was relocalised."""
         tracker, expected = self.system.tracker, self.system.expectation(frame.stamp_s, T_predicted)
         if followed is not None:
             track = tracker.track_near(view, followed.track.T_c_w, followed.track.anchor, expected)
@@ -171,7 +171,7 @@ class Tracking:
         return track, track is not None
 
     def _relocalise(self, frame: Frame, view: View, T_predicted: FloatArray, lost_frames: int) -> Track | None:
-        """Search keyframes near the prediction and those that look alike."""
+        """Relocalise among keyframes near the prediction and revisit candidates."""
         system = self.system
         tries = system.config.tracking.relocalisation_keyframes
         near = candidates(system.tracker, T_predicted, tries - tries // 2, lost_frames)
@@ -180,7 +180,7 @@ class Tracking:
         return self.find(frame, view, [*near, *alike], system.reach(frame.stamp_s, T_predicted))
 
     def find(self, frame: Frame, view: View, asked: list[Keyframe], reach: Reach) -> Track | None:
-        """Search keyframes for a frame; frames before it that waited for a confirmation get their poses too."""
+        """Relocalise a frame among keyframes; earlier unconfirmed frames get their poses too."""
         system = self.system
         found = self.relocaliser.find(frame.index, view, asked, reach)
         if found is None:
@@ -192,7 +192,7 @@ class Tracking:
     # -- by edges ----------------------------------------------------------------------------------------------
 
     def _by_edges(self, frame: Frame, seen: LazyView, T_predicted: FloatArray) -> Located | None:
-        """The pose from edges alone, where no point holds it."""
+        """The pose from edges alone."""
         with self.system.timed("edges"):
             expected = self.system.expectation(frame.stamp_s, T_predicted)
             alone = self._edge_tracker.refine(seen.grey, T_predicted, None, expected)
@@ -203,7 +203,7 @@ class Tracking:
         return Located(track, self.system.map.latest(), 0.0, False, np.zeros((0, 2)), np.zeros(0), edges=alone.edges)
 
     def _with_edges(self, frame: Frame, seen: LazyView, T_predicted: FloatArray, located: Located) -> Located:
-        """The pose from edges beside few points."""
+        """The pose from edges and few points."""
         system, anchor = self.system, located.track.anchor
         slack = depth_slack_px(system.map.anchors, anchor, located.track.T_c_w, system.camera)
         points = PointsInFrame(
@@ -253,7 +253,7 @@ class Tracking:
 
 
 def _in_words(located: Located) -> str:
-    """What a pose rests on, where that is not simply the keypoints of the map."""
+    """Reason of a pose that is not simply tracked on keypoints, in words."""
     inliers = located.track.inliers
     if located.edges:
         return f"by {located.edges} edge points" + (f" beside {inliers} keypoints" if inliers else "")

@@ -1,4 +1,4 @@
-"""Where the camera is, how it moves, and how far a prediction of its pose may be off."""
+"""Motion model: pose and velocity of the camera, and the uncertainty of a predicted pose."""
 
 import numpy as np
 
@@ -8,10 +8,11 @@ from edgeslam_torch.types import FloatArray
 
 ACCELERATION_M_S2 = 3.0
 ANGULAR_ACCELERATION_RAD_S2 = 20.0
-"""Standard deviations of what a hand or a small drone does: a lean of 17 degrees; half a turn a second in 0.15 s."""
+"""Standard deviations for a hand or a small drone: a lean of 17 degrees; reaching half a turn per second in 0.15
+s."""
 
 FADING = 0.8
-"""Share of the velocity that is left after a frame without a pose: what was true a second ago is worth nothing."""
+"""Decay of the velocity per frame without a pose: after a second it is irrelevant."""
 
 
 class MotionModel:
@@ -19,7 +20,7 @@ class MotionModel:
 
     def __init__(self, T_c_w: FloatArray) -> None:
         self.T_c_w = T_c_w
-        """``(4, 4)`` present pose."""
+        """``(4, 4)`` current pose."""
         self.stamp_s = -np.inf
         """Stamp of the newest frame."""
         self.seen_s = -np.inf
@@ -34,36 +35,36 @@ class MotionModel:
 
     def predict(self, stamp_s: float) -> FloatArray:
         """``T_c_w`` at a stamp, at constant velocity."""
-        # Each pose is a product with the one before: projected back, rounding does not add up over a flight.
+        # Each pose is a product with the previous one: projected to SE(3), rounding errors do not accumulate.
         return se3.orthonormalised(se3.exp(self._velocity * (stamp_s - self.stamp_s)) @ self.T_c_w)
 
     def expectation(self, stamp_s: float, T_predicted: FloatArray, metres_per_unit: float) -> PosePrior:
-        """A predicted pose with what accelerations since the newest frame allow it to be off."""
+        """A predicted pose with its uncertainty due to accelerations since the newest frame."""
         dt = stamp_s - self.stamp_s
         sigma_t = 0.5 * ACCELERATION_M_S2 * dt**2 / metres_per_unit
         sigma_r = 0.5 * ANGULAR_ACCELERATION_RAD_S2 * dt**2
         return PosePrior(0, T_predicted, np.diag([sigma_t**-2] * 3 + [sigma_r**-2] * 3))
 
     def move(self, stamp_s: float, T_c_w: FloatArray) -> None:
-        """Take a measured pose as the present one; the velocity is what led to it."""
+        """Accept a measured pose and update the velocity."""
         self._velocity = se3.log(T_c_w @ se3.inverse(self.T_c_w)) / max(stamp_s - self.stamp_s, 1e-6)
         self.T_c_w = T_c_w
         self.seen_s = stamp_s
 
     def drift(self, T_predicted: FloatArray) -> None:
-        """Take a prediction as the present pose and believe the velocity less."""
+        """Accept a prediction as the current pose and decay the velocity."""
         self.T_c_w = T_predicted
         self._velocity = FADING * self._velocity
 
     def stop(self) -> None:
-        """Forget the velocity: the pose came by a leap."""
+        """Reset the velocity after a discontinuity."""
         self._velocity = np.zeros(6)
 
     def carry(self, T_c_w: FloatArray, scale: float) -> None:
-        """Go along with a map that was moved and scaled."""
+        """Transform with a map that was moved and scaled."""
         self.T_c_w = se3.orthonormalised(T_c_w)
         self._velocity = self._velocity * np.array([scale] * 3 + [1.0] * 3)
 
     def correct(self, T_c_c: FloatArray) -> None:
-        """Carry the present pose along with a refinement that moved its keyframe by ``(4, 4)`` on the right."""
+        """Apply a refinement that moved the reference keyframe by ``(4, 4)`` on the right."""
         self.T_c_w = se3.orthonormalised(self.T_c_w @ T_c_c)

@@ -1,9 +1,9 @@
-"""Find the pose of a frame with no useful prediction, and believe it only when the image bears it out.
+"""Relocalisation of a frame without a useful prediction, with verification against perceptual aliasing.
 
-A repeated pattern (tiles, shelves, the doors of a corridor) fits in the wrong place with dozens of inliers, and whoever
-maps from there confirms himself. So a count of inliers is no proof. What tells the right place from a wrong one that
-looks alike is how much of what should be seen there is seen, over how much of the image, whether the camera can have
-come there in the time, whether another place would do as well, and whether the frames that follow agree.
+A repeated pattern (tiles, shelves, the doors of a corridor) matches a wrong place with dozens of inliers, and mapping
+from there confirms the error. So the number of inliers is no proof. A place is accepted by the share of visible
+anchors that are found, their spread over the image, reachability, absence of an equally good rival, and agreement of
+the following frames.
 """
 
 from dataclasses import dataclass
@@ -20,51 +20,51 @@ from edgeslam_torch.types import FloatArray
 
 MIN_MATCHES = 20
 LIKELY_SHARE = 0.12
-"""Anchors found, of those that should be seen (or of the frame's keypoints, if they are fewer), from which on a place
-is likely. Wrong places reach 0.09 in a corridor whose doors repeat and 0.06 in furnished rooms; right ones have 0.2 and
-more in 95 % of redkitchen's frames (docs/decisions/0050-relocalisation.md)."""
+"""Minimum share of found anchors among those in view (or among the frame's keypoints, if fewer) of a likely place.
+Wrong places reach 0.09 in a corridor whose doors repeat and 0.06 in furnished rooms; right ones have 0.2 and more in
+95 % of redkitchen's frames (docs/decisions/0050-relocalisation.md)."""
 SURE_SHARE = 0.2
-"""The same for a place within reach that needs no further frame to confirm it. While reach is but one place, as in the
-first 0.2 s, a likely one is it."""
+"""The same for a place within reach that needs no further confirmation. While the reachable region is a single place,
+as in the first 0.2 s, a likely one is accepted."""
 GRID = (8, 6)
-"""Cells across and down in which the spread over the image is counted."""
+"""Grid of cells for measuring the spread over the image."""
 MIN_CELLS = 6
-"""Cells with an inlier: one picture on the wall fills four."""
+"""Minimum number of cells with an inlier: one picture on the wall fills four."""
 LIKELY_SPREAD = 0.3
-"""Cells with an inlier, of those with an anchor to be seen: 0.24 at a wrong place of the boards, 0.4 and more at right
-ones."""
+"""Minimum share of cells with an inlier among those with an anchor in view: 0.24 at a wrong place of the boards, 0.4
+and more at right ones."""
 AGREEING_FRAMES = 3
-"""Frames in a row that must agree on a likely place."""
+"""Consecutive frames that must agree on a likely place."""
 RIVAL = 0.6
-"""Share of the best place's inliers from which on another place is as good."""
+"""Share of the best place's inliers above which another place is a rival."""
 APART = 0.15
-"""Distance of two poses, relative to the depth seen there, up to which they are one place: a frame's step as well."""
+"""Maximum distance of two poses of one place, relative to the scene depth; also of consecutive frames."""
 MAX_APART_RAD = np.deg2rad(20.0)
 ACCELERATION_M_S2 = 9.0
 ANGULAR_ACCELERATION_RAD_S2 = 60.0
-"""What a hand or a small drone hardly exceeds: three times the standard deviations that tracking expects."""
+"""Bounds for a hand or a small drone: three times the standard deviations of the motion model."""
 
 
 @dataclass(frozen=True, slots=True)
 class Reach:
-    """Where the camera can be by now."""
+    """Region that the camera can have reached."""
 
     T_c_w: FloatArray
     """``(4, 4)`` expected pose: by the last velocity, or by telemetry."""
     shift_m: float
-    """Farthest from there."""
+    """Radius of the region."""
     turn_rad: float
     metre: float | None = None
-    """Its length [map units]; where nothing tells it, a third of the depth seen will do."""
+    """Its length [map units]; a third of the scene depth if unknown."""
 
     def holds(self, place: "Place") -> bool:
-        """Whether a place is within reach, or as good as there."""
+        """Whether a place is within reach, with a tolerance."""
         shift, turn = apart(place.track.T_c_w, self.T_c_w)
         near = shift <= self._shift(place.depth) + APART * place.depth
         return near and turn <= self.turn_rad + MAX_APART_RAD
 
     def is_one_place(self, depth: float) -> bool:
-        """Whether all that is within reach is one place, for a camera that looks at something so far away."""
+        """Whether the reachable region is a single place at the given scene depth."""
         return self._shift(depth) <= APART * depth
 
     def _shift(self, depth: float) -> float:
@@ -72,18 +72,18 @@ class Reach:
 
 
 def reach_after(seconds: float, T_predicted: FloatArray, metre: float | None) -> Reach:
-    """What motion allows some time after the last pose."""
+    """Region reachable some time after the last pose."""
     half = 0.5 * seconds**2
     return Reach(T_predicted, half * ACCELERATION_M_S2, half * ANGULAR_ACCELERATION_RAD_S2, metre)
 
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where a frame may be, with what speaks for it."""
+    """A candidate place of a frame, with its evidence."""
 
     track: Track
     share: float
-    """Anchors found, of those that could be."""
+    """Share of found anchors."""
     cells: int
     """Cells of the image with an inlier."""
     spread: float
@@ -92,45 +92,45 @@ class Place:
     """Median depth of the anchors that should be seen [map units]."""
 
     def is_as(self, other: "Place") -> bool:
-        """Whether two poses are one place."""
+        """Whether two poses belong to one place."""
         shift, turn = apart(self.track.T_c_w, other.track.T_c_w)
         return shift <= APART * min(self.depth, other.depth) and turn <= MAX_APART_RAD
 
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """A frame that is found again, with the frames before it that confirmed it."""
+    """A relocalised frame, with the earlier frames that confirmed it."""
 
     track: Track
     earlier: dict[int, FloatArray]
-    """``T_c_w`` of frames before this one, by their index: they were at this place already."""
+    """``T_c_w`` of frames before this one, by their index."""
 
 
 class Relocaliser:
-    """Asks keyframes where a lost frame is; between frames it remembers a place that is likely but not proven."""
+    """Relocalises frames against keyframes; stores likely but unconfirmed places between frames."""
 
     def __init__(self, tracker: Tracker) -> None:
         self.tracker = tracker
         self._waiting: list[tuple[int, Place]] = []
-        """Index and place of the last frames, which agree with each other."""
+        """Index and place of the last consistent frames."""
 
     def forget(self) -> None:
-        """Nothing is likely any more: the camera was found, or the map begins anew."""
+        """Reset, after relocalisation or for a new map."""
         self._waiting = []
 
     @property
     def waiting(self) -> int:
-        """Frames in a row that agree on a likely place."""
+        """Number of consecutive frames that agree on a likely place."""
         return len(self._waiting)
 
     def find(self, index: int, view: View, candidates: list[Keyframe], reach: Reach) -> Found | None:
-        """Pose of a lost frame, once it is proven.
+        """Pose of a lost frame, if verified.
 
         Args:
             index: Of the frame.
             view: Its features.
-            candidates: Keyframes that it may show the place of.
-            reach: Where motion allows it to be.
+            candidates: Keyframes to match.
+            reach: Region that the camera can have reached.
         """
         place = self._only_place(self._places(view, candidates), reach)
         if place is None:
@@ -154,7 +154,7 @@ class Relocaliser:
         return [place_of(self.tracker, view, track) for track in tracks if track is not None]
 
     def _only_place(self, places: list[Place], reach: Reach) -> Place | None:
-        """The best place if it is likely and no other one would do; of two that would, the one within reach."""
+        """The best place if it is likely and without a rival; of two rivals, the one within reach."""
         places = sorted(places, key=lambda place: -place.track.inliers)
         rivals = [p for p in places if p.track.inliers > RIVAL * places[0].track.inliers]
         if not all(p.is_as(rivals[0]) for p in rivals):
@@ -168,7 +168,7 @@ class Relocaliser:
 
 
 def place_of(tracker: Tracker, view: View, track: Track) -> Place:
-    """What speaks for a pose."""
+    """Evidence for a pose."""
     seen = tracker.expected(track.T_c_w, tracker.map.anchors_seen_by(tracker.local_keyframes(track.anchor)))
     possible = max(1, min(len(seen.anchor), len(view.features.uv)))
     depth = float(np.median(seen.depth)) if len(seen.depth) else 0.0
@@ -183,13 +183,13 @@ def _cells(camera: Camera, uv: FloatArray) -> set[tuple[int, int]]:
 
 
 def candidates(tracker: Tracker, T_predicted: FloatArray, count: int, attempt: int) -> list[Keyframe]:
-    """Keyframes to ask: some of the nearest to the prediction first, then all in turn.
+    """Keyframes to match: some of the nearest to the prediction first, then the others in rotation.
 
     Args:
         tracker: With the map to look in.
         T_predicted: ``(4, 4)`` world-to-camera guess.
-        count: How many to ask now.
-        attempt: Frames lost so far; shifts the turn.
+        count: Number of keyframes.
+        attempt: Frames lost so far; selects the rotation.
     """
     all_keyframes = sorted(tracker.map.keyframes.values(), key=lambda k: -k.id)
     if len(all_keyframes) <= count:
@@ -203,7 +203,7 @@ def candidates(tracker: Tracker, T_predicted: FloatArray, count: int, attempt: i
 
 
 def match_keyframe(tracker: Tracker, view: View, keyframe: Keyframe) -> Track | None:
-    """Pose of a frame from one keyframe that it looks like, completed with what the map has there."""
+    """Pose of a frame from one similar keyframe, refined on the local map."""
     held = keyframe.keypoints_with_anchor()
     if len(held) < MIN_MATCHES:
         return None
@@ -228,7 +228,7 @@ def match_keyframe(tracker: Tracker, view: View, keyframe: Keyframe) -> Track | 
 
 
 def apart(T_c_w: FloatArray, other: FloatArray) -> tuple[float, float]:
-    """Distance of two cameras [map units] and the turn between them [rad]."""
+    """Distance of two cameras [map units] and the rotation between them [rad]."""
     centre, there = (-T[:3, :3].T @ T[:3, 3] for T in (T_c_w, other))
     cosine = 0.5 * (float(np.trace(T_c_w[:3, :3] @ other[:3, :3].T)) - 1.0)
     return float(np.linalg.norm(centre - there)), float(np.arccos(np.clip(cosine, -1.0, 1.0)))

@@ -1,4 +1,4 @@
-"""What a cheap camera does to a perfect image: light changes, noise, blur, vignetting, compression."""
+"""Faults of a cheap camera: light changes, noise, blur, vignetting, compression."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -14,7 +14,7 @@ Rng = np.random.Generator
 
 @dataclass(frozen=True, slots=True)
 class CameraFaults:
-    """How bad the simulated camera is; all zero leaves images untouched.
+    """Faults of the simulated camera; all zero leaves images unchanged.
 
     The defaults resemble a drone's camera indoors by day.
     """
@@ -61,7 +61,7 @@ def with_noise(rng: Rng, image: np.ndarray, read: float, shot: float) -> np.ndar
     """Gaussian noise of variance ``read^2 + shot^2 * level`` in grey levels, a little of it shared by the channels."""
     if read == 0 and shot == 0:
         return image
-    # A long noise field read from a random place: as good as new noise and far cheaper.
+    # Noise is read from a random place of a long field: equivalent to new noise and far cheaper.
     table = _noise_table()
     if image.size >= len(table):
         noise = rng.standard_normal(image.shape, dtype=np.float32)

@@ -20,11 +20,11 @@ GRAVITY_M_S2 = 9.81
 KNOT_S = 0.5
 DEGREE = 5
 _HOVERED_S = 3.0
-"""How long a drone has hovered when a recording that begins with a hover begins."""
+"""Time hovered before a recording that begins with a hover."""
 _DRIFT_M = 0.02
 """Standard deviation of a hovering drone's drift in half a second, on each axis: 3 cm all in all."""
 CORNER_M = 0.1
-"""Corners of the polyline are cut by no more than this at usual speeds; added to the clearance of its legs."""
+"""Maximum cut of the polyline's corners at usual speeds; added to the clearance of its legs."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,9 +43,9 @@ class FlightPlan:
     start_height_m: float = 0.4
     """Where the climb starts: just after lift-off. On the floor a Tello's camera is at 0.07 m."""
     glance_rad: float = np.deg2rad(25.0)
-    """How far the drone looks aside from where it flies."""
+    """Maximum angle between heading and direction of flight."""
     view_m: float = 1.8
-    """It turns away from what is nearer than this: an inspector does not stare at a bare wall."""
+    """Minimum free view; the drone turns away from nearer surfaces."""
     wobble_m: float = 0.006
     wobble_rad: float = np.deg2rad(0.35)
     camera_tilt_rad: float = np.deg2rad(12.0)

@@ -1,6 +1,6 @@
-"""What a Tello's state messages would have said along a trajectory: units, quantisation, noise, drift, loss and all.
+"""A Tello's state messages along a trajectory, with units, quantisation, noise, drift and loss.
 
-Works on simulated flights and on ground truth of real recordings alike.
+For simulated flights and for the ground truth of recordings.
 """
 
 from dataclasses import dataclass
@@ -17,12 +17,12 @@ GRAVITY_M_S2 = 9.81
 FIELDS = ("vgx", "vgy", "vgz", "pitch", "roll", "yaw", "tof", "h", "baro", "bat", "agx", "agy", "agz")
 """SDK names, in the order of `TelemetryLog.rows`."""
 TOF_RANGE_M = (0.1, 8.0)
-"""The sensor reads 10 cm on the floor and nothing beyond its reach."""
+"""Range of the sensor: it reads 10 cm on the floor."""
 
 
 @dataclass(frozen=True, slots=True)
 class TelemetryFaults:
-    """How bad the telemetry is; the defaults follow the recorded flights."""
+    """Faults of the telemetry; the defaults follow the recorded flights."""
 
     rate_hz: float = 10.0
     video_delay_s: float = 0.5
@@ -37,7 +37,7 @@ class TelemetryFaults:
     velocity_walk: float = 0.003
     """Random walk of the velocity bias [m/s per sqrt(s)] on a full battery."""
     bias_memory_s: float = 12.0
-    """The bias forgets itself in this time: the drone's optical flow holds it near zero."""
+    """Correlation time of the bias [s]: the drone's optical flow holds it near zero."""
     battery_start: float = 0.87
     flight_time_s: float = 600.0
     """From full to empty."""
@@ -207,7 +207,7 @@ def _mean_acceleration(path: CubicSpline, t: FloatArray, moments: FloatArray, sp
 
 
 def _drift(rng: np.random.Generator, battery: FloatArray, faults: TelemetryFaults) -> FloatArray:
-    """Velocity bias [m/s] in power-on axes, ``(M, 3)``: a leaky random walk, wilder as the battery drains."""
+    """Velocity bias [m/s] in power-on axes, ``(M, 3)``: a leaky random walk that grows as the battery drains."""
     dt = 1.0 / faults.rate_hz
     kick = faults.velocity_walk * np.sqrt(dt) * (1.0 + faults.sag * (1.0 - battery))
     steps = kick[:, None] * rng.standard_normal((len(battery), 3))
@@ -219,7 +219,7 @@ def _drift(rng: np.random.Generator, battery: FloatArray, faults: TelemetryFault
 
 
 def _slow_noise(rng: np.random.Generator, count: int, sigma: float) -> FloatArray:
-    """Noise with a memory of two seconds at 10 Hz and standard deviation ``sigma``."""
+    """Noise with a correlation time of two seconds at 10 Hz and standard deviation ``sigma``."""
     keep = 0.95
     steps = np.sqrt(1 - keep**2) * sigma * rng.standard_normal(count)
     out = np.zeros(count)

@@ -1,4 +1,4 @@
-"""Assembling a `World`: surfaces, solids and lamps in; light baked into every texture out."""
+"""Assembling a `World`: surfaces, solids and lamps, with light baked into every texture."""
 
 from dataclasses import dataclass, field
 from functools import cache, lru_cache
@@ -63,7 +63,7 @@ class Paint:
     offset: tuple[float, float] = (0.0, 0.0)
     """Start within the tile, in [0, 1)."""
     glow: bool = False
-    """Shines by itself: not shaded."""
+    """Emissive: not shaded."""
 
 
 def random_paint(rng: np.random.Generator, kinds: tuple[str, ...], turned: bool = False, vivid: float = 0.04) -> Paint:
