@@ -46,6 +46,7 @@ from edgeslam_torch.tracking.tracker import Tracker, View, make_view
 from edgeslam_torch.types import (
     FloatArray,
     Frame,
+    Health,
     Piece,
     PointCloud,
     PoseNow,
@@ -117,6 +118,7 @@ class EdgeSlam:
         if realtime:
             self.events["keyframes_skipped"] = 0
         self._finished = False
+        self._health: Health | None = None
         self._present = Present()
         """What `pose_now` rests on: replaced as a whole, never changed."""
         self._machine = Machine()
@@ -186,7 +188,9 @@ class EdgeSlam:
         step = self._step(frame, seen)
         self._machine.meet(step.event, frame.stamp_s)
         system.motion.stamp_s = frame.stamp_s
-        self._present = Present(system.fusion.snapshot(), system.published, self._is_metric())
+        metric = self._is_metric()
+        self._present = Present(system.fusion.snapshot(), system.published, metric)
+        self._health = system.fusion.health(frame.stamp_s, str(self.state), metric)
         return self._output(frame, step, joined)
 
     def pose_now(self, stamp_s: float, telemetry: Sequence[TelemetrySample] = ()) -> PoseNow | None:
@@ -213,6 +217,10 @@ class EdgeSlam:
         if self.state is State.LOST:
             return self._lost.step(frame, seen, self._machine)
         return self._tracking.step(frame, seen) or self._lost.begin(frame, seen.view)
+
+    def health(self) -> Health | None:
+        """What the newest pose and its metres are worth; ``None`` before the first frame. Callable from any thread."""
+        return self._health
 
     # -- results -----------------------------------------------------------------------------------------------
 
@@ -320,6 +328,7 @@ class EdgeSlam:
             metric=self._is_metric(),
             revision=system.published.revision,
             stage_ms=dict(system.stage_ms),
+            health=self._health,
         )
 
     def _is_metric(self) -> bool:

@@ -12,6 +12,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+DISAGREEMENT = 3.0
+"""Sigmas between two sources of the scale that a status line mentions; right ones are that far apart in 0.3 %."""
+SILENCE_S = 1.0
+"""Age of the newest state message that a status line mentions: ten of a Tello's messages."""
+
 FloatArray = NDArray[np.floating]
 IntArray = NDArray[np.integer]
 
@@ -201,6 +206,48 @@ class Support:
 
 
 @dataclass(frozen=True, slots=True)
+class Health:
+    """What pilots and programs need to know before they rely on a pose or its metres."""
+
+    stamp_s: float
+    """Stamp of the frame."""
+    state: str
+    """What carries the pose, see `edgeslam_torch.states.machine.State`: ``starting``, ``tracking``, ``edges only``,
+    ``lost``."""
+    metric: bool
+    """As in `SlamOutput`."""
+    scale: ScaleEstimate
+    """All sources together."""
+    sources: tuple[ScaleEstimate, ...] = ()
+    """Each source alone: ``telemetry`` (velocities), ``height``, ``depth``; those not used as well."""
+    disagreement: float = 0.0
+    """Largest distance between two of them, in standard deviations of their difference."""
+    telemetry_age_s: float = np.inf
+    """Since the newest state message; infinite without telemetry."""
+    delay_s: float = np.nan
+    """Of the video behind telemetry; NaN while it is not known."""
+    delay_sigma_s: float = np.inf
+    battery: float = np.nan
+    """Charge in [0, 1]; NaN while it is not known."""
+    filtering: bool = False
+    """Whether the Kalman filter predicts the pose: `EdgeSlam.pose_now` makes up for the delay."""
+    doubts: tuple[str, ...] = ()
+    """What is not used, and why, in sentences."""
+
+    def in_words(self) -> str:
+        """For a status line: metres, disagreement, telemetry and battery, as far as there is something to say."""
+        relative = self.scale.sigma / self.scale.value
+        words = [f"metres to {100.0 * relative:.0f} %" if self.metric else "no metres"]
+        if self.disagreement > DISAGREEMENT:
+            words.append(f"sources {self.disagreement:.0f} sigmas apart")
+        if SILENCE_S < self.telemetry_age_s < np.inf:
+            words.append(f"telemetry silent for {self.telemetry_age_s:.1f} s")
+        if np.isfinite(self.battery):
+            words.append(f"battery {100.0 * self.battery:.0f} %")
+        return ", ".join(words)
+
+
+@dataclass(frozen=True, slots=True)
 class SlamOutput:
     """Result of `EdgeSlam.step` for one frame."""
 
@@ -226,6 +273,8 @@ class SlamOutput:
     """Changes of the unit of ``T_w_c`` so far; after a change, read earlier poses and points again."""
     stage_ms: dict[str, float]
     """Time of each stage in this step [ms]."""
+    health: Health | None = None
+    """What the pose and its metres are worth; None only in outputs that no system made."""
 
 
 @dataclass(frozen=True, slots=True)

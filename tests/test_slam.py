@@ -97,6 +97,28 @@ def test_flight_with_known_depth_is_metric():
     assert np.rad2deg(np.linalg.norm(se3.log(a)[3:] - se3.log(b)[3:])) < 0.5
 
 
+def test_health_says_what_the_newest_pose_is_worth():
+    slam, outputs = metric_run()
+    health = outputs[-1].health
+    assert slam.health() == health
+    assert (health.state, health.metric, health.stamp_s) == ("tracking", True, panels().stamps_s[-1])
+    assert [s.source for s in health.sources] == ["depth"]
+    assert health.telemetry_age_s == np.inf
+    assert not health.filtering
+    assert EdgeSlam(CAMERA, NO_NETWORK).health() is None
+
+
+def test_present_pose_without_a_drone_goes_on_at_constant_velocity():
+    slam, outputs = metric_run()
+    a, b = outputs[-2], outputs[-1]
+    now = slam.pose_now(b.stamp_s + 1 / 30)
+    assert (now.source, now.seen_s, now.metric) == ("visual", b.stamp_s, True)
+    step = b.T_w_c[:3, 3] - a.T_w_c[:3, 3]
+    assert np.linalg.norm(now.T_w_c[:3, 3] - b.T_w_c[:3, 3] - step) < 0.5 * np.linalg.norm(step)
+    np.testing.assert_allclose(now.velocity_w, 30.0 * step, atol=0.3)
+    assert EdgeSlam(CAMERA, NO_NETWORK).pose_now(0.0) is None
+
+
 @pytest.mark.parametrize("metres", [np.nan, np.inf, 1e30, 0.0])
 def test_unusable_depth_is_as_no_depth(metres):
     def depth(image, camera):

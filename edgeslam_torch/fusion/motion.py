@@ -20,6 +20,7 @@ from edgeslam_torch.fusion.delay import DelaySearch
 from edgeslam_torch.fusion.depth_scale import DepthRatio, DepthRatios, DepthScale
 from edgeslam_torch.fusion.ekf import EkfState
 from edgeslam_torch.fusion.filter_feed import FilterFeed, Metric
+from edgeslam_torch.fusion.health import disagreement
 from edgeslam_torch.fusion.mount import Mount, estimate_mount
 from edgeslam_torch.fusion.plausibility import HEIGHTS, Trust
 from edgeslam_torch.fusion.prediction import (
@@ -36,7 +37,7 @@ from edgeslam_torch.fusion.snapshot import Snapshot
 from edgeslam_torch.fusion.telemetry_scale import TelemetryFit, TelemetryScale, rescaled
 from edgeslam_torch.fusion.track import TelemetryTrack
 from edgeslam_torch.fusion.visual_memory import VisualMemory, VisualPose
-from edgeslam_torch.types import FloatArray, ScaleEstimate, TelemetrySample
+from edgeslam_torch.types import FloatArray, Health, ScaleEstimate, TelemetrySample
 
 _REFIT_S = 1.0
 _REFIT_SHARE = 0.12
@@ -235,6 +236,40 @@ class MotionFusion:
             told = by_filter(view, self.scale(), self.delay_sigma_s)
             return with_velocity(told, last, previous, self.scale())
         return self._predict_unfiltered(last, previous, stamp_s)
+
+    def sources(self) -> tuple[ScaleEstimate, ...]:
+        """Scale by each source alone, used or not."""
+        told = [ScaleEstimate(s.value, s.sigma, name) for name, s in self._fit.sources.items()]
+        depth = self._depth.scale()
+        if depth is not None:
+            value = math.exp(depth.opinion.log_scale)
+            told.append(ScaleEstimate(value, value * self._with_focal(depth).sigma, "depth"))
+        return tuple(told)
+
+    def health(self, stamp_s: float, state: str, metric: bool) -> Health:
+        """What the metres are worth when a frame has been looked at.
+
+        Args:
+            stamp_s: Stamp of the frame.
+            state: What carries its pose.
+            metric: Whether the published unit is a metre.
+        """
+        sources, delay = self.sources(), self._delay.delay
+        doubt = self._settled().warning
+        return Health(
+            stamp_s,
+            state,
+            metric,
+            self.scale(),
+            sources,
+            disagreement(sources),
+            stamp_s - self._track.last_s,
+            delay.value_s if math.isfinite(delay.sigma_s) else math.nan,
+            delay.sigma_s,
+            self._track.battery,
+            self.filtering,
+            tuple(self._trust.warnings() + ([] if doubt is None else [doubt])),
+        )
 
     def snapshot(self) -> Snapshot | None:
         """What is known of the present motion, for other threads; ``None`` before the first tracked frame."""

@@ -20,6 +20,8 @@ _FROZEN_S = 1.5
 _TRUNCATION_PRIOR = -4.0
 """Log odds before any evidence; readings that are rounded need no correction."""
 _PACKET_S = 0.15
+_RECENT = 50
+"""Messages that are looked through for a charge: five seconds."""
 _UPRIGHT = math.cos(math.radians(18.0))
 
 
@@ -121,6 +123,11 @@ class TelemetryTrack:
     def last_s(self) -> float:
         """Stamp of the newest sample, minus infinity before the first."""
         return float(self._samples[-1].stamp_s) if self._samples else -math.inf
+
+    @property
+    def battery(self) -> float:
+        """Newest known charge in [0, 1], NaN where none of the last messages tells it."""
+        return next((s.battery for s in self._samples[: -_RECENT - 1 : -1] if math.isfinite(s.battery)), math.nan)
 
     @property
     def readings(self) -> Readings:
