@@ -5,11 +5,6 @@ from enum import StrEnum
 import torch
 from torch import Tensor
 
-CHI2_2DOF_95 = 5.991
-"""95 % quantile of chi-square with 2 degrees of freedom."""
-CHI2_1DOF_95 = 3.841
-"""95 % quantile of chi-square with 1 degree of freedom."""
-
 
 class Kernel(StrEnum):
     """Shape of the robust cost."""

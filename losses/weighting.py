@@ -8,8 +8,7 @@ from dataclasses import dataclass, field, replace
 
 from torch import Tensor
 
-MAD_TO_SIGMA = 1.4826
-"""Median absolute deviation to standard deviation of a normal distribution."""
+from edgeslam_torch.geometry.robust_statistics import MAD_TO_SIGMA
 
 
 def robust_sigma(residual: Tensor) -> Tensor:

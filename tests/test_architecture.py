@@ -150,7 +150,7 @@ def test_table_allows_nothing_that_nobody_uses():
     [
         ("writers.ply", "mapping.mapper"),
         ("geometry.se3", "optim.problem"),
-        ("optim.kernels.points", "optim.local_ba"),
+        ("optim.kernels.point_blocks", "optim.local_ba"),
         ("readers.layouts.tum", "readers.source"),
         ("files.atomic", "geometry.se3"),
         ("eval.metrics.align", "eval.judge.cells"),

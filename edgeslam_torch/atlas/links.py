@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from edgeslam_torch.geometry import se3, sim3
+from edgeslam_torch.geometry.robust_statistics import robust_sigma
 from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.tracking.relocaliser import LIKELY_SHARE, LIKELY_SPREAD, Place, apart, match_keyframe, place_of
 from edgeslam_torch.tracking.tracker import Track, Tracker, View
@@ -110,7 +111,7 @@ def common_scale(tracker: Tracker, keyframe: Keyframe, track: Track) -> tuple[fl
     ratio = np.log(z_there[front] / z_own[front])
     middle = float(np.median(ratio))
     agreeing = ratio[np.abs(ratio - middle) <= AGREE_LOG]
-    sigma = 1.4826 * float(np.median(np.abs(ratio - middle))) / np.sqrt(len(ratio))
+    sigma = robust_sigma(ratio - middle) / np.sqrt(len(ratio))
     if len(agreeing) < MIN_AGREEING * len(ratio) or sigma > MAX_SIGMA_LOG:
         return None
     return float(np.exp(np.mean(agreeing))), max(sigma, 1e-3)

@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from edgeslam_torch.fusion.scale import LogScale
+from edgeslam_torch.geometry.robust_statistics import robust_sigma
 from edgeslam_torch.types import FloatArray
 
 SLOPE_SIGMA = 0.4
@@ -190,4 +191,4 @@ def _robust_mean(x: FloatArray, sigma: FloatArray) -> tuple[float, float]:
 
 
 def _robust_deviation(x: FloatArray) -> float:
-    return 1.4826 * float(np.median(np.abs(x - np.median(x))))
+    return robust_sigma(x - np.median(x))

@@ -20,11 +20,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import cho_solve, lapack
 
+from edgeslam_torch.geometry.robust_statistics import robust_sigma, tukey_weight
 from edgeslam_torch.geometry.se3 import hat
 from edgeslam_torch.types import FloatArray, IntArray
 
-_TUKEY = 4.685
-"""Tukey's biweight: 95 % efficiency on normal errors; a frozen or jumping reading gets no weight at all."""
 _LEAST_WEIGHT = 1e-3
 _MIN_DISPLACEMENTS = 6
 _MIN_HEIGHTS = 6
@@ -128,7 +127,7 @@ def displacement_evidence(
         return None
     J = np.concatenate([moved_map[:, :, None], -hat(moved_map)], axis=2).transpose(1, 0, 2)  # (3, N, 4)
     target = moved_m.T[:, :, None]  # (3, N, 1)
-    weight = np.ones(n)
+    weight: FloatArray = np.ones(n)
     latent, fit = J, None
     for iteration in range(5):
         white = (sigma_m**2 + (s * sigma_map) ** 2) / np.maximum(weight, _LEAST_WEIGHT)
@@ -141,7 +140,7 @@ def displacement_evidence(
         variance = sigma_m**2 + (s * sigma_map) ** 2
         normalised = np.sqrt(np.sum(clean**2, axis=0) / (3.0 * variance))
         spread = max(float(np.median(normalised)) / 0.888, 0.3)
-        weight = np.square(np.maximum(0.0, 1.0 - np.square(normalised / (_TUKEY * spread))))
+        weight = tukey_weight(normalised, spread)
         drift = fit.slow - fit.bias  # the map's, so it is in the regressor as well
         partner = moved_map + ((s * sigma_map**2 / variance) * clean + drift / s).T
         latent = np.concatenate([partner[:, :, None], -hat(partner)], axis=2).transpose(1, 0, 2)
@@ -194,7 +193,8 @@ def height_evidence(
     J = np.column_stack([p[:, 2], p[:, 1], -p[:, 0], np.zeros(n), offsets])[None]  # (delta x p)_z = dx y - dy x
     memory = np.exp(-np.abs(t[:, None] - t[None]) / _DRIFT_MEMORY_S) * (stretch[:, None] == stretch[None])
     prior = _tilt_prior(scale, tilt_sigma_rad, K)
-    weight, fit = np.ones(n), None
+    weight: FloatArray = np.ones(n)
+    fit = None
     for iteration in range(4):
         white = (sigma_m**2 + (scale * sigma_map) ** 2) / count / np.maximum(weight, _LEAST_WEIGHT)
         tried = (
@@ -207,8 +207,8 @@ def height_evidence(
             return None
         clean = fit.residual[0] - fit.slow[0]
         normalised = np.abs(clean) / np.sqrt((sigma_m**2 + (scale * sigma_map) ** 2) / count)
-        spread = max(1.4826 * float(np.median(normalised)), 0.3)
-        weight = np.square(np.maximum(0.0, 1.0 - np.square(normalised / (_TUKEY * spread))))
+        spread = max(robust_sigma(normalised), 0.3)
+        weight = tukey_weight(normalised, spread)
     if fit is None:
         return None
     A, v = fit.information.copy(), fit.vector

@@ -10,12 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from edgeslam_torch.geometry.robust_statistics import robust_sigma, tukey_weight
 from edgeslam_torch.geometry.se3 import hat
 from edgeslam_torch.types import FloatArray, IntArray, ScaleEstimate
 
 _HUBER = 2.5
-_TUKEY = 4.685
-"""Tukey's biweight: 95 % efficiency on normal errors; a frozen or jumping reading gets no weight at all."""
 _MIN_DISPLACEMENTS = 6
 
 
@@ -98,12 +97,12 @@ def fit_displacements(
         variance = sigma_m**2 + (scale * sigma_map) ** 2
         normalised = np.sqrt(np.sum(residual**2, axis=1) / (3.0 * variance))
         if iteration < 3:  # Huber first: Tukey needs a start inside its basin
-            spread = max(1.4826 * float(np.median(normalised)) / 1.4, 0.3)
+            spread = max(robust_sigma(normalised) / 1.4, 0.3)
             weight = np.minimum(1.0, _HUBER * spread / np.maximum(normalised, 1e-12))
         else:
             # Median of a chi variable with 3 degrees over sqrt(3) is 0.888.
             spread = max(float(np.median(normalised)) / 0.888, 0.3)
-            weight = np.square(np.maximum(0.0, 1.0 - np.square(normalised / (_TUKEY * spread))))
+            weight = tukey_weight(normalised, spread)
         latent = turned + (scale * sigma_map**2 / variance)[:, None] * residual  # where the true displacement lies
         J, J_latent = (_jacobian(scale * v, duration_s, block, K) for v in (turned, latent))
         w = np.repeat(weight / (variance * spread**2), 3)

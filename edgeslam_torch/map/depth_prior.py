@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from edgeslam_torch.geometry.robust_statistics import robust_sigma
 from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.types import DepthMap, FloatArray
 
@@ -43,7 +44,7 @@ def fit_to_anchors(network_m: FloatArray, anchor_depth: FloatArray) -> DepthFit 
         return None
     log_ratio = np.log(anchor_depth[usable] / network_m[usable])
     centre = float(np.median(log_ratio))
-    spread = 1.4826 * float(np.median(np.abs(log_ratio - centre)))
+    spread = robust_sigma(log_ratio - centre)
     return DepthFit(centre, max(spread, 0.02), int(usable.sum()))
 
 
@@ -92,7 +93,7 @@ def _bend(anchor_uv: FloatArray, error: FloatArray, uv: FloatArray) -> tuple[Flo
     mean, distance = _nearby(tree, error, uv)
     mean_of_others, apart = _nearby(tree, error, anchor_uv, but_itself=True)
     left = error - np.exp(-apart / REACH_PX) * mean_of_others
-    return np.exp(-distance / REACH_PX) * mean, 1.4826 * float(np.median(np.abs(left)))
+    return np.exp(-distance / REACH_PX) * mean, robust_sigma(left)
 
 
 def _nearby(

@@ -46,6 +46,12 @@ class SlamMap:
         heir, T_keyframe_heir = self._heir(keyframe_id)
         return T_keyframe_heir @ self.keyframes[heir].T_c_w
 
+    def median_depth(self, keyframe: Keyframe) -> float | None:
+        """Of the anchors that a keyframe observes [map units]; None without any in front of it."""
+        held = keyframe.anchor[keyframe.anchor >= 0]
+        z = se3.transform(keyframe.T_c_w, self.anchors.p_w[held])[:, 2]
+        return float(np.median(z[z > 0])) if (z > 0).any() else None
+
     def _heir(self, keyframe_id: int) -> tuple[int, FloatArray]:
         """The surviving keyframe that a keyframe is linked to (itself if alive), and the transform to it."""
         chain = []

@@ -145,18 +145,13 @@ class EdgeMap:
 
     def _targets(self, keyframe: Keyframe) -> list[Keyframe]:
         """Covisible keyframes whose baseline is long enough to measure and short enough to look alike."""
-        depth = self._median_depth(keyframe)
+        depth = self.map.median_depth(keyframe) or 1.0
         chosen = []
         for other in self.map.covisible(keyframe, 4 * self.config.targets, min_shared=30):
             baseline = float(np.linalg.norm(other.centre_w - keyframe.centre_w)) / depth
             if other.grey is not None and 0.02 < baseline < 0.5:
                 chosen.append(other)
         return chosen[: self.config.targets]
-
-    def _median_depth(self, keyframe: Keyframe) -> float:
-        held = keyframe.anchor[keyframe.anchor >= 0]
-        z = (self.map.anchors.p_w[held] @ keyframe.T_c_w[:3, :3].T + keyframe.T_c_w[:3, 3])[:, 2]
-        return float(np.median(z[z > 0])) if (z > 0).any() else 1.0
 
     def _overlapping(self, keyframe: Keyframe) -> list[EdgePoints]:
         near = {k.id for k in self.map.covisible(keyframe, 3 * self.config.targets)}
@@ -198,7 +193,7 @@ class EdgeMap:
             count = np.concatenate([h.observations for h in hosts])
             depth = np.median(np.concatenate([h.p_c[:, 2] for h in hosts]))
         agreed = count >= self.config.min_observations
-        return fuse(p_w[agreed], sigma[agreed], colour[agreed], count[agreed], self.config.voxel * float(depth))
+        return fuse_voxels(p_w[agreed], sigma[agreed], colour[agreed], count[agreed], self.config.voxel * float(depth))
 
     def _T_w_c(self, host: EdgePoints) -> FloatArray:
         return se3.inverse(self.map.pose_of(host.keyframe_id))
@@ -250,7 +245,9 @@ def _disc(radius: int, width: int) -> list[int]:
     return [int(o) for o in (v * width + u).ravel()[order[distance[order] <= radius * radius]]]
 
 
-def fuse(p_w: FloatArray, sigma: FloatArray, colour: NDArray[np.uint8], count: IntArray, voxel: float) -> PointCloud:
+def fuse_voxels(
+    p_w: FloatArray, sigma: FloatArray, colour: NDArray[np.uint8], count: IntArray, voxel: float
+) -> PointCloud:
     """One point per occupied cell: the inverse-variance mean of what lies in it."""
     if len(p_w) == 0:
         return PointCloud(p_w.astype(np.float32), colour, sigma.astype(np.float32), count.astype(np.int32))

@@ -3,6 +3,7 @@
 import numpy as np
 
 from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.geometry.robust_statistics import CHI2_2DOF_95
 from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.map.projection import match_projection, project_anchors
 from edgeslam_torch.map.slam_map import SlamMap
@@ -14,14 +15,12 @@ MAX_HAMMING = 50
 """Bits, of 256; the strict figure of ORB-SLAM2, as there is no ratio test."""
 YOUNG = 3
 """Number of keyframes during which a new anchor is searched in its neighbours."""
-CHI2_2 = 5.991
-"""Chi-square, two degrees of freedom, 95 %."""
 
 Pairs = tuple[IntArray, IntArray]
 """Ids ``(M,)`` of pairs of anchors that may be duplicates."""
 
 
-def fuse(slam_map: SlamMap, camera: Camera, keyframe: Keyframe, neighbours: list[Keyframe]) -> None:
+def fuse_young(slam_map: SlamMap, camera: Camera, keyframe: Keyframe, neighbours: list[Keyframe]) -> None:
     """Search a keyframe's young anchors in its neighbours; `fuse_all` searches all."""
     ids = slam_map.anchors_seen_by([keyframe])
     young = ids[slam_map.anchors.born[ids] > keyframe.id - YOUNG]
@@ -94,7 +93,7 @@ def _look_in(slam_map: SlamMap, camera: Camera, keyframe: Keyframe, ids: IntArra
     growth = slam_map.scale_factor
     found, keypoint, error = look_for(slam_map, camera, keyframe, ids, RADIUS_PX, growth, 1.0)
     sigma = growth ** keyframe.features.octave[keypoint].astype(np.float64)
-    good = (error**2).sum(1) <= CHI2_2 * sigma**2
+    good = (error**2).sum(1) <= CHI2_2DOF_95 * sigma**2
     return observe_or_pair(slam_map, keyframe, found[good], keypoint[good])
 
 

@@ -7,11 +7,12 @@ from edgeslam_torch.frontend.keypoint_grid import KeypointGrid
 from edgeslam_torch.frontend.matching import Matches
 from edgeslam_torch.frontend.orb import spread
 from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.geometry.robust_statistics import CHI2_2DOF_95
 from edgeslam_torch.map.depth_prior import depth_prior
 from edgeslam_torch.map.keyframe import NO_ANCHOR, Keyframe
 from edgeslam_torch.map.slam_map import SlamMap
-from edgeslam_torch.mapping.fuse import fuse
-from edgeslam_torch.mapping.new_anchors import CHI2_2, epipolar_matches, triangulate_matches
+from edgeslam_torch.mapping.fuse import fuse_young
+from edgeslam_torch.mapping.new_anchors import epipolar_matches, triangulate_matches
 from edgeslam_torch.mapping.prior_anchors import (
     add_on_prior,
     drop_needless_priors,
@@ -58,7 +59,7 @@ class Mapper:
             self.cull_recent_anchors(keyframe)
             neighbours = self.map.covisible(keyframe, self.config.neighbours)
             self.triangulate_new(keyframe, neighbours, colour)
-            fuse(self.map, self.camera, keyframe, self.map.covisible(keyframe, 2 * self.config.neighbours))
+            fuse_young(self.map, self.camera, keyframe, self.map.covisible(keyframe, 2 * self.config.neighbours))
             drift_px = reobserve(self.map, self.camera, keyframe)
         if drift_px is not None and drift_px > MAX_DRIFT_PX:  # the drift lies outside the window
             refine_all(self.map, self.camera, self.lm)
@@ -156,7 +157,7 @@ class Mapper:
         T_o_k = other.T_c_w @ keyframe.T_w_c
         ray, uv = rays(keyframe, mine, self.camera), other.features.uv[theirs].astype(np.float64)
         found, chi2 = inverse_depth_with_prior(ray, uv, sigma_px, T_o_k, self.camera, prior[mine])
-        good = chi2 <= CHI2_2
+        good = chi2 <= CHI2_2DOF_95
         mine, theirs, found = mine[good], theirs[good], found[good]
         ids = add_on_prior(self.map, self.camera, keyframe, mine, found[:, 0], prior[mine], colour[mine])
         self.map.observe(other, theirs, ids)

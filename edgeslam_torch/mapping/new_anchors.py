@@ -6,14 +6,10 @@ from edgeslam_torch.frontend.keypoint_grid import KeypointGrid
 from edgeslam_torch.frontend.matching import EMPTY, Matches, best_pairs, hamming
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.geometry.robust_statistics import CHI2_1DOF_95, CHI2_2DOF_95
 from edgeslam_torch.geometry.triangulation import bearings, triangulate
 from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.types import FloatArray, IntArray
-
-CHI2_1 = 3.841
-"""Chi-square, one degree of freedom, 95 %: distance to an epipolar line."""
-CHI2_2 = 5.991
-"""Chi-square, two degrees of freedom, 95 %: a reprojection."""
 
 
 def epipolar_matches(
@@ -62,7 +58,7 @@ def epipolar_matches(
     offset = other.features.uv[train] - middle[query]
     across = offset[:, 0] * direction[query, 1] - offset[:, 1] * direction[query, 0]
     sigma = scale_factor ** other.features.octave[train].astype(np.float64)
-    ok = (across**2 <= CHI2_1 * sigma**2) | (length[query] < 1.0)
+    ok = (across**2 <= CHI2_1DOF_95 * sigma**2) | (length[query] < 1.0)
     query, train = query[ok], train[ok]
     matches = best_pairs(query, train, hamming(keyframe.words[free[query]], other.words[train]), max_hamming, ratio)
     return Matches(free[matches.query], matches.train, matches.distance)
@@ -100,8 +96,8 @@ def triangulate_matches(
         cosine = ((p_k @ T_o_k[:3, :3].T) * p_o).sum(1) / (d_k * d_o)
         angle = np.arccos(np.clip(cosine, -1.0, 1.0))
         ok = np.isfinite(p_k).all(1) & (p_k[:, 2] > 0) & (p_o[:, 2] > 0) & (angle > min_parallax_rad)
-        ok &= ((camera.project(p_k) - uv_k) ** 2).sum(1) <= CHI2_2 * sigma_k**2
-        ok &= ((camera.project(p_o) - uv_o) ** 2).sum(1) <= CHI2_2 * sigma_o**2
+        ok &= ((camera.project(p_k) - uv_k) ** 2).sum(1) <= CHI2_2DOF_95 * sigma_k**2
+        ok &= ((camera.project(p_o) - uv_o) ** 2).sum(1) <= CHI2_2DOF_95 * sigma_o**2
         level_ratio = sigma_o / sigma_k * d_o / d_k  # 1 when the same patch fills both pyramid levels alike
         ok &= (level_ratio < 1.5 * scale_factor) & (level_ratio > 1.0 / (1.5 * scale_factor))
     ok = np.flatnonzero(ok)

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.geometry.robust_statistics import CHI2_2DOF_95
 from edgeslam_torch.losses.robust import Kernel
 from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.map.slam_map import SlamMap
@@ -15,9 +16,6 @@ from edgeslam_torch.types import IntArray
 
 MIN_EXTENT = 1e-6
 """Minimum distance between keyframes that defines a scale [map units]."""
-
-CHI2_2 = 5.991
-"""Chi-square, two degrees of freedom, 95 %."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,7 +136,7 @@ def write_back(slam_map: SlamMap, window: Window, keypoint: list[IntArray], resu
         for keyframe, T_c_w in zip(keyframes, result.T_c_w, strict=False):  # hosts outside the window follow
             keyframe.T_c_w = T_c_w
         slam_map.anchors.p_w[window.anchor] = result.p_w
-        bad = (result.chi2 > CHI2_2) | ~result.in_front
+        bad = (result.chi2 > CHI2_2DOF_95) | ~result.in_front
         start = 0
         for keyframe, seen in zip(keyframes, keypoint, strict=True):
             wrong = seen[bad[start : start + len(seen)]]

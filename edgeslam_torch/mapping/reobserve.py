@@ -10,7 +10,6 @@ import logging
 import numpy as np
 from numpy.typing import NDArray
 
-from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.map.slam_map import SlamMap
@@ -47,7 +46,7 @@ def revisit_candidate(slam_map: SlamMap, keyframe: Keyframe) -> Keyframe | None:
     or None."""
     piece = slam_map.piece_of(keyframe.id)  # poses of another one do not relate
     older = [k for k in slam_map.keyframes.values() if k.id < keyframe.id and slam_map.piece_of(k.id) == piece]
-    depth = _median_depth(slam_map, keyframe)
+    depth = slam_map.median_depth(keyframe)
     if not older or depth is None:
         return None
     cosine = np.stack([k.T_c_w[2, :3] for k in older]) @ keyframe.T_c_w[2, :3]
@@ -92,10 +91,3 @@ def _agreeing(
     uv = keyframe.features.uv[keypoint].astype(np.float64)
     inv_sigma = growth ** -keyframe.features.octave[keypoint].astype(np.float64)
     return refine_pose(keyframe.T_c_w, p_w, uv, inv_sigma, (camera.fx, camera.fy, camera.cx, camera.cy)).inliers
-
-
-def _median_depth(slam_map: SlamMap, keyframe: Keyframe) -> float | None:
-    """Of the keyframe's anchors [map units]; None without any in front."""
-    held = keyframe.anchor[keyframe.anchor >= 0]
-    z = se3.transform(keyframe.T_c_w, slam_map.anchors.p_w[held])[:, 2]
-    return float(np.median(z[z > 0])) if (z > 0).any() else None

@@ -11,7 +11,7 @@ from edgeslam_torch.frontend.corners import Junctions, detect_junctions
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.losses.cycle import CycleForm
 from edgeslam_torch.optim.edge_association import EdgeField, associate_edges, edge_field, nearest_edges
-from edgeslam_torch.optim.kernels.junctions import collinearity_prior
+from edgeslam_torch.optim.kernels.junction_blocks import collinearity_prior
 from edgeslam_torch.optim.problem import EdgeTerms, JunctionTerms
 from edgeslam_torch.types import Edges, FloatArray, IntArray
 

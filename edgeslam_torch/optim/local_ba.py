@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from edgeslam_torch.geometry import se3_torch as lie
-from edgeslam_torch.optim.kernels import pairs, points, schur
+from edgeslam_torch.optim.kernels import pair_blocks, point_blocks, schur
 from edgeslam_torch.optim.kernels.compiled import kernel
-from edgeslam_torch.optim.kernels.edges import EdgeBlocks
-from edgeslam_torch.optim.kernels.junctions import JunctionBlocks
-from edgeslam_torch.optim.kernels.pairs import INVERSE_DEPTH_MIN, RelativeSystem
-from edgeslam_torch.optim.kernels.points import PointBlocks, PointSystem
+from edgeslam_torch.optim.kernels.edge_blocks import EdgeBlocks
+from edgeslam_torch.optim.kernels.junction_blocks import JunctionBlocks
+from edgeslam_torch.optim.kernels.pair_blocks import INVERSE_DEPTH_MIN, RelativeSystem
+from edgeslam_torch.optim.kernels.point_blocks import PointBlocks, PointSystem
 from edgeslam_torch.optim.levenberg_marquardt import Step, minimise
 from edgeslam_torch.optim.objective import refined, window_losses
 from edgeslam_torch.optim.priors import PriorTerms
@@ -241,7 +241,7 @@ class _Window:
 
     def _reduce(
         self, system: _System, mu: float
-    ) -> tuple[Tensor, Tensor, points.Eliminated, tuple[pairs.Eliminated, ...]]:
+    ) -> tuple[Tensor, Tensor, point_blocks.Eliminated, tuple[pair_blocks.Eliminated, ...]]:
         """Reduced pose system, its right side, and the eliminated blocks."""
         S, b = system.H.clone(), system.g.clone()
         anchors = self.points.reduce(system.points, mu, S, b)

@@ -7,7 +7,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from edgeslam_torch.losses.robust import CHI2_2DOF_95
+from edgeslam_torch.geometry.robust_statistics import CHI2_2DOF_95
 from edgeslam_torch.optim.priors import inverse_left_jacobian, pose_prior_residual
 from edgeslam_torch.optim.problem import PosePrior
 from edgeslam_torch.types import FloatArray

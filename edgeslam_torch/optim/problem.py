@@ -6,8 +6,9 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from edgeslam_torch.geometry.robust_statistics import CHI2_1DOF_95, CHI2_2DOF_95
 from edgeslam_torch.losses.cycle import CycleForm
-from edgeslam_torch.losses.robust import CHI2_1DOF_95, CHI2_2DOF_95, Kernel
+from edgeslam_torch.losses.robust import Kernel
 from edgeslam_torch.types import FloatArray, IntArray
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from edgeslam_torch.config import InitialisationConfig
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.geometry.robust_statistics import CHI2_2DOF_95
 from edgeslam_torch.geometry.triangulation import bearings, triangulate
 from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.optim.local_ba import refine_window
@@ -20,9 +21,6 @@ from edgeslam_torch.optim.problem import LmConfig, ScalePrior, WindowProblem
 from edgeslam_torch.tracking.relative_pose import relative_pose
 from edgeslam_torch.tracking.tracker import View
 from edgeslam_torch.types import FloatArray, IntArray, MotionKind
-
-CHI2_2 = 5.991
-"""Chi-square, two degrees of freedom, 95 %."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,7 +205,7 @@ def consensus(
         scale_priors=(ScalePrior(0, newest, baseline, 0.001),),
     )
     result = refine_window(problem, LmConfig(max_iterations=20, diagnostics=True))
-    agreeing = (result.chi2 <= CHI2_2) & result.in_front
+    agreeing = (result.chi2 <= CHI2_2DOF_95) & result.in_front
     covariance = result.pose_covariance[:3, :3]
     sigma = float(np.sqrt(np.trace(covariance))) / baseline if np.isfinite(covariance).all() else np.inf
     # A point must be an inlier in the two views that become keyframes.

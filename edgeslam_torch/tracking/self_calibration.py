@@ -22,6 +22,7 @@ from edgeslam_torch.config import OrbConfig
 from edgeslam_torch.frontend.matching import match_all, words
 from edgeslam_torch.frontend.orb import OrbExtractor
 from edgeslam_torch.geometry.camera import GUESSED_FOCAL_SIGMA, Camera
+from edgeslam_torch.geometry.robust_statistics import robust_sigma
 from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.types import FloatArray, IntArray
 
@@ -106,7 +107,7 @@ def focal_from_matches(pairs: Sequence[tuple[FloatArray, FloatArray]], width: in
         return FocalEstimate(None, np.inf, len(found), f"{len(found)} of {len(pairs)} image pairs usable{why}")
     logs = np.log(found)
     centre = float(np.median(logs))
-    spread = 1.4826 * float(np.median(np.abs(logs - centre)))
+    spread = robust_sigma(logs - centre)
     # The median of n normal samples has a sigma of 1.2533 sigma / sqrt(n); 2 % for common errors (lens, centre).
     relative = float(np.hypot(1.2533 * spread / np.sqrt(len(found) / _SHARED), 0.02))
     if relative > MAX_RELATIVE_SIGMA:

@@ -9,13 +9,13 @@ from point_map import CAMERA, PointMap, small_motion
 from edgeslam_torch.config import EdgeConfig
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.map.depth_prior import depth_prior
-from edgeslam_torch.mapping.edge_map import AGREE_PX, PRIOR_CELL_PX, EdgeMap, EdgePoints, PaintedEdges, fuse
+from edgeslam_torch.mapping.edge_map import AGREE_PX, PRIOR_CELL_PX, EdgeMap, EdgePoints, PaintedEdges, fuse_voxels
 
 
 def test_two_points_of_one_cell_worked_by_hand():
     p = np.array([[0.001, 0.0, 0.0], [0.004, 0.0, 0.0], [0.5, 0.5, 0.5]])
     colour = np.array([[0, 0, 0], [100, 50, 0], [7, 8, 9]], np.uint8)
-    cloud = fuse(p, np.array([0.02, 0.01, 0.03]), colour, np.array([2, 5, 3]), 0.01)
+    cloud = fuse_voxels(p, np.array([0.02, 0.01, 0.03]), colour, np.array([2, 5, 3]), 0.01)
     # Weights 1 : 4.
     np.testing.assert_allclose(cloud.p_w, [[0.0034, 0.0, 0.0], [0.5, 0.5, 0.5]], atol=1e-6)
     assert cloud.colour.tolist() == [[80, 40, 0], [7, 8, 9]]
@@ -25,14 +25,14 @@ def test_two_points_of_one_cell_worked_by_hand():
 
 def test_fusing_nothing_gives_nothing():
     none = np.zeros((0, 3))
-    cloud = fuse(none, np.zeros(0), none.astype(np.uint8), np.zeros(0, int), 0.01)
+    cloud = fuse_voxels(none, np.zeros(0), none.astype(np.uint8), np.zeros(0, int), 0.01)
     assert cloud.p_w.shape == (0, 3)
     assert len(cloud.observations) == 0
 
 
 def test_fused_points_stay_apart_and_inside(rng):
     p = rng.uniform(-1, 1, (5000, 3))
-    cloud = fuse(p, np.full(5000, 0.01), np.zeros((5000, 3), np.uint8), np.full(5000, 2), 0.1)
+    cloud = fuse_voxels(p, np.full(5000, 0.01), np.zeros((5000, 3), np.uint8), np.full(5000, 2), 0.1)
     cells = np.floor(cloud.p_w / 0.1).astype(int)
     assert len(np.unique(cells, axis=0)) == len(cells)
     assert len(cells) == len(np.unique(np.floor(p / 0.1).astype(int), axis=0))

@@ -19,15 +19,15 @@ from edgeslam_torch.optim.benchmark import (
     refine_with_gtsam,
     seeded_window,
 )
-from edgeslam_torch.optim.kernels import compiled, points, schur
-from edgeslam_torch.optim.kernels.edges import EdgePairs, edge_cost, edge_weights
-from edgeslam_torch.optim.kernels.junctions import (
+from edgeslam_torch.optim.kernels import compiled, point_blocks, schur
+from edgeslam_torch.optim.kernels.edge_blocks import EdgePairs, edge_cost, edge_weights
+from edgeslam_torch.optim.kernels.junction_blocks import (
     JunctionPairs,
     collinearity_prior,
     junction_cost,
     junction_weights,
 )
-from edgeslam_torch.optim.kernels.pairs import Robust
+from edgeslam_torch.optim.kernels.pair_blocks import Robust
 from edgeslam_torch.optim.local_ba import refine_window
 from edgeslam_torch.optim.problem import (
     DepthPriors,
@@ -114,8 +114,8 @@ def test_chi2_is_in_the_callers_order():
 def test_order_of_observations_and_of_chunks_does_not_matter(rng, monkeypatch):
     window = seeded_window(4, SMALL)
     before = refine_window(window.problem, TIGHT)
-    monkeypatch.setattr(points, "_FEW_POSES", 0)
-    monkeypatch.setattr(points, "_ANCHORS_PER_CHUNK", 16)
+    monkeypatch.setattr(point_blocks, "_FEW_POSES", 0)
+    monkeypatch.setattr(point_blocks, "_ANCHORS_PER_CHUNK", 16)
     after = refine_window(keep(window.problem, rng.permutation(len(window.problem.uv))), TIGHT)
     assert after.cost_after == pytest.approx(before.cost_after, rel=1e-10)
     np.testing.assert_allclose(after.T_c_w, before.T_c_w, atol=1e-7)
@@ -529,19 +529,19 @@ def test_kernels_stay_on_their_device():
         corner, corners = torch.zeros(3, B, L, **f), JunctionPairs(rays, line[:2], arms, weight, K, False, robust)
         place = torch.zeros(B, 9, L, dtype=torch.int64)
         pixel, three = torch.zeros(B, 2, L, **g), torch.zeros(3, **g)
-        seen = points.Observed(
+        seen = point_blocks.Observed(
             some[:B], place[:, :3], pixel, pixel, pixel[:, 0], some, three, three, three, min_depth=1e-3
         )
-        places = points.Places(
+        places = point_blocks.Places(
             place.flatten(), place[:, 0].flatten(), some[:B], some, place[:, :6], place[:, :3].flatten(), 3 * E, True
         )
         point = (torch.zeros(4, 4, 4, **g), torch.zeros(3, E, **g), seen)
         out = [*edge_weights(Rt, edge, edges._replace(form=CycleForm.RELATIVE_DEPTH))]
         out += [*edge_weights(Rt, edge, edges._replace(form=CycleForm.PIXEL)), edge_cost(Rt, edge, edges)]
         out += [*junction_weights(Rt, corner, corners), junction_cost(Rt, corner, corners)]
-        linear = points.point_normals(*point, places, Kernel.HUBER, 2.0)
-        out += [*linear.system, *linear[1:], points.point_cost(*point, Kernel.HUBER, 2.0)]
-        out += [*points.coupled(linear.system, places, three[0], torch.float32)]
+        linear = point_blocks.point_normals(*point, places, Kernel.HUBER, 2.0)
+        out += [*linear.system, *linear[1:], point_blocks.point_cost(*point, Kernel.HUBER, 2.0)]
+        out += [*point_blocks.coupled(linear.system, places, three[0], torch.float32)]
         for size in (1, 3):
             V, g = torch.zeros(size * (size + 1) // 2, B, L, **f), torch.zeros(size, B, L, **f)
             out += [*schur.eliminate(V, g, torch.zeros(B, T, 6, size, L, **f), torch.zeros((), **f))]

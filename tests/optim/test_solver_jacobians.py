@@ -13,7 +13,7 @@ from edgeslam_torch.losses import edge_alignment as ea
 from edgeslam_torch.losses.lshape import junction_residuals, junction_rows
 from edgeslam_torch.losses.reprojection import camera_points, reprojection_residuals
 from edgeslam_torch.losses.robust import Kernel
-from edgeslam_torch.optim.kernels.points import PointBlocks
+from edgeslam_torch.optim.kernels.point_blocks import PointBlocks
 from edgeslam_torch.optim.priors import inverse_left_jacobian, scale_prior
 from edgeslam_torch.optim.problem import DepthPriors, LmConfig, ScalePrior, WindowProblem
 

@@ -10,7 +10,7 @@ import torch
 from edgeslam_torch.losses.cycle import CycleForm
 from edgeslam_torch.losses.robust import Kernel
 from edgeslam_torch.optim.benchmark import WindowSize, seeded_window
-from edgeslam_torch.optim.kernels import points
+from edgeslam_torch.optim.kernels import point_blocks
 from edgeslam_torch.optim.local_ba import _State, _System, _Window
 from edgeslam_torch.optim.problem import DepthPriors, LmConfig, WindowProblem
 
@@ -61,7 +61,7 @@ CASES = {
 
 @pytest.mark.parametrize("case", CASES)
 def test_window_is_that_of_the_page(case, monkeypatch):
-    monkeypatch.setattr(points, "_ANCHORS_PER_CHUNK", 9)  # several chunks of a few anchors
+    monkeypatch.setattr(point_blocks, "_ANCHORS_PER_CHUNK", 9)  # several chunks of a few anchors
     size, settings, changes = CASES[case]
     config, problem = replace(EXACT, **settings), window(3, size)
     if "cycle" in changes:

@@ -12,7 +12,7 @@ from torch import Tensor
 from edgeslam_torch.losses.lshape import junction_residuals, junction_rows
 from edgeslam_torch.optim.kernels import schur
 from edgeslam_torch.optim.kernels.compiled import kernel
-from edgeslam_torch.optim.kernels.pairs import (
+from edgeslam_torch.optim.kernels.pair_blocks import (
     Known,
     Layout,
     Linearised,

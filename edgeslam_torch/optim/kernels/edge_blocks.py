@@ -24,7 +24,7 @@ from edgeslam_torch.losses.edge_alignment import (
 )
 from edgeslam_torch.optim.kernels import schur
 from edgeslam_torch.optim.kernels.compiled import kernel
-from edgeslam_torch.optim.kernels.pairs import (
+from edgeslam_torch.optim.kernels.pair_blocks import (
     Known,
     Layout,
     Linearised,

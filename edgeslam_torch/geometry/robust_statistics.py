@@ -1,0 +1,35 @@
+"""Quantiles, robust spreads and weights that several stages share."""
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from edgeslam_torch.types import FloatArray
+
+CHI2_1DOF_95 = 3.841
+"""95 % quantile of chi-square with 1 degree of freedom."""
+CHI2_2DOF_95 = 5.991
+"""95 % quantile of chi-square with 2 degrees of freedom."""
+MAD_TO_SIGMA = 1.4826
+"""Median absolute deviation to standard deviation of a normal distribution."""
+TUKEY_95 = 4.685
+"""Width of Tukey's biweight [standard deviations]: 95 % efficiency on normal errors (Huber 1981)."""
+
+
+def robust_sigma(residual: ArrayLike) -> float:
+    """Standard deviation about zero by the median absolute value; NaN without residuals.
+
+    Example:
+        >>> robust_sigma([-1.0, 1.0, 1.0, -1.0, 1000.0])
+        1.4826
+    """
+    return MAD_TO_SIGMA * float(np.median(np.abs(residual)))
+
+
+def tukey_weight(residual: FloatArray, sigma: float) -> FloatArray:
+    """Tukey's biweight of residuals with standard deviation ``sigma``: zero beyond 4.685 of them.
+
+    Example:
+        >>> tukey_weight(np.array([0.0, 1.0, 5.0]), 1.0).round(3).tolist()
+        [1.0, 0.911, 0.0]
+    """
+    return np.square(np.maximum(0.0, 1.0 - np.square(residual / (TUKEY_95 * sigma))))

@@ -1,0 +1,31 @@
+"""Constants against scipy's distributions, spreads and weights against samples."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from edgeslam_torch.geometry import robust_statistics as rs
+
+
+def test_quantiles_are_those_of_their_distributions():
+    assert pytest.approx(stats.chi2.ppf(0.95, 1), abs=1e-3) == rs.CHI2_1DOF_95
+    assert pytest.approx(stats.chi2.ppf(0.95, 2), abs=1e-3) == rs.CHI2_2DOF_95
+    assert pytest.approx(1.0 / stats.norm.ppf(0.75), abs=1e-4) == rs.MAD_TO_SIGMA
+
+
+def test_robust_sigma_is_the_deviation_of_normal_errors_and_ignores_a_third_of_outliers(rng):
+    x = rng.normal(0.0, 2.5, 20_000)
+    assert rs.robust_sigma(x) == pytest.approx(2.5, rel=0.03)
+    assert rs.robust_sigma(np.concatenate([x, np.full(6000, 1e6)])) < 2 * 2.5
+
+
+def test_biweight_is_95_percent_efficient(rng):
+    """Variance of the mean that it weighs, against the plain mean's, on normal errors."""
+    x = rng.normal(size=(4000, 60))
+    weight = rs.tukey_weight(x, 1.0)
+    weighed = (weight * x).sum(1) / weight.sum(1)
+    for _ in range(5):
+        weight = rs.tukey_weight(x - weighed[:, None], 1.0)
+        weighed = (weight * x).sum(1) / weight.sum(1)
+    assert x.mean(1).var() / weighed.var() == pytest.approx(0.95, abs=0.02)
+    assert rs.tukey_weight(np.array([-10.0, 10.0]), 2.0).tolist() == [0.0, 0.0]
