@@ -223,7 +223,7 @@ def test_truncated_velocities_are_told_from_rounded_ones(rng, swinging, replay):
 @pytest.mark.parametrize("truncated", [False, True])
 def test_height_decides_what_the_readings_leave_open(rng, swinging, replay, truncated):
     """No velocity reaches three steps, so they do not tell rounding from truncation: the range sensor does."""
-    motion = swinging(40.0, size_m=0.13)
+    motion = swinging(30.0, size_m=0.13)
     exact = simulate(rng, motion.stamps_s, motion.T_w_c, T_B_C, faults=replace(EXACT, video_delay_s=0.5)).samples()
     whole = np.trunc if truncated else np.rint
     samples = [replace(s, velocity_m_s=whole(10 * (s.velocity_m_s + rng.normal(0, 0.02, 3))) / 10) for s in exact]

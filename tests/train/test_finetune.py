@@ -49,15 +49,34 @@ def finetune(recordings: Path, tmp_path: Path) -> Finetune:
     """Runs the command on recordings by name, into ``tmp_path/out``; exit code, stdout and stderr."""
 
     def call(*words: str, steps: int = 8, out: Path = tmp_path / "out") -> tuple[int, str, str]:
-        given = [str(recordings / w) if (recordings / w).exists() else w for w in words]
-        if "--weights" not in given:
-            given += ["--weights", str(recordings / "start.safetensors")]
-        stdout, stderr = io.StringIO(), io.StringIO()
-        with redirect_stdout(stdout), redirect_stderr(stderr):
-            code = cli.main(["finetune", *COMMON, *given, "--out", str(out), "--steps", str(steps)])
-        return code, stdout.getvalue(), stderr.getvalue()
+        return _finetune(recordings, *words, steps=steps, out=out)
 
     return call
+
+
+def _finetune(recordings: Path, *words: str, steps: int, out: Path) -> tuple[int, str, str]:
+    given = [str(recordings / w) if (recordings / w).exists() else w for w in words]
+    if "--weights" not in given:
+        given += ["--weights", str(recordings / "start.safetensors")]
+    stdout, stderr = io.StringIO(), io.StringIO()
+    with redirect_stdout(stdout), redirect_stderr(stderr):
+        code = cli.main(["finetune", *COMMON, *given, "--out", str(out), "--steps", str(steps)])
+    return code, stdout.getvalue(), stderr.getvalue()
+
+
+@pytest.fixture(scope="module")
+def eight_steps(recordings: Path) -> tuple[Path, str]:
+    """A whole run on the kitchen, made once, and what it printed."""
+    folder = recordings / "eight steps"
+    code, stdout, _ = _finetune(recordings, "kitchen", steps=8, out=folder)
+    assert code == 0
+    return folder, stdout
+
+
+@pytest.fixture
+def trained(eight_steps: tuple[Path, str], tmp_path: Path) -> Path:
+    """A copy of that run in ``tmp_path/out``."""
+    return Path(shutil.copytree(eight_steps[0], tmp_path / "out"))
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -96,8 +115,9 @@ def test_before_and_after_are_reported_and_weights_say_what_they_are(
     assert set(modes.values()) == {oct(0o666 & ~umask)}, modes
 
 
-def test_other_data_into_the_same_folder_is_refused_and_nothing_changes(finetune: Finetune, tmp_path: Path) -> None:
-    assert finetune("kitchen")[0] == 0
+def test_other_data_into_the_same_folder_is_refused_and_nothing_changes(
+    finetune: Finetune, trained: Path, tmp_path: Path
+) -> None:
     before = contents(tmp_path / "out")
     refused(finetune("hall"), "data: kitchen (depth) then, hall (depth) now", "--overwrite")
     refused(finetune("kitchen", "hall"), "kitchen (depth), hall (depth) now")
@@ -109,8 +129,7 @@ def test_other_data_into_the_same_folder_is_refused_and_nothing_changes(finetune
     assert contents(tmp_path / "out") == before
 
 
-def test_other_weights_are_refused(finetune: Finetune, recordings: Path, tmp_path: Path) -> None:
-    finetune("kitchen")
+def test_other_weights_are_refused(finetune: Finetune, trained: Path, tmp_path: Path) -> None:
     torch.manual_seed(1)
     network = build_network(METADATA, Widths((4,) + (8,) * 13, (8,) * 5))
     save_checkpoint(network, METADATA, tmp_path / "other.safetensors")
@@ -141,8 +160,10 @@ def test_moved_data_and_folder_go_on(finetune: Finetune, recordings: Path, tmp_p
     assert "goes on after step 8" in stdout
 
 
-def test_same_command_again_trains_nothing_and_says_so(finetune: Finetune, tmp_path: Path) -> None:
-    _, first, _ = finetune("kitchen")
+def test_same_command_again_trains_nothing_and_says_so(
+    finetune: Finetune, eight_steps: tuple[Path, str], trained: Path, tmp_path: Path
+) -> None:
+    first = eight_steps[1].replace(str(eight_steps[0]), str(trained))
     before = contents(tmp_path / "out")
     code, second, _ = finetune("kitchen")
     assert code == 0
@@ -151,8 +172,7 @@ def test_same_command_again_trains_nothing_and_says_so(finetune: Finetune, tmp_p
     assert contents(tmp_path / "out") == before
 
 
-def test_more_steps_go_on_and_fewer_are_refused(finetune: Finetune, tmp_path: Path) -> None:
-    finetune("kitchen")
+def test_more_steps_go_on_and_fewer_are_refused(finetune: Finetune, trained: Path, tmp_path: Path) -> None:
     code, stdout, _ = finetune("kitchen", steps=12)
     assert code == 0
     assert "goes on after step 8" in stdout
@@ -164,10 +184,11 @@ def test_more_steps_go_on_and_fewer_are_refused(finetune: Finetune, tmp_path: Pa
     assert [(s["from_step"], s["steps"]) for s in sessions] == [(0, 8), (8, 12)]
 
 
-def test_resume_takes_another_rate_and_needs_something_to_resume(finetune: Finetune, tmp_path: Path) -> None:
-    refused(finetune("kitchen", "--resume"), "nothing to resume")
-    assert not (tmp_path / "out").exists()
-    finetune("kitchen")
+def test_resume_takes_another_rate_and_needs_something_to_resume(
+    finetune: Finetune, trained: Path, tmp_path: Path
+) -> None:
+    refused(finetune("kitchen", "--resume", out=tmp_path / "new"), "nothing to resume")
+    assert not (tmp_path / "new").exists()
     refused(finetune("kitchen", "--lr", "0.001", steps=10), "lr: 0.01 then, 0.001 now", "--resume")
     assert finetune("kitchen", "--lr", "0.001", "--resume", steps=10)[0] == 0
 
@@ -197,8 +218,7 @@ def test_files_that_no_finetuning_wrote_are_left_alone(finetune: Finetune, recor
     assert contents(own) == before
 
 
-def test_damaged_record_is_named(finetune: Finetune, tmp_path: Path) -> None:
-    finetune("kitchen")
+def test_damaged_record_is_named(finetune: Finetune, trained: Path, tmp_path: Path) -> None:
     for text in ("", "{}", "[1]", '{"given": {"weights": 1, "data": 5}}', "[" * 100_000):
         (tmp_path / "out" / "finetune.json").write_text(text)
         refused(finetune("kitchen"), "finetune.json: unreadable")
@@ -309,7 +329,11 @@ def test_what_made_nothing_better_keeps_the_weights_it_began_with(
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_signal_says_what_is_kept_and_the_same_command_goes_on(
-    finetune: Finetune, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
+    finetune: Finetune,
+    eight_steps: tuple[Path, str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    number: signal.Signals,
 ) -> None:
     def stopped(self: ProgressBar, state: TrainState, losses: dict[str, float]) -> None:
         if state.step == 5:
@@ -322,9 +346,8 @@ def test_signal_says_what_is_kept_and_the_same_command_goes_on(
     assert code == 130
     assert signal.getsignal(number) is before
     assert stderr.splitlines()[-1].endswith("holds step 5, and the same command goes on from there")
-    whole, resumed = tmp_path / "whole", tmp_path / "out"
+    whole, resumed = eight_steps[0], tmp_path / "out"
     assert "goes on after step 5" in finetune("kitchen")[1]
-    finetune("kitchen", out=whole)
     for name in ("weights.safetensors", "final.safetensors", "curve.jsonl"):
         assert (whole / name).read_bytes() == (resumed / name).read_bytes(), name
 
