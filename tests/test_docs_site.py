@@ -97,6 +97,13 @@ def test_what_a_page_would_load_is_found(tmp_path: Path) -> None:
     ]
 
 
+def test_every_decision_record_is_in_the_index() -> None:
+    records = BUILD.parent / "decisions"
+    index = (records / "README.md").read_text(encoding="utf-8")
+    missing = [path.name for path in sorted(records.glob("0*.md")) if f"({path.name})" not in index]
+    assert not missing
+
+
 def test_no_guide_installs_the_package_from_an_index() -> None:
     root = BUILD.parent.parent
     guides = [root / name for name in build.GUIDES] + sorted((root / "docs").rglob("*.md"))

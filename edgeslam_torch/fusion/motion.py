@@ -52,8 +52,8 @@ mean square over fr1_xyz, redkitchen and euroc_mh05_a is 0.4 in the logarithm.""
 class MotionFusion:
     """Ties the visual map to the drone's telemetry; `EdgeSlam` calls it for every frame and every packet.
 
-    The map may be in any gauge: ``T_w_c`` in arbitrary units and axes, as long as they stay the same until `rescale`
-    (or `reset_map`). A frame stamped ``t`` shows what telemetry reported at ``t - delay``.
+    The map may be in any gauge: ``T_w_c`` in arbitrary units and axes, as long as they stay the same until `rescale`.
+    A frame stamped ``t`` shows what telemetry reported at ``t - delay``.
 
     Args:
         config: Settings.
@@ -163,14 +163,6 @@ class MotionFusion:
             self._by_telemetry = replace(told, log_scale=told.log_scale - math.log(factor))
         self._fit = rescaled(self._fit, factor)
 
-    def reset_map(self) -> None:
-        """A new map in a new gauge: visual memory and scale are forgotten, telemetry and delay are kept."""
-        self._memory.clear()
-        self._filter.clear()
-        self._depth = DepthRatios(self.config.depth_bias_log)
-        self._forget_scale()
-        self._R_w_m, self._fitted_s = None, -math.inf
-
     def _forget_scale(self) -> None:
         self._by_telemetry, self._fit = None, TelemetryFit(shortfall_m_s=self._fit.shortfall_m_s)
 
@@ -201,11 +193,6 @@ class MotionFusion:
     def _with_focal(self, depth: DepthScale) -> LogScale:
         """Map depth, and the network's metres, go with the focal length: its whole uncertainty is the ratio's too."""
         return replace(depth.opinion, sigma=math.hypot(depth.sigma, self._focal_sigma))
-
-    def gravity(self) -> FloatArray | None:
-        """Unit vector ``(3,)`` that points up, in the map frame; ``None`` without telemetry attitude."""
-        R = self._R_w_m
-        return None if R is None else R.T @ np.array([0.0, 0.0, 1.0])
 
     def rotation(self) -> FloatArray | None:
         """``R_w_m`` ``(3, 3)``: map axes to the drone's power-on world; ``None`` without telemetry attitude."""

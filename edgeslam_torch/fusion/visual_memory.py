@@ -167,13 +167,6 @@ class VisualMemory:
         """The map around the newest frames was moved by ``T`` ``(4, 4)``: ``T_w_c' = T T_w_c``; older ones stay."""
         self.last, self.previous = (None if v is None else v.moved(T) for v in (self.last, self.previous))
 
-    def clear(self) -> None:
-        """A new map in a new gauge."""
-        self._intervals.clear()
-        self._sightings.clear()
-        self._start = self.previous = self.last = None
-        self._displacements = None
-
     def _each(self, change: Callable[[VisualPose], VisualPose]) -> None:
         self._intervals = deque((i.each(change) for i in self._intervals), self._intervals.maxlen)
         self._sightings = deque(map(change, self._sightings), self._sightings.maxlen)
