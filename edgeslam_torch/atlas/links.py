@@ -1,4 +1,4 @@
-"""Proof that a keyframe shows another piece of map, and the similarity between its own piece and that one.
+"""Verification that a keyframe shows another piece of map, and the similarity between the two pieces.
 
 The keyframe is searched in the other piece as a lost frame is (`tracking/relocaliser.py`), which gives its pose there
 on the evidence of hundreds of keypoints. What a pose leaves open is the scale: keypoints that have an anchor on both

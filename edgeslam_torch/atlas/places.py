@@ -1,7 +1,7 @@
-"""Which keyframes look like an image: its keypoints vote for the anchors that resemble them.
+"""Place recognition: keypoints of an image vote for keyframes through similar anchors.
 
 A vote costs one pass over the descriptors of the map (256 bits each, 200 keypoints against 10 000 anchors: 12 ms on one
-core). It needs no vocabulary and no state of its own, forgets what the map forgets, and cannot be out of date.
+core). It needs no vocabulary and has no state, so it is always consistent with the map.
 """
 
 import cv2

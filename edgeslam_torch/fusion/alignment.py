@@ -1,4 +1,4 @@
-"""Which way the map lies in the drone's power-on world, by the drone's attitude."""
+"""Orientation of the map in the drone's power-on world, from the drone's attitude."""
 
 from dataclasses import dataclass
 
@@ -43,7 +43,7 @@ def map_to_world(sightings: Sightings, track: TelemetryTrack, delay_s: float, R_
 
 
 def turns(moved: Displacements, track: TelemetryTrack, R_b_c: FloatArray) -> Turns:
-    """What images and telemetry say of the turn over each interval.
+    """Rotations over each interval according to images and telemetry.
 
     Args:
         moved: Displacements on telemetry's clock.

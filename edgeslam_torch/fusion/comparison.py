@@ -1,4 +1,4 @@
-"""Velocities and attitude held against the images, at the delay in use and at others."""
+"""Comparison of velocities and attitude with the images, at the current delay and at others."""
 
 import math
 from dataclasses import dataclass, replace
@@ -17,9 +17,9 @@ from edgeslam_torch.types import FloatArray
 
 _WIDE_DELAYS_S = (-3.0, 3.0)
 _WIDE_STEP_S = 0.1
-"""Delays beyond those allowed are looked at where telemetry does not fit well: a wrong clock is said, not used."""
+"""Delays beyond the allowed ones are tested if telemetry fits badly: a wrong clock is reported, not used."""
 _FIXED_REACH_S = 0.15
-"""A configured delay may be so far off before the clock is called wrong."""
+"""Tolerance of a configured delay."""
 _FITS_WELL = 0.9
 _MUCH_LIKELIER = 6.0
 """Log likelihood ratio; half the intervals count as independent."""
@@ -29,7 +29,7 @@ _LEAST_TURN_RAD_S = math.radians(2.0)
 
 @dataclass(frozen=True, slots=True)
 class Present:
-    """What a comparison needs to know of the moment."""
+    """Inputs of a comparison."""
 
     memory: VisualMemory
     track: TelemetryTrack
@@ -42,7 +42,7 @@ class Present:
 
 
 class Comparison:
-    """Passes verdicts on velocities and attitude to `Trust`; remembers when it last looked at other delays."""
+    """Updates `Trust` with verdicts on velocities and attitude; stores when other delays were last tested."""
 
     def __init__(self, config: FusionConfig) -> None:
         self._config = config
@@ -51,8 +51,8 @@ class Comparison:
     def judge(self, trust: Trust, present: Present, delay: Delay, R_w_m: FloatArray) -> None:
         """Compare at the delay in use and, if that fits badly, read in other frames and at other delays.
 
-        Velocities that surely fit better in another frame are read so from now on: the images have the last word on
-        what the settings or the reader of a log took them for.
+        Velocities that fit significantly better in another frame are read in that frame from now on, overriding
+        settings and reader.
         """
         used = self._compared(present, delay.value_s, R_w_m)
         now, n = used[Reading.VELOCITY], present.memory.count
@@ -96,7 +96,7 @@ class Comparison:
     def _compared(self, present: Present, delay_s: float, R_w_m: FloatArray) -> dict[Reading, Agreement]:
         """How velocities and attitude go with the images under one delay.
 
-        Without the camera's lever: where velocities say nothing, turns must not speak for them.
+        Without the camera's lever arm: rotations must not count as evidence for velocities.
         """
         track = present.track
         moved = present.memory.displacements()

@@ -1,7 +1,7 @@
-"""Opinions on the scale that cannot all be right: which are used, and what is said of the others.
+"""Consensus of contradicting scale estimates: which are used, and warnings about the others.
 
-An average of a right opinion and a wrong one is wrong. So opinions further apart than `CONTRADICTION` sigmas are not
-averaged; the one with the worse evidence is dropped. The depth network's is always worse than that of the drone's
+The average of a right estimate and a wrong one is wrong. So opinions further apart than `CONTRADICTION` sigmas are
+not averaged; the one with the worse evidence is dropped. The depth network's is always worse than that of the drone's
 sensors where these confirm each other: all its keyframes share one error, whereas displacements and heights are many
 independent measurements. One sensor alone may be in the wrong unit. Where that or a useless network are the two ways to
 explain what is seen, neither is used.
@@ -45,11 +45,11 @@ def sided_with(one: LogScale, other: LogScale, witness: LogScale | None) -> LogS
 
 @dataclass(frozen=True, slots=True)
 class Settled:
-    """What remains of the opinions of drone and network."""
+    """Estimates of drone and network that remain."""
 
     used: tuple[LogScale, ...]
     warning: str | None = None
-    """Names what was dropped, and why."""
+    """Warning about dropped estimates."""
 
 
 def settled_with_network(told: LogScale | None, network: LogScale | None, in_domain: bool) -> Settled:

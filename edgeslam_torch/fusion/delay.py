@@ -1,4 +1,4 @@
-"""Video delay behind telemetry, by the motion that both of them saw."""
+"""Video delay behind telemetry, estimated from the common motion."""
 
 import math
 from dataclasses import dataclass
@@ -12,11 +12,11 @@ from edgeslam_torch.fusion.visual_memory import Displacements, VisualMemory
 from edgeslam_torch.types import FloatArray
 
 MIN_DISPLACEMENTS = 12
-"""Fewer tell no delay."""
+"""Minimum number of displacements."""
 GROWTH = 1.3
-"""The search is repeated when there is this much more to judge by."""
+"""Growth of the data after which the search is repeated."""
 _GUESS_S = 0.3
-"""Used until the motion says better; the short end of what Tello owners measure."""
+"""Initial value, at the lower end of measured Tello delays."""
 _STEP_S = 0.05
 _MARGIN_S = 0.1
 """Searched and used beyond the configured range, so that a delay at its end is found, and one beyond that is seen to be
@@ -27,7 +27,7 @@ _CLEARLY = 6.0
 """Log likelihood by which a second valley must be worse."""
 _CLOCK_SIGMA_S = 0.005
 _KEPT = 0.9
-"""Share of the residuals that count: one in ten may be wild."""
+"""Share of the residuals used: one in ten may be an outlier."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""Late and out-of-order measurements: keep the last seconds, put each in its place and propagate again."""
+"""Late and out-of-order measurements: buffer the last seconds, insert in time order and re-propagate."""
 
 import bisect
 import math
@@ -17,7 +17,7 @@ _SAME_S = 1e-6
 _SILENCE_S = 0.5
 """Readings further apart are not interpolated."""
 _PACKET_S = 0.15
-"""A turn is believed to go on for so long after the last reading."""
+"""Time for which a rotation rate is extrapolated after the last reading."""
 _EXACT = 1e-6
 """Jitter of what has none [m], [rad]: keeps the covariance of an innovation invertible."""
 
@@ -32,7 +32,7 @@ class PoseSigma:
 
 @dataclass(frozen=True, slots=True)
 class Moved:
-    """What the filter knows of the body since vision last saw it."""
+    """Motion of the body since the last visual update."""
 
     from_s: float
     """Telemetry's stamp of the last visual pose."""
@@ -74,8 +74,8 @@ class _Event:
 class BufferedEkf:
     """`Ekf` with a clock: measurements of the last ``config.buffer_s`` may come in any order.
 
-    A late one goes to its place among the kept events; the filter is restored to the state before it and everything
-    behind it is applied again. Velocities and angles between two readings are interpolated once both are there.
+    A late one is inserted among the buffered events; the filter is restored to the state before it and later events
+    are applied again. Velocities and angles between two readings are interpolated once both are there.
     """
 
     def __init__(self, config: FusionConfig) -> None:

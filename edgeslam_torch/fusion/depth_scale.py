@@ -1,10 +1,10 @@
-r"""Metric scale from the depth network, and how far it may be wrong.
+r"""Metric scale from the depth network, with its uncertainty.
 
 Each keyframe gives the median of log (network depth [m] / map depth [map units]) over its triangulated anchors. All
-keyframes of a scene share the network's error, so the mean of their ratios is no surer than the network is of the
-scene. How sure that is, the keyframes themselves tell: by the slope :math:`b` of log network depth on log map depth
-inside a keyframe (1: the network follows depth; 0: it says the same of everything), by the spread :math:`s` of single
-anchors around their keyframe's ratio, and by how much the ratios wander, :math:`w`, from keyframe to keyframe:
+keyframes of a scene share the network's error, so the mean of their ratios is not more certain than the network for
+the scene. That uncertainty is inferred from the keyframes: by the slope :math:`b` of log network depth on log map
+depth inside a keyframe (1: the network follows depth; 0: it predicts a constant), by the spread :math:`s` of
+single anchors around their keyframe's ratio, and by how much the ratios wander, :math:`w`, from keyframe to keyframe:
 
 .. math:: \sigma^2 = \sigma_0^2 + a_b^2 (1 - b)^2 + a_s^2 s^2 + a_w^2 w^2
 
@@ -33,7 +33,7 @@ _MAP_NOISE_LOG = 0.05
 """Error of triangulated depth: in a scene of one depth the slope is not taken from noise but counted as 0."""
 _USUAL_WANDER_LOG = 0.15
 _USUAL_COUNTS = 4
-"""What a few keyframes do not tell yet: the median over the calibration's runs, instead of so many keyframes."""
+"""Prior for few keyframes: the median over the calibration's runs, weighted as this many keyframes."""
 _KEPT = 200
 _LEAST_ANCHORS = 8
 _LEAST_SPREAD_LOG = 0.02
@@ -94,7 +94,7 @@ def _slope(x: FloatArray, y: FloatArray) -> tuple[float, float]:
 
 @dataclass(frozen=True, slots=True)
 class DepthScale:
-    """The network's opinion on a map's scale, with what its sigma rests on."""
+    """The network's estimate of a map's scale, with the components of its sigma."""
 
     log_scale: float
     """Log of metres per map unit."""
@@ -106,7 +106,7 @@ class DepthScale:
 
     @property
     def in_domain(self) -> bool:
-        """Whether the network knows scenes like this one well enough to tell metres."""
+        """Whether the network is accurate enough for such scenes to provide metres."""
         return self.sigma <= MOST_SIGMA
 
     @property
@@ -162,7 +162,7 @@ class DepthRatios:
         self._scale = None
 
     def scale(self) -> DepthScale | None:
-        """The opinion of all keyframes; asked for twice a frame, worked out once a keyframe."""
+        """The estimate of all keyframes; cached per keyframe."""
         if self._scale is None and self._ratios:
             self._scale = self._summed_up()
         return self._scale

@@ -1,9 +1,9 @@
 r"""Extended Kalman filter of the drone's position and attitude, paper eqs. (8)-(14).
 
-The state is :math:`x = (p, \alpha)`, position and roll-pitch-yaw in the power-on world, eq. (8); behind it lie a
-velocity bias and a clone: where vision last saw the body. The clone is carried along by visual increments and compared
-with the pose. Thus the jitter of a visual pose counts once, and not in the increment before it and in the one after it,
-as it would if increments were independent measurements; only the drift of the map adds up.
+The state is :math:`x = (p, \alpha)`, position and roll-pitch-yaw in the power-on world, eq. (8); augmented by a
+velocity bias and a clone, the pose of the body at the last visual update. The clone is propagated by visual
+increments and compared with the pose. Thus the jitter of a visual pose counts once, instead of in the increments
+before and after it, as if they were independent; only the drift of the map accumulates.
 
 Note:
     The printed filter and the corrected default differ in seven points (docs/tello.md, "The filter");
@@ -35,7 +35,7 @@ Saved = tuple[FloatArray, FloatArray, float, dict[int, int]]
 
 
 class Outcome(StrEnum):
-    """What became of one measurement."""
+    """Outcome of a measurement."""
 
     ACCEPTED = "accepted"
     REFUSED = "refused"
@@ -66,7 +66,7 @@ class EkfState:
 
 @dataclass(frozen=True, slots=True)
 class Relative:
-    """Motion of the body since vision last saw it, in its axes at that moment."""
+    """Motion of the body since the last visual update, in its axes at that time."""
 
     T: FloatArray
     """``(4, 4)`` pose [m]."""
@@ -77,7 +77,7 @@ class Relative:
 
 
 class Ekf:
-    """The filter proper: it knows no clock and no buffer, see `BufferedEkf` for late measurements."""
+    """The filter without clock and buffer; see `BufferedEkf` for late measurements."""
 
     def __init__(self, config: FusionConfig) -> None:
         self.config = config
@@ -176,7 +176,7 @@ class Ekf:
         return outcome
 
     def clone(self) -> None:
-        """Vision sees the body where the filter has it: a start without knowledge of its own."""
+        """Start vision at the filter's pose, without information of its own."""
         self.x[_CLONE] = self.x[_POSE]
         self.P[_CLONE] = self.P[_POSE]
         self.P[:, _CLONE] = self.P[:, _POSE]
@@ -263,7 +263,7 @@ class Ekf:
             if self.refused_in_row[n] < self.config.refusals_before_recovery:
                 return Outcome.REFUSED
             outcome = Outcome.RECOVERED
-            # The filter has been sure of the wrong thing: believe it less, by what the innovation says.
+            # The filter was overconfident: inflate its covariance according to the innovation.
             factor = min(self.nis / n, 1e4)
             P_Ht = P_Ht * factor  # before P changes: it may be a view of it
             self.P = self.P * factor

@@ -1,8 +1,7 @@
 """The Kalman filter and the visual map: tracked poses go in as metric increments, predicted poses come out.
 
-The filter never learns where the map lies in the drone's world. It knows where the body is relative to where vision
-last saw it, and that is all that a prediction in the map needs: a map that is moved, turned or scaled moves the
-prediction along.
+The filter does not estimate where the map lies in the drone's world, only the body relative to its last visual pose,
+which is all that a prediction in the map needs: a map that is moved, rotated or scaled transforms the prediction.
 """
 
 import math
@@ -47,10 +46,10 @@ class Metric:
 
 @dataclass(frozen=True, slots=True)
 class FilterView:
-    """The filter's opinion at one stamp, relative to a visual pose of the map."""
+    """The filter's estimate at one stamp, relative to a visual pose of the map."""
 
     seen: VisualPose
-    """Where vision last saw the camera."""
+    """The last visual pose of the camera."""
     to_s: float
     """Stamp of the estimate on the frames' clock."""
     T_seen_c: FloatArray
@@ -149,7 +148,7 @@ class FilterFeed:
 
 @dataclass(frozen=True, slots=True)
 class FrozenFilter:
-    """The filter at one moment, never changed again."""
+    """An immutable copy of the filter."""
 
     ekf: BufferedEkf
     seen: VisualPose

@@ -1,4 +1,4 @@
-r"""Metric scale from velocity and height together, with noise whose kind is told by the flight itself.
+r"""Metric scale from velocity and height together, with noise models selected by the flight's residuals.
 
 Unknowns are :math:`\theta = (s, s\,\delta)`: metres per map unit and a small rotation of the map against the drone's
 world. Both kinds of measurement are linear in them, so each gives information on :math:`\theta` and the two add up:
@@ -28,7 +28,7 @@ _LEAST_WEIGHT = 1e-3
 _MIN_DISPLACEMENTS = 6
 _MIN_HEIGHTS = 6
 _BELIEF = 20.0
-"""Residuals that the expected noise counts for when the real one is judged."""
+"""Weight of the expected noise against the observed one, in residuals."""
 _USUAL_BIAS_M_S = 0.01
 _USUAL = (_USUAL_BIAS_M_S, 0.03)
 """Standard deviations of the velocity bias [m/s] and of the visual drift [m] before any are told apart."""
@@ -46,7 +46,7 @@ _WHEN_TOLD_APART = 2
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """What one kind of measurement says of ``theta`` ``(4,)``."""
+    """Information of one kind of measurement on ``theta`` ``(4,)``."""
 
     information: FloatArray
     """``(4, 4)``"""
@@ -234,7 +234,7 @@ def _of_changes(apart_s: FloatArray, duration_s: FloatArray, memory_s: float) ->
 
 @dataclass(frozen=True, slots=True)
 class _Slow:
-    """Noise with a memory: covariance ``(N, N)``, the part of it that is velocity bias, log prior."""
+    """Correlated noise: covariance ``(N, N)``, the part due to velocity bias, log prior."""
 
     covariance: FloatArray
     bias: FloatArray
@@ -267,7 +267,7 @@ def _best(
     target: FloatArray,
     prior: FloatArray,
 ) -> _Fit | None:
-    """Generalised least squares ``(axes, N, unknowns)`` with the slow noise that explains most."""
+    """Generalised least squares ``(axes, N, unknowns)`` with the most likely correlated noise."""
     best, likeliest = None, -math.inf
     n = len(white)
     for noise in tried:

@@ -1,4 +1,4 @@
-"""Whether telemetry and images tell of the same motion; what does not agree is no evidence for the scale.
+"""Whether telemetry and images show the same motion; telemetry that disagrees is no evidence for the scale.
 
 The test is the correlation of what both say of the same half seconds: displacements, turns, changes of height. It needs
 no scale. How much is needed was measured: displacements of six recordings and two real flights against those of another
@@ -45,14 +45,14 @@ class Verdict(StrEnum):
     """What a comparison says."""
 
     OPEN = "open"
-    """Too little motion, or neither here nor there."""
+    """Too little motion, or undecided."""
     AGREES = "agrees"
     CONTRADICTS = "contradicts"
 
 
 @dataclass(frozen=True, slots=True)
 class Agreement:
-    """How well two series of the same motion go together."""
+    """Agreement of two series of the same motion."""
 
     correlation: float = 0.0
     """0 when one of them does not move."""
@@ -89,7 +89,7 @@ def agreement(seen: FloatArray, told: FloatArray, least_seen: float, least_told:
     Args:
         seen: ``(N, 1)`` or ``(N, 3)``, in any unit.
         told: The same shape, in any unit.
-        least_seen: Length below which ``seen`` is noise; infinite when nobody knows.
+        least_seen: Length below which ``seen`` is noise; infinite if unknown.
         least_told: The same of ``told``.
 
     Returns:
@@ -113,7 +113,7 @@ def _moving(x: FloatArray, least: float) -> NDArray[np.bool_]:
 
 
 def _tamed(x: FloatArray) -> FloatArray:
-    """Long ones cut to thrice the median: one wild reading must not decide."""
+    """Winsorised at three times the median, against outliers."""
     length = np.linalg.norm(x, axis=1)
     moved = length[length > 0]
     if len(moved) == 0:
@@ -137,7 +137,7 @@ class AtOdds:
     """``telemetry`` (velocities) or ``height``, whichever the depth network confirms; None when it confirms neither."""
 
     def warning(self) -> str:
-        """What is not used, and why."""
+        """Warning about what is not used."""
         said = (
             f"telemetry's velocities and heights contradict each other, {self.by_velocity:.3g} and "
             f"{self.by_height:.3g} m per map unit"
@@ -170,7 +170,7 @@ class Reread:
 
 
 class Trust:
-    """Verdicts on a flight's readings, each kept until the opposite is proven."""
+    """Verdicts on a flight's readings, each kept until contradicted."""
 
     def __init__(self) -> None:
         self.latest: dict[Reading, Agreement] = {}
@@ -202,7 +202,7 @@ class Trust:
         return self.elsewhere_s is None and self.verdict(Reading.VELOCITY) is Verdict.AGREES
 
     def height(self, reading: Reading) -> bool:
-        """Whether a height may: it needs the vertical, and its own proof where nothing else proves this flight."""
+        """Whether a height may: it needs the vertical, and its own evidence if nothing else confirms the flight."""
         attitude, own = self.verdict(Reading.ATTITUDE), self.verdict(reading)
         if self.elsewhere_s is not None or attitude is Verdict.CONTRADICTS:
             return False
@@ -210,7 +210,7 @@ class Trust:
 
     @property
     def motion(self) -> bool:
-        """Whether telemetry may carry the pose on where the images are lost: nothing speaks against it."""
+        """Whether telemetry may predict the pose without images: not contradicted."""
         moved = (Reading.VELOCITY, Reading.ATTITUDE)
         return self.elsewhere_s is None and not any(self.verdict(r) is Verdict.CONTRADICTS for r in moved)
 

@@ -1,4 +1,4 @@
-"""Where the camera is at a stamp without an image: by visual velocity, by the Kalman filter, by telemetry alone.
+"""Prediction of the camera at a stamp without an image: by visual velocity, by the Kalman filter, by telemetry alone.
 
 Two frames a twentieth of a second apart tell the velocity better than state messages of whole dm/s and degrees; after a
 fifth of a second it is the other way round. So the filter's prediction and that of constant velocity are averaged by
@@ -96,7 +96,7 @@ def by_vision(last: VisualPose, previous: VisualPose | None, stamp_s: float) -> 
 
 @dataclass(frozen=True, slots=True)
 class Carried:
-    """What telemetry needs to carry a pose on."""
+    """Inputs for propagating a pose by telemetry."""
 
     track: TelemetryTrack
     delay_s: float

@@ -1,9 +1,9 @@
-"""From the map's own units and axes to the world that is published: metres when they are known, z up.
+"""Transform from map units and axes to the published world: metric if known, z up.
 
 The map itself is never rescaled, and while flying its units are published as they are: the depth network's metres at
 its start, or arbitrary ones. Only sensors of the drone that are sure and contradict what is published revise it, and
 each revision is an event that the output counts: a scale that follows every new estimate would bend the trajectory.
-The similarity then turns about the present camera, so that the live pose does not jump. The final results use the
+The similarity then scales about the current camera, so that the live pose does not jump. The final results use the
 final scale throughout.
 """
 
@@ -20,10 +20,11 @@ T_LEVEL = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0
 """``T_w_c`` of a level camera that looks along world x: the first pose when nothing tells the attitude."""
 
 SURE = 0.1
-"""Relative sigma of a scale that may revise what is published: better than any depth network in a new place."""
+"""Maximum relative sigma of a scale that may revise the published one: better than any depth network in a new
+place."""
 
 CONTRADICTION = 2.0
-"""Sigmas that the published scale may be off before it is revised."""
+"""Deviation of the published scale that triggers a revision [sigmas]."""
 
 MEASURED = frozenset({"telemetry", "height"})
 """Sources that measure metres; a depth network has guessed them at the start already."""

@@ -20,7 +20,7 @@ _MIN_DISPLACEMENTS = 6
 
 @dataclass(frozen=True, slots=True)
 class LogScale:
-    """One source's opinion on the logarithm of metres per map unit."""
+    """One source's estimate of the logarithm of metres per map unit."""
 
     log_scale: float
     sigma: float
@@ -181,14 +181,14 @@ def floor_segments(stamp_s: FloatArray, z_m: FloatArray, z_predicted_m: FloatArr
 
 
 def fuse(opinions: Sequence[LogScale]) -> ScaleEstimate:
-    """Information-weighted mean of independent opinions; sigma grows with their disagreement."""
+    """Information-weighted mean of independent estimates; sigma grows with their disagreement."""
     if not opinions:
         return ScaleEstimate()
     log_scale = np.array([o.log_scale for o in opinions])
     weight = np.array([o.sigma for o in opinions]) ** -2.0
     mean = float(np.sum(weight * log_scale) / np.sum(weight))
     sigma = float(np.sum(weight)) ** -0.5
-    if len(opinions) > 1:  # Birge ratio: opinions that disagree beyond their sigmas widen the result
+    if len(opinions) > 1:  # Birge ratio: estimates that disagree beyond their sigmas widen the result
         birge = math.sqrt(float(np.sum(weight * (log_scale - mean) ** 2)) / (len(opinions) - 1))
         sigma *= max(1.0, birge)
     names = dict.fromkeys(o.source for o in opinions)
