@@ -5,7 +5,6 @@ import json
 import reprlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,8 @@ from edgeslam_torch.errors import WeightsError
 from edgeslam_torch.models.layout import INPUT_MULTIPLE, HasShape, Output, Padding, Variant, variant_of
 
 HEADER_KEY = "edgeslam"
+OTHER_NETWORK = "other"
+"""``variant`` of a network that is no FastDepth; it comes as an ONNX file, which holds its own graph."""
 DEFAULT_WEIGHTS = Path(__file__).parent / "weights" / "default.safetensors"
 MAX_INPUT_PX = 2048
 """Maximum height and width; four times the training size."""
@@ -56,9 +57,9 @@ class Metadata:
     notes: str = ""
 
     def __post_init__(self) -> None:
-        for name, kind in _CHOICES.items():
-            if getattr(self, name) not in list(kind):
-                self._refuse(name, f"one of {', '.join(kind)}")
+        for name, choices in _CHOICES.items():
+            if getattr(self, name) not in choices:
+                self._refuse(name, f"one of {', '.join(choices)}")
         for name in ("input_height", "input_width"):
             size = getattr(self, name)
             if type(size) is not int or size % INPUT_MULTIPLE or not INPUT_MULTIPLE <= size <= MAX_INPUT_PX:
@@ -93,7 +94,11 @@ class Metadata:
         raise ValueError(f"{name} must be {wanted}, got {reprlib.repr(getattr(self, name))}")
 
 
-_CHOICES: dict[str, type[StrEnum]] = {"variant": Variant, "padding": Padding, "output": Output}
+_CHOICES: dict[str, list[str]] = {
+    "variant": [*Variant, OTHER_NETWORK],
+    "padding": [*Padding],
+    "output": [*Output],
+}
 
 
 def _is_number(value: object, low: float, high: float) -> bool:

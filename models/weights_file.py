@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from edgeslam_torch.errors import WeightsError
 from edgeslam_torch.models.layout import STEP_COUNTER, Variant, check_shapes
-from edgeslam_torch.models.record import HEADER_KEY, Metadata, metadata_from_json, upstream_metadata
+from edgeslam_torch.models.record import HEADER_KEY, OTHER_NETWORK, Metadata, metadata_from_json, upstream_metadata
 
 Array = NDArray[Any]
 MAX_FILE_BYTES = 1 << 29
@@ -119,6 +119,8 @@ def check_weights(state: Mapping[str, Stored], metadata: Metadata) -> dict[str, 
     Raises:
         WeightsError: With the reason, without the file's name.
     """
+    if metadata.variant == OTHER_NETWORK:
+        raise WeightsError("says that it is no FastDepth; another network comes as an ONNX file")
     check_shapes(state, Variant(metadata.variant), metadata.uncertainty)
     return {k: _counter(k, v) if k.endswith(STEP_COUNTER) else _as_float32(k, v) for k, v in state.items()}
 

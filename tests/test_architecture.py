@@ -162,6 +162,20 @@ def test_import_that_the_table_does_not_allow_is_noticed(module, name):
     assert forbidden(f"edgeslam_torch.{module}", ["edgeslam_torch.errors", "numpy.linalg"]) == []
 
 
+MAX_FILES, MAX_LINES = 15, 2500
+TOO_BIG = {"edgeslam_torch/fusion"}
+"""Folders that still have to be split."""
+
+
+def test_no_folder_is_too_big():
+    folders: dict[str, list[Path]] = {}
+    for path in sources():
+        folders.setdefault(str(path.parent.relative_to(ROOT)), []).append(path)
+    lines = {name: sum(p.read_text(encoding="utf-8").count("\n") for p in files) for name, files in folders.items()}
+    too_big = {name for name, files in folders.items() if len(files) > MAX_FILES or lines[name] > MAX_LINES}
+    assert too_big == TOO_BIG
+
+
 @pytest.mark.parametrize("path", PARSED, ids=lambda p: str(p.relative_to(ROOT)))
 def test_packages_that_do_not_belong_are_not_imported(path):
     tops = {name.split(".")[0] for name in PARSED[path]}
