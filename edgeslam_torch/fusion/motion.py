@@ -79,6 +79,9 @@ class MotionFusion:
         self._fit = TelemetryFit(shortfall_m_s=0.5 * config.velocity_step_m_s if truncates else 0.0)
         self._by_telemetry: LogScale | None = None
         """Scale by the drone's own sensors; held while they say nothing new."""
+        self._scale = ScaleEstimate()
+        self._scale_rests_on: tuple[LogScale | None, DepthScale | None] = (None, None)
+        """Opinions that it was made of: it is asked for several times a frame."""
         self._fitted_s = -math.inf
         self._counts: Counter[str] = Counter()
 
@@ -180,7 +183,10 @@ class MotionFusion:
 
     def scale(self) -> ScaleEstimate:
         """Metres per map unit with sigma and source; held while the motion says nothing new."""
-        return fuse(self._settled().used)
+        rests_on = self._by_telemetry, self._depth.scale()
+        if rests_on != self._scale_rests_on:
+            self._scale_rests_on, self._scale = rests_on, fuse(self._settled().used)
+        return self._scale
 
     def _settled(self) -> Settled:
         """Opinions that may be averaged."""

@@ -82,10 +82,15 @@ def _spread(values: list[float]) -> str:
 class Truth:
     """Camera poses at any time between the first and the last."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, stamps_s: FloatArray, T_w_c: FloatArray) -> None:
+        self.stamps_s, self.T_w_c = stamps_s, T_w_c
+        self._turn = Slerp(stamps_s, Rotation.from_matrix(T_w_c[:, :3, :3]))
+
+    @classmethod
+    def of(cls, folder: Path) -> "Truth":
+        """Ground truth of a recording."""
         truth = read_trajectory(folder / "groundtruth.txt")
-        self.stamps_s, self.T_w_c = truth.stamps_s, truth.T_w_c
-        self._turn = Slerp(self.stamps_s, Rotation.from_matrix(self.T_w_c[:, :3, :3]))
+        return cls(truth.stamps_s, truth.T_w_c)
 
     def at(self, stamp_s: float) -> FloatArray:
         """``T_w_c`` ``(4, 4)``."""
@@ -158,9 +163,8 @@ def record(folder: Path, course: str, seed: int, speed_m_s: float, seconds: floa
     return target
 
 
-def told(folder: Path, delay_s: float, seed: int, truncated: bool) -> list[TelemetrySample]:
-    """A Tello's state messages along a recording's ground truth."""
-    truth = read_trajectory(folder / "groundtruth.txt")
+def told(truth: Truth, delay_s: float, seed: int, truncated: bool) -> list[TelemetrySample]:
+    """A Tello's state messages along a flight."""
     faults = TelemetryFaults(video_delay_s=delay_s)
     rng = np.random.default_rng(seed)
     if not truncated:
@@ -198,11 +202,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for course in args.course or ["room", "corridor"]:
         for seed in range(args.seeds):
             folder = record(args.folder, course, seed, args.speed, args.seconds)
-            telemetry = told(folder, args.delay, seed, args.truncated)
+            truth = Truth.of(folder)
+            telemetry = told(truth, args.delay, seed, args.truncated)
             for name, settings in variants.items():
                 recording = open_source(folder)
                 assert isinstance(recording, Recording)
-                errors = judge(ask(recording, telemetry, settings), Truth(folder), args.delay)
+                errors = judge(ask(recording, telemetry, settings), truth, args.delay)
                 totals[name].add(errors)
                 sys.stdout.write(errors.line(f"{course} {seed} {name}") + "\n")
                 sys.stdout.flush()
