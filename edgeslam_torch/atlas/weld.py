@@ -70,12 +70,13 @@ def weld(slam_map: SlamMap, camera: Camera, links: list[Link], lm: LmConfig) -> 
             )
             slam_map.join_pieces(link.keyframe, [link.other])
         fused = before - len(slam_map.anchors)
-    refine_all(slam_map, camera, replace(lm, max_iterations=ITERATIONS))
+    thorough = replace(lm, max_iterations=ITERATIONS if lm.max_iterations else 0)  # none where reprojection is off
+    refine_all(slam_map, camera, thorough)
     with slam_map.lock:
         for link in links:
             fused += _look_around(slam_map, camera, link)
         slam_map.refresh_anchors(np.flatnonzero(slam_map.anchors.alive))
-    refine_all(slam_map, camera, replace(lm, max_iterations=ITERATIONS))
+    refine_all(slam_map, camera, thorough)
     logger.info("welded at %d keyframes, %d anchors in common", len(links), fused)
     return fused
 

@@ -66,9 +66,17 @@ class RunFolder:
             return None
 
     @property
+    def pose_rows(self) -> tuple[dict[str, str], ...]:
+        """Rows of ``status.csv`` that belong to poses of ``trajectory``: of a run in pieces, those of the largest."""
+        if len(self.status) == len(self.trajectory):
+            return self.status
+        there = {round(stamp, 6) for stamp in self.trajectory.stamps_s.tolist()}
+        return tuple(row for row in self.status if round(float(row.get("stamp_s") or "nan"), 6) in there)
+
+    @property
     def trusted_frames(self) -> int:
-        """Frames whose final pose is supported by the map; all without ``status.csv``."""
-        return sum(map(is_supported, self.status)) if self.status else len(self.trajectory)
+        """Poses of ``trajectory`` supported by the map; all without ``status.csv``."""
+        return sum(map(is_supported, self.pose_rows)) if self.status else len(self.trajectory)
 
 
 def open_run(path: Path | str) -> RunFolder:

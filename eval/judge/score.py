@@ -72,7 +72,7 @@ def _own_figures(run: RunFolder) -> dict[str, Any]:
     sigma = scale.get("sigma")
     return {
         "frames": summary.get("frames"),
-        "supported_end": np.sum(support.at_end(run.status, run.trajectory.T_w_c, p_w, camera)) / offered,
+        "supported_end": np.sum(support.at_end(run.pose_rows, run.trajectory.T_w_c, p_w, camera)) / offered,
         "supported_live": np.sum(support.live(run.status)) / offered,
         "losses": summary.get("lost_events"),
         "pieces": sum(piece["supported"] > 0 for piece in summary.get("pieces") or ()),

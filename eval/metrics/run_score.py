@@ -195,7 +195,7 @@ def _coverage(
 
 
 def _first_trusted(run: RunFolder) -> float:
-    for row, stamp in zip(run.status, run.trajectory.stamps_s, strict=False):
+    for row, stamp in zip(run.pose_rows, run.trajectory.stamps_s, strict=False):
         if is_supported(row):
             return float(stamp)
     return float(run.trajectory.stamps_s[0])

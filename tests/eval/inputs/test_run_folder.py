@@ -1,0 +1,16 @@
+"""A run's folder as evaluation reads it."""
+
+from edgeslam_torch.eval.inputs.run_folder import is_supported, open_run
+
+
+def test_rows_are_those_of_the_poses_where_a_run_is_in_pieces(tmp_path):
+    """Frames 2 and 3 are another piece's, in a file of its own."""
+    whole = (0, 1, 4, 5)
+    (tmp_path / "trajectory.txt").write_text("".join(f"{0.1 * i:.6f} {i} 0 0 0 0 0 1\n" for i in whole))
+    rows = [f"{i},{0.1 * i:.6f},{int(i != 5)}" for i in range(6)]
+    (tmp_path / "status.csv").write_text("index,stamp_s,supported\n" + "\n".join(rows) + "\n")
+    run = open_run(tmp_path)
+    assert [int(row["index"]) for row in run.pose_rows] == list(whole)
+    assert [is_supported(row) for row in run.pose_rows] == [True, True, True, False]
+    assert run.trusted_frames == 3
+    assert len(run.status) == 6
