@@ -272,7 +272,7 @@ def pushed_and_centred(emulator):
     return [text for text in emulator.heard if text.startswith("rc ")]
 
 
-def test_sticks_that_nobody_holds_any_more_are_centred(emulate):
+def test_released_sticks_are_centred(emulate):
     """The controller is dead: one push, then nothing. The drone stands still, whatever keeps it listening."""
     emulator, address = emulate()
     with Tello(address, allow_motion=True, limits=QUICK) as tello:
@@ -379,7 +379,7 @@ def stranger():
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "localhost", "127.1"])
-def test_pictures_of_strangers_are_refused(emulate, stranger, caplog, host):
+def test_pictures_of_other_senders_are_refused(emulate, stranger, caplog, host):
     """A stranger's whole film, keyframe first, shows nowhere; that it came is counted and said once."""
     _, address = emulate()
     film = [packet for k in range(5) for packet in Encoder(64, 48, 30).encode(np.full((48, 64, 3), 40 * k, np.uint8))]
@@ -397,7 +397,7 @@ def test_pictures_of_strangers_are_refused(emulate, stranger, caplog, host):
     assert said == ["video port: packets from 127.0.0.2 are refused; only 127.0.0.1 is listened to"]
 
 
-def test_state_of_strangers_is_refused(emulate, stranger):
+def test_state_of_other_senders_is_refused(emulate, stranger):
     """Nobody else lands our drone by telling of an empty battery."""
     _, address = emulate()
     with Tello(address, allow_motion=True) as tello:
@@ -413,7 +413,7 @@ def test_state_of_strangers_is_refused(emulate, stranger):
         assert tello.latest.fields["bat"] > 90
 
 
-def test_answers_of_strangers_are_refused(emulate, stranger):
+def test_answers_of_other_senders_are_refused(emulate, stranger):
     emulator, address = emulate()
     limits = TelloLimits(timeout_s=PATIENCE_S, retries=0)
     with Tello(address, limits=limits) as tello:
@@ -488,7 +488,7 @@ def test_an_outage_of_three_seconds_in_flight_is_survived(emulate):
     assert emulator.drone.mode is Mode.GROUND
 
 
-def test_nobody_there_is_an_error_with_a_remedy():
+def test_no_answer_is_an_error_with_a_remedy():
     command, state, video = free_ports(3)
     limits = TelloLimits(timeout_s=0.1, retries=1)
     address = TelloAddress("127.0.0.1", command, state, video)

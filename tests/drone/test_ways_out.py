@@ -187,7 +187,7 @@ def test_the_terminal_is_closed(tmp_path):
     check_folder(tmp_path / "flight")
 
 
-def test_nobody_reads_what_is_printed(tmp_path):
+def test_a_closed_pipe_ends_quietly(tmp_path):
     """``edgeslam record --fly | head -1``: the flight goes on, and ends as it is told."""
     with emulated() as (emulator, url), recording(url, tmp_path / "flight") as process:
         assert "focal length" in process.stdout.readline()

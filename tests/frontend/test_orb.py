@@ -61,7 +61,7 @@ def test_keypoints_come_undistorted(rng):
     np.testing.assert_array_equal(bent.descriptors, straight.descriptors)
 
 
-def test_corners_of_every_pyramid_level_lie_where_they_are(rng):
+def test_corners_of_every_pyramid_level_are_unbiased(rng):
     """Squares drawn four times too large and shrunk: all four kinds of corner together are off by nothing.
 
     OpenCV's own positions are off by 0.5 to 1.5 px on the coarse levels, always up and to the left.

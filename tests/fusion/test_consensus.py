@@ -13,7 +13,7 @@ def opinion(value, sigma, source):
     return LogScale(math.log(value), sigma, source)
 
 
-def test_opinions_that_agree_are_all_used():
+def test_consistent_estimates_are_all_used():
     told, network = opinion(3.0, 0.02, "telemetry+height"), opinion(2.6, 0.15, "depth")
     settled = settled_with_network(told, network, in_domain=True)
     assert settled.used == (told, network)

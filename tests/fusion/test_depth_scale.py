@@ -111,7 +111,7 @@ def test_each_sign_of_doubt_widens(rng):
     assert sigma([replace(ratio, log_ratio=x) for x in rng.normal(0.3, 0.3, 20)]) > 1.1 * best
 
 
-def test_more_keyframes_never_make_it_surer_than_the_network_is(rng):
+def test_more_keyframes_never_reduce_sigma_below_the_networks(rng):
     held = DepthRatios(LEAST)
     for x in rng.normal(0.2, 0.1, 500):
         held.add(DepthRatio(x, 0.1))

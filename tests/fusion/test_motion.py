@@ -100,7 +100,7 @@ def test_a_network_that_sees_no_depth_gives_no_metres_and_says_so():
     assert "out of its domain" in warning
 
 
-def test_telemetry_stays_surer_than_depth_under_a_guessed_focal_length(rng, swinging, replay):
+def test_telemetry_keeps_a_smaller_sigma_than_depth_under_a_guessed_focal_length(rng, swinging, replay):
     motion = swinging(20.0)
     samples = simulate(rng, motion.stamps_s, motion.T_w_c, T_B_C, faults=EXACT).samples()
     gauge = motion.in_gauge(rng)

@@ -188,7 +188,7 @@ def test_attitude_of_another_flight_is_named_and_takes_the_heights_with_it(rng, 
 
 
 @pytest.mark.parametrize("late_s", [1.2, -2.0])
-def test_a_wrong_clock_is_said_with_what_would_mend_it(rng, swinging, replay, late_s):
+def test_a_wrong_clock_is_reported_with_its_correction(rng, swinging, replay, late_s):
     """The video is 0.5 s late by itself: stamps 1.2 s late make a delay of -0.7 s, which nobody searches."""
 
     def spoil(rng, samples, motion):

@@ -89,7 +89,7 @@ def test_a_hole_in_time_starts_a_new_segment():
     np.testing.assert_array_equal(floor_segments(np.array([0.0, 0.1, 2.0]), np.ones(3), np.ones(3), 0.1), [0, 0, 1])
 
 
-def test_no_opinion_is_arbitrary_units():
+def test_no_estimate_means_arbitrary_units():
     assert fuse([]).units is Units.ARBITRARY
     assert fuse([]).source == "none"
 
@@ -102,6 +102,6 @@ def test_fused_scale_is_the_weighted_mean_with_all_sources_named():
     assert fused.sigma < 0.01
 
 
-def test_opinions_that_disagree_widen_sigma():
+def test_inconsistent_estimates_widen_sigma():
     fused = fuse([LogScale(0.0, 0.01, "telemetry"), LogScale(0.3, 0.01, "height")])
     assert fused.sigma > 0.1

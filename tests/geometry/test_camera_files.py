@@ -76,7 +76,7 @@ def test_wrong_file_is_refused_by_name(tmp_path, text, words):
 
 
 @pytest.mark.parametrize("line", ["", "distortion_model:\n", "distortion_model: none\n"])
-def test_a_lens_that_nobody_describes_has_no_distortion(tmp_path, line):
+def test_a_lens_without_description_has_no_distortion(tmp_path, line):
     (tmp_path / "c.yaml").write_text(GOOD + line)
     assert not load_camera(tmp_path / "c.yaml").is_distorted
 

@@ -57,7 +57,7 @@ def test_transform_moves_points_as_the_matrix_does(rng):
     np.testing.assert_allclose(se3.transform(T, p), (T @ np.c_[p, np.ones(7)].T).T[:, :3], atol=1e-12)
 
 
-def test_orthonormalised_keeps_a_motion_and_mends_a_drifted_one(rng):
+def test_orthonormalised_keeps_a_motion_and_corrects_a_drifted_one(rng):
     T = se3.exp(rng.normal(size=6))
     np.testing.assert_allclose(se3.orthonormalised(T), T, atol=1e-14)
     drifted = T.copy()

@@ -18,7 +18,7 @@ def test_weight_is_the_derivative_of_the_cost(kernel):
     assert weight[0].item() == pytest.approx(1.0)
 
 
-def test_kernels_order_by_how_little_they_listen_to_outliers():
+def test_kernels_order_by_their_weight_of_outliers():
     s = torch.tensor([100.0], dtype=torch.float64)
     weights = [float(rho(s, k, 2.0)[1]) for k in (Kernel.L2, Kernel.HUBER, Kernel.CAUCHY, Kernel.TUKEY)]
     assert weights == sorted(weights, reverse=True)

@@ -74,7 +74,7 @@ def test_young_anchors_that_are_not_found_again_go(rng):
     check_map(points.map)
 
 
-def test_a_full_map_forgets_the_keyframe_that_is_farthest_away(rng):
+def test_a_full_map_removes_the_farthest_keyframe(rng):
     """Thirty cameras in a row, of which no one is redundant: twelve stay, and the window is left alone."""
     points = PointMap(rng, 300, 30)
     anchor_of = points.fill([0, 1])
@@ -110,7 +110,7 @@ def test_keyframes_whose_anchors_others_see_go_but_the_first_and_the_last_stay(r
         assert len(missed[missed >= 0]) < 0.4 * len(points.point_of[id])
 
 
-def test_keyframe_that_nobody_shares_is_taken_in(rng):
+def test_keyframe_without_covisible_ones_is_inserted(rng):
     points = PointMap(rng, 100, 3)
     points.fill([0, 1])
     insert(make_mapper(points), points, 2, np.full(100, -1))

@@ -145,7 +145,7 @@ def test_https_is_not_left_by_a_redirect() -> None:
                 handler.redirect_request(request, body, 302, "", {}, end)
 
 
-def test_a_server_that_speaks_no_http_is_one_line(server: str, tmp_path: Path) -> None:
+def test_a_server_without_http_is_one_line(server: str, tmp_path: Path) -> None:
     with pytest.raises(WeightsError, match="download failed") as caught:
         download((f"{server}/garbage",), tmp_path / "w")
     assert "\n" not in str(caught.value)

@@ -254,7 +254,7 @@ def test_fields_of_newer_files_are_ignored() -> None:
     assert metadata_from_json(json.dumps(asdict(METADATA) | {"lens": "fisheye"})) == METADATA
 
 
-def test_nobody_can_write_an_impossible_record() -> None:
+def test_an_impossible_record_cannot_be_written() -> None:
     with pytest.raises(ValueError, match="focal_px must be"):
         Metadata(focal_px=float("nan"))
     with pytest.raises(ValueError, match="sigma_floor must be positive"):

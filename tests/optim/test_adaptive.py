@@ -57,7 +57,7 @@ def test_scaled_terms_have_unit_residuals_and_terms_that_are_off_stay_off():
     assert not off.pair_inv_sigma.any()
 
 
-def test_a_wrong_sigma_is_mended_and_the_poses_gain():
+def test_a_wrong_sigma_is_corrected_and_improves_the_poses():
     window = seeded_window(4, replace(SMALL, anchors=60, observations=200), Noise(px=0.7))
     edges = window.problem.edges
     # Edges stated far too poor (20 px), as a constant weight may be in another scene.

@@ -80,7 +80,7 @@ def test_what_is_written_is_read_back(tmp_path):
     assert math.isnan(second.tof_m)
 
 
-def test_a_row_torn_by_a_crash_costs_that_row_only(tmp_path):
+def test_a_row_cut_by_a_crash_costs_only_that_row(tmp_path):
     path = tmp_path / "telemetry.csv"
     with TelemetryWriter(path) as writer:
         writer.write(1.0, {"vgx": 1.0})

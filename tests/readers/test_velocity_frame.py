@@ -61,7 +61,7 @@ def test_hover_and_missing_columns_say_nothing(rng):
 
 @pytest.mark.data
 @pytest.mark.parametrize("name", ["flight_a", "flight_b"])
-def test_real_tellos_speak_of_the_world(data_dir, name):
+def test_real_tellos_report_world_velocities(data_dir, name):
     table = read_table(data_dir / "tello_telemetry" / f"{name}.csv")
     units = detect_units(table)
     assert (units.velocity_m_s, units.z_down, units.body_frame) == (0.1, True, False)

@@ -102,7 +102,7 @@ def test_parallel_lines_do_not_fix_a_pose():
     assert pose is None or not pose.is_fixed
 
 
-def test_a_strange_image_is_not_believed(tracker, flight, rng):
+def test_an_image_of_another_place_is_rejected(tracker, flight, rng):
     noise = rng.integers(0, 255, (240, 320), dtype=np.uint8)
     pose = tracker.refine(noise, se3.inverse(flight.T_w_c[0]))
     other = film(stairs_world(99), CAMERA, sideways(1, 0.0)).frames[0].image[..., 1].copy()

@@ -183,7 +183,7 @@ def test_guessed_map_is_replaced_and_the_map_stays_consistent(points):
 
 
 @pytest.mark.parametrize("network", [False, True])
-def test_without_a_network_two_views_must_be_surer(points, network):
+def test_without_a_network_two_views_need_a_smaller_sigma(points, network):
     """A network tells a flat scene from a real one; alone, only a sure direction of the second camera does."""
     if network:
         flat = np.ones((CAMERA.height, CAMERA.width), np.float32)

@@ -111,7 +111,7 @@ def test_pairs_that_say_nothing_are_refused_by_name(make_motion, make_points, wo
     assert "0 of 8" in estimate.reason
 
 
-def test_good_pairs_speak_when_most_are_useless(rng):
+def test_good_pairs_suffice_when_most_are_useless(rng):
     mixed = [*pairs(rng, 517.0, 10), *pairs(rng, 517.0, 15, 0.3, turning), *pairs(rng, 517.0, 15, 0.3, still)]
     estimate = focal_from_matches(mixed, WIDTH, HEIGHT)
     assert estimate.focal_px == pytest.approx(517.0, rel=0.03)

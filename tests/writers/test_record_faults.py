@@ -128,7 +128,7 @@ def test_garbage_on_every_port(tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_strangers_change_nothing_and_are_told_of(tmp_path, capsys):
+def test_packets_of_other_senders_change_nothing_and_are_reported(tmp_path, capsys):
     """A film and an empty battery from another address: the recording holds the drone's own pictures alone."""
     try:
         other = open_udp(("127.0.0.2", 0), "stranger")

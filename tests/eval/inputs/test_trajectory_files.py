@@ -72,7 +72,7 @@ def test_missing_binary_and_empty_folders_are_named(tmp_path: Path) -> None:
         read_trajectory(tmp_path)
 
 
-def test_mended_rows_are_reported(tmp_path: Path) -> None:
+def test_corrected_rows_are_reported(tmp_path: Path) -> None:
     rows = [GOOD[2], GOOD[1], GOOD[1], GOOD[0], "0.3 inf 0 0 0 0 0 1"]
     found = read_trajectory(tum(tmp_path / "t.txt", rows))
     assert found.stamps_s.tolist() == [0.0, 0.1, 0.2]

@@ -10,7 +10,7 @@ from edgeslam_torch.readers.source import open_source
 
 
 @pytest.mark.parametrize("layout", layouts(), ids=lambda layout: layout.KIND)
-def test_folder_of_something_else_is_nobodys(layout, tmp_path):
+def test_folder_of_something_else_is_not_recognised(layout, tmp_path):
     (tmp_path / "notes.txt").write_text("")
     assert not layout.recognises(tmp_path)
     assert layout_of(tmp_path) is None

@@ -70,7 +70,7 @@ def test_line_that_is_none_is_left_out_by_name(tmp_path: Path) -> None:
         load_depth_folder(folder)
 
 
-def test_unit_that_nobody_states_is_tums_and_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_unstated_unit_is_tums_with_a_remark(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     folder = write_folder(tmp_path / "a", 1)
     CAMERA.save(folder / "camera.yaml")
     depth = load_depth_folder(folder).views[0].depth_m
