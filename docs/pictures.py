@@ -22,7 +22,7 @@ from browser import PROGRAM, Browser  # noqa: E402  # the tests' own, not instal
 IMAGES = ROOT / "docs" / "images"
 _WIDTH_PX = 1400
 _LEVELS = 51
-"""Values a channel: half the bytes, and nobody sees it; 255 and 0 stay what they are."""
+"""Levels per channel: half the file size without visible difference; 0 and 255 are kept."""
 
 _ALL_DRAWN = """new Promise(done => {
   const look = () => viewer.dirty || viewer.moving || viewer.drawn < viewer.total() ?

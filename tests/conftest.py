@@ -19,7 +19,7 @@ settings.load_profile("edgeslam")
 def pytest_configure(config: pytest.Config) -> None:
     """Hear signals that whoever started us ignores, as shells do for what runs in the background.
 
-    The programs under test would inherit that, and heed it, as `nohup` wants it.
+    The programs under test would inherit that, and keep ignoring it, as under `nohup`.
     """
     signal.signal(signal.SIGINT, signal.default_int_handler)
     for name in ("SIGTERM", "SIGHUP", "SIGQUIT"):

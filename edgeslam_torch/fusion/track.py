@@ -61,7 +61,7 @@ class Turn(IntEnum):
 
     AS_READ = 0
     FROM_BODY = 1
-    """They are in the axes of the body, though nobody said so."""
+    """They are in body axes, although not declared so."""
     BACK = -1
     """They were in the world before whoever read them turned them."""
 

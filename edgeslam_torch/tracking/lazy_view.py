@@ -1,4 +1,4 @@
-"""A frame whose features are extracted when somebody asks for them: between keyframes nobody does."""
+"""A frame whose features are extracted on first use; most frames between keyframes never need them."""
 
 from collections.abc import Callable
 from functools import cached_property

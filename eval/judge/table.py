@@ -15,7 +15,7 @@ _FOOTNOTES = (
     "metres unless they say otherwise; ATE after Sim(3) over all frames.",
     "Maps of recordings are judged against depth maps nearer than 5 m, those of simulations against the true surfaces. "
     "7scenes_redkitchen's depth maps are not registered to colour by its makers: the transformation was fitted to its "
-    "own images (eval/inputs/dataset.py), so that a few mm of its map's distances are that fit's.",
+    "own images (readers/layouts/seven_scenes.py), so that a few mm of its map's distances are that fit's.",
     "CPU, wall and memory are of the run alone (one thread, start-up and judging left out), on a machine that others "
     "may have used meanwhile; variants also decode the frames that they leave out.",
 )

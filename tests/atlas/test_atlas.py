@@ -1,4 +1,4 @@
-"""Two pieces of one place are found to be one, with exact truth; two places never are."""
+"""Two pieces of one place are joined, two different places never; exact ground truth."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ from edgeslam_torch.tracking.relocaliser import match_keyframe
 from edgeslam_torch.tracking.tracker import Tracker
 
 MISPLACED = sim3.exp(np.array([0.5, -0.8, 0.3, 0.4, -0.3, 0.6, np.log(1.4)]))
-"""Where the second piece believes to be."""
+"""Offset of the second piece's gauge."""
 
 
 class Pieces:
@@ -60,7 +60,7 @@ class Pieces:
         return Atlas(self.tracker, self.edges, self.log, LmConfig(diagnostics=False))
 
     def position_error(self):
-        """Of all keyframes after the one similarity that fits them best."""
+        """RMSE of all keyframes after Sim(3) alignment."""
         found = np.stack([k.centre_w for k in self.keyframes])
         truth = np.stack([-T[:3, :3].T @ T[:3, 3] for T in self.points.world.T_c_w])
         return np.linalg.norm(sim3.transform(sim3.fit(found, truth), found) - truth, axis=1).max()

@@ -48,7 +48,7 @@ class Watched:
 
 @pytest.fixture
 def quick(monkeypatch):
-    """The guard's patience in hundredths of seconds."""
+    """The guard with time-outs of hundredths of a second."""
     monkeypatch.setattr(tello_guard, "_AGAIN_S", 0.01)
     monkeypatch.setattr(tello_guard, "_SILENCE_S", 0.01)
     monkeypatch.setattr(tello_guard, "_HANGS_S", 0.05)
@@ -104,7 +104,7 @@ def test_centred_sticks_are_left_alone_while_the_program_hangs(quick):
 
 
 class Loud:
-    """A socket in whose answers somebody says ok at once, again and again."""
+    """A socket that receives repeated early ``ok`` datagrams."""
 
     def __init__(self, sender):
         self.sender, self.sent = sender, []

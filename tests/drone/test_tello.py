@@ -137,7 +137,7 @@ def test_a_drone_that_stops_answering_lands_itself_and_says_why(emulate):
 
 @pytest.mark.parametrize("seed", [3, 4, 5])
 def test_bad_air_is_flown_through(emulate, seed):
-    """5 % loss, garbage on every port: what matters is said until it is heard."""
+    """5 % loss and garbage on every port: safety-critical commands are repeated until acknowledged."""
     emulator, address = emulate(link=LinkFaults(loss=0.05, garbage=0.2, video_latency_s=0.02), seed=seed)
     limits = TelloLimits(timeout_s=0.5, retries=20, state_loss_s=PATIENCE_S, video_loss_s=PATIENCE_S)
     with Tello(address, allow_motion=True, limits=limits) as tello:
@@ -263,7 +263,7 @@ def test_a_drone_that_comes_down_by_itself_ends_the_flight(emulate):
         tello.connect(PATIENCE_S)
         tello.take_off()
         until(lambda: tello.latest.fields["h"] > 50)
-        emulator.drone.land()  # as by the phone of somebody else
+        emulator.drone.land()  # as by another client
         until(lambda: not tello.airborne)
         assert tello.stop_reason == "the drone came down by itself"
 
@@ -273,7 +273,7 @@ def pushed_and_centred(emulator):
 
 
 def test_released_sticks_are_centred(emulate):
-    """The controller is dead: one push, then nothing. The drone stands still, whatever keeps it listening."""
+    """The controller dies after one stick command: the drone hovers, even while keep-alives continue."""
     emulator, address = emulate()
     with Tello(address, allow_motion=True, limits=QUICK) as tello:
         tello.connect(PATIENCE_S)
@@ -289,7 +289,7 @@ def test_released_sticks_are_centred(emulate):
 
 
 def test_sticks_are_centred_while_the_controller_waits_for_an_answer(emulate):
-    """Whatever the program does: here it pushes the sticks and then hangs on a question that nobody answers."""
+    """Even if the program moves the sticks and then blocks on a command without an answer."""
     emulator, address = emulate()
     limits = TelloLimits(timeout_s=PATIENCE_S, retries=0, keep_alive_s=PATIENCE_S)
     with Tello(address, allow_motion=True, limits=limits) as tello:
@@ -380,7 +380,7 @@ def stranger():
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "localhost", "127.1"])
 def test_pictures_of_other_senders_are_refused(emulate, stranger, caplog, host):
-    """A stranger's whole film, keyframe first, shows nowhere; that it came is counted and said once."""
+    """A complete video stream of another sender is dropped, counted and logged once."""
     _, address = emulate()
     film = [packet for k in range(5) for packet in Encoder(64, 48, 30).encode(np.full((48, 64, 3), 40 * k, np.uint8))]
     sizes = set()
@@ -398,7 +398,7 @@ def test_pictures_of_other_senders_are_refused(emulate, stranger, caplog, host):
 
 
 def test_state_of_other_senders_is_refused(emulate, stranger):
-    """Nobody else lands our drone by telling of an empty battery."""
+    """A forged low-battery state does not land the drone."""
     _, address = emulate()
     with Tello(address, allow_motion=True) as tello:
         tello.connect(PATIENCE_S)

@@ -80,12 +80,12 @@ def test_a_signal_lands_the_drone_and_leaves_a_whole_recording(tmp_path, number)
 
 
 class SlowStarter(SwiftDrone):
-    """Its rotors spin up for two seconds after ``takeoff``; until then it stands on the floor, as its state says."""
+    """Its rotors spin up for two seconds after ``takeoff``; until then it reports to be on the floor."""
 
     spin_up_s = 0.0
 
     def take_off(self):
-        self.spin_up_s = 8.0  # it lives four times as fast
+        self.spin_up_s = 8.0  # it runs four times as fast
         return super().take_off()
 
     def step(self, dt):
@@ -118,7 +118,7 @@ def test_a_signal_before_take_off_is_answered(tmp_path, number):
 
 
 def test_ctrl_c_again_and_again_does_not_end_the_landing(tmp_path):
-    """The first three ``land`` are lost, and each is followed by the user's impatience."""
+    """The first three ``land`` are lost, and after each the user presses Ctrl-C."""
     lost = []
 
     def impatient(text):
@@ -153,7 +153,7 @@ def test_a_program_that_is_shot_still_lands(tmp_path, number):
 
 
 def test_a_program_that_is_stopped_is_landed_and_finds_its_flight_ended(tmp_path):
-    """Ctrl-Z: nobody is there to see what becomes of the drone."""
+    """Ctrl-Z stops the program that controls the drone."""
     with emulated() as (emulator, url), recording(url, tmp_path / "flight") as process:
         until(lambda: flying(emulator))
         process.send_signal(signal.SIGSTOP)

@@ -1,4 +1,4 @@
-"""Exported maps open in other people's readers."""
+"""Exported maps open in third-party readers."""
 
 import argparse
 import importlib.util
@@ -41,7 +41,7 @@ def test_pcd_round_trips(cloud: PointCloud, tmp_path: Path) -> None:
 
 
 def test_pcd_is_what_the_format_page_says(cloud: PointCloud, tmp_path: Path) -> None:
-    """Read by the header alone, as any PCL reader does, not by what the writer knows."""
+    """Read by the header alone, as a PCL reader does."""
     write_pcd(tmp_path / "m.pcd", cloud)
     head, body = (tmp_path / "m.pcd").read_bytes().split(b"DATA binary\n")
     words = {line.split()[0]: line.split()[1:] for line in head.decode().splitlines() if not line.startswith("#")}

@@ -1,4 +1,4 @@
-"""Opinions that cannot all be right are not averaged: the worse one is dropped and named."""
+"""Inconsistent estimates are not averaged: the less plausible one is dropped and reported."""
 
 import math
 

@@ -149,7 +149,7 @@ def test_mean_nees_over_50_seeds_is_inside_its_95_percent_band(flight):
     assert low <= nees <= high
     assert rms([s.rmse_m for s in scores]) < rms([integrated(s) for s in scenes]) / 3
     # Turning is process noise that the readings themselves announce, so innovations are smaller than stated:
-    # cautious, never sure of the wrong thing.
+    # conservative, never overconfident.
     assert nis[3] < 3.5
     assert nis[6] < 6.5
 

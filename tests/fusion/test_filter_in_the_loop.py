@@ -21,7 +21,7 @@ from edgeslam_torch.types import TelemetrySample
 T_B_C = camera_on_body()
 DELAY_S = 0.4
 LATE = replace(EXACT, video_delay_s=DELAY_S)
-"""Right to the last digit, and the video late."""
+"""Exact telemetry, delayed video."""
 KNOWN = FusionConfig(delay_s=DELAY_S)
 FIRST_S = 12.0
 """Scale is known by then."""
@@ -45,7 +45,7 @@ class Flown:
         self.fusion = MotionFusion(config, T_B_C)
 
     def run(self, each=lambda i, t: None, until_s=np.inf, tracked=lambda t: True):
-        """Frames and packets in the order of their arrival; ``each`` is asked after the packets, before the frame."""
+        """Frames and packets in order of arrival; ``each`` is called after the packets, before the frame."""
         sent = 0
         for i, t in enumerate(self.motion.stamps_s):
             if t > until_s:
@@ -112,7 +112,7 @@ def test_without_the_filter_the_prediction_is_worse(rng, swinging, monkeypatch):
 
 
 def test_an_outage_of_vision_is_bridged_and_said(rng, swinging):
-    """Ten frames, thirty, a hundred without an image: error and sigma grow together."""
+    """10, 30 and 100 frames without an image: error and sigma grow together."""
     flown = Flown(rng, swinging(20.0), faults=TelemetryFaults(video_delay_s=DELAY_S))
     flown.run(until_s=14.0)
     sigmas = []
@@ -161,7 +161,7 @@ def test_the_printed_filter_stays_selectable_and_says_something_else(rng, swingi
 
 
 def test_a_map_that_is_moved_moves_the_prediction_along(rng, swinging):
-    """A refinement shifts the newest frames: the camera has not moved."""
+    """A refinement shifts the newest poses although the camera has not moved."""
     flown = Flown(rng, swinging(16.0)).run(until_s=15.0)
     before = flown.fusion.predict(15.2).T_w_c
     T = se3.exp(np.array([0.3, -0.1, 0.2, 0.1, -0.2, 0.3]))

@@ -1,4 +1,4 @@
-"""A camera half a metre before the body's centre: what turning does to it is neither flight nor climb."""
+"""A camera half a metre ahead of the body's centre: lever-arm motion is neither translation nor climb."""
 
 from dataclasses import replace
 

@@ -163,13 +163,13 @@ def test_a_frozen_or_silent_link_does_not_pull_the_scale(rng, swinging, replay):
 
 @pytest.mark.parametrize("gap_s", [0.05, 0.5, 1.0])
 def test_prediction_bridges_lost_vision(rng, swinging, replay, gap_s):
-    """Against standing still: what telemetry adds when the picture is gone."""
+    """Compared with a constant pose: what telemetry adds while video is missing."""
     motion = swinging(30.0)
     errors, still = [], []
     last = {}
 
     def seen(t):
-        """From 12 s on the picture is gone for ``gap_s`` every two seconds."""
+        """From 12 s on, video is missing for ``gap_s`` every two seconds."""
         return t < 12.0 or t % 2.0 > gap_s - 0.01
 
     def each(t, i):
@@ -191,7 +191,7 @@ def test_lost_frames_are_no_evidence(rng, swinging, replay):
     motion = swinging(30.0)
     samples = simulate(rng, motion.stamps_s, motion.T_w_c, T_B_C).samples()
     gauge = motion.in_gauge(rng)
-    gauge.T_m_c[200:300, :3, 3] *= 3.0  # what a lost tracker may say
+    gauge.T_m_c[200:300, :3, 3] *= 3.0  # what a lost tracker may report
     fusion = MotionFusion(FusionConfig(), T_B_C)
     replay(fusion, motion, gauge, samples, tracked=lambda t: not 10.0 <= t < 15.0)
     assert fusion.scale().value == pytest.approx(gauge.scale, rel=0.03)
@@ -237,7 +237,7 @@ def test_height_decides_what_the_readings_leave_open(rng, swinging, replay, trun
 
 
 def test_height_changes_alone_tell_the_scale_of_a_climb(rng, replay, swinging):
-    """Velocity missing, range there: the metre up and down at the start of a flight."""
+    """Range without velocity: one metre up and down at the start of a flight."""
     motion = swinging(20.0)
     T = motion.T_w_c.copy()
     T[:, :3, 3] = [0.0, 0.0, 1.0] + np.stack([0 * motion.stamps_s, 0 * motion.stamps_s,

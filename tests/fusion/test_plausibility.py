@@ -189,7 +189,7 @@ def test_attitude_of_another_flight_is_named_and_takes_the_heights_with_it(rng, 
 
 @pytest.mark.parametrize("late_s", [1.2, -2.0])
 def test_a_wrong_clock_is_reported_with_its_correction(rng, swinging, replay, late_s):
-    """The video is 0.5 s late by itself: stamps 1.2 s late make a delay of -0.7 s, which nobody searches."""
+    """The video itself is 0.5 s late: stamps 1.2 s late give a delay of -0.7 s, outside the search range."""
 
     def spoil(rng, samples, motion):
         return [replace(s, stamp_s=s.stamp_s + late_s) for s in samples]
@@ -222,7 +222,7 @@ def turned_by_yaw(samples, times):
 
 @pytest.mark.parametrize(("times", "frame"), [(-1, "in body axes"), (1, "without the turn by yaw")])
 def test_images_have_the_last_word_on_the_velocities_frame(rng, swinging, replay, times, frame):
-    """Body axes though nobody said so; world axes that the reader of the log took for the body's and turned."""
+    """Undeclared body axes; world axes that the log's reader mistook for body axes and rotated."""
 
     def spoil(rng, samples, motion):
         return turned_by_yaw(no_heights(samples), times)
@@ -276,7 +276,7 @@ def test_velocities_in_the_wrong_unit_are_named_and_dropped(rng, swinging, repla
 
 
 def test_velocities_in_the_wrong_unit_with_nothing_beside_them_give_no_metres(rng, swinging, replay):
-    """The depth network alone speaks against them: one of the two is nonsense, and nobody knows which."""
+    """Only the depth network contradicts them: one of the two is wrong, and the data do not say which."""
 
     def spoil(rng, samples, motion):
         return [replace(s, velocity_m_s=10.0 * s.velocity_m_s) for s in no_heights(samples)]

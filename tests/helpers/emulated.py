@@ -1,4 +1,4 @@
-"""An emulated drone on free ports, its picture, and what it has heard."""
+"""An emulated drone on free ports, its image, and the commands it received."""
 
 import threading
 import time
@@ -12,11 +12,11 @@ from edgeslam_torch.drone.emulator.link import LinkFaults
 from edgeslam_torch.drone.emulator.server import EmulatorConfig, TelloEmulator
 
 PATIENCE_S = 120.0
-"""For what must happen in the end, however busy the machine is; nothing waits this long when all is well."""
+"""Time-out for expected events on a busy machine; passing tests wait far less."""
 
 
 class SwiftDrone(DroneModel):
-    """Lives four times as fast, so that the tests spend less time in the air."""
+    """Simulated at four times real time to shorten the tests."""
 
     def step(self, dt):
         for _ in range(4):
@@ -62,7 +62,7 @@ def speckled():
 
 
 def until(condition, seconds=PATIENCE_S):
-    """Wait for what must come."""
+    """Wait until a condition holds."""
     deadline = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < deadline, "not in time"

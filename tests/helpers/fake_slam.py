@@ -1,4 +1,4 @@
-"""A SLAM system that knows the answer: tests of everything around the real one need no real one."""
+"""A stub of the SLAM system with known results."""
 
 import numpy as np
 

@@ -5,7 +5,7 @@ import socket
 
 
 def free_ports(count):
-    """Ports that are free and that the system hands to nobody who asks for any port (those begin at 32768)."""
+    """Free ports below the ephemeral range, which begins at 32768."""
     sockets = []
     try:
         while len(sockets) < count:

@@ -66,5 +66,5 @@ def test_frames_follow_the_next_keyframe_where_refinement_moved_it(rng):
     log.append(4, 0.4, b.id, b.T_c_w, True, before)
     log.append(5, 0.5, b.id, forward(0.5), True)
     np.testing.assert_allclose(log.poses()[1][:, 0, 3], [0.0, 0.1, 0.2, 0.3, 0.4, 0.5], atol=1e-12)
-    log.records[2].supported = False  # a predicted frame between them: nobody knows which way it went
+    log.records[2].supported = False  # a predicted frame between them, without a measured pose
     np.testing.assert_allclose(log.poses()[1][:, 0, 3], [0.0, 0.2, 0.4, 0.6, 0.4, 0.5], atol=1e-12)

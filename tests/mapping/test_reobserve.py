@@ -1,4 +1,4 @@
-"""A camera that returns finds its old anchors again, however drift has moved them."""
+"""A returning camera observes its old anchors again despite drift."""
 
 from dataclasses import replace
 
@@ -111,7 +111,7 @@ def test_a_place_of_which_most_does_not_fit_is_not_joined(rng, drift):
 
 
 def test_a_keyframe_that_shares_the_anchors_of_its_neighbour_is_no_revisit(rng):
-    """It stands where another stood, and they know each other: nothing is to be joined."""
+    """It is at the place of a keyframe with which it already shares anchors."""
     points = drifted(rng, np.eye(4))
     last, first = points.keyframes[5], points.keyframes[1]
     assert revisit_candidate(points.map, last) is first

@@ -1,4 +1,4 @@
-"""What is read while another thread maps is of one moment.
+"""Snapshots taken while another thread maps are consistent.
 
 The other thread comes at the worst point, between two arrays of what is read or changed. It takes the lock if it is
 free and does its work then and there, so nothing here depends on time.
@@ -17,7 +17,7 @@ from edgeslam_torch.slam import EdgeSlam
 
 
 def beside(lock, work):
-    """Do ``work`` in another thread now, unless somebody holds the lock."""
+    """Do ``work`` in another thread now, unless the lock is held."""
 
     def attempt():
         if lock.acquire(blocking=False):

@@ -29,16 +29,16 @@ class Fault:
     """Stem of the list it stands in."""
     name: str
     line: str
-    """What stands in the code, a piece of one line."""
+    """Part of one line of the code."""
     put: str
-    """What the fault makes of it."""
+    """Its replacement."""
     why: str
-    """What goes wrong in a flight when nobody notices."""
+    """The consequence in flight if no test detects it."""
     tests: list[str]
     """Files in ``tests/`` by name, optionally ``::test_name``, or ``-k`` with an expression behind all of them."""
     at: str = ""
     survives: str = ""
-    """Why no test sees it; every survivor needs such a sentence."""
+    """Why no test detects it; required of every survivor."""
 
 
 @dataclass(frozen=True, slots=True)

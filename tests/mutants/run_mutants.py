@@ -60,7 +60,7 @@ class Copies:
         self._lock = threading.Lock()
 
     def take(self) -> Path:
-        """A copy that nobody uses; there are as many as jobs."""
+        """A free copy; there are as many copies as jobs."""
         with self._lock:
             return self._free.pop()
 

@@ -1,4 +1,4 @@
-"""Window refinement: exact on clean worlds, robust on dirty ones, honest on degenerate ones."""
+"""Window refinement on clean, contaminated and degenerate synthetic worlds."""
 
 import shutil
 from dataclasses import replace

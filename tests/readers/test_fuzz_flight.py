@@ -1,4 +1,4 @@
-"""Whatever a crash, a thief of bytes or another program leaves in a flight folder, and whatever a drone answers."""
+"""Fuzzed flight folders (truncated, damaged, foreign files) and fuzzed answers of a drone."""
 
 import pytest
 from hypothesis import HealthCheck, given, settings

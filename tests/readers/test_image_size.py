@@ -1,4 +1,4 @@
-"""The size that a header tells is the size that the decoder finds."""
+"""The size in an image's header equals the decoded size."""
 
 import cv2
 import numpy as np

@@ -1,4 +1,4 @@
-"""Poses from edges: exact surfaces, measured edges, frames that edges alone must hold."""
+"""Poses from edges: exact surfaces, measured edges, and frames without usable points."""
 
 import cv2
 import numpy as np

@@ -24,7 +24,7 @@ POSES = sideways(4, 0.05, turn_rad=0.01)
 
 
 class Scene:
-    """One keyframe before the panels whose anchors lie exactly where the renderer put them."""
+    """One keyframe in front of the panels, with anchors at their rendered positions."""
 
     def __init__(self, camera=CAMERA):
         self.camera = camera
@@ -123,7 +123,9 @@ def test_an_image_that_does_not_show_the_template_has_no_pose(scene, rng, what):
         T_c_w = se3.exp(np.array([0, 0, 0, 0, np.pi, 0])) @ T_c_w
     before = scene.map.anchors.visible.copy()
     assert scene.tracker().follow(scene.template, image, T_c_w) is None
-    np.testing.assert_array_equal(scene.map.anchors.visible, before)  # a blind frame says nothing about an anchor
+    np.testing.assert_array_equal(
+        scene.map.anchors.visible, before
+    )  # a frame without texture is no evidence about an anchor
 
 
 def test_anchors_that_are_seen_and_found_are_counted(scene):
@@ -155,7 +157,7 @@ def test_a_lens_changes_nothing_but_the_pixels(scene):
 
 
 def test_a_matched_frame_can_be_followed_without_being_a_keyframe(scene):
-    """Only what matched in it is looked for, at its own pixels."""
+    """Only its matched keypoints are tracked, from their own pixels."""
     view = make_view(scene.keyframe.features, ORB.scale_factor)
     keypoint = np.arange(0, len(view.features.uv), 2)
     anchor = scene.keyframe.anchor[keypoint]
@@ -216,7 +218,7 @@ def test_keyframe_by_view_change_parallax_or_time_but_not_at_once():
 
 
 def test_few_matches_are_judged_by_anchors_that_have_proved_themselves(scene):
-    """Of 500 anchors that one keyframe has seen, none counts once there are three keyframes."""
+    """With three keyframes, none of 500 anchors seen by a single keyframe counts."""
     ids = scene.keyframe.anchor
     track = Track(scene.keyframe.T_c_w, np.arange(30), ids[:30], np.arange(30), ids[:30], np.eye(6))
     assert few_matches(track, scene.keyframe, scene.map, MappingConfig())
@@ -269,7 +271,7 @@ def test_flow_weighs_keypoints_by_their_level(scene):
 
 @pytest.mark.parametrize(("off_px", "shows_it"), [(1.0, True), (3.0, False)])
 def test_a_free_keypoint_shows_an_anchor_where_flow_puts_it_and_not_beside(scene, off_px, shows_it):
-    """At level 0, 1.5 px count as the same place."""
+    """At level 0 the tolerance is 1.5 px."""
     all_found = scene.tracker().follow(scene.template, scene.grey, scene.keyframe.T_c_w)
     one, none = np.array([5]), np.zeros(0, np.int64)
     anchor = all_found.track.anchor[one]

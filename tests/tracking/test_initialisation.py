@@ -1,4 +1,4 @@
-"""From a guessed map to one that two views made, and what refuses a wrong one."""
+"""From a predicted map to a two-view map, and the checks that reject a wrong one."""
 
 from dataclasses import replace
 
@@ -184,7 +184,7 @@ def test_guessed_map_is_replaced_and_the_map_stays_consistent(points):
 
 @pytest.mark.parametrize("network", [False, True])
 def test_without_a_network_two_views_need_a_smaller_sigma(points, network):
-    """A network tells a flat scene from a real one; alone, only a sure direction of the second camera does."""
+    """With a network a flat scene is recognised; without one, the baseline direction must be certain."""
     if network:
         flat = np.ones((CAMERA.height, CAMERA.width), np.float32)
         points.keyframes[0].depth = DepthMap(flat, 0.2 * flat)
@@ -281,7 +281,7 @@ def test_a_map_that_too_many_observations_refute_is_refused(points):
 
 
 def test_of_two_structures_the_one_that_fits_becomes_the_map(points):
-    """Nobody between: a structure that fits nothing, and the one that starts at the network's depth."""
+    """Without views between: a structure that fits nothing, and one initialised from the network's depth."""
     with_network(points)
     bootstrap, found = offered(points, between=())
     away = se3.exp(np.array([0.8, 0.0, 0.3, 0.0, 0.5, 0.2]))

@@ -1,4 +1,4 @@
-"""Two-view motion and the names of its degenerate cases."""
+"""Two-view motion and its degenerate cases."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""A lost frame is found at its place, and never at one that only resembles it."""
+"""A lost frame is relocalised at its place, not at one of similar appearance."""
 
 import numpy as np
 import pytest
@@ -119,7 +119,7 @@ def test_beyond_reach_the_next_frames_must_agree(points, rng):
     for index in range(AGREEING_FRAMES - 1):
         assert relocaliser.find(index, seen, [points.keyframes[3]], NOWHERE) is None
         assert relocaliser.waiting == index + 1
-    found = relocaliser.find(AGREEING_FRAMES, seen, [], NOWHERE)  # no keyframe need be asked again
+    found = relocaliser.find(AGREEING_FRAMES, seen, [], NOWHERE)  # no keyframe is matched again
     assert sorted(found.earlier) == list(range(AGREEING_FRAMES - 1))
     for T_c_w in (found.track.T_c_w, *found.earlier.values()):
         assert pose_error(T_c_w, points.world.T_c_w[3])[0] < 0.03

@@ -1,4 +1,4 @@
-"""A frame's pose against the map, and finding it again without a prediction."""
+"""A frame's pose against the map, with and without a prediction."""
 
 import numpy as np
 import pytest

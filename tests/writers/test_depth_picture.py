@@ -1,4 +1,4 @@
-"""The bar below a depth picture tells the truth."""
+"""The colour bar below a depth image."""
 
 import cv2
 import numpy as np

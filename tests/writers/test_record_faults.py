@@ -1,4 +1,5 @@
-"""``edgeslam record`` in bad air: it ends by itself, says why, leaves the drone on the floor and a flight that runs.
+"""``edgeslam record`` over a faulty link: it ends by itself, says why, leaves the drone on the floor and a flight
+that runs.
 
 Nothing here asserts how long anything takes; what must happen in the end is waited for.
 """
@@ -92,7 +93,7 @@ def test_an_outage_of_three_seconds(tmp_path, capsys):
 
 @pytest.mark.slow
 def test_a_drone_that_stops_answering(tmp_path, capsys):
-    """The one flight here that fails: the drone hears us no more, and comes down by itself."""
+    """The only flight here that fails: the drone receives nothing any more and lands by itself."""
     with emulated() as (emulator, url):
 
         def freeze(stop):
@@ -129,7 +130,7 @@ def test_garbage_on_every_port(tmp_path, capsys):
 
 @pytest.mark.slow
 def test_packets_of_other_senders_change_nothing_and_are_reported(tmp_path, capsys):
-    """A film and an empty battery from another address: the recording holds the drone's own pictures alone."""
+    """Video and a low-battery state from another address: the recording holds the drone's own images only."""
     try:
         other = open_udp(("127.0.0.2", 0), "stranger")
     except SourceError:

@@ -1,4 +1,4 @@
-"""What was seen live and what its recording gives are the same, to the bit."""
+"""A live source and its recording give the same frames, bit for bit."""
 
 import numpy as np
 import pytest
@@ -50,7 +50,7 @@ def test_a_recorded_live_source_gives_again_what_it_gave(address, tmp_path):
 @pytest.mark.parametrize("failure", [OSError(28, "No space left on device"), RuntimeError("bug")])
 @pytest.mark.parametrize("kind", ["FlightWriter.add_frame", "TelemetryWriter.write"])
 def test_a_writer_that_fails_ends_the_recording_and_not_the_flight(tmp_path, monkeypatch, kind, failure):
-    """More frames than may wait for the disk: nobody waits for a writer that is gone."""
+    """More frames than the queue holds: a writer that has died does not block the caller."""
     monkeypatch.setattr(tee, "_WAITING", 3)
     owner, name = kind.split(".")
     write, calls = getattr(getattr(flight_writer, owner), name), []
@@ -76,7 +76,7 @@ def test_a_writer_that_fails_ends_the_recording_and_not_the_flight(tmp_path, mon
 
 
 class ManyPictures:
-    """Pictures that are there at once, each with a state message."""
+    """Images without delay, each with a state message."""
 
     def __init__(self, count):
         self.count, self.closed = count, 0

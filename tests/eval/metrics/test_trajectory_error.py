@@ -1,4 +1,4 @@
-"""Trajectory errors: by hand, against evo, and with the usual mistakes made on purpose."""
+"""Trajectory errors: worked by hand, against evo, and for common mistakes in input files."""
 
 import re
 from dataclasses import replace
@@ -151,7 +151,7 @@ def test_reference_trajectories_score_what_evo_prints(name: str, data_dir: Path)
     found = (score.ate_m.rmse, score.ate_m.mean, score.ate_m.std, score.ate_m.max)
     assert found == pytest.approx((rmse, mean, std, most), abs=1e-6)
     near = (truth.stamps_s > estimate.stamps_s[200]) & (truth.stamps_s < estimate.stamps_s[500])
-    assert_agrees(truth.take(near), estimate.take(slice(200, 500)), AlignmentKind.SIM3)  # evo takes its time
+    assert_agrees(truth.take(near), estimate.take(slice(200, 500)), AlignmentKind.SIM3)  # evo is slow
 
 
 def test_each_pose_of_the_shorter_list_gets_its_nearest() -> None:

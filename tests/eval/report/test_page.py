@@ -1,4 +1,4 @@
-"""What ``report.html`` says, and that no name or number of a run can break it."""
+"""Contents of ``report.html``, also for hostile names and numbers."""
 
 import json
 from collections.abc import Callable
