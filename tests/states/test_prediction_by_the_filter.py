@@ -1,0 +1,53 @@
+"""What the system asks of the fusion between two frames."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.states.system import System
+from edgeslam_torch.tracking.motion_model import MotionModel
+
+TOLD = se3.exp(np.array([0.3, -0.1, 0.2, 0.1, 0.2, -0.3]))
+"""``T_w_c`` that the fusion predicts."""
+
+
+def system(**fusion):
+    motion = MotionModel(np.eye(4))
+    motion.stamp_s = 0.0
+    motion.move(0.1, se3.exp(np.array([0.02, 0.0, 0.0, 0.0, 0.01, 0.0])))
+    motion.stamp_s = 0.1
+    return SimpleNamespace(
+        has_telemetry=True,
+        motion=motion,
+        fusion=SimpleNamespace(predict=lambda stamp_s: SimpleNamespace(T_w_c=TOLD), **fusion),
+        stage_ms={},
+    )
+
+
+@pytest.mark.parametrize(("filtering", "lost"), [(True, False), (True, True), (False, True)])
+def test_the_filter_predicts_once_it_is_fed_and_telemetry_when_lost(filtering, lost):
+    asked = system(filtering=filtering)
+    np.testing.assert_allclose(System.predict(asked, 0.2, lost), se3.inverse(TOLD), atol=1e-12)
+
+
+def test_before_that_and_without_a_drone_it_is_constant_velocity():
+    for asked in (system(filtering=False), system(filtering=True)):
+        asked.has_telemetry = asked.fusion.filtering is False
+        np.testing.assert_array_equal(System.predict(asked, 0.2, False), asked.motion.predict(0.2))
+
+
+def test_a_correction_of_the_map_is_told_to_the_fusion_as_such():
+    """The camera has not moved: ``T_w_c`` before, moved as the fusion is told, is ``T_w_c`` after."""
+    moved = []
+    asked = system(filtering=True, map_moved=moved.append)
+    before = se3.inverse(asked.motion.T_c_w)
+    tracked = se3.exp(np.array([0.1, 0.0, 0.3, 0.0, 0.1, 0.0]))
+    refined = se3.exp(np.array([0.12, -0.01, 0.31, 0.01, 0.1, 0.02]))
+    mapped = SimpleNamespace(keyframes=[SimpleNamespace(T_c_w=refined)], T_tracked=tracked, stage_ms={})
+    asked.compare_depth = lambda keyframe: None
+    System.absorb(asked, mapped)
+    after = se3.inverse(asked.motion.T_c_w)
+    assert np.linalg.norm(after - before) > 0.01
+    np.testing.assert_allclose(moved[0] @ before, after, atol=1e-9)
