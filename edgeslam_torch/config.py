@@ -260,6 +260,9 @@ class WindowConfig:
     """Edge pixels used per keyframe."""
     targets: int = 3
     """Neighbouring keyframes in which each edge pixel is associated."""
+    telemetry: str = "last"
+    """Where the drone's displacements, heights and gravity keep the map's scale and level the same all over: in
+    ``every`` refinement, in the ``last`` one, or ``off``."""
 
     def __post_init__(self) -> None:
         _positive(self, "rounds", "edges_per_keyframe", "targets")
@@ -269,6 +272,7 @@ class WindowConfig:
             ("cycle", ("relative", "literal", "off")),
             ("angle", ("arms", "cosine", "literal", "off")),
             ("collinearity", ("relative", "literal", "off")),
+            ("telemetry", ("every", "last", "off")),
         ):
             if getattr(self, name) not in allowed:
                 raise ValueError(f"{name} must be one of {', '.join(allowed)}, got {getattr(self, name)!r}")

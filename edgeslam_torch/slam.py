@@ -229,7 +229,9 @@ class EdgeSlam:
         self._system.collect(wait=True)
         self._joining.finish()
         self._finished = True
-        result = last_refinement(self.map, self.camera, self.edges, self.config.window)
+        result = last_refinement(
+            self.map, self.camera, self.edges, self.config.window, self._system.telemetry("last", "every")
+        )
         self._losses = {} if result is None else result.losses
         self._system.fusion.revise(*self.log.poses())
         estimate = self.scale

@@ -18,6 +18,7 @@ from edgeslam_torch.fusion.config import FusionConfig
 from edgeslam_torch.fusion.consensus import Settled, settled_with_network
 from edgeslam_torch.fusion.delay import DelaySearch
 from edgeslam_torch.fusion.depth_scale import DepthRatio, DepthRatios, DepthScale
+from edgeslam_torch.fusion.displacement import TelemetryModel
 from edgeslam_torch.fusion.ekf import EkfState
 from edgeslam_torch.fusion.filter_feed import FilterFeed, Metric
 from edgeslam_torch.fusion.health import disagreement
@@ -333,6 +334,26 @@ class MotionFusion:
         depth, contradiction = self._depth.scale(), self._settled().warning
         own = (None if depth is None else depth.warning(), contradiction)
         return self._trust.warnings() + self._track.warnings() + [said for said in own if said is not None]
+
+    def telemetry(self) -> TelemetryModel | None:
+        """Telemetry and its tie to the map as they are now, for refinement; None while either is not known."""
+        told = self._by_telemetry
+        if told is None or self._R_w_m is None:
+            return None
+        there = self._track.heights()
+        heights = [reading for reading in HEIGHTS if reading in there and self._trust.height(reading)]
+        return TelemetryModel(
+            self._track.copy(),
+            self.config,
+            self.T_b_c,
+            self._R_w_m,
+            self.delay_s,
+            self.delay_sigma_s,
+            math.exp(told.log_scale),
+            told.sigma,
+            self._trust.velocity,
+            heights[0] if heights else None,
+        )
 
     # --- estimation ----------------------------------------------------------------------------------------------
 

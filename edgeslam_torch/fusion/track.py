@@ -184,6 +184,12 @@ class TelemetryTrack:
         beyond = np.clip(np.asarray(stamps_s) - stamp[-1], 0.0, _PACKET_S)  # one packet ahead at the last velocity
         return _hermite(stamp, path, velocity, inside) + beyond[:, None] * velocity[-1]
 
+    def copy(self) -> "TelemetryTrack":
+        """The track as it is now, for another thread."""
+        out = TelemetryTrack("body" if self._body else "world", self._max_gap_s, self._keep_s)
+        out._samples, out._cached, out.refused = list(self._samples), self._cached, self.refused
+        return out
+
     def attitude(self, stamps_s: FloatArray) -> FloatArray:
         """Body to power-on world ``(N, 3, 3)``."""
         told = self.readings

@@ -7,6 +7,7 @@ import numpy as np
 
 from edgeslam_torch.config import WindowConfig
 from edgeslam_torch.frontend.canny import canny
+from edgeslam_torch.fusion.displacement import TelemetryModel
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.losses.cycle import CycleForm
 from edgeslam_torch.losses.robust import Kernel
@@ -15,6 +16,7 @@ from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.mapping.edge_map import EdgeMap, EdgePoints
 from edgeslam_torch.mapping.fuse import fuse_all
+from edgeslam_torch.mapping.motion_terms import solver
 from edgeslam_torch.mapping.refinement import refine_all, whole_map, window_problem, write_back
 from edgeslam_torch.mapping.reobserve import MAX_DRIFT_PX, reobserve_all
 from edgeslam_torch.mapping.window_terms import (
@@ -52,8 +54,17 @@ def lm_config(config: WindowConfig) -> LmConfig:
     )
 
 
-def last_refinement(slam_map: SlamMap, camera: Camera, edges: EdgeMap, config: WindowConfig) -> WindowResult | None:
+def last_refinement(
+    slam_map: SlamMap, camera: Camera, edges: EdgeMap, config: WindowConfig, telemetry: TelemetryModel | None = None
+) -> WindowResult | None:
     """Refine all keyframes and anchors, merge duplicates, measure the remaining edges, refine with edges.
+
+    Args:
+        slam_map: Refined in place.
+        camera: Of its keyframes.
+        edges: Their edges, in place as well.
+        config: Which terms take part.
+        telemetry: Its displacements, heights and gravity take part; None for none.
 
     Returns:
         Result of the last solver run; None if there was nothing to refine.
@@ -62,22 +73,27 @@ def last_refinement(slam_map: SlamMap, camera: Camera, edges: EdgeMap, config: W
     fine = replace(lm, cost_tolerance=FINE, losses=True)
     with_edges = config.uses_edges or config.uses_corners
     result = None
-    if config.reprojection != "off" and refine_all(slam_map, camera, lm) is not None:
+    if config.reprojection != "off" and refine_all(slam_map, camera, lm, telemetry) is not None:
         with slam_map.lock:
             drift_px = max(reobserve_all(slam_map, camera), default=0.0)
         if drift_px > MAX_DRIFT_PX:
-            refine_all(slam_map, camera, lm)
+            refine_all(slam_map, camera, lm, telemetry)
         with slam_map.lock:
             fuse_all(slam_map, camera)
-        result = refine_all(slam_map, camera, lm if with_edges else fine)
+        result = refine_all(slam_map, camera, lm if with_edges else fine, telemetry)
     edges.update(everything=True)
     if with_edges:
-        result = refine_with_edges(slam_map, camera, edges, fine, config) or result
+        result = refine_with_edges(slam_map, camera, edges, fine, config, telemetry) or result
     return result
 
 
 def refine_with_edges(
-    slam_map: SlamMap, camera: Camera, edges: EdgeMap, lm: LmConfig, config: WindowConfig
+    slam_map: SlamMap,
+    camera: Camera,
+    edges: EdgeMap,
+    lm: LmConfig,
+    config: WindowConfig,
+    telemetry: TelemetryModel | None = None,
 ) -> WindowResult | None:
     """Refine the whole map with edge and corner terms beside its anchors; edges are associated again in every round.
 
@@ -93,7 +109,7 @@ def refine_with_edges(
     scales = AdaptiveScales()
     result = None
     for _ in range(config.rounds):
-        problem, keypoint = window_problem(slam_map, window, camera, lm)
+        problem, keypoint = window_problem(slam_map, window, camera, lm, telemetry)
         structures = [_structure(k, hosts.get(k.id), camera, config, edges) for k in keyframes]
         T_c_w = problem.T_c_w[: len(keyframes)]
         placed = edge_terms(structures, T_c_w, problem.K, terms) if config.uses_edges else None
@@ -107,7 +123,7 @@ def refine_with_edges(
             scales = scales.updated(term_residuals(problem))
             problem = with_scales(problem, scales, ALIKE)
             logger.debug("term scales %s", {k: round(t.sigma, 4) for k, t in scales.terms.items()})
-        result = refine_window(problem, lm)
+        result = refine_window(problem, solver(lm, problem))
         if result.stop is StopReason.NOT_FINITE:
             return result
         if config.reprojection == "off":

@@ -6,6 +6,7 @@ from edgeslam_torch.config import SlamConfig
 from edgeslam_torch.frontend.keypoint_grid import KeypointGrid
 from edgeslam_torch.frontend.matching import Matches
 from edgeslam_torch.frontend.orb import spread
+from edgeslam_torch.fusion.displacement import TelemetryModel
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.robust_statistics import CHI2_2DOF_95
 from edgeslam_torch.map.depth_prior import depth_prior
@@ -44,12 +45,15 @@ class Mapper:
         self.lm = lm
         self._recent: IntArray = np.zeros(0, dtype=np.int64)
 
-    def insert(self, keyframe: Keyframe, colour: np.ndarray) -> WindowResult | None:
+    def insert(
+        self, keyframe: Keyframe, colour: np.ndarray, telemetry: TelemetryModel | None = None
+    ) -> WindowResult | None:
         """Insert a new keyframe: cull, triangulate, fuse, rejoin, refine.
 
         Args:
             keyframe: Already in the map; ``keyframe.anchor`` holds what tracking matched.
             colour: RGB of each keypoint, ``(N, 3)`` uint8.
+            telemetry: What may take part in the refinement.
 
         Returns:
             What the window refinement reports, or None when there was nothing to refine.
@@ -62,9 +66,9 @@ class Mapper:
             fuse_young(self.map, self.camera, keyframe, self.map.covisible(keyframe, 2 * self.config.neighbours))
             drift_px = reobserve(self.map, self.camera, keyframe)
         if drift_px is not None and drift_px > MAX_DRIFT_PX:  # the drift lies outside the window
-            refine_all(self.map, self.camera, self.lm)
+            refine_all(self.map, self.camera, self.lm, telemetry)
         window = choose_window(self.map, keyframe, self.config.window, self.config.window_fixed)
-        result = refine(self.map, window, self.camera, self.lm)
+        result = refine(self.map, window, self.camera, self.lm, telemetry)
         with self.map.lock:
             # Refinement moves the other keyframes too little to change viewing directions.
             self.map.refresh_anchors(keyframe.anchor[keyframe.anchor >= 0])

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 from edgeslam_torch.frontend.depth_check import CheckedDepth
 from edgeslam_torch.frontend.image import as_grey, colours_at
+from edgeslam_torch.fusion.displacement import TelemetryModel
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.mapping.edge_map import EdgeMap
@@ -59,11 +60,11 @@ class MappingPipeline:
         """Whether keyframes are being mapped, or are mapped and not yet collected."""
         return self._pending is not None
 
-    def submit(self, new: list[tuple[Frame, Keyframe]]) -> Mapped | None:
+    def submit(self, new: list[tuple[Frame, Keyframe]], telemetry: TelemetryModel | None = None) -> Mapped | None:
         """Map keyframes that were put into the map; None when that happens while others go on."""
         if self._executor is None:
-            return self._run(new)
-        self._pending = self._executor.submit(self._run, new)
+            return self._run(new, telemetry)
+        self._pending = self._executor.submit(self._run, new, telemetry)
         return None
 
     def collect(self, wait: bool = False) -> Mapped | None:
@@ -85,7 +86,7 @@ class MappingPipeline:
         keyframe.depth = None if self.depth is None else self.depth(keyframe.image, self.camera)
         self.has_depth = self.has_depth or keyframe.depth is not None
 
-    def _run(self, new: list[tuple[Frame, Keyframe]]) -> Mapped:
+    def _run(self, new: list[tuple[Frame, Keyframe]], telemetry: TelemetryModel | None) -> Mapped:
         """The only thing that runs on the executor."""
         stage_ms: dict[str, float] = {}
         T_tracked = new[-1][1].T_c_w
@@ -94,7 +95,7 @@ class MappingPipeline:
                 self.look(frame, keyframe)
             assert keyframe.image is not None
             with timed(stage_ms, "mapping"):
-                self.mapper.insert(keyframe, colours_at(keyframe.image, keyframe.features.uv))
+                self.mapper.insert(keyframe, colours_at(keyframe.image, keyframe.features.uv), telemetry)
             with timed(stage_ms, "edges"):
                 self.edges.announce(keyframe)
                 self.edges.update()

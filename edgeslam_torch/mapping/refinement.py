@@ -4,11 +4,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from edgeslam_torch.fusion.displacement import TelemetryModel
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.robust_statistics import CHI2_2DOF_95
 from edgeslam_torch.losses.robust import Kernel
 from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.map.slam_map import SlamMap
+from edgeslam_torch.mapping.motion_terms import motion_factors, solver
 from edgeslam_torch.mapping.prior_anchors import depth_priors
 from edgeslam_torch.optim.local_ba import refine_window
 from edgeslam_torch.optim.problem import LmConfig, ScalePrior, StopReason, WindowProblem, WindowResult
@@ -16,6 +18,9 @@ from edgeslam_torch.types import IntArray
 
 MIN_EXTENT = 1e-6
 """Minimum distance between keyframes that defines a scale [map units]."""
+
+UNKNOWN_SCALE_LOG = 1.0
+"""Standard deviation of the log of the metres per map unit where nothing but the window's own telemetry tells them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,10 +50,12 @@ def choose_window(slam_map: SlamMap, newest: Keyframe, free: int, fixed: int) ->
     return Window(members, frozen, slam_map.anchors_seen_by(members))
 
 
-def refine_all(slam_map: SlamMap, camera: Camera, config: LmConfig) -> WindowResult | None:
+def refine_all(
+    slam_map: SlamMap, camera: Camera, config: LmConfig, telemetry: TelemetryModel | None = None
+) -> WindowResult | None:
     """Refine every keyframe of the map at once; None when there is nothing to refine, see `whole_map`."""
     window = whole_map(slam_map)
-    return None if window is None else refine(slam_map, window, camera, config)
+    return None if window is None else refine(slam_map, window, camera, config, telemetry)
 
 
 def whole_map(slam_map: SlamMap) -> Window | None:
@@ -75,18 +82,20 @@ def held_extent(window: Window) -> ScalePrior | None:
     return ScalePrior(far, len(window.free), float(distance[far]), 1e-3)
 
 
-def refine(slam_map: SlamMap, window: Window, camera: Camera, config: LmConfig) -> WindowResult | None:
+def refine(
+    slam_map: SlamMap, window: Window, camera: Camera, config: LmConfig, telemetry: TelemetryModel | None = None
+) -> WindowResult | None:
     """Refine the window in place; outlier observations are removed from the map."""
-    problem, keypoint = window_problem(slam_map, window, camera, config)
+    problem, keypoint = window_problem(slam_map, window, camera, config, telemetry)
     if len(problem.obs_pose) == 0:
         return None
-    result = refine_window(problem, config)
+    result = refine_window(problem, solver(config, problem))
     write_back(slam_map, window, keypoint, result)
     return result
 
 
 def window_problem(
-    slam_map: SlamMap, window: Window, camera: Camera, config: LmConfig
+    slam_map: SlamMap, window: Window, camera: Camera, config: LmConfig, telemetry: TelemetryModel | None = None
 ) -> tuple[WindowProblem, list[IntArray]]:
     """A window's poses, anchors and observations, and the observations' keypoints of each keyframe.
 
@@ -112,6 +121,9 @@ def window_problem(
     # If most depths rest on priors, these fix the scale; the distance between poses of a rotating camera is noise.
     extent = None if unsure.sum() > 0.5 * len(unsure) else held_extent(window)
     priors, hosts = depth_priors(slam_map, window.anchor, [k.id for k in keyframes])
+    # Where the scale is held by one distance alone, that one is arbitrary.
+    doubt = UNKNOWN_SCALE_LOG if extent is not None else None
+    told = motion_factors(telemetry, keyframes, [slam_map.piece_of(k.id) for k in keyframes], doubt)
     problem = WindowProblem(
         T_c_w=np.stack([*(k.T_c_w for k in keyframes), *(slam_map.pose_of(id) for id in hosts)]),
         pose_fixed=np.arange(len(keyframes) + len(hosts)) >= len(window.free),
@@ -123,6 +135,8 @@ def window_problem(
         K=(camera.fx, camera.fy, camera.cx, camera.cy),
         scale_priors=() if extent is None else (extent,),
         depth_priors=priors,
+        centres=told.centres,
+        gravity=told.gravity,
     )
     return problem, keypoint
 

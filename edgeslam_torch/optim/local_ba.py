@@ -17,6 +17,7 @@ from edgeslam_torch.optim.kernels.junction_blocks import JunctionBlocks
 from edgeslam_torch.optim.kernels.pair_blocks import INVERSE_DEPTH_MIN, RelativeSystem
 from edgeslam_torch.optim.kernels.point_blocks import PointBlocks, PointSystem
 from edgeslam_torch.optim.levenberg_marquardt import Step, minimise
+from edgeslam_torch.optim.motion_factors import MotionTerms
 from edgeslam_torch.optim.objective import refined, window_losses
 from edgeslam_torch.optim.priors import PriorTerms
 from edgeslam_torch.optim.problem import (
@@ -139,6 +140,7 @@ class _Window:
         K = torch.tensor(problem.K, dtype=torch.float64)
         self.points = PointBlocks(problem, K, column, config)
         self.priors = PriorTerms(problem.pose_priors, problem.scale_priors, column.tolist())
+        self.motion = MotionTerms(problem.centres, problem.gravity, column.tolist())
         self.relative: list[EdgeBlocks | JunctionBlocks] = []
         columns = torch.as_tensor(column)
         if problem.edges is not None and len(problem.edges.host):
@@ -153,6 +155,7 @@ class _Window:
     def cost(self, state: _State) -> float:
         """Robust cost of a state."""
         total = float(self.points.cost(state.T_c_w, state.p)) + self.priors.cost(state.T_c_w)
+        total += self.motion.cost(state.T_c_w)
         return total + sum(float(b.cost(state.T_c_w, x)) for b, x in self._blocks(state))
 
     def linearise(self, state: _State) -> _System:
@@ -163,6 +166,7 @@ class _Window:
         H.diagonal(dim1=0, dim2=2).copy_(anchors.H.permute(1, 2, 0))
         H, g = H.view(6 * F, 6 * F), anchors.g.flatten()
         cost = float(anchors.cost) + self.priors.linearise(T, H, g)
+        cost += self.motion.linearise(T, H, g)
         relative = []
         for block, x in self._blocks(state):
             system, value = block.linearise(T, x, H, g)

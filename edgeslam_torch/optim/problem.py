@@ -140,6 +140,34 @@ class JunctionTerms:
 
 
 @dataclass(frozen=True, slots=True)
+class CentreFactor:
+    """A Gaussian of some camera centres."""
+
+    pose: IntArray
+    """``(K,)`` pose indices."""
+    information: FloatArray
+    """``(3 K, 3 K)`` symmetric, positive semidefinite."""
+    vector: FloatArray
+    """``(3 K,)`` information times mean."""
+    constant: float = 0.0
+    """What makes the cost a chi-square."""
+
+
+@dataclass(frozen=True, slots=True)
+class GravityFactor:
+    """The world's up direction as cameras see it."""
+
+    pose: IntArray
+    """``(U,)`` pose indices."""
+    up_c: FloatArray
+    """``(U, 3)`` measured unit vectors, camera axes."""
+    up_w: FloatArray
+    """``(3,)`` the same in the world."""
+    sigma_rad: float
+    """Standard deviation of each, per axis."""
+
+
+@dataclass(frozen=True, slots=True)
 class WindowProblem:
     """Poses and anchors to refine together; ``W`` poses, ``A`` anchors, ``M`` observations."""
 
@@ -164,6 +192,8 @@ class WindowProblem:
     depth_priors: DepthPriors | None = None
     edges: EdgeTerms | None = None
     junctions: JunctionTerms | None = None
+    centres: tuple[CentreFactor, ...] = ()
+    gravity: tuple[GravityFactor, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

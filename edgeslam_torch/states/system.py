@@ -7,6 +7,7 @@ import numpy as np
 
 from edgeslam_torch.config import SlamConfig
 from edgeslam_torch.fusion.depth_scale import compared
+from edgeslam_torch.fusion.displacement import TelemetryModel
 from edgeslam_torch.fusion.motion import MotionFusion
 from edgeslam_torch.fusion.published import Published
 from edgeslam_torch.geometry import se3
@@ -103,7 +104,11 @@ class System:
     def map_keyframes(self, new: list[tuple[Frame, Keyframe]]) -> bool:
         """Map new keyframes; returns whether that is complete."""
         self.keyframe_s = new[-1][1].stamp_s
-        return self.absorb(self.mapping.submit(new))
+        return self.absorb(self.mapping.submit(new, self.telemetry("every")))
+
+    def telemetry(self, *where: str) -> TelemetryModel | None:
+        """Telemetry as it is now, if the settings want it in one of these refinements."""
+        return self.fusion.telemetry() if self.has_telemetry and self.config.window.telemetry in where else None
 
     def collect(self, wait: bool = False) -> None:
         """Collect finished results of real-time mapping; with ``wait`` the caller owns the map afterwards."""

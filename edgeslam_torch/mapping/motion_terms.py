@@ -1,0 +1,63 @@
+"""Motion factors of a window from what telemetry says of its keyframes."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from edgeslam_torch.fusion.displacement import TelemetryModel
+from edgeslam_torch.map.keyframe import Keyframe
+from edgeslam_torch.optim.problem import CentreFactor, GravityFactor, LmConfig, WindowProblem
+
+ALIKE = 30.0
+"""Keypoints err together: a window's thousands of reprojections, taken for independent, hold a wrong scale against
+telemetry whose covariance is honest. So many of them count as one (docs/decisions/0052)."""
+COST_TOLERANCE = 1e-5
+MU = 1e-8
+"""For windows with telemetry: a drift of the scale is a slow mode, which a solver that stops early or is damped by the
+stiff ones never reaches."""
+
+
+@dataclass(frozen=True, slots=True)
+class MotionFactors:
+    """What telemetry adds to a window."""
+
+    centres: tuple[CentreFactor, ...] = ()
+    gravity: tuple[GravityFactor, ...] = ()
+
+
+def motion_factors(
+    model: TelemetryModel | None,
+    keyframes: Sequence[Keyframe],
+    piece: Sequence[int],
+    scale_sigma_log: float | None = None,
+) -> MotionFactors:
+    """Factors between keyframes that follow each other in time, piece by piece.
+
+    Args:
+        model: Telemetry and what ties it to the map; None where it is silent.
+        keyframes: Of the window, in the order of its poses.
+        piece: Number of each one's piece of map: where one lies relative to another is not known.
+        scale_sigma_log: How far the scale may be off, common to all; the model's own doubt when None.
+    """
+    if model is None:
+        return MotionFactors()
+    centres, gravity = [], []
+    for number in sorted(set(piece)):
+        members = [i for i, p in enumerate(piece) if p == number]
+        order = np.array(sorted(members, key=lambda i: keyframes[i].stamp_s), dtype=np.int64)
+        stamps = np.array([keyframes[i].stamp_s for i in order])
+        told = model.positions(stamps, np.stack([keyframes[i].centre_w for i in order]), scale_sigma_log)
+        if told is not None:
+            centres.append(CentreFactor(order, ALIKE * told.information, ALIKE * told.vector, ALIKE * told.constant))
+        up = model.up(stamps)
+        if up is not None:
+            gravity.append(GravityFactor(order[up.frame], up.up_c, up.up_m, up.sigma_rad))
+    return MotionFactors(tuple(centres), tuple(gravity))
+
+
+def solver(config: LmConfig, problem: WindowProblem) -> LmConfig:
+    """How a window is minimised: to the end where it has motion factors."""
+    if not problem.centres:
+        return config
+    return replace(config, cost_tolerance=min(config.cost_tolerance, COST_TOLERANCE), mu=min(config.mu, MU))

@@ -1,0 +1,91 @@
+r"""Residuals of camera positions and of gravity: what inertial or other measurements of motion add to a window.
+
+Positions come as one Gaussian, :math:`\chi^2 = c^T A c - 2 b^T c + k` of the stacked camera centres
+:math:`c_i = -R_i^T t_i`, whose derivative by a left perturbation :math:`(\rho, \phi)` of the pose is
+:math:`-R_i^T \rho`: the translation alone. Gravity is a direction in the camera, :math:`R_i g - u_i`, with the
+derivative :math:`-[R_i g]_\times \phi`.
+"""
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from edgeslam_torch.geometry.se3 import hat
+from edgeslam_torch.optim.problem import CentreFactor, GravityFactor
+from edgeslam_torch.types import FloatArray
+
+
+class MotionTerms:
+    """Motion factors of one window; adds itself to the normal equations.
+
+    Small dense blocks: numpy, where a call costs a tenth of a torch call.
+    """
+
+    def __init__(
+        self, centres: tuple[CentreFactor, ...], gravity: tuple[GravityFactor, ...], column: list[int]
+    ) -> None:
+        """Prepare the terms.
+
+        Args:
+            centres: Gaussians of camera centres.
+            gravity: Up directions.
+            column: Free-pose number of each pose, -1 for a fixed one.
+        """
+        self.centres, self.gravity = centres, gravity
+        self.column = np.asarray(column)
+
+    def cost(self, T_c_w: Tensor) -> float:
+        """Sum of squared whitened residuals."""
+        if not self.centres and not self.gravity:
+            return 0.0
+        T = T_c_w.cpu().numpy()
+        total = sum(centre_cost(T[f.pose], f)[0] for f in self.centres)
+        return total + sum(float(np.sum(gravity_residual(T[f.pose], f) ** 2)) for f in self.gravity)
+
+    def linearise(self, T_c_w: Tensor, H: Tensor, g: Tensor) -> float:
+        """Add the terms to ``H (6F, 6F)`` and ``g (6F,)``; returns their cost."""
+        if not self.centres and not self.gravity:
+            return 0.0
+        T = T_c_w.cpu().numpy()
+        F = H.shape[0] // 6
+        H_np, g_np = np.zeros((F, 6, F, 6)), np.zeros((F, 6))
+        total = 0.0
+        for centre in self.centres:
+            value, by_centre = centre_cost(T[centre.pose], centre)
+            total += value
+            column = self.column[centre.pose]
+            free = np.flatnonzero(column >= 0)
+            into, R = column[free], T[centre.pose[free], :3, :3]
+            K = len(centre.pose)
+            A = centre.information.reshape(K, 3, K, 3)[free][:, :, free]
+            np.add.at(g_np[:, :3], into, -np.einsum("kab,kb->ka", R, by_centre[free]))
+            turned = np.einsum("iab,ibjd,jcd->iajc", R, A, R)
+            H_np[into[:, None], :3, into[None], :3] += turned.transpose(0, 2, 1, 3)
+        for gravity in self.gravity:
+            r = gravity_residual(T[gravity.pose], gravity)
+            J = gravity_jacobian(T[gravity.pose], gravity)
+            total += float(np.sum(r**2))
+            for k, i in enumerate(self.column[gravity.pose]):
+                if i >= 0:
+                    H_np[i, 3:, i, 3:] += J[k].T @ J[k]
+                    g_np[i, 3:] += J[k].T @ r[k]
+        H += torch.as_tensor(H_np.reshape(H.shape))
+        g += torch.as_tensor(g_np.ravel())
+        return total
+
+
+def centre_cost(T_c_w: FloatArray, factor: CentreFactor) -> tuple[float, FloatArray]:
+    """Chi-square of camera centres ``(K, 4, 4)``, and half its derivative by them ``(K, 3)``."""
+    c = -np.einsum("kba,kb->ka", T_c_w[:, :3, :3], T_c_w[:, :3, 3]).ravel()
+    slope = factor.information @ c - factor.vector
+    return float(c @ slope - factor.vector @ c) + factor.constant, slope.reshape(-1, 3)
+
+
+def gravity_residual(T_c_w: FloatArray, factor: GravityFactor) -> FloatArray:
+    """Predicted minus measured up direction in units of its sigma ``(U, 3)``."""
+    return np.asarray((T_c_w[:, :3, :3] @ factor.up_w - factor.up_c) / factor.sigma_rad)
+
+
+def gravity_jacobian(T_c_w: FloatArray, factor: GravityFactor) -> FloatArray:
+    """Derivative of `gravity_residual` by the rotation of a left perturbation ``(U, 3, 3)``."""
+    return np.asarray(-hat(T_c_w[:, :3, :3] @ factor.up_w) / factor.sigma_rad)

@@ -1,0 +1,94 @@
+"""Telemetry in a window: a part of the map that hangs on nothing else keeps scale and place."""
+
+import numpy as np
+import pytest
+from point_map import CAMERA, PointMap, check_map
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, Slerp
+
+from edgeslam_torch.fusion.config import FusionConfig
+from edgeslam_torch.fusion.displacement import TelemetryModel
+from edgeslam_torch.fusion.track import TelemetryTrack
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.mapping.motion_terms import motion_factors
+from edgeslam_torch.mapping.refinement import Window, refine
+from edgeslam_torch.optim.problem import LmConfig
+from edgeslam_torch.synthetic.flights.flight import camera_on_body
+from edgeslam_torch.synthetic.flights.telemetry import EXACT, simulate
+
+T_B_C = camera_on_body()
+
+
+@pytest.fixture
+def halves(rng):
+    """Six keyframes, one a second: the first three share no anchor with the last three."""
+    points = PointMap(rng, 400, 6)
+    points.fill()
+    for keyframe in points.keyframes:
+        other = np.flatnonzero((keyframe.anchor >= 0) & (keyframe.anchor % 2 != (keyframe.id >= 3)))
+        points.map.forget_observations(keyframe, other)
+    return points
+
+
+def telemetry_of(rng, points, scale=1.0):
+    """The model of a drone that flew by all keyframes in their order, in a map of other units."""
+    T_w_c = se3.inverse(points.world.T_c_w)
+    stamps = np.array([k.stamp_s for k in points.keyframes])
+    t = np.arange(-1.0, stamps[-1] + 1.0, 0.05)
+    T = np.tile(np.eye(4), (len(t), 1, 1))
+    T[:, :3, 3] = scale * CubicSpline(stamps, T_w_c[:, :3, 3])(t)
+    T[:, :3, :3] = Slerp(stamps, Rotation.from_matrix(T_w_c[:, :3, :3]))(t.clip(stamps[0], stamps[-1])).as_matrix()
+    track = TelemetryTrack("world", 0.35)
+    track.add(simulate(rng, t, T, T_B_C, faults=EXACT).samples())
+    yaw = Rotation.from_matrix(T[0, :3, :3] @ T_B_C[:3, :3].T).as_euler("ZYX")[0]
+    R_w_m = Rotation.from_euler("z", -yaw).as_matrix()
+    return TelemetryModel(
+        track, FusionConfig(velocity_rounding="nearest"), T_B_C, R_w_m, 0.0, 0.0, scale, 0.01, True, None
+    )
+
+
+def blow_up(points, factor):
+    """The last three keyframes and their anchors, scaled about the third."""
+    centre = points.keyframes[2].centre_w
+    for keyframe in points.keyframes[3:]:
+        T_w_c = keyframe.T_w_c
+        T_w_c[:3, 3] = centre + factor * (T_w_c[:3, 3] - centre)
+        keyframe.T_c_w = se3.inverse(T_w_c)
+    mine = points.map.anchors_seen_by(points.keyframes[3:])
+    points.map.anchors.p_w[mine] = centre + factor * (points.map.anchors.p_w[mine] - centre)
+
+
+def far(points):
+    true = se3.inverse(points.world.T_c_w)[3:, :3, 3]
+    return max(float(np.linalg.norm(k.centre_w - c)) for k, c in zip(points.keyframes[3:], true, strict=True))
+
+
+@pytest.mark.parametrize("factor", [0.7, 1.4])
+@pytest.mark.parametrize("scale", [1.0, 3.0])
+def test_scale_is_carried_over_to_what_shares_no_anchor(rng, halves, factor, scale):
+    blow_up(halves, factor)
+    off = far(halves)
+    window = Window(halves.keyframes[3:], halves.keyframes[:3], halves.map.anchors_seen_by(halves.keyframes))
+    refine(halves.map, window, CAMERA, LmConfig())
+    assert far(halves) > 0.9 * off
+    refine(halves.map, window, CAMERA, LmConfig(max_iterations=50), telemetry_of(rng, halves, scale))
+    assert far(halves) < 0.05 * off
+    check_map(halves.map)
+
+
+def test_pieces_are_not_tied_to_each_other(rng, halves):
+    model = telemetry_of(rng, halves)
+    factors = motion_factors(model, halves.keyframes, [0, 0, 0, 1, 1, 1])
+    assert [f.pose.tolist() for f in factors.centres] == [[0, 1, 2], [3, 4, 5]]
+    assert [f.pose.tolist() for f in factors.gravity] == [[0, 1, 2], [3, 4, 5]]
+
+
+def test_poses_come_in_any_order(rng, halves):
+    model, shuffled = telemetry_of(rng, halves), [halves.keyframes[i] for i in (4, 0, 5, 2, 1, 3)]
+    (factor,) = motion_factors(model, shuffled, [0] * 6).centres
+    assert [shuffled[i].id for i in factor.pose] == [0, 1, 2, 3, 4, 5]
+
+
+def test_no_telemetry_no_factors(halves):
+    factors = motion_factors(None, halves.keyframes, [0] * 6)
+    assert not factors.centres and not factors.gravity

@@ -1,0 +1,105 @@
+"""Camera-centre and gravity factors against finite differences and against what they mean."""
+
+import numpy as np
+import pytest
+import torch
+
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.optim.motion_factors import MotionTerms, gravity_jacobian, gravity_residual
+from edgeslam_torch.optim.problem import CentreFactor, GravityFactor
+
+STEP = 1e-6
+
+
+def random_poses(rng, count):
+    return np.stack([se3.exp(np.concatenate([rng.normal(size=3), rng.normal(0.0, 1.0, 3)])) for _ in range(count)])
+
+
+def between(i, j, moved, sigma, count):
+    """The Gaussian of ``c_j - c_i = moved``."""
+    D = np.zeros((3, count, 3))
+    D[:, j], D[:, i] = np.eye(3), -np.eye(3)
+    D = D.reshape(3, -1) / sigma
+    b = np.asarray(moved) / sigma
+    return CentreFactor(np.arange(count), D.T @ D, D.T @ b, float(b @ b))
+
+
+def moved_by(T, pose, xi):
+    out = T.copy()
+    out[pose] = se3.exp(xi) @ T[pose]
+    return out
+
+
+@pytest.fixture
+def terms(rng):
+    """Five poses, the second fixed; two centre factors in another order than the poses', and gravity."""
+    B = rng.normal(size=(9, 9))
+    dense = CentreFactor(np.array([3, 1, 0]), B @ B.T, rng.normal(size=9), 2.0)
+    pair = between(2, 4, [0.3, -0.2, 0.1], 0.05, 5)
+    up_c = rng.normal(size=(3, 3))
+    up_c /= np.linalg.norm(up_c, axis=1)[:, None]
+    gravity = GravityFactor(np.array([4, 1, 2]), up_c, np.array([0.0, 0.6, 0.8]), 0.1)
+    return MotionTerms((dense, pair), (gravity,), [0, -1, 1, 2, 3])
+
+
+def test_gradient_and_curvature_are_those_of_the_cost(rng, terms):
+    T = random_poses(rng, 5)
+    H, g = torch.zeros(24, 24, dtype=torch.float64), torch.zeros(24, dtype=torch.float64)
+    value = terms.linearise(torch.as_tensor(T), H, g)
+    assert value == pytest.approx(terms.cost(torch.as_tensor(T)), rel=1e-12)
+    numeric = np.zeros(24)
+    for pose, column in ((0, 0), (2, 1), (3, 2), (4, 3)):
+        for k in range(6):
+            xi = STEP * np.eye(6)[k]
+            up, down = (terms.cost(torch.as_tensor(moved_by(T, pose, s * xi))) for s in (1, -1))
+            numeric[6 * column + k] = (up - down) / (4 * STEP)  # half the derivative, as J^T r is
+    np.testing.assert_allclose(g.numpy(), numeric, rtol=1e-5, atol=1e-5 * np.abs(numeric).max())
+    np.testing.assert_allclose(H.numpy(), H.numpy().T, atol=1e-9)
+
+
+def test_curvature_of_centres_is_exact_in_the_translations(rng, terms):
+    """The cost is quadratic in them, so the difference of two gradients is the curvature."""
+    terms.gravity = ()
+    T = random_poses(rng, 5)
+    xi = np.concatenate([rng.normal(size=3), np.zeros(3)])
+    H, g, moved_H, moved_g = (torch.zeros(*s, dtype=torch.float64) for s in ((24, 24), (24,)) * 2)
+    terms.linearise(torch.as_tensor(T), H, g)
+    terms.linearise(torch.as_tensor(moved_by(T, 3, xi)), moved_H, moved_g)
+    np.testing.assert_allclose(moved_g - g, H[:, 12:18].numpy() @ xi, rtol=1e-9, atol=1e-9)
+
+
+def test_gravity_jacobian_matches_finite_differences(rng):
+    T = random_poses(rng, 1)
+    factor = GravityFactor(np.array([0]), np.array([[0.0, -1.0, 0.0]]), np.array([0.0, 0.0, 1.0]), 0.2)
+    J = gravity_jacobian(T, factor)[0]
+    for k in range(3):
+        xi = np.concatenate([np.zeros(3), STEP * np.eye(3)[k]])
+        up, down = (gravity_residual(moved_by(T, 0, s * xi), factor)[0] for s in (1, -1))
+        np.testing.assert_allclose(J[:, k], (up - down) / (2 * STEP), atol=1e-7)
+
+
+def test_a_displacement_has_a_direction():
+    """The camera that moved forward is ahead: the same displacement the other way round costs four times its square."""
+    T_w_c = np.tile(np.eye(4), (2, 1, 1))
+    T_w_c[1, :3, 3] = [0.5, 0.0, 0.0]
+    T = torch.as_tensor(se3.inverse(T_w_c))
+    for moved, cost in (([0.5, 0.0, 0.0], 0.0), ([-0.5, 0.0, 0.0], 100.0), ([0.5, 0.1, 0.0], 1.0)):
+        assert MotionTerms((between(0, 1, moved, 0.1, 2),), (), [0, 1]).cost(T) == pytest.approx(cost, abs=1e-9)
+
+
+def test_gravity_has_a_direction():
+    """A level camera sees up as minus y; upside down it is two radii off."""
+    level = np.eye(4)
+    level[:3, :3] = [[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]
+    T = torch.as_tensor(se3.inverse(level)[None])
+    for up_c, cost in (([0.0, -1.0, 0.0], 0.0), ([0.0, 1.0, 0.0], 400.0)):
+        factor = GravityFactor(np.array([0]), np.array([up_c]), np.array([0.0, 0.0, 1.0]), 0.1)
+        assert MotionTerms((), (factor,), [0]).cost(T) == pytest.approx(cost, abs=1e-9)
+
+
+def test_nothing_to_say_costs_nothing_and_changes_nothing(rng):
+    T = torch.as_tensor(random_poses(rng, 2))
+    H, g = torch.zeros(12, 12, dtype=torch.float64), torch.zeros(12, dtype=torch.float64)
+    nothing = MotionTerms((), (), [0, 1])
+    assert nothing.cost(T) == nothing.linearise(T, H, g) == 0.0
+    assert not H.any() and not g.any()
