@@ -27,6 +27,8 @@ from edgeslam_torch.types import FloatArray, IntArray
 _LEAST_WEIGHT = 1e-3
 _MIN_DISPLACEMENTS = 6
 _MIN_HEIGHTS = 6
+_MOST_PARTS = 4
+"""Parts of a flight whose scales are compared: of a tenth of it there is too little to tell."""
 _BELIEF = 20.0
 """Weight of the expected noise against the observed one, in residuals."""
 _USUAL_BIAS_M_S = 0.01
@@ -147,7 +149,8 @@ def displacement_evidence(
     if fit is None or float(weight.sum()) < _MIN_DISPLACEMENTS:
         return None
     rms = math.sqrt(float(np.sum(weight * clean**2)) / max(3.0 * float(weight.sum()), 1e-9))
-    return Evidence(fit.information, fit.vector, rms, fit.bias[:, -1] / duration_s[-1])
+    evidence = Evidence(fit.information, fit.vector, rms, fit.bias[:, -1] / duration_s[-1])
+    return evidence.softened(_unrest(white, fit, J, latent, target))
 
 
 def height_evidence(
@@ -222,6 +225,35 @@ def height_evidence(
     return Evidence(0.5 * (information + information.T), vector, rms, np.zeros(3))
 
 
+def _unrest(white: FloatArray, fit: "_Fit", J: FloatArray, latent: FloatArray, target: FloatArray) -> float:
+    """Error of the mean scale [m per map unit] because parts of the flight have scales that differ beyond their noise.
+
+    A map that drifts in scale, or telemetry that is right in part: no averaging within a part tells of it. The variance
+    between parts is that of a random-effects model (DerSimonian and Laird 1986).
+    """
+    n = len(white)
+    parts = min(_MOST_PARTS, n // _MIN_DISPLACEMENTS)
+    if parts < 2:
+        return 0.0
+    C = fit.noise.covariance.copy()
+    C.flat[:: n + 1] += white
+    scale, information = np.zeros(parts), np.zeros(parts)
+    for k, i in enumerate(np.array_split(np.arange(n), parts)):
+        inverse = np.linalg.inv(C[np.ix_(i, i)])
+        A = np.einsum("anu,anv->uv", latent[:, i], inverse @ J[:, i])[_SCALE]
+        v = float(np.einsum("an,anx->", latent[:, i, _SCALE], inverse @ target[:, i]))
+        information[k] = max(float(A[_SCALE]), 0.0)
+        scale[k] = (v - float(A[1:] @ fit.theta[1:])) / max(float(A[_SCALE]), 1e-30)
+    information /= fit.kappa
+    total, squares = float(information.sum()), float(np.sum(information**2))
+    room = total - squares / max(total, 1e-30)
+    if not room > 0:
+        return 0.0
+    apart = float(np.sum(information * (scale - np.sum(information * scale) / total) ** 2))
+    between = max(0.0, (apart - (parts - 1)) / room)
+    return math.sqrt(between * squares) / total
+
+
 def _of_changes(apart_s: FloatArray, duration_s: FloatArray, memory_s: float) -> FloatArray:
     """Correlation of an Ornstein-Uhlenbeck process's changes over intervals ``(N, N)``."""
 
@@ -257,6 +289,8 @@ class _Fit:
     """``(axes, N)``, the part that is bias."""
     noise: _Slow
     inverse_trace: float
+    kappa: float
+    """Variance of the residuals over what was expected."""
 
 
 def _best(
@@ -295,5 +329,5 @@ def _best(
         if likely > likeliest:
             likeliest = likely
             slow, bias = whitened @ noise.covariance, whitened @ noise.bias
-            best = _Fit(theta, A / kappa, v / kappa, residual, slow, bias, noise, float(np.trace(inverse)) / kappa)
+            best = _Fit(theta, A / kappa, v / kappa, residual, slow, bias, noise, float(np.trace(inverse)) / kappa, kappa)
     return best

@@ -65,6 +65,23 @@ def test_stated_sigma_is_that_of_the_errors(rng):
     assert abs(np.mean(ratio)) < 0.5
 
 
+def test_parts_of_a_flight_that_differ_in_scale_widen_sigma(rng):
+    """A map that has grown by a third while it was made: the mean is no surer than its parts are alike."""
+    growing = np.repeat([0.85, 0.95, 1.05, 1.15], 20)[:, None]
+
+    def drifting():
+        t, seen, told = moved(rng)
+        return [displaced(t, seen * growing, told)]
+
+    error, ratio = errors(drifting, 20)
+    _, steady = solved([displaced(*moved(rng))], TILT)
+    _, sigma = solved(drifting(), TILT)
+    assert sigma > 4 * steady
+    assert 0.04 < sigma < 0.12
+    assert np.abs(error).max() < 0.06
+    assert np.abs(ratio).max() < 1.0
+
+
 def test_noise_of_both_sides_does_not_shrink_the_scale(rng):
     error, _ = errors(lambda: [displaced(*moved(rng, 100, noise_map_m=0.03), math.sqrt(2) * 0.03)], 30)
     assert abs(np.mean(error)) < 0.02
