@@ -329,5 +329,6 @@ def _best(
         if likely > likeliest:
             likeliest = likely
             slow, bias = whitened @ noise.covariance, whitened @ noise.bias
-            best = _Fit(theta, A / kappa, v / kappa, residual, slow, bias, noise, float(np.trace(inverse)) / kappa, kappa)
+            trace = float(np.trace(inverse)) / kappa
+            best = _Fit(theta, A / kappa, v / kappa, residual, slow, bias, noise, trace, kappa)
     return best
