@@ -1,4 +1,4 @@
-"""kornia's Canny and OpenCV's, held together."""
+"""kornia's Canny against OpenCV's."""
 
 import cv2
 import numpy as np

@@ -1,4 +1,4 @@
-"""Depth maps that cannot be meant count as none."""
+"""Implausible depth maps count as missing."""
 
 import logging
 

@@ -135,7 +135,7 @@ def test_onnxruntime_backend_never_imports_torch(weights: Path) -> None:
 def test_shipped_weights_on_rooms_they_were_not_trained_on(
     data_dir: Path, folder: str, stride: int, scaled: float, metric: float
 ) -> None:
-    """A smoke bound well above the model card's figures: catches broken preprocessing or a wrong focal length."""
+    """A loose bound above the model card's figures: detects broken preprocessing or a wrong focal length."""
     from edgeslam_torch.train.views.datasets import load_depth_folder
 
     predictor = DepthPredictor()

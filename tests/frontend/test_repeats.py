@@ -6,7 +6,7 @@ from edgeslam_torch.frontend.repeats import RepeatedImages
 
 
 def room(rng, size=(240, 320)):
-    """A soft picture with grain, as a camera gives."""
+    """A smooth image with sensor noise."""
     return np.clip(cv2.GaussianBlur(rng.normal(0, 400, size), (0, 0), 6) + 128, 0, 255).astype(np.uint8)
 
 
@@ -53,7 +53,7 @@ def test_a_motion_too_slow_for_two_images_adds_up(rng):
 
 
 def test_an_encoder_lets_a_still_picture_be_recognised(rng, tmp_path):
-    """A re-encoded frozen video is never the same to the bit."""
+    """A re-encoded frozen video differs in single bits."""
     path = str(tmp_path / "frozen.mp4")
     writer = cv2.VideoWriter(path, cv2.VideoWriter_fourcc(*"mp4v"), 30.0, (320, 240))
     assert writer.isOpened()

@@ -1,4 +1,4 @@
-"""Calibration files: the three kinds we read, and what is said about the ones we cannot."""
+"""Calibration files: the three supported kinds, and the errors for others."""
 
 from dataclasses import replace
 

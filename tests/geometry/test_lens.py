@@ -1,4 +1,4 @@
-"""Which calibrations can be a camera's."""
+"""Plausibility of calibrations."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What the cycle loss sees and what it does not."""
+"""Sensitivity and invariances of the cycle loss."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What every loss promises: zero at the truth, forward from residuals, right gradients, quiet degenerate cases."""
+"""Properties of every loss: zero at the truth, forward from residuals, correct gradients, finite degenerate cases."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

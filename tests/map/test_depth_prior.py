@@ -1,4 +1,4 @@
-"""How deep a pixel probably is, from the network and the anchors."""
+"""Depth priors of pixels from the network and the anchors."""
 
 import numpy as np
 import pytest
@@ -90,7 +90,7 @@ def test_anchors_behind_the_camera_do_not_count(points):
 
 @pytest.mark.parametrize("twist", [0.0, 0.3])
 def test_network_that_errs_is_bent_towards_the_anchors_and_trusted_less(points, twist):
-    """An error that grows across the image, as in a room that the network never saw; it says one per cent."""
+    """An error that grows across the image, as in an unfamiliar room, with a stated sigma of 1 %."""
     keyframe, z = points.keyframes[0], true_depth(points, 0)
     u, v = np.rint(keyframe.features.uv).astype(int).T
     error = twist * (u - 320) / 320

@@ -1,4 +1,4 @@
-"""The map stays consistent whatever is done to it."""
+"""The map's invariants hold under any sequence of operations."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ MOVES = (
 
 
 class Scribbler:
-    """Does random allowed things to a map."""
+    """Applies random valid operations to a map."""
 
     def __init__(self, seed):
         self.rng = np.random.default_rng(seed)
@@ -149,7 +149,7 @@ def test_refreshed_anchor_faces_its_cameras_and_knows_its_distance(rng):
 
 
 def test_a_keyframe_belongs_to_the_piece_that_it_was_tracked_in(rng):
-    """Found again in the first piece while a second one exists: that joins nothing."""
+    """Relocalised in the first piece while a second one exists: that joins nothing."""
     points = PointMap(rng, 300, 3)
     first, second, again = points.keyframes
     points.map.begin_piece("first")

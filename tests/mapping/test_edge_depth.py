@@ -83,7 +83,7 @@ def test_prior_that_is_off_by_a_third_changes_little(factor):
 
 
 def test_true_depth_outside_the_search_is_not_made_up():
-    """Prior three times too deep and sure of itself: next to nothing may pass for measured."""
+    """An overconfident prior three times too deep: almost nothing may count as measured."""
     result, _ = measured(slanted_wall(), 3.0, 0.1)
     assert np.isfinite(result.inverse_depth).mean() < 0.05
 

@@ -164,7 +164,7 @@ def test_the_nearest_edge_pixel_is_found_within_two_pixels(rng):
 
 
 def test_keyframes_without_a_measured_edge_are_an_empty_map(rng):
-    """No median of nothing: numpy warns, and a warning here fails."""
+    """No median of an empty set: numpy's warning would fail the test."""
     points = PointMap(rng, 300, 3)
     points.fill()
     edges = EdgeMap(points.map, CAMERA, EdgeConfig(), 0.35)

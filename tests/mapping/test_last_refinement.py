@@ -1,4 +1,4 @@
-"""The refinement of the whole map with its edges, in every form that can be set."""
+"""The refinement of the whole map with its edges, for every setting."""
 
 import pickle
 from functools import lru_cache

@@ -46,7 +46,7 @@ def test_disturbed_window_comes_back_exactly(points, rng):
 
 @pytest.mark.parametrize("what", ["anchor", "pixel"])
 def test_a_window_that_cannot_be_refined_is_left_as_it_is(points, what):
-    """One number that is none: poses, anchors and observations stay, whatever the solver hands back."""
+    """A NaN in the solver's result leaves poses, anchors and observations unchanged."""
     window = choose_window(points.map, points.keyframes[-1], 4, 15)
     if what == "anchor":
         points.map.anchors.p_w[window.anchor[3]] = np.nan
@@ -132,7 +132,7 @@ def test_map_of_two_keyframes_is_left_alone(rng):
 
 
 def test_map_of_a_camera_that_never_moved_is_left_alone(points):
-    """Its extent cannot hold the scale: this was a division by zero on an image folder of one place."""
+    """Zero extent cannot fix the gauge; this once divided by zero on a folder of images from one place."""
     for keyframe in points.map.keyframes.values():
         keyframe.T_c_w = np.eye(4)
     assert refine_all(points.map, CAMERA, LmConfig()) is None

@@ -1,4 +1,4 @@
-"""The loop itself, on problems small enough to follow by hand."""
+"""Levenberg-Marquardt on problems small enough to work by hand."""
 
 import math
 from dataclasses import dataclass, field, replace
@@ -26,10 +26,10 @@ class Linear:
 
 @dataclass
 class Curve:
-    """Residuals ``r(x)``; keeps count of what it was asked for."""
+    """Residuals ``r(x)``; counts its evaluations."""
 
     spoil: float = 0.0
-    """Added to every candidate's cost: a model that never delivers."""
+    """Added to every candidate's cost, so that no step is accepted."""
     singular: bool = False
     linearised: list[Linear] = field(default_factory=list)
     proposed: list[float] = field(default_factory=list)

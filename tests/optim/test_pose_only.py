@@ -1,4 +1,4 @@
-"""Pose-only refinement: exact, robust, and silent about nothing."""
+"""Pose-only refinement: accuracy, robustness, reported failures."""
 
 from dataclasses import replace
 

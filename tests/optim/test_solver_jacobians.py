@@ -49,7 +49,7 @@ def test_exp_passes_gradcheck(xi):
 
 
 def test_anchors_and_their_elimination(T, rng):
-    """Normal equations, reduced system and the way back, against the dense Jacobian of plain residuals."""
+    """Normal equations, reduced system and back-substitution, against the dense Jacobian of plain residuals."""
     poses = torch.stack((T, lie.exp(tensor([0.1, 0, 0, 0, 0.1, 0])) @ T, lie.exp(tensor([0, 0.2, 0, 0.1, 0, 0])) @ T))
     p = (tensor(rng.uniform((-1, -1, 2), (1, 1, 5), (7, 3))) - T[:3, 3]) @ T[:3, :3]
     pose, anchor = (torch.as_tensor(x.ravel()) for x in np.meshgrid(np.arange(3), np.arange(7)))

@@ -1,4 +1,4 @@
-"""Lost frames get their poses backwards in time, and only where the map bears them out."""
+"""Lost frames get poses backwards in time, only where the map supports them."""
 
 from types import SimpleNamespace
 
@@ -34,7 +34,7 @@ class Lost:
         self.placed |= poses
 
     def keep(self, index, known=1.0):
-        """A frame of whose keypoints a share, all over the image, looks as it does in the map."""
+        """A frame of whose keypoints a share, spread over the image, matches the map."""
         seen = np.flatnonzero(self.points.world.visible[VIEW])
         features = self.points.features(VIEW, seen, 0.5 * self.rng.normal(size=(len(seen), 2)))
         strange = self.rng.random(len(seen)) >= known

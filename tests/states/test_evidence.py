@@ -1,4 +1,4 @@
-"""What counts as evidence for the scale, with which sign and how surely, from image to metres."""
+"""Evidence for the scale, from image to metres: sources, signs and sigmas."""
 
 from dataclasses import replace
 from functools import lru_cache

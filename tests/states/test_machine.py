@@ -1,4 +1,4 @@
-"""The table of states: what follows what, and that nothing else can."""
+"""The state machine's transition table."""
 
 import math
 

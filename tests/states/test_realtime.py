@@ -71,7 +71,7 @@ def test_a_worker_that_is_done_at_once_maps_as_well_as_none():
 
 
 def test_what_refinement_did_to_the_newest_keyframe_carries_the_camera_along():
-    """While frames are tracked against the old map, all of it is moved by 60 cm and 20 degrees."""
+    """The map moves by 60 cm and 20 degrees while frames are tracked against its old state."""
     M = se3.exp(np.array([0.4, -0.3, 0.3, 0.1, 0.3, -0.15]))
     scheduler = Scheduler()
     slam = realtime(scheduler)
@@ -142,7 +142,7 @@ def test_a_fault_of_the_mapping_is_raised_where_the_frames_are_stepped():
 
 
 def test_maps_are_read_and_frames_are_tracked_while_the_network_runs():
-    """A real thread stands still inside of the depth network until the others have done all that they may want."""
+    """A real thread blocks inside the depth network until the others have finished."""
     inside, go_on = threading.Event(), threading.Event()
 
     def depth(image, camera):
@@ -172,7 +172,7 @@ def test_maps_are_read_and_frames_are_tracked_while_the_network_runs():
 
 
 def dark(frame):
-    """The same moment with nothing to see."""
+    """The same situation with blank images."""
     return replace(frame, image=np.zeros_like(frame.image))
 
 
@@ -192,7 +192,7 @@ def test_a_lost_frame_is_found_again_while_the_worker_is_busy():
 
 
 def test_a_new_piece_of_map_begins_after_what_is_being_mapped():
-    """Lost for too long, then in front of something else: two threads never write to the map."""
+    """Lost beyond the time-out, then at another place: two threads never write to the map."""
     scheduler = Scheduler()
     slam = realtime(scheduler)
     frames = to_the_map(slam, scheduler)

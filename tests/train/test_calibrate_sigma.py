@@ -1,4 +1,4 @@
-"""Uncertainty that means what it says."""
+"""Calibration of the predicted uncertainty."""
 
 import numpy as np
 import pytest

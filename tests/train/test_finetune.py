@@ -46,7 +46,7 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def finetune(recordings: Path, tmp_path: Path) -> Finetune:
-    """Runs the command on recordings by name, into ``tmp_path/out``; exit code, stdout and stderr."""
+    """Runs the command on named recordings into ``tmp_path/out``; returns exit code, stdout and stderr."""
 
     def call(*words: str, steps: int = 8, out: Path = tmp_path / "out") -> tuple[int, str, str]:
         return _finetune(recordings, *words, steps=steps, out=out)
@@ -66,7 +66,7 @@ def _finetune(recordings: Path, *words: str, steps: int, out: Path) -> tuple[int
 
 @pytest.fixture(scope="module")
 def eight_steps(recordings: Path) -> tuple[Path, str]:
-    """A whole run on the kitchen, made once, and what it printed."""
+    """A whole run on the kitchen, shared by the tests, and its output."""
     folder = recordings / "eight steps"
     code, stdout, _ = _finetune(recordings, "kitchen", steps=8, out=folder)
     assert code == 0

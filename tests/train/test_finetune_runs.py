@@ -176,7 +176,7 @@ def test_two_recordings_with_one_name_get_a_run_each(tmp_path: Path) -> None:
 
 
 class _FakeSlam:
-    """Stands for `run`: writes what makes a run folder, and counts."""
+    """Stub of `run`: writes a minimal run folder and counts calls."""
 
     def __init__(self) -> None:
         self.calls = 0

@@ -60,7 +60,7 @@ def run(out: Path, config: TrainConfig = CONFIG, hooks: Sequence[Hooks] = ()) ->
 
 
 class _SnapshotAt(Hooks):
-    """What a SIGKILL right after a step would leave."""
+    """The state after a SIGKILL between two steps."""
 
     def __init__(self, step: int, folder: Path, snapshot: Path) -> None:
         self.step, self.folder, self.snapshot = step, folder, snapshot

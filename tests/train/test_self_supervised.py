@@ -69,7 +69,7 @@ def test_hidden_points_are_left_out() -> None:
 
 
 class _Oracle(torch.nn.Module):
-    """Stands for a network: gives chosen log depths at the training focal length."""
+    """Stub of a network: given log depths at the training focal length."""
 
     def __init__(self, signal: SelfSupervised, slots: list[Slot], factor: float) -> None:
         super().__init__()

@@ -27,7 +27,7 @@ CONFIG = TrainConfig(steps=9, batch=1, warmup_steps=1, validate_every=3, checkpo
 
 
 class _Killed(Hooks):
-    """Ends like a killed process: nothing of the last steps is saved."""
+    """Ends like a killed process: the last steps are not saved."""
 
     def __init__(self, step: int) -> None:
         self.step = step

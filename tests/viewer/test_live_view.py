@@ -1,4 +1,4 @@
-"""The view that looks on while another thread maps."""
+"""The live view while another thread maps."""
 
 from types import SimpleNamespace
 
@@ -14,7 +14,7 @@ CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
 
 
 class Screen:
-    """Keeps what it is given to show."""
+    """Records what it is given to show."""
 
     def __init__(self, *_, **__):
         self.depth = []
@@ -30,7 +30,7 @@ class Screen:
 
 
 class Measured:
-    """A keyframe whose depth the mapping thread drops as soon as somebody has looked at it."""
+    """A keyframe whose depth the mapping thread drops after the first read."""
 
     features = SimpleNamespace(uv=np.zeros((5, 2), np.float32))
 

@@ -23,7 +23,7 @@ GREEN = Metadata(
 
 
 def write_green_network(path: Path) -> Path:
-    """A network that takes green for far: ``1 + 3 green`` metres, 10 % sure of it, at half the image's size."""
+    """A network that maps green to depth: ``1 + 3 green`` metres, 10 % sure of it, at half the image's size."""
     constants = {"green": [[[[0.0]], [[3.0]], [[0.0]]]], "one": [1.0], "none": 0.0, "sigma": 0.1}
     nodes = [
         helper.make_node("Conv", ["image", "green", "one"], ["depth"]),

@@ -37,7 +37,7 @@ def linearised(problem: WindowProblem, config: LmConfig) -> tuple[_Window, _Syst
 
 
 def moved(solver: _Window, problem: WindowProblem, state: _State) -> torch.Tensor:
-    """How far anchors, edges and junctions went, in the plain window's order."""
+    """Updates of anchors, edges and junctions, in the plain window's order."""
     parts = [torch.as_tensor(solver.points.in_callers_order(state.p) - problem.p_w).flatten()]
     for block, x in solver._blocks(state):
         start = problem.edges.inverse_depth if block.size == 1 else problem.junctions.inverse_depth

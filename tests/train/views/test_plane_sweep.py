@@ -64,7 +64,7 @@ def test_what_one_neighbour_does_not_see_is_taken_from_the_others(rng: np.random
 
 
 def test_bare_pixels_follow_their_neighbours() -> None:
-    """Costs that say nothing take the plane of what surrounds them; those that say something keep it."""
+    """Uninformative costs take the plane of their surroundings; informative ones keep their minimum."""
     cost = np.full((8, 20, 20), 1.0, np.float32)
     cost[3] = 0.2
     cost[:, 6:14, 6:14] = 0.7
