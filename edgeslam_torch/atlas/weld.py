@@ -39,6 +39,7 @@ def move_piece(slam_map: SlamMap, edges: EdgeMap, log: TrajectoryLog, piece: int
         ids = slam_map.anchors_seen_by(mine)
         for keyframe in mine:
             keyframe.T_c_w = sim3.moved_camera(S, keyframe.T_c_w)
+            keyframe.scale(scale)
         slam_map.scale_links(piece, scale)
         anchors = slam_map.anchors
         anchors.p_w[ids] = sim3.transform(S, anchors.p_w[ids])

@@ -1,6 +1,7 @@
 """A keyframe: features, their anchors, and the pose that refinement moves."""
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,46 @@ from edgeslam_torch.geometry import se3
 from edgeslam_torch.types import DepthMap, FloatArray, FrameFeatures, IntArray
 
 NO_ANCHOR = -1
+
+SHARED_ERRORS = 3.0
+"""Factor on the standard deviation of a tracked motion: neighbouring keyframes share the errors of their corners and of
+the depth network, which its covariance takes for independent."""
+
+
+@dataclass(frozen=True, slots=True)
+class NetworkView:
+    """How a keyframe's network depth compares with its triangulated anchors."""
+
+    log_network: float
+    """Median log network depth [m]."""
+    log_map: float
+    """Median log depth in the map [map units]."""
+    slope: float
+    """Of log network depth on log map depth."""
+    weight: float
+    """How much the slope rests on."""
+
+    def scaled(self, scale: float) -> "NetworkView":
+        """The same once the map has grown by a factor."""
+        return replace(self, log_map=self.log_map + math.log(scale))
+
+
+@dataclass(frozen=True, slots=True)
+class TrackedMotion:
+    """Where tracking saw a keyframe from another one."""
+
+    reference_id: int
+    T_c_r: FloatArray
+    """``(4, 4)``, takes coordinates of the reference to the keyframe."""
+    information: FloatArray
+    """``(6, 6)`` inverse covariance of its left tangent."""
+
+    def scaled(self, scale: float) -> "TrackedMotion":
+        """The same once the map has grown by a factor."""
+        T = self.T_c_r.copy()
+        T[:3, 3] *= scale
+        by = np.array([1.0 / scale] * 3 + [1.0] * 3)
+        return replace(self, T_c_r=T, information=self.information * np.outer(by, by))
 
 
 @dataclass(slots=True)
@@ -31,6 +72,11 @@ class Keyframe:
     """Index of ``features.uv``."""
     depth: DepthMap | None = None
     """Released, like ``image``, after the edges are measured."""
+    network_m: FloatArray | None = None
+    """``(N,)`` network depth at the keypoints [m], NaN where it says nothing; stays when ``depth`` goes."""
+    network_view: NetworkView | None = None
+    tracked: TrackedMotion | None = None
+    """Set when it was made while most depths that it sees rested on priors."""
     image: NDArray[np.uint8] | None = None
     """Undistorted, ``(H, W, 3)`` BGR or ``(H, W)`` grey; for edges."""
     grey: NDArray[np.uint8] | None = None
@@ -45,6 +91,11 @@ class Keyframe:
     def centre_w(self) -> FloatArray:
         """``(3,)`` camera centre."""
         return -self.T_c_w[:3, :3].T @ self.T_c_w[:3, 3]
+
+    def scale(self, scale: float) -> None:
+        """Take along what it remembers in map units once the map has grown by a factor; the pose is the caller's."""
+        self.network_view = None if self.network_view is None else self.network_view.scaled(scale)
+        self.tracked = None if self.tracked is None else self.tracked.scaled(scale)
 
     def keypoints_with_anchor(self) -> IntArray:
         """Indices of keypoints that have an anchor."""
@@ -63,3 +114,10 @@ def make_keyframe(id: int, frame_index: int, stamp_s: float, T_c_w: FloatArray, 
         words=words(features.descriptors),
         grid=KeypointGrid(features.uv),
     )
+
+
+def tracked_motion(reference: Keyframe, T_c_w: FloatArray, covariance: FloatArray) -> TrackedMotion | None:
+    """Where tracking saw a camera from a keyframe; None without a covariance ``(6, 6)`` that can be inverted."""
+    if not np.isfinite(covariance).all() or np.linalg.matrix_rank(covariance, hermitian=True) < 6:
+        return None
+    return TrackedMotion(reference.id, T_c_w @ reference.T_w_c, np.linalg.inv(SHARED_ERRORS**2 * covariance))

@@ -10,6 +10,7 @@ from edgeslam_torch.frontend.depth_check import CheckedDepth
 from edgeslam_torch.frontend.image import as_grey, colours_at
 from edgeslam_torch.fusion.displacement import TelemetryModel
 from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.map.depth_prior import sample
 from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.mapping.edge_map import EdgeMap
 from edgeslam_torch.mapping.mapper import Mapper
@@ -84,6 +85,8 @@ class MappingPipeline:
         keyframe.image = self.camera.undistort_image(frame.image)
         keyframe.grey = as_grey(keyframe.image)
         keyframe.depth = None if self.depth is None else self.depth(keyframe.image, self.camera)
+        if keyframe.depth is not None:
+            keyframe.network_m = sample(keyframe.depth, keyframe.features.uv)[0]
         self.has_depth = self.has_depth or keyframe.depth is not None
 
     def _run(self, new: list[tuple[Frame, Keyframe]], telemetry: TelemetryModel | None) -> Mapped:

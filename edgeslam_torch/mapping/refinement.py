@@ -11,9 +11,18 @@ from edgeslam_torch.losses.robust import Kernel
 from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.mapping.motion_terms import motion_factors, solver
-from edgeslam_torch.mapping.prior_anchors import depth_priors
+from edgeslam_torch.mapping.network_scale import network_priors
+from edgeslam_torch.mapping.prior_anchors import depth_priors, mostly_on_priors
 from edgeslam_torch.optim.local_ba import refine_window
-from edgeslam_torch.optim.problem import LmConfig, ScalePrior, StopReason, WindowProblem, WindowResult
+from edgeslam_torch.optim.problem import (
+    DepthPriors,
+    LmConfig,
+    RelativePosePrior,
+    ScalePrior,
+    StopReason,
+    WindowProblem,
+    WindowResult,
+)
 from edgeslam_torch.types import IntArray
 
 MIN_EXTENT = 1e-6
@@ -133,12 +142,43 @@ def window_problem(
         uv=uv.astype(np.float64),
         inv_sigma=np.ones(len(row)) if alike else shrink[octave],
         K=(camera.fx, camera.fy, camera.cx, camera.cy),
+        relative_priors=tracked_motions(slam_map, keyframes),
         scale_priors=() if extent is None else (extent,),
-        depth_priors=priors,
+        depth_priors=_both(priors, network_priors(slam_map, window.anchor, window.free)),
         centres=told.centres,
         gravity=told.gravity,
     )
     return problem, keypoint
+
+
+def tracked_motions(slam_map: SlamMap, keyframes: list[Keyframe]) -> tuple[RelativePosePrior, ...]:
+    """How tracking placed those of a window's keyframes that still see mostly anchors on priors.
+
+    Refined together with such depths, a pose that hardly moved runs away: from a shifted camera every depth can follow
+    its pixel's noise, from a turned one none can. Tracking widens the noise by the depths' uncertainty instead and is
+    free of this.
+    """
+    pose_of = {k.id: pose for pose, k in enumerate(keyframes)}
+    motions = []
+    for pose, keyframe in enumerate(keyframes):
+        motion = keyframe.tracked
+        if motion is None or motion.reference_id not in pose_of:
+            continue
+        if mostly_on_priors(slam_map.anchors, keyframe.anchor[keyframe.anchor >= 0]):
+            motions.append(RelativePosePrior(pose_of[motion.reference_id], pose, motion.T_c_r, motion.information))
+    return tuple(motions)
+
+
+def _both(a: DepthPriors | None, b: DepthPriors | None) -> DepthPriors | None:
+    """Two sets of priors as one."""
+    if a is None or b is None:
+        return a or b
+    return DepthPriors(
+        np.concatenate([a.anchor, b.anchor]),
+        np.concatenate([a.pose, b.pose]),
+        np.concatenate([a.inverse_depth, b.inverse_depth]),
+        np.concatenate([a.sigma, b.sigma]),
+    )
 
 
 def write_back(slam_map: SlamMap, window: Window, keypoint: list[IntArray], result: WindowResult) -> None:

@@ -139,7 +139,7 @@ class _Window:
         self.free = torch.as_tensor(np.flatnonzero(~fixed))
         K = torch.tensor(problem.K, dtype=torch.float64)
         self.points = PointBlocks(problem, K, column, config)
-        self.priors = PriorTerms(problem.pose_priors, problem.scale_priors, column.tolist())
+        self.priors = PriorTerms(problem.pose_priors, problem.scale_priors, column.tolist(), problem.relative_priors)
         self.motion = MotionTerms(problem.centres, problem.gravity, column.tolist())
         self.relative: list[EdgeBlocks | JunctionBlocks] = []
         columns = torch.as_tensor(column)

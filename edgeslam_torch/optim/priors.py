@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from edgeslam_torch.geometry import se3
-from edgeslam_torch.optim.problem import PosePrior, ScalePrior
+from edgeslam_torch.optim.problem import PosePrior, RelativePosePrior, ScalePrior
 
 _BERNOULLI = (-0.5, 1.0 / 12.0, 0.0, -1.0 / 720.0, 0.0, 1.0 / 30240.0)
 """B_n / n! for n = 1..6, the series of the inverse left Jacobian."""
@@ -19,34 +19,45 @@ class PriorTerms:
     A handful of 6-vectors: numpy, where a call costs a tenth of a torch call.
     """
 
-    def __init__(self, poses: tuple[PosePrior, ...], scales: tuple[ScalePrior, ...], column: list[int]) -> None:
+    def __init__(
+        self,
+        poses: tuple[PosePrior, ...],
+        scales: tuple[ScalePrior, ...],
+        column: list[int],
+        relative: tuple[RelativePosePrior, ...] = (),
+    ) -> None:
         """Prepare the terms.
 
         Args:
             poses: Pose priors.
             scales: Priors on distances between camera centres.
             column: Free-pose number of each pose, -1 for a fixed one.
+            relative: Priors on one pose seen from another.
         """
         self.poses = [p for p in poses if column[p.pose] >= 0]
+        self.relative = [p for p in relative if column[p.pose_i] >= 0 or column[p.pose_j] >= 0]
         self.scales = [p for p in scales if column[p.pose_i] >= 0 or column[p.pose_j] >= 0]
         self.column = column
 
     def cost(self, T_c_w: Tensor) -> float:
         """Sum of squared whitened residuals."""
-        if not self.poses and not self.scales:
+        if not (self.poses or self.relative or self.scales):
             return 0.0
         T = T_c_w.cpu().numpy()
         total = 0.0
         for prior in self.poses:
             r = pose_prior_residual(T[prior.pose], prior)
             total += float(r @ prior.information @ r)
+        for relation in self.relative:
+            r = relative_prior(T[relation.pose_i], T[relation.pose_j], relation)[0]
+            total += float(r @ relation.information @ r)
         for scale in self.scales:
             total += scale_prior(T[scale.pose_i], T[scale.pose_j], scale)[0] ** 2
         return total
 
     def linearise(self, T_c_w: Tensor, H: Tensor, g: Tensor) -> float:
         """Add the terms to ``H (6F, 6F)`` and ``g (6F,)``; returns their cost."""
-        if not self.poses and not self.scales:
+        if not (self.poses or self.relative or self.scales):
             return 0.0
         T = T_c_w.cpu().numpy()
         H_np, g_np = np.zeros(H.shape), np.zeros(g.shape)
@@ -58,6 +69,15 @@ class PriorTerms:
             H_np[k : k + 6, k : k + 6] += J.T @ prior.information @ J
             g_np[k : k + 6] += J.T @ (prior.information @ r)
             total += float(r @ prior.information @ r)
+        for relation in self.relative:
+            r, by_i, by_j = relative_prior(T[relation.pose_i], T[relation.pose_j], relation)
+            total += float(r @ relation.information @ r)
+            J = np.zeros((6, len(g_np)))
+            for pose, block in ((relation.pose_i, by_i), (relation.pose_j, by_j)):
+                if self.column[pose] >= 0:
+                    J[:, 6 * self.column[pose] : 6 * self.column[pose] + 6] = block
+            H_np += J.T @ relation.information @ J
+            g_np += J.T @ (relation.information @ r)
         for scale in self.scales:
             r_s, J_i, J_j = scale_prior(T[scale.pose_i], T[scale.pose_j], scale)
             total += r_s**2
@@ -89,6 +109,23 @@ def inverse_left_jacobian(xi: np.ndarray) -> np.ndarray:
         if coefficient:
             J += coefficient * power
     return J
+
+
+def relative_prior(T_i: np.ndarray, T_j: np.ndarray, prior: RelativePosePrior) -> tuple[np.ndarray, ...]:
+    """Tangent ``(6,)`` from the expected relative pose to ``T_j T_i^-1``, and its derivatives by both left tangents."""
+    T_j_i = T_j @ se3.inverse(T_i)
+    r = se3.log(T_j_i @ se3.inverse(np.asarray(prior.T_j_i, dtype=np.float64)))
+    J = inverse_left_jacobian(r)
+    return r, -J @ adjoint(T_j_i), J
+
+
+def adjoint(T: np.ndarray) -> np.ndarray:
+    """``(6, 6)`` with ``T exp(d) T^-1 = exp(adjoint(T) d)``, translation first."""
+    R = T[:3, :3]
+    out = np.zeros((6, 6))
+    out[:3, :3] = out[3:, 3:] = R
+    out[:3, 3:] = se3.hat(T[:3, 3]) @ R
+    return out
 
 
 def scale_prior(T_i: np.ndarray, T_j: np.ndarray, prior: ScalePrior) -> tuple[float, np.ndarray, np.ndarray]:

@@ -42,6 +42,18 @@ class PosePrior:
 
 
 @dataclass(frozen=True, slots=True)
+class RelativePosePrior:
+    """What is known beforehand of one pose seen from another: ``log(T_j T_i^-1 T_j_i^-1) ~ N(0, information^-1)``."""
+
+    pose_i: int
+    pose_j: int
+    T_j_i: FloatArray
+    """``(4, 4)`` expected pose, takes coordinates of i to j."""
+    information: FloatArray
+    """``(6, 6)`` inverse covariance, translation first, of a left perturbation."""
+
+
+@dataclass(frozen=True, slots=True)
 class ScalePrior:
     """Expected distance between two camera centres; fixes the scale gauge."""
 
@@ -188,6 +200,7 @@ class WindowProblem:
     K: tuple[float, float, float, float]
     """fx, fy, cx, cy [px]."""
     pose_priors: tuple[PosePrior, ...] = ()
+    relative_priors: tuple[RelativePosePrior, ...] = ()
     scale_priors: tuple[ScalePrior, ...] = ()
     depth_priors: DepthPriors | None = None
     edges: EdgeTerms | None = None

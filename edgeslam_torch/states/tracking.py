@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 
 from edgeslam_torch.atlas.places import lookalikes
-from edgeslam_torch.map.keyframe import Keyframe, make_keyframe
-from edgeslam_torch.mapping.prior_anchors import depth_slack_px
+from edgeslam_torch.map.keyframe import Keyframe, make_keyframe, tracked_motion
+from edgeslam_torch.mapping.prior_anchors import depth_slack_px, mostly_on_priors
 from edgeslam_torch.states.backfill import Backfill
 from edgeslam_torch.states.machine import Event
 from edgeslam_torch.states.step import Located, Step
@@ -231,6 +231,8 @@ class Tracking:
         track, features = located.track, located.view.features
         keyframe = make_keyframe(system.map.next_keyframe_id(), frame.index, frame.stamp_s, track.T_c_w, features)
         keyframe.anchor[track.keypoint] = track.anchor
+        if mostly_on_priors(system.map.anchors, track.anchor):
+            keyframe.tracked = tracked_motion(located.reference, track.T_c_w, track.covariance)
         system.map.add_keyframe(keyframe, located.reference)
         self._follow_from(keyframe, seen)
         self._map([(frame, keyframe)])

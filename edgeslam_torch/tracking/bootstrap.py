@@ -7,7 +7,7 @@ import numpy as np
 
 from edgeslam_torch.config import InitialisationConfig
 from edgeslam_torch.geometry import se3
-from edgeslam_torch.map.keyframe import Keyframe, make_keyframe
+from edgeslam_torch.map.keyframe import Keyframe, make_keyframe, tracked_motion
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.mapping.prior_anchors import prior_of
 from edgeslam_torch.mapping.refinement import Window, refine
@@ -48,6 +48,8 @@ class WaitingFrame:
     """``(M,)`` their partners in the reference keyframe."""
     centre_w: FloatArray
     """``(3,)`` camera centre in the predicted map."""
+    covariance: FloatArray
+    """``(6, 6)`` of its pose in the predicted map."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -209,7 +211,7 @@ class Bootstrap:
         if frame.stamp_s - (self.reference.stamp_s if last is None else last.stamp_s) < self.config.keyframe_gap_s:
             return
         mine, theirs = track.matched_keypoint, self.views[-1].reference_keypoint
-        self.waiting.append(WaitingFrame(frame, view, mine, theirs, se3.inverse(track.T_c_w)[:3, 3]))
+        self.waiting.append(WaitingFrame(frame, view, mine, theirs, se3.inverse(track.T_c_w)[:3, 3], track.covariance))
         if len(self.waiting) > self.config.max_keyframes:
             centres = np.stack([self.reference.centre_w, *(w.centre_w for w in self.waiting)])
             self.waiting.pop(int(np.linalg.norm(centres[2:] - centres[:-2], axis=1).argmin()))
@@ -253,9 +255,14 @@ class Bootstrap:
             track: Its pose in the predicted map.
         """
         T_c_w = {v.frame_index: v.T_c_w for v in self.views[:-1]}
-        new = [(w.frame, self._keyframe(w, T_c_w[w.frame.index])) for w in self.waiting if w.frame is not frame]
+        new = []
+        for waiting in self.waiting:
+            keyframe = self._keyframe(waiting, T_c_w[waiting.frame.index])
+            keyframe.tracked = tracked_motion(self.reference, keyframe.T_c_w, waiting.covariance)
+            new.append((waiting.frame, keyframe))
         newest = make_keyframe(self.map.next_keyframe_id(), frame.index, frame.stamp_s, track.T_c_w, view.features)
         newest.anchor[track.keypoint] = track.anchor
+        newest.tracked = tracked_motion(self.reference, track.T_c_w, track.covariance)
         new.append((frame, newest))
         for _, keyframe in new:
             self.map.add_keyframe(keyframe)

@@ -1,0 +1,63 @@
+"""Priors on poses against numeric derivatives."""
+
+import numpy as np
+import pytest
+import torch
+
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.optim.priors import PriorTerms, adjoint, relative_prior
+from edgeslam_torch.optim.problem import RelativePosePrior
+
+STEP = 1e-6
+
+
+def pose(rng, size=0.5):
+    return se3.exp(rng.normal(0.0, size, 6))
+
+
+def relation(rng, T_i, T_j, off=0.3):
+    """A prior that the two poses miss."""
+    half = rng.normal(0.0, 1.0, (6, 6))
+    return RelativePosePrior(0, 1, se3.exp(rng.normal(0.0, off, 6)) @ T_j @ se3.inverse(T_i), half @ half.T)
+
+
+def test_adjoint_carries_a_tangent_through_a_pose(rng):
+    T, d = pose(rng), rng.normal(0.0, 0.2, 6)
+    np.testing.assert_allclose(se3.exp(adjoint(T) @ d), T @ se3.exp(d) @ se3.inverse(T), atol=1e-12)
+
+
+def test_relative_prior_is_met_by_the_relative_pose_alone(rng):
+    T_i, T_j = pose(rng), pose(rng)
+    prior = RelativePosePrior(0, 1, T_j @ se3.inverse(T_i), np.eye(6))
+    world = pose(rng)  # another world: both cameras the same
+    np.testing.assert_allclose(relative_prior(T_i @ world, T_j @ world, prior)[0], 0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("which", [0, 1])
+def test_relative_prior_derivatives(rng, which):
+    T = [pose(rng), pose(rng)]
+    prior = relation(rng, *T)
+    J = relative_prior(*T, prior)[1 + which]
+    numeric = np.zeros((6, 6))
+    for k in range(6):
+        d = STEP * np.eye(6)[k]
+        both = [[se3.exp(s * d) @ T[p] if p == which else T[p] for p in (0, 1)] for s in (1, -1)]
+        numeric[:, k] = (relative_prior(*both[0], prior)[0] - relative_prior(*both[1], prior)[0]) / (2 * STEP)
+    np.testing.assert_allclose(J, numeric, atol=1e-6)
+
+
+def test_the_normal_equations_are_those_of_the_cost(rng):
+    """One pose fixed, one free: the gradient is half the cost's derivative, and a step leads to the prior."""
+    T = np.stack([pose(rng), pose(rng)])
+    terms = PriorTerms((), (), [-1, 0], (relation(rng, *T, off=0.05),))
+    H, g = torch.zeros((6, 6), dtype=torch.float64), torch.zeros(6, dtype=torch.float64)
+    cost = terms.linearise(torch.as_tensor(T), H, g)
+    assert cost == pytest.approx(terms.cost(torch.as_tensor(T)))
+    for k in range(6):
+        moved = [T.copy(), T.copy()]
+        for s, m in zip((1, -1), moved, strict=True):
+            m[1] = se3.exp(s * STEP * np.eye(6)[k]) @ T[1]
+        slope = (terms.cost(torch.as_tensor(moved[0])) - terms.cost(torch.as_tensor(moved[1]))) / (2 * STEP)
+        assert 2.0 * float(g[k]) == pytest.approx(slope, rel=1e-4, abs=1e-6)
+    T[1] = se3.exp(-np.linalg.solve(H.numpy(), g.numpy())) @ T[1]
+    assert terms.cost(torch.as_tensor(T)) < 1e-2 * cost
