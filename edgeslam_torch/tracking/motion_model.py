@@ -1,5 +1,7 @@
 """Motion model: pose and velocity of the camera, and the uncertainty of a predicted pose."""
 
+import math
+
 import numpy as np
 
 from edgeslam_torch.geometry import se3
@@ -13,6 +15,10 @@ s."""
 
 FADING = 0.8
 """Decay of the velocity per frame without a pose: after a second it is irrelevant."""
+
+SPEED_M_S = 0.5
+ANGULAR_SPEED_RAD_S = 1.0
+"""Standard deviations of how they move while no velocity is known."""
 
 
 class MotionModel:
@@ -41,8 +47,9 @@ class MotionModel:
     def expectation(self, stamp_s: float, T_predicted: FloatArray, metres_per_unit: float) -> PosePrior:
         """A predicted pose with its uncertainty due to accelerations since the newest frame."""
         dt = stamp_s - self.stamp_s
-        sigma_t = 0.5 * ACCELERATION_M_S2 * dt**2 / metres_per_unit
-        sigma_r = 0.5 * ANGULAR_ACCELERATION_RAD_S2 * dt**2
+        speed, turn = (SPEED_M_S, ANGULAR_SPEED_RAD_S) if self.stands else (0.0, 0.0)  # it may have moved all the time
+        sigma_t = math.hypot(speed * dt, 0.5 * ACCELERATION_M_S2 * dt**2) / metres_per_unit
+        sigma_r = math.hypot(turn * dt, 0.5 * ANGULAR_ACCELERATION_RAD_S2 * dt**2)
         return PosePrior(0, T_predicted, np.diag([sigma_t**-2] * 3 + [sigma_r**-2] * 3))
 
     def move(self, stamp_s: float, T_c_w: FloatArray) -> None:

@@ -68,3 +68,11 @@ def test_predictions_that_become_poses_stay_rigid_motions():
         np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
     steady = se3.exp(81 * np.array([0.02, 0.01, 0.0, 0.03, -0.02, 0.04]))
     np.testing.assert_allclose(T, steady, atol=1e-6)
+
+
+def test_before_any_velocity_is_known_it_may_have_moved_all_the_time():
+    """Half a metre and one radian a second over a tenth, beside what accelerations add."""
+    model = MotionModel(at(1.0))
+    model.stamp_s = 10.0
+    sigma = 1.0 / np.sqrt(np.diag(model.expectation(10.1, at(1.0), 1.0).information))
+    assert np.allclose(sigma, [np.hypot(0.05, 0.015)] * 3 + [np.hypot(0.1, 0.1)] * 3)
