@@ -15,6 +15,7 @@ def robust_sigma(residual: Tensor) -> Tensor:
     """Standard deviation ``()`` of residuals about zero by their median absolute value; NaN for none.
 
     Example:
+        >>> import torch
         >>> robust_sigma(torch.tensor([-1.0, 1.0, 1.0, -1.0, 1000.0]))
         tensor(1.4826)
     """

@@ -60,7 +60,7 @@ def exp(xi: FloatArray) -> FloatArray:
     """Similarity ``(4, 4)`` of a tangent ``(7,)``.
 
     Example:
-        >>> exp(np.array([0.0, 0, 0, 0, 0, 0, math.log(2.0)]))[0, 0]
+        >>> float(exp(np.array([0.0, 0, 0, 0, 0, 0, math.log(2.0)]))[0, 0])
         2.0
     """
     rho, phi, sigma = xi[:3], xi[3:6], float(xi[6])

@@ -28,6 +28,11 @@ from edgeslam_torch.types import FloatArray, Frame
 MIN_KEYPOINTS = 100
 """Fewer keypoints than this cannot start a map."""
 
+MIN_GAP_S = 0.15
+"""Time between frames from which on the filter predicts the pose for tracking. Telemetry comes every 0.1 s in whole
+degrees: over less, vision's own velocity is the better word, and a flow that starts from a worse one ends worse
+(fr1_xyz with telemetry: ATE .0151 m with the filter's predictions at 30 Hz, .0101 without)."""
+
 UNKNOWN_SIGMA = 0.01
 """Standard deviation of a visual pose without a covariance [map units, rad]."""
 
@@ -65,11 +70,12 @@ class System:
     # -- motion ------------------------------------------------------------------------------------------------
 
     def predict(self, stamp_s: float, lost: bool) -> FloatArray:
-        """``T_c_w`` expected at a stamp: by the Kalman filter where it is fed, else at constant velocity.
+        """``T_c_w`` expected at a stamp: at constant velocity over short gaps, by telemetry over others.
 
-        Before the filter knows scale and delay, telemetry alone carries the pose where vision has no velocity.
+        By the Kalman filter where it is fed; before it knows scale and delay, by telemetry alone.
         """
-        if self.has_telemetry and (self.fusion.filtering or lost or self.motion.stands):
+        gap = stamp_s - self.motion.stamp_s >= MIN_GAP_S
+        if self.has_telemetry and (lost or self.motion.stands or (gap and self.fusion.filtering)):
             estimate = self.fusion.predict(stamp_s)
             if estimate is not None:
                 return se3.inverse(estimate.T_w_c)

@@ -26,16 +26,20 @@ def system(**fusion):
     )
 
 
-@pytest.mark.parametrize(("filtering", "lost"), [(True, False), (True, True), (False, True)])
-def test_the_filter_predicts_once_it_is_fed_and_telemetry_when_lost(filtering, lost):
+@pytest.mark.parametrize(("filtering", "lost", "stamp_s"), [(True, False, 0.3), (True, True, 0.2), (False, True, 0.2)])
+def test_the_filter_predicts_over_gaps_once_it_is_fed_and_telemetry_when_lost(filtering, lost, stamp_s):
     asked = system(filtering=filtering)
-    np.testing.assert_allclose(System.predict(asked, 0.2, lost), se3.inverse(TOLD), atol=1e-12)
+    np.testing.assert_allclose(System.predict(asked, stamp_s, lost), se3.inverse(TOLD), atol=1e-12)
 
 
-def test_before_that_and_without_a_drone_it_is_constant_velocity():
-    for asked in (system(filtering=False), system(filtering=True)):
-        asked.has_telemetry = asked.fusion.filtering is False
-        np.testing.assert_array_equal(System.predict(asked, 0.2, False), asked.motion.predict(0.2))
+@pytest.mark.parametrize(
+    ("has_telemetry", "filtering", "stamp_s"),
+    [(True, False, 0.3), (False, True, 0.3), (True, True, 0.2)],  # not fed, no drone, too short a gap
+)
+def test_otherwise_it_is_constant_velocity(has_telemetry, filtering, stamp_s):
+    asked = system(filtering=filtering)
+    asked.has_telemetry = has_telemetry
+    np.testing.assert_array_equal(System.predict(asked, stamp_s, False), asked.motion.predict(stamp_s))
 
 
 def test_a_correction_of_the_map_is_told_to_the_fusion_as_such():
