@@ -154,6 +154,12 @@ class MotionFusion:
         """How one keyframe's network depth compares with the map's."""
         self._depth.add(ratio)
 
+    def replace_depth_ratios(self, ratios: Sequence[DepthRatio]) -> None:
+        """The same of all keyframes, once the map has another unit."""
+        self._depth = DepthRatios(self.config.depth_bias_log)
+        for ratio in ratios:
+            self._depth.add(ratio)
+
     def rescale(self, factor: float, about: FloatArray | None = None) -> None:
         """The map was scaled: ``p' = about + factor (p - about)``; everything remembered follows."""
         if not (math.isfinite(factor) and factor > 0):

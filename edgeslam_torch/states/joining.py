@@ -38,6 +38,7 @@ class Joining:
         scale = sim3.scale_of(join.S) if join.moved == piece else 1.0
         T_c_k[:3, 3] *= scale
         system.motion.carry(T_c_k @ system.map.pose_of(last), scale)
+        system.compare_depths_again()
         system.fusion.revise(*system.log.poses())
         # Poses published before belong to a piece that has moved since.
         system.published = replace(system.published, revision=system.published.revision + 1)

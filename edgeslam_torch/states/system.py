@@ -6,13 +6,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from edgeslam_torch.config import SlamConfig
-from edgeslam_torch.fusion.depth_scale import compared
+from edgeslam_torch.fusion.depth_scale import DepthRatio, compared
 from edgeslam_torch.fusion.displacement import TelemetryModel
 from edgeslam_torch.fusion.motion import MotionFusion
 from edgeslam_torch.fusion.published import Published
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
-from edgeslam_torch.map.depth_prior import sample
 from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.map.trajectory import TrajectoryLog
@@ -134,12 +133,21 @@ class System:
 
     def compare_depth(self, keyframe: Keyframe) -> None:
         """Compare the network's depth with the map's units."""
-        if keyframe.depth is None:
-            return
+        ratio = self._depth_ratio(keyframe)
+        if ratio is not None:
+            self.fusion.add_depth_ratio(ratio)
+
+    def compare_depths_again(self) -> None:
+        """Compare every keyframe of the current piece of map again, once the piece has another unit."""
+        piece = self.map.piece_of(self.map.latest().id)
+        mine = [k for id, k in sorted(self.map.keyframes.items()) if self.map.piece_of(id) == piece]
+        self.fusion.replace_depth_ratios([r for k in mine if (r := self._depth_ratio(k)) is not None])
+
+    def _depth_ratio(self, keyframe: Keyframe) -> DepthRatio | None:
+        if keyframe.network_m is None:
+            return None
         held = keyframe.keypoints_with_anchor()
         held = held[~self.map.anchors.from_depth[keyframe.anchor[held]]]  # their depth comes from the network itself
         p_w = self.map.anchors.p_w[keyframe.anchor[held]]
         z = (p_w @ keyframe.T_c_w[:3, :3].T + keyframe.T_c_w[:3, 3])[:, 2]
-        ratio = compared(sample(keyframe.depth, keyframe.features.uv[held])[0], z)
-        if ratio is not None:
-            self.fusion.add_depth_ratio(ratio)
+        return compared(keyframe.network_m[held], z)

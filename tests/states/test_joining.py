@@ -50,8 +50,16 @@ def system_of(pieces, motion, busy=False):
     revised = []
     fusion = SimpleNamespace(revise=lambda *poses: revised.append(poses), revised=revised)
     mapping = SimpleNamespace(busy=busy)
+    again = lambda: revised.append("ratios")  # noqa: E731
     return SimpleNamespace(
-        log=log, map=pieces, motion=motion, fusion=fusion, mapping=mapping, published=Published(2.0), events={}
+        compare_depths_again=again,
+        log=log,
+        map=pieces,
+        motion=motion,
+        fusion=fusion,
+        mapping=mapping,
+        published=Published(2.0),
+        events={},
     )
 
 
@@ -77,7 +85,7 @@ def test_the_pose_and_its_future_go_along_with_their_piece(rng):
     np.testing.assert_allclose(after, 1.5 * np.array(before), atol=1e-9)
     assert (system.published.scale, system.published.revision) == (2.0, 1)
     assert system.events == {"joined": 1}
-    assert system.fusion.revised == [("stamps", "poses")]
+    assert system.fusion.revised == ["ratios", ("stamps", "poses")], "in the unit that the piece has now"
     assert system.map.asked == 2, "until there is no other join"
 
 
