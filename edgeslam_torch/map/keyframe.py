@@ -1,6 +1,5 @@
 """A keyframe: features, their anchors, and the pose that refinement moves."""
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,24 +15,6 @@ NO_ANCHOR = -1
 SHARED_ERRORS = 3.0
 """Factor on the standard deviation of a tracked motion: neighbouring keyframes share the errors of their corners and of
 the depth network, which its covariance takes for independent."""
-
-
-@dataclass(frozen=True, slots=True)
-class NetworkView:
-    """How a keyframe's network depth compares with its triangulated anchors."""
-
-    log_network: float
-    """Median log network depth [m]."""
-    log_map: float
-    """Median log depth in the map [map units]."""
-    slope: float
-    """Of log network depth on log map depth."""
-    weight: float
-    """How much the slope rests on."""
-
-    def scaled(self, scale: float) -> "NetworkView":
-        """The same once the map has grown by a factor."""
-        return replace(self, log_map=self.log_map + math.log(scale))
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +55,6 @@ class Keyframe:
     """Released, like ``image``, after the edges are measured."""
     network_m: FloatArray | None = None
     """``(N,)`` network depth at the keypoints [m], NaN where it says nothing; stays when ``depth`` goes."""
-    network_view: NetworkView | None = None
     tracked: TrackedMotion | None = None
     """Set when it was made while most depths that it sees rested on priors."""
     image: NDArray[np.uint8] | None = None
@@ -94,7 +74,6 @@ class Keyframe:
 
     def scale(self, scale: float) -> None:
         """Take along what it remembers in map units once the map has grown by a factor; the pose is the caller's."""
-        self.network_view = None if self.network_view is None else self.network_view.scaled(scale)
         self.tracked = None if self.tracked is None else self.tracked.scaled(scale)
 
     def keypoints_with_anchor(self) -> IntArray:

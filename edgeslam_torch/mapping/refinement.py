@@ -11,11 +11,9 @@ from edgeslam_torch.losses.robust import Kernel
 from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.mapping.motion_terms import motion_factors, solver
-from edgeslam_torch.mapping.network_scale import network_priors
 from edgeslam_torch.mapping.prior_anchors import depth_priors, mostly_on_priors
 from edgeslam_torch.optim.local_ba import refine_window
 from edgeslam_torch.optim.problem import (
-    DepthPriors,
     LmConfig,
     RelativePosePrior,
     ScalePrior,
@@ -144,7 +142,7 @@ def window_problem(
         K=(camera.fx, camera.fy, camera.cx, camera.cy),
         relative_priors=tracked_motions(slam_map, keyframes),
         scale_priors=() if extent is None else (extent,),
-        depth_priors=_both(priors, network_priors(slam_map, window.anchor, window.free)),
+        depth_priors=priors,
         centres=told.centres,
         gravity=told.gravity,
     )
@@ -167,18 +165,6 @@ def tracked_motions(slam_map: SlamMap, keyframes: list[Keyframe]) -> tuple[Relat
         if mostly_on_priors(slam_map.anchors, keyframe.anchor[keyframe.anchor >= 0]):
             motions.append(RelativePosePrior(pose_of[motion.reference_id], pose, motion.T_c_r, motion.information))
     return tuple(motions)
-
-
-def _both(a: DepthPriors | None, b: DepthPriors | None) -> DepthPriors | None:
-    """Two sets of priors as one."""
-    if a is None or b is None:
-        return a or b
-    return DepthPriors(
-        np.concatenate([a.anchor, b.anchor]),
-        np.concatenate([a.pose, b.pose]),
-        np.concatenate([a.inverse_depth, b.inverse_depth]),
-        np.concatenate([a.sigma, b.sigma]),
-    )
 
 
 def write_back(slam_map: SlamMap, window: Window, keypoint: list[IntArray], result: WindowResult) -> None:
