@@ -22,7 +22,7 @@ from edgeslam_torch.config import SlamConfig
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.files.config_file import to_toml
 from edgeslam_torch.geometry.camera import Camera
-from edgeslam_torch.readers.flight import telemetry_gap
+from edgeslam_torch.readers.flight_folder import telemetry_gap
 from edgeslam_torch.readers.pace import Counter, at_their_pace
 from edgeslam_torch.readers.read_ahead import read_ahead
 from edgeslam_torch.readers.source import Source

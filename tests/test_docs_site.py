@@ -12,7 +12,7 @@ from browser import PROGRAM, Browser
 pytest.importorskip("pdoc", reason="the documentation's tools are not installed")
 
 BUILD = Path(__file__).resolve().parent.parent / "docs" / "build.py"
-WITH_FORMULAS = ("edgeslam_torch.fusion.joint_scale", "edgeslam_torch.losses.base", "edgeslam_torch.losses.cycle")
+WITH_FORMULAS = ("edgeslam_torch.fusion.scale.joint_scale", "edgeslam_torch.losses.base", "edgeslam_torch.losses.cycle")
 
 
 def load_build() -> ModuleType:

@@ -16,7 +16,7 @@ from edgeslam_torch.drone.guard import Guard
 from edgeslam_torch.drone.sdk_state import parse_state, sample_from_sdk
 from edgeslam_torch.drone.sticks import Sticks
 from edgeslam_torch.drone.udp import Inlet
-from edgeslam_torch.drone.video import ArrivalClock, Picture, VideoReceiver
+from edgeslam_torch.drone.video_stream import ArrivalClock, Picture, VideoReceiver
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.types import TelemetrySample
 

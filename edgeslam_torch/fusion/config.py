@@ -102,7 +102,7 @@ class FusionConfig:
     sigma_baro_m: float = 0.15
     depth_bias_log: float = 0.1
     """Error of the depth network's scale that all keyframes of a scene share and nothing gives away; what does give it
-    away comes on top (`fusion/depth_scale.py`)."""
+    away comes on top (`fusion/scale/depth_scale.py`)."""
 
     def __post_init__(self) -> None:
         for name in _POSITIVE:

@@ -19,8 +19,8 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from edgeslam_torch.fusion.config import FusionConfig
-from edgeslam_torch.fusion.scale import floor_segments
-from edgeslam_torch.fusion.track import TelemetryTrack
+from edgeslam_torch.fusion.scale.log_scale import floor_segments
+from edgeslam_torch.fusion.telemetry.track import TelemetryTrack
 from edgeslam_torch.geometry.se3 import hat
 from edgeslam_torch.types import FloatArray, IntArray
 

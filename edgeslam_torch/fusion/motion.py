@@ -12,18 +12,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from edgeslam_torch.fusion.alignment import map_to_world
-from edgeslam_torch.fusion.comparison import Comparison, Present
 from edgeslam_torch.fusion.config import FusionConfig
-from edgeslam_torch.fusion.consensus import Settled, settled_with_network
-from edgeslam_torch.fusion.delay import DelaySearch
-from edgeslam_torch.fusion.depth_scale import DepthRatio, DepthRatios, DepthScale
 from edgeslam_torch.fusion.displacement import TelemetryModel
-from edgeslam_torch.fusion.ekf import EkfState
-from edgeslam_torch.fusion.filter_feed import FilterFeed, Metric
+from edgeslam_torch.fusion.filter.ekf import EkfState
+from edgeslam_torch.fusion.filter.filter_feed import FilterFeed, Metric
 from edgeslam_torch.fusion.health import disagreement
-from edgeslam_torch.fusion.mount import Mount, estimate_mount
-from edgeslam_torch.fusion.plausibility import HEIGHTS, Trust
 from edgeslam_torch.fusion.prediction import (
     VISUAL_REACH_S,
     Carried,
@@ -33,11 +26,18 @@ from edgeslam_torch.fusion.prediction import (
     by_vision,
     with_velocity,
 )
-from edgeslam_torch.fusion.scale import LogScale, fuse
+from edgeslam_torch.fusion.scale.camera_mount import Mount, estimate_mount
+from edgeslam_torch.fusion.scale.consensus import Settled, settled_with_network
+from edgeslam_torch.fusion.scale.depth_scale import DepthRatio, DepthRatios, DepthScale
+from edgeslam_torch.fusion.scale.log_scale import LogScale, fuse
 from edgeslam_torch.fusion.snapshot import Snapshot
+from edgeslam_torch.fusion.telemetry.alignment import map_to_world
+from edgeslam_torch.fusion.telemetry.comparison import Comparison, Present
+from edgeslam_torch.fusion.telemetry.delay import DelaySearch
+from edgeslam_torch.fusion.telemetry.plausibility import HEIGHTS, Trust
+from edgeslam_torch.fusion.telemetry.track import TelemetryTrack
+from edgeslam_torch.fusion.telemetry.visual_memory import VisualMemory, VisualPose
 from edgeslam_torch.fusion.telemetry_scale import TelemetryFit, TelemetryScale, rescaled
-from edgeslam_torch.fusion.track import TelemetryTrack
-from edgeslam_torch.fusion.visual_memory import VisualMemory, VisualPose
 from edgeslam_torch.types import FloatArray, Health, ScaleEstimate, TelemetrySample
 
 _REFIT_S = 1.0

@@ -10,12 +10,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from edgeslam_torch.fusion.filter_feed import FilterView
-from edgeslam_torch.fusion.rotations import rotation_vector
+from edgeslam_torch.fusion.filter.filter_feed import FilterView
+from edgeslam_torch.fusion.telemetry.track import TelemetryTrack
+from edgeslam_torch.fusion.telemetry.visual_memory import VisualPose
 from edgeslam_torch.fusion.telemetry_scale import TelemetryFit
-from edgeslam_torch.fusion.track import TelemetryTrack
-from edgeslam_torch.fusion.visual_memory import VisualPose
 from edgeslam_torch.geometry import se3
+from edgeslam_torch.geometry.rotations import rotation_vector
 from edgeslam_torch.types import FloatArray, ScaleEstimate
 
 VISUAL_REACH_S = 0.15

@@ -6,10 +6,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from edgeslam_torch.fusion.filter_feed import FilterView, FrozenFilter
+from edgeslam_torch.fusion.filter.filter_feed import FilterView, FrozenFilter
 from edgeslam_torch.fusion.prediction import by_vision
 from edgeslam_torch.fusion.published import Published
-from edgeslam_torch.fusion.visual_memory import VisualPose
+from edgeslam_torch.fusion.telemetry.visual_memory import VisualPose
 from edgeslam_torch.types import FloatArray, PoseNow, ScaleEstimate, TelemetrySample
 
 _LONGEST_STEP_S = 0.5

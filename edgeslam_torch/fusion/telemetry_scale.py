@@ -5,13 +5,13 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from edgeslam_torch.fusion.comparison import Present
 from edgeslam_torch.fusion.config import FusionConfig
-from edgeslam_torch.fusion.consensus import at_odds, contradict, sided_with
-from edgeslam_torch.fusion.joint_scale import Evidence, displacement_evidence, height_evidence, solved
-from edgeslam_torch.fusion.plausibility import AtOdds, Reading, Trust, agreement, changes
-from edgeslam_torch.fusion.scale import LogScale, floor_segments
-from edgeslam_torch.fusion.visual_memory import Displacements
+from edgeslam_torch.fusion.scale.consensus import at_odds, contradict, sided_with
+from edgeslam_torch.fusion.scale.joint_scale import Evidence, displacement_evidence, height_evidence, solved
+from edgeslam_torch.fusion.scale.log_scale import LogScale, floor_segments
+from edgeslam_torch.fusion.telemetry.comparison import Present
+from edgeslam_torch.fusion.telemetry.plausibility import AtOdds, Reading, Trust, agreement, changes
+from edgeslam_torch.fusion.telemetry.visual_memory import Displacements
 from edgeslam_torch.types import FloatArray, IntArray
 
 _IMPROBABLE = 1e-4

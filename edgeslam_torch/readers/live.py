@@ -11,7 +11,7 @@ import numpy as np
 
 from edgeslam_torch.calibration.camera_choice import choose_camera
 from edgeslam_torch.drone.tello import StateMessage, Tello, TelloAddress, TelloError
-from edgeslam_torch.drone.video import ArrivalClock, Picture
+from edgeslam_torch.drone.video_stream import ArrivalClock, Picture
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.readers.listing import Problem

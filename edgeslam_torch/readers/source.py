@@ -11,7 +11,7 @@ from typing import Protocol
 from edgeslam_torch.calibration.camera_choice import choose_camera
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.geometry.camera import Camera
-from edgeslam_torch.readers import flight, images, video
+from edgeslam_torch.readers import flight_folder, images, video
 from edgeslam_torch.readers.layouts import layout_of, read_sequence, tum
 from edgeslam_torch.readers.listing import ImageEntry, Problem
 from edgeslam_torch.readers.read_ahead import read_ahead
@@ -131,8 +131,8 @@ def open_source(
     path = Path(spec).expanduser()
     content = _content(path)
     folders = [path, content.folder] if path.is_dir() else [content.folder]
-    telemetry_file = flight.telemetry_file(folders, telemetry)
-    samples, remarks = flight.read_samples(telemetry_file) if telemetry_file is not None else ([], [])
+    telemetry_file = flight_folder.telemetry_file(folders, telemetry)
+    samples, remarks = flight_folder.read_samples(telemetry_file) if telemetry_file is not None else ([], [])
     default = content.default_camera
     chosen, warnings = choose_camera(content.size, camera, folders, default, bool(samples))
     length = content.length
@@ -182,7 +182,7 @@ def _folder_content(folder: Path) -> _Content:
     if sequence is not None:
         return _listed(sequence, sequence.folder)
     truth = folder / "groundtruth.txt" if (folder / "groundtruth.txt").is_file() else None
-    recorded = flight.find_video(folder)
+    recorded = flight_folder.find_video(folder)
     if recorded is not None:
         return _video_content(recorded, truth)
     found, problems = images.list_image_folder(folder)
@@ -190,7 +190,7 @@ def _folder_content(folder: Path) -> _Content:
 
 
 def _video_content(path: Path, groundtruth: Path | None) -> _Content:
-    clip = video.Video(path, flight.video_stamps(path))
+    clip = video.Video(path, flight_folder.video_stamps(path))
 
     def decode(_: tuple[int, int], problems: list[Problem]) -> Iterator[Frame]:
         return clip.frames(problems)

@@ -6,10 +6,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from edgeslam_torch.config import SlamConfig
-from edgeslam_torch.fusion.depth_scale import DepthRatio, compared
 from edgeslam_torch.fusion.displacement import TelemetryModel
 from edgeslam_torch.fusion.motion import MotionFusion
 from edgeslam_torch.fusion.published import Published
+from edgeslam_torch.fusion.scale.depth_scale import DepthRatio, compared
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.map.keyframe import Keyframe

@@ -561,7 +561,7 @@ def test_any_address_is_read_or_refused(text):
 
 
 def test_video_survives_a_start_in_mid_stream_lost_packets_and_garbage(rng):
-    from edgeslam_torch.drone.video import PictureAssembler
+    from edgeslam_torch.drone.video_stream import PictureAssembler
 
     encoder, assembler = Encoder(320, 240, 30), PictureAssembler()
     picture = rng.integers(0, 255, (240, 320, 3), dtype=np.uint8)
@@ -579,7 +579,7 @@ def test_video_survives_a_start_in_mid_stream_lost_packets_and_garbage(rng):
 
 
 def test_without_pyav_the_message_says_what_to_install(monkeypatch):
-    from edgeslam_torch.drone import video as tello_video
+    from edgeslam_torch.drone import video_stream as tello_video
 
     def missing(name):
         raise ImportError(name)

@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from edgeslam_torch.fusion.consensus import at_odds, contradict, settled_with_network, sided_with
-from edgeslam_torch.fusion.scale import LogScale, fuse
+from edgeslam_torch.fusion.scale.consensus import at_odds, contradict, settled_with_network, sided_with
+from edgeslam_torch.fusion.scale.log_scale import LogScale, fuse
 
 
 def opinion(value, sigma, source):

@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation, Slerp
 from scipy.stats import chi2
 
 from edgeslam_torch.fusion.config import FusionConfig
-from edgeslam_torch.fusion.delayed import BufferedEkf, PoseSigma
-from edgeslam_torch.fusion.rotations import matrix_from_rpy, rpy_from_matrix
+from edgeslam_torch.fusion.filter.delayed import BufferedEkf, PoseSigma
 from edgeslam_torch.geometry import se3
+from edgeslam_torch.geometry.rotations import matrix_from_rpy, rpy_from_matrix
 from edgeslam_torch.readers.telemetry_csv import read_telemetry
 from edgeslam_torch.types import FloatArray, TelemetrySample
 

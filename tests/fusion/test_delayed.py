@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from edgeslam_torch.fusion.config import FusionConfig
-from edgeslam_torch.fusion.delayed import BufferedEkf, PoseSigma
+from edgeslam_torch.fusion.filter.delayed import BufferedEkf, PoseSigma
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.types import TelemetrySample
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from edgeslam_torch.fusion.depth_scale import DepthRatio, DepthRatios, compared
+from edgeslam_torch.fusion.scale.depth_scale import DepthRatio, DepthRatios, compared
 
 LEAST = 0.1
 

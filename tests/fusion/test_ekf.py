@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from edgeslam_torch.fusion.config import FusionConfig
-from edgeslam_torch.fusion.ekf import Ekf, Outcome
-from edgeslam_torch.fusion.rotations import (
+from edgeslam_torch.fusion.filter.ekf import Ekf, Outcome
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.geometry.rotations import (
     euler_rate_matrix,
     matrix_from_rpy,
     mean_rotation,
@@ -13,7 +14,6 @@ from edgeslam_torch.fusion.rotations import (
     rpy_from_matrix,
     wrapped,
 )
-from edgeslam_torch.geometry import se3
 
 CONFIG = FusionConfig()
 

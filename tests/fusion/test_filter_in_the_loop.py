@@ -8,8 +8,8 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
 from edgeslam_torch.fusion.config import FusionConfig
-from edgeslam_torch.fusion.delayed import BufferedEkf, PoseSigma
-from edgeslam_torch.fusion.filter_feed import FilterFeed
+from edgeslam_torch.fusion.filter.delayed import BufferedEkf, PoseSigma
+from edgeslam_torch.fusion.filter.filter_feed import FilterFeed
 from edgeslam_torch.fusion.motion import MotionFusion
 from edgeslam_torch.fusion.published import Published
 from edgeslam_torch.fusion.snapshot import Present

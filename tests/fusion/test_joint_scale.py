@@ -3,9 +3,9 @@ import math
 import numpy as np
 import pytest
 
-from edgeslam_torch.fusion.joint_scale import displacement_evidence, height_evidence, solved
-from edgeslam_torch.fusion.rotations import matrix_from_rpy
-from edgeslam_torch.fusion.scale import floor_segments
+from edgeslam_torch.fusion.scale.joint_scale import displacement_evidence, height_evidence, solved
+from edgeslam_torch.fusion.scale.log_scale import floor_segments
+from edgeslam_torch.geometry.rotations import matrix_from_rpy
 
 TILT = math.radians(3.0)
 SCALE = 2.5

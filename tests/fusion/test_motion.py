@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from edgeslam_torch.fusion.config import FusionConfig
-from edgeslam_torch.fusion.depth_scale import DepthRatio
 from edgeslam_torch.fusion.motion import MotionFusion
+from edgeslam_torch.fusion.scale.depth_scale import DepthRatio
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.synthetic.flights.flight import camera_on_body
 from edgeslam_torch.synthetic.flights.telemetry import EXACT, TelemetryFaults, simulate
@@ -328,7 +328,7 @@ def test_statistics_are_plain_numbers(rng, swinging, replay):
 
 @pytest.mark.data
 def test_a_real_tello_truncates_its_velocities(data_dir):
-    from edgeslam_torch.fusion.track import TelemetryTrack
+    from edgeslam_torch.fusion.telemetry.track import TelemetryTrack
     from edgeslam_torch.readers.telemetry_csv import read_telemetry
 
     track = TelemetryTrack("world", 0.35)

@@ -8,9 +8,9 @@ import pytest
 from edgeslam_torch.fusion.config import FusionConfig
 from edgeslam_torch.fusion.motion import MotionFusion
 from edgeslam_torch.fusion.prediction import Carried
+from edgeslam_torch.fusion.telemetry.track import TelemetryTrack
+from edgeslam_torch.fusion.telemetry.visual_memory import VisualPose
 from edgeslam_torch.fusion.telemetry_scale import TelemetryFit
-from edgeslam_torch.fusion.track import TelemetryTrack
-from edgeslam_torch.fusion.visual_memory import VisualPose
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.synthetic.flights.flight import camera_on_body
 from edgeslam_torch.synthetic.flights.telemetry import EXACT, TelemetryFaults, simulate

@@ -3,8 +3,8 @@ import math
 import numpy as np
 import pytest
 
-from edgeslam_torch.fusion.rotations import matrix_from_rpy, rotation_vector
-from edgeslam_torch.fusion.scale import LogScale, fit_displacements, floor_segments, fuse
+from edgeslam_torch.fusion.scale.log_scale import LogScale, fit_displacements, floor_segments, fuse
+from edgeslam_torch.geometry.rotations import matrix_from_rpy, rotation_vector
 from edgeslam_torch.types import Units
 
 

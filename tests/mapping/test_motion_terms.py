@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from edgeslam_torch.fusion.config import FusionConfig
 from edgeslam_torch.fusion.displacement import TelemetryModel
-from edgeslam_torch.fusion.track import TelemetryTrack
+from edgeslam_torch.fusion.telemetry.track import TelemetryTrack
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.mapping.motion_terms import motion_factors
 from edgeslam_torch.mapping.refinement import Window, refine

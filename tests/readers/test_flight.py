@@ -1,6 +1,6 @@
 import pytest
 
-from edgeslam_torch.readers.flight import telemetry_gap
+from edgeslam_torch.readers.flight_folder import telemetry_gap
 from edgeslam_torch.readers.source import open_source
 from edgeslam_torch.types import TelemetrySample
 

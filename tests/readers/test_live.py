@@ -7,7 +7,7 @@ import pytest
 
 from edgeslam_torch.cli import main
 from edgeslam_torch.drone.emulator.server import TelloEmulator
-from edgeslam_torch.drone.video import Picture
+from edgeslam_torch.drone.video_stream import Picture
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.readers.live import CaptureFeed, LiveSource, open_live
 

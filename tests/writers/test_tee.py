@@ -8,7 +8,7 @@ from edgeslam_torch.cli import main
 from edgeslam_torch.drone.emulator.link import LinkFaults
 from edgeslam_torch.drone.emulator.server import EmulatorConfig, TelloEmulator
 from edgeslam_torch.drone.tello import StateMessage
-from edgeslam_torch.drone.video import Picture
+from edgeslam_torch.drone.video_stream import Picture
 from edgeslam_torch.errors import OutputError
 from edgeslam_torch.geometry.camera import PRESETS
 from edgeslam_torch.readers.live import LiveSource, open_tello

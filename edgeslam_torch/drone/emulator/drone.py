@@ -7,8 +7,8 @@ from enum import StrEnum
 
 import numpy as np
 
-from edgeslam_torch.fusion.rotations import matrix_from_rpy, wrapped
 from edgeslam_torch.geometry import se3
+from edgeslam_torch.geometry.rotations import matrix_from_rpy, wrapped
 from edgeslam_torch.types import FloatArray
 
 _GRAVITY = 9.80665

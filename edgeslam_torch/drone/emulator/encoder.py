@@ -4,7 +4,7 @@ from fractions import Fraction
 
 import numpy as np
 
-from edgeslam_torch.drone.video import CHUNK, import_av
+from edgeslam_torch.drone.video_stream import CHUNK, import_av
 
 
 class Encoder:

@@ -11,7 +11,7 @@ import numpy as np
 from edgeslam_torch.drone.emulator.stopwatch import age_s, read_time
 from edgeslam_torch.drone.tello import StateMessage, Tello, TelloAddress, TelloError
 from edgeslam_torch.drone.udp import open_udp
-from edgeslam_torch.drone.video import Picture
+from edgeslam_torch.drone.video_stream import Picture
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.types import FloatArray
 

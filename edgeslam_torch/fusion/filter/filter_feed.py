@@ -11,11 +11,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from edgeslam_torch.fusion.config import FusionConfig
-from edgeslam_torch.fusion.delay import Delay
-from edgeslam_torch.fusion.delayed import BufferedEkf, PoseSigma
-from edgeslam_torch.fusion.rotations import matrix_from_rpy, rotation_vector
-from edgeslam_torch.fusion.visual_memory import VisualPose
+from edgeslam_torch.fusion.filter.delayed import BufferedEkf, PoseSigma
+from edgeslam_torch.fusion.telemetry.delay import Delay
+from edgeslam_torch.fusion.telemetry.visual_memory import VisualPose
 from edgeslam_torch.geometry import se3
+from edgeslam_torch.geometry.rotations import matrix_from_rpy, rotation_vector
 from edgeslam_torch.types import FloatArray, ScaleEstimate, TelemetrySample
 
 _SAME_S = 1e-6

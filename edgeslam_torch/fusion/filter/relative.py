@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from edgeslam_torch.fusion.rotations import rotation_vector_of
+from edgeslam_torch.geometry.rotations import rotation_vector_of
 from edgeslam_torch.types import FloatArray
 
 Row = tuple[float, float, float]

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edgeslam_torch.fusion.alignment import map_to_world, turns
 from edgeslam_torch.fusion.config import FusionConfig
-from edgeslam_torch.fusion.track import TelemetryTrack
-from edgeslam_torch.fusion.visual_memory import Displacements, VisualMemory
+from edgeslam_torch.fusion.telemetry.alignment import map_to_world, turns
+from edgeslam_torch.fusion.telemetry.track import TelemetryTrack
+from edgeslam_torch.fusion.telemetry.visual_memory import Displacements, VisualMemory
 from edgeslam_torch.types import FloatArray
 
 MIN_DISPLACEMENTS = 12

@@ -13,7 +13,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from edgeslam_torch.fusion.track import Turn
+from edgeslam_torch.fusion.telemetry.track import Turn
 from edgeslam_torch.types import FloatArray, IntArray
 
 _LEAST_COUNT = 6

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from edgeslam_torch.fusion.rotations import matrix_from_rpy
+from edgeslam_torch.geometry.rotations import matrix_from_rpy
 from edgeslam_torch.types import FloatArray, TelemetrySample
 
 _FROZEN_S = 1.5

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edgeslam_torch.fusion.rotations import mean_rotation
-from edgeslam_torch.fusion.track import TelemetryTrack
-from edgeslam_torch.fusion.visual_memory import Displacements, Sightings
+from edgeslam_torch.fusion.telemetry.track import TelemetryTrack
+from edgeslam_torch.fusion.telemetry.visual_memory import Displacements, Sightings
+from edgeslam_torch.geometry.rotations import mean_rotation
 from edgeslam_torch.types import FloatArray
 
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from edgeslam_torch.fusion.config import FusionConfig
-from edgeslam_torch.fusion.ekf import Ekf, EkfState, Outcome, Relative, Saved
-from edgeslam_torch.fusion.rotations import rpy_from_matrix, wrapped
+from edgeslam_torch.fusion.filter.ekf import Ekf, EkfState, Outcome, Relative, Saved
+from edgeslam_torch.geometry.rotations import rpy_from_matrix, wrapped
 from edgeslam_torch.types import FloatArray, TelemetrySample
 
 _TELEMETRY, _RELATIVE, _ABSOLUTE, _CLONE = range(4)

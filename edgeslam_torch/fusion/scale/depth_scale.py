@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from edgeslam_torch.fusion.scale import LogScale
+from edgeslam_torch.fusion.scale.log_scale import LogScale
 from edgeslam_torch.geometry.robust_statistics import robust_sigma
 from edgeslam_torch.types import FloatArray
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edgeslam_torch.fusion.scale import fit_displacements
+from edgeslam_torch.fusion.scale.log_scale import fit_displacements
 from edgeslam_torch.types import FloatArray
 
 _PRIOR_RAD = math.radians(30.0)

@@ -6,13 +6,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from edgeslam_torch.fusion.alignment import map_to_world, turns
 from edgeslam_torch.fusion.config import FusionConfig
-from edgeslam_torch.fusion.delay import GROWTH, MIN_DISPLACEMENTS, Delay
-from edgeslam_torch.fusion.plausibility import Agreement, Reading, Reread, Trust, Verdict, agreement
-from edgeslam_torch.fusion.scale import LogScale
-from edgeslam_torch.fusion.track import TelemetryTrack, Turn
-from edgeslam_torch.fusion.visual_memory import VisualMemory
+from edgeslam_torch.fusion.scale.log_scale import LogScale
+from edgeslam_torch.fusion.telemetry.alignment import map_to_world, turns
+from edgeslam_torch.fusion.telemetry.delay import GROWTH, MIN_DISPLACEMENTS, Delay
+from edgeslam_torch.fusion.telemetry.plausibility import Agreement, Reading, Reread, Trust, Verdict, agreement
+from edgeslam_torch.fusion.telemetry.track import TelemetryTrack, Turn
+from edgeslam_torch.fusion.telemetry.visual_memory import VisualMemory
 from edgeslam_torch.types import FloatArray
 
 _WIDE_DELAYS_S = (-3.0, 3.0)

@@ -19,8 +19,8 @@ from scipy.linalg.lapack import dposv
 from scipy.special import chdtri  # scipy.stats takes a second of CPU to import
 
 from edgeslam_torch.fusion.config import FusionConfig
-from edgeslam_torch.fusion.relative import relative_measurement
-from edgeslam_torch.fusion.rotations import euler_rate_matrix, matrix_from_rpy, rpy_from_matrix, wrapped
+from edgeslam_torch.fusion.filter.relative import relative_measurement
+from edgeslam_torch.geometry.rotations import euler_rate_matrix, matrix_from_rpy, rpy_from_matrix, wrapped
 from edgeslam_torch.types import FloatArray
 
 _P, _A, _B = slice(0, 3), slice(3, 6), slice(6, 9)

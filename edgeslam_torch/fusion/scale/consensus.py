@@ -10,7 +10,7 @@ explain what is seen, neither is used.
 import math
 from dataclasses import dataclass
 
-from edgeslam_torch.fusion.scale import LogScale
+from edgeslam_torch.fusion.scale.log_scale import LogScale
 
 CONTRADICTION = 3.0
 """Sigmas of the difference; right opinions are that far apart in 0.3 % of the cases."""
