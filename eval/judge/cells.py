@@ -67,6 +67,9 @@ VARIANTS = {
 }
 """Names after the slash in a cell's name."""
 
+BACKWARDS = "backwards"
+"""The variant that plays a recording from its end: an honest second opinion, since nobody has tuned on it."""
+
 
 @dataclass(frozen=True, slots=True)
 class Cell:
@@ -79,7 +82,7 @@ class Cell:
     folder: str = ""
     """Of the recording."""
     variant: str = ""
-    """A name in `VARIANTS`, or ``kidnap``."""
+    """A name in `VARIANTS`, `BACKWARDS` or ``kidnap``."""
     course: str = ""
     """Of a simulated flight: a name in `courses.COURSES`."""
     nothing: str = ""
@@ -147,6 +150,7 @@ def list_cells(data: Path | None, which: str, seeds: Sequence[int], only: Sequen
     recordings = find_recordings(data) if data is not None else {}
     for name, (folder, frames) in recordings.items():
         variants = [v for v, change in VARIANTS.items() if change.frames_of(frames) >= MIN_FRAMES]
+        variants.append(BACKWARDS)
         wanted = ([""] if which in ("base", "all") else []) + (variants if which in ("variants", "all") else [])
         wanted += ["kidnap"] if which in ("flights", "all") and _can_kidnap(name, frames) else []
         made += [_cell(name, folder, variant) for variant in wanted]

@@ -16,11 +16,12 @@ from edgeslam_torch.errors import EdgeSlamError
 from edgeslam_torch.eval.inputs.dataset import interpolate, open_dataset
 from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, write_tum
 from edgeslam_torch.eval.judge import flights, sources
-from edgeslam_torch.eval.judge.cells import KIDNAP, VARIANTS, Cell
+from edgeslam_torch.eval.judge.cells import BACKWARDS, KIDNAP, VARIANTS, Cell
 from edgeslam_torch.eval.judge.runner import CELL, RESULT
 from edgeslam_torch.eval.judge.score import Truth, score
 from edgeslam_torch.files.atomic import write_text
 from edgeslam_torch.files.config_file import load_config
+from edgeslam_torch.readers.layouts import read_sequence
 from edgeslam_torch.readers.source import Recording, open_source
 from edgeslam_torch.run import run, settle_camera
 from edgeslam_torch.synthetic.flights.courses import COURSES
@@ -62,6 +63,8 @@ def _opened(cell: Cell, folder: Path, flights_root: Path) -> tuple[Recording, Tr
     source = _recording(place)
     if cell.variant == "kidnap":
         return _kidnapped(source, place, folder / "groundtruth.txt")
+    if cell.variant == BACKWARDS:
+        return _backwards(source, place, folder / "groundtruth.txt")
     truth = Truth(place, place if open_dataset(place).depth is not None else None)
     return VARIANTS[cell.variant].applied_to(source) if cell.variant else source, truth
 
@@ -84,6 +87,17 @@ def _kidnapped(source: Recording, place: Path, truth_file: Path) -> tuple[Record
     T_w_c, known = interpolate(dataset.truth, dataset.frame_stamps_s[plan.originals])
     write_tum(Trajectory(plan.new_stamps_s[known], T_w_c[known]), truth_file)
     return sources.cut(source, plan), Truth(truth_file)
+
+
+def _backwards(source: Recording, place: Path, truth_file: Path) -> tuple[Recording, Truth]:
+    """The recording from its end, and its ground truth turned round alike into a file."""
+    sequence = read_sequence(place)
+    assert sequence is not None, "a recording with truth has a layout"
+    stamps_s = np.array([entry.stamp_s for entry in sequence.images])
+    T_w_c, known = interpolate(open_dataset(place).truth, stamps_s)
+    turned = sources.mirrored_stamps_s(stamps_s)[known]
+    write_tum(Trajectory(turned[::-1], T_w_c[known][::-1]), truth_file)
+    return sources.backwards(source, sequence.images), Truth(truth_file)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Variants of a recording as sources: another rate, size, start, focal length or order; no file is copied."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 
@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgeslam_torch.geometry.camera import Camera
-from edgeslam_torch.readers.listing import Problem
+from edgeslam_torch.readers.images import frames_of
+from edgeslam_torch.readers.listing import ImageEntry, Problem
 from edgeslam_torch.readers.source import Recording
 from edgeslam_torch.types import FloatArray, Frame
 
@@ -115,6 +116,28 @@ def cut(recording: Recording, plan: Cut) -> Recording:
             begin += last - first
 
     return replace(recording, decode=decode, length=len(stamps), telemetry=[], groundtruth=None)
+
+
+def backwards(recording: Recording, images: Sequence[ImageEntry]) -> Recording:
+    """The last image first, without telemetry; its ground truth must be turned round alike.
+
+    Args:
+        recording: As it was taken.
+        images: Its files in time order.
+    """
+    stamps = mirrored_stamps_s(np.array([entry.stamp_s for entry in images]))
+    turned = [ImageEntry(i, float(stamps[-1 - i]), e.path) for i, e in enumerate(reversed(images))]
+    size = recording.camera.width, recording.camera.height
+
+    def decode(problems: list[Problem]) -> Iterator[Frame]:
+        return frames_of(turned, size, problems)
+
+    return replace(recording, decode=decode, length=len(turned), telemetry=[], groundtruth=None)
+
+
+def mirrored_stamps_s(stamps_s: FloatArray) -> FloatArray:
+    """When each frame ``(F,)`` comes if time runs from the last to the first, in the same span."""
+    return stamps_s[0] + stamps_s[-1] - stamps_s
 
 
 def made_of(images: Callable[[int], NDArray[np.uint8]], count: int, camera: Camera, rate_hz: float) -> Recording:

@@ -1,6 +1,7 @@
 """A cell from recording to figures, on a tiny rendered flight."""
 
 import json
+import shutil
 import subprocess
 from pathlib import Path
 
@@ -137,6 +138,23 @@ def test_kidnapped_recording_gets_the_truth_of_the_frames_played(recording, tmp_
     assert np.allclose([f.stamp_s for f in played], poses.stamps_s)
     for frame, number in zip(played, picked, strict=True):
         assert frame.path == original.image_paths[number]
+
+
+def test_recording_played_backwards_gets_the_truth_of_each_image_also_where_the_last_have_none(recording, tmp_path):
+    place = tmp_path / "stairs"
+    shutil.copytree(recording, place)
+    truth_file = place / "groundtruth.txt"
+    truth_file.write_text("".join(truth_file.read_text().splitlines(keepends=True)[:-4]))
+    source, truth = run_cell._opened(Cell("stairs/backwards", 0, str(place), "backwards"), tmp_path, tmp_path)
+    played, poses = list(source.frames()), read_trajectory(truth.poses)
+    assert [f.path.name for f in played] == sorted((p.name for p in (place / "rgb").iterdir()), reverse=True)
+    assert np.diff([f.stamp_s for f in played]) == pytest.approx(0.1)
+    original = open_dataset(recording)
+    shown = {path.name: p for path, p in zip(original.image_paths, original.truth.positions, strict=True)}
+    told = {round(stamp, 4): p for stamp, p in zip(poses.stamps_s, poses.positions, strict=True)}
+    known = [f for f in played if round(f.stamp_s, 4) in told]
+    assert len(known) == len(told) == len(played) - 4
+    assert np.allclose([told[round(f.stamp_s, 4)] for f in known], [shown[f.path.name] for f in known], atol=1e-6)
 
 
 def test_flight_is_recorded_once_and_only_whole(tmp_path, monkeypatch):

@@ -6,6 +6,7 @@ import pytest
 from edgeslam_torch.eval.judge import sources
 from edgeslam_torch.eval.judge.cells import VARIANTS, Variant
 from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.readers.layouts import read_sequence
 from edgeslam_torch.readers.source import open_source
 from edgeslam_torch.types import TelemetrySample
 
@@ -84,3 +85,15 @@ def test_telemetry_from_long_before_the_start_is_left_out(numbered):
     numbered.telemetry = [TelemetrySample(0.1 * k) for k in range(20)]
     later = sources.start_at(numbered, 17)
     assert [round(s.stamp_s, 1) for s in later.telemetry] == [round(0.1 * k, 1) for k in range(7, 20)]
+
+
+def test_backwards_plays_from_the_end_in_the_same_span(tmp_path, write_images):
+    names = ["1.000000.png", "1.100000.png", "1.300000.png"]
+    write_images(tmp_path / "rgb", names, (64, 48))
+    (tmp_path / "rgb.txt").write_text("".join(f"{n[:-4]} rgb/{n}\n" for n in names))
+    CAMERA.save(tmp_path / "camera.yaml")
+    turned = sources.backwards(open_source(tmp_path), read_sequence(tmp_path).images)
+    frames = list(turned.frames())
+    assert [f.path.name for f in frames] == names[::-1]
+    assert [f.index for f in frames] == [0, 1, 2]
+    assert [f.stamp_s for f in frames] == pytest.approx([1.0, 1.2, 1.3])
