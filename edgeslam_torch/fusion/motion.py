@@ -14,7 +14,6 @@ import numpy as np
 
 from edgeslam_torch.fusion.config import FusionConfig
 from edgeslam_torch.fusion.displacement import TelemetryModel
-from edgeslam_torch.fusion.filter.ekf import EkfState
 from edgeslam_torch.fusion.filter.filter_feed import FilterFeed, Metric
 from edgeslam_torch.fusion.health import disagreement
 from edgeslam_torch.fusion.prediction import (
@@ -37,7 +36,7 @@ from edgeslam_torch.fusion.telemetry.delay import DelaySearch
 from edgeslam_torch.fusion.telemetry.plausibility import HEIGHTS, Trust
 from edgeslam_torch.fusion.telemetry.track import TelemetryTrack
 from edgeslam_torch.fusion.telemetry.visual_memory import VisualMemory, VisualPose
-from edgeslam_torch.fusion.telemetry_scale import TelemetryFit, TelemetryScale, rescaled
+from edgeslam_torch.fusion.telemetry_scale import TelemetryFit, TelemetryScale
 from edgeslam_torch.types import FloatArray, Health, ScaleEstimate, TelemetrySample
 
 _REFIT_S = 1.0
@@ -53,7 +52,7 @@ mean square over fr1_xyz, redkitchen and euroc_mh05_a is 0.4 in the logarithm.""
 class MotionFusion:
     """Ties the visual map to the drone's telemetry; `EdgeSlam` calls it for every frame and every packet.
 
-    The map may be in any gauge: ``T_w_c`` in arbitrary units and axes, as long as they stay the same until `rescale`.
+    The map may be in any gauge: ``T_w_c`` in arbitrary units and axes, as long as they stay the same.
     A frame stamped ``t`` shows what telemetry reported at ``t - delay``.
 
     Args:
@@ -160,19 +159,6 @@ class MotionFusion:
         for ratio in ratios:
             self._depth.add(ratio)
 
-    def rescale(self, factor: float, about: FloatArray | None = None) -> None:
-        """The map was scaled: ``p' = about + factor (p - about)``; everything remembered follows."""
-        if not (math.isfinite(factor) and factor > 0):
-            raise ValueError(f"factor must be positive, got {factor}")
-        centre = np.zeros(3) if about is None else np.asarray(about, dtype=np.float64)
-        self._memory.rescale(factor, centre)
-        if (seen := self._filter.seen) is not None:
-            self._filter.move_map(seen.rescaled(factor, centre))
-        self._depth.rescale(factor)
-        if (told := self._by_telemetry) is not None:
-            self._by_telemetry = replace(told, log_scale=told.log_scale - math.log(factor))
-        self._fit = rescaled(self._fit, factor)
-
     def _forget_scale(self) -> None:
         self._by_telemetry, self._fit = None, TelemetryFit(shortfall_m_s=self._fit.shortfall_m_s)
 
@@ -215,12 +201,6 @@ class MotionFusion:
     def filtering(self) -> bool:
         """Whether the Kalman filter is fed by vision: it then predicts the camera."""
         return self._filter.seen is not None
-
-    def filter_state(self, stamp_s: float | None = None) -> EkfState | None:
-        """The Kalman filter's body pose in the power-on world, on the telemetry clock."""
-        ekf = self._filter.ekf
-        stamp = ekf.stamp_s if stamp_s is None else stamp_s
-        return None if stamp is None else ekf.state_at(stamp)
 
     def predict(self, stamp_s: float) -> PoseEstimate | None:
         """Camera pose at a frame's stamp from what vision saw last and what telemetry has told since.

@@ -1,7 +1,7 @@
 """Metric scale from the drone's velocities and heights: what they say of the map, alone and together."""
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -36,10 +36,6 @@ class SourceScale:
     value: float
     """Metres per map unit."""
     sigma: float
-
-    def rescaled(self, factor: float) -> "SourceScale":
-        """The same after the map grew by ``factor``."""
-        return SourceScale(self.value / factor, self.sigma / factor)
 
 
 @dataclass(frozen=True, slots=True)
@@ -273,8 +269,3 @@ class TelemetryScale:
         least = max(_LEAST_CLIMB_M, _LEAST_CLIMB_SIGMAS * getattr(self._config, _HEIGHT_SOURCES[reading]))
         seen, told = (changes(z, stamps_s, segment, _HEIGHT_BIN_S) for z in (z_map, z_m))
         self._trust.judge(reading, agreement(seen, told, least / scale, least))
-
-
-def rescaled(fit: TelemetryFit, factor: float) -> TelemetryFit:
-    """The same after the map grew by ``factor``."""
-    return replace(fit, sources={name: source.rescaled(factor) for name, source in fit.sources.items()})

@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.types import FloatArray
 
-IDENTITY = np.eye(4)
 SMALL = 1e-5
 """Angle [rad] and log scale below which series take the place of quotients of tiny numbers."""
 

@@ -27,14 +27,6 @@ def telemetry_file(folders: Sequence[Path], given: str | Path | None) -> Path | 
     return next((folder / TELEMETRY for folder in folders if (folder / TELEMETRY).is_file()), None)
 
 
-def read_samples(path: Path) -> tuple[list[TelemetrySample], list[str]]:
-    """Telemetry in time order, and warnings about the file."""
-    from edgeslam_torch.readers.telemetry_csv import read_table, samples_of  # only flights need it
-
-    table = read_table(path)
-    return samples_of(path, table), table.warnings(path.name)
-
-
 def telemetry_gap(samples: Sequence[TelemetrySample], first_s: float, last_s: float) -> str | None:
     """Warning about the part of a video without telemetry; None for small gaps or without any telemetry.
 

@@ -16,6 +16,7 @@ from edgeslam_torch.readers.layouts import layout_of, read_sequence, tum
 from edgeslam_torch.readers.listing import ImageEntry, Problem
 from edgeslam_torch.readers.read_ahead import read_ahead
 from edgeslam_torch.readers.sequence import Sequence
+from edgeslam_torch.readers.telemetry_csv import read_telemetry
 from edgeslam_torch.types import Frame, TelemetrySample
 
 LIVE_SCHEMES = ("tello://", "webcam:", "rtsp://", "udp://")
@@ -132,7 +133,7 @@ def open_source(
     content = _content(path)
     folders = [path, content.folder] if path.is_dir() else [content.folder]
     telemetry_file = flight_folder.telemetry_file(folders, telemetry)
-    samples, remarks = flight_folder.read_samples(telemetry_file) if telemetry_file is not None else ([], [])
+    samples, remarks = ([], []) if telemetry_file is None else read_telemetry(telemetry_file)
     default = content.default_camera
     chosen, warnings = choose_camera(content.size, camera, folders, default, bool(samples))
     length = content.length

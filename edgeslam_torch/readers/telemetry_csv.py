@@ -128,8 +128,8 @@ class TelemetryTable:
         return said
 
 
-def read_telemetry(path: str | Path, units: TelemetryUnits | None = None) -> list[TelemetrySample]:
-    """Telemetry of a flight in SI units, in time order.
+def read_telemetry(path: Path, units: TelemetryUnits | None = None) -> tuple[list[TelemetrySample], list[str]]:
+    """Telemetry of a flight in SI units, in time order, and warnings about the file.
 
     Args:
         path: Our ``telemetry.csv`` or another log with a header line.
@@ -139,28 +139,20 @@ def read_telemetry(path: str | Path, units: TelemetryUnits | None = None) -> lis
         TelemetryError: If the file is not there, is not text, or has no clock or no known column.
     """
     table = read_table(path)
-    for warning in table.warnings(str(path)):
-        logger.warning("%s", warning)
-    return samples_of(path, table, units)
-
-
-def samples_of(path: str | Path, table: TelemetryTable, units: TelemetryUnits | None = None) -> list[TelemetrySample]:
-    """As `read_telemetry`, from a table."""
     if units is None:
         units = detect_units(table)
         logger.info(
             "%s: velocities: %s; %s", path, units.evidence, units.frame_evidence or "frame: SDK default (world)"
         )
-    return table.samples(units)
+    return table.samples(units), table.warnings(path.name)
 
 
-def read_table(path: str | Path) -> TelemetryTable:
+def read_table(path: Path) -> TelemetryTable:
     """The known columns, row by row; malformed rows are counted and skipped.
 
     Raises:
         TelemetryError: As `read_telemetry`.
     """
-    path = Path(path)
     try:
         if path.stat().st_size > _MAX_BYTES:
             raise TelemetryError(f"{path}: larger than any flight; is this telemetry?")

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 
-from edgeslam_torch.errors import SourceError
 from edgeslam_torch.files.atomic import write_atomically
 from edgeslam_torch.types import PointCloud
 
@@ -41,27 +40,3 @@ def write_pcd(path: Path, cloud: PointCloud) -> None:
     ]
     data = "\n".join(header).encode("ascii") + points.tobytes()
     write_atomically(path, lambda file: file.write(data))
-
-
-def read_pcd(path: Path) -> PointCloud:
-    """Read a cloud written by `write_pcd`.
-
-    Raises:
-        SourceError: If the file is missing, of another layout or cut off.
-    """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise SourceError(f"{path}: {error.strerror or error}") from error
-    head, mark, body = data.partition(b"DATA binary\n")
-    words = {line.split()[0]: line.split()[1:] for line in head.decode("ascii", "replace").splitlines() if line.split()}
-    if not mark or words.get("FIELDS") != list(POINT.names or ()) or not words.get("POINTS", [""])[0].isdecimal():
-        raise SourceError(f"{path}: not a PCD file of this program (binary, {' '.join(POINT.names or ())})")
-    count = int(words["POINTS"][0])
-    if len(body) < count * POINT.itemsize:
-        raise SourceError(f"{path}: cut off after {len(body) // POINT.itemsize} of {count} points; make it again")
-    points = np.frombuffer(body, dtype=POINT, count=count)
-    bits = points["rgb"].copy().view(np.uint32)
-    colour = np.stack([bits >> 16, bits >> 8, bits], axis=1).astype(np.uint8)
-    p_w = np.stack([points[n] for n in ("x", "y", "z")], axis=1)
-    return PointCloud(p_w, colour, points["sigma"].copy(), points["observations"].copy())

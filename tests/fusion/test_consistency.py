@@ -166,7 +166,7 @@ def test_absolute_updates_of_accumulated_poses_are_overconfident_relative_ones_a
 @pytest.mark.data
 @pytest.mark.parametrize("name", ["flight_a", "flight_b"])
 def test_real_tello_flights_run_through_the_filter(data_dir, name):
-    samples = read_telemetry(data_dir / "tello_telemetry" / f"{name}.csv")
+    samples = read_telemetry(data_dir / "tello_telemetry" / f"{name}.csv")[0]
     ekf = BufferedEkf(FusionConfig())
     for sample in samples[:1200]:
         ekf.add_telemetry(replace(sample))
@@ -180,7 +180,7 @@ def test_real_tello_flights_run_through_the_filter(data_dir, name):
 @pytest.mark.data
 def test_height_from_vertical_velocity_agrees_with_the_range_sensor(data_dir):
     """Where the floor is flat: one-second changes of tof against integrated vz, flight_a (it climbs and sinks)."""
-    samples = read_telemetry(data_dir / "tello_telemetry" / "flight_a.csv")
+    samples = read_telemetry(data_dir / "tello_telemetry" / "flight_a.csv")[0]
     t = np.array([s.stamp_s for s in samples])
     vz = np.array([s.velocity_m_s[2] for s in samples])
     tof = np.array([s.tof_m for s in samples])

@@ -147,12 +147,3 @@ def test_ratios_that_are_no_numbers_are_ignored():
     for pair in [(math.nan, 0.1), (0.0, math.inf), (0.1, 0.0)]:
         held.add(DepthRatio(*pair))
     assert held.scale() is None
-
-
-def test_rescaled_ratios_follow_the_map():
-    held = DepthRatios(LEAST)
-    held.add(DepthRatio(math.log(2.0), 0.1))
-    before = held.scale()
-    held.rescale(4.0)
-    assert math.exp(held.scale().log_scale) == pytest.approx(0.5)
-    assert held.scale().sigma == pytest.approx(before.sigma)

@@ -13,7 +13,7 @@ The coefficients are fitted to the true errors over recordings, simulated flight
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -155,11 +155,6 @@ class DepthRatios:
             self._ratios.append(ratio)
             del self._ratios[:-_KEPT]
             self._scale = None
-
-    def rescale(self, factor: float) -> None:
-        """The map grew by ``factor``: metres per map unit shrink."""
-        self._ratios = [replace(r, log_ratio=r.log_ratio - math.log(factor)) for r in self._ratios]
-        self._scale = None
 
     def scale(self) -> DepthScale | None:
         """The estimate of all keyframes; cached per keyframe."""

@@ -25,10 +25,6 @@ class VisualPose:
     """Standard deviation of the translation per axis [map units]."""
     sigma_r_rad: float
 
-    def rescaled(self, factor: float, centre: FloatArray) -> "VisualPose":
-        """The same after ``p' = centre + factor (p - centre)``."""
-        return replace(self, T=_scaled(self.T, factor, centre), sigma_t=self.sigma_t * factor)
-
     def moved(self, T: FloatArray) -> "VisualPose":
         """The same in a map that was moved by ``T`` ``(4, 4)``."""
         return replace(self, T=T @ self.T)
@@ -159,10 +155,6 @@ class VisualMemory:
         known = dict(zip(stamps_s.tolist(), T_w_c, strict=True))
         self._each(lambda visual: visual.revised(known))
 
-    def rescale(self, factor: float, centre: FloatArray) -> None:
-        """The map was scaled about a point ``(3,)``."""
-        self._each(lambda visual: visual.rescaled(factor, centre))
-
     def move_newest(self, T: FloatArray) -> None:
         """The map around the newest frames was moved by ``T`` ``(4, 4)``: ``T_w_c' = T T_w_c``; older ones stay."""
         self.last, self.previous = (None if v is None else v.moved(T) for v in (self.last, self.previous))
@@ -207,9 +199,3 @@ class VisualMemory:
             np.array([v.T for v in self._sightings]).reshape(-1, 4, 4),
             np.array([v.sigma_t for v in self._sightings]),
         )
-
-
-def _scaled(T: FloatArray, factor: float, centre: FloatArray) -> FloatArray:
-    out = T.copy()
-    out[:3, 3] = centre + factor * (T[:3, 3] - centre)
-    return out

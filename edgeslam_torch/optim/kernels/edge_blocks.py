@@ -128,6 +128,10 @@ class EdgeBlocks(RelativeBlocks):
     """Edge pixels: alignment across the edge and the depth cycle, one inverse depth each."""
 
     size = 1
+    system_kernel = staticmethod(edge_system)
+    cost_kernel = staticmethod(edge_cost)
+    prior: EdgePrior
+    pairs: EdgePairs
 
     def __init__(self, terms: EdgeTerms, K: Tensor, column: Tensor, config: LmConfig) -> None:
         """Arrange the terms in the solver's layout; ``K`` is fx, fy, cx, cy."""
@@ -156,17 +160,6 @@ class EdgeBlocks(RelativeBlocks):
             form=terms.cycle if used.any() else None,
             robust=self.robust(),
         )
-
-    def system(self, T_c_w: Tensor, x: Tensor) -> Linearised:
-        """See `RelativeBlocks.system`."""
-        linear = kernel(edge_system, self.config.compile)
-        out: Linearised = linear(T_c_w, x, self.layout, self.prior, self.pairs)
-        return out
-
-    def robust_cost(self, Rt: Tensor, x: Tensor) -> Tensor:
-        """See `RelativeBlocks.robust_cost`."""
-        out: Tensor = kernel(edge_cost, self.config.compile)(Rt, x, self.pairs)
-        return out
 
     def prior_cost(self, x: Tensor) -> Tensor:
         """See `RelativeBlocks.prior_cost`."""

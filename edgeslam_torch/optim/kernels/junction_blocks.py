@@ -11,7 +11,6 @@ from torch import Tensor
 
 from edgeslam_torch.losses.lshape import junction_residuals, junction_rows
 from edgeslam_torch.optim.kernels import schur
-from edgeslam_torch.optim.kernels.compiled import kernel
 from edgeslam_torch.optim.kernels.pair_blocks import (
     Known,
     Layout,
@@ -87,6 +86,10 @@ class JunctionBlocks(RelativeBlocks):
     """L-junctions: corner, arms or angle, and the straightness of the arms, three inverse depths each."""
 
     size = 3
+    system_kernel = staticmethod(junction_system)
+    cost_kernel = staticmethod(junction_cost)
+    prior: JunctionPrior
+    pairs: JunctionPairs
 
     def __init__(self, terms: JunctionTerms, K: Tensor, column: Tensor, config: LmConfig) -> None:
         """Arrange the terms in the solver's layout; ``K`` is fx, fy, cx, cy."""
@@ -111,17 +114,6 @@ class JunctionBlocks(RelativeBlocks):
             cosines=terms.cosines,
             robust=self.robust(),
         )
-
-    def system(self, T_c_w: Tensor, x: Tensor) -> Linearised:
-        """See `RelativeBlocks.system`."""
-        linear = kernel(junction_system, self.config.compile)
-        out: Linearised = linear(T_c_w, x, self.layout, self.prior, self.pairs)
-        return out
-
-    def robust_cost(self, Rt: Tensor, x: Tensor) -> Tensor:
-        """See `RelativeBlocks.robust_cost`."""
-        out: Tensor = kernel(junction_cost, self.config.compile)(Rt, x, self.pairs)
-        return out
 
     def prior_cost(self, x: Tensor) -> Tensor:
         """See `RelativeBlocks.prior_cost`."""

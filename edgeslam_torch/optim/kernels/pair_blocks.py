@@ -6,7 +6,8 @@ adjoint map them to the two poses: ``xi_rel = xi_target - Ad(T_target_host) xi_h
 """
 
 from abc import ABC, abstractmethod
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -97,6 +98,13 @@ class Known(NamedTuple):
     """``()``."""
 
 
+class Prior(Protocol):
+    """Prior on the blocks."""
+
+    def at(self, x: Tensor) -> Known:
+        """At blocks ``(size, B, L)``."""
+
+
 class Linearised(NamedTuple):
     """A `RelativeSystem`, and what it adds to the pose system."""
 
@@ -116,6 +124,13 @@ class RelativeBlocks(ABC):
     """
 
     size: int
+    system_kernel: Callable[..., Linearised]
+    """Normal equations at poses ``(W, 4, 4)`` and blocks ``(size, B, L)``, given layout, prior and pairs."""
+    cost_kernel: Callable[..., Tensor]
+    """Robust cost ``()`` of the rows at motions ``(3, 4, B, T, 1)`` and blocks, given pairs."""
+    prior: Prior
+    pairs: NamedTuple
+    """Blocks and what the views that see them measured, in tiles."""
 
     def __init__(
         self,
@@ -149,13 +164,16 @@ class RelativeBlocks(ABC):
             self.tiles.host, self.tiles.target, column[self.tiles.host], column[self.tiles.target].flatten(), F, dtype
         )
 
-    @abstractmethod
     def system(self, T_c_w: Tensor, x: Tensor) -> Linearised:
         """Normal equations at poses ``(W, 4, 4)`` and blocks ``(size, B, L)``."""
+        linear = kernel(self.system_kernel, self.config.compile)
+        out: Linearised = linear(T_c_w, x, self.layout, self.prior, self.pairs)
+        return out
 
-    @abstractmethod
     def robust_cost(self, Rt: Tensor, x: Tensor) -> Tensor:
         """Robust cost ``()`` of the residual rows, at motions ``(3, 4, B, T, 1)``."""
+        out: Tensor = kernel(self.cost_kernel, self.config.compile)(Rt, x, self.pairs)
+        return out
 
     @abstractmethod
     def prior_cost(self, x: Tensor) -> Tensor:

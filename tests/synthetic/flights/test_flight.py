@@ -226,7 +226,7 @@ def test_csv_reader_agrees_with_our_own_conversion(tmp_path: Path, flight: Fligh
     log.write(tmp_path / "telemetry.csv")
     from edgeslam_torch.readers.telemetry_csv import read_telemetry
 
-    for read, own in zip(read_telemetry(tmp_path / "telemetry.csv"), log.samples(), strict=True):
+    for read, own in zip(read_telemetry(tmp_path / "telemetry.csv")[0], log.samples(), strict=True):
         np.testing.assert_allclose(read.velocity_m_s, own.velocity_m_s, atol=1e-9)
         np.testing.assert_allclose(read.rpy_rad, own.rpy_rad, atol=1e-9)
         np.testing.assert_allclose(read.acceleration_m_s2, own.acceleration_m_s2, rtol=1e-3, atol=1e-6)
