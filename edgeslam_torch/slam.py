@@ -299,7 +299,13 @@ class EdgeSlam:
     def warnings(self) -> list[str]:
         """Limits of the results, in sentences for the run's summary."""
         depth = None if self.depth is None else self.depth.warning()
-        warnings = (depth, self._warning_of_pieces(), self._repeats.warning(), self._calibration_warning)
+        warnings = (
+            self._machine.warning(),
+            depth,
+            self._warning_of_pieces(),
+            self._repeats.warning(),
+            self._calibration_warning,
+        )
         return [warning for warning in warnings if warning is not None] + self._system.fusion.warnings()
 
     def _warning_of_pieces(self) -> str | None:

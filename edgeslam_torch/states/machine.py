@@ -13,6 +13,7 @@
 """
 
 import math
+from collections import Counter
 from enum import StrEnum
 
 
@@ -58,7 +59,10 @@ TRANSITIONS: dict[State, dict[Event, State]] = {
     State.EDGES_ONLY: _FOUND,
     State.LOST: {Event.POINTS: State.TRACKING, Event.NOTHING: State.LOST, Event.BEGUN: State.STARTING},
 }
-"""Transitions; other events cannot happen."""
+"""Transitions. The states' code causes no other events; wherever an event is listed it leads to the same state."""
+
+LEADS_TO: dict[Event, State] = {event: state for row in TRANSITIONS.values() for event, state in row.items()}
+"""State after each event, also after one that its state does not list."""
 
 
 class Machine:
@@ -78,14 +82,14 @@ class Machine:
         """Frames in a row without a pose."""
         self.lost_since_s = math.inf
         """Stamp of the first of them; infinite while not lost, minus infinity without a map to return to."""
+        self.unexpected: Counter[str] = Counter()
+        """Events that their state does not list: errors of this program, by state and event in words."""
 
     def meet(self, event: Event, stamp_s: float) -> None:
-        """Apply an event.
-
-        Raises:
-            KeyError: If the event is invalid in the current state.
-        """
-        self.state = TRANSITIONS[self.state][event]
+        """Apply an event. One that the current state does not list is counted, and leads where it leads elsewhere."""
+        if event not in TRANSITIONS[self.state]:
+            self.unexpected[f"{event} while {self.state}"] += 1
+        self.state = LEADS_TO[event]
         if self.state is not State.LOST:
             self.lost_frames, self.lost_since_s = 0, math.inf
             return
@@ -94,3 +98,10 @@ class Machine:
             self.lost_since_s = -math.inf
         elif self.lost_frames == 1:
             self.lost_since_s = stamp_s
+
+    def warning(self) -> str | None:
+        """What the states did that the table does not list; None if nothing."""
+        if not self.unexpected:
+            return None
+        cases = ", ".join(f"{what} ({count} times)" for what, count in self.unexpected.items())
+        return f"transitions that the table of states does not list: {cases}; please report this"

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from edgeslam_torch.states.machine import TRANSITIONS, Event, Machine, State
+from edgeslam_torch.states.machine import LEADS_TO, TRANSITIONS, Event, Machine, State
 
 
 def after(*events: Event) -> Machine:
@@ -46,14 +46,21 @@ def test_edges_carry_on_from_tracking_and_hand_back():
     assert after(Event.BEGUN, Event.MAP_STANDS, Event.EDGES, Event.NOTHING).lost_frames == 1
 
 
-@pytest.mark.parametrize(
-    "events",
-    [
-        (Event.POINTS,),  # no map yet
-        (Event.BEGUN, Event.MAP_STANDS, Event.BEGUN),  # a new piece without a loss
-        (Event.BEGUN, Event.MAP_STANDS, Event.NOTHING, Event.EDGES),  # edges look near a prediction only
-    ],
-)
-def test_what_cannot_happen_is_an_error(events):
-    with pytest.raises(KeyError):
-        after(*events)
+def test_an_event_leads_to_the_same_state_from_everywhere():
+    assert set(LEADS_TO) == set(Event)
+    for row in TRANSITIONS.values():
+        assert all(LEADS_TO[event] is state for event, state in row.items())
+
+
+@pytest.mark.parametrize("state", State)
+@pytest.mark.parametrize("event", Event)
+def test_every_event_is_survived_in_every_state_and_said_if_unlisted(state, event):
+    machine = Machine()
+    machine.state = state
+    machine.meet(event, 3.0)
+    assert machine.state is LEADS_TO[event]
+    if event in TRANSITIONS[state]:
+        assert machine.warning() is None
+    else:
+        machine.meet(Event.NOTHING, 4.0)
+        assert f"{event} while {state} (1 times)" in machine.warning()
