@@ -16,7 +16,6 @@ from edgeslam_torch.atlas.atlas import Atlas, Join
 from edgeslam_torch.config import SlamConfig
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.frontend.depth_check import CheckedDepth, DepthFunction
-from edgeslam_torch.frontend.image import as_grey
 from edgeslam_torch.frontend.orb import OrbExtractor
 from edgeslam_torch.frontend.repeats import REPEATED, RepeatedImages
 from edgeslam_torch.fusion.motion import MotionFusion
@@ -118,9 +117,8 @@ class EdgeSlam:
         if realtime:
             self.events["keyframes_skipped"] = 0
         self._finished = False
-        self._health: Health | None = None
         self._present = Present()
-        """What `pose_now` rests on: replaced as a whole, never changed."""
+        """What `pose_now` and `health` rest on: replaced as a whole, never changed."""
         self._machine = Machine()
         atlas = Atlas(self._system.tracker, self.edges, self.log, lm)
         self._joining = Joining(self._system, atlas)
@@ -147,7 +145,7 @@ class EdgeSlam:
         Raises:
             SourceError: If the image is not of the camera's size.
         """
-        seen = LazyView(_grey(frame, self.camera), self._extract)
+        seen = LazyView(frame, self.camera, self._extract)
         if self._tracking.needs_features:
             _ = seen.view
         return seen
@@ -170,7 +168,7 @@ class EdgeSlam:
         """
         if frame.stamp_s <= self._system.motion.stamp_s:
             raise SourceError(
-                f"{_name(frame)}: stamp {frame.stamp_s} s does not follow {self._system.motion.stamp_s} s"
+                f"{frame.name}: stamp {frame.stamp_s} s does not follow {self._system.motion.stamp_s} s"
             )
         system = self._system
         system.stage_ms = {}
@@ -188,9 +186,7 @@ class EdgeSlam:
         step = self._step(frame, seen)
         self._machine.meet(step.event, frame.stamp_s)
         system.motion.stamp_s = frame.stamp_s
-        metric = self._is_metric()
-        self._present = Present(system.fusion.snapshot(), system.published, metric)
-        self._health = system.fusion.health(frame.stamp_s, str(self.state), metric)
+        self._present = system.fusion.present(frame.stamp_s, str(self.state), system.published)
         return self._output(frame, step, joined)
 
     def pose_now(self, stamp_s: float, telemetry: Sequence[TelemetrySample] = ()) -> PoseNow | None:
@@ -220,7 +216,7 @@ class EdgeSlam:
 
     def health(self) -> Health | None:
         """What the newest pose and its metres are worth; ``None`` before the first frame. Callable from any thread."""
-        return self._health
+        return self._present.health
 
     # -- results -----------------------------------------------------------------------------------------------
 
@@ -318,7 +314,8 @@ class EdgeSlam:
     # -- helpers -----------------------------------------------------------------------------------------------
 
     def _output(self, frame: Frame, step: Step, joined: str) -> SlamOutput:
-        system, track = self._system, step.track
+        system, track, health = self._system, step.track, self._present.health
+        assert health is not None
         T_c_w = system.motion.T_c_w
         self.log.append(frame.index, frame.stamp_s, step.keyframe.id, T_c_w, step.status.supported, step.T_c_before)
         return SlamOutput(
@@ -332,29 +329,12 @@ class EdgeSlam:
             parallax_rad=step.parallax_rad,
             keyframe=step.is_keyframe,
             piece=self.map.piece_of(step.keyframe.id),
-            scale=self.scale,
-            metric=self._is_metric(),
+            scale=health.scale,
+            metric=health.metric,
             revision=system.published.revision,
             stage_ms=dict(system.stage_ms),
-            health=self._health,
+            health=health,
         )
-
-    def _is_metric(self) -> bool:
-        """Whether the published unit is a metre within the uncertainty of the estimate."""
-        estimate = self.scale
-        return bool(np.isfinite(estimate.sigma)) and not self._system.published.contradicts(estimate)
-
-
-def _name(frame: Frame) -> str:
-    return str(frame.path or f"frame {frame.index}")
-
-
-def _grey(frame: Frame, camera: Camera) -> np.ndarray:
-    grey = as_grey(frame.image) if frame.grey is None else frame.grey
-    height, width = grey.shape
-    if (width, height) != (camera.width, camera.height):
-        raise SourceError(f"{_name(frame)}: image is {width}x{height}, the calibration {camera.width}x{camera.height}")
-    return grey
 
 
 def _depth_from_config(config: SlamConfig) -> DepthFunction | None:

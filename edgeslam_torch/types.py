@@ -36,13 +36,18 @@ class Frame:
     grey: NDArray[np.uint8] | None = None
     """``(H, W)`` if the reader decodes it directly; None to derive it from ``image``."""
 
+    @property
+    def name(self) -> str:
+        """Its file or its number, for messages."""
+        return str(self.path or f"frame {self.index}")
+
 
 @dataclass(frozen=True, slots=True)
 class TelemetrySample:
     """One state message of the drone in SI units; a missing field is NaN.
 
     Velocity is in the frame fixed at power-on, rotated to our world axes (x forward at power-on, y left, z up);
-    `drone/tello.py` converts the SDK's north-east-down decimetres.
+    `drone/sdk_state.py` converts the SDK's north-east-down decimetres.
     """
 
     stamp_s: float

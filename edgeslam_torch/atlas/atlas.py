@@ -77,6 +77,11 @@ class Atlas:
         """Keyframes of other pieces that have something to be recognised by."""
         return [k for k in self.map.keyframes.values() if self.map.piece_of(k.id) != piece and _is_mapped(k)]
 
+    @property
+    def is_up_to_date(self) -> bool:
+        """Whether every keyframe was asked."""
+        return max(self.map.keyframes, default=-1) <= self._asked
+
     def update(self) -> Join | None:
         """Ask the keyframes that are new since the last call; the join that follows, if one does.
 

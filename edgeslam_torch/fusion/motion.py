@@ -25,13 +25,14 @@ from edgeslam_torch.fusion.prediction import (
     by_vision,
     with_velocity,
 )
+from edgeslam_torch.fusion.published import Published
 from edgeslam_torch.fusion.scale.camera_mount import Mount, estimate_mount
 from edgeslam_torch.fusion.scale.consensus import Settled, settled_with_network
 from edgeslam_torch.fusion.scale.depth_scale import DepthRatio, DepthRatios, DepthScale
 from edgeslam_torch.fusion.scale.log_scale import LogScale, fuse
-from edgeslam_torch.fusion.snapshot import Snapshot
+from edgeslam_torch.fusion.snapshot import Present, Snapshot
 from edgeslam_torch.fusion.telemetry.alignment import map_to_world
-from edgeslam_torch.fusion.telemetry.comparison import Comparison, Present
+from edgeslam_torch.fusion.telemetry.comparison import Comparison, FlightSoFar
 from edgeslam_torch.fusion.telemetry.delay import DelaySearch
 from edgeslam_torch.fusion.telemetry.plausibility import HEIGHTS, Trust
 from edgeslam_torch.fusion.telemetry.track import TelemetryTrack
@@ -226,21 +227,26 @@ class MotionFusion:
             told.append(ScaleEstimate(value, value * self._with_focal(depth).sigma, "depth"))
         return tuple(told)
 
-    def health(self, stamp_s: float, state: str, metric: bool) -> Health:
-        """What the metres are worth when a frame has been looked at.
+    def present(self, stamp_s: float, state: str, published: Published) -> Present:
+        """What is known once a frame has been looked at: the motion, and what its metres are worth.
 
         Args:
             stamp_s: Stamp of the frame.
             state: What carries its pose.
-            metric: Whether the published unit is a metre.
+            published: What is published of the map.
         """
-        sources, delay = self.sources(), self._delay.delay
+        health = self.health(stamp_s, state, published.is_metric(self.scale()))
+        return Present(self.snapshot(), published, health.metric, health)
+
+    def health(self, stamp_s: float, state: str, metric: bool) -> Health:
+        """What the metres are worth; arguments as in `present`, and whether the published unit is a metre."""
+        sources, delay, scale = self.sources(), self._delay.delay, self.scale()
         doubt = self._settled().warning
         return Health(
             stamp_s,
             state,
             metric,
-            self.scale(),
+            scale,
             sources,
             disagreement(sources),
             stamp_s - self._track.last_s,
@@ -362,7 +368,7 @@ class MotionFusion:
         self._R_w_m = R_w_m
         depth = self._depth.scale()
         network = None if depth is None else self._with_focal(depth)
-        present = Present(self._memory, self._track, self.T_b_c[:3, :3], self._rough_scale(), network)
+        present = FlightSoFar(self._memory, self._track, self.T_b_c[:3, :3], self._rough_scale(), network)
         self._comparison.judge(self._trust, present, self._delay.delay, R_w_m)
         self._trust.at_odds = None
         scale = TelemetryScale(self.config, self.T_b_c, present, self._trust, self.delay_s, R_w_m, self._held_scale())

@@ -56,6 +56,10 @@ class Published:
         p = self.points(cloud.p_w.astype(np.float64)).astype(np.float32)
         return replace(cloud, p_w=p, sigma_m=(self.scale * cloud.sigma_m).astype(np.float32))
 
+    def is_metric(self, estimate: ScaleEstimate) -> bool:
+        """Whether the published unit is a metre within the uncertainty of an estimate [metres per map unit]."""
+        return math.isfinite(estimate.sigma) and not self.contradicts(estimate)
+
     def contradicts(self, estimate: ScaleEstimate) -> bool:
         """Whether an estimate [metres per map unit] leaves no room for the published scale."""
         sigma = estimate.sigma / estimate.value

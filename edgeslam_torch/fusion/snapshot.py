@@ -10,7 +10,7 @@ from edgeslam_torch.fusion.filter.filter_feed import FilterView, FrozenFilter
 from edgeslam_torch.fusion.prediction import by_vision
 from edgeslam_torch.fusion.published import Published
 from edgeslam_torch.fusion.telemetry.visual_memory import VisualPose
-from edgeslam_torch.types import FloatArray, PoseNow, ScaleEstimate, TelemetrySample
+from edgeslam_torch.types import FloatArray, Health, PoseNow, ScaleEstimate, TelemetrySample
 
 _LONGEST_STEP_S = 0.5
 """Tracked frames further apart tell no velocity."""
@@ -31,11 +31,13 @@ class Snapshot:
 
 @dataclass(frozen=True, slots=True)
 class Present:
-    """The same with the world that is published."""
+    """What a frame leaves behind: the same with the world that is published, and what that is worth."""
 
     snapshot: Snapshot | None = None
     published: Published = field(default_factory=Published)
     metric: bool = False
+    health: Health | None = None
+    """None before the first frame."""
 
     def pose_at(self, stamp_s: float, telemetry: Sequence[TelemetrySample] = ()) -> PoseNow | None:
         """The camera at a moment; ``None`` before the first tracked frame.

@@ -9,7 +9,7 @@ from edgeslam_torch.fusion.config import FusionConfig
 from edgeslam_torch.fusion.scale.consensus import at_odds, contradict, sided_with
 from edgeslam_torch.fusion.scale.joint_scale import Evidence, displacement_evidence, height_evidence, solved
 from edgeslam_torch.fusion.scale.log_scale import LogScale, floor_segments
-from edgeslam_torch.fusion.telemetry.comparison import Present
+from edgeslam_torch.fusion.telemetry.comparison import FlightSoFar
 from edgeslam_torch.fusion.telemetry.plausibility import AtOdds, Reading, Trust, agreement, changes
 from edgeslam_torch.fusion.telemetry.visual_memory import Displacements
 from edgeslam_torch.types import FloatArray, IntArray
@@ -94,7 +94,7 @@ class TelemetryScale:
         self,
         config: FusionConfig,
         T_b_c: FloatArray,
-        present: Present,
+        present: FlightSoFar,
         trust: Trust,
         delay_s: float,
         R_w_m: FloatArray,

@@ -27,7 +27,7 @@ class Joining:
 
     def _once(self) -> Join | None:
         system = self.system
-        if not system.log.records:
+        if self.atlas.is_up_to_date or not system.log.records:
             return None
         last = system.log.records[-1].keyframe_id
         piece, T_k_w = system.map.piece_of(last), system.map.pose_of(last)

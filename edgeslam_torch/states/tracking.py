@@ -13,10 +13,10 @@ from edgeslam_torch.states.step import Located, Step
 from edgeslam_torch.states.system import System
 from edgeslam_torch.tracking.edge_tracker import MIN_EDGES, EdgeTracker, PointsInFrame
 from edgeslam_torch.tracking.flow import FlowTracker, Followed, Template, join, template_of_keyframe, template_of_track
-from edgeslam_torch.tracking.keyframe_choice import few_matches, is_due, lost_most, lost_sight
+from edgeslam_torch.tracking.keyframe_choice import due_by_flow, few_matches, is_due
 from edgeslam_torch.tracking.lazy_view import LazyView
 from edgeslam_torch.tracking.relocaliser import Reach, Relocaliser, candidates
-from edgeslam_torch.tracking.tracker import Track, View, median_parallax
+from edgeslam_torch.tracking.tracker import Track, View, parallax_to
 from edgeslam_torch.types import FloatArray, Frame, FrameStatus, IntArray
 
 FEW_INLIERS = 100
@@ -127,9 +127,8 @@ class Tracking:
 
     def _locate_followed(self, followed: Followed, stamp_s: float) -> Located:
         reference = self.system.map.keyframes.get(followed.keyframe_id, self.system.map.latest())
-        parallax_rad = self._parallax(followed.track, reference)
-        mapping = self.system.config.mapping
-        due = self._is_due(stamp_s, lost_sight(followed, mapping), parallax_rad, lost_most(followed, mapping))
+        parallax_rad = parallax_to(reference, followed.track, self.system.map.anchors.p_w)
+        due = due_by_flow(followed, parallax_rad, stamp_s - self.system.keyframe_s, self.system.config.mapping)
         inv_sigma = self.system.config.orb.scale_factor ** -followed.octave.astype(np.float64)
         return Located(followed.track, reference, parallax_rad, due, followed.uv, inv_sigma)
 
@@ -149,9 +148,10 @@ class Tracking:
         """The pose of a matched frame, which becomes the template for the next ones."""
         system = self.system
         reference = system.tracker.local_keyframes(track.anchor)[0]
-        parallax_rad = self._parallax(track, reference)
+        parallax_rad = parallax_to(reference, track, system.map.anchors.p_w)
         few = few_matches(track, reference, system.map, system.config.mapping)
-        due = followed is not None or self._is_due(stamp_s, few, parallax_rad)
+        since_s = stamp_s - system.keyframe_s
+        due = followed is not None or is_due(few, parallax_rad, since_s, system.config.mapping)
         self._template = template_of_track(track, view, reference, seen.grey, system.camera)
         uv, inv_sigma = view.features.uv[track.keypoint], view.inv_sigma[track.keypoint]
         return Located(track, reference, parallax_rad, due, uv, inv_sigma, view, relocalised)
@@ -245,13 +245,6 @@ class Tracking:
         if self.system.map_keyframes(new):
             newest = new[-1][1]
             self._recent = newest.anchor[newest.anchor >= 0]
-
-    def _parallax(self, track: Track, reference: Keyframe) -> float:
-        return median_parallax(self.system.map.anchors.p_w[track.anchor], track.T_c_w, reference.centre_w)
-
-    def _is_due(self, stamp_s: float, changed: bool, parallax_rad: float, at_once: bool = False) -> bool:
-        since_s = stamp_s - self.system.keyframe_s
-        return is_due(changed, parallax_rad, since_s, self.system.config.mapping, at_once)
 
 
 def _in_words(located: Located) -> str:

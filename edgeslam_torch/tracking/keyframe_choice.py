@@ -22,6 +22,12 @@ def lost_most(followed: Followed, config: MappingConfig) -> bool:
     return followed.share < config.keyframe_at_once
 
 
+def due_by_flow(followed: Followed, parallax_rad: float, since_keyframe_s: float, config: MappingConfig) -> bool:
+    """Whether a frame that was followed should become a keyframe; arguments as in `is_due`."""
+    changed, at_once = lost_sight(followed, config), lost_most(followed, config)
+    return is_due(changed, parallax_rad, since_keyframe_s, config, at_once)
+
+
 def few_matches(track: Track, reference: Keyframe, slam_map: SlamMap, config: MappingConfig) -> bool:
     """Whether too few of the reference keyframe's anchors are matched."""
     # Anchors of only two keyframes are unstable; overlap is measured on the others.

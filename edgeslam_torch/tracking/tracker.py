@@ -195,6 +195,11 @@ class Tracker:
         )
 
 
+def parallax_to(reference: Keyframe, track: Track, p_w: FloatArray) -> float:
+    """Median angle [rad] at the anchors ``p_w`` ``(A, 3)`` of a track between its camera and a keyframe."""
+    return median_parallax(p_w[track.anchor], track.T_c_w, reference.centre_w)
+
+
 def median_parallax(p_w: FloatArray, T_c_w: FloatArray, centre_w: FloatArray) -> float:
     """Median angle [rad] between the rays from two camera centres to points ``(N, 3)``; 0 without points."""
     if len(p_w) == 0:

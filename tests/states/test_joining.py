@@ -42,7 +42,7 @@ class Pieces:
                 self.T_k_w = sim3.moved_camera(S, self.T_k_w)
             return Join(1.0, 0, 1, moved, S if moved == 1 else sim3.inverse(S), 0.01, 2, 300)
 
-        return SimpleNamespace(update=update, ask_all_again=lambda: None)
+        return SimpleNamespace(update=update, ask_all_again=lambda: None, is_up_to_date=False)
 
 
 def system_of(pieces, motion, busy=False):

@@ -28,7 +28,7 @@ _LEAST_TURN_RAD_S = math.radians(2.0)
 
 
 @dataclass(frozen=True, slots=True)
-class Present:
+class FlightSoFar:
     """Inputs of a comparison."""
 
     memory: VisualMemory
@@ -48,7 +48,7 @@ class Comparison:
         self._config = config
         self._looked_wide_at = 0
 
-    def judge(self, trust: Trust, present: Present, delay: Delay, R_w_m: FloatArray) -> None:
+    def judge(self, trust: Trust, present: FlightSoFar, delay: Delay, R_w_m: FloatArray) -> None:
         """Compare at the delay in use and, if that fits badly, read in other frames and at other delays.
 
         Velocities that fit significantly better in another frame are read in that frame from now on, overriding
@@ -70,7 +70,7 @@ class Comparison:
         for reading, found in used.items():
             trust.judge(reading, found)
 
-    def _fits_turned(self, present: Present, now: Agreement, delay_s: float, R_w_m: FloatArray) -> Turn | None:
+    def _fits_turned(self, present: FlightSoFar, now: Agreement, delay_s: float, R_w_m: FloatArray) -> Turn | None:
         """The frame in which the velocities surely fit better than in the one they are read in."""
         best, best_turn = now, None
         for turn in Turn:
@@ -81,7 +81,7 @@ class Comparison:
                     best, best_turn = found, turn
         return best_turn if _surely_better(best, now) else None
 
-    def _fits_elsewhere(self, present: Present, now: Agreement, used_s: float) -> float | None:
+    def _fits_elsewhere(self, present: FlightSoFar, now: Agreement, used_s: float) -> float | None:
         """The delay at which telemetry surely fits better than now, if that is one which is not allowed."""
         fixed = self._config.delay_s
         low, high = self._config.delay_range_s if fixed is None else (fixed - _FIXED_REACH_S, fixed + _FIXED_REACH_S)
@@ -93,7 +93,7 @@ class Comparison:
                 best, best_s = found, delay_s
         return best_s if _surely_better(best, now) and not low <= best_s <= high else None
 
-    def _compared(self, present: Present, delay_s: float, R_w_m: FloatArray) -> dict[Reading, Agreement]:
+    def _compared(self, present: FlightSoFar, delay_s: float, R_w_m: FloatArray) -> dict[Reading, Agreement]:
         """How velocities and attitude go with the images under one delay.
 
         Without the camera's lever arm: rotations must not count as evidence for velocities.
