@@ -167,9 +167,7 @@ class EdgeSlam:
             SourceError: If the image is not of the camera's size, or the stamp does not increase.
         """
         if frame.stamp_s <= self._system.motion.stamp_s:
-            raise SourceError(
-                f"{frame.name}: stamp {frame.stamp_s} s does not follow {self._system.motion.stamp_s} s"
-            )
+            raise SourceError(f"{frame.name}: stamp {frame.stamp_s} s does not follow {self._system.motion.stamp_s} s")
         system = self._system
         system.stage_ms = {}
         system.collect()
@@ -193,7 +191,7 @@ class EdgeSlam:
         """Where the camera is at a moment after the newest frame; callable from any thread while frames are stepped.
 
         With telemetry the video's delay is made up for: the frame stamped ``t`` shows the world at ``t - delay``, and
-        what telemetry told since carries the pose on to the present.
+        telemetry received since propagates the pose to the present.
 
         Args:
             stamp_s: The moment, on the clock that stamps frames and telemetry.
@@ -215,7 +213,7 @@ class EdgeSlam:
         return self._tracking.step(frame, seen) or self._lost.begin(frame, seen.view)
 
     def health(self) -> Health | None:
-        """What the newest pose and its metres are worth; ``None`` before the first frame. Callable from any thread."""
+        """Reliability of the newest pose and its metres; ``None`` before the first frame. Callable from any thread."""
         return self._present.health
 
     # -- results -----------------------------------------------------------------------------------------------

@@ -279,7 +279,7 @@ class SlamOutput:
     stage_ms: dict[str, float]
     """Time of each stage in this step [ms]."""
     health: Health | None = None
-    """What the pose and its metres are worth; None only in outputs that no system made."""
+    """Reliability of the pose and its metres; None only in outputs made by hand."""
 
 
 @dataclass(frozen=True, slots=True)

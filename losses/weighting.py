@@ -29,7 +29,7 @@ class TermScale:
     sigma: float
     """Current estimate, in the residual's unit."""
     low: float
-    """Lower bound: a lucky window must not make a term dominate."""
+    """Lower bound, so that no term dominates after a window with unusually small residuals."""
     high: float
     """Upper bound: a bad window must not silence a term."""
     smoothing: float = 0.8

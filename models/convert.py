@@ -24,7 +24,7 @@ def convert_upstream(path: Path, out: Path) -> Metadata:
     """Write an official checkpoint as safetensors with metadata.
 
     Raises:
-        WeightsError: If it is no FastDepth checkpoint.
+        WeightsError: If it is not a FastDepth checkpoint.
         OSError: If ``out`` cannot be written.
     """
     state, metadata = read_upstream(path)

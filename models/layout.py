@@ -109,7 +109,7 @@ def variant_of(state: Mapping[str, HasShape]) -> Variant:
     """The variant of a checkpoint without a record, by its names and widths.
 
     Raises:
-        WeightsError: If it is no FastDepth checkpoint.
+        WeightsError: If it is not a FastDepth checkpoint.
     """
     widths = Widths.of_state_dict(state)
     if "conv0.0.weight" in state:

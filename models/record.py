@@ -13,7 +13,7 @@ from edgeslam_torch.models.layout import INPUT_MULTIPLE, HasShape, Output, Paddi
 
 HEADER_KEY = "edgeslam"
 OTHER_NETWORK = "other"
-"""``variant`` of a network that is no FastDepth; it comes as an ONNX file, which holds its own graph."""
+"""``variant`` of a network other than FastDepth; it comes as an ONNX file, which holds its own graph."""
 DEFAULT_WEIGHTS = Path(__file__).parent / "weights" / "default.safetensors"
 MAX_INPUT_PX = 2048
 """Maximum height and width; four times the training size."""
@@ -115,7 +115,7 @@ def metadata_from_json(text: str) -> Metadata:
     try:
         return metadata_from_record(json.loads(text))
     except ValueError:
-        raise WeightsError("its metadata cannot be used: it is no JSON") from None
+        raise WeightsError("its metadata cannot be used: it is not JSON") from None
     except RecursionError:
         raise WeightsError("its metadata cannot be used: nested too deeply") from None
 
@@ -131,7 +131,7 @@ def metadata_from_record(record: object) -> Metadata:
             raise ValueError(f"it is {reprlib.repr(record)}, not a table")
         missing = [name for name in _REQUIRED if name not in record]
         if missing:
-            raise ValueError(f"it says nothing about {', '.join(missing)}")
+            raise ValueError(f"it has no value for {', '.join(missing)}")
         known = {f.name for f in dataclasses.fields(Metadata)}
         kept: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in record.items() if k in known}
         return Metadata(**kept)
@@ -146,7 +146,7 @@ def upstream_metadata(state: Mapping[str, HasShape]) -> Metadata:
     250, centre-cropped to 304x228, then squeezed to 224x224.
 
     Raises:
-        WeightsError: If it is no FastDepth checkpoint.
+        WeightsError: If it is not a FastDepth checkpoint.
     """
     return Metadata(
         variant=variant_of(state).value,

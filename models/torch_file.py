@@ -199,7 +199,7 @@ class _LegacyReader:
         for key in keys if isinstance(keys, list) else ():
             storage = storages.get(key) if isinstance(key, str) else None
             if storage is None:
-                raise WeightsError("damaged checkpoint: bytes of a tensor that nobody knows")
+                raise WeightsError("damaged checkpoint: bytes of an unknown tensor")
             count = int.from_bytes(self._data[position : position + 8], "little")
             position += 8 + count * storage.item_bytes
             if position > len(self._data):

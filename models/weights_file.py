@@ -120,7 +120,7 @@ def check_weights(state: Mapping[str, Stored], metadata: Metadata) -> dict[str, 
         WeightsError: With the reason, without the file's name.
     """
     if metadata.variant == OTHER_NETWORK:
-        raise WeightsError("says that it is no FastDepth; another network comes as an ONNX file")
+        raise WeightsError("is not FastDepth by its record; other networks come as ONNX files")
     check_shapes(state, Variant(metadata.variant), metadata.uncertainty)
     return {k: _counter(k, v) if k.endswith(STEP_COUNTER) else _as_float32(k, v) for k, v in state.items()}
 
@@ -178,7 +178,7 @@ def _read_header(file: BinaryIO) -> tuple[Metadata | None, dict[str, _Entry]]:
     try:
         header = json.loads(file.read(length))
     except (ValueError, RecursionError):
-        raise WeightsError("not a safetensors file, or damaged: its header is no JSON") from None
+        raise WeightsError("not a safetensors file, or damaged: its header is not JSON") from None
     if not isinstance(header, dict):
         raise WeightsError("damaged: its header is no table")
     remarks = header.pop("__metadata__", None) or {}

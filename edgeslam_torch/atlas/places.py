@@ -18,7 +18,7 @@ MAX_HAMMING = 50
 RATIO = 0.9
 """Nearest over second nearest anchor."""
 MIN_VOTES = 8
-"""Votes from which on a keyframe is worth a closer look: wrong places of other rooms get 4 at most."""
+"""Votes above which a keyframe becomes a revisit candidate: places in other rooms get at most 4."""
 
 
 def lookalikes(slam_map: SlamMap, words: NDArray[np.uint64], among: list[Keyframe], most: int) -> list[Keyframe]:

@@ -27,7 +27,7 @@ class TelloAddress:
         """From ``tello://HOST[:COMMAND[:STATE[:VIDEO]]]`` or ``HOST``; no host means 192.168.10.1.
 
         Raises:
-            SourceError: If it is no such address.
+            SourceError: If it is not such an address.
 
         Example:
             >>> TelloAddress.parse("tello://127.0.0.1:9000:9001:9002").video_port

@@ -1,4 +1,4 @@
-"""Stage 1, depth: FastDepth on one thread, in metres for the camera at hand."""
+"""Stage 1, depth: FastDepth on one thread, in metres for the given camera."""
 
 import logging
 from pathlib import Path

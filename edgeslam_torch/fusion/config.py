@@ -89,7 +89,7 @@ class FusionConfig:
     alignment_sigma_rad: float = math.radians(3.0)
     """How far the attitude-derived rotation from map to power-on world may be corrected by displacements."""
     min_speed_m_s: float = 0.06
-    """RMS metric speed below which an interval says nothing of scale (hover, turning on the spot)."""
+    """RMS metric speed below which an interval does not constrain the scale (hover, turning on the spot)."""
     systematic_log: float = 0.008
     """Scale error of the drone's own velocity that no averaging removes."""
     height_systematic_log: float = 0.02

@@ -228,7 +228,7 @@ class MotionFusion:
         return tuple(told)
 
     def present(self, stamp_s: float, state: str, published: Published) -> Present:
-        """What is known once a frame has been looked at: the motion, and what its metres are worth.
+        """What is known after a frame: the motion, and the reliability of its metres.
 
         Args:
             stamp_s: Stamp of the frame.
@@ -239,7 +239,7 @@ class MotionFusion:
         return Present(self.snapshot(), published, health.metric, health)
 
     def health(self, stamp_s: float, state: str, metric: bool) -> Health:
-        """What the metres are worth; arguments as in `present`, and whether the published unit is a metre."""
+        """Reliability of the metres; arguments as in `present`, and whether the published unit is a metre."""
         sources, delay, scale = self.sources(), self._delay.delay, self.scale()
         doubt = self._settled().warning
         return Health(

@@ -31,7 +31,7 @@ class Snapshot:
 
 @dataclass(frozen=True, slots=True)
 class Present:
-    """What a frame leaves behind: the same with the world that is published, and what that is worth."""
+    """State after a frame: the snapshot, the published world, and their reliability."""
 
     snapshot: Snapshot | None = None
     published: Published = field(default_factory=Published)

@@ -54,7 +54,7 @@ class Keyframe:
     depth: DepthMap | None = None
     """Released, like ``image``, after the edges are measured."""
     network_m: FloatArray | None = None
-    """``(N,)`` network depth at the keypoints [m], NaN where it says nothing; stays when ``depth`` goes."""
+    """``(N,)`` network depth at the keypoints [m], NaN where it is undefined; kept when ``depth`` is released."""
     tracked: TrackedMotion | None = None
     """Set when it was made while most depths that it sees rested on priors."""
     image: NDArray[np.uint8] | None = None

@@ -38,7 +38,7 @@ class JpegFrame(Frame):
         """Decode a file's bytes in grey.
 
         Raises:
-            SourceError: If they are no image, or a damaged one.
+            SourceError: If they are not an image, or a damaged one.
         """
         grey = _grey_of_jpeg(data, path)
         for name, value in (("index", index), ("stamp_s", stamp_s), ("path", path), ("grey", grey), ("_data", data)):
@@ -107,7 +107,7 @@ def _bytes(path: Path) -> bytes:
     try:
         size = path.stat().st_size if path.is_file() else None
         if size is not None and size > _MAX_BYTES:
-            raise SourceError(f"{path}: {size / 1e6:.0f} MB are no image")
+            raise SourceError(f"{path}: {size / 1e6:.0f} MB is too large for an image")
         data = path.read_bytes() if size is not None else None
     except OSError as error:
         raise SourceError(f"{path}: {error.strerror or error}") from error

@@ -96,7 +96,7 @@ ROWS = (
 
 @dataclass(frozen=True, slots=True)
 class AblationSettings:
-    """What is run."""
+    """What to run."""
 
     data: Path
     """Folder of recordings."""
@@ -141,15 +141,15 @@ def run_ablation(settings: AblationSettings, out: Path, say: Callable[[str], Non
     repeated.
 
     Args:
-        settings: What is run.
+        settings: What to run.
         out: Folder of ``ablation.json``.
-        say: Told one line for every run.
+        say: Called with one line for every run.
 
     Returns:
         The record: conditions, and for every row of `ROWS` by name its runs with their figures.
 
     Raises:
-        EvaluationError: For a name that is no row, or a sequence that is not there.
+        EvaluationError: If a row or a sequence does not exist.
     """
     sequences, rows = _sequences(settings), _rows(settings.rows)
     out.mkdir(parents=True, exist_ok=True)

@@ -66,7 +66,7 @@ class Errors:
     def line(self, name: str) -> str:
         """For the terminal."""
         if not self.absolute_m:
-            return f"{name}: the filter never told the pose ({self.asked} times asked)"
+            return f"{name}: the filter never gave the pose ({self.asked} requests)"
         return (
             f"{name}: pose {_spread(self.absolute_m)}; motion since the last frame {_spread(self.since_seen_m)}, "
             f"not made up for {_spread(self.late_m)}; velocity {_spread(self.velocity_m_s)} a second; "

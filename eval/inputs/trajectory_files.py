@@ -201,7 +201,7 @@ def _read_table(path: Path) -> tuple[FloatArray, int]:
 def _read_text(path: Path) -> str:
     try:
         if path.stat().st_size > _MAX_FILE_BYTES:
-            raise EvaluationError(f"{path}: {path.stat().st_size / 1e9:.1f} GB is no trajectory file")
+            raise EvaluationError(f"{path}: {path.stat().st_size / 1e9:.1f} GB is too large for a trajectory file")
         return path.read_text(encoding="utf-8")
     except FileNotFoundError as error:
         raise EvaluationError(f"{path}: no such trajectory file") from error

@@ -68,7 +68,7 @@ VARIANTS = {
 """Names after the slash in a cell's name."""
 
 BACKWARDS = "backwards"
-"""The variant that plays a recording from its end: an honest second opinion, since nobody has tuned on it."""
+"""The variant that plays a recording from its end: an independent check, since nothing was tuned on it."""
 
 
 @dataclass(frozen=True, slots=True)

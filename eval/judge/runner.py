@@ -64,7 +64,7 @@ def judge(
         cells: What to run.
         settings: How.
         out: Folder for the cells' own folders.
-        say: Told one line for every cell that ends.
+        say: Called with one line for every finished cell.
         commit: State of the code; asked of git when None. A result of another state is not taken.
         start: Starts a cell's process; `start_cell` when None.
 

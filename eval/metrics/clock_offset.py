@@ -9,7 +9,7 @@ from edgeslam_torch.eval.inputs.trajectory_files import Trajectory
 from edgeslam_torch.eval.metrics.align import umeyama
 
 NEAR_S = 10.0
-"""Offsets looked at when the clocks do overlap."""
+"""Offsets tried when the clocks overlap."""
 
 _MAX_POSES = 200
 _MAX_TRIALS = 2000

@@ -15,7 +15,7 @@ from edgeslam_torch.readers.images import pixels_or_none
 from edgeslam_torch.types import FloatArray
 
 MIN_DEPTH_M = 1e-3
-"""Predictions are not taken below this: log and ratio need a positive depth."""
+"""Lower bound of predictions: log and ratio need a positive depth."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,12 +35,12 @@ class DepthScore:
     delta3: float
     """The same below ``1.25^3``."""
     scale: float
-    """What the prediction was multiplied by: 1 for metric figures, the ratio of medians for scaled ones."""
+    """Factor applied to the prediction: 1 for metric figures, the ratio of medians for scaled ones."""
 
 
 @dataclass(frozen=True, slots=True)
 class DepthReport:
-    """One prediction judged four ways."""
+    """Errors of one prediction: metric and scaled, everywhere and at edges."""
 
     metric: DepthScore
     median_scaled: DepthScore
@@ -61,7 +61,7 @@ def score_depth(
     Args:
         prediction: Depth ``(H, W)`` [m].
         truth: Measured depth ``(H, W)`` [m]; 0, negative or not finite where nothing was measured.
-        mask: Pixels ``(H, W)`` to look at; all measured ones by default.
+        mask: Pixels ``(H, W)`` to evaluate; all measured ones by default.
         median_scaled: Multiply the prediction by ``median(truth) / median(prediction)`` of those pixels first.
 
     Raises:
@@ -131,9 +131,9 @@ def compare_folders(
     """Mean figures over the maps that two folders (or files) share by name.
 
     Args:
-        prediction: Folder or file to judge; of a name's ``.npy`` and ``.png`` the former is taken.
+        prediction: Folder or file to evaluate; ``.npy`` takes precedence over ``.png``.
         truth: Folder or file of measured depth.
-        metres_per_unit: What a PNG's value is worth [m].
+        metres_per_unit: Depth of one unit of a PNG [m].
         images: Folder or file of images of the same names and size: their edge pixels are judged alone too.
 
     Raises:

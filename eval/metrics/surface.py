@@ -42,7 +42,7 @@ _SINGLE_FRAMES = 30
 """Depth maps that judge a point one by one, spread evenly over the sequence."""
 
 _HIDDEN_M = 0.1
-"""A point this far behind a depth map's surface is hidden there, and that map says nothing about it."""
+"""A point this far behind a depth map's surface is hidden there and cannot be compared with that map."""
 
 _CANNY = (50.0, 150.0)
 """Thresholds of the edges asked for, on the grey image smoothed with sigma 1, L2 gradient."""

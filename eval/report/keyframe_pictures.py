@@ -25,7 +25,7 @@ _HIDDEN = 1.08
 def keyframe_pictures(run: RunFolder, cloud: PointCloud, stamps_s: FloatArray) -> list[tuple[float, np.ndarray]]:
     """Stamp and BGR picture of the keyframes at ``stamps_s`` whose images can still be read.
 
-    Only sources that are folders of images are looked at; a missing one gives no pictures, not an error.
+    Only folders of images are supported; a missing one gives no pictures, not an error.
     """
     paths = image_paths(run, stamps_s)
     if len(cloud.p_w) == 0 or not any(paths):

@@ -199,7 +199,7 @@ def _scale_sentence(summary: dict[str, Any]) -> str:
         return ""
     value, sigma, source = _float(scale.get("value")), _float(scale.get("sigma")), str(scale.get("source", "none"))
     if scale.get("units") == "arbitrary" or not math.isfinite(sigma) or not value:
-        return "Nothing told the metric scale, so lengths are in arbitrary units."
+        return "No source determined the metric scale, so lengths are in arbitrary units."
     known = f"{100 * sigma / value:.1f} % (1 sigma) from {source.replace('+', ' and ')}"
     return f"Lengths are in metres, with the scale known to {known}."
 

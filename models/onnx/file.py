@@ -45,7 +45,7 @@ def read_onnx(path: Path) -> tuple[bytes, Metadata]:
 def _record(model: onnx.ModelProto) -> Metadata:
     record = next((p.value for p in model.metadata_props if p.key == HEADER_KEY), None)
     if record is None:
-        raise WeightsError("holds no EdgeSLAM metadata, or is no ONNX file; export it with `edgeslam export`")
+        raise WeightsError("holds no EdgeSLAM metadata, or is not an ONNX file; export it with `edgeslam export`")
     return metadata_from_json(record)
 
 

@@ -227,10 +227,10 @@ def test_a_record_with_a_wrong_type_is_refused(field: str) -> None:
         ("[]", r"it is \[\], not a table"),
         ("3", "it is 3"),
         ('"text"', "it is 'text'"),
-        ("{}", "says nothing about variant"),
+        ("{}", "has no value for variant"),
         ("[" * 100_000, "nested too deeply"),
         ('{"variant": ' + "[" * 100_000, "nested too deeply"),
-        ('{"variant": ' + "[" * 500 + "]" * 500 + "}", "says nothing about|variant must be"),
+        ('{"variant": ' + "[" * 500 + "]" * 500 + "}", "has no value for|variant must be"),
         ('{"input_width": ' + "9" * 5000 + "}", "no JSON"),
     ],
 )
@@ -246,7 +246,7 @@ def test_what_is_no_record_is_refused(file: File, tmp_path: Path, text: str, mat
 def test_a_record_that_does_not_say_how_to_run_it_is_refused(field: str) -> None:
     record = asdict(METADATA)
     del record[field]
-    with pytest.raises(WeightsError, match=f"says nothing about {field}"):
+    with pytest.raises(WeightsError, match=f"has no value for {field}"):
         metadata_from_json(json.dumps(record))
 
 

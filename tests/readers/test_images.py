@@ -123,5 +123,5 @@ def test_an_image_of_too_many_pixels_is_refused_before_it_is_decoded(tmp_path, m
 def test_a_file_too_large_for_an_image_is_not_read(tmp_path):
     with (tmp_path / "a.png").open("wb") as file:
         file.truncate(1 << 40)
-    with pytest.raises(SourceError, match="a.png: 1099512 MB are no image"):
+    with pytest.raises(SourceError, match="a.png: 1099512 MB is too large for an image"):
         read_image(tmp_path / "a.png")

@@ -38,7 +38,7 @@ class DroneModel:
     """
 
     clearance: Callable[[FloatArray], float] = lambda p: math.inf
-    """Free air [m] around a point of the drone's world; the drone stops short of walls."""
+    """Clearance [m] around a point of the drone's world; the drone stops short of walls."""
     battery: float = 1.0
     battery_per_s: float = 1.0 / 780.0
     """13 minutes of flight on a full battery."""

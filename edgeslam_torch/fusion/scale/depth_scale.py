@@ -64,7 +64,7 @@ def compared(network_m: FloatArray, map_depth: FloatArray) -> DepthRatio | None:
     """Ratio, spread and slope between network and triangulated z-depth of one keyframe's anchors.
 
     Args:
-        network_m: Network depth at the anchors ``(A,)`` [m], NaN where it says nothing.
+        network_m: Network depth at the anchors ``(A,)`` [m], NaN where it is undefined.
         map_depth: Their depth in the map ``(A,)`` [map units].
 
     Returns:

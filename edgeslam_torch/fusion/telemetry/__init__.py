@@ -1,1 +1,1 @@
-"""What was told and seen: the flight so far, the video's delay, the attitude of the map, and whether they agree."""
+"""Telemetry and visual poses of the flight so far, the video's delay, the map's attitude, and their agreement."""

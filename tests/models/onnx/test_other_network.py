@@ -1,4 +1,4 @@
-"""A depth network that is no FastDepth is an ONNX file with our inputs, outputs and record (CONTRIBUTING.md)."""
+"""A depth network other than FastDepth is an ONNX file with our inputs, outputs and record (CONTRIBUTING.md)."""
 
 import json
 from dataclasses import asdict
