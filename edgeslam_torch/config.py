@@ -141,7 +141,7 @@ class InitialisationConfig:
     """Standard deviation of the second camera's position relative to the baseline above which initialisation waits:
     0.08 are 4.6 degrees of direction."""
     max_direction_sigma_alone: float = 0.05
-    """The same without a depth network to resolve the two-fold ambiguity of a small motion."""
+    """The same, 2.9 degrees, without a depth network to resolve the two-fold ambiguity of a small motion."""
 
     def __post_init__(self) -> None:
         _positive(self, "min_parallax_deg", "min_points", "max_reprojection_px", "keyframe_gap_s", "max_keyframes")

@@ -64,7 +64,9 @@ def test_links_between_guides_have_room_between_them(site: Path, browser: Browse
 
 
 def test_formulas_are_set_without_a_network(site: Path, browser: Browser) -> None:
-    browser.open(site / "api" / "edgeslam_torch" / "fusion" / "joint_scale.html", width=390, height=844, mobile=True)
+    browser.open(
+        site / "api" / "edgeslam_torch" / "fusion" / "scale" / "joint_scale.html", width=390, height=844, mobile=True
+    )
     sizes = browser.run("[...document.querySelectorAll('math')].map(m => m.getBoundingClientRect().height)")
     assert len(sizes) == 5 and min(sizes) > 5
     index = browser.run("document.querySelector('math msub').lastElementChild.getBoundingClientRect().height")

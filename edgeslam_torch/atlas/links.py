@@ -32,6 +32,7 @@ MAX_SIGMA_LOG = 0.03
 MAX_SHIFT = 0.1
 """Distance of two estimates of one camera, relative to the depth that it sees."""
 MAX_TURN_RAD = np.deg2rad(5.0)
+"""Angle between two estimates of one camera: as much as `MAX_SHIFT` seen at that depth, 6 degrees."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,6 +11,7 @@ from edgeslam_torch.types import TelemetrySample
 TELEMETRY = "telemetry.csv"
 _HOLE_S = 1.0
 _HOLE_SHARE = 0.05
+"""Ten messages in a row missing are a hole; holes over more than this share of the video are a warning."""
 
 
 def telemetry_file(folders: Sequence[Path], given: str | Path | None) -> Path | None:

@@ -25,6 +25,7 @@ ENOUGH_FOR_ROUGH = 250
 """Maximum number of the last frame's anchors in the first pass; more only cost time."""
 
 FINE = PoseConfig(rounds=3, robust_rounds=1, cost_tolerance=1e-2)
+"""The pass on all matches; its tolerance is 0.1 standard deviations (docs/decisions/0017)."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -221,8 +221,8 @@ def test_a_record_with_a_wrong_type_is_refused(field: str) -> None:
 @pytest.mark.parametrize(
     ("text", "match"),
     [
-        ("", "no JSON"),
-        ("{", "no JSON"),
+        ("", "not JSON"),
+        ("{", "not JSON"),
         ("null", "it is None, not a table"),
         ("[]", r"it is \[\], not a table"),
         ("3", "it is 3"),
@@ -231,7 +231,7 @@ def test_a_record_with_a_wrong_type_is_refused(field: str) -> None:
         ("[" * 100_000, "nested too deeply"),
         ('{"variant": ' + "[" * 100_000, "nested too deeply"),
         ('{"variant": ' + "[" * 500 + "]" * 500 + "}", "has no value for|variant must be"),
-        ('{"input_width": ' + "9" * 5000 + "}", "no JSON"),
+        ('{"input_width": ' + "9" * 5000 + "}", "not JSON"),
     ],
 )
 def test_what_is_no_record_is_refused(file: File, tmp_path: Path, text: str, match: str) -> None:
@@ -267,9 +267,9 @@ def test_an_impossible_record_cannot_be_written() -> None:
 @pytest.mark.parametrize(
     ("header", "match"),
     [
-        (b"", "no JSON"),
+        (b"", "not JSON"),
         (b"[]", "header is no table"),
-        (b"[" * 100_000, "no JSON"),
+        (b"[" * 100_000, "not JSON"),
         (b'{"conv0.0.weight": 3}', "describes 'conv0.0.weight' wrongly"),
         (b'{"a": {"dtype": "F32", "shape": [1], "data_offsets": [0]}}', "wrongly"),
         (b'{"a": {"dtype": "F32", "shape": [-1], "data_offsets": [0, 4]}}', "wrongly"),
@@ -282,7 +282,7 @@ def test_an_impossible_record_cannot_be_written() -> None:
         (b'{"a": {"dtype": "F32", "shape": [9], "data_offsets": [0, 36]}}', "are missing"),
         (b'{"__metadata__": {"edgeslam": [1]}}', "metadata cannot be used"),
         (b'{"__metadata__": [1]}', "not a FastDepth checkpoint"),
-        (b"\xff\xfe", "no JSON"),
+        (b"\xff\xfe", "not JSON"),
     ],
 )
 def test_a_header_that_makes_no_sense_is_refused(tmp_path: Path, header: bytes, match: str) -> None:

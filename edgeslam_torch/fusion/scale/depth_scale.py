@@ -35,8 +35,11 @@ _USUAL_WANDER_LOG = 0.15
 _USUAL_COUNTS = 4
 """Prior for few keyframes: the median over the calibration's runs, weighted as this many keyframes."""
 _KEPT = 200
+"""Newest ratios kept: as many as the map has keyframes at most."""
 _LEAST_ANCHORS = 8
 _LEAST_SPREAD_LOG = 0.02
+"""Minimum number of anchors of a ratio, whose median then has a third of their spread as its sigma; and lower bound of
+that spread, less than any depth network has."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,7 +15,9 @@ from edgeslam_torch.geometry.se3 import hat
 from edgeslam_torch.types import FloatArray, IntArray, ScaleEstimate
 
 _HUBER = 2.5
+"""Residual from which on its weight falls [sigmas]."""
 _MIN_DISPLACEMENTS = 6
+"""18 measurements for 7 unknowns: scale, rotation, one bias."""
 
 
 @dataclass(frozen=True, slots=True)

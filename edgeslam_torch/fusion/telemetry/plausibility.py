@@ -23,9 +23,12 @@ _DOUBTFUL = {1: 0.3, 3: 0.5}
 """Correlation below which series of one and of three dimensions contradict each other. Right ones have 0.74 (velocities
 truncated) and 0.42 (barometer) in the worst 1 %."""
 _EVEN = 0.8
+"""Correlation with the means left in, from which on an even motion explains a low correlation without them."""
 _WINSOR = 3.0
+"""Times the median at which lengths are cut off."""
 _SMALL_SHARE = 0.3
 _LARGE_QUANTILE = 0.9
+"""Intervals shorter than this share of the long ones (the length at this quantile) count as standing still."""
 
 
 class Reading(StrEnum):

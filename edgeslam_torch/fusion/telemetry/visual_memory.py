@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 from edgeslam_torch.types import FloatArray
 
 _SIGHTING_S = 0.09
+"""Minimum time between the poses kept: telemetry comes every 0.1 s."""
 _MANY_DISPLACEMENTS = 16
+"""Number of displacements, eight seconds of them, from which on pairs are joined to intervals of a second."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -75,7 +75,7 @@ def test_a_whole_file_is_read(whole: bytes, tmp_path: Path) -> None:
     ("change", "match"),
     [
         (lambda m: m.ClearField("metadata_props"), "no EdgeSLAM metadata"),
-        (lambda m: with_record(m, ""), "no JSON"),
+        (lambda m: with_record(m, ""), "not JSON"),
         (lambda m: with_record(m, "null"), "not a table"),
         (lambda m: with_record(m, "[" * 100_000), "nested too deeply"),
         (with_field(std=[0, 0, 0]), "std must be"),
