@@ -21,5 +21,9 @@ class WeightsError(EdgeSlamError):
     """Network weights are missing, damaged or belong to another network."""
 
 
+class AtlasError(EdgeSlamError):
+    """A saved atlas is missing, damaged, of another version or of another camera."""
+
+
 class OutputError(EdgeSlamError):
     """A result cannot be written."""

@@ -15,7 +15,7 @@ from enum import StrEnum
 from itertools import islice
 from pathlib import Path
 from types import FrameType
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from edgeslam_torch.calibration.camera_choice import GUESS, GUESS_COST, GUESS_WARNING
 from edgeslam_torch.config import SlamConfig
@@ -39,6 +39,9 @@ from edgeslam_torch.types import (
 )
 from edgeslam_torch.writers.map_picture import write_map_picture
 from edgeslam_torch.writers.run_writer import CAMERA, PICTURE, RunWriter
+
+if TYPE_CHECKING:
+    from edgeslam_torch.atlas.saved import SavedAtlas
 
 logger = logging.getLogger(__name__)
 
@@ -106,6 +109,15 @@ class Slam(Protocol):
     def warnings(self) -> list[str]:
         """Limits of the results, one line each."""
 
+    def load_atlas(self, saved: "SavedAtlas") -> None:
+        """Fly in the map of earlier flights."""
+
+    def saved_atlas(self, flight: str) -> "SavedAtlas":
+        """The map for the next flight."""
+
+    def earlier_flights(self) -> dict[str, Any] | None:
+        """What became of the atlas that was loaded."""
+
     @property
     def scale(self) -> ScaleEstimate:
         """Metres per map unit."""
@@ -119,6 +131,16 @@ class Listener(Protocol):
 
     def on_finish(self, slam: Slam) -> None:
         """Called once, after the last refinement, before the results are written."""
+
+
+@dataclass(frozen=True, slots=True)
+class AtlasFiles:
+    """Maps of earlier flights and for later ones."""
+
+    load: "SavedAtlas | None" = None
+    """To fly in."""
+    save: Path | None = None
+    """File to write the map to in the end."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,6 +167,7 @@ def run(
     mode: Mode = Mode.OFFLINE,
     listeners: Sequence[Listener] = (),
     make_slam: Callable[[Camera, SlamConfig, bool], Slam] | None = None,
+    atlas: "AtlasFiles | None" = None,
 ) -> RunResult:
     """Run the SLAM system over a source and write its folder.
 
@@ -158,16 +181,19 @@ def run(
         mode: How frames are fed.
         listeners: Called after every frame.
         make_slam: Builds the system from camera, settings and whether it runs in real time; `EdgeSlam` when None.
+        atlas: Maps of earlier flights and for later ones; none by default.
 
     Raises:
         OutputError: If the folder cannot be written to at all, holds files that no run wrote, or another run writes
             into it.
         SourceError: If the source provides no frame, or fails during the run (after the results are written).
     """
-    config = config or SlamConfig()
+    config, atlas = config or SlamConfig(), atlas or AtlasFiles()
     with closing(source), closing(RunWriter(out_dir, [Path(source.location)], to_toml(config))) as writer:
         slam = (make_slam or _edge_slam)(source.camera, config, mode is Mode.REALTIME)
-        return _Run(source, writer, slam, config, mode, listeners).go()
+        if atlas.load is not None:
+            slam.load_atlas(atlas.load)
+        return _Run(source, writer, slam, config, mode, listeners, atlas).go()
 
 
 def settle_camera(source: Source) -> None:
@@ -204,6 +230,7 @@ class _Run:
         config: SlamConfig,
         mode: Mode,
         listeners: Sequence[Listener],
+        atlas: "AtlasFiles",
     ) -> None:
         self.source = source
         self.writer = writer
@@ -211,6 +238,7 @@ class _Run:
         self.config = config
         self.mode = mode
         self.listeners = listeners
+        self.atlas = atlas
         self.tally = Tally()
         self.dropped = Counter()
         self.interrupt = _Interrupt()
@@ -296,6 +324,7 @@ class _Run:
         edge_map, anchors, scale = self.slam.edge_map(), self.slam.anchors(), self.slam.scale
         for listener in self.listeners:
             listener.on_finish(self.slam)
+        saved = None if self.atlas.save is None else self.slam.saved_atlas(self.source.name)
         cpu_s = time.process_time() - cpu_start_s
         summary = {
             **summarise(
@@ -310,6 +339,8 @@ class _Run:
             "losses": {k: v for k, v in self.slam.losses().items() if math.isfinite(v)},
             "events": dict(self.slam.events),
             "joins": [join.in_words() for join in self.slam.joins()],
+            "atlas": None if self.atlas.load is None else self.slam.earlier_flights(),
+            "saved_atlas": None if saved is None else saved.summary(),
             "fusion": {k: v for k, v in self.slam.telemetry_statistics().items() if math.isfinite(v)},
             "mode": str(self.mode),
             "seed": self.config.seed,
@@ -324,6 +355,10 @@ class _Run:
             write_map_picture(path, edge_map, poses[support.whole()], scale.units, title)
 
         extras = [(CAMERA, self.source.camera.save), (PICTURE, picture)]
+        if saved is not None and self.atlas.save is not None:
+            from edgeslam_torch.atlas.atlas_file import write_atlas
+
+            extras.append((str(self.atlas.save.resolve()), lambda path: write_atlas(path, saved)))
         self.writer.finish(summary, stamps, poses, support, edge_map, anchors, scale.units, extras)
         self.result = RunResult(
             self.writer.folder, summary, stamps, poses, self.interrupt.requested, self.writer.failure

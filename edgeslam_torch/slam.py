@@ -6,13 +6,17 @@ state, and returns the results.
 
 from collections.abc import Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import torch
 
 from edgeslam_torch.atlas.atlas import Atlas, Join
+from edgeslam_torch.atlas.earlier import EarlierFlights
+from edgeslam_torch.atlas.saved import SavedAtlas, Unit, pack, unpack
 from edgeslam_torch.config import SlamConfig
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.frontend.depth_check import CheckedDepth, DepthFunction
@@ -21,7 +25,7 @@ from edgeslam_torch.frontend.repeats import REPEATED, RepeatedImages
 from edgeslam_torch.fusion.motion import MotionFusion
 from edgeslam_torch.fusion.published import Published, first_pose
 from edgeslam_torch.fusion.snapshot import Present
-from edgeslam_torch.geometry import se3
+from edgeslam_torch.geometry import se3, sim3
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.map.keyframe import Keyframe
@@ -122,6 +126,7 @@ class EdgeSlam:
         self._machine = Machine()
         atlas = Atlas(self._system.tracker, self.edges, self.log, lm)
         self._joining = Joining(self._system, atlas)
+        self._earlier: EarlierFlights | None = None
         self._tracking = Tracking(self._system)
         self._starting = Starting(self._system, self._tracking, atlas, lm, realtime)
         self._lost = Lost(self._system, self._tracking, self._starting)
@@ -138,6 +143,30 @@ class EdgeSlam:
         return self._system.events
 
     # -- one frame ---------------------------------------------------------------------------------------------
+
+    def load_atlas(self, saved: SavedAtlas) -> None:
+        """Fly in the map of earlier flights; to be called before the first frame.
+
+        The flight begins a piece of its own, until a place of the atlas is recognised.
+        """
+        if self.map.keyframes:
+            raise ValueError("an atlas is loaded before the first frame")
+        unpack(saved, self.map, self.edges, self.camera)
+        self._earlier = EarlierFlights(saved.flights, saved.keyframes, len(saved.scale))
+        self._joining.atlas.known_scale.update(enumerate(saved.scale))
+
+    def saved_atlas(self, flight: str) -> SavedAtlas:
+        """The map as it is now, in published units, for the next flight.
+
+        Args:
+            flight: Name of this flight, added to those that the atlas was made of.
+        """
+        shown, estimate, published = self.support().largest(), self.scale, self._system.published
+        relative = replace(estimate, value=estimate.value / published.scale, sigma=estimate.sigma / published.scale)
+        units = {piece: Unit(np.eye(4), known) for piece, known in self._joining.atlas.known_scale.items()}
+        units[shown] = Unit(sim3.compose(published.scale, published.R, published.offset), relative)
+        flights = (*(() if self._earlier is None else self._earlier.flights), flight)
+        return pack(self.map, self.edges, self.camera, flights, units)
 
     def prepare(self, frame: Frame) -> LazyView:
         """Feature extraction that does not depend on earlier frames; may run on another thread.
@@ -179,9 +208,11 @@ class EdgeSlam:
         with system.timed("fusion"):
             system.fusion.add_telemetry(telemetry)
             system.has_telemetry = system.has_telemetry or len(telemetry) > 0
-        if not self.map.keyframes and telemetry:  # the first camera turns so that the world's z is up
+        if not self.log.records and telemetry:  # the first camera turns so that the world's z is up
             system.motion.T_c_w = se3.inverse(first_pose(telemetry[-1].rpy_rad, self._T_b_c))
         step = self._step(frame, seen)
+        if self._earlier is not None:
+            self._joining.enter(self.map.piece_of(step.keyframe.id))
         self._machine.meet(step.event, frame.stamp_s)
         system.motion.stamp_s = frame.stamp_s
         self._present = system.fusion.present(frame.stamp_s, str(self.state), system.published)
@@ -204,7 +235,7 @@ class EdgeSlam:
 
     def _step(self, frame: Frame, seen: LazyView) -> Step:
         """Process a frame in the current state."""
-        if not self.map.keyframes:
+        if not self.log.records:
             return self._starting.begin(frame, seen.view, FIRST_FRAME)
         if self.state is State.STARTING:
             return self._starting.step(frame, seen)
@@ -222,6 +253,8 @@ class EdgeSlam:
         """Refine the whole map, measure the remaining edges and fix the published scale after the last frame."""
         self._system.collect(wait=True)
         self._joining.finish()
+        if self._earlier is not None:
+            self._joining.enter(self.support().largest())
         self._finished = True
         result = last_refinement(
             self.map, self.camera, self.edges, self.config.window, self._system.telemetry("last", "every")
@@ -282,6 +315,12 @@ class EdgeSlam:
         """Pieces that were found to be one, with the evidence, in the order of time."""
         return list(self._joining.atlas.joins)
 
+    def earlier_flights(self) -> dict[str, Any] | None:
+        """What became of the atlas that was loaded, in numbers; None without one."""
+        if self._earlier is None:
+            return None
+        return self._earlier.summary(self.support(), self.map)
+
     def telemetry_statistics(self) -> dict[str, float]:
         """Telemetry statistics: counts, delay, tilt, scale by source; empty without telemetry."""
         return self._system.fusion.statistics() if self._system.has_telemetry else {}
@@ -293,10 +332,12 @@ class EdgeSlam:
     def warnings(self) -> list[str]:
         """Limits of the results, in sentences for the run's summary."""
         depth = None if self.depth is None else self.depth.warning()
+        apart = None if self._earlier is None else self._earlier.warning(self.support())
         warnings = (
             self._machine.warning(),
             depth,
             self._warning_of_pieces(),
+            apart,
             self._repeats.warning(),
             self._calibration_warning,
         )
@@ -315,6 +356,10 @@ class EdgeSlam:
         system, track, health = self._system, step.track, self._present.health
         assert health is not None
         T_c_w = system.motion.T_c_w
+        piece = self.map.piece_of(step.keyframe.id)
+        if self._earlier is not None:
+            found = self._earlier.see(frame.stamp_s, piece, step.status.supported)
+            joined = "; ".join(filter(None, (joined, found)))
         self.log.append(frame.index, frame.stamp_s, step.keyframe.id, T_c_w, step.status.supported, step.T_c_before)
         return SlamOutput(
             index=frame.index,
@@ -326,7 +371,7 @@ class EdgeSlam:
             inliers=0 if track is None else track.inliers,
             parallax_rad=step.parallax_rad,
             keyframe=step.is_keyframe,
-            piece=self.map.piece_of(step.keyframe.id),
+            piece=piece,
             scale=health.scale,
             metric=health.metric,
             revision=system.published.revision,

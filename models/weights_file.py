@@ -4,11 +4,8 @@ Nothing is read before the header is checked against the file's size and the net
 costs at most its own size.
 """
 
-import json
 import math
-import reprlib
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, Protocol
 
@@ -16,14 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgeslam_torch.errors import WeightsError
+from edgeslam_torch.files.tensor_file import Damaged, Entry, OtherFormat, read_entries
 from edgeslam_torch.models.layout import STEP_COUNTER, Variant, check_shapes
 from edgeslam_torch.models.record import HEADER_KEY, OTHER_NETWORK, Metadata, metadata_from_json, upstream_metadata
 
 Array = NDArray[Any]
 MAX_FILE_BYTES = 1 << 29
 """Maximum file size. The largest official network has 20.7 M parameters, 83 MB; twice that with optimiser state."""
-MAX_HEADER_BYTES = 1 << 20
-"""Maximum header size; FastDepth's has 24 kB."""
 MAX_VALUE = 1e6
 """Maximum absolute value of a parameter; float16, our storage type, ends at 65504."""
 FLOATS: dict[str, np.dtype[Any]] = {
@@ -153,63 +149,15 @@ def _as_float32(name: str, stored: Stored) -> Array:
     return raw.astype(np.float32).reshape(stored.shape)
 
 
-@dataclass(frozen=True, slots=True)
-class _Entry:
-    """A tensor in an open safetensors file."""
-
-    file: BinaryIO
-    kind: str
-    shape: tuple[int, ...]
-    start: int
-    """Position in the file."""
-    size: int
-    """Bytes."""
-
-    def read(self) -> bytes:
-        self.file.seek(self.start)
-        return self.file.read(self.size)
-
-
-def _read_header(file: BinaryIO) -> tuple[Metadata | None, dict[str, _Entry]]:
+def _read_header(file: BinaryIO) -> tuple[Metadata | None, dict[str, Entry]]:
     """Metadata, if any, and tensors, whose bytes all lie within the file."""
-    length = int.from_bytes(file.read(8).ljust(8, b"\xff"), "little")
-    if length > MAX_HEADER_BYTES:
-        raise WeightsError("not a safetensors file, or damaged (`edgeslam weights convert` reads torch's .pth and .pt)")
     try:
-        header = json.loads(file.read(length))
-    except (ValueError, RecursionError):
-        raise WeightsError("not a safetensors file, or damaged: its header is not JSON") from None
-    if not isinstance(header, dict):
-        raise WeightsError("damaged: its header is no table")
-    remarks = header.pop("__metadata__", None) or {}
-    record = remarks.get(HEADER_KEY) if isinstance(remarks, dict) else None
+        remarks, entries = read_entries(file, _SIZES)
+    except OtherFormat as error:
+        raise WeightsError(f"{error} (`edgeslam weights convert` reads torch's .pth and .pt)") from None
+    except Damaged as error:
+        raise WeightsError(str(error)) from None
+    record = remarks.get(HEADER_KEY)
     if not isinstance(record, str | None):
         raise WeightsError("its metadata cannot be used: it is no text")
-    end = file.seek(0, 2)
-    entries = {name: _entry(file, name, fields, 8 + length, end) for name, fields in header.items()}
-    _check_disjoint(entries)
     return None if record is None else metadata_from_json(record), entries
-
-
-def _entry(file: BinaryIO, name: str, fields: Any, offset: int, end: int) -> _Entry:
-    try:
-        kind, shape, (start, stop) = fields["dtype"], tuple(fields["shape"]), fields["data_offsets"]
-    except (TypeError, KeyError, ValueError):
-        raise WeightsError(f"damaged: its header describes {name[:80]!r} wrongly") from None
-    if not isinstance(kind, str) or kind not in _SIZES:
-        raise WeightsError(f"{name[:80]} holds {reprlib.repr(kind)} numbers, not one of {', '.join(FLOATS)}")
-    numbers = (*shape, start, stop)
-    if not all(type(n) is int and 0 <= n <= end for n in numbers) or len(shape) > 4:
-        raise WeightsError(f"damaged: its header describes {name[:80]!r} wrongly")
-    if stop - start != math.prod(shape) * _SIZES[kind] or offset + stop > end:
-        raise WeightsError(f"truncated or damaged: the bytes of {name[:80]!r} are missing")
-    return _Entry(file, kind, shape, offset + start, stop - start)
-
-
-def _check_disjoint(entries: Mapping[str, _Entry]) -> None:
-    """Reject tensors that share bytes: no writer creates them, and they would need more memory than the file."""
-    last = 0
-    for name, entry in sorted(entries.items(), key=lambda item: item[1].start):
-        if entry.size and entry.start < last:
-            raise WeightsError(f"damaged: {name[:80]!r} lies over another tensor")
-        last = max(last, entry.start + entry.size)

@@ -17,7 +17,7 @@ from edgeslam_torch.map.trajectory import TrajectoryLog
 from edgeslam_torch.mapping.edge_map import EdgeMap
 from edgeslam_torch.optim.problem import LmConfig
 from edgeslam_torch.tracking.tracker import Tracker
-from edgeslam_torch.types import FloatArray
+from edgeslam_torch.types import FloatArray, ScaleEstimate
 
 CLOSER_LOOKS = 3
 """Keyframes of other pieces that a new keyframe is compared with."""
@@ -68,6 +68,8 @@ class Atlas:
         self.log = log
         self.lm = lm
         self.joins: list[Join] = []
+        self.known_scale: dict[int, ScaleEstimate] = {}
+        """Metres per unit of pieces of earlier flights, by their number."""
         self._links: list[Link] = []
         """Found so far, between pieces that are still apart."""
         self._asked = -1
@@ -142,7 +144,7 @@ class Atlas:
         best = max(links, key=lambda one: len(one.keypoint))
         mine, theirs = self._pieces(best)
         moved, S = mine, best.S
-        if self._size(mine) > self._size(theirs):  # the smaller one moves
+        if self._weight(mine) > self._weight(theirs):  # the lighter one moves
             moved, S = theirs, sim3.inverse(best.S)
         move_piece(self.map, self.edges, self.log, moved, S)
         weld(self.map, self.tracker.camera, links, self.lm)
@@ -157,11 +159,20 @@ class Atlas:
             sum(len(one.keypoint) for one in links),
         )
         self.joins.append(join)
+        self._follow_scale(mine, theirs, moved)
         self._links = []  # their similarities hold for pieces as they were
         return join
 
-    def _size(self, piece: int) -> int:
-        return sum(self.map.piece_of(id) == piece for id in self.map.keyframes)
+    def _weight(self, piece: int) -> tuple[bool, int]:
+        """What speaks against moving a piece: metres known from an earlier flight, then its size."""
+        return piece in self.known_scale, sum(self.map.piece_of(id) == piece for id in self.map.keyframes)
+
+    def _follow_scale(self, mine: int, theirs: int, moved: int) -> None:
+        """The joined piece has the units of the one that stayed."""
+        scales = {piece: self.known_scale.pop(piece, None) for piece in (mine, theirs)}
+        stayed = scales[mine if moved == theirs else theirs]
+        if stayed is not None:
+            self.known_scale[min(mine, theirs)] = stayed
 
 
 def _is_mapped(keyframe: Keyframe) -> bool:

@@ -1,12 +1,14 @@
 """Trajectory and semi-dense edge map from a recording, an image folder, a video or a live camera."""
 
 import argparse
+import os
 import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from edgeslam_torch.atlas.saved import SavedAtlas
     from edgeslam_torch.config import SlamConfig
     from edgeslam_torch.geometry.camera import Camera
     from edgeslam_torch.readers.source import Source
@@ -39,6 +41,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="offline: every frame, repeatable; realtime: at camera pace, late frames dropped "
         "(default: offline, realtime for live sources)",
     )
+    parser.add_argument(
+        "--atlas", type=Path, metavar="FILE", help="fly in the map of an earlier flight, once recognised"
+    )
+    parser.add_argument("--save-atlas", type=Path, metavar="FILE", help="save the map for later flights (--atlas)")
     parser.add_argument("--record", type=Path, metavar="DIR", help="record a live source, to run it again")
     parser.add_argument("--lossless", action="store_true", help="record PNG instead of JPEG (quality 95)")
     parser.add_argument("--max-frames", type=_positive_int, metavar="N", help="stop after N frames")
@@ -66,16 +72,21 @@ def main(args: argparse.Namespace) -> int:
     from edgeslam_torch.errors import ConfigError
     from edgeslam_torch.progress import make_progress
     from edgeslam_torch.readers.source import open_source
-    from edgeslam_torch.run import Listener, Mode, run, settle_camera
+    from edgeslam_torch.run import AtlasFiles, Listener, Mode, run, settle_camera
 
     if args.lossless and args.record is None:
         raise ConfigError("--lossless is for --record DIR")
     config = resolved_config(args)
+    _check_atlas_can_be_saved(args.save_atlas)
+    earlier = _earlier_flights(args.atlas)
     if args.record is not None:
         source = _recorded(args)
     else:
         source = open_source(args.source, args.camera, args.telemetry, args.max_frames)
-    settle_camera(source)
+    if earlier is None or not _take_its_camera(source, earlier):
+        settle_camera(source)
+    if earlier is not None:
+        _check_fits(earlier, source, config, args.atlas)
     for warning in source.warnings:
         _say(f"warning: {warning}")
     _say(_camera_words(source.camera))
@@ -88,7 +99,8 @@ def main(args: argparse.Namespace) -> int:
 
         listeners.append(LiveView(source.name, source.camera, args.save_rrd))
     with make_progress(source.length, show_bar) as progress:
-        result = run(source, out, config, mode, [progress, *listeners])
+        atlas = AtlasFiles(earlier, args.save_atlas)
+        result = run(source, out, config, mode, [progress, *listeners], atlas=atlas)
     if not args.no_report and result.failure is None:
         write_page(result)
     _report(result, source)
@@ -119,6 +131,66 @@ def _recorded(args: argparse.Namespace) -> "Source":
         source, _, messages = open_tello(args.source, args.camera, args.max_frames)
         return RecordedLive(source, messages, args.record, args.lossless)
     return RecordedLive(open_live(args.source, args.camera, args.max_frames), [], args.record, args.lossless)
+
+
+def _earlier_flights(path: Path | None) -> "SavedAtlas | None":
+    """The atlas to fly in."""
+    if path is None:
+        return None
+    from edgeslam_torch.atlas.atlas_file import read_atlas
+
+    return read_atlas(path)
+
+
+def _take_its_camera(source: "Source", atlas: "SavedAtlas") -> bool:
+    """Give a source of unknown focal length the camera of the atlas, if its images have the same size."""
+    camera = source.camera
+    if not camera.focal_sigma > atlas.camera.focal_sigma:
+        return False
+    if (camera.width, camera.height) != (atlas.camera.width, atlas.camera.height):
+        return False
+    source.camera = replace(atlas.camera, source=f"{atlas.camera.source}, as in the atlas")
+    return True
+
+
+def _check_fits(atlas: "SavedAtlas", source: "Source", config: "SlamConfig", path: Path) -> None:
+    from edgeslam_torch.atlas.atlas_file import check_fits
+
+    check_fits(atlas, source.camera, config.orb.scale_factor, path)
+
+
+def _check_atlas_can_be_saved(path: Path | None) -> None:
+    """Refuse a file that could not be written, or that is no atlas, before the flight and not after it."""
+    from edgeslam_torch.errors import OutputError
+
+    if path is None:
+        return
+    if not path.parent.is_dir():
+        raise OutputError(f"{path}: there is no folder {path.parent}")
+    if not os.access(path.parent, os.W_OK):
+        raise OutputError(f"{path}: cannot write there")
+    if path.exists():
+        from edgeslam_torch.atlas.atlas_file import is_atlas
+
+        if not is_atlas(path):
+            raise OutputError(f"{path}: exists and is no atlas; give another file to --save-atlas")
+
+
+def _atlas_words(summary: dict[str, Any]) -> list[str]:
+    """What became of the earlier map, and what was saved."""
+    lines = []
+    earlier, saved = summary["atlas"], summary["saved_atlas"]
+    if earlier is not None and earlier["frames_placed"]:
+        after = earlier["found_after_s"]
+        when = "at the end" if after is None else f"{after:.1f} s after the first frame"
+        lines.append(
+            f"atlas: recognised {when}; {earlier['frames_placed']} of {summary['frames']} frames lie in it, "
+            f"{earlier['keyframes_added']} keyframes added to {earlier['keyframes']}"
+        )
+    if saved is not None:
+        flights = f"{saved['flights']} flight{'s' if saved['flights'] > 1 else ''}"
+        lines.append(f"atlas saved: {saved['keyframes']} keyframes, {saved['anchors']} anchors, {flights}")
+    return lines
 
 
 def resolved_config(args: argparse.Namespace) -> "SlamConfig":
@@ -184,6 +256,8 @@ def _report(result: "RunResult", source: "Source") -> None:
     if counts["edge_points"] == 0:
         _say("warning: the edge map is empty")
     print(f"map: {counts['edge_points']} edge points, {counts['anchors']} anchors, {counts['keyframes']} keyframes")
+    for line in _atlas_words(summary):
+        print(line)
     print(f"results: {result.folder} (look at {_best_view(result.folder)})")
 
 

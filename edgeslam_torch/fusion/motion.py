@@ -78,10 +78,12 @@ class MotionFusion:
         self._R_w_m: FloatArray | None = None
         truncates = config.velocity_rounding == "truncate"
         self._fit = TelemetryFit(shortfall_m_s=0.5 * config.velocity_step_m_s if truncates else 0.0)
+        self._remembered: LogScale | None = None
+        """Scale of a map that an earlier flight made."""
         self._by_telemetry: LogScale | None = None
         """Scale by the drone's own sensors; held while they say nothing new."""
         self._scale = ScaleEstimate()
-        self._scale_rests_on: tuple[LogScale | None, DepthScale | None] = (None, None)
+        self._scale_rests_on: tuple[LogScale | None, LogScale | None, DepthScale | None] = (None, None, None)
         """Opinions that it was made of: it is asked for several times a frame."""
         self._fitted_s = -math.inf
         self._counts: Counter[str] = Counter()
@@ -160,6 +162,16 @@ class MotionFusion:
         for ratio in ratios:
             self._depth.add(ratio)
 
+    def remember(self, scale: ScaleEstimate | None) -> None:
+        """Metres per unit of the map that the camera is in, as an earlier flight left them; None for a map of its own.
+
+        They take the place of the depth network's opinion: its error in a place is the same in every flight.
+        """
+        if scale is None or not math.isfinite(scale.sigma):
+            self._remembered = None
+        else:
+            self._remembered = LogScale(math.log(scale.value), scale.sigma / scale.value, "atlas")
+
     def _forget_scale(self) -> None:
         self._by_telemetry, self._fit = None, TelemetryFit(shortfall_m_s=self._fit.shortfall_m_s)
 
@@ -177,7 +189,7 @@ class MotionFusion:
 
     def scale(self) -> ScaleEstimate:
         """Metres per map unit with sigma and source; held while the motion says nothing new."""
-        rests_on = self._by_telemetry, self._depth.scale()
+        rests_on = self._remembered, self._by_telemetry, self._depth.scale()
         if rests_on != self._scale_rests_on:
             self._scale_rests_on, self._scale = rests_on, fuse(self._settled().used)
         return self._scale
@@ -188,6 +200,8 @@ class MotionFusion:
         if told is not None:
             told = replace(told, sigma=math.hypot(told.sigma, _FOCAL_SHARE * self._focal_sigma))
         network = None if depth is None else self._with_focal(depth)
+        if self._remembered is not None:  # which the network has had its part in
+            return settled_with_network(told, self._remembered, True)
         return settled_with_network(told, network, depth is not None and depth.in_domain)
 
     def _with_focal(self, depth: DepthScale) -> LogScale:
@@ -225,6 +239,9 @@ class MotionFusion:
         if depth is not None:
             value = math.exp(depth.opinion.log_scale)
             told.append(ScaleEstimate(value, value * self._with_focal(depth).sigma, "depth"))
+        if (known := self._remembered) is not None:
+            value = math.exp(known.log_scale)
+            told.append(ScaleEstimate(value, value * known.sigma, known.source))
         return tuple(told)
 
     def present(self, stamp_s: float, state: str, published: Published) -> Present:

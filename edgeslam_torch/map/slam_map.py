@@ -43,7 +43,7 @@ class SlamMap:
 
     def pose_of(self, keyframe_id: int) -> FloatArray:
         """``T_c_w`` of a keyframe, alive or removed."""
-        heir, T_keyframe_heir = self._heir(keyframe_id)
+        heir, T_keyframe_heir = self.heir_of(keyframe_id)
         return T_keyframe_heir @ self.keyframes[heir].T_c_w
 
     def median_depth(self, keyframe: Keyframe) -> float | None:
@@ -52,7 +52,7 @@ class SlamMap:
         z = se3.transform(keyframe.T_c_w, self.anchors.p_w[held])[:, 2]
         return float(np.median(z[z > 0])) if (z > 0).any() else None
 
-    def _heir(self, keyframe_id: int) -> tuple[int, FloatArray]:
+    def heir_of(self, keyframe_id: int) -> tuple[int, FloatArray]:
         """The surviving keyframe that a keyframe is linked to (itself if alive), and the transform to it."""
         chain = []
         T = np.eye(4)
@@ -75,7 +75,12 @@ class SlamMap:
         """
         members = (k for k in self.keyframes.values() if self._piece[k.id] == self.piece)
         if not self.begun or any((k.anchor != NO_ANCHOR).any() for k in members):
-            self.begun[len(self.begun)] = begun
+            self.add_piece(begun)
+
+    def add_piece(self, begun: str) -> int:
+        """Number of a new piece, whatever the last one holds."""
+        self.begun[len(self.begun)] = begun
+        return len(self.begun) - 1
 
     @property
     def piece(self) -> int:
@@ -203,6 +208,20 @@ class SlamMap:
         self.keyframes[keyframe.id] = keyframe
         self._piece[keyframe.id] = self.piece if reference is None else self._piece[reference.id]
         self.anchors.observations[keyframe.anchor[keyframe.anchor >= 0]] += 1
+
+    def restore_keyframe(self, keyframe: Keyframe, piece: int) -> None:
+        """Add a keyframe of an earlier flight, under its own id, to a piece that was added for it."""
+        self.revision += 1
+        self.keyframes[keyframe.id] = keyframe
+        self._piece[keyframe.id] = piece
+        self._next_id = max(self._next_id, keyframe.id + 1)
+        self.anchors.observations[keyframe.anchor[keyframe.anchor >= 0]] += 1
+
+    def restore_removed(self, id: int, heir: int, T_removed_heir: FloatArray) -> None:
+        """Link a keyframe that an earlier flight removed to the surviving one ``heir``."""
+        self.links[id] = (heir, T_removed_heir)
+        self._piece[id] = self._piece[heir]
+        self._next_id = max(self._next_id, id + 1)
 
     def remove_keyframe(self, keyframe: Keyframe) -> None:
         """Remove a keyframe; its frames are linked to the nearest surviving one in time."""

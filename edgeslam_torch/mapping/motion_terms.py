@@ -44,7 +44,10 @@ def motion_factors(
         return MotionFactors()
     centres, gravity = [], []
     for number in sorted(set(piece)):
-        members = [i for i, p in enumerate(piece) if p == number]
+        # Keyframes of earlier flights have no time on this one's clock.
+        members = [i for i, p in enumerate(piece) if p == number and np.isfinite(keyframes[i].stamp_s)]
+        if not members:
+            continue
         order = np.array(sorted(members, key=lambda i: keyframes[i].stamp_s), dtype=np.int64)
         stamps = np.array([keyframes[i].stamp_s for i in order])
         told = model.positions(stamps, np.stack([keyframes[i].centre_w for i in order]), scale_sigma_log)

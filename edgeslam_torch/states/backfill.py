@@ -7,7 +7,7 @@ from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.states.system import System
 from edgeslam_torch.tracking.relocaliser import LIKELY_SHARE, place_of
 from edgeslam_torch.tracking.tracker import View
-from edgeslam_torch.types import FloatArray, Frame, IntArray
+from edgeslam_torch.types import FloatArray, IntArray
 
 MAX_FRAMES = 60
 """Maximum number of lost frames whose features are kept (3 MB): two seconds at 30 Hz."""
@@ -22,9 +22,9 @@ class Backfill:
         self.system = system
         self._lost: list[tuple[int, View]] = []
 
-    def keep(self, frame: Frame, view: View) -> None:
-        """Store a frame without a pose; beyond the limit the oldest is dropped."""
-        self._lost = [*self._lost[1 - MAX_FRAMES :], (frame.index, view)]
+    def keep(self, index: int, view: View) -> None:
+        """Store a frame without a pose, by its index; beyond the limit the oldest is dropped."""
+        self._lost = [*self._lost[1 - MAX_FRAMES :], (index, view)]
 
     def place(self, keyframe: Keyframe, T_c_w: FloatArray, anchors: IntArray) -> int:
         """Track the lost frames one by one, newest first.

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 from edgeslam_torch.atlas.atlas import Atlas, Join
+from edgeslam_torch.fusion.published import Published
 from edgeslam_torch.geometry import se3, sim3
 from edgeslam_torch.states.system import System
 
@@ -13,12 +14,25 @@ class Joining:
     def __init__(self, system: System, atlas: Atlas) -> None:
         self.system = system
         self.atlas = atlas
+        self._piece: int | None = None
+        """That the camera was in when the last frame was done."""
 
     def update(self) -> str:
         """Join pieces that the newest keyframes connect; returns the joins in words, empty without any."""
         if self.system.mapping.busy:
             return ""
         return "; ".join(join.in_words() for join in iter(self._once, None))
+
+    def enter(self, piece: int) -> None:
+        """Take over the metres of the camera's piece of map where an earlier flight has left them."""
+        system = self.system
+        if piece == self._piece:
+            return
+        self._piece = piece
+        known = self.atlas.known_scale.get(piece)
+        system.fusion.remember(known)
+        if known is not None and (system.published.scale != known.value or system.published.offset.any()):
+            system.published = Published(known.value, revision=system.published.revision + 1)
 
     def finish(self) -> None:
         """Query every keyframe again, since the pieces have grown."""

@@ -11,6 +11,7 @@ from edgeslam_torch.frontend.image import colours_at
 from edgeslam_torch.map.depth_prior import sample
 from edgeslam_torch.map.keyframe import Keyframe, make_keyframe
 from edgeslam_torch.optim.problem import LmConfig
+from edgeslam_torch.states.backfill import MAX_FRAMES
 from edgeslam_torch.states.machine import Event
 from edgeslam_torch.states.step import Step
 from edgeslam_torch.states.system import MIN_KEYPOINTS, System
@@ -69,6 +70,8 @@ class Starting:
             most = min(MAX_WAITING_IN_REAL_TIME, self.config.max_keyframes)
             self.config = replace(self.config, max_keyframes=most)
         self._attempt: Bootstrap | None = None
+        self._seen: list[tuple[int, View]] = []
+        """Frames of the attempt, the newest ones: placed later if an earlier piece is recognised."""
 
     def begin(self, frame: Frame, view: View, reason: str) -> Step:
         """Start a piece of map at the current pose with predicted depths.
@@ -85,7 +88,7 @@ class Starting:
         T_c_w = system.motion.T_c_w
         keyframe = make_keyframe(slam_map.next_keyframe_id(), frame.index, frame.stamp_s, T_c_w, view.features)
         if len(view.features.uv) < MIN_KEYPOINTS:
-            if not slam_map.keyframes:  # a reference for the poses
+            if not system.log.records:  # a reference for the poses
                 slam_map.begin_piece(reason)
                 slam_map.add_keyframe(keyframe)
             reason = f"only {len(view.features.uv)} keypoints, waiting for texture"
@@ -96,6 +99,7 @@ class Starting:
         slam_map.begin_piece(reason)
         system.fusion.begin_piece()
         colour = colours_at(keyframe.image, view.features.uv)
+        self._seen = [(frame.index, view)]
         self._attempt = Bootstrap(slam_map, system.tracker, self.config, keyframe, guess, colour, system.config.seed)
         slam_map.remove_empty_keyframes()
         return Step(Event.BEGUN, keyframe, FrameStatus.STARTING, reason, is_keyframe=True)
@@ -110,7 +114,10 @@ class Starting:
             track = self._track(attempt, frame, view) if back is None else None
         if back is not None:
             self._give_up()
+            for index, its_view in self._seen:
+                self.tracking.backfill.keep(index, its_view)
             return replace(self.tracking.return_to(frame, seen, back.T_c_w, back), event=Event.RETURNED)
+        self._seen = [*self._seen[1 - MAX_FRAMES :], (frame.index, view)]
         if track is None or track.inliers < MIN_INLIERS:
             self.system.events["restarted"] += 1
             self.system.motion.stop()
@@ -168,7 +175,7 @@ class Starting:
         """Hand over to tracking with the new map."""
         assert self._attempt is not None
         reference, keyframe = self._attempt.reference, started.new[-1][1]
-        self._attempt = None
+        self._attempt, self._seen = None, []
         system = self.system
         system.log.replace(started.T_c_w, [reference, *(k for _, k in started.new)])
         system.motion.T_c_w = started.T_c_w[max(started.T_c_w)]

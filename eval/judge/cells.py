@@ -23,6 +23,12 @@ MIN_FRAMES = 30
 KIDNAP = ((0, 250), (420, 600), (100, 250))
 """Frames of `KIDNAPPED`: away from a place without warning, and back to it."""
 KIDNAPPED = "7scenes_redkitchen"
+SECOND_FLIGHT = "second_flight"
+"""Variant whose first flight saves its map and whose second flies in it: of `KIDNAPPED` the first and the second
+`HALF` frames, of a simulation two paths through one world."""
+HALF = 300
+FLOWN_AGAIN = "room"
+"""Course that is flown twice."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +88,7 @@ class Cell:
     folder: str = ""
     """Of the recording."""
     variant: str = ""
-    """A name in `VARIANTS`, `BACKWARDS` or ``kidnap``."""
+    """A name in `VARIANTS`, `BACKWARDS`, ``kidnap`` or `SECOND_FLIGHT`."""
     course: str = ""
     """Of a simulated flight: a name in `courses.COURSES`."""
     nothing: str = ""
@@ -153,9 +159,11 @@ def list_cells(data: Path | None, which: str, seeds: Sequence[int], only: Sequen
         variants.append(BACKWARDS)
         wanted = ([""] if which in ("base", "all") else []) + (variants if which in ("variants", "all") else [])
         wanted += ["kidnap"] if which in ("flights", "all") and _can_kidnap(name, frames) else []
+        wanted += [SECOND_FLIGHT] if which in ("flights", "all") and _can_kidnap(name, frames) else []
         made += [_cell(name, folder, variant) for variant in wanted]
     if which in ("flights", "all"):
         made += [Cell(f"flight/{course}", 0, course=course) for course in COURSES]
+        made += [Cell(f"flight/{FLOWN_AGAIN}/{SECOND_FLIGHT}", 0, variant=SECOND_FLIGHT, course=FLOWN_AGAIN)]
         made += [Cell(f"none/{kind}", 0, nothing=kind) for kind in NONE]
     kept = [cell for cell in made if not only or any(fnmatchcase(cell.name, pattern) for pattern in only)]
     if not kept:

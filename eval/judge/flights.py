@@ -16,7 +16,16 @@ from edgeslam_torch import synthetic
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.judge.sources import made_of
 from edgeslam_torch.readers.source import Recording
-from edgeslam_torch.synthetic.flights.courses import COURSES, RATE_HZ, flown, record_course, simulated_camera
+from edgeslam_torch.synthetic.flights.courses import (
+    COURSES,
+    RATE_HZ,
+    SECONDS,
+    Course,
+    flown,
+    record_course,
+    record_flight,
+    simulated_camera,
+)
 from edgeslam_torch.synthetic.house.render import render
 
 NONE = ("noise", "black", "frozen")
@@ -24,15 +33,29 @@ NONE = ("noise", "black", "frozen")
 NONE_FRAMES = 150
 
 
-def flight_folder(root: Path, course: str, seed: int) -> Path:
+def flight_folder(root: Path, course: str, seed: int, flight: int = 0) -> Path:
     """Folder of a course's recording, made when it is not there; another simulator has another folder.
+
+    Args:
+        root: Where the recordings are.
+        course: A name in `COURSES`.
+        seed: Of the world.
+        flight: Number of a further flight in the same world, on another path; 0 for the course itself.
 
     Raises:
         EvaluationError: If it cannot be recorded.
     """
-    folder = root / f"{course}-s{seed}-{_simulator()}"
+    folder = root / f"{course}-s{seed}{f'-f{flight}' if flight else ''}-{_simulator()}"
     if not folder.is_dir():
-        command = [sys.executable, "-m", "edgeslam_torch.eval.judge.flights", course, str(seed), str(folder)]
+        command = [
+            sys.executable,
+            "-m",
+            "edgeslam_torch.eval.judge.flights",
+            course,
+            str(seed),
+            str(folder),
+            str(flight),
+        ]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode != 0:
             raise EvaluationError(f"{course}, seed {seed}: could not be recorded: {done.stderr.strip()[-300:]}")
@@ -65,14 +88,26 @@ def _simulator() -> str:
     return digest.hexdigest()[:8]
 
 
-def main(course: str, seed: int, folder: Path) -> int:
+def _record_again(folder: Path, course: Course, seed: int, flight: int) -> None:
+    """Another flight through the world of a course."""
+    world = course.world(np.random.default_rng(seed))
+    rng = np.random.default_rng([seed, flight])
+    flown_again = course.pilot(rng, world, round(SECONDS * RATE_HZ), rate_hz=RATE_HZ)
+    camera = simulated_camera()
+    record_flight(folder, world, flown_again, rng, camera, course.telemetry, course.faults, seed=seed + flight)
+
+
+def main(course: str, seed: int, folder: Path, flight: int = 0) -> int:
     """Record into a folder beside ``folder`` and give it its name when it is whole."""
     part = folder.with_name(f".{folder.name}.part")
     shutil.rmtree(part, ignore_errors=True)
-    record_course(part, COURSES[course], seed)
+    if flight == 0:
+        record_course(part, COURSES[course], seed)
+    else:
+        _record_again(part, COURSES[course], seed, flight)
     part.rename(folder)
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1], int(sys.argv[2]), Path(sys.argv[3])))
+    sys.exit(main(sys.argv[1], int(sys.argv[2]), Path(sys.argv[3]), int(sys.argv[4])))

@@ -15,8 +15,8 @@ from edgeslam_torch.config import SlamConfig
 from edgeslam_torch.errors import EdgeSlamError
 from edgeslam_torch.eval.inputs.dataset import interpolate, open_dataset
 from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, write_tum
-from edgeslam_torch.eval.judge import flights, sources
-from edgeslam_torch.eval.judge.cells import BACKWARDS, KIDNAP, VARIANTS, Cell
+from edgeslam_torch.eval.judge import flights, second_flight, sources
+from edgeslam_torch.eval.judge.cells import BACKWARDS, HALF, KIDNAP, SECOND_FLIGHT, VARIANTS, Cell
 from edgeslam_torch.eval.judge.runner import CELL, RESULT
 from edgeslam_torch.eval.judge.score import Truth, score
 from edgeslam_torch.files.atomic import write_text
@@ -39,12 +39,19 @@ def main(folder: Path) -> int:
         source, truth = _opened(cell, folder, Path(spec["flights"]))
         if spec["max_frames"] is not None:
             source = sources.first_frames(source, spec["max_frames"])
-        settle_camera(source)
-        result = run(source, folder / RUN, config)
+        if cell.variant == SECOND_FLIGHT:
+            first, first_truth = _first_flight(cell, Path(spec["flights"]))
+            second_flight.fly_first(first, folder, config)
+            result = second_flight.fly_second(source, folder / RUN, folder, config)
+        else:
+            settle_camera(source)
+            result = run(source, folder / RUN, config)
         if result.interrupted or result.failure is not None:
             sys.stderr.write(f"{result.failure or 'interrupted'}\n")
             return 1
         figures, notes = score(folder / RUN, truth)
+        if cell.variant == SECOND_FLIGHT:
+            figures |= second_flight.compared(folder / RUN, truth, folder / second_flight.FIRST, first_truth)
     except EdgeSlamError as error:
         sys.stderr.write(f"{error}\n")
         return 1
@@ -57,7 +64,7 @@ def _opened(cell: Cell, folder: Path, flights_root: Path) -> tuple[Recording, Tr
     if cell.nothing:
         return flights.nothing_to_see(cell.nothing, cell.seed), Truth(None)
     if cell.course:
-        place = flights.flight_folder(flights_root, cell.course, cell.seed)
+        place = flights.flight_folder(flights_root, cell.course, cell.seed, int(cell.variant == SECOND_FLIGHT))
         return _recording(place), Truth(place, surfaces=lambda p: _distances(cell, p))
     place = Path(cell.folder)
     source = _recording(place)
@@ -65,8 +72,18 @@ def _opened(cell: Cell, folder: Path, flights_root: Path) -> tuple[Recording, Tr
         return _kidnapped(source, place, folder / "groundtruth.txt")
     if cell.variant == BACKWARDS:
         return _backwards(source, place, folder / "groundtruth.txt")
+    if cell.variant == SECOND_FLIGHT:
+        return sources.start_at(source, HALF), Truth(place)
     truth = Truth(place, place if open_dataset(place).depth is not None else None)
     return VARIANTS[cell.variant].applied_to(source) if cell.variant else source, truth
+
+
+def _first_flight(cell: Cell, flights_root: Path) -> tuple[Recording, Truth]:
+    """Source of the flight whose map the cell's own flight begins with."""
+    if cell.course:
+        place = flights.flight_folder(flights_root, cell.course, cell.seed)
+        return _recording(place), Truth(place)
+    return sources.first_frames(_recording(Path(cell.folder)), HALF), Truth(Path(cell.folder))
 
 
 def _recording(place: Path) -> Recording:

@@ -17,6 +17,7 @@ from edgeslam_torch.mapping.edge_map import EdgeMap, EdgePoints
 from edgeslam_torch.optim.problem import LmConfig
 from edgeslam_torch.tracking.relocaliser import match_keyframe
 from edgeslam_torch.tracking.tracker import Tracker
+from edgeslam_torch.types import ScaleEstimate
 
 MISPLACED = sim3.exp(np.array([0.5, -0.8, 0.3, 0.4, -0.3, 0.6, np.log(1.4)]))
 """Offset of the second piece's gauge."""
@@ -269,3 +270,16 @@ def test_moved_anchors_are_searched_as_before(rng):
     before = looks()
     move_piece(pieces.map, pieces.edges, pieces.log, 1, MISPLACED)
     np.testing.assert_allclose(looks(), before, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("known", [0, 1])
+def test_the_map_of_an_earlier_flight_stays_and_keeps_its_metres(rng, known):
+    """However small it is beside the flight's own piece."""
+    pieces = Pieces(rng)
+    for keyframe in pieces.keyframes[:2] if known == 0 else pieces.keyframes[6:]:
+        pieces.map.remove_keyframe(keyframe)
+    atlas, metres = pieces.atlas(), ScaleEstimate(1.0, 0.02, "telemetry")
+    atlas.known_scale[known] = metres
+    join = atlas.update()
+    assert join.moved == 1 - known
+    assert atlas.known_scale == {0: metres}

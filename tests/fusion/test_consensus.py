@@ -47,6 +47,12 @@ def test_a_network_out_of_its_domain_tells_nothing_but_still_contradicts_nonsens
     assert settled_with_network(opinion(2.0, 0.01, "telemetry"), network, in_domain=False).used == ()
 
 
+def test_an_atlas_that_telemetry_contradicts_is_not_used_and_named():
+    settled = settled_with_network(opinion(1.3, 0.02, "telemetry+height"), opinion(1.0, 0.02, "atlas"), True)
+    assert [o.source for o in settled.used] == ["telemetry+height"]
+    assert "the atlas contradict" in settled.warning and "network" not in settled.warning
+
+
 def test_nothing_told_is_nothing_used():
     assert settled_with_network(None, None, in_domain=False).used == ()
 

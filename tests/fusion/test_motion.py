@@ -10,7 +10,7 @@ from edgeslam_torch.fusion.scale.depth_scale import DepthRatio
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.synthetic.flights.flight import camera_on_body
 from edgeslam_torch.synthetic.flights.telemetry import EXACT, TelemetryFaults, simulate
-from edgeslam_torch.types import TelemetrySample, Units
+from edgeslam_torch.types import ScaleEstimate, TelemetrySample, Units
 
 T_B_C = camera_on_body()
 
@@ -80,6 +80,21 @@ def test_depth_alone_gives_metres_with_its_own_doubt(swinging):
     assert (scale.source, scale.units) == ("depth", Units.METRES)
     assert scale.value == pytest.approx(3.0)
     assert FusionConfig().depth_bias_log < scale.sigma / scale.value < 0.2
+
+
+def test_metres_of_an_earlier_flight_take_the_place_of_the_networks():
+    fusion = MotionFusion(FusionConfig(), T_B_C)
+    for _ in range(50):
+        fusion.add_depth_ratio(DepthRatio(math.log(3.0), 0.05))
+    own = fusion.scale()
+    fusion.remember(ScaleEstimate(1.0, 0.03, "telemetry"))
+    assert (fusion.scale().value, fusion.scale().source) == (1.0, "atlas")
+    assert fusion.scale().sigma == pytest.approx(0.03)
+    assert {"atlas"} <= {source.source for source in fusion.sources()}
+    fusion.remember(ScaleEstimate())
+    assert fusion.scale() == own
+    fusion.remember(None)
+    assert fusion.scale() == own
 
 
 def test_a_guessed_focal_length_makes_depth_that_much_less_sure():

@@ -83,6 +83,18 @@ def test_pieces_are_not_tied_to_each_other(rng, halves):
     assert [f.pose.tolist() for f in factors.gravity] == [[0, 1, 2], [3, 4, 5]]
 
 
+def test_keyframes_of_earlier_flights_have_no_time_on_this_clock(rng, halves):
+    model = telemetry_of(rng, halves)
+    halves.keyframes[0].stamp_s = -np.inf
+    told = motion_factors(model, halves.keyframes, [0] * 6)
+    assert [factor.pose.tolist() for factor in told.centres] == [[1, 2, 3, 4, 5]]
+    assert all(0 not in factor.pose for factor in told.gravity)
+    for keyframe in halves.keyframes:
+        keyframe.stamp_s = -np.inf
+    told = motion_factors(model, halves.keyframes, [0] * 6)
+    assert not told.centres and not told.gravity
+
+
 def test_poses_come_in_any_order(rng, halves):
     model, shuffled = telemetry_of(rng, halves), [halves.keyframes[i] for i in (4, 0, 5, 2, 1, 3)]
     (factor,) = motion_factors(model, shuffled, [0] * 6).centres

@@ -41,7 +41,7 @@ class Lost:
         descriptors = features.descriptors.copy()
         descriptors[strange] = self.rng.integers(0, 256, (strange.sum(), 32), dtype=np.uint8)
         features = FrameFeatures(features.uv, features.octave, features.angle_rad, descriptors)
-        self.backfill.keep(SimpleNamespace(index=index), make_view(features, SCALE_FACTOR))
+        self.backfill.keep(index, make_view(features, SCALE_FACTOR))
 
     def place(self):
         held = self.keyframe.anchor[self.keyframe.anchor >= 0]

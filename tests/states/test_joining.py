@@ -10,6 +10,7 @@ from edgeslam_torch.fusion.published import Published
 from edgeslam_torch.geometry import se3, sim3
 from edgeslam_torch.states.joining import Joining
 from edgeslam_torch.tracking.motion_model import MotionModel
+from edgeslam_torch.types import ScaleEstimate
 
 S = sim3.exp(np.array([0.4, -0.2, 0.7, 0.3, -0.5, 0.2, np.log(1.5)]))
 KEYFRAME = 7
@@ -42,13 +43,16 @@ class Pieces:
                 self.T_k_w = sim3.moved_camera(S, self.T_k_w)
             return Join(1.0, 0, 1, moved, S if moved == 1 else sim3.inverse(S), 0.01, 2, 300)
 
-        return SimpleNamespace(update=update, ask_all_again=lambda: None, is_up_to_date=False)
+        return SimpleNamespace(update=update, ask_all_again=lambda: None, is_up_to_date=False, known_scale={})
 
 
 def system_of(pieces, motion, busy=False):
     log = SimpleNamespace(records=[SimpleNamespace(keyframe_id=KEYFRAME)], poses=lambda: ("stamps", "poses"))
     revised = []
-    fusion = SimpleNamespace(revise=lambda *poses: revised.append(poses), revised=revised)
+    remembered = []
+    fusion = SimpleNamespace(
+        revise=lambda *poses: revised.append(poses), revised=revised, remember=remembered.append, remembered=remembered
+    )
     mapping = SimpleNamespace(busy=busy)
     again = lambda: revised.append("ratios")  # noqa: E731
     return SimpleNamespace(
@@ -108,3 +112,21 @@ def test_nothing_is_joined_while_the_worker_maps(rng, finish):
         assert joining.update() == ""
     assert system.map.asked == 0
     assert system.events == {}
+
+
+def test_the_metres_of_an_earlier_flight_hold_in_its_map_and_nowhere_else(rng):
+    T_k_w, motion = moving(rng)
+    system = system_of(Pieces(T_k_w), motion)
+    atlas = system.map.atlas(moved=1)
+    known = ScaleEstimate(1.0, 0.02, "depth")
+    atlas.known_scale[0] = known
+    joining = Joining(system, atlas)
+    joining.enter(1)
+    assert (system.published.scale, system.published.revision) == (2.0, 0)
+    joining.enter(0)
+    assert (system.published.scale, system.published.revision) == (1.0, 1), "and whoever reads poses is told"
+    joining.enter(0)
+    system.published = Published(1.1, revision=2)  # telemetry has contradicted it since
+    joining.enter(0)
+    assert (system.published.scale, system.published.revision) == (1.1, 2)
+    assert system.fusion.remembered == [None, known]

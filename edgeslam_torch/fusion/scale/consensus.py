@@ -53,11 +53,11 @@ class Settled:
 
 
 def settled_with_network(told: LogScale | None, network: LogScale | None, in_domain: bool) -> Settled:
-    """Opinions of the drone's sensors and of the depth network, less those that must be wrong.
+    """Opinions of the drone's sensors and of the depth network or an atlas, less those that must be wrong.
 
     Args:
         told: By velocities, heights or both.
-        network: By the depth network.
+        network: By the depth network, or by the atlas in whose metres it had its part.
         in_domain: Whether the network may tell metres at all; if not, it may still contradict nonsense.
     """
     if told is None or network is None:
@@ -65,9 +65,10 @@ def settled_with_network(told: LogScale | None, network: LogScale | None, in_dom
     if not contradict(told, network):
         return Settled((told, network) if in_domain else (told,))
     scales = f"{math.exp(told.log_scale):.3g} and {math.exp(network.log_scale):.3g} metres per map unit"
-    said = f"telemetry ({told.source}) and the depth network contradict each other: {scales}"
+    other, short = ("atlas", "atlas") if network.source == "atlas" else ("depth network", "network")
+    said = f"telemetry ({told.source}) and the {other} contradict each other: {scales}"
     if "+" in told.source:
-        return Settled((told,), f"{said}; velocities and heights confirm each other, so the network is not used")
+        return Settled((told,), f"{said}; velocities and heights confirm each other, so the {short} is not used")
     if _apart(told, network) > _WRONG_UNIT_LOG:
         return Settled((), f"{said}; one of them is nonsense, and neither is used: is telemetry in the right unit?")
-    return Settled((told,), f"{said}; many measurements speak for telemetry, one error for the network: it is not used")
+    return Settled((told,), f"{said}; many measurements speak for telemetry, one error for the {other}: it is not used")

@@ -95,7 +95,8 @@ def test_cell_that_cannot_run_says_why_and_leaves_no_result(tmp_path, capsys):
 def test_simulated_flight_is_judged_by_its_world(tmp_path, monkeypatch):
     folders = []
 
-    def record(root, course, seed):
+    def record(root, course, seed, flight):
+        assert flight == 0
         folders.append(root / course)
         record_course(folders[0], COURSES[course], seed, seconds=0.4)
         return folders[0]
@@ -157,6 +158,25 @@ def test_recording_played_backwards_gets_the_truth_of_each_image_also_where_the_
     assert np.allclose([told[round(f.stamp_s, 4)] for f in known], [shown[f.path.name] for f in known], atol=1e-6)
 
 
+def test_second_flight_is_in_the_map_of_the_first_and_judged_against_it(recording, tmp_path, monkeypatch):
+    monkeypatch.setattr(run_cell, "HALF", 20)
+    code, result = run(tmp_path, Cell("stairs/second_flight", 0, str(recording), "second_flight"))
+    figures = result["figures"]
+    assert code == 0 and figures["frames"] == 16
+    assert figures["placed_after_s"] < 1.0 and figures["placed"] > 0.9
+    assert 0.0 <= figures["metres_off"] < 0.1
+
+
+def test_a_further_flight_has_another_path_through_the_same_world(tmp_path, monkeypatch):
+    monkeypatch.setattr(flights, "SECONDS", 0.4)
+    assert flights.main("room", 3, tmp_path / "again", 1) == 0
+    world, first, _ = flights.flown(COURSES["room"], 3, seconds=0.4)
+    again = open_dataset(tmp_path / "again").truth
+    assert len(again.stamps_s) == 8
+    assert np.linalg.norm(again.positions[0] - first.T_w_c[0, :3, 3]) > 0.1
+    assert world.clearance(again.positions[0]) > 0.2, "in free space of that world"
+
+
 def test_flight_is_recorded_once_and_only_whole(tmp_path, monkeypatch):
     calls = []
     monkeypatch.setattr(flights, "record_course", lambda part, course, seed: (part.mkdir(), calls.append(seed)))
@@ -170,7 +190,7 @@ def test_flight_is_recorded_once_and_only_whole(tmp_path, monkeypatch):
 
 def plain(command):
     """Arguments of ``flights.main`` in its command line."""
-    return command[-3], int(command[-2]), Path(command[-1])
+    return command[-4], int(command[-3]), Path(command[-2]), int(command[-1])
 
 
 def finished(code, stderr=""):

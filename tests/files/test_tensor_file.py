@@ -1,0 +1,73 @@
+"""Named arrays in a safetensors file: what is written is read, what is damaged is refused."""
+
+import json
+
+import numpy as np
+import pytest
+
+from edgeslam_torch.files.tensor_file import KINDS, Damaged, read_entries, write_tensors
+
+SIZES = {kind: dtype.itemsize for kind, dtype in KINDS.items()}
+ARRAYS = {
+    "a": np.arange(6, dtype="<f4").reshape(2, 3),
+    "b": np.array([], dtype="<i8"),
+    "c": np.array([[1, 2]], dtype="u1"),
+}
+
+
+def raw(header, data=b""):
+    text = header if isinstance(header, bytes) else json.dumps(header).encode()
+    return len(text).to_bytes(8, "little") + text + data
+
+
+def read(path):
+    with path.open("rb") as file:
+        remarks, entries = read_entries(file, SIZES)
+        return remarks, {name: entry.array() for name, entry in entries.items()}
+
+
+def test_what_is_written_is_read(tmp_path):
+    write_tensors(tmp_path / "x", {"key": "words"}, ARRAYS)
+    remarks, arrays = read(tmp_path / "x")
+    assert remarks == {"key": "words"} and list(arrays) == list(ARRAYS)
+    for name, array in ARRAYS.items():
+        np.testing.assert_array_equal(arrays[name], array)
+        assert arrays[name].dtype == array.dtype
+
+
+def test_other_programs_read_it(tmp_path):
+    safetensors = pytest.importorskip("safetensors.numpy")
+    write_tensors(tmp_path / "x", {"key": "words"}, ARRAYS)
+    np.testing.assert_array_equal(safetensors.load_file(tmp_path / "x")["a"], ARRAYS["a"])
+
+
+@pytest.mark.parametrize("length", range(0, 200, 7))
+def test_a_truncated_file_is_refused(tmp_path, length):
+    write_tensors(tmp_path / "x", {"key": "words"}, ARRAYS)
+    whole = (tmp_path / "x").read_bytes()
+    (tmp_path / "x").write_bytes(whole[: min(length, len(whole) - 1)])
+    with pytest.raises(Damaged):
+        read(tmp_path / "x")
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"\x80\x04pickle",
+        raw(b"{"),
+        raw([]),
+        raw({"a": []}),
+        raw({"a": {"dtype": "F32", "shape": [1], "data_offsets": [0, 8]}}, bytes(8)),
+        raw({"a": {"dtype": "F32", "shape": [2], "data_offsets": [0, 8]}}, bytes(7)),
+        raw({"a": {"dtype": "F32", "shape": [-1], "data_offsets": [0, -4]}}, bytes(8)),
+        raw({"a": {"dtype": "F32", "shape": [1 << 62], "data_offsets": [0, 1 << 64]}}, bytes(8)),
+        raw({"a": {"dtype": "O", "shape": [1], "data_offsets": [0, 8]}}, bytes(8)),
+        raw({n: {"dtype": "U8", "shape": [8], "data_offsets": [0, 8]} for n in "ab"}, bytes(8)),
+        raw(b"[" * 100_000),
+    ],
+)
+def test_a_hostile_file_is_refused(tmp_path, content):
+    (tmp_path / "x").write_bytes(content)
+    with pytest.raises(Damaged):
+        read(tmp_path / "x")

@@ -1,0 +1,167 @@
+"""Two flights: the second begins in the map that the first has saved."""
+
+from functools import lru_cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from point_map import check_map
+from rendered import CAMERA, film, sideways, stairs_world
+
+from edgeslam_torch.atlas.atlas_file import read_atlas, write_atlas
+from edgeslam_torch.atlas.earlier import FOUND
+from edgeslam_torch.cli import main
+from edgeslam_torch.config import DepthConfig, SlamConfig
+from edgeslam_torch.eval.metrics.align import umeyama
+from edgeslam_torch.slam import EdgeSlam
+from edgeslam_torch.types import FrameStatus
+
+NO_NETWORK = SlamConfig(depth=DepthConfig(weights="none"))
+
+
+@lru_cache(maxsize=1)
+def first_film():
+    return film(stairs_world(), CAMERA, sideways(40, 0.03, turn_rad=0.004), step_s=1 / 30)
+
+
+@lru_cache(maxsize=1)
+def second_film():
+    """The other way, from the middle of the first path, 5 cm lower and nearer."""
+    poses = sideways(40, 0.03, turn_rad=0.004)[30:8:-1].copy()
+    poses[:, :3, 3] += [0.0, 0.05, 0.05]
+    return film(stairs_world(), CAMERA, poses, step_s=1 / 30)
+
+
+@lru_cache(maxsize=1)
+def elsewhere():
+    return film(stairs_world(9), CAMERA, sideways(30, 0.03, turn_rad=0.004), step_s=1 / 30)
+
+
+@lru_cache(maxsize=1)
+def first_flight():
+    slam = EdgeSlam(CAMERA, NO_NETWORK, depth=first_film().depth_function())
+    for frame in first_film().frames:
+        slam.step(frame)
+    slam.finish()
+    return slam, slam.saved_atlas("first")
+
+
+def second_flight(frames, depth=None, atlas=None):
+    slam = EdgeSlam(CAMERA, NO_NETWORK, depth=depth)
+    slam.load_atlas(first_flight()[1] if atlas is None else atlas)
+    outputs = [slam.step(frame) for frame in frames]
+    check_map(slam.map)
+    slam.finish()
+    check_map(slam.map)
+    return slam, outputs
+
+
+def similarity(T_w_c, truth):
+    return umeyama(T_w_c[:, :3, 3], truth[:, :3, 3], "sim3")
+
+
+def test_second_flight_is_in_the_map_of_the_first_at_once_and_in_its_metres(tmp_path):
+    write_atlas(tmp_path / "room.atlas", first_flight()[1])
+    slam, outputs = second_flight(second_film().frames, atlas=read_atlas(tmp_path / "room.atlas"))
+    said = [o.index for o in outputs if FOUND in o.reason]
+    assert len(said) == 1 and said[0] <= 6, "said once, 0.2 s after take-off"
+    assert all(o.piece == 0 and o.status.supported for o in outputs[said[0] :])
+    assert slam.support().supported.all() and set(slam.support().piece) == {0}, "frames before it are placed later"
+    _, first = first_flight()[0].trajectory()
+    _, second = slam.trajectory()
+    known = similarity(first, first_film().T_w_c)
+    error = known.points(second[:, :3, 3]) - second_film().T_w_c[:, :3, 3]
+    assert np.sqrt((error**2).sum(1).mean()) < 0.02  # metres, 2.5 m from the panels; 0.013 when written
+    summary = slam.earlier_flights()
+    assert summary["flights"] == ["first"] and summary["frames_placed"] == len(outputs)
+    assert summary["found_after_s"] == pytest.approx(said[0] / 30)
+    assert slam.scale.source == "atlas" and slam.scale.value == 1.0
+    assert outputs[-1].metric
+
+
+def test_a_second_flight_adds_to_the_map(tmp_path):
+    slam, _ = second_flight(second_film().frames)
+    again = slam.saved_atlas("second")
+    assert again.flights == ("first", "second")
+    assert again.keyframes >= first_flight()[1].keyframes
+    assert len(again.scale) == 1 and again.scale[0].value == pytest.approx(1.0)
+
+
+def test_a_flight_elsewhere_has_a_map_of_its_own_and_both_are_saved():
+    slam, outputs = second_flight(elsewhere().frames)
+    assert {o.piece for o in outputs} == {1}
+    assert slam.earlier_flights()["found_after_s"] is None
+    assert any("no place of the atlas was recognised" in warning for warning in slam.warnings())
+    saved = slam.saved_atlas("elsewhere")
+    assert len(saved.scale) == 2
+    assert saved.scale[0] == first_flight()[1].scale[0], "its metres are not forgotten"
+    assert (saved.arrays["keyframe.piece"] == 0).sum() == first_flight()[1].keyframes
+
+
+def test_dark_first_images_do_not_take_the_flight_into_the_map():
+    dark = second_film().with_images(lambda i, image: image if i > 3 else np.zeros_like(image))
+    slam, outputs = second_flight(dark)
+    assert outputs[0].status is FrameStatus.LOST and outputs[0].piece == 1
+    assert any(FOUND in o.reason for o in outputs)
+
+
+def test_an_atlas_is_loaded_before_the_first_frame():
+    slam, saved = first_flight()
+    with pytest.raises(ValueError, match="before the first frame"):
+        slam.load_atlas(saved)
+
+
+# -- the command -------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def recording(tmp_path, write_tum) -> Path:
+    return write_tum(tmp_path / "recording", 3)
+
+
+def test_command_saves_and_reports(tmp_path, write_images, capsys):
+    for name, shot in (("monday", first_film()), ("tuesday", second_film())):
+        folder = tmp_path / name
+        (folder / "rgb").mkdir(parents=True)
+        rows = []
+        for frame in shot.frames:
+            cv2.imwrite(str(folder / f"rgb/{frame.index:03d}.png"), frame.image)
+            rows.append(f"{frame.stamp_s:.6f} rgb/{frame.index:03d}.png\n")
+        (folder / "rgb.txt").write_text("".join(rows))
+        CAMERA.save(folder / "camera.yaml")
+    atlas = str(tmp_path / "room.atlas")
+    options = ["--depth", "none", "--no-report", "--out"]
+    assert main(["run", str(tmp_path / "monday"), *options, str(tmp_path / "m"), "--save-atlas", atlas]) == 0
+    assert "atlas saved: " in capsys.readouterr().out
+    assert main(["run", str(tmp_path / "tuesday"), *options, str(tmp_path / "t"), "--atlas", atlas]) == 0
+    said = capsys.readouterr().out
+    assert "atlas: recognised 0." in said and "22 of 22 frames lie in it" in said
+    assert FOUND in (tmp_path / "t" / "status.csv").read_text()
+    assert '"found_after_s": 0.' in (tmp_path / "t" / "summary.json").read_text()
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        (["--atlas", "none.atlas"], "none.atlas: not an atlas that can be used: no such atlas file"),
+        (["--atlas", "text"], "text: not an atlas that can be used: not a safetensors file"),
+        (["--save-atlas", "text"], "text: exists and is no atlas; give another file to --save-atlas"),
+        (["--save-atlas", "nowhere/room.atlas"], "nowhere/room.atlas: there is no folder nowhere"),
+    ],
+)
+def test_command_refuses_in_one_line_before_it_flies(tmp_path, recording, monkeypatch, capsys, options, match):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "text").write_text("notes")
+    assert main(["run", str(recording), "--out", str(tmp_path / "out"), *options]) == 1
+    said = capsys.readouterr().err.strip().splitlines()
+    assert match in said[-1]
+    assert not (tmp_path / "out").exists()
+    assert (tmp_path / "text").read_text() == "notes"
+
+
+def test_command_refuses_another_lens(tmp_path, recording, capsys):
+    write_atlas(tmp_path / "room.atlas", first_flight()[1])
+    (recording / "camera.yaml").write_text("width: 64\nheight: 48\nfx: 60.0\nfy: 60.0\ncx: 31.5\ncy: 23.5\n")
+    assert main(["run", str(recording), "--atlas", str(tmp_path / "room.atlas")]) == 1
+    assert "made with another camera (320x240, f 260 px; this one: 64x48, f 60 px)" in capsys.readouterr().err
