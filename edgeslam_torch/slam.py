@@ -280,7 +280,7 @@ class EdgeSlam:
         return self._system.published.cloud(self.edges.points(self._shown_piece()))
 
     def anchors(self) -> PointCloud:
-        """Triangulated anchors, as a consistent snapshot."""
+        """Anchors with the standard deviation of their depth, as a consistent snapshot."""
         with self.map.lock:
             shown = self._shown_piece()
             seen_by = [k for id, k in self.map.keyframes.items() if self.map.piece_of(id) == shown]

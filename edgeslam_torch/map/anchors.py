@@ -5,6 +5,9 @@ from numpy.typing import NDArray
 
 from edgeslam_torch.types import FloatArray, IntArray, PointCloud
 
+MIN_OBSERVATIONS = 2
+"""Keyframes that must observe an anchor for it to be given out: the first one alone has not been confirmed."""
+
 
 class Anchors:
     """All anchors of the map. Rows of removed anchors are reused after the next `begin_pass`."""
@@ -88,8 +91,11 @@ class Anchors:
         self._just_removed.extend(ids.tolist())
 
     def cloud(self, ids: IntArray) -> PointCloud:
-        """Those of the given anchors that are triangulated; the caller holds the map's lock."""
-        ids = ids[self.alive[ids] & ~self.from_depth[ids]]
+        """Those of the given anchors that at least two keyframes observe; the caller holds the map's lock.
+
+        Where the depth rests on a prior, `sigma` is the prior's: half of the depth or more.
+        """
+        ids = ids[self.alive[ids] & (self.observations[ids] >= MIN_OBSERVATIONS)]
         return PointCloud(
             self.p_w[ids].astype(np.float32),
             self.colour[ids],
