@@ -4,7 +4,7 @@ One section per stage, collected in `SlamConfig`. Functions take plain arguments
 """
 
 import math
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any
 
 from edgeslam_torch.fusion.config import FusionConfig
@@ -96,6 +96,8 @@ class TrackingConfig:
     """Maximum number of keyframes in the local map."""
     relocalisation_keyframes: int = 4
     """Keyframes tried in each lost frame."""
+    edges: bool = True
+    """Whether edges take part in the pose of frames with few keypoints."""
 
     def __post_init__(self) -> None:
         _positive(self, "motion_radius_px", "map_radius_px", "max_hamming", "ratio", "min_inliers", "local_keyframes")
@@ -231,12 +233,22 @@ class EdgeConfig:
             raise ValueError(f"canny_high must not be below canny_low, got {self.canny_high} < {self.canny_low}")
 
 
+_FLYING_FORMS: dict[str, tuple[Any, Any]] = {
+    "alignment": (True, False),
+    "cycle": ("relative", "off"),
+    "angle": ("arms", "off"),
+    "collinearity": ("relative", "off"),
+}
+"""Losses of the windows while flying: default form, and what says that one is off."""
+
+
 @dataclass(frozen=True, slots=True)
 class WindowConfig:
     """Stage 4: which losses refine poses, anchors and edge depths, and in which form.
 
     Each term is off, in the default form, or ``literal``: the paper's equation as printed
-    (``docs/equations.md``). Edge and corner terms join the last refinement, after all edges are measured.
+    (``docs/equations.md``). Edge and corner terms join the last refinement, after all edges are measured, and the
+    windows while flying as ``in_flight`` says.
     """
 
     reprojection: str = "robust"
@@ -260,22 +272,45 @@ class WindowConfig:
     """Edge pixels used per keyframe."""
     targets: int = 3
     """Neighbouring keyframes in which each edge pixel is associated."""
+    in_flight: str = "few"
+    """Where edge and corner terms join the windows while flying: ``off``, where the newest keyframe's image has ``few``
+    clear corners (``orb.fast_faint`` was needed) or it has fewer than 100 anchors, or ``always``."""
+    in_flight_losses: tuple[str, ...] = ("alignment", "cycle")
+    """Which of ``alignment``, ``cycle``, ``angle`` and ``collinearity``, each in the form chosen above or, if that is
+    off, its default."""
+    in_flight_edges: int = 300
+    """Edge pixels per keyframe there, each associated in two neighbours."""
     telemetry: str = "last"
     """Where the drone's displacements, heights and gravity keep the map's scale and level the same all over: in
     ``every`` refinement, in the ``last`` one, or ``off``."""
 
     def __post_init__(self) -> None:
-        _positive(self, "rounds", "edges_per_keyframe", "targets")
+        _positive(self, "rounds", "edges_per_keyframe", "targets", "in_flight_edges")
         _at_most(self, rounds=100)
+        for loss in self.in_flight_losses:
+            if loss not in _FLYING_FORMS:
+                raise ValueError(f"in_flight_losses must be among {', '.join(_FLYING_FORMS)}, got {loss!r}")
         for name, allowed in (
             ("reprojection", ("robust", "literal", "off")),
             ("cycle", ("relative", "literal", "off")),
             ("angle", ("arms", "cosine", "literal", "off")),
             ("collinearity", ("relative", "literal", "off")),
+            ("in_flight", ("off", "few", "always")),
             ("telemetry", ("every", "last", "off")),
         ):
             if getattr(self, name) not in allowed:
                 raise ValueError(f"{name} must be one of {', '.join(allowed)}, got {getattr(self, name)!r}")
+
+    @property
+    def flying(self) -> "WindowConfig | None":
+        """The terms of the windows while flying; None without edge and corner terms."""
+        if self.in_flight == "off" or not self.in_flight_losses:
+            return None
+        form: dict[str, Any] = {}
+        for loss, (default, none) in _FLYING_FORMS.items():
+            chosen = getattr(self, loss)
+            form[loss] = none if loss not in self.in_flight_losses else default if chosen == none else chosen
+        return replace(self, edges_per_keyframe=self.in_flight_edges, targets=2, **form)
 
     @property
     def uses_edges(self) -> bool:

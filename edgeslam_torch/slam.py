@@ -105,7 +105,7 @@ class EdgeSlam:
         if executor is None and realtime:
             executor = ThreadPoolExecutor(1, thread_name_prefix="mapping")
         lm = lm_config(config.window)
-        mapper = Mapper(self.map, camera, config, lm)
+        mapper = Mapper(self.map, camera, config, lm, self.edges)
         self._system = System(
             camera,
             config,

@@ -80,6 +80,8 @@ class FrameFeatures:
     """``(N,)`` orientation, float32."""
     descriptors: NDArray[np.uint8]
     """``(N, 32)`` ORB bits."""
+    faint: bool = False
+    """Whether the image has too few clear corners, so that fainter ones are among these."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -55,6 +55,7 @@ class OrbExtractor:
             octave=np.array([k.octave for k in kept], dtype=np.int32),
             angle_rad=np.deg2rad(np.array([k.angle for k in kept], dtype=np.float32)),
             descriptors=np.asarray(descriptors, dtype=np.uint8)[keep],
+            faint=detector is not self._detectors[0],
         )
 
 

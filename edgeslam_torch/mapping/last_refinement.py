@@ -6,31 +6,20 @@ from dataclasses import replace
 import numpy as np
 
 from edgeslam_torch.config import WindowConfig
-from edgeslam_torch.frontend.canny import canny
 from edgeslam_torch.fusion.displacement import TelemetryModel
 from edgeslam_torch.geometry.camera import Camera
-from edgeslam_torch.losses.cycle import CycleForm
 from edgeslam_torch.losses.robust import Kernel
 from edgeslam_torch.losses.weighting import AdaptiveScales
-from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.map.slam_map import SlamMap
-from edgeslam_torch.mapping.edge_map import EdgeMap, EdgePoints
+from edgeslam_torch.mapping.edge_map import EdgeMap
 from edgeslam_torch.mapping.fuse import fuse_all
 from edgeslam_torch.mapping.motion_terms import solver
 from edgeslam_torch.mapping.refinement import refine_all, whole_map, window_problem, write_back
 from edgeslam_torch.mapping.reobserve import MAX_DRIFT_PX, reobserve_all
-from edgeslam_torch.mapping.window_terms import (
-    PlacedEdges,
-    Structure,
-    TermConfig,
-    edge_terms,
-    junction_terms,
-    make_structure,
-)
+from edgeslam_torch.mapping.window_edges import WindowEdges
 from edgeslam_torch.optim.adaptive import term_residuals, with_scales
 from edgeslam_torch.optim.local_ba import refine_window
 from edgeslam_torch.optim.problem import LmConfig, StopReason, WindowProblem, WindowResult
-from edgeslam_torch.types import FloatArray
 
 logger = logging.getLogger(__name__)
 
@@ -104,20 +93,16 @@ def refine_with_edges(
     if window is None:
         return None
     keyframes = [*window.free, *window.fixed]
-    hosts = {h.keyframe_id: h for h in edges.hosts}
-    terms = term_config(config)
+    terms = WindowEdges(edges, camera, config, flying=False)
     scales = AdaptiveScales()
     result = None
     for _ in range(config.rounds):
         problem, keypoint = window_problem(slam_map, window, camera, lm, telemetry)
-        structures = [_structure(k, hosts.get(k.id), camera, config, edges) for k in keyframes]
-        T_c_w = problem.T_c_w[: len(keyframes)]
-        placed = edge_terms(structures, T_c_w, problem.K, terms) if config.uses_edges else None
-        corners = junction_terms(structures, T_c_w, problem.K, terms) if config.uses_corners else None
-        problem = replace(problem, edges=None if placed is None else placed.terms, junctions=corners)
+        placed = terms.place(problem, keyframes)
+        problem = placed.problem
         if config.reprojection == "off":
             problem = _without_points(problem)
-        if problem.edges is None and problem.junctions is None:
+        if not placed.has_terms:
             return result
         if config.adaptive:
             scales = scales.updated(term_residuals(problem))
@@ -130,39 +115,9 @@ def refine_with_edges(
             keypoint = [k[:0] for k in keypoint]
         with slam_map.lock:  # a consistent snapshot for readers
             write_back(slam_map, window, keypoint, result)
-            if placed is not None:
-                _write_back_depths(keyframes, hosts, camera, placed, result.edge_inverse_depth)
+            terms.write_back(keyframes, placed.edges, result.edge_inverse_depth)
         logger.debug("edges and corners: %s after %d steps", result.stop, result.iterations)
     return result
-
-
-def term_config(config: WindowConfig) -> TermConfig:
-    """Terms of a window for the given settings."""
-    default = TermConfig()
-    cycle_sigma = {"relative": default.cycle_sigma, "literal": 1.0, "off": 0.0}[config.cycle]
-    return TermConfig(
-        edges_per_pose=config.edges_per_keyframe,
-        targets=config.targets,
-        edge_sigma_px=default.edge_sigma_px if config.alignment else 0.0,
-        cycle=CycleForm.PIXEL if config.cycle == "literal" else CycleForm.RELATIVE_DEPTH,
-        cycle_sigma=cycle_sigma,
-        collinearity=config.collinearity,
-        # The literal angle's residual is identically zero: omitting it is equivalent.
-        angle_sigma=default.angle_sigma if config.angle in ("arms", "cosine") else 0.0,
-        cosines=config.angle == "cosine",
-    )
-
-
-def _structure(
-    keyframe: Keyframe, host: EdgePoints | None, camera: Camera, config: WindowConfig, edges: EdgeMap
-) -> Structure:
-    """A keyframe's measured edges; empty if they were not measured."""
-    if host is None or keyframe.grey is None:
-        blank = np.zeros((camera.height, camera.width), np.uint8)
-        return make_structure(blank, np.zeros((0, 2)), np.zeros(0), np.zeros(0))
-    z = host.p_c[:, 2]
-    mask = canny(keyframe.grey, edges.config.canny_low, edges.config.canny_high) if config.uses_corners else None
-    return make_structure(keyframe.grey, host.uv, 1.0 / z, host.sigma / z**2, mask)
 
 
 def _without_points(problem: WindowProblem) -> WindowProblem:
@@ -170,18 +125,3 @@ def _without_points(problem: WindowProblem) -> WindowProblem:
     return replace(
         problem, obs_pose=none, obs_anchor=none, uv=np.zeros((0, 2)), inv_sigma=np.zeros(0), depth_priors=None
     )
-
-
-def _write_back_depths(
-    keyframes: list[Keyframe],
-    hosts: dict[int, EdgePoints],
-    camera: Camera,
-    placed: PlacedEdges,
-    inverse_depth: FloatArray,
-) -> None:
-    """Write refined depths back to the keyframes' edge points."""
-    good = np.isfinite(inverse_depth) & (inverse_depth > 0)
-    for pose in np.unique(placed.terms.host):
-        mine = np.flatnonzero((placed.terms.host == pose) & good)
-        host, index = hosts[keyframes[pose].id], placed.index[mine]
-        host.p_c[index] = camera.back_project(host.uv[index], 1.0 / inverse_depth[mine])

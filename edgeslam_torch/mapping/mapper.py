@@ -12,6 +12,7 @@ from edgeslam_torch.geometry.robust_statistics import CHI2_2DOF_95
 from edgeslam_torch.map.depth_prior import depth_prior
 from edgeslam_torch.map.keyframe import NO_ANCHOR, Keyframe
 from edgeslam_torch.map.slam_map import SlamMap
+from edgeslam_torch.mapping.edge_map import EdgeMap
 from edgeslam_torch.mapping.fuse import fuse_young
 from edgeslam_torch.mapping.new_anchors import epipolar_matches, triangulate_matches
 from edgeslam_torch.mapping.prior_anchors import (
@@ -23,6 +24,7 @@ from edgeslam_torch.mapping.prior_anchors import (
 )
 from edgeslam_torch.mapping.refinement import choose_window, refine, refine_all
 from edgeslam_torch.mapping.reobserve import MAX_DRIFT_PX, reobserve
+from edgeslam_torch.mapping.window_edges import WindowEdges
 from edgeslam_torch.optim.problem import LmConfig, WindowResult
 from edgeslam_torch.types import FloatArray, IntArray
 
@@ -33,9 +35,19 @@ EMPTY_RADIUS_PX = 25.0
 
 
 class Mapper:
-    """Inserts keyframes into the map, one at a time."""
+    """Inserts keyframes into the map, one at a time.
 
-    def __init__(self, slam_map: SlamMap, camera: Camera, config: SlamConfig, lm: LmConfig) -> None:
+    Args:
+        slam_map: The map.
+        camera: Of its keyframes.
+        config: All settings.
+        lm: Settings of the solver.
+        edges: Measured edges, which may join the refinement; None for none.
+    """
+
+    def __init__(
+        self, slam_map: SlamMap, camera: Camera, config: SlamConfig, lm: LmConfig, edges: EdgeMap | None = None
+    ) -> None:
         self.map = slam_map
         self.camera = camera
         self.orb = config.orb
@@ -43,6 +55,8 @@ class Mapper:
         self.config = config.mapping
         self.depth = config.depth
         self.lm = lm
+        flying = config.window.flying
+        self._edges = None if edges is None or flying is None else WindowEdges(edges, camera, flying, flying=True)
         self._recent: IntArray = np.zeros(0, dtype=np.int64)
 
     def insert(
@@ -68,7 +82,8 @@ class Mapper:
         if drift_px is not None and drift_px > MAX_DRIFT_PX:  # the drift lies outside the window
             refine_all(self.map, self.camera, self.lm, telemetry)
         window = choose_window(self.map, keyframe, self.config.window, self.config.window_fixed)
-        result = refine(self.map, window, self.camera, self.lm, telemetry)
+        edges = self._edges if self._edges is not None and self._edges.wanted(keyframe) else None
+        result = refine(self.map, window, self.camera, self.lm, telemetry, edges)
         with self.map.lock:
             # Refinement moves the other keyframes too little to change viewing directions.
             self.map.refresh_anchors(keyframe.anchor[keyframe.anchor >= 0])

@@ -12,6 +12,7 @@ from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.mapping.motion_terms import motion_factors, solver
 from edgeslam_torch.mapping.prior_anchors import depth_priors, mostly_on_priors
+from edgeslam_torch.mapping.window_edges import WindowEdges
 from edgeslam_torch.optim.local_ba import refine_window
 from edgeslam_torch.optim.problem import (
     LmConfig,
@@ -90,14 +91,25 @@ def held_extent(window: Window) -> ScalePrior | None:
 
 
 def refine(
-    slam_map: SlamMap, window: Window, camera: Camera, config: LmConfig, telemetry: TelemetryModel | None = None
+    slam_map: SlamMap,
+    window: Window,
+    camera: Camera,
+    config: LmConfig,
+    telemetry: TelemetryModel | None = None,
+    edges: WindowEdges | None = None,
 ) -> WindowResult | None:
-    """Refine the window in place; outlier observations are removed from the map."""
+    """Refine the window in place, with its edges if given; outlier observations are removed from the map."""
     problem, keypoint = window_problem(slam_map, window, camera, config, telemetry)
-    if len(problem.obs_pose) == 0:
+    keyframes = [*window.free, *window.fixed]
+    placed = None if edges is None else edges.place(problem, keyframes)
+    problem = problem if placed is None else placed.problem
+    if len(problem.obs_pose) == 0 and (placed is None or not placed.has_terms):
         return None
     result = refine_window(problem, solver(config, problem))
     write_back(slam_map, window, keypoint, result)
+    if edges is not None and placed is not None and result.stop is not StopReason.NOT_FINITE:
+        with slam_map.lock:
+            edges.write_back(keyframes, placed.edges, result.edge_inverse_depth)
     return result
 
 

@@ -35,6 +35,8 @@ class TermConfig:
     """Number and weights of the terms."""
 
     edges_per_pose: int = 800
+    hosts: int | None = None
+    """Number of first poses whose edges are used; None for all."""
     targets: int = 3
     """Number of target poses per host: those with the smallest baseline."""
     max_px: float = 4.0
@@ -122,7 +124,10 @@ def edge_terms(
         config: Numbers and weights.
     """
     config = config or TermConfig()
-    chosen = [_spread(s.field.inverse_depth > 0, config.edges_per_pose) for s in structures]
+    chosen = [
+        _spread(s.field.inverse_depth > 0, config.edges_per_pose if config.hosts is None or i < config.hosts else 0)
+        for i, s in enumerate(structures)
+    ]
     host = np.repeat(np.arange(len(structures)), [len(c) for c in chosen])
     if len(host) == 0 or len(structures) < 2:
         return None
@@ -212,6 +217,8 @@ def junction_terms(
 def _spread(mask: np.ndarray, most: int) -> IntArray:
     """At most ``most`` indices at which ``mask`` is true, evenly spread."""
     places = np.flatnonzero(mask)
+    if most == 0:
+        return places[:0]
     if len(places) <= most:
         return places
     return places[np.linspace(0, len(places) - 1, most).astype(np.int64)]

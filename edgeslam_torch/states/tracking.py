@@ -31,7 +31,7 @@ class Tracking:
         self._flow = FlowTracker(
             system.map, system.camera, system.config.orb, system.config.flow, system.config.tracking.min_inliers
         )
-        self._edge_tracker = EdgeTracker(system.map, system.edges, system.camera)
+        self._edge_tracker = EdgeTracker(system.map, system.edges, system.camera, system.config.tracking.edges)
         self.relocaliser = Relocaliser(system.tracker)
         self.backfill = Backfill(system)
         self._template: Template | None = None

@@ -92,12 +92,13 @@ class EdgePose:
 
 
 class EdgeTracker:
-    """Tracks the edge map in a frame; stateless."""
+    """Tracks the edge map in a frame, if enabled; stateless."""
 
-    def __init__(self, slam_map: SlamMap, edges: EdgeMap, camera: Camera) -> None:
+    def __init__(self, slam_map: SlamMap, edges: EdgeMap, camera: Camera, enabled: bool = True) -> None:
         self.map = slam_map
         self.edges = edges
         self.camera = camera
+        self.enabled = enabled
 
     def refine(
         self,
@@ -115,7 +116,7 @@ class EdgeTracker:
             expected: Prior of the pose.
         """
         points = points or PointsInFrame.none()
-        known = self._edges_near(T_c_w)
+        known = self._edges_near(T_c_w) if self.enabled else None
         if known is None:
             return None
         seen = EdgeImage.of(grey, self.edges.config.canny_low, self.edges.config.canny_high)

@@ -10,7 +10,8 @@ import logging
 import pickle
 import threading
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -34,6 +35,7 @@ from edgeslam_torch.files.record_files import read_mapping
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.map.trajectory import TrajectoryLog
+from edgeslam_torch.mapping import prior_anchors
 from edgeslam_torch.mapping.edge_map import EdgeMap
 from edgeslam_torch.mapping.last_refinement import last_refinement
 from edgeslam_torch.readers.source import open_source
@@ -47,6 +49,12 @@ DEFAULT = "default"
 _CORNERS = ("window.angle=arms", "window.collinearity=relative")
 
 
+def _in_flight(losses: str) -> tuple[str, ...]:
+    """These losses, and no others, in every window while flying."""
+    names = ", ".join(f'"{name}"' for name in losses.split())
+    return ("window.in_flight=always", f"window.in_flight_losses=[{names}]")
+
+
 @dataclass(frozen=True, slots=True)
 class Row:
     """One line of the table."""
@@ -57,6 +65,8 @@ class Row:
     """``section.key=value`` on top of the defaults."""
     against: str = DEFAULT
     """Name of the row it is compared with."""
+    own_sigma: bool = False
+    """Whether the depth network's own sigma is believed, without the lower bound of `prior_anchors.MIN_SIGMA_LOG`."""
 
 
 ROWS = (
@@ -79,6 +89,7 @@ ROWS = (
         "literal-total",
         "the paper's total (eq. 28), all literal",
         (
+            *_in_flight("cycle collinearity"),
             "window.reprojection=literal",
             "window.alignment=false",
             "window.cycle=literal",
@@ -88,6 +99,16 @@ ROWS = (
         ),
     ),
     Row("fixed-weights", "fixed weights: no adaptive scales", ("window.adaptive=false",)),
+    Row("no-edge-tracking", "edges off in tracking", ("tracking.edges=false",)),
+    Row("flight-off", "edges off in the flying windows", ("window.in_flight=off",)),
+    Row("flight-always", "edges in all flying windows", _in_flight("alignment cycle")),
+    Row("flight-alignment", "in all: alignment, no cycle", _in_flight("alignment"), "flight-always"),
+    Row("flight-cycle", "in all: cycle, no alignment", _in_flight("cycle"), "flight-always"),
+    Row("flight-angle", "in all: with angle", _in_flight("alignment cycle angle"), "flight-always"),
+    Row(
+        "flight-collinearity", "in all: with collinearity", _in_flight("alignment cycle collinearity"), "flight-always"
+    ),
+    Row("ungated-network", "network prior with its own sigma", (), own_sigma=True),
     Row("no-depth-network", "no depth network", ("depth.weights=none",)),
     Row("no-flow", "no optical flow: every frame matched", ("flow.enabled=false",)),
 )
@@ -111,15 +132,24 @@ class AblationSettings:
 
 
 _COLUMNS = (
-    ("ate_sim3_m", "ATE Sim(3) [mm]", 1e3, "{:.1f}"),
+    ("ate_sim3_m", "ATE [mm]", 1e3, "{:.1f}"),
+    ("ate_online_sim3_m", "online [mm]", 1e3, "{:.1f}"),
     ("map_median_m", "map error [mm]", 1e3, "{:.1f}"),
     ("edges_within_2cm", "edges in 2 cm", 1e2, "{:.0f} %"),
+    ("map_points", "points", 1.0, "{:.0f}"),
+    ("supported", "supported", 1e2, "{:.0f} %"),
     ("scale_error_abs", "scale off", 1e2, "{:.1f} %"),
     ("cpu_ms_per_frame", "CPU [ms/frame]", 1.0, "{:.0f}"),
     ("finish_ms", "last refinement [ms]", 1.0, "{:.0f}"),
 )
-_JUDGED = ("ate_sim3_m", "map_median_m", "edges_within_2cm")
-_SHORT = {"ate_sim3_m": "ATE", "map_median_m": "map", "edges_within_2cm": "edges found"}
+_SHORT = {
+    "ate_sim3_m": "ATE",
+    "ate_online_sim3_m": "online",
+    "map_median_m": "map",
+    "edges_within_2cm": "edges found",
+    "map_points": "points",
+}
+"""The judged figures."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,6 +162,8 @@ class _Flight:
     cpu_s: float
     metres_per_unit: float
     """NaN while the scale is unknown."""
+    online: Trajectory
+    """Poses as they were known live."""
 
 
 def run_ablation(settings: AblationSettings, out: Path, say: Callable[[str], None]) -> dict[str, Any]:
@@ -169,7 +201,8 @@ def run_ablation(settings: AblationSettings, out: Path, say: Callable[[str], Non
                 if not todo:
                     continue
                 say(f"{name}, seed {seed}: flying for {', '.join(row.name for row, _ in todo)}")
-                flight = _fly(folder, sharing.config, settings.max_frames)
+                with _network_believed(sharing.own_sigma):
+                    flight = _fly(folder, sharing.config, settings.max_frames)
                 for row, window in todo:
                     figures = _finish(flight, window, dataset)
                     run = {"sequence": name, "seed": seed, "figures": figures, "error": ""}
@@ -207,36 +240,53 @@ class _Sharing:
     """Rows that one flight serves."""
 
     config: SlamConfig
+    own_sigma: bool
     rows: tuple[tuple[Row, WindowConfig], ...]
 
 
 def _sharing(rows: Iterable[Row], settings: AblationSettings, seed: int) -> list[_Sharing]:
-    """Rows by what matters before the last refinement: everything but the window's edge and corner terms."""
-    groups: dict[SlamConfig, list[tuple[Row, WindowConfig]]] = {}
+    """Rows by what matters before the last refinement: of the window's terms only those in flight."""
+    groups: dict[tuple[SlamConfig, bool], list[tuple[SlamConfig, Row]]] = {}
     for row in rows:
         config = load_config(replace(SlamConfig(), seed=seed), None, (*settings.overrides, *row.overrides))
-        flown = replace(config, window=WindowConfig(reprojection=config.window.reprojection))
-        groups.setdefault(flown, []).append((row, config.window))
-    return [_Sharing(config, tuple(members)) for config, members in groups.items()]
+        flying = config.window.flying or WindowConfig(in_flight="off")
+        flown = replace(
+            config, window=replace(flying, reprojection=config.window.reprojection, rounds=1, adaptive=True)
+        )
+        groups.setdefault((flown, row.own_sigma), []).append((config, row))
+    return [
+        _Sharing(members[0][0], own_sigma, tuple((row, config.window) for config, row in members))
+        for (_, own_sigma), members in groups.items()
+    ]
+
+
+@contextmanager
+def _network_believed(own_sigma: bool) -> Iterator[None]:
+    """The lower bound on the sigma of predicted depths, lifted for a while."""
+    bound = prior_anchors.MIN_SIGMA_LOG
+    prior_anchors.MIN_SIGMA_LOG = 0.0 if own_sigma else bound
+    try:
+        yield
+    finally:
+        prior_anchors.MIN_SIGMA_LOG = bound
 
 
 def _fly(folder: Path, config: SlamConfig, max_frames: int | None) -> _Flight:
     source = open_source(folder)
     try:
         slam = EdgeSlam(source.camera, config)
-        start, frames = time.process_time(), 0
-        for frame in islice(source.frames(), max_frames):
-            slam.step(frame)
-            frames += 1
+        start = time.process_time()
+        live = [slam.step(frame) for frame in islice(source.frames(), max_frames)]
         cpu_s = time.process_time() - start
     finally:
         source.close()
     scale = slam.scale
     return _Flight(
         pickled((slam.map, slam.edges, slam.log, slam.camera)),
-        frames,
+        len(live),
         cpu_s,
         scale.value if np.isfinite(scale.sigma) else float("nan"),
+        Trajectory(np.array([o.stamp_s for o in live]), np.stack([o.T_w_c for o in live])),
     )
 
 
@@ -252,6 +302,9 @@ def _finish(flight: _Flight, window: WindowConfig, dataset: EvalDataset) -> dict
     score = score_trajectory(dataset.truth, estimate, AlignmentKind.SIM3)
     figures: dict[str, float | None] = {
         "ate_sim3_m": score.ate_m.rmse,
+        "ate_online_sim3_m": score_trajectory(dataset.truth, flight.online, AlignmentKind.SIM3).ate_m.rmse,
+        "supported": float(np.mean([record.supported for record in log.records])),
+        "map_points": float(len(edges.points().p_w)),
         "scale_error_abs": abs(score.alignment.scale / flight.metres_per_unit - 1.0),
         "cpu_ms_per_frame": 1e3 * (flight.cpu_s + finish_s) / max(flight.frames, 1),
         "finish_ms": 1e3 * finish_s,
@@ -289,7 +342,7 @@ def pickled(state: object) -> bytes:
 
 
 def _sequences(settings: AblationSettings) -> dict[str, Path]:
-    found = find_sequences(settings.data)
+    found = find_sequences(settings.data, min_hz=0.0)
     missing = [name for name in settings.sequences if name not in found]
     if missing or not found:
         raise EvaluationError(
@@ -345,6 +398,6 @@ def _verdict(records: dict[str, dict[str, Any]], row: Row, sequence: str) -> str
     told = [
         f"{_SHORT[c['metric']]} {c['verdict']}"
         for c in found
-        if c["sequence"] == sequence and c["metric"] in _JUDGED and c["verdict"] != "same"
+        if c["sequence"] == sequence and c["metric"] in _SHORT and c["verdict"] != "same"
     ]
     return f"{row.against}: {', '.join(told) or 'same'}"

@@ -75,8 +75,8 @@ class BenchSettings:
     """Time the solver's window and the depth network too."""
 
 
-def find_sequences(data: Path | None) -> dict[str, Path]:
-    """Recordings with ground truth and images at a camera's rate, by name.
+def find_sequences(data: Path | None, min_hz: float = _MIN_HZ) -> dict[str, Path]:
+    """Recordings with ground truth and images at no less than a rate, by name; a camera's rate when none is given.
 
     Raises:
         EvaluationError: If ``data`` is given but is no folder.
@@ -92,7 +92,7 @@ def find_sequences(data: Path | None) -> dict[str, Path]:
         except EdgeSlamError:
             continue
         stamps = dataset.frame_stamps_s
-        if len(stamps) > 30 and 1.0 / float(np.median(np.diff(stamps))) >= _MIN_HZ:
+        if len(stamps) > 30 and 1.0 / float(np.median(np.diff(stamps))) >= min_hz:
             found[dataset.name] = folder
     return found
 

@@ -74,6 +74,11 @@ def test_edges_alone_find_the_pose(flight, tracker, rng, index):
     assert pose.edges > 300
 
 
+def test_switched_off_no_edges_are_looked_for(flight, tracker):
+    off = EdgeTracker(tracker.map, tracker.edges, tracker.camera, enabled=False)
+    assert off.refine(grey_of(flight, 1), se3.inverse(flight.T_w_c[1])) is None
+
+
 def test_from_farther_off_a_wrong_pose_is_not_believed(flight, tracker, rng):
     """Up to 30 px: edges meet the wrong neighbours, in some starts; no such pose counts as fixed."""
     found = 0

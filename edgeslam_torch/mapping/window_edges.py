@@ -1,0 +1,147 @@
+"""Edges and corners of a window's keyframes as terms of its refinement: while flying and at the end."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from edgeslam_torch.config import WindowConfig
+from edgeslam_torch.frontend.canny import canny
+from edgeslam_torch.frontend.edges import extract_edges
+from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.losses.cycle import CycleForm
+from edgeslam_torch.map.keyframe import Keyframe
+from edgeslam_torch.mapping.edge_map import EdgeMap, EdgePoints
+from edgeslam_torch.mapping.window_terms import (
+    PlacedEdges,
+    Structure,
+    TermConfig,
+    edge_terms,
+    junction_terms,
+    make_structure,
+)
+from edgeslam_torch.optim.problem import WindowProblem
+from edgeslam_torch.types import FloatArray
+
+FEW_ANCHORS = 100
+"""Anchors of a keyframe below which edges join its window: as many as start a map, and as tracking's threshold."""
+
+
+@dataclass(frozen=True, slots=True)
+class Placed:
+    """A window with its edge and corner terms."""
+
+    problem: WindowProblem
+    edges: PlacedEdges | None
+
+    @property
+    def has_terms(self) -> bool:
+        """Whether any edge or corner found a partner."""
+        return self.problem.edges is not None or self.problem.junctions is not None
+
+
+class WindowEdges:
+    """Makes the terms of windows; remembers the last window's indexed edges.
+
+    Args:
+        edges: Measured edges by keyframe.
+        camera: Of the keyframes.
+        config: Which terms, and in which form.
+        flying: Keyframes whose edges are not measured yet take part as targets.
+    """
+
+    def __init__(self, edges: EdgeMap, camera: Camera, config: WindowConfig, flying: bool) -> None:
+        self.edges = edges
+        self.camera = camera
+        self.config = config
+        self.flying = flying
+        self.terms = term_config(config)
+        self._indexed: dict[int, _Indexed] = {}
+        """Of the last window, by keyframe."""
+
+    def wanted(self, newest: Keyframe) -> bool:
+        """Whether the window of a new keyframe gets terms while flying."""
+        if self.config.in_flight == "few":
+            return newest.features.faint or int(np.count_nonzero(newest.anchor >= 0)) < FEW_ANCHORS
+        return self.config.in_flight == "always"
+
+    def place(self, problem: WindowProblem, keyframes: list[Keyframe]) -> Placed:
+        """Add the terms to a window whose first poses are those of the keyframes, the free ones first.
+
+        While flying, the free keyframes' edges are used, and the others as partners.
+        """
+        free = int(np.count_nonzero(~problem.pose_fixed))
+        terms = replace(self.terms, hosts=free) if self.flying else self.terms
+        structures = self._structures(keyframes)
+        T_c_w, K = problem.T_c_w[: len(keyframes)], problem.K
+        placed = edge_terms(structures, T_c_w, K, terms) if self.config.uses_edges else None
+        corners = junction_terms(structures, T_c_w, K, terms) if self.config.uses_corners else None
+        return Placed(replace(problem, edges=None if placed is None else placed.terms, junctions=corners), placed)
+
+    def write_back(self, keyframes: list[Keyframe], placed: PlacedEdges | None, inverse_depth: FloatArray) -> None:
+        """Write refined depths back to the keyframes' edge points."""
+        if placed is None:
+            return
+        hosts = {h.keyframe_id: h for h in self.edges.hosts}
+        good = np.isfinite(inverse_depth) & (inverse_depth > 0)
+        for pose in np.unique(placed.terms.host):
+            mine = np.flatnonzero((placed.terms.host == pose) & good)
+            host, index = hosts[keyframes[pose].id], placed.index[mine]
+            host.p_c[index] = self.camera.back_project(host.uv[index], 1.0 / inverse_depth[mine])
+
+    def _structures(self, keyframes: list[Keyframe]) -> list[Structure]:
+        """The keyframes' edges; only their depths are read anew where a keyframe was in the last window too."""
+        hosts = {h.keyframe_id: h for h in self.edges.hosts}
+        self._indexed = {k.id: self._index(k, hosts.get(k.id)) for k in keyframes}
+        return [self._indexed[k.id].now(hosts.get(k.id)) for k in keyframes]
+
+    def _index(self, keyframe: Keyframe, host: EdgePoints | None) -> "_Indexed":
+        uv = None if host is None else host.uv
+        known = self._indexed.get(keyframe.id)
+        if known is not None and known.uv is uv:
+            return known
+        config, grey = self.edges.config, keyframe.grey
+        pixels: FloatArray
+        if grey is None or (uv is None and not self.flying):
+            grey, pixels = np.zeros((self.camera.height, self.camera.width), np.uint8), np.zeros((0, 2))
+        elif uv is None:
+            pixels = extract_edges(grey, config.canny_low, config.canny_high, config.max_pixels).uv
+        else:
+            pixels = uv
+        corners = self.config.uses_corners and uv is not None
+        mask = canny(grey, config.canny_low, config.canny_high) if corners else None
+        unknown = np.zeros(len(pixels))
+        return _Indexed(uv, make_structure(grey, pixels, unknown, unknown, mask))
+
+
+@dataclass(frozen=True, slots=True)
+class _Indexed:
+    """A keyframe's indexed edges."""
+
+    uv: FloatArray | None
+    """The measured edges that they were made of; None for unmeasured ones."""
+    structure: Structure
+
+    def now(self, host: EdgePoints | None) -> Structure:
+        """With depths as they are now."""
+        if host is None or len(self.structure.field.edges.uv) != len(host.uv):
+            return self.structure
+        z = host.p_c[:, 2]
+        field = replace(self.structure.field, inverse_depth=1.0 / z)
+        return replace(self.structure, field=field, sigma=host.sigma / z**2)
+
+
+def term_config(config: WindowConfig) -> TermConfig:
+    """Terms of a window for the given settings."""
+    default = TermConfig()
+    cycle_sigma = {"relative": default.cycle_sigma, "literal": 1.0, "off": 0.0}[config.cycle]
+    return TermConfig(
+        edges_per_pose=config.edges_per_keyframe,
+        targets=config.targets,
+        edge_sigma_px=default.edge_sigma_px if config.alignment else 0.0,
+        cycle=CycleForm.PIXEL if config.cycle == "literal" else CycleForm.RELATIVE_DEPTH,
+        cycle_sigma=cycle_sigma,
+        collinearity=config.collinearity,
+        # The literal angle's residual is identically zero: omitting it is equivalent.
+        angle_sigma=default.angle_sigma if config.angle in ("arms", "cosine") else 0.0,
+        cosines=config.angle == "cosine",
+    )

@@ -1,0 +1,135 @@
+"""Edges in the windows while flying: where they take part, whose edges, and what comes back."""
+
+import pickle
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from rendered import CAMERA, film, sideways, stairs_world
+
+from edgeslam_torch.config import DepthConfig, SlamConfig, WindowConfig
+from edgeslam_torch.eval.benchmark.ablation import pickled
+from edgeslam_torch.losses.cycle import CycleForm
+from edgeslam_torch.map.slam_map import SlamMap
+from edgeslam_torch.mapping.edge_map import EdgeMap
+from edgeslam_torch.mapping.refinement import choose_window, refine, window_problem
+from edgeslam_torch.mapping.window_edges import FEW_ANCHORS, WindowEdges, term_config
+from edgeslam_torch.optim.problem import LmConfig
+from edgeslam_torch.slam import EdgeSlam
+
+ALWAYS = WindowConfig(in_flight="always")
+
+
+@lru_cache(maxsize=1)
+def flown() -> bytes:
+    filmed = film(stairs_world(), CAMERA, sideways(30, 0.03, turn_rad=0.004))
+    slam = EdgeSlam(CAMERA, SlamConfig(depth=DepthConfig(weights="none")))
+    for frame in filmed.frames:
+        slam.step(frame)
+    return pickled((slam.map, slam.edges))
+
+
+def state() -> tuple[SlamMap, EdgeMap]:
+    slam_map, edges = pickle.loads(flown())
+    edges.map = slam_map
+    return slam_map, edges
+
+
+def flying(edges: EdgeMap, config: WindowConfig = ALWAYS) -> WindowEdges:
+    terms = config.flying
+    assert terms is not None
+    return WindowEdges(edges, CAMERA, terms, flying=True)
+
+
+def test_edges_join_where_corners_are_few():
+    slam_map, edges = state()
+    rich = slam_map.latest()
+    assert np.count_nonzero(rich.anchor >= 0) >= FEW_ANCHORS
+    assert not rich.features.faint
+    few = flying(edges, WindowConfig(in_flight="few"))
+    assert flying(edges).wanted(rich)
+    assert not few.wanted(rich)
+    assert few.wanted(replace(rich, features=replace(rich.features, faint=True)))
+    assert few.wanted(replace(rich, anchor=np.full_like(rich.anchor, -1)))
+    assert WindowConfig(in_flight="off").flying is None
+
+
+def test_free_keyframes_bring_edges_and_unmeasured_ones_are_partners():
+    slam_map, edges = state()
+    window = choose_window(slam_map, slam_map.latest(), 4, 15)
+    keyframes = [*window.free, *window.fixed]
+    measured = {h.keyframe_id for h in edges.hosts}
+    assert slam_map.latest().id not in measured
+    problem, _ = window_problem(slam_map, window, CAMERA, LmConfig())
+    terms = flying(edges).place(problem, keyframes).problem.edges
+    assert terms is not None
+    hosts = {keyframes[pose].id for pose in terms.host}
+    assert hosts
+    assert hosts <= measured & {k.id for k in window.free}
+    partners = {keyframes[pose].id for pose in terms.pair_pose}
+    assert partners - measured, "the newest keyframes' edges were not used"
+    unmeasured = np.array([keyframes[pose].id not in measured for pose in terms.pair_pose])
+    assert (terms.pair_inverse_depth[unmeasured] == 0).all()  # no depth there, so no cycle
+    assert (terms.pair_inverse_depth[~unmeasured] > 0).all()
+    assert np.bincount(terms.host).max() <= ALWAYS.in_flight_edges
+
+
+def test_a_disturbed_pose_comes_back_by_edges_alone():
+    slam_map, edges = state()
+    window = choose_window(slam_map, slam_map.latest(), 4, 15)
+    moved = next(k for k in window.free if k.id in {h.keyframe_id for h in edges.hosts})
+    true = moved.T_c_w.copy()
+    moved.T_c_w = true.copy()
+    moved.T_c_w[0, 3] += 0.01
+    for keyframe in window.free:
+        keyframe.anchor[:] = -1
+    window = replace(window, anchor=window.anchor[:0])
+    assert refine(slam_map, window, CAMERA, LmConfig(max_iterations=20)) is None
+    result = refine(slam_map, window, CAMERA, LmConfig(max_iterations=20), edges=flying(edges))
+    assert result is not None
+    assert len(result.edge_inverse_depth) > 100
+    assert abs(moved.T_c_w[0, 3] - true[0, 3]) < 0.005
+
+
+def test_depths_go_back_to_the_keyframes_and_are_read_anew():
+    slam_map, edges = state()
+    window = choose_window(slam_map, slam_map.latest(), 4, 15)
+    terms, depth = flying(edges), {h.keyframe_id: h.p_c[:, 2].copy() for h in edges.hosts}
+    for _ in range(2):
+        keyframes = [*window.free, *window.fixed]
+        problem, _ = window_problem(slam_map, window, CAMERA, LmConfig())
+        placed = terms.place(problem, keyframes)
+        assert placed.edges is not None
+        terms.write_back(keyframes, placed.edges, placed.edges.terms.inverse_depth / 1.01)
+    used = [h for h in edges.hosts if not np.array_equal(h.p_c[:, 2], depth[h.keyframe_id])]
+    assert used
+    ratio = np.concatenate([h.p_c[:, 2] / depth[h.keyframe_id] for h in used])
+    assert np.isclose(ratio, 1.01**2, rtol=1e-3).sum() > 100  # twice, from what the first round left
+
+
+@pytest.mark.parametrize(
+    ("losses", "alignment", "cycle", "angle", "collinearity"),
+    [
+        (("alignment", "cycle"), True, "relative", "off", "off"),
+        (("cycle",), False, "relative", "off", "off"),
+        (("alignment", "angle"), True, "off", "arms", "off"),
+        (("collinearity",), False, "off", "off", "relative"),
+    ],
+)
+def test_losses_of_the_flying_windows_are_chosen_one_by_one(losses, alignment, cycle, angle, collinearity):
+    terms = WindowConfig(in_flight_losses=losses).flying
+    assert terms is not None
+    assert (terms.alignment, terms.cycle, terms.angle, terms.collinearity) == (alignment, cycle, angle, collinearity)
+    assert terms.edges_per_keyframe == terms.in_flight_edges
+
+
+def test_forms_chosen_for_the_end_hold_while_flying_and_unknown_losses_are_refused():
+    terms = WindowConfig(cycle="literal").flying
+    assert terms is not None
+    assert term_config(terms).cycle is CycleForm.PIXEL
+    assert WindowConfig(in_flight_losses=()).flying is None
+    with pytest.raises(ValueError, match="in_flight_losses must be among alignment, cycle, angle, collinearity"):
+        WindowConfig(in_flight_losses=("edges",))
+    with pytest.raises(ValueError, match="in_flight must be one of off, few, always"):
+        WindowConfig(in_flight="sometimes")
