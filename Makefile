@@ -1,6 +1,7 @@
 # From a bare Python 3.11 and a fresh clone: `make demo`, `make test`. The first call makes .venv (minutes, most of it
 # the download of torch); later calls find the stamp file and start at once.
 #   make test PYTEST_ARGS="-k ply"
+#   make test WORKERS=0                          in one process, for a debugger; otherwise one process a core
 #   make demo PIP_ARGS="--extra-index-url URL"   another package index, e.g. torch's own with the smaller CPU build
 SHELL := /bin/bash
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
@@ -8,6 +9,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 PIP_ARGS ?=
 PYTEST_ARGS ?=
+WORKERS ?= logical
 DEMO_ARGS ?= --out runs/demo
 MUTANTS_ARGS ?=
 STAMP := $(VENV)/.installed
@@ -31,9 +33,12 @@ $(STAMP): pyproject.toml constraints.txt
 demo: $(STAMP)
 	$(BIN)/edgeslam demo $(DEMO_ARGS)
 
+# One process a core, each with one thread of torch; a file's tests stay together as long as no process is idle.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
+
 # The examples in docstrings are tests too.
 test: $(STAMP)
-	$(BIN)/python -m pytest --doctest-modules --doctest-ignore-import-errors tests edgeslam_torch $(PYTEST_ARGS)
+	$(PYTEST) --doctest-modules --doctest-ignore-import-errors tests edgeslam_torch $(PYTEST_ARGS)
 
 test-slow: $(STAMP)
 	$(BIN)/python -m pytest -m slow $(PYTEST_ARGS)

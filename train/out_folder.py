@@ -80,11 +80,11 @@ class OutFolder:
             if self.existing is Existing.RESUME:
                 raise ConfigError(f"{self.path}: nothing to resume there")
             return
-        if self.existing is Existing.OVERWRITE or not self.step:
+        if self.existing is Existing.OVERWRITE or not (step := self.step):
             return
         steps = given.settings["steps"]
-        if self.step > steps:
-            raise ConfigError(f"{self.path}: has {self.step} steps behind it, so it cannot end after {steps}")
+        if step > steps:
+            raise ConfigError(f"{self.path}: has {step} steps behind it, so it cannot end after {steps}")
         ignored = WITH_RESUME if self.existing is Existing.RESUME else NOT_COMPARED
         different = given_from_json(record["given"]).differences(given, ignored)
         if different:

@@ -216,8 +216,8 @@ def _finetune(
     if rank() == 0:
         for line in data.describe():
             print(line, flush=True)
-        if not args.overwrite and 0 < out.step < args.steps:
-            print(f"{out.path}: goes on after step {out.step}", flush=True)
+        if not args.overwrite and 0 < (step := out.step) < args.steps:
+            print(f"{out.path}: goes on after step {step}", flush=True)
     return finetune(network, metadata, data, config, out, from_runs, reading)
 
 
@@ -246,6 +246,6 @@ def _data(args: argparse.Namespace, items: list[_Item], out: "OutFolder") -> "Da
 
 def _left(out: "OutFolder") -> str:
     """Message after an interrupt."""
-    if out.step:
-        return f"{out.path} holds step {out.step}, and the same command goes on from there"
+    if step := out.step:
+        return f"{out.path} holds step {step}, and the same command goes on from there"
     return "no step was saved"

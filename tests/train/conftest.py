@@ -7,6 +7,8 @@ import pytest
 import torch
 from posed_run import write_run
 
+from edgeslam_torch.train import watchers
+
 
 @pytest.fixture(autouse=True)
 def one_thread() -> Iterator[None]:
@@ -15,6 +17,12 @@ def one_thread() -> Iterator[None]:
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(before)
+
+
+@pytest.fixture(autouse=True)
+def small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In TensorBoard: writing them would take longer than the training."""
+    monkeypatch.setattr(watchers, "PICTURE_SIZE", (80, 60))
 
 
 @pytest.fixture(scope="session")
