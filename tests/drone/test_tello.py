@@ -320,18 +320,6 @@ def test_centred_sticks_that_are_lost_are_said_again(emulate):
     assert len(lost) == 5
 
 
-def test_a_controller_that_goes_on_is_not_disturbed(emulate):
-    emulator, address = emulate()
-    with Tello(address, allow_motion=True) as tello:
-        tello.connect(PATIENCE_S)
-        tello.take_off()
-        stop = time.monotonic() + 1.0
-        while time.monotonic() < stop:
-            tello.rc(0.0, 0.0, 0.0, 0.2)
-            threading.Event().wait(0.02)
-        assert set(pushed_and_centred(emulator)) == {"rc 0 0 0 20"}
-
-
 def test_a_movement_takes_the_sticks_out_of_the_hand(emulate):
     """One ``rc`` that centres them, then the movement, and no more ``rc`` into it."""
     emulator, address = emulate()

@@ -12,6 +12,7 @@ from point_map import CAMERA, PointMap
 
 from edgeslam_torch.config import DepthConfig, EdgeConfig, SlamConfig
 from edgeslam_torch.geometry import se3
+from edgeslam_torch.map.trajectory import TrajectoryLog
 from edgeslam_torch.mapping.edge_map import EdgeMap, EdgePoints
 from edgeslam_torch.slam import EdgeSlam
 
@@ -44,6 +45,8 @@ def slam(points):
     slam.map = points.map
     slam.edges = EdgeMap(points.map, CAMERA, EdgeConfig(voxel=1e-6), 0.35)
     slam.edges.hosts += [host(points, id) for id in range(3)]
+    slam.log = TrajectoryLog(points.map)
+    slam.log.append(0, 0.0, 2, points.map.pose_of(2), True)  # the camera is in the piece of map that is shown
     return slam
 
 
@@ -114,6 +117,7 @@ def test_anchors_that_are_replaced_while_they_are_read_are_the_old_ones_or_the_n
     anchors.sigma[alive] = 1.0
     anchors.colour = anchors.colour.view(Meddled)
     cloud = slam.anchors()
+    assert len(cloud.p_w) == len(alive) > 100
     assert np.unique(cloud.colour).tolist() == np.unique(cloud.sigma_m).tolist()
 
 

@@ -148,7 +148,7 @@ def test_maps_are_read_and_frames_are_tracked_while_the_network_runs():
     def depth(image, camera):
         if threading.current_thread() is not threading.main_thread():
             inside.set()
-            assert go_on.wait(120.0)
+            assert go_on.wait(60.0)
 
     scheduler = Scheduler()
     slam = realtime(scheduler, depth)
