@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from point_map import check_map
 from rendered import CAMERA, film, patchwork, sideways, stairs_world
+from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.config import DepthConfig, SlamConfig
 from edgeslam_torch.errors import SourceError
@@ -72,7 +73,8 @@ def statuses(outputs):
 def test_sideways_flight_without_a_network_is_right_up_to_scale():
     slam, outputs = panels_run()
     stamps, T_w_c = slam.trajectory()
-    assert ate(T_w_c, panels().T_w_c) < 0.012  # 1 % of the path; 0.004 when written
+    assert ate(T_w_c, panels().T_w_c) < 0.0045  # of 1.2 m; 0.0031 when written
+    assert ate(np.stack([o.T_w_c for o in outputs]), panels().T_w_c) < 0.011  # live; 0.0079 when written
     np.testing.assert_array_equal(stamps, panels().stamps_s)
     assert set(statuses(outputs)) <= TRACKING
     assert not outputs[1].status.supported, "live, the map was still a guess"
@@ -88,8 +90,9 @@ def test_flight_with_known_depth_is_metric():
     slam, outputs = metric_run()
     _, T_w_c = slam.trajectory()
     truth = panels().T_w_c
-    assert ate(T_w_c, truth) < 0.012
-    assert ate(T_w_c, truth, "se3") < 0.04
+    assert ate(T_w_c, truth) < 0.0045  # 0.0033 when written
+    assert ate(T_w_c, truth, "se3") < 0.005  # 0.0036: lengths are right to 0.4 %
+    assert ate(np.stack([o.T_w_c for o in outputs]), truth, "se3") < 0.01  # live
     assert slam.scale.units is Units.METRES
     assert slam.scale.source == "depth"
     assert set(statuses(outputs)) <= TRACKING
@@ -163,16 +166,25 @@ def test_first_depth_map_unknown_at_every_keypoint_is_no_guess():
     assert np.linalg.norm(outputs[-1].T_w_c[:3, 3] - outputs[0].T_w_c[:3, 3]) > 0.05
 
 
-def test_edge_map_and_anchors_lie_on_the_surfaces():
-    slam, _ = panels_run()
-    _, T_w_c = slam.trajectory()
-    aligned = umeyama(T_w_c[:, :3, 3], panels().T_w_c[:, :3, 3], "sim3")
-    for cloud, least in ((slam.edge_map(), 5000), (slam.anchors(), 300)):
-        assert len(cloud.p_w) >= least
-        distance = panels().world.distance_to_surface(aligned.points(cloud.p_w.astype(np.float64)))
-        # Half a pixel at 260 px over a baseline of 40 cm is 4 cm at 3 m and 8 cm at the wall.
-        assert np.median(distance) < 0.05
-        assert np.mean(distance < 0.2) > 0.85
+def in_the_world(slam, p_w):
+    """Points of a map in the world of the images, the path's scale taken from it: and rotations, as it is straight."""
+    T_w_c, truth = slam.trajectory()[1], panels().T_w_c
+    R = Rotation.from_matrix(truth[:, :3, :3] @ np.swapaxes(T_w_c[:, :3, :3], 1, 2)).mean().as_matrix()
+    path, true_path = (T[:, :3, 3] - T[:, :3, 3].mean(0) for T in (T_w_c, truth))
+    scale = np.sum(true_path * (path @ R.T)) / np.sum(path**2)
+    return scale * (p_w - T_w_c[:, :3, 3].mean(0)) @ R.T + truth[:, :3, 3].mean(0)
+
+
+@pytest.mark.parametrize("run", [panels_run, metric_run])
+def test_edge_map_and_anchors_lie_on_the_surfaces(run):
+    """Half a pixel at 260 px over 40 cm is 4 cm at 3 m: edges seen from many places are nearer than that."""
+    slam, _ = run()
+    # Median distance [m], share within 10 cm; 0.012 to 0.014, 0.97, 0.028 and 0.79 when written.
+    for cloud, count, median_m, share in ((slam.edge_map(), 14_000, 0.018, 0.95), (slam.anchors(), 900, 0.036, 0.75)):
+        assert len(cloud.p_w) >= count
+        distance = panels().world.distance_to_surface(in_the_world(slam, cloud.p_w.astype(np.float64)))
+        assert np.median(distance) < median_m
+        assert np.mean(distance < 0.1) > share
         assert cloud.observations.min() >= 2
         assert np.isfinite(cloud.p_w).all()
     assert slam.edge_map().colour.std() > 20

@@ -88,8 +88,8 @@ def test_anchors_behind_the_camera_do_not_count(points):
     assert np.isnan(depth_prior(keyframe, keyframe.features.uv[:4], points.map.anchors.p_w, 0.35)[0]).all()
 
 
-@pytest.mark.parametrize("twist", [0.0, 0.3])
-def test_network_that_errs_is_bent_towards_the_anchors_and_trusted_less(points, twist):
+@pytest.mark.parametrize(("twist", "sigma_log"), [(0.0, 0.051), (0.3, 0.061)])
+def test_network_that_errs_is_bent_towards_the_anchors_and_trusted_less(points, twist, sigma_log):
     """An error that grows across the image, as in an unfamiliar room, with a stated sigma of 1 %."""
     keyframe, z = points.keyframes[0], true_depth(points, 0)
     u, v = np.rint(keyframe.features.uv).astype(int).T
@@ -101,5 +101,5 @@ def test_network_that_errs_is_bent_towards_the_anchors_and_trusted_less(points, 
     known = np.isfinite(prior)
     left = np.abs(np.log(prior / z))[known]
     assert np.median(left) <= 0.5 * np.median(np.abs(error)) + 0.01
-    assert np.median(prior_sigma[known]) == pytest.approx(0.051, abs=0.003) or twist > 0
-    assert np.mean(left < 2.5 * prior_sigma[known]) > 0.97
+    assert np.median(prior_sigma[known]) == pytest.approx(sigma_log, abs=0.003)
+    assert np.mean(left < 2.5 * prior_sigma[known]) > 0.95

@@ -104,16 +104,19 @@ def test_sigma_covers_the_error(flight, tracker, rng):
 def test_parallel_lines_do_not_fix_a_pose():
     tracker = tracker_on(STRIPES, np.full((240, 320), 2.0), np.eye(4))
     pose = tracker.refine(STRIPES, np.eye(4))
-    assert pose is None or not pose.is_fixed
+    assert pose.edges > 500
+    assert not pose.is_fixed
 
 
 def test_an_image_of_another_place_is_rejected(tracker, flight, rng):
+    """Some edges meet others by chance, a tenth to a fifth of those in view; noise has more to meet."""
     noise = rng.integers(0, 255, (240, 320), dtype=np.uint8)
-    pose = tracker.refine(noise, se3.inverse(flight.T_w_c[0]))
     other = film(stairs_world(99), CAMERA, sideways(1, 0.0)).frames[0].image[..., 1].copy()
-    elsewhere = tracker.refine(other, se3.inverse(flight.T_w_c[0]))
-    assert pose is None or not pose.is_fixed or off(pose.T_c_w, flight.T_w_c[0])[0] < 0.05
-    assert elsewhere is None or not elsewhere.is_fixed
+    for start in (np.eye(4), small_motion(rng, 0.02, 0.02)):
+        for image in (noise, other):
+            pose = tracker.refine(image, start @ se3.inverse(flight.T_w_c[0]))
+            assert pose.in_view > 500
+            assert not pose.is_fixed
 
 
 @pytest.mark.parametrize("grey", [0, 255])
