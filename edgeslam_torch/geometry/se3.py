@@ -29,8 +29,10 @@ def exp(xi: FloatArray) -> FloatArray:
     u, v, w, x, y, z = (float(value) for value in xi)
     theta2 = x * x + y * y + z * z
     theta = math.sqrt(theta2)
-    if theta < 1e-6:  # Taylor terms; the next one is below float64 resolution
-        a, b, c = 1.0 - theta2 / 6.0, 0.5 - theta2 / 24.0, 1.0 / 6.0 - theta2 / 120.0
+    if theta < 1e-3:  # Taylor terms, as 1 - cos cancels; the next ones are below float64 resolution
+        a = 1.0 - theta2 / 6.0 + theta2 * theta2 / 120.0
+        b = 0.5 - theta2 / 24.0 + theta2 * theta2 / 720.0
+        c = 1.0 / 6.0 - theta2 / 120.0 + theta2 * theta2 / 5040.0
     else:
         a = math.sin(theta) / theta
         b = (1.0 - math.cos(theta)) / theta2

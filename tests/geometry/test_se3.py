@@ -20,13 +20,20 @@ def test_quarter_turn_about_z_worked_by_hand():
     np.testing.assert_allclose(T[:3, 3], [2 / np.pi, 2 / np.pi, 0.0], atol=1e-15)
 
 
+@pytest.mark.parametrize("angle", [1e-9, 0.99e-6, 1.01e-6, 1e-5, 0.99e-3, 1.01e-3, 0.1, 3.0])
+def test_small_arcs_bend_as_the_circle_does(angle):
+    """One unit along x while turning about z: it ends ``tan(angle / 2)`` of the way aside."""
+    T = se3.exp(np.array([1.0, 0.0, 0.0, 0.0, 0.0, angle]))
+    np.testing.assert_allclose(T[1, 3] / T[0, 3], np.tan(0.5 * angle), rtol=1e-9)
+    np.testing.assert_allclose(T[:2, 0], [np.cos(angle), np.sin(angle)], rtol=1e-13)
+
+
 @settings(max_examples=60, deadline=None)
 @given(tangents)
 def test_exp_is_the_matrix_exponential(xi):
-    """To 1e-9: just above the angles that take the series, ``1 - cos`` has lost all but four digits."""
     generator = np.zeros((4, 4))
     generator[:3, :3], generator[:3, 3] = se3.hat(xi[3:]), xi[:3]
-    np.testing.assert_allclose(se3.exp(xi), expm(generator), atol=1e-9)
+    np.testing.assert_allclose(se3.exp(xi), expm(generator), atol=1e-12)
 
 
 @settings(max_examples=60, deadline=None)
