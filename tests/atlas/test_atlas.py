@@ -85,8 +85,12 @@ def test_two_pieces_of_one_place_become_one(rng):
 def test_a_piece_is_asked_again_only_by_new_keyframes(rng):
     pieces = Pieces(rng)
     atlas = pieces.atlas()
+    assert not atlas.is_up_to_date
     assert atlas.update() is not None
     assert atlas.update() is None
+    assert atlas.is_up_to_date
+    atlas.ask_all_again()
+    assert not atlas.is_up_to_date
     assert len(atlas.joins) == 1
 
 
