@@ -94,8 +94,8 @@ class FusionConfig:
     """Scale error of the drone's own velocity that no averaging removes."""
     height_systematic_log: float = 0.02
     """The same of height, compared with a climb of decimetres: over that the map itself bends by a centimetre."""
-    truncation_systematic_log: float = 0.03
-    """The same when readings are truncated: what happens below one step stays unknown."""
+    truncation_systematic_log: float = 0.015
+    """The same when readings are truncated: the remainders rest on a noise before them that is assumed."""
     sigma_tof_m: float = 0.015
     sigma_h_m: float = 0.06
     """SDK ``h`` moves in steps of 10 cm."""

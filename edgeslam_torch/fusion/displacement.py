@@ -46,9 +46,6 @@ _TUKEY = 4.685
 _LEAST_WEIGHT = 1e-4
 _BENT = 0.2
 """Share of a way by which the map may be off without the reading being a wild one: that is what is to be mended."""
-_AGNOSTIC = 4.0
-"""Log odds that take the prior for rounding out of `TelemetryTrack.truncation_probability`: where no velocity swept
-through zero nothing is known, and a positions' factor has to say so."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,6 +115,8 @@ class TelemetryModel:
     """Whether velocities may speak."""
     height: str | None
     """Name of the height that may speak, if any."""
+    truncates: float
+    """Probability that velocities are truncated, not rounded."""
 
     def positions(
         self, stamps_s: FloatArray, p_m: FloatArray, scale_sigma_log: float | None = None
@@ -165,7 +164,7 @@ class TelemetryModel:
         if len(use) == 0:
             return None
         step = self.config.velocity_step_m_s
-        truncates = self._truncation()
+        truncates = self.truncates
         moved = np.diff(self.track.displacement(at_s, truncates * 0.5 * step), axis=0)[use]
         lever = self.track.attitude(at_s) @ self.T_b_c[:3, 3]
         d = moved + np.diff(lever, axis=0)[use]
@@ -179,7 +178,7 @@ class TelemetryModel:
         share = _shares(told.stamp_s, start, end)  # (N, S)
         heard = np.flatnonzero(share.any(axis=0))
         share = share[:, heard]
-        R_w = self._axes(told.stamp_s[heard])
+        R_w = self.track.axes()[heard]
         raw = np.einsum("swa,sw->sa", R_w, told.velocity[heard])
         U = _runs(share, raw, R_w, step, truncates)
         bias = BIAS_M_S**2 * np.exp(-np.abs(start[:, None] - start[None]) / BIAS_MEMORY_S) * np.outer(L, L)
@@ -207,21 +206,6 @@ class TelemetryModel:
             group,
             np.repeat(np.linalg.norm(d, axis=1), 3),
         )
-
-    def _axes(self, stamps_s: FloatArray) -> FloatArray:
-        """Axes in which the drone gives its velocity, to world ``(S, 3, 3)``."""
-        if self.config.velocity_frame == "body":
-            return self.track.attitude(stamps_s)
-        return np.broadcast_to(np.eye(3), (len(stamps_s), 3, 3))
-
-    def _truncation(self) -> float:
-        """Probability that velocities are truncated."""
-        fixed = {"nearest": 0.0, "truncate": 1.0}.get(self.config.velocity_rounding)
-        if fixed is not None:
-            return fixed
-        p = self.track.truncation_probability(self.config.velocity_step_m_s)
-        odds = p / max(1.0 - p, 1e-12) * math.exp(_AGNOSTIC)
-        return odds / (1.0 + odds)
 
     def _heights(self, at_s: FloatArray, sigma_log: float) -> _Rows | None:
         name = self.height

@@ -41,6 +41,8 @@ from edgeslam_torch.fusion.telemetry_scale import TelemetryFit, TelemetryScale
 from edgeslam_torch.types import FloatArray, Health, ScaleEstimate, TelemetrySample
 
 _REFIT_S = 1.0
+_FIRST_FIT_S = 0.5
+"""Time from one fit to the next as long as telemetry has told no scale: a displacement's length."""
 _REFIT_SHARE = 0.12
 """Each fit costs more and changes less than the one before."""
 _BELIEVED = 0.3
@@ -362,12 +364,14 @@ class MotionFusion:
             told.sigma,
             self._trust.velocity,
             heights[0] if heights else None,
+            self._fit.truncates,
         )
 
     # --- estimation ----------------------------------------------------------------------------------------------
 
     def _is_due(self, stamp_s: float) -> bool:
-        pause_s = max(_REFIT_S, _REFIT_SHARE * min(self._memory.length_s, self.config.window_s))
+        first_s = _FIRST_FIT_S if self._by_telemetry is None else _REFIT_S
+        pause_s = max(first_s, _REFIT_SHARE * min(self._memory.length_s, self.config.window_s))
         return len(self._track) > 0 and (self._R_w_m is None or stamp_s - self._fitted_s >= pause_s)
 
     def _refit(self) -> None:

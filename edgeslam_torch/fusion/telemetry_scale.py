@@ -12,9 +12,21 @@ from edgeslam_torch.fusion.scale.log_scale import LogScale, floor_segments
 from edgeslam_torch.fusion.telemetry.comparison import FlightSoFar
 from edgeslam_torch.fusion.telemetry.plausibility import AtOdds, Reading, Trust, agreement, changes
 from edgeslam_torch.fusion.telemetry.visual_memory import Displacements
+from edgeslam_torch.fusion.telemetry.whole_steps import (
+    Rounding,
+    SeenVelocity,
+    remainder_gain,
+    seen_velocity,
+)
 from edgeslam_torch.types import FloatArray, IntArray
 
-_IMPROBABLE = 1e-4
+_MOST_ROUNDS = 5
+_SETTLED = 0.003
+"""Relative change of the scale below which remainders need not be computed again: a third of `systematic_log`."""
+_MOST_CHANGE = 0.5
+_UNDITHERED = 0.05
+"""Error of all remainders together, in steps: with 0.2 to 0.3 steps of noise before the rounding a reading is off by
+0.15 to 0.05 steps in the mean, up or down with the speed, and the speeds of a flight average two thirds of it."""
 _MOST_GAP = 6.0
 """Sigmas between velocity and height beyond which one hypothesis is not made any less probable."""
 _MOST_SIGMA = 0.5
@@ -48,6 +60,8 @@ class TelemetryFit:
     """Velocities (``telemetry``) and ``height`` on their own."""
     shortfall_m_s: float = 0.0
     """How much every velocity that is not zero reads low, as likely as not."""
+    truncates: float = 0.5
+    """Probability that velocities are truncated, not rounded."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,8 +70,8 @@ class _Hypothesis:
 
     log_scale: float
     sigma: float
-    gap: float
-    """How far velocity and height are apart, in sigmas of the difference."""
+    log_odds: float
+    """How well it explains the displacements, up to a constant, less what puts velocity and height apart."""
     fit: TelemetryFit
 
 
@@ -75,6 +89,31 @@ class _Given:
     def opinion(self) -> LogScale:
         """In logarithms."""
         return LogScale(math.log(self.scale), self.sigma, self.name)
+
+
+@dataclass(frozen=True, slots=True)
+class _Shown:
+    """What velocities are compared with."""
+
+    intervals: Displacements
+    """On telemetry's clock."""
+    told: FloatArray
+    """``(N, 3)`` their displacements by the readings as they are [m]."""
+    velocity: SeenVelocity
+    start: float
+    """Scale to begin with, from the lengths of both."""
+
+    @property
+    def speed(self) -> float:
+        """Root mean square [map units/s]."""
+        return math.sqrt(
+            float(np.mean(np.sum((self.intervals.moved / self.intervals.duration_s[:, None]) ** 2, axis=1)))
+        )
+
+    @property
+    def ends_s(self) -> FloatArray:
+        """Starts and ends ``(2 N,)``."""
+        return np.concatenate([self.intervals.from_s, self.intervals.to_s])
 
 
 class TelemetryScale:
@@ -103,39 +142,40 @@ class TelemetryScale:
         self._config, self._T_b_c = config, T_b_c
         self._present, self._trust = present, trust
         self._delay_s, self._R_w_m, self._held = delay_s, R_w_m, held
+        self._shown = self._compared() if trust.velocity else None
 
     def opinion(self) -> tuple[LogScale, TelemetryFit] | None:
         """Scale for readings rounded to the nearest step or truncated; ``None`` where nothing tells.
 
-        The mean of both, weighted by how probable each is; its sigma spans them while that is open. Readings that would
-        put velocity and height at odds are so much the less probable.
+        The mean of both, weighted by how probable each is; its sigma spans them while that is open. The better one of
+        them explains the sweeps through zero and the displacements that the images show, and the less it puts velocity
+        and height at odds, the more probable it is.
         """
         config = self._config
-        half = 0.5 * config.velocity_step_m_s
-        share = {"nearest": 0.0, "truncate": 1.0}.get(config.velocity_rounding)
-        if share is None:
-            share = self._present.track.truncation_probability(config.velocity_step_m_s)
-        mixed: list[tuple[float, _Hypothesis]] = []
-        for probability, shortfall_m_s, systematic in (
-            (1.0 - share, 0.0, config.systematic_log),
-            (share, half, config.truncation_systematic_log),
-        ):
-            if probability < _IMPROBABLE:
-                continue
-            found = self._together(shortfall_m_s, systematic)
-            if found is not None:
-                mixed.append((probability * math.exp(-0.5 * min(found.gap, _MOST_GAP) ** 2), found))
-        if not mixed:
+        fixed = {"nearest": Rounding.NEAREST, "truncate": Rounding.TRUNCATE}.get(config.velocity_rounding)
+        sweeps = 0.0 if fixed else self._present.track.truncation_log_odds(config.velocity_step_m_s)
+        systematic = {
+            Rounding.NEAREST: config.systematic_log,
+            Rounding.TRUNCATE: config.truncation_systematic_log,
+        }
+        tried = (Rounding.NEAREST, Rounding.TRUNCATE) if fixed is None else (fixed,)
+        found = {r: h for r in tried if (h := self._together(r, systematic[r])) is not None}
+        if not found:
             return None
+        log_odds = np.array([h.log_odds + (sweeps if r is Rounding.TRUNCATE else 0.0) for r, h in found.items()])
+        share = np.exp(log_odds - log_odds.max())
+        share /= share.sum()
+        mixed = list(zip(share.tolist(), found.values(), strict=True))
         best = max(mixed, key=lambda m: m[0])[1]
-        total = sum(p for p, _ in mixed)
-        mean = sum(p * o.log_scale for p, o in mixed) / total
-        variance = sum(p * (o.sigma**2 + (o.log_scale - mean) ** 2) for p, o in mixed) / total
-        return LogScale(mean, math.sqrt(variance), "+".join(best.fit.sources)), best.fit
+        mean = sum(p * o.log_scale for p, o in mixed)
+        variance = sum(p * (o.sigma**2 + (o.log_scale - mean) ** 2) for p, o in mixed)
+        truncates = dict(zip(found, share.tolist(), strict=True)).get(Rounding.TRUNCATE, 0.0)
+        fit = replace(best.fit, truncates=truncates)
+        return LogScale(mean, math.sqrt(variance), "+".join(fit.sources)), fit
 
-    def _together(self, shortfall_m_s: float, systematic: float) -> _Hypothesis | None:
+    def _together(self, rounding: Rounding, systematic: float) -> _Hypothesis | None:
         tilt = self._config.alignment_sigma_rad
-        moved = self._by_displacements(shortfall_m_s) if self._trust.velocity else None
+        moved = self._by_displacements(rounding)
         rough = self._rough(moved)
         if rough is None:
             return None
@@ -160,8 +200,10 @@ class TelemetryScale:
         sources = {g.name: SourceScale(g.scale, g.scale * g.sigma) for g in given}
         # Birge ratio: sources that disagree beyond their sigmas widen the result.
         sigma = max(1.0, gap) * together[1]
+        log_odds = (0.0 if moved is None else moved.log_likelihood) - 0.5 * min(gap, _MOST_GAP) ** 2
         moved = moved if "telemetry" in sources else None
-        return _Hypothesis(math.log(together[0]), sigma, gap, TelemetryFit(moved, sources, shortfall_m_s))
+        shortfall_m_s = 0.5 * self._config.velocity_step_m_s if rounding is Rounding.TRUNCATE else 0.0
+        return _Hypothesis(math.log(together[0]), sigma, log_odds, TelemetryFit(moved, sources, shortfall_m_s))
 
     def _alone(self, name: str, evidence: Evidence | None, systematic: float, rough: float) -> _Given | None:
         """What one kind of evidence says, with the error that no averaging removes."""
@@ -186,9 +228,46 @@ class TelemetryScale:
         wrong = network is not None and contradict(LogScale(math.log(alone[0]), alone[1], "telemetry"), network)
         return self._present.rough_scale if wrong else alone[0]
 
-    def _by_displacements(self, shortfall_m_s: float) -> Evidence | None:
-        track, config = self._present.track, self._config
-        moved = self._present.memory.displacements()
+    def _by_displacements(self, rounding: Rounding) -> Evidence | None:
+        """Velocities against displacements: the scale at which their remainders are what the images make expect."""
+        shown = self._shown
+        if shown is None:
+            return None
+        tilt, step = self._config.alignment_sigma_rad, self._config.velocity_step_m_s
+        intervals, told = shown.intervals, shown.told
+        scale = shown.start
+        for _ in range(_MOST_ROUNDS):
+            lost = shown.velocity.lost(shown.ends_s, scale, step, rounding)
+            evidence = self._evidence(intervals, told + lost[len(intervals) :] - lost[: len(intervals)])
+            alone = None if evidence is None else solved([evidence], tilt)
+            if evidence is None or alone is None:
+                return None
+            gain = remainder_gain(shown.velocity, intervals, self._R_w_m, scale, step, rounding)
+            speed_m_s = alone[0] * shown.speed
+            repeated = alone[1] * math.sqrt((1.0 - gain) ** -2 - 1.0)
+            softened = evidence.softened(alone[0] * math.hypot(repeated, _UNDITHERED * step / speed_m_s))
+            change = (alone[0] / scale - 1.0) / (1.0 - gain)
+            if abs(change) < _SETTLED:
+                break
+            scale *= 1.0 + float(np.clip(change, -_MOST_CHANGE, _MOST_CHANGE))
+        return softened
+
+    def _evidence(self, moved: Displacements, moved_m: FloatArray) -> Evidence | None:
+        config = self._config
+        return displacement_evidence(
+            moved.moved @ self._R_w_m.T,
+            moved_m,
+            moved.from_s,
+            moved.duration_s,
+            moved.sigma,
+            config.sigma_velocity_m_s * np.sqrt(0.1 * moved.duration_s),
+            config.alignment_sigma_rad,
+        )
+
+    def _compared(self) -> _Shown | None:
+        """Intervals in which the drone moves, as images and readings have them."""
+        track, config, memory = self._present.track, self._config, self._present.memory
+        moved = memory.displacements()
         if len(moved) == 0:
             return None
         use = track.covered(moved.from_s - self._delay_s, moved.to_s - self._delay_s)
@@ -196,22 +275,18 @@ class TelemetryScale:
             return None
         moved = moved.only(use).joined().on_telemetry_clock(self._delay_s)
         R_from, R_to = track.attitude(moved.from_s), track.attitude(moved.to_s)
-        told = track.displacement(np.concatenate([moved.from_s, moved.to_s]), shortfall_m_s)
+        told = track.displacement(np.concatenate([moved.from_s, moved.to_s]))
         moved_m = told[len(moved) :] - told[: len(moved)] + (R_to - R_from) @ self._T_b_c[:3, 3]
         moving = self._moving(moved, moved_m)
         if moving.sum() < 2:
             return None
         moved, moved_m = moved.only(moving), moved_m[moving]
-        duration_s = moved.duration_s
-        return displacement_evidence(
-            moved.moved @ self._R_w_m.T,
-            moved_m,
-            moved.from_s,
-            duration_s,
-            moved.sigma,
-            config.sigma_velocity_m_s * np.sqrt(0.1 * duration_s),
-            config.alignment_sigma_rad,
-        )
+        ways = float(np.sum(moved_m**2)), float(np.sum(moved.moved**2))
+        if min(ways) <= 0.0:
+            return None
+        seen = memory.sightings()
+        velocity = seen_velocity(track, seen, self._delay_s, self._R_w_m, self._T_b_c, config.max_gap_s)
+        return _Shown(moved, moved_m, velocity, math.sqrt(ways[0] / ways[1]))
 
     def _moving(self, moved: Displacements, moved_m: FloatArray) -> np.ndarray:
         """Intervals fast enough to speak of scale, judged by vision once the scale is roughly known."""

@@ -13,14 +13,13 @@ from edgeslam_torch.synthetic.flights.telemetry import EXACT, TelemetryFaults, s
 from edgeslam_torch.types import TelemetrySample
 
 T_B_C = camera_on_body()
-ROUNDED = FusionConfig(velocity_rounding="nearest")
 
 
 def model_of(samples, R_w_m=None, scale=1.0, **changes):
     track = TelemetryTrack("world", 0.35)
     track.add(samples)
     R = np.eye(3) if R_w_m is None else R_w_m
-    model = TelemetryModel(track, ROUNDED, T_B_C, R, 0.0, 0.0, scale, 0.02, True, None)
+    model = TelemetryModel(track, FusionConfig(), T_B_C, R, 0.0, 0.0, scale, 0.02, True, None, truncates=0.0)
     return replace(model, **changes)
 
 
@@ -156,7 +155,7 @@ def test_chi_square_of_the_truth_is_what_it_should_be(swinging, truncated):
         model, stamps, p = flown(rng, motion, faults)
         if truncated:
             cut = [replace(s, velocity_m_s=np.trunc(s.velocity_m_s / 0.1) * 0.1) for s in model.track._samples]
-            model = replace(model_of(cut), config=FusionConfig(velocity_rounding="truncate"))
+            model = model_of(cut, truncates=1.0)
         told = model.positions(stamps, p)
         values.append(chi2(told, p) / (3 * told.rows))
     assert 0.3 < np.mean(values) < 1.2

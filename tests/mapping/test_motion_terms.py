@@ -42,9 +42,7 @@ def telemetry_of(rng, points, scale=1.0):
     track.add(simulate(rng, t, T, T_B_C, faults=EXACT).samples())
     yaw = Rotation.from_matrix(T[0, :3, :3] @ T_B_C[:3, :3].T).as_euler("ZYX")[0]
     R_w_m = Rotation.from_euler("z", -yaw).as_matrix()
-    return TelemetryModel(
-        track, FusionConfig(velocity_rounding="nearest"), T_B_C, R_w_m, 0.0, 0.0, scale, 0.01, True, None
-    )
+    return TelemetryModel(track, FusionConfig(), T_B_C, R_w_m, 0.0, 0.0, scale, 0.01, True, None, truncates=0.0)
 
 
 def blow_up(points, factor):

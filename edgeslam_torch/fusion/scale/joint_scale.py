@@ -25,7 +25,7 @@ from edgeslam_torch.geometry.se3 import hat
 from edgeslam_torch.types import FloatArray, IntArray
 
 _LEAST_WEIGHT = 1e-3
-_MIN_DISPLACEMENTS = 6
+_MIN_DISPLACEMENTS = 5
 _MIN_HEIGHTS = 6
 _MOST_PARTS = 4
 """Parts of a flight whose scales are compared: of a tenth of it there is too little to tell."""
@@ -58,6 +58,8 @@ class Evidence:
     """Residual."""
     bias: FloatArray
     """``(3,)`` velocity bias at the end [m/s]; zeros for heights."""
+    log_likelihood: float = 0.0
+    """Of the displacements, up to a constant: larger where the same ones are better explained."""
 
     def softened(self, sigma: float) -> "Evidence":
         """The same with an error of the scale [m per map unit] that no averaging removes."""
@@ -149,7 +151,7 @@ def displacement_evidence(
     if fit is None or float(weight.sum()) < _MIN_DISPLACEMENTS:
         return None
     rms = math.sqrt(float(np.sum(weight * clean**2)) / max(3.0 * float(weight.sum()), 1e-9))
-    evidence = Evidence(fit.information, fit.vector, rms, fit.bias[:, -1] / duration_s[-1])
+    evidence = Evidence(fit.information, fit.vector, rms, fit.bias[:, -1] / duration_s[-1], fit.log_likelihood)
     return evidence.softened(_unrest(white, fit, J, latent, target))
 
 
@@ -291,6 +293,7 @@ class _Fit:
     inverse_trace: float
     kappa: float
     """Variance of the residuals over what was expected."""
+    log_likelihood: float
 
 
 def _best(
@@ -330,5 +333,5 @@ def _best(
             likeliest = likely
             slow, bias = whitened @ noise.covariance, whitened @ noise.bias
             trace = float(np.trace(inverse)) / kappa
-            best = _Fit(theta, A / kappa, v / kappa, residual, slow, bias, noise, trace, kappa)
+            best = _Fit(theta, A / kappa, v / kappa, residual, slow, bias, noise, trace, kappa, likely)
     return best

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from edgeslam_torch.fusion.config import FusionConfig
 from edgeslam_torch.fusion.scale.log_scale import LogScale
 from edgeslam_torch.fusion.telemetry.alignment import map_to_world, turns
-from edgeslam_torch.fusion.telemetry.delay import GROWTH, MIN_DISPLACEMENTS, Delay
+from edgeslam_torch.fusion.telemetry.delay import GROWTH, Delay
 from edgeslam_torch.fusion.telemetry.plausibility import Agreement, Reading, Reread, Trust, Verdict, agreement
 from edgeslam_torch.fusion.telemetry.track import TelemetryTrack, Turn
 from edgeslam_torch.fusion.telemetry.visual_memory import VisualMemory
@@ -21,6 +21,8 @@ _WIDE_STEP_S = 0.1
 _FIXED_REACH_S = 0.15
 """Tolerance of a configured delay."""
 _FITS_WELL = 0.9
+_TO_LOOK_ELSEWHERE = 12
+"""Moving intervals before other frames and delays are tried."""
 _MUCH_LIKELIER = 6.0
 """Log likelihood ratio; half the intervals count as independent."""
 _LEAST_TURN_RAD_S = math.radians(2.0)
@@ -58,7 +60,7 @@ class Comparison:
         now, n = used[Reading.VELOCITY], present.memory.count
         if now.correlation >= _FITS_WELL:
             trust.elsewhere_s = None
-        elif now.count >= MIN_DISPLACEMENTS and n >= GROWTH * self._looked_wide_at:
+        elif now.count >= _TO_LOOK_ELSEWHERE and n >= GROWTH * self._looked_wide_at:
             self._looked_wide_at = n
             turn = self._fits_turned(present, now, delay.value_s, R_w_m)
             if turn is not None:

@@ -17,8 +17,6 @@ _FROZEN_S = 1.5
 """Velocity and attitude repeated to the bit for so long, while anything but zero: the link repeats its last packet."""
 
 
-_TRUNCATION_PRIOR = -4.0
-"""Log odds before any evidence; readings that are rounded need no correction."""
 _PACKET_S = 0.15
 _RECENT = 50
 """Messages that are looked through for a charge: five seconds."""
@@ -183,7 +181,7 @@ class TelemetryTrack:
         velocity = told.velocity + shortfall_m_s * told.sign
         inside = np.clip(stamps_s, stamp[0], stamp[-1])
         beyond = np.clip(np.asarray(stamps_s) - stamp[-1], 0.0, _PACKET_S)  # one packet ahead at the last velocity
-        return _hermite(stamp, path, velocity, inside) + beyond[:, None] * velocity[-1]
+        return cubic(stamp, path, velocity, inside) + beyond[:, None] * velocity[-1]
 
     def copy(self) -> "TelemetryTrack":
         """The track as it is now, for another thread."""
@@ -220,25 +218,33 @@ class TelemetryTrack:
         first, last = np.clip(first, 0, len(stamp) - 1), np.clip(last, 0, len(stamp) - 1)
         return inside & (count[last] == count[first])
 
-    def truncation_probability(self, step_m_s: float) -> float:
-        """Probability that velocities are truncated rather than rounded, from the readings alone.
+    def axes(self) -> FloatArray:
+        """Axes in which the drone tells its velocity, to the power-on world, at each reading ``(N, 3, 3)``."""
+        rpy = self.readings.rpy
+        axes = np.broadcast_to(np.eye(3), (len(rpy), 3, 3))
+        if self._turn is Turn.FROM_BODY:
+            axes = Rotation.from_euler("z", rpy[:, 2:]).as_matrix()
+        return Rotation.from_euler("ZYX", rpy[:, ::-1]).as_matrix() @ axes if self._body else axes
+
+    def truncation_log_odds(self, step_m_s: float) -> float:
+        """Log odds that velocities are truncated, not rounded, by the readings alone; 0 where they do not tell.
 
         Where a velocity sweeps from three steps below zero to three above (or back) it passes all values alike; a
         truncating drone then reads 0 over two steps, so twice as often as +1 or -1, a rounding one over one step. A
-        recorded flight has 92 zeros to 90 readings of one step: odds of 90 000 to 1, against the prior of 1 to 55.
+        recorded flight has 92 zeros to 90 readings of one step: odds of 90 000 to 1.
         """
         if len(self._samples) < 20:
             return 0.0
         stamp = self.readings.stamp_s
         told = np.array([s.velocity_m_s for s in self._samples], dtype=np.float64)
-        log_odds = _TRUNCATION_PRIOR
+        log_odds = 0.0
         for v in np.rint(np.nan_to_num(told) / step_m_s).T:
             far = np.flatnonzero(np.abs(v) >= 3)
             for i, j in zip(far[:-1], far[1:], strict=True):
                 if v[i] * v[j] < 0 and j - i > 1 and stamp[j] - stamp[i] < 4.0:
                     size = np.abs(v[i + 1 : j])
                     log_odds += math.log(1.5) * int(np.sum(size == 0)) + math.log(0.75) * int(np.sum(size == 1))
-        return 1.0 / (1.0 + math.exp(-max(-50.0, min(50.0, log_odds))))
+        return log_odds
 
     @property
     def has_attitude(self) -> bool:
@@ -300,7 +306,7 @@ def _filled(rows: FloatArray) -> FloatArray:
     return rows[source]
 
 
-def _hermite(stamp: FloatArray, p: FloatArray, v: FloatArray, at: FloatArray) -> FloatArray:
+def cubic(stamp: FloatArray, p: FloatArray, v: FloatArray, at: FloatArray) -> FloatArray:
     """Cubic through points ``(N, 3)`` with velocities ``(N, 3)``, at times ``(M,)`` between the first and the last.
 
     (`scipy.interpolate` takes 0.15 s of CPU to import.)
