@@ -1,7 +1,7 @@
 """Metric scale from the drone's velocities and heights: what they say of the map, alone and together."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 

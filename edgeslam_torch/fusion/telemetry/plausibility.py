@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from edgeslam_torch.fusion.telemetry.track import Turn
 from edgeslam_torch.types import FloatArray, IntArray
 
-_LEAST_COUNT = 5
+_LEAST_COUNT = 6
 _TO_CONTRADICT = 12
 """Moving intervals below which a low correlation may be chance."""
 _DOUBTFUL = {1: 0.3, 3: 0.5}
