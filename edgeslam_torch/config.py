@@ -170,7 +170,8 @@ class MappingConfig:
     """Insert a keyframe when the median parallax to the reference exceeds this: a pixel at 525 px focal length is
     then 4 % of the depth."""
     max_keyframes: int = 200
-    """Maximum number of keyframes in the map; the least useful one is removed first. Bounds memory and time."""
+    """Number of keyframes in the map from which on those go of whose anchors most are seen by others. The only views of
+    places stay, up to twice as many. Bounds memory and time."""
     redundancy: float = 0.95
     """A keyframe is redundant when this share of its anchors is observed by three others; the rest of 300 anchors are
     15, as many as make two keyframes covisible."""

@@ -24,6 +24,8 @@ CLOSER_LOOKS = 3
 AGREEING_LINKS = 2
 MIN_BASELINE = 0.02
 """Distance between the keyframes of two links, relative to their depth, from which on they are two witnesses."""
+MIN_TURN_RAD = np.deg2rad(3.0)
+"""Turn between them from which on they are, too."""
 WITNESSES = 4
 """Earlier keyframes of the same piece that are asked at once when one has found a link."""
 
@@ -43,7 +45,7 @@ class Join:
     S: FloatArray
     """``(4, 4)`` similarity that moved it."""
     sigma_log: float
-    """Standard deviation of its log scale."""
+    """Standard deviation of its log scale: as measured, as the links differ, and as the maps bend where they meet."""
     links: int
     """Keyframes that agreed."""
     matches: int
@@ -154,7 +156,7 @@ class Atlas:
             max(mine, theirs),
             moved,
             S,
-            best.sigma_log,
+            _sigma_log(best, links),
             len(links),
             sum(len(one.keypoint) for one in links),
         )
@@ -175,15 +177,24 @@ class Atlas:
             self.known_scale[min(mine, theirs)] = stayed
 
 
+def _sigma_log(best: Link, links: list[Link]) -> float:
+    """Standard deviation of the log scale of the best of some links that agree."""
+    between = float(np.std([np.log(sim3.scale_of(one.S)) for one in links]))
+    return float(np.sqrt(best.sigma_log**2 + best.bend_log**2 + between**2))
+
+
 def _is_mapped(keyframe: Keyframe) -> bool:
     return bool((keyframe.anchor != NO_ANCHOR).any())
 
 
 def _apart_enough(one: Link, other: Link) -> bool:
     """Whether two links' keyframes are two witnesses, not one image twice."""
-    if one.keyframe.id == other.keyframe.id or one.other.id == other.other.id:
-        return False
-    scale = sim3.scale_of(one.S)
-    baseline = float(np.linalg.norm(one.keyframe.centre_w - other.keyframe.centre_w)) * scale
-    turn = float(np.arccos(np.clip(one.keyframe.T_c_w[2, :3] @ other.keyframe.T_c_w[2, :3], -1.0, 1.0)))
-    return baseline > MIN_BASELINE * one.depth or turn > np.deg2rad(3.0)
+    there = MIN_BASELINE * one.depth
+    here = there / sim3.scale_of(one.S)
+    return _differ(one.keyframe, other.keyframe, here) and _differ(one.other, other.other, there)
+
+
+def _differ(a: Keyframe, b: Keyframe, baseline: float) -> bool:
+    """Whether two keyframes show a place from two places or in two directions."""
+    turn = float(np.arccos(np.clip(a.T_c_w[2, :3] @ b.T_c_w[2, :3], -1.0, 1.0)))
+    return float(np.linalg.norm(a.centre_w - b.centre_w)) > baseline or turn > MIN_TURN_RAD

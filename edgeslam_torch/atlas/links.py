@@ -29,6 +29,8 @@ MIN_AGREEING = 0.6
 does."""
 MAX_SIGMA_LOG = 0.03
 """Standard deviation of the common log scale."""
+MIN_PART = 5
+"""Keypoints in a quarter of the view whose median says something."""
 MAX_SHIFT = 0.1
 """Distance of two estimates of one camera, relative to the depth that it sees."""
 MAX_TURN_RAD = np.deg2rad(5.0)
@@ -45,7 +47,9 @@ class Link:
     S: FloatArray
     """``(4, 4)`` similarity that takes the keyframe's piece to the other."""
     sigma_log: float
-    """Standard deviation of its log scale."""
+    """Standard deviation of its log scale, as if the two maps were the same but for a similarity."""
+    bend_log: float
+    """How far the log scale differs from one part of the image to another: the maps are bent."""
     keypoint: IntArray
     """``(M,)`` keypoints of the keyframe that show ..."""
     anchor: IntArray
@@ -83,7 +87,7 @@ def link(tracker: Tracker, keyframe: Keyframe, other: Keyframe) -> Link | None:
     shift, turn = apart(back.track.T_c_w, sim3.moved_camera(sim3.inverse(S), other.T_c_w))
     if shift > MAX_SHIFT * back.depth or turn > MAX_TURN_RAD:
         return None
-    return Link(keyframe, other, S, scale[1], there.track.keypoint, there.track.anchor, there.depth)
+    return Link(keyframe, other, S, scale[1], scale[2], there.track.keypoint, there.track.anchor, there.depth)
 
 
 def _place(tracker: Tracker, keyframe: Keyframe, other: Keyframe) -> Place | None:
@@ -96,8 +100,8 @@ def _place(tracker: Tracker, keyframe: Keyframe, other: Keyframe) -> Place | Non
     return place if place.share >= LIKELY_SHARE and place.spread >= LIKELY_SPREAD else None
 
 
-def common_scale(tracker: Tracker, keyframe: Keyframe, track: Track) -> tuple[float, float] | None:
-    """Size of the track's piece relative to the keyframe's own, and the standard deviation of its log.
+def common_scale(tracker: Tracker, keyframe: Keyframe, track: Track) -> tuple[float, float, float] | None:
+    """Size of the track's piece relative to the keyframe's own, the standard deviation of its log, and its bend.
 
     None where too few depths are known on both sides or they do not agree.
     """
@@ -115,7 +119,20 @@ def common_scale(tracker: Tracker, keyframe: Keyframe, track: Track) -> tuple[fl
     sigma = robust_sigma(ratio - middle) / np.sqrt(len(ratio))
     if len(agreeing) < MIN_AGREEING * len(ratio) or sigma > MAX_SIGMA_LOG:
         return None
-    return float(np.exp(np.mean(agreeing))), max(sigma, 1e-3)
+    keypoint = track.keypoint[both][front]
+    bend = _bend(ratio, z_there[front], keyframe.features.uv[keypoint, 0])
+    return float(np.exp(np.mean(agreeing))), max(sigma, 1e-3), bend
+
+
+def _bend(ratio: FloatArray, depth: FloatArray, u: FloatArray) -> float:
+    """Scatter of the log scale between near and far, left and right, beyond that of its keypoints ``(N,)``."""
+    far, right = depth > np.median(depth), u > np.median(u)
+    quarters = [ratio[(far == f) & (right == r)] for f in (False, True) for r in (False, True)]
+    parts = [quarter for quarter in quarters if len(quarter) >= MIN_PART]
+    if len(parts) < 2:
+        return 0.0
+    chance = np.mean([robust_sigma(part - np.median(part)) ** 2 / len(part) for part in parts])
+    return float(np.sqrt(max(0.0, np.var([np.median(part) for part in parts], ddof=1) - chance)))
 
 
 def _similarity(T_c_own: FloatArray, T_c_there: FloatArray, scale: float) -> FloatArray:

@@ -33,6 +33,9 @@ ENOUGH_ANCHORS = 300
 EMPTY_RADIUS_PX = 25.0
 """Minimum distance of a keypoint in an empty region from the next anchor."""
 
+ONLY_VIEW = 0.5
+"""Share of a keyframe's anchors that would go with it above which it is the only view of its place."""
+
 
 class Mapper:
     """Inserts keyframes into the map, one at a time.
@@ -217,10 +220,24 @@ class Mapper:
             if len(held) == 0 or np.mean(self.map.anchors.observations[held] >= 4) > self.config.redundancy:
                 self.map.remove_keyframe(other)
         while len(self.map.keyframes) > self.config.max_keyframes:
-            self.map.remove_keyframe(self._least_useful(newest))
+            needless = self._most_needless(newest)
+            if needless is None:
+                return
+            self.map.remove_keyframe(needless)
 
-    def _least_useful(self, newest: Keyframe) -> Keyframe:
-        """The keyframe farthest from the newest, in position relative to the map's extent; ties to the oldest."""
+    def _most_needless(self, newest: Keyframe) -> Keyframe | None:
+        """The keyframe outside the window whose removal costs the smallest share of what it shows; ties to the oldest.
+
+        None while each is the only view of its place, until there are twice as many as `MappingConfig.max_keyframes`.
+        """
         others = [k for k in self.map.keyframes.values() if newest.id - k.id >= self.config.window]
-        distance = [float(np.linalg.norm(k.centre_w - newest.centre_w)) for k in others]
-        return others[int(np.argmax(distance))]
+        lost = [self._lost_without(k) for k in others]
+        least = int(np.argmin(lost))
+        if lost[least] > ONLY_VIEW and len(self.map.keyframes) <= 2 * self.config.max_keyframes:
+            return None
+        return others[least]
+
+    def _lost_without(self, keyframe: Keyframe) -> float:
+        """Share of a keyframe's anchors that only one other keyframe sees, or none: they would go with it."""
+        held = keyframe.anchor[keyframe.anchor >= 0]
+        return float(np.mean(self.map.anchors.observations[held] <= 2)) if len(held) else 0.0

@@ -1,10 +1,12 @@
 """Two pieces of one place are joined, two different places never; exact ground truth."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from point_map import CAMERA, SCALE_FACTOR, PointMap, check_map
 
-from edgeslam_torch.atlas.atlas import Atlas
+from edgeslam_torch.atlas.atlas import Atlas, _apart_enough, _sigma_log
 from edgeslam_torch.atlas.links import common_scale, link, view_of
 from edgeslam_torch.atlas.places import lookalikes
 from edgeslam_torch.atlas.weld import move_piece
@@ -145,7 +147,7 @@ def test_depths_that_do_not_agree_are_no_scale(rng):
     pieces = Pieces(rng)
     keyframe = pieces.keyframes[4]
     track = match_keyframe(pieces.tracker, view_of(keyframe, SCALE_FACTOR), pieces.keyframes[3])
-    scale, _ = common_scale(pieces.tracker, keyframe, track)
+    scale, _, _ = common_scale(pieces.tracker, keyframe, track)
     assert scale == pytest.approx(1 / 1.4, rel=0.01)
     own = keyframe.anchor[keyframe.anchor >= 0]
     away = pieces.map.anchors.p_w[own] - keyframe.centre_w
@@ -287,3 +289,32 @@ def test_the_map_of_an_earlier_flight_stays_and_keeps_its_metres(rng, known):
     join = atlas.update()
     assert join.moved == 1 - known
     assert atlas.known_scale == {0: metres}
+
+
+def warped(pieces, bend):
+    """Stretch the second piece about its first keyframe: farther anchors by more."""
+    anchors, centre = pieces.map.anchors, pieces.keyframes[4].centre_w
+    ids = pieces.map.anchors_seen_by(pieces.keyframes[4:])
+    away = anchors.p_w[ids] - centre
+    distance = np.linalg.norm(away, axis=1)
+    anchors.p_w[ids] = centre + away * ((distance / np.median(distance)) ** bend)[:, None]
+    return link(pieces.tracker, pieces.keyframes[4], pieces.keyframes[3])
+
+
+def test_the_sigma_of_a_join_knows_how_the_maps_bend(rng):
+    straight, bent = warped(Pieces(rng), 0.0), warped(Pieces(rng), 0.15)
+    assert straight.bend_log < 0.005
+    assert bent.bend_log > 0.02 > 2.0 * bent.sigma_log
+    assert _sigma_log(bent, [bent]) > bent.bend_log
+    other = replace(bent, S=bent.S @ sim3.exp(np.array([0, 0, 0, 0, 0, 0, 0.1])))
+    assert _sigma_log(bent, [bent, other]) > 0.05
+
+
+def test_one_image_stored_twice_in_the_other_piece_is_one_witness(rng):
+    pieces = Pieces(rng)
+    one, other = (link(pieces.tracker, k, pieces.keyframes[3]) for k in pieces.keyframes[4:6])
+    stored = pieces.keyframes[3]
+    twin = make_keyframe(pieces.map.next_keyframe_id(), 99, 9.0, stored.T_c_w, stored.features)
+    assert not _apart_enough(one, replace(other, other=twin))
+    assert not _apart_enough(replace(one, other=twin), replace(other, keyframe=one.keyframe))
+    assert _apart_enough(one, replace(other, other=pieces.keyframes[1]))
