@@ -12,6 +12,7 @@ from edgeslam_torch.losses.robust import Kernel
 from edgeslam_torch.losses.weighting import AdaptiveScales
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.mapping.edge_map import EdgeMap
+from edgeslam_torch.mapping.freed_depths import Weight
 from edgeslam_torch.mapping.fuse import fuse_all
 from edgeslam_torch.mapping.motion_terms import solver
 from edgeslam_torch.mapping.refinement import refine_all, whole_map, window_problem, write_back
@@ -62,14 +63,14 @@ def last_refinement(
     fine = replace(lm, cost_tolerance=FINE, losses=True)
     with_edges = config.uses_edges or config.uses_corners
     result = None
-    if config.reprojection != "off" and refine_all(slam_map, camera, lm, telemetry) is not None:
+    if config.reprojection != "off" and refine_all(slam_map, camera, lm, telemetry, Weight.WIDE) is not None:
         with slam_map.lock:
             drift_px = max(reobserve_all(slam_map, camera), default=0.0)
         if drift_px > MAX_DRIFT_PX:
-            refine_all(slam_map, camera, lm, telemetry)
+            refine_all(slam_map, camera, lm, telemetry, Weight.EXACT)
         with slam_map.lock:
             fuse_all(slam_map, camera)
-        result = refine_all(slam_map, camera, lm if with_edges else fine, telemetry)
+        result = refine_all(slam_map, camera, lm if with_edges else fine, telemetry, Weight.EXACT)
     edges.update(everything=True)
     if with_edges:
         result = refine_with_edges(slam_map, camera, edges, fine, config, telemetry) or result
@@ -89,7 +90,7 @@ def refine_with_edges(
     Returns:
         Result of the last round; None if there was nothing to refine.
     """
-    window = whole_map(slam_map)
+    window = whole_map(slam_map, Weight.NONE if config.reprojection == "off" else Weight.EXACT)
     if window is None:
         return None
     keyframes = [*window.free, *window.fixed]

@@ -1,6 +1,6 @@
 """Stage 4 on the map: select a window, refine it, write the result back, remove outliers."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -10,6 +10,7 @@ from edgeslam_torch.geometry.robust_statistics import CHI2_2DOF_95
 from edgeslam_torch.losses.robust import Kernel
 from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.map.slam_map import SlamMap
+from edgeslam_torch.mapping.freed_depths import Weight, motion_priors
 from edgeslam_torch.mapping.motion_terms import motion_factors, solver
 from edgeslam_torch.mapping.prior_anchors import depth_priors, mostly_on_priors
 from edgeslam_torch.mapping.window_edges import WindowEdges
@@ -38,6 +39,8 @@ class Window:
     free: list[Keyframe]
     fixed: list[Keyframe]
     anchor: IntArray
+    freed: Weight = Weight.NONE
+    """How the bias of depths on priors is undone."""
 
 
 def choose_window(slam_map: SlamMap, newest: Keyframe, free: int, fixed: int) -> Window:
@@ -59,19 +62,23 @@ def choose_window(slam_map: SlamMap, newest: Keyframe, free: int, fixed: int) ->
 
 
 def refine_all(
-    slam_map: SlamMap, camera: Camera, config: LmConfig, telemetry: TelemetryModel | None = None
+    slam_map: SlamMap,
+    camera: Camera,
+    config: LmConfig,
+    telemetry: TelemetryModel | None = None,
+    freed: Weight = Weight.NONE,
 ) -> WindowResult | None:
     """Refine every keyframe of the map at once; None when there is nothing to refine, see `whole_map`."""
-    window = whole_map(slam_map)
+    window = whole_map(slam_map, freed)
     return None if window is None else refine(slam_map, window, camera, config, telemetry)
 
 
-def whole_map(slam_map: SlamMap) -> Window | None:
+def whole_map(slam_map: SlamMap, freed: Weight = Weight.NONE) -> Window | None:
     """All keyframes as one window, the first pose fixed; None for fewer than three, or a camera that never moved."""
     keyframes = [slam_map.keyframes[id] for id in sorted(slam_map.keyframes)]
     if len(keyframes) < 3:
         return None
-    window = Window(keyframes[1:], keyframes[:1], slam_map.anchors_seen_by(keyframes))
+    window = Window(keyframes[1:], keyframes[:1], slam_map.anchors_seen_by(keyframes), freed)
     return window if held_extent(window) is not None else None
 
 
@@ -143,6 +150,7 @@ def window_problem(
     # Where the scale is held by one distance alone, that one is arbitrary.
     doubt = UNKNOWN_SCALE_LOG if extent is not None else None
     told = motion_factors(telemetry, keyframes, [slam_map.piece_of(k.id) for k in keyframes], doubt)
+    motions = tracked_motions(slam_map, keyframes)
     problem = WindowProblem(
         T_c_w=np.stack([*(k.T_c_w for k in keyframes), *(slam_map.pose_of(id) for id in hosts)]),
         pose_fixed=np.arange(len(keyframes) + len(hosts)) >= len(window.free),
@@ -152,13 +160,13 @@ def window_problem(
         uv=uv.astype(np.float64),
         inv_sigma=np.ones(len(row)) if alike else shrink[octave],
         K=(camera.fx, camera.fy, camera.cx, camera.cy),
-        relative_priors=tracked_motions(slam_map, keyframes),
+        relative_priors=motions,
         scale_priors=() if extent is None else (extent,),
         depth_priors=priors,
         centres=told.centres,
         gravity=told.gravity,
     )
-    return problem, keypoint
+    return replace(problem, relative_priors=(*motions, *motion_priors(problem, window.freed))), keypoint
 
 
 def tracked_motions(slam_map: SlamMap, keyframes: list[Keyframe]) -> tuple[RelativePosePrior, ...]:

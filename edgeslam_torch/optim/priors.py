@@ -72,12 +72,13 @@ class PriorTerms:
         for relation in self.relative:
             r, by_i, by_j = relative_prior(T[relation.pose_i], T[relation.pose_j], relation)
             total += float(r @ relation.information @ r)
-            J = np.zeros((6, len(g_np)))
-            for pose, block in ((relation.pose_i, by_i), (relation.pose_j, by_j)):
-                if self.column[pose] >= 0:
-                    J[:, 6 * self.column[pose] : 6 * self.column[pose] + 6] = block
-            H_np += J.T @ relation.information @ J
-            g_np += J.T @ (relation.information @ r)
+            blocks = [(relation.pose_i, by_i), (relation.pose_j, by_j)]
+            free = [(slice(6 * k, 6 * k + 6), J) for pose, J in blocks if (k := self.column[pose]) >= 0]
+            for rows, J in free:
+                weighted = J.T @ relation.information
+                g_np[rows] += weighted @ r
+                for columns, other in free:
+                    H_np[rows, columns] += weighted @ other
         for scale in self.scales:
             r_s, J_i, J_j = scale_prior(T[scale.pose_i], T[scale.pose_j], scale)
             total += r_s**2
