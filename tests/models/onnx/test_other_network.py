@@ -60,6 +60,6 @@ def test_other_network_gives_the_slam_metres_for_its_camera(tmp_path: Path) -> N
 def test_weights_without_a_graph_cannot_be_another_network(tmp_path: Path) -> None:
     widths = Widths((8, 8) + (16,) * 12, (16, 16, 16, 8, 8))
     fastdepth = Metadata(input_height=64, input_width=96, focal_px=80.0)
-    with pytest.raises(WeightsError, match="another network comes as an ONNX file"):
+    with pytest.raises(WeightsError, match="other networks come as ONNX files"):
         save_checkpoint(build_network(fastdepth, widths).eval(), GREEN, tmp_path / "w.safetensors")
         DepthPredictor(tmp_path / "w.safetensors")
