@@ -92,6 +92,7 @@ def refused(answer: tuple[int, str, str], *words: str) -> None:
         assert word in errors[0]
 
 
+@pytest.mark.slow
 def test_before_and_after_are_reported_and_weights_say_what_they_are(
     finetune: Finetune, recordings: Path, tmp_path: Path
 ) -> None:
@@ -150,6 +151,7 @@ def test_data_that_changed_on_disk_is_refused(finetune: Finetune, recordings: Pa
     assert contents(tmp_path / "out") == before
 
 
+@pytest.mark.slow
 def test_moved_data_and_folder_go_on(finetune: Finetune, recordings: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(recordings / "kitchen", tmp_path / "here" / "kitchen")
     finetune(str(folder), out=tmp_path / "first")
@@ -193,6 +195,7 @@ def test_resume_takes_another_rate_and_needs_something_to_resume(
     assert finetune("kitchen", "--lr", "0.001", "--resume", steps=10)[0] == 0
 
 
+@pytest.mark.slow
 def test_overwrite_begins_anew_and_keeps_the_old_one_until_the_data_is_read(finetune: Finetune, tmp_path: Path) -> None:
     finetune("kitchen", steps=10)
     before = contents(tmp_path / "out")
@@ -240,6 +243,7 @@ def test_out_that_cannot_be_written_is_one_line(finetune: Finetune, tmp_path: Pa
     refused(finetune("kitchen"), "last.pt")
 
 
+@pytest.mark.slow
 def test_full_disk_is_one_line_and_goes_on_later(
     finetune: Finetune, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -303,6 +307,7 @@ def test_no_step_is_a_mistake(finetune: Finetune) -> None:
     refused(finetune("kitchen", steps=-3), "--steps must be at least 1")
 
 
+@pytest.mark.slow
 def test_what_made_nothing_better_keeps_the_weights_it_began_with(
     finetune: Finetune, recordings: Path, tmp_path: Path
 ) -> None:
@@ -327,7 +332,14 @@ def test_what_made_nothing_better_keeps_the_weights_it_began_with(
     assert json.loads((tmp_path / "out" / "finetune.json").read_text())["outcome"]["kept_step"] == 0
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize(
+    "number",
+    [
+        signal.SIGINT,
+        pytest.param(signal.SIGTERM, marks=pytest.mark.slow),
+        pytest.param(signal.SIGHUP, marks=pytest.mark.slow),
+    ],
+)
 def test_signal_says_what_is_kept_and_the_same_command_goes_on(
     finetune: Finetune,
     eight_steps: tuple[Path, str],
@@ -352,6 +364,7 @@ def test_signal_says_what_is_kept_and_the_same_command_goes_on(
         assert (whole / name).read_bytes() == (resumed / name).read_bytes(), name
 
 
+@pytest.mark.slow
 def test_divergence_is_one_line_and_a_smaller_rate_goes_on(
     finetune: Finetune, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

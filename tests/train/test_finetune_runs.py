@@ -49,6 +49,7 @@ def changed(run_folder: Path, tmp_path: Path) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_run_is_learnt_from_and_validated_on_what_the_teacher_measured(
     run_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -71,6 +72,7 @@ def test_pairs_alone_leave_nothing_to_validate_on_and_that_is_said(
     assert "not validated" in metadata.notes
 
 
+@pytest.mark.slow
 def test_interrupted_teacher_goes_on_where_it_was(
     run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -95,6 +97,7 @@ def test_interrupted_teacher_goes_on_where_it_was(
         assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
 
 
+@pytest.mark.slow
 def test_teacher_of_other_weights_is_made_anew(
     run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

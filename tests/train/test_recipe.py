@@ -194,6 +194,7 @@ def test_finished_run_is_not_trained_further(tmp_path: Path) -> None:
     assert load_checkpoint(tmp_path / "final.safetensors")[1] == METADATA
 
 
+@pytest.mark.slow
 def test_one_batch_is_learnt_almost_to_zero(tmp_path: Path) -> None:
     losses: list[float] = []
 
@@ -383,6 +384,7 @@ def in_two_processes(script: Path, *words: str) -> list[tuple[int, str]]:
     return [(worker.returncode, text) for worker, text in zip(workers, said, strict=True)]
 
 
+@pytest.mark.slow
 def test_two_processes_give_the_single_process_result(tmp_path: Path) -> None:
     script = tmp_path / "script.py"
     script.write_text(SCRIPT.format(folder=str(Path(__file__).parent), module=Path(__file__).stem))
