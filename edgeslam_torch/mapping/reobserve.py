@@ -24,6 +24,7 @@ RADIUS_PX = 30.0
 RATIO = 0.85
 """Maximum ratio of nearest to second nearest descriptor distance."""
 MIN_INLIERS = 15
+"""As many anchors as make two keyframes covisible (`SlamMap.covisible`)."""
 MIN_SHARE = 0.5
 """Minimum share of inliers: the majority of the matches."""
 MAX_TURN_RAD = np.deg2rad(30.0)

@@ -15,7 +15,7 @@ from edgeslam_torch.frontend.matching import match_all
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.map.keyframe import Keyframe
-from edgeslam_torch.tracking.tracker import Track, Tracker, View
+from edgeslam_torch.tracking.tracker import MIN_ROUGH, Track, Tracker, View
 from edgeslam_torch.types import FloatArray
 
 MIN_MATCHES = 20
@@ -222,7 +222,7 @@ def match_keyframe(tracker: Tracker, view: View, keyframe: Keyframe) -> Track | 
     T_c_w[:3, :3], T_c_w[:3, 3] = cv2.Rodrigues(rvec)[0], tvec[:, 0]
     kept = inliers.ravel()
     first = tracker.solve(view, T_c_w, matches.train[kept], ids[kept])
-    if first is None or first.inliers < 10:
+    if first is None or first.inliers < MIN_ROUGH:
         return None
     return tracker.track(view, first.T_c_w, first.anchor)
 

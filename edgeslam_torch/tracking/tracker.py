@@ -27,6 +27,13 @@ ENOUGH_FOR_ROUGH = 250
 FINE = PoseConfig(rounds=3, robust_rounds=1, cost_tolerance=1e-2)
 """The pass on all matches; its tolerance is 0.1 standard deviations (docs/decisions/0017)."""
 
+WIDER = 2.5
+"""Factor on the radius of a second search: 15 px become 37, which are 4 degrees at 525 px: a turn of 120 degrees a
+second at 30 Hz."""
+MIN_ROUGH = 10
+"""Inliers of a rough pose from which the local map is searched: 20 equations for 6 unknowns. `min_inliers` decides
+after that search."""
+
 
 @dataclass(frozen=True, slots=True)
 class View:
@@ -90,8 +97,8 @@ class Tracker:
         some = recent[:: 1 + len(recent) // ENOUGH_FOR_ROUGH]
         first = self.refine(view, T_c_w, some, self.config.motion_radius_px, ROUGH, expected)
         if first is None or first.inliers < self.config.min_inliers:
-            first = self.refine(view, T_c_w, recent, 2.5 * self.config.motion_radius_px, ROUGH, expected)
-        if first is None or first.inliers < 10:
+            first = self.refine(view, T_c_w, recent, WIDER * self.config.motion_radius_px, ROUGH, expected)
+        if first is None or first.inliers < MIN_ROUGH:
             return None
         return self._complete(view, first.T_c_w, first.anchor, first.keypoint, first.anchor, expected)
 
