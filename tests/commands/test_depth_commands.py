@@ -145,6 +145,7 @@ def test_missing_image_is_one_line(weights: Path, tmp_path: Path) -> None:
         run("depth", tmp_path / "none.png", "--out", tmp_path, "--weights", weights)
 
 
+@pytest.mark.slow
 def test_int8_export_is_checked_and_runs_on_the_companion_example(
     weights: Path, pictures: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -71,6 +71,7 @@ def test_a_flight_below_one_step_confirms_any_scale(speed_m_s, low, high):
     assert low <= remainder_gain(shown, intervals(seen), np.eye(3), 1.0, 0.1, Rounding.TRUNCATE) <= high
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rounding", list(Rounding))
 def test_slow_flights_are_as_sure_as_they_may_be(swinging, replay, rounding):
     """Speeds of one to two steps: five draws of telemetry, each inside its own three sigmas."""

@@ -150,6 +150,7 @@ def test_data_set_without_depth_is_refused(folder: Path, tmp_path: Path) -> None
         build_surface(open_dataset(tmp_path))
 
 
+@pytest.mark.slow
 @pytest.mark.data
 def test_measured_surface_of_a_recording_is_its_own_best_map(data_dir: Path) -> None:
     truth = build_surface(open_dataset(data_dir / "tum_fr1_xyz"))
