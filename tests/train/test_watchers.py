@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.summary.writer import event_file_writer
 
 from edgeslam_torch.models.checkpoint import build_network
 from edgeslam_torch.models.fastdepth import Widths
@@ -46,7 +47,12 @@ def run(out: Path, config: TrainConfig, *more: Hooks) -> TrainState:
     return train(network, METADATA, [signal], config, out, lambda n: {"score": 1.0}, hooks)
 
 
-def test_steps_are_in_tensorboard_once_after_interrupts_and_more_steps(tmp_path: Path) -> None:
+def test_steps_are_in_tensorboard_once_after_interrupts_and_more_steps(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Files of one second are read in the order of their names, where a counter of the process puts 10 before 9; runs
+    # of their own have seconds of their own.
+    monkeypatch.setattr(event_file_writer, "_global_uid", event_file_writer.AtomicCounter(1000))
     for step in (2, 7):  # before the first checkpoint, and between two
         with pytest.raises(KeyboardInterrupt):
             run(tmp_path, CONFIG, _Killed(step))
