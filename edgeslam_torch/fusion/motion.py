@@ -42,7 +42,7 @@ from edgeslam_torch.types import FloatArray, Health, ScaleEstimate, TelemetrySam
 
 _REFIT_S = 1.0
 _FIRST_FIT_S = 0.5
-"""Time from one fit to the next as long as telemetry has told no scale: a displacement's length."""
+"""Time from one fit to the next as long as telemetry has told no scale or no delay: a displacement's length."""
 _REFIT_SHARE = 0.12
 """Each fit costs more and changes less than the one before."""
 _BELIEVED = 0.3
@@ -370,7 +370,8 @@ class MotionFusion:
     # --- estimation ----------------------------------------------------------------------------------------------
 
     def _is_due(self, stamp_s: float) -> bool:
-        first_s = _FIRST_FIT_S if self._by_telemetry is None else _REFIT_S
+        known = self._by_telemetry is not None and math.isfinite(self.delay_sigma_s)
+        first_s = _REFIT_S if known else _FIRST_FIT_S
         pause_s = max(first_s, _REFIT_SHARE * min(self._memory.length_s, self.config.window_s))
         return len(self._track) > 0 and (self._R_w_m is None or stamp_s - self._fitted_s >= pause_s)
 
@@ -382,7 +383,11 @@ class MotionFusion:
         self._fitted_s = last.stamp_s
         if self._R_w_m is None:
             self._R_w_m = self._alignment()
+        guessed = not math.isfinite(self.delay_sigma_s)
         self._delay.search(self._memory, self._track)
+        if guessed and math.isfinite(self.delay_sigma_s):  # heights were compared at a wrong delay
+            for reading in HEIGHTS:
+                self._trust.forget(reading)
         R_w_m = self._alignment()
         if R_w_m is None:
             return

@@ -159,7 +159,10 @@ class TelemetryScale:
             Rounding.TRUNCATE: config.truncation_systematic_log,
         }
         tried = (Rounding.NEAREST, Rounding.TRUNCATE) if fixed is None else (fixed,)
-        found = {r: h for r in tried if (h := self._together(r, systematic[r])) is not None}
+        moved = {r: self._by_displacements(r) for r in tried}
+        if any(evidence is None for evidence in moved.values()):  # what cannot be compared is not chosen from
+            moved = dict.fromkeys(tried)
+        found = {r: h for r in tried if (h := self._together(r, moved[r], systematic[r])) is not None}
         if not found:
             return None
         log_odds = np.array([h.log_odds + (sweeps if r is Rounding.TRUNCATE else 0.0) for r, h in found.items()])
@@ -173,9 +176,8 @@ class TelemetryScale:
         fit = replace(best.fit, truncates=truncates)
         return LogScale(mean, math.sqrt(variance), "+".join(fit.sources)), fit
 
-    def _together(self, rounding: Rounding, systematic: float) -> _Hypothesis | None:
+    def _together(self, rounding: Rounding, moved: Evidence | None, systematic: float) -> _Hypothesis | None:
         tilt = self._config.alignment_sigma_rad
-        moved = self._by_displacements(rounding)
         rough = self._rough(moved)
         if rough is None:
             return None
@@ -224,7 +226,8 @@ class TelemetryScale:
         network = self._present.network
         alone = None if moved is None else solved([moved], self._config.alignment_sigma_rad)
         if alone is None:
-            return self._present.rough_scale
+            known = self._present.rough_scale
+            return self._shown.start if known is None and self._shown is not None else known
         wrong = network is not None and contradict(LogScale(math.log(alone[0]), alone[1], "telemetry"), network)
         return self._present.rough_scale if wrong else alone[0]
 

@@ -11,11 +11,12 @@ from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.inputs.dataset import open_dataset
 from edgeslam_torch.eval.judge import sources
 from edgeslam_torch.eval.judge.flights import NONE
+from edgeslam_torch.eval.judge.telemetry.made import KINDS
 from edgeslam_torch.readers.source import Recording
 from edgeslam_torch.synthetic.flights.courses import COURSES
 
-SETS = ("base", "variants", "flights", "all")
-"""What ``--set`` takes: recordings as they are, their variants, simulations, everything."""
+SETS = ("base", "variants", "flights", "telemetry", "all")
+"""What ``--set`` takes: recordings as they are, their variants, simulations, telemetry along them, everything."""
 
 MIN_FRAMES = 30
 """Shorter recordings, and variants that leave fewer, are not judged."""
@@ -29,6 +30,8 @@ SECOND_FLIGHT = "second_flight"
 HALF = 300
 FLOWN_AGAIN = "room"
 """Course that is flown twice."""
+WITH_TELEMETRY = ("tum_fr1_xyz", "7scenes_redkitchen", "euroc_mh05_a", "tartan_hospital")
+"""Recordings that telemetry is made for."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,9 +85,9 @@ class Cell:
     """One run."""
 
     name: str
-    """``RECORDING``, ``RECORDING/VARIANT``, ``flight/COURSE`` or ``none/KIND``."""
+    """``RECORDING``, ``RECORDING/VARIANT``, ``flight/COURSE``, ``none/KIND`` or ``telemetry/KIND/RECORDING``."""
     seed: int
-    """Of the system; of a simulation the world's too."""
+    """Of the system; of a simulation the world's too, and the draw of made telemetry."""
     folder: str = ""
     """Of the recording."""
     variant: str = ""
@@ -93,6 +96,8 @@ class Cell:
     """Of a simulated flight: a name in `courses.COURSES`."""
     nothing: str = ""
     """What a source without anything to see shows: a name in `flights.NONE`."""
+    telemetry: str = ""
+    """Telemetry made along the recording: a name in `telemetry.made.KINDS`."""
 
     @property
     def base(self) -> str:
@@ -161,6 +166,8 @@ def list_cells(data: Path | None, which: str, seeds: Sequence[int], only: Sequen
         wanted += ["kidnap"] if which in ("flights", "all") and _can_kidnap(name, frames) else []
         wanted += [SECOND_FLIGHT] if which in ("flights", "all") and _can_kidnap(name, frames) else []
         made += [_cell(name, folder, variant) for variant in wanted]
+        if which in ("telemetry", "all") and name in WITH_TELEMETRY:
+            made += [Cell(f"telemetry/{kind}/{name}", 0, str(folder), telemetry=kind) for kind in KINDS]
     if which in ("flights", "all"):
         made += [Cell(f"flight/{course}", 0, course=course) for course in COURSES]
         made += [Cell(f"flight/{FLOWN_AGAIN}/{SECOND_FLIGHT}", 0, variant=SECOND_FLIGHT, course=FLOWN_AGAIN)]

@@ -19,6 +19,7 @@ from edgeslam_torch.eval.judge import flights, second_flight, sources
 from edgeslam_torch.eval.judge.cells import BACKWARDS, HALF, KIDNAP, SECOND_FLIGHT, VARIANTS, Cell
 from edgeslam_torch.eval.judge.runner import CELL, RESULT
 from edgeslam_torch.eval.judge.score import Truth, score
+from edgeslam_torch.eval.judge.telemetry.made import KINDS, Drawn
 from edgeslam_torch.files.atomic import write_text
 from edgeslam_torch.files.config_file import load_config
 from edgeslam_torch.readers.layouts import read_sequence
@@ -74,7 +75,11 @@ def _opened(cell: Cell, folder: Path, flights_root: Path) -> tuple[Recording, Tr
         return _backwards(source, place, folder / "groundtruth.txt")
     if cell.variant == SECOND_FLIGHT:
         return sources.start_at(source, HALF), Truth(place)
-    truth = Truth(place, place if open_dataset(place).depth is not None else None)
+    dataset = open_dataset(place)
+    if cell.telemetry:
+        drawn = Drawn(dataset.truth, dataset.frame_stamps_s, cell.seed)
+        return replace(source, telemetry=KINDS[cell.telemetry](drawn)), Truth(place)
+    truth = Truth(place, place if dataset.depth is not None else None)
     return VARIANTS[cell.variant].applied_to(source) if cell.variant else source, truth
 
 

@@ -110,7 +110,7 @@ def judge(
 
 def _order(row: dict[str, Any]) -> tuple[bool, str, int]:
     """Recordings, each before its variants, then simulations."""
-    return row["cell"].startswith(("flight/", "none/")), row["cell"], row["seed"]
+    return row["cell"].startswith(("flight/", "none/", "telemetry/")), row["cell"], row["seed"]
 
 
 def start_cell(folder: Path, log: IO[str]) -> subprocess.Popen[str]:

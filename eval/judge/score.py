@@ -13,6 +13,7 @@ from edgeslam_torch.eval.inputs.dataset import open_dataset
 from edgeslam_torch.eval.inputs.run_folder import RunFolder, open_run
 from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, read_trajectory
 from edgeslam_torch.eval.judge import support
+from edgeslam_torch.eval.judge.telemetry.live_scale import live_figures
 from edgeslam_torch.eval.metrics.run_score import RunScore, evaluate_run
 from edgeslam_torch.eval.metrics.trajectory_error import TrajectoryScore
 from edgeslam_torch.geometry.camera import load_camera
@@ -70,6 +71,7 @@ def _own_figures(run: RunFolder) -> dict[str, Any]:
     counts = summary.get("map") or {}
     scale = summary.get("scale") or {}
     sigma = scale.get("sigma")
+    sources = str(scale.get("source", "")).split("+")
     return {
         "frames": summary.get("frames"),
         "supported_end": np.sum(support.at_end(run.pose_rows, run.trajectory.T_w_c, p_w, camera)) / offered,
@@ -78,6 +80,8 @@ def _own_figures(run: RunFolder) -> dict[str, Any]:
         "pieces": sum(piece["supported"] > 0 for piece in summary.get("pieces") or ()),
         "metric": float(scale.get("units") == "metres"),
         "scale_sigma": float(sigma) / float(scale["value"]) if sigma else None,
+        "by_telemetry": float("telemetry" in sources or "height" in sources),
+        "said": float(any("telemetry" in warning for warning in summary.get("warnings") or ())),
         "map_points": counts.get("edge_points"),
         "anchors": counts.get("anchors"),
         "cpu_ms": summary.get("cpu_ms_per_frame"),
@@ -93,6 +97,7 @@ def _against_truth(run: RunFolder, truth: Truth, notes: list[str]) -> dict[str, 
     assert found.sim3 is not None
     scale = found.sim3.scale
     sigma = _own_sigma(run)
+    off = np.log(scale) if scale > 0 else None
     figures = {
         "ate_m": found.ate_sim3_m,
         "online_m": found.ate_online_sim3_m,
@@ -102,12 +107,15 @@ def _against_truth(run: RunFolder, truth: Truth, notes: list[str]) -> dict[str, 
         "se3_m": found.ate_se3_m if found.units == "metres" else None,
         "scale": scale if found.units == "metres" else None,
         "scale_sim3": scale,
-        "scale_z": np.log(scale) / sigma if sigma is not None and scale > 0 else None,
+        "scale_z": off / sigma if sigma is not None and off is not None else None,
+        "scale_off": abs(off) if sigma is not None and off is not None else None,
+        "scale_sigmas": abs(off) / sigma if sigma is not None and off is not None else None,
         "still_m": found.fixed_position_m,
         "path_m": found.sim3.truth_path_m,
         "first_m": _beginning(found.sim3)[0],
         "first_over_rest": _beginning(found.sim3)[1],
     }
+    figures |= live_figures(run, _poses(truth.poses))
     figures |= _map_figures(run, found, truth.surfaces)
     if judge_map and found.map is None:
         notes.append(found.map_note)
@@ -156,11 +164,15 @@ def _map_figures(run: RunFolder, found: RunScore, surfaces: Surfaces | None) -> 
     }
 
 
+def _poses(truth: Path) -> Trajectory:
+    return open_dataset(truth).truth if truth.is_dir() else read_trajectory(truth)
+
+
 def _standing_still(run: RunFolder, truth: Path) -> dict[str, Any]:
     """Errors of a run that never moved: those of the best fixed position; empty for one that did."""
     if float(np.ptp(run.trajectory.positions, axis=0).max()) > 0:
         return {}
-    poses: Trajectory = open_dataset(truth).truth if truth.is_dir() else read_trajectory(truth)
+    poses = _poses(truth)
     matched = poses.positions[match(poses.stamps_s, run.trajectory.stamps_s)[0]]
     if len(matched) == 0:
         return {}

@@ -11,7 +11,9 @@ from edgeslam_torch.eval.judge.bars import Bar, Row, verdicts_of_cell, verdicts_
 _FOOTNOTES = (
     "end, live: share of the frames whose pose rests on the map, at the end and when they came. path: ATE in % of the "
     "true path. still: ATE of the best fixed position. scale: true over estimated; sigma as the run states it, z = log "
-    "scale / sigma. 1st s: error of the first second's poses, and how many times that of the others it is. Lengths in "
+    "scale / sigma. 1st scale s: when the published unit first became the drone's metre, its z then; >3 sigma: share of "
+    "the frames from 12.5 s on whose live scale is further off. 1st s: error of the first second's poses, and how many "
+    "times that of the others it is. Lengths in "
     "metres unless they say otherwise; ATE after Sim(3) over all frames.",
     "Maps of recordings are judged against depth maps nearer than 5 m, those of simulations against the true surfaces. "
     "7scenes_redkitchen's depth maps are not registered to colour by its makers: the transformation was fitted to its "
@@ -56,6 +58,9 @@ COLUMNS = (
     Column("scale", "scale", "{:.3f}"),
     Column("sigma %", "scale_sigma", "{:.1f}", 100.0),
     Column("z", "scale_z", "{:+.1f}"),
+    Column("1st scale s", "first_scale_s", "{:.1f}"),
+    Column("its z", "first_scale_sigmas", "{:.1f}"),
+    Column(">3 sigma %", "beyond_3_sigma", "{:.0f}", 100.0),
     Column("SE(3)", "se3_m"),
     Column("still", "still_m", "{:.3f}"),
     Column("1st s", "first_m"),

@@ -7,6 +7,8 @@ import pytest
 from edgeslam_torch.fusion.config import FusionConfig
 from edgeslam_torch.fusion.motion import MotionFusion
 from edgeslam_torch.fusion.scale.depth_scale import DepthRatio
+from edgeslam_torch.fusion.telemetry.whole_steps import Rounding
+from edgeslam_torch.fusion.telemetry_scale import TelemetryScale
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.synthetic.flights.flight import camera_on_body
 from edgeslam_torch.synthetic.flights.telemetry import EXACT, TelemetryFaults, simulate
@@ -34,6 +36,50 @@ def test_scale_gravity_and_delay_come_out_of_a_swung_camera(rng, swinging, repla
     assert fusion.delay_s == pytest.approx(0.5, abs=0.04)
     up = gauge.T_m_w[:3, :3] @ [0.0, 0.0, 1.0]
     assert math.degrees(math.acos(min(1.0, float(up @ fusion.rotation()[2])))) < 0.5
+
+
+@pytest.mark.parametrize(("delay_s", "latest_s"), [(0.5, 2.8), (0.3, 4.2), (0.75, 4.2)])
+def test_a_climb_tells_the_scale_within_its_sigma(delay_s, latest_s, swinging, replay):
+    """Up by 0.8 m in 1.6 s, then on: after four half seconds, a second later where the delay is not the guess."""
+    t = np.arange(0.0, 6.0, 0.05)
+    motion = take_off(swinging(1.0), t)
+    off = []
+    for seed in range(4):
+        found = []
+
+        def watched(fusion, *given, found=found):
+            replay(fusion, *given, each=lambda t, _: found.append((t, fusion.scale())))
+
+        late = TelemetryFaults(video_delay_s=delay_s)
+        _, gauge, _ = fused(np.random.default_rng(seed), motion, watched, late)
+        told = [(at, scale) for at, scale in found if scale.sigma < 0.1 * scale.value]
+        assert told[0][0] < latest_s
+        off.append(math.log(told[0][1].value / gauge.scale) * told[0][1].value / told[0][1].sigma)
+    assert np.max(np.abs(off)) < 2.5
+
+
+def take_off(motion, t):
+    """A drone that climbs and then flies ahead."""
+    z = 0.4 + 0.8 * np.clip((t - 0.4) / 1.6, 0.0, 1.0)
+    x = 0.3 * np.clip(t - 2.0, 0.0, None) ** 1.2
+    smooth = np.ones(9) / 9.0
+    p = np.stack([np.convolve(np.pad(a, 4, "edge"), smooth, "valid") for a in (x, 0.0 * t, z)], axis=1)
+    T_w_c = np.tile(T_B_C, (len(t), 1, 1))
+    T_w_c[:, :3, 3] += p
+    return replace(motion, stamps_s=t, T_w_c=T_w_c)
+
+
+def test_velocities_that_fit_one_rounding_only_do_not_decide_for_it(rng, swinging, replay, monkeypatch):
+    """Too few displacements for a fit under one hypothesis: likelihoods do not compare, and heights stand alone."""
+    fitted = TelemetryScale._by_displacements
+    monkeypatch.setattr(
+        TelemetryScale,
+        "_by_displacements",
+        lambda self, rounding: fitted(self, rounding) if rounding is Rounding.TRUNCATE else None,
+    )
+    fusion, gauge, _ = fused(rng, swinging(12.0), replay)
+    assert fusion.scale().source == "height"
+    assert abs(math.log(fusion.scale().value / gauge.scale)) < 0.15
 
 
 def test_scale_is_unknown_before_there_is_motion_or_telemetry(rng, swinging):

@@ -45,6 +45,13 @@ def test_agreement_and_contradiction_must_both_be_proven():
     assert Agreement(0.90, 12, dimensions=1).verdict is Verdict.OPEN  # one axis proves less
 
 
+def test_few_intervals_prove_velocities_only_where_they_agree_nearly_fully():
+    assert Agreement(0.96, 4, early=True).verdict is Verdict.AGREES
+    assert Agreement(0.94, 5, early=True).verdict is Verdict.OPEN
+    assert Agreement(0.99, 3, early=True).verdict is Verdict.OPEN
+    assert Agreement(0.92, 6, early=True).verdict is Verdict.AGREES
+
+
 def test_an_even_flight_proves_nothing_either_way(rng):
     """Straight on at one speed: what noise does about the mean must not count against it."""
     seen = np.array([0.3, 0.0, 0.0]) + rng.normal(0, 0.01, (40, 3))

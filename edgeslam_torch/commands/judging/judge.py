@@ -19,10 +19,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--set",
-        choices=("base", "variants", "flights", "all"),
+        choices=("base", "variants", "flights", "telemetry", "all"),
         default="base",
         dest="which",
-        help="recordings as they are, their variants, simulations, or all (default: base)",
+        help="recordings as they are, their variants, simulations, made telemetry, or all (default: base)",
     )
     parser.add_argument("--seeds", type=int, default=1, metavar="N", help="runs of every cell (default: 1)")
     parser.add_argument("--jobs", type=int, default=2, metavar="N", help="processes at a time (default: 2)")

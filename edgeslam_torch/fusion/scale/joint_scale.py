@@ -26,7 +26,7 @@ from edgeslam_torch.types import FloatArray, IntArray
 
 _LEAST_WEIGHT = 1e-3
 _MIN_DISPLACEMENTS = 6
-_MIN_HEIGHTS = 6
+_MIN_HEIGHTS = 4
 _MOST_PARTS = 4
 """Parts of a flight whose scales are compared: of a tenth of it there is too little to tell."""
 _BELIEF = 20.0

@@ -111,7 +111,7 @@ class Comparison:
         told = track.displacement(moved.to_s) - track.displacement(moved.from_s)
         slow = self._config.min_speed_m_s
         least_seen = math.inf if present.rough_scale is None else 2.0 * slow / present.rough_scale
-        velocity = agreement(moved.moved @ R_w_m.T / duration, told / duration, least_seen, slow)
+        velocity = agreement(moved.moved @ R_w_m.T / duration, told / duration, least_seen, slow, early=True)
         found = {Reading.VELOCITY: velocity}
         if track.has_attitude:
             both = turns(moved, track, present.R_b_c)

@@ -1,0 +1,1 @@
+"""Telemetry made from ground truth, right and faulty, and the scale that a run states while flying."""
