@@ -11,7 +11,7 @@ from edgeslam_torch.eval.judge.bars import Bar, Row, verdicts_of_cell, verdicts_
 _FOOTNOTES = (
     "end, live: share of the frames whose pose rests on the map, at the end and when they came. path: ATE in % of the "
     "true path. still: ATE of the best fixed position. scale: true over estimated; sigma as the run states it, z = log "
-    "scale / sigma. 1st scale s: when the published unit first became the drone's metre, its z then; >3 sigma: share of "
+    "scale / sigma. 1st scale s: when the published unit first became the drone's metre, its z; >3 sigma: share of "
     "the frames from 12.5 s on whose live scale is further off. 1st s: error of the first second's poses, and how many "
     "times that of the others it is. Lengths in "
     "metres unless they say otherwise; ATE after Sim(3) over all frames.",
