@@ -33,8 +33,9 @@ $(STAMP): pyproject.toml constraints.txt
 demo: $(STAMP)
 	$(BIN)/edgeslam demo $(DEMO_ARGS)
 
-# One process a core, each with one thread of torch; a file's tests stay together as long as no process is idle.
-PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
+# One process a core, each with one thread of torch; a file's tests stay together as long as no process is idle. Byte
+# code is kept, also where the shell says no: commands that tests start would compile the package each time.
+PYTEST := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 
 # The examples in docstrings are tests too.
 test: $(STAMP)

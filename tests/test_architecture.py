@@ -4,6 +4,7 @@ import ast
 import subprocess
 import sys
 from collections.abc import Iterable, Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -32,6 +33,17 @@ def sources() -> list[Path]:
     return sorted({p for p in files if "__pycache__" not in p.parts})
 
 
+def statements(node: ast.AST) -> Iterator[ast.stmt]:
+    """Statements inside a node at any depth, except for the type checker's own."""
+    for inner in ast.iter_child_nodes(node):
+        if isinstance(inner, ast.If) and "TYPE_CHECKING" in ast.unparse(inner.test):
+            continue
+        if isinstance(inner, ast.stmt):
+            yield inner
+        if isinstance(inner, ast.stmt | ast.ExceptHandler | ast.match_case):  # no import stands in an expression
+            yield from statements(inner)
+
+
 def imported(tree: ast.AST, known: frozenset[str] = frozenset()) -> Iterator[str]:
     """Full names that a module imports, anywhere in it, except for the type checker alone.
 
@@ -39,13 +51,7 @@ def imported(tree: ast.AST, known: frozenset[str] = frozenset()) -> Iterator[str
         tree: The parsed module.
         known: Modules; of ``from package import module`` the module counts, not the package.
     """
-    skipped: set[int] = set()
-    for node in ast.walk(tree):
-        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
-            skipped |= {id(inner) for inner in ast.walk(node)}
-    for node in ast.walk(tree):
-        if id(node) in skipped:
-            continue
+    for node in statements(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -72,7 +78,14 @@ def module_name(path: Path) -> str:
 
 
 MODULES = frozenset(module_name(path) for path in sources())
-PARSED = {path: list(imported(ast.parse(path.read_text(encoding="utf-8")), MODULES)) for path in sources()}
+
+
+@cache
+def imports() -> dict[str, list[str]]:
+    """What each module of the package imports, by its full name."""
+    return {
+        module_name(path): list(imported(ast.parse(path.read_text(encoding="utf-8")), MODULES)) for path in sources()
+    }
 
 
 def test_table_names_every_part_once_and_nothing_else():
@@ -87,13 +100,13 @@ def test_table_has_no_arrow_up():
         assert row.may_use <= below, f"{row.parts} may use {set(row.may_use - below)}, which does not lie below"
 
 
-@pytest.mark.parametrize("path", PARSED, ids=lambda p: str(p.relative_to(ROOT)))
-def test_imports_are_those_of_the_table(path):
-    assert forbidden(module_name(path), PARSED[path]) == [], "docs/architecture.md does not allow it"
+def test_imports_are_those_of_the_table():
+    found = {module: forbidden(module, names) for module, names in imports().items()}
+    assert {module: names for module, names in found.items() if names} == {}, "docs/architecture.md does not allow it"
 
 
 def test_table_allows_only_imports_in_use():
-    used = {(part_of(module_name(path)), part_of(name)) for path, names in PARSED.items() for name in names}
+    used = {(part_of(module), part_of(name)) for module, names in imports().items() for name in names}
     rows = [row for row in LAYERS if not row.is_all]
     needless = [
         (row.parts, other) for row in rows for other in row.may_use if not used & {(p, other) for p in row.parts}
@@ -130,18 +143,16 @@ def test_no_folder_is_too_big():
     assert too_big == set()
 
 
-@pytest.mark.parametrize("path", PARSED, ids=lambda p: str(p.relative_to(ROOT)))
-def test_packages_that_do_not_belong_are_not_imported(path):
-    tops = {name.split(".")[0] for name in PARSED[path]}
-    assert not tops & NEVER
-    assert all(ORACLES[name] == module_name(path) for name in tops & ORACLES.keys())
-    assert not tops & {"models", "losses", "train", "eval"}, "import edgeslam_torch.losses, not losses"
+def test_packages_that_do_not_belong_are_not_imported():
+    tops = {module: {name.split(".")[0] for name in names} for module, names in imports().items()}
+    users = {name: {module for module, found in tops.items() if name in found} for name in {*NEVER, *ORACLES, *LINKED}}
+    assert {name: users[name] for name in NEVER if users[name]} == {}
+    assert {name: users[name] - {home} for name, home in ORACLES.items() if users[name] - {home}} == {}
+    assert {name: users[name] for name in LINKED if users[name]} == {}, "import edgeslam_torch.losses, not losses"
 
 
 def test_train_is_imported_by_commands_only():
-    users = {
-        module_name(path) for path, names in PARSED.items() if any(n.startswith("edgeslam_torch.train") for n in names)
-    }
+    users = {module for module, names in imports().items() if any(n.startswith("edgeslam_torch.train") for n in names)}
     assert {name.split(".")[1] for name in users} <= {"train", "commands"}
 
 

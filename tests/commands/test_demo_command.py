@@ -30,7 +30,7 @@ def test_record_only_leaves_a_recording_that_can_be_run(
 
 def test_shorter_demo_leaves_nothing_of_the_longer_one(tmp_path: Path) -> None:
     for seconds in (2.0, 1.0):
-        record(tmp_path, DemoSettings(seconds=seconds, rate_hz=5.0, width=160, height=120))
+        record(tmp_path, DemoSettings(world="corridor", seconds=seconds, rate_hz=5.0, width=160, height=120))
     assert len(list((tmp_path / "rgb").iterdir())) == 5
 
 

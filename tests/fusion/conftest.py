@@ -48,7 +48,7 @@ class Gauge:
     sigma_r: float
 
 
-def _swinging(duration_s: float = 30.0, rate_hz: float = 20.0, size_m: float = 0.25) -> Motion:
+def _swinging(duration_s: float = 20.0, rate_hz: float = 20.0, size_m: float = 0.25) -> Motion:
     """A camera swung by hand along three axes, turning a little."""
     t = np.arange(0.0, duration_s, 1.0 / rate_hz)
     p = size_m * np.stack([np.sin(1.7 * t), np.sin(1.3 * t + 1.0), 0.7 * np.sin(2.1 * t + 2.0)], axis=1)

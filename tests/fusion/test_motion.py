@@ -177,12 +177,12 @@ def test_telemetry_keeps_a_smaller_sigma_than_depth_under_a_guessed_focal_length
 
 
 def test_a_frozen_or_silent_link_does_not_pull_the_scale(rng, swinging, replay):
-    motion = swinging(30.0)
+    motion = swinging(20.0)
     samples = simulate(rng, motion.stamps_s, motion.T_w_c, T_B_C).samples()
     gauge = motion.in_gauge(rng)
-    last = next(s for s in samples if s.stamp_s > 12.0 and np.abs(s.velocity_m_s).max() > 0.15)
-    frozen = [replace(last, stamp_s=s.stamp_s) if 12.0 < s.stamp_s < 22.0 else s for s in samples]
-    silent = [s for s in samples if not 12.0 < s.stamp_s < 22.0]
+    last = next(s for s in samples if s.stamp_s > 8.0 and np.abs(s.velocity_m_s).max() > 0.15)
+    frozen = [replace(last, stamp_s=s.stamp_s) if 8.0 < s.stamp_s < 15.0 else s for s in samples]
+    silent = [s for s in samples if not 8.0 < s.stamp_s < 15.0]
     scales = []
     for log in (frozen, silent):
         fusion = MotionFusion(FusionConfig(), T_B_C)
@@ -195,13 +195,13 @@ def test_a_frozen_or_silent_link_does_not_pull_the_scale(rng, swinging, replay):
 @pytest.mark.parametrize("gap_s", [0.05, 0.5, 1.0])
 def test_prediction_bridges_lost_vision(rng, swinging, replay, gap_s):
     """Compared with a constant pose: what telemetry adds while video is missing."""
-    motion = swinging(30.0)
+    motion = swinging(24.0)
     errors, still = [], []
     last = {}
 
     def seen(t):
-        """From 12 s on, video is missing for ``gap_s`` every two seconds."""
-        return t < 12.0 or t % 2.0 > gap_s - 0.01
+        """From 6 s on, video is missing for ``gap_s`` every two seconds."""
+        return t < 6.0 or t % 2.0 > gap_s - 0.01
 
     def each(t, i):
         if not seen(t) and seen(t + 0.05):
@@ -219,7 +219,7 @@ def test_prediction_bridges_lost_vision(rng, swinging, replay, gap_s):
 
 
 def test_lost_frames_are_no_evidence(rng, swinging, replay):
-    motion = swinging(30.0)
+    motion = swinging(20.0)
     samples = simulate(rng, motion.stamps_s, motion.T_w_c, T_B_C).samples()
     gauge = motion.in_gauge(rng)
     gauge.T_m_c[200:300, :3, 3] *= 3.0  # what a lost tracker may report
@@ -231,7 +231,7 @@ def test_lost_frames_are_no_evidence(rng, swinging, replay):
 
 def test_truncated_velocities_are_told_from_rounded_ones(rng, swinging, replay):
     """A real Tello truncates: read as rounded, the scale of this motion would be 15 to 20 % low."""
-    motion = swinging(30.0)
+    motion = swinging(20.0)
     exact = simulate(rng, motion.stamps_s, motion.T_w_c, T_B_C, faults=replace(EXACT, video_delay_s=0.5)).samples()
     truncated = [
         replace(s, velocity_m_s=np.trunc(10 * (s.velocity_m_s + rng.normal(0, 0.02, 3))) / 10, tof_m=np.nan,
@@ -251,7 +251,7 @@ def test_truncated_velocities_are_told_from_rounded_ones(rng, swinging, replay):
 @pytest.mark.parametrize("truncated", [False, True])
 def test_the_images_tell_rounding_from_truncation(rng, swinging, replay, truncated):
     """No velocity reaches three steps, so readings alone tell nothing; read wrongly the scale is 25 % off."""
-    motion = swinging(30.0, size_m=0.13)
+    motion = swinging(20.0, size_m=0.13)
     exact = simulate(rng, motion.stamps_s, motion.T_w_c, T_B_C, faults=replace(EXACT, video_delay_s=0.5)).samples()
     whole = np.trunc if truncated else np.rint
     samples = [replace(s, velocity_m_s=whole(10 * (s.velocity_m_s + rng.normal(0, 0.02, 3))) / 10) for s in exact]
@@ -282,7 +282,7 @@ def test_height_changes_alone_tell_the_scale_of_a_climb(rng, replay, swinging):
 
 def test_velocities_and_heights_that_disagree_widen_sigma(rng, swinging, replay):
     """Heights 15 % too large: neither is nonsense, and the scale may be that of either."""
-    motion = swinging(30.0)
+    motion = swinging(20.0)
     gauge = motion.in_gauge(rng)
     stated = []
     for factor in (1.0, 1.15):
@@ -309,13 +309,13 @@ def test_a_pose_that_is_no_number_is_no_evidence(rng, swinging, replay):
 
 
 def test_filter_follows_the_flight_in_metres(rng, swinging, replay):
-    motion = swinging(30.0)
+    motion = swinging(20.0)
     samples = simulate(rng, motion.stamps_s, motion.T_w_c, T_B_C).samples()
     fusion, gauge = MotionFusion(FusionConfig(), T_B_C), motion.in_gauge(rng)
     states = []
 
     def each(t, i):
-        if 20.0 < t < 29.4 and i % 10 == 0:
+        if 10.0 < t < 19.4 and i % 10 == 0:
             ekf = fusion.snapshot().filter.ekf
             states.append(ekf.state_at(ekf.stamp_s))
 
@@ -331,7 +331,7 @@ def test_filter_follows_the_flight_in_metres(rng, swinging, replay):
 @pytest.mark.parametrize("noise_m", [0.003, 0.02])
 def test_filter_takes_vision_for_as_noisy_as_it_is(rng, swinging, replay, noise_m):
     """Where the stated sigma is right, 95 % of the increments pass the gate, whatever the noise."""
-    motion = swinging(30.0)
+    motion = swinging(20.0)
     samples = simulate(rng, motion.stamps_s, motion.T_w_c, T_B_C).samples()
     fusion = MotionFusion(FusionConfig(), T_B_C)
     replay(fusion, motion, motion.in_gauge(rng, noise_m=noise_m), samples)
@@ -343,7 +343,7 @@ def test_filter_takes_vision_for_as_noisy_as_it_is(rng, swinging, replay, noise_
 @pytest.mark.parametrize("true_tilt_deg", [12.0, 25.0])
 def test_tilt_of_the_camera_is_estimated_from_the_flight(rng, swinging, replay, true_tilt_deg):
     """Assumed 12 degrees; the drone carries its camera differently."""
-    base = swinging(40.0)
+    base = swinging(30.0)
     T_true = camera_on_body(math.radians(true_tilt_deg))
     motion = replace(base, T_w_c=base.T_w_c @ se3.inverse(T_B_C) @ T_true)
     samples = simulate(rng, motion.stamps_s, motion.T_w_c, T_true).samples()

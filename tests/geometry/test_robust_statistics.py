@@ -13,6 +13,17 @@ def test_quantiles_are_those_of_their_distributions():
     assert pytest.approx(1.0 / stats.norm.ppf(0.75), abs=1e-4) == rs.MAD_TO_SIGMA
 
 
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_median_is_numpys_to_the_bit(rng, dtype):
+    for n in [*range(1, 12), 301, 5000]:
+        x = rng.normal(size=n).astype(dtype)
+        assert rs.median(x) == np.median(x)
+        assert rs.median(np.r_[x, np.full(n + 1, np.inf)]) == np.inf
+        x[n // 2] = np.nan
+        assert np.isnan(rs.median(x))
+    assert np.isnan(rs.median(np.zeros(0)))
+
+
 def test_robust_sigma_is_the_deviation_of_normal_errors_and_ignores_a_third_of_outliers(rng):
     x = rng.normal(0.0, 2.5, 20_000)
     assert rs.robust_sigma(x) == pytest.approx(2.5, rel=0.03)

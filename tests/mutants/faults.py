@@ -9,7 +9,7 @@ import ast
 import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -94,7 +94,7 @@ def applied(fault: Fault, files: list[Source]) -> tuple[Path, str]:
     if fault.line.split() == fault.put.split():
         raise FaultError(f"{fault.room}: {fault.name}: changes nothing")
     try:
-        _tree(text)
+        ast.parse(text)
     except SyntaxError as error:
         raise FaultError(f"{fault.room}: {fault.name}: {error}") from error
     return source.path, text
@@ -133,9 +133,14 @@ def _spans(text: str, qualified: str) -> Iterator[tuple[int, int]]:
     yield from walk(_tree(text), "")
 
 
-@lru_cache(maxsize=32)
+@cache
 def _tree(text: str) -> ast.Module:
     return ast.parse(text)
+
+
+@lru_cache(maxsize=1)
+def _test_files(root: Path) -> list[Path]:
+    return sorted((root / "tests").rglob("*.py"))
 
 
 def pytest_arguments(fault: Fault, root: Path = ROOT) -> list[str]:
@@ -150,7 +155,7 @@ def pytest_arguments(fault: Fault, root: Path = ROOT) -> list[str]:
             arguments += ["-k", test.removeprefix("-k ")]
             continue
         name, colons, function = test.partition("::")
-        found = sorted((root / "tests").rglob(name))
+        found = [path for path in _test_files(root) if path.as_posix().endswith(f"/{name}")]
         if len(found) != 1:
             raise FaultError(f"{fault.room}: {fault.name}: {len(found)} files tests/**/{name}")
         if function and f"def {function}(" not in found[0].read_text(encoding="utf-8"):

@@ -92,15 +92,27 @@ def assert_same(whole: TrainState, other: TrainState) -> None:
     assert (whole.best, whole.best_step) == (other.best, other.best_step)
 
 
+@pytest.fixture(scope="module")
+def killed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folders ``step1`` to ``step6`` as they were after each step of one run."""
+    folder = tmp_path_factory.mktemp("killed")
+    run(folder / "whole", hooks=[_SnapshotAt(i, folder / "whole", folder / f"step{i}") for i in range(1, 7)])
+    return folder
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> TrainState:
+    """The end of a run that nothing disturbed; not to be changed."""
+    return run(tmp_path_factory.mktemp("whole"))
+
+
 @pytest.mark.parametrize("step", [1, 2, 3, 5, 6])
-def test_killed_and_resumed_run_ends_with_the_same_weights(tmp_path: Path, step: int) -> None:
-    whole = run(tmp_path / "whole", hooks=[_SnapshotAt(step, tmp_path / "whole", tmp_path / "killed")])
-    assert_same(whole, run(tmp_path / "killed"))
+def test_killed_and_resumed_run_ends_with_the_same_weights(whole: TrainState, killed: Path, step: int) -> None:
+    assert_same(whole, run(killed / f"step{step}"))
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), RuntimeError("a broken hook")])
-def test_interrupt_and_broken_hook_lose_no_step(tmp_path: Path, error: BaseException) -> None:
-    whole = run(tmp_path / "whole")
+def test_interrupt_and_broken_hook_lose_no_step(whole: TrainState, tmp_path: Path, error: BaseException) -> None:
     hook = _RaiseAt(5, error)
     with pytest.raises(type(error)):
         run(tmp_path / "stopped", hooks=[hook])
@@ -109,11 +121,10 @@ def test_interrupt_and_broken_hook_lose_no_step(tmp_path: Path, error: BaseExcep
     assert_same(whole, run(tmp_path / "stopped"))
 
 
-def test_interrupt_in_the_validation_is_validated_after_the_resume(tmp_path: Path) -> None:
+def test_interrupt_in_the_validation_is_validated_after_the_resume(whole: TrainState, tmp_path: Path) -> None:
     def interrupted(_: FastDepth) -> dict[str, float]:
         raise KeyboardInterrupt
 
-    whole = run(tmp_path / "whole")
     with pytest.raises(KeyboardInterrupt):
         train(network(), METADATA, [signal()], CONFIG, tmp_path / "stopped", interrupted)
     assert saved_step(tmp_path / "stopped" / "last.pt") == 3
@@ -121,9 +132,8 @@ def test_interrupt_in_the_validation_is_validated_after_the_resume(tmp_path: Pat
 
 
 def test_interrupt_between_two_weights_of_a_step_saves_the_step_before(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    whole: TrainState, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole = run(tmp_path / "whole")
     steps = []
     real = torch.optim.AdamW.step
 
@@ -253,14 +263,23 @@ class _ExplodeAt(Hooks):
                     parameter.mul_(self.factor)
 
 
+@pytest.fixture(scope="module")
+def longer(tmp_path_factory: pytest.TempPathFactory) -> tuple[TrainConfig, TrainState]:
+    """A run of eight steps and its end."""
+    config = replace(CONFIG, steps=8)
+    return config, run(tmp_path_factory.mktemp("longer"), config)
+
+
 @pytest.mark.parametrize("factor", [1e3, 1e30, torch.nan])
 @pytest.mark.parametrize("step", [4, 5])
-def test_last_state_is_a_working_network_after_a_divergence(tmp_path: Path, factor: float, step: int) -> None:
-    config = replace(CONFIG, steps=8)
+def test_last_state_is_a_working_network_after_a_divergence(
+    longer: tuple[TrainConfig, TrainState], tmp_path: Path, factor: float, step: int
+) -> None:
+    config, whole = longer
     with pytest.raises(DivergedError, match=r"last\.pt holds step [24], the last good one"):
         run(tmp_path, config, hooks=[_ExplodeAt(step, factor)])
     assert saved_step(tmp_path / "last.pt") == (2 if step == 4 else 4)
-    assert_same(run(tmp_path / "other", config), run(tmp_path, config))
+    assert_same(whole, run(tmp_path, config))
 
 
 def test_interrupt_after_an_explosion_saves_no_ruin(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from edgeslam_torch.fusion.scale.log_scale import LogScale
-from edgeslam_torch.geometry.robust_statistics import robust_sigma
+from edgeslam_torch.geometry.robust_statistics import median, robust_sigma
 from edgeslam_torch.types import FloatArray
 
 SLOPE_SIGMA = 0.4
@@ -79,7 +79,7 @@ def compared(network_m: FloatArray, map_depth: FloatArray) -> DepthRatio | None:
     x, y = np.log(map_depth[usable]), np.log(network_m[usable])
     spread = max(_robust_deviation(y - x), _LEAST_SPREAD_LOG)
     slope, depth_spread = _slope(x, y)
-    return DepthRatio(float(np.median(y - x)), spread, slope, depth_spread, len(x))
+    return DepthRatio(median(y - x), spread, slope, depth_spread, len(x))
 
 
 def _slope(x: FloatArray, y: FloatArray) -> tuple[float, float]:
@@ -189,4 +189,4 @@ def _robust_mean(x: FloatArray, sigma: FloatArray) -> tuple[float, float]:
 
 
 def _robust_deviation(x: FloatArray) -> float:
-    return robust_sigma(x - np.median(x))
+    return robust_sigma(x - median(x))

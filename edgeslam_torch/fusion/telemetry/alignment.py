@@ -32,8 +32,6 @@ def map_to_world(sightings: Sightings, track: TelemetryTrack, delay_s: float, R_
     Returns:
         ``R_w_m`` ``(3, 3)``, map axes to the power-on world; ``None`` where no attitude covers a pose.
     """
-    if not np.isfinite(track.attitude(np.array([0.0]))).all():
-        return None
     stamps_s = sightings.stamps_s - delay_s
     inside = track.covered(stamps_s, stamps_s)
     if not inside.any():

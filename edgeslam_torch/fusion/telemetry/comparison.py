@@ -12,7 +12,7 @@ from edgeslam_torch.fusion.telemetry.alignment import map_to_world, turns
 from edgeslam_torch.fusion.telemetry.delay import GROWTH, Delay
 from edgeslam_torch.fusion.telemetry.plausibility import Agreement, Reading, Reread, Trust, Verdict, agreement
 from edgeslam_torch.fusion.telemetry.track import TelemetryTrack, Turn
-from edgeslam_torch.fusion.telemetry.visual_memory import VisualMemory
+from edgeslam_torch.fusion.telemetry.visual_memory import Displacements, VisualMemory
 from edgeslam_torch.types import FloatArray
 
 _WIDE_DELAYS_S = (-3.0, 3.0)
@@ -56,8 +56,7 @@ class Comparison:
         Velocities that fit significantly better in another frame are read in that frame from now on, overriding
         settings and reader.
         """
-        used = self._compared(present, delay.value_s, R_w_m)
-        now, n = used[Reading.VELOCITY], present.memory.count
+        now, n = self._velocity(present, delay.value_s, R_w_m), present.memory.count
         if now.correlation >= _FITS_WELL:
             trust.elsewhere_s = None
         elif now.count >= _TO_LOOK_ELSEWHERE and n >= GROWTH * self._looked_wide_at:
@@ -66,11 +65,13 @@ class Comparison:
             if turn is not None:
                 trust.reread = Reread(turn, now)
                 present.track.read_as(turn)
-                used = self._compared(present, delay.value_s, R_w_m)
+                now = self._velocity(present, delay.value_s, R_w_m)
                 trust.forget(Reading.VELOCITY)
-            trust.elsewhere_s = self._fits_elsewhere(present, used[Reading.VELOCITY], delay.value_s)
-        for reading, found in used.items():
-            trust.judge(reading, found)
+            trust.elsewhere_s = self._fits_elsewhere(present, now, delay.value_s)
+        trust.judge(Reading.VELOCITY, now)
+        attitude = self._attitude(present, delay.value_s)
+        if attitude is not None:
+            trust.judge(Reading.ATTITUDE, attitude)
 
     def _fits_turned(self, present: FlightSoFar, now: Agreement, delay_s: float, R_w_m: FloatArray) -> Turn | None:
         """The frame in which the velocities surely fit better than in the one they are read in."""
@@ -78,7 +79,7 @@ class Comparison:
         for turn in Turn:
             if turn is not present.track.turn:
                 other = replace(present, track=present.track.as_if(turn))
-                found = self._compared(other, delay_s, R_w_m)[Reading.VELOCITY]
+                found = self._velocity(other, delay_s, R_w_m)
                 if found.correlation > best.correlation:
                     best, best_turn = found, turn
         return best_turn if _surely_better(best, now) else None
@@ -90,34 +91,39 @@ class Comparison:
         best, best_s = now, used_s
         for delay_s in np.arange(_WIDE_DELAYS_S[0], _WIDE_DELAYS_S[1] + 1e-9, _WIDE_STEP_S).tolist():
             R = map_to_world(present.memory.sightings(), present.track, delay_s, present.R_b_c)
-            found = None if R is None else self._compared(present, delay_s, R)[Reading.VELOCITY]
+            found = None if R is None else self._velocity(present, delay_s, R)
             if found is not None and found.count >= now.count // 2 and found.correlation > best.correlation:
                 best, best_s = found, delay_s
         return best_s if _surely_better(best, now) and not low <= best_s <= high else None
 
-    def _compared(self, present: FlightSoFar, delay_s: float, R_w_m: FloatArray) -> dict[Reading, Agreement]:
-        """How velocities and attitude go with the images under one delay.
+    def _velocity(self, present: FlightSoFar, delay_s: float, R_w_m: FloatArray) -> Agreement:
+        """How velocities go with the images under one delay.
 
         Without the camera's lever arm: rotations must not count as evidence for velocities.
         """
-        track = present.track
-        moved = present.memory.displacements()
-        use = track.covered(moved.from_s - delay_s, moved.to_s - delay_s)
-        if not use.any():
-            return {Reading.VELOCITY: Agreement()}
-        moved = moved.only(use)
+        track, moved = present.track, _in_common(present, delay_s)
+        if len(moved) == 0:
+            return Agreement()
         duration = moved.duration_s[:, None]
-        moved = moved.on_telemetry_clock(delay_s)
-        told = track.displacement(moved.to_s) - track.displacement(moved.from_s)
+        told = track.displacement(moved.to_s - delay_s) - track.displacement(moved.from_s - delay_s)
         slow = self._config.min_speed_m_s
         least_seen = math.inf if present.rough_scale is None else 2.0 * slow / present.rough_scale
-        velocity = agreement(moved.moved @ R_w_m.T / duration, told / duration, least_seen, slow, early=True)
-        found = {Reading.VELOCITY: velocity}
-        if track.has_attitude:
-            both = turns(moved, track, present.R_b_c)
-            seen, told = (Rotation.from_matrix(R).as_rotvec() / duration for R in (both.seen, both.told))
-            found[Reading.ATTITUDE] = agreement(seen, told, _LEAST_TURN_RAD_S, 1.5 * _LEAST_TURN_RAD_S)
-        return found
+        return agreement(moved.moved @ R_w_m.T / duration, told / duration, least_seen, slow, early=True)
+
+    def _attitude(self, present: FlightSoFar, delay_s: float) -> Agreement | None:
+        """How attitude goes with them; None where there is none."""
+        moved = _in_common(present, delay_s)
+        if len(moved) == 0 or not present.track.has_attitude:
+            return None
+        both = turns(moved.on_telemetry_clock(delay_s), present.track, present.R_b_c)
+        seen, told = (Rotation.from_matrix(R).as_rotvec() / moved.duration_s[:, None] for R in (both.seen, both.told))
+        return agreement(seen, told, _LEAST_TURN_RAD_S, 1.5 * _LEAST_TURN_RAD_S)
+
+
+def _in_common(present: FlightSoFar, delay_s: float) -> Displacements:
+    """Displacements over which there is telemetry; on the video's clock."""
+    moved = present.memory.displacements()
+    return moved.only(present.track.covered(moved.from_s - delay_s, moved.to_s - delay_s))
 
 
 def _surely_better(best: Agreement, now: Agreement) -> bool:

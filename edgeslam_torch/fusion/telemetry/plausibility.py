@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgeslam_torch.fusion.telemetry.track import Turn
+from edgeslam_torch.geometry.robust_statistics import median
 from edgeslam_torch.types import FloatArray, IntArray
 
 _LEAST_COUNT = 6
@@ -133,7 +134,7 @@ def _tamed(x: FloatArray) -> FloatArray:
     moved = length[length > 0]
     if len(moved) == 0:
         return x
-    return np.asarray(x * np.minimum(1.0, _WINSOR * float(np.median(moved)) / np.maximum(length, 1e-12))[:, None])
+    return np.asarray(x * np.minimum(1.0, _WINSOR * median(moved) / np.maximum(length, 1e-12))[:, None])
 
 
 def _correlation(x: FloatArray, y: FloatArray) -> float:

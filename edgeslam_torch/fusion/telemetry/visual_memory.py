@@ -132,6 +132,7 @@ class VisualMemory:
         self.previous: VisualPose | None = None
         """The one before, if tracking has not been interrupted since."""
         self._displacements: Displacements | None = None
+        self._shown: Sightings | None = None
 
     def add(self, visual: VisualPose) -> None:
         """A tracked frame, newer than all before."""
@@ -140,6 +141,7 @@ class VisualMemory:
         self.previous, self.last = None if gap else last, visual
         if not self._sightings or visual.stamp_s - self._sightings[-1].stamp_s > _SIGHTING_S:
             self._sightings.append(visual)
+            self._shown = None
         start = None if gap else self._start
         if start is None:
             self._start = visual
@@ -164,6 +166,7 @@ class VisualMemory:
     def _each(self, change: Callable[[VisualPose], VisualPose]) -> None:
         self._intervals = deque((i.each(change) for i in self._intervals), self._intervals.maxlen)
         self._sightings = deque(map(change, self._sightings), self._sightings.maxlen)
+        self._shown = None
         self._start, self.last, self.previous = (
             None if visual is None else change(visual) for visual in (self._start, self.last, self.previous)
         )
@@ -196,8 +199,10 @@ class VisualMemory:
 
     def sightings(self) -> Sightings:
         """All of them as arrays."""
-        return Sightings(
-            np.array([v.stamp_s for v in self._sightings]),
-            np.array([v.T for v in self._sightings]).reshape(-1, 4, 4),
-            np.array([v.sigma_t for v in self._sightings]),
-        )
+        if self._shown is None:
+            self._shown = Sightings(
+                np.array([v.stamp_s for v in self._sightings]),
+                np.array([v.T for v in self._sightings]).reshape(-1, 4, 4),
+                np.array([v.sigma_t for v in self._sightings]),
+            )
+        return self._shown

@@ -52,8 +52,15 @@ def run(tmp_path, cell, **changes):
     return code, json.loads(result.read_text()) if result.is_file() else None
 
 
-def test_recording_is_run_and_judged(recording, tmp_path):
-    code, result = run(tmp_path, Cell("stairs", 0, str(recording)))
+@pytest.fixture(scope="module")
+def judged(recording, tmp_path_factory):
+    """The recording's cell after its run: folder, exit code and result."""
+    folder = tmp_path_factory.mktemp("judged")
+    return folder, *run(folder, Cell("stairs", 0, str(recording)))
+
+
+def test_recording_is_run_and_judged(judged):
+    _, code, result = judged
     figures = result["figures"]
     assert code == 0 and result["key"] == "k" and result["notes"] == []
     assert figures["frames"] == 36
@@ -74,8 +81,8 @@ def test_variant_is_judged_against_the_same_truth(recording, tmp_path):
     assert result["figures"]["path_m"] == pytest.approx(34 * 0.03, rel=0.05)
 
 
-def test_run_that_never_moves_scores_a_fixed_position(recording, tmp_path):
-    run(tmp_path, Cell("stairs", 0, str(recording)))
+def test_run_that_never_moves_scores_a_fixed_position(recording, judged, tmp_path):
+    shutil.copytree(judged[0] / "run", tmp_path / "run")
     truth = open_dataset(recording).truth
     still = Trajectory(truth.stamps_s, np.tile(np.eye(4), (len(truth), 1, 1)))
     for name in ("trajectory.txt", "trajectory_online.txt"):
@@ -102,12 +109,12 @@ def test_simulated_flight_is_judged_by_its_world(tmp_path, monkeypatch):
         return folders[0]
 
     monkeypatch.setattr(flights, "flight_folder", record)
-    code, result = run(tmp_path, Cell("flight/hover_first", 3, course="hover_first"))
+    code, result = run(tmp_path, Cell("flight/blank_corridor", 3, course="blank_corridor"))
     assert code == 0 and result["figures"]["frames"] == 8
     assert result["figures"]["path_m"] > 0
-    assert folders == [tmp_path / "flights" / "hover_first"]
+    assert folders == [tmp_path / "flights" / "blank_corridor"]
     assert Truth(None).surfaces is None
-    surfaces = run_cell._opened(Cell("flight/room", 3, course="room"), tmp_path, tmp_path)[1].surfaces
+    surfaces = run_cell._opened(Cell("flight/corridor", 3, course="corridor"), tmp_path, tmp_path)[1].surfaces
     floor = np.array([[0.0, 0.0, -0.25]])
     assert surfaces(floor) == pytest.approx([0.25], abs=0.01), "the floor is at height 0, a rug 8 mm above"
 
@@ -169,8 +176,8 @@ def test_second_flight_is_in_the_map_of_the_first_and_judged_against_it(recordin
 
 def test_a_further_flight_has_another_path_through_the_same_world(tmp_path, monkeypatch):
     monkeypatch.setattr(flights, "SECONDS", 0.4)
-    assert flights.main("room", 3, tmp_path / "again", 1) == 0
-    world, first, _ = flights.flown(COURSES["room"], 3, seconds=0.4)
+    assert flights.main("corridor", 3, tmp_path / "again", 1) == 0
+    world, first, _ = flights.flown(COURSES["corridor"], 3, seconds=0.4)
     again = open_dataset(tmp_path / "again").truth
     assert len(again.stamps_s) == 8
     assert np.linalg.norm(again.positions[0] - first.T_w_c[0, :3, 3]) > 0.1
