@@ -30,9 +30,10 @@ def test_the_guide_begins_with_these_commands():
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 @pytest.mark.timeout(580)
 def test_the_guide_can_be_followed(tmp_path):
-    """A flight, and either a map that frames were tracked against, or the plain word that there is none."""
+    """A flight, a map that its frames are tracked against, and metres."""
     sim, record, run = commands()
     command, state, video = free_ports(3)
     sim += [f"--command-port={command}", f"--state-port={state}", f"--video-port={video}"]
@@ -53,5 +54,7 @@ def test_the_guide_can_be_followed(tmp_path):
     summary = json.loads((tmp_path / "runs" / Path(folder).name / "summary.json").read_text())
     assert f"{summary['frames']} frames" in flown.stdout
     assert f"{summary['tracked']} of {summary['frames']} frames tracked" in done.stdout
-    assert summary["tracked"] or "no frame was tracked against a map" in done.stderr
-    assert summary["map"]["edge_points"] or "the edge map is empty" in done.stderr
+    # All of 613 frames and 24 600 points when written, beside eight busy processes.
+    assert summary["tracked"] > 0.9 * summary["frames"]
+    assert summary["map"]["edge_points"] > 8000
+    assert summary["scale"]["units"] == "metres"

@@ -88,9 +88,9 @@ def read_atlas(path: Path) -> SavedAtlas:
     Raises:
         AtlasError: In one line, with the file's name.
     """
+    if not path.is_file():
+        raise AtlasError(f"{path}: no such atlas file")
     try:
-        if not path.is_file():
-            raise Damaged("no such atlas file")
         if path.stat().st_size > MAX_FILE_BYTES:
             raise Damaged(f"more than any atlas of ours ({MAX_FILE_BYTES >> 20} MiB)")
         with path.open("rb") as file:

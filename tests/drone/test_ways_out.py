@@ -22,7 +22,11 @@ from edgeslam_torch.drone.emulator.drone import Mode
 from edgeslam_torch.readers.source import open_source
 
 pytest.importorskip("av", reason="PyAV is not installed: the [drone] extra")
-pytestmark = [pytest.mark.slow, pytest.mark.skipif(os.name != "posix", reason="signals as POSIX has them")]
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.alone,
+    pytest.mark.skipif(os.name != "posix", reason="signals as POSIX has them"),
+]
 
 LOST = Reply("", Answer.NEVER)
 POLITE = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT]

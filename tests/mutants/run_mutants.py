@@ -1,8 +1,8 @@
 """Put each fault into a copy of the project and run its tests: ``make mutants``; survivors are what tests overlook.
 
 ``make mutants MUTANTS_ARGS="--only fusion"`` takes the faults whose list or name contains the word.
-Exit status: 0 when at least 90 % are killed and every survivor has a sentence; 1 otherwise; 2 when the lists do not fit
-the code or the tests fail without any fault.
+Exit status: 0 when at least 90 % are killed, every survivor has a sentence and no run timed out; 1 otherwise; 2 when
+the lists do not fit the code or the tests fail without any fault.
 """
 
 import argparse
@@ -21,6 +21,7 @@ import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from enum import StrEnum
 from importlib.util import cache_from_source
 from pathlib import Path
 
@@ -34,7 +35,15 @@ LEFT_OUT = shutil.ignore_patterns(
     ".git", ".venv", "runs", "site", "dist", "build", "__pycache__", ".pytest_cache", ".mypy_cache", ".ruff_cache"
 )
 WALL_S = 900.0
-"""A fault whose tests take longer hangs; usually the limit of CPU time decides, the same on a busy machine."""
+"""A run of the tests that takes longer says nothing about the fault: they may hang, or the machine is busy."""
+
+
+class Outcome(StrEnum):
+    """What the tests say about a fault."""
+
+    KILLED = "killed"
+    SURVIVED = "SURVIVED"
+    TIMED_OUT = "TIMED OUT"
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +51,7 @@ class Verdict:
     """What became of one fault."""
 
     fault: Fault
-    killed: bool
+    outcome: Outcome
     seconds: float
     words: str
     """The test that failed, or how else it ended."""
@@ -97,7 +106,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             return 2
         with ThreadPoolExecutor(args.jobs) as pool:
             verdicts = list(pool.map(lambda r: _try(copies, *r, args.cpu_s), chosen))
-    return _report(verdicts)
+    return report(verdicts)
 
 
 def _sound(copies: Copies, chosen: list[tuple[Fault, Path, str, list[str]]], cpu_s: int) -> bool:
@@ -121,15 +130,12 @@ def _try(copies: Copies, fault: Fault, path: Path, text: str, arguments: list[st
     began = time.monotonic()
     try:
         _write(target, text.encode("utf-8"))
-        killed, words = _judged(*_pytest(copy, arguments, cpu_s))
+        outcome, words = judged(*_pytest(copy, arguments, cpu_s))
     finally:
         _write(target, right)
         copies.give_back(copy)
-    verdict = Verdict(fault, killed, time.monotonic() - began, words)
-    print(
-        f"{'killed  ' if killed else 'SURVIVED'} {verdict.seconds:5.1f} s  {fault.room}: {fault.name}  {words}",
-        flush=True,
-    )
+    verdict = Verdict(fault, outcome, time.monotonic() - began, words)
+    print(f"{outcome:9} {verdict.seconds:5.1f} s  {fault.room}: {fault.name}  {words}", flush=True)
     return verdict
 
 
@@ -139,31 +145,42 @@ def _write(target: Path, content: bytes) -> None:
     Path(cache_from_source(str(target))).unlink(missing_ok=True)
 
 
-def _judged(status: int | None, output: str) -> tuple[bool, str]:
+def judged(status: int | None, output: str) -> tuple[Outcome, str]:
+    """Outcome of a run, and the test that failed or how else it ended.
+
+    Args:
+        status: pytest's exit status, negative for a signal, None when the wall clock ran out.
+        output: What it printed.
+
+    Raises:
+        RuntimeError: If pytest itself failed.
+    """
     if status == 0:
-        return False, ""
+        return Outcome.SURVIVED, ""
     if status == pytest.ExitCode.NO_TESTS_COLLECTED:
-        return False, "(no test was selected)"
-    if status is None or status < 0:
-        return True, "(took too long)"
+        return Outcome.SURVIVED, "(no test was selected)"
+    if status is None:
+        return Outcome.TIMED_OUT, f"(not done after {WALL_S:.0f} s)"
+    if status < 0:  # the limit of CPU time, the same on a busy machine: pytest's own limit would end an endless loop
+        return Outcome.KILLED, f"({signal.Signals(-status).name})"
     failed = re.search(r"^(?:FAILED|ERROR) (\S+)", output, re.MULTILINE)
     if failed is None:  # nothing was tested: that must not pass for a fault that was noticed
         raise RuntimeError(f"pytest ended with status {status}:\n{output[-3000:]}")
-    return True, failed[1].split("/")[-1]
+    return Outcome.KILLED, failed[1].split("/")[-1]
 
 
 def _pytest(copy: Path, arguments: list[str], cpu_s: int) -> tuple[int | None, str]:
-    """Exit status (None when it hangs) and output of pytest in a copy, in a process of its own."""
+    """Exit status (None when it is not done in time) and output of pytest in a copy, in a process of its own."""
     log = copy.parent / "pytest.log"
     log.write_bytes(b"")
     process = _PROCESSES.Process(target=_run_pytest, args=(copy, arguments, log, cpu_s))
     process.start()
     process.join(WALL_S)
+    in_time = process.exitcode is not None
     with contextlib.suppress(ProcessLookupError):  # what it started goes with it
         os.killpg(process.pid or 0, signal.SIGKILL)
     process.join()
-    status = None if process.exitcode == -signal.SIGKILL else process.exitcode
-    return status, log.read_text(encoding="utf-8", errors="replace")
+    return process.exitcode if in_time else None, log.read_text(encoding="utf-8", errors="replace")
 
 
 def _run_pytest(copy: Path, arguments: list[str], log: Path, cpu_s: int) -> None:
@@ -183,19 +200,24 @@ def _run_pytest(copy: Path, arguments: list[str], log: Path, cpu_s: int) -> None
     sys.exit(pytest.main(["-x", "-q", "-p", "no:cacheprovider", "--tb=line", *arguments]))
 
 
-def _report(verdicts: list[Verdict]) -> int:
-    survivors = [v for v in verdicts if not v.killed]
+def report(verdicts: Sequence[Verdict]) -> int:
+    """Print what stands out, and the exit status."""
+    survivors = [v for v in verdicts if v.outcome is Outcome.SURVIVED]
+    late = [v for v in verdicts if v.outcome is Outcome.TIMED_OUT]
     for verdict in survivors:
         fault = verdict.fault
         print(f"\nsurvived: {fault.room}: {fault.name} {verdict.words}\n  {fault.line}  ->  {fault.put}\n  {fault.why}")
         print(f"  {fault.survives or 'NO SENTENCE says why no test sees it'}")
     for verdict in verdicts:
-        if verdict.killed and verdict.fault.survives:
+        if verdict.outcome is Outcome.KILLED and verdict.fault.survives:
             print(f"\n{verdict.fault.room}: {verdict.fault.name}: is killed by now; take its sentence away")
-    share = len(survivors) / len(verdicts)
-    print(f"\n{len(verdicts) - len(survivors)} of {len(verdicts)} killed, {100 * share:.0f} % survived")
+    for verdict in late:
+        print(f"\ntimed out, run it again: {verdict.fault.room}: {verdict.fault.name} {verdict.words}")
+    share = len(survivors) / max(len(verdicts) - len(late), 1)
+    killed = len(verdicts) - len(late) - len(survivors)
+    print(f"\n{killed} of {len(verdicts)} killed, {len(survivors)} survived, {len(late)} timed out")
     unexplained = any(not v.fault.survives for v in survivors)
-    return int(share > MAX_SURVIVORS or unexplained)
+    return int(share > MAX_SURVIVORS or unexplained or bool(late))
 
 
 if __name__ == "__main__":

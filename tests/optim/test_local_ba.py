@@ -479,7 +479,7 @@ def test_gtsam_finds_the_same_minimum():
 
 
 @pytest.mark.slow
-def test_compiled_kernels_find_the_same_minimum(monkeypatch, tmp_path):
+def test_compiled_kernels_find_the_same_minimum(monkeypatch, tmp_path, caplog):
     monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path))
     monkeypatch.setattr(compiled, "_compiled", {})
     if shutil.which("g++") is None and shutil.which("clang++") is None:
@@ -488,6 +488,7 @@ def test_compiled_kernels_find_the_same_minimum(monkeypatch, tmp_path):
     eager, fast = refine_window(problem, TIGHT), refine_window(problem, replace(TIGHT, compile=True))
     assert fast.cost_after == pytest.approx(eager.cost_after, rel=1e-9)
     np.testing.assert_allclose(fast.T_c_w, eager.T_c_w, atol=1e-8)
+    assert "eager from now on" not in caplog.text, "every kernel was compiled"
 
 
 def test_a_compiler_that_fails_leaves_the_eager_result(monkeypatch, caplog):

@@ -102,6 +102,7 @@ def test_webcams_are_numbered(spec):
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 def test_emulator_command_starts_and_stops(capsys):
     arguments = ["--command-port", "0", "--state-port", "1", "--video-port", "1", "--duration", "0.1"]
     assert main(["sim", *arguments, "--render-width", "64"]) == 0
@@ -109,6 +110,7 @@ def test_emulator_command_starts_and_stops(capsys):
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 @pytest.mark.timeout(120)
 @pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="signals as POSIX has them")
 def test_emulator_ends_whichever_of_its_threads_gets_the_signal(capsys, monkeypatch):

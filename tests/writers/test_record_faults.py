@@ -63,6 +63,7 @@ def record(url, folder, *options):
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 def test_one_packet_in_twenty_lost(tmp_path, capsys):
     with emulated(loss=0.05) as (emulator, url):
         assert record(url, tmp_path / "flight", "--max-frames", "150") == 0
@@ -72,6 +73,7 @@ def test_one_packet_in_twenty_lost(tmp_path, capsys):
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 def test_an_outage_of_three_seconds(tmp_path, capsys):
     with emulated() as (emulator, url):
 
@@ -92,6 +94,7 @@ def test_an_outage_of_three_seconds(tmp_path, capsys):
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 def test_a_drone_that_stops_answering(tmp_path, capsys):
     """The only flight here that fails: the drone receives nothing any more and lands by itself."""
     with emulated() as (emulator, url):
@@ -109,6 +112,7 @@ def test_a_drone_that_stops_answering(tmp_path, capsys):
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 def test_garbage_on_every_port(tmp_path, capsys):
     """Sent by the drone itself, and by others on its own address, where no filter tells them apart."""
     with emulated(garbage=0.2) as (emulator, url):
@@ -129,6 +133,7 @@ def test_garbage_on_every_port(tmp_path, capsys):
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 def test_packets_of_other_senders_change_nothing_and_are_reported(tmp_path, capsys):
     """Video and a low-battery state from another address: the recording holds the drone's own images only."""
     try:
@@ -157,6 +162,7 @@ def test_packets_of_other_senders_change_nothing_and_are_reported(tmp_path, caps
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 def test_a_drone_that_is_not_there(tmp_path, capsys):
     with emulated() as (emulator, url):
         emulator.frozen = True

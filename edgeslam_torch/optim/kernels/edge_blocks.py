@@ -167,7 +167,7 @@ class EdgeBlocks(RelativeBlocks):
 
     def alignment_chi2(self, T_c_w: Tensor, x: Tensor) -> FloatArray:
         """Squared whitened alignment residuals in the caller's order ``(P,)``; infinite behind the camera."""
-        chi2 = kernel(alignment_chi2, self.config.compile)
+        chi2 = kernel(alignment_chi2, self.compile)
         return self.tiles.of_pairs(chi2(self.motions(T_c_w)[1], x.to(self.dtype), self.pairs))
 
 

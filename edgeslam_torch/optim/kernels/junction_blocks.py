@@ -90,6 +90,8 @@ class JunctionBlocks(RelativeBlocks):
     cost_kernel = staticmethod(junction_cost)
     prior: JunctionPrior
     pairs: JunctionPairs
+    compiles = False
+    """A window has some dozens; compiling them took 60 s of CPU time, two thirds of the whole."""
 
     def __init__(self, terms: JunctionTerms, K: Tensor, column: Tensor, config: LmConfig) -> None:
         """Arrange the terms in the solver's layout; ``K`` is fx, fy, cx, cy."""

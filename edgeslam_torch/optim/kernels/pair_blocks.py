@@ -7,7 +7,7 @@ adjoint map them to the two poses: ``xi_rel = xi_target - Ad(T_target_host) xi_h
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import NamedTuple, Protocol
+from typing import ClassVar, NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -131,6 +131,8 @@ class RelativeBlocks(ABC):
     prior: Prior
     pairs: NamedTuple
     """Blocks and what the views that see them measured, in tiles."""
+    compiles: ClassVar[bool] = True
+    """Whether there are enough of them to pay for compiled kernels."""
 
     def __init__(
         self,
@@ -154,6 +156,7 @@ class RelativeBlocks(ABC):
             dtype: Of the blocks.
         """
         self.config, self.dtype = config, dtype
+        self.compile = config.compile and self.compiles
         self.tiles = lay_out(host, pair_block, pair_pose, len(column))
         self.x = self.tiles.blocks(np.maximum(inverse_depth, INVERSE_DEPTH_MIN), torch.float64, 1.0)
         # Cost of a pair behind a camera; empty slots cost nothing.
@@ -166,13 +169,13 @@ class RelativeBlocks(ABC):
 
     def system(self, T_c_w: Tensor, x: Tensor) -> Linearised:
         """Normal equations at poses ``(W, 4, 4)`` and blocks ``(size, B, L)``."""
-        linear = kernel(self.system_kernel, self.config.compile)
+        linear = kernel(self.system_kernel, self.compile)
         out: Linearised = linear(T_c_w, x, self.layout, self.prior, self.pairs)
         return out
 
     def robust_cost(self, Rt: Tensor, x: Tensor) -> Tensor:
         """Robust cost ``()`` of the residual rows, at motions ``(3, 4, B, T, 1)``."""
-        out: Tensor = kernel(self.cost_kernel, self.config.compile)(Rt, x, self.pairs)
+        out: Tensor = kernel(self.cost_kernel, self.compile)(Rt, x, self.pairs)
         return out
 
     @abstractmethod
@@ -181,7 +184,7 @@ class RelativeBlocks(ABC):
 
     def motions(self, T_c_w: Tensor) -> tuple[Tensor, Tensor]:
         """Relative motions ``(B T, 4, 4)``, and in the blocks' precision ``(3, 4, B, T, 1)``."""
-        motions = kernel(relative_motions, self.config.compile)
+        motions = kernel(relative_motions, self.compile)
         out: tuple[Tensor, Tensor] = motions(T_c_w, self.tiles.host, self.tiles.target, self.dtype)
         return out
 
@@ -199,7 +202,7 @@ class RelativeBlocks(ABC):
     def reduce(self, system: RelativeSystem, mu: float, S: Tensor, b: Tensor) -> Eliminated:
         """Eliminate the blocks from the pose system ``S`` and its right side ``b``."""
         damping = torch.tensor(mu, dtype=torch.float64)
-        eliminated, taken, right = kernel(taken_out, self.config.compile)(system, damping)
+        eliminated, taken, right = kernel(taken_out, self.compile)(system, damping)
         S -= taken
         b -= right
         out: Eliminated = eliminated

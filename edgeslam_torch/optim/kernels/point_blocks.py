@@ -454,7 +454,7 @@ _MATRIX = np.array([[0, 1, 2], [1, 3, 5], [2, 5, 8]])
 """Indices of ``R^T J^T J R`` in the output of `rotated`."""
 _VECTOR = np.array([4, 6, 7])
 """Indices of ``R^T J^T r`` in it."""
-_ROW, _COLUMN = np.triu_indices(3)
+_ROW, _COLUMN = (i.tolist() for i in np.triu_indices(3))  # numpy arrays cannot be compiled under inference mode
 _UPPER = torch.as_tensor(_MATRIX[_ROW, _COLUMN])
 _GRADIENT = torch.as_tensor(_VECTOR)
 _POWER = np.array([[0, 1, 2, 3], [1, 4, 5, 6], [2, 5, 7, 8], [3, 6, 8, 9]])

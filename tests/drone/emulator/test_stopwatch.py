@@ -36,6 +36,7 @@ def test_the_room_is_painted_where_the_drone_is():
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 def test_our_client_measures_the_delay_of_the_emulated_video():
     pytest.importorskip("av", reason="PyAV is not installed: the [drone] extra")
     from edgeslam_torch.drone.emulator.measure import measure

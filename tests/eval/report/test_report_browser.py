@@ -111,6 +111,7 @@ def test_no_text_of_a_run_makes_the_page_scroll_sideways(worst_page: Path, brows
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 def test_largest_map_is_turned_in_short_frames(run_folder: Callable[..., Path], tmp_path: Path) -> None:
     """Prints what is asked for: milliseconds a frame with 200 000 points, drawn by the processor alone."""
     page = write_report(tmp_path / "run", run_folder(tmp_path / "run", points=200_000))
