@@ -184,6 +184,9 @@ class MappingConfig:
     """Keyframes refined together (the paper says "short")."""
     window_fixed: int = 15
     """Fixed keyframes outside the window, which hold its gauge."""
+    loop_closure: bool = True
+    """Recognise places of the same piece of map after a long way, and spread the drift over the way between. Off, only
+    drift of a few pixels is made up for (the paper has no loop closure)."""
 
     def __post_init__(self) -> None:
         _positive(

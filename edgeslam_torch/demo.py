@@ -17,14 +17,14 @@ from edgeslam_torch.eval.metrics.run_score import RunScore, evaluate_run
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.readers.source import open_source
 from edgeslam_torch.run import Listener, RunResult, run
-from edgeslam_torch.synthetic.flights.courses import record_flight, simulated_camera
+from edgeslam_torch.synthetic.flights.courses import COURSES, RATE_HZ, SECONDS, record_flight, simulated_camera
 from edgeslam_torch.synthetic.flights.degrade import CLEAN, CameraFaults
-from edgeslam_torch.synthetic.flights.flight import Flight, FlightPlan, fly
+from edgeslam_torch.synthetic.flights.flight import Flight
 from edgeslam_torch.synthetic.flights.telemetry import TelemetryFaults
-from edgeslam_torch.synthetic.house.rooms import corridor, room
 from edgeslam_torch.synthetic.house.world import World
 
-WORLDS: dict[str, Callable[[np.random.Generator], World]] = {"room": room, "corridor": corridor}
+WORLDS = {name: COURSES[name] for name in ("room", "corridor", "block")}
+"""What ``--world`` takes: where and how to fly."""
 CAMERAS = {
     "clean": CLEAN,
     "normal": CameraFaults(),
@@ -48,8 +48,8 @@ class DemoSettings:
     """Settings of the demo flight."""
 
     world: str = "room"
-    seconds: float = 16.0
-    rate_hz: float = 20.0
+    seconds: float = SECONDS
+    rate_hz: float = RATE_HZ
     seed: int = 0
     images: str = "normal"
     """A name in `CAMERAS`."""
@@ -57,7 +57,6 @@ class DemoSettings:
     """None flies without telemetry."""
     width: int = 640
     height: int = 480
-    plan: FlightPlan = FlightPlan()
 
     def __post_init__(self) -> None:
         if self.world not in WORLDS:
@@ -122,8 +121,9 @@ def record(folder: Path, settings: DemoSettings, on_frame: Callable[[int], None]
     _clear(folder)
     start = time.perf_counter()
     rng = np.random.default_rng(settings.seed)
-    world = WORLDS[settings.world](rng)
-    flight = fly(rng, world, settings.frames, rate_hz=settings.rate_hz, plan=settings.plan)
+    course = WORLDS[settings.world]
+    world = course.world(rng)
+    flight = course.pilot(rng, world, settings.frames, rate_hz=settings.rate_hz)
     record_flight(
         folder,
         world,

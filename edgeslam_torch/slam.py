@@ -16,6 +16,7 @@ import torch
 
 from edgeslam_torch.atlas.atlas import Atlas, Join
 from edgeslam_torch.atlas.earlier import EarlierFlights
+from edgeslam_torch.atlas.loops import Closure
 from edgeslam_torch.atlas.saved import SavedAtlas, Unit, pack, unpack
 from edgeslam_torch.config import SlamConfig
 from edgeslam_torch.errors import SourceError
@@ -124,7 +125,7 @@ class EdgeSlam:
         self._present = Present()
         """What `pose_now` and `health` rest on: replaced as a whole, never changed."""
         self._machine = Machine()
-        atlas = Atlas(self._system.tracker, self.edges, self.log, lm)
+        atlas = Atlas(self._system.tracker, self.edges, self.log, lm, config.mapping.loop_closure)
         self._joining = Joining(self._system, atlas)
         self._earlier: EarlierFlights | None = None
         self._tracking = Tracking(self._system)
@@ -314,6 +315,10 @@ class EdgeSlam:
     def joins(self) -> list[Join]:
         """Pieces that were found to be one, with the evidence, in the order of time."""
         return list(self._joining.atlas.joins)
+
+    def closures(self) -> list[Closure]:
+        """Loops that were closed inside a piece, with the evidence, in the order of time."""
+        return list(self._joining.atlas.closures)
 
     def earlier_flights(self) -> dict[str, Any] | None:
         """What became of the atlas that was loaded, in numbers; None without one."""

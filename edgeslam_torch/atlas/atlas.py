@@ -1,7 +1,7 @@
-"""The pieces of the map and the search for what joins them.
+"""The pieces of the map and the search for what joins them, or closes a loop in one of them.
 
 One false join bends everything; a missed one leaves two pieces that say so. Hence two pieces are joined on two pairs of
-keyframes that have no keyframe in common and agree about the similarity, never on one.
+keyframes that have no keyframe in common and agree about the similarity, never on one; and so is a loop closed.
 """
 
 from dataclasses import dataclass
@@ -9,8 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from edgeslam_torch.atlas.links import Link, link
-from edgeslam_torch.atlas.places import lookalikes
-from edgeslam_torch.atlas.weld import move_piece, weld
+from edgeslam_torch.atlas.loops import LOOP_SHARE, Closure, far_keyframes, is_plausible, is_within_reach, spread
+from edgeslam_torch.atlas.places import MIN_VOTES, lookalikes
+from edgeslam_torch.atlas.weld import look_around, move_piece, share_anchors, weld
 from edgeslam_torch.geometry import sim3
 from edgeslam_torch.map.keyframe import NO_ANCHOR, Keyframe
 from edgeslam_torch.map.trajectory import TrajectoryLog
@@ -26,6 +27,11 @@ MIN_BASELINE = 0.02
 """Distance between the keyframes of two links, relative to their depth, from which on they are two witnesses."""
 MIN_TURN_RAD = np.deg2rad(3.0)
 """Turn between them from which on they are, too."""
+LOOK_BACK_S = 1.0
+"""Time from one search for loops to the next: a loop may wait, and each search costs as much as half a frame."""
+LOOP_VOTES = 20
+"""Votes from which on it is worth a closer look: a tenth. Where a fifth of what is in view will be found, 30 and more
+of 200 keypoints vote; a wall with the same paper gets 22."""
 WITNESSES = 4
 """Earlier keyframes of the same piece that are asked at once when one has found a link."""
 
@@ -51,6 +57,10 @@ class Join:
     matches: int
     """Keypoints of these that show the other piece."""
 
+    def growth(self, piece: int, keyframe_id: int) -> float:
+        """Factor by which the map grew around a keyframe that belonged to a piece."""
+        return sim3.scale_of(self.S) if self.moved == piece else 1.0
+
     def in_words(self) -> str:
         """For `status.csv` and the summary."""
         scale = sim3.scale_of(self.S)
@@ -61,60 +71,98 @@ class Join:
 
 
 class Atlas:
-    """Asks every new keyframe whether it shows a piece that it does not belong to."""
+    """Asks every new keyframe whether it shows a piece that it does not belong to, or a far part of its own.
 
-    def __init__(self, tracker: Tracker, edges: EdgeMap, log: TrajectoryLog, lm: LmConfig) -> None:
+    Args:
+        tracker: With the map.
+        edges: Measured edges, which move with their keyframes.
+        log: Frames, which do so, too.
+        lm: Settings of the refinement.
+        closing: Whether loops inside a piece are closed.
+    """
+
+    def __init__(
+        self, tracker: Tracker, edges: EdgeMap, log: TrajectoryLog, lm: LmConfig, closing: bool = False
+    ) -> None:
         self.tracker = tracker
         self.map = tracker.map
         self.edges = edges
         self.log = log
         self.lm = lm
+        self.closing = closing
         self.joins: list[Join] = []
+        self.closures: list[Closure] = []
         self.known_scale: dict[int, ScaleEstimate] = {}
         """Metres per unit of pieces of earlier flights, by their number."""
         self._links: list[Link] = []
         """Found so far, between pieces that are still apart."""
         self._asked = -1
         """Newest keyframe that was asked."""
+        self._looked_back_s = -np.inf
+        """Stamp of the newest keyframe that was asked for a loop."""
 
     def strangers(self, piece: int) -> list[Keyframe]:
         """Keyframes of other pieces that have something to be recognised by."""
         return [k for k in self.map.keyframes.values() if self.map.piece_of(k.id) != piece and _is_mapped(k)]
 
     @property
+    def is_divided(self) -> bool:
+        """Whether the keyframes belong to several pieces."""
+        return len({self.map.piece_of(id) for id in self.map.keyframes}) > 1
+
+    @property
     def is_up_to_date(self) -> bool:
         """Whether every keyframe was asked."""
         return max(self.map.keyframes, default=-1) <= self._asked
 
-    def update(self) -> Join | None:
-        """Ask the keyframes that are new since the last call; the join that follows, if one does.
+    def update(self) -> Join | Closure | None:
+        """Ask the keyframes that are new since the last call; the join or the closed loop that follows, if one does.
 
         The map must belong to the caller.
         """
         for id in sorted(id for id in self.map.keyframes if id > self._asked):
             self._asked = id
-            join = self._ask(self.map.keyframes[id])
-            if join is not None:
-                return join
+            change = self._ask(self.map.keyframes[id])
+            if change is not None:
+                return change
         return None
 
     def ask_all_again(self) -> None:
         """Let the next `update` ask every keyframe."""
         self._asked = -1
+        self._looked_back_s = -np.inf
 
-    def _ask(self, keyframe: Keyframe) -> Join | None:
-        piece = self.map.piece_of(keyframe.id)
-        others = self.strangers(piece)
-        if not others or not _is_mapped(keyframe):
+    def _ask(self, keyframe: Keyframe) -> Join | Closure | None:
+        if not _is_mapped(keyframe):
             return None
-        for candidate in lookalikes(self.map, keyframe.words, others, CLOSER_LOOKS):
-            found = link(self.tracker, keyframe, candidate)
+        strangers = self.strangers(self.map.piece_of(keyframe.id))
+        for candidate in [*self._alike(keyframe, strangers, CLOSER_LOOKS), *self._seen_before(keyframe)]:
+            found = self._link(keyframe, candidate)
             if found is not None:
                 return self._settle(found)
         return None
 
-    def _settle(self, found: Link) -> Join | None:
-        """Join the two pieces of a link if another one agrees; earlier keyframes are asked for it."""
+    def _seen_before(self, keyframe: Keyframe) -> list[Keyframe]:
+        """Keyframes at the far end of a loop that look like this one, if it is time to ask."""
+        if not self.closing or keyframe.stamp_s - self._looked_back_s < LOOK_BACK_S:
+            return []
+        self._looked_back_s = keyframe.stamp_s
+        return self._alike(keyframe, far_keyframes(self.map, keyframe), CLOSER_LOOKS, LOOP_VOTES)
+
+    def _alike(
+        self, keyframe: Keyframe, among: list[Keyframe], most: int, min_votes: int = MIN_VOTES
+    ) -> list[Keyframe]:
+        return lookalikes(self.map, keyframe.words, among, most, min_votes) if among else []
+
+    def _link(self, keyframe: Keyframe, other: Keyframe) -> Link | None:
+        """A link that may be true: within a piece, places that look alike and are far apart are not one."""
+        if self.map.piece_of(keyframe.id) != self.map.piece_of(other.id):
+            return link(self.tracker, keyframe, other)
+        found = link(self.tracker, keyframe, other, LOOP_SHARE)
+        return found if found is not None and is_plausible(self.map, found) else None
+
+    def _settle(self, found: Link) -> Join | Closure | None:
+        """Make one of what a link connects if another one agrees; earlier keyframes are asked for it."""
         agreeing = [found]
         for witness in self._witnesses(found):
             if witness.agrees(found) and all(_apart_enough(witness, other) for other in agreeing):
@@ -122,18 +170,24 @@ class Atlas:
         self._links.append(found)
         if len(agreeing) < AGREEING_LINKS:
             return None
-        return self._join(agreeing)
+        mine, theirs = self._pieces(found)
+        return self._close(agreeing) if mine == theirs else self._join(agreeing)
 
     def _witnesses(self, found: Link) -> list[Link]:
         """Links between the same two pieces: those found before, and those of keyframes nearby."""
         pieces = self._pieces(found)
         known = [one for one in self._links if self._stands(one) and self._pieces(one) == pieces]
-        theirs = [k for k in self.strangers(pieces[0]) if self.map.piece_of(k.id) == pieces[1] and k is not found.other]
         new = []
         for keyframe in self.map.covisible(found.keyframe, WITNESSES):
-            for candidate in lookalikes(self.map, keyframe.words, theirs, 1):
-                new.append(link(self.tracker, keyframe, candidate))
+            for candidate in self._alike(keyframe, self._asked_by(keyframe, found), 1):
+                new.append(self._link(keyframe, candidate))
         return [*known, *(one for one in new if one is not None)]
+
+    def _asked_by(self, witness: Keyframe, found: Link) -> list[Keyframe]:
+        """Keyframes that a neighbour of a link's keyframe may see as well."""
+        mine, theirs = self._pieces(found)
+        others = far_keyframes(self.map, witness) if mine == theirs else self.strangers(mine)
+        return [k for k in others if self.map.piece_of(k.id) == theirs and k is not found.other]
 
     def _pieces(self, one: Link) -> tuple[int, int]:
         return self.map.piece_of(one.keyframe.id), self.map.piece_of(one.other.id)
@@ -141,6 +195,18 @@ class Atlas:
     def _stands(self, one: Link) -> bool:
         """Whether both ends of a link are still in the map."""
         return all(self.map.keyframes.get(k.id) is k for k in (one.keyframe, one.other))
+
+    def _close(self, links: list[Link]) -> Closure | None:
+        """Close a loop; None if it is as good as closed, and both ends only get the same anchors."""
+        self._links = []
+        if all(is_within_reach(self.map, self.tracker.camera, one) for one in links):
+            share_anchors(self.map, links)
+            return None
+        closure = spread(self.map, self.edges, self.log, links)
+        share_anchors(self.map, links)
+        look_around(self.map, self.tracker.camera, links)  # the windows that follow, and the end, refine
+        self.closures.append(closure)
+        return closure
 
     def _join(self, links: list[Link]) -> Join:
         best = max(links, key=lambda one: len(one.keypoint))

@@ -72,16 +72,23 @@ def view_of(keyframe: Keyframe, scale_factor: float) -> View:
     return View(keyframe.features, keyframe.words, keyframe.grid, inv_sigma)
 
 
-def link(tracker: Tracker, keyframe: Keyframe, other: Keyframe) -> Link | None:
-    """A keyframe's place in another keyframe's piece; None unless all of it is proven."""
-    there = _place(tracker, keyframe, other)
+def link(tracker: Tracker, keyframe: Keyframe, other: Keyframe, min_share: float = LIKELY_SHARE) -> Link | None:
+    """A keyframe's place in another keyframe's piece; None unless all of it is proven.
+
+    Args:
+        tracker: With the map.
+        keyframe: Whose place is sought.
+        other: Keyframe that may show the same.
+        min_share: Share of the anchors in view that must be found, there and on the way back.
+    """
+    there = _place(tracker, keyframe, other, min_share)
     if there is None:
         return None
     scale = common_scale(tracker, keyframe, there.track)
     if scale is None:
         return None
     S = _similarity(keyframe.T_c_w, there.track.T_c_w, scale[0])
-    back = _place(tracker, other, keyframe)
+    back = _place(tracker, other, keyframe, min_share)
     if back is None:
         return None
     shift, turn = apart(back.track.T_c_w, sim3.moved_camera(sim3.inverse(S), other.T_c_w))
@@ -90,14 +97,14 @@ def link(tracker: Tracker, keyframe: Keyframe, other: Keyframe) -> Link | None:
     return Link(keyframe, other, S, scale[1], scale[2], there.track.keypoint, there.track.anchor, there.depth)
 
 
-def _place(tracker: Tracker, keyframe: Keyframe, other: Keyframe) -> Place | None:
+def _place(tracker: Tracker, keyframe: Keyframe, other: Keyframe, min_share: float) -> Place | None:
     """Where a keyframe is in the piece of another, if it looks as if it were there."""
     view = view_of(keyframe, tracker.orb.scale_factor)
     track = match_keyframe(tracker, view, other)
     if track is None or track.inliers < MIN_INLIERS:
         return None
     place = place_of(tracker, view, track)
-    return place if place.share >= LIKELY_SHARE and place.spread >= LIKELY_SPREAD else None
+    return place if place.share >= min_share and place.spread >= LIKELY_SPREAD else None
 
 
 def common_scale(tracker: Tracker, keyframe: Keyframe, track: Track) -> tuple[float, float, float] | None:

@@ -21,7 +21,9 @@ MIN_VOTES = 8
 """Votes above which a keyframe becomes a revisit candidate: places in other rooms get at most 4."""
 
 
-def lookalikes(slam_map: SlamMap, words: NDArray[np.uint64], among: list[Keyframe], most: int) -> list[Keyframe]:
+def lookalikes(
+    slam_map: SlamMap, words: NDArray[np.uint64], among: list[Keyframe], most: int, min_votes: int = MIN_VOTES
+) -> list[Keyframe]:
     """Keyframes that see most of the anchors that an image's keypoints resemble, best first.
 
     Args:
@@ -29,10 +31,11 @@ def lookalikes(slam_map: SlamMap, words: NDArray[np.uint64], among: list[Keyfram
         words: Descriptors of the image ``(N, 4)``.
         among: Keyframes that may be named.
         most: How many at most.
+        min_votes: Of `MOST_VOTERS` or fewer.
     """
     votes = votes_for(slam_map, words, slam_map.anchors_seen_by(among))
     allowed = {keyframe.id for keyframe in among}
-    counts = {id: n for id, n in slam_map.shared_counts(votes).items() if id in allowed and n >= MIN_VOTES}
+    counts = {id: n for id, n in slam_map.shared_counts(votes).items() if id in allowed and n >= min_votes}
     ranked = sorted(counts, key=lambda id: (-counts[id], -id))
     return [slam_map.keyframes[id] for id in ranked[:most]]
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from edgeslam_torch.files.tensor_file import Array
 from edgeslam_torch.frontend.matching import words
-from edgeslam_torch.geometry import sim3
+from edgeslam_torch.geometry import se3, sim3
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.map.keyframe import NO_ANCHOR, Keyframe, make_keyframe
 from edgeslam_torch.map.slam_map import SlamMap
@@ -99,7 +99,7 @@ def pack(
         "removed.id": _ints(number[id] for id in removed),
         "removed.heir": _ints(number[heirs[id][0]] for id in removed),
         "removed.T_removed_heir": _stacked(
-            [_scaled(heirs[id][1], sim3.scale_of(unit[piece_of[id]].S)) for id in removed], (4, 4)
+            [se3.scaled(heirs[id][1], sim3.scale_of(unit[piece_of[id]].S)) for id in removed], (4, 4)
         ),
         **_keypoints(keyframes, anchor, len(slam_map.anchors.alive)),
         **_anchors(slam_map, keyframes, anchor, S, number),
@@ -239,12 +239,6 @@ def _converted(uv: FloatArray, made_with: Camera, camera: Camera) -> FloatArray:
 
 def _moved(similarity: FloatArray, p: FloatArray) -> FloatArray:
     return np.einsum("nij,nj->ni", similarity[:, :3, :3], p) + similarity[:, :3, 3]
-
-
-def _scaled(T: FloatArray, scale: float) -> FloatArray:
-    out = T.copy()
-    out[:3, 3] *= scale
-    return out
 
 
 def _split(counts: IntArray) -> list[slice]:

@@ -17,9 +17,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", type=Path, default=Path("runs/demo"), metavar="DIR", help="results (default: runs/demo)"
     )
-    parser.add_argument("--world", default="room", help="room or corridor (default: room)")
-    parser.add_argument("--seconds", type=float, default=16.0, metavar="N", help="length of the flight (default: 16)")
-    parser.add_argument("--rate", type=float, default=20.0, metavar="HZ", help="images per second (default: 20)")
+    parser.add_argument(
+        "--world",
+        default="room",
+        help="room, corridor or block (once around four corridors; default: room)",
+    )
+    parser.add_argument("--seconds", type=float, metavar="N", help="length of the flight (default: 16; block: 64)")
+    parser.add_argument("--rate", type=float, metavar="HZ", help="images per second (default: 20; block: 15)")
     parser.add_argument(
         "--seed", type=int, default=0, help="another number gives another place and flight (default: 0)"
     )
@@ -87,8 +91,9 @@ def report(demo: "DemoResult") -> str:
 
 
 def _settings(args: argparse.Namespace) -> "DemoSettings":
-    from edgeslam_torch.demo import DemoSettings
+    from edgeslam_torch.demo import WORLDS, DemoSettings
     from edgeslam_torch.errors import ConfigError
+    from edgeslam_torch.synthetic.flights.courses import Course
     from edgeslam_torch.synthetic.flights.telemetry import TelemetryFaults
 
     if args.seed < 0:
@@ -97,7 +102,10 @@ def _settings(args: argparse.Namespace) -> "DemoSettings":
         faults = TelemetryFaults(video_delay_s=args.delay, loss=args.loss, battery_start=args.battery / 100.0)
     except ValueError as error:
         raise ConfigError(f"--loss must lie in [0, 1) and --battery in (0, 100]: {error}") from error
-    settings = DemoSettings(args.world, args.seconds, args.rate, args.seed, args.images)
+    course = WORLDS.get(args.world, Course())
+    seconds = course.seconds if args.seconds is None else args.seconds
+    rate_hz = course.rate_hz if args.rate is None else args.rate
+    settings = DemoSettings(args.world, seconds, rate_hz, args.seed, args.images)
     return replace(settings, telemetry=None if args.no_telemetry else faults)
 
 

@@ -84,6 +84,13 @@ def transform(T: FloatArray, p: FloatArray) -> FloatArray:
     return p @ T[:3, :3].T + T[:3, 3]
 
 
+def scaled(T: FloatArray, scale: float) -> FloatArray:
+    """The same motion ``(4, 4)`` in units that are ``scale`` times smaller."""
+    out = T.copy()
+    out[:3, 3] *= scale
+    return out
+
+
 def orthonormalised(T: FloatArray) -> FloatArray:
     """``T`` with its rotation projected to the nearest orthonormal matrix; long products drift without it."""
     out = T.copy()

@@ -5,11 +5,10 @@ Davison, RSS 2010). A similarity is kept as a ``(4, 4)`` matrix with ``s R`` in 
 and inverses are those of matrices.
 """
 
-import math
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from edgeslam_torch.geometry.se3 import hat
 from edgeslam_torch.types import FloatArray
 
 SMALL = 1e-5
@@ -56,21 +55,28 @@ def moved_camera(S: FloatArray, T_c_w: FloatArray) -> FloatArray:
 
 
 def exp(xi: FloatArray) -> FloatArray:
-    """Similarity ``(4, 4)`` of a tangent ``(7,)``.
+    """Similarities ``(..., 4, 4)`` of tangents ``(..., 7)``.
 
     Example:
         >>> float(exp(np.array([0.0, 0, 0, 0, 0, 0, math.log(2.0)]))[0, 0])
         2.0
     """
-    rho, phi, sigma = xi[:3], xi[3:6], float(xi[6])
-    return compose(math.exp(sigma), Rotation.from_rotvec(phi).as_matrix(), _left(phi, sigma) @ rho)
+    rho, phi, sigma = xi[..., :3], xi[..., 3:6], xi[..., 6]
+    S = np.zeros((*xi.shape[:-1], 4, 4))
+    R = Rotation.from_rotvec(phi.reshape(-1, 3)).as_matrix().reshape(*phi.shape, 3)
+    S[..., :3, :3] = np.exp(sigma)[..., None, None] * R
+    S[..., :3, 3] = (_left(phi, sigma) @ rho[..., None])[..., 0]
+    S[..., 3, 3] = 1.0
+    return S
 
 
 def log(S: FloatArray) -> FloatArray:
-    """Tangent ``(7,)`` of a similarity; inverse of `exp` for angles below pi."""
-    scale, R, t = parts(S)
-    phi, sigma = Rotation.from_matrix(R).as_rotvec(), math.log(scale)
-    return np.concatenate([np.linalg.solve(_left(phi, sigma), t), phi, [sigma]])
+    """Tangents ``(..., 7)`` of similarities; inverse of `exp` for angles below pi."""
+    scale = np.cbrt(np.linalg.det(S[..., :3, :3]))
+    R = S[..., :3, :3] / scale[..., None, None]
+    phi, sigma = Rotation.from_matrix(R.reshape(-1, 3, 3)).as_rotvec().reshape(R.shape[:-1]), np.log(scale)
+    rho = np.linalg.solve(_left(phi, sigma), S[..., :3, 3:])[..., 0]
+    return np.concatenate([rho, phi, sigma[..., None]], axis=-1)
 
 
 def fit(a: FloatArray, b: FloatArray) -> FloatArray | None:
@@ -93,18 +99,21 @@ def fit(a: FloatArray, b: FloatArray) -> FloatArray | None:
     return compose(scale, R, mean_b - scale * R @ mean_a)
 
 
-def _left(phi: FloatArray, sigma: float) -> FloatArray:
-    """Integral of ``exp(u (sigma + hat(phi)))`` over ``u`` from 0 to 1, ``(3, 3)``: what turns rho into t."""
-    theta = float(np.linalg.norm(phi))
-    hat = np.array([[0.0, -phi[2], phi[1]], [phi[2], 0.0, -phi[0]], [-phi[1], phi[0], 0.0]])
-    scale = math.exp(sigma)
-    whole = math.expm1(sigma) / sigma if abs(sigma) > SMALL else 1.0 + 0.5 * sigma
-    if theta < SMALL:
-        # Integral of u exp(u sigma).
-        first = (scale * (sigma - 1.0) + 1.0) / sigma**2 if abs(sigma) > 1e-3 else 0.5 + sigma / 3.0
-        return whole * np.eye(3) + first * hat
-    # Integrals of exp(u sigma) sin(u theta) and of exp(u sigma) cos(u theta).
-    both = sigma**2 + theta**2
-    sine = (scale * (sigma * math.sin(theta) - theta * math.cos(theta)) + theta) / both
-    cosine = (scale * (sigma * math.cos(theta) + theta * math.sin(theta)) - sigma) / both
-    return whole * np.eye(3) + sine / theta * hat + (whole - cosine) / theta**2 * (hat @ hat)
+def _left(phi: FloatArray, sigma: FloatArray) -> FloatArray:
+    """Integral of ``exp(u (sigma + hat(phi)))`` over ``u`` from 0 to 1, ``(..., 3, 3)``: what turns rho into t."""
+    theta, scale = np.linalg.norm(phi, axis=-1), np.exp(sigma)
+    # Integrals of exp(u sigma), and of it times sin(u theta) / theta and times (1 - cos(u theta)) / theta^2.
+    safe = np.where(np.abs(sigma) > SMALL, sigma, 1.0)
+    whole = np.where(np.abs(sigma) > SMALL, np.expm1(safe) / safe, 1.0 + 0.5 * sigma)
+    turned = theta > SMALL
+    t = np.where(turned, theta, 1.0)
+    both = sigma**2 + t**2
+    sine = (scale * (sigma * np.sin(t) - t * np.cos(t)) + t) / both
+    cosine = (scale * (sigma * np.cos(t) + t * np.sin(t)) - sigma) / both
+    # Integral of u exp(u sigma), its limit.
+    wide = np.where(np.abs(sigma) > 1e-3, sigma, 1.0)
+    slow = np.where(np.abs(sigma) > 1e-3, (scale * (wide - 1.0) + 1.0) / wide**2, 0.5 + sigma / 3.0)
+    first = np.where(turned, sine / t, slow)[..., None, None]
+    second = np.where(turned, (whole - cosine) / t**2, 0.0)[..., None, None]
+    turn = hat(phi)
+    return whole[..., None, None] * np.eye(3) + first * turn + second * (turn @ turn)

@@ -29,10 +29,8 @@ class TrackedMotion:
 
     def scaled(self, scale: float) -> "TrackedMotion":
         """The same once the map has grown by a factor."""
-        T = self.T_c_r.copy()
-        T[:3, 3] *= scale
         by = np.array([1.0 / scale] * 3 + [1.0] * 3)
-        return replace(self, T_c_r=T, information=self.information * np.outer(by, by))
+        return replace(self, T_c_r=se3.scaled(self.T_c_r, scale), information=self.information * np.outer(by, by))
 
 
 @dataclass(slots=True)

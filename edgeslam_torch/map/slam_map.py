@@ -104,13 +104,12 @@ class SlamMap:
             self._joined[piece] = oldest
         return bool(found)
 
-    def scale_links(self, piece: int, scale: float) -> None:
-        """Follow a piece that was scaled: the ways from its removed keyframes to the surviving ones."""
-        for removed, (heir, T_removed_heir) in self.links.items():
-            if self.piece_of(removed) == piece:
-                T = T_removed_heir.copy()
-                T[:3, 3] *= scale
-                self.links[removed] = (heir, T)
+    def scale_links(self, scale_of: dict[int, float]) -> None:
+        """Follow keyframes around which the map was scaled, by their ids: the ways from removed ones to them."""
+        for removed in list(self.links):
+            heir, T = self.heir_of(removed)
+            if heir in scale_of:
+                self.links[removed] = (heir, se3.scaled(T, scale_of[heir]))
 
     def latest(self) -> Keyframe:
         """The newest keyframe."""

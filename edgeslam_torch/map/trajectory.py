@@ -83,13 +83,15 @@ class TrajectoryLog:
             record.T_c_k = T_c_w @ keyframe.T_w_c
             record.supported = True
 
-    def scale(self, piece: int, scale: float) -> None:
-        """Follow a piece of map that was scaled: the ways from its keyframes to their frames."""
+    def scale(self, scale_of: dict[int, float]) -> None:
+        """Follow keyframes around which the map was scaled, by their ids: the ways from them to their frames."""
+        before = None
         for record in self.records:
-            if self.map.piece_of(record.keyframe_id) == piece:
-                record.T_c_k = _scaled(record.T_c_k, scale)
-                if record.T_c_before is not None:
-                    record.T_c_before = _scaled(record.T_c_before, scale)
+            grown = scale_of.get(self.map.heir_of(record.keyframe_id)[0], 1.0)
+            if record.T_c_before is not None:
+                record.T_c_before = se3.scaled(record.T_c_before, grown if before is None else before)
+            record.T_c_k = se3.scaled(record.T_c_k, grown)
+            before = grown
 
     def support(self) -> Support:
         """What each frame's pose rests on in the map as it is now."""
@@ -121,12 +123,6 @@ class TrajectoryLog:
         T_c_w = np.stack([r.T_c_k for r in records]) @ np.stack([T_k_w[r.keyframe_id] for r in records])
         _close_gaps(records, T_c_w, T_k_w)
         return np.array([r.stamp_s for r in records]), se3.inverse(T_c_w)
-
-
-def _scaled(T: FloatArray, scale: float) -> FloatArray:
-    out = T.copy()
-    out[:3, 3] *= scale
-    return out
 
 
 def _close_gaps(records: list[FrameRecord], T_c_w: FloatArray, T_k_w: dict[int, FloatArray]) -> None:

@@ -14,6 +14,7 @@ from edgeslam_torch.eval.inputs.run_folder import RunFolder, open_run
 from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, read_trajectory
 from edgeslam_torch.eval.judge import support
 from edgeslam_torch.eval.judge.telemetry.live_scale import live_figures
+from edgeslam_torch.eval.metrics.revisit import returns
 from edgeslam_torch.eval.metrics.run_score import RunScore, evaluate_run
 from edgeslam_torch.eval.metrics.trajectory_error import TrajectoryScore
 from edgeslam_torch.geometry.camera import load_camera
@@ -116,6 +117,7 @@ def _against_truth(run: RunFolder, truth: Truth, notes: list[str]) -> dict[str, 
         "first_over_rest": _beginning(found.sim3)[1],
     }
     figures |= live_figures(run, _poses(truth.poses))
+    figures |= returns(_poses(truth.poses), run.trajectory, run.online)
     figures |= _map_figures(run, found, truth.surfaces)
     if judge_map and found.map is None:
         notes.append(found.map_note)

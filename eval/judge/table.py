@@ -54,6 +54,7 @@ COLUMNS = (
     Column("ATE", "ate_m", spread=True),
     Column("online", "online_m", spread=True),
     Column("path %", "ate_percent", "{:.2f}"),
+    Column("return %", "return_percent", "{:.2f}"),
     Column("rot °", "rotation_deg", "{:.2f}"),
     Column("scale", "scale", "{:.3f}"),
     Column("sigma %", "scale_sigma", "{:.1f}", 100.0),

@@ -73,6 +73,9 @@ class FakeSlam:
     def joins(self):
         return []
 
+    def closures(self):
+        return []
+
     def warnings(self):
         return []
 

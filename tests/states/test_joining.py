@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from edgeslam_torch.atlas.atlas import Join
+from edgeslam_torch.atlas.loops import Closure
 from edgeslam_torch.fusion.published import Published
 from edgeslam_torch.geometry import se3, sim3
 from edgeslam_torch.states.joining import Joining
@@ -43,7 +44,9 @@ class Pieces:
                 self.T_k_w = sim3.moved_camera(S, self.T_k_w)
             return Join(1.0, 0, 1, moved, S if moved == 1 else sim3.inverse(S), 0.01, 2, 300)
 
-        return SimpleNamespace(update=update, ask_all_again=lambda: None, is_up_to_date=False, known_scale={})
+        return SimpleNamespace(
+            update=update, ask_all_again=lambda: None, is_up_to_date=False, is_divided=True, known_scale={}
+        )
 
 
 def system_of(pieces, motion, busy=False):
@@ -99,6 +102,28 @@ def test_the_pose_stays_where_the_other_piece_comes_to_it(rng):
     system = system_of(Pieces(T_k_w), motion)
     Joining(system, system.map.atlas(moved=0)).update()
     np.testing.assert_allclose((motion.T_c_w, motion.predict(1.3)), before, atol=1e-12)
+
+
+def test_the_pose_goes_along_when_a_loop_is_closed(rng):
+    """By as much as the map grew around its keyframe, however much that was elsewhere."""
+    T_k_w, motion = moving(rng)
+    p = rng.normal(size=(20, 3))
+    before = se3.transform(motion.T_c_w, p)
+    pieces = Pieces(T_k_w)
+
+    def update():
+        if pieces.asked:
+            return None
+        pieces.asked += 1
+        pieces.T_k_w = sim3.moved_camera(S, T_k_w)
+        return Closure(1.0, 1, 30.0, 0.2, 0.1, 1.2, 2, 300, {KEYFRAME: 1.5, 3: 1.1})
+
+    system = system_of(pieces, motion)
+    words = Joining(system, SimpleNamespace(update=update, is_up_to_date=False)).update()
+    assert words.startswith("loop closed in piece 1, a place seen again after 30.0 s: 2 keyframes agree, 300 keypoints")
+    np.testing.assert_allclose(se3.transform(motion.T_c_w, sim3.transform(S, p)), 1.5 * before, atol=1e-9)
+    assert (system.published.revision, system.events) == (1, {"loops_closed": 1})
+    assert system.fusion.revised == ["ratios", ("stamps", "poses")]
 
 
 @pytest.mark.parametrize("finish", [False, True])

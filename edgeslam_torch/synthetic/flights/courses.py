@@ -10,13 +10,15 @@ import numpy as np
 
 from edgeslam_torch.geometry.camera import PRESETS, Camera
 from edgeslam_torch.synthetic.flights.degrade import CameraFaults
-from edgeslam_torch.synthetic.flights.flight import Flight, FlightPlan, climb, fly, fly_after_hover, turn
+from edgeslam_torch.synthetic.flights.flight import Flight, FlightPlan, climb, fly, fly_after_hover, fly_around, turn
 from edgeslam_torch.synthetic.flights.telemetry import TelemetryFaults, simulate
 from edgeslam_torch.synthetic.flights.writer import write_flight
-from edgeslam_torch.synthetic.house.rooms import blank_corridor, corridor, room
+from edgeslam_torch.synthetic.house.rooms import BLOCK_M, blank_corridor, block, corridor, room
 from edgeslam_torch.synthetic.house.world import World
 
 Rng = np.random.Generator
+SECONDS, RATE_HZ = 16.0, 20.0
+"""Length and frame rate of most courses, and of the demo."""
 
 
 class Pilot(Protocol):
@@ -37,8 +39,11 @@ class Course:
     faults: CameraFaults = field(default_factory=CameraFaults)
     telemetry: TelemetryFaults | None = field(default_factory=TelemetryFaults)
     """None flies without telemetry."""
+    seconds: float = SECONDS
+    rate_hz: float = RATE_HZ
 
 
+AROUND_BLOCK = partial(fly_around, sides_m=BLOCK_M, plan=FlightPlan(speed_m_s=0.8))
 LOW_LIGHT = CameraFaults(gain=0.2, read_noise=2.5, shot_noise=0.35, vignetting=0.3, shutter_s=0.02)
 """A fifth of the light at a slow shutter: walls at about 40 grey levels, noise of 3, blur of some pixels in a turn."""
 
@@ -46,16 +51,15 @@ COURSES = {
     "room": Course(),
     "corridor": Course(corridor),
     "blank_corridor": Course(blank_corridor),
+    "block": Course(block, AROUND_BLOCK, seconds=64.0, rate_hz=15.0),
     "climb": Course(pilot=climb),
     "yaw": Course(pilot=turn),
     "low_light": Course(faults=LOW_LIGHT),
     "turn_first": Course(pilot=partial(fly_after_hover, turning=True)),
     "hover_first": Course(pilot=fly_after_hover),
 }
-"""By name; the first two are the demo's."""
+"""By name. ``block`` goes once around, 40 m, and 4 m on over ground that it knows."""
 
-SECONDS, RATE_HZ = 16.0, 20.0
-"""Length and frame rate of a course, and of the demo."""
 DEPTH_EVERY = 10
 """Frames from one exact depth map to the next."""
 
@@ -65,7 +69,7 @@ def simulated_camera(width: int = 640, height: int = 480) -> Camera:
     return replace(PRESETS["tello"].scaled(width, height), source="simulated Tello")
 
 
-def flown(course: Course, seed: int, seconds: float = SECONDS, rate_hz: float = RATE_HZ) -> tuple[World, Flight, Rng]:
+def flown(course: Course, seed: int, seconds: float | None = None) -> tuple[World, Flight, Rng]:
     """World and flight of a course, and the generator that goes on with its telemetry.
 
     Raises:
@@ -73,10 +77,11 @@ def flown(course: Course, seed: int, seconds: float = SECONDS, rate_hz: float = 
     """
     rng = np.random.default_rng(seed)
     world = course.world(rng)
-    return world, course.pilot(rng, world, round(seconds * rate_hz), rate_hz=rate_hz), rng
+    frames = round((course.seconds if seconds is None else seconds) * course.rate_hz)
+    return world, course.pilot(rng, world, frames, rate_hz=course.rate_hz), rng
 
 
-def record_course(folder: Path, course: Course, seed: int, seconds: float = SECONDS, threads: int = 1) -> None:
+def record_course(folder: Path, course: Course, seed: int, seconds: float | None = None, threads: int = 1) -> None:
     """Fly a course and leave its recording in ``folder``.
 
     Raises:

@@ -23,6 +23,10 @@ _HOVERED_S = 3.0
 """Time hovered before a recording that begins with a hover."""
 _DRIFT_M = 0.02
 """Standard deviation of a hovering drone's drift in half a second, on each axis: 3 cm all in all."""
+_AROUND_M = 0.8
+"""Way before and after the corner of a rectangle within which the drone turns."""
+_CORNER_SPEED = 0.6
+"""Share of the speed around it: a turn of 90 degrees at 28 degrees a second."""
 CORNER_M = 0.1
 """Maximum cut of the polyline's corners at usual speeds; added to the clearance of its legs."""
 
@@ -149,6 +153,76 @@ def climb(
     z = low + np.minimum(risen, 2.0 * (high - low) - risen)
     control = np.column_stack([np.tile(here[:2], (steps, 1)), z, np.full(steps, yaw)])
     return _sampled(rng, control, stamps, plan)
+
+
+def fly_around(
+    rng: np.random.Generator,
+    world: World,
+    frames: int,
+    *,
+    rate_hz: float = 30.0,
+    plan: FlightPlan | None = None,
+    sides_m: tuple[float, float] = (11.0, 9.0),
+) -> Flight:
+    """Along a rectangle around the origin, again and again, looking ahead; the second round begins as the first did.
+
+    Args:
+        rng: Of height, distance from the line, glances to the side and unrest.
+        world: With free air along the rectangle.
+        frames: Length of the flight.
+        rate_hz: Frames a second.
+        plan: Its speed is flown along the sides and `_CORNER_SPEED` of it around the corners.
+        sides_m: Length and breadth of the rectangle.
+    """
+    plan = plan or FlightPlan()
+    stamps = np.arange(frames) / rate_hz
+    seconds = float(stamps[-1]) + 1.0
+    start_m = 0.5 * sides_m[0] - 1.0
+    low = world.bounds_w[0, 2]
+    risen = np.arange(low + plan.start_height_m, low + plan.hover_height_m, 0.5 * KNOT_S)[
+        : None if plan.take_off else 0
+    ]
+    way = [start_m] * (len(risen) + 1)
+    while len(way) * KNOT_S < seconds:
+        near = _to_corner(way[-1], sides_m) < _AROUND_M
+        way.append(way[-1] + plan.speed_m_s * (_CORNER_SPEED if near else 1.0) * KNOT_S)
+    x, y, heading = np.array([_on_rectangle(s, sides_m) for s in way]).T
+    wander = _slow_waves(rng, len(way), 3) * np.minimum(1.0, np.maximum(0.0, np.array(way) - start_m))[:, None]
+    aside, up, glance = (wander * [0.2, plan.height_spread_m, np.deg2rad(10.0)]).T
+    z = np.full(len(way), low + plan.hover_height_m)
+    z[: len(risen)] = risen
+    control = [x - aside * np.sin(heading), y + aside * np.cos(heading), z + up, heading + glance]
+    return _sampled(rng, np.column_stack(control), stamps, plan)
+
+
+def _to_corner(way_m: float, sides_m: tuple[float, float]) -> float:
+    """Distance along a rectangle from a place on it to its nearest corner."""
+    length, breadth = sides_m
+    corners = np.array([0.0, length, length + breadth, 2 * length + breadth, 2 * (length + breadth)])
+    return float(np.abs(way_m % corners[-1] - corners).min())
+
+
+def _on_rectangle(way_m: float, sides_m: tuple[float, float]) -> tuple[float, float, float]:
+    """x, y and the heading, which goes on turning, so far along a rectangle around the origin, from its low corner."""
+    length, breadth = sides_m
+    corners = np.array([[-length, -breadth], [length, -breadth], [length, breadth], [-length, breadth]]) / 2
+    left, side = way_m, 0
+    while left > sides_m[side % 2]:
+        left -= sides_m[side % 2]
+        side += 1
+    here, there = corners[side % 4], corners[(side + 1) % 4]
+    x, y = here + left / sides_m[side % 2] * (there - here)
+    # The turn of a corner is spread over the way before and after it.
+    to_corner, from_corner = 1.0 - (sides_m[side % 2] - left) / _AROUND_M, 1.0 - left / _AROUND_M
+    heading = side + 0.5 * np.clip(to_corner, 0.0, 1.0) - 0.5 * np.clip(from_corner, 0.0, 1.0)
+    return float(x), float(y), float(heading) * np.pi / 2
+
+
+def _slow_waves(rng: np.random.Generator, count: int, columns: int) -> FloatArray:
+    """Smooth random curves within -1 and 1, ``(count, columns)``, one value every `KNOT_S`."""
+    frequency, phase = rng.uniform(0.03, 0.12, (3, columns)), rng.uniform(0.0, 2.0 * np.pi, (3, columns))
+    time_s = KNOT_S * np.arange(count)
+    return np.sin(2.0 * np.pi * frequency * time_s[:, None, None] + phase).mean(axis=1)
 
 
 def turn(

@@ -1,4 +1,4 @@
-"""Seeded worlds: a corridor with doors, a furnished room, and endlessly varied rooms for depth training."""
+"""Seeded worlds: one corridor with doors or four around a block, a furnished room, and varied ones to train depth."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -34,26 +34,74 @@ def corridor(rng: Rng, *, length_m: float = 14.0, width_m: float = 2.4, height_m
         if wall in (1, 3):  # the two ends
             _door(scene, place.at(0.0, 0.0), rng)
             continue
-        x = -length / 2 + rng.uniform(0.3, 0.9)
-        while x < length / 2 - 1.1:
-            kind = rng.random()
-            if kind < 0.42:
-                _door(scene, place.at(x + 0.5, 0.0), rng)
-                x += 1.1
-            elif kind < 0.72:
-                x += _decorate(scene, place, rng, x, height_m, ("poster", "picture", "poster", "whiteboard"))
-            elif kind < 0.84:
-                _radiator(scene, place.at(x + 0.45, 0.0), rng)
-                x += 1.0
-            else:
-                name = str(rng.choice(["shelf", "cupboard", "bin", "plant", "cartons", "chair"]))
-                piece = PIECES[name]
-                width = min(float(rng.uniform(*piece.width_m)), 0.9)
-                depth = min(float(rng.uniform(*piece.depth_m)), 0.45)
-                piece.build(scene, place.at(x + width / 2 + 0.05, 0.02), rng, width, depth)
-                x += width + 0.1
-            x += rng.uniform(0.15, 0.7)
+        _line_wall(scene, place, length, rng, height_m)
     return scene.world("corridor")
+
+
+BLOCK_M = (11.0, 9.0)
+"""Length and breadth of the centre line around `block` [m]: once around is 40 m."""
+
+
+def block(rng: Rng, *, width_m: float = 2.4, height_m: float = 2.7) -> World:
+    """Four corridors around a block of rooms that one cannot look into, centred on the origin.
+
+    Their centre line is a rectangle of `BLOCK_M`; walls and what stands there are as in `corridor`.
+    """
+    half = 0.5 * np.array(BLOCK_M)
+    low, high = np.array([*(-half - width_m / 2), 0.0]), np.array([*(half + width_m / 2), height_m])
+    scene = _shell(rng, low, high, 0.004, walls=TEXTURED_WALLS, floors=FLOORS)
+    scene.ambient = 0.6
+    corner = half - width_m / 2
+    scene.box(
+        Place(0.0, 0.0, 0.0),
+        (0.0, 0.0, height_m / 2),
+        (2 * float(corner[0]), 2 * float(corner[1]), height_m),
+        random_paint(rng, TEXTURED_WALLS),
+        "wall",
+        faces="frbl",
+    )
+    for x, y in _along_rectangle(half, 2.6):
+        scene.lamps_w.append(np.array([x, y, height_m - 0.1]))
+        _ceiling_lamp(scene, scene.lamps_w[-1], 1.1, 0.3)
+    for wall in range(4):
+        place, length = _wall(low, high, wall)
+        _line_wall(scene, place, length, rng, height_m)
+        place, length = _wall(np.array([*-corner, 0.0]), np.array([*corner, height_m]), wall)
+        _line_wall(scene, place.at(0.0, 0.0, yaw_rad=np.pi), length, rng, height_m)
+    return scene.world("block")
+
+
+def _along_rectangle(half: FloatArray, spacing_m: float) -> Iterator[tuple[float, float]]:
+    """Places at most so far apart along the four sides of a rectangle around the origin, corners included."""
+    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half
+    for here, there in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        count = int(np.ceil(np.linalg.norm(there - here) / spacing_m))
+        for k in range(count):
+            x, y = here + k / count * (there - here)
+            yield float(x), float(y)
+
+
+def _line_wall(scene: Scene, place: Place, length: float, rng: Rng, height_m: float) -> None:
+    """Doors, notices, radiators and a few things left standing along a corridor's wall."""
+    x = -length / 2 + rng.uniform(0.3, 0.9)
+    while x < length / 2 - 1.1:
+        kind = rng.random()
+        if kind < 0.42:
+            _door(scene, place.at(x + 0.5, 0.0), rng)
+            x += 1.1
+        elif kind < 0.72:
+            x += _decorate(scene, place, rng, x, height_m, ("poster", "picture", "poster", "whiteboard"))
+        elif kind < 0.84:
+            _radiator(scene, place.at(x + 0.45, 0.0), rng)
+            x += 1.0
+        else:
+            name = str(rng.choice(["shelf", "cupboard", "bin", "plant", "cartons", "chair"]))
+            piece = PIECES[name]
+            width = min(float(rng.uniform(*piece.width_m)), 0.9)
+            depth = min(float(rng.uniform(*piece.depth_m)), 0.45)
+            piece.build(scene, place.at(x + width / 2 + 0.05, 0.02), rng, width, depth)
+            x += width + 0.1
+        x += rng.uniform(0.15, 0.7)
 
 
 def blank_corridor(rng: Rng, *, length_m: float = 14.0, width_m: float = 2.4, height_m: float = 2.7) -> World:

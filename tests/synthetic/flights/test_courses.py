@@ -20,6 +20,7 @@ from edgeslam_torch.synthetic.flights.courses import (
 from edgeslam_torch.synthetic.flights.degrade import degraded
 from edgeslam_torch.synthetic.flights.flight import FlightPlan
 from edgeslam_torch.synthetic.house.render import render
+from edgeslam_torch.synthetic.house.rooms import BLOCK_M
 
 
 @cache
@@ -56,7 +57,33 @@ def path_m(flight):
 def test_course_keeps_clear_of_walls_and_furniture(name):
     world, flight = flight_of(name)
     assert world.clearance(flight.T_w_b[:, :3, 3]).min() > 0.3
-    assert len(flight.stamps_s) == 320 and flight.stamps_s[0] == 0
+    assert len(flight.stamps_s) == 16.0 * COURSES[name].rate_hz and flight.stamps_s[0] == 0
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_block_is_flown_once_around_and_the_beginning_again(seed):
+    world, flight = flight_of("block", seed, None)
+    p = flight.T_w_b[:, :3, 3]
+    assert world.clearance(p).min() > 0.3
+    yaw = np.unwrap(np.arctan2(flight.T_w_c[:, 1, 2], flight.T_w_c[:, 0, 2]))
+    assert np.degrees(yaw[-1] - yaw[0]) == pytest.approx(360.0, abs=20.0), "the wall of the block is always at the left"
+    assert path_m(flight) == pytest.approx(45.0, abs=1.0)
+    again = np.linalg.norm(p[-1] - p, axis=1)[: len(p) // 2]
+    assert again.min() < 0.4, "height and distance from the line differ"
+    assert np.degrees(np.abs(np.gradient(yaw, flight.stamps_s))).max() < 45.0
+    assert len(world.boxes) > 20
+
+
+def test_a_flight_along_a_rectangle_turns_at_its_corners():
+    world, flight = flight_of("block", 0, None)
+    p = flight.T_w_b[:, :2, 3]
+    outer = np.abs(p) - 0.5 * np.array(BLOCK_M)
+    assert np.abs(outer.max(axis=1)).max() < 0.5, "on one side or the other"
+    heading = np.arctan2(flight.T_w_b[:, 1, 0], flight.T_w_b[:, 0, 0])
+    way = np.arctan2(flight.velocity_w[:, 1], flight.velocity_w[:, 0])
+    fast = np.linalg.norm(flight.velocity_w[:, :2], axis=1) > 0.3
+    off = np.abs((heading - way + np.pi) % (2 * np.pi) - np.pi)[fast]
+    assert np.degrees(np.percentile(off, 95)) < 35.0, "it looks where it flies"
 
 
 def test_climb_is_straight_up_and_down():
@@ -105,5 +132,5 @@ def test_room_and_corridor_are_the_demos(tmp_path):
     demo.record(tmp_path / "demo", settings)
     for file in ("groundtruth.txt", "telemetry.csv", "camera.yaml", "rgb/00000.500000.jpg"):
         assert (tmp_path / "course" / file).read_bytes() == (tmp_path / "demo" / file).read_bytes()
-    assert {name: COURSES[name].world for name in demo.WORLDS} == demo.WORLDS
+    assert {name: COURSES[name] for name in demo.WORLDS} == demo.WORLDS
     assert (demo.DemoSettings().seconds, settings.rate_hz) == (SECONDS, RATE_HZ)

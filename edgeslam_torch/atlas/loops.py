@@ -1,0 +1,215 @@
+"""A loop inside one piece of map: what its drift was, and how the whole piece makes up for it.
+
+Two keyframes that see one place from two ends of a long way say where the newer one should be (`links.py`). A graph of
+all keyframes of the piece (`optim/pose_graph.py`) spreads this over the way between; anchors, edges and frames follow
+their keyframes. What is left is for the refinement that follows.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from edgeslam_torch.atlas.links import MAX_SHIFT, Link
+from edgeslam_torch.atlas.saved import BEFORE_S
+from edgeslam_torch.atlas.weld import move_anchors, move_keyframes
+from edgeslam_torch.geometry import se3, sim3
+from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.map.keyframe import Keyframe
+from edgeslam_torch.map.slam_map import SlamMap
+from edgeslam_torch.map.trajectory import TrajectoryLog
+from edgeslam_torch.mapping.edge_map import EdgeMap
+from edgeslam_torch.optim.pose_graph import PoseGraph, solve
+from edgeslam_torch.types import FloatArray, IntArray
+
+MIN_AWAY_S = 5.0
+"""Time since an older keyframe from which on it may close a loop; before, the window has not lost it yet."""
+MIN_SHARED = 15
+"""Anchors in common from which on two keyframes are covisible, as in `SlamMap.covisible`."""
+NEIGHBOURS = 10
+"""Edges from a keyframe to the older ones that it shares most anchors with."""
+LOOP_SHARE = 0.2
+"""Share of the anchors in view that must be found at the other end. A wall whose paper repeats reaches 0.16 at a wrong
+place, a hundred keypoints with one scale; a right place 0.2 to 0.4 once the camera is there, and a loop can wait."""
+MAX_DRIFT = 0.1
+"""Most that a map drifts, in shares of the way: several times the usual 1 to 3 %. A place that is farther from where
+the map has it is another one that looks alike, as doors and wallpaper do."""
+MAX_DRIFT_RAD = np.deg2rad(20.0)
+MAX_DRIFT_LOG = np.log(1.5)
+"""Most that it turns and grows."""
+WITHIN_PX = 5.0
+"""Offset up to which tracking and the window find the old anchors by themselves, as in `mapping/reobserve.py`."""
+SIGMAS = 3.0
+"""Difference of scale beyond which it is not chance."""
+MIN_BASELINE = 0.02
+"""Least distance of two keyframes relative to the depth: without parallax the scale between them is anybody's guess,
+but not worse than this."""
+
+
+@dataclass(frozen=True, slots=True)
+class Closure:
+    """A loop that was closed."""
+
+    stamp_s: float
+    """Of the keyframe that settled it."""
+    piece: int
+    away_s: float
+    """Time since the place was seen before; infinite for an earlier flight."""
+    shift: float
+    """How far the camera was off, relative to the depth that it sees."""
+    turn_rad: float
+    scale: float
+    """Factor by which the map grew at the newer end."""
+    links: int
+    """Keyframes that agreed."""
+    matches: int
+    """Keypoints of these that show the older end."""
+    grown: dict[int, float]
+    """Factor by which the map grew around each keyframe, removed ones included."""
+
+    def growth(self, piece: int, keyframe_id: int) -> float:
+        """Factor by which the map grew around a keyframe."""
+        return self.grown.get(keyframe_id, 1.0)
+
+    def in_words(self) -> str:
+        """For `status.csv` and the summary."""
+        since = f"after {self.away_s:.1f} s" if np.isfinite(self.away_s) else "from an earlier flight"
+        return (
+            f"loop closed in piece {self.piece}, a place seen again {since}: {self.links} keyframes agree, "
+            f"{self.matches} keypoints; the camera was off by {100 * self.shift:.0f} % of the depth and "
+            f"{np.rad2deg(self.turn_rad):.1f} degrees, the map scaled by {self.scale:.3f} there"
+        )
+
+
+def far_keyframes(slam_map: SlamMap, keyframe: Keyframe) -> list[Keyframe]:
+    """Older keyframes of the same piece that a keyframe is connected with only by a long way.
+
+    Those are left out that share anchors with it, or with keyframes that do.
+    """
+    piece = slam_map.piece_of(keyframe.id)
+    older = [k for k in slam_map.keyframes.values() if keyframe.stamp_s - k.stamp_s >= MIN_AWAY_S]
+    older = [k for k in older if slam_map.piece_of(k.id) == piece]
+    if not older:
+        return []
+    around = slam_map.anchors_seen_by([keyframe, *slam_map.covisible(keyframe, len(slam_map.keyframes), MIN_SHARED)])
+    near = slam_map.shared_counts(around)
+    return [k for k in older if near.get(k.id, 0) < MIN_SHARED]
+
+
+def is_plausible(slam_map: SlamMap, link: Link) -> bool:
+    """Whether a map can have drifted as much as a link says on the way from its older keyframe to its newer one."""
+    ids = [id for id in sorted(slam_map.keyframes) if link.other.id <= id <= link.keyframe.id]
+    centres = np.stack([slam_map.keyframes[id].centre_w for id in ids])
+    way = float(np.linalg.norm(np.diff(centres, axis=0), axis=1).sum())
+    shift, turn = _off(link, link.keyframe.T_c_w)
+    near = shift * link.depth <= MAX_DRIFT * way + MAX_SHIFT * link.depth
+    return near and turn <= MAX_DRIFT_RAD and abs(np.log(sim3.scale_of(link.S))) <= MAX_DRIFT_LOG
+
+
+def is_within_reach(slam_map: SlamMap, camera: Camera, link: Link) -> bool:
+    """Whether what a link says of the drift is so little that the window makes up for it."""
+    p_c = se3.transform(link.keyframe.T_c_w, slam_map.anchors.p_w[link.anchor])
+    if not (p_c[:, 2] > 0).all():
+        return False
+    off = np.linalg.norm(camera.project(p_c) - link.keyframe.features.uv[link.keypoint], axis=1)
+    sigma = np.hypot(link.sigma_log, link.bend_log)
+    return bool(np.median(off) <= WITHIN_PX and abs(np.log(sim3.scale_of(link.S))) <= SIGMAS * sigma)
+
+
+def spread(slam_map: SlamMap, edges: EdgeMap, log: TrajectoryLog, links: list[Link]) -> Closure:
+    """Move a piece so that both ends of a loop agree, each keyframe by its share."""
+    best = max(links, key=lambda one: len(one.keypoint))
+    piece = slam_map.piece_of(best.keyframe.id)
+    before = best.keyframe.T_c_w
+    members = [k for id, k in sorted(slam_map.keyframes.items()) if slam_map.piece_of(id) == piece]
+    graph = _graph(slam_map, members, links)
+    S = {k.id: np.linalg.inv(new) @ k.T_c_w for k, new in zip(members, solve(graph), strict=True)}
+    with slam_map.lock:
+        for id, ids in _hosted(slam_map, members).items():
+            move_anchors(slam_map.anchors, ids, S[id])
+        move_keyframes(slam_map, edges, log, S)
+    grown = {id: sim3.scale_of(moved) for id, moved in S.items()}
+    grown |= {id: grown[heir] for id in slam_map.links if (heir := slam_map.heir_of(id)[0]) in grown}
+    shift, turn = _off(best, before)
+    return Closure(
+        max(one.keyframe.stamp_s for one in links),
+        piece,
+        best.keyframe.stamp_s - best.other.stamp_s,
+        shift,
+        turn,
+        grown[best.keyframe.id],
+        len(links),
+        sum(len(one.keypoint) for one in links),
+        grown,
+    )
+
+
+def _off(link: Link, T_c_w: FloatArray) -> tuple[float, float]:
+    """How far a camera is from where a link says it is: relative to the depth, and the angle [rad]."""
+    there = sim3.moved_camera(link.S, T_c_w)
+    moved = T_c_w @ se3.inverse(there)
+    return float(np.linalg.norm(moved[:3, 3])) / link.depth, float(np.linalg.norm(se3.log(moved)[3:]))
+
+
+def _graph(slam_map: SlamMap, members: list[Keyframe], links: list[Link]) -> PoseGraph:
+    """Keyframes in order, what they share as it is, and what the links say."""
+    row_of = {k.id: row for row, k in enumerate(members)}
+    depth = [slam_map.median_depth(k) or 1.0 for k in members]
+    T = np.stack([k.T_c_w for k in members])
+    pairs = _shared(slam_map, members)
+    i, j, S_ij, inv_sigma = [], [], [], []
+    for (a, b), count in pairs.items():
+        i.append(a)
+        j.append(b)
+        S_ij.append(T[a] @ se3.inverse(T[b]))
+        apart = float(np.linalg.norm(S_ij[-1][:3, 3])) / depth[a]
+        inv_sigma.append(_inv_sigma(count, depth[a], max(apart, MIN_BASELINE)))
+    for link in links:
+        i.append(row_of[link.keyframe.id])
+        j.append(row_of[link.other.id])
+        S_ij.append(T[i[-1]] @ sim3.inverse(link.S) @ se3.inverse(T[j[-1]]))
+        inv_sigma.append(_inv_sigma(len(link.keypoint), depth[i[-1]], 1.0))
+    old = np.flatnonzero([k.stamp_s == BEFORE_S for k in members])
+    fixed = old if len(old) else np.zeros(1, dtype=np.int64)  # axes and metres of an earlier flight stay
+    return PoseGraph(T, fixed, np.array(i), np.array(j), np.stack(S_ij), np.stack(inv_sigma))
+
+
+def _inv_sigma(shared: int, depth: float, apart: float) -> FloatArray:
+    """Weights ``(7,)`` of an edge, up to a common factor.
+
+    Every keypoint that two keyframes share tells a direction. That gives the turn, the shift relative to the depth, and
+    the scale by a parallax: worse, the shorter the way between them.
+
+    Args:
+        shared: Number of keypoints.
+        depth: That the keyframe sees [map units].
+        apart: Distance of the keyframes, relative to the depth.
+    """
+    return np.sqrt(max(shared, 1)) * np.array([1.0 / depth] * 3 + [1.0] * 3 + [min(apart, 1.0)])
+
+
+def _shared(slam_map: SlamMap, members: list[Keyframe]) -> dict[tuple[int, int], int]:
+    """Anchors that pairs of keyframes share, by their rows, newer one first: the best pairs, and those in sequence."""
+    row_of = {k.id: row for row, k in enumerate(members)}
+    pairs: dict[tuple[int, int], int] = {}
+    for row, keyframe in enumerate(members):
+        counts = slam_map.shared_counts(keyframe.anchor[keyframe.anchor >= 0])
+        older = {row_of[id]: n for id, n in counts.items() if row_of.get(id, row) < row}
+        best = sorted((r for r in older if older[r] >= MIN_SHARED), key=lambda r: (-older[r], -r))[:NEIGHBOURS]
+        pairs |= {(row, r): older[r] for r in best}
+        if row > 0:
+            pairs[row, row - 1] = older.get(row - 1, 0)
+    return pairs
+
+
+def _hosted(slam_map: SlamMap, members: list[Keyframe]) -> dict[int, IntArray]:
+    """Ids of the anchors that go with each keyframe: the one that their prior rests on, or the newest observer."""
+    anchors = slam_map.anchors
+    owner = np.full(len(anchors.alive) + 1, -1, dtype=np.int64)  # the last row answers for NO_ANCHOR
+    for keyframe in members:
+        owner[keyframe.anchor] = keyframe.id
+    owner = owner[:-1]
+    alive = {k.id for k in members}
+    for id in np.flatnonzero((owner >= 0) & anchors.from_depth):
+        heir = slam_map.heir_of(int(anchors.host[id]))[0] if anchors.host[id] >= 0 else -1
+        owner[id] = heir if heir in alive else owner[id]
+    return {k.id: np.flatnonzero(owner == k.id) for k in members}
