@@ -52,13 +52,14 @@ COURSES = {
     "corridor": Course(corridor),
     "blank_corridor": Course(blank_corridor),
     "block": Course(block, AROUND_BLOCK, seconds=64.0, rate_hz=15.0),
+    "block_no_telemetry": Course(block, AROUND_BLOCK, telemetry=None, seconds=64.0, rate_hz=15.0),
     "climb": Course(pilot=climb),
     "yaw": Course(pilot=turn),
     "low_light": Course(faults=LOW_LIGHT),
     "turn_first": Course(pilot=partial(fly_after_hover, turning=True)),
     "hover_first": Course(pilot=fly_after_hover),
 }
-"""By name. ``block`` goes once around, 40 m, and 4 m on over ground that it knows."""
+"""By name. ``block`` goes once around, 40 m, and 5 m on over ground that it knows."""
 
 DEPTH_EVERY = 10
 """Frames from one exact depth map to the next."""

@@ -11,7 +11,7 @@ from scipy.signal import lfilter
 
 from edgeslam_torch.eval.inputs.trajectory_files import Trajectory
 from edgeslam_torch.geometry.rotations import matrix_from_rpy
-from edgeslam_torch.synthetic.flights.courses import COURSES, RATE_HZ, flown
+from edgeslam_torch.synthetic.flights.courses import COURSES, flown
 from edgeslam_torch.synthetic.flights.flight import camera_on_body
 from edgeslam_torch.synthetic.flights.telemetry import FIELDS, TelemetryFaults, simulate
 from edgeslam_torch.types import FloatArray, TelemetrySample
@@ -89,7 +89,7 @@ def doubled(drawn: Drawn) -> Samples:
 def other_flight(drawn: Drawn) -> Samples:
     """Telemetry of a simulated flight through a room."""
     seconds = float(drawn.stamps_s[-1] - drawn.stamps_s[0]) + 1.0
-    world, flight, rng = flown(COURSES["room"], drawn.draw, seconds, RATE_HZ)
+    world, flight, rng = flown(COURSES["room"], drawn.draw, seconds)
     floor = world.floor_below(flight.T_w_b[:, :3, 3])
     log = simulate(rng, flight.stamps_s, flight.T_w_c, flight.T_b_c, floor_m=floor)
     return replace(log, stamps_s=log.stamps_s + float(drawn.stamps_s[0])).samples()
