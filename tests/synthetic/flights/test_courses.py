@@ -57,12 +57,11 @@ def path_m(flight):
 def test_course_keeps_clear_of_walls_and_furniture(name):
     world, flight = flight_of(name)
     assert world.clearance(flight.T_w_b[:, :3, 3]).min() > 0.3
-    assert len(flight.stamps_s) == 16.0 * COURSES[name].rate_hz and flight.stamps_s[0] == 0
+    assert len(flight.stamps_s) == COURSES[name].seconds * COURSES[name].rate_hz and flight.stamps_s[0] == 0
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
-def test_block_is_flown_once_around_and_the_beginning_again(seed):
-    world, flight = flight_of("block", seed, None)
+def test_block_is_flown_once_around_and_the_beginning_again():
+    world, flight = flight_of("block")
     p = flight.T_w_b[:, :3, 3]
     assert world.clearance(p).min() > 0.3
     yaw = np.unwrap(np.arctan2(flight.T_w_c[:, 1, 2], flight.T_w_c[:, 0, 2]))
@@ -75,7 +74,7 @@ def test_block_is_flown_once_around_and_the_beginning_again(seed):
 
 
 def test_a_flight_along_a_rectangle_turns_at_its_corners():
-    world, flight = flight_of("block", 0, None)
+    _, flight = flight_of("block")
     p = flight.T_w_b[:, :2, 3]
     outer = np.abs(p) - 0.5 * np.array(BLOCK_M)
     assert np.abs(outer.max(axis=1)).max() < 0.5, "on one side or the other"
