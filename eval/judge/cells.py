@@ -28,6 +28,9 @@ SECOND_FLIGHT = "second_flight"
 """Variant whose first flight saves its map and whose second flies in it: of `KIDNAPPED` the first and the second
 `HALF` frames, of a simulation two paths through one world."""
 HALF = 300
+CUT, CUT_FRAMES = "cut", 160
+"""Variant that shows so many frames of a simulation, and then as many of the next seed's: two places, two pieces."""
+CUT_COURSES = ("room", "corridor")
 FLOWN_AGAIN = "room"
 """Course that is flown twice."""
 WITH_TELEMETRY = ("tum_fr1_xyz", "7scenes_redkitchen", "euroc_mh05_a", "tartan_hospital")
@@ -91,7 +94,7 @@ class Cell:
     folder: str = ""
     """Of the recording."""
     variant: str = ""
-    """A name in `VARIANTS`, `BACKWARDS`, ``kidnap`` or `SECOND_FLIGHT`."""
+    """A name in `VARIANTS`, `BACKWARDS`, ``kidnap``, `CUT` or `SECOND_FLIGHT`."""
     course: str = ""
     """Of a simulated flight: a name in `courses.COURSES`."""
     nothing: str = ""
@@ -171,6 +174,7 @@ def list_cells(data: Path | None, which: str, seeds: Sequence[int], only: Sequen
     if which in ("flights", "all"):
         made += [Cell(f"flight/{course}", 0, course=course) for course in COURSES]
         made += [Cell(f"flight/{FLOWN_AGAIN}/{SECOND_FLIGHT}", 0, variant=SECOND_FLIGHT, course=FLOWN_AGAIN)]
+        made += [Cell(f"flight/{course}/{CUT}", 0, variant=CUT, course=course) for course in CUT_COURSES]
         made += [Cell(f"none/{kind}", 0, nothing=kind) for kind in NONE]
     kept = [cell for cell in made if not only or any(fnmatchcase(cell.name, pattern) for pattern in only)]
     if not kept:

@@ -16,7 +16,7 @@ from edgeslam_torch.errors import EdgeSlamError
 from edgeslam_torch.eval.inputs.dataset import interpolate, open_dataset
 from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, write_tum
 from edgeslam_torch.eval.judge import flights, second_flight, sources
-from edgeslam_torch.eval.judge.cells import BACKWARDS, HALF, KIDNAP, SECOND_FLIGHT, VARIANTS, Cell
+from edgeslam_torch.eval.judge.cells import BACKWARDS, CUT, CUT_FRAMES, HALF, KIDNAP, SECOND_FLIGHT, VARIANTS, Cell
 from edgeslam_torch.eval.judge.runner import CELL, RESULT
 from edgeslam_torch.eval.judge.score import Truth, score
 from edgeslam_torch.eval.judge.telemetry.made import KINDS, Drawn
@@ -25,7 +25,7 @@ from edgeslam_torch.files.config_file import load_config
 from edgeslam_torch.readers.layouts import read_sequence
 from edgeslam_torch.readers.source import Recording, open_source
 from edgeslam_torch.run import run, settle_camera
-from edgeslam_torch.synthetic.flights.courses import COURSES
+from edgeslam_torch.synthetic.flights.courses import COURSES, RATE_HZ
 from edgeslam_torch.types import FloatArray
 
 RUN = "run"
@@ -64,6 +64,9 @@ def _opened(cell: Cell, folder: Path, flights_root: Path) -> tuple[Recording, Tr
     """The cell's source and what its run is compared with."""
     if cell.nothing:
         return flights.nothing_to_see(cell.nothing, cell.seed), Truth(None)
+    if cell.variant == CUT:
+        here, there = (flights.flight_folder(flights_root, cell.course, cell.seed + after) for after in (0, 1))
+        return sources.followed_by(_recording(here), _recording(there), CUT_FRAMES, RATE_HZ), Truth(None)
     if cell.course:
         place = flights.flight_folder(flights_root, cell.course, cell.seed, int(cell.variant == SECOND_FLIGHT))
         return _recording(place), Truth(place, surfaces=lambda p: _distances(cell, p))

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
+from itertools import chain, islice
 
 import cv2
 import numpy as np
@@ -116,6 +116,16 @@ def cut(recording: Recording, plan: Cut) -> Recording:
             begin += last - first
 
     return replace(recording, decode=decode, length=len(stamps), telemetry=[], groundtruth=None)
+
+
+def followed_by(first: Recording, second: Recording, count: int, rate_hz: float) -> Recording:
+    """A film with a cut: ``count`` frames of one recording, then of another with the same camera, without telemetry."""
+
+    def decode(problems: list[Problem]) -> Iterator[Frame]:
+        both = chain.from_iterable(islice(one.decode(problems), count) for one in (first, second))
+        return (ChangedFrame(frame, i, i / rate_hz) for i, frame in enumerate(both))
+
+    return replace(first, decode=decode, length=2 * count, telemetry=[], groundtruth=None)
 
 
 def backwards(recording: Recording, images: Sequence[ImageEntry]) -> Recording:

@@ -226,3 +226,25 @@ def test_cells_are_chosen_by_pattern_and_repeated_by_seed(recording):
 def test_folder_that_is_not_there_is_named(tmp_path):
     with pytest.raises(EvaluationError, match="no such folder of recordings"):
         list_cells(tmp_path / "gone", "base", [0])
+
+
+def test_a_cut_shows_one_world_and_then_the_next(tmp_path, monkeypatch):
+    asked = []
+
+    def folder(root, course, seed):
+        asked.append((course, seed))
+        if not (root / f"{seed}").is_dir():
+            record_course(root / f"{seed}", COURSES[course], seed, seconds=0.3)
+        return root / f"{seed}"
+
+    monkeypatch.setattr(flights, "flight_folder", folder)
+    monkeypatch.setattr(run_cell, "CUT_FRAMES", 4)
+    source, truth = run_cell._opened(
+        Cell("flight/corridor/cut", 6, variant="cut", course="corridor"), tmp_path, tmp_path
+    )
+    frames = list(source.frames())
+    assert asked == [("corridor", 6), ("corridor", 7)]
+    assert [f.path.parent.parent.name for f in frames] == ["6"] * 4 + ["7"] * 4
+    assert [f.index for f in frames] == list(range(8))
+    assert np.diff([f.stamp_s for f in frames]) == pytest.approx(0.05)
+    assert source.telemetry == [] and source.length == 8 and truth.poses is None

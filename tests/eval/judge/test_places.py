@@ -1,0 +1,51 @@
+"""Links between maps of one place and of different places; the maps are those of a film of stairs."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from rendered import CAMERA, film, sideways, stairs_world
+
+from edgeslam_torch.config import SlamConfig
+from edgeslam_torch.eval.judge.places import Half, _flown, compare
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.readers.source import Recording
+
+
+@pytest.fixture(scope="module")
+def half():
+    """A map of the stairs, and where its keyframes truly were; the stamps are those of the first pass."""
+    flight = film(stairs_world(), CAMERA, sideways(30, 0.03))
+    source = Recording("stairs", "images", "stairs", CAMERA, lambda _: iter(flight.frames), len(flight.frames))
+    atlas, stamps = _flown(source, "stairs")
+    rows = [int(np.abs(flight.stamps_s - t).argmin()) for t in stamps]
+    np.testing.assert_allclose(flight.stamps_s[rows], stamps)
+    return Half("stairs", "first", atlas, stamps, flight.T_w_c[rows])
+
+
+def test_two_passes_of_one_place_are_linked_and_recalled(half):
+    later = replace(half, name="second", stamps_s=half.stamps_s + 60.0)
+    found = compare(half, later, SlamConfig())
+    assert found.links > 0
+    assert (found.false, found.agreeing) == (0, False)
+    assert found.revisits == 2 * len(half.stamps_s)
+    assert found.recalled >= 0.8 * found.revisits
+
+
+def test_links_between_recordings_of_different_places_are_false(half):
+    found = compare(half, replace(half, recording="elsewhere"), SlamConfig())
+    assert found.false == found.links > 0
+    assert found.revisits == 0
+
+
+def test_a_link_that_is_off_by_the_truth_is_false(half):
+    """The other half was a metre higher, so that nothing was visited twice."""
+    up = se3.exp(np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0]))
+    later = replace(half, name="second", stamps_s=half.stamps_s + 60.0, T_w_c=up @ half.T_w_c)
+    found = compare(half, later, SlamConfig())
+    assert found.false == found.links > 0
+    assert found.revisits == 0
+
+
+def test_what_was_seen_just_before_is_no_revisit(half):
+    assert compare(half, replace(half, name="second"), SlamConfig()).revisits == 0
