@@ -3,6 +3,7 @@
 import re
 import sys
 from functools import lru_cache
+from itertools import pairwise
 from pathlib import Path
 from types import CodeType, FrameType
 
@@ -17,6 +18,9 @@ from edgeslam_torch.types import FrameStatus
 
 HOPS = 51
 """Different calls from one folder into another on a tracked frame's way, without those into `geometry` and `types`."""
+
+CLIMBS = 10
+"""Times that the way goes on in a higher row of the table than before, in the order in which it first enters files."""
 
 ROOT = Path(edgeslam_torch.__file__).parent
 ROWS = {part: number for number, row in enumerate(LAYERS) for part in row.parts}
@@ -99,6 +103,14 @@ def test_hops_between_folders_stay_few():
     beside = {"geometry", "types"}  # everybody calls them
     hops = {(a, b, name) for a, b, name in calls() if part_of(a) != part_of(b) and part_of(b) not in beside}
     assert 10 < len(hops) <= HOPS, sorted(hops)
+
+
+def test_the_way_goes_on_in_a_higher_row_few_times():
+    """What is read from top to bottom should lie so too; each climb is a return to a caller that then asks another."""
+    entered = dict.fromkeys(called for _, called, _ in calls() if part_of(called) not in {"geometry", "types"})
+    rows = [ROWS[part_of(module)] for module in entered if part_of(module) != "stage_times"]
+    climbs = sum(after > before for before, after in pairwise(rows))
+    assert 3 < climbs <= CLIMBS, list(entered)
 
 
 @pytest.mark.parametrize("name", ["slam", "states/tracking", "optim/pose_only", "fusion/published"])

@@ -21,6 +21,7 @@ from scipy.linalg import cho_factor, cho_solve
 from edgeslam_torch.fusion.config import FusionConfig
 from edgeslam_torch.fusion.scale.log_scale import floor_segments
 from edgeslam_torch.fusion.telemetry.track import TelemetryTrack
+from edgeslam_torch.geometry.robust_statistics import tukey_weight
 from edgeslam_torch.geometry.se3 import hat
 from edgeslam_torch.types import FloatArray, IntArray
 
@@ -42,7 +43,6 @@ FLOOR_M = 30.0
 UP_RAD = math.radians(2.0)
 """Error of the direction of gravity in one picture: mount, accelerations in flight."""
 UP_MEMORY_S = 5.0
-_TUKEY = 4.685
 _LEAST_WEIGHT = 1e-4
 _BENT = 0.2
 """Share of a way by which the map may be off without the reading being a wild one: that is what is to be mended."""
@@ -258,7 +258,7 @@ class TelemetryModel:
             power = np.bincount(rows.group, clean**2 / allowed)
             z = np.sqrt(power)
             spread = max(1.0, float(np.median(z)))
-            tukey = np.square(np.maximum(0.0, 1.0 - np.square(z / (_TUKEY * spread))))
+            tukey = tukey_weight(z, spread)
             weight = np.maximum(tukey, _LEAST_WEIGHT)[rows.group]
         factor = cho_factor(slow + np.diag(rows.white / weight), lower=True)
         whitened = cho_solve(factor, np.column_stack([D, rows.told]))

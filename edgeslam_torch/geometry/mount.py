@@ -1,11 +1,16 @@
 """Camera mount on the drone's body."""
 
+import math
+
 import numpy as np
 
 from edgeslam_torch.types import FloatArray
 
+TELLO_TILT_RAD, TELLO_FORWARD_M = math.radians(12.0), 0.03
+"""A Tello's camera, within two degrees and a centimetre or so."""
 
-def camera_on_body(tilt_rad: float, forward_m: float) -> FloatArray:
+
+def camera_on_body(tilt_rad: float = TELLO_TILT_RAD, forward_m: float = TELLO_FORWARD_M) -> FloatArray:
     """``T_b_c`` ``(4, 4)`` of a forward-looking camera tilted down by ``tilt_rad``.
 
     Example:

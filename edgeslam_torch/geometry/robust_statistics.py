@@ -9,6 +9,8 @@ CHI2_1DOF_95 = 3.841
 """95 % quantile of chi-square with 1 degree of freedom."""
 CHI2_2DOF_95 = 5.991
 """95 % quantile of chi-square with 2 degrees of freedom."""
+RMS_MEDIAN_3DOF = 0.888
+"""Median length of three normal components with unit variance, over sqrt(3)."""
 MAD_TO_SIGMA = 1.4826
 """Median absolute deviation to standard deviation of a normal distribution."""
 TUKEY_95 = 4.685

@@ -19,10 +19,11 @@ from edgeslam_torch.config import SlamConfig
 from edgeslam_torch.eval.inputs.trajectory_files import read_trajectory
 from edgeslam_torch.eval.metrics.align import Alignment, AlignmentKind, umeyama
 from edgeslam_torch.geometry import se3
+from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.readers.source import Recording, open_source
 from edgeslam_torch.slam import EdgeSlam
 from edgeslam_torch.synthetic.flights.courses import COURSES, RATE_HZ, record_flight, simulated_camera
-from edgeslam_torch.synthetic.flights.flight import FlightPlan, camera_on_body
+from edgeslam_torch.synthetic.flights.flight import FlightPlan
 from edgeslam_torch.synthetic.flights.telemetry import TelemetryFaults, simulate
 from edgeslam_torch.types import FloatArray, PoseNow, TelemetrySample
 

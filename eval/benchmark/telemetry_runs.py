@@ -19,9 +19,9 @@ import numpy as np
 from edgeslam_torch.config import SlamConfig
 from edgeslam_torch.eval.inputs.trajectory_files import read_trajectory
 from edgeslam_torch.eval.metrics.run_score import evaluate_run
+from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.readers.source import open_source
 from edgeslam_torch.run import run
-from edgeslam_torch.synthetic.flights.flight import camera_on_body
 from edgeslam_torch.synthetic.flights.telemetry import TelemetryFaults, TelemetryLog, simulate
 
 OUTAGE_S = 10.0

@@ -182,19 +182,3 @@ def test_weights_that_give_no_depth_are_refused_when_they_are_loaded(tmp_path: P
 def test_weights_that_see_nothing_are_refused_when_they_are_loaded(tmp_path: Path, backend: str) -> None:
     with pytest.raises(WeightsError, match="the same depth whatever it sees"):
         DepthPredictor(changed(tmp_path, decode_conv6__0__weight=0.0, decode_conv6__1__bias=1.0), backend)
-
-
-def test_the_end_of_the_networks_range_is_unknown_not_100_m(weights: Path, image: np.ndarray) -> None:
-    class Half:
-        metadata, fixed_size = METADATA, None
-
-        def run(self, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            log_depth = np.zeros((image.shape[2] // 2, image.shape[3] // 2), np.float32)
-            log_depth[:, : log_depth.shape[1] // 2] = np.log(100.0)
-            return log_depth, np.ones_like(log_depth)
-
-    predictor = DepthPredictor(weights)
-    predictor._engine = Half()
-    depth = predictor(image, CAMERA).depth_m
-    assert np.isnan(depth[:, :78]).all()
-    assert (depth[:, 82:] > 0.5).all()

@@ -10,7 +10,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, Slerp
 
 from edgeslam_torch.fusion.motion import MotionFusion
-from edgeslam_torch.synthetic.flights.flight import camera_on_body
+from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.types import FloatArray, TelemetrySample
 
 T_B_C = camera_on_body()

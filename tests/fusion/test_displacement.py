@@ -8,7 +8,7 @@ import pytest
 from edgeslam_torch.fusion.config import FusionConfig
 from edgeslam_torch.fusion.displacement import TelemetryModel
 from edgeslam_torch.fusion.telemetry.track import TelemetryTrack
-from edgeslam_torch.synthetic.flights.flight import camera_on_body
+from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.synthetic.flights.telemetry import EXACT, TelemetryFaults, simulate
 from edgeslam_torch.types import TelemetrySample
 

@@ -14,7 +14,7 @@ from edgeslam_torch.fusion.motion import MotionFusion
 from edgeslam_torch.fusion.published import Published
 from edgeslam_torch.fusion.snapshot import Present
 from edgeslam_torch.geometry import se3
-from edgeslam_torch.synthetic.flights.flight import camera_on_body
+from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.synthetic.flights.telemetry import EXACT, TelemetryFaults, simulate
 from edgeslam_torch.types import TelemetrySample
 

@@ -6,7 +6,7 @@ import pytest
 from edgeslam_torch.fusion.config import FusionConfig
 from edgeslam_torch.fusion.health import disagreement
 from edgeslam_torch.fusion.motion import MotionFusion
-from edgeslam_torch.synthetic.flights.flight import camera_on_body
+from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.synthetic.flights.telemetry import TelemetryFaults, simulate
 from edgeslam_torch.types import Health, ScaleEstimate
 

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.fusion.config import FusionConfig
 from edgeslam_torch.fusion.motion import MotionFusion
-from edgeslam_torch.synthetic.flights.flight import camera_on_body
+from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.synthetic.flights.telemetry import EXACT, simulate
 
 FAR = camera_on_body(forward_m=0.5)

@@ -10,7 +10,7 @@ from edgeslam_torch.fusion.scale.depth_scale import DepthRatio
 from edgeslam_torch.fusion.telemetry.whole_steps import Rounding
 from edgeslam_torch.fusion.telemetry_scale import TelemetryScale
 from edgeslam_torch.geometry import se3
-from edgeslam_torch.synthetic.flights.flight import camera_on_body
+from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.synthetic.flights.telemetry import EXACT, TelemetryFaults, simulate
 from edgeslam_torch.types import ScaleEstimate, TelemetrySample, Units
 

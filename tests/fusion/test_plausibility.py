@@ -12,7 +12,7 @@ from edgeslam_torch.fusion.config import FusionConfig
 from edgeslam_torch.fusion.motion import MotionFusion
 from edgeslam_torch.fusion.scale.depth_scale import DepthRatio
 from edgeslam_torch.fusion.telemetry.plausibility import Agreement, Reading, Trust, Verdict, agreement, changes
-from edgeslam_torch.synthetic.flights.flight import camera_on_body
+from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.synthetic.flights.telemetry import TelemetryFaults, simulate
 
 T_B_C = camera_on_body()

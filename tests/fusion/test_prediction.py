@@ -12,7 +12,7 @@ from edgeslam_torch.fusion.telemetry.track import TelemetryTrack
 from edgeslam_torch.fusion.telemetry.visual_memory import VisualPose
 from edgeslam_torch.fusion.telemetry_scale import TelemetryFit
 from edgeslam_torch.geometry import se3
-from edgeslam_torch.synthetic.flights.flight import camera_on_body
+from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.synthetic.flights.telemetry import EXACT, TelemetryFaults, simulate
 from edgeslam_torch.types import ScaleEstimate
 

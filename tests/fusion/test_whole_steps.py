@@ -10,7 +10,7 @@ from edgeslam_torch.fusion.motion import MotionFusion
 from edgeslam_torch.fusion.telemetry.track import TelemetryTrack
 from edgeslam_torch.fusion.telemetry.visual_memory import Displacements, Sightings
 from edgeslam_torch.fusion.telemetry.whole_steps import Rounding, remainder, remainder_gain, seen_velocity
-from edgeslam_torch.synthetic.flights.flight import camera_on_body
+from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.synthetic.flights.telemetry import EXACT, simulate
 from edgeslam_torch.types import TelemetrySample
 

@@ -10,10 +10,10 @@ from edgeslam_torch.fusion.config import FusionConfig
 from edgeslam_torch.fusion.displacement import TelemetryModel
 from edgeslam_torch.fusion.telemetry.track import TelemetryTrack
 from edgeslam_torch.geometry import se3
+from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.mapping.motion_terms import motion_factors
 from edgeslam_torch.mapping.refinement import Window, refine
 from edgeslam_torch.optim.problem import LmConfig
-from edgeslam_torch.synthetic.flights.flight import camera_on_body
 from edgeslam_torch.synthetic.flights.telemetry import EXACT, simulate
 
 T_B_C = camera_on_body()

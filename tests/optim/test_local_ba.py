@@ -20,7 +20,7 @@ from edgeslam_torch.optim.benchmark import (
     seeded_window,
 )
 from edgeslam_torch.optim.kernels import compiled, point_blocks, schur
-from edgeslam_torch.optim.kernels.edge_blocks import EdgePairs, edge_cost, edge_weights
+from edgeslam_torch.optim.kernels.edge_blocks import EdgeTiles, edge_cost, edge_weights
 from edgeslam_torch.optim.kernels.junction_blocks import (
     JunctionPairs,
     collinearity_prior,
@@ -524,7 +524,7 @@ def test_kernels_stay_on_their_device():
         pair, some = torch.zeros(B, T, L, **f), torch.zeros(3, dtype=torch.int64)
         robust = Robust(pair, Kernel.HUBER, 2.0)
         line, ray = torch.zeros(3, B, T, L, **f), torch.zeros(2, B, 1, L, **f)
-        edge, edges = torch.zeros(1, B, L, **f), EdgePairs(ray, line, pair, pair, K, None, robust)
+        edge, edges = torch.zeros(1, B, L, **f), EdgeTiles(ray, line, pair, pair, K, None, robust)
         rays, arms = torch.zeros(2, 3, B, 1, L, **f), torch.zeros(2, 2, B, T, L, **f)
         weight = torch.zeros(4, B, T, L, **f)
         corner, corners = torch.zeros(3, B, L, **f), JunctionPairs(rays, line[:2], arms, weight, K, False, robust)

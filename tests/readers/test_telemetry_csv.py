@@ -6,6 +6,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from edgeslam_torch.drone.sdk_state import FIELDS, parse_state, sample_from_sdk
+from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.readers.telemetry_csv import (
     HEADER,
     TelemetryError,
@@ -15,7 +16,6 @@ from edgeslam_torch.readers.telemetry_csv import (
     read_table,
     read_telemetry,
 )
-from edgeslam_torch.synthetic.flights.flight import camera_on_body
 from edgeslam_torch.synthetic.flights.telemetry import simulate
 
 REAL = (

@@ -9,6 +9,7 @@ from rendered import CAMERA, film, sideways, stairs_world
 
 from edgeslam_torch.config import DepthConfig, SlamConfig
 from edgeslam_torch.eval.metrics.align import umeyama
+from edgeslam_torch.fusion.motion import MotionFusion
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.slam import EdgeSlam
 from edgeslam_torch.types import DepthMap, TelemetrySample, Units
@@ -45,13 +46,13 @@ def test_a_first_depth_map_that_is_off_is_put_right_by_those_that_follow(factor)
     assert live == pytest.approx(factor * length(panels().T_w_c), rel=0.1), "live units do not follow a guess"
 
 
-def test_depths_that_the_network_gave_do_not_confirm_the_network():
+def test_depths_that_the_network_gave_do_not_confirm_the_network(monkeypatch):
     """A camera that only turns: every anchor lies where the network put it, which says nothing of the network."""
     turn = np.linspace(0.0, 0.5, 30)
     poses = np.stack([se3.exp(np.array([0.0, 0.0, 0.0, 0.0, a, 0.0])) for a in turn])
     turning = film(stairs_world(), CAMERA, poses)
     slam = EdgeSlam(CAMERA, NO_NETWORK, depth=turning.depth_function())
-    told = spied(slam, "add_depth_ratio")
+    told = spied(monkeypatch, "add_depth_ratio")
     for frame in turning.frames:
         slam.step(frame)
     assert len(slam.map.anchors) > 300
@@ -59,23 +60,22 @@ def test_depths_that_the_network_gave_do_not_confirm_the_network():
     assert told == []
 
 
-def spied(slam, name):
+def spied(monkeypatch, name):
     """Arguments of all calls of one of fusion's methods from now on."""
-    fusion, calls = slam._system.fusion, []
-    inner = getattr(fusion, name)
+    calls, inner = [], getattr(MotionFusion, name)
 
-    def method(*arguments, **named):
+    def method(fusion, *arguments, **named):
         calls.append((*arguments, *named.values()))
-        return inner(*arguments, **named)
+        return inner(fusion, *arguments, **named)
 
-    setattr(fusion, name, method)
+    monkeypatch.setattr(MotionFusion, name, method)
     return calls
 
 
-def test_visual_sigma_is_that_of_the_visual_errors():
+def test_visual_sigma_is_that_of_the_visual_errors(monkeypatch):
     """From one frame to the next, in map units: within a factor of three, be it too large or too small."""
     slam = EdgeSlam(CAMERA, NO_NETWORK)
-    told = spied(slam, "add_visual")
+    told = spied(monkeypatch, "add_visual")
     for frame in panels().frames:
         slam.step(frame)
     T = np.stack([call[1] for call in told])
@@ -98,12 +98,12 @@ def test_frames_that_were_lost_are_counted_and_are_no_evidence():
     assert slam.telemetry_statistics()["visual not tracked"] == 5
 
 
-def test_the_last_word_on_the_scale_rests_on_the_refined_poses():
+def test_the_last_word_on_the_scale_rests_on_the_refined_poses(monkeypatch):
     slam = EdgeSlam(CAMERA, NO_NETWORK, depth=panels().depth_function())
     for frame in panels().frames:
         slam.step(frame)
     before = slam.log.poses()[1].copy()
-    told = spied(slam, "revise")
+    told = spied(monkeypatch, "revise")
     slam.finish()
     ((stamps, T_w_c),) = told
     np.testing.assert_array_equal(stamps, panels().stamps_s)
@@ -112,13 +112,13 @@ def test_the_last_word_on_the_scale_rests_on_the_refined_poses():
     assert slam.scale.units is Units.METRES
 
 
-def test_one_scale_for_all_of_a_frozen_stretch():
+def test_one_scale_for_all_of_a_frozen_stretch(monkeypatch):
     """A video that stands still gives its last new image once, and nothing until it moves again."""
     frames = list(panels().frames[:24])
     frozen = [replace(frames[-1], index=24 + k, stamp_s=frames[-1].stamp_s + (k + 1) / 30) for k in range(5)]
     later = [replace(f, stamp_s=f.stamp_s + 5 / 30, index=f.index + 5) for f in panels().frames[24:]]
     slam = EdgeSlam(CAMERA, NO_NETWORK)
-    told = spied(slam, "add_visual")
+    told = spied(monkeypatch, "add_visual")
     for frame in [*frames, *frozen, *later]:
         slam.step(frame)
     stamps = [call[0] for call in told]

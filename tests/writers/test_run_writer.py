@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fake_slam import FakeSlam
+from full_disk import FullDisk
 
 from edgeslam_torch.errors import OutputError
 from edgeslam_torch.types import Frame, Support, Units
@@ -199,24 +200,13 @@ def test_folder_that_cannot_be_made(tmp_path):
 
 
 def test_full_disk_leaves_whole_lines_and_room_for_the_rest(tmp_path, monkeypatch):
+    disk = FullDisk(monkeypatch, "trajectory_online.txt")
     writer = RunWriter(tmp_path)
     slam, frames = outputs(5)
     for output in frames[:3]:
         assert writer.append(output, 1.0)
 
-    class Full:
-        """A file whose disk has room for twenty more bytes."""
-
-        def __init__(self, file):
-            self.file = file
-
-        def write(self, data):
-            return self.file.write(data[:20])
-
-        def __getattr__(self, name):
-            return getattr(self.file, name)
-
-    writer._live._online._file = Full(writer._live._online._file)
+    disk.room = 20
     assert not writer.append(frames[3], 1.0)
     assert "No space left" in writer.failure
     assert not writer.append(frames[4], 1.0)

@@ -6,7 +6,7 @@ import numpy as np
 
 from edgeslam_torch.drone.emulator.drone import DroneModel
 from edgeslam_torch.geometry.camera import PRESETS, Camera
-from edgeslam_torch.synthetic.flights.flight import camera_on_body
+from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.synthetic.house.render import picture
 from edgeslam_torch.synthetic.house.rooms import room
 from edgeslam_torch.synthetic.house.world import MAX_LEVEL, World

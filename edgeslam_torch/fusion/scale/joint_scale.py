@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import cho_solve, lapack
 
-from edgeslam_torch.geometry.robust_statistics import median, robust_sigma, tukey_weight
+from edgeslam_torch.geometry.robust_statistics import RMS_MEDIAN_3DOF, median, robust_sigma, tukey_weight
 from edgeslam_torch.geometry.se3 import hat
 from edgeslam_torch.types import FloatArray, IntArray
 
@@ -143,7 +143,7 @@ def displacement_evidence(
         clean = fit.residual - fit.slow  # (3, N)
         variance = sigma_m**2 + (s * sigma_map) ** 2
         normalised = np.sqrt(np.sum(clean**2, axis=0) / (3.0 * variance))
-        spread = max(median(normalised) / 0.888, 0.3)
+        spread = max(median(normalised) / RMS_MEDIAN_3DOF, 0.3)
         weight = tukey_weight(normalised, spread)
         drift = fit.slow - fit.bias  # the map's, so it is in the regressor as well
         partner = moved_map + ((s * sigma_map**2 / variance) * clean + drift / s).T

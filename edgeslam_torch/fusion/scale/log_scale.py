@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edgeslam_torch.geometry.robust_statistics import median, robust_sigma, tukey_weight
+from edgeslam_torch.geometry.robust_statistics import RMS_MEDIAN_3DOF, median, robust_sigma, tukey_weight
 from edgeslam_torch.geometry.se3 import hat
 from edgeslam_torch.types import FloatArray, IntArray, ScaleEstimate
 
@@ -102,8 +102,7 @@ def fit_displacements(
             spread = max(robust_sigma(normalised) / 1.4, 0.3)
             weight = np.minimum(1.0, _HUBER * spread / np.maximum(normalised, 1e-12))
         else:
-            # Median of a chi variable with 3 degrees over sqrt(3) is 0.888.
-            spread = max(median(normalised) / 0.888, 0.3)
+            spread = max(median(normalised) / RMS_MEDIAN_3DOF, 0.3)
             weight = tukey_weight(normalised, spread)
         latent = turned + (scale * sigma_map**2 / variance)[:, None] * residual  # where the true displacement lies
         J, J_latent = (_jacobian(scale * v, duration_s, block, K) for v in (turned, latent))

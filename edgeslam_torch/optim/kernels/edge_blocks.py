@@ -39,7 +39,7 @@ from edgeslam_torch.optim.problem import EdgeTerms, LmConfig
 from edgeslam_torch.types import FloatArray
 
 
-class EdgePairs(NamedTuple):
+class EdgeTiles(NamedTuple):
     """Edge pixels and what the views that see them measured, in tiles."""
 
     ray: Tensor
@@ -72,7 +72,7 @@ class EdgePrior(NamedTuple):
         return Known(self.weight, g, (g * e).sum())
 
 
-def edge_weights(Rt: Tensor, x: Tensor, pairs: EdgePairs) -> Weighed:
+def edge_weights(Rt: Tensor, x: Tensor, pairs: EdgeTiles) -> Weighed:
     """Alignment and cycle rows at relative motions ``(3, 4, B, T, 1)`` and inverse depths ``(1, B, L)``."""
     x = x[0, :, None]
     g = pair_geometry(Rt, pairs.ray, x)
@@ -99,13 +99,13 @@ def edge_weights(Rt: Tensor, x: Tensor, pairs: EdgePairs) -> Weighed:
     return Weighed(*schur.pair_products(J, Jd), value)
 
 
-def edge_system(T_c_w: Tensor, x: Tensor, layout: Layout, prior: EdgePrior, pairs: EdgePairs) -> Linearised:
+def edge_system(T_c_w: Tensor, x: Tensor, layout: Layout, prior: EdgePrior, pairs: EdgeTiles) -> Linearised:
     """Normal equations at poses ``(W, 4, 4)`` and inverse depths ``(1, B, L)``."""
     T_rel, Rt = relative_motions(T_c_w, layout.host, layout.target, layout.dtype)
     return as_system(T_rel, layout, edge_weights(Rt, x.to(layout.dtype), pairs), prior.at(x))
 
 
-def edge_cost(Rt: Tensor, x: Tensor, pairs: EdgePairs) -> Tensor:
+def edge_cost(Rt: Tensor, x: Tensor, pairs: EdgeTiles) -> Tensor:
     """Robust cost ``()``; arguments as `edge_weights` takes them."""
     g = pair_geometry(Rt, pairs.ray, x[0, :, None])
     value, _ = robust_sum(alignment_row(g, pairs.line), g.front, pairs.robust)
@@ -117,7 +117,7 @@ def edge_cost(Rt: Tensor, x: Tensor, pairs: EdgePairs) -> Tensor:
     return value
 
 
-def alignment_chi2(Rt: Tensor, x: Tensor, pairs: EdgePairs) -> Tensor:
+def alignment_chi2(Rt: Tensor, x: Tensor, pairs: EdgeTiles) -> Tensor:
     """Squared whitened alignment residuals ``(B, T, L)``; arguments as `edge_weights` takes them."""
     g = pair_geometry(Rt, pairs.ray, x[0, :, None])
     r = alignment_row(g, pairs.line)
@@ -131,7 +131,7 @@ class EdgeBlocks(RelativeBlocks):
     system_kernel = staticmethod(edge_system)
     cost_kernel = staticmethod(edge_cost)
     prior: EdgePrior
-    pairs: EdgePairs
+    pairs: EdgeTiles
 
     def __init__(self, terms: EdgeTerms, K: Tensor, column: Tensor, config: LmConfig) -> None:
         """Arrange the terms in the solver's layout; ``K`` is fx, fy, cx, cy."""
@@ -151,7 +151,7 @@ class EdgeBlocks(RelativeBlocks):
         line = partner_line(partner, normal, _tensor(terms.pair_inv_sigma), K)
         held = np.asarray(terms.pair_inverse_depth, dtype=np.float64)
         used = (held > 0) & (terms.cycle_sigma > 0)
-        self.pairs = EdgePairs(
+        self.pairs = EdgeTiles(
             ray=tiles.blocks(((np.asarray(terms.uv).reshape(-1, 2) - c) / f).T, dtype)[:, :, None],
             line=tiles.pairs(line.cpu().numpy(), dtype),
             held=tiles.pairs(np.where(held > 0, held, 1.0), dtype, 1.0),

@@ -12,7 +12,7 @@ from scipy.interpolate import BSpline
 from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.geometry import se3
-from edgeslam_torch.synthetic.house.rooms import look
+from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.synthetic.house.world import World
 from edgeslam_torch.types import FloatArray
 
@@ -84,11 +84,6 @@ class Flight:
         dt = float(self.stamps_s[j] - self.stamps_s[i])
         T = self.T_w_c
         return se3.log(se3.inverse(T[i]) @ T[j]) / dt if dt > 0 else np.zeros(6)
-
-
-def camera_on_body(tilt_rad: float = np.deg2rad(12.0), forward_m: float = 0.03) -> FloatArray:
-    """``T_b_c`` of a forward camera tilted down."""
-    return look(np.array([forward_m, 0.0, 0.0]), 0.0, tilt_rad)
 
 
 def fly(

@@ -10,9 +10,9 @@ import numpy as np
 from scipy.signal import lfilter
 
 from edgeslam_torch.eval.inputs.trajectory_files import Trajectory
+from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.geometry.rotations import matrix_from_rpy
 from edgeslam_torch.synthetic.flights.courses import COURSES, flown
-from edgeslam_torch.synthetic.flights.flight import camera_on_body
 from edgeslam_torch.synthetic.flights.telemetry import FIELDS, TelemetryFaults, simulate
 from edgeslam_torch.types import FloatArray, TelemetrySample
 

@@ -22,9 +22,9 @@ GREEN = Metadata(
 """Takes RGB in [0, 1]; its metres hold for 80 px of focal length at a width of 96."""
 
 
-def write_green_network(path: Path) -> Path:
-    """A network that maps green to depth: ``1 + 3 green`` metres, 10 % sure of it, at half the image's size."""
-    constants = {"green": [[[[0.0]], [[3.0]], [[0.0]]]], "one": [1.0], "none": 0.0, "sigma": 0.1}
+def write_green_network(path: Path, metres: float = 3.0) -> Path:
+    """A network that maps green to depth: ``1 + metres green``, 10 % sure of it, at half the image's size."""
+    constants = {"green": [[[[0.0]], [[metres]], [[0.0]]]], "one": [1.0], "none": 0.0, "sigma": 0.1}
     nodes = [
         helper.make_node("Conv", ["image", "green", "one"], ["depth"]),
         helper.make_node("AveragePool", ["depth"], ["half"], kernel_shape=[2, 2], strides=[2, 2]),
@@ -55,6 +55,15 @@ def test_other_network_gives_the_slam_metres_for_its_camera(tmp_path: Path) -> N
     np.testing.assert_allclose(depth.depth_m[:, :80], 2.0, rtol=1e-5)
     np.testing.assert_allclose(depth.depth_m[:, 112:], 8.0, rtol=1e-5)
     np.testing.assert_allclose(depth.sigma_log, 0.1, rtol=1e-5)
+
+
+def test_the_end_of_a_networks_range_is_unknown_not_100_m(tmp_path: Path) -> None:
+    predict = DepthPredictor(write_green_network(tmp_path / "far.onnx", metres=99.0))
+    image = np.zeros((128, 192, 3), np.uint8)
+    image[:, :96, 1] = 255
+    depth_m = predict(image, Camera(192, 128, 160.0, 160.0, 95.5, 63.5)).depth_m
+    assert np.isnan(depth_m[:, :90]).all()
+    np.testing.assert_allclose(depth_m[:, 102:], 1.0, rtol=1e-5)
 
 
 def test_weights_without_a_graph_cannot_be_another_network(tmp_path: Path) -> None:

@@ -12,9 +12,10 @@ from edgeslam_torch.eval.inputs.dataset import open_dataset
 from edgeslam_torch.eval.inputs.trajectory_files import read_trajectory
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera, load_camera
+from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.readers.source import open_source
 from edgeslam_torch.synthetic.flights.degrade import CameraFaults
-from edgeslam_torch.synthetic.flights.flight import Flight, FlightPlan, camera_on_body, fly
+from edgeslam_torch.synthetic.flights.flight import Flight, FlightPlan, fly
 from edgeslam_torch.synthetic.flights.telemetry import EXACT, FIELDS, TelemetryFaults, simulate
 from edgeslam_torch.synthetic.flights.writer import DEPTH_PER_METRE, write_flight
 from edgeslam_torch.synthetic.house.render import render

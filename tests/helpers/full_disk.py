@@ -1,0 +1,35 @@
+"""A disk that fills up while one file is written."""
+
+from pathlib import Path
+
+import pytest
+
+
+class FullDisk:
+    """Files of a name: while ``room`` is set, a write leaves that many bytes and says so, as POSIX has it.
+
+    Args:
+        monkeypatch: Undoes it.
+        name: Of the files.
+    """
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+        self.room: int | None = None
+        opened = Path.open
+
+        def open_on_it(path: Path, mode: str = "r", *arguments, **named):
+            file = opened(path, mode, *arguments, **named)
+            return _File(file, self) if path.name == name and "r" not in mode else file
+
+        monkeypatch.setattr(Path, "open", open_on_it)
+
+
+class _File:
+    def __init__(self, file, disk: FullDisk) -> None:
+        self.file, self.disk = file, disk
+
+    def write(self, data):
+        return self.file.write(data[: self.disk.room])
+
+    def __getattr__(self, name):
+        return getattr(self.file, name)
