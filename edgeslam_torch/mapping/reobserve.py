@@ -28,6 +28,7 @@ MIN_INLIERS = 15
 MIN_SHARE = 0.5
 """Minimum share of inliers: the majority of the matches."""
 MAX_TURN_RAD = np.deg2rad(30.0)
+"""Maximum angle between the two views: beyond it, views of 60 degrees share less than half."""
 MAX_SHIFT = 0.35
 """Maximum distance of the two cameras relative to the newer one's median depth: 20 degrees of parallax."""
 MAX_DRIFT_PX = 5.0

@@ -1,4 +1,4 @@
-"""A recording on disk as its layout describes it: images with stamps, and the files beside them.
+"""A recording on disk: images with time stamps, and the files beside them.
 
 SLAM, evaluation and training all read recordings through this record; `edgeslam_torch.readers.layouts` makes it.
 """
@@ -41,7 +41,7 @@ class DepthMaps:
         return self.camera is None
 
     def taken_by(self, colour: Camera) -> Camera:
-        """The camera that took the maps, beside a colour camera."""
+        """The camera that took the maps: ``colour`` itself when they are registered."""
         return colour if self.camera is None else self.camera
 
     def read(self, index: int, colour: Camera) -> FloatArray:
@@ -61,7 +61,7 @@ class DepthMaps:
         metres = np.where(np.isin(raw, NOTHING_MEASURED), 0, raw) * np.float32(self.metres_per_unit)
         if not camera.is_distorted:
             return np.asarray(metres, np.float32)
-        # Nearest neighbour: averaging two depths creates points in the air.
+        # Nearest neighbour: interpolation across a depth discontinuity would create points in mid-air.
         maps, flat = camera.undistortion_maps(), metres.astype(np.float32)
         straight = cv2.remap(flat, *maps, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
         return np.asarray(straight, np.float32)
@@ -109,7 +109,7 @@ class Sequence:
 
 
 def register_depth(depth: FloatArray, depth_camera: Camera, T_c_d: FloatArray, camera: Camera) -> FloatArray:
-    """Depth map ``(H, W)`` of one camera rendered in another; 0 where empty; the nearest depth wins."""
+    """Depth map ``(H, W)`` of one camera rendered in another; 0 where empty, else the nearest depth."""
     v, u = np.nonzero(depth)
     p_d = depth_camera.back_project(np.stack([u, v], axis=1).astype(np.float64), depth[v, u])
     p = p_d @ T_c_d[:3, :3].T + T_c_d[:3, 3]

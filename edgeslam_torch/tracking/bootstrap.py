@@ -26,14 +26,14 @@ from edgeslam_torch.types import FloatArray, Frame, IntArray
 logger = logging.getLogger(__name__)
 
 WITNESS_SHARE = 0.6
-"""Minimum share of inliers in the frames between: right structures reach 0.8 to 0.95 (95 % of the right matches)."""
+"""Minimum share of inliers in the frames between: correct structures reach 0.8 to 0.95 (95 % of correct matches)."""
 
 ALIKE_COST = 1.2
 """Maximum ratio of the costs of two structures that both explain the images: four standard deviations of a chi-square
 with several hundred degrees of freedom."""
 
 AGREEING_SHARE = 0.8
-"""The same after joint refinement of all frames: 95 % if every match were right, less a sixth of wrong matches."""
+"""The same after joint refinement of all frames: 95 % if every match were correct, less a sixth of wrong matches."""
 
 
 @dataclass(frozen=True, slots=True)

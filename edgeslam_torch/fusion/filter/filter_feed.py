@@ -1,7 +1,7 @@
-"""The Kalman filter and the visual map: tracked poses go in as metric increments, predicted poses come out.
+"""Feeds tracked poses to the Kalman filter as metric increments, and expresses its predictions in the map.
 
-The filter does not estimate where the map lies in the drone's world, only the body relative to its last visual pose,
-which is all that a prediction in the map needs: a map that is moved, rotated or scaled transforms the prediction.
+The filter does not estimate the pose of the map in the drone's world, only the motion of the body since the last visual
+pose. A prediction in the map needs no more, and stays valid when the map is moved, rotated or scaled.
 """
 
 import math
@@ -20,19 +20,20 @@ from edgeslam_torch.types import FloatArray, ScaleEstimate, TelemetrySample
 
 _SAME_S = 1e-6
 _SURE = 0.2
-"""Relative sigma of a scale that makes increments metric: over the delay of a video, 0.2 m at most, it costs 4 cm."""
+"""Maximum relative sigma of the scale: over a video's delay, 0.2 m of flight at most, that is an error of 4 cm."""
 _DELAY_MOVED_S = 0.003
-"""The filter's clock follows the delay; where it jumps, increments start anew: they would be stretched."""
+"""Change of the estimated delay after which increments restart: one across it would cover a wrong interval."""
 _DRIFT = 0.01
-"""Share of the way by which a map drifts from one frame to the next."""
+"""Standard deviation of the drift from frame to frame, as a share of the distance travelled."""
 _DRIFT_TURN = 0.003
+"""The same as a share of the angle turned."""
 _JITTER_M, _JITTER_RAD = 0.002, 0.001
-"""Least jitter of a tracked pose."""
+"""Minimum noise of a tracked pose."""
 
 
 @dataclass(frozen=True, slots=True)
 class Metric:
-    """What turns the map's units and clock into the drone's."""
+    """Conversion of the map's units and clock to the drone's."""
 
     scale: ScaleEstimate
     """Metres per map unit."""
@@ -40,7 +41,7 @@ class Metric:
 
     @property
     def sure(self) -> bool:
-        """Whether increments may go into the filter."""
+        """Whether increments may enter the filter."""
         return self.scale.sigma < _SURE * self.scale.value and math.isfinite(self.delay.sigma_s)
 
 
@@ -53,12 +54,11 @@ class FilterView:
     to_s: float
     """Stamp of the estimate on the frames' clock."""
     T_seen_c: FloatArray
-    """``(4, 4)`` camera in the camera that was seen [m]."""
+    """``(4, 4)`` camera, relative to the camera at `seen` [m]."""
     velocity_m_s: FloatArray
-    """``(3,)`` of the body, in the axes of the camera that was seen."""
+    """``(3,)`` of the body, in the axes of the camera at `seen`."""
     covariance: FloatArray
-    """``(9, 9)`` of translation [m], rotation vector [rad] and velocity [m/s], in the axes of the camera that was
-    seen."""
+    """``(9, 9)`` of translation [m], rotation vector [rad] and velocity [m/s], in the axes of the camera at `seen`."""
 
 
 class FilterFeed:
@@ -69,9 +69,9 @@ class FilterFeed:
         self.ekf = BufferedEkf(config)
         self._seen: VisualPose | None = None
         self._delay: Delay | None = None
-        """Of the filter's clock at that pose."""
+        """Delay by which the stamp of that pose was converted to telemetry's clock."""
         self._accumulated: FloatArray | None = None
-        """The printed filter's own visual odometry: body in the power-on world [m]."""
+        """Visual odometry accumulated by the paper's filter: body in the power-on world [m]."""
 
     @property
     def seen(self) -> VisualPose | None:
@@ -79,19 +79,19 @@ class FilterFeed:
         return self._seen
 
     def move_map(self, seen: VisualPose | None) -> None:
-        """The pose at the last update as it is now, in a map that was refined or scaled."""
+        """Replace the pose at the last update after the map was refined, moved or scaled."""
         self._seen = seen
 
     def clear(self) -> None:
-        """A new map in a new gauge."""
+        """Forget the last pose: a new map has another gauge."""
         self._seen = self._delay = self._accumulated = None
 
     def add_telemetry(self, sample: TelemetrySample, shortfall_m_s: float) -> None:
         """One state message; its velocity reads low by ``shortfall_m_s`` unless it is zero."""
-        self.ekf.add_telemetry(_made_up(sample, shortfall_m_s))
+        self.ekf.add_telemetry(_corrected(sample, shortfall_m_s))
 
     def see(self, visual: VisualPose, metric: Metric) -> None:
-        """A tracked frame."""
+        """Update the filter with a tracked frame."""
         seen = self._seen
         if not metric.sure:
             self._seen = None
@@ -122,7 +122,7 @@ class FilterFeed:
         self.ekf.add_relative(from_s, stamp_s, T_b, drift, jitter)
 
     def _add_accumulated(self, from_s: float, to_s: float, T_b: FloatArray, sigma: PoseSigma) -> None:
-        """Paper eq. (13): increments one after the other are taken for a pose."""
+        """Paper eq. (13): the chained increments are measured as an absolute pose."""
         if self._accumulated is None:
             start = self.ekf.state_at(from_s)
             if start is None:
@@ -133,10 +133,7 @@ class FilterFeed:
         self.ekf.add_absolute(to_s, self._accumulated, sigma)
 
     def view(self, stamp_s: float) -> FilterView | None:
-        """Where the filter has the camera at a frame's stamp; ``None`` where it does not know.
-
-        That is before it was fed, and where telemetry ends too early.
-        """
+        """The camera at a frame's stamp; ``None`` before the first update, and where telemetry ends too early."""
         return view(self.ekf, self._seen, self._delay, stamp_s, self._T_b_c, self._config.max_gap_s)
 
     def frozen(self) -> "FrozenFilter | None":
@@ -173,7 +170,7 @@ class FrozenFilter:
 def view(
     ekf: BufferedEkf, seen: VisualPose | None, delay: Delay | None, stamp_s: float, T_b_c: FloatArray, max_gap_s: float
 ) -> FilterView | None:
-    """The filter's opinion at a frame's stamp; ``None`` where telemetry ends more than ``max_gap_s`` before."""
+    """The filter's estimate at a frame's stamp; ``None`` where telemetry ends more than ``max_gap_s`` before."""
     if seen is None or delay is None:
         return None
     at_s = stamp_s - delay.value_s
@@ -193,8 +190,8 @@ def view(
     )
 
 
-def _made_up(sample: TelemetrySample, shortfall_m_s: float) -> TelemetrySample:
-    """A truncated velocity put back to where it lies on average."""
+def _corrected(sample: TelemetrySample, shortfall_m_s: float) -> TelemetrySample:
+    """A truncated velocity, corrected by what truncation takes away on average."""
     if shortfall_m_s == 0.0:
         return sample
     return replace(sample, velocity_m_s=sample.velocity_m_s + shortfall_m_s * np.sign(sample.velocity_m_s))

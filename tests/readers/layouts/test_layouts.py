@@ -1,12 +1,17 @@
 """What holds for every layout."""
 
+import sys
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 from edgeslam_torch.eval.inputs.dataset import open_dataset
+from edgeslam_torch.readers import layouts as package
 from edgeslam_torch.readers.layouts import layout_of, layouts
 from edgeslam_torch.readers.source import open_source
+from edgeslam_torch.train.views.datasets import load_depth_folder
 
 
 @pytest.mark.parametrize("layout", layouts(), ids=lambda layout: layout.KIND)
@@ -30,3 +35,62 @@ def test_evaluation_and_slam_take_the_same_camera(tmp_path: Path, write_tum, nam
     camera = open_dataset(folder).camera
     assert (None if camera is None else camera.fx) == fx
     assert open_source(folder).camera.fx == (fx or 1.2 * 640)
+
+
+GARDEN = """
+import numpy as np
+from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.readers.listing import ImageEntry
+from edgeslam_torch.readers.sequence import DepthMaps, Sequence
+
+KIND = "garden"
+
+
+def recognises(folder):
+    return (folder / "walk.txt").is_file()
+
+
+def read(folder):
+    images = sorted(folder.glob("*.seen.png"))
+    depth = DepthMaps(0.1 * np.arange(len(images)), tuple(sorted(folder.glob("*.depth.png"))), 0.001)
+    return Sequence(
+        KIND,
+        folder,
+        tuple(ImageEntry(i, 0.1 * i, path) for i, path in enumerate(images)),
+        groundtruth=folder / "walk.txt",
+        camera=Camera(64, 48, 60.0, 60.0, 31.5, 23.5, source="the garden's"),
+        depth=lambda: depth,
+    )
+"""
+
+
+def test_one_new_file_is_all_that_a_data_set_needs(tmp_path, monkeypatch, write_images):
+    """SLAM, evaluation and training find a layout that only its own module knows of."""
+    more, folder = tmp_path / "more", tmp_path / "walk"
+    more.mkdir()
+    (more / "garden.py").write_text(GARDEN)
+    write_images(folder, [f"{i}.seen.png" for i in range(4)])
+    for i in range(4):
+        cv2.imwrite(str(folder / f"{i}.depth.png"), np.full((48, 64), 2000, np.uint16))
+    (folder / "walk.txt").write_text("".join(f"{0.1 * i:.1f} {i} 0 0 0 0 0 1\n" for i in range(4)))
+    monkeypatch.setattr(package, "__path__", [*package.__path__, str(more)])
+    layouts.cache_clear()
+    try:
+        source = open_source(folder)
+        assert [frame.stamp_s for frame in source.frames()] == pytest.approx([0.0, 0.1, 0.2, 0.3])
+        assert source.camera.source == "the garden's"
+        np.testing.assert_allclose(open_dataset(folder).truth.positions[:, 0], [0.0, 1.0, 2.0, 3.0])
+        views = load_depth_folder(folder).views
+        assert len(views) == 4 and (views[0].depth_m == 2.0).all()
+    finally:
+        layouts.cache_clear()
+        sys.modules.pop(f"{package.__name__}.garden", None)
+
+
+def test_nothing_outside_their_folder_names_a_layout():
+    root = Path(__file__).resolve().parents[3]
+    modules = {layout.__name__.rpartition(".")[2] for layout in layouts()}
+    paths = [path for name in ("edgeslam_torch", "eval", "train") for path in (root / name).rglob("*.py")]
+    for path in (path for path in paths if path.parent.name != "layouts"):
+        text = path.read_text(encoding="utf-8")
+        assert not [m for m in modules if f"readers.layouts.{m}" in text or f"readers.layouts import {m}" in text], path
