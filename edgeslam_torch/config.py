@@ -158,7 +158,7 @@ class MappingConfig:
     """Minimum time between keyframes: a camera moved by hand or in slow flight has then gained about a degree of
     parallax."""
     keyframe_max_gap_s: float = 0.98
-    """Maximum time between keyframes while the camera moves: a second, less half a frame at 30 Hz for rounded stamps."""
+    """Maximum time between keyframes while the camera moves: a second, less half a frame at 30 Hz for rounding."""
     keyframe_followed: float = 0.9
     """Insert a keyframe when flow tracks fewer than this share of the last one's keypoints: a tenth of a 60-degree
     view is lost by a turn of 6 degrees."""
