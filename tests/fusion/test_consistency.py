@@ -123,10 +123,19 @@ def rms(values) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
+@pytest.fixture(scope="module")
+def scenes(flight: Flight) -> list[Scene]:
+    return [scene(flight, seed) for seed in range(4)]
+
+
+@pytest.fixture(scope="module")
+def by_default(scenes: list[Scene]) -> list[Score]:
+    return [fly(s, FusionConfig()) for s in scenes]
+
+
 @pytest.mark.data
-def test_filter_beats_telemetry_alone_and_the_literal_filter(flight):
-    scenes = [scene(flight, seed) for seed in range(4)]
-    default = rms([fly(s, FusionConfig()).rmse_m for s in scenes])
+def test_filter_beats_telemetry_alone_and_the_literal_filter(scenes, by_default):
+    default = rms([score.rmse_m for score in by_default])
     literal = rms([fly(s, FusionConfig(literal=True), absolute=True).rmse_m for s in scenes])
     body = rms([fly(s, FusionConfig(literal=True, velocity_frame="body"), absolute=True).rmse_m for s in scenes])
     alone = rms([integrated(s) for s in scenes])
@@ -155,9 +164,8 @@ def test_mean_nees_over_50_seeds_is_inside_its_95_percent_band(flight):
 
 
 @pytest.mark.data
-def test_absolute_updates_of_accumulated_poses_are_overconfident_relative_ones_are_not(flight):
-    scenes = [scene(flight, seed) for seed in range(4)]
-    relative = np.mean([fly(s, FusionConfig()).nees for s in scenes])
+def test_absolute_updates_of_accumulated_poses_are_overconfident_relative_ones_are_not(scenes, by_default):
+    relative = np.mean([score.nees for score in by_default])
     absolute = np.mean([fly(s, FusionConfig(), absolute=True).nees for s in scenes])
     assert absolute > 4 * relative
     assert 3.0 < relative < 9.0
