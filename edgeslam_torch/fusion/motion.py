@@ -136,7 +136,7 @@ class MotionFusion:
             T_w_c: Their poses ``(F, 4, 4)`` in the map as it is now.
         """
         self._remember(stamps_s, T_w_c)
-        self._refit()
+        self._refit(flying=False)
 
     def _remember(self, stamps_s: FloatArray, T_w_c: FloatArray) -> None:
         self._memory.revise(stamps_s, T_w_c)
@@ -375,7 +375,7 @@ class MotionFusion:
         pause_s = max(first_s, _REFIT_SHARE * min(self._memory.length_s, self.config.window_s))
         return len(self._track) > 0 and (self._R_w_m is None or stamp_s - self._fitted_s >= pause_s)
 
-    def _refit(self) -> None:
+    def _refit(self, flying: bool = True) -> None:
         """Delay, alignment, trust and scale from what is remembered."""
         last = self._memory.last
         if last is None or len(self._track) == 0:
@@ -397,7 +397,8 @@ class MotionFusion:
         present = FlightSoFar(self._memory, self._track, self.T_b_c[:3, :3], self._rough_scale(), network)
         self._comparison.judge(self._trust, present, self._delay.delay, R_w_m)
         self._trust.at_odds = None
-        scale = TelemetryScale(self.config, self.T_b_c, present, self._trust, self.delay_s, R_w_m, self._held_scale())
+        held = self._held_scale()
+        scale = TelemetryScale(self.config, self.T_b_c, present, self._trust, self.delay_s, R_w_m, held, flying)
         self._take(scale.opinion())
 
     def _take(self, found: tuple[LogScale, TelemetryFit] | None) -> None:

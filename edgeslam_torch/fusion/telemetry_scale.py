@@ -7,7 +7,13 @@ import numpy as np
 
 from edgeslam_torch.fusion.config import FusionConfig
 from edgeslam_torch.fusion.scale.consensus import at_odds, contradict, sided_with
-from edgeslam_torch.fusion.scale.joint_scale import Evidence, displacement_evidence, height_evidence, solved
+from edgeslam_torch.fusion.scale.joint_scale import (
+    Evidence,
+    aged_since,
+    displacement_evidence,
+    height_evidence,
+    solved,
+)
 from edgeslam_torch.fusion.scale.log_scale import LogScale, floor_segments
 from edgeslam_torch.fusion.telemetry.comparison import FlightSoFar
 from edgeslam_torch.fusion.telemetry.plausibility import AtOdds, Reading, Trust, agreement, changes
@@ -116,6 +122,15 @@ class _Shown:
         return np.concatenate([self.intervals.from_s, self.intervals.to_s])
 
 
+def _shared_drift(given: list[_Given]) -> float:
+    """Error of a mean of velocities and heights that its sigma lacks: the drift of the map is the same for both."""
+    if len(given) < 2:
+        return 0.0
+    weight = np.array([g.sigma for g in given]) ** -2.0
+    one, other = weight / weight.sum() * [g.evidence.drift_sigma for g in given]
+    return math.sqrt(2.0 * one * other)
+
+
 class TelemetryScale:
     """Scale from displacements and height at one moment; `Trust` learns what the heights are worth.
 
@@ -127,6 +142,7 @@ class TelemetryScale:
         delay_s: Video delay behind telemetry.
         R_w_m: Map axes to the power-on world ``(3, 3)``.
         held: Scale that was believed before [metres per map unit].
+        flying: Whether the present scale is asked for, of a map that drifts; in the end one scale holds for all of it.
     """
 
     def __init__(
@@ -138,10 +154,12 @@ class TelemetryScale:
         delay_s: float,
         R_w_m: FloatArray,
         held: float | None,
+        flying: bool = False,
     ) -> None:
         self._config, self._T_b_c = config, T_b_c
         self._present, self._trust = present, trust
         self._delay_s, self._R_w_m, self._held = delay_s, R_w_m, held
+        self._flying = flying
         self._shown = self._compared() if trust.velocity else None
 
     def opinion(self) -> tuple[LogScale, TelemetryFit] | None:
@@ -181,7 +199,7 @@ class TelemetryScale:
         rough = self._rough(moved)
         if rough is None:
             return None
-        height = self._by_height(rough)
+        height = self._by_height(rough, moved)
         given = [
             g
             for g in (
@@ -201,7 +219,7 @@ class TelemetryScale:
             gap = abs(one.log_scale - other.log_scale) / math.hypot(one.sigma, other.sigma)
         sources = {g.name: SourceScale(g.scale, g.scale * g.sigma) for g in given}
         # Birge ratio: sources that disagree beyond their sigmas widen the result.
-        sigma = max(1.0, gap) * together[1]
+        sigma = max(1.0, gap) * math.hypot(together[1], _shared_drift(given))
         log_odds = (0.0 if moved is None else moved.log_likelihood) - 0.5 * min(gap, _MOST_GAP) ** 2
         moved = moved if "telemetry" in sources else None
         shortfall_m_s = 0.5 * self._config.velocity_step_m_s if rounding is Rounding.TRUNCATE else 0.0
@@ -241,7 +259,8 @@ class TelemetryScale:
         scale = shown.start
         for _ in range(_MOST_ROUNDS):
             lost = shown.velocity.lost(shown.ends_s, scale, step, rounding)
-            evidence = self._evidence(intervals, told + lost[len(intervals) :] - lost[: len(intervals)])
+            whole = told + lost[len(intervals) :] - lost[: len(intervals)]
+            evidence = self._evidence(intervals, whole, self._aged(intervals.to_s))
             alone = None if evidence is None else solved([evidence], tilt)
             if evidence is None or alone is None:
                 return None
@@ -253,9 +272,20 @@ class TelemetryScale:
             if abs(change) < _SETTLED:
                 break
             scale *= 1.0 + float(np.clip(change, -_MOST_CHANGE, _MOST_CHANGE))
-        return softened
+        # A scale that may wander explains what truncation leaves out as well: the roundings compare without that.
+        rigid = self._evidence(intervals, whole, None) if self._flying else evidence
+        if rigid is None:
+            return None
+        return replace(self._with_drift(softened, rigid), log_likelihood=rigid.log_likelihood)
 
-    def _evidence(self, moved: Displacements, moved_m: FloatArray) -> Evidence | None:
+    def _with_drift(self, evidence: Evidence, rigid: Evidence) -> Evidence:
+        """Evidence of the present scale, and how much less sure it is than that of a scale which never changes."""
+        pair = [solved([e], self._config.alignment_sigma_rad) for e in (evidence, rigid)]
+        if pair[0] is None or pair[1] is None:
+            return evidence
+        return replace(evidence, drift_sigma=math.sqrt(max(0.0, pair[0][1] ** 2 - pair[1][1] ** 2)))
+
+    def _evidence(self, moved: Displacements, moved_m: FloatArray, aged: FloatArray | None) -> Evidence | None:
         config = self._config
         return displacement_evidence(
             moved.moved @ self._R_w_m.T,
@@ -265,7 +295,15 @@ class TelemetryScale:
             moved.sigma,
             config.sigma_velocity_m_s * np.sqrt(0.1 * moved.duration_s),
             config.alignment_sigma_rad,
+            aged,
         )
+
+    def _aged(self, stamps_s: FloatArray) -> FloatArray | None:
+        """How much the map has aged since each time ``(N,)`` of telemetry's clock; None where that is of no matter."""
+        memory = self._present.memory
+        if not self._flying or memory.last is None:
+            return None
+        return aged_since(stamps_s + self._delay_s, memory.began_s, memory.last.stamp_s)
 
     def _compared(self) -> _Shown | None:
         """Intervals in which the drone moves, as images and readings have them."""
@@ -299,7 +337,7 @@ class TelemetryScale:
             speed = np.linalg.norm(moved_m, axis=1) / moved.duration_s
         return speed > self._config.min_speed_m_s
 
-    def _by_height(self, scale: float) -> Evidence | None:
+    def _by_height(self, scale: float, moved: Evidence | None) -> Evidence | None:
         """The best of range, SDK height and barometer: they watch the same motion."""
         config = self._config
         seen = self._present.memory.sightings()
@@ -324,9 +362,14 @@ class TelemetryScale:
             if not self._trust.height(Reading(name)):
                 continue
             tilt = config.alignment_sigma_rad
-            evidence = height_evidence(p, z[here], times[here], segment, sigma_map, sigma, scale, tilt)
+            aged = self._aged(times[here])
+            wander = {} if moved is None else {"wander": moved.wander}
+            evidence = height_evidence(p, z[here], times[here], segment, sigma_map, sigma, scale, tilt, aged, **wander)
             single = solved([evidence], tilt) if evidence is not None else None
-            if single is not None and single[1] < best_sigma:
+            if evidence is not None and single is not None and single[1] < best_sigma:
+                if aged is not None:
+                    rigid = height_evidence(p, z[here], times[here], segment, sigma_map, sigma, scale, tilt)
+                    evidence = evidence if rigid is None else self._with_drift(evidence, rigid)
                 best, best_sigma = evidence, single[1]
             if best_sigma < _GOOD_HEIGHT:
                 break

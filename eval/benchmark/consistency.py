@@ -1,7 +1,8 @@
 """Whether stated covariances are true: NEES of the present pose and of the log scale over many simulated flights.
 
-No images: vision is the true pose with jitter and a drift that grows with the way, in a map of unknown unit. So fifty
-flights take minutes, and what is judged is the fusion alone::
+No images: vision is the true pose with jitter and a drift that grows with the way, in a map of unknown unit whose scale
+wanders while it is young. The drone's own velocities and heights have a scale error each. All these are drawn as large
+as the settings of the fusion state them. So fifty flights take minutes, and what is judged is the fusion alone::
 
     python -m edgeslam_torch.eval.benchmark.consistency --seeds 50
 """
@@ -28,14 +29,18 @@ from edgeslam_torch.types import FloatArray, TelemetrySample
 JITTER_M, JITTER_RAD = 0.002, 0.001
 DRIFT = 0.01
 """Of the way from one frame to the next, as a random walk."""
+WANDER = 0.03
+"""Change of the log scale while the map's age grows by a factor of e: the usual one of `fusion.scale.joint_scale`."""
 _EVERY = 5
 """Frames from one question to the next."""
 _SECONDS = 24.0
 
+Telemetry = list[TelemetrySample]
+
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """What vision makes of a flight."""
+    """What vision makes of a flight; the unit is the one at its end."""
 
     stamps_s: FloatArray
     T_m_c: FloatArray
@@ -44,16 +49,38 @@ class Seen:
 
 
 def see(truth: Truth, seed: int) -> Seen:
-    """Jitter, drift and a unit."""
+    """Jitter, drift, a unit and how it wanders."""
     rng = np.random.default_rng([seed, 1])
     T, n = truth.T_w_c.copy(), len(truth.T_w_c)
-    way = np.linalg.norm(np.diff(T[:, :3, 3], axis=0, prepend=T[:1, :3, 3]), axis=1)
+    step = np.diff(T[:, :3, 3], axis=0, prepend=T[:1, :3, 3])
+    way = np.linalg.norm(step, axis=1)
+    aged = np.diff(np.log(1.0 + truth.stamps_s - truth.stamps_s[0]), prepend=0.0)
+    wandered = np.cumsum(WANDER * np.sqrt(aged) * rng.standard_normal(n))
+    T[:, :3, 3] = T[0, :3, 3] + np.cumsum(step * np.exp(wandered - wandered[-1])[:, None], axis=0)
     T[:, :3, 3] += np.cumsum(DRIFT * way[:, None] * rng.standard_normal((n, 3)), axis=0)
     T[:, :3, 3] += JITTER_M * rng.standard_normal((n, 3))
     T[:, :3, :3] = T[:, :3, :3] @ Rotation.from_rotvec(JITTER_RAD * rng.standard_normal((n, 3))).as_matrix()
     unit = float(np.exp(rng.uniform(-0.7, 0.7)))
     T[:, :3, 3] /= unit
     return Seen(truth.stamps_s, T, unit)
+
+
+def told_with_errors(truth: Truth, config: FusionConfig, seed: int, delay_s: float, truncated: bool) -> Telemetry:
+    """State messages of a drone whose velocities and heights have a scale error each."""
+    rng = np.random.default_rng([seed, 2])
+    velocity, height = (
+        told(_stretched(truth, math.exp(sigma * rng.standard_normal())), delay_s, seed, truncated)
+        for sigma in (config.systematic_log, config.height_systematic_log)
+    )
+    return [
+        replace(v, tof_m=h.tof_m, height_m=h.height_m, baro_m=h.baro_m) for v, h in zip(velocity, height, strict=True)
+    ]
+
+
+def _stretched(truth: Truth, factor: float) -> Truth:
+    T_w_c = truth.T_w_c.copy()
+    T_w_c[:, :3, 3] *= factor
+    return Truth(truth.stamps_s, T_w_c)
 
 
 def ask(fusion: MotionFusion, seen: Seen, telemetry: Sequence[TelemetrySample]) -> list[Asked]:
@@ -103,7 +130,7 @@ def consistency(config: FusionConfig, seeds: int, *, delay_s: float, speed_m_s: 
         plan = FlightPlan(speed_m_s=speed_m_s)
         flight = course.pilot(rng, course.world(rng), round(_SECONDS * RATE_HZ), rate_hz=RATE_HZ, plan=plan)
         truth = Truth(flight.stamps_s, flight.T_w_c)
-        telemetry, seen = told(truth, delay_s, seed, truncated), see(truth, seed)
+        telemetry, seen = told_with_errors(truth, config, seed, delay_s, truncated), see(truth, seed)
         fusion = MotionFusion(config, flight.T_b_c)
         errors = judge(ask(fusion, seen, telemetry), truth, delay_s)
         scale = fusion.scale()

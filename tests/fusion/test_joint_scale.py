@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from edgeslam_torch.fusion.scale.joint_scale import displacement_evidence, height_evidence, solved
+from edgeslam_torch.fusion.scale.joint_scale import aged_since, displacement_evidence, height_evidence, solved
 from edgeslam_torch.fusion.scale.log_scale import floor_segments
 from edgeslam_torch.geometry.rotations import matrix_from_rpy
 
@@ -193,3 +193,56 @@ def test_height_and_displacements_mean_the_same_tilt(rng):
     together = solved([moves.softened(0.2 * SCALE), heights(t, p, z)], TILT)
     assert together[0] == pytest.approx(SCALE, rel=0.02)
     assert together[1] < 0.02
+
+
+# -- a map that drifts in scale ------------------------------------------------------------------------------------
+
+
+def climbed_then_level(rng, drift):
+    """Climb for two seconds, then level flight for ten; the map's first two seconds are ``drift`` shorter."""
+    t = 0.5 * np.arange(25)
+    step = np.where(t[:, None] < 2.0, [0.0, 0.0, 0.25], [0.2, 0.05, 0.0]) + 0.03 * rng.standard_normal((25, 3))
+    seen = step * np.where(t < 2.0, math.exp(-drift), 1.0)[:, None] / SCALE
+    told = step + 0.0094 * rng.standard_normal(step.shape)
+    return t, seen, told
+
+
+def climbed(rng, drift):
+    """Heights of the same flight at 10 Hz."""
+    t = 0.1 * np.arange(120)
+    z = 0.5 * np.minimum(t, 2.0)
+    p = np.stack([0.4 * np.maximum(t - 2.0, 0.0), 0.0 * t, z * math.exp(-drift)], axis=1) / SCALE
+    return t, p, z + 0.012 * rng.standard_normal(120)
+
+
+def test_the_present_scale_follows_a_map_that_has_drifted_since_the_climb(rng):
+    """By 15 %: one scale for all lies between the two; the present one is right within its sigma."""
+    present, throughout = [], []
+    for _ in range(12):
+        t, seen, told = climbed_then_level(rng, 0.15)
+        given = (seen, told, t, np.full(25, 0.5), np.full(25, 1e-3 / SCALE), np.full(25, 0.0094), TILT)
+        for found, aged in ((present, aged_since(t + 0.5, 0.0, 12.5)), (throughout, None)):
+            s, sigma = solved([displacement_evidence(*given, aged)], TILT)
+            found.append((math.log(s / SCALE), sigma))
+    now, all_along = np.array(present), np.array(throughout)
+    assert abs(now[:, 0].mean()) < 0.7 * all_along[:, 0].mean()
+    assert np.sqrt(np.mean((now[:, 0] / now[:, 1]) ** 2)) < 1.5
+
+
+def test_heights_of_an_old_climb_are_less_sure_of_the_present_scale(rng):
+    """A climb ten seconds ago of a map that is 10 % off there: covered, the surer the younger the climb."""
+    t, p, z = climbed(rng, 0.1)
+    segment = np.zeros(len(t), int)
+    sigmas = []
+    for until, aged in ((40, True), (120, True), (120, False)):
+        given = (p[:until], z[:until], t[:until], segment[:until], 1e-4, 0.015, SCALE, TILT)
+        s, sigma = solved([height_evidence(*given, aged_since(t[:until], 0.0, t[until - 1]) if aged else None)], TILT)
+        sigmas.append(sigma)
+        assert s == pytest.approx(SCALE * math.exp(0.1), rel=0.03)
+    assert sigmas[0] < 0.8 * sigmas[1]
+    assert sigmas[2] < 0.8 * sigmas[1]
+
+
+def test_a_map_ages_most_while_it_is_young():
+    aged = aged_since(np.array([-1.0, 0.0, 1.0, 9.0, 19.0]), 0.0, 19.0)
+    assert aged == pytest.approx([math.log(20.0), math.log(20.0), math.log(10.0), math.log(2.0), 0.0])

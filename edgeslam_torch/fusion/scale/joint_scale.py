@@ -39,6 +39,12 @@ _BIAS_AND_DRIFT = ((0.003, 0.002), (0.01, 0.002), (0.03, 0.002), (0.003, 0.03), 
 _BIAS_MEMORY_S = 12.0
 _DRIFT_M = (0.002, 0.006, 0.02, 0.06)
 _DRIFT_MEMORY_S = 4.0
+_USUAL_WANDER = 0.03
+_WANDER = (_USUAL_WANDER, 0.09)
+"""Standard deviations of how much a map's log scale changes while its age grows by a factor of e: in the first seconds
+by 2 to 14 %, later by 1 to 2 %. No less than usual: a flight's velocities cannot tell 1 from 3 %."""
+_YOUNG_S = 1.0
+"""Age before which a map is no younger."""
 _BIN_S = 0.5
 _SCALE, _THETA, _OFFSETS = 0, slice(0, 4), slice(4, None)
 """Places in the vector of unknowns; heights have an offset for each stretch behind theta."""
@@ -60,6 +66,10 @@ class Evidence:
     """``(3,)`` velocity bias at the end [m/s]; zeros for heights."""
     log_likelihood: float = 0.0
     """Of the displacements, up to a constant: larger where the same ones are better explained."""
+    wander: float = _USUAL_WANDER
+    """How much the map's scale changes, one of `_WANDER`; displacements tell, heights do not."""
+    drift_sigma: float = 0.0
+    """Relative error of the present scale because of that; velocities and heights share it."""
 
     def softened(self, sigma: float) -> "Evidence":
         """The same with an error of the scale [m per map unit] that no averaging removes."""
@@ -101,6 +111,7 @@ def displacement_evidence(
     sigma_map: FloatArray,
     sigma_m: FloatArray,
     tilt_sigma_rad: float,
+    aged: FloatArray | None = None,
 ) -> Evidence | None:
     """From visual and telemetry displacements of the same intervals.
 
@@ -115,6 +126,8 @@ def displacement_evidence(
         sigma_map: Standard deviation of ``moved_map`` per axis, shape ``(N,)``.
         sigma_m: Expected standard deviation of ``moved_m`` per axis, shape ``(N,)``.
         tilt_sigma_rad: Prior on the rotation.
+        aged: How much the map has aged since each interval, see `aged_since`, ``(N,)``: the scale found is the present
+            one, to which older intervals tell less. None: one scale holds throughout.
     """
     n = len(moved_map)
     length = float(np.sum(moved_map**2))
@@ -124,11 +137,16 @@ def displacement_evidence(
     apart_s = from_s[:, None] - from_s[None]
     bias = np.exp(-np.abs(apart_s) / _BIAS_MEMORY_S) * np.outer(duration_s, duration_s)
     drift = _of_changes(apart_s, duration_s, _DRIFT_MEMORY_S)
-    possible = {(a, b): _slow(a**2 * bias, b**2 * drift, a) for a, b in _BIAS_AND_DRIFT}
-    noise = replace(possible[_USUAL], log_prior=0.0)
     s = math.sqrt(float(np.sum(moved_m**2)) / length)
     if not (math.isfinite(s) and s > 1e-9):
         return None
+    wandering = np.zeros((n, n)) if aged is None else s**2 * _common(aged) * (moved_map @ moved_map.T)
+    possible = {
+        (a, b, c): _slow(a**2 * bias, b**2 * drift + c**2 * wandering, a, c)
+        for a, b in _BIAS_AND_DRIFT
+        for c in ((_USUAL_WANDER,) if aged is None else _WANDER)
+    }
+    noise = replace(possible[*_USUAL, _USUAL_WANDER], log_prior=0.0)
     J = np.concatenate([moved_map[:, :, None], -hat(moved_map)], axis=2).transpose(1, 0, 2)  # (3, N, 4)
     target = moved_m.T[:, :, None]  # (3, N, 1)
     weight: FloatArray = np.ones(n)
@@ -151,7 +169,8 @@ def displacement_evidence(
     if fit is None or float(weight.sum()) < _MIN_DISPLACEMENTS:
         return None
     rms = math.sqrt(float(np.sum(weight * clean**2)) / max(3.0 * float(weight.sum()), 1e-9))
-    evidence = Evidence(fit.information, fit.vector, rms, fit.bias[:, -1] / duration_s[-1], fit.log_likelihood)
+    bias_m_s = fit.bias[:, -1] / duration_s[-1]
+    evidence = Evidence(fit.information, fit.vector, rms, bias_m_s, fit.log_likelihood, fit.noise.wander)
     return evidence.softened(_unrest(white, fit, J, latent, target))
 
 
@@ -164,6 +183,8 @@ def height_evidence(
     sigma_m: float,
     scale: float,
     tilt_sigma_rad: float,
+    aged: FloatArray | None = None,
+    wander: float = _USUAL_WANDER,
 ) -> Evidence | None:
     """From height above the floor against visual height, with a free offset in each stretch without a floor step.
 
@@ -176,6 +197,8 @@ def height_evidence(
         sigma_m: Expected noise of ``z_m``.
         scale: Rough metres per map unit.
         tilt_sigma_rad: Prior on the rotation.
+        aged: As in `displacement_evidence`, ``(N,)``.
+        wander: How much the map's scale changes, by the displacements.
     """
     if len(z_m) < 2 * _MIN_HEIGHTS:
         return None
@@ -196,14 +219,21 @@ def height_evidence(
     offsets = np.zeros((n, K))
     offsets[np.arange(n), stretch] = 1.0
     J = np.column_stack([p[:, 2], p[:, 1], -p[:, 0], np.zeros(n), offsets])[None]  # (delta x p)_z = dx y - dy x
-    memory = np.exp(-np.abs(t[:, None] - t[None]) / _DRIFT_MEMORY_S) * (stretch[:, None] == stretch[None])
+    together = stretch[:, None] == stretch[None]
+    memory = np.exp(-np.abs(t[:, None] - t[None]) / _DRIFT_MEMORY_S) * together
+    wandering = np.zeros((n, n))
+    if aged is not None:
+        risen = (
+            np.tril(together) * np.diff(p[:, 2], prepend=p[0, 2])[None]
+        )  # sums of these are heights, but for offsets
+        wandering = (wander * scale) ** 2 * (risen @ _common(np.interp(t, stamp_s, aged)) @ risen.T)
     prior = _tilt_prior(scale, tilt_sigma_rad, K)
     weight: FloatArray = np.ones(n)
     fit = None
     for iteration in range(4):
         white = (sigma_m**2 + (scale * sigma_map) ** 2) / count / np.maximum(weight, _LEAST_WEIGHT)
         tried = (
-            [_Slow(a**2 * memory, 0.0 * memory, 0.0) for a in _DRIFT_M]
+            [_Slow(a**2 * memory + wandering, 0.0 * memory, 0.0) for a in _DRIFT_M]
             if fit is None or iteration == _WHEN_TOLD_APART
             else [fit.noise]
         )
@@ -256,6 +286,16 @@ def _unrest(white: FloatArray, fit: "_Fit", J: FloatArray, latent: FloatArray, t
     return math.sqrt(between * squares) / total
 
 
+def aged_since(stamps_s: FloatArray, began_s: float, now_s: float) -> FloatArray:
+    """Logarithm of the map's age now over its age at each stamp ``(N,)``; a map drifts most while it is young."""
+    return np.asarray(np.log((now_s - began_s + _YOUNG_S) / (np.maximum(stamps_s - began_s, 0.0) + _YOUNG_S)))
+
+
+def _common(aged: FloatArray) -> FloatArray:
+    """What two moments' scales have in common of the change since, ``(N, N)``: a random walk back from the present."""
+    return np.minimum(aged[:, None], aged[None])
+
+
 def _of_changes(apart_s: FloatArray, duration_s: FloatArray, memory_s: float) -> FloatArray:
     """Correlation of an Ornstein-Uhlenbeck process's changes over intervals ``(N, N)``."""
 
@@ -268,15 +308,17 @@ def _of_changes(apart_s: FloatArray, duration_s: FloatArray, memory_s: float) ->
 
 @dataclass(frozen=True, slots=True)
 class _Slow:
-    """Correlated noise: covariance ``(N, N)``, the part due to velocity bias, log prior."""
+    """Correlated noise: covariance ``(N, N)``, the part due to velocity bias, log prior, wandering of the scale."""
 
     covariance: FloatArray
     bias: FloatArray
     log_prior: float
+    wander: float = _USUAL_WANDER
 
 
-def _slow(bias: FloatArray, drift: FloatArray, sigma_bias_m_s: float) -> _Slow:
-    return _Slow(bias + drift, bias, -0.5 * math.log(sigma_bias_m_s / _USUAL_BIAS_M_S, 3.0) ** 2)
+def _slow(bias: FloatArray, drift: FloatArray, sigma_bias_m_s: float, wander: float) -> _Slow:
+    rare = math.log(sigma_bias_m_s / _USUAL_BIAS_M_S, 3.0) ** 2 + math.log(wander / _USUAL_WANDER, 3.0) ** 2
+    return _Slow(bias + drift, bias, -0.5 * rare, wander)
 
 
 @dataclass(frozen=True, slots=True)

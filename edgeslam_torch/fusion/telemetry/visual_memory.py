@@ -127,6 +127,8 @@ class VisualMemory:
         self._sightings: deque[VisualPose] = deque(maxlen=int(10 * window_s))
         self._start: VisualPose | None = None
         """Where the present displacement begins."""
+        self.began_s = math.inf
+        """Stamp of the first tracked frame."""
         self.last: VisualPose | None = None
         """Newest tracked frame."""
         self.previous: VisualPose | None = None
@@ -137,6 +139,7 @@ class VisualMemory:
     def add(self, visual: VisualPose) -> None:
         """A tracked frame, newer than all before."""
         last = self.last
+        self.began_s = min(self.began_s, visual.stamp_s)
         gap = last is None or visual.stamp_s - last.stamp_s > self._max_gap_s
         self.previous, self.last = None if gap else last, visual
         if not self._sightings or visual.stamp_s - self._sightings[-1].stamp_s > _SIGHTING_S:
