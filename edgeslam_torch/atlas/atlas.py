@@ -200,11 +200,13 @@ class Atlas:
         """Close a loop; None if it is as good as closed, and both ends only get the same anchors."""
         self._links = []
         if all(is_within_reach(self.map, self.tracker.camera, one) for one in links):
-            share_anchors(self.map, links)
+            with self.map.lock:
+                share_anchors(self.map, links)
             return None
-        closure = spread(self.map, self.edges, self.log, links)
-        share_anchors(self.map, links)
-        look_around(self.map, self.tracker.camera, links)  # the windows that follow, and the end, refine
+        with self.map.lock:  # a consistent snapshot for readers
+            closure = spread(self.map, self.edges, self.log, links)
+            share_anchors(self.map, links)
+            look_around(self.map, self.tracker.camera, links)  # the windows that follow, and the end, refine
         self.closures.append(closure)
         return closure
 

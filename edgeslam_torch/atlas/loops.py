@@ -97,8 +97,9 @@ def far_keyframes(slam_map: SlamMap, keyframe: Keyframe) -> list[Keyframe]:
 
 def is_plausible(slam_map: SlamMap, link: Link) -> bool:
     """Whether a map can have drifted as much as a link says on the way from its older keyframe to its newer one."""
-    ids = [id for id in sorted(slam_map.keyframes) if link.other.id <= id <= link.keyframe.id]
-    centres = np.stack([slam_map.keyframes[id].centre_w for id in ids])
+    between = [k for id, k in sorted(slam_map.keyframes.items()) if link.other.id <= id <= link.keyframe.id]
+    piece = slam_map.piece_of(link.keyframe.id)
+    centres = np.stack([k.centre_w for k in between if slam_map.piece_of(k.id) == piece])
     way = float(np.linalg.norm(np.diff(centres, axis=0), axis=1).sum())
     shift, turn = _off(link, link.keyframe.T_c_w)
     near = shift * link.depth <= MAX_DRIFT * way + MAX_SHIFT * link.depth
