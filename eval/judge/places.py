@@ -63,14 +63,13 @@ class Half:
     """``(K, 4, 4)`` their true poses; NaN where unknown."""
 
     @property
-    def to_truth(self) -> FloatArray | None:
-        """``(4, 4)`` similarity from the map to the truth; None when too little is known."""
+    def metres(self) -> float:
+        """True metres per unit of the map; NaN when too little is known."""
         known = np.isfinite(self.T_w_c[:, 0, 0])
         if known.sum() < 3:
-            return None
+            return float("nan")
         centres = se3.inverse(self.atlas.arrays["keyframe.T_c_w"])[known, :3, 3]
-        found = umeyama(centres, self.T_w_c[known, :3, 3])
-        return sim3.compose(found.scale, found.R, found.t)
+        return umeyama(centres, self.T_w_c[known, :3, 3]).scale
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,16 +174,15 @@ def _two_agree(links: list[Link]) -> bool:
 
 
 def _right(links: list[Link], mine: list[Keyframe], theirs: list[Keyframe], a: Half, b: Half) -> list[bool]:
-    """Which links put their camera where the truth has it; all where that is unknown."""
-    to_truth, row_of = b.to_truth, {k.id: row for row, k in enumerate(mine)}
-    answers = []
+    """Which links put their camera where the truth has it, seen from the other keyframe; all where that is unknown."""
+    here, there = ({k.id: row for row, k in enumerate(side)} for side in (mine, theirs))
+    metres, answers = b.metres, []
     for one in links:
-        true = a.T_w_c[row_of[one.keyframe.id]]
-        if to_truth is None or not np.isfinite(true).all():
-            answers.append(True)
-            continue
-        T_w_c = se3.inverse(sim3.moved_camera(to_truth @ one.S, one.keyframe.T_c_w))
-        answers.append(bool(_near(T_w_c[None], true[None])[0, 0]))
+        T_w_k, T_w_o = a.T_w_c[here[one.keyframe.id]], b.T_w_c[there[one.other.id]]
+        true = se3.inverse(T_w_o) @ T_w_k
+        found = one.other.T_c_w @ se3.inverse(sim3.moved_camera(one.S, one.keyframe.T_c_w))
+        unknown = not (np.isfinite(metres) and np.isfinite(true).all())
+        answers.append(unknown or bool(_near(se3.scaled(found, metres)[None], true[None])[0, 0]))
     return answers
 
 
