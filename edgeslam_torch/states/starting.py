@@ -4,10 +4,12 @@ map."""
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from edgeslam_torch.atlas.atlas import CLOSER_LOOKS, Atlas
 from edgeslam_torch.atlas.places import lookalikes
-from edgeslam_torch.frontend.image import colours_at
+from edgeslam_torch.frontend.aperture import are_corners
+from edgeslam_torch.frontend.image import as_grey, colours_at
 from edgeslam_torch.map.depth_prior import sample
 from edgeslam_torch.map.keyframe import Keyframe, make_keyframe
 from edgeslam_torch.optim.problem import LmConfig
@@ -25,7 +27,8 @@ from edgeslam_torch.types import FloatArray, Frame, FrameStatus
 
 ADOPT_SHARE = 0.6
 """Share of the maximum number of inliers below which the view has changed, and the depth network's map is adopted,
-since parallax may never come (rotation, climb, hover). At 0.4 two views come first on redkitchen and its map is
+since parallax may never come (rotation, climb, hover); two views are no longer asked then, as they rest on the few
+points that are left (docs/decisions/0074). At 0.4 two views come first on redkitchen and its map is
 better (median 3.7 against 4.2 cm); on bare boards they come first in some seeds, and are wrong (ATE .011 to .030 m;
 .0105 in all five seeds at 0.6)."""
 
@@ -100,7 +103,10 @@ class Starting:
         system.fusion.begin_piece()
         colour = colours_at(keyframe.image, view.features.uv)
         self._seen = [(frame.index, view)]
-        self._attempt = Bootstrap(slam_map, system.tracker, self.config, keyframe, guess, colour, system.config.seed)
+        corner = self._corners(frame, view)
+        self._attempt = Bootstrap(
+            slam_map, system.tracker, self.config, keyframe, guess, colour, system.config.seed, corner
+        )
         slam_map.remove_empty_keyframes()
         return Step(Event.BEGUN, keyframe, FrameStatus.STARTING, reason, is_keyframe=True)
 
@@ -124,18 +130,19 @@ class Starting:
             return self.begin(frame, view, "lost sight of the first keyframe before parallax sufficed")
         self.system.motion.move(frame.stamp_s, track.T_c_w)
         with self.system.timed("initialisation"):
-            two_view = attempt.two_views(frame.index, view, track)
-            if two_view.ok:
+            two_view = attempt.two_views(frame.index, view, track, self._corners(frame, view))
+            leaving = track.inliers < ADOPT_SHARE * attempt.max_matched and attempt.reference.depth is not None
+            if two_view.ok and not leaving:
                 two_view = attempt.confirm(view, two_view)
                 self.system.events["initialisations_refused"] += not two_view.ok
+        if leaving:
+            with self.system.timed("mapping"), self.system.map.lock:
+                started = attempt.adopt(frame, view, track)
+            return self._stands(frame, seen, started, DEPTH_MAP, track, two_view)
         if two_view.ok:
             with self.system.timed("mapping"), self.system.map.lock:
                 started = attempt.replace_map(frame, view, two_view, self.lm)
             return self._stands(frame, seen, started, "two views", track, two_view)
-        if track.inliers < ADOPT_SHARE * attempt.max_matched and attempt.reference.depth is not None:
-            with self.system.timed("mapping"), self.system.map.lock:
-                started = attempt.adopt(frame, view, track)
-            return self._stands(frame, seen, started, DEPTH_MAP, track, two_view)
         attempt.wait(frame, view, track)
         if track.inliers < HANDOVER_INLIERS:
             return self.begin(frame, view, "first keyframe out of sight before parallax sufficed")
@@ -187,6 +194,12 @@ class Starting:
         return Step(
             Event.MAP_STANDS, keyframe, FrameStatus.INITIALISED, reason, track, two_view.parallax_rad, is_keyframe=True
         )
+
+    def _corners(self, frame: Frame, view: View) -> NDArray[np.bool_]:
+        """Which keypoints of a frame are corners ``(N,)``; the others lie on edges."""
+        grey = as_grey(frame.image) if frame.grey is None else frame.grey
+        on_lens = self.system.camera.distort_points(view.features.uv)
+        return are_corners(grey, on_lens, 1.0 / view.inv_sigma)
 
     def _guess_depth(self, keyframe: Keyframe) -> FloatArray:
         """Predicted depth [map units] of every keypoint and its log sigma, ``(N, 2)``."""

@@ -4,6 +4,7 @@ import logging
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from edgeslam_torch.config import InitialisationConfig
 from edgeslam_torch.geometry import se3
@@ -74,6 +75,7 @@ class Bootstrap:
         guess: FloatArray,
         colour: np.ndarray,
         seed: int = 0,
+        corner: NDArray[np.bool_] | None = None,
     ) -> None:
         """Begin with a map of predicted depths.
 
@@ -85,12 +87,14 @@ class Bootstrap:
             guess: Depth of its keypoints [map units] and log standard deviation ``(N, 2)``.
             colour: RGB of its keypoints ``(N, 3)``.
             seed: Of the essential matrix's random samples.
+            corner: Which of its keypoints are corners ``(N,)``, see `are_corners`; None: all.
         """
         self.map = slam_map
         self.tracker = tracker
         self.config = config
         self.seed = seed
         self.reference = reference
+        self.corner = np.ones(len(guess), dtype=bool) if corner is None else corner
         self.guess_depth = guess_depth = guess[:, 0]
         self.max_matched = 0
         """Maximum number of inliers so far."""
@@ -119,8 +123,18 @@ class Bootstrap:
             self.max_matched = max(self.max_matched, track.inliers)
         return track
 
-    def two_views(self, frame_index: int, view: View, track: Track) -> TwoView:
-        """Store the frame's matches and try to triangulate them with the reference."""
+    def two_views(self, frame_index: int, view: View, track: Track, corner: NDArray[np.bool_] | None = None) -> TwoView:
+        """Store the frame's matches and try to triangulate those of corners with the reference.
+
+        Keypoints on edges fit every motion along them, and with a sharp minimum: hundreds on a wall of panels leave the
+        essential matrix 20 degrees and a factor of 2.4 off.
+
+        Args:
+            frame_index: Of the frame.
+            view: Its features.
+            track: Its matches.
+            corner: Which of its keypoints are corners ``(N,)``; None: all.
+        """
         keypoint_of_anchor = np.full(len(self.map.anchors.alive), -1, dtype=np.int64)
         keypoint_of_anchor[self.reference.anchor] = np.arange(len(self.reference.anchor))
         reference_keypoint = keypoint_of_anchor[track.matched_anchor]
@@ -133,12 +147,14 @@ class Bootstrap:
                 track.T_c_w,
             )
         )
+        keypoint = track.matched_keypoint
+        both = self.corner[reference_keypoint] & (True if corner is None else corner[keypoint])
         return two_view_map(
             self.reference,
             self.guess_depth,
             view,
-            reference_keypoint,
-            track.matched_keypoint,
+            reference_keypoint[both],
+            keypoint[both],
             self.tracker.camera,
             self.config,
             self.seed,

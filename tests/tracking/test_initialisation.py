@@ -126,12 +126,12 @@ def test_witness_that_sees_nothing_of_it_keeps_its_pose_and_says_nothing(points)
     assert poses_of_witnesses([], nothing, CAMERA) == ([], 1.0)
 
 
-def make_bootstrap(points, guess_depth, config=CONFIG):
+def make_bootstrap(points, guess_depth, config=CONFIG, corner=None):
     tracker = Tracker(points.map, CAMERA, OrbConfig(), TrackingConfig(motion_radius_px=100.0))
     reference = points.keyframes[0]
     colour = np.zeros((len(reference.anchor), 3), np.uint8)
     guess = np.stack([guess_depth, np.full(len(guess_depth), 0.35)], axis=1)
-    return Bootstrap(points.map, tracker, config, reference, guess, colour)
+    return Bootstrap(points.map, tracker, config, reference, guess, colour, corner=corner)
 
 
 def frame_of(points, view):
@@ -154,6 +154,24 @@ def attempted(points, **config):
         if view < 4:
             bootstrap.wait(frame_of(points, view), view_of(points, view), track)
     return bootstrap, accepted
+
+
+@pytest.mark.parametrize("side", ["reference", "frame"])
+def test_keypoints_that_slid_along_edges_do_not_tell_the_motion(points, side):
+    """Every keypoint slides with its neighbours, as on the parallel joints of a wall, but for 40 % of them."""
+    corner = np.random.default_rng(0).random(len(points.point_of[0])) < 0.4
+    view = view_of(points, 4)
+    there = np.isin(points.point_of[4], points.point_of[0][corner])
+    view.features.uv[~there] += 0.02 * (view.features.uv[~there][:, ::-1] - [CAMERA.cy, CAMERA.cx])
+    known = {"corner": corner} if side == "reference" else {}
+    bootstrap = make_bootstrap(points, z_in(points, 0), **known)
+    track = bootstrap.track(view, points.world.T_c_w[4])
+    assert track is not None
+    found = bootstrap.two_views(4, view, track, there if side == "frame" else None)
+    assert found.ok
+    T = found.T_c_w @ se3.inverse(points.world.T_c_w[4])
+    assert np.abs(se3.log(T)).max() < 2e-3
+    assert corner[found.reference_keypoint].all()
 
 
 def started(points, **config):
