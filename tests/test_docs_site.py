@@ -47,6 +47,7 @@ def pages(site: Path) -> list[Path]:
     return sorted(page for page in site.rglob("*.html") if page != site / "api" / "index.html")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [360, 390, 1280])
 def test_no_page_scrolls_sideways(site: Path, browser: Browser, width: int) -> None:
     wide = {}

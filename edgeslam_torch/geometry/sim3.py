@@ -58,7 +58,7 @@ def exp(xi: FloatArray) -> FloatArray:
     """Similarities ``(..., 4, 4)`` of tangents ``(..., 7)``.
 
     Example:
-        >>> float(exp(np.array([0.0, 0, 0, 0, 0, 0, math.log(2.0)]))[0, 0])
+        >>> round(float(exp(np.array([0.0, 0, 0, 0, 0, 0, np.log(2.0)]))[0, 0]), 12)
         2.0
     """
     rho, phi, sigma = xi[..., :3], xi[..., 3:6], xi[..., 6]

@@ -123,6 +123,7 @@ def test_does_not_take_off_with_an_empty_battery(emulate):
             tello.take_off()
 
 
+@pytest.mark.slow
 def test_a_drone_that_stops_answering_lands_itself_and_says_why(emulate):
     emulator, address = emulate()
     limits = TelloLimits(timeout_s=0.3, retries=1, keep_alive_s=0.5, state_loss_s=3.0)
@@ -135,7 +136,7 @@ def test_a_drone_that_stops_answering_lands_itself_and_says_why(emulate):
         until(lambda: emulator.drone.mode is Mode.GROUND)
 
 
-@pytest.mark.parametrize("seed", [3, 4, 5])
+@pytest.mark.parametrize("seed", [3, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (4, 5))])
 def test_bad_air_is_flown_through(emulate, seed):
     """5 % loss and garbage on every port: safety-critical commands are repeated until acknowledged."""
     emulator, address = emulate(link=LinkFaults(loss=0.05, garbage=0.2, video_latency_s=0.02), seed=seed)
@@ -454,6 +455,7 @@ def test_late_answers_and_noise_are_not_taken_for_an_answer():
         assert not belongs_to(command, text)
 
 
+@pytest.mark.slow
 def test_an_outage_of_three_seconds_in_flight_is_survived(emulate):
     emulator, address = emulate()
     limits = TelloLimits(state_loss_s=PATIENCE_S, video_loss_s=PATIENCE_S)
@@ -577,6 +579,7 @@ def test_without_pyav_the_message_says_what_to_install(monkeypatch):
         tello_video.import_av()
 
 
+@pytest.mark.slow
 def test_djitellopy_flies_the_emulator(emulate, monkeypatch):
     """A client that no one here wrote, its code unchanged; only the ports it uses and its patience are set."""
     if importlib.util.find_spec("djitellopy") is None:
