@@ -1,10 +1,11 @@
 """The scale that a run states while flying, against what it truly is.
 
-Lengths of the published trajectory since the last revision tell metres per published unit, and the revision metres per
-map unit: what every estimate of the scale before and after has to be.
+Lengths of the published trajectory during the longest time without a revision tell metres per published unit, and the
+revision before it metres per map unit: what every estimate of the scale before and after has to be.
 """
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -73,11 +74,11 @@ def _beyond(stated: _Stated, true: float) -> bool:
 
 
 def _true_scale(stated: Sequence[_Stated], online: Trajectory, truth: Trajectory) -> float | None:
-    """Metres per map unit, by the poses published since the last revision."""
-    last = stated[-1].revision
-    since = next(s for s in stated if s.revision == last)
-    unit = since.value if last > 0 else 1.0
-    used = online.stamps_s >= since.stamp_s - 1e-6
+    """Metres per map unit, by the poses of the longest time without a revision."""
+    revision, _ = Counter(s.revision for s in stated).most_common(1)[0]
+    stretch = [s.stamp_s for s in stated if s.revision == revision]
+    unit = next(s.value for s in stated if s.revision == revision) if revision > 0 else 1.0
+    used = (online.stamps_s >= stretch[0] - 1e-6) & (online.stamps_s <= stretch[-1] + 1e-6)
     p = online.positions[used]
     there, here = match(truth.stamps_s, online.stamps_s[used])
     if len(here) < _LEAST_POSES:

@@ -90,7 +90,7 @@ def run_of(scales, sigmas, revisions, published, truth, tmp_path):
     return RunFolder(tmp_path, truth, Trajectory(stamps, T), rows, {})
 
 
-def test_scale_while_flying_is_compared_with_the_lengths_published_since_the_last_revision(drawn, tmp_path):
+def test_scale_while_flying_is_compared_with_the_lengths_published_between_revisions(drawn, tmp_path):
     """The map's unit is 0.5 m; after five seconds 0.55 is published, ten seconds later 0.5 is stated."""
     truth = drawn.truth
     t, n = truth.stamps_s, len(truth.stamps_s)
@@ -106,3 +106,15 @@ def test_scale_while_flying_is_compared_with_the_lengths_published_since_the_las
     assert figures["beyond_3_sigma"] == pytest.approx(2.5 / (SECONDS - 12.5), abs=0.01)
     never = run_of(np.ones(n), np.full(n, np.inf), np.zeros(n, int), truth.positions / 0.5, truth, tmp_path)
     assert live_figures(never, truth) == {"beyond_3_sigma": 0.0}
+
+
+def test_a_revision_just_before_the_end_leaves_the_lengths_of_the_time_before(drawn, tmp_path):
+    truth = drawn.truth
+    t = truth.stamps_s
+    last = t >= SECONDS - 0.5
+    scales, sigmas = np.where(last, 0.52, 0.55), np.full(len(t), 0.01)
+    published = scales[:, None] * truth.positions / 0.5
+    run = run_of(scales, sigmas, 1 + last.astype(int), published, truth, tmp_path)
+    figures = live_figures(run, truth)
+    assert figures["first_scale_off"] == pytest.approx(math.log(1.1), abs=1e-6)
+    assert figures["beyond_3_sigma"] == pytest.approx(1.0 - 0.5 / (SECONDS - 12.5), abs=0.01)
