@@ -120,6 +120,7 @@ def recording(tmp_path, write_tum) -> Path:
     return write_tum(tmp_path / "recording", 3)
 
 
+@pytest.mark.slow
 def test_command_saves_and_reports(tmp_path, write_images, capsys):
     for name, shot in (("monday", first_film()), ("tuesday", second_film())):
         folder = tmp_path / name

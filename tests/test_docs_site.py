@@ -58,6 +58,7 @@ def test_no_page_scrolls_sideways(site: Path, browser: Browser, width: int) -> N
     assert len(wide) > len(WITH_FORMULAS) + 10 and browser.errors == []
 
 
+@pytest.mark.slow
 def test_links_between_guides_have_room_between_them(site: Path, browser: Browser) -> None:
     browser.open(site / "index.html", width=390, height=844, mobile=True)
     assert " ".join(browser.run("document.querySelector('nav').innerText").split()).startswith("Readme Contributing ")

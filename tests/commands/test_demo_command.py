@@ -34,6 +34,7 @@ def test_shorter_demo_leaves_nothing_of_the_longer_one(tmp_path: Path) -> None:
     assert len(list((tmp_path / "rgb").iterdir())) == 5
 
 
+@pytest.mark.slow
 def test_demo_runs_and_judges_itself(tmp_path: Path) -> None:
     settings = DemoSettings(seconds=6.0, rate_hz=12.0, width=320, height=240)
     recorded = record(tmp_path / "flight", settings)

@@ -27,6 +27,7 @@ def data(tmp_path):
     return folder.parent
 
 
+@pytest.mark.slow
 def test_table_is_printed_written_and_compared(data, tmp_path, capsys):
     out = tmp_path / "out"
     command = ["judge", str(data), "--jobs", "1", "--change", "depth.weights=none"]

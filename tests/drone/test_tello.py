@@ -614,6 +614,7 @@ def test_djitellopy_flies_the_emulator(emulate, monkeypatch):
     drone.end()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.environ.get("CI_NO_SOCKETS") == "1", reason="no sockets here")
 def test_recording_of_a_live_drone_is_a_flight_that_opens(emulate, tmp_path, capsys):
     from edgeslam_torch.cli import main

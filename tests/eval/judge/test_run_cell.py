@@ -165,6 +165,7 @@ def test_recording_played_backwards_gets_the_truth_of_each_image_also_where_the_
     assert np.allclose([told[round(f.stamp_s, 4)] for f in known], [shown[f.path.name] for f in known], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_second_flight_is_in_the_map_of_the_first_and_judged_against_it(recording, tmp_path, monkeypatch):
     monkeypatch.setattr(run_cell, "HALF", 20)
     code, result = run(tmp_path, Cell("stairs/second_flight", 0, str(recording), "second_flight"))

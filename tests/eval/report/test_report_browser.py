@@ -45,6 +45,7 @@ def browser(tmp_path: Path) -> Iterator[Browser]:
         yield started
 
 
+@pytest.mark.slow
 def test_every_control_of_the_page_works(page: Path, browser: Browser) -> None:
     browser.open(page)
     found = browser.run(PROBE.read_text(encoding="utf-8"))
@@ -80,6 +81,7 @@ def test_every_control_of_the_page_works(page: Path, browser: Browser) -> None:
     assert fast["points"] >= found["paced"]["total"], "a fast one draws everything while it is turned"
 
 
+@pytest.mark.slow
 def test_page_fits_a_phone(page: Path, browser: Browser) -> None:
     browser.open(page, width=360, height=780, ratio=3.0, mobile=True)
     found = browser.run(PROBE.read_text(encoding="utf-8"))
