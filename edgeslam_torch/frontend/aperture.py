@@ -15,8 +15,8 @@ RADIUS_PX = 4.0
 """Half the side of the square at pyramid level 0: a FAST circle and the support of its gradients."""
 MIN_WEAK_ROOT = 15.0
 """Minimum root of the tensor's smaller eigenvalue [grey levels]: with 15 grey levels between corresponding pixels
-(noise, light, perspective) a patch is placed to a pixel along its edge. Matches of known motion are 1.0 to 2.2 px off
-below it (median, four recordings), .4 to .9 px above."""
+(noise, light, perspective) a patch is placed to a pixel along its edge. Along it, matches of known motion are 1.0 to
+2.2 px off below 12 (median, four recordings), .4 to 1.1 px above 25, and in between as the recording is."""
 
 MIN_ROOT_RATIO = 0.1
 """Minimum root of the ratio of the eigenvalues: the pixel grid alone turns the gradients of a straight, sharp edge by

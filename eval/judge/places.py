@@ -208,8 +208,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--only", action="append", default=[], metavar="PATTERN", help="recordings by name")
     args = parser.parse_args(argv)
     args.out.mkdir(parents=True, exist_ok=True)
+    try:
+        recordings = find_recordings(args.data)
+    except EdgeSlamError as error:
+        print(error, file=sys.stderr)
+        return 1
     halves: list[Half] = []
-    for name, (folder, _) in find_recordings(args.data).items():
+    for name, (folder, _) in recordings.items():
         if args.only and not any(fnmatchcase(name, pattern) for pattern in args.only):
             continue
         for half in (0, 1):
@@ -217,6 +222,9 @@ def main(argv: Sequence[str] | None = None) -> int:
                 halves.append(fly_half(folder, name, half, args.out))
             except EdgeSlamError as error:
                 print(f"{name}: {error}", file=sys.stderr)
+    if len(halves) < 2:
+        print(f"{args.data}: no recording with ground truth that could be flown", file=sys.stderr)
+        return 1
     total = Pair(0, 0, False)
     pairs = joined = 0
     for a, b in combinations(halves, 2):

@@ -7,7 +7,7 @@ import pytest
 from rendered import CAMERA, film, sideways, stairs_world
 
 from edgeslam_torch.config import SlamConfig
-from edgeslam_torch.eval.judge.places import Half, _flown, compare
+from edgeslam_torch.eval.judge.places import Half, _flown, compare, main
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.readers.source import Recording
 
@@ -49,3 +49,14 @@ def test_a_link_that_is_off_by_the_truth_is_false(half):
 
 def test_what_was_seen_just_before_is_no_revisit(half):
     assert compare(half, replace(half, name="second"), SlamConfig()).revisits == 0
+
+
+def test_a_folder_without_recordings_is_no_success(tmp_path, capsys):
+    assert main(["--data", str(tmp_path), "--out", str(tmp_path / "maps")]) == 1
+    said = capsys.readouterr()
+    assert "no recording with ground truth" in said.err and "links" not in said.out
+
+
+def test_a_missing_folder_is_one_line(tmp_path, capsys):
+    assert main(["--data", str(tmp_path / "none"), "--out", str(tmp_path / "maps")]) == 1
+    assert len(capsys.readouterr().err.splitlines()) == 1
