@@ -22,6 +22,7 @@ from edgeslam_torch.config import SlamConfig
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.files.config_file import to_toml
 from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.geometry.camera_file import save_camera
 from edgeslam_torch.readers.flight_folder import telemetry_gap
 from edgeslam_torch.readers.pace import Counter, at_their_pace
 from edgeslam_torch.readers.read_ahead import read_ahead
@@ -358,7 +359,7 @@ class _Run:
         def picture(path: Path) -> None:
             write_map_picture(path, edge_map, poses[support.whole()], scale.units, title)
 
-        extras = [(CAMERA, self.source.camera.save), (PICTURE, picture)]
+        extras = [(CAMERA, lambda path: save_camera(path, self.source.camera)), (PICTURE, picture)]
         if saved is not None and self.atlas.save is not None:
             from edgeslam_torch.atlas.atlas_file import write_atlas
 

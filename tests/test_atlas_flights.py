@@ -14,6 +14,7 @@ from edgeslam_torch.atlas.earlier import FOUND
 from edgeslam_torch.cli import main
 from edgeslam_torch.config import DepthConfig, SlamConfig
 from edgeslam_torch.eval.metrics.align import umeyama
+from edgeslam_torch.geometry.camera_file import save_camera
 from edgeslam_torch.slam import EdgeSlam
 from edgeslam_torch.types import FrameStatus
 
@@ -130,7 +131,7 @@ def test_command_saves_and_reports(tmp_path, write_images, capsys):
             cv2.imwrite(str(folder / f"rgb/{frame.index:03d}.png"), frame.image)
             rows.append(f"{frame.stamp_s:.6f} rgb/{frame.index:03d}.png\n")
         (folder / "rgb.txt").write_text("".join(rows))
-        CAMERA.save(folder / "camera.yaml")
+        save_camera(folder / "camera.yaml", CAMERA)
     atlas = str(tmp_path / "room.atlas")
     options = ["--depth", "none", "--no-report", "--out"]
     assert main(["run", str(tmp_path / "monday"), *options, str(tmp_path / "m"), "--save-atlas", atlas]) == 0

@@ -18,6 +18,7 @@ from fake_slam import FakeSlam
 import edgeslam_torch.run
 from edgeslam_torch import __version__, cli
 from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.geometry.camera_file import save_camera
 
 
 @pytest.fixture
@@ -39,7 +40,7 @@ def edgeslam(monkeypatch, capsys):
 @pytest.fixture
 def recording(tmp_path, write_tum):
     folder = write_tum(tmp_path / "seq", 6)
-    Camera(64, 48, 50.0, 50.0, 31.5, 23.5).save(folder / "camera.yaml")
+    save_camera(folder / "camera.yaml", Camera(64, 48, 50.0, 50.0, 31.5, 23.5))
     return folder
 
 

@@ -16,6 +16,7 @@ from edgeslam_torch.errors import EdgeSlamError, SourceError, WeightsError
 from edgeslam_torch.eval.inputs.run_folder import open_run
 from edgeslam_torch.files.config_file import load_config
 from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.geometry.camera_file import save_camera
 from edgeslam_torch.readers.pace import Counter, at_their_pace
 from edgeslam_torch.readers.source import open_source
 from edgeslam_torch.run import Mode, _load_slam, run
@@ -109,7 +110,7 @@ def test_a_list_that_runs_backwards_costs_no_coverage(tmp_path, write_tum):
 
 def test_results_name_no_folder_of_the_disk_and_find_the_recording_when_both_move(tmp_path, write_tum):
     folder = write_tum(tmp_path / "here" / "data" / "seq", 4)
-    Camera(64, 48, 50.0, 50.0, 31.5, 23.5).save(folder / "camera.yaml")
+    save_camera(folder / "camera.yaml", Camera(64, 48, 50.0, 50.0, 31.5, 23.5))
     sorted((folder / "rgb").iterdir())[3].write_bytes(b"")
     out = run(open_source(folder), tmp_path / "here" / "runs" / "a", make_slam=fake(FakeSlam())).folder
     assert not [path.name for path in out.iterdir() if str(tmp_path).encode() in path.read_bytes()]

@@ -6,7 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from edgeslam_torch.errors import CalibrationError
-from edgeslam_torch.geometry.camera import GUESSED_FOCAL_SIGMA, PRESETS, Camera, load_camera
+from edgeslam_torch.geometry.camera import GUESSED_FOCAL_SIGMA, PRESETS, Camera
+from edgeslam_torch.geometry.camera_file import load_camera
 from edgeslam_torch.geometry.lens import unique_share
 
 CALIBRATION_FILES = ("camera.yaml", "ost.yaml", "sensor.yaml")

@@ -7,6 +7,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from edgeslam_torch.geometry.camera_file import save_camera
+
 if TYPE_CHECKING:
     import numpy as np
 
@@ -54,7 +56,7 @@ def main(args: argparse.Namespace) -> int:
         raise CalibrationError(f"{error}; {len(unreadable)} could not be read (the first: {name}: {reason})") from error
     try:
         args.out.parent.mkdir(parents=True, exist_ok=True)
-        result.camera.save(args.out)
+        save_camera(args.out, result.camera)
     except OSError as error:
         raise OutputError(f"{args.out}: cannot be written: {error.strerror or error}") from error
     camera, sigma = result.camera, result.sigma

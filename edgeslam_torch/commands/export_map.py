@@ -80,7 +80,7 @@ def _pcd(run: "RunFolder", cloud: "PointCloud", args: argparse.Namespace) -> Pat
 
 
 def _colmap(run: "RunFolder", cloud: "PointCloud", args: argparse.Namespace) -> Path:
-    from edgeslam_torch.geometry.camera import load_camera
+    from edgeslam_torch.geometry.camera_file import load_camera
     from edgeslam_torch.writers.colmap import write_colmap
 
     folder: Path = args.out or run.path / "colmap"
@@ -104,7 +104,7 @@ def _images(run: "RunFolder") -> tuple[list[str], list[int]]:
 def _occupancy(run: "RunFolder", cloud: "PointCloud", args: argparse.Namespace) -> Path:
     import numpy as np
 
-    from edgeslam_torch.geometry.camera import load_camera
+    from edgeslam_torch.geometry.camera_file import load_camera
     from edgeslam_torch.writers.occupancy import occupancy_grid, write_occupancy
 
     if run.units == "arbitrary":

@@ -36,7 +36,7 @@ def main(args: argparse.Namespace) -> int:
 
 def _rerun(args: argparse.Namespace) -> int:
     from edgeslam_torch.eval.inputs.run_folder import open_run
-    from edgeslam_torch.geometry.camera import load_camera
+    from edgeslam_torch.geometry.camera_file import load_camera
     from edgeslam_torch.viewer.rerun_viewer import Viewer
 
     run = open_run(args.run)

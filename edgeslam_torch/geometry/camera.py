@@ -1,17 +1,12 @@
-"""Pinhole camera with Brown-Conrady distortion; calibration files and presets."""
+"""Pinhole camera with Brown-Conrady distortion, and presets."""
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
-import yaml
 
 from edgeslam_torch.errors import CalibrationError
-from edgeslam_torch.files.record_files import plain_yaml
-from edgeslam_torch.geometry.lens import check_camera
 from edgeslam_torch.types import FloatArray
 
 GUESSED_FOCAL_SIGMA = 0.45
@@ -120,22 +115,6 @@ class Camera:
         pixels, _ = cv2.projectPoints(p_c, still, still, self.K, np.array(self.distortion))
         return np.asarray(pixels, dtype=np.float32).reshape(-1, 2)
 
-    def save(self, path: Path) -> None:
-        """Write ``camera.yaml``."""
-        record = {
-            "model": "pinhole",
-            "width": self.width,
-            "height": self.height,
-            "fx": float(self.fx),
-            "fy": float(self.fy),
-            "cx": float(self.cx),
-            "cy": float(self.cy),
-            "distortion": [float(k) for k in self.distortion],
-            "source": self.source,
-            "focal_sigma": float(self.focal_sigma),
-        }
-        Path(path).write_text(yaml.safe_dump(record, sort_keys=False))
-
 
 @lru_cache(maxsize=4)
 def _undistortion_maps(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
@@ -160,67 +139,3 @@ PRESETS = {
     "tello": Camera(960, 720, 925.0, 925.0, 485.0, 360.0),
     "kinect": Camera(640, 480, 525.0, 525.0, 319.5, 239.5),
 }
-
-
-def load_camera(name: str | Path) -> Camera:
-    """Camera from a preset's name or a calibration file.
-
-    Reads our ``camera.yaml``, ROS ``ost.yaml`` (``camera_matrix`` / ``distortion_coefficients``) and EuRoC
-    ``sensor.yaml`` (``intrinsics``).
-
-    Raises:
-        CalibrationError: If there is neither such a preset nor such a file, the file is malformed, or its numbers
-            cannot be a camera's.
-    """
-    if str(name) in PRESETS:
-        return replace(PRESETS[str(name)], source=f"preset {name}")
-    path = Path(name)
-    if not path.is_file():
-        raise CalibrationError(f"no camera file or preset {str(name)!r}; presets: {', '.join(PRESETS)}")
-    try:
-        record = plain_yaml(path.read_text(encoding="utf-8"))
-        if not isinstance(record, dict):
-            raise ValueError("no key: value lines in it")
-        camera = _camera_from_record(record, str(Path(*path.parts[-2:])))
-        check_camera(camera)
-        return camera
-    except OSError as error:
-        raise CalibrationError(f"{path}: {error.strerror or error}") from error
-    except CalibrationError as error:
-        raise CalibrationError(f"{path}: {error}") from error
-    except RecursionError as error:
-        raise CalibrationError(f"{path}: not a camera calibration, nested too deeply") from error
-    except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
-        reason = " ".join(str(error).split())[:200]
-        raise CalibrationError(
-            f"{path}: not a camera calibration ({type(error).__name__}: {reason}); "
-            "it needs width, height, fx, fy, cx, cy"
-        ) from error
-
-
-def _camera_from_record(record: dict[str, Any], source: str) -> Camera:
-    lens = record.get("distortion_model") or "plumb_bob"
-    if not isinstance(lens, str) or lens.lower() not in ("plumb_bob", "radial-tangential", "radtan", "none"):
-        raise ValueError(f"distortion model {lens!r} is not supported, only plumb_bob (radial-tangential)")
-    if "camera_matrix" in record:  # ROS camera_calibration
-        k = [float(x) for x in record["camera_matrix"]["data"]]
-        d = [float(x) for x in record["distortion_coefficients"]["data"]]
-        size = (int(record["image_width"]), int(record["image_height"]))
-        return Camera(*size, k[0], k[4], k[2], k[5], _five(d), source)
-    if "intrinsics" in record:  # EuRoC sensor.yaml
-        fx, fy, cx, cy = (float(x) for x in record["intrinsics"])
-        width, height = (int(x) for x in record["resolution"])
-        return Camera(width, height, fx, fy, cx, cy, _five(record.get("distortion_coefficients", [])), source)
-    model = record.get("model", "pinhole")
-    if model != "pinhole":
-        raise ValueError(f"camera model {model!r} is not supported, only pinhole")
-    fx, fy, cx, cy = (float(record[key]) for key in ("fx", "fy", "cx", "cy"))
-    size = (int(record["width"]), int(record["height"]))
-    focal_sigma = float(record.get("focal_sigma", 0.0))
-    return Camera(*size, fx, fy, cx, cy, _five(record.get("distortion", [])), source, focal_sigma)
-
-
-def _five(coefficients: list[float]) -> tuple[float, ...]:
-    if len(coefficients) > 5:
-        raise ValueError(f"{len(coefficients)} distortion coefficients; k1 k2 p1 p2 k3 are supported")
-    return tuple(float(k) for k in (*coefficients, *([0.0] * (5 - len(coefficients)))))

@@ -1,14 +1,10 @@
 """Plausibility of a calibration: mistyped numbers, wrong units, or a fit to too few pictures."""
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from edgeslam_torch.errors import CalibrationError
+from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.types import FloatArray
-
-if TYPE_CHECKING:
-    from edgeslam_torch.geometry.camera import Camera
 
 FOCAL = (0.1, 20.0)
 """Plausible focal lengths relative to the image's longer side: 168 and 3 degrees of view."""
@@ -25,7 +21,7 @@ UNIQUE = 2 / 3
 modelled with k1 alone (EuRoC's with -0.3) fold at 0.7 of the distance to the corners."""
 
 
-def check_camera(camera: "Camera") -> None:
+def check_camera(camera: Camera) -> None:
     """Reject calibrations that no camera has.
 
     Raises:
@@ -47,7 +43,7 @@ def check_camera(camera: "Camera") -> None:
         raise CalibrationError(f"distortion [{numbers}] cannot be a lens's: it folds the image or tears it apart")
 
 
-def unique_share(camera: "Camera") -> float:
+def unique_share(camera: Camera) -> float:
     """Share of the distance from the principal point to the border within which the distortion is invertible.
 
     1 if everywhere. Where the model folds, two pixels share a ray; beyond, rays have no pixel.
@@ -64,13 +60,13 @@ def unique_share(camera: "Camera") -> float:
     return 0.0 if torn else float(min(1.0, farthest.min()))
 
 
-def _sides(camera: "Camera") -> tuple[float, float, float, float]:
+def _sides(camera: Camera) -> tuple[float, float, float, float]:
     """Left, right, upper and lower border relative to the principal point [px], at least one pixel."""
     right, down = max(camera.width - 0.5 - camera.cx, 1.0), max(camera.height - 0.5 - camera.cy, 1.0)
     return min(-0.5 - camera.cx, -1.0), right, min(-0.5 - camera.cy, -1.0), down
 
 
-def _border(camera: "Camera") -> FloatArray:
+def _border(camera: Camera) -> FloatArray:
     """Points ``(2, R)`` of the plane z = 1 that project to the image border without distortion, including the
     corners."""
     left, right, up, down = _sides(camera)
@@ -80,14 +76,14 @@ def _border(camera: "Camera") -> FloatArray:
     return np.concatenate([*across, *along], axis=1) / [[camera.fx], [camera.fy]]
 
 
-def _progress(camera: "Camera", xy: FloatArray) -> FloatArray:
+def _progress(camera: Camera, xy: FloatArray) -> FloatArray:
     """Position of points ``(2, ...)`` of the plane z = 1 between the principal point (0) and the border (1)."""
     left, right, up, down = _sides(camera)
     u, v = camera.fx * xy[0], camera.fy * xy[1]
     return np.maximum(np.where(u > 0, u / right, u / left), np.where(v > 0, v / down, v / up))
 
 
-def _distorted(camera: "Camera", xy: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _distorted(camera: Camera, xy: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Distorted points ``(2, ...)`` of the plane z = 1, and the determinant of the distortion's Jacobian."""
     k1, k2, p1, p2, k3 = camera.distortion
     x, y = xy

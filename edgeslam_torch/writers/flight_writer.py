@@ -10,6 +10,7 @@ from edgeslam_torch.drone.tello import StateMessage
 from edgeslam_torch.errors import EdgeSlamError, OutputError
 from edgeslam_torch.files.appender import Appender
 from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.geometry.camera_file import save_camera
 from edgeslam_torch.readers.telemetry_csv import TelemetryWriter
 from edgeslam_torch.types import Frame
 
@@ -39,7 +40,7 @@ class FlightWriter:
             raise OutputError(f"{folder}: holds {held} already, of a recording or a run; give another folder")
         try:
             (folder / "rgb").mkdir(parents=True, exist_ok=True)
-            camera.save(folder / "camera.yaml")
+            save_camera(folder / "camera.yaml", camera)
             self._list = Appender(folder / "rgb.txt", "# stamp_s file\n")
             self._raw = Appender(folder / "state.txt", "") if with_telemetry else None
             self._telemetry = TelemetryWriter(folder / "telemetry.csv") if with_telemetry else None

@@ -17,7 +17,7 @@ from edgeslam_torch.eval.judge.telemetry.live_scale import live_figures
 from edgeslam_torch.eval.metrics.revisit import returns
 from edgeslam_torch.eval.metrics.run_score import RunScore, evaluate_run
 from edgeslam_torch.eval.metrics.trajectory_error import TrajectoryScore
-from edgeslam_torch.geometry.camera import load_camera
+from edgeslam_torch.geometry.camera_file import load_camera
 from edgeslam_torch.types import FloatArray
 
 MAP_THRESHOLDS_M = (0.02, 0.05, 0.06, 0.10)

@@ -9,7 +9,8 @@ from edgeslam_torch.errors import EdgeSlamError
 from edgeslam_torch.eval.inputs.associate import nearest
 from edgeslam_torch.eval.inputs.run_folder import RunFolder
 from edgeslam_torch.geometry import se3
-from edgeslam_torch.geometry.camera import Camera, load_camera
+from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.geometry.camera_file import load_camera
 from edgeslam_torch.readers import images
 from edgeslam_torch.readers.layouts import layout_of
 from edgeslam_torch.readers.listing import ImageEntry

@@ -7,7 +7,8 @@ import pytest
 from edgeslam_torch.calibration.board import Board, board_size, calibrate
 from edgeslam_torch.cli import main
 from edgeslam_torch.errors import CalibrationError
-from edgeslam_torch.geometry.camera import Camera, load_camera
+from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.geometry.camera_file import load_camera
 
 CAMERA = Camera(640, 480, 520.0, 518.0, 315.0, 243.0)
 

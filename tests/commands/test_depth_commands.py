@@ -17,6 +17,7 @@ import torch
 from edgeslam_torch.errors import ConfigError, EdgeSlamError
 from edgeslam_torch.frontend.depth_network import DepthPredictor
 from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.geometry.camera_file import save_camera
 from edgeslam_torch.models.checkpoint import build_network, load_checkpoint, save_checkpoint
 from edgeslam_torch.models.fastdepth import FastDepth, Variant, Widths
 from edgeslam_torch.models.onnx.graph import build_graph
@@ -51,7 +52,7 @@ def pictures(tmp_path: Path, rng: np.random.Generator) -> Path:
     for k in range(10):
         small = rng.integers(0, 256, (9, 12, 3), np.uint8)
         cv2.imwrite(str(folder / f"img{k}.png"), cv2.resize(small, (160, 120), interpolation=cv2.INTER_CUBIC))
-    CAMERA.save(folder / "camera.yaml")
+    save_camera(folder / "camera.yaml", CAMERA)
     return folder
 
 

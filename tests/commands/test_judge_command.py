@@ -9,6 +9,7 @@ from rendered import CAMERA, film, sideways, stairs_world
 
 from edgeslam_torch import cli
 from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, write_tum
+from edgeslam_torch.geometry.camera_file import save_camera
 
 
 @pytest.fixture
@@ -22,7 +23,7 @@ def data(tmp_path):
         cv2.imwrite(str(folder / f"{frame.index}.png"), frame.image)
         lines.append(f"{frame.stamp_s:.3f} {frame.index}.png")
     (folder / "rgb.txt").write_text("\n".join(lines) + "\n")
-    CAMERA.save(folder / "camera.yaml")
+    save_camera(folder / "camera.yaml", CAMERA)
     write_tum(Trajectory(flight.stamps_s, np.asarray(flight.T_w_c)), folder / "groundtruth.txt")
     return folder.parent
 

@@ -16,6 +16,7 @@ import yaml
 from edgeslam_torch.commands import export_map
 from edgeslam_torch.errors import EdgeSlamError
 from edgeslam_torch.geometry.camera import PRESETS, Camera
+from edgeslam_torch.geometry.camera_file import save_camera
 from edgeslam_torch.types import PointCloud
 from edgeslam_torch.writers.colmap import write_colmap
 from edgeslam_torch.writers.occupancy import FREE, OCCUPIED, UNKNOWN, occupancy_grid, write_occupancy
@@ -142,7 +143,7 @@ def export(*words: object) -> int:
 @pytest.mark.parametrize("form", export_map.FORMATS)
 def test_command_writes_every_format(form: str, run_folder: Callable[..., Path], tmp_path: Path) -> None:
     run_folder(tmp_path / "a")
-    PRESETS["kinect"].save(tmp_path / "a" / "camera.yaml")
+    save_camera(tmp_path / "a" / "camera.yaml", PRESETS["kinect"])
     before = set((tmp_path / "a").rglob("*"))
     assert export(tmp_path / "a", "--format", form, "--max-sigma", 0.05) == 0
     assert set((tmp_path / "a").rglob("*")) > before

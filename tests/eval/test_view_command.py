@@ -16,6 +16,7 @@ from edgeslam_torch.commands import view
 from edgeslam_torch.errors import ConfigError, OutputError
 from edgeslam_torch.eval.inputs.run_folder import open_run
 from edgeslam_torch.geometry.camera import PRESETS
+from edgeslam_torch.geometry.camera_file import save_camera
 from edgeslam_torch.types import FrameStatus, PointCloud, ScaleEstimate, SlamOutput
 
 HAS_RERUN = importlib.util.find_spec("rerun") is not None
@@ -75,7 +76,7 @@ needs_rerun = pytest.mark.skipif(not HAS_RERUN, reason="rerun is not installed: 
 @needs_rerun
 def test_recording_of_a_finished_run_holds_its_map_and_poses(run_folder: Callable[..., Path], tmp_path: Path) -> None:
     run_folder(tmp_path / "a")
-    PRESETS["kinect"].save(tmp_path / "a" / "camera.yaml")
+    save_camera(tmp_path / "a" / "camera.yaml", PRESETS["kinect"])
     assert run_view(tmp_path / "a", "--save-rrd", tmp_path / "a.rrd") == 0
     rows, run = recorded(tmp_path / "a.rrd"), open_run(tmp_path / "a")
     cloud = run.cloud()

@@ -5,7 +5,8 @@ from dataclasses import replace
 import pytest
 
 from edgeslam_torch.errors import CalibrationError
-from edgeslam_torch.geometry.camera import PRESETS, Camera, load_camera
+from edgeslam_torch.geometry.camera import PRESETS, Camera
+from edgeslam_torch.geometry.camera_file import load_camera, save_camera
 
 GOOD = "width: 640\nheight: 480\nfx: 500\nfy: 501\ncx: 320\ncy: 240\n"
 ROS = (
@@ -16,13 +17,13 @@ LAUGHS = "a: &a [x, x, x]\n" + "".join(f"{n}: &{n} [*{m}, *{m}, *{m}]\n" for m, 
 
 
 def test_own_file_round_trips(tmp_path):
-    PRESETS["tum_fr1"].save(tmp_path / "camera.yaml")
+    save_camera(tmp_path / "camera.yaml", PRESETS["tum_fr1"])
     back = load_camera(tmp_path / "camera.yaml")
     assert (back.fx, back.cy, back.distortion) == (517.306408, 255.313989, PRESETS["tum_fr1"].distortion)
 
 
 def test_how_well_the_focal_length_is_known_goes_with_the_file(tmp_path):
-    replace(PRESETS["kinect"], focal_sigma=0.12).save(tmp_path / "camera.yaml")
+    save_camera(tmp_path / "camera.yaml", replace(PRESETS["kinect"], focal_sigma=0.12))
     assert load_camera(tmp_path / "camera.yaml").focal_sigma == 0.12
     (tmp_path / "plain.yaml").write_text(GOOD)
     assert load_camera(tmp_path / "plain.yaml").focal_sigma == 0.0

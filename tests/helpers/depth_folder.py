@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 
 from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.geometry.camera_file import save_camera
 
 CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
 
@@ -26,7 +27,7 @@ def write_folder(folder: Path, count: int = 12, camera: Camera = CAMERA) -> Path
         lines["depth"].append(f"{t + 0.004:.6f} depth/{k}.png")
     for name, rows in lines.items():
         (folder / f"{name}.txt").write_text("\n".join(rows) + "\n")
-    camera.save(folder / "camera.yaml")
+    save_camera(folder / "camera.yaml", camera)
     with (folder / "camera.yaml").open("a") as file:
         file.write("depth_scale: 1000.0\n")
     return folder

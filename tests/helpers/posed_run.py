@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.geometry.camera_file import save_camera
 from edgeslam_torch.synthetic.house.render import render
 from edgeslam_torch.synthetic.house.rooms import look, room
 from edgeslam_torch.synthetic.house.world import World
@@ -43,8 +44,8 @@ def write_run(root: Path) -> Path:
         poses.append(T_w_c)
         stamps.append(stamp)
     (images / "rgb.txt").write_text("".join(f"{t:.6f} rgb/{t:.6f}.png\n" for t in stamps))
-    CAMERA.save(images / "camera.yaml")
-    CAMERA.save(run / "camera.yaml")
+    save_camera(images / "camera.yaml", CAMERA)
+    save_camera(run / "camera.yaml", CAMERA)
     (run / "trajectory.txt").write_text("".join(tum_line(t, T) for t, T in zip(stamps, poses, strict=True)))
     rows = ["stamp_s,status"] + [f"{t},{'lost' if k == 3 else 'tracked'}" for k, t in enumerate(stamps)]
     (run / "status.csv").write_text("\n".join(rows) + "\n")

@@ -8,13 +8,14 @@ import pytest
 
 from edgeslam_torch.errors import CalibrationError, SourceError
 from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.geometry.camera_file import save_camera
 from edgeslam_torch.readers.source import open_source
 
 
 def test_tum_folder(tmp_path, write_tum):
     folder = write_tum(tmp_path / "seq", 5)
     (folder / "groundtruth.txt").write_text("")
-    Camera(64, 48, 50.0, 50.0, 31.5, 23.5).save(folder / "camera.yaml")
+    save_camera(folder / "camera.yaml", Camera(64, 48, 50.0, 50.0, 31.5, 23.5))
     source = open_source(folder)
     frames = list(source.frames())
     assert [f.index for f in frames] == [0, 1, 2, 3, 4]
@@ -273,7 +274,7 @@ def test_missing_telemetry_file(tmp_path, write_tum):
 
 def test_given_calibration_wins_over_the_sources_own(tmp_path, write_tum):
     folder = write_tum(tmp_path, 2, (640, 480))
-    Camera(640, 480, 50.0, 50.0, 320.0, 240.0).save(folder / "camera.yaml")
+    save_camera(folder / "camera.yaml", Camera(640, 480, 50.0, 50.0, 320.0, 240.0))
     assert open_source(folder, camera="kinect").camera.fx == 525.0
 
 
@@ -297,13 +298,13 @@ def test_calibration_of_another_shape_is_refused_naming_both_sizes(tmp_path, wri
 
 def test_lens_that_turns_back_in_the_corners_is_used_with_a_warning(tmp_path, write_tum):
     folder = write_tum(tmp_path, 2)
-    Camera(64, 48, 40.0, 40.0, 31.5, 23.5, (-0.3, 0.0, 0.0, 0.0, 0.0)).save(folder / "camera.yaml")
+    save_camera(folder / "camera.yaml", Camera(64, 48, 40.0, 40.0, 31.5, 23.5, (-0.3, 0.0, 0.0, 0.0, 0.0)))
     assert "turns back at 70 % of the way to the border" in open_source(folder).warnings[0]
 
 
 def test_impossible_lens_is_refused(tmp_path, write_tum):
     folder = write_tum(tmp_path, 2)
-    Camera(64, 48, 40.0, 40.0, 31.5, 23.5, (1e300, 0.0, 0.0, 0.0, 0.0)).save(folder / "camera.yaml")
+    save_camera(folder / "camera.yaml", Camera(64, 48, 40.0, 40.0, 31.5, 23.5, (1e300, 0.0, 0.0, 0.0, 0.0)))
     with pytest.raises(CalibrationError, match="camera.yaml: distortion .* cannot be a lens's"):
         open_source(folder)
 

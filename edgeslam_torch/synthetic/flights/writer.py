@@ -10,6 +10,7 @@ import numpy as np
 from edgeslam_torch.errors import OutputError
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.geometry.camera_file import save_camera
 from edgeslam_torch.synthetic.flights.degrade import CLEAN, CameraFaults, degraded
 from edgeslam_torch.synthetic.flights.flight import Flight
 from edgeslam_torch.synthetic.flights.telemetry import TelemetryLog
@@ -61,7 +62,7 @@ def write_flight(
         (folder / "rgb").mkdir(parents=True, exist_ok=True)
         if depth_every:
             (folder / "depth").mkdir(exist_ok=True)
-        camera.save(folder / "camera.yaml")
+        save_camera(folder / "camera.yaml", camera)
         _write_text(folder / "groundtruth.txt", _groundtruth_lines(flight.stamps_s, T_w_c))
         if telemetry is not None:
             telemetry.write(folder / "telemetry.csv")

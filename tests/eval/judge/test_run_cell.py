@@ -16,6 +16,7 @@ from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, read_traject
 from edgeslam_torch.eval.judge import flights, run_cell
 from edgeslam_torch.eval.judge.cells import VARIANTS, Cell, find_recordings, list_cells
 from edgeslam_torch.eval.judge.score import Truth, score
+from edgeslam_torch.geometry.camera_file import save_camera
 from edgeslam_torch.synthetic.flights.courses import COURSES, record_course
 
 
@@ -36,7 +37,7 @@ def recording(tmp_path_factory):
             depth.append(f"{frame.stamp_s:.3f} {name.replace('rgb', 'depth')}")
     (folder / "rgb.txt").write_text("\n".join(lines) + "\n")
     (folder / "depth.txt").write_text("\n".join(depth) + "\n")
-    CAMERA.save(folder / "camera.yaml")
+    save_camera(folder / "camera.yaml", CAMERA)
     with (folder / "camera.yaml").open("a") as file:
         file.write("depth_scale: 1000.0\n")
     write_tum(Trajectory(flight.stamps_s, flight.T_w_c), folder / "groundtruth.txt")

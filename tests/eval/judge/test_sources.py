@@ -6,6 +6,7 @@ import pytest
 from edgeslam_torch.eval.judge import sources
 from edgeslam_torch.eval.judge.cells import VARIANTS, Variant
 from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.geometry.camera_file import save_camera
 from edgeslam_torch.readers.layouts import read_sequence
 from edgeslam_torch.readers.source import open_source
 from edgeslam_torch.types import TelemetrySample
@@ -74,7 +75,7 @@ def test_cut_plays_its_stretches_at_one_pace(numbered):
 def test_half_size_of_jpeg_files_has_grey_and_colour_of_one_size(tmp_path, write_images):
     write_images(tmp_path / "rgb", ["1.000000.jpg", "1.100000.jpg"], (64, 48))
     (tmp_path / "rgb.txt").write_text("1.0 rgb/1.000000.jpg\n1.1 rgb/1.100000.jpg\n")
-    CAMERA.save(tmp_path / "camera.yaml")
+    save_camera(tmp_path / "camera.yaml", CAMERA)
     frames = list(VARIANTS["half_size"].applied_to(open_source(tmp_path)).frames())
     assert [f.grey.shape for f in frames] == [(24, 32)] * 2
     assert [f.image.shape[:2] for f in frames] == [(24, 32)] * 2
@@ -91,7 +92,7 @@ def test_backwards_plays_from_the_end_in_the_same_span(tmp_path, write_images):
     names = ["1.000000.png", "1.100000.png", "1.300000.png"]
     write_images(tmp_path / "rgb", names, (64, 48))
     (tmp_path / "rgb.txt").write_text("".join(f"{n[:-4]} rgb/{n}\n" for n in names))
-    CAMERA.save(tmp_path / "camera.yaml")
+    save_camera(tmp_path / "camera.yaml", CAMERA)
     turned = sources.backwards(open_source(tmp_path), read_sequence(tmp_path).images)
     frames = list(turned.frames())
     assert [f.path.name for f in frames] == names[::-1]

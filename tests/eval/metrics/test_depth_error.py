@@ -15,6 +15,7 @@ from edgeslam_torch.eval.metrics.depth_error import (
     score_depth,
 )
 from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.geometry.camera_file import save_camera
 
 
 def test_error_worked_out_by_hand() -> None:
@@ -86,7 +87,7 @@ def test_recording_is_matched_by_its_images_and_stamps(tmp_path: Path) -> None:
     data, ours = tmp_path / "data", tmp_path / "ours"
     for folder in (data / "rgb", data / "depth", ours):
         folder.mkdir(parents=True)
-    Camera(64, 48, 50.0, 50.0, 31.5, 23.5).save(data / "camera.yaml")
+    save_camera(data / "camera.yaml", Camera(64, 48, 50.0, 50.0, 31.5, 23.5))
     image = np.zeros((48, 64), np.uint8)
     image[:, 32:] = 200
     for k in range(4):

@@ -14,6 +14,7 @@ from edgeslam_torch.eval.metrics.align import Alignment
 from edgeslam_torch.eval.metrics.edge_map_score import score_map
 from edgeslam_torch.eval.metrics.surface import SurfaceTruth, build_surface
 from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.geometry.camera_file import save_camera
 from edgeslam_torch.readers.layouts.seven_scenes import T_COLOUR_DEPTH
 from edgeslam_torch.readers.sequence import register_depth
 
@@ -31,7 +32,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     T = np.tile(np.eye(4), (8, 1, 1))
     T[:, 0, 3] = np.linspace(-0.1, 0.1, 8)
     write_tum(Trajectory(stamps, T), out / "groundtruth.txt")
-    CAMERA.save(out / "camera.yaml")
+    save_camera(out / "camera.yaml", CAMERA)
     for name in ("rgb", "depth"):
         comment = "# metres = value / 5000\n" if name == "depth" else "# images\n"
         rows = "".join(f"{t:.6f} {name}/{t:.6f}.png\n" for t in stamps)

@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 from edgeslam_torch.eval.inputs.dataset import open_dataset
 from edgeslam_torch.eval.inputs.trajectory_files import read_trajectory
 from edgeslam_torch.geometry import se3
-from edgeslam_torch.geometry.camera import Camera, load_camera
+from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.geometry.camera_file import load_camera
 from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.readers.source import open_source
 from edgeslam_torch.synthetic.flights.degrade import CameraFaults

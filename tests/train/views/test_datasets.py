@@ -9,6 +9,7 @@ import pytest
 from depth_folder import CAMERA, write_folder
 
 from edgeslam_torch.errors import CalibrationError, SourceError
+from edgeslam_torch.geometry.camera_file import save_camera
 from edgeslam_torch.train.views.datasets import has_depth, load_depth_folder
 
 
@@ -72,7 +73,7 @@ def test_line_that_is_none_is_left_out_by_name(tmp_path: Path) -> None:
 
 def test_unstated_unit_is_tums_with_a_remark(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     folder = write_folder(tmp_path / "a", 1)
-    CAMERA.save(folder / "camera.yaml")
+    save_camera(folder / "camera.yaml", CAMERA)
     depth = load_depth_folder(folder).views[0].depth_m
     np.testing.assert_allclose(depth[20], np.linspace(0.2, 0.6, 64), atol=2e-4)
     assert "does not say the unit of its depth maps" in caplog.text
