@@ -5,6 +5,7 @@ import subprocess
 import sys
 from collections.abc import Iterable, Iterator
 from functools import cache
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -44,14 +45,14 @@ def statements(node: ast.AST) -> Iterator[ast.stmt]:
             yield from statements(inner)
 
 
-def imported(tree: ast.AST, known: frozenset[str] = frozenset()) -> Iterator[str]:
-    """Full names that a module imports, anywhere in it, except for the type checker alone.
+def imported(nodes: Iterable[ast.AST], known: frozenset[str] = frozenset()) -> Iterator[str]:
+    """Full names that statements of a module import.
 
     Args:
-        tree: The parsed module.
+        nodes: `statements` of the parsed module, or with `ast.walk` also those for the type checker alone.
         known: Modules; of ``from package import module`` the module counts, not the package.
     """
-    for node in statements(tree):
+    for node in nodes:
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -83,9 +84,12 @@ MODULES = frozenset(module_name(path) for path in sources())
 @cache
 def imports() -> dict[str, list[str]]:
     """What each module of the package imports, by its full name."""
-    return {
-        module_name(path): list(imported(ast.parse(path.read_text(encoding="utf-8")), MODULES)) for path in sources()
-    }
+    return {module_name(path): list(imported(statements(parsed(path)), MODULES)) for path in sources()}
+
+
+def parsed(path: Path) -> ast.Module:
+    """Syntax tree of a file."""
+    return ast.parse(path.read_text(encoding="utf-8"))
 
 
 def test_table_names_every_part_once_and_nothing_else():
@@ -103,6 +107,11 @@ def test_table_has_no_arrow_up():
 def test_imports_are_those_of_the_table():
     found = {module: forbidden(module, names) for module, names in imports().items()}
     assert {module: names for module, names in found.items() if names} == {}, "docs/architecture.md does not allow it"
+
+
+def test_no_files_import_each_other_in_a_circle():
+    graph = {module_name(path): set(imported(ast.walk(parsed(path)), MODULES)) for path in sources()}
+    TopologicalSorter(graph).prepare()  # raises CycleError, which names the circle
 
 
 def test_table_allows_only_imports_in_use():
@@ -126,7 +135,7 @@ def test_table_allows_only_imports_in_use():
     ],
 )
 def test_import_that_the_table_does_not_allow_is_noticed(module, name):
-    found = imported(ast.parse(f"from edgeslam_torch.{name} import thing"), MODULES)
+    found = imported(ast.walk(ast.parse(f"from edgeslam_torch.{name} import thing")), MODULES)
     assert forbidden(f"edgeslam_torch.{module}", found) == [f"edgeslam_torch.{name}"]
     assert forbidden(f"edgeslam_torch.{module}", ["edgeslam_torch.errors", "numpy.linalg"]) == []
 
