@@ -4,9 +4,9 @@ A process of its own, so that drawing the pictures does not count as the judged 
 """
 
 import hashlib
-import shutil
 import subprocess
 import sys
+import tempfile
 from functools import lru_cache
 from pathlib import Path
 
@@ -98,14 +98,18 @@ def _record_again(folder: Path, course: Course, seed: int, flight: int) -> None:
 
 
 def main(course: str, seed: int, folder: Path, flight: int = 0) -> int:
-    """Record into a folder beside ``folder`` and give it its name when it is whole."""
-    part = folder.with_name(f".{folder.name}.part")
-    shutil.rmtree(part, ignore_errors=True)
-    if flight == 0:
-        record_course(part, COURSES[course], seed)
-    else:
-        _record_again(part, COURSES[course], seed, flight)
-    part.rename(folder)
+    """Record into a folder of its own, and give it the name ``folder`` when it is whole; the first of several stays."""
+    with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as own:
+        part = Path(own) / folder.name
+        if flight == 0:
+            record_course(part, COURSES[course], seed)
+        else:
+            _record_again(part, COURSES[course], seed, flight)
+        try:
+            part.rename(folder)
+        except OSError:
+            if not folder.is_dir():  # not another judge's
+                raise
     return 0
 
 
