@@ -19,6 +19,7 @@ from edgeslam_torch.geometry import se3
 from edgeslam_torch.slam import EdgeSlam
 from edgeslam_torch.states.lost import UNCONFIRMED
 from edgeslam_torch.states.starting import AFTER_LOSS
+from edgeslam_torch.tracking.tracker import Tracker
 from edgeslam_torch.types import DepthMap, Frame, FrameStatus, TelemetrySample, Units
 
 NO_NETWORK = SlamConfig(depth=DepthConfig(weights="none"))
@@ -98,6 +99,31 @@ def test_flight_with_known_depth_is_metric():
     assert set(statuses(outputs)) <= TRACKING
     a, b = (np.linalg.inv(T[0]) @ T[-1] for T in (T_w_c, truth))
     assert np.rad2deg(np.linalg.norm(se3.log(a)[3:] - se3.log(b)[3:])) < 0.5
+
+
+def without_matching_corners(monkeypatch, change):
+    """Frames past the panels, in whose second half no corner matches, and what ``change`` makes of these images."""
+    slam = EdgeSlam(CAMERA, NO_NETWORK)
+    for frame in panels().frames[:16]:
+        slam.step(frame)
+    monkeypatch.setattr(Tracker, "track_near", lambda *args: None)
+    outputs = [slam.step(replace(frame, image=change(frame.image))) for frame in panels().frames[16:]]
+    check_map(slam.map)
+    return [k.frame_index for k in slam.keyframes() if k.frame_index >= 16], outputs
+
+
+def test_where_no_corner_matches_keyframes_rest_on_what_flow_sees(monkeypatch):
+    """Other corners came into view, clearer ones, and the detector has none left for those of the map."""
+    keyframes, outputs = without_matching_corners(monkeypatch, lambda image: image)
+    assert len(keyframes) >= 3
+    assert set(statuses(outputs)) == {FrameStatus.TRACKED}
+    assert ate(np.stack([o.T_w_c for o in outputs]), panels().T_w_c[16:]) < 0.01
+
+
+def test_blurred_images_without_matches_do_not_become_keyframes(monkeypatch):
+    keyframes, outputs = without_matching_corners(monkeypatch, lambda image: cv2.GaussianBlur(image, (0, 0), 4.0))
+    assert keyframes == []
+    assert statuses(outputs).count(FrameStatus.TRACKED) >= 5
 
 
 def test_health_says_what_the_newest_pose_is_worth():

@@ -12,11 +12,19 @@ from edgeslam_torch.states.machine import Event
 from edgeslam_torch.states.step import Located, Step
 from edgeslam_torch.states.system import System
 from edgeslam_torch.tracking.edge_tracker import MIN_EDGES, EdgeTracker, PointsInFrame
-from edgeslam_torch.tracking.flow import FlowTracker, Followed, Template, join, template_of_keyframe, template_of_track
+from edgeslam_torch.tracking.flow import (
+    FlowTracker,
+    Followed,
+    Template,
+    join,
+    template_of_keyframe,
+    template_of_track,
+    with_followed,
+)
 from edgeslam_torch.tracking.keyframe_choice import due_by_flow, few_matches, is_due
 from edgeslam_torch.tracking.lazy_view import LazyView
 from edgeslam_torch.tracking.relocaliser import Reach, Relocaliser, candidates
-from edgeslam_torch.tracking.tracker import Track, View, parallax_to
+from edgeslam_torch.tracking.tracker import Track, View, make_view, parallax_to
 from edgeslam_torch.types import FloatArray, Frame, FrameStatus, IntArray
 
 FEW_INLIERS = 100
@@ -67,8 +75,8 @@ class Tracking:
             # While the worker is busy no keyframe can be created; matching then finds newly mapped anchors.
             if located is None or located.due:
                 matched = self._match(frame, seen, T_predicted, followed)
-                if matched is None and located is not None:  # in a blurred image flow may work where matching fails
-                    matched = replace(located, due=False)
+                if matched is None and located is not None and followed is not None:
+                    matched = self._on_flow_alone(seen, located, followed)
                 located = matched
             if located is None:
                 located = self._by_edges(frame, seen, T_predicted)
@@ -131,6 +139,13 @@ class Tracking:
         due = due_by_flow(followed, parallax_rad, stamp_s - self.system.keyframe_s, self.system.config.mapping)
         inv_sigma = self.system.config.orb.scale_factor ** -followed.octave.astype(np.float64)
         return Located(followed.track, reference, parallax_rad, due, followed.uv, inv_sigma)
+
+    def _on_flow_alone(self, seen: LazyView, located: Located, followed: Followed) -> Located:
+        """A frame that is due for a keyframe, but none of whose keypoints matches."""
+        if seen.view.features.faint:  # a blurred image: a sharper one will come
+            return replace(located, due=False)
+        features, track = with_followed(seen.view, followed, self.system.map.anchors.words)
+        return replace(located, track=track, view=make_view(features, self.system.config.orb.scale_factor))
 
     def _match(
         self, frame: Frame, seen: LazyView, T_predicted: FloatArray, followed: Followed | None

@@ -131,6 +131,31 @@ def join(track: Track, followed: Followed, view: View, scale_factor: float) -> T
     )
 
 
+def with_followed(view: View, followed: Followed, words: NDArray[np.uint64]) -> tuple[FrameFeatures, Track]:
+    """A frame's features with flow's pixels after them, and flow's track on these.
+
+    For a frame that must become a keyframe although none of its corners matches: the clearest corners of the image have
+    just come into view, and the detector has none left for the fainter ones that flow still holds. Their pixels drift a
+    little, but without them the new corners cannot be placed in the map.
+
+    Args:
+        view: The frame's features.
+        followed: What flow tracks into it.
+        words: Descriptors ``(A, 4)`` of all anchors, by id.
+    """
+    features, track, count = view.features, followed.track, len(view.features.uv)
+    descriptors = np.ascontiguousarray(words[track.anchor]).view(np.uint8).reshape(-1, features.descriptors.shape[1])
+    features = replace(
+        features,
+        uv=np.concatenate([features.uv, followed.uv.astype(features.uv.dtype)]),
+        octave=np.concatenate([features.octave, followed.octave.astype(features.octave.dtype)]),
+        angle_rad=np.concatenate([features.angle_rad, np.zeros(track.inliers, features.angle_rad.dtype)]),
+        descriptors=np.concatenate([features.descriptors, descriptors]),
+    )
+    keypoint = count + np.arange(track.inliers)
+    return features, replace(track, keypoint=keypoint, matched_keypoint=keypoint, matched_anchor=track.anchor)
+
+
 class FlowTracker:
     """Tracks a template's anchors into a frame and refines its pose; caches the selected keypoints."""
 

@@ -9,12 +9,13 @@ from rendered import CAMERA, sideways, stairs_world
 
 from edgeslam_torch.config import FlowConfig, MappingConfig, OrbConfig
 from edgeslam_torch.frontend.image import as_grey
+from edgeslam_torch.frontend.matching import words
 from edgeslam_torch.frontend.orb import OrbExtractor
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.map.keyframe import NO_ANCHOR, make_keyframe
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.synthetic.house.render import render
-from edgeslam_torch.tracking.flow import FlowTracker, join, template_of_keyframe, template_of_track
+from edgeslam_torch.tracking.flow import FlowTracker, join, template_of_keyframe, template_of_track, with_followed
 from edgeslam_torch.tracking.keyframe_choice import few_matches, is_due, lost_most, lost_sight
 from edgeslam_torch.tracking.tracker import Track, make_view
 
@@ -190,6 +191,20 @@ def test_what_flow_finds_and_matching_does_not_goes_to_the_keypoint_that_shows_i
     # Two anchors may vie for one corner, and what is matched already takes part no more.
     assert len(pairs[0] & pairs[1]) > 0.95 * alone.inliers
     assert len(np.unique(joined.keypoint)) == len(np.unique(joined.anchor)) == joined.inliers
+
+
+def test_pixels_of_flow_become_keypoints_with_their_anchors_descriptors(scene):
+    grey = grey_at(POSES[1])
+    followed = scene.tracker().follow(scene.template, grey, se3.inverse(POSES[1]))
+    view = make_view(OrbExtractor(ORB, CAMERA)(grey), ORB.scale_factor)
+    features, track = with_followed(view, followed, scene.map.anchors.words)
+    count = len(view.features.uv)
+    assert len(features.uv) == len(features.angle_rad) == count + followed.track.inliers
+    np.testing.assert_array_equal(features.uv[:count], view.features.uv)
+    np.testing.assert_array_equal(features.uv[track.keypoint], followed.uv)
+    np.testing.assert_array_equal(features.octave[track.keypoint], followed.octave)
+    np.testing.assert_array_equal(words(features.descriptors)[track.keypoint], scene.map.anchors.words[track.anchor])
+    np.testing.assert_array_equal(track.anchor, followed.track.anchor)
 
 
 def test_a_frame_whose_keypoints_are_all_matched_gains_nothing(scene):
