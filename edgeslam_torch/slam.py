@@ -388,7 +388,7 @@ class EdgeSlam:
 def _depth_from_config(config: SlamConfig) -> DepthFunction | None:
     if config.depth.weights == "none":
         return None
-    from edgeslam_torch.frontend.depth_network import DepthPredictor
+    from edgeslam_torch.frontend.depth_network import open_depth
 
     weights = None if config.depth.weights == "default" else Path(config.depth.weights)
-    return DepthPredictor(weights=weights, backend=config.depth.backend)
+    return open_depth(weights, config.depth.backend)

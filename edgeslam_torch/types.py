@@ -104,6 +104,8 @@ class DepthMap:
     """``(H, W)`` z-depth [m], float32, in the pixels of the *undistorted* image; NaN or <= 0 where unknown."""
     sigma_log: FloatArray
     """``(H, W)`` standard deviation of log depth, float32."""
+    is_relative: bool = False
+    """Whether the inverse of ``depth_m`` is right up to an unknown scale and shift only; it is not in metres then."""
 
 
 class MotionKind(StrEnum):

@@ -31,7 +31,7 @@ def load_config(default: C, path: Path | None, overrides: Sequence[str] = ()) ->
     """
     config = default
     if path is not None:
-        config = _laid_over(config, read_mapping(path, "TOML", ConfigError), str(path), "")
+        config = laid_over(config, read_mapping(path, "TOML", ConfigError), str(path))
     for text in overrides:
         key, equals, value = text.partition("=")
         origin = f"--set {_cut(text)}"
@@ -69,8 +69,18 @@ def keys_of(config: Any, prefix: str = "") -> list[str]:
     return keys
 
 
-def _laid_over(config: C, record: Mapping[str, Any], origin: str, prefix: str) -> C:
-    """``config`` overridden by a TOML table."""
+def laid_over(config: C, record: Mapping[str, Any], origin: str, prefix: str = "") -> C:
+    """``config`` overridden by a parsed TOML or JSON table.
+
+    Args:
+        config: A frozen dataclass.
+        record: Its keys and values.
+        origin: Where they come from, for messages.
+        prefix: Of the keys in messages.
+
+    Raises:
+        ConfigError: If a key is unknown, or a value has the wrong type or range.
+    """
     hints = typing.get_type_hints(type(config))
     changes: dict[str, Any] = {}
     for name, value in record.items():
@@ -81,7 +91,7 @@ def _laid_over(config: C, record: Mapping[str, Any], origin: str, prefix: str) -
         if dataclasses.is_dataclass(current):
             if not isinstance(value, dict):
                 raise ConfigError(f"{origin}: {key} is a section; write [{key}] and its keys below")
-            changes[name] = _laid_over(current, value, origin, f"{key}.")
+            changes[name] = laid_over(current, value, origin, f"{key}.")
         else:
             changes[name] = _checked(value, hints[name], key, origin)
     return _replaced(config, changes, origin, prefix)

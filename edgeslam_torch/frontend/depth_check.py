@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,8 +28,10 @@ cannot be trusted on the rest."""
 def usable(depth: DepthMap) -> NDArray[np.bool_]:
     """Pixels whose depth and sigma are finite, positive and plausible, ``(H, W)``."""
     z, sigma = depth.depth_m, depth.sigma_log
-    nearest, farthest = PLAUSIBLE_M
-    return np.asarray((z >= nearest) & (z <= farthest) & (sigma > 0) & (sigma <= MAX_SIGMA_LOG))  # NaN compares false
+    nearest, farthest = (0.0, np.inf) if depth.is_relative else PLAUSIBLE_M
+    return np.asarray(
+        (z > 0) & np.isfinite(z) & (z >= nearest) & (z <= farthest) & (sigma > 0) & (sigma <= MAX_SIGMA_LOG)
+    )
 
 
 class CheckedDepth:
@@ -56,7 +59,7 @@ class CheckedDepth:
         if share < MIN_SHARE:
             self._refuse(share)
             return None
-        return depth if share == 1.0 else DepthMap(np.where(good, depth.depth_m, np.float32(np.nan)), depth.sigma_log)
+        return depth if share == 1.0 else replace(depth, depth_m=np.where(good, depth.depth_m, np.float32(np.nan)))
 
     def _refuse(self, share: float) -> None:
         self.refused += 1

@@ -9,8 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgeslam_torch.errors import WeightsError
+from edgeslam_torch.frontend.network_input import network_size, preprocess
+from edgeslam_torch.frontend.onnx_session import first_line, has_onnxruntime, open_session
 from edgeslam_torch.geometry.camera import Camera
-from edgeslam_torch.models.layout import INPUT_MULTIPLE, MAX_LOG_DEPTH
+from edgeslam_torch.models.layout import MAX_LOG_DEPTH
 from edgeslam_torch.models.record import DEFAULT_WEIGHTS, Metadata
 from edgeslam_torch.types import DepthMap, FloatArray
 
@@ -20,6 +22,37 @@ _TRIAL_SIZE = 64
 """Side of the test images for newly loaded weights [px]; takes a few milliseconds."""
 _LOG_RANGE = MAX_LOG_DEPTH - 1e-3
 """The network clips log depth to this range: values at its ends mean out of range."""
+
+
+class DepthNetwork(Protocol):
+    """Depth of an undistorted image: what the SLAM takes, whatever network is behind it."""
+
+    weights: Path
+
+    def __call__(self, image: NDArray[np.uint8], camera: Camera) -> DepthMap:
+        """Depth and its uncertainty at the size of the image, ``(H, W, 3)`` BGR or ``(H, W)`` grey."""
+
+
+def open_depth(weights: Path | None = None, backend: str = "onnxruntime", threads: int = 1) -> DepthNetwork:
+    """A depth network from a file: FastDepth, or an ONNX network of others that is described.
+
+    Args:
+        weights: A ``.safetensors`` file or an ``.onnx`` file; the shipped weights by default.
+        backend: ``"onnxruntime"`` or ``"torch"``; an ONNX file runs in onnxruntime.
+        threads: Threads per inference.
+
+    Raises:
+        WeightsError: If the weights are missing, damaged, not described, or give no depth.
+        ValueError: If the backend is unknown.
+    """
+    if weights is not None and weights.suffix == ".onnx":
+        from edgeslam_torch.models.onnx.file import holds_record
+
+        if not holds_record(weights):
+            from edgeslam_torch.frontend.external_depth import ExternalDepth
+
+            return ExternalDepth(weights, threads)
+    return DepthPredictor(weights, backend, threads)
 
 
 class _Engine(Protocol):
@@ -81,7 +114,9 @@ class DepthPredictor:
         """
         if image.shape[:2] != (camera.height, camera.width) or image.ndim not in (2, 3):
             raise ValueError(f"image {image.shape} does not fit a camera of {camera.width}x{camera.height}")
-        height, width = self._engine.fixed_size or network_size(camera.height, camera.width, self.metadata)
+        height, width = self._engine.fixed_size or network_size(
+            camera.height, camera.width, _training_size(self.metadata)
+        )
         log_depth, sigma = self._engine.run(preprocess(image, height, width, self.metadata))
         log_depth = np.where(np.abs(log_depth) < _LOG_RANGE, log_depth, np.float32(np.nan))
         small = camera.scaled(width, height)
@@ -92,47 +127,15 @@ class DepthPredictor:
         return DepthMap(np.asarray(depth_m, np.float32), np.asarray(sigma_log, np.float32))
 
 
-def preprocess(image: NDArray[np.uint8], height: int, width: int, metadata: Metadata) -> FloatArray:
-    """BGR or grey uint8 -> ``(1, 3, height, width)`` float32, the whole image squeezed, normalised RGB."""
-    shrinks = height <= image.shape[0] and width <= image.shape[1]
-    small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
-    gain = np.float32(1.0) / (np.float32(255.0) * np.array(metadata.std, np.float32))
-    offset = np.array(metadata.mean, np.float32) / np.array(metadata.std, np.float32)
-    planes = np.empty((1, 3, height, width), np.float32)
-    for i, plane in enumerate(planes[0]):
-        np.multiply(small if small.ndim == 2 else small[:, :, 2 - i], gain[i], out=plane)
-        plane -= offset[i]
-    return planes
-
-
-def network_size(height: int, width: int, metadata: Metadata) -> tuple[int, int]:
-    """Input size ``(height, width)``: multiples of 32 close to the image's shape, at most the training
-    area."""
-    area = metadata.input_height * metadata.input_width
-    best, best_cost = (metadata.input_height, metadata.input_width), np.inf
-    for h in range(INPUT_MULTIPLE, 2 * metadata.input_height + 1, INPUT_MULTIPLE):
-        for w in range(INPUT_MULTIPLE, 2 * metadata.input_width + 1, INPUT_MULTIPLE):
-            if h * w > area:
-                continue
-            # A 10 % change of aspect ratio counts as much as losing 20 % of the pixels.
-            cost = abs(np.log((w / h) / (width / height))) + 0.5 * np.log(area / (h * w))
-            if cost < best_cost - 1e-9:
-                best, best_cost = (h, w), cost
-    return best
+def _training_size(metadata: Metadata) -> tuple[int, int]:
+    return metadata.input_height, metadata.input_width
 
 
 def _open_engine(weights: Path, backend: str, threads: int) -> _Engine:
     if backend == "onnxruntime":
-        try:
-            import onnxruntime  # noqa: F401 - only to see whether it is there
-        except ImportError:
-            if weights.suffix == ".onnx":
-                raise WeightsError(
-                    f"{weights}: running an ONNX file needs onnxruntime (pip install onnxruntime)"
-                ) from None
-            logger.warning("onnxruntime is not installed: depth runs in torch, about twice as slow")
-        else:
+        if weights.suffix == ".onnx" or has_onnxruntime():
             return _OnnxEngine(weights, threads)
+        logger.warning("onnxruntime is not installed: depth runs in torch, about twice as slow")
     if weights.suffix == ".onnx":
         raise WeightsError(f"{weights}: an ONNX file runs in onnxruntime only, not with backend 'torch'")
     return _TorchEngine(weights, threads)
@@ -152,7 +155,7 @@ def _try_out(engine: _Engine, weights: Path) -> None:
         try:
             log_depth, sigma = engine.run(preprocess(image, height, width, engine.metadata))
         except Exception as error:  # onnxruntime's errors have no common base class
-            raise WeightsError(f"{weights}: cannot be run ({_first_line(error)})") from error
+            raise WeightsError(f"{weights}: cannot be run ({first_line(error)})") from error
         if log_depth.shape != (height // 2, width // 2) or sigma.shape != log_depth.shape:
             raise WeightsError(f"{weights}: gives depth of shape {log_depth.shape} for a picture of {height}x{width}")
         known = np.isfinite(log_depth) & (np.abs(log_depth) < _LOG_RANGE) & np.isfinite(sigma) & (sigma > 0)
@@ -163,17 +166,8 @@ def _try_out(engine: _Engine, weights: Path) -> None:
         raise WeightsError(f"{weights}: gives the same depth whatever it sees")
 
 
-def _first_line(error: Exception) -> str:
-    return " ".join(str(error).split())[:160]
-
-
 class _OnnxEngine:
     def __init__(self, weights: Path, threads: int) -> None:
-        import onnxruntime
-
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
-        options.log_severity_level = 4  # errors are raised anyway
         if weights.suffix == ".onnx":
             from edgeslam_torch.models.onnx.file import read_onnx
 
@@ -182,10 +176,7 @@ class _OnnxEngine:
             from edgeslam_torch.models.onnx.graph import build_graph
 
             content, self.metadata = build_graph(weights)
-        try:
-            self._session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
-        except Exception as error:  # onnxruntime's have no base of their own
-            raise WeightsError(f"{weights}: onnxruntime cannot load it ({_first_line(error)})") from error
+        self._session = open_session(content, weights, threads)
         height, width = self._session.get_inputs()[0].shape[2:]
         self.fixed_size = (height, width) if isinstance(height, int) and isinstance(width, int) else None
 

@@ -6,7 +6,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from edgeslam_torch.geometry.robust_statistics import robust_sigma
+from edgeslam_torch.map.anchors import Anchors
 from edgeslam_torch.map.keyframe import Keyframe
+from edgeslam_torch.map.relative_depth import InverseFit, fit_inverse
 from edgeslam_torch.types import DepthMap, FloatArray
 
 REACH_PX = 40.0
@@ -26,6 +28,10 @@ class DepthFit:
     sigma_log: float
     """Robust spread of single anchors around the fit."""
     anchors: int
+
+    def log_ratio_at(self, network_m: FloatArray) -> FloatArray:
+        """Log of map units per network metre at pixels with the network's depth ``(N,)``: everywhere the same."""
+        return np.full(len(network_m), self.log_ratio)
 
 
 def sample(depth: DepthMap, uv: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -49,35 +55,43 @@ def fit_to_anchors(network_m: FloatArray, anchor_depth: FloatArray) -> DepthFit 
 
 
 def depth_prior(
-    keyframe: Keyframe, uv: FloatArray, anchor_p_w: FloatArray, unknown_sigma_log: float
+    keyframe: Keyframe, uv: FloatArray, anchors: Anchors, unknown_sigma_log: float
 ) -> tuple[FloatArray, FloatArray]:
     """Expected z-depth [map units] and its log sigma at pixels ``(N, 2)`` of a keyframe, ``(N,)`` each.
 
     With a depth map: the network's depth in map units by the keyframe's anchors, corrected by those nearby, with at
-    least the sigma observed at them, since the network is overconfident in unseen rooms. Without one: the log depth
-    of the nearest anchors, with a wide sigma.
+    least the sigma observed at them, since the network is overconfident in unseen rooms. A relative one gets scale
+    and shift from triangulated anchors. Without either: the log depth of the nearest anchors, with a wide sigma.
 
     Args:
         keyframe: Keyframe with some anchors.
         uv: Undistorted pixels.
-        anchor_p_w: ``(A, 3)`` positions of all anchors, indexed by id.
+        anchors: All anchors.
         unknown_sigma_log: Sigma without a network.
     """
     held = keyframe.keypoints_with_anchor()
-    z = (anchor_p_w[keyframe.anchor[held]] @ keyframe.T_c_w[:3, :3].T + keyframe.T_c_w[:3, 3])[:, 2]
+    p_w = anchors.p_w[keyframe.anchor[held]]
+    z = (p_w @ keyframe.T_c_w[:3, :3].T + keyframe.T_c_w[:3, 3])[:, 2]
     held, z = held[z > 0], z[z > 0]
     if len(held) == 0:
         return np.full(len(uv), np.nan), np.full(len(uv), np.inf)
     anchor_uv = keyframe.features.uv[held]
     if keyframe.depth is not None:
+        network, sigma = sample(keyframe.depth, uv)
         at_anchors, _ = sample(keyframe.depth, anchor_uv)
-        fit = fit_to_anchors(at_anchors, z)
+        fit: DepthFit | InverseFit | None
+        if keyframe.depth.is_relative:  # anchors that rest on it would agree with any scale and shift
+            measured = ~anchors.from_depth[keyframe.anchor[held]]
+            fit = fit_inverse(at_anchors[measured], z[measured])
+            sigma = sigma if fit is None else fit.sigma(network)
+        else:
+            fit = fit_to_anchors(at_anchors, z)
         if fit is not None:
-            network, sigma = sample(keyframe.depth, uv)
-            known = np.isfinite(at_anchors)
-            error = np.log(z[known] / at_anchors[known]) - fit.log_ratio
-            bend, unexplained = _bend(anchor_uv[known], error, uv)
-            return network * np.exp(fit.log_ratio + bend), np.hypot(np.maximum(sigma, unexplained), 0.05)
+            error = np.log(z / at_anchors) - fit.log_ratio_at(at_anchors)
+            known = np.isfinite(error)
+            bend, unexplained = _bend(anchor_uv[known], error[known], uv)
+            log_ratio = fit.log_ratio_at(network)
+            return network * np.exp(log_ratio + bend), np.hypot(np.maximum(sigma, unexplained), 0.05)
     log_z, _ = _nearby(cKDTree(anchor_uv), np.log(z), uv)
     return np.exp(log_z), np.full(len(uv), unknown_sigma_log)
 

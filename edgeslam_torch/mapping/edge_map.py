@@ -125,7 +125,7 @@ class EdgeMap:
         u, v = (uv // PRIOR_CELL_PX).astype(np.int64).T
         cells, cell_of = np.unique(v * across + u, return_inverse=True)
         middle = np.stack([cells % across, cells // across], axis=1) * PRIOR_CELL_PX + (PRIOR_CELL_PX - 1) / 2
-        prior, sigma = depth_prior(keyframe, middle, self.map.anchors.p_w, self.unknown_sigma_log)
+        prior, sigma = depth_prior(keyframe, middle, self.map.anchors, self.unknown_sigma_log)
         return prior[cell_of], sigma[cell_of]
 
     def _bound(self) -> None:

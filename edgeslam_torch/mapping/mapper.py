@@ -109,7 +109,7 @@ class Mapper:
         prior, sigma = np.full((2, len(keyframe.anchor)), np.nan)
         free = np.flatnonzero(keyframe.anchor < 0)
         prior[free], sigma[free] = depth_prior(
-            keyframe, keyframe.features.uv[free], self.map.anchors.p_w, self.depth.prior_sigma_log
+            keyframe, keyframe.features.uv[free], self.map.anchors, self.depth.prior_sigma_log
         )
         if not np.isfinite(prior).any():
             return

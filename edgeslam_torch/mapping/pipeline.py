@@ -51,7 +51,7 @@ class MappingPipeline:
         self.edges = edges
         self.camera = camera
         self.depth = depth
-        self.has_depth = False
+        self.has_metres = False
         """Whether the depth network has said something usable yet."""
         self._executor = executor
         self._pending: Future[Mapped] | None = None
@@ -85,9 +85,9 @@ class MappingPipeline:
         keyframe.image = self.camera.undistort_image(frame.image)
         keyframe.grey = as_grey(keyframe.image)
         keyframe.depth = None if self.depth is None else self.depth(keyframe.image, self.camera)
-        if keyframe.depth is not None:
+        if keyframe.depth is not None and not keyframe.depth.is_relative:
             keyframe.network_m = sample(keyframe.depth, keyframe.features.uv)[0]
-        self.has_depth = self.has_depth or keyframe.depth is not None
+            self.has_metres = True
 
     def _run(self, new: list[tuple[Frame, Keyframe]], telemetry: TelemetryModel | None) -> Mapped:
         """The only thing that runs on the executor."""

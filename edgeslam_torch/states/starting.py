@@ -211,6 +211,9 @@ class Starting:
         if not known.any():
             guess[:, 0] = self._earlier_depth()
             return guess
+        if keyframe.depth is not None and keyframe.depth.is_relative:  # its shape alone
+            guess[:, 0] = self._earlier_depth() * np.where(known, network_m, 1.0) / np.median(network_m[known])
+            return guess
         guess[:, 0] = np.where(known, network_m, np.nanmedian(network_m)) / self.system.published.scale
         guess[known, 1] = sigma_log[known]
         return guess

@@ -82,13 +82,13 @@ class System:
 
     def expectation(self, stamp_s: float, T_predicted: FloatArray) -> PosePrior | None:
         """The predicted pose with the uncertainty due to accelerations; None without a scale."""
-        if not self.mapping.has_depth:
+        if not self.mapping.has_metres:
             return None
         return self.motion.expectation(stamp_s, T_predicted, self.published.scale)
 
     def reach(self, stamp_s: float, T_predicted: FloatArray) -> Reach:
         """Region that the camera can have reached during frames without a pose."""
-        metre = 1.0 / self.published.scale if self.mapping.has_depth else None
+        metre = 1.0 / self.published.scale if self.mapping.has_metres else None
         return reach_after(stamp_s - self.motion.seen_s, T_predicted, metre)
 
     def see(self, stamp_s: float, track: Track) -> None:

@@ -19,6 +19,16 @@ MAX_VALUE = 1e9
 _FLOATS = (TensorProto.FLOAT, TensorProto.FLOAT16, TensorProto.DOUBLE)
 
 
+def holds_record(path: Path) -> bool:
+    """Whether an ONNX file holds a record of this project, or cannot be read: `read_onnx` says why then."""
+    try:
+        with open_weights(path) as file:
+            model = onnx.load_model_from_string(file.read())
+    except (OSError, DecodeError, ValueError, TypeError, WeightsError):
+        return True
+    return any(p.key == HEADER_KEY for p in model.metadata_props)
+
+
 def read_onnx(path: Path) -> tuple[bytes, Metadata]:
     """A file written by ``edgeslam export`` and its record.
 

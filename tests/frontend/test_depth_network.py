@@ -11,7 +11,8 @@ import pytest
 import torch
 
 from edgeslam_torch.errors import WeightsError
-from edgeslam_torch.frontend.depth_network import DepthPredictor, network_size, preprocess
+from edgeslam_torch.frontend.depth_network import DepthPredictor
+from edgeslam_torch.frontend.network_input import network_size, preprocess
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.models.checkpoint import build_network, save_checkpoint
 from edgeslam_torch.models.fastdepth import Variant
@@ -86,7 +87,7 @@ def test_preprocessing_is_whole_image_rgb_in_minus_one_to_one() -> None:
 @pytest.mark.parametrize("size", [(480, 640), (480, 752), (720, 960), (1080, 1920), (640, 480), (240, 320)])
 def test_network_sees_about_the_images_shape_at_the_training_area(size: tuple[int, int]) -> None:
     metadata = Metadata(input_height=192, input_width=256)
-    h, w = network_size(*size, metadata)
+    h, w = network_size(*size, (metadata.input_height, metadata.input_width))
     assert h % 32 == 0
     assert w % 32 == 0
     assert 0.6 * 192 * 256 <= h * w <= 192 * 256
@@ -94,7 +95,7 @@ def test_network_sees_about_the_images_shape_at_the_training_area(size: tuple[in
 
 
 def test_training_shape_is_used_for_the_training_cameras() -> None:
-    assert network_size(480, 640, Metadata(input_height=192, input_width=256)) == (192, 256)
+    assert network_size(480, 640, (192, 256)) == (192, 256)
 
 
 def test_wrong_size_backend_and_files_are_refused(weights: Path, image: np.ndarray, tmp_path: Path) -> None:

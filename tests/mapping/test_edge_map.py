@@ -110,7 +110,7 @@ def test_edges_of_one_cell_share_a_prior_near_their_own(points, rng):
     uv = rng.integers(0, (CAMERA.width, CAMERA.height), (600, 2)).astype(np.float32)
     keyframe = points.keyframes[0]
     prior, sigma = edge_map(points)._prior(keyframe, uv)
-    own, own_sigma = depth_prior(keyframe, uv, points.map.anchors.p_w, 0.35)
+    own, own_sigma = depth_prior(keyframe, uv, points.map.anchors, 0.35)
     np.testing.assert_array_equal(sigma, own_sigma)
     assert np.median(np.abs(np.log(prior / own))) < 0.05
     _, cell = np.unique(uv // PRIOR_CELL_PX, axis=0, return_inverse=True)

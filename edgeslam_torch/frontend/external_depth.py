@@ -1,0 +1,137 @@
+"""Stage 1, depth: networks of others as ONNX files, in metres for the given camera or relative."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from edgeslam_torch.errors import WeightsError
+from edgeslam_torch.frontend.network_input import network_size, preprocess
+from edgeslam_torch.frontend.onnx_session import first_line, open_session
+from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.models.onnx.external import Gives, read_external
+from edgeslam_torch.types import DepthMap, FloatArray
+
+FARTHEST = 3.0
+"""What a relative network sees farthest, relative to the median depth, before the map says it: 1.4 to 3.4 in the rooms
+of nine recordings with measured depth (their 98th percentile)."""
+FARTHEST_PERCENTILE = 2.0
+BEYOND = 4.0
+"""Factor on `FARTHEST` beyond which relative depth is unknown."""
+_TRIAL_SIDE = 112
+"""Side of the test images [px], rounded up: eight patches of a vision transformer."""
+
+
+class ExternalDepth:
+    """Depth of an undistorted image by an ONNX network that is described (`models.onnx.external`).
+
+    Args:
+        weights: The ``.onnx`` file.
+        threads: Threads per inference.
+
+    Raises:
+        WeightsError: If it is missing, damaged, not described, cannot be run, or gives no depth.
+    """
+
+    def __init__(self, weights: Path, threads: int = 1) -> None:
+        self.weights = weights
+        content, self.network = read_external(weights)
+        self._session = open_session(content, weights, threads)
+        sides = self._session.get_inputs()[0].shape[2:]
+        self._fixed_size = (sides[0], sides[1]) if all(isinstance(side, int) for side in sides) else None
+        self._try_out()
+
+    def __call__(self, image: NDArray[np.uint8], camera: Camera) -> DepthMap:
+        """Depth and its uncertainty at the image's size; NaN where the network gives none.
+
+        Metres are corrected by the ratio of the focal lengths where the network was trained for one. Relative depth has
+        a median of 1, and `FARTHEST` as its far end: its inverse is right up to scale and shift.
+
+        Args:
+            image: ``(H, W, 3)`` BGR or ``(H, W)`` grey, undistorted.
+            camera: Intrinsics of that image.
+
+        Raises:
+            ValueError: If the image's size is not the camera's or it has neither one nor three channels.
+        """
+        if image.shape[:2] != (camera.height, camera.width) or image.ndim not in (2, 3):
+            raise ValueError(f"image {image.shape} does not fit a camera of {camera.width}x{camera.height}")
+        network = self.network
+        training = (network.input_height, network.input_width)
+        height, width = self._fixed_size or network_size(camera.height, camera.width, training, network.multiple)
+        small, sigma = self._run(preprocess(image, height, width, network))
+        to_image = (camera.width, camera.height)
+        given = np.asarray(cv2.resize(small, to_image, interpolation=cv2.INTER_LINEAR), np.float32)
+        sigma_log = (
+            np.full(given.shape, network.sigma_log, np.float32)
+            if sigma is None
+            else np.asarray(cv2.resize(sigma, to_image, interpolation=cv2.INTER_LINEAR), np.float32)
+        )
+        if network.is_relative:
+            return DepthMap(relative_depth(given), sigma_log, is_relative=True)
+        lens = camera.scaled(width, height)
+        longer = float(np.sqrt(lens.fx * lens.fy)) / network.focal_px if network.focal_px else 1.0
+        return DepthMap(np.asarray(longer * _metres(given, network.gives), np.float32), sigma_log)
+
+    def _run(self, image: FloatArray) -> tuple[FloatArray, FloatArray | None]:
+        """What the network gives and its sigma, ``(h, w)`` each."""
+        names = [name for name in (self.network.depth, self.network.sigma) if name]
+        found = [np.asarray(array, np.float32) for array in self._session.run(names, {self.network.input: image})]
+        planes = [array.reshape(array.shape[-2:]) for array in found]  # (1, 1, h, w) or (1, h, w): one plane
+        return planes[0], planes[1] if self.network.sigma else None
+
+    def _try_out(self) -> None:
+        """Reject a network that gives no depth for two simple images, or the same for both."""
+        side = -(-_TRIAL_SIDE // self.network.multiple) * self.network.multiple
+        height, width = self._fixed_size or (side, side)
+        across, down = np.meshgrid(np.linspace(0, 255, width), np.linspace(0, 255, height))
+        picture = np.stack([across, down, 255 - across], axis=2).astype(np.uint8)
+        answers = []
+        for image in (picture, np.ascontiguousarray(picture[::-1])):
+            try:
+                given, _ = self._run(preprocess(image, height, width, self.network))
+            except Exception as error:  # onnxruntime's errors have no common base class
+                raise WeightsError(f"{self.weights}: cannot be run ({first_line(error)})") from error
+            depth = relative_depth(given) if self.network.is_relative else _metres(given, self.network.gives)
+            if not np.isfinite(depth).any():
+                raise WeightsError(f"{self.weights}: gives no depth, if its numbers are {self.network.gives}")
+            answers.append(given)
+        if np.array_equal(answers[0], answers[1], equal_nan=True):
+            raise WeightsError(f"{self.weights}: gives the same depth whatever it sees")
+
+
+def _metres(given: FloatArray, gives: str) -> FloatArray:
+    """Depth [m] for the training camera; NaN where it is not positive."""
+    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
+        depth = {
+            Gives.METRES: lambda: given,
+            Gives.LOG_METRES: lambda: np.exp(given),
+            Gives.INVERSE_METRES: lambda: 1.0 / given,
+        }[Gives(gives)]()
+        return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(np.nan))
+
+
+def relative_depth(inverse: FloatArray) -> FloatArray:
+    """Depth whose inverse is a multiple of the given one plus a constant: its median is 1 and its far end `FARTHEST`.
+
+    Args:
+        inverse: ``(H, W)`` inverse depth up to scale and shift.
+
+    Returns:
+        ``(H, W)`` float32; NaN where it is unknown, everywhere when the image shows no differences.
+
+    Example:
+        >>> relative_depth(np.array([[1.0, 2.0, 3.0]], np.float32)).round(1)
+        array([[2.9, 1. , 0.6]], dtype=float32)
+    """
+    known = np.isfinite(inverse)
+    if not known.any():
+        return np.full(inverse.shape, np.nan, np.float32)
+    far, middle = np.percentile(inverse[known], [FARTHEST_PERCENTILE, 50.0])
+    if not middle > far:
+        return np.full(inverse.shape, np.nan, np.float32)
+    share = (inverse - far) / (middle - far)
+    normalised = 1.0 / FARTHEST + (1.0 - 1.0 / FARTHEST) * share
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(normalised > 1.0 / (BEYOND * FARTHEST), 1.0 / normalised, np.nan).astype(np.float32)

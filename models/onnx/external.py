@@ -1,0 +1,192 @@
+"""Depth networks of others as ONNX files: what goes in, and what comes out.
+
+The file may say so itself, in its property ``edgeslam.depth`` (JSON); otherwise a TOML file beside it says it.
+"""
+
+import json
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+import onnx
+from google.protobuf.message import DecodeError
+
+from edgeslam_torch.errors import ConfigError, WeightsError
+from edgeslam_torch.files.config_file import laid_over
+from edgeslam_torch.files.record_files import read_mapping
+from edgeslam_torch.models.onnx.presets import PRESETS
+from edgeslam_torch.models.record import MAX_INPUT_PX, STD_RANGE
+from edgeslam_torch.models.weights_file import open_weights
+
+PROPERTY = "edgeslam.depth"
+"""Key of the record among a file's properties."""
+MAX_MULTIPLE = 256
+SIGMA_RANGE = (0.01, 2.0)
+"""Plausible standard deviations of log depth: 1 % to a factor of 7."""
+
+
+class Gives(StrEnum):
+    """What the numbers of the depth output are."""
+
+    METRES = "metres"
+    LOG_METRES = "log_metres"
+    INVERSE_METRES = "inverse_metres"
+    RELATIVE_INVERSE = "relative_inverse"
+    """Inverse depth up to scale and shift, larger where it is nearer."""
+
+
+@dataclass(frozen=True, slots=True)
+class ExternalNetwork:
+    """How to feed a depth network and to read its output.
+
+    Raises:
+        ValueError: If a value is not plausible.
+    """
+
+    gives: str = ""
+    """One of `Gives`."""
+    mean: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    std: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """The input is ``(rgb - mean) / std`` with rgb in [0, 1]."""
+    input_height: int = 0
+    input_width: int = 0
+    """Size of the training images [px]; 0 for the graph's own fixed size. A graph of dynamic size gets the image's
+    shape at about so many pixels."""
+    multiple: int = 1
+    """Height and width of the input must be multiples of this: 14 or 16 for vision transformers."""
+    focal_px: float = 0.0
+    """Focal length, in pixels of the input, for which the metres are right; 0 when the network takes any camera."""
+    sigma_log: float = 0.25
+    """Standard deviation of log depth where the network states none."""
+    input: str = ""
+    depth: str = ""
+    """Names of input and depth output; empty for the only input and the first output."""
+    sigma: str = ""
+    """Name of the output with the standard deviation of log depth; empty for none."""
+    licence: str = ""
+    notes: str = ""
+
+    def __post_init__(self) -> None:
+        if self.gives not in [*Gives]:
+            raise ValueError(f"gives must be one of {', '.join(Gives)}, got {self.gives!r}")
+        for name, low, high in (
+            ("input_height", 0, MAX_INPUT_PX),
+            ("input_width", 0, MAX_INPUT_PX),
+            ("multiple", 1, MAX_MULTIPLE),
+        ):
+            if not low <= getattr(self, name) <= high:
+                raise ValueError(f"{name} must be from {low} to {high}, got {getattr(self, name)}")
+        if self.input_height % self.multiple or self.input_width % self.multiple:
+            raise ValueError(f"input_height and input_width must be multiples of {self.multiple}")
+        if not all(abs(x) <= 10.0 for x in self.mean) or not all(STD_RANGE[0] <= x <= STD_RANGE[1] for x in self.std):
+            raise ValueError(f"mean must lie within 10 and std from {STD_RANGE[0]:g} to {STD_RANGE[1]:g}")
+        if not 0.0 <= self.focal_px <= 20.0 * MAX_INPUT_PX:
+            raise ValueError(f"focal_px must be positive, or 0 for any camera, got {self.focal_px}")
+        if not SIGMA_RANGE[0] <= self.sigma_log <= SIGMA_RANGE[1]:
+            raise ValueError(f"sigma_log must be from {SIGMA_RANGE[0]:g} to {SIGMA_RANGE[1]:g}, got {self.sigma_log}")
+
+    @property
+    def is_relative(self) -> bool:
+        """Whether its depth has neither unit nor origin."""
+        return self.gives == Gives.RELATIVE_INVERSE
+
+
+def read_external(path: Path) -> tuple[bytes, ExternalNetwork]:
+    """An ONNX depth network of others and its description.
+
+    The description is the file's own, else that of the TOML file beside it (``depth.toml`` of ``depth.onnx``), whose
+    ``preset`` may name one of `PRESETS` to start from.
+
+    Raises:
+        WeightsError: If the file is missing, damaged, refers to other files, or is not described.
+    """
+    try:
+        with open_weights(path) as file:
+            content = file.read()
+        model = onnx.load_model_from_string(content)
+    except OSError as error:
+        raise WeightsError(f"{path}: cannot read the weights ({error.strerror or error})") from error
+    except (DecodeError, ValueError, TypeError) as error:
+        raise WeightsError(f"{path}: damaged or not an ONNX file ({' '.join(str(error).split())[:80]})") from None
+    except WeightsError as error:
+        raise WeightsError(f"{path}: {error}") from None
+    outside = next((t.name for t in model.graph.initializer if t.data_location == onnx.TensorProto.EXTERNAL), None)
+    if outside is not None:
+        raise WeightsError(f"{path}: {outside} lies outside the file; save the network as one file")
+    return content, _with_fixed_size(_description(model, path), model, path)
+
+
+def _description(model: onnx.ModelProto, path: Path) -> ExternalNetwork:
+    beside = path.with_suffix(".toml")
+    own = next((p.value for p in model.metadata_props if p.key == PROPERTY), None)
+    if own is None and not beside.is_file():
+        raise WeightsError(
+            f"{path}: nothing says how to use this network; describe it in {beside.name} beside it "
+            f"(gives = {' | '.join(repr(str(g)) for g in Gives)}, or preset = {' | '.join(map(repr, PRESETS))})"
+        )
+    try:
+        record = _json(own) if own is not None else read_mapping(beside, "TOML", ConfigError)
+        preset = record.pop("preset", None)
+        if preset is not None and preset not in PRESETS:
+            raise ConfigError(f"no preset {preset!r}; there are {', '.join(PRESETS)}")
+        known = {} if preset is None else PRESETS[preset].description
+        origin = f"{path}: {PROPERTY}" if own is not None else str(beside)
+        return laid_over(_start(known, record, origin), {**known, **record}, origin)
+    except (ConfigError, ValueError) as error:
+        said = str(error)
+        raise WeightsError(said if said.startswith((str(path), str(beside))) else f"{path}: {said}") from None
+
+
+def _json(text: str) -> dict[str, Any]:
+    try:
+        record = json.loads(text)
+    except (ValueError, RecursionError):
+        raise ConfigError(f"its property {PROPERTY} is not JSON") from None
+    if not isinstance(record, dict):
+        raise ConfigError(f"its property {PROPERTY} is not a JSON object")
+    return record
+
+
+def _start(known: dict[str, Any], record: dict[str, Any], origin: str) -> ExternalNetwork:
+    """Neutral values; ``gives`` has none and must be said."""
+    gives = record.get("gives", known.get("gives"))
+    if gives not in [*Gives]:
+        raise ConfigError(f"{origin}: gives must be one of {', '.join(Gives)}, got {gives!r}")
+    return ExternalNetwork(gives=str(gives))
+
+
+def _with_fixed_size(network: ExternalNetwork, model: onnx.ModelProto, path: Path) -> ExternalNetwork:
+    """The description with names and size of the graph's ends, checked against each other.
+
+    Raises:
+        WeightsError: If the graph has other ends than the description says.
+    """
+    constants = {tensor.name for tensor in model.graph.initializer}
+    inputs = [value for value in model.graph.input if value.name not in constants]
+    outputs = [value.name for value in model.graph.output]
+    chosen = [v for v in inputs if v.name == (network.input or v.name)]
+    if len(chosen) != 1:
+        names = ", ".join(v.name for v in inputs)
+        raise WeightsError(
+            f"{path}: it must take one image; its inputs are {names or 'none'}, input is {network.input!r}"
+        )
+    shape = chosen[0].type.tensor_type.shape.dim
+    sides = [d.dim_value for d in shape]
+    if len(sides) != 4 or sides[1] not in (0, 3):
+        raise WeightsError(f"{path}: its input is {sides}, expected [1, 3, H, W]")
+    for name in (network.depth or outputs[0], network.sigma):
+        if name and name not in outputs:
+            raise WeightsError(f"{path}: no output {name!r}; there are {', '.join(outputs)}")
+    size = dict(zip(("input_height", "input_width"), sides[2:], strict=True))
+    fixed = {name: side for name, side in size.items() if side}
+    if any(getattr(network, name) not in (0, side) for name, side in fixed.items()):
+        raise WeightsError(
+            f"{path}: it takes images of {sides[2]}x{sides[3]} (height x width), not of the described size"
+        )
+    network = replace(network, input=chosen[0].name, depth=network.depth or outputs[0], **fixed)
+    if not (network.input_height and network.input_width):
+        raise WeightsError(
+            f"{path}: it takes images of any size: say input_height and input_width, those of its training"
+        )
+    return network
