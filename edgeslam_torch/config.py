@@ -66,7 +66,7 @@ class DepthConfig:
     """Stage 1: the depth network, once per keyframe."""
 
     weights: str = "default"
-    """``default``, ``none``, or a weights file."""
+    """``default``, ``none``, a weights file, a described ONNX file, or the name of a downloaded network."""
     backend: str = "onnxruntime"
     """``onnxruntime`` or ``torch``."""
     prior_sigma_log: float = 0.35

@@ -7,7 +7,6 @@ state, and returns the results.
 from collections.abc import Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -388,7 +387,6 @@ class EdgeSlam:
 def _depth_from_config(config: SlamConfig) -> DepthFunction | None:
     if config.depth.weights == "none":
         return None
-    from edgeslam_torch.frontend.depth_network import open_depth
+    from edgeslam_torch.frontend.depth_network import open_depth, weights_path
 
-    weights = None if config.depth.weights == "default" else Path(config.depth.weights)
-    return open_depth(weights, config.depth.backend)
+    return open_depth(weights_path(config.depth.weights), config.depth.backend)

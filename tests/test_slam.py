@@ -523,3 +523,22 @@ def test_telemetry_that_the_images_do_not_bear_out_is_a_warning_of_the_system():
     slam.finish()
     assert slam.scale.source == "depth"
     assert any("velocities are not used" in w for w in slam.warnings())
+
+
+def relative(depth):
+    """A depth function whose inverse is right up to a scale and a shift alone."""
+
+    def seen(image, camera):
+        metres = depth(image, camera)
+        inverse = 3.0 / metres.depth_m + 0.2
+        return DepthMap(1.0 / inverse, metres.sigma_log, is_relative=True)
+
+    return seen
+
+
+def test_relative_depth_serves_the_map_and_gives_no_metres():
+    slam, outputs = go(panels().frames, relative(panels().depth_function()))
+    _, T_w_c = slam.trajectory()
+    assert ate(T_w_c, panels().T_w_c) < 0.01
+    assert not any(o.metric for o in outputs) and slam.scale.source == "none"
+    assert len(slam.edge_map().p_w) > 0.7 * len(metric_run()[0].edge_map().p_w)

@@ -36,7 +36,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--battery", type=float, default=87.0, metavar="PERCENT", help="charge at take-off (default: 87)"
     )
     parser.add_argument("--no-telemetry", action="store_true", help="fly without telemetry: no metres from the drone")
-    parser.add_argument("--depth", metavar="FILE|none", help="weights of the depth network, or none")
+    parser.add_argument(
+        "--depth", metavar="FILE|NAME|none", help="depth network: weights, an ONNX file, a downloaded network, or none"
+    )
     parser.add_argument("--config", type=Path, metavar="FILE.toml", help="settings of the pipeline")
     parser.add_argument(
         "--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="change one setting; may be repeated"

@@ -2,12 +2,13 @@
 
 import argparse
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from edgeslam_torch.errors import OutputError
+from edgeslam_torch.errors import ConfigError, OutputError
 
 if TYPE_CHECKING:
     from edgeslam_torch.geometry.camera import Camera
@@ -35,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--camera", metavar="FILE|PRESET", help="calibration (default: the source's own camera.yaml); metres follow it"
     )
     parser.add_argument(
-        "--weights", type=Path, metavar="FILE", help=".safetensors, or .onnx of edgeslam export (default: the shipped)"
+        "--weights", default="default", metavar="FILE|NAME", help="weights, an ONNX file or a downloaded network"
     )
     parser.add_argument("--backend", choices=("onnxruntime", "torch"), default="onnxruntime", help="what runs it")
     parser.add_argument("--threads", type=_positive, default=1, metavar="N", help="threads of one inference")
@@ -49,9 +50,11 @@ def main(args: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from edgeslam_torch.frontend.depth_check import MIN_SHARE
-    from edgeslam_torch.frontend.depth_network import DepthPredictor
+    from edgeslam_torch.frontend.depth_network import open_depth, weights_path
 
-    predictor = DepthPredictor(args.weights, args.backend, args.threads)
+    network = open_depth(weights_path(args.weights), args.backend, args.threads)
+    if not network.is_metric:
+        raise ConfigError(f"{network.weights}: gives depth up to scale and shift; a map has both: edgeslam run --depth")
     camera, frames, length, warnings, problems = _frames(args.source, args.camera, args.max_frames)
     for warning in warnings:
         print(f"note: {warning}")
@@ -61,7 +64,7 @@ def main(args: argparse.Namespace) -> int:
         args.out.mkdir(parents=True, exist_ok=True)
         for frame in tqdm(frames, total=length, unit="image", disable=None):
             _spare_the_source(args.out, frame.path)
-            depth = predictor(np.asarray(camera.undistort_image(frame.image), np.uint8), camera)
+            depth = network(np.asarray(camera.undistort_image(frame.image), np.uint8), camera)
             depth, share = _believable(depth)
             shares.append(share)
             write_depth(args.out, _stem(frame, stems), depth, args.sigma)
@@ -75,7 +78,7 @@ def main(args: argparse.Namespace) -> int:
     if unknown:
         print(f"note: {unknown} of {len(shares)} depth maps are mostly unknown: these weights do not fit these images")
     lens = ", lens distortion removed" if camera.is_distorted else ""
-    print(f"{len(shares)} depth maps in {args.out} (metres for {camera.source}{lens}; {predictor.backend})")
+    print(f"{len(shares)} depth maps in {args.out} (metres for {camera.source}{lens}; {network.backend})")
     return 0
 
 
@@ -101,10 +104,9 @@ def write_depth(folder: Path, stem: str, depth: "DepthMap", with_sigma: bool = F
 def _believable(depth: "DepthMap") -> "tuple[DepthMap, float]":
     """The map with NaN at implausible pixels, and the share of plausible ones."""
     from edgeslam_torch.frontend.depth_check import usable
-    from edgeslam_torch.types import DepthMap
 
     good = usable(depth)
-    return DepthMap(np.where(good, depth.depth_m, np.float32(np.nan)), depth.sigma_log), float(good.mean())
+    return replace(depth, depth_m=np.where(good, depth.depth_m, np.float32(np.nan))), float(good.mean())
 
 
 def _spare_the_source(out: Path, image: Path | None) -> None:

@@ -34,7 +34,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--telemetry", type=Path, metavar="FILE", help="telemetry.csv of the flight (default: SOURCE's own)"
     )
-    parser.add_argument("--depth", metavar="FILE|none", help="weights of the depth network, or none")
+    parser.add_argument(
+        "--depth", metavar="FILE|NAME|none", help="depth network: weights, an ONNX file, a downloaded network, or none"
+    )
     parser.add_argument(
         "--mode",
         choices=("offline", "realtime"),

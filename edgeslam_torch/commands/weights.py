@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 from edgeslam_torch.errors import ConfigError, OutputError
 
 if TYPE_CHECKING:
-    from edgeslam_torch.models.download import Fetched
+    from edgeslam_torch.models.download import Fetched, Remote
+    from edgeslam_torch.models.onnx.external import ExternalNetwork
     from edgeslam_torch.models.record import Metadata
 
 HELP = "list, download, convert and inspect depth-network weights"
@@ -18,9 +19,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's options."""
     actions = parser.add_subparsers(dest="action", required=True)
     actions.add_parser("list", help="shipped, downloaded and downloadable weights")
-    download = actions.add_parser("download", help="fetch official FastDepth weights and convert them")
+    download = actions.add_parser("download", help="fetch official FastDepth weights, or a network of others")
     download.add_argument("name", help="as 'list' prints it")
-    download.add_argument("--out", "-o", type=Path, help="where to put the .safetensors (default: the cache)")
+    download.add_argument("--out", "-o", type=Path, help="where to put the file (default: the cache)")
     download.add_argument(
         "--sha256", type=_sha256, help="expected SHA-256 of the download (default: that of the first download)"
     )
@@ -41,42 +42,73 @@ def main(args: argparse.Namespace) -> int:
 
 def _list(_: argparse.Namespace) -> None:
     from edgeslam_torch.models.download import REMOTES, cache_folder, shipped
+    from edgeslam_torch.models.onnx.presets import PRESETS, preset_file
     from edgeslam_torch.models.weights_file import read_header
 
     print(f"default  {read_header(shipped()).variant}  {shipped()}")
-    for remote in REMOTES.values():
-        local = cache_folder() / f"{remote.name}.safetensors"
+    there = [(remote, cache_folder() / f"{remote.name}.safetensors") for remote in REMOTES.values()]
+    there += [(preset.remote, preset_file(name)) for name, preset in PRESETS.items()]
+    for remote, local in there:
         print(f"{remote.name}: {remote.about}; {remote.licence}")
         print(f"    {local if local.is_file() else 'not downloaded: ' + remote.urls[0]}")
 
 
 def _download(args: argparse.Namespace) -> None:
+    from edgeslam_torch.models.download import REMOTES, cache_folder, remember, remembered
+    from edgeslam_torch.models.onnx.presets import PRESETS, preset_file
+
+    if args.name in PRESETS:
+        remote, suffix, raw = PRESETS[args.name].remote, ".onnx", preset_file(args.name)
+    elif args.name in REMOTES:
+        remote, suffix = REMOTES[args.name], ".safetensors"
+        raw = cache_folder() / f"{remote.name}.pth.tar"
+    else:
+        raise ConfigError(f"no weights called {args.name!r}; there are {', '.join([*REMOTES, *PRESETS])}")
+    try:
+        before = remembered(raw)
+        fetched = _fetch(remote, raw, args.sha256)
+        target = args.out or cache_folder() / f"{remote.name}{suffix}"
+        target.parent.mkdir(parents=True, exist_ok=True)
+        (_describe if args.name in PRESETS else _converted)(args.name, raw, target)
+        kept = remember(raw, fetched.sha256)  # remember the checksum of valid files only
+    except OSError as error:
+        raise OutputError(f"{error.filename or raw}: cannot be written ({error.strerror or error})") from error
+    print(f"{fetched.url}\nsha256 {fetched.sha256}, {_trust(args.sha256, before, fetched, kept)}")
+    print(target)
+
+
+def _fetch(remote: "Remote", target: Path, sha256: str | None) -> "Fetched":
     from tqdm import tqdm
 
-    from edgeslam_torch.models.convert import convert_upstream
-    from edgeslam_torch.models.download import REMOTES, cache_folder, download, remember, remembered
+    from edgeslam_torch.models.download import download
 
-    remote = REMOTES.get(args.name)
-    if remote is None:
-        raise ConfigError(f"no weights called {args.name!r}; there are {', '.join(REMOTES)}")
-    raw = cache_folder() / f"{remote.name}.pth.tar"
     with tqdm(unit="B", unit_scale=True, desc=remote.name, disable=None) as bar:
 
         def show(have: int, total: int) -> None:
             bar.total = total or None
             bar.update(have - bar.n)
 
-        try:
-            before = remembered(raw)
-            fetched = download(remote.urls, raw, args.sha256, show)
-            target = args.out or cache_folder() / f"{remote.name}.safetensors"
-            target.parent.mkdir(parents=True, exist_ok=True)
-            convert_upstream(raw, target)
-            kept = remember(raw, fetched.sha256)  # remember the checksum of valid files only
-        except OSError as error:
-            raise OutputError(f"{error.filename or raw}: cannot be written ({error.strerror or error})") from error
-    print(f"{fetched.url}\nsha256 {fetched.sha256}, {_trust(args.sha256, before, fetched, kept)}")
-    print(target)
+        return download(remote.urls, target, sha256, show)
+
+
+def _converted(_: str, raw: Path, target: Path) -> None:
+    from edgeslam_torch.models.convert import convert_upstream
+
+    convert_upstream(raw, target)
+
+
+def _describe(name: str, raw: Path, target: Path) -> None:
+    """Put the network and its description in place, once it proves to be one."""
+    import shutil
+
+    from edgeslam_torch.files.atomic import write_text
+    from edgeslam_torch.models.onnx.external import read_external
+
+    write_text(raw.with_suffix(".toml"), f'preset = "{name}"\n')
+    read_external(raw)
+    if target != raw:
+        shutil.copyfile(raw, target)
+        write_text(target.with_suffix(".toml"), f'preset = "{name}"\n')
 
 
 def _trust(given: str | None, before: str | None, fetched: "Fetched", kept: Path) -> str:
@@ -117,11 +149,12 @@ def _inspect(args: argparse.Namespace) -> None:
         print(f"{field.name}: {_printable(str(getattr(metadata, field.name)))}")
 
 
-def _size_and_record(path: Path) -> "tuple[str, Metadata]":
+def _size_and_record(path: Path) -> "tuple[str, Metadata | ExternalNetwork]":
     if path.suffix == ".onnx":
-        from edgeslam_torch.models.onnx.file import read_onnx
+        from edgeslam_torch.models.onnx.external import read_external
+        from edgeslam_torch.models.onnx.file import holds_record, read_onnx
 
-        return "", read_onnx(path)[1]
+        return "", read_onnx(path)[1] if holds_record(path) else read_external(path)[1]
     from edgeslam_torch.models.checkpoint import load_checkpoint
     from edgeslam_torch.models.complexity import measure_complexity
 

@@ -29,6 +29,14 @@ class DepthNetwork(Protocol):
 
     weights: Path
 
+    @property
+    def is_metric(self) -> bool:
+        """Whether its depth is in metres; otherwise its inverse is right up to scale and shift."""
+
+    @property
+    def backend(self) -> str:
+        """What runs it."""
+
     def __call__(self, image: NDArray[np.uint8], camera: Camera) -> DepthMap:
         """Depth and its uncertainty at the size of the image, ``(H, W, 3)`` BGR or ``(H, W)`` grey."""
 
@@ -53,6 +61,27 @@ def open_depth(weights: Path | None = None, backend: str = "onnxruntime", thread
 
             return ExternalDepth(weights, threads)
     return DepthPredictor(weights, backend, threads)
+
+
+def weights_path(name: str) -> Path | None:
+    """File of a depth network: ``default`` (None), the name of a downloaded preset, or a path.
+
+    Raises:
+        WeightsError: If it is a preset that was not downloaded.
+    """
+    if name == "default":
+        return None
+    if Path(name).suffix or Path(name).exists():
+        return Path(name)
+    from edgeslam_torch.models.onnx.presets import PRESETS, preset_file
+
+    if name not in PRESETS:
+        close = ", ".join(PRESETS)
+        raise WeightsError(f"{name}: no such weights file, and no network of that name; there are {close}")
+    path = preset_file(name)
+    if not path.is_file():
+        raise WeightsError(f"{name} is not there yet; fetch it with `edgeslam weights download {name}`")
+    return path
 
 
 class _Engine(Protocol):
@@ -88,6 +117,8 @@ class DepthPredictor:
         self.weights = DEFAULT_WEIGHTS if weights is None else Path(weights)
         self._engine = _open_engine(self.weights, backend, threads)
         _try_out(self._engine, self.weights)
+
+    is_metric = True
 
     @property
     def metadata(self) -> Metadata:

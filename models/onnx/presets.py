@@ -5,9 +5,10 @@ published files.
 """
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
-from edgeslam_torch.models.download import Remote
+from edgeslam_torch.models.download import Remote, cache_folder
 
 IMAGENET = {"mean": (0.485, 0.456, 0.406), "std": (0.229, 0.224, 0.225)}
 HUGGING_FACE = "https://huggingface.co/onnx-community"
@@ -75,3 +76,8 @@ PRESETS = {
     )
 }
 """By the name that ``--depth`` takes."""
+
+
+def preset_file(name: str) -> Path:
+    """Where a preset's ONNX file is kept once it was downloaded."""
+    return cache_folder() / f"{name}.onnx"

@@ -13,14 +13,16 @@ import onnx
 import onnxruntime
 import pytest
 import torch
+from small_networks import RELATIVE, describe, green_network
 
 from edgeslam_torch.errors import ConfigError, EdgeSlamError
-from edgeslam_torch.frontend.depth_network import DepthPredictor
+from edgeslam_torch.frontend.depth_network import DepthPredictor, open_depth, weights_path
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.camera_file import save_camera
 from edgeslam_torch.models.checkpoint import build_network, load_checkpoint, save_checkpoint
 from edgeslam_torch.models.fastdepth import FastDepth, Variant, Widths
 from edgeslam_torch.models.onnx.graph import build_graph
+from edgeslam_torch.models.onnx.presets import PRESETS
 from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.types import DepthMap
 
@@ -254,3 +256,37 @@ def test_inspect_reads_exported_files_and_shows_no_control_characters(
     (tmp_path / "w.onnx").write_bytes(build_graph(weights)[0])
     run("weights", "inspect", tmp_path / "w.onnx")
     assert "focal_px: 105.0" in capsys.readouterr().out
+
+
+# -- networks of others --------------------------------------------------------------------------------------------
+
+
+def test_depth_maps_of_a_relative_network_would_have_no_unit(pictures: Path, tmp_path: Path) -> None:
+    network = describe(green_network(tmp_path / "n.onnx", **RELATIVE), 'preset = "midas-small"\n')
+    with pytest.raises(ConfigError, match="up to scale and shift"):
+        run("depth", pictures, "--out", tmp_path / "out", "--weights", network)
+
+
+def test_network_of_others_is_inspected_by_its_description(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    network = describe(green_network(tmp_path / "n.onnx"), 'preset = "metric3d-v2-small"\ndepth = ""\n')
+    assert run("weights", "inspect", network) == 0
+    said = capsys.readouterr().out
+    assert "gives: metres" in said and "focal_px: 1000.0" in said
+
+
+def test_downloaded_network_is_ready_to_use(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("EDGESLAM_CACHE", str(tmp_path / "cache"))
+    published = green_network(tmp_path / "published.onnx", **RELATIVE, input="0", size=(256, 256), plane=True)
+    preset = PRESETS["midas-small"]
+    remote = replace(preset.remote, urls=(published.as_uri(),))
+    monkeypatch.setitem(PRESETS, "midas-small", replace(preset, remote=remote))
+    assert run("weights", "download", "midas-small") == 0
+    assert "trusted on first use" in capsys.readouterr().out
+    assert not open_depth(weights_path("midas-small")).is_metric
+    assert run("weights", "list") == 0
+    assert str(tmp_path / "cache" / "midas-small.onnx") in capsys.readouterr().out
+    published.write_bytes(b"<html>not found</html>")
+    with pytest.raises(EdgeSlamError, match="has changed since"):
+        run("weights", "download", "midas-small")

@@ -103,3 +103,30 @@ def test_network_that_errs_is_bent_towards_the_anchors_and_trusted_less(points, 
     assert np.median(left) <= 0.5 * np.median(np.abs(error)) + 0.01
     assert np.median(prior_sigma[known]) == pytest.approx(sigma_log, abs=0.003)
     assert np.mean(left < 2.5 * prior_sigma[known]) > 0.95
+
+
+def relative_map(points, view, scale=0.7, shift=0.02):
+    """Relative depth at the keypoints of a view: its inverse is right up to scale and shift."""
+    keyframe = points.keyframes[view]
+    depth = np.full((480, 640), np.nan, np.float32)
+    u, v = np.rint(keyframe.features.uv).astype(int).T
+    depth[np.clip(v, 0, 479), np.clip(u, 0, 639)] = scale / (1.0 / true_depth(points, view) - shift)
+    return DepthMap(depth, np.full((480, 640), 0.25, np.float32), is_relative=True)
+
+
+def test_relative_network_is_brought_to_the_map_by_scale_and_shift(points):
+    keyframe, z = points.keyframes[0], true_depth(points, 0)
+    keyframe.depth = relative_map(points, 0)
+    prior, sigma = depth_prior(keyframe, keyframe.features.uv, points.map.anchors, 0.35)
+    known = np.isfinite(prior)
+    assert known.mean() > 0.9
+    np.testing.assert_allclose(prior[known], z[known], rtol=0.02)
+    assert np.median(sigma) < 0.1
+
+
+def test_anchors_that_rest_on_a_relative_network_do_not_say_its_scale(points):
+    keyframe = points.keyframes[0]
+    keyframe.depth = relative_map(points, 0)
+    points.map.anchors.from_depth[:] = True
+    _, sigma = depth_prior(keyframe, keyframe.features.uv, points.map.anchors, 0.35)
+    np.testing.assert_allclose(sigma, 0.35)

@@ -6,8 +6,12 @@ import os
 import sys
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from edgeslam_torch.errors import OutputError
+
+if TYPE_CHECKING:
+    from edgeslam_torch.eval.benchmark.benchmark import BenchSettings
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -20,6 +24,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--max-frames", type=int, metavar="N", help="stop every run after N frames")
     parser.add_argument("--mode", choices=("offline", "realtime"), default="offline")
     parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="change one setting")
+    parser.add_argument(
+        "--depth",
+        action="append",
+        default=[],
+        metavar="FILE|NAME|none",
+        help="compare depth networks: everything once with each; may be repeated ('default' is the shipped one)",
+    )
     parser.add_argument("--no-micro", action="store_true", help="omit the times of solver and depth network")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the runs (default: runs/bench-TIME)")
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write the results here")
@@ -51,6 +62,8 @@ def main(args: argparse.Namespace) -> int:
     if data is None:
         _say("no recordings (--data or EDGESLAM_DATA): the synthetic flight alone")
     out = args.out or Path("runs") / time.strftime("bench-%Y%m%d-%H%M%S")
+    if args.depth:
+        return _networks(settings, args, out)
     try:
         record = benchmark.run_benchmark(settings, out, _say)
         text = benchmark.markdown_bench(record)
@@ -63,6 +76,23 @@ def main(args: argparse.Namespace) -> int:
     print(text)
     print(f"results: {out / 'bench.json'}")
     return 1 if any(run["error"] for run in record["runs"]) else 0
+
+
+def _networks(settings: "BenchSettings", args: argparse.Namespace, out: Path) -> int:
+    """Compare depth networks; 1 when a run failed."""
+    from edgeslam_torch.eval.benchmark.networks import compare_networks, markdown_networks
+
+    try:
+        records = compare_networks(settings, args.depth, out, _say)
+        text = markdown_networks(records)
+        if args.json is not None:
+            args.json.write_text(json.dumps(records, indent=1, default=str) + "\n", encoding="utf-8")
+        if args.markdown is not None:
+            args.markdown.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"{error.filename}: cannot be written ({error.strerror or error})") from error
+    print(text)
+    return 1 if any(run["error"] for record in records.values() for run in record["runs"]) else 0
 
 
 def _say(text: str) -> None:

@@ -1,0 +1,221 @@
+"""ONNX depth networks of others: the right depth, or one line that says what is missing."""
+
+import json
+
+import numpy as np
+import onnx
+import pytest
+from small_networks import FAR_M, NEAR_M, RELATIVE, describe, green_network, node
+
+from edgeslam_torch.errors import WeightsError
+from edgeslam_torch.frontend.depth_check import CheckedDepth
+from edgeslam_torch.frontend.depth_network import DepthPredictor, open_depth, weights_path
+from edgeslam_torch.frontend.external_depth import ExternalDepth, relative_depth
+from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.models.onnx.presets import PRESETS, preset_file
+
+CAMERA = Camera(192, 128, 160.0, 160.0, 95.5, 63.5)
+SIZE = "input_height = 128\ninput_width = 192\n"
+GREEN = {
+    "metres": {},
+    "log_metres": {"nodes": [node("Log", "depth", "log")], "output": "log"},
+    "inverse_metres": {"nodes": [node("Reciprocal", "depth", "inverse")], "output": "inverse"},
+    "relative_inverse": RELATIVE,
+}
+
+
+@pytest.fixture
+def image():
+    """Black and green halves."""
+    made = np.zeros((128, 192, 3), np.uint8)
+    made[:, 96:, 1] = 255
+    return made
+
+
+@pytest.mark.parametrize("gives", ["metres", "log_metres", "inverse_metres"])
+@pytest.mark.parametrize("plane", [False, True])
+def test_metres_come_out_whatever_the_numbers_mean(tmp_path, image, gives, plane):
+    path = green_network(tmp_path / "net.onnx", plane=plane, **GREEN[gives])
+    network = open_depth(describe(path, f'gives = "{gives}"\nfocal_px = 80.0\n{SIZE}'))
+    found = network(image, CAMERA)
+    assert network.is_metric and not found.is_relative
+    np.testing.assert_allclose(found.depth_m[:, :80], 2 * NEAR_M, rtol=1e-5)  # a lens of twice the focal length
+    np.testing.assert_allclose(found.depth_m[:, 112:], 2 * FAR_M, rtol=1e-5)
+    np.testing.assert_allclose(found.sigma_log, 0.25)
+
+
+def test_a_network_for_any_camera_is_taken_at_its_word(tmp_path, image):
+    network = open_depth(describe(green_network(tmp_path / "net.onnx"), f'gives = "metres"\nsigma_log = 0.1\n{SIZE}'))
+    found = network(image, CAMERA)
+    np.testing.assert_allclose(found.depth_m[:, :80], NEAR_M, rtol=1e-5)
+    np.testing.assert_allclose(found.sigma_log, 0.1)
+
+
+def test_sigma_is_the_networks_own_where_it_states_one(tmp_path, image):
+    nodes = [node("Mul", "depth tenth", "sigma")]
+    path = green_network(tmp_path / "net.onnx", nodes, "depth sigma", constants={"tenth": 0.1})
+    found = open_depth(describe(path, f'gives = "metres"\nsigma = "sigma"\n{SIZE}'))(image, CAMERA)
+    np.testing.assert_allclose(found.sigma_log, 0.1 * found.depth_m, rtol=1e-5)
+
+
+def test_relative_depth_is_right_up_to_scale_and_shift_of_its_inverse(tmp_path, rng):
+    network = open_depth(
+        describe(green_network(tmp_path / "n.onnx", **RELATIVE), f'gives = "relative_inverse"\n{SIZE}')
+    )
+    green = rng.integers(0, 256, (128, 192)).astype(np.uint8)
+    found = network(np.stack([0 * green, green, 0 * green], axis=2), CAMERA)
+    assert found.is_relative and not network.is_metric
+    true = 1.0 / (NEAR_M + (FAR_M - NEAR_M) * green / 255.0)
+    line = np.polyfit(true.ravel(), 1.0 / found.depth_m.ravel(), 1)
+    assert line[0] > 0
+    np.testing.assert_allclose(1.0 / found.depth_m, np.polyval(line, true), rtol=1e-4)
+    assert np.median(found.depth_m) == pytest.approx(1.0, rel=1e-3)
+
+
+def test_record_inside_the_file_needs_no_other(tmp_path, image):
+    path = green_network(tmp_path / "net.onnx")
+    model = onnx.load(str(path))
+    record = {"gives": "metres", "input_height": 128, "input_width": 192}
+    onnx.helper.set_model_props(model, {"edgeslam.depth": json.dumps(record)})
+    onnx.save(model, str(path))
+    np.testing.assert_allclose(open_depth(path)(image, CAMERA).depth_m[:, 112:], FAR_M, rtol=1e-5)
+
+
+def test_input_fits_the_image_in_multiples_of_the_networks_patches(tmp_path):
+    """A transformer's patches: an image of any other size cannot be run."""
+    nodes = [node("Reshape", "depth patches", "cut"), node("Reshape", "cut whole", "again")]
+    constants = {
+        "patches": np.array([1, 1, -1, 14 * 9 * 14], np.int64),
+        "whole": np.array([1, 1, -1, 14 * 9], np.int64),
+    }
+    path = green_network(tmp_path / "net.onnx", nodes, "again", constants=constants, size=("h", 126))
+    text = 'gives = "metres"\nmultiple = 14\ninput_height = 84\n'
+    with pytest.raises(WeightsError, match="say input_height and input_width"):
+        open_depth(describe(green_network(tmp_path / "free.onnx"), text))
+    network = open_depth(describe(path, text))
+    assert network(np.zeros((96, 144, 3), np.uint8), Camera(144, 96, 99.0, 99.0, 71.5, 47.5)).depth_m.shape == (96, 144)
+
+
+# -- one line ------------------------------------------------------------------------------------------------------
+
+BAD = {
+    "nothing says": None,
+    "gives must be one of": "input_width = 192\n",
+    "unknown key 'gife'": f'gives = "metres"\ngife = 1\n{SIZE}',
+    "multiples of 14": f'gives = "metres"\nmultiple = 14\n{SIZE}',
+    "std from": f'gives = "metres"\nstd = [0.0, 1.0, 1.0]\n{SIZE}',
+    "no preset 'midas'": 'preset = "midas"\n',
+    "no output 'inverse'": f'gives = "metres"\ndepth = "inverse"\n{SIZE}',
+    "input is 'picture'": f'gives = "metres"\ninput = "picture"\n{SIZE}',
+    "not valid TOML": "gives =\n",
+    "sigma_log must be from": f'gives = "metres"\nsigma_log = 0.0\n{SIZE}',
+}
+
+
+@pytest.mark.parametrize("words", BAD)
+def test_bad_description_is_one_line(tmp_path, words):
+    path = green_network(tmp_path / "net.onnx")
+    if BAD[words] is not None:
+        describe(path, BAD[words])
+    with pytest.raises(WeightsError, match=words) as caught:
+        open_depth(path)
+    assert "\n" not in str(caught.value) and "net." in str(caught.value)
+
+
+def test_fixed_size_differs_from_the_description(tmp_path):
+    path = green_network(tmp_path / "net.onnx", size=(64, 96))
+    with pytest.raises(WeightsError, match="images of 64x96"):
+        open_depth(describe(path, f'gives = "metres"\n{SIZE}'))
+
+
+def test_graph_with_four_channels_is_no_camera_network(tmp_path):
+    with pytest.raises(WeightsError, match=r"expected \[1, 3, H, W\]"):
+        open_depth(describe(green_network(tmp_path / "net.onnx", channels=4), f'gives = "metres"\n{SIZE}'))
+
+
+def test_size_that_the_network_does_not_take_is_one_line(tmp_path, image):
+    constants = {"rows": np.array([1, 1, 126, -1], np.int64)}
+    path = green_network(tmp_path / "net.onnx", [node("Reshape", "depth rows", "out")], "out", constants=constants)
+    with pytest.raises(WeightsError, match="cannot be run on 112x112 pixels"):
+        open_depth(describe(path, f'gives = "metres"\n{SIZE}'))
+
+
+@pytest.mark.parametrize(
+    ("number", "gives", "words"),
+    [
+        (np.nan, "metres", "gives no depth"),
+        (-9.0, "metres", "gives no depth"),
+        (0.0, "relative_inverse", "gives no depth"),
+    ],
+)
+def test_network_without_depth_is_refused(tmp_path, number, gives, words):
+    nodes = [node("Mul", "depth none", "zero"), node("Add", "zero number", "bad")]
+    path = green_network(tmp_path / "net.onnx", nodes, "bad", constants={"none": 0.0, "number": number})
+    with pytest.raises(WeightsError, match=words):
+        open_depth(describe(path, f'gives = "{gives}"\n{SIZE}'))
+
+
+def test_network_that_sees_nothing_is_refused(tmp_path):
+    nodes = [node("Mul", "depth none", "zero"), node("Add", "zero number", "same")]
+    path = green_network(tmp_path / "net.onnx", nodes, "same", constants={"none": 0.0, "number": 2.0})
+    with pytest.raises(WeightsError, match="the same depth whatever it sees"):
+        open_depth(describe(path, f'gives = "metres"\n{SIZE}'))
+
+
+def test_pixels_without_a_number_are_unknown(tmp_path, image):
+    """The logarithm of what is black after a shift is no number: those pixels alone have no depth."""
+    nodes = [node("Sub", "depth near2", "less"), node("Log", "less", "log"), node("Exp", "log", "again")]
+    path = green_network(tmp_path / "net.onnx", nodes, "again", constants={"near2": 2.0})
+    depth = CheckedDepth(ExternalDepth(describe(path, f'gives = "metres"\n{SIZE}')))
+    found = depth(image, CAMERA)
+    assert np.isnan(found.depth_m[:, :90]).all()
+    np.testing.assert_allclose(found.depth_m[:, 112:], FAR_M - 2.0, rtol=1e-4)
+
+
+def test_an_image_without_differences_has_no_relative_depth():
+    assert np.isnan(relative_depth(np.full((4, 4), 3.0, np.float32))).all()
+    assert np.isnan(relative_depth(np.full((4, 4), np.nan, np.float32))).all()
+
+
+# -- presets -------------------------------------------------------------------------------------------------------
+
+SIGNATURES = {
+    "depth-anything-v2-small": {**RELATIVE, "input": "pixel_values", "plane": True},
+    "depth-anything-v2-small-indoor": {"plane": True},
+    "midas-small": {**RELATIVE, "input": "0", "size": (256, 256), "plane": True},
+    "metric3d-v2-small": {
+        "nodes": (node("Identity", "depth", "predicted_depth"), node("Identity", "depth", "predicted_normal")),
+        "input": "pixel_values",
+        "output": "predicted_normal predicted_depth",
+    },
+}
+"""Inputs, outputs and sizes as the published files have them."""
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_preset_runs_a_graph_of_its_networks_signature(tmp_path, monkeypatch, name):
+    image = np.zeros((128, 192, 3), np.uint8)
+    image[..., 1] = np.where(np.arange(192) < 96, 128, 255)
+    monkeypatch.setenv("EDGESLAM_CACHE", str(tmp_path))
+    with pytest.raises(WeightsError, match=f"edgeslam weights download {name}"):
+        weights_path(name)
+    describe(green_network(preset_file(name), **SIGNATURES[name]), f'preset = "{name}"\n')
+    network = open_depth(weights_path(name))
+    assert isinstance(network, ExternalDepth) and network.is_metric == ("metres" in PRESETS[name].remote.about)
+    found = network(image, CAMERA)
+    assert found.depth_m[:, 112:].mean() > 1.5 * found.depth_m[:, :80].mean() > 0
+
+
+def test_a_preset_can_be_corrected(tmp_path, image):
+    path = describe(green_network(tmp_path / "n.onnx"), 'preset = "metric3d-v2-small"\ndepth = ""\nmultiple = 14\n')
+    assert open_depth(path).network.multiple == 14
+
+
+def test_our_own_weights_are_opened_as_before():
+    assert weights_path("default") is None
+    assert isinstance(open_depth(), DepthPredictor) and open_depth().is_metric
+
+
+def test_a_name_that_nobody_knows_lists_what_there_is():
+    with pytest.raises(WeightsError, match="midas-small"):
+        weights_path("midas_small")
