@@ -1,4 +1,9 @@
-"""The contract of every loss: signed residuals for Levenberg-Marquardt, one scalar for training."""
+"""The contract of every loss: signed residuals for Levenberg-Marquardt, one number an item for training.
+
+Inputs without a batch axis give a scalar ``()``, batches ``(B, ...)`` one value an item ``(B,)``. What was not observed
+(outside a mask, NaN in an observation) is left out, with a gradient of zero whatever stands there. NaN in a prediction
+that counts gives NaN: a network that has diverged is seen. Half inputs are computed, and returned, in float32.
+"""
 
 from enum import StrEnum
 from typing import NamedTuple
@@ -19,7 +24,7 @@ class Residuals(NamedTuple):
 
 
 class Reduction(StrEnum):
-    """How elements become a scalar."""
+    """How elements become one number."""
 
     SUM = "sum"
     """Sum over valid elements, as in the paper."""
@@ -28,7 +33,7 @@ class Reduction(StrEnum):
 
 
 class ResidualLoss(nn.Module):
-    """Base of the losses: a subclass writes `residuals`, `forward` follows from it."""
+    """Base of the losses: a subclass writes ``residuals``, and ``forward`` as their reduction."""
 
     def __init__(self, reduction: Reduction = Reduction.MEAN, kernel: Kernel = Kernel.L2, delta: float = 1.0) -> None:
         """Choose how residuals are reduced.
@@ -43,17 +48,29 @@ class ResidualLoss(nn.Module):
             raise ValueError(f"delta must be positive, got {delta}")
         self.reduction, self.kernel, self.delta = Reduction(reduction), Kernel(kernel), delta
 
-    def residuals(self, *args: Tensor, **kwargs: Tensor) -> Residuals:
-        """Per element, signed, unreduced; see the subclass."""
-        raise NotImplementedError
-
-    def forward(self, *args: Tensor, **kwargs: Tensor) -> Tensor:
-        """Scalar loss ``()`` of the residuals; arguments as `residuals` takes them."""
-        return reduce(self.residuals(*args, **kwargs), self.reduction, self.kernel, self.delta)
+    def reduced(self, residuals: Residuals, axes: int) -> Tensor:
+        """Residuals reduced over the last ``axes`` axes of elements: ``()``, or ``(B,)`` for a batch."""
+        return reduce(residuals, self.reduction, self.kernel, self.delta, axes)
 
 
-def reduce(residuals: Residuals, reduction: Reduction, kernel: Kernel = Kernel.L2, delta: float = 1.0) -> Tensor:
+def reduce(
+    residuals: Residuals,
+    reduction: Reduction,
+    kernel: Kernel = Kernel.L2,
+    delta: float = 1.0,
+    axes: int | None = None,
+) -> Tensor:
     """Sum or mean of robust squared norms over valid elements; zero, with a gradient, when there are none.
+
+    Args:
+        residuals: With elements ``(..., E1, ..., En)``.
+        reduction: Sum or mean.
+        kernel: Robust kernel.
+        delta: Where it departs from least squares.
+        axes: How many axes are elements' (``n``), the others being the batch's; all by default.
+
+    Returns:
+        ``(...)``.
 
     Example:
         >>> r = Residuals(torch.tensor([[3.0, 4.0], [1.0, 0.0]]), torch.tensor([True, False]))
@@ -62,15 +79,26 @@ def reduce(residuals: Residuals, reduction: Reduction, kernel: Kernel = Kernel.L
     """
     squared = residuals.value.square().sum(-1)
     cost, _ = rho(squared, kernel, delta)
-    total = torch.where(residuals.valid, cost, 0.0).sum()
+    valid = residuals.valid
+    over = tuple(range(-(valid.ndim if axes is None else axes), 0))
+    total = torch.where(valid, cost, 0.0).sum(over)
     if reduction is Reduction.SUM:
         return total
-    return total / residuals.valid.sum().clamp_min(1)
+    return total / valid.sum(over).clamp_min(1)
 
 
-def masked(value: Tensor, valid: Tensor) -> Residuals:
-    """Residuals ``(..., R)`` with zeros (and zero gradients) where not valid."""
-    return Residuals(torch.where(valid[..., None], value, 0.0), valid)
+def masked(value: Tensor, valid: Tensor, lost: Tensor | None = None) -> Residuals:
+    """Residuals ``(..., R)`` with zeros (and zero gradients) where not valid.
+
+    Args:
+        value: Residuals ``(..., R)``.
+        valid: Which count ``(...)``.
+        lost: Elements whose prediction is NaN ``(...)``: they count, as NaN.
+    """
+    value = torch.where(valid[..., None], value, 0.0)
+    if lost is None:
+        return Residuals(value, valid)
+    return Residuals(torch.where(lost[..., None], torch.nan, value), valid | lost)
 
 
 def back_project(uv: Tensor, depth_m: Tensor, K: Tensor) -> Tensor:
@@ -81,12 +109,13 @@ def back_project(uv: Tensor, depth_m: Tensor, K: Tensor) -> Tensor:
     Args:
         uv: Pixels ``(..., 2)``.
         depth_m: z-depths ``(...)``.
-        K: Calibration matrix ``(3, 3)`` [px].
+        K: Calibration matrix ``(3, 3)`` [px]; ``(..., 3, 3)``, one an item, for pixels ``(..., N, 2)``.
 
     Returns:
         Points ``(..., 3)``.
     """
-    xy = (uv - K[:2, 2]) / K.diagonal()[:2]
+    focal, centre = _intrinsics(K)
+    xy = (uv - centre) / focal
     return torch.cat((xy, torch.ones_like(xy[..., :1])), -1) * depth_m[..., None]
 
 
@@ -94,13 +123,21 @@ def project(p_c: Tensor, K: Tensor, min_depth: float = 1e-6) -> tuple[Tensor, Te
     """Pixels ``(..., 2)`` of camera-frame points ``(..., 3)``, paper eqs. (1), (19), and which lie in front.
 
     Points behind the camera are projected from ``z = 1``: finite, with finite gradients, and marked invalid.
+    ``K`` as in `back_project`.
     """
     z = p_c[..., 2:]
     front = z > min_depth
     n = p_c[..., :2] / torch.where(front, z, 1.0)
-    return n * K.diagonal()[:2] + K[:2, 2], front[..., 0]
+    focal, centre = _intrinsics(K)
+    return n * focal + centre, front[..., 0]
 
 
 def move(T: Tensor, p: Tensor) -> Tensor:
     """Points ``(..., N, 3)`` transformed by rigid motions ``(..., 4, 4)``."""
     return p @ T[..., :3, :3].mT + T[..., None, :3, 3]
+
+
+def _intrinsics(K: Tensor) -> tuple[Tensor, Tensor]:
+    """Focal lengths and principal point, ``(2,)`` or ``(..., 1, 2)`` each."""
+    focal, centre = K.diagonal(dim1=-2, dim2=-1)[..., :2], K[..., :2, 2]
+    return (focal, centre) if K.ndim == 2 else (focal[..., None, :], centre[..., None, :])

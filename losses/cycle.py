@@ -1,6 +1,7 @@
 """Edge cycle consistency, paper eqs. (17)-(23)."""
 
 from enum import StrEnum
+from typing import TYPE_CHECKING
 
 import torch
 import torch.nn.functional as F
@@ -15,6 +16,7 @@ from edgeslam_torch.losses.base import (
     move,
     project,
 )
+from edgeslam_torch.losses.inputs import check_shapes, in_full_precision
 from edgeslam_torch.losses.robust import Kernel
 
 
@@ -65,55 +67,103 @@ class CycleLoss(ResidualLoss):
         """The paper's loss as printed: pixels, summed, without occlusion masks."""
         return cls(CycleForm.PIXEL, Reduction.SUM, max_relative=float("inf"))
 
-    def residuals(  # type: ignore[override]
-        self, T_j_i: Tensor, uv: Tensor, depth_i: Tensor, depth_j: Tensor, K: Tensor
-    ) -> Residuals:
+    @in_full_precision
+    def residuals(self, T_j_i: Tensor, uv: Tensor, depth_i: Tensor, depth_j: Tensor, K: Tensor) -> Residuals:
         """Round-trip residuals of edge pixels.
 
         Args:
-            T_j_i: Motion from frame i to frame j ``(4, 4)``.
-            uv: Edge pixels in frame i ``(N, 2)``.
-            depth_i: Their z-depths ``(N,)``.
-            depth_j: Depth map of frame j ``(H, W)``, or the depths ``(N,)`` already sampled there.
+            T_j_i: Motion from frame i to frame j ``(4, 4)``, in the depths' unit.
+            uv: Edge pixels in frame i ``(N, 2)``; NaN for none.
+            depth_i: Their z-depths ``(N,)``; 0 where unknown.
+            depth_j: Depth map of frame j ``(H, W)``, or the depths ``(N,)`` already sampled there; 0 or NaN where
+                unknown.
             K: Calibration matrix ``(3, 3)`` [px].
 
         Returns:
             ``(N, 2)`` pixels or ``(N, 1)`` ratios; invalid outside the image, behind a camera, without depth, or
-            occluded in frame j.
+            occluded in frame j. All may have a leading batch axis.
+
+        Raises:
+            ValueError: If shapes do not fit.
         """
+        is_map = depth_j.ndim > depth_i.ndim
+        check_shapes(
+            T_j_i=(T_j_i, "4 4"),
+            uv=(uv, "N 2"),
+            depth_i=(depth_i, "N"),
+            depth_j=(depth_j, "H W" if is_map else "N"),
+            K=(K, "? 3 3"),
+        )
+        seen = uv.isfinite().all(-1) & ~(depth_i <= 0)  # a depth of NaN counts: it is a prediction
+        uv, depth_i = uv.where(seen[..., None], 0.0), depth_i.where(seen, 1.0)
         p_j = move(T_j_i, back_project(uv, depth_i, K))  # eqs. (17), (18)
-        uv_j, valid = project(p_j, K)  # eq. (19)
-        if depth_j.ndim == 2:
-            d_j, inside = sample_depth(depth_j, uv_j)
-            valid = valid & inside
+        uv_j, front = project(p_j, K)  # eq. (19)
+        if is_map:
+            d_j, known = sample_depth(depth_j, uv_j)
         else:
-            d_j = depth_j
+            known = depth_j > 0
+            d_j = depth_j.where(known, 0.0)
+        lost = seen & p_j.isnan().any(-1)
+        valid = seen & front & known
         z = p_j[..., 2]
-        valid = valid & (depth_i > 0) & (d_j > 0)
         relative = (z - d_j) / torch.where(valid, z + d_j, 1.0)
         valid = valid & (relative.detach() < self.max_relative)
         if self.form is CycleForm.RELATIVE_DEPTH:
-            return masked(relative[..., None], valid)
-        back = back_project(uv_j, d_j, K) - T_j_i[:3, 3]  # eqs. (20), (21)
-        round_trip, front = project(back @ T_j_i[:3, :3], K)  # eq. (22)
+            return masked(relative[..., None], valid, lost)
+        back = back_project(uv_j, d_j, K) - T_j_i[..., None, :3, 3]  # eqs. (20), (21)
+        round_trip, front = project(back @ T_j_i[..., :3, :3], K)  # eq. (22)
         residual, valid = round_trip - uv, valid & front  # eq. (23)
         if self.form is CycleForm.PARALLAX:
             parallax = expected_parallax_px(T_j_i, depth_i, K)
             valid = valid & (parallax.detach() > self.min_parallax_px)
             residual = residual / torch.where(valid, parallax, 1.0)[..., None]
-        return masked(residual, valid)
+        return masked(residual, valid, lost)
+
+    @in_full_precision
+    def forward(self, T_j_i: Tensor, uv: Tensor, depth_i: Tensor, depth_j: Tensor, K: Tensor) -> Tensor:
+        """Mean (or sum) over edge pixels of the squared residuals ``()``, ``(B,)`` for a batch of pairs.
+
+        Args:
+            T_j_i: Motion from frame i to frame j ``(4, 4)`` or ``(B, 4, 4)``, in the depths' unit.
+            uv: Edge pixels in frame i ``(N, 2)`` or ``(B, N, 2)`` [px]; NaN for none.
+            depth_i: Their z-depths ``(N,)`` or ``(B, N)``; 0 where unknown.
+            depth_j: Depth map of frame j ``(H, W)`` or ``(B, H, W)``, or the depths sampled there, shaped as
+                ``depth_i``; 0 or NaN where unknown.
+            K: Calibration matrix ``(3, 3)`` or ``(B, 3, 3)`` [px].
+
+        Raises:
+            ValueError: If shapes do not fit.
+        """
+        return self.reduced(self.residuals(T_j_i, uv, depth_i, depth_j, K), 1)
+
+    if TYPE_CHECKING:
+        __call__ = forward
 
 
 def expected_parallax_px(T_j_i: Tensor, depth_i: Tensor, K: Tensor) -> Tensor:
-    """Expected parallax ``f |t| / z`` of points at ``depth_i (N,)`` [px], ``(N,)``."""
-    return K[0, 0] * (T_j_i[:3, 3].square().sum() + 1e-30).sqrt() / depth_i.clamp_min(1e-6)
+    """Expected parallax ``f |t| / z`` of points at ``depth_i (..., N)`` [px], ``(..., N)``."""
+    baseline = (T_j_i[..., :3, 3].square().sum(-1) + 1e-30).sqrt()
+    return (K[..., 0, 0] * baseline)[..., None] / depth_i.clamp_min(1e-6)
 
 
 def sample_depth(depth: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
-    """Bilinear depths ``(N,)`` of a map ``(H, W)`` at pixels ``(N, 2)``, and which pixels lie inside."""
-    H, W = depth.shape
+    """Bilinear depths of a map at pixels, and which pixels lie inside and touch no hole.
+
+    Args:
+        depth: ``(H, W)`` or ``(B, H, W)``; 0, negative or NaN in holes.
+        uv: ``(N, 2)`` or ``(B, N, 2)`` [px].
+
+    Returns:
+        ``(N,)`` or ``(B, N)`` each.
+    """
+    H, W = depth.shape[-2:]
     size = torch.tensor((W - 1, H - 1), dtype=uv.dtype, device=uv.device)
     inside = ((uv >= 0) & (uv <= size)).all(-1)
     grid = torch.where(inside[..., None], 2.0 * uv / size - 1.0, 0.0)
-    out = F.grid_sample(depth[None, None], grid[None, None], align_corners=True, padding_mode="border")
-    return out[0, 0, 0], inside
+    hole = ~(depth > 0)
+    maps = torch.stack((depth.where(~hole, 0.0), hole.to(depth.dtype)), -3)
+    out = F.grid_sample(
+        maps.reshape(-1, 2, H, W), grid.reshape(-1, 1, grid.shape[-2], 2), align_corners=True, padding_mode="border"
+    )
+    out = out.reshape(*depth.shape[:-2], 2, -1)
+    return out[..., 0, :], inside & (out[..., 1, :] == 0)

@@ -1,31 +1,65 @@
 """Training-only depth terms: each takes log depth ``(B, 1, H, W)`` and a mask, and returns one value per image.
 
-Per-image means (not means over the batch's pixels) make the loss of a batch the mean of its images'
-losses, so the
-same batch split over two processes gives the same gradient.
+Per-image means (not means over the batch's pixels) make the loss of a batch the mean of its images' losses, so the same
+batch split over two processes gives the same gradient.
+
+The mask is bool. Where it is False, prediction and target may be anything, NaN included. All have the same shape:
+``(B, N)`` for samples will do, but for `GradientMatching`.
 """
+
+import math
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
 
+from edgeslam_torch.losses.inputs import check_images, check_mask, in_full_precision
 
+LOG_SQRT_2 = 0.5 * math.log(2.0)
+"""Logarithm of a Laplace distribution's standard deviation over its scale."""
+
+
+@in_full_precision
 def masked_mean(x: Tensor, mask: Tensor) -> Tensor:
-    """Mean of ``x`` where ``mask``, per image: ``(B, ...) -> (B,)``; 0 for an image without a valid pixel."""
-    weight = mask.to(x.dtype)
-    total = torch.where(mask, x, torch.zeros_like(x)).flatten(1).sum(1)
-    return total / weight.flatten(1).sum(1).clamp(min=1.0)
+    """Mean of ``x`` where ``mask``, per image: ``(B, ...) -> (B,)``; 0 for an image without a valid pixel.
+
+    Raises:
+        ValueError: If shapes differ.
+        TypeError: If the mask is not bool.
+    """
+    check_images(x=x, mask=mask)
+    check_mask(mask)
+    return torch.where(mask, x, 0.0).flatten(1).sum(1) / mask.flatten(1).sum(1).clamp(min=1)
+
+
+def _residual(log_depth: Tensor, log_target: Tensor, mask: Tensor) -> Tensor:
+    """Predicted minus observed where ``mask``, 0 elsewhere: what is not observed must not reach later operations,
+    whose gradients of zero times NaN would be NaN."""
+    check_images(log_depth=log_depth, log_target=log_target, mask=mask)
+    check_mask(mask)
+    return torch.where(mask, log_depth - log_target, 0.0)
 
 
 class MaskedL1(nn.Module):
     """Mean absolute difference of log depth: a relative error, weighted equally near and far."""
 
-    def residuals(self, log_depth: Tensor, log_target: Tensor) -> Tensor:
-        """Predicted minus observed log depth, ``(B, 1, H, W)``."""
-        return log_depth - log_target
-
+    @in_full_precision
     def forward(self, log_depth: Tensor, log_target: Tensor, mask: Tensor) -> Tensor:
-        """``(B,)``."""
-        return masked_mean(self.residuals(log_depth, log_target).abs(), mask)
+        """Mean over valid pixels ``(B,)``.
+
+        Args:
+            log_depth: Predicted ``(B, 1, H, W)`` [log m].
+            log_target: Observed ``(B, 1, H, W)`` [log m].
+            mask: Where it is known ``(B, 1, H, W)`` bool.
+
+        Raises:
+            ValueError: If shapes differ.
+            TypeError: If the mask is not bool.
+        """
+        return masked_mean(_residual(log_depth, log_target, mask).abs(), mask)
+
+    if TYPE_CHECKING:
+        __call__ = forward
 
 
 class BerHu(nn.Module):
@@ -39,11 +73,25 @@ class BerHu(nn.Module):
         super().__init__()
         self.fraction = fraction
 
+    @in_full_precision
     def forward(self, log_depth: Tensor, log_target: Tensor, mask: Tensor) -> Tensor:
-        """``(B,)``."""
-        r = torch.where(mask, log_depth - log_target, 0.0).abs()
+        """Mean over valid pixels ``(B,)``.
+
+        Args:
+            log_depth: Predicted ``(B, 1, H, W)`` [log m].
+            log_target: Observed ``(B, 1, H, W)`` [log m].
+            mask: Where it is known ``(B, 1, H, W)`` bool.
+
+        Raises:
+            ValueError: If shapes differ.
+            TypeError: If the mask is not bool.
+        """
+        r = _residual(log_depth, log_target, mask).abs()
         c = (self.fraction * r.flatten(1).amax(1)).clamp(min=1e-6).view(-1, *[1] * (r.ndim - 1))
         return masked_mean(torch.where(r <= c, r, (r * r + c * c) / (2 * c)), mask)
+
+    if TYPE_CHECKING:
+        __call__ = forward
 
 
 class SILog(nn.Module):
@@ -57,15 +105,28 @@ class SILog(nn.Module):
         super().__init__()
         self.balance = balance
 
+    @in_full_precision
     def forward(self, log_depth: Tensor, log_target: Tensor, mask: Tensor) -> Tensor:
-        """``(B,)``."""
-        r = log_depth - log_target
+        """Error over valid pixels ``(B,)``, squared [log m].
+
+        Args:
+            log_depth: Predicted ``(B, 1, H, W)`` [log m].
+            log_target: Observed ``(B, 1, H, W)`` [log m].
+            mask: Where it is known ``(B, 1, H, W)`` bool.
+
+        Raises:
+            ValueError: If shapes differ.
+            TypeError: If the mask is not bool.
+        """
+        r = _residual(log_depth, log_target, mask)
         return masked_mean(r * r, mask) - self.balance * masked_mean(r, mask).square()
+
+    if TYPE_CHECKING:
+        __call__ = forward
 
 
 class GradientMatching(nn.Module):
-    """Absolute difference of the residual's gradients over several scales (MegaDepth, CVPR 2018): keeps
-    edges sharp.
+    """Absolute difference of the residual's gradients over several scales (MegaDepth, CVPR 2018): keeps edges sharp.
 
     Args:
         scales: Differences over 1, 2, 4, ... pixels.
@@ -75,10 +136,20 @@ class GradientMatching(nn.Module):
         super().__init__()
         self.scales = scales
 
+    @in_full_precision
     def forward(self, log_depth: Tensor, log_target: Tensor, mask: Tensor) -> Tensor:
-        """``(B,)``."""
-        # Invalid targets may be NaN: set them to zero before differences spread them.
-        r = torch.where(mask, log_depth - log_target, torch.zeros_like(log_depth))
+        """Mean over pairs of valid pixels ``(B,)``.
+
+        Args:
+            log_depth: Predicted ``(B, 1, H, W)`` [log m].
+            log_target: Observed ``(B, 1, H, W)`` [log m].
+            mask: Where it is known ``(B, 1, H, W)`` bool.
+
+        Raises:
+            ValueError: If shapes differ.
+            TypeError: If the mask is not bool.
+        """
+        r = _residual(log_depth, log_target, mask)
         total = r.new_zeros(r.shape[0])
         for scale in range(self.scales):
             d = 2**scale
@@ -89,6 +160,9 @@ class GradientMatching(nn.Module):
             total = total + masked_mean(dx.abs(), mx) + masked_mean(dy.abs(), my)
         return total / self.scales
 
+    if TYPE_CHECKING:
+        __call__ = forward
+
 
 class LaplaceNll(nn.Module):
     """Negative log likelihood of a Laplace distribution: trains the uncertainty head.
@@ -96,8 +170,25 @@ class LaplaceNll(nn.Module):
     The residual is detached, so that the head describes the error without reducing its penalty.
     """
 
+    @in_full_precision
     def forward(self, log_sigma: Tensor, log_depth: Tensor, log_target: Tensor, mask: Tensor) -> Tensor:
-        """``(B,)``; the standard deviation of a Laplace distribution is sqrt(2) times its scale."""
-        log_b = log_sigma - 0.5 * torch.log(log_sigma.new_tensor(2.0))
-        r = torch.where(mask, log_depth - log_target, torch.zeros_like(log_depth)).detach().abs()
+        """Mean over valid pixels ``(B,)``.
+
+        Args:
+            log_sigma: Predicted logarithm of the standard deviation of ``log_depth`` ``(B, 1, H, W)``; that of a
+                Laplace distribution is sqrt(2) times its scale.
+            log_depth: Predicted ``(B, 1, H, W)`` [log m]; gets no gradient.
+            log_target: Observed ``(B, 1, H, W)`` [log m].
+            mask: Where it is known ``(B, 1, H, W)`` bool.
+
+        Raises:
+            ValueError: If shapes differ.
+            TypeError: If the mask is not bool.
+        """
+        check_images(log_sigma=log_sigma, log_depth=log_depth)
+        r = _residual(log_depth, log_target, mask).detach().abs()
+        log_b = log_sigma.where(mask, 0.0) - LOG_SQRT_2
         return masked_mean(r * torch.exp(-log_b) + log_b, mask)
+
+    if TYPE_CHECKING:
+        __call__ = forward

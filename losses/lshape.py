@@ -1,6 +1,7 @@
 """L-shape consistency: the angle and the straightness of the arms of corners, paper eqs. (24)-(27)."""
 
 from enum import StrEnum
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -16,6 +17,7 @@ from edgeslam_torch.losses.base import (
     reduce,
 )
 from edgeslam_torch.losses.edge_alignment import PairGeometry, depth_slopes, pair_geometry
+from edgeslam_torch.losses.inputs import check_mask, check_shapes, in_full_precision
 from edgeslam_torch.losses.robust import Kernel
 
 
@@ -50,33 +52,63 @@ class AngleLoss(ResidualLoss):
         super().__init__(reduction, kernel, delta)
         self.form, self.gate_cos = AngleForm(form), gate_cos
 
-    def residuals(  # type: ignore[override]
-        self, T_j_i: Tensor, uv: Tensor, depth_i: Tensor, cos_j: Tensor, K: Tensor
-    ) -> Residuals:
+    @in_full_precision
+    def residuals(self, T_j_i: Tensor, uv: Tensor, depth_i: Tensor, cos_j: Tensor, K: Tensor) -> Residuals:
         """Cosine of the projected angle minus the expected cosine.
 
         Args:
-            T_j_i: Motion from frame i to frame j ``(4, 4)``.
-            uv: Corner, end of arm 1, end of arm 2 in frame i ``(C, 3, 2)`` [px].
-            depth_i: Their z-depths ``(C, 3)``.
+            T_j_i: Motion from frame i to frame j ``(4, 4)``, in the depths' unit.
+            uv: Corner, end of arm 1, end of arm 2 in frame i ``(C, 3, 2)`` [px]; NaN for none.
+            depth_i: Their z-depths ``(C, 3)``; 0 where unknown.
             cos_j: Cosine of the angle observed in frame j ``(C,)``; NaN if not observed. Not used by
                 ``SAME_FRAME`` and ``RIGHT_ANGLE``.
             K: Calibration matrix ``(3, 3)`` [px].
 
         Returns:
-            ``(C, 1)``.
+            ``(C, 1)``; all may have a leading batch axis.
+
+        Raises:
+            ValueError: If shapes do not fit.
         """
-        p_i = back_project(uv, depth_i, K)
-        positive = (depth_i > 0).all(-1)
+        check_shapes(
+            T_j_i=(T_j_i, "4 4"), uv=(uv, "C 3 2"), depth_i=(depth_i, "C 3"), cos_j=(cos_j, "C"), K=(K, "? 3 3")
+        )
+        seen = uv.isfinite().all((-1, -2)) & ~(depth_i <= 0).any(-1)
+        if self.form is AngleForm.CROSS_VIEW:
+            seen = seen & cos_j.isfinite()
+            cos_j = cos_j.where(seen, 0.0)
+        uv, depth_i = uv.where(seen[..., None, None], 0.0), depth_i.where(seen[..., None], 1.0)
+        p = back_project(uv.flatten(-3, -2), depth_i.flatten(-2), K)  # (..., 3 C, 3)
+        if self.form is AngleForm.CROSS_VIEW:
+            p = move(T_j_i, p)
+        lost = seen & p.isnan().any(-1).unflatten(-1, (-1, 3)).any(-1)
         if self.form is AngleForm.RIGHT_ANGLE:
-            cos, proper = cosine(p_i[:, 1] - p_i[:, 0], p_i[:, 2] - p_i[:, 0])
-            return masked(cos[:, None], positive & proper & (cos.detach().abs() < self.gate_cos))
-        same = self.form is AngleForm.SAME_FRAME
-        projected, front = project(p_i if same else move(T_j_i, p_i), K)
-        cos, proper = cosine(projected[:, 1] - projected[:, 0], projected[:, 2] - projected[:, 0])
-        expected = cosine(uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0])[0] if same else cos_j
-        valid = positive & front.all(-1) & proper & expected.isfinite()
-        return masked((cos - torch.where(valid, expected, 0.0))[:, None], valid)
+            cos, proper = _cosine_of_arms(p.unflatten(-2, (-1, 3)))
+            return masked(cos[..., None], seen & proper & (cos.detach().abs() < self.gate_cos), lost)
+        projected, front = project(p, K)
+        cos, proper = _cosine_of_arms(projected.unflatten(-2, (-1, 3)))
+        expected = cos_j if self.form is AngleForm.CROSS_VIEW else _cosine_of_arms(uv)[0]
+        valid = seen & front.unflatten(-1, (-1, 3)).all(-1) & proper
+        return masked((cos - expected)[..., None], valid, lost)
+
+    @in_full_precision
+    def forward(self, T_j_i: Tensor, uv: Tensor, depth_i: Tensor, cos_j: Tensor, K: Tensor) -> Tensor:
+        """Mean (or sum) over corners of squared differences of cosines ``()``, ``(B,)`` for a batch of pairs.
+
+        Args:
+            T_j_i: Motion from frame i to frame j ``(4, 4)`` or ``(B, 4, 4)``, in the depths' unit.
+            uv: Corner, end of arm 1, end of arm 2 in frame i ``(C, 3, 2)`` or ``(B, C, 3, 2)`` [px]; NaN for none.
+            depth_i: Their z-depths ``(C, 3)`` or ``(B, C, 3)``; 0 where unknown.
+            cos_j: Cosine of the angle observed in frame j ``(C,)`` or ``(B, C)``; NaN if not observed.
+            K: Calibration matrix ``(3, 3)`` or ``(B, 3, 3)`` [px].
+
+        Raises:
+            ValueError: If shapes do not fit.
+        """
+        return self.reduced(self.residuals(T_j_i, uv, depth_i, cos_j, K), 1)
+
+    if TYPE_CHECKING:
+        __call__ = forward
 
 
 def cosine(a: Tensor, b: Tensor, min_length: float = 1e-6) -> tuple[Tensor, Tensor]:
@@ -84,6 +116,11 @@ def cosine(a: Tensor, b: Tensor, min_length: float = 1e-6) -> tuple[Tensor, Tens
     squared = a.square().sum(-1) * b.square().sum(-1)
     proper = squared > min_length**4
     return (a * b).sum(-1) * torch.where(proper, squared, 1.0).rsqrt(), proper
+
+
+def _cosine_of_arms(points: Tensor) -> tuple[Tensor, Tensor]:
+    """`cosine` between the arms of corners ``(..., 3, D)``."""
+    return cosine(points[..., 1, :] - points[..., 0, :], points[..., 2, :] - points[..., 0, :])
 
 
 class CollinearityLoss(ResidualLoss):
@@ -106,18 +143,29 @@ class CollinearityLoss(ResidualLoss):
         super().__init__(reduction, kernel, delta)
         self.literal = literal
 
-    def residuals(self, p: Tensor, mask: Tensor | None = None) -> Residuals:  # type: ignore[override]
+    @in_full_precision
+    def residuals(self, p: Tensor, mask: Tensor | None = None) -> Residuals:
         """Offsets of points from their arms' lines.
 
         Args:
             p: Points of each arm ``(C, 2, M, 3)`` [m].
-            mask: Which points exist ``(C, 2, M)``; all by default.
+            mask: Which points exist ``(C, 2, M)`` bool; all by default.
 
         Returns:
             ``(C, 2, M, 3)`` offset vectors over the root of the arm's number of points, so that the squares of an
-            arm add up to its mean; invalid for arms of fewer than 3 points.
+            arm add up to its mean; invalid for arms of fewer than 3 points. All may have a leading batch axis.
+
+        Raises:
+            ValueError: If shapes do not fit.
+            TypeError: If the mask is not bool.
         """
+        check_shapes(p=(p, "C 2 M 3"))
+        if mask is not None:
+            check_shapes(p=(p, "C 2 M 3"), mask=(mask, "C 2 M"))
+            check_mask(mask)
         given = torch.ones(p.shape[:-1], dtype=torch.bool, device=p.device) if mask is None else mask
+        lost = given & p.isnan().any(-1)
+        p = p.where((given & ~lost)[..., None], 0.0)
         weight = given.to(p.dtype)[..., None]
         count = weight.sum(-2, keepdim=True)
         centre = (p * weight).sum(-2, keepdim=True) / count.clamp_min(1)
@@ -130,15 +178,28 @@ class CollinearityLoss(ResidualLoss):
             divisor = count.sqrt() if self.literal else count.sqrt() * length[..., None, None].clamp_min(1e-9)
         centred = p - centre
         across = centred - (centred @ direction) * direction.mT
-        return masked(across / divisor.clamp_min(1e-9), valid)
+        return masked(across / divisor.clamp_min(1e-9), valid, lost)
 
-    def forward(self, p: Tensor, mask: Tensor | None = None) -> Tensor:  # type: ignore[override]
-        """Mean (or sum) over corners of both arms' mean squared offsets ``()``; arguments as `residuals`."""
+    @in_full_precision
+    def forward(self, p: Tensor, mask: Tensor | None = None) -> Tensor:
+        """Mean (or sum) over corners of both arms' mean squared offsets ``()``, ``(B,)`` for a batch.
+
+        Args:
+            p: Points of each arm ``(C, 2, M, 3)`` or ``(B, C, 2, M, 3)`` [m].
+            mask: Which points exist ``(C, 2, M)`` or ``(B, C, 2, M)``, bool; all by default.
+
+        Raises:
+            ValueError: If shapes do not fit.
+            TypeError: If the mask is not bool.
+        """
         residuals = self.residuals(p, mask)
-        total = reduce(residuals, Reduction.SUM, self.kernel, self.delta)
+        total = reduce(residuals, Reduction.SUM, self.kernel, self.delta, axes=3)
         if self.reduction is Reduction.SUM:
             return total
-        return total / residuals.valid.flatten(1).any(1).sum().clamp_min(1)
+        return total / residuals.valid.flatten(-2).any(-1).sum(-1).clamp_min(1)
+
+    if TYPE_CHECKING:
+        __call__ = forward
 
 
 class LShapeLoss(torch.nn.Module):
@@ -157,6 +218,7 @@ class LShapeLoss(torch.nn.Module):
         """The paper's terms as printed."""
         return cls(AngleLoss(AngleForm.SAME_FRAME), CollinearityLoss(literal=True), lambda_theta, lambda_col)
 
+    @in_full_precision
     def forward(
         self,
         T_j_i: Tensor,
@@ -167,9 +229,27 @@ class LShapeLoss(torch.nn.Module):
         arms: Tensor,
         arms_mask: Tensor | None = None,
     ) -> Tensor:
-        """Weighted sum ``()``; arguments as the two terms take them, ``arms`` being the collinearity's points."""
+        """Weighted sum of the two terms ``()``, ``(B,)`` for a batch of pairs.
+
+        Args:
+            T_j_i: Motion from frame i to frame j ``(4, 4)`` or ``(B, 4, 4)``, in the depths' unit.
+            uv: Corner, end of arm 1, end of arm 2 in frame i ``(C, 3, 2)`` or ``(B, C, 3, 2)`` [px]; NaN for none.
+            depth_i: Their z-depths ``(C, 3)`` or ``(B, C, 3)``; 0 where unknown.
+            cos_j: Cosine of the angle observed in frame j ``(C,)`` or ``(B, C)``; NaN if not observed.
+            K: Calibration matrix ``(3, 3)`` or ``(B, 3, 3)`` [px].
+            arms: Points of straight arms ``(A, 2, M, 3)`` or ``(B, A, 2, M, 3)`` [m], of these corners or others.
+            arms_mask: Which of them exist ``(A, 2, M)`` or ``(B, A, 2, M)``, bool; all by default.
+
+        Raises:
+            ValueError: If shapes do not fit.
+            TypeError: If the mask is not bool.
+        """
+        check_shapes(T_j_i=(T_j_i, "4 4"), arms=(arms, "A 2 M 3"))  # one batch
         angle = self.angle(T_j_i, uv, depth_i, cos_j, K)
         return self.lambda_theta * angle + self.lambda_col * self.collinearity(arms, arms_mask)
+
+    if TYPE_CHECKING:
+        __call__ = forward
 
 
 def junction_residuals(

@@ -1,25 +1,40 @@
-"""Photometric reprojection for self-supervised depth (Godard et al., ICCV 2019): training only."""
+"""Photometric reprojection for self-supervised depth (Godard et al., ICCV 2019): training only.
+
+SSIM and warp are own ones: kornia's are slower, and its warp does not say which pixels it could see
+(docs/decisions/0092-kornia.md). Tests hold them together.
+"""
+
+from typing import TYPE_CHECKING
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from edgeslam_torch.losses.base import back_project, move, project
+from edgeslam_torch.losses.inputs import check_shapes, in_full_precision
+
 SSIM_WEIGHT = 0.85
 _C1, _C2 = 0.01**2, 0.03**2
 """Stabilisers of SSIM for images in [0, 1] (Wang et al., 2004)."""
+NEAREST = 1e-3
+"""Smallest depth in the other frame, in the depth's unit."""
+ROUNDING_PX = 0.01
+"""How far outside a pixel still counts as inside: a camera that moves sideways leaves the first and the last row on the
+border itself, and rounding would choose which of their pixels count."""
 
 
+@in_full_precision
 def warp_to(image_j: Tensor, depth_i: Tensor, T_j_i: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
     """View i synthesised from frame j.
 
     Args:
         image_j: ``(B, 3, H, W)`` in [0, 1].
-        depth_i: z-depth of view i ``(B, 1, H, W)`` [same unit as ``T_j_i``].
+        depth_i: z-depth of view i ``(B, 1, H, W)`` [same unit as ``T_j_i``]; 0 where unknown.
         T_j_i: Camera i to camera j ``(B, 4, 4)``.
         K: Intrinsics of both ``(B, 3, 3)`` [px].
 
     Returns:
-        Warped image ``(B, 3, H, W)`` and where it is valid (in front, inside) ``(B, 1, H, W)``.
+        Warped image ``(B, 3, H, W)`` and where it is valid (known, in front, inside) ``(B, 1, H, W)``.
     """
     B, _, H, W = depth_i.shape
     v, u = torch.meshgrid(
@@ -27,61 +42,91 @@ def warp_to(image_j: Tensor, depth_i: Tensor, T_j_i: Tensor, K: Tensor) -> tuple
         torch.arange(W, dtype=depth_i.dtype, device=depth_i.device),
         indexing="ij",
     )
-    pixels = torch.stack((u, v, torch.ones_like(u))).reshape(1, 3, -1)
-    p_i = torch.linalg.solve(K, pixels.expand(B, -1, -1)) * depth_i.reshape(B, 1, -1)
-    p_j = T_j_i[:, :3, :3] @ p_i + T_j_i[:, :3, 3:]
-    z = p_j[:, 2:].clamp(min=1e-3)
-    uv = (K @ (p_j / z))[:, :2]
-    grid = torch.stack((2 * uv[:, 0] / (W - 1) - 1, 2 * uv[:, 1] / (H - 1) - 1), -1).reshape(B, H, W, 2)
-    valid = (grid.abs() <= 1).all(-1) & (p_j[:, 2] > 1e-3).reshape(B, H, W)
+    pixels = torch.stack((u, v), -1).reshape(1, -1, 2)
+    depth = depth_i.flatten(1)
+    known = ~(depth <= 0)
+    p_j = move(T_j_i, back_project(pixels, depth.where(known, 1.0), K))
+    uv, front = project(p_j, K, NEAREST)
+    size = uv.new_tensor((W - 1, H - 1))
+    valid = (known & front & ((uv >= -ROUNDING_PX) & (uv <= size + ROUNDING_PX)).all(-1)).reshape(B, 1, H, W)
     # Values far outside would overflow float32 in the sampler's derivative.
-    warped = F.grid_sample(image_j, grid.clamp(-2, 2), padding_mode="border", align_corners=True)
-    return warped, valid[:, None]
+    grid = (2.0 * uv / size - 1.0).clamp(-2, 2).reshape(B, H, W, 2)
+    return F.grid_sample(image_j, grid, padding_mode="border", align_corners=True), valid
 
 
+@in_full_precision
 def dissimilarity(a: Tensor, b: Tensor) -> Tensor:
-    """``0.85 (1 - SSIM) / 2 + 0.15 |a - b|`` per pixel, mean over colours: ``(B, 3, H, W)`` twice -> ``(B,
-    1, H, W)``."""
+    """``0.85 (1 - SSIM) / 2 + 0.15 |a - b|`` per pixel, mean over colours: ``(B, 3, H, W)`` twice, ``(B, 1, H, W)``."""
     l1 = (a - b).abs().mean(1, keepdim=True)
+    distance = ((1 - ssim(a, b)) / 2).clamp(0, 1).mean(1, keepdim=True)
+    return SSIM_WEIGHT * distance + (1 - SSIM_WEIGHT) * l1
+
+
+def ssim(a: Tensor, b: Tensor) -> Tensor:
+    """Structural similarity in windows of 3 x 3 pixels: images ``(B, C, H, W)`` in [0, 1], and as much out."""
     x, y = F.pad(a, (1, 1, 1, 1), mode="reflect"), F.pad(b, (1, 1, 1, 1), mode="reflect")
     mx, my = F.avg_pool2d(x, 3, 1), F.avg_pool2d(y, 3, 1)
     vx = (F.avg_pool2d(x * x, 3, 1) - mx * mx).clamp(min=0)
     vy = (F.avg_pool2d(y * y, 3, 1) - my * my).clamp(min=0)
     vxy = F.avg_pool2d(x * y, 3, 1) - mx * my
-    ssim = ((2 * mx * my + _C1) * (2 * vxy + _C2)) / ((mx * mx + my * my + _C1) * (vx + vy + _C2))
-    distance = ((1 - ssim) / 2).clamp(0, 1).mean(1, keepdim=True)
-    return SSIM_WEIGHT * distance + (1 - SSIM_WEIGHT) * l1
+    return ((2 * mx * my + _C1) * (2 * vxy + _C2)) / ((mx * mx + my * my + _C1) * (vx + vy + _C2))
 
 
 class PhotometricLoss(nn.Module):
     """Smallest dissimilarity over the source frames; pixels that match better without motion are masked."""
 
+    @in_full_precision
     def forward(self, image_i: Tensor, images_j: Tensor, depth_i: Tensor, T_j_i: Tensor, K: Tensor) -> Tensor:
-        """Mean per image ``(B,)``.
+        """Mean per image ``(B,)``; NaN for a depth or motion of NaN.
 
         Args:
             image_i: ``(B, 3, H, W)`` in [0, 1].
             images_j: Source frames ``(B, S, 3, H, W)``.
-            depth_i: ``(B, 1, H, W)``.
-            T_j_i: ``(B, S, 4, 4)``.
-            K: ``(B, 3, 3)``.
+            depth_i: Predicted z-depth ``(B, 1, H, W)`` [m, or the motions' unit]; 0 where unknown.
+            T_j_i: Motions from frame i to the source frames ``(B, S, 4, 4)``.
+            K: Calibration matrix of all ``(B, 3, 3)`` [px].
+
+        Raises:
+            ValueError: If shapes do not fit.
         """
+        check_shapes(
+            image_i=(image_i, "B 3 H W"),
+            images_j=(images_j, "B S 3 H W"),
+            depth_i=(depth_i, "B 1 H W"),
+            T_j_i=(T_j_i, "B S 4 4"),
+            K=(K, "B 3 3"),
+        )
         costs, still = [], []
         for s in range(images_j.shape[1]):
             warped, valid = warp_to(images_j[:, s], depth_i, T_j_i[:, s], K)
             cost = dissimilarity(warped, image_i)
-            costs.append(torch.where(valid, cost, torch.full_like(cost, 1e3)))
+            costs.append(torch.where(valid, cost, 1e3))
             still.append(dissimilarity(images_j[:, s], image_i))
         best, unmoved = torch.stack(costs).amin(0), torch.stack(still).amin(0)
         mask = (best < unmoved.detach()) & (best < 1e2)
-        return (torch.where(mask, best, 0.0).flatten(1).sum(1)) / mask.flatten(1).sum(1).clamp(min=1)
+        mean = torch.where(mask, best, 0.0).flatten(1).sum(1) / mask.flatten(1).sum(1).clamp(min=1)
+        lost = depth_i.isnan().flatten(1).any(1) | T_j_i.isnan().flatten(1).any(1)
+        return torch.where(lost, torch.nan, mean)
+
+    if TYPE_CHECKING:
+        __call__ = forward
 
 
 class SmoothnessLoss(nn.Module):
     """Second-order smoothness of log depth where the image is smooth; planes in log depth are free."""
 
+    @in_full_precision
     def forward(self, log_depth: Tensor, image: Tensor) -> Tensor:
-        """``(B, 1, H, W)`` and ``(B, 3, H, W)`` -> ``(B,)``."""
+        """Mean per image ``(B,)``.
+
+        Args:
+            log_depth: Predicted ``(B, 1, H, W)`` [log m].
+            image: ``(B, 3, H, W)`` in [0, 1].
+
+        Raises:
+            ValueError: If shapes do not fit.
+        """
+        check_shapes(log_depth=(log_depth, "B 1 H W"), image=(image, "B 3 H W"))
         total = log_depth.new_zeros(log_depth.shape[0])
         for dim in (-1, -2):
             bend = log_depth.diff(n=2, dim=dim).abs()
@@ -90,3 +135,6 @@ class SmoothnessLoss(nn.Module):
             weight = torch.exp(-10.0 * torch.maximum(contrast.narrow(dim, 0, n), contrast.narrow(dim, 1, n)))
             total = total + (bend * weight).flatten(1).mean(1)
         return total
+
+    if TYPE_CHECKING:
+        __call__ = forward

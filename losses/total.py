@@ -1,6 +1,7 @@
 """The total loss, paper eq. (28)."""
 
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
@@ -23,8 +24,8 @@ class TotalLoss(nn.Module):
             raise ValueError(f"weights must not be negative, got {negative}")
         self.weights = dict(weights)
 
-    def forward(self, terms: Mapping[str, Tensor]) -> Tensor:
-        """Weighted sum ``()`` of scalar terms.
+    def weighted(self, terms: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Each term times its weight, those of weight 0 left out.
 
         Raises:
             ValueError: For a term without a weight, or no term.
@@ -32,4 +33,21 @@ class TotalLoss(nn.Module):
         unknown = terms.keys() - self.weights.keys()
         if unknown or not terms:
             raise ValueError(f"terms {sorted(terms)} must be some of {sorted(self.weights)}")
-        return torch.stack([self.weights[k] * v for k, v in terms.items()]).sum()
+        return {name: self.weights[name] * term for name, term in terms.items() if self.weights[name]}
+
+    def forward(self, terms: Mapping[str, Tensor]) -> Tensor:
+        """Weighted sum of terms, shaped as each of them: ``()``, or ``(B,)`` one value an item.
+
+        Raises:
+            ValueError: For a term without a weight, no term, or terms of several shapes.
+        """
+        shapes = {name: tuple(term.shape) for name, term in terms.items()}
+        if len(set(shapes.values())) > 1:
+            raise ValueError(f"terms must have one shape, got {shapes}")
+        weighted = self.weighted(terms)
+        if not weighted:
+            return torch.zeros_like(next(iter(terms.values())))
+        return torch.stack(list(weighted.values())).sum(0)
+
+    if TYPE_CHECKING:
+        __call__ = forward

@@ -1,0 +1,199 @@
+"""What every public loss promises to training loops that are not ours: precision, NaN, shapes, batches, tracing."""
+
+import inspect
+
+import pytest
+import torch
+from loss_cases import CASES, B, Case, H, W
+from torch import Tensor, nn
+
+from edgeslam_torch import losses
+
+EVERY = pytest.mark.parametrize("case", [pytest.param(case, id=name) for name, case in CASES.items()])
+HALVES = pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16], ids=str)
+
+
+def cast(arguments: dict[str, Tensor], dtype: torch.dtype) -> dict[str, Tensor]:
+    return {name: x.to(dtype) if x.is_floating_point() else x for name, x in arguments.items()}
+
+
+def item(arguments: dict[str, Tensor], b: int) -> dict[str, Tensor]:
+    return {name: x[b] for name, x in arguments.items()}
+
+
+def gradient(case: Case, arguments: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+    """Loss and its gradient by what is predicted."""
+    x = arguments[case.predicted].detach().clone().requires_grad_()
+    value = case.loss(**{**arguments, case.predicted: x})
+    value.sum().backward()
+    assert x.grad is not None
+    return value.detach(), x.grad
+
+
+def test_every_exported_loss_has_a_case():
+    exported = {getattr(losses, name) for name in losses.__all__}
+    modules = {x for x in exported if inspect.isclass(x) and issubclass(x, nn.Module)}
+    assert modules - {losses.ResidualLoss, losses.TotalLoss} == {type(case.loss) for case in CASES.values()}
+
+
+@EVERY
+def test_one_value_an_item_and_a_scalar_for_one(case):
+    given = case.given()
+    together = case.loss(**given)
+    assert together.shape == (B,) and (together > 0).all() or isinstance(case.loss, losses.LaplaceNll)
+    for b in range(B):
+        if case.batch_only:
+            alone = case.loss(**{name: x[b : b + 1] for name, x in given.items()})[0]
+        else:
+            alone = case.loss(**item(given, b))
+            assert alone.shape == ()
+        torch.testing.assert_close(together[b], alone)
+
+
+@EVERY
+def test_gradient_is_right(case):
+    if case.loss is CASES["collinearity"].loss:
+        pytest.skip("holds its arms' lengths as well as their lines; in metres (literal) it has no lengths")
+    given = case.given()
+    x = given[case.predicted].clone().requires_grad_()
+    assert torch.autograd.gradcheck(
+        lambda x: case.loss(**{**given, case.predicted: x}), x, fast_mode=True, eps=1e-7, atol=1e-5
+    )
+
+
+@EVERY
+def test_float32_is_float64_rounded(case):
+    value, slope = gradient(case, cast(case.given(), torch.float32))
+    exact, exact_slope = gradient(case, case.given())
+    assert (value.dtype, slope.dtype) == (torch.float32, torch.float32)
+    torch.testing.assert_close(value.double(), exact, rtol=2e-4, atol=1e-5)
+    assert float((slope - exact_slope).norm() / exact_slope.norm()) < 2e-3
+
+
+@EVERY
+@HALVES
+def test_half_is_computed_in_float32(case, dtype):
+    """The inputs are rounded, the arithmetic is not: the same numbers in float32 give the same result."""
+    rounded = cast(case.given(), dtype)
+    value, slope = gradient(case, rounded)
+    exact, exact_slope = gradient(case, cast(rounded, torch.float32))
+    assert (value.dtype, slope.dtype) == (torch.float32, dtype)
+    torch.testing.assert_close(value, exact)
+    torch.testing.assert_close(slope, exact_slope.to(dtype))
+
+
+@EVERY
+def test_autocast_changes_nothing(case):
+    given = cast(case.given(), torch.float32)
+    with torch.autocast("cpu", torch.bfloat16):
+        inside = case.loss(**given)
+    assert torch.equal(inside, case.loss(**given))
+
+
+@HALVES
+def test_half_holds_a_whole_image(dtype):
+    """480 x 640 valid pixels: more than the largest float16."""
+    one = torch.ones(1, 1, 480, 640, dtype=dtype, requires_grad=True)
+    zero, mask = torch.zeros_like(one), torch.ones(1, 1, 480, 640, dtype=torch.bool)
+    for loss in (losses.MaskedL1(), losses.SILog(), losses.BerHu(), losses.GradientMatching()):
+        value = loss(one, zero, mask)
+        expected = {losses.SILog: 0.5, losses.GradientMatching: 0.0, losses.BerHu: 2.6}.get(type(loss), 1.0)
+        assert value.item() == pytest.approx(expected)
+    image = torch.full((1, 3, 480, 640), 0.5, dtype=dtype)
+    motion, K = torch.eye(4, dtype=dtype)[None, None], torch.tensor([[[500.0, 0, 320], [0, 500, 240], [0, 0, 1]]])
+    assert losses.PhotometricLoss()(image, image[:, None], one, motion, K.to(dtype)).item() == 0.0
+
+
+@pytest.mark.parametrize("case", [pytest.param(c, id=n) for n, c in CASES.items() if c.out])
+def test_what_is_not_observed_leaves_no_trace(case):
+    """Whatever its numbers are, it has no part in the value, and none in any input's gradient."""
+    given = {name: x.clone() for name, x in case.given().items()}
+    chosen = given[case.out].view(B, -1)
+    chosen[0, 0] = False if chosen.dtype is torch.bool else torch.nan
+    without = case.loss(**given)
+    assert without.isfinite().all()
+    for name, numbers in case.with_it.items():
+        given[name].view(B, -1)[0, :numbers] = torch.nan
+    inputs = {name: x.requires_grad_() for name, x in given.items() if x.is_floating_point()}
+    value = case.loss(**given)
+    torch.testing.assert_close(value, without)
+    slopes = torch.autograd.grad(value.sum(), list(inputs.values()), allow_unused=True)
+    assert [n for n, slope in zip(inputs, slopes, strict=True) if slope is not None and slope.isnan().any()] == []
+
+
+@EVERY
+def test_prediction_of_nan_is_seen_in_its_item_alone(case):
+    given = {name: x.clone() for name, x in case.given().items()}
+    given[case.predicted].view(B, -1)[0, 0] = torch.nan
+    value = case.loss(**given)
+    assert value.isnan().tolist() == [True, False]
+
+
+@pytest.mark.parametrize("case", [pytest.param(c, id=n) for n, c in CASES.items() if "T_j_i" in c.given()])
+def test_motion_of_nan_is_seen(case):
+    if isinstance(case.loss, losses.AngleLoss) and case.loss.form is losses.AngleForm.RIGHT_ANGLE:
+        pytest.skip("an angle in one frame has no motion")
+    given = {name: x.clone() for name, x in case.given().items()}
+    given["T_j_i"].view(B, -1)[1] = torch.nan
+    assert case.loss(**given).isnan().tolist() == [False, True]
+
+
+@EVERY
+def test_axes_that_do_not_fit_are_refused(case):
+    given = case.given()
+    for name, x in given.items():
+        for wrong in (x[:, :-1], x[..., None], x[:1].expand(3, *x.shape[1:])):
+            if name == "depth_j" and wrong.ndim == x.ndim and len(wrong) == B:
+                continue  # the map of frame j may have a size of its own
+            with pytest.raises(ValueError, match=f"shapes .* \\({', '.join(map(str, wrong.shape))}\\)"):
+                case.loss(**{**given, name: wrong})
+
+
+def test_images_without_their_channel_are_refused():
+    """Broadcasting would compare every image with every other."""
+    x = torch.zeros(2, 1, 4, 5)
+    with pytest.raises(ValueError, match=r"log_target \(2, 4, 5\)"):
+        losses.MaskedL1()(x, x[:, 0], torch.ones_like(x, dtype=torch.bool))
+    with pytest.raises(ValueError, match="shapes must be the same"):
+        losses.masked_mean(x[:, 0], torch.ones_like(x, dtype=torch.bool))
+
+
+@pytest.mark.parametrize(
+    "case", [pytest.param(c, id=n) for n, c in CASES.items() if {"mask", "arms_mask"} & {*c.given()}]
+)
+def test_mask_of_numbers_is_refused_with_what_to_write(case):
+    given = case.given()
+    name = "mask" if "mask" in given else "arms_mask"
+    with pytest.raises(TypeError, match="mask must be bool, not numbers; write mask > 0.5"):
+        case.loss(**{**given, name: given[name].float()})
+
+
+def test_holes_of_a_depth_map_are_not_mixed_into_its_samples():
+    depth = torch.full((1, H, W), 2.0)
+    depth[0, 5, 5], depth[0, 8, 8] = torch.nan, 0.0
+    uv = torch.tensor([[[3.0, 3.0], [4.5, 5.0], [5.0, 5.0], [7.9, 8.0], [5.0, 4.0]]])
+    d, known = losses.sample_depth(depth, uv)
+    assert known.tolist() == [[True, False, False, False, True]]
+    assert d[known].tolist() == [2.0, 2.0]
+
+
+@pytest.mark.slow
+@EVERY
+def test_compiled_whole_it_gives_the_same(case):
+    """The graph's capture is what can fail for a loss; machine code is the compiler's business."""
+    given = cast(case.given(), torch.float32)
+    compiled = torch.compile(case.loss, fullgraph=True, backend="aot_eager")
+    x = given[case.predicted].clone().requires_grad_()
+    value = compiled(**{**given, case.predicted: x})
+    value.sum().backward()
+    expected, slope = gradient(case, given)
+    torch.testing.assert_close(value.detach(), expected)
+    torch.testing.assert_close(x.grad, slope, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.slow
+@EVERY
+def test_exported_it_gives_the_same(case):
+    given = cast(case.given(), torch.float32)
+    program = torch.export.export(case.loss, (), given)
+    torch.testing.assert_close(program.module()(**given), case.loss(**given))
