@@ -95,7 +95,8 @@ def fine_tune(folder: Path) -> None:
     """One evaluation of the self-supervised losses on a run."""
     metadata = Metadata(input_height=96, input_width=128, focal_px=100.0)
     signal = SelfSupervised([load_run(write_run(folder))], metadata)
-    signal.losses(FastDepth(metadata.variant, uncertainty=True), signal.draw([Slot(0, 0, 0)]))
+    batch = signal.draw([Slot(0, 0, 0)])
+    signal.losses(FastDepth(metadata.variant, uncertainty=True).predict(batch["image"]), batch)
 
 
 @pytest.fixture(scope="module")

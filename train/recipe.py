@@ -318,7 +318,7 @@ def _step(state: TrainState, signals: Sequence[Signal], config: TrainConfig, thi
             batch["image"] = batch["image"].contiguous(memory_format=torch.channels_last)
         state.shown = batch["image"][:2]
         with torch.autocast("cpu", torch.bfloat16, enabled=config.amp):
-            losses = signal.losses(network, batch)
+            losses = signal.losses(network.predict(batch["image"]), batch)
         for name, value in losses.items():
             if not torch.isfinite(value).all():
                 images = [d for d, v in zip(signal.describe(slots), value, strict=True) if not torch.isfinite(v)]

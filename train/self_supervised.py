@@ -1,7 +1,7 @@
 """Self-supervision from a SLAM run: photometric reprojection, map points, edge cycle, L-shapes."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 import torch
@@ -14,7 +14,8 @@ from edgeslam_torch.losses.depth_terms import LaplaceNll, masked_mean
 from edgeslam_torch.losses.lshape import AngleLoss, CollinearityLoss, LShapeLoss
 from edgeslam_torch.losses.photometric import PhotometricLoss, SmoothnessLoss
 from edgeslam_torch.losses.robust import Kernel
-from edgeslam_torch.models.fastdepth import FastDepth
+from edgeslam_torch.losses.total import TotalLoss
+from edgeslam_torch.models.fastdepth import Prediction
 from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.train.signals import Slot
 from edgeslam_torch.train.validate import image_tensor
@@ -92,52 +93,45 @@ class SelfSupervised:
         batch["image"] = torch.cat((batch.pop("input_i"), batch.pop("input_j")))
         return batch
 
-    def losses(self, network: FastDepth, batch: dict[str, Tensor]) -> dict[str, Tensor]:
+    def losses(self, predicted: Prediction, batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """Weighted terms, each ``(B,)``."""
         w = self.weights
-        predicted = network.predict(batch["image"])
         shift = batch["log_focal"].view(-1, 1, 1, 1)
         B = shift.shape[0]
         log_i = predicted.log_depth[:B].float() + shift
         log_j = predicted.log_depth[B:].float() + shift
-        depth_i, K, T = log_i.exp(), batch["K"], batch["T_j_i"]
-        out: dict[str, Tensor] = {}
+        K, T = batch["K"], batch["T_j_i"]
+        terms: dict[str, Tensor] = {}
         if w.photometric:
-            out["photometric"] = w.photometric * self._photometric(batch["rgb_i"], batch["rgb_j"], depth_i, T, K)
+            terms["photometric"] = self._photometric(batch["rgb_i"], batch["rgb_j"], log_i.exp(), T, K)
         at_points = _at(log_i, batch["uv"])
         residual = at_points - batch["log_z"]
         near = batch["known"] & (residual.detach().abs() < CLIP_LOG)
         if w.points:
             # Residuals are clipped to a constant beyond the limit, so that larger errors do not lower the loss.
-            out["points"] = w.points * masked_mean(residual.abs().clamp(max=CLIP_LOG), batch["known"])
+            terms["points"] = masked_mean(residual.abs().clamp(max=CLIP_LOG), batch["known"])
         if w.cycle:
-            terms = [self._cycle_term(log_i[b], log_j[b], batch, b) for b in range(B)]
-            out["cycle"] = w.cycle * torch.stack(terms)
+            edges = batch["edges"]
+            terms["cycle"] = self._cycle(T[:, 0], edges, _depth_at(log_i, edges), log_j[:, 0].exp(), K)
         if w.lshape:
-            terms = [self._lshape_term(log_i[b], batch, b) for b in range(B)]
-            out["lshape"] = w.lshape * torch.stack(terms)
+            terms["lshape"] = self._lshape_term(log_i, batch)
         if w.smooth:
-            out["smooth"] = w.smooth * self._smooth(log_i, batch["rgb_i"])
+            terms["smooth"] = self._smooth(log_i, batch["rgb_i"])
         if predicted.log_sigma is not None and w.uncertainty:
             sigma = _at(predicted.log_sigma[:B].float(), batch["uv"])
-            out["uncertainty"] = w.uncertainty * self._nll(sigma, at_points, batch["log_z"], near)
-        return out
+            terms["uncertainty"] = self._nll(sigma, at_points, batch["log_z"], near)
+        return TotalLoss(asdict(w)).weighted(terms)
 
-    def _cycle_term(self, log_i: Tensor, log_j: Tensor, batch: dict[str, Tensor], b: int) -> Tensor:
-        uv = batch["edges"][b]
-        loss: Tensor = self._cycle(batch["T_j_i"][b, 0], uv, _depth_at(log_i, uv), log_j[0].exp(), batch["K"][b])
-        return loss
-
-    def _lshape_term(self, log_i: Tensor, batch: dict[str, Tensor], b: int) -> Tensor:
-        T, K, arms, corners = batch["T_j_i"][b, 0], batch["K"][b], batch["arms"][b], batch["junctions_i"][b]
-        on_arms = back_project(arms.reshape(-1, 2), _depth_at(log_i, arms), K).reshape(-1, 2, ARM_POINTS, 3)
-        depth = _depth_at(log_i, corners).reshape(-1, 3)
+    def _lshape_term(self, log_i: Tensor, batch: dict[str, Tensor]) -> Tensor:
+        T, K, arms, corners = batch["T_j_i"][:, 0], batch["K"], batch["arms"], batch["junctions_i"]
+        depth = _depth_at(log_i, corners)
         with torch.no_grad():
-            projected, _ = project(move(T, back_project(corners, depth, K)), K)
-            cos_j = seen_cosines(projected, batch["junctions_j"][b])
-        known = arms[..., 0].reshape(-1, 2, ARM_POINTS) >= 0
-        loss: Tensor = self._lshape(T, corners, depth, cos_j, K, on_arms, known)
-        return loss
+            p_i = back_project(corners.flatten(1, 2), depth.flatten(1), K)
+            projected = project(move(T, p_i), K)[0].unflatten(1, corners.shape[1:3])
+            cos_j = torch.stack([seen_cosines(*pair) for pair in zip(projected, batch["junctions_j"], strict=True)])
+        shape = (len(arms), -1, 2, ARM_POINTS)
+        on_arms = back_project(arms.flatten(1, 2), _depth_at(log_i, arms).flatten(1), K).reshape(*shape, 3)
+        return self._lshape(T, corners, depth, cos_j, K, on_arms, (arms[..., 0] >= 0).reshape(shape))
 
     def _sample(self, slot: Slot) -> dict[str, Tensor]:
         rng = slot.rng()
@@ -232,10 +226,10 @@ def _rgb(image: NDArray[np.uint8]) -> Tensor:
 
 
 def _depth_at(log_depth: Tensor, uv: Tensor) -> Tensor:
-    """Depths ``(N,)`` of ``(1, H, W)`` at pixels ``(..., 2)``; 0, which the losses leave out, at padding (-1)."""
-    uv = uv.reshape(-1, 2)
-    depth = _at(log_depth[None], uv[None])[0].exp()
-    return torch.where(uv[:, 0] >= 0, depth, torch.zeros_like(depth))
+    """Depths ``(B, ...)`` of ``(B, 1, H, W)`` at pixels ``(B, ..., 2)``; 0, which the losses leave out, at padding
+    (-1)."""
+    depth = _at(log_depth, uv.flatten(1, -2)).exp().reshape(uv.shape[:-1])
+    return torch.where(uv[..., 0] >= 0, depth, 0.0)
 
 
 def _at(maps: Tensor, uv: Tensor) -> Tensor:

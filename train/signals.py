@@ -1,7 +1,7 @@
 """Sources of supervision: a signal draws its part of a batch and returns named losses."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -9,7 +9,8 @@ import torch
 from torch import Tensor, nn
 
 from edgeslam_torch.losses.depth_terms import BerHu, GradientMatching, LaplaceNll, MaskedL1, SILog, masked_mean
-from edgeslam_torch.models.fastdepth import FastDepth
+from edgeslam_torch.losses.total import TotalLoss
+from edgeslam_torch.models.fastdepth import Prediction
 from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.train.validate import image_tensor
 from edgeslam_torch.train.views.augment import AugmentConfig, View, random_view
@@ -42,8 +43,8 @@ class Signal(Protocol):
         """What each slot shows, for messages."""
         ...
 
-    def losses(self, network: FastDepth, batch: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Weighted losses by name, each ``(B,)``."""
+    def losses(self, predicted: Prediction, batch: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Weighted losses by name, each ``(B,)``, of what the network predicts for ``batch["image"]``."""
         ...
 
 
@@ -115,18 +116,14 @@ class Supervised:
         log_depth = depth.clamp(NEAR_M, FAR_M).log()
         return {"image": torch.stack(images), "log_depth": log_depth, "mask": mask, "metric": torch.tensor(metric)}
 
-    def losses(self, network: FastDepth, batch: dict[str, Tensor]) -> dict[str, Tensor]:
+    def losses(self, predicted: Prediction, batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """Weighted terms, each ``(B,)``."""
-        predicted, target, mask = network.predict(batch["image"]), batch["log_depth"], batch["mask"]
+        target, mask = batch["log_depth"], batch["mask"]
         # Part of the mean error is removed from the residual, including its gradient, leaving scale partly free.
         free = (1.0 - batch["metric"]) * masked_mean(predicted.log_depth - target, mask)
         target = target + free.view(-1, 1, 1, 1)
-        out = {}
-        for name, term in self._terms.items():
-            weight = getattr(self.weights, name)
-            if weight:
-                out[name] = weight * term(predicted.log_depth, target, mask)
-        if predicted.log_sigma is not None and self.weights.uncertainty:
-            nll = self._nll(predicted.log_sigma, predicted.log_depth, target, mask)
-            out["uncertainty"] = self.weights.uncertainty * nll
-        return out
+        weights = asdict(self.weights)
+        terms = {n: term(predicted.log_depth, target, mask) for n, term in self._terms.items() if weights[n]}
+        if predicted.log_sigma is not None and weights["uncertainty"]:
+            terms["uncertainty"] = self._nll(predicted.log_sigma, predicted.log_depth, target, mask)
+        return TotalLoss(weights).weighted(terms)

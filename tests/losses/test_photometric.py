@@ -1,10 +1,13 @@
 """Photometric reprojection."""
 
+import sys
+
+import kornia
 import pytest
 import torch
 from torch.autograd import gradcheck
 
-from edgeslam_torch.losses.photometric import PhotometricLoss, SmoothnessLoss, dissimilarity, warp_to
+from edgeslam_torch.losses.photometric import ROUNDING_PX, PhotometricLoss, SmoothnessLoss, dissimilarity, ssim, warp_to
 
 K = torch.tensor([[[20.0, 0.0, 11.5], [0.0, 20.0, 7.5], [0.0, 0.0, 1.0]]], dtype=torch.float64)
 
@@ -31,6 +34,27 @@ def test_warp_shifts_by_the_disparity() -> None:
     torch.testing.assert_close(warped[inner], picture()[inner], atol=1e-9, rtol=0)
     assert valid[0, 0, :, -2:].sum() == 0
     assert valid[0, 0, :, :-2].all()
+
+
+def test_warp_is_kornias() -> None:
+    torch.manual_seed(0)
+    depth, T = 1.5 + torch.rand(2, 1, 16, 24).double(), sideways(0.2).repeat(2, 1, 1)
+    T[1, :3, :3] = torch.linalg.matrix_exp(torch.tensor([[0.0, -0.1, 0.05], [0.1, 0.0, 0.02], [-0.05, -0.02, 0.0]]))
+    images = torch.rand(2, 3, 16, 24).double()
+    warped, valid = warp_to(images, depth, T, K.repeat(2, 1, 1))
+    other = kornia.geometry.depth.warp_frame_depth(images, depth, T, K.repeat(2, 1, 1))
+    assert valid.float().mean() > 0.7
+    apart = (warped - other).abs()[valid.expand_as(warped)]
+    assert apart.quantile(0.99) < 1e-5
+    assert apart.max() < ROUNDING_PX  # on the border, where kornia's begins to be black
+
+
+def test_structural_similarity_is_kornias_with_a_mean_for_its_gaussian(monkeypatch: pytest.MonkeyPatch) -> None:
+    torch.manual_seed(0)
+    a, b = torch.rand(2, 2, 3, 16, 24).double()
+    mean = torch.full((1, 3), 1 / 3).double()
+    monkeypatch.setattr(sys.modules["kornia.metrics.ssim"], "get_gaussian_kernel1d", lambda *_, **__: mean)
+    torch.testing.assert_close(ssim(a, b), kornia.metrics.ssim(a, b, 3), atol=1e-5, rtol=0)
 
 
 def test_dissimilarity_is_zero_for_equal_images_and_positive_otherwise() -> None:

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from edgeslam_torch.errors import ConfigError, WeightsError
 from edgeslam_torch.models.checkpoint import build_network, load_checkpoint
-from edgeslam_torch.models.fastdepth import FastDepth, Widths
+from edgeslam_torch.models.fastdepth import FastDepth, Prediction, Widths
 from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.train import recipe
 from edgeslam_torch.train.recipe import (
@@ -231,8 +231,8 @@ class _PoisonedAt(Supervised):
         self.poisoned = slots[0].step >= self.step
         return super().draw(slots)
 
-    def losses(self, network: FastDepth, batch: dict[str, Tensor]) -> dict[str, Tensor]:
-        found = super().losses(network, batch)
+    def losses(self, predicted: Prediction, batch: dict[str, Tensor]) -> dict[str, Tensor]:
+        found = super().losses(predicted, batch)
         found["l1"] = found["l1"].clone()
         if self.poisoned:
             found["l1"][self.image] = torch.nan

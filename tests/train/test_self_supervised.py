@@ -104,7 +104,7 @@ def test_every_term_is_smallest_at_the_true_depth(sequence: PosedSequence) -> No
     slots = [Slot(0, 0, k) for k in range(2)]
     with never_flipped():
         batch = signal.draw(slots)
-        at = {f: signal.losses(_Oracle(signal, slots, f), batch) for f in (0.75, 1.0, 1.3)}  # type: ignore[arg-type]
+        at = {f: signal.losses(_Oracle(signal, slots, f).predict(batch["image"]), batch) for f in (0.75, 1.0, 1.3)}
     for term in ("photometric", "points", "cycle"):
         wrong = min(at[0.75][term].mean(), at[1.3][term].mean())
         assert at[1.0][term].mean() < 0.6 * wrong, term
@@ -170,7 +170,8 @@ def test_gradient_reaches_the_network(sequence: PosedSequence) -> None:
     torch.manual_seed(0)
     network = build_network(METADATA, Widths((4,) + (8,) * 13, (8,) * 5))
     signal = SelfSupervised([sequence], METADATA)
-    losses = signal.losses(network, signal.draw([Slot(0, 0, 0)]))
+    batch = signal.draw([Slot(0, 0, 0)])
+    losses = signal.losses(network.predict(batch["image"]), batch)
     assert set(losses) == {"photometric", "points", "cycle", "lshape", "smooth", "uncertainty"}
     sum(v.sum() for v in losses.values()).backward()  # type: ignore[union-attr]
     grads = [p.grad for p in network.parameters() if p.grad is not None]
