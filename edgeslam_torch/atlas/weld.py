@@ -52,9 +52,7 @@ def move_keyframes(slam_map: SlamMap, edges: EdgeMap, log: TrajectoryLog, S: dic
             keyframe.scale(scale[id])
         slam_map.scale_links(scale)
         for host in edges.hosts:
-            grown = scale.get(slam_map.heir_of(host.keyframe_id)[0], 1.0)
-            host.p_c *= grown
-            host.sigma *= grown
+            host.grow(scale.get(slam_map.heir_of(host.keyframe_id)[0], 1.0))
         log.scale(scale)
 
 

@@ -1,7 +1,7 @@
 """The semi-dense edge map: edge points stay with the keyframe that measured them and move with its pose."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +10,7 @@ from edgeslam_torch.config import EdgeConfig
 from edgeslam_torch.frontend.edges import extract_edges
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
-from edgeslam_torch.map.depth_prior import depth_prior
+from edgeslam_torch.map.depth_prior import MIN_ANCHORS, depth_prior
 from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.mapping.edge_depth import StereoView, measure_edge_depth
@@ -45,6 +45,15 @@ class EdgePoints:
     colour: NDArray[np.uint8]
     observations: IntArray
     """``(E,)`` keyframes that measured the same point, this one included."""
+    keypoint_z: FloatArray = field(default_factory=lambda: np.zeros(0))
+    """``(N,)`` depths of the keyframe's keypoints when its edges' depths were right, NaN without a triangulated anchor;
+    empty where they are not known."""
+
+    def grow(self, scale: float) -> None:
+        """Multiply all depths."""
+        self.p_c *= scale
+        self.sigma *= scale
+        self.keypoint_z *= scale
 
     def keep(self, mask: NDArray[np.bool_]) -> int:
         """Remove the points outside a mask ``(E,)``; returns their number."""
@@ -109,8 +118,37 @@ class EdgeMap:
             sigma=(relative * depth)[good],
             colour=edges.colour[known][good],
             observations=np.ones(int(good.sum()), dtype=np.int32),
+            keypoint_z=self._keypoint_z(keyframe),
         )
         self.add(points)
+
+    def _keypoint_z(self, keyframe: Keyframe) -> FloatArray:
+        """Depth ``(N,)`` of a keyframe's triangulated anchors at their keypoints, NaN elsewhere."""
+        held = keyframe.keypoints_with_anchor()
+        triangulated = ~self.map.anchors.from_depth[keyframe.anchor[held]]
+        held = held[triangulated]
+        z = np.full(len(keyframe.anchor), np.nan)
+        z[held] = se3.transform(keyframe.T_c_w, self.map.anchors.p_w[keyframe.anchor[held]])[:, 2]
+        z[z <= 0] = np.nan
+        return z
+
+    def follow_anchors(self) -> None:
+        """Change the depths of each keyframe's edges as refinement has changed those of its anchors since.
+
+        They were measured with the poses of their time. A refinement that changes the scale of a place moves anchors
+        and poses, and edges that stay behind pull the poses back in the next one (docs/decisions/0076).
+        """
+        for host in self.hosts:
+            keyframe = self.map.keyframes.get(host.keyframe_id)
+            if keyframe is None or len(host.keypoint_z) != len(keyframe.anchor):
+                continue
+            now = self._keypoint_z(keyframe)
+            change = np.log(now / host.keypoint_z)
+            change = change[np.isfinite(change)]
+            if len(change) < MIN_ANCHORS:
+                continue
+            host.grow(math.exp(float(np.median(change))))
+            host.keypoint_z = now
 
     def add(self, points: EdgePoints) -> None:
         """Add the measured edges of a keyframe, and remove others beyond the limit."""

@@ -72,6 +72,8 @@ def last_refinement(
             fuse_all(slam_map, camera)
         result = refine_all(slam_map, camera, lm if with_edges else fine, telemetry, Weight.EXACT)
     edges.update(everything=True)
+    with slam_map.lock:
+        edges.follow_anchors()
     if with_edges:
         result = refine_with_edges(slam_map, camera, edges, fine, config, telemetry) or result
     return result

@@ -187,3 +187,36 @@ def test_the_same_pixel_at_another_depth_is_another_edge(points):
         counts.append((edges.hosts[1].observations == 2).mean())
     assert counts[0] > 0.9
     assert counts[1] < 0.1
+
+
+def followed(points, grown, on_prior=0):
+    """Edges of keyframe 0 before and after its anchors have moved away from it ``grown`` times as far."""
+    edges, camera = edge_map(points), points.map.keyframes[0]
+    measured = host(points, 0, points.world.p_w[points.world.visible[0]][:60])
+    measured.keypoint_z = edges._keypoint_z(camera)
+    edges.hosts.append(measured)
+    before = measured.p_c.copy()
+    anchors, held = points.map.anchors, camera.anchor[camera.anchor >= 0]
+    anchors.p_w[held] = camera.centre_w + grown * (anchors.p_w[held] - camera.centre_w)
+    anchors.from_depth[held[on_prior:]] = on_prior > 0
+    edges.follow_anchors()
+    edges.follow_anchors()  # they are there already
+    return before, measured
+
+
+def test_edges_follow_the_anchors_of_their_keyframe(points):
+    before, after = followed(points, 0.8)
+    np.testing.assert_allclose(after.p_c, 0.8 * before, rtol=1e-9)
+    np.testing.assert_allclose(after.sigma, 0.008, rtol=1e-9)
+
+
+def test_edges_do_not_follow_a_handful_of_anchors_nor_the_network(points):
+    before, after = followed(points, 0.8, on_prior=5)  # five triangulated ones are left
+    np.testing.assert_array_equal(after.p_c, before)
+
+
+def test_edges_that_grow_take_along_what_they_follow(points):
+    before, after = followed(points, 1.0)
+    after.grow(2.0)
+    np.testing.assert_allclose(after.p_c, 2.0 * before, rtol=1e-9)
+    np.testing.assert_allclose(after.keypoint_z, 2.0 * edge_map(points)._keypoint_z(points.map.keyframes[0]))

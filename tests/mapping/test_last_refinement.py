@@ -78,6 +78,18 @@ def test_edges_take_part_and_their_depths_go_back_to_the_keyframes():
     assert np.median(moved[moved > 0]) < 0.03
 
 
+def test_edges_that_were_measured_in_another_scale_follow_the_map():
+    """As after a turn: the refinement of the anchors changes the scale of what was measured before it."""
+    slam_map, edges, log = pickle.loads(flight()[0])
+    for host in edges.hosts:  # measured when everything was nearer
+        host.grow(0.8)
+    last_refinement(slam_map, CAMERA, edges, WindowConfig())
+    _, right, _, _ = finish(WindowConfig())
+    depths = [np.median(np.concatenate([h.p_c[:, 2] for h in e.hosts])) for e in (edges, right)]
+    assert depths[0] == pytest.approx(depths[1], rel=0.01)
+    assert ate(log) < 0.02
+
+
 def test_without_reprojection_anchors_stay_where_they_are():
     start, _, _ = pickle.loads(flight()[0])
     slam_map, _, _, _ = finish(FORMS["no reprojection"])
