@@ -34,6 +34,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--fp16", action="store_true", help="store weights as float16")
     parser.add_argument("--calibrate", help="images, recording or video like those it will see")
     parser.add_argument("--size", metavar="HxW", help="input size, multiples of 32 (default: as trained)")
+    parser.add_argument("--dynamic-size", action="store_true", help="any height and width, multiples of 32; slower")
+    parser.add_argument("--dynamic-batch", action="store_true", help="any number of images at a time")
     parser.add_argument("--opset", type=int, default=18, help="ONNX operator set (default: 18)")
     parser.add_argument(
         "--old-runtime", action="store_true", help="for onnxruntime before 1.17: opset 17 and IR version 9"
@@ -61,7 +63,8 @@ def main(args: argparse.Namespace) -> int:
         args.out.parent.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory() as folder:
             plain = Path(folder) / "float32.onnx"
-            export_onnx(network, metadata, plain, ExportOptions(height, width, opset))
+            options = ExportOptions(height, width, opset, args.dynamic_size, args.dynamic_batch)
+            export_onnx(network, metadata, plain, options)
             models = {"float32": _Model(plain)}
             _require_parity(models["float32"], deployed(network, metadata), images[:CHECK_IMAGES])
             target = plain
@@ -76,7 +79,9 @@ def main(args: argparse.Namespace) -> int:
             write_atomically(args.out, lambda file: file.write(target.read_bytes()))
     except OSError as error:
         raise OutputError(f"{args.out}: cannot be written ({error.strerror or error})") from error
-    print(f"{args.out}: {height}x{width}, opset {opset}, focal length {metadata.focal_px:.1f} px in the input")
+    size = "any size in multiples of 32" if args.dynamic_size else f"{height}x{width}"
+    batch = ", any batch" if args.dynamic_batch else ""
+    print(f"{args.out}: {size}{batch}, opset {opset}, focal length {metadata.focal_px:.1f} px in the input")
     return 0
 
 
@@ -109,7 +114,7 @@ def _opset(wanted: int) -> int:
 
 def _images(source: str | None, height: int, width: int, metadata: "Metadata") -> "list[FloatArray]":
     """Preprocessed frames, spread evenly over the source; noise-free ramps when there is none."""
-    from edgeslam_torch.frontend.depth_network import preprocess
+    from edgeslam_torch.frontend.network_input import preprocess
 
     if source is None:
         ramp = np.linspace(0, 255, 640 * 480 * 3).reshape(480, 640, 3).astype(np.uint8)

@@ -5,6 +5,7 @@ import logging
 import warnings
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import onnx
 import torch
@@ -12,10 +13,12 @@ import torch
 from edgeslam_torch.errors import OutputError
 from edgeslam_torch.files.atomic import write_atomically
 from edgeslam_torch.models.fastdepth import FastDepth
+from edgeslam_torch.models.layout import INPUT_MULTIPLE
 from edgeslam_torch.models.onnx.file import INPUT, LOG_DEPTH, SIGMA
 from edgeslam_torch.models.onnx.fold import deployed
-from edgeslam_torch.models.record import HEADER_KEY, Metadata
+from edgeslam_torch.models.record import HEADER_KEY, MAX_INPUT_PX, Metadata
 
+MAX_BATCH = 1024
 OLDEST_OPSET = 14
 """Oldest opset that ONNX's version converter reaches for this network."""
 OLD_RUNTIME_IR, OLD_RUNTIME_OPSET = 9, 17
@@ -29,13 +32,15 @@ class ExportOptions:
     height: int = 192
     width: int = 256
     opset: int = 18
-    dynamic: bool = False
-    """Leave height and width dynamic (multiples of 32); runtimes optimise a fixed size better."""
+    dynamic_size: bool = False
+    """Leave height and width open (multiples of 32); runtimes optimise a fixed size better."""
+    dynamic_batch: bool = False
+    """Leave the number of images open."""
 
 
 def export_onnx(network: FastDepth, metadata: Metadata, path: Path, options: ExportOptions) -> None:
     """Write ``path`` (inputs ``image`` ``(1, 3, H, W)``; outputs ``log_depth`` and ``sigma_log`` ``(1, 1,
-    H/2, W/2)``).
+    H/2, W/2)``, or as many as the batch has).
 
     Depth in metres is ``exp(log_depth) * focal / focal_px``, focal being the camera's in pixels of the
     network's input.
@@ -44,11 +49,8 @@ def export_onnx(network: FastDepth, metadata: Metadata, path: Path, options: Exp
         OutputError: If the written file has another opset or fails the checker.
     """
     module = deployed(network, metadata)
-    example = torch.zeros(1, 3, options.height, options.width)
-    shapes = None
-    if options.dynamic:
-        h, w = torch.export.Dim("h32", min=1, max=64), torch.export.Dim("w32", min=1, max=64)
-        shapes = ({2: 32 * h, 3: 32 * w},)
+    # An example of one image would be taken for a batch that can only be one.
+    example = torch.zeros(2 if options.dynamic_batch else 1, 3, options.height, options.width)
     # They warn about torchvision operators, which are not used, and about the choice of version converter.
     for name in ("torch.onnx", "onnxscript"):
         logging.getLogger(name).setLevel(logging.ERROR)
@@ -61,7 +63,7 @@ def export_onnx(network: FastDepth, metadata: Metadata, path: Path, options: Exp
             opset_version=max(options.opset, 18),
             input_names=[INPUT],
             output_names=[LOG_DEPTH, SIGMA],
-            dynamic_shapes=shapes,
+            dynamic_shapes=_open_dimensions(options),
             optimize=True,
             verbose=False,
         )
@@ -71,6 +73,18 @@ def export_onnx(network: FastDepth, metadata: Metadata, path: Path, options: Exp
     write_metadata(model, metadata, options)
     check_model(model, options.opset)
     write_atomically(path, lambda file: file.write(model.SerializeToString()))
+
+
+def _open_dimensions(options: ExportOptions) -> "tuple[dict[int, Any]] | None":
+    """What the exporter leaves open of the image's dimensions; None for nothing."""
+    dimensions: dict[int, Any] = {}
+    if options.dynamic_batch:
+        dimensions[0] = torch.export.Dim("batch", min=1, max=MAX_BATCH)
+    if options.dynamic_size:
+        longest = MAX_INPUT_PX // INPUT_MULTIPLE
+        for axis, name in ((2, "h32"), (3, "w32")):
+            dimensions[axis] = INPUT_MULTIPLE * torch.export.Dim(name, min=1, max=longest)
+    return (dimensions,) if dimensions else None
 
 
 def set_opset(model: onnx.ModelProto, opset: int) -> onnx.ModelProto:
@@ -91,7 +105,8 @@ def set_opset(model: onnx.ModelProto, opset: int) -> onnx.ModelProto:
 
 def write_metadata(model: onnx.ModelProto, metadata: Metadata, options: ExportOptions) -> None:
     """Store the checkpoint's metadata, with this file's input size, in the model's properties."""
-    record = asdict(metadata) | {"export_height": options.height, "export_width": options.width}
+    size = {} if options.dynamic_size else {"export_height": options.height, "export_width": options.width}
+    record = asdict(metadata) | size
     onnx.helper.set_model_props(model, {HEADER_KEY: json.dumps(record)})
 
 

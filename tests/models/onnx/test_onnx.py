@@ -82,6 +82,19 @@ def test_exported_file_holds_opset_and_metadata_and_agrees(tmp_path: Path) -> No
         np.testing.assert_allclose(ours, theirs.numpy(), rtol=1e-4, atol=1e-4)
 
 
+def test_open_dimensions_take_any_batch_and_size(tmp_path: Path) -> None:
+    network = random_network(METADATA)
+    path = tmp_path / "model.onnx"
+    export_onnx(network, METADATA, path, ExportOptions(64, 96, dynamic_size=True, dynamic_batch=True))
+    assert read_onnx(path)[1] == METADATA
+    for shape in ((1, 3, 64, 96), (3, 3, 96, 32)):
+        x = torch.randn(*shape)
+        with torch.no_grad():
+            expected = deployed(network, METADATA)(x)
+        for ours, theirs in zip(run(str(path), x.numpy()), expected, strict=True):
+            np.testing.assert_allclose(ours, theirs.numpy(), rtol=1e-4, atol=1e-4)
+
+
 def test_file_without_metadata_is_refused(tmp_path: Path) -> None:
     graph, _ = _plain_model()
     onnx.save(graph, str(tmp_path / "x.onnx"))
