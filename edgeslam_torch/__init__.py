@@ -8,7 +8,12 @@ import os
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:  # as type checkers read it; `typing` itself takes longer to load than all the rest here
-    from typing import Any
+    from edgeslam_torch.config import SlamConfig
+    from edgeslam_torch.errors import EdgeSlamError
+    from edgeslam_torch.geometry.camera import Camera
+    from edgeslam_torch.readers.source import open_source
+    from edgeslam_torch.slam import EdgeSlam
+    from edgeslam_torch.types import Frame, SlamOutput, TelemetrySample
 
 # torch's OpenMP threads spin while they wait; with a busy second core that turns a 26 ms inference
 # into 419 ms (docs/decisions/0025-threads-and-seeds.md). Both must be set before torch is first imported.
@@ -33,10 +38,25 @@ _LAZY = {
     "TelemetrySample": "edgeslam_torch.types",
     "open_source": "edgeslam_torch.readers.source",
 }
-__all__ = [*_LAZY, "__version__"]
+__all__ = [
+    "Camera",
+    "EdgeSlam",
+    "EdgeSlamError",
+    "Frame",
+    "SlamConfig",
+    "SlamOutput",
+    "TelemetrySample",
+    "__version__",
+    "open_source",
+]
 
 
-def __getattr__(name: str) -> "Any":
-    if name in _LAZY:
-        return getattr(importlib.import_module(_LAZY[name]), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+if not TYPE_CHECKING:  # a type checker takes the imports above, and says so where a name is wrong
+
+    def __getattr__(name):
+        if name in _LAZY:
+            return getattr(importlib.import_module(_LAZY[name]), name)
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+    def __dir__():
+        return sorted({*globals(), *__all__})

@@ -43,6 +43,9 @@ def _residual(log_depth: Tensor, log_target: Tensor, mask: Tensor) -> Tensor:
 class MaskedL1(nn.Module):
     """Mean absolute difference of log depth: a relative error, weighted equally near and far."""
 
+    def __init__(self) -> None:
+        super().__init__()
+
     @in_full_precision
     def forward(self, log_depth: Tensor, log_target: Tensor, mask: Tensor) -> Tensor:
         """Mean over valid pixels ``(B,)``.
@@ -169,6 +172,9 @@ class LaplaceNll(nn.Module):
 
     The residual is detached, so that the head describes the error without reducing its penalty.
     """
+
+    def __init__(self) -> None:
+        super().__init__()
 
     @in_full_precision
     def forward(self, log_sigma: Tensor, log_depth: Tensor, log_target: Tensor, mask: Tensor) -> Tensor:

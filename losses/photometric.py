@@ -75,6 +75,9 @@ def ssim(a: Tensor, b: Tensor) -> Tensor:
 class PhotometricLoss(nn.Module):
     """Smallest dissimilarity over the source frames; pixels that match better without motion are masked."""
 
+    def __init__(self) -> None:
+        super().__init__()
+
     @in_full_precision
     def forward(self, image_i: Tensor, images_j: Tensor, depth_i: Tensor, T_j_i: Tensor, K: Tensor) -> Tensor:
         """Mean per image ``(B,)``; NaN for a depth or motion of NaN.
@@ -114,6 +117,9 @@ class PhotometricLoss(nn.Module):
 
 class SmoothnessLoss(nn.Module):
     """Second-order smoothness of log depth where the image is smooth; planes in log depth are free."""
+
+    def __init__(self) -> None:
+        super().__init__()
 
     @in_full_precision
     def forward(self, log_depth: Tensor, image: Tensor) -> Tensor:

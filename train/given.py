@@ -14,8 +14,10 @@ from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.train.views.datasets import DepthFolder
 from edgeslam_torch.train.views.posed import PosedSequence
 
-NOT_COMPARED = ("steps", "patience", "validate_every", "checkpoint_every", "warmup_steps")
-"""Settings of the length of training, which may differ."""
+HOOKS = "hooks"
+"""Setting with the names of the user's hooks."""
+NOT_COMPARED = ("steps", "patience", "validate_every", "checkpoint_every", "warmup_steps", HOOKS)
+"""Settings of the length of training, which may differ; those of hooks that change losses are compared."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from edgeslam_torch.errors import ConfigError, EdgeSlamError, WeightsError
 from edgeslam_torch.files.atomic import write_atomically, write_text
 from edgeslam_torch.models.checkpoint import save_checkpoint
-from edgeslam_torch.models.fastdepth import FastDepth
+from edgeslam_torch.models.fastdepth import FastDepth, Prediction
 from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.train.processes.distributed import add_up, by_first, everyones, rank, world
 from edgeslam_torch.train.signals import Signal, Slot
@@ -109,25 +109,75 @@ class TrainState:
     """Some images of the last batch ``(B, 3, H, W)``."""
     whole: bool = True
     """False while a step changes the weights."""
+    stop: str = ""
+    """Why training is to end after this step; a hook may write it. Not empty in one process, it ends all."""
+
+
+@dataclass
+class Drawn:
+    """What one signal drew for this process, between the network and the gradient."""
+
+    signal: str
+    """Its name: ``supervised`` (labels), ``teacher`` (measured depth) or ``self`` (pairs)."""
+    batch: dict[str, Tensor]
+    """What the signal drew, with ``image`` the network's normalised input ``(B, 3, H, W)``; of ``self``, first images
+    and then their partners ``(2 B, 3, H, W)``. To be read."""
+    predicted: Prediction
+    """The network's output for ``image``, with its gradient. To be read."""
+    losses: dict[str, Tensor]
+    """By name, one value an image ``(B,)``, weighted: change them, add others, remove some. Their sum is minimised,
+    averaged over the images of all processes."""
 
 
 class Hooks:
-    """Called by the recipe; every method does nothing here."""
+    """What happens around the recipe's steps; every method does nothing here. Write a subclass with those you need.
+
+    In order: ``on_start``; for every step ``on_losses`` (once a signal) and ``on_step``; at times ``on_validation``;
+    ``on_end``; ``close``. Under ``torchrun`` each process calls its own hooks, for its own images: what only reports
+    does so where `edgeslam_torch.train.rank` gives 0. A step depends on the seed, its number and the weights alone, so
+    that a resume repeats it; a hook that draws random numbers or remembers steps has to see to that itself. An
+    exception ends training, with the last whole step saved.
+    """
 
     def on_start(self, state: TrainState, config: TrainConfig) -> None:
-        """Before the first step of this process (also after a resume)."""
+        """Before the first step of this process (also after a resume, at ``state.step``).
+
+        May change the peak learning rates, ``state.optimiser.param_groups[i]["peak"]``. All else is to be read.
+        """
+
+    def on_losses(self, state: TrainState, drawn: Drawn) -> None:
+        """Before each gradient, once for every signal; may change ``drawn.losses``.
+
+        Called in every process, and must do the same in each. ``finetune.json`` keeps the names of hooks that
+        have this method: a training is not resumed with other ones.
+        """
 
     def on_step(self, state: TrainState, losses: dict[str, float]) -> None:
-        """After each optimiser step, with the mean losses of this process's images."""
+        """After each optimiser step, with the mean losses ``signal/name`` of this process's images.
+
+        ``state.shown`` has some of the images ``(B, 3, H, W)``, as the network sees them. May write ``state.stop``: the
+        averaged weights are validated, and training ends.
+        """
 
     def on_validation(self, state: TrainState, metrics: dict[str, float]) -> None:
-        """After each validation of the averaged weights."""
+        """After each validation of the averaged weights, ``state.averaged``; may write ``state.stop``.
+
+        Args:
+            state: With ``best``, ``best_step`` and ``stale`` brought up to date.
+            metrics: Of `edgeslam_torch.train.DepthScores`, and ``score``, which decides what is best; the same in every
+                process.
+        """
 
     def on_end(self, state: TrainState, reason: str) -> None:
-        """Once, when the run ends normally."""
+        """Once, when the run ends normally; the files are written."""
 
     def close(self) -> None:
         """Called last in any case: release files and the terminal."""
+
+
+def changes_losses(hook: Hooks) -> bool:
+    """Whether a hook takes part in what is minimised."""
+    return type(hook).on_losses is not Hooks.on_losses
 
 
 Validation = Callable[[FastDepth], dict[str, float]]
@@ -206,16 +256,20 @@ def _loop(
 ) -> str:
     """Run all steps; returns the reason for stopping."""
     while True:
+        _agree_to_stop(state)
         if validate is not None and _validation_is_due(state, config):
             metrics = by_first(lambda: validate(state.averaged))
             _note(state, metrics, metadata, out)
             for hook in hooks:
                 hook.on_validation(state, metrics)
+            _agree_to_stop(state)
         if config.patience and state.stale >= config.patience:
             return f"no improvement in {config.patience} validations"
         if state.step >= config.steps:
             return "all steps done"
-        losses = _step(state, signals, config, rank(), world())
+        if state.stop:
+            return state.stop
+        losses = _step(state, signals, config, hooks)
         for hook in hooks:
             hook.on_step(state, losses)
         if state.step % config.checkpoint_every == 0 or state.step == config.steps:
@@ -225,7 +279,13 @@ def _loop(
 def _validation_is_due(state: TrainState, config: TrainConfig) -> bool:
     """Also after a resume between a step and its validation; at most once per step."""
     noted = state.history[-1]["step"] if state.history else 0.0
-    return state.step > noted and (state.step % config.validate_every == 0 or state.step == config.steps)
+    last = state.step == config.steps or bool(state.stop)
+    return state.step > noted and (state.step % config.validate_every == 0 or last)
+
+
+def _agree_to_stop(state: TrainState) -> None:
+    """What one process's hook asked for, in all of them: they must end after the same step."""
+    state.stop = next(iter(everyones([state.stop] if state.stop else [])), "")
 
 
 def _finish(state: TrainState, metadata: Metadata, out: Path) -> None:
@@ -302,8 +362,10 @@ def learning_rate_factor(step: int, config: TrainConfig) -> float:
     return config.lr_end + (1 - config.lr_end) * 0.5 * (1 + math.cos(math.pi * min(progress, 1.0)))
 
 
-def _step(state: TrainState, signals: Sequence[Signal], config: TrainConfig, this: int, of: int) -> dict[str, float]:
-    network = state.network
+def _step(
+    state: TrainState, signals: Sequence[Signal], config: TrainConfig, hooks: Sequence[Hooks]
+) -> dict[str, float]:
+    network, this, of = state.network, rank(), world()
     _set_modes(network, config)
     factor = learning_rate_factor(state.step, config)
     for group in state.optimiser.param_groups:
@@ -318,7 +380,9 @@ def _step(state: TrainState, signals: Sequence[Signal], config: TrainConfig, thi
             batch["image"] = batch["image"].contiguous(memory_format=torch.channels_last)
         state.shown = batch["image"][:2]
         with torch.autocast("cpu", torch.bfloat16, enabled=config.amp):
-            losses = signal.losses(network.predict(batch["image"]), batch)
+            predicted = network.predict(batch["image"])
+            losses = signal.losses(predicted, batch)
+        losses = _hooked(hooks, state, Drawn(signal.name, batch, predicted, losses), len(slots))
         for name, value in losses.items():
             if not torch.isfinite(value).all():
                 images = [d for d, v in zip(signal.describe(slots), value, strict=True) if not torch.isfinite(v)]
@@ -339,6 +403,22 @@ def _step(state: TrainState, signals: Sequence[Signal], config: TrainConfig, thi
     state.step += 1
     state.whole = True
     return {k: float(v.detach()) for k, v in named.items()}
+
+
+def _hooked(hooks: Sequence[Hooks], state: TrainState, drawn: Drawn, images: int) -> dict[str, Tensor]:
+    """The losses after every hook had its say.
+
+    Raises:
+        ConfigError: If a hook made something else of them than one value an image; names it.
+    """
+    for hook in hooks:
+        hook.on_losses(state, drawn)
+        for name, value in drawn.losses.items():
+            if not isinstance(value, Tensor) or value.shape != (images,):
+                found = f"of shape {tuple(value.shape)}" if isinstance(value, Tensor) else f"a {type(value).__name__}"
+                who = f"hook {type(hook).__name__}"
+                raise ConfigError(f"{who}: loss {name!r} must be one value an image, ({images},), and is {found}")
+    return drawn.losses
 
 
 def _set_modes(network: FastDepth, config: TrainConfig) -> None:

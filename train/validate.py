@@ -34,7 +34,7 @@ class DepthScores:
     """Standard deviation over images of the log median ratio: variation of scale."""
 
 
-def image_tensor(image: np.ndarray, metadata: Metadata) -> torch.Tensor:
+def image_tensor(image: NDArray[np.uint8], metadata: Metadata) -> torch.Tensor:
     """BGR uint8 ``(H, W, 3)`` -> normalised RGB ``(3, H, W)`` float32."""
     rgb = image[..., ::-1].astype(np.float32) / 255.0
     normalised = (rgb - np.array(metadata.mean, np.float32)) / np.array(metadata.std, np.float32)

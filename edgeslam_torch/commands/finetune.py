@@ -18,10 +18,10 @@ from edgeslam_torch.errors import ConfigError, SourceError
 if TYPE_CHECKING:
     from edgeslam_torch.models.fastdepth import FastDepth
     from edgeslam_torch.models.record import Metadata
-    from edgeslam_torch.train.finetune import Data
-    from edgeslam_torch.train.out_folder import OutFolder
+    from edgeslam_torch.train.finetuning import Data
+    from edgeslam_torch.train.folder import OutFolder
     from edgeslam_torch.train.outcome import Outcome
-    from edgeslam_torch.train.recipe import TrainConfig
+    from edgeslam_torch.train.recipe import Hooks, TrainConfig
 
 HELP = "adapt the depth network to recordings: labelled, unlabelled or output folders of 'edgeslam run'"
 
@@ -74,6 +74,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--amp", action="store_true", help="bfloat16 arithmetic where the processor has it")
     parser.add_argument("--threads", type=int, default=1, help="threads of each process")
     parser.add_argument("--camera", help="calibration for recordings without one")
+    parser.add_argument(
+        "--hook",
+        action="append",
+        default=[],
+        metavar="MODULE:NAME",
+        help="a training hook of your own, FILE.py:NAME too: losses, loggers, early stops (docs/training-your-own.md); "
+        "may be given more than once",
+    )
 
 
 def main(args: argparse.Namespace) -> int:
@@ -87,11 +95,13 @@ def main(args: argparse.Namespace) -> int:
     import torch
 
     from edgeslam_torch.models.checkpoint import load_checkpoint
-    from edgeslam_torch.train.out_folder import Existing, out_folder
+    from edgeslam_torch.train.folder import Existing, out_folder
+    from edgeslam_torch.train.hook_names import named_hooks
     from edgeslam_torch.train.processes.distributed import process_group
 
     torch.set_num_threads(args.threads)
     config = _config(args)
+    hooks = named_hooks(args.hook)
     network, metadata = load_checkpoint(args.weights)
     existing = Existing.RESUME if args.resume else Existing.OVERWRITE if args.overwrite else Existing.SAME
     with _signals_interrupt(), process_group() as rank:
@@ -99,7 +109,7 @@ def main(args: argparse.Namespace) -> int:
             logging.getLogger("edgeslam_torch").setLevel(logging.ERROR)
         with out_folder(args.out, existing) as out:
             try:
-                outcome = _finetune(args, items, network, metadata, config, out)
+                outcome = _finetune(args, items, network, metadata, config, hooks, out)
             except KeyboardInterrupt:
                 if rank == 0:
                     sys.stderr.write(f"edgeslam: interrupted; {_left(out)}\n")
@@ -195,9 +205,10 @@ def _finetune(
     network: "FastDepth",
     metadata: "Metadata",
     config: "TrainConfig",
+    hooks: "list[Hooks]",
     out: "OutFolder",
 ) -> "Outcome":
-    from edgeslam_torch.train.finetune import FromRuns, finetune, settings_of
+    from edgeslam_torch.train.finetuning import FromRuns, finetune, settings_of
     from edgeslam_torch.train.given import DataSet, Given, weights_name
     from edgeslam_torch.train.processes.distributed import by_first, rank
 
@@ -207,7 +218,7 @@ def _finetune(
         weights_name(network, metadata),
         tuple(DataSet(item.name, "depth" if item.kind == "depth" else "run") for item in items),
         tuple(DataSet(os.path.basename(os.path.abspath(path)), "depth") for path in args.validate),
-        settings_of(config, from_runs, reading),
+        settings_of(config, from_runs, reading, hooks),
     )
     by_first(lambda: out.check(expected))  # fail before running SLAM
     if args.weights is not None and out.holds(args.weights):
@@ -218,12 +229,12 @@ def _finetune(
             print(line, flush=True)
         if not args.overwrite and 0 < (step := out.step) < args.steps:
             print(f"{out.path}: goes on after step {step}", flush=True)
-    return finetune(network, metadata, data, config, out, from_runs, reading)
+    return finetune(network, metadata, data, config, out, from_runs, reading, hooks)
 
 
 def _data(args: argparse.Namespace, items: list[_Item], out: "OutFolder") -> "Data":
     """Read the folders; SLAM is run on recordings without labels first."""
-    from edgeslam_torch.train.finetune import Data
+    from edgeslam_torch.train.finetuning import Data
     from edgeslam_torch.train.processes.distributed import by_first
     from edgeslam_torch.train.views.datasets import load_depth_folder
     from edgeslam_torch.train.views.posed import load_run

@@ -380,3 +380,19 @@ def test_divergence_is_one_line_and_a_smaller_rate_goes_on(
     code, stdout, _ = finetune("kitchen", "--lr", "0.001", "--resume")
     assert code == 0
     assert "goes on after step 3" in stdout
+
+
+def test_hooks_of_the_command_line_take_part(finetune: Finetune, tmp_path: Path) -> None:
+    hooks = tmp_path / "hooks_of_a_user.py"
+    hooks.write_text(
+        "from edgeslam_torch.train import Hooks\n"
+        "class Stop(Hooks):\n"
+        "    def on_step(self, state, losses):\n        state.stop = 'enough'\n"
+    )
+    refused(finetune("kitchen", "--hook", f"{hooks}:Other"), "has no Other")
+    assert not (tmp_path / "out").exists()
+    code, _, _ = finetune("kitchen", "--hook", f"{hooks}:Stop")
+    assert code == 0
+    assert saved_step(tmp_path / "out" / recipe.LAST) == 1
+    record = json.loads((tmp_path / "out" / "finetune.json").read_text())
+    assert record["given"]["settings"]["hooks"] == ["hooks_of_a_user:Stop"]

@@ -17,7 +17,7 @@ from edgeslam_torch.models.checkpoint import build_network, load_checkpoint, sav
 from edgeslam_torch.models.fastdepth import FastDepth, Widths
 from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.train import teacher
-from edgeslam_torch.train.finetune import Data
+from edgeslam_torch.train.finetuning import Data
 from edgeslam_torch.train.views import posed, slam_runs
 from edgeslam_torch.train.views.posed import PosedSequence, load_run
 from edgeslam_torch.train.views.slam_runs import ensure_run

@@ -444,3 +444,33 @@ def test_loss_that_is_not_finite_in_one_process_stops_all_with_its_name(tmp_path
         assert code == 1
         assert f"step 3: loss supervised/l1 is not finite for {named}; " in said
         assert "last.pt holds step 2, the last good one" in said
+
+
+STOPPED = """
+import sys, torch
+from pathlib import Path
+from edgeslam_torch.train.processes.distributed import process_group, rank
+sys.path.insert(0, {folder!r})
+from {module} import CONFIG, METADATA, Hooks, network, replace, signal, train
+torch.set_num_threads(1)
+
+class Stop(Hooks):
+    def on_step(self, state, losses):
+        if rank() == 1 and state.step == 2:
+            state.stop = "asked for by the second"
+
+    def on_end(self, state, reason):
+        sys.stderr.write(f"{{reason}} at {{state.step}}")
+
+with process_group():
+    train(network(), METADATA, [signal()], replace(CONFIG, freeze_norm=True), Path(sys.argv[1]), hooks=[Stop()])
+"""
+
+
+@pytest.mark.slow
+def test_stop_that_one_process_asks_for_ends_all_after_the_same_step(tmp_path: Path) -> None:
+    script = tmp_path / "script.py"
+    script.write_text(STOPPED.format(folder=str(Path(__file__).parent), module=Path(__file__).stem))
+    for code, said in in_two_processes(script, str(tmp_path / "out")):
+        assert code == 0
+        assert "asked for by the second at 2" in said

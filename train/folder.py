@@ -113,7 +113,7 @@ class OutFolder:
             self._clear()
         step = self.step
         session = {"from_step": step, "processes": world(), "version": __version__}
-        session |= {name: given.settings[name] for name in WITH_RESUME}
+        session |= {name: given.settings[name] for name in WITH_RESUME if name in given.settings}
         sessions = [*record["sessions"], session] if kept and record is not None else [session]
         self._write({"given": dataclasses.asdict(given), "sessions": sessions, "outcome": None})
         return step

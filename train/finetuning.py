@@ -18,11 +18,11 @@ from edgeslam_torch.errors import SourceError
 from edgeslam_torch.models.checkpoint import load_checkpoint, save_checkpoint
 from edgeslam_torch.models.fastdepth import FastDepth
 from edgeslam_torch.models.record import Metadata
-from edgeslam_torch.train.given import Given, labelled_set, posed_set, weights_name
-from edgeslam_torch.train.out_folder import TEACHER, TENSORBOARD, WEIGHTS, OutFolder
+from edgeslam_torch.train.folder import TEACHER, TENSORBOARD, WEIGHTS, OutFolder
+from edgeslam_torch.train.given import HOOKS, Given, labelled_set, posed_set, weights_name
 from edgeslam_torch.train.outcome import Outcome
 from edgeslam_torch.train.processes.distributed import by_first, rank
-from edgeslam_torch.train.recipe import BEST, FINAL, Hooks, TrainConfig, TrainState, train
+from edgeslam_torch.train.recipe import BEST, FINAL, Hooks, TrainConfig, TrainState, changes_losses, train
 from edgeslam_torch.train.self_supervised import SelfSupervised, fit_log_scale
 from edgeslam_torch.train.signals import Signal, Source, Supervised
 from edgeslam_torch.train.teacher import Taught, teach
@@ -89,7 +89,8 @@ def finetune(
     config: TrainConfig,
     out: OutFolder,
     from_runs: FromRuns = FromRuns.TEACHER,
-    reading: Mapping[str, Any] = MappingProxyType({}),
+    reading: Mapping[str, object] = MappingProxyType({}),
+    hooks: Sequence[Hooks] = (),
 ) -> Outcome:
     """Train ``network`` on ``data``; resumes a training in ``out`` with the same inputs.
 
@@ -104,10 +105,11 @@ def finetune(
         out: From `out_folder`.
         from_runs: What is learnt from images without labels.
         reading: How the data was read, plain values by name; a training is resumed only if they are the same.
+        hooks: Your own, called after the progress and before TensorBoard, in every process.
 
     Raises:
         SourceError: If there is nothing to learn from, or to validate on.
-        ConfigError: If ``out`` holds another training.
+        ConfigError: If ``out`` holds another training, or a hook makes no losses of them.
         DivergedError: If a loss is not finite, or the network's depth becomes absurd.
         OSError: If the file cannot be written.
     """
@@ -116,7 +118,7 @@ def finetune(
         weights_name(network, metadata),
         (*map(labelled_set, data.labelled), *map(posed_set, data.posed)),
         tuple(map(labelled_set, data.validation)),
-        settings_of(config, from_runs, reading),
+        settings_of(config, from_runs, reading, hooks),
     )
     if (done := by_first(lambda: out.finished(given))) is not None:
         return dataclasses.replace(done, nothing_to_do=True)
@@ -125,9 +127,9 @@ def finetune(
     signals, held_out = _prepared(start, metadata, data, from_runs, out.path / TEACHER)
     before = by_first(lambda: score(start, metadata, held_out)) if held_out else None
     tuned = _tuned_metadata(metadata, data)
-    hooks: list[Hooks] = []
+    watching = list(hooks)
     if rank() == 0:
-        hooks = [ProgressBar(), TensorBoard(out.path / TENSORBOARD, tuned, _pictures(data, held_out))]
+        watching = [ProgressBar(), *hooks, TensorBoard(out.path / TENSORBOARD, tuned, _pictures(data, held_out))]
 
     def validate(averaged: FastDepth) -> dict[str, float]:
         return _metrics(score(averaged, metadata, held_out))
@@ -139,15 +141,19 @@ def finetune(
         config,
         out.path,
         validate if held_out else None,
-        hooks,
+        watching,
         None if before is None else _metrics(before),
     )
     return by_first(lambda: _conclude(state, start, metadata, tuned, before, held_out, out))
 
 
-def settings_of(config: TrainConfig, from_runs: FromRuns, reading: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings by name, plain values, as ``finetune.json`` keeps them."""
-    return {**dataclasses.asdict(config), "from_runs": str(from_runs), **reading}
+def settings_of(
+    config: TrainConfig, from_runs: FromRuns, reading: Mapping[str, object], hooks: Sequence[Hooks] = ()
+) -> dict[str, Any]:
+    """Settings by name, plain values, as ``finetune.json`` keeps them; those of hooks only where there are any."""
+    named = {f"{type(hook).__module__}:{type(hook).__qualname__}": hook for hook in hooks}
+    own = {HOOKS: sorted(named), "losses_of": sorted(name for name, hook in named.items() if changes_losses(hook))}
+    return {**dataclasses.asdict(config), "from_runs": str(from_runs), **reading, **{k: v for k, v in own.items() if v}}
 
 
 def _prepared(
