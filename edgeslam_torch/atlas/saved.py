@@ -22,6 +22,9 @@ EARLIER_FLIGHT = "map of an earlier flight"
 BEFORE_S = -np.inf
 """Stamp of keyframes of earlier flights: they have no time on this flight's clock."""
 
+FARTHEST = 1e4
+"""Distance from the origin beyond which an anchor tells a direction only [map units], and the file has no number for it
+at last; it is left out."""
 UNKNOWN_SIGMA = 1e6
 """Stands for an infinite standard deviation in the file."""
 
@@ -151,6 +154,7 @@ def _worth_keeping(slam_map: SlamMap) -> tuple[list[Keyframe], IntArray]:
     """Keyframes that see something, in order, and the anchors that they see; without priors that rest on nothing."""
     keyframes = [slam_map.keyframes[id] for id in sorted(slam_map.keyframes)]
     anchors, anchor = slam_map.anchors, slam_map.anchors_seen_by(keyframes)
+    anchor = anchor[np.abs(anchors.p_w[anchor]).max(axis=1, initial=0.0) <= FARTHEST]
     alive = {k.id for k in keyframes if (k.anchor != NO_ANCHOR).any()}
     held_by = np.array([slam_map.heir_of(int(h))[0] if h >= 0 else -1 for h in anchors.host[anchor]], dtype=np.int64)
     anchor = anchor[~anchors.from_depth[anchor] | np.isin(held_by, sorted(alive))]

@@ -98,6 +98,20 @@ def test_a_saved_map_shows_the_same_in_published_units(rng, tmp_path):
     assert len(slam_map.begun) == 1 and slam_map.next_keyframe_id() == 5
 
 
+@pytest.mark.parametrize("far", [1.2e7, np.inf, np.nan])
+def test_an_anchor_that_ran_away_is_left_out(rng, tmp_path, far):
+    """One keypoint without parallax, 12 000 km off after the last refinement, made a file that could not be read."""
+    flown = Flown(rng)
+    held = flown.map.latest().anchor
+    runaway = held[(held >= 0) & ~np.isin(held, flown.guessed)][0]
+    whole = flown.saved().anchors
+    flown.map.anchors.p_w[runaway] = far
+    write_atlas(tmp_path / "a.atlas", flown.saved())
+    saved = read_atlas(tmp_path / "a.atlas")
+    assert saved.anchors == whole - 1
+    assert len(restored(saved)[0].anchors) == whole - 1
+
+
 def test_edges_of_removed_keyframes_come_along(rng, tmp_path):
     flown = Flown(rng)
     write_atlas(tmp_path / "room.atlas", flown.saved(Unit(S, KNOWN)))
