@@ -32,6 +32,8 @@ LOOK_BACK_S = 1.0
 LOOP_VOTES = 20
 """Votes from which on it is worth a closer look: a tenth. Where a fifth of what is in view will be found, 30 and more
 of 200 keypoints vote; a wall with the same paper gets 22."""
+AGAIN_S = 0.1
+"""Time from one keyframe that is asked again to the next: a third of a core while that lasts."""
 WITNESSES = 4
 """Earlier keyframes of the same piece that are asked at once when one has found a link."""
 
@@ -98,6 +100,10 @@ class Atlas:
         """Found so far, between pieces that are still apart."""
         self._asked = -1
         """Newest keyframe that was asked."""
+        self._again: list[int] = []
+        """Keyframes that are to be asked again, the next one last."""
+        self._again_s = -np.inf
+        """Stamp at which the last of them was."""
         self._looked_back_s = -np.inf
         """Stamp of the newest keyframe that was asked for a loop."""
 
@@ -112,20 +118,38 @@ class Atlas:
 
     @property
     def is_up_to_date(self) -> bool:
-        """Whether every keyframe was asked."""
-        return max(self.map.keyframes, default=-1) <= self._asked
+        """Whether every keyframe was asked, and none is to be asked again."""
+        return max(self.map.keyframes, default=-1) <= self._asked and not self._again
 
-    def update(self) -> Join | Closure | None:
-        """Ask the keyframes that are new since the last call; the join or the closed loop that follows, if one does.
+    def update(self, stamp_s: float = np.inf) -> Join | Closure | None:
+        """Ask the keyframes that are new since the last call, and one of those that are to be asked again.
 
         The map must belong to the caller.
+
+        Args:
+            stamp_s: Present time.
+
+        Returns:
+            The join or the closed loop that follows, if one does.
         """
-        for id in sorted(id for id in self.map.keyframes if id > self._asked):
-            self._asked = id
+        for id in [*sorted(id for id in self.map.keyframes if id > self._asked), *self._next_again(stamp_s)]:
+            self._asked = max(self._asked, id)
             change = self._ask(self.map.keyframes[id])
             if change is not None:
                 return change
         return None
+
+    def ask_again(self) -> None:
+        """Let the next calls of `update` ask every keyframe once more, the newest first: its piece has grown since."""
+        self._again = sorted(self.map.keyframes)
+
+    def _next_again(self, stamp_s: float) -> list[int]:
+        """The keyframe whose turn it is, if it is time."""
+        if not self._again or stamp_s - self._again_s < AGAIN_S:
+            return []
+        self._again_s = stamp_s
+        id = self._again.pop()
+        return [id] if id in self.map.keyframes else []
 
     def ask_all_again(self) -> None:
         """Let the next `update` ask every keyframe."""
@@ -230,6 +254,7 @@ class Atlas:
         )
         self.joins.append(join)
         self._follow_scale(mine, theirs, moved)
+        self._again = []
         self._links = []  # their similarities hold for pieces as they were
         return join
 

@@ -1,5 +1,6 @@
 """Joining of pieces, and closing of loops, between two frames; the current pose is transformed along."""
 
+import math
 from dataclasses import replace
 
 from edgeslam_torch.atlas.atlas import Atlas, Join
@@ -16,14 +17,22 @@ class Joining:
         self.system = system
         self.atlas = atlas
         self._piece: int | None = None
-        """That the camera was in when the last frame was done."""
+        """Whose metres hold."""
+        self._left: int | None = None
+        """Piece that the camera was in when the last frame was done."""
 
-    def update(self) -> str:
-        """Join pieces, and close loops, that the newest keyframes connect; returns it in words, empty without any."""
+    def update(self, stamp_s: float = math.inf) -> str:
+        """Join pieces, and close loops, that the newest keyframes connect; returns it in words, empty without any.
+
+        Args:
+            stamp_s: Of the present frame.
+        """
         if self.system.mapping.busy:
             return ""
+        if len(self.system.map.begun) > 1:
+            self._notice_return()
         words = []
-        while (change := self._once()) is not None:
+        while (change := self._once(stamp_s)) is not None:
             words.append(change.in_words())
         return "; ".join(words)
 
@@ -38,19 +47,27 @@ class Joining:
         if known is not None and (system.published.scale != known.value or system.published.offset.any()):
             system.published = Published(known.value, revision=system.published.revision + 1)
 
+    def _notice_return(self) -> None:
+        """When the camera returns to an earlier piece, the one that it left is complete: both are compared again."""
+        piece = self.system.map.piece_of(self.system.log.records[-1].keyframe_id)
+        returned = self._left is not None and piece < self._left
+        self._left = piece
+        if returned and self.atlas.is_divided:
+            self.atlas.ask_again()
+
     def finish(self) -> None:
         """Query every keyframe again where there are several pieces, since they have grown."""
         if self.atlas.is_divided:
             self.atlas.ask_all_again()
         self.update()
 
-    def _once(self) -> Join | Closure | None:
+    def _once(self, stamp_s: float) -> Join | Closure | None:
         system = self.system
         if self.atlas.is_up_to_date or not system.log.records:
             return None
         last = system.log.records[-1].keyframe_id
         piece, T_k_w = system.map.piece_of(last), system.map.pose_of(last)
-        change = self.atlas.update()
+        change = self.atlas.update(stamp_s)
         if change is None:
             return None
         T_c_k = system.motion.T_c_w @ se3.inverse(T_k_w)

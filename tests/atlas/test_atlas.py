@@ -96,6 +96,31 @@ def test_a_piece_is_asked_again_only_by_new_keyframes(rng):
     assert len(atlas.joins) == 1
 
 
+def test_keyframes_are_asked_again_one_at_a_time_the_newest_first(rng, monkeypatch):
+    """Not all at once, which would stop the video for a second."""
+    pieces = Pieces(rng)
+    atlas, asked = pieces.atlas(), []
+    monkeypatch.setattr(atlas, "_ask", lambda keyframe: asked.append(keyframe.id))
+    atlas.update(0.0)
+    assert (asked, atlas.is_up_to_date) == ([0, 1, 2, 3, 4, 5, 6, 7], True)
+    asked.clear()
+    atlas.ask_again()
+    told = [(atlas.update(1.0 + 0.04 * i), len(asked))[1] for i in range(8)]
+    assert (asked, told) == ([7, 6, 5], [1, 1, 1, 2, 2, 2, 3, 3])
+    assert not atlas.is_up_to_date
+
+
+def test_what_was_missed_at_first_is_joined_when_asked_again(rng):
+    pieces = Pieces(rng)
+    atlas = pieces.atlas()
+    atlas._asked = 7  # as if each had been asked before the other piece had grown
+    assert atlas.update(0.0) is None
+    atlas.ask_again()
+    joins = [join for i in range(8) if (join := atlas.update(1.0 + i)) is not None]
+    assert len(joins) == 1
+    assert atlas.is_up_to_date
+
+
 def test_two_places_stay_two_pieces(rng):
     pieces = Pieces(rng, same_place=False)
     before = [k.T_c_w.copy() for k in pieces.keyframes]

@@ -22,7 +22,9 @@ class Pieces:
 
     def __init__(self, T_k_w):
         self.T_k_w, self.piece = T_k_w, 1
+        self.begun = {0: "first", 1: "second"}
         self.asked = 0
+        self.again = []
 
     def piece_of(self, keyframe_id):
         assert keyframe_id == KEYFRAME
@@ -35,7 +37,7 @@ class Pieces:
     def atlas(self, moved):
         """Finds one join, of which the camera's piece is moved if it is number ``moved``."""
 
-        def update():
+        def update(stamp_s):
             self.asked += 1
             if self.piece == 0:
                 return None
@@ -45,7 +47,12 @@ class Pieces:
             return Join(1.0, 0, 1, moved, S if moved == 1 else sim3.inverse(S), 0.01, 2, 300)
 
         return SimpleNamespace(
-            update=update, ask_all_again=lambda: None, is_up_to_date=False, is_divided=True, known_scale={}
+            update=update,
+            ask_all_again=lambda: None,
+            ask_again=lambda: self.again.append(self.piece),
+            is_up_to_date=False,
+            is_divided=True,
+            known_scale={},
         )
 
 
@@ -111,7 +118,7 @@ def test_the_pose_goes_along_when_a_loop_is_closed(rng):
     before = se3.transform(motion.T_c_w, p)
     pieces = Pieces(T_k_w)
 
-    def update():
+    def update(stamp_s):
         if pieces.asked:
             return None
         pieces.asked += 1
@@ -155,3 +162,16 @@ def test_the_metres_of_an_earlier_flight_hold_in_its_map_and_nowhere_else(rng):
     joining.enter(0)
     assert (system.published.scale, system.published.revision) == (1.1, 2)
     assert system.fusion.remembered == [None, known]
+
+
+def test_pieces_are_compared_again_when_the_camera_returns_from_one_to_an_earlier_one(rng):
+    """The one that it left is complete; one that it has just begun is not."""
+    T_k_w, motion = moving(rng)
+    system = system_of(Pieces(T_k_w), motion)
+    atlas = system.map.atlas(moved=1)
+    atlas.is_up_to_date = True
+    joining = Joining(system, atlas)
+    for piece, asked in ((0, 0), (1, 0), (1, 0), (0, 1), (0, 1), (1, 1), (0, 2)):
+        system.map.piece = piece
+        joining.update()
+        assert len(system.map.again) == asked
