@@ -258,7 +258,7 @@ def _report(result: "RunResult", source: "Source") -> None:
     if counts["edge_points"] == 0:
         _say("warning: the edge map is empty")
     print(f"map: {counts['edge_points']} edge points, {counts['anchors']} anchors, {counts['keyframes']} keyframes")
-    for line in _atlas_words(summary):
+    for line in [*summary["joins"], *summary["loops"], *_atlas_words(summary)]:
         print(line)
     print(f"results: {result.folder} (look at {_best_view(result.folder)})")
 

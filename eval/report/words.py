@@ -8,6 +8,8 @@ from typing import Any
 from edgeslam_torch.eval.inputs.run_folder import RunFolder, is_supported
 from edgeslam_torch.eval.metrics.run_score import RunScore
 
+_MOST_SAID = 5
+"""Joins and loops that the story names."""
 _LEADING = re.compile(
     r"(?<![\w.:/\\<])"  # where a word begins: the slashes of 6/s, rtsp://host and </tag> are none
     r"(?:(?:\.\.[\\/])+|[A-Za-z]:[\\/]|\\\\|/)(?=[^\s/\\:;,'\"<>|])"
@@ -59,6 +61,7 @@ def story(run: RunFolder, score: RunScore | None) -> str:
             sentences.append("Tracking was never lost." if lost == 0 else f"Tracking was lost {_times(lost)}.")
     sentences.append(_scale_sentence(summary))
     sentences.append(_pieces_sentence(summary))
+    sentences.append(_found_again_sentence(summary))
     if score is not None:
         sentences.append(
             f"Against ground truth the camera is off by {_length(score.ate_sim3_m)} (RMSE after scaling; a camera that "
@@ -217,6 +220,16 @@ def _pieces_sentence(summary: dict[str, Any]) -> str:
         f"The map is in {len(pieces)} pieces whose relation is not known: {spans}. This page is about the largest; "
         "the others have trajectory files of their own."
     )
+
+
+def _found_again_sentence(summary: dict[str, Any]) -> str:
+    """Joins of pieces and closed loops, with their evidence."""
+    said = [text for key in ("joins", "loops") if isinstance(found := summary.get(key), list) for text in found]
+    said = [text for text in said if isinstance(text, str) and text]
+    if not said:
+        return ""
+    more = f"; and {len(said) - _MOST_SAID} more" if len(said) > _MOST_SAID else ""
+    return f"Places were seen again: {'; '.join(said[:_MOST_SAID])}{more}."
 
 
 def _times(count: int) -> str:

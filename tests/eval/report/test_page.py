@@ -90,6 +90,18 @@ def test_pieces_are_named_with_their_seconds(run: Path) -> None:
     assert "piece 0 from 0.0 to 8.1 s, piece 1 from 8.2 to 11.5 s" in story
 
 
+def test_joins_and_loops_are_told_with_their_evidence(run: Path) -> None:
+    joins, loops = ["piece 1 joined piece 0: 2 keyframes agree"], [f"loop {k} closed" for k in range(7)]
+    story = Page(write_report(with_summary(run, joins=joins, loops=loops))).data["story"]
+    assert "Places were seen again: piece 1 joined piece 0: 2 keyframes agree; loop 0 closed; " in story
+    assert "loop 3 closed; and 3 more." in story and "loop 4" not in story
+
+
+@pytest.mark.parametrize("said", [None, "loop", 3, {}, [None, 3, ""]])
+def test_a_summary_without_joins_tells_of_none(run: Path, said: object) -> None:
+    assert "seen again" not in Page(write_report(with_summary(run, joins=said, loops=said))).data["story"]
+
+
 def test_a_run_that_never_tracked_was_not_never_lost(run: Path) -> None:
     lines = (run / "status.csv").read_text().splitlines()
     at = lines[0].split(",").index("status")
