@@ -1,5 +1,6 @@
 """Stage 4 on the map: select a window, refine it, write the result back, remove outliers."""
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -85,12 +86,16 @@ def whole_map(slam_map: SlamMap, freed: Weight = Weight.NONE) -> Window | None:
 def held_extent(window: Window) -> ScalePrior | None:
     """Scale prior if only one pose is fixed: the distance to the farthest other pose. None if no pose is free.
 
-    Two fixed poses fix the scale themselves; coincident poses have none.
+    Two fixed poses fix the scale themselves; coincident poses have none. In the map of an earlier flight it is the
+    farthest pose of that flight: a metre is as long as it was.
     """
     if len(window.fixed) != 1 or not window.free:
         return None
     centre = window.fixed[0].centre_w
     distance = np.array([np.linalg.norm(k.centre_w - centre) for k in window.free])
+    earlier = np.array([math.isinf(k.stamp_s) for k in window.free])
+    if math.isinf(window.fixed[0].stamp_s) and (distance[earlier] >= MIN_EXTENT).any():
+        distance = np.where(earlier, distance, 0.0)
     far = int(distance.argmax())
     if distance[far] < MIN_EXTENT:
         return None

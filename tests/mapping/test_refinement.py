@@ -125,6 +125,22 @@ def test_whole_map_comes_back_up_to_its_gauge(points, rng):
     check_map(points.map)
 
 
+def test_the_unit_of_an_earlier_flight_stays_as_it_was(points):
+    """What this flight adds is a tenth too far off: it comes to the earlier map, not the other way round."""
+    earlier, later = points.keyframes[:3], points.keyframes[3:]
+    origin = earlier[0].centre_w
+    for keyframe in earlier:
+        keyframe.stamp_s = -np.inf
+    for keyframe in later:
+        keyframe.T_c_w[:3, 3] = -keyframe.T_c_w[:3, :3] @ (origin + 1.1 * (keyframe.centre_w - origin))
+    refine_all(points.map, CAMERA, LmConfig(max_iterations=30))
+    truth = -np.einsum("kji,kj->ki", points.world.T_c_w[:, :3, :3], points.world.T_c_w[:, :3, 3])
+    for keyframe in points.keyframes[1:]:
+        far = np.linalg.norm(truth[keyframe.id] - origin)
+        assert np.linalg.norm(keyframe.centre_w - origin) == pytest.approx(far, rel=5e-3)
+    check_map(points.map)
+
+
 def test_map_of_two_keyframes_is_left_alone(rng):
     points = PointMap(rng, 100, 2)
     points.fill()
