@@ -20,6 +20,7 @@ import pdoc.docstrings
 import pdoc.render
 
 import edgeslam_torch
+import edgeslam_torch.train
 
 ROOT = Path(__file__).resolve().parent.parent
 GUIDES = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")
@@ -113,8 +114,9 @@ def network_needs(site: Path) -> list[str]:
 
 def modules() -> list[str]:
     """What lies directly in the package; pdoc goes on from there and finds the lazily loaded names resolved."""
-    for name in edgeslam_torch.__all__:
-        setattr(edgeslam_torch, name, getattr(edgeslam_torch, name))
+    for package in (edgeslam_torch, edgeslam_torch.train):
+        for name in package.__all__:
+            getattr(package, name)
     found = pkgutil.iter_modules(edgeslam_torch.__path__, "edgeslam_torch.")
     return ["edgeslam_torch", *(module.name for module in found)]
 

@@ -110,7 +110,8 @@ if not TYPE_CHECKING:  # a type checker takes the imports above
 
     def __getattr__(name):
         if name in _LAZY:
-            return getattr(importlib.import_module(_LAZY[name]), name)
+            globals()[name] = getattr(importlib.import_module(_LAZY[name]), name)
+            return globals()[name]
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
     def __dir__():
