@@ -54,7 +54,8 @@ def check_images(**images: Tensor) -> None:
         ValueError: If shapes differ, or there is no axis beside the batch's.
     """
     shapes = {name: tuple(x.shape) for name, x in images.items()}
-    if len(set(shapes.values())) > 1 or len(next(iter(shapes.values()))) < 2:
+    first = next(iter(shapes.values()))
+    if any(shape != first for shape in shapes.values()) or len(first) < 2:
         raise ValueError(f"shapes must be the same, (B, 1, H, W): {_listed(shapes)}")
 
 
@@ -75,17 +76,17 @@ def check_shapes(**given: tuple[Tensor, str]) -> None:
         ValueError: shapes do not fit: uv (5, 2) should be (N, 2), depth (4,) should be (N,)
     """
     sizes: dict[str, int] = {}
-    batches: set[tuple[int, ...]] = set()
+    batches: list[tuple[int, ...]] = []  # no set: sizes of a traced graph cannot be hashed
     fits = True
     for x, axes in given.values():
         names = axes.removeprefix("? ").split()
         batch, own = tuple(x.shape[: x.ndim - len(names)]), tuple(x.shape[x.ndim - len(names) :])
         fits &= len(own) == len(names) and len(batch) <= 1
         if batch or not axes.startswith("?"):
-            batches.add(batch)
+            batches.append(batch)
         for name, size in zip(names, own, strict=False):
             fits &= size == (int(name) if name.isdigit() else sizes.setdefault(name, size))
-    if not fits or len(batches) > 1:
+    if not fits or any(batch != batches[0] for batch in batches):
         shapes = {name: tuple(x.shape) for name, (x, _) in given.items()}
         wanted = {name: _axes(axes.removeprefix("? ")) for name, (_, axes) in given.items()}
         also = "; with a batch, (B, ...) each" if any(batches) else ""

@@ -42,7 +42,7 @@ class TotalLoss(nn.Module):
             ValueError: For a term without a weight, no term, or terms of several shapes.
         """
         shapes = {name: tuple(term.shape) for name, term in terms.items()}
-        if len(set(shapes.values())) > 1:
+        if any(shape != next(iter(shapes.values())) for shape in shapes.values()):
             raise ValueError(f"terms must have one shape, got {shapes}")
         weighted = self.weighted(terms)
         if not weighted:

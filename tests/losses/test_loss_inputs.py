@@ -177,23 +177,31 @@ def test_holes_of_a_depth_map_are_not_mixed_into_its_samples():
     assert d[known].tolist() == [2.0, 2.0]
 
 
+def larger(arguments: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The batch with its first item once more at its end."""
+    return {name: torch.cat((x, x[:1])).contiguous() for name, x in arguments.items()}
+
+
 @pytest.mark.slow
 @EVERY
 def test_compiled_whole_it_gives_the_same(case):
     """The graph's capture is what can fail for a loss; machine code is the compiler's business."""
-    given = cast(case.given(), torch.float32)
     compiled = torch.compile(case.loss, fullgraph=True, backend="aot_eager")
-    x = given[case.predicted].clone().requires_grad_()
-    value = compiled(**{**given, case.predicted: x})
-    value.sum().backward()
-    expected, slope = gradient(case, given)
-    torch.testing.assert_close(value.detach(), expected)
-    torch.testing.assert_close(x.grad, slope, rtol=1e-4, atol=1e-5)
+    given = cast(case.given(), torch.float32)
+    for batch in (given, larger(given)):  # another size of batch makes sizes variables
+        x = batch[case.predicted].clone().requires_grad_()
+        value = compiled(**{**batch, case.predicted: x})
+        value.sum().backward()
+        expected, slope = gradient(case, batch)
+        torch.testing.assert_close(value.detach(), expected)
+        torch.testing.assert_close(x.grad, slope, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.slow
 @EVERY
-def test_exported_it_gives_the_same(case):
-    given = cast(case.given(), torch.float32)
-    program = torch.export.export(case.loss, (), given)
-    torch.testing.assert_close(program.module()(**given), case.loss(**given))
+def test_exported_for_any_batch_it_gives_the_same(case):
+    given = {name: x.contiguous() for name, x in cast(case.given(), torch.float32).items()}
+    batch = torch.export.Dim("batch", min=2, max=64)
+    program = torch.export.export(case.loss, (), given, dynamic_shapes={name: {0: batch} for name in given})
+    for some in (given, larger(given)):
+        torch.testing.assert_close(program.module()(**some), case.loss(**some))

@@ -60,3 +60,13 @@ def test_total_is_the_weighted_sum_and_refuses_what_it_does_not_know():
         total({})
     with pytest.raises(ValueError, match="negative"):
         TotalLoss({"cycle": -1.0})
+
+
+def test_total_of_a_batch_has_one_value_an_item_and_terms_have_one_shape():
+    total = TotalLoss({"reproj": 2.0, "cycle": 0.5, "shape": 0.0})
+    reproj, cycle = torch.tensor([1.0, 2.0]), torch.tensor([4.0, 0.0])
+    assert total({"reproj": reproj, "cycle": cycle, "shape": reproj}).tolist() == [4.0, 4.0]
+    assert total({"shape": reproj}).tolist() == [0.0, 0.0]
+    assert set(total.weighted({"reproj": reproj, "shape": reproj})) == {"reproj"}
+    with pytest.raises(ValueError, match=r"one shape, got .'reproj': \(2,\), 'cycle': \(\)"):
+        total({"reproj": reproj, "cycle": cycle.sum()})
