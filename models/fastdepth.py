@@ -1,7 +1,7 @@
 """FastDepth (Wofk et al., ICRA 2019) in its four published variants, under upstream's parameter names."""
 
 import math
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -115,6 +115,9 @@ class FastDepth(nn.Module):
         if self.output is Output.LOG_DEPTH:
             return last.clamp(-MAX_LOG_DEPTH, MAX_LOG_DEPTH).exp()
         return F.relu(last)
+
+    if TYPE_CHECKING:
+        __call__ = forward
 
     def features(self, x: Tensor) -> Tensor:
         """Input of the last 1x1 convolution, ``(B, C, H/2, W/2)``."""
