@@ -36,6 +36,7 @@ from edgeslam_torch.fusion.telemetry.comparison import Comparison, FlightSoFar
 from edgeslam_torch.fusion.telemetry.delay import DelaySearch
 from edgeslam_torch.fusion.telemetry.plausibility import HEIGHTS, Trust
 from edgeslam_torch.fusion.telemetry.track import TelemetryTrack
+from edgeslam_torch.fusion.telemetry.unrest import Unrest
 from edgeslam_torch.fusion.telemetry.visual_memory import VisualMemory, VisualPose
 from edgeslam_torch.fusion.telemetry_scale import TelemetryFit, TelemetryScale
 from edgeslam_torch.types import FloatArray, Health, ScaleEstimate, TelemetrySample
@@ -77,6 +78,7 @@ class MotionFusion:
         self._comparison = Comparison(config)
         self._filter = FilterFeed(config, self.T_b_c)
         self._trust = Trust()
+        self._unrest = Unrest()
         self._R_w_m: FloatArray | None = None
         truncates = config.velocity_rounding == "truncate"
         self._fit = TelemetryFit(shortfall_m_s=0.5 * config.velocity_step_m_s if truncates else 0.0)
@@ -121,7 +123,9 @@ class MotionFusion:
         self._memory.add(visual)
         if self._is_due(stamp_s):
             if self.refined_poses is not None:
+                before = self._memory.sightings()
                 self._remember(*self.refined_poses(stamp_s - self.config.window_s))
+                self._unrest.compare(before, self._memory.sightings(), stamp_s)
             self._refit()
         if self._trust.velocity and self._trust.motion:
             self._filter.see(visual, Metric(self.scale(), self._delay.delay))
@@ -399,13 +403,14 @@ class MotionFusion:
         self._trust.at_odds = None
         held = self._held_scale()
         scale = TelemetryScale(self.config, self.T_b_c, present, self._trust, self.delay_s, R_w_m, held, flying)
-        self._take(scale.opinion())
+        unrest = self._unrest.sigma if flying else 0.0
+        self._take(scale.opinion(), unrest)
 
-    def _take(self, found: tuple[LogScale, TelemetryFit] | None) -> None:
+    def _take(self, found: tuple[LogScale, TelemetryFit] | None, unrest: float) -> None:
         if found is not None:
             self._fit = found[1]
         if found is not None and found[0].sigma < _BELIEVED:
-            self._by_telemetry = found[0]
+            self._by_telemetry = replace(found[0], sigma=math.hypot(found[0].sigma, unrest))
         elif not self._still_trusted():
             self._forget_scale()
         # else nothing new to say: hover, pure rotation, or telemetry missing

@@ -26,6 +26,12 @@ place."""
 CONTRADICTION = 2.0
 """Deviation of the published scale that triggers a revision [sigmas]."""
 
+GUESS_SURE = 0.15
+_GUESS_CONTRADICTION, _GUESS_OFF = 1.0, 0.05
+"""The same while the unit is still the one that the map began with, and the least deviation of its logarithm: depth
+networks have stated 0.16 at best. A guess is given up as soon as measured metres are likely to be nearer to the truth,
+unless a revision would hardly tell."""
+
 MEASURED = frozenset({"telemetry", "height"})
 """Sources that measure metres; a depth network has guessed them at the start already."""
 
@@ -63,7 +69,16 @@ class Published:
     def contradicts(self, estimate: ScaleEstimate) -> bool:
         """Whether an estimate [metres per map unit] leaves no room for the published scale."""
         sigma = estimate.sigma / estimate.value
-        return bool(abs(math.log(estimate.value / self.scale)) > CONTRADICTION * sigma)
+        return bool(self._off(estimate) > CONTRADICTION * sigma)
+
+    def _off(self, estimate: ScaleEstimate) -> float:
+        """Deviation of the published scale from an estimate, in the logarithm."""
+        return abs(math.log(estimate.value / self.scale))
+
+    def _worse_guess(self, estimate: ScaleEstimate) -> bool:
+        """Whether the published scale is the first guess, and surely worse than an estimate."""
+        off = self._off(estimate)
+        return self.revision == 0 and off > max(_GUESS_OFF, _GUESS_CONTRADICTION * estimate.sigma / estimate.value)
 
     def revised(self, estimate: ScaleEstimate, centre_map: FloatArray) -> "Published":
         """The same at an estimated scale, if that is measured, sure and contradicts the published one.
@@ -73,7 +88,9 @@ class Published:
             centre_map: Point of the map ``(3,)`` that stays where it is published.
         """
         measured = not MEASURED.isdisjoint(estimate.source.split("+"))
-        if not (measured and estimate.sigma < SURE * estimate.value and self.contradicts(estimate)):
+        sure = SURE if self.revision > 0 else GUESS_SURE
+        wrong = self.contradicts(estimate) or self._worse_guess(estimate)
+        if not (measured and estimate.sigma < sure * estimate.value and wrong):
             return self
         offset = self.offset + (self.scale - estimate.value) * (self.R @ centre_map)
         return Published(estimate.value, self.R, offset, self.revision + 1)

@@ -8,6 +8,8 @@ import numpy as np
 from edgeslam_torch.fusion.config import FusionConfig
 from edgeslam_torch.fusion.scale.consensus import at_odds, contradict, sided_with
 from edgeslam_torch.fusion.scale.joint_scale import (
+    MOST_WANDER,
+    USUAL_WANDER,
     Evidence,
     aged_since,
     displacement_evidence,
@@ -16,7 +18,15 @@ from edgeslam_torch.fusion.scale.joint_scale import (
 )
 from edgeslam_torch.fusion.scale.log_scale import LogScale, floor_segments
 from edgeslam_torch.fusion.telemetry.comparison import FlightSoFar
-from edgeslam_torch.fusion.telemetry.plausibility import AtOdds, Reading, Trust, agreement, changes
+from edgeslam_torch.fusion.telemetry.plausibility import (
+    LEAST_COUNT,
+    AtOdds,
+    Reading,
+    Trust,
+    Verdict,
+    agreement,
+    changes,
+)
 from edgeslam_torch.fusion.telemetry.visual_memory import Displacements
 from edgeslam_torch.fusion.telemetry.whole_steps import (
     Rounding,
@@ -41,8 +51,16 @@ _GOOD_HEIGHT = 0.2
 """Relative sigma with which a height source is good enough; the next one would say the same less well."""
 _HEIGHT_BIN_S = 0.5
 _HEIGHT_SOURCES = {"tof": "sigma_tof_m", "h": "sigma_h_m", "baro": "sigma_baro_m"}
+_HEIGHT_STEP_M = {"tof": 0.01, "h": 0.1, "baro": 0.01}
+"""Steps in which the SDK tells them."""
 _LEAST_CLIMB_M = 0.05
 _LEAST_CLIMB_SIGMAS = 2.0
+_LEAST_MOVING, _LEAST_SHARE, _ROUGH_LOG = 4, 0.25, 0.2
+"""Moving intervals, and share of the motion that velocities must explain, for a ratio of lengths to mean anything, and
+that ratio's error."""
+_EXPLAINED = 0.98
+"""Correlation of velocities and images, their means left in, below which a fifth of the way (root mean square) is
+unexplained: whole steps of 0.1 m/s leave less, and so does a delay that is 0.25 s off."""
 _MOST_STEPS = 0.3
 """Share of height readings that may step: more is not furniture passing below."""
 
@@ -131,6 +149,15 @@ def _shared_drift(given: list[_Given]) -> float:
     return math.sqrt(2.0 * one * other)
 
 
+def _by_steps(z_m: FloatArray, step_m: float) -> float:
+    """Relative error of a scale by heights ``(N,)`` in steps of ``step_m``, which no repetition removes.
+
+    A height errs by the same whenever the drone passes it again. The slope of the rounded height over an even motion
+    through ``m`` steps is wrong by ``-1 / m**2`` (from edge to edge) to ``+1 / (2 m**2)`` (from middle to middle).
+    """
+    return min(1.0, (step_m / max(float(np.ptp(z_m)), 1e-6)) ** 2)
+
+
 class TelemetryScale:
     """Scale from displacements and height at one moment; `Trust` learns what the heights are worth.
 
@@ -180,6 +207,7 @@ class TelemetryScale:
         moved = {r: self._by_displacements(r) for r in tried}
         if any(evidence is None for evidence in moved.values()):  # what cannot be compared is not chosen from
             moved = dict.fromkeys(tried)
+        self._trust.tells_scale = all(evidence is not None for evidence in moved.values())
         found = {r: h for r in tried if (h := self._together(r, moved[r], systematic[r])) is not None}
         if not found:
             return None
@@ -210,6 +238,8 @@ class TelemetryScale:
         ]
         if len(given) == 2 and at_odds(given[0].opinion, given[1].opinion):
             given = self._settled(*given)
+        elif len(given) == 1 and given[0].name == "height" and self._nonsense(given[0]):
+            given = []
         together = solved([g.evidence for g in given], tilt) if given else None
         if together is None:
             return None
@@ -238,6 +268,21 @@ class TelemetryScale:
         kept = sided_with(velocity.opinion, height.opinion, self._present.network)
         self._trust.at_odds = AtOdds(velocity.scale, height.scale, None if kept is None else kept.source)
         return [given for given in (velocity, height) if kept is not None and given.name == kept.source]
+
+    def _nonsense(self, height: _Given) -> bool:
+        """Whether velocities that cannot tell the scale themselves still leave no room for that of heights alone.
+
+        Where the map's first second is wrong, a climb of decimetres in it is, too, and nothing else asks. Velocities
+        that go with the images to a quarter tell a scale to some tenths by the length of the way.
+        """
+        told = self._trust.latest.get(Reading.VELOCITY)
+        if told is None or told.count < _LEAST_MOVING or told.share < _LEAST_SHARE:
+            return False
+        shown = self._shown or self._compared()
+        if shown is None or not at_odds(height.opinion, LogScale(math.log(shown.start), _ROUGH_LOG, "telemetry")):
+            return False
+        self._trust.at_odds = AtOdds(shown.start, height.scale, None)
+        return True
 
     def _rough(self, moved: Evidence | None) -> float | None:
         """Metres per map unit to look for floor steps with: by velocities, unless the network contradicts them."""
@@ -363,8 +408,10 @@ class TelemetryScale:
                 continue
             tilt = config.alignment_sigma_rad
             aged = self._aged(times[here])
-            wander = {} if moved is None else {"wander": moved.wander}
-            evidence = height_evidence(p, z[here], times[here], segment, sigma_map, sigma, scale, tilt, aged, **wander)
+            wander = self._wander(moved)
+            evidence = height_evidence(p, z[here], times[here], segment, sigma_map, sigma, scale, tilt, aged, wander)
+            if evidence is not None:
+                evidence = evidence.softened(scale * _by_steps(z[here], _HEIGHT_STEP_M[name]))
             single = solved([evidence], tilt) if evidence is not None else None
             if evidence is not None and single is not None and single[1] < best_sigma:
                 if aged is not None:
@@ -374,6 +421,20 @@ class TelemetryScale:
             if best_sigma < _GOOD_HEIGHT:
                 break
         return best
+
+    def _wander(self, moved: Evidence | None) -> float:
+        """How much the map's scale changes as it ages: by the displacements, if they tell.
+
+        Velocities that had motion enough to prove themselves, have not, and leave a fifth of the way unexplained: a map
+        that changes its scale on the way is what parts them from the images.
+        """
+        if moved is not None:
+            return moved.wander
+        tried = self._trust.latest.get(Reading.VELOCITY)
+        if tried is None or self._trust.verdict(Reading.VELOCITY) is Verdict.CONTRADICTS:  # of no such flight
+            return USUAL_WANDER
+        parted = tried.count >= LEAST_COUNT and tried.steady < _EXPLAINED
+        return MOST_WANDER if parted else USUAL_WANDER
 
     def _judge_height(
         self,

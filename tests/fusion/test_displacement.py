@@ -23,6 +23,21 @@ def model_of(samples, R_w_m=None, scale=1.0, **changes):
     return replace(model, **changes)
 
 
+@pytest.mark.parametrize("rate_rad_s", [2.0, 4.0])
+def test_readings_that_are_means_over_a_tenth_of_a_second_give_back_the_way(rate_rad_s):
+    """A swing of 10 cm: what the mean takes away, and what the trapezoid rule does, is put back."""
+    t = np.arange(0.0, 8.0, 0.1)
+    position = np.sin(rate_rad_s * np.stack([t - 0.05, t + 0.05])) / 10.0
+    track = TelemetryTrack("world", 0.35)
+    velocity = (position[1] - position[0]) / 0.1
+    track.add([TelemetrySample(s, np.array([v, 0.0, 0.0]), np.zeros(3)) for s, v in zip(t, velocity, strict=True)])
+    asked = np.arange(0.5, 7.0, 0.1)
+    moved = track.displacement(asked)[:, 0]
+    true = np.sin(rate_rad_s * asked) / 10.0
+    slope = np.polyfit(true, moved, 1)[0]
+    assert slope == pytest.approx(1.0, abs=0.001)
+
+
 def power_on_axes(motion):
     """Rotation of the simulated world to the drone's power-on axes."""
     forward = (motion.T_w_c[0, :3, :3] @ T_B_C[:3, :3].T)[:, 0]

@@ -229,6 +229,23 @@ def test_the_present_scale_follows_a_map_that_has_drifted_since_the_climb(rng):
     assert np.sqrt(np.mean((now[:, 0] / now[:, 1]) ** 2)) < 1.5
 
 
+def test_the_present_scale_follows_a_map_that_shrinks_all_along(rng):
+    """Along bare walls a map's scale triples in ten seconds. No walk explains so steady a change fully."""
+    off, throughout = [], []
+    for _ in range(7):
+        t = 0.5 * np.arange(24)
+        step = np.stack([0.3 * np.cos(0.3 * t), 0.3 * np.sin(0.3 * t), 0.02 * np.sin(t)], axis=1)
+        seen = step * np.exp(1.2 * (1.0 - t / t[-1]))[:, None] / SCALE
+        told = step + 0.0094 * rng.standard_normal(step.shape)
+        given = (seen, told, t, np.full(24, 0.5), np.full(24, 1e-3 / SCALE), np.full(24, 0.0094), TILT)
+        evidence = displacement_evidence(*given, aged_since(t + 0.5, 0.0, 12.0))
+        off.append((math.log(solved([evidence], TILT)[0] / SCALE), evidence.wander))
+        throughout.append(math.log(solved([displacement_evidence(*given)], TILT)[0] / SCALE))
+    error, wander = np.median(np.array(off), axis=0)
+    assert abs(error) < 0.3 < 0.5 < abs(np.median(throughout))
+    assert wander > 0.2
+
+
 def test_heights_of_an_old_climb_are_less_sure_of_the_present_scale(rng):
     """A climb ten seconds ago of a map that is 10 % off there: covered, the surer the younger the climb."""
     t, p, z = climbed(rng, 0.1)

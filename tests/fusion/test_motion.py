@@ -38,9 +38,10 @@ def test_scale_gravity_and_delay_come_out_of_a_swung_camera(rng, swinging, repla
     assert math.degrees(math.acos(min(1.0, float(up @ fusion.rotation()[2])))) < 0.5
 
 
-@pytest.mark.parametrize(("delay_s", "latest_s"), [(0.5, 2.8), (0.3, 4.2), (0.75, 4.2)])
+@pytest.mark.parametrize(("delay_s", "latest_s"), [(0.5, 2.8), (0.3, 5.8), (0.75, 5.8)])
 def test_a_climb_tells_the_scale_within_its_sigma(delay_s, latest_s, swinging, replay):
-    """Up by 0.8 m in 1.6 s, then on: after four half seconds, a second later where the delay is not the guess."""
+    """Up by 0.8 m in 1.6 s, then on: after four half seconds; where the delay is not the guess heights are off by a
+    tenth, velocities do not bear them out, and it takes until the delay is known."""
     t = np.arange(0.0, 6.0, 0.05)
     motion = take_off(swinging(1.0), t)
     off = []

@@ -3,6 +3,7 @@
 import math
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,9 @@ from scipy.spatial.transform import Rotation
 from edgeslam_torch.fusion.config import FusionConfig
 from edgeslam_torch.fusion.motion import MotionFusion
 from edgeslam_torch.fusion.scale.depth_scale import DepthRatio
+from edgeslam_torch.fusion.scale.log_scale import LogScale
 from edgeslam_torch.fusion.telemetry.plausibility import Agreement, Reading, Trust, Verdict, agreement, changes
+from edgeslam_torch.fusion.telemetry_scale import TelemetryScale
 from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.synthetic.flights.telemetry import TelemetryFaults, simulate
 
@@ -261,6 +264,55 @@ def test_right_velocities_of_a_turning_drone_stay_as_they_are(rng, swinging, rep
     _, fusion, gauge = told_of(rng, replay, circling(swinging), lambda rng, samples, motion: samples)
     assert fusion.warnings() == []
     assert fusion.scale().value == pytest.approx(gauge.scale, rel=0.06)
+
+
+def test_velocities_do_not_count_where_the_attitude_of_the_same_messages_contradicts():
+    trust = Trust()
+    trust.judge(Reading.VELOCITY, Agreement(0.95, 12))
+    assert trust.velocity
+    trust.judge(Reading.ATTITUDE, Agreement(0.1, 12))
+    assert not trust.velocity
+    assert any("velocities are not used" in w for w in trust.warnings())
+
+
+def test_velocities_that_agree_and_tell_no_scale_are_said():
+    trust = Trust()
+    trust.judge(Reading.VELOCITY, Agreement(0.8, 12))
+    assert trust.warnings() == []
+    trust.tells_scale = False
+    assert any("too badly to tell a scale" in w for w in trust.warnings())
+
+
+@pytest.mark.parametrize(
+    ("by_height", "correlation", "count", "nonsense"),
+    [(0.34, 0.7, 5, True), (2.2, 0.7, 5, False), (0.34, 0.4, 5, False), (0.34, 0.7, 3, False)],
+)
+def test_a_height_may_be_nonsense_beside_velocities_that_prove_nothing(by_height, correlation, count, nonsense):
+    """By the length of the way, three metres a unit; the height of a map whose first second is wrong says a tenth."""
+    scale = TelemetryScale.__new__(TelemetryScale)
+    scale._trust, scale._shown = Trust(), SimpleNamespace(start=3.0)
+    scale._trust.judge(Reading.VELOCITY, Agreement(correlation, count))
+    assert (
+        scale._nonsense(SimpleNamespace(scale=by_height, opinion=LogScale(math.log(by_height), 0.2, "height")))
+        == nonsense
+    )
+    said = any("velocities and heights contradict each other" in w for w in scale._trust.warnings())
+    assert said == nonsense
+
+
+def test_heights_beside_velocities_that_leave_much_unexplained_tell_nothing_yet(rng, swinging, replay):
+    """Turned by a tumble they explain a quarter of the motion: is the map wrong, or are they?"""
+    turn = Rotation.from_euler("xyz", [50.0, 0.0, 50.0], degrees=True)
+
+    def spoil(rng, samples, motion):
+        return [replace(s, velocity_m_s=turn.apply(s.velocity_m_s)) for s in samples]
+
+    sigma = []
+    for change in (spoil, lambda rng, samples, motion: samples):
+        motion = swinging(6.0)
+        _, fusion, _ = told_of(np.random.default_rng(0), replay, motion, change)
+        sigma.append({s.source: s.sigma / s.value for s in fusion.sources()}.get("height", math.inf))
+    assert sigma[0] > 2.0 * sigma[1]
 
 
 def test_velocities_in_the_wrong_unit_are_named_and_dropped(rng, swinging, replay):

@@ -27,7 +27,7 @@ def test_revision_leaves_the_present_camera_where_it_is(rng):
     ("value", "sigma", "source"),
     [
         (3.0, 0.1, "depth"),  # the network guessed already, and has nothing new to say
-        (3.0, 0.31, "telemetry"),  # not sure enough
+        (3.0, 0.46, "telemetry"),  # no surer than a network
         (2.05, 0.05, "height+depth"),  # within its own uncertainty
         (1.0, np.inf, "none"),
     ],
@@ -35,6 +35,29 @@ def test_revision_leaves_the_present_camera_where_it_is(rng):
 def test_what_is_not_measured_not_sure_or_no_news_revises_nothing(value, sigma, source):
     old = Published(2.0)
     assert old.revised(ScaleEstimate(value, sigma, source), np.ones(3)) is old
+
+
+@pytest.mark.parametrize(
+    ("value", "sigma", "given_up"),
+    [
+        (1.1, 0.08, True),  # more than a sigma off: what is measured is likely to be nearer
+        (1.1, 0.109, False),  # not surer than it is off
+        (1.04, 0.03, False),  # more than a sigma, but hardly worth a revision
+    ],
+)
+def test_the_unit_that_the_map_began_with_is_given_up_sooner_than_a_measured_one(value, sigma, given_up):
+    estimate = ScaleEstimate(value, sigma, "height+depth")
+    assert (Published(1.0).revised(estimate, np.zeros(3)).revision == 1) == given_up
+    measured = Published(1.0, revision=1)
+    assert measured.revised(estimate, np.zeros(3)) is measured
+
+
+def test_a_measured_unit_needs_a_surer_one_to_be_revised():
+    estimate = ScaleEstimate(2.0, 0.24, "telemetry")
+    assert Published(1.0).revised(estimate, np.zeros(3)).revision == 1
+    measured = Published(1.0, revision=1)
+    assert measured.revised(estimate, np.zeros(3)) is measured
+    assert measured.revised(ScaleEstimate(2.0, 0.19, "telemetry"), np.zeros(3)).revision == 2
 
 
 def test_contradiction_is_counted_in_sigmas_of_the_logarithm():

@@ -39,10 +39,11 @@ _BIAS_AND_DRIFT = ((0.003, 0.002), (0.01, 0.002), (0.03, 0.002), (0.003, 0.03), 
 _BIAS_MEMORY_S = 12.0
 _DRIFT_M = (0.002, 0.006, 0.02, 0.06)
 _DRIFT_MEMORY_S = 4.0
-_USUAL_WANDER = 0.03
-_WANDER = (_USUAL_WANDER, 0.09)
+USUAL_WANDER, MOST_WANDER = 0.03, 0.81
+_WANDER = (USUAL_WANDER, 0.09, 0.27, MOST_WANDER)
 """Standard deviations of how much a map's log scale changes while its age grows by a factor of e: in the first seconds
-by 2 to 14 %, later by 1 to 2 %. No less than usual: a flight's velocities cannot tell 1 from 3 %."""
+by 2 to 14 %, later by 1 to 2 %; along bare walls the scale triples. No less than usual: a flight's velocities cannot
+tell 1 from 3 %."""
 _YOUNG_S = 1.0
 """Age before which a map is no younger."""
 _BIN_S = 0.5
@@ -66,8 +67,8 @@ class Evidence:
     """``(3,)`` velocity bias at the end [m/s]; zeros for heights."""
     log_likelihood: float = 0.0
     """Of the displacements, up to a constant: larger where the same ones are better explained."""
-    wander: float = _USUAL_WANDER
-    """How much the map's scale changes, one of `_WANDER`; displacements tell, heights do not."""
+    wander: float = USUAL_WANDER
+    """How much the map's scale changes; displacements tell, heights do not."""
     drift_sigma: float = 0.0
     """Relative error of the present scale because of that; velocities and heights share it."""
 
@@ -144,13 +145,13 @@ def displacement_evidence(
     possible = {
         (a, b, c): _slow(a**2 * bias, b**2 * drift + c**2 * wandering, a, c)
         for a, b in _BIAS_AND_DRIFT
-        for c in ((_USUAL_WANDER,) if aged is None else _WANDER)
+        for c in ((USUAL_WANDER,) if aged is None else _WANDER)
     }
-    noise = replace(possible[*_USUAL, _USUAL_WANDER], log_prior=0.0)
+    noise = replace(possible[*_USUAL, USUAL_WANDER], log_prior=0.0)
     J = np.concatenate([moved_map[:, :, None], -hat(moved_map)], axis=2).transpose(1, 0, 2)  # (3, N, 4)
     target = moved_m.T[:, :, None]  # (3, N, 1)
     weight: FloatArray = np.ones(n)
-    latent, fit = J, None
+    latent, fit, wander = J, None, USUAL_WANDER
     for iteration in range(5):
         white = (sigma_m**2 + (s * sigma_map) ** 2) / np.maximum(weight, _LEAST_WEIGHT)
         tried = list(possible.values()) if iteration == _WHEN_TOLD_APART else [noise]
@@ -158,6 +159,7 @@ def displacement_evidence(
         if fit is None or not fit.theta[_SCALE] > 1e-9:
             return None
         noise, s = fit.noise, float(fit.theta[_SCALE])
+        wander = fit.wander if len(tried) > 1 else wander
         clean = fit.residual - fit.slow  # (3, N)
         variance = sigma_m**2 + (s * sigma_map) ** 2
         normalised = np.sqrt(np.sum(clean**2, axis=0) / (3.0 * variance))
@@ -170,7 +172,7 @@ def displacement_evidence(
         return None
     rms = math.sqrt(float(np.sum(weight * clean**2)) / max(3.0 * float(weight.sum()), 1e-9))
     bias_m_s = fit.bias[:, -1] / duration_s[-1]
-    evidence = Evidence(fit.information, fit.vector, rms, bias_m_s, fit.log_likelihood, fit.noise.wander)
+    evidence = Evidence(fit.information, fit.vector, rms, bias_m_s, fit.log_likelihood, wander)
     return evidence.softened(_unrest(white, fit, J, latent, target))
 
 
@@ -184,7 +186,7 @@ def height_evidence(
     scale: float,
     tilt_sigma_rad: float,
     aged: FloatArray | None = None,
-    wander: float = _USUAL_WANDER,
+    wander: float = USUAL_WANDER,
 ) -> Evidence | None:
     """From height above the floor against visual height, with a free offset in each stretch without a floor step.
 
@@ -313,11 +315,11 @@ class _Slow:
     covariance: FloatArray
     bias: FloatArray
     log_prior: float
-    wander: float = _USUAL_WANDER
+    wander: float = USUAL_WANDER
 
 
 def _slow(bias: FloatArray, drift: FloatArray, sigma_bias_m_s: float, wander: float) -> _Slow:
-    rare = math.log(sigma_bias_m_s / _USUAL_BIAS_M_S, 3.0) ** 2 + math.log(wander / _USUAL_WANDER, 3.0) ** 2
+    rare = math.log(sigma_bias_m_s / _USUAL_BIAS_M_S, 3.0) ** 2 + math.log(wander / USUAL_WANDER, 3.0) ** 2
     return _Slow(bias + drift, bias, -0.5 * rare, wander)
 
 
@@ -336,6 +338,8 @@ class _Fit:
     kappa: float
     """Variance of the residuals over what was expected."""
     log_likelihood: float
+    wander: float = USUAL_WANDER
+    """Root mean square over the noises tried, by their probability."""
 
 
 def _best(
@@ -348,6 +352,7 @@ def _best(
 ) -> _Fit | None:
     """Generalised least squares ``(axes, N, unknowns)`` with the most likely correlated noise."""
     best, likeliest = None, -math.inf
+    told: list[tuple[float, float]] = []
     n = len(white)
     for noise in tried:
         C = noise.covariance.copy()
@@ -371,9 +376,17 @@ def _best(
         sign, logdet = np.linalg.slogdet(A + prior)
         spent = 2.0 * len(J) * float(np.sum(np.log(np.diag(factor)))) + (float(logdet) if sign > 0 else math.inf)
         likely = noise.log_prior - 0.5 * (dof * math.log(kappa) + spent)
+        told.append((likely, noise.wander))
         if likely > likeliest:
             likeliest = likely
             slow, bias = whitened @ noise.covariance, whitened @ noise.bias
             trace = float(np.trace(inverse)) / kappa
             best = _Fit(theta, A / kappa, v / kappa, residual, slow, bias, noise, trace, kappa, likely)
-    return best
+    return None if best is None else replace(best, wander=_expected(told))
+
+
+def _expected(told: list[tuple[float, float]]) -> float:
+    """Root mean square of wanders, by the log likelihood before each."""
+    likely, wander = np.array(told).T
+    share = np.exp(likely - likely.max())
+    return math.sqrt(float(np.sum(share * wander**2) / np.sum(share)))

@@ -17,7 +17,7 @@ from edgeslam_torch.fusion.telemetry.track import Turn
 from edgeslam_torch.geometry.robust_statistics import median
 from edgeslam_torch.types import FloatArray, IntArray
 
-_LEAST_COUNT = 6
+LEAST_COUNT = 6
 _EARLY_COUNT, _EARLY = 4, 0.95
 """Velocities may agree with fewer intervals: before the delay is searched there is one delay to be lucky with. Of 1764
 pairs of unrelated displacements (five recordings, twelve simulated and two real flights) 0.2 % reach this with four
@@ -80,14 +80,14 @@ class Agreement:
     @property
     def needed(self) -> float:
         """Correlation that unrelated motions hardly reach."""
-        if self.early and self.count < _LEAST_COUNT:
+        if self.early and self.count < LEAST_COUNT:
             return _EARLY
         return 0.6 + 5.4 / (self.dimensions * max(self.count, 1))
 
     @property
     def verdict(self) -> Verdict:
         """Agreement has to be proven, and so has contradiction."""
-        least = _EARLY_COUNT if self.early else _LEAST_COUNT
+        least = _EARLY_COUNT if self.early else LEAST_COUNT
         if self.count >= least and self.correlation >= self.needed:
             return Verdict.AGREES
         doubtful = self.correlation < _DOUBTFUL[self.dimensions] and self.steady < _EVEN
@@ -194,6 +194,8 @@ class Trust:
         """Video delay at which telemetry fits the images, when that is none of the delays allowed."""
         self.at_odds: AtOdds | None = None
         """Scales by velocities and by height where these cannot both be right."""
+        self.tells_scale = True
+        """Whether velocities that may tell the scale could be fitted to the images."""
         self.reread: Reread | None = None
         """Set when velocities are read in another frame than they were given in."""
         self._verdicts: dict[Reading, Verdict] = {}
@@ -214,8 +216,14 @@ class Trust:
 
     @property
     def velocity(self) -> bool:
-        """Whether velocities may tell the scale: only once they have proven to be of this flight."""
-        return self.elsewhere_s is None and self.verdict(Reading.VELOCITY) is Verdict.AGREES
+        """Whether velocities may tell the scale: only once they have proven to be of this flight.
+
+        They come in one message with the attitude, which also turns the map towards them: where that contradicts the
+        images their agreement is chance.
+        """
+        if self.elsewhere_s is not None or self.verdict(Reading.ATTITUDE) is Verdict.CONTRADICTS:
+            return False
+        return self.verdict(Reading.VELOCITY) is Verdict.AGREES
 
     def height(self, reading: Reading) -> bool:
         """Whether a height may: it needs the vertical, and its own evidence if nothing else confirms the flight."""
@@ -248,6 +256,11 @@ class Trust:
             )
         if velocity is not None and not self.velocity:
             said.append(f"telemetry's velocities are not used: {_why(velocity, 'motion')}")
+        if velocity is not None and self.velocity and not self.tells_scale and velocity.count >= _TO_CONTRADICT:
+            said.append(
+                f"telemetry's velocities fit the images too badly to tell a scale ({100 * velocity.share:.0f} % of the "
+                "motion explained) and are not used"
+            )
         for reading in HEIGHTS:
             height = self.latest.get(reading)
             if height is not None and self.verdict(reading) is Verdict.CONTRADICTS:
@@ -258,7 +271,7 @@ class Trust:
 
 
 def _why(found: Agreement, motion: str) -> str:
-    if found.count < (_EARLY_COUNT if found.early else _LEAST_COUNT):
+    if found.count < (_EARLY_COUNT if found.early else LEAST_COUNT):
         return f"too little {motion} in common with the images to compare"
     if found.steady >= _EVEN and found.correlation < _DOUBTFUL[found.dimensions]:
         return f"the {motion} is too even to compare it with the images"
