@@ -466,6 +466,17 @@ def test_two_pieces_are_joined_when_the_second_comes_to_the_place_of_the_first()
     assert ate(after, long.T_w_c[order][told[0].index :]) < 0.01
 
 
+def test_known_ground_gets_no_keyframes():
+    """There, back and there again, slowly: the third pass sees nothing that the first two have not seen."""
+    there = list(range(0, len(panels().frames), 2))
+    order = there + there[-2::-1] + there[1:]
+    slam, outputs = go([Frame(i, 1.0 * i, panels().frames[k].image) for i, k in enumerate(order)])
+    new = [o.index for o in outputs if o.keyframe]
+    assert sum(i < len(there) for i in new) >= 4
+    assert sum(i > len(order) - len(there) for i in new) == 0
+    assert ate(slam.trajectory()[1], panels().T_w_c[order]) < 0.012
+
+
 def test_few_keypoints_after_a_dark_start_still_begin_a_map():
     """150 keypoints are enough for a first frame; they must be enough after black ones too."""
     poor = replace(NO_NETWORK, orb=replace(NO_NETWORK.orb, features=150, candidates=300))

@@ -56,7 +56,7 @@ class System:
     """Counts of losses, relocalisations, restarts and refused initialisations."""
     has_telemetry: bool = False
     keyframe_s: float = -np.inf
-    """Stamp of the newest keyframe."""
+    """Stamp of the newest keyframe, or of a later frame that needed not become one."""
     shows_nothing_new: bool = False
     """Whether the current image repeats the previous one."""
     stage_ms: dict[str, float] = field(default_factory=dict)

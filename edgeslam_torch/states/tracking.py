@@ -21,7 +21,7 @@ from edgeslam_torch.tracking.flow import (
     template_of_track,
     with_followed,
 )
-from edgeslam_torch.tracking.keyframe_choice import due_by_flow, few_matches, is_due
+from edgeslam_torch.tracking.keyframe_choice import KNOWN_SHARE, due_by_flow, few_matches, is_due, known_share
 from edgeslam_torch.tracking.lazy_view import LazyView
 from edgeslam_torch.tracking.relocaliser import Reach, Relocaliser, candidates
 from edgeslam_torch.tracking.tracker import Track, View, make_view, parallax_to
@@ -111,7 +111,8 @@ class Tracking:
         self._recent = track.anchor if track.inliers else self._recent
         system.see(frame.stamp_s, track)
         before = system.log.relative_to_last(track.T_c_w)
-        keyframe = self._insert_keyframe(frame, seen, located) if located.due else None
+        due = located.due and not self._adds_nothing(frame.stamp_s, located)
+        keyframe = self._insert_keyframe(frame, seen, located) if due else None
         if keyframe is not None and keyframe.id in system.map.keyframes:
             reference = keyframe
         return Step(
@@ -236,6 +237,18 @@ class Tracking:
         return replace(located, track=track, edges=both.edges)
 
     # -- keyframes ---------------------------------------------------------------------------------------------
+
+    def _adds_nothing(self, stamp_s: float, located: Located) -> bool:
+        """Whether keyframes of earlier visits have seen what there is to see; it is not asked again at once."""
+        system = self.system
+        if located.view is None or located.track.inliers < FEW_INLIERS:
+            return False
+        uv = located.view.features.uv
+        share = known_share(located.track, uv, stamp_s, system.map, system.camera, system.config.mapping)
+        if share < KNOWN_SHARE:
+            return False
+        system.keyframe_s = stamp_s
+        return True
 
     def _insert_keyframe(self, frame: Frame, seen: LazyView, located: Located) -> Keyframe | None:
         """Map a new keyframe; None when real-time mapping is still busy with the last one."""

@@ -3,13 +3,26 @@
 import numpy as np
 
 from edgeslam_torch.config import MappingConfig
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.tracking.flow import Followed
+from edgeslam_torch.tracking.relocaliser import cells_of
 from edgeslam_torch.tracking.tracker import Track
+from edgeslam_torch.types import FloatArray
 
 SHORTEST_GAP_S = 0.04
 """Minimum time between keyframes whatever the change of view: every second frame at 30 Hz, every frame at 20."""
+
+OLD_S = 10.0
+"""Age from which on a keyframe counts as one of an earlier visit: a hand that waves, or a turn on the spot, brings
+another view of what it is looking at, which the map profits from (docs/decisions/0079)."""
+KNOWN_SHARE = 0.8
+"""Share of a view that earlier visits must have seen for it to add nothing: 0.81 and more from the third pass over a
+place on, below 0.05 on new ground."""
+VISITS = 10
+"""Keyframes of earlier visits that are asked: those that see most of the same."""
 
 
 def lost_sight(followed: Followed, config: MappingConfig) -> bool:
@@ -55,3 +68,41 @@ def is_due(
         0.25 * config.keyframe_parallax_deg
     )
     return changed or moved or overdue
+
+
+def known_share(
+    track: Track, uv: FloatArray, stamp_s: float, slam_map: SlamMap, camera: Camera, config: MappingConfig
+) -> float:
+    """Share of a view, in cells that hold keypoints, that keyframes of earlier visits have seen from the same side.
+
+    A cell is known when a triangulated anchor found in it was seen by such a keyframe at less parallax than makes a
+    keyframe, and less than a pyramid level nearer or farther: a keyframe here would see nothing new of it.
+
+    Args:
+        track: Anchors found in the frame.
+        uv: All keypoints of the frame ``(N, 2)``.
+        stamp_s: Of the frame.
+        slam_map: With the keyframes.
+        camera: Of the frame.
+        config: Whose parallax makes a keyframe.
+    """
+    anchor = track.anchor
+    keypoint = track.keypoint[~slam_map.anchors.from_depth[anchor]]
+    anchor = anchor[~slam_map.anchors.from_depth[anchor]]
+    counts = slam_map.shared_counts(anchor)
+    old = [id for id in counts if stamp_s - slam_map.keyframes[id].stamp_s >= OLD_S]
+    row_of = np.full(len(slam_map.anchors.alive) + 1, -1, dtype=np.int64)
+    row_of[anchor] = np.arange(len(anchor))
+    ray = slam_map.anchors.p_w[anchor] - se3.inverse(track.T_c_w)[:3, 3]
+    distance = np.linalg.norm(ray, axis=1)
+    known = np.zeros(len(anchor), dtype=bool)
+    for id in sorted(old, key=lambda id: (-counts[id], -id))[:VISITS]:
+        keyframe = slam_map.keyframes[id]
+        mine = row_of[keyframe.anchor[keyframe.anchor >= 0]]
+        mine = mine[mine >= 0]
+        other = slam_map.anchors.p_w[anchor[mine]] - keyframe.centre_w
+        far = np.linalg.norm(other, axis=1)
+        cosine = np.einsum("ij,ij->i", ray[mine], other) / np.maximum(distance[mine] * far, 1e-12)
+        alike = np.abs(np.log(distance[mine] / np.maximum(far, 1e-12))) <= np.log(slam_map.scale_factor)
+        known[mine] |= alike & (cosine >= np.cos(np.deg2rad(config.keyframe_parallax_deg)))
+    return len(cells_of(camera, uv[keypoint[known]])) / max(1, len(cells_of(camera, uv)))

@@ -172,11 +172,11 @@ def place_of(tracker: Tracker, view: View, track: Track) -> Place:
     seen = tracker.expected(track.T_c_w, tracker.map.anchors_seen_by(tracker.local_keyframes(track.anchor)))
     possible = max(1, min(len(seen.anchor), len(view.features.uv)))
     depth = float(np.median(seen.depth)) if len(seen.depth) else 0.0
-    filled, could = _cells(tracker.camera, view.features.uv[track.keypoint]), _cells(tracker.camera, seen.uv)
+    filled, could = cells_of(tracker.camera, view.features.uv[track.keypoint]), cells_of(tracker.camera, seen.uv)
     return Place(track, track.inliers / possible, len(filled), len(filled) / max(1, len(could)), depth)
 
 
-def _cells(camera: Camera, uv: FloatArray) -> set[tuple[int, int]]:
+def cells_of(camera: Camera, uv: FloatArray) -> set[tuple[int, int]]:
     """Cells of the image that hold a pixel."""
     cells = (uv // (np.array([camera.width, camera.height]) / GRID)).astype(np.int64)
     return set(map(tuple, cells.tolist()))

@@ -1,0 +1,81 @@
+"""What earlier visits have seen needs no keyframe; few anchors, another side or another distance do."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from point_map import CAMERA, PointMap
+
+from edgeslam_torch.config import MappingConfig
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.tracking.keyframe_choice import KNOWN_SHARE, OLD_S, known_share
+from edgeslam_torch.tracking.tracker import Track
+
+LATER_S = 100.0
+
+
+@pytest.fixture(scope="module")
+def visited():
+    points = PointMap(np.random.default_rng(3), 1500, 6)
+    points.fill()
+    return points
+
+
+def again(points, view=2, T_c_w=None):
+    """A frame that sees what a keyframe saw, from the same place or another one, and all its keypoints."""
+    keyframe = points.keyframes[view]
+    held = keyframe.keypoints_with_anchor()
+    T = keyframe.T_c_w if T_c_w is None else T_c_w
+    track = Track(T, held, keyframe.anchor[held], held, keyframe.anchor[held], np.eye(6))
+    return track, keyframe.features.uv.astype(np.float64)
+
+
+def share(points, track, uv, stamp_s=LATER_S):
+    return known_share(track, uv, stamp_s, points.map, CAMERA, MappingConfig())
+
+
+def test_a_view_that_was_seen_before_is_known(visited):
+    assert share(visited, *again(visited)) > 0.95
+
+
+def test_what_was_seen_just_now_is_no_earlier_visit(visited):
+    """Six keyframes a second apart: the oldest is five seconds old."""
+    assert share(visited, *again(visited), stamp_s=OLD_S - 1e-3) == 0.0
+    assert share(visited, *again(visited), stamp_s=OLD_S + 5.0) > 0.95
+
+
+def test_the_map_of_an_earlier_flight_is_an_earlier_visit():
+    points = PointMap(np.random.default_rng(3), 1500, 6)
+    points.fill()
+    for keyframe in points.keyframes:
+        keyframe.stamp_s = -math.inf
+    assert share(points, *again(points), stamp_s=0.0) > 0.95
+
+
+def test_a_half_that_nothing_was_found_in_is_not_known(visited):
+    track, uv = again(visited)
+    left = uv[track.keypoint, 0] < 0.5 * CAMERA.width
+    half = replace(track, keypoint=track.keypoint[left], anchor=track.anchor[left])
+    assert 0.4 < share(visited, half, uv) < 0.6 < KNOWN_SHARE
+
+
+def from_elsewhere(points, shift):
+    """The same anchors from a camera moved by a share of the depth along its own axes."""
+    keyframe = points.keyframes[2]
+    T_w_c = keyframe.T_w_c.copy()
+    T_w_c[:3, 3] += T_w_c[:3, :3] @ (np.array(shift) * points.map.median_depth(keyframe))
+    return se3.inverse(T_w_c)
+
+
+@pytest.mark.parametrize("shift", [(0.0, -0.3, 0.0), (0.0, 0.0, -0.6)])
+def test_another_side_and_another_distance_are_not_known(visited, shift):
+    """Fifteen degrees of parallax; 1.6 times as far, which is two pyramid levels."""
+    assert share(visited, *again(visited, T_c_w=from_elsewhere(visited, shift))) < 0.3
+
+
+def test_depths_that_are_only_guessed_are_not_known():
+    points = PointMap(np.random.default_rng(3), 1500, 6)
+    points.fill()
+    points.map.anchors.from_depth[:] = True
+    assert share(points, *again(points)) == 0.0
