@@ -25,8 +25,8 @@ from edgeslam_torch.train.processes.distributed import by_first, rank
 from edgeslam_torch.train.recipe import BEST, FINAL, Hooks, TrainConfig, TrainState, changes_losses, train
 from edgeslam_torch.train.self_supervised import SelfSupervised, fit_log_scale
 from edgeslam_torch.train.signals import Signal, Source, Supervised
-from edgeslam_torch.train.teacher import Taught, teach
-from edgeslam_torch.train.validate import DepthScores, can_be_scored, predict_metres, score
+from edgeslam_torch.train.teachers.teach import Taught, teach
+from edgeslam_torch.train.validate import DepthScores, can_be_scored, metres_by, predict_metres, score
 from edgeslam_torch.train.views.augment import View
 from edgeslam_torch.train.views.datasets import DepthFolder
 from edgeslam_torch.train.views.posed import PosedSequence, PosedView
@@ -172,7 +172,7 @@ def _prepared(
         if from_runs is not FromRuns.PAIRS:
             sources = []
             for k, (sequence, scale) in enumerate(zip(data.posed, scales, strict=True)):
-                taught = teach(start, metadata, sequence, scale, teacher / f"{k}-{sequence.name}")
+                taught = teach(metres_by(start, metadata), sequence, scale, teacher / f"{k}-{sequence.name}")
                 if not (data.validation or labelled):
                     held_out += [_measured_only(t) for t in taught[::HELD_OUT]]
                     taught = [t for i, t in enumerate(taught) if i % HELD_OUT]

@@ -1,6 +1,6 @@
 """Depth metrics on held-out views, as the recipe prints them."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -12,6 +12,7 @@ from edgeslam_torch.errors import SourceError
 from edgeslam_torch.models.fastdepth import FastDepth
 from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.train.views.augment import View, fitted_view
+from edgeslam_torch.train.views.posed import PosedView
 from edgeslam_torch.types import FloatArray
 
 MIN_DEPTH_M, MAX_DEPTH_M = 0.1, 10.0
@@ -55,6 +56,17 @@ def predict_metres(network: FastDepth, metadata: Metadata, view: View) -> tuple[
     h, w = view.image.shape[:2]
     large = cv2.resize(log_depth, (w, h), interpolation=cv2.INTER_LINEAR)
     return np.exp(large), np.exp(cv2.resize(log_sigma, (w, h), interpolation=cv2.INTER_LINEAR))
+
+
+def metres_by(network: FastDepth, metadata: Metadata) -> Callable[[PosedView], FloatArray]:
+    """The network's depth [m] of every pixel of a view, as a teacher takes it."""
+    network.eval()
+
+    def predict(view: PosedView) -> FloatArray:
+        unlabelled = View(view.image, np.zeros(view.image.shape[:2], np.float32), view.K)
+        return predict_metres(network, metadata, unlabelled)[0]
+
+    return predict
 
 
 def score(network: FastDepth, metadata: Metadata, views: Sequence[View]) -> DepthScores:

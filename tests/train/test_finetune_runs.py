@@ -11,13 +11,13 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from edgeslam_torch.commands import finetune as command
+from edgeslam_torch.commands.training import finetune as command
 from edgeslam_torch.errors import OutputError, SourceError
 from edgeslam_torch.models.checkpoint import build_network, load_checkpoint, save_checkpoint
 from edgeslam_torch.models.fastdepth import FastDepth, Widths
 from edgeslam_torch.models.record import Metadata
-from edgeslam_torch.train import teacher
 from edgeslam_torch.train.finetuning import Data
+from edgeslam_torch.train.teachers import teach as teacher
 from edgeslam_torch.train.views import posed, slam_runs
 from edgeslam_torch.train.views.posed import PosedSequence, load_run
 from edgeslam_torch.train.views.slam_runs import ensure_run
@@ -174,7 +174,8 @@ def test_damaged_run_is_named(run_folder: Path, tmp_path: Path, name: str, conte
 def test_two_recordings_with_one_name_get_a_run_each(tmp_path: Path) -> None:
     for name in ("a", "b"):
         (tmp_path / name / "flight").mkdir(parents=True)
-    items = command._items(arguments(tmp_path, tmp_path / "a" / "flight", tmp_path / "b" / "flight"))
+    given = arguments(tmp_path, tmp_path / "a" / "flight", tmp_path / "b" / "flight")
+    items = command.items_of(given, ignore_depth=False)
     assert [(item.kind, item.name) for item in items] == [("recording", "flight"), ("recording", "flight-2")]
 
 

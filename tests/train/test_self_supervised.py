@@ -21,7 +21,8 @@ from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.synthetic.house.render import render
 from edgeslam_torch.train.self_supervised import SelfSupervised, fit_log_scale
 from edgeslam_torch.train.signals import Slot
-from edgeslam_torch.train.teacher import teach
+from edgeslam_torch.train.teachers.teach import teach
+from edgeslam_torch.train.validate import metres_by
 from edgeslam_torch.train.views.junctions import junction_points, seen_cosines
 from edgeslam_torch.train.views.posed import PosedSequence, is_run_folder, load_run, visible_points
 from edgeslam_torch.train.views.straight import straight_edges
@@ -219,7 +220,7 @@ def test_teacher_measures_what_the_network_does_not_know(sequence: PosedSequence
     network = build_network(METADATA, Widths((4,) + (8,) * 13, (8,) * 5))
     metres = 0.5
     errors, shares = [], []
-    dense = teach(network, METADATA, sequence, float(np.log(metres)), tmp_path)
+    dense = teach(metres_by(network, METADATA), sequence, float(np.log(metres)), tmp_path)
     for view, taught in zip(sequence.views, dense, strict=True):
         error = np.abs(taught.view.depth_m / (metres * render(world(), CAMERA, view.T_w_c).depth_m) - 1)
         errors.append(np.median(error))

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from edgeslam_torch.train.views.plane_sweep import aggregate, sweep_depth
+from edgeslam_torch.train.teachers.plane_sweep import aggregate, sweep_depth
 
 K = np.array([[100.0, 0.0, 59.5], [0.0, 100.0, 44.5], [0.0, 0.0, 1.0]])
 NORMAL, DISTANCE = np.array([0.3, 0.1, -1.0]), -2.0

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from edgeslam_torch.train.views.densify import densify
+from edgeslam_torch.train.teachers.densify import densify
 
 
 def scene() -> tuple[np.ndarray, np.ndarray]:

@@ -1,11 +1,11 @@
-"""The teacher for images without labels: dense depth from a run's poses and map, completed by the network.
+"""The teacher for images without labels: dense depth from a run's poses and map, completed by a network.
 
 Each view is swept against its neighbours (`plane_sweep`); pixels whose depth is confirmed by other views are kept.
 The rest is the network's depth, corrected towards those pixels and the map's points (`densify`).
 """
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,14 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgeslam_torch.files.atomic import write_atomically
-from edgeslam_torch.models.fastdepth import FastDepth
-from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.train.processes.counting import counted
 from edgeslam_torch.train.processes.distributed import share_of, wait_for_all
-from edgeslam_torch.train.validate import predict_metres
+from edgeslam_torch.train.teachers.densify import densify
+from edgeslam_torch.train.teachers.plane_sweep import sweep_depth
 from edgeslam_torch.train.views.augment import View, fitted_view
-from edgeslam_torch.train.views.densify import densify
-from edgeslam_torch.train.views.plane_sweep import sweep_depth
 from edgeslam_torch.train.views.posed import PosedSequence, PosedView, relative_motion
 from edgeslam_torch.types import FloatArray
 
@@ -40,6 +37,10 @@ ASKED = 6
 """Number of nearest views used for confirmation."""
 SPACING = 4
 """Every n-th confirmed pixel corrects the network's depth around it."""
+
+
+Predict = Callable[[PosedView], FloatArray]
+"""Depth [m] of every pixel of a view ``(H, W)`` by a network; NaN where it has none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,16 +62,13 @@ class Taught:
     """``(H, W)``: where its depth was measured; elsewhere the network's own was completed."""
 
 
-def teach(
-    network: FastDepth, metadata: Metadata, sequence: PosedSequence, log_scale: float, folder: Path
-) -> list[Taught]:
+def teach(predict: Predict, sequence: PosedSequence, log_scale: float, folder: Path) -> list[Taught]:
     """Views of a run with dense depth [m]; the processes of a group share the work by way of ``folder``.
 
     Existing files are reused, so an interrupted teacher resumes.
 
     Args:
-        network: Network before training; fills unmeasured pixels.
-        metadata: Of the network.
+        predict: Fills unmeasured pixels.
         sequence: The run.
         log_scale: Log of metres per map unit.
         folder: For the depth maps of this run, this network and this scale alone; made when missing.
@@ -79,7 +77,6 @@ def teach(
         OSError: If the file cannot be written.
         ProcessError: If another process of the group is gone.
     """
-    network.eval()
     folder.mkdir(parents=True, exist_ok=True)
     count = min(MOST, len(sequence.views))
     chosen = np.unique(np.linspace(0, len(sequence.views) - 1, count).astype(int)).tolist()
@@ -92,7 +89,7 @@ def teach(
     for i in counted(share_of(chosen), f"{sequence.name}: depth elsewhere", "image"):
         if not (path := folder / f"dense_{i}.npy").is_file():
             measured = _confirmed(swept, i) if i in swept else np.zeros((1, 1), np.float32)
-            _save(path, _completed(network, metadata, sequence.views[i], measured, log_scale))
+            _save(path, _completed(predict, sequence.views[i], measured, log_scale))
     wait_for_all()
     taught = [_taught(sequence.views[i], np.load(folder / f"dense_{i}.npy")) for i in chosen]
     share = float(np.mean([t.measured.mean() for t in taught]))
@@ -156,19 +153,24 @@ def _nearest(swept: Mapping[int, Swept], i: int) -> list[int]:
     return sorted(others, key=distance)[:ASKED]
 
 
-def _completed(
-    network: FastDepth, metadata: Metadata, view: PosedView, measured: FloatArray, log_scale: float
-) -> FloatArray:
-    """Depth [m] of every pixel ``(H, W)`` float32, negative where it was not measured."""
+def _completed(predict: Predict, view: PosedView, measured: FloatArray, log_scale: float) -> FloatArray:
+    """Depth [m] of every pixel ``(H, W)`` float32, negative where it was not measured, 0 where it is not known."""
     height, width = view.image.shape[:2]
     measured = np.asarray(cv2.resize(measured, (width, height), interpolation=cv2.INTER_NEAREST), np.float32)
-    predicted, _ = predict_metres(network, metadata, View(view.image, np.zeros_like(measured), view.K))
+    metres = np.exp(log_scale)
+    predicted = predict(view)
+    known = np.isfinite(predicted) & (predicted > 0)
+    if not known.any():
+        return measured * metres
     v, u = np.nonzero(measured)
     v, u = v[::SPACING], u[::SPACING]
     uv = np.concatenate([view.uv, np.stack([u, v], 1).astype(np.float32)])
     log_z = np.log(np.concatenate([view.z, measured[v, u]])) + log_scale
-    dense = np.exp(densify(np.log(predicted), uv, log_z))
-    return np.where(measured > 0, measured * np.exp(log_scale), -dense).astype(np.float32)
+    at = np.clip(np.rint(uv), 0, (width - 1, height - 1)).astype(int)
+    there = known[at[:, 1], at[:, 0]]
+    filled = np.where(known, predicted, np.median(predicted[known]))
+    dense = np.where(known, np.exp(densify(np.log(filled), uv[there], log_z[there])), 0.0) if there.any() else filled
+    return np.where(measured > 0, measured * metres, -dense).astype(np.float32)
 
 
 def _small(view: PosedView) -> View:

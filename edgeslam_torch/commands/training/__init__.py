@@ -1,0 +1,1 @@
+"""Training commands: `finetune`, `distil`."""

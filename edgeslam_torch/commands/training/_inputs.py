@@ -1,0 +1,171 @@
+"""What training commands have in common: folders of images, SLAM on those without labels, an end by a signal."""
+
+import argparse
+import os
+import signal
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING
+
+from edgeslam_torch.errors import ConfigError, SourceError
+
+if TYPE_CHECKING:
+    from edgeslam_torch.train.folder import OutFolder
+    from edgeslam_torch.train.views.datasets import DepthFolder
+    from edgeslam_torch.train.views.posed import PosedSequence
+
+EXIT_INTERRUPTED = 130
+MAX_THREADS = 256
+"""Tens of thousands crash OpenMP."""
+
+
+def add_shared_arguments(parser: argparse.ArgumentParser, steps: int, batch: int) -> None:
+    """Declare the options of every training command."""
+    parser.add_argument(
+        "data",
+        nargs="+",
+        type=Path,
+        help="recordings (TUM, 7-Scenes, EuRoC, flights, videos) or output folders of 'edgeslam run', in any mix",
+    )
+    parser.add_argument("--out", "-o", type=Path, required=True, help="folder for weights, curve and checkpoints")
+    again = parser.add_mutually_exclusive_group()
+    again.add_argument(
+        "--resume",
+        action="store_true",
+        help="resume in --out, also at another --lr; an error if there is nothing to resume (without this option: "
+        "resume if data, weights and settings are the same; more --steps are allowed)",
+    )
+    again.add_argument("--overwrite", action="store_true", help="replace an older training in --out")
+    parser.add_argument("--max-frames", type=int, help="use the first frames of each recording only")
+    parser.add_argument(
+        "--validate",
+        type=Path,
+        nargs="*",
+        default=[],
+        help="recordings with depth to validate on (default: every tenth labelled image, not learnt from then)",
+    )
+    parser.add_argument("--steps", type=int, default=steps, help=f"default: {steps}; more overfits a single run")
+    parser.add_argument("--batch", type=int, default=batch, help="images (or pairs) per step over all processes")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--patience", type=int, default=0, help="stop after this many validations without progress")
+    parser.add_argument("--amp", action="store_true", help="bfloat16 arithmetic where the processor has it")
+    parser.add_argument("--threads", type=int, default=1, help="threads of each process")
+    parser.add_argument("--camera", help="calibration for recordings without one")
+    parser.add_argument(
+        "--hook",
+        action="append",
+        default=[],
+        metavar="MODULE:NAME",
+        help="a training hook of your own, FILE.py:NAME too: losses, loggers, early stops (docs/training-your-own.md); "
+        "may be given more than once",
+    )
+
+
+def check_shared(args: argparse.Namespace) -> None:
+    """Refuse numbers that make no sense.
+
+    Raises:
+        ConfigError: With the option's name.
+    """
+    if not 1 <= args.threads <= MAX_THREADS:
+        raise ConfigError(f"--threads must be 1 to {MAX_THREADS}, got {args.threads}")
+    if args.max_frames is not None and args.max_frames < 1:
+        raise ConfigError(f"--max-frames must be at least 1, got {args.max_frames}")
+
+
+@contextmanager
+def signals_interrupt() -> Iterator[None]:
+    """``timeout``, ``torchrun`` and a closed terminal end training like Ctrl-C: after a step that is saved."""
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    in_main = threading.current_thread() is threading.main_thread()
+    # Ignored signals stay ignored (nohup).
+    taken = [n for n in numbers if in_main and signal.getsignal(n) is signal.SIG_DFL]
+    for number in taken:
+        signal.signal(number, interrupt)
+    try:
+        yield
+    finally:
+        for number in taken:
+            signal.signal(number, signal.SIG_DFL)
+
+
+@dataclass(frozen=True, slots=True)
+class Item:
+    """One training folder."""
+
+    path: Path
+    kind: str
+    """``depth``, ``run``, or ``recording``, on which SLAM is run first."""
+    name: str
+    """Of the data set; of the run's folder for a recording."""
+
+
+def items_of(args: argparse.Namespace, ignore_depth: bool) -> list[Item]:
+    """Training folders of the arguments, by kind.
+
+    Args:
+        args: With ``data``, ``validate`` and ``out``.
+        ignore_depth: Whether depth maps of recordings are no labels.
+
+    Raises:
+        SourceError: If a folder is missing, or has no depth to validate on.
+        ConfigError: If a folder is used twice.
+    """
+    from edgeslam_torch.train.views.datasets import has_depth
+    from edgeslam_torch.train.views.posed import is_run_folder
+
+    items: list[Item] = []
+    for path in args.data:
+        if not path.exists():
+            raise SourceError(f"{path}: no such recording or folder")
+        if path.is_dir() and args.out.is_dir() and path.samefile(args.out):
+            raise ConfigError(f"{path}: is a training folder; give another --out")
+        name = os.path.basename(os.path.abspath(path))
+        kind = "run" if is_run_folder(path) else "depth" if has_depth(path) and not ignore_depth else "recording"
+        if kind == "recording":  # of two recordings with one name each gets a run of its own
+            same = sum(item.kind == kind and item.path.name == path.name for item in items)
+            name = f"{name}-{same + 1}" if same else name
+        items.append(Item(path, kind, name))
+    for path in args.validate:
+        if not has_depth(path):
+            raise SourceError(f"{path}: no recording with depth (rgb.txt, depth.txt and camera.yaml) to validate on")
+        if any(item.kind == "depth" and item.path.samefile(path) for item in items):
+            raise ConfigError(f"{path}: is used for training and cannot validate; omit --validate")
+    return sorted(items, key=lambda item: item.kind != "depth")
+
+
+def posed_run(
+    item: Item, out: "OutFolder", camera: str | None, max_frames: int | None, weights: Path | None = None
+) -> "PosedSequence":
+    """Images, poses and map points of a run, or of a recording that SLAM is run on first, in ``out``."""
+    from edgeslam_torch.train.processes.distributed import by_first
+    from edgeslam_torch.train.views.posed import load_run
+    from edgeslam_torch.train.views.slam_runs import ensure_run
+
+    folder = item.path
+    if item.kind == "recording":
+        folder = out.path / "slam" / item.name
+        by_first(lambda: ensure_run(item.path, folder, weights, camera, max_frames, out.path))
+    return load_run(folder, max_frames=max_frames)
+
+
+def validation_folders(paths: Sequence[Path]) -> "list[DepthFolder]":
+    """Images with depth to validate on."""
+    from edgeslam_torch.train.views.datasets import load_depth_folder
+
+    return [load_depth_folder(path, width=640) for path in paths]
+
+
+def left(out: "OutFolder") -> str:
+    """Message after an interrupt."""
+    if step := out.step:
+        return f"{out.path} holds step {step}, and the same command goes on from there"
+    return "no step was saved"

@@ -1,0 +1,178 @@
+"""``edgeslam distil``: teach FastDepth what a larger depth network knows."""
+
+import argparse
+import logging
+import os
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from edgeslam_torch.commands.training._inputs import (
+    EXIT_INTERRUPTED,
+    Item,
+    add_shared_arguments,
+    check_shared,
+    items_of,
+    left,
+    posed_run,
+    signals_interrupt,
+    validation_folders,
+)
+from edgeslam_torch.errors import ConfigError
+
+if TYPE_CHECKING:
+    from edgeslam_torch.frontend.depth_network import DepthNetwork
+    from edgeslam_torch.models.fastdepth import FastDepth
+    from edgeslam_torch.models.record import Metadata
+    from edgeslam_torch.train.finetuning import Data
+    from edgeslam_torch.train.folder import OutFolder
+    from edgeslam_torch.train.outcome import Outcome
+    from edgeslam_torch.train.recipe import Hooks, TrainConfig
+
+HELP = "teach a drone-sized network what a larger depth network knows, on recordings without labels"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's options."""
+    parser.add_argument(
+        "--teacher", required=True, metavar="FILE|NAME", help="the larger network, as for 'edgeslam run --depth'"
+    )
+    parser.add_argument(
+        "--student",
+        default="mobilenet-nnconv5dw-skipadd",
+        metavar="VARIANT|FILE",
+        help="a variant of FastDepth, beginning with the shipped weights where shapes are the same, or weights "
+        "(default: the shipped ones)",
+    )
+    add_shared_arguments(parser, steps=400, batch=8)
+    parser.add_argument(
+        "--lr",
+        type=float,
+        help="learning rate of the decoder (default: 3e-4, of a new variant 1e-3); the encoder's is a fifth",
+    )
+
+
+def main(args: argparse.Namespace) -> int:
+    """Label the recordings, train, and print the results."""
+    check_shared(args)
+    items = items_of(args, ignore_depth=True)
+
+    import torch
+
+    from edgeslam_torch.frontend.depth_network import open_depth, weights_path
+    from edgeslam_torch.train.folder import Existing, out_folder
+    from edgeslam_torch.train.hook_names import named_hooks
+    from edgeslam_torch.train.processes.distributed import process_group
+
+    torch.set_num_threads(args.threads)
+    teacher = open_depth(weights_path(args.teacher), threads=args.threads)
+    student, metadata, is_new = _student(args.student)
+    config = _config(args, is_new)
+    hooks = named_hooks(args.hook)
+    existing = Existing.RESUME if args.resume else Existing.OVERWRITE if args.overwrite else Existing.SAME
+    with signals_interrupt(), process_group() as rank:
+        if rank:  # common warnings are printed once
+            logging.getLogger("edgeslam_torch").setLevel(logging.ERROR)
+        with out_folder(args.out, existing) as out:
+            try:
+                outcome = _distil(args, items, teacher, student, metadata, config, hooks, out)
+            except KeyboardInterrupt:
+                if rank == 0:
+                    sys.stderr.write(f"edgeslam: interrupted; {left(out)}\n")
+                return EXIT_INTERRUPTED
+    if rank == 0:
+        print(outcome.describe())
+    return 0
+
+
+def _student(name: str) -> "tuple[FastDepth, Metadata, bool]":
+    """The network to begin with, its record, and whether parts of it are new."""
+    from edgeslam_torch.models.checkpoint import load_checkpoint
+    from edgeslam_torch.models.layout import Variant
+    from edgeslam_torch.models.record import Metadata
+    from edgeslam_torch.train.teachers.distil import new_student
+
+    if name in [*Variant]:
+        network, metadata = new_student(Variant(name))
+        return network, metadata, name != Metadata().variant
+    if not Path(name).suffix:
+        raise ConfigError(f"--student {name}: no weights file, and no variant; there are {', '.join(Variant)}")
+    return *load_checkpoint(Path(name)), False
+
+
+def _config(args: argparse.Namespace, is_new: bool) -> "TrainConfig":
+    """A new variant learns everything, at a higher rate."""
+    from edgeslam_torch.train.recipe import TrainConfig
+
+    every = max(args.steps // 8, 1)
+    lr = args.lr if args.lr is not None else 1e-3 if is_new else 3e-4
+    try:
+        return TrainConfig(
+            steps=args.steps,
+            batch=args.batch,
+            seed=args.seed,
+            lr=lr,
+            encoder_lr=lr / 5,
+            frozen_stages=0 if is_new else 4,
+            freeze_norm=not is_new,
+            warmup_steps=min(20, args.steps // 4),
+            ema_decay=0.99,
+            validate_every=every,
+            checkpoint_every=every,
+            patience=args.patience,
+            amp=args.amp,
+        )
+    except ValueError as error:
+        raise ConfigError(f"--{error}") from error
+
+
+def _distil(
+    args: argparse.Namespace,
+    items: list[Item],
+    teacher: "DepthNetwork",
+    student: "FastDepth",
+    metadata: "Metadata",
+    config: "TrainConfig",
+    hooks: "list[Hooks]",
+    out: "OutFolder",
+) -> "Outcome":
+    from edgeslam_torch.models.checkpoint import file_hash
+    from edgeslam_torch.train.finetuning import FromRuns, finetune, settings_of
+    from edgeslam_torch.train.given import DataSet, Given, weights_name
+    from edgeslam_torch.train.processes.distributed import by_first, rank
+
+    sha256 = file_hash(teacher.weights)
+    reading = {"teacher": f"{teacher.weights.name} {sha256[:12]}", "max_frames": args.max_frames, "camera": args.camera}
+    expected = Given(
+        weights_name(student, metadata),
+        tuple(DataSet(item.name, "depth") for item in items),
+        tuple(DataSet(os.path.basename(os.path.abspath(path)), "depth") for path in args.validate),
+        settings_of(config, FromRuns.TEACHER, reading, hooks),
+    )
+    by_first(lambda: out.check(expected))  # fail before running SLAM
+    data = _labelled(args, items, teacher, sha256, out)
+    if rank() == 0:
+        for line in data.describe():
+            print(line, flush=True)
+    return finetune(student, metadata, data, config, out, reading=reading, hooks=hooks)
+
+
+def _labelled(
+    args: argparse.Namespace, items: list[Item], teacher: "DepthNetwork", sha256: str, out: "OutFolder"
+) -> "Data":
+    """The recordings with the teacher's depth; metres are the teacher's, or the run's where it has none."""
+    from edgeslam_torch.train.finetuning import Data
+    from edgeslam_torch.train.processes.distributed import rank
+    from edgeslam_torch.train.teachers.distil import label
+
+    data = Data(validation=validation_folders(args.validate))
+    for number, item in enumerate(items):
+        run = posed_run(item, out, args.camera, args.max_frames)
+        if not (teacher.is_metric or run.metric):
+            raise ConfigError(f"{item.path}: neither the teacher nor the run gives metres; add telemetry to it")
+        scale = None if teacher.is_metric else 0.0
+        labels = label(teacher, run, scale, out.path / "labels" / f"{number}-{item.name}-{sha256[:12]}")
+        data.labelled.append(labels.folder)
+        if rank() == 0:
+            print(labels.describe(), flush=True)
+    return data

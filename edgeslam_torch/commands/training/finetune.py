@@ -1,0 +1,150 @@
+"""``edgeslam finetune``: adapt the depth network to your camera and rooms."""
+
+import argparse
+import logging
+import os
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from edgeslam_torch.commands.training._inputs import (
+    EXIT_INTERRUPTED,
+    Item,
+    add_shared_arguments,
+    check_shared,
+    items_of,
+    left,
+    posed_run,
+    signals_interrupt,
+    validation_folders,
+)
+from edgeslam_torch.errors import ConfigError
+
+if TYPE_CHECKING:
+    from edgeslam_torch.models.fastdepth import FastDepth
+    from edgeslam_torch.models.record import Metadata
+    from edgeslam_torch.train.finetuning import Data
+    from edgeslam_torch.train.folder import OutFolder
+    from edgeslam_torch.train.outcome import Outcome
+    from edgeslam_torch.train.recipe import Hooks, TrainConfig
+
+HELP = "adapt the depth network to recordings: labelled, unlabelled or output folders of 'edgeslam run'"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's options."""
+    add_shared_arguments(parser, steps=100, batch=6)
+    parser.add_argument("--weights", type=Path, help="weights to start from (default: the shipped ones)")
+    parser.add_argument("--ignore-depth", action="store_true", help="ignore depth maps of recordings")
+    parser.add_argument("--lr", type=float, default=3e-4, help="learning rate of the decoder; the encoder's is a fifth")
+    parser.add_argument(
+        "--from-runs",
+        choices=("teacher", "pairs", "both"),
+        default="teacher",
+        help="supervision for images without depth: depth measured with the run's poses (default), losses on pairs of "
+        "images, or both (four times slower)",
+    )
+    parser.add_argument("--freeze-encoder", action="store_true", help="train the decoder alone (twice as fast)")
+
+
+def main(args: argparse.Namespace) -> int:
+    """Prepare the data, train, and print the results."""
+    check_shared(args)
+    items = items_of(args, args.ignore_depth)
+
+    import torch
+
+    from edgeslam_torch.models.checkpoint import load_checkpoint
+    from edgeslam_torch.train.folder import Existing, out_folder
+    from edgeslam_torch.train.hook_names import named_hooks
+    from edgeslam_torch.train.processes.distributed import process_group
+
+    torch.set_num_threads(args.threads)
+    config = _config(args)
+    hooks = named_hooks(args.hook)
+    network, metadata = load_checkpoint(args.weights)
+    existing = Existing.RESUME if args.resume else Existing.OVERWRITE if args.overwrite else Existing.SAME
+    with signals_interrupt(), process_group() as rank:
+        if rank:  # common warnings are printed once
+            logging.getLogger("edgeslam_torch").setLevel(logging.ERROR)
+        with out_folder(args.out, existing) as out:
+            try:
+                outcome = _finetune(args, items, network, metadata, config, hooks, out)
+            except KeyboardInterrupt:
+                if rank == 0:
+                    sys.stderr.write(f"edgeslam: interrupted; {left(out)}\n")
+                return EXIT_INTERRUPTED
+    if rank == 0:
+        print(outcome.describe())
+    return 0
+
+
+def _config(args: argparse.Namespace) -> "TrainConfig":
+    from edgeslam_torch.train.recipe import TrainConfig
+
+    every = max(args.steps // 8, 1)
+    try:
+        return TrainConfig(
+            steps=args.steps,
+            batch=args.batch,
+            seed=args.seed,
+            lr=args.lr,
+            encoder_lr=args.lr / 5,
+            frozen_stages=14 if args.freeze_encoder else 4,
+            freeze_norm=True,
+            warmup_steps=max(min(20, args.steps // 4), 0),
+            ema_decay=0.99,
+            validate_every=every,
+            checkpoint_every=every,
+            patience=args.patience,
+            amp=args.amp,
+        )
+    except ValueError as error:
+        raise ConfigError(f"--{error}") from error
+
+
+def _finetune(
+    args: argparse.Namespace,
+    items: list[Item],
+    network: "FastDepth",
+    metadata: "Metadata",
+    config: "TrainConfig",
+    hooks: "list[Hooks]",
+    out: "OutFolder",
+) -> "Outcome":
+    from edgeslam_torch.train.finetuning import FromRuns, finetune, settings_of
+    from edgeslam_torch.train.given import DataSet, Given, weights_name
+    from edgeslam_torch.train.processes.distributed import by_first, rank
+
+    from_runs = FromRuns(args.from_runs)
+    reading = {name: getattr(args, name) for name in ("ignore_depth", "max_frames", "camera")}
+    expected = Given(
+        weights_name(network, metadata),
+        tuple(DataSet(item.name, "depth" if item.kind == "depth" else "run") for item in items),
+        tuple(DataSet(os.path.basename(os.path.abspath(path)), "depth") for path in args.validate),
+        settings_of(config, from_runs, reading, hooks),
+    )
+    by_first(lambda: out.check(expected))  # fail before running SLAM
+    if args.weights is not None and out.holds(args.weights):
+        raise ConfigError(f"{args.weights}: would be overwritten by its own fine-tuning; give another --out")
+    data = _data(args, items, out)
+    if rank() == 0:
+        for line in data.describe():
+            print(line, flush=True)
+        if not args.overwrite and 0 < (step := out.step) < args.steps:
+            print(f"{out.path}: goes on after step {step}", flush=True)
+    return finetune(network, metadata, data, config, out, from_runs, reading, hooks)
+
+
+def _data(args: argparse.Namespace, items: list[Item], out: "OutFolder") -> "Data":
+    """Read the folders; SLAM is run on recordings without labels first."""
+    from edgeslam_torch.train.finetuning import Data
+    from edgeslam_torch.train.views.datasets import load_depth_folder
+
+    data = Data(validation=validation_folders(args.validate))
+    for item in items:
+        if item.kind == "depth":
+            data.labelled.append(load_depth_folder(item.path, max_frames=args.max_frames))
+        else:
+            data.posed.append(posed_run(item, out, args.camera, args.max_frames, args.weights))
+    return data

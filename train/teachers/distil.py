@@ -1,0 +1,159 @@
+"""Teach FastDepth what a larger depth network knows, on recordings without labels.
+
+Each recording gets poses and a map by the SLAM. The teacher's depth is brought to that map view by view, by scale (or
+scale and shift, when it is relative) and smoothly near measured pixels; where the plane sweep measures depth, that
+counts instead (`teach`). The result trains the student like any images with depth.
+"""
+
+import logging
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import nn
+
+from edgeslam_torch.errors import SourceError
+from edgeslam_torch.frontend.depth_check import usable
+from edgeslam_torch.frontend.depth_network import DepthNetwork
+from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.map.depth_prior import fit_to_anchors
+from edgeslam_torch.map.relative_depth import fit_inverse
+from edgeslam_torch.models.checkpoint import build_network, load_checkpoint
+from edgeslam_torch.models.fastdepth import FastDepth
+from edgeslam_torch.models.layout import Variant
+from edgeslam_torch.models.record import Metadata
+from edgeslam_torch.train.processes.distributed import world
+from edgeslam_torch.train.teachers.teach import teach
+from edgeslam_torch.train.views.datasets import DepthFolder
+from edgeslam_torch.train.views.posed import PosedSequence, PosedView
+from edgeslam_torch.types import FloatArray
+
+logger = logging.getLogger(__name__)
+
+ASKED = 24
+"""Views that say how many metres a map unit has."""
+
+
+def new_student(variant: Variant) -> tuple[FastDepth, Metadata]:
+    """A network to begin with: the shipped weights in layers of the same shape, new ones elsewhere.
+
+    The first two variants share the encoder; of the pruned one, whose layers are narrower, next to everything is new.
+    """
+    shipped, metadata = load_checkpoint(None)
+    if metadata.variant == variant:
+        return shipped, metadata
+    metadata = replace(metadata, variant=variant.value, metrics={}, notes="")
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)  # the same at every call, so that a training can be resumed
+        student = build_network(metadata)
+    new, old = ([*network.encoder(), *network.decoder_layers()] for network in (student, shipped))
+    kept = [_copied(a, b) for a, b in zip(new, old, strict=True)]
+    logger.info("%s: %d of %d layers begin with the shipped weights", variant, sum(kept), len(kept))
+    return student.eval(), metadata
+
+
+def _copied(new: nn.Module, old: nn.Module) -> bool:
+    """Give a layer the other's parameters, if all have the same shapes."""
+    theirs = old.state_dict()
+    if {k: v.shape for k, v in new.state_dict().items()} != {k: v.shape for k, v in theirs.items()}:
+        return False
+    new.load_state_dict(theirs)
+    return True
+
+
+@dataclass(frozen=True, slots=True)
+class Labels:
+    """What a teacher says about a run's views."""
+
+    folder: DepthFolder
+    measured: float
+    """Share of the pixels measured by the plane sweep."""
+    without: int
+    """Views in which the teacher does not agree with the map: only measured pixels count there."""
+
+    def describe(self) -> str:
+        """One line for the terminal."""
+        views = (
+            f"{self.folder.name}: {len(self.folder.views)} images, {100 * self.measured:.0f} % of their pixels measured"
+        )
+        return views + (f", {self.without} without the teacher's depth" if self.without else "")
+
+
+def label(teacher: DepthNetwork, sequence: PosedSequence, log_scale: float | None, folder: Path) -> Labels:
+    """Dense depth [m] of a run's views by a teacher.
+
+    Args:
+        teacher: The larger network.
+        sequence: The run.
+        log_scale: Log of metres per map unit; None to take the metres of a metric teacher.
+        folder: For depth maps, reused by a later call; of this run and this teacher alone.
+
+    Raises:
+        SourceError: If the teacher gives no metres and none are given, or it agrees with no view of the map.
+        OSError: If a file cannot be written.
+    """
+    if log_scale is None:
+        log_scale = log_metres(teacher, sequence)
+    without: list[str] = []
+
+    def predict(view: PosedView) -> FloatArray:
+        depth = brought_to_map(teacher, view, log_scale)
+        if depth is None:
+            without.append(view.name)
+            return np.full(view.image.shape[:2], np.nan, np.float32)
+        return depth
+
+    taught = teach(predict, sequence, log_scale, folder)
+    views = [t.view for t in taught if (t.view.depth_m > 0).any()]
+    if not views or (len(without) == len(taught) and world() == 1):
+        raise SourceError(f"{sequence.name}: {teacher.weights.name} agrees with the map in none of its views")
+    measured = float(np.mean([t.measured.mean() for t in taught]))
+    return Labels(DepthFolder(sequence.name, views, tuple(without)), measured, len(without))
+
+
+def log_metres(teacher: DepthNetwork, sequence: PosedSequence) -> float:
+    """Log of metres per map unit by a metric teacher: the median over views of the median over their points.
+
+    Raises:
+        SourceError: If the teacher is relative, or gives no depth at the map's points.
+    """
+    if not teacher.is_metric:
+        raise SourceError(f"{teacher.weights.name}: gives no metres")
+    chosen = np.unique(np.linspace(0, len(sequence.views) - 1, min(ASKED, len(sequence.views))).astype(int))
+    ratios = []
+    for view in (sequence.views[int(i)] for i in chosen):
+        ratio = np.log(_at_points(_depth(teacher, view)[0], view) / view.z)
+        ratios += [float(np.median(ratio[np.isfinite(ratio)]))] if np.isfinite(ratio).any() else []
+    if not ratios:
+        raise SourceError(f"{sequence.name}: {teacher.weights.name} gives no depth at the map's points")
+    return float(np.median(ratios))
+
+
+def brought_to_map(teacher: DepthNetwork, view: PosedView, log_scale: float) -> FloatArray | None:
+    """The teacher's depth [m] of a view ``(H, W)``, scaled to the map's points in it; NaN where the teacher gives none.
+
+    None if it does not agree with them.
+    """
+    depth, is_relative = _depth(teacher, view)
+    at_points = _at_points(depth, view)
+    metres = view.z.astype(np.float64) * np.exp(log_scale)
+    if is_relative:
+        line = fit_inverse(at_points, metres)
+        return None if line is None else np.asarray(line.depth(depth), np.float32)
+    scale = fit_to_anchors(at_points, metres)
+    return None if scale is None else np.asarray(depth * np.exp(scale.log_ratio), np.float32)
+
+
+def _depth(teacher: DepthNetwork, view: PosedView) -> tuple[FloatArray, bool]:
+    """The teacher's depth ``(H, W)``, NaN where it is not usable; whether it is relative."""
+    height, width = view.image.shape[:2]
+    K = view.K
+    found = teacher(view.image, Camera(width, height, K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
+    return np.where(usable(found), found.depth_m, np.float32(np.nan)), found.is_relative
+
+
+def _at_points(depth: FloatArray, view: PosedView) -> FloatArray:
+    height, width = depth.shape
+    at = np.clip(np.rint(view.uv), 0, (width - 1, height - 1)).astype(int)
+    return depth[at[:, 1], at[:, 0]].astype(np.float64)
