@@ -5,6 +5,10 @@ of each other, and maps of different places::
 
     python -m edgeslam_torch.eval.judge.places --data DIR --out DIR
 
+Or simulated rooms are, no two of them alike, each on one path or several::
+
+    python -m edgeslam_torch.eval.judge.places --rooms 15 --paths 1 --out DIR
+
 A link between different places is false, and so is one between halves that puts the camera more than half a metre or
 twenty degrees from where the truth has it. A keyframe revisits a place when a keyframe of the other half was within
 half a metre and twenty degrees of it by the truth, five seconds away or more; it is recalled when a keyframe of the
@@ -39,6 +43,11 @@ from edgeslam_torch.mapping.edge_map import EdgeMap
 from edgeslam_torch.readers.source import Recording, open_source
 from edgeslam_torch.run import settle_camera
 from edgeslam_torch.slam import EdgeSlam
+from edgeslam_torch.synthetic.flights.courses import COURSES, simulated_camera
+from edgeslam_torch.synthetic.flights.degrade import CameraFaults, degraded
+from edgeslam_torch.synthetic.flights.flight import Flight, fly
+from edgeslam_torch.synthetic.house.render import render
+from edgeslam_torch.synthetic.house.world import World
 from edgeslam_torch.tracking.tracker import Tracker
 from edgeslam_torch.types import FloatArray, IntArray
 
@@ -46,6 +55,8 @@ NEAR_M, NEAR_RAD = 0.5, np.deg2rad(20.0)
 AWAY_S, WITHIN_S = 5.0, 1.0
 CLOSER_LOOKS = 3
 """Keyframes of the other map that each is compared with, as in flight."""
+ROOM_S, ROOM_HZ = 12.0, 10.0
+"""Length and rate of a flight through a simulated room."""
 SAME_PLACE = ({"tum_fr1_xyz", "tum_fr1_rpy_depth"},)
 """Recordings of one place: links between them are neither right nor wrong here."""
 
@@ -103,6 +114,33 @@ def fly_half(folder: Path, name: str, half: int, out: Path) -> Half:
     T_w_c, known = interpolate(open_dataset(folder).truth, stamps)
     T_w_c = np.where(known[:, None, None], T_w_c, np.nan)
     return Half(name, f"{name} {'second' if half else 'first'} half", atlas, stamps, T_w_c)
+
+
+def fly_room(seed: int, path: int, out: Path) -> Half:
+    """Fly one of several paths through a simulated room, or take the map that an earlier call has left."""
+    world = COURSES["room"].world(np.random.default_rng(seed))
+    flight = fly(np.random.default_rng([seed, path]), world, round(ROOM_S * ROOM_HZ), rate_hz=ROOM_HZ)
+    name = f"room {seed}"
+    file, stamps_file = out / f"room-{seed}-{path}.atlas", out / f"room-{seed}-{path}.npy"
+    if not (file.is_file() and stamps_file.is_file()):
+        atlas, stamps = _flown(_pictures(world, flight, seed), name)
+        write_atlas(file, atlas)
+        np.save(stamps_file, stamps)
+    stamps = np.load(stamps_file)
+    rows = np.abs(flight.stamps_s[None, :] - stamps[:, None]).argmin(axis=1)
+    later_s = path * (ROOM_S + AWAY_S)
+    return Half(name, f"{name} path {path}", read_atlas(file), stamps + later_s, flight.T_w_c[rows])
+
+
+def _pictures(world: World, flight: Flight, seed: int) -> Recording:
+    camera = simulated_camera()
+
+    def picture(i: int) -> NDArray[np.uint8]:
+        view, rng = render(world, camera, flight.T_w_c[i]), np.random.default_rng([seed, i])
+        stamp_s, twist_c = float(flight.stamps_s[i]), flight.twist_c(i)
+        return degraded(rng, view.image, view.depth_m, camera, CameraFaults(), stamp_s=stamp_s, twist_c=twist_c)
+
+    return sources.made_of(picture, len(flight.stamps_s), camera, ROOM_HZ)
 
 
 def _flown(source: Recording, name: str) -> tuple[SavedAtlas, FloatArray]:
@@ -203,25 +241,23 @@ def _revisits(here: Half, there: Half) -> IntArray:
 def main(argv: Sequence[str] | None = None) -> int:
     """Print one line for every pair with a link or a revisit, and the totals."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, required=True, help="folder of recordings with ground truth")
+    what = parser.add_mutually_exclusive_group(required=True)
+    what.add_argument("--data", type=Path, help="folder of recordings with ground truth")
+    what.add_argument("--rooms", type=int, metavar="N", help="simulated rooms instead, seeds 0 to N - 1")
+    parser.add_argument("--paths", type=int, default=2, metavar="N", help="through each room")
     parser.add_argument("--out", type=Path, required=True, help="folder of the maps")
     parser.add_argument("--only", action="append", default=[], metavar="PATTERN", help="recordings by name")
     args = parser.parse_args(argv)
     args.out.mkdir(parents=True, exist_ok=True)
     try:
-        recordings = find_recordings(args.data)
+        halves = (
+            _halves_of_recordings(args.data, args.only, args.out)
+            if args.data
+            else _rooms(args.rooms, args.paths, args.out)
+        )
     except EdgeSlamError as error:
         print(error, file=sys.stderr)
         return 1
-    halves: list[Half] = []
-    for name, (folder, _) in recordings.items():
-        if args.only and not any(fnmatchcase(name, pattern) for pattern in args.only):
-            continue
-        for half in (0, 1):
-            try:
-                halves.append(fly_half(folder, name, half, args.out))
-            except EdgeSlamError as error:
-                print(f"{name}: {error}", file=sys.stderr)
     if len(halves) < 2:
         print(f"{args.data}: no recording with ground truth that could be flown", file=sys.stderr)
         return 1
@@ -243,6 +279,23 @@ def main(argv: Sequence[str] | None = None) -> int:
             print(_line(f"{a.name}, {b.name}", found))
     print(_line(f"{pairs} pairs, {joined} falsely joined", total))
     return 0
+
+
+def _rooms(count: int, paths: int, out: Path) -> list[Half]:
+    return [fly_room(seed, path, out) for seed in range(count) for path in range(paths)]
+
+
+def _halves_of_recordings(data: Path, only: Sequence[str], out: Path) -> list[Half]:
+    halves: list[Half] = []
+    for name, (folder, _) in find_recordings(data).items():
+        if only and not any(fnmatchcase(name, pattern) for pattern in only):
+            continue
+        for half in (0, 1):
+            try:
+                halves.append(fly_half(folder, name, half, out))
+            except EdgeSlamError as error:
+                print(f"{name}: {error}", file=sys.stderr)
+    return halves
 
 
 def _line(name: str, found: Pair) -> str:

@@ -71,6 +71,61 @@ def block(rng: Rng, *, width_m: float = 2.4, height_m: float = 2.7) -> World:
     return scene.world("block")
 
 
+BUILDING_M = (16.0, 4.0)
+"""Length and breadth of the line through the rooms of `building` [m]: once around is 40 m."""
+
+
+def building(rng: Rng, *, side_m: float = 4.0, opening_m: float = 1.3, height_m: float = 2.7) -> World:
+    """Ten rooms in two rows of five, centred on the origin; `BUILDING_M` leads through openings from each to the next.
+
+    Args:
+        rng: Of materials and what stands and hangs there.
+        side_m: Of a room.
+        opening_m: Width of the openings, which reach up to the ceiling.
+        height_m: Of the rooms.
+    """
+    half = np.array([2.5 * side_m, side_m])
+    scene = _shell(
+        rng, np.array([*-half, 0.0]), np.array([*half, height_m]), 0.006, walls=TEXTURED_WALLS, floors=FLOORS
+    )
+    scene.ambient = 0.6
+    for column in range(-2, 3):
+        x = column * side_m
+        for y in (-0.5 * side_m, 0.5 * side_m):
+            scene.lamps_w.append(np.array([x, y, height_m - 0.1]))
+            _ceiling_lamp(scene, scene.lamps_w[-1], 1.1, 0.3)
+            _rug(scene, rng, x, y)
+            _room_wall(scene, Place(x, 2 * y, 0.0 if y < 0 else np.pi), side_m, rng, height_m)
+            if column > -2:
+                _partition(scene, Place(x - 0.5 * side_m, y, np.pi / 2), side_m, opening_m, rng, height_m)
+        _partition(scene, Place(x, 0.0, 0.0), side_m, opening_m if abs(column) == 2 else 0.0, rng, height_m)
+    for side in (-1, 1):
+        for y in (-0.5 * side_m, 0.5 * side_m):
+            _room_wall(scene, Place(side * float(half[0]), y, side * np.pi / 2), side_m, rng, height_m)
+    return scene.world("building")
+
+
+def _partition(scene: Scene, place: Place, length: float, opening: float, rng: Rng, height_m: float) -> None:
+    """A wall between two rooms, around an opening in its middle if it has one; each side has its own paint."""
+    width = 0.5 * (length - opening)
+    for side in (-1, 1):
+        part = place.at(side * 0.5 * (length - width), 0.0)
+        paint = {face: random_paint(rng, TEXTURED_WALLS) for face in "fb"}
+        scene.box(
+            part, (0.0, 0.0, height_m / 2), (width, 0.12, height_m), paint["f"], "wall", faces="frbl", special=paint
+        )
+        for face in (part.at(0.0, 0.06), part.at(0.0, -0.06, yaw_rad=np.pi)):
+            if opening:
+                _decorate(scene, face, rng, -0.25 * width, height_m, ("poster", "picture"))
+            else:
+                _room_wall(scene, face.at(0.0, 0.02), width, rng, height_m)
+
+
+def _room_wall(scene: Scene, place: Place, length: float, rng: Rng, height_m: float) -> None:
+    """Furnished as `room` is."""
+    _furnish_wall(scene, place, length, rng, height_m, density=0.96, door=False, pictures=0.9, names=HOME)
+
+
 def _along_rectangle(half: FloatArray, spacing_m: float) -> Iterator[tuple[float, float]]:
     """Places at most so far apart along the four sides of a rectangle around the origin, corners included."""
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half

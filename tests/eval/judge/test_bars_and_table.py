@@ -71,7 +71,8 @@ def test_bar_that_says_nothing_is_refused(tmp_path):
 
 def test_own_bars_name_figures_that_the_judge_has():
     known = {column.figure for column in COLUMNS} | {"online_percent", "metric"}
-    known |= {"placed_after_s", "placed", "metres_off"} | {"scale_off", "scale_sigmas", "by_telemetry", "said"}
+    known |= {"placed_after_s", "placed", "placed_late_s", "metres_off", "metres_off_depth"}
+    known |= {"scale_off", "scale_sigmas", "by_telemetry", "said"}
     assert {bar.figure for bar in read_bars()} <= known
 
 

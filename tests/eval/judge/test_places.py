@@ -7,7 +7,8 @@ import pytest
 from rendered import CAMERA, film, sideways, stairs_world
 
 from edgeslam_torch.config import SlamConfig
-from edgeslam_torch.eval.judge.places import Half, _flown, compare, main
+from edgeslam_torch.eval.judge import places
+from edgeslam_torch.eval.judge.places import AWAY_S, Half, _flown, compare, fly_room, main
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.readers.source import Recording
 
@@ -60,3 +61,23 @@ def test_a_folder_without_recordings_is_no_success(tmp_path, capsys):
 def test_a_missing_folder_is_one_line(tmp_path, capsys):
     assert main(["--data", str(tmp_path / "none"), "--out", str(tmp_path / "maps")]) == 1
     assert len(capsys.readouterr().err.splitlines()) == 1
+
+
+@pytest.mark.slow
+def test_a_simulated_room_is_flown_once_on_each_path_and_known_to_the_truth(tmp_path, monkeypatch):
+    monkeypatch.setattr(places, "ROOM_S", 3.0)
+    first, second = fly_room(3, 0, tmp_path), fly_room(3, 1, tmp_path)
+    assert (first.recording, second.recording) == ("room 3", "room 3")
+    assert first.stamps_s.max() < 3.0 and second.stamps_s.min() >= 3.0 + AWAY_S
+    for half in (first, second):
+        assert np.isfinite(half.T_w_c).all() and 0.5 < half.metres < 2.0
+    made = {path.name: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
+    again = fly_room(3, 1, tmp_path)
+    np.testing.assert_array_equal(again.stamps_s, second.stamps_s)
+    assert made == {path.name: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
+
+
+def test_recordings_or_rooms_must_be_asked_for(tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        main(["--out", str(tmp_path)])
+    assert "one of the arguments --data --rooms is required" in capsys.readouterr().err
