@@ -128,8 +128,8 @@ class CollinearityLoss(ResidualLoss):
 
     Note:
         Offsets are divided by the arm's length unless ``literal``: in metres they shrink with the depth
-        (docs/decisions/0014-l-shape-loss.md). The line is a constant for the gradient; at the best fit its own
-        derivative drops out.
+        (docs/decisions/0014-l-shape-loss.md). The line's direction is a constant for the gradient; at the best fit its
+        own derivative drops out. The length is no constant: held, it would leave the gradient the one of the metres.
     """
 
     def __init__(
@@ -172,13 +172,15 @@ class CollinearityLoss(ResidualLoss):
         with torch.no_grad():
             offset = (p - centre) * weight
             direction = torch.linalg.eigh(offset.mT @ offset)[1][..., -1:]  # (C, 2, 3, 1)
-            along = (offset @ direction)[..., 0]
-            length = along.amax(-1) - along.amin(-1)
-            valid = given & (count[..., 0] >= 3) & (length > 1e-9)[..., None]
-            divisor = count.sqrt() if self.literal else count.sqrt() * length[..., None, None].clamp_min(1e-9)
         centred = p - centre
-        across = centred - (centred @ direction) * direction.mT
-        return masked(across / divisor.clamp_min(1e-9), valid, lost)
+        along = centred @ direction
+        # Of points at even distances it is the distance of the ends; unlike that it does not turn with the line.
+        spread = 12.0 * (count - 1) / (count + 1) * (along * weight).square().sum(-2, keepdim=True) / count.clamp_min(1)
+        valid = given & (count[..., 0] >= 3) & (spread[..., 0] > 1e-18)
+        divisor = count.clamp_min(1)
+        if not self.literal:
+            divisor = divisor * torch.where(valid.any(-1)[..., None, None], spread, 1.0)
+        return masked((centred - along * direction.mT) / divisor.sqrt(), valid, lost)
 
     @in_full_precision
     def forward(self, p: Tensor, mask: Tensor | None = None) -> Tensor:

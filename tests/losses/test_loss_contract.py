@@ -268,6 +268,23 @@ def test_collinearity_does_not_depend_on_scale_unless_literal(rng):
     torch.testing.assert_close(CollinearityLoss(literal=True)(0.01 * p), 1e-4 * CollinearityLoss(literal=True)(p))
 
 
+@pytest.mark.parametrize("literal", [False, True])
+def test_gradient_of_collinearity_does_not_shrink_the_scene_unless_literal(literal, rng):
+    """What does not change with the scale must not have a gradient along it."""
+    p = torch.tensor(rng.normal(size=(3, 2, 6, 3)) + [0, 0, 5], dtype=torch.float64, requires_grad=True)
+    value = CollinearityLoss(literal)(p)
+    (gradient,) = torch.autograd.grad(value, p)
+    assert float((gradient * p).sum().detach() / value.detach()) == pytest.approx(2.0 if literal else 0.0, abs=1e-9)
+
+
+def test_arm_of_even_points_is_as_long_as_it_looks():
+    steps = torch.linspace(0, 1, 5, dtype=torch.float64)[:, None]
+    arm = steps * torch.tensor([0.0, 2.0, 0.0], dtype=torch.float64)
+    bent = arm + torch.tensor([[0.0], [1.0], [0.0], [-1.0], [0.0]]) * torch.tensor([0.0, 0.0, 1e-3]).double()
+    arms = torch.stack((bent, arm))[None]
+    assert float(CollinearityLoss()(arms) / CollinearityLoss(literal=True)(arms)) == pytest.approx(0.25, rel=1e-5)
+
+
 def test_collinearity_of_a_known_bend():
     # Three points of an arm of length 2, the middle one h off: offsets from the best line are h/3, 2h/3, h/3.
     h = 0.3

@@ -52,8 +52,6 @@ def test_one_value_an_item_and_a_scalar_for_one(case):
 
 @EVERY
 def test_gradient_is_right(case):
-    if case.loss is CASES["collinearity"].loss:
-        pytest.skip("holds its arms' lengths as well as their lines; in metres (literal) it has no lengths")
     given = case.given()
     x = given[case.predicted].clone().requires_grad_()
     assert torch.autograd.gradcheck(
