@@ -1,10 +1,12 @@
 """What training commands have in common: folders of images, SLAM on those without labels, an end by a signal."""
 
 import argparse
+import logging
 import os
 import signal
+import sys
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +17,7 @@ from edgeslam_torch.errors import ConfigError, SourceError
 
 if TYPE_CHECKING:
     from edgeslam_torch.train.folder import OutFolder
+    from edgeslam_torch.train.outcome import Outcome
     from edgeslam_torch.train.views.datasets import DepthFolder
     from edgeslam_torch.train.views.posed import PosedSequence
 
@@ -77,8 +80,32 @@ def check_shared(args: argparse.Namespace) -> None:
         raise ConfigError(f"--max-frames must be at least 1, got {args.max_frames}")
 
 
+def in_folder(args: argparse.Namespace, work: "Callable[[OutFolder], Outcome]") -> int:
+    """Train in ``--out``, alone or as one of ``torchrun``'s processes, and print the outcome; the exit code."""
+    import torch
+
+    from edgeslam_torch.train.folder import Existing, out_folder
+    from edgeslam_torch.train.processes.distributed import process_group
+
+    torch.set_num_threads(args.threads)
+    existing = Existing.RESUME if args.resume else Existing.OVERWRITE if args.overwrite else Existing.SAME
+    with _signals_interrupt(), process_group() as rank:
+        if rank:  # common warnings are printed once
+            logging.getLogger("edgeslam_torch").setLevel(logging.ERROR)
+        with out_folder(args.out, existing) as out:
+            try:
+                outcome = work(out)
+            except KeyboardInterrupt:
+                if rank == 0:
+                    sys.stderr.write(f"edgeslam: interrupted; {_left(out)}\n")
+                return EXIT_INTERRUPTED
+    if rank == 0:
+        print(outcome.describe())
+    return 0
+
+
 @contextmanager
-def signals_interrupt() -> Iterator[None]:
+def _signals_interrupt() -> Iterator[None]:
     """``timeout``, ``torchrun`` and a closed terminal end training like Ctrl-C: after a step that is saved."""
 
     def interrupt(number: int, frame: FrameType | None) -> None:
@@ -164,7 +191,7 @@ def validation_folders(paths: Sequence[Path]) -> "list[DepthFolder]":
     return [load_depth_folder(path, width=640) for path in paths]
 
 
-def left(out: "OutFolder") -> str:
+def _left(out: "OutFolder") -> str:
     """Message after an interrupt."""
     if step := out.step:
         return f"{out.path} holds step {step}, and the same command goes on from there"

@@ -1,21 +1,17 @@
 """``edgeslam finetune``: adapt the depth network to your camera and rooms."""
 
 import argparse
-import logging
 import os
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from edgeslam_torch.commands.training._inputs import (
-    EXIT_INTERRUPTED,
     Item,
     add_shared_arguments,
     check_shared,
+    in_folder,
     items_of,
-    left,
     posed_run,
-    signals_interrupt,
     validation_folders,
 )
 from edgeslam_torch.errors import ConfigError
@@ -52,31 +48,13 @@ def main(args: argparse.Namespace) -> int:
     check_shared(args)
     items = items_of(args, args.ignore_depth)
 
-    import torch
-
     from edgeslam_torch.models.checkpoint import load_checkpoint
-    from edgeslam_torch.train.folder import Existing, out_folder
     from edgeslam_torch.train.hook_names import named_hooks
-    from edgeslam_torch.train.processes.distributed import process_group
 
-    torch.set_num_threads(args.threads)
     config = _config(args)
     hooks = named_hooks(args.hook)
     network, metadata = load_checkpoint(args.weights)
-    existing = Existing.RESUME if args.resume else Existing.OVERWRITE if args.overwrite else Existing.SAME
-    with signals_interrupt(), process_group() as rank:
-        if rank:  # common warnings are printed once
-            logging.getLogger("edgeslam_torch").setLevel(logging.ERROR)
-        with out_folder(args.out, existing) as out:
-            try:
-                outcome = _finetune(args, items, network, metadata, config, hooks, out)
-            except KeyboardInterrupt:
-                if rank == 0:
-                    sys.stderr.write(f"edgeslam: interrupted; {left(out)}\n")
-                return EXIT_INTERRUPTED
-    if rank == 0:
-        print(outcome.describe())
-    return 0
+    return in_folder(args, lambda out: _finetune(args, items, network, metadata, config, hooks, out))
 
 
 def _config(args: argparse.Namespace) -> "TrainConfig":
