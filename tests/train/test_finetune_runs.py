@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from edgeslam_torch.commands.training import finetune as command
+from edgeslam_torch.commands.training._inputs import EXIT_INTERRUPTED
 from edgeslam_torch.errors import OutputError, SourceError
 from edgeslam_torch.models.checkpoint import build_network, load_checkpoint, save_checkpoint
 from edgeslam_torch.models.fastdepth import FastDepth, Widths
@@ -87,7 +88,7 @@ def test_interrupted_teacher_goes_on_where_it_was(
         return real(sequence, i)
 
     monkeypatch.setattr(teacher, "_sweep", sweep)
-    assert command.main(arguments(tmp_path, run_folder)) == command.EXIT_INTERRUPTED
+    assert command.main(arguments(tmp_path, run_folder)) == EXIT_INTERRUPTED
     assert "no step was saved" in capsys.readouterr().err
     assert command.main(arguments(tmp_path, run_folder)) == 0
     assert [i for i in swept if i >= 0] == list(range(11)), "each view is swept once"
@@ -106,7 +107,7 @@ def test_teacher_of_other_weights_is_made_anew(
 
     with monkeypatch.context() as patch:
         patch.setattr(teacher, "_completed", interrupted)
-        assert command.main(arguments(tmp_path, run_folder)) == command.EXIT_INTERRUPTED
+        assert command.main(arguments(tmp_path, run_folder)) == EXIT_INTERRUPTED
     stale = tmp_path / "out" / "teacher" / "0-run" / "swept_0.npy"
     stale.write_bytes(b"of the weights before")
     torch.manual_seed(7)
