@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgeslam_torch.errors import WeightsError
-from edgeslam_torch.frontend.network_input import network_size, preprocess
+from edgeslam_torch.frontend.network_input import check_image, network_size, preprocess
 from edgeslam_torch.frontend.onnx_session import first_line, open_session
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.models.onnx.external import Gives, read_external
@@ -65,8 +65,7 @@ class ExternalDepth:
         Raises:
             ValueError: If the image's size is not the camera's or it has neither one nor three channels.
         """
-        if image.shape[:2] != (camera.height, camera.width) or image.ndim not in (2, 3):
-            raise ValueError(f"image {image.shape} does not fit a camera of {camera.width}x{camera.height}")
+        check_image(image, camera)
         network = self.network
         training = (network.input_height, network.input_width)
         height, width = self._taken(*network_size(camera.height, camera.width, training, network.multiple))

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.models.layout import INPUT_MULTIPLE
 from edgeslam_torch.types import FloatArray
 
@@ -20,6 +21,16 @@ class Normalisation(Protocol):
     @property
     def std(self) -> tuple[float, float, float]:
         """Of red, green and blue."""
+
+
+def check_image(image: NDArray[np.uint8], camera: Camera) -> None:
+    """Refuse an image that is not the camera's.
+
+    Raises:
+        ValueError: If its size is another or it has neither one nor three channels.
+    """
+    if image.shape[:2] != (camera.height, camera.width) or image.ndim not in (2, 3):
+        raise ValueError(f"image {image.shape} does not fit a camera of {camera.width}x{camera.height}")
 
 
 def preprocess(image: NDArray[np.uint8], height: int, width: int, values: Normalisation) -> FloatArray:

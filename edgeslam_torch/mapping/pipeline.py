@@ -52,7 +52,7 @@ class MappingPipeline:
         self.camera = camera
         self.depth = depth
         self.has_metres = False
-        """Whether the depth network has said something usable yet."""
+        """Whether the depth network has said metres yet."""
         self._executor = executor
         self._pending: Future[Mapped] | None = None
 

@@ -45,6 +45,8 @@ from edgeslam_torch.types import FloatArray, Frame, TelemetrySample
 NOISE = 2.0
 """Standard deviation of the noise added to a recording's pictures [grey levels]: as much as a cheap camera's own."""
 RATE_HZ, SPEED_M_S = 15.0, 0.8
+MIN_FRAMES = 30
+"""Fewer are no pass: a map needs a second."""
 LAP_S = 56.0
 """Once around either world: 40 m, slower at the corners."""
 WORLDS: dict[str, tuple[Callable[[np.random.Generator], World], tuple[float, float]]] = {
@@ -220,6 +222,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0, help="of noise, and of the world")
     args = parser.parse_args(argv)
     say = partial(print, file=sys.stderr, flush=True)
+    if args.world and not args.minutes * 60 >= LAP_S:
+        parser.error(f"--minutes must be at least {LAP_S / 60:.2f}, once around")
+    if args.frames < MIN_FRAMES or args.passes < 1 or args.width < 160 or args.noise < 0:
+        parser.error(f"--frames must be at least {MIN_FRAMES}, --passes 1, --width 160, --noise 0")
     try:
         if args.world:
             flight = around(args.world, args.seed, args.minutes, args.width)

@@ -259,7 +259,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(error, file=sys.stderr)
         return 1
     if len(halves) < 2:
-        print(f"{args.data}: no recording with ground truth that could be flown", file=sys.stderr)
+        print(f"{args.data or '--rooms'}: fewer than two flights with ground truth to compare", file=sys.stderr)
         return 1
     total = Pair(0, 0, False)
     pairs = joined = 0

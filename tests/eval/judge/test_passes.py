@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from edgeslam_torch.eval.judge.passes import Pass, errors_of_passes, points_a_room
+from edgeslam_torch.eval.judge.passes import Pass, errors_of_passes, main, points_a_room
 from edgeslam_torch.geometry import sim3
 
 
@@ -35,3 +35,12 @@ def test_points_are_counted_in_their_rooms():
 def test_a_pass_in_a_row_of_the_table():
     flown = Pass(4, 3, 2, 20, 300, 4000, np.array([1.0, 2.0, 3.0, 10.0]), 512.4)
     assert flown.cells() == ["4", "75.0", "2", "20", "300", "4000", "4.0", "9", "512"]
+
+
+@pytest.mark.parametrize(
+    "words", [("--world", "block", "--minutes", "0.5"), ("--recording", "x", "--passes", "0"), ("--frames", "3")]
+)
+def test_a_flight_of_no_pass_is_refused(words, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main([*words] if "--frames" not in words else ["--recording", "x", *words])
+    assert ended.value.code == 2 and "at least" in capsys.readouterr().err

@@ -55,7 +55,7 @@ def test_what_was_seen_just_before_is_no_revisit(half):
 def test_a_folder_without_recordings_is_no_success(tmp_path, capsys):
     assert main(["--data", str(tmp_path), "--out", str(tmp_path / "maps")]) == 1
     said = capsys.readouterr()
-    assert "no recording with ground truth" in said.err and "links" not in said.out
+    assert "fewer than two flights with ground truth" in said.err and "links" not in said.out
 
 
 def test_a_missing_folder_is_one_line(tmp_path, capsys):
