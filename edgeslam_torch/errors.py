@@ -27,3 +27,7 @@ class AtlasError(EdgeSlamError):
 
 class OutputError(EdgeSlamError):
     """A result cannot be written."""
+
+
+class MissingPackageError(EdgeSlamError):
+    """A package that only this command needs is not installed; the message names the extra."""

@@ -13,13 +13,16 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from flatbuffers import encode, number_types
-from flatbuffers.table import Table
 from torch import Tensor
 
 from edgeslam_torch.errors import WeightsError
+from edgeslam_torch.extras import needs_extra
 from edgeslam_torch.models.fastdepth import FastDepth
 from edgeslam_torch.models.layout import Padding
+
+with needs_extra("train", "reading a TFLite file"):
+    from flatbuffers import encode, number_types
+    from flatbuffers.table import Table
 
 _DTYPES = {2: "<i4", 3: "u1"}
 """TFLite tensor types used here: INT32 (biases) and UINT8 (weights)."""

@@ -15,7 +15,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 LINKED = ("models", "losses", "train", "eval")
 """Folders at the root that are parts of the package."""
-NOT_DISTRIBUTED = (".ci/",)
+NOT_DISTRIBUTED = (".ci/", ".github/")
 
 
 def repository_files(root: Path = ROOT) -> list[str]:

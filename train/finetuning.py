@@ -30,7 +30,7 @@ from edgeslam_torch.train.validate import DepthScores, can_be_scored, metres_by,
 from edgeslam_torch.train.views.augment import View
 from edgeslam_torch.train.views.datasets import DepthFolder
 from edgeslam_torch.train.views.posed import PosedSequence, PosedView
-from edgeslam_torch.train.watchers import ProgressBar, TensorBoard
+from edgeslam_torch.train.watchers import ProgressBar, curves
 
 logger = logging.getLogger(__name__)
 
@@ -129,7 +129,7 @@ def finetune(
     tuned = _tuned_metadata(metadata, data)
     watching = list(hooks)
     if rank() == 0:
-        watching = [ProgressBar(), *hooks, TensorBoard(out.path / TENSORBOARD, tuned, _pictures(data, held_out))]
+        watching = [ProgressBar(), *hooks, *curves(out.path / TENSORBOARD, tuned, _pictures(data, held_out))]
 
     def validate(averaged: FastDepth) -> dict[str, float]:
         return _metrics(score(averaged, metadata, held_out))

@@ -1,5 +1,7 @@
 """Hooks that report training: progress with time left, and TensorBoard."""
 
+import importlib.util
+import logging
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -7,11 +9,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from edgeslam_torch.extras import install_command
 from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.train.processes.counting import Count
 from edgeslam_torch.train.recipe import Hooks, TrainConfig, TrainState
 from edgeslam_torch.train.validate import predict_metres
 from edgeslam_torch.train.views.augment import View
+
+logger = logging.getLogger(__name__)
 
 PICTURE_SIZE = (320, 240)
 
@@ -36,6 +41,14 @@ class ProgressBar(Hooks):
         """Leave the terminal's line."""
         if self._count is not None:
             self._count.close()
+
+
+def curves(folder: Path, metadata: Metadata, views: Sequence[View]) -> list[Hooks]:
+    """`TensorBoard` where it is installed; training goes on without it."""
+    if importlib.util.find_spec("tensorboard") is None:
+        logger.warning("no curves are written: TensorBoard is not installed: %s", install_command("train"))
+        return []
+    return [TensorBoard(folder, metadata, views)]
 
 
 class TensorBoard(Hooks):

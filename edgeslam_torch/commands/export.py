@@ -1,6 +1,7 @@
 """Export the depth network to ONNX, verified and timed."""
 
 import argparse
+import importlib
 import time
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -9,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from edgeslam_torch.errors import ConfigError, OutputError
+from edgeslam_torch.extras import needs_extra
 from edgeslam_torch.files.atomic import write_atomically
 
 if TYPE_CHECKING:
@@ -44,6 +46,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Export, compare with torch on real frames, print the table."""
+    with needs_extra("export", "edgeslam export"):
+        importlib.import_module("onnxscript")  # torch loads it when it exports, and fails in many words
     from edgeslam_torch.models.checkpoint import load_checkpoint
     from edgeslam_torch.models.onnx.export import OLD_RUNTIME_OPSET, ExportOptions, export_onnx
     from edgeslam_torch.models.onnx.fold import deployed

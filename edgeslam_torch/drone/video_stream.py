@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from edgeslam_torch.drone.udp import Inlet
-from edgeslam_torch.errors import SourceError
+from edgeslam_torch.extras import needs_extra
 
 logger = logging.getLogger(__name__)
 
@@ -25,12 +25,10 @@ def import_av() -> Any:
     """Import PyAV.
 
     Raises:
-        SourceError: If it is not installed.
+        MissingPackageError: If it is not installed.
     """
-    try:
+    with needs_extra("drone", "video of a drone"):
         av = importlib.import_module("av")
-    except ImportError as error:
-        raise SourceError("video of a drone needs PyAV: pip install 'av>=12'") from error
     av.logging.set_level(None)  # a lossy stream would flood the terminal with decoder messages
     return av
 
@@ -113,7 +111,8 @@ class VideoReceiver:
         on_picture: Called for each picture, from the video thread.
 
     Raises:
-        SourceError: If PyAV is missing or the port is taken.
+        MissingPackageError: If PyAV is missing.
+        SourceError: If the port is taken.
     """
 
     def __init__(

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from edgeslam_torch.errors import ConfigError, OutputError
+from edgeslam_torch.errors import OutputError
+from edgeslam_torch.extras import needs_extra
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.types import FloatArray, PointCloud, SlamOutput
 
@@ -36,16 +37,14 @@ class Viewer:
         live: Lay the window out for `step` (pictures and plots beside the map); else for `show_run`.
 
     Raises:
-        ConfigError: If rerun is not installed.
+        MissingPackageError: If rerun is not installed.
         OutputError: If ``save`` cannot be written.
     """
 
     def __init__(self, name: str, save: Path | None = None, show: bool = True, live: bool = True) -> None:
-        try:
+        with needs_extra("viewer", "the viewer"):
             self._rr: Any = importlib.import_module("rerun")
             layout = _layout(importlib.import_module("rerun.blueprint"), live)
-        except ImportError as error:
-            raise ConfigError("the viewer needs rerun: pip install 'rerun-sdk>=0.23'") from error
         self._stream: Any = self._rr.RecordingStream(f"edgeslam {name}")
         if save is not None:
             _check_writable(save)

@@ -24,7 +24,7 @@ from edgeslam_torch.drone.emulator.encoder import Encoder
 from edgeslam_torch.drone.emulator.link import LinkFaults
 from edgeslam_torch.drone.emulator.server import EmulatorConfig, TelloEmulator
 from edgeslam_torch.drone.tello import Tello, TelloAddress, TelloError, TelloLimits
-from edgeslam_torch.errors import SourceError
+from edgeslam_torch.errors import MissingPackageError, SourceError
 
 av = pytest.importorskip("av", reason="PyAV is not installed: the [drone] extra")
 
@@ -572,10 +572,10 @@ def test_without_pyav_the_message_says_what_to_install(monkeypatch):
     from edgeslam_torch.drone import video_stream as tello_video
 
     def missing(name):
-        raise ImportError(name)
+        raise ModuleNotFoundError(name, name=name)
 
     monkeypatch.setattr(tello_video.importlib, "import_module", missing)
-    with pytest.raises(SourceError, match=r"pip install 'av"):
+    with pytest.raises(MissingPackageError, match=r"video of a drone needs av: pip install 'edgeslam-torch\[drone\]'"):
         tello_video.import_av()
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from edgeslam_torch.commands import view
-from edgeslam_torch.errors import ConfigError, OutputError
+from edgeslam_torch.errors import MissingPackageError, OutputError
 from edgeslam_torch.eval.inputs.run_folder import open_run
 from edgeslam_torch.geometry.camera import PRESETS
 from edgeslam_torch.geometry.camera_file import save_camera
@@ -46,7 +46,7 @@ def test_page_is_made_when_missing_and_opened(
 @pytest.mark.skipif(HAS_RERUN, reason="rerun is installed here")
 def test_missing_rerun_is_said_with_the_remedy(run_folder: Callable[..., Path], tmp_path: Path) -> None:
     run_folder(tmp_path / "a")
-    with pytest.raises(ConfigError, match="pip install 'rerun-sdk>=0.23'"):
+    with pytest.raises(MissingPackageError, match=r"pip install 'edgeslam-torch\[viewer\]'"):
         run_view(tmp_path / "a", "--viewer")
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from edgeslam_torch.errors import EdgeSlamError, OutputError
+from edgeslam_torch.extras import needs_extra
 
 if TYPE_CHECKING:
     from edgeslam_torch.eval.metrics.run_score import RunScore
@@ -149,7 +150,9 @@ def _write_files(args: argparse.Namespace, scores: list[Any], report: str) -> No
 
 def _plot(folder: Path, args: argparse.Namespace, scores: list[Any]) -> None:
     from edgeslam_torch.eval.inputs.trajectory_files import read_trajectory
-    from edgeslam_torch.eval.report.plots import plot_errors
+
+    with needs_extra("plots", "--plots"):
+        from edgeslam_torch.eval.report.plots import plot_errors
 
     folder.mkdir(parents=True, exist_ok=True)
     truth = read_trajectory(args.groundtruth)
