@@ -2,28 +2,22 @@
 
 import hashlib
 import json
-import os
-import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
 from edgeslam_torch import __version__
 from edgeslam_torch.eval.judge.cells import Cell
 from edgeslam_torch.files.atomic import write_text
+from edgeslam_torch.jobs import Job, Limits, Start, run_each, start_module
 
 CELL, RESULT, LOG = "cell.json", "result.json", "log.txt"
 FORMAT = 1
 """Of the record."""
-_POLL_S = 0.05
-_ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-
-Start = Callable[[Path, IO[str]], subprocess.Popen[str]]
-"""Starts the process of a cell's folder, which writes to a log."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,15 +33,6 @@ class JudgeSettings:
     """A cell that takes longer is ended."""
     flights: Path | None = None
     """Where simulated flights are recorded, to be used again; ``flights`` in the output folder when None."""
-
-
-@dataclass(slots=True)
-class _Running:
-    cell: Cell
-    process: subprocess.Popen[str]
-    log: IO[str]
-    key: str
-    begun_s: float = field(default_factory=time.monotonic)
 
 
 def judge(
@@ -84,19 +69,17 @@ def judge(
             rows[cell] = _row(cell, found)
     if rows:
         say(f"{len(rows)} of {len(cells)} cells were done before")
-    running: list[_Running] = []
-    try:
-        while waiting or running:
-            while waiting and len(running) < settings.jobs:
-                running.append(_begin(waiting.pop(0), settings, commit, out, start))
-            time.sleep(_POLL_S)
-            for job in [j for j in running if _ended(j, settings.timeout_s)]:
-                running.remove(job)
-                rows[job.cell] = _finish(job, out, settings.timeout_s)
-                say(f"[{len(rows)}/{len(cells)}] {_one_line(rows[job.cell])}")
-    finally:  # an interrupted judge leaves no process behind
-        for job in running:
-            _kill(job)
+    limits = Limits(settings.timeout_s)
+
+    def begin(cell: Cell) -> Job:
+        folder = _prepared(cell, settings, commit, out)
+        return Job(folder, folder / LOG, start, limits)
+
+    with closing(run_each(waiting, begin, settings.jobs)) as ends:
+        for cell, ended in ends:
+            found = _result(out / "cells" / cell.slug, _key(cell, settings, commit))
+            rows[cell] = _row(cell, {"error": ended.reason} if found is None else found)
+            say(f"[{len(rows)}/{len(cells)}] {_one_line(rows[cell])}")
     return {
         "format": FORMAT,
         "version": __version__,
@@ -114,12 +97,8 @@ def _order(row: dict[str, Any]) -> tuple[bool, str, int]:
 
 
 def start_cell(folder: Path, log: IO[str]) -> subprocess.Popen[str]:
-    """The process that runs a cell's folder, on one thread, out of reach of the terminal's Ctrl-C."""
-    command = [sys.executable, "-m", "edgeslam_torch.eval.judge.run_cell", str(folder)]
-    environment = os.environ | _ONE_THREAD
-    return subprocess.Popen(
-        command, stdout=log, stderr=log, text=True, env=environment, start_new_session=os.name == "posix"
-    )
+    """The process that runs a cell's folder."""
+    return start_module("edgeslam_torch.eval.judge.run_cell", folder, log)
 
 
 def code_state() -> str:
@@ -165,55 +144,22 @@ def _others(cells: Sequence[Cell], settings: JudgeSettings, out: Path, commit: s
     return rows
 
 
-def _begin(cell: Cell, settings: JudgeSettings, commit: str, out: Path, start: Start) -> _Running:
+def _prepared(cell: Cell, settings: JudgeSettings, commit: str, out: Path) -> Path:
+    """The cell's folder, with what its process has to do and no result."""
     folder = out / "cells" / cell.slug
     folder.mkdir(parents=True, exist_ok=True)
     (folder / RESULT).unlink(missing_ok=True)
-    key = _key(cell, settings, commit)
     flights = settings.flights or out / "flights"
     flights.mkdir(parents=True, exist_ok=True)
     spec = {
-        "key": key,
+        "key": _key(cell, settings, commit),
         "cell": cell.to_dict(),
         "overrides": settings.overrides,
         "max_frames": settings.max_frames,
         "flights": str(flights),
     }
     write_text(folder / CELL, json.dumps(spec, indent=1) + "\n")
-    log = (folder / LOG).open("w", encoding="utf-8")
-    return _Running(cell, start(folder, log), log, key)
-
-
-def _ended(job: _Running, timeout_s: float) -> bool:
-    return job.process.poll() is not None or time.monotonic() - job.begun_s > timeout_s
-
-
-def _finish(job: _Running, out: Path, timeout_s: float) -> dict[str, Any]:
-    late = job.process.poll() is None
-    _kill(job)
-    folder = out / "cells" / job.cell.slug
-    found = _result(folder, job.key)
-    if found is not None:
-        return _row(job.cell, found)
-    reason = f"took longer than {timeout_s:.0f} s" if late else _reason(folder / LOG, job.process.returncode)
-    return _row(job.cell, {"error": reason})
-
-
-def _kill(job: _Running) -> None:
-    if job.process.poll() is None:
-        if os.name == "posix" and os.getpgid(job.process.pid) == job.process.pid:
-            os.killpg(job.process.pid, signal.SIGKILL)  # what the cell itself started too
-        else:
-            job.process.kill()
-    job.process.wait()
-    job.log.close()
-
-
-def _reason(log: Path, code: int) -> str:
-    """Last line of the process's output, or how it ended."""
-    lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
-    ended = f"killed by signal {-code}" if code < 0 else f"exit code {code}"
-    return f"{lines[-1].strip()} ({ended})" if lines else ended
+    return folder
 
 
 def _row(cell: Cell, found: dict[str, Any]) -> dict[str, Any]:

@@ -1,6 +1,5 @@
 """Runs of the SLAM on recordings without depth, kept in the fine-tuning's folder for the next time."""
 
-import hashlib
 import json
 import logging
 import sys
@@ -11,6 +10,7 @@ from pathlib import Path
 from edgeslam_torch.config import DepthConfig, SlamConfig
 from edgeslam_torch.errors import OutputError
 from edgeslam_torch.files.atomic import write_text
+from edgeslam_torch.files.signature import signature
 from edgeslam_torch.progress import make_progress
 from edgeslam_torch.readers.source import open_source
 from edgeslam_torch.run import run, settle_camera
@@ -43,9 +43,9 @@ def ensure_run(
         KeyboardInterrupt: If the user stopped it; the next call begins anew.
     """
     made_from = {
-        "recording": _signature(recording, apart),
-        "weights": _signature(weights) if weights is not None else None,
-        "camera": _signature(Path(camera)) if camera is not None and Path(camera).is_file() else camera,
+        "recording": signature(recording, apart),
+        "weights": signature(weights) if weights is not None else None,
+        "camera": signature(Path(camera)) if camera is not None and Path(camera).is_file() else camera,
         "max_frames": max_frames,
     }
     note = out.with_name(out.name + ".json")
@@ -66,17 +66,6 @@ def ensure_run(
     if result.failure is not None:
         raise OutputError(result.failure)
     write_text(note, json.dumps(made_from) + "\n")
-
-
-def _signature(path: Path, apart: Path | None = None) -> str:
-    """Changes when a file is added, taken away, changed or renamed; reads none of them."""
-    files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
-    digest = hashlib.sha256()
-    for file in files:
-        if apart is None or not file.is_relative_to(apart):
-            state = file.stat()
-            digest.update(f"{file.relative_to(path)} {state.st_size} {state.st_mtime_ns}\n".encode())
-    return digest.hexdigest()
 
 
 def _read(note: Path) -> Mapping[str, object] | None:

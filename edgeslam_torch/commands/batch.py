@@ -1,0 +1,115 @@
+"""Run, evaluate and report many recordings: one page and one table of all."""
+
+import argparse
+import os
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from edgeslam_torch.errors import ConfigError, OutputError, SourceError
+
+if TYPE_CHECKING:
+    from edgeslam_torch.fleet.batch import Runner
+    from edgeslam_torch.fleet.folder import BatchSettings
+    from edgeslam_torch.fleet.manifest import Flight
+
+EXIT_INTERRUPTED = 130
+MEMORY_MB = 4000.0
+"""Ten times what a flight of half a minute takes, and a quarter of a common computer."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's options."""
+    parser.add_argument(
+        "manifest",
+        nargs="+",
+        metavar="MANIFEST",
+        help="folder of recordings, recording, pattern in quotes, or a .csv table with the columns recording, name, "
+        "camera, telemetry, truth, settings (all but the first may be left out)",
+    )
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="results; finished flights are not repeated"
+    )
+    parser.add_argument("--jobs", type=int, metavar="N", help="flights at a time (default: one a core)")
+    parser.add_argument(
+        "--ray", metavar="auto|ADDRESS", help="run on a Ray cluster ([fleet] extra): auto is this machine's"
+    )
+    parser.add_argument("--timeout", type=float, default=3600.0, metavar="S", help="longest flight [s] (default: 3600)")
+    parser.add_argument(
+        "--memory", type=float, default=MEMORY_MB, metavar="MB", help="most memory of a flight (default: 4000)"
+    )
+    parser.add_argument("--depth", metavar="FILE|NAME|none", help="depth network of all flights, as for 'run'")
+    parser.add_argument("--max-frames", type=int, metavar="N", help="stop every flight after N frames")
+    parser.add_argument("--config", type=Path, metavar="FILE.toml", help="settings of all flights")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="change one setting; may be repeated"
+    )
+    parser.add_argument("--seed", type=int, help="seed of the robust estimators (default: 0)")
+    parser.add_argument(
+        "--map-score", action="store_true", help="compare maps with measured depth too (slower, a gigabyte each)"
+    )
+
+
+def main(args: argparse.Namespace) -> int:
+    """Run what is missing; 1 when a flight failed."""
+    from edgeslam_torch.fleet.batch import run_batch
+    from edgeslam_torch.fleet.folder import PAGE, TABLE
+    from edgeslam_torch.fleet.manifest import read_manifests
+    from edgeslam_torch.fleet.table import FAILED, counts
+
+    for name, value in (("--jobs", args.jobs), ("--max-frames", args.max_frames)):
+        if value is not None and value < 1:
+            raise ConfigError(f"{name} must be at least 1, got {value}")
+    for name, value in (("--timeout", args.timeout), ("--memory", args.memory)):
+        if value <= 0:
+            raise ConfigError(f"{name} must be positive, got {value:g}")
+    flights = _without(read_manifests(args.manifest), args.out)
+    try:
+        rows = run_batch(flights, _settings(args), args.out, _runner(args), _say)
+    except KeyboardInterrupt:
+        sys.stderr.write(f"edgeslam: interrupted; {args.out} holds what was finished, the same command goes on\n")
+        return EXIT_INTERRUPTED
+    except OSError as error:
+        raise OutputError(f"{error.filename}: cannot be written ({error.strerror or error})") from error
+    failed = [row for row in rows if row.state == FAILED]
+    for row in failed:
+        print(row.in_words())
+    print(f"{counts(rows)['done']} of {len(rows)} flights finished, {len(failed)} failed")
+    print(f"results: {args.out / PAGE}, {args.out / TABLE}")
+    return 1 if failed else 0
+
+
+def _without(flights: "list[Flight]", out: Path) -> "list[Flight]":
+    """Flights but for the batch's own folder, which may lie among the recordings."""
+    kept = [flight for flight in flights if flight.recording.resolve() != out.resolve()]
+    if not kept:
+        raise SourceError(f"{out}: is the only folder there; give recordings")
+    return kept
+
+
+def _settings(args: argparse.Namespace) -> "BatchSettings":
+    from edgeslam_torch.commands.run import resolved_config
+    from edgeslam_torch.fleet.folder import BatchSettings
+
+    if args.depth is not None and os.path.exists(args.depth):
+        args.depth = os.path.abspath(args.depth)  # also for processes elsewhere
+    return BatchSettings(resolved_config(args), args.max_frames, args.map_score)
+
+
+def _runner(args: argparse.Namespace) -> "Runner":
+    from edgeslam_torch.fleet.batch import Local
+    from edgeslam_torch.jobs import Limits
+
+    limits = Limits(args.timeout, args.memory)
+    if args.ray is None:
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        return Local(args.jobs or cores, limits)
+    from edgeslam_torch.fleet.on_ray import OnRay
+
+    if args.jobs is not None:
+        raise ConfigError("--jobs is for this machine; a Ray cluster runs one flight a CPU")
+    return OnRay(args.ray, limits)
+
+
+def _say(text: str) -> None:
+    sys.stderr.write(f"edgeslam: {text}\n")

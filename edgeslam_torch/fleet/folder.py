@@ -1,0 +1,129 @@
+"""The folder of a batch: a run folder for every finished flight, and beside them what each had to do and how it went.
+
+``flights/NAME`` appears when the flight is finished, whole; ``jobs/NAME`` has its task, log and result, also of those
+that failed; ``work/NAME`` is a flight on its way, ``older/NAME`` one of other settings.
+"""
+
+import hashlib
+import json
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from edgeslam_torch import __version__
+from edgeslam_torch.config import SlamConfig
+from edgeslam_torch.errors import ConfigError, OutputError
+from edgeslam_torch.files.atomic import write_text
+from edgeslam_torch.files.config_file import load_config, to_toml
+from edgeslam_torch.files.signature import signature
+from edgeslam_torch.fleet.manifest import Flight
+
+FLIGHTS, JOBS, WORK, OLDER, PICTURES = "flights", "jobs", "work", "older", "pictures"
+TASK, CONFIG, RESULT, LOG = "task.json", "config.toml", "result.json", "log.txt"
+TABLE, RECORD, PAGE = "batch.csv", "batch.json", "index.html"
+
+
+@dataclass(frozen=True, slots=True)
+class BatchSettings:
+    """How every flight of a batch is run."""
+
+    config: SlamConfig
+    max_frames: int | None = None
+    map_score: bool = False
+    """Compare maps with measured depth where a recording has it: half a minute and a gigabyte each."""
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """One flight, and everything that determines its results."""
+
+    flight: Flight
+    config: str
+    """TOML."""
+    content: dict[str, Any]
+    """Of ``task.json``."""
+
+    @property
+    def key(self) -> str:
+        """Changes with the recording, its camera, telemetry and truth, the settings and our version."""
+        text = json.dumps([self.content, self.config], sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()
+
+
+class BatchFolder:
+    """Paths and contents of a batch's folder."""
+
+    def __init__(self, path: Path) -> None:
+        """Make it, or go on in one.
+
+        Raises:
+            OutputError: If it holds something that no batch wrote.
+            OSError: If it cannot be made.
+        """
+        self.path = path.resolve()
+        self.path.mkdir(parents=True, exist_ok=True)
+        names = {p.name for p in self.path.iterdir() if not p.name.startswith(".")}
+        if names and RECORD not in names:
+            raise OutputError(f"{path}: holds {min(names)}, which no batch wrote; give another folder to --out")
+        for name in (FLIGHTS, JOBS, WORK, PICTURES):
+            (self.path / name).mkdir(exist_ok=True)
+        if RECORD not in names:
+            write_text(self.path / RECORD, "{}\n")
+
+    def task(self, flight: Flight, settings: BatchSettings) -> Task:
+        """What has to be done for a flight.
+
+        Raises:
+            ConfigError: If its settings are malformed; the message names the manifest's line.
+        """
+        try:
+            config = load_config(settings.config, None, flight.settings)
+        except ConfigError as error:
+            raise ConfigError(f"{flight.origin}: {error}") from error
+        files = {name: getattr(flight, name) for name in ("camera", "telemetry", "truth")} | {
+            "recording": str(flight.recording.absolute()),
+            "weights": str(config.depth.weights or ""),
+        }
+        content = {
+            "version": __version__,
+            "name": flight.name,
+            "batch": str(self.path),
+            **files,
+            "max_frames": settings.max_frames,
+            "map_score": settings.map_score,
+            "signatures": {name: self._signature(Path(file)) for name, file in files.items() if file},
+        }
+        return Task(flight, to_toml(config), content)
+
+    def result(self, task: Task) -> dict[str, Any] | None:
+        """The result of this very task from before, if the flight finished."""
+        try:
+            found = json.loads((self.path / JOBS / task.flight.name / RESULT).read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            return None
+        ours = isinstance(found, dict) and found.get("key") == task.key
+        return found if ours and (self.path / FLIGHTS / task.flight.name).is_dir() else None
+
+    def prepare(self, task: Task) -> Path:
+        """The folder of a task to be done now; results of other settings move to ``older``."""
+        name = task.flight.name
+        job = self.path / JOBS / name
+        job.mkdir(exist_ok=True)
+        (job / RESULT).unlink(missing_ok=True)
+        (self.path / PICTURES / f"{name}.jpg").unlink(missing_ok=True)
+        finished = self.path / FLIGHTS / name
+        if finished.is_dir():
+            older = self.path / OLDER / name
+            shutil.rmtree(older, ignore_errors=True)
+            older.parent.mkdir(exist_ok=True)
+            finished.rename(older)
+        write_text(job / CONFIG, task.config)
+        write_text(job / TASK, json.dumps(task.content | {"key": task.key}, indent=1) + "\n")
+        return job
+
+    def _signature(self, path: Path) -> str:
+        try:
+            return signature(path, self.path)
+        except OSError:
+            return ""  # a preset's name, or a file that is not there, which the flight's own process says
