@@ -98,7 +98,7 @@ def _settings(args: argparse.Namespace) -> "BatchSettings":
 
 def _runner(args: argparse.Namespace) -> "Runner":
     from edgeslam_torch.fleet.batch import Local
-    from edgeslam_torch.jobs import Limits
+    from edgeslam_torch.jobs.watched import Limits
 
     limits = Limits(args.timeout, args.memory)
     if args.ray is None:

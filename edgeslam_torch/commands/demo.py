@@ -44,6 +44,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="change one setting; may be repeated"
     )
     parser.add_argument("--record-only", action="store_true", help="only write the simulated recording, to DIR/flight")
+    parser.add_argument(
+        "--flights",
+        type=int,
+        metavar="N",
+        help="with --record-only: N recordings with seeds from --seed on, to DIR/flight_0000 and so on, for 'batch'",
+    )
+    parser.add_argument("--width", type=int, default=640, metavar="PX", help="of the images (default: 640)")
 
 
 def main(args: argparse.Namespace) -> int:
@@ -54,6 +61,8 @@ def main(args: argparse.Namespace) -> int:
 
     settings = _settings(args)
     config = resolved_config(args)
+    if args.flights is not None:
+        return _record_many(args, settings)
     rendered = _Rendered(settings.frames)
     recorded = record(args.out / "flight", settings, rendered)
     rendered.done()
@@ -65,6 +74,21 @@ def main(args: argparse.Namespace) -> int:
     write_page(demo.run)
     print(report(demo))
     return EXIT_INTERRUPTED if demo.run.interrupted else 0
+
+
+def _record_many(args: argparse.Namespace, settings: "DemoSettings") -> int:
+    """Flights through different places; those that are there already are left alone."""
+    from edgeslam_torch.demo import record
+    from edgeslam_torch.errors import ConfigError
+
+    if not args.record_only or args.flights < 1:
+        raise ConfigError("--flights needs --record-only, and a number of at least 1")
+    for i in range(args.flights):
+        folder = args.out / f"flight_{settings.seed + i:04d}"
+        if not (folder / "depth.txt").is_file():  # written last
+            record(folder, replace(settings, seed=settings.seed + i))
+    print(f"{args.flights} recordings: {args.out} (try: edgeslam batch {args.out} --out {args.out}-batch)")
+    return 0
 
 
 def report(demo: "DemoResult") -> str:
@@ -107,7 +131,10 @@ def _settings(args: argparse.Namespace) -> "DemoSettings":
     course = WORLDS.get(args.world, Course())
     seconds = course.seconds if args.seconds is None else args.seconds
     rate_hz = course.rate_hz if args.rate is None else args.rate
-    settings = DemoSettings(args.world, seconds, rate_hz, args.seed, args.images)
+    if not 160 <= args.width <= 1920 or args.width % 4:
+        raise ConfigError(f"--width must be 160 to 1920 and a multiple of 4, got {args.width}")
+    size = {"width": args.width, "height": args.width * 3 // 4}
+    settings = DemoSettings(args.world, seconds, rate_hz, args.seed, args.images, **size)
     return replace(settings, telemetry=None if args.no_telemetry else faults)
 
 

@@ -1,22 +1,23 @@
 """Runs the flights of a batch that have no result yet, and keeps one table and one page of all."""
 
+import os
+import subprocess
 import time
 from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import IO, Any, Protocol
 
 from edgeslam_torch.fleet.folder import FLIGHTS, JOBS, LOG, PICTURES, BatchFolder, BatchSettings, Task
 from edgeslam_torch.fleet.manifest import Flight
 from edgeslam_torch.fleet.page import write_page
 from edgeslam_torch.fleet.table import DONE, FAILED, WAITING, Row, write_tables
-from edgeslam_torch.jobs import Ended, Job, Limits, run_each, start_module
+from edgeslam_torch.jobs.watched import Ended, Job, Limits, Start, run_each, start_module
 from edgeslam_torch.writers.own_folder import FolderLock
 
 WRITE_EVERY_S = 5.0
 """Table and page are written again after this time, and at the end."""
-MODULE = "edgeslam_torch.fleet.run_flight"
 
 
 class Runner(Protocol):
@@ -31,6 +32,11 @@ class Runner(Protocol):
         """
 
 
+def start_flight(folder: Path, log: IO[str]) -> subprocess.Popen[str]:
+    """The process of a task's folder."""
+    return start_module("edgeslam_torch.fleet.run_flight", folder, log)
+
+
 @dataclass(frozen=True, slots=True)
 class Local:
     """Runs tasks on this machine, each in a process of its own on one thread."""
@@ -39,15 +45,15 @@ class Local:
     limits: Limits
     retries: int = 1
     """For a process that was killed by somebody else."""
+    start: Start = start_flight
 
     def __call__(self, tasks: Sequence[Task], prepare: Callable[[Task], Path]) -> Generator[tuple[Task, Ended]]:
         """See `Runner`."""
-        return run_each(tasks, lambda task: start_flight(prepare(task), self.limits), self.processes, self.retries)
+        return run_each(tasks, lambda task: self.job(prepare(task)), self.processes, self.retries)
 
-
-def start_flight(folder: Path, limits: Limits) -> Job:
-    """The process of a task's folder."""
-    return Job(folder, folder / LOG, lambda path, log: start_module(MODULE, path, log), limits)
+    def job(self, folder: Path) -> Job:
+        """The watched process of a task's folder."""
+        return Job(folder, folder / LOG, self.start, self.limits)
 
 
 def run_batch(
@@ -109,8 +115,14 @@ def _row_before(folder: BatchFolder, task: Task) -> Row:
 def _row_after(folder: BatchFolder, task: Task, ended: Ended) -> Row:
     found = folder.result(task)
     if found is None:
-        return _row(folder, task, FAILED, ended.reason or "left no result", attempts=ended.attempts)
+        return _row(folder, task, FAILED, _short(ended.reason, task.flight), attempts=ended.attempts)
     return _row(folder, task, DONE, "", found, ended.attempts)
+
+
+def _short(reason: str, flight: Flight) -> str:
+    """The reason without what every failure of ours ends with, and without folders that mean nothing elsewhere."""
+    short = reason.removesuffix(" (exit code 1)").replace(f"{flight.recording.absolute().parent}{os.sep}", "")
+    return short or "left no result"
 
 
 def _row(

@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Any
 
 from edgeslam_torch.errors import ConfigError
-from edgeslam_torch.fleet.batch import start_flight
+from edgeslam_torch.extras import needs_extra
+from edgeslam_torch.fleet.batch import Local
 from edgeslam_torch.fleet.folder import Task
-from edgeslam_torch.jobs import Ended, How, Limits, run_each
+from edgeslam_torch.jobs.watched import Ended, How, Limits, run_each
 
-MISSING = "no Ray in this installation; it is an extra: pip install 'edgeslam-torch[fleet]'"
 _QUEUED_PER_CPU = 2
 """Tasks handed to the cluster, those that wait included: enough to keep it busy, few enough to interrupt."""
 
@@ -59,7 +59,8 @@ class OnRay:
 
 def _attempt(folder: str, limits: Limits, retries: int) -> Ended:
     """On a node: the flight's process, watched as on one machine; ends with the Ray worker."""
-    with closing(run_each([folder], lambda path: start_flight(Path(path), limits), 1, retries)) as ends:
+    here = Local(1, limits, retries)
+    with closing(run_each([Path(folder)], here.job, 1, retries)) as ends:
         return next(ends)[1]
 
 
@@ -72,10 +73,8 @@ def _ended(ray: Any, reference: Any) -> Ended:
 
 
 def _connected(address: str) -> Any:
-    try:
+    with needs_extra("fleet", f"--ray {address}"):
         ray = importlib.import_module("ray")
-    except ImportError as error:
-        raise ConfigError(f"--ray {address}: {MISSING}") from error
     try:
         ray.init(address=address, log_to_driver=False, logging_level="ERROR")
     except (ConnectionError, ValueError, RuntimeError, TimeoutError) as error:

@@ -49,7 +49,7 @@ def _summary(rows: Sequence[Row]) -> str:
     middle = medians(rows)
     named = [(c, middle[c.name]) for c in COLUMNS if c.name in ("tracked", "ate_m", "cpu_ms") and c.name in middle]
     if named:
-        words.append("medians: " + ", ".join(f"{column.title} {column.cell(value)}" for column, value in named))
+        words.append("medians: " + ", ".join(f"{column.title} = {column.cell(value)}" for column, value in named))
     return "; ".join(words) + "."
 
 
@@ -70,16 +70,18 @@ def _row(row: Row, shown: Sequence[Column]) -> str:
     name = html.escape(row.name)
     target = f"{row.folder}/report.html" if row.folder else row.log
     link = f'<a href="{_link(target)}">{name}</a>' if target else name
-    image = f'<img loading="lazy" src="{_link(row.picture)}" alt="Map of {name}" width="240">' if row.picture else ""
-    cells = [f'<td data-key="{name}">{link}{image}</td>', f'<td class="{row.state}">{row.state}</td>']
+    image = f'<img loading="lazy" src="{_link(row.picture)}" alt="Map of {name}" width="180">' if row.picture else ""
+    reason = f'<p class="reason">{html.escape(row.reason)}</p>' if row.reason else ""
+    state = f'<td class="{row.state}" data-key="{row.state}">{row.state}{reason}</td>'
+    cells = [f'<td data-key="{name}">{link}{image}</td>', state]
     for column in shown:
         value = row.figures.get(column.name)
         text = html.escape(column.cell(value))
         key = f' data-key="{float(value)!r}"' if isinstance(value, int | float) and text else ""
         cells.append(f'<td class="number"{key}>{text}</td>' if not isinstance(value, str) else f"<td>{text}</td>")
     again = [f"attempt {row.attempts}"] if row.attempts > 1 else []
-    remarks = html.escape("; ".join([*([row.reason] if row.reason else []), *again, *row.notes]))
-    return f'<tr data-state="{row.state}">{"".join(cells)}<td class="remarks">{remarks}</td></tr>'
+    remarks = html.escape("; ".join([*again, *row.notes]))
+    return f'<tr data-state="{row.state}">{"".join(cells)}<td class="remarks"><p>{remarks}</p></td></tr>'
 
 
 def _link(path: str) -> str:

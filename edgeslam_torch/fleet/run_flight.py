@@ -18,13 +18,15 @@ from edgeslam_torch.eval.report.page import write_report
 from edgeslam_torch.files.atomic import write_atomically, write_text
 from edgeslam_torch.files.config_file import load_config
 from edgeslam_torch.fleet.folder import CONFIG, FLIGHTS, PICTURES, RESULT, TASK, WORK
-from edgeslam_torch.jobs import end_with_parent
+from edgeslam_torch.jobs.watched import end_with_parent
 from edgeslam_torch.readers.images import pixels_or_none
 from edgeslam_torch.readers.source import Source, open_source
 from edgeslam_torch.run import run, settle_camera
 from edgeslam_torch.writers.run_writer import PICTURE
 
-_PICTURE_WIDTH_PX = 480
+_FROM_ABOVE = (slice(44, None), slice(0, 650))
+"""Rows and columns of a run's picture that show the map from above; all three views would be too small in a row."""
+_PICTURE_WIDTH_PX = 400
 
 
 def main(folder: Path) -> int:
@@ -107,10 +109,11 @@ def _notes(source: Source) -> list[str]:
 
 
 def _write_picture(big: Path, small: Path) -> None:
-    """The run's picture at the size of a table's row."""
+    """The run's map from above at the size of a table's row."""
     image = pixels_or_none(big, cv2.IMREAD_COLOR)
     if image is None:
         return
+    image = image[_FROM_ABOVE]
     height = round(image.shape[0] * _PICTURE_WIDTH_PX / image.shape[1])
     image = cv2.resize(image, (_PICTURE_WIDTH_PX, height), interpolation=cv2.INTER_AREA)
     jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 80])[1]

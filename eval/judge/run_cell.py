@@ -22,7 +22,7 @@ from edgeslam_torch.eval.judge.score import Truth, score
 from edgeslam_torch.eval.judge.telemetry.made import KINDS, Drawn
 from edgeslam_torch.files.atomic import write_text
 from edgeslam_torch.files.config_file import load_config
-from edgeslam_torch.jobs import end_with_parent
+from edgeslam_torch.jobs.watched import end_with_parent
 from edgeslam_torch.readers.layouts import read_sequence
 from edgeslam_torch.readers.source import Recording, open_source
 from edgeslam_torch.run import run, settle_camera

@@ -13,7 +13,7 @@ from typing import IO, Any
 from edgeslam_torch import __version__
 from edgeslam_torch.eval.judge.cells import Cell
 from edgeslam_torch.files.atomic import write_text
-from edgeslam_torch.jobs import Job, Limits, Start, run_each, start_module
+from edgeslam_torch.jobs.watched import Job, Limits, Start, run_each, start_module
 
 CELL, RESULT, LOG = "cell.json", "result.json", "log.txt"
 FORMAT = 1

@@ -28,6 +28,19 @@ def test_record_only_leaves_a_recording_that_can_be_run(
     assert "edgeslam run" in capsys.readouterr().out
 
 
+def test_many_recordings_have_different_places_and_are_not_made_again(tmp_path: Path) -> None:
+    options = ["--world", "corridor", "--seconds", "1", "--rate", "5", "--width", "160", "--seed", "3"]
+    assert main(["demo", "--out", str(tmp_path), "--record-only", "--flights", "2", *options]) == 0
+    images = [open_source(str(tmp_path / f"flight_000{i}")).frames() for i in (3, 4)]
+    first, second = (next(frames).image for frames in images)
+    assert first.shape == (120, 160, 3)
+    assert np.abs(first.astype(int) - second).mean() > 5
+    before = (tmp_path / "flight_0003" / "rgb.txt").stat().st_mtime_ns
+    assert main(["demo", "--out", str(tmp_path), "--record-only", "--flights", "3", *options]) == 0
+    assert (tmp_path / "flight_0003" / "rgb.txt").stat().st_mtime_ns == before
+    assert (tmp_path / "flight_0005" / "rgb.txt").is_file()
+
+
 def test_shorter_demo_leaves_nothing_of_the_longer_one(tmp_path: Path) -> None:
     for seconds in (2.0, 1.0):
         record(tmp_path, DemoSettings(world="corridor", seconds=seconds, rate_hz=5.0, width=160, height=120))
@@ -81,6 +94,8 @@ def test_demo_flight_meets_its_bars(tmp_path: Path, world: str, scale_bar: float
         (["--images", "awful"], "no image quality 'awful'"),
         (["--loss", "1.5"], "--loss must lie in"),
         (["--seed", "-3"], "--seed must not be negative"),
+        (["--flights", "3"], "--flights needs --record-only"),
+        (["--width", "641"], "--width must be"),
     ],
 )
 def test_wrong_options_are_told_in_one_line(

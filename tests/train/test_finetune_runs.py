@@ -63,6 +63,19 @@ def test_run_is_learnt_from_and_validated_on_what_the_teacher_measured(
     assert list((tmp_path / "out" / "tensorboard").iterdir())
 
 
+def test_run_that_tracked_nothing_is_left_out_beside_others_and_refused_alone(
+    run_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    lost = changed(run_folder, tmp_path)
+    (lost / "status.csv").write_text((lost / "status.csv").read_text().replace("tracked", "lost"))
+    with caplog.at_level(logging.WARNING):
+        assert command.main(arguments(tmp_path, run_folder, lost, "--from-runs", "pairs")) == 0
+    assert [m for m in caplog.messages if m.startswith("left out: ") and "only 0 frames" in m]
+    assert "11 posed images" in capsys.readouterr().out
+    with pytest.raises(SourceError, match="only 0 frames"):
+        command.main(arguments(tmp_path, lost, "--overwrite"))
+
+
 def test_pairs_alone_leave_nothing_to_validate_on_and_that_is_said(
     run_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -35,6 +35,10 @@ MIN_POINTS, MIN_VIEWS = 30, 8
 """Minimum map points per view, and views per run."""
 
 
+class TooFewViews(SourceError):
+    """A run that no network can learn from: it hardly tracked, or its camera saw nothing."""
+
+
 @dataclass(frozen=True, slots=True)
 class PosedView:
     """One undistorted image with its pose and the map points seen in it."""
@@ -92,7 +96,8 @@ def load_run(
         max_frames: Use only the first frames of the recording.
 
     Raises:
-        SourceError: If the folder is no run's, the recording is gone, or too few views have points.
+        TooFewViews: If too few views have points.
+        SourceError: If the folder is no run's, or the recording is gone.
     """
     folder = Path(os.path.abspath(folder))
     try:
@@ -123,7 +128,7 @@ def load_run(
             count.advance()
     views = [v for v in views if len(v.z) >= MIN_POINTS]
     if len(views) < MIN_VIEWS:
-        raise SourceError(
+        raise TooFewViews(
             f"{folder}: only {len(views)} frames of {recording} have a pose and {MIN_POINTS} map points in view, "
             f"{MIN_VIEWS} are needed"
         )

@@ -1,6 +1,7 @@
 """``edgeslam finetune``: adapt the depth network to your camera and rooms."""
 
 import argparse
+import logging
 import os
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
     from edgeslam_torch.train.folder import OutFolder
     from edgeslam_torch.train.outcome import Outcome
     from edgeslam_torch.train.recipe import Hooks, TrainConfig
+
+logger = logging.getLogger(__name__)
 
 HELP = "adapt the depth network to recordings: labelled, unlabelled or output folders of 'edgeslam run'"
 
@@ -118,11 +121,20 @@ def _data(args: argparse.Namespace, items: list[Item], out: "OutFolder") -> "Dat
     """Read the folders; SLAM is run on recordings without labels first."""
     from edgeslam_torch.train.finetuning import Data
     from edgeslam_torch.train.views.datasets import load_depth_folder
+    from edgeslam_torch.train.views.posed import TooFewViews
 
     data = Data(validation=validation_folders(args.validate))
+    useless: list[TooFewViews] = []
     for item in items:
         if item.kind == "depth":
             data.labelled.append(load_depth_folder(item.path, max_frames=args.max_frames))
-        else:
+            continue
+        try:
             data.posed.append(posed_run(item, out, args.camera, args.max_frames, args.weights))
+        except TooFewViews as error:  # one of a fleet's flights; the others teach
+            useless.append(error)
+    if useless and not data.labelled and not data.posed:
+        raise useless[0]
+    for left_out in useless:
+        logger.warning("left out: %s", left_out)
     return data

@@ -1,0 +1,167 @@
+"""A batch as a whole: what is run, kept, repeated and said; the flights' processes are tiny scripts."""
+
+import csv
+import json
+import subprocess
+import sys
+
+import pytest
+
+from edgeslam_torch.config import SlamConfig
+from edgeslam_torch.errors import ConfigError, OutputError
+from edgeslam_torch.fleet.batch import Local, run_batch
+from edgeslam_torch.fleet.folder import BatchSettings
+from edgeslam_torch.fleet.manifest import read_manifests
+from edgeslam_torch.jobs.watched import Limits
+
+GOOD = """
+import json, pathlib, sys
+job = pathlib.Path(sys.argv[1])
+task = json.loads((job / 'task.json').read_text())
+(pathlib.Path(task['batch']) / 'flights' / task['name']).mkdir()
+figures = {'frames': 10, 'tracked': 0.9, 'ate_m': 0.02, 'scale_error': float('nan'), 'scale_source': 'depth'}
+(job / 'result.json').write_text(json.dumps({'key': task['key'], 'figures': figures, 'notes': ['a <b>note</b>']}))
+"""
+BROKEN = "import sys; sys.exit('no image can be read')"
+KILLED_ONCE = (
+    "import os, pathlib, signal, sys; seen = pathlib.Path(sys.argv[1]) / 'seen'\n"
+    "if not seen.exists(): seen.touch(); os.kill(os.getpid(), signal.SIGKILL)\n"
+) + GOOD
+
+
+class Starter:
+    """Starts the script given for a flight's name, and notes which."""
+
+    def __init__(self, **scripts):
+        self.scripts = scripts
+        self.started = []
+
+    def __call__(self, folder, log):
+        self.started.append(folder.name)
+        command = [sys.executable, "-S", "-c", self.scripts.get(folder.name, GOOD), str(folder)]
+        return subprocess.Popen(command, stdout=log, stderr=log, text=True)
+
+
+@pytest.fixture
+def recordings(tmp_path, write_images):
+    for name in ("a", "b", "c"):
+        write_images(tmp_path / "recordings" / name, ["0.png"])
+    return tmp_path / "recordings"
+
+
+def batch(tmp_path, recordings, starter, settings=None, manifest=None, said=None):
+    flights = read_manifests([str(manifest or recordings)])
+    runner = Local(2, Limits(60.0), start=starter)
+    say = (lambda _: None) if said is None else said.append
+    return run_batch(flights, settings or BatchSettings(SlamConfig()), tmp_path / "out", runner, say)
+
+
+def states(rows):
+    return {row.name: row.state for row in rows}
+
+
+def test_failed_flight_is_a_row_with_its_reason_and_the_rest_is_done(tmp_path, recordings):
+    rows = batch(tmp_path, recordings, Starter(b=BROKEN))
+    assert states(rows) == {"a": "done", "b": "failed", "c": "done"}
+    assert rows[1].reason == "no image can be read"
+    assert sorted(p.name for p in (tmp_path / "out" / "flights").iterdir()) == ["a", "c"]
+    table = list(csv.DictReader((tmp_path / "out" / "batch.csv").open()))
+    assert [(row["name"], row["state"], row["ate_m"]) for row in table] == [
+        ("a", "done", "0.02"),
+        ("b", "failed", ""),
+        ("c", "done", "0.02"),
+    ]
+    record = json.loads((tmp_path / "out" / "batch.json").read_text())
+    assert record["counts"] == {"done": 2, "failed": 1, "waiting": 0}
+    assert record["medians"]["ate_m"] == 0.02
+    assert record["flights"][0]["figures"]["scale_error"] is None, "JSON has no NaN"
+
+
+def test_what_is_done_is_not_done_again_and_what_failed_is(tmp_path, recordings):
+    starter, said = Starter(b=BROKEN), []
+    batch(tmp_path, recordings, starter)
+    batch(tmp_path, recordings, starter, said=said)
+    assert sorted(starter.started) == ["a", "b", "b", "c"]
+    assert said[0] == "2 of 3 flights were done before"
+    starter.scripts.clear()
+    assert states(batch(tmp_path, recordings, starter)) == {"a": "done", "b": "done", "c": "done"}
+
+
+def test_other_settings_start_anew_and_keep_the_older_results(tmp_path, recordings):
+    starter = Starter()
+    batch(tmp_path, recordings, starter)
+    (tmp_path / "out" / "flights" / "a" / "of_seed_0").touch()
+    batch(tmp_path, recordings, starter, BatchSettings(SlamConfig(seed=1)))
+    assert len(starter.started) == 6
+    assert (tmp_path / "out" / "older" / "a" / "of_seed_0").exists()
+    assert not (tmp_path / "out" / "flights" / "a" / "of_seed_0").exists()
+
+
+def test_changed_recording_is_run_again_alone(tmp_path, recordings, write_images):
+    starter = Starter()
+    batch(tmp_path, recordings, starter)
+    write_images(recordings / "b", ["1.png"])
+    batch(tmp_path, recordings, starter)
+    assert sorted(starter.started) == ["a", "b", "b", "c"]
+
+
+def test_killed_process_costs_its_flight_one_attempt(tmp_path, recordings):
+    rows = batch(tmp_path, recordings, Starter(b=KILLED_ONCE))
+    assert [row.attempts for row in rows] == [1, 2, 1]
+    assert states(rows)["b"] == "done"
+
+
+def test_half_written_result_is_no_result(tmp_path, recordings):
+    starter = Starter()
+    batch(tmp_path, recordings, starter)
+    (tmp_path / "out" / "jobs" / "b" / "result.json").write_text('{"key": ')
+    batch(tmp_path, recordings, starter)
+    assert sorted(starter.started) == ["a", "b", "b", "c"]
+
+
+def test_interrupted_batch_leaves_a_table_of_what_is_finished(tmp_path, recordings):
+    def interrupt(text):
+        raise KeyboardInterrupt
+
+    flights = read_manifests([str(recordings)])
+    runner = Local(1, Limits(60.0), start=Starter())
+    with pytest.raises(KeyboardInterrupt):
+        run_batch(flights, BatchSettings(SlamConfig()), tmp_path / "out", runner, interrupt)
+    record = json.loads((tmp_path / "out" / "batch.json").read_text())
+    assert record["counts"] == {"done": 1, "failed": 0, "waiting": 2}
+    assert "2 not run yet" in (tmp_path / "out" / "index.html").read_text()
+    starter = Starter()
+    batch(tmp_path, recordings, starter)
+    assert starter.started == ["b", "c"]
+
+
+def test_mistake_in_one_flights_settings_is_found_before_any_is_run(tmp_path, recordings):
+    manifest = tmp_path / "flights.csv"
+    manifest.write_text(f"recording,settings\n{recordings}/a,\n{recordings}/b,orb.featurs=5\n")
+    starter = Starter()
+    with pytest.raises(ConfigError, match=r"flights.csv, line 3: .*did you mean 'orb.features'"):
+        batch(tmp_path, recordings, starter, manifest=manifest)
+    assert starter.started == []
+
+
+def test_folder_of_something_else_is_refused(tmp_path, recordings):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "thesis.tex").touch()
+    with pytest.raises(OutputError, match=r"holds thesis.tex, which no batch wrote"):
+        batch(tmp_path, recordings, Starter())
+
+
+def test_page_is_escaped_and_needs_no_network(tmp_path, recordings, write_images):
+    write_images(recordings / "x<script>alert(1)", ["0.png"])
+    batch(tmp_path, recordings, Starter(c="import sys; sys.exit('<img src=x>')"))
+    page = (tmp_path / "out" / "index.html").read_text()
+    assert "<b>note" not in page
+    assert "<img src=x>" not in page
+    assert "http" not in page.replace("http-equiv", "")
+    assert 'data-key="0.02"' in page, "sorted by the figure, not by its rounded text"
+    assert str(tmp_path) not in page.replace(str(recordings), ""), "links are relative: the folder may be moved"
+
+
+def test_text_that_a_spreadsheet_would_execute_stays_text(tmp_path, recordings):
+    batch(tmp_path, recordings, Starter(a="import sys; sys.exit('=1+1')"))
+    assert "'=1+1" in (tmp_path / "out" / "batch.csv").read_text()

@@ -1,0 +1,94 @@
+"""Folders, patterns and tables of recordings."""
+
+import pytest
+
+from edgeslam_torch.errors import ConfigError, SourceError
+from edgeslam_torch.fleet.manifest import read_manifests
+
+
+@pytest.fixture
+def recordings(tmp_path, write_images):
+    for name in ("b", "a"):
+        write_images(tmp_path / "all" / name, ["0.png"])
+    (tmp_path / "all" / "broken").mkdir()
+    (tmp_path / "all" / "clip.mp4").touch()
+    (tmp_path / "all" / "notes.txt").touch()
+    (tmp_path / "all" / ".hidden").mkdir()
+    return tmp_path / "all"
+
+
+def names(*manifests):
+    return [flight.name for flight in read_manifests([str(m) for m in manifests])]
+
+
+def table(tmp_path, text):
+    path = tmp_path / "flights.csv"
+    path.write_text(text)
+    return path
+
+
+def test_every_folder_and_video_of_a_folder_is_a_flight(recordings):
+    assert names(recordings) == ["a", "b", "broken", "clip.mp4"]
+
+
+def test_recording_itself_is_one_flight(recordings):
+    assert names(recordings / "a") == ["a"]
+    assert names(recordings / "clip.mp4") == ["clip.mp4"]
+
+
+def test_pattern_names_flights(recordings):
+    assert names(recordings / "[ab]") == ["a", "b"]
+    with pytest.raises(SourceError, match="no folder or video matches"):
+        names(recordings / "x*")
+
+
+def test_same_names_are_numbered_also_where_only_their_case_differs(tmp_path, write_images):
+    for name in ("one/flight", "two/Flight", "three/flight"):
+        write_images(tmp_path / name, ["0.png"])
+    assert names(*(tmp_path / n / f for n, f in (("one", "flight"), ("two", "Flight"), ("three", "flight")))) == [
+        "flight",
+        "Flight-2",
+        "flight-3",
+    ]
+
+
+def test_table_gives_each_flight_its_own_camera_truth_and_settings(tmp_path):
+    rows = "recording, name, camera, truth, settings\nf/1,first,tello,,orb.features=500; seed=3\n/x/2,,c.yaml,t.txt,\n"
+    first, second = read_manifests([str(table(tmp_path, rows))])
+    assert (first.recording, first.name, first.camera) == (tmp_path / "f" / "1", "first", "tello")
+    assert first.settings == ("orb.features=500", "seed=3")
+    assert first.origin.endswith("flights.csv, line 2")
+    assert str(second.recording) == "/x/2"
+    assert second.name == "2"
+    assert (second.camera, second.truth) == (str(tmp_path / "c.yaml"), str(tmp_path / "t.txt"))
+
+
+def test_name_cannot_leave_the_batchs_folder(tmp_path):
+    flights = read_manifests([str(table(tmp_path, 'recording,name\na,../../etc\nb,"a b/c"\nc,..\n'))])
+    assert [flight.name for flight in flights] == ["etc", "a_b_c", "flight"]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("recording,tuth\na,b\n", "unknown column 'tuth'; did you mean 'truth'"),
+        ("name,camera\na,b\n", "no column 'recording'"),
+        ("recording\n", "no recording in it"),
+        ("", "no recording in it"),
+        ("recording,name\n,x\n", "line 2: no recording"),
+        ("recording\na,b,c\n", "line 2: more cells than columns"),
+        ("recording\ntello://\n", "line 2: a batch takes recordings, not live sources"),
+    ],
+)
+def test_malformed_table_is_refused_with_its_line(tmp_path, text, message):
+    with pytest.raises((ConfigError, SourceError), match=message):
+        read_manifests([str(table(tmp_path, text))])
+
+
+def test_what_is_not_there_is_named(tmp_path):
+    with pytest.raises(SourceError, match="nowhere: no such folder, recording or table"):
+        names(tmp_path / "nowhere")
+    with pytest.raises(SourceError, match="no folders or videos in it"):
+        names(tmp_path)
+    with pytest.raises(SourceError, match="not live sources"):
+        names("webcam:0")

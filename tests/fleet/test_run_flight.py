@@ -1,0 +1,92 @@
+"""The process of one flight, called in this one, with a stub of the SLAM system."""
+
+import json
+from functools import partial
+
+import pytest
+from fake_slam import FakeSlam
+
+from edgeslam_torch.config import SlamConfig
+from edgeslam_torch.fleet import run_flight
+from edgeslam_torch.fleet.folder import BatchFolder, BatchSettings
+from edgeslam_torch.fleet.manifest import read_manifests
+from edgeslam_torch.run import run
+
+FRAMES = 12
+
+
+@pytest.fixture
+def flown(tmp_path, write_tum, monkeypatch):
+    """Function that runs one recording as a batch's process would."""
+    monkeypatch.setattr(run_flight, "run", partial(run, make_slam=lambda *_: FakeSlam()))
+
+    def fly(recording, truth=""):
+        manifest = tmp_path / "flights.csv"
+        manifest.write_text(f"recording,name,camera,truth\n{recording},one,,{truth}\n")
+        folder = BatchFolder(tmp_path / "out")
+        task = folder.task(read_manifests([str(manifest)])[0], BatchSettings(SlamConfig()))
+        return folder, task, run_flight.main(folder.prepare(task))
+
+    return fly
+
+
+def write_truth(path, scale=2.0):
+    """The stub's path, `scale` times as long."""
+    lines = [f"{100 + 0.1 * i:.6f} {scale * 0.01 * i} {0.001 * i * i} 1 0 0 0 1" for i in range(FRAMES)]
+    path.write_text("\n".join(lines) + "\n")
+
+
+def test_finished_flight_is_a_run_folder_with_report_picture_and_result(tmp_path, flown, write_tum):
+    folder, task, code = flown(write_tum(tmp_path / "rec", FRAMES))
+    assert code == 0
+    made = folder.path / "flights" / "one"
+    assert {"summary.json", "trajectory.txt", "report.html", "edge_map.ply"} <= {p.name for p in made.iterdir()}
+    assert (folder.path / "pictures" / "one.jpg").is_file()
+    assert list((folder.path / "work").iterdir()) == []
+    found = folder.result(task)
+    assert (found["figures"]["frames"], found["figures"]["tracked"]) == (FRAMES, 1.0)
+    assert "ate_m" not in found["figures"]
+    source = json.loads((made / "summary.json").read_text())["source"]["path"]
+    assert (made / source).resolve() == (tmp_path / "rec").resolve(), "the run still finds its recording"
+
+
+def test_recordings_own_truth_is_used(tmp_path, flown, write_tum):
+    recording = write_tum(tmp_path / "rec", FRAMES)
+    write_truth(recording / "groundtruth.txt")
+    folder, task, _ = flown(recording)
+    figures = folder.result(task)["figures"]
+    assert 0 < figures["ate_m"] < 0.05
+    assert figures["scale_error"] == pytest.approx(1.0, abs=0.3), "the truth is twice as long"
+
+
+def test_given_truth_comes_first(tmp_path, flown, write_tum):
+    recording = write_tum(tmp_path / "rec", FRAMES)
+    write_truth(recording / "groundtruth.txt", scale=9.0)
+    write_truth(tmp_path / "truth.txt", scale=2.0)
+    folder, task, _ = flown(recording, truth="truth.txt")
+    assert folder.result(task)["figures"]["scale_error"] == pytest.approx(1.0, abs=0.3)
+
+
+def test_truth_that_cannot_be_used_is_a_note_and_the_run_stays(tmp_path, flown, write_tum):
+    (tmp_path / "truth.txt").write_text("1 2 3\n")
+    folder, task, code = flown(write_tum(tmp_path / "rec", FRAMES), truth="truth.txt")
+    assert code == 0
+    assert any(note.startswith("not evaluated: ") for note in folder.result(task)["notes"])
+
+
+def test_broken_recording_says_why_in_its_last_line(tmp_path, flown, capsys):
+    (tmp_path / "rec").mkdir()
+    folder, task, code = flown(tmp_path / "rec")
+    assert code == 1
+    assert capsys.readouterr().err.strip().endswith("or a video")
+    assert folder.result(task) is None
+    assert list((folder.path / "flights").iterdir()) == []
+
+
+def test_rest_of_a_killed_attempt_is_no_obstacle(tmp_path, flown, write_tum):
+    rest = tmp_path / "out" / "work" / "one"
+    recording = write_tum(tmp_path / "rec", FRAMES)
+    BatchFolder(tmp_path / "out")
+    rest.mkdir()
+    (rest / "holiday.png").touch()
+    assert flown(recording)[2] == 0
