@@ -4,6 +4,10 @@ import argparse
 import math
 import signal
 import time
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from edgeslam_torch.synthetic.sites.site import Site
 
 _POLL_S = 0.1
 """A signal delivered to another thread does not wake the main thread, which handles it."""
@@ -15,7 +19,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--command-port", type=int, default=8889, metavar="PORT", help="default: 8889")
     parser.add_argument("--state-port", type=int, default=8890, metavar="PORT", help="client's port, default: 8890")
     parser.add_argument("--video-port", type=int, default=11111, metavar="PORT", help="client's port, default: 11111")
-    parser.add_argument("--seed", type=int, default=0, help="of the room (default: 0)")
+    parser.add_argument("--world", metavar="NAME", help="a named world such as l_corridor (default: a furnished room)")
+    parser.add_argument("--seed", type=int, default=0, help="of the world (default: 0)")
+    parser.add_argument("--wind", type=float, default=0.0, metavar="M_S", help="mean wind across, half of it as gusts")
     parser.add_argument("--battery", type=float, default=100.0, metavar="PERCENT", help="charge at the start")
     parser.add_argument("--drain", type=float, default=13.0, metavar="MINUTES", help="flight time of a full battery")
     parser.add_argument("--loss", type=float, default=0.0, metavar="PERCENT", help="packets lost, each way")
@@ -40,13 +46,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Emulate until Ctrl-C."""
+    from edgeslam_torch.drone.emulator.air import Air
     from edgeslam_torch.drone.emulator.link import LinkFaults
-    from edgeslam_torch.drone.emulator.room import furnished_drone
+    from edgeslam_torch.drone.emulator.room import drone_at, furnished_drone
     from edgeslam_torch.drone.emulator.server import EmulatorConfig, TelloEmulator
     from edgeslam_torch.errors import ConfigError
 
     if args.measure is not None:
         return _measure(args)
+    import numpy as np
+
     width = args.render_width
     if args.seed < 0:
         raise ConfigError(f"--seed must be at least 0, got {args.seed}")
@@ -63,7 +72,14 @@ def main(args: argparse.Namespace) -> int:
         args.bind, *ports, link=faults, seed=args.seed, mission_pads=args.sdk == "2.0", stopwatch=args.stopwatch
     )
     size = (width, round(width * 0.75))
-    drone, paint, _ = furnished_drone(args.seed, math.radians(args.tilt), size, args.battery / 100.0)
+    if not 0 <= args.wind <= 2:
+        raise ConfigError(f"--wind must be 0 to 2 m/s, got {args.wind:g}")
+    tilt, charge = math.radians(args.tilt), args.battery / 100.0
+    if args.world is None:
+        drone, paint, _ = furnished_drone(args.seed, tilt, size, charge)
+    else:
+        drone, paint, _ = drone_at(_site(args.world, args.seed), tilt, size, charge)
+    drone.air = Air(np.array([0.0, args.wind, 0.0]), 0.5 * args.wind, np.random.default_rng(args.seed))
     drone.battery_per_s = 1.0 / (60.0 * args.drain)
     told: list[int] = []
     previous = signal.signal(signal.SIGTERM, lambda number, _: told.append(number))
@@ -86,6 +102,16 @@ def main(args: argparse.Namespace) -> int:
     finally:
         signal.signal(signal.SIGTERM, previous)
     return 0
+
+
+def _site(name: str, seed: int) -> "Site":
+    from edgeslam_torch.errors import ConfigError
+    from edgeslam_torch.synthetic.sites.build import named_site
+
+    try:
+        return named_site(name, seed)
+    except ValueError as error:
+        raise ConfigError(f"--world: {error}") from error
 
 
 def _measure(args: argparse.Namespace) -> int:

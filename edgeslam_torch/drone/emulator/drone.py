@@ -7,6 +7,7 @@ from enum import StrEnum
 
 import numpy as np
 
+from edgeslam_torch.drone.emulator.air import DRAG_PER_S, Air, ground_effect
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.rotations import matrix_from_rpy, wrapped
 from edgeslam_torch.types import FloatArray
@@ -17,7 +18,16 @@ _GROUND_M = 0.1
 """Height of camera and range sensor when the drone stands on the floor."""
 _TAU_S = 0.35
 """Time constant of the velocity controller."""
-_WALL_M = 0.15
+RADIUS_M = 0.1
+"""Of the sphere that holds body and propellers without guards: 18 cm from tip to tip across."""
+_CRASH_M_S = 0.6
+"""Slower, a Tello bounces off and flies on; faster, a propeller stops and it falls."""
+_BOUNCE = 0.3
+"""Share of the speed that is left after a bounce."""
+_LEAN_S = 0.12
+"""Time constant of the attitude controller."""
+_MAX_LEAN_M_S2 = 4.0
+"""Acceleration at the greatest lean, 22 degrees."""
 _TURN_RAD_S = math.radians(90.0)
 
 
@@ -30,15 +40,29 @@ class Mode(StrEnum):
     LANDING = "landing"
 
 
+@dataclass(frozen=True, slots=True)
+class Contact:
+    """A touch of something that is not the floor."""
+
+    clock_s: float
+    p_w: FloatArray
+    """``(3,)`` centre of the drone [m]."""
+    speed_m_s: float
+    crashed: bool
+    """Whether the motors stopped; otherwise it bounced off."""
+    doing: "Mode"
+
+
 @dataclass(slots=True)
 class DroneModel:
-    """Point mass with first-order velocity control and attitude that follows its acceleration.
+    """A sphere with first-order velocity control by an attitude that follows late, in moving air.
 
     World axes: x forward and y left at power-on, z up, origin on the floor below the power-on place.
     """
 
     clearance: Callable[[FloatArray], float] = lambda p: math.inf
-    """Clearance [m] around a point of the drone's world; the drone stops short of walls."""
+    """Distance [m] of a point of the drone's world ``(3,)`` to the nearest surface other than the floor."""
+    air: Air = field(default_factory=Air)
     battery: float = 1.0
     battery_per_s: float = 1.0 / 780.0
     """13 minutes of flight on a full battery."""
@@ -52,6 +76,9 @@ class DroneModel:
     """Time with motors on [s]."""
     rc: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     """Sticks in [-1, 1]: right, forward, up, clockwise."""
+    contacts: list[Contact] = field(default_factory=list)
+    lean_m_s2: FloatArray = field(default_factory=lambda: np.zeros(2))
+    """Level acceleration that the present attitude gives, in the world ``(2,)``: gravity times the lean's tangent."""
     _target: FloatArray | None = None
     _target_yaw: float | None = None
     _speed: float = 0.5
@@ -87,6 +114,7 @@ class DroneModel:
         """Emergency: motors off; it drops."""
         self.stop()
         self.mode, self.velocity, self.yaw_rate = Mode.GROUND, np.zeros(3), 0.0
+        self.lean_m_s2 = np.zeros(2)
         self.p_w = np.array([self.p_w[0], self.p_w[1], _GROUND_M])
 
     def stop(self) -> None:
@@ -112,17 +140,36 @@ class DroneModel:
         self.battery = max(0.0, self.battery - dt * self.battery_per_s)
         if self.battery <= 0.05:
             self.land()
-        wanted = self._wanted_velocity()
-        self.acceleration = np.clip((wanted - self.velocity) / _TAU_S, -4.0, 4.0)
-        self.velocity = self.velocity + dt * self.acceleration
+        self._step_velocity(dt)
         ahead = self.p_w + dt * self.velocity
-        if self.clearance(ahead) < min(_WALL_M, self.clearance(self.p_w)):
-            self.velocity = np.array([0.0, 0.0, self.velocity[2] if self.mode is not Mode.FLYING else 0.0])
-            self._target = None if self.mode is Mode.FLYING else self._target
-            ahead = self.p_w + dt * self.velocity
+        if self.clearance(ahead) < min(RADIUS_M, self.clearance(self.p_w)):
+            ahead = self._touch()
         self.p_w = ahead
         self._step_yaw(dt)
         self._finish()
+
+    def _step_velocity(self, dt: float) -> None:
+        """Lean towards the wanted velocity; the air does the rest. The controller knows its drag, not the wind."""
+        wanted = (self._wanted_velocity() - self.velocity) / _TAU_S
+        wanted = np.clip(wanted + DRAG_PER_S * self.velocity, -_MAX_LEAN_M_S2, _MAX_LEAN_M_S2)
+        self.lean_m_s2 = self.lean_m_s2 + (1.0 - math.exp(-dt / _LEAN_S)) * (wanted[:2] - self.lean_m_s2)
+        thrust = np.array([*self.lean_m_s2, wanted[2]])
+        disturbed = self.air.drag(self.velocity, dt) + self.air.wash(self.clearance(self.p_w))
+        disturbed[2] += ground_effect(self.p_w[2]) - ground_effect(_HOVER_M)
+        self.acceleration = thrust + disturbed
+        self.velocity = self.velocity + dt * self.acceleration
+
+    def _touch(self) -> FloatArray:
+        """Bounce off, or crash; returns where it is afterwards."""
+        speed = float(np.linalg.norm(self.velocity))
+        crashed = speed > _CRASH_M_S
+        self.contacts.append(Contact(self._clock, self.p_w.copy(), speed, crashed, self.mode))
+        if crashed:
+            self.cut()
+            return self.p_w
+        self.velocity = -_BOUNCE * self.velocity
+        self._target = None if self.mode is Mode.FLYING else self._target
+        return self.p_w
 
     def _wanted_velocity(self) -> FloatArray:
         if self.mode is Mode.LANDING:
@@ -158,10 +205,10 @@ class DroneModel:
             self.velocity = np.maximum(self.velocity, [-np.inf, -np.inf, 0.0])
 
     def rpy(self) -> FloatArray:
-        """Roll, pitch, yaw [rad]: a multicopter leans into its acceleration."""
+        """Roll, pitch, yaw [rad]: a multicopter leans the way it accelerates."""
         c, s = math.cos(self.yaw), math.sin(self.yaw)
-        ahead = c * self.acceleration[0] + s * self.acceleration[1] if self.flying else 0.0
-        left = -s * self.acceleration[0] + c * self.acceleration[1] if self.flying else 0.0
+        ahead = c * self.lean_m_s2[0] + s * self.lean_m_s2[1] if self.flying else 0.0
+        left = -s * self.lean_m_s2[0] + c * self.lean_m_s2[1] if self.flying else 0.0
         return np.array([-math.atan(left / _GRAVITY), math.atan(ahead / _GRAVITY), float(wrapped(np.array(self.yaw)))])
 
     def T_w_b(self) -> FloatArray:

@@ -34,7 +34,7 @@ def corridor(rng: Rng, *, length_m: float = 14.0, width_m: float = 2.4, height_m
         if wall in (1, 3):  # the two ends
             _door(scene, place.at(0.0, 0.0), rng)
             continue
-        _line_wall(scene, place, length, rng, height_m)
+        line_wall(scene, place, length, rng, height_m)
     return scene.world("corridor")
 
 
@@ -49,7 +49,7 @@ def block(rng: Rng, *, width_m: float = 2.4, height_m: float = 2.7) -> World:
     """
     half = 0.5 * np.array(BLOCK_M)
     low, high = np.array([*(-half - width_m / 2), 0.0]), np.array([*(half + width_m / 2), height_m])
-    scene = _shell(rng, low, high, 0.004, walls=TEXTURED_WALLS, floors=FLOORS)
+    scene = shell(rng, low, high, 0.004, walls=TEXTURED_WALLS, floors=FLOORS)
     scene.ambient = 0.6
     corner = half - width_m / 2
     scene.box(
@@ -62,12 +62,12 @@ def block(rng: Rng, *, width_m: float = 2.4, height_m: float = 2.7) -> World:
     )
     for x, y in _along_rectangle(half, 2.6):
         scene.lamps_w.append(np.array([x, y, height_m - 0.1]))
-        _ceiling_lamp(scene, scene.lamps_w[-1], 1.1, 0.3)
+        hang_lamp(scene, scene.lamps_w[-1], 1.1, 0.3)
     for wall in range(4):
         place, length = _wall(low, high, wall)
-        _line_wall(scene, place, length, rng, height_m)
+        line_wall(scene, place, length, rng, height_m)
         place, length = _wall(np.array([*-corner, 0.0]), np.array([*corner, height_m]), wall)
-        _line_wall(scene, place.at(0.0, 0.0, yaw_rad=np.pi), length, rng, height_m)
+        line_wall(scene, place.at(0.0, 0.0, yaw_rad=np.pi), length, rng, height_m)
     return scene.world("block")
 
 
@@ -85,15 +85,13 @@ def building(rng: Rng, *, side_m: float = 4.0, opening_m: float = 1.3, height_m:
         height_m: Of the rooms.
     """
     half = np.array([2.5 * side_m, side_m])
-    scene = _shell(
-        rng, np.array([*-half, 0.0]), np.array([*half, height_m]), 0.006, walls=TEXTURED_WALLS, floors=FLOORS
-    )
+    scene = shell(rng, np.array([*-half, 0.0]), np.array([*half, height_m]), 0.006, walls=TEXTURED_WALLS, floors=FLOORS)
     scene.ambient = 0.6
     for column in range(-2, 3):
         x = column * side_m
         for y in (-0.5 * side_m, 0.5 * side_m):
             scene.lamps_w.append(np.array([x, y, height_m - 0.1]))
-            _ceiling_lamp(scene, scene.lamps_w[-1], 1.1, 0.3)
+            hang_lamp(scene, scene.lamps_w[-1], 1.1, 0.3)
             _rug(scene, rng, x, y)
             _room_wall(scene, Place(x, 2 * y, 0.0 if y < 0 else np.pi), side_m, rng, height_m)
             if column > -2:
@@ -123,7 +121,7 @@ def _partition(scene: Scene, place: Place, length: float, opening: float, rng: R
 
 def _room_wall(scene: Scene, place: Place, length: float, rng: Rng, height_m: float) -> None:
     """Furnished as `room` is."""
-    _furnish_wall(scene, place, length, rng, height_m, density=0.96, door=False, pictures=0.9, names=HOME)
+    furnish_wall(scene, place, length, rng, height_m, density=0.96, door=False, pictures=0.9, names=HOME)
 
 
 def _along_rectangle(half: FloatArray, spacing_m: float) -> Iterator[tuple[float, float]]:
@@ -136,7 +134,7 @@ def _along_rectangle(half: FloatArray, spacing_m: float) -> Iterator[tuple[float
             yield float(x), float(y)
 
 
-def _line_wall(scene: Scene, place: Place, length: float, rng: Rng, height_m: float) -> None:
+def line_wall(scene: Scene, place: Place, length: float, rng: Rng, height_m: float) -> None:
     """Doors, notices, radiators and a few things left standing along a corridor's wall."""
     x = -length / 2 + rng.uniform(0.3, 0.9)
     while x < length / 2 - 1.1:
@@ -173,11 +171,11 @@ def blank_corridor(rng: Rng, *, length_m: float = 14.0, width_m: float = 2.4, he
 def _lit_corridor(rng: Rng, length_m: float, width_m: float, height_m: float, walls: tuple[str, ...]) -> Scene:
     """A corridor's shell with lamps along its ceiling."""
     low, high = np.array([0.0, -width_m / 2, 0.0]), np.array([length_m, width_m / 2, height_m])
-    scene = _shell(rng, low, high, 0.004, walls=walls, floors=FLOORS, one_wall_paint=True)
+    scene = shell(rng, low, high, 0.004, walls=walls, floors=FLOORS, one_wall_paint=True)
     scene.ambient = 0.6
     scene.lamps_w = [np.array([x, 0.0, height_m - 0.1]) for x in np.arange(1.2, length_m, 2.6)]
     for lamp in scene.lamps_w:
-        _ceiling_lamp(scene, lamp, 1.1, 0.3)
+        hang_lamp(scene, lamp, 1.1, 0.3)
     return scene
 
 
@@ -185,13 +183,13 @@ def room(rng: Rng, *, size_m: tuple[float, float, float] = (6.5, 5.2, 2.7)) -> W
     """A furnished living or work room centred on the origin, free in the middle."""
     half = np.array([size_m[0] / 2, size_m[1] / 2])
     low, high = np.array([-half[0], -half[1], 0.0]), np.array([half[0], half[1], size_m[2]])
-    scene = _shell(rng, low, high, 0.004, walls=TEXTURED_WALLS, floors=FLOORS)
+    scene = shell(rng, low, high, 0.004, walls=TEXTURED_WALLS, floors=FLOORS)
     _lamps(scene, rng)
     scene.ambient = 0.55
     _rug(scene, rng, 0.0, 0.0)
     for wall in rng.permutation(4).tolist():
         place, length = _wall(low, high, wall)
-        _furnish_wall(scene, place, length, rng, size_m[2], density=0.96, door=wall == 0, pictures=0.9, names=HOME)
+        furnish_wall(scene, place, length, rng, size_m[2], density=0.96, door=wall == 0, pictures=0.9, names=HOME)
     return scene.world("room")
 
 
@@ -204,7 +202,7 @@ def random_room(rng: Rng, *, texel_m: float = 0.006) -> World:
         size = np.array([*np.exp(rng.uniform(np.log(2.3), np.log(8.5), 2)), rng.uniform(2.2, 3.4)])
         size[1] = min(size[1], 9.0)
     low, high = np.array([-size[0] / 2, -size[1] / 2, 0.0]), np.array([size[0] / 2, size[1] / 2, size[2]])
-    scene = _shell(rng, low, high, texel_m, walls=WALLS, floors=FLOORS)
+    scene = shell(rng, low, high, texel_m, walls=WALLS, floors=FLOORS)
     _lamps(scene, rng)
     scene.ambient = float(rng.uniform(0.35, 0.85))
     scene.exposure = float(np.exp(rng.normal(-0.05, 0.22)))
@@ -213,7 +211,7 @@ def random_room(rng: Rng, *, texel_m: float = 0.006) -> World:
     density, pictures = float(rng.uniform(0.3, 1.0)), float(rng.uniform(0.0, 0.8))
     for wall in range(4):
         place, length = _wall(low, high, wall)
-        _furnish_wall(scene, place, length, rng, size[2], density=density, door=rng.random() < 0.35, pictures=pictures)
+        furnish_wall(scene, place, length, rng, size[2], density=density, door=rng.random() < 0.35, pictures=pictures)
     for _ in range(int(rng.poisson(size[0] * size[1] / 14.0))):
         _in_the_middle(scene, rng)
     if rng.random() < 0.4:
@@ -299,7 +297,7 @@ def random_views(rng: Rng, camera: Camera, *, views_per_room: int = 32) -> Itera
             yield random_view(rng, camera, world)
 
 
-def _shell(
+def shell(
     rng: Rng,
     low: FloatArray,
     high: FloatArray,
@@ -401,7 +399,7 @@ def _decorate(
     return width
 
 
-def _furnish_wall(
+def furnish_wall(
     scene: Scene,
     place: Place,
     length: float,
@@ -526,10 +524,10 @@ def _lamps(scene: Scene, rng: Rng) -> None:
         lamp = np.array([x, y, high[2] - rng.uniform(0.05, 0.3)])
         scene.lamps_w.append(lamp)
         if rng.random() < 0.6:
-            _ceiling_lamp(scene, lamp, float(rng.uniform(0.3, 1.2)), float(rng.uniform(0.15, 0.4)))
+            hang_lamp(scene, lamp, float(rng.uniform(0.3, 1.2)), float(rng.uniform(0.15, 0.4)))
 
 
-def _ceiling_lamp(scene: Scene, lamp: FloatArray, width: float, depth: float) -> None:
+def hang_lamp(scene: Scene, lamp: FloatArray, width: float, depth: float) -> None:
     """Shining panel just under the ceiling."""
     place = Place(float(lamp[0]), float(lamp[1]), 0.0, float(scene.high_w[2]))
     glow = Paint("plaster", 0, (1.7, 1.7, 1.7), glow=True)

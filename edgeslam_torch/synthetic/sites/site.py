@@ -1,0 +1,48 @@
+"""A world with a task: where a drone starts, where it should go, and which openings are exits."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from edgeslam_torch.synthetic.house.world import World
+from edgeslam_torch.synthetic.sites.solids import Solids
+from edgeslam_torch.types import FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class TrueExit:
+    """An opening in a wall with free space on both sides."""
+
+    centre_w: FloatArray
+    """``(3,)`` middle of the opening, at half its height [m]."""
+    normal_w: FloatArray
+    """``(3,)`` level unit vector through the opening, away from the start."""
+    width_m: float
+    height_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class Site:
+    """A world to fly in, and what a judge knows about it. The world's floor is at z = 0."""
+
+    name: str
+    seed: int
+    world: World
+    solids: Solids
+    """Everything that a drone can hit, also what no camera sees."""
+    T_site_w: FloatArray
+    """``(4, 4)`` the drone's own world (origin on the floor below it, x forward) in the site's axes."""
+    goal_w: FloatArray
+    """``(3,)`` where to go, in the drone's own world [m]."""
+    exits: tuple[TrueExit, ...]
+    """In the drone's own world."""
+    pathway_w: FloatArray
+    """``(N, 2)`` a polyline from the start to the goal through free space, in the drone's own world [m]."""
+
+    def clearance(self, p_w: FloatArray) -> FloatArray:
+        """Distance [m] from points ``(N, 3)`` of the drone's own world to the nearest solid."""
+        return self.solids.distance(self.in_site(p_w))
+
+    def in_site(self, p_w: FloatArray) -> FloatArray:
+        """Points ``(..., 3)`` of the drone's own world in the site's axes."""
+        return np.asarray(p_w) @ self.T_site_w[:3, :3].T + self.T_site_w[:3, 3]
