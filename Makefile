@@ -61,7 +61,8 @@ wheel: $(STAMP)
 	$(BIN)/python tests/check_wheel.py dist
 
 docs: $(STAMP)
-	$(BIN)/python docs/build.py
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build -q
+	@echo "docs: open site/index.html"
 
 clean:
 	rm -rf dist build site runs .pytest_cache .mypy_cache .ruff_cache .hypothesis
