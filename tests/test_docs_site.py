@@ -17,15 +17,17 @@ ROOT = Path(__file__).resolve().parent.parent
 BUILDING = ROOT / "docs" / "building"
 WITH_FORMULAS = ("fusion/scale/joint_scale.html", "losses/base.html", "losses/cycle.html")
 ALL_FOUND = """new Promise((done, fail) => {
-  const look = (left) => {
-    const found = [...document.querySelectorAll('.md-search-result__link')].map(a => a.getAttribute('href'));
-    found.length ? done(found) : left ? setTimeout(() => look(left - 1), 100) : fail(new Error('nothing found'));
-  };
-  document.querySelector('[data-md-toggle=search]').checked = true;
+  document.querySelector('[data-md-toggle=search]').click();
   const field = document.querySelector('.md-search__input');
-  field.focus(); field.value = 'Schur'; field.dispatchEvent(new Event('input', {bubbles: true}));
-  field.dispatchEvent(new Event('keyup', {bubbles: true}));
-  look(300);
+  const look = (left) => {  // typed again and again: the index loads after the page, in its own time
+    const found = [...document.querySelectorAll('.md-search-result__link')].map(a => a.getAttribute('href'));
+    if (found.length || !left) return found.length ? done(found) : fail(new Error('nothing found'));
+    field.focus();
+    field.value = left % 2 ? 'Schur' : 'Schur complement';
+    field.dispatchEvent(new KeyboardEvent('keyup', {bubbles: true}));
+    setTimeout(() => look(left - 1), 1000);
+  };
+  look(120);
 })"""
 
 

@@ -32,14 +32,18 @@ _FENCED = re.compile(r"(^```.*?^```)", re.MULTILINE | re.DOTALL)
 
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
-    """Fill the menu: notebooks, modules, and below a folder's index the pages of the folder."""
-    for entry in config.nav or []:
+    """Fill the menu: notebooks, modules, a folder's pages below its index, and guides that it does not name."""
+    menu = config.nav or []
+    named = str(menu)
+    for entry in menu:
+        if "Guides" in entry:
+            guides = sorted(path.name for path in (ROOT / "docs").glob("*.md"))
+            entry["Guides"] += [name for name in guides if f"'{name}'" not in named]
         if "Notebooks" in entry:
             entry["Notebooks"] = [f"notebooks/{path.stem}.md" for path in notebooks()]
-        elif "API" in entry:
+        if "API" in entry:
             entry["API"] = menu_of(modules())
-        else:
-            unfold(entry)
+        unfold(entry)
     return config
 
 
