@@ -12,6 +12,7 @@ if TYPE_CHECKING:
 COMMANDS = {
     "demo": ("edgeslam_torch.commands.demo", "fly a simulated drone through a simulated house; needs no data"),
     "run": ("edgeslam_torch.commands.run", "trajectory and edge map from a recording, a video or a live camera"),
+    "topics": ("edgeslam_torch.commands.topics", "what a ROS bag holds, and what a run would use of it"),
     "eval": ("edgeslam_torch.commands.judging.eval", "judge runs or trajectory files against ground truth"),
     "bench": ("edgeslam_torch.commands.judging.bench", "accuracy and speed in one table, beside other systems"),
     "judge": (

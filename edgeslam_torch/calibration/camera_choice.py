@@ -32,11 +32,12 @@ def choose_camera(
     folders: Sequence[Path] = (),
     default: Camera | None = None,
     is_drone: bool = False,
+    own: Camera | None = None,
 ) -> tuple[Camera, list[str]]:
     """Calibration for images of one size; the paper's ``E = K^T F K`` needs K and cannot provide it.
 
-    In this order: the given one, a calibration file in the source, the data set's default, the Tello's if the source
-    looks like one, a guess. A focal length from F may replace a guess later.
+    In this order: the given one, the recording's own, a calibration file beside it, the data set's default, the
+    Tello's if the source looks like one, a guess. A focal length from F may replace a guess later.
 
     Args:
         size: ``(width, height)`` of the images [px].
@@ -44,6 +45,7 @@ def choose_camera(
         folders: Where to look for `CALIBRATION_FILES`, in this order.
         default: Of the data set.
         is_drone: Whether there is telemetry.
+        own: Calibration inside the recording.
 
     Returns:
         The camera, with its origin in ``source`` and its uncertainty in ``focal_sigma``, and warnings in words.
@@ -51,6 +53,9 @@ def choose_camera(
     Raises:
         CalibrationError: If the calibration is malformed or made for images of another shape.
     """
+    if own is not None and given is None:
+        camera, notes = fitted(own, size, own.source)
+        return camera, [*notes, *_lens_doubts(camera, own.source)]
     found = given if given is not None else _calibration_in(folders)
     if found is not None:
         camera, notes = fitted(load_camera(found), size, str(found))

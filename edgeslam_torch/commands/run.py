@@ -23,7 +23,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "source",
         metavar="SOURCE",
-        help="TUM, 7-Scenes, EuRoC or image folder, video file, flight recording, tello://HOST, webcam:N, rtsp://...",
+        help="TUM, 7-Scenes, EuRoC or image folder, video file, flight recording, ROS bag, tello://HOST, webcam:N, "
+        "rtsp://...",
     )
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the results (default: runs/NAME)")
     parser.add_argument(
@@ -33,6 +34,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--telemetry", type=Path, metavar="FILE", help="telemetry.csv of the flight (default: SOURCE's own)"
+    )
+    parser.add_argument(
+        "--topic",
+        action="append",
+        default=[],
+        metavar="[ROLE=]NAME",
+        help="topic of a ROS bag to use, such as /cam0/image_raw or odom=/x (list: edgeslam topics); may be repeated",
     )
     parser.add_argument(
         "--depth", metavar="FILE|NAME|none", help="depth network: weights, an ONNX file, a downloaded network, or none"
@@ -84,7 +92,7 @@ def main(args: argparse.Namespace) -> int:
     if args.record is not None:
         source = _recorded(args)
     else:
-        source = open_source(args.source, args.camera, args.telemetry, args.max_frames)
+        source = open_source(args.source, args.camera, args.telemetry, args.max_frames, args.topic)
     if earlier is None or not _take_its_camera(source, earlier):
         settle_camera(source)
     if earlier is not None:
@@ -129,6 +137,8 @@ def _recorded(args: argparse.Namespace) -> "Source":
         raise ConfigError(f"{args.source}: --record is for live sources ({', '.join(LIVE_SCHEMES)})")
     if args.telemetry is not None:
         raise ConfigError("--telemetry is for recordings; a live drone sends its own")
+    if args.topic:
+        raise ConfigError("--topic is for ROS bags; a live source has none")
     if args.source.startswith("tello://"):
         source, _, messages = open_tello(args.source, args.camera, args.max_frames)
         return RecordedLive(source, messages, args.record, args.lossless)

@@ -2,7 +2,7 @@
 
 import importlib
 import importlib.util
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
@@ -12,19 +12,18 @@ from edgeslam_torch.calibration.camera_choice import choose_camera
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.readers import flight_folder, images, video
+from edgeslam_torch.readers.bags.bag import SUFFIXES, is_bag
+from edgeslam_torch.readers.bags.recording import open_bag
 from edgeslam_torch.readers.layouts import layout_of, read_sequence, tum
 from edgeslam_torch.readers.listing import ImageEntry, Problem
 from edgeslam_torch.readers.read_ahead import read_ahead
-from edgeslam_torch.readers.sequence import Sequence
+from edgeslam_torch.readers.sequence import Sequence as ImageSequence
 from edgeslam_torch.readers.telemetry_csv import read_telemetry
 from edgeslam_torch.types import Frame, TelemetrySample
 
 LIVE_SCHEMES = ("tello://", "webcam:", "rtsp://", "udp://")
 
 ARCHIVES = {
-    ".bag": "a ROS bag: extract its images first",
-    ".db3": "a ROS bag: extract its images first",
-    ".mcap": "a ROS bag: extract its images first",
     ".zip": "an archive: unpack it first",
     ".tgz": "an archive: unpack it first",
     ".gz": "an archive: unpack it first",
@@ -39,7 +38,7 @@ class Source(Protocol):
     name: str
     """Name for messages and file names."""
     kind: str
-    """A layout's ``KIND``, or ``images``, ``video``, ``flight``, ``live``."""
+    """A layout's ``KIND``, or ``images``, ``video``, ``flight``, ``bag``, ``live``."""
     location: str
     """Absolute path, or the address of a live source."""
     camera: Camera
@@ -104,6 +103,10 @@ class _Content:
     folder: Path
     groundtruth: Path | None = None
     default_camera: Camera | None = None
+    own_camera: Camera | None = None
+    """Calibration inside the recording."""
+    telemetry: tuple[TelemetrySample, ...] = ()
+    """Telemetry inside the recording."""
 
 
 def open_source(
@@ -111,31 +114,41 @@ def open_source(
     camera: str | Path | None = None,
     telemetry: str | Path | None = None,
     max_frames: int | None = None,
+    topics: Sequence[str] = (),
 ) -> Source:
     """Open the source that ``spec`` names.
 
     Args:
-        spec: A TUM-layout, 7-Scenes, EuRoC or image folder, a video file, a flight recording, or a live
+        spec: A TUM-layout, 7-Scenes, EuRoC or image folder, a video file, a flight recording, a ROS bag, or a live
             source (``tello://HOST``, ``webcam:0``, ``rtsp://...``).
         camera: Calibration file or preset; default: the source's own.
         telemetry: ``telemetry.csv`` of the flight; default: the source's own.
         max_frames: Maximum number of frames.
+        topics: Of a ROS bag, see `edgeslam_torch.readers.bags.topics.choose`.
 
     Raises:
         SourceError: If there is nothing usable; the message names the file and what to do.
         CalibrationError: If the calibration does not fit.
+        MissingPackageError: If the source needs a package that is not installed.
     """
     if max_frames is not None and max_frames < 1:
         raise SourceError(f"max_frames must be at least 1, got {max_frames}")
     if str(spec).startswith(LIVE_SCHEMES):
+        if topics:
+            raise SourceError(f"{spec}: --topic is for ROS bags ({', '.join(SUFFIXES)})")
         return _open_live(str(spec), camera, telemetry, max_frames)
     path = Path(spec).expanduser()
-    content = _content(path)
+    if path.exists() and is_bag(path):
+        content = _bag_content(path, topics, camera is not None)
+    elif topics:
+        raise SourceError(f"{path}: --topic is for ROS bags ({', '.join(SUFFIXES)})")
+    else:
+        content = _content(path)
     folders = [path, content.folder] if path.is_dir() else [content.folder]
     telemetry_file = flight_folder.telemetry_file(folders, telemetry)
-    samples, remarks = ([], []) if telemetry_file is None else read_telemetry(telemetry_file)
+    samples, remarks = (list(content.telemetry), []) if telemetry_file is None else read_telemetry(telemetry_file)
     default = content.default_camera
-    chosen, warnings = choose_camera(content.size, camera, folders, default, bool(samples))
+    chosen, warnings = choose_camera(content.size, camera, folders, default, bool(samples), content.own_camera)
     length = content.length
     if max_frames is not None:
         length = max_frames if length is None else min(length, max_frames)
@@ -170,12 +183,26 @@ def _content(path: Path) -> _Content:
 def _file_content(path: Path) -> _Content:
     suffix = path.suffix.lower()
     if suffix in images.SUFFIXES:
-        return _listed(Sequence("images", path.parent, (ImageEntry(0, 0.0, path),)), path)
+        return _listed(ImageSequence("images", path.parent, (ImageEntry(0, 0.0, path),)), path)
     if suffix in ARCHIVES:
         raise SourceError(f"{path}: {ARCHIVES[suffix]}, then give the folder")
     if path.name in tum.LISTS:
         return _folder_content(path.parent)
     return _video_content(path, None)
+
+
+def _bag_content(path: Path, topics: Sequence[str], calibrated: bool) -> _Content:
+    bag = open_bag(path, topics, calibrated)
+    return _Content(
+        "bag",
+        lambda _, problems: bag.frames(problems),
+        bag.size,
+        bag.count,
+        [Problem(path.name, remark, frames=0) for remark in bag.remarks],
+        path if path.is_dir() else path.parent,
+        own_camera=bag.camera,
+        telemetry=tuple(bag.telemetry),
+    )
 
 
 def _folder_content(folder: Path) -> _Content:
@@ -187,7 +214,7 @@ def _folder_content(folder: Path) -> _Content:
     if recorded is not None:
         return _video_content(recorded, truth)
     found, problems = images.list_image_folder(folder)
-    return _listed(Sequence("images", folder, tuple(found), tuple(problems), truth), folder)
+    return _listed(ImageSequence("images", folder, tuple(found), tuple(problems), truth), folder)
 
 
 def _video_content(path: Path, groundtruth: Path | None) -> _Content:
@@ -199,7 +226,7 @@ def _video_content(path: Path, groundtruth: Path | None) -> _Content:
     return _Content("video", decode, clip.size, clip.count, [], path.parent, groundtruth)
 
 
-def _listed(sequence: Sequence, place: Path) -> _Content:
+def _listed(sequence: ImageSequence, place: Path) -> _Content:
     """Images of a sequence that was found in ``place``, which messages name."""
     if not sequence.images:
         raise SourceError(_nothing_in(place))

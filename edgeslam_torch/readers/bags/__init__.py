@@ -1,0 +1,1 @@
+"""ROS bags and MCAP files as recordings, without ROS."""

@@ -1,0 +1,102 @@
+"""Pictures of ``Image`` and ``CompressedImage`` messages."""
+
+import re
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from edgeslam_torch.errors import SourceError
+from edgeslam_torch.readers.images import check_size
+
+_CHANNELS = {"mono8": 1, "8UC1": 1, "8UC3": 3, "8UC4": 4, "rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4}
+_CHANNELS |= {"yuv422": 2, "yuv422_yuy2": 2, "uyvy": 2, "yuyv": 2, "mono16": 1}
+_TO_BGR = {
+    "rgb8": cv2.COLOR_RGB2BGR,
+    "rgba8": cv2.COLOR_RGBA2BGR,
+    "bgra8": cv2.COLOR_BGRA2BGR,
+    "8UC4": cv2.COLOR_BGRA2BGR,
+    "yuv422": cv2.COLOR_YUV2BGR_UYVY,  # ROS: U Y V Y
+    "uyvy": cv2.COLOR_YUV2BGR_UYVY,
+    "yuv422_yuy2": cv2.COLOR_YUV2BGR_YUY2,
+    "yuyv": cv2.COLOR_YUV2BGR_YUY2,
+    # OpenCV names a pattern by its second row, ROS by its first.
+    "bayer_rggb": cv2.COLOR_BayerBG2BGR,
+    "bayer_bggr": cv2.COLOR_BayerRG2BGR,
+    "bayer_gbrg": cv2.COLOR_BayerGR2BGR,
+    "bayer_grbg": cv2.COLOR_BayerGB2BGR,
+}
+_DEPTH = ("16UC1", "32FC1", "64FC1", "compressedDepth")
+SUPPORTED = "mono8, mono16, rgb8, bgr8, rgba8, bgra8, bayer_*, yuv422, jpeg and png"
+
+
+def depth_format(message: Any) -> str | None:
+    """The format by which a picture is a depth map, which SLAM cannot use as an image; None for ordinary pictures."""
+    name = _format(message)
+    return next((form for form in _DEPTH if form.lower() in name.lower()), None)
+
+
+def _format(message: Any) -> str:
+    return str(message.encoding if hasattr(message, "encoding") else message.format)
+
+
+class PictureDecoder:
+    """Reads the pictures of one topic; 16 bits are scaled to 8 as the first picture needs."""
+
+    def __init__(self, name: str) -> None:
+        """``name``: file and topic, for messages."""
+        self.name = name
+        self._shift: int | None = None
+
+    def decode(self, message: Any) -> NDArray[np.uint8]:
+        """``(H, W, 3)`` BGR or ``(H, W)`` grey.
+
+        Raises:
+            SourceError: If the encoding is a depth map's or not known, or the picture is damaged.
+        """
+        form = depth_format(message)
+        if form is not None:
+            raise SourceError(f"{self.name}: depth maps ({form}), not pictures; give the camera's --topic")
+        if hasattr(message, "encoding"):
+            return self._plain(message)
+        picture = cv2.imdecode(np.asarray(message.data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+        if picture is None:
+            raise SourceError(
+                f"{self.name}: compressed as {_format(message)[:40]!r} cannot be decoded; {SUPPORTED} are read"
+            )
+        check_size(picture.shape[1], picture.shape[0], self.name)
+        if picture.dtype != np.uint8:
+            picture = self._eight_bits(picture)
+        return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGRA2BGR) if picture.shape[2:] == (4,) else picture)
+
+    def _plain(self, message: Any) -> NDArray[np.uint8]:
+        encoding, (width, height) = str(message.encoding), (int(message.width), int(message.height))
+        bayer = re.fullmatch(r"(bayer_(?:rggb|bggr|gbrg|grbg))(8|16)", encoding)
+        channels = 1 if bayer else _CHANNELS.get(encoding)
+        if channels is None:
+            raise SourceError(f"{self.name}: encoding {encoding[:40]!r} is not supported; {SUPPORTED} are")
+        check_size(width, height, self.name)
+        deep = encoding == "mono16" or bool(bayer and bayer[2] == "16")
+        row = width * channels * (2 if deep else 1)
+        step, data = int(message.step) or row, np.asarray(message.data, dtype=np.uint8)
+        if width < 1 or height < 1 or step < row or data.size < step * (height - 1) + row:
+            raise SourceError(
+                f"{self.name}: {data.size} bytes are too few for a {width}x{height} picture in {encoding}"
+            )
+        padded = np.zeros(step * height, np.uint8)
+        padded[: min(data.size, padded.size)] = data[: padded.size]
+        pixels = padded.reshape(height, step)[:, :row]
+        if deep:
+            order = ">u2" if message.is_bigendian else "<u2"
+            image = self._eight_bits(np.ascontiguousarray(pixels).view(order).reshape(height, width))
+        else:
+            image = np.ascontiguousarray(pixels).reshape((height, width, channels) if channels > 1 else (height, width))
+        code = _TO_BGR.get(bayer[1] if bayer else encoding)
+        return image if code is None else np.asarray(cv2.cvtColor(image, code), np.uint8)
+
+    def _eight_bits(self, image: np.ndarray) -> NDArray[np.uint8]:
+        """Cameras send 10, 12 or 14 bits in 16: the first picture's brightest pixel tells how many."""
+        if self._shift is None:
+            self._shift = max(0, int(image.max(initial=0)).bit_length() - 8)
+        return np.asarray(np.minimum(image.astype(np.uint16) >> self._shift, 255), np.uint8)

@@ -1,0 +1,148 @@
+"""A bag as a recording: pictures with stamps, calibration, telemetry."""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from edgeslam_torch.errors import SourceError
+from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.readers.bags.bag import Bag
+from edgeslam_torch.readers.bags.clock import Offset, TopicClock, disagree, header_s, measure
+from edgeslam_torch.readers.bags.lens import camera_from_info
+from edgeslam_torch.readers.bags.pictures import PictureDecoder
+from edgeslam_torch.readers.bags.telemetry import read_bag_telemetry
+from edgeslam_torch.readers.bags.topics import Choice, choose
+from edgeslam_torch.readers.listing import Problem
+from edgeslam_torch.types import Frame, TelemetrySample
+
+_LOOKED_AT = 20
+"""Messages at the start of a topic by which its clock is judged."""
+
+
+@dataclass(frozen=True, slots=True)
+class BagRecording:
+    """What a run needs of a bag."""
+
+    bag: Bag
+    choice: Choice
+    size: tuple[int, int]
+    """``(width, height)`` of its first picture [px]."""
+    count: int
+    """Messages of the camera."""
+    camera: Camera | None
+    """By its ``CameraInfo``; None without a usable one."""
+    telemetry: list[TelemetrySample]
+    remarks: tuple[str, ...]
+    """One line each, for the user."""
+    offset: Offset
+    """Of the pictures' header stamps."""
+
+    def frames(self, problems: list[Problem]) -> Iterator[Frame]:
+        """Pictures with increasing stamps, read a chunk of the file at a time; skipped ones go to ``problems``."""
+        name = self.choice.image
+        label = f"{self.bag.path.name}:{name}"
+        decoder, clock = PictureDecoder(label), TopicClock(self.offset.value_s, self.offset.fault is None)
+        last = -math.inf
+        for index, raw in enumerate(self.bag.messages([name])):
+            where = f"{label}, picture {index}"
+            try:
+                message = self.bag.decode(raw)
+                stamp = clock.stamp(raw.received_s, header_s(message))
+                image = decoder.decode(message)
+            except SourceError as error:
+                problems.append(Problem(where, str(error).removeprefix(f"{label}: ")))
+                continue
+            size = (image.shape[1], image.shape[0])
+            if size != self.size or stamp <= last:
+                odd = f"image is {size[0]}x{size[1]}, the others are {self.size[0]}x{self.size[1]}"
+                reason = odd if size != self.size else f"stamp {stamp:.6f} does not increase"
+                problems.append(Problem(where, f"{reason}; image left out"))
+                continue
+            last = stamp
+            yield Frame(index, stamp, image)
+        if clock.mended:
+            reason = f"{clock.mended} header stamps jump; the times between receipts were used for them"
+            problems.append(Problem(label, reason, frames=0))
+
+
+def open_bag(path: Path, topics: Sequence[str] = (), calibrated: bool = False) -> BagRecording:
+    """Choose topics and clock, and read calibration and telemetry.
+
+    Args:
+        path: File, or folder of a ROS 2 recording.
+        topics: As given to ``--topic``.
+        calibrated: Whether the calibration comes from elsewhere, so that the bag's is not read.
+
+    Raises:
+        SourceError: If the file cannot be read, or the camera is not clear.
+        CalibrationError: If our lens model cannot express its calibration.
+        MissingPackageError: If rosbags is not installed.
+    """
+    bag = Bag(path)
+    choice = choose(bag, topics)
+    count = next(topic.count for topic in bag.topics if topic.name == choice.image)
+    remarks = list(choice.remarks)
+    camera = None if calibrated else _camera(bag, choice, remarks)
+    size = _first_size(bag, choice.image)
+    offset, clocks = _clocks(bag, choice, remarks)
+    telemetry, said = read_bag_telemetry(bag, choice.telemetry, choice.asked, clocks)
+    for name, clock in clocks.items():
+        if clock.mended:
+            remarks.append(f"{name}: {clock.mended} header stamps jump; the times between receipts were used for them")
+    return BagRecording(bag, choice, size, count, camera, telemetry, (*remarks, *said), offset)
+
+
+def _camera(bag: Bag, choice: Choice, remarks: list[str]) -> Camera | None:
+    first = [] if choice.camera is None else bag.first(choice.camera, 1)
+    if not first or choice.camera is None:
+        return None
+    rectified = "rect" in choice.image.removesuffix("/compressed").rpartition("/")[2]
+    camera = camera_from_info(first[0][1], f"{bag.path.name}:{choice.camera}", rectified)
+    if camera is None:
+        remarks.append(f"{choice.camera}: an empty calibration (all zeros), so it is not used")
+    return camera
+
+
+def _first_size(bag: Bag, name: str) -> tuple[int, int]:
+    """Size of the first picture that can be read among the first `_LOOKED_AT`.
+
+    Raises:
+        SourceError: If none can.
+    """
+    decoder, first = PictureDecoder(f"{bag.path.name}:{name}"), ""
+    for raw, _ in zip(bag.messages([name]), range(_LOOKED_AT), strict=False):
+        try:
+            image = decoder.decode(bag.decode(raw))
+        except SourceError as error:
+            first = first or str(error)
+            continue
+        return image.shape[1], image.shape[0]
+    raise SourceError(first or f"{bag.path}: {name} holds no message")
+
+
+def _clocks(bag: Bag, choice: Choice, remarks: list[str]) -> tuple[Offset, dict[str, TopicClock]]:
+    """The pictures' clock, and one clock a telemetry topic on the same time."""
+    offsets = {
+        name: measure([(raw.received_s, header_s(message)) for raw, message in bag.first(name, _LOOKED_AT)])
+        for name in (choice.image, *choice.telemetry.values())
+    }
+    of_image = offsets[choice.image]
+    if of_image.fault is not None:
+        remarks.append(f"{choice.image}: {of_image.fault}; times of receipt are used")
+    elif of_image.other_epoch:
+        remarks.append(
+            f"{choice.image}: header stamps are {abs(of_image.value_s) / 86400:.0f} days off the times of receipt; "
+            "they are used as they are"
+        )
+    clocks = {}
+    for name in choice.telemetry.values():
+        offset = offsets[name]
+        fault = offset.fault
+        if fault is None and disagree(offset, of_image):
+            apart_s = abs(offset.value_s - of_image.value_s)
+            fault = f"header stamps are {apart_s:.3g} s apart from those of {choice.image}"
+        if fault is not None and fault != "has no header stamps" and fault != of_image.fault:
+            remarks.append(f"{name}: {fault}; times of receipt are used for it")
+        clocks[name] = TopicClock(of_image.value_s, fault is None)
+    return of_image, clocks

@@ -1,0 +1,156 @@
+"""Which topic of a bag is what: by type, and by ``--topic``."""
+
+import difflib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from edgeslam_torch.errors import SourceError
+from edgeslam_torch.readers.bags.bag import Bag, Topic
+from edgeslam_torch.readers.bags.pictures import depth_format
+
+IMAGE, CAMERA = "image", "camera"
+TELEMETRY = ("tello", "odom", "velocity", "imu", "range", "battery")
+"""Roles of telemetry, in the order in which one is preferred as the source of velocity."""
+_ROLES = {
+    "sensor_msgs/Image": IMAGE,
+    "sensor_msgs/CompressedImage": IMAGE,
+    "sensor_msgs/CameraInfo": CAMERA,
+    "nav_msgs/Odometry": "odom",
+    "geometry_msgs/TwistStamped": "velocity",
+    "geometry_msgs/TwistWithCovarianceStamped": "velocity",
+    "sensor_msgs/Imu": "imu",
+    "sensor_msgs/Range": "range",
+    "sensor_msgs/BatteryState": "battery",
+}
+_MESSAGE_OF_THE_DRIVER = "FlightData"
+"""tello_msgs/FlightData, in whichever package a driver defines it."""
+_NOTHING = "none"
+_COMPRESSED = "/compressed"
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """The topics that a run uses."""
+
+    image: str
+    camera: str | None
+    telemetry: Mapping[str, str]
+    """Role to topic."""
+    asked: frozenset[str] = frozenset()
+    """Roles that were named by ``--topic``."""
+    remarks: tuple[str, ...] = ()
+
+
+def role_of(topic: Topic) -> str | None:
+    """What a topic can be used as, by its type; None for anything else."""
+    if topic.kind.rpartition("/")[2] == _MESSAGE_OF_THE_DRIVER:
+        return "tello"
+    return _ROLES.get(topic.kind)
+
+
+def depth_of(bag: Bag, topic: Topic) -> str | None:
+    """Format of a topic of depth maps; None for ordinary pictures."""
+    if "compressedDepth" in topic.name:
+        return "compressedDepth"
+    first = bag.first(topic.name, 1) if topic.count else []
+    return depth_format(first[0][1]) if first else None
+
+
+def choose(bag: Bag, wanted: Sequence[str] = ()) -> Choice:
+    """The topics to use.
+
+    Args:
+        bag: The recording.
+        wanted: As given to ``--topic``: ``/name``, whose type says what it is, ``role=/name``, or ``role=none``.
+
+    Raises:
+        SourceError: If a topic does not exist or cannot be what it was given for, or the camera is not clear.
+    """
+    wishes = _wishes(bag, wanted)
+    image = _image(bag, wishes.get(IMAGE))
+    telemetry, remarks = _telemetry(bag, wishes)
+    asked = frozenset(role for role, name in wishes.items() if name != _NOTHING)
+    return Choice(image, _camera(bag, image, wishes.get(CAMERA)), telemetry, asked, tuple(remarks))
+
+
+def _wishes(bag: Bag, wanted: Sequence[str]) -> dict[str, str]:
+    topics = {topic.name: topic for topic in bag.topics}
+    wishes: dict[str, str] = {}
+    for wish in wanted:
+        role, equals, name = wish.rpartition("=")
+        if equals and role not in (IMAGE, CAMERA, *TELEMETRY):
+            raise SourceError(f"--topic {wish}: no role {role!r}; there are {', '.join((IMAGE, CAMERA, *TELEMETRY))}")
+        if equals and name == _NOTHING and role != IMAGE:
+            wishes[role] = _NOTHING
+            continue
+        if name not in topics:
+            close = difflib.get_close_matches(name, topics, n=1, cutoff=0.5)
+            hint = f"did you mean {close[0]}?" if close else f"list them with: edgeslam topics {bag.path}"
+            raise SourceError(f"--topic {wish}: {bag.path.name} has no topic {name!r}; {hint}")
+        can_be = role_of(topics[name])
+        if can_be is None or (equals and can_be != role):
+            what = f"a {role} topic" if equals else "of a type that is used"
+            raise SourceError(f"--topic {wish}: {topics[name].kind} is not {what}; see edgeslam topics {bag.path}")
+        if can_be in wishes:
+            raise SourceError(f"--topic {wish}: {wishes[can_be]} was given as {can_be} already; give one")
+        wishes[can_be] = name
+    return wishes
+
+
+def _image(bag: Bag, wish: str | None) -> str:
+    candidates = [topic for topic in bag.topics if role_of(topic) == IMAGE]
+    if wish is not None:
+        form = depth_of(bag, next(topic for topic in candidates if topic.name == wish))
+        if form is not None:
+            raise SourceError(f"--topic {wish}: depth maps ({form}), not a camera's pictures")
+        return wish
+    filled = [topic for topic in candidates if topic.count]
+    forms = {topic.name: depth_of(bag, topic) for topic in filled}
+    cameras = {name for name, form in forms.items() if form is None}
+    # A driver publishes the same pictures raw and compressed.
+    cameras = {name for name in cameras if _raw(name) == name or _raw(name) not in cameras}
+    if len(cameras) == 1:
+        return cameras.pop()
+    if cameras:
+        names = sorted(cameras)
+        listing = ", ".join(names[:6]) + (", ..." if len(names) > 6 else "")
+        count = {2: "two", 3: "three", 4: "four"}.get(len(names), str(len(names)))
+        raise SourceError(f"{bag.path}: {count} cameras ({listing}); choose one, such as --topic {names[0]}")
+    if forms:
+        name, form = next(iter(forms.items()))
+        raise SourceError(f"{bag.path}: depth maps only ({name}: {form}); a camera's pictures are needed")
+    kinds = ", ".join(sorted({topic.kind for topic in bag.topics})[:5]) or "nothing"
+    raise SourceError(f"{bag.path}: no pictures in it (found {kinds}); needed: sensor_msgs/Image or CompressedImage")
+
+
+def _raw(name: str) -> str:
+    return name.removesuffix(_COMPRESSED)
+
+
+def _camera(bag: Bag, image: str, wish: str | None) -> str | None:
+    """The ``CameraInfo`` beside the pictures; with one camera in the bag, the only one there is."""
+    if wish is not None:
+        return None if wish == _NOTHING else wish
+    infos = [topic.name for topic in bag.topics if role_of(topic) == CAMERA and topic.count]
+    beside = _raw(image).rpartition("/")[0] + "/camera_info"
+    if beside in infos:
+        return beside
+    cameras = {_raw(t.name).rpartition("/")[0] for t in bag.topics if role_of(t) == IMAGE and t.count}
+    return infos[0] if len(infos) == 1 and len(cameras) == 1 else None
+
+
+def _telemetry(bag: Bag, wishes: Mapping[str, str]) -> tuple[dict[str, str], list[str]]:
+    """Topic of each role, and what is not used because there are several."""
+    chosen: dict[str, str] = {}
+    remarks = []
+    for role in TELEMETRY:
+        if role in wishes:
+            if wishes[role] != _NOTHING:
+                chosen[role] = wishes[role]
+            continue
+        names = [topic.name for topic in bag.topics if role_of(topic) == role and topic.count]
+        if len(names) == 1:
+            chosen[role] = names[0]
+        elif names:
+            remarks.append(f"none of {', '.join(names)} is used as {role}; choose with --topic {role}={names[0]}")
+    return chosen, remarks

@@ -1,0 +1,105 @@
+"""Encodings of pictures, against values worked out by hand or by OpenCV's inverse."""
+
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+
+from edgeslam_torch.errors import SourceError
+from edgeslam_torch.readers.bags.pictures import PictureDecoder, depth_format
+
+RED, GREEN, BLUE = (0, 0, 255), (0, 255, 0), (255, 0, 0)
+
+
+def _message(encoding, data, width, height, step=0, big=0):
+    data = np.frombuffer(bytes(data), np.uint8)
+    return SimpleNamespace(encoding=encoding, width=width, height=height, step=step, is_bigendian=big, data=data)
+
+
+def _read(*args, **kwargs):
+    return PictureDecoder("a.bag:/x").decode(_message(*args, **kwargs))
+
+
+@pytest.mark.parametrize(
+    ("encoding", "data"),
+    [
+        ("rgb8", (255, 0, 0)),
+        ("bgr8", (0, 0, 255)),
+        ("8UC3", (0, 0, 255)),
+        ("rgba8", (255, 0, 0, 9)),
+        ("bgra8", (0, 0, 255, 9)),
+    ],
+)
+def test_one_red_pixel(encoding, data):
+    assert _read(encoding, data, 1, 1)[0, 0].tolist() == list(RED)
+
+
+def test_grey_rows_lose_their_padding():
+    for encoding in ("mono8", "8UC1"):
+        assert _read(encoding, [1, 2, 99, 3, 4, 99], 2, 2, step=3).tolist() == [[1, 2], [3, 4]]
+        assert _read(encoding, [1, 2, 99, 3, 4], 2, 2, step=3).tolist() == [[1, 2], [3, 4]]  # last row cut short
+
+
+def test_twelve_bits_in_sixteen_of_both_byte_orders_keep_their_range():
+    values = np.array([[0, 16, 4095, 2048]], np.uint16)
+    for order, big in (("<u2", 0), (">u2", 1)):
+        assert _read("mono16", values.astype(order).tobytes(), 4, 1, big=big).tolist() == [[0, 1, 255, 128]]
+
+
+def test_the_first_picture_sets_the_range_of_all():
+    decoder = PictureDecoder("x")
+    bright, dark = (np.full((2, 2), value, "<u2").tobytes() for value in (65535, 255))
+    assert decoder.decode(_message("mono16", bright, 2, 2)).max() == 255
+    assert decoder.decode(_message("mono16", dark, 2, 2)).max() == 0
+
+
+@pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
+@pytest.mark.parametrize("colour", [RED, GREEN, BLUE])
+@pytest.mark.parametrize("bits", [8, 16])
+def test_bayer_patterns_give_the_colour_that_made_them(pattern, colour, bits):
+    # ROS names the 2x2 cell row by row; an even colour gives the same value at all cells of its channel.
+    channel = {"r": 2, "g": 1, "b": 0}
+    cell = np.array([colour[channel[c]] for c in pattern], np.uint16).reshape(2, 2)
+    mosaic = np.tile(cell, (4, 4))
+    data = mosaic.astype(np.uint8).tobytes() if bits == 8 else (mosaic * 257).astype("<u2").tobytes()
+    image = _read(f"bayer_{pattern}{bits}", data, 8, 8)
+    assert np.abs(image[2:-2, 2:-2].astype(int) - colour).max() <= 1
+
+
+def test_yuv_orders():
+    # BT.601 video range: red is Y 82, U 90, V 240.
+    for encoding, data in {
+        "yuv422": (90, 82, 240, 82),
+        "uyvy": (90, 82, 240, 82),
+        "yuv422_yuy2": (82, 90, 82, 240),
+        "yuyv": (82, 90, 82, 240),
+    }.items():
+        assert np.abs(_read(encoding, data, 2, 1).astype(int) - RED).max() <= 3, encoding
+
+
+def test_jpeg_and_png():
+    picture = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 256, (40, 60, 3), dtype=np.uint8), (0, 0), 4)
+    for suffix, most in ((".png", 0), (".jpg", 12)):
+        ok, data = cv2.imencode(suffix, picture)
+        assert ok
+        message = SimpleNamespace(format=f"bgr8; {suffix[1:]} compressed bgr8", data=data.ravel())
+        got = PictureDecoder("x").decode(message)
+        assert np.abs(got.astype(int) - picture).max() <= most
+
+
+def test_what_is_no_picture_is_refused_in_one_line():
+    for encoding in ("16UC1", "32FC1"):
+        assert depth_format(_message(encoding, [0] * 4, 1, 1)) == encoding
+        with pytest.raises(SourceError, match="depth maps"):
+            _read(encoding, [0] * 4, 1, 1)
+    with pytest.raises(SourceError, match="'nv12' is not supported; mono8"):
+        _read("nv12", [0] * 6, 2, 2)
+    with pytest.raises(SourceError, match="too few"):
+        _read("rgb8", [0] * 5, 1, 2)
+    with pytest.raises(SourceError, match="too few"):
+        _read("rgb8", [], 0, 0)
+    with pytest.raises(SourceError, match="million pixels"):
+        _read("mono8", [0], 10**6, 10**6)
+    with pytest.raises(SourceError, match="'h264' cannot be decoded"):
+        PictureDecoder("x").decode(SimpleNamespace(format="h264", data=np.zeros(20, np.uint8)))
