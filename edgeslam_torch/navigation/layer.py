@@ -1,0 +1,52 @@
+"""A level cut through free space, as planning uses it."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy import ndimage
+
+from edgeslam_torch.types import FloatArray
+
+
+@dataclass(frozen=True)
+class Layer:
+    """Free and solid cells at one height; what is neither was not seen."""
+
+    free: np.ndarray
+    """``(X, Y)`` bool."""
+    solid: np.ndarray
+    """``(X, Y)`` bool."""
+    corner_w: FloatArray
+    """``(2,)`` low corner of the first cell [m]."""
+    cell_m: float
+
+    @cached_property
+    def clearance_m(self) -> FloatArray:
+        """``(X, Y)`` distance of each free cell's centre to the border of what is not known to be free; 0 there."""
+        padded = np.pad(self.free, 1)
+        away = np.asarray(ndimage.distance_transform_edt(padded))[1:-1, 1:-1]
+        return np.maximum(away - 0.5, 0.0) * self.cell_m
+
+    @cached_property
+    def from_solid_m(self) -> FloatArray:
+        """``(X, Y)`` distance of each cell's centre to the border of the nearest solid cell."""
+        if not self.solid.any():
+            return np.full(self.solid.shape, np.inf)
+        return np.maximum(np.asarray(ndimage.distance_transform_edt(~self.solid)) - 0.5, 0.0) * self.cell_m
+
+    def cells(self, p_w: FloatArray) -> np.ndarray:
+        """Cells ``(..., 2)`` int of points ``(..., 2)``, clipped to the grid."""
+        index = np.floor((np.asarray(p_w) - self.corner_w) / self.cell_m).astype(int)
+        return np.clip(index, 0, np.array(self.free.shape) - 1)
+
+    def centres(self, cells: np.ndarray) -> FloatArray:
+        """Centres ``(..., 2)`` [m] of cells."""
+        return self.corner_w + (np.asarray(cells) + 0.5) * self.cell_m
+
+    def clearance_at(self, p_w: FloatArray) -> FloatArray:
+        """Clearance [m] at points ``(..., 2)``, interpolated between cells."""
+        at = (np.asarray(p_w) - self.corner_w) / self.cell_m - 0.5
+        flat = at.reshape(-1, 2).T
+        value = ndimage.map_coordinates(self.clearance_m, flat, order=1, mode="constant", cval=0.0)
+        return np.asarray(value).reshape(at.shape[:-1])

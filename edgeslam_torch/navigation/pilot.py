@@ -1,0 +1,214 @@
+"""Decides, at every moment, how to move towards a task through what is known to be free."""
+
+import math
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+
+from edgeslam_torch.geometry.rotations import wrapped
+from edgeslam_torch.navigation.arcs import Arcs, candidates
+from edgeslam_torch.navigation.layer import Layer
+from edgeslam_torch.navigation.limits import NavLimits
+from edgeslam_torch.navigation.route import CostToGo, cost_to_go
+from edgeslam_torch.navigation.sight import HOVER, Sight, Wish
+from edgeslam_torch.navigation.space import Space
+from edgeslam_torch.navigation.tasks import Task
+from edgeslam_torch.types import FloatArray
+
+BAND_M = 0.05
+"""Free height above and below the drone's hull."""
+TAKE_OFF_M = 0.5
+"""Radius that a person leaves free around a drone that takes off."""
+_LOOK_M = 0.25
+"""Rise above the height of flight from which a camera that is tilted down sees what is at that height before it."""
+_SWEEP_RAD = math.radians(45.0)
+"""Turn to each side there: a camera of 55 degrees does not see the sides of the way just before it."""
+_REPLAN_S = 0.5
+_AHEAD_M = 0.8
+"""Way ahead that the drone turns to."""
+_FACING_RAD = math.radians(30.0)
+"""Beyond it the drone turns before it flies: it does not fly where it does not look."""
+_SIDEWAYS = 0.3
+"""Share of the speed with which it moves where it does not look, through what it saw before."""
+_GAIN_M = 0.04
+"""Least progress of a movement, in metres of way."""
+_PATIENCE_S = 1.0
+"""Time in which a look must show a way; then it rises for another view."""
+_LOST_S = 15.0
+"""Time without progress after which the task is given up."""
+_WANTED_M = 0.45
+"""Clearance that is wanted where there is space for it."""
+
+
+class Phase(StrEnum):
+    """What the pilot is doing."""
+
+    RISING = "rising to look"
+    SWEEPING = "looking left and right"
+    SINKING = "sinking to the height of flight"
+    FLYING = "flying"
+    DONE = "done"
+    STUCK = "no way"
+
+
+@dataclass(slots=True)
+class Pilot:
+    """Flies one task at a time; a new task may be given at any moment."""
+
+    task: Task
+    limits: NavLimits = field(default_factory=NavLimits)
+    space: Space = field(default_factory=Space)
+    phase: Phase = Phase.RISING
+    layer: Layer | None = None
+    """The last layer, for pictures."""
+    way_w: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
+    """The last way, for pictures."""
+    _plan: CostToGo | None = None
+    _planned_s: float = -math.inf
+    _progress_s: float = math.nan
+    """When the cost to go was last less than ever."""
+    _least: float = math.inf
+    _waiting_s: float = math.nan
+    """Since when there is nothing to fly into."""
+    _sweep: list[float] = field(default_factory=list)
+    """Headings still to be looked at, last first."""
+
+    def begin(self, task: Task) -> None:
+        """Fly something else from now on."""
+        self.task, self.phase = task, Phase.FLYING
+        self._plan, self._planned_s = None, -math.inf
+        self._progress_s, self._least, self._waiting_s = math.nan, math.inf, math.nan
+
+    def update(self, sight: Sight) -> Wish:
+        """Take in what is seen, and decide.
+
+        Raises:
+            ValueError: If the position or the velocity is not finite.
+        """
+        if not (np.isfinite(sight.p_w).all() and np.isfinite(sight.velocity_w).all()):
+            raise ValueError("a pilot needs to know where the drone is, and how fast")
+        self._take_in(sight)
+        if self.phase in (Phase.RISING, Phase.SWEEPING, Phase.SINKING):
+            return self._level(sight)
+        if self.phase in (Phase.DONE, Phase.STUCK):
+            return self._at_height(sight, HOVER)
+        if self.task.done(sight):
+            self.phase = Phase.DONE
+            return self._at_height(sight, HOVER)
+        return self._at_height(sight, self._fly(sight))
+
+    def _take_in(self, sight: Sight) -> None:
+        if math.isnan(self._progress_s):
+            self._progress_s = sight.stamp_s
+            if self.phase is Phase.RISING:
+                for z in np.arange(0.1, self.limits.height_m + _LOOK_M, 0.2):
+                    self.space.flown(np.array([*sight.p_w[:2], z]), TAKE_OFF_M)
+        self.space.follow(sight.p_w)
+        if sight.view is not None:
+            self.space.observe(sight.view)
+        self.space.flown(sight.p_w, self.limits.radius_m + BAND_M)
+
+    def _level(self, sight: Sight) -> Wish:
+        """Rise above the height of flight, look left and right, and come back to it."""
+        low, high = self.limits.height_m, self.limits.height_m + _LOOK_M
+        if self.phase is Phase.RISING and sight.p_w[2] > high - 0.06:
+            self.phase = Phase.SWEEPING
+            self._sweep = [sight.yaw_rad + side * _SWEEP_RAD for side in (0.0, 1.0, -1.0)]
+        if self.phase is Phase.SWEEPING:
+            error = float(wrapped(np.array(self._sweep[-1] - sight.yaw_rad)))
+            if abs(error) < math.radians(8.0):
+                self._sweep.pop()
+            if self._sweep:
+                return Wish(0.0, 0.0, self._climb(high - sight.p_w[2]), self._turn(error), str(self.phase))
+            self.phase = Phase.SINKING
+        if self.phase is Phase.SINKING and sight.p_w[2] < low + 0.06:
+            self.phase, self._waiting_s = Phase.FLYING, math.nan
+        target = high if self.phase is Phase.RISING else low
+        return Wish(up_m_s=self._climb(target - sight.p_w[2]), why=str(self.phase))
+
+    def _turn(self, error_rad: float) -> float:
+        return float(np.clip(2.0 * error_rad, -self.limits.turn_rad_s, self.limits.turn_rad_s))
+
+    def _climb(self, error_m: float) -> float:
+        return float(np.clip(1.5 * error_m, -self.limits.climb_m_s, self.limits.climb_m_s))
+
+    def _at_height(self, sight: Sight, wish: Wish) -> Wish:
+        up = self._climb(self.limits.height_m - float(sight.p_w[2]))
+        return Wish(wish.forward_m_s, wish.left_m_s, up, wish.turn_left_rad_s, wish.why)
+
+    def _fly(self, sight: Sight) -> Wish:
+        plan = self._planned(sight)
+        here = sight.p_w[:2]
+        now = float(plan.at(here))
+        if now < self._least - 0.1:
+            self._least, self._progress_s = now, sight.stamp_s
+        elif sight.stamp_s - self._progress_s > _LOST_S:
+            self.phase = Phase.STUCK
+            return HOVER
+        if not math.isfinite(now):
+            return Wish(turn_left_rad_s=0.5 * self.limits.turn_rad_s, why="no way is known: look around")
+        self.way_w = plan.way(here, 3.0)
+        ahead = self._bearing(here)
+        error = float(wrapped(np.array(ahead - sight.yaw_rad)))
+        turn = self._turn(error)
+        chosen = self._chosen(sight, plan, ahead, error)
+        if chosen is None:
+            return self._look(sight, error, turn)
+        self._waiting_s = math.nan
+        c, s = math.cos(sight.yaw_rad), math.sin(sight.yaw_rad)
+        return Wish(c * chosen[0] + s * chosen[1], c * chosen[1] - s * chosen[0], 0.0, turn, "along the way")
+
+    def _planned(self, sight: Sight) -> CostToGo:
+        """The plan, made anew when it is half a second old."""
+        half = self.limits.radius_m + BAND_M
+        self.layer = self.space.layer(self.limits.height_m, half)
+        if self._plan is None or sight.stamp_s - self._planned_s >= _REPLAN_S:
+            goals = self.task.goals(self.layer, sight)
+            need = self.limits.clearance_m(sight.position_sigma_m)
+            self._plan = cost_to_go(self.layer, goals, need, self.layer.cells(sight.p_w[:2]))
+            self._planned_s = sight.stamp_s
+        return self._plan
+
+    def _bearing(self, here: FloatArray) -> float:
+        """Direction of the way, `_AHEAD_M` ahead."""
+        far = self.way_w[min(len(self.way_w) - 1, round(_AHEAD_M / 0.1))] - here
+        return math.atan2(far[1], far[0])
+
+    def _chosen(self, sight: Sight, plan: CostToGo, ahead: float, error: float) -> FloatArray | None:
+        """Velocity ``(2,)`` in the world of the best candidate; None when standing is as good."""
+        assert self.layer is not None
+        arcs = candidates(self.layer, sight.p_w[:2], sight.velocity_w[:2], ahead, self.limits, self.limits.speed_m_s)
+        need = self.limits.clearance_m(sight.position_sigma_m)
+        standing = float(arcs.clearance_m[0])
+        good = arcs.clearance_m >= need
+        if standing < need:  # too near already: away from it
+            good |= arcs.clearance_m >= standing - 1e-3
+        score = self._score(arcs, plan, sight.yaw_rad, error)
+        score[~good] = np.inf
+        best = int(np.argmin(score))
+        if best == 0 or not score[best] < score[0] - _GAIN_M:
+            return None
+        return arcs.velocity_w[best]
+
+    def _score(self, arcs: Arcs, plan: CostToGo, yaw_rad: float, error: float) -> FloatArray:
+        """Metres to go after each candidate, and what its lack of clearance is worth."""
+        score = np.asarray(plan.at(arcs.end_w), dtype=np.float64).copy()
+        score += 0.5 * np.clip(_WANTED_M - arcs.clearance_m, 0.0, None)
+        speed = np.linalg.norm(arcs.velocity_w, axis=1)
+        off = np.abs(wrapped(np.arctan2(arcs.velocity_w[:, 1], arcs.velocity_w[:, 0]) - yaw_rad))
+        unseen = (off > _FACING_RAD) & (speed > _SIDEWAYS * self.limits.speed_m_s + 1e-6)
+        turning = (abs(error) > _FACING_RAD) & (speed > _SIDEWAYS * self.limits.speed_m_s + 1e-6)
+        score[unseen | turning] = np.inf
+        return score
+
+    def _look(self, sight: Sight, error: float, turn: float) -> Wish:
+        """Turn to where the way goes; if that shows nothing, see it from higher."""
+        if abs(error) > math.radians(8.0):
+            self._waiting_s = math.nan
+            return Wish(turn_left_rad_s=turn, why="look along the way")
+        if math.isnan(self._waiting_s):
+            self._waiting_s = sight.stamp_s
+        elif sight.stamp_s - self._waiting_s > _PATIENCE_S:
+            self.phase, self._waiting_s = Phase.RISING, math.nan
+        return Wish(turn_left_rad_s=turn, why="wait for a view of the way")

@@ -1,0 +1,89 @@
+"""Ways to a goal: cost to go over a layer, optimistic about what was not seen."""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import dijkstra
+
+from edgeslam_torch.navigation.layer import Layer
+from edgeslam_torch.types import FloatArray
+
+_NEIGHBOURS = ((1, 0), (0, 1), (1, 1), (1, -1))
+_UNSEEN_COST = 1.6
+"""A metre that was not seen costs this much: a known way of less than that is taken instead."""
+_TIGHT_M, _TIGHT_COST = 0.45, 3.0
+"""Nearer than this to a solid, a metre costs up to so much more: the middle of a corridor is the shortest way."""
+
+
+@dataclass(frozen=True, slots=True)
+class CostToGo:
+    """Metres, weighted, from every cell to the nearest goal; infinite where there is no way."""
+
+    layer: Layer
+    cost: FloatArray
+    """``(X, Y)``."""
+
+    def at(self, p_w: FloatArray) -> FloatArray:
+        """Cost at points ``(..., 2)``."""
+        cells = self.layer.cells(p_w)
+        return np.asarray(self.cost[cells[..., 0], cells[..., 1]])
+
+    def way(self, p_w: FloatArray, length_m: float) -> FloatArray:
+        """The cheapest way from a point ``(2,)``, ``(N, 2)`` centres of cells, as far as ``length_m`` or the goal."""
+        here = self.layer.cells(p_w)
+        out = [self.layer.centres(here)]
+        steps = int(length_m / self.layer.cell_m)
+        for _ in range(steps):
+            low = np.maximum(here - 1, 0)
+            around = self.cost[low[0] : here[0] + 2, low[1] : here[1] + 2]
+            best = low + np.array(np.unravel_index(int(np.argmin(around)), around.shape))
+            if (best == here).all() or not np.isfinite(self.cost[tuple(best)]):
+                break
+            here = best
+            out.append(self.layer.centres(here))
+        return np.array(out)
+
+
+def cost_to_go(layer: Layer, goals: np.ndarray, clearance_m: float, here: np.ndarray) -> CostToGo:
+    """Cheapest way from everywhere to the goals (Dijkstra, from the goals).
+
+    Args:
+        layer: Free, solid and unseen cells.
+        goals: Cells ``(G, 2)``; those that are blocked lead nowhere.
+        clearance_m: Distance of the drone's centre from solids that a way must keep.
+        here: The drone's cell ``(2,)``; a way may begin nearer to a solid than that.
+    """
+    away = layer.from_solid_m
+    open_ = away > clearance_m - 0.5 * layer.cell_m
+    low = np.maximum(here - 2, 0)
+    open_[low[0] : here[0] + 3, low[1] : here[1] + 3] |= ~layer.solid[low[0] : here[0] + 3, low[1] : here[1] + 3]
+    tight = np.clip(1.0 - (away - clearance_m) / _TIGHT_M, 0.0, 1.0)
+    weight = np.where(layer.free, 1.0, _UNSEEN_COST) + _TIGHT_COST * tight
+    shape = layer.free.shape
+    first, second, length = _edges(shape)
+    flat, w = open_.ravel(), weight.ravel()
+    kept = flat[first] & flat[second]
+    a, b = first[kept], second[kept]
+    graph = csr_array((length[kept] * layer.cell_m * 0.5 * (w[a] + w[b]), (a, b)), shape=(flat.size, flat.size))
+    sources = np.unique(np.ravel_multi_index(tuple(np.asarray(goals).T), shape))
+    sources = sources[flat[sources]]
+    if len(sources) == 0:
+        return CostToGo(layer, np.full(shape, np.inf))
+    found = dijkstra(graph, directed=False, indices=sources, min_only=True)
+    return CostToGo(layer, np.asarray(found).reshape(shape))
+
+
+@lru_cache(maxsize=4)
+def _edges(shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, FloatArray]:
+    """Pairs of neighbouring cells, flat, and their distance in cells."""
+    index = np.arange(shape[0] * shape[1]).reshape(shape)
+    first, second, length = [], [], []
+    for di, dj in _NEIGHBOURS:
+        a = index[: shape[0] - di, max(0, -dj) : shape[1] - max(0, dj)]
+        b = index[di:, max(0, dj) : shape[1] + min(0, dj)]
+        first.append(a.ravel())
+        second.append(b.ravel())
+        length.append(np.full(a.size, float(np.hypot(di, dj))))
+    return np.concatenate(first), np.concatenate(second), np.concatenate(length)

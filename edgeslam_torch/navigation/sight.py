@@ -1,0 +1,84 @@
+"""What a pilot is told at each moment: where the drone is, and what it saw."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from edgeslam_torch.types import FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """A depth map, and where it was taken."""
+
+    stamp_s: float
+    depth_m: FloatArray
+    """``(H, W)`` z-depth [m]; NaN or at most 0 where unknown."""
+    sigma_log: FloatArray
+    """``(H, W)`` standard deviation of its logarithm."""
+    K: FloatArray
+    """``(3, 3)`` of a camera without distortion [px]."""
+    T_w_c: FloatArray
+    """``(4, 4)`` metric; in the drone's world: origin on the floor at power-on, x forward, y left, z up."""
+    keyframe: int = -1
+    """Keyframe of the map that it hangs on, whose correction moves it; -1 for none."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sight:
+    """The moment as a pilot knows it."""
+
+    stamp_s: float
+    p_w: FloatArray
+    """``(3,)`` position in the drone's world [m]."""
+    yaw_rad: float
+    velocity_w: FloatArray
+    """``(3,)`` [m/s]."""
+    position_sigma_m: float = 0.02
+    scale_sigma: float = 0.0
+    """Relative standard deviation of a metre."""
+    metric: bool = True
+    """Whether the unit is a metre at all."""
+    tracked: bool = True
+    """Whether the pose rests on a map."""
+    conflict: bool = False
+    """Whether sources of scale contradict each other."""
+    seen_s: float = math.nan
+    """When the newest picture that arrived was taken; NaN for now."""
+    battery: float = 1.0
+    view: View | None = None
+    """A new depth map, if there is one."""
+
+    @property
+    def blind_s(self) -> float:
+        """Age of the newest picture."""
+        return 0.0 if math.isnan(self.seen_s) else self.stamp_s - self.seen_s
+
+
+@dataclass(frozen=True, slots=True)
+class Wish:
+    """What the drone should do until the next moment, in its own level axes."""
+
+    forward_m_s: float = 0.0
+    left_m_s: float = 0.0
+    up_m_s: float = 0.0
+    turn_left_rad_s: float = 0.0
+    why: str = ""
+    """For the log and the live view."""
+
+    def sticks(self) -> tuple[float, float, float, float]:
+        """Right, forward, up, clockwise in [-1, 1], as a Tello reads them: 1 m/s and 100 degrees a second in full.
+
+        Example:
+            >>> Wish(forward_m_s=0.5, turn_left_rad_s=-0.5).sticks()
+            (-0.0, 0.5, 0.0, 0.286)
+        """
+        values = (-self.left_m_s, self.forward_m_s, self.up_m_s, -self.turn_left_rad_s / math.radians(100.0))
+        if not all(map(math.isfinite, values)):
+            raise ValueError(f"a wish must be finite: {self}")
+        right, forward, up, clockwise = (round(float(np.clip(v, -1.0, 1.0)), 3) for v in values)
+        return right, forward, up, clockwise
+
+
+HOVER = Wish(why="hover")

@@ -1,0 +1,211 @@
+"""Free space around a drone: a grid of log-odds that moves with it and bends with the map.
+
+What was never seen is not free. Depth frees a ray only as far as two of its sigmas before what it shows, since a wall
+that is seen too far away is the one that is hit.
+"""
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import cv2
+import numpy as np
+
+from edgeslam_torch.navigation.layer import Layer
+from edgeslam_torch.navigation.sight import View
+from edgeslam_torch.types import FloatArray
+
+CELL_M = 0.1
+SIDE = 160
+"""Cells across: 16 m, of which a drone that sees 5 m far uses what it needs to come home from next door."""
+LEVELS = 24
+"""Cells upwards, from the floor: 2.4 m."""
+REACH_M = 5.0
+"""Maximum depth that is used: small obstacles are a pixel beyond."""
+_MISS, _HIT = np.float32(-0.5), np.float32(1.2)
+"""Log-odds of a cell that a ray passed, that a ray ended in: one hit outweighs two misses."""
+_LIMIT = np.float32(4.0)
+FREE, SOLID = -0.8, 0.4
+"""Free after two misses; solid after one hit."""
+_FLOWN = np.float32(-4.0)
+_SHIFT = 20
+"""The grid moves in steps of this many cells."""
+_SIGMAS = 2.0
+_MIN_DEPTH_M = 0.15
+_KEPT = 120
+"""Views that are remembered to rebuild the grid from when the map moves."""
+_SMALL = (80, 60)
+"""Size at which depth is used [px], the nearest of the pixels that fall together: 7 cm at `REACH_M`."""
+
+
+@dataclass(slots=True)
+class Space:
+    """The grid.
+
+    Args:
+        centre_w: Where it is at first ``(2,)`` [m].
+        floor_m: Height of its lowest face.
+    """
+
+    centre_w: FloatArray = field(default_factory=lambda: np.zeros(2))
+    floor_m: float = 0.0
+    _odds: FloatArray = field(init=False)
+    """``(SIDE, SIDE, LEVELS)`` log-odds of being solid."""
+    _corner: np.ndarray = field(init=False)
+    """``(2,)`` int, cell of the world at its corner."""
+    _views: deque[View] = field(init=False)
+    _flown: deque[tuple[FloatArray, float]] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._odds = np.zeros((SIDE, SIDE, LEVELS), np.float32)
+        self._corner = np.floor(self.centre_w / CELL_M).astype(int) - SIDE // 2
+        self._views = deque(maxlen=_KEPT)
+        self._flown = deque(maxlen=4000)
+
+    def observe(self, view: View) -> None:
+        """Carve and fill by a depth map."""
+        self._views.append(_smaller(view))
+        self._add(self._views[-1])
+
+    def flown(self, p_w: FloatArray, radius_m: float) -> None:
+        """What the drone has flown through is free: a sphere around ``(3,)``, of the drone's radius or, at take-off,
+        of what a person left free around it."""
+        self._flown.append((np.array(p_w, dtype=np.float64), radius_m))
+        self._clear(p_w, radius_m)
+
+    def follow(self, p_w: FloatArray) -> None:
+        """Move the grid when the drone ``(3,)`` comes near its border; what falls off is forgotten."""
+        wanted = np.floor(np.asarray(p_w[:2]) / CELL_M).astype(int) - SIDE // 2
+        step = ((wanted - self._corner) / _SHIFT).astype(int) * _SHIFT
+        if not step.any():
+            return
+        moved = np.zeros_like(self._odds)
+        old = [slice(max(0, s), min(SIDE, SIDE + s)) for s in step]
+        new = [slice(max(0, -s), min(SIDE, SIDE - s)) for s in step]
+        if all(s.stop > s.start for s in old):
+            moved[new[0], new[1]] = self._odds[old[0], old[1]]
+        self._odds, self._corner = moved, self._corner + step
+
+    def rebuild(self, pose: Callable[[View], FloatArray]) -> None:
+        """Build the grid anew after the map moved.
+
+        Args:
+            pose: The present ``T_w_c`` ``(4, 4)`` of a remembered view.
+        """
+        self._odds[:] = 0.0
+        for k, view in enumerate(self._views):
+            self._views[k] = replace(view, T_w_c=pose(view))
+            self._add(self._views[k])
+        for p_w, radius_m in self._flown:
+            self._clear(p_w, radius_m)
+
+    def layer(self, height_m: float, half_m: float) -> Layer:
+        """What a drone at a height can fly through, if everything within ``half_m`` above and below must be free."""
+        low = int(np.floor((height_m - half_m - self.floor_m) / CELL_M + 1e-6))
+        high = int(np.ceil((height_m + half_m - self.floor_m) / CELL_M - 1e-6))
+        if low < 0 or high > LEVELS:
+            raise ValueError(f"a height of {height_m:.2f} m is outside the grid of {LEVELS * CELL_M:.1f} m")
+        band = self._odds[:, :, low:high]
+        return Layer(np.asarray((band < FREE).all(2)), np.asarray((band > SOLID).any(2)), self._corner * CELL_M, CELL_M)
+
+    def _add(self, view: View) -> None:
+        depth = np.where(np.isfinite(view.depth_m) & (view.depth_m > 0), view.depth_m, 0.0).astype(np.float32)
+        self._carve(view, depth)
+        self._fill(view, depth)
+
+    def _carve(self, view: View, depth: FloatArray) -> None:
+        """Free the cells that lie wholly before everything that their pixels show."""
+        height, width = depth.shape
+        index, p_c = self._cells_before(view, height, width)
+        if len(index) == 0:
+            return
+        z = p_c[:, 2]
+        u, v = ((view.K[k, k] * p_c[:, k] / z + view.K[k, 2]) for k in (0, 1))
+        sure = depth * np.exp(-_SIGMAS * view.sigma_log.astype(np.float32))
+        # A cell covers several pixels: the nearest of them counts, from a pyramid of minima.
+        half_px = 0.5 * CELL_M * view.K[0, 0] / z
+        level = np.clip(np.ceil(np.log2(np.maximum(half_px, 1.0))), 0, 5).astype(int)
+        nearest = np.zeros(len(z), np.float32)
+        for k in range(int(level.max()) + 1):
+            size = 2 * 2**k + 1
+            least = cv2.erode(sure, np.ones((size, size), np.uint8)) if k else sure
+            mine = level == k
+            row = np.clip(np.rint(v[mine]), 0, height - 1).astype(int)
+            column = np.clip(np.rint(u[mine]), 0, width - 1).astype(int)
+            nearest[mine] = least[row, column]
+        inside = (u > -0.5) & (u < width - 0.5) & (v > -0.5) & (v < height - 0.5)
+        passed = index[inside & (z + 0.5 * CELL_M < nearest)]
+        odds = self._odds.reshape(-1)
+        odds[passed] = np.maximum(odds[passed] + _MISS, -_LIMIT)
+
+    def _cells_before(self, view: View, height: int, width: int) -> tuple[np.ndarray, FloatArray]:
+        """Cells in the camera's field of view: flat index ``(N,)`` and centre in its axes ``(N, 3)``."""
+        T = view.T_w_c
+        reach = int(np.ceil(REACH_M / CELL_M))
+        here = np.floor(T[:2, 3] / CELL_M).astype(int) - self._corner
+        low, high = np.maximum(here - reach, 0), np.minimum(here + reach + 1, SIDE)
+        if (low >= high).any():
+            return np.zeros(0, int), np.zeros((0, 3))
+        i, j = np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1]), indexing="ij")
+        x = (i + self._corner[0] + 0.5) * CELL_M - T[0, 3]
+        y = (j + self._corner[1] + 0.5) * CELL_M - T[1, 3]
+        ahead = T[:2, 2] / max(float(np.linalg.norm(T[:2, 2])), 1e-6)
+        along, across = x * ahead[0] + y * ahead[1], np.abs(y * ahead[0] - x * ahead[1])
+        widest = max(view.K[0, 2], width - view.K[0, 2]) / view.K[0, 0]
+        seen = (along > 0) & (across < 1.15 * widest * along + CELL_M) & (along < REACH_M)
+        i, j, x, y = i[seen], j[seen], x[seen], y[seen]
+        z = (np.arange(LEVELS) + 0.5) * CELL_M + self.floor_m - T[2, 3]
+        level = np.stack([x, y], axis=1).astype(np.float32) @ T[:2, :3].astype(np.float32)
+        p_c = level[:, None, :] + z.astype(np.float32)[:, None] * T[2, :3].astype(np.float32)
+        highest = np.maximum(view.K[1, 2], height - view.K[1, 2]) / view.K[1, 1]
+        front = (p_c[..., 2] > _MIN_DEPTH_M) & (np.abs(p_c[..., 1]) < highest * p_c[..., 2])
+        index = (i * SIDE + j)[:, None] * LEVELS + np.arange(LEVELS)
+        return index[front], p_c[front]
+
+    def _fill(self, view: View, depth: FloatArray) -> None:
+        """Mark the cells in which rays end."""
+        height, width = depth.shape
+        v, u = np.nonzero((depth > _MIN_DEPTH_M) & (depth < REACH_M))
+        z = depth[v, u]
+        rays = np.stack([(u - view.K[0, 2]) / view.K[0, 0], (v - view.K[1, 2]) / view.K[1, 1], np.ones(len(u))], 1)
+        p = (z[:, None] * rays) @ view.T_w_c[:3, :3].T + view.T_w_c[:3, 3]
+        self._mark(p)
+
+    def points(self, p_w: FloatArray) -> None:
+        """Mark points of surfaces ``(N, 3)`` [m], such as edges and anchors, as solid."""
+        self._mark(np.asarray(p_w, dtype=np.float64))
+
+    def _mark(self, p_w: FloatArray) -> None:
+        cell = np.floor(p_w / CELL_M).astype(int)
+        cell[:, 2] = np.floor((p_w[:, 2] - self.floor_m) / CELL_M).astype(int)
+        cell[:, :2] -= self._corner
+        inside = ((cell >= 0) & (cell < [SIDE, SIDE, LEVELS])).all(1)
+        index = np.unique(np.ravel_multi_index(tuple(cell[inside].T), self._odds.shape))
+        odds = self._odds.reshape(-1)
+        odds[index] = np.minimum(np.maximum(odds[index], _MISS) + _HIT, _LIMIT)
+
+    def _clear(self, p_w: FloatArray, radius_m: float) -> None:
+        offset = np.array([*self._corner * CELL_M, self.floor_m])
+        low = np.maximum(np.floor((p_w - radius_m - offset) / CELL_M).astype(int), 0)
+        high = np.minimum(np.floor((p_w + radius_m - offset) / CELL_M).astype(int) + 1, [SIDE, SIDE, LEVELS])
+        if (low < high).all():
+            axes = [(np.arange(a, b) + 0.5) * CELL_M + o - x for a, b, o, x in zip(low, high, offset, p_w, strict=True)]
+            x, y, z = np.meshgrid(*axes, indexing="ij")
+            part = self._odds[low[0] : high[0], low[1] : high[1], low[2] : high[2]]
+            part[x * x + y * y + z * z < (radius_m + 0.5 * CELL_M) ** 2] = _FLOWN
+
+
+def _smaller(view: View) -> View:
+    """At the size at which it is remembered: the nearest of the pixels that fall together."""
+    height, width = view.depth_m.shape
+    step = max(1, -(-width // _SMALL[0]), -(-height // _SMALL[1]))
+    if step == 1:
+        return view
+    known = np.where(np.isfinite(view.depth_m) & (view.depth_m > 0), view.depth_m, 0.0).astype(np.float32)
+    rows, columns = height // step, width // step
+    blocks = known[: rows * step, : columns * step].reshape(rows, step, columns, step)
+    K = view.K.copy()
+    K[:2] /= step
+    K[:2, 2] += 0.5 / step - 0.5
+    sigma = view.sigma_log[: rows * step : step, : columns * step : step]
+    return replace(view, depth_m=blocks.min(axis=(1, 3)), sigma_log=sigma, K=K)

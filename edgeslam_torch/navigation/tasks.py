@@ -1,0 +1,77 @@
+"""What a flight is for: where to go next, and when it is done."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from scipy import ndimage
+
+from edgeslam_torch.navigation.layer import Layer
+from edgeslam_torch.navigation.sight import Sight
+from edgeslam_torch.types import FloatArray
+
+ARRIVED_M = 0.2
+_FRONTIER_M = 0.5
+"""Smaller borders of the unseen are gaps between rays, not places to go."""
+
+
+class Task(Protocol):
+    """One behaviour."""
+
+    def goals(self, layer: Layer, sight: Sight) -> np.ndarray:
+        """Cells ``(G, 2)`` worth going to; empty when there is nothing left to do."""
+
+    def done(self, sight: Sight) -> bool:
+        """Whether it is reached."""
+
+
+@dataclass(frozen=True, slots=True)
+class GoTo:
+    """Fly to a point."""
+
+    goal_w: FloatArray
+    """``(3,)`` in the drone's world [m]."""
+
+    def goals(self, layer: Layer, sight: Sight) -> np.ndarray:
+        """The goal's cell; where the grid ends, the last one towards it."""
+        low = layer.corner_w + layer.cell_m
+        high = layer.corner_w + (np.array(layer.free.shape) - 1) * layer.cell_m
+        step = self.goal_w[:2] - sight.p_w[:2]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            room = np.where(step > 0, (high - sight.p_w[:2]) / step, (low - sight.p_w[:2]) / step)
+        share = float(np.nanmin(np.where(step == 0, np.inf, room)))
+        return layer.cells(sight.p_w[:2] + min(1.0, share) * step)[None]
+
+    def done(self, sight: Sight) -> bool:
+        """Whether the drone is there, and slow."""
+        near = float(np.linalg.norm(sight.p_w[:2] - self.goal_w[:2])) < ARRIVED_M
+        return near and float(np.linalg.norm(sight.velocity_w)) < 0.15
+
+
+@dataclass(slots=True)
+class Explore:
+    """Fly to where the known free space ends, until it ends nowhere or time is over."""
+
+    until_s: float = np.inf
+    """On the clock of the sights."""
+
+    def goals(self, layer: Layer, sight: Sight) -> np.ndarray:
+        """Cells at the middle of each border between free and unseen."""
+        return frontiers(layer)
+
+    def done(self, sight: Sight) -> bool:
+        """Whether the time is over."""
+        return sight.stamp_s >= self.until_s
+
+
+def frontiers(layer: Layer) -> np.ndarray:
+    """One cell ``(F, 2)`` for each border between free and unseen that is wide enough to fly through."""
+    unseen = ~layer.free & ~layer.solid
+    border = layer.free & ndimage.binary_dilation(unseen) & (layer.from_solid_m > 0.3)
+    parts, count = ndimage.label(border, np.ones((3, 3)))
+    out = []
+    for part in range(1, count + 1):
+        cells = np.argwhere(parts == part)
+        if len(cells) * layer.cell_m >= _FRONTIER_M:
+            out.append(cells[int(np.argmin(((cells - cells.mean(0)) ** 2).sum(1)))])
+    return np.array(out, dtype=int).reshape(-1, 2)

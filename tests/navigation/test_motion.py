@@ -1,0 +1,140 @@
+"""Routes, candidate movements, and the pilot, against geometry and the emulated body."""
+
+import math
+
+import numpy as np
+import pytest
+
+from edgeslam_torch.drone.emulator.drone import DroneModel
+from edgeslam_torch.navigation.arcs import candidates, flown
+from edgeslam_torch.navigation.layer import Layer
+from edgeslam_torch.navigation.limits import NavLimits
+from edgeslam_torch.navigation.pilot import Phase, Pilot
+from edgeslam_torch.navigation.route import cost_to_go
+from edgeslam_torch.navigation.sight import Sight, Wish
+from edgeslam_torch.navigation.tasks import GoTo, frontiers
+
+
+def hall(size=60, wall=None, unseen=None):
+    """An open square of 6 m whose first cell is at the origin; ``wall`` and ``unseen`` are slices of cells."""
+    free, solid = np.ones((size, size), bool), np.zeros((size, size), bool)
+    for part, is_solid in ((wall, True), (unseen, False)):
+        if part is not None:
+            free[part], solid[part] = False, is_solid
+    return Layer(free, solid, np.zeros(2), 0.1)
+
+
+def test_the_way_goes_round_a_wall_with_its_clearance():
+    layer = hall(wall=(slice(29, 31), slice(0, 45)))
+    goal = layer.cells(np.array([[5.0, 1.0]]))
+    plan = cost_to_go(layer, goal, 0.3, layer.cells(np.array([1.0, 1.0])))
+    way = plan.way(np.array([1.0, 1.0]), 20.0)
+    assert way[-1] == pytest.approx([5.05, 1.05], abs=0.06)
+    passing = way[np.abs(way[:, 0] - 3.0) < 0.2]
+    assert passing[:, 1].min() > 4.5 + 0.25
+
+
+def test_unseen_ground_costs_more_than_a_known_detour_and_less_than_a_long_one():
+    layer = hall(unseen=(slice(20, 40), slice(20, 40)))
+    here, goal = np.array([1.0, 3.0]), layer.cells(np.array([[5.0, 3.0]]))
+    way = cost_to_go(layer, goal, 0.25, layer.cells(here)).way(here, 20.0)
+    cells = layer.cells(way)
+    assert (~layer.free[cells[:, 0], cells[:, 1]]).sum() <= 1  # it may cut a corner
+    walled = hall(wall=(slice(20, 40), slice(0, 12)), unseen=(slice(20, 40), slice(12, 60)))
+    assert np.isfinite(cost_to_go(walled, goal, 0.25, walled.cells(here)).at(here))
+
+
+def test_no_way_is_infinite():
+    layer = hall(wall=(slice(29, 31), slice(0, 60)))
+    plan = cost_to_go(layer, layer.cells(np.array([[5.0, 3.0]])), 0.25, np.array([10, 30]))
+    assert math.isinf(plan.at(np.array([1.0, 3.0])))
+
+
+def test_candidates_are_flown_as_the_emulated_drone_flies():
+    """The prediction of the way until it stands, against the body itself (which leans late)."""
+    limits = NavLimits(reaction_s=0.1)
+    drone = DroneModel()
+    drone.take_off()
+    for _ in range(500):
+        drone.step(0.01)
+    begin = drone.p_w[:2].copy()
+    predicted = flown(begin, np.zeros(2), np.array([[0.5, 0.0]]), limits)[0, -1]
+    drone.rc = (0.0, 0.5, 0.0, 0.0)
+    for _ in range(60):
+        drone.step(0.01)
+    drone.rc = (0.0, 0.0, 0.0, 0.0)
+    for _ in range(300):
+        drone.step(0.01)
+    assert drone.p_w[0] - begin[0] == pytest.approx(predicted[0] - begin[0], abs=0.03)
+
+
+def test_a_candidate_that_cannot_stop_before_the_unseen_has_no_clearance():
+    layer = hall(unseen=(slice(35, 60), slice(0, 60)))
+    fast = candidates(layer, np.array([3.0, 3.0]), np.array([0.5, 0.0]), 0.0, NavLimits(), 0.5)
+    forward = np.argmax(fast.velocity_w[:, 0])
+    back = np.argmin(fast.velocity_w[:, 0])
+    assert fast.clearance_m[forward] == 0.0
+    assert fast.clearance_m[back] > fast.clearance_m[0]
+
+
+def test_frontiers_are_where_the_known_ends():
+    layer = hall(unseen=(slice(40, 60), slice(0, 60)))
+    found = frontiers(layer)
+    assert found.tolist() == [[39, 29]] or found.tolist() == [[39, 30]]
+
+
+@pytest.mark.parametrize(
+    ("wish", "sticks"),
+    [
+        (Wish(forward_m_s=0.5), (0.0, 0.5, 0.0, 0.0)),
+        (Wish(left_m_s=0.5), (-0.5, 0.0, 0.0, 0.0)),
+        (Wish(up_m_s=0.2), (0.0, 0.0, 0.2, 0.0)),
+        (Wish(turn_left_rad_s=math.radians(50.0)), (0.0, 0.0, 0.0, -0.5)),
+        (Wish(forward_m_s=9.0), (0.0, 1.0, 0.0, 0.0)),
+    ],
+)
+def test_wishes_become_sticks(wish, sticks):
+    assert wish.sticks() == pytest.approx(sticks)
+
+
+def test_a_wish_that_is_no_number_is_refused():
+    with pytest.raises(ValueError, match="finite"):
+        Wish(forward_m_s=math.nan).sticks()
+
+
+def at(x, y, **fields):
+    return Sight(0.0, np.array([x, y, 1.15]), 0.0, np.zeros(3), **fields)
+
+
+def test_a_pilot_without_a_position_decides_nothing():
+    with pytest.raises(ValueError, match="where"):
+        Pilot(GoTo(np.array([1.0, 0.0, 1.0]))).update(at(math.nan, 0.0))
+
+
+def test_a_pilot_that_sees_nothing_does_not_leave_what_it_knows():
+    """For twenty seconds in the dark it never asks to move farther than the free place of its take-off."""
+    pilot = Pilot(GoTo(np.array([3.0, 0.0, 1.15])))
+    drone = DroneModel()
+    drone.take_off()
+    for _ in range(500):
+        drone.step(0.01)
+    for k in range(300):
+        now = Sight(k / 15, drone.p_w.copy(), drone.yaw, drone.velocity.copy())
+        right, forward, up, clockwise = pilot.update(now).sticks()
+        drone.rc = (right, forward, up, clockwise)
+        for _ in range(7):
+            drone.step(0.01)
+        assert np.hypot(*drone.p_w[:2]) < 0.5
+    assert pilot.phase is not Phase.DONE
+
+
+def test_a_goal_beyond_the_grid_is_aimed_at_from_its_border():
+    layer = hall()
+    (cell,) = GoTo(np.array([30.0, 3.0, 1.0])).goals(layer, at(3.0, 3.0))
+    assert cell.tolist() == [59, 30] or cell.tolist() == [58, 30]
+
+
+@pytest.mark.parametrize("wrong", [{"speed_m_s": 0.0}, {"height_m": 3.0}, {"fence_m": 0.0}, {"land_battery": 0.5}])
+def test_impossible_limits_are_refused(wrong):
+    with pytest.raises(ValueError):
+        NavLimits(**wrong)

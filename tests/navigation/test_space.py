@@ -1,0 +1,114 @@
+"""Free space from depth: what is before a wall, the wall, and what nobody has seen."""
+
+import numpy as np
+import pytest
+
+from edgeslam_torch.geometry.mount import camera_on_body
+from edgeslam_torch.navigation.sight import View
+from edgeslam_torch.navigation.space import Space
+
+K = np.array([[77.0, 0.0, 39.5], [0.0, 77.0, 29.5], [0.0, 0.0, 1.0]])
+
+
+def facing_a_wall(distance_m=2.0, sigma=0.01, x=0.0, yaw=0.0, height_m=1.15):
+    """A level camera that sees a wall across its optical axis."""
+    T = camera_on_body(0.0, 0.0)
+    turn = np.eye(4)
+    turn[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
+    T = turn @ T
+    T[:3, 3] = [x, 0.0, height_m]
+    depth = np.full((60, 80), distance_m, np.float32)
+    return View(0.0, depth, np.full((60, 80), sigma, np.float32), K, T)
+
+
+def seen(space, times=3, **view):
+    for _ in range(times):
+        space.observe(facing_a_wall(**view))
+    return space.layer(1.15, 0.15)
+
+
+def cell(layer, x, y):
+    i, j = layer.cells(np.array([x, y]))
+    return bool(layer.free[i, j]), bool(layer.solid[i, j])
+
+
+def test_nothing_is_free_before_it_was_seen():
+    assert not Space().layer(1.15, 0.15).free.any()
+
+
+def test_before_a_wall_is_free_in_it_solid_behind_it_unseen():
+    layer = seen(Space())
+    assert cell(layer, 1.55, 0.05) == (True, False)
+    assert cell(layer, 2.05, 0.05)[1] or cell(layer, 1.95, 0.05)[1]
+    assert cell(layer, 2.55, 0.05) == (False, False)
+    assert cell(layer, 1.0, 1.5) == (False, False)  # beside the field of view
+    assert cell(layer, -1.0, 0.05) == (False, False)  # behind the camera
+
+
+def test_depth_frees_only_two_sigmas_before_what_it_shows():
+    """A depth of 2 m within 20 % may be 1.34 m: nothing beyond that is free."""
+    layer = seen(Space(), sigma=0.2)
+    line = np.array([[x, 0.05] for x in np.arange(0.55, 2.0, 0.1)])
+    free = [cell(layer, *p)[0] for p in line]
+    farthest = line[np.flatnonzero(free).max(), 0]
+    assert 1.1 < farthest < 2.0 * np.exp(-0.4)
+
+
+def test_a_thin_thing_is_not_carved_away_by_what_is_behind_it():
+    space = Space()
+    view = facing_a_wall(4.0)
+    view.depth_m[:, 39:41] = 1.55  # a rod of two pixels: 4 cm
+    for _ in range(5):
+        space.observe(view)
+    layer = space.layer(1.15, 0.15)
+    assert cell(layer, 1.55, 0.0)[1] or cell(layer, 1.55, -0.05)[1]
+    assert not cell(layer, 3.0, 0.0)[0]
+
+
+def test_where_it_flew_is_free():
+    space = Space()
+    space.flown(np.array([0.5, 0.5, 1.15]), 0.2)
+    layer = space.layer(1.15, 0.05)
+    assert cell(layer, 0.5, 0.5)[0]
+    assert not cell(layer, 1.0, 0.5)[0]
+
+
+def test_it_bends_with_the_map():
+    space = Space()
+    seen(space)
+    space.rebuild(lambda view: facing_a_wall(x=1.0).T_w_c)
+    layer = space.layer(1.15, 0.15)
+    assert cell(layer, 2.55, 0.05) == (True, False)
+    assert cell(layer, 3.05, 0.05)[1] or cell(layer, 2.95, 0.05)[1]
+    assert not cell(layer, 0.55, 0.05)[0]
+
+
+def test_it_follows_the_drone_and_keeps_what_it_knows():
+    space = Space()
+    before = cell(seen(space), 1.55, 0.05)
+    space.follow(np.array([4.0, 0.0, 1.15]))
+    layer = space.layer(1.15, 0.15)
+    assert layer.corner_w[0] == pytest.approx(-8.0 + 4.0)
+    assert cell(layer, 1.55, 0.05) == before
+
+
+def test_points_of_the_map_are_solid():
+    space = Space()
+    seen(space)
+    space.points(np.array([[1.05, 0.05, 1.15]]))
+    layer = space.layer(1.15, 0.15)
+    assert cell(layer, 1.05, 0.05) == (False, True)
+
+
+def test_unknown_depth_teaches_nothing():
+    space = Space()
+    view = facing_a_wall()
+    view.depth_m[:] = np.nan
+    space.observe(view)
+    layer = space.layer(1.15, 0.15)
+    assert not layer.free.any() and not layer.solid.any()
+
+
+def test_heights_outside_the_grid_are_refused():
+    with pytest.raises(ValueError, match="outside"):
+        Space().layer(2.4, 0.2)
