@@ -24,6 +24,7 @@ COMMANDS = {
         "contribution of each loss: one table, one change at a time",
     ),
     "batch": ("edgeslam_torch.commands.batch", "run, evaluate and report many recordings, on all cores or a cluster"),
+    "data": ("edgeslam_torch.commands.data", "fetch published recordings from their authors, ready to run"),
     "report": ("edgeslam_torch.commands.report", "make the report page of a run"),
     "view": ("edgeslam_torch.commands.view", "open a run's report or viewer"),
     "depth": ("edgeslam_torch.commands.depth", "depth maps of images, folders or videos"),

@@ -5,23 +5,14 @@ download is stored beside the file and required of later ones (trust on first us
 """
 
 import hashlib
-import http.client
 import os
-import re
-import urllib.error
-import urllib.request
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
 
 from edgeslam_torch.errors import WeightsError
-from edgeslam_torch.files.atomic import write_text
+from edgeslam_torch.files.download import FAILURES, Progress, discard, fetch, reason_of, remembered
 from edgeslam_torch.models.record import DEFAULT_WEIGHTS
 from edgeslam_torch.models.weights_file import MAX_FILE_BYTES
-
-CHUNK = 1 << 16
-TIMEOUT_S = 30.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +76,7 @@ class Fetched:
 
 
 def download(
-    urls: tuple[str, ...], target: Path, sha256: str | None = None, progress: Callable[[int, int], None] | None = None
+    urls: tuple[str, ...], target: Path, sha256: str | None = None, progress: Progress | None = None
 ) -> Fetched:
     """Fetch from the first URL that answers, resuming a partial download.
 
@@ -105,16 +96,16 @@ def download(
         # One partial file per protocol: bytes received over http stay untrusted.
         part = target.with_name(f"{target.name}.{url.split(':')[0]}.part")
         try:
-            _fetch(url, part, progress)
+            fetch(url, part, MAX_FILE_BYTES, progress)
             break
-        except (http.client.HTTPException, OSError, ValueError) as error:
-            reasons.append(f"{url} ({_one_line(getattr(error, 'reason', error))})")
+        except FAILURES as error:
+            reasons.append(f"{url} ({reason_of(error)})")
     else:
         raise WeightsError(f"download failed: {'; '.join(reasons)}; what has come is kept, run it again to go on")
     found, before = _hash(part), remembered(target)
     expected = (sha256 or before or found).lower()
     if found != expected:
-        part.unlink()
+        discard(part)
         if sha256 is None:
             raise WeightsError(
                 f"{target.name}: the file at {url} has changed since it was first downloaded: its checksum is {found}, "
@@ -122,73 +113,8 @@ def download(
             )
         raise WeightsError(f"{target.name}: checksum is {found}, expected {expected}; the file was deleted")
     part.replace(target)
+    discard(part)
     return Fetched(found, url)
-
-
-def remembered(target: Path) -> str | None:
-    """Checksum of a file's first download; None if there was none."""
-    try:
-        words = _checksum_file(target).read_text("utf-8").split()
-    except (OSError, ValueError):
-        return None
-    return words[0].lower() if words and re.fullmatch("[0-9a-fA-F]{64}", words[0]) else None
-
-
-def remember(target: Path, sha256: str) -> Path:
-    """Store a checksum beside its file, in the format of ``sha256sum -c``.
-
-    Raises:
-        OSError: If the file cannot be written.
-    """
-    path = _checksum_file(target)
-    write_text(path, f"{sha256}  {target.name}\n")
-    return path
-
-
-def _checksum_file(target: Path) -> Path:
-    return target.with_name(f"{target.name}.sha256")
-
-
-def _one_line(reason: object) -> str:
-    return " ".join(str(reason).split())[:120] or type(reason).__name__
-
-
-class _KeepEncryption(urllib.request.HTTPRedirectHandler):
-    """Refuses redirects from https to other protocols."""
-
-    def redirect_request(
-        self, request: urllib.request.Request, file: IO[bytes], code: int, message: str, headers: Any, url: str
-    ) -> urllib.request.Request | None:
-        if request.type == "https" and not url.startswith("https:"):
-            raise urllib.error.URLError(f"leads from https to {url[:80]}")
-        return super().redirect_request(request, file, code, message, headers, url)
-
-
-def _fetch(url: str, part: Path, progress: Callable[[int, int], None] | None) -> None:
-    have = part.stat().st_size if part.is_file() else 0
-    request = urllib.request.Request(url, headers={"Range": f"bytes={have}-"} if have else {})
-    try:
-        response = urllib.request.build_opener(_KeepEncryption).open(request, timeout=TIMEOUT_S)
-    except urllib.error.HTTPError as error:
-        if error.code == 416 and have:  # the partial file was complete
-            return
-        raise
-    with response:
-        continued = response.status == 206
-        have = have if continued else 0
-        total = have + int(response.headers.get("Content-Length") or 0)
-        if total > MAX_FILE_BYTES:
-            raise ValueError(f"the server offers {total} bytes")
-        with part.open("ab" if continued else "wb") as file:
-            while chunk := response.read(CHUNK):
-                file.write(chunk)
-                have += len(chunk)
-                if have > MAX_FILE_BYTES:
-                    raise ValueError("the server sends without end")
-                if progress is not None:
-                    progress(have, total)
-        if total and have < total:
-            raise OSError(f"connection lost after {have} of {total} bytes")
 
 
 def _hash(path: Path) -> str:

@@ -54,7 +54,8 @@ def _list(_: argparse.Namespace) -> None:
 
 
 def _download(args: argparse.Namespace) -> None:
-    from edgeslam_torch.models.download import REMOTES, cache_folder, remember, remembered
+    from edgeslam_torch.files.download import remember, remembered
+    from edgeslam_torch.models.download import REMOTES, cache_folder
     from edgeslam_torch.models.onnx.presets import PRESETS, preset_file
 
     if args.name in PRESETS:

@@ -78,6 +78,8 @@ class BenchSettings:
 def find_sequences(data: Path | None, min_hz: float = _MIN_HZ) -> dict[str, Path]:
     """Recordings with ground truth and images at no less than a rate, by name; a camera's rate when none is given.
 
+    ``data`` itself, its folders and theirs are looked at.
+
     Raises:
         EvaluationError: If ``data`` is given but is no folder.
     """
@@ -85,8 +87,12 @@ def find_sequences(data: Path | None, min_hz: float = _MIN_HZ) -> dict[str, Path
         return {}
     if not data.is_dir():
         raise EvaluationError(f"{data}: no such folder of recordings (--data or EDGESLAM_DATA)")
-    found = {}
-    for folder in [data, *sorted(p for p in data.iterdir() if p.is_dir())]:
+    found: dict[str, Path] = {}
+    folders = sorted(p for p in data.iterdir() if p.is_dir())
+    deeper = [p for folder in folders for p in sorted(folder.iterdir()) if p.is_dir()]
+    for folder in [data, *folders, *deeper]:
+        if folder.parent in found.values():  # a part of a recording
+            continue
         try:
             dataset = open_dataset(folder)
         except EdgeSlamError:

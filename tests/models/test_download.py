@@ -12,7 +12,8 @@ from pathlib import Path
 import pytest
 
 from edgeslam_torch.errors import WeightsError
-from edgeslam_torch.models.download import REMOTES, _KeepEncryption, cache_folder, download, remember, remembered
+from edgeslam_torch.files.download import KeepEncryption, remember, remembered
+from edgeslam_torch.models.download import REMOTES, cache_folder, download
 
 CONTENT = bytes(range(256)) * 700
 
@@ -129,7 +130,7 @@ def test_a_kept_checksum_that_is_none_counts_as_none(tmp_path: Path, content: by
 
 
 def test_https_is_not_left_by_a_redirect() -> None:
-    handler, body = _KeepEncryption(), io.BytesIO()
+    handler, body = KeepEncryption(), io.BytesIO()
     for start, end, allowed in (
         ("https://a/x", "https://b/x", True),
         ("https://a/x", "http://a/x", False),

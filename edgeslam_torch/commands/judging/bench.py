@@ -21,6 +21,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--sequence", action="append", default=[], metavar="NAME", help="only this one; may be repeated"
     )
+    parser.add_argument(
+        "--get",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="fetch this published recording first, and run only such; may be repeated ('readme': those of the README)",
+    )
+    parser.add_argument("--agree", action="store_true", help="agree to the licences of --get, which are printed")
     parser.add_argument("--max-frames", type=int, metavar="N", help="stop every run after N frames")
     parser.add_argument("--mode", choices=("offline", "realtime"), default="offline")
     parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="change one setting")
@@ -50,6 +58,9 @@ def main(args: argparse.Namespace) -> int:
         print(bench_compare.markdown_compare(before, after))
         return 0
     data = args.data or (Path(os.environ["EDGESLAM_DATA"]) if os.environ.get("EDGESLAM_DATA") else None)
+    if args.get:
+        data, fetched = _fetched(args)
+        args.sequence += fetched
     settings = benchmark.BenchSettings(
         data=data,
         seeds=tuple(range(max(1, args.seeds))),
@@ -76,6 +87,15 @@ def main(args: argparse.Namespace) -> int:
     print(text)
     print(f"results: {out / 'bench.json'}")
     return 1 if any(run["error"] for run in record["runs"]) else 0
+
+
+def _fetched(args: argparse.Namespace) -> tuple[Path, list[str]]:
+    """Folder of published recordings, and the names that the benchmark has for those of ``--get``."""
+    from edgeslam_torch.commands.data import fetch, recordings_folder
+    from edgeslam_torch.eval.inputs.dataset import open_dataset
+
+    root = recordings_folder(args.data)
+    return root, [open_dataset(root / recording.name).name for recording in fetch(args.get, root, args.agree)]
 
 
 def _networks(settings: "BenchSettings", args: argparse.Namespace, out: Path) -> int:

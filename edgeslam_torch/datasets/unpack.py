@@ -1,0 +1,176 @@
+"""Archives unpacked as if their authors were hostile: nothing leaves the folder, no links, a bounded size."""
+
+import shutil
+import tarfile
+import zipfile
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import IO
+
+from edgeslam_torch.errors import SourceError
+
+MAX_FILES = 200_000
+"""Of one archive; EuRoC's longest sequence has 15 000."""
+MAX_GROWTH = 20
+"""Unpacked size over the archive's; recordings of PNG images grow by less than 1.1, their lists by 5."""
+_JUNK = ("__MACOSX", ".DS_Store", "Thumbs.db")
+_ARCHIVES = (".zip", ".tgz", ".tar.gz", ".tar")
+
+
+@dataclass(frozen=True, slots=True)
+class _Member:
+    """A regular file in an archive."""
+
+    parts: tuple[str, ...]
+    size: int
+    handle: zipfile.ZipInfo | tarfile.TarInfo
+
+
+def unpack(archive: Path, inside: str, folder: Path) -> int:
+    """Unpack a part of an archive into an empty folder.
+
+    Args:
+        archive: ``.zip``, ``.tgz``, ``.tar.gz`` or ``.tar``.
+        inside: A folder in it, whose own name is left out, or an archive in it; everything when empty. An archive
+            inside is unpacked in turn; one folder that holds everything is left out.
+        folder: Where to.
+
+    Returns:
+        Number of files.
+
+    Raises:
+        SourceError: If it is damaged, hostile, or has no such part.
+        OSError: If the disk is full.
+    """
+    if not inside.endswith(_ARCHIVES):
+        return _unpack(archive, inside, folder)
+    nested = folder.with_name(f"{folder.name}.{PurePosixPath(inside).name}")
+    try:
+        nested.unlink(missing_ok=True)
+        with _opened(archive) as (members, read):
+            member = next((m for m in members if "/".join(m.parts) == inside), None)
+            if member is None:
+                raise SourceError(f"{archive}: has no {inside}")
+            _copy(read(member), nested, member.size, archive)
+        return _unpack(nested, "", folder)
+    finally:
+        nested.unlink(missing_ok=True)
+
+
+def member_ending(archive: Path, ending: str) -> bytes:
+    """Content of the only file whose path ends so.
+
+    Raises:
+        SourceError: If the archive is damaged, or has none or several.
+    """
+    wanted = PurePosixPath(ending).parts
+    with _opened(archive) as (members, read):
+        found = [m for m in members if m.parts[-len(wanted) :] == wanted]
+        if len(found) != 1:
+            raise SourceError(f"{archive}: has {len(found)} files {ending}, not one")
+        if found[0].size > 64 << 20:
+            raise SourceError(f"{archive}: {ending} has {found[0].size} bytes")
+        return read(found[0]).read()
+
+
+def _unpack(archive: Path, inside: str, folder: Path) -> int:
+    with _opened(archive) as (members, read):
+        prefix = PurePosixPath(inside).parts if inside else _common_folder(members)
+        chosen = [m for m in members if m.parts[: len(prefix)] == prefix and len(m.parts) > len(prefix)]
+        if not chosen:
+            raise SourceError(f"{archive}: has no {inside or 'files'}")
+        made: set[Path] = set()
+        for member in chosen:
+            target = folder.joinpath(*member.parts[len(prefix) :])
+            if target in made:
+                raise SourceError(f"{archive}: has {'/'.join(member.parts)} twice")
+            made.add(target)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            _copy(read(member), target, member.size, archive)
+    return len(chosen)
+
+
+def _common_folder(members: list[_Member]) -> tuple[str, ...]:
+    """The folder that holds everything, if there is one."""
+    first = {m.parts[0] for m in members}
+    return (first.pop(),) if len(first) == 1 and all(len(m.parts) > 1 for m in members) else ()
+
+
+def _copy(source: IO[bytes], target: Path, size: int, archive: Path) -> None:
+    """Copy no more than the size stated before: what the limits were checked with."""
+    with source, target.open("xb") as file:
+        left = size
+        while left and (chunk := source.read(min(left, 1 << 20))):
+            file.write(chunk)
+            left -= len(chunk)
+        if left or source.read(1):
+            raise SourceError(f"{archive}: damaged: {target.name} is not as long as it says")
+
+
+class _Reader:
+    """Reads members of an open archive."""
+
+    def __init__(self, archive: zipfile.ZipFile | tarfile.TarFile) -> None:
+        self._archive = archive
+
+    def __call__(self, member: _Member) -> IO[bytes]:
+        if isinstance(self._archive, zipfile.ZipFile):
+            assert isinstance(member.handle, zipfile.ZipInfo)
+            return self._archive.open(member.handle)
+        assert isinstance(member.handle, tarfile.TarInfo)
+        file = self._archive.extractfile(member.handle)
+        assert file is not None, "regular files have content"
+        return file
+
+
+@contextmanager
+def _opened(archive: Path) -> Iterator[tuple[list[_Member], _Reader]]:
+    """Checked members of an archive, and how to read them."""
+    try:
+        if zipfile.is_zipfile(archive):
+            with zipfile.ZipFile(archive) as opened:
+                yield _checked(archive, [_of_zip(archive, info) for info in opened.infolist()]), _Reader(opened)
+        else:
+            with tarfile.open(archive) as opened:
+                yield _checked(archive, [_of_tar(archive, info) for info in opened]), _Reader(opened)
+    except (zipfile.BadZipFile, tarfile.TarError, zlib.error, EOFError, RuntimeError, NotImplementedError) as error:
+        raise SourceError(f"{archive}: damaged, or no archive ({' '.join(str(error).split())[:120]})") from error
+
+
+def _of_zip(archive: Path, info: zipfile.ZipInfo) -> _Member | None:
+    kind = info.external_attr >> 28
+    if info.is_dir():
+        return None
+    if kind not in (0, 8):  # 8: a regular file, 10: a symbolic link
+        raise SourceError(f"{archive}: {info.filename[:80]!r} is a link or a device; nothing was unpacked")
+    return _Member(_parts(archive, info.filename), info.file_size, info)
+
+
+def _of_tar(archive: Path, info: tarfile.TarInfo) -> _Member | None:
+    if info.isdir():
+        return None
+    if not info.isreg():
+        raise SourceError(f"{archive}: {info.name[:80]!r} is a link or a device; nothing was unpacked")
+    return _Member(_parts(archive, info.name), info.size, info)
+
+
+def _parts(archive: Path, name: str) -> tuple[str, ...]:
+    """Folders and name of a member, which must lie below the place it is unpacked to."""
+    parts = tuple(part for part in name.split("/") if part not in ("", "."))
+    bad = name.startswith("/") or not parts or any(part == ".." or set(part) & set("\\:\0") for part in parts)
+    if bad:
+        raise SourceError(f"{archive}: {name[:80]!r} would lie outside the folder; nothing was unpacked")
+    return parts
+
+
+def _checked(archive: Path, members: list[_Member | None]) -> list[_Member]:
+    files = [m for m in members if m is not None and not any(part in _JUNK for part in m.parts)]
+    size, packed = sum(m.size for m in files), archive.stat().st_size
+    if len(files) > MAX_FILES or size > MAX_GROWTH * packed + (16 << 20):
+        raise SourceError(f"{archive}: would unpack to {len(files)} files of {size / 1e9:.1f} GB; that is no recording")
+    if size > shutil.disk_usage(archive.parent).free:
+        raise OSError(28, f"{size / 1e9:.1f} GB do not fit on the disk", str(archive.parent))
+    return files

@@ -1,0 +1,136 @@
+"""Downloads that go on where they broke off, and checksums remembered from the first time."""
+
+import http.client
+import re
+import shutil
+import urllib.error
+import urllib.request
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import IO, Any
+
+from edgeslam_torch import __version__
+from edgeslam_torch.files.atomic import write_text
+
+CHUNK = 1 << 16
+TIMEOUT_S = 30.0
+USER_AGENT = f"edgeslam-torch/{__version__}"
+"""Some repositories of universities refuse Python's own."""
+
+Progress = Callable[[int, int], None]
+"""Called with bytes so far and in total (0 if unknown)."""
+
+
+def fetch(url: str, part: Path, max_bytes: int, progress: Progress | None = None) -> None:
+    """Fetch into ``part``, going on behind what is there if the server still has the same file.
+
+    Args:
+        url: Http or https; https may not lead to anything else.
+        part: Grows; its ETag is kept beside it.
+        max_bytes: A server that offers or sends more is not heard.
+        progress: See `Progress`.
+
+    Raises:
+        OSError: If the connection cannot be made or breaks (`urllib.error.URLError` is one), or the disk is full.
+        http.client.HTTPException: If the answer is no HTTP.
+        ValueError: If the server sends too much, or another piece than was asked for.
+    """
+    have = part.stat().st_size if part.is_file() else 0
+    tag = _tag_file(part)
+    request = urllib.request.Request(url, headers={"User-Agent": USER_AGENT, "Accept-Encoding": "identity"})
+    if have:
+        request.add_header("Range", f"bytes={have}-")
+        with suppress(OSError):
+            request.add_header("If-Range", tag.read_text("ascii"))
+    try:
+        response = urllib.request.build_opener(KeepEncryption).open(request, timeout=TIMEOUT_S)
+    except urllib.error.HTTPError as error:
+        if error.code == 416 and have:  # the partial file was complete
+            return
+        raise
+    with response:
+        have = _continued_at(response, have)
+        total = have + int(response.headers.get("Content-Length") or 0)
+        if total > max_bytes:
+            raise ValueError(f"the server offers {total} bytes")
+        if shutil.disk_usage(part.parent).free < total - have:
+            raise OSError(f"the disk has no room for {total - have} bytes")
+        etag = response.headers.get("ETag", "")
+        if etag.startswith('"') and etag.isascii():  # weak ones do not promise the same bytes
+            tag.write_text(etag, "ascii")
+        with part.open("ab" if have else "wb") as file:
+            while chunk := response.read(CHUNK):
+                file.write(chunk)
+                have += len(chunk)
+                if have > max_bytes:
+                    raise ValueError("the server sends without end")
+                if progress is not None:
+                    progress(have, total)
+        if total and have < total:
+            raise OSError(f"connection lost after {have} of {total} bytes")
+
+
+def discard(part: Path) -> None:
+    """Forget a partial file."""
+    part.unlink(missing_ok=True)
+    _tag_file(part).unlink(missing_ok=True)
+
+
+def reason_of(error: BaseException) -> str:
+    """What went wrong with a download, in one short line."""
+    reason = getattr(error, "reason", error)
+    return " ".join(str(reason).split())[:120] or type(reason).__name__
+
+
+FAILURES = (http.client.HTTPException, OSError, ValueError)
+"""What `fetch` raises."""
+
+
+class KeepEncryption(urllib.request.HTTPRedirectHandler):
+    """Refuses redirects from https to other protocols."""
+
+    def redirect_request(
+        self, request: urllib.request.Request, file: IO[bytes], code: int, message: str, headers: Any, url: str
+    ) -> urllib.request.Request | None:
+        if request.type == "https" and not url.startswith("https:"):
+            raise urllib.error.URLError(f"leads from https to {url[:80]}")
+        return super().redirect_request(request, file, code, message, headers, url)
+
+
+def remembered(target: Path) -> str | None:
+    """SHA-256 of a file's first download; None if there was none."""
+    try:
+        words = _checksum_file(target).read_text("utf-8").split()
+    except (OSError, ValueError):
+        return None
+    return words[0].lower() if words and re.fullmatch("[0-9a-fA-F]{64}", words[0]) else None
+
+
+def remember(target: Path, sha256: str) -> Path:
+    """Store a checksum beside its file, in the format of ``sha256sum -c``.
+
+    Raises:
+        OSError: If the file cannot be written.
+    """
+    path = _checksum_file(target)
+    write_text(path, f"{sha256}  {target.name}\n")
+    return path
+
+
+def _continued_at(response: Any, have: int) -> int:
+    """Bytes that need not be sent again; 0 when the server begins anew."""
+    if response.status != 206:
+        return 0
+    stated = re.match(r"bytes (\d+)-", response.headers.get("Content-Range") or f"bytes {have}-")
+    if stated is None or int(stated[1]) != have:
+        raise ValueError(f"the server sends another piece than from byte {have} on")
+    return have
+
+
+def _checksum_file(target: Path) -> Path:
+    return target.with_name(f"{target.name}.sha256")
+
+
+def _tag_file(part: Path) -> Path:
+    return part.with_name(f"{part.name}.etag")

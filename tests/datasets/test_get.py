@@ -1,0 +1,331 @@
+"""``edgeslam data get`` from a publisher on this machine."""
+
+import hashlib
+import io
+import json
+import sys
+
+import numpy as np
+import pytest
+from published import png, tgz, zipped
+
+from edgeslam_torch.cli import main
+from edgeslam_torch.commands import data as command
+from edgeslam_torch.datasets import catalogue, store
+from edgeslam_torch.eval.benchmark import benchmark
+from edgeslam_torch.files.download import USER_AGENT
+from edgeslam_torch.readers.source import open_source
+
+pytest.importorskip("pooch", reason="needs the [data] extra: pooch is not installed")
+
+
+def tum(count=4, name="rgbd_dataset_freiburg1_xyz"):
+    """A recording as TUM publishes it."""
+    rgb = {f"{name}/rgb/{i}.png": png(i) for i in range(count)}
+    lists = {
+        f"{name}/rgb.txt": "".join(f"{i}.0 rgb/{i}.png\n" for i in range(count)).encode(),
+        f"{name}/groundtruth.txt": b"".join(b"%d 0 0 %d 0 0 0 1\n" % (i, i) for i in range(count)),
+    }
+    return tgz({**rgb, **lists})
+
+
+@pytest.fixture
+def shop(publisher, tmp_path, monkeypatch):
+    """Function that puts archives into a catalogue of its own."""
+
+    def stocked(*archives, layout="tum"):
+        text = '[sets]\n[[collection]]\nname = "Set"\npage = "https://x"\nlicence = "L"\nterms = "https://t"\n'
+        text += f'cite = "C"\nlayout = "{layout}"\n'
+        for fields in archives:
+            names = ", ".join(f'"{name}" = "{inside}"' for name, inside in fields.pop("sequences").items())
+            text += "[[collection.archive]]\n" + "".join(f"{k} = {json.dumps(v)}\n" for k, v in fields.items())
+            text += f"sequences = {{ {names} }}\n"
+        path = tmp_path / "catalogue.toml"
+        path.write_text(text)
+        read = catalogue.read_catalogue(path)
+        monkeypatch.setattr(catalogue, "catalogue", lambda: read)
+
+    return stocked
+
+
+@pytest.fixture
+def one(shop, publisher):
+    """Function that offers one recording ``tum_fr1_a`` of some content."""
+
+    def offered(content, **fields):
+        publisher.files["/a.tgz"] = content
+        urls = fields.pop("urls", [f"{publisher.address}/a.tgz"])
+        shop({"urls": urls, "sequences": {"tum_fr1_a": "rgbd_dataset_freiburg1_xyz"}, **fields})
+
+    return offered
+
+
+def get(tmp_path, *words):
+    return main(["data", "get", *words, "--to", str(tmp_path / "rec"), "--agree"])
+
+
+def sha256(content):
+    return hashlib.sha256(content).hexdigest()
+
+
+def test_recording_is_ready_to_run_and_says_where_it_comes_from(one, publisher, tmp_path, capsys):
+    content = tum()
+    one(content, bytes=len(content), checksum=f"sha256:{sha256(content)}", checksum_by="agreed")
+    assert get(tmp_path, "tum_fr1_a") == 0
+    said = capsys.readouterr().out
+    assert "Licence: L (https://t)" in said
+    assert "the checksum that independent projects recorded" in said
+    source = open_source(tmp_path / "rec" / "tum_fr1_a")
+    assert len(list(source.frames())) == 4
+    assert "freiburg1" in source.camera.source, "the folder's name tells the camera"
+    origin = json.loads((tmp_path / "rec" / "tum_fr1_a" / ".origin.json").read_text())
+    assert (origin["licence"], origin["sha256"]) == ("L", sha256(content))
+    assert [p.name for p in (tmp_path / "rec" / ".downloads").iterdir()] == ["a.tgz.sha256"], "the archive is gone"
+    assert publisher.agents == {USER_AGENT}, "some servers refuse Python's own"
+
+
+def test_second_call_asks_nobody(one, publisher, tmp_path, capsys):
+    one(tum())
+    assert get(tmp_path, "tum_fr1_a") == 0
+    publisher.requests.clear()
+    assert get(tmp_path, "tum_fr1_a") == 0
+    assert publisher.requests == []
+    assert "tum_fr1_a: is there" in capsys.readouterr().out
+
+
+def test_broken_download_goes_on_in_the_same_call(one, publisher, tmp_path):
+    content = tum()
+    one(content)
+    publisher.breaks["/a.tgz"] = 1000
+    assert get(tmp_path, "tum_fr1_a") == 0
+    assert publisher.requests == [("/a.tgz", ""), ("/a.tgz", "bytes=1000-")]
+
+
+def test_broken_download_goes_on_in_the_next_call(one, publisher, tmp_path, capsys):
+    one(tum())
+    publisher.breaks["/a.tgz"] = 1000
+    part = tmp_path / "rec" / ".downloads" / "a.tgz.http.part"
+    content, fetch = publisher.files["/a.tgz"], store.fetch
+
+    def vanish(url, part, most, progress):  # the publisher is gone after the first piece
+        try:
+            fetch(url, part, most, progress)
+        finally:
+            publisher.files.pop("/a.tgz", None)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(store, "fetch", vanish)
+        assert get(tmp_path, "tum_fr1_a") == 1
+    assert "the same command goes on" in capsys.readouterr().err
+    assert part.stat().st_size == 1000
+    assert not (tmp_path / "rec" / "tum_fr1_a").exists()
+    publisher.files["/a.tgz"] = content
+    publisher.requests.clear()
+    assert get(tmp_path, "tum_fr1_a") == 0
+    assert publisher.requests == [("/a.tgz", "bytes=1000-")]
+
+
+def test_file_that_changed_between_two_pieces_is_fetched_anew(one, publisher, tmp_path):
+    one(tum())
+    publisher.breaks["/a.tgz"] = 1000
+    fetch = store.fetch
+
+    def swap(url, part, most, progress):
+        try:
+            fetch(url, part, most, progress)
+        finally:
+            publisher.files["/a.tgz"] = tum(6)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(store, "fetch", swap)
+        assert get(tmp_path, "tum_fr1_a") == 0
+    assert len(list(open_source(tmp_path / "rec" / "tum_fr1_a").frames())) == 6
+
+
+def test_server_without_ranges_costs_the_whole_again(one, publisher, tmp_path):
+    one(tum())
+    publisher.has_ranges = False
+    publisher.breaks["/a.tgz"] = 1000
+    assert get(tmp_path, "tum_fr1_a") == 0
+
+
+@pytest.mark.parametrize("algorithm", ["sha256", "md5"])
+def test_wrong_checksum_leaves_nothing(one, tmp_path, capsys, algorithm):
+    wrong = f"{algorithm}:" + "0" * hashlib.new(algorithm).digest_size * 2
+    one(tum(), checksum=wrong, checksum_by="publisher")
+    assert get(tmp_path, "tum_fr1_a") == 1
+    error = capsys.readouterr().err.strip()
+    assert "not the file that it should be; it was deleted" in error
+    assert "\n" not in error
+    assert list((tmp_path / "rec" / ".downloads").iterdir()) == []
+
+
+def test_truncated_file_of_known_size_is_not_taken(one, tmp_path, capsys):
+    content = tum()
+    one(content[:-10], bytes=len(content))
+    assert get(tmp_path, "tum_fr1_a") == 1
+    assert f"has {len(content) - 10} bytes instead of {len(content)}" in capsys.readouterr().err
+
+
+def test_larger_file_than_stated_is_not_fetched(one, tmp_path, capsys):
+    content = tum()
+    one(content, bytes=len(content) - 1)
+    assert get(tmp_path, "tum_fr1_a") == 1
+    assert f"the server offers {len(content)} bytes" in capsys.readouterr().err
+
+
+def test_missing_file_is_named_with_a_way_out_and_the_next_address_is_tried(one, publisher, tmp_path, capsys):
+    one(tum(), urls=[f"{publisher.address}/gone.tgz"])
+    assert get(tmp_path, "tum_fr1_a") == 1
+    error = capsys.readouterr().err
+    assert "/gone.tgz (Not Found)" in error
+    assert "--archive FILE" in error
+    one(tum(), urls=[f"{publisher.address}/gone.tgz", f"{publisher.address}/a.tgz"])
+    assert get(tmp_path, "tum_fr1_a") == 0
+
+
+def test_redirect_is_followed(one, publisher, tmp_path):
+    one(tum(), urls=[f"{publisher.address}/old.tgz"])
+    publisher.redirects["/old.tgz"] = f"{publisher.address}/a.tgz"
+    assert get(tmp_path, "tum_fr1_a") == 0
+
+
+def test_first_download_is_trusted_and_a_changed_second_one_is_not(one, publisher, tmp_path, capsys):
+    one(tum())
+    assert get(tmp_path, "tum_fr1_a") == 0
+    assert "trusted on first use: no checksum is known, and it came unencrypted" in capsys.readouterr().out
+    target = tmp_path / "rec" / "tum_fr1_a"
+    target.rename(tmp_path / "rec" / "aside")
+    publisher.files["/a.tgz"] = tum(5)
+    assert get(tmp_path, "tum_fr1_a") == 1
+    assert "not the file that it should be" in capsys.readouterr().err
+    assert not target.exists()
+
+
+def test_archive_by_hand_is_checked_and_kept(one, tmp_path, capsys):
+    content = tum()
+    one(b"", checksum=f"sha256:{sha256(content)}", checksum_by="agreed")
+    archive = tmp_path / "mine.tgz"
+    archive.write_bytes(content)
+    assert get(tmp_path, "tum_fr1_a", "--archive", str(archive)) == 0
+    assert archive.exists()
+    (tmp_path / "rec" / "tum_fr1_a").rename(tmp_path / "rec" / "aside")
+    archive.write_bytes(tum(5))
+    assert get(tmp_path, "tum_fr1_a", "--archive", str(archive)) == 1
+    assert "expected" in capsys.readouterr().err
+    assert get(tmp_path, "tum_fr1_a", "--archive", str(tmp_path / "nowhere.tgz")) == 1
+
+
+def test_hostile_archive_leaves_nothing(one, tmp_path, capsys):
+    one(tgz({"rgbd_dataset_freiburg1_xyz/rgb.txt": b"1 a.png\n", "../../../evil": b"x"}))
+    assert get(tmp_path, "tum_fr1_a") == 1
+    assert "would lie outside" in capsys.readouterr().err
+    assert not (tmp_path / "rec" / "tum_fr1_a").exists()
+    assert not list(tmp_path.rglob("evil"))
+    assert not list(tmp_path.rglob("*.unpacking"))
+
+
+def test_archive_without_a_recording_is_refused(one, tmp_path, capsys):
+    one(tgz({"rgbd_dataset_freiburg1_xyz/readme": b"moved"}))
+    assert get(tmp_path, "tum_fr1_a") == 1
+    assert "has the publisher changed the archive?" in capsys.readouterr().err
+    assert not (tmp_path / "rec" / "tum_fr1_a").exists()
+
+
+def test_two_recordings_of_one_archive_are_one_download(shop, publisher, tmp_path):
+    def scene(number):
+        names = [f"frame-{i:06d}" for i in range(3)]
+        pose = "\n".join("\t".join(str(float(x)) for x in row) for row in np.eye(4)).encode()
+        files = {f"seq-{number:02d}/{n}.color.png": png(number) for n in names}
+        return zipped(files | {f"seq-{number:02d}/{n}.pose.txt": pose for n in names})
+
+    publisher.files["/k.zip"] = zipped({f"k/seq-{i:02d}.zip": scene(i) for i in (1, 2)})
+    names = {f"7scenes_k_{i}": f"k/seq-{i:02d}.zip" for i in (1, 2)}
+    shop({"urls": [f"{publisher.address}/k.zip"], "sequences": names}, layout="7scenes")
+    assert get(tmp_path, "7scenes_k_*") == 0
+    assert len(publisher.requests) == 1
+    for name in names:
+        assert open_source(tmp_path / "rec" / name).groundtruth is not None
+
+
+def test_truth_of_its_own_archive_is_joined(shop, publisher, tmp_path):
+    publisher.files["/i.tgz"] = tgz({f"mono/ME000/{i:06d}.png": png(i) for i in range(3)})
+    publisher.files["/t.zip"] = zipped({"gt/mono_gt/ME000.txt": b"0 0 0 0 0 0 1\n" * 3})
+    fields = {"urls": [f"{publisher.address}/i.tgz"], "truth": f"{publisher.address}/t.zip"}
+    shop({**fields, "sequences": {"tartanair_me000": "mono/ME000"}}, layout="tartanair")
+    assert get(tmp_path, "tartanair_me000") == 0
+    assert open_source(tmp_path / "rec" / "tartanair_me000").groundtruth is not None
+
+
+def test_disk_without_room_is_noticed_before_the_first_byte(one, publisher, tmp_path, capsys, monkeypatch):
+    one(tum(), bytes=10**18)
+    assert get(tmp_path, "tum_fr1_a") == 1
+    assert "of disk" in (said := capsys.readouterr()).out or "GB free" in said.err
+    assert publisher.requests == []
+
+
+def test_folder_of_something_else_is_not_touched(one, publisher, tmp_path, capsys):
+    one(tum())
+    mine = tmp_path / "rec" / "tum_fr1_a"
+    mine.mkdir(parents=True)
+    (mine / "notes").touch()
+    assert get(tmp_path, "tum_fr1_a") == 1
+    assert "was not fetched by 'edgeslam data get'" in capsys.readouterr().err
+    assert publisher.requests == []
+
+
+@pytest.mark.parametrize(("answer", "code"), [("y\n", 0), ("yes\n", 0), ("n\n", 1), ("\n", 1), ("", 1)])
+def test_licence_is_asked_for(one, publisher, tmp_path, monkeypatch, answer, code):
+    one(tum())
+
+    class Terminal:
+        def isatty(self):
+            return True
+
+        def readline(self):
+            return answer
+
+    monkeypatch.setattr(command.sys, "stdin", Terminal())
+    assert main(["data", "get", "tum_fr1_a", "--to", str(tmp_path / "rec")]) == code
+    assert bool(publisher.requests) == (code == 0)
+
+
+def test_script_without_consent_fetches_nothing(one, publisher, tmp_path, monkeypatch, capsys):
+    one(tum())
+    monkeypatch.setattr(command.sys, "stdin", io.StringIO())
+    assert main(["data", "get", "tum_fr1_a", "--to", str(tmp_path / "rec")]) == 1
+    assert "give --agree" in capsys.readouterr().err
+    assert publisher.requests == []
+
+
+def test_missing_pooch_is_named_with_its_extra(one, tmp_path, monkeypatch, capsys):
+    one(tum())
+    monkeypatch.setitem(sys.modules, "pooch", None)
+    assert get(tmp_path, "tum_fr1_a") == 1
+    assert "pip install 'edgeslam-torch[data]'" in capsys.readouterr().err
+
+
+def test_list_says_what_is_there(one, tmp_path, capsys):
+    one(tum(), bytes=450_000_000, doubt="it moved")
+    assert main(["data", "list", "--to", str(tmp_path / "rec")]) == 0
+    said = capsys.readouterr().out
+    assert "tum_fr1_a: 0.45 GB, no checksum known, address in doubt: it moved\n" in said
+    (tmp_path / "rec" / "tum_fr1_a").mkdir(parents=True)
+    (tmp_path / "rec" / "tum_fr1_a" / ".origin.json").touch()
+    main(["data", "list", "tum_*", "--to", str(tmp_path / "rec")])
+    assert "is there" in capsys.readouterr().out
+
+
+def test_benchmark_runs_on_what_it_fetched(one, tmp_path, monkeypatch):
+    one(tum(40))
+    seen = {}
+
+    def run_benchmark(settings, out, say):
+        seen.update(data=settings.data, only=settings.only, found=benchmark.find_sequences(settings.data, 0.5))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(benchmark, "run_benchmark", run_benchmark)
+    words = ["bench", "--get", "tum_fr1_a", "--agree", "--data", str(tmp_path / "rec"), "--out", str(tmp_path / "out")]
+    assert main(words) == 130
+    assert seen["only"] == ("tum_fr1_a",)
+    assert seen["found"] == {"tum_fr1_a": tmp_path / "rec" / "tum_fr1_a"}
