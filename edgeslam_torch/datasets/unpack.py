@@ -17,6 +17,8 @@ MAX_FILES = 200_000
 MAX_GROWTH = 20
 """Unpacked size over the archive's; recordings of PNG images grow by less than 1.1, their lists by 5."""
 _JUNK = ("__MACOSX", ".DS_Store", "Thumbs.db")
+_NOT_IN_NAMES = frozenset("\\:\0")
+"""Separators and drives of other systems."""
 _ARCHIVES = (".zip", ".tgz", ".tar.gz", ".tar")
 
 
@@ -160,7 +162,7 @@ def _of_tar(archive: Path, info: tarfile.TarInfo) -> _Member | None:
 def _parts(archive: Path, name: str) -> tuple[str, ...]:
     """Folders and name of a member, which must lie below the place it is unpacked to."""
     parts = tuple(part for part in name.split("/") if part not in ("", "."))
-    bad = name.startswith("/") or not parts or any(part == ".." or set(part) & set("\\:\0") for part in parts)
+    bad = name.startswith("/") or not parts or any(part == ".." or set(part) & _NOT_IN_NAMES for part in parts)
     if bad:
         raise SourceError(f"{archive}: {name[:80]!r} would lie outside the folder; nothing was unpacked")
     return parts

@@ -10,12 +10,11 @@ from contextlib import suppress
 from pathlib import Path
 from typing import IO, Any
 
-from edgeslam_torch import __version__
 from edgeslam_torch.files.atomic import write_text
 
 CHUNK = 1 << 16
 TIMEOUT_S = 30.0
-USER_AGENT = f"edgeslam-torch/{__version__}"
+USER_AGENT = "edgeslam-torch"
 """Some repositories of universities refuse Python's own."""
 
 Progress = Callable[[int, int], None]

@@ -218,13 +218,13 @@ def test_download_says_how_far_a_file_can_be_trusted(
     """First, again, changed: with a file in the server's place."""
     from edgeslam_torch.models import download as module
 
-    def fetch(url: str, part: Path, progress: object) -> None:
+    def fetch(url: str, part: Path, max_bytes: int, progress: object) -> None:
         part.write_bytes(content)
 
     torch.save(FastDepth(Variant.PRUNED).state_dict(), tmp_path / "plain.pth")
     content = (tmp_path / "plain.pth").read_bytes()
     monkeypatch.setenv("EDGESLAM_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(module, "_fetch", fetch)
+    monkeypatch.setattr(module, "fetch", fetch)
     name = "mobilenet-nnconv5dw-skipadd-pruned"
     run("weights", "download", name)
     assert "trusted on first use" in capsys.readouterr().out
@@ -239,7 +239,7 @@ def test_a_download_that_is_no_network_is_not_remembered(tmp_path: Path, monkeyp
     from edgeslam_torch.models import download as module
 
     monkeypatch.setenv("EDGESLAM_CACHE", str(tmp_path))
-    monkeypatch.setattr(module, "_fetch", lambda url, part, progress: part.write_bytes(b"<html>not found</html>"))
+    monkeypatch.setattr(module, "fetch", lambda url, part, *_: part.write_bytes(b"<html>not found</html>"))
     with pytest.raises(EdgeSlamError, match="checkpoint"):
         run("weights", "download", "mobilenet-nnconv5")
     assert not list(tmp_path.glob("*.sha256"))

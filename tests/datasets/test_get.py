@@ -10,8 +10,7 @@ import pytest
 from published import png, tgz, zipped
 
 from edgeslam_torch.cli import main
-from edgeslam_torch.commands import data as command
-from edgeslam_torch.datasets import catalogue, store
+from edgeslam_torch.datasets import catalogue, consent, store
 from edgeslam_torch.eval.benchmark import benchmark
 from edgeslam_torch.files.download import USER_AGENT
 from edgeslam_torch.readers.source import open_source
@@ -285,14 +284,14 @@ def test_licence_is_asked_for(one, publisher, tmp_path, monkeypatch, answer, cod
         def readline(self):
             return answer
 
-    monkeypatch.setattr(command.sys, "stdin", Terminal())
+    monkeypatch.setattr(consent.sys, "stdin", Terminal())
     assert main(["data", "get", "tum_fr1_a", "--to", str(tmp_path / "rec")]) == code
     assert bool(publisher.requests) == (code == 0)
 
 
 def test_script_without_consent_fetches_nothing(one, publisher, tmp_path, monkeypatch, capsys):
     one(tum())
-    monkeypatch.setattr(command.sys, "stdin", io.StringIO())
+    monkeypatch.setattr(consent.sys, "stdin", io.StringIO())
     assert main(["data", "get", "tum_fr1_a", "--to", str(tmp_path / "rec")]) == 1
     assert "give --agree" in capsys.readouterr().err
     assert publisher.requests == []

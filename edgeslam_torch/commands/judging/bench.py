@@ -91,11 +91,11 @@ def main(args: argparse.Namespace) -> int:
 
 def _fetched(args: argparse.Namespace) -> tuple[Path, list[str]]:
     """Folder of published recordings, and the names that the benchmark has for those of ``--get``."""
-    from edgeslam_torch.commands.data import fetch, recordings_folder
+    from edgeslam_torch.datasets.consent import fetch, recordings_folder
     from edgeslam_torch.eval.inputs.dataset import open_dataset
 
     root = recordings_folder(args.data)
-    return root, [open_dataset(root / recording.name).name for recording in fetch(args.get, root, args.agree)]
+    return root, [open_dataset(root / recording.name).name for recording in fetch(args.get, root, args.agree, print)]
 
 
 def _networks(settings: "BenchSettings", args: argparse.Namespace, out: Path) -> int:
