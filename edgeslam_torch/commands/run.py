@@ -3,6 +3,7 @@
 import argparse
 import os
 import sys
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -74,6 +75,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--viewer", action="store_true", help="watch it in rerun ([viewer] extra)")
     parser.add_argument("--save-rrd", type=Path, metavar="FILE", help="save the rerun recording to a file instead")
+    parser.add_argument(
+        "--save-mcap",
+        type=Path,
+        metavar="FILE",
+        help="save the run as ROS 2 messages, for Foxglove and RViz ([bags] extra)",
+    )
     parser.add_argument("--no-report", action="store_true", help="do not write the page report.html")
 
 
@@ -104,11 +111,18 @@ def main(args: argparse.Namespace) -> int:
     out = args.out if args.out is not None else Path("runs") / source.name
     show_bar = sys.stderr.isatty() if args.progress is None else args.progress
     listeners: list[Listener] = []
+    files = ExitStack()
     if args.viewer or args.save_rrd is not None:
         from edgeslam_torch.viewer.live_view import LiveView
 
         listeners.append(LiveView(source.name, source.camera, args.save_rrd))
-    with make_progress(source.length, show_bar) as progress:
+    if args.save_mcap is not None:
+        from edgeslam_torch.viewer.mcap_view import McapView
+
+        saved = McapView(source.camera, args.save_mcap)
+        listeners.append(saved)
+        files.callback(saved.close)
+    with files, make_progress(source.length, show_bar) as progress:
         atlas = AtlasFiles(earlier, args.save_atlas)
         result = run(source, out, config, mode, [progress, *listeners], atlas=atlas)
     if not args.no_report and result.failure is None:

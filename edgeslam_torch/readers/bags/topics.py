@@ -26,6 +26,8 @@ _MESSAGE_OF_THE_DRIVER = "FlightData"
 """tello_msgs/FlightData, in whichever package a driver defines it."""
 _NOTHING = "none"
 _COMPRESSED = "/compressed"
+_OURS = "/edgeslam/"
+"""Results of ``--save-mcap``: what a run found is no measurement for the next one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +45,8 @@ class Choice:
 
 def role_of(topic: Topic) -> str | None:
     """What a topic can be used as, by its type; None for anything else."""
+    if topic.name.startswith(_OURS):
+        return None
     if topic.kind.rpartition("/")[2] == _MESSAGE_OF_THE_DRIVER:
         return "tello"
     return _ROLES.get(topic.kind)
