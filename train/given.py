@@ -16,8 +16,12 @@ from edgeslam_torch.train.views.posed import PosedSequence
 
 HOOKS = "hooks"
 """Setting with the names of the user's hooks."""
-NOT_COMPARED = ("steps", "patience", "validate_every", "checkpoint_every", "warmup_steps", HOOKS)
-"""Settings of the length of training, which may differ; those of hooks that change losses are compared."""
+NOT_COMPARED = (
+    *("steps", "patience", "validate_every", "checkpoint_every", "warmup_steps", HOOKS),
+    *("device", "amp", "channels_last", "workers", "accumulate"),
+)
+"""Settings of the length of training, and of where it is computed, may differ; those of hooks that change losses are
+compared."""
 
 
 @dataclass(frozen=True, slots=True)

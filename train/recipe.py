@@ -23,7 +23,10 @@ from edgeslam_torch.files.atomic import write_atomically, write_text
 from edgeslam_torch.models.checkpoint import save_checkpoint
 from edgeslam_torch.models.fastdepth import FastDepth, Prediction
 from edgeslam_torch.models.record import Metadata
+from edgeslam_torch.train.processes.device import DEVICES, Arithmetic, arithmetic
 from edgeslam_torch.train.processes.distributed import add_up, by_first, everyones, rank, world
+from edgeslam_torch.train.processes.loading import drawn
+from edgeslam_torch.train.processes.shared_norm import share_norms
 from edgeslam_torch.train.signals import Signal, Slot
 
 logger = logging.getLogger(__name__)
@@ -32,6 +35,7 @@ LAST, BEST, FINAL, CURVE = "last.pt", "best.safetensors", "final.safetensors", "
 """Files of `train`: its whole state, the best validated and the last averaged weights, the validations."""
 MAX_BATCH = 1024
 """Images: tens of gigabytes."""
+MAX_WORKERS = 256
 NO_ROOM_M = (0.02, 90.0)
 """Plausible median depth; a network mostly outside of it has diverged."""
 
@@ -61,7 +65,7 @@ class TrainConfig:
     """conv0 ... conv(n-1) are not trained; 14 freezes the encoder."""
     freeze_norm: bool = False
     """Keep all batch-norm statistics (right for fine-tuning on little data); the encoder's are always
-    kept."""
+    kept. Those that learn see the images of all processes at once."""
     weight_decay: float = 1e-2
     warmup_steps: int = 100
     lr_end: float = 0.01
@@ -73,12 +77,19 @@ class TrainConfig:
     checkpoint_every: int = 250
     patience: int = 0
     """Validations without improvement before stopping; 0 never stops early."""
-    amp: bool = False
-    """bfloat16 autocast."""
+    amp: bool | None = False
+    """Autocast: bfloat16, on GPUs without it float16 with scaled gradients; None: on CUDA alone."""
     channels_last: bool = True
+    device: str = "cpu"
+    """``auto``, ``cpu``, ``cuda`` or ``mps``."""
+    workers: int = 0
+    """Processes that draw batches ahead; 0 draws between the steps."""
+    accumulate: int = 1
+    """Parts that a process learns its images of a step in, one after another, which takes less memory. The step is the
+    same, unless norms learn: each part has its own statistics."""
 
     def __post_init__(self) -> None:
-        for name in ("steps", "batch", "validate_every", "checkpoint_every"):
+        for name in ("steps", "batch", "validate_every", "checkpoint_every", "accumulate"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
         if self.batch > MAX_BATCH:
@@ -87,14 +98,20 @@ class TrainConfig:
             # Adam moves every weight by about this per step, and weights are about 0.05.
             if not 0.0 < getattr(self, name) <= 1.0:
                 raise ValueError(f"{name} must be above 0 and at most 1, got {getattr(self, name)}")
-        for name in ("seed", "patience", "warmup_steps", "frozen_stages"):
+        for name in ("seed", "patience", "warmup_steps", "frozen_stages", "workers"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name} must not be negative, got {getattr(self, name)}")
+        if self.workers > MAX_WORKERS:
+            raise ValueError(f"workers must be at most {MAX_WORKERS}, got {self.workers}")
+        if self.accumulate > self.batch:
+            raise ValueError(f"accumulate must be at most the batch, {self.batch}, got {self.accumulate}")
+        if self.device not in DEVICES:
+            raise ValueError(f"device must be one of {', '.join(DEVICES)}, got {self.device}")
 
 
 @dataclass
 class TrainState:
-    """Everything that changes during a run; a checkpoint holds all of it but the last two."""
+    """Everything that changes during a run; a checkpoint holds what a resume needs."""
 
     network: FastDepth
     averaged: FastDepth
@@ -109,8 +126,13 @@ class TrainState:
     """Some images of the last batch ``(B, 3, H, W)``."""
     whole: bool = True
     """False while a step changes the weights."""
+    statistics: dict[str, Tensor] = field(default_factory=dict)
+    """Buffers of norms that learn, as they were before the step that is under way: its forward pass changes them."""
     stop: str = ""
     """Why training is to end after this step; a hook may write it. Not empty in one process, it ends all."""
+    arithmetic: Arithmetic = field(default_factory=lambda: arithmetic("cpu", amp=False))
+    scaler: torch.amp.GradScaler = field(default_factory=lambda: torch.amp.GradScaler("cpu", enabled=False))
+    """Of float16 alone."""
 
 
 @dataclass
@@ -213,16 +235,26 @@ def train(
     Raises:
         NonFiniteLossError: If a loss is not finite; names the images of the batch.
         DivergedError: If the network's depth has become absurd.
-        ConfigError: If ``out`` holds more steps than asked for, or there are more processes than images in a batch.
+        ConfigError: If ``out`` holds more steps than asked for, there are more processes than images in a batch, or no
+            such device.
+        WorkerError: If a process that draws batches is gone.
         WeightsError: If ``out/last.pt`` is damaged or of another network.
         OSError: If the file cannot be written.
     """
-    if world() > config.batch:
-        raise ConfigError(f"{world()} processes for a batch of {config.batch}: every one needs an image")
+    least = world() * config.accumulate
+    if least > config.batch:
+        parts = f" that learn in {config.accumulate} parts" if config.accumulate > 1 else ""
+        raise ConfigError(f"{world()} processes{parts} for a batch of {config.batch}: every one needs an image")
     out.mkdir(parents=True, exist_ok=True)
+    numbers = arithmetic(config.device, config.amp)
+    network = network.to(numbers.device)
     if config.channels_last:
         network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    state = TrainState(network, copy.deepcopy(network).eval(), build_optimiser(network, config))
+    averaged = copy.deepcopy(network).eval()
+    if world() > 1 and not config.freeze_norm:
+        share_norms(network)
+    optimiser = build_optimiser(network, config)
+    state = TrainState(network, averaged, optimiser, arithmetic=numbers, scaler=numbers.scaler())
     if not resume(state, out / LAST) and before is not None:
         state.best, state.history = before["score"], [{"step": 0.0, **before}]
     if state.step > config.steps:
@@ -255,6 +287,21 @@ def _loop(
     hooks: Sequence[Hooks],
 ) -> str:
     """Run all steps; returns the reason for stopping."""
+    parts = _Parts(signals, config, rank(), world())
+    with drawn(parts, state.step, config.steps, config.workers) as batches:
+        return _steps(state, signals, config, metadata, out, validate, hooks, batches)
+
+
+def _steps(
+    state: TrainState,
+    signals: Sequence[Signal],
+    config: TrainConfig,
+    metadata: Metadata,
+    out: Path,
+    validate: Validation | None,
+    hooks: Sequence[Hooks],
+    batches: Iterator[list["_Part"]],
+) -> str:
     while True:
         _agree_to_stop(state)
         if validate is not None and _validation_is_due(state, config):
@@ -269,7 +316,7 @@ def _loop(
             return "all steps done"
         if state.stop:
             return state.stop
-        losses = _step(state, signals, config, hooks)
+        losses = _step(state, signals, config, hooks, next(batches))
         for hook in hooks:
             hook.on_step(state, losses)
         if state.step % config.checkpoint_every == 0 or state.step == config.steps:
@@ -324,6 +371,9 @@ def _rescue(state: TrainState, out: Path) -> None:
     """Save the last completed step during an interrupt or failure, without masking it."""
     if rank() != 0 or not state.whole or state.shown is None:
         return
+    for name, buffer in state.network.named_buffers():
+        if name in state.statistics:
+            buffer.copy_(state.statistics[name])
     try:
         _save_good(state, out)
     except (DivergedError, OSError) as error:
@@ -362,47 +412,97 @@ def learning_rate_factor(step: int, config: TrainConfig) -> float:
     return config.lr_end + (1 - config.lr_end) * 0.5 * (1 + math.cos(math.pi * min(progress, 1.0)))
 
 
+@dataclass(frozen=True, slots=True)
+class _Part:
+    """Images that one forward pass sees, for one of the signals."""
+
+    signal: int
+    slots: list[Slot]
+    batch: dict[str, Tensor]
+
+
+@dataclass(frozen=True, slots=True)
+class _Parts:
+    """What this process learns from in a step; a function of the step's number, so that any process may draw it."""
+
+    signals: Sequence[Signal]
+    config: TrainConfig
+    this: int
+    of: int
+
+    def __call__(self, step: int) -> list[_Part]:
+        mine = range(self.this, self.config.batch, self.of)
+        parts = self.config.accumulate
+        found = []
+        for k in range(parts):
+            for number, signal in enumerate(self.signals):
+                slots = [Slot(self.config.seed + 7919 * number, step, i) for i in mine[k::parts]]
+                found.append(_Part(number, slots, signal.draw(slots)))
+        return found
+
+
 def _step(
-    state: TrainState, signals: Sequence[Signal], config: TrainConfig, hooks: Sequence[Hooks]
+    state: TrainState,
+    signals: Sequence[Signal],
+    config: TrainConfig,
+    hooks: Sequence[Hooks],
+    parts: Sequence[_Part],
 ) -> dict[str, float]:
-    network, this, of = state.network, rank(), world()
+    network = state.network
     _set_modes(network, config)
+    if not config.freeze_norm:
+        state.statistics = {name: buffer.clone() for name, buffer in network.named_buffers()}
     factor = learning_rate_factor(state.step, config)
     for group in state.optimiser.param_groups:
         group["lr"] = group["peak"] * factor
     state.optimiser.zero_grad(set_to_none=True)
-    named: dict[str, Tensor] = {}
+    totals: dict[str, float] = {}
     bad: list[str] = []
-    for offset, signal in enumerate(signals):
-        slots = [Slot(config.seed + 7919 * offset, state.step, i) for i in range(this, config.batch, of)]
-        batch = signal.draw(slots)
-        if config.channels_last:
-            batch["image"] = batch["image"].contiguous(memory_format=torch.channels_last)
-        state.shown = batch["image"][:2]
-        with torch.autocast("cpu", torch.bfloat16, enabled=config.amp):
-            predicted = network.predict(batch["image"])
-            losses = signal.losses(predicted, batch)
-        losses = _hooked(hooks, state, Drawn(signal.name, batch, predicted, losses), len(slots))
-        for name, value in losses.items():
-            if not torch.isfinite(value).all():
-                images = [d for d, v in zip(signal.describe(slots), value, strict=True) if not torch.isfinite(v)]
-                bad.append(f"loss {signal.name}/{name} is not finite for {', '.join(images)}")
-            # Sum over this process's images, divided by the whole batch: processes add up to the global mean.
-            named[f"{signal.name}/{name}"] = value.sum() / config.batch
-    torch.stack(list(named.values())).sum().backward()
-    gradients = [p.grad for p in network.parameters() if p.grad is not None]
-    add_up(gradients)
+    for start in range(0, len(parts), len(signals)):  # the parts of one image share a gradient
+        named: dict[str, Tensor] = {}
+        for part in parts[start : start + len(signals)]:
+            named |= _losses(state, signals[part.signal], part, config, hooks, bad)
+        state.scaler.scale(torch.stack(list(named.values())).sum()).backward()
+        for name, value in named.items():
+            totals[name] = totals.get(name, 0.0) + float(value.detach())
+    add_up([p.grad for p in network.parameters() if p.grad is not None])
     if failures := everyones(bad):
         raise NonFiniteLossError(f"step {state.step}: {failures[0]}")
+    state.scaler.unscale_(state.optimiser)
     norm = nn.utils.clip_grad_norm_([p for p in network.parameters() if p.grad is not None], config.clip_norm)
-    if not torch.isfinite(norm):
+    # The scaler leaves out a step whose float16 gradients overflow, and scales less from then on.
+    if not state.arithmetic.scales and not torch.isfinite(norm):
         raise NonFiniteLossError(f"step {state.step}: the gradient is not finite")
     state.whole = False
-    state.optimiser.step()
+    state.scaler.step(state.optimiser)
+    state.scaler.update()
     _average(state, config.ema_decay)
     state.step += 1
+    state.statistics = {}
     state.whole = True
-    return {k: float(v.detach()) for k, v in named.items()}
+    return totals
+
+
+def _losses(
+    state: TrainState, signal: Signal, part: _Part, config: TrainConfig, hooks: Sequence[Hooks], bad: list[str]
+) -> dict[str, Tensor]:
+    """Losses of one part by name, ``()`` each: sums over its images, divided by the whole batch, so that parts and
+    processes add up to the mean. What is not finite is said in ``bad``."""
+    batch = state.arithmetic.moved(part.batch)
+    if config.channels_last:
+        batch["image"] = batch["image"].contiguous(memory_format=torch.channels_last)
+    state.shown = batch["image"][:2]
+    with state.arithmetic.autocast():
+        predicted = state.network.predict(batch["image"])
+        losses = signal.losses(predicted, batch)
+    losses = _hooked(hooks, state, Drawn(signal.name, batch, predicted, losses), len(part.slots))
+    named = {}
+    for name, value in losses.items():
+        if not torch.isfinite(value).all():
+            images = [d for d, v in zip(signal.describe(part.slots), value, strict=True) if not torch.isfinite(v)]
+            bad.append(f"loss {signal.name}/{name} is not finite for {', '.join(images)}")
+        named[f"{signal.name}/{name}"] = value.float().sum() / config.batch
+    return named
 
 
 def _hooked(hooks: Sequence[Hooks], state: TrainState, drawn: Drawn, images: int) -> dict[str, Tensor]:
@@ -465,6 +565,7 @@ def save_state(state: TrainState, path: Path) -> None:
         "network": state.network.state_dict(),
         "averaged": state.averaged.state_dict(),
         "optimiser": state.optimiser.state_dict(),
+        "scaler": state.scaler.state_dict(),
         "step": state.step,
         "best": state.best,
         "best_step": state.best_step,
@@ -491,6 +592,8 @@ def resume(state: TrainState, path: Path) -> bool:
         state.network.load_state_dict(content["network"])
         state.averaged.load_state_dict(content["averaged"])
         state.optimiser.load_state_dict(content["optimiser"])
+        if state.scaler.is_enabled() and content.get("scaler"):
+            state.scaler.load_state_dict(content["scaler"])
         state.step, state.best, state.stale = content["step"], content["best"], content["stale"]
         state.best_step, state.history = content["best_step"], content["history"]
     for group, peak in zip(state.optimiser.param_groups, peaks, strict=True):

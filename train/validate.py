@@ -46,13 +46,16 @@ def predict_metres(network: FastDepth, metadata: Metadata, view: View) -> tuple[
     """Depth [m] and its sigma (log) at the view's own size, focal length corrected."""
     size = (metadata.input_height, metadata.input_width)
     fitted = fitted_view(view, size)
+    image = image_tensor(fitted.image, metadata)[None]
     with torch.no_grad():
-        prediction = network.predict_half(image_tensor(fitted.image, metadata)[None])
+        prediction = network.predict_half(image.to(next(network.parameters()).device))
     # The network sees pixels, so what counts is the focal length in its own pixels (input_width of them).
-    log_depth = prediction.log_depth[0, 0].numpy() + np.log(
+    log_depth = prediction.log_depth[0, 0].cpu().numpy() + np.log(
         np.sqrt(fitted.K[0, 0] * fitted.K[1, 1]) / metadata.focal_px
     )
-    log_sigma = prediction.log_sigma[0, 0].numpy() if prediction.log_sigma is not None else np.zeros_like(log_depth)
+    log_sigma = (
+        prediction.log_sigma[0, 0].cpu().numpy() if prediction.log_sigma is not None else np.zeros_like(log_depth)
+    )
     h, w = view.image.shape[:2]
     large = cv2.resize(log_depth, (w, h), interpolation=cv2.INTER_LINEAR)
     return np.exp(large), np.exp(cv2.resize(log_sigma, (w, h), interpolation=cv2.INTER_LINEAR))

@@ -3,6 +3,7 @@
 import errno
 import os
 import shutil
+import signal as signal_number
 import socket
 import subprocess
 import sys
@@ -15,13 +16,16 @@ import pytest
 import torch
 from torch import Tensor
 
-from edgeslam_torch.errors import ConfigError, WeightsError
+from edgeslam_torch.errors import ConfigError, SourceError, WeightsError
 from edgeslam_torch.models.checkpoint import build_network, load_checkpoint
 from edgeslam_torch.models.fastdepth import FastDepth, Prediction, Widths
 from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.train import recipe
+from edgeslam_torch.train.processes.device import Arithmetic
+from edgeslam_torch.train.processes.loading import WorkerError
 from edgeslam_torch.train.recipe import (
     DivergedError,
+    Drawn,
     Hooks,
     NonFiniteLossError,
     TrainConfig,
@@ -377,15 +381,26 @@ import sys, torch
 from pathlib import Path
 from edgeslam_torch.train.processes.distributed import process_group
 sys.path.insert(0, {folder!r})
-from {module} import CONFIG, METADATA, network, replace, signal, train
+from {module} import METADATA, network, replace, shared_config, train, two_recordings
 torch.set_num_threads(1)
 with process_group() as rank:
-    state = train(network(), METADATA, [signal()], replace(CONFIG, freeze_norm=True), Path(sys.argv[1]))
+    config = shared_config(frozen=sys.argv[3] == "frozen")
+    state = train(network(), METADATA, [two_recordings()], config, Path(sys.argv[1]))
     if rank == 0:
-        torch.save(state.network.state_dict(), sys.argv[2])
+        torch.save([state.network.state_dict(), state.averaged.state_dict()], sys.argv[2])
 threads = [path.read_text() for path in Path("/proc/self/task").glob("*/comm")]
 assert not [name for name in threads if "gloo" in name], "the group's threads would abort the process at its end"
 """
+
+
+def two_recordings() -> Supervised:
+    sources = [Source("first", views(3), 1.0), Source("second", views(5)[3:], 2.0)]
+    return Supervised(sources, METADATA, AugmentConfig())
+
+
+def shared_config(frozen: bool) -> TrainConfig:
+    """Five images a step: three in one process, two in the other."""
+    return replace(CONFIG, steps=20, batch=5, freeze_norm=frozen, checkpoint_every=20)
 
 
 def in_two_processes(script: Path, *words: str) -> list[tuple[int, str]]:
@@ -404,17 +419,124 @@ def in_two_processes(script: Path, *words: str) -> list[tuple[int, str]]:
 
 
 @pytest.mark.slow
-def test_two_processes_give_the_single_process_result(tmp_path: Path) -> None:
+@pytest.mark.parametrize("norms", ["frozen", "learning"])
+def test_two_processes_on_two_recordings_give_the_single_process_result(tmp_path: Path, norms: str) -> None:
     script = tmp_path / "script.py"
     script.write_text(SCRIPT.format(folder=str(Path(__file__).parent), module=Path(__file__).stem))
     together = tmp_path / "together.pt"
-    ended = in_two_processes(script, str(tmp_path / "b"), str(together))
+    ended = in_two_processes(script, str(tmp_path / "b"), str(together), norms)
     assert [code for code, _ in ended] == [0, 0], ended
-    alone = train(network(), METADATA, [signal()], replace(CONFIG, freeze_norm=True), tmp_path / "a").network
-    second = torch.load(together)
-    for name, value in alone.state_dict().items():
-        # The same images and terms, added up in another order.
-        torch.testing.assert_close(second[name], value, rtol=1e-3, atol=2e-5, msg=name)
+    config = shared_config(frozen=norms == "frozen")
+    alone = train(network(), METADATA, [two_recordings()], config, tmp_path / "a")
+    for mine, theirs in zip((alone.network, alone.averaged), torch.load(together), strict=True):
+        for name, value in mine.state_dict().items():
+            # The same images and terms, added up in another order.
+            torch.testing.assert_close(theirs[name], value, rtol=1e-4, atol=1e-4, msg=name)
+
+
+@pytest.mark.parametrize("parts", [2, 3, 5])
+def test_parts_of_a_batch_give_the_step_of_the_whole(tmp_path: Path, parts: int) -> None:
+    config = shared_config(frozen=True)
+    whole = train(network(), METADATA, [two_recordings()], config, tmp_path / "whole").network.state_dict()
+    divided = replace(config, accumulate=parts)
+    state = train(network(), METADATA, [two_recordings()], divided, tmp_path / "parts").network.state_dict()
+    for name, value in whole.items():
+        torch.testing.assert_close(state[name], value, rtol=1e-4, atol=1e-4, msg=name)
+
+
+def test_more_parts_than_images_are_refused() -> None:
+    with pytest.raises(ValueError, match="accumulate must be at most the batch, 4, got 5"):
+        replace(CONFIG, accumulate=5)
+
+
+def test_workers_draw_the_same_batches(whole: TrainState, tmp_path: Path) -> None:
+    assert_same(whole, run(tmp_path, replace(CONFIG, workers=2)))
+
+
+class _Unreadable(Supervised):
+    def draw(self, slots: Sequence[Slot]) -> dict[str, Tensor]:
+        if slots[0].step == 3:
+            raise SourceError("flight/3.png: unreadable")
+        return super().draw(slots)
+
+
+def test_error_in_a_worker_is_that_error(tmp_path: Path) -> None:
+    signals = [_Unreadable([Source("made", views(), 1.0)], METADATA)]
+    with pytest.raises(SourceError, match=r"^flight/3\.png: unreadable$"):
+        train(network(), METADATA, signals, replace(CONFIG, workers=1), tmp_path)
+    assert saved_step(tmp_path / "last.pt") == 3
+
+
+class _KilledAt3(Supervised):
+    def draw(self, slots: Sequence[Slot]) -> dict[str, Tensor]:
+        if slots[0].step == 3:
+            os.kill(os.getpid(), signal_number.SIGKILL)
+        return super().draw(slots)
+
+
+def test_killed_worker_ends_training_in_one_line_and_loses_no_step(whole: TrainState, tmp_path: Path) -> None:
+    signals = [_KilledAt3([Source("made", views(), 1.0)], METADATA)]
+    with pytest.raises(WorkerError, match=r"a process that draws batches ended \(.*\); fewer --workers take less"):
+        train(network(), METADATA, signals, replace(CONFIG, workers=1), tmp_path, lambda n: {"score": 1.0})
+    assert_same(whole, run(tmp_path))
+
+
+def test_interrupt_in_a_forward_pass_leaves_the_statistics_of_the_step_before(
+    whole: TrainState, tmp_path: Path
+) -> None:
+    class Interrupted(Hooks):
+        def on_losses(self, state: TrainState, drawn: Drawn) -> None:
+            if state.step == 4:
+                raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path, hooks=[Interrupted()])
+    assert saved_step(tmp_path / "last.pt") == 4
+    assert_same(whole, run(tmp_path))
+
+
+@pytest.mark.parametrize("device", ["cuda", "mps"])
+def test_device_that_is_not_there_is_refused_in_one_line(tmp_path: Path, device: str) -> None:
+    if (torch.cuda if device == "cuda" else torch.backends.mps).is_available():
+        pytest.skip(f"{device} is there")
+    with pytest.raises(ConfigError, match=f"--device {device}: this torch .* finds no such device; use --device cpu"):
+        run(tmp_path, replace(CONFIG, device=device))
+
+
+@pytest.mark.parametrize("device", ["cuda", "mps"])
+@pytest.mark.parametrize("amp", [False, True])
+def test_training_on_a_gpu_goes_on_anywhere(tmp_path: Path, device: str, amp: bool) -> None:
+    if not (torch.cuda if device == "cuda" else torch.backends.mps).is_available():
+        pytest.skip(f"no {device} device here")
+    config = replace(CONFIG, device=device, amp=amp)
+    state = run(tmp_path / "gpu", config)
+    assert next(state.network.parameters()).device.type == device
+    on_cpu = run(tmp_path / "cpu").network.state_dict()
+    tolerance = 0.05 if amp else 2e-3
+    for name, value in state.network.state_dict().items():
+        torch.testing.assert_close(value.cpu(), on_cpu[name], rtol=tolerance, atol=tolerance, msg=name)
+    assert run(tmp_path / "gpu", replace(CONFIG, steps=8)).step == 8, "a processor takes over"
+
+
+def test_float16_leaves_out_steps_that_overflow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first scale, 65536, is too large for these losses; the scaler halves it until it fits."""
+    half = Arithmetic(torch.device("cpu"), torch.float16)
+    monkeypatch.setattr(recipe, "arithmetic", lambda device, amp: half)
+    monkeypatch.setattr(Arithmetic, "scaler", lambda self: torch.amp.GradScaler("cpu", init_scale=2.0**40))
+    scales = []
+
+    class Record(Hooks):
+        def on_step(self, state: TrainState, losses: dict[str, float]) -> None:
+            scales.append(state.scaler.get_scale())
+
+    before = network().state_dict()
+    state = run(tmp_path, replace(CONFIG, steps=40, validate_every=40), [Record()])
+    assert scales[0] == 2.0**39, "halved by an overflow"
+    assert scales[-1] == scales[-2], "until it fits"
+    assert not torch.equal(state.network.state_dict()["decode_conv3.1.0.weight"], before["decode_conv3.1.0.weight"])
+    assert all(torch.isfinite(p).all() for p in state.network.parameters())
+    again = run(tmp_path, replace(CONFIG, steps=41, validate_every=41))
+    assert again.scaler.get_scale() == scales[-1], "a resume remembers it"
 
 
 POISONED = """

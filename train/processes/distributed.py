@@ -77,7 +77,7 @@ def by_first(work: Callable[[], T]) -> T:
             answer[0] = work()
         except Exception as error:
             failure, answer[1] = error, f"{error}"
-    with _lost_is_said():
+    with lost_is_said():
         dist.broadcast_object_list(answer)
     if failure is not None:
         raise failure
@@ -98,7 +98,7 @@ def wait_for_all() -> None:
         ProcessError: If one is gone.
     """
     if _together():
-        with _lost_is_said():
+        with lost_is_said():
             dist.barrier()
 
 
@@ -111,7 +111,7 @@ def everyones(messages: Sequence[str]) -> list[str]:
     if not _together():
         return list(messages)
     gathered: list[list[str]] = [[] for _ in range(world())]
-    with _lost_is_said():
+    with lost_is_said():
         dist.all_gather_object(gathered, list(messages))
     return [message for part in gathered for message in part]
 
@@ -125,7 +125,7 @@ def add_up(tensors: Sequence[Tensor]) -> None:
     if not _together():
         return
     flat = torch.cat([t.flatten() for t in tensors])
-    with _lost_is_said():
+    with lost_is_said():
         dist.all_reduce(flat)
     start = 0
     for t in tensors:
@@ -138,7 +138,7 @@ def _together() -> bool:
 
 
 @contextmanager
-def _lost_is_said() -> Iterator[None]:
+def lost_is_said() -> Iterator[None]:
     """Gloo reports a dead peer as a closed connection."""
     try:
         yield

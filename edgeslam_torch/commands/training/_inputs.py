@@ -55,7 +55,23 @@ def add_shared_arguments(parser: argparse.ArgumentParser, steps: int, batch: int
     parser.add_argument("--batch", type=int, default=batch, help="images (or pairs) per step over all processes")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--patience", type=int, default=0, help="stop after this many validations without progress")
-    parser.add_argument("--amp", action="store_true", help="bfloat16 arithmetic where the processor has it")
+    parser.add_argument(
+        "--accumulate", type=int, default=1, help="learn each batch in this many parts, which takes less memory"
+    )
+    parser.add_argument(
+        "--device",
+        default="auto",
+        help="auto, cpu, cuda or mps (default: auto, CUDA, then Apple's GPU, then processor)",
+    )
+    parser.add_argument(
+        "--amp",
+        action=argparse.BooleanOptionalAction,
+        default=None,
+        help="half precision: bfloat16, on GPUs without it float16 (default: on CUDA alone)",
+    )
+    parser.add_argument(
+        "--workers", type=int, default=0, help="processes that draw batches ahead, one thread each (default: 0)"
+    )
     parser.add_argument("--threads", type=int, default=1, help="threads of each process")
     parser.add_argument("--camera", help="calibration for recordings without one")
     parser.add_argument(
@@ -78,6 +94,9 @@ def check_shared(args: argparse.Namespace) -> None:
         raise ConfigError(f"--threads must be 1 to {MAX_THREADS}, got {args.threads}")
     if args.max_frames is not None and args.max_frames < 1:
         raise ConfigError(f"--max-frames must be at least 1, got {args.max_frames}")
+    from edgeslam_torch.train.processes.device import find_device
+
+    find_device(args.device)
 
 
 def in_folder(args: argparse.Namespace, work: "Callable[[OutFolder], Outcome]") -> int:

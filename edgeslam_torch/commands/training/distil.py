@@ -99,6 +99,9 @@ def _config(args: argparse.Namespace, is_new: bool) -> "TrainConfig":
             checkpoint_every=every,
             patience=args.patience,
             amp=args.amp,
+            device=args.device,
+            workers=args.workers,
+            accumulate=args.accumulate,
         )
     except ValueError as error:
         raise ConfigError(f"--{error}") from error

@@ -79,6 +79,9 @@ def _config(args: argparse.Namespace) -> "TrainConfig":
             checkpoint_every=every,
             patience=args.patience,
             amp=args.amp,
+            device=args.device,
+            workers=args.workers,
+            accumulate=args.accumulate,
         )
     except ValueError as error:
         raise ConfigError(f"--{error}") from error

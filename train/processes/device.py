@@ -1,0 +1,76 @@
+"""Where training runs, and in which arithmetic."""
+
+import os
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from edgeslam_torch.errors import ConfigError
+
+DEVICES = ("auto", "cpu", "cuda", "mps")
+
+
+@dataclass(frozen=True, slots=True)
+class Arithmetic:
+    """Device of a training and the type that autocast computes in."""
+
+    device: torch.device
+    dtype: torch.dtype | None
+    """None: float32 everywhere."""
+
+    @property
+    def scales(self) -> bool:
+        """Whether gradients must be scaled: those of float16 vanish below 6e-8."""
+        return self.dtype is torch.float16
+
+    def autocast(self) -> torch.autocast:
+        """Context of the forward pass and the losses."""
+        return torch.autocast(self.device.type, self.dtype or torch.bfloat16, enabled=self.dtype is not None)
+
+    def scaler(self) -> torch.amp.GradScaler:
+        """Scales losses, unless that is not needed."""
+        return torch.amp.GradScaler(self.device.type, enabled=self.scales)
+
+    def moved(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
+        """A batch on the device."""
+        return {name: value.to(self.device, non_blocking=True) for name, value in batch.items()}
+
+
+def find_device(name: str) -> torch.device:
+    """The device of a name; of several GPUs, the one of this process's number on its machine (``LOCAL_RANK``).
+
+    Args:
+        name: One of `DEVICES`; ``auto`` is CUDA, else Apple's GPU, else the processor.
+
+    Raises:
+        ConfigError: If there is no such device.
+    """
+    if name not in DEVICES:
+        raise ConfigError(f"--device {name}: there are {', '.join(DEVICES)}")
+    there = {"cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available(), "cpu": True}
+    if name == "auto":
+        name = next(device for device, is_there in there.items() if is_there)
+    if not there[name]:
+        raise ConfigError(f"--device {name}: this torch ({torch.__version__}) finds no such device; use --device cpu")
+    if name != "cuda":
+        return torch.device(name)
+    local = int(os.environ.get("LOCAL_RANK", "0"))
+    return torch.device("cuda", local % torch.cuda.device_count())
+
+
+def arithmetic(device: str, amp: bool | None) -> Arithmetic:
+    """Device and type of a training.
+
+    Args:
+        device: As for `find_device`.
+        amp: Whether to compute in half precision; None: on CUDA alone.
+
+    Raises:
+        ConfigError: If there is no such device.
+    """
+    found = find_device(device)
+    if not (found.type == "cuda" if amp is None else amp):
+        return Arithmetic(found, None)
+    is_old = found.type == "cuda" and not torch.cuda.is_bf16_supported(including_emulation=False)
+    return Arithmetic(found, torch.float16 if is_old else torch.bfloat16)
