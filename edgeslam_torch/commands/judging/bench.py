@@ -39,6 +39,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE|NAME|none",
         help="compare depth networks: everything once with each; may be repeated ('default' is the shipped one)",
     )
+    parser.add_argument(
+        "--navigation", action="store_true", help="judge simulated flights to a goal instead (true pose, lockstep)"
+    )
+    parser.add_argument(
+        "--world", action="append", default=[], metavar="NAME", help="of those flights; may be repeated"
+    )
+    parser.add_argument("--fault", action="append", default=[], metavar="NAME|all", help="likewise (default: none)")
+    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="of those flights at a time (default: 1)")
     parser.add_argument("--no-micro", action="store_true", help="omit the times of solver and depth network")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the runs (default: runs/bench-TIME)")
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write the results here")
@@ -50,6 +58,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Run or compare; 1 when a run failed."""
+    if args.navigation:
+        return _navigation(args)
     from edgeslam_torch.eval.benchmark import benchmark
     from edgeslam_torch.eval.benchmark import compare as bench_compare
 
@@ -117,3 +127,27 @@ def _networks(settings: "BenchSettings", args: argparse.Namespace, out: Path) ->
 
 def _say(text: str) -> None:
     sys.stderr.write(text + "\n")
+
+
+def _navigation(args: argparse.Namespace) -> int:
+    """Flights through named worlds; 1 when one touched something."""
+    from edgeslam_torch.errors import ConfigError
+    from edgeslam_torch.eval.judge.navigation.conditions import FAULTS
+    from edgeslam_torch.eval.judge.navigation.flight import Case
+    from edgeslam_torch.eval.judge.navigation.runner import judge_flights
+    from edgeslam_torch.eval.judge.navigation.table import markdown
+    from edgeslam_torch.synthetic.sites.build import JUDGED, SITES
+
+    worlds = args.world or list(JUDGED)
+    faults = list(FAULTS)[1:] if args.fault == ["all"] else args.fault or ["none"]
+    for name, known, what in ((worlds, SITES, "--world"), (faults, FAULTS, "--fault")):
+        for wrong in (n for n in name if n not in known):
+            raise ConfigError(f"{what}: unknown name {wrong!r}; there are {', '.join(known)}")
+    if args.jobs < 1 or args.seeds < 1:
+        raise ConfigError("--jobs and --seeds must be at least 1")
+    out = args.out or Path("runs") / time.strftime("navigation-%Y%m%d-%H%M%S")
+    cases = [Case(world, seed, fault) for fault in faults for world in worlds for seed in range(args.seeds)]
+    flights = judge_flights(cases, out, args.jobs, _say)
+    print(markdown(flights))
+    print(f"results: {out / 'navigation.md'}")
+    return 1 if any(flown.contacts for flown in flights) else 0

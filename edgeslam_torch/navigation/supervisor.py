@@ -1,0 +1,180 @@
+"""What stands between a pilot and the sticks: it works when the pilot hangs, the picture stops, or metres are doubtful.
+
+Every order to the drone comes from here. It knows nothing of routes; it knows when not to fly.
+"""
+
+import math
+from collections import deque
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+
+from edgeslam_torch.navigation.limits import NavLimits
+from edgeslam_torch.navigation.sight import Sight, Wish
+from edgeslam_torch.types import FloatArray
+
+STALE_S = 0.3
+"""Age of a wish beyond which the sticks are centred."""
+BLIND_S = 0.7
+"""Age of the picture beyond which nothing new is flown into; a Tello's is 0.3 to 0.5 s old when it arrives."""
+BACK_S = 1.5
+"""Time of trouble after which it backs up along the way it came, which was free."""
+LAND_S = 10.0
+"""Time of trouble after which it lands."""
+_BACK_M, _BACK_M_S = 0.6, 0.15
+SCALE_SIGMA = 0.10
+_WIGGLE_S, _WIGGLE_M_S = 2.0, 0.15
+"""Up and down, which tells height and telemetry the scale."""
+_PUSHED_M_S, _STANDS_M_S, _PUSH_S = 0.15, 0.04, 1.5
+"""Commanded faster than the first, moving slower than the second for this long: something holds it."""
+_TRAIL_M = 0.05
+
+
+class Danger(StrEnum):
+    """Why the pilot's wish is not followed, the gravest last."""
+
+    NONE = ""
+    NO_WISH = "no wish of the pilot: planner late or hung"
+    FENCE = "at the fence"
+    SCALE = "metres are not sure"
+    BLIND = "no fresh picture"
+    LOST = "the pose rests on no map"
+    HELD = "commanded and not moving: contact"
+    NOT_METRIC = "no metres"
+    BATTERY_HOME = "battery low: home"
+    BATTERY = "battery empty: land"
+
+
+@dataclass(frozen=True, slots=True)
+class Order:
+    """What the drone is told."""
+
+    wish: Wish
+    land: bool = False
+    home: bool = False
+    """Whether the pilot should fly home."""
+    danger: Danger = Danger.NONE
+
+
+@dataclass(slots=True)
+class Supervisor:
+    """Watches sights and wishes; `order` is to be asked at least every 0.1 s, from a thread of its own."""
+
+    limits: NavLimits = field(default_factory=NavLimits)
+    landing: bool = False
+    """Once it lands, it lands."""
+    _sight: Sight | None = None
+    _wish: Wish | None = None
+    _wished_s: float = -math.inf
+    _since_s: float = math.nan
+    """Since when it is in trouble."""
+    _pushing_s: float = math.nan
+    _trail: deque[FloatArray] = field(default_factory=lambda: deque(maxlen=400))
+    """Where it flew, 5 cm apart."""
+    _home_w: FloatArray | None = None
+
+    def see(self, sight: Sight) -> None:
+        """The newest sight."""
+        self._sight = sight
+        if self._home_w is None:
+            self._home_w = sight.p_w.copy()
+        moved = not self._trail or float(np.linalg.norm(sight.p_w - self._trail[-1])) > _TRAIL_M
+        if moved and self._danger(sight, sight.stamp_s) is Danger.NONE:
+            self._trail.append(sight.p_w.copy())
+
+    def propose(self, wish: Wish, now_s: float) -> None:
+        """The pilot's newest wish; it counts for `STALE_S`."""
+        self._wish, self._wished_s = wish, now_s
+
+    def order(self, now_s: float) -> Order:
+        """What the drone is told now."""
+        if self._sight is None:
+            return Order(Wish(why="no sight yet"), danger=Danger.NO_WISH)
+        danger = self._danger(self._sight, now_s)
+        home = self._sight.battery <= self.limits.home_battery
+        if danger is Danger.BATTERY or self.landing:
+            self.landing = True
+            return Order(Wish(why=str(danger)), land=True, danger=danger)
+        if danger is Danger.NONE:
+            self._since_s = math.nan
+            assert self._wish is not None
+            return Order(self._within_heights(self._wish), home=home, danger=Danger.BATTERY_HOME if home else danger)
+        if math.isnan(self._since_s):
+            self._since_s = now_s
+        trouble_s = now_s - self._since_s
+        if trouble_s > LAND_S or (danger is Danger.HELD and trouble_s > BACK_S + _BACK_M / _BACK_M_S):
+            self.landing = True
+            return Order(Wish(why=str(danger)), land=True, danger=danger)
+        return Order(self._meanwhile(danger, trouble_s), home=home, danger=danger)
+
+    def _danger(self, sight: Sight, now_s: float) -> Danger:
+        late = sight.blind_s + max(0.0, now_s - sight.stamp_s)
+        checks = (
+            (sight.battery <= self.limits.land_battery, Danger.BATTERY),
+            (not sight.metric, Danger.NOT_METRIC),
+            (self._is_held(sight, now_s), Danger.HELD),
+            (not sight.tracked, Danger.LOST),
+            (late > BLIND_S, Danger.BLIND),
+            (sight.scale_sigma > SCALE_SIGMA or sight.conflict, Danger.SCALE),
+            (self._leaves(sight), Danger.FENCE),
+            (self._wish is None or now_s - self._wished_s > STALE_S, Danger.NO_WISH),
+        )
+        return next((danger for holds, danger in checks if holds), Danger.NONE)
+
+    def _is_held(self, sight: Sight, now_s: float) -> bool:
+        """Whether it was told to move for a while and did not."""
+        wish = self._wish
+        pushed = wish is not None and math.hypot(wish.forward_m_s, wish.left_m_s) > _PUSHED_M_S
+        moves = float(np.linalg.norm(sight.velocity_w[:2])) > _STANDS_M_S
+        if not pushed or moves:
+            self._pushing_s = math.nan
+            return False
+        if math.isnan(self._pushing_s):
+            self._pushing_s = now_s
+        return now_s - self._pushing_s > _PUSH_S
+
+    def _leaves(self, sight: Sight) -> bool:
+        """Whether it is beyond the fence and wants to go farther."""
+        assert self._home_w is not None
+        away = sight.p_w[:2] - self._home_w[:2]
+        if float(np.linalg.norm(away)) < self.limits.fence_m or self._wish is None:
+            return False
+        c, s = math.cos(sight.yaw_rad), math.sin(sight.yaw_rad)
+        f, le = self._wish.forward_m_s, self._wish.left_m_s
+        return float(away @ [c * f - s * le, s * f + c * le]) > 0
+
+    def _within_heights(self, wish: Wish) -> Wish:
+        assert self._sight is not None
+        z, up = float(self._sight.p_w[2]), wish.up_m_s
+        if z > self.limits.highest_m:
+            up = min(up, 0.0)
+        if z < self.limits.lowest_m:
+            up = max(up, 0.0)
+        return Wish(wish.forward_m_s, wish.left_m_s, up, wish.turn_left_rad_s, wish.why)
+
+    def _meanwhile(self, danger: Danger, trouble_s: float) -> Wish:
+        """Hover; then what may mend it."""
+        if danger in (Danger.SCALE, Danger.NOT_METRIC):
+            rising = int(trouble_s / _WIGGLE_S) % 2 == 0
+            wish = Wish(up_m_s=_WIGGLE_M_S if rising else -_WIGGLE_M_S, why=f"{danger}: up and down")
+            return self._within_heights(wish)
+        backing = BACK_S < trouble_s < BACK_S + _BACK_M / _BACK_M_S
+        if danger in (Danger.BLIND, Danger.LOST, Danger.HELD) and backing:
+            return self._back(danger)
+        if danger is Danger.LOST and trouble_s > BACK_S + _BACK_M / _BACK_M_S:
+            return Wish(turn_left_rad_s=0.5 * self.limits.turn_rad_s, why=f"{danger}: look around")
+        return Wish(why=f"{danger}: hover")
+
+    def _back(self, danger: Danger) -> Wish:
+        """Along the trail, away from where the trouble began."""
+        assert self._sight is not None
+        here = self._sight.p_w
+        while self._trail and float(np.linalg.norm(self._trail[-1][:2] - here[:2])) < 2 * _TRAIL_M:
+            self._trail.pop()
+        if not self._trail:
+            return Wish(why=f"{danger}: hover")
+        step = self._trail[-1][:2] - here[:2]
+        step = step * (_BACK_M_S / float(np.linalg.norm(step)))
+        c, s = math.cos(self._sight.yaw_rad), math.sin(self._sight.yaw_rad)
+        return Wish(c * step[0] + s * step[1], c * step[1] - s * step[0], 0.0, 0.0, f"{danger}: back the way it came")

@@ -1,0 +1,175 @@
+"""One judged flight, and what came of it."""
+
+import time
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+
+from edgeslam_torch.drone.emulator.air import Air
+from edgeslam_torch.drone.emulator.drone import Contact, DroneModel, Mode
+from edgeslam_torch.drone.emulator.lockstep import LockstepTello
+from edgeslam_torch.drone.emulator.room import drone_at
+from edgeslam_torch.eval.judge.navigation.conditions import FAULTS
+from edgeslam_torch.eval.judge.navigation.eyes import DEPTH_SIZE, TrueEyes, nothing_painted
+from edgeslam_torch.eval.judge.navigation.oracle import shortest_m
+from edgeslam_torch.geometry.mount import TELLO_TILT_RAD
+from edgeslam_torch.navigation.limits import NavLimits
+from edgeslam_torch.navigation.pilot import Phase, Pilot
+from edgeslam_torch.navigation.supervisor import Supervisor
+from edgeslam_torch.navigation.tasks import GoTo
+from edgeslam_torch.synthetic.sites.build import named_site
+from edgeslam_torch.synthetic.sites.site import Site
+from edgeslam_torch.types import FloatArray
+
+TICK_S = 1.0 / 15.0
+LIMIT_S = 120.0
+REACHED_M = 0.35
+"""Of the true goal, when the pilot says that it is there."""
+_FREE_M = 0.6
+"""Clearance from which cruising is free."""
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """What is flown."""
+
+    world: str
+    seed: int
+    fault: str = "none"
+
+
+@dataclass(slots=True)
+class Flown:
+    """What came of it."""
+
+    case: Case
+    reached: bool = False
+    ended: str = ""
+    """How: the pilot's phase, or why it landed."""
+    contacts: int = 0
+    crashed: bool = False
+    landed: bool = False
+    time_s: float = 0.0
+    """From take-off to the goal or the end."""
+    oracle_s: float = 0.0
+    """The shortest way with the true map, at the same speed and after the same take-off."""
+    path_m: float = 0.0
+    distance_m: float = 0.0
+    """To the goal, in the end."""
+    cruise_m_s: float = 0.0
+    """Median speed where there is space."""
+    clearance_p5_m: float = 0.0
+    """Beyond the hull."""
+    clearance_min_m: float = 0.0
+    cpu_ms: float = 0.0
+    """Planning and space, a tick."""
+    cpu_worst_ms: float = 0.0
+    dangers: tuple[str, ...] = ()
+    """What the supervisor met."""
+    track_w: list[list[float]] = field(default_factory=list)
+    """``(N, 3)`` true way, for pictures."""
+
+    def record(self) -> dict[str, Any]:
+        """For JSON."""
+        return asdict(self)
+
+
+def fly(case: Case, limits: NavLimits | None = None) -> Flown:
+    """Fly to the site's goal in lockstep, by the true pose.
+
+    Raises:
+        ValueError: If the world or the fault is unknown.
+    """
+    if case.fault not in FAULTS:
+        raise ValueError(f"unknown fault {case.fault!r}; there are {', '.join(FAULTS)}")
+    limits, conditions = limits or NavLimits(), FAULTS[case.fault]
+    site = named_site(case.world, case.seed)
+    wind = np.array([0.0, conditions.wind_m_s, 0.0])
+    air = Air(wind, 0.5 * conditions.wind_m_s, np.random.default_rng([case.seed, 1]))
+    drone, _, _ = drone_at(site, TELLO_TILT_RAD, DEPTH_SIZE, conditions.battery, air)
+    tello = LockstepTello(drone, nothing_painted, conditions.radio, case.seed)
+    eyes = TrueEyes(site, drone, conditions)
+    pilot = Pilot(GoTo(site.goal_w / conditions.scale), limits)
+    supervisor = Supervisor(limits)
+    found = Flown(case, oracle_s=_take_off_s(limits) + shortest_m(site, limits) / limits.speed_m_s)
+    ticks = _fly(tello, eyes, pilot, supervisor, conditions.hung_s, found)
+    _sum_up(found, site, drone, ticks)
+    return found
+
+
+@dataclass(slots=True)
+class _Tick:
+    p_w: FloatArray
+    speed_m_s: float
+    clearance_m: float
+    cpu_s: float
+
+
+def _fly(
+    tello: LockstepTello,
+    eyes: TrueEyes,
+    pilot: Pilot,
+    supervisor: Supervisor,
+    hung_s: tuple[float, float] | None,
+    found: Flown,
+) -> list[_Tick]:
+    drone, ticks, dangers = tello.drone, [], []
+    tello.send("takeoff")
+    landing = False
+    while tello.clock_s < LIMIT_S:
+        events = tello.advance(TICK_S)
+        touched = [e for e in events if isinstance(e, Contact)]
+        found.contacts += len(touched)
+        found.crashed |= any(t.crashed for t in touched)
+        if drone.mode is Mode.GROUND and tello.clock_s > 2.0:
+            break
+        sight = eyes.sight(tello.clock_s, events)
+        if drone.mode is not Mode.FLYING or landing:
+            continue
+        began = time.process_time()
+        supervisor.see(sight)
+        if hung_s is None or not hung_s[0] <= tello.clock_s < hung_s[1]:
+            supervisor.propose(pilot.update(sight), tello.clock_s)
+        order = supervisor.order(tello.clock_s)
+        cpu_s = time.process_time() - began
+        ticks.append(_Tick(drone.p_w.copy(), float(np.linalg.norm(drone.velocity)), drone.clearance(drone.p_w), cpu_s))
+        if order.danger and str(order.danger) not in dangers:
+            dangers.append(str(order.danger))
+        if pilot.phase in (Phase.DONE, Phase.STUCK):
+            found.ended, found.time_s = found.ended or str(pilot.phase), found.time_s or tello.clock_s
+            landing = True
+            tello.send("land")
+        elif order.land:
+            found.ended, found.time_s, landing = str(order.danger), tello.clock_s, True
+            tello.send("land")
+        else:
+            right, forward, up, clockwise = (round(100 * v) for v in order.wish.sticks())
+            tello.send(f"rc {right} {forward} {up} {clockwise}")
+    found.landed = drone.mode is Mode.GROUND and not found.crashed
+    found.ended = found.ended or ("crash" if found.crashed else "out of time")
+    found.time_s = found.time_s or tello.clock_s
+    found.dangers = tuple(dangers)
+    return ticks
+
+
+def _sum_up(found: Flown, site: Site, drone: DroneModel, ticks: list[_Tick]) -> None:
+    """Figures of the ticks."""
+    if not ticks:
+        return
+    p = np.array([t.p_w for t in ticks])
+    hull = np.array([t.clearance_m for t in ticks]) - NavLimits().radius_m
+    speed, cpu = np.array([t.speed_m_s for t in ticks]), 1e3 * np.array([t.cpu_s for t in ticks])
+    found.track_w = np.round(p, 3).tolist()
+    found.path_m = float(np.linalg.norm(np.diff(p[:, :2], axis=0), axis=1).sum())
+    found.distance_m = float(np.linalg.norm(drone.p_w[:2] - site.goal_w[:2]))
+    found.reached = found.ended == str(Phase.DONE) and found.distance_m < REACHED_M and not found.contacts
+    moving = (hull > _FREE_M) & (speed > 0.1)
+    found.cruise_m_s = float(np.median(speed[moving])) if moving.any() else float("nan")
+    found.clearance_p5_m, found.clearance_min_m = float(np.percentile(hull, 5)), float(hull.min())
+    found.cpu_ms, found.cpu_worst_ms = float(np.median(cpu)), float(cpu.max())
+
+
+def _take_off_s(limits: NavLimits) -> float:
+    """Time of the drone's own take-off to 0.8 m, and of the climb to the height of flight."""
+    return 2.5 + (limits.height_m - 0.9) / limits.climb_m_s

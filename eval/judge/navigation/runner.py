@@ -1,0 +1,64 @@
+"""All flights, several at a time; finished ones are kept, so that a stopped run goes on where it was."""
+
+import json
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from multiprocessing import get_context
+from pathlib import Path
+
+import cv2
+
+from edgeslam_torch.eval.judge.navigation.flight import Case, Flown, fly
+from edgeslam_torch.eval.judge.navigation.pictures import top_view
+from edgeslam_torch.eval.judge.navigation.table import markdown
+from edgeslam_torch.files.atomic import write_text
+
+_WORST = 6
+"""Flights of which a top view is written."""
+
+
+def judge_flights(cases: Sequence[Case], out: Path, jobs: int, say: Callable[[str], None]) -> list[Flown]:
+    """Fly all cases, write a record each, ``navigation.md`` and top views of the worst flights.
+
+    Args:
+        cases: What to fly.
+        out: Folder of the results; records of earlier runs are used where the case is the same.
+        jobs: Flights at a time.
+        say: Told a line for each finished flight.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    found = {case: flown for case in cases if (flown := _earlier(_file(out, case), case)) is not None}
+    missing = [case for case in cases if case not in found]
+    # Spawned: a forked process shares the threads' locks of its parent.
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+        futures = {pool.submit(fly, case): case for case in missing}
+        for future in as_completed(futures):
+            flown = found[futures[future]] = future.result()
+            write_text(_file(out, flown.case), json.dumps(flown.record()) + "\n")
+            say(_line(flown))
+    flights = [found[case] for case in cases]
+    write_text(out / "navigation.md", markdown(flights))
+    for flown in sorted(flights, key=lambda f: (f.reached, not f.contacts, f.clearance_min_m))[:_WORST]:
+        cv2.imwrite(str(out / f"top_{flown.case.world}_{flown.case.seed}_{flown.case.fault}.png"), top_view(flown))
+    return flights
+
+
+def _file(out: Path, case: Case) -> Path:
+    return out / f"flight_{case.world}_{case.seed}_{case.fault}.json"
+
+
+def _earlier(file: Path, case: Case) -> Flown | None:
+    try:
+        record = json.loads(file.read_text(encoding="utf-8"))
+        return Flown(**{**record, "case": case, "dangers": tuple(record["dangers"])})
+    except (OSError, ValueError, TypeError, KeyError):
+        return None
+
+
+def _line(flown: Flown) -> str:
+    told = f"; {', '.join(flown.dangers)}" if flown.dangers else ""
+    return (
+        f"{flown.case.world} {flown.case.seed} {flown.case.fault}: {flown.ended} after {flown.time_s:.1f} s "
+        f"(oracle {flown.oracle_s:.1f}), {flown.distance_m:.2f} m from the goal, {flown.contacts} contacts, "
+        f"clearance {flown.clearance_min_m:.2f} m{told}"
+    )
