@@ -7,6 +7,9 @@ import numpy as np
 from edgeslam_torch.synthetic.house.world import Box, World
 from edgeslam_torch.types import FloatArray
 
+_CHUNK = 512
+"""Points at a time: some megabytes."""
+
 
 class Solids:
     """Surfaces and boxes of a world, arranged for quick questions about single points.
@@ -34,22 +37,21 @@ class Solids:
         Exact for rectangles; for slanted parallelograms (leaves) at most a few percent too far.
         """
         points = np.asarray(p_w, dtype=np.float64)
-        return np.array([self._of_one(p) for p in points])
+        chunks = [self._of(points[k : k + _CHUNK]) for k in range(0, len(points), _CHUNK)]
+        return np.concatenate(chunks) if chunks else np.zeros(0)
 
-    def _of_one(self, p: FloatArray) -> float:
-        walls = float(np.min([p[:2] - self._low[:2], self._high[:2] - p[:2]]))
-        nearest = min(walls, float(self._high[2] - p[2]))
-        if nearest <= 0:
-            return 0.0
+    def _of(self, p: FloatArray) -> FloatArray:
+        nearest = np.minimum(p[:, :2] - self._low[:2], self._high[:2] - p[:, :2]).min(1)
+        nearest = np.maximum(np.minimum(nearest, self._high[2] - p[:, 2]), 0.0)
         if len(self._centre):
-            offset = p - self._centre
-            x = self._cos * offset[:, 0] + self._sin * offset[:, 1]
-            y = self._cos * offset[:, 1] - self._sin * offset[:, 0]
-            out = np.maximum(np.abs(np.stack([x, y, offset[:, 2]], axis=1)) - self._half, 0.0)
-            nearest = min(nearest, float(np.sqrt((out**2).sum(1).min())))
+            offset = p[:, None] - self._centre  # (N, B, 3)
+            x = self._cos * offset[..., 0] + self._sin * offset[..., 1]
+            y = self._cos * offset[..., 1] - self._sin * offset[..., 0]
+            out = [np.maximum(np.abs(v) - self._half[:, k], 0.0) for k, v in enumerate((x, y, offset[..., 2]))]
+            nearest = np.minimum(nearest, np.sqrt((out[0] ** 2 + out[1] ** 2 + out[2] ** 2).min(1)))
         if len(self._origin):
-            offset = p - self._origin
-            st = np.clip(np.einsum("qij,qj->qi", self._inverse, offset), 0.0, 1.0)
-            away = offset - np.einsum("qij,qj->qi", self._basis, st)
-            nearest = min(nearest, float(np.sqrt((away**2).sum(1).min())))
+            offset = p[:, None] - self._origin  # (N, Q, 3)
+            s, t = (np.clip((offset * self._inverse[:, k]).sum(-1), 0.0, 1.0) for k in (0, 1))
+            away = offset - s[..., None] * self._basis[..., 0] - t[..., None] * self._basis[..., 1]
+            nearest = np.minimum(nearest, np.sqrt((away**2).sum(-1).min(1)))
         return nearest

@@ -1,0 +1,75 @@
+"""The judge of flights."""
+
+import json
+
+import numpy as np
+import pytest
+
+from edgeslam_torch.eval.judge.navigation.flight import Case, Flown, fly
+from edgeslam_torch.eval.judge.navigation.oracle import shortest_m, true_layer
+from edgeslam_torch.eval.judge.navigation.pictures import top_view
+from edgeslam_torch.eval.judge.navigation.runner import judge_flights
+from edgeslam_torch.eval.judge.navigation.table import markdown
+from edgeslam_torch.navigation.limits import NavLimits
+from edgeslam_torch.synthetic.sites.build import named_site
+
+
+def test_the_oracle_flies_straight_where_nothing_is_in_the_way():
+    site = named_site("blank_walls", 0)
+    straight = float(np.linalg.norm(site.goal_w[:2]))
+    assert straight - 0.1 <= shortest_m(site, NavLimits()) <= 1.09 * straight
+
+
+def test_true_free_space_is_that_of_the_solids():
+    site = named_site("l_corridor", 0)
+    layer = true_layer(site, NavLimits())
+    for x, y in ((0.0, 0.0), (3.0, 0.0)):
+        assert layer.free[tuple(layer.cells(np.array([x, y])))]
+    assert layer.solid[tuple(layer.cells(np.array([2.0, 3.0])))]
+
+
+def flown(reached, contacts=0, fault="none", **fields):
+    ended = {"ended": "done" if reached else "crash", "landed": not contacts, "time_s": 20.0, "oracle_s": 16.0}
+    return Flown(Case("blank_walls", 0, fault), reached, contacts=contacts, **(ended | fields))
+
+
+def test_the_table_counts_and_says_how_sure_it_is():
+    text = markdown([flown(True), flown(True), flown(False, 1)])
+    row = text.splitlines()[2]
+    assert "| 3 | 2 (21 to 94 %) | 1 (6 to 79 %) |" in row
+    assert "1.25" in row
+
+
+def test_finished_flights_are_not_flown_again(tmp_path):
+    case = Case("blank_walls", 0)
+    record = flown(True, track_w=[[0.0, 0.0, 1.0], [1.0, 0.0, 1.0]]).record()
+    (tmp_path / "flight_blank_walls_0_none.json").write_text(json.dumps(record))
+    said = []
+    (found,) = judge_flights([case], tmp_path, 1, said.append)
+    assert found.reached and not said
+    assert (tmp_path / "navigation.md").read_text().startswith("| world")
+
+
+def test_a_top_view_shows_the_way():
+    image = top_view(flown(True, track_w=[[0.0, 0.0, 1.0], [5.0, 0.0, 1.0]]))
+    assert image.ndim == 3 and (image == (200, 90, 20)).all(2).sum() > 300
+
+
+def test_unknown_faults_are_refused():
+    with pytest.raises(ValueError, match="blackout"):
+        fly(Case("corridor", 0, "storm"))
+
+
+@pytest.mark.slow
+def test_by_the_true_pose_it_reaches_the_goal_of_a_blank_corridor_without_contact():
+    found = fly(Case("blank_walls", 0))
+    assert found.reached and found.contacts == 0 and found.landed
+    assert found.clearance_min_m > 0.1
+    assert found.time_s < 2 * found.oracle_s
+
+
+@pytest.mark.slow
+def test_a_hung_planner_ends_on_the_floor_without_contact():
+    found = fly(Case("blank_walls", 0, "hung"))
+    assert not found.reached and found.landed and found.contacts == 0
+    assert "planner" in " ".join(found.dangers)

@@ -1,0 +1,131 @@
+"""What stands between a pilot and the sticks."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from edgeslam_torch.navigation.limits import NavLimits
+from edgeslam_torch.navigation.sight import Sight, Wish
+from edgeslam_torch.navigation.supervisor import LAND_S, Danger, Supervisor
+
+AHEAD = Wish(forward_m_s=0.5, why="ahead")
+
+
+def sight(now_s, x=0.0, **fields):
+    fields = {"velocity_w": np.array([0.5, 0.0, 0.0]), "seen_s": now_s - 0.4} | fields
+    return Sight(now_s, np.array([x, 0.0, 1.1]), 0.0, **fields)
+
+
+def flown(supervisor, seconds, change=lambda s: s, wish=AHEAD, begin_s=0.0, x=0.0):
+    """Orders of a straight flight; ``change`` spoils its sights, ``wish`` None is a pilot that hangs."""
+    orders = []
+    for k in range(round(20 * seconds)):
+        now = begin_s + k / 20
+        supervisor.see(change(sight(now, x + 0.025 * k)))
+        if wish is not None:
+            supervisor.propose(wish, now)
+        orders.append(supervisor.order(now))
+    return orders
+
+
+def test_a_healthy_flight_is_left_alone():
+    orders = flown(Supervisor(), 3.0)
+    assert all(o.wish == AHEAD and not o.land and o.danger is Danger.NONE for o in orders)
+
+
+def test_a_pilot_that_hangs_gets_its_sticks_centred_then_the_drone_lands():
+    supervisor = Supervisor()
+    flown(supervisor, 1.0)
+    orders = flown(supervisor, LAND_S + 1.0, wish=None, begin_s=1.0)
+    at_half_a_second = orders[10]
+    assert at_half_a_second.danger is Danger.NO_WISH
+    assert at_half_a_second.wish.sticks() == (0.0, 0.0, 0.0, 0.0)
+    assert not orders[150].land and orders[-1].land
+
+
+def test_an_old_picture_stops_it_and_it_backs_up_the_way_it_came():
+    supervisor = Supervisor()
+    flown(supervisor, 3.0)
+    blind = flown(
+        supervisor,
+        LAND_S + 1.5,
+        lambda s: replace(s, p_w=np.array([1.5, 0.0, 1.1]), velocity_w=np.zeros(3), seen_s=2.6),
+        wish=Wish(),
+        begin_s=3.0,
+    )
+    assert blind[0].danger is Danger.NONE  # 0.4 s old, as always
+    assert blind[10].danger is Danger.BLIND and blind[10].wish.forward_m_s == 0.0
+    assert blind[50].wish.forward_m_s < -0.1
+    assert abs(blind[150].wish.forward_m_s) < 1e-9
+    assert blind[-1].land
+
+
+@pytest.mark.parametrize(
+    ("spoilt", "danger"),
+    [
+        ({"tracked": False}, Danger.LOST),
+        ({"scale_sigma": 0.15}, Danger.SCALE),
+        ({"conflict": True}, Danger.SCALE),
+        ({"metric": False}, Danger.NOT_METRIC),
+    ],
+)
+def test_doubt_stops_it(spoilt, danger):
+    supervisor = Supervisor()
+    flown(supervisor, 1.0)
+    orders = flown(supervisor, 1.0, lambda s: replace(s, **spoilt), begin_s=1.0)
+    assert {o.danger for o in orders} == {danger}
+    assert all(o.wish.forward_m_s == 0.0 for o in orders)
+
+
+def test_doubtful_metres_make_it_rise_and_sink_but_not_leave_its_heights():
+    supervisor = Supervisor(NavLimits(highest_m=1.15))
+    orders = flown(supervisor, 5.0, lambda s: replace(s, metric=False))
+    up = [o.wish.up_m_s for o in orders]
+    assert max(up) > 0.1 and min(up) < -0.1
+    high = flown(supervisor, 1.0, lambda s: replace(s, metric=False, p_w=np.array([0, 0, 1.3])), begin_s=5.0)
+    assert max(o.wish.up_m_s for o in high) <= 0.0
+
+
+def test_commanded_and_not_moving_is_a_contact_and_lands_in_the_end():
+    supervisor = Supervisor()
+    flown(supervisor, 1.0)
+    held = flown(
+        supervisor, 8.0, lambda s: replace(s, p_w=np.array([0.5, 0, 1.1]), velocity_w=np.zeros(3)), begin_s=1.0
+    )
+    assert held[20].danger is Danger.NONE
+    assert held[40].danger is Danger.HELD
+    assert held[-1].land
+
+
+def test_battery_calls_home_and_then_lands():
+    low = flown(Supervisor(), 1.0, lambda s: replace(s, battery=0.2))
+    assert all(o.home and not o.land and o.wish == AHEAD for o in low)
+    empty = Supervisor()
+    assert flown(empty, 0.2, lambda s: replace(s, battery=0.08))[-1].land
+    assert flown(empty, 0.2, begin_s=0.2)[-1].land  # once it lands, it lands
+
+
+def test_the_fence_stops_what_leads_out_and_lets_it_return():
+    limits = NavLimits(fence_m=2.0)
+    out = Supervisor(limits)
+    flown(out, 1.0)
+    at_fence = lambda s: replace(s, p_w=np.array([2.1, 0.0, 1.1]))  # noqa: E731
+    assert flown(out, 0.5, at_fence, begin_s=1.0)[-1].danger is Danger.FENCE
+    back = flown(out, 0.5, at_fence, wish=Wish(forward_m_s=-0.3), begin_s=1.5)
+    assert back[-1].danger is Danger.NONE
+
+
+def test_before_it_sees_anything_it_does_nothing():
+    order = Supervisor().order(0.0)
+    assert order.wish.sticks() == (0.0, 0.0, 0.0, 0.0) and not order.land
+
+
+def test_heights_are_kept():
+    limits = NavLimits(lowest_m=0.5, highest_m=1.5)
+    rising = flown(Supervisor(limits), 0.5, lambda s: replace(s, p_w=np.array([0, 0, 1.6])), wish=Wish(up_m_s=0.3))
+    assert rising[-1].wish.up_m_s == 0.0
+    sinking = flown(Supervisor(limits), 0.5, lambda s: replace(s, p_w=np.array([0, 0, 0.4])), wish=Wish(up_m_s=-0.3))
+    assert sinking[-1].wish.up_m_s == 0.0
+    assert math.isclose(flown(Supervisor(limits), 0.5, wish=Wish(up_m_s=0.3))[-1].wish.up_m_s, 0.3)
