@@ -52,8 +52,7 @@ def ten_recordings(tmp_path_factory):
     """Seven short simulated flights, and three broken recordings."""
     folder = tmp_path_factory.mktemp("fleet") / "recordings"
     for seed in range(7):
-        settings = DemoSettings("corridor", 1.5, 10.0, seed, width=320, height=240)
-        record(folder / f"flight_{seed}", settings)
+        record(folder / f"flight_{seed}", DemoSettings("corridor", 2.0, 15.0, seed, width=320, height=240))
     (folder / "empty").mkdir()
     (folder / "clip.mp4").write_bytes(b"no video")
     (folder / "no_image" / "rgb").mkdir(parents=True)
@@ -94,8 +93,17 @@ def test_three_of_ten_broken_and_a_process_killed(ten_recordings, tmp_path):
     assert all(row["attempts"] == "1" for name, row in rows.items() if name != "flight_3")
     assert all(float(rows[f"flight_{i}"]["ate_m"]) < 0.2 for i in range(7))
     # The folders are runs like any other: training takes them as they are.
-    command = [sys.executable, "-m", "edgeslam_torch.cli", "finetune", *map(str, (out / "flights").iterdir())]
-    done = subprocess.run([*command, "--out", tmp_path / "tuned", "--steps", "1", "--batch", "2"])
+    runs = sorted((out / "flights").iterdir())[:3]
+    command = [
+        sys.executable,
+        "-m",
+        "edgeslam_torch.cli",
+        "finetune",
+        *map(str, runs),
+        "--out",
+        str(tmp_path / "tuned"),
+    ]
+    done = subprocess.run([*command, "--from-runs", "pairs", "--steps", "1", "--batch", "2"])
     assert done.returncode == 0
 
 
