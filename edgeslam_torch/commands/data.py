@@ -66,7 +66,7 @@ def _list(names: Sequence[str], root: Path) -> None:
             print(f"{collection.name}: {collection.licence}; {collection.page}")
         archive = recording.archive
         notes = [gigabytes(archive.size)]
-        notes += [f"of {archive.file}"] if recording.inside.endswith(".zip") or recording.truth else []
+        notes += [f"of {archive.file}"] if archive.sequences > 1 else []
         notes += [_CHECKSUM[archive.checksum_by]] if archive.checksum else ["no checksum known"]
         notes += [f"address in doubt: {archive.doubt}"] if archive.doubt else []
         notes += ["is there"] if is_there(recording, root) else []

@@ -47,6 +47,8 @@ class Archive:
     """``publisher``, or ``agreed`` by the records of independent projects."""
     doubt: str
     """What could not be confirmed about it."""
+    sequences: int
+    """Recordings in it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,8 +98,8 @@ def chosen(words: Sequence[str]) -> list[Recording]:
         matched = sets.get(word) or [name for name in recordings if fnmatchcase(name, word)]
         if not matched:
             close = difflib.get_close_matches(word, [*recordings, *sets], n=3, cutoff=0.4)
-            hint = f"; did you mean {' or '.join(close)}?" if close else ""
-            raise ConfigError(f"no recording called {word[:80]!r}{hint} 'edgeslam data list' names them")
+            hint = f"; did you mean {' or '.join(close)}?" if close else ";"
+            raise ConfigError(f"no recording called {word[:80]!r}{hint} 'edgeslam data list' names them all")
         names |= dict.fromkeys(matched)
     return [recordings[name] for name in names]
 
@@ -112,4 +114,5 @@ def _archive(fields: dict[str, Any]) -> Archive:
         fields.get("checksum", ""),
         fields.get("checksum_by", ""),
         fields.get("doubt", ""),
+        len(fields.get("sequences", ())),
     )

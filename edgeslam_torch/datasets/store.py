@@ -61,9 +61,15 @@ def missing(recordings: Sequence[Recording], root: Path) -> list[Recording]:
 
 def needed_bytes(recordings: Sequence[Recording], root: Path) -> int:
     """Disk space that fetching takes at its largest; archives of unknown size count nothing."""
-    archives = {recording.archive.file: recording.archive.size for recording in recordings}
+    sizes = {recording.archive.file: recording.archive.size for recording in recordings}
+    unpacked = sum(_UNPACKED * r.archive.size / r.archive.sequences * (1 + is_nested(r)) for r in recordings)
     there = sum(p.stat().st_size for p in (root / DOWNLOADS).glob("*") if p.is_file()) if root.is_dir() else 0
-    return max(0, int(sum(archives.values()) * (1.0 + _UNPACKED)) - there)
+    return max(0, int(sum(sizes.values()) + unpacked) - there)
+
+
+def is_nested(recording: Recording) -> bool:
+    """Whether it is an archive inside an archive, which lies on the disk too while it is unpacked."""
+    return recording.inside.endswith(".zip")
 
 
 def check_space(recordings: Sequence[Recording], root: Path) -> None:

@@ -263,6 +263,14 @@ def test_disk_without_room_is_noticed_before_the_first_byte(one, publisher, tmp_
     assert publisher.requests == []
 
 
+def test_space_counts_an_archive_once_and_of_it_only_what_is_unpacked(shop, tmp_path):
+    names = {f"s{i}": f"k/{i}.zip" for i in range(10)}
+    shop({"urls": ["https://x/k.zip"], "bytes": 10_000_000_000, "sequences": names})
+    one, two = (store.needed_bytes(catalogue.chosen(words), tmp_path) for words in (["s1"], ["s1", "s2"]))
+    assert 11e9 < one < 13e9, "the archive, the one in it, and a tenth unpacked"
+    assert two - one == pytest.approx(one - 10e9)
+
+
 def test_folder_of_something_else_is_not_touched(one, publisher, tmp_path, capsys):
     one(tum())
     mine = tmp_path / "rec" / "tum_fr1_a"
