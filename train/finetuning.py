@@ -4,7 +4,7 @@ import copy
 import dataclasses
 import logging
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
@@ -25,6 +25,7 @@ from edgeslam_torch.train.processes.distributed import by_first, rank
 from edgeslam_torch.train.recipe import BEST, FINAL, Hooks, TrainConfig, TrainState, changes_losses, train
 from edgeslam_torch.train.self_supervised import SelfSupervised, fit_log_scale
 from edgeslam_torch.train.signals import Signal, Source, Supervised
+from edgeslam_torch.train.teachers.cache import TeacherCache
 from edgeslam_torch.train.teachers.teach import Taught, teach
 from edgeslam_torch.train.validate import DepthScores, can_be_scored, metres_by, predict_metres, score
 from edgeslam_torch.train.views.augment import View
@@ -91,6 +92,7 @@ def finetune(
     from_runs: FromRuns = FromRuns.TEACHER,
     reading: Mapping[str, object] = MappingProxyType({}),
     hooks: Sequence[Hooks] = (),
+    cache: TeacherCache | None = None,
 ) -> Outcome:
     """Train ``network`` on ``data``; resumes a training in ``out`` with the same inputs.
 
@@ -106,6 +108,7 @@ def finetune(
         from_runs: What is learnt from images without labels.
         reading: How the data was read, plain values by name; a training is resumed only if they are the same.
         hooks: Your own, called after the progress and before TensorBoard, in every process.
+        cache: Keeps the teacher's depth for other trainings; by default ``out`` keeps it for this one.
 
     Raises:
         SourceError: If there is nothing to learn from, or to validate on.
@@ -124,7 +127,7 @@ def finetune(
         return dataclasses.replace(done, nothing_to_do=True)
     by_first(lambda: out.begin(given))
     start = copy.deepcopy(network).eval()
-    signals, held_out = _prepared(start, metadata, data, from_runs, out.path / TEACHER)
+    signals, held_out = _prepared(start, metadata, data, from_runs, _kept_in(cache, out))
     before = by_first(lambda: score(start, metadata, held_out)) if held_out else None
     tuned = _tuned_metadata(metadata, data)
     watching = list(hooks)
@@ -157,7 +160,7 @@ def settings_of(
 
 
 def _prepared(
-    start: FastDepth, metadata: Metadata, data: Data, from_runs: FromRuns, teacher: Path
+    start: FastDepth, metadata: Metadata, data: Data, from_runs: FromRuns, kept_in: Callable[[int, str, str], Path]
 ) -> tuple[list[Signal], list[View]]:
     """Training signals, and the views to validate on.
 
@@ -172,7 +175,8 @@ def _prepared(
         if from_runs is not FromRuns.PAIRS:
             sources = []
             for k, (sequence, scale) in enumerate(zip(data.posed, scales, strict=True)):
-                taught = teach(metres_by(start, metadata), sequence, scale, teacher / f"{k}-{sequence.name}")
+                content = repr((posed_set(sequence).sha256, weights_name(start, metadata), scale))
+                taught = teach(metres_by(start, metadata), sequence, scale, kept_in(k, sequence.name, content))
                 if not (data.validation or labelled):
                     held_out += [_measured_only(t) for t in taught[::HELD_OUT]]
                     taught = [t for i, t in enumerate(taught) if i % HELD_OUT]
@@ -183,6 +187,15 @@ def _prepared(
     if data.validation:
         return signals, [v for f in data.validation for v in f.views]
     return signals, [v for v in held_out if can_be_scored(v)]  # none, for a flight high above the ground
+
+
+def _kept_in(cache: TeacherCache | None, out: OutFolder) -> Callable[[int, str, str], Path]:
+    """Where depth of the k-th run is kept, by its number, name and all that it depends on."""
+
+    def place(number: int, name: str, content: str) -> Path:
+        return out.path / TEACHER / f"{number}-{name}" if cache is None else cache.entry(name, content)
+
+    return place
 
 
 def _split(folders: Sequence[DepthFolder], keep_all: bool) -> tuple[list[Source], list[View]]:

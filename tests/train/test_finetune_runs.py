@@ -112,6 +112,25 @@ def test_interrupted_teacher_goes_on_where_it_was(
 
 
 @pytest.mark.slow
+def test_depth_in_the_cache_is_measured_once_for_two_trainings(
+    run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cached = ("--cache", tmp_path / "cache")
+    assert command.main(arguments(tmp_path, run_folder, *cached)) == 0
+    assert not (tmp_path / "out" / "teacher").exists()
+    (entry,) = (tmp_path / "cache").iterdir()
+    assert len(list(entry.glob("swept_*.npy"))) == 11
+    with monkeypatch.context() as patch:
+        patch.setattr(teacher, "_sweep", None)
+        patch.setattr(teacher, "_completed", None)
+        assert command.main(arguments(tmp_path, run_folder, *cached, "--lr", "1e-4", "--out", tmp_path / "other")) == 0
+    save_checkpoint(network(), replace(METADATA, focal_px=110.0), tmp_path / "other.safetensors")
+    words = (*cached, "--out", tmp_path / "third", "--weights", tmp_path / "other.safetensors")
+    assert command.main(arguments(tmp_path, run_folder, *words)) == 0
+    assert len(list((tmp_path / "cache").iterdir())) == 2
+
+
+@pytest.mark.slow
 def test_teacher_of_other_weights_is_made_anew(
     run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

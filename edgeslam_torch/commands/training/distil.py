@@ -12,6 +12,7 @@ from edgeslam_torch.commands.training._inputs import (
     in_folder,
     items_of,
     posed_run,
+    teacher_cache,
     validation_folders,
 )
 from edgeslam_torch.errors import ConfigError
@@ -143,16 +144,21 @@ def _labelled(
 ) -> "Data":
     """The recordings with the teacher's depth; metres are the teacher's, or the run's where it has none."""
     from edgeslam_torch.train.finetuning import Data
+    from edgeslam_torch.train.given import posed_set
     from edgeslam_torch.train.processes.distributed import rank
     from edgeslam_torch.train.teachers.distil import label
 
+    cache = teacher_cache(args)
     data = Data(validation=validation_folders(args.validate))
     for number, item in enumerate(items):
         run = posed_run(item, out, args.camera, args.max_frames)
         if not (teacher.is_metric or run.metric):
             raise ConfigError(f"{item.path}: neither the teacher nor the run gives metres; add telemetry to it")
         scale = None if teacher.is_metric else 0.0
-        labels = label(teacher, run, scale, out.path / "labels" / f"{number}-{item.name}-{sha256[:12]}")
+        folder = out.path / "labels" / f"{number}-{item.name}-{sha256[:12]}"
+        if cache is not None:
+            folder = cache.entry(item.name, str(posed_set(run).sha256), sha256, repr(scale))
+        labels = label(teacher, run, scale, folder)
         data.labelled.append(labels.folder)
         if rank() == 0:
             print(labels.describe(), flush=True)

@@ -13,6 +13,7 @@ from edgeslam_torch.commands.training._inputs import (
     in_folder,
     items_of,
     posed_run,
+    teacher_cache,
     validation_folders,
 )
 from edgeslam_torch.errors import ConfigError
@@ -117,7 +118,7 @@ def _finetune(
             print(line, flush=True)
         if not args.overwrite and 0 < (step := out.step) < args.steps:
             print(f"{out.path}: goes on after step {step}", flush=True)
-    return finetune(network, metadata, data, config, out, from_runs, reading, hooks)
+    return finetune(network, metadata, data, config, out, from_runs, reading, hooks, teacher_cache(args))
 
 
 def _data(args: argparse.Namespace, items: list[Item], out: "OutFolder") -> "Data":
