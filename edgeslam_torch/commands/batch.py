@@ -1,6 +1,7 @@
 """Run, evaluate and report many recordings: one page and one table of all."""
 
 import argparse
+import math
 import os
 import sys
 from pathlib import Path
@@ -15,7 +16,9 @@ if TYPE_CHECKING:
 
 EXIT_INTERRUPTED = 130
 MEMORY_MB = 4000.0
-"""Ten times what a flight of half a minute takes, and a quarter of a common computer."""
+"""Seven times what a flight of half a minute takes."""
+_SHARE = 0.8
+"""Of this machine's memory for all flights together; the rest is for what else runs."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -36,7 +39,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--timeout", type=float, default=3600.0, metavar="S", help="longest flight [s] (default: 3600)")
     parser.add_argument(
-        "--memory", type=float, default=MEMORY_MB, metavar="MB", help="most memory of a flight (default: 4000)"
+        "--memory",
+        type=float,
+        metavar="MB",
+        help="most memory of a flight (default: 4000, or an equal share of 80 %% of this machine's if that is less)",
     )
     parser.add_argument("--depth", metavar="FILE|NAME|none", help="depth network of all flights, as for 'run'")
     parser.add_argument("--max-frames", type=int, metavar="N", help="stop every flight after N frames")
@@ -61,7 +67,7 @@ def main(args: argparse.Namespace) -> int:
         if value is not None and value < 1:
             raise ConfigError(f"{name} must be at least 1, got {value}")
     for name, value in (("--timeout", args.timeout), ("--memory", args.memory)):
-        if value <= 0:
+        if value is not None and value <= 0:
             raise ConfigError(f"{name} must be positive, got {value:g}")
     flights = _without(read_manifests(args.manifest), args.out)
     try:
@@ -100,15 +106,23 @@ def _runner(args: argparse.Namespace) -> "Runner":
     from edgeslam_torch.fleet.batch import Local
     from edgeslam_torch.jobs.watched import Limits
 
-    limits = Limits(args.timeout, args.memory)
     if args.ray is None:
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        return Local(args.jobs or cores, limits)
+        jobs = args.jobs or cores
+        return Local(jobs, Limits(args.timeout, args.memory or min(MEMORY_MB, _SHARE * _memory_mb() / jobs)))
     from edgeslam_torch.fleet.on_ray import OnRay
 
     if args.jobs is not None:
         raise ConfigError("--jobs is for this machine; a Ray cluster runs one flight a CPU")
-    return OnRay(args.ray, limits)
+    return OnRay(args.ray, Limits(args.timeout, args.memory or MEMORY_MB))
+
+
+def _memory_mb() -> float:
+    """Of this machine; without end where it is not known."""
+    try:
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 2**20
+    except (AttributeError, ValueError, OSError):
+        return math.inf
 
 
 def _say(text: str) -> None:

@@ -127,3 +127,10 @@ class BatchFolder:
             return signature(path, self.path)
         except OSError:
             return ""  # a preset's name, or a file that is not there, which the flight's own process says
+
+
+def finished_flights(folder: Path) -> list[Path] | None:
+    """Runs in a batch's folder, by name; None if it is no batch's."""
+    if not ((folder / RECORD).is_file() and (folder / FLIGHTS).is_dir()):
+        return None
+    return sorted(path for path in (folder / FLIGHTS).iterdir() if path.is_dir())

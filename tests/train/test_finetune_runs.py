@@ -76,6 +76,22 @@ def test_run_that_tracked_nothing_is_left_out_beside_others_and_refused_alone(
         command.main(arguments(tmp_path, lost, "--overwrite"))
 
 
+def test_folder_of_a_batch_stands_for_its_finished_flights(
+    run_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    batch = tmp_path / "batch"
+    (batch / "flights").mkdir(parents=True)
+    (batch / "batch.json").write_text("{}")
+    with pytest.raises(SourceError, match="no flight of this batch finished"):
+        command.main(arguments(tmp_path, batch))
+    changed(run_folder, batch / "flights")
+    shutil.rmtree(batch / "flights" / "recording")
+    summary = json.loads((run_folder / "summary.json").read_text())
+    (batch / "flights" / "run" / "summary.json").write_text(json.dumps(summary))
+    assert command.main(arguments(tmp_path, batch, "--from-runs", "pairs")) == 0
+    assert "11 posed images" in capsys.readouterr().out
+
+
 def test_pairs_alone_leave_nothing_to_validate_on_and_that_is_said(
     run_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -35,7 +35,7 @@ def add_shared_arguments(parser: argparse.ArgumentParser, steps: int, batch: int
         "data",
         nargs="+",
         type=Path,
-        help="recordings (TUM, 7-Scenes, EuRoC, flights, videos) or output folders of 'edgeslam run', in any mix",
+        help="recordings (TUM, 7-Scenes, EuRoC, flights, videos), folders of 'edgeslam run' or 'batch', in any mix",
     )
     parser.add_argument("--out", "-o", type=Path, required=True, help="folder for weights, curve and checkpoints")
     again = parser.add_mutually_exclusive_group()
@@ -185,7 +185,7 @@ def items_of(args: argparse.Namespace, ignore_depth: bool) -> list[Item]:
     from edgeslam_torch.train.views.posed import is_run_folder
 
     items: list[Item] = []
-    for path in args.data:
+    for path in _without_batches(args.data):
         if not path.exists():
             raise SourceError(f"{path}: no such recording or folder")
         if path.is_dir() and args.out.is_dir() and path.samefile(args.out):
@@ -202,6 +202,23 @@ def items_of(args: argparse.Namespace, ignore_depth: bool) -> list[Item]:
         if any(item.kind == "depth" and item.path.samefile(path) for item in items):
             raise ConfigError(f"{path}: is used for training and cannot validate; omit --validate")
     return sorted(items, key=lambda item: item.kind != "depth")
+
+
+def _without_batches(paths: Sequence[Path]) -> list[Path]:
+    """Folders of 'edgeslam batch' replaced by the runs in them.
+
+    Raises:
+        SourceError: If no flight of a batch finished.
+    """
+    from edgeslam_torch.fleet.folder import finished_flights
+
+    found: list[Path] = []
+    for path in paths:
+        runs = finished_flights(path)
+        if runs == []:
+            raise SourceError(f"{path}: no flight of this batch finished")
+        found += [path] if runs is None else runs
+    return found
 
 
 def posed_run(
