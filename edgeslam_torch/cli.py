@@ -35,7 +35,10 @@ COMMANDS = {
     "record": ("edgeslam_torch.commands.record", "record a flight or a camera"),
     "calibrate": ("edgeslam_torch.commands.calibrate", "camera calibration from chessboard pictures"),
     "sim": ("edgeslam_torch.commands.sim", "a simulated Tello on this machine's loopback"),
-    "export-map": ("edgeslam_torch.commands.export_map", "edge map to PLY, PCD, COLMAP or an occupancy grid"),
+    "export-map": (
+        "edgeslam_torch.commands.export_map",
+        "map to PLY, PCD, LAS, COLMAP, nerfstudio or occupancy",
+    ),
 }
 """Name: (module, one line of help). A command whose module is missing is not offered."""
 

@@ -31,6 +31,7 @@ from edgeslam_torch.run_summary import Tally, summarise, without_folders
 from edgeslam_torch.types import (
     FloatArray,
     Frame,
+    Observations,
     Piece,
     PointCloud,
     ScaleEstimate,
@@ -39,7 +40,8 @@ from edgeslam_torch.types import (
     TelemetrySample,
 )
 from edgeslam_torch.writers.map_picture import write_map_picture
-from edgeslam_torch.writers.run_writer import CAMERA, PICTURE, RunWriter
+from edgeslam_torch.writers.observations import write_observations
+from edgeslam_torch.writers.run_writer import CAMERA, OBSERVATIONS, PICTURE, RunWriter
 
 if TYPE_CHECKING:
     from edgeslam_torch.atlas.saved import SavedAtlas
@@ -88,6 +90,9 @@ class Slam(Protocol):
 
     def anchors(self) -> PointCloud:
         """Triangulated anchors."""
+
+    def observations(self) -> Observations:
+        """Where keyframes saw the anchors."""
 
     def keyframes(self) -> Sequence[Any]:
         """Keyframes in the map."""
@@ -359,7 +364,11 @@ class _Run:
         def picture(path: Path) -> None:
             write_map_picture(path, edge_map, poses[support.whole()], scale.units, title)
 
-        extras = [(CAMERA, lambda path: save_camera(path, self.source.camera)), (PICTURE, picture)]
+        extras = [
+            (CAMERA, lambda path: save_camera(path, self.source.camera)),
+            (OBSERVATIONS, lambda path: write_observations(path, self.slam.observations())),
+            (PICTURE, picture),
+        ]
         if saved is not None and self.atlas.save is not None:
             from edgeslam_torch.atlas.atlas_file import write_atlas
 

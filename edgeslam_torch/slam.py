@@ -29,6 +29,7 @@ from edgeslam_torch.geometry import se3, sim3
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.map.keyframe import Keyframe
+from edgeslam_torch.map.observed import observations
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.map.trajectory import TrajectoryLog
 from edgeslam_torch.mapping.edge_map import EdgeMap
@@ -50,6 +51,7 @@ from edgeslam_torch.types import (
     FloatArray,
     Frame,
     Health,
+    Observations,
     Piece,
     PointCloud,
     PoseNow,
@@ -282,10 +284,17 @@ class EdgeSlam:
     def anchors(self) -> PointCloud:
         """Anchors with the standard deviation of their depth, as a consistent snapshot."""
         with self.map.lock:
-            shown = self._shown_piece()
-            seen_by = [k for id, k in self.map.keyframes.items() if self.map.piece_of(id) == shown]
-            cloud = self.map.anchors.cloud(self.map.anchors_seen_by(seen_by))
+            cloud = self.map.anchors.cloud(self.map.anchors_seen_by(self._shown_keyframes()))
         return self._system.published.cloud(cloud)
+
+    def observations(self) -> Observations:
+        """Where keyframes saw the anchors of `anchors`, as a consistent snapshot."""
+        with self.map.lock:
+            return observations(self._shown_keyframes(), self.map)
+
+    def _shown_keyframes(self) -> list[Keyframe]:
+        shown = self._shown_piece()
+        return [k for id, k in sorted(self.map.keyframes.items()) if self.map.piece_of(id) == shown]
 
     def _shown_piece(self) -> int | None:
         """Number of the piece whose map is given out: the camera's while flying, in the end the largest."""

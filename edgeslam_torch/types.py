@@ -325,3 +325,17 @@ class PointCloud:
     """``(P,)`` standard deviation along the viewing ray, float32."""
     observations: IntArray
     """``(P,)`` keyframes that observed the point, int32."""
+
+
+@dataclass(frozen=True, slots=True)
+class Observations:
+    """Anchors that keyframes observed."""
+
+    stamps_s: FloatArray
+    """``(K,)`` stamps of the keyframes [s]."""
+    keyframe: IntArray
+    """``(O,)`` index into ``stamps_s``."""
+    anchor: IntArray
+    """``(O,)`` row of the cloud of anchors."""
+    uv: FloatArray
+    """``(O, 2)`` undistorted pixels."""

@@ -33,6 +33,7 @@ FILES = {
     "config.toml",
     "camera.yaml",
     "map.png",
+    "observations.npz",
 }
 
 

@@ -1,4 +1,4 @@
-"""Edge map of a run to PLY, PCD, a COLMAP text model or an occupancy grid."""
+"""Map of a run for other programs: PLY, PCD, LAS, a COLMAP model, nerfstudio, or an occupancy grid."""
 
 import argparse
 from pathlib import Path
@@ -8,16 +8,18 @@ from edgeslam_torch.errors import OutputError
 
 if TYPE_CHECKING:
     from edgeslam_torch.eval.inputs.run_folder import RunFolder
-    from edgeslam_torch.types import PointCloud
+    from edgeslam_torch.types import Observations, PointCloud
 
-FORMATS = ("ply", "pcd", "colmap", "occupancy")
+_SAME_S = 1e-3
+"""Stamps that differ by less are the same frame's."""
+FORMATS = ("ply", "pcd", "las", "colmap", "nerfstudio", "occupancy")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's options."""
     parser.add_argument("run", type=Path, metavar="DIR", help="output folder of 'edgeslam run'")
     parser.add_argument("--format", choices=FORMATS, required=True)
-    parser.add_argument("--out", type=Path, help="file (ply, pcd), folder (colmap) or file stem (occupancy)")
+    parser.add_argument("--out", type=Path, help="file, folder (colmap, nerfstudio) or file stem (occupancy)")
     parser.add_argument("--max-sigma", type=float, metavar="M", help="omit points with a larger sigma than this [m]")
     parser.add_argument(
         "--min-observations", type=int, default=1, metavar="N", help="omit points with fewer observations"
@@ -64,15 +66,25 @@ def _chosen(run: "RunFolder", args: argparse.Namespace) -> "PointCloud":
 
 
 def _ply(run: "RunFolder", cloud: "PointCloud", args: argparse.Namespace) -> Path:
+    from edgeslam_torch.writers.maps.directions import edge_directions
     from edgeslam_torch.writers.ply import write_ply
 
     path: Path = args.out or run.path / "export.ply"
-    write_ply(path, cloud)
+    centres_w = run.trajectory.positions[run.keyframe_poses()]
+    write_ply(path, cloud, normals=edge_directions(cloud.p_w, centres_w))
+    return path
+
+
+def _las(run: "RunFolder", cloud: "PointCloud", args: argparse.Namespace) -> Path:
+    from edgeslam_torch.writers.maps.las import write_las
+
+    path: Path = args.out or run.path / "edge_map.las"
+    write_las(path, cloud)
     return path
 
 
 def _pcd(run: "RunFolder", cloud: "PointCloud", args: argparse.Namespace) -> Path:
-    from edgeslam_torch.writers.pcd import write_pcd
+    from edgeslam_torch.writers.maps.pcd import write_pcd
 
     path: Path = args.out or run.path / "edge_map.pcd"
     write_pcd(path, cloud)
@@ -80,25 +92,56 @@ def _pcd(run: "RunFolder", cloud: "PointCloud", args: argparse.Namespace) -> Pat
 
 
 def _colmap(run: "RunFolder", cloud: "PointCloud", args: argparse.Namespace) -> Path:
+    from edgeslam_torch.eval.report.keyframe_pictures import image_paths
     from edgeslam_torch.geometry.camera_file import load_camera
-    from edgeslam_torch.writers.colmap import write_colmap
+    from edgeslam_torch.writers.maps.colmap import write_colmap
 
     folder: Path = args.out or run.path / "colmap"
     camera = load_camera(run.path / "camera.yaml")
-    names, index = _images(run)
-    write_colmap(folder, camera, names, run.trajectory.T_w_c[index], cloud)
+    seen, anchors, index = _seen(run)
+    paths = image_paths(run, seen.stamps_s)
+    names = [p.name if p is not None else f"{t:.6f}.jpg" for p, t in zip(paths, seen.stamps_s, strict=True)]
+    write_colmap(folder, camera, names, run.trajectory.T_w_c[index], cloud, anchors, seen)
     return folder
 
 
-def _images(run: "RunFolder") -> tuple[list[str], list[int]]:
-    """Keyframes' image names and poses; without image files the names are made from stamps."""
+def _nerfstudio(run: "RunFolder", cloud: "PointCloud", args: argparse.Namespace) -> Path:
     from edgeslam_torch.eval.report.keyframe_pictures import image_paths
+    from edgeslam_torch.geometry.camera_file import load_camera
+    from edgeslam_torch.writers.maps.nerfstudio import write_nerfstudio
 
-    index = run.keyframe_poses()
-    stamps = run.trajectory.stamps_s[index]
-    found = image_paths(run, stamps)
-    names = [p.name if p is not None else f"{t:.6f}.jpg" for p, t in zip(found, stamps, strict=True)]
-    return names, index
+    folder: Path = args.out or run.path / "nerfstudio"
+    camera = load_camera(run.path / "camera.yaml")
+    seen, anchors, index = _seen(run)
+    paths = [path for path in image_paths(run, seen.stamps_s) if path is not None]
+    if len(paths) < len(index):
+        have = f"{len(index) - len(paths)} of {len(index)} images of the keyframes are not there"
+        raise OutputError(f"{run.path}: {have}; run 'edgeslam run' on a folder of images")
+    write_nerfstudio(folder, camera, paths, run.trajectory.T_w_c[index], cloud, anchors, seen)
+    return folder
+
+
+def _seen(run: "RunFolder") -> "tuple[Observations, PointCloud, list[int]]":
+    """What keyframes saw of the anchors, the anchors, and the keyframes' rows in the trajectory."""
+    import numpy as np
+
+    from edgeslam_torch.eval.inputs.associate import nearest
+    from edgeslam_torch.types import Observations
+    from edgeslam_torch.writers.maps.colmap import NO_POINTS
+    from edgeslam_torch.writers.observations import read_observations
+
+    path, anchors = run.path / "observations.npz", run.cloud("anchors.ply")
+    if not path.exists():
+        print(f"{path}: not there (a run of version 0.1): points are not linked to images")
+        rows, none = run.keyframe_poses(), np.zeros(0, np.int64)
+        return Observations(run.trajectory.stamps_s[rows], none, none, np.zeros((0, 2))), NO_POINTS, rows
+    seen = read_observations(path)
+    if anchors is None or (len(seen.anchor) and seen.anchor.max() >= len(anchors.p_w)):
+        raise OutputError(f"{run.path}: anchors.ply and observations.npz are of different runs; make the run again")
+    index = nearest(run.trajectory.stamps_s, seen.stamps_s)
+    if len(index) == 0 or np.abs(run.trajectory.stamps_s[index] - seen.stamps_s).max() > _SAME_S:
+        raise OutputError(f"{run.path}: trajectory.txt lacks keyframes of observations.npz; make the run again")
+    return seen, anchors, index.tolist()
 
 
 def _occupancy(run: "RunFolder", cloud: "PointCloud", args: argparse.Namespace) -> Path:
@@ -124,4 +167,11 @@ def _occupancy(run: "RunFolder", cloud: "PointCloud", args: argparse.Namespace) 
     return path.with_suffix(".yaml")
 
 
-_WRITERS = {"ply": _ply, "pcd": _pcd, "colmap": _colmap, "occupancy": _occupancy}
+_WRITERS = {
+    "ply": _ply,
+    "pcd": _pcd,
+    "las": _las,
+    "colmap": _colmap,
+    "nerfstudio": _nerfstudio,
+    "occupancy": _occupancy,
+}

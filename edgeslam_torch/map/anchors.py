@@ -90,12 +90,16 @@ class Anchors:
         self.alive[ids] = False
         self._just_removed.extend(ids.tolist())
 
+    def confirmed(self, ids: IntArray) -> IntArray:
+        """Those of the given anchors that at least two keyframes observe."""
+        return ids[self.alive[ids] & (self.observations[ids] >= MIN_OBSERVATIONS)]
+
     def cloud(self, ids: IntArray) -> PointCloud:
         """Those of the given anchors that at least two keyframes observe; the caller holds the map's lock.
 
         Where the depth rests on a prior, `sigma` is the prior's: half of the depth or more.
         """
-        ids = ids[self.alive[ids] & (self.observations[ids] >= MIN_OBSERVATIONS)]
+        ids = self.confirmed(ids)
         return PointCloud(
             self.p_w[ids].astype(np.float32),
             self.colour[ids],

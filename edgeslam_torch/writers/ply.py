@@ -7,7 +7,7 @@ import numpy as np
 
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.files.atomic import write_atomically
-from edgeslam_torch.types import PointCloud
+from edgeslam_torch.types import FloatArray, PointCloud
 
 VERTEX = np.dtype(
     [
@@ -22,6 +22,8 @@ VERTEX = np.dtype(
     ]
 )
 """One point of the file; ``sigma`` in metres, or map units while the scale is unknown."""
+
+NORMAL = ("nx", "ny", "nz")
 
 _PLY_TYPES = {
     "char": "i1",
@@ -45,25 +47,29 @@ _NAMES = {"f4": "float", "u1": "uchar", "i4": "int"}
 _MAX_HEADER_BYTES = 65536
 
 
-def write_ply(path: Path, cloud: PointCloud, comments: tuple[str, ...] = ()) -> None:
+def write_ply(path: Path, cloud: PointCloud, comments: tuple[str, ...] = (), normals: FloatArray | None = None) -> None:
     """Write a cloud, atomically; extra properties such as ``sigma`` are ignored by other viewers.
 
     Args:
         path: File to make.
         cloud: ``P`` points.
         comments: Lines for the header, such as the units.
+        normals: ``(P, 3)`` for ``nx ny nz``; none by default.
 
     Raises:
         OSError: If the file cannot be written.
     """
-    vertices = np.empty(len(cloud.p_w), dtype=VERTEX)
+    dtype = VERTEX if normals is None else np.dtype([*VERTEX.descr, *((name, "<f4") for name in NORMAL)])
+    vertices = np.empty(len(cloud.p_w), dtype=dtype)
     for axis, name in enumerate(("x", "y", "z")):
         vertices[name] = cloud.p_w[:, axis]
     for channel, name in enumerate(("red", "green", "blue")):
         vertices[name] = cloud.colour[:, channel]
     vertices["sigma"] = cloud.sigma_m
     vertices["observations"] = cloud.observations
-    properties = [f"property {_NAMES[VERTEX[name].str[1:]]} {name}" for name in VERTEX.names or ()]
+    for axis, name in enumerate(NORMAL if normals is not None else ()):
+        vertices[name] = np.asarray(normals)[:, axis]
+    properties = [f"property {_NAMES[dtype[name].str[1:]]} {name}" for name in dtype.names or ()]
     remarks = [f"comment {' '.join(comment.split())}" for comment in comments]
     lines = ["ply", "format binary_little_endian 1.0", *remarks, f"element vertex {len(vertices)}", *properties]
     header = "\n".join([*lines, "end_header", ""]).encode("ascii", errors="replace")

@@ -27,10 +27,14 @@ EDGE_MAP = "edge_map.ply"
 ANCHORS = "anchors.ply"
 CONFIG = "config.toml"
 CAMERA = "camera.yaml"
+OBSERVATIONS = "observations.npz"
 PICTURE = "map.png"
 PIECE = "trajectory_piece_{}.txt"
 """Of pieces that were never joined with the largest, which is in `TRAJECTORY`."""
-OUTPUTS = (TRAJECTORY, ONLINE, STATUS, EDGE_MAP, ANCHORS, SUMMARY, CONFIG, CAMERA, PICTURE, "report.html")
+OUTPUTS = (
+    *(TRAJECTORY, ONLINE, STATUS, EDGE_MAP, ANCHORS, SUMMARY),
+    *(CONFIG, CAMERA, OBSERVATIONS, PICTURE, "report.html"),
+)
 
 STATUS_COLUMNS = (
     "index",

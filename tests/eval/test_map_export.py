@@ -18,9 +18,9 @@ from edgeslam_torch.errors import EdgeSlamError
 from edgeslam_torch.geometry.camera import PRESETS, Camera
 from edgeslam_torch.geometry.camera_file import save_camera
 from edgeslam_torch.types import PointCloud
-from edgeslam_torch.writers.colmap import write_colmap
+from edgeslam_torch.writers.maps.colmap import write_colmap
+from edgeslam_torch.writers.maps.pcd import write_pcd
 from edgeslam_torch.writers.occupancy import FREE, OCCUPIED, UNKNOWN, occupancy_grid, write_occupancy
-from edgeslam_torch.writers.pcd import write_pcd
 from edgeslam_torch.writers.ply import write_ply
 
 
@@ -140,13 +140,29 @@ def export(*words: object) -> int:
     return export_map.main(parser.parse_args([str(w) for w in words]))
 
 
-@pytest.mark.parametrize("form", export_map.FORMATS)
+@pytest.mark.parametrize("form", [form for form in export_map.FORMATS if form != "nerfstudio"])
 def test_command_writes_every_format(form: str, run_folder: Callable[..., Path], tmp_path: Path) -> None:
     run_folder(tmp_path / "a")
     save_camera(tmp_path / "a" / "camera.yaml", PRESETS["kinect"])
     before = set((tmp_path / "a").rglob("*"))
     assert export(tmp_path / "a", "--format", form, "--max-sigma", 0.05) == 0
     assert set((tmp_path / "a").rglob("*")) > before
+
+
+def test_nerfstudio_without_images_says_so(run_folder: Callable[..., Path], tmp_path: Path) -> None:
+    run_folder(tmp_path / "a")
+    save_camera(tmp_path / "a" / "camera.yaml", PRESETS["kinect"])
+    with pytest.raises(EdgeSlamError, match=r"images of the keyframes are not there; run 'edgeslam run' on a folder"):
+        export(tmp_path / "a", "--format", "nerfstudio")
+
+
+def test_run_without_observations_has_points_without_images(
+    run_folder: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run_folder(tmp_path / "a")
+    save_camera(tmp_path / "a" / "camera.yaml", PRESETS["kinect"])
+    assert export(tmp_path / "a", "--format", "colmap") == 0
+    assert "points are not linked to images" in capsys.readouterr().out
 
 
 def test_occupancy_needs_metres(run_folder: Callable[..., Path], tmp_path: Path) -> None:

@@ -3,7 +3,7 @@
 import numpy as np
 
 from edgeslam_torch.geometry import se3
-from edgeslam_torch.types import FrameStatus, Piece, PointCloud, ScaleEstimate, SlamOutput, Support
+from edgeslam_torch.types import FrameStatus, Observations, Piece, PointCloud, ScaleEstimate, SlamOutput, Support
 
 
 class FakeSlam:
@@ -85,6 +85,10 @@ class FakeSlam:
 
     def anchors(self):
         return self.edge_map()
+
+    def observations(self):
+        none = np.zeros(0, np.int64)
+        return Observations(np.zeros(0), none, none, np.zeros((0, 2), np.float32))
 
     def keyframes(self):
         return [o for o in self.outputs if o.keyframe]
