@@ -15,7 +15,7 @@ MUTANTS_ARGS ?=
 STAMP := $(VENV)/.installed
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help install demo test test-slow mutants lint docs wheel clean
+.PHONY: help install demo test test-slow mutants lint docs notebooks wheel clean
 
 help:
 	@echo "make demo | test | test-slow | mutants | lint | docs | wheel | clean"
@@ -63,6 +63,10 @@ wheel: $(STAMP)
 docs: $(STAMP)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build -q
 	@echo "docs: open site/index.html"
+
+# Runs the notebooks and keeps what they show.
+notebooks: $(STAMP)
+	cd examples/notebooks && ../../$(BIN)/jupyter execute --inplace *.ipynb
 
 clean:
 	rm -rf dist build site runs .pytest_cache .mypy_cache .ruff_cache .hypothesis

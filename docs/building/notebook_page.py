@@ -9,7 +9,7 @@ def notebook_page(path: Path) -> str:
     """Text, code and outputs in order; pictures are inside the page."""
     book = json.loads(path.read_text(encoding="utf-8"))
     parts = [part for cell in book["cells"] for part in _cell(cell)]
-    return "\n\n".join([*parts, f"[This notebook]({path.name}): `examples/notebooks/{path.name}`"]) + "\n"
+    return "\n\n".join([*parts, f"The notebook: `examples/notebooks/{path.name}`"]) + "\n"
 
 
 def _cell(cell: dict[str, Any]) -> list[str]:
@@ -20,6 +20,8 @@ def _cell(cell: dict[str, Any]) -> list[str]:
 
 
 def _output(output: dict[str, Any]) -> str:
+    if output.get("name") == "stderr":
+        return ""
     data = output.get("data", {})
     if "image/png" in data:
         return f'<img alt="what the cell draws" src="data:image/png;base64,{"".join(data["image/png"].split())}">'
