@@ -72,7 +72,10 @@ def choose_camera(
     centre = ((size[0] - 1) / 2.0, (size[1] - 1) / 2.0)
     source = f"{GUESS}: 1.2*max(w,h) = {focal:.0f} px"
     camera = Camera(*size, focal, focal, *centre, source=source, focal_sigma=GUESSED_FOCAL_SIGMA)
-    return camera, [f"{GUESS_WARNING} a focal length of {focal:.0f} px; {GUESS_COST}"]
+    warnings = [f"{GUESS_WARNING} a focal length of {focal:.0f} px; {GUESS_COST}"]
+    if size[0] == 2 * size[1]:
+        warnings.append("pictures twice as wide as high: a panorama has no focal length; export a flat video")
+    return camera, warnings
 
 
 def _lens_doubts(camera: Camera, name: str) -> list[str]:

@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from edgeslam_torch.calibration.board import Board
 
 _PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".ppm", ".pgm")
-_LIVE = ("tello://", "webcam:", "rtsp://", "udp://")
 _LIVE_GAP_S = 1.0
 
 
@@ -37,13 +36,14 @@ def main(args: argparse.Namespace) -> int:
     """Calibrate, write the file, and print its quality."""
     from edgeslam_torch.calibration.board import Board, calibrate
     from edgeslam_torch.errors import CalibrationError, ConfigError, OutputError
+    from edgeslam_torch.readers.source import LIVE_SCHEMES
 
     if args.board and args.charuco:
         raise ConfigError("give --board or --charuco, not both")
     columns, rows = _size(args.charuco or args.board)
     board = Board(columns, rows, args.square / 1e3, bool(args.charuco), args.marker / 1e3, args.dictionary)
     unreadable: dict[str, str] = {}
-    live = args.images[0].startswith(_LIVE)
+    live = args.images[0].startswith(LIVE_SCHEMES)
     if live and len(args.images) > 1:
         raise ConfigError("give one live camera, or pictures")
     pictures = _live_pictures(args.images[0], board, args.views) if live else _pictures(args.images, unreadable)

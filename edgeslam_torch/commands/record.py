@@ -19,7 +19,9 @@ if TYPE_CHECKING:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's options."""
-    parser.add_argument("source", metavar="SOURCE", help="tello://HOST[:PORTS], webcam:N, rtsp://..., udp://...")
+    parser.add_argument(
+        "source", metavar="SOURCE", help="tello://HOST[:PORTS], webcam:N, rtsp://..., http://..., gst:PIPELINE"
+    )
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder (default: flights/DATE-TIME)")
     parser.add_argument("--camera", metavar="FILE|PRESET", help="calibration that is stored with the recording")
     parser.add_argument("--duration", type=float, metavar="S", help="stop after this time (default: until Ctrl-C)")

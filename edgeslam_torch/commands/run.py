@@ -25,7 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "source",
         metavar="SOURCE",
         help="TUM, 7-Scenes, EuRoC or image folder, video file, flight recording, ROS bag, tello://HOST, webcam:N, "
-        "rtsp://...",
+        "rtsp://..., http://..., gst:PIPELINE",
     )
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the results (default: runs/NAME)")
     parser.add_argument(

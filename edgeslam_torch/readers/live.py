@@ -4,7 +4,7 @@ import re
 import threading
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
@@ -14,6 +14,7 @@ from edgeslam_torch.drone.tello import StateMessage, Tello, TelloAddress, TelloE
 from edgeslam_torch.drone.video_stream import ArrivalClock, Picture
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.readers.gstreamer import SCHEME, GStreamerCapture
 from edgeslam_torch.readers.listing import Problem
 from edgeslam_torch.types import Frame, TelemetrySample
 
@@ -21,6 +22,8 @@ FIRST_PICTURE_S = 10.0
 """A Tello's first pictures cannot be decoded until a keyframe comes."""
 SILENCE_S = 10.0
 """After this time without a picture the source has ended."""
+_MAX_NAME = 60
+"""Characters of an address in a folder's name."""
 _SLICE_S = 0.1
 """Polling interval of a waiting source."""
 
@@ -61,7 +64,7 @@ class LiveSource:
             CalibrationError: If the calibration does not fit.
         """
         self.location = location
-        self.name = re.sub(r"[^A-Za-z0-9.-]+", "_", location).strip("_") or "live"
+        self.name = re.sub(r"[^A-Za-z0-9.-]+", "_", location).strip("_")[:_MAX_NAME] or "live"
         self.telemetry = telemetry
         self.length = max_frames
         self.problems: list[Problem] = []
@@ -157,15 +160,12 @@ class CaptureFeed:
     """OpenCV's capture in a thread that keeps only the newest picture."""
 
     def __init__(self, device: int | str, name: str) -> None:
-        """Open the device.
+        """Open the device, address or pipeline.
 
         Raises:
             SourceError: If it cannot be opened.
         """
-        self._capture = cv2.VideoCapture(device)
-        if not self._capture.isOpened():
-            self._capture.release()
-            raise SourceError(f"{name}: cannot be opened; is it there, and free?")
+        self._capture = _opened(device, name)
         self._clock = ArrivalClock()
         self._ready = threading.Condition()
         self._newest: Picture | None = None
@@ -210,8 +210,38 @@ class CaptureFeed:
         self._capture.release()
 
 
+class Capture(Protocol):
+    """The part of `cv2.VideoCapture` that is used."""
+
+    def read(self) -> tuple[bool, Any]:
+        """Whether there is a picture, and the picture."""
+
+    def release(self) -> None:
+        """Close."""
+
+
+def _opened(device: int | str, name: str) -> Capture:
+    if isinstance(device, str) and device.startswith(SCHEME):
+        return GStreamerCapture(device)
+    if isinstance(device, int):
+        capture = cv2.VideoCapture(device)
+    else:
+        limit_ms = round(1e3 * FIRST_PICTURE_S)
+        limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, limit_ms, cv2.CAP_PROP_READ_TIMEOUT_MSEC, limit_ms]
+        capture = cv2.VideoCapture(device, cv2.CAP_FFMPEG, limits)
+    if not capture.isOpened():
+        capture.release()
+        raise SourceError(f"{name}: cannot be opened; is it there, and free?")
+    return capture
+
+
+def without_password(address: str) -> str:
+    """An address that may be shown and shared: ``rtsp://user:secret@camera/1`` without user and password."""
+    return re.sub(r"//[^/?#]*@", "//", address)
+
+
 def open_live(spec: str, camera: str | Path | None = None, max_frames: int | None = None) -> LiveSource:
-    """Open ``tello://HOST[:PORTS]``, ``webcam:N``, ``rtsp://...`` or ``udp://...``.
+    """Open ``tello://HOST[:PORTS]``, ``webcam:N``, ``rtsp://...``, ``udp://...``, ``http://...`` or ``gst:PIPELINE``.
 
     A Tello is only observed: no motion command is sent.
 
@@ -228,7 +258,8 @@ def open_live(spec: str, camera: str | Path | None = None, max_frames: int | Non
         if not (number.isascii() and number.isdigit()):
             raise SourceError(f"{spec}: give webcam:N with a number, such as webcam:0")
         device = int(number)
-    return LiveSource(spec, CaptureFeed(device, spec), [], camera, max_frames, is_drone=False)
+    shown = without_password(spec)
+    return LiveSource(shown, CaptureFeed(device, shown), [], camera, max_frames, is_drone=False)
 
 
 def open_tello(

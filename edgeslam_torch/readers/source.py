@@ -21,7 +21,7 @@ from edgeslam_torch.readers.sequence import Sequence as ImageSequence
 from edgeslam_torch.readers.telemetry_csv import read_telemetry
 from edgeslam_torch.types import Frame, TelemetrySample
 
-LIVE_SCHEMES = ("tello://", "webcam:", "rtsp://", "udp://")
+LIVE_SCHEMES = ("tello://", "webcam:", "rtsp://", "udp://", "http://", "https://", "gst:")
 
 ARCHIVES = {
     ".zip": "an archive: unpack it first",
@@ -30,6 +30,9 @@ ARCHIVES = {
     ".tar": "an archive: unpack it first",
     ".7z": "an archive: unpack it first",
 }
+
+PANORAMAS = (".insv", ".360")
+"""Raw files of Insta360 and GoPro cameras: two fisheye pictures side by side."""
 
 
 class Source(Protocol):
@@ -120,7 +123,7 @@ def open_source(
 
     Args:
         spec: A TUM-layout, 7-Scenes, EuRoC or image folder, a video file, a flight recording, a ROS bag, or a live
-            source (``tello://HOST``, ``webcam:0``, ``rtsp://...``).
+            source (``tello://HOST``, ``webcam:0``, ``rtsp://...``, ``http://...``, ``gst:PIPELINE``).
         camera: Calibration file or preset; default: the source's own.
         telemetry: ``telemetry.csv`` of the flight; default: the source's own.
         max_frames: Maximum number of frames.
@@ -186,6 +189,8 @@ def _file_content(path: Path) -> _Content:
         return _listed(ImageSequence("images", path.parent, (ImageEntry(0, 0.0, path),)), path)
     if suffix in ARCHIVES:
         raise SourceError(f"{path}: {ARCHIVES[suffix]}, then give the folder")
+    if suffix in PANORAMAS:
+        raise SourceError(f"{path}: a raw panorama; export a flat video of one direction in its maker's program")
     if path.name in tum.LISTS:
         return _folder_content(path.parent)
     return _video_content(path, None)

@@ -48,14 +48,16 @@ class Video:
     def frames(self, problems: list[Problem]) -> Iterator[Frame]:
         """Frames with strictly increasing stamps; skipped ones are added to ``problems``."""
         capture = _opened(self.path)
-        last, index = -math.inf, -1
+        last, index, shown_s = -math.inf, -1, 0.0
         try:
             while True:
                 ok, image = capture.read()
                 if not ok:
                     break
                 index += 1
-                stamp = self._stamp(index, capture.get(cv2.CAP_PROP_POS_MSEC))
+                container_ms = capture.get(cv2.CAP_PROP_POS_MSEC)
+                shown_s = 1e-3 * container_ms if math.isfinite(container_ms) else shown_s
+                stamp = self._stamp(index, container_ms)
                 if stamp is None or stamp <= last:
                     reason = "has no stamp" if stamp is None else f"stamp {stamp:.6f} does not increase"
                     problems.append(Problem(f"{self.path}, frame {index}", f"{reason}; image left out"))
@@ -64,7 +66,9 @@ class Video:
                 yield Frame(index, stamp, np.asarray(image, dtype=np.uint8), self.path)
         finally:
             capture.release()
-        if self.count is not None and index + 1 < 0.98 * self.count:
+        # Matroska has no count: OpenCV multiplies duration by rate, which is too many where the rate varies.
+        whole = self.count is None or index + 1 >= 0.98 * self.count or shown_s >= 0.9 * self.count / self.rate_hz
+        if self.count is not None and not whole:
             reason = f"decoding ended after {index + 1} of {self.count} frames; the file is damaged"
             problems.append(Problem(str(self.path), reason, self.count - index - 1))
 
