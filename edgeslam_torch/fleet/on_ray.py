@@ -35,7 +35,7 @@ class OnRay:
     def __call__(self, tasks: Sequence[Task], prepare: Callable[[Task], Path]) -> Generator[tuple[Task, Ended]]:
         """See `edgeslam_torch.fleet.batch.Runner`."""
         ray = _connected(self.address)
-        try:
+        try:  # an interrupted batch disconnects: Ray ends its workers, and flights end with them (ray.cancel crashed)
             yield from self._run(ray, tasks, prepare)
         finally:
             ray.shutdown()
@@ -44,17 +44,13 @@ class OnRay:
         remote = ray.remote(num_cpus=1, max_retries=self.retries)(_attempt)
         waiting = deque(tasks)
         running: dict[Any, Task] = {}
-        try:
-            while waiting or running:
-                most = _QUEUED_PER_CPU * max(1, int(ray.cluster_resources().get("CPU", 1)))
-                while waiting and len(running) < most:
-                    task = waiting.popleft()
-                    running[remote.remote(str(prepare(task)), self.limits, self.retries)] = task
-                for reference in ray.wait(list(running))[0]:
-                    yield running.pop(reference), _ended(ray, reference)
-        finally:
-            for reference in running:
-                ray.cancel(reference)
+        while waiting or running:
+            most = _QUEUED_PER_CPU * max(1, int(ray.cluster_resources().get("CPU", 1)))
+            while waiting and len(running) < most:
+                task = waiting.popleft()
+                running[remote.remote(str(prepare(task)), self.limits, self.retries)] = task
+            for reference in ray.wait(list(running))[0]:
+                yield running.pop(reference), _ended(ray, reference)
 
 
 def _attempt(folder: str, limits: Limits, retries: int) -> Ended:

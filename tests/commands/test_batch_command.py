@@ -144,6 +144,20 @@ def test_ray_gives_the_same_results(ten_recordings, tmp_path):
 
 
 @pytest.mark.slow
+def test_ctrl_c_on_ray_leaves_no_process(ten_recordings, tmp_path):
+    pytest.importorskip("ray", reason="needs the [fleet] extra: Ray is not installed")
+    out = tmp_path / "out"
+    process = subprocess.Popen(batch_command(ten_recordings, out, *RAY), stderr=subprocess.PIPE, text=True)
+    child = os.pidfd_open(flight_process(out, "flight_1"))
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=100)
+    assert process.returncode == 130, said
+    assert select.select([child], [], [], 30.0)[0], "the flight's process ends with its Ray worker"
+    os.close(child)
+    assert sum(row["state"] == "waiting" for row in rows_of(out).values()) >= 3
+
+
+@pytest.mark.slow
 @pytest.mark.skipif(PROGRAM is None, reason="no Chromium")
 def test_page_sorts_and_filters_in_a_browser(tmp_path):
     from edgeslam_torch.fleet.page import write_page
