@@ -61,7 +61,7 @@ class DroneModel:
     """
 
     clearance: Callable[[FloatArray], float] = lambda p: math.inf
-    """Distance [m] of a point of the drone's world ``(3,)`` to the nearest surface other than the floor."""
+    """Distance [m] of a point of the drone's world ``(3,)`` to the nearest surface other than the floor, now."""
     air: Air = field(default_factory=Air)
     battery: float = 1.0
     battery_per_s: float = 1.0 / 780.0
@@ -84,6 +84,13 @@ class DroneModel:
     _speed: float = 0.5
     _busy_since: float = -1.0
     _clock: float = 0.0
+    _clear_m: float = math.inf
+    """Distance to the nearest surface at the end of the last step; infinite on the ground."""
+
+    @property
+    def clock_s(self) -> float:
+        """Time since power-on [s]."""
+        return self._clock
 
     @property
     def flying(self) -> bool:
@@ -135,6 +142,7 @@ class DroneModel:
         """Advance by ``dt`` seconds."""
         self._clock += dt
         if not self.flying:
+            self._clear_m = math.inf
             return
         self.motor_s += dt
         self.battery = max(0.0, self.battery - dt * self.battery_per_s)
@@ -142,9 +150,11 @@ class DroneModel:
             self.land()
         self._step_velocity(dt)
         ahead = self.p_w + dt * self.velocity
-        if self.clearance(ahead) < min(RADIUS_M, self.clearance(self.p_w)):
-            ahead = self._touch()
-        self.p_w = ahead
+        clear_m = self.clearance(ahead)
+        if clear_m < min(RADIUS_M, self._clear_m):
+            ahead = self._touch((self._clear_m - clear_m) / dt)
+            clear_m = self.clearance(self.p_w)
+        self.p_w, self._clear_m = ahead, clear_m
         self._step_yaw(dt)
         self._finish()
 
@@ -154,14 +164,14 @@ class DroneModel:
         wanted = np.clip(wanted + DRAG_PER_S * self.velocity, -_MAX_LEAN_M_S2, _MAX_LEAN_M_S2)
         self.lean_m_s2 = self.lean_m_s2 + (1.0 - math.exp(-dt / _LEAN_S)) * (wanted[:2] - self.lean_m_s2)
         thrust = np.array([*self.lean_m_s2, wanted[2]])
-        disturbed = self.air.drag(self.velocity, dt) + self.air.wash(self.clearance(self.p_w))
+        disturbed = self.air.drag(self.velocity, dt) + self.air.wash(self._clear_m)
         disturbed[2] += ground_effect(self.p_w[2]) - ground_effect(_HOVER_M)
         self.acceleration = thrust + disturbed
         self.velocity = self.velocity + dt * self.acceleration
 
-    def _touch(self) -> FloatArray:
-        """Bounce off, or crash; returns where it is afterwards."""
-        speed = float(np.linalg.norm(self.velocity))
+    def _touch(self, closing_m_s: float) -> FloatArray:
+        """Bounce off, or crash; returns where it is afterwards. What it touches may be what moves."""
+        speed = max(float(np.linalg.norm(self.velocity)), closing_m_s if math.isfinite(closing_m_s) else 0.0)
         crashed = speed > _CRASH_M_S
         self.contacts.append(Contact(self._clock, self.p_w.copy(), speed, crashed, self.mode))
         if crashed:

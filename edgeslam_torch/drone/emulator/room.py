@@ -10,7 +10,7 @@ from edgeslam_torch.geometry.camera import PRESETS, Camera
 from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.synthetic.house.render import picture
 from edgeslam_torch.synthetic.house.rooms import room
-from edgeslam_torch.synthetic.house.world import MAX_LEVEL, World
+from edgeslam_torch.synthetic.house.world import MAX_LEVEL
 from edgeslam_torch.synthetic.sites.site import Site
 from edgeslam_torch.synthetic.sites.solids import Solids
 from edgeslam_torch.types import FloatArray
@@ -41,7 +41,8 @@ def furnished_drone(
     T_room_w = np.eye(4)  # the drone's own world, fixed at power-on, in the room
     T_room_w[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
     T_room_w[:3, 3] = start[0], start[1], low[2]
-    return _drone(world, Solids(world), T_room_w, tilt_rad, size, battery, Air())
+    still = Site("room", seed, world, Solids(world), T_room_w, np.zeros(3), (), np.zeros((0, 2)))
+    return drone_at(still, tilt_rad, size, battery)
 
 
 def drone_at(
@@ -56,28 +57,21 @@ def drone_at(
         battery: Charge in [0, 1].
         air: Wind and gusts; still air without it.
     """
-    return _drone(site.world, site.solids, site.T_site_w, tilt_rad, size, battery, air or Air())
-
-
-def _drone(
-    world: World,
-    solids: Solids,
-    T_place_w: FloatArray,
-    tilt_rad: float,
-    size: tuple[int, int],
-    battery: float,
-    air: Air,
-) -> tuple[DroneModel, Paint, Camera]:
-    for quad in world.quads:  # the coarse levels, which would otherwise delay their first use by a tenth of a second
+    for (
+        quad
+    ) in site.world.quads:  # the coarse levels, which would otherwise delay their first use by a tenth of a second
         quad.texture.level(MAX_LEVEL)
         quad.texture.level(MAX_LEVEL - 1)
     camera = PRESETS["tello"].scaled(*size)
     T_b_c = camera_on_body(tilt_rad)
 
+    drone = DroneModel(battery=battery, air=air or Air())
+
     def clearance(p_w: FloatArray) -> float:
-        return float(solids.distance((T_place_w[:3, :3] @ p_w + T_place_w[:3, 3])[None])[0])
+        return float(site.clearance(p_w[None], drone.clock_s)[0])
 
     def paint(T_w_b: FloatArray) -> np.ndarray:
-        return picture(world, camera, T_place_w @ T_w_b @ T_b_c)
+        return picture(site.painted(drone.clock_s), camera, site.T_site_w @ T_w_b @ T_b_c)
 
-    return DroneModel(clearance=clearance, battery=battery, air=air), paint, camera
+    drone.clearance = clearance
+    return drone, paint, camera

@@ -9,7 +9,9 @@ from edgeslam_torch.geometry import se3
 from edgeslam_torch.synthetic.house.rooms import FLOORS, TEXTURED_WALLS, furnish_wall, hang_lamp, line_wall, shell
 from edgeslam_torch.synthetic.house.scene import Place, Scene, random_paint
 from edgeslam_torch.synthetic.house.world import Box
+from edgeslam_torch.synthetic.sites.mirror import mirrored
 from edgeslam_torch.synthetic.sites.obstacles import connected, stand_in_the_way
+from edgeslam_torch.synthetic.sites.people import Walker, walker
 from edgeslam_torch.synthetic.sites.site import Site, TrueExit
 from edgeslam_torch.synthetic.sites.solids import Solids
 from edgeslam_torch.synthetic.sites.walls import DOOR_HEIGHT_M, Opening, wall
@@ -31,6 +33,9 @@ class _Layout:
     exits: list[TrueExit] = field(default_factory=list)
     panes: list[Box] = field(default_factory=list)
     """Glass: solid and not painted."""
+    walkers: list[Walker] = field(default_factory=list)
+    mirror: bool = False
+    """Whether the wall at the high end of x is a mirror."""
 
 
 def _scene(
@@ -173,6 +178,48 @@ def _glass(rng: Rng) -> _Layout:
     return layout
 
 
+def _mirror(rng: Rng) -> _Layout:
+    """The corridor that turns left; its dead end is a mirror from wall to wall."""
+    layout = _l_corridor(rng)
+    layout.mirror = True
+    return layout
+
+
+def _people(rng: Rng) -> _Layout:
+    """The corridor with a person who walks along one side of it, and one who crosses it."""
+    layout = _straight(rng, TEXTURED_WALLS, dressed=False)
+    side = 0.55 if rng.random() < 0.5 else -0.55
+    across = float(rng.uniform(7.5, 9.5))
+    layout.walkers.append(walker(rng, np.array([[3.5, side], [10.5, side]]), float(rng.uniform(0.5, 0.9))))
+    layout.walkers.append(walker(rng, np.array([[across, -0.6], [across, 0.6]]), float(rng.uniform(0.3, 0.6))))
+    return layout
+
+
+def _doors(rng: Rng) -> _Layout:
+    """A corridor with five doors to rooms on its left; two stand open, and the goal is behind the farther one."""
+    long, wide, deep, apart = 10.5, float(rng.uniform(2.0, 2.4)), 2.8, 2.1
+    lamps = [(x, y) for x in np.arange(apart / 2, long, apart) for y in (0.0, (wide + deep) / 2)]
+    scene = _scene(rng, (0.0, -wide / 2), (long, wide / 2 + deep), TEXTURED_WALLS, lamps)
+    is_open = set(rng.choice([1, 2, 3, 4], 2, replace=False).tolist())
+    doors = [
+        Opening(
+            (k + 0.5) * apart + float(rng.uniform(-0.15, 0.15)),
+            float(rng.uniform(0.85, 1.0)),
+            leaf_rad=float(rng.uniform(1.6, 1.8)) if k in is_open else 0.0,
+        )
+        for k in range(5)
+    ]
+    wall(scene, rng, np.array([[0.0, wide / 2], [long, wide / 2]]), doors, TEXTURED_WALLS)
+    for k in range(1, 5):
+        x = k * apart
+        wall(scene, rng, np.array([[x, wide / 2], [x, wide / 2 + deep]]), (), TEXTURED_WALLS)
+    line_wall(scene, Place(long / 2, -wide / 2, 0.0), long - 0.6, rng, HEIGHT_M)
+    goal = doors[max(is_open)].at_m
+    way = [(0.8, 0.0), (goal, 0.0), (goal, wide / 2 + 0.6 * deep)]
+    exits = [_exit(doors[k].at_m, wide / 2, (0.0, 1.0), doors[k].width_m) for k in sorted(is_open)]
+    return _Layout(scene, (0.8, 0.0, 0.0), way, exits)
+
+
 SITES: dict[str, Callable[[Rng], _Layout]] = {
     "cluttered_room": _cluttered_room,
     "corridor": _corridor,
@@ -180,9 +227,12 @@ SITES: dict[str, Callable[[Rng], _Layout]] = {
     "two_rooms": _two_rooms,
     "blank_walls": _blank_walls,
     "t_corridor": _t_corridor,
+    "doors": _doors,
     "glass": _glass,
+    "mirror": _mirror,
+    "people": _people,
 }
-"""The first five are static and judged; glass is flown, and nothing is promised."""
+"""The first five are static and judged; glass, mirror and people are flown, and nothing is promised."""
 JUDGED = tuple(SITES)[:5]
 
 
@@ -199,6 +249,8 @@ def named_site(name: str, seed: int) -> Site:
     rng = np.random.default_rng([*name.encode(), seed])
     layout = _flyable(SITES[name], rng)
     world = layout.scene.world(name)
+    if layout.mirror:
+        world = mirrored(world)
     x, y, yaw = layout.start
     T_site_w = np.eye(4)
     T_site_w[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
@@ -209,7 +261,8 @@ def named_site(name: str, seed: int) -> Site:
         TrueExit(T_w_site[:3, :3] @ e.centre_w + T_w_site[:3, 3], T_w_site[:3, :3] @ e.normal_w, e.width_m, e.height_m)
         for e in layout.exits
     )
-    return Site(name, seed, world, Solids(world, layout.panes), T_site_w, path[-1], exits, path[:, :2])
+    solids = Solids(world, layout.panes)
+    return Site(name, seed, world, solids, T_site_w, path[-1], exits, path[:, :2], tuple(layout.walkers))
 
 
 def _flyable(build: Callable[[Rng], _Layout], rng: Rng) -> _Layout:

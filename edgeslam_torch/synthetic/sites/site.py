@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from edgeslam_torch.synthetic.house.world import World
+from edgeslam_torch.synthetic.sites.mirror import with_quads
+from edgeslam_torch.synthetic.sites.people import Walker
 from edgeslam_torch.synthetic.sites.solids import Solids
 from edgeslam_torch.types import FloatArray
 
@@ -38,10 +40,27 @@ class Site:
     """In the drone's own world."""
     pathway_w: FloatArray
     """``(N, 2)`` a polyline from the start to the goal through free space, in the drone's own world [m]."""
+    walkers: tuple[Walker, ...] = ()
+    """People, who are neither in `world` nor in `solids`."""
 
-    def clearance(self, p_w: FloatArray) -> FloatArray:
-        """Distance [m] from points ``(N, 3)`` of the drone's own world to the nearest solid."""
-        return self.solids.distance(self.in_site(p_w))
+    def clearance(self, p_w: FloatArray, clock_s: float | None = None) -> FloatArray:
+        """Distance [m] from points ``(N, 3)`` of the drone's own world to the nearest solid.
+
+        Args:
+            p_w: The points.
+            clock_s: When, for sites in which people walk; without it, to what does not move.
+        """
+        p = self.in_site(p_w)
+        away = self.solids.distance(p)
+        if clock_s is not None:
+            for walker in self.walkers:
+                away = np.minimum(away, walker.distance(p, clock_s))
+        return away
+
+    def painted(self, clock_s: float) -> World:
+        """What a camera sees at a time."""
+        people = [quad for walker in self.walkers for quad in walker.painted(clock_s)]
+        return with_quads(self.world, people) if people else self.world
 
     def in_site(self, p_w: FloatArray) -> FloatArray:
         """Points ``(..., 3)`` of the drone's own world in the site's axes."""

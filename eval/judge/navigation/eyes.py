@@ -50,7 +50,8 @@ class TrueEyes:
 
     def _view(self, picture: Picture) -> View:
         T_w_c = picture.T_w_b @ self._T_b_c
-        depth = render(self._site.world, self._camera, self._site.T_site_w @ T_w_c, antialias=False).depth_m
+        world = self._site.painted(picture.captured_s)
+        depth = render(world, self._camera, self._site.T_site_w @ T_w_c, antialias=False).depth_m
         T_w_c[:3, 3] /= self._conditions.scale
         sigma = np.full(depth.shape, _SIGMA_LOG, np.float32)
         return View(picture.captured_s, depth / self._conditions.scale, sigma, self._camera.K, T_w_c)

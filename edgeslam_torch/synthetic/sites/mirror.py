@@ -1,0 +1,45 @@
+"""A wall that is a mirror: what a camera sees in it is the world once more, behind the wall."""
+
+from copy import copy
+
+import numpy as np
+
+from edgeslam_torch.synthetic.house.world import Quad, Texture, World
+
+REFLECTION = "reflection"
+"""Name of surfaces that are seen and not there."""
+_ON_WALL_M = 0.03
+"""What is nearer to the wall belongs to it: skirting boards."""
+
+
+def with_quads(world: World, quads: list[Quad]) -> World:
+    """The world with more surfaces; the arrays of its own are kept, which takes a millisecond."""
+    out = copy(world)
+    out.quads = (*world.quads, *quads)
+    out.corners_w = np.concatenate([world.corners_w, [q.corners_w for q in quads]])
+    out.normals_w = np.concatenate([world.normals_w, [q.normal_w for q in quads]])
+    texels = [float(q.texture.image.shape[0] * q.texture.image.shape[1]) for q in quads]
+    out.texels = np.concatenate([world.texels, texels])
+    out.two_sided = np.concatenate([world.two_sided, [q.two_sided for q in quads]])
+    return out
+
+
+def mirrored(world: World) -> World:
+    """The world with its outer wall at the high end of x taken as a mirror.
+
+    The wall's surface gives way to a reflected copy of everything, so that pictures and depth show what a camera before
+    a mirror sees. The copy's surfaces are named `REFLECTION`; the wall stays the world's bound.
+    """
+    wall = float(world.bounds_w[1, 0])
+    kept = [q for q in world.quads if (q.corners_w[:, 0] < wall - _ON_WALL_M).any()]
+    behind = [_reflected(q, wall) for q in kept]
+    return World([*kept, *behind], world.name, world.bounds_w, list(world.boxes), world.background)
+
+
+def _reflected(quad: Quad, wall: float) -> Quad:
+    """The other side of x = ``wall``; right becomes left, so that it is still seen from its painted side."""
+    flip = np.array([-1.0, 1.0, 1.0])
+    origin = (quad.origin_w + quad.u_w) * flip
+    origin[0] += 2.0 * wall
+    texture = Texture(np.ascontiguousarray(quad.texture.image[:, ::-1]))
+    return Quad(origin, -quad.u_w * flip, quad.v_w * flip, texture, REFLECTION, quad.two_sided)
