@@ -1,9 +1,11 @@
-"""``edgeslam report``: write the self-contained page of a run."""
+"""``edgeslam report``: write the self-contained page of a run, or of two runs side by side."""
 
 import argparse
 from pathlib import Path
 
-from edgeslam_torch.errors import OutputError
+from edgeslam_torch.errors import ConfigError, OutputError
+
+COMPARISON = "comparison.html"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -18,16 +20,43 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--no-map-score", action="store_true", help="do not compare the map with measured depth (faster)"
     )
+    parser.add_argument(
+        "--out",
+        type=Path,
+        metavar="FILE",
+        help=f"page of two runs side by side (default: {COMPARISON} beside the first of two)",
+    )
 
 
 def main(args: argparse.Namespace) -> int:
-    """Write each report and print its path."""
+    """Write each report, and the comparison of two; print their paths."""
     from edgeslam_torch.eval.report.page import write_report
 
+    if args.out is not None and len(args.runs) != 2:
+        raise ConfigError(f"--out is for the comparison of two runs, got {len(args.runs)}")
     for run in args.runs:
+        if len(args.runs) == 2 and run.is_file():
+            continue  # a trajectory alone has no report, but can be compared
         try:
             path = write_report(run, args.groundtruth, judge_map=not args.no_map_score)
         except OSError as error:
             raise OutputError(f"{run / 'report.html'}: cannot be written ({error.strerror or error})") from error
-        print(f"{path} ({path.stat().st_size / 1e6:.1f} MB)")
+        _say(path)
+    if len(args.runs) == 2:
+        _say(_compared(args))
     return 0
+
+
+def _compared(args: argparse.Namespace) -> Path:
+    from edgeslam_torch.eval.report.comparison import write_comparison
+
+    first, second = args.runs
+    out: Path = args.out if args.out is not None else first.resolve().parent / COMPARISON
+    try:
+        return write_comparison(first, second, out, args.groundtruth, judge_map=not args.no_map_score)
+    except OSError as error:
+        raise OutputError(f"{out}: cannot be written ({error.strerror or error})") from error
+
+
+def _say(path: Path) -> None:
+    print(f"{path} ({path.stat().st_size / 1e6:.1f} MB)")

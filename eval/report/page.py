@@ -76,7 +76,7 @@ def write_report(
     if run.path.is_file():
         raise EvaluationError(f"{run.path}: a report needs a run's folder, this is a single file")
     out = Path(out) if out is not None else run.path / "report.html"
-    score, truth = _judge(run, groundtruth, judge_map)
+    score, truth = judge_run(run, groundtruth, judge_map)
     write_text(out, render(run, score, truth))
     return out
 
@@ -85,7 +85,7 @@ def render(run: RunFolder, score: RunScore | None = None, truth: Trajectory | No
     """The page as text."""
     edges = _subset(run.cloud("edge_map.ply"), MAX_POINTS)
     anchors = _subset(run.cloud("anchors.ply"), _MAX_ANCHORS)
-    turn = _upright(run.trajectory, score, truth)
+    turn = upright(run.trajectory, score, truth)
     data, packed_edges, packed_anchors = _payload(run, edges, anchors, score, truth, turn)
     text = json.dumps(_finite(data), allow_nan=False, separators=(",", ":"), default=_plain).replace("<", "\\u003c")
     script = "\n".join((_PAGE / name).read_text(encoding="utf-8") for name in _SCRIPTS)
@@ -102,7 +102,7 @@ def render(run: RunFolder, score: RunScore | None = None, truth: Trajectory | No
     return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], page)
 
 
-def _judge(
+def judge_run(
     run: RunFolder, groundtruth: Path | str | None, judge_map: bool
 ) -> tuple[RunScore | None, Trajectory | None]:
     """Score and true trajectory; without a given ground truth, what the source folder offers, if anything."""
@@ -285,7 +285,7 @@ def _number(row: dict[str, str], *names: str) -> float:
     return float("nan")
 
 
-def _upright(trajectory: Trajectory, score: RunScore | None, truth: Trajectory | None) -> FloatArray:
+def upright(trajectory: Trajectory, score: RunScore | None, truth: Trajectory | None) -> FloatArray:
     """Rotation ``(3, 3)`` that turns the run's world so that z is up on the page.
 
     A run without telemetry takes its first camera for level; ground truth knows better, when its own z is up. Else a

@@ -1,0 +1,147 @@
+"""Two runs side by side."""
+
+import json
+import re
+import shutil
+from collections.abc import Callable
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from browser import PROGRAM, Browser
+
+from edgeslam_torch import cli
+from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, read_trajectory, write_tum
+from edgeslam_torch.eval.report import line_drawings
+from edgeslam_torch.eval.report.comparison import write_comparison
+
+
+class Cells(HTMLParser):
+    """Rows of all tables, and all text."""
+
+    def __init__(self, page: Path) -> None:
+        super().__init__()
+        self.rows: list[list[str]] = []
+        self.text = ""
+        self.tags: list[str] = []
+        self._cell = False
+        self.feed(page.read_text(encoding="utf-8"))
+
+    def handle_starttag(self, tag: str, attrs: object) -> None:
+        self.tags.append(tag)
+        if tag == "tr":
+            self.rows.append([])
+        self._cell = tag in ("td", "th")
+        if self._cell:
+            self.rows[-1].append("")
+
+    def handle_endtag(self, tag: str) -> None:
+        self._cell = False
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+        if self._cell:
+            self.rows[-1][-1] += data
+
+
+def _changed(folder: Path, turn: float = 0.7, size: float = 2.0, **summary: object) -> None:
+    """Another world (turned, moved, ``size`` times as large), and other values in the summary."""
+    run = read_trajectory(folder / "trajectory.txt")
+    R = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]])
+    T = run.T_w_c.copy()
+    T[:, :3, :3] = R @ T[:, :3, :3]
+    T[:, :3, 3] = size * T[:, :3, 3] @ R.T + [5.0, -3.0, 1.0]
+    write_tum(Trajectory(run.stamps_s, T, "b"), folder / "trajectory.txt")
+    known = json.loads((folder / "summary.json").read_text())
+    (folder / "summary.json").write_text(json.dumps(known | summary))
+
+
+@pytest.fixture
+def two(tmp_path: Path, run_folder: Callable[..., Path]) -> tuple[Path, Path]:
+    run_folder(tmp_path / "a", points=500)
+    shutil.copytree(tmp_path / "a", tmp_path / "b")
+    _changed(tmp_path / "b", fps=20.0, source=str(tmp_path / "secret" / "place"))
+    (tmp_path / "a" / "config.toml").write_text('seed = 0\n[depth]\nweights = "default"\n[orb]\nfeatures = 1000\n')
+    (tmp_path / "b" / "config.toml").write_text(f'seed = 0\n[depth]\nweights = "{tmp_path}/w.safetensors"\n')
+    return tmp_path / "a", tmp_path / "b"
+
+
+def test_figures_and_their_difference(two: tuple[Path, Path], tmp_path: Path) -> None:
+    rows = {row[0]: row[1:] for row in Cells(write_comparison(*two, tmp_path / "c.html")).rows}
+    assert rows["frames per second"] == ["24.5", "20.0", "-4.5"]
+    a, b = (float(text.split()[0]) for text in rows["length of the path"][:2])
+    assert b == pytest.approx(2.0 * a, rel=1e-3)
+    assert rows["orb.features"] == ["1000", "\u2013"]
+    assert rows["depth.weights"] == ['"default"', '"w.safetensors"']
+    assert "seed" not in rows
+
+
+def test_one_path_is_laid_on_the_other(two: tuple[Path, Path], tmp_path: Path) -> None:
+    text = Cells(write_comparison(*two, tmp_path / "c.html")).text
+    found = re.search(
+        r"B is laid on A by (\d+) common frames .* made ([\d.]+) times as large\); .* then (\S+) m apart", text
+    )
+    assert found is not None
+    assert found[1] == "200" and float(found[2]) == pytest.approx(0.5, abs=1e-3) and float(found[3]) < 1e-6
+
+
+def test_runs_without_common_frames_are_drawn_apart(two: tuple[Path, Path], tmp_path: Path) -> None:
+    run = read_trajectory(two[1] / "trajectory.txt")
+    write_tum(Trajectory(run.stamps_s + 1e6, run.T_w_c, "b"), two[1] / "trajectory.txt")
+    assert "no frames in common" in Cells(write_comparison(*two, tmp_path / "c.html")).text
+
+
+def test_page_may_be_passed_on(two: tuple[Path, Path], tmp_path: Path) -> None:
+    page = write_comparison(*two, tmp_path / "c.html").read_text()
+    assert str(tmp_path) not in page and "secret" not in page
+    assert not re.findall(r'(?:src|href)="(?!data:)', page) and "<script" not in page and "http" not in page
+
+
+def test_hostile_names_stay_text(two: tuple[Path, Path], tmp_path: Path) -> None:
+    bad = two[1].rename(tmp_path / "<script>alert(1)<&script>")
+    parsed = Cells(write_comparison(two[0], bad, tmp_path / "c.html"))
+    assert "script" not in parsed.tags and "<script>alert(1)" in parsed.text
+
+
+def test_command_writes_reports_and_comparison(
+    two: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["report", str(two[0]), str(two[1]), "--no-map-score"]) == 0
+    assert [line.split()[0].rpartition("/")[2] for line in capsys.readouterr().out.splitlines()] == [
+        "report.html",
+        "report.html",
+        "comparison.html",
+    ]
+    assert (tmp_path / "comparison.html").is_file()
+    assert cli.main(["report", str(two[0]), str(two[1] / "trajectory.txt"), "--out", str(tmp_path / "x.html")]) == 0
+    for wrong in ([str(two[0]), str(two[0])], [str(two[0]), "--out", "x.html"], [str(two[0]), str(tmp_path / "no")]):
+        capsys.readouterr()
+        assert cli.main(["report", *wrong]) == 1
+        assert len(capsys.readouterr().err.splitlines()) == 1
+
+
+def test_drawing_keeps_shape_and_direction() -> None:
+    drawn = line_drawings.view([np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 1.0]])], ["red"], "m")
+    points = re.search(r'points="([^"]+)"', drawn)
+    assert points is not None
+    xy = np.array([[float(c) for c in pair.split(",")] for pair in points[1].split()])
+    right, up = xy[1] - xy[0], xy[2] - xy[1]
+    assert right[0] > 0 and right[1] == 0 and up[0] == 0
+    assert -up[1] == pytest.approx(right[0] / 2, abs=0.1)  # SVG's y points down
+    bar = re.search(r"h([\d.]+)\".*>([\d.]+) m<", drawn)
+    assert bar is not None and float(bar[1]) / float(bar[2]) == pytest.approx(right[0] / 2, rel=1e-2)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(PROGRAM is None, reason="no chromium here")
+def test_page_in_a_browser(two: tuple[Path, Path], tmp_path: Path) -> None:
+    page = write_comparison(*two, tmp_path / "c.html")
+    with Browser(tmp_path / "profile") as browser:
+        browser.open(page)
+        wide = "document.documentElement.scrollWidth > innerWidth + 1"
+        assert browser.run(f"({{wide: {wide}, lines: document.querySelectorAll('polyline').length}})") == {
+            "wide": False,
+            "lines": 5,
+        }
+        assert browser.errors == []
