@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from edgeslam_torch.train.views.edge_pixels import edge_pixels
     from edgeslam_torch.train.views.junctions import junction_points, seen_cosines
     from edgeslam_torch.train.views.posed import PosedSequence, PosedView, load_run, relative_motion
+    from edgeslam_torch.train.views.shards import load_shards, write_shards
     from edgeslam_torch.train.views.straight import straight_edges
     from edgeslam_torch.train.watchers import ProgressBar, TensorBoard
 
@@ -51,6 +52,7 @@ _HOMES = {
     "views.edge_pixels": "edge_pixels",
     "views.junctions": "junction_points seen_cosines",
     "views.posed": "PosedSequence PosedView load_run relative_motion",
+    "views.shards": "load_shards write_shards",
     "views.straight": "straight_edges",
     "watchers": "ProgressBar TensorBoard",
 }
@@ -91,6 +93,7 @@ __all__ = [
     "junction_points",
     "load_depth_folder",
     "load_run",
+    "load_shards",
     "named_hooks",
     "out_folder",
     "predict_metres",
@@ -103,6 +106,7 @@ __all__ = [
     "straight_edges",
     "train",
     "world",
+    "write_shards",
 ]
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 from scipy.ndimage import map_coordinates
@@ -18,6 +18,7 @@ from edgeslam_torch.errors import SourceError
 from edgeslam_torch.models.checkpoint import load_checkpoint, save_checkpoint
 from edgeslam_torch.models.fastdepth import FastDepth
 from edgeslam_torch.models.record import Metadata
+from edgeslam_torch.train.calibrate_sigma import calibrate_sigma
 from edgeslam_torch.train.folder import TEACHER, TENSORBOARD, WEIGHTS, OutFolder
 from edgeslam_torch.train.given import HOOKS, Given, labelled_set, posed_set, weights_name
 from edgeslam_torch.train.outcome import Outcome
@@ -35,8 +36,8 @@ from edgeslam_torch.train.watchers import ProgressBar, curves
 
 logger = logging.getLogger(__name__)
 
-HELD_OUT = 10
-"""Every tenth view with depth is used for validation by default."""
+HELD_OUT, MOST_HELD_OUT = 10, 400
+"""Every tenth view with depth is used for validation by default; at most 400, which stay in memory."""
 OWN_DATA = "; fine-tuned on the user's data"
 
 
@@ -93,6 +94,7 @@ def finetune(
     reading: Mapping[str, object] = MappingProxyType({}),
     hooks: Sequence[Hooks] = (),
     cache: TeacherCache | None = None,
+    calibrate: bool = False,
 ) -> Outcome:
     """Train ``network`` on ``data``; resumes a training in ``out`` with the same inputs.
 
@@ -109,6 +111,7 @@ def finetune(
         reading: How the data was read, plain values by name; a training is resumed only if they are the same.
         hooks: Your own, called after the progress and before TensorBoard, in every process.
         cache: Keeps the teacher's depth for other trainings; by default ``out`` keeps it for this one.
+        calibrate: Fit scale and floor of sigma to the validation images: for networks whose uncertainty is new.
 
     Raises:
         SourceError: If there is nothing to learn from, or to validate on.
@@ -147,7 +150,7 @@ def finetune(
         watching,
         None if before is None else _metrics(before),
     )
-    return by_first(lambda: _conclude(state, start, metadata, tuned, before, held_out, out))
+    return by_first(lambda: _conclude(state, start, metadata, tuned, before, held_out, out, calibrate))
 
 
 def settings_of(
@@ -203,12 +206,37 @@ def _split(folders: Sequence[DepthFolder], keep_all: bool) -> tuple[list[Source]
     held_out: list[View] = []
     sources = []
     for folder in folders:
-        views = list(folder.views)
+        views = folder.views
         if not keep_all and len(views) > 1:
-            held_out += views[::HELD_OUT]
-            views = [v for i, v in enumerate(views) if i % HELD_OUT]
+            every = max(HELD_OUT, math.ceil(len(views) / MOST_HELD_OUT))
+            held_out += list(views[::every])
+            views = _WithoutEvery(views, every)
         sources.append(Source(folder.name, views, 1.0))
     return sources, held_out
+
+
+class _WithoutEvery(Sequence[View]):
+    """All views but those whose number is a multiple of ``every``, read when asked for."""
+
+    def __init__(self, views: Sequence[View], every: int) -> None:
+        self._views, self._every = views, every
+
+    def __len__(self) -> int:
+        return len(self._views) - math.ceil(len(self._views) / self._every)
+
+    @overload
+    def __getitem__(self, index: int) -> View: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> list[View]: ...
+
+    def __getitem__(self, index: int | slice) -> View | list[View]:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
+        if not -len(self) <= index < len(self):
+            raise IndexError(index)
+        index %= len(self)
+        return self._views[index + index // (self._every - 1) + 1]
 
 
 def _measured_only(taught: Taught) -> View:
@@ -235,6 +263,7 @@ def _conclude(
     before: DepthScores | None,
     held_out: Sequence[View],
     out: OutFolder,
+    calibrate: bool,
 ) -> Outcome:
     """Write the better weights with their metadata, and return the outcome."""
     path = out.path / WEIGHTS
@@ -251,6 +280,8 @@ def _conclude(
         kept = score(best, metadata, held_out)
         outcome = Outcome(path, state.step, state.best_step, before, score(last, metadata, held_out), kept)
         record = dataclasses.replace(tuned, metrics={k: round(v, 4) for k, v in _metrics(kept).items() if k != "score"})
+        if calibrate:
+            record = calibrate_sigma(best, record, held_out)
         save_checkpoint(best, outcome.noted_in(record), path, half=True)
     out.finish(outcome)
     for warning in outcome.warnings():

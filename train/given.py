@@ -83,6 +83,8 @@ def weights_name(network: FastDepth, metadata: Metadata) -> str:
 
 def labelled_set(folder: DepthFolder) -> DataSet:
     """Record of a folder with depth."""
+    if folder.sha256 is not None:
+        return DataSet(folder.name, "depth", len(folder.views), folder.sha256)
     arrays = (array for v in folder.views for array in (v.image, v.depth_m, v.K))
     return DataSet(folder.name, "depth", len(folder.views), _hash(arrays))
 

@@ -36,6 +36,8 @@ class DepthFolder:
     views: Sequence[View]
     left_out: tuple[str, ...]
     """Skipped files with reasons."""
+    sha256: str | None = None
+    """Hash of the content, where reading all of it would take too long; None: of the views themselves."""
 
 
 def load_depth_folder(
@@ -73,7 +75,7 @@ def load_depth_folder(
         if isinstance(view, str):
             left_out.append(view)
         else:
-            views.append(_reduced(view, width))
+            views.append(reduced(view, width))
     if not views:
         why = f" ({left_out[0]})" if left_out else f" (no image within {max_gap_s:g} s of a depth map)"
         raise SourceError(f"{folder}: no image with depth could be read{why}")
@@ -133,7 +135,8 @@ def _words(problem: Problem) -> str:
     return f"{problem.file}: {problem.reason}"
 
 
-def _reduced(view: View, width: int) -> View:
+def reduced(view: View, width: int) -> View:
+    """The view at most ``width`` pixels wide."""
     h, w = view.image.shape[:2]
     if w <= width:
         return view

@@ -35,7 +35,7 @@ def add_shared_arguments(parser: argparse.ArgumentParser, steps: int, batch: int
         "data",
         nargs="+",
         type=Path,
-        help="recordings (TUM, 7-Scenes, EuRoC, flights, videos), folders of 'edgeslam run' or 'batch', in any mix",
+        help="recordings (TUM, 7-Scenes, EuRoC, flights, videos), folders of 'edgeslam run' or 'batch', tar shards",
     )
     parser.add_argument("--out", "-o", type=Path, required=True, help="folder for weights, curve and checkpoints")
     again = parser.add_mutually_exclusive_group()
@@ -183,6 +183,7 @@ def items_of(args: argparse.Namespace, ignore_depth: bool) -> list[Item]:
     """
     from edgeslam_torch.train.views.datasets import has_depth
     from edgeslam_torch.train.views.posed import is_run_folder
+    from edgeslam_torch.train.views.shards import is_sharded
 
     items: list[Item] = []
     for path in _without_batches(args.data):
@@ -191,13 +192,17 @@ def items_of(args: argparse.Namespace, ignore_depth: bool) -> list[Item]:
         if path.is_dir() and args.out.is_dir() and path.samefile(args.out):
             raise ConfigError(f"{path}: is a training folder; give another --out")
         name = os.path.basename(os.path.abspath(path))
-        kind = "run" if is_run_folder(path) else "depth" if has_depth(path) and not ignore_depth else "recording"
+        is_run = is_run_folder(path)
+        has_labels = not is_run and (is_sharded(path) or has_depth(path))
+        if ignore_depth and has_labels and is_sharded(path):
+            raise SourceError(f"{path}: shards are single images with depth, which SLAM cannot run on")
+        kind = "run" if is_run else "depth" if has_labels and not ignore_depth else "recording"
         if kind == "recording":  # of two recordings with one name each gets a run of its own
             same = sum(item.kind == kind and item.path.name == path.name for item in items)
             name = f"{name}-{same + 1}" if same else name
         items.append(Item(path, kind, name))
     for path in args.validate:
-        if not has_depth(path):
+        if not (path.exists() and is_sharded(path)) and not has_depth(path):
             raise SourceError(f"{path}: no recording with depth (rgb.txt, depth.txt and camera.yaml) to validate on")
         if any(item.kind == "depth" and item.path.samefile(path) for item in items):
             raise ConfigError(f"{path}: is used for training and cannot validate; omit --validate")
@@ -251,9 +256,17 @@ def teacher_cache(args: argparse.Namespace) -> "TeacherCache | None":
 
 def validation_folders(paths: Sequence[Path]) -> "list[DepthFolder]":
     """Images with depth to validate on."""
-    from edgeslam_torch.train.views.datasets import load_depth_folder
+    return [labelled_folder(path, width=640) for path in paths]
 
-    return [load_depth_folder(path, width=640) for path in paths]
+
+def labelled_folder(path: Path, width: int = 400, max_frames: int | None = None) -> "DepthFolder":
+    """Images with depth of a recording, or of tar shards."""
+    from edgeslam_torch.train.views.datasets import load_depth_folder
+    from edgeslam_torch.train.views.shards import is_sharded, load_shards
+
+    if is_sharded(path):
+        return load_shards(path, width, max_frames)
+    return load_depth_folder(path, width, max_frames=max_frames)
 
 
 def _left(out: "OutFolder") -> str:

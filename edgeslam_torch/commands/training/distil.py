@@ -136,7 +136,7 @@ def _distil(
     if rank() == 0:
         for line in data.describe():
             print(line, flush=True)
-    return finetune(student, metadata, data, config, out, reading=reading, hooks=hooks)
+    return finetune(student, metadata, data, config, out, reading=reading, hooks=hooks, calibrate=True)
 
 
 def _labelled(

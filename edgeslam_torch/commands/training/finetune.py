@@ -12,6 +12,7 @@ from edgeslam_torch.commands.training._inputs import (
     check_shared,
     in_folder,
     items_of,
+    labelled_folder,
     posed_run,
     teacher_cache,
     validation_folders,
@@ -124,14 +125,13 @@ def _finetune(
 def _data(args: argparse.Namespace, items: list[Item], out: "OutFolder") -> "Data":
     """Read the folders; SLAM is run on recordings without labels first."""
     from edgeslam_torch.train.finetuning import Data
-    from edgeslam_torch.train.views.datasets import load_depth_folder
     from edgeslam_torch.train.views.posed import TooFewViews
 
     data = Data(validation=validation_folders(args.validate))
     useless: list[TooFewViews] = []
     for item in items:
         if item.kind == "depth":
-            data.labelled.append(load_depth_folder(item.path, max_frames=args.max_frames))
+            data.labelled.append(labelled_folder(item.path, max_frames=args.max_frames))
             continue
         try:
             data.posed.append(posed_run(item, out, args.camera, args.max_frames, args.weights))

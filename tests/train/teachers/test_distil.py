@@ -13,13 +13,16 @@ from posed_run import CAMERA, world
 from edgeslam_torch.commands.training import distil as command
 from edgeslam_torch.errors import ConfigError, SourceError
 from edgeslam_torch.models.checkpoint import load_checkpoint
+from edgeslam_torch.models.fastdepth import FastDepth
 from edgeslam_torch.models.layout import Variant
 from edgeslam_torch.models.onnx.graph import build_graph
-from edgeslam_torch.models.record import DEFAULT_WEIGHTS
+from edgeslam_torch.models.record import DEFAULT_WEIGHTS, Metadata
 from edgeslam_torch.synthetic.house.render import render
+from edgeslam_torch.train.calibrate_sigma import coverage, residuals_and_sigma
 from edgeslam_torch.train.teachers import teach
 from edgeslam_torch.train.teachers.distil import brought_to_map, label, log_metres, new_student
-from edgeslam_torch.train.views.posed import PosedSequence, load_run
+from edgeslam_torch.train.views.augment import View
+from edgeslam_torch.train.views.posed import PosedSequence, PosedView, load_run
 from edgeslam_torch.types import DepthMap, FloatArray
 
 
@@ -125,6 +128,17 @@ def teacher_file(path: Path) -> Path:
     return path
 
 
+def true_small(view: PosedView) -> FloatArray:
+    height, width = view.image.shape[:2]
+    return cv2.resize(true_depth(view.T_w_c), (width, height), interpolation=cv2.INTER_NEAREST)
+
+
+def coverage_of(network: FastDepth, metadata: Metadata, views: list[View]) -> float:
+    """Share of true log depth within one sigma."""
+    residuals, raw = residuals_and_sigma(network, metadata, views)
+    return coverage(residuals, np.hypot(metadata.sigma_scale * raw, metadata.sigma_floor))[0]
+
+
 def arguments(tmp_path: Path, *words: object) -> argparse.Namespace:
     parser = argparse.ArgumentParser()
     command.add_arguments(parser)
@@ -141,7 +155,12 @@ def test_distil_command_writes_weights_and_says_what_was_learnt(
     assert command.main(arguments(tmp_path, *words)) == 0
     printed = capsys.readouterr().out
     assert "pixels measured" in printed and "| before |" in printed
-    assert load_checkpoint(tmp_path / "out" / "weights.safetensors")[1].variant == Variant.PRUNED
+    student, metadata = load_checkpoint(tmp_path / "out" / "weights.safetensors")
+    assert metadata.variant == Variant.PRUNED
+    assert (metadata.sigma_scale, metadata.sigma_floor) != (1.0, 0.0), "of the student's own errors"
+    held_out = [v for v in load_run(run_folder).views if v.z.size]
+    truths = [View(v.image, true_small(v), v.K) for v in held_out]
+    assert coverage_of(student, metadata, truths) == pytest.approx(0.68, abs=0.25)
     assert command.main(arguments(tmp_path, *words)) == 0
     assert "nothing was left to train" in capsys.readouterr().out
 

@@ -1,0 +1,273 @@
+"""Images with depth in tar files, for sets larger than memory; the layout is WebDataset's.
+
+A sample is the files of one name up to the first dot: ``000001.jpg`` (or png), ``000001.depth.png`` (16 bits) or
+``000001.depth.npy`` (metres), and ``000001.json`` with ``fx``, ``fy``, ``cx``, ``cy`` of the undistorted image [px]
+and ``depth_per_m`` of a png. Nothing is unpacked: the places of all files are read once, and a sample when it is drawn.
+
+Any recording with depth becomes shards by ``python -m edgeslam_torch.train.views.shards RECORDING... --out FOLDER``.
+"""
+
+import argparse
+import hashlib
+import io
+import json
+import logging
+import tarfile
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import overload
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from edgeslam_torch.errors import SourceError
+from edgeslam_torch.files.atomic import write_atomically
+from edgeslam_torch.train.views.augment import View
+from edgeslam_torch.train.views.datasets import MAX_SHOWN, DepthFolder, load_depth_folder, reduced
+from edgeslam_torch.types import FloatArray
+
+logger = logging.getLogger(__name__)
+
+IMAGES = ("jpg", "jpeg", "png")
+DEPTHS = ("depth.png", "depth.npy")
+DEPTH_PER_M = 1000.0
+"""Of a depth.png whose json says nothing else."""
+TAIL = 64
+"""Bytes at the end of each file that tell changed content [bytes]."""
+PER_SHARD = 1000
+"""Samples in a file that `write_shards` writes; about 200 MB."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Place:
+    """Where a file lies in its tar."""
+
+    offset: int
+    size: int
+
+
+@dataclass(frozen=True, slots=True)
+class _Sample:
+    shard: Path
+    name: str
+    files: dict[str, _Place]
+    """By extension."""
+
+
+class ShardedViews(Sequence[View]):
+    """Views of tar files, read and decoded when asked for; nothing is kept.
+
+    Args:
+        samples: Where they lie.
+        width: Images are reduced to this width [px] (never enlarged).
+    """
+
+    def __init__(self, samples: Sequence[_Sample], width: int) -> None:
+        self._samples, self._width = samples, width
+
+    def __len__(self) -> int:
+        return len(self._samples)
+
+    @overload
+    def __getitem__(self, index: int) -> View: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> "ShardedViews": ...
+
+    def __getitem__(self, index: int | slice) -> "View | ShardedViews":
+        """One view, or the unread views of a slice.
+
+        Raises:
+            SourceError: If the sample cannot be read; names it.
+        """
+        if isinstance(index, slice):
+            return ShardedViews(self._samples[index], self._width)
+        sample = self._samples[index]
+        try:
+            return reduced(_decoded(sample), self._width)
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, cv2.error) as error:
+            why = " ".join(str(error).split())[:120]
+            raise SourceError(f"{sample.shard}: {sample.name} cannot be read ({why})") from error
+
+
+def is_sharded(path: Path) -> bool:
+    """Whether this is a tar file or a folder of them."""
+    return path.suffix == ".tar" if path.is_file() else any(path.glob("*.tar"))
+
+
+def load_shards(path: Path, width: int = 400, max_frames: int | None = None) -> DepthFolder:
+    """The samples of a tar file or a folder of them, unread.
+
+    Args:
+        path: The file or folder.
+        width: Images are reduced to this width [px].
+        max_frames: Use only the first samples.
+
+    Raises:
+        SourceError: If a file is damaged or compressed, or there is no whole sample.
+    """
+    shards = sorted(path.glob("*.tar")) if path.is_dir() else [path]
+    samples: list[_Sample] = []
+    left_out: list[str] = []
+    digest = hashlib.sha256()
+    for shard in shards:
+        for sample in _samples_of(shard):
+            missing = _missing(sample)
+            if missing:
+                left_out.append(f"{shard.name}: {sample.name} has no {missing}")
+                continue
+            samples.append(sample)
+            digest.update(_fingerprint(sample))
+    if not samples:
+        raise SourceError(f"{path}: no sample of image, depth and calibration{f' ({left_out[0]})' if left_out else ''}")
+    if left_out:
+        shown = ", ".join(left_out[:MAX_SHOWN]) + (", ..." if len(left_out) > MAX_SHOWN else "")
+        logger.warning("%s: %d samples left out: %s", path, len(left_out), shown)
+    samples = samples[:max_frames]
+    return DepthFolder(path.stem, ShardedViews(samples, width), tuple(left_out), digest.hexdigest())
+
+
+def write_shards(views: Iterable[View], out: Path, name: str, per_shard: int = PER_SHARD) -> list[Path]:
+    """Write views as shards ``NAME-000000.tar`` and so on; each file whole or not at all.
+
+    Args:
+        views: Undistorted; depth beyond 65 m is lost.
+        out: Folder, made when missing.
+        name: Beginning of file and sample names, without a dot.
+        per_shard: Samples in a file.
+
+    Raises:
+        OSError: If a file cannot be written.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    written: list[Path] = []
+    batch: list[View] = []
+    for view in views:
+        batch.append(view)
+        if len(batch) == per_shard:
+            written.append(_write(batch, out, name, len(written) * per_shard))
+            batch = []
+    if batch:
+        written.append(_write(batch, out, name, len(written) * per_shard))
+    return written
+
+
+def _samples_of(shard: Path) -> Iterator[_Sample]:
+    """Samples in order; WebDataset keeps the files of one beside each other."""
+    try:
+        size = shard.stat().st_size
+        with tarfile.open(shard, "r:") as tar:
+            name, files = "", dict[str, _Place]()
+            for member in tar:
+                if not member.isfile():
+                    continue
+                if member.offset_data + member.size > size:
+                    raise SourceError(f"{shard}: is cut off in {member.name}")
+                folder, _, file = member.name.rpartition("/")
+                stem, _, extension = file.partition(".")
+                key = f"{folder}/{stem}" if folder else stem
+                if key != name and files:
+                    yield _Sample(shard, name, files)
+                    files = {}
+                name = key
+                files[extension.lower()] = _Place(member.offset_data, member.size)
+            if files:
+                yield _Sample(shard, name, files)
+    except (OSError, tarfile.TarError) as error:
+        raise SourceError(
+            f"{shard}: no tar file that can be read in place ({error}); compressed ones: gunzip"
+        ) from error
+
+
+def _fingerprint(sample: _Sample) -> bytes:
+    """Names, sizes and last bytes of its files, where a png has its checksum; reading all may take hours."""
+    ends = []
+    with sample.shard.open("rb") as file:
+        for name, place in sorted(sample.files.items()):
+            length = min(TAIL, place.size)
+            ends.append((name, place.size, _read(file, _Place(place.offset + place.size - length, length))))
+    return repr((sample.shard.name, sample.name, ends)).encode()
+
+
+def _missing(sample: _Sample) -> str:
+    for what, names in {"image": IMAGES, "depth": DEPTHS, "calibration (json)": ("json",)}.items():
+        if not any(name in sample.files for name in names):
+            return what
+    return ""
+
+
+def _decoded(sample: _Sample) -> View:
+    image_kind, depth_kind = (next(k for k in kinds if k in sample.files) for kinds in (IMAGES, DEPTHS))
+    with sample.shard.open("rb") as file:
+        content = {kind: _read(file, sample.files[kind]) for kind in (image_kind, depth_kind, "json")}
+    record = json.loads(content["json"])
+    image = cv2.imdecode(np.frombuffer(content[image_kind], np.uint8), cv2.IMREAD_COLOR)
+    if image is None:
+        raise ValueError(f"{image_kind}: no image")
+    depth_m = _depth(content[depth_kind], depth_kind, float(record.get("depth_per_m", DEPTH_PER_M)))
+    if depth_m.shape != image.shape[:2]:
+        raise ValueError(f"depth {depth_m.shape[::-1]} of an image {image.shape[1::-1]}")
+    fx, fy, cx, cy = (float(record[name]) for name in ("fx", "fy", "cx", "cy"))
+    if not (np.isfinite([fx, fy, cx, cy]).all() and fx > 0 and fy > 0):
+        raise ValueError("fx, fy, cx, cy are no calibration")
+    return View(np.asarray(image, np.uint8), depth_m, np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]))
+
+
+def _depth(content: bytes, kind: str, per_m: float) -> FloatArray:
+    """Metres ``(H, W)`` float32, 0 where unknown."""
+    if kind == "depth.npy":
+        depth = np.load(io.BytesIO(content), allow_pickle=False).astype(np.float32)
+    else:
+        stored = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+        if stored is None or stored.dtype != np.uint16 or per_m <= 0:
+            raise ValueError("depth.png: no 16-bit image")
+        depth = stored.astype(np.float32) / np.float32(per_m)
+    return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0.0))
+
+
+def _read(file: io.BufferedReader, place: _Place) -> bytes:
+    file.seek(place.offset)
+    content = file.read(place.size)
+    if len(content) != place.size:
+        raise ValueError("the file is shorter than when training began")
+    return content
+
+
+def _write(views: Sequence[View], out: Path, name: str, first: int) -> Path:
+    buffer = io.BytesIO()
+    with tarfile.open(fileobj=buffer, mode="w") as tar:
+        for number, view in enumerate(views, start=first):
+            (fx, _, cx), (_, fy, cy) = view.K[:2].tolist()
+            stored = np.clip(np.rint(view.depth_m * DEPTH_PER_M), 0, 65535).astype(np.uint16)
+            record = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "depth_per_m": DEPTH_PER_M}
+            contents = {"png": _png(view.image), "depth.png": _png(stored), "json": json.dumps(record).encode()}
+            for extension, content in contents.items():
+                entry = tarfile.TarInfo(f"{name}-{number:06d}.{extension}")
+                entry.size = len(content)
+                tar.addfile(entry, io.BytesIO(content))
+    path = out / f"{name}-{first:06d}.tar"
+    write_atomically(path, lambda file: file.write(buffer.getbuffer()))
+    return path
+
+
+def _png(image: NDArray[np.uint8] | NDArray[np.uint16]) -> bytes:
+    return cv2.imencode(".png", image)[1].tobytes()
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("recordings", nargs="+", type=Path, help="recordings with depth")
+    parser.add_argument("--out", type=Path, required=True, help="folder for the tar files")
+    parser.add_argument("--width", type=int, default=400, help="images are reduced to this width [px]")
+    args = parser.parse_args()
+    for recording in args.recordings:
+        folder = load_depth_folder(recording, args.width)
+        written = write_shards(folder.views, args.out, folder.name.replace(".", "_"))
+        print(f"{recording}: {len(folder.views)} samples in {len(written)} files")  # noqa: T201 - this is a command
+
+
+if __name__ == "__main__":
+    main()
