@@ -69,6 +69,8 @@ class Flown:
     """What the supervisor met."""
     track_w: list[list[float]] = field(default_factory=list)
     """``(N, 3)`` true way, for pictures."""
+    attitude: list[list[float]] = field(default_factory=list)
+    """``(N, 5)`` beside it: clock [s]; roll, pitch, yaw [rad]; clearance beyond the hull [m]."""
 
     def record(self) -> dict[str, Any]:
         """For JSON."""
@@ -100,7 +102,9 @@ def fly(case: Case, limits: NavLimits | None = None) -> Flown:
 
 @dataclass(slots=True)
 class _Tick:
+    clock_s: float
     p_w: FloatArray
+    rpy: FloatArray
     speed_m_s: float
     clearance_m: float
     cpu_s: float
@@ -133,7 +137,8 @@ def _fly(
             supervisor.propose(pilot.update(sight), tello.clock_s)
         order = supervisor.order(tello.clock_s)
         cpu_s = time.process_time() - began
-        ticks.append(_Tick(drone.p_w.copy(), float(np.linalg.norm(drone.velocity)), drone.clearance(drone.p_w), cpu_s))
+        speed, clear_m = float(np.linalg.norm(drone.velocity)), drone.clearance(drone.p_w)
+        ticks.append(_Tick(tello.clock_s, drone.p_w.copy(), drone.rpy(), speed, clear_m, cpu_s))
         if order.danger and str(order.danger) not in dangers:
             dangers.append(str(order.danger))
         if pilot.phase in (Phase.DONE, Phase.STUCK):
@@ -161,6 +166,8 @@ def _sum_up(found: Flown, site: Site, drone: DroneModel, ticks: list[_Tick]) -> 
     hull = np.array([t.clearance_m for t in ticks]) - NavLimits().radius_m
     speed, cpu = np.array([t.speed_m_s for t in ticks]), 1e3 * np.array([t.cpu_s for t in ticks])
     found.track_w = np.round(p, 3).tolist()
+    clock, rpy = np.array([t.clock_s for t in ticks]), np.array([t.rpy for t in ticks])
+    found.attitude = np.round(np.column_stack([clock, rpy, hull]), 3).tolist()
     found.path_m = float(np.linalg.norm(np.diff(p[:, :2], axis=0), axis=1).sum())
     found.distance_m = float(np.linalg.norm(drone.p_w[:2] - site.goal_w[:2]))
     found.reached = found.ended == str(Phase.DONE) and found.distance_m < REACHED_M and not found.contacts

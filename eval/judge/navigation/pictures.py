@@ -34,6 +34,11 @@ def top_view(flown: Flown) -> np.ndarray:
     cv2.circle(image, pixel(np.zeros(2)), 6, _START, -1, cv2.LINE_AA)
     cv2.circle(image, pixel(site.goal_w), 6, _GOAL, -1, cv2.LINE_AA)
     words = f"{flown.case.world} {flown.case.seed} {flown.case.fault}: {flown.ended}, {flown.contacts} contacts"
-    cv2.putText(image, words, (8, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (255, 255, 255), 3, cv2.LINE_AA)
-    cv2.putText(image, words, (8, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0, 0, 0), 1, cv2.LINE_AA)
+    return captioned(image, words)
+
+
+def captioned(image: np.ndarray, words: str) -> np.ndarray:
+    """The image with white words on a dark strip at its top; it is written into."""
+    cv2.rectangle(image, (0, 0), (image.shape[1], 21), (30, 30, 30), -1)
+    cv2.putText(image, words, (6, 15), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (255, 255, 255), 1, cv2.LINE_AA)
     return image

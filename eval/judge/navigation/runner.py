@@ -8,17 +8,18 @@ from pathlib import Path
 
 import cv2
 
+from edgeslam_torch.eval.judge.navigation.film import film_strip
 from edgeslam_torch.eval.judge.navigation.flight import Case, Flown, fly
 from edgeslam_torch.eval.judge.navigation.pictures import top_view
 from edgeslam_torch.eval.judge.navigation.table import markdown
 from edgeslam_torch.files.atomic import write_text
 
 _WORST = 6
-"""Flights of which a top view is written."""
+"""Flights of which a top view and a film strip are written."""
 
 
 def judge_flights(cases: Sequence[Case], out: Path, jobs: int, say: Callable[[str], None]) -> list[Flown]:
-    """Fly all cases, write a record each, ``navigation.md`` and top views of the worst flights.
+    """Fly all cases, write a record each, ``navigation.md``, top views and film strips of the worst.
 
     Args:
         cases: What to fly.
@@ -39,7 +40,11 @@ def judge_flights(cases: Sequence[Case], out: Path, jobs: int, say: Callable[[st
     flights = [found[case] for case in cases]
     write_text(out / "navigation.md", markdown(flights))
     for flown in sorted(flights, key=lambda f: (f.reached, not f.contacts, f.clearance_min_m))[:_WORST]:
-        cv2.imwrite(str(out / f"top_{flown.case.world}_{flown.case.seed}_{flown.case.fault}.png"), top_view(flown))
+        name = f"{flown.case.world}_{flown.case.seed}_{flown.case.fault}.png"
+        cv2.imwrite(str(out / f"top_{name}"), top_view(flown))
+        strip = film_strip(flown)
+        if strip is not None:
+            cv2.imwrite(str(out / f"film_{name}"), strip)
     return flights
 
 

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+from edgeslam_torch.eval.judge.navigation.film import film_strip, moments
 from edgeslam_torch.eval.judge.navigation.flight import Case, Flown, fly
 from edgeslam_torch.eval.judge.navigation.oracle import shortest_m, true_layer
 from edgeslam_torch.eval.judge.navigation.pictures import top_view
@@ -53,6 +54,32 @@ def test_finished_flights_are_not_flown_again(tmp_path):
 def test_a_top_view_shows_the_way():
     image = top_view(flown(True, track_w=[[0.0, 0.0, 1.0], [5.0, 0.0, 1.0]]))
     assert image.ndim == 3 and (image == (200, 90, 20)).all(2).sum() > 300
+
+
+def filmed(clearances):
+    """A straight flight of 0.1 s and 0.2 m a tick."""
+    track = [[0.2 * k, 0.0, 1.1] for k in range(len(clearances))]
+    attitude = [[5.0 + 0.1 * k, 0.0, 0.0, 0.0, c] for k, c in enumerate(clearances)]
+    return flown(True, track_w=track, attitude=attitude)
+
+
+def test_a_film_ends_with_the_narrowest_moment():
+    clearances = np.full(41, 0.8)
+    clearances[30] = 0.1
+    assert moments(filmed(clearances)) == [0, 13, 27, 40, 10, 20, 25, 30]
+
+
+def test_a_film_shows_the_wall_coming_nearer():
+    strip = film_strip(filmed(np.linspace(1.0, 0.2, 51)))
+    first, last = strip[:240, :320].astype(int), strip[:240, 960:].astype(int)
+    assert strip.shape == (480, 1280, 3)
+    assert np.abs(first - last).mean() > 3
+    np.testing.assert_array_equal(strip[240:, 960:], strip[:240, 960:])  # the narrowest is the last
+
+
+def test_a_flight_that_never_flew_has_no_film():
+    assert film_strip(flown(False)) is None
+    assert film_strip(flown(False, track_w=[[0.0, 0.0, 1.0]])) is None, "a record from before film strips"
 
 
 def test_unknown_faults_are_refused():
