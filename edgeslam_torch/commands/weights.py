@@ -155,7 +155,8 @@ def _size_and_record(path: Path) -> "tuple[str, Metadata | ExternalNetwork]":
         from edgeslam_torch.models.onnx.external import read_external
         from edgeslam_torch.models.onnx.file import holds_record, read_onnx
 
-        return "", read_onnx(path)[1] if holds_record(path) else read_external(path)[1]
+        metadata = read_onnx(path)[1] if holds_record(path) else read_external(path)[1]
+        return _operations(path), metadata
     from edgeslam_torch.models.checkpoint import load_checkpoint
     from edgeslam_torch.models.complexity import measure_complexity
 
@@ -163,6 +164,21 @@ def _size_and_record(path: Path) -> "tuple[str, Metadata | ExternalNetwork]":
     # On the meta device: counting needs only shapes, whatever image size the record states.
     size = measure_complexity(network.to("meta"), metadata.input_height, metadata.input_width)
     return f"\n{size.parameters / 1e6:.2f} M parameters, {size.macs / 1e9:.2f} GMAC per image", metadata
+
+
+def _operations(path: Path) -> str:
+    """Multiply-accumulates of an ONNX file, on a line of their own; nothing where its size is open."""
+    import onnx
+
+    from edgeslam_torch.models.onnx.operations import count_operations
+
+    try:
+        count = count_operations(onnx.load(path))
+    except ValueError:
+        return ""
+    total = count.int8_macs + count.float_macs
+    share = count.int8_macs / max(total, 1)
+    return f"\n{total / 1e9:.2f} GMAC per image, {share:.0%} in int8; weights {count.weight_bytes / 1e6:.1f} MB"
 
 
 def _printable(text: str) -> str:
