@@ -7,6 +7,7 @@ import bag_files as bags
 import cv2
 import numpy as np
 import pytest
+from ros1_bag import ros1_bag
 
 from edgeslam_torch import cli
 from edgeslam_torch.errors import CalibrationError, MissingPackageError, SourceError
@@ -63,6 +64,15 @@ def test_each_format_gives_the_pictures_stamps_and_calibration_that_were_written
     assert camera.distortion == (0.05, -0.02, 0.001, -0.002, 0.01)
     assert source.kind == "bag" and source.length == 5 and source.warnings == []
     assert len(list(source.frames())) == 5  # a second time
+
+
+def test_a_bag_written_byte_by_byte_after_the_format(tmp_path):
+    times = _times(4)
+    path = tmp_path / "a.bag"
+    path.write_bytes(ros1_bag("/cam/image_raw", times, [_pixels(i).tobytes() for i in range(4)], 64, 48))
+    frames = list(open_source(path).frames())
+    assert [frame.stamp_s for frame in frames] == pytest.approx(times, abs=1e-6)
+    np.testing.assert_array_equal(frames[2].image, _pixels(2)[:, :, ::-1])  # written as RGB
 
 
 def test_a_camera_given_by_the_user_replaces_the_bags(tmp_path):
