@@ -126,7 +126,14 @@ class EdgeSlam:
         self._present = Present()
         """What `pose_now` and `health` rest on: replaced as a whole, never changed."""
         self._machine = Machine()
-        atlas = Atlas(self._system.tracker, self.edges, self.log, lm, config.mapping.loop_closure)
+        atlas = Atlas(
+            self._system.tracker,
+            self.edges,
+            self.log,
+            lm,
+            config.mapping.loop_closure,
+            self._system.fusion.scale_around,
+        )
         self._joining = Joining(self._system, atlas)
         self._earlier: EarlierFlights | None = None
         self._tracking = Tracking(self._system)

@@ -4,12 +4,21 @@ One false join bends everything; a missed one leaves two pieces that say so. Hen
 keyframes that have no keyframe in common and agree about the similarity, never on one; and so is a loop closed.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from edgeslam_torch.atlas.links import Link, link
-from edgeslam_torch.atlas.loops import LOOP_SHARE, Closure, far_keyframes, is_plausible, is_within_reach, spread
+from edgeslam_torch.atlas.loops import (
+    LOOP_SHARE,
+    Closure,
+    drift_told,
+    far_keyframes,
+    is_plausible,
+    is_within_reach,
+    spread,
+)
 from edgeslam_torch.atlas.places import MIN_VOTES, lookalikes
 from edgeslam_torch.atlas.weld import look_around, move_piece, share_anchors, weld
 from edgeslam_torch.geometry import sim3
@@ -81,10 +90,17 @@ class Atlas:
         log: Frames, which do so, too.
         lm: Settings of the refinement.
         closing: Whether loops inside a piece are closed.
+        metres: Metres per map unit around the stamp of an earlier frame, where anything else than the images tells it.
     """
 
     def __init__(
-        self, tracker: Tracker, edges: EdgeMap, log: TrajectoryLog, lm: LmConfig, closing: bool = False
+        self,
+        tracker: Tracker,
+        edges: EdgeMap,
+        log: TrajectoryLog,
+        lm: LmConfig,
+        closing: bool = False,
+        metres: Callable[[float], ScaleEstimate | None] = lambda _: None,
     ) -> None:
         self.tracker = tracker
         self.map = tracker.map
@@ -92,6 +108,7 @@ class Atlas:
         self.log = log
         self.lm = lm
         self.closing = closing
+        self.metres = metres
         self.joins: list[Join] = []
         self.closures: list[Closure] = []
         self.known_scale: dict[int, ScaleEstimate] = {}
@@ -183,7 +200,10 @@ class Atlas:
         if self.map.piece_of(keyframe.id) != self.map.piece_of(other.id):
             return link(self.tracker, keyframe, other)
         found = link(self.tracker, keyframe, other, LOOP_SHARE)
-        return found if found is not None and is_plausible(self.map, found) else None
+        if found is None:
+            return None
+        told = drift_told(*(self.metres(k.stamp_s) for k in (keyframe, other)))
+        return found if is_plausible(self.map, found, told) else None
 
     def _settle(self, found: Link) -> Join | Closure | None:
         """Make one of what a link connects if another one agrees; earlier keyframes are asked for it."""

@@ -19,7 +19,7 @@ from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.map.trajectory import TrajectoryLog
 from edgeslam_torch.mapping.edge_map import EdgeMap
 from edgeslam_torch.optim.pose_graph import PoseGraph, solve
-from edgeslam_torch.types import FloatArray, IntArray
+from edgeslam_torch.types import FloatArray, IntArray, ScaleEstimate
 
 MIN_AWAY_S = 5.0
 """Time since an older keyframe from which on it may close a loop; before, the window has not lost it yet."""
@@ -34,15 +34,40 @@ MAX_DRIFT = 0.1
 """Most that a map drifts, in shares of the way: several times the usual 1 to 3 %. A place that is farther from where
 the map has it is another one that looks alike, as doors and wallpaper do."""
 MAX_DRIFT_RAD = np.deg2rad(20.0)
-MAX_DRIFT_LOG = np.log(1.5)
-"""Most that it turns and grows."""
+"""Most that it turns."""
+DRIFT_LOG = 0.03
+"""Standard deviation of what the log scale drifts from one keyframe to the next, a random walk: after 15 keyframes, as
+few as a loop has, a factor of 1.12, after the 126 of a round through ten rooms one of 1.4 (2.1 was measured)."""
 WITHIN_PX = 5.0
 """Offset up to which tracking and the window find the old anchors by themselves, as in `mapping/reobserve.py`."""
 SIGMAS = 3.0
 """Difference of scale beyond which it is not chance."""
+WITHIN_LOG = 0.1
+"""Standard deviation of the log scale of a view against that of the seconds around it, of which telemetry tells: in its
+first ten seconds a map of ten rooms grows by a third."""
 MIN_BASELINE = 0.02
 """Least distance of two keyframes relative to the depth: without parallax the scale between them is anybody's guess,
 but not worse than this."""
+
+
+@dataclass(frozen=True, slots=True)
+class Drift:
+    """What is known, before a loop is closed, of the factor by which it scales its newer end."""
+
+    log: float
+    sigma: float
+
+    def allows(self, log: float) -> bool:
+        """Whether this logarithm of the factor can be right."""
+        return abs(log - self.log) <= SIGMAS * self.sigma
+
+
+def drift_told(here: ScaleEstimate | None, there: ScaleEstimate | None) -> Drift | None:
+    """By metres per map unit at the newer and at the older end of a loop; None unless both are known."""
+    if here is None or there is None:
+        return None
+    relative = np.array([here.sigma / here.value, there.sigma / there.value, WITHIN_LOG])
+    return Drift(float(np.log(here.value / there.value)), float(np.linalg.norm(relative)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,15 +120,22 @@ def far_keyframes(slam_map: SlamMap, keyframe: Keyframe) -> list[Keyframe]:
     return [k for k in older if near.get(k.id, 0) < MIN_SHARED]
 
 
-def is_plausible(slam_map: SlamMap, link: Link) -> bool:
-    """Whether a map can have drifted as much as a link says on the way from its older keyframe to its newer one."""
+def is_plausible(slam_map: SlamMap, link: Link, told: Drift | None = None) -> bool:
+    """Whether a map can have drifted as much as a link says on the way from its older keyframe to its newer one.
+
+    Args:
+        slam_map: With both ends.
+        link: Between them.
+        told: What others than the images say of how its scale drifted.
+    """
     between = [k for id, k in sorted(slam_map.keyframes.items()) if link.other.id <= id <= link.keyframe.id]
     piece = slam_map.piece_of(link.keyframe.id)
     centres = np.stack([k.centre_w for k in between if slam_map.piece_of(k.id) == piece])
     way = float(np.linalg.norm(np.diff(centres, axis=0), axis=1).sum())
     shift, turn = _off(link, link.keyframe.T_c_w)
     near = shift * link.depth <= MAX_DRIFT * way + MAX_SHIFT * link.depth
-    return near and turn <= MAX_DRIFT_RAD and abs(np.log(sim3.scale_of(link.S))) <= MAX_DRIFT_LOG
+    drift = told or Drift(0.0, DRIFT_LOG * np.sqrt(len(centres)))
+    return near and turn <= MAX_DRIFT_RAD and drift.allows(float(np.log(sim3.scale_of(link.S))))
 
 
 def is_within_reach(slam_map: SlamMap, camera: Camera, link: Link) -> bool:

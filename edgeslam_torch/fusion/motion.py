@@ -34,6 +34,7 @@ from edgeslam_torch.fusion.snapshot import Present, Snapshot
 from edgeslam_torch.fusion.telemetry.alignment import map_to_world
 from edgeslam_torch.fusion.telemetry.comparison import Comparison, FlightSoFar
 from edgeslam_torch.fusion.telemetry.delay import DelaySearch
+from edgeslam_torch.fusion.telemetry.local_scale import drift_in_words, scale_around
 from edgeslam_torch.fusion.telemetry.plausibility import HEIGHTS, Trust
 from edgeslam_torch.fusion.telemetry.track import TelemetryTrack
 from edgeslam_torch.fusion.telemetry.unrest import Unrest
@@ -89,6 +90,8 @@ class MotionFusion:
         self._scale = ScaleEstimate()
         self._scale_rests_on: tuple[LogScale | None, LogScale | None, DepthScale | None] = (None, None, None)
         """Opinions that it was made of: it is asked for several times a frame."""
+        self._drift: str | None = None
+        """That parts of the map have different scales, in words."""
         self._fitted_s = -math.inf
         self._counts: Counter[str] = Counter()
 
@@ -200,6 +203,13 @@ class MotionFusion:
             self._scale_rests_on, self._scale = rests_on, fuse(self._settled().used)
         return self._scale
 
+    def scale_around(self, stamp_s: float) -> ScaleEstimate | None:
+        """Metres per map unit within seconds of an earlier frame, in the map as it is now; None where nothing tells."""
+        if self._R_w_m is None or not self._trust.velocity or len(self._track) == 0:
+            return None
+        moved = self._memory.displacements()
+        return scale_around(moved, self._track, stamp_s, self.delay_s, self._R_w_m, self.T_b_c, self.config)
+
     def _settled(self) -> Settled:
         """Opinions that may be averaged."""
         told, depth = self._by_telemetry, self._depth.scale()
@@ -277,7 +287,7 @@ class MotionFusion:
             delay.sigma_s,
             self._track.battery,
             self.filtering,
-            tuple(self._trust.warnings() + ([] if doubt is None else [doubt])),
+            tuple(self._trust.warnings() + [said for said in (doubt, self._drift) if said is not None]),
         )
 
     def snapshot(self) -> Snapshot | None:
@@ -347,7 +357,7 @@ class MotionFusion:
     def warnings(self) -> list[str]:
         """What the depth network or telemetry tells that the images do not bear out, in sentences; it is not used."""
         depth, contradiction = self._depth.scale(), self._settled().warning
-        own = (None if depth is None else depth.warning(), contradiction)
+        own = (None if depth is None else depth.warning(), contradiction, self._drift)
         return self._trust.warnings() + self._track.warnings() + [said for said in own if said is not None]
 
     def telemetry(self) -> TelemetryModel | None:
@@ -405,6 +415,8 @@ class MotionFusion:
         scale = TelemetryScale(self.config, self.T_b_c, present, self._trust, self.delay_s, R_w_m, held, flying)
         unrest = self._unrest.sigma if flying else 0.0
         self._take(scale.opinion(), unrest)
+        oldest = self._memory.sightings().stamps_s[0]
+        self._drift = drift_in_words(self.scale_around, float(oldest), last.stamp_s)
 
     def _take(self, found: tuple[LogScale, TelemetryFit] | None, unrest: float) -> None:
         if found is not None:

@@ -1,12 +1,14 @@
 """A camera that flies around a ring and meets its beginning again, in a map that has drifted; exact ground truth."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from point_map import CAMERA, SCALE_FACTOR, check_map
 
 from edgeslam_torch.atlas.atlas import Atlas
 from edgeslam_torch.atlas.links import link
-from edgeslam_torch.atlas.loops import far_keyframes, is_plausible
+from edgeslam_torch.atlas.loops import Drift, drift_told, far_keyframes, is_plausible
 from edgeslam_torch.atlas.saved import BEFORE_S
 from edgeslam_torch.config import EdgeConfig, OrbConfig, TrackingConfig
 from edgeslam_torch.frontend.matching import words
@@ -18,7 +20,7 @@ from edgeslam_torch.mapping.edge_map import EdgeMap, EdgePoints
 from edgeslam_torch.mapping.refinement import refine_all
 from edgeslam_torch.optim.problem import LmConfig
 from edgeslam_torch.tracking.tracker import Tracker
-from edgeslam_torch.types import FrameFeatures
+from edgeslam_torch.types import FrameFeatures, ScaleEstimate
 
 STEP = np.deg2rad(15.0)
 ROUND = 24
@@ -96,8 +98,8 @@ class Ring:
     def moved(self, k):
         return sim3.exp(k * self.drift)
 
-    def atlas(self, closing=True):
-        return Atlas(self.tracker, self.edges, self.log, LmConfig(diagnostics=False), closing)
+    def atlas(self, closing=True, metres=lambda _: None):
+        return Atlas(self.tracker, self.edges, self.log, LmConfig(diagnostics=False), closing, metres)
 
     def gap(self):
         """Error of the way from the first keyframe to the one at the same place, a round later."""
@@ -236,3 +238,41 @@ def test_a_keyframe_of_some_seconds_ago_is_not_far(rng):
     for keyframe in ring.keyframes:
         keyframe.stamp_s *= 0.1
     assert far_keyframes(ring.map, ring.keyframes[-1]) == []
+
+
+def test_a_drift_that_telemetry_bears_out_may_be_large(rng):
+    told = drift_told(ScaleEstimate(1.8, 0.1), ScaleEstimate(1.0, 0.05))
+    assert told is not None
+    assert told.allows(np.log(1.8))
+    assert told.allows(np.log(1.5))
+    assert not told.allows(np.log(1.0 / 1.8))
+    assert not told.allows(0.0)
+    assert drift_told(None, ScaleEstimate(1.0, 0.05)) is None
+    assert drift_told(ScaleEstimate(1.0, 0.05), None) is None
+
+
+def test_telemetry_decides_whether_a_link_is_plausible(rng):
+    """Right links that scale by 0.9: telemetry which is sure of ten times as much speaks against them."""
+    ring = Ring(rng)
+    found = link(ring.tracker, ring.keyframes[ROUND], ring.keyframes[0])
+    assert found is not None
+    assert is_plausible(ring.map, found)
+    assert is_plausible(ring.map, found, Drift(float(np.log(sim3.scale_of(found.S))), 0.001))
+    assert not is_plausible(ring.map, found, Drift(0.4, 0.05))
+    assert closed(ring, ring.atlas(metres=lambda stamp_s: ScaleEstimate(np.exp(0.1 * stamp_s), 0.01))) == []
+    grown = float(np.log(sim3.scale_of(found.S)))
+    assert closed(ring, ring.atlas(metres=lambda stamp_s: ScaleEstimate(np.exp(grown / ROUND * stamp_s), 0.01)))
+
+
+def test_the_longer_the_way_the_more_may_a_map_have_grown(rng):
+    """By images alone: keyframes hand the scale on, and each may change it a little."""
+    ring = Ring(rng, drift=0.0 * DRIFT)
+    found = link(ring.tracker, ring.keyframes[ROUND], ring.keyframes[0])
+    assert found is not None
+    at = se3.transform(found.S, found.keyframe.centre_w[None])[0]
+    grown = {g: replace(found, S=sim3.compose(g, np.eye(3), (1.0 - g) * at) @ found.S) for g in (0.7, 1.4, 1.8)}
+    assert [is_plausible(ring.map, grown[g]) for g in (0.7, 1.4, 1.8)] == [True, True, False]
+    for keyframe in ring.keyframes[3:ROUND]:
+        ring.map.remove_keyframe(keyframe)
+    assert [is_plausible(ring.map, grown[g]) for g in (0.7, 1.4, 1.8)] == [False, False, False]
+    assert is_plausible(ring.map, found)

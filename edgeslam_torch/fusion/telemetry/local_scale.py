@@ -1,0 +1,94 @@
+"""Metres per map unit around one moment of the flight, from the seconds before and after it alone.
+
+The scale of a whole flight (`fusion/telemetry_scale.py`) is that of the present map. A monocular map drifts in scale,
+so two places that it holds may have two scales; velocities of either time tell by how much they differ, whatever
+happened on the way.
+"""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from edgeslam_torch.fusion.config import FusionConfig
+from edgeslam_torch.fusion.scale.joint_scale import displacement_evidence, solved
+from edgeslam_torch.fusion.telemetry.track import TelemetryTrack
+from edgeslam_torch.fusion.telemetry.visual_memory import Displacements
+from edgeslam_torch.types import FloatArray, ScaleEstimate
+
+AROUND_S = 5.0
+"""Time before and after the moment that is looked at: four metres each at an indoor drone's speed."""
+MOST_SIGMA = 0.15
+"""Relative standard deviation beyond which such a short part tells nothing."""
+LEAST_SIGMA = 0.03
+"""The least: a map that drifts does so within these seconds, too."""
+_SIGMAS, _SAID_LOG = 3.0, math.log(1.15)
+"""Difference of two parts of a flight beyond which it is said: no chance, and more than whole steps of velocity and a
+bend of the map make of the same scale."""
+
+
+def scale_around(
+    moved: Displacements,
+    track: TelemetryTrack,
+    stamp_s: float,
+    delay_s: float,
+    R_w_m: FloatArray,
+    T_b_c: FloatArray,
+    config: FusionConfig,
+) -> ScaleEstimate | None:
+    """Metres per map unit within `AROUND_S` of a moment; None where velocities do not tell it.
+
+    Args:
+        moved: Visual displacements of the flight, by the stamps of frames.
+        track: Telemetry of the flight.
+        stamp_s: The moment, by the stamps of frames.
+        delay_s: Video delay behind telemetry.
+        R_w_m: Map axes to telemetry's world ``(3, 3)``.
+        T_b_c: Camera to body ``(4, 4)`` [m].
+        config: Noise of velocities, and the least speed that tells.
+    """
+    near = (moved.from_s >= stamp_s - AROUND_S) & (moved.to_s <= stamp_s + AROUND_S)
+    moved = moved.only(near).on_telemetry_clock(delay_s)
+    moved = moved.only(track.covered(moved.from_s, moved.to_s))
+    if not len(moved):
+        return None
+    turned = track.attitude(moved.to_s) - track.attitude(moved.from_s)
+    told = track.displacement(moved.to_s) - track.displacement(moved.from_s) + turned @ T_b_c[:3, 3]
+    moving = np.linalg.norm(told, axis=1) > config.min_speed_m_s * moved.duration_s
+    moved, told = moved.only(moving), told[moving]
+    sigma_m = config.sigma_velocity_m_s * np.sqrt(0.1 * moved.duration_s)
+    tilt = config.alignment_sigma_rad
+    evidence = displacement_evidence(
+        moved.moved @ R_w_m.T, told, moved.from_s, moved.duration_s, moved.sigma, sigma_m, tilt
+    )
+    found = None if evidence is None else solved([evidence], tilt)
+    if found is None or found[1] > MOST_SIGMA:
+        return None
+    return ScaleEstimate(found[0], found[0] * max(found[1], LEAST_SIGMA), "telemetry")
+
+
+def drift_in_words(scale_at: Callable[[float], ScaleEstimate | None], from_s: float, to_s: float) -> str | None:
+    """That an earlier part of the map has another scale than the present one, if telemetry is sure; None otherwise.
+
+    Args:
+        scale_at: Metres per map unit around a moment.
+        from_s: Oldest moment of which something is remembered.
+        to_s: The present.
+    """
+    now = scale_at(to_s - AROUND_S)
+    if now is None:
+        return None
+    most, said = _SAID_LOG, None
+    for moment_s in np.arange(from_s + AROUND_S, to_s - 3.0 * AROUND_S, 2.0 * AROUND_S).tolist():
+        then = scale_at(moment_s)
+        if then is None:
+            continue
+        gap = abs(math.log(now.value / then.value))
+        if gap > most and gap > _SIGMAS * math.hypot(now.sigma / now.value, then.sigma / then.value):
+            most = gap
+            said = (
+                f"the map's scale has drifted: by telemetry {then.value:.3g} metres per map unit "
+                f"{to_s - moment_s:.0f} s ago and {now.value:.3g} now; distances there are off by "
+                f"{100 * math.expm1(gap):.0f} %"
+            )
+    return said

@@ -1,0 +1,59 @@
+"""A map that shrinks while it is made, against the scale with which it was made."""
+
+import numpy as np
+import pytest
+
+from edgeslam_torch.fusion.config import FusionConfig
+from edgeslam_torch.fusion.motion import MotionFusion
+from edgeslam_torch.geometry.mount import camera_on_body
+from edgeslam_torch.synthetic.flights.telemetry import simulate
+
+T_B_C = camera_on_body()
+GROWN = 1.6
+"""How much metres per map unit grow between 12 and 17 s."""
+
+
+def flown(rng, swinging, grown, until_s=34.0):
+    motion = swinging(until_s, 12.0)
+    samples = simulate(rng, motion.stamps_s, motion.T_w_c, T_B_C).samples()
+    scale = 0.8 * grown ** np.clip((motion.stamps_s - 12.0) / 5.0, 0.0, 1.0)
+    T_m_c = motion.T_w_c.copy()
+    steps = np.diff(motion.T_w_c[:, :3, 3], axis=0) / scale[1:, None]
+    T_m_c[:, :3, 3] = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+    fusion, said, told = MotionFusion(FusionConfig(delay_s=0.5), T_B_C), [], 0
+    for i, stamp_s in enumerate(motion.stamps_s.tolist()):
+        first, told = told, sum(s.stamp_s <= stamp_s for s in samples[told:]) + told
+        fusion.add_telemetry(samples[first:told])
+        fusion.add_visual(stamp_s, T_m_c[i], 0.003, 0.002)
+        if any("drifted" in doubt for doubt in fusion.health(stamp_s, "tracking", True).doubts):
+            said.append(stamp_s)
+    return fusion, said
+
+
+def test_each_part_of_a_flight_has_its_own_scale(rng, swinging):
+    fusion, _ = flown(rng, swinging, GROWN)
+    for stamp_s, truth in ((6.0, 0.8), (28.0, 0.8 * GROWN)):
+        here = fusion.scale_around(stamp_s)
+        assert here is not None
+        assert here.value == pytest.approx(truth, rel=0.05)
+        assert abs(here.value - truth) < 3.0 * here.sigma
+
+
+def test_a_drifted_map_says_so(rng, swinging):
+    fusion, said = flown(rng, swinging, GROWN)
+    assert said
+    assert 17.0 < said[0] < 34.0
+    assert any("drifted" in words for words in fusion.warnings())
+
+
+def test_a_map_of_one_scale_says_nothing(rng, swinging):
+    fusion, said = flown(rng, swinging, 1.0)
+    assert not said
+    assert not any("drifted" in words for words in fusion.warnings())
+
+
+def test_nothing_is_told_without_telemetry_or_before_the_flight(rng, swinging):
+    assert MotionFusion(FusionConfig(), T_B_C).scale_around(3.0) is None
+    fusion, _ = flown(rng, swinging, 1.0, 12.0)
+    assert fusion.scale_around(-100.0) is None
+    assert fusion.scale_around(-np.inf) is None
