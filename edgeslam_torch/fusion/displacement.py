@@ -9,7 +9,8 @@ with displacements :math:`d` from integrated velocities and heights :math:`h` ab
 changes where furniture passes below. The errors are added up from what they are: noise of single readings; the interval
 of the rounding, one error for as long as a reading stays the same; a velocity bias that decays in seconds; and, common
 to all, the scale, the map's tilt, the video's delay and whether the drone rounds or truncates. These nuisance
-parameters are columns of the covariance, so that the solver does not see them.
+parameters are columns of the covariance, so that the solver does not see them. The scale's column is the map's own way
+:math:`s\,p`: with :math:`d` in its place, a map that disagrees would cost less the smaller it is (docs/decisions/0081).
 """
 
 import math
@@ -136,11 +137,12 @@ class TelemetryModel:
             return None
         sigma = self.scale_sigma_log if scale_sigma_log is None else scale_sigma_log
         at_s = stamps_s - self.delay_s
+        per_scale_w = sigma * self.scale * p_m @ self.R_w_m.T
         parts = []
         if self.velocity:
-            parts.append(self._displacements(at_s, sigma))
+            parts.append(self._displacements(at_s, per_scale_w))
         if self.height is not None:
-            parts.append(self._heights(at_s, sigma))
+            parts.append(self._heights(at_s, per_scale_w))
         rows = _stacked([part for part in parts if part is not None])
         return None if rows is None else self._gaussian(rows, p_m)
 
@@ -158,7 +160,8 @@ class TelemetryModel:
         alike = (np.abs(t[:, None] - t[None]) < 0.5 * UP_MEMORY_S).sum(1)
         return UpDirections(frame, R_w_c[:, 2, :], self.R_w_m[2], UP_RAD * math.sqrt(float(np.median(alike))))
 
-    def _displacements(self, at_s: FloatArray, sigma_log: float) -> _Rows | None:
+    def _displacements(self, at_s: FloatArray, per_scale_w: FloatArray) -> _Rows | None:
+        """Rows of the velocities; ``per_scale_w`` ``(K, 3)``: change of the positions per sigma of the scale [m]."""
         start, end = at_s[:-1], at_s[1:]
         use = np.flatnonzero(self.track.covered(start, end) & (end - start < LONGEST_S))
         if len(use) == 0:
@@ -188,7 +191,7 @@ class TelemetryModel:
         delay = min(self.delay_sigma_s, DELAY_S)
         common = np.concatenate(
             [
-                (sigma_log * d)[..., None],
+                np.diff(per_scale_w, axis=0)[use][..., None],
                 TILT_RAD * hat(d),
                 (delay * 10.0 * np.diff(speed, axis=0)[use])[..., None],
                 (half * np.einsum("ns,sa->na", share, told.sign[heard]))[..., None],
@@ -207,7 +210,8 @@ class TelemetryModel:
             np.repeat(np.linalg.norm(d, axis=1), 3),
         )
 
-    def _heights(self, at_s: FloatArray, sigma_log: float) -> _Rows | None:
+    def _heights(self, at_s: FloatArray, per_scale_w: FloatArray) -> _Rows | None:
+        """Rows of the height that may speak; ``per_scale_w`` as in `_displacements`."""
         name = self.height
         stamp, z = self.track.heights().get(name or "", (np.zeros(0), np.zeros(0)))
         if len(stamp) < 2:
@@ -239,7 +243,9 @@ class TelemetryModel:
         none = np.zeros(M)
         tilt = TILT_RAD * np.stack([-way[:, 1], way[:, 0], none], axis=1)  # the last row of hat(way)
         delay = min(self.delay_sigma_s, DELAY_S)
-        common = np.column_stack([sigma_log * rise, tilt, delay * fast, none])
+        per_scale = per_scale_w[use, 2]
+        per_scale = per_scale - (same @ per_scale) / same.sum(1)
+        common = np.column_stack([per_scale, tilt, delay * fast, none])
         rounded = name == "tof"  # centimetres; the others move in steps or wander
         white = np.full(M, sigma**2 if rounded else 0.25 * sigma**2)
         slow = (0.1 if rounded else 1.0) * lasting + level

@@ -88,9 +88,10 @@ def test_a_displacement_the_wrong_way_round_costs(rng, swinging, mirrored):
     assert chi2(told, p * mirrored) > 50.0 * told.rows
 
 
-def test_the_scale_is_held_as_far_as_it_is_known(rng, swinging):
+@pytest.mark.parametrize("height", [None, "tof"])
+def test_the_scale_is_held_as_far_as_it_is_known(rng, swinging, height):
     """A map 10 % too small: five sigmas of 2 %, nothing where the scale is free."""
-    model, stamps, p = flown(rng, swinging(12.0))
+    model, stamps, p = flown(rng, swinging(12.0), height=height)
     for sigma, least, most in ((0.02, 20.0, 30.0), (1.0, 0.0, 0.1)):
         told = model.positions(stamps, p, sigma)
         extra = chi2(told, 0.9 * p) - chi2(told, p)
@@ -107,6 +108,17 @@ def test_a_map_whose_scale_drifts_is_straightened_without_knowing_the_scale(rng,
     ratio = np.linalg.norm(mended, axis=1) / np.linalg.norm(np.diff(p, axis=0), axis=1)
     third = len(ratio) // 3
     assert np.median(ratio[-third:]) / np.median(ratio[:third]) == pytest.approx(1.0, abs=0.02)
+
+
+@pytest.mark.parametrize("height", [None, "tof"])
+def test_a_map_that_disagrees_gains_nothing_by_being_small(rng, swinging, height):
+    """Where the scale is free, the cost is one of shape: its derivative by the map's logarithmic size is nothing."""
+    model, stamps, p = flown(rng, swinging(12.0), height=height)
+    bent = p + rng.normal(0.0, 0.05, p.shape)
+    told = model.positions(stamps, bent, 1.0)
+    by_size = 2.0 * float(bent.ravel() @ (told.information @ bent.ravel() - told.vector))
+    assert chi2(told, bent) > 5.0 * chi2(model.positions(stamps, p, 1.0), p)
+    assert abs(by_size) < 0.05 * chi2(told, bent)
 
 
 def test_gauge_of_the_map_does_not_matter(rng, swinging):
