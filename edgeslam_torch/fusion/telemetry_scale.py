@@ -17,6 +17,7 @@ from edgeslam_torch.fusion.scale.joint_scale import (
     solved,
 )
 from edgeslam_torch.fusion.scale.log_scale import LogScale, floor_segments
+from edgeslam_torch.fusion.scale.present import PRESENT_S, Parted, parted, present_scale
 from edgeslam_torch.fusion.telemetry.comparison import FlightSoFar
 from edgeslam_torch.fusion.telemetry.plausibility import (
     LEAST_COUNT,
@@ -220,7 +221,28 @@ class TelemetryScale:
         variance = sum(p * (o.sigma**2 + (o.log_scale - mean) ** 2) for p, o in mixed)
         truncates = dict(zip(found, share.tolist(), strict=True)).get(Rounding.TRUNCATE, 0.0)
         fit = replace(best.fit, truncates=truncates)
-        return LogScale(mean, math.sqrt(variance), "+".join(fit.sources)), fit
+        return self._unless_parted(LogScale(mean, math.sqrt(variance), "+".join(fit.sources)), fit)
+
+    def _unless_parted(self, before: LogScale, fit: TelemetryFit) -> tuple[LogScale, TelemetryFit]:
+        """What the flight says, or the last seconds where these leave no room for it."""
+        now = self._at_present() if self._flying else None
+        if now is None or not parted(now, before):
+            self._trust.parted = None
+            return before, fit
+        self._trust.parted = Parted(now, before)
+        scale = math.exp(now.log_scale)
+        return now, replace(fit, moved=None, sources={"telemetry": SourceScale(scale, scale * now.sigma)})
+
+    def _at_present(self) -> LogScale | None:
+        """By the displacements of the last seconds, if telemetry is of this flight."""
+        last = self._present.memory.last
+        shown = self._compared(by_told=True) if self._trust.proven and last is not None else None
+        if shown is None or last is None:
+            return None
+        moved = shown.intervals
+        late = moved.to_s > last.stamp_s - self._delay_s - PRESENT_S
+        seen = moved.moved[late] @ self._R_w_m.T
+        return present_scale(seen, shown.told[late], moved.duration_s[late], self._config.velocity_step_m_s)
 
     def _together(self, rounding: Rounding, moved: Evidence | None, systematic: float) -> _Hypothesis | None:
         tilt = self._config.alignment_sigma_rad
@@ -350,8 +372,8 @@ class TelemetryScale:
             return None
         return aged_since(stamps_s + self._delay_s, memory.began_s, memory.last.stamp_s)
 
-    def _compared(self) -> _Shown | None:
-        """Intervals in which the drone moves, as images and readings have them."""
+    def _compared(self, by_told: bool = False) -> _Shown | None:
+        """Intervals in which the drone moves, as images and readings have them; ``by_told`` asks the readings which."""
         track, config, memory = self._present.track, self._config, self._present.memory
         moved = memory.displacements()
         if len(moved) == 0:
@@ -363,7 +385,7 @@ class TelemetryScale:
         R_from, R_to = track.attitude(moved.from_s), track.attitude(moved.to_s)
         told = track.displacement(np.concatenate([moved.from_s, moved.to_s]))
         moved_m = told[len(moved) :] - told[: len(moved)] + (R_to - R_from) @ self._T_b_c[:3, 3]
-        moving = self._moving(moved, moved_m)
+        moving = self._moving(moved, moved_m, by_told)
         if moving.sum() < 2:
             return None
         moved, moved_m = moved.only(moving), moved_m[moving]
@@ -374,9 +396,9 @@ class TelemetryScale:
         velocity = seen_velocity(track, seen, self._delay_s, self._R_w_m, self._T_b_c, config.max_gap_s)
         return _Shown(moved, moved_m, velocity, math.sqrt(ways[0] / ways[1]))
 
-    def _moving(self, moved: Displacements, moved_m: FloatArray) -> np.ndarray:
+    def _moving(self, moved: Displacements, moved_m: FloatArray, by_told: bool) -> np.ndarray:
         """Intervals fast enough to speak of scale, judged by vision once the scale is roughly known."""
-        if self._held is not None:
+        if self._held is not None and not by_told:
             speed = np.linalg.norm(moved.moved, axis=1) * self._held / moved.duration_s
         else:
             speed = np.linalg.norm(moved_m, axis=1) / moved.duration_s

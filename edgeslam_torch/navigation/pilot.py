@@ -71,6 +71,7 @@ class Pilot:
     _least: float = math.inf
     _waiting_s: float = math.nan
     """Since when there is nothing to fly into."""
+    _revision: int = 0
     _sweep: list[float] = field(default_factory=list)
     """Headings still to be looked at, last first."""
 
@@ -99,6 +100,10 @@ class Pilot:
         return self._at_height(sight, self._fly(sight))
 
     def _take_in(self, sight: Sight) -> None:
+        if sight.revision != self._revision:
+            self.space, self._revision = Space(), sight.revision
+            self._plan, self._least, self._progress_s = None, math.inf, math.nan
+            self.phase = Phase.RISING
         if math.isnan(self._progress_s):
             self._progress_s = sight.stamp_s
             if self.phase is Phase.RISING:

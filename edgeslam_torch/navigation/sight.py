@@ -49,6 +49,8 @@ class Sight:
     battery: float = 1.0
     view: View | None = None
     """A new depth map, if there is one."""
+    revision: int = 0
+    """How often the unit of the positions was revised; after a change, earlier ones mean something else."""
 
     @property
     def blind_s(self) -> float:

@@ -13,6 +13,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from edgeslam_torch.fusion.scale.present import Parted
 from edgeslam_torch.fusion.telemetry.track import Turn
 from edgeslam_torch.geometry.robust_statistics import median
 from edgeslam_torch.types import FloatArray, IntArray
@@ -194,6 +195,8 @@ class Trust:
         """Video delay at which telemetry fits the images, when that is none of the delays allowed."""
         self.at_odds: AtOdds | None = None
         """Scales by velocities and by height where these cannot both be right."""
+        self.parted: Parted | None = None
+        """Set while the last seconds leave no room for the scale of the flight before."""
         self.tells_scale = True
         """Whether velocities that may tell the scale could be fitted to the images."""
         self.reread: Reread | None = None
@@ -224,6 +227,12 @@ class Trust:
         if self.elsewhere_s is not None or self.verdict(Reading.ATTITUDE) is Verdict.CONTRADICTS:
             return False
         return self.verdict(Reading.VELOCITY) is Verdict.AGREES
+
+    @property
+    def proven(self) -> bool:
+        """Whether anything has proven that telemetry is of this flight, and nothing that it is not."""
+        readings = (Reading.VELOCITY, Reading.ATTITUDE, *HEIGHTS)
+        return self.motion and any(self.verdict(r) is Verdict.AGREES for r in readings)
 
     def height(self, reading: Reading) -> bool:
         """Whether a height may: it needs the vertical, and its own evidence if nothing else confirms the flight."""
@@ -267,6 +276,8 @@ class Trust:
                 said.append(f"telemetry's height ({reading}) is not used: {_why(height, 'climbing and sinking')}")
         if self.at_odds is not None:
             said.append(self.at_odds.warning())
+        if self.parted is not None:
+            said.append(self.parted.warning())
         return said
 
 

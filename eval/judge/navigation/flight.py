@@ -2,20 +2,22 @@
 
 import time
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from edgeslam_torch.drone.emulator.air import Air
 from edgeslam_torch.drone.emulator.drone import Contact, DroneModel, Mode
-from edgeslam_torch.drone.emulator.lockstep import LockstepTello
+from edgeslam_torch.drone.emulator.lockstep import Event, LockstepTello
 from edgeslam_torch.drone.emulator.room import drone_at
 from edgeslam_torch.eval.judge.navigation.conditions import FAULTS
 from edgeslam_torch.eval.judge.navigation.eyes import DEPTH_SIZE, TrueEyes, nothing_painted
 from edgeslam_torch.eval.judge.navigation.oracle import shortest_m
+from edgeslam_torch.eval.judge.navigation.slam_eyes import IMAGE_SIZE, SlamEyes
 from edgeslam_torch.geometry.mount import TELLO_TILT_RAD
 from edgeslam_torch.navigation.limits import NavLimits
 from edgeslam_torch.navigation.pilot import Phase, Pilot
+from edgeslam_torch.navigation.sight import Sight
 from edgeslam_torch.navigation.supervisor import Supervisor
 from edgeslam_torch.navigation.tasks import GoTo
 from edgeslam_torch.synthetic.sites.build import named_site
@@ -30,6 +32,13 @@ _FREE_M = 0.6
 """Clearance from which cruising is free."""
 
 
+class Eyes(Protocol):
+    """Tells a pilot what it may know."""
+
+    def sight(self, now_s: float, events: list[Event]) -> Sight:
+        """The moment, from what arrived since the last one."""
+
+
 @dataclass(frozen=True, slots=True)
 class Case:
     """What is flown."""
@@ -37,6 +46,8 @@ class Case:
     world: str
     seed: int
     fault: str = "none"
+    eyes: str = "truth"
+    """``truth`` or ``slam``: what the pilot is told."""
 
 
 @dataclass(slots=True)
@@ -78,7 +89,7 @@ class Flown:
 
 
 def fly(case: Case, limits: NavLimits | None = None) -> Flown:
-    """Fly to the site's goal in lockstep, by the true pose.
+    """Fly to the site's goal in lockstep.
 
     Raises:
         ValueError: If the world or the fault is unknown.
@@ -89,9 +100,10 @@ def fly(case: Case, limits: NavLimits | None = None) -> Flown:
     site = named_site(case.world, case.seed)
     wind = np.array([0.0, conditions.wind_m_s, 0.0])
     air = Air(wind, 0.5 * conditions.wind_m_s, np.random.default_rng([case.seed, 1]))
-    drone, _, _ = drone_at(site, TELLO_TILT_RAD, DEPTH_SIZE, conditions.battery, air)
-    tello = LockstepTello(drone, nothing_painted, conditions.radio, case.seed)
-    eyes = TrueEyes(site, drone, conditions)
+    size = IMAGE_SIZE if case.eyes == "slam" else DEPTH_SIZE
+    drone, paint, camera = drone_at(site, TELLO_TILT_RAD, size, conditions.battery, air)
+    tello = LockstepTello(drone, paint if case.eyes == "slam" else nothing_painted, conditions.radio, case.seed)
+    eyes: Eyes = SlamEyes(camera, conditions, case.seed) if case.eyes == "slam" else TrueEyes(site, drone, conditions)
     pilot = Pilot(GoTo(site.goal_w / conditions.scale), limits)
     supervisor = Supervisor(limits)
     found = Flown(case, oracle_s=_take_off_s(limits) + shortest_m(site, limits) / limits.speed_m_s)
@@ -112,7 +124,7 @@ class _Tick:
 
 def _fly(
     tello: LockstepTello,
-    eyes: TrueEyes,
+    eyes: Eyes,
     pilot: Pilot,
     supervisor: Supervisor,
     hung_s: tuple[float, float] | None,

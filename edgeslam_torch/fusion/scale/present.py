@@ -1,0 +1,73 @@
+"""The scale of the last seconds alone: does the map still have the scale that the whole flight says?
+
+Fits over a flight take what contradicts them for outliers. Where a map's scale collapses, as along a corridor after a
+take-off without parallax, all that is new contradicts all that is old, and the flight's fit stays sure of what is no
+longer so. The last way flown, told by telemetry, over the way that the images saw needs no fit.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from edgeslam_torch.fusion.scale.log_scale import LogScale
+from edgeslam_torch.types import FloatArray
+
+PRESENT_S = 4.0
+"""Time that counts as present: two metres at 0.5 m/s."""
+_LEAST_COUNT, _LEAST_WAY_M = 3, 0.8
+_SAME_WAY = 0.9
+"""Cosine of the angle between both ways: 26 degrees."""
+_LEAST_SIGMA = 0.05
+_OF_STEP = 0.4
+"""Standard deviation of a velocity that is rounded or truncated, one does not know which, in steps."""
+_PARTED_LOG, _PARTED_SIGMAS = math.log(1.5), 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class Parted:
+    """A present scale that the flight so far leaves no room for."""
+
+    now: LogScale
+    before: LogScale
+
+    def warning(self) -> str:
+        """What happened, for health and summary."""
+        now, before = math.exp(self.now.log_scale), math.exp(self.before.log_scale)
+        return (
+            f"the map has changed its scale: {now:.3g} metres per unit by the velocities of the last "
+            f"{PRESENT_S:.0f} s, {before:.3g} by the flight before; the present one counts"
+        )
+
+
+def present_scale(
+    moved_map: FloatArray, moved_m: FloatArray, duration_s: FloatArray, step_m_s: float
+) -> LogScale | None:
+    """Metres per map unit of the way ``(N, 3)`` flown in the last seconds; None if it is short, or in two directions.
+
+    Args:
+        moved_map: What the images saw, in world axes [map units].
+        moved_m: What telemetry told of the same intervals [m].
+        duration_s: Their lengths ``(N,)``.
+        step_m_s: Of the velocities that telemetry tells.
+    """
+    if len(moved_map) < _LEAST_COUNT:
+        return None
+    told, seen = np.linalg.norm(moved_m, axis=1), np.linalg.norm(moved_map, axis=1)
+    way_m, way = float(told.sum()), float(seen.sum())
+    if way_m < _LEAST_WAY_M or not way > 0:
+        return None
+    along = float(np.sum(moved_m * moved_map))
+    if along < _SAME_WAY * float(np.sum(told * seen)):
+        return None
+    speed = way_m / float(duration_s.sum())
+    ratio = told[seen > 0] / seen[seen > 0]
+    spread = float(np.std(np.log(np.maximum(ratio, 1e-9)))) / math.sqrt(len(ratio))
+    sigma = math.hypot(_LEAST_SIGMA, spread, _OF_STEP * step_m_s / speed)
+    return LogScale(math.log(way_m / way), sigma, "telemetry")
+
+
+def parted(now: LogScale, before: LogScale) -> bool:
+    """Whether the present scale cannot be that of the flight before."""
+    apart = abs(now.log_scale - before.log_scale)
+    return apart > max(_PARTED_LOG, _PARTED_SIGMAS * math.hypot(now.sigma, before.sigma))
