@@ -75,6 +75,10 @@ class SourceScale:
     sigma: float
 
 
+_FADING = 0.1
+"""What a map that has changed its scale may change it further until the next fit, seconds later."""
+
+
 @dataclass(frozen=True, slots=True)
 class TelemetryFit:
     """What the newest fit found, for prediction and for the report."""
@@ -225,13 +229,18 @@ class TelemetryScale:
 
     def _unless_parted(self, before: LogScale, fit: TelemetryFit) -> tuple[LogScale, TelemetryFit]:
         """What the flight says, or the last seconds where these leave no room for it."""
-        now = self._at_present() if self._flying else None
+        now = (self._at_present() or self._lately()) if self._flying else None
         if now is None or not parted(now, before):
             self._trust.parted = None
             return before, fit
         self._trust.parted = Parted(now, before)
         scale = math.exp(now.log_scale)
         return now, replace(fit, moved=None, sources={"telemetry": SourceScale(scale, scale * now.sigma)})
+
+    def _lately(self) -> LogScale | None:
+        """A present scale found before, less sure of itself each time that nothing new tells one."""
+        last = self._trust.parted
+        return None if last is None else replace(last.now, sigma=math.hypot(last.now.sigma, _FADING))
 
     def _at_present(self) -> LogScale | None:
         """By the displacements of the last seconds, if telemetry is of this flight."""

@@ -1,0 +1,53 @@
+"""Depth of a network brought to the map's metres."""
+
+import numpy as np
+import pytest
+
+from edgeslam_torch.navigation.near_depth import MIN_POINTS, fit_near, fit_to_points
+from edgeslam_torch.types import DepthMap
+
+
+def compressed(rng, count=200, noise=0.05, wrong=0.2):
+    """A network that says 1.4 d^0.7 for d, and points of which a share is hidden by something nearer."""
+    true = rng.uniform(0.4, 6.0, count)
+    network = 1.4 * true**0.7 * np.exp(noise * rng.standard_normal(count))
+    seen = true.copy()
+    hidden = rng.random(count) < wrong
+    seen[hidden] *= rng.uniform(1.5, 4.0, int(hidden.sum()))
+    return network, seen
+
+
+def test_a_network_that_compresses_depth_is_undone(rng):
+    fit = fit_near(*compressed(rng))
+    near = np.exp(fit.offset + fit.slope * np.log(1.4 * 0.5**0.7))
+    assert near == pytest.approx(0.5, rel=0.15)
+    far = np.exp(fit.offset + fit.slope * np.log(1.4 * 5.0**0.7))
+    assert far == pytest.approx(5.0, rel=0.15)
+    assert 0.03 <= fit.sigma_log < 0.3
+
+
+def test_a_right_network_is_left_as_it_is(rng):
+    true = rng.uniform(0.4, 6.0, 100)
+    fit = fit_near(true, true)
+    assert fit.slope == pytest.approx(1.0, abs=1e-6)
+    assert fit.offset == pytest.approx(0.0, abs=1e-6)
+
+
+def test_too_few_points_tell_nothing(rng):
+    network, seen = compressed(rng, MIN_POINTS - 1)
+    assert fit_near(network, seen) is None
+    assert fit_near(np.full(50, np.nan), np.ones(50)) is None
+
+
+def test_points_are_compared_where_they_are_seen(rng):
+    K = np.array([[80.0, 0.0, 39.5], [0.0, 80.0, 29.5], [0.0, 0.0, 1.0]])
+    T = np.eye(4)
+    T[:3, 3] = [1.0, -2.0, 0.5]
+    p = np.c_[rng.uniform(-0.4, 0.4, (300, 2)), np.ones(300)] * rng.uniform(1.0, 4.0, (300, 1)) + T[:3, 3]
+    depth = np.full((60, 80), np.nan, np.float32)
+    for x in p - T[:3, 3]:
+        u, v = np.rint(x[:2] / x[2] * 80.0 + [39.5, 29.5]).astype(int)
+        if 0 <= u < 80 and 0 <= v < 60:
+            depth[v, u] = 2.0 * x[2]
+    fit = fit_to_points(DepthMap(depth, np.full_like(depth, 0.2)), K, T, p)
+    assert np.exp(fit.offset + fit.slope * np.log(4.0)) == pytest.approx(2.0, rel=0.05)
