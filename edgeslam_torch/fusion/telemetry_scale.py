@@ -17,7 +17,7 @@ from edgeslam_torch.fusion.scale.joint_scale import (
     solved,
 )
 from edgeslam_torch.fusion.scale.log_scale import LogScale, floor_segments
-from edgeslam_torch.fusion.scale.present import PRESENT_S, Parted, parted, present_scale
+from edgeslam_torch.fusion.scale.present import PRESENT_S, Parted, has_changed, parted, present_scale
 from edgeslam_torch.fusion.telemetry.comparison import FlightSoFar
 from edgeslam_torch.fusion.telemetry.plausibility import (
     LEAST_COUNT,
@@ -248,10 +248,11 @@ class TelemetryScale:
         shown = self._compared(by_told=True) if self._trust.proven and last is not None else None
         if shown is None or last is None:
             return None
-        moved = shown.intervals
+        moved, step = shown.intervals, self._config.velocity_step_m_s
         late = moved.to_s > last.stamp_s - self._delay_s - PRESENT_S
-        seen = moved.moved[late] @ self._R_w_m.T
-        return present_scale(seen, shown.told[late], moved.duration_s[late], self._config.velocity_step_m_s)
+        seen = moved.moved @ self._R_w_m.T
+        now = present_scale(seen[late], shown.told[late], moved.duration_s[late], step)
+        return now if now is not None and has_changed(now, seen[~late], shown.told[~late]) else None
 
     def _together(self, rounding: Rounding, moved: Evidence | None, systematic: float) -> _Hypothesis | None:
         tilt = self._config.alignment_sigma_rad

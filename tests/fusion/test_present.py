@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from edgeslam_torch.fusion.scale.log_scale import LogScale
-from edgeslam_torch.fusion.scale.present import Parted, parted, present_scale
+from edgeslam_torch.fusion.scale.present import Parted, has_changed, parted, present_scale
 
 
 def flown(count=4, speed=0.5, metres_per_unit=2.0, noise=0.0, seed=0):
@@ -57,3 +57,12 @@ def test_only_what_leaves_no_room_counts():
 def test_it_is_said_with_both_scales():
     said = Parted(LogScale(math.log(2.0), 0.1, "telemetry"), LogScale(math.log(0.5), 0.03, "height")).warning()
     assert "2 metres per unit" in said and "0.5 by the flight before" in said
+
+
+def test_a_wrong_unit_is_no_change():
+    now = present_scale(*flown(metres_per_unit=2.0), 0.1)
+    seen, told, _ = flown(count=10, metres_per_unit=2.0)
+    assert not has_changed(now, seen, told)
+    seen, told, _ = flown(count=10, metres_per_unit=0.5)
+    assert has_changed(now, seen, told)
+    assert not has_changed(now, seen[:0], told[:0])  # nothing before

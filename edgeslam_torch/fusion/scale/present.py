@@ -71,3 +71,9 @@ def parted(now: LogScale, before: LogScale) -> bool:
     """Whether the present scale cannot be that of the flight before."""
     apart = abs(now.log_scale - before.log_scale)
     return apart > max(_PARTED_LOG, _PARTED_SIGMAS * math.hypot(now.sigma, before.sigma))
+
+
+def has_changed(now: LogScale, moved_map: FloatArray, moved_m: FloatArray) -> bool:
+    """Whether the ways before ``(N, 3)``, told and seen, had another scale: a wrong unit is wrong all the time."""
+    told, seen = (float(np.linalg.norm(way, axis=1).sum()) for way in (moved_m, moved_map))
+    return told > 0 and seen > 0 and abs(now.log_scale - math.log(told / seen)) > _PARTED_LOG
