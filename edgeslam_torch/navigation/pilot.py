@@ -37,6 +37,8 @@ _PATIENCE_S = 1.0
 """Time in which a look must show a way; then it rises for another view."""
 _LOST_S = 15.0
 """Time without progress after which the task is given up."""
+_ELSEWHERE_M = 0.5
+"""Way that counts as progress: what is to go may grow when a way turns out to be closed."""
 _WANTED_M = 0.45
 """Clearance that is wanted where there is space for it."""
 
@@ -69,6 +71,8 @@ class Pilot:
     _progress_s: float = math.nan
     """When the cost to go was last less than ever."""
     _least: float = math.inf
+    _progress_w: FloatArray = field(default_factory=lambda: np.zeros(2))
+    """``(2,)`` where it was then."""
     _waiting_s: float = math.nan
     """Since when there is nothing to fly into."""
     _revision: int = 0
@@ -146,8 +150,9 @@ class Pilot:
         plan = self._planned(sight)
         here = sight.p_w[:2]
         now = float(plan.at(here))
-        if now < self._least - 0.1:
-            self._least, self._progress_s = now, sight.stamp_s
+        if now < self._least - 0.1 or float(np.linalg.norm(here - self._progress_w)) > _ELSEWHERE_M:
+            self._least, self._progress_s = min(now, self._least), sight.stamp_s
+            self._progress_w = here.copy()
         elif sight.stamp_s - self._progress_s > _LOST_S:
             self.phase = Phase.STUCK
             return HOVER
