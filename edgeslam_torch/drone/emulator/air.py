@@ -48,7 +48,7 @@ def ground_effect(height_m: float) -> float:
     """Upward acceleration [m/s^2] at hover thrust, ``height_m`` above the floor (Cheeseman and Bennett 1955).
 
     Example:
-        >>> ground_effect(1.0) < 0.01 < 0.3 < ground_effect(0.1)
+        >>> ground_effect(1.0) < 0.01 < 0.3 < ground_effect(0.05)
         True
     """
     ratio = _PROPELLER_M / (4.0 * max(height_m, _PROPELLER_M))
