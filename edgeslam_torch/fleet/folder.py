@@ -90,6 +90,7 @@ class BatchFolder:
             "name": flight.name,
             "batch": str(self.path),
             **files,
+            "topics": list(flight.topics),
             "max_frames": settings.max_frames,
             "map_score": settings.map_score,
             "signatures": {name: self._signature(Path(file)) for name, file in files.items() if file},
@@ -129,8 +130,17 @@ class BatchFolder:
             return ""  # a preset's name, or a file that is not there, which the flight's own process says
 
 
-def finished_flights(folder: Path) -> list[Path] | None:
-    """Runs in a batch's folder, by name; None if it is no batch's."""
-    if not ((folder / RECORD).is_file() and (folder / FLIGHTS).is_dir()):
-        return None
-    return sorted(path for path in (folder / FLIGHTS).iterdir() if path.is_dir())
+def finished_flights(path: Path) -> list[Path] | None:
+    """Runs of a batch, by its folder or the ``flights`` in it, sorted by name; None if it is no batch's."""
+    if path.name == FLIGHTS and _is_batch(path.parent):
+        path = path.parent
+    return sorted(run for run in (path / FLIGHTS).iterdir() if run.is_dir()) if _is_batch(path) else None
+
+
+def is_beside_flights(path: Path) -> bool:
+    """Whether a batch wrote it beside its ``flights``: what a shell's ``DIR/*`` names too, and no run."""
+    return path.name in (JOBS, WORK, OLDER, PICTURES, TABLE, RECORD, PAGE) and _is_batch(path.parent)
+
+
+def _is_batch(folder: Path) -> bool:
+    return (folder / RECORD).is_file() and (folder / FLIGHTS).is_dir()

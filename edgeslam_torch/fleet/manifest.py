@@ -16,7 +16,7 @@ from edgeslam_torch.readers.images import image_files
 from edgeslam_torch.readers.layouts import layout_of
 from edgeslam_torch.readers.source import LIVE_SCHEMES
 
-COLUMNS = ("recording", "name", "camera", "telemetry", "truth", "settings")
+COLUMNS = ("recording", "name", "camera", "telemetry", "topic", "truth", "settings")
 """Of a CSV table; only the first must be there."""
 _MAX_NAME = 80
 _FILES = video.SUFFIXES | {".bag", ".db3", ".mcap"}
@@ -34,6 +34,8 @@ class Flight:
     """Calibration file or preset; the recording's own when empty."""
     telemetry: str = ""
     """Telemetry file; the recording's own when empty."""
+    topics: tuple[str, ...] = ()
+    """Of a ROS bag to use, as ``edgeslam run --topic`` takes them; chosen by type when empty."""
     truth: str = ""
     """Data set folder or trajectory file; what the recording itself has when empty."""
     settings: tuple[str, ...] = ()
@@ -140,10 +142,16 @@ def _of_row(table: Path, line: int, row: dict[str, str]) -> Flight:
         _plain(cells["name"] or Path(os.path.abspath(recording)).name),
         cells["camera"] if cells["camera"] in PRESETS else beside("camera"),
         beside("telemetry"),
+        _words(cells["topic"]),
         beside("truth"),
-        tuple(word for word in re.split(r"[;\s]+", cells["settings"]) if word),
+        _words(cells["settings"]),
         origin,
     )
+
+
+def _words(cell: str) -> tuple[str, ...]:
+    """Several values of one cell, between blanks or semicolons."""
+    return tuple(word for word in re.split(r"[;\s]+", cell) if word)
 
 
 def _plain(name: str) -> str:

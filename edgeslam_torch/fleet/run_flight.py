@@ -41,7 +41,9 @@ def main(folder: Path) -> int:
     shutil.rmtree(work, ignore_errors=True)  # of a process that was killed
     try:
         config = load_config(SlamConfig(), folder / CONFIG, ())
-        source = open_source(task["recording"], task["camera"] or None, task["telemetry"] or None, task["max_frames"])
+        source = open_source(
+            task["recording"], task["camera"] or None, task["telemetry"] or None, task["max_frames"], task["topics"]
+        )
         settle_camera(source)
         result = run(source, work, config)
         if result.interrupted or result.failure is not None:

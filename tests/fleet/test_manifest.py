@@ -63,6 +63,12 @@ def test_table_gives_each_flight_its_own_camera_truth_and_settings(tmp_path):
     assert (second.camera, second.truth) == (str(tmp_path / "c.yaml"), str(tmp_path / "t.txt"))
 
 
+def test_table_names_the_topics_of_a_bag(tmp_path):
+    rows = "recording,topic\na.bag,/cam1/image_raw\nb.mcap,/cam0/image_raw odom=/vio\nc,\n"
+    flights = read_manifests([str(table(tmp_path, rows))])
+    assert [flight.topics for flight in flights] == [("/cam1/image_raw",), ("/cam0/image_raw", "odom=/vio"), ()]
+
+
 def test_name_cannot_leave_the_batchs_folder(tmp_path):
     flights = read_manifests([str(table(tmp_path, 'recording,name\na,../../etc\nb,"a b/c"\nc,..\n'))])
     assert [flight.name for flight in flights] == ["etc", "a_b_c", "flight"]

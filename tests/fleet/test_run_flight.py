@@ -3,6 +3,8 @@
 import json
 from functools import partial
 
+import bag_files as bags
+import numpy as np
 import pytest
 from fake_slam import FakeSlam
 
@@ -13,6 +15,7 @@ from edgeslam_torch.fleet.manifest import read_manifests
 from edgeslam_torch.run import run
 
 FRAMES = 12
+IMAGE, CAMERA_INFO = "sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo"
 
 
 @pytest.fixture
@@ -20,14 +23,25 @@ def flown(tmp_path, write_tum, monkeypatch):
     """Function that runs one recording as a batch's process would."""
     monkeypatch.setattr(run_flight, "run", partial(run, make_slam=lambda *_: FakeSlam()))
 
-    def fly(recording, truth=""):
+    def fly(recording, truth="", topic=""):
         manifest = tmp_path / "flights.csv"
-        manifest.write_text(f"recording,name,camera,truth\n{recording},one,,{truth}\n")
+        manifest.write_text(f"recording,name,camera,topic,truth\n{recording},one,,{topic},{truth}\n")
         folder = BatchFolder(tmp_path / "out")
         task = folder.task(read_manifests([str(manifest)])[0], BatchSettings(SlamConfig()))
         return folder, task, run_flight.main(folder.prepare(task))
 
     return fly
+
+
+def two_cameras(path, frames):
+    """A bag of cameras, each with so many pictures and a calibration."""
+    events = []
+    for camera, count in frames.items():
+        events.append((f"{camera}/camera_info", CAMERA_INFO, 100.0, bags.camera_info((64, 48), 60.0)))
+        for i in range(count):
+            picture = bags.picture(100.0 + 0.1 * i, np.full((48, 64, 3), 10 * i, np.uint8), "bgr8")
+            events.append((f"{camera}/image_raw", IMAGE, 100.0 + 0.1 * i, picture))
+    return bags.write_mcap(path, sorted(events, key=lambda event: event[2]))
 
 
 def write_truth(path, scale=2.0):
@@ -90,3 +104,21 @@ def test_rest_of_a_killed_attempt_is_no_obstacle(tmp_path, flown, write_tum):
     rest.mkdir()
     (rest / "holiday.png").touch()
     assert flown(recording)[2] == 0
+
+
+@pytest.mark.parametrize(("topic", "frames"), [("/cam0/image_raw", 12), ("/cam1/image_raw", 9)])
+def test_a_bags_topic_is_the_tables(tmp_path, flown, topic, frames):
+    pytest.importorskip("rosbags")
+    pytest.importorskip("mcap_ros2")
+    bag = two_cameras(tmp_path / "rec.mcap", {"/cam0": 12, "/cam1": 9})
+    folder, task, code = flown(bag, topic=topic)
+    assert code == 0
+    assert folder.result(task)["figures"]["frames"] == frames
+
+
+def test_a_topic_that_is_not_there_is_one_line(tmp_path, flown, capsys):
+    pytest.importorskip("rosbags")
+    pytest.importorskip("mcap_ros2")
+    _, _, code = flown(two_cameras(tmp_path / "rec.mcap", {"/cam0": 2}), topic="/cam7/image_raw")
+    assert code == 1
+    assert "/cam7/image_raw" in capsys.readouterr().err.splitlines()[-1]

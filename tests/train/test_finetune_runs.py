@@ -88,8 +88,16 @@ def test_folder_of_a_batch_stands_for_its_finished_flights(
     shutil.rmtree(batch / "flights" / "recording")
     summary = json.loads((run_folder / "summary.json").read_text())
     (batch / "flights" / "run" / "summary.json").write_text(json.dumps(summary))
-    assert command.main(arguments(tmp_path, batch, "--from-runs", "pairs")) == 0
-    assert "11 posed images" in capsys.readouterr().out
+    for name in ("jobs", "work", "pictures"):
+        (batch / name).mkdir()
+    for name in ("batch.csv", "index.html"):
+        (batch / name).write_text("")
+    for i, data in enumerate(
+        ([batch], [batch / "flights"], sorted(batch.iterdir()))
+    ):  # DIR, DIR/flights, a shell's DIR/*
+        (out := tmp_path / f"of_{i}").mkdir()
+        assert command.main(arguments(out, *data, "--from-runs", "pairs")) == 0
+        assert "11 posed images" in capsys.readouterr().out
 
 
 def test_pairs_alone_leave_nothing_to_validate_on_and_that_is_said(

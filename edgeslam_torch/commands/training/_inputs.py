@@ -210,15 +210,17 @@ def items_of(args: argparse.Namespace, ignore_depth: bool) -> list[Item]:
 
 
 def _without_batches(paths: Sequence[Path]) -> list[Path]:
-    """Folders of 'edgeslam batch' replaced by the runs in them.
+    """Folders of 'edgeslam batch', or what a shell's ``DIR/*`` makes of one, replaced by the runs in them.
 
     Raises:
         SourceError: If no flight of a batch finished.
     """
-    from edgeslam_torch.fleet.folder import finished_flights
+    from edgeslam_torch.fleet.folder import finished_flights, is_beside_flights
 
     found: list[Path] = []
     for path in paths:
+        if is_beside_flights(path):
+            continue
         runs = finished_flights(path)
         if runs == []:
             raise SourceError(f"{path}: no flight of this batch finished")
