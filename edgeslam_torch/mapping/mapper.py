@@ -22,7 +22,7 @@ from edgeslam_torch.mapping.prior_anchors import (
     prior_of,
     rays,
 )
-from edgeslam_torch.mapping.refinement import choose_window, refine, refine_all
+from edgeslam_torch.mapping.refinement import choose_window, refine, refine_all, young_map
 from edgeslam_torch.mapping.reobserve import MAX_DRIFT_PX, reobserve
 from edgeslam_torch.mapping.window_edges import WindowEdges
 from edgeslam_torch.optim.problem import LmConfig, WindowResult
@@ -84,7 +84,8 @@ class Mapper:
             drift_px = reobserve(self.map, self.camera, keyframe)
         if drift_px is not None and drift_px > MAX_DRIFT_PX:  # the drift lies outside the window
             refine_all(self.map, self.camera, self.lm, telemetry)
-        window = choose_window(self.map, keyframe, self.config.window, self.config.window_fixed)
+        free, fixed = self.config.window, self.config.window_fixed
+        window = young_map(self.map, keyframe, free + fixed) or choose_window(self.map, keyframe, free, fixed)
         edges = self._edges if self._edges is not None and self._edges.wanted(keyframe) else None
         result = refine(self.map, window, self.camera, self.lm, telemetry, edges)
         with self.map.lock:

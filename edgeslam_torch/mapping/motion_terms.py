@@ -14,8 +14,9 @@ ALIKE = 30.0
 telemetry whose covariance is honest. So many of them count as one (docs/decisions/0052)."""
 COST_TOLERANCE = 1e-5
 MU = 1e-8
-"""For windows with telemetry: a drift of the scale is a slow mode, which a solver that stops early or is damped by the
-stiff ones never reaches."""
+ITERATIONS = 30
+"""For windows with telemetry and young maps: a drift of the scale, or a turn taken for a shift, is a slow mode, which a
+solver that stops early or is damped by the stiff ones never reaches."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,8 +60,14 @@ def motion_factors(
     return MotionFactors(tuple(centres), tuple(gravity))
 
 
-def solver(config: LmConfig, problem: WindowProblem) -> LmConfig:
-    """How a window is minimised: to the end where it has motion factors."""
-    if not problem.centres:
+def solver(config: LmConfig, problem: WindowProblem, to_the_end: bool = False) -> LmConfig:
+    """How a window is minimised: to the end if asked, and where it has motion factors."""
+    if not problem.centres and not to_the_end:
         return config
-    return replace(config, cost_tolerance=min(config.cost_tolerance, COST_TOLERANCE), mu=min(config.mu, MU))
+    most = max(config.max_iterations, ITERATIONS) if to_the_end and config.max_iterations else config.max_iterations
+    return replace(
+        config,
+        max_iterations=most,
+        cost_tolerance=min(config.cost_tolerance, COST_TOLERANCE),
+        mu=min(config.mu, MU),
+    )

@@ -42,6 +42,9 @@ class Window:
     anchor: IntArray
     freed: Weight = Weight.NONE
     """How the bias of depths on priors is undone."""
+    young: bool = False
+    """A whole young map: the solver stops only where the cost is flat, and the newest keyframe, the last free one, is as
+    tracking placed it."""
 
 
 def choose_window(slam_map: SlamMap, newest: Keyframe, free: int, fixed: int) -> Window:
@@ -60,6 +63,21 @@ def choose_window(slam_map: SlamMap, newest: Keyframe, free: int, fixed: int) ->
         while len(frozen) < 2 and len(members) > 1:
             frozen.append(members.pop())
     return Window(members, frozen, slam_map.anchors_seen_by(members))
+
+
+def young_map(slam_map: SlamMap, newest: Keyframe, most: int) -> Window | None:
+    """The whole piece of map of the newest keyframe, to be refined to the end, while it has at most ``most`` keyframes.
+
+    A map that began with predicted depths of a wrong shape has a turn where there was a shift, and the other way round.
+    A solver that stops at 1 % of the cost never undoes that, nor can it with two fixed poses, one of them wrong
+    (docs/decisions/0130). None for fewer than three keyframes, or a camera that never moved.
+    """
+    piece = slam_map.piece_of(newest.id)
+    keyframes = [k for id, k in sorted(slam_map.keyframes.items()) if slam_map.piece_of(id) == piece]
+    if not 3 <= len(keyframes) <= most:
+        return None
+    window = Window(keyframes[1:], keyframes[:1], slam_map.anchors_seen_by(keyframes), young=True)
+    return window if held_extent(window) is not None else None
 
 
 def refine_all(
@@ -86,14 +104,16 @@ def whole_map(slam_map: SlamMap, freed: Weight = Weight.NONE) -> Window | None:
 def held_extent(window: Window) -> ScalePrior | None:
     """Scale prior if only one pose is fixed: the distance to the farthest other pose. None if no pose is free.
 
-    Two fixed poses fix the scale themselves; coincident poses have none. In the map of an earlier flight it is the
+    Two fixed poses fix the scale themselves; coincident poses have none. The newest pose of a young map has not been
+    refined and may be anywhere: another one holds the scale. In the map of an earlier flight it is the
     farthest pose of that flight: a metre is as long as it was.
     """
     if len(window.fixed) != 1 or not window.free:
         return None
     centre = window.fixed[0].centre_w
-    distance = np.array([np.linalg.norm(k.centre_w - centre) for k in window.free])
-    earlier = np.array([math.isinf(k.stamp_s) for k in window.free])
+    refined = window.free[:-1] if window.young else window.free
+    distance = np.array([np.linalg.norm(k.centre_w - centre) for k in refined])
+    earlier = np.array([math.isinf(k.stamp_s) for k in refined])
     if math.isinf(window.fixed[0].stamp_s) and (distance[earlier] >= MIN_EXTENT).any():
         distance = np.where(earlier, distance, 0.0)
     far = int(distance.argmax())
@@ -117,7 +137,7 @@ def refine(
     problem = problem if placed is None else placed.problem
     if len(problem.obs_pose) == 0 and (placed is None or not placed.has_terms):
         return None
-    result = refine_window(problem, solver(config, problem))
+    result = refine_window(problem, solver(config, problem, window.young))
     write_back(slam_map, window, keypoint, result)
     if edges is not None and placed is not None and result.stop is not StopReason.NOT_FINITE:
         with slam_map.lock:

@@ -33,6 +33,10 @@ ALIKE_COST = 1.2
 """Maximum ratio of the costs of two structures that both explain the images: four standard deviations of a chi-square
 with several hundred degrees of freedom."""
 
+SAME_PICTURE_PX = 1.0
+"""Median motion of the keypoints up to which a frame is the reference's picture once more. A still camera, or a video
+that repeats a picture, matches all of them, by which no later frame may be measured."""
+
 AGREEING_SHARE = 0.8
 """The same after joint refinement of all frames: 95 % if every match were correct, less a sixth of wrong matches."""
 
@@ -97,7 +101,7 @@ class Bootstrap:
         self.corner = np.ones(len(guess), dtype=bool) if corner is None else corner
         self.guess_depth = guess_depth = guess[:, 0]
         self.max_matched = 0
-        """Maximum number of inliers so far."""
+        """Maximum number of inliers so far, of frames that differ from the reference."""
         self.views: list[BootstrapView] = []
         self.waiting: list[WaitingFrame] = []
         points = se3.transform(reference.T_w_c, tracker.camera.back_project(reference.features.uv, guess_depth))
@@ -119,9 +123,20 @@ class Bootstrap:
         """Pose against the predicted map; the pose is rough, the matches are reliable."""
         radius = 2.0 * self.tracker.config.motion_radius_px
         track = self.tracker.refine(view, T_predicted, self._guessed, radius, expected=expected)
-        if track is not None:
+        if track is not None and self._moved_px(view, track) > SAME_PICTURE_PX:
             self.max_matched = max(self.max_matched, track.inliers)
         return track
+
+    def _moved_px(self, view: View, track: Track) -> float:
+        """Median distance of matched keypoints from their places in the reference [px]."""
+        uv = self.reference.features.uv[self._reference_keypoints(track)]
+        return float(np.median(np.linalg.norm(view.features.uv[track.matched_keypoint] - uv, axis=1)))
+
+    def _reference_keypoints(self, track: Track) -> IntArray:
+        """Keypoints of the reference that a frame was matched with ``(M,)``."""
+        keypoint_of_anchor = np.full(len(self.map.anchors.alive), -1, dtype=np.int64)
+        keypoint_of_anchor[self.reference.anchor] = np.arange(len(self.reference.anchor))
+        return keypoint_of_anchor[track.matched_anchor]
 
     def two_views(self, frame_index: int, view: View, track: Track, corner: NDArray[np.bool_] | None = None) -> TwoView:
         """Store the frame's matches and try to triangulate those of corners with the reference.
@@ -135,9 +150,7 @@ class Bootstrap:
             track: Its matches.
             corner: Which of its keypoints are corners ``(N,)``; None: all.
         """
-        keypoint_of_anchor = np.full(len(self.map.anchors.alive), -1, dtype=np.int64)
-        keypoint_of_anchor[self.reference.anchor] = np.arange(len(self.reference.anchor))
-        reference_keypoint = keypoint_of_anchor[track.matched_anchor]
+        reference_keypoint = self._reference_keypoints(track)
         self.views.append(
             BootstrapView(
                 frame_index,
