@@ -4,9 +4,12 @@ import numpy as np
 import pytest
 from point_map import CAMERA, PointMap, check_map, small_motion
 
+from edgeslam_torch.config import WindowConfig
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.losses.robust import Kernel
-from edgeslam_torch.mapping.refinement import Window, choose_window, refine, refine_all, window_problem
+from edgeslam_torch.mapping.last_refinement import lm_config
+from edgeslam_torch.mapping.refinement import Window, choose_window, refine, refine_all, window_problem, young_map
+from edgeslam_torch.optim.pose_only import refine_pose
 from edgeslam_torch.optim.problem import LmConfig, StopReason
 
 
@@ -152,3 +155,57 @@ def test_map_of_a_camera_that_never_moved_is_left_alone(points):
     for keyframe in points.map.keyframes.values():
         keyframe.T_c_w = np.eye(4)
     assert refine_all(points.map, CAMERA, LmConfig()) is None
+
+
+def bend(points):
+    """The map as a network would begin it that halves the range of log depth, each pose the best in that map."""
+    first, anchors = points.keyframes[0], points.map.anchors
+    ids = np.flatnonzero(anchors.alive)
+    p_c = se3.transform(first.T_c_w, anchors.p_w[ids])
+    depth = np.abs(p_c[:, 2:])
+    anchors.p_w[ids] = se3.transform(first.T_w_c, p_c * np.sqrt(np.median(depth) / depth))
+    for keyframe in points.keyframes[1:]:
+        seen = keyframe.keypoints_with_anchor()
+        uv, p_w = keyframe.features.uv[seen].astype(np.float64), anchors.p_w[keyframe.anchor[seen]]
+        K = (CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy)
+        keyframe.T_c_w = refine_pose(keyframe.T_c_w, p_w, uv, np.ones(len(uv)), K).T_c_w
+
+
+def worst_turn_deg(points):
+    T_w_c0 = points.keyframes[0].T_w_c @ points.world.T_c_w[0]
+    turns = [se3.log(k.T_c_w @ T_w_c0 @ se3.inverse(points.world.T_c_w[k.id]))[3:] for k in points.keyframes]
+    return np.degrees(np.linalg.norm(turns, axis=1).max())
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_young_map_of_a_wrong_shape_is_straightened(seed):
+    """A flying window's six steps leave a tenth of the false turn at best; a whole young map has none left."""
+    points = PointMap(np.random.default_rng(seed), 300, 6, noise_px=0.3)
+    points.fill()
+    bend(points)
+    assert worst_turn_deg(points) > 1.0
+    window = young_map(points.map, points.keyframes[-1], 25)
+    refine(points.map, window, CAMERA, lm_config(WindowConfig()))
+    assert worst_turn_deg(points) < 0.1
+    check_map(points.map)
+
+
+def test_a_young_map_is_all_of_it_held_by_what_was_refined_before(points, rng):
+    """The newest keyframe, the farthest one, comes as tracking placed it: its error must not become the map's scale."""
+    newest, centre = points.keyframes[-1], points.keyframes[0].centre_w
+    distance = [np.linalg.norm(k.centre_w - centre) for k in points.keyframes]
+    T_w_c = newest.T_w_c.copy()
+    T_w_c[:3, 3] += 0.1 * (newest.centre_w - centre)
+    newest.T_c_w = se3.inverse(T_w_c)
+    refine(points.map, young_map(points.map, newest, 25), CAMERA, LmConfig())
+    after = [np.linalg.norm(k.centre_w - centre) for k in points.keyframes]
+    np.testing.assert_allclose(after, distance, rtol=2e-3, atol=1e-6)
+
+
+def test_only_a_small_map_is_young(points):
+    newest = points.keyframes[-1]
+    assert young_map(points.map, newest, len(points.keyframes)).free[-1] is newest
+    assert young_map(points.map, newest, len(points.keyframes) - 1) is None
+    for keyframe in points.keyframes[1:-1]:
+        points.map.remove_keyframe(keyframe)
+    assert young_map(points.map, newest, 25) is None  # two keyframes leave nothing to straighten

@@ -238,6 +238,16 @@ def test_of_many_waiting_frames_those_that_stand_apart_stay(points):
     assert bootstrap.waiting[-1].frame.index == 5
 
 
+def test_the_same_picture_again_is_no_measure_of_later_ones(points):
+    """A camera that stands still matches every keypoint; by that, the first step away would look like another view."""
+    bootstrap = make_bootstrap(points, z_in(points, 0))
+    still = bootstrap.track(view_of(points, 0), points.world.T_c_w[0])
+    assert still.inliers > 0
+    assert bootstrap.max_matched == 0
+    moved = bootstrap.track(view_of(points, 1), points.world.T_c_w[1])
+    assert bootstrap.max_matched == moved.inliers > 0
+
+
 def test_abandoned_attempt_leaves_no_guess_behind(points):
     bootstrap = make_bootstrap(points, np.ones(len(points.point_of[0])))
     bootstrap.forget_guess()
