@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from edgeslam_torch.fusion.displacement import TelemetryModel
+from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.robust_statistics import CHI2_2DOF_95
 from edgeslam_torch.losses.robust import Kernel
@@ -138,11 +139,39 @@ def refine(
     if len(problem.obs_pose) == 0 and (placed is None or not placed.has_terms):
         return None
     result = refine_window(problem, solver(config, problem, window.young))
+    if window.young and problem.scale_priors and not problem.centres and result.stop is not StopReason.NOT_FINITE:
+        result = with_same_depths(problem, result, len(window.free))
     write_back(slam_map, window, keypoint, result)
     if edges is not None and placed is not None and result.stop is not StopReason.NOT_FINITE:
         with slam_map.lock:
             edges.write_back(keyframes, placed.edges, result.edge_inverse_depth)
     return result
+
+
+def with_same_depths(problem: WindowProblem, result: WindowResult, pose: int) -> WindowResult:
+    """The result scaled about a fixed pose such that the median depth of the anchors that it sees is what it was.
+
+    Between keyframes a false turn makes up several times the true distance, so that no distance may hold the unit of a
+    map that is being straightened.
+    """
+    seen = problem.obs_anchor[problem.obs_pose == pose]
+    if len(seen) == 0:
+        return result
+    T_c_w = problem.T_c_w[pose]
+    before, after = (se3.transform(T_c_w, p[seen])[:, 2] for p in (problem.p_w, result.p_w))
+    ahead = (before > 0) & (after > 0)
+    if not ahead.any():
+        return result
+    ratio = float(np.exp(np.median(np.log(before[ahead] / after[ahead]))))
+    centre = se3.inverse(T_c_w)[:3, 3]
+    T_w_c = se3.inverse(result.T_c_w)
+    T_w_c[:, :3, 3] = centre + ratio * (T_w_c[:, :3, 3] - centre)
+    return replace(
+        result,
+        T_c_w=se3.inverse(T_w_c),
+        p_w=centre + ratio * (result.p_w - centre),
+        edge_inverse_depth=result.edge_inverse_depth / ratio,
+    )
 
 
 def window_problem(
