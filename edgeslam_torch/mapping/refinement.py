@@ -71,7 +71,7 @@ def young_map(slam_map: SlamMap, newest: Keyframe, most: int) -> Window | None:
 
     A map that began with predicted depths of a wrong shape has a turn where there was a shift, and the other way round.
     A solver that stops at 1 % of the cost never undoes that, nor can it with two fixed poses, one of them wrong
-    (docs/decisions/0130). None for fewer than three keyframes, or a camera that never moved.
+    (docs/decisions/0083). None for fewer than three keyframes, or a camera that never moved.
     """
     piece = slam_map.piece_of(newest.id)
     keyframes = [k for id, k in sorted(slam_map.keyframes.items()) if slam_map.piece_of(id) == piece]

@@ -40,12 +40,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="compare depth networks: everything once with each; may be repeated ('default' is the shipped one)",
     )
     parser.add_argument(
-        "--navigation", action="store_true", help="judge simulated flights to a goal instead (true pose, lockstep)"
+        "--navigation", action="store_true", help="judge simulated flights to a goal instead (in lockstep)"
     )
     parser.add_argument(
         "--world", action="append", default=[], metavar="NAME", help="of those flights; may be repeated"
     )
     parser.add_argument("--fault", action="append", default=[], metavar="NAME|all", help="likewise (default: none)")
+    parser.add_argument(
+        "--eyes",
+        choices=("truth", "slam"),
+        default="truth",
+        help="what their pilot is told: the true pose and depth (default), or what the SLAM knows",
+    )
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="of those flights at a time (default: 1)")
     parser.add_argument("--no-micro", action="store_true", help="omit the times of solver and depth network")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the runs (default: runs/bench-TIME)")
@@ -146,7 +152,9 @@ def _navigation(args: argparse.Namespace) -> int:
     if args.jobs < 1 or args.seeds < 1:
         raise ConfigError("--jobs and --seeds must be at least 1")
     out = args.out or Path("runs") / time.strftime("navigation-%Y%m%d-%H%M%S")
-    cases = [Case(world, seed, fault) for fault in faults for world in worlds for seed in range(args.seeds)]
+    cases = [
+        Case(world, seed, fault, args.eyes) for fault in faults for world in worlds for seed in range(args.seeds)
+    ]
     flights = judge_flights(cases, out, args.jobs, _say)
     print(markdown(flights))
     print(f"results: {out / 'navigation.md'}")

@@ -40,7 +40,7 @@ def judge_flights(cases: Sequence[Case], out: Path, jobs: int, say: Callable[[st
     flights = [found[case] for case in cases]
     write_text(out / "navigation.md", markdown(flights))
     for flown in sorted(flights, key=lambda f: (f.reached, not f.contacts, f.clearance_min_m))[:_WORST]:
-        name = f"{flown.case.world}_{flown.case.seed}_{flown.case.fault}.png"
+        name = f"{_name(flown.case)}.png"
         cv2.imwrite(str(out / f"top_{name}"), top_view(flown))
         strip = film_strip(flown)
         if strip is not None:
@@ -48,8 +48,12 @@ def judge_flights(cases: Sequence[Case], out: Path, jobs: int, say: Callable[[st
     return flights
 
 
+def _name(case: Case) -> str:
+    return f"{case.world}_{case.seed}_{case.fault}_{case.eyes}"
+
+
 def _file(out: Path, case: Case) -> Path:
-    return out / f"flight_{case.world}_{case.seed}_{case.fault}.json"
+    return out / f"flight_{_name(case)}.json"
 
 
 def _earlier(file: Path, case: Case) -> Flown | None:
@@ -63,7 +67,7 @@ def _earlier(file: Path, case: Case) -> Flown | None:
 def _line(flown: Flown) -> str:
     told = f"; {', '.join(flown.dangers)}" if flown.dangers else ""
     return (
-        f"{flown.case.world} {flown.case.seed} {flown.case.fault}: {flown.ended} after {flown.time_s:.1f} s "
+        f"{flown.case.world} {flown.case.seed} {flown.case.fault} by {flown.case.eyes}: {flown.ended} after {flown.time_s:.1f} s "
         f"(oracle {flown.oracle_s:.1f}), {flown.distance_m:.2f} m from the goal, {flown.contacts} contacts, "
         f"clearance {flown.clearance_min_m:.2f} m{told}"
     )

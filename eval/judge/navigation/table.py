@@ -9,8 +9,8 @@ from edgeslam_torch.eval.judge.navigation.flight import Flown
 
 _Z = 1.959964
 HEAD = (
-    "| world | fault | flights | goal reached | contact | no contact, on the floor in the end | clearance p5, min [m] "
-    "| time over oracle | cruise [m/s] | CPU a tick, worst [ms] |\n|---|---|---|---|---|---|---|---|---|---|\n"
+    "| world | fault | eyes | flights | goal reached | contact | no contact, on the floor in the end | clearance p5, min [m] "
+    "| time over oracle | cruise [m/s] | CPU a tick, worst [ms] |\n|---|---|---|---|---|---|---|---|---|---|---|\n"
 )
 
 
@@ -31,27 +31,27 @@ def wilson(successes: int, trials: int) -> tuple[float, float]:
 
 def markdown(flights: Sequence[Flown]) -> str:
     """One row for every world and fault, and one for all static worlds without a fault."""
-    groups: dict[tuple[str, str], list[Flown]] = {}
+    groups: dict[tuple[str, str, str], list[Flown]] = {}
     for flown in flights:
-        groups.setdefault((flown.case.world, flown.case.fault), []).append(flown)
-    rows = [
-        _row(world, fault, group) for (world, fault), group in sorted(groups.items(), key=lambda item: item[0][::-1])
-    ]
+        groups.setdefault((flown.case.eyes, flown.case.fault, flown.case.world), []).append(flown)
+    rows = [_row(world, fault, eyes, group) for (eyes, fault, world), group in sorted(groups.items())]
     plain = [f for f in flights if f.case.fault == "none"]
     faulty = [f for f in flights if f.case.fault != "none"]
     for name, group in (("all", plain), ("all with a fault", faulty)):
         if len({(f.case.world, f.case.fault) for f in group}) > 1:
-            rows.append(_row(name, "none" if group is plain else "any", group))
+            eyes = ", ".join(sorted({f.case.eyes for f in group}))
+            rows.append(_row(name, "none" if group is plain else "any", eyes, group))
     return HEAD + "".join(rows)
 
 
-def _row(world: str, fault: str, group: Sequence[Flown]) -> str:
+def _row(world: str, fault: str, eyes: str, group: Sequence[Flown]) -> str:
     n = len(group)
     ratio = [f.time_s / f.oracle_s for f in group if f.reached]
     cruise = [f.cruise_m_s for f in group if math.isfinite(f.cruise_m_s)]
     cells = (
         world,
         fault,
+        eyes,
         str(n),
         _share(sum(f.reached for f in group), n),
         _share(sum(f.contacts > 0 for f in group), n),

@@ -44,7 +44,7 @@ def test_the_table_counts_and_says_how_sure_it_is():
 def test_finished_flights_are_not_flown_again(tmp_path):
     case = Case("blank_walls", 0)
     record = flown(True, track_w=[[0.0, 0.0, 1.0], [1.0, 0.0, 1.0]]).record()
-    (tmp_path / "flight_blank_walls_0_none.json").write_text(json.dumps(record))
+    (tmp_path / "flight_blank_walls_0_none_truth.json").write_text(json.dumps(record))
     said = []
     (found,) = judge_flights([case], tmp_path, 1, said.append)
     assert found.reached and not said
