@@ -177,6 +177,13 @@ def worst_turn_deg(points):
     return np.degrees(np.linalg.norm(turns, axis=1).max())
 
 
+def median_depth(points):
+    """Of what the first keyframe sees [map units]."""
+    first = points.keyframes[0]
+    seen = first.anchor[first.anchor >= 0]
+    return np.median(se3.transform(first.T_c_w, points.map.anchors.p_w[seen])[:, 2])
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_a_young_map_of_a_wrong_shape_is_straightened(seed):
     """A flying window's six steps leave a tenth of the false turn at best; a whole young map has none left."""
@@ -184,9 +191,11 @@ def test_a_young_map_of_a_wrong_shape_is_straightened(seed):
     points.fill()
     bend(points)
     assert worst_turn_deg(points) > 1.0
+    before = median_depth(points)
     window = young_map(points.map, points.keyframes[-1], 25)
     refine(points.map, window, CAMERA, lm_config(WindowConfig()))
     assert worst_turn_deg(points) < 0.1
+    assert median_depth(points) == pytest.approx(before, rel=0.02)
     check_map(points.map)
 
 
