@@ -44,8 +44,8 @@ class Window:
     freed: Weight = Weight.NONE
     """How the bias of depths on priors is undone."""
     young: bool = False
-    """A whole young map: the solver stops only where the cost is flat, and the newest keyframe, the last free one, is as
-    tracking placed it."""
+    """A whole young map: the solver stops only where the cost is flat, and the newest keyframe, the last free one, is
+    as tracking placed it."""
 
 
 def choose_window(slam_map: SlamMap, newest: Keyframe, free: int, fixed: int) -> Window:

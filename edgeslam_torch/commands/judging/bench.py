@@ -152,9 +152,7 @@ def _navigation(args: argparse.Namespace) -> int:
     if args.jobs < 1 or args.seeds < 1:
         raise ConfigError("--jobs and --seeds must be at least 1")
     out = args.out or Path("runs") / time.strftime("navigation-%Y%m%d-%H%M%S")
-    cases = [
-        Case(world, seed, fault, args.eyes) for fault in faults for world in worlds for seed in range(args.seeds)
-    ]
+    cases = [Case(world, seed, fault, args.eyes) for fault in faults for world in worlds for seed in range(args.seeds)]
     flights = judge_flights(cases, out, args.jobs, _say)
     print(markdown(flights))
     print(f"results: {out / 'navigation.md'}")

@@ -67,7 +67,8 @@ def _earlier(file: Path, case: Case) -> Flown | None:
 def _line(flown: Flown) -> str:
     told = f"; {', '.join(flown.dangers)}" if flown.dangers else ""
     return (
-        f"{flown.case.world} {flown.case.seed} {flown.case.fault} by {flown.case.eyes}: {flown.ended} after {flown.time_s:.1f} s "
+        f"{flown.case.world} {flown.case.seed} {flown.case.fault} by {flown.case.eyes}: "
+        f"{flown.ended} after {flown.time_s:.1f} s "
         f"(oracle {flown.oracle_s:.1f}), {flown.distance_m:.2f} m from the goal, {flown.contacts} contacts, "
         f"clearance {flown.clearance_min_m:.2f} m{told}"
     )

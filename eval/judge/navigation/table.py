@@ -9,7 +9,8 @@ from edgeslam_torch.eval.judge.navigation.flight import Flown
 
 _Z = 1.959964
 HEAD = (
-    "| world | fault | eyes | flights | goal reached | contact | no contact, on the floor in the end | clearance p5, min [m] "
+    "| world | fault | eyes | flights | goal reached | contact | no contact, on the floor in the end "
+    "| clearance p5, min [m] "
     "| time over oracle | cruise [m/s] | CPU a tick, worst [ms] |\n|---|---|---|---|---|---|---|---|---|---|---|\n"
 )
 
