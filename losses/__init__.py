@@ -9,7 +9,15 @@ if __name__ == "losses":
 
 from edgeslam_torch.losses.base import Reduction, ResidualLoss, Residuals, back_project, move, project, reduce
 from edgeslam_torch.losses.cycle import CycleForm, CycleLoss, sample_depth
-from edgeslam_torch.losses.depth_terms import BerHu, GradientMatching, LaplaceNll, MaskedL1, SILog, masked_mean
+from edgeslam_torch.losses.depth_terms import (
+    BerHu,
+    GradientMatching,
+    LaplaceNll,
+    LogSlope,
+    MaskedL1,
+    SILog,
+    masked_mean,
+)
 from edgeslam_torch.losses.edge_alignment import EdgeAlignmentLoss
 from edgeslam_torch.losses.lshape import AngleForm, AngleLoss, CollinearityLoss, LShapeLoss
 from edgeslam_torch.losses.photometric import PhotometricLoss, SmoothnessLoss, dissimilarity, warp_to
@@ -31,6 +39,7 @@ __all__ = [
     "Kernel",
     "LShapeLoss",
     "LaplaceNll",
+    "LogSlope",
     "MaskedL1",
     "PhotometricLoss",
     "Reduction",

@@ -1,5 +1,12 @@
 """Training-only depth terms: each takes log depth ``(B, 1, H, W)`` and a mask, and returns one value per image.
 
+Every ``forward`` takes
+
+- ``log_depth``, predicted, and ``log_target``, observed ``(B, 1, H, W)`` [log m],
+- ``mask``, where it is known ``(B, 1, H, W)`` bool,
+
+and raises `ValueError` if shapes differ, `TypeError` if the mask is not bool.
+
 Per-image means (not means over the batch's pixels) make the loss of a batch the mean of its images' losses, so the same
 batch split over two processes gives the same gradient.
 
@@ -48,17 +55,7 @@ class MaskedL1(nn.Module):
 
     @in_full_precision
     def forward(self, log_depth: Tensor, log_target: Tensor, mask: Tensor) -> Tensor:
-        """Mean over valid pixels ``(B,)``.
-
-        Args:
-            log_depth: Predicted ``(B, 1, H, W)`` [log m].
-            log_target: Observed ``(B, 1, H, W)`` [log m].
-            mask: Where it is known ``(B, 1, H, W)`` bool.
-
-        Raises:
-            ValueError: If shapes differ.
-            TypeError: If the mask is not bool.
-        """
+        """Mean over valid pixels ``(B,)``."""
         return masked_mean(_residual(log_depth, log_target, mask).abs(), mask)
 
     if TYPE_CHECKING:
@@ -78,17 +75,7 @@ class BerHu(nn.Module):
 
     @in_full_precision
     def forward(self, log_depth: Tensor, log_target: Tensor, mask: Tensor) -> Tensor:
-        """Mean over valid pixels ``(B,)``.
-
-        Args:
-            log_depth: Predicted ``(B, 1, H, W)`` [log m].
-            log_target: Observed ``(B, 1, H, W)`` [log m].
-            mask: Where it is known ``(B, 1, H, W)`` bool.
-
-        Raises:
-            ValueError: If shapes differ.
-            TypeError: If the mask is not bool.
-        """
+        """Mean over valid pixels ``(B,)``."""
         r = _residual(log_depth, log_target, mask).abs()
         c = (self.fraction * r.flatten(1).amax(1)).clamp(min=1e-6).view(-1, *[1] * (r.ndim - 1))
         return masked_mean(torch.where(r <= c, r, (r * r + c * c) / (2 * c)), mask)
@@ -110,19 +97,34 @@ class SILog(nn.Module):
 
     @in_full_precision
     def forward(self, log_depth: Tensor, log_target: Tensor, mask: Tensor) -> Tensor:
-        """Error over valid pixels ``(B,)``, squared [log m].
-
-        Args:
-            log_depth: Predicted ``(B, 1, H, W)`` [log m].
-            log_target: Observed ``(B, 1, H, W)`` [log m].
-            mask: Where it is known ``(B, 1, H, W)`` bool.
-
-        Raises:
-            ValueError: If shapes differ.
-            TypeError: If the mask is not bool.
-        """
+        """Error over valid pixels ``(B,)``, squared [log m]."""
         r = _residual(log_depth, log_target, mask)
         return masked_mean(r * r, mask) - self.balance * masked_mean(r, mask).square()
+
+    if TYPE_CHECKING:
+        __call__ = forward
+
+
+class LogSlope(nn.Module):
+    """Distance from 1 of the slope of predicted log depth on observed log depth: below 1, far is predicted too near.
+
+    The slope is that of the line of least squares through the valid pixels of an image. Scale does not count.
+
+    Args:
+        floor: Variance [log m squared] below which an image has no range to speak of: it pulls the slope to 1.
+    """
+
+    def __init__(self, floor: float = 0.01) -> None:
+        super().__init__()
+        self.floor = floor
+
+    @in_full_precision
+    def forward(self, log_depth: Tensor, log_target: Tensor, mask: Tensor) -> Tensor:
+        """``|slope - 1|`` over valid pixels ``(B,)``."""
+        r = _residual(log_depth, log_target, mask)
+        t = torch.where(mask, log_target, 0.0)
+        t = t - masked_mean(t, mask).view(-1, *[1] * (t.ndim - 1))
+        return (masked_mean(t * r, mask) / (masked_mean(t * t, mask) + self.floor)).abs()
 
     if TYPE_CHECKING:
         __call__ = forward
@@ -141,17 +143,7 @@ class GradientMatching(nn.Module):
 
     @in_full_precision
     def forward(self, log_depth: Tensor, log_target: Tensor, mask: Tensor) -> Tensor:
-        """Mean over pairs of valid pixels ``(B,)``.
-
-        Args:
-            log_depth: Predicted ``(B, 1, H, W)`` [log m].
-            log_target: Observed ``(B, 1, H, W)`` [log m].
-            mask: Where it is known ``(B, 1, H, W)`` bool.
-
-        Raises:
-            ValueError: If shapes differ.
-            TypeError: If the mask is not bool.
-        """
+        """Mean over pairs of valid pixels ``(B,)``."""
         r = _residual(log_depth, log_target, mask)
         total = r.new_zeros(r.shape[0])
         for scale in range(self.scales):
@@ -183,13 +175,7 @@ class LaplaceNll(nn.Module):
         Args:
             log_sigma: Predicted logarithm of the standard deviation of ``log_depth`` ``(B, 1, H, W)``; that of a
                 Laplace distribution is sqrt(2) times its scale.
-            log_depth: Predicted ``(B, 1, H, W)`` [log m]; gets no gradient.
-            log_target: Observed ``(B, 1, H, W)`` [log m].
-            mask: Where it is known ``(B, 1, H, W)`` bool.
-
-        Raises:
-            ValueError: If shapes differ.
-            TypeError: If the mask is not bool.
+            log_depth, log_target, mask: As of the other terms; the prediction gets no gradient.
         """
         check_images(log_sigma=log_sigma, log_depth=log_depth)
         r = _residual(log_depth, log_target, mask).detach().abs()

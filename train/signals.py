@@ -8,10 +8,18 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from edgeslam_torch.losses.depth_terms import BerHu, GradientMatching, LaplaceNll, MaskedL1, SILog, masked_mean
+from edgeslam_torch.losses.depth_terms import (
+    BerHu,
+    GradientMatching,
+    LaplaceNll,
+    LogSlope,
+    MaskedL1,
+    SILog,
+    masked_mean,
+)
 from edgeslam_torch.losses.total import TotalLoss
-from edgeslam_torch.models.fastdepth import Prediction
 from edgeslam_torch.models.record import Metadata
+from edgeslam_torch.models.trainable import Prediction
 from edgeslam_torch.train.validate import image_tensor
 from edgeslam_torch.train.views.augment import AugmentConfig, View, random_view
 from edgeslam_torch.train.views.datasets import FAR_M, NEAR_M
@@ -56,6 +64,8 @@ class SupervisedWeights:
     berhu: float = 0.0
     silog: float = 0.0
     gradient: float = 0.5
+    slope: float = 0.0
+    """Against far depth that is predicted too near."""
     uncertainty: float = 0.1
 
 
@@ -85,7 +95,13 @@ class Supervised:
         shares = np.array([s.share for s in self.sources], dtype=np.float64)
         self._edges = np.cumsum(shares / shares.sum())
         self._terms = nn.ModuleDict(
-            {"l1": MaskedL1(), "berhu": BerHu(), "silog": SILog(), "gradient": GradientMatching()}
+            {
+                "l1": MaskedL1(),
+                "berhu": BerHu(),
+                "silog": SILog(),
+                "gradient": GradientMatching(),
+                "slope": LogSlope(),
+            }
         )
         self._nll = LaplaceNll()
 

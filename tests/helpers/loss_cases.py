@@ -136,6 +136,7 @@ CASES = {
     "l1": Case(losses.MaskedL1(), dense, "log_depth", "mask", PIXEL, batch_only=True),
     "berhu": Case(losses.BerHu(), dense, "log_depth", "mask", PIXEL, batch_only=True),
     "silog": Case(losses.SILog(), dense, "log_depth", "mask", PIXEL, batch_only=True),
+    "slope": Case(losses.LogSlope(), dense, "log_depth", "mask", PIXEL, batch_only=True),
     "gradient": Case(losses.GradientMatching(scales=2), dense, "log_depth", "mask", PIXEL, batch_only=True),
     "laplace": Case(losses.LaplaceNll(), uncertain, "log_sigma", "mask", PIXEL | {"log_sigma": 1}, batch_only=True),
     "photometric": Case(losses.PhotometricLoss(), images, "depth_i", batch_only=True),

@@ -7,9 +7,17 @@ import torch
 from torch import Tensor
 from torch.autograd import gradcheck
 
-from edgeslam_torch.losses.depth_terms import BerHu, GradientMatching, LaplaceNll, MaskedL1, SILog, masked_mean
+from edgeslam_torch.losses.depth_terms import (
+    BerHu,
+    GradientMatching,
+    LaplaceNll,
+    LogSlope,
+    MaskedL1,
+    SILog,
+    masked_mean,
+)
 
-TERMS = [MaskedL1(), BerHu(), SILog(), GradientMatching(scales=2)]
+TERMS = [MaskedL1(), BerHu(), SILog(), GradientMatching(scales=2), LogSlope()]
 
 
 @pytest.fixture
@@ -91,3 +99,15 @@ def test_uncertainty_is_best_at_the_mean_absolute_residual() -> None:
     best = math.log(math.sqrt(2) * 0.2)
     at = [LaplaceNll()(torch.full_like(r, best + d), r, torch.zeros_like(r), mask).item() for d in (-0.05, 0.0, 0.05)]
     assert at[1] == min(at)
+
+
+def test_slope_tells_a_squeezed_range_and_not_a_wrong_scale() -> None:
+    near_and_far = torch.tensor([0.0, 0.0, 2.0, 2.0]).view(1, 1, 2, 2)  # variance 1
+    mask = torch.ones_like(near_and_far, dtype=torch.bool)
+    term = LogSlope(floor=0.25)
+    for slope, cost in ((1.0, 0.0), (0.6, 0.4 / 1.25), (1.3, 0.3 / 1.25), (-1.0, 2.0 / 1.25)):
+        assert term(slope * near_and_far - 3.0, near_and_far, mask).item() == pytest.approx(cost, abs=1e-6)
+    squeezed = (0.5 * near_and_far).requires_grad_()
+    term(squeezed, near_and_far, mask).sum().backward()
+    assert squeezed.grad is not None
+    assert torch.equal(squeezed.grad.sign(), torch.tensor([1.0, 1.0, -1.0, -1.0]).view(1, 1, 2, 2))  # nearer, farther
