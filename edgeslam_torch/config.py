@@ -69,6 +69,9 @@ class DepthConfig:
     """``default``, ``none``, a weights file, a described ONNX file, or the name of a downloaded network."""
     backend: str = "onnxruntime"
     """``onnxruntime`` or ``torch``."""
+    device: str = "cpu"
+    """Where it runs: ``auto``, ``cpu``, ``cuda`` or ``mps``. A GPU's last digits are not the processor's, so that runs
+    are repeatable on one device alone."""
     prior_sigma_log: float = 0.35
     """Standard deviation of log depth without a network; wide enough for a desk and the wall behind it."""
 
@@ -76,6 +79,8 @@ class DepthConfig:
         _positive(self, "prior_sigma_log")
         if self.backend not in ("onnxruntime", "torch"):
             raise ValueError(f"backend must be onnxruntime or torch, got {self.backend!r}")
+        if self.device not in ("auto", "cpu", "cuda", "mps"):
+            raise ValueError(f"device must be auto, cpu, cuda or mps, got {self.device!r}")
 
 
 @dataclass(frozen=True, slots=True)

@@ -405,4 +405,5 @@ def _depth_from_config(config: SlamConfig) -> DepthFunction | None:
         return None
     from edgeslam_torch.frontend.depth_network import open_depth, weights_path
 
-    return open_depth(weights_path(config.depth.weights), config.depth.backend)
+    depth = config.depth
+    return open_depth(weights_path(depth.weights), depth.backend, device=depth.device)

@@ -1,14 +1,16 @@
 """Network weights on disk: safetensors with a JSON record in the header."""
 
+import copy
 import dataclasses
 import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TypeVar
 
 import safetensors.torch
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from edgeslam_torch.errors import WeightsError
 from edgeslam_torch.files.atomic import write_atomically
@@ -24,13 +26,15 @@ from edgeslam_torch.models.record import (
 from edgeslam_torch.models.torch_file import is_zip, open_checkpoint
 from edgeslam_torch.models.weights_file import Array, check_weights, read_weights
 
+Network = TypeVar("Network", bound=nn.Module)
+
 
 def build_network(metadata: Metadata, widths: Widths | None = None) -> FastDepth:
     """A newly initialised network for this description."""
     return FastDepth(metadata.variant, widths, metadata.padding, metadata.output, metadata.uncertainty)
 
 
-def save_checkpoint(network: FastDepth, metadata: Metadata, path: Path, half: bool = False) -> None:
+def save_checkpoint(network: nn.Module, metadata: Metadata, path: Path, half: bool = False) -> None:
     """Write weights and metadata, atomically.
 
     Args:
@@ -68,6 +72,23 @@ def network_of(state: Mapping[str, Array], metadata: Metadata) -> FastDepth:
     counters = {k: v for k, v in network.state_dict().items() if k.endswith(STEP_COUNTER)}
     network.load_state_dict(counters | {k: torch.from_numpy(v) for k, v in state.items()})
     return network.eval()
+
+
+def restored(network: Network, path: Path) -> Network:
+    """A copy of a network, in evaluation mode, with the tensors that `save_checkpoint` wrote of one like it.
+
+    Raises:
+        WeightsError: If the file is missing, damaged, or of a network with other tensors.
+    """
+    try:
+        state = safetensors.torch.load_file(path)
+    except (OSError, safetensors.SafetensorError) as error:
+        raise WeightsError(f"{path}: cannot read the weights ({' '.join(str(error).split())[:120]})") from error
+    copied = copy.deepcopy(network)
+    if {k: v.shape for k, v in state.items()} != {k: v.shape for k, v in copied.state_dict().items()}:
+        raise WeightsError(f"{path}: is of another network, its tensors have other names or shapes")
+    copied.load_state_dict(state)
+    return copied.eval()
 
 
 def file_hash(path: Path) -> str:

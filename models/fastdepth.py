@@ -1,7 +1,7 @@
 """FastDepth (Wofk et al., ICRA 2019) in its four published variants, under upstream's parameter names."""
 
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -21,20 +21,12 @@ from edgeslam_torch.models.layout import (
     Widths,
 )
 from edgeslam_torch.models.mobilenet import encoder_layers
+from edgeslam_torch.models.trainable import DepthModule, Prediction
 
 __all__ = ["FULL", "PRUNED", "FastDepth", "Output", "Padding", "Prediction", "Variant", "Widths"]
 
 
-class Prediction(NamedTuple):
-    """Prediction for a batch; all ``(B, 1, H, W)``."""
-
-    log_depth: Tensor
-    """Natural logarithm of depth at the training focal length [log m]."""
-    log_sigma: Tensor | None
-    """Logarithm of the standard deviation of ``log_depth``; None without an uncertainty head."""
-
-
-class FastDepth(nn.Module):
+class FastDepth(DepthModule):
     """Encoder MobileNetV1, decoder of five 5x5 nearest-neighbour upsampling convolutions.
 
     Args:
@@ -85,6 +77,10 @@ class FastDepth(nn.Module):
         """decode_conv1 ... decode_conv6 in order."""
         prefix = "decode_conv" if self.variant.has_skips else "decoder.conv"
         return [self.get_submodule(f"{prefix}{i}") for i in range(1, 7)]
+
+    def heads(self) -> list[nn.Module]:
+        """The last layer: its batch norm works on one channel, the depth itself."""
+        return self.decoder_layers()[-1:]
 
     def predict_half(self, x: Tensor) -> Prediction:
         """Log depth and its uncertainty for normalised RGB ``(B, 3, H, W)``, at half its size.

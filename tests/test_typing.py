@@ -14,7 +14,7 @@ import pytest
 import edgeslam_torch
 
 ROOT = Path(__file__).resolve().parent.parent
-PUBLIC = ("edgeslam_torch", "edgeslam_torch.losses", "edgeslam_torch.train")
+PUBLIC = ("edgeslam_torch", "edgeslam_torch.losses", "edgeslam_torch.models", "edgeslam_torch.train")
 WITHOUT_SAYING = re.compile(r"numpy\.ndarray\[[^()]*?\]\]+|dict\[str, Any\]")
 """numpy's arrays, which have no shape for the type checker, and records as JSON has them."""
 

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from edgeslam_torch.models.fastdepth import FastDepth
 from edgeslam_torch.models.record import Metadata
+from edgeslam_torch.models.trainable import DepthModule
 from edgeslam_torch.train.validate import MAX_DEPTH_M, MIN_DEPTH_M, predict_metres
 from edgeslam_torch.train.views.augment import View
 from edgeslam_torch.types import FloatArray
@@ -19,7 +19,7 @@ PIXELS_PER_VIEW = 500
 
 
 def residuals_and_sigma(
-    network: FastDepth, metadata: Metadata, views: Sequence[View], seed: int = 0
+    network: DepthModule, metadata: Metadata, views: Sequence[View], seed: int = 0
 ) -> tuple[FloatArray, FloatArray]:
     """Log-depth residuals, each image's median removed, and the head's raw sigma at random valid pixels,
     ``(N,)`` each."""
@@ -44,7 +44,7 @@ def coverage(residuals: FloatArray, sigma: FloatArray) -> tuple[float, float]:
     return float((z < 1.0).mean()), float((z < 1.96).mean())
 
 
-def calibrate_sigma(network: FastDepth, metadata: Metadata, views: Sequence[View]) -> Metadata:
+def calibrate_sigma(network: DepthModule, metadata: Metadata, views: Sequence[View]) -> Metadata:
     """Metadata with ``sigma_scale`` and ``sigma_floor`` that bring both coverages closest to nominal."""
     residuals, raw = residuals_and_sigma(network, metadata, views)
     best, best_cost = (1.0, 0.0), np.inf

@@ -19,9 +19,9 @@ from pathlib import Path
 import torch
 
 from edgeslam_torch.models.checkpoint import build_network, load_checkpoint, save_checkpoint
-from edgeslam_torch.models.fastdepth import FastDepth
 from edgeslam_torch.models.imagenet import load_imagenet_encoder
 from edgeslam_torch.models.record import Metadata
+from edgeslam_torch.models.trainable import DepthModule
 from edgeslam_torch.train.calibrate_sigma import calibrate_sigma
 from edgeslam_torch.train.recipe import Hooks, TrainConfig, TrainState, train
 from edgeslam_torch.train.signals import Source, Supervised
@@ -110,7 +110,7 @@ class _Validation:
     def __init__(self, metadata: Metadata, sets: dict[str, Sequence[View]]) -> None:
         self.metadata, self.sets, self.start = metadata, sets, time.monotonic()
 
-    def __call__(self, network: FastDepth) -> dict[str, float]:
+    def __call__(self, network: DepthModule) -> dict[str, float]:
         metrics: dict[str, float] = {}
         for name, views in self.sets.items():
             for key, value in dataclasses.asdict(score(network, self.metadata, views)).items():
@@ -163,7 +163,7 @@ def make_default_weights(data: Path, out: Path, recipe: Recipe, watch: Sequence[
 
 
 def _phase(
-    network: FastDepth,
+    network: DepthModule,
     metadata: Metadata,
     pools: dict[str, Sequence[View]],
     shares: dict[str, float],

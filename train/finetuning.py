@@ -15,9 +15,9 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 from edgeslam_torch.errors import SourceError
-from edgeslam_torch.models.checkpoint import load_checkpoint, save_checkpoint
-from edgeslam_torch.models.fastdepth import FastDepth
+from edgeslam_torch.models.checkpoint import restored, save_checkpoint
 from edgeslam_torch.models.record import Metadata
+from edgeslam_torch.models.trainable import DepthModule
 from edgeslam_torch.train.calibrate_sigma import calibrate_sigma
 from edgeslam_torch.train.folder import TEACHER, TENSORBOARD, WEIGHTS, OutFolder
 from edgeslam_torch.train.given import HOOKS, Given, labelled_set, posed_set, weights_name
@@ -85,7 +85,7 @@ class Data:
 
 
 def finetune(
-    network: FastDepth,
+    network: DepthModule,
     metadata: Metadata,
     data: Data,
     config: TrainConfig,
@@ -137,7 +137,7 @@ def finetune(
     if rank() == 0:
         watching = [ProgressBar(), *hooks, *curves(out.path / TENSORBOARD, tuned, _pictures(data, held_out))]
 
-    def validate(averaged: FastDepth) -> dict[str, float]:
+    def validate(averaged: DepthModule) -> dict[str, float]:
         return _metrics(score(averaged, metadata, held_out))
 
     state = train(
@@ -163,7 +163,7 @@ def settings_of(
 
 
 def _prepared(
-    start: FastDepth, metadata: Metadata, data: Data, from_runs: FromRuns, kept_in: Callable[[int, str, str], Path]
+    start: DepthModule, metadata: Metadata, data: Data, from_runs: FromRuns, kept_in: Callable[[int, str, str], Path]
 ) -> tuple[list[Signal], list[View]]:
     """Training signals, and the views to validate on.
 
@@ -257,7 +257,7 @@ def _tuned_metadata(metadata: Metadata, data: Data) -> Metadata:
 
 def _conclude(
     state: TrainState,
-    start: FastDepth,
+    start: DepthModule,
     metadata: Metadata,
     tuned: Metadata,
     before: DepthScores | None,
@@ -271,12 +271,12 @@ def _conclude(
         outcome = Outcome(path, state.step)
         save_checkpoint(state.averaged, outcome.noted_in(tuned), path, half=True)
     elif state.best_step == 0:
-        last, _ = load_checkpoint(out.path / FINAL)
+        last = restored(start, out.path / FINAL)
         outcome = Outcome(path, state.step, 0, before, score(last, metadata, held_out), before)
         # Not converted to float16: the initial tensors with their own metadata.
         save_checkpoint(start, outcome.noted_in(metadata), path)
     else:
-        last, best = (load_checkpoint(out.path / name)[0] for name in (FINAL, BEST))
+        last, best = (restored(start, out.path / name) for name in (FINAL, BEST))
         kept = score(best, metadata, held_out)
         outcome = Outcome(path, state.step, state.best_step, before, score(last, metadata, held_out), kept)
         record = dataclasses.replace(tuned, metrics={k: round(v, 4) for k, v in _metrics(kept).items() if k != "score"})
@@ -296,7 +296,7 @@ def _metrics(scores: DepthScores) -> dict[str, float]:
 
 
 def _points_and_depths(
-    network: FastDepth, metadata: Metadata, sequence: PosedSequence, most: int = 24
+    network: DepthModule, metadata: Metadata, sequence: PosedSequence, most: int = 24
 ) -> tuple[list[PosedView], list[np.ndarray]]:
     """Some views, and the network's log depth at their map points."""
     chosen = np.linspace(0, len(sequence.views) - 1, min(most, len(sequence.views))).astype(int)
@@ -304,7 +304,7 @@ def _points_and_depths(
     return views, [_at_points(network, metadata, v) for v in views]
 
 
-def _at_points(network: FastDepth, metadata: Metadata, view: PosedView) -> np.ndarray:
+def _at_points(network: DepthModule, metadata: Metadata, view: PosedView) -> np.ndarray:
     depth, _ = predict_metres(network, metadata, View(view.image, np.zeros(view.image.shape[:2], np.float32), view.K))
     return np.log(map_coordinates(depth, view.uv[:, ::-1].T, order=1, mode="nearest"))
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from torch import nn
 
-from edgeslam_torch.models.fastdepth import FastDepth
 from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.train.views.datasets import DepthFolder
 from edgeslam_torch.train.views.posed import PosedSequence
@@ -74,7 +74,7 @@ def given_from_json(record: dict[str, Any]) -> Given:
     return Given(str(record["weights"]), sets["data"], sets["validation"], dict(record["settings"]))
 
 
-def weights_name(network: FastDepth, metadata: Metadata) -> str:
+def weights_name(network: nn.Module, metadata: Metadata) -> str:
     """Variant and the first digits of a hash over all tensors and the record."""
     tensors = [value.detach().cpu().numpy() for _, value in sorted(network.state_dict().items())]
     record = json.dumps(dataclasses.asdict(metadata), sort_keys=True)

@@ -21,9 +21,10 @@ from torch import Tensor, nn
 from edgeslam_torch.errors import ConfigError, EdgeSlamError, WeightsError
 from edgeslam_torch.files.atomic import write_atomically, write_text
 from edgeslam_torch.models.checkpoint import save_checkpoint
-from edgeslam_torch.models.fastdepth import FastDepth, Prediction
+from edgeslam_torch.models.device import DEVICES
 from edgeslam_torch.models.record import Metadata
-from edgeslam_torch.train.processes.device import DEVICES, Arithmetic, arithmetic
+from edgeslam_torch.models.trainable import DepthModule, Prediction
+from edgeslam_torch.train.processes.device import Arithmetic, arithmetic
 from edgeslam_torch.train.processes.distributed import add_up, by_first, everyones, rank, world
 from edgeslam_torch.train.processes.loading import drawn
 from edgeslam_torch.train.processes.shared_norm import share_norms
@@ -113,8 +114,8 @@ class TrainConfig:
 class TrainState:
     """Everything that changes during a run; a checkpoint holds what a resume needs."""
 
-    network: FastDepth
-    averaged: FastDepth
+    network: DepthModule
+    averaged: DepthModule
     optimiser: torch.optim.Optimizer
     step: int = 0
     best: float = math.inf
@@ -202,12 +203,12 @@ def changes_losses(hook: Hooks) -> bool:
     return type(hook).on_losses is not Hooks.on_losses
 
 
-Validation = Callable[[FastDepth], dict[str, float]]
+Validation = Callable[[DepthModule], dict[str, float]]
 """Metrics of a network; the key ``score`` (smaller is better) decides which weights are best."""
 
 
 def train(
-    network: FastDepth,
+    network: DepthModule,
     metadata: Metadata,
     signals: Sequence[Signal],
     config: TrainConfig,
@@ -358,7 +359,7 @@ def _has_diverged(state: TrainState) -> bool:
     return any(_share_between(network, state.shown, low, high) < 0.5 for network in (state.network, state.averaged))
 
 
-def _share_between(network: FastDepth, images: Tensor, low: float, high: float) -> float:
+def _share_between(network: DepthModule, images: Tensor, low: float, high: float) -> float:
     was_training = network.training
     network.eval()
     with torch.no_grad():
@@ -387,7 +388,7 @@ def _kept(out: Path) -> str:
     return f"{out / LAST} holds step {saved_step(out / LAST)}, the last good one; try a smaller learning rate"
 
 
-def build_optimiser(network: FastDepth, config: TrainConfig) -> torch.optim.Optimizer:
+def build_optimiser(network: DepthModule, config: TrainConfig) -> torch.optim.Optimizer:
     """AdamW with a smaller rate for the encoder; frozen stages get no gradient."""
     encoder = network.encoder()
     for stage in encoder[: config.frozen_stages]:
@@ -521,10 +522,9 @@ def _hooked(hooks: Sequence[Hooks], state: TrainState, drawn: Drawn, images: int
     return drawn.losses
 
 
-def _set_modes(network: FastDepth, config: TrainConfig) -> None:
+def _set_modes(network: DepthModule, config: TrainConfig) -> None:
     network.train()
-    fixed: list[nn.Module] = [*network.encoder(), network.decoder_layers()[-1]]
-    # The head's batch norm works on one channel, the depth itself: batch statistics would erase its scale.
+    fixed: list[nn.Module] = [*network.encoder(), *network.heads()]
     for part in [network] if config.freeze_norm else fixed:
         for module in part.modules():
             if isinstance(module, nn.BatchNorm2d):

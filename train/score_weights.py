@@ -8,8 +8,8 @@ import numpy as np
 import torch
 
 from edgeslam_torch.models.checkpoint import load_checkpoint
-from edgeslam_torch.models.fastdepth import FastDepth
 from edgeslam_torch.models.record import Metadata
+from edgeslam_torch.models.trainable import DepthModule
 from edgeslam_torch.train.calibrate_sigma import coverage, residuals_and_sigma
 from edgeslam_torch.train.validate import score
 from edgeslam_torch.train.views.augment import View
@@ -21,7 +21,7 @@ HEADER = (
 )
 
 
-def table_row(name: str, network: FastDepth, metadata: Metadata, recording: str, views: Sequence[View]) -> str:
+def table_row(name: str, network: DepthModule, metadata: Metadata, recording: str, views: Sequence[View]) -> str:
     """One line of the table for views with depth."""
     s = score(network, metadata, views)
     residuals, raw = residuals_and_sigma(network, metadata, views)

@@ -15,8 +15,8 @@ from edgeslam_torch.losses.lshape import AngleLoss, CollinearityLoss, LShapeLoss
 from edgeslam_torch.losses.photometric import PhotometricLoss, SmoothnessLoss
 from edgeslam_torch.losses.robust import Kernel
 from edgeslam_torch.losses.total import TotalLoss
-from edgeslam_torch.models.fastdepth import Prediction
 from edgeslam_torch.models.record import Metadata
+from edgeslam_torch.models.trainable import Prediction
 from edgeslam_torch.train.signals import Slot
 from edgeslam_torch.train.validate import image_tensor
 from edgeslam_torch.train.views.augment import AugmentConfig, View, recolour, scaled_K, warp

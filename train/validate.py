@@ -9,8 +9,8 @@ import torch
 from numpy.typing import NDArray
 
 from edgeslam_torch.errors import SourceError
-from edgeslam_torch.models.fastdepth import FastDepth
 from edgeslam_torch.models.record import Metadata
+from edgeslam_torch.models.trainable import DepthModule
 from edgeslam_torch.train.views.augment import View, fitted_view
 from edgeslam_torch.train.views.posed import PosedView
 from edgeslam_torch.types import FloatArray
@@ -42,7 +42,7 @@ def image_tensor(image: NDArray[np.uint8], metadata: Metadata) -> torch.Tensor:
     return torch.from_numpy(np.ascontiguousarray(normalised.transpose(2, 0, 1)))
 
 
-def predict_metres(network: FastDepth, metadata: Metadata, view: View) -> tuple[FloatArray, FloatArray]:
+def predict_metres(network: DepthModule, metadata: Metadata, view: View) -> tuple[FloatArray, FloatArray]:
     """Depth [m] and its sigma (log) at the view's own size, focal length corrected."""
     size = (metadata.input_height, metadata.input_width)
     fitted = fitted_view(view, size)
@@ -61,7 +61,7 @@ def predict_metres(network: FastDepth, metadata: Metadata, view: View) -> tuple[
     return np.exp(large), np.exp(cv2.resize(log_sigma, (w, h), interpolation=cv2.INTER_LINEAR))
 
 
-def metres_by(network: FastDepth, metadata: Metadata) -> Callable[[PosedView], FloatArray]:
+def metres_by(network: DepthModule, metadata: Metadata) -> Callable[[PosedView], FloatArray]:
     """The network's depth [m] of every pixel of a view, as a teacher takes it."""
     network.eval()
 
@@ -72,7 +72,7 @@ def metres_by(network: FastDepth, metadata: Metadata) -> Callable[[PosedView], F
     return predict
 
 
-def score(network: FastDepth, metadata: Metadata, views: Sequence[View]) -> DepthScores:
+def score(network: DepthModule, metadata: Metadata, views: Sequence[View]) -> DepthScores:
     """Evaluate on views with depth; images without a valid pixel are skipped.
 
     Raises:

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from edgeslam_torch.commands.run import add_device
 from edgeslam_torch.errors import ConfigError, OutputError, SourceError
 
 if TYPE_CHECKING:
@@ -45,6 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="most memory of a flight (default: 4000, or an equal share of 80 %% of this machine's if that is less)",
     )
     parser.add_argument("--depth", metavar="FILE|NAME|none", help="depth network of all flights, as for 'run'")
+    add_device(parser)
     parser.add_argument("--max-frames", type=int, metavar="N", help="stop every flight after N frames")
     parser.add_argument("--config", type=Path, metavar="FILE.toml", help="settings of all flights")
     parser.add_argument(

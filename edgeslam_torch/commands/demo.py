@@ -6,6 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from edgeslam_torch.commands.run import add_device
+
 if TYPE_CHECKING:
     from edgeslam_torch.demo import DemoResult, DemoSettings
 
@@ -39,6 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--depth", metavar="FILE|NAME|none", help="depth network: weights, an ONNX file, a downloaded network, or none"
     )
+    add_device(parser)
     parser.add_argument("--config", type=Path, metavar="FILE.toml", help="settings of the pipeline")
     parser.add_argument(
         "--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="change one setting; may be repeated"

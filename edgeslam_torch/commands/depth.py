@@ -39,6 +39,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--weights", default="default", metavar="FILE|NAME", help="weights, an ONNX file or a downloaded network"
     )
     parser.add_argument("--backend", choices=("onnxruntime", "torch"), default="onnxruntime", help="what runs it")
+    parser.add_argument(
+        "--device",
+        choices=("auto", "cpu", "cuda", "mps"),
+        default="cpu",
+        help="where it runs (default: cpu; auto: the fastest that is there)",
+    )
     parser.add_argument("--threads", type=_positive, default=1, metavar="N", help="threads of one inference")
     parser.add_argument("--max-frames", type=_positive, metavar="N", help="stop after N images")
     parser.add_argument("--sigma", action="store_true", help="write STEM_sigma.npy, too")
@@ -52,7 +58,7 @@ def main(args: argparse.Namespace) -> int:
     from edgeslam_torch.frontend.depth_check import MIN_SHARE
     from edgeslam_torch.frontend.depth_network import open_depth, weights_path
 
-    network = open_depth(weights_path(args.weights), args.backend, args.threads)
+    network = open_depth(weights_path(args.weights), args.backend, args.threads, args.device)
     if not network.is_metric:
         raise ConfigError(f"{network.weights}: gives depth up to scale and shift; a map has both: edgeslam run --depth")
     camera, frames, length, warnings, problems = _frames(args.source, args.camera, args.max_frames)

@@ -46,6 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--depth", metavar="FILE|NAME|none", help="depth network: weights, an ONNX file, a downloaded network, or none"
     )
+    add_device(parser)
     parser.add_argument(
         "--mode",
         choices=("offline", "realtime"),
@@ -82,6 +83,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="save the run as ROS 2 messages, for Foxglove and RViz ([bags] extra)",
     )
     parser.add_argument("--no-report", action="store_true", help="do not write the page report.html")
+
+
+def add_device(parser: argparse.ArgumentParser) -> None:
+    """Declare ``--device``, which `resolved_config` reads."""
+    parser.add_argument(
+        "--device",
+        choices=("auto", "cpu", "cuda", "mps"),
+        help="where the depth network runs; all else is computed on the processor (default: cpu)",
+    )
 
 
 def main(args: argparse.Namespace) -> int:
@@ -233,6 +243,8 @@ def resolved_config(args: argparse.Namespace) -> "SlamConfig":
             raise ConfigError(f"--seed: {error}") from error
     if args.depth is not None:
         config = replace(config, depth=replace(config.depth, weights=args.depth))
+    if args.device is not None:
+        config = replace(config, depth=replace(config.depth, device=args.device))
     return config
 
 

@@ -153,9 +153,10 @@ def _inspect(args: argparse.Namespace) -> None:
 def _size_and_record(path: Path) -> "tuple[str, Metadata | ExternalNetwork]":
     if path.suffix == ".onnx":
         from edgeslam_torch.models.onnx.external import read_external
-        from edgeslam_torch.models.onnx.file import holds_record, read_onnx
+        from edgeslam_torch.models.onnx.file import parse_onnx, read_onnx
 
-        metadata = read_onnx(path)[1] if holds_record(path) else read_external(path)[1]
+        file = parse_onnx(path)
+        metadata = read_onnx(file)[1] if file.is_ours else read_external(file)[1]
         return _operations(path), metadata
     from edgeslam_torch.models.checkpoint import load_checkpoint
     from edgeslam_torch.models.complexity import measure_complexity

@@ -1,8 +1,8 @@
-"""Stage 1, depth: FastDepth on one thread, in metres for the given camera."""
+"""Stage 1, depth: FastDepth, in metres for the given camera."""
 
 import logging
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import cv2
 import numpy as np
@@ -10,11 +10,17 @@ from numpy.typing import NDArray
 
 from edgeslam_torch.errors import WeightsError
 from edgeslam_torch.frontend.network_input import check_image, network_size, preprocess
-from edgeslam_torch.frontend.onnx_session import first_line, has_onnxruntime, open_session
+from edgeslam_torch.frontend.onnx_session import device_of, first_line, has_onnxruntime, open_session, words_of
 from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.models.device import check_device, find_device, onnxruntime_has_cuda
 from edgeslam_torch.models.layout import MAX_LOG_DEPTH
 from edgeslam_torch.models.record import DEFAULT_WEIGHTS, Metadata
 from edgeslam_torch.types import DepthMap, FloatArray
+
+if TYPE_CHECKING:
+    import torch
+
+    from edgeslam_torch.models.onnx.file import OnnxFile
 
 logger = logging.getLogger(__name__)
 
@@ -41,26 +47,32 @@ class DepthNetwork(Protocol):
         """Depth and its uncertainty at the size of the image, ``(H, W, 3)`` BGR or ``(H, W)`` grey."""
 
 
-def open_depth(weights: Path | None = None, backend: str = "onnxruntime", threads: int = 1) -> DepthNetwork:
+def open_depth(
+    weights: Path | None = None, backend: str = "onnxruntime", threads: int = 1, device: str = "cpu"
+) -> DepthNetwork:
     """A depth network from a file: FastDepth, or an ONNX network of others that is described.
 
     Args:
         weights: A ``.safetensors`` file or an ``.onnx`` file; the shipped weights by default.
         backend: ``"onnxruntime"`` or ``"torch"``; an ONNX file runs in onnxruntime.
         threads: Threads per inference.
+        device: ``cpu``, ``cuda``, ``mps``, or ``auto``: the fastest that is there.
 
     Raises:
+        ConfigError: If there is no such device.
         WeightsError: If the weights are missing, damaged, not described, or give no depth.
         ValueError: If the backend is unknown.
     """
-    if weights is not None and weights.suffix == ".onnx":
-        from edgeslam_torch.models.onnx.file import holds_record
+    if weights is None or weights.suffix != ".onnx":
+        return DepthPredictor(weights, backend, threads, device)
+    from edgeslam_torch.models.onnx.file import parse_onnx
 
-        if not holds_record(weights):
-            from edgeslam_torch.frontend.external_depth import ExternalDepth
+    file = parse_onnx(weights)
+    if file.is_ours:
+        return DepthPredictor(file, backend, threads, device)
+    from edgeslam_torch.frontend.external_depth import ExternalDepth
 
-            return ExternalDepth(weights, threads)
-    return DepthPredictor(weights, backend, threads)
+    return ExternalDepth(file, threads, device)
 
 
 def weights_path(name: str) -> Path | None:
@@ -87,6 +99,8 @@ def weights_path(name: str) -> Path | None:
 class _Engine(Protocol):
     metadata: Metadata
     fixed_size: tuple[int, int] | None
+    device: str
+    """Where it runs, for people."""
 
     def run(self, image: FloatArray) -> tuple[FloatArray, FloatArray]:
         """``(1, 3, H, W)`` -> log depth and sigma, both ``(H/2, W/2)``."""
@@ -100,8 +114,11 @@ class DepthPredictor:
         weights: A ``.safetensors`` file or an exported ``.onnx`` file; the shipped weights by default.
         backend: ``"onnxruntime"`` (falls back to torch when it is not installed) or ``"torch"``.
         threads: Threads per inference. With torch this sets the number of threads of the process.
+        device: ``cpu``, ``cuda``, ``mps``, or ``auto``: the fastest that is there. On a GPU weights run in onnxruntime
+            if it has CUDA, else in torch.
 
     Raises:
+        ConfigError: If there is no such device.
         WeightsError: If the weights are missing, damaged, or give no depth.
         ValueError: If the backend is unknown.
 
@@ -111,11 +128,18 @@ class DepthPredictor:
         (480, 640)
     """
 
-    def __init__(self, weights: Path | None = None, backend: str = "onnxruntime", threads: int = 1) -> None:
+    def __init__(
+        self,
+        weights: "Path | OnnxFile | None" = None,
+        backend: str = "onnxruntime",
+        threads: int = 1,
+        device: str = "cpu",
+    ) -> None:
         if backend not in ("onnxruntime", "torch"):
             raise ValueError(f"backend must be 'onnxruntime' or 'torch', got {backend!r}")
-        self.weights = DEFAULT_WEIGHTS if weights is None else Path(weights)
-        self._engine = _open_engine(self.weights, backend, threads)
+        weights = DEFAULT_WEIGHTS if weights is None else weights
+        self.weights = weights if isinstance(weights, Path) else weights.path
+        self._engine = _open_engine(weights, self.weights, backend, threads, device)
         _try_out(self._engine, self.weights)
 
     is_metric = True
@@ -127,8 +151,9 @@ class DepthPredictor:
 
     @property
     def backend(self) -> str:
-        """Backend in use."""
-        return "torch" if isinstance(self._engine, _TorchEngine) else "onnxruntime"
+        """Backend in use, and its device unless that is the processor."""
+        runtime = "torch" if isinstance(self._engine, _TorchEngine) else "onnxruntime"
+        return words_of(runtime, self._engine.device)
 
     def __call__(self, image: NDArray[np.uint8], camera: Camera) -> DepthMap:
         """Depth [m] and its uncertainty at the image's size; NaN where the network's range ends (100 m, 1 cm).
@@ -161,14 +186,20 @@ def _training_size(metadata: Metadata) -> tuple[int, int]:
     return metadata.input_height, metadata.input_width
 
 
-def _open_engine(weights: Path, backend: str, threads: int) -> _Engine:
-    if backend == "onnxruntime":
-        if weights.suffix == ".onnx" or has_onnxruntime():
-            return _OnnxEngine(weights, threads)
-        logger.warning("onnxruntime is not installed: depth runs in torch, about twice as slow")
-    if weights.suffix == ".onnx":
-        raise WeightsError(f"{weights}: an ONNX file runs in onnxruntime only, not with backend 'torch'")
-    return _TorchEngine(weights, threads)
+def _open_engine(weights: "Path | OnnxFile", path: Path, backend: str, threads: int, device: str) -> _Engine:
+    check_device(device)
+    if path.suffix == ".onnx":
+        if backend == "torch":
+            raise WeightsError(f"{path}: an ONNX file runs in onnxruntime only, not with backend 'torch'")
+        return _OnnxEngine(weights, path, threads, device)
+    if backend == "torch" or not (device == "cpu" or onnxruntime_has_cuda()):
+        where = find_device(device)
+        if backend == "torch" or where.type != "cpu":
+            return _TorchEngine(path, threads, where)
+    if has_onnxruntime():
+        return _OnnxEngine(weights, path, threads, device)
+    logger.warning("onnxruntime is not installed: depth runs in torch, about twice as slow")
+    return _TorchEngine(path, threads, find_device("cpu"))
 
 
 def _try_out(engine: _Engine, weights: Path) -> None:
@@ -197,16 +228,17 @@ def _try_out(engine: _Engine, weights: Path) -> None:
 
 
 class _OnnxEngine:
-    def __init__(self, weights: Path, threads: int) -> None:
-        if weights.suffix == ".onnx":
+    def __init__(self, weights: "Path | OnnxFile", path: Path, threads: int, device: str) -> None:
+        if path.suffix == ".onnx":
             from edgeslam_torch.models.onnx.file import read_onnx
 
             content, self.metadata = read_onnx(weights)
         else:
             from edgeslam_torch.models.onnx.graph import build_graph
 
-            content, self.metadata = build_graph(weights)
-        self._session = open_session(content, weights, threads)
+            content, self.metadata = build_graph(path)
+        self._session = open_session(content, path, threads, device)
+        self.device = device_of(self._session)
         height, width = self._session.get_inputs()[0].shape[2:]
         self.fixed_size = (height, width) if isinstance(height, int) and isinstance(width, int) else None
 
@@ -218,7 +250,7 @@ class _OnnxEngine:
 class _TorchEngine:
     fixed_size: tuple[int, int] | None = None
 
-    def __init__(self, weights: Path, threads: int) -> None:
+    def __init__(self, weights: Path, threads: int, device: "torch.device") -> None:
         import torch
 
         from edgeslam_torch.models.checkpoint import load_checkpoint
@@ -226,11 +258,14 @@ class _TorchEngine:
 
         torch.set_num_threads(threads)
         network, self.metadata = load_checkpoint(weights)
-        self._network = deployed(network, self.metadata).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        module = deployed(network, self.metadata).to(device)
+        self._network = module.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self._device, self.device = device, str(device)
 
     def run(self, image: FloatArray) -> tuple[FloatArray, FloatArray]:
         import torch
 
         with torch.inference_mode():
-            log_depth, sigma = self._network(torch.from_numpy(image).to(memory_format=torch.channels_last))
-        return log_depth[0, 0].numpy(), sigma[0, 0].numpy()
+            x = torch.from_numpy(image).to(self._device).to(memory_format=torch.channels_last)
+            log_depth, sigma = self._network(x)
+        return log_depth[0, 0].cpu().numpy(), sigma[0, 0].cpu().numpy()

@@ -1,6 +1,7 @@
 """Stage 1, depth: networks of others as ONNX files, in metres for the given camera or relative."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -8,10 +9,13 @@ from numpy.typing import NDArray
 
 from edgeslam_torch.errors import WeightsError
 from edgeslam_torch.frontend.network_input import check_image, network_size, preprocess
-from edgeslam_torch.frontend.onnx_session import first_line, open_session
+from edgeslam_torch.frontend.onnx_session import device_of, first_line, open_session, words_of
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.models.onnx.external import Gives, read_external
 from edgeslam_torch.types import DepthMap, FloatArray
+
+if TYPE_CHECKING:
+    from edgeslam_torch.models.onnx.file import OnnxFile
 
 FARTHEST = 2.0
 """The far end of what a relative network sees, relative to the median depth, before the map says it. Measured depth has
@@ -29,8 +33,10 @@ class ExternalDepth:
     Args:
         weights: The ``.onnx`` file.
         threads: Threads per inference.
+        device: ``cpu``, ``cuda``, or ``auto``: CUDA where onnxruntime has it.
 
     Raises:
+        ConfigError: If there is no such device.
         WeightsError: If it is missing, damaged, not described, cannot be run, or gives no depth.
 
     Example:
@@ -38,12 +44,11 @@ class ExternalDepth:
         True
     """
 
-    backend = "onnxruntime"
-
-    def __init__(self, weights: Path, threads: int = 1) -> None:
-        self.weights = weights
+    def __init__(self, weights: "Path | OnnxFile", threads: int = 1, device: str = "cpu") -> None:
+        self.weights = weights if isinstance(weights, Path) else weights.path
         content, self.network = read_external(weights)
-        self._session = open_session(content, weights, threads)
+        self._session = open_session(content, self.weights, threads, device)
+        self.backend = words_of("onnxruntime", device_of(self._session))
         self._fixed = [side if isinstance(side, int) else None for side in self._session.get_inputs()[0].shape[2:]]
         self._try_out()
 

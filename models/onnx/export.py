@@ -1,4 +1,4 @@
-"""Export of FastDepth to a checked ONNX graph."""
+"""Export of depth networks to a checked ONNX graph."""
 
 import json
 import logging
@@ -12,11 +12,11 @@ import torch
 
 from edgeslam_torch.errors import OutputError
 from edgeslam_torch.files.atomic import write_atomically
-from edgeslam_torch.models.fastdepth import FastDepth
 from edgeslam_torch.models.layout import INPUT_MULTIPLE
 from edgeslam_torch.models.onnx.file import INPUT, LOG_DEPTH, SIGMA
 from edgeslam_torch.models.onnx.fold import deployed
 from edgeslam_torch.models.record import HEADER_KEY, MAX_INPUT_PX, Metadata
+from edgeslam_torch.models.trainable import DepthModule
 
 MAX_BATCH = 1024
 OLDEST_OPSET = 14
@@ -38,7 +38,7 @@ class ExportOptions:
     """Leave the number of images open."""
 
 
-def export_onnx(network: FastDepth, metadata: Metadata, path: Path, options: ExportOptions) -> None:
+def export_onnx(network: DepthModule, metadata: Metadata, path: Path, options: ExportOptions) -> None:
     """Write ``path`` (inputs ``image`` ``(1, 3, H, W)``; outputs ``log_depth`` and ``sigma_log`` ``(1, 1,
     H/2, W/2)``, or as many as the batch has).
 

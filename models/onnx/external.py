@@ -10,14 +10,13 @@ from pathlib import Path
 from typing import Any
 
 import onnx
-from google.protobuf.message import DecodeError
 
 from edgeslam_torch.errors import ConfigError, WeightsError
 from edgeslam_torch.files.config_file import laid_over
 from edgeslam_torch.files.record_files import read_mapping
+from edgeslam_torch.models.onnx.file import OnnxFile, parse_onnx
 from edgeslam_torch.models.onnx.presets import PRESETS
 from edgeslam_torch.models.record import MAX_INPUT_PX, STD_RANGE
-from edgeslam_torch.models.weights_file import open_weights
 
 PROPERTY = "edgeslam.depth"
 """Key of the record among a file's properties."""
@@ -92,7 +91,7 @@ class ExternalNetwork:
         return self.gives == Gives.RELATIVE_INVERSE
 
 
-def read_external(path: Path) -> tuple[bytes, ExternalNetwork]:
+def read_external(file: OnnxFile | Path) -> tuple[bytes, ExternalNetwork]:
     """An ONNX depth network of others and its description.
 
     The description is the file's own, else that of the TOML file beside it (``depth.toml`` of ``depth.onnx``), whose
@@ -101,20 +100,12 @@ def read_external(path: Path) -> tuple[bytes, ExternalNetwork]:
     Raises:
         WeightsError: If the file is missing, damaged, refers to other files, or is not described.
     """
-    try:
-        with open_weights(path) as file:
-            content = file.read()
-        model = onnx.load_model_from_string(content)
-    except OSError as error:
-        raise WeightsError(f"{path}: cannot read the weights ({error.strerror or error})") from error
-    except (DecodeError, ValueError, TypeError) as error:
-        raise WeightsError(f"{path}: damaged or not an ONNX file ({' '.join(str(error).split())[:80]})") from None
-    except WeightsError as error:
-        raise WeightsError(f"{path}: {error}") from None
+    file = file if isinstance(file, OnnxFile) else parse_onnx(file)
+    path, model = file.path, file.model
     outside = next((t.name for t in model.graph.initializer if t.data_location == onnx.TensorProto.EXTERNAL), None)
     if outside is not None:
         raise WeightsError(f"{path}: {outside} lies outside the file; save the network as one file")
-    return content, _with_fixed_size(_description(model, path), model, path)
+    return file.content, _with_fixed_size(_description(model, path), model, path)
 
 
 def _description(model: onnx.ModelProto, path: Path) -> ExternalNetwork:

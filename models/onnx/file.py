@@ -1,6 +1,7 @@
 """Exported ONNX files, checked before they run; importing this needs no torch."""
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -19,37 +20,55 @@ MAX_VALUE = 1e9
 _FLOATS = (TensorProto.FLOAT, TensorProto.FLOAT16, TensorProto.DOUBLE)
 
 
-def holds_record(path: Path) -> bool:
-    """Whether an ONNX file holds a record of this project, or cannot be read: `read_onnx` says why then."""
-    try:
-        with open_weights(path) as file:
-            model = onnx.load_model_from_string(file.read())
-    except (OSError, DecodeError, ValueError, TypeError, WeightsError):
-        return True
-    return any(p.key == HEADER_KEY for p in model.metadata_props)
+@dataclass(frozen=True, slots=True)
+class OnnxFile:
+    """An ONNX file, read and parsed once: those of others have hundreds of megabytes."""
+
+    path: Path
+    content: bytes
+    model: onnx.ModelProto
+
+    @property
+    def is_ours(self) -> bool:
+        """Whether it holds a record of this project."""
+        return any(p.key == HEADER_KEY for p in self.model.metadata_props)
 
 
-def read_onnx(path: Path) -> tuple[bytes, Metadata]:
-    """A file written by ``edgeslam export`` and its record.
+def parse_onnx(path: Path) -> OnnxFile:
+    """Read a file; nothing in it is checked yet.
 
     Raises:
-        WeightsError: If the file is missing, damaged, not from this project, or has implausible values.
+        WeightsError: If it is missing or no ONNX file.
     """
     try:
         with open_weights(path) as file:
             content = file.read()
-        model = onnx.load_model_from_string(content)
-        metadata = _record(model)
-        _check_ends(model.graph)
-        for tensor in _constants(model.graph):
-            _check_constant(tensor)
+        return OnnxFile(path, content, onnx.load_model_from_string(content))
     except OSError as error:
         raise WeightsError(f"{path}: cannot read the weights ({error.strerror or error})") from error
     except (DecodeError, ValueError, TypeError) as error:
         raise WeightsError(f"{path}: damaged or not an ONNX file ({' '.join(str(error).split())[:80]})") from None
     except WeightsError as error:
         raise WeightsError(f"{path}: {error}") from None
-    return content, metadata
+
+
+def read_onnx(file: OnnxFile | Path) -> tuple[bytes, Metadata]:
+    """A file written by ``edgeslam export`` and its record.
+
+    Raises:
+        WeightsError: If the file is missing, damaged, not from this project, or has implausible values.
+    """
+    file = file if isinstance(file, OnnxFile) else parse_onnx(file)
+    try:
+        metadata = _record(file.model)
+        _check_ends(file.model.graph)
+        for tensor in _constants(file.model.graph):
+            _check_constant(tensor)
+    except (ValueError, TypeError) as error:
+        raise WeightsError(f"{file.path}: damaged or not an ONNX file ({' '.join(str(error).split())[:80]})") from None
+    except WeightsError as error:
+        raise WeightsError(f"{file.path}: {error}") from None
+    return file.content, metadata
 
 
 def _record(model: onnx.ModelProto) -> Metadata:

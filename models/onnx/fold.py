@@ -6,7 +6,9 @@ import torch
 from torch import Tensor, nn
 
 from edgeslam_torch.models.fastdepth import LOG_SIGMA_RANGE, FastDepth
+from edgeslam_torch.models.layout import MAX_LOG_DEPTH
 from edgeslam_torch.models.record import Metadata
+from edgeslam_torch.models.trainable import DepthModule
 
 
 class _Deployed(nn.Module):
@@ -34,13 +36,35 @@ class _Deployed(nn.Module):
         # Slices instead of a split: ONNX's converter cannot convert Split to older opsets.
         both = self.heads(self.network.features(image))
         last, raw = both[:, :1], both[:, 1:]
-        sigma = raw.clamp(*LOG_SIGMA_RANGE).exp() * self.scale
-        return self.network.log_depth_of(last), (sigma * sigma + self.floor**2).sqrt()
+        return self.network.log_depth_of(last), _calibrated(raw, self.scale, self.floor)
 
 
-def deployed(network: FastDepth, metadata: Metadata) -> nn.Module:
-    """The network as exported: batch norm folded, sigma calibrated; torch reference for parity checks."""
-    return _Deployed(fold_batch_norm(network), metadata).eval()
+class _DeployedOther(nn.Module):
+    """The same of any network, as it is."""
+
+    def __init__(self, network: DepthModule, metadata: Metadata) -> None:
+        super().__init__()
+        self.network = network
+        self.scale, self.floor = metadata.sigma_scale, metadata.sigma_floor
+
+    def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        log_depth, log_sigma = self.network.predict_half(image)
+        log_depth = log_depth.clamp(-MAX_LOG_DEPTH, MAX_LOG_DEPTH)
+        if log_sigma is None:
+            return log_depth, torch.full_like(log_depth, self.floor)
+        return log_depth, _calibrated(log_sigma, self.scale, self.floor)
+
+
+def _calibrated(log_sigma: Tensor, scale: float, floor: float) -> Tensor:
+    sigma = log_sigma.clamp(*LOG_SIGMA_RANGE).exp() * scale
+    return (sigma * sigma + floor**2).sqrt()
+
+
+def deployed(network: DepthModule, metadata: Metadata) -> nn.Module:
+    """The network as exported: sigma calibrated, FastDepth's batch norm folded; torch reference for parity checks."""
+    if isinstance(network, FastDepth):
+        return _Deployed(fold_batch_norm(network), metadata).eval()
+    return _DeployedOther(copy.deepcopy(network), metadata).eval()
 
 
 def fold_batch_norm(network: FastDepth) -> FastDepth:

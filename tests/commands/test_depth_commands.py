@@ -290,3 +290,14 @@ def test_downloaded_network_is_ready_to_use(
     published.write_bytes(b"<html>not found</html>")
     with pytest.raises(EdgeSlamError, match="has changed since"):
         run("weights", "download", "midas-small")
+
+
+def test_a_missing_device_is_said_before_anything_is_written(
+    weights: Path, pictures: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    out = tmp_path / "out"
+    for words in (("depth", pictures, "--weights", weights), ("run", pictures, "--depth", weights)):
+        with pytest.raises(ConfigError, match="--device cuda: .*; use --device cpu"):
+            run(words[0], *words[1:], "--out", out, "--device", "cuda")
+        assert not out.exists() or not list(out.glob("*.npy")) + list(out.glob("trajectory.txt"))

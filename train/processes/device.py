@@ -1,14 +1,11 @@
 """Where training runs, and in which arithmetic."""
 
-import os
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from edgeslam_torch.errors import ConfigError
-
-DEVICES = ("auto", "cpu", "cuda", "mps")
+from edgeslam_torch.models.device import find_device
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,33 +34,11 @@ class Arithmetic:
         return {name: value.to(self.device, non_blocking=True) for name, value in batch.items()}
 
 
-def find_device(name: str) -> torch.device:
-    """The device of a name; of several GPUs, the one of this process's number on its machine (``LOCAL_RANK``).
-
-    Args:
-        name: One of `DEVICES`; ``auto`` is CUDA, else Apple's GPU, else the processor.
-
-    Raises:
-        ConfigError: If there is no such device.
-    """
-    if name not in DEVICES:
-        raise ConfigError(f"--device {name}: there are {', '.join(DEVICES)}")
-    there = {"cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available(), "cpu": True}
-    if name == "auto":
-        name = next(device for device, is_there in there.items() if is_there)
-    if not there[name]:
-        raise ConfigError(f"--device {name}: this torch ({torch.__version__}) finds no such device; use --device cpu")
-    if name != "cuda":
-        return torch.device(name)
-    local = int(os.environ.get("LOCAL_RANK", "0"))
-    return torch.device("cuda", local % torch.cuda.device_count())
-
-
 def arithmetic(device: str, amp: bool | None) -> Arithmetic:
     """Device and type of a training.
 
     Args:
-        device: As for `find_device`.
+        device: As for `edgeslam_torch.models.device.find_device`.
         amp: Whether to compute in half precision; None: on CUDA alone.
 
     Raises:

@@ -18,6 +18,7 @@ from edgeslam_torch.errors import ConfigError, SourceError
 if TYPE_CHECKING:
     from edgeslam_torch.train.folder import OutFolder
     from edgeslam_torch.train.outcome import Outcome
+    from edgeslam_torch.train.recipe import TrainConfig
     from edgeslam_torch.train.teachers.cache import TeacherCache
     from edgeslam_torch.train.views.datasets import DepthFolder
     from edgeslam_torch.train.views.posed import PosedSequence
@@ -110,9 +111,47 @@ def check_shared(args: argparse.Namespace) -> None:
         raise ConfigError(f"--cache-gb must be above 0, got {args.cache_gb:g}")
     if args.cache is not None and args.cache.exists() and not args.cache.is_dir():
         raise ConfigError(f"--cache {args.cache}: is no folder")
-    from edgeslam_torch.train.processes.device import find_device
+    from edgeslam_torch.models.device import find_device
 
     find_device(args.device)
+
+
+def train_config(args: argparse.Namespace, lr: float, frozen_stages: int, freeze_norm: bool) -> "TrainConfig":
+    """Settings of a training that goes on from weights: eight validations, the encoder at a fifth of the rate.
+
+    Args:
+        args: The shared ones.
+        lr: Peak learning rate of the decoder.
+        frozen_stages: Of the encoder.
+        freeze_norm: Whether batch norms keep their statistics.
+
+    Raises:
+        ConfigError: With the option that makes no sense.
+    """
+    from edgeslam_torch.train.recipe import TrainConfig
+
+    every = max(args.steps // 8, 1)
+    try:
+        return TrainConfig(
+            steps=args.steps,
+            batch=args.batch,
+            seed=args.seed,
+            lr=lr,
+            encoder_lr=lr / 5,
+            frozen_stages=frozen_stages,
+            freeze_norm=freeze_norm,
+            warmup_steps=max(min(20, args.steps // 4), 0),
+            ema_decay=0.99,
+            validate_every=every,
+            checkpoint_every=every,
+            patience=args.patience,
+            amp=args.amp,
+            device=args.device,
+            workers=args.workers,
+            accumulate=args.accumulate,
+        )
+    except ValueError as error:
+        raise ConfigError(f"--{error}") from error
 
 
 def in_folder(args: argparse.Namespace, work: "Callable[[OutFolder], Outcome]") -> int:

@@ -13,6 +13,7 @@ from edgeslam_torch.commands.training._inputs import (
     items_of,
     posed_run,
     teacher_cache,
+    train_config,
     validation_folders,
 )
 from edgeslam_torch.errors import ConfigError
@@ -81,31 +82,8 @@ def _student(name: str) -> "tuple[FastDepth, Metadata, bool]":
 
 def _config(args: argparse.Namespace, is_new: bool) -> "TrainConfig":
     """A new variant learns everything, at a higher rate."""
-    from edgeslam_torch.train.recipe import TrainConfig
-
-    every = max(args.steps // 8, 1)
     lr = args.lr if args.lr is not None else 1e-3 if is_new else 3e-4
-    try:
-        return TrainConfig(
-            steps=args.steps,
-            batch=args.batch,
-            seed=args.seed,
-            lr=lr,
-            encoder_lr=lr / 5,
-            frozen_stages=0 if is_new else 4,
-            freeze_norm=not is_new,
-            warmup_steps=min(20, args.steps // 4),
-            ema_decay=0.99,
-            validate_every=every,
-            checkpoint_every=every,
-            patience=args.patience,
-            amp=args.amp,
-            device=args.device,
-            workers=args.workers,
-            accumulate=args.accumulate,
-        )
-    except ValueError as error:
-        raise ConfigError(f"--{error}") from error
+    return train_config(args, lr, frozen_stages=0 if is_new else 4, freeze_norm=not is_new)
 
 
 def _distil(

@@ -15,6 +15,7 @@ from edgeslam_torch.commands.training._inputs import (
     labelled_folder,
     posed_run,
     teacher_cache,
+    train_config,
     validation_folders,
 )
 from edgeslam_torch.errors import ConfigError
@@ -56,37 +57,10 @@ def main(args: argparse.Namespace) -> int:
     from edgeslam_torch.models.checkpoint import load_checkpoint
     from edgeslam_torch.train.hook_names import named_hooks
 
-    config = _config(args)
+    config = train_config(args, args.lr, frozen_stages=14 if args.freeze_encoder else 4, freeze_norm=True)
     hooks = named_hooks(args.hook)
     network, metadata = load_checkpoint(args.weights)
     return in_folder(args, lambda out: _finetune(args, items, network, metadata, config, hooks, out))
-
-
-def _config(args: argparse.Namespace) -> "TrainConfig":
-    from edgeslam_torch.train.recipe import TrainConfig
-
-    every = max(args.steps // 8, 1)
-    try:
-        return TrainConfig(
-            steps=args.steps,
-            batch=args.batch,
-            seed=args.seed,
-            lr=args.lr,
-            encoder_lr=args.lr / 5,
-            frozen_stages=14 if args.freeze_encoder else 4,
-            freeze_norm=True,
-            warmup_steps=max(min(20, args.steps // 4), 0),
-            ema_decay=0.99,
-            validate_every=every,
-            checkpoint_every=every,
-            patience=args.patience,
-            amp=args.amp,
-            device=args.device,
-            workers=args.workers,
-            accumulate=args.accumulate,
-        )
-    except ValueError as error:
-        raise ConfigError(f"--{error}") from error
 
 
 def _finetune(
