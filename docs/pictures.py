@@ -1,7 +1,6 @@
-"""Make the README's pictures from a run: ``python docs/pictures.py runs/fr1`` (needs chromium for the second).
+"""Make the README's picture of a report from a run: ``python docs/pictures.py runs/fr1`` (needs chromium).
 
-``tum_fr1_xyz_map.png`` is the run's own ``map.png``, ``report.png`` the upper part of its report, both with fewer
-pixels and colours.
+``report.png`` is the upper part of the page, with fewer pixels and colours. Clip: ``clip.py``; gallery: ``gallery.py``.
 """
 
 import argparse
@@ -55,17 +54,15 @@ def photograph(page: Path, target: Path) -> None:
 
 
 def main() -> None:
-    """Both pictures."""
+    """Photograph the report."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("run", type=Path, help="output folder of 'edgeslam run' on tum_fr1_xyz")
     parser.add_argument("--groundtruth", "-g", type=Path, help="the recording, when the run no longer finds it")
     options = parser.parse_args()
-    shrink(options.run / "map.png", IMAGES / "tum_fr1_xyz_map.png")
     if PROGRAM is None:
         sys.exit("no chromium here: report.png is left as it is")
     photograph(write_report(options.run, options.groundtruth), IMAGES / "report.png")
-    for name in ("tum_fr1_xyz_map.png", "report.png"):
-        sys.stdout.write(f"{IMAGES / name}: {(IMAGES / name).stat().st_size / 1e3:.0f} kB\n")
+    sys.stdout.write(f"{IMAGES / 'report.png'}: {(IMAGES / 'report.png').stat().st_size / 1e3:.0f} kB\n")
 
 
 if __name__ == "__main__":
