@@ -22,6 +22,9 @@ _CELL_PX = 8
 _HIDDEN = 1.08
 """A point this much farther than its cell's nearest is behind it."""
 
+_WITH_TELEMETRY = "flight"
+"""What a run calls a folder of images in TUM's layout with a telemetry beside them."""
+
 
 def keyframe_pictures(run: RunFolder, cloud: PointCloud, stamps_s: FloatArray) -> list[tuple[float, np.ndarray]]:
     """Stamp and BGR picture of the keyframes at ``stamps_s`` whose images can still be read.
@@ -92,4 +95,6 @@ def _entries(run: RunFolder) -> list[ImageEntry]:
     if kind == "images":
         return images.list_image_folder(folder)[0]
     layout = layout_of(folder)
-    return list(layout.read(folder).images) if layout is not None and kind == layout.KIND else []
+    if layout is None or kind not in (layout.KIND, _WITH_TELEMETRY):
+        return []
+    return list(layout.read(folder).images)

@@ -1,17 +1,23 @@
 """Contents of ``report.html``, also for hostile names and numbers."""
 
 import json
+import shutil
 from collections.abc import Callable
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 
+from edgeslam_torch import open_source
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.inputs.run_folder import open_run
 from edgeslam_torch.eval.report.page import write_report
 from edgeslam_torch.eval.report.words import without_folders
+from edgeslam_torch.geometry.camera import PRESETS
+from edgeslam_torch.geometry.camera_file import save_camera
 
 NAMES = (
     "{{edges}}",
@@ -185,3 +191,23 @@ def test_source_beside_the_run_is_found_by_its_relative_name(run: Path) -> None:
     assert open_run(with_summary(run, source={"path": str(recording)})).source == recording
     assert open_run(with_summary(run, source={"path": "x" * 5000})).source is None
     assert open_run(with_summary(run, source={"path": "\0"})).source is None
+
+
+@pytest.mark.parametrize("telemetry", [False, True])
+def test_keyframes_are_drawn_from_a_recording_with_and_without_telemetry(run: Path, telemetry: bool) -> None:
+    recording = run.parent / "recording"
+    (recording / "rgb").mkdir(parents=True)
+    stamps_s = open_run(run).trajectory.stamps_s[:60:10]
+    for k in range(len(stamps_s)):
+        cv2.imwrite(str(recording / "rgb" / f"{k}.png"), np.full((480, 640, 3), 20 * k, np.uint8))
+    lines = [f"{stamp_s:.6f} rgb/{k}.png\n" for k, stamp_s in enumerate(stamps_s)]
+    (recording / "rgb.txt").write_text("".join(lines))
+    if telemetry:
+        rows = [f"{stamp_s:.3f},0.1,0,0,0,0,0\n" for stamp_s in np.arange(100.0, 103.0, 0.1)]
+        (recording / "telemetry.csv").write_text("stamp_s,vx,vy,vz,roll,pitch,yaw\n" + "".join(rows))
+    for folder in (run, recording):
+        save_camera(folder / "camera.yaml", PRESETS["kinect"])
+    shutil.rmtree(run / "keyframes")
+    source = {"path": "../recording", "kind": open_source(recording).kind}
+    page = Page(write_report(with_summary(run, source=source), None))
+    assert page.data["keyframes"]
