@@ -42,6 +42,7 @@ class Danger(StrEnum):
     LOST = "the pose rests on no map"
     HELD = "commanded and not moving: contact"
     NOT_METRIC = "no metres"
+    HAND = "held by hand"
     BATTERY_HOME = "battery low: home"
     BATTERY = "battery empty: land"
 
@@ -64,6 +65,8 @@ class Supervisor:
     limits: NavLimits = field(default_factory=NavLimits)
     landing: bool = False
     """Once it lands, it lands."""
+    held: bool = False
+    """Whether a person wants it to hover."""
     _sight: Sight | None = None
     _wish: Wish | None = None
     _wished_s: float = -math.inf
@@ -96,6 +99,9 @@ class Supervisor:
         if danger is Danger.BATTERY or self.landing:
             self.landing = True
             return Order(Wish(why=str(danger)), land=True, danger=danger)
+        if self.held:
+            self._since_s = math.nan
+            return Order(Wish(why=str(Danger.HAND)), danger=Danger.HAND)
         if danger is Danger.NONE:
             self._since_s = math.nan
             assert self._wish is not None

@@ -1,0 +1,38 @@
+"""What a navigator flies: a drone over UDP (`udp_craft.py`) or one in lockstep (`lockstep_craft.py`)."""
+
+from collections.abc import Callable
+from typing import Protocol
+
+from edgeslam_torch.geometry.camera import Camera
+
+
+class Craft(Protocol):
+    """A drone with eyes and a cockpit; verbs of a navigator are all about these."""
+
+    camera: Camera
+    over: str
+    """Why the flight is over; empty before and during it."""
+
+    @property
+    def flying(self) -> bool:
+        """Whether it has taken off and does not land yet."""
+
+    @property
+    def battery(self) -> float:
+        """Charge in [0, 1]; NaN if it was never told."""
+
+    def take_off(self) -> None:
+        """Rise to where the drone itself hovers; the cockpit gives the orders from then on.
+
+        Raises:
+            TelloError: If the drone does not.
+        """
+
+    def fly(self, until: Callable[[], bool]) -> None:
+        """Let time pass until something holds or the flight is over."""
+
+    def land(self, why: str) -> None:
+        """Land and wait until it stands."""
+
+    def close(self) -> None:
+        """Land if it flies, and leave."""

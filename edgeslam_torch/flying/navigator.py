@@ -1,0 +1,196 @@
+"""Verbs of a flight: `Navigator.open`, then `take_off`, `go_to`, `explore`, `return_home`, `land`."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+
+from edgeslam_torch.calibration.camera_choice import GUESS
+from edgeslam_torch.drone.address import TelloAddress
+from edgeslam_torch.flying.checks import check_fit, check_goal
+from edgeslam_torch.flying.cockpit import Cockpit, Listener
+from edgeslam_torch.flying.craft import Craft
+from edgeslam_torch.flying.errands import Stay, WayHome
+from edgeslam_torch.flying.outcome import FlightRefused, Outcome
+from edgeslam_torch.flying.recorder import Recorder
+from edgeslam_torch.flying.simulated import is_simulated, site_of
+from edgeslam_torch.navigation.limits import NavLimits
+from edgeslam_torch.navigation.pilot import Phase
+from edgeslam_torch.navigation.sight import Sight
+from edgeslam_torch.navigation.tasks import Explore, GoTo, Task
+from edgeslam_torch.types import FloatArray
+
+HOME_BECAUSE = "battery low: home"
+
+
+class Navigator:
+    """One drone that flies by its own map. Use it as a context manager: leaving it lands.
+
+    Positions are in the drone's own world: origin on the floor below the take-off, x along the drone's heading there,
+    y left, z up [m].
+
+    Example:
+        >>> from edgeslam_torch.flying.navigator import Navigator
+        >>> with Navigator.open("sim://cluttered_room", allow_motion=True) as nav:  # doctest: +SKIP
+        ...     nav.take_off()
+        ...     print(nav.go_to((3.0, 0.0, 1.15)))
+    """
+
+    def __init__(
+        self, craft: Craft, cockpit: Cockpit, allow_motion: bool = False, recorder: Recorder | None = None
+    ) -> None:
+        """Take over a drone; `open` is the way in."""
+        self.recorder = recorder
+        self.craft, self.cockpit, self.allow_motion = craft, cockpit, allow_motion
+        self.limits = cockpit.limits
+
+    @classmethod
+    def open(
+        cls,
+        location: str = "tello://",
+        allow_motion: bool = False,
+        limits: NavLimits | None = None,
+        camera: str | Path | None = None,
+        listeners: Sequence[Listener] = (),
+        record: str | Path | None = None,
+    ) -> "Navigator":
+        """Connect; nothing moves.
+
+        Args:
+            location: ``tello://HOST...`` for a drone or ``edgeslam sim``; ``sim://WORLD[:SEED]`` for an emulated drone
+                on a simulated clock, without network.
+            allow_motion: Whether the drone may fly at all.
+            limits: What the flight keeps to.
+            camera: Calibration; the Tello's own when None.
+            listeners: Told every moment of the flight.
+            record: Folder to record the flight to; none by default.
+
+        Raises:
+            SourceError: If the location means nothing, or the drone does not answer.
+            CalibrationError: If the calibration is malformed.
+            OutputError: If the folder holds a recording already or cannot be written.
+        """
+        recorder = None if record is None else Recorder(Path(record))
+        cockpit = Cockpit(limits or NavLimits(), [*listeners, *([] if recorder is None else [recorder.moment])])
+        craft: Craft
+        if is_simulated(location):
+            from edgeslam_torch.flying.lockstep_craft import LockstepCraft
+
+            craft = LockstepCraft(site_of(location), cockpit, recorder=recorder)
+        else:
+            from edgeslam_torch.flying.udp_craft import UdpCraft
+
+            address = TelloAddress.parse(location)
+            craft = UdpCraft(address, cockpit, allow_motion, camera, recorder=recorder)
+        return cls(craft, cockpit, allow_motion, recorder)
+
+    def __enter__(self) -> "Navigator":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Land if it flies, and leave."""
+        try:
+            self.craft.close()
+        finally:
+            if self.recorder is not None:
+                self.recorder.close()
+
+    def take_off(self) -> Outcome:
+        """Rise, look to both sides, and wait for metres.
+
+        Raises:
+            FlightRefused: If it may not or should not fly.
+            TelloError: If the drone does not rise.
+        """
+        if self.craft.flying:
+            raise FlightRefused("it flies already")
+        if self.craft.over:
+            raise FlightRefused(f"this flight is over ({self.craft.over}); open another navigator for the next")
+        check_fit(self.allow_motion, self.craft.battery, self.limits, self.craft.camera.source.startswith(GUESS))
+        self.cockpit.begin(Stay())
+        self.craft.take_off()
+        return self._fly(Stay(), "in the air")
+
+    def go_to(self, goal_w: Sequence[float] | FloatArray) -> Outcome:
+        """Fly to a point ``(3,)`` around what is in the way; at the height of flight, which the point must be near.
+
+        Raises:
+            FlightRefused: If the point is none, beyond the fence, inside something solid or at another height; or there
+                are no metres yet.
+        """
+        return self._fly(GoTo(self._goal(goal_w)), "there")
+
+    def explore(self, seconds: float) -> Outcome:
+        """Fly to where the known space ends, again and again; reached when time is over or nothing is left to see.
+
+        Raises:
+            FlightRefused: If the time is not positive, or it does not fly.
+        """
+        if not 0 < seconds < 3600:
+            raise FlightRefused(f"exploring takes more than 0 s and less than an hour, not {seconds} s")
+        sight = self._flying_sight()
+        return self._fly(Explore(sight.stamp_s + seconds), "the time is over")
+
+    def return_home(self) -> Outcome:
+        """Fly to the take-off, back along the way where it is far.
+
+        Raises:
+            FlightRefused: If it does not fly.
+        """
+        self._flying_sight()
+        return self._fly(WayHome(self.cockpit.track()), "home", to_home=True)
+
+    def land(self) -> Outcome:
+        """Land; reached when the drone says that it stands.
+
+        Raises:
+            FlightRefused: If it does not fly.
+        """
+        if not self.craft.flying:
+            raise FlightRefused(f"it does not fly{f': {self.craft.over}' if self.craft.over else ''}")
+        path_m, clearance_m = self.cockpit.flown()
+        self.craft.land("as told")
+        return Outcome(self.craft.over == "as told", f"landed: {self.craft.over}", clearance_m, path_m)
+
+    def _goal(self, goal_w: Sequence[float] | FloatArray) -> FloatArray:
+        goal = check_goal(goal_w, self.limits)
+        self._flying_sight()
+        return check_goal(goal, self.limits, self.cockpit.known())
+
+    def _flying_sight(self) -> Sight:
+        """The newest moment of a flight with metres.
+
+        Raises:
+            FlightRefused: If there is none.
+        """
+        sight = self.cockpit.sight
+        if not self.craft.flying or sight is None:
+            why = f" ({self.craft.over})" if self.craft.over else ": take off first"
+            raise FlightRefused(f"it does not fly{why}")
+        if not sight.metric:
+            raise FlightRefused(
+                "the map has no metres yet, so a place in metres means nothing; take_off() waits for them"
+            )
+        return sight
+
+    def _fly(self, task: Task, done: str, to_home: bool = False) -> Outcome:
+        """Fly a task to its end, home when the battery is low."""
+        self.cockpit.begin(task)
+        self.craft.fly(lambda: self.cockpit.ended() is not None or (not to_home and self._wants_home()))
+        path_m, clearance_m = self.cockpit.flown()
+        if not self.craft.flying:
+            return Outcome(False, self.craft.over, clearance_m, path_m)
+        if self.cockpit.ended() is None:
+            self.return_home()
+            if self.craft.flying:
+                self.craft.land(HOME_BECAUSE)
+            return Outcome(False, HOME_BECAUSE, clearance_m, path_m)
+        reached = self.cockpit.ended() is Phase.DONE
+        return Outcome(reached, done if reached else str(Phase.STUCK), clearance_m, path_m)
+
+    def _wants_home(self) -> bool:
+        return self.cockpit.last is not None and self.cockpit.last.home

@@ -1,0 +1,107 @@
+"""A flight on disk: its pictures and state as any recording, and beside them what was known and decided."""
+
+import logging
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+from edgeslam_torch.drone.tello import StateMessage
+from edgeslam_torch.errors import EdgeSlamError, OutputError
+from edgeslam_torch.files.appender import Appender
+from edgeslam_torch.flying.cockpit import Moment
+from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.types import Frame
+from edgeslam_torch.writers.flight_writer import FlightWriter
+
+logger = logging.getLogger(__name__)
+
+MOMENTS = "moments.csv"
+_COLUMNS = (
+    "stamp_s,x_m,y_m,z_m,yaw_rad,vx_m_s,vy_m_s,vz_m_s,position_sigma_m,scale_sigma,metric,tracked,blind_s,battery,"
+    "revision,phase,danger,forward_m_s,left_m_s,up_m_s,turn_left_rad_s,why"
+)
+
+
+class Recorder:
+    """A folder that ``edgeslam run`` reads, with `MOMENTS`: a line for each order, and why.
+
+    A disk that is full ends the recording, not the flight.
+
+    Args:
+        folder: Where; made by `begin`.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.failure: OutputError | None = None
+        """Why the recording ended early."""
+        self._writer: FlightWriter | None = None
+        self._moments: Appender | None = None
+        self._lock = threading.Lock()
+
+    def begin(self, camera: Camera) -> None:
+        """Make the folder.
+
+        Raises:
+            OutputError: If it holds a recording already or cannot be written.
+        """
+        self._writer = FlightWriter(self.folder, camera, with_telemetry=True)
+        self._moments = Appender(self.folder / MOMENTS, _COLUMNS + "\n")
+
+    def picture(self, frame: Frame) -> None:
+        """Write a picture."""
+        with self._lock:
+            if self._writer is not None:
+                self._guarded(lambda writer: writer.add_frame(frame))
+
+    def state(self, message: StateMessage) -> None:
+        """Write a state message."""
+        with self._lock:
+            if self._writer is not None:
+                self._guarded(lambda writer: writer.add_state(message))
+
+    def moment(self, moment: Moment) -> None:
+        """Write what was known and decided."""
+        with self._lock:
+            moments = self._moments
+            if moments is not None:
+                self._guarded(lambda _: moments.write(_line(moment)))
+
+    def close(self) -> None:
+        """Close the files."""
+        with self._lock:
+            if self._writer is not None:
+                self._writer.close()
+            if self._moments is not None:
+                self._moments.close()
+            self._writer = self._moments = None
+
+    def _guarded(self, write: Callable[[FlightWriter], None]) -> None:
+        if self.failure is not None or self._writer is None:
+            return
+        try:
+            write(self._writer)
+        except (OSError, EdgeSlamError) as error:
+            self.failure = OutputError(f"{self.folder}: the recording ended early: {error}")
+            logger.warning("%s; the flight goes on", self.failure)
+
+
+def _line(moment: Moment) -> str:
+    sight, order = moment.sight, moment.order
+    wish = order.wish
+    numbers = [*sight.p_w, sight.yaw_rad, *sight.velocity_w, sight.position_sigma_m, sight.scale_sigma]
+    stick = [wish.forward_m_s, wish.left_m_s, wish.up_m_s, wish.turn_left_rad_s]
+    fields = [
+        f"{sight.stamp_s:.6f}",
+        *(f"{x:.4f}" for x in numbers),
+        str(int(sight.metric)),
+        str(int(sight.tracked)),
+        f"{sight.blind_s:.3f}",
+        f"{sight.battery:.2f}",
+        str(sight.revision),
+        str(moment.phase),
+        str(order.danger),
+        *(f"{x:.3f}" for x in stick),
+        wish.why.replace(",", ";"),
+    ]
+    return ",".join(fields) + "\n"

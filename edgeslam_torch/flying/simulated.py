@@ -1,0 +1,27 @@
+"""Addresses of emulated drones in lockstep: ``sim://WORLD[:SEED]``."""
+
+from edgeslam_torch.errors import SourceError
+from edgeslam_torch.synthetic.sites.build import named_site
+from edgeslam_torch.synthetic.sites.site import Site
+
+_SCHEME = "sim://"
+
+
+def is_simulated(location: str) -> bool:
+    """Whether it names an emulated drone in lockstep."""
+    return location.startswith(_SCHEME)
+
+
+def site_of(location: str) -> Site:
+    """The world that ``sim://WORLD[:SEED]`` names; seed 0 without one.
+
+    Raises:
+        SourceError: If there is none.
+    """
+    name, colon, seed = location.removeprefix(_SCHEME).rstrip("/").partition(":")
+    if colon and not (seed.isascii() and seed.isdigit() and len(seed) < 10):
+        raise SourceError(f"{location}: seed {seed!r} is not a whole number; give {_SCHEME}WORLD[:SEED]")
+    try:
+        return named_site(name, int(seed or 0))
+    except ValueError as error:
+        raise SourceError(f"{location}: {error}") from error

@@ -1,0 +1,195 @@
+"""A Tello over UDP, flown by three threads: one sees, one plans, and one watches over both and owns the sticks."""
+
+import logging
+import math
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+from edgeslam_torch.calibration.camera_choice import choose_camera
+from edgeslam_torch.drone.answers import TelloError
+from edgeslam_torch.drone.tello import StateMessage, Tello, TelloAddress
+from edgeslam_torch.flying.cockpit import Cockpit
+from edgeslam_torch.flying.eyes import SlamEyes
+from edgeslam_torch.flying.recorder import Recorder
+from edgeslam_torch.navigation.sight import View
+from edgeslam_torch.types import Frame
+
+logger = logging.getLogger(__name__)
+
+TICK_S = 0.05
+_VIDEO_DELAY_S = 0.35
+"""From light to the arrival of a Tello's picture, which carries no time: 0.3 to 0.5 s."""
+_FIRST_PICTURE_S = 10.0
+_POLL_S = 0.02
+_THINK_S = 0.5
+"""Time that a thread is given to end."""
+
+
+class UdpCraft:
+    """A Tello, its eyes and its cockpit.
+
+    The thread that watches asks for an order every `TICK_S` and alone sends ``rc`` and ``land``: it waits neither for
+    the planner nor for the pictures. If it fails itself, it lands; if the whole program dies, `Guard` does.
+
+    Args:
+        address: Of the drone.
+        cockpit: What flies it.
+        allow_motion: Whether it may move.
+        camera: File or preset of the calibration; the Tello's when None.
+        recorder: Told every picture and state message.
+
+    Raises:
+        TelloError: If the drone does not answer, or sends no state or picture.
+        CalibrationError: If the calibration is malformed.
+    """
+
+    def __init__(
+        self,
+        address: TelloAddress,
+        cockpit: Cockpit,
+        allow_motion: bool = False,
+        camera: str | Path | None = None,
+        seed: int = 0,
+        recorder: Recorder | None = None,
+    ) -> None:
+        self.over = ""
+        self._cockpit = cockpit
+        self._flying = threading.Event()
+        self._landed = threading.Event()
+        self._land_because: str | None = None
+        self._stopping = threading.Event()
+        self._threads: list[threading.Thread] = []
+        self._view: View | None = None
+        self._view_lock = threading.Lock()
+        self._eyes: SlamEyes | None = None
+        self._recorder = recorder
+        self.tello = Tello(address, allow_motion, on_state=self._hear)
+        try:
+            self.tello.connect()
+            self._video = self.tello.start_video()
+            first = self._video.wait(0, _FIRST_PICTURE_S)
+            if first is None:
+                raise TelloError(f"{address.host}: no picture in {_FIRST_PICTURE_S:.0f} s")
+            size = (first.image.shape[1], first.image.shape[0])
+            self.camera, self.warnings = choose_camera(size, camera, is_drone=True)
+            if recorder is not None:
+                recorder.begin(self.camera)
+            self._eyes = SlamEyes(self.camera, seed, realtime=True)
+        except BaseException:
+            self.tello.close()
+            raise
+        for name, work in (("see", self._see), ("plan", self._plan), ("watch", self._watch)):
+            self._threads.append(threading.Thread(target=work, name=f"fly-{name}", daemon=True))
+            self._threads[-1].start()
+
+    @property
+    def flying(self) -> bool:
+        """As `Craft`."""
+        return self._flying.is_set()
+
+    @property
+    def battery(self) -> float:
+        """As `Craft`."""
+        latest = self.tello.latest
+        return math.nan if latest is None else latest.sample().battery
+
+    def take_off(self) -> None:
+        """As `Craft`.
+
+        Raises:
+            TelloError: If the drone does not.
+        """
+        self.tello.take_off()
+        self._landed.clear()
+        self._flying.set()
+
+    def fly(self, until: Callable[[], bool]) -> None:
+        """As `Craft`."""
+        while self.flying and not until():
+            self._stopping.wait(_POLL_S)
+
+    def land(self, why: str) -> None:
+        """As `Craft`: asks the thread that watches, which does nothing else any more."""
+        if self.flying:
+            self._land_because = self._land_because or why
+            self._landed.wait()
+
+    def close(self) -> None:
+        """As `Craft`."""
+        try:
+            self.land("the program left")
+        finally:
+            self._stopping.set()
+            self.tello.close()  # lands too, should the thread above have died
+            for thread in self._threads:
+                thread.join(_THINK_S)
+            if self._eyes is not None:
+                self._eyes.close()
+
+    def _hear(self, message: StateMessage) -> None:
+        if self._eyes is not None:
+            self._eyes.heard(message.sample())
+        if self._recorder is not None:
+            self._recorder.state(message)
+
+    def _see(self) -> None:
+        """The newest picture, again and again."""
+        assert self._eyes is not None
+        count = 0
+        while not self._stopping.is_set():
+            picture = self._video.wait(count, TICK_S)
+            if picture is None:
+                continue
+            count = picture.count
+            view = self._eyes.seen(picture.image, picture.stamp_s, picture.stamp_s - _VIDEO_DELAY_S)
+            if view is not None:
+                with self._view_lock:
+                    self._view = view
+            if self._recorder is not None:
+                self._recorder.picture(Frame(picture.count - 1, picture.stamp_s, picture.image))
+
+    def _plan(self) -> None:
+        """A wish for the newest moment, again and again."""
+        assert self._eyes is not None
+        while not self._stopping.wait(TICK_S):
+            if not self.flying:
+                continue
+            with self._view_lock:
+                view, self._view = self._view, None
+            self._cockpit.plan(self._eyes.sight(self.tello.clock.now(), view))
+
+    def _watch(self) -> None:
+        """Orders to the drone; whatever goes wrong here ends with a landing."""
+        while not self._stopping.wait(TICK_S):
+            if not self.flying:
+                continue
+            try:
+                self._tick()
+            except TelloError as error:  # a guard of the client lands it, such as the one for lost state
+                self._end(self.tello.stop_reason or str(error))
+            except Exception as error:
+                logger.exception("the supervisor failed; landing")
+                self._end(f"the supervisor failed: {error}")
+
+    def _tick(self) -> None:
+        assert self._eyes is not None
+        if self._land_because is not None:
+            self._end(self._land_because)
+            return
+        order = self._cockpit.order(self._eyes.sight(self.tello.clock.now()))
+        if order.land:
+            self._end(str(order.danger))
+        else:
+            self.tello.rc(*order.wish.sticks())
+
+    def _end(self, why: str) -> None:
+        self.over = why
+        try:
+            self.tello.land()
+        except TelloError as error:
+            self.over = f"{why}; {error}"
+        finally:
+            self._land_because = None
+            self._flying.clear()
+            self._landed.set()

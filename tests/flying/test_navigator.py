@@ -1,0 +1,138 @@
+"""Verbs and their outcomes, over a craft that follows orders exactly, in a room that its pilot has seen."""
+
+import math
+
+import numpy as np
+import pytest
+
+from edgeslam_torch.errors import SourceError
+from edgeslam_torch.flying.cockpit import Cockpit
+from edgeslam_torch.flying.navigator import Navigator
+from edgeslam_torch.flying.outcome import FlightRefused
+from edgeslam_torch.geometry.camera import PRESETS
+from edgeslam_torch.geometry.mount import camera_on_body
+from edgeslam_torch.navigation.limits import NavLimits
+from edgeslam_torch.navigation.sight import Sight, View
+
+TICK_S = 0.05
+WALL_M = 4.0
+
+
+class ObedientCraft:
+    """Moves at once as told, before a wall at x = `WALL_M` that it sees when it looks there; free elsewhere."""
+
+    def __init__(self, cockpit, metric=True, battery=1.0):
+        self.cockpit, self.camera, self.over = cockpit, PRESETS["tello"], ""
+        self.flying, self.battery, self.metric, self.ticks = False, battery, metric, 0
+        self.p, self.yaw, self.v, self.now_s = np.array([0.0, 0.0, 0.1]), 0.0, np.zeros(3), 0.0
+
+    def take_off(self):
+        self.flying, self.p[2] = True, 0.9
+
+    def fly(self, until):
+        while self.flying and not until():
+            self.now_s += TICK_S
+            self.ticks += 1
+            self.p = self.p + TICK_S * self.v
+            sight = Sight(
+                self.now_s, self.p, self.yaw, self.v, metric=self.metric, battery=self.battery, view=self._view()
+            )
+            self.cockpit.plan(sight)
+            order = self.cockpit.order(sight)
+            if order.land:
+                self.land(str(order.danger))
+            w, (c, s) = order.wish, (math.cos(self.yaw), math.sin(self.yaw))
+            self.v = np.array([c * w.forward_m_s - s * w.left_m_s, s * w.forward_m_s + c * w.left_m_s, w.up_m_s])
+            self.yaw += TICK_S * w.turn_left_rad_s
+
+    def land(self, why):
+        if self.flying:
+            self.flying, self.over = False, why
+
+    def close(self):
+        self.land("the program left")
+
+    def _view(self):
+        if self.ticks % 4:  # five a second, as in flight
+            return None
+        turn = np.eye(4)
+        turn[:2, :2] = [[math.cos(self.yaw), -math.sin(self.yaw)], [math.sin(self.yaw), math.cos(self.yaw)]]
+        turn[:3, 3] = self.p
+        T = turn @ camera_on_body()
+        K = np.array([[77.0, 0.0, 39.5], [0.0, 77.0, 29.5], [0.0, 0.0, 1.0]])
+        u, v = np.meshgrid(np.arange(80), np.arange(60))
+        rays = np.stack([(u - 39.5) / 77.0, (v - 29.5) / 77.0, np.ones(u.shape)], -1) @ T[:3, :3].T
+        with np.errstate(divide="ignore"):
+            to_wall = np.where(rays[..., 0] > 1e-6, (WALL_M - T[0, 3]) / rays[..., 0], 20.0)
+            to_floor = np.where(rays[..., 2] < -1e-6, -T[2, 3] / rays[..., 2], 20.0)
+        depth = np.minimum(np.minimum(to_wall, to_floor), 20.0).astype(np.float32)
+        return View(self.now_s, depth, np.full(depth.shape, 0.01, np.float32), K, T)
+
+
+def navigator(allow_motion=True, **craft):
+    cockpit = Cockpit(NavLimits())
+    return Navigator(ObedientCraft(cockpit, **craft), cockpit, allow_motion)
+
+
+@pytest.mark.slow
+def test_there_and_back_with_outcomes():
+    with navigator() as nav:
+        assert nav.take_off().reached
+        there = nav.go_to((2.5, 0.5, 1.15))
+        assert there.reached and there.reason == "there"
+        assert np.linalg.norm(nav.craft.p[:2] - [2.5, 0.5]) < 0.25
+        assert 2.2 < there.path_m < 4.0
+        assert there.min_clearance_m == pytest.approx(WALL_M - nav.craft.p[0] - 0.1, abs=0.25)
+        home = nav.return_home()
+        assert home.reached and np.linalg.norm(nav.craft.p[:2]) < 0.2
+        landed = nav.land()
+        assert landed.reached and not nav.craft.flying
+
+
+def test_goals_in_the_wall_are_refused_and_it_stays_in_the_air():
+    with navigator() as nav:
+        nav.take_off()
+        with pytest.raises(FlightRefused, match="solid"):
+            nav.go_to((WALL_M + 0.05, 0.0, 1.15))
+        assert nav.craft.flying
+    assert nav.craft.over == "the program left"
+
+
+def test_goals_before_metres_are_refused_and_no_metres_end_in_a_landing():
+    with navigator(metric=False) as nav:
+        nav.craft.take_off()
+        nav.cockpit.order(Sight(0.0, nav.craft.p, 0.0, np.zeros(3), metric=False))
+        with pytest.raises(FlightRefused, match="no metres yet"):
+            nav.go_to((1.0, 0.0, 1.15))
+    with navigator(metric=False) as nav:
+        outcome = nav.take_off()
+        assert not outcome.reached and "no metres" in outcome.reason and not nav.craft.flying
+
+
+@pytest.mark.slow
+def test_a_low_battery_brings_it_home_and_down():
+    with navigator() as nav:
+        nav.take_off()
+        nav.go_to((2.0, 0.0, 1.15))
+        nav.craft.battery = 0.2
+        outcome = nav.go_to((2.0, 2.0, 1.15))
+        assert not outcome.reached and "battery low" in outcome.reason
+        assert not nav.craft.flying and np.linalg.norm(nav.craft.p[:2]) < 0.2
+        with pytest.raises(FlightRefused, match="over"):
+            nav.take_off()
+
+
+def test_exploring_ends_in_time():
+    with navigator() as nav:
+        nav.take_off()
+        begin = nav.craft.now_s
+        assert nav.explore(5.0).reached
+        assert 5.0 <= nav.craft.now_s - begin < 5.5
+        with pytest.raises(FlightRefused, match="more than 0"):
+            nav.explore(float("nan"))
+
+
+@pytest.mark.parametrize("location", ["sim://nowhere", "sim://corridor:x", "sim://corridor:-1", "tello://a b"])
+def test_addresses_that_mean_nothing(location):
+    with pytest.raises(SourceError):
+        Navigator.open(location)

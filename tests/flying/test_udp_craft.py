@@ -1,0 +1,147 @@
+"""The threads of a flight over UDP, against an emulator whose true state the eyes tell."""
+
+import threading
+
+import numpy as np
+import pytest
+from emulated import SwiftDrone, emulated, until
+
+from edgeslam_torch.drone.address import TelloAddress
+from edgeslam_torch.drone.emulator.drone import Mode
+from edgeslam_torch.flying import udp_craft
+from edgeslam_torch.flying.cockpit import Cockpit
+from edgeslam_torch.flying.navigator import Navigator
+from edgeslam_torch.flying.outcome import FlightRefused
+from edgeslam_torch.navigation.limits import NavLimits
+from edgeslam_torch.navigation.pilot import Phase
+from edgeslam_torch.navigation.sight import Sight, Wish
+from edgeslam_torch.navigation.supervisor import Danger
+
+pytest.importorskip("av")
+
+
+class Truth:
+    """Eyes that know the emulated drone."""
+
+    drone = SwiftDrone()
+    battery = 1.0
+    tracked = True
+
+    def __init__(self, *unused, **unused_too):
+        pass
+
+    def heard(self, sample):
+        pass
+
+    def seen(self, *unused):
+        return None
+
+    def sight(self, now_s, view=None):
+        d = self.drone
+        moved = np.array([0.2, 0.0, 0.0])  # as if it moved: what is commanded here is not for long
+        return Sight(now_s, d.p_w.copy(), d.yaw, moved, battery=type(self).battery, tracked=type(self).tracked)
+
+    def close(self):
+        pass
+
+
+class Steady:
+    """A pilot that wants one thing, or hangs."""
+
+    def __init__(self):
+        self.wish, self.phase, self.layer, self.task = Wish(forward_m_s=0.3), Phase.FLYING, None, None
+        self.go_on = threading.Event()
+        self.go_on.set()
+
+    def begin(self, task):
+        self.task = task
+
+    def update(self, sight):
+        self.go_on.wait(60.0)
+        return self.wish
+
+
+@pytest.fixture
+def flight(monkeypatch):
+    """An emulator, and a navigator whose pilot wants to go ahead."""
+    monkeypatch.setattr(udp_craft, "SlamEyes", Truth)
+    monkeypatch.setattr(Truth, "battery", 1.0)
+    monkeypatch.setattr(Truth, "tracked", True)
+    drone = SwiftDrone()
+    monkeypatch.setattr(Truth, "drone", drone)
+    with emulated(drone) as (emulator, location):
+        cockpit = Cockpit(NavLimits())
+        cockpit.pilot = Steady()
+        craft = udp_craft.UdpCraft(TelloAddress.parse(location), cockpit, True, camera="tello")
+        try:
+            yield emulator, craft, cockpit
+        finally:
+            cockpit.pilot.go_on.set()
+            craft.close()
+
+
+def forward(emulator):
+    return emulator.drone.rc[1]
+
+
+def test_planner_and_supervisor_fly_and_a_hung_planner_is_stopped(flight):
+    emulator, craft, cockpit = flight
+    craft.take_off()
+    until(lambda: forward(emulator) == pytest.approx(0.3))
+    cockpit.pilot.go_on.clear()
+    until(lambda: emulator.drone.rc == (0.0, 0.0, 0.0, 0.0))
+    until(lambda: cockpit.last.danger is Danger.NO_WISH)
+    cockpit.pilot.go_on.set()
+    until(lambda: forward(emulator) == pytest.approx(0.3))
+    craft.land("as told")
+    assert craft.over == "as told" and not craft.flying
+    until(lambda: emulator.drone.mode is Mode.GROUND)
+
+
+def test_an_empty_battery_lands_it(flight, monkeypatch):
+    emulator, craft, _ = flight
+    craft.take_off()
+    monkeypatch.setattr(Truth, "battery", 0.08)
+    craft.fly(lambda: False)
+    assert craft.over == str(Danger.BATTERY)
+    until(lambda: emulator.drone.mode is Mode.GROUND)
+
+
+def test_a_supervisor_that_fails_lands_it(flight, monkeypatch):
+    emulator, craft, cockpit = flight
+    craft.take_off()
+    monkeypatch.setattr(cockpit, "order", lambda sight: 1 / 0)
+    craft.fly(lambda: False)
+    assert "failed" in craft.over
+    until(lambda: emulator.drone.mode is Mode.GROUND)
+
+
+def test_leaving_lands_it(flight):
+    emulator, craft, _ = flight
+    craft.take_off()
+    craft.close()
+    assert craft.over == "the program left"
+    until(lambda: emulator.drone.mode is Mode.GROUND)
+
+
+def test_nothing_moves_without_leave(monkeypatch):
+    monkeypatch.setattr(udp_craft, "SlamEyes", Truth)
+    with emulated() as (emulator, location), Navigator.open(location, camera="tello") as nav:
+        with pytest.raises(FlightRefused, match="--fly"):
+            nav.take_off()
+        with pytest.raises(FlightRefused, match="take off first"):
+            nav.go_to((1.0, 0.0, 1.15))
+        with pytest.raises(FlightRefused, match="does not fly"):
+            nav.land()
+    moving = ("takeoff", "rc", "land", "go", "up", "forward")
+    assert not [text for text in emulator.heard if text.split()[0] in moving]
+
+
+def test_an_unknown_camera_does_not_fly(monkeypatch):
+    monkeypatch.setattr(udp_craft, "SlamEyes", Truth)
+    with (
+        emulated() as (_, location),
+        Navigator.open(location, allow_motion=True) as nav,
+        pytest.raises(FlightRefused, match="calibration"),
+    ):
+        nav.take_off()
