@@ -34,6 +34,7 @@ COMMANDS = {
     "weights": ("edgeslam_torch.commands.weights", "list, download, convert and inspect network weights"),
     "record": ("edgeslam_torch.commands.record", "record a flight or a camera"),
     "calibrate": ("edgeslam_torch.commands.calibrate", "camera calibration from chessboard pictures"),
+    "fly": ("edgeslam_torch.commands.flying.fly", "fly a Tello by its own map: to a point, exploring, home"),
     "sim": ("edgeslam_torch.commands.sim", "a simulated Tello on this machine's loopback"),
     "export-map": (
         "edgeslam_torch.commands.export_map",

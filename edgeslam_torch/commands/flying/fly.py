@@ -1,0 +1,159 @@
+"""``edgeslam fly``: fly a Tello by its own map; nothing moves without --fly."""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from edgeslam_torch.flying.navigator import Navigator
+    from edgeslam_torch.flying.outcome import Outcome
+    from edgeslam_torch.navigation.limits import NavLimits
+
+EXIT_NOT_REACHED = 3
+"""The flight ended well, but not where it was to go."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's options."""
+    verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
+    goto = verbs.add_parser("goto", help="fly to a point, around what is in the way")
+    goto.add_argument("x", type=float, metavar="X", help="metres ahead of the take-off")
+    goto.add_argument("y", type=float, metavar="Y", help="metres to its left")
+    goto.add_argument("z", type=float, nargs="?", metavar="Z", help="height of the whole flight above the floor")
+    explore = verbs.add_parser("explore", help="fly to where the known space ends, again and again")
+    explore.add_argument("seconds", type=float, metavar="SECONDS", help="for how long")
+    home = verbs.add_parser("home", help="take off, look around, return above the take-off, land: a first test")
+    for verb in (goto, explore, home):
+        _add_common(verb)
+
+
+def _add_common(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--drone",
+        default="tello://",
+        metavar="ADDRESS",
+        help="tello://HOST[:PORTS], or sim://WORLD[:SEED] for an emulated one without network (default: tello://)",
+    )
+    parser.add_argument("--fly", action="store_true", help="really fly; without it nothing moves, the plan is shown")
+    parser.add_argument("--dry-run", action="store_true", help="show the plan without asking the drone anything")
+    parser.add_argument("--back", action="store_true", help="return to the take-off before landing")
+    parser.add_argument("--record", type=Path, metavar="DIR", help="record pictures, state and decisions")
+    parser.add_argument("--camera", metavar="FILE|PRESET", help="calibration of the drone's camera")
+    parser.add_argument("--speed", type=float, metavar="M_S", help="cruising speed (default: 0.5)")
+    parser.add_argument("--height", type=float, metavar="M", help="height of flight (default: 1.15)")
+    parser.add_argument("--fence", type=float, metavar="M", help="never farther from the take-off (default: 30)")
+
+
+def main(args: argparse.Namespace) -> int:
+    """Check, show the plan, and fly it if told to."""
+    from edgeslam_torch.errors import ConfigError
+    from edgeslam_torch.flying.keys import keys
+    from edgeslam_torch.flying.navigator import Navigator
+
+    if args.fly and args.dry_run:
+        raise ConfigError("--fly and --dry-run contradict each other")
+    limits = _limits(args)
+    _check(args, limits)
+    for line in _plan(args, limits):
+        print(line, flush=True)
+    if args.dry_run:
+        print("nothing was sent to the drone")
+        return 0
+    record = args.record if args.fly else None
+    with Navigator.open(args.drone, args.fly, limits, args.camera, record=record) as nav:
+        charge = nav.craft.battery
+        known = f"battery {100 * charge:.0f} %, " if charge == charge else ""
+        camera = nav.craft.camera
+        print(f"{args.drone}: {known}pictures {camera.width}x{camera.height}, calibration: {camera.source}", flush=True)
+        if not args.fly:
+            print("nothing moved: add --fly to fly this")
+            return 0
+        with keys(nav.cockpit.hold, lambda: nav.craft.land("by the keyboard")) as listens:
+            if listens:
+                print("space hovers and lets go again, l or q lands, Ctrl-C lands", flush=True)
+            return _fly(args, nav)
+
+
+def _limits(args: argparse.Namespace) -> "NavLimits":
+    from dataclasses import replace
+
+    from edgeslam_torch.errors import ConfigError
+    from edgeslam_torch.navigation.limits import NavLimits
+
+    height = args.height
+    if args.verb == "goto" and args.z is not None:
+        if height is not None and height != args.z:
+            raise ConfigError(f"the height is given twice: Z {args.z:g} and --height {height:g}")
+        height = args.z
+    usual = NavLimits()
+    if height is not None and not usual.lowest_m <= height <= usual.highest_m:
+        raise ConfigError(f"the height of flight must be {usual.lowest_m:g} to {usual.highest_m:g} m, got {height:g}")
+    given = {"speed_m_s": args.speed, "height_m": height, "fence_m": args.fence}
+    if args.speed is not None and not 0.05 <= args.speed <= 1.0:
+        raise ConfigError(f"--speed must be 0.05 to 1 m/s, got {args.speed:g}")
+    if args.fence is not None and args.fence <= 0:
+        raise ConfigError(f"--fence must be positive, got {args.fence:g}")
+    return replace(usual, **{name: value for name, value in given.items() if value is not None})
+
+
+def _check(args: argparse.Namespace, limits: "NavLimits") -> None:
+    from edgeslam_torch.errors import ConfigError
+    from edgeslam_torch.flying.checks import check_goal
+
+    if args.verb == "goto":
+        check_goal((args.x, args.y, limits.height_m), limits)
+    if args.verb == "explore" and not 0 < args.seconds < 3600:
+        raise ConfigError(f"SECONDS must be above 0 and below 3600, got {args.seconds:g}")
+
+
+def _plan(args: argparse.Namespace, limits: "NavLimits") -> list[str]:
+    """What would be flown, in words."""
+    import math
+
+    what = "return above the take-off"
+    if args.verb == "goto":
+        away = math.hypot(args.x, args.y)
+        what = (
+            f"fly to ({args.x:g}, {args.y:g}): {away:.1f} m as the crow flies, "
+            f"at least {away / limits.speed_m_s:.0f} s, around whatever the map shows in between"
+        )
+    elif args.verb == "explore":
+        what = f"explore for {args.seconds:g} s: fly to where the known space ends, again and again"
+    steps = [f"take off, rise to {limits.height_m:.2f} m and look to both sides", what]
+    steps += ["return above the take-off"] if args.back and args.verb != "home" else []
+    lines = [f"{n}. {step}" for n, step in enumerate([*steps, "land"], 1)]
+    return [
+        "plan:",
+        *lines,
+        f"limits: {limits.speed_m_s:g} m/s, heights {limits.lowest_m:g} to {limits.highest_m:g} m, "
+        f"{limits.fence_m:g} m from the take-off, home at {100 * limits.home_battery:.0f} % battery; "
+        "only through space that was seen to be free",
+    ]
+
+
+def _fly(args: argparse.Namespace, nav: "Navigator") -> int:
+    outcome = _told("take-off", nav.take_off())
+    if nav.craft.flying and outcome.reached:
+        outcome = _verb(args, nav)
+    if nav.craft.flying and args.back and args.verb != "home":
+        _told("return", nav.return_home())
+    if nav.craft.flying:
+        _told("landing", nav.land())
+    if nav.recorder is not None:
+        print(f"recorded: {nav.recorder.folder} (edgeslam run {nav.recorder.folder} maps it again)")
+    return 0 if outcome.reached else EXIT_NOT_REACHED
+
+
+def _verb(args: argparse.Namespace, nav: "Navigator") -> "Outcome":
+    if args.verb == "goto":
+        return _told("goto", nav.go_to((args.x, args.y, nav.limits.height_m)))
+    if args.verb == "explore":
+        return _told("explore", nav.explore(args.seconds))
+    return _told("home", nav.return_home())
+
+
+def _told(what: str, outcome: "Outcome") -> "Outcome":
+    clear = outcome.min_clearance_m
+    known = f", nearest solid on its map {clear:.2f} m from the hull" if clear == clear else ""
+    print(f"{what}: {outcome.reason}; {outcome.path_m:.1f} m flown{known}", flush=True)
+    return outcome
