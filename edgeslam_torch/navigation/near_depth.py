@@ -4,8 +4,9 @@ A network that was trained elsewhere is wrong by tens of percent as a whole and 
 is near is said to be farther than it is, which is the wrong side. The map's own points in the same picture tell both.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
+import cv2
 import numpy as np
 
 from edgeslam_torch.types import DepthMap, FloatArray
@@ -17,6 +18,14 @@ _SLOPE_SIGMA = 0.3
 """Prior of the slope around 1: rooms have shown .3 to .9 of network depth for map depth, that is 1.1 to 3 back."""
 _LEAST_SIGMA = 0.03
 _SLOPES = (0.6, 2.0)
+_NEAR_SHARE = 0.06
+"""Of the picture's width: 4 degrees of a Tello's, over which a network's error hardly changes."""
+_ALONE_SIGMA = 0.3
+"""Of depth that rests on the network alone."""
+_LINE_POINTS = 3.0
+"""Points that outweigh the line."""
+_BLOCK = 8
+"""Pixels that share a mean."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,13 +37,21 @@ class NearFit:
     sigma_log: float
     """Robust spread of single points around it."""
     points: int
+    uv: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
+    """``(P, 2)`` where in the picture the points are [px]; none: nothing is known of places."""
+    residual: FloatArray = field(default_factory=lambda: np.zeros(0))
+    """``(P,)`` logarithm of map depth over the line there."""
 
     def applied(self, depth: DepthMap) -> DepthMap:
-        """Depth in metres with the fit's sigma; unknown where the network's is."""
+        """Depth in metres, with the line's errors made up for near the points; unknown where the network's is.
+
+        Its sigma is the spread of the points nearby, and the network's own far from all.
+        """
         known = np.isfinite(depth.depth_m) & (depth.depth_m > 0)
-        log_m = np.log(np.where(known, depth.depth_m, 1.0))
-        metres = np.where(known, np.exp(self.offset + self.slope * log_m), np.nan).astype(np.float32)
-        return DepthMap(metres, np.full(metres.shape, self.sigma_log, np.float32))
+        log_m = self.offset + self.slope * np.log(np.where(known, depth.depth_m, 1.0))
+        error, sigma = local_error(self.uv, self.residual, self.sigma_log, depth.depth_m.shape)
+        metres = np.where(known, np.exp(log_m + error), np.nan).astype(np.float32)
+        return DepthMap(metres, sigma)
 
 
 def fit_near(network_m: FloatArray, map_m: FloatArray) -> NearFit | None:
@@ -61,6 +78,36 @@ def fit_near(network_m: FloatArray, map_m: FloatArray) -> NearFit | None:
     return NearFit(float(line[0] - slope * middle), slope, spread, int(usable.sum()))
 
 
+def local_error(
+    uv: FloatArray, residual: FloatArray, spread: float, shape: tuple[int, ...]
+) -> tuple[FloatArray, FloatArray]:
+    """What points ``(P, 2)`` with residuals ``(P,)`` say of a line's error at every pixel, and its standard deviation.
+
+    Means over `_NEAR_SHARE` of the picture's width with Gaussian weights, towards the line (error 0, standard deviation
+    at least `_ALONE_SIGMA`) with the weight of `_LINE_POINTS` points: through a door, where no point is, a network that
+    fits this room to 7 % was seen to be 40 % too near. Residuals beyond three spreads are of hidden points.
+
+    Returns:
+        Error and standard deviation, ``shape`` ``(H, W)`` float32 each.
+    """
+    height, width = shape
+    small = (-(-height // _BLOCK), -(-width // _BLOCK))
+    kept = np.abs(residual) < 3.0 * spread
+    block = np.clip((uv[kept] / _BLOCK).astype(int), 0, [small[1] - 1, small[0] - 1])
+    index, r = block[:, 1] * small[1] + block[:, 0], residual[kept]
+    moments = [np.bincount(index, w, small[0] * small[1]).reshape(small) for w in (np.ones(len(r)), r, r * r)]
+    radius = _NEAR_SHARE * width / _BLOCK
+    # The weight of one point in its own place is 1.
+    n, sum_r, sum_rr = (2.0 * np.pi * radius**2 * cv2.GaussianBlur(m, (0, 0), radius) for m in moments)
+    mean = sum_r / (n + _LINE_POINTS)
+    about_mean = np.maximum(sum_rr - 2.0 * mean * sum_r + n * mean * mean, 0.0)
+    unsupported = max(spread, _ALONE_SIGMA) ** 2 + mean * mean
+    variance = (about_mean + _LINE_POINTS * unsupported) / (n + _LINE_POINTS)
+    sigma = np.maximum(np.sqrt(variance), _LEAST_SIGMA)
+    error, sigma = (cv2.resize(x.astype(np.float32), (width, height)) for x in (mean, sigma))
+    return error, sigma
+
+
 def fit_to_points(depth: DepthMap, K: FloatArray, T_w_c: FloatArray, points_w: FloatArray) -> NearFit | None:
     """`fit_near` at the pixels where points of the map ``(N, 3)`` [m] are seen from ``T_w_c`` ``(4, 4)``.
 
@@ -72,4 +119,10 @@ def fit_to_points(depth: DepthMap, K: FloatArray, T_w_c: FloatArray, points_w: F
     uv = np.rint((p_c[:, :2] / p_c[:, 2:]) * [K[0, 0], K[1, 1]] + [K[0, 2], K[1, 2]]).astype(int)
     inside = ((uv >= 0) & (uv < [width, height])).all(1)
     u, v = uv[inside].T
-    return fit_near(depth.depth_m[v, u].astype(np.float64), p_c[inside, 2])
+    network_m, map_m = depth.depth_m[v, u].astype(np.float64), p_c[inside, 2]
+    fit = fit_near(network_m, map_m)
+    if fit is None:
+        return None
+    known = np.isfinite(network_m) & (network_m > 0)
+    line = fit.offset + fit.slope * np.log(network_m[known])
+    return replace(fit, uv=uv[inside][known], residual=np.log(map_m[known]) - line)

@@ -32,6 +32,8 @@ _SHIFT = 20
 """The grid moves in steps of this many cells."""
 _SIGMAS = 2.0
 _MIN_DEPTH_M = 0.15
+_PLACED_M = 0.3
+"""Standard deviation above which a surface has no place: it frees what is sure, and fills nothing (unknown is not free)."""
 _KEPT = 120
 """Views that are remembered to rebuild the grid from when the map moves."""
 _SMALL = (80, 60)
@@ -165,7 +167,8 @@ class Space:
     def _fill(self, view: View, depth: FloatArray) -> None:
         """Mark the cells in which rays end."""
         height, width = depth.shape
-        v, u = np.nonzero((depth > _MIN_DEPTH_M) & (depth < REACH_M))
+        known = view.sigma_log * depth < _PLACED_M
+        v, u = np.nonzero((depth > _MIN_DEPTH_M) & (depth < REACH_M) & known)
         z = depth[v, u]
         rays = np.stack([(u - view.K[0, 2]) / view.K[0, 0], (v - view.K[1, 2]) / view.K[1, 1], np.ones(len(u))], 1)
         p = (z[:, None] * rays) @ view.T_w_c[:3, :3].T + view.T_w_c[:3, 3]

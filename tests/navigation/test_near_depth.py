@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from edgeslam_torch.navigation.near_depth import MIN_POINTS, fit_near, fit_to_points
+from edgeslam_torch.navigation.near_depth import MIN_POINTS, NearFit, fit_near, fit_to_points, local_error
 from edgeslam_torch.types import DepthMap
 
 
@@ -51,3 +51,44 @@ def test_points_are_compared_where_they_are_seen(rng):
             depth[v, u] = 2.0 * x[2]
     fit = fit_to_points(DepthMap(depth, np.full_like(depth, 0.2)), K, T, p)
     assert np.exp(fit.offset + fit.slope * np.log(4.0)) == pytest.approx(2.0, rel=0.05)
+
+
+def half_seen(rng, residual, shape=(120, 160)):
+    """Points in the left half of a picture, whose map depth is ``exp(residual)`` of the line's."""
+    uv = rng.uniform([0, 0], [0.5 * shape[1], shape[0]], (1000, 2))
+    return uv, residual + 0.02 * rng.standard_normal(1000), shape
+
+
+def test_points_mend_the_line_where_they_are_and_nowhere_else(rng):
+    uv, residual, shape = half_seen(rng, -0.4)
+    error, sigma = local_error(uv, residual, 0.3, shape)
+    assert error.shape == sigma.shape == shape
+    np.testing.assert_allclose(error[20:-20, 10:60], -0.4, atol=0.1)
+    np.testing.assert_allclose(error[:, -40:], 0.0, atol=0.01)
+    assert sigma[:, 10:60].max() < 0.3 <= sigma[:, -40:].min() + 1e-6
+
+
+def test_depth_without_points_nearby_is_as_unsure_as_the_network(rng):
+    """A room that fits to 3 % tells nothing of what is seen through its door."""
+    uv, residual, shape = half_seen(rng, 0.0)
+    fit = NearFit(0.0, 1.0, 0.03, len(uv), uv, residual)
+    network = DepthMap(np.full(shape, 2.0, np.float32), np.full(shape, 0.1, np.float32))
+    metres = fit.applied(network)
+    assert np.median(metres.sigma_log[:, 10:60]) < 0.12
+    assert metres.sigma_log[:, -40:].min() >= 0.29
+    np.testing.assert_allclose(metres.depth_m, 2.0, rtol=0.02)
+
+
+def test_what_points_show_nearer_becomes_nearer(rng):
+    uv, residual, shape = half_seen(rng, np.log(0.6))
+    metres = NearFit(0.0, 1.0, 0.3, len(uv), uv, residual).applied(
+        DepthMap(np.full(shape, 2.0, np.float32), np.full(shape, 0.1, np.float32))
+    )
+    assert np.median(metres.depth_m[:, 10:60]) == pytest.approx(1.2, rel=0.08)
+
+
+def test_points_that_something_hides_do_not_push_it_away(rng):
+    uv, residual, shape = half_seen(rng, 0.0)
+    residual[::4] = 1.2
+    error, _ = local_error(uv, residual, 0.1, shape)
+    np.testing.assert_allclose(error, 0.0, atol=0.03)

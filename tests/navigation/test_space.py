@@ -112,3 +112,11 @@ def test_unknown_depth_teaches_nothing():
 def test_heights_outside_the_grid_are_refused():
     with pytest.raises(ValueError, match="outside"):
         Space().layer(2.4, 0.2)
+
+
+def test_a_surface_without_a_sure_place_frees_and_fills_nothing_there():
+    """2 m within 20 % is not an obstacle at 2 m: it may stand anywhere around, and stays unseen."""
+    layer = seen(Space(), sigma=0.2)
+    assert cell(layer, 1.0, 0.05) == (True, False)
+    assert not layer.solid.any()
+    assert seen(Space(), sigma=0.1).solid.any()

@@ -1,6 +1,7 @@
 """One judged flight, and what came of it."""
 
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any, Protocol
 
@@ -28,6 +29,8 @@ TICK_S = 1.0 / 15.0
 LIMIT_S = 120.0
 REACHED_M = 0.35
 """Of the true goal, when the pilot says that it is there."""
+_APART_S = 1.0
+"""Touches nearer in time belong to one event: the body bounces every 10 ms while something pushes it."""
 _FREE_M = 0.6
 """Clearance from which cruising is free."""
 
@@ -59,6 +62,7 @@ class Flown:
     ended: str = ""
     """How: the pilot's phase, or why it landed."""
     contacts: int = 0
+    """Events: a touch that lasts, or bounces at once, is one (`contact_events`)."""
     crashed: bool = False
     landed: bool = False
     time_s: float = 0.0
@@ -130,13 +134,13 @@ def _fly(
     hung_s: tuple[float, float] | None,
     found: Flown,
 ) -> list[_Tick]:
-    drone, ticks, dangers = tello.drone, [], []
+    drone, ticks, dangers, touches = tello.drone, [], [], []
     tello.send("takeoff")
     landing = False
     while tello.clock_s < LIMIT_S:
         events = tello.advance(TICK_S)
         touched = [e for e in events if isinstance(e, Contact)]
-        found.contacts += len(touched)
+        touches += [t.clock_s for t in touched]
         found.crashed |= any(t.crashed for t in touched)
         if drone.mode is Mode.GROUND and tello.clock_s > 2.0:
             break
@@ -163,11 +167,22 @@ def _fly(
         else:
             right, forward, up, clockwise = (round(100 * v) for v in order.wish.sticks())
             tello.send(f"rc {right} {forward} {up} {clockwise}")
+    found.contacts = contact_events(touches)
     found.landed = drone.mode is Mode.GROUND and not found.crashed
     found.ended = found.ended or ("crash" if found.crashed else "out of time")
     found.time_s = found.time_s or tello.clock_s
     found.dangers = tuple(dangers)
     return ticks
+
+
+def contact_events(touches_s: Sequence[float]) -> int:
+    """How many events touches at these times [s], in order, are.
+
+    Example:
+        >>> contact_events([3.00, 3.01, 3.02, 3.9, 8.0])
+        2
+    """
+    return sum(1 for k, t in enumerate(touches_s) if k == 0 or t - touches_s[k - 1] > _APART_S)
 
 
 def _sum_up(found: Flown, site: Site, drone: DroneModel, ticks: list[_Tick]) -> None:
