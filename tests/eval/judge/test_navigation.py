@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from edgeslam_torch.eval.judge.navigation.film import film_strip, moments
-from edgeslam_torch.eval.judge.navigation.flight import Case, Flown, fly
+from edgeslam_torch.eval.judge.navigation.flight import Case, Flown, contact_events, fly
 from edgeslam_torch.eval.judge.navigation.oracle import shortest_m, true_layer
 from edgeslam_torch.eval.judge.navigation.pictures import top_view
 from edgeslam_torch.eval.judge.navigation.runner import judge_flights
@@ -80,6 +80,13 @@ def test_a_film_shows_the_wall_coming_nearer():
 def test_a_flight_that_never_flew_has_no_film():
     assert film_strip(flown(False)) is None
     assert film_strip(flown(False, track_w=[[0.0, 0.0, 1.0]])) is None, "a record from before film strips"
+
+
+def test_touches_in_a_row_are_one_contact():
+    assert contact_events([]) == 0
+    assert contact_events([3.0]) == 1
+    assert contact_events([3.0 + 0.01 * k for k in range(200)]) == 1
+    assert contact_events([3.0, 3.01, 5.0, 5.01, 9.0]) == 3
 
 
 def test_unknown_faults_are_refused():
