@@ -24,7 +24,9 @@ class Arcs:
     p_w: FloatArray
     """``(C, S, 2)`` positions until each stands [m]."""
     clearance_m: FloatArray
-    """``(C,)`` least clearance along it."""
+    """``(C,)`` least distance from what is not known to be free, along it."""
+    from_solid_m: FloatArray
+    """``(C,)`` least distance from what is known to be solid."""
 
     @property
     def end_w(self) -> FloatArray:
@@ -49,7 +51,7 @@ def candidates(
     unit = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     wanted = np.concatenate([np.zeros((1, 2)), *(speed_m_s * s * unit for s in _SPEEDS)])
     p = flown(np.asarray(p_w, dtype=np.float64), np.asarray(velocity_w, dtype=np.float64), wanted, limits)
-    return Arcs(wanted, p, layer.clearance_at(p).min(axis=1))
+    return Arcs(wanted, p, layer.clearance_at(p).min(axis=1), layer.from_solid_at(p).min(axis=1))
 
 
 def flown(p_w: FloatArray, velocity_w: FloatArray, wanted_w: FloatArray, limits: NavLimits) -> FloatArray:

@@ -31,6 +31,8 @@ _FACING_RAD = math.radians(30.0)
 """Beyond it the drone turns before it flies: it does not fly where it does not look."""
 _SIDEWAYS = 0.3
 """Share of the speed with which it moves where it does not look, through what it saw before."""
+_SQUEEZE = 0.6
+"""Share of the speed with which it passes the unseen at a hull's distance."""
 _GAIN_M = 0.04
 """Least progress of a movement, in metres of way."""
 _PATIENCE_S = 1.0
@@ -78,6 +80,8 @@ class Pilot:
     _revision: int = 0
     _sweep: list[float] = field(default_factory=list)
     """Headings still to be looked at, last first."""
+    _looked_w: FloatArray | None = None
+    """``(2,)`` where a look showed no way last."""
 
     def begin(self, task: Task) -> None:
         """Fly something else from now on."""
@@ -194,19 +198,36 @@ class Pilot:
         good = arcs.clearance_m >= need
         if standing < need:  # too near already: away from it
             good |= arcs.clearance_m >= standing - 1e-3
-        score = self._score(arcs, plan, sight.yaw_rad, error)
+        if self._may_squeeze(sight.p_w[:2]):
+            good |= self._squeezes(arcs, sight)
+        score = self._score(arcs, plan, sight, error)
         score[~good] = np.inf
         best = int(np.argmin(score))
         if best == 0 or not score[best] < score[0] - _GAIN_M:
             return None
         return arcs.velocity_w[best]
 
-    def _score(self, arcs: Arcs, plan: CostToGo, yaw_rad: float, error: float) -> FloatArray:
+    def _may_squeeze(self, here: FloatArray) -> bool:
+        """Whether a look from about here showed no way."""
+        return self._looked_w is not None and float(np.linalg.norm(here - self._looked_w)) < _ELSEWHERE_M
+
+    def _squeezes(self, arcs: Arcs, sight: Sight) -> np.ndarray:
+        """``(C,)`` slow movements that keep their clearance from every solid and only a hull's from the unseen.
+
+        What is beside the drone and nearer than 0.6 m is below its picture or above it: no look from here shows it.
+        """
+        slow = np.linalg.norm(arcs.velocity_w, axis=1) < _SQUEEZE * self.limits.speed_m_s + 1e-6
+        hull = self.limits.radius_m + BAND_M + 2.0 * sight.position_sigma_m
+        away = arcs.from_solid_m >= self.limits.clearance_m(sight.position_sigma_m)
+        return np.asarray(slow & away & (arcs.clearance_m >= hull))
+
+    def _score(self, arcs: Arcs, plan: CostToGo, sight: Sight, error: float) -> FloatArray:
         """Metres to go after each candidate, and what its lack of clearance is worth."""
         score = np.asarray(plan.at(arcs.end_w), dtype=np.float64).copy()
-        score += 0.5 * np.clip(_WANTED_M - arcs.clearance_m, 0.0, None)
+        away = arcs.from_solid_m if self._may_squeeze(sight.p_w[:2]) else arcs.clearance_m
+        score += 0.5 * np.clip(_WANTED_M - away, 0.0, None)
         speed = np.linalg.norm(arcs.velocity_w, axis=1)
-        off = np.abs(wrapped(np.arctan2(arcs.velocity_w[:, 1], arcs.velocity_w[:, 0]) - yaw_rad))
+        off = np.abs(wrapped(np.arctan2(arcs.velocity_w[:, 1], arcs.velocity_w[:, 0]) - sight.yaw_rad))
         unseen = (off > _FACING_RAD) & (speed > _SIDEWAYS * self.limits.speed_m_s + 1e-6)
         turning = (abs(error) > _FACING_RAD) & (speed > _SIDEWAYS * self.limits.speed_m_s + 1e-6)
         score[unseen | turning] = np.inf
@@ -221,4 +242,5 @@ class Pilot:
             self._waiting_s = sight.stamp_s
         elif sight.stamp_s - self._waiting_s > _PATIENCE_S:
             self.phase, self._waiting_s = Phase.RISING, math.nan
+            self._looked_w = sight.p_w[:2].copy()
         return Wish(turn_left_rad_s=turn, why="wait for a view of the way")

@@ -1,6 +1,7 @@
 """Routes, candidate movements, and the pilot, against geometry and the emulated body."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -126,6 +127,45 @@ def test_a_pilot_that_sees_nothing_does_not_leave_what_it_knows():
             drone.step(0.01)
         assert np.hypot(*drone.p_w[:2]) < 0.5
     assert pilot.phase is not Phase.DONE
+
+
+def before_a_strip(gap_m=None):
+    """A pilot in a seen circle, from which a seen strip of half the wanted width leads to its goal, through the gap of
+    a wall at 0.55 m if there is one."""
+    pilot = Pilot(GoTo(np.array([3.0, 0.0, 1.15])), phase=Phase.FLYING)
+    for z in np.arange(0.9, 1.5, 0.1):
+        pilot.space.flown(np.array([0.05, 0.05, z]), 0.5)
+        for x in np.arange(0.05, 3.5, 0.1):
+            pilot.space.flown(np.array([x, 0.05, z]), 0.2)
+    if gap_m is not None:
+        y = np.arange(-7.95, 8.0, 0.1)
+        y = y[np.abs(y - 0.05) > 0.5 * gap_m]
+        pilot.space.points(np.c_[np.full(len(y), 0.55), y, np.full(len(y), 1.15)])
+    return pilot
+
+
+def after_looking(pilot):
+    """Its wish when it has looked from where it is, in vain."""
+    for k in range(300):
+        wish = pilot.update(replace(at(0.3, 0.05), stamp_s=k / 15))
+        assert math.hypot(wish.forward_m_s, wish.left_m_s) < 0.01
+        if pilot.phase is Phase.RISING:
+            break
+    assert pilot.phase is Phase.RISING
+    pilot.phase = Phase.FLYING
+    return pilot.update(replace(at(0.3, 0.05), stamp_s=(k + 1) / 15))
+
+
+def test_after_a_look_in_vain_it_passes_the_unseen_slowly_at_a_hulls_distance():
+    wish = after_looking(before_a_strip())
+    assert 0.1 < wish.forward_m_s <= 0.31
+
+
+def test_a_hulls_distance_is_for_the_unseen_not_for_solids():
+    """A gap of half a metre is narrower than it flies through; a look in vain does not change that."""
+    assert after_looking(before_a_strip(gap_m=1.2)).forward_m_s > 0.1
+    wish = after_looking(before_a_strip(gap_m=0.5))
+    assert math.hypot(wish.forward_m_s, wish.left_m_s) < 0.01
 
 
 def test_a_goal_beyond_the_grid_is_aimed_at_from_its_border():
