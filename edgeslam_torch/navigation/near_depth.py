@@ -104,8 +104,11 @@ def local_error(
     unsupported = max(spread, _ALONE_SIGMA) ** 2 + mean * mean
     variance = (about_mean + _LINE_POINTS * unsupported) / (n + _LINE_POINTS)
     sigma = np.maximum(np.sqrt(variance), _LEAST_SIGMA)
-    error, sigma = (cv2.resize(x.astype(np.float32), (width, height)) for x in (mean, sigma))
-    return error, sigma
+    return _enlarged(mean, shape), _enlarged(sigma, shape)
+
+
+def _enlarged(small: FloatArray, shape: tuple[int, ...]) -> FloatArray:
+    return np.asarray(cv2.resize(small.astype(np.float32), (shape[1], shape[0])), dtype=np.float32)
 
 
 def fit_to_points(depth: DepthMap, K: FloatArray, T_w_c: FloatArray, points_w: FloatArray) -> NearFit | None:

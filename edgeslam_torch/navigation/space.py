@@ -33,7 +33,7 @@ _SHIFT = 20
 _SIGMAS = 2.0
 _MIN_DEPTH_M = 0.15
 _PLACED_M = 0.3
-"""Standard deviation above which a surface has no place: it frees what is sure, and fills nothing (unknown is not free)."""
+"""Standard deviation above which a surface has no place: it fills nothing, and frees only what is sure."""
 _KEPT = 120
 """Views that are remembered to rebuild the grid from when the map moves."""
 _SMALL = (80, 60)
