@@ -121,8 +121,11 @@ def _nerfstudio(run: "RunFolder", cloud: "PointCloud", args: argparse.Namespace)
     return folder
 
 
-def _seen(run: "RunFolder") -> "tuple[Observations, PointCloud, list[int]]":
-    """What keyframes saw of the anchors, the anchors, and the keyframes' rows in the trajectory."""
+def _seen(
+    run: "RunFolder", without: str = "points are not linked to images"
+) -> "tuple[Observations, PointCloud, list[int]]":
+    """What keyframes saw of the anchors, the anchors, and the keyframes' rows in the trajectory; `without` says what it
+    means that a run does not tell."""
     import numpy as np
 
     from edgeslam_torch.eval.inputs.associate import nearest
@@ -132,7 +135,7 @@ def _seen(run: "RunFolder") -> "tuple[Observations, PointCloud, list[int]]":
 
     path, anchors = run.path / "observations.npz", run.cloud("anchors.ply")
     if not path.exists():
-        print(f"{path}: not there (a run of version 0.1): points are not linked to images")
+        print(f"{path}: not there (a run of version 0.1): {without}")
         rows, none = run.keyframe_poses(), np.zeros(0, np.int64)
         return Observations(run.trajectory.stamps_s[rows], none, none, np.zeros((0, 2))), NO_POINTS, rows
     seen = read_observations(path)
@@ -147,8 +150,7 @@ def _seen(run: "RunFolder") -> "tuple[Observations, PointCloud, list[int]]":
 def _occupancy(run: "RunFolder", cloud: "PointCloud", args: argparse.Namespace) -> Path:
     import numpy as np
 
-    from edgeslam_torch.geometry.camera_file import load_camera
-    from edgeslam_torch.writers.occupancy import occupancy_grid, write_occupancy
+    from edgeslam_torch.writers.occupancy import SightLines, occupancy_grid, write_occupancy
 
     if run.units == "arbitrary":
         raise OutputError(f"{run.path}: no occupancy grid without metric scale; run with a depth network or telemetry")
@@ -157,13 +159,11 @@ def _occupancy(run: "RunFolder", cloud: "PointCloud", args: argparse.Namespace) 
         middle = float(np.median(run.trajectory.positions[:, 2]))
         low = args.min_z if args.min_z is not None else middle - 0.5
         heights = (low, args.max_z if args.max_z is not None else middle + 0.5)
-    half_fov = 0.5
-    if (run.path / "camera.yaml").is_file():
-        camera = load_camera(run.path / "camera.yaml")
-        half_fov = float(np.arctan(0.5 * camera.width / camera.fx))
-    views = run.trajectory.T_w_c[run.keyframe_poses()]
+    seen, anchors, index = _seen(run, "the grid knows free space only where the camera was")
+    eye_w = run.trajectory.positions[index]
+    lines = SightLines(eye_w[seen.keyframe], anchors.p_w[seen.anchor].astype(float), anchors.sigma_m[seen.anchor])
     path: Path = args.out or run.path / "occupancy"
-    write_occupancy(path, occupancy_grid(cloud.p_w, views, args.resolution, heights, half_fov_rad=half_fov))
+    write_occupancy(path, occupancy_grid(cloud.p_w, lines, run.trajectory.positions, args.resolution, heights))
     return path.with_suffix(".yaml")
 
 

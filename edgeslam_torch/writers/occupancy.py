@@ -19,8 +19,24 @@ FREE, OCCUPIED, UNKNOWN = 254, 0, 205
 MAX_CELLS = 50_000_000
 """Maximum number of cells: 7 km at 1 m, 350 m at 5 cm; more is a mistake of scale or resolution."""
 
-_AZIMUTHS = 720
-"""One ray per half degree of a camera's fan."""
+_SIGMAS = 2.0
+"""A line of sight frees space up to so many sigma before the point that was seen: beyond it, one point in fifty would
+free the wall that it lies on."""
+_CHUNK = 2000
+"""Lines at a time: bounds the memory."""
+
+
+@dataclass(frozen=True, slots=True)
+class SightLines:
+    """Who saw what: the space between was free. What was not seen says nothing, so a wall without edges stays
+    unknown whatever lies behind it."""
+
+    eye_w: FloatArray
+    """``(L, 3)`` positions of the cameras [m]."""
+    point_w: FloatArray
+    """``(L, 3)`` points that they saw [m]."""
+    sigma_m: FloatArray
+    """``(L,)`` of the points' positions."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,29 +54,28 @@ class OccupancyGrid:
 
 def occupancy_grid(
     p_w: FloatArray,
-    T_w_c: FloatArray,
+    seen: SightLines,
+    positions: FloatArray,
     resolution_m: float = 0.05,
     z_range_m: tuple[float, float] | None = None,
     min_points: int = 2,
-    half_fov_rad: float = 0.5,
 ) -> OccupancyGrid:
     """Project obstacles to the floor and mark the space that cameras looked through as free.
 
     Args:
         p_w: Map points ``(P, 3)`` [m], z up.
-        T_w_c: Camera to world ``(N, 4, 4)`` of the views that free space.
+        seen: Lines of sight; each frees the cells that it crosses within the heights.
+        positions: ``(N, 3)`` where the camera was [m]: free as well.
         resolution_m: Side of a cell.
         z_range_m: Heights of obstacles; half a metre below to half a metre above the median camera by default, where
             a drone on this path would hit them.
         min_points: Minimum number of points of an occupied cell; a single one may be an outlier.
-        half_fov_rad: Half the horizontal field of view of a camera.
 
     Raises:
         OutputError: If no point lies within the heights or the grid would be too large.
     """
     if resolution_m <= 0:
         raise OutputError(f"the resolution must be positive, got {resolution_m} m")
-    positions = T_w_c[:, :3, 3]
     middle = float(np.median(positions[:, 2]))
     low, high = z_range_m or (middle - 0.5, middle + 0.5)
     p = p_w[np.isfinite(p_w).all(axis=1)]
@@ -78,9 +93,10 @@ def occupancy_grid(
     np.add.at(counts, (cell[inside, 1], cell[inside, 0]), 1)
     occupied = counts >= min_points
     grid = np.full((height, width), UNKNOWN, dtype=np.uint8)
-    solid = (np.argwhere(occupied)[:, ::-1] + 0.5) * resolution_m + lower
-    for T in T_w_c:
-        _free_fan(grid, T, solid, lower, resolution_m, half_fov_rad)
+    free = np.concatenate([_looked_through(seen, resolution_m, (low, high)), positions[:, :2]])
+    column, row = np.floor((free - lower) / resolution_m).astype(int).T
+    inside = (column >= 0) & (row >= 0) & (column < width) & (row < height)
+    grid[row[inside], column[inside]] = FREE
     grid[occupied] = OCCUPIED
     origin = (float(lower[0]), float(lower[1]))
     return OccupancyGrid(grid[::-1].copy(), resolution_m, origin, (float(low), float(high)))
@@ -109,34 +125,22 @@ def write_occupancy(path: Path, grid: OccupancyGrid) -> None:
     write_text(record, remark + yaml.safe_dump(fields, sort_keys=False))
 
 
-def _free_fan(
-    grid: NDArray[np.uint8],
-    T: FloatArray,
-    solid: FloatArray,
-    lower: FloatArray,
-    resolution_m: float,
-    half_fov_rad: float,
-) -> None:
-    """Mark cells between a camera and the nearest obstacle of each ray as free; rays without an obstacle mark
-    none."""
-    position, forward = T[:2, 3], T[:2, 2]
-    if np.linalg.norm(forward) < 0.2:  # looks straight up or down: no fan
-        return
-    offset = solid - position
-    distance = np.linalg.norm(offset, axis=1)
-    angle = np.arctan2(offset[:, 1], offset[:, 0]) - np.arctan2(forward[1], forward[0])
-    angle = np.mod(angle + np.pi, 2 * np.pi) - np.pi
-    ahead = (np.abs(angle) < half_fov_rad) & (distance > resolution_m)
-    if not ahead.any():
-        return
-    ray = np.floor((angle[ahead] + np.pi) / (2 * np.pi) * _AZIMUTHS).astype(int)
-    nearest = np.full(_AZIMUTHS, np.inf)
-    np.minimum.at(nearest, ray, distance[ahead])
-    hit = np.flatnonzero(np.isfinite(nearest))
-    azimuth = (hit + 0.5) / _AZIMUTHS * 2 * np.pi - np.pi + np.arctan2(forward[1], forward[0])
-    steps = np.arange(0.0, float(nearest[hit].max()), 0.5 * resolution_m)
-    for a, reach in zip(azimuth, nearest[hit], strict=True):
-        along = steps[steps < reach - resolution_m]
-        cell = np.floor((position + along[:, None] * [np.cos(a), np.sin(a)] - lower) / resolution_m).astype(int)
-        ok = (cell >= 0).all(axis=1) & (cell[:, 0] < grid.shape[1]) & (cell[:, 1] < grid.shape[0])
-        grid[cell[ok, 1], cell[ok, 0]] = FREE
+def _looked_through(seen: SightLines, resolution_m: float, z_range_m: tuple[float, float]) -> FloatArray:
+    """Points ``(S, 2)`` seen from above, half a cell apart, of every line within the heights."""
+    low, high = z_range_m
+    found = [np.zeros((0, 2))]
+    for first in range(0, len(seen.eye_w), _CHUNK):
+        part = slice(first, first + _CHUNK)
+        eye_w, way = seen.eye_w[part], seen.point_w[part] - seen.eye_w[part]
+        length = np.linalg.norm(way, axis=1)
+        reach = length - _SIGMAS * seen.sigma_m[part] - resolution_m
+        good = np.isfinite(reach) & (reach > 0.0)  # without a sigma nobody knows how far the point is
+        if not good.any():
+            continue
+        eye_w, way = eye_w[good], way[good] / length[good, None]
+        along = np.arange(0.0, float(reach[good].max()), 0.5 * resolution_m)
+        p = eye_w[:, None] + along[:, None] * way[:, None]
+        p = p[(along < reach[good, None]) & (p[:, :, 2] >= low) & (p[:, :, 2] <= high)]
+        cells = np.unique(np.floor(p[:, :2] / resolution_m).astype(int), axis=0)
+        found.append((cells + 0.5) * resolution_m)
+    return np.concatenate(found)

@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import astuple
 from pathlib import Path
 
 import cv2
@@ -20,7 +21,15 @@ from edgeslam_torch.geometry.camera_file import save_camera
 from edgeslam_torch.types import PointCloud
 from edgeslam_torch.writers.maps.colmap import write_colmap
 from edgeslam_torch.writers.maps.pcd import write_pcd
-from edgeslam_torch.writers.occupancy import FREE, OCCUPIED, UNKNOWN, occupancy_grid, write_occupancy
+from edgeslam_torch.writers.occupancy import (
+    FREE,
+    OCCUPIED,
+    UNKNOWN,
+    OccupancyGrid,
+    SightLines,
+    occupancy_grid,
+    write_occupancy,
+)
 from edgeslam_torch.writers.ply import write_ply
 
 
@@ -104,34 +113,78 @@ def test_colmap_reads_the_model_and_projects_as_we_do(camera: Camera, cloud: Poi
     np.testing.assert_allclose(np.array(found["pixel"]) - 0.5, ours.reshape(2), atol=1e-3)
 
 
-def look_along(yaw: float, position: tuple[float, float, float]) -> np.ndarray:
-    T = np.eye(4)
-    forward = np.array([np.cos(yaw), np.sin(yaw), 0.0])
-    T[:3, 0], T[:3, 1], T[:3, 2] = np.cross(forward, [0, 0, 1.0]), [0, 0, -1.0], forward
-    T[:3, 3] = position
-    return T
+def wall_at(x: float, half_m: float = 1.0) -> np.ndarray:
+    y = np.linspace(-half_m, half_m, 400)
+    return np.stack([np.full(400, x), y, np.tile([0.9, 1.1], 200)], axis=1)
+
+
+def seen_from(eye: tuple[float, float, float], p_w: np.ndarray, sigma_m: float = 0.01) -> SightLines:
+    return SightLines(np.broadcast_to(np.array(eye), p_w.shape), p_w, np.full(len(p_w), sigma_m))
+
+
+def value_at(grid: OccupancyGrid, x: float, y: float) -> int:
+    column = int((x - grid.origin[0]) / grid.resolution_m)
+    row = int((y - grid.origin[1]) / grid.resolution_m)
+    return int(grid.cells[grid.cells.shape[0] - 1 - row, column])
 
 
 def test_occupancy_grid_has_walls_where_they_are(tmp_path: Path) -> None:
-    y = np.linspace(-1.0, 1.0, 400)
-    wall = np.stack([np.full(400, 2.02), y, np.tile([0.9, 1.1], 200)], axis=1)  # x = 2 m
-    floor = np.stack([np.linspace(0.3, 1.9, 400), y, np.zeros(400)], axis=1)  # below the heights
-    views = np.stack([look_along(0.0, (0.0, 0.0, 1.0))])
-    write_occupancy(tmp_path / "m", occupancy_grid(np.concatenate([wall, floor]), views, 0.05))
+    wall = wall_at(2.02)
+    floor = np.stack([np.linspace(0.3, 1.9, 400), wall[:, 1], np.zeros(400)], axis=1)  # below the heights
+    p_w = np.concatenate([wall, floor])
+    write_occupancy(tmp_path / "m", occupancy_grid(p_w, seen_from((0.0, 0.0, 1.0), wall), np.array([[0.0, 0.0, 1.0]])))
     record = yaml.safe_load((tmp_path / "m.yaml").read_text())
     image = cv2.imread(str(tmp_path / record["image"]), cv2.IMREAD_UNCHANGED)
     assert record["resolution"] == 0.05 and record["negate"] == 0
-
-    def cell(x: float, y: float) -> int:
-        column = int((x - record["origin"][0]) / record["resolution"])
-        row = int((y - record["origin"][1]) / record["resolution"])
-        return int(image[image.shape[0] - 1 - row, column])
-
-    assert cell(2.02, 0.0) == OCCUPIED and cell(2.02, 0.9) == OCCUPIED
-    assert cell(1.0, 0.0) == FREE and cell(1.5, 0.3) == FREE
-    assert cell(1.0, -0.9) == UNKNOWN, "outside the field of view"
+    grid = OccupancyGrid(image, record["resolution"], tuple(record["origin"][:2]), (0.5, 1.5))
+    assert value_at(grid, 2.02, 0.0) == OCCUPIED and value_at(grid, 2.02, 0.9) == OCCUPIED
+    assert value_at(grid, 1.0, 0.0) == FREE and value_at(grid, 1.5, 0.3) == FREE
+    assert value_at(grid, 1.0, -0.9) == UNKNOWN, "nothing was seen there"
     columns = np.flatnonzero((image == OCCUPIED).any(axis=0))
     assert len(columns) == 1, "the wall is one cell thick"
+
+
+def test_bare_wall_with_edges_behind_it_is_not_free() -> None:
+    """A wall without edges at 1 m hides edges at 3 m, which were seen from the other room alone: nobody looked
+    through the wall, so neither it nor the space behind it is free, seen from here."""
+    beside, behind = wall_at(1.0)[:20], wall_at(3.0)
+    eyes = np.array([[0.0, 0.0, 1.0], [2.0, 0.0, 1.0]])
+    here, there = seen_from((0.0, 0.0, 1.0), beside), seen_from((2.0, 0.0, 1.0), behind)
+    lines = SightLines(*(np.concatenate(pair) for pair in zip(astuple(here), astuple(there), strict=True)))
+    grid = occupancy_grid(np.concatenate([beside, behind]), lines, eyes)
+    assert value_at(grid, 1.0, 0.0) == UNKNOWN, "the bare wall"
+    assert value_at(grid, 0.5, 0.0) == UNKNOWN, "nothing says how far the bare wall is"
+    assert value_at(grid, 0.5, -0.47) == FREE, "before what was seen of the wall"
+    assert value_at(grid, 2.5, 0.0) == FREE and value_at(grid, 3.0, 0.0) == OCCUPIED
+
+
+@pytest.mark.parametrize(("sigma_m", "x", "expected"), [(0.05, 1.7, FREE), (0.25, 1.7, UNKNOWN), (0.25, 1.3, FREE)])
+def test_space_is_free_up_to_two_sigma_before_what_was_seen(sigma_m: float, x: float, expected: int) -> None:
+    wall = wall_at(2.0)
+    grid = occupancy_grid(wall, seen_from((0.0, 0.0, 1.0), wall, sigma_m), np.array([[0.0, 0.0, 1.0]]))
+    assert value_at(grid, x, 0.0) == expected
+
+
+def test_sight_above_the_heights_frees_nothing() -> None:
+    wall = wall_at(2.0)
+    lamps = wall + [0.0, 0.0, 2.0]  # seen at 45 degrees upwards: the ray leaves the heights half a metre ahead
+    grid = occupancy_grid(np.concatenate([wall, lamps]), seen_from((0.0, 0.0, 1.0), lamps), np.array([[0.0, 0.0, 1.0]]))
+    assert value_at(grid, 0.35, 0.0) == FREE
+    assert value_at(grid, 1.0, 0.0) == UNKNOWN
+
+
+def test_point_without_a_sigma_frees_nothing() -> None:
+    wall = wall_at(2.0)
+    lines = seen_from((0.0, 0.0, 1.0), wall, np.nan)
+    assert value_at(occupancy_grid(wall, lines, np.array([[0.0, 0.0, 1.0]])), 1.0, 0.0) == UNKNOWN
+
+
+def test_grid_without_sight_lines_is_free_where_the_camera_was() -> None:
+    none = np.zeros((0, 3))
+    lines = SightLines(none, none, np.zeros(0))
+    grid = occupancy_grid(wall_at(2.0), lines, np.array([[0.0, 0.0, 1.0]]))
+    assert value_at(grid, 0.0, 0.0) == FREE
+    assert np.count_nonzero(grid.cells == FREE) == 1
 
 
 def export(*words: object) -> int:
