@@ -1,0 +1,112 @@
+"""Rendered corridors, halls and rooms of many sizes, seen level and obliquely, as training views kept in a file."""
+
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.synthetic.house.render import Rendered, render
+from edgeslam_torch.synthetic.house.rooms import (
+    blank_corridor,
+    building,
+    corridor,
+    look,
+    random_room,
+    random_view,
+    room,
+)
+from edgeslam_torch.synthetic.house.world import World
+from edgeslam_torch.types import FloatArray
+
+Rng = np.random.Generator
+WIDTH, HEIGHT = 320, 240
+LEVEL_FOCAL_PX = (140.0, 380.0)
+"""Of the 320 pixel wide images: 98 to 46 degrees across."""
+OBLIQUE_FOCAL_PX = (130.0, 300.0)
+LEVEL_VIEWS, OBLIQUE_VIEWS = 10, 6
+"""Of each place."""
+NEAREST_M = 0.18
+"""Least fifth percentile of an oblique view's depth: nearer, a single texture fills it."""
+TRIES = 8
+
+
+def random_place(rng: Rng) -> World:
+    """A place of random kind and size: what a drone flies through that `random_room` does not have."""
+    kind = rng.random()
+    if kind < 0.3:
+        return random_room(rng)
+    if kind < 0.5:
+        return corridor(rng, length_m=_log(rng, 6, 24), width_m=_log(rng, 1.5, 4.0), height_m=_log(rng, 2.3, 3.6))
+    if kind < 0.68:
+        return blank_corridor(rng, length_m=_log(rng, 6, 24), width_m=_log(rng, 1.5, 4.0), height_m=_log(rng, 2.3, 3.6))
+    if kind < 0.8:  # as wide as a hall
+        return blank_corridor(rng, length_m=_log(rng, 8, 24), width_m=_log(rng, 4.0, 11.0), height_m=_log(rng, 2.6, 6))
+    if kind < 0.95:
+        return room(rng, size_m=(_log(rng, 6, 16), _log(rng, 5, 11), _log(rng, 2.4, 5)))
+    return building(rng, side_m=_log(rng, 3.2, 5.0), opening_m=rng.uniform(0.9, 1.8))
+
+
+def oblique_pose(rng: Rng, world: World) -> FloatArray | None:
+    """A pose ``T_w_c`` 0.3 to 1.3 m from a wall, 5 to 75 degrees from along it, tilted and rolled; None without a free
+    place."""
+    low, high = world.bounds_w
+    for _ in range(60):
+        p = rng.uniform(low + 0.3, high - 0.3)
+        p[2] = np.clip(rng.normal(1.3, 0.5), 0.25, high[2] - 0.25)
+        wall, distance = int(rng.integers(4)), _log(rng, 0.3, 1.3)
+        axis, at_low = wall // 2, wall % 2 == 0
+        if distance > 0.6 * (high - low)[axis]:
+            continue
+        p[axis] = low[axis] + distance if at_low else high[axis] - distance
+        if world.clearance(p) < min(0.2, 0.8 * distance):
+            continue
+        towards = np.zeros(2)
+        towards[axis] = -1.0 if at_low else 1.0
+        along = np.array([-towards[1], towards[0]]) * (1 if rng.random() < 0.5 else -1)
+        turned = np.deg2rad(rng.uniform(5.0, 75.0))
+        ahead = np.cos(turned) * along + np.sin(turned) * towards
+        down = float(np.clip(rng.normal(0.1, 0.4), -1.0, 1.2))
+        return look(p, float(np.arctan2(ahead[1], ahead[0])), down, float(rng.normal(0.0, 0.45)))
+    return None
+
+
+def oblique_view(rng: Rng, camera: Camera, world: World) -> Rendered | None:
+    """A view from `oblique_pose` that is not filled by what is next to the lens; None without one."""
+    for _ in range(TRIES):
+        T_w_c = oblique_pose(rng, world)
+        if T_w_c is None:
+            return None
+        if np.percentile(render(world, camera.scaled(40, 30), T_w_c, antialias=False).depth_m, 5) > NEAREST_M:
+            return render(world, camera, T_w_c)
+    return None
+
+
+def render_places(path: Path, places: int, seed: int = 21) -> None:
+    """Draw all views of ``places`` places and write them to ``path`` (npz), as `views.rendered.load_rendered` reads
+    them; place p depends on (seed, p) alone."""
+    images, depths, matrices = [], [], []
+    for p in tqdm(range(places), desc="rendering places", disable=None):
+        rng = np.random.default_rng((seed, p))
+        world = random_place(rng)
+        for k in range(LEVEL_VIEWS + OBLIQUE_VIEWS):
+            is_level = k < LEVEL_VIEWS
+            camera = _camera(_log(rng, *(LEVEL_FOCAL_PX if is_level else OBLIQUE_FOCAL_PX)))
+            rendered = random_view(rng, camera, world) if is_level else oblique_view(rng, camera, world)
+            if rendered is None:
+                continue
+            images.append(rendered.image)
+            depths.append(rendered.depth_m.astype(np.float16))
+            matrices.append(camera.K)
+    temporary = path.with_suffix(".part.npz")
+    np.savez(temporary, image=np.array(images), depth=np.array(depths), K=np.array(matrices))
+    temporary.replace(path)
+
+
+def _camera(focal_px: float) -> Camera:
+    return Camera(WIDTH, HEIGHT, focal_px, focal_px, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
+
+
+def _log(rng: Rng, low: float, high: float) -> float:
+    """Uniform in the logarithm."""
+    return float(np.exp(rng.uniform(np.log(low), np.log(high))))
