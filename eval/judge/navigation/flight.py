@@ -13,6 +13,7 @@ from edgeslam_torch.drone.emulator.lockstep import Event, LockstepTello
 from edgeslam_torch.drone.emulator.room import drone_at
 from edgeslam_torch.eval.judge.navigation.conditions import FAULTS
 from edgeslam_torch.eval.judge.navigation.eyes import DEPTH_SIZE, TrueEyes, nothing_painted
+from edgeslam_torch.eval.judge.navigation.near import WatchedEyes
 from edgeslam_torch.eval.judge.navigation.oracle import shortest_m
 from edgeslam_torch.eval.judge.navigation.slam_eyes import IMAGE_SIZE, SlamEyes
 from edgeslam_torch.geometry.mount import TELLO_TILT_RAD
@@ -80,6 +81,8 @@ class Flown:
     cpu_ms: float = 0.0
     """Planning and space, a tick."""
     cpu_worst_ms: float = 0.0
+    near: list[int] = field(default_factory=lambda: [0, 0, 0])
+    """Sectors with something at .3 to 1 m; of them told .3 m too far; even at two sigmas (`near_counts`)."""
     dangers: tuple[str, ...] = ()
     """What the supervisor met."""
     track_w: list[list[float]] = field(default_factory=list)
@@ -107,12 +110,14 @@ def fly(case: Case, limits: NavLimits | None = None) -> Flown:
     size = IMAGE_SIZE if case.eyes == "slam" else DEPTH_SIZE
     drone, paint, camera = drone_at(site, TELLO_TILT_RAD, size, conditions.battery, air)
     tello = LockstepTello(drone, paint if case.eyes == "slam" else nothing_painted, conditions.radio, case.seed)
-    eyes: Eyes = SlamEyes(camera, conditions, case.seed) if case.eyes == "slam" else TrueEyes(site, drone, conditions)
+    seeing: Eyes = SlamEyes(camera, conditions, case.seed) if case.eyes == "slam" else TrueEyes(site, drone, conditions)
+    eyes = WatchedEyes(seeing, site)
     pilot = Pilot(GoTo(site.goal_w / conditions.scale), limits)
     supervisor = Supervisor(limits)
     found = Flown(case, oracle_s=_take_off_s(limits) + shortest_m(site, limits) / limits.speed_m_s)
     ticks = _fly(tello, eyes, pilot, supervisor, conditions.hung_s, found)
     _sum_up(found, site, drone, ticks)
+    found.near = [eyes.counts.sectors, eyes.counts.too_far, eyes.counts.surely_too_far]
     return found
 
 

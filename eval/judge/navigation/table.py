@@ -13,6 +13,10 @@ HEAD = (
     "| clearance p5, min [m] "
     "| time over oracle | cruise [m/s] | CPU a tick, worst [ms] |\n|---|---|---|---|---|---|---|---|---|---|---|\n"
 )
+NEAR_HEAD = (
+    "\n| eyes | sectors of 3.7 degrees with something at .3 to 1 m | told more than .3 m too far | less two sigmas |\n"
+    "|---|---|---|---|\n"
+)
 
 
 def wilson(successes: int, trials: int) -> tuple[float, float]:
@@ -42,7 +46,17 @@ def markdown(flights: Sequence[Flown]) -> str:
         if len({(f.case.world, f.case.fault) for f in group}) > 1:
             eyes = ", ".join(sorted({f.case.eyes for f in group}))
             rows.append(_row(name, "none" if group is plain else "any", eyes, group))
-    return HEAD + "".join(rows)
+    return HEAD + "".join(rows) + _near(flights)
+
+
+def _near(flights: Sequence[Flown]) -> str:
+    """A second table, of what is near and told to be far; nothing where nothing was near."""
+    rows = []
+    for eyes in sorted({f.case.eyes for f in flights}):
+        sectors, too_far, surely = np.sum([f.near for f in flights if f.case.eyes == eyes], axis=0).tolist()
+        if sectors:
+            rows.append(f"| {eyes} | {sectors} | {100 * too_far / sectors:.1f} % | {100 * surely / sectors:.1f} % |\n")
+    return NEAR_HEAD + "".join(rows) if rows else ""
 
 
 def _row(world: str, fault: str, eyes: str, group: Sequence[Flown]) -> str:

@@ -7,11 +7,14 @@ import pytest
 
 from edgeslam_torch.eval.judge.navigation.film import film_strip, moments
 from edgeslam_torch.eval.judge.navigation.flight import Case, Flown, contact_events, fly
+from edgeslam_torch.eval.judge.navigation.near import near_counts
 from edgeslam_torch.eval.judge.navigation.oracle import shortest_m, true_layer
 from edgeslam_torch.eval.judge.navigation.pictures import top_view
 from edgeslam_torch.eval.judge.navigation.runner import judge_flights
 from edgeslam_torch.eval.judge.navigation.table import markdown
+from edgeslam_torch.geometry.camera import PRESETS
 from edgeslam_torch.navigation.limits import NavLimits
+from edgeslam_torch.navigation.sight import View
 from edgeslam_torch.synthetic.sites.build import named_site
 
 
@@ -80,6 +83,31 @@ def test_a_film_shows_the_wall_coming_nearer():
 def test_a_flight_that_never_flew_has_no_film():
     assert film_strip(flown(False)) is None
     assert film_strip(flown(False, track_w=[[0.0, 0.0, 1.0]])) is None, "a record from before film strips"
+
+
+def view_of(depth_m, sigma=0.01):
+    K = PRESETS["tello"].scaled(120, 90).K
+    return View(0.0, np.asarray(depth_m, np.float32), np.full((90, 120), sigma, np.float32), K, np.eye(4))
+
+
+def test_sectors_in_which_a_near_thing_is_told_to_be_far_are_counted():
+    """A post of 3 columns at 0.7 m, before a wall at 3 m: seen, missed, or missed within its sigma."""
+    true = np.full((90, 120), 3.0, np.float32)
+    true[:, 50:53] = 0.7
+    seen, missed = near_counts(view_of(true), true), near_counts(view_of(np.full_like(true, 3.0)), true)
+    assert seen.sectors == missed.sectors in (1, 2)
+    assert seen.too_far == seen.surely_too_far == 0
+    assert missed.too_far == missed.surely_too_far == missed.sectors
+    unsure = near_counts(view_of(np.full_like(true, 1.1), 0.2), true)
+    assert unsure.too_far == unsure.sectors and unsure.surely_too_far == 0
+    assert near_counts(view_of(np.full_like(true, np.nan)), true).too_far == 0
+    assert near_counts(view_of(true), np.full_like(true, 3.0)).sectors == 0
+
+
+def test_the_near_table_is_of_all_flights():
+    text = markdown([flown(True, near=[100, 10, 1]), flown(True, near=[100, 20, 3])])
+    assert "| truth | 200 | 15.0 % | 2.0 % |" in text
+    assert "sectors" not in markdown([flown(True)])
 
 
 def test_touches_in_a_row_are_one_contact():

@@ -1,0 +1,89 @@
+"""Whether what is near is known to be near: the nearest obstacle of each narrow sector of a view, against the truth."""
+
+import math
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from edgeslam_torch.drone.emulator.lockstep import Event, Picture
+from edgeslam_torch.geometry.camera import PRESETS
+from edgeslam_torch.geometry.mount import camera_on_body
+from edgeslam_torch.navigation.sight import Sight, View
+from edgeslam_torch.synthetic.house.render import render
+from edgeslam_torch.synthetic.sites.site import Site
+from edgeslam_torch.types import FloatArray
+
+SECTOR_RAD = math.radians(3.7)
+NEAR_M = (0.3, 1.0)
+TOO_FAR_M = 0.3
+_SIGMAS = 2.0
+"""As free space is carved."""
+
+
+@dataclass(frozen=True, slots=True)
+class NearCounts:
+    """Sectors whose nearest surface is really at `NEAR_M`."""
+
+    sectors: int = 0
+    too_far: int = 0
+    """Of them, those in which the view's nearest depth is more than `TOO_FAR_M` beyond it."""
+    surely_too_far: int = 0
+    """The same of depth less two sigmas: what free space believes."""
+
+    def __add__(self, other: "NearCounts") -> "NearCounts":
+        return NearCounts(
+            self.sectors + other.sectors,
+            self.too_far + other.too_far,
+            self.surely_too_far + other.surely_too_far,
+        )
+
+
+def near_counts(view: View, true_m: FloatArray) -> NearCounts:
+    """Compare a view with the true depth of its pixels.
+
+    Args:
+        view: Depth with its sigma; a sector without any depth is unknown, which is not free, so not too far.
+        true_m: ``(H, W)`` z-depth [m].
+    """
+    known = np.isfinite(view.depth_m) & (view.depth_m > 0)
+    told = np.where(known, view.depth_m, np.inf)
+    sure = np.where(known, told * np.exp(-_SIGMAS * view.sigma_log), np.inf)
+    true = np.where(np.isfinite(true_m) & (true_m > 0), true_m, np.inf)
+    angle = np.arctan((np.arange(true.shape[1]) - view.K[0, 2]) / view.K[0, 0])
+    sector = np.floor((angle - angle[0]) / SECTOR_RAD).astype(int)
+    counts = NearCounts()
+    for k in range(int(sector[-1]) + 1):
+        nearest, as_told, at_least = (float(d[:, sector == k].min()) for d in (true, told, sure))
+        if NEAR_M[0] <= nearest <= NEAR_M[1]:
+            far = [math.isfinite(d) and d - nearest > TOO_FAR_M for d in (as_told, at_least)]
+            counts += NearCounts(1, int(far[0]), int(far[1]))
+    return counts
+
+
+class _Eyes(Protocol):
+    def sight(self, now_s: float, events: list[Event]) -> Sight: ...
+
+
+class WatchedEyes:
+    """Passes sights on and counts, in each metric view, what is near and told to be far."""
+
+    def __init__(self, eyes: _Eyes, site: Site) -> None:
+        self.counts = NearCounts()
+        self._eyes, self._site = eyes, site
+        self._T_b_c = camera_on_body()
+
+    def sight(self, now_s: float, events: list[Event]) -> Sight:
+        """The sight of the eyes behind."""
+        sight = self._eyes.sight(now_s, events)
+        if sight.view is not None and sight.metric:
+            for event in events:
+                if isinstance(event, Picture) and event.captured_s == sight.view.stamp_s:
+                    self.counts += near_counts(sight.view, self._true(event, sight.view))
+        return sight
+
+    def _true(self, picture: Picture, view: View) -> FloatArray:
+        height, width = view.depth_m.shape
+        T_site_c = self._site.T_site_w @ picture.T_w_b @ self._T_b_c
+        camera = PRESETS["tello"].scaled(width, height)
+        return render(self._site.painted(picture.captured_s), camera, T_site_c, antialias=False).depth_m
