@@ -73,6 +73,8 @@ class Supervisor:
     _since_s: float = math.nan
     """Since when it is in trouble."""
     _pushing_s: float = math.nan
+    _told: bool = True
+    """Whether the drone was told the pilot's wish at the last order, or would have been but for being held."""
     _trail: deque[FloatArray] = field(default_factory=lambda: deque(maxlen=400))
     """Where it flew, 5 cm apart."""
     _home_w: FloatArray | None = None
@@ -95,6 +97,7 @@ class Supervisor:
         if self._sight is None:
             return Order(Wish(why="no sight yet"), danger=Danger.NO_WISH)
         danger = self._danger(self._sight, now_s)
+        self._told = danger in (Danger.NONE, Danger.HELD) and not self.held
         home = self._sight.battery <= self.limits.home_battery
         if danger is Danger.BATTERY or self.landing:
             self.landing = True
@@ -129,9 +132,9 @@ class Supervisor:
         return next((danger for holds, danger in checks if holds), Danger.NONE)
 
     def _is_held(self, sight: Sight, now_s: float) -> bool:
-        """Whether it was told to move for a while and did not."""
+        """Whether it was told to move for a while and did not; a wish that was not passed on moves nothing."""
         wish = self._wish
-        pushed = wish is not None and math.hypot(wish.forward_m_s, wish.left_m_s) > _PUSHED_M_S
+        pushed = self._told and wish is not None and math.hypot(wish.forward_m_s, wish.left_m_s) > _PUSHED_M_S
         moves = float(np.linalg.norm(sight.velocity_w[:2])) > _STANDS_M_S
         if not pushed or moves:
             self._pushing_s = math.nan

@@ -99,6 +99,17 @@ def test_commanded_and_not_moving_is_a_contact_and_lands_in_the_end():
     assert held[-1].land
 
 
+def test_a_drone_that_is_told_to_wait_is_not_held():
+    """Metres are not sure: it goes up and down whatever the pilot wishes, and that is no contact."""
+    supervisor = Supervisor()
+    flown(supervisor, 1.0)
+    still = {"velocity_w": np.zeros(3), "p_w": np.array([0.5, 0, 1.1])}
+    waiting = flown(supervisor, 5.0, lambda s: replace(s, scale_sigma=0.2, **still), begin_s=1.0)
+    assert {o.danger for o in waiting} == {Danger.SCALE}
+    goes_on = flown(supervisor, 1.0, lambda s: replace(s, **still), begin_s=6.0)
+    assert goes_on[-1].danger is Danger.NONE  # the time in which it waited does not count
+
+
 def test_battery_calls_home_and_then_lands():
     low = flown(Supervisor(), 1.0, lambda s: replace(s, battery=0.2))
     assert all(o.home and not o.land and o.wish == AHEAD for o in low)
