@@ -22,6 +22,8 @@ _VIDEO_DELAY_S = 0.35
 """From light to the arrival of a Tello's picture, which carries no time: 0.3 to 0.5 s."""
 _FIRST_PICTURE_S = 10.0
 _POLL_S = 0.02
+_LAND_S = 60.0
+"""Longest wait for a landing: as often as the client repeats it, and the way down."""
 _THINK_S = 0.5
 """Time that a thread is given to end."""
 
@@ -113,7 +115,7 @@ class UdpCraft:
         """As `Craft`: asks the thread that watches, which does nothing else any more."""
         if self.flying:
             self._land_because = self._land_because or why
-            self._landed.wait()
+            self._landed.wait(_LAND_S)
 
     def close(self) -> None:
         """As `Craft`."""

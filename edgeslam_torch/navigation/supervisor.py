@@ -22,6 +22,8 @@ BACK_S = 1.5
 """Time of trouble after which it backs up along the way it came, which was free."""
 LAND_S = 10.0
 """Time of trouble after which it lands."""
+UNSURE_LAND_S = 20.0
+"""The same when only metres are doubtful: five times up and down where it has been, which is what tells them."""
 _BACK_M, _BACK_M_S = 0.6, 0.15
 SCALE_SIGMA = 0.10
 _WIGGLE_S, _WIGGLE_M_S = 2.0, 0.15
@@ -112,7 +114,8 @@ class Supervisor:
         if math.isnan(self._since_s):
             self._since_s = now_s
         trouble_s = now_s - self._since_s
-        if trouble_s > LAND_S or (danger is Danger.HELD and trouble_s > BACK_S + _BACK_M / _BACK_M_S):
+        patience_s = UNSURE_LAND_S if danger in (Danger.SCALE, Danger.NOT_METRIC) else LAND_S
+        if trouble_s > patience_s or (danger is Danger.HELD and trouble_s > BACK_S + _BACK_M / _BACK_M_S):
             self.landing = True
             return Order(Wish(why=str(danger)), land=True, danger=danger)
         return Order(self._meanwhile(danger, trouble_s), home=home, danger=danger)

@@ -8,7 +8,7 @@ import pytest
 
 from edgeslam_torch.navigation.limits import NavLimits
 from edgeslam_torch.navigation.sight import Sight, Wish
-from edgeslam_torch.navigation.supervisor import LAND_S, Danger, Supervisor
+from edgeslam_torch.navigation.supervisor import LAND_S, UNSURE_LAND_S, Danger, Supervisor
 
 AHEAD = Wish(forward_m_s=0.5, why="ahead")
 
@@ -140,3 +140,10 @@ def test_heights_are_kept():
     sinking = flown(Supervisor(limits), 0.5, lambda s: replace(s, p_w=np.array([0, 0, 0.4])), wish=Wish(up_m_s=-0.3))
     assert sinking[-1].wish.up_m_s == 0.0
     assert math.isclose(flown(Supervisor(limits), 0.5, wish=Wish(up_m_s=0.3))[-1].wish.up_m_s, 0.3)
+
+
+def test_doubtful_metres_have_longer_to_mend_and_still_end_in_a_landing():
+    orders = flown(Supervisor(), UNSURE_LAND_S + 1.0, lambda s: replace(s, metric=False, p_w=np.array([0.0, 0.0, 1.1])))
+    assert not any(o.land for o in orders[: round(20 * UNSURE_LAND_S) - 1]) and orders[-1].land
+    up = [o.wish.up_m_s for o in orders[:-30]]
+    assert min(up) < 0 < max(up) and abs(sum(up)) < 41 * max(up), "up and down about where it was"

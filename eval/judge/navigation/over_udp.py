@@ -8,6 +8,7 @@ import math
 from dataclasses import dataclass
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
+from pathlib import Path
 
 import numpy as np
 
@@ -56,7 +57,7 @@ def emulate(world: str, seed: int, ports: tuple[int, int], pipe: Connection) -> 
         pipe.send(Landed(away, len(drone.contacts), nearest[0] - 0.1, not drone.flying))
 
 
-def fly_one(world: str, seed: int) -> str:
+def fly_one(world: str, seed: int, record: Path | None = None) -> str:
     """One flight to the site's goal, as a line of a table."""
     with open_udp(("127.0.0.1", 0), "free") as a, open_udp(("127.0.0.1", 0), "free") as b:
         ports = (int(a.getsockname()[1]), int(b.getsockname()[1]))
@@ -66,7 +67,7 @@ def fly_one(world: str, seed: int) -> str:
     try:
         goal = named_site(world, seed).goal_w
         address = f"tello://127.0.0.1:{here.recv()}:{ports[0]}:{ports[1]}"
-        said, reason = _fly(address, goal)
+        said, reason = _fly(address, goal, record)
         here.send("landed")
         found: Landed = here.recv()
     finally:
@@ -79,10 +80,10 @@ def fly_one(world: str, seed: int) -> str:
     )
 
 
-def _fly(address: str, goal_w: np.ndarray) -> tuple[bool, str]:
+def _fly(address: str, goal_w: np.ndarray, record: Path | None) -> tuple[bool, str]:
     """Whether it says that it is there, and in words."""
     try:
-        with Navigator.open(address, allow_motion=True, camera="tello") as nav:
+        with Navigator.open(address, allow_motion=True, camera="tello", record=record) as nav:
             outcome = nav.take_off()
             if outcome.reached:
                 outcome = nav.go_to((*goal_w[:2], nav.limits.height_m))
@@ -99,12 +100,14 @@ def main() -> None:
     parser.add_argument("--world", action="append", metavar="NAME", help="default: cluttered_room")
     parser.add_argument("--flights", type=int, default=10, help="for each world (default: 10)")
     parser.add_argument("--first-seed", type=int, default=200, help="default: 200")
+    parser.add_argument("--record", type=Path, metavar="DIR", help="record the flights into folders in it")
     args = parser.parse_args()
     print("| world, seed | reached | ended | from the goal [m] | contacts | clearance min [m] | on the floor |")
     print("|---|---|---|---|---|---|---|")
     for world in args.world or ["cluttered_room"]:
         for seed in range(args.first_seed, args.first_seed + args.flights):
-            print(fly_one(world, seed), flush=True)
+            record = None if args.record is None else args.record / f"{world}_{seed}"
+            print(fly_one(world, seed, record), flush=True)
 
 
 if __name__ == "__main__":
