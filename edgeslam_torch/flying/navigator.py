@@ -113,7 +113,7 @@ class Navigator:
         check_fit(self.allow_motion, self.craft.battery, self.limits, self.craft.camera.source.startswith(GUESS))
         self.cockpit.begin(Stay())
         self.craft.take_off()
-        return self._fly(Stay(), "in the air")
+        return self.fly(Stay(), "in the air")
 
     def go_to(self, goal_w: Sequence[float] | FloatArray) -> Outcome:
         """Fly to a point ``(3,)`` around what is in the way; at the height of flight, which the point must be near.
@@ -122,7 +122,7 @@ class Navigator:
             FlightRefused: If the point is none, beyond the fence, inside something solid or at another height; or there
                 are no metres yet.
         """
-        return self._fly(GoTo(self._goal(goal_w)), "there")
+        return self.fly(GoTo(self._goal(goal_w)), "there")
 
     def explore(self, seconds: float) -> Outcome:
         """Fly to where the known space ends, again and again; reached when time is over or nothing is left to see.
@@ -133,7 +133,7 @@ class Navigator:
         if not 0 < seconds < 3600:
             raise FlightRefused(f"exploring takes more than 0 s and less than an hour, not {seconds} s")
         sight = self._flying_sight()
-        return self._fly(Explore(sight.stamp_s + seconds), "the time is over")
+        return self.fly(Explore(sight.stamp_s + seconds), "the time is over")
 
     def return_home(self) -> Outcome:
         """Fly to the take-off, back along the way where it is far.
@@ -142,7 +142,28 @@ class Navigator:
             FlightRefused: If it does not fly.
         """
         self._flying_sight()
-        return self._fly(WayHome(self.cockpit.track()), "home", to_home=True)
+        return self.fly(WayHome(self.cockpit.track()), "home", to_home=True)
+
+    def fly(self, task: Task, done: str, to_home: bool = False) -> Outcome:
+        """Fly any task of `navigation.tasks` to its end; home and down when the battery is low.
+
+        Args:
+            task: Where to go, and when it is done.
+            done: What the outcome says when it is.
+            to_home: Whether the task itself leads home.
+        """
+        self.cockpit.begin(task)
+        self.craft.fly(lambda: self.cockpit.ended() is not None or (not to_home and self._wants_home()))
+        path_m, clearance_m = self.cockpit.flown()
+        if not self.craft.flying:
+            return Outcome(False, self.craft.over, clearance_m, path_m)
+        if self.cockpit.ended() is None:
+            self.return_home()
+            if self.craft.flying:
+                self.craft.land(HOME_BECAUSE)
+            return Outcome(False, HOME_BECAUSE, clearance_m, path_m)
+        reached = self.cockpit.ended() is Phase.DONE
+        return Outcome(reached, done if reached else str(Phase.STUCK), clearance_m, path_m)
 
     def land(self) -> Outcome:
         """Land; reached when the drone says that it stands.
@@ -176,21 +197,6 @@ class Navigator:
                 "the map has no metres yet, so a place in metres means nothing; take_off() waits for them"
             )
         return sight
-
-    def _fly(self, task: Task, done: str, to_home: bool = False) -> Outcome:
-        """Fly a task to its end, home when the battery is low."""
-        self.cockpit.begin(task)
-        self.craft.fly(lambda: self.cockpit.ended() is not None or (not to_home and self._wants_home()))
-        path_m, clearance_m = self.cockpit.flown()
-        if not self.craft.flying:
-            return Outcome(False, self.craft.over, clearance_m, path_m)
-        if self.cockpit.ended() is None:
-            self.return_home()
-            if self.craft.flying:
-                self.craft.land(HOME_BECAUSE)
-            return Outcome(False, HOME_BECAUSE, clearance_m, path_m)
-        reached = self.cockpit.ended() is Phase.DONE
-        return Outcome(reached, done if reached else str(Phase.STUCK), clearance_m, path_m)
 
     def _wants_home(self) -> bool:
         return self.cockpit.last is not None and self.cockpit.last.home
