@@ -23,7 +23,7 @@ BACK_S = 1.5
 LAND_S = 10.0
 """Time of trouble after which it lands."""
 UNSURE_LAND_S = 20.0
-"""The same when only metres are doubtful: five times up and down where it has been, which is what tells them."""
+"""The same when metres are doubtful: five times up and down where it has been, which is what tells them."""
 _BACK_M, _BACK_M_S = 0.6, 0.15
 SCALE_SIGMA = 0.10
 _WIGGLE_S, _WIGGLE_M_S = 2.0, 0.15
@@ -47,6 +47,9 @@ class Danger(StrEnum):
     HAND = "held by hand"
     BATTERY_HOME = "battery low: home"
     BATTERY = "battery empty: land"
+
+
+_UNSURE = (Danger.SCALE, Danger.NOT_METRIC)
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +77,8 @@ class Supervisor:
     _wished_s: float = -math.inf
     _since_s: float = math.nan
     """Since when it is in trouble."""
+    _grave_s: float = math.nan
+    """Since when in other trouble than doubtful metres."""
     _pushing_s: float = math.nan
     _told: bool = True
     """Whether the drone was told the pilot's wish at the last order, or would have been but for being held."""
@@ -111,14 +116,24 @@ class Supervisor:
             self._since_s = math.nan
             assert self._wish is not None
             return Order(self._within_heights(self._wish), home=home, danger=Danger.BATTERY_HOME if home else danger)
-        if math.isnan(self._since_s):
-            self._since_s = now_s
-        trouble_s = now_s - self._since_s
-        patience_s = UNSURE_LAND_S if danger in (Danger.SCALE, Danger.NOT_METRIC) else LAND_S
-        if trouble_s > patience_s or (danger is Danger.HELD and trouble_s > BACK_S + _BACK_M / _BACK_M_S):
+        trouble_s = self._trouble_s(danger, now_s)
+        patience_s = UNSURE_LAND_S if danger in _UNSURE else LAND_S
+        in_vain = trouble_s > patience_s or now_s - self._since_s > UNSURE_LAND_S
+        if in_vain or (danger is Danger.HELD and trouble_s > BACK_S + _BACK_M / _BACK_M_S):
             self.landing = True
             return Order(Wish(why=str(danger)), land=True, danger=danger)
         return Order(self._meanwhile(danger, trouble_s), home=home, danger=danger)
+
+    def _trouble_s(self, danger: Danger, now_s: float) -> float:
+        """How long it has been in trouble of this gravity: waiting for metres uses up no patience with the rest."""
+        if math.isnan(self._since_s):
+            self._since_s, self._grave_s = now_s, math.nan
+        if danger in _UNSURE:
+            self._grave_s = math.nan
+            return now_s - self._since_s
+        if math.isnan(self._grave_s):
+            self._grave_s = now_s
+        return now_s - self._grave_s
 
     def _danger(self, sight: Sight, now_s: float) -> Danger:
         late = sight.blind_s + max(0.0, now_s - sight.stamp_s)
@@ -167,7 +182,7 @@ class Supervisor:
 
     def _meanwhile(self, danger: Danger, trouble_s: float) -> Wish:
         """Hover; then what may mend it."""
-        if danger in (Danger.SCALE, Danger.NOT_METRIC):
+        if danger in _UNSURE:
             rising = int(trouble_s / _WIGGLE_S) % 2 == 0
             wish = Wish(up_m_s=_WIGGLE_M_S if rising else -_WIGGLE_M_S, why=f"{danger}: up and down")
             return self._within_heights(wish)

@@ -147,3 +147,20 @@ def test_doubtful_metres_have_longer_to_mend_and_still_end_in_a_landing():
     assert not any(o.land for o in orders[: round(20 * UNSURE_LAND_S) - 1]) and orders[-1].land
     up = [o.wish.up_m_s for o in orders[:-30]]
     assert min(up) < 0 < max(up) and abs(sum(up)) < 41 * max(up), "up and down about where it was"
+
+
+def test_an_old_picture_after_a_wait_for_metres_does_not_land_at_once():
+    supervisor = Supervisor()
+    flown(supervisor, 12.0, lambda s: replace(s, scale_sigma=0.3))
+    late = flown(supervisor, 1.0, lambda s: replace(s, seen_s=s.stamp_s - 1.0), begin_s=12.0)
+    assert {o.danger for o in late} == {Danger.BLIND} and not any(o.land for o in late)
+
+
+def test_troubles_that_take_turns_end_in_a_landing_too():
+    supervisor = Supervisor()
+
+    def turns(s):
+        return replace(s, scale_sigma=0.3) if int(s.stamp_s) % 2 else replace(s, seen_s=s.stamp_s - 1.0)
+
+    orders = flown(supervisor, UNSURE_LAND_S + 1.0, turns)
+    assert not orders[round(20 * (LAND_S + 2.0))].land and orders[-1].land
