@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from edgeslam_torch.flying.errands import Stay
+from edgeslam_torch.navigation.flight_record import Decision, NewTask
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.limits import NavLimits
 from edgeslam_torch.navigation.pilot import BAND_M, Phase, Pilot
@@ -34,6 +35,8 @@ class Moment:
     """For its layer and its way; another thread may be changing it."""
 
 
+Witness = Callable[[NewTask | Sight | Decision], None]
+"""Told what the planner is given, before it thinks, and what it decided, from the thread that plans."""
 Listener = Callable[[Moment], None]
 """Called for every moment from the thread that flies: it must return at once."""
 
@@ -45,7 +48,9 @@ class Cockpit:
     only a wish and a lock that is held for microseconds.
     """
 
-    def __init__(self, limits: NavLimits, listeners: Sequence[Listener] = ()) -> None:
+    def __init__(
+        self, limits: NavLimits, listeners: Sequence[Listener] = (), witness: Witness = lambda entry: None
+    ) -> None:
         self.limits = limits
         self.pilot = Pilot(Stay(), limits)
         self.sight: Sight | None = None
@@ -53,6 +58,7 @@ class Cockpit:
         self.last: Order | None = None
         self._supervisor = Supervisor(limits)
         self._listeners = list(listeners)
+        self._witness = witness
         self._lock = threading.Lock()
         self._next: Task | None = None
         self._held = False
@@ -76,16 +82,22 @@ class Cockpit:
         """Hover whatever the pilot wants, until it is called off: for a person at the keyboard."""
         self._held = held
 
-    def plan(self, sight: Sight) -> None:
+    def plan(self, sight: Sight) -> Decision:
         """Let the pilot decide; may take its time, or hang."""
         with self._lock:
-            if self._next is not None:
-                self._take_up(self._next)
-                self._next = None
+            task, self._next = self._next, None
+            if task is not None:
+                self._take_up(task)
+        if task is not None:
+            self._witness(NewTask(task))
+        self._witness(sight)
         wish = self.pilot.update(sight)
         with self._lock:
             self._supervisor.propose(wish, sight.stamp_s)
+        decision = Decision(wish, str(self.pilot.phase))
+        self._witness(decision)
         self._note_clearance(sight)
+        return decision
 
     def _take_up(self, task: Task) -> None:
         """A first look that is under way is finished."""

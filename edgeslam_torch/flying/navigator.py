@@ -69,8 +69,12 @@ class Navigator:
             CalibrationError: If the calibration is malformed.
             OutputError: If the folder holds a recording already or cannot be written.
         """
-        recorder = None if record is None else Recorder(Path(record))
-        cockpit = Cockpit(limits or NavLimits(), [*listeners, *([] if recorder is None else [recorder.moment])])
+        limits = limits or NavLimits()
+        recorder = None if record is None else Recorder(Path(record), limits)
+        if recorder is None:
+            cockpit = Cockpit(limits, listeners)
+        else:
+            cockpit = Cockpit(limits, [*listeners, recorder.moment], recorder.planner)
         craft: Craft
         if is_simulated(location):
             from edgeslam_torch.flying.lockstep_craft import LockstepCraft

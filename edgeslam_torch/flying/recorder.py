@@ -10,6 +10,9 @@ from edgeslam_torch.errors import EdgeSlamError, OutputError
 from edgeslam_torch.files.appender import Appender
 from edgeslam_torch.flying.cockpit import Moment
 from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.navigation.flight_record import PLAN, Decision, NewTask, PlanLog
+from edgeslam_torch.navigation.limits import NavLimits
+from edgeslam_torch.navigation.sight import Sight
 from edgeslam_torch.types import Frame
 from edgeslam_torch.writers.flight_writer import FlightWriter
 
@@ -23,20 +26,23 @@ _COLUMNS = (
 
 
 class Recorder:
-    """A folder that ``edgeslam run`` reads, with `MOMENTS`: a line for each order, and why.
+    """A folder that ``edgeslam run`` reads, with `MOMENTS`, a line for each order and why, and ``plan.jsonl``, by which
+    ``edgeslam fly replay`` asks the planner again.
 
     A disk that is full ends the recording, not the flight.
 
     Args:
         folder: Where; made by `begin`.
+        limits: Of the flight.
     """
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    def __init__(self, folder: Path, limits: NavLimits) -> None:
+        self.folder, self._limits = folder, limits
         self.failure: OutputError | None = None
         """Why the recording ended early."""
         self._writer: FlightWriter | None = None
         self._moments: Appender | None = None
+        self._plan: PlanLog | None = None
         self._lock = threading.Lock()
 
     def begin(self, camera: Camera) -> None:
@@ -47,6 +53,7 @@ class Recorder:
         """
         self._writer = FlightWriter(self.folder, camera, with_telemetry=True)
         self._moments = Appender(self.folder / MOMENTS, _COLUMNS + "\n")
+        self._plan = PlanLog(self.folder / PLAN, self._limits)
 
     def picture(self, frame: Frame) -> None:
         """Write a picture."""
@@ -67,6 +74,13 @@ class Recorder:
             if moments is not None:
                 self._guarded(lambda _: moments.write(_line(moment)))
 
+    def planner(self, entry: NewTask | Sight | Decision) -> None:
+        """Write what the planner is given, or what it decided."""
+        with self._lock:
+            plan = self._plan
+            if plan is not None:
+                self._guarded(lambda _: plan.add(entry))
+
     def close(self) -> None:
         """Close the files."""
         with self._lock:
@@ -74,7 +88,9 @@ class Recorder:
                 self._writer.close()
             if self._moments is not None:
                 self._moments.close()
-            self._writer = self._moments = None
+            if self._plan is not None:
+                self._plan.close()
+            self._writer = self._moments = self._plan = None
 
     def _guarded(self, write: Callable[[FlightWriter], None]) -> None:
         if self.failure is not None or self._writer is None:

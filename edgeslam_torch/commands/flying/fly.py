@@ -25,6 +25,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     home = verbs.add_parser("home", help="take off, look around, return above the take-off, land: a first test")
     for verb in (goto, explore, home):
         _add_common(verb)
+    again = verbs.add_parser("replay", help="show the planner a recorded flight again: what would it have done?")
+    again.add_argument("folder", type=Path, metavar="DIR", help="of --record")
+    again.add_argument("--speed", type=float, metavar="M_S", help="another cruising speed than the flight's")
+    again.add_argument("--height", type=float, metavar="M", help="another height of flight than the flight's")
 
 
 def _add_common(parser: argparse.ArgumentParser) -> None:
@@ -46,6 +50,8 @@ def _add_common(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Check, show the plan, and fly it if told to."""
+    if args.verb == "replay":
+        return _replay(args)
     from edgeslam_torch.errors import ConfigError
     from edgeslam_torch.flying.keys import keys
     from edgeslam_torch.flying.navigator import Navigator
@@ -72,6 +78,20 @@ def main(args: argparse.Namespace) -> int:
             if listens:
                 print("space hovers and lets go again, l or q lands, Ctrl-C lands", flush=True)
             return _fly(args, nav)
+
+
+def _replay(args: argparse.Namespace) -> int:
+    from edgeslam_torch.errors import ConfigError
+    from edgeslam_torch.flying.replay import replay, told
+
+    given = {"speed_m_s": args.speed, "height_m": args.height}
+    try:
+        found = replay(args.folder, **{name: value for name, value in given.items() if value is not None})
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
+    for line in told(found):
+        print(line)
+    return 0
 
 
 def _limits(args: argparse.Namespace) -> "NavLimits":

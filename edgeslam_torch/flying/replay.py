@@ -1,0 +1,130 @@
+"""A recorded flight through the planner again: what would it have done, in this version or with other limits?
+
+The drone is where it was, and sees what it saw: what is compared is each decision, not the flight that would follow.
+"""
+
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from edgeslam_torch.errors import SourceError
+from edgeslam_torch.flying.cockpit import Cockpit
+from edgeslam_torch.navigation.flight_record import PLAN, Decision, NewTask, read_plan
+from edgeslam_torch.navigation.limits import NavLimits
+from edgeslam_torch.navigation.sight import Sight, Wish
+
+_SAME = 0.02
+"""Wishes that differ by less [m/s, rad/s] are the same to a Tello, whose sticks have steps of a hundredth."""
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One decision, then and now."""
+
+    sight: Sight
+    before: Decision | None
+    """None where the recorded planner never answered: it hung, failed, or the program ended."""
+    now: Decision
+    planning_s: float
+    """Time that the decision took now."""
+
+    @property
+    def same(self) -> bool:
+        """Whether the drone would do the same."""
+        if self.before is None or self.before.phase != self.now.phase:
+            return False
+        return bool(np.abs(_sticks(self.before.wish) - _sticks(self.now.wish)).max() <= _SAME)
+
+
+@dataclass(frozen=True, slots=True)
+class Replay:
+    """A flight's decisions, then and now."""
+
+    limits: NavLimits
+    """Of the replay."""
+    steps: tuple[Step, ...]
+    tasks: tuple[str, ...]
+    """Names, in order."""
+
+    @property
+    def differing(self) -> list[Step]:
+        """Decisions that are not the recorded ones."""
+        return [step for step in self.steps if not step.same]
+
+
+def replay(folder: Path, **limits: float) -> Replay:
+    """Show a new planner what the recorded one saw.
+
+    Args:
+        folder: Of `edgeslam fly --record`.
+        **limits: Fields of `NavLimits` that differ from the recorded flight's.
+
+    Raises:
+        SourceError: If the record is missing, damaged, or holds no sight.
+        ValueError: If limits contradict each other.
+    """
+    path = folder / PLAN
+    entries = read_plan(path)
+    recorded = next(entries, None)
+    if not isinstance(recorded, NavLimits):
+        raise SourceError(f"{path}: does not begin with the flight's limits")
+    used = replace(recorded, **limits)
+    cockpit, seen, steps, tasks = Cockpit(used), None, [], []
+    for entry in entries:
+        if isinstance(entry, Decision):
+            if seen is not None:
+                steps.append(_decided(cockpit, seen, entry))
+            seen = None
+            continue
+        if seen is not None:  # no answer was recorded
+            steps.append(_decided(cockpit, seen, None))
+            seen = None
+        if isinstance(entry, NewTask):
+            cockpit.begin(entry.task)
+            tasks.append(type(entry.task).__name__)
+        elif isinstance(entry, Sight):
+            seen = entry
+    if seen is not None:
+        steps.append(_decided(cockpit, seen, None))
+    if not steps:
+        raise SourceError(f"{path}: the planner of this flight never saw anything")
+    return Replay(used, tuple(steps), tuple(tasks))
+
+
+def told(found: Replay) -> list[str]:
+    """The replay in words, a line each."""
+    steps, differing = found.steps, found.differing
+    began = steps[0].sight.stamp_s
+    took_ms = 1e3 * np.array([step.planning_s for step in steps])
+    lines = [
+        f"{len(steps)} decisions in {steps[-1].sight.stamp_s - began:.1f} s, tasks: {', '.join(found.tasks) or 'none'}",
+        f"the same: {len(steps) - len(differing)} of {len(steps)}",
+    ]
+    for step in differing[:1]:
+        lines.append(f"first difference after {step.sight.stamp_s - began:.2f} s, at {_place(step.sight)}:")
+        lines.append(f"  then: {'no answer' if step.before is None else _words(step.before)}")
+        lines.append(f"  now:  {_words(step.now)}")
+    lines.append(f"planning now: median {np.median(took_ms):.1f} ms, 95 % within {np.quantile(took_ms, 0.95):.1f} ms")
+    return lines
+
+
+def _decided(cockpit: Cockpit, sight: Sight, before: Decision | None) -> Step:
+    began = time.perf_counter()
+    now = cockpit.plan(sight)
+    return Step(sight, before, now, time.perf_counter() - began)
+
+
+def _sticks(wish: Wish) -> np.ndarray:
+    return np.array([wish.forward_m_s, wish.left_m_s, wish.up_m_s, wish.turn_left_rad_s])
+
+
+def _place(sight: Sight) -> str:
+    return "({:.2f}, {:.2f}, {:.2f}) m".format(*sight.p_w)
+
+
+def _words(decision: Decision) -> str:
+    forward, left, up, turn = _sticks(decision.wish)
+    moves = f"forward {forward:.2f}, left {left:.2f}, up {up:.2f} m/s, turn left {np.degrees(turn):.0f} deg/s"
+    return f"{decision.phase}; {moves}; {decision.wish.why}"

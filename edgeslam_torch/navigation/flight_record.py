@@ -1,0 +1,159 @@
+"""What a planner saw and decided, on disk: a line of JSON for each limit, task, sight and wish, whole or not at all.
+
+A sight is written before the planner thinks about it: one that hangs or fails leaves in the file what it hung on. A
+file that ends in the middle of a line, after a crash or a flat battery, is good up to that line. Numbers are exact, so
+that a replay decides the same.
+"""
+
+import base64
+import importlib
+import json
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from edgeslam_torch.errors import EdgeSlamError, OutputError, SourceError
+from edgeslam_torch.files.appender import Appender
+from edgeslam_torch.navigation.limits import NavLimits
+from edgeslam_torch.navigation.sight import Sight, Wish
+from edgeslam_torch.navigation.tasks import Task
+
+PLAN = "plan.jsonl"
+_HEAD = {"format": "edgeslam planner", "version": 1}
+_OURS = ("edgeslam_torch.navigation.", "edgeslam_torch.flying.")
+"""Where records of a flight are defined: no other name in a file is looked up."""
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """What the planner wished after a sight, and what it was doing."""
+
+    wish: Wish
+    phase: str
+
+
+@dataclass(frozen=True, slots=True)
+class NewTask:
+    """From here on, the planner flies this."""
+
+    task: Task
+
+
+Entry = NavLimits | NewTask | Sight | Decision
+
+
+class PlanLog:
+    """Writes the file; every call appends one whole line.
+
+    Args:
+        path: The file, which replaces an older one.
+        limits: Of the flight.
+
+    Raises:
+        OSError: If it cannot be written.
+    """
+
+    def __init__(self, path: Path, limits: NavLimits) -> None:
+        self._file = Appender(path, json.dumps(_HEAD) + "\n")
+        self.add(limits)
+
+    def add(self, entry: Entry) -> None:
+        """Append an entry.
+
+        Raises:
+            OSError: If the disk is full; the file is good up to here.
+            OutputError: If a task holds something that a file cannot.
+        """
+        self._file.write(json.dumps(_encoded(entry)) + "\n")
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+def read_plan(path: Path) -> Iterator[Entry]:
+    """The entries in order; the first is the flight's limits. A last line that was cut off is left out.
+
+    Raises:
+        SourceError: If the file is missing, is none of these, or is damaged before its end.
+    """
+    try:
+        with path.open("rb") as file:
+            lines = iter(file)
+            head = _parsed(next(lines, b""), path, 1)
+            if not isinstance(head, dict) or head.get("format") != _HEAD["format"]:
+                raise SourceError(f"{path}: not a planner's record")
+            if head.get("version") != _HEAD["version"]:
+                raise SourceError(f"{path}: version {head.get('version')} is not known here, only {_HEAD['version']}")
+            for number, line in enumerate(lines, 2):
+                if not line.endswith(b"\n"):
+                    return  # the program ended while it wrote this line
+                yield _entry(_parsed(line, path, number), path, number)
+    except FileNotFoundError as error:
+        raise SourceError(f"{path}: not there; 'edgeslam fly ... --fly --record DIR' writes it") from error
+    except OSError as error:
+        raise SourceError(f"{path}: cannot be read ({error.strerror or error})") from error
+
+
+def _parsed(line: bytes, path: Path, number: int) -> Any:
+    try:
+        return json.loads(line)
+    except ValueError as error:
+        raise SourceError(f"{path}: line {number} is damaged or not a planner's record") from error
+
+
+def _entry(value: Any, path: Path, number: int) -> Entry:
+    try:
+        entry = _decoded(value)
+    except EdgeSlamError as error:
+        raise SourceError(f"{path}: line {number}: {error}") from error
+    except (TypeError, ValueError, KeyError, AttributeError, zlib.error) as error:
+        raise SourceError(f"{path}: line {number} is damaged ({error})") from error
+    if not isinstance(entry, NavLimits | NewTask | Sight | Decision):
+        raise SourceError(f"{path}: line {number} is no entry of a planner's record")
+    return entry
+
+
+def _encoded(value: Any) -> Any:
+    if is_dataclass(value) and not isinstance(value, type):
+        # What a record remembers for itself begins with an underscore, and begins anew in a replay.
+        kept = {f.name: _encoded(getattr(value, f.name)) for f in fields(value) if f.init and f.name[0] != "_"}
+        return {"kind": f"{type(value).__module__}:{type(value).__name__}", **kept}
+    if isinstance(value, np.ndarray) and value.dtype.kind in "fiub":
+        data = base64.b64encode(zlib.compress(np.ascontiguousarray(value).tobytes(), 1)).decode("ascii")
+        return {"dtype": value.dtype.str, "shape": value.shape, "zlib": data}
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, list | tuple):
+        return [_encoded(x) for x in value]
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    raise OutputError(f"a flight's record cannot hold a {type(value).__name__}")
+
+
+def _decoded(value: Any) -> Any:
+    if isinstance(value, list):
+        return [_decoded(x) for x in value]
+    if not isinstance(value, dict):
+        return value
+    if "zlib" in value:
+        data = zlib.decompress(base64.b64decode(value["zlib"]))
+        return np.frombuffer(data, np.dtype(value["dtype"])).reshape(value["shape"]).copy()
+    return _kind(value["kind"])(**{name: _decoded(x) for name, x in value.items() if name != "kind"})
+
+
+def _kind(name: str) -> Any:
+    """The record class of this name; only dataclasses of the flight's own folders."""
+    module, _, word = name.partition(":")
+    if module.startswith(_OURS):
+        try:
+            found = getattr(importlib.import_module(module), word, None)
+        except ImportError:
+            found = None
+        if isinstance(found, type) and is_dataclass(found):
+            return found
+    raise SourceError(f"{name} is not known to this version")

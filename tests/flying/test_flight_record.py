@@ -1,0 +1,162 @@
+"""A planner's record holds exactly what it saw and decided, survives a crash, and asks a new planner the same."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from edgeslam_torch.cli import main
+from edgeslam_torch.errors import OutputError, SourceError
+from edgeslam_torch.flying.cockpit import Cockpit
+from edgeslam_torch.flying.errands import WayHome
+from edgeslam_torch.flying.replay import replay, told
+from edgeslam_torch.geometry.mount import camera_on_body
+from edgeslam_torch.navigation.flight_record import PLAN, Decision, NewTask, PlanLog, read_plan
+from edgeslam_torch.navigation.limits import NavLimits
+from edgeslam_torch.navigation.sight import HOVER, Sight, View
+from edgeslam_torch.navigation.tasks import Explore, GoTo
+
+TICK_S = 0.1
+
+
+def sight(now_s, p, v=(0.0, 0.0, 0.0), yaw=0.0):
+    """An open floor of 3 m, seen five times a second."""
+    T = camera_on_body()
+    turn = np.eye(4)
+    turn[:2, :2] = [[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]]
+    turn[:3, 3] = p
+    depth = np.full((30, 40), 3.0, np.float32)
+    K = np.array([[38.5, 0.0, 19.5], [0.0, 38.5, 14.5], [0.0, 0.0, 1.0]])
+    view = View(now_s, depth, np.full_like(depth, 0.02), K, turn @ T) if round(now_s / TICK_S) % 2 == 0 else None
+    return Sight(now_s, np.array(p), yaw, np.array(v), view=view)
+
+
+def fly(path, seconds):
+    """A drone that follows every wish, recorded."""
+    log = PlanLog(path / PLAN, NavLimits())
+    cockpit = Cockpit(NavLimits(), witness=log.add)
+    cockpit.begin(GoTo(np.array([1.5, 0.2, 1.15])))
+    p, v, yaw, decisions = np.array([0.0, 0.0, 0.9]), np.zeros(3), 0.0, []
+    for k in range(round(seconds / TICK_S)):
+        decisions.append(cockpit.plan(sight(k * TICK_S, p, v, yaw)))
+        w, (c, s) = decisions[-1].wish, (math.cos(yaw), math.sin(yaw))
+        v = np.array([c * w.forward_m_s - s * w.left_m_s, s * w.forward_m_s + c * w.left_m_s, w.up_m_s])
+        p, yaw = p + TICK_S * v, yaw + TICK_S * w.turn_left_rad_s
+    log.close()
+    return decisions
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory):
+    """Folder and decisions of a flight that gets under way."""
+    folder = tmp_path_factory.mktemp("flight")
+    decisions = fly(folder, 11.0)
+    assert any(d.phase == "flying" and d.wish.forward_m_s > 0.3 for d in decisions)
+    return folder, decisions
+
+
+def test_entries_come_back_to_the_last_bit(tmp_path):
+    limits = NavLimits(speed_m_s=1.0 / 3.0)
+    seen = replace(sight(0.2, (0.1, 1.0 / 3.0, 1.2)), seen_s=math.nan, revision=2, metric=False)
+    entries = [
+        NewTask(GoTo(np.array([1.0, -2.0, 1.15]))),
+        NewTask(Explore(math.inf)),
+        NewTask(WayHome(np.zeros((0, 2)))),
+        seen,
+        Decision(HOVER, "flying"),
+    ]
+    log = PlanLog(tmp_path / PLAN, limits)
+    for entry in entries:
+        log.add(entry)
+    log.close()
+    first, goto, explore, home, back, decision = read_plan(tmp_path / PLAN)
+    assert first == limits and decision == entries[-1] and explore.task.until_s == math.inf
+    assert goto.task.goal_w.tolist() == [1.0, -2.0, 1.15] and home.task.track_w.shape == (0, 2)
+    assert (back.p_w == seen.p_w).all() and math.isnan(back.seen_s) and back.revision == 2 and back.metric is False
+    assert back.view.depth_m.dtype == np.float32 and (back.view.depth_m == seen.view.depth_m).all()
+    assert (back.view.T_w_c == seen.view.T_w_c).all() and (back.view.K == seen.view.K).all()
+
+
+def test_the_same_planner_decides_the_same(flight):
+    folder, decisions = flight
+    found = replay(folder)
+    assert [step.now for step in found.steps] == decisions
+    assert not found.differing and found.tasks == ("GoTo",)
+
+
+def test_another_speed_limit_decides_otherwise(flight):
+    slower = replay(flight[0], speed_m_s=0.2)
+    assert slower.differing and not slower.differing[0].same
+    assert max(step.now.wish.forward_m_s for step in slower.steps) <= 0.2 + 1e-9
+    assert max(step.before.wish.forward_m_s for step in slower.steps) > 0.3
+    assert any("first difference" in line for line in told(slower))
+
+
+def test_what_a_planner_hung_on_is_in_the_file(tmp_path):
+    log = PlanLog(tmp_path / PLAN, NavLimits())
+    cockpit = Cockpit(NavLimits(), witness=log.add)
+    cockpit.plan(sight(0.0, (0.0, 0.0, 0.9)))
+
+    def hangs(seen):
+        raise KeyboardInterrupt
+
+    cockpit.pilot = type("Hung", (), {"update": staticmethod(hangs)})()
+    with pytest.raises(KeyboardInterrupt):
+        cockpit.plan(sight(0.1, (0.0, 0.0, 0.9)))
+    log.close()
+    found = replay(tmp_path)
+    assert [step.before is None for step in found.steps] == [False, True]
+    assert "no answer" in "\n".join(told(found))
+
+
+def test_a_file_that_a_crash_cut_off_is_good_up_to_there(tmp_path):
+    decisions = fly(tmp_path, 5.0)
+    data = (tmp_path / PLAN).read_bytes()
+    (tmp_path / PLAN).write_bytes(data[:-7])
+    found = replay(tmp_path)
+    assert [step.now for step in found.steps] == decisions
+    assert found.steps[-1].before is None
+
+
+@pytest.mark.parametrize(
+    ("damage", "words"),
+    [
+        (lambda lines: [lines[0], lines[1], b"{half a line\n", *lines[2:]], "line 3 is damaged"),
+        (lambda lines: [b'{"format": "soup"}\n', *lines[1:]], "not a planner's record"),
+        (lambda lines: [lines[0].replace(b"1", b"9"), *lines[1:]], "version 9 is not known"),
+        (lambda lines: [lines[0], b'{"kind": "os:system"}\n'], "os:system is not known"),
+        (lambda lines: [lines[0], lines[1], lines[2].replace(b"GoTo", b"GoBy"), *lines[3:]], "GoBy is not known"),
+        (lambda lines: [lines[0], *lines[3:]], "does not begin with the flight's limits"),
+        (lambda lines: lines[:2], "never saw anything"),
+        (lambda lines: [], "not a planner's record"),
+    ],
+)
+def test_damaged_files_are_refused_in_words(damage, words, tmp_path, capsys):
+    fly_short = PlanLog(tmp_path / PLAN, NavLimits())
+    fly_short.add(NewTask(GoTo(np.ones(3))))
+    fly_short.add(sight(0.0, (0.0, 0.0, 0.9)))
+    fly_short.close()
+    lines = (tmp_path / PLAN).read_bytes().splitlines(keepends=True)
+    (tmp_path / PLAN).write_bytes(b"".join(damage(lines)))
+    assert main(["fly", "replay", str(tmp_path)]) == 1
+    assert words in capsys.readouterr().err
+
+
+def test_replay_says_what_it_found_and_refuses_bad_limits(tmp_path, capsys):
+    fly(tmp_path, 4.0)
+    assert main(["fly", "replay", str(tmp_path)]) == 0
+    assert "the same: 40 of 40" in capsys.readouterr().out
+    assert main(["fly", "replay", str(tmp_path), "--speed", "7"]) == 1
+    assert "speed 0.05 to 1" in capsys.readouterr().err
+    assert main(["fly", "replay", str(tmp_path / "none")]) == 1
+    assert "--record DIR" in capsys.readouterr().err
+
+
+def test_a_task_that_no_file_can_hold_is_said(tmp_path):
+    log = PlanLog(tmp_path / PLAN, NavLimits())
+    with pytest.raises(OutputError, match="cannot hold a set"):
+        log.add(NewTask(GoTo({1})))
+    log.close()
+    with pytest.raises(SourceError, match="never saw"):
+        replay(tmp_path)
