@@ -1,6 +1,7 @@
 """Keyframe selection by change of view and parallax."""
 
 import numpy as np
+from numpy.typing import NDArray
 
 from edgeslam_torch.config import MappingConfig
 from edgeslam_torch.geometry import se3
@@ -8,9 +9,9 @@ from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.tracking.flow import Followed
-from edgeslam_torch.tracking.relocaliser import cells_of
+from edgeslam_torch.tracking.relocaliser import GRID
 from edgeslam_torch.tracking.tracker import Track
-from edgeslam_torch.types import FloatArray
+from edgeslam_torch.types import FloatArray, IntArray
 
 SHORTEST_GAP_S = 0.04
 """Minimum time between keyframes whatever the change of view: every second frame at 30 Hz, every frame at 20."""
@@ -23,6 +24,14 @@ KNOWN_SHARE = 0.8
 place on, below 0.05 on new ground."""
 VISITS = 10
 """Keyframes of earlier visits that are asked: those that see most of the same."""
+LONG_AGO_S = 30.0
+"""Age from which on a keyframe counts as one of a visit that is over: what the drone flies over now it has left."""
+ALIKE_RAD = np.deg2rad(15.0)
+"""Angle between two views of a place up to which their keypoints are recognised (docs/decisions/0078)."""
+ALIKE_LEVELS = 2
+"""Pyramid levels between them up to which they are."""
+CHANCE = 0.05
+"""Probability below which anchors that are expected and not found are a change of the place, not chance."""
 
 
 def lost_sight(followed: Followed, config: MappingConfig) -> bool:
@@ -73,10 +82,12 @@ def is_due(
 def known_share(
     track: Track, uv: FloatArray, stamp_s: float, slam_map: SlamMap, camera: Camera, config: MappingConfig
 ) -> float:
-    """Share of a view, in cells that hold keypoints, that keyframes of earlier visits have seen from the same side.
+    """Share of a view, in cells with keypoints, of which keyframes of earlier visits have seen what there is to see.
 
-    A cell is known when a triangulated anchor found in it was seen by such a keyframe at less parallax than makes a
-    keyframe, and less than a pyramid level nearer or farther: a keyframe here would see nothing new of it.
+    Two kinds of cells are known. A triangulated anchor was found in it that a keyframe of an earlier visit has seen at
+    less parallax than makes a keyframe, and less than a pyramid level nearer or farther: a keyframe here would see
+    nothing new of it. Or a keyframe of long ago has seen anchors that belong there, from a side that looks alike,
+    whether they are found this time or not: a third of them is, on ground that has not changed.
 
     Args:
         track: Anchors found in the frame.
@@ -86,23 +97,53 @@ def known_share(
         camera: Of the frame.
         config: Whose parallax makes a keyframe.
     """
-    anchor = track.anchor
-    keypoint = track.keypoint[~slam_map.anchors.from_depth[anchor]]
-    anchor = anchor[~slam_map.anchors.from_depth[anchor]]
+    triangulated = ~slam_map.anchors.from_depth[track.anchor]
+    anchor, keypoint = track.anchor[triangulated], track.keypoint[triangulated]
     counts = slam_map.shared_counts(anchor)
-    old = [id for id in counts if stamp_s - slam_map.keyframes[id].stamp_s >= OLD_S]
-    row_of = np.full(len(slam_map.anchors.alive) + 1, -1, dtype=np.int64)
-    row_of[anchor] = np.arange(len(anchor))
-    ray = slam_map.anchors.p_w[anchor] - se3.inverse(track.T_c_w)[:3, 3]
-    distance = np.linalg.norm(ray, axis=1)
-    known = np.zeros(len(anchor), dtype=bool)
-    for id in sorted(old, key=lambda id: (-counts[id], -id))[:VISITS]:
-        keyframe = slam_map.keyframes[id]
-        mine = row_of[keyframe.anchor[keyframe.anchor >= 0]]
-        mine = mine[mine >= 0]
-        other = slam_map.anchors.p_w[anchor[mine]] - keyframe.centre_w
-        far = np.linalg.norm(other, axis=1)
-        cosine = np.einsum("ij,ij->i", ray[mine], other) / np.maximum(distance[mine] * far, 1e-12)
-        alike = np.abs(np.log(distance[mine] / np.maximum(far, 1e-12))) <= np.log(slam_map.scale_factor)
-        known[mine] |= alike & (cosine >= np.cos(np.deg2rad(config.keyframe_parallax_deg)))
-    return len(cells_of(camera, uv[keypoint[known]])) / max(1, len(cells_of(camera, uv)))
+    order = sorted(counts, key=lambda id: (-counts[id], -id))
+    visits = [slam_map.keyframes[id] for id in order if stamp_s - slam_map.keyframes[id].stamp_s >= OLD_S]
+    long_ago = [k for k in visits if stamp_s - k.stamp_s >= LONG_AGO_S]
+    seen = _seen_by(visits[:VISITS], track.T_c_w, slam_map, np.deg2rad(config.keyframe_parallax_deg), 1)
+    expected = _seen_by(long_ago[:VISITS], track.T_c_w, slam_map, ALIKE_RAD, ALIKE_LEVELS)
+    known = _keypoints_a_cell(camera, uv[keypoint[seen[anchor]]]) > 0
+    known |= _as_expected(np.flatnonzero(expected), track, slam_map, camera)
+    filled = _keypoints_a_cell(camera, uv) > 0
+    return float((known & filled).sum() / max(1, int(filled.sum())))
+
+
+def _seen_by(
+    keyframes: list[Keyframe], T_c_w: FloatArray, slam_map: SlamMap, max_rad: float, levels: int
+) -> NDArray[np.bool_]:
+    """Which anchors are triangulated and seen by keyframes as a camera would: within an angle and pyramid levels."""
+    anchors, centre = slam_map.anchors, se3.inverse(T_c_w)[:3, 3]
+    seen = np.zeros(len(anchors.alive), dtype=bool)
+    for keyframe in keyframes:
+        held = keyframe.anchor[keyframe.anchor >= 0]
+        held = held[~anchors.from_depth[held]]
+        ray, other = anchors.p_w[held] - centre, anchors.p_w[held] - keyframe.centre_w
+        distance, far = (np.maximum(np.sqrt(np.einsum("ij,ij->i", r, r)), 1e-12) for r in (ray, other))
+        alike = np.abs(np.log(distance / far)) <= levels * np.log(slam_map.scale_factor)
+        cosine = np.einsum("ij,ij->i", ray, other) / (distance * far)
+        seen[held[alike & (cosine >= np.cos(max_rad))]] = True
+    return seen
+
+
+def _as_expected(expected: IntArray, track: Track, slam_map: SlamMap, camera: Camera) -> NDArray[np.bool_]:
+    """Cells in which anchors ``(M,)`` are expected; not those where none of many is found, which is no chance."""
+    p_c = se3.transform(track.T_c_w, slam_map.anchors.p_w[expected])
+    expected, p_c = expected[p_c[:, 2] > 0], p_c[p_c[:, 2] > 0]
+    uv = camera.project(p_c)
+    found = np.isin(expected, track.anchor)
+    there = _keypoints_a_cell(camera, uv[found])
+    if not there.any():
+        return there > 0
+    count = _keypoints_a_cell(camera, uv)
+    enough = np.log(CHANCE) / np.log1p(-min(there.sum() / count.sum(), 0.99))
+    return (there > 0) | ((count > 0) & (count <= enough))
+
+
+def _keypoints_a_cell(camera: Camera, uv: FloatArray) -> IntArray:
+    """Number of pixels ``(N, 2)`` in each cell of the image; undistorted ones may lie beside it."""
+    column, row = np.floor(uv / (np.array([camera.width, camera.height]) / GRID)).astype(np.int64).T
+    inside = (column >= 0) & (column < GRID[0]) & (row >= 0) & (row < GRID[1])
+    return np.bincount((column + GRID[0] * row)[inside], minlength=GRID[0] * GRID[1])

@@ -9,11 +9,13 @@ lap is flown like another one::
 
     python -m edgeslam_torch.eval.judge.passes --world building --seed 0 --minutes 20 --width 320
 
-Times are of one thread, without the drawing of the pictures.
+Times are of one thread, without the drawing of the pictures. An interrupt (Ctrl-C) ends the flight, and what was flown
+is judged.
 """
 
 import argparse
 import resource
+import signal
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -144,8 +146,10 @@ def around(name: str, seed: int, minutes: float, width: int = 640) -> LongFlight
     return LongFlight(camera, frames, T_w_c, round(LAP_S * RATE_HZ), log.samples())
 
 
-def fly(flight: LongFlight, say: Callable[[str], None]) -> tuple[EdgeSlam, list[Pass], FloatArray]:
-    """Fly it; the system, the passes, and the poses ``(F, 4, 4)`` as they were known live."""
+def fly(
+    flight: LongFlight, say: Callable[[str], None], stopped: Callable[[], bool] = lambda: False
+) -> tuple[EdgeSlam, list[Pass], FloatArray]:
+    """Fly it, until stopped; the system, the passes, and the poses ``(F, 4, 4)`` as they were known live."""
     slam = EdgeSlam(flight.camera, SlamConfig())
     passes: list[Pass] = []
     live, cpu_ms, told = [], [], 0
@@ -158,6 +162,8 @@ def fly(flight: LongFlight, say: Callable[[str], None]) -> tuple[EdgeSlam, list[
         if len(live) % flight.pass_frames == 0:
             passes.append(_pass(slam, live[-flight.pass_frames :], cpu_ms[-flight.pass_frames :]))
             say(", ".join(f"{name} {cell}" for name, cell in zip(HEADER, _row(passes), strict=False)))
+        if stopped():
+            break
     begin_s = time.process_time()
     slam.finish()
     say(f"finish: {time.process_time() - begin_s:.1f} s")
@@ -208,6 +214,13 @@ def points_a_room(points: FloatArray, estimate: FloatArray, truth: FloatArray) -
     return np.bincount((5 * row + column)[inside], minlength=10).tolist()
 
 
+def interrupted() -> Callable[[], bool]:
+    """Whether an interrupt was asked for since; the frame at hand is finished first."""
+    asked: list[int] = []
+    signal.signal(signal.SIGINT, lambda number, _: asked.append(number))
+    return lambda: bool(asked)
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Print a line when a pass ends, and the table at the end."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -231,12 +244,14 @@ def main(argv: Sequence[str] | None = None) -> int:
             flight = around(args.world, args.seed, args.minutes, args.width)
         else:
             flight = to_and_fro(args.recording, args.frames, args.passes, args.noise, args.seed)
-        slam, passes, live = fly(flight, say)
+        slam, passes, live = fly(flight, say, interrupted())
     except EdgeSlamError as error:
         print(error, file=sys.stderr)
         return 1
     final = slam.trajectory()[1]
     truth = flight.T_w_c[: len(final)]
+    for change in slam.closures():
+        say(f"{change.stamp_s:.1f} s: {change.in_words()}")
     errors = zip(*(errors_of_passes(T_w_c, truth, flight.pass_frames) for T_w_c in (live, final)), strict=True)
     rows = [
         [*_row(passes[: k + 1]), *(f"{error:.4f}" for error in pair)]

@@ -9,10 +9,12 @@ from point_map import CAMERA, PointMap
 
 from edgeslam_torch.config import MappingConfig
 from edgeslam_torch.geometry import se3
-from edgeslam_torch.tracking.keyframe_choice import KNOWN_SHARE, OLD_S, known_share
+from edgeslam_torch.tracking.keyframe_choice import KNOWN_SHARE, LONG_AGO_S, OLD_S, known_share
 from edgeslam_torch.tracking.tracker import Track
 
 LATER_S = 100.0
+SOON_S = 5.0 + 0.5 * (OLD_S + LONG_AGO_S)
+"""Where all six keyframes, a second apart, are of an earlier visit, and none is of long ago."""
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +73,38 @@ def from_elsewhere(points, shift):
 @pytest.mark.parametrize("shift", [(0.0, -0.3, 0.0), (0.0, 0.0, -0.6)])
 def test_another_side_and_another_distance_are_not_known(visited, shift):
     """Fifteen degrees of parallax; 1.6 times as far, which is two pyramid levels."""
-    assert share(visited, *again(visited, T_c_w=from_elsewhere(visited, shift))) < 0.3
+    assert share(visited, *again(visited, T_c_w=from_elsewhere(visited, shift)), stamp_s=SOON_S) < 0.3
+
+
+def test_after_long_another_side_that_looks_alike_is_known(visited):
+    """Some six degrees of parallax; a tenth of the depth farther, two pyramid levels for the nearest."""
+    for shift in [(0.0, -0.1, 0.0), (0.0, 0.0, -0.1)]:
+        frame = again(visited, T_c_w=from_elsewhere(visited, shift))
+        assert share(visited, *frame) > 0.8 > share(visited, *frame, stamp_s=SOON_S)
+
+
+def test_after_long_another_side_that_looks_unlike_is_not_known(visited):
+    """Thirty degrees of parallax; 2.5 times as far, which is five pyramid levels."""
+    for shift in [(0.0, -0.8, 0.0), (0.0, 0.0, -1.5)]:
+        assert share(visited, *again(visited, T_c_w=from_elsewhere(visited, shift))) < 0.4
+
+
+def thinned(points, among, every):
+    """A frame that sees what keyframes have seen, but finds one in some of the anchors and only among those given."""
+    track, uv = again(points)
+    kept = np.flatnonzero(among(uv[track.keypoint]))[::every]
+    return replace(track, keypoint=track.keypoint[kept], anchor=track.anchor[kept]), uv
+
+
+def test_after_long_what_is_expected_needs_not_be_found(visited):
+    """A third is found again in the same place, spread over the view."""
+    track, uv = thinned(visited, lambda uv: uv[:, 0] >= 0, 3)
+    assert share(visited, track, uv) > 0.9
+
+
+def test_a_part_in_which_nothing_is_found_any_more_has_changed(visited):
+    track, uv = thinned(visited, lambda uv: uv[:, 0] < 0.5 * CAMERA.width, 1)
+    assert share(visited, track, uv) < KNOWN_SHARE
 
 
 def test_depths_that_are_only_guessed_are_not_known():
@@ -79,3 +112,11 @@ def test_depths_that_are_only_guessed_are_not_known():
     points.fill()
     points.map.anchors.from_depth[:] = True
     assert share(points, *again(points)) == 0.0
+
+
+def test_a_half_whose_depths_are_only_guessed_is_not_known():
+    points = PointMap(np.random.default_rng(3), 1500, 6)
+    points.fill()
+    track, uv = again(points)
+    points.map.anchors.from_depth[track.anchor[uv[track.keypoint, 0] < 0.5 * CAMERA.width]] = True
+    assert 0.3 < share(points, track, uv) < 0.7

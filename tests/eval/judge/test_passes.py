@@ -1,9 +1,11 @@
 """What a long flight's passes cost and how far they are off."""
 
+import signal
+
 import numpy as np
 import pytest
 
-from edgeslam_torch.eval.judge.passes import Pass, errors_of_passes, main, points_a_room
+from edgeslam_torch.eval.judge.passes import Pass, errors_of_passes, interrupted, main, points_a_room
 from edgeslam_torch.geometry import sim3
 
 
@@ -44,3 +46,14 @@ def test_a_flight_of_no_pass_is_refused(words, capsys):
     with pytest.raises(SystemExit) as ended:
         main([*words] if "--frames" not in words else ["--recording", "x", *words])
     assert ended.value.code == 2 and "at least" in capsys.readouterr().err
+
+
+def test_an_interrupt_is_noted_and_ends_nothing_by_itself():
+    before = signal.getsignal(signal.SIGINT)
+    try:
+        asked = interrupted()
+        assert not asked()
+        signal.raise_signal(signal.SIGINT)
+        assert asked()
+    finally:
+        signal.signal(signal.SIGINT, before)
