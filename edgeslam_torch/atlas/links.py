@@ -29,6 +29,13 @@ MIN_AGREEING = 0.6
 does."""
 MAX_SIGMA_LOG = 0.03
 """Standard deviation of the common log scale."""
+PLANE_PART, ON_PLANE = 0.9, 0.02
+"""Part of the anchors within a distance from one plane, relative to the depth, that show no more than that plane."""
+PLANE_FITS = 5
+"""Fits of the plane, each to that part alone."""
+PLANE_SHARE = 0.2
+"""Share of the anchors in view that must be found where they lie on one plane: floors and walls with the same paint
+look alike in many places, and a patch of one was found in another room with 0.12 to 0.16 (docs/decisions/0087)."""
 MIN_PART = 5
 """Keypoints in a quarter of the view whose median says something."""
 MAX_SHIFT = 0.1
@@ -84,6 +91,8 @@ def link(tracker: Tracker, keyframe: Keyframe, other: Keyframe, min_share: float
     there = _place(tracker, keyframe, other, min_share)
     if there is None:
         return None
+    if there.share < PLANE_SHARE and on_one_plane(tracker.map.anchors.p_w[there.track.anchor], there.depth):
+        return None
     scale = common_scale(tracker, keyframe, there.track)
     if scale is None:
         return None
@@ -105,6 +114,17 @@ def _place(tracker: Tracker, keyframe: Keyframe, other: Keyframe, min_share: flo
         return None
     place = place_of(tracker, view, track)
     return place if place.share >= min_share and place.spread >= LIKELY_SPREAD else None
+
+
+def on_one_plane(p: FloatArray, depth: float) -> bool:
+    """Whether `PLANE_PART` of some points ``(N, 3)``, seen at a median depth, lie on one plane."""
+    part = np.ones(len(p), dtype=bool)
+    for _ in range(PLANE_FITS):
+        middle = p[part].mean(axis=0)
+        normal = np.linalg.svd(p[part] - middle, full_matrices=False)[2][2]
+        off = np.abs((p - middle) @ normal)
+        part = off <= np.quantile(off, PLANE_PART)
+    return bool(np.quantile(off, PLANE_PART) <= ON_PLANE * depth)
 
 
 def common_scale(tracker: Tracker, keyframe: Keyframe, track: Track) -> tuple[float, float, float] | None:

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from point_map import CAMERA, SCALE_FACTOR, PointMap, check_map
 
+from edgeslam_torch.atlas import links
 from edgeslam_torch.atlas.atlas import Atlas, _apart_enough, _sigma_log
-from edgeslam_torch.atlas.links import common_scale, link, view_of
+from edgeslam_torch.atlas.links import common_scale, link, on_one_plane, view_of
 from edgeslam_torch.atlas.places import lookalikes
 from edgeslam_torch.atlas.weld import move_piece
 from edgeslam_torch.config import EdgeConfig, OrbConfig, TrackingConfig
@@ -265,6 +266,28 @@ def test_a_camera_that_stands_is_one_witness(rng):
     for twin, other in zip(twins, pieces.keyframes[2:4], strict=True):
         assert link(pieces.tracker, twin, other) is not None
     assert atlas.update() is None
+
+
+def test_a_plane_is_told_from_a_corner_whatever_its_place_and_size(rng):
+    """A floor known to 5 mm, in metres and in kilometres; a twelfth of it wrong; a floor and a wall; a bent floor."""
+    floor = np.column_stack([rng.uniform(-1, 1, (240, 2)), rng.normal(0, 0.005, 240)])
+    wrong = floor + np.where(np.arange(240) % 12 == 0, 0.5, 0.0)[:, None]
+    corner = np.where(np.arange(240)[:, None] % 3 == 0, floor[:, [2, 0, 1]] + [1.0, 0.0, 1.0], floor)
+    bent = floor + np.column_stack([np.zeros((240, 2)), 0.2 * floor[:, 0] ** 2])
+    for size in (1.0, 1000.0):
+        S = sim3.exp(np.array([30.0, -8.0, 3.0, 0.4, -0.3, 0.6, np.log(size)]))
+        told = [on_one_plane(sim3.transform(S, p), 2.0 * size) for p in (floor, wrong, corner, bent)]
+        assert told == [True, True, False, False]
+
+
+@pytest.mark.parametrize(("share", "believed"), [(0.15, False), (0.25, True)])
+def test_one_plane_is_a_place_only_when_much_of_it_is_found(rng, monkeypatch, share, believed):
+    pieces = Pieces(rng)
+    place = links._place
+    monkeypatch.setattr(links, "_place", lambda *args: replace(place(*args), share=share))
+    assert link(pieces.tracker, pieces.keyframes[4], pieces.keyframes[3]) is not None
+    monkeypatch.setattr(links, "ON_PLANE", 10.0)  # everything is one
+    assert (link(pieces.tracker, pieces.keyframes[4], pieces.keyframes[3]) is not None) == believed
 
 
 @pytest.mark.parametrize("guessed_there", [False, True])
