@@ -1,6 +1,7 @@
 """A flight on disk: its pictures and state as any recording, and beside them what was known and decided."""
 
 import logging
+import math
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -21,7 +22,7 @@ logger = logging.getLogger(__name__)
 MOMENTS = "moments.csv"
 _COLUMNS = (
     "stamp_s,x_m,y_m,z_m,yaw_rad,vx_m_s,vy_m_s,vz_m_s,position_sigma_m,scale_sigma,metric,tracked,blind_s,battery,"
-    "revision,phase,danger,forward_m_s,left_m_s,up_m_s,turn_left_rad_s,why"
+    "revision,clearance_m,phase,danger,forward_m_s,left_m_s,up_m_s,turn_left_rad_s,why"
 )
 
 
@@ -102,6 +103,15 @@ class Recorder:
             logger.warning("%s; the flight goes on", self.failure)
 
 
+def _clearance_m(moment: Moment) -> float:
+    """Between the hull and the nearest solid that the pilot knows; NaN where it knows none."""
+    layer = moment.pilot.layer
+    if layer is None or not layer.solid.any():
+        return math.nan
+    i, j = layer.cells(moment.sight.p_w[:2])
+    return float(layer.from_solid_m[i, j]) - moment.pilot.limits.radius_m
+
+
 def _line(moment: Moment) -> str:
     sight, order = moment.sight, moment.order
     wish = order.wish
@@ -115,6 +125,7 @@ def _line(moment: Moment) -> str:
         f"{sight.blind_s:.3f}",
         f"{sight.battery:.2f}",
         str(sight.revision),
+        f"{_clearance_m(moment):.3f}",
         str(moment.phase),
         str(order.danger),
         *(f"{x:.3f}" for x in stick),

@@ -22,6 +22,7 @@ from edgeslam_torch.eval.inputs.run_folder import RunFolder, is_keyframe, open_r
 from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, read_trajectory
 from edgeslam_torch.eval.metrics.run_score import RunScore, evaluate_run
 from edgeslam_torch.eval.report import words
+from edgeslam_torch.eval.report.flight_section import flight_section
 from edgeslam_torch.eval.report.keyframe_pictures import keyframe_pictures
 from edgeslam_torch.files.atomic import write_text
 from edgeslam_torch.readers.images import pixels_or_none
@@ -96,6 +97,7 @@ def render(run: RunFolder, score: RunScore | None = None, truth: Trajectory | No
         "edges": packed_edges,
         "anchors": packed_anchors,
         "data": text,
+        "flight": flight_section(run.source),
     }
     # In one pass: a recording may itself be called {{edges}}.
     page = (_PAGE / "page.html").read_text(encoding="utf-8")

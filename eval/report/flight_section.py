@@ -1,0 +1,75 @@
+"""The flight in a run's page: way, clearance, and what happened, from the ``moments.csv`` of a flight by the map."""
+
+import csv
+import html
+from pathlib import Path
+
+import numpy as np
+
+from edgeslam_torch.eval.report.line_drawings import chart, view
+
+_MOMENTS = "moments.csv"
+_NEEDED = ("stamp_s", "x_m", "y_m", "phase", "danger", "why")
+_MOST_EVENTS = 60
+_WAY, _CLEARANCE = "var(--tracked)", "var(--predicted)"
+
+
+def flight_section(folder: Path | None) -> str:
+    """HTML of the flight that a recording holds; empty when it holds none, or one that cannot be read."""
+    rows = [] if folder is None else _rows(folder / _MOMENTS)
+    if not rows:
+        return ""
+    table = {name: np.array([_number(row, name) for row in rows]) for name in ("stamp_s", "x_m", "y_m", "clearance_m")}
+    good = np.isfinite(table["stamp_s"]) & np.isfinite(table["x_m"]) & np.isfinite(table["y_m"])
+    if good.sum() < 2:
+        return ""
+    rows = [row for row, ok in zip(rows, good, strict=True) if ok]
+    stamps, x, y, clearance = (table[name][good] for name in ("stamp_s", "x_m", "y_m", "clearance_m"))
+    seconds, way = stamps - stamps[0], np.stack([x, y], axis=1)
+    parts = ["<h2>Flight</h2>", f'<p class="note">{_words(seconds, way, clearance)}</p>', view([way], [_WAY], "m")]
+    known = np.isfinite(clearance)
+    if known.sum() >= 2:
+        label = "metres between the hull and the nearest solid on its own map"
+        shown = np.clip(clearance[known], 0.0, None)
+        parts.append(f'<div class="scroll">{chart(seconds[known], shown, _CLEARANCE, label)}</div>')
+    parts.append(_events(rows, seconds))
+    return f'<section class="wrap" id="s-flight">{"".join(parts)}</section>'
+
+
+def _rows(path: Path) -> list[dict[str, str]]:
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            rows = list(csv.DictReader(file))
+    except (OSError, UnicodeDecodeError, csv.Error):
+        return []
+    return rows if rows and all(name in rows[0] for name in _NEEDED) else []
+
+
+def _number(row: dict[str, str], name: str) -> float:
+    try:
+        return float(row.get(name) or "nan")
+    except ValueError:
+        return float("nan")
+
+
+def _words(seconds: np.ndarray, way: np.ndarray, clearance: np.ndarray) -> str:
+    length = float(np.linalg.norm(np.diff(way, axis=0), axis=1).sum())
+    text = f"{seconds[-1]:.0f} s, {length:.1f} m by its own map, from the dot on"
+    if np.isfinite(clearance).any():
+        text += f"; never nearer to anything solid on that map than {np.nanmin(clearance):.2f} m"
+    return text + "."
+
+
+def _events(rows: list[dict[str, str]], seconds: np.ndarray) -> str:
+    """A row for each change of what it did, or of what kept it from it."""
+    out, before = [], None
+    for row, t in zip(rows, seconds, strict=True):
+        state = (row["phase"], row["danger"])
+        if state != before:
+            place = f"({_number(row, 'x_m'):.1f}, {_number(row, 'y_m'):.1f})"
+            cells = (f"{t:.1f}", place, row["phase"], row["danger"], row["why"])
+            out.append("<tr>" + "".join(f"<td>{html.escape(cell or '')}</td>" for cell in cells) + "</tr>")
+        before = state
+    head = "<tr><th>s</th><th>at [m]</th><th>doing</th><th>kept from it by</th><th>order</th></tr>"
+    left = f'<p class="note">and {len(out) - _MOST_EVENTS} more</p>' if len(out) > _MOST_EVENTS else ""
+    return f'<div class="scroll"><table>{head}{"".join(out[:_MOST_EVENTS])}</table></div>{left}'
