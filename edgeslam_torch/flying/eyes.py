@@ -56,6 +56,7 @@ class SlamEyes:
         self._output: SlamOutput | None = None
         self._T_home_slam: FloatArray = np.eye(4)
         self._battery = 1.0
+        self._told_height_m = np.nan
 
     def heard(self, sample: TelemetrySample) -> None:
         """Take a state message."""
@@ -63,6 +64,8 @@ class SlamEyes:
             self._samples.append(sample)
             if np.isfinite(sample.battery):
                 self._battery = sample.battery
+            if np.isfinite(sample.height_m):
+                self._told_height_m = sample.height_m + _GROUND_M
 
     def seen(self, image: np.ndarray, arrived_s: float, captured_s: float) -> View | None:
         """Take a picture ``(H, W, 3)`` BGR; every few pictures of a mapped place give depth in metres."""
@@ -85,7 +88,7 @@ class SlamEyes:
         """The moment, with a new view if there is one."""
         with self._lock:
             output, captured_s, home = self._output, self._captured_s, self._T_home_slam
-            samples, battery = list(self._samples), self._battery
+            samples, battery, told = list(self._samples), self._battery, self._told_height_m
         pose = self._slam.pose_now(now_s, samples)
         if pose is None or output is None or output.health is None:
             nowhere = np.array([0.0, 0.0, _GROUND_M])
@@ -98,6 +101,7 @@ class SlamEyes:
                 tracked=False,
                 seen_s=captured_s,
                 battery=battery,
+                told_height_m=told,
             )
         health = output.health
         T_w_b = home @ pose.T_w_c @ se3.inverse(self._T_b_c)
@@ -115,6 +119,7 @@ class SlamEyes:
             conflict=health.disagreement > _DISAGREE_SIGMAS,
             seen_s=captured_s,
             battery=battery,
+            told_height_m=told,
             view=view,
             revision=pose.revision,
         )

@@ -47,6 +47,8 @@ class Sight:
     seen_s: float = math.nan
     """When the newest picture that arrived was taken; NaN for now."""
     battery: float = 1.0
+    told_height_m: float = math.nan
+    """Height above the floor of the take-off as the drone itself says; NaN if it does not."""
     view: View | None = None
     """A new depth map, if there is one."""
     revision: int = 0

@@ -173,12 +173,19 @@ class Supervisor:
 
     def _within_heights(self, wish: Wish) -> Wish:
         assert self._sight is not None
-        z, up = float(self._sight.p_w[2]), wish.up_m_s
+        z, up = self._height_m(self._sight), wish.up_m_s
         if z > self.limits.highest_m:
             up = min(up, 0.0)
         if z < self.limits.lowest_m:
             up = max(up, 0.0)
         return Wish(wish.forward_m_s, wish.left_m_s, up, wish.turn_left_rad_s, wish.why)
+
+    @staticmethod
+    def _height_m(sight: Sight) -> float:
+        """Height above the floor; the drone's own word where the map's metres are doubtful."""
+        doubtful = not sight.metric or sight.scale_sigma > SCALE_SIGMA or sight.conflict
+        told = sight.told_height_m
+        return told if doubtful and math.isfinite(told) else float(sight.p_w[2])
 
     def _meanwhile(self, danger: Danger, trouble_s: float) -> Wish:
         """Hover; then what may mend it."""

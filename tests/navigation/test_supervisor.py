@@ -164,3 +164,13 @@ def test_troubles_that_take_turns_end_in_a_landing_too():
 
     orders = flown(supervisor, UNSURE_LAND_S + 1.0, turns)
     assert not orders[round(20 * (LAND_S + 2.0))].land and orders[-1].land
+
+
+def test_heights_of_a_map_without_metres_are_not_believed_when_the_drone_tells_its_own():
+    def low_by_a_map(s):
+        return replace(s, metric=False, p_w=np.array([0.0, 0.0, 0.3]), told_height_m=2.0)
+
+    up = [o.wish.up_m_s for o in flown(Supervisor(), 8.0, low_by_a_map)]
+    assert max(up) <= 0.0 and min(up) < -0.1, "2 m by its own word: down, whatever the map calls 0.3"
+    sure = flown(Supervisor(), 1.0, lambda s: replace(s, told_height_m=0.2), wish=Wish(up_m_s=-0.2))
+    assert {o.wish.up_m_s for o in sure} == {-0.2}, "sure metres count"
