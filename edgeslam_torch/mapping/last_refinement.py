@@ -14,7 +14,6 @@ from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.mapping.edge_map import EdgeMap
 from edgeslam_torch.mapping.freed_depths import Weight
 from edgeslam_torch.mapping.fuse import fuse_all
-from edgeslam_torch.mapping.motion_terms import solver
 from edgeslam_torch.mapping.refinement import refine_all, whole_map, window_problem, write_back
 from edgeslam_torch.mapping.reobserve import MAX_DRIFT_PX, reobserve_all
 from edgeslam_torch.mapping.window_edges import WindowEdges
@@ -27,19 +26,19 @@ logger = logging.getLogger(__name__)
 ALIKE = 2.4
 """Errors of neighbours on one edge are correlated: about six count as one (the root of six)."""
 ITERATIONS = 30
-ROUGH = 1e-2
-"""Relative decrease of the cost at which a refinement stops that another one follows: by quadratic convergence the
-next step would lower the cost by a few 1e-5, less than one residual changes by one standard deviation."""
-FINE = 3e-4
-"""The same for the last refinement."""
+COST_TOLERANCE = 1e-5
+MU = 1e-8
+"""Every refinement goes to the end: a drift of the scale, or a turn taken for a shift, is a slow mode, which a solver
+that stops at a percent of the cost, or is damped by the stiff modes, never reaches (docs/decisions/0084)."""
 
 
 def lm_config(config: WindowConfig) -> LmConfig:
-    """Solver settings of windows while flying."""
+    """Solver settings of every refinement of the map."""
     return LmConfig(
         diagnostics=False,
-        max_iterations=0 if config.reprojection == "off" else 6,
-        cost_tolerance=ROUGH,
+        max_iterations=0 if config.reprojection == "off" else ITERATIONS,
+        mu=MU,
+        cost_tolerance=COST_TOLERANCE,
         kernel=Kernel.L2 if config.reprojection == "literal" else Kernel.HUBER,
     )
 
@@ -60,7 +59,7 @@ def last_refinement(
         Result of the last solver run; None if there was nothing to refine.
     """
     lm = replace(lm_config(config), max_iterations=ITERATIONS)
-    fine = replace(lm, cost_tolerance=FINE, losses=True)
+    stated = replace(lm, losses=True)
     with_edges = config.uses_edges or config.uses_corners
     result = None
     if config.reprojection != "off" and refine_all(slam_map, camera, lm, telemetry, Weight.WIDE) is not None:
@@ -70,12 +69,12 @@ def last_refinement(
             refine_all(slam_map, camera, lm, telemetry, Weight.EXACT)
         with slam_map.lock:
             fuse_all(slam_map, camera)
-        result = refine_all(slam_map, camera, lm if with_edges else fine, telemetry, Weight.EXACT)
+        result = refine_all(slam_map, camera, lm if with_edges else stated, telemetry, Weight.EXACT)
     edges.update(everything=True)
     with slam_map.lock:
         edges.follow_anchors()
     if with_edges:
-        result = refine_with_edges(slam_map, camera, edges, fine, config, telemetry) or result
+        result = refine_with_edges(slam_map, camera, edges, stated, config, telemetry) or result
     return result
 
 
@@ -111,7 +110,7 @@ def refine_with_edges(
             scales = scales.updated(term_residuals(problem))
             problem = with_scales(problem, scales, ALIKE)
             logger.debug("term scales %s", {k: round(t.sigma, 4) for k, t in scales.terms.items()})
-        result = refine_window(problem, solver(lm, problem))
+        result = refine_window(problem, lm)
         if result.stop is StopReason.NOT_FINITE:
             return result
         if config.reprojection == "off":

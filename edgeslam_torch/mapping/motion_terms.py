@@ -1,22 +1,17 @@
 """Motion factors of a window from what telemetry says of its keyframes."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from edgeslam_torch.fusion.displacement import TelemetryModel
 from edgeslam_torch.map.keyframe import Keyframe
-from edgeslam_torch.optim.problem import CentreFactor, GravityFactor, LmConfig, WindowProblem
+from edgeslam_torch.optim.problem import CentreFactor, GravityFactor
 
 ALIKE = 30.0
 """Keypoints err together: a window's thousands of reprojections, taken for independent, hold a wrong scale against
 telemetry whose covariance is honest. So many of them count as one (docs/decisions/0052)."""
-COST_TOLERANCE = 1e-5
-MU = 1e-8
-ITERATIONS = 30
-"""For windows with telemetry and young maps: a drift of the scale, or a turn taken for a shift, is a slow mode, which a
-solver that stops early or is damped by the stiff ones never reaches."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,16 +53,3 @@ def motion_factors(
         if up is not None:
             gravity.append(GravityFactor(order[up.frame], up.up_c, up.up_m, up.sigma_rad))
     return MotionFactors(tuple(centres), tuple(gravity))
-
-
-def solver(config: LmConfig, problem: WindowProblem, to_the_end: bool = False) -> LmConfig:
-    """How a window is minimised: to the end if asked, and where it has motion factors."""
-    if not problem.centres and not to_the_end:
-        return config
-    most = max(config.max_iterations, ITERATIONS) if to_the_end and config.max_iterations else config.max_iterations
-    return replace(
-        config,
-        max_iterations=most,
-        cost_tolerance=min(config.cost_tolerance, COST_TOLERANCE),
-        mu=min(config.mu, MU),
-    )

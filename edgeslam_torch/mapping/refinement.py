@@ -13,7 +13,7 @@ from edgeslam_torch.losses.robust import Kernel
 from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.mapping.freed_depths import Weight, motion_priors
-from edgeslam_torch.mapping.motion_terms import motion_factors, solver
+from edgeslam_torch.mapping.motion_terms import motion_factors
 from edgeslam_torch.mapping.prior_anchors import depth_priors, mostly_on_priors
 from edgeslam_torch.mapping.window_edges import WindowEdges
 from edgeslam_torch.optim.local_ba import refine_window
@@ -44,8 +44,7 @@ class Window:
     freed: Weight = Weight.NONE
     """How the bias of depths on priors is undone."""
     young: bool = False
-    """A whole young map: the solver stops only where the cost is flat, and the newest keyframe, the last free one, is
-    as tracking placed it."""
+    """A whole young map: its newest keyframe, the last free one, is as tracking placed it."""
 
 
 def choose_window(slam_map: SlamMap, newest: Keyframe, free: int, fixed: int) -> Window:
@@ -67,11 +66,11 @@ def choose_window(slam_map: SlamMap, newest: Keyframe, free: int, fixed: int) ->
 
 
 def young_map(slam_map: SlamMap, newest: Keyframe, most: int) -> Window | None:
-    """The whole piece of map of the newest keyframe, to be refined to the end, while it has at most ``most`` keyframes.
+    """The whole piece of map of the newest keyframe, while it has at most ``most`` keyframes.
 
-    A map that began with predicted depths of a wrong shape has a turn where there was a shift, and the other way round.
-    A solver that stops at 1 % of the cost never undoes that, nor can it with two fixed poses, one of them wrong
-    (docs/decisions/0083). None for fewer than three keyframes, or a camera that never moved.
+    A map that began with predicted depths of a wrong shape has a turn where there was a shift, and the other way round,
+    which a window with two fixed poses, one of them wrong, cannot undo (docs/decisions/0083).
+    None for fewer than three keyframes, or a camera that never moved.
     """
     piece = slam_map.piece_of(newest.id)
     keyframes = [k for id, k in sorted(slam_map.keyframes.items()) if slam_map.piece_of(id) == piece]
@@ -138,7 +137,7 @@ def refine(
     problem = problem if placed is None else placed.problem
     if len(problem.obs_pose) == 0 and (placed is None or not placed.has_terms):
         return None
-    result = refine_window(problem, solver(config, problem, window.young))
+    result = refine_window(problem, config)
     if window.young and problem.scale_priors and not problem.centres and result.stop is not StopReason.NOT_FINITE:
         result = with_same_depths(problem, result, len(window.free))
     write_back(slam_map, window, keypoint, result)

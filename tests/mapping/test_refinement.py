@@ -186,7 +186,7 @@ def median_depth(points):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_young_map_of_a_wrong_shape_is_straightened(seed):
-    """A flying window's six steps leave a tenth of the false turn at best; a whole young map has none left."""
+    """Where one pose and one distance are held, and the solver does not stop early."""
     points = PointMap(np.random.default_rng(seed), 300, 6, noise_px=0.3)
     points.fill()
     bend(points)
