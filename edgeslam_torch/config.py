@@ -51,8 +51,7 @@ class OrbConfig:
     fast_threshold: int = 12
     """FAST threshold in grey levels; low, because the strongest corners of every cell are kept."""
     fast_faint: int = 4
-    """FAST threshold where the image has few corners (cloth, white walls, low light); about twice a camera's
-    noise."""
+    """FAST threshold where the image has few corners (cloth, white walls); about twice a camera's noise."""
 
     def __post_init__(self) -> None:
         _positive(self, "features", "candidates", "levels", "fast_threshold", "fast_faint")
@@ -122,7 +121,7 @@ class FlowConfig:
     levels: int = 4
     """Pyramid levels, each half the size of the previous one."""
     min_share: float = 0.4
-    """Below this share of tracked keypoints, the frame is matched instead."""
+    """Below this share of tracked keypoints, the frame is matched first; of those in view, flow has no say."""
 
     def __post_init__(self) -> None:
         _positive(self, "points", "levels", "min_share")

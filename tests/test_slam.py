@@ -120,10 +120,12 @@ def test_where_no_corner_matches_keyframes_rest_on_what_flow_sees(monkeypatch):
     assert ate(np.stack([o.T_w_c for o in outputs]), panels().T_w_c[16:]) < 0.01
 
 
-def test_blurred_images_without_matches_do_not_become_keyframes(monkeypatch):
+def test_blurred_images_without_matches_become_a_keyframe_only_when_the_view_leaves(monkeypatch):
+    """A sharper one may come while most of what is followed is in view."""
     keyframes, outputs = without_matching_corners(monkeypatch, lambda image: cv2.GaussianBlur(image, (0, 0), 4.0))
-    assert keyframes == []
-    assert statuses(outputs).count(FrameStatus.TRACKED) >= 5
+    (last,) = keyframes
+    assert last > 24
+    assert statuses(outputs).count(FrameStatus.TRACKED) >= 9
 
 
 def test_health_says_what_the_newest_pose_is_worth():
@@ -201,12 +203,14 @@ def in_the_world(slam, p_w):
     return scale * (p_w - T_w_c[:, :3, 3].mean(0)) @ R.T + truth[:, :3, 3].mean(0)
 
 
-@pytest.mark.parametrize("run", [panels_run, metric_run])
-def test_edge_map_and_anchors_lie_on_the_surfaces(run):
-    """Half a pixel at 260 px over 40 cm is 4 cm at 3 m: edges seen from many places are nearer than that."""
+@pytest.mark.parametrize(("run", "scale_m"), [(panels_run, 0.0), (metric_run, 0.006)])
+def test_edge_map_and_anchors_lie_on_the_surfaces(run, scale_m):
+    """Half a pixel at 260 px over 40 cm is 4 cm at 3 m: edges seen from many places are nearer than that. A network's
+    metres are .3 to .8 % off, of 3 m."""
     slam, _ = run()
-    # Median distance [m], share within 10 cm; 0.012 to 0.014, 0.97, 0.028 and 0.79 when written.
+    # Median distance [m], share within 10 cm; 0.012, 0.97, 0.029 and 0.79 when written, 0.022 in metres.
     for cloud, count, median_m, share in ((slam.edge_map(), 14_000, 0.018, 0.95), (slam.anchors(), 900, 0.036, 0.75)):
+        median_m += scale_m
         assert len(cloud.p_w) >= count
         distance = panels().world.distance_to_surface(in_the_world(slam, cloud.p_w.astype(np.float64)))
         assert np.median(distance) < median_m

@@ -73,10 +73,12 @@ class Tracking:
                 followed = self._follow(seen, T_predicted, frame.stamp_s)
             located = None if followed is None else self._locate_followed(followed, frame.stamp_s)
             # While the worker is busy no keyframe can be created; matching then finds newly mapped anchors.
-            if located is None or located.due:
-                matched = self._match(frame, seen, T_predicted, followed)
+            # What has left the view cannot be followed: the frame's own keypoints come first then, flow comes last.
+            strong = followed is not None and followed.share >= system.config.flow.min_share
+            if located is None or located.due or not strong:
+                matched = self._match(frame, seen, T_predicted, followed if strong else None)
                 if matched is None and located is not None and followed is not None:
-                    matched = self._on_flow_alone(seen, located, followed)
+                    matched = self._on_flow_alone(seen, located, followed, hurry=not strong)
                 located = matched
             if located is None:
                 located = self._by_edges(frame, seen, T_predicted)
@@ -141,12 +143,16 @@ class Tracking:
         inv_sigma = self.system.config.orb.scale_factor ** -followed.octave.astype(np.float64)
         return Located(followed.track, reference, parallax_rad, due, followed.uv, inv_sigma)
 
-    def _on_flow_alone(self, seen: LazyView, located: Located, followed: Followed) -> Located:
-        """A frame that is due for a keyframe, but none of whose keypoints matches."""
-        if seen.view.features.faint:  # a blurred image: a sharper one will come
+    def _on_flow_alone(self, seen: LazyView, located: Located, followed: Followed, hurry: bool) -> Located:
+        """A frame that is due for a keyframe, but none of whose keypoints matches.
+
+        A sharper one than a blurred one will come, unless in a ``hurry``: most of what is followed has left the view.
+        """
+        if seen.view.features.faint and not hurry:
             return replace(located, due=False)
         features, track = with_followed(seen.view, followed, self.system.map.anchors.words)
-        return replace(located, track=track, view=make_view(features, self.system.config.orb.scale_factor))
+        view = make_view(features, self.system.config.orb.scale_factor)
+        return replace(located, track=track, view=view, due=True)
 
     def _match(
         self, frame: Frame, seen: LazyView, T_predicted: FloatArray, followed: Followed | None

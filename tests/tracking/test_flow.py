@@ -15,7 +15,14 @@ from edgeslam_torch.geometry import se3
 from edgeslam_torch.map.keyframe import NO_ANCHOR, make_keyframe
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.synthetic.house.render import render
-from edgeslam_torch.tracking.flow import FlowTracker, join, template_of_keyframe, template_of_track, with_followed
+from edgeslam_torch.tracking.flow import (
+    NEAR_LEVELS,
+    FlowTracker,
+    join,
+    template_of_keyframe,
+    template_of_track,
+    with_followed,
+)
 from edgeslam_torch.tracking.keyframe_choice import few_matches, is_due, lost_most, lost_sight
 from edgeslam_torch.tracking.tracker import Track, make_view
 
@@ -109,6 +116,30 @@ def test_keypoints_out_of_view_count_against_the_share(scene):
     assert not lost_sight(replace(followed, share=1.0), MappingConfig())
     assert not lost_most(replace(followed, share=0.85), MappingConfig())
     assert lost_most(replace(followed, share=0.6), MappingConfig())
+
+
+def test_a_pose_rests_on_the_keypoints_that_are_in_view(scene):
+    """A third of the template is left, and nearly all of that is found: no reason to be lost."""
+    turned = POSES[0] @ se3.exp(np.array([0, 0, 0, 0, 0.75, 0]))
+    followed = scene.tracker().follow(scene.template, grey_at(turned), se3.inverse(turned))
+    assert followed.share < scene.tracker().config.min_share
+    assert error(followed.track.T_c_w, turned)[0] < 0.02
+
+
+def test_all_levels_are_taken_only_where_they_find_more(scene, monkeypatch):
+    """Coarse levels lose keypoints near the border of the image."""
+    tracker, tried = scene.tracker(), []
+    found = FlowTracker._locate
+
+    def locate(self, template, grey, keypoint, guess, T_c_w, levels, expected):
+        tried.append(levels)
+        some = keypoint[: len(keypoint) // (2 if levels == NEAR_LEVELS else 4)]
+        return found(self, template, grey, some, guess[: len(some)], T_c_w, levels, expected)
+
+    monkeypatch.setattr(FlowTracker, "_locate", locate)
+    followed = tracker.follow(scene.template, scene.grey, scene.keyframe.T_c_w)
+    assert tried == [NEAR_LEVELS, tracker.config.levels]
+    assert 0.4 < followed.share < 0.55
 
 
 @pytest.mark.parametrize("what", ["black", "noise", "elsewhere", "behind"])
