@@ -397,6 +397,7 @@ class EdgeSlam:
             revision=system.published.revision,
             stage_ms=dict(system.stage_ms),
             health=health,
+            unit=system.published.scale,
         )
 
 

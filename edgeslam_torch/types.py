@@ -284,6 +284,8 @@ class SlamOutput:
     """Time of each stage in this step [ms]."""
     health: Health | None = None
     """Reliability of the pose and its metres; None only in outputs made by hand."""
+    unit: float = 1.0
+    """Length of a map unit in the unit of ``T_w_c``; a revision changes it."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -83,6 +83,8 @@ class MotionFusion:
         self._R_w_m: FloatArray | None = None
         truncates = config.velocity_rounding == "truncate"
         self._fit = TelemetryFit(shortfall_m_s=0.5 * config.velocity_step_m_s if truncates else 0.0)
+        self._guess: ScaleEstimate | None = None
+        """Scale by heights that nothing has proven to be of this flight yet."""
         self._remembered: LogScale | None = None
         """Scale of a map that an earlier flight made."""
         self._by_telemetry: LogScale | None = None
@@ -134,6 +136,20 @@ class MotionFusion:
             self._filter.see(visual, Metric(self.scale(), self._delay.delay))
         else:
             self._filter.clear()
+
+    def add_earlier(self, stamps_s: FloatArray, T_w_c: FloatArray, sigma_t: float, sigma_r_rad: float) -> None:
+        """Frames on which a new piece of map rests, before its first tracked one: they have moved with the drone, too.
+
+        Args:
+            stamps_s: Their stamps ``(F,)``, increasing.
+            T_w_c: Their poses ``(F, 4, 4)`` in the map.
+            sigma_t: As for `add_visual`.
+            sigma_r_rad: Likewise.
+        """
+        for stamp_s, T in zip(stamps_s.tolist(), T_w_c, strict=True):
+            last = self._memory.last
+            if np.isfinite(T).all() and (last is None or stamp_s > last.stamp_s):
+                self._memory.add(VisualPose(stamp_s, T, sigma_t, sigma_r_rad))
 
     def revise(self, stamps_s: FloatArray, T_w_c: FloatArray) -> None:
         """Later knowledge of earlier poses: a map that was refined has moved them, and its scale has drifted less.
@@ -203,6 +219,13 @@ class MotionFusion:
             self._scale_rests_on, self._scale = rests_on, fuse(self._settled().used)
         return self._scale
 
+    def guess(self) -> ScaleEstimate | None:
+        """Metres per map unit by a climb before anything has proven that telemetry is of this flight; None after that.
+
+        No claim of metres: a better guess of the published unit than the depth network's.
+        """
+        return self._guess
+
     def scale_around(self, stamp_s: float) -> ScaleEstimate | None:
         """Metres per map unit within seconds of an earlier frame, in the map as it is now; None where nothing tells."""
         if self._R_w_m is None or not self._trust.velocity or len(self._track) == 0:
@@ -259,6 +282,10 @@ class MotionFusion:
             value = math.exp(known.log_scale)
             told.append(ScaleEstimate(value, value * known.sigma, known.source))
         return tuple(told)
+
+    def republished(self, published: Published, centre_map: FloatArray) -> Published:
+        """What is published, in the unit that is known or guessed now; ``centre_map`` ``(3,)`` stays where it is."""
+        return published.guessed_anew(self._guess, centre_map).revised(self.scale(), centre_map)
 
     def present(self, stamp_s: float, state: str, published: Published) -> Present:
         """What is known after a frame: the motion, and the reliability of its metres.
@@ -415,8 +442,20 @@ class MotionFusion:
         scale = TelemetryScale(self.config, self.T_b_c, present, self._trust, self.delay_s, R_w_m, held, flying)
         unrest = self._unrest.sigma if flying else 0.0
         self._take(scale.opinion(), unrest)
+        supposed = TelemetryScale(
+            self.config, self.T_b_c, present, self._trust.supposing_heights(), self.delay_s, R_w_m, held, flying
+        )
+        self._guess = self._guessed(supposed, unrest) if flying and self._by_telemetry is None else None
         oldest = self._memory.sightings().stamps_s[0]
         self._drift = drift_in_words(self.scale_around, float(oldest), last.stamp_s)
+
+    @staticmethod
+    def _guessed(supposed: TelemetryScale, unrest: float) -> ScaleEstimate | None:
+        found = supposed.opinion()
+        if found is None or not (sigma := math.hypot(found[0].sigma, unrest)) < _BELIEVED:
+            return None
+        value = math.exp(found[0].log_scale)
+        return ScaleEstimate(value, value * sigma, found[0].source)
 
     def _take(self, found: tuple[LogScale, TelemetryFit] | None, unrest: float) -> None:
         if found is not None:

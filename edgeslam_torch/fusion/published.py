@@ -45,6 +45,8 @@ class Published:
     offset: FloatArray = field(default_factory=lambda: np.zeros(3))
     revision: int = 0
     """How often the scale was revised so far."""
+    guessed: bool = True
+    """Whether its unit is still a guess: nothing proven has told metres."""
 
     def pose(self, T_w_c: FloatArray) -> FloatArray:
         """Poses ``(..., 4, 4)`` of the map as published."""
@@ -78,7 +80,17 @@ class Published:
     def _worse_guess(self, estimate: ScaleEstimate) -> bool:
         """Whether the published scale is the first guess, and surely worse than an estimate."""
         off = self._off(estimate)
-        return self.revision == 0 and off > max(_GUESS_OFF, _GUESS_CONTRADICTION * estimate.sigma / estimate.value)
+        return self.guessed and off > max(_GUESS_OFF, _GUESS_CONTRADICTION * estimate.sigma / estimate.value)
+
+    def guessed_anew(self, guess: ScaleEstimate | None, centre_map: FloatArray) -> "Published":
+        """The same with a better guess of its unit; arguments as for `revised`."""
+        if guess is None or not self._worse_guess(guess):
+            return self
+        return self._rescaled(guess.value, centre_map)
+
+    def _rescaled(self, scale: float, centre_map: FloatArray) -> "Published":
+        offset = self.offset + (self.scale - scale) * (self.R @ centre_map)
+        return replace(self, scale=scale, offset=offset, revision=self.revision + 1)
 
     def revised(self, estimate: ScaleEstimate, centre_map: FloatArray) -> "Published":
         """The same at an estimated scale, if that is measured, sure and contradicts the published one.
@@ -88,12 +100,11 @@ class Published:
             centre_map: Point of the map ``(3,)`` that stays where it is published.
         """
         measured = not MEASURED.isdisjoint(estimate.source.split("+"))
-        sure = SURE if self.revision > 0 else GUESS_SURE
+        sure = GUESS_SURE if self.guessed else SURE
         wrong = self.contradicts(estimate) or self._worse_guess(estimate)
         if not (measured and estimate.sigma < sure * estimate.value and wrong):
             return self
-        offset = self.offset + (self.scale - estimate.value) * (self.R @ centre_map)
-        return Published(estimate.value, self.R, offset, self.revision + 1)
+        return replace(self._rescaled(estimate.value, centre_map), guessed=False)
 
 
 def first_pose(rpy_rad: FloatArray, T_b_c: FloatArray) -> FloatArray:

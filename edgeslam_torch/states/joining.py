@@ -45,7 +45,7 @@ class Joining:
         known = self.atlas.known_scale.get(piece)
         system.fusion.remember(known)
         if known is not None and (system.published.scale != known.value or system.published.offset.any()):
-            system.published = Published(known.value, revision=system.published.revision + 1)
+            system.published = Published(known.value, revision=system.published.revision + 1, guessed=False)
 
     def _notice_return(self) -> None:
         """When the camera returns to an earlier piece, the one that it left is complete: both are compared again."""

@@ -185,6 +185,7 @@ class Starting:
         self._attempt, self._seen = None, []
         system = self.system
         system.log.replace(started.T_c_w, [reference, *(k for _, k in started.new)])
+        system.see_again(reference.stamp_s, track)
         system.motion.T_c_w = started.T_c_w[max(started.T_c_w)]
         system.motion.move(frame.stamp_s, keyframe.T_c_w)
         system.edges.announce(reference)

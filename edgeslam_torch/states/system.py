@@ -95,14 +95,16 @@ class System:
         """Pass the visual pose to the fusion, and publish the resulting scale."""
         if self.shows_nothing_new:
             return
-        variance = np.diag(track.covariance)
-        known = bool(np.isfinite(variance).all())
-        sigma_t = float(np.sqrt(np.mean(variance[:3]))) if known else UNKNOWN_SIGMA
-        sigma_r = float(np.sqrt(np.mean(variance[3:]))) if known else UNKNOWN_SIGMA
         T_w_c = se3.inverse(track.T_c_w)
         with self.timed("fusion"):
-            self.fusion.add_visual(stamp_s, T_w_c, sigma_t, sigma_r)
-            self.published = self.published.revised(self.fusion.scale(), T_w_c[:3, 3])
+            self.fusion.add_visual(stamp_s, T_w_c, *_sigmas(track))
+            self.published = self.fusion.republished(self.published, T_w_c[:3, 3])
+
+    def see_again(self, since_s: float, track: Track) -> None:
+        """Pass the logged frames since a stamp, which a map supports now, to the fusion, as sure as ``track``."""
+        stamps_s, T_w_c = self.log.poses(since_s)
+        with self.timed("fusion"):
+            self.fusion.add_earlier(stamps_s, T_w_c, *_sigmas(track))
 
     # -- keyframes ---------------------------------------------------------------------------------------------
 
@@ -151,3 +153,11 @@ class System:
         p_w = self.map.anchors.p_w[keyframe.anchor[held]]
         z = (p_w @ keyframe.T_c_w[:3, :3].T + keyframe.T_c_w[:3, 3])[:, 2]
         return compared(keyframe.network_m[held], z)
+
+
+def _sigmas(track: Track) -> tuple[float, float]:
+    """Standard deviations per axis of a pose's translation [map units] and rotation [rad]."""
+    variance = np.diag(track.covariance)
+    if not np.isfinite(variance).all():
+        return UNKNOWN_SIGMA, UNKNOWN_SIGMA
+    return float(np.sqrt(np.mean(variance[:3]))), float(np.sqrt(np.mean(variance[3:])))

@@ -52,6 +52,7 @@ STATUS_COLUMNS = (
     "scale_source",
     "metric",
     "revision",
+    "unit",
     "step_ms",
 )
 """Columns of ``status.csv``, followed by one column ``<stage>_ms`` per stage."""
@@ -287,6 +288,7 @@ def _status_row(output: SlamOutput, step_ms: float) -> list[str]:
         output.scale.source,
         str(int(output.metric)),
         str(output.revision),
+        _number(output.unit, 6),
         _number(step_ms, 3),
     ]
 

@@ -126,6 +126,7 @@ def test_a_file_that_a_crash_cut_off_is_good_up_to_there(tmp_path):
         (lambda lines: [b'{"format": "soup"}\n', *lines[1:]], "not a planner's record"),
         (lambda lines: [lines[0].replace(b"1", b"9"), *lines[1:]], "version 9 is not known"),
         (lambda lines: [lines[0], b'{"kind": "os:system"}\n'], "os:system is not known"),
+        (lambda lines: [lines[0], b'{"kind": "edgeslam_torch.config:SlamConfig"}\n'], "SlamConfig is not known"),
         (lambda lines: [lines[0], lines[1], lines[2].replace(b"GoTo", b"GoBy"), *lines[3:]], "GoBy is not known"),
         (lambda lines: [lines[0], *lines[3:]], "does not begin with the flight's limits"),
         (lambda lines: lines[:2], "never saw anything"),

@@ -59,6 +59,64 @@ def test_a_climb_tells_the_scale_within_its_sigma(delay_s, latest_s, swinging, r
     assert np.max(np.abs(off)) < 2.5
 
 
+def test_a_climb_guesses_the_unit_before_anything_has_proven_telemetry(swinging, replay):
+    """Within a second and a half; no longer once telemetry tells the scale. The network is a half off."""
+    motion = take_off(swinging(1.0), np.arange(0.0, 5.0, 0.05))
+    for seed in range(4):
+        found = []
+
+        def watched(fusion, motion, gauge, samples, found=found):
+            for _ in range(50):
+                fusion.add_depth_ratio(DepthRatio(math.log(1.5 * gauge.scale), 0.05))
+            replay(fusion, motion, gauge, samples, each=lambda t, _: found.append((t, fusion.guess(), fusion.scale())))
+
+        fusion, gauge, _ = fused(np.random.default_rng(seed), motion, watched, TelemetryFaults(video_delay_s=0.5))
+        first_s, guess, _ = next(f for f in found if f[1] is not None)
+        told_s = next(f[0] for f in found if "height" in f[2].source)
+        assert first_s < min(2.2, told_s - 0.4)
+        assert abs(math.log(guess.value / gauge.scale)) < min(0.3, 2.5 * guess.sigma / guess.value)
+        assert all(f[1] is None for f in found if f[0] > told_s)
+        assert fusion.guess() is None
+
+
+def test_a_camera_that_stays_where_its_drone_climbs_guesses_nothing(swinging, replay):
+    """Telemetry of another flight."""
+    motion = take_off(swinging(1.0), np.arange(0.0, 3.0, 0.05))
+    still = replace(motion, T_w_c=np.repeat(motion.T_w_c[:1], len(motion.T_w_c), axis=0))
+    told = simulate(np.random.default_rng(0), motion.stamps_s, motion.T_w_c, T_B_C, faults=TelemetryFaults()).samples()
+    fusion, guesses = MotionFusion(FusionConfig(), T_B_C), []
+    gauge = still.in_gauge(np.random.default_rng(1))
+    replay(fusion, still, gauge, told, each=lambda t, _: guesses.append(fusion.guess()))
+    assert set(guesses) == {None}
+
+
+def test_frames_that_a_map_began_with_are_as_good_as_tracked_ones(swinging, replay):
+    """Of a climb whose first 1.2 s have no map yet, the scale is told when it would have been with one."""
+    motion = take_off(swinging(1.0), np.arange(0.0, 5.0, 0.05))
+    rng = np.random.default_rng(3)
+    samples = simulate(rng, motion.stamps_s, motion.T_w_c, T_B_C, faults=TelemetryFaults(video_delay_s=0.5)).samples()
+    gauge = motion.in_gauge(rng)
+    told_s = {}
+    for begun_s, again in ((0.0, False), (1.2, False), (1.2, True)):
+        fusion = MotionFusion(FusionConfig(), T_B_C)
+        first = int(np.searchsorted(motion.stamps_s, begun_s))
+        later = replace(motion, stamps_s=motion.stamps_s[first:], T_w_c=motion.T_w_c[first:])
+        poses = replace(gauge, T_m_c=gauge.T_m_c[first:])
+        found = []
+
+        def each(t, i, fusion=fusion, found=found, first=first, again=again):
+            if i == 0 and again:
+                fusion.add_earlier(motion.stamps_s[:first], gauge.T_m_c[:first], gauge.sigma_t, gauge.sigma_r)
+            found.append((t, fusion.scale()))
+
+        replay(fusion, later, poses, samples, each=each)
+        told_s[begun_s, again] = next(t for t, scale in found if scale.units is Units.METRES)
+        if again:
+            assert abs(math.log(fusion.scale().value / gauge.scale)) < 0.1
+    assert told_s[1.2, True] <= told_s[0.0, False] + 0.3
+    assert told_s[1.2, True] < told_s[1.2, False] - 0.4
+
+
 def take_off(motion, t):
     """A drone that climbs and then flies ahead."""
     z = 0.4 + 0.8 * np.clip((t - 0.4) / 1.6, 0.0, 1.0)

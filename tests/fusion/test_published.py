@@ -48,14 +48,28 @@ def test_what_is_not_measured_not_sure_or_no_news_revises_nothing(value, sigma, 
 def test_the_unit_that_the_map_began_with_is_given_up_sooner_than_a_measured_one(value, sigma, given_up):
     estimate = ScaleEstimate(value, sigma, "height+depth")
     assert (Published(1.0).revised(estimate, np.zeros(3)).revision == 1) == given_up
-    measured = Published(1.0, revision=1)
+    measured = Published(1.0, revision=1, guessed=False)
     assert measured.revised(estimate, np.zeros(3)) is measured
+
+
+def test_a_guess_may_follow_a_guess_until_metres_are_measured():
+    here = np.array([1.0, 2.0, 3.0])
+    guess = ScaleEstimate(2.0, 0.4, "height")
+    again = Published(1.0).guessed_anew(guess, here)
+    assert (again.scale, again.revision, again.guessed) == (2.0, 1, True)
+    np.testing.assert_allclose(again.points(here), Published(1.0).points(here))
+    assert again.guessed_anew(ScaleEstimate(1.6, 0.1, "height"), here).scale == 1.6
+    for no_better in (None, ScaleEstimate(2.09, 0.01, "height"), ScaleEstimate(1.6, 0.5, "height")):
+        assert again.guessed_anew(no_better, here) is again
+    measured = again.revised(ScaleEstimate(1.5, 0.05, "height"), here)
+    assert (measured.revision, measured.guessed) == (2, False)
+    assert measured.guessed_anew(guess, here) is measured
 
 
 def test_a_measured_unit_needs_a_surer_one_to_be_revised():
     estimate = ScaleEstimate(2.0, 0.24, "telemetry")
     assert Published(1.0).revised(estimate, np.zeros(3)).revision == 1
-    measured = Published(1.0, revision=1)
+    measured = Published(1.0, revision=1, guessed=False)
     assert measured.revised(estimate, np.zeros(3)) is measured
     assert measured.revised(ScaleEstimate(2.0, 0.19, "telemetry"), np.zeros(3)).revision == 2
 

@@ -241,6 +241,15 @@ class Trust:
             return False
         return own is Verdict.AGREES or (own is Verdict.OPEN and (self.velocity or attitude is Verdict.AGREES))
 
+    def supposing_heights(self) -> "Trust":
+        """The same with heights taken for this flight's while nothing speaks for or against them."""
+        supposed = Trust()
+        supposed.latest, supposed.elsewhere_s = dict(self.latest), self.elsewhere_s
+        supposed._verdicts = dict(self._verdicts)
+        for reading in HEIGHTS:
+            supposed._verdicts.setdefault(reading, Verdict.AGREES)
+        return supposed
+
     @property
     def motion(self) -> bool:
         """Whether telemetry may predict the pose without images: not contradicted."""

@@ -1,7 +1,7 @@
 """The scale that a run states while flying, against what it truly is.
 
-Lengths of the published trajectory during the longest time without a revision tell metres per published unit, and the
-revision before it metres per map unit: what every estimate of the scale before and after has to be.
+Lengths of the published trajectory during the longest time without a revision tell metres per published unit, and so
+metres per map unit: what every estimate of the scale before and after has to be.
 """
 
 import math
@@ -22,6 +22,8 @@ FROM_S = 12.5
 _SURE = 3.0
 """Stated sigmas."""
 _LEAST_POSES = 20
+_SENSORS = frozenset({"telemetry", "height"})
+"""Sources of a scale that is measured, not guessed."""
 
 Figures = dict[str, float | None]
 
@@ -34,6 +36,10 @@ class _Stated:
     value: float
     sigma: float
     revision: int
+    measured: bool
+    """Whether sensors of the drone tell it; before, the unit is a guess, revised or not."""
+    unit: float
+    """Published units per map unit."""
 
 
 def live_figures(run: RunFolder, truth: Trajectory) -> Figures:
@@ -52,7 +58,7 @@ def live_figures(run: RunFolder, truth: Trajectory) -> Figures:
         return {}
     begin_s = stated[0].stamp_s
     figures: Figures = {}
-    first = next((s for s in stated if s.revision > 0), None)
+    first = next((s for s in stated if s.revision > 0 and s.measured), None)
     if first is not None:
         off = math.log(first.value / true)
         figures["first_scale_s"] = first.stamp_s - begin_s
@@ -66,7 +72,10 @@ def live_figures(run: RunFolder, truth: Trajectory) -> Figures:
 
 def _stated(row: dict[str, str]) -> _Stated:
     sigma = float(row.get("scale_sigma") or "inf")
-    return _Stated(float(row["stamp_s"]), float(row["scale"]), sigma, int(row["revision"]))
+    measured = not _SENSORS.isdisjoint(row.get("scale_source", "").split("+"))
+    return _Stated(
+        float(row["stamp_s"]), float(row["scale"]), sigma, int(row["revision"]), measured, float(row["unit"])
+    )
 
 
 def _beyond(stated: _Stated, true: float) -> bool:
@@ -77,7 +86,7 @@ def _true_scale(stated: Sequence[_Stated], online: Trajectory, truth: Trajectory
     """Metres per map unit, by the poses of the longest time without a revision."""
     revision, _ = Counter(s.revision for s in stated).most_common(1)[0]
     stretch = [s.stamp_s for s in stated if s.revision == revision]
-    unit = next(s.value for s in stated if s.revision == revision) if revision > 0 else 1.0
+    unit = next(s.unit for s in stated if s.revision == revision)
     used = (online.stamps_s >= stretch[0] - 1e-6) & (online.stamps_s <= stretch[-1] + 1e-6)
     p = online.positions[used]
     there, here = match(truth.stamps_s, online.stamps_s[used])

@@ -78,12 +78,13 @@ def test_what_is_not_of_this_flight_does_not_go_with_it(drawn):
     assert np.isnan([s.tof_m for s in KINDS["random"](drawn)]).all()
 
 
-def run_of(scales, sigmas, revisions, published, truth, tmp_path):
+def run_of(scales, sigmas, revisions, units, published, truth, tmp_path):
     """A run's folder as read back, twenty frames a second."""
     stamps = truth.stamps_s
     rows = tuple(
         {"stamp_s": str(t), "scale": str(s), "scale_sigma": "" if math.isinf(g) else str(g), "revision": str(r)}
-        for t, s, g, r in zip(stamps, scales, sigmas, revisions, strict=True)
+        | {"scale_source": "depth" if math.isinf(g) else "telemetry+depth", "unit": str(u)}
+        for t, s, g, r, u in zip(stamps, scales, sigmas, revisions, units, strict=True)
     )
     T = truth.T_w_c.copy()
     T[:, :3, 3] = published
@@ -98,14 +99,18 @@ def test_scale_while_flying_is_compared_with_the_lengths_published_between_revis
     scales = np.where(t < 5.0, 1.0, np.where(t < 15.0, 0.55, 0.5))
     sigmas = np.where(t < 5.0, np.inf, np.where(t < 15.0, 0.01, 0.005))
     published = np.where(later, 0.55, 1.0)[:, None] * truth.positions / 0.5
-    run = run_of(scales, sigmas, later.astype(int), published, truth, tmp_path)
+    run = run_of(scales, sigmas, later.astype(int), np.where(later, 0.55, 1.0), published, truth, tmp_path)
     figures = live_figures(run, truth)
     assert figures["first_scale_s"] == pytest.approx(5.0, abs=0.06)
     assert figures["first_scale_off"] == pytest.approx(math.log(1.1), abs=1e-6)
     assert figures["first_scale_sigmas"] == pytest.approx(math.log(1.1) * 55.0, abs=1e-3)
     assert figures["beyond_3_sigma"] == pytest.approx(2.5 / (SECONDS - 12.5), abs=0.01)
-    never = run_of(np.ones(n), np.full(n, np.inf), np.zeros(n, int), truth.positions / 0.5, truth, tmp_path)
+    never = run_of(np.ones(n), np.full(n, np.inf), np.zeros(n, int), np.ones(n), truth.positions / 0.5, truth, tmp_path)
     assert live_figures(never, truth) == {"beyond_3_sigma": 0.0}
+    # A guess revised at once: 0.8 m per map unit from the first frame on is no drone's metre.
+    revisions, units = 1 + later.astype(int), np.where(later, 0.55, 0.8)
+    guessed = run_of(scales, sigmas, revisions, units, units[:, None] * truth.positions / 0.5, truth, tmp_path)
+    assert live_figures(guessed, truth) == pytest.approx(figures)
 
 
 def test_a_revision_just_before_the_end_leaves_the_lengths_of_the_time_before(drawn, tmp_path):
@@ -114,7 +119,7 @@ def test_a_revision_just_before_the_end_leaves_the_lengths_of_the_time_before(dr
     last = t >= SECONDS - 0.5
     scales, sigmas = np.where(last, 0.52, 0.55), np.full(len(t), 0.01)
     published = scales[:, None] * truth.positions / 0.5
-    run = run_of(scales, sigmas, 1 + last.astype(int), published, truth, tmp_path)
+    run = run_of(scales, sigmas, 1 + last.astype(int), scales, published, truth, tmp_path)
     figures = live_figures(run, truth)
     assert figures["first_scale_off"] == pytest.approx(math.log(1.1), abs=1e-6)
     assert figures["beyond_3_sigma"] == pytest.approx(1.0 - 0.5 / (SECONDS - 12.5), abs=0.01)
