@@ -246,6 +246,39 @@ def test_images_have_the_last_word_on_the_velocities_frame(rng, swinging, replay
     assert frame in warning
 
 
+def leaning(motion, lean_rad):
+    """The same motion of a body that leans: its nose down."""
+    lean = np.eye(4)
+    lean[:3, :3] = Rotation.from_euler("y", lean_rad).as_matrix()
+    return replace(motion, T_w_c=motion.T_w_c @ np.linalg.inv(T_B_C) @ lean @ T_B_C)
+
+
+def test_velocities_in_the_axes_of_a_leaning_body_are_recognised_although_they_fit_well(rng, swinging, replay):
+    """A camera in a hand looks down and hardly turns: such velocities go with the images to more than 80 %."""
+
+    def spoil(rng, samples, motion):
+        return with_velocities(
+            no_heights(samples),
+            [Rotation.from_euler("ZYX", s.rpy_rad[::-1]).inv().apply(s.velocity_m_s) for s in samples],
+        )
+
+    _, fusion, gauge = told_of(rng, replay, leaning(swinging(20.0), 0.4), spoil)
+    scale = fusion.scale()
+    assert scale.source == "telemetry+depth"
+    assert scale.value == pytest.approx(gauge.scale, rel=0.03)
+    (warning,) = fusion.warnings()
+    assert "body axes, its lean included" in warning
+    before = float(re.search(r"(\d+) % before", warning).group(1))
+    assert before > 80.0
+
+
+def test_right_velocities_of_a_leaning_body_stay_as_they_are(rng, swinging, replay):
+    motion = leaning(swinging(20.0), 0.4)
+    _, fusion, gauge = told_of(rng, replay, motion, lambda rng, samples, motion: no_heights(samples))
+    assert fusion.warnings() == []
+    assert fusion.scale().value == pytest.approx(gauge.scale, rel=0.03)
+
+
 def test_velocities_read_in_another_frame_carry_the_pose_on(rng, swinging, replay):
     """What the filter and the prediction get is turned as well."""
     motion = circling(swinging)

@@ -51,15 +51,15 @@ class Comparison:
         self._looked_wide_at = 0
 
     def judge(self, trust: Trust, present: FlightSoFar, delay: Delay, R_w_m: FloatArray) -> None:
-        """Compare at the delay in use and, if that fits badly, read in other frames and at other delays.
+        """Compare at the delay in use, in other frames and, if that fits badly, at other delays.
 
         Velocities that fit significantly better in another frame are read in that frame from now on, overriding
-        settings and reader.
+        settings and reader. A camera that hardly turns, but leans, goes with velocities in body axes to 80 or 90 % as
+        well: a good fit is no proof of the frame.
         """
         now, n = self._velocity(present, delay.value_s, R_w_m), present.memory.count
-        if now.correlation >= _FITS_WELL:
-            trust.elsewhere_s = None
-        elif now.count >= _TO_LOOK_ELSEWHERE and n >= GROWTH * self._looked_wide_at:
+        look = now.count >= _TO_LOOK_ELSEWHERE and n >= GROWTH * self._looked_wide_at
+        if look:
             self._looked_wide_at = n
             turn = self._fits_turned(present, now, delay.value_s, R_w_m)
             if turn is not None:
@@ -67,6 +67,9 @@ class Comparison:
                 present.track.read_as(turn)
                 now = self._velocity(present, delay.value_s, R_w_m)
                 trust.forget(Reading.VELOCITY)
+        if now.correlation >= _FITS_WELL:
+            trust.elsewhere_s = None
+        elif look:
             trust.elsewhere_s = self._fits_elsewhere(present, now, delay.value_s)
         trust.judge(Reading.VELOCITY, now)
         attitude = self._attitude(present, delay.value_s)
@@ -76,12 +79,11 @@ class Comparison:
     def _fits_turned(self, present: FlightSoFar, now: Agreement, delay_s: float, R_w_m: FloatArray) -> Turn | None:
         """The frame in which the velocities surely fit better than in the one they are read in."""
         best, best_turn = now, None
-        for turn in Turn:
-            if turn is not present.track.turn:
-                other = replace(present, track=present.track.as_if(turn))
-                found = self._velocity(other, delay_s, R_w_m)
-                if found.correlation > best.correlation:
-                    best, best_turn = found, turn
+        for turn in present.track.other_turns:
+            other = replace(present, track=present.track.as_if(turn))
+            found = self._velocity(other, delay_s, R_w_m)
+            if found.correlation > best.correlation:
+                best, best_turn = found, turn
         return best_turn if _surely_better(best, now) else None
 
     def _fits_elsewhere(self, present: FlightSoFar, now: Agreement, used_s: float) -> float | None:

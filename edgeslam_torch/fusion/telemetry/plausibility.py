@@ -179,6 +179,7 @@ class Reread:
         frame = {
             Turn.AS_READ: "as they were given",
             Turn.FROM_BODY: "in body axes",
+            Turn.FROM_LEANING_BODY: "in body axes, its lean included",
             Turn.BACK: "in the world of power-on, without the turn by yaw that they were given",
         }[self.turn]
         share = "" if now is None else f" ({100 * now.share:.0f} % of the motion explained, "

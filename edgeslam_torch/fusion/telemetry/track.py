@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from enum import IntEnum
+from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,14 +55,28 @@ class Readings:
         return self.has_velocity & ~self.frozen
 
 
-class Turn(IntEnum):
-    """How often velocities are turned by yaw to get into the world of power-on, beyond what the settings say."""
+class Turn(Enum):
+    """What velocities are turned by to get into the world of power-on, beyond what the settings say."""
 
-    AS_READ = 0
-    FROM_BODY = 1
-    """They are in body axes, although not declared so."""
-    BACK = -1
+    AS_READ = "nothing"
+    FROM_BODY = "yaw"
+    """They are in the axes of a body held level, although not declared so."""
+    FROM_LEANING_BODY = "roll, pitch and yaw"
+    """They are in the axes of the body as it leans: what a camera in a hand or on a rig tells."""
+    BACK = "yaw, back"
     """They were in the world before whoever read them turned them."""
+
+    @property
+    def from_body(self) -> bool:
+        """Whether the drone itself tells velocities in axes that turn with it."""
+        return self in (Turn.FROM_BODY, Turn.FROM_LEANING_BODY)
+
+    def rotation(self, rpy: FloatArray) -> Rotation:
+        """Rotation of velocities at roll, pitch and yaw ``(N, 3)`` [rad]."""
+        if self is Turn.FROM_LEANING_BODY:
+            return Rotation.from_euler("ZYX", rpy[:, ::-1])
+        sign = {Turn.AS_READ: 0.0, Turn.FROM_BODY: 1.0, Turn.BACK: -1.0}[self]
+        return Rotation.from_euler("z", sign * rpy[:, 2:])
 
 
 class TelemetryTrack:
@@ -98,6 +112,12 @@ class TelemetryTrack:
         """How velocities are read."""
         return self._turn
 
+    @property
+    def other_turns(self) -> list[Turn]:
+        """How they could be read as well."""
+        declared = {Turn.FROM_LEANING_BODY} if self._body else set()
+        return [turn for turn in Turn if turn is not self._turn and turn not in declared]
+
     def read_as(self, turn: Turn) -> None:
         """Read all velocities, those to come as well, in another frame."""
         if turn is not self._turn:
@@ -110,10 +130,9 @@ class TelemetryTrack:
         return other
 
     def _turned(self, sample: TelemetrySample) -> TelemetrySample:
-        if self._turn is Turn.AS_READ or not math.isfinite(sample.rpy_rad[2]):
+        if self._turn is Turn.AS_READ or not np.isfinite(sample.rpy_rad).all():
             return sample
-        R = Rotation.from_euler("z", self._turn * float(sample.rpy_rad[2]))
-        return replace(sample, velocity_m_s=R.apply(sample.velocity_m_s))
+        return replace(sample, velocity_m_s=self._turn.rotation(sample.rpy_rad[None]).apply(sample.velocity_m_s)[0])
 
     def __len__(self) -> int:
         return len(self._samples)
@@ -143,12 +162,12 @@ class TelemetryTrack:
 
         stamp, told, raw_rpy = column("stamp_s"), column("velocity_m_s"), column("rpy_rad")
         velocity, rpy = _filled(told), np.unwrap(_filled(raw_rpy), axis=0)
-        by_yaw = Rotation.from_euler("z", self._turn * rpy[:, 2:])
+        turn = self._turn.rotation(rpy)
         if self._turn is Turn.BACK:
-            velocity = by_yaw.apply(velocity)
+            velocity = turn.apply(velocity)
         sign = np.sign(np.where(np.abs(velocity) > 1e-6, velocity, 0.0))
-        if self._turn is Turn.FROM_BODY:
-            velocity, sign = by_yaw.apply(velocity), by_yaw.apply(sign)
+        if self._turn.from_body:
+            velocity, sign = turn.apply(velocity), turn.apply(sign)
         if self._body:
             R = Rotation.from_euler("ZYX", rpy[:, ::-1])
             velocity, sign = R.apply(velocity), R.apply(sign)
@@ -222,8 +241,8 @@ class TelemetryTrack:
         """Axes in which the drone tells its velocity, to the power-on world, at each reading ``(N, 3, 3)``."""
         rpy = self.readings.rpy
         axes = np.broadcast_to(np.eye(3), (len(rpy), 3, 3))
-        if self._turn is Turn.FROM_BODY:
-            axes = Rotation.from_euler("z", rpy[:, 2:]).as_matrix()
+        if self._turn.from_body:
+            axes = self._turn.rotation(rpy).as_matrix()
         return Rotation.from_euler("ZYX", rpy[:, ::-1]).as_matrix() @ axes if self._body else axes
 
     def truncation_log_odds(self, step_m_s: float) -> float:
