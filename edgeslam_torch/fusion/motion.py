@@ -436,7 +436,7 @@ class MotionFusion:
         depth = self._depth.scale()
         network = None if depth is None else self._with_focal(depth)
         present = FlightSoFar(self._memory, self._track, self.T_b_c[:3, :3], self._rough_scale(), network)
-        self._comparison.judge(self._trust, present, self._delay.delay, R_w_m)
+        self._comparison.judge(self._trust, present, self._delay.delay, R_w_m, flying)
         self._trust.at_odds = None
         held = self._held_scale()
         scale = TelemetryScale(self.config, self.T_b_c, present, self._trust, self.delay_s, R_w_m, held, flying)

@@ -50,15 +50,17 @@ class Comparison:
         self._config = config
         self._looked_wide_at = 0
 
-    def judge(self, trust: Trust, present: FlightSoFar, delay: Delay, R_w_m: FloatArray) -> None:
+    def judge(self, trust: Trust, present: FlightSoFar, delay: Delay, R_w_m: FloatArray, flying: bool = False) -> None:
         """Compare at the delay in use, in other frames and, if that fits badly, at other delays.
 
         Velocities that fit significantly better in another frame are read in that frame from now on, overriding
         settings and reader. A camera that hardly turns, but leans, goes with velocities in body axes to 80 or 90 % as
-        well: a good fit is no proof of the frame.
+        well: a good fit is no proof of the frame. While ``flying`` this is asked as the flight grows, in the end in
+        any case.
         """
         now, n = self._velocity(present, delay.value_s, R_w_m), present.memory.count
-        look = now.count >= _TO_LOOK_ELSEWHERE and n >= GROWTH * self._looked_wide_at
+        grown = not flying or n >= GROWTH * self._looked_wide_at
+        look = now.count >= _TO_LOOK_ELSEWHERE and grown
         if look:
             self._looked_wide_at = n
             turn = self._fits_turned(present, now, delay.value_s, R_w_m)
