@@ -394,6 +394,7 @@ class MotionFusion:
             return None
         there = self._track.heights()
         heights = [reading for reading in HEIGHTS if reading in there and self._trust.height(reading)]
+        odds = self._trust.at_odds  # what is not used for the scale must not pull at the map either
         return TelemetryModel(
             self._track.copy(),
             self.config,
@@ -403,8 +404,8 @@ class MotionFusion:
             self.delay_sigma_s,
             math.exp(told.log_scale),
             told.sigma,
-            self._trust.velocity,
-            heights[0] if heights else None,
+            self._trust.velocity and (odds is None or odds.kept == "telemetry"),
+            heights[0] if heights and (odds is None or odds.kept == "height") else None,
             self._fit.truncates,
         )
 

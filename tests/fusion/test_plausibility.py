@@ -366,6 +366,8 @@ def test_velocities_in_the_wrong_unit_are_named_and_dropped(rng, swinging, repla
     assert abs(scale.value - gauge.scale) < 2 * scale.sigma
     (warning,) = (w for w in fusion.warnings() if "contradict each other" in w)
     assert "velocities are not used" in warning
+    model = fusion.telemetry()
+    assert (model.velocity, model.height) == (False, "tof"), "nor do they pull at the map in its refinement"
 
 
 def test_velocities_in_the_wrong_unit_with_nothing_beside_them_give_no_metres(rng, swinging, replay):
