@@ -36,6 +36,10 @@ class DepthModule(nn.Module):
         torch.Size([1, 1, 16, 32])
     """
 
+    def __init__(self) -> None:
+        # Torch's own takes anything: a type checker could not tell a wrong argument.
+        super().__init__()
+
     def predict(self, x: Tensor) -> Prediction:
         """Log depth and its uncertainty for normalised RGB ``(B, 3, H, W)``, at its size; gradients pass."""
         raise NotImplementedError(f"{type(self).__name__} must define predict")
