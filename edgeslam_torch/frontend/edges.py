@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from edgeslam_torch.frontend.canny import canny_of_gradient, gradient
+from edgeslam_torch.frontend.canny import canny_of_gradient, edge_thresholds, gradient
 from edgeslam_torch.frontend.image import as_grey, colours_at
 from edgeslam_torch.types import Edges, FloatArray
 
@@ -13,14 +13,14 @@ def extract_edges(image: np.ndarray, low: float, high: float, most: int, border_
 
     Args:
         image: Undistorted image.
-        low: Lower hysteresis threshold, grey levels.
+        low: Lower hysteresis threshold of a well exposed picture, grey levels.
         high: Upper hysteresis threshold.
         most: Maximum number of edge pixels; thinned evenly along the edges.
         border_px: Margin without edges, where gradients and warped patches leave the image.
     """
     grey = as_grey(image)
     along_x, along_y = gradient(grey)
-    mask = canny_of_gradient(along_x, along_y, low, high)
+    mask = canny_of_gradient(along_x, along_y, *edge_thresholds(grey, low, high))
     mask[:border_px] = mask[-border_px:] = False
     mask[:, :border_px] = mask[:, -border_px:] = False
     at = cv2.findNonZero(mask.view(np.uint8))  # same order as np.nonzero, five times as fast

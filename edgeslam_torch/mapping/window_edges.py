@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from edgeslam_torch.config import WindowConfig
-from edgeslam_torch.frontend.canny import canny
+from edgeslam_torch.frontend.canny import canny, edge_thresholds
 from edgeslam_torch.frontend.edges import extract_edges
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.losses.cycle import CycleForm
@@ -108,7 +108,7 @@ class WindowEdges:
         else:
             pixels = uv
         corners = self.config.uses_corners and uv is not None
-        mask = canny(grey, config.canny_low, config.canny_high) if corners else None
+        mask = canny(grey, *edge_thresholds(grey, config.canny_low, config.canny_high)) if corners else None
         unknown = np.zeros(len(pixels))
         return _Indexed(uv, make_structure(grey, pixels, unknown, unknown, mask))
 

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from edgeslam_torch.frontend.canny import canny_of_gradient, gradient
+from edgeslam_torch.frontend.canny import canny_of_gradient, edge_thresholds, gradient
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.map.keyframe import Keyframe
@@ -207,7 +207,7 @@ class EdgeImage:
     def of(cls, grey: NDArray[np.uint8], low: float, high: float) -> "EdgeImage | None":
         """Edges of an image ``(H, W)``; None when it has none."""
         gx, gy = gradient(grey)
-        mask = canny_of_gradient(gx, gy, low, high)
+        mask = canny_of_gradient(gx, gy, *edge_thresholds(grey, low, high))
         if not mask.any():
             return None
         distance, label = cv2.distanceTransformWithLabels(
