@@ -11,22 +11,18 @@ from edgeslam_torch.frontend.edges import extract_edges
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.map.depth_prior import MIN_ANCHORS, depth_prior
+from edgeslam_torch.map.edge_agreement import PaintedEdges, View, bend
 from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.mapping.edge_depth import StereoView, measure_edge_depth
 from edgeslam_torch.types import FloatArray, IntArray, PointCloud
 
-AGREE_PX = 2.0
-"""Maximum distance of a projected edge point from the same edge in another keyframe."""
 AGREE_DEPTH = 0.04
 """Maximum relative depth difference of the same edge in two keyframes."""
 RECENT_HOSTS = 40
 """Number of latest keyframes compared with a new one."""
 PRIOR_CELL_PX = 8
 """Side of the cells whose edges share a depth prior."""
-
-_REACH = math.ceil(AGREE_PX + 0.5)
-"""Radius [px] of a painted edge: a query may be rounded by half a pixel."""
 
 
 @dataclass(slots=True)
@@ -225,62 +221,19 @@ class EdgeMap:
             if not any(len(h.uv) for h in hosts):
                 empty = np.zeros((0, 3), np.float32)
                 return PointCloud(empty, np.zeros((0, 3), np.uint8), np.zeros(0, np.float32), np.zeros(0, np.int32))
-            p_w = np.concatenate([se3.transform(self._T_w_c(h), h.p_c) for h in hosts])
+            views = [View(self._T_w_c(h), h.uv.copy(), h.p_c.copy()) for h in hosts]
             sigma = np.concatenate([h.sigma for h in hosts])
             colour = np.concatenate([h.colour for h in hosts])
             count = np.concatenate([h.observations for h in hosts])
-            depth = np.median(np.concatenate([h.p_c[:, 2] for h in hosts]))
+        p_w = np.concatenate([se3.transform(v.T_w_c, v.p_c) for v in views])
+        z = np.concatenate([v.p_c[:, 2] for v in views])
+        depth = np.median(z)
+        sigma = np.hypot(sigma, bend(views, self.camera) * z)
         agreed = count >= self.config.min_observations
         return fuse_voxels(p_w[agreed], sigma[agreed], colour[agreed], count[agreed], self.config.voxel * float(depth))
 
     def _T_w_c(self, host: EdgePoints) -> FloatArray:
         return se3.inverse(self.map.pose_of(host.keyframe_id))
-
-
-@dataclass(frozen=True, slots=True)
-class PaintedEdges:
-    """Edge pixels rendered into an index image: a third of the time to build and query a tree."""
-
-    uv: FloatArray
-    """``(E, 2)``"""
-    index: IntArray
-    """``(H + 2 R, W + 2 R)`` edge within `AGREE_PX` of each pixel, or a little more, -1 where there is none."""
-
-    @classmethod
-    def of(cls, uv: FloatArray, size: tuple[int, int]) -> "PaintedEdges":
-        """Paint edge pixels ``(E, 2)`` of an image of ``size`` (width, height), the nearest last."""
-        width, height = (n + 2 * _REACH for n in size)
-        index = np.full(width * height, -1, dtype=np.int32)
-        u, v = np.rint(uv).astype(np.int64).T + _REACH
-        flat, order = v * width + u, np.arange(len(uv), dtype=np.int32)
-        for offset in _disc(_REACH, width):
-            index[flat + offset] = order
-        return cls(uv, index.reshape(height, width))
-
-    def nearest(self, uv: FloatArray) -> IntArray:
-        """Index of the edge pixel nearest to each of ``(N, 2)``, -1 where none is within `AGREE_PX`.
-
-        Queries are rounded to pixels, so that of two edges at nearly the same distance either may be returned.
-        """
-        height, width = self.index.shape
-        u, v = (uv + (_REACH + 0.5)).T  # half a pixel more, so that cutting off rounds
-        inside = np.flatnonzero((u >= 0) & (v >= 0) & (u < width) & (v < height))
-        near = self.index[v[inside].astype(np.intp), u[inside].astype(np.intp)]
-        some = np.flatnonzero(near >= 0)
-        query, edge = inside[some], near[some]
-        apart = self.uv[edge] - uv[query]
-        close = np.einsum("ij,ij->i", apart, apart) <= AGREE_PX**2
-        found = np.full(len(uv), -1, dtype=np.int64)
-        found[query[close]] = edge[close]
-        return found
-
-
-def _disc(radius: int, width: int) -> list[int]:
-    """Offsets of the pixels of a disc in a flat image, the farthest from its middle first."""
-    v, u = np.mgrid[-radius : radius + 1, -radius : radius + 1]
-    distance = (u * u + v * v).ravel()
-    order = np.argsort(-distance, kind="stable")
-    return [int(o) for o in (v * width + u).ravel()[order[distance[order] <= radius * radius]]]
 
 
 def fuse_voxels(

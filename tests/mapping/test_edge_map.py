@@ -9,7 +9,8 @@ from point_map import CAMERA, PointMap, small_motion
 from edgeslam_torch.config import EdgeConfig
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.map.depth_prior import depth_prior
-from edgeslam_torch.mapping.edge_map import AGREE_PX, PRIOR_CELL_PX, EdgeMap, EdgePoints, PaintedEdges, fuse_voxels
+from edgeslam_torch.map.edge_agreement import AGREE_PX, USUAL_BEND, PaintedEdges
+from edgeslam_torch.mapping.edge_map import PRIOR_CELL_PX, EdgeMap, EdgePoints, fuse_voxels
 
 
 def test_two_points_of_one_cell_worked_by_hand():
@@ -104,6 +105,15 @@ def test_only_agreed_points_are_given_out(points):
     some.hosts.append(host(points, 0, p_w, observations=counts))
     assert len(some.points().p_w) == 20
     assert edge_map(points).points().p_w.shape == (0, 3)
+
+
+def test_sigma_of_a_point_has_the_bend_of_the_map(points):
+    seen = host(points, 0, points.world.p_w[points.world.visible[0]][:20], observations=np.full(20, 2, np.int32))
+    some = edge_map(points, voxel=1e-6)
+    some.hosts.append(seen)
+    expected = np.hypot(0.01, USUAL_BEND * seen.p_c[:, 2])
+    np.testing.assert_allclose(np.sort(some.points().sigma_m), np.sort(expected), rtol=1e-5)
+    np.testing.assert_array_equal(seen.sigma, 0.01)  # the edge's own, which the solver uses, stays
 
 
 def test_edges_of_one_cell_share_a_prior_near_their_own(points, rng):

@@ -1,0 +1,70 @@
+"""How far keyframes disagree about the depth of the same edges: against errors that were put in."""
+
+import numpy as np
+import pytest
+
+from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.map.edge_agreement import SHARED, USUAL_BEND, View, bend
+
+CAMERA = Camera(640, 480, 400.0, 400.0, 319.5, 239.5)
+
+
+def flight(rng, errors, gap=0.05, edges=600):
+    """Views of one wall of posts from a camera that moves aside; all depths of a view are off by its log error."""
+    p_w = np.c_[rng.uniform(-3, 3, edges), rng.uniform(-1, 1, edges), rng.uniform(2.0, 4.0, edges)]
+    views = []
+    for i, error in enumerate(errors):
+        T_w_c = np.eye(4)
+        T_w_c[0, 3] = gap * i
+        p_c = p_w - T_w_c[:3, 3]
+        uv = CAMERA.project(p_c)
+        inside = (uv >= 5).all(1) & (uv < [635, 475]).all(1)
+        views.append(View(T_w_c, uv[inside], p_c[inside] * np.exp(error)))
+    return views
+
+
+@pytest.mark.parametrize("sigma", [0.004, 0.02])
+def test_drift_between_views_is_found(rng, sigma):
+    errors = sigma * rng.standard_normal(60)
+    assert bend(flight(rng, errors), CAMERA) == pytest.approx(SHARED * sigma, rel=0.25)
+
+
+def test_neighbours_are_not_asked(rng):
+    """Three keyframes that were refined together agree, whatever the drift from those three to the next three."""
+    errors = np.repeat([0.0, 0.02, 0.04, 0.06], 3)
+    apart = np.abs(np.subtract.outer(np.arange(12), np.arange(12))) >= 3
+    expected = np.median(np.abs(np.subtract.outer(errors, errors))[apart]) / 0.6745 / np.sqrt(2)
+    assert bend(flight(rng, errors, gap=0.01), CAMERA) == pytest.approx(SHARED * expected, rel=0.1)
+
+
+def test_views_that_agree_have_none(rng):
+    assert bend(flight(rng, np.zeros(20)), CAMERA) < 1e-6
+
+
+def test_an_error_that_all_share_is_not_seen(rng):
+    """Which is why `SHARED` is more than one."""
+    assert bend(flight(rng, np.full(20, 0.1)), CAMERA) < 0.01
+
+
+def test_edges_that_are_mistaken_for_others_do_not_count(rng):
+    views = flight(rng, 0.01 * rng.standard_normal(40))
+    right = bend(views, CAMERA)
+    for view in views:
+        some = rng.permutation(len(view.p_c))[: len(view.p_c) // 5]
+        view.p_c[some] *= rng.uniform(0.5, 2.0, (len(some), 1))
+    assert bend(views, CAMERA) == pytest.approx(right, rel=0.3)
+
+
+@pytest.mark.parametrize("case", ["none", "neighbours", "opposite"])
+def test_where_nothing_overlaps_it_is_the_usual(rng, case):
+    views = flight(rng, 0.1 * rng.standard_normal(12))
+    if case == "none":
+        views = []
+    elif case == "neighbours":
+        views = views[:3]
+    else:
+        for i, view in enumerate(views):
+            turn = np.deg2rad(90.0 * i)
+            view.T_w_c[:3, :3] = [[np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]]
+        views = views[:4]
+    assert bend(views, CAMERA) == USUAL_BEND
