@@ -10,6 +10,8 @@ from edgeslam_torch.geometry.rotations import wrapped
 from edgeslam_torch.navigation.arcs import Arcs, candidates
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.limits import NavLimits
+from edgeslam_torch.navigation.openings.turned import Walls
+from edgeslam_torch.navigation.openings.watch import ExitWatch
 from edgeslam_torch.navigation.route import CostToGo, cost_to_go
 from edgeslam_torch.navigation.sight import HOVER, Sight, Wish
 from edgeslam_torch.navigation.space import Space
@@ -43,6 +45,8 @@ _ELSEWHERE_M = 0.5
 """Way that counts as progress: what is to go may grow when a way turns out to be closed."""
 _WANTED_M = 0.45
 """Clearance that is wanted where there is space for it."""
+_UPRIGHT_M, _UPRIGHT_SHARE = (0.7, 1.5), 0.7
+"""Heights that a camera at the height of flight sees of a wall two metres away, and how much of them a wall fills."""
 
 
 class Phase(StrEnum):
@@ -68,6 +72,8 @@ class Pilot:
     """The last layer, for pictures."""
     way_w: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
     """The last way, for pictures."""
+    exits: ExitWatch = field(default_factory=ExitWatch)
+    """What was found of exits on the way, whatever the task."""
     _plan: CostToGo | None = None
     _planned_s: float = -math.inf
     _progress_s: float = math.nan
@@ -88,6 +94,11 @@ class Pilot:
         self.task, self.phase = task, Phase.FLYING
         self._plan, self._planned_s = None, -math.inf
         self._progress_s, self._least, self._waiting_s = math.nan, math.inf, math.nan
+
+    def walls(self) -> Walls:
+        """What is known at the height of flight, and what of it stands upright."""
+        layer = self.space.layer(self.limits.height_m, self.limits.radius_m + BAND_M)
+        return Walls(layer, self.space.upright(*_UPRIGHT_M, _UPRIGHT_SHARE))
 
     def update(self, sight: Sight) -> Wish:
         """Take in what is seen, and decide.
@@ -110,6 +121,7 @@ class Pilot:
     def _take_in(self, sight: Sight) -> None:
         if sight.revision != self._revision:
             self.space, self._revision = Space(), sight.revision
+            self.exits = ExitWatch()
             self._plan, self._least, self._progress_s = None, math.inf, math.nan
             self.phase = Phase.RISING
         if math.isnan(self._progress_s):
@@ -121,6 +133,8 @@ class Pilot:
         if sight.view is not None:
             self.space.observe(sight.view)
         self.space.flown(sight.p_w, self.limits.radius_m + BAND_M)
+        if self.exits.due(sight):
+            self.exits.look(self.walls(), sight)
 
     def _level(self, sight: Sight) -> Wish:
         """Rise above the height of flight, look left and right, and come back to it."""

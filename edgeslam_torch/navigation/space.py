@@ -110,6 +110,13 @@ class Space:
         band = self._odds[:, :, low:high]
         return Layer(np.asarray((band < FREE).all(2)), np.asarray((band > SOLID).any(2)), self._corner * CELL_M, CELL_M)
 
+    def upright(self, low_m: float, high_m: float, share: float) -> np.ndarray:
+        """Columns ``(SIDE, SIDE)`` of which at least this share between two heights is known to be solid."""
+        low, high = (round((z - self.floor_m) / CELL_M) for z in (low_m, high_m))
+        if not 0 <= low < high <= LEVELS:
+            raise ValueError(f"heights {low_m:.2f} to {high_m:.2f} m are outside the grid of {LEVELS * CELL_M:.1f} m")
+        return np.asarray((self._odds[:, :, low:high] > SOLID).mean(2) >= share)
+
     def _add(self, view: View) -> None:
         depth = np.where(np.isfinite(view.depth_m) & (view.depth_m > 0), view.depth_m, 0.0).astype(np.float32)
         self._carve(view, depth)

@@ -1,18 +1,16 @@
 """What a flight is for: where to go next, and when it is done."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
-from scipy import ndimage
 
+from edgeslam_torch.navigation.frontiers import Looks, frontiers, reachable
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.sight import Sight
 from edgeslam_torch.types import FloatArray
 
 ARRIVED_M = 0.2
-_FRONTIER_M = 0.5
-"""Smaller borders of the unseen are gaps between rays, not places to go."""
 
 
 class Task(Protocol):
@@ -54,24 +52,12 @@ class Explore:
 
     until_s: float = np.inf
     """On the clock of the sights."""
+    _looks: Looks = field(default_factory=Looks)
 
     def goals(self, layer: Layer, sight: Sight) -> np.ndarray:
         """Cells at the middle of each border between free and unseen."""
-        return frontiers(layer)
+        return self._looks.worth(reachable(frontiers(layer), layer, sight.p_w[:2]), layer, sight)
 
     def done(self, sight: Sight) -> bool:
-        """Whether the time is over."""
-        return sight.stamp_s >= self.until_s
-
-
-def frontiers(layer: Layer) -> np.ndarray:
-    """One cell ``(F, 2)`` for each border between free and unseen that is wide enough to fly through."""
-    unseen = ~layer.free & ~layer.solid
-    border = layer.free & ndimage.binary_dilation(unseen) & (layer.from_solid_m > 0.3)
-    parts, count = ndimage.label(border, np.ones((3, 3)))
-    out = []
-    for part in range(1, count + 1):
-        cells = np.argwhere(parts == part)
-        if len(cells) * layer.cell_m >= _FRONTIER_M:
-            out.append(cells[int(np.argmin(((cells - cells.mean(0)) ** 2).sum(1)))])
-    return np.array(out, dtype=int).reshape(-1, 2)
+        """Whether the time is over, or nothing is left to see."""
+        return sight.stamp_s >= self.until_s or self._looks.over(sight.stamp_s)

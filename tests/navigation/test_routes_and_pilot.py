@@ -8,12 +8,13 @@ import pytest
 
 from edgeslam_torch.drone.emulator.drone import DroneModel
 from edgeslam_torch.navigation.arcs import candidates, flown
+from edgeslam_torch.navigation.frontiers import frontiers
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.limits import NavLimits
 from edgeslam_torch.navigation.pilot import Phase, Pilot
 from edgeslam_torch.navigation.route import cost_to_go
 from edgeslam_torch.navigation.sight import Sight, Wish
-from edgeslam_torch.navigation.tasks import GoTo, frontiers
+from edgeslam_torch.navigation.tasks import GoTo
 
 
 def hall(size=60, wall=None, unseen=None):

@@ -47,6 +47,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--fault", action="append", default=[], metavar="NAME|all", help="likewise (default: none)")
     parser.add_argument(
+        "--behaviour",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="what they fly: goto (default), home, corridor or exits; may be repeated",
+    )
+    parser.add_argument("--first-seed", type=int, default=0, metavar="N", help="of those flights (default: 0)")
+    parser.add_argument(
         "--eyes",
         choices=("truth", "slam"),
         default="truth",
@@ -138,21 +146,33 @@ def _say(text: str) -> None:
 def _navigation(args: argparse.Namespace) -> int:
     """Flights through named worlds; 1 when one touched something."""
     from edgeslam_torch.errors import ConfigError
+    from edgeslam_torch.eval.judge.navigation.behaviours import BEHAVIOURS, is_corridor
     from edgeslam_torch.eval.judge.navigation.conditions import FAULTS
-    from edgeslam_torch.eval.judge.navigation.flight import Case
+    from edgeslam_torch.eval.judge.navigation.flown import Case
     from edgeslam_torch.eval.judge.navigation.runner import judge_flights
     from edgeslam_torch.eval.judge.navigation.table import markdown
     from edgeslam_torch.synthetic.sites.build import JUDGED, SITES
 
-    worlds = args.world or list(JUDGED)
+    worlds, behaviours = args.world or list(JUDGED), args.behaviour or ["goto"]
     faults = list(FAULTS)[1:] if args.fault == ["all"] else args.fault or ["none"]
-    for name, known, what in ((worlds, SITES, "--world"), (faults, FAULTS, "--fault")):
+    given = ((worlds, SITES, "--world"), (faults, FAULTS, "--fault"), (behaviours, BEHAVIOURS, "--behaviour"))
+    for name, known, what in given:
         for wrong in (n for n in name if n not in known):
             raise ConfigError(f"{what}: unknown name {wrong!r}; there are {', '.join(known)}")
-    if args.jobs < 1 or args.seeds < 1:
-        raise ConfigError("--jobs and --seeds must be at least 1")
+    if args.jobs < 1 or args.seeds < 1 or args.first_seed < 0:
+        raise ConfigError("--jobs and --seeds must be at least 1, --first-seed at least 0")
     out = args.out or Path("runs") / time.strftime("navigation-%Y%m%d-%H%M%S")
-    cases = [Case(world, seed, fault, args.eyes) for fault in faults for world in worlds for seed in range(args.seeds)]
+    seeds = range(args.first_seed, args.first_seed + args.seeds)
+    cases = [
+        Case(world, seed, fault, args.eyes, behaviour)
+        for behaviour in behaviours
+        for fault in faults
+        for world in worlds
+        for seed in seeds
+        if behaviour != "corridor" or is_corridor(world)
+    ]
+    if not cases:
+        raise ConfigError(f"--behaviour corridor: none of {', '.join(worlds)} is a corridor")
     flights = judge_flights(cases, out, args.jobs, _say)
     print(markdown(flights))
     print(f"results: {out / 'navigation.md'}")

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from edgeslam_torch.eval.judge.navigation.flight import Flown
+from edgeslam_torch.eval.judge.navigation.flown import Flown
 from edgeslam_torch.eval.judge.navigation.pictures import captioned
 from edgeslam_torch.geometry.camera import PRESETS
 from edgeslam_torch.geometry.mount import camera_on_body

@@ -1,9 +1,9 @@
-"""One judged flight, and what came of it."""
+"""One judged flight."""
 
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
-from typing import Any, Protocol
+from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -11,25 +11,24 @@ from edgeslam_torch.drone.emulator.air import Air
 from edgeslam_torch.drone.emulator.drone import Contact, DroneModel, Mode
 from edgeslam_torch.drone.emulator.lockstep import Event, LockstepTello
 from edgeslam_torch.drone.emulator.room import drone_at
+from edgeslam_torch.eval.judge.navigation.behaviours import BEHAVIOURS, Behaviour, Moment, right_exits
 from edgeslam_torch.eval.judge.navigation.conditions import FAULTS
 from edgeslam_torch.eval.judge.navigation.eyes import DEPTH_SIZE, TrueEyes, nothing_painted
+from edgeslam_torch.eval.judge.navigation.flown import Case, Flown
 from edgeslam_torch.eval.judge.navigation.near import WatchedEyes
 from edgeslam_torch.eval.judge.navigation.oracle import shortest_m
 from edgeslam_torch.eval.judge.navigation.slam_eyes import IMAGE_SIZE, SlamEyes
+from edgeslam_torch.flying.errands import Stay
 from edgeslam_torch.geometry.mount import TELLO_TILT_RAD
 from edgeslam_torch.navigation.limits import NavLimits
 from edgeslam_torch.navigation.pilot import Phase, Pilot
-from edgeslam_torch.navigation.sight import Sight
+from edgeslam_torch.navigation.sight import Sight, Wish
 from edgeslam_torch.navigation.supervisor import Supervisor
-from edgeslam_torch.navigation.tasks import GoTo
 from edgeslam_torch.synthetic.sites.build import named_site
 from edgeslam_torch.synthetic.sites.site import Site
 from edgeslam_torch.types import FloatArray
 
 TICK_S = 1.0 / 15.0
-LIMIT_S = 120.0
-REACHED_M = 0.35
-"""Of the true goal, when the pilot says that it is there."""
 _APART_S = 1.0
 """Touches nearer in time belong to one event: the body bounces every 10 ms while something pushes it."""
 _FREE_M = 0.6
@@ -43,66 +42,16 @@ class Eyes(Protocol):
         """The moment, from what arrived since the last one."""
 
 
-@dataclass(frozen=True, slots=True)
-class Case:
-    """What is flown."""
-
-    world: str
-    seed: int
-    fault: str = "none"
-    eyes: str = "truth"
-    """``truth`` or ``slam``: what the pilot is told."""
-
-
-@dataclass(slots=True)
-class Flown:
-    """What came of it."""
-
-    case: Case
-    reached: bool = False
-    ended: str = ""
-    """How: the pilot's phase, or why it landed."""
-    contacts: int = 0
-    """Events: a touch that lasts, or bounces at once, is one (`contact_events`)."""
-    crashed: bool = False
-    landed: bool = False
-    time_s: float = 0.0
-    """From take-off to the goal or the end."""
-    oracle_s: float = 0.0
-    """The shortest way with the true map, at the same speed and after the same take-off."""
-    path_m: float = 0.0
-    distance_m: float = 0.0
-    """To the goal, in the end."""
-    cruise_m_s: float = 0.0
-    """Median speed where there is space."""
-    clearance_p5_m: float = 0.0
-    """Beyond the hull."""
-    clearance_min_m: float = 0.0
-    cpu_ms: float = 0.0
-    """Planning and space, a tick."""
-    cpu_worst_ms: float = 0.0
-    near: list[int] = field(default_factory=lambda: [0, 0, 0])
-    """Sectors with something at .3 to 1 m; of them told .3 m too far; even at two sigmas (`near_counts`)."""
-    dangers: tuple[str, ...] = ()
-    """What the supervisor met."""
-    track_w: list[list[float]] = field(default_factory=list)
-    """``(N, 3)`` true way, for pictures."""
-    attitude: list[list[float]] = field(default_factory=list)
-    """``(N, 5)`` beside it: clock [s]; roll, pitch, yaw [rad]; clearance beyond the hull [m]."""
-
-    def record(self) -> dict[str, Any]:
-        """For JSON."""
-        return asdict(self)
-
-
 def fly(case: Case, limits: NavLimits | None = None) -> Flown:
-    """Fly to the site's goal in lockstep.
+    """Fly one case in lockstep.
 
     Raises:
-        ValueError: If the world or the fault is unknown.
+        ValueError: If the world, the fault or the behaviour is unknown.
     """
     if case.fault not in FAULTS:
         raise ValueError(f"unknown fault {case.fault!r}; there are {', '.join(FAULTS)}")
+    if case.behaviour not in BEHAVIOURS:
+        raise ValueError(f"unknown behaviour {case.behaviour!r}; there are {', '.join(BEHAVIOURS)}")
     limits, conditions = limits or NavLimits(), FAULTS[case.fault]
     site = named_site(case.world, case.seed)
     wind = np.array([0.0, conditions.wind_m_s, 0.0])
@@ -112,13 +61,46 @@ def fly(case: Case, limits: NavLimits | None = None) -> Flown:
     tello = LockstepTello(drone, paint if case.eyes == "slam" else nothing_painted, conditions.radio, case.seed)
     seeing: Eyes = SlamEyes(camera, conditions, case.seed) if case.eyes == "slam" else TrueEyes(site, drone, conditions)
     eyes = WatchedEyes(seeing, site)
-    pilot = Pilot(GoTo(site.goal_w / conditions.scale), limits)
-    supervisor = Supervisor(limits)
-    found = Flown(case, oracle_s=_take_off_s(limits) + shortest_m(site, limits) / limits.speed_m_s)
-    ticks = _fly(tello, eyes, pilot, supervisor, conditions.hung_s, found)
-    _sum_up(found, site, drone, ticks)
+    errand = _Errand(site, BEHAVIOURS[case.behaviour], Pilot(Stay(), limits), conditions.scale)
+    found = Flown(case)
+    if case.behaviour == "goto":
+        found.oracle_s = _take_off_s(limits) + shortest_m(site, limits) / limits.speed_m_s
+    ticks = _fly(tello, eyes, errand, Supervisor(limits), conditions.hung_s, found)
+    _sum_up(found, site, drone, ticks, BEHAVIOURS[case.behaviour])
+    known = errand.pilot.exits.exits()
+    found.exits = [len(site.exits), len(known), right_exits(known, site)]
     found.near = [eyes.counts.sectors, eyes.counts.too_far, eyes.counts.surely_too_far]
     return found
+
+
+class _Errand:
+    """The pilot, and what it is to do next."""
+
+    def __init__(self, site: Site, behaviour: Behaviour, pilot: Pilot, scale: float) -> None:
+        self.pilot, self.limit_s = pilot, behaviour.limit_s
+        self._site, self._scale, self._steps = site, scale, list(behaviour.steps)
+        self._track: list[FloatArray] = []
+        self._first = True
+
+    def update(self, sight: Sight) -> Wish:
+        """What the pilot wishes; the next task is taken up when one has ended, however it did."""
+        self._track.append(sight.p_w[:2].copy())
+        if self._first or (self.ended() and self._steps):
+            step = self._steps.pop(0)
+            task = step(Moment(self._site, sight.stamp_s, self._scale, self.pilot, np.array(self._track)))
+            if self._first:  # it still rises and looks around
+                self.pilot.task, self._first = task, False
+            else:
+                self.pilot.begin(task)
+        return self.pilot.update(sight)
+
+    def ended(self) -> bool:
+        """Whether the present task has."""
+        return self.pilot.phase in (Phase.DONE, Phase.STUCK)
+
+    def over(self) -> bool:
+        """Whether all of them have."""
+        return self.ended() and not self._steps
 
 
 @dataclass(slots=True)
@@ -134,7 +116,7 @@ class _Tick:
 def _fly(
     tello: LockstepTello,
     eyes: Eyes,
-    pilot: Pilot,
+    errand: _Errand,
     supervisor: Supervisor,
     hung_s: tuple[float, float] | None,
     found: Flown,
@@ -142,7 +124,7 @@ def _fly(
     drone, ticks, dangers, touches = tello.drone, [], [], []
     tello.send("takeoff")
     landing = False
-    while tello.clock_s < LIMIT_S:
+    while tello.clock_s < errand.limit_s:
         events = tello.advance(TICK_S)
         touched = [e for e in events if isinstance(e, Contact)]
         touches += [t.clock_s for t in touched]
@@ -155,15 +137,15 @@ def _fly(
         began = time.process_time()
         supervisor.see(sight)
         if hung_s is None or not hung_s[0] <= tello.clock_s < hung_s[1]:
-            supervisor.propose(pilot.update(sight), tello.clock_s)
+            supervisor.propose(errand.update(sight), tello.clock_s)
         order = supervisor.order(tello.clock_s)
         cpu_s = time.process_time() - began
         speed, clear_m = float(np.linalg.norm(drone.velocity)), drone.clearance(drone.p_w)
         ticks.append(_Tick(tello.clock_s, drone.p_w.copy(), drone.rpy(), speed, clear_m, cpu_s))
         if order.danger and str(order.danger) not in dangers:
             dangers.append(str(order.danger))
-        if pilot.phase in (Phase.DONE, Phase.STUCK):
-            found.ended, found.time_s = found.ended or str(pilot.phase), found.time_s or tello.clock_s
+        if errand.over():
+            found.ended, found.time_s = found.ended or str(errand.pilot.phase), found.time_s or tello.clock_s
             landing = True
             tello.send("land")
         elif order.land:
@@ -190,7 +172,7 @@ def contact_events(touches_s: Sequence[float]) -> int:
     return sum(1 for k, t in enumerate(touches_s) if k == 0 or t - touches_s[k - 1] > _APART_S)
 
 
-def _sum_up(found: Flown, site: Site, drone: DroneModel, ticks: list[_Tick]) -> None:
+def _sum_up(found: Flown, site: Site, drone: DroneModel, ticks: list[_Tick], behaviour: Behaviour) -> None:
     """Figures of the ticks."""
     if not ticks:
         return
@@ -202,7 +184,8 @@ def _sum_up(found: Flown, site: Site, drone: DroneModel, ticks: list[_Tick]) -> 
     found.attitude = np.round(np.column_stack([clock, rpy, hull]), 3).tolist()
     found.path_m = float(np.linalg.norm(np.diff(p[:, :2], axis=0), axis=1).sum())
     found.distance_m = float(np.linalg.norm(drone.p_w[:2] - site.goal_w[:2]))
-    found.reached = found.ended == str(Phase.DONE) and found.distance_m < REACHED_M and not found.contacts
+    found.home_m = float(np.linalg.norm(drone.p_w[:2]))
+    found.reached = found.ended == str(Phase.DONE) and not found.contacts and behaviour.reached(found, site)
     moving = (hull > _FREE_M) & (speed > 0.1)
     found.cruise_m_s = float(np.median(speed[moving])) if moving.any() else float("nan")
     found.clearance_p5_m, found.clearance_min_m = float(np.percentile(hull, 5)), float(hull.min())

@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from edgeslam_torch.eval.judge.navigation.flight import Flown
+from edgeslam_torch.eval.judge.navigation.flown import Flown
 from edgeslam_torch.eval.judge.navigation.oracle import true_layer
 from edgeslam_torch.navigation.limits import NavLimits
 from edgeslam_torch.synthetic.sites.build import named_site

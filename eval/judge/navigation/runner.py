@@ -9,7 +9,8 @@ from pathlib import Path
 import cv2
 
 from edgeslam_torch.eval.judge.navigation.film import film_strip
-from edgeslam_torch.eval.judge.navigation.flight import Case, Flown, fly
+from edgeslam_torch.eval.judge.navigation.flight import fly
+from edgeslam_torch.eval.judge.navigation.flown import Case, Flown
 from edgeslam_torch.eval.judge.navigation.pictures import top_view
 from edgeslam_torch.eval.judge.navigation.table import markdown
 from edgeslam_torch.files.atomic import write_text
@@ -49,7 +50,8 @@ def judge_flights(cases: Sequence[Case], out: Path, jobs: int, say: Callable[[st
 
 
 def _name(case: Case) -> str:
-    return f"{case.world}_{case.seed}_{case.fault}_{case.eyes}"
+    name = f"{case.world}_{case.seed}_{case.fault}_{case.eyes}"
+    return name if case.behaviour == "goto" else f"{name}_{case.behaviour}"
 
 
 def _file(out: Path, case: Case) -> Path:
@@ -66,9 +68,12 @@ def _earlier(file: Path, case: Case) -> Flown | None:
 
 def _line(flown: Flown) -> str:
     told = f"; {', '.join(flown.dangers)}" if flown.dangers else ""
+    there, found, right = flown.exits
     return (
-        f"{flown.case.world} {flown.case.seed} {flown.case.fault} by {flown.case.eyes}: "
+        f"{flown.case.behaviour} {flown.case.world} {flown.case.seed} {flown.case.fault} by {flown.case.eyes}: "
         f"{flown.ended} after {flown.time_s:.1f} s "
-        f"(oracle {flown.oracle_s:.1f}), {flown.distance_m:.2f} m from the goal, {flown.contacts} contacts, "
+        f"(oracle {flown.oracle_s:.1f}), {flown.distance_m:.2f} m from the goal, "
+        f"{flown.home_m:.2f} m from the take-off, {flown.contacts} contacts, "
+        f"exits: {right} of {there} found and {found - right} wrong, "
         f"clearance {flown.clearance_min_m:.2f} m{told}"
     )

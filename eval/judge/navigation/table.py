@@ -5,18 +5,21 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from edgeslam_torch.eval.judge.navigation.flight import Flown
+from edgeslam_torch.eval.judge.navigation.flown import Flown
 
 _Z = 1.959964
 HEAD = (
-    "| world | fault | eyes | flights | goal reached | contact | no contact, on the floor in the end "
+    "| world | behaviour | fault | eyes | flights | reached | contact | no contact, on the floor in the end "
     "| clearance p5, min [m] "
-    "| time over oracle | cruise [m/s] | CPU a tick, worst [ms] |\n|---|---|---|---|---|---|---|---|---|---|---|\n"
+    "| time over oracle | cruise [m/s] | CPU a tick, worst [ms] |\n|---|---|---|---|---|---|---|---|---|---|---|---|\n"
 )
 NEAR_HEAD = (
     "\n| eyes | sectors of 3.7 degrees with something at .3 to 1 m | told more than .3 m too far | less two sigmas |\n"
     "|---|---|---|---|\n"
 )
+
+
+EXITS_HEAD = "\n| behaviour | eyes | exits there | found | precision | recall |\n|---|---|---|---|---|---|\n"
 
 
 def wilson(successes: int, trials: int) -> tuple[float, float]:
@@ -36,17 +39,30 @@ def wilson(successes: int, trials: int) -> tuple[float, float]:
 
 def markdown(flights: Sequence[Flown]) -> str:
     """One row for every world and fault, and one for all static worlds without a fault."""
-    groups: dict[tuple[str, str, str], list[Flown]] = {}
+    groups: dict[tuple[str, ...], list[Flown]] = {}
     for flown in flights:
-        groups.setdefault((flown.case.eyes, flown.case.fault, flown.case.world), []).append(flown)
-    rows = [_row(world, fault, eyes, group) for (eyes, fault, world), group in sorted(groups.items())]
+        case = flown.case
+        groups.setdefault((case.eyes, case.behaviour, case.fault, case.world), []).append(flown)
+    rows = [_row(key[::-1], groups[key]) for key in sorted(groups)]
     plain = [f for f in flights if f.case.fault == "none"]
     faulty = [f for f in flights if f.case.fault != "none"]
     for name, group in (("all", plain), ("all with a fault", faulty)):
         if len({(f.case.world, f.case.fault) for f in group}) > 1:
-            eyes = ", ".join(sorted({f.case.eyes for f in group}))
-            rows.append(_row(name, "none" if group is plain else "any", eyes, group))
-    return HEAD + "".join(rows) + _near(flights)
+            eyes, behaviour = (", ".join(sorted({getattr(f.case, k) for f in group})) for k in ("eyes", "behaviour"))
+            rows.append(_row((name, "none" if group is plain else "any", behaviour, eyes), group))
+    return HEAD + "".join(rows) + _exits(flights) + _near(flights)
+
+
+def _exits(flights: Sequence[Flown]) -> str:
+    """A table of exits; nothing where there are none and none was found."""
+    rows = []
+    for eyes, behaviour in sorted({(f.case.eyes, f.case.behaviour) for f in flights}):
+        group = [f.exits for f in flights if (f.case.eyes, f.case.behaviour) == (eyes, behaviour)]
+        there, found, right = np.sum(group, axis=0).tolist()
+        if there or found:
+            shares = f"{_share(right, found)} | {_share(right, there)}"
+            rows.append(f"| {behaviour} | {eyes} | {there} | {found} | {shares} |\n")
+    return EXITS_HEAD + "".join(rows) if rows else ""
 
 
 def _near(flights: Sequence[Flown]) -> str:
@@ -59,12 +75,15 @@ def _near(flights: Sequence[Flown]) -> str:
     return NEAR_HEAD + "".join(rows) if rows else ""
 
 
-def _row(world: str, fault: str, eyes: str, group: Sequence[Flown]) -> str:
+def _row(names: tuple[str, ...], group: Sequence[Flown]) -> str:
+    """``names``: world, fault, behaviour, eyes."""
+    world, fault, behaviour, eyes = names
     n = len(group)
-    ratio = [f.time_s / f.oracle_s for f in group if f.reached]
+    ratio = [f.time_s / f.oracle_s for f in group if f.reached and f.oracle_s]
     cruise = [f.cruise_m_s for f in group if math.isfinite(f.cruise_m_s)]
     cells = (
         world,
+        behaviour,
         fault,
         eyes,
         str(n),

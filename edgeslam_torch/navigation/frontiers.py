@@ -1,0 +1,82 @@
+"""Where the known free space ends, and which of those places were looked at in vain."""
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy import ndimage
+
+from edgeslam_torch.navigation.layer import Layer
+from edgeslam_torch.navigation.sight import Sight
+from edgeslam_torch.types import FloatArray
+
+_PASSED_M = 0.25
+"""Distance from solids at which a drone passes: what of a border is nearer to one leads nowhere."""
+_FRONTIER_M = 0.3
+"""Smaller borders of the unseen are gaps between rays, not places to go; a doorway of 0.85 m has this much."""
+_NEAR_M = 1.2
+"""From nearer a look should show what is behind the border."""
+_LOOKED_S = 4.0
+"""Time near a border after which it stays unseen: what is above or below the picture is not seen from beside it."""
+_SAME_M = 0.6
+"""Borders move as they are looked at."""
+_ROUND_S = 13.0
+"""Time of a full turn where no way is known, with a second to spare: after it there is nothing left to see."""
+
+
+def frontiers(layer: Layer) -> np.ndarray:
+    """One cell ``(F, 2)`` for each border between free and unseen that is wide enough to fly through."""
+    unseen = ~layer.free & ~layer.solid
+    border = layer.free & ndimage.binary_dilation(unseen) & (layer.from_solid_m > _PASSED_M)
+    parts, count = ndimage.label(border, np.ones((3, 3)))
+    out = []
+    for part in range(1, count + 1):
+        cells = np.argwhere(parts == part)
+        if len(cells) * layer.cell_m >= _FRONTIER_M:
+            out.append(cells[int(np.argmin(((cells - cells.mean(0)) ** 2).sum(1)))])
+    return np.array(out, dtype=int).reshape(-1, 2)
+
+
+def reachable(cells: np.ndarray, layer: Layer, here_w: FloatArray) -> np.ndarray:
+    """Those of the cells ``(G, 2)`` to which something that is not solid leads from a place ``(2,)``."""
+    parts, _ = ndimage.label(layer.from_solid_m > _PASSED_M - 0.5 * layer.cell_m)
+    i, j = layer.cells(here_w)
+    around = parts[max(0, i - 2) : i + 3, max(0, j - 2) : j + 3]
+    return cells[np.isin(parts[cells[:, 0], cells[:, 1]], around[around > 0])]
+
+
+@dataclass(slots=True)
+class Looks:
+    """Remembers where a drone looked in vain, and since when nothing is left to look at."""
+
+    _near: list[tuple[FloatArray, float]] = field(default_factory=list)
+    """Places ``(2,)`` with the time spent near them [s]."""
+    _asked_s: float = math.nan
+    _nothing_s: float = math.nan
+
+    def worth(self, cells: np.ndarray, layer: Layer, sight: Sight) -> np.ndarray:
+        """Those of the cells ``(G, 2)`` that were not looked at in vain; to be asked at every plan."""
+        passed = 0.0 if math.isnan(self._asked_s) else min(sight.stamp_s - self._asked_s, 1.0)
+        self._asked_s = sight.stamp_s
+        places = layer.centres(cells).reshape(-1, 2)
+        for place in places[np.linalg.norm(places - sight.p_w[:2], axis=1) < _NEAR_M]:
+            self._spend(place, passed)
+        vain = [place for place, spent_s in self._near if spent_s > _LOOKED_S]
+        good = [all(np.linalg.norm(place - other) > _SAME_M for other in vain) for place in places]
+        kept = cells[np.array(good, dtype=bool)]
+        if len(kept):
+            self._nothing_s = math.nan
+        elif math.isnan(self._nothing_s):
+            self._nothing_s = sight.stamp_s
+        return np.asarray(kept)
+
+    def over(self, now_s: float) -> bool:
+        """Whether there was nothing left to look at for as long as a look around takes."""
+        return now_s - self._nothing_s > _ROUND_S  # false while it is NaN
+
+    def _spend(self, place_w: FloatArray, passed_s: float) -> None:
+        for k, (other, spent_s) in enumerate(self._near):
+            if np.linalg.norm(place_w - other) <= _SAME_M:
+                self._near[k] = other, spent_s + passed_s
+                return
+        self._near.append((place_w, passed_s))

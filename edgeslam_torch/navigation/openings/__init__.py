@@ -1,0 +1,1 @@
+"""Exits and pathways: what the free space around a drone leads to."""

@@ -1,0 +1,111 @@
+"""Exits: openings of a door's width in a wall, with free space on both sides.
+
+A poster, a closed door and a window's pane are solid to depth, so they leave no opening. What depth takes for an
+opening and is none must also have a wall to both sides in one line, and space that widens before and behind it: two
+cupboards that face each other across a corridor have not.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from edgeslam_torch.navigation.openings.turned import Turned, Walls, runs, turned, wall_directions
+from edgeslam_torch.types import FloatArray
+
+NARROWEST_M, WIDEST_M = 0.6, 1.5
+"""Width of an exit: a drone passes, a door is no wider (a wing of a double door is 1.2 m)."""
+_JAMB_M, _WALL_SHARE = 0.2, 0.7
+"""Wall in line with the opening: metres at each side at least, and share of the opening's width at both sides together.
+Things that stand along a corridor narrow it; they do not make a wall of it."""
+_ALONGSIDE_M = 1.2
+"""How far to each side wall counts."""
+_BEYOND_M = (0.25, 0.65)
+"""Band before and behind the wall in which there must be space: from a frame's depth to where a drone stands."""
+_BESIDE_M = (0.15, 0.4)
+"""Band beside the opening's ends in which the space widens."""
+_FREE_SHARE, _SOLID_SHARE = 0.8, 0.3
+_SAME_M = 0.5
+"""Two openings nearer than this are one: no wall between two doors is thinner."""
+
+
+@dataclass(frozen=True, slots=True)
+class Gap:
+    """An opening as one look at the grid shows it."""
+
+    centre_w: FloatArray
+    """``(2,)`` [m]."""
+    normal_w: FloatArray
+    """``(2,)`` level unit vector through it, away from the place that was looked from."""
+    width_m: float
+    wall_m: float
+    """Wall in line with it, to both sides together: the more, the surer."""
+
+
+def gaps(walls: Walls, here_w: FloatArray) -> list[Gap]:
+    """Openings around a place ``(2,)``, the surest first."""
+    found = []
+    for angle in wall_directions(walls, here_w):
+        grid = turned(walls, here_w, angle)
+        found += [_gap(grid, t, *ends) for t in range(2, len(grid.free) - 2) for ends in _openings(grid, t)]
+    return _distinct([gap for gap in found if gap is not None])
+
+
+def _wall(grid: Turned, t: int) -> np.ndarray:
+    """Where a row, or one beside it, stands upright, ``(N,)``."""
+    return np.asarray(grid.upright[t - 1 : t + 2].any(0))
+
+
+def _openings(grid: Turned, t: int) -> list[tuple[int, int]]:
+    """Ends of what is free between two parts of a wall in row ``t`` and the rows beside it."""
+    wall = _wall(grid, t)
+    if wall.sum() * grid.cell_m < _WALL_SHARE * NARROWEST_M:
+        return []
+    free = np.asarray(grid.free[t - 1 : t + 2].all(0))
+    parts = [part for part in runs(wall) if (part[1] - part[0]) * grid.cell_m >= _JAMB_M - 1e-9]
+    out = []
+    for (_, low), (high, _) in zip(parts[:-1], parts[1:], strict=True):
+        width = (high - low + 1) * grid.cell_m
+        # A cell at each end may have been seen too little to be known.
+        if NARROWEST_M <= width <= WIDEST_M + grid.cell_m and free[low + 1 : high - 1].all():
+            out.append((int(low), int(high)))
+    return out
+
+
+def _gap(grid: Turned, t: int, low: int, high: int) -> Gap | None:
+    """The opening between two cells of a row, if it leads from somewhere to somewhere."""
+    if not all(_leads(grid, t, low, high, side) for side in (-1, 1)):
+        return None
+    reach = round(_ALONGSIDE_M / grid.cell_m)
+    wall = _wall(grid, t)
+    length = grid.cell_m * (wall[max(0, low - reach) : low].sum() + wall[high : high + reach].sum())
+    width = (high - low + 1) * grid.cell_m  # a cell that a wall only touches is solid: half of each end's is open
+    if length < _WALL_SHARE * width:
+        return None
+    rows = np.arange(t - 1, t + 2)
+    beside = grid.upright[rows, max(0, low - 2) : low].any(1) | grid.upright[rows, high : high + 2].any(1)
+    centre = grid.at(0.5 * (low + high - 1), float(rows[beside].mean()) if beside.any() else float(t))
+    away = float((centre - grid.centre_w) @ grid.left_w)
+    return Gap(centre, grid.left_w * (1.0 if away >= 0 else -1.0), width, float(length))
+
+
+def _leads(grid: Turned, t: int, low: int, high: int, side: int) -> bool:
+    """Whether there is space on one side of the wall, wider than the opening."""
+    near, far = (round(x / grid.cell_m) for x in _BEYOND_M)
+    rows = t + side * np.arange(near, far + 1)
+    rows = rows[(rows >= 0) & (rows < len(grid.free))]
+    fifth = (high - low) // 5
+    before = grid.free[rows, low + fifth : high - fifth]
+    if before.size == 0 or before.mean() < _FREE_SHARE:
+        return False
+    first, last = (round(x / grid.cell_m) for x in _BESIDE_M)
+    ends = grid.solid[rows, max(0, low - last) : low - first], grid.solid[rows, high + first : high + last]
+    return min((float(end.mean()) for end in ends if end.size), default=1.0) < _SOLID_SHARE
+
+
+def _distinct(found: list[Gap]) -> list[Gap]:
+    """One of those that overlap: the one with most wall."""
+    kept: list[Gap] = []
+    for gap in sorted(found, key=lambda g: -g.wall_m):
+        if all(np.linalg.norm(gap.centre_w - other.centre_w) > _SAME_M for other in kept):
+            kept.append(gap)
+    return kept

@@ -1,0 +1,103 @@
+"""The surroundings seen along a direction: free space and walls on a grid whose rows run along a wall."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from edgeslam_torch.navigation.layer import Layer
+from edgeslam_torch.types import FloatArray
+
+REACH_M = 6.0
+"""Half the side of what is looked at: beyond it a wall of centimetres has no place."""
+_STEP_RAD = math.radians(3.0)
+_APART_RAD = math.radians(12.0)
+"""Walls that differ by less are one direction."""
+_DIRECTIONS = 2
+"""With what is square to each: a corridor's end is too short to stand out."""
+
+
+@dataclass(frozen=True, slots=True)
+class Walls:
+    """A layer, and which of its solid cells stand upright, as walls do and tables do not."""
+
+    layer: Layer
+    upright: np.ndarray
+    """``(X, Y)`` bool."""
+
+
+@dataclass(frozen=True, slots=True)
+class Turned:
+    """Square of cells around a place; ``[t, s]``: s along the direction, t to its left."""
+
+    free: np.ndarray
+    solid: np.ndarray
+    upright: np.ndarray
+    centre_w: FloatArray
+    """``(2,)`` of the square [m]."""
+    along_w: FloatArray
+    """``(2,)`` unit vector of s."""
+    cell_m: float
+
+    @property
+    def left_w(self) -> FloatArray:
+        """``(2,)`` unit vector of t."""
+        return np.array([-self.along_w[1], self.along_w[0]])
+
+    def at(self, s: float, t: float) -> FloatArray:
+        """Point ``(2,)`` of the world at a cell, which may lie between cells."""
+        half = 0.5 * (self.free.shape[0] - 1)
+        offset = ((s - half) * self.along_w + (t - half) * self.left_w) * self.cell_m
+        return np.asarray(self.centre_w + offset)
+
+
+def turned(walls: Walls, centre_w: FloatArray, angle_rad: float) -> Turned:
+    """What is around a place ``(2,)``, along a direction; what lies beyond the layer was not seen."""
+    layer = walls.layer
+    along = np.array([math.cos(angle_rad), math.sin(angle_rad)])
+    steps = np.arange(-round(REACH_M / layer.cell_m), round(REACH_M / layer.cell_m) + 1) * layer.cell_m
+    t, s = np.meshgrid(steps, steps, indexing="ij")
+    p = centre_w + s[..., None] * along + t[..., None] * np.array([-along[1], along[0]])
+    index = np.floor((p - layer.corner_w) / layer.cell_m).astype(int)
+    inside = ((index >= 0) & (index < layer.free.shape)).all(-1)
+    i, j = np.moveaxis(np.where(inside[..., None], index, 0), -1, 0)
+    free, solid, upright = (mask[i, j] & inside for mask in (layer.free, layer.solid, walls.upright))
+    return Turned(free, solid, upright, np.asarray(centre_w, dtype=np.float64), along, layer.cell_m)
+
+
+def wall_directions(walls: Walls, centre_w: FloatArray) -> list[float]:
+    """Directions in [0, pi) along which upright cells stand in rows, the clearest first, each followed by the one
+    square to it; none where there are no walls."""
+    layer = walls.layer
+    p = layer.centres(np.argwhere(walls.upright)) - centre_w
+    p = p[np.abs(p).max(axis=1) < REACH_M] if len(p) else p
+    if len(p) < 5:
+        return []
+    angles = np.arange(0.0, math.pi - 1e-9, _STEP_RAD)
+    # How sharply the cells fall into rows: the sum of squares of the rows' counts.
+    across = p[:, 1, None] * np.cos(angles) - p[:, 0, None] * np.sin(angles)
+    rows = np.floor(across / layer.cell_m).astype(int)
+    rows -= rows.min()
+    width = int(rows.max()) + 1
+    counts = np.zeros((len(angles), width))
+    np.add.at(counts, (np.broadcast_to(np.arange(len(angles)), rows.shape), rows), 1.0)
+    score = (counts**2).sum(1)
+    found: list[float] = []
+    for k in np.argsort(-score):
+        if score[k] < 0.25 * score.max() or len(found) == 2 * _DIRECTIONS:
+            break
+        apart = [abs((angles[k] - other + math.pi / 4) % (math.pi / 2) - math.pi / 4) for other in found]
+        if all(a > _APART_RAD for a in apart):
+            found += [float(angles[k]), float((angles[k] + math.pi / 2) % math.pi)]
+    return found
+
+
+def runs(mask: np.ndarray) -> np.ndarray:
+    """Where a mask ``(N,)`` is true without a gap: ``(R, 2)`` first cell and the one after the last.
+
+    Example:
+        >>> runs(np.array([True, True, False, True])).tolist()
+        [[0, 2], [3, 4]]
+    """
+    edge = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
+    return edge.reshape(-1, 2)

@@ -1,0 +1,142 @@
+"""Exits over a flight: what one look takes for an opening counts when looks from other places agree."""
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from edgeslam_torch.geometry.rotations import wrapped
+from edgeslam_torch.navigation.openings.exits import WIDEST_M, Gap, gaps
+from edgeslam_torch.navigation.openings.turned import Walls
+from edgeslam_torch.navigation.sight import Sight
+from edgeslam_torch.types import FloatArray
+
+_EVERY_S = 0.5
+_SAME_M, _SAME_RAD = 0.5, math.radians(35.0)
+"""A look within these of an earlier one is of the same opening."""
+_PLACES_M = 0.5
+"""Distance between two places that count as two."""
+_NEAR_M = 4.0
+"""Farther away a door is a few cells of uncertain depth: such looks are kept and do not count."""
+_FIELD_RAD = math.radians(20.0)
+"""Half the camera's field of view, less a margin: an opening within it that is not found again counts against it."""
+_LOOKS = 3
+_CELL_SIGMAS = 1.0 / math.sqrt(6.0)
+"""Standard deviation of a width between two cells, in cells: each end is anywhere in its own."""
+
+
+@dataclass(frozen=True, slots=True)
+class Exit:
+    """An opening of a door's width in a wall, free on both sides, seen from at least two places."""
+
+    centre_w: FloatArray
+    """``(3,)`` its middle at the height of the drone, in the drone's world [m]."""
+    normal_w: FloatArray
+    """``(3,)`` level unit vector through it, away from where it was seen first."""
+    width_m: float
+    width_sigma_m: float
+    position_sigma_m: float
+    """Standard deviation of each level coordinate of the middle, relative to the drone's present place [m]."""
+    places: int
+    """From how many places it was seen."""
+
+    def beyond(self, away_m: float) -> FloatArray:
+        """The point ``(3,)`` behind it; before it with a negative distance."""
+        return np.asarray(self.centre_w + away_m * self.normal_w)
+
+
+@dataclass(slots=True)
+class _Seen:
+    """One opening, look by look."""
+
+    gaps: list[Gap]
+    places_w: list[FloatArray]
+    near: int = 0
+    missed: int = 0
+
+    @property
+    def centre_w(self) -> FloatArray:
+        return np.asarray(np.median([g.centre_w for g in self.gaps], axis=0))
+
+
+@dataclass(slots=True)
+class ExitWatch:
+    """Looks for exits while a drone flies."""
+
+    _seen: list[_Seen] = field(default_factory=list)
+    _looked_s: float = -math.inf
+    _sight: Sight | None = None
+
+    def due(self, sight: Sight) -> bool:
+        """Whether it is time for another look."""
+        return sight.metric and sight.tracked and sight.stamp_s - self._looked_s >= _EVERY_S
+
+    def look(self, walls: Walls, sight: Sight) -> None:
+        """Compare what the grid shows now with what it showed before."""
+        self._looked_s, self._sight = sight.stamp_s, sight
+        here = sight.p_w[:2]
+        found = gaps(walls, here)
+        for seen in self._seen:
+            if not any(_same(gap, seen) for gap in found) and _in_view(seen.centre_w, sight):
+                seen.missed += 1
+        for gap in found:
+            self._note(gap, here)
+        self._seen = [seen for seen in self._seen if seen.missed <= 2 * max(len(seen.gaps), _LOOKS)]
+
+    def exits(self) -> tuple[Exit, ...]:
+        """What counts as an exit now, the nearest first."""
+        if self._sight is None:
+            return ()
+        good = [s for s in self._seen if s.near >= _LOOKS and s.near > s.missed and _places(s.places_w) >= 2]
+        found = [found for seen in good if (found := self._exit(seen, self._sight)).width_m <= WIDEST_M]
+        return tuple(sorted(found, key=lambda e: float(np.linalg.norm(e.centre_w[:2] - self._sight_w))))
+
+    @property
+    def _sight_w(self) -> FloatArray:
+        assert self._sight is not None
+        return self._sight.p_w[:2]
+
+    def _note(self, gap: Gap, here_w: FloatArray) -> None:
+        seen = next((s for s in self._seen if _same(gap, s)), None)
+        if seen is None:
+            seen = _Seen([], [])
+            self._seen.append(seen)
+        seen.gaps.append(gap)
+        if np.linalg.norm(gap.centre_w - here_w) < _NEAR_M:
+            seen.near += 1
+            seen.places_w.append(here_w.copy())
+
+    def _exit(self, seen: _Seen, sight: Sight) -> Exit:
+        centres, widths = np.array([g.centre_w for g in seen.gaps]), np.array([g.width_m for g in seen.gaps])
+        first = seen.gaps[0].normal_w
+        turned = [g.normal_w * np.sign(g.normal_w @ first) for g in seen.gaps]
+        normal = np.sum(turned, axis=0) / np.linalg.norm(np.sum(turned, axis=0))
+        cell = 0.1 * _CELL_SIGMAS
+        centre, width = np.median(centres, axis=0), float(np.median(widths))
+        away = float(np.linalg.norm(centre - sight.p_w[:2]))
+        spread = float(np.sqrt(0.5 * np.mean(((centres - centre) ** 2).sum(1))))
+        position = math.hypot(cell, spread, sight.position_sigma_m, sight.scale_sigma * away)
+        width_sigma = math.hypot(cell, float(np.std(widths)), sight.scale_sigma * width)
+        return Exit(np.array([*centre, sight.p_w[2]]), np.array([*normal, 0.0]), width, width_sigma, position,
+                    _places(seen.places_w))  # fmt: skip
+
+
+def _same(gap: Gap, seen: _Seen) -> bool:
+    """The normal may point either way: the drone may have flown through."""
+    turned = math.acos(min(1.0, abs(float(gap.normal_w @ seen.gaps[0].normal_w)))) if seen.gaps else 0.0
+    return turned < _SAME_RAD and float(np.linalg.norm(gap.centre_w - seen.centre_w)) < _SAME_M
+
+
+def _in_view(centre_w: FloatArray, sight: Sight) -> bool:
+    offset = centre_w - sight.p_w[:2]
+    bearing = float(wrapped(np.array(math.atan2(offset[1], offset[0]) - sight.yaw_rad)))
+    return 1.0 < float(np.linalg.norm(offset)) < _NEAR_M and abs(bearing) < _FIELD_RAD
+
+
+def _places(places_w: list[FloatArray]) -> int:
+    """How many of the places lie apart from each other."""
+    kept: list[FloatArray] = []
+    for place in places_w:
+        if all(np.linalg.norm(place - other) >= _PLACES_M for other in kept):
+            kept.append(place)
+    return len(kept)

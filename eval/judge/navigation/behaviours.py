@@ -1,0 +1,121 @@
+"""What a judged flight is for: its tasks, one after the other, and what counts as reached."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from edgeslam_torch.eval.judge.navigation.flown import Flown
+from edgeslam_torch.flying.errands import WayHome
+from edgeslam_torch.navigation.corridor import FollowCorridor
+from edgeslam_torch.navigation.openings.watch import Exit
+from edgeslam_torch.navigation.pilot import Pilot
+from edgeslam_torch.navigation.tasks import Explore, GoTo, Task
+from edgeslam_torch.synthetic.sites.site import Site
+from edgeslam_torch.types import FloatArray
+
+REACHED_M = 0.35
+"""Of the true goal, when the pilot says that it is there."""
+HOME_M = 0.3
+"""Of the true take-off."""
+_END_M = 1.6
+"""Of a corridor's true end: the drone stops 0.6 m before a wall."""
+_SAME_EXIT_M, _SAME_EXIT_COS = 0.5, np.cos(np.radians(35.0))
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """When the next task begins."""
+
+    site: Site
+    clock_s: float
+    scale: float
+    """The pilot's metre in true metres."""
+    pilot: Pilot
+    track_w: FloatArray
+    """``(N, 2)`` where the drone flew, as it knows."""
+
+
+@dataclass(frozen=True, slots=True)
+class Behaviour:
+    """Tasks and their judge."""
+
+    steps: tuple[Callable[[Moment], Task], ...]
+    reached: Callable[[Flown, Site], bool]
+    """Whether a flight without contact, the last task of which is done, came where it should."""
+    limit_s: float = 120.0
+
+
+def _goal(moment: Moment) -> Task:
+    return GoTo(moment.site.goal_w / moment.scale)
+
+
+def _home(moment: Moment) -> Task:
+    return WayHome(moment.track_w)
+
+
+def _explore(moment: Moment) -> Task:
+    return Explore(moment.clock_s + 75.0)
+
+
+def _corridor(moment: Moment) -> Task:
+    return FollowCorridor(moment.clock_s + 100.0)
+
+
+def _at_goal(flown: Flown, site: Site) -> bool:
+    return flown.distance_m < REACHED_M
+
+
+def _at_home(flown: Flown, site: Site) -> bool:
+    return flown.home_m < HOME_M
+
+
+def _at_an_end(flown: Flown, site: Site) -> bool:
+    here = np.array(flown.track_w[-1][:2])
+    return bool(min(np.linalg.norm(here - end) for end in corridor_ends(site)) < _END_M)
+
+
+def is_corridor(world: str) -> bool:
+    """Whether a named site can be followed from its start."""
+    return world == "blank_walls" or world.endswith("corridor")
+
+
+def corridor_ends(site: Site) -> list[FloatArray]:
+    """Places ``(2,)`` at which following the corridor from the start may end: a door, or the end of an arm.
+
+    Raises:
+        ValueError: If the site is no corridor.
+    """
+    if not is_corridor(site.name):
+        raise ValueError(f"{site.name} is no corridor to follow")
+    goal = site.goal_w[:2]
+    if site.exits:
+        return [e.centre_w[:2] for e in site.exits]
+    return [goal, goal * [1.0, -1.0]] if site.name == "t_corridor" else [goal]
+
+
+BEHAVIOURS = {
+    "goto": Behaviour((_goal,), _at_goal),
+    "home": Behaviour((_goal, _home), _at_home, 240.0),
+    "corridor": Behaviour((_corridor,), _at_an_end, 160.0),
+    "exits": Behaviour((_explore, _home), _at_home, 240.0),
+}
+"""By name; ``exits`` explores for 75 s and comes home, and what counts is also which exits it knows."""
+
+
+def right_exits(found: Sequence[Exit], site: Site) -> int:
+    """How many of the site's exits are among those found: within half a metre, and through the same wall.
+
+    Example:
+        >>> from edgeslam_torch.synthetic.sites.build import named_site
+        >>> right_exits([], named_site("corridor", 0))
+        0
+    """
+    right = 0
+    for true in site.exits:
+        for exit_ in found:
+            near = float(np.linalg.norm(exit_.centre_w[:2] - true.centre_w[:2])) < _SAME_EXIT_M
+            if near and abs(float(exit_.normal_w @ true.normal_w)) > _SAME_EXIT_COS:
+                right += 1
+                break
+    return right
