@@ -12,7 +12,9 @@ from edgeslam_torch.flying.errands import Stay
 from edgeslam_torch.navigation.flight_record import Decision, NewTask
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.limits import NavLimits
-from edgeslam_torch.navigation.pilot import BAND_M, Phase, Pilot
+from edgeslam_torch.navigation.openings.turned import Walls
+from edgeslam_torch.navigation.openings.watch import Exit
+from edgeslam_torch.navigation.pilot import Phase, Pilot
 from edgeslam_torch.navigation.sight import Sight
 from edgeslam_torch.navigation.supervisor import Order, Supervisor
 from edgeslam_torch.navigation.tasks import Task
@@ -128,7 +130,15 @@ class Cockpit:
 
     def known(self) -> Layer:
         """What the pilot knows of its height of flight."""
-        return self.pilot.space.layer(self.limits.height_m, self.limits.radius_m + BAND_M)
+        return self.pilot.walls().layer
+
+    def walls(self) -> Walls:
+        """The same, and what of it stands upright."""
+        return self.pilot.walls()
+
+    def exits(self) -> tuple[Exit, ...]:
+        """What it found of exits, the nearest first."""
+        return self.pilot.exits.exits
 
     def track(self) -> FloatArray:
         """``(N, 2)`` where it flew since its metres were last revised, oldest first."""

@@ -1,6 +1,7 @@
-"""Verbs of a flight: `Navigator.open`, then `take_off`, `go_to`, `explore`, `return_home`, `land`."""
+"""Verbs of a flight: `Navigator.open`, `take_off`, `go_to`, `follow_corridor`, `find_exits`, `return_home`, `land`."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 
@@ -13,13 +14,20 @@ from edgeslam_torch.flying.errands import Stay, WayHome
 from edgeslam_torch.flying.outcome import FlightRefused, Outcome
 from edgeslam_torch.flying.recorder import Recorder
 from edgeslam_torch.flying.simulated import is_simulated, site_of
+from edgeslam_torch.navigation.corridor import FollowCorridor
 from edgeslam_torch.navigation.limits import NavLimits
+from edgeslam_torch.navigation.openings.pathways import Pathway, pathways
+from edgeslam_torch.navigation.openings.watch import Exit
 from edgeslam_torch.navigation.pilot import Phase
 from edgeslam_torch.navigation.sight import Sight
 from edgeslam_torch.navigation.tasks import Explore, GoTo, Task
 from edgeslam_torch.types import FloatArray
 
 HOME_BECAUSE = "battery low: home"
+BEYOND_M = 0.8
+"""How far behind an exit it stops."""
+_LEAST_CORRIDOR_M = 1.0
+"""Way that must have been flown to have followed anything."""
 
 
 class Navigator:
@@ -134,10 +142,57 @@ class Navigator:
         Raises:
             FlightRefused: If the time is not positive, or it does not fly.
         """
-        if not 0 < seconds < 3600:
-            raise FlightRefused(f"exploring takes more than 0 s and less than an hour, not {seconds} s")
-        sight = self._flying_sight()
-        return self.fly(Explore(sight.stamp_s + seconds), "the time is over")
+        until_s = self._until_s(seconds)
+        outcome = self.fly(Explore(until_s), "the time is over")
+        return self._in_time(outcome, until_s, "nothing is left to see")
+
+    def find_exits(self, seconds: float = 60.0) -> Outcome:
+        """Explore until an exit is known; `exits` are the records.
+
+        Raises:
+            FlightRefused: As `explore`.
+        """
+        until_s = self._until_s(seconds)
+        outcome = self.fly(Explore(until_s), "the time is over", lambda: bool(self.exits()))
+        if not self.craft.flying:
+            return outcome
+        if self.exits():
+            return replace(outcome, reached=True, reason="an exit is known")
+        return replace(self._in_time(outcome, until_s, "nothing is left to see"), reached=False)
+
+    def exits(self) -> tuple[Exit, ...]:
+        """Openings of a door's width in a wall that were seen from two places so far, the nearest first."""
+        return self.cockpit.exits()
+
+    def pathways(self) -> list[Pathway]:
+        """Free corridors around the drone, the longest first.
+
+        Raises:
+            FlightRefused: If it does not fly.
+        """
+        return pathways(self.cockpit.walls(), self._flying_sight().p_w[:2])
+
+    def go_through(self, exit_: Exit) -> Outcome:
+        """Fly through an exit of `exits`, and stop `BEYOND_M` behind it.
+
+        Raises:
+            FlightRefused: As `go_to`.
+        """
+        there = exit_.beyond(BEYOND_M)
+        return self.fly(GoTo(self._goal([there[0], there[1], self.limits.height_m])), "through the exit")
+
+    def follow_corridor(self, seconds: float = 120.0) -> Outcome:
+        """Follow the corridor that the drone is in, ahead and round corners, through no door.
+
+        Raises:
+            FlightRefused: As `explore`.
+        """
+        task = FollowCorridor(self._until_s(seconds))
+        outcome = self.fly(task, "the time is over")
+        if outcome.reached and outcome.path_m < _LEAST_CORRIDOR_M:
+            return replace(outcome, reached=False, reason="there is no corridor to follow here")
+        end = "the corridor opens into a room" if task.room else "the corridor ends"
+        return self._in_time(outcome, task.until_s, end)
 
     def return_home(self) -> Outcome:
         """Fly to the take-off, back along the way where it is far.
@@ -148,19 +203,23 @@ class Navigator:
         self._flying_sight()
         return self.fly(WayHome(self.cockpit.track()), "home", to_home=True)
 
-    def fly(self, task: Task, done: str, to_home: bool = False) -> Outcome:
+    def fly(self, task: Task, done: str, until: Callable[[], bool] = lambda: False, to_home: bool = False) -> Outcome:
         """Fly any task of `navigation.tasks` to its end; home and down when the battery is low.
 
         Args:
             task: Where to go, and when it is done.
             done: What the outcome says when it is.
+            until: Ends the task early; then it hovers.
             to_home: Whether the task itself leads home.
         """
         self.cockpit.begin(task)
-        self.craft.fly(lambda: self.cockpit.ended() is not None or (not to_home and self._wants_home()))
+        self.craft.fly(lambda: self.cockpit.ended() is not None or until() or (not to_home and self._wants_home()))
         path_m, clearance_m = self.cockpit.flown()
         if not self.craft.flying:
             return Outcome(False, self.craft.over, clearance_m, path_m)
+        if self.cockpit.ended() is None and until():
+            self.cockpit.begin(Stay())
+            return Outcome(True, done, clearance_m, path_m)
         if self.cockpit.ended() is None:
             self.return_home()
             if self.craft.flying:
@@ -201,6 +260,21 @@ class Navigator:
                 "the map has no metres yet, so a place in metres means nothing; take_off() waits for them"
             )
         return sight
+
+    def _until_s(self, seconds: float) -> float:
+        """When so many seconds are over.
+
+        Raises:
+            FlightRefused: If that is no sensible time, or it does not fly.
+        """
+        if not 0 < seconds < 3600:
+            raise FlightRefused(f"a flight takes more than 0 s and less than an hour, not {seconds} s")
+        return self._flying_sight().stamp_s + seconds
+
+    def _in_time(self, outcome: Outcome, until_s: float, why: str) -> Outcome:
+        """The outcome with another reason if its task was done before its time was over."""
+        early = self.cockpit.sight is not None and self.cockpit.sight.stamp_s < until_s
+        return replace(outcome, reason=why) if outcome.reached and early else outcome
 
     def _wants_home(self) -> bool:
         return self.cockpit.last is not None and self.cockpit.last.home

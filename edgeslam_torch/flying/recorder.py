@@ -9,10 +9,12 @@ from pathlib import Path
 from edgeslam_torch.drone.tello import StateMessage
 from edgeslam_torch.errors import EdgeSlamError, OutputError
 from edgeslam_torch.files.appender import Appender
+from edgeslam_torch.files.atomic import write_text
 from edgeslam_torch.flying.cockpit import Moment
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.navigation.flight_record import PLAN, Decision, NewTask, PlanLog
 from edgeslam_torch.navigation.limits import NavLimits
+from edgeslam_torch.navigation.openings.watch import Exit
 from edgeslam_torch.navigation.sight import Sight
 from edgeslam_torch.types import Frame
 from edgeslam_torch.writers.flight_writer import FlightWriter
@@ -20,6 +22,8 @@ from edgeslam_torch.writers.flight_writer import FlightWriter
 logger = logging.getLogger(__name__)
 
 MOMENTS = "moments.csv"
+EXITS = "exits.csv"
+_EXIT_COLUMNS = "x_m,y_m,normal_x,normal_y,width_m,width_sigma_m,position_sigma_m,places"
 _COLUMNS = (
     "stamp_s,x_m,y_m,z_m,yaw_rad,vx_m_s,vy_m_s,vz_m_s,position_sigma_m,scale_sigma,metric,tracked,blind_s,battery,"
     "revision,clearance_m,phase,danger,forward_m_s,left_m_s,up_m_s,turn_left_rad_s,why"
@@ -27,8 +31,8 @@ _COLUMNS = (
 
 
 class Recorder:
-    """A folder that ``edgeslam run`` reads, with `MOMENTS`, a line for each order and why, and ``plan.jsonl``, by which
-    ``edgeslam fly replay`` asks the planner again.
+    """A folder that ``edgeslam run`` reads, with `MOMENTS`, a line for each order and why, `EXITS`, those known in the
+    end, and ``plan.jsonl``, by which ``edgeslam fly replay`` asks the planner again.
 
     A disk that is full ends the recording, not the flight.
 
@@ -44,6 +48,7 @@ class Recorder:
         self._writer: FlightWriter | None = None
         self._moments: Appender | None = None
         self._plan: PlanLog | None = None
+        self._exits: tuple[Exit, ...] = ()
         self._lock = threading.Lock()
 
     def begin(self, camera: Camera) -> None:
@@ -74,6 +79,7 @@ class Recorder:
             moments = self._moments
             if moments is not None:
                 self._guarded(lambda _: moments.write(_line(moment)))
+                self._note_exits(moment.pilot.exits.exits)
 
     def planner(self, entry: NewTask | Sight | Decision) -> None:
         """Write what the planner is given, or what it decided."""
@@ -93,6 +99,13 @@ class Recorder:
                 self._plan.close()
             self._writer = self._moments = self._plan = None
 
+    def _note_exits(self, exits: tuple[Exit, ...]) -> None:
+        """Write them when others are known than before; a flight without any leaves no file."""
+        if exits is not self._exits and (exits or self._exits):
+            lines = "".join(_exit_line(exit_) for exit_ in exits)
+            self._guarded(lambda _: write_text(self.folder / EXITS, f"{_EXIT_COLUMNS}\n{lines}"))
+        self._exits = exits
+
     def _guarded(self, write: Callable[[FlightWriter], None]) -> None:
         if self.failure is not None or self._writer is None:
             return
@@ -110,6 +123,12 @@ def _clearance_m(moment: Moment) -> float:
         return math.nan
     i, j = layer.cells(moment.sight.p_w[:2])
     return float(layer.from_solid_m[i, j]) - moment.pilot.limits.radius_m
+
+
+def _exit_line(exit_: Exit) -> str:
+    sigmas = (exit_.width_m, exit_.width_sigma_m, exit_.position_sigma_m)
+    numbers = (*exit_.centre_w[:2], *exit_.normal_w[:2], *sigmas)
+    return ",".join([*(f"{x:.3f}" for x in numbers), str(exit_.places)]) + "\n"
 
 
 def _line(moment: Moment) -> str:

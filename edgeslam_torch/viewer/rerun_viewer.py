@@ -47,7 +47,7 @@ class Viewer:
             layout = _layout(importlib.import_module("rerun.blueprint"), live)
         self._stream: Any = self._rr.RecordingStream(f"edgeslam {name}")
         if save is not None:
-            _check_writable(save)
+            check_writable(save)
             self._stream.save(str(save), default_blueprint=layout)
         elif show:
             self._stream.spawn(default_blueprint=layout)
@@ -165,8 +165,12 @@ def _layout(rrb: Any, live: bool) -> Any:
     return rrb.Blueprint(rrb.Horizontal(scene, pictures, plots, column_shares=[4, 3, 3]), collapse_panels=True)
 
 
-def _check_writable(path: Path) -> None:
-    """rerun itself reports an unwritable file late, on a thread."""
+def check_writable(path: Path) -> None:
+    """rerun itself reports an unwritable file late, on a thread.
+
+    Raises:
+        OutputError: If it cannot be written.
+    """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.open("wb").close()

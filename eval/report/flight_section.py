@@ -9,15 +9,17 @@ import numpy as np
 from edgeslam_torch.eval.report.line_drawings import chart, view
 
 _MOMENTS = "moments.csv"
+_EXITS = "exits.csv"
 _NEEDED = ("stamp_s", "x_m", "y_m", "phase", "danger", "why")
+_EXIT_NEEDED = ("x_m", "y_m", "normal_x", "normal_y", "width_m")
 _MOST_EVENTS = 60
-_WAY, _CLEARANCE = "var(--tracked)", "var(--predicted)"
+_WAY, _CLEARANCE, _EXIT = "var(--tracked)", "var(--predicted)", "var(--lost)"
 
 
 def flight_section(folder: Path | None) -> str:
     """HTML of the flight that a recording holds; empty when it holds none, or one that cannot be read."""
     rows = [] if folder is None else _rows(folder / _MOMENTS)
-    if not rows:
+    if folder is None or not rows:
         return ""
     table = {name: np.array([_number(row, name) for row in rows]) for name in ("stamp_s", "x_m", "y_m", "clearance_m")}
     good = np.isfinite(table["stamp_s"]) & np.isfinite(table["x_m"]) & np.isfinite(table["y_m"])
@@ -26,7 +28,9 @@ def flight_section(folder: Path | None) -> str:
     rows = [row for row, ok in zip(rows, good, strict=True) if ok]
     stamps, x, y, clearance = (table[name][good] for name in ("stamp_s", "x_m", "y_m", "clearance_m"))
     seconds, way = stamps - stamps[0], np.stack([x, y], axis=1)
-    parts = ["<h2>Flight</h2>", f'<p class="note">{_words(seconds, way, clearance)}</p>', view([way], [_WAY], "m")]
+    exits = [line for row in _rows(folder / _EXITS, _EXIT_NEEDED) if (line := _across(row)) is not None]
+    drawing = view([way, *exits], [_WAY, *[_EXIT] * len(exits)], "m")
+    parts = ["<h2>Flight</h2>", f'<p class="note">{_words(seconds, way, clearance)}{_exit_words(exits)}</p>', drawing]
     known = np.isfinite(clearance)
     if known.sum() >= 2:
         label = "metres between the hull and the nearest solid on its own map"
@@ -36,13 +40,27 @@ def flight_section(folder: Path | None) -> str:
     return f'<section class="wrap" id="s-flight">{"".join(parts)}</section>'
 
 
-def _rows(path: Path) -> list[dict[str, str]]:
+def _rows(path: Path, needed: tuple[str, ...] = _NEEDED) -> list[dict[str, str]]:
     try:
         with path.open(newline="", encoding="utf-8") as file:
             rows = list(csv.DictReader(file))
     except (OSError, UnicodeDecodeError, csv.Error):
         return []
-    return rows if rows and all(name in rows[0] for name in _NEEDED) else []
+    return rows if rows and all(name in rows[0] for name in needed) else []
+
+
+def _across(row: dict[str, str]) -> np.ndarray | None:
+    """The opening as a line ``(2, 2)`` from jamb to jamb; None if its numbers are none."""
+    x, y, nx, ny, width = (_number(row, name) for name in _EXIT_NEEDED)
+    ends = np.array([[x, y], [x, y]]) + 0.5 * width * np.array([[-ny, nx], [ny, -nx]])
+    return ends if np.isfinite(ends).all() else None
+
+
+def _exit_words(exits: list[np.ndarray]) -> str:
+    if not exits:
+        return ""
+    widths = ", ".join(f"{np.linalg.norm(line[1] - line[0]):.1f} m" for line in exits)
+    return f" {len(exits)} exit{'s' if len(exits) > 1 else ''} found (red), {widths} wide."
 
 
 def _number(row: dict[str, str], name: str) -> float:

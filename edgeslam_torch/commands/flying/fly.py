@@ -1,6 +1,7 @@
 """``edgeslam fly``: fly a Tello by its own map; nothing moves without --fly."""
 
 import argparse
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,8 +23,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     goto.add_argument("z", type=float, nargs="?", metavar="Z", help="height of the whole flight above the floor")
     explore = verbs.add_parser("explore", help="fly to where the known space ends, again and again")
     explore.add_argument("seconds", type=float, metavar="SECONDS", help="for how long")
+    corridor = verbs.add_parser("corridor", help="follow the corridor that it is in, round corners, through no door")
+    exit_ = verbs.add_parser("exit", help="explore until an exit is known, and fly through it")
+    for verb in (corridor, exit_):
+        verb.add_argument(
+            "seconds", type=float, nargs="?", metavar="SECONDS", default=120.0, help="for how long (default: 120)"
+        )
     home = verbs.add_parser("home", help="take off, look around, return above the take-off, land: a first test")
-    for verb in (goto, explore, home):
+    for verb in (goto, explore, corridor, exit_, home):
         _add_common(verb)
     again = verbs.add_parser("replay", help="show the planner a recorded flight again: what would it have done?")
     again.add_argument("folder", type=Path, metavar="DIR", help="of --record")
@@ -42,6 +49,8 @@ def _add_common(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--dry-run", action="store_true", help="show the plan without asking the drone anything")
     parser.add_argument("--back", action="store_true", help="return to the take-off before landing")
     parser.add_argument("--record", type=Path, metavar="DIR", help="record pictures, state and decisions")
+    parser.add_argument("--viewer", action="store_true", help="watch space, way and reasons in rerun ([viewer] extra)")
+    parser.add_argument("--save-rrd", type=Path, metavar="FILE", help="save that recording to a file instead")
     parser.add_argument("--camera", metavar="FILE|PRESET", help="calibration of the drone's camera")
     parser.add_argument("--speed", type=float, metavar="M_S", help="cruising speed (default: 0.5)")
     parser.add_argument("--height", type=float, metavar="M", help="height of flight (default: 1.15)")
@@ -66,7 +75,14 @@ def main(args: argparse.Namespace) -> int:
         print("nothing was sent to the drone")
         return 0
     record = args.record if args.fly else None
-    with Navigator.open(args.drone, args.fly, limits, args.camera, record=record) as nav:
+    with ExitStack() as open_:
+        listeners = []
+        if args.fly and (args.viewer or args.save_rrd is not None):
+            from edgeslam_torch.viewer.flight_view import FlightView
+
+            listeners.append(FlightView(args.drone, args.save_rrd))
+            open_.callback(listeners[0].close)
+        nav = open_.enter_context(Navigator.open(args.drone, args.fly, limits, args.camera, listeners, record))
         charge = nav.craft.battery
         known = f"battery {100 * charge:.0f} %, " if charge == charge else ""
         camera = nav.craft.camera
@@ -122,7 +138,7 @@ def _check(args: argparse.Namespace, limits: "NavLimits") -> None:
 
     if args.verb == "goto":
         check_goal((args.x, args.y, limits.height_m), limits)
-    if args.verb == "explore" and not 0 < args.seconds < 3600:
+    if args.verb in ("explore", "corridor", "exit") and not 0 < args.seconds < 3600:
         raise ConfigError(f"SECONDS must be above 0 and below 3600, got {args.seconds:g}")
 
 
@@ -139,6 +155,10 @@ def _plan(args: argparse.Namespace, limits: "NavLimits") -> list[str]:
         )
     elif args.verb == "explore":
         what = f"explore for {args.seconds:g} s: fly to where the known space ends, again and again"
+    elif args.verb == "corridor":
+        what = f"follow the corridor for at most {args.seconds:g} s, to where it ends or opens into a room"
+    elif args.verb == "exit":
+        what = f"explore for at most {args.seconds:g} s until an exit is known, and fly through it"
     steps = [f"take off, rise to {limits.height_m:.2f} m and look to both sides", what]
     steps += ["return above the take-off"] if args.back and args.verb != "home" else []
     lines = [f"{n}. {step}" for n, step in enumerate([*steps, "land"], 1)]
@@ -168,8 +188,36 @@ def _verb(args: argparse.Namespace, nav: "Navigator") -> "Outcome":
     if args.verb == "goto":
         return _told("goto", nav.go_to((args.x, args.y, nav.limits.height_m)))
     if args.verb == "explore":
-        return _told("explore", nav.explore(args.seconds))
+        outcome = _told("explore", nav.explore(args.seconds))
+        _tell_openings(nav)
+        return outcome
+    if args.verb == "corridor":
+        outcome = _told("corridor", nav.follow_corridor(args.seconds))
+        _tell_openings(nav)
+        return outcome
+    if args.verb == "exit":
+        outcome = _told("search", nav.find_exits(args.seconds))
+        _tell_openings(nav)
+        return _told("exit", nav.go_through(nav.exits()[0])) if nav.craft.flying and nav.exits() else outcome
     return _told("home", nav.return_home())
+
+
+def _tell_openings(nav: "Navigator") -> None:
+    """The records of exits and pathways, a line each."""
+    for exit_ in nav.exits():
+        x, y = exit_.centre_w[:2]
+        print(
+            f"  exit at ({x:.2f}, {y:.2f}) +- {exit_.position_sigma_m:.2f} m, {exit_.width_m:.2f} +- "
+            f"{exit_.width_sigma_m:.2f} m wide, seen from {exit_.places} places",
+            flush=True,
+        )
+    for way in nav.pathways() if nav.craft.flying else ():
+        (x0, y0), (x1, y1) = way.ends_w
+        print(
+            f"  corridor from ({x0:.1f}, {y0:.1f}) to ({x1:.1f}, {y1:.1f}), {way.width_m:.1f} +- "
+            f"{way.width_sigma_m:.1f} m wide",
+            flush=True,
+        )
 
 
 def _told(what: str, outcome: "Outcome") -> "Outcome":

@@ -21,8 +21,8 @@ _ALONGSIDE_M = 1.2
 """How far to each side wall counts."""
 _BEYOND_M = (0.25, 0.65)
 """Band before and behind the wall in which there must be space: from a frame's depth to where a drone stands."""
-_BESIDE_M = (0.15, 0.4)
-"""Band beside the opening's ends in which the space widens."""
+_BESIDE_M = 0.2
+"""How far beside the opening's ends the space must widen: a door may be this near to a corner."""
 _FREE_SHARE, _SOLID_SHARE = 0.8, 0.3
 _SAME_M = 0.5
 """Two openings nearer than this are one: no wall between two doors is thinner."""
@@ -73,7 +73,7 @@ def _openings(grid: Turned, t: int) -> list[tuple[int, int]]:
 
 def _gap(grid: Turned, t: int, low: int, high: int) -> Gap | None:
     """The opening between two cells of a row, if it leads from somewhere to somewhere."""
-    if not all(_leads(grid, t, low, high, side) for side in (-1, 1)):
+    if not all(_leads(grid, t, low, high, side) for side in (-1, 1)) or not _in_a_wall(grid, t, low, high):
         return None
     reach = round(_ALONGSIDE_M / grid.cell_m)
     wall = _wall(grid, t)
@@ -89,17 +89,30 @@ def _gap(grid: Turned, t: int, low: int, high: int) -> Gap | None:
 
 
 def _leads(grid: Turned, t: int, low: int, high: int, side: int) -> bool:
-    """Whether there is space on one side of the wall, wider than the opening."""
+    """Whether there is space on one side of the wall."""
+    fifth = (high - low) // 5
+    before = grid.free[_band(grid, t, side), low + fifth : high - fifth]
+    return before.size > 0 and float(before.mean()) >= _FREE_SHARE
+
+
+def _in_a_wall(grid: Turned, t: int, low: int, high: int) -> bool:
+    """Whether the space widens on each side of the wall, and each end stands free of what leads away from it.
+
+    A leaf that stands open closes one corner. Two cupboards close both of a side, a wall that crosses both of an end.
+    """
+    width = round(_BESIDE_M / grid.cell_m)
+    ends = slice(max(0, low - width), low), slice(high, high + width)
+    closed = np.array(
+        [[grid.solid[_band(grid, t, side), end].mean() >= _SOLID_SHARE for end in ends] for side in (-1, 1)]
+    )
+    return not (closed.all(axis=0).any() or closed.all(axis=1).any())
+
+
+def _band(grid: Turned, t: int, side: int) -> np.ndarray:
+    """Rows before or behind the wall."""
     near, far = (round(x / grid.cell_m) for x in _BEYOND_M)
     rows = t + side * np.arange(near, far + 1)
-    rows = rows[(rows >= 0) & (rows < len(grid.free))]
-    fifth = (high - low) // 5
-    before = grid.free[rows, low + fifth : high - fifth]
-    if before.size == 0 or before.mean() < _FREE_SHARE:
-        return False
-    first, last = (round(x / grid.cell_m) for x in _BESIDE_M)
-    ends = grid.solid[rows, max(0, low - last) : low - first], grid.solid[rows, high + first : high + last]
-    return min((float(end.mean()) for end in ends if end.size), default=1.0) < _SOLID_SHARE
+    return np.asarray(rows[(rows >= 0) & (rows < len(grid.free))])
 
 
 def _distinct(found: list[Gap]) -> list[Gap]:

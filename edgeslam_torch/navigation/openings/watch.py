@@ -63,9 +63,10 @@ class _Seen:
 class ExitWatch:
     """Looks for exits while a drone flies."""
 
+    exits: tuple[Exit, ...] = ()
+    """What counts as an exit now, the nearest first; replaced as a whole, so that other threads may read it."""
     _seen: list[_Seen] = field(default_factory=list)
     _looked_s: float = -math.inf
-    _sight: Sight | None = None
 
     def due(self, sight: Sight) -> bool:
         """Whether it is time for another look."""
@@ -73,7 +74,7 @@ class ExitWatch:
 
     def look(self, walls: Walls, sight: Sight) -> None:
         """Compare what the grid shows now with what it showed before."""
-        self._looked_s, self._sight = sight.stamp_s, sight
+        self._looked_s = sight.stamp_s
         here = sight.p_w[:2]
         found = gaps(walls, here)
         for seen in self._seen:
@@ -82,19 +83,9 @@ class ExitWatch:
         for gap in found:
             self._note(gap, here)
         self._seen = [seen for seen in self._seen if seen.missed <= 2 * max(len(seen.gaps), _LOOKS)]
-
-    def exits(self) -> tuple[Exit, ...]:
-        """What counts as an exit now, the nearest first."""
-        if self._sight is None:
-            return ()
         good = [s for s in self._seen if s.near >= _LOOKS and s.near > s.missed and _places(s.places_w) >= 2]
-        found = [found for seen in good if (found := self._exit(seen, self._sight)).width_m <= WIDEST_M]
-        return tuple(sorted(found, key=lambda e: float(np.linalg.norm(e.centre_w[:2] - self._sight_w))))
-
-    @property
-    def _sight_w(self) -> FloatArray:
-        assert self._sight is not None
-        return self._sight.p_w[:2]
+        exits = [exit_ for seen in good if (exit_ := _exit(seen, sight)).width_m <= WIDEST_M]
+        self.exits = tuple(sorted(exits, key=lambda e: float(np.linalg.norm(e.centre_w[:2] - here))))
 
     def _note(self, gap: Gap, here_w: FloatArray) -> None:
         seen = next((s for s in self._seen if _same(gap, s)), None)
@@ -106,19 +97,21 @@ class ExitWatch:
             seen.near += 1
             seen.places_w.append(here_w.copy())
 
-    def _exit(self, seen: _Seen, sight: Sight) -> Exit:
-        centres, widths = np.array([g.centre_w for g in seen.gaps]), np.array([g.width_m for g in seen.gaps])
-        first = seen.gaps[0].normal_w
-        turned = [g.normal_w * np.sign(g.normal_w @ first) for g in seen.gaps]
-        normal = np.sum(turned, axis=0) / np.linalg.norm(np.sum(turned, axis=0))
-        cell = 0.1 * _CELL_SIGMAS
-        centre, width = np.median(centres, axis=0), float(np.median(widths))
-        away = float(np.linalg.norm(centre - sight.p_w[:2]))
-        spread = float(np.sqrt(0.5 * np.mean(((centres - centre) ** 2).sum(1))))
-        position = math.hypot(cell, spread, sight.position_sigma_m, sight.scale_sigma * away)
-        width_sigma = math.hypot(cell, float(np.std(widths)), sight.scale_sigma * width)
-        return Exit(np.array([*centre, sight.p_w[2]]), np.array([*normal, 0.0]), width, width_sigma, position,
-                    _places(seen.places_w))  # fmt: skip
+
+def _exit(seen: _Seen, sight: Sight) -> Exit:
+    """The opening as the looks agree on it."""
+    centres, widths = np.array([g.centre_w for g in seen.gaps]), np.array([g.width_m for g in seen.gaps])
+    first = seen.gaps[0].normal_w
+    turned = [g.normal_w * np.sign(g.normal_w @ first) for g in seen.gaps]
+    normal = np.sum(turned, axis=0) / np.linalg.norm(np.sum(turned, axis=0))
+    cell = 0.1 * _CELL_SIGMAS
+    centre, width = np.median(centres, axis=0), float(np.median(widths))
+    away = float(np.linalg.norm(centre - sight.p_w[:2]))
+    spread = float(np.sqrt(0.5 * np.mean(((centres - centre) ** 2).sum(1))))
+    position = math.hypot(cell, spread, sight.position_sigma_m, sight.scale_sigma * away)
+    width_sigma = math.hypot(cell, float(np.std(widths)), sight.scale_sigma * width)
+    return Exit(np.array([*centre, sight.p_w[2]]), np.array([*normal, 0.0]), width, width_sigma, position,
+                _places(seen.places_w))  # fmt: skip
 
 
 def _same(gap: Gap, seen: _Seen) -> bool:

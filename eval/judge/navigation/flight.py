@@ -67,7 +67,7 @@ def fly(case: Case, limits: NavLimits | None = None) -> Flown:
         found.oracle_s = _take_off_s(limits) + shortest_m(site, limits) / limits.speed_m_s
     ticks = _fly(tello, eyes, errand, Supervisor(limits), conditions.hung_s, found)
     _sum_up(found, site, drone, ticks, BEHAVIOURS[case.behaviour])
-    known = errand.pilot.exits.exits()
+    known = errand.pilot.exits.exits
     found.exits = [len(site.exits), len(known), right_exits(known, site)]
     found.near = [eyes.counts.sectors, eyes.counts.too_far, eyes.counts.surely_too_far]
     return found

@@ -1,0 +1,223 @@
+"""Exits and pathways against walls whose openings are known, at every angle to the grid."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from edgeslam_torch.navigation.corridor import FollowCorridor
+from edgeslam_torch.navigation.frontiers import Looks, reachable
+from edgeslam_torch.navigation.layer import Layer
+from edgeslam_torch.navigation.openings.exits import gaps
+from edgeslam_torch.navigation.openings.pathways import pathways
+from edgeslam_torch.navigation.openings.turned import Walls, wall_directions
+from edgeslam_torch.navigation.openings.watch import ExitWatch
+from edgeslam_torch.navigation.sight import Sight
+from edgeslam_torch.navigation.space import Space
+
+ANGLES = [0.0, 0.3, math.pi / 4, 1.9]
+HERE = np.zeros(2)
+
+
+def surroundings(is_solid, is_unseen=lambda x, y: np.zeros(x.shape, bool), angle=0.0, low=None):
+    """A square of 12 m around the origin; what is where is said in axes turned by ``angle``."""
+    x, y = np.meshgrid((np.arange(120) + 0.5) * 0.1 - 6.0, (np.arange(120) + 0.5) * 0.1 - 6.0, indexing="ij")
+    c, s = math.cos(angle), math.sin(angle)
+    a, b = c * x + s * y, c * y - s * x
+    solid, unseen = is_solid(a, b), is_unseen(a, b)
+    layer = Layer(~solid & ~unseen, solid & ~unseen, np.array([-6.0, -6.0]), 0.1)
+    return Walls(layer, layer.solid if low is None else layer.solid & ~low(a, b))
+
+
+def turned_back(p, angle):
+    """A point of the world in the axes in which the surroundings are said."""
+    c, s = math.cos(angle), math.sin(angle)
+    return np.array([c * p[0] + s * p[1], c * p[1] - s * p[0]])
+
+
+def wall(gap, at=2.0, middle=0.0):
+    """A wall across the first axis, from -3 to 3, with an opening of this width; what it touches is solid."""
+    return lambda a, b: (np.abs(a - at) < 0.1) & (np.abs(b) < 3.0) & (np.abs(b - middle) > 0.5 * gap - 0.05)
+
+
+@pytest.mark.parametrize("angle", ANGLES)
+@pytest.mark.parametrize(("gap", "middle"), [(0.7, 0.0), (0.9, -0.8), (1.2, 0.6)])
+def test_a_doorway_is_where_it_is(angle, gap, middle):
+    (found,) = gaps(surroundings(wall(gap, middle=middle), angle=angle), HERE)
+    assert turned_back(found.centre_w, angle) == pytest.approx([2.0, middle], abs=0.12)
+    assert turned_back(found.normal_w, angle) == pytest.approx([1.0, 0.0], abs=0.1), "away from where it is seen"
+    assert found.width_m == pytest.approx(gap, abs=0.16)
+
+
+def cupboards(a, b):
+    """A corridor of 2 m, and a cupboard of 0.5 m by 0.8 m at each side of it."""
+    return (np.abs(b) > 1.0) & (np.abs(b) < 1.2) | (np.abs(a - 2.0) < 0.4) & (np.abs(b) > 0.5) & (np.abs(b) < 1.2)
+
+
+@pytest.mark.parametrize(
+    ("case", "solid", "unseen", "low"),
+    [
+        ("a wall, a poster or a closed door", wall(0.0), None, None),
+        ("too narrow", wall(0.4), None, None),
+        ("a wall that ends", wall(2.4), None, None),
+        ("nothing was seen behind it", wall(0.9), lambda a, b: a > 2.15, None),
+        ("a niche", lambda a, b: wall(0.9)(a, b) | ((a > 2.4) & (a < 2.7) & (np.abs(b) < 3.0)), None, None),
+        ("tables", wall(0.9), None, lambda a, b: a > 0.0),
+        ("cupboards along a corridor", cupboards, None, None),
+        ("a post before a wall", lambda a, b: (b > 1.0) & (b < 1.2) | (np.hypot(a - 2, b) < 0.2), None, None),
+    ],
+)
+@pytest.mark.parametrize("angle", [0.0, 0.5])
+def test_what_is_no_exit(case, solid, unseen, low, angle):
+    seen = surroundings(solid, unseen or (lambda a, b: np.zeros(a.shape, bool)), angle, low)
+    assert gaps(seen, HERE) == [], case
+
+
+def sight(x, y=0.0, stamp_s=0.0, yaw=0.0, **fields):
+    return Sight(stamp_s, np.array([x, y, 1.15]), yaw, np.zeros(3), **fields)
+
+
+def watched(places, walls):
+    watch = ExitWatch()
+    for k, x in enumerate(places):
+        watch.look(walls, sight(x, stamp_s=0.5 * k))
+    return watch
+
+
+def test_an_exit_is_seen_from_two_places():
+    walls = surroundings(wall(0.9))
+    assert watched([0.0] * 8, walls).exits == ()
+    (exit_,) = watched([0.0, 0.1, 0.2, 0.6], walls).exits
+    assert exit_.centre_w == pytest.approx([2.0, 0.0, 1.15], abs=0.12)
+    assert exit_.normal_w == pytest.approx([1.0, 0.0, 0.0], abs=0.05)
+    assert exit_.width_m == pytest.approx(0.9, abs=2.0 * exit_.width_sigma_m + 0.05)
+    assert exit_.places == 2
+    assert exit_.beyond(1.0)[0] == pytest.approx(3.0, abs=0.12)
+
+
+def test_its_normal_keeps_its_side_when_the_drone_has_flown_through():
+    (exit_,) = watched([0.0, 0.6, 1.2, 2.8, 3.4], surroundings(wall(0.9))).exits
+    assert exit_.normal_w[0] == pytest.approx(1.0, abs=0.05)
+
+
+def test_its_sigma_has_that_of_the_metres():
+    walls, watch = surroundings(wall(0.9)), ExitWatch()
+    for k, x in enumerate([0.0, 0.2, 0.4, 0.6]):
+        watch.look(walls, sight(x, stamp_s=0.5 * k, scale_sigma=0.2))
+    (exit_,) = watch.exits
+    assert exit_.position_sigma_m == pytest.approx(0.2 * 1.4, rel=0.25)
+    assert exit_.width_sigma_m > 0.17
+
+
+def test_an_opening_that_closes_under_closer_looks_is_forgotten():
+    watch = watched([0.0, 0.2, 0.4, 0.6], surroundings(wall(0.9)))
+    for k in range(12):
+        watch.look(surroundings(wall(0.0)), sight(0.6, stamp_s=5.0 + 0.5 * k))
+    assert watch.exits == ()
+
+
+def test_no_look_without_metres():
+    assert ExitWatch().due(sight(0.0))
+    assert not ExitWatch().due(sight(0.0, metric=False)) and not ExitWatch().due(sight(0.0, tracked=False))
+
+
+@pytest.mark.parametrize("angle", ANGLES)
+@pytest.mark.parametrize("width", [1.2, 2.2])
+def test_a_corridor_is_a_pathway(angle, width):
+    walls = surroundings(lambda a, b: (np.abs(b - 0.3) > width / 2) & (np.abs(b - 0.3) < width / 2 + 0.2), angle=angle)
+    way = pathways(walls, HERE)[0]
+    assert way.width_m == pytest.approx(width, abs=0.16)
+    assert abs(turned_back(way.direction_w, angle)[1]) < 0.05
+    assert [turned_back(end, angle)[1] for end in way.ends_w] == pytest.approx([0.3, 0.3], abs=0.12)
+    assert way.length_m > 9.0
+    assert way.beside_m(way.ends_w[0]) == pytest.approx(0.0, abs=1e-9)
+    assert len(pathways(walls, HERE)) == 1
+
+
+def test_a_room_is_no_pathway():
+    assert pathways(surroundings(lambda a, b: np.maximum(np.abs(a), np.abs(b)) > 2.5), HERE) == []
+
+
+def test_without_walls_there_is_no_direction():
+    assert wall_directions(surroundings(lambda a, b: np.zeros(a.shape, bool)), HERE) == []
+
+
+def corner(a, b):
+    """A corridor of 2 m from behind the origin to a wall at 4 m, where another leads to the left."""
+    along, turn = (np.abs(b) < 1.0) & (a < 4.0), (b > -1.0) & (a > 2.0) & (a < 4.0)
+    return ~(along | turn)
+
+
+def test_a_corridor_is_followed_ahead_then_round_its_corner():
+    task = FollowCorridor()
+    ahead = surroundings(corner, lambda a, b: (a > 1.5) | (a < -1.0)).layer
+    (cell,) = task.goals(ahead, sight(0.0))
+    assert ahead.centres(cell)[0] > 1.0
+    whole = surroundings(corner, lambda a, b: (b > 2.0) | (a < -1.0)).layer
+    for k in range(4):
+        (cell,) = task.goals(whole, sight(0.9 * k, stamp_s=k))
+    (cell,) = task.goals(whole, sight(3.0, stamp_s=5.0, yaw=1.5))
+    assert whole.centres(cell)[1] > 1.0, "not back to what is unseen behind the start"
+
+
+def test_a_door_is_no_corridor():
+    """Free space behind a doorway is not part of what is followed: the goal stays before it."""
+    lined = surroundings(lambda a, b: wall(0.9)(a, b) | (np.abs(b) > 1.0) & (np.abs(b) < 1.2) & (a < 2.0)).layer
+    (cell,) = FollowCorridor().goals(lined, sight(0.0))
+    assert lined.centres(cell)[0] < 1.9
+
+
+def test_a_corridor_ends_in_a_room():
+    task, room = FollowCorridor(), surroundings(lambda a, b: np.maximum(np.abs(a), np.abs(b)) > 2.5).layer
+    for k in range(5):
+        task.goals(room, sight(0.3 * k - 0.6, stamp_s=k))
+        done = task.done(sight(0.3 * k - 0.6, stamp_s=k))
+    assert not done, "a metre must have been flown: a take-off in a room is no corridor's end"
+    task.goals(room, sight(0.6, stamp_s=5.0))
+    task.goals(room, sight(0.6, stamp_s=8.0))
+    assert task.done(sight(0.6, stamp_s=8.0)) and task.room
+
+
+def test_what_is_looked_at_in_vain_is_left():
+    looks, layer = Looks(), surroundings(lambda a, b: np.zeros(a.shape, bool)).layer
+    near, far = layer.cells(np.array([[0.5, 0.0]])), layer.cells(np.array([[4.0, 0.0]]))
+    both = np.concatenate([near, far])
+    for k in range(12):
+        kept = looks.worth(both, layer, sight(0.0, stamp_s=0.5 * k))
+    assert kept.tolist() == far.tolist()
+    assert not looks.over(100.0)
+    looks.worth(near, layer, sight(0.0, stamp_s=6.0))
+    assert not looks.over(18.0) and looks.over(20.0)
+
+
+def test_what_a_wall_parts_is_not_reachable():
+    layer = surroundings(lambda a, b: np.abs(a - 2.0) < 0.1).layer
+    cells = layer.cells(np.array([[1.0, 0.0], [4.0, 0.0]]))
+    assert reachable(cells, layer, HERE).tolist() == cells[:1].tolist()
+
+
+def test_upright_is_what_fills_the_height():
+    space = Space()
+    for z in np.arange(0.05, 2.3, 0.1):
+        space.points(np.array([[1.05, 0.05, z]]))
+        if z < 0.9:
+            space.points(np.array([[2.05, 0.05, z]]))
+    upright = space.upright(0.7, 1.5, 0.7)
+    layer = space.layer(1.15, 0.15)
+    assert upright[tuple(layer.cells(np.array([1.05, 0.05])))]
+    assert not upright[tuple(layer.cells(np.array([2.05, 0.05])))]
+    with pytest.raises(ValueError, match="grid"):
+        space.upright(1.0, 9.0, 0.5)
+
+
+def test_a_revised_unit_forgets_exits():
+    from edgeslam_torch.navigation.pilot import Pilot
+    from edgeslam_torch.navigation.tasks import GoTo
+
+    pilot = Pilot(GoTo(np.array([3.0, 0.0, 1.15])))
+    pilot.exits = watched([0.0, 0.2, 0.4, 0.6], surroundings(wall(0.9)))
+    pilot.update(sight(0.0, stamp_s=9.0))
+    assert len(pilot.exits.exits) <= 1
+    pilot.update(replace(sight(0.0, stamp_s=9.1), revision=1))
+    assert pilot.exits.exits == ()
