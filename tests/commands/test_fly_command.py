@@ -17,6 +17,13 @@ def test_a_dry_run_shows_the_plan_and_asks_nobody(capsys):
     assert "nothing was sent" in out
 
 
+@pytest.mark.parametrize(("verb", "words"), [("corridor", "where it ends or opens"), ("exit", "fly through it")])
+def test_verbs_that_look_for_openings_say_so(verb, words, capsys):
+    assert main(["fly", verb, "40", "--dry-run"]) == 0
+    out = capsys.readouterr().out
+    assert words in out and "at most 40 s" in out
+
+
 def test_without_leave_nothing_moves(capsys):
     assert main(["fly", "explore", "30", "--drone", "sim://blank_walls:1"]) == 0
     assert "nothing moved: add --fly" in capsys.readouterr().out
@@ -32,6 +39,8 @@ def test_without_leave_nothing_moves(capsys):
         (["goto", "3", "0", "--fence", "-1"], "--fence must be positive"),
         (["goto", "3", "0", "--fly", "--dry-run"], "contradict"),
         (["explore", "0"], "above 0"),
+        (["corridor", "0"], "above 0"),
+        (["exit", "9999"], "below 3600"),
         (["home", "--drone", "sim://coridor"], "unknown world 'coridor'"),
         (["home", "--drone", "sim://corridor:x"], "not a whole number"),
     ],

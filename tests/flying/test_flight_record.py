@@ -10,10 +10,14 @@ from edgeslam_torch.cli import main
 from edgeslam_torch.errors import OutputError, SourceError
 from edgeslam_torch.flying.cockpit import Cockpit
 from edgeslam_torch.flying.errands import WayHome
+from edgeslam_torch.flying.recorder import EXITS, Recorder
 from edgeslam_torch.flying.replay import replay, told
+from edgeslam_torch.geometry.camera import PRESETS
 from edgeslam_torch.geometry.mount import camera_on_body
+from edgeslam_torch.navigation.corridor import FollowCorridor
 from edgeslam_torch.navigation.flight_record import PLAN, Decision, NewTask, PlanLog, read_plan
 from edgeslam_torch.navigation.limits import NavLimits
+from edgeslam_torch.navigation.openings.watch import Exit
 from edgeslam_torch.navigation.sight import HOVER, Sight, View
 from edgeslam_torch.navigation.tasks import Explore, GoTo
 
@@ -63,6 +67,7 @@ def test_entries_come_back_to_the_last_bit(tmp_path):
         NewTask(GoTo(np.array([1.0, -2.0, 1.15]))),
         NewTask(Explore(math.inf)),
         NewTask(WayHome(np.zeros((0, 2)))),
+        NewTask(FollowCorridor(7.5)),
         seen,
         Decision(HOVER, "flying"),
     ]
@@ -70,8 +75,9 @@ def test_entries_come_back_to_the_last_bit(tmp_path):
     for entry in entries:
         log.add(entry)
     log.close()
-    first, goto, explore, home, back, decision = read_plan(tmp_path / PLAN)
+    first, goto, explore, home, follow, back, decision = read_plan(tmp_path / PLAN)
     assert first == limits and decision == entries[-1] and explore.task.until_s == math.inf
+    assert follow.task.until_s == 7.5 and not follow.task.room
     assert goto.task.goal_w.tolist() == [1.0, -2.0, 1.15] and home.task.track_w.shape == (0, 2)
     assert (back.p_w == seen.p_w).all() and math.isnan(back.seen_s) and back.revision == 2 and back.metric is False
     assert back.view.depth_m.dtype == np.float32 and (back.view.depth_m == seen.view.depth_m).all()
@@ -161,3 +167,18 @@ def test_a_task_that_no_file_can_hold_is_said(tmp_path):
     log.close()
     with pytest.raises(SourceError, match="never saw"):
         replay(tmp_path)
+
+
+def test_exits_are_recorded_as_they_become_known(tmp_path):
+    recorder = Recorder(tmp_path / "flight", NavLimits())
+    recorder.begin(PRESETS["tello"])
+    cockpit = Cockpit(NavLimits(), [recorder.moment])
+    cockpit.order(sight(0.0, (0.0, 0.0, 1.1)))
+    assert not (tmp_path / "flight" / EXITS).exists()
+    ahead = np.array([1.0, 0.0, 0.0])
+    cockpit.pilot.exits.exits = (Exit(np.array([2.0, 0.5, 1.1]), ahead, 0.9, 0.05, 0.1, 3),)
+    cockpit.order(sight(0.1, (0.0, 0.0, 1.1)))
+    recorder.close()
+    assert recorder.failure is None
+    lines = (tmp_path / "flight" / EXITS).read_text().splitlines()
+    assert lines[0].startswith("x_m,y_m") and lines[1:] == ["2.000,0.500,1.000,0.000,0.900,0.050,0.100,3"]

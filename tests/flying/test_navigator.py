@@ -19,9 +19,13 @@ WALL_M = 4.0
 
 
 class ObedientCraft:
-    """Moves at once as told, before a wall at x = `WALL_M` that it sees when it looks there; free elsewhere."""
+    """Moves at once as told, before a wall at x = `WALL_M` that it sees when it looks there; free elsewhere.
 
-    def __init__(self, cockpit, metric=True, battery=1.0):
+    ``door``: the wall is at 2.5 m, from -2 to 2, with a doorway of 0.9 m, and behind it is another at `WALL_M` + 2.
+    """
+
+    def __init__(self, cockpit, metric=True, battery=1.0, door=False):
+        self.door = door
         self.cockpit, self.camera, self.over = cockpit, PRESETS["tello"], ""
         self.flying, self.battery, self.metric, self.ticks = False, battery, metric, 0
         self.p, self.yaw, self.v, self.now_s = np.array([0.0, 0.0, 0.1]), 0.0, np.zeros(3), 0.0
@@ -63,10 +67,20 @@ class ObedientCraft:
         u, v = np.meshgrid(np.arange(80), np.arange(60))
         rays = np.stack([(u - 39.5) / 77.0, (v - 29.5) / 77.0, np.ones(u.shape)], -1) @ T[:3, :3].T
         with np.errstate(divide="ignore"):
-            to_wall = np.where(rays[..., 0] > 1e-6, (WALL_M - T[0, 3]) / rays[..., 0], 20.0)
+            to_wall = self._to_wall(T, rays)
             to_floor = np.where(rays[..., 2] < -1e-6, -T[2, 3] / rays[..., 2], 20.0)
         depth = np.minimum(np.minimum(to_wall, to_floor), 20.0).astype(np.float32)
         return View(self.now_s, depth, np.full(depth.shape, 0.01, np.float32), K, T)
+
+    def _to_wall(self, T, rays):
+        def to(x):
+            away = (x - T[0, 3]) / rays[..., 0]
+            return np.where((rays[..., 0] > 1e-6) & (away > 0), away, 20.0)
+
+        if not self.door:
+            return to(WALL_M)
+        across = T[1, 3] + to(2.5) * rays[..., 1]
+        return np.where((np.abs(across) < 2.0) & (np.abs(across) > 0.45), to(2.5), to(WALL_M + 2.0))
 
 
 def navigator(allow_motion=True, **craft):
@@ -130,6 +144,31 @@ def test_exploring_ends_in_time():
         assert 5.0 <= nav.craft.now_s - begin < 5.5
         with pytest.raises(FlightRefused, match="more than 0"):
             nav.explore(float("nan"))
+
+
+@pytest.mark.slow
+def test_an_exit_is_found_and_flown_through():
+    with navigator(door=True) as nav:
+        with pytest.raises(FlightRefused, match="take off first"):
+            nav.find_exits()
+        nav.take_off()
+        found = nav.find_exits(60.0)
+        assert found.reached and found.reason == "an exit is known"
+        exit_ = nav.exits()[0]
+        assert exit_.centre_w[:2] == pytest.approx([2.5, 0.0], abs=0.15)
+        assert exit_.width_m == pytest.approx(0.9, abs=0.15)
+        through = nav.go_through(exit_)
+        assert through.reached and through.reason == "through the exit"
+        assert nav.craft.p[:2] == pytest.approx([3.3, 0.0], abs=0.35)
+
+
+def test_nothing_ahead_is_no_corridor():
+    with navigator() as nav:
+        nav.take_off()
+        outcome = nav.follow_corridor(0.5)
+        assert not outcome.reached and outcome.reason == "there is no corridor to follow here"
+        with pytest.raises(FlightRefused, match="more than 0"):
+            nav.follow_corridor(0.0)
 
 
 @pytest.mark.parametrize("location", ["sim://nowhere", "sim://corridor:x", "sim://corridor:-1", "tello://a b"])

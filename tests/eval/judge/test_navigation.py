@@ -5,8 +5,11 @@ import json
 import numpy as np
 import pytest
 
+from edgeslam_torch.cli import main
+from edgeslam_torch.eval.judge.navigation.behaviours import BEHAVIOURS, corridor_ends, right_exits
 from edgeslam_torch.eval.judge.navigation.film import film_strip, moments
-from edgeslam_torch.eval.judge.navigation.flight import Case, Flown, contact_events, fly
+from edgeslam_torch.eval.judge.navigation.flight import contact_events, fly
+from edgeslam_torch.eval.judge.navigation.flown import Case, Flown
 from edgeslam_torch.eval.judge.navigation.near import near_counts
 from edgeslam_torch.eval.judge.navigation.oracle import shortest_m, true_layer
 from edgeslam_torch.eval.judge.navigation.pictures import top_view
@@ -14,6 +17,7 @@ from edgeslam_torch.eval.judge.navigation.runner import judge_flights
 from edgeslam_torch.eval.judge.navigation.table import markdown
 from edgeslam_torch.geometry.camera import PRESETS
 from edgeslam_torch.navigation.limits import NavLimits
+from edgeslam_torch.navigation.openings.watch import Exit
 from edgeslam_torch.navigation.sight import View
 from edgeslam_torch.synthetic.sites.build import named_site
 
@@ -120,6 +124,60 @@ def test_touches_in_a_row_are_one_contact():
 def test_unknown_faults_are_refused():
     with pytest.raises(ValueError, match="blackout"):
         fly(Case("corridor", 0, "storm"))
+    with pytest.raises(ValueError, match="exits"):
+        fly(Case("corridor", 0, behaviour="dance"))
+
+
+def exit_at(true, aside=0.0, turned=0.0):
+    c, s = np.cos(turned), np.sin(turned)
+    normal = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ true.normal_w
+    across = np.array([-true.normal_w[1], true.normal_w[0], 0.0])
+    return Exit(true.centre_w + aside * across, normal, 0.9, 0.05, 0.05, 2)
+
+
+def test_exits_are_right_within_half_a_metre_and_through_the_same_wall():
+    site = named_site("doors", 0)
+    first, second = site.exits
+    assert right_exits([exit_at(first, 0.3), exit_at(second, -0.3, 0.3)], site) == 2
+    assert right_exits([exit_at(first, 0.3), exit_at(first, -0.3)], site) == 1, "one exit counts once"
+    assert right_exits([exit_at(first, turned=np.pi)], site) == 1, "seen from behind"
+    assert right_exits([exit_at(first, 0.7), exit_at(second, turned=1.2)], site) == 0
+
+
+def test_a_corridor_ends_at_its_door_or_in_its_arm():
+    (door,) = corridor_ends(named_site("corridor", 0))
+    assert door == pytest.approx(named_site("corridor", 0).exits[0].centre_w[:2])
+    left, right = corridor_ends(named_site("t_corridor", 0))
+    assert left[0] == right[0] and left[1] == -right[1] != 0
+    with pytest.raises(ValueError, match="no corridor"):
+        corridor_ends(named_site("two_rooms", 0))
+
+
+def test_what_counts_as_reached_is_the_behaviours():
+    site = named_site("corridor", 0)
+    at_the_door = [*(site.exits[0].centre_w[:2] - [0.8, 0.0]), 1.1]
+    there = flown(True, distance_m=2.0, home_m=0.4, track_w=[[0.0, 0.0, 1.1], at_the_door])
+    reached = {name: behaviour.reached(there, site) for name, behaviour in BEHAVIOURS.items()}
+    assert reached == {"goto": False, "home": False, "corridor": True, "exits": False}
+
+
+def test_exits_have_a_table_of_their_own():
+    text = markdown([flown(True, exits=[2, 2, 1]), flown(True, exits=[1, 0, 0]), flown(True)])
+    assert "| goto | truth | 3 | 2 | 1 (9 to 91 %) | 1 (6 to 79 %) |" in text
+    assert "precision" not in markdown([flown(True)])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--behaviour", "dance"], "--behaviour: unknown name 'dance'"),
+        (["--behaviour", "corridor", "--world", "two_rooms"], "none of two_rooms is a corridor"),
+        (["--first-seed", "-1"], "--first-seed at least 0"),
+    ],
+)
+def test_flights_that_cannot_be_judged_are_refused(arguments, words, capsys):
+    assert main(["bench", "--navigation", *arguments]) == 1
+    assert words in capsys.readouterr().err
 
 
 @pytest.mark.slow
@@ -128,6 +186,19 @@ def test_by_the_true_pose_it_reaches_the_goal_of_a_blank_corridor_without_contac
     assert found.reached and found.contacts == 0 and found.landed
     assert found.clearance_min_m > 0.1
     assert found.time_s < 2 * found.oracle_s
+
+
+@pytest.mark.slow
+def test_by_the_true_pose_it_explores_finds_the_door_and_comes_home():
+    found = fly(Case("two_rooms", 1, behaviour="exits"))
+    assert found.reached and found.contacts == 0 and found.home_m < 0.3
+    assert found.exits == [1, 1, 1]
+
+
+@pytest.mark.slow
+def test_by_the_true_pose_it_follows_a_corridor_round_its_corner():
+    found = fly(Case("l_corridor", 1, behaviour="corridor"))
+    assert found.reached and found.contacts == 0
 
 
 @pytest.mark.slow

@@ -22,6 +22,15 @@ def test_way_clearance_and_each_change_of_state(tmp_path):
     assert page.count("<svg") == 2
 
 
+def test_exits_are_drawn_from_jamb_to_jamb(tmp_path):
+    lines = [f"{k},{k}.0,0.0,1.0,flying,,w\n" for k in range(3)]
+    without = written(tmp_path, lines)
+    (tmp_path / "exits.csv").write_text("x_m,y_m,normal_x,normal_y,width_m\n2,0,1,0,0.9\n2,nan,1,0,0.9\n")
+    page = written(tmp_path, lines)
+    assert "1 exit found" in page and "0.9 m wide" in page and "exit" not in without
+    assert page.count("<circle") == without.count("<circle") + 1
+
+
 @pytest.mark.parametrize("lines", [[], ["soup\n"], ["1,nan,0,0,a,b,c\n", "2,0,0,0,a,b,c\n"]])
 def test_no_flight_no_section(lines, tmp_path):
     assert written(tmp_path, lines) == ""
