@@ -13,8 +13,10 @@ from edgeslam_torch.navigation.openings.exits import gaps
 from edgeslam_torch.navigation.openings.pathways import pathways
 from edgeslam_torch.navigation.openings.turned import Walls, wall_directions
 from edgeslam_torch.navigation.openings.watch import ExitWatch
+from edgeslam_torch.navigation.pilot import Pilot
 from edgeslam_torch.navigation.sight import Sight
 from edgeslam_torch.navigation.space import Space
+from edgeslam_torch.navigation.tasks import GoTo
 
 ANGLES = [0.0, 0.3, math.pi / 4, 1.9]
 HERE = np.zeros(2)
@@ -212,12 +214,33 @@ def test_upright_is_what_fills_the_height():
 
 
 def test_a_revised_unit_forgets_exits():
-    from edgeslam_torch.navigation.pilot import Pilot
-    from edgeslam_torch.navigation.tasks import GoTo
-
     pilot = Pilot(GoTo(np.array([3.0, 0.0, 1.15])))
     pilot.exits = watched([0.0, 0.2, 0.4, 0.6], surroundings(wall(0.9)))
     pilot.update(sight(0.0, stamp_s=9.0))
     assert len(pilot.exits.exits) <= 1
     pilot.update(replace(sight(0.0, stamp_s=9.1), revision=1))
     assert pilot.exits.exits == ()
+
+
+def test_the_pilot_takes_what_is_low_for_no_wall():
+    """Two rows of points at x = 1 and 2 m: the first up to 2 m, the second around the height of flight alone."""
+    pilot = Pilot(GoTo(np.array([3.0, 0.0, 1.15])))
+    for y in np.arange(-0.95, 1.0, 0.1):
+        for z in np.arange(0.05, 2.0, 0.1):
+            pilot.space.points(np.array([[1.05, y, z]]))
+        pilot.space.points(np.array([[2.05, y, 1.15], [2.05, y, 1.05]]))
+    walls = pilot.walls()
+    first, second = (tuple(walls.layer.cells(np.array([x, 0.05]))) for x in (1.05, 2.05))
+    assert walls.layer.solid[first] and walls.layer.solid[second]
+    assert walls.upright[first] and not walls.upright[second]
+
+
+def test_what_is_unseen_beside_the_way_is_no_way_on():
+    """Unseen ground half a metre behind the start, and nothing else to see: the far end is the goal."""
+    closed = lambda a, b: (np.abs(b) > 1.0) | (a > 4.0)  # noqa: E731
+    layer = surroundings(closed, lambda a, b: a < -0.5).layer
+    task = FollowCorridor()
+    (cell,) = task.goals(layer, sight(0.0))
+    assert layer.centres(cell)[0] > 3.0
+    task.goals(layer, sight(3.2, stamp_s=5.0))
+    assert len(task.goals(layer, sight(3.3, stamp_s=5.5))) == 0
