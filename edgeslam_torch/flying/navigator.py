@@ -192,7 +192,10 @@ class Navigator:
         if outcome.reached and outcome.path_m < _LEAST_CORRIDOR_M:
             return replace(outcome, reached=False, reason="there is no corridor to follow here")
         end = "the corridor opens into a room" if task.room else "the corridor ends"
-        return self._in_time(outcome, task.until_s, end)
+        outcome = self._in_time(outcome, task.until_s, end)
+        if outcome.reason == end and not (task.room or task.wall):
+            return replace(outcome, reached=False, reason="it sees no way on and no end either")
+        return outcome
 
     def return_home(self) -> Outcome:
         """Fly to the take-off, back along the way where it is far.

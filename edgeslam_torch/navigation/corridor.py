@@ -24,6 +24,8 @@ _ARRIVED_M = 0.6
 _LEAST_M = 1.0
 """Shorter ways ahead are none."""
 _ROOM_S = 2.0
+_WALL_M, _ABREAST_M = 2.0, 0.5
+"""How near a wall ahead ends a corridor, and how far to each side it is looked for: there may be a door in it."""
 
 
 @dataclass(slots=True)
@@ -34,6 +36,8 @@ class FollowCorridor:
     """On the clock of the sights."""
     room: bool = False
     """Whether it ended where the corridor is wider than a corridor."""
+    wall: bool = False
+    """Whether something solid is close ahead: nothing to follow without it is not the corridor's end."""
     _looks: Looks = field(default_factory=Looks)
     _trail: list[FloatArray] = field(default_factory=list)
     """``(2,)`` places flown through, a metre apart, the newest last."""
@@ -47,6 +51,7 @@ class FollowCorridor:
         heading = self._followed(sight)
         self._note_width(layer, sight)
         region = _region(layer, sight.p_w[:2])
+        self.wall = _blocked(layer, sight.p_w[:2], heading)
         if region is None:
             return self._looks.worth(np.zeros((0, 2), int), layer, sight)
         away = np.asarray(ndimage.distance_transform_edt(~region)) * layer.cell_m
@@ -109,6 +114,15 @@ def _region(layer: Layer, here_w: FloatArray) -> np.ndarray | None:
     if np.linalg.norm(layer.centres(cell) - here_w) > _LEAST_M:
         return None
     return np.asarray(parts == parts[tuple(cell)])
+
+
+def _blocked(layer: Layer, here_w: FloatArray, heading: FloatArray) -> bool:
+    """Whether something solid is ahead, or to a side of what is ahead."""
+    steps = np.arange(0.3, _WALL_M, 0.5 * layer.cell_m)
+    left = np.array([-heading[1], heading[0]])
+    rays = here_w + steps[:, None, None] * heading + np.array([[-_ABREAST_M], [0.0], [_ABREAST_M]]) * left
+    cells = layer.cells(rays)
+    return bool(layer.solid[cells[..., 0], cells[..., 1]].any())
 
 
 def _nearest(mask: np.ndarray, cell: np.ndarray) -> np.ndarray:

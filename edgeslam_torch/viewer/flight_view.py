@@ -2,6 +2,7 @@
 
 import importlib
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +35,8 @@ class FlightView:
         with needs_extra("viewer", "the viewer"):
             self._rr: Any = importlib.import_module("rerun")
             layout = _layout(importlib.import_module("rerun.blueprint"))
-        self._stream: Any = self._rr.RecordingStream(f"edgeslam flight {name}")
+        # rerun warns of slashes and colons in a name.
+        self._stream: Any = self._rr.RecordingStream(re.sub(r"[^\w-]+", "_", f"edgeslam_flight_{name}"))
         if save is not None:
             check_writable(save)
             self._stream.save(str(save), default_blueprint=layout)

@@ -163,6 +163,16 @@ def test_a_corridor_is_followed_ahead_then_round_its_corner():
     assert whole.centres(cell)[1] > 1.0, "not back to what is unseen behind the start"
 
 
+def test_an_end_is_something_solid_ahead_not_the_lack_of_a_way():
+    """At 1 m before the end with a door in its middle; in the middle of it; where the sides alone are near."""
+    task = FollowCorridor()
+    ending = surroundings(lambda a, b: wall(0.9)(a, b) | (np.abs(b) > 1.0) & (np.abs(b) < 1.2)).layer
+    task.goals(ending, sight(-1.0))
+    assert not task.wall
+    task.goals(ending, sight(1.0, stamp_s=4.0))
+    assert task.wall
+
+
 def test_a_door_is_no_corridor():
     """Free space behind a doorway is not part of what is followed: the goal stays before it."""
     lined = surroundings(lambda a, b: wall(0.9)(a, b) | (np.abs(b) > 1.0) & (np.abs(b) < 1.2) & (a < 2.0)).layer
