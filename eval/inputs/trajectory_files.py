@@ -1,7 +1,7 @@
 """Trajectory files: TUM, EuRoC, KITTI and 7-Scenes, read and written.
 
-All give camera (or body) to world poses, as the files' own conventions say. Every reader refuses what cannot be a
-trajectory with one line that names the file and the likely mistake.
+All give poses of the camera in the world; those of a body whose camera is not known stay the body's. Every reader
+refuses what cannot be a trajectory with one line that names the file and the likely mistake.
 """
 
 import io
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.eval.errors import EvaluationError
+from edgeslam_torch.files.record_files import plain_yaml
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.types import FloatArray
 
@@ -22,6 +23,9 @@ SEVEN_SCENES_HZ = 30.0
 
 _TIMES = "times.txt"
 """Stamps beside poses whose format has none, as KITTI has them."""
+
+_OF_THE_BODY = ("state_groundtruth_estimate0", "mocap0")
+"""Folders of an EuRoC sequence whose poses are the body's; those of cam0 differ by the mount in its ``sensor.yaml``."""
 
 _LARGE_TEXT = 1 << 20
 _MAX_FILE_BYTES = 1 << 30
@@ -80,7 +84,7 @@ def read_trajectory(path: Path | str, stamps_s: FloatArray | None = None) -> Tra
     if columns == 12:
         return _from_kitti(table, path, stamps_s)
     if columns in (11, 17) or (columns > 8 and path.suffix == ".csv"):  # EuRoC: ns, p, q (w first), v, biases
-        return _from_rows(table[:, 0] * 1e-9, table[:, [1, 2, 3, 5, 6, 7, 4]], path)
+        return _of_camera(_from_rows(table[:, 0] * 1e-9, table[:, [1, 2, 3, 5, 6, 7, 4]], path), path)
     hint = " (positions without orientation?)" if columns == 4 else ""
     raise EvaluationError(
         f"{path}: {columns} number(s) a row from line {first_line} on{hint}; TUM has 8 (t x y z qx qy qz qw), "
@@ -244,6 +248,25 @@ def _from_rows(stamps_s: FloatArray, rows: FloatArray, path: Path) -> Trajectory
     T[:, :3, :3] = Rotation.from_quat(rows[:, 3:]).as_matrix()
     T[:, :3, 3] = rows[:, :3]
     return Trajectory(stamps_s, T, str(path), tuple(notes + more), rows)
+
+
+def _of_camera(body: Trajectory, path: Path) -> Trajectory:
+    """EuRoC's true poses, which are the body's, as those of ``cam0``: its images are what a run sees."""
+    sensor = path.resolve().parent.parent / "cam0" / "sensor.yaml"
+    if path.resolve().parent.name not in _OF_THE_BODY or not sensor.is_file():
+        return body
+    try:
+        record = plain_yaml(sensor.read_text(encoding="utf-8"))
+        if not isinstance(record, dict) or "T_BS" not in record:
+            return body
+        T_b_c = np.array(record["T_BS"]["data"], dtype=np.float64).reshape(4, 4)
+    except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
+        raise EvaluationError(f"{sensor}: T_BS, the camera's pose on the body, cannot be read ({error})") from error
+    R = T_b_c[:3, :3]
+    if not np.isfinite(T_b_c).all() or np.abs(R @ R.T - np.eye(3)).max() > 0.01 or np.linalg.det(R) < 0:
+        raise EvaluationError(f"{sensor}: T_BS, the camera's pose on the body, is no rotation and translation")
+    note = "the body's poses were turned into cam0's (T_BS of its sensor.yaml)"
+    return replace(body, T_w_c=body.T_w_c @ T_b_c, notes=(*body.notes, note))
 
 
 def _increasing(stamps_s: FloatArray, rows: FloatArray) -> tuple[FloatArray, FloatArray, list[str]]:

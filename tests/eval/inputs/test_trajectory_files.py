@@ -107,3 +107,41 @@ def test_huge_file_is_not_read(tmp_path: Path) -> None:
         file.truncate(3 << 30)  # sparse: takes no room
     with pytest.raises(EvaluationError, match="3.2 GB is too large for a trajectory"):
         read_trajectory(tmp_path / "flight.bag")
+
+
+_MOUNT = "T_BS:\n  cols: 4\n  rows: 4\n  data: [0, -1, 0, 0.5, 1, 0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]\n"
+"""A camera half a metre ahead of the body, a quarter turn around its axis."""
+
+
+def euroc_folder(folder: Path, body: Trajectory, sensor: str) -> Path:
+    """True poses and a camera's file, as EuRoC publishes them."""
+    (folder / "mav0" / "cam0").mkdir(parents=True)
+    (folder / "mav0" / "cam0" / "sensor.yaml").write_text(f"%YAML:1.0\nsensor_type: camera\n{sensor}")
+    truth = folder / "mav0" / "state_groundtruth_estimate0" / "data.csv"
+    truth.parent.mkdir()
+    WRITERS["euroc"](body, truth)
+    return truth
+
+
+def test_euroc_truth_becomes_the_cameras(loop: Trajectory, tmp_path: Path) -> None:
+    truth = euroc_folder(tmp_path, loop, _MOUNT)
+    for place in (tmp_path, tmp_path / "mav0", truth):
+        found = read_trajectory(place)
+        np.testing.assert_allclose(found.positions, loop.positions + 0.5 * loop.T_w_c[:, :3, 0], atol=1e-8)
+        np.testing.assert_allclose(found.T_w_c[:, :3, 0], loop.T_w_c[:, :3, 1], atol=1e-8)
+    assert "cam0" in found.notes[-1], "it says so"
+
+
+def test_euroc_truth_without_a_mount_stays_the_bodys(loop: Trajectory, tmp_path: Path) -> None:
+    found = read_trajectory(euroc_folder(tmp_path, loop, "rate_hz: 20\n"))
+    np.testing.assert_allclose(found.T_w_c, loop.T_w_c, atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    "sensor",
+    ["T_BS: 3\n", "T_BS: {data: [1, 2]}\n", _MOUNT.replace("-1", ".nan"), _MOUNT.replace("-1", "-2"), "T_BS: [\n"],
+)
+def test_euroc_mount_that_is_none_is_refused(sensor: str, loop: Trajectory, tmp_path: Path) -> None:
+    truth = euroc_folder(tmp_path, loop, sensor)
+    with pytest.raises(EvaluationError, match=r"sensor\.yaml: T_BS"):
+        read_trajectory(truth)
