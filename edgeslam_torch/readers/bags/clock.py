@@ -1,4 +1,4 @@
-"""Stamps of a topic's messages: of their headers, unless these are zero, frozen or of another clock."""
+"""Stamps of a topic's messages: of their headers, unless these are zero, frozen, backwards or of another clock."""
 
 import math
 from collections.abc import Sequence
@@ -49,6 +49,9 @@ def measure(first: Sequence[tuple[float, float | None]]) -> Offset:
         return Offset(0.0, "header stamps are zero")
     if len(headers) > 2 and len(set(headers)) == 1:
         return Offset(0.0, "header stamps never change")
+    steps = np.diff(headers)
+    if len(steps) > 1 and (steps < 0).sum() > len(steps) / 2:
+        return Offset(0.0, "header stamps run backwards")
     known = [(received, header) for received, header in first if header]
     return Offset(float(np.median([header - received for received, header in known])), None)
 

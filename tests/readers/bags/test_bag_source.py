@@ -136,6 +136,14 @@ def test_zero_header_stamps_are_replaced_by_receipt_and_said(tmp_path):
     assert "header stamps are zero" in _reasons(source)
 
 
+def test_header_stamps_that_run_backwards_are_replaced_by_receipt_and_said(tmp_path):
+    received = _times(9)
+    path = bags.write_mcap(tmp_path / "a.mcap", _pictures([2 * received[0] - t for t in received], received=received))
+    source = open_source(path)
+    assert _stamps(source) == pytest.approx(received, abs=1e-6)
+    assert "header stamps run backwards" in _reasons(source)
+
+
 def test_one_wild_stamp_and_a_clock_that_is_set_back_cost_no_picture(tmp_path):
     true = _times(20)
     wild = list(true)
