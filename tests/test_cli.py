@@ -138,6 +138,8 @@ MISTAKES = [
     (["sim", "--seed=-1"], 1, "--seed must be at least 0"),
     (["report", "{tmp}/deep"], 1, "summary.json: not valid JSON (nested too deeply)"),
     (["run", "{seq}", "--mode", "fast"], 2, "invalid choice"),
+    (["data"], 2, "list|get"),
+    (["weights"], 2, "list|download|convert|inspect"),
     (["run", "{seq}", "--camra", "x"], 2, "no option '--camra'; did you mean '--camera'?"),
     (["run", "{seq}", "--max", "5"], 2, "did you mean '--max-frames'?"),
     (["run", "{seq}", "more"], 2, "unexpected 'more'"),

@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         metavar="MANIFEST",
         help="folder of recordings, recording, pattern in quotes, or a .csv table with the columns recording, name, "
-        "camera, telemetry, truth, settings (all but the first may be left out)",
+        "camera, telemetry, topic, truth, settings (all but the first may be left out)",
     )
     parser.add_argument(
         "--out", type=Path, required=True, metavar="DIR", help="results; finished flights are not repeated"

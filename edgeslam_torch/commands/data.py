@@ -11,7 +11,7 @@ _CHECKSUM = {"publisher": "checksum by its publisher", "agreed": "checksum recor
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's options."""
-    actions = parser.add_subparsers(dest="action", required=True)
+    actions = parser.add_subparsers(dest="action", required=True, metavar="list|get")
     listing = actions.add_parser("list", help="names, sizes, licences, and what is there")
     listing.add_argument("names", nargs="*", metavar="NAME", help="only these; patterns such as 'tum_fr1_*'")
     add_folder(listing, "--to")

@@ -17,7 +17,7 @@ HELP = "list, download, convert and inspect depth-network weights"
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's options."""
-    actions = parser.add_subparsers(dest="action", required=True)
+    actions = parser.add_subparsers(dest="action", required=True, metavar="list|download|convert|inspect")
     actions.add_parser("list", help="shipped, downloaded and downloadable weights")
     download = actions.add_parser("download", help="fetch official FastDepth weights, or a network of others")
     download.add_argument("name", help="as 'list' prints it")
