@@ -43,6 +43,8 @@ class FollowCorridor:
     """``(2,)`` places flown through, a metre apart, the newest last."""
     _heading_w: FloatArray | None = None
     """``(2,)`` unit vector of the flight over the last metre; of the drone's nose at first."""
+    _began_w: FloatArray | None = None
+    """``(2, 2)`` where it began, and the direction of its nose there."""
     _wide_s: float = math.nan
     _target_w: FloatArray | None = None
 
@@ -57,8 +59,7 @@ class FollowCorridor:
         away = np.asarray(ndimage.distance_transform_edt(~region)) * layer.cell_m
         found = frontiers(layer)
         found = found[away[found[:, 0], found[:, 1]] <= 0.3]
-        apart = np.linalg.norm(layer.centres(found)[:, None] - np.array(self._trail), axis=2).min(axis=1)
-        found = found[apart > _PASSED_M]
+        found = found[self._is_new(layer.centres(found))]
         found = self._looks.worth(np.concatenate([found, self._end(layer, region, sight, heading)]), layer, sight)
         if len(found) == 0:
             return found
@@ -82,11 +83,20 @@ class FollowCorridor:
         if self._heading_w is None:
             self._heading_w = np.array([math.cos(sight.yaw_rad), math.sin(sight.yaw_rad)])
             self._trail = [here.copy()]
+            self._began_w = np.array([here, self._heading_w])
         step = here - self._trail[-1]
         if (length := float(np.linalg.norm(step))) >= _HEADING_M:
             self._heading_w = step / length
             self._trail.append(here.copy())
         return self._heading_w
+
+    def _is_new(self, p_w: FloatArray) -> np.ndarray:
+        """Which of the points ``(N, 2)`` are neither beside the way flown nor in the corridor behind its start."""
+        assert self._began_w is not None
+        step = p_w - self._began_w[0]
+        behind = (step @ self._began_w[1] < 0.0) & (np.linalg.norm(step, axis=1) < WIDEST_M)
+        apart = np.linalg.norm(p_w[:, None] - np.array(self._trail), axis=2).min(axis=1)
+        return np.asarray((apart > _PASSED_M) & ~behind)
 
     def _note_width(self, layer: Layer, sight: Sight) -> None:
         """A room is where nothing solid is within half a corridor's width, and all of that is seen."""
@@ -99,6 +109,9 @@ class FollowCorridor:
     def _end(self, layer: Layer, region: np.ndarray, sight: Sight, heading: FloatArray) -> np.ndarray:
         """The far end of what is free ahead, ``(1, 2)``; none when the drone is there."""
         cells = np.argwhere(region)
+        cells = cells[self._is_new(layer.centres(cells))]
+        if len(cells) == 0:
+            return cells
         ahead = (layer.centres(cells) - sight.p_w[:2]) @ heading
         best = int(np.argmax(ahead))
         return cells[best : best + 1] if ahead[best] > _ARRIVED_M else cells[:0]

@@ -42,5 +42,8 @@ def test_one_command_fetches_runs_and_judges_what_readme_quotes(publisher, data_
     for name, figures in runs.items():
         assert f"### {name}\n" in said
         assert figures["ate_sim3_m"] < 0.1, name
-        assert (figures.get("map_median_m") is not None) == (name != "euroc_mh_05"), "EuRoC has no depth maps"
+    # EuRoC has no depth maps, and two seconds of turning on the spot may leave no map to compare.
+    mapped = {name for name, figures in runs.items() if figures.get("map_median_m") is not None}
+    assert {"tum_fr1_xyz", "7scenes_redkitchen_seq-01", "tum_fr3_structure_notexture_far"} <= mapped
+    assert "euroc_mh_05" not in mapped
     assert runs["euroc_mh_05"]["rotation_deg"] < 20.0, "the truth is the body's, turned into the camera's"

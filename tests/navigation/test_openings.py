@@ -163,6 +163,14 @@ def test_a_corridor_is_followed_ahead_then_round_its_corner():
     assert whole.centres(cell)[1] > 1.0, "not back to what is unseen behind the start"
 
 
+def test_what_is_unseen_behind_the_start_is_where_it_came_from():
+    """Two metres behind it, which is not beside its way: at the end of the corridor it does not turn back to it."""
+    layer = surroundings(lambda a, b: (np.abs(b) > 1.0) | (a > 4.0), lambda a, b: a < -2.0).layer
+    task = FollowCorridor()
+    task.goals(layer, sight(0.0))
+    assert len(task.goals(layer, sight(3.3, stamp_s=5.0))) == 0
+
+
 def test_an_end_is_something_solid_ahead_not_the_lack_of_a_way():
     """At 1 m before the end with a door in its middle; in the middle of it; where the sides alone are near."""
     task = FollowCorridor()
