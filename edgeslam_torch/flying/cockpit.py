@@ -12,6 +12,7 @@ from edgeslam_torch.flying.errands import Stay
 from edgeslam_torch.navigation.flight_record import Decision, NewTask
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.limits import NavLimits
+from edgeslam_torch.navigation.moved import Moved
 from edgeslam_torch.navigation.openings.turned import Walls
 from edgeslam_torch.navigation.openings.watch import Exit
 from edgeslam_torch.navigation.pilot import Phase, Pilot
@@ -65,7 +66,6 @@ class Cockpit:
         self._next: Task | None = None
         self._held = False
         self._track: list[FloatArray] = []
-        self._revision = 0
         self._path_m, self._clearance_m = 0.0, math.nan
 
     def begin(self, task: Task) -> None:
@@ -93,6 +93,8 @@ class Cockpit:
         if task is not None:
             self._witness(NewTask(task))
         self._witness(sight)
+        if sight.moved is not None:
+            self._carry(sight.moved)
         wish = self.pilot.update(sight)
         with self._lock:
             self._supervisor.propose(wish, sight.stamp_s)
@@ -100,6 +102,12 @@ class Cockpit:
         self._witness(decision)
         self._note_clearance(sight)
         return decision
+
+    def _carry(self, moved: Moved) -> None:
+        """Take the way flown along with the map; the pilot does so itself."""
+        with self._lock:
+            self._track = list(moved.points(np.array(self._track).reshape(-1, 2)))
+            self._supervisor.carry(moved)
 
     def _take_up(self, task: Task) -> None:
         """A first look that is under way is finished."""
@@ -141,7 +149,7 @@ class Cockpit:
         return self.pilot.exits.exits
 
     def track(self) -> FloatArray:
-        """``(N, 2)`` where it flew since its metres were last revised, oldest first."""
+        """``(N, 2)`` where it flew, oldest first."""
         with self._lock:
             return np.array(self._track).reshape(-1, 2)
 
@@ -153,8 +161,6 @@ class Cockpit:
     def _note_path(self, sight: Sight) -> None:
         here = sight.p_w[:2]
         with self._lock:
-            if sight.revision != self._revision:
-                self._revision, self._track = sight.revision, []
             step = float(np.linalg.norm(here - self._track[-1])) if self._track else 0.0
             if self._track and step < _STEP_M:
                 return

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from edgeslam_torch.navigation.layer import Layer
+from edgeslam_torch.navigation.moved import Moved
 from edgeslam_torch.navigation.sight import Sight
 from edgeslam_torch.types import FloatArray
 
@@ -25,8 +26,11 @@ class Stay:
         """At once: a pilot asks only when it is at its height."""
         return True
 
+    def carry(self, moved: Moved) -> None:
+        """It remembers nothing."""
 
-@dataclass(frozen=True, slots=True)
+
+@dataclass(slots=True)
 class WayHome:
     """Fly to the take-off, along the way that was flown as long as the take-off lies beyond the grid."""
 
@@ -45,3 +49,7 @@ class WayHome:
         """Whether the drone is above its take-off, and slow."""
         near = float(np.linalg.norm(sight.p_w[:2])) < HOME_M
         return near and float(np.linalg.norm(sight.velocity_w)) < _SLOW_M_S
+
+    def carry(self, moved: Moved) -> None:
+        """Take the way along with the map; the take-off stays the origin."""
+        self.track_w = moved.points(self.track_w)

@@ -1,6 +1,7 @@
 """What a pilot is told: what the SLAM knows, from pictures and state messages alone."""
 
 import threading
+from collections import deque
 
 import cv2
 import numpy as np
@@ -10,8 +11,10 @@ from edgeslam_torch.frontend.depth_network import DepthNetwork, open_depth
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.mount import camera_on_body
+from edgeslam_torch.navigation.moved import Moved, moves
 from edgeslam_torch.navigation.near_depth import fit_to_points
 from edgeslam_torch.navigation.sight import Sight, View
+from edgeslam_torch.navigation.space import CELL_M, KEPT
 from edgeslam_torch.slam import EdgeSlam
 from edgeslam_torch.types import FloatArray, Frame, SlamOutput, TelemetrySample
 
@@ -26,6 +29,8 @@ _STEP = 4
 _LOST = ("lost", "starting")
 _DISAGREE_SIGMAS = 3.0
 _WIDEST_SIGMA_M = 0.2
+_MOVES_EVERY_S = 3.0
+"""Least time between two moves of the map in one unit: each costs a pilot as much as all its views together."""
 
 
 class SlamEyes:
@@ -57,6 +62,12 @@ class SlamEyes:
         self._T_home_slam: FloatArray = np.eye(4)
         self._battery = 1.0
         self._told_height_m = np.nan
+        self._shown: tuple[FloatArray, float] = np.zeros((0, 4, 4)), 1.0
+        """Poses ``(F, 4, 4)`` of all pictures when the last view was made, and the unit of the map then."""
+        self._told: deque[tuple[int, FloatArray]] = deque(maxlen=KEPT)
+        """Pictures whose views were told, and their poses as they were told last."""
+        self._told_unit, self._moved_s = 1.0, -np.inf
+        self._revision = 0
 
     def heard(self, sample: TelemetrySample) -> None:
         """Take a state message."""
@@ -75,17 +86,22 @@ class SlamEyes:
         with self._lock:
             batch = list(self._samples)
         output = self._slam.step(Frame(self._frames, arrived_s, image), batch)
-        home = self._home()
+        T_slam = self._slam.trajectory()[1]
+        home = self._home(T_slam[0])
         with self._lock:
             del self._samples[: len(batch)]
             self._output, self._captured_s, self._T_home_slam = output, captured_s, home
         self._frames += 1
-        if self._frames % _DEPTH_EVERY or not _tracks(output):
+        revised, self._revision = output.revision != self._revision, output.revision
+        if (self._frames % _DEPTH_EVERY and not revised) or not _tracks(output):
             return None
-        return self._view(image, output, captured_s)
+        view = self._view(image, output, captured_s)
+        with self._lock:
+            self._shown = home @ T_slam, output.unit
+        return view
 
     def sight(self, now_s: float, view: View | None = None) -> Sight:
-        """The moment, with a new view if there is one."""
+        """The moment, with a new view if there is one, and with it how the map moved since the last."""
         with self._lock:
             output, captured_s, home = self._output, self._captured_s, self._T_home_slam
             samples, battery, told = list(self._samples), self._battery, self._told_height_m
@@ -122,15 +138,32 @@ class SlamEyes:
             told_height_m=told,
             view=view,
             revision=pose.revision,
+            moved=None if view is None else self._moved(view),
         )
 
     def close(self) -> None:
         """Stop the SLAM's threads."""
         self._slam.close()
 
-    def _home(self) -> FloatArray:
+    def _moved(self, view: View) -> Moved | None:
+        """How the views that were told have moved when this one was made; this one counts as told from now on."""
+        with self._lock:
+            T_w_c, unit = self._shown
+        found = None
+        if self._told:
+            before = np.array([T for _, T in self._told])
+            after = T_w_c[[picture for picture, _ in self._told]]
+            revised = unit != self._told_unit
+            if revised or (view.stamp_s - self._moved_s > _MOVES_EVERY_S and moves(before, after, CELL_M)):
+                found, self._moved_s = Moved(before, after, unit / self._told_unit), view.stamp_s
+                self._told = deque(((k, T) for (k, _), T in zip(self._told, after, strict=True)), self._told.maxlen)
+        self._told.append((view.picture, view.T_w_c))
+        self._told_unit = unit
+        return found
+
+    def _home(self, T_first: FloatArray) -> FloatArray:
         """``(4, 4)`` from the SLAM's world to the one whose origin is below the first picture's body."""
-        T_w_b = self._slam.trajectory()[1][0] @ se3.inverse(self._T_b_c)
+        T_w_b = T_first @ se3.inverse(self._T_b_c)
         yaw = float(np.arctan2(T_w_b[1, 0], T_w_b[0, 0]))
         out = np.eye(4)
         out[:2, :2] = [[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]]
@@ -150,7 +183,7 @@ class SlamEyes:
         K[:2, 2] += 0.5 / _STEP - 0.5
         part = (slice(_STEP // 2, None, _STEP), slice(_STEP // 2, None, _STEP))
         T_w_c = self._T_home_slam @ output.T_w_c
-        return View(captured_s, metres.depth_m[part], metres.sigma_log[part], K, T_w_c)
+        return View(captured_s, metres.depth_m[part], metres.sigma_log[part], K, T_w_c, self._frames - 1)
 
 
 def _tracks(output: SlamOutput) -> bool:

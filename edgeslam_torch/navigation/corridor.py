@@ -8,6 +8,7 @@ from scipy import ndimage
 
 from edgeslam_torch.navigation.frontiers import Looks, frontiers
 from edgeslam_torch.navigation.layer import Layer
+from edgeslam_torch.navigation.moved import Moved
 from edgeslam_torch.navigation.openings.pathways import WIDEST_M
 from edgeslam_torch.navigation.sight import Sight
 from edgeslam_torch.types import FloatArray
@@ -76,6 +77,15 @@ class FollowCorridor:
         """Whether the corridor ended, or the time."""
         self.room = sight.stamp_s - self._wide_s > _ROOM_S
         return self.room or self._looks.over(sight.stamp_s) or sight.stamp_s >= self.until_s
+
+    def carry(self, moved: Moved) -> None:
+        """Take the way flown along with the map; directions of level flight hardly turn with it."""
+        self._looks.carry(moved)
+        self._trail = list(moved.points(np.array(self._trail).reshape(-1, 2)))
+        if self._began_w is not None:
+            self._began_w[:1] = moved.points(self._began_w[:1])
+        if self._target_w is not None:
+            self._target_w = moved.points(self._target_w[None])[0]
 
     def _followed(self, sight: Sight) -> FloatArray:
         """Note where it is; the direction of the flight ``(2,)``."""

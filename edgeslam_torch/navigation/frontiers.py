@@ -7,6 +7,7 @@ import numpy as np
 from scipy import ndimage
 
 from edgeslam_torch.navigation.layer import Layer
+from edgeslam_torch.navigation.moved import Moved
 from edgeslam_torch.navigation.sight import Sight
 from edgeslam_torch.types import FloatArray
 
@@ -73,6 +74,11 @@ class Looks:
     def over(self, now_s: float) -> bool:
         """Whether there was nothing left to look at for as long as a look around takes."""
         return now_s - self._nothing_s > _ROUND_S  # false while it is NaN
+
+    def carry(self, moved: Moved) -> None:
+        """Take the places along with the map."""
+        places = moved.points(np.array([place for place, _ in self._near]).reshape(-1, 2))
+        self._near = [(place, spent_s) for place, (_, spent_s) in zip(places, self._near, strict=True)]
 
     def _spend(self, place_w: FloatArray, passed_s: float) -> None:
         for k, (other, spent_s) in enumerate(self._near):

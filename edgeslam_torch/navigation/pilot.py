@@ -10,6 +10,7 @@ from edgeslam_torch.geometry.rotations import wrapped
 from edgeslam_torch.navigation.arcs import Arcs, candidates
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.limits import NavLimits
+from edgeslam_torch.navigation.moved import Moved
 from edgeslam_torch.navigation.openings.turned import Walls
 from edgeslam_torch.navigation.openings.watch import ExitWatch
 from edgeslam_torch.navigation.route import CostToGo, cost_to_go
@@ -37,8 +38,12 @@ _SQUEEZE = 0.6
 """Share of the speed with which it passes the unseen at a hull's distance."""
 _GAIN_M = 0.04
 """Least progress of a movement, in metres of way."""
+_MOVES_S = 1.0
+"""Time within which a view should come after a revision of metres, five a second being usual."""
 _PATIENCE_S = 1.0
 """Time in which a look must show a way; then it rises for another view."""
+_LEVEL_S = 40.0
+"""Time after which a look around is given up: it takes 12 s, and metres are waited for up to 20 s more."""
 _LOST_S = 15.0
 """Time without progress after which the task is given up."""
 _ELSEWHERE_M = 0.5
@@ -84,6 +89,10 @@ class Pilot:
     _waiting_s: float = math.nan
     """Since when there is nothing to fly into."""
     _revision: int = 0
+    _revised_s: float = -math.inf
+    """When its metres were last those of the sights."""
+    _level_s: float = math.nan
+    """Since when it looks around."""
     _sweep: list[float] = field(default_factory=list)
     """Headings still to be looked at, last first."""
     _looked_w: FloatArray | None = None
@@ -108,9 +117,12 @@ class Pilot:
         """
         if not (np.isfinite(sight.p_w).all() and np.isfinite(sight.velocity_w).all()):
             raise ValueError("a pilot needs to know where the drone is, and how fast")
+        if sight.revision != self._revision and sight.moved is None and sight.stamp_s - self._revised_s < _MOVES_S:
+            return Wish(why="its metres were revised: wait for a view in the new ones")
         self._take_in(sight)
         if self.phase in (Phase.RISING, Phase.SWEEPING, Phase.SINKING):
             return self._level(sight)
+        self._level_s = math.nan
         if self.phase in (Phase.DONE, Phase.STUCK):
             return self._at_height(sight, HOVER)
         if self.task.done(sight):
@@ -119,11 +131,11 @@ class Pilot:
         return self._at_height(sight, self._fly(sight))
 
     def _take_in(self, sight: Sight) -> None:
-        if sight.revision != self._revision:
-            self.space, self._revision = Space(), sight.revision
-            self.exits = ExitWatch()
-            self._plan, self._least, self._progress_s = None, math.inf, math.nan
-            self.phase = Phase.RISING
+        if sight.moved is not None:
+            self._carry(sight.moved, sight.stamp_s)
+        elif sight.revision != self._revision:
+            self._forget()
+        self._revision, self._revised_s = sight.revision, sight.stamp_s
         if math.isnan(self._progress_s):
             self._progress_s = sight.stamp_s
             if self.phase is Phase.RISING:
@@ -136,9 +148,31 @@ class Pilot:
         if self.exits.due(sight):
             self.exits.look(self.walls(), sight)
 
+    def _carry(self, moved: Moved, now_s: float) -> None:
+        """Bring what is known along with the map that moved."""
+        self.space.rebuild(moved)
+        self.exits.carry(moved)
+        self.task.carry(moved)
+        if self._looked_w is not None:
+            self._looked_w = moved.points(self._looked_w[None])[0]
+        self._plan, self._least = None, math.inf
+        if not math.isnan(self._progress_s):
+            self._progress_s = now_s
+
+    def _forget(self) -> None:
+        """Begin anew: nothing says how what is known relates to the new metres."""
+        self.space, self.exits = Space(), ExitWatch()
+        self._plan, self._least, self._progress_s = None, math.inf, math.nan
+        self.phase = Phase.RISING
+
     def _level(self, sight: Sight) -> Wish:
         """Rise above the height of flight, look left and right, and come back to it."""
         low, high = self.limits.height_m, self.limits.height_m + _LOOK_M
+        if math.isnan(self._level_s):
+            self._level_s = sight.stamp_s
+        if sight.stamp_s - self._level_s > _LEVEL_S:
+            self.phase = Phase.STUCK
+            return HOVER
         if self.phase is Phase.RISING and sight.p_w[2] > high - 0.06:
             self.phase = Phase.SWEEPING
             self._sweep = [sight.yaw_rad + side * _SWEEP_RAD for side in (0.0, 1.0, -1.0)]

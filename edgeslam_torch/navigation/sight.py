@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from edgeslam_torch.navigation.moved import Moved
 from edgeslam_torch.types import FloatArray
 
 
@@ -21,8 +22,8 @@ class View:
     """``(3, 3)`` of a camera without distortion [px]."""
     T_w_c: FloatArray
     """``(4, 4)`` metric; in the drone's world: origin on the floor at power-on, x forward, y left, z up."""
-    keyframe: int = -1
-    """Keyframe of the map that it hangs on, whose correction moves it; -1 for none."""
+    picture: int = -1
+    """Number of the picture that it was seen in; -1 where nobody asks."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +54,8 @@ class Sight:
     """A new depth map, if there is one."""
     revision: int = 0
     """How often the unit of the positions was revised; after a change, earlier ones mean something else."""
+    moved: Moved | None = None
+    """How the map moved since the last sight with a view; None where it did not."""
 
     @property
     def blind_s(self) -> float:

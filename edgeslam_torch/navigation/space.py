@@ -5,13 +5,13 @@ that is seen too far away is the one that is hit.
 """
 
 from collections import deque
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
 
 from edgeslam_torch.navigation.layer import Layer
+from edgeslam_torch.navigation.moved import Moved
 from edgeslam_torch.navigation.sight import View
 from edgeslam_torch.types import FloatArray
 
@@ -34,8 +34,10 @@ _SIGMAS = 2.0
 _MIN_DEPTH_M = 0.15
 _PLACED_M = 0.3
 """Standard deviation above which a surface has no place: it fills nothing, and frees only what is sure."""
-_KEPT = 120
-"""Views that are remembered to rebuild the grid from when the map moves."""
+KEPT = 240
+"""Views that are remembered to rebuild the grid from when the map moves: 24 m of way at the fastest."""
+_SAME_M, _SAME_COS, _ALIKE = 0.1, np.cos(np.radians(4.0)), 3
+"""A fourth view from within these of three others takes the place of the last: hovering fills no memory."""
 _SMALL = (80, 60)
 """Size at which depth is used [px], the nearest of the pixels that fall together: 7 cm at `REACH_M`."""
 
@@ -61,13 +63,17 @@ class Space:
     def __post_init__(self) -> None:
         self._odds = np.zeros((SIDE, SIDE, LEVELS), np.float32)
         self._corner = np.floor(self.centre_w / CELL_M).astype(int) - SIDE // 2
-        self._views = deque(maxlen=_KEPT)
+        self._views = deque(maxlen=KEPT)
         self._flown = deque(maxlen=4000)
 
     def observe(self, view: View) -> None:
         """Carve and fill by a depth map."""
-        self._views.append(_smaller(view))
-        self._add(self._views[-1])
+        small = _smaller(view)
+        if len(self._views) >= _ALIKE and _alike(self._views[-_ALIKE], small):
+            self._views[-1] = small
+        else:
+            self._views.append(small)
+        self._add(small)
 
     def flown(self, p_w: FloatArray, radius_m: float) -> None:
         """What the drone has flown through is free: a sphere around ``(3,)``, of the drone's radius or, at take-off,
@@ -88,18 +94,18 @@ class Space:
             moved[new[0], new[1]] = self._odds[old[0], old[1]]
         self._odds, self._corner = moved, self._corner + step
 
-    def rebuild(self, pose: Callable[[View], FloatArray]) -> None:
-        """Build the grid anew after the map moved.
-
-        Args:
-            pose: The present ``T_w_c`` ``(4, 4)`` of a remembered view.
-        """
+    def rebuild(self, moved: Moved) -> None:
+        """Build the grid anew from the views that are remembered, after the map moved."""
         self._odds[:] = 0.0
-        for k, view in enumerate(self._views):
-            self._views[k] = replace(view, T_w_c=pose(view))
-            self._add(self._views[k])
-        for p_w, radius_m in self._flown:
-            self._clear(p_w, radius_m)
+        if self._views:
+            poses = moved.poses(np.array([view.T_w_c for view in self._views]))
+            for k, (view, T_w_c) in enumerate(zip(self._views, poses, strict=True)):
+                self._views[k] = replace(view, T_w_c=T_w_c, depth_m=moved.ratio * view.depth_m)
+                self._add(self._views[k])
+        flown = moved.points(np.array([p_w for p_w, _ in self._flown]).reshape(-1, 3))
+        for k, p_w in enumerate(flown):
+            self._flown[k] = p_w, self._flown[k][1]
+            self._clear(*self._flown[k])
 
     def layer(self, height_m: float, half_m: float) -> Layer:
         """What a drone at a height can fly through, if everything within ``half_m`` above and below must be free."""
@@ -203,6 +209,11 @@ class Space:
             x, y, z = np.meshgrid(*axes, indexing="ij")
             part = self._odds[low[0] : high[0], low[1] : high[1], low[2] : high[2]]
             part[x * x + y * y + z * z < (radius_m + 0.5 * CELL_M) ** 2] = _FLOWN
+
+
+def _alike(one: View, other: View) -> bool:
+    near = float(np.linalg.norm(one.T_w_c[:3, 3] - other.T_w_c[:3, 3])) < _SAME_M
+    return near and float(one.T_w_c[:3, 2] @ other.T_w_c[:3, 2]) > _SAME_COS
 
 
 def _smaller(view: View) -> View:

@@ -11,6 +11,7 @@ from enum import StrEnum
 import numpy as np
 
 from edgeslam_torch.navigation.limits import NavLimits
+from edgeslam_torch.navigation.moved import Moved
 from edgeslam_torch.navigation.sight import Sight, Wish
 from edgeslam_torch.types import FloatArray
 
@@ -31,6 +32,9 @@ _WIGGLE_S, _WIGGLE_M_S = 2.0, 0.15
 _PUSHED_M_S, _STANDS_M_S, _PUSH_S = 0.15, 0.04, 1.5
 """Commanded faster than the first, moving slower than the second for this long: something holds it."""
 _TRAIL_M = 0.05
+_APART_M, _APART_S = 0.5, 1.0
+"""Heights of map and drone that are so far apart for so long cannot both be true. Together sure metres of 10 % at the
+highest flight, a video that is 0.5 s late in a climb of 0.4 m/s, and the drone's own decimetres explain 0.45 m."""
 
 
 class Danger(StrEnum):
@@ -42,6 +46,7 @@ class Danger(StrEnum):
     SCALE = "metres are not sure"
     BLIND = "no fresh picture"
     LOST = "the pose rests on no map"
+    APART = "the map and the drone's own height contradict each other"
     HELD = "commanded and not moving: contact"
     NOT_METRIC = "no metres"
     HAND = "held by hand"
@@ -80,6 +85,8 @@ class Supervisor:
     _grave_s: float = math.nan
     """Since when in other trouble than doubtful metres."""
     _pushing_s: float = math.nan
+    _apart_s: float = math.nan
+    """Since when the heights of map and drone are apart."""
     _told: bool = True
     """Whether the drone was told the pilot's wish at the last order, or would have been but for being held."""
     _trail: deque[FloatArray] = field(default_factory=lambda: deque(maxlen=400))
@@ -94,6 +101,10 @@ class Supervisor:
         moved = not self._trail or float(np.linalg.norm(sight.p_w - self._trail[-1])) > _TRAIL_M
         if moved and self._danger(sight, sight.stamp_s) is Danger.NONE:
             self._trail.append(sight.p_w.copy())
+
+    def carry(self, moved: Moved) -> None:
+        """Take the way flown along with the map."""
+        self._trail = deque(moved.points(np.array(self._trail).reshape(-1, 3)), maxlen=self._trail.maxlen)
 
     def propose(self, wish: Wish, now_s: float) -> None:
         """The pilot's newest wish; it counts for `STALE_S`."""
@@ -142,6 +153,7 @@ class Supervisor:
             (not sight.metric, Danger.NOT_METRIC),
             (self._is_held(sight, now_s), Danger.HELD),
             (not sight.tracked, Danger.LOST),
+            (self._is_apart(sight, now_s), Danger.APART),
             (late > BLIND_S, Danger.BLIND),
             (sight.scale_sigma > SCALE_SIGMA or sight.conflict, Danger.SCALE),
             (self._leaves(sight), Danger.FENCE),
@@ -161,6 +173,16 @@ class Supervisor:
             self._pushing_s = now_s
         return now_s - self._pushing_s > _PUSH_S
 
+    def _is_apart(self, sight: Sight, now_s: float) -> bool:
+        """Whether the pose goes its own way: a map that is sure of its metres, and another height than the drone's."""
+        off = abs(sight.told_height_m - float(sight.p_w[2]))
+        if _doubtful(sight) or not off > _APART_M:  # false too where the drone says nothing
+            self._apart_s = math.nan
+            return False
+        if math.isnan(self._apart_s):
+            self._apart_s = now_s
+        return now_s - self._apart_s > _APART_S
+
     def _leaves(self, sight: Sight) -> bool:
         """Whether it is beyond the fence and wants to go farther."""
         assert self._home_w is not None
@@ -173,19 +195,12 @@ class Supervisor:
 
     def _within_heights(self, wish: Wish) -> Wish:
         assert self._sight is not None
-        z, up = self._height_m(self._sight), wish.up_m_s
-        if z > self.limits.highest_m:
+        heights, up = _heights_m(self._sight), wish.up_m_s
+        if max(heights) > self.limits.highest_m:
             up = min(up, 0.0)
-        if z < self.limits.lowest_m:
+        if min(heights) < self.limits.lowest_m:
             up = max(up, 0.0)
         return Wish(wish.forward_m_s, wish.left_m_s, up, wish.turn_left_rad_s, wish.why)
-
-    @staticmethod
-    def _height_m(sight: Sight) -> float:
-        """Height above the floor; the drone's own word where the map's metres are doubtful."""
-        doubtful = not sight.metric or sight.scale_sigma > SCALE_SIGMA or sight.conflict
-        told = sight.told_height_m
-        return told if doubtful and math.isfinite(told) else float(sight.p_w[2])
 
     def _meanwhile(self, danger: Danger, trouble_s: float) -> Wish:
         """Hover; then what may mend it."""
@@ -194,7 +209,7 @@ class Supervisor:
             wish = Wish(up_m_s=_WIGGLE_M_S if rising else -_WIGGLE_M_S, why=f"{danger}: up and down")
             return self._within_heights(wish)
         backing = BACK_S < trouble_s < BACK_S + _BACK_M / _BACK_M_S
-        if danger in (Danger.BLIND, Danger.LOST, Danger.HELD) and backing:
+        if danger in (Danger.BLIND, Danger.LOST, Danger.HELD) and backing:  # not where the pose itself is wrong
             return self._back(danger)
         if danger is Danger.LOST and trouble_s > BACK_S + _BACK_M / _BACK_M_S:
             return Wish(turn_left_rad_s=0.5 * self.limits.turn_rad_s, why=f"{danger}: look around")
@@ -212,3 +227,16 @@ class Supervisor:
         step = step * (_BACK_M_S / float(np.linalg.norm(step)))
         c, s = math.cos(self._sight.yaw_rad), math.sin(self._sight.yaw_rad)
         return Wish(c * step[0] + s * step[1], c * step[1] - s * step[0], 0.0, 0.0, f"{danger}: back the way it came")
+
+
+def _doubtful(sight: Sight) -> bool:
+    """Whether the map's metres are."""
+    return not sight.metric or sight.scale_sigma > SCALE_SIGMA or sight.conflict
+
+
+def _heights_m(sight: Sight) -> list[float]:
+    """Heights above the floor by the drone and by the map, as far as they are known and not doubtful; at least one."""
+    told, mapped = sight.told_height_m, float(sight.p_w[2])
+    if not math.isfinite(told):
+        return [mapped]
+    return [told] if _doubtful(sight) else [told, mapped]

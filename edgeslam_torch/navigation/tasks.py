@@ -7,6 +7,7 @@ import numpy as np
 
 from edgeslam_torch.navigation.frontiers import Looks, frontiers, reachable
 from edgeslam_torch.navigation.layer import Layer
+from edgeslam_torch.navigation.moved import Moved
 from edgeslam_torch.navigation.sight import Sight
 from edgeslam_torch.types import FloatArray
 
@@ -21,6 +22,9 @@ class Task(Protocol):
 
     def done(self, sight: Sight) -> bool:
         """Whether it is reached."""
+
+    def carry(self, moved: Moved) -> None:
+        """Take remembered places along with the map."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +49,9 @@ class GoTo:
         near = float(np.linalg.norm(sight.p_w[:2] - self.goal_w[:2])) < ARRIVED_M
         return near and float(np.linalg.norm(sight.velocity_w)) < 0.15
 
+    def carry(self, moved: Moved) -> None:
+        """A goal in metres from the take-off stays what it is."""
+
 
 @dataclass(slots=True)
 class Explore:
@@ -61,3 +68,7 @@ class Explore:
     def done(self, sight: Sight) -> bool:
         """Whether the time is over, or nothing is left to see."""
         return sight.stamp_s >= self.until_s or self._looks.over(sight.stamp_s)
+
+    def carry(self, moved: Moved) -> None:
+        """Take the places along that were looked at in vain."""
+        self._looks.carry(moved)

@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 from edgeslam_torch.flying.cockpit import Cockpit
+from edgeslam_torch.flying.errands import Stay
 from edgeslam_torch.navigation.limits import NavLimits
+from edgeslam_torch.navigation.moved import Moved
 from edgeslam_torch.navigation.pilot import Phase
 from edgeslam_torch.navigation.sight import Sight, Wish
 from edgeslam_torch.navigation.supervisor import Danger
@@ -79,8 +81,12 @@ def test_way_is_counted_for_each_task_and_the_track_for_the_flight(cockpit):
     cockpit.begin(object())
     assert cockpit.flown()[0] == 0.0
     assert len(cockpit.track()) > 5 and cockpit.track()[0] == pytest.approx([0.0, 0.0])
-    cockpit.order(replace(sight(2.0, 0.5), revision=1))
-    assert cockpit.track() == pytest.approx(np.array([[0.5, 0.0]])), "other metres, another track"
+    length = cockpit.track()[-1][0]
+    here = np.eye(4)[None]
+    cockpit.pilot.task = Stay()
+    cockpit.begin(Stay())
+    cockpit.plan(replace(sight(2.0, 0.5), revision=1, moved=Moved(here, here, 1.5)))
+    assert cockpit.track()[-1] == pytest.approx([1.5 * length, 0.0]), "longer metres, a longer track"
 
 
 def test_a_task_has_ended_only_when_the_pilot_took_it_up(cockpit):

@@ -9,6 +9,7 @@ import pytest
 from edgeslam_torch.navigation.corridor import FollowCorridor
 from edgeslam_torch.navigation.frontiers import Looks, reachable
 from edgeslam_torch.navigation.layer import Layer
+from edgeslam_torch.navigation.moved import Moved
 from edgeslam_torch.navigation.openings.exits import gaps
 from edgeslam_torch.navigation.openings.pathways import pathways
 from edgeslam_torch.navigation.openings.turned import Walls, wall_directions
@@ -231,13 +232,40 @@ def test_upright_is_what_fills_the_height():
         space.upright(1.0, 9.0, 0.5)
 
 
-def test_a_revised_unit_forgets_exits():
+def test_exits_go_along_with_the_map():
+    """Its metres become twice as long and the map turns square to the left about the origin."""
+    watch = watched([0.0, 0.2, 0.4, 0.6], surroundings(wall(0.9)))
+    before = np.eye(4)[None]
+    after = np.array([[[0.0, -1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]])
+    watch.carry(Moved(before, after, 1.3))
+    nothing = surroundings(lambda a, b: np.zeros(a.shape, bool))
+    watch.look(nothing, sight(0.0, stamp_s=3.0, yaw=-2.0))
+    (exit_,) = watch.exits
+    assert exit_.centre_w[:2] == pytest.approx([0.0, 2.6], abs=0.15)
+    assert exit_.normal_w[:2] == pytest.approx([0.0, 1.0], abs=0.1)
+    assert exit_.width_m == pytest.approx(1.17, abs=0.2)
+
+
+def test_a_revised_unit_forgets_exits_if_no_view_says_where_they_went():
     pilot = Pilot(GoTo(np.array([3.0, 0.0, 1.15])))
     pilot.exits = watched([0.0, 0.2, 0.4, 0.6], surroundings(wall(0.9)))
     pilot.update(sight(0.0, stamp_s=9.0))
     assert len(pilot.exits.exits) <= 1
-    pilot.update(replace(sight(0.0, stamp_s=9.1), revision=1))
+    waits = pilot.update(replace(sight(0.0, stamp_s=9.1), revision=1))
+    assert pilot.exits.exits and "revised" in waits.why and not any(waits.sticks())
+    pilot.update(replace(sight(0.0, stamp_s=10.2), revision=1))
     assert pilot.exits.exits == ()
+
+
+def test_a_revised_unit_keeps_exits_that_a_view_carries_along():
+    pilot = Pilot(GoTo(np.array([3.0, 0.0, 1.15])))
+    pilot.exits = watched([0.0, 0.2, 0.4, 0.6], surroundings(wall(0.9)))
+    pilot.update(sight(0.0, stamp_s=9.0))
+    assert len(pilot.exits.exits) == 1
+    here = np.eye(4)[None]
+    pilot.update(replace(sight(0.0, stamp_s=9.1, yaw=2.0), revision=1, moved=Moved(here, here, 1.2)))
+    pilot.update(replace(sight(0.0, stamp_s=9.7, yaw=2.0), revision=1))
+    assert [e.centre_w[0] for e in pilot.exits.exits] == [pytest.approx(2.4, abs=0.15)]
 
 
 def test_the_pilot_takes_what_is_low_for_no_wall():

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from edgeslam_torch.geometry.mount import camera_on_body
+from edgeslam_torch.navigation.moved import Moved
 from edgeslam_torch.navigation.sight import View
 from edgeslam_torch.navigation.space import Space
 
@@ -76,11 +77,35 @@ def test_where_it_flew_is_free():
 def test_it_bends_with_the_map():
     space = Space()
     seen(space)
-    space.rebuild(lambda view: facing_a_wall(x=1.0).T_w_c)
+    space.rebuild(Moved(facing_a_wall().T_w_c[None], facing_a_wall(x=1.0).T_w_c[None]))
     layer = space.layer(1.15, 0.15)
     assert cell(layer, 2.55, 0.05) == (True, False)
     assert cell(layer, 3.05, 0.05)[1] or cell(layer, 2.95, 0.05)[1]
     assert not cell(layer, 0.55, 0.05)[0]
+
+
+def test_it_grows_with_the_unit():
+    """Metres of 2 m become 1.5 times as long: the wall is 3 m away, and a place flown through 1 m to the side 1.5 m."""
+    space = Space()
+    seen(space)
+    space.flown(np.array([0.0, 1.0, 1.15]), 0.2)
+    here = facing_a_wall().T_w_c[None]
+    space.rebuild(Moved(here, here, 1.5))
+    layer = space.layer(1.15, 0.15)
+    assert cell(layer, 2.55, 0.05) == (True, False)
+    assert cell(layer, 3.05, 0.05)[1] or cell(layer, 2.95, 0.05)[1]
+    layer = space.layer(1.15, 0.05)
+    assert cell(layer, 0.05, 1.55)[0] and not cell(layer, 0.05, 1.05)[0]
+
+
+def test_what_it_hovers_before_fills_no_memory_and_what_it_passed_is_kept():
+    space = Space()
+    for k in range(300):
+        space.observe(facing_a_wall(x=0.01 * min(k, 100)))
+    here = np.array([facing_a_wall(x=x).T_w_c for x in (0.0, 1.0)])
+    space.rebuild(Moved(here, here))
+    layer = space.layer(1.15, 0.15)
+    assert cell(layer, 0.75, 0.05) == (True, False) and cell(layer, 1.55, 0.05) == (True, False)
 
 
 def test_it_follows_the_drone_and_keeps_what_it_knows():

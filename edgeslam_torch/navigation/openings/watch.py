@@ -1,11 +1,12 @@
 """Exits over a flight: what one look takes for an opening counts when looks from other places agree."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from edgeslam_torch.geometry.rotations import wrapped
+from edgeslam_torch.navigation.moved import Moved
 from edgeslam_torch.navigation.openings.exits import WIDEST_M, Gap, gaps
 from edgeslam_torch.navigation.openings.turned import Walls
 from edgeslam_torch.navigation.sight import Sight
@@ -87,6 +88,14 @@ class ExitWatch:
         exits = [exit_ for seen in good if (exit_ := _exit(seen, sight)).width_m <= WIDEST_M]
         self.exits = tuple(sorted(exits, key=lambda e: float(np.linalg.norm(e.centre_w[:2] - here))))
 
+    def carry(self, moved: Moved) -> None:
+        """Take what was found along with the map; `exits` are those of the next look."""
+        for seen in self._seen:
+            centres = moved.points(np.array([gap.centre_w for gap in seen.gaps]))
+            beyond = moved.points(np.array([gap.centre_w + 0.1 * gap.normal_w for gap in seen.gaps]))
+            seen.gaps = [_carried(*gap, moved.ratio) for gap in zip(seen.gaps, centres, beyond, strict=True)]
+            seen.places_w = list(moved.points(np.array(seen.places_w).reshape(-1, 2)))
+
     def _note(self, gap: Gap, here_w: FloatArray) -> None:
         seen = next((s for s in self._seen if _same(gap, s)), None)
         if seen is None:
@@ -112,6 +121,12 @@ def _exit(seen: _Seen, sight: Sight) -> Exit:
     width_sigma = math.hypot(cell, float(np.std(widths)), sight.scale_sigma * width)
     return Exit(np.array([*centre, sight.p_w[2]]), np.array([*normal, 0.0]), width, width_sigma, position,
                 _places(seen.places_w))  # fmt: skip
+
+
+def _carried(gap: Gap, centre_w: FloatArray, beyond_w: FloatArray, ratio: float) -> Gap:
+    """The same opening after its middle and a point behind it moved."""
+    normal = (beyond_w - centre_w) / np.linalg.norm(beyond_w - centre_w)
+    return replace(gap, centre_w=centre_w, normal_w=normal, width_m=ratio * gap.width_m)
 
 
 def _same(gap: Gap, seen: _Seen) -> bool:

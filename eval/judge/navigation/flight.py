@@ -84,6 +84,8 @@ class _Errand:
 
     def update(self, sight: Sight) -> Wish:
         """What the pilot wishes; the next task is taken up when one has ended, however it did."""
+        if sight.moved is not None:
+            self._track = list(sight.moved.points(np.array(self._track)))
         self._track.append(sight.p_w[:2].copy())
         if self._first or (self.ended() and self._steps):
             step = self._steps.pop(0)
@@ -138,6 +140,8 @@ def _fly(
         supervisor.see(sight)
         if hung_s is None or not hung_s[0] <= tello.clock_s < hung_s[1]:
             supervisor.propose(errand.update(sight), tello.clock_s)
+            if sight.moved is not None:
+                supervisor.carry(sight.moved)
         order = supervisor.order(tello.clock_s)
         cpu_s = time.process_time() - began
         speed, clear_m = float(np.linalg.norm(drone.velocity)), drone.clearance(drone.p_w)
