@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from edgeslam_torch.navigation.limits import NavLimits
+from edgeslam_torch.navigation.moved import Moved
 from edgeslam_torch.navigation.sight import Sight, Wish
 from edgeslam_torch.navigation.supervisor import LAND_S, UNSURE_LAND_S, Danger, Supervisor
 
@@ -172,5 +173,43 @@ def test_heights_of_a_map_without_metres_are_not_believed_when_the_drone_tells_i
 
     up = [o.wish.up_m_s for o in flown(Supervisor(), 8.0, low_by_a_map)]
     assert max(up) <= 0.0 and min(up) < -0.1, "2 m by its own word: down, whatever the map calls 0.3"
-    sure = flown(Supervisor(), 1.0, lambda s: replace(s, told_height_m=0.2), wish=Wish(up_m_s=-0.2))
-    assert {o.wish.up_m_s for o in sure} == {-0.2}, "sure metres count"
+
+
+def test_a_map_that_is_sure_and_at_another_height_than_the_drone_is_not_flown_by():
+    """At a wall without corners the pose sank by 0.5 m while the drone rose by 0.9 m, every frame tracked."""
+    supervisor = Supervisor()
+    flown(supervisor, 2.0, lambda s: replace(s, told_height_m=1.4))
+    orders = flown(supervisor, LAND_S + 2.0, lambda s: replace(s, told_height_m=1.7), wish=AHEAD, begin_s=2.0)
+    assert orders[10].danger is Danger.NONE, "a picture that is late in a climb"
+    assert orders[30].danger is Danger.APART
+    assert all(o.wish.sticks()[:2] == (0.0, 0.0) for o in orders[30:]), "by a pose that is wrong no way leads back"
+    assert orders[-1].land
+
+
+def test_heights_apart_mean_nothing_while_metres_are_not_sure():
+    orders = flown(Supervisor(), 3.0, lambda s: replace(s, told_height_m=1.9, scale_sigma=0.2))
+    assert {o.danger for o in orders} == {Danger.SCALE}
+
+
+def test_neither_height_may_be_beyond_the_limits():
+    """The map says 1.2 m, the drone 2.0 m: it rises no more, and sinks if it wants to."""
+    rising = flown(Supervisor(), 0.5, lambda s: replace(s, told_height_m=2.0), wish=Wish(up_m_s=0.3))
+    assert all(o.wish.up_m_s == 0.0 for o in rising)
+    sinking = flown(Supervisor(), 0.5, lambda s: replace(s, told_height_m=2.0), wish=Wish(up_m_s=-0.3))
+    assert all(o.wish.up_m_s == -0.3 for o in sinking)
+
+
+def test_the_way_back_goes_along_with_the_map():
+    """Metres become twice as long: the drone that was 1.5 m from its start is 3 m away, and backs up."""
+    supervisor = Supervisor()
+    flown(supervisor, 3.0)
+    here = np.eye(4)[None]
+    supervisor.carry(Moved(here, here, 2.0))
+    blind = flown(
+        supervisor,
+        4.0,
+        lambda s: replace(s, p_w=np.array([2.95, 0.0, 2.2]), velocity_w=np.zeros(3), seen_s=2.6),
+        wish=Wish(),
+        begin_s=3.0,
+    )
+    assert blind[60].wish.forward_m_s < -0.1
