@@ -289,9 +289,9 @@ class WindowConfig:
     off, its default."""
     in_flight_edges: int = 300
     """Edge pixels per keyframe there, each associated in two neighbours."""
-    telemetry: str = "gravity"
+    telemetry: str = "last"
     """Where the drone's displacements, heights and gravity keep the map's scale and level the same all over: in
-    ``every`` refinement, in the ``last`` one, there and ``gravity`` alone in those before, or ``off``."""
+    ``every`` refinement, in the ``last`` one, or ``off``."""
 
     def __post_init__(self) -> None:
         _positive(self, "rounds", "edges_per_keyframe", "targets", "in_flight_edges")
@@ -305,7 +305,7 @@ class WindowConfig:
             ("angle", ("arms", "cosine", "literal", "off")),
             ("collinearity", ("relative", "literal", "off")),
             ("in_flight", ("off", "few", "always")),
-            ("telemetry", ("every", "gravity", "last", "off")),
+            ("telemetry", ("every", "last", "off")),
         ):
             if getattr(self, name) not in allowed:
                 raise ValueError(f"{name} must be one of {', '.join(allowed)}, got {getattr(self, name)!r}")

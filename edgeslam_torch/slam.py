@@ -266,7 +266,7 @@ class EdgeSlam:
             self._joining.enter(self.support().largest())
         self._finished = True
         result = last_refinement(
-            self.map, self.camera, self.edges, self.config.window, self._system.telemetry(last=True)
+            self.map, self.camera, self.edges, self.config.window, self._system.telemetry("last", "every")
         )
         self._losses = {} if result is None else result.losses
         self._system.fusion.revise(*self.log.poses())

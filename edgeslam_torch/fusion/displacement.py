@@ -14,7 +14,7 @@ parameters are columns of the covariance, so that the solver does not see them. 
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -145,10 +145,6 @@ class TelemetryModel:
             parts.append(self._heights(at_s, per_scale_w))
         rows = _stacked([part for part in parts if part is not None])
         return None if rows is None else self._gaussian(rows, p_m)
-
-    def gravity_alone(self) -> "TelemetryModel":
-        """The same without velocities and heights."""
-        return replace(self, velocity=False, height=None)
 
     def up(self, stamps_s: FloatArray) -> UpDirections | None:
         """Gravity in frames at ``stamps_s`` ``(K,)``; None where no attitude is told."""

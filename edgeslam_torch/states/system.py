@@ -111,15 +111,11 @@ class System:
     def map_keyframes(self, new: list[tuple[Frame, Keyframe]]) -> bool:
         """Map new keyframes; returns whether that is complete."""
         self.keyframe_s = new[-1][1].stamp_s
-        return self.absorb(self.mapping.submit(new, self.telemetry()))
+        return self.absorb(self.mapping.submit(new, self.telemetry("every")))
 
-    def telemetry(self, last: bool = False) -> TelemetryModel | None:
-        """Telemetry as it is now, as far as the settings want it in the refinements in flight, or in the last one."""
-        wanted = self.config.window.telemetry
-        if not self.has_telemetry or wanted == "off" or (wanted == "last" and not last):
-            return None
-        model = self.fusion.telemetry()
-        return model if model is None or last or wanted == "every" else model.gravity_alone()
+    def telemetry(self, *where: str) -> TelemetryModel | None:
+        """Telemetry as it is now, if the settings want it in one of these refinements."""
+        return self.fusion.telemetry() if self.has_telemetry and self.config.window.telemetry in where else None
 
     def collect(self, wait: bool = False) -> None:
         """Collect finished results of real-time mapping; with ``wait`` the caller owns the map afterwards."""
