@@ -289,7 +289,7 @@ class WindowConfig:
     off, its default."""
     in_flight_edges: int = 300
     """Edge pixels per keyframe there, each associated in two neighbours."""
-    telemetry: str = "last"
+    telemetry: str = "every"
     """Where the drone's displacements, heights and gravity keep the map's scale and level the same all over: in
     ``every`` refinement, in the ``last`` one, or ``off``."""
 
