@@ -27,7 +27,7 @@ UNSURE_LAND_S = 20.0
 """The same when metres are doubtful: five times up and down where it has been, which is what tells them."""
 _BACK_M, _BACK_M_S = 0.6, 0.15
 SCALE_SIGMA = 0.10
-_WIGGLE_S, _WIGGLE_M_S = 2.0, 0.15
+_WIGGLE_S, _WIGGLE_M_S = 2.0, 0.25
 """Up and down, which tells height and telemetry the scale."""
 _PUSHED_M_S, _STANDS_M_S, _PUSH_S = 0.15, 0.04, 1.5
 """Commanded faster than the first, moving slower than the second for this long: something holds it."""
