@@ -219,6 +219,8 @@ class EdgeSlam:
             system.has_telemetry = system.has_telemetry or len(telemetry) > 0
         if not self.log.records and telemetry:  # the first camera turns so that the world's z is up
             system.motion.T_c_w = se3.inverse(first_pose(telemetry[-1].rpy_rad, self._T_b_c))
+            # In a map of an earlier flight, axes are those of that flight.
+            system.fusion.began_upright = self._earlier is None and bool(np.isfinite(telemetry[-1].rpy_rad).all())
         step = self._step(frame, seen)
         if self._earlier is not None:
             self._joining.enter(self.map.piece_of(step.keyframe.id))

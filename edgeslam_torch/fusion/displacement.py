@@ -112,12 +112,15 @@ class TelemetryModel:
     scale: float
     """Metres per map unit."""
     scale_sigma_log: float
+    """Infinite where only gravity is known."""
     velocity: bool
     """Whether velocities may speak."""
     height: str | None
     """Name of the height that may speak, if any."""
     truncates: float
     """Probability that velocities are truncated, not rounded."""
+    attitude: bool = True
+    """Whether attitude may speak."""
 
     def positions(
         self, stamps_s: FloatArray, p_m: FloatArray, scale_sigma_log: float | None = None
@@ -133,7 +136,7 @@ class TelemetryModel:
         Returns:
             The Gaussian, or None where telemetry is silent.
         """
-        if len(stamps_s) < 2 or len(self.track) < 2:
+        if len(stamps_s) < 2 or len(self.track) < 2 or not (self.velocity or self.height is not None):
             return None
         sigma = self.scale_sigma_log if scale_sigma_log is None else scale_sigma_log
         at_s = stamps_s - self.delay_s
@@ -148,7 +151,7 @@ class TelemetryModel:
 
     def up(self, stamps_s: FloatArray) -> UpDirections | None:
         """Gravity in frames at ``stamps_s`` ``(K,)``; None where no attitude is told."""
-        if len(self.track) < 2 or not self.track.has_attitude:
+        if len(self.track) < 2 or not (self.attitude and self.track.has_attitude):
             return None
         at_s = stamps_s - self.delay_s
         frame = np.flatnonzero(self.track.covered(at_s, at_s))

@@ -81,6 +81,8 @@ class MotionFusion:
         self._trust = Trust()
         self._unrest = Unrest()
         self._R_w_m: FloatArray | None = None
+        self.began_upright = False
+        """Whether the map's z axis is up: its first camera was turned so by the drone's attitude."""
         truncates = config.velocity_rounding == "truncate"
         self._fit = TelemetryFit(shortfall_m_s=0.5 * config.velocity_step_m_s if truncates else 0.0)
         self._guess: ScaleEstimate | None = None
@@ -388,9 +390,14 @@ class MotionFusion:
         return self._trust.warnings() + self._track.warnings() + [said for said in own if said is not None]
 
     def telemetry(self) -> TelemetryModel | None:
-        """Telemetry and its tie to the map as they are now, for refinement; None while either is not known."""
+        """Telemetry and its tie to the map as they are now, for refinement; None while there is none.
+
+        Until its metres are known gravity alone speaks, if the map was begun upright: the mean of attitudes that
+        `_R_w_m` is has the map's own tilt in it by then (docs/decisions/0108).
+        """
         told = self._by_telemetry
-        if told is None or self._R_w_m is None:
+        R_w_m = self._R_w_m if told is not None else np.eye(3) if self.began_upright else None
+        if R_w_m is None:
             return None
         there = self._track.heights()
         heights = [reading for reading in HEIGHTS if reading in there and self._trust.height(reading)]
@@ -399,14 +406,15 @@ class MotionFusion:
             self._track.copy(),
             self.config,
             self.T_b_c,
-            self._R_w_m,
+            R_w_m,
             self.delay_s,
             self.delay_sigma_s,
-            math.exp(told.log_scale),
-            told.sigma,
-            self._trust.velocity and (odds is None or odds.kept == "telemetry"),
-            heights[0] if heights and (odds is None or odds.kept == "height") else None,
+            1.0 if told is None else math.exp(told.log_scale),
+            math.inf if told is None else told.sigma,
+            told is not None and self._trust.velocity and (odds is None or odds.kept == "telemetry"),
+            heights[0] if told is not None and heights and (odds is None or odds.kept == "height") else None,
             self._fit.truncates,
+            self._trust.attitude,
         )
 
     # --- estimation ----------------------------------------------------------------------------------------------

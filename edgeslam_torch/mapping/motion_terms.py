@@ -1,5 +1,6 @@
 """Motion factors of a window from what telemetry says of its keyframes."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -51,5 +52,5 @@ def motion_factors(
             centres.append(CentreFactor(order, ALIKE * told.information, ALIKE * told.vector, ALIKE * told.constant))
         up = model.up(stamps)
         if up is not None:
-            gravity.append(GravityFactor(order[up.frame], up.up_c, up.up_m, up.sigma_rad))
+            gravity.append(GravityFactor(order[up.frame], up.up_c, up.up_m, up.sigma_rad / math.sqrt(ALIKE)))
     return MotionFactors(tuple(centres), tuple(gravity))

@@ -230,6 +230,11 @@ class Trust:
         return self.verdict(Reading.VELOCITY) is Verdict.AGREES
 
     @property
+    def attitude(self) -> bool:
+        """Whether attitude may keep the map level: from the first frame on, until the images contradict it."""
+        return self.elsewhere_s is None and self.verdict(Reading.ATTITUDE) is not Verdict.CONTRADICTS
+
+    @property
     def proven(self) -> bool:
         """Whether anything has proven that telemetry is of this flight, and nothing that it is not."""
         readings = (Reading.VELOCITY, Reading.ATTITUDE, *HEIGHTS)
