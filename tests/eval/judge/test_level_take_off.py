@@ -15,7 +15,7 @@ TICK_S = 1.0 / 15.0
 
 @pytest.mark.slow
 def test_a_climb_before_bare_walls_is_not_taken_for_a_turn():
-    """The drone rises and goes up and down on the spot; the map had it 0.6 m forward and its camera turned by 48 degrees."""
+    """It rises and goes up and down on the spot; the map had it 0.6 m ahead and its camera turned by 48 degrees."""
     site = named_site("blank_walls", 300)
     drone, paint, camera = drone_at(site, TELLO_TILT_RAD, IMAGE_SIZE)
     tello, eyes = LockstepTello(drone, paint, seed=300), SlamEyes(camera, FAULTS["none"], 300)
