@@ -92,9 +92,9 @@ class Cockpit:
                 self._take_up(task)
         if task is not None:
             self._witness(NewTask(task))
-        self._witness(sight)
         if sight.moved is not None:
             self._carry(sight.moved)
+        self._witness(sight)
         wish = self.pilot.update(sight)
         with self._lock:
             self._supervisor.propose(wish, sight.stamp_s)

@@ -370,6 +370,25 @@ def test_velocities_in_the_wrong_unit_are_named_and_dropped(rng, swinging, repla
     assert (model.velocity, model.height) == (False, "tof"), "nor do they pull at the map in its refinement"
 
 
+def test_gravity_speaks_before_metres_are_known_if_the_map_began_upright():
+    fusion = MotionFusion(FusionConfig(), T_B_C)
+    assert fusion.telemetry() is None, "nothing says where up is"
+    fusion.began_upright = True
+    model = fusion.telemetry()
+    assert model.attitude and (model.velocity, model.height) == (False, None)
+    assert (model.R_w_m == np.eye(3)).all()
+
+
+def test_gravity_of_another_flight_does_not_speak(rng, swinging, replay):
+    def spoil(rng, samples, motion):
+        return [replace(s, rpy_rad=other.rpy_rad) for s, other in zip(samples, samples[::-1], strict=True)]
+
+    _, fusion, _ = told_of(rng, replay, swinging(18.0), spoil)
+    fusion.began_upright = True
+    assert fusion._trust.verdict(Reading.ATTITUDE) is Verdict.CONTRADICTS
+    assert not fusion.telemetry().attitude
+
+
 def test_velocities_in_the_wrong_unit_with_nothing_beside_them_give_no_metres(rng, swinging, replay):
     """Only the depth network contradicts them: one of the two is wrong, and the data do not say which."""
 

@@ -1,5 +1,7 @@
 """Telemetry in a window: a part of the map that hangs on nothing else keeps scale and place."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from point_map import CAMERA, PointMap, check_map
@@ -97,6 +99,47 @@ def test_poses_come_in_any_order(rng, halves):
     model, shuffled = telemetry_of(rng, halves), [halves.keyframes[i] for i in (4, 0, 5, 2, 1, 3)]
     (factor,) = motion_factors(model, shuffled, [0] * 6).centres
     assert [shuffled[i].id for i in factor.pose] == [0, 1, 2, 3, 4, 5]
+
+
+def tilted(points, angle_rad):
+    """The last three keyframes and their anchors, turned about a level axis through the third."""
+    R, centre = Rotation.from_rotvec([0.0, angle_rad, 0.0]).as_matrix(), points.keyframes[2].centre_w
+    for keyframe in points.keyframes[3:]:
+        T_w_c = keyframe.T_w_c
+        T_w_c[:3, :3], T_w_c[:3, 3] = R @ T_w_c[:3, :3], centre + R @ (T_w_c[:3, 3] - centre)
+        keyframe.T_c_w = se3.inverse(T_w_c)
+    mine = points.map.anchors_seen_by(points.keyframes[3:])
+    points.map.anchors.p_w[mine] = centre + (points.map.anchors.p_w[mine] - centre) @ R.T
+
+
+def tilt_deg(points):
+    """Largest tilt of a keyframe's camera against the truth."""
+    true = se3.inverse(points.world.T_c_w)[3:, :3, :3]
+    mine = np.array([k.T_w_c[:3, :3] for k in points.keyframes[3:]])
+    return float(np.degrees(np.arccos(np.clip(np.einsum("ki,ki->k", mine[:, 2], true[:, 2]), -1, 1))).max())
+
+
+def test_gravity_alone_holds_level_what_nothing_else_holds(rng, halves):
+    tilted(halves, 0.2)
+    assert tilt_deg(halves) > 10.0
+    model = replace(telemetry_of(rng, halves), velocity=False)
+    assert not motion_factors(model, halves.keyframes, [0] * 6).centres
+    window = Window(halves.keyframes[3:], halves.keyframes[:3], halves.map.anchors_seen_by(halves.keyframes))
+    refine(halves.map, window, CAMERA, LmConfig(max_iterations=50), model)
+    assert tilt_deg(halves) < 0.5
+
+
+def test_gravity_weighs_against_a_window_as_the_rest_of_telemetry_does(rng, halves):
+    """Keyframes a second apart: three are within half of the 5 s that an error of attitude lasts."""
+    model = telemetry_of(rng, halves)
+    (gravity,) = motion_factors(model, halves.keyframes, [0] * 6).gravity
+    assert np.degrees(gravity.sigma_rad) == pytest.approx(2.0 * np.sqrt(5.0) / np.sqrt(30.0), rel=0.15)
+
+
+def test_attitude_that_may_not_speak_gives_no_gravity(rng, halves):
+    model = replace(telemetry_of(rng, halves), attitude=False)
+    factors = motion_factors(model, halves.keyframes, [0] * 6)
+    assert factors.centres and not factors.gravity
 
 
 def test_no_telemetry_no_factors(halves):

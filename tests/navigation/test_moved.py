@@ -32,6 +32,11 @@ def test_views_told_before_are_exactly_where_they_are_now():
     assert Moved(BEFORE, AFTER, 2.0).poses(BEFORE) == pytest.approx(AFTER)
 
 
+def test_views_between_them_move_as_points_do():
+    (between,) = Moved(BEFORE, AFTER, 2.0).poses(pose(5.0, 0.0)[None])
+    assert between == pytest.approx(pose(4.0, 3.0, 1.2, np.pi / 2))
+
+
 def test_of_views_at_one_place_the_newest_counts():
     both = Moved(np.array([pose(0, 0), pose(0, 0)]), np.array([pose(0, 0), pose(0, 0.5)]))
     assert both.points(np.array([[1.0, 0.0]])) == pytest.approx(np.array([[1.0, 0.5]]))
