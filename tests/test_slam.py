@@ -227,7 +227,8 @@ def test_two_runs_give_the_same_bytes():
     assert a.anchors().p_w.tobytes() == b.anchors().p_w.tobytes()
     for x, y in zip(out_a, out_b, strict=True):
         assert x.T_w_c.tobytes() == y.T_w_c.tobytes()
-        assert replace(x, T_w_c=y.T_w_c, stage_ms={}) == replace(y, stage_ms={})
+        # In words, which are exact: since Python 3.13 a NaN in a record differs from itself.
+        assert repr(replace(x, stage_ms={})) == repr(replace(y, stage_ms={}))
 
 
 def test_grey_images_give_the_poses_of_colour_ones():
