@@ -66,12 +66,16 @@ def cost_to_go(layer: Layer, goals: np.ndarray, clearance_m: float, here: np.nda
     flat, w = open_.ravel(), weight.ravel()
     kept = flat[first] & flat[second]
     a, b = first[kept], second[kept]
-    graph = csr_array((length[kept] * layer.cell_m * 0.5 * (w[a] + w[b]), (a, b)), shape=(flat.size, flat.size))
+    graph = csr_array(
+        (length[kept] * layer.cell_m * 0.5 * (w[a] + w[b]), (a.astype(np.int32), b.astype(np.int32))),
+        shape=(flat.size, flat.size),
+    )
     sources = np.unique(np.ravel_multi_index(tuple(np.asarray(goals).T), shape))
     sources = sources[flat[sources]]
     if len(sources) == 0:
         return CostToGo(layer, np.full(shape, np.inf))
-    found = dijkstra(graph, directed=False, indices=sources, min_only=True)
+    # SciPy 1.13 wants 32 bits; a grid has 25 600 cells.
+    found = dijkstra(graph, directed=False, indices=sources.astype(np.int32), min_only=True)
     return CostToGo(layer, np.asarray(found).reshape(shape))
 
 
