@@ -11,7 +11,7 @@ from point_map import check_map
 from rendered import CAMERA, film, patchwork, sideways, stairs_world
 from scipy.spatial.transform import Rotation
 
-from edgeslam_torch.config import DepthConfig, SlamConfig
+from edgeslam_torch.config import DepthConfig, OrbConfig, SlamConfig
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.eval.metrics.align import umeyama
 from edgeslam_torch.fusion.published import T_LEVEL
@@ -101,9 +101,9 @@ def test_flight_with_known_depth_is_metric():
     assert np.rad2deg(np.linalg.norm(se3.log(a)[3:] - se3.log(b)[3:])) < 0.5
 
 
-def without_matching_corners(monkeypatch, change):
+def without_matching_corners(monkeypatch, change, config=NO_NETWORK):
     """Frames past the panels, in whose second half no corner matches, and what ``change`` makes of these images."""
-    slam = EdgeSlam(CAMERA, NO_NETWORK)
+    slam = EdgeSlam(CAMERA, config)
     for frame in panels().frames[:16]:
         slam.step(frame)
     monkeypatch.setattr(Tracker, "track_near", lambda *args: None)
@@ -121,11 +121,19 @@ def test_where_no_corner_matches_keyframes_rest_on_what_flow_sees(monkeypatch):
 
 
 def test_blurred_images_without_matches_become_a_keyframe_only_when_the_view_leaves(monkeypatch):
-    """A sharper one may come while most of what is followed is in view."""
+    """A sharper one may come while most of what is followed is in view; after that one the blur is what there is."""
     keyframes, outputs = without_matching_corners(monkeypatch, lambda image: cv2.GaussianBlur(image, (0, 0), 4.0))
-    (last,) = keyframes
-    assert last > 24
+    assert keyframes[0] > 24
     assert statuses(outputs).count(FrameStatus.TRACKED) >= 9
+
+
+def test_before_a_bare_wall_no_sharper_image_is_waited_for(monkeypatch):
+    """The keyframe that is followed has few clear corners, too: it is the wall, not blur."""
+    all_faint = replace(NO_NETWORK, orb=OrbConfig(fast_threshold=100))
+    keyframes, outputs = without_matching_corners(monkeypatch, lambda image: image, all_faint)
+    assert keyframes[0] <= 24
+    assert len(keyframes) >= 3
+    assert set(statuses(outputs)) == {FrameStatus.TRACKED}
 
 
 def test_health_says_what_the_newest_pose_is_worth():

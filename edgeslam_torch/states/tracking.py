@@ -71,12 +71,14 @@ class Tracking:
         with system.map.lock:
             with system.timed("tracking"):
                 followed = self._follow(seen, T_predicted, frame.stamp_s)
-            located = None if followed is None else self._locate_followed(followed, frame.stamp_s)
+            located = None
+            if followed is not None and followed.trusted:
+                located = self._locate_followed(followed, frame.stamp_s)
             # While the worker is busy no keyframe can be created; matching then finds newly mapped anchors.
             # What has left the view cannot be followed: the frame's own keypoints come first then, flow comes last.
             strong = followed is not None and followed.share >= system.config.flow.min_share
             if located is None or located.due or not strong:
-                matched = self._match(frame, seen, T_predicted, followed if strong else None)
+                matched = self._match(frame, seen, T_predicted, followed, strong)
                 if matched is None and located is not None and followed is not None:
                     matched = self._on_flow_alone(seen, located, followed, hurry=not strong)
                 located = matched
@@ -96,7 +98,7 @@ class Tracking:
     def return_to(self, frame: Frame, seen: LazyView, T_predicted: FloatArray, track: Track) -> Step:
         """Continue in the map at a relocalised place."""
         self.system.events["relocalised"] += 1
-        located = self._located(track, seen.view, seen, frame.stamp_s, None, relocalised=True)
+        located = self._located(track, seen.view, seen, frame.stamp_s, due=False, relocalised=True)
         step = self.arrive(frame, seen, T_predicted, located)
         self.system.motion.stop()
         self.backfill.place(step.keyframe, track.T_c_w, track.anchor)
@@ -147,25 +149,27 @@ class Tracking:
         """A frame that is due for a keyframe, but none of whose keypoints matches.
 
         A sharper one than a blurred one will come, unless in a ``hurry``: most of what is followed has left the view.
+        Where the keyframe that is followed is faint as well, it is not blur that makes corners few but a bare wall.
         """
-        if seen.view.features.faint and not hurry:
+        blurred = seen.view.features.faint and not located.reference.features.faint
+        if blurred and not hurry:
             return replace(located, due=False)
         features, track = with_followed(seen.view, followed, self.system.map.anchors.words)
         view = make_view(features, self.system.config.orb.scale_factor)
         return replace(located, track=track, view=view, due=True)
 
     def _match(
-        self, frame: Frame, seen: LazyView, T_predicted: FloatArray, followed: Followed | None
+        self, frame: Frame, seen: LazyView, T_predicted: FloatArray, followed: Followed | None, strong: bool
     ) -> Located | None:
-        """By the frame's own keypoints: where flow fails, and for keyframes."""
+        """By the frame's own keypoints: where flow fails, and where a ``strong`` flow has called a keyframe due."""
         with self.system.timed("features"):
             view = seen.view
         with self.system.timed("tracking"):
-            track, relocalised = self._find(frame, view, T_predicted, followed)
-        return None if track is None else self._located(track, view, seen, frame.stamp_s, followed, relocalised)
+            track, relocalised = self._find(frame, view, T_predicted, followed, strong)
+        return None if track is None else self._located(track, view, seen, frame.stamp_s, strong, relocalised)
 
     def _located(
-        self, track: Track, view: View, seen: LazyView, stamp_s: float, followed: Followed | None, relocalised: bool
+        self, track: Track, view: View, seen: LazyView, stamp_s: float, due: bool, relocalised: bool
     ) -> Located:
         """The pose of a matched frame, which becomes the template for the next ones."""
         system = self.system
@@ -173,20 +177,23 @@ class Tracking:
         parallax_rad = parallax_to(reference, track, system.map.anchors.p_w)
         few = few_matches(track, reference, system.map, system.config.mapping)
         since_s = stamp_s - system.keyframe_s
-        due = followed is not None or is_due(few, parallax_rad, since_s, system.config.mapping)
+        due = due or is_due(few, parallax_rad, since_s, system.config.mapping)
         self._template = template_of_track(track, view, reference, seen.grey, system.camera)
         uv, inv_sigma = view.features.uv[track.keypoint], view.inv_sigma[track.keypoint]
         return Located(track, reference, parallax_rad, due, uv, inv_sigma, view, relocalised)
 
     def _find(
-        self, frame: Frame, view: View, T_predicted: FloatArray, followed: Followed | None
+        self, frame: Frame, view: View, T_predicted: FloatArray, followed: Followed | None, strong: bool
     ) -> tuple[Track | None, bool]:
         """Track near flow's result or the prediction, else relocalise; and whether it was relocalised."""
         tracker, expected = self.system.tracker, self.system.expectation(frame.stamp_s, T_predicted)
-        if followed is not None:
+        if followed is not None and strong:
             track = tracker.track_near(view, followed.track.T_c_w, followed.track.anchor, expected)
             return None if track is None else join(track, followed, view, self.system.config.orb.scale_factor), False
         track = tracker.track(view, T_predicted, self._recent, expected)
+        if track is None and followed is not None:
+            # After a jerk, or in a blurred image, what little flow holds is nearer than the prediction.
+            track = tracker.track_near(view, followed.track.T_c_w, followed.track.anchor, expected)
         if track is not None:
             return track, False
         track = self._relocalise(frame, view, T_predicted, 0)

@@ -82,6 +82,8 @@ class Followed:
     """``(M,)`` their pyramid levels."""
     share: float
     """Share of inliers among the selected keypoints."""
+    trusted: bool
+    """Whether enough of those in view are inliers to tell a pose; else it tells where to look for one."""
 
 
 def template_of_keyframe(keyframe: Keyframe, grey: NDArray[np.uint8], camera: Camera) -> Template:
@@ -170,7 +172,7 @@ class FlowTracker:
     def follow(
         self, template: Template, grey: NDArray[np.uint8], T_c_w: FloatArray, expected: PosePrior | None = None
     ) -> Followed | None:
-        """Pose near a predicted one, or None if too few keypoints are tracked.
+        """Pose near a predicted one, or None if hardly any keypoint is tracked.
 
         Args:
             template: Template to track.
@@ -191,12 +193,14 @@ class FlowTracker:
             far = self._locate(template, grey, visible, guess, T_c_w, self.config.levels, expected)
             # Patches of coarse levels reach past the border of the image: keypoints near it are found on the fine ones.
             track, uv = far if far[0].inliers >= least else max(far, (track, uv), key=lambda tried: tried[0].inliers)
-        if track.inliers < least:
+        if track.inliers < self.min_inliers:
             return None
-        self.map.anchors.visible[template.anchor[visible]] += 1
-        self.map.anchors.found[track.anchor] += 1
+        trusted = track.inliers >= least
+        if trusted:
+            self.map.anchors.visible[template.anchor[visible]] += 1
+            self.map.anchors.found[track.anchor] += 1
         octave = template.octave[track.keypoint]
-        return Followed(template.keyframe_id, track, uv, octave, track.inliers / len(wanted))
+        return Followed(template.keyframe_id, track, uv, octave, track.inliers / len(wanted), trusted)
 
     def _locate(
         self,

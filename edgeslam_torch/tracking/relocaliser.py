@@ -40,6 +40,9 @@ RIVAL = 0.6
 APART = 0.15
 """Maximum distance of two poses of one place, relative to the scene depth; also of consecutive frames."""
 MAX_APART_RAD = np.deg2rad(20.0)
+NEXT_ALIKE = 1.0 / 3.0
+"""Distance, relative to the scene depth, within which nothing repeats that fills 30 % of the image: doors every 1.9 m
+are seen from 3 to 5 m."""
 ACCELERATION_M_S2 = 9.0
 ANGULAR_ACCELERATION_RAD_S2 = 60.0
 """Bounds for a hand or a small drone: three times the standard deviations of the motion model."""
@@ -63,9 +66,14 @@ class Reach:
         near = shift <= self._shift(place.depth) + APART * place.depth
         return near and turn <= self.turn_rad + MAX_APART_RAD
 
-    def is_one_place(self, depth: float) -> bool:
-        """Whether the reachable region is a single place at the given scene depth."""
-        return self._shift(depth) <= APART * depth
+    def leaves_only(self, place: "Place") -> bool:
+        """Whether no other place like this one can be meant: all that is within reach is one place, or it is where the
+        camera is expected and the next one like it is out of reach."""
+        near = self._shift(place.depth)
+        if near <= APART * place.depth:
+            return self.holds(place)
+        shift, turn = apart(place.track.T_c_w, self.T_c_w)
+        return near <= NEXT_ALIKE * place.depth and shift <= APART * place.depth and turn <= MAX_APART_RAD
 
     def _shift(self, depth: float) -> float:
         return self.shift_m * (self.metre or depth / 3.0)
@@ -139,7 +147,7 @@ class Relocaliser:
         if self._waiting and not place.is_as(self._waiting[-1][1]):
             self.forget()
         self._waiting.append((index, place))
-        sure = reach.holds(place) and (place.share >= SURE_SHARE or reach.is_one_place(place.depth))
+        sure = reach.leaves_only(place) or (reach.holds(place) and place.share >= SURE_SHARE)
         if not sure and len(self._waiting) < AGREEING_FRAMES:
             return None
         earlier = {i: p.track.T_c_w for i, p in self._waiting[:-1]}
@@ -156,15 +164,19 @@ class Relocaliser:
     def _only_place(self, places: list[Place], reach: Reach) -> Place | None:
         """The best place if it is likely and without a rival; of two rivals, the one within reach."""
         places = sorted(places, key=lambda place: -place.track.inliers)
+        if places and reach.leaves_only(places[0]):
+            return places[0] if self._is_wide(places[0], self.tracker.config.min_inliers) else None
         rivals = [p for p in places if p.track.inliers > RIVAL * places[0].track.inliers]
         if not all(p.is_as(rivals[0]) for p in rivals):
             rivals = [p for p in rivals if reach.holds(p)]
         if not rivals or not all(p.is_as(rivals[0]) for p in rivals):
             return None
-        best = rivals[0]
-        enough = best.track.inliers >= 2 * self.tracker.config.min_inliers
-        wide = best.cells >= MIN_CELLS and best.spread >= LIKELY_SPREAD
-        return best if enough and wide and best.share >= LIKELY_SHARE else None
+        enough = self._is_wide(rivals[0], 2 * self.tracker.config.min_inliers)
+        return rivals[0] if enough and rivals[0].share >= LIKELY_SHARE else None
+
+    def _is_wide(self, place: Place, inliers: int) -> bool:
+        """Whether as many anchors agree, over enough of the image."""
+        return place.track.inliers >= inliers and place.cells >= MIN_CELLS and place.spread >= LIKELY_SPREAD
 
 
 def place_of(tracker: Tracker, view: View, track: Track) -> Place:

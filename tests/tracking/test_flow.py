@@ -123,7 +123,21 @@ def test_a_pose_rests_on_the_keypoints_that_are_in_view(scene):
     turned = POSES[0] @ se3.exp(np.array([0, 0, 0, 0, 0.75, 0]))
     followed = scene.tracker().follow(scene.template, grey_at(turned), se3.inverse(turned))
     assert followed.share < scene.tracker().config.min_share
+    assert followed.trusted
     assert error(followed.track.T_c_w, turned)[0] < 0.02
+
+
+def test_few_of_what_is_in_view_tell_where_to_look_and_no_pose(scene):
+    """Most of the image is blurred: what is left agrees, and is no evidence about the other anchors."""
+    grey = scene.grey.copy()
+    left = grey.shape[1] // 4
+    grey[:, left:] = cv2.GaussianBlur(grey[:, left:], (0, 0), 15.0)
+    before = scene.map.anchors.visible.copy()
+    followed = scene.tracker().follow(scene.template, grey, scene.keyframe.T_c_w)
+    assert not followed.trusted
+    assert followed.share < scene.tracker().config.min_share
+    assert error(followed.track.T_c_w, POSES[0])[0] < 0.05
+    np.testing.assert_array_equal(scene.map.anchors.visible, before)
 
 
 def test_all_levels_are_taken_only_where_they_find_more(scene, monkeypatch):
@@ -154,7 +168,8 @@ def test_an_image_that_does_not_show_the_template_has_no_pose(scene, rng, what):
     if what == "behind":
         T_c_w = se3.exp(np.array([0, 0, 0, 0, np.pi, 0])) @ T_c_w
     before = scene.map.anchors.visible.copy()
-    assert scene.tracker().follow(scene.template, image, T_c_w) is None
+    followed = scene.tracker().follow(scene.template, image, T_c_w)
+    assert followed is None or not followed.trusted
     np.testing.assert_array_equal(
         scene.map.anchors.visible, before
     )  # a frame without texture is no evidence about an anchor

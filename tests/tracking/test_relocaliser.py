@@ -105,12 +105,16 @@ def test_lost_frame_is_found_at_once_where_motion_allows_it(points, rng, view):
     assert found.earlier == {}
 
 
-def test_while_only_one_place_is_in_reach_a_likely_one_is_it(points, rng):
-    """Every sixth keypoint is known: enough at once where the camera can hardly have moved, not after seconds."""
-    tracker, view = tracker_of(points), view_of(points, 3, rng, lambda uv: (uv // 10).sum(axis=1) % 6 == 0)
-    for shift, at_once in ((0.1, True), (100.0, False)):
-        reach = Reach(points.world.T_c_w[3], shift, 0.2, 1.0)
-        assert (Relocaliser(tracker).find(0, view, [points.keyframes[3]], reach) is not None) is at_once
+@pytest.mark.parametrize("one_of", [6, 11])
+def test_while_only_one_place_is_in_reach_what_agrees_with_it_is_it(points, rng, one_of):
+    """Every sixth or eleventh keypoint is known, as in a blurred image: enough at once where the camera can hardly have
+    moved, not after seconds, and not elsewhere."""
+    tracker, view = tracker_of(points), view_of(points, 3, rng, lambda uv: (uv // 10).sum(axis=1) % one_of == 0)
+    here, elsewhere = points.world.T_c_w[3], se3.exp(np.array([5.0, 0, 0, 0, 0, 0])) @ points.world.T_c_w[3]
+    for expected, shift, at_once in ((here, 0.1, True), (here, 100.0, False), (elsewhere, 0.1, False)):
+        reach = Reach(expected, shift, 0.2, 1.0)
+        found = Relocaliser(tracker).find(0, view, [points.keyframes[3]], reach)
+        assert (found is not None) is at_once
 
 
 def test_beyond_reach_the_next_frames_must_agree(points, rng):
@@ -185,11 +189,27 @@ def test_reach_grows_with_the_square_of_time():
     reach = reach_after(0.2, np.eye(4), metre=2.0)
     assert reach.shift_m == pytest.approx(0.18)
     assert reach.turn_rad == pytest.approx(1.2)
-    assert reach.is_one_place(2.5)
-    assert not reach.is_one_place(2.0)
+    assert (reach.metre * reach.shift_m) == pytest.approx(0.36)
+
+
+def test_nothing_else_can_be_meant_within_a_small_reach_or_where_it_is_expected():
+    """36 cm are all one place at a depth of 2.5 m; at 2 m as expected within 15 %; and at 1 m doors may repeat."""
+    reach, aside = reach_after(0.2, np.eye(4), metre=2.0), se3.exp(np.array([0.35, 0, 0, 0, 0, 0]))
+    assert reach.leaves_only(at(se3.exp(np.array([0.7, 0, 0, 0, 0, 0])), depth=2.5))
+    assert not reach.leaves_only(at(se3.exp(np.array([0.8, 0, 0, 0, 0, 0])), depth=2.5))
+    assert reach.leaves_only(at(np.eye(4), depth=2.0))
+    assert not reach.leaves_only(at(aside, depth=2.0))
+    assert not reach.leaves_only(at(se3.exp(np.array([0, 0, 0, 0, 0.4, 0])), depth=2.0))
+    assert not reach.leaves_only(at(np.eye(4), depth=1.0))
     unknown = reach_after(0.2, np.eye(4), metre=None)  # 6 % of the depth
-    assert unknown.is_one_place(2.0)
-    assert not reach_after(0.4, np.eye(4), metre=None).is_one_place(2.0)
+    assert unknown.leaves_only(at(aside, depth=2.0))
+    assert not reach_after(0.5, np.eye(4), metre=None).leaves_only(at(np.eye(4), depth=2.0))
+
+
+def at(T_c_w, depth):
+    """A place with a scene depth."""
+    none = np.zeros(0, dtype=np.int64)
+    return Place(Track(T_c_w, none, none, none, none, np.eye(6)), 1.0, 48, 1.0, depth)
 
 
 @pytest.mark.parametrize(
@@ -199,9 +219,7 @@ def test_reach_grows_with_the_square_of_time():
 )
 def test_within_reach_is_as_good_as_there(xi, inside):
     """36 cm and 15 % of a depth of 2 m, and 0.2 rad and 20 degrees."""
-    none = np.zeros(0, dtype=np.int64)
-    T_c_w = se3.exp(np.array(xi, dtype=float))
-    place = Place(Track(T_c_w, none, none, none, none, np.eye(6)), 1.0, 48, 1.0, depth=2.0)
+    place = at(se3.exp(np.array(xi, dtype=float)), depth=2.0)
     assert Reach(np.eye(4), 0.36, 0.2, 1.0).holds(place) == inside
 
 
