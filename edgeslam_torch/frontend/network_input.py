@@ -36,7 +36,11 @@ def check_image(image: NDArray[np.uint8], camera: Camera) -> None:
 def preprocess(image: NDArray[np.uint8], height: int, width: int, values: Normalisation) -> FloatArray:
     """BGR or grey uint8 -> ``(1, 3, height, width)`` float32, the whole image squeezed, normalised RGB."""
     shrinks = height <= image.shape[0] and width <= image.shape[1]
-    small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+    if shrinks:
+        # In floats: rounded to grey levels, a mean that lies between two falls one way on x86 and the other on Arm.
+        small = cv2.resize(image.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
+    else:
+        small = cv2.resize(image, (width, height), interpolation=cv2.INTER_LINEAR)
     gain = np.float32(1.0) / (np.float32(255.0) * np.array(values.std, np.float32))
     offset = np.array(values.mean, np.float32) / np.array(values.std, np.float32)
     planes = np.empty((1, 3, height, width), np.float32)

@@ -84,6 +84,15 @@ def test_preprocessing_is_whole_image_rgb_in_minus_one_to_one() -> None:
     np.testing.assert_allclose(x[0, 0], -1.0, atol=1e-6)
 
 
+def test_a_shrunk_image_is_not_rounded_to_grey_levels() -> None:
+    """Processors round a mean between two levels differently, and hence would see other depths."""
+    image = np.random.default_rng(0).integers(0, 256, (64, 96, 3), np.uint8)
+    mean = image.reshape(32, 2, 48, 2, 3).mean(axis=(1, 3))
+    assert np.mean(mean % 1.0 == 0.5) > 0.1
+    x = preprocess(image, 32, 48, Metadata())
+    np.testing.assert_allclose(x[0], np.moveaxis(mean[:, :, ::-1], 2, 0) / 127.5 - 1.0, atol=1e-6)
+
+
 @pytest.mark.parametrize("size", [(480, 640), (480, 752), (720, 960), (1080, 1920), (640, 480), (240, 320)])
 def test_network_sees_about_the_images_shape_at_the_training_area(size: tuple[int, int]) -> None:
     metadata = Metadata(input_height=192, input_width=256)
