@@ -122,6 +122,11 @@ class TelemetryModel:
     attitude: bool = True
     """Whether attitude may speak."""
 
+    @property
+    def knows_metres(self) -> bool:
+        """Whether more than gravity is known."""
+        return math.isfinite(self.scale_sigma_log)
+
     def positions(
         self, stamps_s: FloatArray, p_m: FloatArray, scale_sigma_log: float | None = None
     ) -> PositionGaussian | None:

@@ -21,6 +21,10 @@ AGREE_DEPTH = 0.04
 """Maximum relative depth difference of the same edge in two keyframes."""
 RECENT_HOSTS = 40
 """Number of latest keyframes compared with a new one."""
+CHECKED = 100
+"""Edges of a keyframe that are measured again to see whether all must be."""
+OFF_LOG = 0.05
+"""Median change of their log depth beyond which they must: twice the largest relative sigma of an edge."""
 PRIOR_CELL_PX = 8
 """Side of the cells whose edges share a depth prior."""
 
@@ -84,16 +88,23 @@ class EdgeMap:
                 keyframe.image = keyframe.depth = None
 
     def _measure(self, keyframe: Keyframe) -> None:
-        if keyframe.image is None or keyframe.grey is None:
+        if keyframe.image is None:
             return
+        edges = extract_edges(keyframe.image, self.config.canny_low, self.config.canny_high, self.config.max_pixels)
+        points, _ = self._measured(keyframe, edges.uv, edges.normal, edges.colour)
+        if points is not None:
+            self.add(points)
+
+    def _measured(
+        self, keyframe: Keyframe, uv: FloatArray, normal: FloatArray, colour: NDArray[np.uint8]
+    ) -> tuple[EdgePoints | None, IntArray]:
+        """Those of a keyframe's edges whose depth can be told, and which; None without another view of them."""
         targets = self._targets(keyframe)
-        if not targets:
-            return
-        config = self.config
-        edges = extract_edges(keyframe.image, config.canny_low, config.canny_high, config.max_pixels)
-        prior, sigma = self._prior(keyframe, edges.uv)
+        if not targets or keyframe.grey is None:
+            return None, np.zeros(0, dtype=np.int64)
+        prior, sigma = self._prior(keyframe, uv)
         known = np.isfinite(prior)
-        uv, normal = edges.uv[known], edges.normal[known]
+        uv, normal = uv[known], normal[known]
         measured = measure_edge_depth(
             StereoView(keyframe.grey, keyframe.T_c_w),
             uv,
@@ -105,18 +116,18 @@ class EdgeMap:
         )
         depth = 1.0 / measured.inverse_depth
         relative = measured.sigma * depth
-        good = np.isfinite(depth) & (depth > 0) & (relative < config.max_sigma)
+        good = np.isfinite(depth) & (depth > 0) & (relative < self.config.max_sigma)
         points = EdgePoints(
             keyframe_id=keyframe.id,
             uv=uv[good],
             normal=normal[good],
             p_c=self.camera.back_project(uv[good], depth[good]),
             sigma=(relative * depth)[good],
-            colour=edges.colour[known][good],
+            colour=colour[known][good],
             observations=np.ones(int(good.sum()), dtype=np.int32),
             keypoint_z=self._keypoint_z(keyframe),
         )
-        self.add(points)
+        return points, np.flatnonzero(known)[good]
 
     def _keypoint_z(self, keyframe: Keyframe) -> FloatArray:
         """Depth ``(N,)`` of a keyframe's triangulated anchors at their keypoints, NaN elsewhere."""
@@ -132,24 +143,48 @@ class EdgeMap:
         """Change the depths of each keyframe's edges as refinement has changed those of its anchors since.
 
         They were measured with the poses of their time. A refinement that changes the scale of a place moves anchors
-        and poses, and edges that stay behind pull the poses back in the next one (docs/decisions/0076).
+        and poses, and edges that stay behind pull the poses back in the next one (docs/decisions/0076). Where more than
+        a scale has changed, they are measured again.
         """
-        for host in self.hosts:
+        for i, host in enumerate(self.hosts):
             keyframe = self.map.keyframes.get(host.keyframe_id)
             if keyframe is None or len(host.keypoint_z) != len(keyframe.anchor):
                 continue
             now = self._keypoint_z(keyframe)
             change = np.log(now / host.keypoint_z)
             change = change[np.isfinite(change)]
-            if len(change) < MIN_ANCHORS:
-                continue
-            host.grow(math.exp(float(np.median(change))))
-            host.keypoint_z = now
+            if len(change) >= MIN_ANCHORS:
+                host.grow(math.exp(float(np.median(change))))
+                host.keypoint_z = now
+            if self._is_off(host, keyframe):
+                self.hosts[i] = self._measured_again(host, keyframe)
+
+    def _measured_again(self, host: EdgePoints, keyframe: Keyframe) -> EdgePoints:
+        """A keyframe's edges with the depths that the poses of now give them."""
+        again, _ = self._measured(keyframe, host.uv, host.normal, host.colour)
+        if again is None:
+            return host
+        for other in self._overlapping(keyframe, [h for h in self.hosts if h is not host]):
+            again.observations[self._agreeing(again, other)[0]] += 1
+        return again
+
+    def _is_off(self, host: EdgePoints, keyframe: Keyframe) -> bool:
+        """Whether some of a keyframe's edges, measured with the poses of now, lie elsewhere."""
+        some = np.arange(0, len(host.uv), max(1, len(host.uv) // CHECKED))
+        again, which = self._measured(keyframe, host.uv[some], host.normal[some], host.colour[some])
+        if again is None or len(which) < MIN_ANCHORS:
+            return False
+        change = np.log(again.p_c[:, 2] / host.p_c[some[which], 2])
+        return abs(float(np.median(change))) > OFF_LOG
 
     def add(self, points: EdgePoints) -> None:
         """Add the measured edges of a keyframe, and remove others beyond the limit."""
         with self.map.lock:
-            self._count_agreement(points, self._overlapping(self.map.keyframes[points.keyframe_id]))
+            recent = self.hosts[-RECENT_HOSTS:]
+            for other in self._overlapping(self.map.keyframes[points.keyframe_id], recent):
+                mine, theirs = self._agreeing(points, other)
+                points.observations[mine] += 1
+                other.observations[theirs] += 1
             self.hosts.append(points)
             self._bound()
 
@@ -187,26 +222,24 @@ class EdgeMap:
                 chosen.append(other)
         return chosen[: self.config.targets]
 
-    def _overlapping(self, keyframe: Keyframe) -> list[EdgePoints]:
+    def _overlapping(self, keyframe: Keyframe, hosts: list[EdgePoints]) -> list[EdgePoints]:
         near = {k.id for k in self.map.covisible(keyframe, 3 * self.config.targets)}
-        return [h for h in self.hosts[-RECENT_HOSTS:] if h.keyframe_id in near][-8:]
+        return [h for h in hosts if h.keyframe_id in near][-8:]
 
-    def _count_agreement(self, points: EdgePoints, others: list[EdgePoints]) -> None:
-        """Raise the count of points that two keyframes measured alike: the cycle of paper eqs. (17)-(22), as a test."""
+    def _agreeing(self, points: EdgePoints, other: EdgePoints) -> tuple[IntArray, IntArray]:
+        """Which points of two keyframes they measured alike: the cycle of paper eqs. (17)-(22), as a test."""
         if len(points.uv) == 0:
-            return
+            return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
         painted = PaintedEdges.of(points.uv, (self.camera.width, self.camera.height))
-        T_p_w = self.map.pose_of(points.keyframe_id)
-        for other in others:
-            p = se3.transform(T_p_w @ se3.inverse(self.map.pose_of(other.keyframe_id)), other.p_c)
-            front = np.flatnonzero(p[:, 2] > 0)
-            nearest = painted.nearest(self.camera.project(p[front]))
-            found = nearest >= 0
-            mine, theirs = nearest[found], front[found]
-            z_mine = points.p_c[mine, 2]
-            same = np.abs(p[theirs, 2] - z_mine) < AGREE_DEPTH * z_mine
-            other.observations[theirs[same]] += 1
-            points.observations[np.unique(mine[same])] += 1
+        T_p_o = self.map.pose_of(points.keyframe_id) @ se3.inverse(self.map.pose_of(other.keyframe_id))
+        p = se3.transform(T_p_o, other.p_c)
+        front = np.flatnonzero(p[:, 2] > 0)
+        nearest = painted.nearest(self.camera.project(p[front]))
+        found = nearest >= 0
+        mine, theirs = nearest[found], front[found]
+        z_mine = points.p_c[mine, 2]
+        same = np.abs(p[theirs, 2] - z_mine) < AGREE_DEPTH * z_mine
+        return np.unique(mine[same]), theirs[same]
 
     def points(self, piece: int | None = None) -> PointCloud:
         """Edge points that several keyframes agree on, fused in cells, in the map's world frame.

@@ -22,12 +22,17 @@ from edgeslam_torch.mapping.prior_anchors import (
     prior_of,
     rays,
 )
-from edgeslam_torch.mapping.refinement import choose_window, refine, refine_all, young_map
+from edgeslam_torch.mapping.refinement import choose_window, recent_map, refine, refine_all, young_map
 from edgeslam_torch.mapping.reobserve import MAX_DRIFT_PX, reobserve
 from edgeslam_torch.mapping.window_edges import WindowEdges
 from edgeslam_torch.optim.problem import LmConfig, WindowResult
 from edgeslam_torch.types import FloatArray, IntArray
 
+WIDE = 60
+"""Keyframes of a wide window: some 20 s of flight. With 25 a drifted scale swings past the true one
+(docs/decisions/0111)."""
+WIDE_EVERY = 4
+"""Windows until the next wide one: about a second in flight."""
 ENOUGH_ANCHORS = 300
 """Number of anchors below which empty regions of a keyframe are filled from the depth prior alone."""
 EMPTY_RADIUS_PX = 25.0
@@ -60,6 +65,8 @@ class Mapper:
         self.lm = lm
         flying = config.window.flying
         self._edges = None if edges is None or flying is None else WindowEdges(edges, camera, flying, flying=True)
+        self._windows = 0
+        """Since the last wide one."""
         self._recent: IntArray = np.zeros(0, dtype=np.int64)
 
     def insert(
@@ -84,6 +91,8 @@ class Mapper:
             drift_px = reobserve(self.map, self.camera, keyframe)
         if drift_px is not None and drift_px > MAX_DRIFT_PX:  # the drift lies outside the window
             refine_all(self.map, self.camera, self.lm, telemetry)
+        if telemetry is not None and telemetry.knows_metres:
+            self._take_back_drift(keyframe, telemetry)
         free, fixed = self.config.window, self.config.window_fixed
         window = young_map(self.map, keyframe, free + fixed) or choose_window(self.map, keyframe, free, fixed)
         edges = self._edges if self._edges is not None and self._edges.wanted(keyframe) else None
@@ -94,6 +103,20 @@ class Mapper:
             drop_needless_priors(self.map, keyframe, np.deg2rad(self.config.min_parallax_deg))
             self.cull_keyframes(keyframe)
         return result
+
+    def _take_back_drift(self, keyframe: Keyframe, telemetry: TelemetryModel) -> None:
+        """Refine the recent map with telemetry every few keyframes.
+
+        The fixed keyframes around a window hold its scale, right or drifted, against telemetry
+        (docs/decisions/0111).
+        """
+        self._windows += 1
+        if self._windows < WIDE_EVERY:
+            return
+        self._windows = 0
+        window = recent_map(self.map, keyframe, WIDE)
+        if window is not None:
+            refine(self.map, window, self.camera, self.lm, telemetry)
 
     def cull_recent_anchors(self, keyframe: Keyframe) -> None:
         """Remove young anchors that tracking rarely finds or that only two keyframes observe."""

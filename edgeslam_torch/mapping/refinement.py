@@ -80,6 +80,24 @@ def young_map(slam_map: SlamMap, newest: Keyframe, most: int) -> Window | None:
     return window if held_extent(window) is not None else None
 
 
+def recent_map(slam_map: SlamMap, newest: Keyframe, most: int) -> Window | None:
+    """The newest ``most`` keyframes of a piece of map as one window.
+
+    Two earlier keyframes hold it, those that see most of the same anchors; without earlier ones its first pose and the
+    distance to one other do. None for fewer than three, or a camera that never moved.
+    """
+    piece = slam_map.piece_of(newest.id)
+    keyframes = [k for id, k in sorted(slam_map.keyframes.items()) if slam_map.piece_of(id) == piece]
+    recent, earlier = keyframes[-most:], keyframes[:-most]
+    anchor = slam_map.anchors_seen_by(recent)
+    if earlier:
+        shared = slam_map.shared_counts(anchor)
+        earlier.sort(key=lambda k: (-shared.get(k.id, 0), -k.id))
+        return Window(recent, earlier[:2], anchor, Weight.WIDE)
+    window = Window(recent[1:], recent[:1], anchor, Weight.WIDE)
+    return window if len(recent) >= 3 and held_extent(window) is not None else None
+
+
 def refine_all(
     slam_map: SlamMap,
     camera: Camera,
@@ -241,7 +259,11 @@ def tracked_motions(slam_map: SlamMap, keyframes: list[Keyframe]) -> tuple[Relat
 
 
 def write_back(slam_map: SlamMap, window: Window, keypoint: list[IntArray], result: WindowResult) -> None:
-    """Write the result of `window_problem` back to the map; outlier observations are removed."""
+    """Write the result of `window_problem` back to the map; outlier observations are removed.
+
+    Not where the solver ran out of steps: half-way, residuals do not tell which observations are wrong, and a keyframe
+    that loses its right ones hangs on nothing (docs/decisions/0111).
+    """
     if result.stop is StopReason.NOT_FINITE:  # its residuals say nothing, so no observation disagrees
         return
     keyframes = [*window.free, *window.fixed]
@@ -249,6 +271,8 @@ def write_back(slam_map: SlamMap, window: Window, keypoint: list[IntArray], resu
         for keyframe, T_c_w in zip(keyframes, result.T_c_w, strict=False):  # hosts outside the window follow
             keyframe.T_c_w = T_c_w
         slam_map.anchors.p_w[window.anchor] = result.p_w
+        if result.stop is StopReason.MAX_ITERATIONS:
+            return
         bad = (result.chi2 > CHI2_2DOF_95) | ~result.in_front
         start = 0
         for keyframe, seen in zip(keyframes, keypoint, strict=True):

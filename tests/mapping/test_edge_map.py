@@ -70,7 +70,9 @@ def test_points_that_two_keyframes_measured_alike_count_twice(points):
     p_w = points.world.p_w[points.world.visible[0] & points.world.visible[1]][:60]
     a, b = host(points, 0, p_w), host(points, 1, p_w)
     b.p_c[:10] *= 1.2  # measured 20 % deeper: not the same point
-    edge_map(points)._count_agreement(a, [b])
+    edges = edge_map(points)
+    edges.add(b)
+    edges.add(a)
     lonely = np.flatnonzero(a.observations == 1)
     assert set(range(10)) <= set(lonely)
     assert len(lonely) < 15  # another edge pixel may lie nearer by chance
@@ -81,7 +83,9 @@ def test_points_behind_the_other_keyframe_do_not_count(points, rng):
     p_w = points.world.p_w[points.world.visible[0] & points.world.visible[1]][:40]
     a, b = host(points, 0, p_w), host(points, 1, p_w)
     points.keyframes[1].T_c_w = se3.exp(np.array([0, 0, 0, 0, np.pi, 0])) @ points.keyframes[1].T_c_w
-    edge_map(points)._count_agreement(a, [b])
+    edges = edge_map(points)
+    edges.add(b)
+    edges.add(a)
     assert (a.observations == 1).all()
     assert (b.observations == 1).all()
 

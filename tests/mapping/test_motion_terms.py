@@ -8,13 +8,16 @@ from point_map import CAMERA, PointMap, check_map
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, Slerp
 
+from edgeslam_torch.config import MappingConfig, SlamConfig, WindowConfig
 from edgeslam_torch.fusion.config import FusionConfig
 from edgeslam_torch.fusion.displacement import TelemetryModel
 from edgeslam_torch.fusion.telemetry.track import TelemetryTrack
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.mount import camera_on_body
+from edgeslam_torch.mapping.last_refinement import lm_config
+from edgeslam_torch.mapping.mapper import WIDE_EVERY, Mapper
 from edgeslam_torch.mapping.motion_terms import motion_factors
-from edgeslam_torch.mapping.refinement import Window, refine
+from edgeslam_torch.mapping.refinement import Window, recent_map, refine
 from edgeslam_torch.optim.problem import LmConfig
 from edgeslam_torch.synthetic.flights.telemetry import EXACT, simulate
 
@@ -47,14 +50,14 @@ def telemetry_of(rng, points, scale=1.0):
     return TelemetryModel(track, FusionConfig(), T_B_C, R_w_m, 0.0, 0.0, scale, 0.01, True, None, truncates=0.0)
 
 
-def blow_up(points, factor):
-    """The last three keyframes and their anchors, scaled about the third."""
-    centre = points.keyframes[2].centre_w
-    for keyframe in points.keyframes[3:]:
+def blow_up(points, factor, first=3):
+    """The keyframes from one on and their anchors, scaled about the one before it."""
+    centre = points.keyframes[first - 1].centre_w
+    for keyframe in points.keyframes[first:]:
         T_w_c = keyframe.T_w_c
         T_w_c[:3, 3] = centre + factor * (T_w_c[:3, 3] - centre)
         keyframe.T_c_w = se3.inverse(T_w_c)
-    mine = points.map.anchors_seen_by(points.keyframes[3:])
+    mine = points.map.anchors_seen_by(points.keyframes[first:])
     points.map.anchors.p_w[mine] = centre + factor * (points.map.anchors.p_w[mine] - centre)
 
 
@@ -74,6 +77,62 @@ def test_scale_is_carried_over_to_what_shares_no_anchor(rng, halves, factor, sca
     refine(halves.map, window, CAMERA, LmConfig(max_iterations=50), telemetry_of(rng, halves, scale))
     assert far(halves) < 0.05 * off
     check_map(halves.map)
+
+
+@pytest.mark.parametrize("most", [3, 60])
+def test_the_recent_map_takes_back_a_drift_that_a_window_holds(rng, halves, most):
+    """Where two earlier keyframes hold it, or the first one and a distance."""
+    blow_up(halves, 1.4)
+    off = far(halves)
+    window = recent_map(halves.map, halves.keyframes[-1], most)
+    assert [k.id for k in window.free] == ([3, 4, 5] if most == 3 else [1, 2, 3, 4, 5])
+    assert len(window.fixed) == (2 if most == 3 else 1)
+    refine(halves.map, window, CAMERA, lm_config(WindowConfig()), telemetry_of(rng, halves))
+    ratio = spread_of(halves, 3, 6) / spread_of(halves, 0, 3)
+    true = se3.inverse(halves.world.T_c_w)[:, :3, 3]
+    # One distance keeps the unit, so that the model's line through the bent way leaves a sixth of the drift at once.
+    assert ratio == pytest.approx(np.ptp(true[3:], axis=0).max() / np.ptp(true[:3], axis=0).max(), rel=0.08)
+    if most == 3:
+        assert far(halves) < 0.05 * off
+    check_map(halves.map)
+
+
+def spread_of(points, first, last):
+    """Extent of the way of some keyframes."""
+    return np.ptp(np.array([k.centre_w for k in points.keyframes[first:last]]), axis=0).max()
+
+
+def test_only_two_keyframes_or_a_camera_that_stood_are_no_recent_map(halves):
+    newest = halves.keyframes[-1]
+    assert recent_map(halves.map, newest, 2).fixed
+    for keyframe in halves.keyframes:
+        keyframe.T_c_w = newest.T_c_w
+    assert recent_map(halves.map, newest, 60) is None
+    for keyframe in halves.keyframes[:-2]:
+        halves.map.remove_keyframe(keyframe)
+    assert recent_map(halves.map, newest, 60) is None
+
+
+@pytest.mark.parametrize("metres", [True, False])
+def test_every_few_keyframes_the_recent_map_is_refined_with_telemetry(rng, metres):
+    """Keyframes that hold a drifted scale are beyond the window of two and its two fixed ones."""
+    points = PointMap(rng, 600, 8 + WIDE_EVERY)
+    points.fill()
+    model = telemetry_of(rng, points)
+    model = model if metres else replace(model, velocity=False, scale_sigma_log=np.inf)
+    split = 4
+    for keyframe in points.keyframes:
+        other = np.flatnonzero((keyframe.anchor >= 0) & (keyframe.anchor % 2 != (keyframe.id >= split)))
+        points.map.forget_observations(keyframe, other)
+    blow_up(points, 1.4, split)
+    config = SlamConfig(mapping=MappingConfig(window=2, window_fixed=2))
+    mapper = Mapper(points.map, CAMERA, config, lm_config(config.window))
+    for keyframe in points.keyframes[-WIDE_EVERY:]:
+        mapper.insert(keyframe, np.zeros((len(keyframe.anchor), 3), np.uint8), model)
+    true = se3.inverse(points.world.T_c_w)[:, :3, 3]
+    drift = spread_of(points, split, 8) / np.ptp(true[split:8], axis=0).max()
+    drift /= spread_of(points, 0, split) / np.ptp(true[:split], axis=0).max()
+    assert 1.0 < drift < 1.25 if metres else drift > 1.35  # half of it at the first time
 
 
 def test_pieces_are_not_tied_to_each_other(rng, halves):

@@ -93,6 +93,19 @@ def test_wrong_observations_are_taken_out_of_the_map(points, rng):
     check_map(points.map)
 
 
+def test_half_way_no_observation_is_taken_for_a_wrong_one(points, rng):
+    """The solver runs out of steps far from the minimum, where right observations do not fit either."""
+    keyframe = points.keyframes[-1]
+    keyframe.T_c_w = small_motion(rng, 0.3, 0.1) @ keyframe.T_c_w
+    before = keyframe.anchor.copy()
+    window = choose_window(points.map, keyframe, 4, 15)
+    result = refine(points.map, window, CAMERA, LmConfig(max_iterations=1, mu=1.0))
+    assert result.stop is StopReason.MAX_ITERATIONS
+    assert np.mean(result.chi2 > 5.991) > 0.1
+    np.testing.assert_array_equal(keyframe.anchor, before)
+    check_map(points.map)
+
+
 def test_a_window_of_two_keyframes_keeps_its_scale(rng):
     points = PointMap(rng, 100, 2)
     points.fill()
