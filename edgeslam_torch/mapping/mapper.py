@@ -1,5 +1,7 @@
 """Stage 3 and 4 for one keyframe: cull, triangulate, fuse, refine, cull keyframes."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from edgeslam_torch.config import SlamConfig
@@ -10,6 +12,7 @@ from edgeslam_torch.fusion.displacement import TelemetryModel
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.robust_statistics import CHI2_2DOF_95
 from edgeslam_torch.map.depth_prior import depth_prior
+from edgeslam_torch.map.growth import depths, take_along
 from edgeslam_torch.map.keyframe import NO_ANCHOR, Keyframe
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.mapping.edge_map import EdgeMap
@@ -33,6 +36,8 @@ WIDE = 60
 (docs/decisions/0111)."""
 WIDE_EVERY = 4
 """Windows until the next wide one: about a second in flight."""
+WIDE_STEPS = 100
+"""Limit of the solver's steps in it: some 15 are usual, the first one after a long drift takes several times that."""
 ENOUGH_ANCHORS = 300
 """Number of anchors below which empty regions of a keyframe are filled from the depth prior alone."""
 EMPTY_RADIUS_PX = 25.0
@@ -115,8 +120,12 @@ class Mapper:
             return
         self._windows = 0
         window = recent_map(self.map, keyframe, WIDE)
-        if window is not None:
-            refine(self.map, window, self.camera, self.lm, telemetry)
+        if window is None:
+            return
+        keyframes = sorted([*window.fixed, *window.free], key=lambda k: k.id)
+        before = depths(self.map, keyframes)
+        refine(self.map, window, self.camera, replace(self.lm, max_iterations=WIDE_STEPS), telemetry)
+        take_along(self.map, keyframes, before)
 
     def cull_recent_anchors(self, keyframe: Keyframe) -> None:
         """Remove young anchors that tracking rarely finds or that only two keyframes observe."""

@@ -45,6 +45,9 @@ class Window:
     """How the bias of depths on priors is undone."""
     young: bool = False
     """A whole young map: its newest keyframe, the last free one, is as tracking placed it."""
+    settled: bool = False
+    """Written back only if the solver has reached a minimum: half-way the newest keyframes, which are being tracked on,
+    can be anywhere."""
 
 
 def choose_window(slam_map: SlamMap, newest: Keyframe, free: int, fixed: int) -> Window:
@@ -93,8 +96,8 @@ def recent_map(slam_map: SlamMap, newest: Keyframe, most: int) -> Window | None:
     if earlier:
         shared = slam_map.shared_counts(anchor)
         earlier.sort(key=lambda k: (-shared.get(k.id, 0), -k.id))
-        return Window(recent, earlier[:2], anchor, Weight.WIDE)
-    window = Window(recent[1:], recent[:1], anchor, Weight.WIDE)
+        return Window(recent, earlier[:2], anchor, Weight.WIDE, settled=True)
+    window = Window(recent[1:], recent[:1], anchor, Weight.WIDE, settled=True)
     return window if len(recent) >= 3 and held_extent(window) is not None else None
 
 
@@ -156,6 +159,8 @@ def refine(
     if len(problem.obs_pose) == 0 and (placed is None or not placed.has_terms):
         return None
     result = refine_window(problem, config)
+    if window.settled and not result.stop.converged:
+        return result
     if window.young and problem.scale_priors and not problem.centres and result.stop is not StopReason.NOT_FINITE:
         result = with_same_depths(problem, result, len(window.free))
     write_back(slam_map, window, keypoint, result)

@@ -8,7 +8,15 @@ from edgeslam_torch.config import WindowConfig
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.losses.robust import Kernel
 from edgeslam_torch.mapping.last_refinement import lm_config
-from edgeslam_torch.mapping.refinement import Window, choose_window, refine, refine_all, window_problem, young_map
+from edgeslam_torch.mapping.refinement import (
+    Window,
+    choose_window,
+    recent_map,
+    refine,
+    refine_all,
+    window_problem,
+    young_map,
+)
 from edgeslam_torch.optim.pose_only import refine_pose
 from edgeslam_torch.optim.problem import LmConfig, StopReason
 
@@ -104,6 +112,18 @@ def test_half_way_no_observation_is_taken_for_a_wrong_one(points, rng):
     assert np.mean(result.chi2 > 5.991) > 0.1
     np.testing.assert_array_equal(keyframe.anchor, before)
     check_map(points.map)
+
+
+def test_a_wide_window_is_taken_at_its_minimum_only(points, rng):
+    for keyframe in points.keyframes[1:]:
+        keyframe.T_c_w = small_motion(rng, 0.3, 0.1) @ keyframe.T_c_w
+    before = [k.T_c_w.copy() for k in points.keyframes]
+    window = recent_map(points.map, points.keyframes[-1], 60)
+    refine(points.map, window, CAMERA, LmConfig(max_iterations=1, mu=1.0))
+    np.testing.assert_array_equal([k.T_c_w for k in points.keyframes], before)
+    result = refine(points.map, window, CAMERA, LmConfig(max_iterations=50))
+    assert result.stop.converged
+    assert any((k.T_c_w != T).any() for k, T in zip(points.keyframes, before, strict=True))
 
 
 def test_a_window_of_two_keyframes_keeps_its_scale(rng):

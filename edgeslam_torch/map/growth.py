@@ -1,0 +1,54 @@
+"""What anchors and keyframes remember in map units, taken along where a refinement changes the scale of their place.
+
+A window changes the scale by too little to matter. Telemetry that takes back a drift changes it by half and more:
+anchors would be looked for on the wrong pyramid level, and priors would pull back (docs/decisions/0111).
+"""
+
+import numpy as np
+
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.map.keyframe import Keyframe
+from edgeslam_torch.map.slam_map import SlamMap
+from edgeslam_torch.types import FloatArray, IntArray
+
+MIN_ANCHORS = 8
+"""Anchors of a keyframe whose depths tell how its place has grown."""
+
+Depths = dict[int, tuple[IntArray, FloatArray]]
+"""Anchors that each keyframe sees, by its id, and their depths in it."""
+
+
+def depths(slam_map: SlamMap, keyframes: list[Keyframe]) -> Depths:
+    """Depths of the anchors that keyframes see, as they are now."""
+    seen = {}
+    for keyframe in keyframes:
+        held = keyframe.anchor[keyframe.anchor >= 0]
+        seen[keyframe.id] = held, se3.transform(keyframe.T_c_w, slam_map.anchors.p_w[held])[:, 2]
+    return seen
+
+
+def take_along(slam_map: SlamMap, keyframes: list[Keyframe], before: Depths) -> None:
+    """Scale what anchors and keyframes remember by how much farther each keyframe's anchors are than ``before``.
+
+    Args:
+        slam_map: After the refinement.
+        keyframes: That took part, in the order of time: an anchor grows as the last one that sees it.
+        before: Their `depths` before it.
+    """
+    anchors = slam_map.anchors
+    grown = np.ones(len(anchors.alive))
+    with slam_map.lock:
+        for keyframe in keyframes:
+            held, z = before[keyframe.id]
+            now = se3.transform(keyframe.T_c_w, anchors.p_w[held])[:, 2]
+            good = anchors.alive[held] & (z > 0) & (now > 0)
+            if good.sum() < MIN_ANCHORS:
+                continue
+            growth = float(np.exp(np.median(np.log(now[good] / z[good]))))
+            grown[held] = growth
+            keyframe.scale(growth)
+            hosted = np.flatnonzero(anchors.alive & anchors.from_depth & (anchors.host == keyframe.id))
+            anchors.prior[hosted] /= growth
+            anchors.origin[hosted] = keyframe.centre_w
+        anchors.max_distance *= grown
+        anchors.sigma *= grown
