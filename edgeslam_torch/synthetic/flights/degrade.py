@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 
 from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.synthetic.image_ops import product
 from edgeslam_torch.types import FloatArray
 
 Rng = np.random.Generator
@@ -86,15 +87,15 @@ def with_vignetting(image: np.ndarray, loss: float) -> np.ndarray:
     if loss == 0:
         return image
     channels = image.shape[2] if image.ndim == 3 else 1
-    return cv2.multiply(image, _vignette(image.shape[0], image.shape[1], channels, loss), scale=1.0 / 255.0)
+    return product(image, _vignette(image.shape[0], image.shape[1], channels, loss))
 
 
 @lru_cache(maxsize=8)
 def _vignette(h: int, w: int, channels: int, loss: float) -> np.ndarray:
-    """Gain times 255, ``(h, w)`` or ``(h, w, channels)``."""
+    """Gain in steps of 1/255, ``(h, w)`` or ``(h, w, channels)`` float32."""
     x, y = (np.arange(w) - (w - 1) / 2) / (w / 2), (np.arange(h) - (h - 1) / 2) / (h / 2)
     gain = np.rint(255.0 * (1.0 - 0.5 * loss * (x[None] ** 2 + y[:, None] ** 2)))
-    return cv2.merge([np.clip(gain, 0, 255).astype(np.uint8)] * channels)
+    return cv2.merge([(np.clip(gain, 0, 255) / 255.0).astype(np.float32)] * channels)
 
 
 def with_jpeg(image: np.ndarray, quality: int) -> np.ndarray:

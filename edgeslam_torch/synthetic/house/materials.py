@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 
 from edgeslam_torch.synthetic.house.noise import Rng, colour, fractal, shaded, timber
+from edgeslam_torch.types import FloatArray
 
 TILE_M = 1.6
 """Side of a tile [m]."""
@@ -194,9 +195,17 @@ def dead_leaves(rng: Rng, shape: tuple[int, int] = (TILE_PX, TILE_PX), count: in
             axes = (int(radius) + 1, int(radius * rng.uniform(0.4, 1)) + 1)
             cv2.ellipse(image, centre, axes, rng.uniform(0, 180), 0, 360, tone.tolist(), -1, cv2.LINE_AA)
         else:
-            box = cv2.boxPoints((centre, (radius * 2, radius * rng.uniform(0.5, 2)), rng.uniform(0, 90)))
-            cv2.fillConvexPoly(image, box.astype(np.int32), tone.tolist(), cv2.LINE_AA)
+            half = np.array([radius, radius * rng.uniform(0.25, 1)])
+            box = _turned_box(centre, half, np.deg2rad(rng.uniform(0, 90)))
+            cv2.fillConvexPoly(image, box, tone.tolist(), cv2.LINE_AA)
     return shaded(image.astype(np.float32), 1 + 0.05 * fractal(rng, shape, 1.0))
+
+
+def _turned_box(centre: tuple[int, int], half: FloatArray, turn_rad: float) -> np.ndarray:
+    """Corners ``(4, 2)`` int32 of a rectangle; not by `cv2.boxPoints`, whose floats depend on the processor."""
+    c, s = np.cos(turn_rad), np.sin(turn_rad)
+    corners = half * np.array([[-1, 1], [-1, -1], [1, -1], [1, 1]])
+    return (centre + corners @ np.array([[c, s], [-s, c]])).astype(np.int32)
 
 
 def ceiling_panels(rng: Rng) -> np.ndarray:

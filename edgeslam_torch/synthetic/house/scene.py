@@ -8,6 +8,7 @@ import numpy as np
 
 from edgeslam_torch.synthetic.house import materials, pictures
 from edgeslam_torch.synthetic.house.world import Box, Quad, Texture, World
+from edgeslam_torch.synthetic.image_ops import product, resized, shrunk
 from edgeslam_torch.types import FloatArray
 
 LIGHT_GRID_M = 0.16
@@ -317,15 +318,13 @@ def _bake(surface: Surface, light: FloatArray, scene: Scene) -> np.ndarray:
             image = cv2.rotate(image, cv2.ROTATE_90_CLOCKWISE)
         needed = max(width_m / image.shape[1], height_m / image.shape[0])
         if needed < 0.6 * scene.texel_m:  # finer than anything else in the world: shrink
-            size = [max(4, round(x / (0.7 * scene.texel_m))) for x in (width_m, height_m)]
-            image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+            image = shrunk(image, *(max(4, round(x / (0.7 * scene.texel_m))) for x in (width_m, height_m)))
     else:
         image = _spread(paint, width_m, height_m, scene.texel_m)
     gain = np.array(paint.tint) * (np.ones(3) if paint.glow else np.array(scene.light_bgr))
     field_ = np.full_like(light, scene.exposure) if paint.glow else light
     light8 = np.clip(UNIT_LIGHT * field_[..., None] * gain, 0, 255).astype(np.uint8)
-    smooth = cv2.resize(light8, (image.shape[1], image.shape[0]), interpolation=cv2.INTER_LINEAR)
-    return cv2.multiply(image, smooth, scale=1.0 / UNIT_LIGHT)
+    return product(image, resized(light8, image.shape[1], image.shape[0]) / np.float32(UNIT_LIGHT))
 
 
 @lru_cache(maxsize=256)
@@ -333,7 +332,7 @@ def _sized_tile(kind: str, variant: int, side_px: int) -> np.ndarray:
     """A material's tile resampled to ``side_px`` (smoothed first when it shrinks)."""
     pyramid = material_tile(kind, variant)
     level = max(0, int(2 * np.log2(materials.TILE_PX / side_px)))
-    return cv2.resize(pyramid.level(level), (side_px, side_px), interpolation=cv2.INTER_LINEAR)
+    return resized(pyramid.level(level), side_px, side_px)
 
 
 def _spread(paint: Paint, width_m: float, height_m: float, texel_m: float) -> np.ndarray:

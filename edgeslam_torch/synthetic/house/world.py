@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
+from edgeslam_torch.synthetic.image_ops import shrunk
 from edgeslam_torch.types import FloatArray
 
 MAX_LEVEL = 18
@@ -33,8 +33,8 @@ class Texture:
         if found is None:
             source = self.level(max(k - 2, 0))
             shrink = 2.0 ** (-0.5 * min(k, 2))
-            size = [max(1, round(n * shrink)) for n in (source.shape[1], source.shape[0])]
-            found = self._levels.setdefault(k, np.asarray(cv2.resize(source, size, interpolation=cv2.INTER_AREA)))
+            width, height = (max(1, round(n * shrink)) for n in (source.shape[1], source.shape[0]))
+            found = self._levels.setdefault(k, shrunk(source, width, height))
         return found
 
 

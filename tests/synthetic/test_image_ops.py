@@ -1,0 +1,44 @@
+"""Image arithmetic that must not depend on the processor: compared with whole-number arithmetic."""
+
+from fractions import Fraction
+
+import numpy as np
+
+from edgeslam_torch.synthetic.image_ops import product, resized, shrunk
+
+
+def test_a_product_is_the_nearest_grey_level() -> None:
+    a, b = np.meshgrid(np.arange(256, dtype=np.uint8), np.arange(256, dtype=np.uint8))
+    nearest = (2 * a.astype(int) * b + 255) // 510  # a b / 255 never lies between two levels
+    np.testing.assert_array_equal(product(a, b / np.float32(255)), nearest)
+
+
+def test_a_product_saturates() -> None:
+    assert product(np.array([[200]], np.uint8), np.array([[1.5]], np.float32)).tolist() == [[255]]
+
+
+def test_a_mean_is_exact_and_halves_go_up() -> None:
+    image = np.random.default_rng(0).integers(0, 256, (35, 10, 3), dtype=np.uint8)
+    out = shrunk(image, 7, 25)
+    for row, column, channel in np.ndindex(out.shape):
+        assert out[row, column, channel] == _area_mean(image[..., channel], row, column, 25, 7)
+
+
+def _area_mean(image: np.ndarray, row: int, column: int, height: int, width: int) -> int:
+    """Mean of the source under one pixel by fractions, to the nearest level, halves up."""
+    down, across = Fraction(image.shape[0], height), Fraction(image.shape[1], width)
+    rows = [_overlap(i, row * down, (row + 1) * down) for i in range(image.shape[0])]
+    columns = [_overlap(j, column * across, (column + 1) * across) for j in range(image.shape[1])]
+    total = sum(int(image[i, j]) * r * c for i, r in enumerate(rows) if r for j, c in enumerate(columns) if c)
+    return int(total / (down * across) + Fraction(1, 2))
+
+
+def _overlap(pixel: int, low: Fraction, high: Fraction) -> Fraction:
+    return max(Fraction(0), min(high, Fraction(pixel + 1)) - max(low, Fraction(pixel)))
+
+
+def test_interpolation_meets_a_ramp() -> None:
+    ramp = np.arange(0, 250, 10, dtype=np.uint8)[None].repeat(4, axis=0)
+    out = resized(ramp, 100, 4)
+    inside = 10 * ((np.arange(100) + 0.5) / 4 - 0.5)
+    np.testing.assert_allclose(out[0, 4:-4], inside[4:-4], atol=0.51)
