@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from edgeslam_torch.geometry.camera import Camera
-from edgeslam_torch.synthetic.image_ops import product
+from edgeslam_torch.synthetic.textures.image_ops import looked_up, product
 from edgeslam_torch.types import FloatArray
 
 Rng = np.random.Generator
@@ -146,8 +146,7 @@ def with_motion_blur(
         if share == 0:
             continue
         map_x, map_y = x - np.float32(share) * flow_x, y - np.float32(share) * flow_y
-        moved = cv2.remap(image, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        cv2.accumulate(moved, total)
+        cv2.accumulate(looked_up(image, map_x, map_y), total)
     return cv2.convertScaleAbs(total, alpha=1.0 / steps)
 
 

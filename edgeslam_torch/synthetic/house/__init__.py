@@ -1,1 +1,1 @@
-"""Textured rooms: materials, furniture, scenes, and their exact rendering."""
+"""Rooms: furniture, scenes, and their exact rendering."""

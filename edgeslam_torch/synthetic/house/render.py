@@ -1,7 +1,7 @@
 """Exact z-buffer rendering of a `World` with numpy and OpenCV.
 
 On a plane, inverse depth is an affine function of the pixel and texture coordinates are a homography of it: depth
-is exact at every pixel centre, and one `cv2.warpPerspective` per visible quad and texture level draws its colour.
+is exact at every pixel centre, and one look-up per visible quad and texture level draws its colour.
 Borders are smoothed by five samples per pixel: its centre and, shared with its neighbours, its corners.
 """
 
@@ -14,6 +14,7 @@ import numpy as np
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.synthetic.house.world import MAX_LEVEL, World
+from edgeslam_torch.synthetic.textures.image_ops import looked_up
 from edgeslam_torch.types import FloatArray
 
 NEAR_M = 0.02
@@ -244,11 +245,17 @@ def _draw(image: np.ndarray, iz: FloatArray, ids: np.ndarray, polygon: _Polygon,
                 continue
             mask = mask[top : top + h, left : left + w]
         level = texture.level(k)
-        shift = np.array([[1.0, 0.0, x0 + left], [0.0, 1.0, y0 + top], [0.0, 0.0, 1.0]])
-        source_from_roi = _texture_from_st(level) @ polygon.st_from_uv @ shift
-        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        drawn = cv2.warpPerspective(level, source_from_roi, (w, h), flags=flags, borderMode=cv2.BORDER_REPLICATE)
+        texture_from_uv = _texture_from_st(level) @ polygon.st_from_uv
+        drawn = looked_up(level, *_mapped(texture_from_uv, x0 + left, y0 + top, w, h))
         cv2.copyTo(drawn, mask, image[y0 + top : y0 + top + h, x0 + left : x0 + left + w])
+
+
+def _mapped(H: FloatArray, x0: int, y0: int, width: int, height: int) -> tuple[FloatArray, FloatArray]:
+    """Where a homography ``(3, 3)`` takes the pixels of a rectangle, x and y ``(height, width)``."""
+    x, y = np.arange(x0, x0 + width, dtype=np.float64), np.arange(y0, y0 + height, dtype=np.float64)[:, None]
+    u, v, w = (row[0] * x + (row[1] * y + row[2]) for row in H)
+    per_w = 1.0 / w
+    return u * per_w, v * per_w
 
 
 def _level_at(iz: float, g: float) -> int:
@@ -325,7 +332,7 @@ def _render_distorted(world: World, camera: Camera, T_w_c: FloatArray, antialias
     local = ideal - low
     shape = (camera.height, camera.width)
     map_x, map_y = (local[:, i].astype(np.float32).reshape(shape) for i in (0, 1))
-    image = cv2.remap(view.image, map_x, map_y, cv2.INTER_LINEAR)
+    image = looked_up(view.image, map_x, map_y)
     nearest = np.rint(local).astype(np.int64)
     ids = view.quad_id[nearest[:, 1], nearest[:, 0]]
     planes = np.zeros((len(world.quads) + 1, 3))

@@ -6,9 +6,9 @@ from functools import cache, lru_cache
 import cv2
 import numpy as np
 
-from edgeslam_torch.synthetic.house import materials, pictures
 from edgeslam_torch.synthetic.house.world import Box, Quad, Texture, World
-from edgeslam_torch.synthetic.image_ops import product, resized, shrunk
+from edgeslam_torch.synthetic.textures import materials, pictures
+from edgeslam_torch.synthetic.textures.image_ops import product, resized, shrunk
 from edgeslam_torch.types import FloatArray
 
 LIGHT_GRID_M = 0.16

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edgeslam_torch.synthetic.image_ops import shrunk
+from edgeslam_torch.synthetic.textures.image_ops import shrunk
 from edgeslam_torch.types import FloatArray
 
 MAX_LEVEL = 18

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
-from edgeslam_torch.synthetic.house.noise import Rng, colour, fractal, shaded, timber
+from edgeslam_torch.synthetic.textures.noise import Rng, colour, fractal, shaded, timber
 from edgeslam_torch.types import FloatArray
 
 TILE_M = 1.6

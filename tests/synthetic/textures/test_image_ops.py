@@ -4,7 +4,7 @@ from fractions import Fraction
 
 import numpy as np
 
-from edgeslam_torch.synthetic.image_ops import product, resized, shrunk
+from edgeslam_torch.synthetic.textures.image_ops import looked_up, product, resized, shrunk
 
 
 def test_a_product_is_the_nearest_grey_level() -> None:
@@ -42,3 +42,15 @@ def test_interpolation_meets_a_ramp() -> None:
     out = resized(ramp, 100, 4)
     inside = 10 * ((np.arange(100) + 0.5) / 4 - 0.5)
     np.testing.assert_allclose(out[0, 4:-4], inside[4:-4], atol=0.51)
+
+
+def test_a_look_up_weighs_the_four_pixels_around() -> None:
+    image = np.random.default_rng(1).integers(0, 256, (5, 7), dtype=np.uint8)
+    x, y = np.array([[0.25, 4.5, -9.0]]), np.array([[1.75, 2.5, 99.0]])
+    low = image.astype(float)
+    expected = [
+        0.25 * (0.75 * low[1, 0] + 0.25 * low[1, 1]) + 0.75 * (0.75 * low[2, 0] + 0.25 * low[2, 1]),
+        low[2:4, 4:6].mean(),
+        low[4, 0],
+    ]
+    np.testing.assert_allclose(looked_up(image, x, y)[0], expected, atol=0.51)

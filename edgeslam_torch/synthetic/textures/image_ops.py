@@ -1,7 +1,7 @@
 """Arithmetic on 8-bit images that gives the same bytes on every processor.
 
-OpenCV rounds products and resized images of 8 bits otherwise on Arm than on x86. A flight that is drawn again on
-another processor must show the same pictures, so these three go where rounding is defined.
+OpenCV rounds products, resized and warped images of 8 bits otherwise on Arm than on x86. A flight that is drawn again
+on another processor must show the same pictures, so what decides about their bytes is done where rounding is defined.
 """
 
 import cv2
@@ -41,3 +41,14 @@ def resized(image: np.ndarray, width: int, height: int) -> np.ndarray:
     [[0, 25, 75, 100]]
     """
     return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_LINEAR_EXACT))
+
+
+def looked_up(image: np.ndarray, x_px: FloatArray, y_px: FloatArray) -> np.ndarray:
+    """Bilinear interpolation at pixels, ``(H, W)`` each, to 1/32 px in whole numbers; the border goes on outside.
+
+    >>> looked_up(np.array([[0, 100]], np.uint8), np.array([[0.25, 3.0]]), np.zeros((1, 2))).tolist()
+    [[25, 100]]
+    """
+    x, y = np.asarray(x_px, np.float32), np.asarray(y_px, np.float32)
+    whole, part = cv2.convertMaps(x, y, cv2.CV_16SC2)
+    return np.asarray(cv2.remap(image, whole, part, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
