@@ -27,6 +27,8 @@ _LOOK_M = 0.25
 """Rise above the height of flight from which a camera that is tilted down sees what is at that height before it."""
 _SWEEP_RAD = math.radians(45.0)
 """Turn to each side there: a camera of 55 degrees does not see the sides of the way just before it."""
+_AHEAD_RAD = math.radians(10.0)
+"""Turn within which it still looks ahead."""
 _REPLAN_S = 0.5
 _AHEAD_M = 0.8
 """Way ahead that the drone turns to."""
@@ -177,6 +179,7 @@ class Pilot:
             self.phase = Phase.SWEEPING
             self._sweep = [sight.yaw_rad + side * _SWEEP_RAD for side in (0.0, 1.0, -1.0)]
         if self.phase is Phase.SWEEPING:
+            self._sweep = self._worth_a_look(sight)
             error = float(wrapped(np.array(self._sweep[-1] - sight.yaw_rad)))
             if abs(error) < math.radians(8.0):
                 self._sweep.pop()
@@ -187,6 +190,14 @@ class Pilot:
             self.phase, self._waiting_s = Phase.FLYING, math.nan
         target = high if self.phase is Phase.RISING else low
         return Wish(up_m_s=self._climb(target - sight.p_w[2]), why=str(self.phase))
+
+    def _worth_a_look(self, sight: Sight) -> list[float]:
+        """Headings of the sweep but those on the side where the pose was lost: a wall that shows nothing."""
+        ahead = self._sweep[0]
+        off = wrapped(np.array([sight.yaw_rad - ahead, *(h - ahead for h in self._sweep)]))
+        if sight.tracked or abs(off[0]) < _AHEAD_RAD:
+            return self._sweep
+        return [h for h, side in zip(self._sweep, off[1:], strict=True) if side * off[0] < 1e-9]
 
     def _turn(self, error_rad: float) -> float:
         return float(np.clip(2.0 * error_rad, -self.limits.turn_rad_s, self.limits.turn_rad_s))

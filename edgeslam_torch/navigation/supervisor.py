@@ -10,6 +10,7 @@ from enum import StrEnum
 
 import numpy as np
 
+from edgeslam_torch.geometry.rotations import wrapped
 from edgeslam_torch.navigation.limits import NavLimits
 from edgeslam_torch.navigation.moved import Moved
 from edgeslam_torch.navigation.sight import Sight, Wish
@@ -27,6 +28,8 @@ UNSURE_LAND_S = 20.0
 """The same when metres are doubtful: five times up and down where it has been, which is what tells them."""
 _BACK_M, _BACK_M_S = 0.6, 0.15
 SCALE_SIGMA = 0.10
+_KNOWN_S = 1.2
+"""How long before its pose was lost it looked at what it knew well: pictures are up to half a second late."""
 _WIGGLE_S, _WIGGLE_M_S = 2.0, 0.25
 """Up and down, which tells height and telemetry the scale."""
 _PUSHED_M_S, _STANDS_M_S, _PUSH_S = 0.15, 0.04, 1.5
@@ -92,10 +95,16 @@ class Supervisor:
     _trail: deque[FloatArray] = field(default_factory=lambda: deque(maxlen=400))
     """Where it flew, 5 cm apart."""
     _home_w: FloatArray | None = None
+    _headings: deque[tuple[float, float]] = field(default_factory=deque)
+    """Moments and headings of the last `_KNOWN_S` with a pose that rests on a map."""
 
     def see(self, sight: Sight) -> None:
         """The newest sight."""
         self._sight = sight
+        if sight.tracked:
+            self._headings.append((sight.stamp_s, sight.yaw_rad))
+            while self._headings[0][0] < sight.stamp_s - _KNOWN_S:
+                self._headings.popleft()
         if self._home_w is None:
             self._home_w = sight.p_w.copy()
         moved = not self._trail or float(np.linalg.norm(sight.p_w - self._trail[-1])) > _TRAIL_M
@@ -204,10 +213,15 @@ class Supervisor:
 
     def _meanwhile(self, danger: Danger, trouble_s: float) -> Wish:
         """Hover; then what may mend it."""
+        assert self._sight is not None
         if danger in _UNSURE:
             rising = int(trouble_s / _WIGGLE_S) % 2 == 0
             wish = Wish(up_m_s=_WIGGLE_M_S if rising else -_WIGGLE_M_S, why=f"{danger}: up and down")
             return self._within_heights(wish)
+        if danger is Danger.LOST and trouble_s <= BACK_S and self._headings:
+            error = float(wrapped(np.array(self._headings[0][1] - self._sight.yaw_rad)))
+            turn = float(np.clip(2.0 * error, -self.limits.turn_rad_s, self.limits.turn_rad_s))
+            return Wish(turn_left_rad_s=turn, why=f"{danger}: turn to what was known")
         backing = BACK_S < trouble_s < BACK_S + _BACK_M / _BACK_M_S
         if danger in (Danger.BLIND, Danger.LOST, Danger.HELD) and backing:  # not where the pose itself is wrong
             return self._back(danger)

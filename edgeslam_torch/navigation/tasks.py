@@ -11,7 +11,7 @@ from edgeslam_torch.navigation.moved import Moved
 from edgeslam_torch.navigation.sight import Sight
 from edgeslam_torch.types import FloatArray
 
-ARRIVED_M = 0.2
+ARRIVED_M = 0.15
 
 
 class Task(Protocol):

@@ -130,6 +130,22 @@ def test_a_pilot_that_sees_nothing_does_not_leave_what_it_knows():
     assert pilot.phase is not Phase.DONE
 
 
+def test_a_sweep_leaves_out_the_side_where_the_pose_is_lost():
+    """The wall on the right shows nothing; the left is looked at all the same, then it goes on."""
+    pilot, yaw, seen = Pilot(GoTo(np.array([3.0, 0.0, 1.15]))), 0.0, []
+    for k in range(400):
+        lost = yaw < math.radians(-30.0)
+        height = min(1.4, 0.05 * k) if pilot.phase is Phase.RISING else 1.4
+        wish = pilot.update(Sight(k / 20, np.array([0.0, 0.0, height]), yaw, np.zeros(3), tracked=not lost))
+        if pilot.phase is not Phase.RISING and pilot.phase is not Phase.SWEEPING:
+            break
+        seen.append(yaw)
+        yaw += wish.turn_left_rad_s / 20
+    assert pilot.phase is Phase.SINKING
+    assert math.radians(-35.0) < min(seen) < math.radians(-30.0)
+    assert max(seen) > math.radians(36.0)
+
+
 def before_a_strip(gap_m=None):
     """A pilot in a seen circle, from which a seen strip of half the wanted width leads to its goal, through the gap of
     a wall at 0.55 m if there is one."""

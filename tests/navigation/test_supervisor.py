@@ -80,6 +80,20 @@ def test_doubt_stops_it(spoilt, danger):
     assert all(o.wish.forward_m_s == 0.0 for o in orders)
 
 
+def test_a_pose_lost_in_a_turn_is_looked_for_where_it_was_known():
+    """It turned left from 0, and lost the map at 45 degrees: it turns right again, back to what it saw before."""
+    supervisor = Supervisor()
+    yaw, turns = 0.0, []
+    for k in range(60):
+        now, lost = k / 20, k > 30
+        yaw = min(k, 30) / 30 * math.radians(45.0) if not lost else yaw + turns[-1] / 20
+        supervisor.see(replace(sight(now), yaw_rad=yaw, tracked=not lost, velocity_w=np.zeros(3)))
+        supervisor.propose(Wish(turn_left_rad_s=0.5), now)
+        turns.append(supervisor.order(now).wish.turn_left_rad_s)
+    assert max(turns[31:40]) < -0.5
+    assert yaw == pytest.approx(math.radians(45.0 * (30 - 24) / 30), abs=math.radians(5.0))
+
+
 def test_doubtful_metres_make_it_rise_and_sink_but_not_leave_its_heights():
     supervisor = Supervisor(NavLimits(highest_m=1.15))
     orders = flown(supervisor, 5.0, lambda s: replace(s, metric=False))
