@@ -27,6 +27,10 @@ _LOOK_M = 0.25
 """Rise above the height of flight from which a camera that is tilted down sees what is at that height before it."""
 _SWEEP_RAD = math.radians(45.0)
 """Turn to each side there: a camera of 55 degrees does not see the sides of the way just before it."""
+_SEARCH_RAD, _SEARCH_S = math.radians(60.0), 8.0
+"""Turn to each side of the goal where no way is known, and time of a turn there and back: 30 degrees a second."""
+_BESIDE_M = 0.6
+"""How near to a goal that seems to lie in a solid it flies: what is said to be there may be a speck, seen from afar."""
 _AHEAD_RAD = math.radians(10.0)
 """Turn within which it still looks ahead."""
 _REPLAN_S = 0.5
@@ -38,6 +42,8 @@ _SIDEWAYS = 0.3
 """Share of the speed with which it moves where it does not look, through what it saw before."""
 _SQUEEZE = 0.6
 """Share of the speed with which it passes the unseen at a hull's distance."""
+_STEP_M_S, _VARIES_S = 0.1, 4.0
+"""A Tello tells its velocity in whole decimetres a second, cut off; time in which the speed goes down and up again."""
 _GAIN_M = 0.04
 """Least progress of a movement, in metres of way."""
 _MOVES_S = 1.0
@@ -220,7 +226,7 @@ class Pilot:
             self.phase = Phase.STUCK
             return HOVER
         if not math.isfinite(now):
-            return Wish(turn_left_rad_s=0.5 * self.limits.turn_rad_s, why="no way is known: look around")
+            return Wish(turn_left_rad_s=self._search(sight), why="no way is known: look around")
         self.way_w = plan.way(here, 3.0)
         ahead = self._bearing(here)
         error = float(wrapped(np.array(ahead - sight.yaw_rad)))
@@ -232,6 +238,20 @@ class Pilot:
         c, s = math.cos(sight.yaw_rad), math.sin(sight.yaw_rad)
         return Wish(c * chosen[0] + s * chosen[1], c * chosen[1] - s * chosen[0], 0.0, turn, "along the way")
 
+    def _search(self, sight: Sight) -> float:
+        """Rate of turn [rad/s] that looks left and right of where the goal is; all around if it is nowhere.
+
+        A full turn would leave behind all that it knows, and what hides the way is between it and the goal.
+        """
+        assert self.layer is not None
+        goals = self.task.goals(self.layer, sight)
+        if len(goals) == 0:
+            return 0.5 * self.limits.turn_rad_s
+        step = self.layer.centres(goals).mean(axis=0) - sight.p_w[:2]
+        side = 4.0 * abs(sight.stamp_s / _SEARCH_S % 1.0 - 0.5) - 1.0
+        wanted = math.atan2(step[1], step[0]) + side * _SEARCH_RAD
+        return self._turn(float(wrapped(np.array(wanted - sight.yaw_rad))))
+
     def _planned(self, sight: Sight) -> CostToGo:
         """The plan, made anew when it is half a second old."""
         half = self.limits.radius_m + BAND_M
@@ -239,7 +259,7 @@ class Pilot:
         if self._plan is None or sight.stamp_s - self._planned_s >= _REPLAN_S:
             goals = self.task.goals(self.layer, sight)
             need = self.limits.clearance_m(sight.position_sigma_m)
-            self._plan = cost_to_go(self.layer, goals, need, self.layer.cells(sight.p_w[:2]))
+            self._plan = cost_to_go(self.layer, goals, need, self.layer.cells(sight.p_w[:2]), _BESIDE_M)
             self._planned_s = sight.stamp_s
         return self._plan
 
@@ -251,7 +271,8 @@ class Pilot:
     def _chosen(self, sight: Sight, plan: CostToGo, ahead: float, error: float) -> FloatArray | None:
         """Velocity ``(2,)`` in the world of the best candidate; None when standing is as good."""
         assert self.layer is not None
-        arcs = candidates(self.layer, sight.p_w[:2], sight.velocity_w[:2], ahead, self.limits, self.limits.speed_m_s)
+        fastest = self._cruise_m_s(sight.stamp_s)
+        arcs = candidates(self.layer, sight.p_w[:2], sight.velocity_w[:2], ahead, self.limits, fastest)
         need = self.limits.clearance_m(sight.position_sigma_m)
         standing = float(arcs.clearance_m[0])
         good = arcs.clearance_m >= need
@@ -265,6 +286,12 @@ class Pilot:
         if best == 0 or not score[best] < score[0] - _GAIN_M:
             return None
         return arcs.velocity_w[best]
+
+    def _cruise_m_s(self, stamp_s: float) -> float:
+        """The highest speed, and evenly down to a step of telemetry below it: what is cut off then averages to half
+        a step, where one speed kept to would lose up to a whole one and make every metre too short."""
+        share = abs(2.0 * (stamp_s / _VARIES_S % 1.0) - 1.0)
+        return self.limits.speed_m_s - min(_STEP_M_S, 0.5 * self.limits.speed_m_s) * share
 
     def _may_squeeze(self, here: FloatArray) -> bool:
         """Whether a look from about here showed no way."""

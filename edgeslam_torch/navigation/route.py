@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+from scipy import ndimage
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
@@ -46,7 +47,9 @@ class CostToGo:
         return np.array(out)
 
 
-def cost_to_go(layer: Layer, goals: np.ndarray, clearance_m: float, here: np.ndarray) -> CostToGo:
+def cost_to_go(
+    layer: Layer, goals: np.ndarray, clearance_m: float, here: np.ndarray, beside_m: float = 0.0
+) -> CostToGo:
     """Cheapest way from everywhere to the goals (Dijkstra, from the goals).
 
     Args:
@@ -54,6 +57,8 @@ def cost_to_go(layer: Layer, goals: np.ndarray, clearance_m: float, here: np.nda
         goals: Cells ``(G, 2)``; those that are blocked lead nowhere.
         clearance_m: Distance of the drone's centre from solids that a way must keep.
         here: The drone's cell ``(2,)``; a way may begin nearer to a solid than that.
+        beside_m: If no goal can be reached from there, cells up to this far from one are goals as well, the
+            nearest that can be.
     """
     away = layer.from_solid_m
     open_ = away > clearance_m - 0.5 * layer.cell_m
@@ -70,13 +75,24 @@ def cost_to_go(layer: Layer, goals: np.ndarray, clearance_m: float, here: np.nda
         (length[kept] * layer.cell_m * 0.5 * (w[a] + w[b]), (a.astype(np.int32), b.astype(np.int32))),
         shape=(flat.size, flat.size),
     )
-    sources = np.unique(np.ravel_multi_index(tuple(np.asarray(goals).T), shape))
-    sources = sources[flat[sources]]
-    if len(sources) == 0:
-        return CostToGo(layer, np.full(shape, np.inf))
+    at_goals = np.zeros(shape, bool)
+    at_goals[tuple(np.asarray(goals, dtype=int).T)] = True
+    cost = _from(graph, at_goals & open_)
+    for cells in range(1, round(beside_m / layer.cell_m) + 1 if at_goals.any() else 1):
+        if np.isfinite(cost[tuple(here)]):
+            break
+        cost = _from(graph, open_ & (ndimage.distance_transform_edt(~at_goals) <= cells))
+    return CostToGo(layer, cost)
+
+
+def _from(graph: csr_array, sources: np.ndarray) -> FloatArray:
+    """Cost of every cell from the nearest of the sources ``(X, Y)`` bool; infinite without any."""
+    index = np.flatnonzero(sources)
+    if len(index) == 0:
+        return np.full(sources.shape, np.inf)
     # SciPy 1.13 wants 32 bits; a grid has 25 600 cells.
-    found = dijkstra(graph, directed=False, indices=sources.astype(np.int32), min_only=True)
-    return CostToGo(layer, np.asarray(found).reshape(shape))
+    found = dijkstra(graph, directed=False, indices=index.astype(np.int32), min_only=True)
+    return np.asarray(found).reshape(sources.shape)
 
 
 @lru_cache(maxsize=4)

@@ -5,7 +5,7 @@ Every order to the drone comes from here. It knows nothing of routes; it knows w
 
 import math
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 import numpy as np
@@ -28,8 +28,9 @@ UNSURE_LAND_S = 20.0
 """The same when metres are doubtful: five times up and down where it has been, which is what tells them."""
 _BACK_M, _BACK_M_S = 0.6, 0.15
 SCALE_SIGMA = 0.10
-_KNOWN_S = 1.2
-"""How long before its pose was lost it looked at what it knew well: pictures are up to half a second late."""
+_KNOWN_S, _BEFORE_S = 1.2, 6.0
+"""How long before its pose was lost it looked at what it knew well: pictures are up to half a second late. If that
+shows nothing, the second."""
 _WIGGLE_S, _WIGGLE_M_S = 2.0, 0.25
 """Up and down, which tells height and telemetry the scale."""
 _PUSHED_M_S, _STANDS_M_S, _PUSH_S = 0.15, 0.04, 1.5
@@ -96,14 +97,14 @@ class Supervisor:
     """Where it flew, 5 cm apart."""
     _home_w: FloatArray | None = None
     _headings: deque[tuple[float, float]] = field(default_factory=deque)
-    """Moments and headings of the last `_KNOWN_S` with a pose that rests on a map."""
+    """Moments and headings of the last `_BEFORE_S` with a pose that rests on a map."""
 
     def see(self, sight: Sight) -> None:
         """The newest sight."""
         self._sight = sight
         if sight.tracked:
             self._headings.append((sight.stamp_s, sight.yaw_rad))
-            while self._headings[0][0] < sight.stamp_s - _KNOWN_S:
+            while self._headings[0][0] < sight.stamp_s - _BEFORE_S:
                 self._headings.popleft()
         if self._home_w is None:
             self._home_w = sight.p_w.copy()
@@ -218,16 +219,25 @@ class Supervisor:
             rising = int(trouble_s / _WIGGLE_S) % 2 == 0
             wish = Wish(up_m_s=_WIGGLE_M_S if rising else -_WIGGLE_M_S, why=f"{danger}: up and down")
             return self._within_heights(wish)
-        if danger is Danger.LOST and trouble_s <= BACK_S and self._headings:
-            error = float(wrapped(np.array(self._headings[0][1] - self._sight.yaw_rad)))
-            turn = float(np.clip(2.0 * error, -self.limits.turn_rad_s, self.limits.turn_rad_s))
-            return Wish(turn_left_rad_s=turn, why=f"{danger}: turn to what was known")
+        if danger is Danger.LOST and trouble_s <= BACK_S:
+            return Wish(turn_left_rad_s=self._turn_back(_KNOWN_S), why=f"{danger}: turn to what was known")
         backing = BACK_S < trouble_s < BACK_S + _BACK_M / _BACK_M_S
         if danger in (Danger.BLIND, Danger.LOST, Danger.HELD) and backing:  # not where the pose itself is wrong
-            return self._back(danger)
+            turn = self._turn_back(_BEFORE_S) if danger is Danger.LOST else 0.0
+            return replace(self._back(danger), turn_left_rad_s=turn)
         if danger is Danger.LOST and trouble_s > BACK_S + _BACK_M / _BACK_M_S:
             return Wish(turn_left_rad_s=0.5 * self.limits.turn_rad_s, why=f"{danger}: look around")
         return Wish(why=f"{danger}: hover")
+
+    def _turn_back(self, before_s: float) -> float:
+        """Rate of the turn [rad/s] to where it looked this long before its pose was lost."""
+        assert self._sight is not None
+        if not self._headings:
+            return 0.0
+        moment = self._headings[-1][0] - before_s
+        yaw = next(h for at, h in self._headings if at >= moment)
+        error = float(wrapped(np.array(yaw - self._sight.yaw_rad)))
+        return float(np.clip(2.0 * error, -self.limits.turn_rad_s, self.limits.turn_rad_s))
 
     def _back(self, danger: Danger) -> Wish:
         """Along the trail, away from where the trouble began."""

@@ -52,6 +52,17 @@ def test_no_way_is_infinite():
     assert math.isinf(plan.at(np.array([1.0, 3.0])))
 
 
+def test_a_goal_in_a_speck_is_flown_to_as_near_as_can_be():
+    """What seems to be solid around the goal leaves free only what is 0.4 m from it; a wall leaves nothing."""
+    here, goal = np.array([5, 30]), np.array([[40, 30]])
+    speck = hall(wall=(slice(39, 42), slice(29, 32)))
+    assert not np.isfinite(cost_to_go(speck, goal, 0.25, here).at(np.array([0.55, 3.05])))
+    way = cost_to_go(speck, goal, 0.25, here, beside_m=0.6).way(np.array([0.55, 3.05]), 6.0)
+    assert 0.3 < np.linalg.norm(way[-1] - speck.centres(goal[0])) < 0.5
+    closed = hall(wall=(slice(20, 48), slice(0, 60)))
+    assert not np.isfinite(cost_to_go(closed, goal, 0.25, here, beside_m=0.6).at(np.array([0.55, 3.05])))
+
+
 def test_candidates_are_flown_as_the_emulated_drone_flies():
     """The prediction of the way until it stands, against the body itself (which leans late)."""
     limits = NavLimits(reaction_s=0.1)
@@ -104,8 +115,8 @@ def test_a_wish_that_is_no_number_is_refused():
         Wish(forward_m_s=math.nan).sticks()
 
 
-def at(x, y, **fields):
-    return Sight(0.0, np.array([x, y, 1.15]), 0.0, np.zeros(3), **fields)
+def at(x, y, stamp_s=0.0, yaw_rad=0.0, speed_m_s=0.0, **fields):
+    return Sight(stamp_s, np.array([x, y, 1.15]), yaw_rad, np.array([speed_m_s, 0.0, 0.0]), **fields)
 
 
 def test_a_pilot_without_a_position_decides_nothing():
@@ -144,6 +155,37 @@ def test_a_sweep_leaves_out_the_side_where_the_pose_is_lost():
     assert pilot.phase is Phase.SINKING
     assert math.radians(-35.0) < min(seen) < math.radians(-30.0)
     assert max(seen) > math.radians(36.0)
+
+
+def test_its_speed_averages_out_what_telemetry_cuts_off():
+    """Readings of whole decimetres a second, with half a step added, are right in the mean along a free way."""
+    pilot, speeds = before_a_free_way(), []
+    for k in range(15 * 8):
+        wish = pilot.update(at(0.0, 0.0, speed_m_s=0.45, stamp_s=k / 15))
+        speeds.append(wish.forward_m_s)
+    way, read = sum(speeds), sum(math.floor(10.0 * v) / 10.0 + 0.05 for v in speeds)
+    assert read == pytest.approx(way, rel=0.02)
+    assert 0.39 < min(speeds) < 0.42 and 0.48 < max(speeds) <= 0.5
+
+
+def before_a_free_way():
+    """A pilot that has looked around, in a free hall, far from its goal."""
+    pilot = Pilot(GoTo(np.array([6.0, 0.0, 1.15])), phase=Phase.FLYING)
+    for x in np.arange(-1.0, 7.0, 0.2):
+        pilot.space.flown(np.array([x, 0.0, 1.15]), 0.8)
+    return pilot
+
+
+def test_where_no_way_is_known_it_looks_left_and_right_of_the_goal():
+    pilot, yaw, seen = before_a_free_way(), 0.0, []
+    pilot.task = GoTo(np.array([0.0, 5.0, 1.15]))
+    pilot.space.points(np.array([[x, 1.0, z] for x in np.arange(-9.0, 9.0, 0.05) for z in (1.05, 1.15, 1.25)]))
+    for k in range(15 * 12):
+        wish = pilot.update(at(0.0, 0.0, yaw_rad=yaw, stamp_s=k / 15))
+        yaw += wish.turn_left_rad_s / 15
+        seen.append(math.degrees(yaw))
+    assert 20.0 < min(seen[60:]) < 45.0
+    assert 135.0 < max(seen[60:]) < 160.0
 
 
 def before_a_strip(gap_m=None):
