@@ -12,9 +12,9 @@ from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.types import FloatArray
 
 _NEIGHBOURS = ((1, 0), (0, 1), (1, 1), (1, -1))
-_UNSEEN_COST = 1.6
+_UNSEEN_COST = 2.5
 """A metre that was not seen costs this much: a known way of less than that is taken instead."""
-_TIGHT_M, _TIGHT_COST = 0.45, 3.0
+_TIGHT_M, _TIGHT_COST = 0.45, 2.0
 """Nearer than this to a solid, a metre costs up to so much more: the middle of a corridor is the shortest way."""
 
 

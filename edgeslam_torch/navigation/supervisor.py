@@ -26,7 +26,7 @@ LAND_S = 10.0
 """Time of trouble after which it lands."""
 UNSURE_LAND_S = 20.0
 """The same when metres are doubtful: five times up and down where it has been, which is what tells them."""
-_BACK_M, _BACK_M_S = 0.6, 0.15
+_BACK_M, _BACK_M_S = 1.0, 0.25
 SCALE_SIGMA = 0.10
 _KNOWN_S, _BEFORE_S = 1.2, 6.0
 """How long before its pose was lost it looked at what it knew well: pictures are up to half a second late. If that

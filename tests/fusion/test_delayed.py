@@ -101,6 +101,23 @@ def test_bias_of_the_velocity_is_found_from_relative_poses(rng):
     assert ekf.state_at(19.9).velocity_bias_m_s[0] == pytest.approx(0.08, abs=0.01)
 
 
+def test_a_drone_that_hovers_unseen_stays_where_it_was():
+    """What was cut off its speed is no speed: after 20 s at .45 m/s, told as .4, it reads that it stands for 10 s."""
+    ekf = BufferedEkf(CONFIG)
+    T = np.eye(4)
+    T[:3, 3] = [0.045, 0.0, 0.0]
+    for k in range(200):
+        ekf.add_telemetry(TelemetrySample(0.1 * k, np.array([0.4, 0.0, 0.0]), np.zeros(3), battery=1.0))
+        if k > 0:
+            ekf.add_relative(0.1 * (k - 1), 0.1 * k, T, PoseSigma(0.003, 0.003))
+    assert ekf.state_at(19.9).velocity_bias_m_s[0] < -0.03
+    p_w = []
+    for k in range(200, 300):
+        ekf.add_telemetry(TelemetrySample(0.1 * k, np.zeros(3), np.zeros(3), battery=1.0))
+        p_w.append(ekf.state_at(0.1 * k).p_w[0])
+    assert abs(p_w[-1] - p_w[5]) < 0.02
+
+
 def test_silence_of_telemetry_only_adds_uncertainty(rng):
     ekf = run(telemetry(rng, 20), [], 0.0)
     near, far = ekf.state_at(1.95), ekf.state_at(6.0)

@@ -28,6 +28,8 @@ _POSE, _CLONE = slice(0, 6), slice(9, 15)
 _CLONE_P, _CLONE_A = slice(9, 12), slice(12, 15)
 _SIZE = 15
 _NO_RATE = np.zeros(3)
+_BLIND_S = 0.5
+"""Time without vision from which no motion is read out of readings of nothing; a late video's gap is shorter."""
 _IDENTITY = np.eye(4)
 
 Saved = tuple[FloatArray, FloatArray, float, dict[int, int]]
@@ -118,7 +120,7 @@ class Ekf:
             self._predict_literal(dt_s, velocity_m_s, spent)
             return
         config, x, P = self.config, self.x, self.P
-        velocity = velocity_m_s - x[_B]
+        velocity = velocity_m_s - self._bias(velocity_m_s)
         if config.velocity_frame == "body":
             R = matrix_from_rpy(x[_A])
             moved = R.dot(velocity)
@@ -142,6 +144,14 @@ class Ekf:
         diagonal[_P] += position
         diagonal[_A] += turning
         diagonal[_B] += bias
+
+    def _bias(self, velocity_m_s: FloatArray) -> FloatArray:
+        """What a reading is off by ``(3,)``; nothing where a drone without vision for a while reads that it stands.
+
+        The bias of a moving drone is what whole steps cut off its speed, and would carry one that hovers away.
+        """
+        bias = self.x[_B]
+        return bias if self.tau_s < _BLIND_S else np.where(velocity_m_s == 0.0, 0.0, bias)
 
     def _predict_literal(self, dt_s: float, velocity_m_s: FloatArray, spent: float) -> None:
         x, P, config = self.x, self.P, self.config

@@ -1,0 +1,44 @@
+"""The metres that a pilot is told by the SLAM while they become better: all that it knows goes along."""
+
+import numpy as np
+import pytest
+
+from edgeslam_torch.drone.emulator.lockstep import LockstepTello
+from edgeslam_torch.drone.emulator.room import drone_at
+from edgeslam_torch.eval.judge.navigation.conditions import FAULTS
+from edgeslam_torch.eval.judge.navigation.slam_eyes import IMAGE_SIZE, SlamEyes
+from edgeslam_torch.geometry.mount import TELLO_TILT_RAD
+from edgeslam_torch.synthetic.sites.build import named_site
+
+TICK_S = 1.0 / 15.0
+
+
+@pytest.mark.slow
+def test_what_a_pilot_knows_is_moved_with_its_metres_and_the_drone_is_where_it_says():
+    """Up and down for 8 s, then ahead through a corridor for 8 s."""
+    site = named_site("corridor", 300)
+    drone, paint, camera = drone_at(site, TELLO_TILT_RAD, IMAGE_SIZE)
+    tello, eyes = LockstepTello(drone, paint, seed=300), SlamEyes(camera, FAULTS["none"], 300)
+    tello.send("takeoff")
+    before, ratios = None, []
+    while tello.clock_s < 18.0:
+        sight = eyes.sight(tello.clock_s, tello.advance(TICK_S))
+        tello.send(sticks(tello.clock_s))
+        if before is not None and before.revision > 0 and sight.revision != before.revision:
+            assert sight.view is not None and sight.moved is not None
+            ratios.append(sight.moved.ratio)
+        if sight.moved is not None:
+            carried = sight.moved.points(before.p_w[None])[0]
+            assert np.linalg.norm(carried - sight.p_w) < 0.1
+        before = sight
+    assert any(abs(ratio - 1.0) > 0.01 for ratio in ratios), "its metres did become others"
+    flown = np.linalg.norm(drone.p_w[:2])
+    assert flown > 2.5
+    assert np.linalg.norm(before.p_w[:2] - drone.p_w[:2]) < 0.05 + 3.0 * before.scale_sigma * flown
+
+
+def sticks(clock_s):
+    """Up and down every 2 s, then ahead."""
+    if clock_s > 10.0:
+        return "rc 0 45 0 0"
+    return f"rc 0 0 {25 if int(clock_s / 2.0) % 2 else -25} 0" if clock_s > 2.5 else "rc 0 0 0 0"
