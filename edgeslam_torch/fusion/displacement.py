@@ -121,11 +121,18 @@ class TelemetryModel:
     """Probability that velocities are truncated, not rounded."""
     attitude: bool = True
     """Whether attitude may speak."""
+    young: bool = False
+    """Whether the map has begun seconds ago."""
 
     @property
     def knows_metres(self) -> bool:
         """Whether more than gravity is known."""
         return math.isfinite(self.scale_sigma_log)
+
+    @property
+    def holds_level(self) -> bool:
+        """Whether attitude decides what turned and what moved: the map's depths are guesses still."""
+        return self.young and not self.knows_metres
 
     def positions(
         self, stamps_s: FloatArray, p_m: FloatArray, scale_sigma_log: float | None = None

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from edgeslam_torch.fusion.config import FusionConfig
-from edgeslam_torch.fusion.displacement import TelemetryModel
+from edgeslam_torch.fusion.displacement import DELAY_S, TelemetryModel
 from edgeslam_torch.fusion.filter.filter_feed import FilterFeed, Metric
 from edgeslam_torch.fusion.health import disagreement
 from edgeslam_torch.fusion.prediction import (
@@ -248,6 +248,19 @@ class MotionFusion:
     def _with_focal(self, depth: DepthScale) -> LogScale:
         """Map depth, and the network's metres, go with the focal length: its whole uncertainty is the ratio's too."""
         return replace(depth.opinion, sigma=math.hypot(depth.sigma, self._focal_sigma))
+
+    def vertical(self, stamp_s: float) -> tuple[FloatArray, float] | None:
+        """The map's z axis ``(3,)`` in a frame's camera by the drone's attitude, and how far [rad] that turned within
+        the doubt about the video's delay; None where attitude is not to be asked, or metres are told: whole degrees
+        are worse than what a map with parallax says."""
+        at_s, late_s = stamp_s - self.delay_s, min(self.delay_sigma_s, DELAY_S)
+        around = np.array([at_s, at_s - late_s, at_s + late_s])
+        asked = self._by_telemetry is None and self.began_upright and self._trust.attitude
+        if not asked or not self._track.covered(around[:1], around[:1])[0]:
+            return None
+        up_c = self.T_b_c[:3, :3].T @ self._track.attitude(around)[:, 2].T  # a column each
+        turned = max(float(np.linalg.norm(up_c[:, k] - up_c[:, 0])) for k in (1, 2))
+        return up_c[:, 0], turned
 
     def rotation(self) -> FloatArray | None:
         """``R_w_m`` ``(3, 3)``: map axes to the drone's power-on world; ``None`` without telemetry attitude."""

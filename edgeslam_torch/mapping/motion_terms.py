@@ -13,6 +13,9 @@ from edgeslam_torch.optim.problem import CentreFactor, GravityFactor
 ALIKE = 30.0
 """Keypoints err together: a window's thousands of reprojections, taken for independent, hold a wrong scale against
 telemetry whose covariance is honest. So many of them count as one (docs/decisions/0052)."""
+GUESSED = 3000.0
+"""The same for gravity in a young map while nothing has told metres: what turns and what moves is told apart by guessed
+depths, which err together in all of the picture (docs/decisions/0114)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,5 +55,6 @@ def motion_factors(
             centres.append(CentreFactor(order, ALIKE * told.information, ALIKE * told.vector, ALIKE * told.constant))
         up = model.up(stamps)
         if up is not None:
-            gravity.append(GravityFactor(order[up.frame], up.up_c, up.up_m, up.sigma_rad / math.sqrt(ALIKE)))
+            alike = GUESSED if model.holds_level else ALIKE
+            gravity.append(GravityFactor(order[up.frame], up.up_c, up.up_m, up.sigma_rad / math.sqrt(alike)))
     return MotionFactors(tuple(centres), tuple(gravity))

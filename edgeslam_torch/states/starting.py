@@ -86,6 +86,7 @@ class Starting:
         """
         system, slam_map = self.system, self.system.map
         system.collect(wait=True)
+        system.piece_began_s = frame.stamp_s
         self.tracking.forget()
         self._give_up()
         T_c_w = system.motion.T_c_w

@@ -1,7 +1,7 @@
 """Parts shared by all states: map, motion, scale, and the creation of keyframes."""
 
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -17,8 +17,8 @@ from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.map.trajectory import TrajectoryLog
 from edgeslam_torch.mapping.edge_map import EdgeMap
 from edgeslam_torch.mapping.pipeline import Mapped, MappingPipeline
-from edgeslam_torch.optim.problem import PosePrior
 from edgeslam_torch.stage_times import timed
+from edgeslam_torch.tracking.expectation import Expectation, Vertical
 from edgeslam_torch.tracking.motion_model import MotionModel
 from edgeslam_torch.tracking.relocaliser import Reach, reach_after
 from edgeslam_torch.tracking.tracker import Track, Tracker
@@ -27,6 +27,9 @@ from edgeslam_torch.types import FloatArray, Frame
 MIN_KEYPOINTS = 100
 """Fewer keypoints than this cannot start a map."""
 
+YOUNG_S = 10.0
+"""Time after the beginning of a map in which the drone's roll and pitch hold its frames, if nothing has told metres: a
+take-off and a look up and down take as long, and by then something has parallax."""
 MIN_GAP_S = 0.15
 """Time between frames from which on the filter predicts the pose for tracking. Telemetry comes every 0.1 s in whole
 degrees: over less, vision's own velocity is the better word, and a flow that starts from a worse one ends worse
@@ -55,6 +58,8 @@ class System:
     )
     """Counts of losses, relocalisations, restarts and refused initialisations."""
     has_telemetry: bool = False
+    piece_began_s: float = -np.inf
+    """Stamp of the frame with which the newest piece of map began."""
     keyframe_s: float = -np.inf
     """Stamp of the newest keyframe, or of a later frame that needed not become one."""
     shows_nothing_new: bool = False
@@ -80,11 +85,16 @@ class System:
                 return se3.inverse(estimate.T_w_c)
         return self.motion.predict(stamp_s)
 
-    def expectation(self, stamp_s: float, T_predicted: FloatArray) -> PosePrior | None:
-        """The predicted pose with the uncertainty due to accelerations; None without a scale."""
+    def expectation(self, stamp_s: float, T_predicted: FloatArray) -> Expectation | None:
+        """The predicted pose with the uncertainty due to accelerations; None without a scale.
+
+        While its map is young, roll and pitch are the drone's: images then hardly tell a climb from a turn.
+        """
         if not self.mapping.has_metres:
             return None
-        return self.motion.expectation(stamp_s, T_predicted, self.published.scale)
+        told = self.fusion.vertical(stamp_s) if self._is_young(stamp_s) else None
+        vertical = None if told is None else Vertical(*told)
+        return Expectation(self.motion.expectation(stamp_s, T_predicted, self.published.scale), vertical)
 
     def reach(self, stamp_s: float, T_predicted: FloatArray) -> Reach:
         """Region that the camera can have reached during frames without a pose."""
@@ -115,7 +125,13 @@ class System:
 
     def telemetry(self, *where: str) -> TelemetryModel | None:
         """Telemetry as it is now, if the settings want it in one of these refinements."""
-        return self.fusion.telemetry() if self.has_telemetry and self.config.window.telemetry in where else None
+        wanted = self.has_telemetry and self.config.window.telemetry in where
+        model = self.fusion.telemetry() if wanted else None
+        return None if model is None else replace(model, young=self._is_young(self.motion.stamp_s))
+
+    def _is_young(self, stamp_s: float) -> bool:
+        """Whether the map that a frame is tracked on has begun seconds ago."""
+        return stamp_s - self.piece_began_s < YOUNG_S
 
     def collect(self, wait: bool = False) -> None:
         """Collect finished results of real-time mapping; with ``wait`` the caller owns the map afterwards."""

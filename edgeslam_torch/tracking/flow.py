@@ -18,9 +18,7 @@ from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.map.keyframe import NO_ANCHOR, Keyframe
 from edgeslam_torch.map.slam_map import SlamMap
-from edgeslam_torch.mapping.prior_anchors import depth_slack_px, mostly_on_priors
-from edgeslam_torch.optim.pose_only import refine_pose
-from edgeslam_torch.optim.problem import PosePrior
+from edgeslam_torch.tracking.expectation import Expectation, pose_on_anchors
 from edgeslam_torch.tracking.tracker import FINE, Track, View
 from edgeslam_torch.types import FloatArray, FrameFeatures, IntArray
 
@@ -170,7 +168,7 @@ class FlowTracker:
         self._chosen = _Chosen(None, -1, np.zeros(0, dtype=np.int64))
 
     def follow(
-        self, template: Template, grey: NDArray[np.uint8], T_c_w: FloatArray, expected: PosePrior | None = None
+        self, template: Template, grey: NDArray[np.uint8], T_c_w: FloatArray, expected: Expectation | None = None
     ) -> Followed | None:
         """Pose near a predicted one, or None if hardly any keypoint is tracked.
 
@@ -210,7 +208,7 @@ class FlowTracker:
         guess: FloatArray,
         T_c_w: FloatArray,
         levels: int,
-        expected: PosePrior | None,
+        expected: Expectation | None,
     ) -> tuple[Track, FloatArray]:
         """Pose from flow over the given pyramid levels, and the inliers' undistorted pixels."""
         raw_uv, found = self._flow(template, grey, keypoint, guess, levels)
@@ -260,20 +258,12 @@ class FlowTracker:
         return np.asarray(uv, dtype=np.float32).reshape(-1, 2), found
 
     def _solve(
-        self, template: Template, keypoint: IntArray, uv: FloatArray, T_c_w: FloatArray, expected: PosePrior | None
+        self, template: Template, keypoint: IntArray, uv: FloatArray, T_c_w: FloatArray, expected: Expectation | None
     ) -> Track:
         # Flow inherits the localisation error of the keyframe's keypoint: same weight as a match.
         anchor = template.anchor[keypoint]
         inv_sigma = self.orb.scale_factor ** -template.octave[keypoint].astype(np.float64)
-        result = refine_pose(
-            T_c_w,
-            self.map.anchors.p_w[anchor],
-            uv.astype(np.float64),
-            inv_sigma,
-            (self.camera.fx, self.camera.fy, self.camera.cx, self.camera.cy),
-            slack_px=depth_slack_px(self.map.anchors, anchor, T_c_w, self.camera),
-            prior=expected if mostly_on_priors(self.map.anchors, anchor) else None,
-            config=FINE,
-        )
+        found = uv.astype(np.float64)
+        result = pose_on_anchors(self.map.anchors, anchor, found, inv_sigma, T_c_w, self.camera, expected, FINE)
         inliers = result.inliers
         return Track(result.T_c_w, keypoint[inliers], anchor[inliers], keypoint, anchor, result.covariance)

@@ -13,9 +13,8 @@ from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.map.projection import Projection, match_projection, project_anchors
 from edgeslam_torch.map.slam_map import SlamMap
-from edgeslam_torch.mapping.prior_anchors import depth_slack_px, mostly_on_priors
-from edgeslam_torch.optim.pose_only import PoseConfig, refine_pose
-from edgeslam_torch.optim.problem import PosePrior
+from edgeslam_torch.optim.pose_only import PoseConfig
+from edgeslam_torch.tracking.expectation import Expectation, pose_on_anchors
 from edgeslam_torch.types import FloatArray, FrameFeatures, IntArray
 
 ROUGH = PoseConfig(rounds=1, robust_rounds=1, iterations=5, cost_tolerance=1e-2)
@@ -91,7 +90,9 @@ class Tracker:
         self.orb = orb
         self.config = config
 
-    def track(self, view: View, T_c_w: FloatArray, recent: IntArray, expected: PosePrior | None = None) -> Track | None:
+    def track(
+        self, view: View, T_c_w: FloatArray, recent: IntArray, expected: Expectation | None = None
+    ) -> Track | None:
         """Pose near a predicted one: anchors of the last frame first, then the local map; None with too few
         inliers."""
         some = recent[:: 1 + len(recent) // ENOUGH_FOR_ROUGH]
@@ -103,7 +104,7 @@ class Tracker:
         return self._complete(view, first.T_c_w, first.anchor, first.keypoint, first.anchor, expected)
 
     def track_near(
-        self, view: View, T_c_w: FloatArray, recent: IntArray, expected: PosePrior | None = None
+        self, view: View, T_c_w: FloatArray, recent: IntArray, expected: Expectation | None = None
     ) -> Track | None:
         """The same from a pose accurate to a pixel or two, without the first pass."""
         return self._complete(view, T_c_w, recent, recent[:0], recent[:0], expected)
@@ -121,7 +122,7 @@ class Tracker:
         anchor_ids: IntArray,
         radius_px: float,
         effort: PoseConfig = FINE,
-        expected: PosePrior | None = None,
+        expected: Expectation | None = None,
     ) -> Track | None:
         """Match the given anchors around their predicted pixels and refine the pose on what matches."""
         seen = self.expected(T_c_w, anchor_ids)
@@ -135,7 +136,7 @@ class Tracker:
         recent: IntArray,
         keypoint: IntArray,
         anchor: IntArray,
-        expected: PosePrior | None,
+        expected: Expectation | None,
     ) -> Track | None:
         """Track against the local map around ``recent``; known matches are kept."""
         anchors = self.map.anchors
@@ -178,21 +179,13 @@ class Tracker:
         keypoint: IntArray,
         anchor: IntArray,
         effort: PoseConfig = FINE,
-        expected: PosePrior | None = None,
+        expected: Expectation | None = None,
     ) -> Track | None:
         """Robust pose from given matches; None with too few of them."""
         if len(keypoint) < 6:
             return None
-        result = refine_pose(
-            T_c_w,
-            self.map.anchors.p_w[anchor],
-            view.features.uv[keypoint].astype(np.float64),
-            view.inv_sigma[keypoint],
-            (self.camera.fx, self.camera.fy, self.camera.cx, self.camera.cy),
-            slack_px=depth_slack_px(self.map.anchors, anchor, T_c_w, self.camera),
-            prior=expected if mostly_on_priors(self.map.anchors, anchor) else None,
-            config=effort,
-        )
+        uv, inv_sigma = view.features.uv[keypoint].astype(np.float64), view.inv_sigma[keypoint]
+        result = pose_on_anchors(self.map.anchors, anchor, uv, inv_sigma, T_c_w, self.camera, expected, effort)
         return Track(
             T_c_w=result.T_c_w,
             keypoint=keypoint[result.inliers],

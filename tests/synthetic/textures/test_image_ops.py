@@ -44,13 +44,20 @@ def test_interpolation_meets_a_ramp() -> None:
     np.testing.assert_allclose(out[0, 4:-4], inside[4:-4], atol=0.51)
 
 
-def test_a_look_up_weighs_the_four_pixels_around() -> None:
-    image = np.random.default_rng(1).integers(0, 256, (5, 7), dtype=np.uint8)
-    x, y = np.array([[0.25, 4.5, -9.0]]), np.array([[1.75, 2.5, 99.0]])
-    low = image.astype(float)
-    expected = [
-        0.25 * (0.75 * low[1, 0] + 0.25 * low[1, 1]) + 0.75 * (0.75 * low[2, 0] + 0.25 * low[2, 1]),
-        low[2:4, 4:6].mean(),
-        low[4, 0],
+def test_a_look_up_is_exact_at_steps_of_a_256th() -> None:
+    rng = np.random.default_rng(1)
+    image = rng.integers(0, 256, (50, 70, 3), dtype=np.uint8)
+    x, y = np.rint(256 * rng.uniform(0, [69, 49], (40, 60, 2))).astype(int).transpose(2, 0, 1)
+    (column, fx), (row, fy) = (np.divmod(v, 256) for v in (x, y))
+    fx, fy, low = fx[..., None], fy[..., None], image.astype(int)
+    above = (256 - fx) * low[row, column] + fx * low[row, np.minimum(column + 1, 69)]
+    below = (256 - fx) * low[np.minimum(row + 1, 49), column] + fx * low[
+        np.minimum(row + 1, 49), np.minimum(column + 1, 69)
     ]
-    np.testing.assert_allclose(looked_up(image, x, y)[0], expected, atol=0.51)
+    expected = np.rint(((256 - fy) * above + fy * below) / 65536)
+    np.testing.assert_array_equal(looked_up(image, x / 256, y / 256), expected)
+
+
+def test_the_border_goes_on_outside() -> None:
+    image = np.arange(12, dtype=np.uint8).reshape(3, 4)
+    assert looked_up(image, np.array([[-9.0, 99.0]]), np.array([[99.0, -1.0]])).tolist() == [[8, 3]]
