@@ -61,8 +61,8 @@ def resolve(name: str) -> Callable[..., object]:
 
 
 def fly_and_map(folder: Path) -> World:
-    """Three seconds of the demo flight with all terms of the window, refined once more with the printed cycle."""
-    flown = record(folder, DemoSettings(world="corridor", seconds=3.0, rate_hz=10.0, width=320, height=240))
+    """Four seconds of the demo flight with all terms of the window, refined once more with the printed cycle."""
+    flown = record(folder, DemoSettings(world="corridor", seconds=4.0, rate_hz=10.0, width=320, height=240))
     source = open_source(str(folder))
     slam = EdgeSlam(source.camera, SlamConfig(window=WINDOW))
     for frame in source.frames():
