@@ -27,7 +27,13 @@ class Home:
 
     @staticmethod
     def of(T_w_first: FloatArray, scale: float, T_b_c: FloatArray) -> "Home":
-        """From the pose ``T_w_c`` of the first picture, in published units."""
+        """The world that begins below the first picture's body.
+
+        Args:
+            T_w_first: ``T_w_c`` of the first picture ``(4, 4)``, in published units.
+            scale: Metres per published unit.
+            T_b_c: Camera on the body ``(4, 4)`` [m].
+        """
         T_w_b = T_w_first @ se3.inverse(T_b_c)
         yaw = math.atan2(T_w_b[1, 0], T_w_b[0, 0])
         c, s = math.cos(yaw), math.sin(yaw)

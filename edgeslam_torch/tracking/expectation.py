@@ -91,4 +91,7 @@ def pose_on_anchors(
         return free
     by_motion = expected.by_motion if counts else replace(expected.by_motion, information=np.zeros((6, 6)))
     upright = refined(levelled(by_motion, expected.vertical))
-    return upright if upright.inliers.sum() >= NO_WORSE * free.inliers.sum() else free
+    if upright.inliers.sum() < NO_WORSE * free.inliers.sum():
+        return free
+    # Attitude comes in whole degrees: holding it made the pose no surer than the image is.
+    return replace(upright, covariance=free.covariance)

@@ -57,6 +57,12 @@ def test_a_climb_before_guessed_depths_is_a_climb_by_the_drones_attitude(wall):
     assert se3.inverse(upright)[2, 3] == pytest.approx(CLIMB_M, rel=0.2)
 
 
+def test_a_pose_that_is_held_is_no_surer_than_its_image(wall):
+    held, free = solved(wall, Vertical(LEVEL[:3, 2], 0.0)), solved(wall, None)
+    assert not np.allclose(held.T_c_w, free.T_c_w)
+    np.testing.assert_array_equal(held.covariance, free.covariance)
+
+
 def test_a_vertical_that_the_image_contradicts_does_not_count(wall):
     wrong = Vertical(tilted(25.0)[:3, 2], 0.0)
     np.testing.assert_allclose(solved(wall, wrong).T_c_w, solved(wall, None).T_c_w)
