@@ -88,6 +88,8 @@ class Pilot:
     exits: ExitWatch = field(default_factory=ExitWatch)
     """What was found of exits on the way, whatever the task."""
     _plan: CostToGo | None = None
+    _goals: np.ndarray = field(default_factory=lambda: np.zeros((0, 2), int))
+    """Cells ``(G, 2)`` that it leads to."""
     _planned_s: float = -math.inf
     _progress_s: float = math.nan
     """When the cost to go was last less than ever."""
@@ -243,11 +245,10 @@ class Pilot:
 
         A full turn would leave behind all that it knows, and what hides the way is between it and the goal.
         """
-        assert self.layer is not None
-        goals = self.task.goals(self.layer, sight)
-        if len(goals) == 0:
+        assert self._plan is not None
+        if len(self._goals) == 0:
             return 0.5 * self.limits.turn_rad_s
-        step = self.layer.centres(goals).mean(axis=0) - sight.p_w[:2]
+        step = self._plan.layer.centres(self._goals).mean(axis=0) - sight.p_w[:2]
         side = 4.0 * abs(sight.stamp_s / _SEARCH_S % 1.0 - 0.5) - 1.0
         wanted = math.atan2(step[1], step[0]) + side * _SEARCH_RAD
         return self._turn(float(wrapped(np.array(wanted - sight.yaw_rad))))
@@ -257,9 +258,9 @@ class Pilot:
         half = self.limits.radius_m + BAND_M
         self.layer = self.space.layer(self.limits.height_m, half)
         if self._plan is None or sight.stamp_s - self._planned_s >= _REPLAN_S:
-            goals = self.task.goals(self.layer, sight)
+            self._goals = self.task.goals(self.layer, sight)
             need = self.limits.clearance_m(sight.position_sigma_m)
-            self._plan = cost_to_go(self.layer, goals, need, self.layer.cells(sight.p_w[:2]), _BESIDE_M)
+            self._plan = cost_to_go(self.layer, self._goals, need, self.layer.cells(sight.p_w[:2]), _BESIDE_M)
             self._planned_s = sight.stamp_s
         return self._plan
 

@@ -78,10 +78,13 @@ def cost_to_go(
     at_goals = np.zeros(shape, bool)
     at_goals[tuple(np.asarray(goals, dtype=int).T)] = True
     cost = _from(graph, at_goals & open_)
-    for cells in range(1, round(beside_m / layer.cell_m) + 1 if at_goals.any() else 1):
+    if np.isfinite(cost[tuple(here)]) or beside_m == 0.0 or not at_goals.any():
+        return CostToGo(layer, cost)
+    away = ndimage.distance_transform_edt(~at_goals)
+    for cells in range(1, round(beside_m / layer.cell_m) + 1):
+        cost = _from(graph, open_ & (away <= cells))
         if np.isfinite(cost[tuple(here)]):
             break
-        cost = _from(graph, open_ & (ndimage.distance_transform_edt(~at_goals) <= cells))
     return CostToGo(layer, cost)
 
 
