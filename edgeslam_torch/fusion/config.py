@@ -59,7 +59,7 @@ class FusionConfig:
     """Error of one velocity reading: 0.1 / sqrt(12) of quantisation and the drone's own 0.02."""
     sigma_attitude_rad: float = math.radians(0.36)
     """Error of one attitude reading: 1 deg / sqrt(12) of quantisation that repeats while the drone hovers."""
-    sigma_turn_rad_sqrt_s: float = 0.06
+    sigma_turn_rad_sqrt_s: float = 0.05
     """Random walk of the angles between readings, on top of the turning that the readings themselves show."""
     sigma_bias_m_s: float = 0.03
     """Velocity bias at the start (0 takes the bias out of the state: the paper's six states)."""

@@ -31,8 +31,8 @@ HALF = 300
 CUT, CUT_FRAMES = "cut", 160
 """Variant that shows so many frames of a simulation, and then as many of the next seed's: two places, two pieces."""
 CUT_COURSES = ("room", "corridor")
-FLOWN_AGAIN = "room"
-"""Course that is flown twice."""
+FLOWN_AGAIN = ("room", "building")
+"""Courses that are flown twice: from another place, and from where the first flight took off."""
 WITH_TELEMETRY = ("tum_fr1_xyz", "7scenes_redkitchen", "euroc_mh05_a", "tartan_hospital")
 """Recordings that telemetry is made for."""
 
@@ -173,7 +173,7 @@ def list_cells(data: Path | None, which: str, seeds: Sequence[int], only: Sequen
             made += [Cell(f"telemetry/{kind}/{name}", 0, str(folder), telemetry=kind) for kind in KINDS]
     if which in ("flights", "all"):
         made += [Cell(f"flight/{course}", 0, course=course) for course in COURSES]
-        made += [Cell(f"flight/{FLOWN_AGAIN}/{SECOND_FLIGHT}", 0, variant=SECOND_FLIGHT, course=FLOWN_AGAIN)]
+        made += [Cell(f"flight/{c}/{SECOND_FLIGHT}", 0, variant=SECOND_FLIGHT, course=c) for c in FLOWN_AGAIN]
         made += [Cell(f"flight/{course}/{CUT}", 0, variant=CUT, course=course) for course in CUT_COURSES]
         made += [Cell(f"none/{kind}", 0, nothing=kind) for kind in NONE]
     kept = [cell for cell in made if not only or any(fnmatchcase(cell.name, pattern) for pattern in only)]

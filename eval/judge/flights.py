@@ -19,7 +19,6 @@ from edgeslam_torch.readers.source import Recording
 from edgeslam_torch.synthetic.flights.courses import (
     COURSES,
     RATE_HZ,
-    SECONDS,
     Course,
     flown,
     record_course,
@@ -92,7 +91,7 @@ def _record_again(folder: Path, course: Course, seed: int, flight: int) -> None:
     """Another flight through the world of a course."""
     world = course.world(np.random.default_rng(seed))
     rng = np.random.default_rng([seed, flight])
-    flown_again = course.pilot(rng, world, round(SECONDS * RATE_HZ), rate_hz=RATE_HZ)
+    flown_again = course.pilot(rng, world, round(course.seconds * course.rate_hz), rate_hz=course.rate_hz)
     camera = simulated_camera()
     record_flight(folder, world, flown_again, rng, camera, course.telemetry, course.faults, seed=seed + flight)
 

@@ -13,7 +13,7 @@ from edgeslam_torch.synthetic.flights.degrade import CameraFaults
 from edgeslam_torch.synthetic.flights.flight import Flight, FlightPlan, climb, fly, fly_after_hover, fly_around, turn
 from edgeslam_torch.synthetic.flights.telemetry import TelemetryFaults, simulate
 from edgeslam_torch.synthetic.flights.writer import write_flight
-from edgeslam_torch.synthetic.house.rooms import BLOCK_M, blank_corridor, block, corridor, room
+from edgeslam_torch.synthetic.house.rooms import BLOCK_M, BUILDING_M, blank_corridor, block, building, corridor, room
 from edgeslam_torch.synthetic.house.world import World
 
 Rng = np.random.Generator
@@ -44,6 +44,7 @@ class Course:
 
 
 AROUND_BLOCK = partial(fly_around, sides_m=BLOCK_M, plan=FlightPlan(speed_m_s=0.8))
+AROUND_BUILDING = partial(fly_around, sides_m=BUILDING_M, plan=FlightPlan(speed_m_s=0.8))
 LOW_LIGHT = CameraFaults(gain=0.2, read_noise=2.5, shot_noise=0.35, vignetting=0.3, shutter_s=0.02)
 """A fifth of the light at a slow shutter: walls at about 40 grey levels, noise of 3, blur of some pixels in a turn."""
 
@@ -53,13 +54,14 @@ COURSES = {
     "blank_corridor": Course(blank_corridor),
     "block": Course(block, AROUND_BLOCK, seconds=64.0, rate_hz=15.0),
     "block_no_telemetry": Course(block, AROUND_BLOCK, telemetry=None, seconds=64.0, rate_hz=15.0),
+    "building": Course(building, AROUND_BUILDING, seconds=64.0, rate_hz=15.0),
     "climb": Course(pilot=climb),
     "yaw": Course(pilot=turn),
     "low_light": Course(faults=LOW_LIGHT),
     "turn_first": Course(pilot=partial(fly_after_hover, turning=True)),
     "hover_first": Course(pilot=fly_after_hover),
 }
-"""By name. ``block`` goes once around, 40 m, and 5 m on over ground that it knows."""
+"""By name. ``block`` and ``building`` go once around, 40 m, and 5 m on over ground that they know."""
 
 DEPTH_EVERY = 10
 """Frames from one exact depth map to the next."""

@@ -3,6 +3,7 @@
 import json
 import shutil
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -177,13 +178,21 @@ def test_second_flight_is_in_the_map_of_the_first_and_judged_against_it(recordin
 
 
 def test_a_further_flight_has_another_path_through_the_same_world(tmp_path, monkeypatch):
-    monkeypatch.setattr(flights, "SECONDS", 0.4)
+    monkeypatch.setitem(COURSES, "corridor", replace(COURSES["corridor"], seconds=0.4))
     assert flights.main("corridor", 3, tmp_path / "again", 1) == 0
     world, first, _ = flights.flown(COURSES["corridor"], 3, seconds=0.4)
     again = open_dataset(tmp_path / "again").truth
     assert len(again.stamps_s) == 8
     assert np.linalg.norm(again.positions[0] - first.T_w_c[0, :3, 3]) > 0.1
     assert world.clearance(again.positions[0]) > 0.2, "in free space of that world"
+
+
+def test_a_further_flight_through_the_building_takes_off_from_the_same_place(tmp_path, monkeypatch):
+    monkeypatch.setitem(COURSES, "building", replace(COURSES["building"], seconds=6.0, rate_hz=2.0))
+    assert flights.main("building", 0, tmp_path / "again", 1) == 0
+    first = flights.flown(COURSES["building"], 0)[1].T_w_c[:, :3, 3]
+    apart = np.linalg.norm(open_dataset(tmp_path / "again").truth.positions - first, axis=1)
+    assert apart[0] < 0.05 and apart.max() > 0.1
 
 
 def test_flight_is_recorded_once_and_only_whole(tmp_path, monkeypatch):
