@@ -61,6 +61,9 @@ from edgeslam_torch.types import (
     TelemetrySample,
 )
 
+_AROUND = 8
+"""Keyframes whose anchors are around the newest frame."""
+
 
 class EdgeSlam:
     """The SLAM system.
@@ -295,6 +298,19 @@ class EdgeSlam:
         with self.map.lock:
             cloud = self.map.anchors.cloud(self.map.anchors_seen_by(self._shown_keyframes()))
         return self._system.published.cloud(cloud)
+
+    def surroundings(self) -> FloatArray:
+        """Anchors and edge points ``(N, 3)`` float64 of keyframes that see what the newest frame sees, as published.
+
+        What an obstacle is told by: a consistent snapshot, at a tenth of the cost of both maps.
+        """
+        if not self.log.records:
+            return np.zeros((0, 3))
+        with self.map.lock:
+            reference = self.map.keyframes[self.map.heir_of(self.log.records[-1].keyframe_id)[0]]
+            seen = self.map.anchors_seen_by([reference, *self.map.covisible(reference, _AROUND)])
+            p_w = np.concatenate([self.map.anchors.p_w[seen], self.edges.around(reference)])
+        return self._system.published.points(p_w)
 
     def observations(self) -> Observations:
         """Where keyframes saw the anchors of `anchors`, as a consistent snapshot."""

@@ -228,6 +228,14 @@ def test_edge_map_and_anchors_lie_on_the_surfaces(run, scale_m):
     assert slam.edge_map().colour.std() > 20
 
 
+def test_surroundings_are_points_of_both_maps_that_lie_on_the_surfaces():
+    slam, _ = panels_run()
+    p_w = slam.surroundings()
+    assert len(p_w) > 1000
+    distance = panels().world.distance_to_surface(in_the_world(slam, p_w))
+    assert np.median(distance) < 0.02 and np.mean(distance < 0.1) > 0.9
+
+
 def test_two_runs_give_the_same_bytes():
     (a, out_a), (b, out_b) = short_run(), go(panels().frames[:16])
     assert a.trajectory()[1].tobytes() == b.trajectory()[1].tobytes()
@@ -287,6 +295,7 @@ def test_no_frame_at_all():
     slam.finish()
     assert slam.trajectory()[1].shape == (0, 4, 4)
     assert slam.edge_map().p_w.shape == (0, 3)
+    assert slam.surroundings().shape == (0, 3)
 
 
 @pytest.mark.parametrize("depth", [True, False])

@@ -14,6 +14,7 @@ from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.navigation.moved import Moved, moves
 from edgeslam_torch.navigation.near_depth import fit_to_points
+from edgeslam_torch.navigation.near_points import agreeing, seen_points, with_nearer_points
 from edgeslam_torch.navigation.sight import Sight, View
 from edgeslam_torch.navigation.space import CELL_M, KEPT
 from edgeslam_torch.slam import EdgeSlam
@@ -50,6 +51,7 @@ class SlamEyes:
             width, height = width // 2, height // 2
         self._camera = camera.scaled(width, height)
         self._slam = EdgeSlam(self._camera, SlamConfig(seed=seed), realtime=realtime)
+        self._K_small = self._camera.scaled(width // _STEP, height // _STEP).K
         self._network: DepthNetwork = open_depth()
         self._T_b_c = camera_on_body()
         self._lock = threading.Lock()
@@ -170,20 +172,24 @@ class SlamEyes:
         return found
 
     def _depth(self, image: np.ndarray, output: SlamOutput) -> DepthMap | None:
-        """Depth of the network, brought to the map's published unit by its points; None with too few of them."""
-        depth = self._network(image, self._camera)
-        anchors = self._slam.anchors()
-        fit = fit_to_points(depth, self._camera.K, output.T_w_c, anchors.p_w.astype(np.float64))
-        return None if fit is None else fit.applied(depth)
+        """Depth at a quarter of the picture's size, in published units: the network's, brought to them by the map's
+        points, and these where they stand before it; None with too few of them."""
+        depth, T_w_c = self._network(image, self._camera), output.T_w_c
+        anchors = self._slam.anchors().p_w.astype(np.float64)
+        fit = fit_to_points(depth, *seen_points(anchors, self._camera.K, T_w_c, depth.depth_m.shape))
+        if fit is None:
+            return None
+        fitted = fit.applied(depth)
+        part = (slice(_STEP // 2, None, _STEP), slice(_STEP // 2, None, _STEP))
+        small = DepthMap(fitted.depth_m[part], fitted.sigma_log[part])
+        uv, z = seen_points(self._slam.surroundings(), self._K_small, T_w_c, small.depth_m.shape)
+        kept = agreeing(uv, z, small.depth_m.shape[1])
+        return with_nearer_points(small, uv[kept], z[kept])
 
     def _view(self, depth: DepthMap, home: Home, T_w_c: FloatArray, captured_s: float) -> View:
-        """Depth in published units as a pilot is told of it: in metres, at a quarter of its size."""
-        K = self._camera.K / _STEP
-        K[2, 2] = 1.0
-        K[:2, 2] += 0.5 / _STEP - 0.5
-        part = (slice(_STEP // 2, None, _STEP), slice(_STEP // 2, None, _STEP))
-        metres = home.scale * depth.depth_m[part]
-        return View(captured_s, metres, depth.sigma_log[part], K, home.poses(T_w_c), self._frames - 1)
+        """Depth in published units as a pilot is told of it, in metres."""
+        metres = home.scale * depth.depth_m
+        return View(captured_s, metres, depth.sigma_log, self._K_small, home.poses(T_w_c), self._frames - 1)
 
 
 def _tracks(output: SlamOutput) -> bool:

@@ -25,6 +25,8 @@ CHECKED = 100
 """Edges of a keyframe that are measured again to see whether all must be."""
 OFF_LOG = 0.05
 """Median change of their log depth beyond which they must: twice the largest relative sigma of an edge."""
+NEARLY = 0.1
+"""Relative standard deviation of a depth that tells an obstacle: 10 cm at a metre."""
 PRIOR_CELL_PX = 8
 """Side of the cells whose edges share a depth prior."""
 
@@ -264,6 +266,22 @@ class EdgeMap:
         sigma = np.hypot(sigma, bend(views, self.camera) * z)
         agreed = count >= self.config.min_observations
         return fuse_voxels(p_w[agreed], sigma[agreed], colour[agreed], count[agreed], self.config.voxel * float(depth))
+
+    def around(self, keyframe: Keyframe) -> FloatArray:
+        """Edge points ``(E, 3)`` in the map's world that several keyframes agree on, of those that see the same as one.
+
+        A consistent snapshot, callable from any thread, at a tenth of the cost of all `points`. Their depth is known to
+        `NEARLY`.
+        """
+        with self.map.lock:
+            same = [h for h in self.hosts if h.keyframe_id == keyframe.id]
+            hosts = same + [h for h in self._overlapping(keyframe, self.hosts) if h.keyframe_id != keyframe.id]
+            parts: list[FloatArray] = [np.zeros((0, 3))]
+            for host in hosts:
+                sure = host.sigma < NEARLY * host.p_c[:, 2]
+                agreed = host.observations >= self.config.min_observations
+                parts.append(se3.transform(self._T_w_c(host), host.p_c[sure & agreed]))
+        return np.concatenate(parts)
 
     def _T_w_c(self, host: EdgePoints) -> FloatArray:
         return se3.inverse(self.map.pose_of(host.keyframe_id))

@@ -111,6 +111,20 @@ def test_only_agreed_points_are_given_out(points):
     assert edge_map(points).points().p_w.shape == (0, 3)
 
 
+def test_edges_around_a_keyframe_are_the_agreed_and_sure_ones_of_those_that_see_the_same(points):
+    p_w = points.world.p_w[points.world.visible[0] & points.world.visible[1]][:60]
+    z = se3.transform(points.map.pose_of(1), p_w)[:, 2]
+    observations = np.where(np.arange(60) < 50, 2, 1).astype(np.int32)
+    sigma = np.where(np.arange(60) < 40, 0.05, 0.3) * z
+    edges = edge_map(points)
+    edges.hosts.append(host(points, 1, p_w, observations=observations, sigma=sigma))
+    first = points.map.keyframes[0]
+    np.testing.assert_allclose(edges.around(first), p_w[:40], atol=1e-9)
+    first.anchor[:] = -1  # it now shares nothing with the other one
+    points.map.revision += 1
+    assert edges.around(first).shape == (0, 3)
+
+
 def test_sigma_of_a_point_has_the_bend_of_the_map(points):
     seen = host(points, 0, points.world.p_w[points.world.visible[0]][:20], observations=np.full(20, 2, np.int32))
     some = edge_map(points, voxel=1e-6)

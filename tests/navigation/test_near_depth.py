@@ -40,17 +40,14 @@ def test_too_few_points_tell_nothing(rng):
 
 
 def test_points_are_compared_where_they_are_seen(rng):
-    K = np.array([[80.0, 0.0, 39.5], [0.0, 80.0, 29.5], [0.0, 0.0, 1.0]])
-    T = np.eye(4)
-    T[:3, 3] = [1.0, -2.0, 0.5]
-    p = np.c_[rng.uniform(-0.4, 0.4, (300, 2)), np.ones(300)] * rng.uniform(1.0, 4.0, (300, 1)) + T[:3, 3]
+    uv, z = rng.integers(0, [80, 60], (300, 2)), rng.uniform(1.0, 4.0, 300)
     depth = np.full((60, 80), np.nan, np.float32)
-    for x in p - T[:3, 3]:
-        u, v = np.rint(x[:2] / x[2] * 80.0 + [39.5, 29.5]).astype(int)
-        if 0 <= u < 80 and 0 <= v < 60:
-            depth[v, u] = 2.0 * x[2]
-    fit = fit_to_points(DepthMap(depth, np.full_like(depth, 0.2)), K, T, p)
+    depth[uv[:, 1], uv[:, 0]] = 2.0 * z
+    _, last = np.unique((uv @ [1, 80])[::-1], return_index=True)  # the last of those in one pixel is in the picture
+    last = 299 - last
+    fit = fit_to_points(DepthMap(depth, np.full_like(depth, 0.2)), uv[last] + 0.3, z[last])
     assert np.exp(fit.offset + fit.slope * np.log(4.0)) == pytest.approx(2.0, rel=0.05)
+    assert fit.residual == pytest.approx(0.0, abs=0.05)
 
 
 def half_seen(rng, residual, shape=(120, 160)):
@@ -92,3 +89,12 @@ def test_points_that_something_hides_do_not_push_it_away(rng):
     residual[::4] = 1.2
     error, _ = local_error(uv, residual, 0.1, shape)
     np.testing.assert_allclose(error, 0.0, atol=0.03)
+
+
+def test_points_far_before_what_the_network_sees_are_what_a_drone_would_touch(rng):
+    """A door leaf at 0.6 m before a wall that the network sees at 2 m, in a room that fits it to 10 %."""
+    uv, residual, shape = half_seen(rng, np.log(0.3))
+    metres = NearFit(0.0, 1.0, 0.1, len(uv), uv, residual).applied(
+        DepthMap(np.full(shape, 2.0, np.float32), np.full(shape, 0.1, np.float32))
+    )
+    assert np.median(metres.depth_m[:, 10:60]) == pytest.approx(0.6, rel=0.15)
