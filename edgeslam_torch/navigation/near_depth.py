@@ -85,8 +85,8 @@ def local_error(
 
     Means over `_NEAR_SHARE` of the picture's width with Gaussian weights, towards the line (error 0, standard deviation
     at least `_ALONE_SIGMA`) with the weight of `_LINE_POINTS` points: through a door, where no point is, a network that
-    fits this room to 7 % was seen to be 40 % too near. Points more than three spreads farther than the line are hidden by
-    what the network sees; those that are nearer are none that it hides.
+    fits this room to 7 % was seen to be 40 % too near. Points more than three spreads farther than the line are hidden
+    by what the network sees; those that are nearer are none that it hides.
 
     Returns:
         Error and standard deviation, ``shape`` ``(H, W)`` float32 each.
