@@ -16,7 +16,7 @@ from edgeslam_torch.navigation.moved import Moved
 from edgeslam_torch.navigation.openings.turned import Walls
 from edgeslam_torch.navigation.openings.watch import Exit
 from edgeslam_torch.navigation.pilot import Phase, Pilot
-from edgeslam_torch.navigation.sight import Sight
+from edgeslam_torch.navigation.sight import Sight, Touch
 from edgeslam_torch.navigation.supervisor import Order, Supervisor
 from edgeslam_torch.navigation.tasks import Task
 from edgeslam_torch.types import FloatArray
@@ -38,7 +38,7 @@ class Moment:
     """For its layer and its way; another thread may be changing it."""
 
 
-Witness = Callable[[NewTask | Sight | Decision], None]
+Witness = Callable[[NewTask | Touch | Sight | Decision], None]
 """Told what the planner is given, before it thinks, and what it decided, from the thread that plans."""
 Listener = Callable[[Moment], None]
 """Called for every moment from the thread that flies: it must return at once."""
@@ -65,6 +65,8 @@ class Cockpit:
         self._lock = threading.Lock()
         self._next: Task | None = None
         self._held = False
+        self._touch: Touch | None = None
+        """What was felt since the pilot planned last."""
         self._track: list[FloatArray] = []
         self._path_m, self._clearance_m = 0.0, math.nan
 
@@ -84,16 +86,25 @@ class Cockpit:
         """Hover whatever the pilot wants, until it is called off: for a person at the keyboard."""
         self._held = held
 
+    def feel(self, touch: Touch) -> None:
+        """Let the pilot know of something that it does not see, when it plans next."""
+        with self._lock:
+            self._touch = touch
+
     def plan(self, sight: Sight) -> Decision:
         """Let the pilot decide; may take its time, or hang."""
         with self._lock:
             task, self._next = self._next, None
+            touch, self._touch = self._touch, None
             if task is not None:
                 self._take_up(task)
         if task is not None:
             self._witness(NewTask(task))
         if sight.moved is not None:
             self._carry(sight.moved)
+        if touch is not None:
+            self._witness(touch)
+            self.pilot.touched(touch)
         self._witness(sight)
         wish = self.pilot.update(sight)
         with self._lock:
@@ -122,6 +133,8 @@ class Cockpit:
             self._supervisor.see(sight)
             self._supervisor.held = self._held
             order = self._supervisor.order(sight.stamp_s)
+        if order.touch is not None:
+            self.feel(order.touch)
         self._note_path(sight)
         self.sight, self.last = sight, order
         self._tell(Moment(sight, order, self.pilot.phase, self.pilot))

@@ -13,7 +13,7 @@ from edgeslam_torch.errors import SourceError
 from edgeslam_torch.flying.cockpit import Cockpit
 from edgeslam_torch.navigation.flight_record import PLAN, Decision, NewTask, read_plan
 from edgeslam_torch.navigation.limits import NavLimits
-from edgeslam_torch.navigation.sight import Sight, Wish
+from edgeslam_torch.navigation.sight import Sight, Touch, Wish
 
 _SAME = 0.02
 """Wishes that differ by less [m/s, rad/s] are the same to a Tello, whose sticks have steps of a hundredth."""
@@ -84,6 +84,8 @@ def replay(folder: Path, **limits: float) -> Replay:
         if isinstance(entry, NewTask):
             cockpit.begin(entry.task)
             tasks.append(type(entry.task).__name__)
+        elif isinstance(entry, Touch):
+            cockpit.feel(entry)
         elif isinstance(entry, Sight):
             seen = entry
     if seen is not None:

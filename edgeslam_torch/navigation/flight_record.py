@@ -1,4 +1,4 @@
-"""What a planner saw and decided, on disk: a line of JSON for each limit, task, sight and wish, whole or not at all.
+"""What a planner saw and decided, on disk: a line of JSON for each limit, task, touch, sight and wish, whole or not.
 
 A sight is written before the planner thinks about it: one that hangs or fails leaves in the file what it hung on. A
 file that ends in the middle of a line, after a crash or a flat battery, is good up to that line. Numbers are exact, so
@@ -19,7 +19,7 @@ import numpy as np
 from edgeslam_torch.errors import EdgeSlamError, OutputError, SourceError
 from edgeslam_torch.files.appender import Appender
 from edgeslam_torch.navigation.limits import NavLimits
-from edgeslam_torch.navigation.sight import Sight, Wish
+from edgeslam_torch.navigation.sight import Sight, Touch, Wish
 from edgeslam_torch.navigation.tasks import Task
 
 PLAN = "plan.jsonl"
@@ -43,7 +43,7 @@ class NewTask:
     task: Task
 
 
-Entry = NavLimits | NewTask | Sight | Decision
+Entry = NavLimits | NewTask | Touch | Sight | Decision
 
 
 class PlanLog:
@@ -113,7 +113,7 @@ def _entry(value: Any, path: Path, number: int) -> Entry:
         raise SourceError(f"{path}: line {number}: {error}") from error
     except (TypeError, ValueError, KeyError, AttributeError, zlib.error) as error:
         raise SourceError(f"{path}: line {number} is damaged ({error})") from error
-    if not isinstance(entry, NavLimits | NewTask | Sight | Decision):
+    if not isinstance(entry, Entry):
         raise SourceError(f"{path}: line {number} is no entry of a planner's record")
     return entry
 

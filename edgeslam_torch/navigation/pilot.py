@@ -14,8 +14,8 @@ from edgeslam_torch.navigation.moved import Moved
 from edgeslam_torch.navigation.openings.turned import Walls
 from edgeslam_torch.navigation.openings.watch import ExitWatch
 from edgeslam_torch.navigation.route import CostToGo, cost_to_go
-from edgeslam_torch.navigation.sight import HOVER, Sight, Wish
-from edgeslam_torch.navigation.space import Space
+from edgeslam_torch.navigation.sight import HOVER, Sight, Touch, Wish
+from edgeslam_torch.navigation.space import CELL_M, Space
 from edgeslam_torch.navigation.tasks import Task
 from edgeslam_torch.types import FloatArray
 
@@ -118,6 +118,11 @@ class Pilot:
         """What is known at the height of flight, and what of it stands upright."""
         layer = self.space.layer(self.limits.height_m, self.limits.radius_m + BAND_M)
         return Walls(layer, self.space.upright(*_UPRIGHT_M, _UPRIGHT_SHARE))
+
+    def touched(self, touch: Touch) -> None:
+        """Something holds it that no view shows: not there again."""
+        self.space.touched(touch, self.limits.radius_m + 0.5 * CELL_M)
+        self._plan = None
 
     def update(self, sight: Sight) -> Wish:
         """Take in what is seen, and decide.

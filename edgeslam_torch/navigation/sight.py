@@ -64,6 +64,16 @@ class Sight:
 
 
 @dataclass(frozen=True, slots=True)
+class Touch:
+    """The drone was told to move and did not: something holds it that it does not see."""
+
+    p_w: FloatArray
+    """``(3,)`` where the drone was [m]."""
+    towards_w: FloatArray
+    """``(2,)`` level unit vector of where it was to go."""
+
+
+@dataclass(frozen=True, slots=True)
 class Wish:
     """What the drone should do until the next moment, in its own level axes."""
 

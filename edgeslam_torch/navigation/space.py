@@ -12,7 +12,7 @@ import numpy as np
 
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.moved import Moved
-from edgeslam_torch.navigation.sight import View
+from edgeslam_torch.navigation.sight import Touch, View
 from edgeslam_torch.types import FloatArray
 
 CELL_M = 0.1
@@ -38,6 +38,8 @@ KEPT = 240
 """Views that are remembered to rebuild the grid from when the map moves: 24 m of way at the fastest."""
 _SAME_M, _SAME_COS, _ALIKE = 0.1, np.cos(np.radians(4.0)), 3
 """A fourth view from within these of three others takes the place of the last: hovering fills no memory."""
+_TOUCHED_RAD = np.radians(35.0)
+"""To each side of the direction of a touch: what holds a drone is rarely as thin as a cell."""
 _SMALL = (80, 60)
 """Size at which depth is used [px], the nearest of the pixels that fall together: 7 cm at `REACH_M`."""
 
@@ -59,6 +61,8 @@ class Space:
     """``(2,)`` int, cell of the world at its corner."""
     _views: deque[View] = field(init=False)
     _flown: deque[tuple[FloatArray, float]] = field(init=False)
+    _touched: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    """``(N, 3)`` where the drone was held by what it does not see."""
 
     def __post_init__(self) -> None:
         self._odds = np.zeros((SIDE, SIDE, LEVELS), np.float32)
@@ -81,6 +85,12 @@ class Space:
         self._flown.append((np.array(p_w, dtype=np.float64), radius_m))
         self._clear(p_w, radius_m)
 
+    def touched(self, touch: Touch, reach_m: float) -> None:
+        """There is a solid from now on, whatever is seen, ``reach_m`` from the drone's centre."""
+        angle = np.arctan2(touch.towards_w[1], touch.towards_w[0]) + _TOUCHED_RAD * np.array([-1.0, 0.0, 1.0])
+        level = touch.p_w[:2] + reach_m * np.column_stack([np.cos(angle), np.sin(angle)])
+        self._touched = np.concatenate([self._touched, np.column_stack([level, np.full(len(level), touch.p_w[2])])])
+
     def follow(self, p_w: FloatArray) -> None:
         """Move the grid when the drone ``(3,)`` comes near its border; what falls off is forgotten."""
         wanted = np.floor(np.asarray(p_w[:2]) / CELL_M).astype(int) - SIDE // 2
@@ -102,6 +112,7 @@ class Space:
             for k, (view, T_w_c) in enumerate(zip(self._views, poses, strict=True)):
                 self._views[k] = replace(view, T_w_c=T_w_c, depth_m=moved.ratio * view.depth_m)
                 self._add(self._views[k])
+        self._touched = moved.points(self._touched)
         flown = moved.points(np.array([p_w for p_w, _ in self._flown]).reshape(-1, 3))
         for k, p_w in enumerate(flown):
             self._flown[k] = p_w, self._flown[k][1]
@@ -114,7 +125,11 @@ class Space:
         if low < 0 or high > LEVELS:
             raise ValueError(f"a height of {height_m:.2f} m is outside the grid of {LEVELS * CELL_M:.1f} m")
         band = self._odds[:, :, low:high]
-        return Layer(np.asarray((band < FREE).all(2)), np.asarray((band > SOLID).any(2)), self._corner * CELL_M, CELL_M)
+        free, solid = np.asarray((band < FREE).all(2)), np.asarray((band > SOLID).any(2))
+        cell = np.floor(self._touched[:, :2] / CELL_M).astype(int) - self._corner
+        i, j = cell[((cell >= 0) & (cell < SIDE)).all(axis=1)].T
+        free[i, j], solid[i, j] = False, True
+        return Layer(free, solid, self._corner * CELL_M, CELL_M)
 
     def upright(self, low_m: float, high_m: float, share: float) -> np.ndarray:
         """Columns ``(SIDE, SIDE)`` of which at least this share between two heights is known to be solid."""

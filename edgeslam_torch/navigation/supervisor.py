@@ -13,7 +13,7 @@ import numpy as np
 from edgeslam_torch.geometry.rotations import wrapped
 from edgeslam_torch.navigation.limits import NavLimits
 from edgeslam_torch.navigation.moved import Moved
-from edgeslam_torch.navigation.sight import Sight, Wish
+from edgeslam_torch.navigation.sight import Sight, Touch, Wish
 from edgeslam_torch.types import FloatArray
 
 STALE_S = 0.3
@@ -70,6 +70,8 @@ class Order:
     home: bool = False
     """Whether the pilot should fly home."""
     danger: Danger = Danger.NONE
+    touch: Touch | None = None
+    """What the pilot should know of since it was just felt."""
 
 
 @dataclass(slots=True)
@@ -143,7 +145,9 @@ class Supervisor:
         if in_vain or (danger is Danger.HELD and trouble_s > BACK_S + _BACK_M / _BACK_M_S):
             self.landing = True
             return Order(Wish(why=str(danger)), land=True, danger=danger)
-        return Order(self._meanwhile(danger, trouble_s), home=home, danger=danger)
+        felt = danger is Danger.HELD and trouble_s == 0.0
+        touch = Touch(self._sight.p_w.copy(), self._pushed_w()) if felt else None
+        return Order(self._meanwhile(danger, trouble_s), home=home, danger=danger, touch=touch)
 
     def _trouble_s(self, danger: Danger, now_s: float) -> float:
         """How long it has been in trouble of this gravity: waiting for metres uses up no patience with the rest."""
@@ -183,6 +187,13 @@ class Supervisor:
             self._pushing_s = now_s
         return now_s - self._pushing_s > _PUSH_S
 
+    def _pushed_w(self) -> FloatArray:
+        """Direction ``(2,)`` of the pilot's wish in the world."""
+        assert self._sight is not None and self._wish is not None
+        c, s = math.cos(self._sight.yaw_rad), math.sin(self._sight.yaw_rad)
+        forward, left = self._wish.forward_m_s, self._wish.left_m_s
+        return np.array([c * forward - s * left, s * forward + c * left]) / math.hypot(forward, left)
+
     def _is_apart(self, sight: Sight, now_s: float) -> bool:
         """Whether the pose goes its own way: a map that is sure of its metres, and another height than the drone's."""
         off = abs(sight.told_height_m - float(sight.p_w[2]))
@@ -199,9 +210,9 @@ class Supervisor:
         away = sight.p_w[:2] - self._home_w[:2]
         if float(np.linalg.norm(away)) < self.limits.fence_m or self._wish is None:
             return False
-        c, s = math.cos(sight.yaw_rad), math.sin(sight.yaw_rad)
-        f, le = self._wish.forward_m_s, self._wish.left_m_s
-        return float(away @ [c * f - s * le, s * f + c * le]) > 0
+        if math.hypot(self._wish.forward_m_s, self._wish.left_m_s) == 0.0:
+            return False
+        return float(away @ self._pushed_w()) > 0
 
     def _within_heights(self, wish: Wish) -> Wish:
         assert self._sight is not None

@@ -18,7 +18,7 @@ from edgeslam_torch.navigation.corridor import FollowCorridor
 from edgeslam_torch.navigation.flight_record import PLAN, Decision, NewTask, PlanLog, read_plan
 from edgeslam_torch.navigation.limits import NavLimits
 from edgeslam_torch.navigation.openings.watch import Exit
-from edgeslam_torch.navigation.sight import HOVER, Sight, View
+from edgeslam_torch.navigation.sight import HOVER, Sight, Touch, View
 from edgeslam_torch.navigation.tasks import Explore, GoTo
 
 TICK_S = 0.1
@@ -36,8 +36,8 @@ def sight(now_s, p, v=(0.0, 0.0, 0.0), yaw=0.0):
     return Sight(now_s, np.array(p), yaw, np.array(v), view=view)
 
 
-def fly(path, seconds):
-    """A drone that follows every wish, recorded."""
+def fly(path, seconds, held_x=math.inf):
+    """A drone that follows every wish, until a pane that nobody sees holds it, recorded."""
     log = PlanLog(path / PLAN, NavLimits())
     cockpit = Cockpit(NavLimits(), witness=log.add)
     cockpit.begin(GoTo(np.array([1.5, 0.2, 1.15])))
@@ -46,7 +46,11 @@ def fly(path, seconds):
         decisions.append(cockpit.plan(sight(k * TICK_S, p, v, yaw)))
         w, (c, s) = decisions[-1].wish, (math.cos(yaw), math.sin(yaw))
         v = np.array([c * w.forward_m_s - s * w.left_m_s, s * w.forward_m_s + c * w.left_m_s, w.up_m_s])
+        if p[0] + TICK_S * v[0] > held_x:
+            v = np.zeros(3)
         p, yaw = p + TICK_S * v, yaw + TICK_S * w.turn_left_rad_s
+        if math.isfinite(held_x):
+            cockpit.order(sight(k * TICK_S, p, v, yaw))
     log.close()
     return decisions
 
@@ -89,6 +93,17 @@ def test_the_same_planner_decides_the_same(flight):
     found = replay(folder)
     assert [step.now for step in found.steps] == decisions
     assert not found.differing and found.tasks == ("GoTo",)
+
+
+def test_what_was_felt_and_not_seen_turns_it_away_and_is_replayed(tmp_path):
+    decisions = fly(tmp_path, 15.0, held_x=0.6)
+    entries = list(read_plan(tmp_path / PLAN))
+    touches = [k for k, entry in enumerate(entries) if isinstance(entry, Touch)]
+    assert touches and entries[touches[0]].p_w[0] == pytest.approx(0.6, abs=0.05)
+    assert entries[touches[0]].towards_w[0] > 0.7
+    before, after = (next(e for e in entries[touches[0] + s :: s] if isinstance(e, Decision)) for s in (-1, 1))
+    assert before.wish.forward_m_s > 0.2 and after.wish.forward_m_s < 0.05
+    assert [step.now for step in replay(tmp_path).steps] == decisions
 
 
 def test_another_speed_limit_decides_otherwise(flight):

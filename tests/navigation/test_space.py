@@ -5,7 +5,7 @@ import pytest
 
 from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.navigation.moved import Moved
-from edgeslam_torch.navigation.sight import View
+from edgeslam_torch.navigation.sight import Touch, View
 from edgeslam_torch.navigation.space import Space
 
 K = np.array([[77.0, 0.0, 39.5], [0.0, 77.0, 29.5], [0.0, 0.0, 1.0]])
@@ -145,3 +145,31 @@ def test_a_surface_without_a_sure_place_frees_and_fills_nothing_there():
     assert cell(layer, 1.0, 0.05) == (True, False)
     assert not layer.solid.any()
     assert seen(Space(), sigma=0.1).solid.any()
+
+
+def test_what_was_touched_is_solid_whatever_is_seen():
+    space = Space()
+    layer = seen(space, distance_m=4.0)
+    assert cell(layer, 1.22, 0.05) == (True, False)
+    space.touched(Touch(np.array([1.05, 0.05, 1.15]), np.array([1.0, 0.0])), 0.17)
+    layer = seen(space, distance_m=4.0)
+    assert cell(layer, 1.22, 0.05) == (False, True), "ahead of the drone"
+    assert cell(layer, 0.88, 0.05) == (True, False), "not behind it"
+    assert cell(layer, 1.05, 0.25) == (True, False), "not beside it"
+
+
+def test_what_was_touched_moves_with_the_map():
+    space = Space()
+    space.touched(Touch(np.array([1.05, 0.05, 1.15]), np.array([1.0, 0.0])), 0.17)
+    T = np.eye(4)[None]
+    shifted = T.copy()
+    shifted[0, :3, 3] = [1.0, 2.0, 0.0]
+    space.rebuild(Moved(T, shifted, 1.0))
+    layer = space.layer(1.15, 0.15)
+    assert cell(layer, 2.22, 2.05)[1] and not cell(layer, 1.22, 0.05)[1]
+
+
+def test_a_touch_beyond_the_grid_is_no_error():
+    space = Space()
+    space.touched(Touch(np.array([100.0, 0.0, 1.15]), np.array([1.0, 0.0])), 0.17)
+    assert not space.layer(1.15, 0.15).solid.any()

@@ -114,6 +114,21 @@ def test_commanded_and_not_moving_is_a_contact_and_lands_in_the_end():
     assert held[-1].land
 
 
+def test_what_holds_the_drone_is_told_once_with_its_direction():
+    """It looks along y and is told to go left: along -x."""
+    supervisor = Supervisor()
+    still = {"p_w": np.array([0.5, 0, 1.1]), "velocity_w": np.zeros(3), "yaw_rad": math.pi / 2}
+    touches = []
+    for k in range(60):
+        now = 1.0 + k / 15
+        supervisor.see(replace(sight(now), **still))
+        supervisor.propose(Wish(left_m_s=0.4), now)
+        touches.append(supervisor.order(now).touch)
+    (touch,) = [t for t in touches if t is not None]
+    np.testing.assert_allclose(touch.p_w, [0.5, 0, 1.1])
+    np.testing.assert_allclose(touch.towards_w, [-1.0, 0.0], atol=1e-9)
+
+
 def test_a_drone_that_is_told_to_wait_is_not_held():
     """Metres are not sure: it goes up and down whatever the pilot wishes, and that is no contact."""
     supervisor = Supervisor()

@@ -143,6 +143,8 @@ def _fly(
             if sight.moved is not None:
                 supervisor.carry(sight.moved)
         order = supervisor.order(tello.clock_s)
+        if order.touch is not None:
+            errand.pilot.touched(order.touch)
         cpu_s = time.process_time() - began
         speed, clear_m = float(np.linalg.norm(drone.velocity)), drone.clearance(drone.p_w)
         ticks.append(_Tick(tello.clock_s, drone.p_w.copy(), drone.rpy(), speed, clear_m, cpu_s))
