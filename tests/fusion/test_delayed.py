@@ -118,6 +118,22 @@ def test_a_drone_that_hovers_unseen_stays_where_it_was():
     assert abs(p_w[-1] - p_w[5]) < 0.02
 
 
+def test_the_speed_of_a_wrong_map_does_not_stay_when_it_is_lost():
+    """A map sinks at .7 m/s for 2 s while the drone flies level, told as .2 m/s ahead; then nothing is seen for 5 s."""
+    ekf = BufferedEkf(CONFIG)
+    T = np.eye(4)
+    T[:3, 3] = [0.02, 0.0, -0.07]
+    for k in range(70):
+        ekf.add_telemetry(TelemetrySample(0.1 * k, np.array([0.2, 0.0, 0.1]), np.zeros(3), battery=1.0))
+        if 0 < k <= 20:
+            ekf.add_relative(0.1 * (k - 1), 0.1 * k, T, PoseSigma(0.003, 0.003))
+            lost_w = ekf.state_at(0.1 * k).p_w
+    moved = ekf.state_at(6.9).p_w - lost_w
+    assert moved[0] == pytest.approx(0.98, abs=0.1)
+    assert moved[2] > -0.1, "the map sank by .7 m/s, and may not go on with it"
+    assert np.abs(ekf.state_at(6.9).velocity_bias_m_s).max() <= CONFIG.velocity_step_m_s
+
+
 def test_silence_of_telemetry_only_adds_uncertainty(rng):
     ekf = run(telemetry(rng, 20), [], 0.0)
     near, far = ekf.state_at(1.95), ekf.state_at(6.0)

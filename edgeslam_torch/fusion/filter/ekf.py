@@ -286,6 +286,8 @@ class Ekf:
         self.P = 0.5 * (P + P.T)
         if not self.config.literal:
             _wrap_in_place(self.x, (3, 4, 5, 12, 13, 14))
+            # Whole steps hide less than a step. A wrong map moves faster: where it is lost, its speed must not stay.
+            np.clip(self.x[_B], -self.config.velocity_step_m_s, self.config.velocity_step_m_s, out=self.x[_B])
         return outcome
 
     def state(self, stamp_s: float) -> EkfState:
