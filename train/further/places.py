@@ -1,5 +1,9 @@
-"""Rendered corridors, halls and rooms of many sizes, seen level and obliquely, as training views kept in a file."""
+"""Rendered corridors, halls, rooms of many sizes and the sites of flights, as training views kept in a file.
 
+They are seen level, obliquely and from near.
+"""
+
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +21,7 @@ from edgeslam_torch.synthetic.house.rooms import (
     room,
 )
 from edgeslam_torch.synthetic.house.world import World
+from edgeslam_torch.synthetic.sites.build import JUDGED, named_site
 from edgeslam_torch.types import FloatArray
 
 Rng = np.random.Generator
@@ -24,15 +29,19 @@ WIDTH, HEIGHT = 320, 240
 LEVEL_FOCAL_PX = (140.0, 380.0)
 """Of the 320 pixel wide images: 98 to 46 degrees across."""
 OBLIQUE_FOCAL_PX = (130.0, 300.0)
-LEVEL_VIEWS, OBLIQUE_VIEWS = 10, 6
+LEVEL_VIEWS, OBLIQUE_VIEWS, NEAR_VIEWS = 8, 5, 5
 """Of each place."""
 NEAREST_M = 0.18
-"""Least fifth percentile of an oblique view's depth: nearer, a single texture fills it."""
+"""Least fifth percentile of an oblique or near view's depth: nearer, a single texture fills it."""
+SITE_SEEDS = (1_000_000, 2_000_000)
+"""Of sites to learn from; flights are judged on smaller ones."""
 TRIES = 8
 
 
 def random_place(rng: Rng) -> World:
     """A place of random kind and size: what a drone flies through that `random_room` does not have."""
+    if rng.random() < 0.25:
+        return named_site(str(rng.choice((*JUDGED, "doors"))), int(rng.integers(*SITE_SEEDS))).world
     kind = rng.random()
     if kind < 0.3:
         return random_room(rng)
@@ -71,10 +80,30 @@ def oblique_pose(rng: Rng, world: World) -> FloatArray | None:
     return None
 
 
-def oblique_view(rng: Rng, camera: Camera, world: World) -> Rendered | None:
-    """A view from `oblique_pose` that is not filled by what is next to the lens; None without one."""
+def near_pose(rng: Rng, world: World) -> FloatArray | None:
+    """A pose ``T_w_c`` of a drone that has something 0.35 to 1 m beside or before it; None without a free place."""
+    low, high = world.bounds_w
+    wanted = _log(rng, 0.35, 1.0)
+    for _ in range(60):
+        p = rng.uniform(low + 0.3, high - 0.3)
+        p[2] = np.clip(rng.normal(1.1, 0.3), 0.3, high[2] - 0.3)
+        away = float(world.clearance(p))
+        if not 0.8 * wanted < away < 1.25 * wanted:
+            continue
+        towards = away - np.array([float(world.clearance(p + step)) for step in 0.05 * np.eye(3)[:2]])
+        if np.linalg.norm(towards) < 0.025:  # the floor or the ceiling is nearest
+            continue
+        yaw = float(np.arctan2(towards[1], towards[0])) + float(rng.normal(0.0, 0.6))
+        return look(p, yaw, float(np.clip(rng.normal(0.05, 0.12), -0.5, 0.5)), float(rng.normal(0.0, 0.06)))
+    return None
+
+
+def close_view(
+    rng: Rng, camera: Camera, world: World, pose: Callable[[Rng, World], FloatArray | None]
+) -> Rendered | None:
+    """A view from `oblique_pose` or `near_pose` that is not filled by what is next to the lens; None without one."""
     for _ in range(TRIES):
-        T_w_c = oblique_pose(rng, world)
+        T_w_c = pose(rng, world)
         if T_w_c is None:
             return None
         if np.percentile(render(world, camera.scaled(40, 30), T_w_c, antialias=False).depth_m, 5) > NEAREST_M:
@@ -89,18 +118,25 @@ def render_places(path: Path, places: int, seed: int = 21) -> None:
     for p in tqdm(range(places), desc="rendering places", disable=None):
         rng = np.random.default_rng((seed, p))
         world = random_place(rng)
-        for k in range(LEVEL_VIEWS + OBLIQUE_VIEWS):
-            is_level = k < LEVEL_VIEWS
-            camera = _camera(_log(rng, *(LEVEL_FOCAL_PX if is_level else OBLIQUE_FOCAL_PX)))
-            rendered = random_view(rng, camera, world) if is_level else oblique_view(rng, camera, world)
-            if rendered is None:
-                continue
+        for camera, rendered in _views(rng, world):
             images.append(rendered.image)
             depths.append(rendered.depth_m.astype(np.float16))
             matrices.append(camera.K)
     temporary = path.with_suffix(".part.npz")
     np.savez(temporary, image=np.array(images), depth=np.array(depths), K=np.array(matrices))
     temporary.replace(path)
+
+
+def _views(rng: Rng, world: World) -> Iterator[tuple[Camera, Rendered]]:
+    """All views of a place that there are."""
+    for kind in ["level"] * LEVEL_VIEWS + ["oblique"] * OBLIQUE_VIEWS + ["near"] * NEAR_VIEWS:
+        camera = _camera(_log(rng, *(OBLIQUE_FOCAL_PX if kind == "oblique" else LEVEL_FOCAL_PX)))
+        if kind == "level":
+            rendered: Rendered | None = random_view(rng, camera, world)
+        else:
+            rendered = close_view(rng, camera, world, oblique_pose if kind == "oblique" else near_pose)
+        if rendered is not None:
+            yield camera, rendered
 
 
 def _camera(focal_px: float) -> Camera:

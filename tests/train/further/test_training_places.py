@@ -38,10 +38,27 @@ def test_oblique_poses_stand_near_a_wall_and_look_along_or_into_it(corridor) -> 
         np.testing.assert_allclose(T_w_c[:3, :3] @ T_w_c[:3, :3].T, np.eye(3), atol=1e-9)
 
 
+def test_near_poses_look_at_what_stands_beside_them(corridor) -> None:
+    """In a corridor without furniture the nearest wall is .3 to 1.25 m away, and mostly in view."""
+    rng = np.random.default_rng(2)
+    low, high = corridor.bounds_w
+    into = []
+    for _ in range(30):
+        T_w_c = places.near_pose(rng, corridor)
+        assert T_w_c is not None
+        p, ahead = T_w_c[:3, 3], T_w_c[:3, 2]
+        gaps = np.array([p[0] - low[0], high[0] - p[0], p[1] - low[1], high[1] - p[1]])
+        assert 0.25 < gaps.min() < 1.3
+        outwards = np.array([[-1, 0], [1, 0], [0, -1], [0, 1]])[gaps.argmin()]
+        into.append(outwards @ ahead[:2])
+    assert np.median(into) > 0.7
+
+
 @pytest.mark.slow
 def test_a_place_depends_on_its_number_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(places, "LEVEL_VIEWS", 1)
     monkeypatch.setattr(places, "OBLIQUE_VIEWS", 1)
+    monkeypatch.setattr(places, "NEAR_VIEWS", 1)
     monkeypatch.setattr(places, "WIDTH", 64)
     monkeypatch.setattr(places, "HEIGHT", 48)
     for count in (1, 2):
