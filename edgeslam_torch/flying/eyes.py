@@ -13,8 +13,8 @@ from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.navigation.moved import Moved, moves
-from edgeslam_torch.navigation.near_depth import fit_to_points
-from edgeslam_torch.navigation.near_points import agreeing, seen_points, with_nearer_points
+from edgeslam_torch.navigation.near.depth import fit_to_points
+from edgeslam_torch.navigation.near.points import agreeing, seen_points, with_nearer_points
 from edgeslam_torch.navigation.sight import Sight, View
 from edgeslam_torch.navigation.space import CELL_M, KEPT
 from edgeslam_torch.slam import EdgeSlam

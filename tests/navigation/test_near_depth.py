@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from edgeslam_torch.navigation.near_depth import MIN_POINTS, NearFit, fit_near, fit_to_points, local_error
+from edgeslam_torch.navigation.near.depth import MIN_POINTS, NearFit, fit_near, fit_to_points, local_error
 from edgeslam_torch.types import DepthMap
 
 

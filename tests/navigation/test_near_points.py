@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from edgeslam_torch.navigation.near_points import ALIKE, SIGMA_LOG, agreeing, seen_points, with_nearer_points
+from edgeslam_torch.navigation.near.points import ALIKE, SIGMA_LOG, agreeing, seen_points, with_nearer_points
 from edgeslam_torch.types import DepthMap
 
 K = np.array([[100.0, 0.0, 59.5], [0.0, 100.0, 44.5], [0.0, 0.0, 1.0]])

@@ -187,6 +187,7 @@ def test_a_further_flight_has_another_path_through_the_same_world(tmp_path, monk
     assert world.clearance(again.positions[0]) > 0.2, "in free space of that world"
 
 
+@pytest.mark.slow
 def test_a_further_flight_through_the_building_takes_off_from_the_same_place(tmp_path, monkeypatch):
     monkeypatch.setitem(COURSES, "building", replace(COURSES["building"], seconds=6.0, rate_hz=2.0))
     assert flights.main("building", 0, tmp_path / "again", 1) == 0
