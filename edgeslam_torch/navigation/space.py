@@ -61,7 +61,7 @@ class Space:
     """``(2,)`` int, cell of the world at its corner."""
     _views: deque[View] = field(init=False)
     _flown: deque[tuple[FloatArray, float]] = field(init=False)
-    _touched: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    _touched: FloatArray = field(init=False)
     """``(N, 3)`` where the drone was held by what it does not see."""
 
     def __post_init__(self) -> None:
@@ -69,6 +69,7 @@ class Space:
         self._corner = np.floor(self.centre_w / CELL_M).astype(int) - SIDE // 2
         self._views = deque(maxlen=KEPT)
         self._flown = deque(maxlen=4000)
+        self._touched = np.zeros((0, 3))
 
     def observe(self, view: View) -> None:
         """Carve and fill by a depth map."""
