@@ -302,7 +302,7 @@ class EdgeSlam:
     def surroundings(self) -> FloatArray:
         """Anchors and edge points ``(N, 3)`` float64 of keyframes that see what the newest frame sees, as published.
 
-        What an obstacle is told by: a consistent snapshot, at a tenth of the cost of both maps.
+        What an obstacle is told by: a consistent snapshot in a millisecond; both whole maps take thirty to fifty.
         """
         if not self.log.records:
             return np.zeros((0, 3))

@@ -60,7 +60,8 @@ class FusionConfig:
     sigma_attitude_rad: float = math.radians(0.36)
     """Error of one attitude reading: 1 deg / sqrt(12) of quantisation that repeats while the drone hovers."""
     sigma_turn_rad_sqrt_s: float = 0.05
-    """Random walk of the angles between readings, on top of the turning that the readings themselves show."""
+    """Random walk of the angles between readings, on top of the turning that the readings themselves show: what makes
+    the stated rotation as far off as it is (`eval.benchmark.consistency`; .06 states up to a third more)."""
     sigma_bias_m_s: float = 0.03
     """Velocity bias at the start (0 takes the bias out of the state: the paper's six states)."""
     bias_walk_m_s_sqrt_s: float = 0.015

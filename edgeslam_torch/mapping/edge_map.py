@@ -270,8 +270,8 @@ class EdgeMap:
     def around(self, keyframe: Keyframe) -> FloatArray:
         """Edge points ``(E, 3)`` in the map's world that several keyframes agree on, of those that see the same as one.
 
-        A consistent snapshot, callable from any thread, at a tenth of the cost of all `points`. Their depth is known to
-        `NEARLY`.
+        A consistent snapshot, callable from any thread, at a fraction of the cost of all `points`. Their depth is
+        known to `NEARLY`.
         """
         with self.map.lock:
             same = [h for h in self.hosts if h.keyframe_id == keyframe.id]
