@@ -40,6 +40,7 @@ from edgeslam_torch.fusion.telemetry.track import TelemetryTrack
 from edgeslam_torch.fusion.telemetry.unrest import Unrest
 from edgeslam_torch.fusion.telemetry.visual_memory import VisualMemory, VisualPose
 from edgeslam_torch.fusion.telemetry_scale import TelemetryFit, TelemetryScale
+from edgeslam_torch.geometry.rotations import rotation_vector
 from edgeslam_torch.types import FloatArray, Health, ScaleEstimate, TelemetrySample
 
 _REFIT_S = 1.0
@@ -49,6 +50,10 @@ _REFIT_SHARE = 0.12
 """Each fit costs more and changes less than the one before."""
 _BELIEVED = 0.3
 """Relative sigma of a scale from telemetry that is used."""
+_TURNED_S = 5.0
+"""Time over which the map and the drone's attitude have turned together: maps drift by a degree in it."""
+_STAMPED_S = 0.05
+"""Standard deviation of a message's moment: half of the time from one to the next."""
 _FOCAL_SHARE = 0.4
 """How much of a focal length's error the scale from telemetry takes on: with 0.7 to 1.5 times the right one the root
 mean square over fr1_xyz, redkitchen and euroc_mh05_a is 0.4 in the logarithm."""
@@ -261,6 +266,24 @@ class MotionFusion:
         up_c = self.T_b_c[:3, :3].T @ self._track.attitude(around)[:, 2].T  # a column each
         turned = max(float(np.linalg.norm(up_c[:, k] - up_c[:, 0])) for k in (1, 2))
         return up_c[:, 0], turned
+
+    def turned(self, stamp_s: float) -> tuple[FloatArray, float] | None:
+        """Rotation ``R_c_m`` ``(3, 3)`` of a frame's camera by the drone's attitude, turned into the map as the last
+        seconds' frames were, and how far [rad] it turned within the doubt about the video's delay; None where
+        telemetry has not proven to be of this flight, or the map is too young."""
+        late_s = math.hypot(self.delay_sigma_s, _STAMPED_S)
+        around = stamp_s - self.delay_s + np.array([0.0, -late_s, late_s])
+        if not (self._trust.turns and math.isfinite(late_s) and self._track.covered(around[:1], around[:1])[0]):
+            return None
+        recent = self._memory.recent(stamp_s - _TURNED_S)
+        if recent is None:
+            return None
+        R_w_m = map_to_world(recent, self._track, self.delay_s, self.T_b_c[:3, :3])
+        if R_w_m is None:
+            return None
+        R_m_c = R_w_m.T @ self._track.attitude(around) @ self.T_b_c[:3, :3]
+        doubt = max(float(np.linalg.norm(rotation_vector(R_m_c[0].T @ R_m_c[k]))) for k in (1, 2))
+        return R_m_c[0].T, doubt
 
     def rotation(self) -> FloatArray | None:
         """``R_w_m`` ``(3, 3)``: map axes to the drone's power-on world; ``None`` without telemetry attitude."""

@@ -18,7 +18,7 @@ from edgeslam_torch.map.trajectory import TrajectoryLog
 from edgeslam_torch.mapping.edge_map import EdgeMap
 from edgeslam_torch.mapping.pipeline import Mapped, MappingPipeline
 from edgeslam_torch.stage_times import timed
-from edgeslam_torch.tracking.expectation import Expectation, Vertical
+from edgeslam_torch.tracking.expectation import Attitude, Expectation, Vertical
 from edgeslam_torch.tracking.motion_model import MotionModel
 from edgeslam_torch.tracking.relocaliser import Reach, reach_after
 from edgeslam_torch.tracking.tracker import Track, Tracker
@@ -95,6 +95,11 @@ class System:
         told = self.fusion.vertical(stamp_s) if self._is_young(stamp_s) else None
         vertical = None if told is None else Vertical(*told)
         return Expectation(self.motion.expectation(stamp_s, T_predicted, self.published.scale), vertical)
+
+    def attitude(self, stamp_s: float) -> Attitude | None:
+        """Rotation that the drone tells for a frame; None where it is not known to turn with the images."""
+        turned = self.fusion.turned(stamp_s) if self.has_telemetry else None
+        return None if turned is None else Attitude(*turned)
 
     def reach(self, stamp_s: float, T_predicted: FloatArray) -> Reach:
         """Region that the camera can have reached during frames without a pose."""

@@ -69,22 +69,43 @@ class Tracking:
         system = self.system
         T_predicted = system.predict(frame.stamp_s, lost=False)
         with system.map.lock:
-            with system.timed("tracking"):
-                followed = self._follow(seen, T_predicted, frame.stamp_s)
-            located = None
-            if followed is not None and followed.trusted:
-                located = self._locate_followed(followed, frame.stamp_s)
-            # While the worker is busy no keyframe can be created; matching then finds newly mapped anchors.
-            # What has left the view cannot be followed: the frame's own keypoints come first then, flow comes last.
-            strong = followed is not None and followed.share >= system.config.flow.min_share
-            if located is None or located.due or not strong:
-                matched = self._match(frame, seen, T_predicted, followed, strong)
-                if matched is None and located is not None and followed is not None:
-                    matched = self._on_flow_alone(seen, located, followed, hurry=not strong)
-                located = matched
-            if located is None:
-                located = self._by_edges(frame, seen, T_predicted)
+            located = self._locate(frame, seen, T_predicted)
+            if located is not None:
+                located = self._as_turned(frame, seen, T_predicted, located)
             return None if located is None else self.arrive(frame, seen, T_predicted, located)
+
+    def _locate(self, frame: Frame, seen: LazyView, T_predicted: FloatArray) -> Located | None:
+        """The frame's pose near a prediction: by flow, by matching, by edges; None if that fails."""
+        system = self.system
+        with system.timed("tracking"):
+            followed = self._follow(seen, T_predicted, frame.stamp_s)
+        located = None
+        if followed is not None and followed.trusted:
+            located = self._locate_followed(followed, frame.stamp_s)
+        # While the worker is busy no keyframe can be created; matching then finds newly mapped anchors.
+        # What has left the view cannot be followed: the frame's own keypoints come first then, flow comes last.
+        strong = followed is not None and followed.share >= system.config.flow.min_share
+        if located is None or located.due or not strong:
+            matched = self._match(frame, seen, T_predicted, followed, strong)
+            if matched is None and located is not None and followed is not None:
+                matched = self._on_flow_alone(seen, located, followed, hurry=not strong)
+            located = matched
+        return self._by_edges(frame, seen, T_predicted) if located is None else located
+
+    def _as_turned(self, frame: Frame, seen: LazyView, T_predicted: FloatArray, located: Located) -> Located:
+        """A pose that the drone's attitude denies is sought once more, where attitude has it.
+
+        Where a pattern repeats, as on wallpaper, images hold a pose by the neighbour of what they show. Where they
+        show the same pose again it stays: attitude alone moves none.
+        """
+        attitude, template = self.system.attitude(frame.stamp_s), self._template
+        if attitude is None or not attitude.denies(located.track.T_c_w):
+            return located
+        again = self._locate(frame, seen, attitude.applied_to(T_predicted))
+        if again is None or attitude.denies(again.track.T_c_w):
+            self._template = template
+            return located
+        return again
 
     def search(self, frame: Frame, seen: LazyView, T_predicted: FloatArray, lost_frames: int) -> Step | None:
         """Relocalise a frame among keyframes; None without success."""
@@ -225,7 +246,7 @@ class Tracking:
         with self.system.timed("edges"):
             expected = self.system.expectation(frame.stamp_s, T_predicted)
             alone = self._edge_tracker.refine(seen.grey, T_predicted, None, expected)
-        if alone is None or not alone.is_fixed:
+        if alone is None or not alone.is_fixed or self._denied(alone.T_c_w, frame.stamp_s):
             return None
         none = np.zeros(0, dtype=np.int64)
         track = Track(alone.T_c_w, none, none, none, none, alone.covariance)
@@ -246,8 +267,15 @@ class Tracking:
             both = self._edge_tracker.refine(seen.grey, located.track.T_c_w, points, expected)
         if both is None or both.edges < MIN_EDGES or both.points.mean() < 0.5:
             return located
+        if self._denied(both.T_c_w, frame.stamp_s):
+            return located
         track = replace(located.track, T_c_w=both.T_c_w, covariance=both.covariance)
         return replace(located, track=track, edges=both.edges)
+
+    def _denied(self, T_c_w: FloatArray, stamp_s: float) -> bool:
+        """Whether the drone has not turned as a pose ``(4, 4)`` by edges has; parallel ones hold few directions."""
+        attitude = self.system.attitude(stamp_s)
+        return attitude is not None and attitude.denies(T_c_w)
 
     # -- keyframes ---------------------------------------------------------------------------------------------
 

@@ -16,6 +16,8 @@ from edgeslam_torch.types import FloatArray, IntArray
 HELD_RAD = 5e-5
 """Standard deviation that holds a direction against hundreds of corners: together they tell it to .01 px. What all of
 them say alike, on guessed depths, is no better for their number."""
+DENIED_RAD = math.radians(3.0)
+"""Turn that whole degrees do not explain: three readings' worst, where tracked poses stay within one."""
 NO_WORSE = 0.9
 """Share of the inliers that an upright pose must keep of a free one's: where the images contradict it they say so by
 as many. A climb that is taken for a turn has as many either way."""
@@ -29,6 +31,28 @@ class Vertical:
     """``(3,)`` in the camera's axes."""
     doubt_rad: float
     """How far it may be off, where the moment is not known: it turned by so much around it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Attitude:
+    """The camera's rotation as the drone's attitude has it, by the map of the last seconds."""
+
+    R_c_w: FloatArray
+    """``(3, 3)`` map to camera."""
+    doubt_rad: float
+    """How far it may be off, where the moment is not known: it turned by so much around it."""
+
+    def denies(self, T_c_w: FloatArray) -> bool:
+        """Whether a pose ``(4, 4)`` has turned as the drone has not."""
+        cosine = 0.5 * (float(np.sum(self.R_c_w * T_c_w[:3, :3])) - 1.0)
+        return math.acos(min(max(cosine, -1.0), 1.0)) > DENIED_RAD + self.doubt_rad
+
+    def applied_to(self, T_c_w: FloatArray) -> FloatArray:
+        """A pose ``(4, 4)`` with this rotation, its centre where it is."""
+        T = np.eye(4)
+        T[:3, :3] = self.R_c_w
+        T[:3, 3] = self.R_c_w @ T_c_w[:3, :3].T @ T_c_w[:3, 3]
+        return T
 
 
 @dataclass(frozen=True, slots=True)

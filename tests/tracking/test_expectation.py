@@ -10,7 +10,7 @@ from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.map.anchors import Anchors
 from edgeslam_torch.optim.pose_only import PoseConfig
 from edgeslam_torch.optim.problem import PosePrior
-from edgeslam_torch.tracking.expectation import Expectation, Vertical, levelled, pose_on_anchors
+from edgeslam_torch.tracking.expectation import Attitude, Expectation, Vertical, levelled, pose_on_anchors
 
 CAMERA = Camera(640, 480, 460.0, 460.0, 320.0, 240.0)
 LEVEL = np.array([[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
@@ -83,3 +83,15 @@ def test_levelling_keeps_the_centre_and_the_heading():
     about, across = LEVEL[:3, 2], np.array([0.0, 0.0, 1.0])
     assert about @ prior.information[3:, 3:] @ about == pytest.approx(1.0)
     assert across @ prior.information[3:, 3:] @ across > 1e8
+
+
+def test_attitude_denies_a_turn_that_whole_degrees_do_not_explain():
+    told = Attitude(LEVEL[:3, :3], math.radians(1.0))
+    assert not told.denies(LEVEL) and not told.denies(climbed())
+    assert not told.denies(tilted(3.9)) and not told.denies(tilted(-3.9))
+    assert told.denies(tilted(4.1)) and told.denies(tilted(-4.1))
+
+
+def test_attitude_turns_a_pose_about_its_centre():
+    turned = Attitude(LEVEL[:3, :3], 0.0).applied_to(tilted(20.0, climbed()))
+    np.testing.assert_allclose(turned, climbed(), atol=1e-12)

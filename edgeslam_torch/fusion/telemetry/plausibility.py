@@ -235,6 +235,11 @@ class Trust:
         return self.elsewhere_s is None and self.verdict(Reading.ATTITUDE) is not Verdict.CONTRADICTS
 
     @property
+    def turns(self) -> bool:
+        """Whether attitude may say that the camera has not turned: it has turned with the images before."""
+        return self.elsewhere_s is None and self.verdict(Reading.ATTITUDE) is Verdict.AGREES
+
+    @property
     def proven(self) -> bool:
         """Whether anything has proven that telemetry is of this flight, and nothing that it is not."""
         readings = (Reading.VELOCITY, Reading.ATTITUDE, *HEIGHTS)

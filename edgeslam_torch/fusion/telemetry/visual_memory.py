@@ -2,8 +2,9 @@
 
 import math
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
+from itertools import islice, takewhile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,8 @@ from edgeslam_torch.types import FloatArray
 
 _SIGHTING_S = 0.09
 """Minimum time between the poses kept: telemetry comes every 0.1 s."""
+_FEW = 4
+"""Recent poses below which their mean is not asked for: a second of flight."""
 _MANY_DISPLACEMENTS = 16
 """Number of displacements, eight seconds of them, from which on pairs are joined to intervals of a second."""
 
@@ -200,12 +203,22 @@ class VisualMemory:
             )
         return self._displacements
 
+    def recent(self, since_s: float) -> Sightings | None:
+        """Every third of those since a stamp, as arrays; None where they are too few for a mean."""
+        newest_first = takewhile(lambda v: v.stamp_s >= since_s, reversed(self._sightings))
+        some = list(islice(newest_first, 0, None, 3))
+        return _arrays(some) if len(some) >= _FEW else None
+
     def sightings(self) -> Sightings:
         """All of them as arrays."""
         if self._shown is None:
-            self._shown = Sightings(
-                np.array([v.stamp_s for v in self._sightings]),
-                np.array([v.T for v in self._sightings]).reshape(-1, 4, 4),
-                np.array([v.sigma_t for v in self._sightings]),
-            )
+            self._shown = _arrays(self._sightings)
         return self._shown
+
+
+def _arrays(poses: Collection[VisualPose]) -> Sightings:
+    return Sightings(
+        np.array([v.stamp_s for v in poses]),
+        np.array([v.T for v in poses]).reshape(-1, 4, 4),
+        np.array([v.sigma_t for v in poses]),
+    )
