@@ -13,7 +13,7 @@ from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.navigation.moved import Moved, moves
-from edgeslam_torch.navigation.near.depth import fit_to_points
+from edgeslam_torch.navigation.near.depth import NearFit, fit_to_points
 from edgeslam_torch.navigation.near.points import agreeing, seen_points, with_nearer_points
 from edgeslam_torch.navigation.sight import Sight, View
 from edgeslam_torch.navigation.space import CELL_M, KEPT
@@ -26,6 +26,8 @@ _DEPTH_EVERY = 3
 """Frames from one depth map to the next: 5 a second."""
 _STEP = 4
 """Depth is handed on at a quarter of the picture's size."""
+_CARRIED_S = 4.0
+"""Time after a pose is lost in which depth goes on by the last fit: a bare wall shows no point to fit it to."""
 _LOST = ("lost", "starting")
 _DISAGREE_SIGMAS = 3.0
 _WIDEST_SIGMA_M = 0.2
@@ -61,6 +63,8 @@ class SlamEyes:
         self._captured_s = 0.0
         self._output: SlamOutput | None = None
         self._home = Home(np.eye(3), 1.0, np.zeros(3))
+        self._fit: tuple[NearFit, float, int] | None = None
+        """The last fit of depth to points, when its picture arrived, and in which unit."""
         self._metres = np.nan
         """Metres per map unit by which it goes; NaN while the published unit is all there is."""
         self._battery = 1.0
@@ -94,7 +98,7 @@ class SlamEyes:
         T_slam = self._slam.trajectory()[1]
         self._frames += 1
         revised, self._revision = output.revision != self._revision, output.revision
-        due = (revised or self._frames % _DEPTH_EVERY == 0) and _tracks(output)
+        due = revised or self._frames % _DEPTH_EVERY == 0
         depth = self._depth(image, output) if due else None
         # A pilot is told of new metres together with a view in them.
         may_move = depth is not None and captured_s - self._moved_s > _MOVES_EVERY_S
@@ -174,9 +178,10 @@ class SlamEyes:
     def _depth(self, image: np.ndarray, output: SlamOutput) -> DepthMap | None:
         """Depth at a quarter of the picture's size, in published units: the network's, brought to them by the map's
         points, and these where they stand before it; None with too few of them."""
+        if not _tracks(output) and self._last_fit(output) is None:
+            return None
         depth, T_w_c = self._network(image, self._camera), output.T_w_c
-        anchors = self._slam.anchors().p_w.astype(np.float64)
-        fit = fit_to_points(depth, *seen_points(anchors, self._camera.K, T_w_c, depth.depth_m.shape))
+        fit = self._fitted(depth, output) if _tracks(output) else self._last_fit(output)
         if fit is None:
             return None
         fitted = fit.applied(depth)
@@ -185,6 +190,21 @@ class SlamEyes:
         uv, z = seen_points(self._slam.surroundings(), self._K_small, T_w_c, small.depth_m.shape)
         kept = agreeing(uv, z, small.depth_m.shape[1])
         return with_nearer_points(small, uv[kept], z[kept])
+
+    def _fitted(self, depth: DepthMap, output: SlamOutput) -> NearFit | None:
+        """The network's depth against the map's points in the picture, kept for pictures without any."""
+        anchors = self._slam.anchors().p_w.astype(np.float64)
+        fit = fit_to_points(depth, *seen_points(anchors, self._camera.K, output.T_w_c, depth.depth_m.shape))
+        if fit is not None:
+            self._fit = fit.alone(), output.stamp_s, output.revision
+        return fit
+
+    def _last_fit(self, output: SlamOutput) -> NearFit | None:
+        """The last fit, for a picture without a place in the map; None if it is too old, or in another unit."""
+        if self._fit is None:
+            return None
+        fit, at_s, revision = self._fit
+        return fit if output.stamp_s - at_s < _CARRIED_S and output.revision == revision else None
 
     def _view(self, depth: DepthMap, home: Home, T_w_c: FloatArray, captured_s: float) -> View:
         """Depth in published units as a pilot is told of it, in metres."""

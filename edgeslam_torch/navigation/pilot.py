@@ -219,7 +219,9 @@ class Pilot:
         return float(np.clip(1.5 * error_m, -self.limits.climb_m_s, self.limits.climb_m_s))
 
     def _at_height(self, sight: Sight, wish: Wish) -> Wish:
-        up = self._climb(self.limits.height_m - float(sight.p_w[2]))
+        # A pose that telemetry carries drifts in height, too: by velocities that are cut off. The drone measures it.
+        carried = not sight.tracked and math.isfinite(sight.told_height_m)
+        up = self._climb(self.limits.height_m - (sight.told_height_m if carried else float(sight.p_w[2])))
         return Wish(wish.forward_m_s, wish.left_m_s, up, wish.turn_left_rad_s, wish.why)
 
     def _fly(self, sight: Sight) -> Wish:
@@ -332,7 +334,7 @@ class Pilot:
             return Wish(turn_left_rad_s=turn, why="look along the way")
         if math.isnan(self._waiting_s):
             self._waiting_s = sight.stamp_s
-        elif sight.stamp_s - self._waiting_s > _PATIENCE_S:
+        elif sight.stamp_s - self._waiting_s > _PATIENCE_S and sight.tracked:  # else there is no view to come
             self.phase, self._waiting_s = Phase.RISING, math.nan
             self._looked_w = sight.p_w[:2].copy()
         return Wish(turn_left_rad_s=turn, why="wait for a view of the way")

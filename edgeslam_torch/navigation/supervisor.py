@@ -31,6 +31,9 @@ SCALE_SIGMA = 0.10
 _KNOWN_S, _BEFORE_S = 1.2, 6.0
 """How long before its pose was lost it looked at what it knew well: pictures are up to half a second late. If that
 shows nothing, the second."""
+CARRIED_SIGMA_M = 0.12
+"""Standard deviation of the position up to which it flies on by telemetry alone where the picture shows nothing: two of
+them are the margin and the hull. A bare wall fills the picture for a metre of way; telemetry carries as far."""
 _WIGGLE_S, _WIGGLE_M_S = 2.0, 0.25
 """Up and down, which tells height and telemetry the scale."""
 _PUSHED_M_S, _STANDS_M_S, _PUSH_S = 0.15, 0.04, 1.5
@@ -98,6 +101,10 @@ class Supervisor:
     _trail: deque[FloatArray] = field(default_factory=lambda: deque(maxlen=400))
     """Where it flew, 5 cm apart."""
     _home_w: FloatArray | None = None
+    _known_w: FloatArray | None = None
+    """Where its pose rested on a map last."""
+    _back_s: float = math.nan
+    """How long it backs up, if its trouble makes it."""
     _headings: deque[tuple[float, float]] = field(default_factory=deque)
     """Moments and headings of the last `_BEFORE_S` with a pose that rests on a map."""
 
@@ -105,6 +112,7 @@ class Supervisor:
         """The newest sight."""
         self._sight = sight
         if sight.tracked:
+            self._known_w = sight.p_w
             self._headings.append((sight.stamp_s, sight.yaw_rad))
             while self._headings[0][0] < sight.stamp_s - _BEFORE_S:
                 self._headings.popleft()
@@ -140,9 +148,9 @@ class Supervisor:
             assert self._wish is not None
             return Order(self._within_heights(self._wish), home=home, danger=Danger.BATTERY_HOME if home else danger)
         trouble_s = self._trouble_s(danger, now_s)
-        patience_s = UNSURE_LAND_S if danger in _UNSURE else LAND_S
+        patience_s = UNSURE_LAND_S if danger in _UNSURE else LAND_S + self._back_s - _BACK_M / _BACK_M_S
         in_vain = trouble_s > patience_s or now_s - self._since_s > UNSURE_LAND_S
-        if in_vain or (danger is Danger.HELD and trouble_s > BACK_S + _BACK_M / _BACK_M_S):
+        if in_vain or (danger is Danger.HELD and trouble_s > BACK_S + self._back_s):
             self.landing = True
             return Order(Wish(why=str(danger)), land=True, danger=danger)
         felt = danger is Danger.HELD and trouble_s == 0.0
@@ -158,7 +166,14 @@ class Supervisor:
             return now_s - self._since_s
         if math.isnan(self._grave_s):
             self._grave_s = now_s
+            self._back_s = (_BACK_M + self._carried_m()) / _BACK_M_S
         return now_s - self._grave_s
+
+    def _carried_m(self) -> float:
+        """Way since its pose rested on a map."""
+        if self._known_w is None or self._sight is None:
+            return 0.0
+        return float(np.linalg.norm(self._sight.p_w[:2] - self._known_w[:2]))
 
     def _danger(self, sight: Sight, now_s: float) -> Danger:
         late = sight.blind_s + max(0.0, now_s - sight.stamp_s)
@@ -166,7 +181,7 @@ class Supervisor:
             (sight.battery <= self.limits.land_battery, Danger.BATTERY),
             (not sight.metric, Danger.NOT_METRIC),
             (self._is_held(sight, now_s), Danger.HELD),
-            (not sight.tracked, Danger.LOST),
+            (not sight.tracked and not self._is_carried(sight), Danger.LOST),
             (self._is_apart(sight, now_s), Danger.APART),
             (late > BLIND_S, Danger.BLIND),
             (sight.scale_sigma > SCALE_SIGMA or sight.conflict, Danger.SCALE),
@@ -174,6 +189,11 @@ class Supervisor:
             (self._wish is None or now_s - self._wished_s > STALE_S, Danger.NO_WISH),
         )
         return next((danger for holds, danger in checks if holds), Danger.NONE)
+
+    def _is_carried(self, sight: Sight) -> bool:
+        """Whether it goes on by telemetry alone: on its way, not in a turn to what it may not know."""
+        flies = self._wish is not None and math.hypot(self._wish.forward_m_s, self._wish.left_m_s) > 0.0
+        return flies and sight.position_sigma_m < CARRIED_SIGMA_M
 
     def _is_held(self, sight: Sight, now_s: float) -> bool:
         """Whether it was told to move for a while and did not; a wish that was not passed on moves nothing."""
@@ -232,11 +252,11 @@ class Supervisor:
             return self._within_heights(wish)
         if danger is Danger.LOST and trouble_s <= BACK_S:
             return Wish(turn_left_rad_s=self._turn_back(_KNOWN_S), why=f"{danger}: turn to what was known")
-        backing = BACK_S < trouble_s < BACK_S + _BACK_M / _BACK_M_S
+        backing = BACK_S < trouble_s < BACK_S + self._back_s
         if danger in (Danger.BLIND, Danger.LOST, Danger.HELD) and backing:  # not where the pose itself is wrong
             turn = self._turn_back(_BEFORE_S) if danger is Danger.LOST else 0.0
             return replace(self._back(danger), turn_left_rad_s=turn)
-        if danger is Danger.LOST and trouble_s > BACK_S + _BACK_M / _BACK_M_S:
+        if danger is Danger.LOST and trouble_s > BACK_S + self._back_s:
             return Wish(turn_left_rad_s=0.5 * self.limits.turn_rad_s, why=f"{danger}: look around")
         return Wish(why=f"{danger}: hover")
 
@@ -253,12 +273,14 @@ class Supervisor:
     def _back(self, danger: Danger) -> Wish:
         """Along the trail, away from where the trouble began."""
         assert self._sight is not None
-        here = self._sight.p_w
-        while self._trail and float(np.linalg.norm(self._trail[-1][:2] - here[:2])) < 2 * _TRAIL_M:
+        here = self._sight.p_w[:2]
+        away = np.linalg.norm(np.array(self._trail).reshape(-1, 3)[:, :2] - here, axis=1)
+        nearest = int(np.argmin(away)) if len(away) else 0
+        while self._trail and (len(self._trail) - 1 > nearest or away[len(self._trail) - 1] < 2 * _TRAIL_M):
             self._trail.pop()
         if not self._trail:
             return Wish(why=f"{danger}: hover")
-        step = self._trail[-1][:2] - here[:2]
+        step = self._trail[-1][:2] - here
         step = step * (_BACK_M_S / float(np.linalg.norm(step)))
         c, s = math.cos(self._sight.yaw_rad), math.sin(self._sight.yaw_rad)
         return Wish(c * step[0] + s * step[1], c * step[1] - s * step[0], 0.0, 0.0, f"{danger}: back the way it came")

@@ -66,7 +66,7 @@ def test_an_old_picture_stops_it_and_it_backs_up_the_way_it_came():
 @pytest.mark.parametrize(
     ("spoilt", "danger"),
     [
-        ({"tracked": False}, Danger.LOST),
+        ({"tracked": False, "position_sigma_m": 0.15}, Danger.LOST),
         ({"scale_sigma": 0.15}, Danger.SCALE),
         ({"conflict": True}, Danger.SCALE),
         ({"metric": False}, Danger.NOT_METRIC),
@@ -78,6 +78,44 @@ def test_doubt_stops_it(spoilt, danger):
     orders = flown(supervisor, 1.0, lambda s: replace(s, **spoilt), begin_s=1.0)
     assert {o.danger for o in orders} == {danger}
     assert all(o.wish.forward_m_s == 0.0 for o in orders)
+
+
+def test_telemetry_carries_it_past_what_shows_nothing_as_long_as_it_is_sure_of_its_place():
+    supervisor = Supervisor()
+    flown(supervisor, 1.0)
+    carried = {"tracked": False, "position_sigma_m": 0.1}
+    orders = flown(supervisor, 1.0, lambda s: replace(s, **carried), begin_s=1.0, x=0.5)
+    assert all(o.wish == AHEAD and o.danger is Danger.NONE for o in orders)
+    waiting = flown(supervisor, 0.2, lambda s: replace(s, **carried), Wish(turn_left_rad_s=0.5), begin_s=2.0, x=1.0)
+    assert {o.danger for o in waiting} == {Danger.LOST}  # it turns to what it may not know either
+
+
+def test_it_backs_up_to_where_it_was_sure_and_a_metre_farther():
+    """Its pose was lost at 1 m and carried on to 2 m."""
+    supervisor = Supervisor()
+    flown(supervisor, 2.0)
+    flown(supervisor, 2.0, lambda s: replace(s, tracked=False, position_sigma_m=0.1), begin_s=2.0, x=1.0)
+    x, wishes = 1.975, []
+    for k in range(400):
+        now = 4.0 + k / 20
+        supervisor.see(replace(sight(now, x), tracked=False, position_sigma_m=0.2))
+        supervisor.propose(AHEAD, now)
+        wishes.append(supervisor.order(now))
+        x += wishes[-1].wish.forward_m_s / 20
+        if wishes[-1].land:
+            break
+    assert x == pytest.approx(0.0, abs=0.15)
+    assert max(o.wish.forward_m_s for o in wishes) <= 0.0
+
+
+def test_it_backs_up_although_it_has_drifted_beside_its_way():
+    """By more than the steps in which the way is kept, half a metre back: onto it, and not forward to its end."""
+    supervisor = Supervisor()
+    flown(supervisor, 3.0)
+    aside = {"p_w": np.array([0.975, 0.2, 1.1]), "velocity_w": np.zeros(3), "tracked": False, "position_sigma_m": 0.2}
+    lost = flown(supervisor, 4.0, lambda s: replace(s, **aside), begin_s=3.0)
+    assert lost[-1].wish.why.endswith("back the way it came") and lost[-1].wish.left_m_s < 0.0
+    assert lost[-1].wish.forward_m_s < 1e-6
 
 
 def test_a_pose_lost_in_a_turn_is_looked_for_where_it_was_known():

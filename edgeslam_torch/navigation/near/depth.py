@@ -42,6 +42,10 @@ class NearFit:
     residual: FloatArray = field(default_factory=lambda: np.zeros(0))
     """``(P,)`` logarithm of map depth over the line there."""
 
+    def alone(self) -> "NearFit":
+        """The line without its points: of another picture than theirs."""
+        return NearFit(self.offset, self.slope, self.sigma_log, self.points)
+
     def applied(self, depth: DepthMap) -> DepthMap:
         """Depth in metres, with the line's errors made up for near the points; unknown where the network's is.
 
@@ -96,7 +100,9 @@ def local_error(
     kept = residual < 3.0 * spread
     block = np.clip((uv[kept] / _BLOCK).astype(int), 0, [small[1] - 1, small[0] - 1])
     index, r = block[:, 1] * small[1] + block[:, 0], residual[kept]
-    moments = [np.bincount(index, w, small[0] * small[1]).reshape(small) for w in (np.ones(len(r)), r, r * r)]
+    weights = np.ones(len(r)), r, r * r
+    # Without a point counts are integers.
+    moments = [np.bincount(index, w, small[0] * small[1]).reshape(small).astype(np.float64) for w in weights]
     radius = _NEAR_SHARE * width / _BLOCK
     # The weight of one point in its own place is 1.
     n, sum_r, sum_rr = (2.0 * np.pi * radius**2 * cv2.GaussianBlur(m, (0, 0), radius) for m in moments)
