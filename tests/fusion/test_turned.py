@@ -17,10 +17,10 @@ PROVEN_S = 12.0
 """Time after which a swung camera's turns have proven attitude."""
 
 
-def asked(rng, motion, replay, samples_of=lambda samples: samples, untracked_s=(math.inf, math.inf)):
+def asked(rng, motion, replay, samples_of=lambda samples: samples, untracked_s=(math.inf, math.inf), delay_s=None):
     """Angles [rad] of what is told from `PROVEN_S` on to the truth, each with its doubt; None where nothing is told."""
     gauge = motion.in_gauge(rng)
-    fusion, found = MotionFusion(FusionConfig(), T_B_C), []
+    fusion, found = MotionFusion(FusionConfig(delay_s=delay_s), T_B_C), []
 
     def each(t, i):
         told = fusion.turned(t) if t > PROVEN_S else None
@@ -42,9 +42,11 @@ def test_it_is_the_cameras_to_a_degree_and_the_doubt_about_its_moment(rng, swing
 
 
 def test_attitude_of_another_flight_tells_nothing(rng, swinging, replay):
-    other = swinging(24.0)
-    backwards = simulate(rng, other.stamps_s, other.T_w_c[::-1], T_B_C).samples()
-    assert all(one is None for one in asked(rng, swinging(24.0), replay, lambda samples: backwards))
+    """Even where the delay is known beforehand."""
+    motion = swinging(24.0)
+    backwards = simulate(rng, motion.stamps_s, motion.T_w_c[::-1], T_B_C).samples()
+    told = asked(rng, motion, replay, lambda samples: backwards, delay_s=0.5)
+    assert all(one is None for one in told)
 
 
 @pytest.mark.parametrize("missing", ["silent", "repeated"])

@@ -220,6 +220,21 @@ def test_after_a_look_in_vain_it_passes_the_unseen_slowly_at_a_hulls_distance():
     assert 0.1 < wish.forward_m_s <= 0.31
 
 
+def test_it_does_not_rise_for_a_view_that_a_lost_pose_cannot_give():
+    pilot = before_a_strip()
+    for k in range(60):
+        pilot.update(replace(at(0.3, 0.05), stamp_s=k / 15, tracked=False))
+    assert pilot.phase is Phase.FLYING
+
+
+def test_a_carried_pose_keeps_the_height_that_the_drone_measures():
+    """It thinks that it sank to .9 m, and rose to 1.4."""
+    told = replace(at(0.0, 0.0), p_w=np.array([0.0, 0.0, 0.9]), told_height_m=1.4)
+    assert before_a_free_way().update(told).up_m_s > 0.1
+    assert before_a_free_way().update(replace(told, tracked=False)).up_m_s < -0.1
+    assert before_a_free_way().update(replace(told, tracked=False, told_height_m=math.nan)).up_m_s > 0.1
+
+
 def test_a_hulls_distance_is_for_the_unseen_not_for_solids():
     """A gap of half a metre is narrower than it flies through; a look in vain does not change that."""
     assert after_looking(before_a_strip(gap_m=1.2)).forward_m_s > 0.1

@@ -1,0 +1,49 @@
+"""What a pilot is told of a picture that has no place in the map."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from edgeslam_torch.flying.eyes import SlamEyes
+from edgeslam_torch.geometry.camera import PRESETS
+from edgeslam_torch.types import DepthMap
+
+CAMERA = PRESETS["tello"].scaled(480, 360)
+DISTANCE_M = 1.5
+"""Of a wall across the camera's axis."""
+
+
+@pytest.fixture
+def eyes():
+    """Eyes whose network says twice the distance of everything, and whose map has points of the wall."""
+    made = SlamEyes(CAMERA)
+    told = DepthMap(np.full((360, 480), 2.0 * DISTANCE_M, np.float32), np.full((360, 480), 0.2, np.float32))
+    across = np.linspace(-0.4, 0.4, 10)
+    points = np.array([[x, y, DISTANCE_M] for x in across for y in across])
+    made._network = lambda image, camera: told
+    made._slam = SimpleNamespace(anchors=lambda: SimpleNamespace(p_w=points), surroundings=lambda: np.zeros((0, 3)))
+    return made
+
+
+def told(eyes, stamp_s, state, revision=3):
+    output = SimpleNamespace(
+        health=SimpleNamespace(state=state), stamp_s=stamp_s, revision=revision, T_w_c=np.eye(4), unit=1.0
+    )
+    return eyes._depth(np.zeros((360, 480, 3), np.uint8), output)
+
+
+def test_a_bare_wall_is_as_far_as_the_network_says_by_the_last_fit_and_less_sure(eyes):
+    fitted = told(eyes, 1.0, "tracking")
+    np.testing.assert_allclose(fitted.depth_m, DISTANCE_M, rtol=0.02)
+    carried = told(eyes, 2.0, "lost")
+    np.testing.assert_allclose(carried.depth_m, DISTANCE_M, rtol=0.02)
+    assert carried.sigma_log.min() >= 0.29 > np.median(fitted.sigma_log)
+
+
+def test_a_fit_that_is_old_or_in_another_unit_tells_nothing(eyes):
+    assert told(eyes, 0.5, "lost") is None  # none yet
+    told(eyes, 1.0, "tracking")
+    assert told(eyes, 2.0, "lost", revision=4) is None
+    assert told(eyes, 4.9, "lost") is not None
+    assert told(eyes, 5.1, "lost") is None
