@@ -28,6 +28,9 @@ _STEP = 4
 """Depth is handed on at a quarter of the picture's size."""
 _CARRIED_S = 4.0
 """Time after a pose is lost in which depth goes on by the last fit: a bare wall shows no point to fit it to."""
+_DARK, _FLAT = 25.0, 2.0
+"""Mean and standard deviation [of 255] of a picture below which the light is out, or the lens covered: a bare wall has
+shades, and the network sees walls in the dark, too."""
 _LOST = ("lost", "starting")
 _DISAGREE_SIGMAS = 3.0
 _WIDEST_SIGMA_M = 0.2
@@ -178,7 +181,7 @@ class SlamEyes:
     def _depth(self, image: np.ndarray, output: SlamOutput) -> DepthMap | None:
         """Depth at a quarter of the picture's size, in published units: the network's, brought to them by the map's
         points, and these where they stand before it; None with too few of them."""
-        if not _tracks(output) and self._last_fit(output) is None:
+        if not _tracks(output) and (self._last_fit(output) is None or not _shows(image)):
             return None
         depth, T_w_c = self._network(image, self._camera), output.T_w_c
         fit = self._fitted(depth, output) if _tracks(output) else self._last_fit(output)
@@ -214,3 +217,8 @@ class SlamEyes:
 
 def _tracks(output: SlamOutput) -> bool:
     return output.health is not None and output.health.state not in _LOST
+
+
+def _shows(image: np.ndarray) -> bool:
+    """Whether a picture shows anything, if only a bare wall."""
+    return bool(image.mean() > _DARK and image.std() > _FLAT)

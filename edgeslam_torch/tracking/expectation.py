@@ -35,7 +35,7 @@ class Vertical:
 
 @dataclass(frozen=True, slots=True)
 class Attitude:
-    """The camera's rotation as the drone's attitude has it, by the map of the last seconds."""
+    """The camera's rotation as the drone's attitude has it, by the map of the last seconds (docs/decisions/0119)."""
 
     R_c_w: FloatArray
     """``(3, 3)`` map to camera."""

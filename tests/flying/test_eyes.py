@@ -26,11 +26,16 @@ def eyes():
     return made
 
 
-def told(eyes, stamp_s, state, revision=3):
+def bare_wall():
+    """A grey picture ``(360, 480, 3)``, brighter towards one side."""
+    return np.broadcast_to(np.linspace(120, 140, 480)[None, :, None], (360, 480, 3)).astype(np.uint8)
+
+
+def told(eyes, stamp_s, state, revision=3, image=None):
     output = SimpleNamespace(
         health=SimpleNamespace(state=state), stamp_s=stamp_s, revision=revision, T_w_c=np.eye(4), unit=1.0
     )
-    return eyes._depth(np.zeros((360, 480, 3), np.uint8), output)
+    return eyes._depth(bare_wall() if image is None else image, output)
 
 
 def test_a_bare_wall_is_as_far_as_the_network_says_by_the_last_fit_and_less_sure(eyes):
@@ -47,3 +52,11 @@ def test_a_fit_that_is_old_or_in_another_unit_tells_nothing(eyes):
     assert told(eyes, 2.0, "lost", revision=4) is None
     assert told(eyes, 4.9, "lost") is not None
     assert told(eyes, 5.1, "lost") is None
+
+
+def test_the_dark_is_no_wall(eyes):
+    told(eyes, 1.0, "tracking")
+    dark = np.random.default_rng(0).integers(0, 12, (360, 480, 3)).astype(np.uint8)
+    assert told(eyes, 2.0, "lost", image=dark) is None
+    assert told(eyes, 2.0, "lost", image=np.full((360, 480, 3), 200, np.uint8)) is None
+    assert told(eyes, 2.0, "lost") is not None
