@@ -48,6 +48,8 @@ class Danger(StrEnum):
     """Why the pilot's wish is not followed, the gravest last."""
 
     NONE = ""
+    CARRIED = "carried by telemetry past what shows nothing"
+    """The pilot's wish is followed all the same, as when the battery calls it home."""
     NO_WISH = "no wish of the pilot: planner late or hung"
     FENCE = "at the fence"
     SCALE = "metres are not sure"
@@ -125,6 +127,8 @@ class Supervisor:
     def carry(self, moved: Moved) -> None:
         """Take the way flown along with the map."""
         self._trail = deque(moved.points(np.array(self._trail).reshape(-1, 3)), maxlen=self._trail.maxlen)
+        if self._known_w is not None:
+            self._known_w = moved.points(self._known_w[None])[0]
 
     def propose(self, wish: Wish, now_s: float) -> None:
         """The pilot's newest wish; it counts for `STALE_S`."""
@@ -146,7 +150,8 @@ class Supervisor:
         if danger is Danger.NONE:
             self._since_s = math.nan
             assert self._wish is not None
-            return Order(self._within_heights(self._wish), home=home, danger=Danger.BATTERY_HOME if home else danger)
+            said = danger if self._sight.tracked else Danger.CARRIED
+            return Order(self._within_heights(self._wish), home=home, danger=Danger.BATTERY_HOME if home else said)
         trouble_s = self._trouble_s(danger, now_s)
         patience_s = UNSURE_LAND_S if danger in _UNSURE else LAND_S + self._back_s - _BACK_M / _BACK_M_S
         in_vain = trouble_s > patience_s or now_s - self._since_s > UNSURE_LAND_S

@@ -76,7 +76,7 @@ class FlightView:
         """Phase, danger and reason, when they change."""
         words = f"{moment.phase}; {moment.order.wish.why}"
         if moment.order.danger:
-            words += f"; kept from it by: {moment.order.danger}"
+            words += f"; {moment.order.danger}"
         if words != self._words:
             self._words = words
             self._log("reasons", self._rr.TextLog(words))

@@ -85,7 +85,7 @@ def test_telemetry_carries_it_past_what_shows_nothing_as_long_as_it_is_sure_of_i
     flown(supervisor, 1.0)
     carried = {"tracked": False, "position_sigma_m": 0.1}
     orders = flown(supervisor, 1.0, lambda s: replace(s, **carried), begin_s=1.0, x=0.5)
-    assert all(o.wish == AHEAD and o.danger is Danger.NONE for o in orders)
+    assert all(o.wish == AHEAD and o.danger is Danger.CARRIED for o in orders)  # done, and said
     waiting = flown(supervisor, 0.2, lambda s: replace(s, **carried), Wish(turn_left_rad_s=0.5), begin_s=2.0, x=1.0)
     assert {o.danger for o in waiting} == {Danger.LOST}  # it turns to what it may not know either
 
@@ -264,6 +264,18 @@ def test_neither_height_may_be_beyond_the_limits():
     assert all(o.wish.up_m_s == 0.0 for o in rising)
     sinking = flown(Supervisor(), 0.5, lambda s: replace(s, told_height_m=2.0), wish=Wish(up_m_s=-0.3))
     assert all(o.wish.up_m_s == -0.3 for o in sinking)
+
+
+def test_metres_that_change_while_it_is_carried_are_no_way_flown():
+    """Carried by half a metre, which become a whole one: it backs up by 2 m, in 8 s, not by 3.5."""
+    supervisor = Supervisor()
+    flown(supervisor, 2.0)
+    flown(supervisor, 1.0, lambda s: replace(s, tracked=False, position_sigma_m=0.1), begin_s=2.0, x=1.0)
+    supervisor.carry(Moved(np.eye(4)[None], np.eye(4)[None], 2.0))
+    there = {"p_w": np.array([2.95, 0.0, 2.2]), "velocity_w": np.zeros(3), "tracked": False, "position_sigma_m": 0.2}
+    lost = flown(supervisor, 11.0, lambda s: replace(s, **there), wish=Wish(), begin_s=3.0)
+    backing = [o.wish.why.endswith("back the way it came") for o in lost]
+    assert sum(backing) / 20 == pytest.approx(8.0, abs=0.3)
 
 
 def test_the_way_back_goes_along_with_the_map():
