@@ -34,6 +34,7 @@ from edgeslam_torch.fusion.snapshot import Present, Snapshot
 from edgeslam_torch.fusion.telemetry.alignment import map_to_world
 from edgeslam_torch.fusion.telemetry.comparison import Comparison, FlightSoFar
 from edgeslam_torch.fusion.telemetry.delay import DelaySearch
+from edgeslam_torch.fusion.telemetry.grown import REACH_S, grown
 from edgeslam_torch.fusion.telemetry.local_scale import drift_in_words, scale_around
 from edgeslam_torch.fusion.telemetry.plausibility import HEIGHTS, Trust
 from edgeslam_torch.fusion.telemetry.track import TelemetryTrack
@@ -101,7 +102,8 @@ class MotionFusion:
         """Opinions that it was made of: it is asked for several times a frame."""
         self._drift: str | None = None
         """That parts of the map have different scales, in words."""
-        self._fitted_s = -math.inf
+        self._fitted_s = self._followed_s = -math.inf
+        """Stamps at which it was last fitted, and last followed the map between fits."""
         self._counts: Counter[str] = Counter()
 
     # --- input ---------------------------------------------------------------------------------------------------
@@ -139,10 +141,22 @@ class MotionFusion:
                 self._remember(*self.refined_poses(stamp_s - self.config.window_s))
                 self._unrest.compare(before, self._memory.sightings(), stamp_s)
             self._refit()
+        elif self._by_telemetry is not None and stamp_s - max(self._fitted_s, self._followed_s) >= _REFIT_S:
+            self._follow_map(self._by_telemetry, stamp_s)
         if self._trust.velocity and self._trust.motion:
             self._filter.see(visual, Metric(self.scale(), self._delay.delay))
         else:
             self._filter.clear()
+
+    def _follow_map(self, told: LogScale, stamp_s: float) -> None:
+        """Take the scale along with a map that refinement has enlarged since the last fit."""
+        self._followed_s = stamp_s
+        if self.refined_poses is None:
+            return
+        before = self._memory.displacements()
+        self._remember(*self.refined_poses(stamp_s - REACH_S))
+        log_ratio = math.log(grown(before, self._memory.displacements(), stamp_s))
+        self._by_telemetry = replace(told, log_scale=told.log_scale - log_ratio)
 
     def add_earlier(self, stamps_s: FloatArray, T_w_c: FloatArray, sigma_t: float, sigma_r_rad: float) -> None:
         """Frames on which a new piece of map rests, before its first tracked one: they have moved with the drone, too.

@@ -30,6 +30,9 @@ from edgeslam_torch.types import IntArray
 MIN_EXTENT = 1e-6
 """Minimum distance between keyframes that defines a scale [map units]."""
 
+_NEWEST, _LEAST_WAY = 10, 4
+"""Keyframes that may still have drifted, a window of them, and older ones below which nothing else tells the unit."""
+
 UNKNOWN_SCALE_LOG = 1.0
 """Standard deviation of the log of the metres per map unit where nothing but the window's own telemetry tells them."""
 
@@ -86,8 +89,9 @@ def young_map(slam_map: SlamMap, newest: Keyframe, most: int) -> Window | None:
 def recent_map(slam_map: SlamMap, newest: Keyframe, most: int) -> Window | None:
     """The newest ``most`` keyframes of a piece of map as one window.
 
-    Two earlier keyframes hold it, those that see most of the same anchors; without earlier ones its first pose and the
-    distance to one other do. None for fewer than three, or a camera that never moved.
+    The earlier keyframe that sees most of the same anchors holds it, its own first one if there is none, and its older
+    part holds the unit (`with_same_way`): two poses beside each other would not. None for fewer than three, or a camera
+    that never moved.
     """
     piece = slam_map.piece_of(newest.id)
     keyframes = [k for id, k in sorted(slam_map.keyframes.items()) if slam_map.piece_of(id) == piece]
@@ -96,9 +100,10 @@ def recent_map(slam_map: SlamMap, newest: Keyframe, most: int) -> Window | None:
     if earlier:
         shared = slam_map.shared_counts(anchor)
         earlier.sort(key=lambda k: (-shared.get(k.id, 0), -k.id))
-        return Window(recent, earlier[:2], anchor, Weight.WIDE, settled=True)
-    window = Window(recent[1:], recent[:1], anchor, Weight.WIDE, settled=True)
-    return window if len(recent) >= 3 and held_extent(window) is not None else None
+        window = Window(recent, earlier[:1], anchor, Weight.WIDE, settled=True)
+    else:
+        window = Window(recent[1:], recent[:1], anchor, Weight.WIDE, settled=True)
+    return window if len(window.free) >= 2 and held_extent(window) is not None else None
 
 
 def refine_all(
@@ -161,8 +166,11 @@ def refine(
     result = refine_window(problem, config)
     if window.settled and not result.stop.converged:
         return result
-    if window.young and problem.scale_priors and not problem.centres and result.stop is not StopReason.NOT_FINITE:
-        result = with_same_depths(problem, result, len(window.free))
+    if problem.scale_priors and result.stop is not StopReason.NOT_FINITE:
+        if window.young and not problem.centres:
+            result = with_same_depths(problem, result, len(window.free))
+        elif window.settled:
+            result = with_same_way(problem, result, len(window.free))
     write_back(slam_map, window, keypoint, result)
     if edges is not None and placed is not None and result.stop is not StopReason.NOT_FINITE:
         with slam_map.lock:
@@ -184,9 +192,36 @@ def with_same_depths(problem: WindowProblem, result: WindowResult, pose: int) ->
     ahead = (before > 0) & (after > 0)
     if not ahead.any():
         return result
-    ratio = float(np.exp(np.median(np.log(before[ahead] / after[ahead]))))
-    centre = se3.inverse(T_c_w)[:3, 3]
+    return _scaled(result, pose, float(np.exp(np.median(np.log(before[ahead] / after[ahead])))))
+
+
+def with_same_way(problem: WindowProblem, result: WindowResult, pose: int) -> WindowResult:
+    """The result scaled about a fixed pose such that the way of all but the newest keyframes is as long as it was.
+
+    The pose that is farthest away is mostly one of the newest, and a map drifts there: where its distance held the
+    unit, telemetry that takes back a drift would shrink all the rest of the map instead. Unchanged where there are
+    too few older ones, or they stand.
+
+    Args:
+        problem: Free poses in the order of time, with a fixed one before them.
+        result: Of it.
+        pose: Number of the fixed one.
+    """
+    order = [pose, *range(pose - _NEWEST)]
+    if len(order) < _LEAST_WAY:
+        return result
+    before, after = (
+        np.linalg.norm(np.diff(se3.inverse(T[order])[:, :3, 3], axis=0), axis=1) for T in (problem.T_c_w, result.T_c_w)
+    )
+    if before.sum() < MIN_EXTENT or after.sum() < MIN_EXTENT:
+        return result
+    return _scaled(result, pose, float((before @ after) / (after @ after)))
+
+
+def _scaled(result: WindowResult, pose: int, ratio: float) -> WindowResult:
+    """The result scaled about the camera of a pose."""
     T_w_c = se3.inverse(result.T_c_w)
+    centre = T_w_c[pose, :3, 3].copy()
     T_w_c[:, :3, 3] = centre + ratio * (T_w_c[:, :3, 3] - centre)
     return replace(
         result,

@@ -311,7 +311,7 @@ class Pilot:
         What is beside the drone and nearer than 0.6 m is below its picture or above it: no look from here shows it.
         """
         slow = np.linalg.norm(arcs.velocity_w, axis=1) < _SQUEEZE * self.limits.speed_m_s + 1e-6
-        hull = self.limits.radius_m + BAND_M + 2.0 * sight.position_sigma_m
+        hull = self.limits.radius_m + 2.0 * sight.position_sigma_m
         away = arcs.from_solid_m >= self.limits.clearance_m(sight.position_sigma_m)
         return np.asarray(slow & away & (arcs.clearance_m >= hull))
 

@@ -1,5 +1,6 @@
 """What a flight is for: where to go next, and when it is done."""
 
+import math
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -12,6 +13,8 @@ from edgeslam_torch.navigation.sight import Sight
 from edgeslam_torch.types import FloatArray
 
 ARRIVED_M = 0.15
+_MOST_DOUBT_M = 0.3
+"""Doubt about where it is that may count as having arrived, at most."""
 
 
 class Task(Protocol):
@@ -45,12 +48,21 @@ class GoTo:
         return layer.cells(sight.p_w[:2] + min(1.0, share) * step)[None]
 
     def done(self, sight: Sight) -> bool:
-        """Whether the drone is there, and slow."""
-        near = float(np.linalg.norm(sight.p_w[:2] - self.goal_w[:2])) < ARRIVED_M
+        """Whether the drone is there, and slow; where its pose rests on no map, as near as it can know.
+
+        Before a bare wall no view shows what is left of the way, and a standard deviation of its metres may be more.
+        """
+        reach_m = ARRIVED_M if sight.tracked else max(ARRIVED_M, min(_doubt_m(sight), _MOST_DOUBT_M))
+        near = float(np.linalg.norm(sight.p_w[:2] - self.goal_w[:2])) < reach_m
         return near and float(np.linalg.norm(sight.velocity_w)) < 0.15
 
     def carry(self, moved: Moved) -> None:
         """A goal in metres from the take-off stays what it is."""
+
+
+def _doubt_m(sight: Sight) -> float:
+    """Standard deviation of where it is in metres from the take-off."""
+    return math.hypot(sight.position_sigma_m, sight.scale_sigma * float(np.linalg.norm(sight.p_w[:2])))
 
 
 @dataclass(slots=True)

@@ -235,6 +235,29 @@ def test_a_carried_pose_keeps_the_height_that_the_drone_measures():
     assert before_a_free_way().update(replace(told, tracked=False, told_height_m=math.nan)).up_m_s > 0.1
 
 
+@pytest.mark.parametrize(("off_m", "arrived"), [(0.14, True), (0.2, False), (0.28, False)])
+def test_it_arrives_within_a_stated_distance_of_its_goal(off_m, arrived):
+    goal = GoTo(np.array([12.0, 0.0, 1.15]))
+    assert goal.done(replace(at(12.0 - off_m, 0.0), scale_sigma=0.03)) == arrived
+    assert not goal.done(replace(at(12.0 - off_m, 0.0, speed_m_s=0.2), scale_sigma=0.03))
+
+
+@pytest.mark.parametrize(
+    ("off_m", "scale_sigma", "sigma_m", "arrived"),
+    [
+        (0.14, 0.0, 0.01, True),
+        (0.2, 0.01, 0.1, False),
+        (0.2, 0.02, 0.1, True),
+        (0.28, 0.5, 0.1, True),
+        (0.31, 0.5, 0.1, False),
+    ],
+)
+def test_where_its_pose_rests_on_no_map_its_doubt_is_as_near_as_it_can_know(off_m, scale_sigma, sigma_m, arrived):
+    goal, there = GoTo(np.array([12.0, 0.0, 1.15])), at(12.0 - off_m, 0.0)
+    lost = replace(there, scale_sigma=scale_sigma, position_sigma_m=sigma_m, tracked=False)
+    assert goal.done(lost) == arrived
+
+
 def test_a_hulls_distance_is_for_the_unseen_not_for_solids():
     """A gap of half a metre is narrower than it flies through; a look in vain does not change that."""
     assert after_looking(before_a_strip(gap_m=1.2)).forward_m_s > 0.1
