@@ -9,6 +9,7 @@ import numpy as np
 from edgeslam_torch.config import SlamConfig
 from edgeslam_torch.flying.home import GROUND_M, Home, metres_per_unit
 from edgeslam_torch.frontend.depth_network import DepthNetwork, open_depth
+from edgeslam_torch.fusion.health import disagreement
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.mount import camera_on_body
@@ -18,7 +19,7 @@ from edgeslam_torch.navigation.near.points import agreeing, seen_points, with_ne
 from edgeslam_torch.navigation.sight import Sight, View
 from edgeslam_torch.navigation.space import CELL_M, KEPT
 from edgeslam_torch.slam import EdgeSlam
-from edgeslam_torch.types import DepthMap, FloatArray, Frame, SlamOutput, TelemetrySample
+from edgeslam_torch.types import DepthMap, FloatArray, Frame, Health, SlamOutput, TelemetrySample
 
 IMAGE_WIDTH = 480
 """Wider pictures are halved until they are not wider than this: the width at which flights were judged."""
@@ -32,7 +33,7 @@ _DARK, _FLAT = 25.0, 2.0
 """Mean and standard deviation [of 255] of a picture below which the light is out, or the lens covered: a bare wall has
 shades, and the network sees walls in the dark, too."""
 _LOST = ("lost", "starting")
-_DISAGREE_SIGMAS = 3.0
+_DISAGREE_SIGMAS, _MEASURED = 3.0, {"telemetry", "height"}
 _WIDEST_SIGMA_M = 0.2
 _MOVES_EVERY_S = 3.0
 """Least time between two moves of the map in one unit: each costs a pilot as much as all its views together."""
@@ -149,7 +150,7 @@ class SlamEyes:
             scale_sigma=relative if np.isfinite(relative) else 1.0,
             metric=health.metric,
             tracked=_tracks(output),
-            conflict=health.disagreement > _DISAGREE_SIGMAS,
+            conflict=_contradicted(health),
             seen_s=captured_s,
             battery=battery,
             told_height_m=told,
@@ -217,6 +218,14 @@ class SlamEyes:
 
 def _tracks(output: SlamOutput) -> bool:
     return output.health is not None and output.health.state not in _LOST
+
+
+def _contradicted(health: Health) -> bool:
+    """Whether sources of scale contradict each other, and nothing settles it: velocities and heights that confirm each
+    other do against a depth network that was trained elsewhere."""
+    confirmed = set(health.scale.source.split("+")) >= _MEASURED
+    asked = [s for s in health.sources if s.source in _MEASURED] if confirmed else health.sources
+    return disagreement(asked) > _DISAGREE_SIGMAS
 
 
 def _shows(image: np.ndarray) -> bool:

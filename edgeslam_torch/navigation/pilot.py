@@ -56,6 +56,8 @@ _LOST_S = 15.0
 """Time without progress after which the task is given up."""
 _ELSEWHERE_M = 0.5
 """Way that counts as progress: what is to go may grow when a way turns out to be closed."""
+_NARROW_AHEAD_M = 2.0
+"""Way ahead in which a gap that is too narrow is what a look was for."""
 _WANTED_M = 0.45
 """Clearance that is wanted where there is space for it."""
 _UPRIGHT_M, _UPRIGHT_SHARE = (0.7, 1.5), 0.7
@@ -105,13 +107,15 @@ class Pilot:
     """Since when it looks around."""
     _sweep: list[float] = field(default_factory=list)
     """Headings still to be looked at, last first."""
+    _tries_narrow: bool = True
+    """Whether gaps that are too narrow are worth a look: until one was in vain."""
     _looked_w: FloatArray | None = None
     """``(2,)`` where a look showed no way last."""
 
     def begin(self, task: Task) -> None:
         """Fly something else from now on."""
         self.task, self.phase = task, Phase.FLYING
-        self._plan, self._planned_s = None, -math.inf
+        self._plan, self._planned_s, self._tries_narrow = None, -math.inf, True
         self._progress_s, self._least, self._waiting_s = math.nan, math.inf, math.nan
 
     def walls(self) -> Walls:
@@ -247,6 +251,13 @@ class Pilot:
         c, s = math.cos(sight.yaw_rad), math.sin(sight.yaw_rad)
         return Wish(c * chosen[0] + s * chosen[1], c * chosen[1] - s * chosen[0], 0.0, turn, "along the way")
 
+    def _is_narrow(self, sight: Sight) -> bool:
+        """Whether the way just ahead is narrower than it flies through."""
+        assert self.layer is not None
+        ahead = self.way_w[: round(_NARROW_AHEAD_M / CELL_M)]
+        need = self.limits.clearance_m(sight.position_sigma_m) - 0.5 * CELL_M
+        return bool((self.layer.from_solid_at(ahead) <= need).any())
+
     def _search(self, sight: Sight) -> float:
         """Rate of turn [rad/s] that looks left and right of where the goal is; all around if it is nowhere.
 
@@ -266,8 +277,9 @@ class Pilot:
         self.layer = self.space.layer(self.limits.height_m, half)
         if self._plan is None or sight.stamp_s - self._planned_s >= _REPLAN_S:
             self._goals = self.task.goals(self.layer, sight)
-            need = self.limits.clearance_m(sight.position_sigma_m)
-            self._plan = cost_to_go(self.layer, self._goals, need, self.layer.cells(sight.p_w[:2]), _BESIDE_M)
+            need, here = self.limits.clearance_m(sight.position_sigma_m), self.layer.cells(sight.p_w[:2])
+            narrow = self._hull_m(sight) if self._tries_narrow else math.inf
+            self._plan = cost_to_go(self.layer, self._goals, need, here, _BESIDE_M, narrow)
             self._planned_s = sight.stamp_s
         return self._plan
 
@@ -311,9 +323,13 @@ class Pilot:
         What is beside the drone and nearer than 0.6 m is below its picture or above it: no look from here shows it.
         """
         slow = np.linalg.norm(arcs.velocity_w, axis=1) < _SQUEEZE * self.limits.speed_m_s + 1e-6
-        hull = self.limits.radius_m + 2.0 * sight.position_sigma_m
+        hull = self._hull_m(sight)
         away = arcs.from_solid_m >= self.limits.clearance_m(sight.position_sigma_m)
         return np.asarray(slow & away & (arcs.clearance_m >= hull))
+
+    def _hull_m(self, sight: Sight) -> float:
+        """Distance of the drone's centre from what its hull may be beside."""
+        return self.limits.radius_m + 2.0 * sight.position_sigma_m
 
     def _score(self, arcs: Arcs, plan: CostToGo, sight: Sight, error: float) -> FloatArray:
         """Metres to go after each candidate, and what its lack of clearance is worth."""
@@ -337,4 +353,5 @@ class Pilot:
         elif sight.stamp_s - self._waiting_s > _PATIENCE_S and sight.tracked:  # else there is no view to come
             self.phase, self._waiting_s = Phase.RISING, math.nan
             self._looked_w = sight.p_w[:2].copy()
+            self._tries_narrow &= not self._is_narrow(sight)
         return Wish(turn_left_rad_s=turn, why="wait for a view of the way")

@@ -1,5 +1,6 @@
 """Ways to a goal: cost to go over a layer, optimistic about what was not seen."""
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -14,6 +15,9 @@ from edgeslam_torch.types import FloatArray
 _NEIGHBOURS = ((1, 0), (0, 1), (1, 1), (1, -1))
 _UNSEEN_COST = 2.5
 """A metre that was not seen costs this much: a known way of less than that is taken instead."""
+_NARROW_COST = 10.0
+"""A metre between solids that stand nearer than a way must keep: worth a look from near by, where a gap seen from afar
+mostly is wider, before a detour of as many metres."""
 _TIGHT_M, _TIGHT_COST = 0.45, 2.0
 """Nearer than this to a solid, a metre costs up to so much more: the middle of a corridor is the shortest way."""
 
@@ -48,7 +52,12 @@ class CostToGo:
 
 
 def cost_to_go(
-    layer: Layer, goals: np.ndarray, clearance_m: float, here: np.ndarray, beside_m: float = 0.0
+    layer: Layer,
+    goals: np.ndarray,
+    clearance_m: float,
+    here: np.ndarray,
+    beside_m: float = 0.0,
+    narrow_m: float = math.inf,
 ) -> CostToGo:
     """Cheapest way from everywhere to the goals (Dijkstra, from the goals).
 
@@ -59,13 +68,15 @@ def cost_to_go(
         here: The drone's cell ``(2,)``; a way may begin nearer to a solid than that.
         beside_m: If no goal can be reached from there, cells up to this far from one are goals as well, the
             nearest that can be.
+        narrow_m: Distance from solids down to which a way is planned at a high cost, though it may not be flown.
     """
-    away = layer.from_solid_m
-    open_ = away > clearance_m - 0.5 * layer.cell_m
+    away, slack = layer.from_solid_m, 0.5 * layer.cell_m
+    open_ = away > min(clearance_m, narrow_m) - slack
     low = np.maximum(here - 2, 0)
     open_[low[0] : here[0] + 3, low[1] : here[1] + 3] |= ~layer.solid[low[0] : here[0] + 3, low[1] : here[1] + 3]
     tight = np.clip(1.0 - (away - clearance_m) / _TIGHT_M, 0.0, 1.0)
     weight = np.where(layer.free, 1.0, _UNSEEN_COST) + _TIGHT_COST * tight
+    weight += np.where(away > clearance_m - slack, 0.0, _NARROW_COST)
     shape = layer.free.shape
     first, second, length = _edges(shape)
     flat, w = open_.ravel(), weight.ravel()

@@ -10,6 +10,7 @@ from edgeslam_torch.navigation.frontiers import Looks, frontiers, reachable
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.moved import Moved
 from edgeslam_torch.navigation.sight import Sight
+from edgeslam_torch.navigation.supervisor import CARRIED_SIGMA_M
 from edgeslam_torch.types import FloatArray
 
 ARRIVED_M = 0.15
@@ -48,11 +49,13 @@ class GoTo:
         return layer.cells(sight.p_w[:2] + min(1.0, share) * step)[None]
 
     def done(self, sight: Sight) -> bool:
-        """Whether the drone is there, and slow; where its pose rests on no map, as near as it can know.
+        """Whether the drone is there, and slow; or as near as it can know.
 
-        Before a bare wall no view shows what is left of the way, and a standard deviation of its metres may be more.
+        Before a bare wall telemetry carries it no farther, and a standard deviation of its metres may be more than what
+        is left of the way.
         """
-        reach_m = ARRIVED_M if sight.tracked else max(ARRIVED_M, min(_doubt_m(sight), _MOST_DOUBT_M))
+        carried_out = not sight.tracked and sight.position_sigma_m >= CARRIED_SIGMA_M
+        reach_m = max(ARRIVED_M, min(_doubt_m(sight), _MOST_DOUBT_M)) if carried_out else ARRIVED_M
         near = float(np.linalg.norm(sight.p_w[:2] - self.goal_w[:2])) < reach_m
         return near and float(np.linalg.norm(sight.velocity_w)) < 0.15
 

@@ -5,9 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from edgeslam_torch.flying.eyes import SlamEyes
+from edgeslam_torch.flying.eyes import SlamEyes, _contradicted
 from edgeslam_torch.geometry.camera import PRESETS
-from edgeslam_torch.types import DepthMap
+from edgeslam_torch.types import DepthMap, ScaleEstimate
 
 CAMERA = PRESETS["tello"].scaled(480, 360)
 DISTANCE_M = 1.5
@@ -60,3 +60,21 @@ def test_the_dark_is_no_wall(eyes):
     assert told(eyes, 2.0, "lost", image=dark) is None
     assert told(eyes, 2.0, "lost", image=np.full((360, 480, 3), 200, np.uint8)) is None
     assert told(eyes, 2.0, "lost") is not None
+
+
+@pytest.mark.parametrize(
+    ("used", "telemetry", "network", "contradicted"),
+    [
+        ("telemetry+height", 2.6, 0.7, False),
+        ("telemetry+height", 2.0, 2.5, True),
+        ("height", 2.6, 0.7, True),
+        ("telemetry+height+depth", 2.6, 2.5, False),
+    ],
+)
+def test_a_network_contradicts_nothing_that_velocities_and_heights_confirm(used, telemetry, network, contradicted):
+    sources = [ScaleEstimate(telemetry, 0.05, "telemetry"), ScaleEstimate(2.55, 0.05, "height")]
+    sources = sources if "telemetry" in used else sources[1:]
+    health = SimpleNamespace(
+        scale=ScaleEstimate(2.55, 0.05, used), sources=(*sources, ScaleEstimate(network, 0.2 * network, "depth"))
+    )
+    assert _contradicted(health) == contradicted

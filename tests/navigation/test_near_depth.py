@@ -50,6 +50,9 @@ def test_points_are_compared_where_they_are_seen(rng):
     assert fit.residual == pytest.approx(0.0, abs=0.05)
 
 
+LEVEL = np.log(2.0)
+
+
 def half_seen(rng, residual, shape=(120, 160)):
     """Points in the left half of a picture, whose map depth is ``exp(residual)`` of the line's."""
     uv = rng.uniform([0, 0], [0.5 * shape[1], shape[0]], (1000, 2))
@@ -58,7 +61,7 @@ def half_seen(rng, residual, shape=(120, 160)):
 
 def test_points_mend_the_line_where_they_are_and_nowhere_else(rng):
     uv, residual, shape = half_seen(rng, -0.4)
-    error, sigma = local_error(uv, residual, 0.3, shape)
+    error, sigma = local_error(uv, np.zeros(len(uv)), residual, 0.3, np.zeros(shape))
     assert error.shape == sigma.shape == shape
     np.testing.assert_allclose(error[20:-20, 10:60], -0.4, atol=0.1)
     np.testing.assert_allclose(error[:, -40:], 0.0, atol=0.01)
@@ -68,7 +71,7 @@ def test_points_mend_the_line_where_they_are_and_nowhere_else(rng):
 def test_depth_without_points_nearby_is_as_unsure_as_the_network(rng):
     """A room that fits to 3 % tells nothing of what is seen through its door."""
     uv, residual, shape = half_seen(rng, 0.0)
-    fit = NearFit(0.0, 1.0, 0.03, len(uv), uv, residual)
+    fit = NearFit(0.0, 1.0, 0.03, len(uv), uv, np.full(len(uv), LEVEL), residual)
     network = DepthMap(np.full(shape, 2.0, np.float32), np.full(shape, 0.1, np.float32))
     metres = fit.applied(network)
     assert np.median(metres.sigma_log[:, 10:60]) < 0.12
@@ -76,9 +79,23 @@ def test_depth_without_points_nearby_is_as_unsure_as_the_network(rng):
     np.testing.assert_allclose(metres.depth_m, 2.0, rtol=0.02)
 
 
+@pytest.mark.parametrize("ratio", [0.5, 2.0])
+def test_a_doors_frame_tells_nothing_of_the_room_behind_it(rng, ratio):
+    """Points all around, at another depth than that of the pixels in the middle."""
+    uv, shape = rng.uniform([0, 0], [160, 120], (1500, 2)), (120, 160)
+    uv = uv[np.abs(uv - [80, 60]).max(axis=1) > 16]
+    log_m = np.full(shape, LEVEL)
+    log_m[44:76, 64:96] += np.log(ratio)
+    error, sigma = local_error(uv, np.full(len(uv), LEVEL), np.full(len(uv), -0.3), 0.1, log_m)
+    assert np.abs(error[44:76, 64:96]).max() < 0.1
+    assert sigma[44:76, 64:96].min() > 0.25
+    assert error[:, :50].max() < -0.2
+    assert sigma[:, :50].max() < 0.2
+
+
 def test_a_fit_of_another_picture_is_its_line_alone(rng):
     uv, residual, shape = half_seen(rng, -0.4)
-    fit = NearFit(np.log(0.5), 1.0, 0.03, len(uv), uv, residual).alone()
+    fit = NearFit(np.log(0.5), 1.0, 0.03, len(uv), uv, np.zeros(len(uv)), residual).alone()
     metres = fit.applied(DepthMap(np.full(shape, 2.0, np.float32), np.full(shape, 0.1, np.float32)))
     np.testing.assert_allclose(metres.depth_m, 1.0, rtol=1e-4)
     assert metres.sigma_log.min() >= 0.29
@@ -86,7 +103,7 @@ def test_a_fit_of_another_picture_is_its_line_alone(rng):
 
 def test_what_points_show_nearer_becomes_nearer(rng):
     uv, residual, shape = half_seen(rng, np.log(0.6))
-    metres = NearFit(0.0, 1.0, 0.3, len(uv), uv, residual).applied(
+    metres = NearFit(0.0, 1.0, 0.3, len(uv), uv, np.full(len(uv), LEVEL), residual).applied(
         DepthMap(np.full(shape, 2.0, np.float32), np.full(shape, 0.1, np.float32))
     )
     assert np.median(metres.depth_m[:, 10:60]) == pytest.approx(1.2, rel=0.08)
@@ -95,14 +112,14 @@ def test_what_points_show_nearer_becomes_nearer(rng):
 def test_points_that_something_hides_do_not_push_it_away(rng):
     uv, residual, shape = half_seen(rng, 0.0)
     residual[::4] = 1.2
-    error, _ = local_error(uv, residual, 0.1, shape)
+    error, _ = local_error(uv, np.zeros(len(uv)), residual, 0.1, np.zeros(shape))
     np.testing.assert_allclose(error, 0.0, atol=0.03)
 
 
 def test_points_far_before_what_the_network_sees_are_what_a_drone_would_touch(rng):
     """A door leaf at 0.6 m before a wall that the network sees at 2 m, in a room that fits it to 10 %."""
     uv, residual, shape = half_seen(rng, np.log(0.3))
-    metres = NearFit(0.0, 1.0, 0.1, len(uv), uv, residual).applied(
+    metres = NearFit(0.0, 1.0, 0.1, len(uv), uv, np.full(len(uv), LEVEL), residual).applied(
         DepthMap(np.full(shape, 2.0, np.float32), np.full(shape, 0.1, np.float32))
     )
     assert np.median(metres.depth_m[:, 10:60]) == pytest.approx(0.6, rel=0.15)

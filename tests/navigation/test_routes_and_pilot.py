@@ -52,6 +52,45 @@ def test_no_way_is_infinite():
     assert math.isinf(plan.at(np.array([1.0, 3.0])))
 
 
+def walled_with_gap(cells, other=None, first=30):
+    """A wall across the hall with a gap of some cells, and perhaps another one."""
+    layer = hall(wall=(slice(29, 31), slice(0, 60)))
+    for gap in (slice(first, first + cells), other):
+        if gap is not None:
+            layer.free[29:31, gap], layer.solid[29:31, gap] = True, False
+    return layer
+
+
+@pytest.mark.parametrize(("cells", "narrow_m", "leads_on"), [(3, 0.12, True), (2, 0.12, False), (3, math.inf, False)])
+def test_a_gap_narrower_than_asked_is_worth_a_look_if_a_hull_passes(cells, narrow_m, leads_on):
+    layer = walled_with_gap(cells)
+    plan = cost_to_go(layer, np.array([[50, 31]]), 0.27, np.array([10, 31]), narrow_m=narrow_m)
+    assert math.isfinite(plan.at(np.array([1.05, 3.15]))) == leads_on
+
+
+@pytest.mark.parametrize(("wide", "through_y"), [(slice(12, 22), 1.7), (slice(50, 60), 0.65)])
+def test_a_detour_of_some_metres_is_taken_before_a_narrow_gap(wide, through_y):
+    """A gap of a metre 1 m beside the way is flown through; one 5 m away costs more than the narrow one."""
+    layer = walled_with_gap(3, wide, first=5)
+    here = np.array([10, 6])
+    way = cost_to_go(layer, np.array([[50, 6]]), 0.27, here, narrow_m=0.12).way(layer.centres(here), 12.0)
+    crossing = way[np.abs(way[:, 0] - 3.0).argmin(), 1]
+    assert crossing == pytest.approx(through_y, abs=0.35)
+
+
+def test_after_a_look_in_vain_it_looks_for_another_way_than_a_narrow_one():
+    """Its way leads through a gap of three cells; it looks, rises, and has no way left then."""
+    pilot = before_a_strip(gap_m=0.3)
+    pilot.update(at(0.3, 0.05))
+    assert math.isfinite(pilot._plan.at(np.array([0.3, 0.05])))
+    after_looking(pilot)
+    pilot.update(replace(at(0.3, 0.05), stamp_s=30.0))
+    assert not math.isfinite(pilot._plan.at(np.array([0.3, 0.05])))
+    pilot.begin(pilot.task)
+    pilot.update(replace(at(0.3, 0.05), stamp_s=31.0))
+    assert math.isfinite(pilot._plan.at(np.array([0.3, 0.05])))
+
+
 def test_a_goal_in_a_speck_is_flown_to_as_near_as_can_be():
     """What seems to be solid around the goal leaves free only what is 0.4 m from it; a wall leaves nothing."""
     here, goal = np.array([5, 30]), np.array([[40, 30]])
@@ -246,13 +285,14 @@ def test_it_arrives_within_a_stated_distance_of_its_goal(off_m, arrived):
     ("off_m", "scale_sigma", "sigma_m", "arrived"),
     [
         (0.14, 0.0, 0.01, True),
-        (0.2, 0.01, 0.1, False),
-        (0.2, 0.02, 0.1, True),
-        (0.28, 0.5, 0.1, True),
-        (0.31, 0.5, 0.1, False),
+        (0.2, 0.02, 0.11, False),
+        (0.2, 0.01, 0.13, False),
+        (0.2, 0.02, 0.13, True),
+        (0.28, 0.5, 0.13, True),
+        (0.31, 0.5, 0.13, False),
     ],
 )
-def test_where_its_pose_rests_on_no_map_its_doubt_is_as_near_as_it_can_know(off_m, scale_sigma, sigma_m, arrived):
+def test_where_telemetry_carries_it_no_farther_its_doubt_is_near_enough(off_m, scale_sigma, sigma_m, arrived):
     goal, there = GoTo(np.array([12.0, 0.0, 1.15])), at(12.0 - off_m, 0.0)
     lost = replace(there, scale_sigma=scale_sigma, position_sigma_m=sigma_m, tracked=False)
     assert goal.done(lost) == arrived

@@ -66,6 +66,37 @@ def test_a_thin_thing_is_not_carved_away_by_what_is_behind_it():
     assert not cell(layer, 3.0, 0.0)[0]
 
 
+def test_a_ramp_between_something_near_and_the_wall_behind_it_fills_nothing():
+    """A network draws no edge but a ramp: a door's frame at 1 m, and the room behind it."""
+    view = facing_a_wall(3.0)
+    view.depth_m[:, :30] = 1.0
+    ramped = facing_a_wall(3.0)
+    ramped.depth_m[:, :30] = 1.0
+    ramped.depth_m[:, 30:36] = np.linspace(1.0, 3.0, 8)[1:-1]
+    for picture in (view, ramped):
+        space = Space()
+        for _ in range(3):
+            space.observe(picture)
+        layer = space.layer(1.15, 0.15)
+        solid = layer.centres(np.argwhere(layer.solid))
+        assert ((solid[:, 0] > 1.25) & (solid[:, 0] < 2.75)).sum() == 0
+        assert (np.abs(solid[:, 0] - 1.0) < 0.1).any()
+        assert (np.abs(solid[:, 0] - 3.0) < 0.1).any()
+
+
+@pytest.mark.parametrize("side_m", [0.8, 1.5])
+def test_a_wall_along_the_way_is_no_ramp(side_m):
+    view = facing_a_wall(9.0)
+    z = K[0, 0] * side_m / np.maximum(39.5 - np.arange(80.0), 0.5)
+    view.depth_m[:] = np.minimum(z, 9.0)[None]
+    space = Space()
+    space.observe(view)
+    layer = space.layer(1.15, 0.15)
+    seen_m = z[z < 4.5]
+    assert len(seen_m) > 10
+    assert all(any(cell(layer, x, side_m + off)[1] for off in (-1e-3, 1e-3)) for x in seen_m)
+
+
 def test_where_it_flew_is_free():
     space = Space()
     space.flown(np.array([0.5, 0.5, 1.15]), 0.2)
