@@ -119,7 +119,7 @@ def local_error(
         high = (log_depth - lowest) / _LEVEL_LOG + _BEYOND
         return np.stack([(v + 0.5) / _BLOCK - 0.5, (u + 0.5) / _BLOCK - 0.5, np.clip(high, 0.0, levels - 1.0)])
 
-    cell = np.rint(place(*uv[kept].T, level[kept])).astype(int)
+    cell = np.rint(place(uv[kept, 0], uv[kept, 1], level[kept])).astype(int)
     cell = np.clip(cell, 0, np.array(small)[:, None] - 1)
     index, r = np.ravel_multi_index(tuple(cell), small), residual[kept]
     radius = _NEAR_SHARE * width / _BLOCK
