@@ -144,12 +144,12 @@ def _say(text: str) -> None:
 
 
 def _navigation(args: argparse.Namespace) -> int:
-    """Flights through named worlds; 1 when one touched something."""
+    """Flights through named worlds; 1 when one touched something, or failed."""
     from edgeslam_torch.errors import ConfigError
     from edgeslam_torch.eval.judge.navigation.behaviours import BEHAVIOURS, is_corridor
     from edgeslam_torch.eval.judge.navigation.conditions import FAULTS
     from edgeslam_torch.eval.judge.navigation.flown import Case
-    from edgeslam_torch.eval.judge.navigation.runner import judge_flights
+    from edgeslam_torch.eval.judge.navigation.runner import FAILED, judge_flights
     from edgeslam_torch.eval.judge.navigation.table import markdown
     from edgeslam_torch.synthetic.sites.build import JUDGED, SITES
 
@@ -176,4 +176,4 @@ def _navigation(args: argparse.Namespace) -> int:
     flights = judge_flights(cases, out, args.jobs, _say)
     print(markdown(flights))
     print(f"results: {out / 'navigation.md'}")
-    return 1 if any(flown.contacts for flown in flights) else 0
+    return 1 if any(flown.contacts or flown.ended.startswith(FAILED) for flown in flights) else 0

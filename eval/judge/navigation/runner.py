@@ -15,6 +15,8 @@ from edgeslam_torch.eval.judge.navigation.pictures import top_view
 from edgeslam_torch.eval.judge.navigation.table import markdown
 from edgeslam_torch.files.atomic import write_text
 
+FAILED = "failed"
+"""How the ending of a flight begins that ended with an error of ours."""
 _WORST = 6
 """Flights of which a top view and a film strip are written."""
 
@@ -27,6 +29,9 @@ def judge_flights(cases: Sequence[Case], out: Path, jobs: int, say: Callable[[st
         out: Folder of the results; records of earlier runs are used where the case is the same.
         jobs: Flights at a time.
         say: Told a line for each finished flight.
+
+    Returns:
+        All flights. One that raised an error, or the process of which died, counts as flown and not reached.
     """
     out.mkdir(parents=True, exist_ok=True)
     found = {case: flown for case in cases if (flown := _earlier(_file(out, case), case)) is not None}
@@ -35,12 +40,17 @@ def judge_flights(cases: Sequence[Case], out: Path, jobs: int, say: Callable[[st
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
         futures = {pool.submit(fly, case): case for case in missing}
         for future in as_completed(futures):
-            flown = found[futures[future]] = future.result()
-            write_text(_file(out, flown.case), json.dumps(flown.record()) + "\n")
+            case = futures[future]
+            try:
+                flown = found[case] = future.result()
+                write_text(_file(out, case), json.dumps(flown.record()) + "\n")
+            except Exception as error:  # the others fly on; this one is flown again the next time
+                flown = found[case] = Flown(case, ended=f"{FAILED}: {type(error).__name__}: {error}")
             say(_line(flown))
     flights = [found[case] for case in cases]
     write_text(out / "navigation.md", markdown(flights))
-    for flown in sorted(flights, key=lambda f: (f.reached, not f.contacts, f.clearance_min_m))[:_WORST]:
+    seen = [flown for flown in flights if flown.track_w]
+    for flown in sorted(seen, key=lambda f: (f.reached, not f.contacts, f.clearance_min_m))[:_WORST]:
         name = f"{_name(flown.case)}.png"
         cv2.imwrite(str(out / f"top_{name}"), top_view(flown))
         strip = film_strip(flown)

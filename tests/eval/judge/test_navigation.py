@@ -58,6 +58,19 @@ def test_finished_flights_are_not_flown_again(tmp_path):
     assert (tmp_path / "navigation.md").read_text().startswith("| world")
 
 
+def test_a_flight_that_fails_ends_no_other(tmp_path):
+    """A world that does not exist is an error of that flight; what was flown before stays."""
+    good, bad, said = Case("blank_walls", 0), Case("nowhere", 0), []
+    record = flown(True, track_w=[[0.0, 0.0, 1.0], [1.0, 0.0, 1.0]]).record()
+    (tmp_path / "flight_blank_walls_0_none_truth.json").write_text(json.dumps(record))
+    flights = judge_flights([bad, good], tmp_path, 1, said.append)
+    assert [f.reached for f in flights] == [False, True]
+    assert flights[0].ended.startswith("failed: ") and "nowhere" in flights[0].ended
+    assert "nowhere" in said[0]
+    assert "| 2 | 1 (" in (tmp_path / "navigation.md").read_text()
+    assert not (tmp_path / "flight_nowhere_0_none_truth.json").exists()
+
+
 def test_a_top_view_shows_the_way():
     image = top_view(flown(True, track_w=[[0.0, 0.0, 1.0], [5.0, 0.0, 1.0]]))
     assert image.ndim == 3 and (image == (200, 90, 20)).all(2).sum() > 300
