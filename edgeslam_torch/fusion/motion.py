@@ -136,10 +136,7 @@ class MotionFusion:
         visual = VisualPose(stamp_s, np.array(T_w_c, dtype=np.float64), sigma_t, sigma_r_rad)
         self._memory.add(visual)
         if self._is_due(stamp_s):
-            if self.refined_poses is not None:
-                before = self._memory.sightings()
-                self._remember(*self.refined_poses(stamp_s - self.config.window_s))
-                self._unrest.compare(before, self._memory.sightings(), stamp_s)
+            self._remember_refined(stamp_s, self.config.window_s)
             self._refit()
         elif self._by_telemetry is not None and stamp_s - max(self._fitted_s, self._followed_s) >= _REFIT_S:
             self._follow_map(self._by_telemetry, stamp_s)
@@ -151,10 +148,8 @@ class MotionFusion:
     def _follow_map(self, told: LogScale, stamp_s: float) -> None:
         """Take the scale along with a map that refinement has enlarged since the last fit."""
         self._followed_s = stamp_s
-        if self.refined_poses is None:
-            return
         before = self._memory.displacements()
-        self._remember(*self.refined_poses(stamp_s - REACH_S))
+        self._remember_refined(stamp_s, REACH_S)
         log_ratio = math.log(grown(before, self._memory.displacements(), stamp_s))
         self._by_telemetry = replace(told, log_scale=told.log_scale - log_ratio)
 
@@ -181,6 +176,14 @@ class MotionFusion:
         """
         self._remember(stamps_s, T_w_c)
         self._refit(flying=False)
+
+    def _remember_refined(self, stamp_s: float, reach_s: float) -> None:
+        """Poses of the last seconds as the map has them now, and how much that changes."""
+        if self.refined_poses is None:
+            return
+        before = self._memory.sightings()
+        self._remember(*self.refined_poses(stamp_s - reach_s))
+        self._unrest.compare(before, self._memory.sightings(), stamp_s)
 
     def _remember(self, stamps_s: FloatArray, T_w_c: FloatArray) -> None:
         self._memory.revise(stamps_s, T_w_c)

@@ -217,3 +217,22 @@ def test_gate_is_the_95_percent_quantile(degrees, share, outcome):
 def test_settings_out_of_range_are_refused_by_name(wrong):
     with pytest.raises(ValueError, match=next(iter(wrong))):
         FusionConfig(**wrong)
+
+
+def test_recovering_for_ever_leaves_a_covariance(rng):
+    """A map that goes its own way, refused and taken in again and again: the absolute place is measured by nothing, and
+    must not become so unknown that what is known of the last second drowns in rounding (a flight ended so)."""
+    ekf = Ekf(CONFIG)
+    recovered = 0
+    for _ in range(600):
+        ekf.clone()
+        for _ in range(3):
+            ekf.predict(0.03, rng.normal(0.0, 0.2, 3))
+        moved = pose(rng.normal(0.0, 0.5, 3), rng.normal(0.0, 0.2, 3))
+        recovered += ekf.update_relative(moved, 0.005, 0.003) is Outcome.RECOVERED
+        recovered += ekf.update_attitude(rng.normal(0.0, 0.5, 3)) is Outcome.RECOVERED
+        assert np.diag(ekf.since_clone(np.zeros(3)).covariance).min() > 0.0
+    assert recovered > 50
+    assert np.diag(ekf.P).max() < 1e6
+    eigenvalues = np.linalg.eigvalsh(ekf.P)
+    assert eigenvalues[0] > -1e-12 * eigenvalues[-1]

@@ -273,12 +273,16 @@ class Ekf:
             if self.refused_in_row[n] < self.config.refusals_before_recovery:
                 return Outcome.REFUSED
             outcome = Outcome.RECOVERED
-            # The filter was overconfident: inflate its covariance according to the innovation.
-            factor = min(self.nis / n, 1e4)
-            P_Ht = P_Ht * factor  # before P changes: it may be a view of it
-            self.P = self.P * factor
-            S *= factor
-            S.ravel()[:: n + 1] += (1.0 - factor) * noise
+            # The filter was overconfident: inflate what the measurement tells of, according to the innovation. All of
+            # the covariance would grow for ever with it, as nothing measures the absolute place (docs/decisions/0134).
+            grown = min(self.nis / n, 1e4) - 1.0
+            known = S.copy()
+            known.ravel()[:: n + 1] -= noise
+            along = np.eye(n) + grown * np.linalg.solve(S, known)
+            self.P = self.P + grown * P_Ht.dot(gain)
+            P_Ht, S = P_Ht.dot(along), known.dot(along)
+            S = 0.5 * (S + S.T)
+            S.ravel()[:: n + 1] += noise
             gain, weighted = _solved(S, P_Ht, residual)
         self.refused_in_row[n] = 0
         self.x += P_Ht.dot(weighted)
