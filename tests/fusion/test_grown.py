@@ -42,6 +42,12 @@ def test_noise_and_a_young_map_tell_nothing(before):
     assert grown(before, replace(before, moved=2.0 * before.moved), 8.0) == 1.0
 
 
+@pytest.mark.parametrize("factor", [0.0, np.nan, np.inf])
+def test_a_map_that_collapsed_tells_no_size(factor):
+    before = steps()
+    assert grown(before, replace(before, moved=np.full_like(before.moved, factor)), 20.0) == 1.0
+
+
 def test_other_intervals_are_refused():
     with pytest.raises(ValueError, match="20 intervals were 19"):
         grown(steps(20), steps(19), 20.0)

@@ -4,6 +4,8 @@ A map's unit is free, and every refinement may change it by a percent. A scale i
 only; between two fits it goes along with the map.
 """
 
+import math
+
 import numpy as np
 
 from edgeslam_torch.fusion.telemetry.visual_memory import Displacements
@@ -17,7 +19,7 @@ _LEAST_COUNT, _LEAST_SIGMAS = 4, 5.0
 
 
 def grown(before: Displacements, after: Displacements, now_s: float) -> float:
-    """Size of the map now over its size before; 1 where too little has moved to tell.
+    """Size of the map now over its size before; 1 where too little has moved to tell, or the map is no map any more.
 
     Args:
         before: Displacements as they were.
@@ -34,4 +36,5 @@ def grown(before: Displacements, after: Displacements, now_s: float) -> float:
     told = (age_s > _SETTLED_S) & (age_s < REACH_S) & (then > _LEAST_SIGMAS * before.sigma)
     if int(told.sum()) < _LEAST_COUNT:
         return 1.0
-    return float(now[told] @ then[told] / (then[told] @ then[told]))
+    ratio = float(now[told] @ then[told] / (then[told] @ then[told]))
+    return ratio if math.isfinite(ratio) and ratio > 0.0 else 1.0
