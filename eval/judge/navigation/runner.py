@@ -42,10 +42,12 @@ def judge_flights(cases: Sequence[Case], out: Path, jobs: int, say: Callable[[st
         for future in as_completed(futures):
             case = futures[future]
             try:
-                flown = found[case] = future.result()
+                flown = future.result()
+            except Exception as error:  # whatever it is: the others fly on, and this one is flown again the next time
+                flown = Flown(case, ended=f"{FAILED}: {type(error).__name__}: {error}")
+            else:
                 write_text(_file(out, case), json.dumps(flown.record()) + "\n")
-            except Exception as error:  # the others fly on; this one is flown again the next time
-                flown = found[case] = Flown(case, ended=f"{FAILED}: {type(error).__name__}: {error}")
+            found[case] = flown
             say(_line(flown))
     flights = [found[case] for case in cases]
     write_text(out / "navigation.md", markdown(flights))
