@@ -13,6 +13,8 @@ from dataclasses import replace
 import numpy as np
 
 from edgeslam_torch.fusion.config import FusionConfig
+from edgeslam_torch.fusion.dead_reckoning import REACH_S as RECKONED_S
+from edgeslam_torch.fusion.dead_reckoning import Reckoned, reckoned
 from edgeslam_torch.fusion.displacement import DELAY_S, TelemetryModel
 from edgeslam_torch.fusion.filter.filter_feed import FilterFeed, Metric
 from edgeslam_torch.fusion.health import disagreement
@@ -301,6 +303,14 @@ class MotionFusion:
         R_m_c = R_w_m.T @ self._track.attitude(around) @ self.T_b_c[:3, :3]
         doubt = max(float(np.linalg.norm(rotation_vector(R_m_c[0].T @ R_m_c[k]))) for k in (1, 2))
         return R_m_c[0].T, doubt
+
+    def reckoned(self, stamp_s: float) -> Reckoned | None:
+        """Place of a frame's camera by dead reckoning, in the axes of `rotation`; None where telemetry tells no metres,
+        or its velocities have not proven to be of this flight."""
+        model, recent = self.telemetry(), self._memory.recent(stamp_s - RECKONED_S)
+        if model is None or recent is None or not (model.velocity and math.isfinite(model.delay_sigma_s)):
+            return None
+        return reckoned(model, recent, stamp_s)
 
     def rotation(self) -> FloatArray | None:
         """``R_w_m`` ``(3, 3)``: map axes to the drone's power-on world; ``None`` without telemetry attitude."""

@@ -18,7 +18,7 @@ from edgeslam_torch.map.trajectory import TrajectoryLog
 from edgeslam_torch.mapping.edge_map import EdgeMap
 from edgeslam_torch.mapping.pipeline import Mapped, MappingPipeline
 from edgeslam_torch.stage_times import timed
-from edgeslam_torch.tracking.expectation import Attitude, Expectation, Vertical
+from edgeslam_torch.tracking.expectation import Attitude, Expectation, Place, Told, Vertical
 from edgeslam_torch.tracking.motion_model import MotionModel
 from edgeslam_torch.tracking.relocaliser import Reach, reach_after
 from edgeslam_torch.tracking.tracker import Track, Tracker
@@ -64,6 +64,8 @@ class System:
     """Stamp of the newest keyframe, or of a later frame that needed not become one."""
     shows_nothing_new: bool = False
     """Whether the current image repeats the previous one."""
+    _told: tuple[float, Told] = (-np.inf, Told())
+    """What the drone's sensors tell of one frame: it is asked for several times."""
     stage_ms: dict[str, float] = field(default_factory=dict)
     """Times of the current frame."""
 
@@ -94,12 +96,21 @@ class System:
             return None
         told = self.fusion.vertical(stamp_s) if self._is_young(stamp_s) else None
         vertical = None if told is None else Vertical(*told)
-        return Expectation(self.motion.expectation(stamp_s, T_predicted, self.published.scale), vertical)
+        by_motion = self.motion.expectation(stamp_s, T_predicted, self.published.scale)
+        return Expectation(by_motion, vertical, self.told(stamp_s).place)
 
-    def attitude(self, stamp_s: float) -> Attitude | None:
-        """Rotation that the drone tells for a frame; None where it is not known to turn with the images."""
-        turned = self.fusion.turned(stamp_s) if self.has_telemetry else None
-        return None if turned is None else Attitude(*turned)
+    def told(self, stamp_s: float) -> Told:
+        """What the drone's sensors tell of a frame's pose, if telemetry has proven to be of this flight."""
+        if self._told[0] != stamp_s:
+            self._told = stamp_s, self._ask(stamp_s) if self.has_telemetry else Told()
+        return self._told[1]
+
+    def _ask(self, stamp_s: float) -> Told:
+        turned, reckoned, R_w_m = self.fusion.turned(stamp_s), self.fusion.reckoned(stamp_s), self.fusion.rotation()
+        attitude = None if turned is None else Attitude(*turned)
+        if reckoned is None or R_w_m is None:
+            return Told(attitude)
+        return Told(attitude, Place(R_w_m, reckoned.centre, reckoned.doubt))
 
     def reach(self, stamp_s: float, T_predicted: FloatArray) -> Reach:
         """Region that the camera can have reached during frames without a pose."""

@@ -71,7 +71,7 @@ class Tracking:
         with system.map.lock:
             located = self._locate(frame, seen, T_predicted)
             if located is not None:
-                located = self._as_turned(frame, seen, T_predicted, located)
+                located = self._as_told(frame, seen, T_predicted, located)
             return None if located is None else self.arrive(frame, seen, T_predicted, located)
 
     def _locate(self, frame: Frame, seen: LazyView, T_predicted: FloatArray) -> Located | None:
@@ -92,17 +92,17 @@ class Tracking:
             located = matched
         return self._by_edges(frame, seen, T_predicted) if located is None else located
 
-    def _as_turned(self, frame: Frame, seen: LazyView, T_predicted: FloatArray, located: Located) -> Located:
-        """A pose that the drone's attitude denies is sought once more, where attitude has it.
+    def _as_told(self, frame: Frame, seen: LazyView, T_predicted: FloatArray, located: Located) -> Located:
+        """A pose that the drone's sensors deny is sought once more, where they have it.
 
         Where a pattern repeats, as on wallpaper, images hold a pose by the neighbour of what they show. Where they
-        show the same pose again it stays: attitude alone moves none.
+        show the same pose again it stays: telemetry alone moves none.
         """
-        attitude, template = self.system.attitude(frame.stamp_s), self._template
-        if attitude is None or not attitude.denies(located.track.T_c_w):
+        told, template = self.system.told(frame.stamp_s), self._template
+        if not told.denies(located.track.T_c_w):
             return located
-        again = self._locate(frame, seen, attitude.applied_to(T_predicted))
-        if again is None or attitude.denies(again.track.T_c_w):
+        again = self._locate(frame, seen, told.applied_to(T_predicted))
+        if again is None or told.denies(again.track.T_c_w):
             self._template = template
             return located
         return again
@@ -246,7 +246,7 @@ class Tracking:
         with self.system.timed("edges"):
             expected = self.system.expectation(frame.stamp_s, T_predicted)
             alone = self._edge_tracker.refine(seen.grey, T_predicted, None, expected)
-        if alone is None or not alone.is_fixed or self._denied(alone.T_c_w, frame.stamp_s):
+        if alone is None or not alone.is_fixed or self.system.told(frame.stamp_s).denies(alone.T_c_w):
             return None
         none = np.zeros(0, dtype=np.int64)
         track = Track(alone.T_c_w, none, none, none, none, alone.covariance)
@@ -267,15 +267,10 @@ class Tracking:
             both = self._edge_tracker.refine(seen.grey, located.track.T_c_w, points, expected)
         if both is None or both.edges < MIN_EDGES or both.points.mean() < 0.5:
             return located
-        if self._denied(both.T_c_w, frame.stamp_s):
+        if system.told(frame.stamp_s).denies(both.T_c_w):
             return located
         track = replace(located.track, T_c_w=both.T_c_w, covariance=both.covariance)
         return replace(located, track=track, edges=both.edges)
-
-    def _denied(self, T_c_w: FloatArray, stamp_s: float) -> bool:
-        """Whether the drone has not turned as a pose ``(4, 4)`` by edges has; parallel ones hold few directions."""
-        attitude = self.system.attitude(stamp_s)
-        return attitude is not None and attitude.denies(T_c_w)
 
     # -- keyframes ---------------------------------------------------------------------------------------------
 

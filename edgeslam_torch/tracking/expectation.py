@@ -18,6 +18,10 @@ HELD_RAD = 5e-5
 them say alike, on guessed depths, is no better for their number."""
 DENIED_RAD = math.radians(3.0)
 """Turn that whole degrees do not explain: three readings' worst, where tracked poses stay within one."""
+HELD_SHARE = 0.02
+"""Standard deviation that holds a centre, as a share of its doubt: hundreds of corners tell it to a tenth."""
+DENIED_SHARE = 1.25
+"""Share of its doubt at which a centre is denied: more than one that is held at it."""
 NO_WORSE = 0.9
 """Share of the inliers that an upright pose must keep of a free one's: where the images contradict it they say so by
 as many. A climb that is taken for a turn has as many either way."""
@@ -56,6 +60,66 @@ class Attitude:
 
 
 @dataclass(frozen=True, slots=True)
+class Place:
+    """Where the drone's sensors carry the camera, by the map of the last seconds (docs/decisions/0135)."""
+
+    R_w_m: FloatArray
+    """``(3, 3)`` map to the axes of the drone's world."""
+    centre: FloatArray
+    """``(3,)`` of the camera in them [map units]."""
+    doubt: FloatArray
+    """``(3,)`` how far it may be off along each [map units]."""
+
+    def beyond(self, T_c_w: FloatArray) -> FloatArray:
+        """How far ``(3,)`` the centre of a pose ``(4, 4)`` is from what is not in doubt, along each axis."""
+        off = self._off(T_c_w)
+        return off - np.clip(off, -self.doubt, self.doubt)
+
+    def denies(self, T_c_w: FloatArray) -> bool:
+        """Whether a pose ``(4, 4)`` has gone where the drone has not, by more than `held` leaves open."""
+        return bool((np.abs(self._off(T_c_w)) > DENIED_SHARE * self.doubt).any())
+
+    def applied_to(self, T_c_w: FloatArray) -> FloatArray:
+        """A pose ``(4, 4)`` with its centre where the drone is, along the axes along which that is not in doubt."""
+        return self._moved(T_c_w, np.where(self.beyond(T_c_w) != 0, self._off(T_c_w), 0.0))
+
+    def held(self, T_c_w: FloatArray, start: PosePrior) -> PosePrior:
+        """A prior that keeps a pose from leaving it along the axes along which it has left."""
+        beyond = self.beyond(T_c_w)
+        T, left = self._moved(T_c_w, beyond), beyond != 0
+        axes = T[:3, :3] @ self.R_w_m.T[:, left]
+        information = start.information.copy()
+        information[:3, :3] += (axes / (HELD_SHARE * self.doubt[left]) ** 2) @ axes.T
+        return PosePrior(start.pose, T, information)
+
+    def _off(self, T_c_w: FloatArray) -> FloatArray:
+        return -self.R_w_m @ T_c_w[:3, :3].T @ T_c_w[:3, 3] - self.centre
+
+    def _moved(self, T_c_w: FloatArray, by: FloatArray) -> FloatArray:
+        """A pose whose centre is moved back by ``(3,)`` along the axes; its rotation stays."""
+        T = T_c_w.copy()
+        T[:3, 3] += T_c_w[:3, :3] @ self.R_w_m.T @ by
+        return T
+
+
+@dataclass(frozen=True, slots=True)
+class Told:
+    """What the drone's sensors tell of a frame's pose; None where they do not."""
+
+    attitude: Attitude | None = None
+    place: Place | None = None
+
+    def denies(self, T_c_w: FloatArray) -> bool:
+        """Whether a pose ``(4, 4)`` has moved as the drone has not."""
+        return any(told is not None and told.denies(T_c_w) for told in (self.attitude, self.place))
+
+    def applied_to(self, T_c_w: FloatArray) -> FloatArray:
+        """A pose ``(4, 4)`` turned as the drone is, and brought to where it may be."""
+        turned = T_c_w if self.attitude is None else self.attitude.applied_to(T_c_w)
+        return turned if self.place is None else self.place.applied_to(turned)
+
+
+@dataclass(frozen=True, slots=True)
 class Expectation:
     """What is known of one pose."""
 
@@ -63,6 +127,8 @@ class Expectation:
     """Counts where anchors rest on guessed depths."""
     vertical: Vertical | None = None
     """Decides roll and pitch in a young map; None where it is not asked."""
+    place: Place | None = None
+    """Keeps what the images hardly tell within it; None where telemetry tells none."""
 
 
 def levelled(expected: PosePrior, vertical: Vertical) -> PosePrior:
@@ -88,7 +154,7 @@ def pose_on_anchors(
     expected: Expectation | None,
     config: PoseConfig,
 ) -> PoseResult:
-    """Robust pose of a frame that sees anchors ``(N,)`` at pixels ``(N, 2)``; upright if its image allows it.
+    """Robust pose of a frame that sees anchors ``(N,)`` at pixels ``(N, 2)``; where the drone has it if images allow.
 
     Args:
         anchors: Of the map.
@@ -111,11 +177,19 @@ def pose_on_anchors(
         return refined(None)
     counts = mostly_on_priors(anchors, anchor)
     free = refined(expected.by_motion if counts else None)
-    if expected.vertical is None:
-        return free
     by_motion = expected.by_motion if counts else replace(expected.by_motion, information=np.zeros((6, 6)))
-    upright = refined(levelled(by_motion, expected.vertical))
-    if upright.inliers.sum() < NO_WORSE * free.inliers.sum():
+    if expected.vertical is not None:
+        return _unless_worse(refined(levelled(by_motion, expected.vertical)), free)
+    if expected.place is not None and expected.place.beyond(free.T_c_w).any():
+        return _unless_worse(refined(expected.place.held(free.T_c_w, by_motion)), free)
+    return free
+
+
+def _unless_worse(held: PoseResult, free: PoseResult) -> PoseResult:
+    """A pose that telemetry holds, if the images allow it.
+
+    Attitude comes in whole degrees, velocity in decimetres a second: that made it no surer than the images are.
+    """
+    if held.inliers.sum() < NO_WORSE * free.inliers.sum():
         return free
-    # Attitude comes in whole degrees: holding it made the pose no surer than the image is.
-    return replace(upright, covariance=free.covariance)
+    return replace(held, covariance=free.covariance)

@@ -1,40 +1,71 @@
-"""A pose that the drone's attitude denies: before a wall whose pattern repeats, images alone take any neighbour."""
+"""Poses that the drone's attitude or its place denies: before a wall whose pattern repeats, images alone take any
+neighbour."""
 
 from functools import lru_cache
 
 import numpy as np
+import pytest
 from rendered import CAMERA, film, patchwork, sideways, stairs_world
 
 from edgeslam_torch.config import DepthConfig, SlamConfig
+from edgeslam_torch.fusion.dead_reckoning import Reckoned
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.slam import EdgeSlam
 from edgeslam_torch.synthetic.house.world import Quad, Texture, World
 
 PERIOD_M = 0.24
 """31 px of a wall 2 m away."""
+STEPS_M = (0.15, 0.18)
+"""Way from one frame to the next, for three of them: 20 and 23 px."""
+PICTURE_M = 0.6
+DOUBT_M = 0.08
 STEP_RAD = 0.09
 """Turn from one frame to the next, for three of them: 23 px. When it ends, the neighbour is nearer to what is
 expected."""
 
 
-@lru_cache(maxsize=1)
-def wallpaper():
-    """A camera before a papered wall that creeps sideways, turns, and stops at once."""
+def papered(poses, picture_m=0.0):
+    """A camera before a papered wall with a picture in its middle, at poses ``(4, 4)``."""
     across = 20
     paper = np.tile(patchwork(np.random.default_rng(5), 128, 40), (across, across, 1))
     side_m = across * PERIOD_M
+    size = int(picture_m / side_m * len(paper))
+    if size:
+        begin = (len(paper) - size) // 2
+        inside = slice(begin, begin + size)
+        paper[inside, inside] = patchwork(np.random.default_rng(9), size, size * 40 // 128)
     u, v = np.array([side_m, 0.0, 0.0]), np.array([0.0, side_m, 0.0])
     world = World([Quad(np.array([-side_m / 2, -side_m / 2, 2.0]), u, v, Texture(paper))])
-    poses = [se3.exp(np.array([0.0, 0.0, 0.0, 0.0, STEP_RAD * np.clip(k - 11, 0, 3), 0.0])) for k in range(23)]
-    for k, T in enumerate(poses):
-        T[0, 3] = 0.01 * k
     return film(world, CAMERA, np.stack(poses), step_s=1 / 15)
 
 
-def flown(flight, told):
-    """Outputs of a flight where attitude is ``told`` as a frame's."""
+def after_eleven(step):
+    """Poses that creep sideways, by three steps ``(6,)`` more after the eleventh, and stop at once."""
+    poses = [se3.exp(np.array(step) * np.clip(k - 11, 0, 3)) for k in range(23)]
+    for k, T in enumerate(poses):
+        T[0, 3] += 0.01 * k
+    return poses
+
+
+@lru_cache(maxsize=1)
+def wallpaper():
+    """The camera turns."""
+    return papered(after_eleven([0.0, 0.0, 0.0, 0.0, STEP_RAD, 0.0]))
+
+
+@lru_cache(maxsize=2)
+def passing(axis):
+    """The camera jumps sideways (axis 0) or down (1), away from a picture by which it began."""
+    step = np.zeros(6)
+    step[axis] = -STEPS_M[axis]
+    return papered(after_eleven(step), PICTURE_M)
+
+
+def flown(flight, told=lambda stamp_s: None, place=lambda stamp_s: None):
+    """Outputs of a flight where attitude and place are ``told`` as a frame's."""
     slam = EdgeSlam(CAMERA, SlamConfig(depth=DepthConfig(weights="none")), depth=flight.depth_function())
-    slam._system.has_telemetry, slam._system.fusion.turned = True, told
+    slam._system.has_telemetry, slam._system.fusion.turned, slam._system.fusion.reckoned = True, told, place
+    slam._system.fusion.rotation = lambda: np.eye(3)
     return [slam.step(frame) for frame in flight.frames]
 
 
@@ -65,7 +96,41 @@ def test_without_attitude_the_images_are_all_there_is():
 def test_attitude_that_lies_moves_no_pose_that_the_images_prove():
     flight = film(stairs_world(), CAMERA, sideways(16, 0.03, turn_rad=0.004), step_s=1 / 30)
     lie = se3.exp(np.array([0.0, 0.0, 0.0, 0.1, 0.1, 0.1]))[:3, :3]
-    lied, untold = flown(flight, lambda stamp_s: (lie, 0.0)), flown(flight, lambda stamp_s: None)
+    lied, untold = flown(flight, lambda stamp_s: (lie, 0.0)), flown(flight)
+    assert [out.status for out in lied] == [out.status for out in untold]
+    for a, b in zip(lied, untold, strict=True):
+        np.testing.assert_allclose(a.T_w_c, b.T_w_c, atol=2e-3)
+
+
+def true_centre(flight, k):
+    """Where the camera of a frame is in a map whose axes are those of the first one turned upright."""
+    first = se3.inverse(EdgeSlam(CAMERA)._system.motion.T_c_w)
+    return (first @ se3.inverse(flight.T_w_c[0]) @ flight.T_w_c[k])[:3, 3]
+
+
+def carried(flight):
+    """Where the drone's sensors carry a frame's camera."""
+
+    def place(stamp_s):
+        k = int(np.argmin(np.abs(flight.stamps_s - stamp_s)))
+        return Reckoned(true_centre(flight, k), np.full(3, DOUBT_M))
+
+    return place
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_repeating_wall_is_no_way_that_the_drone_has_not_gone(axis):
+    flight = passing(axis)
+    held, alone = (flown(flight, place=place) for place in (carried(flight), lambda stamp_s: None))
+    true = true_centre(flight, len(flight.frames) - 1)
+    assert np.abs(held[-1].T_w_c[:3, 3] - true).max() < 1.5 * DOUBT_M
+    assert np.abs(alone[-1].T_w_c[:3, 3] - true).max() > 4.0 * DOUBT_M
+
+
+def test_a_place_that_lies_moves_no_pose_that_the_images_prove():
+    flight = film(stairs_world(), CAMERA, sideways(16, 0.03, turn_rad=0.004), step_s=1 / 30)
+    lied = flown(flight, place=lambda stamp_s: Reckoned(np.array([0.3, -0.5, 0.4]), np.full(3, DOUBT_M)))
+    untold = flown(flight)
     assert [out.status for out in lied] == [out.status for out in untold]
     for a, b in zip(lied, untold, strict=True):
         np.testing.assert_allclose(a.T_w_c, b.T_w_c, atol=2e-3)

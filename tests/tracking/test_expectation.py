@@ -10,7 +10,7 @@ from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.map.anchors import Anchors
 from edgeslam_torch.optim.pose_only import PoseConfig
 from edgeslam_torch.optim.problem import PosePrior
-from edgeslam_torch.tracking.expectation import Attitude, Expectation, Vertical, levelled, pose_on_anchors
+from edgeslam_torch.tracking.expectation import Attitude, Expectation, Place, Vertical, levelled, pose_on_anchors
 
 CAMERA = Camera(640, 480, 460.0, 460.0, 320.0, 240.0)
 LEVEL = np.array([[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
@@ -95,3 +95,80 @@ def test_attitude_denies_a_turn_that_whole_degrees_do_not_explain():
 def test_attitude_turns_a_pose_about_its_centre():
     turned = Attitude(LEVEL[:3, :3], 0.0).applied_to(tilted(20.0, climbed()))
     np.testing.assert_allclose(turned, climbed(), atol=1e-12)
+
+
+AXES = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+"""``R_w_m`` of a drone that was switched on facing right."""
+
+
+def at(centre_m, doubt=0.05):
+    """The place of a camera at ``(3,)`` in the map's axes."""
+    return Place(AXES, AXES @ centre_m, np.full(3, doubt))
+
+
+def seen_from(T_c_w, p_w, mapped_w, rng):
+    """What a camera sees of points ``(N, 3)``, and the anchors ``(N, 3)`` that the map has of them."""
+    anchors = Anchors()
+    n = len(p_w)
+    ids = anchors.add(mapped_w, np.zeros((n, 4), np.uint64), 0, False, np.zeros((n, 3), np.uint8))
+    return anchors, ids, CAMERA.project(se3.transform(T_c_w, p_w)) + rng.normal(0, 0.3, (n, 2))
+
+
+@pytest.fixture
+def papered(rng):
+    """A wall 3.7 m away that fills little of the image, mapped as leaning by 5 degrees, from a camera 0.3 m higher."""
+    y, z = rng.uniform([-1.4, -1.0], [1.4, 0.9], (300, 2)).T
+    p_w = np.column_stack([np.full(300, 3.7), y, z])
+    mapped = p_w + np.column_stack([math.tan(math.radians(5.0)) * z, np.zeros((300, 2))])
+    return seen_from(climbed(), p_w, mapped, rng)
+
+
+def test_a_climb_before_a_wall_that_leans_in_the_map_is_one_that_the_drone_has_made(papered):
+    anchors, ids, uv = papered
+    by_motion = PosePrior(0, LEVEL, np.diag([1.0] * 6))
+
+    def centre(place):
+        found = pose_on_anchors(
+            anchors, ids, uv, np.full(len(ids), 0.5), LEVEL, CAMERA, Expectation(by_motion, None, place), PoseConfig()
+        )
+        return se3.inverse(found.T_c_w)[:3, 3]
+
+    free = centre(None)
+    assert abs(free[2] - CLIMB_M) > 0.1
+    held = centre(at(np.array([0.0, 0.0, CLIMB_M])))
+    np.testing.assert_allclose(np.abs(held - [0.0, 0.0, CLIMB_M]).max(), 0.05, atol=0.005)
+    np.testing.assert_array_equal(centre(at(free)), free)
+
+
+def test_a_place_that_the_images_contradict_does_not_count(rng):
+    p_w = rng.uniform([1.5, -2.0, -1.0], [6.0, 2.0, 1.0], (300, 3))
+    anchors, ids, uv = seen_from(climbed(), p_w, p_w, rng)
+    lie = Expectation(PosePrior(0, LEVEL, np.eye(6)), None, at(np.array([0.0, 0.0, -0.4])))
+    found = pose_on_anchors(anchors, ids, uv, np.ones(len(ids)), LEVEL, CAMERA, lie, PoseConfig())
+    np.testing.assert_allclose(se3.inverse(found.T_c_w)[:3, 3], [0.0, 0.0, CLIMB_M], atol=0.02)
+
+
+def test_what_is_beyond_a_place_is_measured_along_its_axes():
+    place = Place(AXES, np.array([1.0, 2.0, 3.0]), np.array([0.1, 0.2, 0.3]))
+    inside, beyond = (AXES.T @ np.array(c) for c in ([1.09, 1.81, 3.0], [1.5, 1.5, 3.31]))
+    T = np.eye(4)
+    T[:3, :3] = se3.exp(np.array([0.0, 0.0, 0.0, 0.4, -0.2, 0.9]))[:3, :3]
+
+    def from_centre(c):
+        return np.block([[T[:3, :3], -T[:3, :3] @ c[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]])
+
+    np.testing.assert_array_equal(place.beyond(from_centre(inside)), np.zeros(3))
+    np.testing.assert_allclose(place.beyond(from_centre(beyond)), [0.4, -0.3, 0.01], atol=1e-12)
+    prior = place.held(from_centre(beyond), PosePrior(0, np.eye(4), np.zeros((6, 6))))
+    np.testing.assert_allclose(AXES @ se3.inverse(prior.T_c_w)[:3, 3], [1.1, 1.8, 3.3], atol=1e-12)
+    np.testing.assert_allclose(prior.T_c_w[:3, :3], T[:3, :3], atol=1e-12)
+
+
+def test_a_place_holds_only_the_axes_along_which_a_pose_has_left_it():
+    place = Place(AXES, np.zeros(3), np.full(3, 0.1))
+    T = np.block([[np.eye(3), -(AXES.T @ [0.0, 0.0, 0.5])[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]])
+    information = place.held(T, PosePrior(0, np.eye(4), np.zeros((6, 6)))).information
+    along, across = AXES[2], AXES[0]
+    assert along @ information[:3, :3] @ along == pytest.approx(1.0 / 0.002**2)
+    assert across @ information[:3, :3] @ across == pytest.approx(0.0, abs=1e-6)
+    assert not information[3:].any()
