@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from edgeslam_torch.fusion.displacement import TelemetryModel
+from edgeslam_torch.fusion.heading import headings
 from edgeslam_torch.map.keyframe import Keyframe
-from edgeslam_torch.optim.problem import CentreFactor, GravityFactor
+from edgeslam_torch.optim.problem import CentreFactor, GravityFactor, HeadingFactor
 
 ALIKE = 30.0
 """Keypoints err together: a window's thousands of reprojections, taken for independent, hold a wrong scale against
@@ -24,6 +25,7 @@ class MotionFactors:
 
     centres: tuple[CentreFactor, ...] = ()
     gravity: tuple[GravityFactor, ...] = ()
+    headings: tuple[HeadingFactor, ...] = ()
 
 
 def motion_factors(
@@ -42,7 +44,7 @@ def motion_factors(
     """
     if model is None:
         return MotionFactors()
-    centres, gravity = [], []
+    centres, gravity, turned = [], [], []
     for number in sorted(set(piece)):
         # Keyframes of earlier flights have no time on this one's clock.
         members = [i for i, p in enumerate(piece) if p == number and np.isfinite(keyframes[i].stamp_s)]
@@ -57,4 +59,8 @@ def motion_factors(
         if up is not None:
             alike = GUESSED if model.holds_level else ALIKE
             gravity.append(GravityFactor(order[up.frame], up.up_c, up.up_m, up.sigma_rad / math.sqrt(alike)))
-    return MotionFactors(tuple(centres), tuple(gravity))
+        told_yaw = headings(model, stamps)
+        if told_yaw is not None:
+            poses = order[told_yaw.frame]
+            turned.append(HeadingFactor(poses, told_yaw.R_c_m, told_yaw.up_m, ALIKE * told_yaw.information))
+    return MotionFactors(tuple(centres), tuple(gravity), tuple(turned))

@@ -217,6 +217,7 @@ def window_problem(
         depth_priors=priors,
         centres=told.centres,
         gravity=told.gravity,
+        headings=told.headings,
     )
     return replace(problem, relative_priors=(*motions, *motion_priors(problem, window.freed))), keypoint
 

@@ -140,7 +140,7 @@ class _Window:
         K = torch.tensor(problem.K, dtype=torch.float64)
         self.points = PointBlocks(problem, K, column, config)
         self.priors = PriorTerms(problem.pose_priors, problem.scale_priors, column.tolist(), problem.relative_priors)
-        self.motion = MotionTerms(problem.centres, problem.gravity, column.tolist())
+        self.motion = MotionTerms(problem.centres, problem.gravity, problem.headings, column.tolist())
         self.relative: list[EdgeBlocks | JunctionBlocks] = []
         columns = torch.as_tensor(column)
         if problem.edges is not None and len(problem.edges.host):

@@ -1,9 +1,12 @@
-r"""Residuals of camera positions and of gravity: what inertial or other measurements of motion add to a window.
+r"""Residuals of camera positions, gravity and headings: what inertial or other measurements of motion add to a window.
 
 Positions come as one Gaussian, :math:`\chi^2 = c^T A c - 2 b^T c + k` of the stacked camera centres
 :math:`c_i = -R_i^T t_i`, whose derivative by a left perturbation :math:`(\rho, \phi)` of the pose is
 :math:`-R_i^T \rho`: the translation alone. Gravity is a direction in the camera, :math:`R_i g - u_i`, with the
-derivative :math:`-[R_i g]_\times \phi`.
+derivative :math:`-[R_i g]_\times \phi`. A heading is the turn about the vertical from a measured rotation
+:math:`M_i`: of :math:`E_i = M_i^T R_i`, with angle :math:`\theta_i` and axis :math:`a_i`, the part
+:math:`\sin\theta_i\, g^T a_i`, with the derivative
+:math:`\tfrac12 g^T (\mathrm{tr}(E_i) I - E_i)\, M_i^T \phi`.
 """
 
 import numpy as np
@@ -11,7 +14,7 @@ import torch
 from torch import Tensor
 
 from edgeslam_torch.geometry.se3 import hat
-from edgeslam_torch.optim.problem import CentreFactor, GravityFactor
+from edgeslam_torch.optim.problem import CentreFactor, GravityFactor, HeadingFactor
 from edgeslam_torch.types import FloatArray
 
 
@@ -22,29 +25,36 @@ class MotionTerms:
     """
 
     def __init__(
-        self, centres: tuple[CentreFactor, ...], gravity: tuple[GravityFactor, ...], column: list[int]
+        self,
+        centres: tuple[CentreFactor, ...],
+        gravity: tuple[GravityFactor, ...],
+        headings: tuple[HeadingFactor, ...],
+        column: list[int],
     ) -> None:
         """Prepare the terms.
 
         Args:
             centres: Gaussians of camera centres.
             gravity: Up directions.
+            headings: Gaussians of turns about the vertical.
             column: Free-pose number of each pose, -1 for a fixed one.
         """
-        self.centres, self.gravity = centres, gravity
+        self.centres, self.gravity, self.headings = centres, gravity, headings
         self.column = np.asarray(column)
 
     def cost(self, T_c_w: Tensor) -> float:
         """Sum of squared whitened residuals."""
-        if not self.centres and not self.gravity:
+        if not (self.centres or self.gravity or self.headings):
             return 0.0
         T = T_c_w.cpu().numpy()
         total = sum(centre_cost(T[f.pose], f)[0] for f in self.centres)
-        return total + sum(float(np.sum(gravity_residual(T[f.pose], f) ** 2)) for f in self.gravity)
+        total += sum(float(np.sum(gravity_residual(T[f.pose], f) ** 2)) for f in self.gravity)
+        turned = ((heading_residual(T[f.pose], f), f.information) for f in self.headings)
+        return total + sum(float(e @ A @ e) for e, A in turned)
 
     def linearise(self, T_c_w: Tensor, H: Tensor, g: Tensor) -> float:
         """Add the terms to ``H (6F, 6F)`` and ``g (6F,)``; returns their cost."""
-        if not self.centres and not self.gravity:
+        if not (self.centres or self.gravity or self.headings):
             return 0.0
         T = T_c_w.cpu().numpy()
         F = H.shape[0] // 6
@@ -69,6 +79,16 @@ class MotionTerms:
                 if i >= 0:
                     H_np[i, 3:, i, 3:] += J[k].T @ J[k]
                     g_np[i, 3:] += J[k].T @ r[k]
+        for heading in self.headings:
+            e, J = heading_residual(T[heading.pose], heading), heading_jacobian(T[heading.pose], heading)
+            slope = heading.information @ e
+            total += float(e @ slope)
+            column = self.column[heading.pose]
+            free = np.flatnonzero(column >= 0)
+            into, J = column[free], J[free]
+            np.add.at(g_np[:, 3:], into, J * slope[free, None])
+            curvature = np.einsum("ia,ij,jb->ijab", J, heading.information[np.ix_(free, free)], J)
+            H_np[into[:, None], 3:, into[None], 3:] += curvature
         H += torch.as_tensor(H_np.reshape(H.shape))
         g += torch.as_tensor(g_np.ravel())
         return total
@@ -89,3 +109,23 @@ def gravity_residual(T_c_w: FloatArray, factor: GravityFactor) -> FloatArray:
 def gravity_jacobian(T_c_w: FloatArray, factor: GravityFactor) -> FloatArray:
     """Derivative of `gravity_residual` by the rotation of a left perturbation ``(U, 3, 3)``."""
     return np.asarray(-hat(T_c_w[:, :3, :3] @ factor.up_w) / factor.sigma_rad)
+
+
+def heading_residual(T_c_w: FloatArray, factor: HeadingFactor) -> FloatArray:
+    """Sine of the turn about the vertical from measured to predicted rotations ``(U,)``."""
+    E = np.swapaxes(factor.R_c_w, 1, 2) @ T_c_w[:, :3, :3]
+    return np.asarray(0.5 * np.einsum("a,ua->u", factor.up_w, _antisymmetric(E)))
+
+
+def heading_jacobian(T_c_w: FloatArray, factor: HeadingFactor) -> FloatArray:
+    """Derivative of `heading_residual` by the rotation of a left perturbation ``(U, 3)``."""
+    M_T = np.swapaxes(factor.R_c_w, 1, 2)
+    E = M_T @ T_c_w[:, :3, :3]
+    trace = np.trace(E, axis1=1, axis2=2)[:, None, None]
+    return np.asarray(0.5 * np.einsum("a,uab,ubc->uc", factor.up_w, trace * np.eye(3) - E, M_T))
+
+
+def _antisymmetric(E: FloatArray) -> FloatArray:
+    """Vectors ``(U, 3)`` whose cross product is ``E - E^T``."""
+    D = E - np.swapaxes(E, 1, 2)
+    return np.stack([D[:, 2, 1], D[:, 0, 2], D[:, 1, 0]], axis=1)

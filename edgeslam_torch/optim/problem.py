@@ -180,6 +180,20 @@ class GravityFactor:
 
 
 @dataclass(frozen=True, slots=True)
+class HeadingFactor:
+    """A Gaussian of how some cameras are turned about the world's vertical."""
+
+    pose: IntArray
+    """``(U,)`` pose indices."""
+    R_c_w: FloatArray
+    """``(U, 3, 3)`` measured world-to-camera rotations."""
+    up_w: FloatArray
+    """``(3,)`` unit vector of the vertical in the world."""
+    information: FloatArray
+    """``(U, U)`` symmetric, positive semidefinite [1/rad^2]."""
+
+
+@dataclass(frozen=True, slots=True)
 class WindowProblem:
     """Poses and anchors to refine together; ``W`` poses, ``A`` anchors, ``M`` observations."""
 
@@ -207,6 +221,7 @@ class WindowProblem:
     junctions: JunctionTerms | None = None
     centres: tuple[CentreFactor, ...] = ()
     gravity: tuple[GravityFactor, ...] = ()
+    headings: tuple[HeadingFactor, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

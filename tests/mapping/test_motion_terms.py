@@ -192,6 +192,44 @@ def tilt_deg(points):
     return float(np.degrees(np.arccos(np.clip(np.einsum("ki,ki->k", mine[:, 2], true[:, 2]), -1, 1))).max())
 
 
+@pytest.mark.parametrize("turn_rad", [0.15, -0.15])
+def test_a_part_that_has_turned_is_turned_back_by_the_drones_heading(rng, halves, turn_rad):
+    """The last three keyframes and what they alone see, turned about the vertical through the third: positions alone
+    would move them back and leave them turned."""
+    turned_about(halves, [0.0, 0.0, turn_rad])
+    assert heading_deg(halves) == pytest.approx(np.degrees(turn_rad), abs=0.1)
+    window = Window(halves.keyframes[3:], halves.keyframes[:3], halves.map.anchors_seen_by(halves.keyframes))
+    model = replace(telemetry_of(rng, halves), velocity=False)
+    refine(halves.map, window, CAMERA, LmConfig(max_iterations=50), model)
+    assert abs(heading_deg(halves)) < 0.5
+    check_map(halves.map)
+
+
+def turned_about(points, rotation_vector, first=3):
+    """The keyframes from one on and their anchors, turned about the one before it."""
+    centre = points.keyframes[first - 1].centre_w
+    T = se3.exp(np.concatenate([np.zeros(3), rotation_vector]))
+    T[:3, 3] = centre - T[:3, :3] @ centre
+    for keyframe in points.keyframes[first:]:
+        keyframe.T_c_w = se3.inverse(T @ keyframe.T_w_c)
+    mine = points.map.anchors_seen_by(points.keyframes[first:])
+    points.map.anchors.p_w[mine] = se3.transform(T, points.map.anchors.p_w[mine])
+
+
+def heading_deg(points, first=3):
+    """Mean turn about the vertical of the keyframes from one on."""
+    true = se3.inverse(points.world.T_c_w)
+    off = [k.T_w_c[:3, :3] @ true[k.id, :3, :3].T for k in points.keyframes[first:]]
+    return float(np.degrees(np.mean(Rotation.from_matrix(np.array(off)).as_rotvec()[:, 2])))
+
+
+def test_headings_say_nothing_before_metres_or_where_attitude_may_not_speak(rng, halves):
+    model = telemetry_of(rng, halves)
+    assert motion_factors(model, halves.keyframes, [0] * 6).headings
+    for silent in (replace(model, attitude=False), replace(model, scale_sigma_log=np.inf, velocity=False)):
+        assert not motion_factors(silent, halves.keyframes, [0] * 6).headings
+
+
 def test_gravity_alone_holds_level_what_nothing_else_holds(rng, halves):
     tilted(halves, 0.2)
     assert tilt_deg(halves) > 10.0
@@ -227,4 +265,4 @@ def test_attitude_that_may_not_speak_gives_no_gravity(rng, halves):
 
 def test_no_telemetry_no_factors(halves):
     factors = motion_factors(None, halves.keyframes, [0] * 6)
-    assert not factors.centres and not factors.gravity
+    assert not factors.centres and not factors.gravity and not factors.headings

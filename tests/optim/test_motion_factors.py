@@ -5,8 +5,14 @@ import pytest
 import torch
 
 from edgeslam_torch.geometry import se3
-from edgeslam_torch.optim.motion_factors import MotionTerms, gravity_jacobian, gravity_residual
-from edgeslam_torch.optim.problem import CentreFactor, GravityFactor
+from edgeslam_torch.optim.motion_factors import (
+    MotionTerms,
+    gravity_jacobian,
+    gravity_residual,
+    heading_jacobian,
+    heading_residual,
+)
+from edgeslam_torch.optim.problem import CentreFactor, GravityFactor, HeadingFactor
 
 STEP = 1e-6
 
@@ -32,14 +38,17 @@ def moved_by(T, pose, xi):
 
 @pytest.fixture
 def terms(rng):
-    """Five poses, the second fixed; two centre factors in another order than the poses', and gravity."""
+    """Five poses, the second fixed; two centre factors in another order than the poses', gravity and headings."""
     B = rng.normal(size=(9, 9))
     dense = CentreFactor(np.array([3, 1, 0]), B @ B.T, rng.normal(size=9), 2.0)
     pair = between(2, 4, [0.3, -0.2, 0.1], 0.05, 5)
     up_c = rng.normal(size=(3, 3))
     up_c /= np.linalg.norm(up_c, axis=1)[:, None]
     gravity = GravityFactor(np.array([4, 1, 2]), up_c, np.array([0.0, 0.6, 0.8]), 0.1)
-    return MotionTerms((dense, pair), (gravity,), [0, -1, 1, 2, 3])
+    told = random_poses(rng, 4)[:, :3, :3]
+    C = rng.normal(size=(4, 4))
+    heading = HeadingFactor(np.array([2, 0, 1, 4]), told, np.array([0.48, 0.6, 0.64]), C @ C.T)
+    return MotionTerms((dense, pair), (gravity,), (heading,), [0, -1, 1, 2, 3])
 
 
 def test_gradient_and_curvature_are_those_of_the_cost(rng, terms):
@@ -59,7 +68,7 @@ def test_gradient_and_curvature_are_those_of_the_cost(rng, terms):
 
 def test_curvature_of_centres_is_exact_in_the_translations(rng, terms):
     """The cost is quadratic in them, so the difference of two gradients is the curvature."""
-    terms.gravity = ()
+    terms.gravity = terms.headings = ()
     T = random_poses(rng, 5)
     xi = np.concatenate([rng.normal(size=3), np.zeros(3)])
     H, g, moved_H, moved_g = (torch.zeros(*s, dtype=torch.float64) for s in ((24, 24), (24,)) * 2)
@@ -78,13 +87,34 @@ def test_gravity_jacobian_matches_finite_differences(rng):
         np.testing.assert_allclose(J[:, k], (up - down) / (2 * STEP), atol=1e-7)
 
 
+def test_heading_jacobian_matches_finite_differences(rng):
+    T = random_poses(rng, 3)
+    up = np.array([0.48, 0.6, 0.64])
+    factor = HeadingFactor(np.arange(3), random_poses(rng, 3)[:, :3, :3], up, np.eye(3))
+    J = heading_jacobian(T, factor)
+    for k in range(3):
+        xi = np.concatenate([np.zeros(3), STEP * np.eye(3)[k]])
+        for pose in range(3):
+            up_, down = (heading_residual(moved_by(T, pose, s * xi), factor)[pose] for s in (1, -1))
+            assert J[pose, k] == pytest.approx((up_ - down) / (2 * STEP), abs=1e-7)
+
+
+def test_a_heading_is_a_turn_about_the_vertical_and_nothing_else(rng):
+    T = random_poses(rng, 2)
+    up = np.array([0.0, 0.0, 1.0])
+    for axis, turn, sine in ((up, 0.3, np.sin(0.3)), (up, -0.3, -np.sin(0.3)), (np.array([1.0, 0.0, 0.0]), 0.3, 0.0)):
+        in_world = se3.exp(np.concatenate([np.zeros(3), turn * axis]))[:3, :3]
+        factor = HeadingFactor(np.arange(2), T[:, :3, :3] @ in_world.T, up, np.eye(2))
+        np.testing.assert_allclose(heading_residual(T, factor), sine, atol=1e-12)
+
+
 def test_a_displacement_has_a_direction():
     """The camera that moved forward is ahead: the same displacement the other way round costs four times its square."""
     T_w_c = np.tile(np.eye(4), (2, 1, 1))
     T_w_c[1, :3, 3] = [0.5, 0.0, 0.0]
     T = torch.as_tensor(se3.inverse(T_w_c))
     for moved, cost in (([0.5, 0.0, 0.0], 0.0), ([-0.5, 0.0, 0.0], 100.0), ([0.5, 0.1, 0.0], 1.0)):
-        assert MotionTerms((between(0, 1, moved, 0.1, 2),), (), [0, 1]).cost(T) == pytest.approx(cost, abs=1e-9)
+        assert MotionTerms((between(0, 1, moved, 0.1, 2),), (), (), [0, 1]).cost(T) == pytest.approx(cost, abs=1e-9)
 
 
 def test_gravity_has_a_direction():
@@ -94,12 +124,12 @@ def test_gravity_has_a_direction():
     T = torch.as_tensor(se3.inverse(level)[None])
     for up_c, cost in (([0.0, -1.0, 0.0], 0.0), ([0.0, 1.0, 0.0], 400.0)):
         factor = GravityFactor(np.array([0]), np.array([up_c]), np.array([0.0, 0.0, 1.0]), 0.1)
-        assert MotionTerms((), (factor,), [0]).cost(T) == pytest.approx(cost, abs=1e-9)
+        assert MotionTerms((), (factor,), (), [0]).cost(T) == pytest.approx(cost, abs=1e-9)
 
 
 def test_nothing_to_say_costs_nothing_and_changes_nothing(rng):
     T = torch.as_tensor(random_poses(rng, 2))
     H, g = torch.zeros(12, 12, dtype=torch.float64), torch.zeros(12, dtype=torch.float64)
-    nothing = MotionTerms((), (), [0, 1])
+    nothing = MotionTerms((), (), (), [0, 1])
     assert nothing.cost(T) == nothing.linearise(T, H, g) == 0.0
     assert not H.any() and not g.any()
