@@ -93,10 +93,10 @@ def test_the_doubt_covers_whole_decimetres(rng, swinging, rounding, height):
 
 
 def test_an_even_flight_loses_nearly_a_step_all_the_time(rng, swinging):
-    """At .19 m/s a velocity that is cut off says .1, and who takes it for rounded adds nothing."""
+    """At .185 m/s a velocity that is cut off says .1, and who takes it for rounded adds nothing."""
     motion = swinging(16.0)
-    T_w_c = np.repeat(motion.T_w_c[:1], len(motion.stamps_s), axis=0)
-    T_w_c[:, :3, 3] += motion.stamps_s[:, None] * [0.19, 0.19, 0.0]
+    T_w_c = motion.T_w_c.copy()  # it looks about: a message that is repeated is none
+    T_w_c[:, :3, 3] = [0.0, 0.0, 1.2] + motion.stamps_s[:, None] * [0.185, 0.185, 0.0]
     even = replace(motion, T_w_c=T_w_c)
     off, doubt = np.moveaxis(Flight(rng, even, told=in_whole_steps("truncate")).all_off_m(), 1, 0)
     assert (np.abs(off) < doubt).all()
