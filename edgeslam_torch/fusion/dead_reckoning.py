@@ -32,6 +32,8 @@ _FEW = 4
 class Reckoned:
     """A camera's place in the axes of the drone's power-on world."""
 
+    R_w_m: FloatArray
+    """``(3, 3)`` map to those axes."""
     centre: FloatArray
     """``(3,)`` [map units]."""
     doubt: FloatArray
@@ -65,7 +67,7 @@ def reckoned(model: TelemetryModel, recent: Sightings, stamp_s: float) -> Reckon
     height = _by_height(model, stamps_s, seen[:, 2] - arm[:-3, 2], frame_s)
     if height is not None and height[1] < doubt[2]:
         centre[2], doubt[2] = height[0] + arm[-3, 2], height[1]
-    return Reckoned(centre / model.scale, doubt / model.scale)
+    return Reckoned(model.R_w_m, centre / model.scale, doubt / model.scale)
 
 
 def _by_height(

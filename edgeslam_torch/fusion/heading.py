@@ -1,8 +1,9 @@
 """What telemetry says of a camera's headings at some moments, as a Gaussian with everything unknown marginalised.
 
 A drone's yaw is an integrated gyroscope: right from one keyframe to the next, and unknown as a whole. Its errors are
-added up from what they are: whole degrees; a rate of drift, the same for the flight; the video's delay, which errs with
-the rate of the turn; and the offset between the map's axes and those of power-on.
+added up from what they are: whole degrees; a rate of drift, the same for the flight; a share of each turn, by the
+gyroscope's and the camera's scale; the video's delay, which errs with the rate of the turn; and the offset between the
+map's axes and those of power-on.
 """
 
 import math
@@ -11,13 +12,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from edgeslam_torch.fusion.displacement import DELAY_S, TelemetryModel
-from edgeslam_torch.geometry.rotations import rotation_vector
 from edgeslam_torch.types import FloatArray, IntArray
 
 HEADING_RAD = math.radians(0.5)
 """Error of one heading: whole degrees, and a camera's mount that is off in a turn."""
 DRIFT_RAD_S = math.radians(0.02)
 """Standard deviation of the rate at which a gyroscope drifts: a degree in a minute."""
+TURN_SHARE = 0.01
+"""Standard deviation of a turn's length, relative: a gyroscope's scale and a focal length are known to a percent."""
 _OFFSET_RAD = 1.0
 _RATE_S = 0.1
 """Time over which the rate of a turn is taken."""
@@ -45,9 +47,15 @@ def headings(model: TelemetryModel, stamps_s: FloatArray) -> Headings | None:
     if len(frame) < 2:
         return None
     t = at_s[frame]
-    R_c_w = np.swapaxes(model.track.attitude(t) @ model.T_b_c[:3, :3], 1, 2)
-    before, after = model.track.attitude(t - 0.5 * _RATE_S), model.track.attitude(t + 0.5 * _RATE_S)
-    rate = np.array([rotation_vector(b @ a.T)[2] for a, b in zip(before, after, strict=True)]) / _RATE_S
-    drift, late = DRIFT_RAD_S * (t - t[0]), min(model.delay_sigma_s, DELAY_S) * rate
-    covariance = HEADING_RAD**2 * np.eye(len(t)) + _OFFSET_RAD**2 + np.outer(drift, drift) + np.outer(late, late)
-    return Headings(frame, R_c_w @ model.R_w_m, model.R_w_m[2], np.linalg.inv(covariance))
+    R_b_w = np.swapaxes(model.track.attitude(t), 1, 2)
+    covariance = HEADING_RAD**2 * np.eye(len(t)) + sum(np.outer(error, error) for error in _common(model, t))
+    R_c_m = model.T_b_c[:3, :3].T @ R_b_w @ model.R_w_m
+    return Headings(frame, R_c_m, model.R_w_m[2], np.linalg.inv(covariance))
+
+
+def _common(model: TelemetryModel, t: FloatArray) -> tuple[FloatArray, ...]:
+    """Errors of headings at ``t`` ``(U,)`` per standard deviation of what is common to all: ``(U,)`` each [rad]."""
+    turned = model.track.yaw(np.stack([t - 0.5 * _RATE_S, t, t + 0.5 * _RATE_S]))
+    yaw, rate = turned[1], (turned[2] - turned[0]) / _RATE_S
+    late_s = min(model.delay_sigma_s, DELAY_S)
+    return np.full(len(t), _OFFSET_RAD), DRIFT_RAD_S * (t - t[0]), TURN_SHARE * (yaw - yaw[0]), late_s * rate

@@ -286,6 +286,10 @@ class MotionFusion:
         turned = max(float(np.linalg.norm(up_c[:, k] - up_c[:, 0])) for k in (1, 2))
         return up_c[:, 0], turned
 
+    def told(self, stamp_s: float) -> tuple[tuple[FloatArray, float] | None, Reckoned | None]:
+        """What `turned` and `reckoned` say of a frame."""
+        return self.turned(stamp_s), self.reckoned(stamp_s)
+
     def turned(self, stamp_s: float) -> tuple[FloatArray, float] | None:
         """Rotation ``R_c_m`` ``(3, 3)`` of a frame's camera by the drone's attitude, turned into the map as the last
         seconds' frames were, and how far [rad] it turned within the doubt about the video's delay; None where
@@ -305,7 +309,7 @@ class MotionFusion:
         return R_m_c[0].T, doubt
 
     def reckoned(self, stamp_s: float) -> Reckoned | None:
-        """Place of a frame's camera by dead reckoning, in the axes of `rotation`; None where telemetry tells no metres,
+        """Place of a frame's camera by dead reckoning; None where telemetry tells no metres,
         or its velocities have not proven to be of this flight."""
         model, recent = self.telemetry(), self._memory.recent(stamp_s - RECKONED_S)
         if model is None or recent is None or not (model.velocity and math.isfinite(model.delay_sigma_s)):

@@ -64,7 +64,7 @@ class System:
     """Stamp of the newest keyframe, or of a later frame that needed not become one."""
     shows_nothing_new: bool = False
     """Whether the current image repeats the previous one."""
-    _told: tuple[float, Told] = (-np.inf, Told())
+    _told: tuple[float, Told | None] = (-np.inf, None)
     """What the drone's sensors tell of one frame: it is asked for several times."""
     stage_ms: dict[str, float] = field(default_factory=dict)
     """Times of the current frame."""
@@ -97,20 +97,21 @@ class System:
         told = self.fusion.vertical(stamp_s) if self._is_young(stamp_s) else None
         vertical = None if told is None else Vertical(*told)
         by_motion = self.motion.expectation(stamp_s, T_predicted, self.published.scale)
-        return Expectation(by_motion, vertical, self.told(stamp_s).place)
+        moved = self.told(stamp_s)
+        return Expectation(by_motion, vertical, None if moved is None else moved.place)
 
-    def told(self, stamp_s: float) -> Told:
-        """What the drone's sensors tell of a frame's pose, if telemetry has proven to be of this flight."""
+    def told(self, stamp_s: float) -> Told | None:
+        """What the drone's sensors tell of a frame's pose; None where none has proven to be of this flight."""
         if self._told[0] != stamp_s:
-            self._told = stamp_s, self._ask(stamp_s) if self.has_telemetry else Told()
+            self._told = stamp_s, self._ask(stamp_s) if self.has_telemetry else None
         return self._told[1]
 
-    def _ask(self, stamp_s: float) -> Told:
-        turned, reckoned, R_w_m = self.fusion.turned(stamp_s), self.fusion.reckoned(stamp_s), self.fusion.rotation()
-        attitude = None if turned is None else Attitude(*turned)
-        if reckoned is None or R_w_m is None:
-            return Told(attitude)
-        return Told(attitude, Place(R_w_m, reckoned.centre, reckoned.doubt))
+    def _ask(self, stamp_s: float) -> Told | None:
+        turned, reckoned = self.fusion.told(stamp_s)
+        if turned is None and reckoned is None:
+            return None
+        place = None if reckoned is None else Place(reckoned.R_w_m, reckoned.centre, reckoned.doubt)
+        return Told(None if turned is None else Attitude(*turned), place)
 
     def reach(self, stamp_s: float, T_predicted: FloatArray) -> Reach:
         """Region that the camera can have reached during frames without a pose."""

@@ -99,7 +99,7 @@ class Tracking:
         show the same pose again it stays: telemetry alone moves none.
         """
         told, template = self.system.told(frame.stamp_s), self._template
-        if not told.denies(located.track.T_c_w):
+        if told is None or not told.denies(located.track.T_c_w):
             return located
         again = self._locate(frame, seen, told.applied_to(T_predicted))
         if again is None or told.denies(again.track.T_c_w):
@@ -246,7 +246,7 @@ class Tracking:
         with self.system.timed("edges"):
             expected = self.system.expectation(frame.stamp_s, T_predicted)
             alone = self._edge_tracker.refine(seen.grey, T_predicted, None, expected)
-        if alone is None or not alone.is_fixed or self.system.told(frame.stamp_s).denies(alone.T_c_w):
+        if alone is None or not alone.is_fixed or self._denied(alone.T_c_w, frame.stamp_s):
             return None
         none = np.zeros(0, dtype=np.int64)
         track = Track(alone.T_c_w, none, none, none, none, alone.covariance)
@@ -267,10 +267,15 @@ class Tracking:
             both = self._edge_tracker.refine(seen.grey, located.track.T_c_w, points, expected)
         if both is None or both.edges < MIN_EDGES or both.points.mean() < 0.5:
             return located
-        if system.told(frame.stamp_s).denies(both.T_c_w):
+        if self._denied(both.T_c_w, frame.stamp_s):
             return located
         track = replace(located.track, T_c_w=both.T_c_w, covariance=both.covariance)
         return replace(located, track=track, edges=both.edges)
+
+    def _denied(self, T_c_w: FloatArray, stamp_s: float) -> bool:
+        """Whether the drone has not moved as a pose ``(4, 4)`` by edges has; parallel ones hold few directions."""
+        told = self.system.told(stamp_s)
+        return told is not None and told.denies(T_c_w)
 
     # -- keyframes ---------------------------------------------------------------------------------------------
 

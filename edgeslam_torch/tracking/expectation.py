@@ -104,7 +104,7 @@ class Place:
 
 @dataclass(frozen=True, slots=True)
 class Told:
-    """What the drone's sensors tell of a frame's pose; None where they do not."""
+    """What the drone's sensors tell of a frame's pose, at least one of the two."""
 
     attitude: Attitude | None = None
     place: Place | None = None

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.fusion.config import FusionConfig
 from edgeslam_torch.fusion.displacement import TelemetryModel
-from edgeslam_torch.fusion.heading import DRIFT_RAD_S, HEADING_RAD, headings
+from edgeslam_torch.fusion.heading import DRIFT_RAD_S, HEADING_RAD, TURN_SHARE, headings
 from edgeslam_torch.fusion.telemetry.track import TelemetryTrack
 from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.synthetic.flights.telemetry import EXACT, simulate
@@ -54,6 +54,25 @@ def test_a_common_turn_costs_nothing_and_one_keyframe_alone_its_sigma(rng, swing
     drift = DRIFT_RAD_S * (stamps_s - stamps_s[0])
     assert chi2(told, step) > 10.0
     assert chi2(told, drift) < 1.1
+
+
+def test_a_percent_of_each_turn_costs_little(rng, swinging):
+    """As a focal length that is a percent off turns a camera, and not by twice as much one way as the other."""
+    motion = swinging(14.0)
+    stamps_s = flown(rng, motion)[2]
+    yaw = 20.0 * 0.3 * np.sin(0.7 * stamps_s)  # twenty times what is swung: whole turns
+    wide = replace(motion, T_w_c=turned(motion, 20.0))
+    told = flown(rng, wide)[0]
+    assert chi2(told, TURN_SHARE * yaw) < 1.5
+    assert chi2(told, TURN_SHARE * np.abs(yaw)) > 20.0
+
+
+def turned(motion, share):
+    """Poses of a camera that swings its heading so many times as wide."""
+    yaw = (share - 1.0) * 0.3 * np.sin(0.7 * motion.stamps_s)
+    T_w_c = motion.T_w_c.copy()
+    T_w_c[:, :3, :3] = Rotation.from_euler("z", yaw[:, None]).as_matrix() @ T_w_c[:, :3, :3]
+    return T_w_c
 
 
 def test_a_moment_that_is_not_known_says_less_of_turns(rng, swinging):

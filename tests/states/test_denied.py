@@ -65,7 +65,6 @@ def flown(flight, told=lambda stamp_s: None, place=lambda stamp_s: None):
     """Outputs of a flight where attitude and place are ``told`` as a frame's."""
     slam = EdgeSlam(CAMERA, SlamConfig(depth=DepthConfig(weights="none")), depth=flight.depth_function())
     slam._system.has_telemetry, slam._system.fusion.turned, slam._system.fusion.reckoned = True, told, place
-    slam._system.fusion.rotation = lambda: np.eye(3)
     return [slam.step(frame) for frame in flight.frames]
 
 
@@ -113,7 +112,7 @@ def carried(flight):
 
     def place(stamp_s):
         k = int(np.argmin(np.abs(flight.stamps_s - stamp_s)))
-        return Reckoned(true_centre(flight, k), np.full(3, DOUBT_M))
+        return Reckoned(np.eye(3), true_centre(flight, k), np.full(3, DOUBT_M))
 
     return place
 
@@ -129,7 +128,7 @@ def test_a_repeating_wall_is_no_way_that_the_drone_has_not_gone(axis):
 
 def test_a_place_that_lies_moves_no_pose_that_the_images_prove():
     flight = film(stairs_world(), CAMERA, sideways(16, 0.03, turn_rad=0.004), step_s=1 / 30)
-    lied = flown(flight, place=lambda stamp_s: Reckoned(np.array([0.3, -0.5, 0.4]), np.full(3, DOUBT_M)))
+    lied = flown(flight, place=lambda stamp_s: Reckoned(np.eye(3), np.array([0.3, -0.5, 0.4]), np.full(3, DOUBT_M)))
     untold = flown(flight)
     assert [out.status for out in lied] == [out.status for out in untold]
     for a, b in zip(lied, untold, strict=True):

@@ -216,6 +216,11 @@ class TelemetryTrack:
             return matrix_from_rpy(rpy[0])[None]
         return Rotation.from_euler("ZYX", rpy[:, ::-1]).as_matrix()
 
+    def yaw(self, stamps_s: FloatArray) -> FloatArray:
+        """Yaw [rad] without jumps, of the shape of the stamps."""
+        told = self.readings
+        return np.interp(stamps_s, told.stamp_s, told.rpy[:, 2])
+
     def interpolation_variance(self, stamps_s: FloatArray) -> FloatArray:
         """Variance of `attitude` ``(N,)`` in units of one reading's: 1 at a reading, a half between two."""
         stamp = self.readings.stamp_s
