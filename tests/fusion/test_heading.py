@@ -56,8 +56,8 @@ def test_a_common_turn_costs_nothing_and_one_keyframe_alone_its_sigma(rng, swing
     assert chi2(told, drift) < 1.1
 
 
-def test_a_percent_of_each_turn_costs_little(rng, swinging):
-    """As a focal length that is a percent off turns a camera, and not by twice as much one way as the other."""
+def test_half_a_percent_of_each_turn_costs_little(rng, swinging):
+    """As a focal length that is half a percent off turns a camera, and not by twice as much one way as the other."""
     motion = swinging(14.0)
     stamps_s = flown(rng, motion)[2]
     yaw = 20.0 * 0.3 * np.sin(0.7 * stamps_s)  # twenty times what is swung: whole turns
