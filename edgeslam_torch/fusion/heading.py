@@ -19,7 +19,7 @@ HEADING_RAD = math.radians(0.5)
 DRIFT_RAD_S = math.radians(0.02)
 """Standard deviation of the rate at which a gyroscope drifts: a degree in a minute."""
 TURN_SHARE = 0.005
-"""Standard deviation of a turn's length, relative: a gyroscope's scale and a focal length are known to half a percent."""
+"""Standard deviation of a turn, relative: a gyroscope's scale and a focal length are known to half a percent."""
 _OFFSET_RAD = 1.0
 _RATE_S = 0.1
 """Time over which the rate of a turn is taken."""
