@@ -311,7 +311,7 @@ class MotionFusion:
     def reckoned(self, stamp_s: float) -> Reckoned | None:
         """Place of a frame's camera by dead reckoning; None where telemetry tells no metres,
         or its velocities have not proven to be of this flight."""
-        model, recent = self.telemetry(), self._memory.recent(stamp_s - RECKONED_S)
+        model, recent = self._model(), self._memory.recent(stamp_s - RECKONED_S)
         if model is None or recent is None or not (model.velocity and math.isfinite(model.delay_sigma_s)):
             return None
         return reckoned(model, recent, stamp_s)
@@ -462,6 +462,11 @@ class MotionFusion:
         Until its metres are known gravity alone speaks, if the map was begun upright: the mean of attitudes that
         `_R_w_m` is has the map's own tilt in it by then (docs/decisions/0108).
         """
+        model = self._model()
+        return None if model is None else replace(model, track=self._track.copy())
+
+    def _model(self) -> TelemetryModel | None:
+        """The same on the track that grows, for use at once."""
         told = self._by_telemetry
         R_w_m = self._R_w_m if told is not None else np.eye(3) if self.began_upright else None
         if R_w_m is None:
@@ -470,7 +475,7 @@ class MotionFusion:
         heights = [reading for reading in HEIGHTS if reading in there and self._trust.height(reading)]
         odds = self._trust.at_odds  # what is not used for the scale must not pull at the map either
         return TelemetryModel(
-            self._track.copy(),
+            self._track,
             self.config,
             self.T_b_c,
             R_w_m,

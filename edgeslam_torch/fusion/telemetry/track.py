@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from enum import Enum
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +25,7 @@ _UPRIGHT = math.cos(math.radians(18.0))
 """Cosine of the lean above which the range sensor's slanted ray is 5 % too long."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Readings:
     """Telemetry as arrays; ``N`` readings in the order of their stamps."""
 
@@ -48,6 +49,11 @@ class Readings:
     """``(N,)``"""
     frozen: NDArray[np.bool_]
     """``(N,)`` part of a run that repeats one message to the bit."""
+
+    @cached_property
+    def heights(self) -> dict[str, tuple[FloatArray, FloatArray]]:
+        """As `TelemetryTrack.heights`: asked for with every frame, where readings are new with every message."""
+        return _heights(self)
 
     @property
     def valid(self) -> NDArray[np.bool_]:
@@ -291,19 +297,20 @@ class TelemetryTrack:
 
     def heights(self) -> dict[str, tuple[FloatArray, FloatArray]]:
         """Readings of each height source: name to (stamps, metres above floor or take-off)."""
-        if not self._samples:
-            return {}
-        told = self.readings
-        lean = np.cos(told.rpy[:, 0]) * np.cos(told.rpy[:, 1])
-        sources = {}
-        for name, z in (("tof", told.tof), ("h", told.height), ("baro", told.baro)):
-            good = np.isfinite(z) & ~told.frozen
-            if name == "tof":
-                # 10 cm on the ground, 65.53 m beyond reach, and a slanted ray when the drone leans.
-                good &= (z > 0.15) & (z < 8.0) & np.logical_not(lean < _UPRIGHT)
-            if good.any():
-                sources[name] = (told.stamp_s[good], z[good])
-        return sources
+        return self.readings.heights if self._samples else {}
+
+
+def _heights(told: Readings) -> dict[str, tuple[FloatArray, FloatArray]]:
+    lean = np.cos(told.rpy[:, 0]) * np.cos(told.rpy[:, 1])
+    sources = {}
+    for name, z in (("tof", told.tof), ("h", told.height), ("baro", told.baro)):
+        good = np.isfinite(z) & ~told.frozen
+        if name == "tof":
+            # 10 cm on the ground, 65.53 m beyond reach, and a slanted ray when the drone leans.
+            good &= (z > 0.15) & (z < 8.0) & np.logical_not(lean < _UPRIGHT)
+        if good.any():
+            sources[name] = (told.stamp_s[good], z[good])
+    return sources
 
 
 def _integral(stamp: FloatArray, velocity: FloatArray) -> FloatArray:
