@@ -23,8 +23,8 @@ HELD_SHARE = 0.02
 DENIED_SHARE = 1.25
 """Share of its doubt at which a centre is denied: more than one that is held at it."""
 NO_WORSE = 0.9
-"""Share of the inliers that an upright pose must keep of a free one's: where the images contradict it they say so by
-as many. A climb that is taken for a turn has as many either way."""
+"""Share of the inliers that a pose which telemetry holds must keep of a free one's: where the images contradict it they
+say so by as many. A climb that is taken for a turn has as many either way."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,12 +85,22 @@ class Place:
 
     def held(self, T_c_w: FloatArray, start: PosePrior) -> PosePrior:
         """A prior that keeps a pose from leaving it along the axes along which it has left."""
-        beyond = self.beyond(T_c_w)
-        T, left = self._moved(T_c_w, beyond), beyond != 0
-        axes = T[:3, :3] @ self.R_w_m.T[:, left]
+        axes, doubt = self._left(T_c_w)
         information = start.information.copy()
-        information[:3, :3] += (axes / (HELD_SHARE * self.doubt[left]) ** 2) @ axes.T
-        return PosePrior(start.pose, T, information)
+        information[:3, :3] += (axes / (HELD_SHARE * doubt) ** 2) @ axes.T
+        return PosePrior(start.pose, self._moved(T_c_w, self.beyond(T_c_w)), information)
+
+    def unsure(self, T_c_w: FloatArray) -> FloatArray:
+        """Covariance ``(6, 6)`` that is added to a pose held instead of one that has left: all of the doubt."""
+        axes, doubt = self._left(T_c_w)
+        covariance = np.zeros((6, 6))
+        covariance[:3, :3] = (axes * doubt**2) @ axes.T
+        return covariance
+
+    def _left(self, T_c_w: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Axes ``(3, A)`` in the camera along which a pose has left, and the doubt along each ``(A,)``."""
+        left = self.beyond(T_c_w) != 0
+        return T_c_w[:3, :3] @ self.R_w_m.T[:, left], self.doubt[left]
 
     def _off(self, T_c_w: FloatArray) -> FloatArray:
         return -self.R_w_m @ T_c_w[:3, :3].T @ T_c_w[:3, 3] - self.centre
@@ -178,18 +188,14 @@ def pose_on_anchors(
     counts = mostly_on_priors(anchors, anchor)
     free = refined(expected.by_motion if counts else None)
     by_motion = expected.by_motion if counts else replace(expected.by_motion, information=np.zeros((6, 6)))
+    place = expected.place
     if expected.vertical is not None:
-        return _unless_worse(refined(levelled(by_motion, expected.vertical)), free)
-    if expected.place is not None and expected.place.beyond(free.T_c_w).any():
-        return _unless_worse(refined(expected.place.held(free.T_c_w, by_motion)), free)
-    return free
-
-
-def _unless_worse(held: PoseResult, free: PoseResult) -> PoseResult:
-    """A pose that telemetry holds, if the images allow it.
-
-    Attitude comes in whole degrees, velocity in decimetres a second: that made it no surer than the images are.
-    """
-    if held.inliers.sum() < NO_WORSE * free.inliers.sum():
+        held = refined(levelled(by_motion, expected.vertical))
+        # Attitude comes in whole degrees: holding it made the pose no surer than the image is.
+        covariance = free.covariance
+    elif place is not None and free.inliers.any() and place.beyond(free.T_c_w).any():
+        held = refined(place.held(free.T_c_w, by_motion))
+        covariance = free.covariance + place.unsure(free.T_c_w)
+    else:
         return free
-    return replace(held, covariance=free.covariance)
+    return free if held.inliers.sum() < NO_WORSE * free.inliers.sum() else replace(held, covariance=covariance)

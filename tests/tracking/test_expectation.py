@@ -123,21 +123,45 @@ def papered(rng):
     return seen_from(climbed(), p_w, mapped, rng)
 
 
-def test_a_climb_before_a_wall_that_leans_in_the_map_is_one_that_the_drone_has_made(papered):
+def before_the_wall(papered, place):
     anchors, ids, uv = papered
-    by_motion = PosePrior(0, LEVEL, np.diag([1.0] * 6))
+    expected = Expectation(PosePrior(0, LEVEL, np.eye(6)), None, place)
+    return pose_on_anchors(anchors, ids, uv, np.full(len(ids), 0.5), LEVEL, CAMERA, expected, PoseConfig())
 
-    def centre(place):
-        found = pose_on_anchors(
-            anchors, ids, uv, np.full(len(ids), 0.5), LEVEL, CAMERA, Expectation(by_motion, None, place), PoseConfig()
-        )
-        return se3.inverse(found.T_c_w)[:3, 3]
 
-    free = centre(None)
+def centre_of(found):
+    return se3.inverse(found.T_c_w)[:3, 3]
+
+
+def test_a_climb_before_a_wall_that_leans_in_the_map_is_one_that_the_drone_has_made(papered):
+    true = np.array([0.0, 0.0, CLIMB_M])
+    free = centre_of(before_the_wall(papered, None))
     assert abs(free[2] - CLIMB_M) > 0.1
-    held = centre(at(np.array([0.0, 0.0, CLIMB_M])))
-    np.testing.assert_allclose(np.abs(held - [0.0, 0.0, CLIMB_M]).max(), 0.05, atol=0.005)
-    np.testing.assert_array_equal(centre(at(free)), free)
+    held = centre_of(before_the_wall(papered, at(true)))
+    np.testing.assert_allclose(np.abs(held - true).max(), 0.05, atol=0.005)
+    np.testing.assert_array_equal(centre_of(before_the_wall(papered, at(free))), free)
+
+
+def test_a_pose_that_is_held_at_a_place_is_as_unsure_as_that(papered):
+    """The images say something else: along the axes that are held its sigma is the doubt, and no other changes."""
+    free = before_the_wall(papered, None)
+    place = at(np.array([0.0, 0.0, CLIMB_M]))
+    held = before_the_wall(papered, place)
+    left = place.beyond(free.T_c_w) != 0
+    to_axes = AXES @ free.T_c_w[:3, :3].T
+    added = to_axes @ (held.covariance - free.covariance)[:3, :3] @ to_axes.T
+    np.testing.assert_allclose(added, np.diag(np.where(left, 0.05**2, 0.0)), atol=1e-12)
+    assert left.any() and not left.all()
+    np.testing.assert_array_equal(held.covariance[3:], free.covariance[3:])
+
+
+def test_what_cannot_be_solved_is_not_held(papered):
+    anchors, ids, uv = papered
+    expected = Expectation(PosePrior(0, LEVEL, np.eye(6)), None, at(np.array([0.0, 0.0, CLIMB_M])))
+    few = slice(0, 4)
+    found = pose_on_anchors(anchors, ids[few], uv[few], np.ones(4), LEVEL, CAMERA, expected, PoseConfig())
+    assert not found.inliers.any()
+    np.testing.assert_array_equal(found.T_c_w, LEVEL)
 
 
 def test_a_place_that_the_images_contradict_does_not_count(rng):
