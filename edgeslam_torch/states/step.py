@@ -44,3 +44,5 @@ class Located:
     relocalised: bool = False
     edges: int = 0
     """Number of edge points used for the pose."""
+    denied: bool = False
+    """Whether the drone's sensors deny the pose, and the images hold it all the same."""

@@ -54,9 +54,10 @@ class System:
     motion: MotionModel
     published: Published = field(default_factory=Published)
     events: dict[str, int] = field(
-        default_factory=lambda: {"lost": 0, "relocalised": 0, "restarted": 0, "initialisations_refused": 0}
+        default_factory=lambda: {"lost": 0, "relocalised": 0, "restarted": 0, "initialisations_refused": 0, "denied": 0}
     )
-    """Counts of losses, relocalisations, restarts and refused initialisations."""
+    """Counts of losses, relocalisations, restarts, refused initialisations, and of poses that the images hold although
+    the drone has not moved so."""
     has_telemetry: bool = False
     piece_began_s: float = -np.inf
     """Stamp of the frame with which the newest piece of map began."""
@@ -64,7 +65,7 @@ class System:
     """Stamp of the newest keyframe, or of a later frame that needed not become one."""
     shows_nothing_new: bool = False
     """Whether the current image repeats the previous one."""
-    _told: tuple[float, Told | None] = (-np.inf, None)
+    _told: tuple[float, Told | None] = field(default=(-np.inf, None), init=False, repr=False)
     """What the drone's sensors tell of one frame: it is asked for several times."""
     stage_ms: dict[str, float] = field(default_factory=dict)
     """Times of the current frame."""

@@ -104,7 +104,8 @@ class Tracking:
         again = self._locate(frame, seen, told.applied_to(T_predicted))
         if again is None or told.denies(again.track.T_c_w):
             self._template = template
-            return located
+            self.system.events["denied"] += 1
+            return replace(located, denied=True)
         return again
 
     def search(self, frame: Frame, seen: LazyView, T_predicted: FloatArray, lost_frames: int) -> Step | None:
@@ -318,7 +319,11 @@ class Tracking:
 
 def _in_words(located: Located) -> str:
     """Reason of a pose that is not simply tracked on keypoints, in words."""
-    inliers = located.track.inliers
+    inliers, said = located.track.inliers, []
     if located.edges:
-        return f"by {located.edges} edge points" + (f" beside {inliers} keypoints" if inliers else "")
-    return "found again among the keyframes" if located.relocalised else ""
+        said.append(f"by {located.edges} edge points" + (f" beside {inliers} keypoints" if inliers else ""))
+    elif located.relocalised:
+        said.append("found again among the keyframes")
+    if located.denied:
+        said.append("the drone's own motion denies it")
+    return "; ".join(said)

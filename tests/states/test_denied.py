@@ -99,6 +99,7 @@ def test_attitude_that_lies_moves_no_pose_that_the_images_prove():
     assert [out.status for out in lied] == [out.status for out in untold]
     for a, b in zip(lied, untold, strict=True):
         np.testing.assert_allclose(a.T_w_c, b.T_w_c, atol=2e-3)
+    assert "denies it" in lied[-1].reason and not untold[-1].reason
 
 
 def true_centre(flight, k):
@@ -133,3 +134,4 @@ def test_a_place_that_lies_moves_no_pose_that_the_images_prove():
     assert [out.status for out in lied] == [out.status for out in untold]
     for a, b in zip(lied, untold, strict=True):
         np.testing.assert_allclose(a.T_w_c, b.T_w_c, atol=2e-3)
+    assert "denies it" in lied[-1].reason and not untold[-1].reason
