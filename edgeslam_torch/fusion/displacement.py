@@ -44,6 +44,10 @@ FLOOR_M = 30.0
 UP_RAD = math.radians(2.0)
 """Error of the direction of gravity in one picture: mount, accelerations in flight."""
 UP_MEMORY_S = 5.0
+UNPROVEN_S = 3.0
+"""How far off the stamps of telemetry may be that has not yet turned with the images: `comparison` looks so far."""
+LEAST_LEVEL_RAD = math.radians(10.0)
+"""Doubt of a vertical beyond which it is left out: a drone hardly leans further, and a factor is linear."""
 _LEAST_WEIGHT = 1e-4
 _BENT = 0.2
 """Share of a way by which the map may be off without the reading being a wild one: that is what is to be mended."""
@@ -74,8 +78,8 @@ class UpDirections:
     """``(U, 3)`` unit vectors, camera axes."""
     up_m: FloatArray
     """``(3,)`` the same in the map."""
-    sigma_rad: float
-    """Of each, per axis."""
+    sigma_rad: FloatArray
+    """``(U,)`` of each, per axis."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,6 +125,8 @@ class TelemetryModel:
     """Probability that velocities are truncated, not rounded."""
     attitude: bool = True
     """Whether attitude may speak."""
+    attitude_proven: bool = True
+    """Whether it has turned as the images did."""
     young: bool = False
     """Whether the map has begun seconds ago."""
 
@@ -166,14 +172,16 @@ class TelemetryModel:
         if len(self.track) < 2 or not (self.attitude and self.track.has_attitude):
             return None
         at_s = stamps_s - self.delay_s
-        frame = np.flatnonzero(self.track.covered(at_s, at_s))
+        doubt_rad = self.track.leaned(at_s, lean_reach_s(self.attitude_proven, self.delay_sigma_s))
+        frame = np.flatnonzero(self.track.covered(at_s, at_s) & (doubt_rad < LEAST_LEVEL_RAD))
         if len(frame) == 0:
             return None
         t = at_s[frame]
         R_w_c = self.track.attitude(t) @ self.T_b_c[:3, :3]
         # Neighbours err alike: together they count as one.
         alike = (np.abs(t[:, None] - t[None]) < 0.5 * UP_MEMORY_S).sum(1)
-        return UpDirections(frame, R_w_c[:, 2, :], self.R_w_m[2], UP_RAD * math.sqrt(float(np.median(alike))))
+        sigma_rad = np.hypot(UP_RAD, doubt_rad[frame]) * math.sqrt(float(np.median(alike)))
+        return UpDirections(frame, R_w_c[:, 2, :], self.R_w_m[2], sigma_rad)
 
     def _displacements(self, at_s: FloatArray, per_scale_w: FloatArray) -> _Rows | None:
         """Rows of the velocities; ``per_scale_w`` ``(K, 3)``: change of the positions per sigma of the scale [m]."""
@@ -288,6 +296,16 @@ class TelemetryModel:
         return PositionGaussian(
             0.5 * (A + A.T), D.T @ whitened[:, -1], float(rows.told @ whitened[:, -1]), len(tukey), refused
         )
+
+
+def lean_reach_s(proven: bool, delay_sigma_s: float) -> float:
+    """Time [s] by which a frame's attitude may be another moment's.
+
+    Args:
+        proven: Whether the drone's attitude has turned as the images did.
+        delay_sigma_s: Standard deviation of the video's delay.
+    """
+    return min(delay_sigma_s, DELAY_S) if proven else UNPROVEN_S
 
 
 def _stacked(parts: list[_Rows]) -> _Rows | None:

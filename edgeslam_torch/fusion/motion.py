@@ -15,7 +15,7 @@ import numpy as np
 from edgeslam_torch.fusion.config import FusionConfig
 from edgeslam_torch.fusion.dead_reckoning import REACH_S as RECKONED_S
 from edgeslam_torch.fusion.dead_reckoning import Reckoned, reckoned
-from edgeslam_torch.fusion.displacement import DELAY_S, TelemetryModel
+from edgeslam_torch.fusion.displacement import TelemetryModel, lean_reach_s
 from edgeslam_torch.fusion.filter.filter_feed import FilterFeed, Metric
 from edgeslam_torch.fusion.health import disagreement
 from edgeslam_torch.fusion.prediction import (
@@ -274,17 +274,15 @@ class MotionFusion:
         return replace(depth.opinion, sigma=math.hypot(depth.sigma, self._focal_sigma))
 
     def vertical(self, stamp_s: float) -> tuple[FloatArray, float] | None:
-        """The map's z axis ``(3,)`` in a frame's camera by the drone's attitude, and how far [rad] that turned within
-        the doubt about the video's delay; None where attitude is not to be asked, or metres are told: whole degrees
+        """The map's z axis ``(3,)`` in a frame's camera by the drone's attitude, and how far [rad] that leaned within
+        the doubt about its moment; None where attitude is not to be asked, or metres are told: whole degrees
         are worse than what a map with parallax says."""
-        at_s, late_s = stamp_s - self.delay_s, min(self.delay_sigma_s, DELAY_S)
-        around = np.array([at_s, at_s - late_s, at_s + late_s])
+        at_s = np.array([stamp_s - self.delay_s])
         asked = self._by_telemetry is None and self.began_upright and self._trust.attitude
-        if not asked or not self._track.covered(around[:1], around[:1])[0]:
+        if not asked or not self._track.covered(at_s, at_s)[0]:
             return None
-        up_c = self.T_b_c[:3, :3].T @ self._track.attitude(around)[:, 2].T  # a column each
-        turned = max(float(np.linalg.norm(up_c[:, k] - up_c[:, 0])) for k in (1, 2))
-        return up_c[:, 0], turned
+        reach_s = lean_reach_s(self._trust.turns, self.delay_sigma_s)
+        return self.T_b_c[:3, :3].T @ self._track.attitude(at_s)[0, 2], float(self._track.leaned(at_s, reach_s)[0])
 
     def told(self, stamp_s: float) -> tuple[tuple[FloatArray, float] | None, Reckoned | None]:
         """What `turned` and `reckoned` say of a frame."""
@@ -487,6 +485,7 @@ class MotionFusion:
             heights[0] if told is not None and heights and (odds is None or odds.kept == "height") else None,
             self._fit.truncates,
             self._trust.attitude,
+            self._trust.turns,
         )
 
     # --- estimation ----------------------------------------------------------------------------------------------

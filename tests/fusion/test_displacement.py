@@ -198,6 +198,33 @@ def test_gravity_points_up(rng, swinging):
     np.testing.assert_allclose(up.up_m, [0.0, 0.0, 1.0])
 
 
+def leaning(pitch_deg, **changes):
+    """Model of a drone with these pitches, ten a second."""
+    rpy = np.radians([[0.0, float(pitch), 0.0] for pitch in pitch_deg])
+    return model_of([TelemetrySample(0.1 * k, np.zeros(3), a) for k, a in enumerate(rpy)], **changes)
+
+
+def test_a_vertical_is_as_unsure_as_its_moment():
+    """A nose that goes down by 6 degrees a second, and a video that is .2 s late or not: 1.2 degrees beside the 2."""
+    pitch = np.clip(6.0 * (0.1 * np.arange(100) - 5.0), 0.0, 6.0)
+    steady, moving = (leaning(pitch, delay_sigma_s=0.2).up(np.array([t])).sigma_rad for t in (3.0, 5.5))
+    assert np.degrees(steady) == pytest.approx(2.0)
+    assert np.degrees(moving) == pytest.approx(np.hypot(2.0, 1.2), rel=0.01)
+
+
+def test_the_vertical_of_telemetry_that_has_proven_nothing_may_be_seconds_off():
+    """Its clock may be: what leans by 6 degrees within seconds is that unsure, by 20 of no use."""
+    stamps = np.array([3.0])
+    for lean_deg, sigma_deg in ((0.0, 2.0), (6.0, np.hypot(2.0, 6.0))):
+        pitch = np.where(np.arange(100) < 50, 0.0, lean_deg)
+        assert np.degrees(leaning(pitch, attitude_proven=False).up(stamps).sigma_rad) == pytest.approx(sigma_deg)
+        assert np.degrees(leaning(pitch).up(stamps).sigma_rad) == pytest.approx(2.0)
+    far = np.where(np.arange(100) < 50, 0.0, 20.0)
+    assert leaning(far, attitude_proven=False).up(stamps) is None
+    assert leaning(far).up(stamps) is not None
+    assert leaning(far, attitude_proven=False).up(np.array([1.0])) is not None
+
+
 def test_silence_says_nothing(rng, swinging):
     model, stamps, p = flown(rng, swinging(6.0))
     assert model.positions(stamps[:1], p[:1]) is None

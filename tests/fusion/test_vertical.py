@@ -7,6 +7,7 @@ import pytest
 
 from edgeslam_torch.fusion.config import FusionConfig
 from edgeslam_torch.fusion.motion import MotionFusion
+from edgeslam_torch.fusion.telemetry.plausibility import Agreement, Reading
 from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.types import TelemetrySample
 
@@ -27,7 +28,7 @@ def told(pitch_rad, upright=True, delay_s=0.0):
 def test_a_nose_that_is_down_sees_up_behind_and_above():
     up_c, doubt_rad = told(math.radians(10.0)).vertical(1.0)
     np.testing.assert_allclose(up_c, [0.0, -math.cos(math.radians(10.0)), -math.sin(math.radians(10.0))], atol=1e-9)
-    assert doubt_rad == 0.0
+    assert doubt_rad == pytest.approx(0.0, abs=1e-12)
 
 
 def test_it_is_of_the_moment_that_the_image_shows():
@@ -42,3 +43,10 @@ def test_a_map_that_began_askew_is_not_asked():
 
 def test_a_moment_without_telemetry_says_nothing():
     assert told(0.0).vertical(9.0) is None
+
+
+def test_it_is_as_unsure_as_telemetry_that_may_be_of_another_moment_until_it_turns_with_the_images():
+    fusion = told(np.where(np.arange(30) < 20, 0.0, math.radians(10.0)))
+    assert fusion.vertical(1.0)[1] == pytest.approx(math.radians(10.0))
+    fusion._trust.judge(Reading.ATTITUDE, Agreement(0.99, 30))
+    assert fusion.vertical(1.0)[1] == pytest.approx(0.0, abs=1e-9)

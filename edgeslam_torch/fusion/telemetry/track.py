@@ -61,6 +61,10 @@ class Readings:
         return self.has_velocity & ~self.frozen
 
 
+_AROUND = np.linspace(-1.0, 1.0, 25)
+"""Moments that are looked at within a reach, as shares of it: every 0.25 s of the longest, 3 s."""
+
+
 class Turn(Enum):
     """What velocities are turned by to get into the world of power-on, beyond what the settings say."""
 
@@ -221,6 +225,13 @@ class TelemetryTrack:
         if len(rpy) == 1:
             return matrix_from_rpy(rpy[0])[None]
         return Rotation.from_euler("ZYX", rpy[:, ::-1]).as_matrix()
+
+    def leaned(self, stamps_s: FloatArray, reach_s: float) -> FloatArray:
+        """How far [rad] the vertical moves in the body within ``reach_s`` of each stamp ``(N,)``; at least 0."""
+        around = stamps_s[:, None] + reach_s * _AROUND
+        up = self.attitude(around.ravel())[:, 2].reshape(*around.shape, 3)
+        chord = np.linalg.norm(up - self.attitude(stamps_s)[:, None, 2], axis=2).max(axis=1)
+        return np.asarray(2.0 * np.arcsin(0.5 * chord))
 
     def yaw(self, stamps_s: FloatArray) -> FloatArray:
         """Yaw [rad] without jumps, of the shape of the stamps."""
