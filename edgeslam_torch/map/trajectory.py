@@ -5,11 +5,14 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.types import FloatArray, Piece, Support
+
+_THE_SAME = 1e-9
 
 
 @dataclass(slots=True)
@@ -120,12 +123,15 @@ class TrajectoryLog:
             return np.zeros(0), np.zeros((0, 4, 4))
         with self.map.lock:
             T_k_w = {id: self.map.pose_of(id) for id in {r.keyframe_id for r in records}}
-        T_c_w = np.stack([r.T_c_k for r in records]) @ np.stack([T_k_w[r.keyframe_id] for r in records])
-        _close_gaps(records, T_c_w, T_k_w)
+        T_c_k = np.stack([r.T_c_k for r in records])
+        T_c_w = T_c_k @ np.stack([T_k_w[r.keyframe_id] for r in records])
+        _close_gaps(records, T_c_w, T_k_w, np.abs(T_c_k - np.eye(4)).max(axis=(1, 2)) < _THE_SAME)
         return np.array([r.stamp_s for r in records]), se3.inverse(T_c_w)
 
 
-def _close_gaps(records: list[FrameRecord], T_c_w: FloatArray, T_k_w: dict[int, FloatArray]) -> None:
+def _close_gaps(
+    records: list[FrameRecord], T_c_w: FloatArray, T_k_w: dict[int, FloatArray], own: NDArray[np.bool_]
+) -> None:
     """Spread over the frames between two keyframes, in place, what refinement changed from one to the other.
 
     A frame keeps the way from its keyframe as it was tracked, in the scale that the map had just there. Where
@@ -135,10 +141,13 @@ def _close_gaps(records: list[FrameRecord], T_c_w: FloatArray, T_k_w: dict[int, 
         records: Of consecutive frames.
         T_c_w: Their poses ``(F, 4, 4)`` by their own keyframes.
         T_k_w: World-to-camera pose of each keyframe.
+        own: Whether a frame stands where the keyframe does that it is tied to ``(F,)``: those of a map's beginning were
+            not tracked before they became keyframes.
     """
     begin = 0
     for i, record in enumerate(records):
         if record.T_c_before is None:
+            begin = i if own[i] else begin
             continue
         held = records[begin].keyframe_id  # frames tied to another one need not be right where that one begins
         if i - begin > 1 and all(r.supported and r.keyframe_id == held for r in records[begin:i]):

@@ -8,6 +8,7 @@ import numpy as np
 
 from edgeslam_torch.fusion.displacement import TelemetryModel
 from edgeslam_torch.fusion.heading import headings
+from edgeslam_torch.fusion.inertia import inertia
 from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.optim.problem import CentreFactor, GravityFactor, HeadingFactor
 
@@ -55,6 +56,9 @@ def motion_factors(
         told = model.positions(stamps, np.stack([keyframes[i].centre_w for i in order]), scale_sigma_log)
         if told is not None:
             centres.append(CentreFactor(order, ALIKE * told.information, ALIKE * told.vector, ALIKE * told.constant))
+        inert = inertia(stamps, model.scale) if model.knows_metres else None
+        if inert is not None:
+            centres.append(CentreFactor(order, ALIKE * inert, np.zeros(len(inert)), 0.0))
         up = model.up(stamps)
         if up is not None:
             alike = GUESSED if model.holds_level else ALIKE

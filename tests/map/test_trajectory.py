@@ -68,3 +68,24 @@ def test_frames_follow_the_next_keyframe_where_refinement_moved_it(rng):
     np.testing.assert_allclose(log.poses()[1][:, 0, 3], [0.0, 0.1, 0.2, 0.3, 0.4, 0.5], atol=1e-12)
     log.records[2].supported = False  # a predicted frame between them, without a measured pose
     np.testing.assert_allclose(log.poses()[1][:, 0, 3], [0.0, 0.2, 0.4, 0.6, 0.4, 0.5], atol=1e-12)
+
+
+def test_the_way_from_a_keyframe_of_the_first_map_is_closed_as_well(rng):
+    """It was never tracked as a frame; those after it are tied to it, those before it to the first keyframe."""
+    points = PointMap(rng, 200, 3)
+    points.fill()
+    first, second, third = points.keyframes
+
+    def forward(x):
+        T = np.eye(4)
+        T[0, 3] = -x
+        return T
+
+    first.T_c_w, second.T_c_w = forward(0.0), forward(0.4)
+    log = TrajectoryLog(points.map)
+    for i, (keyframe, x) in enumerate(((first, 0.0), (first, 0.2), (second, 0.4), (second, 0.8), (second, 1.2))):
+        log.append(i, 0.1 * i, keyframe.id, forward(x), True)
+    before = log.relative_to_last(forward(1.6))
+    third.T_c_w = forward(0.7)
+    log.append(5, 0.5, third.id, third.T_c_w, True, before)
+    np.testing.assert_allclose(log.poses()[1][:, 0, 3], [0.0, 0.2, 0.4, 0.5, 0.6, 0.7], atol=1e-12)

@@ -266,3 +266,32 @@ def test_attitude_that_may_not_speak_gives_no_gravity(rng, halves):
 def test_no_telemetry_no_factors(halves):
     factors = motion_factors(None, halves.keyframes, [0] * 6)
     assert not factors.centres and not factors.gravity and not factors.headings
+
+
+@pytest.mark.parametrize("metres", [1.0, 0.2])
+def test_a_keyframe_that_hangs_on_its_neighbour_alone_stays_where_a_camera_can_have_been(rng, metres):
+    """The first of six, a fifth of a second apart: nothing else sees what it shares with the second one."""
+    points = PointMap(rng, 400, 6)
+    points.fill()
+    first, second, *rest = points.keyframes
+    shared = np.intersect1d(first.anchor[first.anchor >= 0], second.anchor[second.anchor >= 0])
+    for keyframe in points.keyframes:
+        keyframe.stamp_s = 0.2 * keyframe.id
+        pair, held = keyframe in (first, second), keyframe.anchor
+        lost = np.isin(held, shared[::2]) & ~pair | (held >= 0) & ~np.isin(held, shared[::2]) & (keyframe is first)
+        points.map.forget_observations(keyframe, np.flatnonzero(lost))
+    right, start = first.centre_w, second.centre_w
+    own = points.map.anchors_seen_by([first])
+    T_w_c = first.T_w_c
+    T_w_c[:3, 3] = start + 30.0 * (right - start)
+    first.T_c_w = se3.inverse(T_w_c)
+    points.map.anchors.p_w[own] = start + 30.0 * (points.map.anchors.p_w[own] - start)
+    off = np.linalg.norm(first.centre_w - right)
+    window = Window([first], [second, *rest], own)
+    solver = LmConfig(max_iterations=100)
+    refine(points.map, window, CAMERA, solver)
+    assert np.linalg.norm(first.centre_w - right) > 0.9 * off
+    silent = replace(telemetry_of(rng, points), velocity=False, attitude=False, scale=metres)
+    refine(points.map, window, CAMERA, solver, silent)
+    assert np.linalg.norm(first.centre_w - right) * metres < 1.0 < 0.25 * off * metres
+    check_map(points.map)
