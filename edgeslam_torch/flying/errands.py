@@ -1,5 +1,6 @@
 """Tasks that a flight has beside those of `navigation.tasks`: to stay where it is, and to go back the way it came."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -7,15 +8,19 @@ import numpy as np
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.moved import Moved
 from edgeslam_torch.navigation.sight import Sight
+from edgeslam_torch.navigation.tasks import LooksAhead
 from edgeslam_torch.types import FloatArray
 
 HOME_M = 0.15
 """Distance from the take-off at which the drone is home."""
 _SLOW_M_S = 0.15
+_LOOK_M, _LOOK_S = 0.6, 3.0
+"""How near to the take-off it looks ahead, and for how long: two keyframes, a loop, and a view in new metres."""
+_AHEAD_RAD = math.radians(8.0)
 
 
 @dataclass(frozen=True, slots=True)
-class Stay:
+class Stay(LooksAhead):
     """Rise, look around, and hover."""
 
     def goals(self, layer: Layer, sight: Sight) -> np.ndarray:
@@ -32,10 +37,17 @@ class Stay:
 
 @dataclass(slots=True)
 class WayHome:
-    """Fly to the take-off, along the way that was flown as long as the take-off lies beyond the grid."""
+    """Fly to the take-off, along the way that was flown as long as the take-off lies beyond the grid.
+
+    On the way back a camera sees the back of all that it saw on the way there, so that the map drifts by two percent
+    of the way. Near the take-off it looks ahead as it did there, and the map is mended by what it knows again.
+    """
 
     track_w: FloatArray
     """``(N, 2)`` where it flew, oldest first [m]."""
+    _looked: bool = False
+    _looks_s: float = math.nan
+    """Since when it looks where it looked at its take-off."""
 
     def goals(self, layer: Layer, sight: Sight) -> np.ndarray:
         """The cell of the oldest point of the way that the grid still holds."""
@@ -46,9 +58,18 @@ class WayHome:
         return layer.cells(oldest)[None]
 
     def done(self, sight: Sight) -> bool:
-        """Whether the drone is above its take-off, and slow."""
+        """Whether the drone is above its take-off, slow, and has looked as it did there."""
         near = float(np.linalg.norm(sight.p_w[:2])) < HOME_M
-        return near and float(np.linalg.norm(sight.velocity_w)) < _SLOW_M_S
+        return self._looked and near and float(np.linalg.norm(sight.velocity_w)) < _SLOW_M_S
+
+    def heading_rad(self, sight: Sight) -> float | None:
+        """The heading of the take-off, which is 0, for seconds when it comes near."""
+        if self._looked or float(np.linalg.norm(sight.p_w[:2])) > _LOOK_M:
+            return None
+        if math.isnan(self._looks_s) and abs(sight.yaw_rad) < _AHEAD_RAD:
+            self._looks_s = sight.stamp_s
+        self._looked = sight.stamp_s - self._looks_s > _LOOK_S
+        return 0.0
 
     def carry(self, moved: Moved) -> None:
         """Take the way along with the map; the take-off stays the origin."""

@@ -11,6 +11,7 @@ from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.moved import Moved
 from edgeslam_torch.navigation.openings.pathways import WIDEST_M
 from edgeslam_torch.navigation.sight import Sight
+from edgeslam_torch.navigation.tasks import LooksAhead
 from edgeslam_torch.types import FloatArray
 
 _BERTH_M = 0.55
@@ -30,7 +31,7 @@ _WALL_M, _ABREAST_M = 2.0, 0.5
 
 
 @dataclass(slots=True)
-class FollowCorridor:
+class FollowCorridor(LooksAhead):
     """Fly on along the corridor that the drone is in, in its middle; through no door."""
 
     until_s: float = np.inf

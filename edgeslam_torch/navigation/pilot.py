@@ -229,6 +229,13 @@ class Pilot:
         return Wish(wish.forward_m_s, wish.left_m_s, up, wish.turn_left_rad_s, wish.why)
 
     def _fly(self, sight: Sight) -> Wish:
+        heading = self.task.heading_rad(sight)
+        if heading is not None:
+            self._progress_s = sight.stamp_s
+            return Wish(
+                turn_left_rad_s=self._turn(float(wrapped(np.array(heading - sight.yaw_rad)))),
+                why="stand and look where the task wants",
+            )
         plan = self._planned(sight)
         here = sight.p_w[:2]
         now = float(plan.at(here))

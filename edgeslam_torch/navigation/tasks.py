@@ -30,9 +30,22 @@ class Task(Protocol):
     def carry(self, moved: Moved) -> None:
         """Take remembered places along with the map."""
 
+    def heading_rad(self, sight: Sight) -> float | None:
+        """Where to look now, standing; None to look where it flies."""
+
+
+class LooksAhead:
+    """Part of a task during which the drone looks where it flies, always."""
+
+    __slots__ = ()
+
+    def heading_rad(self, sight: Sight) -> float | None:
+        """None: ahead."""
+        return None
+
 
 @dataclass(frozen=True, slots=True)
-class GoTo:
+class GoTo(LooksAhead):
     """Fly to a point."""
 
     goal_w: FloatArray
@@ -69,7 +82,7 @@ def _doubt_m(sight: Sight) -> float:
 
 
 @dataclass(slots=True)
-class Explore:
+class Explore(LooksAhead):
     """Fly to where the known free space ends, until it ends nowhere or time is over."""
 
     until_s: float = np.inf

@@ -1,0 +1,49 @@
+"""The way home, and its look at the take-off."""
+
+import math
+
+import numpy as np
+import pytest
+
+from edgeslam_torch.flying.errands import WayHome
+from edgeslam_torch.navigation.limits import NavLimits
+from edgeslam_torch.navigation.pilot import Phase, Pilot
+from edgeslam_torch.navigation.sight import Sight
+
+
+def at(stamp_s, x=0.0, y=0.0, yaw_deg=0.0, speed=0.0):
+    place = np.array([x, y, NavLimits().height_m])
+    return Sight(stamp_s, place, math.radians(yaw_deg), np.array([speed, 0.0, 0.0]))
+
+
+def way_home():
+    return WayHome(np.array([[0.0, 0.0], [1.0, 0.0], [3.0, 0.0]]))
+
+
+def test_near_its_take_off_it_looks_as_it_did_there_and_then_it_is_home():
+    task = way_home()
+    assert task.heading_rad(at(0.0, x=2.0, yaw_deg=180.0)) is None
+    assert task.heading_rad(at(1.0, x=0.5, yaw_deg=180.0)) == 0.0
+    assert not task.done(at(1.0, x=0.1))
+    for stamp_s in (2.0, 3.0, 4.9):
+        assert task.heading_rad(at(stamp_s, x=0.5, yaw_deg=3.0)) == 0.0
+    task.heading_rad(at(5.5, x=0.5, yaw_deg=3.0))
+    assert task.heading_rad(at(5.6, x=0.5)) is None
+    assert task.done(at(6.0, x=0.1)) and not task.done(at(6.0, x=0.1, speed=0.3)) and not task.done(at(6.0, x=0.3))
+
+
+def test_it_looks_for_as_long_as_it_looks_ahead_not_while_it_turns():
+    task = way_home()
+    for stamp_s in range(10):
+        assert task.heading_rad(at(float(stamp_s), x=0.4, yaw_deg=90.0)) == 0.0
+    assert task.heading_rad(at(10.0, x=0.4)) == 0.0
+    assert not task.done(at(10.0))
+
+
+@pytest.mark.parametrize(("yaw_deg", "sign"), [(120.0, -1.0), (-120.0, 1.0)])
+def test_a_pilot_stands_and_turns_where_the_task_wants_to_look(yaw_deg, sign):
+    pilot = Pilot(way_home())
+    pilot.phase = Phase.FLYING
+    wish = pilot.update(at(0.0, x=0.5, yaw_deg=yaw_deg))
+    assert (wish.forward_m_s, wish.left_m_s) == (0.0, 0.0)
+    assert np.sign(wish.turn_left_rad_s) == sign
