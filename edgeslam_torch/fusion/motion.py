@@ -481,12 +481,19 @@ class MotionFusion:
             self.delay_sigma_s,
             1.0 if told is None else math.exp(told.log_scale),
             math.inf if told is None else told.sigma,
-            told is not None and self._trust.velocity and (odds is None or odds.kept == "telemetry"),
+            self._velocity_speaks(told),
             heights[0] if told is not None and heights and (odds is None or odds.kept == "height") else None,
             self._fit.truncates,
             self._trust.attitude,
             self._trust.turns,
         )
+
+    def _velocity_speaks(self, told: LogScale | None) -> bool:
+        """Whether velocities go with the metres that are told: in the wrong unit they carry the camera ten times too
+        far where heights alone told these, until both are compared."""
+        odds = self._trust.at_odds
+        agreed = told is not None and "telemetry" in told.source
+        return agreed and self._trust.velocity and (odds is None or odds.kept == "telemetry")
 
     # --- estimation ----------------------------------------------------------------------------------------------
 
