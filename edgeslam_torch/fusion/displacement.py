@@ -46,8 +46,9 @@ UP_RAD = math.radians(2.0)
 UP_MEMORY_S = 5.0
 UNPROVEN_S = 3.0
 """How far off the stamps of telemetry may be that has not yet turned with the images: `comparison` looks so far."""
-LEAST_LEVEL_RAD = math.radians(10.0)
-"""Doubt of a vertical beyond which it is left out: a drone hardly leans further, and a factor is linear."""
+STEADY_RAD = math.radians(15.0)
+"""Lean of a drone that takes off and flies slowly, at most; a camera in a hand rolls by more, and its attitude may be
+another moment's until it has proven otherwise."""
 _LEAST_WEIGHT = 1e-4
 _BENT = 0.2
 """Share of a way by which the map may be off without the reading being a wild one: that is what is to be mended."""
@@ -172,15 +173,18 @@ class TelemetryModel:
         if len(self.track) < 2 or not (self.attitude and self.track.has_attitude):
             return None
         at_s = stamps_s - self.delay_s
-        doubt_rad = self.track.leaned(at_s, lean_reach_s(self.attitude_proven, self.delay_sigma_s))
-        frame = np.flatnonzero(self.track.covered(at_s, at_s) & (doubt_rad < LEAST_LEVEL_RAD))
+        use = self.track.covered(at_s, at_s)
+        if not self.attitude_proven:
+            use &= self.track.leaned(at_s, UNPROVEN_S) < STEADY_RAD
+        frame = np.flatnonzero(use)
         if len(frame) == 0:
             return None
         t = at_s[frame]
         R_w_c = self.track.attitude(t) @ self.T_b_c[:3, :3]
         # Neighbours err alike: together they count as one.
         alike = (np.abs(t[:, None] - t[None]) < 0.5 * UP_MEMORY_S).sum(1)
-        sigma_rad = np.hypot(UP_RAD, doubt_rad[frame]) * math.sqrt(float(np.median(alike)))
+        late_rad = self.track.leaned(t, min(self.delay_sigma_s, DELAY_S))
+        sigma_rad = np.hypot(UP_RAD, late_rad) * math.sqrt(float(np.median(alike)))
         return UpDirections(frame, R_w_c[:, 2, :], self.R_w_m[2], sigma_rad)
 
     def _displacements(self, at_s: FloatArray, per_scale_w: FloatArray) -> _Rows | None:
@@ -296,16 +300,6 @@ class TelemetryModel:
         return PositionGaussian(
             0.5 * (A + A.T), D.T @ whitened[:, -1], float(rows.told @ whitened[:, -1]), len(tukey), refused
         )
-
-
-def lean_reach_s(proven: bool, delay_sigma_s: float) -> float:
-    """Time [s] by which a frame's attitude may be another moment's.
-
-    Args:
-        proven: Whether the drone's attitude has turned as the images did.
-        delay_sigma_s: Standard deviation of the video's delay.
-    """
-    return min(delay_sigma_s, DELAY_S) if proven else UNPROVEN_S
 
 
 def _stacked(parts: list[_Rows]) -> _Rows | None:

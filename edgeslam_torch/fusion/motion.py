@@ -15,7 +15,7 @@ import numpy as np
 from edgeslam_torch.fusion.config import FusionConfig
 from edgeslam_torch.fusion.dead_reckoning import REACH_S as RECKONED_S
 from edgeslam_torch.fusion.dead_reckoning import Reckoned, reckoned
-from edgeslam_torch.fusion.displacement import TelemetryModel, lean_reach_s
+from edgeslam_torch.fusion.displacement import DELAY_S, STEADY_RAD, UNPROVEN_S, TelemetryModel
 from edgeslam_torch.fusion.filter.filter_feed import FilterFeed, Metric
 from edgeslam_torch.fusion.health import disagreement
 from edgeslam_torch.fusion.prediction import (
@@ -275,14 +275,16 @@ class MotionFusion:
 
     def vertical(self, stamp_s: float) -> tuple[FloatArray, float] | None:
         """The map's z axis ``(3,)`` in a frame's camera by the drone's attitude, and how far [rad] that leaned within
-        the doubt about its moment; None where attitude is not to be asked, or metres are told: whole degrees
+        the doubt about the video's delay; None where attitude is not to be asked, or metres are told: whole degrees
         are worse than what a map with parallax says."""
         at_s = np.array([stamp_s - self.delay_s])
         asked = self._by_telemetry is None and self.began_upright and self._trust.attitude
         if not asked or not self._track.covered(at_s, at_s)[0]:
             return None
-        reach_s = lean_reach_s(self._trust.turns, self.delay_sigma_s)
-        return self.T_b_c[:3, :3].T @ self._track.attitude(at_s)[0, 2], float(self._track.leaned(at_s, reach_s)[0])
+        if not self._trust.turns and self._track.leaned(at_s, UNPROVEN_S)[0] > STEADY_RAD:
+            return None
+        leaned = self._track.leaned(at_s, min(self.delay_sigma_s, DELAY_S))
+        return self.T_b_c[:3, :3].T @ self._track.attitude(at_s)[0, 2], float(leaned[0])
 
     def told(self, stamp_s: float) -> tuple[tuple[FloatArray, float] | None, Reckoned | None]:
         """What `turned` and `reckoned` say of a frame."""

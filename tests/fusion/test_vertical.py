@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from edgeslam_torch.fusion.config import FusionConfig
+from edgeslam_torch.fusion.displacement import DELAY_S
 from edgeslam_torch.fusion.motion import MotionFusion
 from edgeslam_torch.fusion.telemetry.plausibility import Agreement, Reading
 from edgeslam_torch.geometry.mount import camera_on_body
@@ -45,8 +46,15 @@ def test_a_moment_without_telemetry_says_nothing():
     assert told(0.0).vertical(9.0) is None
 
 
-def test_it_is_as_unsure_as_telemetry_that_may_be_of_another_moment_until_it_turns_with_the_images():
-    fusion = told(np.where(np.arange(30) < 20, 0.0, math.radians(10.0)))
-    assert fusion.vertical(1.0)[1] == pytest.approx(math.radians(10.0))
+def test_where_it_leans_as_a_hand_does_it_is_asked_once_it_has_turned_with_the_images():
+    fusion = told(np.where(np.arange(30) < 20, 0.0, math.radians(20.0)))
+    assert fusion.vertical(1.0) is None
     fusion._trust.judge(Reading.ATTITUDE, Agreement(0.99, 30))
     assert fusion.vertical(1.0)[1] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_it_is_as_unsure_as_the_moment_of_the_image():
+    fusion = told(np.radians(np.clip(20.0 * (0.1 * np.arange(30) - 1.0), 0.0, 10.0)), delay_s=None)
+    late_s = min(fusion.delay_sigma_s, DELAY_S)
+    leaned = fusion.vertical(1.25 + fusion.delay_s)[1]
+    assert math.degrees(leaned) == pytest.approx(20.0 * min(late_s, 0.25), rel=0.05)
