@@ -79,8 +79,8 @@ class UpDirections:
     """``(U, 3)`` unit vectors, camera axes."""
     up_m: FloatArray
     """``(3,)`` the same in the map."""
-    sigma_rad: FloatArray
-    """``(U,)`` of each, per axis."""
+    sigma_rad: float
+    """Of each, per axis."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,9 +183,7 @@ class TelemetryModel:
         R_w_c = self.track.attitude(t) @ self.T_b_c[:3, :3]
         # Neighbours err alike: together they count as one.
         alike = (np.abs(t[:, None] - t[None]) < 0.5 * UP_MEMORY_S).sum(1)
-        late_rad = self.track.leaned(t, min(self.delay_sigma_s, DELAY_S))
-        sigma_rad = np.hypot(UP_RAD, late_rad) * math.sqrt(float(np.median(alike)))
-        return UpDirections(frame, R_w_c[:, 2, :], self.R_w_m[2], sigma_rad)
+        return UpDirections(frame, R_w_c[:, 2, :], self.R_w_m[2], UP_RAD * math.sqrt(float(np.median(alike))))
 
     def _displacements(self, at_s: FloatArray, per_scale_w: FloatArray) -> _Rows | None:
         """Rows of the velocities; ``per_scale_w`` ``(K, 3)``: change of the positions per sigma of the scale [m]."""

@@ -14,6 +14,7 @@ from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.mapping.edge_map import EdgeMap
 from edgeslam_torch.mapping.freed_depths import Weight
 from edgeslam_torch.mapping.fuse import fuse_all
+from edgeslam_torch.mapping.motion_terms import ALIKE_AT_THE_END
 from edgeslam_torch.mapping.refinement import refine_all, whole_map, window_problem, write_back
 from edgeslam_torch.mapping.reobserve import MAX_DRIFT_PX, reobserve_all
 from edgeslam_torch.mapping.window_edges import WindowEdges
@@ -62,14 +63,17 @@ def last_refinement(
     stated = replace(lm, losses=True)
     with_edges = config.uses_edges or config.uses_corners
     result = None
-    if config.reprojection != "off" and refine_all(slam_map, camera, lm, telemetry, Weight.WIDE) is not None:
+    if (
+        config.reprojection != "off"
+        and refine_all(slam_map, camera, lm, telemetry, Weight.WIDE, ALIKE_AT_THE_END) is not None
+    ):
         with slam_map.lock:
             drift_px = max(reobserve_all(slam_map, camera), default=0.0)
         if drift_px > MAX_DRIFT_PX:
-            refine_all(slam_map, camera, lm, telemetry, Weight.EXACT)
+            refine_all(slam_map, camera, lm, telemetry, Weight.EXACT, ALIKE_AT_THE_END)
         with slam_map.lock:
             fuse_all(slam_map, camera)
-        result = refine_all(slam_map, camera, lm if with_edges else stated, telemetry, Weight.EXACT)
+        result = refine_all(slam_map, camera, lm if with_edges else stated, telemetry, Weight.EXACT, ALIKE_AT_THE_END)
     edges.update(everything=True)
     with slam_map.lock:
         edges.follow_anchors()
@@ -91,7 +95,8 @@ def refine_with_edges(
     Returns:
         Result of the last round; None if there was nothing to refine.
     """
-    window = whole_map(slam_map, Weight.NONE if config.reprojection == "off" else Weight.EXACT)
+    freed = Weight.NONE if config.reprojection == "off" else Weight.EXACT
+    window = whole_map(slam_map, freed, ALIKE_AT_THE_END)
     if window is None:
         return None
     keyframes = [*window.free, *window.fixed]

@@ -14,7 +14,10 @@ from edgeslam_torch.optim.problem import CentreFactor, GravityFactor, HeadingFac
 
 ALIKE = 30.0
 """Keypoints err together: a window's thousands of reprojections, taken for independent, hold a wrong scale against
-telemetry whose covariance is honest. So many of them count as one (docs/decisions/0052)."""
+telemetry whose covariance is honest. So many of them count as one in flight (docs/decisions/0052)."""
+ALIKE_AT_THE_END = 1.0
+"""The same in the last refinement: what drifted was taken back in flight, and telemetry's own errors, which have
+a memory of seconds, would bend the map (docs/decisions/0139)."""
 GUESSED = 3000.0
 """The same for gravity in a young map while nothing has told metres: what turns and what moves is told apart by guessed
 depths, which err together in all of the picture (docs/decisions/0114)."""
@@ -34,6 +37,7 @@ def motion_factors(
     keyframes: Sequence[Keyframe],
     piece: Sequence[int],
     scale_sigma_log: float | None = None,
+    alike: float = ALIKE,
 ) -> MotionFactors:
     """Factors between keyframes that follow each other in time, piece by piece.
 
@@ -42,6 +46,7 @@ def motion_factors(
         keyframes: Of the window, in the order of its poses.
         piece: Number of each one's piece of map: where one lies relative to another is not known.
         scale_sigma_log: How far the scale may be off, common to all; the model's own doubt when None.
+        alike: How many keypoints count as one beside it.
     """
     if model is None:
         return MotionFactors()
@@ -55,16 +60,16 @@ def motion_factors(
         stamps = np.array([keyframes[i].stamp_s for i in order])
         told = model.positions(stamps, np.stack([keyframes[i].centre_w for i in order]), scale_sigma_log)
         if told is not None:
-            centres.append(CentreFactor(order, ALIKE * told.information, ALIKE * told.vector, ALIKE * told.constant))
+            centres.append(CentreFactor(order, alike * told.information, alike * told.vector, alike * told.constant))
         inert = inertia(stamps, model.scale) if model.knows_metres else None
         if inert is not None:
-            centres.append(CentreFactor(order, ALIKE * inert, np.zeros(len(inert)), 0.0))
+            centres.append(CentreFactor(order, alike * inert, np.zeros(len(inert)), 0.0))
         up = model.up(stamps)
         if up is not None:
-            alike = GUESSED if model.holds_level else ALIKE
-            gravity.append(GravityFactor(order[up.frame], up.up_c, up.up_m, up.sigma_rad / math.sqrt(alike)))
+            share = GUESSED if model.holds_level else alike
+            gravity.append(GravityFactor(order[up.frame], up.up_c, up.up_m, up.sigma_rad / math.sqrt(share)))
         told_yaw = headings(model, stamps)
         if told_yaw is not None:
             poses = order[told_yaw.frame]
-            turned.append(HeadingFactor(poses, told_yaw.R_c_m, told_yaw.up_m, ALIKE * told_yaw.information))
+            turned.append(HeadingFactor(poses, told_yaw.R_c_m, told_yaw.up_m, alike * told_yaw.information))
     return MotionFactors(tuple(centres), tuple(gravity), tuple(turned))

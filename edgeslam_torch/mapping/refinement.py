@@ -12,7 +12,7 @@ from edgeslam_torch.losses.robust import Kernel
 from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.mapping.freed_depths import Weight, motion_priors
-from edgeslam_torch.mapping.motion_terms import motion_factors
+from edgeslam_torch.mapping.motion_terms import ALIKE, motion_factors
 from edgeslam_torch.mapping.prior_anchors import depth_priors, mostly_on_priors
 from edgeslam_torch.mapping.window_edges import WindowEdges
 from edgeslam_torch.optim.local_ba import refine_window
@@ -45,6 +45,8 @@ class Window:
     settled: bool = False
     """Written back only if the solver has reached a minimum: half-way the newest keyframes, which are being tracked on,
     can be anywhere."""
+    alike: float = ALIKE
+    """How many of its keypoints count as one beside telemetry."""
 
 
 def choose_window(slam_map: SlamMap, newest: Keyframe, free: int, fixed: int) -> Window:
@@ -106,18 +108,19 @@ def refine_all(
     config: LmConfig,
     telemetry: TelemetryModel | None = None,
     freed: Weight = Weight.NONE,
+    alike: float = ALIKE,
 ) -> WindowResult | None:
     """Refine every keyframe of the map at once; None when there is nothing to refine, see `whole_map`."""
-    window = whole_map(slam_map, freed)
+    window = whole_map(slam_map, freed, alike)
     return None if window is None else refine(slam_map, window, camera, config, telemetry)
 
 
-def whole_map(slam_map: SlamMap, freed: Weight = Weight.NONE) -> Window | None:
+def whole_map(slam_map: SlamMap, freed: Weight = Weight.NONE, alike: float = ALIKE) -> Window | None:
     """All keyframes as one window, the first pose fixed; None for fewer than three, or a camera that never moved."""
     keyframes = [slam_map.keyframes[id] for id in sorted(slam_map.keyframes)]
     if len(keyframes) < 3:
         return None
-    window = Window(keyframes[1:], keyframes[:1], slam_map.anchors_seen_by(keyframes), freed)
+    window = Window(keyframes[1:], keyframes[:1], slam_map.anchors_seen_by(keyframes), freed, alike=alike)
     return window if held_extent(window) is not None else None
 
 
@@ -201,7 +204,7 @@ def window_problem(
     priors, hosts = depth_priors(slam_map, window.anchor, [k.id for k in keyframes])
     # Where the scale is held by one distance alone, that one is arbitrary.
     doubt = UNKNOWN_SCALE_LOG if extent is not None else None
-    told = motion_factors(telemetry, keyframes, [slam_map.piece_of(k.id) for k in keyframes], doubt)
+    told = motion_factors(telemetry, keyframes, [slam_map.piece_of(k.id) for k in keyframes], doubt, window.alike)
     motions = tracked_motions(slam_map, keyframes)
     problem = WindowProblem(
         T_c_w=np.stack([*(k.T_c_w for k in keyframes), *(slam_map.pose_of(id) for id in hosts)]),

@@ -103,12 +103,12 @@ def centre_cost(T_c_w: FloatArray, factor: CentreFactor) -> tuple[float, FloatAr
 
 def gravity_residual(T_c_w: FloatArray, factor: GravityFactor) -> FloatArray:
     """Predicted minus measured up direction in units of its sigma ``(U, 3)``."""
-    return np.asarray((T_c_w[:, :3, :3] @ factor.up_w - factor.up_c) / factor.sigma_rad[:, None])
+    return np.asarray((T_c_w[:, :3, :3] @ factor.up_w - factor.up_c) / factor.sigma_rad)
 
 
 def gravity_jacobian(T_c_w: FloatArray, factor: GravityFactor) -> FloatArray:
     """Derivative of `gravity_residual` by the rotation of a left perturbation ``(U, 3, 3)``."""
-    return np.asarray(-hat(T_c_w[:, :3, :3] @ factor.up_w) / factor.sigma_rad[:, None, None])
+    return np.asarray(-hat(T_c_w[:, :3, :3] @ factor.up_w) / factor.sigma_rad)
 
 
 def heading_residual(T_c_w: FloatArray, factor: HeadingFactor) -> FloatArray:

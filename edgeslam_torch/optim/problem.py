@@ -175,8 +175,8 @@ class GravityFactor:
     """``(U, 3)`` measured unit vectors, camera axes."""
     up_w: FloatArray
     """``(3,)`` the same in the world."""
-    sigma_rad: FloatArray
-    """``(U,)`` standard deviation of each, per axis."""
+    sigma_rad: float
+    """Standard deviation of each, per axis."""
 
 
 @dataclass(frozen=True, slots=True)

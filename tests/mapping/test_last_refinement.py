@@ -14,8 +14,10 @@ from edgeslam_torch.eval.metrics.align import umeyama
 from edgeslam_torch.losses.robust import Kernel
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.map.trajectory import TrajectoryLog
+from edgeslam_torch.mapping import refinement
 from edgeslam_torch.mapping.edge_map import EdgeMap
 from edgeslam_torch.mapping.last_refinement import last_refinement, lm_config
+from edgeslam_torch.mapping.motion_terms import MotionFactors
 from edgeslam_torch.optim.problem import StopReason, WindowResult
 from edgeslam_torch.slam import EdgeSlam
 
@@ -120,6 +122,19 @@ def test_one_anchor_that_is_no_number_costs_the_refinement_and_not_the_map():
     check_map(slam_map)
     np.testing.assert_allclose(log.poses()[1], before, atol=1e-12)
     assert len(slam_map.anchors) > 300
+
+
+def test_in_the_last_refinement_telemetry_counts_as_often_as_it_was_heard(monkeypatch):
+    """In each of its rounds, with edges and without: thirty times, as in flight, bends what is straight."""
+    asked = []
+
+    def factors(model, keyframes, piece, doubt, alike):
+        asked.append(alike)
+        return MotionFactors()
+
+    monkeypatch.setattr(refinement, "motion_factors", factors)
+    finish(WindowConfig())
+    assert len(asked) >= 3 and set(asked) == {1.0}
 
 
 def test_what_the_forms_mean_while_flying():

@@ -1,5 +1,6 @@
 """Telemetry in a window: a part of the map that hangs on nothing else keeps scale and place."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -16,8 +17,8 @@ from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.mapping.last_refinement import lm_config
 from edgeslam_torch.mapping.mapper import WIDE_EVERY, Mapper
-from edgeslam_torch.mapping.motion_terms import motion_factors
-from edgeslam_torch.mapping.refinement import Window, recent_map, refine
+from edgeslam_torch.mapping.motion_terms import ALIKE, motion_factors
+from edgeslam_torch.mapping.refinement import Window, recent_map, refine, whole_map, window_problem
 from edgeslam_torch.optim.problem import LmConfig
 from edgeslam_torch.synthetic.flights.telemetry import EXACT, simulate
 
@@ -254,7 +255,21 @@ def test_gravity_decides_in_a_young_map_while_nothing_has_told_metres(rng, halve
         motion_factors(m, halves.keyframes, [0] * 6).gravity
         for m in (replace(model, scale_sigma_log=np.inf, velocity=False, young=True), model)
     )
-    assert np.degrees(before.sigma_rad.max()) < 0.1 < 0.5 < np.degrees(after.sigma_rad.min())
+    assert np.degrees(before.sigma_rad) < 0.1 < 0.5 < np.degrees(after.sigma_rad)
+
+
+def test_a_whole_map_may_count_telemetry_as_often_as_it_was_heard(rng, halves):
+    """In a window of the flight thirty times, beside keypoints that err together."""
+    model, keyframes = telemetry_of(rng, halves), halves.keyframes
+    flying = Window(keyframes[1:], keyframes[:1], halves.map.anchors_seen_by(keyframes))
+    one, often = (
+        window_problem(halves.map, w, CAMERA, LmConfig(), model)[0] for w in (whole_map(halves.map, alike=1.0), flying)
+    )
+    for once, again in zip(one.centres, often.centres, strict=True):
+        np.testing.assert_allclose(ALIKE * once.information, again.information, rtol=1e-6)
+        np.testing.assert_allclose(ALIKE * once.vector, again.vector, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(one.gravity[0].sigma_rad, math.sqrt(ALIKE) * often.gravity[0].sigma_rad)
+    np.testing.assert_allclose(ALIKE * one.headings[0].information, often.headings[0].information)
 
 
 def test_attitude_that_may_not_speak_gives_no_gravity(rng, halves):

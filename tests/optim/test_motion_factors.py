@@ -44,7 +44,7 @@ def terms(rng):
     pair = between(2, 4, [0.3, -0.2, 0.1], 0.05, 5)
     up_c = rng.normal(size=(3, 3))
     up_c /= np.linalg.norm(up_c, axis=1)[:, None]
-    gravity = GravityFactor(np.array([4, 1, 2]), up_c, np.array([0.0, 0.6, 0.8]), np.array([0.1, 0.2, 0.05]))
+    gravity = GravityFactor(np.array([4, 1, 2]), up_c, np.array([0.0, 0.6, 0.8]), 0.1)
     told = random_poses(rng, 4)[:, :3, :3]
     C = rng.normal(size=(4, 4))
     heading = HeadingFactor(np.array([2, 0, 1, 4]), told, np.array([0.48, 0.6, 0.64]), C @ C.T)
@@ -79,7 +79,7 @@ def test_curvature_of_centres_is_exact_in_the_translations(rng, terms):
 
 def test_gravity_jacobian_matches_finite_differences(rng):
     T = random_poses(rng, 1)
-    factor = GravityFactor(np.array([0]), np.array([[0.0, -1.0, 0.0]]), np.array([0.0, 0.0, 1.0]), np.array([0.2]))
+    factor = GravityFactor(np.array([0]), np.array([[0.0, -1.0, 0.0]]), np.array([0.0, 0.0, 1.0]), 0.2)
     J = gravity_jacobian(T, factor)[0]
     for k in range(3):
         xi = np.concatenate([np.zeros(3), STEP * np.eye(3)[k]])
@@ -123,7 +123,7 @@ def test_gravity_has_a_direction():
     level[:3, :3] = [[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]
     T = torch.as_tensor(se3.inverse(level)[None])
     for up_c, cost in (([0.0, -1.0, 0.0], 0.0), ([0.0, 1.0, 0.0], 400.0)):
-        factor = GravityFactor(np.array([0]), np.array([up_c]), np.array([0.0, 0.0, 1.0]), np.array([0.1]))
+        factor = GravityFactor(np.array([0]), np.array([up_c]), np.array([0.0, 0.0, 1.0]), 0.1)
         assert MotionTerms((), (factor,), (), [0]).cost(T) == pytest.approx(cost, abs=1e-9)
 
 
