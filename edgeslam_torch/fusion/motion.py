@@ -309,8 +309,12 @@ class MotionFusion:
         return R_m_c[0].T, doubt
 
     def reckoned(self, stamp_s: float) -> Reckoned | None:
-        """Place of a frame's camera by dead reckoning; None where telemetry tells no metres,
-        or its velocities have not proven to be of this flight."""
+        """Place of a frame's camera by dead reckoning; None where telemetry tells no metres, its velocities have not
+        proven to be of this flight, or the metres that are told do not rest on them: in the wrong unit they carry the
+        camera ten times too far beside heights that nothing has compared with them yet."""
+        told = self._by_telemetry
+        if told is None or "telemetry" not in told.source:
+            return None
         model, recent = self._model(), self._memory.recent(stamp_s - RECKONED_S)
         if model is None or recent is None or not (model.velocity and math.isfinite(model.delay_sigma_s)):
             return None
@@ -483,19 +487,12 @@ class MotionFusion:
             self.delay_sigma_s,
             1.0 if told is None else math.exp(told.log_scale),
             math.inf if told is None else told.sigma,
-            self._velocity_speaks(told),
+            told is not None and self._trust.velocity and (odds is None or odds.kept == "telemetry"),
             heights[0] if told is not None and heights and (odds is None or odds.kept == "height") else None,
             self._fit.truncates,
             self._trust.attitude,
             self._trust.turns,
         )
-
-    def _velocity_speaks(self, told: LogScale | None) -> bool:
-        """Whether velocities go with the metres that are told: in the wrong unit they carry the camera ten times too
-        far where heights alone told these, until both are compared."""
-        odds = self._trust.at_odds
-        agreed = told is not None and "telemetry" in told.source
-        return agreed and self._trust.velocity and (odds is None or odds.kept == "telemetry")
 
     # --- estimation ----------------------------------------------------------------------------------------------
 

@@ -178,3 +178,15 @@ def test_telemetry_of_another_flight_reckons_nothing(rng, swinging, replay):
     backwards = simulate(rng, motion.stamps_s, motion.T_w_c[::-1], T_B_C).samples()
     replay(fusion, motion, motion.in_gauge(rng), backwards, each=lambda t, i: told.append(fusion.reckoned(t)))
     assert told.count(None) == len(told)
+
+
+@pytest.mark.parametrize("source", ["height", "telemetry+height"])
+def test_velocities_on_which_no_metres_rest_carry_nothing(rng, swinging, replay, source):
+    """Heights told the metres alone, and nothing has compared the velocities with them: they may be cm/s."""
+    motion = swinging(24.0)
+    fusion = MotionFusion(FusionConfig(), T_B_C)
+    replay(fusion, motion, motion.in_gauge(rng), simulate(rng, motion.stamps_s, motion.T_w_c, T_B_C).samples())
+    last_s = float(motion.stamps_s[-20])
+    assert fusion.reckoned(last_s) is not None
+    fusion._by_telemetry = replace(fusion._by_telemetry, source=source)
+    assert (fusion.reckoned(last_s) is None) == (source == "height")

@@ -13,15 +13,7 @@ from edgeslam_torch.fusion.config import FusionConfig
 from edgeslam_torch.fusion.motion import MotionFusion
 from edgeslam_torch.fusion.scale.depth_scale import DepthRatio
 from edgeslam_torch.fusion.scale.log_scale import LogScale
-from edgeslam_torch.fusion.telemetry.plausibility import (
-    Agreement,
-    AtOdds,
-    Reading,
-    Trust,
-    Verdict,
-    agreement,
-    changes,
-)
+from edgeslam_torch.fusion.telemetry.plausibility import Agreement, Reading, Trust, Verdict, agreement, changes
 from edgeslam_torch.fusion.telemetry_scale import TelemetryScale
 from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.synthetic.flights.telemetry import TelemetryFaults, simulate
@@ -376,25 +368,6 @@ def test_velocities_in_the_wrong_unit_are_named_and_dropped(rng, swinging, repla
     assert "velocities are not used" in warning
     model = fusion.telemetry()
     assert (model.velocity, model.height) == (False, "tof"), "nor do they pull at the map in its refinement"
-
-
-@pytest.mark.parametrize(
-    ("source", "kept", "speaks"),
-    [
-        ("telemetry+height", "", True),
-        ("telemetry", "telemetry", True),
-        ("telemetry+height", "height", False),
-        ("telemetry+height", None, False),
-        ("height", "", False),
-    ],
-)
-def test_velocities_pull_at_the_map_where_they_go_with_the_metres_that_are_told(source, kept, speaks):
-    """Heights that told them alone may contradict velocities ten times too fast, and nobody knows yet."""
-    fusion = MotionFusion(FusionConfig(), T_B_C)
-    fusion._R_w_m, fusion._by_telemetry = np.eye(3), LogScale(0.0, 0.1, source)
-    fusion._trust.judge(Reading.VELOCITY, Agreement(0.99, 30))
-    fusion._trust.at_odds = None if kept == "" else AtOdds(10.0, 1.0, kept)
-    assert fusion.telemetry().velocity is speaks
 
 
 def test_gravity_speaks_before_metres_are_known_if_the_map_began_upright():
