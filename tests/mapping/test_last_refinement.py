@@ -126,6 +126,7 @@ def test_one_anchor_that_is_no_number_costs_the_refinement_and_not_the_map():
 
 def test_in_the_last_refinement_telemetry_counts_as_often_as_it_was_heard(monkeypatch):
     """In each of its rounds, with edges and without: thirty times, as in flight, bends what is straight."""
+    flight()
     asked = []
 
     def factors(model, keyframes, piece, doubt, alike):
