@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from edgeslam_torch.geometry.rotations import wrapped
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.moved import Moved
 from edgeslam_torch.navigation.sight import Sight
@@ -66,7 +67,7 @@ class WayHome:
         """The heading of the take-off, which is 0, for seconds when it comes near."""
         if self._looked or float(np.linalg.norm(sight.p_w[:2])) > _LOOK_M:
             return None
-        if math.isnan(self._looks_s) and abs(sight.yaw_rad) < _AHEAD_RAD:
+        if math.isnan(self._looks_s) and abs(float(wrapped(np.array(sight.yaw_rad)))) < _AHEAD_RAD:
             self._looks_s = sight.stamp_s
         self._looked = sight.stamp_s - self._looks_s > _LOOK_S
         return 0.0

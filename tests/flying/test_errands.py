@@ -40,6 +40,15 @@ def test_it_looks_for_as_long_as_it_looks_ahead_not_while_it_turns():
     assert not task.done(at(10.0))
 
 
+@pytest.mark.parametrize("turns", [-1, 1, 2])
+def test_a_drone_that_has_turned_round_looks_ahead_all_the_same(turns):
+    """Its heading is told without jumps: 360 degrees are ahead."""
+    task = way_home()
+    for stamp_s in (0.0, 2.0, 4.0):
+        task.heading_rad(at(stamp_s, x=0.4, yaw_deg=360.0 * turns + 2.0))
+    assert task.done(at(5.0))
+
+
 @pytest.mark.parametrize(("yaw_deg", "sign"), [(120.0, -1.0), (-120.0, 1.0)])
 def test_a_pilot_stands_and_turns_where_the_task_wants_to_look(yaw_deg, sign):
     pilot = Pilot(way_home())
