@@ -17,6 +17,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from edgeslam_torch.fusion.config import FusionConfig
@@ -44,9 +45,9 @@ FLOOR_M = 30.0
 UP_RAD = math.radians(2.0)
 """Error of the direction of gravity in one picture: mount, accelerations in flight."""
 UP_MEMORY_S = 5.0
-UNPROVEN_S = 3.0
+_UNPROVEN_S = 3.0
 """How far off the stamps of telemetry may be that has not yet turned with the images: `comparison` looks so far."""
-STEADY_RAD = math.radians(15.0)
+_STEADY_RAD = math.radians(15.0)
 """Lean of a drone that takes off and flies slowly, at most; a camera in a hand rolls by more, and its attitude may be
 another moment's until it has proven otherwise."""
 _LEAST_WEIGHT = 1e-4
@@ -175,7 +176,7 @@ class TelemetryModel:
         at_s = stamps_s - self.delay_s
         use = self.track.covered(at_s, at_s)
         if not self.attitude_proven:
-            use &= self.track.leaned(at_s, UNPROVEN_S) < STEADY_RAD
+            use &= is_steady(self.track, at_s)
         frame = np.flatnonzero(use)
         if len(frame) == 0:
             return None
@@ -298,6 +299,11 @@ class TelemetryModel:
         return PositionGaussian(
             0.5 * (A + A.T), D.T @ whitened[:, -1], float(rows.told @ whitened[:, -1]), len(tukey), refused
         )
+
+
+def is_steady(track: TelemetryTrack, at_s: FloatArray) -> NDArray[np.bool_]:
+    """Whether a drone leans at moments ``(N,)`` as one that takes off does, whichever moment near by is meant."""
+    return np.asarray(track.leaned(at_s, _UNPROVEN_S) < _STEADY_RAD)
 
 
 def _stacked(parts: list[_Rows]) -> _Rows | None:

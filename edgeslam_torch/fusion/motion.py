@@ -15,7 +15,7 @@ import numpy as np
 from edgeslam_torch.fusion.config import FusionConfig
 from edgeslam_torch.fusion.dead_reckoning import REACH_S as RECKONED_S
 from edgeslam_torch.fusion.dead_reckoning import Reckoned, reckoned
-from edgeslam_torch.fusion.displacement import DELAY_S, STEADY_RAD, UNPROVEN_S, TelemetryModel
+from edgeslam_torch.fusion.displacement import DELAY_S, TelemetryModel, is_steady
 from edgeslam_torch.fusion.filter.filter_feed import FilterFeed, Metric
 from edgeslam_torch.fusion.health import disagreement
 from edgeslam_torch.fusion.prediction import (
@@ -53,6 +53,9 @@ _REFIT_SHARE = 0.12
 """Each fit costs more and changes less than the one before."""
 _BELIEVED = 0.3
 """Relative sigma of a scale from telemetry that is used."""
+_SURE = 0.15
+"""Relative sigma of a scale by heights alone by which velocities pull at the map: half of what is believed, so that two
+sigmas are a third and not more than a half. A scale that is wrong by several times tears the map by them."""
 _TURNED_S = 5.0
 """Time over which the map and the drone's attitude have turned together: maps drift by a degree in it."""
 _STAMPED_S = 0.05
@@ -281,7 +284,7 @@ class MotionFusion:
         asked = self._by_telemetry is None and self.began_upright and self._trust.attitude
         if not asked or not self._track.covered(at_s, at_s)[0]:
             return None
-        if not self._trust.turns and self._track.leaned(at_s, UNPROVEN_S)[0] > STEADY_RAD:
+        if not (self._trust.turns or is_steady(self._track, at_s)[0]):
             return None
         leaned = self._track.leaned(at_s, min(self.delay_sigma_s, DELAY_S))
         return self.T_b_c[:3, :3].T @ self._track.attitude(at_s)[0, 2], float(leaned[0])
@@ -487,12 +490,19 @@ class MotionFusion:
             self.delay_sigma_s,
             1.0 if told is None else math.exp(told.log_scale),
             math.inf if told is None else told.sigma,
-            told is not None and self._trust.velocity and (odds is None or odds.kept == "telemetry"),
+            self._velocity_speaks(told),
             heights[0] if told is not None and heights and (odds is None or odds.kept == "height") else None,
             self._fit.truncates,
             self._trust.attitude,
             self._trust.turns,
         )
+
+    def _velocity_speaks(self, told: LogScale | None) -> bool:
+        """Whether velocities may pull at the map: not by metres that heights alone told, and hardly know."""
+        if told is None or not ("telemetry" in told.source or told.sigma < _SURE):
+            return False
+        odds = self._trust.at_odds
+        return self._trust.velocity and (odds is None or odds.kept == "telemetry")
 
     # --- estimation ----------------------------------------------------------------------------------------------
 

@@ -13,7 +13,15 @@ from edgeslam_torch.fusion.config import FusionConfig
 from edgeslam_torch.fusion.motion import MotionFusion
 from edgeslam_torch.fusion.scale.depth_scale import DepthRatio
 from edgeslam_torch.fusion.scale.log_scale import LogScale
-from edgeslam_torch.fusion.telemetry.plausibility import Agreement, Reading, Trust, Verdict, agreement, changes
+from edgeslam_torch.fusion.telemetry.plausibility import (
+    Agreement,
+    AtOdds,
+    Reading,
+    Trust,
+    Verdict,
+    agreement,
+    changes,
+)
 from edgeslam_torch.fusion.telemetry_scale import TelemetryScale
 from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.synthetic.flights.telemetry import TelemetryFaults, simulate
@@ -368,6 +376,26 @@ def test_velocities_in_the_wrong_unit_are_named_and_dropped(rng, swinging, repla
     assert "velocities are not used" in warning
     model = fusion.telemetry()
     assert (model.velocity, model.height) == (False, "tof"), "nor do they pull at the map in its refinement"
+
+
+@pytest.mark.parametrize(
+    ("source", "sigma", "kept", "speaks"),
+    [
+        ("telemetry+height", 0.28, "", True),
+        ("telemetry", 0.28, "telemetry", True),
+        ("height", 0.1, "", True),
+        ("height", 0.28, "", False),
+        ("telemetry+height", 0.1, "height", False),
+        ("telemetry+height", 0.1, None, False),
+    ],
+)
+def test_velocities_pull_at_the_map_where_they_go_with_metres_that_are_known(source, sigma, kept, speaks):
+    """A young map's heights may tell a unit several times off at a quarter, and velocities would tear it by that."""
+    fusion = MotionFusion(FusionConfig(), T_B_C)
+    fusion._R_w_m, fusion._by_telemetry = np.eye(3), LogScale(0.0, sigma, source)
+    fusion._trust.judge(Reading.VELOCITY, Agreement(0.99, 30))
+    fusion._trust.at_odds = None if kept == "" else AtOdds(10.0, 1.0, kept)
+    assert fusion.telemetry().velocity is speaks
 
 
 def test_gravity_speaks_before_metres_are_known_if_the_map_began_upright():
