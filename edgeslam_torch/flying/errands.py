@@ -18,6 +18,8 @@ _SLOW_M_S = 0.15
 _LOOK_M, _LOOK_S = 0.6, 3.0
 """How near to the take-off it looks ahead, and for how long: two keyframes, a loop, and a view in new metres."""
 _AHEAD_RAD = math.radians(8.0)
+_GIVEN_UP_S = 12.0
+"""Time to turn and look: half a turn at a third of the usual rate, and the look. A drone that cannot turn comes home."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +51,8 @@ class WayHome:
     _looked: bool = False
     _looks_s: float = math.nan
     """Since when it looks where it looked at its take-off."""
+    _near_s: float = math.nan
+    """Since when it wants to."""
 
     def goals(self, layer: Layer, sight: Sight) -> np.ndarray:
         """The cell of the oldest point of the way that the grid still holds."""
@@ -67,9 +71,11 @@ class WayHome:
         """The heading of the take-off, which is 0, for seconds when it comes near."""
         if self._looked or float(np.linalg.norm(sight.p_w[:2])) > _LOOK_M:
             return None
+        if math.isnan(self._near_s):
+            self._near_s = sight.stamp_s
         if math.isnan(self._looks_s) and abs(float(wrapped(np.array(sight.yaw_rad)))) < _AHEAD_RAD:
             self._looks_s = sight.stamp_s
-        self._looked = sight.stamp_s - self._looks_s > _LOOK_S
+        self._looked = sight.stamp_s - self._looks_s > _LOOK_S or sight.stamp_s - self._near_s > _GIVEN_UP_S
         return 0.0
 
     def carry(self, moved: Moved) -> None:

@@ -40,6 +40,14 @@ def test_it_looks_for_as_long_as_it_looks_ahead_not_while_it_turns():
     assert not task.done(at(10.0))
 
 
+def test_a_drone_that_cannot_turn_is_home_all_the_same():
+    task = way_home()
+    for stamp_s in range(12):
+        assert task.heading_rad(at(20.0 + stamp_s, x=0.1, yaw_deg=90.0)) == 0.0
+    task.heading_rad(at(32.5, x=0.1, yaw_deg=90.0))
+    assert task.heading_rad(at(33.0, x=0.1, yaw_deg=90.0)) is None and task.done(at(33.0, x=0.1, yaw_deg=90.0))
+
+
 @pytest.mark.parametrize("turns", [-1, 1, 2])
 def test_a_drone_that_has_turned_round_looks_ahead_all_the_same(turns):
     """Its heading is told without jumps: 360 degrees are ahead."""
