@@ -188,6 +188,9 @@ class MappingConfig:
     """Keyframes refined together (the paper says "short")."""
     window_fixed: int = 15
     """Fixed keyframes outside the window, which hold its gauge."""
+    sub_pixel: bool = True
+    """Align keypoints of keyframes with the first views of their anchors. Off, corners stay on whole pixels of their
+    octave (the paper)."""
     loop_closure: bool = True
     """Recognise places of the same piece of map after a long way, and spread the drift over the way between. Off, only
     drift of a few pixels is made up for (the paper has no loop closure)."""

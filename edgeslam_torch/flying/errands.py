@@ -19,7 +19,7 @@ _LOOK_M, _LOOK_S = 0.6, 3.0
 """How near to the take-off it looks ahead, and for how long: two keyframes, a loop, and a view in new metres."""
 _AHEAD_RAD = math.radians(8.0)
 _GIVEN_UP_S = 12.0
-"""Time to turn and look: half a turn at a third of the usual rate, and the look. A drone that cannot turn comes home."""
+"""Time to turn and look: half a turn at a third of the usual rate, and the look. A drone may not be able to turn."""
 
 
 @dataclass(frozen=True, slots=True)

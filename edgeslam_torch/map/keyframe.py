@@ -48,7 +48,10 @@ class Keyframe:
     words: NDArray[np.uint64]
     """``(N, 4)`` descriptors for `hamming`."""
     grid: KeypointGrid
-    """Index of ``features.uv``."""
+    """Index of ``features.uv`` as they were detected."""
+    aligned_px: FloatArray
+    """``(N,)`` standard deviation [px] of keypoints that are aligned with other views (`sub_pixel.align`); NaN for
+    corners as they were detected."""
     depth: DepthMap | None = None
     """Released, like ``image``, after the edges are measured."""
     network_m: FloatArray | None = None
@@ -90,6 +93,7 @@ def make_keyframe(id: int, frame_index: int, stamp_s: float, T_c_w: FloatArray, 
         anchor=np.full(len(features.uv), NO_ANCHOR, dtype=np.int64),
         words=words(features.descriptors),
         grid=KeypointGrid(features.uv),
+        aligned_px=np.full(len(features.uv), np.nan),
     )
 
 

@@ -15,6 +15,7 @@ from edgeslam_torch.map.depth_prior import depth_prior
 from edgeslam_torch.map.growth import depths, take_along
 from edgeslam_torch.map.keyframe import NO_ANCHOR, Keyframe
 from edgeslam_torch.map.slam_map import SlamMap
+from edgeslam_torch.map.sub_pixel import align
 from edgeslam_torch.mapping.edge_map import EdgeMap
 from edgeslam_torch.mapping.fuse import fuse_young
 from edgeslam_torch.mapping.new_anchors import epipolar_matches, triangulate_matches
@@ -94,6 +95,8 @@ class Mapper:
             self.triangulate_new(keyframe, neighbours, colour)
             fuse_young(self.map, self.camera, keyframe, self.map.covisible(keyframe, 2 * self.config.neighbours))
             drift_px = reobserve(self.map, self.camera, keyframe)
+            if self.config.sub_pixel:
+                align(self.map, keyframe, self.camera)
         if drift_px is not None and drift_px > MAX_DRIFT_PX:  # the drift lies outside the window
             refine_all(self.map, self.camera, self.lm, telemetry)
         if telemetry is not None and telemetry.knows_metres:

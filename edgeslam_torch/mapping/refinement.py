@@ -181,7 +181,7 @@ def window_problem(
     """A window's poses, anchors and observations, and the observations' keypoints of each keyframe.
 
     Poses come free ones first, those of hosts outside the window last. With plain squares (``Kernel.L2``, the paper's
-    literal form) keypoints have equal weight; otherwise they are whitened by their octave.
+    literal form) keypoints have equal weight; otherwise they are whitened by octave or alignment.
     """
     keyframes = [*window.free, *window.fixed]
     row_of_anchor = np.full(len(slam_map.anchors.alive) + 1, -1, dtype=np.int64)
@@ -196,8 +196,10 @@ def window_problem(
     row = np.concatenate([row_of_anchor[k.anchor[s]] for k, s in zip(keyframes, keypoint, strict=True)])
     uv = np.concatenate([k.features.uv[s] for k, s in zip(keyframes, keypoint, strict=True)])
     octave = np.concatenate([k.features.octave[s] for k, s in zip(keyframes, keypoint, strict=True)])
+    aligned = np.concatenate([k.aligned_px[s] for k, s in zip(keyframes, keypoint, strict=True)])
     alike = config.kernel is Kernel.L2
-    shrink = slam_map.scale_factor ** -np.arange(slam_map.levels, dtype=np.float64)
+    growth = slam_map.scale_factor ** np.arange(slam_map.levels, dtype=np.float64)
+    sigma_px = np.where(np.isnan(aligned), growth[octave], aligned)
     unsure = slam_map.anchors.from_depth[window.anchor]
     # If most depths rest on priors, these fix the scale; the distance between poses of a rotating camera is noise.
     extent = None if unsure.sum() > 0.5 * len(unsure) else held_extent(window)
@@ -213,7 +215,7 @@ def window_problem(
         obs_pose=np.concatenate(pose),
         obs_anchor=row,
         uv=uv.astype(np.float64),
-        inv_sigma=np.ones(len(row)) if alike else shrink[octave],
+        inv_sigma=np.ones(len(row)) if alike else 1.0 / sigma_px,
         K=(camera.fx, camera.fy, camera.cx, camera.cy),
         relative_priors=motions,
         scale_priors=() if extent is None else (extent,),

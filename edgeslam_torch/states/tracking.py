@@ -200,7 +200,7 @@ class Tracking:
         few = few_matches(track, reference, system.map, system.config.mapping)
         since_s = stamp_s - system.keyframe_s
         due = due or is_due(few, parallax_rad, since_s, system.config.mapping)
-        self._template = template_of_track(track, view, reference, seen.grey, system.camera)
+        self._template = template_of_track(track, view, reference, seen.grey)
         uv, inv_sigma = view.features.uv[track.keypoint], view.inv_sigma[track.keypoint]
         return Located(track, reference, parallax_rad, due, uv, inv_sigma, view, relocalised)
 
@@ -309,7 +309,7 @@ class Tracking:
         return keyframe
 
     def _follow_from(self, keyframe: Keyframe, seen: LazyView) -> None:
-        self._template = template_of_keyframe(keyframe, seen.grey, self.system.camera)
+        self._template = template_of_keyframe(keyframe, seen.grey)
 
     def _map(self, new: list[tuple[Frame, Keyframe]]) -> None:
         if self.system.map_keyframes(new):

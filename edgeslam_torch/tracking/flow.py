@@ -50,7 +50,7 @@ class Template:
     grey: NDArray[np.uint8]
     """``(H, W)`` with the lens distortion still in it."""
     uv: FloatArray
-    """``(N, 2)`` pixels of the keypoints in ``grey``, float32."""
+    """``(N, 2)`` undistorted pixels of the keypoints, float32; a keyframe's own array, which mapping aligns."""
     octave: IntArray
     """``(N,)``"""
     anchor: IntArray
@@ -84,24 +84,20 @@ class Followed:
     """Whether enough of those in view are inliers to tell a pose; else it tells where to look for one."""
 
 
-def template_of_keyframe(keyframe: Keyframe, grey: NDArray[np.uint8], camera: Camera) -> Template:
+def template_of_keyframe(keyframe: Keyframe, grey: NDArray[np.uint8]) -> Template:
     """Template of a keyframe's anchors; ``grey`` is its distorted image."""
-    return _template(keyframe.id, keyframe.features, keyframe.anchor, grey, camera)
+    return _template(keyframe.id, keyframe.features, keyframe.anchor, grey)
 
 
-def template_of_track(
-    track: Track, view: View, reference: Keyframe, grey: NDArray[np.uint8], camera: Camera
-) -> Template:
+def template_of_track(track: Track, view: View, reference: Keyframe, grey: NDArray[np.uint8]) -> Template:
     """Template of the anchors matched in a frame that is not a keyframe."""
     anchor = np.full(len(view.features.uv), NO_ANCHOR, dtype=np.int64)
     anchor[track.keypoint] = track.anchor
-    return _template(reference.id, view.features, anchor, grey, camera)
+    return _template(reference.id, view.features, anchor, grey)
 
 
-def _template(
-    keyframe_id: int, features: FrameFeatures, anchor: IntArray, grey: NDArray[np.uint8], camera: Camera
-) -> Template:
-    return Template(keyframe_id, grey, camera.distort_points(features.uv), features.octave, anchor)
+def _template(keyframe_id: int, features: FrameFeatures, anchor: IntArray, grey: NDArray[np.uint8]) -> Template:
+    return Template(keyframe_id, grey, features.uv, features.octave, anchor)
 
 
 def join(track: Track, followed: Followed, view: View, scale_factor: float) -> Track:
@@ -247,7 +243,7 @@ class FlowTracker:
         uv, status, difference = cv2.calcOpticalFlowPyrLK(
             template.grey,
             grey,
-            np.ascontiguousarray(template.uv[keypoint]).reshape(-1, 1, 2),
+            np.ascontiguousarray(self.camera.distort_points(template.uv[keypoint]), np.float32).reshape(-1, 1, 2),
             np.ascontiguousarray(guess, dtype=np.float32).reshape(-1, 1, 2),
             winSize=window,
             maxLevel=levels - 1,

@@ -48,6 +48,20 @@ def test_keyframes_grow_a_map_that_is_exact(rng):
     assert np.abs(xi).max() < 1e-3
 
 
+@pytest.mark.parametrize("sub_pixel", [True, False])
+def test_keypoints_of_a_new_keyframe_are_aligned_with_the_views_before_it(rng, sub_pixel):
+    """Three cameras at one place see the same picture; the newest one's corners lie .4 px beside what it shows."""
+    points = PointMap(rng, 400, 3)
+    picture = np.kron(rng.integers(0, 255, (120, 160)), np.ones((4, 4))).astype(np.uint8)
+    for keyframe, seen in zip(points.keyframes, points.point_of, strict=True):
+        keyframe.T_c_w, keyframe.grey = points.world.T_c_w[0].copy(), picture
+        keyframe.features.uv[:] = CAMERA.project(se3.transform(keyframe.T_c_w, points.world.p_w[seen]))
+    anchor_of = points.fill([0, 1])
+    points.keyframes[2].features.uv[:] += 0.4
+    insert(make_mapper(points, sub_pixel=sub_pixel), points, 2, anchor_of)
+    assert np.isfinite(points.keyframes[2].aligned_px).any() == sub_pixel
+
+
 def test_pose_error_of_a_new_keyframe_is_refined_away(rng):
     points = PointMap(rng, 400, 5)
     anchor_of = points.fill([0, 1, 2, 3])

@@ -86,6 +86,17 @@ def test_keypoints_count_as_precisely_as_their_level_tells(points, kernel, sigma
     np.testing.assert_allclose(problem.inv_sigma[~mine], 1.0)
 
 
+def test_an_aligned_keypoint_counts_as_precisely_as_its_alignment(points):
+    window = choose_window(points.map, points.keyframes[-1], 4, 15)
+    newest = points.keyframes[-1]
+    newest.features.octave[:] = 3
+    newest.aligned_px[::2] = 0.5
+    problem, keypoint = window_problem(points.map, window, CAMERA, LmConfig())
+    pose = [*window.free, *window.fixed].index(newest)
+    expected = np.where(keypoint[pose] % 2 == 0, 0.5, 1.2**3)
+    np.testing.assert_allclose(1.0 / problem.inv_sigma[problem.obs_pose == pose], expected)
+
+
 def test_wrong_observations_are_taken_out_of_the_map(points, rng):
     keyframe = points.keyframes[-1]
     wrong = rng.permutation(keyframe.keypoints_with_anchor())[:20]

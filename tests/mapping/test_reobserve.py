@@ -24,6 +24,7 @@ def drifted(rng, drift, same_place=True):
     seen = points.point_of[5] = points.point_of[1]
     last.features = points.keyframes[1].features
     last.words, last.grid = points.keyframes[1].words, points.keyframes[1].grid
+    last.aligned_px = points.keyframes[1].aligned_px.copy()
     last.anchor = np.full(len(seen), -1, dtype=np.int64)
     last.T_c_w = points.world.T_c_w[1].copy()
     points.fill((0, 1, 2))

@@ -47,7 +47,7 @@ class Scene:
         ids = self.map.anchors.add(se3.transform(POSES[0], p_c), self.keyframe.words, 0, False, colour)
         self.map.add_keyframe(self.keyframe)
         self.map.observe(self.keyframe, np.arange(len(ids)), ids)
-        self.template = template_of_keyframe(self.keyframe, self.grey, CAMERA)
+        self.template = template_of_keyframe(self.keyframe, self.grey)
 
     def tracker(self, **settings):
         return FlowTracker(self.map, self.camera, ORB, FlowConfig(**settings), MIN_INLIERS)
@@ -196,7 +196,7 @@ def test_a_lens_changes_nothing_but_the_pixels(scene):
         return cv2.remap(grey, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
     tracker = FlowTracker(scene.map, lens, ORB, FlowConfig(), MIN_INLIERS)
-    template = template_of_keyframe(scene.keyframe, through(scene.grey), lens)
+    template = template_of_keyframe(scene.keyframe, through(scene.grey))
     followed = tracker.follow(template, through(grey_at(POSES[1])), se3.inverse(POSES[1]))
     translation, rotation = error(followed.track.T_c_w, POSES[1])
     assert translation < 0.01  # half a pixel at their distance
@@ -209,7 +209,7 @@ def test_a_matched_frame_can_be_followed_without_being_a_keyframe(scene):
     keypoint = np.arange(0, len(view.features.uv), 2)
     anchor = scene.keyframe.anchor[keypoint]
     track = Track(scene.keyframe.T_c_w, keypoint, anchor, keypoint, anchor, np.eye(6))
-    template = template_of_track(track, view, scene.keyframe, scene.grey, CAMERA)
+    template = template_of_track(track, view, scene.keyframe, scene.grey)
     assert (np.flatnonzero(template.anchor != NO_ANCHOR) == keypoint).all()
     assert template.keyframe_id == scene.keyframe.id
     followed = scene.tracker().follow(template, grey_at(POSES[1]), se3.inverse(POSES[1]))
