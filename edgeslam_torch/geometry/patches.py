@@ -26,7 +26,8 @@ _LONGEST_PX = 1.0
 _OFFSETS = np.arange(-HALF_PX - 1, HALF_PX + 2, dtype=np.float32)
 _X, _Y = (a.ravel() for a in np.meshgrid(_OFFSETS, _OFFSETS))
 _INNER = np.maximum(np.abs(_X), np.abs(_Y)) <= HALF_PX
-_SIDE = len(_OFFSETS)
+SIDE_PX = len(_OFFSETS)
+"""Side of a template: a patch and the pixels around it, for its gradients."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +89,7 @@ def templates(image: NDArray[np.uint8], uv: FloatArray, warps: FloatArray) -> Fl
     """
     x = uv[:, :1] + warps[:, 0, :1] * _X + warps[:, 0, 1:] * _Y
     y = uv[:, 1:] + warps[:, 1, :1] * _X + warps[:, 1, 1:] * _Y
-    return _looked_up(image, x, y).reshape(len(uv), _SIDE, _SIDE)
+    return _looked_up(image, x, y).reshape(len(uv), SIDE_PX, SIDE_PX)
 
 
 def find(image: NDArray[np.uint8], uv: FloatArray, patches: FloatArray) -> Found:

@@ -5,13 +5,15 @@ What an anchor's patch looked like in the earliest keyframe that sees it is foun
 (`geometry/patches.py`), so that parallax tells depths several times better.
 """
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
-from edgeslam_torch.geometry.patches import find, patch_warps, templates
+from edgeslam_torch.geometry.patches import SIDE_PX, find, patch_warps, templates
 from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.types import FloatArray, IntArray
@@ -29,6 +31,21 @@ _LEVELS = 3
 """Of a pyramid of halves: the coarsest of ORB's octaves is 3.6 times smaller."""
 
 
+@dataclass(frozen=True, slots=True)
+class _Looks:
+    """What one view shows of some anchors, as a keyframe would see it."""
+
+    view: Keyframe
+    theirs: IntArray
+    """``(M,)`` the view's keypoints."""
+    mine: IntArray
+    """``(M,)`` the keyframe's."""
+    level: IntArray
+    """``(M,)`` of the pyramid of halves."""
+    patches: FloatArray
+    """``(M, S, S)``"""
+
+
 def align(slam_map: SlamMap, keyframe: Keyframe, camera: Camera) -> int:
     """Align a keyframe's keypoints that have anchors with the anchors' earliest views; called under the map's lock.
 
@@ -42,29 +59,36 @@ def align(slam_map: SlamMap, keyframe: Keyframe, camera: Camera) -> int:
     Returns:
         Number of keypoints that were aligned.
     """
-    if keyframe.grey is None:
+    looks = [] if keyframe.grey is None else _first_looks(slam_map, keyframe, camera)
+    if keyframe.grey is None or not looks:
         return 0
+    mine = np.concatenate([look.mine for look in looks])
+    octave_px = slam_map.scale_factor ** keyframe.features.octave[mine].astype(np.float64)
+    before = keyframe.features.uv[mine].astype(np.float64)
+    uv, sigma_px = _found(keyframe.grey, before, looks)
+    good = (sigma_px < _UNSURE_PX) & (np.abs(uv - before).max(1) < _FARTHEST_PX * octave_px)
+    keyframe.features.uv[mine[good]] = uv[good]  # in place: optical flow follows these very pixels
+    keyframe.aligned_px[mine[good]] = np.hypot(SIGMA_PX * octave_px, sigma_px)[good]
+    for look in looks:
+        held = look.theirs[np.isfinite(keyframe.aligned_px[look.mine])]
+        limit = SIGMA_PX * slam_map.scale_factor ** look.view.features.octave[held].astype(np.float64)
+        look.view.aligned_px[held] = np.fmin(look.view.aligned_px[held], limit)
+    return int(good.sum())
+
+
+def _first_looks(slam_map: SlamMap, keyframe: Keyframe, camera: Camera) -> list[_Looks]:
+    """What the earliest views of a keyframe's anchors show of them."""
     known = [k for k in slam_map.covisible(keyframe, VIEWS) if k.id < keyframe.id and k.grey is not None]
     waiting = keyframe.keypoints_with_anchor()
-    uv, sigma = keyframe.features.uv.astype(np.float64), keyframe.aligned_px.copy()
-    pyramid, growth = _pyramid(keyframe.grey), slam_map.scale_factor
+    looks = []
     for view in sorted(known, key=lambda k: k.id):
         mine, theirs = _shared(keyframe, waiting, view)
         waiting = np.setdiff1d(waiting, mine, assume_unique=True)
         depth = se3.transform(view.T_c_w, slam_map.anchors.p_w[keyframe.anchor[mine]])[:, 2]
-        mine, theirs, depth = mine[depth > 0], theirs[depth > 0], depth[depth > 0]
-        if len(mine) == 0:
-            continue
-        found, sigma_px = _found(view, theirs, depth, keyframe, mine, pyramid, camera, growth)
-        farthest = _FARTHEST_PX * growth ** keyframe.features.octave[mine]
-        good = (sigma_px < _UNSURE_PX) & (np.abs(found - uv[mine]).max(1) < farthest)
-        uv[mine[good]] = found[good]
-        sigma[mine[good]] = np.hypot(SIGMA_PX * growth ** keyframe.features.octave[mine[good]], sigma_px[good])
-        held = theirs[good]
-        view.aligned_px[held] = np.fmin(view.aligned_px[held], SIGMA_PX * growth ** view.features.octave[held])
-    keyframe.features.uv[:] = uv  # in place: optical flow follows these very pixels
-    keyframe.aligned_px[:] = sigma
-    return int(np.isfinite(sigma).sum())
+        front = depth > 0
+        if front.any():
+            looks.append(_look(view, theirs[front], depth[front], keyframe, mine[front], camera, slam_map.scale_factor))
+    return looks
 
 
 def _shared(keyframe: Keyframe, keypoint: IntArray, view: Keyframe) -> tuple[IntArray, IntArray]:
@@ -77,35 +101,42 @@ def _shared(keyframe: Keyframe, keypoint: IntArray, view: Keyframe) -> tuple[Int
     return keypoint[same], order[at[same]]
 
 
-def _found(
+def _look(
     view: Keyframe,
     theirs: IntArray,
     depth: FloatArray,
     keyframe: Keyframe,
     mine: IntArray,
-    pyramid: list[NDArray[np.uint8]],
     camera: Camera,
-    growth: float,
-) -> tuple[FloatArray, FloatArray]:
-    """Pixels ``(M, 2)`` of a keyframe that show what a view shows at its keypoints, and their sigmas ``(M,)`` [px]."""
+    scale_factor: float,
+) -> _Looks:
+    """Patches of a view around its keypoints at z-depths ``(M,)``, as a keyframe would see them."""
     assert view.grey is not None
-    uv_from = view.features.uv[theirs].astype(np.float64)
-    warps = patch_warps(uv_from, depth, keyframe.T_c_w @ view.T_w_c, camera)
-    level = np.rint(np.log2(growth) * view.features.octave[theirs]).astype(np.int64).clip(0, _LEVELS - 1)
-    from_pyramid = _pyramid(view.grey)
-    uv = keyframe.features.uv[mine].astype(np.float64)
-    sigma = np.full(len(mine), np.inf)
-    for i in np.unique(level):
+    uv = view.features.uv[theirs].astype(np.float64)
+    warps = patch_warps(uv, depth, keyframe.T_c_w @ view.T_w_c, camera)
+    level = np.rint(np.log2(scale_factor) * view.features.octave[theirs]).astype(np.int64).clip(0, _LEVELS - 1)
+    patches = np.zeros((len(mine), SIDE_PX, SIDE_PX), np.float32)
+    for i, grey in enumerate(_pyramid(view.grey, int(level.max()) + 1)):
+        on = level == i
+        patches[on] = templates(grey, uv[on] / 2.0**i, warps[on])
+    return _Looks(view, theirs, mine, level, patches)
+
+
+def _found(grey: NDArray[np.uint8], uv: FloatArray, looks: list[_Looks]) -> tuple[FloatArray, FloatArray]:
+    """Pixels ``(N, 2)`` of an image where it shows patches, looked for around ``uv``; their sigmas ``(N,)`` [px]."""
+    level = np.concatenate([look.level for look in looks])
+    patches = np.concatenate([look.patches for look in looks])
+    there, sigma = uv.copy(), np.full(len(uv), np.inf)
+    for i, image in enumerate(_pyramid(grey, int(level.max()) + 1)):
         on, half = level == i, 2.0**i
-        patches = templates(from_pyramid[i], uv_from[on] / half, warps[on])
-        found = find(pyramid[i], uv[on] / half, patches)
-        uv[on], sigma[on] = half * found.uv, half * found.sigma_px
-    return uv, sigma
+        found = find(image, uv[on] / half, patches[on])
+        there[on], sigma[on] = half * found.uv, half * found.sigma_px
+    return there, sigma
 
 
-def _pyramid(grey: NDArray[np.uint8]) -> list[NDArray[np.uint8]]:
+def _pyramid(grey: NDArray[np.uint8], levels: int) -> list[NDArray[np.uint8]]:
     """Halves of an image: pixel ``i`` of one level is pixel ``2 i`` of the one before."""
-    levels = [grey]
-    for _ in range(_LEVELS - 1):
-        levels.append(np.asarray(cv2.pyrDown(levels[-1]), dtype=np.uint8))
-    return levels
+    pyramid = [grey]
+    for _ in range(levels - 1):
+        pyramid.append(np.asarray(cv2.pyrDown(pyramid[-1]), dtype=np.uint8))
+    return pyramid

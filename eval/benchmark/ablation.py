@@ -111,6 +111,7 @@ ROWS = (
     Row("ungated-network", "network prior with its own sigma", (), own_sigma=True),
     Row("no-depth-network", "no depth network", ("depth.weights=none",)),
     Row("no-flow", "no optical flow: every frame matched", ("flow.enabled=false",)),
+    Row("whole-pixels", "corners on whole pixels, as ORB finds them", ("mapping.sub_pixel=false",)),
 )
 """The table of `edgeslam ablation`, top to bottom."""
 

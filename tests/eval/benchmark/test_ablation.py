@@ -35,8 +35,8 @@ def flights(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list:
 
 def test_rows_that_differ_in_the_last_refinement_alone_share_a_flight(flights, tmp_path):
     record = run_ablation(AblationSettings(tmp_path, seeds=(0, 1)), tmp_path / "out", lambda line: None)
-    assert len(flights) == 2 * 15  # all rows but those of the last refinement, which share the default's
-    assert len({config for _, config in flights}) == 2 * 14  # the network's own sigma is no setting
+    assert len(flights) == 2 * 16  # all rows but those of the last refinement, which share the default's
+    assert len({config for _, config in flights}) == 2 * 15  # the network's own sigma is no setting
     assert all(len(row["runs"]) == 2 for row in record["rows"].values())
     assert record == json.loads((tmp_path / "out" / "ablation.json").read_text())
 
