@@ -55,7 +55,7 @@ def patch_warps(uv: FloatArray, depth: FloatArray, T_to_from: FloatArray, camera
         other camera's plane.
 
     Example:
-        A camera that comes half as near sees everything twice as large:
+        A camera that comes twice as near sees everything twice as large:
 
         >>> from edgeslam_torch.geometry.camera import PRESETS
         >>> forward = np.eye(4)

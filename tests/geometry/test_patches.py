@@ -76,6 +76,15 @@ def test_a_straight_edge_tells_nothing_along_it():
     assert not (find(edge, PLACES, templates(edge, PLACES, SAME)).sigma_px < 0.5).any()
 
 
+def test_a_point_in_the_other_cameras_plane_is_not_found():
+    beside = np.eye(4)
+    beside[2, 3] = -2.0
+    warps = patch_warps(PLACES[:1], np.array([2.0]), beside, CAMERA)
+    assert not np.isfinite(warps).all()
+    found = find(image(), PLACES[:1], templates(image(), PLACES[:1], warps))
+    assert np.isinf(found.sigma_px[0]) and np.isfinite(found.uv).all()
+
+
 def test_no_patch_is_no_patch():
     none = np.zeros((0, 2))
     found = find(image(), none, templates(image(), none, np.zeros((0, 2, 2))))
