@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgeslam_torch.geometry.camera import Camera
-from edgeslam_torch.geometry.se3 import transform
 from edgeslam_torch.types import FloatArray, IntArray
 
 HALF_PX = 4
@@ -47,7 +46,7 @@ def patch_warps(uv: FloatArray, depth: FloatArray, T_to_from: FloatArray, camera
     Args:
         uv: Pixels ``(N, 2)`` of the points in the image that the patches are taken from.
         depth: Their z-depths ``(N,)`` there, positive; the surface is taken for parallel to the image.
-        T_to_from: ``(4, 4)`` from that camera to the other one, in the unit of the depths.
+        T_to_from: ``(4, 4)`` from that camera to the other one, in the unit of the depths; or one a point.
         camera: Of both images.
 
     Returns:
@@ -66,10 +65,11 @@ def patch_warps(uv: FloatArray, depth: FloatArray, T_to_from: FloatArray, camera
     """
     focal = np.array([camera.fx, camera.fy])
     p = np.column_stack([(uv - (camera.cx, camera.cy)) / focal, np.ones(len(uv))]) * depth[:, None]
-    x, y, z = transform(T_to_from, p).T
+    R = T_to_from[..., :3, :3]
+    x, y, z = (np.einsum("...ij,...j->...i", R, p) + T_to_from[..., :3, 3]).T
     with np.errstate(divide="ignore", invalid="ignore"):
-        ahead = T_to_from[:2, :2] / z[:, None, None]
-        slope = np.stack([x, y], axis=1)[:, :, None] * T_to_from[2, :2] / (z * z)[:, None, None]
+        ahead = R[..., :2, :2] / z[:, None, None]
+        slope = np.stack([x, y], axis=1)[:, :, None] * R[..., 2:, :2] / (z * z)[:, None, None]
         away = (ahead - slope) * focal[:, None] / focal * depth[:, None, None]
         det = away[:, 0, 0] * away[:, 1, 1] - away[:, 0, 1] * away[:, 1, 0]
         swapped = np.stack(

@@ -79,47 +79,49 @@ def align(slam_map: SlamMap, keyframe: Keyframe, camera: Camera) -> int:
 def _first_looks(slam_map: SlamMap, keyframe: Keyframe, camera: Camera) -> list[_Looks]:
     """What the earliest views of a keyframe's anchors show of them."""
     known = [k for k in slam_map.covisible(keyframe, VIEWS) if k.id < keyframe.id and k.grey is not None]
-    waiting = keyframe.keypoints_with_anchor()
-    looks = []
-    for view in sorted(known, key=lambda k: k.id):
-        mine, theirs = _shared(keyframe, waiting, view)
-        waiting = np.setdiff1d(waiting, mine, assume_unique=True)
-        depth = se3.transform(view.T_c_w, slam_map.anchors.p_w[keyframe.anchor[mine]])[:, 2]
-        front = depth > 0
-        if front.any():
-            looks.append(_look(view, theirs[front], depth[front], keyframe, mine[front], camera, slam_map.scale_factor))
-    return looks
+    known.sort(key=lambda k: k.id)
+    mine, first, theirs = _first_seen(keyframe, known, len(slam_map.anchors.alive))
+    if len(mine) == 0:
+        return []
+    T_c_w = np.stack([k.T_c_w for k in known])
+    p_w = slam_map.anchors.p_w[keyframe.anchor[mine]]
+    depth = np.einsum("ij,ij->i", T_c_w[first, 2, :3], p_w) + T_c_w[first, 2, 3]
+    front = depth > 0
+    mine, first, theirs, depth = mine[front], first[front], theirs[front], depth[front]
+    uv = np.zeros((len(mine), 2))
+    octave = np.zeros(len(mine))
+    groups = [np.flatnonzero(first == i) for i in range(len(known))]
+    for view, some in zip(known, groups, strict=True):
+        uv[some], octave[some] = view.features.uv[theirs[some]], view.features.octave[theirs[some]]
+    warps = patch_warps(uv, depth, (keyframe.T_c_w @ se3.inverse(T_c_w))[first], camera)
+    level = np.rint(np.log2(slam_map.scale_factor) * octave).astype(np.int64).clip(0, _LEVELS - 1)
+    return [
+        _Looks(view, theirs[some], mine[some], level[some], _patches(view, uv[some], warps[some], level[some]))
+        for view, some in zip(known, groups, strict=True)
+        if len(some)
+    ]
 
 
-def _shared(keyframe: Keyframe, keypoint: IntArray, view: Keyframe) -> tuple[IntArray, IntArray]:
-    """Of some keypoints those whose anchors another keyframe sees, and its keypoints."""
-    theirs = view.keypoints_with_anchor()
-    order = theirs[np.argsort(view.anchor[theirs], kind="stable")]
-    at = np.searchsorted(view.anchor[order], keyframe.anchor[keypoint])
-    same = at < len(order)
-    same[same] = view.anchor[order[at[same]]] == keyframe.anchor[keypoint[same]]
-    return keypoint[same], order[at[same]]
+def _first_seen(keyframe: Keyframe, known: list[Keyframe], anchors: int) -> tuple[IntArray, IntArray, IntArray]:
+    """A keyframe's keypoints whose anchors others see, which of the others is the first, and its keypoints."""
+    first, theirs = np.full(anchors, -1), np.zeros(anchors, dtype=np.int64)
+    for i in reversed(range(len(known))):
+        held = known[i].keypoints_with_anchor()
+        first[known[i].anchor[held]], theirs[known[i].anchor[held]] = i, held
+    mine = keyframe.keypoints_with_anchor()
+    mine = mine[first[keyframe.anchor[mine]] >= 0]
+    return mine, first[keyframe.anchor[mine]], theirs[keyframe.anchor[mine]]
 
 
-def _look(
-    view: Keyframe,
-    theirs: IntArray,
-    depth: FloatArray,
-    keyframe: Keyframe,
-    mine: IntArray,
-    camera: Camera,
-    scale_factor: float,
-) -> _Looks:
-    """Patches of a view around its keypoints at z-depths ``(M,)``, as a keyframe would see them."""
+def _patches(view: Keyframe, uv: FloatArray, warps: FloatArray, level: IntArray) -> FloatArray:
+    """Patches ``(M, S, S)`` of a view around pixels, each on its level of the pyramid, as another view sees them."""
     assert view.grey is not None
-    uv = view.features.uv[theirs].astype(np.float64)
-    warps = patch_warps(uv, depth, keyframe.T_c_w @ view.T_w_c, camera)
-    level = np.rint(np.log2(scale_factor) * view.features.octave[theirs]).astype(np.int64).clip(0, _LEVELS - 1)
-    patches = np.zeros((len(mine), SIDE_PX, SIDE_PX), np.float32)
+    patches = np.zeros((len(uv), SIDE_PX, SIDE_PX), np.float32)
     for i, grey in enumerate(_pyramid(view.grey, int(level.max()) + 1)):
-        on = level == i
-        patches[on] = templates(grey, uv[on] / 2.0**i, warps[on])
-    return _Looks(view, theirs, mine, level, patches)
+        on = np.flatnonzero(level == i)
+        if len(on):
+            patches[on] = templates(grey, uv[on] / 2.0**i, warps[on])
+    return patches
 
 
 def _found(grey: NDArray[np.uint8], uv: FloatArray, looks: list[_Looks]) -> tuple[FloatArray, FloatArray]:
