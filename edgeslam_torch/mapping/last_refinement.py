@@ -28,8 +28,6 @@ ALIKE = 2.4
 """Errors of neighbours on one edge are correlated: about six count as one (the root of six)."""
 ITERATIONS = 30
 COST_TOLERANCE = 1e-5
-LEAST_DECREASE = 0.1
-"""A third of a standard deviation of one combination of all that is refined."""
 MU = 1e-8
 """Every refinement goes to the end: a drift of the scale, or a turn taken for a shift, is a slow mode, which a solver
 that stops at a percent of the cost, or is damped by the stiff modes, never reaches (docs/decisions/0084)."""
@@ -42,7 +40,6 @@ def lm_config(config: WindowConfig) -> LmConfig:
         max_iterations=0 if config.reprojection == "off" else ITERATIONS,
         mu=MU,
         cost_tolerance=COST_TOLERANCE,
-        least_decrease=LEAST_DECREASE,
         kernel=Kernel.L2 if config.reprojection == "literal" else Kernel.HUBER,
     )
 

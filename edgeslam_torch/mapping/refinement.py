@@ -30,9 +30,6 @@ from edgeslam_torch.types import IntArray
 UNKNOWN_SCALE_LOG = 1.0
 """Standard deviation of the log of the metres per map unit where nothing but the window's own telemetry tells them."""
 
-_ONE_SIGMA = 1.0
-"""Of one combination of all that is refined, squared."""
-
 
 @dataclass(frozen=True, slots=True)
 class Window:
@@ -48,8 +45,6 @@ class Window:
     settled: bool = False
     """Written back only if the solver has reached a minimum: half-way the newest keyframes, which are being tracked on,
     can be anywhere."""
-    passing: bool = False
-    """Refined again before anything rests on it: what is left below a standard deviation is left to the next."""
     alike: float = ALIKE
     """How many of its keypoints count as one beside telemetry."""
 
@@ -69,7 +64,7 @@ def choose_window(slam_map: SlamMap, newest: Keyframe, free: int, fixed: int) ->
         members.sort(key=lambda k: -k.id)
         while len(frozen) < 2 and len(members) > 1:
             frozen.append(members.pop())
-    return Window(members, frozen, slam_map.anchors_seen_by(members), passing=True)
+    return Window(members, frozen, slam_map.anchors_seen_by(members))
 
 
 def young_map(slam_map: SlamMap, newest: Keyframe, most: int) -> Window | None:
@@ -165,7 +160,7 @@ def refine(
     problem = problem if placed is None else placed.problem
     if len(problem.obs_pose) == 0 and (placed is None or not placed.has_terms):
         return None
-    result = refine_window(problem, replace(config, least_decrease=_ONE_SIGMA) if window.passing else config)
+    result = refine_window(problem, config)
     if window.settled and not result.stop.converged:
         return result
     if problem.scale_priors and result.stop is not StopReason.NOT_FINITE:

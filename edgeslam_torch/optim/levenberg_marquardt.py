@@ -8,7 +8,7 @@ from edgeslam_torch.optim.problem import LmConfig, StopReason
 
 _MU_MIN = 1e-12
 _LIKELY_LAST = 2.0
-"""Factor on the least decrease: a step with a smaller predicted one is likely the last."""
+"""Factor on the cost tolerance: a step with a smaller predicted decrease is likely the last."""
 
 S = TypeVar("S")
 
@@ -93,10 +93,6 @@ def minimise(problem: LeastSquares[S, L], start: S, config: LmConfig) -> tuple[S
     if system.gradient < config.gradient_tolerance:
         return ended(StopReason.GRADIENT_CONVERGED)
     solved = False
-
-    def least() -> float:
-        return max(config.cost_tolerance * cost, config.least_decrease)
-
     while tried < config.max_iterations:
         tried += 1
         step = problem.propose(system, mu)
@@ -106,14 +102,14 @@ def minimise(problem: LeastSquares[S, L], start: S, config: LmConfig) -> tuple[S
             solved = True
             if step.size < config.step_tolerance:
                 return ended(StopReason.STEP_CONVERGED)
-            if tried < config.max_iterations and step.predicted > _LIKELY_LAST * least():
+            if tried < config.max_iterations and step.predicted > _LIKELY_LAST * config.cost_tolerance * cost:
                 trial = problem.linearise(step.state)
                 candidate = trial.cost
             else:
                 candidate = problem.cost(step.state)
             decrease = cost - candidate
             if math.isfinite(candidate) and decrease >= 0.0 and step.predicted > 0.0:
-                small = decrease <= least()
+                small = decrease <= config.cost_tolerance * cost
                 ratio = decrease / step.predicted
                 state, cost = step.state, candidate
                 accepted += 1

@@ -247,8 +247,6 @@ class LmConfig:
     mu_max: float = 1e8
     cost_tolerance: float = 1e-5
     """Relative decrease of the cost below which an accepted step is the last."""
-    least_decrease: float = 0.0
-    """The same in squared standard deviations: a minimum nearer than one is as good as any other."""
     step_tolerance: float = 1e-9
     """Largest tangent component below which a step is the last."""
     gradient_tolerance: float = 1e-9
