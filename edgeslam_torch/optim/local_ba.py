@@ -197,8 +197,7 @@ class _Window:
             moved.append((x + dx).clamp_min(INVERSE_DEPTH_MIN))
         T = state.T_c_w.clone()
         T[self.free] = kernel(lie.exp, self.config.compile)(delta.view(-1, 6)) @ T[self.free]
-        p = state.p + self.points.bounded(state.T_c_w, T, state.p, step)
-        return Step(_State(T, p, tuple(moved)), predicted, float(size))
+        return Step(_State(T, state.p + step, tuple(moved)), predicted, float(size))
 
     # -- the rest -------------------------------------------------------------------------------------------
 

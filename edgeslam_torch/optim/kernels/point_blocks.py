@@ -29,8 +29,6 @@ _LANES = 128
 _FEW_POSES = 12
 """Up to this many free poses, cutting the anchors into chunks saves less than it costs."""
 _ANCHORS_PER_CHUNK = 192
-_NEARER = 0.5
-"""Share of its depth to which one step takes an anchor at most."""
 _NO_DEPTH_PRIORS = DepthPriors(np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros(0))
 
 
@@ -308,41 +306,12 @@ class PointBlocks:
             back[:, chunk.first : chunk.last] -= (part @ in_world[chunk.poses].view(-1)).view(3, -1)
         return schur.unwhiten(eliminated.factor, back)
 
-    def bounded(self, T_c_w: Tensor, moved: Tensor, p: Tensor, step: Tensor) -> Tensor:
-        """The anchors' step ``(3, A)``, shortened where it would more than halve a depth.
-
-        A linearised reprojection takes an anchor at more than twice its depth through the camera, where one anchor
-        costs more than all others gain. The step is then refused for all, until damping holds everything in place.
-
-        Args:
-            T_c_w: Poses ``(W, 4, 4)`` now.
-            moved: Poses after the step.
-            p: Anchors ``(3, A)`` now.
-            step: Of `step`.
-        """
-        before, after = depths(T_c_w, p, self.seen), depths(moved, p + step, self.seen)
-        least = _NEARER * before
-        crossing = (before > self.seen.min_depth) & (after < least) & (self.seen.far > 0.0)
-        if not bool(crossing.any()):
-            return step
-        share = torch.where(crossing, (before - least) / (before - after), 1.0)
-        anchor = self.seen.place[:, 0].reshape(-1)
-        whole = torch.ones(p.shape[1], dtype=p.dtype, device=p.device)
-        return step * whole.scatter_reduce_(0, anchor, share.view(-1), "amin")
-
     def _parts(self, Y: Tensor) -> list[tuple[Chunk, Tensor]]:
         """The chunks with their pieces of ``Y``, ``(3 (last - first), 6 w)``."""
         return [(c, Y[c.begin : c.end].view(-1, 6 * len(c.poses))) for c in self.chunks]
 
     def _kernel(self) -> tuple[Kernel, float]:
         return self.config.kernel, self.config.delta
-
-
-def depths(T_c_w: Tensor, p: Tensor, seen: Observed) -> Tensor:
-    """Depths ``(G, L)`` of all slots' anchors in their cameras; arguments as `evaluate` takes them."""
-    along, t = T_c_w[:, 2:3, :3], T_c_w[:, 2:3, 3:]
-    position = p.reshape(-1).index_select(0, seen.place.reshape(-1)).view(seen.place.shape)
-    return torch.baddbmm((along @ seen.centre[:, None] + t)[seen.pose], along[seen.pose], position)[:, 0]
 
 
 def evaluate(T_c_w: Tensor, p: Tensor, seen: Observed) -> tuple[Tensor, ...]:
