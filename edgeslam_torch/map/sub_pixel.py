@@ -103,7 +103,7 @@ def _first_looks(slam_map: SlamMap, keyframe: Keyframe, camera: Camera) -> list[
 
 
 def _first_seen(keyframe: Keyframe, known: list[Keyframe], anchors: int) -> tuple[IntArray, IntArray, IntArray]:
-    """A keyframe's keypoints whose anchors others see, which of the others is the first, and its keypoints."""
+    """A keyframe's keypoints ``(M,)`` whose anchors others see, which of ``known`` is the first, and its keypoints."""
     first, theirs = np.full(anchors, -1), np.zeros(anchors, dtype=np.int64)
     for i in reversed(range(len(known))):
         held = known[i].keypoints_with_anchor()

@@ -64,6 +64,15 @@ def test_a_view_from_elsewhere_is_found_with_its_warp():
     assert straight.sigma_px[0] > 5 * warped.sigma_px[0], "and what does not fit is not sure"
 
 
+def test_every_point_may_come_from_a_camera_of_its_own(rng):
+    poses = np.stack([se3.exp(xi) for xi in rng.normal(0.0, 0.2, (len(PLACES), 6))])
+    depth = rng.uniform(2.0, 4.0, len(PLACES))
+    at_once = patch_warps(PLACES, depth, poses, CAMERA)
+    for i in range(len(PLACES)):
+        alone = patch_warps(PLACES[i : i + 1], depth[i : i + 1], poses[i], CAMERA)
+        np.testing.assert_allclose(at_once[i : i + 1], alone, rtol=1e-12)
+
+
 def test_nothing_is_found_on_a_bare_wall():
     bare = np.full((240, 320), 90, np.uint8)
     found = find(bare, PLACES, templates(bare, PLACES, SAME))
