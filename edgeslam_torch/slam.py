@@ -222,8 +222,10 @@ class EdgeSlam:
             system.has_telemetry = system.has_telemetry or len(telemetry) > 0
         if not self.log.records and telemetry:  # the first camera turns so that the world's z is up
             system.motion.T_c_w = se3.inverse(first_pose(telemetry[-1].rpy_rad, self._T_b_c))
+            upright = bool(np.isfinite(telemetry[-1].rpy_rad).all())
+            system.published = replace(system.published, upright=upright)
             # In a map of an earlier flight, axes are those of that flight.
-            system.fusion.began_upright = self._earlier is None and bool(np.isfinite(telemetry[-1].rpy_rad).all())
+            system.fusion.began_upright = self._earlier is None and upright
         step = self._step(frame, seen)
         if self._earlier is not None:
             self._joining.enter(self.map.piece_of(step.keyframe.id))
@@ -277,7 +279,7 @@ class EdgeSlam:
         self._system.fusion.revise(*self.log.poses())
         estimate = self.scale
         if np.isfinite(estimate.sigma):
-            self._system.published = Published(estimate.value)
+            self._system.published = Published(estimate.value, self._system.published.R)
         self._calibration_warning = calibration_warning(self.camera, self.keyframes())
 
     def trajectory(self) -> tuple[FloatArray, FloatArray]:

@@ -3,6 +3,7 @@
 import re
 from dataclasses import replace
 from functools import lru_cache
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -14,8 +15,10 @@ from scipy.spatial.transform import Rotation
 from edgeslam_torch.config import DepthConfig, OrbConfig, SlamConfig
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.eval.metrics.align import umeyama
-from edgeslam_torch.fusion.published import T_LEVEL
+from edgeslam_torch.fusion.published import T_LEVEL, first_pose
 from edgeslam_torch.geometry import se3
+from edgeslam_torch.geometry.mount import camera_on_body
+from edgeslam_torch.geometry.rotations import rpy_from_matrix
 from edgeslam_torch.slam import EdgeSlam
 from edgeslam_torch.states.lost import UNCONFIRMED
 from edgeslam_torch.states.starting import AFTER_LOSS
@@ -279,6 +282,27 @@ def test_first_camera_turns_as_the_drone_says():
     sample = TelemetrySample(99.9, velocity_m_s=np.zeros(3), rpy_rad=np.array([0.0, 0.0, np.pi / 2]))
     T = slam.step(panels().frames[0], [sample]).T_w_c
     np.testing.assert_allclose(T[:3, 2], [0, np.cos(np.deg2rad(12)), -np.sin(np.deg2rad(12))], atol=1e-9)
+
+
+@pytest.mark.parametrize("late", [1, 10])
+def test_the_world_is_upright_though_the_drone_tells_its_attitude_late(late):
+    """Pictures may come before the first state message: the world then begins as if the camera were level."""
+    film_ = panels()
+    R_w = first_pose(np.zeros(3), camera_on_body(np.deg2rad(12.0)))[:3, :3] @ film_.T_w_c[0, :3, :3].T  # a level nose
+    R_w_b = R_w @ film_.T_w_c[:, :3, :3] @ camera_on_body(np.deg2rad(12.0))[:3, :3].T
+    slam, outputs = EdgeSlam(CAMERA, NO_NETWORK, depth=film_.depth_function()), []
+    for frame, R in zip(film_.frames, R_w_b, strict=True):
+        told = TelemetrySample(frame.stamp_s, velocity_m_s=np.full(3, np.nan), rpy_rad=rpy_from_matrix(R))
+        outputs.append(slam.step(frame, [told] if frame.index >= late else []))
+    slam.finish()
+    up = (R_w @ film_.T_w_c[:, :3, :3])[:, 2]  # in each camera
+    assert np.degrees(np.arccos(outputs[0].T_w_c[2, :3] @ up[0])) == pytest.approx(12.0)
+    for T, true in ((outputs[-1].T_w_c, up[-1]), *zip(slam.trajectory()[1], up, strict=True)):
+        assert np.degrees(np.arccos(np.clip(T[2, :3] @ true, -1.0, 1.0))) < 1.0
+    turned = [k for k, (a, b) in enumerate(pairwise(outputs), 1) if b.revision > a.revision]
+    assert turned[0] >= late, "told as an event"
+    jump = outputs[turned[0]].T_w_c[:3, 3] - outputs[turned[0] - 1].T_w_c[:3, 3]
+    assert np.linalg.norm(jump) < 0.06, "about the camera: two steps at most"
 
 
 def test_one_frame_is_a_trajectory_of_one_and_an_empty_map():

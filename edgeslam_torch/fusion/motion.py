@@ -360,7 +360,9 @@ class MotionFusion:
         return tuple(told)
 
     def republished(self, published: Published, centre_map: FloatArray) -> Published:
-        """What is published, in the unit that is known or guessed now; ``centre_map`` ``(3,)`` stays where it is."""
+        """What is published, upright and in the unit that is known or guessed now; ``centre_map`` ``(3,)`` stays where
+        it is."""
+        published = published.turned_upright(self._R_w_m, centre_map)
         return published.guessed_anew(self._guess, centre_map).revised(self.scale(), centre_map)
 
     def present(self, stamp_s: float, state: str, published: Published) -> Present:

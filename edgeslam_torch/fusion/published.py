@@ -4,7 +4,8 @@ The map itself is never rescaled, and while flying its units are published as th
 its start, or arbitrary ones. Only sensors of the drone that are sure and contradict what is published revise it, and
 each revision is an event that the output counts: a scale that follows every new estimate would bend the trajectory.
 The similarity then scales about the current camera, so that the live pose does not jump. The final results use the
-final scale throughout.
+final scale throughout. A map that began before the drone had told its attitude is turned upright about the camera when
+it has, once, which is a revision too.
 """
 
 import math
@@ -47,6 +48,8 @@ class Published:
     """How often the scale was revised so far."""
     guessed: bool = True
     """Whether its unit is still a guess: nothing proven has told metres."""
+    upright: bool = False
+    """Whether its axes stay what they are: z is up by the drone's attitude, or they are those of an earlier flight."""
 
     def pose(self, T_w_c: FloatArray) -> FloatArray:
         """Poses ``(..., 4, 4)`` of the map as published."""
@@ -87,6 +90,20 @@ class Published:
         if guess is None or not self._worse_guess(guess):
             return self
         return self._rescaled(guess.value, centre_map)
+
+    def turned_upright(self, R_w_m: FloatArray | None, centre_map: FloatArray) -> "Published":
+        """The same with z up, by the smallest turn, if it is not yet and an attitude tells where up is.
+
+        Args:
+            R_w_m: Rotation ``(3, 3)`` from the map to a world whose z is up; None as long as nothing tells it.
+            centre_map: Point of the map ``(3,)`` that stays where it is published.
+        """
+        if self.upright or R_w_m is None:
+            return self
+        turn, _ = Rotation.align_vectors([[0.0, 0.0, 1.0]], [self.R @ R_w_m[2]])
+        R = turn.as_matrix() @ self.R
+        offset = self.offset + self.scale * ((self.R - R) @ centre_map)
+        return replace(self, R=R, offset=offset, revision=self.revision + 1, upright=True)
 
     def _rescaled(self, scale: float, centre_map: FloatArray) -> "Published":
         offset = self.offset + (self.scale - scale) * (self.R @ centre_map)

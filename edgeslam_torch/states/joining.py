@@ -3,6 +3,8 @@
 import math
 from dataclasses import replace
 
+import numpy as np
+
 from edgeslam_torch.atlas.atlas import Atlas, Join
 from edgeslam_torch.atlas.loops import Closure
 from edgeslam_torch.fusion.published import Published
@@ -44,8 +46,12 @@ class Joining:
         self._piece = piece
         known = self.atlas.known_scale.get(piece)
         system.fusion.remember(known)
-        if known is not None and (system.published.scale != known.value or system.published.offset.any()):
-            system.published = Published(known.value, revision=system.published.revision + 1, guessed=False)
+        if known is None:
+            return
+        old = replace(system.published, upright=True)
+        moved = old.scale != known.value or old.offset.any() or not np.array_equal(old.R, np.eye(3))
+        new = Published(known.value, revision=old.revision + 1, guessed=False, upright=True)
+        system.published = new if moved else old
 
     def _notice_return(self) -> None:
         """When the camera returns to an earlier piece, the one that it left is complete: both are compared again."""

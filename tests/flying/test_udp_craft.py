@@ -1,6 +1,7 @@
 """The threads of a flight over UDP, against an emulator whose true state the eyes tell."""
 
 import threading
+import time
 
 import numpy as np
 import pytest
@@ -28,13 +29,13 @@ class Truth:
     tracked = True
 
     def __init__(self, *unused, **unused_too):
-        pass
+        self.told_by, self.seen_s = set(), []
 
     def heard(self, sample):
-        pass
+        self.told_by.add(threading.current_thread())
 
     def seen(self, *unused):
-        return None
+        self.seen_s.append(time.monotonic())
 
     def sight(self, now_s, view=None):
         d = self.drone
@@ -78,6 +79,14 @@ def flight(monkeypatch):
         finally:
             cockpit.pilot.go_on.set()
             craft.close()
+
+
+def test_eyes_know_the_attitude_before_the_first_picture_and_look_fifteen_times_a_second(flight):
+    _, craft, _ = flight
+    eyes = craft._eyes
+    assert threading.current_thread() in eyes.told_by, "while they were opened: the next message may be late"
+    until(lambda: len(eyes.seen_s) > 6)
+    assert min(np.diff(eyes.seen_s)) > 0.9 / 15.0, "of thirty that are sent"
 
 
 def forward(emulator):

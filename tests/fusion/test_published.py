@@ -74,6 +74,20 @@ def test_a_measured_unit_needs_a_surer_one_to_be_revised():
     assert measured.revised(ScaleEstimate(2.0, 0.19, "telemetry"), np.zeros(3)).revision == 2
 
 
+def test_a_map_is_turned_upright_once_about_the_camera(rng):
+    old = Published(1.5, small_motion(rng, 0, 1.0)[:3, :3], rng.normal(size=3), revision=2)
+    R_w_m, here = small_motion(rng, 0, 1.0)[:3, :3], rng.normal(size=3)
+    new = old.turned_upright(R_w_m, here)
+    assert (new.revision, new.scale, new.upright) == (3, 1.5, True)
+    np.testing.assert_allclose(new.points(here), old.points(here), atol=1e-12)
+    up_m = R_w_m.T @ [0.0, 0.0, 1.0]
+    np.testing.assert_allclose(new.R @ up_m, [0.0, 0.0, 1.0], atol=1e-12)
+    turn = new.R @ old.R.T
+    assert np.arccos((np.trace(turn) - 1.0) / 2.0) == pytest.approx(np.arccos((old.R @ up_m)[2])), "by no more than that"
+    assert new.turned_upright(small_motion(rng, 0, 1.0)[:3, :3], here) is new
+    assert old.turned_upright(None, here) is old
+
+
 def test_contradiction_is_counted_in_sigmas_of_the_logarithm():
     published = Published(1.0)
     for factor in (1.1, 1 / 1.1):

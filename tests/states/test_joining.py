@@ -164,6 +164,21 @@ def test_the_metres_of_an_earlier_flight_hold_in_its_map_and_nowhere_else(rng):
     assert system.fusion.remembered == [None, known]
 
 
+@pytest.mark.parametrize("turned", [False, True])
+def test_the_axes_of_an_earlier_flight_hold_in_its_map(rng, turned):
+    """A world that this flight turned upright by its own attitude is not that of the earlier one."""
+    T_k_w, motion = moving(rng)
+    system = system_of(Pieces(T_k_w), motion)
+    R_w_m = se3.exp(np.array([0.0, 0.0, 0.0, 0.2, 0.0, 0.0]))[:3, :3]
+    system.published = Published(1.0).turned_upright(R_w_m if turned else None, np.zeros(3))
+    atlas = system.map.atlas(moved=1)
+    atlas.known_scale[0] = ScaleEstimate(1.0, 0.02, "depth")
+    Joining(system, atlas).enter(0)
+    np.testing.assert_array_equal(system.published.R, np.eye(3))
+    assert system.published.revision == 2 * int(turned)
+    assert system.published.turned_upright(R_w_m, np.zeros(3)) is system.published
+
+
 def test_pieces_are_compared_again_when_the_camera_returns_from_one_to_an_earlier_one(rng):
     """The one that it left is complete; one that it has just begun is not."""
     T_k_w, motion = moving(rng)

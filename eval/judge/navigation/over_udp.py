@@ -21,6 +21,8 @@ from edgeslam_torch.geometry.mount import TELLO_TILT_RAD
 from edgeslam_torch.synthetic.sites.build import named_site
 
 _SIZE = (480, 360)
+_RATE_HZ = 15
+"""Pictures a second: half of a Tello's 30, which are drawn on the machine that has to fly by them. 15 are looked at."""
 _REACHED_M = 0.5
 """As in the flights in lockstep."""
 
@@ -50,7 +52,7 @@ def emulate(world: str, seed: int, ports: tuple[int, int], pipe: Connection) -> 
         return away
 
     drone.clearance = noted
-    with TelloEmulator(EmulatorConfig("127.0.0.1", 0, *ports, seed=seed), paint, drone) as emulator:
+    with TelloEmulator(EmulatorConfig("127.0.0.1", 0, *ports, rate_hz=_RATE_HZ, seed=seed), paint, drone) as emulator:
         pipe.send(emulator.command_port)
         pipe.recv()
         away = float(np.linalg.norm(drone.p_w[:2] - site.goal_w[:2]))
