@@ -4,7 +4,7 @@ import logging
 import math
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -98,6 +98,8 @@ class Cockpit:
             touch, self._touch = self._touch, None
             if task is not None:
                 self._take_up(task)
+            if self.last is not None and not self.last.follows:
+                sight = replace(sight, hindered=True)
         if task is not None:
             self._witness(NewTask(task))
         if sight.moved is not None:

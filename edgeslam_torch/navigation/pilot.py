@@ -53,7 +53,10 @@ _PATIENCE_S = 1.0
 _LEVEL_S = 40.0
 """Time after which a look around is given up: it takes 12 s, and metres are waited for up to 20 s more."""
 _LOST_S = 15.0
-"""Time without progress after which the task is given up."""
+"""Time without progress, two looks left and right, after which what is known of this place is forgotten and looked at
+anew; the next time, the task is given up."""
+_DITHERS_S = 5.0
+"""Time without progress after which small movements to and fro have shown all that they can: it rises for another view."""
 _ELSEWHERE_M = 0.5
 """Way that counts as progress: what is to go may grow when a way turns out to be closed."""
 _NARROW_AHEAD_M = 2.0
@@ -94,7 +97,8 @@ class Pilot:
     """Cells ``(G, 2)`` that it leads to."""
     _planned_s: float = -math.inf
     _progress_s: float = math.nan
-    """When the cost to go was last less than ever."""
+    """When the cost to go was last less than ever, as if it had flown ever since: looks and what hinders it count not."""
+    _updated_s: float = math.nan
     _least: float = math.inf
     _progress_w: FloatArray = field(default_factory=lambda: np.zeros(2))
     """``(2,)`` where it was then."""
@@ -111,11 +115,13 @@ class Pilot:
     """Whether gaps that are too narrow are worth a look: until one was in vain."""
     _looked_w: FloatArray | None = None
     """``(2,)`` where a look showed no way last."""
+    _forgot_w: FloatArray | None = None
+    """``(2,)`` where it forgot what it knew last."""
 
     def begin(self, task: Task) -> None:
         """Fly something else from now on."""
         self.task, self.phase = task, Phase.FLYING
-        self._plan, self._planned_s, self._tries_narrow = None, -math.inf, True
+        self._plan, self._planned_s, self._tries_narrow, self._forgot_w = None, -math.inf, True, None
         self._progress_s, self._least, self._waiting_s = math.nan, math.inf, math.nan
 
     def walls(self) -> Walls:
@@ -139,7 +145,11 @@ class Pilot:
         if sight.revision != self._revision and sight.moved is None and sight.stamp_s - self._revised_s < _MOVES_S:
             return Wish(why="its metres were revised: wait for a view in the new ones")
         self._take_in(sight)
-        if self.phase in (Phase.RISING, Phase.SWEEPING, Phase.SINKING):
+        looks = self.phase in (Phase.RISING, Phase.SWEEPING, Phase.SINKING)
+        if sight.hindered or looks:  # that is no lack of progress
+            self._progress_s += sight.stamp_s - self._updated_s
+        self._updated_s = sight.stamp_s
+        if looks:
             return self._level(sight)
         self._level_s = math.nan
         if self.phase in (Phase.DONE, Phase.STUCK):
@@ -156,7 +166,7 @@ class Pilot:
             self._forget()
         self._revision, self._revised_s = sight.revision, sight.stamp_s
         if math.isnan(self._progress_s):
-            self._progress_s = sight.stamp_s
+            self._progress_s = self._updated_s = sight.stamp_s
             if self.phase is Phase.RISING:
                 for z in np.arange(0.1, self.limits.height_m + _LOOK_M, 0.2):
                     self.space.flown(np.array([*sight.p_w[:2], z]), TAKE_OFF_M)
@@ -174,9 +184,11 @@ class Pilot:
         self.task.carry(moved)
         if self._looked_w is not None:
             self._looked_w = moved.points(self._looked_w[None])[0]
+        if self._forgot_w is not None:
+            self._forgot_w = moved.points(self._forgot_w[None])[0]
         self._plan, self._least = None, math.inf
         if not math.isnan(self._progress_s):
-            self._progress_s = now_s
+            self._progress_s = self._updated_s = now_s
 
     def _forget(self) -> None:
         """Begin anew: nothing says how what is known relates to the new metres."""
@@ -242,9 +254,10 @@ class Pilot:
         if now < self._least - 0.1 or float(np.linalg.norm(here - self._progress_w)) > _ELSEWHERE_M:
             self._least, self._progress_s = min(now, self._least), sight.stamp_s
             self._progress_w = here.copy()
-        elif sight.stamp_s - self._progress_s > _LOST_S:
-            self.phase = Phase.STUCK
-            return HOVER
+        elif (stands_s := sight.stamp_s - self._progress_s) > _LOST_S:
+            return self._start_over(sight)
+        elif stands_s > _DITHERS_S and math.isfinite(now) and self._may_rise(sight):
+            return self._rise(sight)
         if not math.isfinite(now):
             return Wish(turn_left_rad_s=self._search(sight), why="no way is known: look around")
         self.way_w = plan.way(here, 3.0)
@@ -322,7 +335,7 @@ class Pilot:
 
     def _may_squeeze(self, here: FloatArray) -> bool:
         """Whether a look from about here showed no way."""
-        return self._looked_w is not None and float(np.linalg.norm(here - self._looked_w)) < _ELSEWHERE_M
+        return _about(self._looked_w, here)
 
     def _squeezes(self, arcs: Arcs, sight: Sight) -> np.ndarray:
         """``(C,)`` slow movements that keep their clearance from every solid and only a hull's from the unseen.
@@ -350,6 +363,28 @@ class Pilot:
         score[unseen | turning] = np.inf
         return score
 
+    def _may_rise(self, sight: Sight) -> bool:
+        """Whether there is a view to come from higher that it has not seen yet."""
+        return sight.tracked and not _about(self._looked_w, sight.p_w[:2])
+
+    def _rise(self, sight: Sight) -> Wish:
+        """See the way from higher."""
+        self.phase, self._waiting_s = Phase.RISING, math.nan
+        self._looked_w = sight.p_w[:2].copy()
+        self._tries_narrow &= not self._is_narrow(sight)
+        return HOVER
+
+    def _start_over(self, sight: Sight) -> Wish:
+        """Forget what closes the way and look around anew, once about a place: it may be the trace of a wrong depth or
+        of a pose that has been put right since. What is unseen is not flown into, so nothing is risked."""
+        if _about(self._forgot_w, sight.p_w[:2]) or not sight.tracked:
+            self.phase = Phase.STUCK
+            return HOVER
+        self.space = self.space.unseen(sight.p_w)
+        self._plan, self._least, self._progress_s = None, math.inf, sight.stamp_s
+        self._forgot_w, wish, self._tries_narrow = sight.p_w[:2].copy(), self._rise(sight), True
+        return wish
+
     def _look(self, sight: Sight, error: float, turn: float) -> Wish:
         """Turn to where the way goes; if that shows nothing, see it from higher."""
         if abs(error) > math.radians(8.0):
@@ -357,8 +392,11 @@ class Pilot:
             return Wish(turn_left_rad_s=turn, why="look along the way")
         if math.isnan(self._waiting_s):
             self._waiting_s = sight.stamp_s
-        elif sight.stamp_s - self._waiting_s > _PATIENCE_S and sight.tracked:  # else there is no view to come
-            self.phase, self._waiting_s = Phase.RISING, math.nan
-            self._looked_w = sight.p_w[:2].copy()
-            self._tries_narrow &= not self._is_narrow(sight)
+        elif sight.stamp_s - self._waiting_s > _PATIENCE_S and self._may_rise(sight):
+            return self._rise(sight)
         return Wish(turn_left_rad_s=turn, why="wait for a view of the way")
+
+
+def _about(place_w: FloatArray | None, here: FloatArray) -> bool:
+    """Whether a place ``(2,)`` of earlier is this one."""
+    return place_w is not None and float(np.linalg.norm(here - place_w)) < _ELSEWHERE_M

@@ -56,6 +56,8 @@ class Sight:
     """How often the unit of the positions was revised; after a change, earlier ones mean something else."""
     moved: Moved | None = None
     """How the map moved since the last sight with a view; None where it did not."""
+    hindered: bool = False
+    """Whether the last wish was not followed: the supervisor or a hand had something else in mind."""
 
     @property
     def blind_s(self) -> float:

@@ -124,6 +124,12 @@ class Space:
             self._flown[k] = p_w, self._flown[k][1]
             self._clear(*self._flown[k])
 
+    def unseen(self, p_w: FloatArray) -> "Space":
+        """The same around a drone ``(3,)`` with nothing seen yet; what held the drone is no matter of sight."""
+        new = Space(np.asarray(p_w[:2], dtype=np.float64), self.floor_m)
+        new._touched = self._touched
+        return new
+
     def layer(self, height_m: float, half_m: float) -> Layer:
         """What a drone at a height can fly through, if everything within ``half_m`` above and below must be free."""
         low = int(np.floor((height_m - half_m - self.floor_m) / CELL_M + 1e-6))

@@ -64,6 +64,7 @@ class Danger(StrEnum):
 
 
 _UNSURE = (Danger.SCALE, Danger.NOT_METRIC)
+_FOLLOWED = (Danger.NONE, Danger.CARRIED, Danger.BATTERY_HOME)
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +78,11 @@ class Order:
     danger: Danger = Danger.NONE
     touch: Touch | None = None
     """What the pilot should know of since it was just felt."""
+
+    @property
+    def follows(self) -> bool:
+        """Whether the pilot's wish is passed on."""
+        return self.danger in _FOLLOWED
 
 
 @dataclass(slots=True)
@@ -96,6 +102,8 @@ class Supervisor:
     _grave_s: float = math.nan
     """Since when in other trouble than doubtful metres."""
     _pushing_s: float = math.nan
+    _backing_s: float = math.nan
+    """Since when it backs up and does not move."""
     _apart_s: float = math.nan
     """Since when the heights of map and drone are apart."""
     _told: bool = True
@@ -159,8 +167,23 @@ class Supervisor:
             self.landing = True
             return Order(Wish(why=str(danger)), land=True, danger=danger)
         felt = danger is Danger.HELD and trouble_s == 0.0
-        touch = Touch(self._sight.p_w.copy(), self._pushed_w()) if felt else None
-        return Order(self._meanwhile(danger, trouble_s), home=home, danger=danger, touch=touch)
+        touch = Touch(self._sight.p_w.copy(), self._pushed_w(self._wish)) if felt else None
+        wish = self._meanwhile(danger, trouble_s)
+        if self._backs_in_vain(wish, now_s):
+            self._trail.clear()
+            wish, touch = Wish(why=f"{danger}: hover"), Touch(self._sight.p_w.copy(), self._pushed_w(wish))
+        return Order(wish, home=home, danger=danger, touch=touch)
+
+    def _backs_in_vain(self, wish: Wish, now_s: float) -> bool:
+        """Whether something holds it on its way back, which the map has in another place."""
+        assert self._sight is not None
+        pushes = math.hypot(wish.forward_m_s, wish.left_m_s) > _PUSHED_M_S
+        if not pushes or float(np.linalg.norm(self._sight.velocity_w[:2])) > _STANDS_M_S:
+            self._backing_s = math.nan
+            return False
+        if math.isnan(self._backing_s):
+            self._backing_s = now_s
+        return now_s - self._backing_s > _PUSH_S
 
     def _trouble_s(self, danger: Danger, now_s: float) -> float:
         """How long it has been in trouble of this gravity: waiting for metres uses up no patience with the rest."""
@@ -212,11 +235,11 @@ class Supervisor:
             self._pushing_s = now_s
         return now_s - self._pushing_s > _PUSH_S
 
-    def _pushed_w(self) -> FloatArray:
-        """Direction ``(2,)`` of the pilot's wish in the world."""
-        assert self._sight is not None and self._wish is not None
+    def _pushed_w(self, wish: Wish | None) -> FloatArray:
+        """Direction ``(2,)`` of a wish in the world."""
+        assert self._sight is not None and wish is not None
         c, s = math.cos(self._sight.yaw_rad), math.sin(self._sight.yaw_rad)
-        forward, left = self._wish.forward_m_s, self._wish.left_m_s
+        forward, left = wish.forward_m_s, wish.left_m_s
         return np.array([c * forward - s * left, s * forward + c * left]) / math.hypot(forward, left)
 
     def _is_apart(self, sight: Sight, now_s: float) -> bool:
@@ -237,7 +260,7 @@ class Supervisor:
             return False
         if math.hypot(self._wish.forward_m_s, self._wish.left_m_s) == 0.0:
             return False
-        return float(away @ self._pushed_w()) > 0
+        return float(away @ self._pushed_w(self._wish)) > 0
 
     def _within_heights(self, wish: Wish) -> Wish:
         assert self._sight is not None

@@ -69,6 +69,18 @@ def test_a_hand_on_the_keyboard_holds_it_and_lets_go(cockpit):
     assert cockpit.order(sight(0.15)).wish == AHEAD
 
 
+def test_a_pilot_knows_that_its_wish_was_not_followed(cockpit):
+    told = []
+    cockpit.pilot.update = lambda sight: told.append(sight.hindered) or AHEAD
+    for held in (False, True, False):
+        cockpit.hold(held)
+        cockpit.plan(sight(0.0))
+        cockpit.order(sight(0.1))
+    cockpit.plan(sight(0.2, hindered=False))
+    cockpit.plan(sight(0.2, hindered=True))  # as a record of a flight has it
+    assert told == [False, False, True, False, True]
+
+
 def test_an_empty_battery_lands_whoever_holds_it(cockpit):
     cockpit.hold(True)
     assert cockpit.order(sight(0.1, battery=0.05)).land

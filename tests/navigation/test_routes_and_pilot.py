@@ -13,7 +13,7 @@ from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.limits import NavLimits
 from edgeslam_torch.navigation.pilot import Phase, Pilot
 from edgeslam_torch.navigation.route import cost_to_go
-from edgeslam_torch.navigation.sight import Sight, Wish
+from edgeslam_torch.navigation.sight import Sight, Touch, Wish
 from edgeslam_torch.navigation.tasks import GoTo
 
 
@@ -84,10 +84,10 @@ def test_after_a_look_in_vain_it_looks_for_another_way_than_a_narrow_one():
     pilot.update(at(0.3, 0.05))
     assert math.isfinite(pilot._plan.at(np.array([0.3, 0.05])))
     after_looking(pilot)
-    pilot.update(replace(at(0.3, 0.05), stamp_s=30.0))
+    pilot.update(replace(at(0.3, 0.05), stamp_s=8.0))
     assert not math.isfinite(pilot._plan.at(np.array([0.3, 0.05])))
     pilot.begin(pilot.task)
-    pilot.update(replace(at(0.3, 0.05), stamp_s=31.0))
+    pilot.update(replace(at(0.3, 0.05), stamp_s=9.0))
     assert math.isfinite(pilot._plan.at(np.array([0.3, 0.05])))
 
 
@@ -199,7 +199,7 @@ def test_a_sweep_leaves_out_the_side_where_the_pose_is_lost():
 def test_its_speed_averages_out_what_telemetry_cuts_off():
     """Readings of whole decimetres a second, with half a step added, are right in the mean along a free way."""
     pilot, speeds = before_a_free_way(), []
-    for k in range(15 * 8):
+    for k in range(15 * 4):
         wish = pilot.update(at(0.0, 0.0, speed_m_s=0.45, stamp_s=k / 15))
         speeds.append(wish.forward_m_s)
     way, read = sum(speeds), sum(math.floor(10.0 * v) / 10.0 + 0.05 for v in speeds)
@@ -257,6 +257,59 @@ def after_looking(pilot):
 def test_after_a_look_in_vain_it_passes_the_unseen_slowly_at_a_hulls_distance():
     wish = after_looking(before_a_strip())
     assert 0.1 < wish.forward_m_s <= 0.31
+
+
+def closed(pilot):
+    """A wall across the way, from end to end of what it knows."""
+    y = np.arange(-7.95, 8.0, 0.1)
+    pilot.space.points(np.array([[1.0, across, z] for across in y for z in (1.05, 1.15, 1.25)]))
+
+
+def stays(pilot, seconds, begin_s=0.0, **fields):
+    """Phases of a pilot whose drone does not move, and whose looks show nothing."""
+    phases = []
+    for k in range(round(15 * seconds)):
+        pilot.update(at(0.0, 0.0, stamp_s=begin_s + k / 15, **fields))
+        phases.append(pilot.phase)
+        if pilot.phase is Phase.RISING:
+            pilot.phase = Phase.FLYING
+    return phases
+
+
+def test_small_movements_to_and_fro_are_ended_by_a_look_from_higher_once():
+    """The way is free, the drone wants to go, and does not come forward: wind, or a map that says otherwise each time."""
+    phases = stays(before_a_free_way(), 14.0)
+    assert phases.count(Phase.RISING) == 1
+    assert phases.index(Phase.RISING) / 15 == pytest.approx(5.0, abs=0.2)
+
+
+def test_what_closes_the_way_is_forgotten_once_before_the_task_is_given_up():
+    pilot = before_a_free_way()
+    closed(pilot)
+    pilot.touched(Touch(np.array([0.0, 3.0, 1.15]), np.array([0.0, 1.0])))
+    phases = stays(pilot, 14.5)
+    assert set(phases) == {Phase.FLYING} and pilot.space.layer(1.15, 0.15).solid.any()
+    phases = stays(pilot, 1.0, 14.5)
+    layer = pilot.space.layer(1.15, 0.15)
+    assert phases.count(Phase.RISING) == 1
+    assert layer.from_solid_at(np.array([[1.0, 0.0]]))[0] > 2.0, "the wall is gone"
+    assert layer.from_solid_at(np.array([[0.0, 3.1]]))[0] < 0.2, "what held the drone is not"
+    assert stays(pilot, 20.0, 15.5)[-1] is Phase.STUCK
+    assert Phase.RISING not in stays(pilot, 1.0, 36.0)
+
+
+def test_a_lost_pose_forgets_nothing():
+    pilot = before_a_free_way()
+    closed(pilot)
+    assert stays(pilot, 16.0, tracked=False)[-1] is Phase.STUCK
+    assert pilot.space.layer(1.15, 0.15).solid.any()
+
+
+def test_time_in_which_its_wishes_are_not_followed_is_no_lack_of_progress():
+    pilot = before_a_free_way()
+    closed(pilot)
+    assert set(stays(pilot, 30.0, hindered=True)) == {Phase.FLYING}
+    assert Phase.RISING in stays(pilot, 16.0, 30.0)
 
 
 def test_it_does_not_rise_for_a_view_that_a_lost_pose_cannot_give():

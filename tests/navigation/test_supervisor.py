@@ -12,6 +12,8 @@ from edgeslam_torch.navigation.sight import Sight, Wish
 from edgeslam_torch.navigation.supervisor import LAND_S, UNSURE_LAND_S, Danger, Supervisor
 
 AHEAD = Wish(forward_m_s=0.5, why="ahead")
+BACK = np.array([-0.2, 0.0, 0.0])
+"""As it moves while it backs up."""
 
 
 def sight(now_s, x=0.0, **fields):
@@ -112,7 +114,7 @@ def test_it_backs_up_although_it_has_drifted_beside_its_way():
     """By more than the steps in which the way is kept, half a metre back: onto it, and not forward to its end."""
     supervisor = Supervisor()
     flown(supervisor, 3.0)
-    aside = {"p_w": np.array([0.975, 0.2, 1.1]), "velocity_w": np.zeros(3), "tracked": False, "position_sigma_m": 0.2}
+    aside = {"p_w": np.array([0.975, 0.2, 1.1]), "velocity_w": BACK, "tracked": False, "position_sigma_m": 0.2}
     lost = flown(supervisor, 4.0, lambda s: replace(s, **aside), begin_s=3.0)
     assert lost[-1].wish.why.endswith("back the way it came") and lost[-1].wish.left_m_s < 0.0
     assert lost[-1].wish.forward_m_s < 1e-6
@@ -266,13 +268,26 @@ def test_neither_height_may_be_beyond_the_limits():
     assert all(o.wish.up_m_s == -0.3 for o in sinking)
 
 
+def test_a_way_back_that_something_stands_in_is_given_up_and_told():
+    """It backs up by .25 m/s for a second and a half, and its own velocities say that it stands."""
+    supervisor = Supervisor()
+    flown(supervisor, 3.0)
+    here = {"p_w": np.array([1.5, 0.0, 1.1]), "velocity_w": np.array([0.02, 0.0, 0.0]), "tracked": False}
+    lost = flown(supervisor, 9.0, lambda s: replace(s, **here, position_sigma_m=0.2), begin_s=3.0, wish=Wish())
+    backing = [o.wish.why.endswith("back the way it came") for o in lost]
+    assert sum(backing) / 20 == pytest.approx(1.55, abs=0.1)
+    (touch,) = [o.touch for o in lost if o.touch is not None]
+    np.testing.assert_allclose(touch.towards_w, [-1.0, 0.0], atol=0.2)
+    assert not any(o.land for o in lost)
+
+
 def test_metres_that_change_while_it_is_carried_are_no_way_flown():
     """Carried by half a metre, which become a whole one: it backs up by 2 m, in 8 s, not by 3.5."""
     supervisor = Supervisor()
     flown(supervisor, 2.0)
     flown(supervisor, 1.0, lambda s: replace(s, tracked=False, position_sigma_m=0.1), begin_s=2.0, x=1.0)
     supervisor.carry(Moved(np.eye(4)[None], np.eye(4)[None], 2.0))
-    there = {"p_w": np.array([2.95, 0.0, 2.2]), "velocity_w": np.zeros(3), "tracked": False, "position_sigma_m": 0.2}
+    there = {"p_w": np.array([2.95, 0.0, 2.2]), "velocity_w": BACK, "tracked": False, "position_sigma_m": 0.2}
     lost = flown(supervisor, 11.0, lambda s: replace(s, **there), wish=Wish(), begin_s=3.0)
     backing = [o.wish.why.endswith("back the way it came") for o in lost]
     assert sum(backing) / 20 == pytest.approx(8.0, abs=0.3)
