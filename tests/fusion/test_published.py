@@ -83,7 +83,9 @@ def test_a_map_is_turned_upright_once_about_the_camera(rng):
     up_m = R_w_m.T @ [0.0, 0.0, 1.0]
     np.testing.assert_allclose(new.R @ up_m, [0.0, 0.0, 1.0], atol=1e-12)
     turn = new.R @ old.R.T
-    assert np.arccos((np.trace(turn) - 1.0) / 2.0) == pytest.approx(np.arccos((old.R @ up_m)[2])), "by no more than that"
+    assert np.arccos((np.trace(turn) - 1.0) / 2.0) == pytest.approx(np.arccos((old.R @ up_m)[2])), (
+        "by no more than that"
+    )
     assert new.turned_upright(small_motion(rng, 0, 1.0)[:3, :3], here) is new
     assert old.turned_upright(None, here) is old
 
