@@ -53,10 +53,10 @@ _PATIENCE_S = 1.0
 _LEVEL_S = 40.0
 """Time after which a look around is given up: it takes 12 s, and metres are waited for up to 20 s more."""
 _LOST_S = 15.0
-"""Time without progress, two looks left and right, after which what is known of this place is forgotten and looked at
-anew; the next time, the task is given up."""
+"""Time without progress, two looks left and right, after which what closes the way is doubted and looked at anew; the
+next time, the task is given up."""
 _DITHERS_S = 5.0
-"""Time without progress after which small movements to and fro have shown all that they can: it rises for another view."""
+"""Time without progress after which movements to and fro have shown all that they can: it rises for another view."""
 _ELSEWHERE_M = 0.5
 """Way that counts as progress: what is to go may grow when a way turns out to be closed."""
 _NARROW_AHEAD_M = 2.0
@@ -97,7 +97,7 @@ class Pilot:
     """Cells ``(G, 2)`` that it leads to."""
     _planned_s: float = -math.inf
     _progress_s: float = math.nan
-    """When the cost to go was last less than ever, as if it had flown ever since: looks and what hinders it count not."""
+    """When the cost to go was last less than ever; time of looks, and in which it was hindered, is left out."""
     _updated_s: float = math.nan
     _least: float = math.inf
     _progress_w: FloatArray = field(default_factory=lambda: np.zeros(2))
@@ -115,13 +115,13 @@ class Pilot:
     """Whether gaps that are too narrow are worth a look: until one was in vain."""
     _looked_w: FloatArray | None = None
     """``(2,)`` where a look showed no way last."""
-    _forgot_w: FloatArray | None = None
-    """``(2,)`` where it forgot what it knew last."""
+    _doubted_w: FloatArray | None = None
+    """``(2,)`` where it doubted what closed its way last."""
 
     def begin(self, task: Task) -> None:
         """Fly something else from now on."""
         self.task, self.phase = task, Phase.FLYING
-        self._plan, self._planned_s, self._tries_narrow, self._forgot_w = None, -math.inf, True, None
+        self._plan, self._planned_s, self._tries_narrow, self._doubted_w = None, -math.inf, True, None
         self._progress_s, self._least, self._waiting_s = math.nan, math.inf, math.nan
 
     def walls(self) -> Walls:
@@ -184,8 +184,8 @@ class Pilot:
         self.task.carry(moved)
         if self._looked_w is not None:
             self._looked_w = moved.points(self._looked_w[None])[0]
-        if self._forgot_w is not None:
-            self._forgot_w = moved.points(self._forgot_w[None])[0]
+        if self._doubted_w is not None:
+            self._doubted_w = moved.points(self._doubted_w[None])[0]
         self._plan, self._least = None, math.inf
         if not math.isnan(self._progress_s):
             self._progress_s = self._updated_s = now_s
@@ -375,14 +375,14 @@ class Pilot:
         return HOVER
 
     def _start_over(self, sight: Sight) -> Wish:
-        """Forget what closes the way and look around anew, once about a place: it may be the trace of a wrong depth or
+        """Doubt what closes the way and look around anew, once about a place: it may be the trace of a wrong depth or
         of a pose that has been put right since. What is unseen is not flown into, so nothing is risked."""
-        if _about(self._forgot_w, sight.p_w[:2]) or not sight.tracked:
+        if _about(self._doubted_w, sight.p_w[:2]) or not sight.tracked:
             self.phase = Phase.STUCK
             return HOVER
-        self.space = self.space.unseen(sight.p_w)
+        self.space.doubt_solids()
         self._plan, self._least, self._progress_s = None, math.inf, sight.stamp_s
-        self._forgot_w, wish, self._tries_narrow = sight.p_w[:2].copy(), self._rise(sight), True
+        self._doubted_w, wish, self._tries_narrow = sight.p_w[:2].copy(), self._rise(sight), True
         return wish
 
     def _look(self, sight: Sight, error: float, turn: float) -> Wish:

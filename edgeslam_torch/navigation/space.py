@@ -65,6 +65,8 @@ class Space:
     _corner: np.ndarray = field(init=False)
     """``(2,)`` int, cell of the world at its corner."""
     _views: deque[View] = field(init=False)
+    _doubted: int = field(init=False)
+    """How many of them, the earliest, only carve since their solids were doubted."""
     _flown: deque[tuple[FloatArray, float]] = field(init=False)
     _touched: FloatArray = field(init=False)
     """``(N, 3)`` where the drone was held by what it does not see."""
@@ -74,6 +76,7 @@ class Space:
         self._corner = np.floor(self.centre_w / CELL_M).astype(int) - SIDE // 2
         self._views = deque(maxlen=KEPT)
         self._flown = deque(maxlen=4000)
+        self._doubted = 0
         self._touched = np.zeros((0, 3))
 
     def observe(self, view: View) -> None:
@@ -81,7 +84,9 @@ class Space:
         small = _smaller(view)
         if len(self._views) >= _ALIKE and _alike(self._views[-_ALIKE], small):
             self._views[-1] = small
+            self._doubted = min(self._doubted, len(self._views) - 1)
         else:
+            self._doubted -= int(len(self._views) == KEPT and self._doubted > 0)
             self._views.append(small)
         self._add(small)
 
@@ -117,18 +122,18 @@ class Space:
             poses = moved.poses(np.array([view.T_w_c for view in self._views]))
             for k, (view, T_w_c) in enumerate(zip(self._views, poses, strict=True)):
                 self._views[k] = replace(view, T_w_c=T_w_c, depth_m=moved.ratio * view.depth_m)
-                self._add(self._views[k])
+                self._add(self._views[k], fills=k >= self._doubted)
         self._touched = moved.points(self._touched)
         flown = moved.points(np.array([p_w for p_w, _ in self._flown]).reshape(-1, 3))
         for k, p_w in enumerate(flown):
             self._flown[k] = p_w, self._flown[k][1]
             self._clear(*self._flown[k])
 
-    def unseen(self, p_w: FloatArray) -> "Space":
-        """The same around a drone ``(3,)`` with nothing seen yet; what held the drone is no matter of sight."""
-        new = Space(np.asarray(p_w[:2], dtype=np.float64), self.floor_m)
-        new._touched = self._touched
-        return new
+    def doubt_solids(self) -> None:
+        """What was seen to be solid is as good as unseen until it is seen again; what is free stays free, and where
+        something held the drone there is something."""
+        self._odds[self._odds > 0.0] = 0.0
+        self._doubted = len(self._views)
 
     def layer(self, height_m: float, half_m: float) -> Layer:
         """What a drone at a height can fly through, if everything within ``half_m`` above and below must be free."""
@@ -150,10 +155,11 @@ class Space:
             raise ValueError(f"heights {low_m:.2f} to {high_m:.2f} m are outside the grid of {LEVELS * CELL_M:.1f} m")
         return np.asarray((self._odds[:, :, low:high] > SOLID).mean(2) >= share)
 
-    def _add(self, view: View) -> None:
+    def _add(self, view: View, fills: bool = True) -> None:
         depth = np.where(np.isfinite(view.depth_m) & (view.depth_m > 0), view.depth_m, 0.0).astype(np.float32)
         self._carve(view, depth)
-        self._fill(view, depth)
+        if fills:
+            self._fill(view, depth)
 
     def _carve(self, view: View, depth: FloatArray) -> None:
         """Free the cells that lie wholly before everything that their pixels show."""

@@ -277,13 +277,13 @@ def stays(pilot, seconds, begin_s=0.0, **fields):
 
 
 def test_small_movements_to_and_fro_are_ended_by_a_look_from_higher_once():
-    """The way is free, the drone wants to go, and does not come forward: wind, or a map that says otherwise each time."""
+    """The way is free, the drone wants to go, and comes no farther: wind, or a map that says otherwise each time."""
     phases = stays(before_a_free_way(), 14.0)
     assert phases.count(Phase.RISING) == 1
     assert phases.index(Phase.RISING) / 15 == pytest.approx(5.0, abs=0.2)
 
 
-def test_what_closes_the_way_is_forgotten_once_before_the_task_is_given_up():
+def test_what_closes_the_way_is_doubted_once_before_the_task_is_given_up():
     pilot = before_a_free_way()
     closed(pilot)
     pilot.touched(Touch(np.array([0.0, 3.0, 1.15]), np.array([0.0, 1.0])))
@@ -294,11 +294,12 @@ def test_what_closes_the_way_is_forgotten_once_before_the_task_is_given_up():
     assert phases.count(Phase.RISING) == 1
     assert layer.from_solid_at(np.array([[1.0, 0.0]]))[0] > 2.0, "the wall is gone"
     assert layer.from_solid_at(np.array([[0.0, 3.1]]))[0] < 0.2, "what held the drone is not"
+    assert layer.free[tuple(layer.cells(np.array([0.5, 0.0])))], "what was free is"
     assert stays(pilot, 20.0, 15.5)[-1] is Phase.STUCK
     assert Phase.RISING not in stays(pilot, 1.0, 36.0)
 
 
-def test_a_lost_pose_forgets_nothing():
+def test_a_lost_pose_doubts_nothing():
     pilot = before_a_free_way()
     closed(pilot)
     assert stays(pilot, 16.0, tracked=False)[-1] is Phase.STUCK

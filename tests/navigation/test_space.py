@@ -139,6 +139,22 @@ def test_what_it_hovers_before_fills_no_memory_and_what_it_passed_is_kept():
     assert cell(layer, 0.75, 0.05) == (True, False) and cell(layer, 1.55, 0.05) == (True, False)
 
 
+def test_a_doubted_wall_is_unseen_until_it_is_seen_again_also_after_the_map_moved():
+    """Before it is free all the while, and nobody frees it."""
+    space, moved = Space(), Moved(facing_a_wall().T_w_c[None], facing_a_wall(x=1.0).T_w_c[None])
+    seen(space)
+    space.doubt_solids()
+    layer = space.layer(1.15, 0.15)
+    assert cell(layer, 1.55, 0.05) == (True, False) and not layer.solid.any() and not cell(layer, 2.05, 0.05)[0]
+    space.rebuild(moved)
+    layer = space.layer(1.15, 0.15)
+    assert cell(layer, 2.55, 0.05) == (True, False) and not layer.solid.any()
+    layer = seen(space, x=1.0)
+    assert cell(layer, 3.05, 0.05)[1] or cell(layer, 2.95, 0.05)[1]
+    space.rebuild(Moved(moved.after_w, moved.after_w))
+    assert space.layer(1.15, 0.15).solid.any(), "what was seen again stays"
+
+
 def test_it_follows_the_drone_and_keeps_what_it_knows():
     space = Space()
     before = cell(seen(space), 1.55, 0.05)
