@@ -97,7 +97,7 @@ class Pilot:
     """Cells ``(G, 2)`` that it leads to."""
     _planned_s: float = -math.inf
     _progress_s: float = math.nan
-    """When the cost to go was last less than ever; time of looks, and in which it was hindered, is left out."""
+    """When the cost to go was last less than ever; time of first looks, and in which it was hindered, is left out."""
     _updated_s: float = math.nan
     _least: float = math.inf
     _progress_w: FloatArray = field(default_factory=lambda: np.zeros(2))
@@ -115,6 +115,8 @@ class Pilot:
     """Whether gaps that are too narrow are worth a look: until one was in vain."""
     _looked_w: FloatArray | None = None
     """``(2,)`` where a look showed no way last."""
+    _looks_again: bool = False
+    """Whether the present look is another one from about the same place, which counts as lack of progress."""
     _doubted_w: FloatArray | None = None
     """``(2,)`` where it doubted what closed its way last."""
 
@@ -146,7 +148,7 @@ class Pilot:
             return Wish(why="its metres were revised: wait for a view in the new ones")
         self._take_in(sight)
         looks = self.phase in (Phase.RISING, Phase.SWEEPING, Phase.SINKING)
-        if sight.hindered or looks:  # that is no lack of progress
+        if sight.hindered or (looks and not self._looks_again):  # that is no lack of progress
             self._progress_s += sight.stamp_s - self._updated_s
         self._updated_s = sight.stamp_s
         if looks:
@@ -256,7 +258,7 @@ class Pilot:
             self._progress_w = here.copy()
         elif (stands_s := sight.stamp_s - self._progress_s) > _LOST_S:
             return self._start_over(sight)
-        elif stands_s > _DITHERS_S and math.isfinite(now) and self._may_rise(sight):
+        elif stands_s > _DITHERS_S and math.isfinite(now) and sight.tracked and not _about(self._looked_w, here):
             return self._rise(sight)
         if not math.isfinite(now):
             return Wish(turn_left_rad_s=self._search(sight), why="no way is known: look around")
@@ -334,8 +336,8 @@ class Pilot:
         return self.limits.speed_m_s - min(_STEP_M_S, 0.5 * self.limits.speed_m_s) * share
 
     def _may_squeeze(self, here: FloatArray) -> bool:
-        """Whether a look from about here showed no way."""
-        return _about(self._looked_w, here)
+        """Whether a look from about here showed no way, and what is unseen is not what it has doubted to be solid."""
+        return _about(self._looked_w, here) and not _about(self._doubted_w, here)
 
     def _squeezes(self, arcs: Arcs, sight: Sight) -> np.ndarray:
         """``(C,)`` slow movements that keep their clearance from every solid and only a hull's from the unseen.
@@ -363,13 +365,10 @@ class Pilot:
         score[unseen | turning] = np.inf
         return score
 
-    def _may_rise(self, sight: Sight) -> bool:
-        """Whether there is a view to come from higher that it has not seen yet."""
-        return sight.tracked and not _about(self._looked_w, sight.p_w[:2])
-
     def _rise(self, sight: Sight) -> Wish:
         """See the way from higher."""
         self.phase, self._waiting_s = Phase.RISING, math.nan
+        self._looks_again = _about(self._looked_w, sight.p_w[:2])
         self._looked_w = sight.p_w[:2].copy()
         self._tries_narrow &= not self._is_narrow(sight)
         return HOVER
@@ -382,7 +381,8 @@ class Pilot:
             return HOVER
         self.space.doubt_solids()
         self._plan, self._least, self._progress_s = None, math.inf, sight.stamp_s
-        self._doubted_w, wish, self._tries_narrow = sight.p_w[:2].copy(), self._rise(sight), True
+        self._doubted_w, self._looked_w = sight.p_w[:2].copy(), None
+        wish, self._tries_narrow = self._rise(sight), True
         return wish
 
     def _look(self, sight: Sight, error: float, turn: float) -> Wish:
@@ -392,7 +392,7 @@ class Pilot:
             return Wish(turn_left_rad_s=turn, why="look along the way")
         if math.isnan(self._waiting_s):
             self._waiting_s = sight.stamp_s
-        elif sight.stamp_s - self._waiting_s > _PATIENCE_S and self._may_rise(sight):
+        elif sight.stamp_s - self._waiting_s > _PATIENCE_S and sight.tracked:  # else there is no view to come
             return self._rise(sight)
         return Wish(turn_left_rad_s=turn, why="wait for a view of the way")
 

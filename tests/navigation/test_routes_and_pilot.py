@@ -299,6 +299,13 @@ def test_what_closes_the_way_is_doubted_once_before_the_task_is_given_up():
     assert Phase.RISING not in stays(pilot, 1.0, 36.0)
 
 
+def test_what_was_solid_is_not_passed_at_a_hulls_distance():
+    pilot = before_a_strip()
+    assert after_looking(pilot).forward_m_s > 0.1
+    pilot._doubted_w = np.array([0.3, 0.05])
+    assert pilot.update(replace(at(0.3, 0.05), stamp_s=9.0)).forward_m_s < 0.01
+
+
 def test_a_lost_pose_doubts_nothing():
     pilot = before_a_free_way()
     closed(pilot)

@@ -16,6 +16,7 @@ from edgeslam_torch.drone.emulator.room import drone_at
 from edgeslam_torch.drone.emulator.server import EmulatorConfig, TelloEmulator
 from edgeslam_torch.drone.udp import open_udp
 from edgeslam_torch.errors import EdgeSlamError
+from edgeslam_torch.eval.judge.navigation.behaviours import REACHED_M
 from edgeslam_torch.flying.navigator import Navigator
 from edgeslam_torch.geometry.mount import TELLO_TILT_RAD
 from edgeslam_torch.synthetic.sites.build import named_site
@@ -23,8 +24,6 @@ from edgeslam_torch.synthetic.sites.build import named_site
 _SIZE = (480, 360)
 _RATE_HZ = 15
 """Pictures a second: half of a Tello's 30, which are drawn on the machine that has to fly by them. 15 are looked at."""
-_REACHED_M = 0.5
-"""As in the flights in lockstep."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +74,7 @@ def fly_one(world: str, seed: int, record: Path | None = None) -> str:
     finally:
         process.terminate()
         process.join()
-    reached = said and found.distance_m < _REACHED_M and not found.contacts
+    reached = said and found.distance_m < REACHED_M and not found.contacts
     return (
         f"| {world} {seed} | {'yes' if reached else 'no'} | {reason} | {found.distance_m:.2f} | {found.contacts} | "
         f"{found.clearance_m:.2f} | {'yes' if found.on_floor else 'no'} |"
