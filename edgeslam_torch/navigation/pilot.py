@@ -257,9 +257,11 @@ class Pilot:
             self._least, self._progress_s = min(now, self._least), sight.stamp_s
             self._progress_w = here.copy()
         elif (stands_s := sight.stamp_s - self._progress_s) > _LOST_S:
-            return self._start_over(sight)
+            self._start_over(sight)
+            return HOVER
         elif stands_s > _DITHERS_S and math.isfinite(now) and sight.tracked and not _about(self._looked_w, here):
-            return self._rise(sight)
+            self._rise(sight)
+            return HOVER
         if not math.isfinite(now):
             return Wish(turn_left_rad_s=self._search(sight), why="no way is known: look around")
         self.way_w = plan.way(here, 3.0)
@@ -365,25 +367,24 @@ class Pilot:
         score[unseen | turning] = np.inf
         return score
 
-    def _rise(self, sight: Sight) -> Wish:
+    def _rise(self, sight: Sight) -> None:
         """See the way from higher."""
         self.phase, self._waiting_s = Phase.RISING, math.nan
         self._looks_again = _about(self._looked_w, sight.p_w[:2])
         self._looked_w = sight.p_w[:2].copy()
         self._tries_narrow &= not self._is_narrow(sight)
-        return HOVER
 
-    def _start_over(self, sight: Sight) -> Wish:
+    def _start_over(self, sight: Sight) -> None:
         """Doubt what closes the way and look around anew, once about a place: it may be the trace of a wrong depth or
         of a pose that has been put right since. What is unseen is not flown into, so nothing is risked."""
         if _about(self._doubted_w, sight.p_w[:2]) or not sight.tracked:
             self.phase = Phase.STUCK
-            return HOVER
+            return
         self.space.doubt_solids()
         self._plan, self._least, self._progress_s = None, math.inf, sight.stamp_s
         self._doubted_w, self._looked_w = sight.p_w[:2].copy(), None
-        wish, self._tries_narrow = self._rise(sight), True
-        return wish
+        self._rise(sight)
+        self._tries_narrow = True
 
     def _look(self, sight: Sight, error: float, turn: float) -> Wish:
         """Turn to where the way goes; if that shows nothing, see it from higher."""
@@ -393,7 +394,7 @@ class Pilot:
         if math.isnan(self._waiting_s):
             self._waiting_s = sight.stamp_s
         elif sight.stamp_s - self._waiting_s > _PATIENCE_S and sight.tracked:  # else there is no view to come
-            return self._rise(sight)
+            self._rise(sight)
         return Wish(turn_left_rad_s=turn, why="wait for a view of the way")
 
 
