@@ -305,6 +305,17 @@ def test_the_world_is_upright_though_the_drone_tells_its_attitude_late(late):
     assert np.linalg.norm(jump) < 0.06, "about the camera: two steps at most"
 
 
+def test_an_attitude_that_comes_in_flight_and_has_proven_nothing_does_not_turn_the_world():
+    """It may be of another moment, or of another flight: the first one that it tells is 20 degrees off."""
+    film_ = panels()
+    slam = EdgeSlam(CAMERA, NO_NETWORK, depth=film_.depth_function())
+    for frame in film_.frames:
+        stamp_s = 0.1 * frame.index  # the flight takes 4 s
+        told = TelemetrySample(stamp_s, velocity_m_s=np.full(3, np.nan), rpy_rad=np.deg2rad([20.0, 0.0, 0.0]))
+        output = slam.step(replace(frame, stamp_s=stamp_s), [told] if stamp_s > 2.8 else [])
+    assert output.T_w_c[2, 0] == pytest.approx(0.0, abs=0.02), "the camera's x axis is level"
+
+
 def test_one_frame_is_a_trajectory_of_one_and_an_empty_map():
     slam, outputs = go(panels().frames[:1])
     assert statuses(outputs) == [FrameStatus.STARTING]

@@ -58,6 +58,8 @@ _SURE = 0.15
 sigmas are a third and not more than a half. A scale that is wrong by several times tears the map by them."""
 _TURNED_S = 5.0
 """Time over which the map and the drone's attitude have turned together: maps drift by a degree in it."""
+_BEGINS_S = 2.0
+"""Time in which a flight's first state message comes, and a picture of then: ten a second, half a second late."""
 _STAMPED_S = 0.05
 """Standard deviation of a message's moment: half of the time from one to the next."""
 _FOCAL_SHARE = 0.4
@@ -92,6 +94,8 @@ class MotionFusion:
         self._trust = Trust()
         self._unrest = Unrest()
         self._R_w_m: FloatArray | None = None
+        self._began_s = math.inf
+        """Stamp of the first pose."""
         self.began_upright = False
         """Whether the map's z axis is up: its first camera was turned so by the drone's attitude."""
         truncates = config.velocity_rounding == "truncate"
@@ -140,6 +144,7 @@ class MotionFusion:
             return
         visual = VisualPose(stamp_s, np.array(T_w_c, dtype=np.float64), sigma_t, sigma_r_rad)
         self._memory.add(visual)
+        self._began_s = min(self._began_s, stamp_s)
         if self._is_due(stamp_s):
             self._remember_refined(stamp_s, self.config.window_s)
             self._refit()
@@ -362,8 +367,15 @@ class MotionFusion:
     def republished(self, published: Published, centre_map: FloatArray) -> Published:
         """What is published, upright and in the unit that is known or guessed now; ``centre_map`` ``(3,)`` stays where
         it is."""
-        published = published.turned_upright(self._R_w_m, centre_map)
+        published = published.turned_upright(self._R_w_m if self._knows_up() else None, centre_map)
         return published.guessed_anew(self._guess, centre_map).revised(self.scale(), centre_map)
+
+    def _knows_up(self) -> bool:
+        """Whether attitude may turn the world: when it has proven to be of this flight, or as the first one may that
+        comes with the first picture: at its beginning."""
+        last = self._memory.last
+        begins = last is not None and last.stamp_s - self._began_s < _BEGINS_S
+        return self._trust.attitude and (self._trust.turns or begins)
 
     def present(self, stamp_s: float, state: str, published: Published) -> Present:
         """What is known after a frame: the motion, and the reliability of its metres.
