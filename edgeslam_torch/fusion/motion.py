@@ -59,7 +59,7 @@ sigmas are a third and not more than a half. A scale that is wrong by several ti
 _TURNED_S = 5.0
 """Time over which the map and the drone's attitude have turned together: maps drift by a degree in it."""
 _BEGINS_S = 1.0
-"""Time in which a flight's first state messages come, ten a second, and the first picture of then, half a second late."""
+"""Time in which a flight's first state messages come, ten a second, and a picture of then, half a second late."""
 _STAMPED_S = 0.05
 """Standard deviation of a message's moment: half of the time from one to the next."""
 _FOCAL_SHARE = 0.4
