@@ -220,6 +220,8 @@ class EdgeSlam:
         with system.timed("fusion"):
             system.fusion.add_telemetry(telemetry)
             system.has_telemetry = system.has_telemetry or len(telemetry) > 0
+        if not self.log.records:
+            system.fusion.began_s = frame.stamp_s
         if not self.log.records and telemetry:  # the first camera turns so that the world's z is up
             system.motion.T_c_w = se3.inverse(first_pose(telemetry[-1].rpy_rad, self._T_b_c))
             upright = bool(np.isfinite(telemetry[-1].rpy_rad).all())

@@ -58,8 +58,8 @@ _SURE = 0.15
 sigmas are a third and not more than a half. A scale that is wrong by several times tears the map by them."""
 _TURNED_S = 5.0
 """Time over which the map and the drone's attitude have turned together: maps drift by a degree in it."""
-_BEGINS_S = 1.0
-"""Time in which a flight's first state messages come, ten a second, and a picture of then, half a second late."""
+_AT_ONCE_S = 0.5
+"""Time from the first frame in which the first attitude comes if it comes at all: five messages."""
 _STAMPED_S = 0.05
 """Standard deviation of a message's moment: half of the time from one to the next."""
 _FOCAL_SHARE = 0.4
@@ -94,8 +94,10 @@ class MotionFusion:
         self._trust = Trust()
         self._unrest = Unrest()
         self._R_w_m: FloatArray | None = None
-        self._began_s = math.inf
-        """Stamp of the first pose."""
+        self.began_s = math.nan
+        """Stamp of the first frame."""
+        self._attitude_s = math.inf
+        """Stamp of the first message with an attitude."""
         self.began_upright = False
         """Whether the map's z axis is up: its first camera was turned so by the drone's attitude."""
         truncates = config.velocity_rounding == "truncate"
@@ -120,6 +122,8 @@ class MotionFusion:
     def add_telemetry(self, samples: Sequence[TelemetrySample]) -> None:
         """State messages in the order of arrival."""
         for sample in self._track.add(samples):
+            if np.isfinite(sample.rpy_rad).all():
+                self._attitude_s = min(self._attitude_s, sample.stamp_s)
             self._filter.add_telemetry(sample, self._fit.shortfall_m_s)
 
     def add_visual(
@@ -144,7 +148,6 @@ class MotionFusion:
             return
         visual = VisualPose(stamp_s, np.array(T_w_c, dtype=np.float64), sigma_t, sigma_r_rad)
         self._memory.add(visual)
-        self._began_s = min(self._began_s, stamp_s)
         if self._is_due(stamp_s):
             self._remember_refined(stamp_s, self.config.window_s)
             self._refit()
@@ -371,11 +374,10 @@ class MotionFusion:
         return published.guessed_anew(self._guess, centre_map).revised(self.scale(), centre_map)
 
     def _knows_up(self) -> bool:
-        """Whether attitude may turn the world: when it has proven to be of this flight, or as the first one may that
-        comes with the first picture: at its beginning."""
-        last = self._memory.last
-        begins = last is not None and last.stamp_s - self._began_s < _BEGINS_S
-        return self._trust.attitude and (self._trust.turns or begins)
+        """Whether attitude may turn the world: when it has proven to be of this flight, or as the one may that comes
+        with the first picture."""
+        at_once = self._attitude_s - self.began_s < _AT_ONCE_S
+        return self._trust.attitude and (self._trust.turns or at_once)
 
     def present(self, stamp_s: float, state: str, published: Published) -> Present:
         """What is known after a frame: the motion, and the reliability of its metres.
