@@ -370,14 +370,15 @@ class MotionFusion:
     def republished(self, published: Published, centre_map: FloatArray) -> Published:
         """What is published, upright and in the unit that is known or guessed now; ``centre_map`` ``(3,)`` stays where
         it is."""
-        published = published.turned_upright(self._R_w_m if self._knows_up() else None, centre_map)
+        if not published.upright and self._knows_up():
+            published = published.turned_upright(self._R_w_m, centre_map)
         return published.guessed_anew(self._guess, centre_map).revised(self.scale(), centre_map)
 
     def _knows_up(self) -> bool:
         """Whether attitude may turn the world: when it has proven to be of this flight, or as the one may that comes
         with the first picture."""
         at_once = self._attitude_s - self.began_s < _AT_ONCE_S
-        return self._trust.attitude and (self._trust.turns or at_once)
+        return self._R_w_m is not None and self._trust.attitude and (self._trust.turns or at_once)
 
     def present(self, stamp_s: float, state: str, published: Published) -> Present:
         """What is known after a frame: the motion, and the reliability of its metres.
