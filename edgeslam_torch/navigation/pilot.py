@@ -99,6 +99,7 @@ class Pilot:
     _progress_s: float = math.nan
     """When the cost to go was last less than ever; time of first looks, and in which it was hindered, is left out."""
     _updated_s: float = math.nan
+    """When it took in the last sight."""
     _least: float = math.inf
     _progress_w: FloatArray = field(default_factory=lambda: np.zeros(2))
     """``(2,)`` where it was then."""
@@ -376,7 +377,8 @@ class Pilot:
 
     def _start_over(self, sight: Sight) -> None:
         """Doubt what closes the way and look around anew, once about a place: it may be the trace of a wrong depth or
-        of a pose that has been put right since. What is unseen is not flown into, so nothing is risked."""
+        of a pose that has been put right since. What is unseen is not flown into; but two views through what was solid
+        free it now, where it took up to ten, so nothing of it is passed at a hull's distance."""
         if _about(self._doubted_w, sight.p_w[:2]) or not sight.tracked:
             self.phase = Phase.STUCK
             return

@@ -171,7 +171,8 @@ class Supervisor:
         wish = self._meanwhile(danger, trouble_s)
         if self._backs_in_vain(wish, now_s):
             self._trail.clear()
-            wish, touch = Wish(why=f"{danger}: hover"), Touch(self._sight.p_w.copy(), self._pushed_w(wish))
+            touch = Touch(self._sight.p_w.copy(), self._pushed_w(wish))
+            wish = Wish(why=f"{danger}: hover")
         return Order(wish, home=home, danger=danger, touch=touch)
 
     def _backs_in_vain(self, wish: Wish, now_s: float) -> bool:

@@ -48,10 +48,10 @@ class Joining:
         system.fusion.remember(known)
         if known is None:
             return
-        old = replace(system.published, upright=True)
-        moved = old.scale != known.value or old.offset.any() or not np.array_equal(old.R, np.eye(3))
-        new = Published(known.value, revision=old.revision + 1, guessed=False, upright=True)
-        system.published = new if moved else old
+        published = replace(system.published, upright=True)
+        if published.scale != known.value or published.offset.any() or not np.array_equal(published.R, np.eye(3)):
+            published = Published(known.value, revision=published.revision + 1, guessed=False, upright=True)
+        system.published = published
 
     def _notice_return(self) -> None:
         """When the camera returns to an earlier piece, the one that it left is complete: both are compared again."""
