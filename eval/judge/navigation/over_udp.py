@@ -19,7 +19,7 @@ from edgeslam_torch.errors import EdgeSlamError
 from edgeslam_torch.eval.judge.navigation.behaviours import REACHED_M
 from edgeslam_torch.flying.navigator import Navigator
 from edgeslam_torch.geometry.mount import TELLO_TILT_RAD
-from edgeslam_torch.synthetic.sites.build import named_site
+from edgeslam_torch.synthetic.sites.build import SITES, named_site
 
 _SIZE = (480, 360)
 _RATE_HZ = 15
@@ -98,11 +98,15 @@ def _fly(address: str, goal_w: np.ndarray, record: Path | None) -> tuple[bool, s
 def main() -> None:
     """Fly and print a table."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--world", action="append", metavar="NAME", help="default: cluttered_room")
+    parser.add_argument(
+        "--world", action="append", metavar="NAME", choices=sorted(SITES), help="default: cluttered_room"
+    )
     parser.add_argument("--flights", type=int, default=10, help="for each world (default: 10)")
     parser.add_argument("--first-seed", type=int, default=200, help="default: 200")
     parser.add_argument("--record", type=Path, metavar="DIR", help="record the flights into folders in it")
     args = parser.parse_args()
+    if args.flights < 1 or args.first_seed < 0:
+        parser.error("--flights must be at least 1, --first-seed at least 0")
     print("| world, seed | reached | ended | from the goal [m] | contacts | clearance min [m] | on the floor |")
     print("|---|---|---|---|---|---|---|")
     for world in args.world or ["cluttered_room"]:
