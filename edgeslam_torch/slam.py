@@ -281,7 +281,8 @@ class EdgeSlam:
         self._system.fusion.revise(*self.log.poses())
         estimate = self.scale
         if np.isfinite(estimate.sigma):
-            self._system.published = Published(estimate.value, self._system.published.R)
+            held = self._system.published
+            self._system.published = Published(estimate.value, held.R, upright=held.upright)
         self._calibration_warning = calibration_warning(self.camera, self.keyframes())
 
     def trajectory(self) -> tuple[FloatArray, FloatArray]:
@@ -382,6 +383,7 @@ class EdgeSlam:
             apart,
             self._repeats.warning(),
             self._calibration_warning,
+            None if self._system.published.upright else self._system.fusion.leaning(),
         )
         return [warning for warning in warnings if warning is not None] + self._system.fusion.warnings()
 

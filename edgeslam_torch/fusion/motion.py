@@ -370,15 +370,26 @@ class MotionFusion:
     def republished(self, published: Published, centre_map: FloatArray) -> Published:
         """What is published, upright and in the unit that is known or guessed now; ``centre_map`` ``(3,)`` stays where
         it is."""
-        if not published.upright and self._knows_up():
-            published = published.turned_upright(self._R_w_m, centre_map)
+        published = published.turned_upright(self._up_by_attitude(), centre_map)
         return published.guessed_anew(self._guess, centre_map).revised(self.scale(), centre_map)
 
-    def _knows_up(self) -> bool:
-        """Whether attitude may turn the world: when it has proven to be of this flight, or as the one may that comes
-        with the first picture."""
+    def _up_by_attitude(self) -> FloatArray | None:
+        """``R_w_m`` where attitude may turn the world: when it has proven to be of this flight, or as the one may that
+        comes with the first picture."""
+        if self._R_w_m is None or not self._trust.attitude:
+            return None
         at_once = self._attitude_s - self.began_s < _AT_ONCE_S
-        return self._R_w_m is not None and self._trust.attitude and (self._trust.turns or at_once)
+        return self._R_w_m if at_once or self._trust.turns else None
+
+    def leaning(self) -> str | None:
+        """That no attitude was sure enough to tell where up is, in words; None where the drone told none."""
+        if not math.isfinite(self._attitude_s):
+            return None
+        return (
+            "where up is was not known, the world leans as the first camera did: no attitude of the drone that came at "
+            "once or has proven to be of this flight covers a picture with a pose (the first one came "
+            f"{self._attitude_s - self.began_s:.1f} s after the first picture)"
+        )
 
     def present(self, stamp_s: float, state: str, published: Published) -> Present:
         """What is known after a frame: the motion, and the reliability of its metres.
