@@ -31,12 +31,12 @@ def data(tmp_path):
 @pytest.mark.slow
 def test_table_is_printed_written_and_compared(data, tmp_path, capsys):
     out = tmp_path / "out"
-    command = ["judge", str(data), "--jobs", "1", "--change", "depth.weights=none"]
+    command = ["judge", str(data), "--jobs", "1", "--first-seed", "3", "--change", "depth.weights=none"]
     assert cli.main([*command, "--out", str(out)]) == 0
     printed = capsys.readouterr().out
     assert "| stairs |" in printed and "| frames |" in printed
     (row,) = json.loads((out / "judge.json").read_text())["rows"]
-    assert row["cell"] == "stairs" and row["figures"]["frames"] == 30
+    assert (row["cell"], row["seed"]) == ("stairs", 3) and row["figures"]["frames"] == 30
     assert (out / "judge.md").read_text() in printed
     assert cli.main([*command, "--out", str(out), "--against", str(out)]) == 0
     shown = capsys.readouterr()
@@ -50,6 +50,8 @@ def test_table_is_printed_written_and_compared(data, tmp_path, capsys):
         (["--only", "desk*"], "no cell matches; there are: stairs"),
         (["--against", "nowhere"], "cannot be read as a judge's result"),
         (["--bars", "nowhere.toml"], "cannot be read as bars"),
+        (["--first-seed", "-1"], "--jobs and --seeds must be at least 1, --first-seed at least 0"),
+        (["--jobs", "0"], "--jobs and --seeds must be at least 1, --first-seed at least 0"),
     ],
 )
 def test_mistakes_are_one_line(data, tmp_path, capsys, arguments, message):

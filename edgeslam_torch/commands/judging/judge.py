@@ -6,7 +6,7 @@ import os
 import sys
 from pathlib import Path
 
-from edgeslam_torch.errors import OutputError
+from edgeslam_torch.errors import ConfigError, OutputError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -25,6 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="recordings as they are, their variants, simulations, made telemetry, or all (default: base)",
     )
     parser.add_argument("--seeds", type=int, default=1, metavar="N", help="runs of every cell (default: 1)")
+    parser.add_argument("--first-seed", type=int, default=0, metavar="N", help="of those runs (default: 0)")
     parser.add_argument("--jobs", type=int, default=2, metavar="N", help="processes at a time (default: 2)")
     parser.add_argument("--timeout", type=float, default=900.0, metavar="S", help="longest cell [s] (default: 900)")
     parser.add_argument("--max-frames", type=int, metavar="N", help="stop every run after N frames")
@@ -50,8 +51,10 @@ def main(args: argparse.Namespace) -> int:
     data = args.data or (Path(os.environ["EDGESLAM_DATA"]) if os.environ.get("EDGESLAM_DATA") else None)
     bars = read_bars(args.bars or BARS)
     before = read_record(args.against) if args.against is not None else None
-    cells = list_cells(data, args.which, range(max(1, args.seeds)), args.only)
-    settings = JudgeSettings(tuple(args.change), args.max_frames, max(1, args.jobs), args.timeout, args.flights)
+    if args.jobs < 1 or args.seeds < 1 or args.first_seed < 0:
+        raise ConfigError("--jobs and --seeds must be at least 1, --first-seed at least 0")
+    cells = list_cells(data, args.which, range(args.first_seed, args.first_seed + args.seeds), args.only)
+    settings = JudgeSettings(tuple(args.change), args.max_frames, args.jobs, args.timeout, args.flights)
     try:
         record = judge(cells, settings, args.out, _say)
         text = markdown(record, bars)
