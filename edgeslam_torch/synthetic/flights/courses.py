@@ -50,7 +50,9 @@ LOW_LIGHT = CameraFaults(gain=0.2, read_noise=2.5, shot_noise=0.35, vignetting=0
 
 COURSES = {
     "room": Course(),
+    "room_no_telemetry": Course(telemetry=None),
     "corridor": Course(corridor),
+    "corridor_no_telemetry": Course(corridor, telemetry=None),
     "blank_corridor": Course(blank_corridor),
     "block": Course(block, AROUND_BLOCK, seconds=64.0, rate_hz=15.0),
     "block_no_telemetry": Course(block, AROUND_BLOCK, telemetry=None, seconds=64.0, rate_hz=15.0),
