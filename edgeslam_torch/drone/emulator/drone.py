@@ -29,6 +29,8 @@ _LEAN_S = 0.12
 _MAX_LEAN_M_S2 = 4.0
 """Acceleration at the greatest lean, 22 degrees."""
 _TURN_RAD_S = math.radians(90.0)
+_SETTLED_S, _SETTLED_M = 1.0, 0.02
+"""A landing drone that has not come this much lower for so long stands on something, and stops its motors."""
 
 
 class Mode(StrEnum):
@@ -84,6 +86,8 @@ class DroneModel:
     _speed: float = 0.5
     _busy_since: float = -1.0
     _clock: float = 0.0
+    _lowest: tuple[float, float] = (math.inf, 0.0)
+    """Height of the present landing [m], and when it was reached."""
     _clear_m: float = math.inf
     """Distance to the nearest surface at the end of the last step; infinite on the ground."""
 
@@ -115,6 +119,8 @@ class DroneModel:
         """Descend to the floor and stop."""
         if self.flying:
             self.stop()
+            if self.mode is not Mode.LANDING:
+                self._lowest = float(self.p_w[2]), self._clock
             self.mode = Mode.LANDING
 
     def cut(self) -> None:
@@ -211,8 +217,20 @@ class DroneModel:
         if self.p_w[2] <= _GROUND_M:
             self.p_w = np.array([self.p_w[0], self.p_w[1], _GROUND_M])
             if self.mode is Mode.LANDING:
-                self.mode, self.velocity, self.yaw_rate = Mode.GROUND, np.zeros(3), 0.0
+                self._stand()
             self.velocity = np.maximum(self.velocity, [-np.inf, -np.inf, 0.0])
+        elif self.mode is Mode.LANDING and self._settles():
+            self._stand()
+
+    def _settles(self) -> bool:
+        """Whether a landing goes no lower: on furniture."""
+        height_m, at_s = self._lowest
+        if self.p_w[2] < height_m - _SETTLED_M:
+            self._lowest = float(self.p_w[2]), self._clock
+        return self._clock - at_s > _SETTLED_S
+
+    def _stand(self) -> None:
+        self.mode, self.velocity, self.yaw_rate = Mode.GROUND, np.zeros(3), 0.0
 
     def rpy(self) -> FloatArray:
         """Roll, pitch, yaw [rad]: a multicopter leans the way it accelerates."""

@@ -17,6 +17,7 @@ from edgeslam_torch.drone.emulator.server import EmulatorConfig, TelloEmulator
 from edgeslam_torch.drone.udp import open_udp
 from edgeslam_torch.errors import EdgeSlamError
 from edgeslam_torch.eval.judge.navigation.behaviours import REACHED_M
+from edgeslam_torch.eval.judge.navigation.flight import contact_events
 from edgeslam_torch.flying.navigator import Navigator
 from edgeslam_torch.geometry.mount import TELLO_TILT_RAD
 from edgeslam_torch.synthetic.sites.build import SITES, named_site
@@ -33,6 +34,7 @@ class Landed:
     distance_m: float
     """Level distance to the goal."""
     contacts: int
+    """Events, also while it lands."""
     clearance_m: float
     """Least distance of the hull to a solid in flight; infinite if it never flew."""
     on_floor: bool
@@ -55,7 +57,8 @@ def emulate(world: str, seed: int, ports: tuple[int, int], pipe: Connection) -> 
         pipe.send(emulator.command_port)
         pipe.recv()
         away = float(np.linalg.norm(drone.p_w[:2] - site.goal_w[:2]))
-        pipe.send(Landed(away, len(drone.contacts), nearest[0] - 0.1, not drone.flying))
+        contacts = contact_events([contact.clock_s for contact in drone.contacts])
+        pipe.send(Landed(away, contacts, nearest[0] - 0.1, not drone.flying))
 
 
 def fly_one(world: str, seed: int, record: Path | None = None) -> str:

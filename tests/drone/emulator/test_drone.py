@@ -33,6 +33,23 @@ def test_takes_off_to_80_cm_and_lands(hovering):
     np.testing.assert_array_equal(hovering.velocity, 0.0)
 
 
+def test_lands_on_a_table_that_is_under_it():
+    """It stands on the top, a hull's radius above it, and rises from there again."""
+    drone = DroneModel(clearance=lambda p: abs(float(p[2]) - 0.5))
+    drone.p_w = np.array([0.0, 0.0, 1.2])
+    drone.mode = Mode.FLYING
+    for _ in range(25):  # whoever repeats the command
+        drone.land()
+        fly(drone, 0.2)
+    assert drone.mode is Mode.GROUND
+    assert drone.p_w[2] == pytest.approx(0.6, abs=0.03)
+    touching = [contact for contact in drone.contacts if contact.clock_s > 3.5]
+    assert not touching  # its motors are off
+    assert drone.take_off()
+    fly(drone, 3.0)
+    assert drone.p_w[2] == pytest.approx(0.9, abs=0.05)
+
+
 def test_moves_are_in_body_axes(hovering):
     hovering.turn(math.pi / 2)
     fly(hovering, 4.0)
