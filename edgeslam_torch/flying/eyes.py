@@ -72,7 +72,7 @@ class SlamEyes:
         self._metres = np.nan
         """Metres per map unit by which it goes; NaN while the published unit is all there is."""
         self._battery = 1.0
-        self._told_height_m = np.nan
+        self._told_height_m, self._told_speed_m_s = np.nan, np.nan
         self._shown: tuple[FloatArray, float, int] = np.zeros((0, 4, 4)), 1.0, 0
         """When the last view was made: poses ``(F, 4, 4)`` of all pictures, metres per map unit, and the revision."""
         self._told: deque[tuple[int, FloatArray]] = deque(maxlen=KEPT)
@@ -90,6 +90,7 @@ class SlamEyes:
                 self._battery = sample.battery
             if np.isfinite(sample.height_m):
                 self._told_height_m = sample.height_m + GROUND_M
+            self._told_speed_m_s = float(np.linalg.norm(sample.velocity_m_s[:2]))
 
     def seen(self, image: np.ndarray, arrived_s: float, captured_s: float) -> View | None:
         """Take a picture ``(H, W, 3)`` BGR; every few pictures of a mapped place give depth in metres."""
@@ -122,7 +123,8 @@ class SlamEyes:
         """The moment, with a new view if there is one, and with it how the map moved since the last."""
         with self._lock:
             output, captured_s, home, changes = self._output, self._captured_s, self._home, self._changes
-            samples, battery, told = list(self._samples), self._battery, self._told_height_m
+            samples, battery = list(self._samples), self._battery
+            told, told_speed = self._told_height_m, self._told_speed_m_s
         pose = self._slam.pose_now(now_s, samples)
         if pose is None or output is None or output.health is None:
             nowhere = np.array([0.0, 0.0, GROUND_M])
@@ -136,6 +138,7 @@ class SlamEyes:
                 seen_s=captured_s,
                 battery=battery,
                 told_height_m=told,
+                told_speed_m_s=told_speed,
             )
         health = output.health
         T_w_b = home.poses(pose.T_w_c) @ se3.inverse(self._T_b_c)
@@ -154,6 +157,7 @@ class SlamEyes:
             seen_s=captured_s,
             battery=battery,
             told_height_m=told,
+            told_speed_m_s=told_speed,
             view=view,
             revision=pose.revision + changes,
             moved=None if view is None else self._moved(view),

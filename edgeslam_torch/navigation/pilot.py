@@ -101,6 +101,7 @@ class Pilot:
     _updated_s: float = math.nan
     """When it took in the last sight."""
     _least: float = math.inf
+    """The least cost to go; NaN where the map has moved since it was known."""
     _progress_w: FloatArray = field(default_factory=lambda: np.zeros(2))
     """``(2,)`` where it was then."""
     _waiting_s: float = math.nan
@@ -164,7 +165,7 @@ class Pilot:
 
     def _take_in(self, sight: Sight) -> None:
         if sight.moved is not None:
-            self._carry(sight.moved, sight.stamp_s)
+            self._carry(sight.moved)
         elif sight.revision != self._revision:
             self._forget()
         self._revision, self._revised_s = sight.revision, sight.stamp_s
@@ -180,8 +181,8 @@ class Pilot:
         if self.exits.due(sight):
             self.exits.look(self.walls(), sight)
 
-    def _carry(self, moved: Moved, now_s: float) -> None:
-        """Bring what is known along with the map that moved."""
+    def _carry(self, moved: Moved) -> None:
+        """Bring what is known along with the map that moved; that is no progress."""
         self.space.rebuild(moved)
         self.exits.carry(moved)
         self.task.carry(moved)
@@ -189,9 +190,8 @@ class Pilot:
             self._looked_w = moved.points(self._looked_w[None])[0]
         if self._doubted_w is not None:
             self._doubted_w = moved.points(self._doubted_w[None])[0]
-        self._plan, self._least = None, math.inf
-        if not math.isnan(self._progress_s):
-            self._progress_s = self._updated_s = now_s
+        self._plan, self._least = None, math.nan
+        self._progress_w = moved.points(self._progress_w[None])[0]
 
     def _forget(self) -> None:
         """Begin anew: nothing says how what is known relates to the new metres."""
@@ -254,6 +254,8 @@ class Pilot:
         plan = self._planned(sight)
         here = sight.p_w[:2]
         now = float(plan.at(here))
+        if math.isnan(self._least):
+            self._least = now
         if now < self._least - 0.1 or float(np.linalg.norm(here - self._progress_w)) > _ELSEWHERE_M:
             self._least, self._progress_s = min(now, self._least), sight.stamp_s
             self._progress_w = here.copy()

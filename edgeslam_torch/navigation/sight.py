@@ -50,6 +50,8 @@ class Sight:
     battery: float = 1.0
     told_height_m: float = math.nan
     """Height above the floor of the take-off as the drone itself says; NaN if it does not."""
+    told_speed_m_s: float = math.nan
+    """Level speed as the drone itself says; NaN if it does not."""
     view: View | None = None
     """A new depth map, if there is one."""
     revision: int = 0

@@ -13,6 +13,7 @@ import numpy as np
 from edgeslam_torch.geometry.rotations import wrapped
 from edgeslam_torch.navigation.limits import NavLimits
 from edgeslam_torch.navigation.moved import Moved
+from edgeslam_torch.navigation.push import PUSHED_M_S, Push
 from edgeslam_torch.navigation.sight import Sight, Touch, Wish
 from edgeslam_torch.types import FloatArray
 
@@ -36,8 +37,6 @@ CARRIED_SIGMA_M = 0.12
 them are the margin and the hull. A bare wall fills the picture for a metre of way; telemetry carries as far."""
 _WIGGLE_S, _WIGGLE_M_S = 2.0, 0.25
 """Up and down, which tells height and telemetry the scale."""
-_PUSHED_M_S, _STANDS_M_S, _PUSH_S = 0.15, 0.04, 1.5
-"""Commanded faster than the first, moving slower than the second for this long: something holds it."""
 _TRAIL_M = 0.05
 _APART_M, _APART_S = 0.5, 1.0
 """Heights of map and drone that are so far apart for so long cannot both be true. Together sure metres of 10 % at the
@@ -101,9 +100,10 @@ class Supervisor:
     """Since when it is in trouble."""
     _grave_s: float = math.nan
     """Since when in other trouble than doubtful metres."""
-    _pushing_s: float = math.nan
-    _backing_s: float = math.nan
-    """Since when it backs up and does not move."""
+    _onward: Push = field(default_factory=Push)
+    """Whether it comes on where the pilot wants to."""
+    _backward: Push = field(default_factory=Push)
+    """Whether it comes back the way it came."""
     _apart_s: float = math.nan
     """Since when the heights of map and drone are apart."""
     _told: bool = True
@@ -178,13 +178,7 @@ class Supervisor:
     def _backs_in_vain(self, wish: Wish, now_s: float) -> bool:
         """Whether something holds it on its way back, which the map has in another place."""
         assert self._sight is not None
-        pushes = math.hypot(wish.forward_m_s, wish.left_m_s) > _PUSHED_M_S
-        if not pushes or float(np.linalg.norm(self._sight.velocity_w[:2])) > _STANDS_M_S:
-            self._backing_s = math.nan
-            return False
-        if math.isnan(self._backing_s):
-            self._backing_s = now_s
-        return now_s - self._backing_s > _PUSH_S
+        return self._backward.holds(self._sight, self._push_w(wish), now_s)
 
     def _trouble_s(self, danger: Danger, now_s: float) -> float:
         """How long it has been in trouble of this gravity: waiting for metres uses up no patience with the rest."""
@@ -226,15 +220,7 @@ class Supervisor:
 
     def _is_held(self, sight: Sight, now_s: float) -> bool:
         """Whether it was told to move for a while and did not; a wish that was not passed on moves nothing."""
-        wish = self._wish
-        pushed = self._told and wish is not None and math.hypot(wish.forward_m_s, wish.left_m_s) > _PUSHED_M_S
-        moves = float(np.linalg.norm(sight.velocity_w[:2])) > _STANDS_M_S
-        if not pushed or moves:
-            self._pushing_s = math.nan
-            return False
-        if math.isnan(self._pushing_s):
-            self._pushing_s = now_s
-        return now_s - self._pushing_s > _PUSH_S
+        return self._onward.holds(sight, self._push_w(self._wish) if self._told else None, now_s)
 
     def _pushed_w(self, wish: Wish | None) -> FloatArray:
         """Direction ``(2,)`` of a wish in the world."""
@@ -242,6 +228,11 @@ class Supervisor:
         c, s = math.cos(self._sight.yaw_rad), math.sin(self._sight.yaw_rad)
         forward, left = wish.forward_m_s, wish.left_m_s
         return np.array([c * forward - s * left, s * forward + c * left]) / math.hypot(forward, left)
+
+    def _push_w(self, wish: Wish | None) -> FloatArray | None:
+        """The same of a wish that is to move it; None where it need not."""
+        pushes = wish is not None and math.hypot(wish.forward_m_s, wish.left_m_s) > PUSHED_M_S
+        return self._pushed_w(wish) if pushes else None
 
     def _is_apart(self, sight: Sight, now_s: float) -> bool:
         """Whether the pose goes its own way: a map that is sure of its metres, and another height than the drone's."""

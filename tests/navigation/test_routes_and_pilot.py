@@ -11,6 +11,7 @@ from edgeslam_torch.navigation.arcs import candidates, flown
 from edgeslam_torch.navigation.frontiers import frontiers
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.limits import NavLimits
+from edgeslam_torch.navigation.moved import Moved
 from edgeslam_torch.navigation.pilot import Phase, Pilot
 from edgeslam_torch.navigation.route import cost_to_go
 from edgeslam_torch.navigation.sight import Sight, Touch, Wish
@@ -318,6 +319,23 @@ def test_time_in_which_its_wishes_are_not_followed_is_no_lack_of_progress():
     closed(pilot)
     assert set(stays(pilot, 30.0, hindered=True)) == {Phase.FLYING}
     assert Phase.RISING in stays(pilot, 16.0, 30.0)
+
+
+def test_a_map_that_moves_is_no_progress():
+    """To and fro by a decimetre, twice a second: what was free and solid goes along, and the way stays closed."""
+    pilot = before_a_free_way()
+    closed(pilot)
+    before = np.eye(4)
+    before[2, 3] = 1.15
+    for k in range(36):
+        after = before.copy()
+        after[0, 3] = 0.1 * (k % 2 == 0)
+        moved = Moved(before[None], after[None])
+        before = after
+        pilot.update(replace(at(after[0, 3], 0.0, stamp_s=0.5 * k), moved=moved if k else None))
+        if pilot.phase is Phase.RISING:
+            pilot.phase = Phase.FLYING
+    assert pilot._doubted_w is not None
 
 
 def test_it_does_not_rise_for_a_view_that_a_lost_pose_cannot_give():

@@ -1,0 +1,61 @@
+"""What holds a drone, by its pose and by its own velocities."""
+
+import numpy as np
+import pytest
+
+from edgeslam_torch.navigation.push import Push
+from edgeslam_torch.navigation.sight import Sight
+
+AHEAD = np.array([1.0, 0.0])
+
+
+def held_after_s(velocities_w, told_m_s, towards_w=lambda k: AHEAD, seconds=6.0):
+    """When it is held first, of a push by 20 sights a second; None if never."""
+    push = Push()
+    for k in range(round(20 * seconds)):
+        now = k / 20
+        sight = Sight(now, np.zeros(3), 0.0, np.array([*velocities_w(k), 0.0]), told_speed_m_s=told_m_s(k))
+        if push.holds(sight, towards_w(k), now):
+            return now
+    return None
+
+
+def shaking(k):
+    """A tenth of a metre a second to and fro: nowhere."""
+    return 0.1 * (-1.0) ** k, 0.05 * (-1.0) ** (k // 2)
+
+
+@pytest.mark.parametrize(
+    ("velocities_w", "told_m_s"),
+    [
+        (lambda k: (0.0, 0.0), lambda k: np.nan),
+        (lambda k: (0.03, 0.0), lambda k: 0.3),  # the radio repeats an old message
+        (shaking, lambda k: 0.0),
+        (lambda k: (-0.2, 0.0), lambda k: 0.0),  # a pose that runs away
+    ],
+)
+def test_it_is_held_after_a_second_and_a_half(velocities_w, told_m_s):
+    assert held_after_s(velocities_w, told_m_s) == pytest.approx(1.55, abs=0.06)
+
+
+@pytest.mark.parametrize(
+    ("velocities_w", "told_m_s"),
+    [
+        (lambda k: (0.2, 0.0), lambda k: 0.2),
+        (lambda k: (0.2, 0.0), lambda k: 0.0),  # the drone repeats that it stands, and the pictures move
+        (shaking, lambda k: np.nan),  # nothing tells shaking from moving
+        (shaking, lambda k: 0.1),
+        (lambda k: (0.0, 0.2), lambda k: 0.2),  # along what it pushes against
+    ],
+)
+def test_it_is_not_held_where_it_moves(velocities_w, told_m_s):
+    assert held_after_s(velocities_w, told_m_s) is None
+
+
+def test_to_and_fro_is_no_push():
+    """A second each way: no movement is asked for long enough."""
+    assert held_after_s(lambda k: (0.0, 0.0), lambda k: 0.0, lambda k: AHEAD * (-1.0) ** (k // 20)) is None
+
+
+def test_a_pause_begins_it_anew():
+    assert held_after_s(lambda k: (0.0, 0.0), lambda k: 0.0, lambda k: None if k % 25 == 24 else AHEAD) is None
