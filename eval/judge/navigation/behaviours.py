@@ -9,7 +9,6 @@ from edgeslam_torch.eval.judge.navigation.flown import Flown
 from edgeslam_torch.flying.errands import WayHome
 from edgeslam_torch.navigation.corridor import FollowCorridor
 from edgeslam_torch.navigation.openings.watch import Exit
-from edgeslam_torch.navigation.pilot import Pilot
 from edgeslam_torch.navigation.tasks import Explore, GoTo, Task
 from edgeslam_torch.synthetic.sites.site import Site
 from edgeslam_torch.types import FloatArray
@@ -31,7 +30,6 @@ class Moment:
     clock_s: float
     scale: float
     """The pilot's metre in true metres."""
-    pilot: Pilot
     track_w: FloatArray
     """``(N, 2)`` where the drone flew, as it knows."""
 

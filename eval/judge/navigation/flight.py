@@ -18,12 +18,11 @@ from edgeslam_torch.eval.judge.navigation.flown import Case, Flown
 from edgeslam_torch.eval.judge.navigation.near import WatchedEyes
 from edgeslam_torch.eval.judge.navigation.oracle import shortest_m
 from edgeslam_torch.eval.judge.navigation.slam_eyes import IMAGE_SIZE, SlamEyes
-from edgeslam_torch.flying.errands import Stay
+from edgeslam_torch.flying.cockpit import Cockpit
 from edgeslam_torch.geometry.mount import TELLO_TILT_RAD
 from edgeslam_torch.navigation.limits import NavLimits
-from edgeslam_torch.navigation.pilot import Phase, Pilot
-from edgeslam_torch.navigation.sight import Sight, Wish
-from edgeslam_torch.navigation.supervisor import Supervisor
+from edgeslam_torch.navigation.pilot import Phase
+from edgeslam_torch.navigation.sight import Sight
 from edgeslam_torch.synthetic.sites.build import named_site
 from edgeslam_torch.synthetic.sites.site import Site
 from edgeslam_torch.types import FloatArray
@@ -61,48 +60,36 @@ def fly(case: Case, limits: NavLimits | None = None) -> Flown:
     tello = LockstepTello(drone, paint if case.eyes == "slam" else nothing_painted, conditions.radio, case.seed)
     seeing: Eyes = SlamEyes(camera, conditions, case.seed) if case.eyes == "slam" else TrueEyes(site, drone, conditions)
     eyes = WatchedEyes(seeing, site)
-    errand = _Errand(site, BEHAVIOURS[case.behaviour], Pilot(Stay(), limits), conditions.scale)
+    errand = _Errand(site, BEHAVIOURS[case.behaviour], Cockpit(limits), conditions.scale)
     found = Flown(case)
     if case.behaviour == "goto":
         found.oracle_s = _take_off_s(limits) + shortest_m(site, limits) / limits.speed_m_s
-    ticks = _fly(tello, eyes, errand, Supervisor(limits), conditions.hung_s, found)
+    ticks = _fly(tello, eyes, errand, conditions.hung_s, found)
     _sum_up(found, site, drone, ticks, BEHAVIOURS[case.behaviour])
-    known = errand.pilot.exits.exits
+    known = errand.cockpit.exits()
     found.exits = [len(site.exits), len(known), right_exits(known, site)]
     found.near = [eyes.counts.sectors, eyes.counts.too_far, eyes.counts.surely_too_far]
     return found
 
 
 class _Errand:
-    """The pilot, and what it is to do next."""
+    """What the cockpit is to do, one task after the other, however the one before ended."""
 
-    def __init__(self, site: Site, behaviour: Behaviour, pilot: Pilot, scale: float) -> None:
-        self.pilot, self.limit_s = pilot, behaviour.limit_s
+    def __init__(self, site: Site, behaviour: Behaviour, cockpit: Cockpit, scale: float) -> None:
+        self.cockpit, self.limit_s = cockpit, behaviour.limit_s
         self._site, self._scale, self._steps = site, scale, list(behaviour.steps)
-        self._track: list[FloatArray] = []
         self._first = True
 
-    def update(self, sight: Sight) -> Wish:
-        """What the pilot wishes; the next task is taken up when one has ended, however it did."""
-        if sight.moved is not None:
-            self._track = list(sight.moved.points(np.array(self._track)))
-        self._track.append(sight.p_w[:2].copy())
-        if self._first or (self.ended() and self._steps):
+    def go_on(self, now_s: float) -> None:
+        """Give the next task when there is none; the first is taken up while it still rises and looks around."""
+        if self._steps and (self._first or self.cockpit.ended() is not None):
             step = self._steps.pop(0)
-            task = step(Moment(self._site, sight.stamp_s, self._scale, self.pilot, np.array(self._track)))
-            if self._first:  # it still rises and looks around
-                self.pilot.task, self._first = task, False
-            else:
-                self.pilot.begin(task)
-        return self.pilot.update(sight)
-
-    def ended(self) -> bool:
-        """Whether the present task has."""
-        return self.pilot.phase in (Phase.DONE, Phase.STUCK)
+            self.cockpit.begin(step(Moment(self._site, now_s, self._scale, self.cockpit.track())))
+            self._first = False
 
     def over(self) -> bool:
-        """Whether all of them have."""
-        return self.ended() and not self._steps
+        """Whether all tasks have ended."""
+        return self.cockpit.ended() is not None and not self._steps
 
 
 @dataclass(slots=True)
@@ -119,7 +106,6 @@ def _fly(
     tello: LockstepTello,
     eyes: Eyes,
     errand: _Errand,
-    supervisor: Supervisor,
     hung_s: tuple[float, float] | None,
     found: Flown,
 ) -> list[_Tick]:
@@ -137,21 +123,17 @@ def _fly(
         if drone.mode is not Mode.FLYING or landing:
             continue
         began = time.process_time()
-        supervisor.see(sight)
         if hung_s is None or not hung_s[0] <= tello.clock_s < hung_s[1]:
-            supervisor.propose(errand.update(sight), tello.clock_s)
-            if sight.moved is not None:
-                supervisor.carry(sight.moved)
-        order = supervisor.order(tello.clock_s)
-        if order.touch is not None:
-            errand.pilot.touched(order.touch)
+            errand.go_on(sight.stamp_s)
+            errand.cockpit.plan(sight)
+        order = errand.cockpit.order(sight)
         cpu_s = time.process_time() - began
         speed, clear_m = float(np.linalg.norm(drone.velocity)), drone.clearance(drone.p_w)
         ticks.append(_Tick(tello.clock_s, drone.p_w.copy(), drone.rpy(), speed, clear_m, cpu_s))
         if order.danger and str(order.danger) not in dangers:
             dangers.append(str(order.danger))
         if errand.over():
-            found.ended, found.time_s = found.ended or str(errand.pilot.phase), found.time_s or tello.clock_s
+            found.ended, found.time_s = found.ended or str(errand.cockpit.ended()), found.time_s or tello.clock_s
             landing = True
             tello.send("land")
         elif order.land:
