@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy import ndimage
 
-from edgeslam_torch.navigation.frontiers import Looks, frontiers
+from edgeslam_torch.navigation.exploring.frontiers import Looks, frontiers
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.moved import Moved
 from edgeslam_torch.navigation.openings.pathways import WIDEST_M

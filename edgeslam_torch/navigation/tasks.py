@@ -6,7 +6,8 @@ from typing import Protocol
 
 import numpy as np
 
-from edgeslam_torch.navigation.frontiers import Looks, frontiers, reachable
+from edgeslam_torch.navigation.exploring.around import LooksAround
+from edgeslam_torch.navigation.exploring.frontiers import Looks, frontiers, reachable
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.moved import Moved
 from edgeslam_torch.navigation.sight import Sight
@@ -82,12 +83,16 @@ def _doubt_m(sight: Sight) -> float:
 
 
 @dataclass(slots=True)
-class Explore(LooksAhead):
-    """Fly to where the known free space ends, until it ends nowhere or time is over."""
+class Explore:
+    """Fly to where the known free space ends, until it ends nowhere or time is over, and look around on the way.
+
+    A camera of 55 degrees that looks where it flies sees of the wall that it comes through the two jambs.
+    """
 
     until_s: float = np.inf
     """On the clock of the sights."""
     _looks: Looks = field(default_factory=Looks)
+    _around: LooksAround = field(default_factory=LooksAround)
 
     def goals(self, layer: Layer, sight: Sight) -> np.ndarray:
         """Cells at the middle of each border between free and unseen."""
@@ -98,5 +103,10 @@ class Explore(LooksAhead):
         return sight.stamp_s >= self.until_s or self._looks.over(sight.stamp_s)
 
     def carry(self, moved: Moved) -> None:
-        """Take the places along that were looked at in vain."""
+        """Take the places along that were looked at, and looked around at."""
         self._looks.carry(moved)
+        self._around.carry(moved)
+
+    def heading_rad(self, sight: Sight) -> float | None:
+        """Left and right, standing, wherever it has not looked around."""
+        return self._around.heading_rad(sight)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from edgeslam_torch.navigation.corridor import FollowCorridor
-from edgeslam_torch.navigation.frontiers import Looks, reachable
+from edgeslam_torch.navigation.exploring.frontiers import Looks, reachable
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.moved import Moved
 from edgeslam_torch.navigation.openings.exits import gaps

@@ -8,7 +8,7 @@ import pytest
 
 from edgeslam_torch.drone.emulator.drone import DroneModel
 from edgeslam_torch.navigation.arcs import candidates, flown
-from edgeslam_torch.navigation.frontiers import frontiers
+from edgeslam_torch.navigation.exploring.frontiers import frontiers
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.limits import NavLimits
 from edgeslam_torch.navigation.moved import Moved

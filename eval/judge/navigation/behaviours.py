@@ -17,6 +17,8 @@ REACHED_M = 0.35
 """Of the true goal, when the pilot says that it is there."""
 HOME_M = 0.3
 """Of the true take-off."""
+EXPLORED_S = 180.0
+"""Time in which a room and what is next door are looked at from everywhere, by a drone that stops to look."""
 _END_M = 1.6
 """Of a corridor's true end: the drone stops 0.6 m before a wall."""
 _SAME_EXIT_M, _SAME_EXIT_COS = 0.5, np.cos(np.radians(35.0))
@@ -53,7 +55,7 @@ def _home(moment: Moment) -> Task:
 
 
 def _explore(moment: Moment) -> Task:
-    return Explore(moment.clock_s + 75.0)
+    return Explore(moment.clock_s + EXPLORED_S)
 
 
 def _corridor(moment: Moment) -> Task:
@@ -96,9 +98,9 @@ BEHAVIOURS = {
     "goto": Behaviour((_goal,), _at_goal),
     "home": Behaviour((_goal, _home), _at_home, 240.0),
     "corridor": Behaviour((_corridor,), _at_an_end, 160.0),
-    "exits": Behaviour((_explore, _home), _at_home, 240.0),
+    "exits": Behaviour((_explore, _home), _at_home, 420.0),
 }
-"""By name; ``exits`` explores for 75 s and comes home, and what counts is also which exits it knows."""
+"""By name; ``exits`` explores for `EXPLORED_S` and comes home, and what counts is also which exits it knows."""
 
 
 def right_exits(found: Sequence[Exit], site: Site) -> int:

@@ -1,0 +1,1 @@
+"""Exploring: where the known space ends, and where it was looked around."""
