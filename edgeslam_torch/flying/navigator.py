@@ -137,7 +137,8 @@ class Navigator:
         return self.fly(GoTo(self._goal(goal_w)), "there")
 
     def explore(self, seconds: float) -> Outcome:
-        """Fly to where the known space ends, again and again; reached when time is over or nothing is left to see.
+        """Fly to where the known space ends, again and again, and look around on the way; reached when time is over or
+        nothing is left to see.
 
         Raises:
             FlightRefused: If the time is not positive, or it does not fly.
@@ -146,7 +147,7 @@ class Navigator:
         outcome = self.fly(Explore(until_s), "the time is over")
         return self._in_time(outcome, until_s, "nothing is left to see")
 
-    def find_exits(self, seconds: float = 60.0) -> Outcome:
+    def find_exits(self, seconds: float = 180.0) -> Outcome:
         """Explore until an exit is known; `exits` are the records.
 
         Raises:

@@ -327,6 +327,7 @@ class Pilot:
             good |= arcs.clearance_m >= standing - 1e-3
         if self._may_squeeze(sight.p_w[:2]):
             good |= self._squeezes(arcs, sight)
+        good |= self._goes_back(arcs, sight)
         score = self._score(arcs, plan, sight, error)
         score[~good] = np.inf
         best = int(np.argmin(score))
@@ -353,6 +354,13 @@ class Pilot:
         hull = self._hull_m(sight)
         away = arcs.from_solid_m >= self.limits.clearance_m(sight.position_sigma_m)
         return np.asarray(slow & away & (arcs.clearance_m >= hull))
+
+    def _goes_back(self, arcs: Arcs, sight: Sight) -> np.ndarray:
+        """``(C,)`` slow movements along the way that it flew: through a door whose frame was never seen from behind."""
+        slow = np.linalg.norm(arcs.velocity_w, axis=1) < _SQUEEZE * self.limits.speed_m_s + 1e-6
+        hull = self._hull_m(sight)
+        passes = (arcs.from_solid_m >= hull + 0.5 * CELL_M) & (arcs.clearance_m >= hull)
+        return np.asarray(slow & passes & self.space.was_at(arcs.p_w).all(axis=1))
 
     def _hull_m(self, sight: Sight) -> float:
         """Distance of the drone's centre from what its hull may be beside."""

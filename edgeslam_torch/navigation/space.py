@@ -41,7 +41,7 @@ _SAME_M, _SAME_COS, _ALIKE = 0.1, np.cos(np.radians(4.0)), 3
 _TOUCHED_RAD = np.radians(35.0)
 """To each side of the direction of a touch: what holds a drone is rarely as thin as a cell."""
 _NOWHERE = np.float32(1e6)
-_AROUND = np.ones((5, 5), np.uint8)
+_AROUND, _NEIGHBOURS = np.ones((5, 5), np.uint8), np.ones((3, 3), np.uint8)
 _RAMP, _NEAR_END = 1.5, 1.1
 """Ratio of depths within four pixels beyond which they are of two things, and how much farther than the nearest the
 nearer thing may be: a wall 0.8 m beside the way, seen along, has 1.4 at `REACH_M`."""
@@ -95,6 +95,18 @@ class Space:
         of what a person left free around it."""
         self._flown.append((np.array(p_w, dtype=np.float64), radius_m))
         self._clear(p_w, radius_m)
+
+    def was_at(self, p_w: FloatArray) -> np.ndarray:
+        """Whether the drone flew within a cell of each of the places ``(..., 2)``, bool ``(...)``."""
+        flown = np.array([p[:2] for p, _ in self._flown]).reshape(-1, 2)
+        cell = np.floor(flown / CELL_M).astype(int) - self._corner
+        i, j = cell[((cell >= 0) & (cell < SIDE)).all(axis=1)].T
+        way = np.zeros((SIDE, SIDE), np.uint8)
+        way[i, j] = 1
+        at = np.floor(np.asarray(p_w) / CELL_M).astype(int) - self._corner
+        inside = ((at >= 0) & (at < SIDE)).all(axis=-1)
+        i, j = np.moveaxis(np.where(inside[..., None], at, 0), -1, 0)
+        return np.asarray(inside & (cv2.dilate(way, _NEIGHBOURS)[i, j] > 0))
 
     def touched(self, touch: Touch, reach_m: float) -> None:
         """There is a solid from now on, whatever is seen, ``reach_m`` from the drone's centre."""

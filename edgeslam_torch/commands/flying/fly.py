@@ -25,10 +25,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     explore.add_argument("seconds", type=float, metavar="SECONDS", help="for how long")
     corridor = verbs.add_parser("corridor", help="follow the corridor that it is in, round corners, through no door")
     exit_ = verbs.add_parser("exit", help="explore until an exit is known, and fly through it")
-    for verb in (corridor, exit_):
-        verb.add_argument(
-            "seconds", type=float, nargs="?", metavar="SECONDS", default=120.0, help="for how long (default: 120)"
-        )
+    for verb, longest_s in ((corridor, 120.0), (exit_, 180.0)):
+        said = f"for how long (default: {longest_s:.0f})"
+        verb.add_argument("seconds", type=float, nargs="?", metavar="SECONDS", default=longest_s, help=said)
     home = verbs.add_parser("home", help="take off, look around, return above the take-off, land: a first test")
     for verb in (goto, explore, corridor, exit_, home):
         _add_common(verb)
