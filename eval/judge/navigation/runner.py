@@ -14,6 +14,7 @@ from edgeslam_torch.eval.judge.navigation.flown import Case, Flown
 from edgeslam_torch.eval.judge.navigation.pictures import top_view
 from edgeslam_torch.eval.judge.navigation.table import markdown
 from edgeslam_torch.files.atomic import write_text
+from edgeslam_torch.jobs.watched import end_with_parent_process
 
 FAILED = "failed"
 """How the ending of a flight begins that ended with an error of ours."""
@@ -37,7 +38,7 @@ def judge_flights(cases: Sequence[Case], out: Path, jobs: int, say: Callable[[st
     found = {case: flown for case in cases if (flown := _earlier(_file(out, case), case)) is not None}
     missing = [case for case in cases if case not in found]
     # Spawned: a forked process shares the threads' locks of its parent.
-    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), initializer=end_with_parent_process) as pool:
         futures = {pool.submit(fly, case): case for case in missing}
         for future in as_completed(futures):
             case = futures[future]
