@@ -68,6 +68,8 @@ class Space:
     _doubted: int = field(init=False)
     """How many of them, the earliest, only carve since their solids were doubted."""
     _flown: deque[tuple[FloatArray, float]] = field(init=False)
+    _way: np.ndarray = field(init=False)
+    """``(SIDE, SIDE)`` uint8, 1 where it flew."""
     _touched: FloatArray = field(init=False)
     """``(N, 3)`` where the drone was held by what it does not see."""
 
@@ -77,6 +79,7 @@ class Space:
         self._views = deque(maxlen=KEPT)
         self._flown = deque(maxlen=4000)
         self._doubted = 0
+        self._way = np.zeros((SIDE, SIDE), np.uint8)
         self._touched = np.zeros((0, 3))
 
     def observe(self, view: View) -> None:
@@ -94,19 +97,14 @@ class Space:
         """What the drone has flown through is free: a sphere around ``(3,)``, of the drone's radius or, at take-off,
         of what a person left free around it."""
         self._flown.append((np.array(p_w, dtype=np.float64), radius_m))
-        self._clear(p_w, radius_m)
+        self._pass(p_w, radius_m)
 
     def was_at(self, p_w: FloatArray) -> np.ndarray:
         """Whether the drone flew within a cell of each of the places ``(..., 2)``, bool ``(...)``."""
-        flown = np.array([p[:2] for p, _ in self._flown]).reshape(-1, 2)
-        cell = np.floor(flown / CELL_M).astype(int) - self._corner
-        i, j = cell[((cell >= 0) & (cell < SIDE)).all(axis=1)].T
-        way = np.zeros((SIDE, SIDE), np.uint8)
-        way[i, j] = 1
         at = np.floor(np.asarray(p_w) / CELL_M).astype(int) - self._corner
         inside = ((at >= 0) & (at < SIDE)).all(axis=-1)
         i, j = np.moveaxis(np.where(inside[..., None], at, 0), -1, 0)
-        return np.asarray(inside & (cv2.dilate(way, _NEIGHBOURS)[i, j] > 0))
+        return np.asarray(inside & (cv2.dilate(self._way, _NEIGHBOURS)[i, j] > 0))
 
     def touched(self, touch: Touch, reach_m: float) -> None:
         """There is a solid from now on, whatever is seen, ``reach_m`` from the drone's centre."""
@@ -120,16 +118,17 @@ class Space:
         step = ((wanted - self._corner) / _SHIFT).astype(int) * _SHIFT
         if not step.any():
             return
-        moved = np.zeros_like(self._odds)
+        moved, way = np.zeros_like(self._odds), np.zeros_like(self._way)
         old = [slice(max(0, s), min(SIDE, SIDE + s)) for s in step]
         new = [slice(max(0, -s), min(SIDE, SIDE - s)) for s in step]
         if all(s.stop > s.start for s in old):
             moved[new[0], new[1]] = self._odds[old[0], old[1]]
-        self._odds, self._corner = moved, self._corner + step
+            way[new[0], new[1]] = self._way[old[0], old[1]]
+        self._odds, self._way, self._corner = moved, way, self._corner + step
 
     def rebuild(self, moved: Moved) -> None:
         """Build the grid anew from the views that are remembered, after the map moved."""
-        self._odds[:] = 0.0
+        self._odds[:], self._way[:] = 0.0, 0
         if self._views:
             poses = moved.poses(np.array([view.T_w_c for view in self._views]))
             for k, (view, T_w_c) in enumerate(zip(self._views, poses, strict=True)):
@@ -139,7 +138,7 @@ class Space:
         flown = moved.points(np.array([p_w for p_w, _ in self._flown]).reshape(-1, 3))
         for k, p_w in enumerate(flown):
             self._flown[k] = p_w, self._flown[k][1]
-            self._clear(*self._flown[k])
+            self._pass(*self._flown[k])
 
     def doubt_solids(self) -> None:
         """What was seen to be solid is as good as unseen until it is seen again; what is free stays free, and where
@@ -244,6 +243,13 @@ class Space:
         index = np.unique(np.ravel_multi_index(tuple(cell[inside].T), self._odds.shape))
         odds = self._odds.reshape(-1)
         odds[index] = np.minimum(np.maximum(odds[index], _MISS) + _HIT, _LIMIT)
+
+    def _pass(self, p_w: FloatArray, radius_m: float) -> None:
+        """The drone was here."""
+        i, j = np.floor(p_w[:2] / CELL_M).astype(int) - self._corner
+        if 0 <= i < SIDE and 0 <= j < SIDE:
+            self._way[i, j] = 1
+        self._clear(p_w, radius_m)
 
     def _clear(self, p_w: FloatArray, radius_m: float) -> None:
         offset = np.array([*self._corner * CELL_M, self.floor_m])

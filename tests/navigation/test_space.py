@@ -220,3 +220,17 @@ def test_a_touch_beyond_the_grid_is_no_error():
     space = Space()
     space.touched(Touch(np.array([100.0, 0.0, 1.15]), np.array([1.0, 0.0])), 0.17)
     assert not space.layer(1.15, 0.15).solid.any()
+
+
+def test_where_it_flew_is_known_as_the_grid_and_the_map_move():
+    """Within a cell of it; after metres have become twice as long, twice as far away."""
+    space = Space()
+    for x in np.arange(0.05, 4.0, 0.1):
+        space.flown(np.array([x, 0.05, 1.15]), 0.2)
+    places = np.array([[2.05, 0.05], [2.05, -0.05], [2.05, 0.25], [7.0, 0.05]])
+    assert space.was_at(places).tolist() == [True, True, False, False]
+    space.follow(np.array([3.0, 0.0, 1.15]))
+    assert space.was_at(places).tolist() == [True, True, False, False]
+    space.rebuild(Moved(np.eye(4)[None], np.eye(4)[None], 2.0))
+    assert space.was_at(places).tolist() == [True, False, True, True]
+    assert not space.was_at(np.array([50.0, 0.0]))
