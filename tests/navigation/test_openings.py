@@ -10,6 +10,7 @@ from edgeslam_torch.navigation.corridor import FollowCorridor
 from edgeslam_torch.navigation.exploring.frontiers import Looks, reachable
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.moved import Moved
+from edgeslam_torch.navigation.openings.detour import has_detour
 from edgeslam_torch.navigation.openings.exits import gaps
 from edgeslam_torch.navigation.openings.pathways import pathways
 from edgeslam_torch.navigation.openings.turned import Walls, wall_directions
@@ -118,6 +119,31 @@ def test_an_opening_that_closes_under_closer_looks_is_forgotten():
     for k in range(12):
         watch.look(surroundings(wall(0.0)), sight(0.6, stamp_s=5.0 + 0.5 * k))
     assert watch.exits == ()
+
+
+@pytest.mark.parametrize("angle", ANGLES)
+@pytest.mark.parametrize(
+    ("solid", "unseen", "detour"),
+    [
+        (wall(0.9), None, False),
+        (lambda a, b: wall(0.9)(a, b) & (np.abs(b) < 1.2), None, True),  # two pillars in a room
+        (lambda a, b: wall(0.9)(a, b) & (b < 1.2), None, True),  # a pillar before the end of a wall
+        (lambda a, b: wall(0.9)(a, b) & (np.abs(b) < 1.2), lambda a, b: np.abs(b) > 1.25, False),  # not seen around
+        (wall(0.9), lambda a, b: a > 2.15, False),
+    ],
+)
+def test_what_can_be_passed_by_parts_nothing(solid, unseen, detour, angle):
+    walls = surroundings(solid, unseen or (lambda a, b: np.zeros(a.shape, bool)), angle=angle)
+    normal = np.array([math.cos(angle), math.sin(angle)])
+    assert has_detour(walls.layer, 2.0 * normal, normal, 0.9) == detour
+
+
+def test_pillars_are_no_exit_once_their_surroundings_are_seen():
+    """Seen from two places as a wall with a door, and then it turns out that the wall ends beside it."""
+    watch = watched([0.0, 0.2, 0.4, 0.6], surroundings(wall(0.9)))
+    assert len(watch.exits) == 1
+    watch.look(surroundings(lambda a, b: wall(0.9)(a, b) & (np.abs(b) < 1.2)), sight(0.6, stamp_s=5.0))
+    assert not watch.exits
 
 
 def test_no_look_without_metres():
@@ -238,8 +264,8 @@ def test_exits_go_along_with_the_map():
     before = np.eye(4)[None]
     after = np.array([[[0.0, -1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]])
     watch.carry(Moved(before, after, 1.3))
-    nothing = surroundings(lambda a, b: np.zeros(a.shape, bool))
-    watch.look(nothing, sight(0.0, stamp_s=3.0, yaw=-2.0))
+    unseen = surroundings(lambda a, b: np.zeros(a.shape, bool), lambda a, b: np.ones(a.shape, bool))
+    watch.look(unseen, sight(0.0, stamp_s=3.0, yaw=-2.0))
     (exit_,) = watch.exits
     assert exit_.centre_w[:2] == pytest.approx([0.0, 2.6], abs=0.15)
     assert exit_.normal_w[:2] == pytest.approx([0.0, 1.0], abs=0.1)

@@ -6,7 +6,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from edgeslam_torch.geometry.rotations import wrapped
+from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.moved import Moved
+from edgeslam_torch.navigation.openings.detour import has_detour
 from edgeslam_torch.navigation.openings.exits import WIDEST_M, Gap, gaps
 from edgeslam_torch.navigation.openings.turned import Walls
 from edgeslam_torch.navigation.sight import Sight
@@ -85,7 +87,7 @@ class ExitWatch:
             self._note(gap, here)
         self._seen = [seen for seen in self._seen if seen.missed <= 2 * max(len(seen.gaps), _LOOKS)]
         good = [s for s in self._seen if s.near >= _LOOKS and s.near > s.missed and _places(s.places_w) >= 2]
-        exits = [exit_ for seen in good if (exit_ := _exit(seen, sight)).width_m <= WIDEST_M]
+        exits = [e for seen in good if (e := _exit(seen, sight)).width_m <= WIDEST_M and not _passed_by(e, walls.layer)]
         self.exits = tuple(sorted(exits, key=lambda e: float(np.linalg.norm(e.centre_w[:2] - here))))
 
     def carry(self, moved: Moved) -> None:
@@ -121,6 +123,11 @@ def _exit(seen: _Seen, sight: Sight) -> Exit:
     width_sigma = math.hypot(cell, float(np.std(widths)), sight.scale_sigma * width)
     return Exit(np.array([*centre, sight.p_w[2]]), np.array([*normal, 0.0]), width, width_sigma, position,
                 _places(seen.places_w))  # fmt: skip
+
+
+def _passed_by(exit_: Exit, layer: Layer) -> bool:
+    """Whether it is the space between two things in one room."""
+    return has_detour(layer, exit_.centre_w[:2], exit_.normal_w[:2], exit_.width_m)
 
 
 def _carried(gap: Gap, centre_w: FloatArray, beyond_w: FloatArray, ratio: float) -> Gap:
