@@ -11,6 +11,8 @@ from edgeslam_torch.types import FloatArray
 PUSHED_M_S = 0.15
 """Slower wishes say nothing: a drone that drifts may be as fast."""
 _STANDS_M_S, _PUSH_S = 0.04, 1.5
+_PAUSE_S = 0.5
+"""Not asked for longer, it was told something else meanwhile."""
 _TOLD_M_S = 0.1
 """A Tello tells whole decimetres a second, cut off: slower is 0."""
 
@@ -45,7 +47,7 @@ class Push:
         if towards_w is None or turned or (speed > _STANDS_M_S and not stands):
             self._since_s, self._towards_w = math.nan, np.zeros(2) if towards_w is None else towards_w
             return False
-        if math.isnan(self._since_s):
+        if math.isnan(self._since_s) or now_s - self._last_s > _PAUSE_S:
             self._since_s = self._last_s = now_s
             self._gone_m, self._shook = 0.0, False
         self._gone_m += (now_s - self._last_s) * float(sight.velocity_w[:2] @ towards_w)

@@ -59,3 +59,11 @@ def test_to_and_fro_is_no_push():
 
 def test_a_pause_begins_it_anew():
     assert held_after_s(lambda k: (0.0, 0.0), lambda k: 0.0, lambda k: None if k % 25 == 24 else AHEAD) is None
+
+
+def test_what_it_was_told_before_a_pause_does_not_count():
+    push = Push()
+    still = Sight(0.0, np.zeros(3), 0.0, np.zeros(3))
+    assert not any(push.holds(still, AHEAD, k / 20) for k in range(20))
+    assert not push.holds(still, AHEAD, 9.0)
+    assert any(push.holds(still, AHEAD, 9.0 + k / 20) for k in range(40))
