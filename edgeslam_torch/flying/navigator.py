@@ -24,6 +24,8 @@ from edgeslam_torch.navigation.tasks import Explore, GoTo, Task
 from edgeslam_torch.types import FloatArray
 
 HOME_BECAUSE = "battery low: home"
+CARRIED = "by telemetry alone: the pose rests on no map"
+"""What an outcome adds where nothing that is seen says so."""
 BEYOND_M = 0.8
 """How far behind an exit it stops."""
 _LEAST_CORRIDOR_M = 1.0
@@ -229,8 +231,10 @@ class Navigator:
             if self.craft.flying:
                 self.craft.land(HOME_BECAUSE)
             return Outcome(False, HOME_BECAUSE, clearance_m, path_m)
-        reached = self.cockpit.ended() is Phase.DONE
-        return Outcome(reached, done if reached else str(Phase.STUCK), clearance_m, path_m)
+        if self.cockpit.ended() is not Phase.DONE:
+            return Outcome(False, str(Phase.STUCK), clearance_m, path_m)
+        carried = self.cockpit.sight is not None and not self.cockpit.sight.tracked
+        return Outcome(True, f"{done}, {CARRIED}" if carried else done, clearance_m, path_m)
 
     def land(self) -> Outcome:
         """Land; reached when the drone says that it stands.

@@ -7,11 +7,13 @@ import pytest
 
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.flying.cockpit import Cockpit
-from edgeslam_torch.flying.navigator import Navigator
+from edgeslam_torch.flying.errands import Stay
+from edgeslam_torch.flying.navigator import CARRIED, Navigator
 from edgeslam_torch.flying.outcome import FlightRefused
 from edgeslam_torch.geometry.camera import PRESETS
 from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.navigation.limits import NavLimits
+from edgeslam_torch.navigation.pilot import Phase
 from edgeslam_torch.navigation.sight import Sight, View
 
 TICK_S = 0.05
@@ -86,6 +88,16 @@ class ObedientCraft:
 def navigator(allow_motion=True, **craft):
     cockpit = Cockpit(NavLimits())
     return Navigator(ObedientCraft(cockpit, **craft), cockpit, allow_motion)
+
+
+@pytest.mark.parametrize(("tracked", "reason"), [(True, "home"), (False, f"home, {CARRIED}")])
+def test_an_outcome_says_what_it_rests_on(tracked, reason):
+    nav = navigator()
+    nav.craft.flying, nav.craft.fly = True, lambda until: None
+    nav.cockpit.sight = Sight(9.0, np.zeros(3), 0.0, np.zeros(3), tracked=tracked)
+    nav.cockpit.ended = lambda: Phase.DONE
+    outcome = nav.fly(Stay(), "home")
+    assert (outcome.reached, outcome.reason) == (True, reason)
 
 
 @pytest.mark.slow
