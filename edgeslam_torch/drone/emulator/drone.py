@@ -227,7 +227,8 @@ class DroneModel:
         height_m, at_s = self._lowest
         if self.p_w[2] < height_m - _SETTLED_M:
             self._lowest = float(self.p_w[2]), self._clock
-        return self._clock - at_s > _SETTLED_S
+        touches = bool(self.contacts) and self._clock - self.contacts[-1].clock_s < 0.5 * _SETTLED_S
+        return touches and self._clock - at_s > _SETTLED_S  # else it only has to stop climbing first
 
     def _stand(self) -> None:
         self.mode, self.velocity, self.yaw_rate = Mode.GROUND, np.zeros(3), 0.0

@@ -38,6 +38,7 @@ class Landed:
     clearance_m: float
     """Least distance of the hull to a solid in flight; infinite if it never flew."""
     on_floor: bool
+    """With its motors off, and not on furniture."""
 
 
 def emulate(world: str, seed: int, ports: tuple[int, int], pipe: Connection) -> None:
@@ -58,7 +59,7 @@ def emulate(world: str, seed: int, ports: tuple[int, int], pipe: Connection) -> 
         pipe.recv()
         away = float(np.linalg.norm(drone.p_w[:2] - site.goal_w[:2]))
         contacts = contact_events([contact.clock_s for contact in drone.contacts])
-        pipe.send(Landed(away, contacts, nearest[0] - 0.1, not drone.flying))
+        pipe.send(Landed(away, contacts, nearest[0] - 0.1, not drone.flying and drone.p_w[2] < 0.15))
 
 
 def fly_one(world: str, seed: int, record: Path | None = None) -> str:

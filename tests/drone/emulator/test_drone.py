@@ -50,6 +50,16 @@ def test_lands_on_a_table_that_is_under_it():
     assert drone.p_w[2] == pytest.approx(0.9, abs=0.05)
 
 
+def test_a_fast_climb_that_ends_in_a_landing_ends_on_the_floor(hovering):
+    hovering.rc = (0.0, 0.0, 1.0, 0.0)
+    fly(hovering, 2.0)
+    hovering.land()
+    fly(hovering, 1.5)
+    assert hovering.mode is Mode.LANDING
+    fly(hovering, 10.0)
+    assert hovering.mode is Mode.GROUND and hovering.p_w[2] == pytest.approx(0.1)
+
+
 def test_moves_are_in_body_axes(hovering):
     hovering.turn(math.pi / 2)
     fly(hovering, 4.0)
