@@ -196,7 +196,7 @@ class Navigator:
             return replace(outcome, reached=False, reason="there is no corridor to follow here")
         end = "the corridor opens into a room" if task.room else "the corridor ends"
         outcome = self._in_time(outcome, task.until_s, end)
-        if outcome.reason == end and not (task.room or task.wall):
+        if outcome.reason.startswith(end) and not (task.room or task.wall):
             return replace(outcome, reached=False, reason="it sees no way on and no end either")
         return outcome
 
@@ -282,7 +282,8 @@ class Navigator:
     def _in_time(self, outcome: Outcome, until_s: float, why: str) -> Outcome:
         """The outcome with another reason if its task was done before its time was over."""
         early = self.cockpit.sight is not None and self.cockpit.sight.stamp_s < until_s
-        return replace(outcome, reason=why) if outcome.reached and early else outcome
+        carried = f", {CARRIED}" if outcome.reason.endswith(CARRIED) else ""
+        return replace(outcome, reason=why + carried) if outcome.reached and early else outcome
 
     def _wants_home(self) -> bool:
         return self.cockpit.last is not None and self.cockpit.last.home

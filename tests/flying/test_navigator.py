@@ -98,6 +98,8 @@ def test_an_outcome_says_what_it_rests_on(tracked, reason):
     nav.cockpit.ended = lambda: Phase.DONE
     outcome = nav.fly(Stay(), "home")
     assert (outcome.reached, outcome.reason) == (True, reason)
+    explored = nav.explore(60.0)
+    assert explored.reason == reason.replace("home", "nothing is left to see")
 
 
 @pytest.mark.slow
