@@ -136,6 +136,7 @@ class EdgeSlam:
             lm,
             config.mapping.loop_closure,
             self._system.fusion.scale_around,
+            self._system.fusion.scale_along,
         )
         self._joining = Joining(self._system, atlas)
         self._earlier: EarlierFlights | None = None
@@ -233,7 +234,8 @@ class EdgeSlam:
             self._joining.enter(self.map.piece_of(step.keyframe.id))
         self._machine.meet(step.event, frame.stamp_s)
         system.motion.stamp_s = frame.stamp_s
-        self._present = system.fusion.present(frame.stamp_s, str(self.state), system.published)
+        present = system.fusion.present(frame.stamp_s, str(self.state), system.published, system.apart_sigma)
+        self._present = present
         return self._output(frame, step, joined)
 
     def pose_now(self, stamp_s: float, telemetry: Sequence[TelemetrySample] = ()) -> PoseNow | None:

@@ -242,6 +242,9 @@ class Health:
     """Whether the Kalman filter predicts the pose: `EdgeSlam.pose_now` makes up for the delay."""
     doubts: tuple[str, ...] = ()
     """What is not used, and why, in sentences."""
+    apart_sigma: float = 0.0
+    """Standard deviation per axis of the newest pose against the piece of map in which the flight began [published
+    unit]: what the drone's sensors leave open that carried the camera from one to the other. 0 in one map."""
 
     def in_words(self) -> str:
         """For a status line: metres, disagreement, telemetry and battery, as far as there is something to say."""
@@ -249,6 +252,8 @@ class Health:
         words = [f"metres to {100.0 * relative:.0f} %" if self.metric else "no metres"]
         if self.disagreement > DISAGREEMENT:
             words.append(f"sources {self.disagreement:.0f} sigmas apart")
+        if self.apart_sigma > 0:
+            words.append(f"to {self.apart_sigma:.2g} {'m' if self.metric else 'units'} of where the flight began")
         if SILENCE_S < self.telemetry_age_s < np.inf:
             words.append(f"telemetry silent for {self.telemetry_age_s:.1f} s")
         if np.isfinite(self.battery):

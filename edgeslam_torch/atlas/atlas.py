@@ -15,6 +15,7 @@ from edgeslam_torch.atlas.loops import (
     Closure,
     drift_told,
     far_keyframes,
+    is_carried,
     is_plausible,
     is_within_reach,
     spread,
@@ -91,6 +92,7 @@ class Atlas:
         lm: Settings of the refinement.
         closing: Whether loops inside a piece are closed.
         metres: Metres per map unit around the stamp of an earlier frame, where anything else than the images tells it.
+        metres_along: The same along some frames, by their stamps ``(F,)`` and poses ``(F, 4, 4)``.
     """
 
     def __init__(
@@ -101,6 +103,7 @@ class Atlas:
         lm: LmConfig,
         closing: bool = False,
         metres: Callable[[float], ScaleEstimate | None] = lambda _: None,
+        metres_along: Callable[[FloatArray, FloatArray], ScaleEstimate | None] = lambda *_: None,
     ) -> None:
         self.tracker = tracker
         self.map = tracker.map
@@ -109,6 +112,7 @@ class Atlas:
         self.lm = lm
         self.closing = closing
         self.metres = metres
+        self.metres_along = metres_along
         self.joins: list[Join] = []
         self.closures: list[Closure] = []
         self.known_scale: dict[int, ScaleEstimate] = {}
@@ -198,12 +202,29 @@ class Atlas:
     def _link(self, keyframe: Keyframe, other: Keyframe) -> Link | None:
         """A link that may be true: within a piece, places that look alike and are far apart are not one."""
         if self.map.piece_of(keyframe.id) != self.map.piece_of(other.id):
-            return link(self.tracker, keyframe, other)
+            found = link(self.tracker, keyframe, other, told=self._size_told)
+            if found is None or found.by_images or is_carried(self.map, found):
+                return found
+            return None
         found = link(self.tracker, keyframe, other, LOOP_SHARE)
         if found is None:
             return None
         told = drift_told(*(self.metres(k.stamp_s) for k in (keyframe, other)))
         return found if is_plausible(self.map, found, told) else None
+
+    def _size_told(self, keyframe: Keyframe, other: Keyframe) -> tuple[float, float] | None:
+        """Size of another keyframe's piece relative to a keyframe's own, by the metres along the frames of either."""
+        here, there = (self._metres_of(self.map.piece_of(k.id)) for k in (keyframe, other))
+        if here is None or there is None:
+            return None
+        sigma = float(np.hypot(here.sigma / here.value, there.sigma / there.value))
+        return here.value / there.value, sigma
+
+    def _metres_of(self, piece: int) -> ScaleEstimate | None:
+        support = self.log.support()
+        use = (support.piece == piece) & support.supported
+        stamps_s, T_w_c = self.log.poses()
+        return self.metres_along(stamps_s[use], T_w_c[use])
 
     def _settle(self, found: Link) -> Join | Closure | None:
         """Make one of what a link connects if another one agrees; earlier keyframes are asked for it."""

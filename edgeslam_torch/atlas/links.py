@@ -3,10 +3,12 @@
 The keyframe is searched in the other piece as a lost frame is (`tracking/relocaliser.py`), which gives its pose there
 on the evidence of hundreds of keypoints. What a pose leaves open is the scale: keypoints that have an anchor on both
 sides have two depths, and these must not only tell a scale but agree about it, since they come from two reconstructions
-that know nothing of each other. At last the way back must close: the other keyframe, searched in the first piece, has
-to be where the similarity says.
+that know nothing of each other. A drone that turns on the spot has no two depths: its own sensors may tell the scale
+there. At last the way back must close: the other keyframe, searched in the first piece, has to be where the similarity
+says.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,6 +31,9 @@ MIN_AGREEING = 0.6
 does."""
 MAX_SIGMA_LOG = 0.03
 """Standard deviation of the common log scale."""
+TOLD_SHARE = 0.2
+"""Share of the anchors in view that must be found where the images tell no scale: wallpaper that repeats reaches 0.16
+at a wrong place."""
 PLANE_PART, ON_PLANE = 0.9, 0.02
 """Part of the anchors within a distance from one plane, relative to the depth, that show no more than that plane."""
 PLANE_FITS = 5
@@ -42,6 +47,11 @@ MAX_SHIFT = 0.1
 """Distance of two estimates of one camera, relative to the depth that it sees."""
 MAX_TURN_RAD = np.deg2rad(5.0)
 """Angle between two estimates of one camera: as much as `MAX_SHIFT` seen at that depth, 6 degrees."""
+
+
+Told = Callable[[Keyframe, Keyframe], tuple[float, float] | None]
+"""Size of the second keyframe's piece relative to the first one's, and the standard deviation of its log, by others
+than the images; None where they do not tell."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +73,8 @@ class Link:
     """... these anchors of the other piece."""
     depth: float
     """Median depth that the keyframe sees there [units of the other piece]."""
+    by_images: bool = True
+    """Whether the images told the scale."""
 
     def agrees(self, other: "Link") -> bool:
         """Whether another link between the same pieces says the same of where this keyframe is, and how large."""
@@ -79,7 +91,13 @@ def view_of(keyframe: Keyframe, scale_factor: float) -> View:
     return View(keyframe.features, keyframe.words, keyframe.grid, inv_sigma)
 
 
-def link(tracker: Tracker, keyframe: Keyframe, other: Keyframe, min_share: float = LIKELY_SHARE) -> Link | None:
+def link(
+    tracker: Tracker,
+    keyframe: Keyframe,
+    other: Keyframe,
+    min_share: float = LIKELY_SHARE,
+    told: Told = lambda *_: None,
+) -> Link | None:
     """A keyframe's place in another keyframe's piece; None unless all of it is proven.
 
     Args:
@@ -87,13 +105,19 @@ def link(tracker: Tracker, keyframe: Keyframe, other: Keyframe, min_share: float
         keyframe: Whose place is sought.
         other: Keyframe that may show the same.
         min_share: Share of the anchors in view that must be found, there and on the way back.
+        told: Asked for the scale where the images show too few depths on both sides.
     """
     there = _place(tracker, keyframe, other, min_share)
     if there is None:
         return None
     if there.share < PLANE_SHARE and on_one_plane(tracker.map.anchors.p_w[there.track.anchor], there.depth):
         return None
-    scale = common_scale(tracker, keyframe, there.track)
+    common = _common_depths(tracker, keyframe, there.track)
+    by_images = len(common.own) >= MIN_COMMON
+    if by_images:
+        scale = _agreed(keyframe, common)
+    else:
+        scale = _told(told, keyframe, other) if there.share >= TOLD_SHARE else None
     if scale is None:
         return None
     S = _similarity(keyframe.T_c_w, there.track.T_c_w, scale[0])
@@ -103,7 +127,8 @@ def link(tracker: Tracker, keyframe: Keyframe, other: Keyframe, min_share: float
     shift, turn = apart(back.track.T_c_w, sim3.moved_camera(sim3.inverse(S), other.T_c_w))
     if shift > MAX_SHIFT * back.depth or turn > MAX_TURN_RAD:
         return None
-    return Link(keyframe, other, S, scale[1], scale[2], there.track.keypoint, there.track.anchor, there.depth)
+    track = there.track
+    return Link(keyframe, other, S, scale[1], scale[2], track.keypoint, track.anchor, there.depth, by_images)
 
 
 def _place(tracker: Tracker, keyframe: Keyframe, other: Keyframe, min_share: float) -> Place | None:
@@ -127,28 +152,50 @@ def on_one_plane(p: FloatArray, depth: float) -> bool:
     return bool(np.quantile(off, PLANE_PART) <= ON_PLANE * depth)
 
 
+@dataclass(frozen=True, slots=True)
+class _Depths:
+    """Of keypoints with a triangulated anchor on both sides ``(C,)``, in the units of either."""
+
+    own: FloatArray
+    there: FloatArray
+    keypoint: IntArray
+
+
 def common_scale(tracker: Tracker, keyframe: Keyframe, track: Track) -> tuple[float, float, float] | None:
     """Size of the track's piece relative to the keyframe's own, the standard deviation of its log, and its bend.
 
     None where too few depths are known on both sides or they do not agree.
     """
+    common = _common_depths(tracker, keyframe, track)
+    return _agreed(keyframe, common) if len(common.own) >= MIN_COMMON else None
+
+
+def _common_depths(tracker: Tracker, keyframe: Keyframe, track: Track) -> _Depths:
     anchors = tracker.map.anchors
     own = keyframe.anchor[track.keypoint]
     both = (own >= 0) & ~anchors.from_depth[own] & ~anchors.from_depth[track.anchor]
     z_own = se3.transform(keyframe.T_c_w, anchors.p_w[own[both]])[:, 2]
     z_there = se3.transform(track.T_c_w, anchors.p_w[track.anchor[both]])[:, 2]
     front = (z_own > 0) & (z_there > 0)
-    if front.sum() < MIN_COMMON:
-        return None
-    ratio = np.log(z_there[front] / z_own[front])
+    return _Depths(z_own[front], z_there[front], track.keypoint[both][front])
+
+
+def _agreed(keyframe: Keyframe, common: _Depths) -> tuple[float, float, float] | None:
+    """What the depths say together; None if they do not agree."""
+    ratio = np.log(common.there / common.own)
     middle = float(np.median(ratio))
     agreeing = ratio[np.abs(ratio - middle) <= AGREE_LOG]
     sigma = robust_sigma(ratio - middle) / np.sqrt(len(ratio))
     if len(agreeing) < MIN_AGREEING * len(ratio) or sigma > MAX_SIGMA_LOG:
         return None
-    keypoint = track.keypoint[both][front]
-    bend = _bend(ratio, z_there[front], keyframe.features.uv[keypoint, 0])
+    bend = _bend(ratio, common.there, keyframe.features.uv[common.keypoint, 0])
     return float(np.exp(np.mean(agreeing))), max(sigma, 1e-3), bend
+
+
+def _told(told: Told, keyframe: Keyframe, other: Keyframe) -> tuple[float, float, float] | None:
+    """The same by others than the images, which know of no bend."""
+    found = told(keyframe, other)
+    return None if found is None else (*found, 0.0)
 
 
 def _bend(ratio: FloatArray, depth: FloatArray, u: FloatArray) -> float:

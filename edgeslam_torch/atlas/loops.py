@@ -138,6 +138,16 @@ def is_plausible(slam_map: SlamMap, link: Link, told: Drift | None = None) -> bo
     return near and turn <= MAX_DRIFT_RAD and drift.allows(float(np.log(sim3.scale_of(link.S))))
 
 
+def is_carried(slam_map: SlamMap, link: Link) -> bool:
+    """Whether two pieces can lie to each other as a link says, the newer one of which was begun where the drone's
+    sensors had carried the camera: nothing but their drift and that of the maps on the way is between them."""
+    ids = sorted((link.keyframe.id, link.other.id))
+    centres = np.stack([k.centre_w for id, k in sorted(slam_map.keyframes.items()) if ids[0] <= id <= ids[1]])
+    way = float(np.linalg.norm(np.diff(centres, axis=0), axis=1).sum())
+    shift, turn = _off(link, link.keyframe.T_c_w)
+    return shift * link.depth <= MAX_DRIFT * way + MAX_SHIFT * link.depth and turn <= MAX_DRIFT_RAD
+
+
 def is_within_reach(slam_map: SlamMap, camera: Camera, link: Link) -> bool:
     """Whether what a link says of the drift is so little that the window makes up for it."""
     p_c = se3.transform(link.keyframe.T_c_w, slam_map.anchors.p_w[link.anchor])

@@ -150,6 +150,8 @@ class SlamEyes:
             float(np.arctan2(T_w_b[1, 0], T_w_b[0, 0])),
             home.scale * (home.R @ np.asarray(pose.velocity_w)),
             position_sigma_m=min(sigma, _WIDEST_SIGMA_M),
+            apart_sigma_m=home.scale * health.apart_sigma,
+            piece=output.piece,
             scale_sigma=relative if np.isfinite(relative) else 1.0,
             metric=health.metric,
             tracked=_tracks(output),

@@ -25,6 +25,7 @@ from edgeslam_torch.types import FloatArray
 
 HOME_BECAUSE = "battery low: home"
 CARRIED = "by telemetry alone: the pose rests on no map"
+APART = "to {:.2g} m: what telemetry leaves open between this piece of map and that of the take-off"
 """What an outcome adds where nothing that is seen says so."""
 BEYOND_M = 0.8
 """How far behind an exit it stops."""
@@ -233,8 +234,7 @@ class Navigator:
             return Outcome(False, HOME_BECAUSE, clearance_m, path_m)
         if self.cockpit.ended() is not Phase.DONE:
             return Outcome(False, str(Phase.STUCK), clearance_m, path_m)
-        carried = self.cockpit.sight is not None and not self.cockpit.sight.tracked
-        return Outcome(True, f"{done}, {CARRIED}" if carried else done, clearance_m, path_m)
+        return Outcome(True, done + self._rests_on(), clearance_m, path_m)
 
     def land(self) -> Outcome:
         """Land; reached when the drone says that it stands.
@@ -282,8 +282,16 @@ class Navigator:
     def _in_time(self, outcome: Outcome, until_s: float, why: str) -> Outcome:
         """The outcome with another reason if its task was done before its time was over."""
         early = self.cockpit.sight is not None and self.cockpit.sight.stamp_s < until_s
-        carried = f", {CARRIED}" if outcome.reason.endswith(CARRIED) else ""
-        return replace(outcome, reason=why + carried) if outcome.reached and early else outcome
+        return replace(outcome, reason=why + self._rests_on()) if outcome.reached and early else outcome
+
+    def _rests_on(self) -> str:
+        """What a reached outcome has to say of the pose that it rests on."""
+        sight = self.cockpit.sight
+        if sight is None:
+            return ""
+        if not sight.tracked:
+            return f", {CARRIED}"
+        return f", {APART.format(sight.apart_sigma_m)}" if sight.apart_sigma_m > 0 else ""
 
     def _wants_home(self) -> bool:
         return self.cockpit.last is not None and self.cockpit.last.home

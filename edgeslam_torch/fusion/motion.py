@@ -37,7 +37,7 @@ from edgeslam_torch.fusion.telemetry.alignment import map_to_world
 from edgeslam_torch.fusion.telemetry.comparison import Comparison, FlightSoFar
 from edgeslam_torch.fusion.telemetry.delay import DelaySearch
 from edgeslam_torch.fusion.telemetry.grown import REACH_S, grown
-from edgeslam_torch.fusion.telemetry.local_scale import drift_in_words, scale_around
+from edgeslam_torch.fusion.telemetry.local_scale import drift_in_words, scale_around, scale_of
 from edgeslam_torch.fusion.telemetry.plausibility import HEIGHTS, Trust
 from edgeslam_torch.fusion.telemetry.track import TelemetryTrack
 from edgeslam_torch.fusion.telemetry.unrest import Unrest
@@ -58,6 +58,8 @@ _SURE = 0.15
 sigmas are a third and not more than a half. A scale that is wrong by several times tears the map by them."""
 _TURNED_S = 5.0
 """Time over which the map and the drone's attitude have turned together: maps drift by a degree in it."""
+_USUAL_SIGMA = 0.01
+"""Standard deviation of a visual pose whose own is not known any more [map units, rad]."""
 _AT_ONCE_S = 0.5
 """Time from the first frame in which the first attitude comes if it comes at all: five messages."""
 _STAMPED_S = 0.05
@@ -270,6 +272,16 @@ class MotionFusion:
         moved = self._memory.displacements()
         return scale_around(moved, self._track, stamp_s, self.delay_s, self._R_w_m, self.T_b_c, self.config)
 
+    def scale_along(self, stamps_s: FloatArray, T_w_c: FloatArray) -> ScaleEstimate | None:
+        """Metres per map unit along some frames of the flight, ``(F,)`` and ``(F, 4, 4)``; None where nothing tells."""
+        if self._R_w_m is None or not self._trust.velocity or len(self._track) == 0 or len(stamps_s) == 0:
+            return None
+        length_s = float(stamps_s[-1] - stamps_s[0]) + self.config.window_s
+        memory = VisualMemory(self.config.interval_s, length_s, self.config.max_gap_s)
+        for stamp_s, T in zip(stamps_s.tolist(), T_w_c, strict=True):
+            memory.add(VisualPose(stamp_s, T, _USUAL_SIGMA, _USUAL_SIGMA))
+        return scale_of(memory.displacements(), self._track, self.delay_s, self._R_w_m, self.T_b_c, self.config)
+
     def _settled(self) -> Settled:
         """Opinions that may be averaged."""
         told, depth = self._by_telemetry, self._depth.scale()
@@ -391,18 +403,19 @@ class MotionFusion:
             f"{self._attitude_s - self.began_s:.1f} s after the first picture)"
         )
 
-    def present(self, stamp_s: float, state: str, published: Published) -> Present:
+    def present(self, stamp_s: float, state: str, published: Published, apart_sigma: float = 0.0) -> Present:
         """What is known after a frame: the motion, and the reliability of its metres.
 
         Args:
             stamp_s: Stamp of the frame.
             state: What carries its pose.
             published: What is published of the map.
+            apart_sigma: As in `Health`.
         """
-        health = self.health(stamp_s, state, published.is_metric(self.scale()))
+        health = self.health(stamp_s, state, published.is_metric(self.scale()), apart_sigma)
         return Present(self.snapshot(), published, health.metric, health)
 
-    def health(self, stamp_s: float, state: str, metric: bool) -> Health:
+    def health(self, stamp_s: float, state: str, metric: bool, apart_sigma: float = 0.0) -> Health:
         """Reliability of the metres; arguments as in `present`, and whether the published unit is a metre."""
         sources, delay, scale = self.sources(), self._delay.delay, self.scale()
         doubt = self._settled().warning
@@ -419,6 +432,7 @@ class MotionFusion:
             self._track.battery,
             self.filtering,
             tuple(self._trust.warnings() + [said for said in (doubt, self._drift) if said is not None]),
+            apart_sigma,
         )
 
     def snapshot(self) -> Snapshot | None:

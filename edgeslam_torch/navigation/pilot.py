@@ -16,6 +16,7 @@ from edgeslam_torch.navigation.openings.watch import ExitWatch
 from edgeslam_torch.navigation.route import CostToGo, cost_to_go
 from edgeslam_torch.navigation.sight import HOVER, Sight, Touch, Wish
 from edgeslam_torch.navigation.space import CELL_M, Space
+from edgeslam_torch.navigation.supervisor import CARRIED_SIGMA_M
 from edgeslam_torch.navigation.tasks import Task
 from edgeslam_torch.types import FloatArray
 
@@ -121,6 +122,10 @@ class Pilot:
     """Whether the present look is another one from about the same place, which counts as lack of progress."""
     _doubted_w: FloatArray | None = None
     """``(2,)`` where it doubted what closed its way last."""
+    _piece: int = 0
+    """Piece of map that it is in."""
+    _piece_s: float = -math.inf
+    """When the first picture in it was taken; minus infinity once what was seen before has been forgotten."""
 
     def begin(self, task: Task) -> None:
         """Fly something else from now on."""
@@ -169,6 +174,7 @@ class Pilot:
         elif sight.revision != self._revision:
             self._forget()
         self._revision, self._revised_s = sight.revision, sight.stamp_s
+        self._mind_pieces(sight)
         if math.isnan(self._progress_s):
             self._progress_s = self._updated_s = sight.stamp_s
             if self.phase is Phase.RISING:
@@ -192,6 +198,15 @@ class Pilot:
             self._doubted_w = moved.points(self._doubted_w[None])[0]
         self._plan, self._least = None, math.nan
         self._progress_w = moved.points(self._progress_w[None])[0]
+
+    def _mind_pieces(self, sight: Sight) -> None:
+        """What was seen in other pieces of map counts as long as it is known where they lie to this one."""
+        if sight.piece != self._piece:
+            self._piece, self._piece_s = sight.piece, sight.stamp_s - sight.blind_s
+        if sight.apart_sigma_m > CARRIED_SIGMA_M and self._piece_s > -math.inf:
+            self.space.forget_before(self._piece_s)
+            self._plan, self._least, self._piece_s = None, math.nan, -math.inf
+            self._looked_w = self._doubted_w = None
 
     def _forget(self) -> None:
         """Begin anew: nothing says how what is known relates to the new metres."""

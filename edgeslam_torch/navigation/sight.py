@@ -37,6 +37,10 @@ class Sight:
     velocity_w: FloatArray
     """``(3,)`` [m/s]."""
     position_sigma_m: float = 0.02
+    apart_sigma_m: float = 0.0
+    """Standard deviation of where the piece of map that it is in lies to that of the take-off; 0 in one map."""
+    piece: int = 0
+    """Number of the piece of map."""
     scale_sigma: float = 0.0
     """Relative standard deviation of a metre."""
     metric: bool = True

@@ -128,17 +128,31 @@ class Space:
 
     def rebuild(self, moved: Moved) -> None:
         """Build the grid anew from the views that are remembered, after the map moved."""
-        self._odds[:], self._way[:] = 0.0, 0
         if self._views:
             poses = moved.poses(np.array([view.T_w_c for view in self._views]))
             for k, (view, T_w_c) in enumerate(zip(self._views, poses, strict=True)):
                 self._views[k] = replace(view, T_w_c=T_w_c, depth_m=moved.ratio * view.depth_m)
-                self._add(self._views[k], fills=k >= self._doubted)
         self._touched = moved.points(self._touched)
         flown = moved.points(np.array([p_w for p_w, _ in self._flown]).reshape(-1, 3))
         for k, p_w in enumerate(flown):
             self._flown[k] = p_w, self._flown[k][1]
-            self._pass(*self._flown[k])
+        self._build()
+
+    def forget_before(self, seen_s: float) -> None:
+        """Know no more than what the views since a moment showed."""
+        kept = [view for view in self._views if view.stamp_s >= seen_s]
+        self._doubted = max(0, self._doubted - (len(self._views) - len(kept)))
+        self._views = deque(kept, maxlen=KEPT)
+        self._flown.clear()
+        self._touched = np.zeros((0, 3))
+        self._build()
+
+    def _build(self) -> None:
+        self._odds[:], self._way[:] = 0.0, 0
+        for k, view in enumerate(self._views):
+            self._add(view, fills=k >= self._doubted)
+        for p_w, radius_m in self._flown:
+            self._pass(p_w, radius_m)
 
     def doubt_solids(self) -> None:
         """What was seen to be solid is as good as unseen until it is seen again; what is free stays free, and where

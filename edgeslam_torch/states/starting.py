@@ -101,6 +101,7 @@ class Starting:
             system.mapping.look(frame, keyframe)
         guess = self._guess_depth(keyframe)
         slam_map.begin_piece(reason)
+        system.carried_to(slam_map.piece, frame.stamp_s)
         system.fusion.begin_piece()
         colour = colours_at(keyframe.image, view.features.uv)
         self._seen = [(frame.index, view)]

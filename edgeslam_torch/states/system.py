@@ -18,6 +18,7 @@ from edgeslam_torch.map.trajectory import TrajectoryLog
 from edgeslam_torch.mapping.edge_map import EdgeMap
 from edgeslam_torch.mapping.pipeline import Mapped, MappingPipeline
 from edgeslam_torch.stage_times import timed
+from edgeslam_torch.states.apart import Apart
 from edgeslam_torch.tracking.expectation import Attitude, Expectation, Place, Told, Vertical
 from edgeslam_torch.tracking.motion_model import MotionModel
 from edgeslam_torch.tracking.relocaliser import Reach, reach_after
@@ -61,6 +62,9 @@ class System:
     has_telemetry: bool = False
     piece_began_s: float = -np.inf
     """Stamp of the frame with which the newest piece of map began."""
+    apart: Apart = field(default_factory=Apart)
+    apart_sigma: float = 0.0
+    """As in `Health`, of the newest tracked frame."""
     keyframe_s: float = -np.inf
     """Stamp of the newest keyframe, or of a later frame that needed not become one."""
     shows_nothing_new: bool = False
@@ -127,12 +131,29 @@ class System:
         with self.timed("fusion"):
             self.fusion.add_visual(stamp_s, T_w_c, *_sigmas(track))
             self.published = self.fusion.republished(self.published, T_w_c[:3, 3])
+        if self.apart.begun:
+            self.apart_sigma = self._apart_sigma(self.map.piece_of(self.log.records[-1].keyframe_id))
 
     def see_again(self, since_s: float, track: Track) -> None:
         """Pass the logged frames since a stamp, which a map supports now, to the fusion, as sure as ``track``."""
         stamps_s, T_w_c = self.log.poses(since_s)
         with self.timed("fusion"):
             self.fusion.add_earlier(stamps_s, T_w_c, *_sigmas(track))
+
+    def carried_to(self, piece: int, stamp_s: float) -> None:
+        """A piece of map begins at the current pose, where prediction has carried the camera."""
+        earlier = (self.map.piece_of(r.keyframe_id) for r in reversed(self.log.records))
+        before, told = next((p for p in earlier if p != piece), None), self.fusion.predict(stamp_s)
+        if before is not None:
+            sigma_t, sigma_r = (np.inf, np.inf) if told is None else (told.sigma_t, told.sigma_r_rad)
+            self.apart.begin(piece, before, se3.inverse(self.motion.T_c_w)[:3, 3], sigma_t, sigma_r)
+            self.apart_sigma = self._apart_sigma(piece)
+
+    def _apart_sigma(self, piece: int) -> float:
+        if piece == self.map.piece_of(self.log.records[0].keyframe_id):
+            return 0.0
+        scale, centre = self.fusion.scale(), se3.inverse(self.motion.T_c_w)[:3, 3]
+        return self.published.scale * self.apart.sigma(piece, centre, scale.sigma / scale.value)
 
     # -- keyframes ---------------------------------------------------------------------------------------------
 

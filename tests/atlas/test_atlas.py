@@ -29,7 +29,7 @@ MISPLACED = sim3.exp(np.array([0.5, -0.8, 0.3, 0.4, -0.3, 0.6, np.log(1.4)]))
 class Pieces:
     """Views 0 to 3 in one piece, 4 to 7 in another, which has anchors of its own and lies elsewhere."""
 
-    def __init__(self, rng, same_place=True, noise_px=0.3):
+    def __init__(self, rng, same_place=True, noise_px=0.3, misplaced=MISPLACED):
         points = self.points = PointMap(rng, 1200, 8, noise_px)
         self.map = points.map
         self.map.begin_piece("first")
@@ -41,7 +41,7 @@ class Pieces:
         known = np.unique(np.concatenate(points.point_of[4:]))
         anchor_of = np.full(len(points.world.p_w), -1)
         anchor_of[known] = self.map.anchors.add(
-            sim3.transform(MISPLACED, points.world.p_w[known]),
+            sim3.transform(misplaced, points.world.p_w[known]),
             words(points.descriptors[known]),
             4,
             False,
@@ -49,7 +49,7 @@ class Pieces:
         )
         for keyframe, seen in zip(later, points.point_of[4:], strict=True):
             keyframe.words = words(points.descriptors[seen])
-            keyframe.T_c_w = sim3.moved_camera(MISPLACED, keyframe.T_c_w)
+            keyframe.T_c_w = sim3.moved_camera(misplaced, keyframe.T_c_w)
             keyframe.anchor[:] = anchor_of[seen]
             self.map.add_keyframe(keyframe)
         self.map.refresh_anchors(anchor_of[known])
@@ -60,8 +60,8 @@ class Pieces:
         for keyframe in self.keyframes:
             self.log.append(keyframe.frame_index, keyframe.stamp_s, keyframe.id, keyframe.T_c_w, True)
 
-    def atlas(self):
-        return Atlas(self.tracker, self.edges, self.log, LmConfig(diagnostics=False))
+    def atlas(self, **told):
+        return Atlas(self.tracker, self.edges, self.log, LmConfig(diagnostics=False), **told)
 
     def position_error(self):
         """RMSE of all keyframes after Sim(3) alignment."""
@@ -297,6 +297,67 @@ def test_guessed_depths_tell_no_scale(rng, guessed_there):
     track = match_keyframe(pieces.tracker, view_of(keyframe, SCALE_FACTOR), pieces.keyframes[3])
     anchors.from_depth[track.anchor if guessed_there else keyframe.anchor[keyframe.anchor >= 0]] = True
     assert common_scale(pieces.tracker, keyframe, track) is None
+
+
+CARRIED = sim3.exp(np.array([0.02, -0.03, 0.01, 0.01, -0.02, 0.02, np.log(1.06)]))
+"""The same of a piece that began where the drone's sensors had carried the camera."""
+
+
+def turning(rng, misplaced):
+    """A second piece whose depths are all the network's: the drone has turned on the spot."""
+    pieces = Pieces(rng, misplaced=misplaced)
+    anchors, host = pieces.map.anchors, pieces.keyframes[4]
+    ids = pieces.map.anchors_seen_by(pieces.keyframes[4:])
+    inverse_depth = 1.0 / se3.transform(host.T_c_w, anchors.p_w[ids])[:, 2]
+    anchors.from_depth[ids] = True
+    anchors.rest_on_prior(ids, host.id, host.centre_w, np.column_stack([inverse_depth, 0.05 * inverse_depth]))
+    return pieces
+
+
+def metres_along(second):
+    """Metres per unit of either piece, by the stamps of its frames: 2 of the first, to 2 %."""
+
+    def told(stamps_s, T_w_c):
+        value = 2.0 if len(stamps_s) and stamps_s[0] == 0.0 else second
+        return ScaleEstimate(value, 0.02 * value, "telemetry")
+
+    return told
+
+
+def test_where_images_tell_no_scale_the_drones_own_sensors_do(rng):
+    pieces = turning(rng, CARRIED)
+    keyframe, other = pieces.keyframes[4], pieces.keyframes[3]
+    assert link(pieces.tracker, keyframe, other) is None
+    found = link(pieces.tracker, keyframe, other, told=lambda *_: (1 / 1.06, 0.03))
+    error = sim3.log(found.S @ CARRIED)
+    assert np.abs(error[:6]).max() < 0.03 and abs(error[6]) < 0.001
+    assert (found.by_images, found.sigma_log) == (False, 0.03)
+    assert link(pieces.tracker, keyframe, other, told=lambda *_: None) is None
+
+
+def test_wallpaper_is_no_place_whose_scale_is_told(rng, monkeypatch):
+    pieces = turning(rng, CARRIED)
+    place = links._place
+    monkeypatch.setattr(links, "_place", lambda *args: replace(place(*args), share=0.16))
+    monkeypatch.setattr(links, "on_one_plane", lambda *_: False)
+    assert link(pieces.tracker, pieces.keyframes[4], pieces.keyframes[3], told=lambda *_: (1 / 1.06, 0.03)) is None
+
+
+def test_a_drone_that_turned_on_the_spot_joins_the_map_of_its_take_off(rng):
+    assert turning(rng, CARRIED).atlas().update() is None
+    pieces = turning(rng, CARRIED)
+    join = pieces.atlas(metres_along=metres_along(2.0 / 1.06)).update()
+    assert (join.piece, join.absorbed) == (0, 1)
+    assert sim3.scale_of(join.S) == pytest.approx(1 / 1.06 if join.moved == 1 else 1.06, rel=1e-6)
+    assert join.sigma_log == pytest.approx(0.02 * np.sqrt(2.0))
+    check_map(pieces.map)
+    assert pieces.position_error() < 0.02
+
+
+def test_a_piece_that_no_sensor_has_carried_there_is_not_joined_by_told_metres(rng):
+    """Half a metre and forty degrees off after a way of centimetres: nothing drifts so."""
+    pieces = turning(rng, MISPLACED)
+    assert pieces.atlas(metres_along=metres_along(2.0 / 1.4)).update() is None
 
 
 def test_the_way_back_must_close(rng):

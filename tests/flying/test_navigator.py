@@ -8,7 +8,7 @@ import pytest
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.flying.cockpit import Cockpit
 from edgeslam_torch.flying.errands import Stay
-from edgeslam_torch.flying.navigator import CARRIED, Navigator
+from edgeslam_torch.flying.navigator import APART, CARRIED, Navigator
 from edgeslam_torch.flying.outcome import FlightRefused
 from edgeslam_torch.geometry.camera import PRESETS
 from edgeslam_torch.geometry.mount import camera_on_body
@@ -90,11 +90,19 @@ def navigator(allow_motion=True, **craft):
     return Navigator(ObedientCraft(cockpit, **craft), cockpit, allow_motion)
 
 
-@pytest.mark.parametrize(("tracked", "reason"), [(True, "home"), (False, f"home, {CARRIED}")])
-def test_an_outcome_says_what_it_rests_on(tracked, reason):
+@pytest.mark.parametrize(
+    ("tracked", "apart_m", "reason"),
+    [
+        (True, 0.0, "home"),
+        (False, 0.0, f"home, {CARRIED}"),
+        (False, 0.3, f"home, {CARRIED}"),
+        (True, 0.31, f"home, {APART.format(0.31)}"),
+    ],
+)
+def test_an_outcome_says_what_it_rests_on(tracked, apart_m, reason):
     nav = navigator()
     nav.craft.flying, nav.craft.fly = True, lambda until: None
-    nav.cockpit.sight = Sight(9.0, np.zeros(3), 0.0, np.zeros(3), tracked=tracked)
+    nav.cockpit.sight = Sight(9.0, np.zeros(3), 0.0, np.zeros(3), tracked=tracked, apart_sigma_m=apart_m)
     nav.cockpit.ended = lambda: Phase.DONE
     outcome = nav.fly(Stay(), "home")
     assert (outcome.reached, outcome.reason) == (True, reason)

@@ -57,3 +57,19 @@ def test_nothing_is_told_without_telemetry_or_before_the_flight(rng, swinging):
     fusion, _ = flown(rng, swinging, 1.0, 12.0)
     assert fusion.scale_around(-100.0) is None
     assert fusion.scale_around(-np.inf) is None
+
+
+def test_some_frames_of_a_flight_have_a_scale_of_their_own(rng, swinging):
+    """Whatever is remembered of them: a piece of map may be older than the displacements that are kept."""
+    fusion, _ = flown(rng, swinging, GROWN)
+    motion = swinging(34.0, 12.0)
+    early = motion.stamps_s < 11.0
+    T_m_c = motion.T_w_c[early].copy()
+    T_m_c[:, :3, 3] /= 0.7
+    told = fusion.scale_along(motion.stamps_s[early], T_m_c)
+    assert told is not None
+    assert told.value == pytest.approx(0.7, rel=0.05)
+    assert abs(told.value - 0.7) < 3.0 * told.sigma
+    assert fusion.scale_along(motion.stamps_s[:0], T_m_c[:0]) is None
+    assert fusion.scale_along(motion.stamps_s[early] + 1e3, T_m_c) is None
+    assert MotionFusion(FusionConfig(), T_B_C).scale_along(motion.stamps_s[early], T_m_c) is None

@@ -151,6 +151,10 @@ def test_no_look_without_metres():
     assert not ExitWatch().due(sight(0.0, metric=False)) and not ExitWatch().due(sight(0.0, tracked=False))
 
 
+def test_no_look_counts_in_a_piece_of_map_that_may_lie_elsewhere():
+    assert ExitWatch().due(sight(0.0, apart_sigma_m=0.1)) and not ExitWatch().due(sight(0.0, apart_sigma_m=0.13))
+
+
 @pytest.mark.parametrize("angle", ANGLES)
 @pytest.mark.parametrize("width", [1.2, 2.2])
 def test_a_corridor_is_a_pathway(angle, width):

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from views import facing_a_wall
 
 from edgeslam_torch.drone.emulator.drone import DroneModel
 from edgeslam_torch.navigation.arcs import candidates, flown
@@ -358,6 +359,26 @@ def test_a_map_that_moves_is_no_progress():
         if pilot.phase is Phase.RISING:
             pilot.phase = Phase.FLYING
     assert pilot._doubted_w is not None
+
+
+@pytest.mark.parametrize(("apart_m", "forgotten"), [(0.1, False), (0.13, True)])
+def test_what_another_piece_of_map_showed_is_forgotten_when_it_may_lie_elsewhere(apart_m, forgotten):
+    """A door that may be a quarter of a metre beside where it was seen is none to fly through."""
+    pilot = before_a_free_way()
+
+    def see(stamp_s, yaw_rad, **piece):
+        seen_s = stamp_s - 0.4
+        view = replace(facing_a_wall(yaw=yaw_rad), stamp_s=seen_s)
+        pilot.update(replace(at(0.0, 0.0, stamp_s=stamp_s, **piece), seen_s=seen_s, view=view))
+
+    for k in range(4):
+        see(1.0 + k / 5, -math.pi / 2)
+    for k in range(4):
+        see(3.0 + k / 5, math.pi / 2, piece=1, apart_sigma_m=0.03)
+    see(5.0, math.pi / 2, piece=1, apart_sigma_m=apart_m)
+    layer = pilot.walls().layer
+    old, new = (bool(layer.free[tuple(layer.cells(np.array([0.05, y])))]) for y in (-1.55, 1.55))
+    assert (old, new) == (not forgotten, True)
 
 
 def test_it_does_not_rise_for_a_view_that_a_lost_pose_cannot_give():

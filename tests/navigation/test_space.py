@@ -1,25 +1,14 @@
 """Free space from depth: what is before a wall, the wall, and what nobody has seen."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from views import K, facing_a_wall
 
-from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.navigation.moved import Moved
-from edgeslam_torch.navigation.sight import Touch, View
+from edgeslam_torch.navigation.sight import Touch
 from edgeslam_torch.navigation.space import Space
-
-K = np.array([[77.0, 0.0, 39.5], [0.0, 77.0, 29.5], [0.0, 0.0, 1.0]])
-
-
-def facing_a_wall(distance_m=2.0, sigma=0.01, x=0.0, yaw=0.0, height_m=1.15):
-    """A level camera that sees a wall across its optical axis."""
-    T = camera_on_body(0.0, 0.0)
-    turn = np.eye(4)
-    turn[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
-    T = turn @ T
-    T[:3, 3] = [x, 0.0, height_m]
-    depth = np.full((60, 80), distance_m, np.float32)
-    return View(0.0, depth, np.full((60, 80), sigma, np.float32), K, T)
 
 
 def seen(space, times=3, **view):
@@ -234,3 +223,18 @@ def test_where_it_flew_is_known_as_the_grid_and_the_map_move():
     space.rebuild(Moved(np.eye(4)[None], np.eye(4)[None], 2.0))
     assert space.was_at(places).tolist() == [True, False, True, True]
     assert not space.was_at(np.array([50.0, 0.0]))
+
+
+def test_what_was_seen_and_felt_before_a_moment_can_be_forgotten():
+    space = Space()
+    for stamp_s, yaw in ((1.0, 0.0), (1.2, 0.0), (1.4, 0.0), (5.0, np.pi / 2), (5.2, np.pi / 2), (5.4, np.pi / 2)):
+        space.observe(replace(facing_a_wall(yaw=yaw), stamp_s=stamp_s))
+    space.flown(np.array([-3.0, 0.0, 1.15]), 0.3)
+    space.touched(Touch(np.array([0.0, -2.0, 1.15]), np.array([0.0, -1.0])), 0.3)
+    layer = space.layer(1.15, 0.15)
+    assert cell(layer, 1.55, 0.05)[0] and cell(layer, 0.05, 1.55)[0] and cell(layer, -3.0, 0.0)[0]
+    space.forget_before(5.0)
+    layer = space.layer(1.15, 0.15)
+    assert cell(layer, 0.05, 1.55) == (True, False)
+    for x, y in ((1.55, 0.05), (2.05, 0.05), (-3.0, 0.0), (0.0, -2.3)):
+        assert cell(layer, x, y) == (False, False)

@@ -48,7 +48,19 @@ def scale_around(
         config: Noise of velocities, and the least speed that tells.
     """
     near = (moved.from_s >= stamp_s - AROUND_S) & (moved.to_s <= stamp_s + AROUND_S)
-    moved = moved.only(near).on_telemetry_clock(delay_s)
+    return scale_of(moved.only(near), track, delay_s, R_w_m, T_b_c, config)
+
+
+def scale_of(
+    moved: Displacements,
+    track: TelemetryTrack,
+    delay_s: float,
+    R_w_m: FloatArray,
+    T_b_c: FloatArray,
+    config: FusionConfig,
+) -> ScaleEstimate | None:
+    """Metres per map unit by some displacements; arguments as for `scale_around`."""
+    moved = moved.on_telemetry_clock(delay_s)
     moved = moved.only(track.covered(moved.from_s, moved.to_s))
     if not len(moved):
         return None

@@ -12,6 +12,7 @@ from edgeslam_torch.navigation.openings.detour import has_detour
 from edgeslam_torch.navigation.openings.exits import WIDEST_M, Gap, gaps
 from edgeslam_torch.navigation.openings.turned import Walls
 from edgeslam_torch.navigation.sight import Sight
+from edgeslam_torch.navigation.supervisor import CARRIED_SIGMA_M
 from edgeslam_torch.types import FloatArray
 
 _EVERY_S = 0.5
@@ -72,8 +73,10 @@ class ExitWatch:
     _looked_s: float = -math.inf
 
     def due(self, sight: Sight) -> bool:
-        """Whether it is time for another look."""
-        return sight.metric and sight.tracked and sight.stamp_s - self._looked_s >= _EVERY_S
+        """Whether it is time for another look. In a piece of map that may lie half a hull elsewhere none counts, for or
+        against what was found."""
+        placed = sight.metric and sight.tracked and sight.apart_sigma_m <= CARRIED_SIGMA_M
+        return placed and sight.stamp_s - self._looked_s >= _EVERY_S
 
     def look(self, walls: Walls, sight: Sight) -> None:
         """Compare what the grid shows now with what it showed before."""

@@ -30,6 +30,8 @@ from edgeslam_torch.types import FloatArray
 TICK_S = 1.0 / 15.0
 _APART_S = 1.0
 """Touches nearer in time belong to one event: the body bounces every 10 ms while something pushes it."""
+_SIGMAS, _NO_HARM_M = 3.0, 0.1
+"""Error of a pose that is more than is said, and more than the hull's own size."""
 _FREE_M = 0.6
 """Clearance from which cruising is free."""
 
@@ -70,6 +72,20 @@ def fly(case: Case, limits: NavLimits | None = None) -> Flown:
     found.exits = [len(site.exits), len(known), right_exits(known, site)]
     found.near = [eyes.counts.sectors, eyes.counts.too_far, eyes.counts.surely_too_far]
     return found
+
+
+def is_beyond(sight: Sight, p_w: FloatArray) -> bool:
+    """Whether a pose is farther from the truth than all that is said of it allows: of the pose itself, of where its
+    piece of map lies, and of the metres from the take-off.
+
+    Example:
+        >>> sight = Sight(0.0, np.array([3.2, 0.0, 1.0]), 0.0, np.zeros(3), scale_sigma=0.02)
+        >>> is_beyond(sight, np.array([3.0, 0.0, 1.0])), is_beyond(sight, np.array([2.9, 0.0, 1.0]))
+        (False, True)
+    """
+    way = sight.scale_sigma * float(np.linalg.norm(sight.p_w[:2]))
+    sigma = float(np.linalg.norm([sight.position_sigma_m, sight.apart_sigma_m, way]))
+    return float(np.linalg.norm(sight.p_w[:2] - p_w[:2])) > _SIGMAS * sigma + _NO_HARM_M
 
 
 class _Errand:
@@ -120,6 +136,10 @@ def _fly(
         if drone.mode is Mode.GROUND and tello.clock_s > 2.0:
             break
         sight = eyes.sight(tello.clock_s, events)
+        if sight.metric:
+            found.off[0] += 1
+            found.off[1] += is_beyond(sight, drone.p_w)
+            found.off_m = max(found.off_m, float(np.linalg.norm(sight.p_w[:2] - drone.p_w[:2])))
         if drone.mode is not Mode.FLYING or landing:
             continue
         began = time.process_time()

@@ -50,6 +50,10 @@ class Flown:
     cpu_worst_ms: float = 0.0
     near: list[int] = field(default_factory=lambda: [0, 0, 0])
     """Sectors with something at .3 to 1 m; of them told .3 m too far; even at two sigmas (`near_counts`)."""
+    off: list[int] = field(default_factory=lambda: [0, 0])
+    """Moments with metres; of them, those with a pose that is farther off than it says (`is_beyond`)."""
+    off_m: float = 0.0
+    """Level error of the pose, at most, in moments with metres."""
     dangers: tuple[str, ...] = ()
     """What the supervisor met."""
     track_w: list[list[float]] = field(default_factory=list)

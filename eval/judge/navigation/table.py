@@ -17,8 +17,10 @@ NEAR_HEAD = (
     "\n| eyes | sectors of 3.7 degrees with something at .3 to 1 m | told more than .3 m too far | less two sigmas |\n"
     "|---|---|---|---|\n"
 )
-
-
+OFF_HEAD = (
+    "\n| eyes | moments with metres | pose more than .1 m beyond three of its sigmas | flights in which it was "
+    "| error at most, median and worst [m] |\n|---|---|---|---|---|\n"
+)
 EXITS_HEAD = "\n| behaviour | eyes | exits there | found | precision | recall |\n|---|---|---|---|---|---|\n"
 
 
@@ -50,7 +52,7 @@ def markdown(flights: Sequence[Flown]) -> str:
         if len({(f.case.world, f.case.fault) for f in group}) > 1:
             eyes, behaviour = (", ".join(sorted({getattr(f.case, k) for f in group})) for k in ("eyes", "behaviour"))
             rows.append(_row((name, "none" if group is plain else "any", behaviour, eyes), group))
-    return HEAD + "".join(rows) + _exits(flights) + _near(flights)
+    return HEAD + "".join(rows) + _exits(flights) + _near(flights) + _off(flights)
 
 
 def _exits(flights: Sequence[Flown]) -> str:
@@ -73,6 +75,21 @@ def _near(flights: Sequence[Flown]) -> str:
         if sectors:
             rows.append(f"| {eyes} | {sectors} | {100 * too_far / sectors:.1f} % | {100 * surely / sectors:.1f} % |\n")
     return NEAR_HEAD + "".join(rows) if rows else ""
+
+
+def _off(flights: Sequence[Flown]) -> str:
+    """A third table, of poses that are farther off than they say; nothing where no flight had metres."""
+    rows = []
+    for eyes in sorted({f.case.eyes for f in flights}):
+        group = [f for f in flights if f.case.eyes == eyes and f.off[0]]
+        if group:
+            moments, beyond = np.sum([f.off for f in group], axis=0).tolist()
+            worst = [f.off_m for f in group]
+            rows.append(
+                f"| {eyes} | {moments} | {100 * beyond / moments:.1f} % | {sum(f.off[1] > 0 for f in group)} of "
+                f"{len(group)} | {np.median(worst):.2f}, {max(worst):.2f} |\n"
+            )
+    return OFF_HEAD + "".join(rows) if rows else ""
 
 
 def _row(names: tuple[str, ...], group: Sequence[Flown]) -> str:

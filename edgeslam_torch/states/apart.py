@@ -1,0 +1,67 @@
+"""How well it is known where a piece of map lies that was begun where the camera had been carried to without a map.
+
+Poses of different pieces are unrelated as far as images go. The drone's sensors, or constant velocity, relate them: by
+the predicted pose with which a piece begins, in the unit that its depths were guessed in. What that leaves open stays
+until both pieces are found to be one.
+"""
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from edgeslam_torch.types import FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class _Begun:
+    centre: FloatArray
+    """``(3,)`` of the camera [map units]."""
+    sigma_t: float
+    """Standard deviation of it per axis [map units], that of the piece before included."""
+    sigma_r_rad: float
+
+
+@dataclass(slots=True)
+class Apart:
+    """What is known of the pieces that began after the flight's first one, by their numbers."""
+
+    begun: dict[int, _Begun] = field(default_factory=dict)
+
+    def begin(self, piece: int, before: int, centre: FloatArray, sigma_t: float, sigma_r_rad: float) -> None:
+        """A piece begins at a predicted pose.
+
+        Args:
+            piece: Its number.
+            before: Number of the piece that the prediction starts from.
+            centre: Camera ``(3,)`` [map units].
+            sigma_t: Standard deviation of the prediction's translation per axis [map units].
+            sigma_r_rad: The same of its rotation.
+        """
+        earlier = self.begun.get(before)
+        if earlier is not None:
+            sigma_t = math.hypot(sigma_t, self.sigma(before, centre, 0.0))
+            sigma_r_rad = math.hypot(sigma_r_rad, earlier.sigma_r_rad)
+        self.begun[piece] = _Begun(np.array(centre, dtype=np.float64), sigma_t, sigma_r_rad)
+
+    def sigma(self, piece: int, centre: FloatArray, sigma_scale: float) -> float:
+        """Standard deviation per axis [map units] of a camera of a piece in the world of the first one; infinite for
+        one that nothing relates to it, as that of an earlier flight.
+
+        Args:
+            piece: Number of the piece as the map is now: pieces that were joined have the lower of their numbers.
+            centre: The camera ``(3,)`` [map units].
+            sigma_scale: Relative standard deviation of a piece's unit.
+
+        Example:
+            >>> apart = Apart()
+            >>> apart.begin(1, 0, np.zeros(3), 0.1, 0.02)
+            >>> round(apart.sigma(1, np.array([3.0, 0, 0]), 0.0), 3)
+            0.117
+        """
+        begun = self.begun.get(piece)
+        if begun is None:
+            return math.inf
+        way = float(np.linalg.norm(centre - begun.centre))
+        # Both pieces have a unit of their own.
+        return math.hypot(begun.sigma_t, way * begun.sigma_r_rad, way * math.sqrt(2.0) * sigma_scale)

@@ -1,0 +1,19 @@
+"""Depth maps as a pilot is told of them."""
+
+import numpy as np
+
+from edgeslam_torch.geometry.mount import camera_on_body
+from edgeslam_torch.navigation.sight import View
+
+K = np.array([[77.0, 0.0, 39.5], [0.0, 77.0, 29.5], [0.0, 0.0, 1.0]])
+
+
+def facing_a_wall(distance_m=2.0, sigma=0.01, x=0.0, yaw=0.0, height_m=1.15):
+    """A level camera that sees a wall across its optical axis."""
+    T = camera_on_body(0.0, 0.0)
+    turn = np.eye(4)
+    turn[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
+    T = turn @ T
+    T[:3, 3] = [x, 0.0, height_m]
+    depth = np.full((60, 80), distance_m, np.float32)
+    return View(0.0, depth, np.full((60, 80), sigma, np.float32), K, T)
