@@ -21,6 +21,8 @@ from edgeslam_torch.atlas.loops import (
     spread,
 )
 from edgeslam_torch.atlas.places import MIN_VOTES, lookalikes
+from edgeslam_torch.atlas.unit import AGAIN_S as UNIT_AGAIN_S
+from edgeslam_torch.atlas.unit import Rescaled, about, is_other
 from edgeslam_torch.atlas.weld import look_around, move_piece, share_anchors, weld
 from edgeslam_torch.geometry import sim3
 from edgeslam_torch.map.keyframe import NO_ANCHOR, Keyframe
@@ -127,6 +129,8 @@ class Atlas:
         """Stamp at which the last of them was."""
         self._looked_back_s = -np.inf
         """Stamp of the newest keyframe that was asked for a loop."""
+        self._unit_s = -np.inf
+        """Stamp at which the unit of the camera's piece was last compared."""
 
     def strangers(self, piece: int) -> list[Keyframe]:
         """Keyframes of other pieces that have something to be recognised by."""
@@ -202,7 +206,7 @@ class Atlas:
     def _link(self, keyframe: Keyframe, other: Keyframe) -> Link | None:
         """A link that may be true: within a piece, places that look alike and are far apart are not one."""
         if self.map.piece_of(keyframe.id) != self.map.piece_of(other.id):
-            found = link(self.tracker, keyframe, other, told=self._size_told)
+            found = link(self.tracker, keyframe, other, told=self._size_between)
             if found is None or found.by_images or is_carried(self.map, found):
                 return found
             return None
@@ -212,9 +216,33 @@ class Atlas:
         told = drift_told(*(self.metres(k.stamp_s) for k in (keyframe, other)))
         return found if is_plausible(self.map, found, told) else None
 
-    def _size_told(self, keyframe: Keyframe, other: Keyframe) -> tuple[float, float] | None:
-        """Size of another keyframe's piece relative to a keyframe's own, by the metres along the frames of either."""
-        here, there = (self._metres_of(self.map.piece_of(k.id)) for k in (keyframe, other))
+    def rescale(self, stamp_s: float) -> Rescaled | None:
+        """Bring the camera's piece to the unit of the flight's first one, if the drone's sensors tell another.
+
+        The map must belong to the caller.
+        """
+        records = self.log.records
+        if not records or stamp_s - self._unit_s < UNIT_AGAIN_S:
+            return None
+        first, piece = (self.map.piece_of(records[k].keyframe_id) for k in (0, -1))
+        if piece == first or piece in self.known_scale:
+            return None
+        self._unit_s = stamp_s
+        told = self._size_told(piece, first)
+        if told is None or not is_other(*told):
+            return None
+        began = min(k.id for k in self.map.keyframes.values() if self.map.piece_of(k.id) == piece)
+        S = about(self.map.keyframes[began].centre_w, told[0])
+        move_piece(self.map, self.edges, self.log, piece, S)
+        self._links = []  # their similarities hold for pieces as they were
+        return Rescaled(stamp_s, piece, S, told[1])
+
+    def _size_between(self, keyframe: Keyframe, other: Keyframe) -> tuple[float, float] | None:
+        return self._size_told(*(self.map.piece_of(k.id) for k in (keyframe, other)))
+
+    def _size_told(self, piece: int, other: int) -> tuple[float, float] | None:
+        """Size of another piece relative to a piece, by the metres along the frames of either."""
+        here, there = self._metres_of(piece), self._metres_of(other)
         if here is None or there is None:
             return None
         sigma = float(np.hypot(here.sigma / here.value, there.sigma / there.value))

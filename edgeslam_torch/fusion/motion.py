@@ -269,8 +269,8 @@ class MotionFusion:
         """Metres per map unit within seconds of an earlier frame, in the map as it is now; None where nothing tells."""
         if self._R_w_m is None or not self._trust.velocity or len(self._track) == 0:
             return None
-        moved = self._memory.displacements()
-        return scale_around(moved, self._track, stamp_s, self.delay_s, self._R_w_m, self.T_b_c, self.config)
+        moved, low = self._memory.displacements(), self._fit.shortfall_m_s
+        return scale_around(moved, self._track, stamp_s, self.delay_s, self._R_w_m, self.T_b_c, self.config, low)
 
     def scale_along(self, stamps_s: FloatArray, T_w_c: FloatArray) -> ScaleEstimate | None:
         """Metres per map unit along some frames of the flight, ``(F,)`` and ``(F, 4, 4)``; None where nothing tells."""
@@ -280,7 +280,13 @@ class MotionFusion:
         memory = VisualMemory(self.config.interval_s, length_s, self.config.max_gap_s)
         for stamp_s, T in zip(stamps_s.tolist(), T_w_c, strict=True):
             memory.add(VisualPose(stamp_s, T, _USUAL_SIGMA, _USUAL_SIGMA))
-        return scale_of(memory.displacements(), self._track, self.delay_s, self._R_w_m, self.T_b_c, self.config)
+        moved, low = memory.displacements(), self._fit.shortfall_m_s
+        return scale_of(moved, self._track, self.delay_s, self._R_w_m, self.T_b_c, self.config, low)
+
+    def network_unit(self) -> float | None:
+        """The depth network's metres per map unit, right or wrong; None before anything has been compared."""
+        depth = self._depth.scale()
+        return None if depth is None else math.exp(depth.log_scale)
 
     def _settled(self) -> Settled:
         """Opinions that may be averaged."""

@@ -63,5 +63,7 @@ class Apart:
         if begun is None:
             return math.inf
         way = float(np.linalg.norm(centre - begun.centre))
+        if way == 0.0:
+            return begun.sigma_t
         # Both pieces have a unit of their own.
         return math.hypot(begun.sigma_t, way * begun.sigma_r_rad, way * math.sqrt(2.0) * sigma_scale)

@@ -7,9 +7,14 @@ import numpy as np
 
 from edgeslam_torch.atlas.atlas import Atlas, Join
 from edgeslam_torch.atlas.loops import Closure
+from edgeslam_torch.atlas.unit import Rescaled
 from edgeslam_torch.fusion.published import Published
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.states.system import System
+from edgeslam_torch.types import FloatArray
+
+_COUNTED: dict[type, str] = {Join: "joined", Closure: "loops_closed", Rescaled: "rescaled"}
+"""Names of the events of the summary."""
 
 
 class Joining:
@@ -31,9 +36,13 @@ class Joining:
         """
         if self.system.mapping.busy:
             return ""
+        words = []
         if len(self.system.map.begun) > 1:
             self._notice_return()
-        words = []
+            before = self._last()
+            if (rescaled := self.atlas.rescale(stamp_s)) is not None:
+                self._follow(rescaled, *before)
+                words.append(rescaled.in_words())
         while (change := self._once(stamp_s)) is not None:
             words.append(change.in_words())
         return "; ".join(words)
@@ -67,15 +76,23 @@ class Joining:
             self.atlas.ask_all_again()
         self.update()
 
+    def _last(self) -> tuple[int, int, FloatArray]:
+        """Keyframe that the newest frame is tied to, its piece, and its pose."""
+        last = self.system.log.records[-1].keyframe_id
+        return last, self.system.map.piece_of(last), self.system.map.pose_of(last)
+
     def _once(self, stamp_s: float) -> Join | Closure | None:
-        system = self.system
-        if self.atlas.is_up_to_date or not system.log.records:
+        if self.atlas.is_up_to_date or not self.system.log.records:
             return None
-        last = system.log.records[-1].keyframe_id
-        piece, T_k_w = system.map.piece_of(last), system.map.pose_of(last)
+        before = self._last()
         change = self.atlas.update(stamp_s)
-        if change is None:
-            return None
+        if change is not None:
+            self._follow(change, *before)
+        return change
+
+    def _follow(self, change: Join | Closure | Rescaled, last: int, piece: int, T_k_w: FloatArray) -> None:
+        """Take the live pose and the metres along with a map that has changed since the newest frame was tied to it."""
+        system = self.system
         T_c_k = system.motion.T_c_w @ se3.inverse(T_k_w)
         scale = change.growth(piece, last)
         T_c_k[:3, 3] *= scale
@@ -84,6 +101,5 @@ class Joining:
         system.fusion.revise(*system.log.poses())
         # Poses published before belong to a map that has moved since.
         system.published = replace(system.published, revision=system.published.revision + 1)
-        kind = "joined" if isinstance(change, Join) else "loops_closed"
+        kind = _COUNTED[type(change)]
         system.events[kind] = system.events.get(kind, 0) + 1
-        return change

@@ -217,7 +217,9 @@ class Starting:
         if keyframe.depth is not None and keyframe.depth.is_relative:  # its shape alone
             guess[:, 0] = self._earlier_depth() * np.where(known, network_m, 1.0) / np.median(network_m[known])
             return guess
-        guess[:, 0] = np.where(known, network_m, np.nanmedian(network_m)) / self.system.published.scale
+        # A network that is wrong here was as wrong before: the new piece gets the unit of the one that was lost.
+        per_unit = self.system.fusion.network_unit() or self.system.published.scale
+        guess[:, 0] = np.where(known, network_m, np.nanmedian(network_m)) / per_unit
         guess[known, 1] = sigma_log[known]
         return guess
 

@@ -36,6 +36,9 @@ MIN_GAP_S = 0.15
 degrees: over less, vision's own velocity is the better word, and a flow that starts from a worse one ends worse
 (fr1_xyz with telemetry: ATE .0151 m with the filter's predictions at 30 Hz, .0101 without)."""
 
+_BY_SENSORS = ("filter", "telemetry")
+"""Predictions that carry a camera from one piece of map to another: constant velocity alone relates nothing."""
+
 UNKNOWN_SIGMA = 0.01
 """Standard deviation of a visual pose without a covariance [map units, rad]."""
 
@@ -145,7 +148,8 @@ class System:
         earlier = (self.map.piece_of(r.keyframe_id) for r in reversed(self.log.records))
         before, told = next((p for p in earlier if p != piece), None), self.fusion.predict(stamp_s)
         if before is not None:
-            sigma_t, sigma_r = (np.inf, np.inf) if told is None else (told.sigma_t, told.sigma_r_rad)
+            carried = told is not None and told.source in _BY_SENSORS
+            sigma_t, sigma_r = (told.sigma_t, told.sigma_r_rad) if told and carried else (np.inf, np.inf)
             self.apart.begin(piece, before, se3.inverse(self.motion.T_c_w)[:3, 3], sigma_t, sigma_r)
             self.apart_sigma = self._apart_sigma(piece)
 

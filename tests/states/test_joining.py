@@ -50,6 +50,7 @@ class Pieces:
             update=update,
             ask_all_again=lambda: None,
             ask_again=lambda: self.again.append(self.piece),
+            rescale=lambda stamp_s: None,
             is_up_to_date=False,
             is_divided=True,
             known_scale={},

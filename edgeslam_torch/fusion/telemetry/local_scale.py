@@ -35,6 +35,7 @@ def scale_around(
     R_w_m: FloatArray,
     T_b_c: FloatArray,
     config: FusionConfig,
+    shortfall_m_s: float = 0.0,
 ) -> ScaleEstimate | None:
     """Metres per map unit within `AROUND_S` of a moment; None where velocities do not tell it.
 
@@ -46,9 +47,10 @@ def scale_around(
         R_w_m: Map axes to telemetry's world ``(3, 3)``.
         T_b_c: Camera to body ``(4, 4)`` [m].
         config: Noise of velocities, and the least speed that tells.
+        shortfall_m_s: How much every velocity that is not zero reads low.
     """
     near = (moved.from_s >= stamp_s - AROUND_S) & (moved.to_s <= stamp_s + AROUND_S)
-    return scale_of(moved.only(near), track, delay_s, R_w_m, T_b_c, config)
+    return scale_of(moved.only(near), track, delay_s, R_w_m, T_b_c, config, shortfall_m_s)
 
 
 def scale_of(
@@ -58,6 +60,7 @@ def scale_of(
     R_w_m: FloatArray,
     T_b_c: FloatArray,
     config: FusionConfig,
+    shortfall_m_s: float,
 ) -> ScaleEstimate | None:
     """Metres per map unit by some displacements; arguments as for `scale_around`."""
     moved = moved.on_telemetry_clock(delay_s)
@@ -65,7 +68,8 @@ def scale_of(
     if not len(moved):
         return None
     turned = track.attitude(moved.to_s) - track.attitude(moved.from_s)
-    told = track.displacement(moved.to_s) - track.displacement(moved.from_s) + turned @ T_b_c[:3, 3]
+    told = track.displacement(moved.to_s, shortfall_m_s) - track.displacement(moved.from_s, shortfall_m_s)
+    told += turned @ T_b_c[:3, 3]
     moving = np.linalg.norm(told, axis=1) > config.min_speed_m_s * moved.duration_s
     moved, told = moved.only(moving), told[moving]
     sigma_m = config.sigma_velocity_m_s * np.sqrt(0.1 * moved.duration_s)
