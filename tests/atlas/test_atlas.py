@@ -10,6 +10,7 @@ from edgeslam_torch.atlas import links
 from edgeslam_torch.atlas.atlas import Atlas, _apart_enough, _sigma_log
 from edgeslam_torch.atlas.links import common_scale, link, on_one_plane, view_of
 from edgeslam_torch.atlas.places import lookalikes
+from edgeslam_torch.atlas.unit import AGAIN_S
 from edgeslam_torch.atlas.weld import move_piece
 from edgeslam_torch.config import EdgeConfig, OrbConfig, TrackingConfig
 from edgeslam_torch.frontend.matching import words
@@ -352,6 +353,62 @@ def test_a_drone_that_turned_on_the_spot_joins_the_map_of_its_take_off(rng):
     assert join.sigma_log == pytest.approx(0.02 * np.sqrt(2.0))
     check_map(pieces.map)
     assert pieces.position_error() < 0.02
+
+
+def test_a_piece_is_brought_to_the_unit_of_the_first_one(rng):
+    """Anchors, keyframes and frames, about where it began; what its cameras see stays the same."""
+    pieces = Pieces(rng, misplaced=CARRIED)
+    before = [k.centre_w for k in pieces.keyframes]
+    pixels = [pixels_of(pieces, k) for k in pieces.keyframes]
+    atlas = pieces.atlas(metres_along=metres_along(2.0 * 1.5))
+    done = atlas.rescale(1.0)
+    assert (done.piece, sim3.scale_of(done.S)) == (1, pytest.approx(1.5))
+    assert done.growth(1, 5) == pytest.approx(1.5) and done.growth(0, 1) == 1.0
+    began = before[4]
+    for k, keyframe in enumerate(pieces.keyframes):
+        there = before[k] if k < 4 else began + 1.5 * (before[k] - began)
+        np.testing.assert_allclose(keyframe.centre_w, there, atol=1e-9)
+        np.testing.assert_allclose(pixels_of(pieces, keyframe), pixels[k], atol=1e-6)
+    check_map(pieces.map)
+    assert atlas.rescale(1.0 + 0.9 * AGAIN_S) is None, "not at each frame"
+
+
+@pytest.mark.parametrize(
+    ("second", "sigma", "why"),
+    [
+        (2.0 * 1.04, 0.02, "within two sigmas"),
+        (2.0 * 1.5, 0.09, "not sure"),
+        (None, 0.02, "nothing tells"),
+    ],
+)
+def test_a_piece_keeps_its_unit_where_nothing_is_surely_wrong(rng, second, sigma, why):
+    def told(stamps_s, T_w_c):
+        first = stamps_s[0] == 0.0
+        if not first and second is None:
+            return None
+        value = 2.0 if first else second
+        return ScaleEstimate(value, sigma * value, "telemetry")
+
+    pieces = Pieces(rng, misplaced=CARRIED)
+    before = [k.T_c_w.copy() for k in pieces.keyframes]
+    assert pieces.atlas(metres_along=told).rescale(1.0) is None, why
+    for keyframe, T_c_w in zip(pieces.keyframes, before, strict=True):
+        np.testing.assert_array_equal(keyframe.T_c_w, T_c_w)
+
+
+def test_the_first_piece_and_that_of_an_earlier_flight_keep_their_unit(rng):
+    pieces = Pieces(rng, misplaced=CARRIED)
+    atlas = pieces.atlas(metres_along=metres_along(3.0))
+    atlas.known_scale[1] = ScaleEstimate(1.0, 0.02, "atlas")
+    assert atlas.rescale(1.0) is None
+    atlas = pieces.atlas(metres_along=metres_along(3.0))
+    del pieces.log.records[4:]  # the camera is in the first piece
+    assert atlas.rescale(1.0) is None
+
+
+def pixels_of(pieces, keyframe):
+    held = keyframe.keypoints_with_anchor()
+    return CAMERA.project(se3.transform(keyframe.T_c_w, pieces.map.anchors.p_w[keyframe.anchor[held]]))
 
 
 def test_a_piece_that_no_sensor_has_carried_there_is_not_joined_by_told_metres(rng):

@@ -1,12 +1,15 @@
 """A map that shrinks while it is made, against the scale with which it was made."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from edgeslam_torch.fusion.config import FusionConfig
 from edgeslam_torch.fusion.motion import MotionFusion
+from edgeslam_torch.fusion.scale.depth_scale import compared
 from edgeslam_torch.geometry.mount import camera_on_body
-from edgeslam_torch.synthetic.flights.telemetry import simulate
+from edgeslam_torch.synthetic.flights.telemetry import EXACT, simulate
 
 T_B_C = camera_on_body()
 GROWN = 1.6
@@ -73,3 +76,28 @@ def test_some_frames_of_a_flight_have_a_scale_of_their_own(rng, swinging):
     assert fusion.scale_along(motion.stamps_s[:0], T_m_c[:0]) is None
     assert fusion.scale_along(motion.stamps_s[early] + 1e3, T_m_c) is None
     assert MotionFusion(FusionConfig(), T_B_C).scale_along(motion.stamps_s[early], T_m_c) is None
+
+
+def test_readings_that_are_cut_off_are_made_up_for(rng, swinging):
+    """A drone that truncates reads half a step low: at .3 m/s a sixth, and a scale by them would be short by as much."""
+    motion = swinging(34.0, 12.0)
+    exact = simulate(rng, motion.stamps_s, motion.T_w_c, T_B_C, faults=EXACT).samples()
+    steps = [10.0 * s.velocity_m_s + rng.normal(0.0, 0.2, 3) for s in exact]
+    samples = [replace(s, velocity_m_s=0.1 * np.trunc(step)) for s, step in zip(exact, steps, strict=True)]
+    fusion = MotionFusion(FusionConfig(delay_s=0.0, velocity_rounding="truncate"), T_B_C)
+    told = 0
+    for i, stamp_s in enumerate(motion.stamps_s.tolist()):
+        first, told = told, sum(s.stamp_s <= stamp_s for s in samples[told:]) + told
+        fusion.add_telemetry(samples[first:told])
+        fusion.add_visual(stamp_s, motion.T_w_c[i], 0.003, 0.002)
+    for found in (fusion.scale_around(17.0), fusion.scale_along(motion.stamps_s, motion.T_w_c)):
+        assert found.value == pytest.approx(1.0, rel=0.05)
+
+
+def test_the_networks_unit_is_what_it_told_of_the_map(rng):
+    fusion = MotionFusion(FusionConfig(), T_B_C)
+    assert fusion.network_unit() is None
+    depth = rng.uniform(1.0, 4.0, 50)
+    for _ in range(5):
+        fusion.add_depth_ratio(compared(0.6 * depth, depth))
+    assert fusion.network_unit() == pytest.approx(0.6)

@@ -7,6 +7,7 @@ import pytest
 
 from edgeslam_torch.atlas.atlas import Join
 from edgeslam_torch.atlas.loops import Closure
+from edgeslam_torch.atlas.unit import Rescaled, about
 from edgeslam_torch.fusion.published import Published
 from edgeslam_torch.geometry import se3, sim3
 from edgeslam_torch.states.joining import Joining
@@ -127,10 +128,30 @@ def test_the_pose_goes_along_when_a_loop_is_closed(rng):
         return Closure(1.0, 1, 30.0, 0.2, 0.1, 1.2, 2, 300, {KEYFRAME: 1.5, 3: 1.1})
 
     system = system_of(pieces, motion)
-    words = Joining(system, SimpleNamespace(update=update, is_up_to_date=False)).update()
+    words = Joining(system, SimpleNamespace(update=update, rescale=lambda _: None, is_up_to_date=False)).update()
     assert words.startswith("loop closed in piece 1, a place seen again after 30.0 s: 2 keyframes agree, 300 keypoints")
     np.testing.assert_allclose(se3.transform(motion.T_c_w, sim3.transform(S, p)), 1.5 * before, atol=1e-9)
     assert (system.published.revision, system.events) == (1, {"loops_closed": 1})
+    assert system.fusion.revised == ["ratios", ("stamps", "poses")]
+
+
+def test_the_pose_goes_along_when_its_piece_gets_the_unit_of_another(rng):
+    T_k_w, motion = moving(rng)
+    p = rng.normal(size=(20, 3))
+    before = se3.transform(motion.T_c_w, p)
+    pieces = Pieces(T_k_w)
+    grown = about(np.array([1.0, -2.0, 0.5]), 1.3)
+
+    def rescale(stamp_s):
+        pieces.T_k_w = sim3.moved_camera(grown, T_k_w)
+        return Rescaled(7.0, 1, grown, 0.05)
+
+    system = system_of(pieces, motion)
+    atlas = SimpleNamespace(rescale=rescale, update=lambda _: None, is_up_to_date=False)
+    words = Joining(system, atlas).update()
+    assert words == "piece 1 scaled by 1.300 (sigma 5.0 %) to the metres before it"
+    np.testing.assert_allclose(se3.transform(motion.T_c_w, sim3.transform(grown, p)), 1.3 * before, atol=1e-9)
+    assert (system.published.revision, system.events) == (1, {"rescaled": 1})
     assert system.fusion.revised == ["ratios", ("stamps", "poses")]
 
 
