@@ -10,6 +10,7 @@ from edgeslam_torch.atlas.atlas import Atlas
 from edgeslam_torch.atlas.links import link
 from edgeslam_torch.atlas.loops import Drift, drift_told, far_keyframes, is_plausible
 from edgeslam_torch.atlas.saved import BEFORE_S
+from edgeslam_torch.atlas.weld import share_anchors
 from edgeslam_torch.config import EdgeConfig, OrbConfig, TrackingConfig
 from edgeslam_torch.frontend.matching import words
 from edgeslam_torch.geometry import se3, sim3
@@ -276,3 +277,17 @@ def test_the_longer_the_way_the_more_may_a_map_have_grown(rng):
         ring.map.remove_keyframe(keyframe)
     assert [is_plausible(ring.map, grown[g]) for g in (0.7, 1.4, 1.8)] == [False, False, False]
     assert is_plausible(ring.map, found)
+
+
+def test_what_is_near_a_closed_loop_has_not_drifted_by_as_much_as_the_way_round(rng):
+    """A place that looks alike a metre on: on a way of 12 m the map may have drifted so, on what is left it has not."""
+    ring = Ring(rng, drift=0.0 * DRIFT)
+    found, beside = (link(ring.tracker, ring.keyframes[ROUND + k], ring.keyframes[k]) for k in (0, 2))
+    assert found is not None and beside is not None
+    off = np.eye(4)
+    off[:3, 3] = 1.0 * beside.keyframe.T_c_w[0, :3]  # along the wall
+    alike = replace(beside, S=off @ beside.S)
+    assert is_plausible(ring.map, beside) and is_plausible(ring.map, alike)
+    share_anchors(ring.map, [found])
+    assert is_plausible(ring.map, beside)
+    assert not is_plausible(ring.map, alike)

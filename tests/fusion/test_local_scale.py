@@ -79,7 +79,7 @@ def test_some_frames_of_a_flight_have_a_scale_of_their_own(rng, swinging):
 
 
 def test_readings_that_are_cut_off_are_made_up_for(rng, swinging):
-    """A drone that truncates reads half a step low: at .3 m/s a sixth, and a scale by them would be short by as much."""
+    """A drone that truncates reads half a step low: at .3 m/s a sixth, and so would a scale by them."""
     motion = swinging(34.0, 12.0)
     exact = simulate(rng, motion.stamps_s, motion.T_w_c, T_B_C, faults=EXACT).samples()
     steps = [10.0 * s.velocity_m_s + rng.normal(0.0, 0.2, 3) for s in exact]
