@@ -137,6 +137,7 @@ class EdgeSlam:
             config.mapping.loop_closure,
             self._system.fusion.scale_around,
             self._system.fusion.scale_along,
+            self._system.apart.is_carried,
         )
         self._joining = Joining(self._system, atlas)
         self._earlier: EarlierFlights | None = None

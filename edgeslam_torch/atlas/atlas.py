@@ -5,14 +5,16 @@ keyframes that have no keyframe in common and agree about the similarity, never 
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from edgeslam_torch.atlas.links import Link, link
 from edgeslam_torch.atlas.loops import (
     LOOP_SHARE,
+    Bridge,
     Closure,
+    bridge,
     drift_told,
     far_keyframes,
     is_carried,
@@ -70,10 +72,12 @@ class Join:
     """Keyframes that agreed."""
     matches: int
     """Keypoints of these that show the other piece."""
+    grown: dict[int, float] = field(default_factory=dict)
+    """Factor by which the map grew around each keyframe after that, when the drift of the older piece was spread."""
 
     def growth(self, piece: int, keyframe_id: int) -> float:
         """Factor by which the map grew around a keyframe that belonged to a piece."""
-        return sim3.scale_of(self.S) if self.moved == piece else 1.0
+        return (sim3.scale_of(self.S) if self.moved == piece else 1.0) * self.grown.get(keyframe_id, 1.0)
 
     def in_words(self) -> str:
         """For `status.csv` and the summary."""
@@ -95,6 +99,7 @@ class Atlas:
         closing: Whether loops inside a piece are closed.
         metres: Metres per map unit around the stamp of an earlier frame, where anything else than the images tells it.
         metres_along: The same along some frames, by their stamps ``(F,)`` and poses ``(F, 4, 4)``.
+        carried: Whether the drone's sensors carried the camera to where a piece, by its number, began.
     """
 
     def __init__(
@@ -106,6 +111,7 @@ class Atlas:
         closing: bool = False,
         metres: Callable[[float], ScaleEstimate | None] = lambda _: None,
         metres_along: Callable[[FloatArray, FloatArray], ScaleEstimate | None] = lambda *_: None,
+        carried: Callable[[int], bool] = lambda _: False,
     ) -> None:
         self.tracker = tracker
         self.map = tracker.map
@@ -115,6 +121,7 @@ class Atlas:
         self.closing = closing
         self.metres = metres
         self.metres_along = metres_along
+        self.carried = carried
         self.joins: list[Join] = []
         self.closures: list[Closure] = []
         self.known_scale: dict[int, ScaleEstimate] = {}
@@ -306,10 +313,15 @@ class Atlas:
     def _join(self, links: list[Link]) -> Join:
         best = max(links, key=lambda one: len(one.keypoint))
         mine, theirs = self._pieces(best)
+        carried = bridge(self.map, mine, theirs) if self.carried(max(mine, theirs)) else None
         moved, S = mine, best.S
         if self._weight(mine) > self._weight(theirs):  # the lighter one moves
             moved, S = theirs, sim3.inverse(best.S)
         move_piece(self.map, self.edges, self.log, moved, S)
+        made_up = None
+        if carried is not None:
+            left = [replace(one, S=S @ one.S if moved == theirs else one.S @ sim3.inverse(S)) for one in links]
+            made_up = self._make_up(left, carried.scaled(sim3.scale_of(S)) if moved == min(mine, theirs) else carried)
         weld(self.map, self.tracker.camera, links, self.lm)
         join = Join(
             max(one.keyframe.stamp_s for one in links),
@@ -320,12 +332,21 @@ class Atlas:
             _sigma_log(best, links),
             len(links),
             sum(len(one.keypoint) for one in links),
+            {} if made_up is None else made_up.grown,
         )
         self.joins.append(join)
         self._follow_scale(mine, theirs, moved)
         self._again = []
         self._links = []  # their similarities hold for pieces as they were
         return join
+
+    def _make_up(self, links: list[Link], carried: Bridge) -> Closure:
+        """Spread over both pieces how far the newer one has been moved from where the drone's sensors carried it to:
+        that is what the older one has drifted by on its way, and left there it would pull the pieces apart again."""
+        with self.map.lock:
+            for one in links:
+                self.map.join_pieces(one.keyframe, [one.other])
+            return spread(self.map, self.edges, self.log, links, carried)
 
     def _weight(self, piece: int) -> tuple[bool, int]:
         """What speaks against moving a piece: metres known from an earlier flight, then its size."""

@@ -5,7 +5,7 @@ all keyframes of the piece (`optim/pose_graph.py`) spreads this over the way bet
 their keyframes. What is left is for the refinement that follows.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -40,6 +40,8 @@ MAX_DRIFT_RAD = np.deg2rad(20.0)
 DRIFT_LOG = 0.03
 """Standard deviation of what the log scale drifts from one keyframe to the next, a random walk: after 15 keyframes, as
 few as a loop has, a factor of 1.12, after the 126 of a round through ten rooms one of 1.4 (2.1 was measured)."""
+_CARRIED_SHARED = 100
+"""Keypoints that a way without images is worth: as much as one between usual keyframes. It drifts by centimetres."""
 _NO_WAY = 1e-9
 """Length of a way between two cameras in one place [map units]: a graph takes 0 for no way at all."""
 WITHIN_PX = 5.0
@@ -72,6 +74,22 @@ def drift_told(here: ScaleEstimate | None, there: ScaleEstimate | None) -> Drift
         return None
     relative = np.array([here.sigma / here.value, there.sigma / there.value, WITHIN_LOG])
     return Drift(float(np.log(here.value / there.value)), float(np.linalg.norm(relative)))
+
+
+@dataclass(frozen=True, slots=True)
+class Bridge:
+    """What the drone's sensors say of two keyframes in sequence between which the camera was lost."""
+
+    newer: int
+    """Id of the first keyframe of a piece."""
+    older: int
+    """Id of the last one before."""
+    T: FloatArray
+    """``(4, 4)`` camera of the older one to that of the newer one, in the older one's unit."""
+
+    def scaled(self, scale: float) -> "Bridge":
+        """The same after the older one's unit was scaled."""
+        return replace(self, T=se3.scaled(self.T, scale))
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,13 +199,34 @@ def is_within_reach(slam_map: SlamMap, camera: Camera, link: Link) -> bool:
     return bool(np.median(off) <= WITHIN_PX and abs(np.log(sim3.scale_of(link.S))) <= SIGMAS * sigma)
 
 
-def spread(slam_map: SlamMap, edges: EdgeMap, log: TrajectoryLog, links: list[Link]) -> Closure:
-    """Move a piece so that both ends of a loop agree, each keyframe by its share."""
+def bridge(slam_map: SlamMap, piece: int, other: int) -> Bridge | None:
+    """Between two pieces, one of which began when the other was lost; None if another one lies between them in time."""
+    newer = max(piece, other)
+    first = min(k for k in slam_map.keyframes if slam_map.piece_of(k) == newer)
+    before = max((k for k in slam_map.keyframes if k < first), default=None)
+    if before is None or slam_map.piece_of(before) != min(piece, other):
+        return None
+    newer_T, older_T = (slam_map.keyframes[k].T_c_w for k in (first, before))
+    return Bridge(first, before, newer_T @ se3.inverse(older_T))
+
+
+def spread(
+    slam_map: SlamMap, edges: EdgeMap, log: TrajectoryLog, links: list[Link], carried: Bridge | None = None
+) -> Closure:
+    """Move a piece so that both ends of a loop agree, each keyframe by its share.
+
+    Args:
+        slam_map: With the piece.
+        edges: Measured edges, which move with their keyframes.
+        log: Frames, which do so, too.
+        links: Between both ends.
+        carried: How two keyframes that show nothing in common lay to each other before the links were known.
+    """
     best = max(links, key=lambda one: len(one.keypoint))
     piece = slam_map.piece_of(best.keyframe.id)
     before = best.keyframe.T_c_w
     members = [k for id, k in sorted(slam_map.keyframes.items()) if slam_map.piece_of(id) == piece]
-    graph = _graph(slam_map, members, links)
+    graph = _graph(slam_map, members, links, carried)
     S = {k.id: np.linalg.inv(new) @ k.T_c_w for k, new in zip(members, solve(graph), strict=True)}
     with slam_map.lock:
         for id, ids in _hosted(slam_map, members).items():
@@ -216,13 +255,19 @@ def _off(link: Link, T_c_w: FloatArray) -> tuple[float, float]:
     return float(np.linalg.norm(moved[:3, 3])) / link.depth, float(np.linalg.norm(se3.log(moved)[3:]))
 
 
-def _graph(slam_map: SlamMap, members: list[Keyframe], links: list[Link]) -> PoseGraph:
-    """Keyframes in order, what they share as it is, and what the links say."""
+def _graph(slam_map: SlamMap, members: list[Keyframe], links: list[Link], carried: Bridge | None) -> PoseGraph:
+    """Keyframes in order, what they share as it is, what the links say, and what the drone's sensors do."""
     row_of = {k.id: row for row, k in enumerate(members)}
     depth = [slam_map.median_depth(k) or 1.0 for k in members]
     T = np.stack([k.T_c_w for k in members])
     pairs = _shared(slam_map, members)
     i, j, S_ij, inv_sigma = [], [], [], []
+    if carried is not None:
+        i.append(row_of[carried.newer])
+        j.append(row_of[carried.older])
+        pairs.pop((i[0], j[0]), None)
+        S_ij.append(carried.T)
+        inv_sigma.append(_inv_sigma(_CARRIED_SHARED, depth[i[0]], 1.0))
     for (a, b), count in pairs.items():
         i.append(a)
         j.append(b)
