@@ -235,8 +235,8 @@ class EdgeSlam:
             self._joining.enter(self.map.piece_of(step.keyframe.id))
         self._machine.meet(step.event, frame.stamp_s)
         system.motion.stamp_s = frame.stamp_s
-        present = system.fusion.present(frame.stamp_s, str(self.state), system.published, system.apart_sigma)
-        self._present = present
+        doubts = system.apart_sigma, system.drift_sigma
+        self._present = system.fusion.present(frame.stamp_s, str(self.state), system.published, *doubts)
         return self._output(frame, step, joined)
 
     def pose_now(self, stamp_s: float, telemetry: Sequence[TelemetrySample] = ()) -> PoseNow | None:

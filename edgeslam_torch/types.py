@@ -245,6 +245,14 @@ class Health:
     apart_sigma: float = 0.0
     """Standard deviation per axis of the newest pose against the piece of map in which the flight began [published
     unit]: what the drone's sensors leave open that carried the camera from one to the other. 0 in one map."""
+    drift_sigma: float = 0.0
+    """The same of what its map may have drifted by since the first frame: it grows with the way, and shrinks where a
+    place is known again. That metres themselves are unsure (`scale`) comes on top."""
+
+    @property
+    def home_sigma(self) -> float:
+        """Standard deviation per axis of the newest pose, seen from where the flight began [published unit]."""
+        return float(np.hypot(self.apart_sigma, self.drift_sigma))
 
     def in_words(self) -> str:
         """For a status line: metres, disagreement, telemetry and battery, as far as there is something to say."""
@@ -253,7 +261,7 @@ class Health:
         if self.disagreement > DISAGREEMENT:
             words.append(f"sources {self.disagreement:.0f} sigmas apart")
         if self.apart_sigma > 0:
-            words.append(f"to {self.apart_sigma:.2g} {'m' if self.metric else 'units'} of where the flight began")
+            words.append(f"{self.home_sigma:.2g} {'m' if self.metric else 'units'} unsure of where the flight began")
         if SILENCE_S < self.telemetry_age_s < np.inf:
             words.append(f"telemetry silent for {self.telemetry_age_s:.1f} s")
         if np.isfinite(self.battery):

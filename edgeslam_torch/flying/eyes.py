@@ -151,6 +151,7 @@ class SlamEyes:
             home.scale * (home.R @ np.asarray(pose.velocity_w)),
             position_sigma_m=min(sigma, _WIDEST_SIGMA_M),
             apart_sigma_m=home.scale * health.apart_sigma,
+            drift_sigma_m=home.scale * health.drift_sigma,
             piece=output.piece,
             scale_sigma=relative if np.isfinite(relative) else 1.0,
             metric=health.metric,

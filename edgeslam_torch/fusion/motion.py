@@ -409,7 +409,9 @@ class MotionFusion:
             f"{self._attitude_s - self.began_s:.1f} s after the first picture)"
         )
 
-    def present(self, stamp_s: float, state: str, published: Published, apart_sigma: float = 0.0) -> Present:
+    def present(
+        self, stamp_s: float, state: str, published: Published, apart_sigma: float = 0.0, drift_sigma: float = 0.0
+    ) -> Present:
         """What is known after a frame: the motion, and the reliability of its metres.
 
         Args:
@@ -417,11 +419,13 @@ class MotionFusion:
             state: What carries its pose.
             published: What is published of the map.
             apart_sigma: As in `Health`.
+            drift_sigma: As in `Health`.
         """
-        health = self.health(stamp_s, state, published.is_metric(self.scale()), apart_sigma)
+        known = self.health(stamp_s, state, published.is_metric(self.scale()))
+        health = replace(known, apart_sigma=apart_sigma, drift_sigma=drift_sigma)
         return Present(self.snapshot(), published, health.metric, health)
 
-    def health(self, stamp_s: float, state: str, metric: bool, apart_sigma: float = 0.0) -> Health:
+    def health(self, stamp_s: float, state: str, metric: bool) -> Health:
         """Reliability of the metres; arguments as in `present`, and whether the published unit is a metre."""
         sources, delay, scale = self.sources(), self._delay.delay, self.scale()
         doubt = self._settled().warning
@@ -438,7 +442,6 @@ class MotionFusion:
             self._track.battery,
             self.filtering,
             tuple(self._trust.warnings() + [said for said in (doubt, self._drift) if said is not None]),
-            apart_sigma,
         )
 
     def snapshot(self) -> Snapshot | None:

@@ -39,6 +39,8 @@ class Sight:
     position_sigma_m: float = 0.02
     apart_sigma_m: float = 0.0
     """Standard deviation of where the piece of map that it is in lies to that of the take-off; 0 in one map."""
+    drift_sigma_m: float = 0.0
+    """Standard deviation of what the map may have drifted by since the take-off."""
     piece: int = 0
     """Number of the piece of map."""
     scale_sigma: float = 0.0
@@ -64,6 +66,11 @@ class Sight:
     """How the map moved since the last sight with a view; None where it did not."""
     hindered: bool = False
     """Whether the last wish was not followed: the supervisor or a hand had something else in mind."""
+
+    @property
+    def home_sigma_m(self) -> float:
+        """Standard deviation of where it is, seen from its take-off, by all that is known but the length of a metre."""
+        return math.hypot(self.position_sigma_m, self.apart_sigma_m, self.drift_sigma_m)
 
     @property
     def blind_s(self) -> float:

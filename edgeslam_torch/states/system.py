@@ -19,6 +19,7 @@ from edgeslam_torch.mapping.edge_map import EdgeMap
 from edgeslam_torch.mapping.pipeline import Mapped, MappingPipeline
 from edgeslam_torch.stage_times import timed
 from edgeslam_torch.states.apart import Apart
+from edgeslam_torch.states.drift import SHARE, Drift
 from edgeslam_torch.tracking.expectation import Attitude, Expectation, Place, Told, Vertical
 from edgeslam_torch.tracking.motion_model import MotionModel
 from edgeslam_torch.tracking.relocaliser import Reach, reach_after
@@ -68,6 +69,9 @@ class System:
     apart: Apart = field(default_factory=Apart)
     apart_sigma: float = 0.0
     """As in `Health`, of the newest tracked frame."""
+    drift: Drift = field(default_factory=Drift)
+    drift_sigma: float = 0.0
+    """As in `Health`, of the newest keyframe that has been mapped."""
     keyframe_s: float = -np.inf
     """Stamp of the newest keyframe, or of a later frame that needed not become one."""
     shows_nothing_new: bool = False
@@ -189,7 +193,9 @@ class System:
         self.fusion.map_moved(se3.inverse(self.motion.T_c_w) @ before)
         self.stage_ms.update(mapped.stage_ms)
         for keyframe in mapped.keyframes:
+            self.drift.add(self.map, keyframe)
             self.compare_depth(keyframe)
+        self.drift_sigma = SHARE * self.published.scale * self.drift.newest
         return True
 
     def compare_depth(self, keyframe: Keyframe) -> None:

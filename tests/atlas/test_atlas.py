@@ -9,6 +9,7 @@ from point_map import CAMERA, SCALE_FACTOR, PointMap, check_map
 from edgeslam_torch.atlas import links
 from edgeslam_torch.atlas.atlas import Atlas, _apart_enough, _sigma_log
 from edgeslam_torch.atlas.links import common_scale, link, on_one_plane, view_of
+from edgeslam_torch.atlas.loops import bridge
 from edgeslam_torch.atlas.places import lookalikes
 from edgeslam_torch.atlas.unit import AGAIN_S
 from edgeslam_torch.atlas.weld import move_piece
@@ -353,6 +354,26 @@ def test_a_drone_that_turned_on_the_spot_joins_the_map_of_its_take_off(rng):
     assert join.sigma_log == pytest.approx(0.02 * np.sqrt(2.0))
     check_map(pieces.map)
     assert pieces.position_error() < 0.02
+
+
+@pytest.mark.parametrize("by_sensors", [True, False])
+def test_what_the_older_piece_has_drifted_by_is_spread_over_it(rng, by_sensors):
+    """The newer one began where the drone's sensors had carried it: a step between them would be torn by telemetry."""
+    pieces = Pieces(rng, misplaced=CARRIED)
+    join = pieces.atlas(carried=lambda piece: by_sensors and piece == 1).update()
+    assert (sorted(join.grown) == list(range(8))) == by_sensors
+    assert pieces.position_error() < 0.02
+    assert join.growth(join.moved, 7) == pytest.approx(sim3.scale_of(join.S) * join.grown.get(7, 1.0))
+
+
+def test_a_bridge_is_between_the_last_keyframe_and_the_first_after_it(rng):
+    pieces = Pieces(rng, misplaced=CARRIED)
+    found = bridge(pieces.map, 1, 0)
+    assert (found.newer, found.older) == (4, 3)
+    older, newer = (pieces.keyframes[k].T_c_w for k in (3, 4))
+    np.testing.assert_allclose(found.T @ older, newer, atol=1e-12)
+    np.testing.assert_allclose(found.scaled(2.0).T[:3, 3], 2.0 * found.T[:3, 3])
+    np.testing.assert_allclose(found.scaled(2.0).T[:3, :3], found.T[:3, :3])
 
 
 def test_a_piece_is_brought_to_the_unit_of_the_first_one(rng):

@@ -1,5 +1,6 @@
 """One judged flight."""
 
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -76,7 +77,7 @@ def fly(case: Case, limits: NavLimits | None = None) -> Flown:
 
 def is_beyond(sight: Sight, p_w: FloatArray) -> bool:
     """Whether a pose is farther from the truth than all that is said of it allows: of the pose itself, of where its
-    piece of map lies, and of the metres from the take-off.
+    piece of map lies, of what the map has drifted by, and of the metres from the take-off.
 
     Example:
         >>> sight = Sight(0.0, np.array([3.2, 0.0, 1.0]), 0.0, np.zeros(3), scale_sigma=0.02)
@@ -84,7 +85,7 @@ def is_beyond(sight: Sight, p_w: FloatArray) -> bool:
         (False, True)
     """
     way = sight.scale_sigma * float(np.linalg.norm(sight.p_w[:2]))
-    sigma = float(np.linalg.norm([sight.position_sigma_m, sight.apart_sigma_m, way]))
+    sigma = math.hypot(sight.home_sigma_m, way)
     return float(np.linalg.norm(sight.p_w[:2] - p_w[:2])) > _SIGMAS * sigma + _NO_HARM_M
 
 
