@@ -81,7 +81,7 @@ def is_beyond(sight: Sight, p_w: FloatArray) -> bool:
 
     Example:
         >>> sight = Sight(0.0, np.array([3.2, 0.0, 1.0]), 0.0, np.zeros(3), scale_sigma=0.02)
-        >>> is_beyond(sight, np.array([3.0, 0.0, 1.0])), is_beyond(sight, np.array([2.9, 0.0, 1.0]))
+        >>> is_beyond(sight, np.array([3.0, 0.0, 1.0])), is_beyond(sight, np.array([2.8, 0.0, 1.0]))
         (False, True)
     """
     way = sight.scale_sigma * float(np.linalg.norm(sight.p_w[:2]))
