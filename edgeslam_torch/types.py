@@ -260,7 +260,9 @@ class Health:
         words = [f"metres to {100.0 * relative:.0f} %" if self.metric else "no metres"]
         if self.disagreement > DISAGREEMENT:
             words.append(f"sources {self.disagreement:.0f} sigmas apart")
-        if self.apart_sigma > 0:
+        if np.isinf(self.apart_sigma):
+            words.append("nothing relates this piece of map to where the flight began")
+        elif self.apart_sigma > 0:
             words.append(f"{self.home_sigma:.2g} {'m' if self.metric else 'units'} unsure of where the flight began")
         if SILENCE_S < self.telemetry_age_s < np.inf:
             words.append(f"telemetry silent for {self.telemetry_age_s:.1f} s")

@@ -238,7 +238,7 @@ class Atlas:
         told = self._size_told(piece, first)
         if told is None or not is_other(*told):
             return None
-        began = min(k.id for k in self.map.keyframes.values() if self.map.piece_of(k.id) == piece)
+        began = min(id for id in self.map.keyframes if self.map.piece_of(id) == piece)
         S = about(self.map.keyframes[began].centre_w, told[0])
         move_piece(self.map, self.edges, self.log, piece, S)
         self._links = []  # their similarities hold for pieces as they were

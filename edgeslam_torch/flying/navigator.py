@@ -1,5 +1,6 @@
 """Verbs of a flight: `Navigator.open`, `take_off`, `go_to`, `follow_corridor`, `find_exits`, `return_home`, `land`."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -25,6 +26,7 @@ from edgeslam_torch.types import FloatArray
 
 HOME_BECAUSE = "battery low: home"
 CARRIED = "by telemetry alone: the pose rests on no map"
+LONE = "in a piece of map that nothing relates to that of the take-off"
 APART = "to {:.2g} m: what telemetry leaves open between this piece of map and that of the take-off"
 """What an outcome adds where nothing that is seen says so."""
 BEYOND_M = 0.8
@@ -291,6 +293,8 @@ class Navigator:
             return ""
         if not sight.tracked:
             return f", {CARRIED}"
+        if math.isinf(sight.apart_sigma_m):
+            return f", {LONE}"
         return f", {APART.format(sight.apart_sigma_m)}" if sight.apart_sigma_m > 0 else ""
 
     def _wants_home(self) -> bool:

@@ -8,7 +8,7 @@ import pytest
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.flying.cockpit import Cockpit
 from edgeslam_torch.flying.errands import Stay
-from edgeslam_torch.flying.navigator import APART, CARRIED, Navigator
+from edgeslam_torch.flying.navigator import APART, CARRIED, LONE, Navigator
 from edgeslam_torch.flying.outcome import FlightRefused
 from edgeslam_torch.geometry.camera import PRESETS
 from edgeslam_torch.geometry.mount import camera_on_body
@@ -97,6 +97,7 @@ def navigator(allow_motion=True, **craft):
         (False, 0.0, f"home, {CARRIED}"),
         (False, 0.3, f"home, {CARRIED}"),
         (True, 0.31, f"home, {APART.format(0.31)}"),
+        (True, math.inf, f"home, {LONE}"),
     ],
 )
 def test_an_outcome_says_what_it_rests_on(tracked, apart_m, reason):

@@ -32,6 +32,8 @@ def test_words_name_what_is_wrong_and_nothing_else():
     assert bad.in_words() == "metres to 3 %, sources 7 sigmas apart, telemetry silent for 4.2 s"
     apart = replace(good, apart_sigma=0.3, drift_sigma=0.4)
     assert apart.in_words() == "metres to 3 %, 0.5 m unsure of where the flight began, battery 63 %"
+    lone = replace(good, apart_sigma=math.inf).in_words()
+    assert lone == "metres to 3 %, nothing relates this piece of map to where the flight began, battery 63 %"
     assert Health(9.0, "tracking", True, SURE).in_words() == "metres to 3 %", "no drone, no word of it"
 
 
