@@ -9,11 +9,12 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from edgeslam_torch.atlas.links import Link, link
+from edgeslam_torch.atlas.links import Link, link, on_one_plane
 from edgeslam_torch.atlas.loops import (
     LOOP_SHARE,
     Bridge,
     Closure,
+    as_it_is,
     bridge,
     drift_told,
     far_keyframes,
@@ -43,6 +44,8 @@ MIN_TURN_RAD = np.deg2rad(3.0)
 """Turn between them from which on they are, too."""
 LOOK_BACK_S = 1.0
 """Time from one search for loops to the next: a loop may wait, and each search costs as much as half a frame."""
+LOOK_BACK_RAD = np.deg2rad(20.0)
+"""Turn after which it does not wait: a drone that turns on the spot has a third of a view before it that was not."""
 LOOP_VOTES = 20
 """Votes from which on it is worth a closer look: a tenth. Where a fifth of what is in view will be found, 30 and more
 of 200 keypoints vote; a wall with the same paper gets 22."""
@@ -134,8 +137,8 @@ class Atlas:
         """Keyframes that are to be asked again, the next one last."""
         self._again_s = -np.inf
         """Stamp at which the last of them was."""
-        self._looked_back_s = -np.inf
-        """Stamp of the newest keyframe that was asked for a loop."""
+        self._looked_back: Keyframe | None = None
+        """The newest keyframe that was asked for a loop."""
         self._unit_s = -np.inf
         """Stamp at which the unit of the camera's piece was last compared."""
 
@@ -186,7 +189,7 @@ class Atlas:
     def ask_all_again(self) -> None:
         """Let the next `update` ask every keyframe."""
         self._asked = -1
-        self._looked_back_s = -np.inf
+        self._looked_back = None
 
     def _ask(self, keyframe: Keyframe) -> Join | Closure | None:
         if not _is_mapped(keyframe):
@@ -200,9 +203,15 @@ class Atlas:
 
     def _seen_before(self, keyframe: Keyframe) -> list[Keyframe]:
         """Keyframes at the far end of a loop that look like this one, if it is time to ask."""
-        if not self.closing or keyframe.stamp_s - self._looked_back_s < LOOK_BACK_S:
+        last = self._looked_back
+        waits = (
+            last is not None
+            and keyframe.stamp_s - last.stamp_s < LOOK_BACK_S
+            and _turn_rad(keyframe, last) < LOOK_BACK_RAD
+        )
+        if not self.closing or waits:
             return []
-        self._looked_back_s = keyframe.stamp_s
+        self._looked_back = keyframe
         return self._alike(keyframe, far_keyframes(self.map, keyframe), CLOSER_LOOKS, LOOP_VOTES)
 
     def _alike(
@@ -217,11 +226,15 @@ class Atlas:
             if found is None or found.by_images or is_carried(self.map, found):
                 return found
             return None
-        found = link(self.tracker, keyframe, other, LOOP_SHARE)
-        if found is None:
+        found = link(self.tracker, keyframe, other, LOOP_SHARE, told=as_it_is)
+        if found is None or (not found.by_images and self._is_flat(found)):
             return None
         told = drift_told(*(self.metres(k.stamp_s) for k in (keyframe, other)))
         return found if is_plausible(self.map, found, told) else None
+
+    def _is_flat(self, one: Link) -> bool:
+        """Whether what a link rests on is one plane, such as a wall whose paper looks the same a metre on."""
+        return on_one_plane(self.map.anchors.p_w[one.anchor], one.depth)
 
     def rescale(self, stamp_s: float) -> Rescaled | None:
         """Bring the camera's piece to the unit of the flight's first one, if the drone's sensors tell another.
@@ -379,5 +392,9 @@ def _apart_enough(one: Link, other: Link) -> bool:
 
 def _differ(a: Keyframe, b: Keyframe, baseline: float) -> bool:
     """Whether two keyframes show a place from two places or in two directions."""
-    turn = float(np.arccos(np.clip(a.T_c_w[2, :3] @ b.T_c_w[2, :3], -1.0, 1.0)))
-    return float(np.linalg.norm(a.centre_w - b.centre_w)) > baseline or turn > MIN_TURN_RAD
+    return float(np.linalg.norm(a.centre_w - b.centre_w)) > baseline or _turn_rad(a, b) > MIN_TURN_RAD
+
+
+def _turn_rad(a: Keyframe, b: Keyframe) -> float:
+    """Angle between the directions in which two keyframes look."""
+    return float(np.arccos(np.clip(a.T_c_w[2, :3] @ b.T_c_w[2, :3], -1.0, 1.0)))

@@ -127,6 +127,12 @@ class Closure:
         )
 
 
+def as_it_is(*_: Keyframe) -> tuple[float, float]:
+    """Size of the older end of a loop relative to the newer one, where images tell none: a piece has one unit, within
+    what it drifts. The loop then tells where its newer end is, and how that is turned."""
+    return 1.0, WITHIN_LOG
+
+
 def far_keyframes(slam_map: SlamMap, keyframe: Keyframe) -> list[Keyframe]:
     """Older keyframes of the same piece that a keyframe is connected with only by a long way.
 
@@ -278,7 +284,7 @@ def _graph(slam_map: SlamMap, members: list[Keyframe], links: list[Link], carrie
         i.append(row_of[link.keyframe.id])
         j.append(row_of[link.other.id])
         S_ij.append(T[i[-1]] @ sim3.inverse(link.S) @ se3.inverse(T[j[-1]]))
-        inv_sigma.append(_inv_sigma(len(link.keypoint), depth[i[-1]], 1.0))
+        inv_sigma.append(_inv_sigma(len(link.keypoint), depth[i[-1]], 1.0 if link.by_images else MIN_BASELINE))
     old = np.flatnonzero([k.stamp_s == BEFORE_S for k in members])
     fixed = old if len(old) else np.zeros(1, dtype=np.int64)  # axes and metres of an earlier flight stay
     return PoseGraph(T, fixed, np.array(i), np.array(j), np.stack(S_ij), np.stack(inv_sigma))

@@ -13,6 +13,7 @@ from edgeslam_torch.navigation.limits import NavLimits
 from edgeslam_torch.navigation.moved import Moved
 from edgeslam_torch.navigation.openings.turned import Walls
 from edgeslam_torch.navigation.openings.watch import ExitWatch
+from edgeslam_torch.navigation.pace import varied
 from edgeslam_torch.navigation.route import CostToGo, cost_to_go
 from edgeslam_torch.navigation.sight import HOVER, Sight, Touch, Wish
 from edgeslam_torch.navigation.space import CELL_M, Space
@@ -43,8 +44,6 @@ _SIDEWAYS = 0.3
 """Share of the speed with which it moves where it does not look, through what it saw before."""
 _SQUEEZE = 0.6
 """Share of the speed with which it passes the unseen at a hull's distance."""
-_STEP_M_S, _VARIES_S = 0.1, 4.0
-"""A Tello tells its velocity in whole decimetres a second, cut off; time in which the speed goes down and up again."""
 _GAIN_M = 0.04
 """Least progress of a movement, in metres of way."""
 _MOVES_S = 1.0
@@ -333,7 +332,7 @@ class Pilot:
     def _chosen(self, sight: Sight, plan: CostToGo, ahead: float, error: float) -> FloatArray | None:
         """Velocity ``(2,)`` in the world of the best candidate; None when standing is as good."""
         assert self.layer is not None
-        fastest = self._cruise_m_s(sight.stamp_s)
+        fastest = varied(self.limits.speed_m_s, sight.stamp_s)
         arcs = candidates(self.layer, sight.p_w[:2], sight.velocity_w[:2], ahead, self.limits, fastest)
         need = self.limits.clearance_m(sight.position_sigma_m)
         standing = float(arcs.clearance_m[0])
@@ -349,12 +348,6 @@ class Pilot:
         if best == 0 or not score[best] < score[0] - _GAIN_M:
             return None
         return arcs.velocity_w[best]
-
-    def _cruise_m_s(self, stamp_s: float) -> float:
-        """The highest speed, and evenly down to a step of telemetry below it: what is cut off then averages to half
-        a step, where one speed kept to would lose up to a whole one and make every metre too short."""
-        share = abs(2.0 * (stamp_s / _VARIES_S % 1.0) - 1.0)
-        return self.limits.speed_m_s - min(_STEP_M_S, 0.5 * self.limits.speed_m_s) * share
 
     def _may_squeeze(self, here: FloatArray) -> bool:
         """Whether a look from about here showed no way, and what is unseen is not what it has doubted to be solid."""

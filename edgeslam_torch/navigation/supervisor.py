@@ -13,6 +13,7 @@ import numpy as np
 from edgeslam_torch.geometry.rotations import wrapped
 from edgeslam_torch.navigation.limits import NavLimits
 from edgeslam_torch.navigation.moved import Moved
+from edgeslam_torch.navigation.pace import STEP_M_S, varied
 from edgeslam_torch.navigation.push import PUSHED_M_S, Push
 from edgeslam_torch.navigation.sight import Sight, Touch, Wish
 from edgeslam_torch.types import FloatArray
@@ -28,6 +29,7 @@ LAND_S = 10.0
 UNSURE_LAND_S = 20.0
 """The same when metres are doubtful: five times up and down where it has been, which is what tells them."""
 _BACK_M, _BACK_M_S = 1.0, 0.25
+"""Way back, and its mean speed: without a picture telemetry alone says how far it came."""
 SCALE_SIGMA = 0.10
 _KNOWN_S, _BEFORE_S = 1.2, 6.0
 """How long before its pose was lost it looked at what it knew well: pictures are up to half a second late. If that
@@ -275,7 +277,7 @@ class Supervisor:
         backing = BACK_S < trouble_s < BACK_S + self._back_s
         if danger in (Danger.BLIND, Danger.LOST, Danger.HELD) and backing:  # not where the pose itself is wrong
             turn = self._turn_back(_BEFORE_S) if danger is Danger.LOST else 0.0
-            return replace(self._back(danger), turn_left_rad_s=turn)
+            return replace(self._back(danger, trouble_s), turn_left_rad_s=turn)
         if danger is Danger.LOST and trouble_s > BACK_S + self._back_s:
             return Wish(turn_left_rad_s=0.5 * self.limits.turn_rad_s, why=f"{danger}: look around")
         return Wish(why=f"{danger}: hover")
@@ -290,7 +292,7 @@ class Supervisor:
         error = float(wrapped(np.array(yaw - self._sight.yaw_rad)))
         return float(np.clip(2.0 * error, -self.limits.turn_rad_s, self.limits.turn_rad_s))
 
-    def _back(self, danger: Danger) -> Wish:
+    def _back(self, danger: Danger, trouble_s: float) -> Wish:
         """Along the trail, away from where the trouble began."""
         assert self._sight is not None
         here = self._sight.p_w[:2]
@@ -301,7 +303,7 @@ class Supervisor:
         if not self._trail:
             return Wish(why=f"{danger}: hover")
         step = self._trail[-1][:2] - here
-        step = step * (_BACK_M_S / float(np.linalg.norm(step)))
+        step = step * (varied(_BACK_M_S + 0.5 * STEP_M_S, trouble_s) / float(np.linalg.norm(step)))
         c, s = math.cos(self._sight.yaw_rad), math.sin(self._sight.yaw_rad)
         return Wish(c * step[0] + s * step[1], c * step[1] - s * step[0], 0.0, 0.0, f"{danger}: back the way it came")
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from point_map import CAMERA, SCALE_FACTOR, check_map
 
-from edgeslam_torch.atlas.atlas import Atlas
+from edgeslam_torch.atlas import atlas as atlas_module
+from edgeslam_torch.atlas.atlas import LOOK_BACK_RAD, Atlas
 from edgeslam_torch.atlas.links import link
 from edgeslam_torch.atlas.loops import Drift, drift_told, far_keyframes, is_plausible
 from edgeslam_torch.atlas.saved import BEFORE_S
@@ -291,3 +292,50 @@ def test_what_is_near_a_closed_loop_has_not_drifted_by_as_much_as_the_way_round(
     share_anchors(ring.map, [found])
     assert is_plausible(ring.map, beside)
     assert not is_plausible(ring.map, alike)
+
+
+def guessed(ring, since=ROUND - 2):
+    """The newer end has the network's depths alone, a tenth too long: the drone turns on the spot there."""
+    anchors = ring.map.anchors
+    for keyframe in ring.keyframes[since:]:
+        seen = keyframe.anchor[keyframe.anchor >= 0]
+        ids = seen[anchors.alive[seen] & ~anchors.from_depth[seen] & (anchors.host[seen] >= -1)]
+        z = se3.transform(keyframe.T_c_w, anchors.p_w[ids])[:, 2]
+        anchors.p_w[ids] = keyframe.centre_w + 1.1 * (anchors.p_w[ids] - keyframe.centre_w)
+        anchors.from_depth[ids] = True
+        prior = np.column_stack([1.0 / (1.1 * z), 0.05 / z])
+        anchors.rest_on_prior(ids, keyframe.id, keyframe.centre_w, prior)
+    return ring
+
+
+def test_a_drone_that_turns_on_the_spot_closes_its_loop_without_a_scale(rng):
+    """Its images tell where it is and how it is turned, not how large its surroundings are."""
+    ring = guessed(Ring(rng))
+    assert link(ring.tracker, ring.keyframes[ROUND], ring.keyframes[0]) is None
+    assert ring.gap() > 0.2
+    closure = closed(ring, ring.atlas())[0]
+    assert ring.gap() < 0.06
+    assert 0.88 < closure.scale < 1.02, "the map has .91; the way that closes tells some of it"
+    check_map(ring.map)
+
+
+def test_where_all_lies_on_one_plane_the_images_must_tell_the_scale(rng, monkeypatch):
+    """A wall with the same paper a metre on: found with a fifth of the anchors, and depths are what tells it apart."""
+    monkeypatch.setattr(atlas_module, "on_one_plane", lambda *_: True)
+    turning, flying = guessed(Ring(rng)), Ring(rng)
+    assert closed(turning, turning.atlas()) == []
+    assert len(closed(flying, flying.atlas())) == 1
+
+
+@pytest.mark.parametrize(("turn", "asked"), [(1.1 * LOOK_BACK_RAD, 4), (0.3 * LOOK_BACK_RAD, 2)])
+def test_while_it_turns_it_looks_back_more_often(rng, monkeypatch, turn, asked):
+    """Four keyframes within a second, at the last of which a second has passed."""
+    ring, looks = Ring(rng), []
+    atlas = ring.atlas()
+    monkeypatch.setattr(atlas_module, "far_keyframes", lambda _, keyframe: looks.append(keyframe.id) or [])
+    first = ring.keyframes[0]
+    for k in range(4):
+        c, s = np.cos(k * turn), np.sin(k * turn)
+        R = np.array([[c, 0.0, -s, 0.0], [0.0, 1.0, 0.0, 0.0], [s, 0.0, c, 0.0], [0.0, 0.0, 0.0, 1.0]])
+        atlas._seen_before(replace(first, stamp_s=k / 3.0, T_c_w=R @ first.T_c_w))
+    assert len(looks) == asked
