@@ -137,7 +137,7 @@ class EdgeSlam:
             config.mapping.loop_closure,
             self._system.fusion.scale_around,
             self._system.fusion.scale_along,
-            self._system.apart.is_carried,
+            self._system.apart.carried_sigma,
         )
         self._joining = Joining(self._system, atlas)
         self._earlier: EarlierFlights | None = None

@@ -24,6 +24,7 @@ from edgeslam_torch.atlas.loops import (
     spread,
 )
 from edgeslam_torch.atlas.places import MIN_VOTES, lookalikes
+from edgeslam_torch.atlas.saved import BEFORE_S
 from edgeslam_torch.atlas.unit import AGAIN_S as UNIT_AGAIN_S
 from edgeslam_torch.atlas.unit import Rescaled, about, is_other
 from edgeslam_torch.atlas.weld import look_around, move_piece, share_anchors, weld
@@ -102,7 +103,8 @@ class Atlas:
         closing: Whether loops inside a piece are closed.
         metres: Metres per map unit around the stamp of an earlier frame, where anything else than the images tells it.
         metres_along: The same along some frames, by their stamps ``(F,)`` and poses ``(F, 4, 4)``.
-        carried: Whether the drone's sensors carried the camera to where a piece, by its number, began.
+        carried: Standard deviation per axis [map units] of where a piece, by its number, began, if the drone's sensors
+            carried the camera there; infinite otherwise.
     """
 
     def __init__(
@@ -114,7 +116,7 @@ class Atlas:
         closing: bool = False,
         metres: Callable[[float], ScaleEstimate | None] = lambda _: None,
         metres_along: Callable[[FloatArray, FloatArray], ScaleEstimate | None] = lambda *_: None,
-        carried: Callable[[int], bool] = lambda _: False,
+        carried: Callable[[int], float] = lambda _: np.inf,
     ) -> None:
         self.tracker = tracker
         self.map = tracker.map
@@ -223,14 +225,18 @@ class Atlas:
         """A link that may be true: within a piece, places that look alike and are far apart are not one."""
         if self.map.piece_of(keyframe.id) != self.map.piece_of(other.id):
             found = link(self.tracker, keyframe, other, told=self._size_between)
-            if found is None or found.by_images or is_carried(self.map, found):
-                return found
-            return None
+            return found if found is not None and self._may_lie_so(found) else None
         found = link(self.tracker, keyframe, other, LOOP_SHARE, told=as_it_is)
         if found is None or (not found.by_images and self._is_flat(found)):
             return None
         told = drift_told(*(self.metres(k.stamp_s) for k in (keyframe, other)))
         return found if is_plausible(self.map, found, told) else None
+
+    def _may_lie_so(self, one: Link) -> bool:
+        """Whether a link between two pieces agrees with what the drone's sensors say of where they lie."""
+        earlier = BEFORE_S in (one.keyframe.stamp_s, one.other.stamp_s)
+        sigma = np.inf if earlier else self.carried(max(self._pieces(one)))
+        return is_carried(self.map, one, sigma) if np.isfinite(sigma) else one.by_images
 
     def _is_flat(self, one: Link) -> bool:
         """Whether what a link rests on is one plane, such as a wall whose paper looks the same a metre on."""
@@ -326,7 +332,7 @@ class Atlas:
     def _join(self, links: list[Link]) -> Join:
         best = max(links, key=lambda one: len(one.keypoint))
         mine, theirs = self._pieces(best)
-        carried = bridge(self.map, mine, theirs) if self.carried(max(mine, theirs)) else None
+        carried = bridge(self.map, mine, theirs) if np.isfinite(self.carried(max(mine, theirs))) else None
         moved, S = mine, best.S
         if self._weight(mine) > self._weight(theirs):  # the lighter one moves
             moved, S = theirs, sim3.inverse(best.S)

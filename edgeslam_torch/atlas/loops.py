@@ -185,14 +185,22 @@ def _shortest_way(slam_map: SlamMap, link: Link) -> tuple[float, int]:
     return float(length[there]), steps
 
 
-def is_carried(slam_map: SlamMap, link: Link) -> bool:
+def is_carried(slam_map: SlamMap, link: Link, sigma: float) -> bool:
     """Whether two pieces can lie to each other as a link says, the newer one of which was begun where the drone's
-    sensors had carried the camera: nothing but their drift and that of the maps on the way is between them."""
+    sensors had carried the camera: nothing but their drift and that of the maps on the way is between them.
+
+    Both ends of a corridor look alike, doors, depths and all; they are not where the drone can have come to.
+
+    Args:
+        slam_map: With both pieces.
+        link: Between them.
+        sigma: Standard deviation per axis of where the newer one began [map units].
+    """
     ids = sorted((link.keyframe.id, link.other.id))
     centres = np.stack([k.centre_w for id, k in sorted(slam_map.keyframes.items()) if ids[0] <= id <= ids[1]])
     way = float(np.linalg.norm(np.diff(centres, axis=0), axis=1).sum())
     shift, turn = _off(link, link.keyframe.T_c_w)
-    return shift * link.depth <= MAX_DRIFT * way + MAX_SHIFT * link.depth and turn <= MAX_DRIFT_RAD
+    return shift * link.depth <= MAX_DRIFT * way + MAX_SHIFT * link.depth + SIGMAS * sigma and turn <= MAX_DRIFT_RAD
 
 
 def is_within_reach(slam_map: SlamMap, camera: Camera, link: Link) -> bool:

@@ -44,10 +44,11 @@ class Apart:
             sigma_r_rad = math.hypot(sigma_r_rad, earlier.sigma_r_rad)
         self.begun[piece] = _Begun(np.array(centre, dtype=np.float64), sigma_t, sigma_r_rad)
 
-    def is_carried(self, piece: int) -> bool:
-        """Whether the drone's sensors carried the camera to where a piece began."""
+    def carried_sigma(self, piece: int) -> float:
+        """Standard deviation per axis [map units] of where a piece began; infinite unless the drone's sensors carried
+        the camera there."""
         begun = self.begun.get(piece)
-        return begun is not None and math.isfinite(begun.sigma_t)
+        return math.inf if begun is None else begun.sigma_t
 
     def sigma(self, piece: int, centre: FloatArray, sigma_scale: float) -> float:
         """Standard deviation per axis [map units] of a camera of a piece in the world of the first one; infinite for

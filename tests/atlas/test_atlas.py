@@ -11,6 +11,7 @@ from edgeslam_torch.atlas.atlas import Atlas, _apart_enough, _sigma_log
 from edgeslam_torch.atlas.links import common_scale, link, on_one_plane, view_of
 from edgeslam_torch.atlas.loops import bridge
 from edgeslam_torch.atlas.places import lookalikes
+from edgeslam_torch.atlas.saved import BEFORE_S
 from edgeslam_torch.atlas.unit import AGAIN_S
 from edgeslam_torch.atlas.weld import move_piece
 from edgeslam_torch.config import EdgeConfig, OrbConfig, TrackingConfig
@@ -348,7 +349,8 @@ def test_wallpaper_is_no_place_whose_scale_is_told(rng, monkeypatch):
 def test_a_drone_that_turned_on_the_spot_joins_the_map_of_its_take_off(rng):
     assert turning(rng, CARRIED).atlas().update() is None
     pieces = turning(rng, CARRIED)
-    join = pieces.atlas(metres_along=metres_along(2.0 / 1.06)).update()
+    assert pieces.atlas(metres_along=metres_along(2.0 / 1.06)).update() is None, "nothing says where it began"
+    join = pieces.atlas(metres_along=metres_along(2.0 / 1.06), carried=lambda _: 0.01).update()
     assert (join.piece, join.absorbed) == (0, 1)
     assert sim3.scale_of(join.S) == pytest.approx(1 / 1.06 if join.moved == 1 else 1.06, rel=1e-6)
     assert join.sigma_log == pytest.approx(0.02 * np.sqrt(2.0))
@@ -360,7 +362,7 @@ def test_a_drone_that_turned_on_the_spot_joins_the_map_of_its_take_off(rng):
 def test_what_the_older_piece_has_drifted_by_is_spread_over_it(rng, by_sensors):
     """The newer one began where the drone's sensors had carried it: a step between them would be torn by telemetry."""
     pieces = Pieces(rng, misplaced=CARRIED)
-    join = pieces.atlas(carried=lambda piece: by_sensors and piece == 1).update()
+    join = pieces.atlas(carried=lambda piece: 0.01 if by_sensors and piece == 1 else np.inf).update()
     assert (sorted(join.grown) == list(range(8))) == by_sensors
     assert pieces.position_error() < 0.02
     assert join.growth(join.moved, 7) == pytest.approx(sim3.scale_of(join.S) * join.grown.get(7, 1.0))
@@ -432,10 +434,27 @@ def pixels_of(pieces, keyframe):
     return CAMERA.project(se3.transform(keyframe.T_c_w, pieces.map.anchors.p_w[keyframe.anchor[held]]))
 
 
-def test_a_piece_that_no_sensor_has_carried_there_is_not_joined_by_told_metres(rng):
-    """Half a metre and forty degrees off after a way of centimetres: nothing drifts so."""
-    pieces = turning(rng, MISPLACED)
-    assert pieces.atlas(metres_along=metres_along(2.0 / 1.4)).update() is None
+def test_a_piece_is_not_joined_where_the_drone_cannot_have_come_to(rng):
+    """Half a metre and forty degrees off after a way of centimetres: nothing drifts so, however much it looks alike."""
+    told = metres_along(2.0 / 1.4)
+    assert turning(rng, MISPLACED).atlas(metres_along=told, carried=lambda _: 0.01).update() is None
+    assert Pieces(rng, misplaced=MISPLACED).atlas(carried=lambda _: 0.01).update() is None
+    assert Pieces(rng, misplaced=MISPLACED).atlas().update() is not None, "by images alone"
+
+
+def test_where_a_piece_of_an_earlier_flight_lies_no_sensor_tells(rng):
+    pieces = Pieces(rng, misplaced=MISPLACED)
+    for keyframe in pieces.keyframes[:4]:
+        keyframe.stamp_s = BEFORE_S
+    assert pieces.atlas(carried=lambda _: 0.01).update() is not None
+
+
+@pytest.mark.parametrize(("sigma", "may"), [(0.1, False), (0.4, True)])
+def test_what_the_sensors_leave_open_may_be_made_up_for(rng, sigma, may):
+    """More than a metre beside where it was carried to."""
+    beside = sim3.exp(np.array([1.3, 0.1, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    join = Pieces(rng, misplaced=beside).atlas(carried=lambda _: sigma).update()
+    assert (join is not None) == may
 
 
 def test_the_way_back_must_close(rng):
