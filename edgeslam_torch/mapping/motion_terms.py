@@ -12,9 +12,12 @@ from edgeslam_torch.fusion.inertia import inertia
 from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.optim.problem import CentreFactor, GravityFactor, HeadingFactor
 
-ALIKE = 30.0
+ALIKE = 120.0
 """Keypoints err together: a window's thousands of reprojections, taken for independent, hold a wrong scale against
-telemetry whose covariance is honest. So many of them count as one in flight (docs/decisions/0052)."""
+telemetry whose covariance is honest. So many of them count as one in flight (docs/decisions/0052): thirty while corners
+were whole pixels, more since they are aligned to a fifth of one (docs/decisions/0145)."""
+ATTITUDE = 0.25
+"""Share of that for attitude, if it is more than one: its errors, of leaning and of the mount, do not average."""
 ALIKE_AT_THE_END = 1.0
 """The same in the last refinement: what drifted was taken back in flight, and telemetry's own errors, which have
 a memory of seconds, would bend the map (docs/decisions/0139)."""
@@ -64,12 +67,12 @@ def motion_factors(
         inert = inertia(stamps, model.scale) if model.knows_metres else None
         if inert is not None:
             centres.append(CentreFactor(order, alike * inert, np.zeros(len(inert)), 0.0))
-        up = model.up(stamps)
+        up, attitude = model.up(stamps), max(1.0, ATTITUDE * alike)
         if up is not None:
-            share = GUESSED if model.holds_level else alike
+            share = GUESSED if model.holds_level else attitude
             gravity.append(GravityFactor(order[up.frame], up.up_c, up.up_m, up.sigma_rad / math.sqrt(share)))
         told_yaw = headings(model, stamps)
         if told_yaw is not None:
             poses = order[told_yaw.frame]
-            turned.append(HeadingFactor(poses, told_yaw.R_c_m, told_yaw.up_m, alike * told_yaw.information))
+            turned.append(HeadingFactor(poses, told_yaw.R_c_m, told_yaw.up_m, attitude * told_yaw.information))
     return MotionFactors(tuple(centres), tuple(gravity), tuple(turned))

@@ -6,6 +6,7 @@ import numpy as np
 
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.limits import NavLimits
+from edgeslam_torch.navigation.pace import told
 from edgeslam_torch.types import FloatArray
 
 _HORIZON_S = 0.6
@@ -35,7 +36,13 @@ class Arcs:
 
 
 def candidates(
-    layer: Layer, p_w: FloatArray, velocity_w: FloatArray, ahead_rad: float, limits: NavLimits, speed_m_s: float
+    layer: Layer,
+    p_w: FloatArray,
+    velocity_w: FloatArray,
+    ahead_rad: float,
+    limits: NavLimits,
+    speed_m_s: float,
+    blind: bool = False,
 ) -> Arcs:
     """Velocities in all directions at some speeds, flown for a moment and stopped.
 
@@ -46,10 +53,12 @@ def candidates(
         ahead_rad: One of the directions: that of the way.
         limits: Reaction and settling of the drone.
         speed_m_s: The highest of the speeds.
+        blind: Whether telemetry alone will tell where they lead to.
     """
     angle = ahead_rad + 2 * np.pi * np.arange(_HEADINGS) / _HEADINGS
     unit = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     wanted = np.concatenate([np.zeros((1, 2)), *(speed_m_s * s * unit for s in _SPEEDS)])
+    wanted = told(wanted) if blind else wanted
     p = flown(np.asarray(p_w, dtype=np.float64), np.asarray(velocity_w, dtype=np.float64), wanted, limits)
     return Arcs(wanted, p, layer.clearance_at(p).min(axis=1), layer.from_solid_at(p).min(axis=1))
 

@@ -333,7 +333,8 @@ class Pilot:
         """Velocity ``(2,)`` in the world of the best candidate; None when standing is as good."""
         assert self.layer is not None
         fastest = varied(self.limits.speed_m_s, sight.stamp_s)
-        arcs = candidates(self.layer, sight.p_w[:2], sight.velocity_w[:2], ahead, self.limits, fastest)
+        here, blind = sight.p_w[:2], not sight.tracked
+        arcs = candidates(self.layer, here, sight.velocity_w[:2], ahead, self.limits, fastest, blind)
         need = self.limits.clearance_m(sight.position_sigma_m)
         standing = float(arcs.clearance_m[0])
         good = arcs.clearance_m >= need

@@ -13,7 +13,7 @@ import numpy as np
 from edgeslam_torch.geometry.rotations import wrapped
 from edgeslam_torch.navigation.limits import NavLimits
 from edgeslam_torch.navigation.moved import Moved
-from edgeslam_torch.navigation.pace import STEP_M_S, varied
+from edgeslam_torch.navigation.pace import STEP_M_S, told, varied
 from edgeslam_torch.navigation.push import PUSHED_M_S, Push
 from edgeslam_torch.navigation.sight import Sight, Touch, Wish
 from edgeslam_torch.types import FloatArray
@@ -303,9 +303,10 @@ class Supervisor:
         if not self._trail:
             return Wish(why=f"{danger}: hover")
         step = self._trail[-1][:2] - here
-        step = step * (varied(_BACK_M_S + 0.5 * STEP_M_S, trouble_s) / float(np.linalg.norm(step)))
+        speed_m_s = varied(_BACK_M_S + 0.5 * STEP_M_S, trouble_s)
+        v_w = told(step * (speed_m_s / float(np.linalg.norm(step))))
         c, s = math.cos(self._sight.yaw_rad), math.sin(self._sight.yaw_rad)
-        return Wish(c * step[0] + s * step[1], c * step[1] - s * step[0], 0.0, 0.0, f"{danger}: back the way it came")
+        return Wish(c * v_w[0] + s * v_w[1], c * v_w[1] - s * v_w[0], 0.0, 0.0, f"{danger}: back the way it came")
 
 
 def _doubtful(sight: Sight) -> bool:

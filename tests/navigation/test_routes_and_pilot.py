@@ -209,6 +209,17 @@ def test_its_speed_averages_out_what_telemetry_cuts_off():
     assert 0.39 < min(speeds) < 0.42 and 0.48 < max(speeds) <= 0.5
 
 
+@pytest.mark.parametrize("tracked", [True, False])
+def test_without_a_picture_it_flies_in_no_direction_that_telemetry_does_not_tell(tracked):
+    """A Tello tells whole decimetres a second along the axes of its power-on: what is less is told as none."""
+    pilot, sideways = before_a_free_way(), []
+    pilot.task = GoTo(np.array([6.0, 0.75, 1.15]))
+    for k in range(15):
+        wish = pilot.update(at(0.0, 0.0, speed_m_s=0.45, stamp_s=k / 15, tracked=tracked))
+        sideways.append(abs(wish.left_m_s))
+    assert any(0.0 < v < 0.1 for v in sideways) == tracked
+
+
 def before_a_free_way():
     """A pilot that has looked around, in a free hall, far from its goal."""
     pilot = Pilot(GoTo(np.array([6.0, 0.0, 1.15])), phase=Phase.FLYING)

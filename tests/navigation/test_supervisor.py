@@ -120,6 +120,29 @@ def test_it_backs_up_although_it_has_drifted_beside_its_way():
     assert lost[-1].wish.forward_m_s < 1e-6
 
 
+def test_telemetry_tells_how_far_it_backed_up():
+    """In whole decimetres a second, cut off, with half a step added: one speed would be told up to half of it wrong."""
+    supervisor = Supervisor()
+    flown(supervisor, 6.0)
+    stays = {"p_w": np.array([2.9, 0.0, 1.1]), "velocity_w": BACK, "tracked": False, "position_sigma_m": 0.2}
+    lost = flown(supervisor, 5.45, lambda s: replace(s, **stays), begin_s=6.0)
+    speeds = [-o.wish.forward_m_s for o in lost if o.wish.why.endswith("back the way it came")][:80]
+    assert len(speeds) >= 75
+    told = [math.floor(10.0 * v) / 10.0 + 0.05 for v in speeds]
+    assert sum(told) == pytest.approx(sum(speeds), rel=0.03)
+    assert sum(speeds) / len(speeds) == pytest.approx(0.25, abs=0.01)
+
+
+def test_without_a_picture_it_moves_in_no_direction_that_telemetry_does_not_tell():
+    """A few centimetres beside its way it does not creep towards it, which would be told as standing."""
+    supervisor = Supervisor()
+    flown(supervisor, 3.0)
+    aside = {"p_w": np.array([0.975, 0.03, 1.1]), "velocity_w": BACK, "tracked": False, "position_sigma_m": 0.2}
+    lost = flown(supervisor, 4.0, lambda s: replace(s, **aside), begin_s=3.0)
+    backing = [o.wish for o in lost if o.wish.why.endswith("back the way it came")]
+    assert backing and all(wish.left_m_s == 0.0 and wish.forward_m_s < -0.15 for wish in backing)
+
+
 def test_a_pose_lost_in_a_turn_is_looked_for_where_it_was_known():
     """It turned left from 0, and lost the map at 45 degrees: it turns right again, back to what it saw before."""
     supervisor = Supervisor()
