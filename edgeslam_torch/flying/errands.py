@@ -20,6 +20,9 @@ _LOOK_M, _LOOK_S = 0.6, 3.0
 _AHEAD_RAD = math.radians(8.0)
 _GIVEN_UP_S = 12.0
 """Time to turn and look: half a turn at a third of the usual rate, and the look. A drone may not be able to turn."""
+_FACES_S = 8.0
+"""Time in which it flies the last metre as it looks, slowly: what a turn would show is another part of the map, of a
+single turn before, and was seen to lie a quarter of a metre elsewhere."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +51,8 @@ class WayHome:
 
     track_w: FloatArray
     """``(N, 2)`` where it flew, oldest first [m]."""
-    _looked: bool = False
+    _looked_s: float = math.inf
+    """When it had looked as at its take-off."""
     _looks_s: float = math.nan
     """Since when it looks where it looked at its take-off."""
     _near_s: float = math.nan
@@ -65,18 +69,23 @@ class WayHome:
     def done(self, sight: Sight) -> bool:
         """Whether the drone is above its take-off, slow, and has looked as it did there."""
         near = float(np.linalg.norm(sight.p_w[:2])) < HOME_M
-        return self._looked and near and float(np.linalg.norm(sight.velocity_w)) < _SLOW_M_S
+        return sight.stamp_s >= self._looked_s and near and float(np.linalg.norm(sight.velocity_w)) < _SLOW_M_S
 
     def heading_rad(self, sight: Sight) -> float | None:
         """The heading of the take-off, which is 0, for seconds when it comes near."""
-        if self._looked or float(np.linalg.norm(sight.p_w[:2])) > _LOOK_M:
+        if sight.stamp_s >= self._looked_s or float(np.linalg.norm(sight.p_w[:2])) > _LOOK_M:
             return None
         if math.isnan(self._near_s):
             self._near_s = sight.stamp_s
         if math.isnan(self._looks_s) and abs(float(wrapped(np.array(sight.yaw_rad)))) < _AHEAD_RAD:
             self._looks_s = sight.stamp_s
-        self._looked = sight.stamp_s - self._looks_s > _LOOK_S or sight.stamp_s - self._near_s > _GIVEN_UP_S
+        if sight.stamp_s - self._looks_s > _LOOK_S or sight.stamp_s - self._near_s > _GIVEN_UP_S:
+            self._looked_s = sight.stamp_s
         return 0.0
+
+    def faces_rad(self, sight: Sight) -> float | None:
+        """The same heading for the last metre."""
+        return 0.0 if 0.0 <= sight.stamp_s - self._looked_s < _FACES_S else None
 
     def carry(self, moved: Moved) -> None:
         """Take the way along with the map; the take-off stays the origin."""

@@ -282,8 +282,8 @@ class Pilot:
         if not math.isfinite(now):
             return Wish(turn_left_rad_s=self._search(sight), why="no way is known: look around")
         self.way_w = plan.way(here, 3.0)
-        ahead = self._bearing(here)
-        error = float(wrapped(np.array(ahead - sight.yaw_rad)))
+        ahead, faced = self._bearing(here), self.task.faces_rad(sight)
+        error = float(wrapped(np.array((ahead if faced is None else faced) - sight.yaw_rad)))
         turn = self._turn(error)
         chosen = self._chosen(sight, plan, ahead, error)
         if chosen is None:

@@ -34,6 +34,9 @@ class Task(Protocol):
     def heading_rad(self, sight: Sight) -> float | None:
         """Where to look now, standing; None to look where it flies."""
 
+    def faces_rad(self, sight: Sight) -> float | None:
+        """Where to look while it flies, slowly and through what it knows; None to look where it flies."""
+
 
 class LooksAhead:
     """Part of a task during which the drone looks where it flies, always."""
@@ -41,6 +44,10 @@ class LooksAhead:
     __slots__ = ()
 
     def heading_rad(self, sight: Sight) -> float | None:
+        """None: ahead."""
+        return None
+
+    def faces_rad(self, sight: Sight) -> float | None:
         """None: ahead."""
         return None
 
@@ -110,3 +117,7 @@ class Explore:
     def heading_rad(self, sight: Sight) -> float | None:
         """Left and right, standing, wherever it has not looked around."""
         return self._around.heading_rad(sight)
+
+    def faces_rad(self, sight: Sight) -> float | None:
+        """None: ahead."""
+        return None

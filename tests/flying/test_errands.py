@@ -64,3 +64,28 @@ def test_a_pilot_stands_and_turns_where_the_task_wants_to_look(yaw_deg, sign):
     wish = pilot.update(at(0.0, x=0.5, yaw_deg=yaw_deg))
     assert (wish.forward_m_s, wish.left_m_s) == (0.0, 0.0)
     assert np.sign(wish.turn_left_rad_s) == sign
+
+
+def looked(x):
+    """A task whose look at the take-off is over, and the moment of that."""
+    task = way_home()
+    for stamp_s in (0.0, 2.0, 3.5):
+        task.heading_rad(at(stamp_s, x=x))
+    return task, 3.5
+
+
+def test_it_faces_as_it_looked_for_the_last_metre_and_not_for_ever():
+    assert way_home().faces_rad(at(0.0, x=0.5)) is None
+    task, since_s = looked(0.5)
+    assert task.faces_rad(at(since_s + 0.1, x=0.5)) == 0.0
+    assert task.faces_rad(at(since_s + 9.0, x=0.5)) is None
+
+
+def test_a_pilot_flies_the_last_metre_backwards_and_slowly():
+    """Before it what it has just known again, and the take-off behind it: no turn to what may lie elsewhere."""
+    task, since_s = looked(0.55)
+    pilot = Pilot(task, phase=Phase.FLYING)
+    for x in np.arange(-0.5, 2.0, 0.1):
+        pilot.space.flown(np.array([x, 0.0, NavLimits().height_m]), 0.6)
+    wishes = [pilot.update(at(since_s + 0.1 * k, x=0.55)) for k in range(1, 6)]
+    assert all(-0.2 < wish.forward_m_s < -0.05 and abs(wish.turn_left_rad_s) < 0.05 for wish in wishes)
