@@ -17,10 +17,12 @@ HOME_M = 0.15
 _SLOW_M_S = 0.15
 _LOOK_M, _LOOK_S = 0.6, 3.0
 """How near to the take-off it looks ahead, and for how long: two keyframes, a loop, and a view in new metres."""
+_LOST_M = 1.5
+"""The same once its pose was lost this near: a bare wall behind the take-off shows nothing to come home by."""
 _AHEAD_RAD = math.radians(8.0)
 _GIVEN_UP_S = 12.0
 """Time to turn and look: half a turn at a third of the usual rate, and the look. A drone may not be able to turn."""
-_FACES_S = 8.0
+_FACES_S = 12.0
 """Time in which it flies the last metre as it looks, slowly: what a turn would show is another part of the map, of a
 single turn before, and was seen to lie a quarter of a metre elsewhere."""
 
@@ -57,6 +59,7 @@ class WayHome:
     """Since when it looks where it looked at its take-off."""
     _near_s: float = math.nan
     """Since when it wants to."""
+    _look_m: float = _LOOK_M
 
     def goals(self, layer: Layer, sight: Sight) -> np.ndarray:
         """The cell of the oldest point of the way that the grid still holds."""
@@ -73,7 +76,10 @@ class WayHome:
 
     def heading_rad(self, sight: Sight) -> float | None:
         """The heading of the take-off, which is 0, for seconds when it comes near."""
-        if sight.stamp_s >= self._looked_s or float(np.linalg.norm(sight.p_w[:2])) > _LOOK_M:
+        away = float(np.linalg.norm(sight.p_w[:2]))
+        if not sight.tracked and away < _LOST_M:
+            self._look_m = _LOST_M
+        if sight.stamp_s >= self._looked_s or away > self._look_m:
             return None
         if math.isnan(self._near_s):
             self._near_s = sight.stamp_s

@@ -1,6 +1,7 @@
 """The way home, and its look at the take-off."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -66,6 +67,16 @@ def test_a_pilot_stands_and_turns_where_the_task_wants_to_look(yaw_deg, sign):
     assert np.sign(wish.turn_left_rad_s) == sign
 
 
+def test_where_its_pose_was_lost_near_home_it_looks_from_farther_away():
+    """It has backed up from the bare wall behind its take-off: it does not fly at it again."""
+    task = way_home()
+    assert task.heading_rad(at(0.0, x=1.2, yaw_deg=180.0)) is None
+    assert task.heading_rad(replace(at(1.0, x=2.0, yaw_deg=180.0), tracked=False)) is None
+    assert task.heading_rad(at(1.5, x=1.2, yaw_deg=180.0)) is None, "that was not near"
+    task.heading_rad(replace(at(2.0, x=0.8, yaw_deg=180.0), tracked=False))
+    assert task.heading_rad(at(3.0, x=1.2, yaw_deg=180.0)) == 0.0
+
+
 def looked(x):
     """A task whose look at the take-off is over, and the moment of that."""
     task = way_home()
@@ -78,7 +89,7 @@ def test_it_faces_as_it_looked_for_the_last_metre_and_not_for_ever():
     assert way_home().faces_rad(at(0.0, x=0.5)) is None
     task, since_s = looked(0.5)
     assert task.faces_rad(at(since_s + 0.1, x=0.5)) == 0.0
-    assert task.faces_rad(at(since_s + 9.0, x=0.5)) is None
+    assert task.faces_rad(at(since_s + 13.0, x=0.5)) is None
 
 
 def test_a_pilot_flies_the_last_metre_backwards_and_slowly():
