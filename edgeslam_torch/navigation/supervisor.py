@@ -40,6 +40,8 @@ them are the margin and the hull. A bare wall fills the picture for a metre of w
 _WIGGLE_S, _WIGGLE_M_S = 2.0, 0.25
 """Up and down, which tells height and telemetry the scale."""
 _TRAIL_M = 0.05
+_ONE_WAY_M = 0.3
+"""How far the way back may lie beside the way out."""
 _APART_M, _APART_S = 0.5, 1.0
 """Heights of map and drone that are so far apart for so long cannot both be true. Together sure metres of 10 % at the
 highest flight, a video that is 0.5 s late in a climb of 0.4 m/s, and the drone's own decimetres explain 0.45 m."""
@@ -297,7 +299,7 @@ class Supervisor:
         assert self._sight is not None
         here = self._sight.p_w[:2]
         away = np.linalg.norm(np.array(self._trail).reshape(-1, 3)[:, :2] - here, axis=1)
-        nearest = int(np.argmin(away)) if len(away) else 0
+        nearest = _latest_approach(away)
         while self._trail and (len(self._trail) - 1 > nearest or away[len(self._trail) - 1] < 2 * _TRAIL_M):
             self._trail.pop()
         if not self._trail:
@@ -307,6 +309,16 @@ class Supervisor:
         v_w = told(step * (speed_m_s / float(np.linalg.norm(step))))
         c, s = math.cos(self._sight.yaw_rad), math.sin(self._sight.yaw_rad)
         return Wish(c * v_w[0] + s * v_w[1], c * v_w[1] - s * v_w[0], 0.0, 0.0, f"{danger}: back the way it came")
+
+
+def _latest_approach(away_m: FloatArray) -> int:
+    """Where along a way, by the distances ``(N,)`` of its points, a place lies: on its latest pass, not on the way out
+    when it is flown back."""
+    if len(away_m) == 0:
+        return 0
+    padded = np.concatenate([[np.inf], away_m, [np.inf]])
+    passes = (away_m <= padded[:-2]) & (away_m <= padded[2:]) & (away_m <= away_m.min() + _ONE_WAY_M)
+    return int(np.flatnonzero(passes)[-1])
 
 
 def _doubtful(sight: Sight) -> bool:

@@ -120,6 +120,20 @@ def test_it_backs_up_although_it_has_drifted_beside_its_way():
     assert lost[-1].wish.forward_m_s < 1e-6
 
 
+def test_on_its_way_home_it_backs_up_the_way_it_came_not_the_way_it_had_gone():
+    """Out to 3 m and back to 1 m beside that, then a bare wall: back towards 3 m, where its pose was known last."""
+    supervisor = Supervisor()
+    flown(supervisor, 6.0)
+    for k in range(80):
+        supervisor.see(replace(sight(6.0 + k / 20, 3.0 - 0.025 * k), p_w=np.array([3.0 - 0.025 * k, 0.1, 1.1])))
+        supervisor.propose(AHEAD, 6.0 + k / 20)
+        supervisor.order(6.0 + k / 20)
+    stays = {"p_w": np.array([1.0, 0.1, 1.1]), "velocity_w": -BACK, "tracked": False, "position_sigma_m": 0.2}
+    lost = flown(supervisor, 4.0, lambda s: replace(s, **stays), begin_s=10.0)
+    backing = [o.wish for o in lost if o.wish.why.endswith("back the way it came")]
+    assert backing and all(wish.forward_m_s > 0.1 for wish in backing)
+
+
 def test_telemetry_tells_how_far_it_backed_up():
     """In whole decimetres a second, cut off, with half a step added: one speed would be told up to half of it wrong."""
     supervisor = Supervisor()
