@@ -196,11 +196,26 @@ def is_carried(slam_map: SlamMap, link: Link, sigma: float) -> bool:
         link: Between them.
         sigma: Standard deviation per axis of where the newer one began [map units].
     """
-    ids = sorted((link.keyframe.id, link.other.id))
+    shift, turn = _off(link, link.keyframe.T_c_w)
+    near = is_near(slam_map, link.keyframe, link.other, shift * link.depth, link.depth, sigma)
+    return near and turn <= MAX_DRIFT_RAD
+
+
+def is_near(slam_map: SlamMap, one: Keyframe, other: Keyframe, shift: float, depth: float, sigma: float) -> bool:
+    """Whether a camera can be this far from where the drone's sensors say, on a map that has drifted on the way.
+
+    Args:
+        slam_map: With the keyframes.
+        one: Where the way ends, or begins.
+        other: Its other end.
+        shift: Distance [map units].
+        depth: That the camera sees.
+        sigma: Standard deviation per axis of what the sensors say.
+    """
+    ids = sorted((one.id, other.id))
     centres = np.stack([k.centre_w for id, k in sorted(slam_map.keyframes.items()) if ids[0] <= id <= ids[1]])
     way = float(np.linalg.norm(np.diff(centres, axis=0), axis=1).sum())
-    shift, turn = _off(link, link.keyframe.T_c_w)
-    return shift * link.depth <= MAX_DRIFT * way + MAX_SHIFT * link.depth + SIGMAS * sigma and turn <= MAX_DRIFT_RAD
+    return shift <= MAX_DRIFT * way + MAX_SHIFT * depth + SIGMAS * sigma
 
 
 def is_within_reach(slam_map: SlamMap, camera: Camera, link: Link) -> bool:

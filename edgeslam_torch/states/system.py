@@ -8,6 +8,7 @@ import numpy as np
 from edgeslam_torch.config import SlamConfig
 from edgeslam_torch.fusion.displacement import TelemetryModel
 from edgeslam_torch.fusion.motion import MotionFusion
+from edgeslam_torch.fusion.prediction import PoseEstimate
 from edgeslam_torch.fusion.published import Published
 from edgeslam_torch.fusion.scale.depth_scale import DepthRatio, compared
 from edgeslam_torch.geometry import se3
@@ -124,6 +125,11 @@ class System:
             return None
         place = None if reckoned is None else Place(reckoned.R_w_m, reckoned.centre, reckoned.doubt)
         return Told(None if turned is None else Attitude(*turned), place)
+
+    def carried(self, stamp_s: float) -> PoseEstimate | None:
+        """Where the drone's sensors say the camera is; None without them."""
+        told = self.fusion.predict(stamp_s) if self.has_telemetry else None
+        return told if told is not None and told.source in _BY_SENSORS and np.isfinite(told.sigma_t) else None
 
     def reach(self, stamp_s: float, T_predicted: FloatArray) -> Reach:
         """Region that the camera can have reached during frames without a pose."""

@@ -4,7 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from edgeslam_torch.atlas.loops import is_near
 from edgeslam_torch.atlas.places import lookalikes
+from edgeslam_torch.atlas.saved import BEFORE_S
+from edgeslam_torch.geometry import se3
 from edgeslam_torch.map.keyframe import Keyframe, make_keyframe, tracked_motion
 from edgeslam_torch.mapping.prior_anchors import depth_slack_px, mostly_on_priors
 from edgeslam_torch.states.backfill import Backfill
@@ -234,11 +237,26 @@ class Tracking:
         """Relocalise a frame among keyframes; earlier unconfirmed frames get their poses too."""
         system = self.system
         found = self.relocaliser.find(frame.index, view, asked, reach)
-        if found is None:
+        if found is None or not self._may_be_at(found.track, frame.stamp_s):
             return None
         if found.earlier:
             system.log.replace(found.earlier, system.tracker.local_keyframes(found.track.anchor)[:1])
         return found.track
+
+    def _may_be_at(self, track: Track, stamp_s: float) -> bool:
+        """Whether the drone can have come to where a frame looks like: a wall with the same paper is found again three
+        metres on, by several frames. Without sensors, or in another piece of map, images decide alone."""
+        system = self.system
+        told, records = system.carried(stamp_s), system.log.records
+        if told is None or not records:
+            return True
+        here, there = system.map.heir_of(records[-1].keyframe_id)[0], system.tracker.local_keyframes(track.anchor)[0]
+        apart = system.map.piece_of(here) != system.map.piece_of(there.id) or there.stamp_s == BEFORE_S
+        if apart:
+            return True
+        shift = float(np.linalg.norm(se3.inverse(track.T_c_w)[:3, 3] - told.T_w_c[:3, 3]))
+        depth = float(np.median(se3.transform(track.T_c_w, system.map.anchors.p_w[track.anchor])[:, 2]))
+        return is_near(system.map, system.map.keyframes[here], there, shift, depth, told.sigma_t)
 
     # -- by edges ----------------------------------------------------------------------------------------------
 

@@ -1,0 +1,78 @@
+"""Where a lost frame may be found again: where the drone's sensors let it be."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from edgeslam_torch.atlas.saved import BEFORE_S
+from edgeslam_torch.fusion.prediction import PoseEstimate
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.states.tracking import Tracking
+
+
+def placed(x):
+    """Camera-to-world pose at ``(x, 0, 0)``."""
+    T_w_c = np.eye(4)
+    T_w_c[0, 3] = x
+    return T_w_c
+
+
+class Flown:
+    """Six keyframes along five units, the newest of which was tracked last; what it sees is two units away."""
+
+    def __init__(self, sigma=0.01, earlier=False):
+        stamps = [BEFORE_S if earlier and k < 3 else float(k) for k in range(6)]
+        self.keyframes = {
+            k: SimpleNamespace(id=k, centre_w=np.array([float(k), 0.0, 0.0]), stamp_s=stamps[k]) for k in range(6)
+        }
+        self.piece_of = dict.fromkeys(range(6), 0)
+        self.told = PoseEstimate(6.0, placed(5.0), sigma, 0.01, "filter")
+        self.asked = []
+
+    def system(self):
+        slam_map = SimpleNamespace(
+            keyframes=self.keyframes,
+            heir_of=lambda k: (k, np.eye(4)),
+            piece_of=self.piece_of.__getitem__,
+            anchors=SimpleNamespace(p_w=np.array([[0.0, 0.0, 2.0], [5.0, 0.0, 2.0]])),
+        )
+        return SimpleNamespace(
+            map=slam_map,
+            tracker=SimpleNamespace(local_keyframes=lambda anchor: [self.keyframes[0]]),
+            log=SimpleNamespace(
+                records=[SimpleNamespace(keyframe_id=5)], replace=lambda *_: self.asked.append("moved")
+            ),
+            carried=lambda stamp_s: self.told,
+        )
+
+    def finds(self, x):
+        """The track that a relocaliser's find at ``(x, 0, 0)``, confirmed by earlier frames, comes to."""
+        track = SimpleNamespace(T_c_w=se3.inverse(placed(x)), anchor=np.array([0, 1]))
+        found = SimpleNamespace(track=track, earlier=[1])
+        state = SimpleNamespace(system=self.system(), relocaliser=SimpleNamespace(find=lambda *_: found))
+        state._may_be_at = lambda *args: Tracking._may_be_at(state, *args)
+        return Tracking.find(state, SimpleNamespace(index=7, stamp_s=6.0), None, [], None)
+
+
+def test_a_frame_is_not_found_again_where_the_drone_cannot_have_come_to():
+    """Two and a half units from where it was carried to, on a way of five; nor are the frames before it moved there."""
+    flown = Flown()
+    assert flown.finds(2.5) is None and flown.asked == []
+
+
+@pytest.mark.parametrize(("x", "sigma", "may"), [(4.4, 0.01, True), (4.0, 0.01, False), (4.0, 0.2, True)])
+def test_a_map_drifts_and_sensors_doubt(x, sigma, may):
+    """A tenth of the way and of the depth, and three sigmas: .7 and 1.3 units."""
+    assert (Flown(sigma).finds(x) is not None) == may
+
+
+def test_images_decide_alone():
+    """Without sensors, in another piece of map, and in the map of an earlier flight."""
+    flown = Flown()
+    flown.told = None
+    assert flown.finds(0.0) is not None
+    flown = Flown()
+    flown.piece_of[5] = 1
+    assert flown.finds(0.0) is not None
+    assert Flown(earlier=True).finds(0.0) is not None
