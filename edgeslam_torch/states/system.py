@@ -128,7 +128,7 @@ class System:
 
     def carried(self, stamp_s: float) -> PoseEstimate | None:
         """Where the drone's sensors say the camera is; None without them."""
-        told = self.fusion.predict(stamp_s) if self.has_telemetry else None
+        told = self.fusion.predict(stamp_s)
         return told if told is not None and told.source in _BY_SENSORS and np.isfinite(told.sigma_t) else None
 
     def reach(self, stamp_s: float, T_predicted: FloatArray) -> Reach:
@@ -156,10 +156,9 @@ class System:
     def carried_to(self, piece: int, stamp_s: float) -> None:
         """A piece of map begins at the current pose, where prediction has carried the camera."""
         earlier = (self.map.piece_of(r.keyframe_id) for r in reversed(self.log.records))
-        before, told = next((p for p in earlier if p != piece), None), self.fusion.predict(stamp_s)
+        before, told = next((p for p in earlier if p != piece), None), self.carried(stamp_s)
         if before is not None:
-            carried = told is not None and told.source in _BY_SENSORS
-            sigma_t, sigma_r = (told.sigma_t, told.sigma_r_rad) if told and carried else (np.inf, np.inf)
+            sigma_t, sigma_r = (np.inf, np.inf) if told is None else (told.sigma_t, told.sigma_r_rad)
             self.apart.begin(piece, before, se3.inverse(self.motion.T_c_w)[:3, 3], sigma_t, sigma_r)
             self.apart_sigma = self._apart_sigma(piece)
 
