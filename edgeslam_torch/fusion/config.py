@@ -88,7 +88,8 @@ class FusionConfig:
     max_gap_s: float = 0.35
     """A longer hole in telemetry or tracking ends a displacement."""
     alignment_sigma_rad: float = math.radians(3.0)
-    """How far the attitude-derived rotation from map to power-on world may be corrected by displacements."""
+    """How far the camera's mount may be off, per axis, and with it the attitude-derived rotation from map to power-on
+    world, until the flight's turns say it better."""
     min_speed_m_s: float = 0.06
     """RMS metric speed below which an interval does not constrain the scale (hover, turning on the spot)."""
     systematic_log: float = 0.008

@@ -28,12 +28,12 @@ from edgeslam_torch.fusion.prediction import (
     with_velocity,
 )
 from edgeslam_torch.fusion.published import Published
-from edgeslam_torch.fusion.scale.camera_mount import Mount, estimate_mount
+from edgeslam_torch.fusion.scale.camera_mount import Mount, Turned, estimate_mount, mount_by_turns
 from edgeslam_torch.fusion.scale.consensus import Settled, settled_with_network
 from edgeslam_torch.fusion.scale.depth_scale import DepthRatio, DepthRatios, DepthScale
 from edgeslam_torch.fusion.scale.log_scale import LogScale, fuse
 from edgeslam_torch.fusion.snapshot import Present, Snapshot
-from edgeslam_torch.fusion.telemetry.alignment import map_to_world
+from edgeslam_torch.fusion.telemetry.alignment import attitudes, map_to_world
 from edgeslam_torch.fusion.telemetry.comparison import Comparison, FlightSoFar
 from edgeslam_torch.fusion.telemetry.delay import DelaySearch
 from edgeslam_torch.fusion.telemetry.grown import REACH_S, grown
@@ -95,7 +95,8 @@ class MotionFusion:
         self._filter = FilterFeed(config, self.T_b_c)
         self._trust = Trust()
         self._unrest = Unrest()
-        self._R_w_m: FloatArray | None = None
+        self._turned: Turned | None = None
+        """How map and camera are turned against the drone and its world; None without telemetry attitude."""
         self.began_s = math.nan
         """Stamp of the first frame."""
         self._attitude_s = math.inf
@@ -267,21 +268,24 @@ class MotionFusion:
 
     def scale_around(self, stamp_s: float) -> ScaleEstimate | None:
         """Metres per map unit within seconds of an earlier frame, in the map as it is now; None where nothing tells."""
-        if self._R_w_m is None or not self._trust.velocity or len(self._track) == 0:
+        if self._turned is None or not self._trust.velocity or len(self._track) == 0:
             return None
         moved, low = self._memory.displacements(), self._fit.shortfall_m_s
-        return scale_around(moved, self._track, stamp_s, self.delay_s, self._R_w_m, self.T_b_c, self.config, low)
+        return scale_around(
+            moved, self._track, stamp_s, self.delay_s, self._turned.R_w_m, self._mounted, self.config, low
+        )
 
     def scale_along(self, stamps_s: FloatArray, T_w_c: FloatArray) -> ScaleEstimate | None:
         """Metres per map unit along some frames of the flight, ``(F,)`` and ``(F, 4, 4)``; None where nothing tells."""
-        if self._R_w_m is None or not self._trust.velocity or len(self._track) == 0 or len(stamps_s) == 0:
+        R_w_m = self.rotation()
+        if R_w_m is None or not self._trust.velocity or len(self._track) == 0 or len(stamps_s) == 0:
             return None
         length_s = float(stamps_s[-1] - stamps_s[0]) + self.config.window_s
         memory = VisualMemory(self.config.interval_s, length_s, self.config.max_gap_s)
         for stamp_s, T in zip(stamps_s.tolist(), T_w_c, strict=True):
             memory.add(VisualPose(stamp_s, T, _USUAL_SIGMA, _USUAL_SIGMA))
         moved, low = memory.displacements(), self._fit.shortfall_m_s
-        return scale_of(moved, self._track, self.delay_s, self._R_w_m, self.T_b_c, self.config, low)
+        return scale_of(moved, self._track, self.delay_s, R_w_m, self._mounted, self.config, low)
 
     def network_unit(self) -> float | None:
         """The depth network's metres per map unit, right or wrong; None before anything has been compared."""
@@ -330,10 +334,10 @@ class MotionFusion:
         recent = self._memory.recent(stamp_s - _TURNED_S)
         if recent is None:
             return None
-        R_w_m = map_to_world(recent, self._track, self.delay_s, self.T_b_c[:3, :3])
+        R_w_m = map_to_world(recent, self._track, self.delay_s, self._mounted[:3, :3])
         if R_w_m is None:
             return None
-        R_m_c = R_w_m.T @ self._track.attitude(around) @ self.T_b_c[:3, :3]
+        R_m_c = R_w_m.T @ self._track.attitude(around) @ self._mounted[:3, :3]
         doubt = max(float(np.linalg.norm(rotation_vector(R_m_c[0].T @ R_m_c[k]))) for k in (1, 2))
         return R_m_c[0].T, doubt
 
@@ -351,7 +355,16 @@ class MotionFusion:
 
     def rotation(self) -> FloatArray | None:
         """``R_w_m`` ``(3, 3)``: map axes to the drone's power-on world; ``None`` without telemetry attitude."""
-        return self._R_w_m
+        return None if self._turned is None else self._turned.R_w_m
+
+    @property
+    def _mounted(self) -> FloatArray:
+        """Camera in the body ``(4, 4)`` as the flight's turns have it."""
+        if self._turned is None:
+            return self.T_b_c
+        T_b_c = self.T_b_c.copy()
+        T_b_c[:3, :3] = self._turned.R_b_c
+        return T_b_c
 
     @property
     def filtering(self) -> bool:
@@ -394,10 +407,10 @@ class MotionFusion:
     def _up_by_attitude(self) -> FloatArray | None:
         """``R_w_m`` where attitude may turn the world: when it has proven to be of this flight, or as the one may that
         comes with the first picture."""
-        if self._R_w_m is None or not self._trust.attitude:
+        if self._turned is None or not self._trust.attitude:
             return None
         at_once = self._attitude_s - self.began_s < _AT_ONCE_S
-        return self._R_w_m if at_once or self._trust.turns else None
+        return self._turned.R_w_m if at_once or self._trust.turns else None
 
     def leaning(self) -> str | None:
         """That no attitude was sure enough to tell where up is, in words; None where the drone told none."""
@@ -463,7 +476,7 @@ class MotionFusion:
 
     def _carried(self) -> Carried:
         sigma = self.config.sigma_velocity_m_s
-        return Carried(self._track, self.delay_s, self.T_b_c, self._R_w_m, self.scale(), self._fit, sigma)
+        return Carried(self._track, self.delay_s, self._mounted, self.rotation(), self.scale(), self._fit, sigma)
 
     def mount(self) -> Mount | None:
         """How the camera sits on the body, estimated from the flight; ``None`` without enough motion."""
@@ -501,6 +514,8 @@ class MotionFusion:
         if mount is not None:
             numbers["camera tilt deg"] = math.degrees(mount.tilt_rad)
             numbers["camera tilt sigma deg"] = math.degrees(mount.tilt_sigma_rad)
+        turned = self._mounted[:3, :3] @ self.T_b_c[:3, :3].T
+        numbers["camera mount turned deg"] = math.degrees(float(np.linalg.norm(rotation_vector(turned))))
         for name, source in self._fit.sources.items():
             numbers[f"scale {name}"], numbers[f"scale {name} sigma"] = source.value, source.sigma
         depth = self._depth.scale()
@@ -518,7 +533,7 @@ class MotionFusion:
         """Telemetry and its tie to the map as they are now, for refinement; None while there is none.
 
         Until its metres are known gravity alone speaks, if the map was begun upright: the mean of attitudes that
-        `_R_w_m` is has the map's own tilt in it by then (docs/decisions/0108).
+        `rotation` is has the map's own tilt in it by then (docs/decisions/0108).
         """
         model = self._model()
         return None if model is None else replace(model, track=self._track.copy())
@@ -526,7 +541,7 @@ class MotionFusion:
     def _model(self) -> TelemetryModel | None:
         """The same on the track that grows, for use at once."""
         told = self._by_telemetry
-        R_w_m = self._R_w_m if told is not None else np.eye(3) if self.began_upright else None
+        R_w_m = self.rotation() if told is not None else np.eye(3) if self.began_upright else None
         if R_w_m is None:
             return None
         there = self._track.heights()
@@ -535,7 +550,7 @@ class MotionFusion:
         return TelemetryModel(
             self._track,
             self.config,
-            self.T_b_c,
+            self.T_b_c if told is None else self._mounted,
             R_w_m,
             self.delay_s,
             self.delay_sigma_s,
@@ -561,7 +576,7 @@ class MotionFusion:
         known = self._by_telemetry is not None and math.isfinite(self.delay_sigma_s)
         first_s = _REFIT_S if known else _FIRST_FIT_S
         pause_s = max(first_s, _REFIT_SHARE * min(self._memory.length_s, self.config.window_s))
-        return len(self._track) > 0 and (self._R_w_m is None or stamp_s - self._fitted_s >= pause_s)
+        return len(self._track) > 0 and (self._turned is None or stamp_s - self._fitted_s >= pause_s)
 
     def _refit(self, flying: bool = True) -> None:
         """Delay, alignment, trust and scale from what is remembered."""
@@ -569,28 +584,28 @@ class MotionFusion:
         if last is None or len(self._track) == 0:
             return
         self._fitted_s = last.stamp_s
-        if self._R_w_m is None:
-            self._R_w_m = self._alignment()
+        if self._turned is None:
+            self._turned = self._alignment()
         guessed = not math.isfinite(self.delay_sigma_s)
         self._delay.search(self._memory, self._track)
         if guessed and math.isfinite(self.delay_sigma_s):  # heights were compared at a wrong delay
             for reading in HEIGHTS:
                 self._trust.forget(reading)
-        R_w_m = self._alignment()
-        if R_w_m is None:
+        turned = self._alignment()
+        if turned is None:
             return
-        self._R_w_m = R_w_m
+        self._turned = turned
         depth = self._depth.scale()
         network = None if depth is None else self._with_focal(depth)
-        present = FlightSoFar(self._memory, self._track, self.T_b_c[:3, :3], self._rough_scale(), network)
-        self._comparison.judge(self._trust, present, self._delay.delay, R_w_m, flying)
+        present = FlightSoFar(self._memory, self._track, self._mounted[:3, :3], self._rough_scale(), network)
+        self._comparison.judge(self._trust, present, self._delay.delay, turned.R_w_m, flying)
         self._trust.at_odds = None
         held = self._held_scale()
-        scale = TelemetryScale(self.config, self.T_b_c, present, self._trust, self.delay_s, R_w_m, held, flying)
+        scale = TelemetryScale(self.config, self._mounted, present, self._trust, self.delay_s, turned, held, flying)
         unrest = self._unrest.sigma if flying else 0.0
         self._take(scale.opinion(), unrest)
         supposed = TelemetryScale(
-            self.config, self.T_b_c, present, self._trust.supposing_heights(), self.delay_s, R_w_m, held, flying
+            self.config, self._mounted, present, self._trust.supposing_heights(), self.delay_s, turned, held, flying
         )
         self._guess = self._guessed(supposed, unrest) if flying and self._by_telemetry is None else None
         oldest = self._memory.sightings().stamps_s[0]
@@ -613,8 +628,15 @@ class MotionFusion:
             self._forget_scale()
         # else nothing new to say: hover, pure rotation, or telemetry missing
 
-    def _alignment(self) -> FloatArray | None:
-        return map_to_world(self._memory.sightings(), self._track, self.delay_s, self.T_b_c[:3, :3])
+    def _alignment(self) -> Turned | None:
+        """By the flight's attitudes; the camera's mount only once they have turned as the images did."""
+        told = attitudes(self._memory.sightings(), self._track, self.delay_s)
+        if told is None:
+            return None
+        R_b_c, sigma_rad = self.T_b_c[:3, :3], self.config.alignment_sigma_rad
+        if self._trust.turns:
+            return mount_by_turns(told.R_m_c, told.R_w_b, told.stamp_s, R_b_c, sigma_rad)
+        return Turned(R_b_c, told.map_to_world(R_b_c), np.full(3, sigma_rad))
 
     def _rough_scale(self) -> float | None:
         """Metres per map unit, for what counts as motion."""

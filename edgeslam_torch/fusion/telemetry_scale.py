@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from edgeslam_torch.fusion.config import FusionConfig
+from edgeslam_torch.fusion.scale.camera_mount import Turned
 from edgeslam_torch.fusion.scale.consensus import at_odds, contradict, sided_with
 from edgeslam_torch.fusion.scale.joint_scale import (
     MOST_WANDER,
@@ -172,7 +173,7 @@ class TelemetryScale:
         present: What is remembered.
         trust: Which readings may be used.
         delay_s: Video delay behind telemetry.
-        R_w_m: Map axes to the power-on world ``(3, 3)``.
+        turned: How the map is turned against the power-on world.
         held: Scale that was believed before [metres per map unit].
         flying: Whether the present scale is asked for, of a map that drifts; in the end one scale holds for all of it.
     """
@@ -184,13 +185,14 @@ class TelemetryScale:
         present: FlightSoFar,
         trust: Trust,
         delay_s: float,
-        R_w_m: FloatArray,
+        turned: Turned,
         held: float | None,
         flying: bool = False,
     ) -> None:
         self._config, self._T_b_c = config, T_b_c
         self._present, self._trust = present, trust
-        self._delay_s, self._R_w_m, self._held = delay_s, R_w_m, held
+        self._delay_s, self._held = delay_s, held
+        self._R_w_m, self._tilt_rad = turned.R_w_m, turned.sigma_rad
         self._flying = flying
         self._shown = self._compared() if trust.velocity else None
 
@@ -255,7 +257,7 @@ class TelemetryScale:
         return now if now is not None and has_changed(now, seen[~late], shown.told[~late]) else None
 
     def _together(self, rounding: Rounding, moved: Evidence | None, systematic: float) -> _Hypothesis | None:
-        tilt = self._config.alignment_sigma_rad
+        tilt = self._tilt_rad
         rough = self._rough(moved)
         if rough is None:
             return None
@@ -292,7 +294,7 @@ class TelemetryScale:
         if evidence is None:
             return None
         evidence = evidence.softened(systematic * rough)
-        single = solved([evidence], self._config.alignment_sigma_rad)
+        single = solved([evidence], self._tilt_rad)
         return None if single is None or single[1] >= _MOST_SIGMA else _Given(name, evidence, *single)
 
     def _settled(self, velocity: _Given, height: _Given) -> list[_Given]:
@@ -319,7 +321,7 @@ class TelemetryScale:
     def _rough(self, moved: Evidence | None) -> float | None:
         """Metres per map unit to look for floor steps with: by velocities, unless the network contradicts them."""
         network = self._present.network
-        alone = None if moved is None else solved([moved], self._config.alignment_sigma_rad)
+        alone = None if moved is None else solved([moved], self._tilt_rad)
         if alone is None:
             known = self._present.rough_scale
             return self._shown.start if known is None and self._shown is not None else known
@@ -331,7 +333,7 @@ class TelemetryScale:
         shown = self._shown
         if shown is None:
             return None
-        tilt, step = self._config.alignment_sigma_rad, self._config.velocity_step_m_s
+        tilt, step = self._tilt_rad, self._config.velocity_step_m_s
         intervals, told = shown.intervals, shown.told
         scale = shown.start
         for _ in range(_MOST_ROUNDS):
@@ -357,7 +359,7 @@ class TelemetryScale:
 
     def _with_drift(self, evidence: Evidence, rigid: Evidence) -> Evidence:
         """Evidence of the present scale, and how much less sure it is than that of a scale which never changes."""
-        pair = [solved([e], self._config.alignment_sigma_rad) for e in (evidence, rigid)]
+        pair = [solved([e], self._tilt_rad) for e in (evidence, rigid)]
         if pair[0] is None or pair[1] is None:
             return evidence
         return replace(evidence, drift_sigma=math.sqrt(max(0.0, pair[0][1] ** 2 - pair[1][1] ** 2)))
@@ -371,7 +373,7 @@ class TelemetryScale:
             moved.duration_s,
             moved.sigma,
             config.sigma_velocity_m_s * np.sqrt(0.1 * moved.duration_s),
-            config.alignment_sigma_rad,
+            self._tilt_rad,
             aged,
         )
 
@@ -438,7 +440,7 @@ class TelemetryScale:
             self._judge_height(Reading(name), p[:, 2:], z[here, None], times[here], segment, scale)
             if not self._trust.height(Reading(name)):
                 continue
-            tilt = config.alignment_sigma_rad
+            tilt = self._tilt_rad
             aged = self._aged(times[here])
             wander = self._wander(moved)
             evidence = height_evidence(p, z[here], times[here], segment, sigma_map, sigma, scale, tilt, aged, wander)

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.fusion.config import FusionConfig
 from edgeslam_torch.fusion.motion import MotionFusion
+from edgeslam_torch.fusion.scale.camera_mount import Turned
 from edgeslam_torch.fusion.scale.depth_scale import DepthRatio
 from edgeslam_torch.fusion.scale.log_scale import LogScale
 from edgeslam_torch.fusion.telemetry.plausibility import (
@@ -392,7 +393,8 @@ def test_velocities_in_the_wrong_unit_are_named_and_dropped(rng, swinging, repla
 def test_velocities_pull_at_the_map_where_they_go_with_metres_that_are_known(source, sigma, kept, speaks):
     """A young map's heights may tell a unit several times off at a quarter, and velocities would tear it by that."""
     fusion = MotionFusion(FusionConfig(), T_B_C)
-    fusion._R_w_m, fusion._by_telemetry = np.eye(3), LogScale(0.0, sigma, source)
+    fusion._turned = Turned(np.eye(3), np.eye(3), np.zeros(3))
+    fusion._by_telemetry = LogScale(0.0, sigma, source)
     fusion._trust.judge(Reading.VELOCITY, Agreement(0.99, 30))
     fusion._trust.at_odds = None if kept == "" else AtOdds(10.0, 1.0, kept)
     assert fusion.telemetry().velocity is speaks

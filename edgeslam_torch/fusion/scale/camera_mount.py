@@ -1,17 +1,26 @@
-"""How the camera sits on the drone, from a flight: the same displacements in camera and in body axes."""
+"""How the camera sits on the drone, from a flight: the same displacements, or turns, in camera and in body axes."""
 
 import math
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.fusion.scale.log_scale import fit_displacements
+from edgeslam_torch.geometry.rotations import mean_rotation
 from edgeslam_torch.types import FloatArray
 
 _PRIOR_RAD = math.radians(30.0)
 _BIAS_M_S = 0.03
 """Standard deviations of the prior: how far the first guess may be off, and the bias of a velocity reading, a third of
 its step of 0.1 m/s."""
+
+_ATTITUDE_RAD, _ATTITUDE_MEMORY_S = math.radians(1.0), 5.0
+"""Error of roll and pitch of a drone that speeds up and slows down, and how long one lasts."""
+_BENT_RAD = math.radians(1.0)
+"""By how much a map's own axes change from place to place."""
+_STEPS = 3
+"""Of Gauss and Newton: rotations of some degrees are nearly linear."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,3 +65,49 @@ def estimate_mount(
     tilt = math.asin(max(-1.0, min(1.0, -float(R[2, 2]))))
     sigma = float(fit.rotation_sigma_rad[1])
     return Mount(R, tilt, sigma) if sigma < math.radians(10.0) else None
+
+
+@dataclass(frozen=True, slots=True)
+class Turned:
+    """How camera and map are turned against the drone and its world."""
+
+    R_b_c: FloatArray
+    """``(3, 3)`` camera to body."""
+    R_w_m: FloatArray
+    """``(3, 3)`` map to the power-on world."""
+    sigma_rad: FloatArray
+    """``(3,)`` how far ``R_w_m`` may be off, about the world's axes."""
+
+
+def mount_by_turns(
+    R_m_c: FloatArray, R_w_b: FloatArray, stamps_s: FloatArray, R_b_c: FloatArray, sigma_rad: float
+) -> Turned:
+    """Rotations that let attitude turn as the images do (robot-world and hand-eye calibration).
+
+    ``R_w_m R_m_c = R_w_b R_b_c`` holds in all pictures, with both ``R_w_m`` and ``R_b_c`` unknown: where a drone turns,
+    a lean of its camera goes round with it, a lean of the map does not. What no turn tells stays as it was given.
+
+    Args:
+        R_m_c: Cameras in the map ``(N, 3, 3)``.
+        R_w_b: The drone's attitude then ``(N, 3, 3)``.
+        stamps_s: Increasing stamps ``(N,)``.
+        R_b_c: Camera to body as it was given ``(3, 3)``.
+        sigma_rad: How far off that may be, per axis.
+    """
+    memory_s = 0.5 * _ATTITUDE_MEMORY_S
+    alike = np.searchsorted(stamps_s, stamps_s + memory_s, "right") - np.searchsorted(stamps_s, stamps_s - memory_s)
+    weight = 1.0 / (_ATTITUDE_RAD**2 * alike)
+    R_w_m = mean_rotation(R_w_b @ R_b_c @ np.swapaxes(R_m_c, 1, 2))
+    R_b_w = np.swapaxes(R_w_b, 1, 2)
+    J = np.concatenate([R_b_w, np.broadcast_to(-np.eye(3), R_b_w.shape)], axis=2)  # of the turns of R_w_m and R_b_c
+    weighted = np.einsum("nai,n->ain", J, weight)
+    prior = np.diag([0.0] * 3 + [sigma_rad**-2] * 3)
+    covariance = np.linalg.inv(np.einsum("ain,naj->ij", weighted, J) + prior)
+    turned = np.zeros(6)
+    for _ in range(_STEPS):
+        map_turned, mount_turned = Rotation.from_rotvec(turned.reshape(2, 3)).as_matrix()
+        apart = Rotation.from_matrix(R_b_w @ map_turned @ R_w_m @ R_m_c @ (mount_turned @ R_b_c).T).as_rotvec()
+        turned -= covariance @ (np.einsum("ain,na->i", weighted, apart) + prior @ turned)
+    map_turned, mount_turned = Rotation.from_rotvec(turned.reshape(2, 3)).as_matrix()
+    sigma = np.sqrt(np.diag(covariance)[:3] + _BENT_RAD**2)
+    return Turned(mount_turned @ R_b_c, map_turned @ R_w_m, sigma)

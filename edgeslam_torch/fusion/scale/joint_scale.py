@@ -80,7 +80,7 @@ class Evidence:
         return replace(self, information=information, vector=self.vector - column * self.vector[_SCALE])
 
 
-def solved(evidence: list[Evidence], tilt_sigma_rad: float) -> tuple[float, float] | None:
+def solved(evidence: list[Evidence], tilt_sigma_rad: float | FloatArray) -> tuple[float, float] | None:
     """Scale and relative standard deviation from all evidence, the rotation free within its prior."""
     information = np.sum([e.information for e in evidence], axis=0)
     vector = np.sum([e.vector for e in evidence], axis=0)
@@ -99,9 +99,9 @@ def solved(evidence: list[Evidence], tilt_sigma_rad: float) -> tuple[float, floa
     return s, math.sqrt(float(covariance[_SCALE, _SCALE])) / s
 
 
-def _tilt_prior(s: float, tilt_sigma_rad: float, offsets: int = 0) -> FloatArray:
+def _tilt_prior(s: float, tilt_sigma_rad: float | FloatArray, offsets: int = 0) -> FloatArray:
     """Information on the unknowns before any measurement: the scale is free, offsets nearly."""
-    return np.diag([0.0, *[(s * tilt_sigma_rad) ** -2] * 3, *[1e-6] * offsets])
+    return np.diag([0.0, *np.broadcast_to((s * tilt_sigma_rad) ** -2, 3), *[1e-6] * offsets])
 
 
 def displacement_evidence(
@@ -111,7 +111,7 @@ def displacement_evidence(
     duration_s: FloatArray,
     sigma_map: FloatArray,
     sigma_m: FloatArray,
-    tilt_sigma_rad: float,
+    tilt_sigma_rad: float | FloatArray,
     aged: FloatArray | None = None,
 ) -> Evidence | None:
     """From visual and telemetry displacements of the same intervals.
@@ -126,7 +126,7 @@ def displacement_evidence(
         duration_s: Their lengths ``(N,)``.
         sigma_map: Standard deviation of ``moved_map`` per axis, shape ``(N,)``.
         sigma_m: Expected standard deviation of ``moved_m`` per axis, shape ``(N,)``.
-        tilt_sigma_rad: Prior on the rotation.
+        tilt_sigma_rad: Prior on the rotation; ``(3,)``, about each axis, or one for all.
         aged: How much the map has aged since each interval, see `aged_since`, ``(N,)``: the scale found is the present
             one, to which older intervals tell less. None: one scale holds throughout.
     """
@@ -184,7 +184,7 @@ def height_evidence(
     sigma_map: float,
     sigma_m: float,
     scale: float,
-    tilt_sigma_rad: float,
+    tilt_sigma_rad: float | FloatArray,
     aged: FloatArray | None = None,
     wander: float = USUAL_WANDER,
 ) -> Evidence | None:
@@ -198,7 +198,7 @@ def height_evidence(
         sigma_map: Noise of ``p_map`` per axis.
         sigma_m: Expected noise of ``z_m``.
         scale: Rough metres per map unit.
-        tilt_sigma_rad: Prior on the rotation.
+        tilt_sigma_rad: Prior on the rotation; ``(3,)``, about each axis, or one for all.
         aged: As in `displacement_evidence`, ``(N,)``.
         wander: How much the map's scale changes, by the displacements.
     """

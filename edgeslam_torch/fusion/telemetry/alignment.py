@@ -11,6 +11,22 @@ from edgeslam_torch.types import FloatArray
 
 
 @dataclass(frozen=True, slots=True)
+class Attitudes:
+    """Cameras in the map beside the drone's attitude."""
+
+    stamp_s: FloatArray
+    """``(N,)`` on telemetry's clock."""
+    R_m_c: FloatArray
+    """``(N, 3, 3)`` by the images."""
+    R_w_b: FloatArray
+    """``(N, 3, 3)`` by telemetry."""
+
+    def map_to_world(self, R_b_c: FloatArray) -> FloatArray:
+        """``R_w_m`` ``(3, 3)``, the mean of ``R_w_b R_b_c R_m_c^T``."""
+        return mean_rotation(self.R_w_b @ R_b_c @ np.swapaxes(self.R_m_c, 1, 2))
+
+
+@dataclass(frozen=True, slots=True)
 class Turns:
     """Rotations over the same intervals, in body axes."""
 
@@ -18,6 +34,15 @@ class Turns:
     """``(N, 3, 3)`` by the images."""
     told: FloatArray
     """``(N, 3, 3)`` by telemetry."""
+
+
+def attitudes(sightings: Sightings, track: TelemetryTrack, delay_s: float) -> Attitudes | None:
+    """The drone's attitude at each pose in the map that telemetry covers; None where it covers none."""
+    stamps_s = sightings.stamps_s - delay_s
+    inside = track.covered(stamps_s, stamps_s)
+    if not inside.any():
+        return None
+    return Attitudes(stamps_s[inside], sightings.T[inside, :3, :3], track.attitude(stamps_s[inside]))
 
 
 def map_to_world(sightings: Sightings, track: TelemetryTrack, delay_s: float, R_b_c: FloatArray) -> FloatArray | None:
@@ -32,12 +57,8 @@ def map_to_world(sightings: Sightings, track: TelemetryTrack, delay_s: float, R_
     Returns:
         ``R_w_m`` ``(3, 3)``, map axes to the power-on world; ``None`` where no attitude covers a pose.
     """
-    stamps_s = sightings.stamps_s - delay_s
-    inside = track.covered(stamps_s, stamps_s)
-    if not inside.any():
-        return None
-    R_m_c = sightings.T[inside, :3, :3]
-    return mean_rotation(track.attitude(stamps_s[inside]) @ R_b_c @ np.swapaxes(R_m_c, 1, 2))
+    told = attitudes(sightings, track, delay_s)
+    return None if told is None else told.map_to_world(R_b_c)
 
 
 def turns(moved: Displacements, track: TelemetryTrack, R_b_c: FloatArray) -> Turns:
