@@ -39,9 +39,10 @@ def off_deg(R, R_true):
 
 
 @pytest.mark.parametrize("lean_deg", [(3.0, 0.0), (0.0, 4.0), (-2.0, -3.0)])
-def test_a_turn_tells_roll_and_pitch_of_the_camera(rng, lean_deg):
+@pytest.mark.parametrize("yaw_deg", [180.0, 360.0])
+def test_a_turn_tells_roll_and_pitch_of_the_camera(rng, lean_deg, yaw_deg):
     true = Rotation.from_euler("xy", lean_deg, degrees=True).as_matrix() @ GIVEN
-    found, R_w_m = mount(turning(360.0), true, rng, math.radians(0.5))
+    found, R_w_m = mount(turning(yaw_deg), true, rng, math.radians(0.5))
     assert np.abs(off_deg(found.R_b_c, true)[:2]).max() < 0.15 * max(np.abs(lean_deg))
     assert np.abs(off_deg(found.R_w_m, R_w_m)[:2]).max() < 0.15 * max(np.abs(lean_deg))
 
