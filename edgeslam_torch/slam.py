@@ -223,13 +223,13 @@ class EdgeSlam:
             system.fusion.add_telemetry(telemetry)
             system.has_telemetry = system.has_telemetry or len(telemetry) > 0
         if not self.log.records:
-            system.fusion.began_s = frame.stamp_s
+            system.fusion.orientation.began_s = frame.stamp_s
         if not self.log.records and telemetry:  # the first camera turns so that the world's z is up
             system.motion.T_c_w = se3.inverse(first_pose(telemetry[-1].rpy_rad, self._T_b_c))
             upright = bool(np.isfinite(telemetry[-1].rpy_rad).all())
             system.published = replace(system.published, upright=upright)
             # In a map of an earlier flight, axes are those of that flight.
-            system.fusion.began_upright = self._earlier is None and upright
+            system.fusion.orientation.began_upright = self._earlier is None and upright
         step = self._step(frame, seen)
         if self._earlier is not None:
             self._joining.enter(self.map.piece_of(step.keyframe.id))
@@ -386,7 +386,7 @@ class EdgeSlam:
             apart,
             self._repeats.warning(),
             self._calibration_warning,
-            None if self._system.published.upright else self._system.fusion.leaning(),
+            None if self._system.published.upright else self._system.fusion.orientation.leaning(),
         )
         return [warning for warning in warnings if warning is not None] + self._system.fusion.warnings()
 

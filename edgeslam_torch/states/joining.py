@@ -54,7 +54,7 @@ class Joining:
             return
         self._piece = piece
         known = self.atlas.known_scale.get(piece)
-        system.fusion.remember(known)
+        system.fusion.metres.remember(known)
         if known is None:
             return
         published = replace(system.published, upright=True)

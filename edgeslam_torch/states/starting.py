@@ -218,7 +218,7 @@ class Starting:
             guess[:, 0] = self._earlier_depth() * np.where(known, network_m, 1.0) / np.median(network_m[known])
             return guess
         # A network that is wrong here was as wrong before: the new piece gets the unit of the one that was lost.
-        per_unit = self.system.fusion.network_unit() or self.system.published.scale
+        per_unit = self.system.fusion.metres.network_unit() or self.system.published.scale
         guess[:, 0] = np.where(known, network_m, np.nanmedian(network_m)) / per_unit
         guess[known, 1] = sigma_log[known]
         return guess

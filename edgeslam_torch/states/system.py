@@ -207,13 +207,13 @@ class System:
         """Compare the network's depth with the map's units."""
         ratio = self._depth_ratio(keyframe)
         if ratio is not None:
-            self.fusion.add_depth_ratio(ratio)
+            self.fusion.metres.add_depth_ratio(ratio)
 
     def compare_depths_again(self) -> None:
         """Compare every keyframe of the current piece of map again, once the piece has another unit."""
         piece = self.map.piece_of(self.map.latest().id)
         mine = [k for id, k in sorted(self.map.keyframes.items()) if self.map.piece_of(id) == piece]
-        self.fusion.replace_depth_ratios([r for k in mine if (r := self._depth_ratio(k)) is not None])
+        self.fusion.metres.replace_depth_ratios([r for k in mine if (r := self._depth_ratio(k)) is not None])
 
     def _depth_ratio(self, keyframe: Keyframe) -> DepthRatio | None:
         if keyframe.network_m is None:

@@ -74,6 +74,6 @@ def test_up_and_scale_of_a_camera_that_leans(rng, replay, swinging):
     gauge = motion.in_gauge(rng)
     replay(fusion, motion, gauge, simulate(rng, motion.stamps_s, motion.T_w_c, T_true).samples())
     up = gauge.T_m_w[:3, :3] @ [0.0, 0.0, 1.0]
-    assert math.degrees(math.acos(min(1.0, float(up @ fusion.rotation()[2])))) < 1.0
+    assert math.degrees(math.acos(min(1.0, float(up @ fusion.orientation.R_w_m[2])))) < 1.0
     assert abs(math.log(fusion.scale().value / gauge.scale)) < 2.0 * fusion.scale().sigma / fusion.scale().value
     assert fusion.statistics()["camera mount turned deg"] == pytest.approx(5.0, abs=1.2)

@@ -280,4 +280,4 @@ def test_the_delay_is_right_whatever_the_phase_of_the_packets(seed):
         pose[:3, 3] += rng.normal(0.0, 0.001, 3)
         fusion.add_visual(stamp, pose, 0.001, 0.0005)
     assert fusion.delay_s == pytest.approx(DELAY_S, abs=0.025)
-    assert abs(fusion.delay_s - DELAY_S) < 3.0 * fusion.delay_sigma_s
+    assert abs(fusion.delay_s - DELAY_S) < 3.0 * fusion.flight.delay_sigma_s

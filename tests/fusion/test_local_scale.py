@@ -96,8 +96,8 @@ def test_readings_that_are_cut_off_are_made_up_for(rng, swinging):
 
 def test_the_networks_unit_is_what_it_told_of_the_map(rng):
     fusion = MotionFusion(FusionConfig(), T_B_C)
-    assert fusion.network_unit() is None
+    assert fusion.metres.network_unit() is None
     depth = rng.uniform(1.0, 4.0, 50)
     for _ in range(5):
-        fusion.add_depth_ratio(compared(0.6 * depth, depth))
-    assert fusion.network_unit() == pytest.approx(0.6)
+        fusion.metres.add_depth_ratio(compared(0.6 * depth, depth))
+    assert fusion.metres.network_unit() == pytest.approx(0.6)

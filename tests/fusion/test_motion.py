@@ -35,7 +35,7 @@ def test_scale_gravity_and_delay_come_out_of_a_swung_camera(rng, swinging, repla
     assert "telemetry" in scale.source
     assert fusion.delay_s == pytest.approx(0.5, abs=0.04)
     up = gauge.T_m_w[:3, :3] @ [0.0, 0.0, 1.0]
-    assert math.degrees(math.acos(min(1.0, float(up @ fusion.rotation()[2])))) < 0.5
+    assert math.degrees(math.acos(min(1.0, float(up @ fusion.orientation.R_w_m[2])))) < 0.5
 
 
 @pytest.mark.parametrize(("delay_s", "latest_s"), [(0.5, 2.8), (0.3, 5.8), (0.75, 5.8)])
@@ -67,8 +67,10 @@ def test_a_climb_guesses_the_unit_before_anything_has_proven_telemetry(swinging,
 
         def watched(fusion, motion, gauge, samples, found=found):
             for _ in range(50):
-                fusion.add_depth_ratio(DepthRatio(math.log(1.5 * gauge.scale), 0.05))
-            replay(fusion, motion, gauge, samples, each=lambda t, _: found.append((t, fusion.guess(), fusion.scale())))
+                fusion.metres.add_depth_ratio(DepthRatio(math.log(1.5 * gauge.scale), 0.05))
+            replay(
+                fusion, motion, gauge, samples, each=lambda t, _: found.append((t, fusion.metres.guess, fusion.scale()))
+            )
 
         fusion, gauge, _ = fused(np.random.default_rng(seed), motion, watched, TelemetryFaults(video_delay_s=0.5))
         first_s, guess, _ = next(f for f in found if f[1] is not None)
@@ -76,7 +78,7 @@ def test_a_climb_guesses_the_unit_before_anything_has_proven_telemetry(swinging,
         assert first_s < min(2.2, told_s - 0.4)
         assert abs(math.log(guess.value / gauge.scale)) < min(0.3, 2.5 * guess.sigma / guess.value)
         assert all(f[1] is None for f in found if f[0] > told_s)
-        assert fusion.guess() is None
+        assert fusion.metres.guess is None
 
 
 def test_a_camera_that_stays_where_its_drone_climbs_guesses_nothing(swinging, replay):
@@ -86,7 +88,7 @@ def test_a_camera_that_stays_where_its_drone_climbs_guesses_nothing(swinging, re
     told = simulate(np.random.default_rng(0), motion.stamps_s, motion.T_w_c, T_B_C, faults=TelemetryFaults()).samples()
     fusion, guesses = MotionFusion(FusionConfig(), T_B_C), []
     gauge = still.in_gauge(np.random.default_rng(1))
-    replay(fusion, still, gauge, told, each=lambda t, _: guesses.append(fusion.guess()))
+    replay(fusion, still, gauge, told, each=lambda t, _: guesses.append(fusion.metres.guess))
     assert set(guesses) == {None}
 
 
@@ -168,12 +170,12 @@ def test_scale_is_unknown_before_there_is_motion_or_telemetry(rng, swinging):
     motion = swinging(2.0)
     fusion = MotionFusion(FusionConfig(), T_B_C)
     assert fusion.scale().units is Units.ARBITRARY
-    assert fusion.rotation() is None
+    assert fusion.orientation.R_w_m is None
     assert fusion.predict(0.0) is None
     for t, T in zip(motion.stamps_s, motion.T_w_c, strict=True):
         fusion.add_visual(float(t), T, 0.003, 0.002)
     assert fusion.scale().units is Units.ARBITRARY
-    assert fusion.rotation() is None
+    assert fusion.orientation.R_w_m is None
 
 
 def test_gravity_is_there_with_the_first_frame(rng, swinging):
@@ -182,7 +184,7 @@ def test_gravity_is_there_with_the_first_frame(rng, swinging):
     fusion = MotionFusion(FusionConfig(delay_s=0.0), T_B_C)
     fusion.add_telemetry(samples[:2])
     fusion.add_visual(0.05, motion.T_w_c[1], 0.003, 0.002)
-    np.testing.assert_allclose(fusion.rotation()[2], [0.0, 0.0, 1.0], atol=0.02)
+    np.testing.assert_allclose(fusion.orientation.R_w_m[2], [0.0, 0.0, 1.0], atol=0.02)
 
 
 def test_hovering_holds_the_scale(rng, swinging, replay):
@@ -203,7 +205,7 @@ def test_hovering_holds_the_scale(rng, swinging, replay):
 def test_depth_alone_gives_metres_with_its_own_doubt(swinging):
     fusion = MotionFusion(FusionConfig(), T_B_C)
     for _ in range(50):
-        fusion.add_depth_ratio(DepthRatio(math.log(3.0), 0.05))
+        fusion.metres.add_depth_ratio(DepthRatio(math.log(3.0), 0.05))
     scale = fusion.scale()
     assert (scale.source, scale.units) == ("depth", Units.METRES)
     assert scale.value == pytest.approx(3.0)
@@ -213,15 +215,15 @@ def test_depth_alone_gives_metres_with_its_own_doubt(swinging):
 def test_metres_of_an_earlier_flight_take_the_place_of_the_networks():
     fusion = MotionFusion(FusionConfig(), T_B_C)
     for _ in range(50):
-        fusion.add_depth_ratio(DepthRatio(math.log(3.0), 0.05))
+        fusion.metres.add_depth_ratio(DepthRatio(math.log(3.0), 0.05))
     own = fusion.scale()
-    fusion.remember(ScaleEstimate(1.0, 0.03, "telemetry"))
+    fusion.metres.remember(ScaleEstimate(1.0, 0.03, "telemetry"))
     assert (fusion.scale().value, fusion.scale().source) == (1.0, "atlas")
     assert fusion.scale().sigma == pytest.approx(0.03)
-    assert {"atlas"} <= {source.source for source in fusion.sources()}
-    fusion.remember(ScaleEstimate())
+    assert {"atlas"} <= {source.source for source in fusion.metres.sources()}
+    fusion.metres.remember(ScaleEstimate())
     assert fusion.scale() == own
-    fusion.remember(None)
+    fusion.metres.remember(None)
     assert fusion.scale() == own
 
 
@@ -229,7 +231,7 @@ def test_a_guessed_focal_length_makes_depth_that_much_less_sure():
     """768 px for 517: the stated 15 % were 15 % with either."""
     fusion = MotionFusion(FusionConfig(), T_B_C, focal_sigma=0.45)
     for _ in range(50):
-        fusion.add_depth_ratio(DepthRatio(math.log(3.0), 0.05))
+        fusion.metres.add_depth_ratio(DepthRatio(math.log(3.0), 0.05))
     scale = fusion.scale()
     assert 0.45 < scale.sigma / scale.value < 0.5
 
@@ -237,7 +239,7 @@ def test_a_guessed_focal_length_makes_depth_that_much_less_sure():
 def test_a_network_that_sees_no_depth_gives_no_metres_and_says_so():
     fusion = MotionFusion(FusionConfig(), T_B_C)
     for _ in range(50):
-        fusion.add_depth_ratio(DepthRatio(math.log(3.0), 0.3, slope=0.0))
+        fusion.metres.add_depth_ratio(DepthRatio(math.log(3.0), 0.3, slope=0.0))
     assert fusion.scale().units is Units.ARBITRARY
     (warning,) = fusion.warnings()
     assert "out of its domain" in warning

@@ -164,7 +164,7 @@ def told_of(rng, replay, motion, spoil, **options):
     for told in ([], spoil(rng, samples, motion)):
         fusion = MotionFusion(FusionConfig(), T_B_C)
         for _ in range(20):
-            fusion.add_depth_ratio(DepthRatio(math.log(gauge.scale) + DEPTH_LOG, 0.05))
+            fusion.metres.add_depth_ratio(DepthRatio(math.log(gauge.scale) + DEPTH_LOG, 0.05))
         replay(fusion, motion, gauge, told, **options)
         fusions.append(fusion)
     without, fusion = fusions
@@ -353,7 +353,7 @@ def test_heights_beside_velocities_that_leave_much_unexplained_tell_nothing_yet(
     for change in (spoil, lambda rng, samples, motion: samples):
         motion = swinging(6.0)
         _, fusion, _ = told_of(np.random.default_rng(0), replay, motion, change)
-        sigma.append({s.source: s.sigma / s.value for s in fusion.sources()}.get("height", math.inf))
+        sigma.append({s.source: s.sigma / s.value for s in fusion.metres.sources()}.get("height", math.inf))
     assert sigma[0] > 2.0 * sigma[1]
 
 
@@ -393,17 +393,17 @@ def test_velocities_in_the_wrong_unit_are_named_and_dropped(rng, swinging, repla
 def test_velocities_pull_at_the_map_where_they_go_with_metres_that_are_known(source, sigma, kept, speaks):
     """A young map's heights may tell a unit several times off at a quarter, and velocities would tear it by that."""
     fusion = MotionFusion(FusionConfig(), T_B_C)
-    fusion._turned = Turned(np.eye(3), np.eye(3), np.zeros(3))
-    fusion._by_telemetry = LogScale(0.0, sigma, source)
-    fusion._trust.judge(Reading.VELOCITY, Agreement(0.99, 30))
-    fusion._trust.at_odds = None if kept == "" else AtOdds(10.0, 1.0, kept)
+    fusion.orientation.found = Turned(np.eye(3), np.eye(3), np.zeros(3))
+    fusion.metres.told = LogScale(0.0, sigma, source)
+    fusion.flight.trust.judge(Reading.VELOCITY, Agreement(0.99, 30))
+    fusion.flight.trust.at_odds = None if kept == "" else AtOdds(10.0, 1.0, kept)
     assert fusion.telemetry().velocity is speaks
 
 
 def test_gravity_speaks_before_metres_are_known_if_the_map_began_upright():
     fusion = MotionFusion(FusionConfig(), T_B_C)
     assert fusion.telemetry() is None, "nothing says where up is"
-    fusion.began_upright = True
+    fusion.orientation.began_upright = True
     model = fusion.telemetry()
     assert model.attitude and (model.velocity, model.height) == (False, None)
     assert (model.R_w_m == np.eye(3)).all()
@@ -414,8 +414,8 @@ def test_gravity_of_another_flight_does_not_speak(rng, swinging, replay):
         return [replace(s, rpy_rad=other.rpy_rad) for s, other in zip(samples, samples[::-1], strict=True)]
 
     _, fusion, _ = told_of(rng, replay, swinging(18.0), spoil)
-    fusion.began_upright = True
-    assert fusion._trust.verdict(Reading.ATTITUDE) is Verdict.CONTRADICTS
+    fusion.orientation.began_upright = True
+    assert fusion.flight.trust.verdict(Reading.ATTITUDE) is Verdict.CONTRADICTS
     assert not fusion.telemetry().attitude
 
 

@@ -23,7 +23,7 @@ def asked(rng, motion, replay, samples_of=lambda samples: samples, untracked_s=(
     fusion, found = MotionFusion(FusionConfig(delay_s=delay_s), T_B_C), []
 
     def each(t, i):
-        told = fusion.turned(t) if t > PROVEN_S else None
+        told = fusion.orientation.turned(t) if t > PROVEN_S else None
         off = None if told is None else Rotation.from_matrix(told[0] @ gauge.T_m_c[i, :3, :3]).magnitude()
         found.append((t, None if told is None else (off, told[1])))
 

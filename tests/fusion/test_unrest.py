@@ -78,7 +78,7 @@ def test_a_scale_told_by_a_map_at_unrest_is_less_sure(rng, swinging, replay):
         fusion = MotionFusion(FusionConfig(), T_B_C)
 
         def refined(since_s, fusion=fusion, rate=rate):
-            now = np.searchsorted(motion.stamps_s, fusion._memory.last.stamp_s, side="right")
+            now = np.searchsorted(motion.stamps_s, fusion.flight.memory.last.stamp_s, side="right")
             T = gauge.T_m_c[:now].copy()
             T[:, :3, 3] *= math.exp(rate * motion.stamps_s[now - 1])
             return motion.stamps_s[:now], T

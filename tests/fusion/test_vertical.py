@@ -19,7 +19,7 @@ T_B_C = camera_on_body(0.0)
 def told(pitch_rad, upright=True, delay_s=0.0):
     """Fusion that has heard of a drone with a nose this far down, the same all the time or ``(N,)`` every 0.1 s."""
     fusion = MotionFusion(FusionConfig(delay_s=delay_s), T_B_C)
-    fusion.began_upright = upright
+    fusion.orientation.began_upright = upright
     for k, pitch in enumerate(np.broadcast_to(pitch_rad, 30)):
         rpy = np.array([0.0, float(pitch), 1.0])
         fusion.add_telemetry([TelemetrySample(0.1 * k, np.zeros(3), rpy, battery=1.0)])
@@ -49,12 +49,12 @@ def test_a_moment_without_telemetry_says_nothing():
 def test_where_it_leans_as_a_hand_does_it_is_asked_once_it_has_turned_with_the_images():
     fusion = told(np.where(np.arange(30) < 20, 0.0, math.radians(20.0)))
     assert fusion.vertical(1.0) is None
-    fusion._trust.judge(Reading.ATTITUDE, Agreement(0.99, 30))
+    fusion.flight.trust.judge(Reading.ATTITUDE, Agreement(0.99, 30))
     assert fusion.vertical(1.0)[1] == pytest.approx(0.0, abs=1e-9)
 
 
 def test_it_is_as_unsure_as_the_moment_of_the_image():
     fusion = told(np.radians(np.clip(20.0 * (0.1 * np.arange(30) - 1.0), 0.0, 10.0)), delay_s=None)
-    late_s = min(fusion.delay_sigma_s, DELAY_S)
+    late_s = min(fusion.flight.delay_sigma_s, DELAY_S)
     leaned = fusion.vertical(1.25 + fusion.delay_s)[1]
     assert math.degrees(leaned) == pytest.approx(20.0 * min(late_s, 0.25), rel=0.05)

@@ -65,7 +65,7 @@ def flown(flight, told=lambda stamp_s: None, place=lambda stamp_s: None):
     """Outputs of a flight where attitude and place are ``told`` as a frame's."""
     config = SlamConfig(depth=DepthConfig(weights="none"), mapping=MappingConfig(sub_pixel=False))
     slam = EdgeSlam(CAMERA, config, depth=flight.depth_function())
-    slam._system.has_telemetry, slam._system.fusion.turned, slam._system.fusion.reckoned = True, told, place
+    slam._system.has_telemetry, slam._system.fusion.orientation.turned, slam._system.fusion.reckoned = True, told, place
     return [slam.step(frame) for frame in flight.frames]
 
 

@@ -9,6 +9,7 @@ from rendered import CAMERA, film, sideways, stairs_world
 
 from edgeslam_torch.config import DepthConfig, SlamConfig
 from edgeslam_torch.eval.metrics.align import umeyama
+from edgeslam_torch.fusion.metres import Metres
 from edgeslam_torch.fusion.motion import MotionFusion
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.slam import EdgeSlam
@@ -52,7 +53,7 @@ def test_depths_that_the_network_gave_do_not_confirm_the_network(monkeypatch):
     poses = np.stack([se3.exp(np.array([0.0, 0.0, 0.0, 0.0, a, 0.0])) for a in turn])
     turning = film(stairs_world(), CAMERA, poses)
     slam = EdgeSlam(CAMERA, NO_NETWORK, depth=turning.depth_function())
-    told = spied(monkeypatch, "add_depth_ratio")
+    told = spied(monkeypatch, "add_depth_ratio", of=Metres)
     for frame in turning.frames:
         slam.step(frame)
     assert len(slam.map.anchors) > 300
@@ -60,15 +61,15 @@ def test_depths_that_the_network_gave_do_not_confirm_the_network(monkeypatch):
     assert told == []
 
 
-def spied(monkeypatch, name):
+def spied(monkeypatch, name, of=MotionFusion):
     """Arguments of all calls of one of fusion's methods from now on."""
-    calls, inner = [], getattr(MotionFusion, name)
+    calls, inner = [], getattr(of, name)
 
     def method(fusion, *arguments, **named):
         calls.append((*arguments, *named.values()))
         return inner(fusion, *arguments, **named)
 
-    monkeypatch.setattr(MotionFusion, name, method)
+    monkeypatch.setattr(of, name, method)
     return calls
 
 

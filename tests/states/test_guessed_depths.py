@@ -15,7 +15,7 @@ def guessed(network_unit, published, depth_m=3.0):
     """Depth [map units] of the keypoints of a picture that the network says is this far away, in a flight so far."""
     depth = DepthMap(np.full((24, 32), depth_m, np.float32), np.full((24, 32), 0.2, np.float32))
     keyframe = SimpleNamespace(depth=depth, features=SimpleNamespace(uv=np.array([[5.0, 6.0], [20.0, 12.0]])))
-    fusion = SimpleNamespace(network_unit=lambda: network_unit)
+    fusion = SimpleNamespace(metres=SimpleNamespace(network_unit=lambda: network_unit))
     system = SimpleNamespace(config=SlamConfig(), fusion=fusion, published=Published(published))
     starting = Starting.__new__(Starting)
     starting.system = system

@@ -63,7 +63,10 @@ def system_of(pieces, motion, busy=False):
     revised = []
     remembered = []
     fusion = SimpleNamespace(
-        revise=lambda *poses: revised.append(poses), revised=revised, remember=remembered.append, remembered=remembered
+        revise=lambda *poses: revised.append(poses),
+        revised=revised,
+        metres=SimpleNamespace(remember=remembered.append),
+        remembered=remembered,
     )
     mapping = SimpleNamespace(busy=busy)
     again = lambda: revised.append("ratios")  # noqa: E731

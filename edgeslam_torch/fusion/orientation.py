@@ -1,0 +1,122 @@
+"""How the map and the camera are turned against the drone and its world, by the drone's attitude."""
+
+import math
+
+import numpy as np
+
+from edgeslam_torch.fusion.displacement import DELAY_S, is_steady
+from edgeslam_torch.fusion.remembered import Remembered
+from edgeslam_torch.fusion.scale.camera_mount import Turned, mount_by_turns
+from edgeslam_torch.fusion.telemetry.alignment import attitudes, map_to_world
+from edgeslam_torch.geometry.rotations import rotation_vector
+from edgeslam_torch.types import FloatArray
+
+_TURNED_S = 5.0
+"""Time over which the map and the drone's attitude have turned together: maps drift by a degree in it."""
+_AT_ONCE_S = 0.5
+"""Time from the first frame in which the first attitude comes if it comes at all: five messages."""
+_STAMPED_S = 0.05
+"""Standard deviation of a message's moment: half of the time from one to the next."""
+
+
+class Orientation:
+    """Rotations of one flight's map.
+
+    Args:
+        flight: What is remembered.
+        given: Camera in the body as it was given ``(4, 4)`` [m].
+    """
+
+    def __init__(self, flight: Remembered, given: FloatArray) -> None:
+        self._flight, self.given = flight, given
+        self.found: Turned | None = None
+        """By the newest fit; None without telemetry attitude."""
+        self.began_s = math.nan
+        """Stamp of the first frame."""
+        self.began_upright = False
+        """Whether the map's z axis is up: its first camera was turned so by the drone's attitude."""
+        self._attitude_s = math.inf
+
+    @property
+    def R_w_m(self) -> FloatArray | None:
+        """``(3, 3)`` map axes to the drone's power-on world; None without telemetry attitude."""
+        return None if self.found is None else self.found.R_w_m
+
+    @property
+    def T_b_c(self) -> FloatArray:
+        """Camera in the body ``(4, 4)`` [m] as the flight's turns have it: what `R_w_m` was found with."""
+        if self.found is None:
+            return self.given
+        T_b_c = self.given.copy()
+        T_b_c[:3, :3] = self.found.R_b_c
+        return T_b_c
+
+    @property
+    def mount_turned_rad(self) -> float:
+        """How far the camera is turned from how it was given."""
+        return float(np.linalg.norm(rotation_vector(self.T_b_c[:3, :3] @ self.given[:3, :3].T)))
+
+    def heard_attitude(self, stamp_s: float) -> None:
+        """A message with an attitude has come."""
+        self._attitude_s = min(self._attitude_s, stamp_s)
+
+    def fitted(self) -> Turned | None:
+        """By all that is remembered; the camera's mount only once attitude has turned as the images did."""
+        flight = self._flight
+        told = attitudes(flight.memory.sightings(), flight.track, flight.delay_s)
+        if told is None:
+            return None
+        R_b_c, sigma_rad = self.given[:3, :3], flight.config.alignment_sigma_rad
+        if flight.trust.turns:
+            return mount_by_turns(told.R_m_c, told.R_w_b, told.stamp_s, R_b_c, sigma_rad)
+        return Turned(R_b_c, told.map_to_world(R_b_c), np.full(3, sigma_rad))
+
+    def vertical(self, stamp_s: float) -> tuple[FloatArray, float] | None:
+        """The map's z axis ``(3,)`` in a frame's camera by the drone's attitude, and how far [rad] that leaned within
+        the doubt about the video's delay; None where attitude is not to be asked. Of a map that `began_upright`."""
+        flight = self._flight
+        at_s = np.array([stamp_s - flight.delay_s])
+        if not (flight.trust.attitude and flight.track.covered(at_s, at_s)[0]):
+            return None
+        if not (flight.trust.turns or is_steady(flight.track, at_s)[0]):
+            return None
+        leaned = flight.track.leaned(at_s, min(flight.delay_sigma_s, DELAY_S))
+        return self.given[:3, :3].T @ flight.track.attitude(at_s)[0, 2], float(leaned[0])
+
+    def turned(self, stamp_s: float) -> tuple[FloatArray, float] | None:
+        """Rotation ``R_c_m`` ``(3, 3)`` of a frame's camera by the drone's attitude, turned into the map as the last
+        seconds' frames were, and how far [rad] it turned within the doubt about the video's delay; None where
+        telemetry has not proven to be of this flight, or the map is too young."""
+        flight = self._flight
+        late_s = math.hypot(flight.delay_sigma_s, _STAMPED_S)
+        around = stamp_s - flight.delay_s + np.array([0.0, -late_s, late_s])
+        if not (flight.trust.turns and math.isfinite(late_s) and flight.track.covered(around[:1], around[:1])[0]):
+            return None
+        recent = flight.memory.recent(stamp_s - _TURNED_S)
+        if recent is None:
+            return None
+        R_b_c = self.T_b_c[:3, :3]
+        R_w_m = map_to_world(recent, flight.track, flight.delay_s, R_b_c)
+        if R_w_m is None:
+            return None
+        R_m_c = R_w_m.T @ flight.track.attitude(around) @ R_b_c
+        doubt = max(float(np.linalg.norm(rotation_vector(R_m_c[0].T @ R_m_c[k]))) for k in (1, 2))
+        return R_m_c[0].T, doubt
+
+    def upright(self) -> FloatArray | None:
+        """``R_w_m`` where attitude may turn the world: when it has proven to be of this flight, or as the one may that
+        comes with the first picture."""
+        if self.found is None or not self._flight.trust.attitude:
+            return None
+        at_once = self._attitude_s - self.began_s < _AT_ONCE_S
+        return self.found.R_w_m if at_once or self._flight.trust.turns else None
+
+    def leaning(self) -> str | None:
+        """That no attitude was sure enough to tell where up is, in words; None where the drone told none."""
+        if not math.isfinite(self._attitude_s):
+            return None
+        return (
+            "where up is was not known, the world leans as the first camera did: no attitude of the drone that came at "
+            "once or has proven to be of this flight covers a picture with a pose (the first one came "
+            f"{self._attitude_s - self.began_s:.1f} s after the first picture)"
+        )

@@ -1,0 +1,30 @@
+"""What is remembered of a flight for tying its map to its telemetry; each room of `MotionFusion` reads it."""
+
+from dataclasses import dataclass
+
+from edgeslam_torch.fusion.config import FusionConfig
+from edgeslam_torch.fusion.telemetry.delay import DelaySearch
+from edgeslam_torch.fusion.telemetry.plausibility import Trust
+from edgeslam_torch.fusion.telemetry.track import TelemetryTrack
+from edgeslam_torch.fusion.telemetry.visual_memory import VisualMemory
+
+
+@dataclass(frozen=True, slots=True)
+class Remembered:
+    """Messages and poses, the delay between them, and which readings may be used."""
+
+    config: FusionConfig
+    track: TelemetryTrack
+    memory: VisualMemory
+    delay: DelaySearch
+    trust: Trust
+
+    @property
+    def delay_s(self) -> float:
+        """Video delay behind telemetry [s]: configured, estimated, or the guess while nothing is known."""
+        return self.delay.delay.value_s
+
+    @property
+    def delay_sigma_s(self) -> float:
+        """Standard deviation of `delay_s`; infinite while it is a guess, 0 when configured."""
+        return self.delay.delay.sigma_s
