@@ -34,6 +34,10 @@ ALIKE_COST = 1.2
 """Maximum ratio of the costs of two structures that both explain the images: four standard deviations of a chi-square
 with several hundred degrees of freedom."""
 
+OTHER_SAMPLES = 4
+"""Further random samples of the matches that must say the same of two views that no frame between confirms: where each
+second sample says otherwise, fifteen of sixteen such views are refused."""
+
 SAME_PICTURE_PX = 1.0
 """Median motion of the keypoints up to which a frame is the reference's picture once more. A still camera, or a video
 that repeats a picture, matches all of them, by which no later frame may be measured."""
@@ -163,16 +167,23 @@ class Bootstrap:
         )
         keypoint = track.matched_keypoint
         both = self.corner[reference_keypoint] & (True if corner is None else corner[keypoint])
-        return two_view_map(
-            self.reference,
-            self.guess_depth,
-            view,
-            reference_keypoint[both],
-            keypoint[both],
-            self.tracker.camera,
-            self.config,
-            self.seed,
-        )
+        matches = reference_keypoint[both], keypoint[both]
+        found = self._two_view_map(view, *matches, self.seed)
+        if found.ok and len(self.views) == 1:
+            others = (self._two_view_map(view, *matches, self.seed + k) for k in range(1, OTHER_SAMPLES + 1))
+            if not all(other.ok and self._same_direction(found, other) for other in others):
+                return replace(found, ok=False, reason="no frame between decides what random samples leave open")
+        return found
+
+    def _two_view_map(self, view: View, reference_keypoint: IntArray, keypoint: IntArray, seed: int) -> TwoView:
+        camera, config = self.tracker.camera, self.config
+        return two_view_map(self.reference, self.guess_depth, view, reference_keypoint, keypoint, camera, config, seed)
+
+    def _same_direction(self, a: TwoView, b: TwoView) -> bool:
+        """Whether two structures move the camera alike, within what two directions as unsure as allowed differ by."""
+        one, other = (se3.inverse(two_view.T_c_w)[:3, 3] - self.reference.centre_w for two_view in (a, b))
+        cosine = float(one @ other) / float(np.linalg.norm(one) * np.linalg.norm(other))
+        return cosine > np.cos(np.sqrt(2.0) * self.config.max_direction_sigma)
 
     def confirm(self, view: View, two_view: TwoView) -> TwoView:
         """The structure refined over all frames, or rejected with a reason."""

@@ -6,11 +6,13 @@ import cv2
 import numpy as np
 import pytest
 from point_map import CAMERA, SCALE_FACTOR, PointMap, check_map, small_motion
+from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.config import InitialisationConfig, OrbConfig, TrackingConfig
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.map.keyframe import make_keyframe
 from edgeslam_torch.optim.problem import LmConfig
+from edgeslam_torch.tracking import bootstrap as bootstrap_module
 from edgeslam_torch.tracking.bootstrap import WITNESS_SHARE, Bootstrap
 from edgeslam_torch.tracking.initialiser import BootstrapView, poses_of_witnesses, two_view_map
 from edgeslam_torch.tracking.tracker import Tracker, make_view
@@ -299,6 +301,44 @@ def test_a_map_that_the_frames_between_refute_is_refused(points):
     assert bootstrap.confirm(view_of(points, 4), found).ok
     refused = bootstrap.confirm(view_of(points, 4), slid(points, found))
     assert (refused.ok, refused.reason) == (False, "the frames between disagree with two views")
+
+
+def samples_that_say_otherwise(monkeypatch, turned_deg):
+    """Each third random sample of the matches finds a motion in a direction that is turned, or none where None."""
+    right = bootstrap_module.two_view_map
+
+    def sampled(reference, *given):
+        found = right(reference, *given)
+        if given[-1] % 3 != 2:
+            return found
+        if turned_deg is None:
+            return replace(found, ok=False, reason="pure rotation")
+        T_r_c = reference.T_c_w @ se3.inverse(found.T_c_w)
+        T_r_c[:3, 3] = Rotation.from_euler("y", turned_deg, degrees=True).as_matrix() @ T_r_c[:3, 3]
+        return replace(found, T_c_w=se3.inverse(T_r_c) @ reference.T_c_w)
+
+    monkeypatch.setattr(bootstrap_module, "two_view_map", sampled)
+
+
+def seen_by(points, views):
+    """Two views of the first frame and the last of these, those between seen before."""
+    bootstrap = make_bootstrap(points, z_in(points, 0), InitialisationConfig())
+    for view in views:
+        track = bootstrap.track(view_of(points, view), points.world.T_c_w[view])
+        found = bootstrap.two_views(points.keyframes[view].frame_index, view_of(points, view), track)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("turned_deg", "taken"), [(0.0, True), (4.0, True), (10.0, False), (-40.0, False), (None, False)]
+)
+def test_what_depends_on_random_samples_waits_for_a_frame_between(points, monkeypatch, turned_deg, taken):
+    """Two directions that are sure to 4.6 degrees each are within 6.5 of each other."""
+    samples_that_say_otherwise(monkeypatch, turned_deg)
+    found = seen_by(points, (4,))
+    assert found.ok is taken
+    assert taken or found.reason == "no frame between decides what random samples leave open"
+    assert seen_by(points, (2, 4)).ok
 
 
 def test_a_map_that_too_many_observations_refute_is_refused(points):
