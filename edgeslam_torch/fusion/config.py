@@ -16,6 +16,7 @@ _POSITIVE = (
     "sigma_baro_m",
     "depth_bias_log",
     "max_gap_s",
+    "alignment_sigma_rad",
 )
 _NOT_NEGATIVE = (
     "beta",
@@ -31,7 +32,6 @@ _NOT_NEGATIVE = (
     "height_systematic_log",
     "truncation_systematic_log",
     "min_speed_m_s",
-    "alignment_sigma_rad",
 )
 
 
