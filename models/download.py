@@ -11,7 +11,6 @@ from pathlib import Path
 
 from edgeslam_torch.errors import WeightsError
 from edgeslam_torch.files.download import FAILURES, Progress, discard, fetch, reason_of, remembered
-from edgeslam_torch.models.record import DEFAULT_WEIGHTS
 from edgeslam_torch.models.weights_file import MAX_FILE_BYTES
 
 
@@ -54,11 +53,6 @@ def cache_folder() -> Path:
         return Path(given).expanduser()
     base = os.environ.get("XDG_CACHE_HOME")
     return (Path(base) if base else Path.home() / ".cache") / "edgeslam"
-
-
-def shipped() -> Path:
-    """The weights inside the package."""
-    return DEFAULT_WEIGHTS
 
 
 @dataclass(frozen=True, slots=True)

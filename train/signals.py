@@ -69,6 +69,34 @@ class SupervisedWeights:
     uncertainty: float = 0.1
 
 
+class SupervisedTerms:
+    """What labels ask of a prediction."""
+
+    def __init__(self, weights: SupervisedWeights) -> None:
+        self._weights = asdict(weights)
+        self._terms = nn.ModuleDict(
+            {
+                "l1": MaskedL1(),
+                "berhu": BerHu(),
+                "silog": SILog(),
+                "gradient": GradientMatching(),
+                "slope": LogSlope(),
+            }
+        )
+        self._nll = LaplaceNll()
+
+    def __call__(self, predicted: Prediction, batch: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Weighted terms, each ``(B,)``, of a batch as `Supervised.draw` gives it."""
+        target, mask, weights = batch["log_depth"], batch["mask"], self._weights
+        # Part of the mean error is removed from the residual, including its gradient, leaving scale partly free.
+        free = (1.0 - batch["metric"]) * masked_mean(predicted.log_depth - target, mask)
+        target = target + free.view(-1, 1, 1, 1)
+        terms = {n: term(predicted.log_depth, target, mask) for n, term in self._terms.items() if weights[n]}
+        if predicted.log_sigma is not None and weights["uncertainty"]:
+            terms["uncertainty"] = self._nll(predicted.log_sigma, predicted.log_depth, target, mask)
+        return TotalLoss(weights).weighted(terms)
+
+
 @dataclass(frozen=True, slots=True)
 class Source:
     """A pool of views drawn with equal chances."""
@@ -94,16 +122,7 @@ class Supervised:
     def __post_init__(self) -> None:
         shares = np.array([s.share for s in self.sources], dtype=np.float64)
         self._edges = np.cumsum(shares / shares.sum())
-        self._terms = nn.ModuleDict(
-            {
-                "l1": MaskedL1(),
-                "berhu": BerHu(),
-                "silog": SILog(),
-                "gradient": GradientMatching(),
-                "slope": LogSlope(),
-            }
-        )
-        self._nll = LaplaceNll()
+        self._terms = SupervisedTerms(self.weights)
 
     def _choose(self, rng: np.random.Generator) -> tuple[Source, int]:
         source = self.sources[min(int(np.searchsorted(self._edges, rng.random())), len(self.sources) - 1)]
@@ -134,12 +153,4 @@ class Supervised:
 
     def losses(self, predicted: Prediction, batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """Weighted terms, each ``(B,)``."""
-        target, mask = batch["log_depth"], batch["mask"]
-        # Part of the mean error is removed from the residual, including its gradient, leaving scale partly free.
-        free = (1.0 - batch["metric"]) * masked_mean(predicted.log_depth - target, mask)
-        target = target + free.view(-1, 1, 1, 1)
-        weights = asdict(self.weights)
-        terms = {n: term(predicted.log_depth, target, mask) for n, term in self._terms.items() if weights[n]}
-        if predicted.log_sigma is not None and weights["uncertainty"]:
-            terms["uncertainty"] = self._nll(predicted.log_sigma, predicted.log_depth, target, mask)
-        return TotalLoss(weights).weighted(terms)
+        return self._terms(predicted, batch)

@@ -39,7 +39,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--no-telemetry", action="store_true", help="fly without telemetry: no metres from the drone")
     parser.add_argument(
-        "--depth", metavar="FILE|NAME|none", help="depth network: weights, an ONNX file, a downloaded network, or none"
+        "--depth",
+        metavar="FILE|NAME|none",
+        help="depth network: weights, broad, an ONNX file, a downloaded network, or none",
     )
     add_device(parser)
     parser.add_argument("--config", type=Path, metavar="FILE.toml", help="settings of the pipeline")

@@ -36,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--camera", metavar="FILE|PRESET", help="calibration (default: the source's own camera.yaml); metres follow it"
     )
     parser.add_argument(
-        "--weights", default="default", metavar="FILE|NAME", help="weights, an ONNX file or a downloaded network"
+        "--weights", default="default", metavar="FILE|NAME", help="weights, broad, an ONNX file or a downloaded network"
     )
     parser.add_argument("--backend", choices=("onnxruntime", "torch"), default="onnxruntime", help="what runs it")
     parser.add_argument(

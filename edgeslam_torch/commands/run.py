@@ -44,7 +44,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="topic of a ROS bag to use, such as /cam0/image_raw or odom=/x (list: edgeslam topics); may be repeated",
     )
     parser.add_argument(
-        "--depth", metavar="FILE|NAME|none", help="depth network: weights, an ONNX file, a downloaded network, or none"
+        "--depth",
+        metavar="FILE|NAME|none",
+        help="depth network: weights, broad, an ONNX file, a downloaded network, or none",
     )
     add_device(parser)
     parser.add_argument(

@@ -5,6 +5,7 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from edgeslam_torch.command_line import weights_file
 from edgeslam_torch.errors import ConfigError, OutputError
 
 if TYPE_CHECKING:
@@ -30,7 +31,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     convert.add_argument("--out", "-o", type=Path, required=True)
     inspect = actions.add_parser("inspect", help="print the metadata of a weights file")
     inspect.add_argument(
-        "weights", nargs="?", type=Path, help=".safetensors, .pt or .onnx (default: the shipped weights)"
+        "weights",
+        nargs="?",
+        type=weights_file,
+        help=".safetensors, .pt or .onnx, or 'default' or 'broad' (default: default)",
     )
 
 
@@ -41,11 +45,13 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _list(_: argparse.Namespace) -> None:
-    from edgeslam_torch.models.download import REMOTES, cache_folder, shipped
+    from edgeslam_torch.models.download import REMOTES, cache_folder
     from edgeslam_torch.models.onnx.presets import PRESETS, preset_file
+    from edgeslam_torch.models.record import SHIPPED_WEIGHTS
     from edgeslam_torch.models.weights_file import read_header
 
-    print(f"default  {read_header(shipped()).variant}  {shipped()}")
+    for name, path in SHIPPED_WEIGHTS.items():
+        print(f"{name}: {read_header(path).variant}\n    {path}")
     there = [(remote, cache_folder() / f"{remote.name}.safetensors") for remote in REMOTES.values()]
     there += [(preset.remote, preset_file(name)) for name, preset in PRESETS.items()]
     for remote, local in there:

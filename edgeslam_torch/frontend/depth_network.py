@@ -14,7 +14,7 @@ from edgeslam_torch.frontend.onnx_session import device_of, first_line, has_onnx
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.models.device import check_device, find_device, onnxruntime_has_cuda
 from edgeslam_torch.models.layout import MAX_LOG_DEPTH
-from edgeslam_torch.models.record import DEFAULT_WEIGHTS, Metadata
+from edgeslam_torch.models.record import DEFAULT_WEIGHTS, SHIPPED_WEIGHTS, Metadata
 from edgeslam_torch.types import DepthMap, FloatArray
 
 if TYPE_CHECKING:
@@ -76,19 +76,21 @@ def open_depth(
 
 
 def weights_path(name: str) -> Path | None:
-    """File of a depth network: ``default`` (None), the name of a downloaded preset, or a path.
+    """File of a depth network: ``default`` (None), ``broad``, the name of a downloaded preset, or a path.
 
     Raises:
         WeightsError: If it is a preset that was not downloaded.
     """
     if name == "default":
         return None
+    if name in SHIPPED_WEIGHTS:
+        return SHIPPED_WEIGHTS[name]
     if Path(name).suffix or Path(name).exists():
         return Path(name)
     from edgeslam_torch.models.onnx.presets import PRESETS, preset_file
 
     if name not in PRESETS:
-        close = ", ".join(PRESETS)
+        close = ", ".join((*SHIPPED_WEIGHTS, *PRESETS))
         raise WeightsError(f"{name}: no such weights file, and no network of that name; there are {close}")
     path = preset_file(name)
     if not path.is_file():

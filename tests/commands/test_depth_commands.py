@@ -200,7 +200,11 @@ def test_weights_list_inspect_convert(
 ) -> None:
     monkeypatch.setenv("EDGESLAM_CACHE", str(tmp_path / "cache"))
     run("weights", "list")
-    assert "mobilenet-nnconv5dw-skipadd-pruned: pruned" in capsys.readouterr().out
+    listed = capsys.readouterr().out
+    assert "mobilenet-nnconv5dw-skipadd-pruned: pruned" in listed
+    assert "broad: mobilenet-nnconv5dw-skipadd\n" in listed
+    run("weights", "inspect", "broad")
+    assert "icsl_corridor" in capsys.readouterr().out
     run("weights", "inspect")
     printed = capsys.readouterr().out
     assert "3.96 M parameters" in printed

@@ -1,12 +1,14 @@
 """ONNX depth networks of others: the right depth, or one line that says what is missing."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import onnx
 import pytest
 from small_networks import FAR_M, NEAR_M, RELATIVE, describe, green_network, node
 
+from edgeslam_torch.command_line import weights_file
 from edgeslam_torch.errors import WeightsError
 from edgeslam_torch.frontend.depth_check import CheckedDepth
 from edgeslam_torch.frontend.depth_network import DepthPredictor, open_depth, weights_path
@@ -214,6 +216,16 @@ def test_a_preset_can_be_corrected(tmp_path, image):
 def test_our_own_weights_are_opened_as_before():
     assert weights_path("default") is None
     assert isinstance(open_depth(), DepthPredictor) and open_depth().is_metric
+
+
+def test_weights_that_come_with_the_package_have_names(image):
+    broad, usual = (open_depth(weights_path(name)) for name in ("broad", "default"))
+    assert broad.is_metric
+    assert "icsl_corridor" in broad.metadata.data and "icsl_corridor" not in usual.metadata.data
+    apart = np.log(broad(image, CAMERA).depth_m / usual(image, CAMERA).depth_m)
+    assert 1e-3 < np.abs(apart).mean() < 2.0
+    assert weights_file("broad") == weights_path("broad")
+    assert weights_file("a/b.safetensors") == Path("a/b.safetensors")
 
 
 def test_a_name_that_nobody_knows_lists_what_there_is():

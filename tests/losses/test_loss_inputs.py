@@ -88,6 +88,19 @@ def test_autocast_changes_nothing(case):
     assert torch.equal(inside, case.loss(**given))
 
 
+@EVERY
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16, torch.float16], ids=str)
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA here")
+def test_a_gpu_gives_the_processors_loss(case, dtype):
+    given = cast(case.given(), dtype)
+    value, slope = gradient(case, {name: x.cuda() for name, x in given.items()})
+    exact, exact_slope = gradient(case, cast(cast(given, dtype), torch.float64))
+    assert (value.device.type, value.dtype, slope.dtype) == ("cuda", torch.float32, dtype)
+    torch.testing.assert_close(value.double().cpu(), exact, rtol=1e-3, atol=1e-5)
+    tolerance = {torch.float32: 2e-3, torch.float16: 4e-3, torch.bfloat16: 2e-2}[dtype]
+    assert float((slope.double().cpu() - exact_slope).norm() / exact_slope.norm()) < tolerance
+
+
 @HALVES
 def test_half_holds_a_whole_image(dtype):
     """480 x 640 valid pixels: more than the largest float16."""

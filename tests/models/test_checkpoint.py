@@ -11,7 +11,7 @@ import torch
 from edgeslam_torch.errors import WeightsError
 from edgeslam_torch.models.checkpoint import build_network, load_checkpoint, save_checkpoint
 from edgeslam_torch.models.fastdepth import FastDepth, Variant
-from edgeslam_torch.models.record import DEFAULT_WEIGHTS, Metadata
+from edgeslam_torch.models.record import SHIPPED_WEIGHTS, Metadata
 from edgeslam_torch.models.weights_file import read_header
 
 
@@ -81,9 +81,10 @@ def test_pickled_module_is_refused_with_the_remedy(tmp_path: Path) -> None:
         load_checkpoint(tmp_path / "whole.pth.tar")
 
 
-def test_shipped_weights_are_small_and_say_what_they_are() -> None:
-    assert DEFAULT_WEIGHTS.stat().st_size <= 8_000_000
-    metadata = read_header(DEFAULT_WEIGHTS)
+@pytest.mark.parametrize("name", SHIPPED_WEIGHTS)
+def test_shipped_weights_are_small_and_say_what_they_are(name: str) -> None:
+    assert SHIPPED_WEIGHTS[name].stat().st_size <= 8_000_000
+    metadata = read_header(SHIPPED_WEIGHTS[name])
     assert metadata.units == "m"
     assert metadata.licence
     assert metadata.data

@@ -35,6 +35,7 @@ from edgeslam_torch.train.recipe import (
     train,
 )
 from edgeslam_torch.train.signals import Slot, Source, Supervised, SupervisedWeights
+from edgeslam_torch.train.validate import image_tensor
 from edgeslam_torch.train.views.augment import AugmentConfig, View
 
 METADATA = Metadata(input_height=32, input_width=64, focal_px=50.0)
@@ -505,6 +506,17 @@ def test_device_that_is_not_there_is_refused_in_one_line(tmp_path: Path, device:
         run(tmp_path, replace(CONFIG, device=device))
 
 
+def depth_of(state: TrainState) -> Tensor:
+    """Log depth of the first view by what was learnt, on the processor."""
+    with torch.no_grad():
+        return state.averaged.cpu().eval().predict(image_tensor(views()[0].image, METADATA)[None]).log_depth
+
+
+def test_bfloat16_learns_the_same_as_float32(tmp_path: Path) -> None:
+    there, here = (depth_of(run(tmp_path / f"{amp}", replace(CONFIG, amp=amp))) for amp in (True, False))
+    assert 0.0 < float((there - here).abs().mean()) < 0.06
+
+
 @pytest.mark.parametrize("device", ["cuda", "mps"])
 @pytest.mark.parametrize("amp", [False, True])
 def test_training_on_a_gpu_goes_on_anywhere(tmp_path: Path, device: str, amp: bool) -> None:
@@ -513,10 +525,10 @@ def test_training_on_a_gpu_goes_on_anywhere(tmp_path: Path, device: str, amp: bo
     config = replace(CONFIG, device=device, amp=amp)
     state = run(tmp_path / "gpu", config)
     assert next(state.network.parameters()).device.type == device
-    on_cpu = run(tmp_path / "cpu").network.state_dict()
-    tolerance = 0.05 if amp else 2e-3
-    for name, value in state.network.state_dict().items():
-        torch.testing.assert_close(value.cpu(), on_cpu[name], rtol=tolerance, atol=tolerance, msg=name)
+    # Adam moves a weight whose gradient is all rounding by as much as any other one: what was learnt is compared.
+    there, here = (depth_of(learnt) for learnt in (state, run(tmp_path / "cpu")))
+    mean = float((there - here).abs().mean())
+    assert mean < (0.06 if amp else 0.02)  # bfloat16 on a processor: .022; a GPU's float32 convolutions are TF32
     assert run(tmp_path / "gpu", replace(CONFIG, steps=8)).step == 8, "a processor takes over"
 
 

@@ -1,9 +1,12 @@
-"""Rendered corridors, halls, rooms of many sizes and the sites of flights, as training views kept in a file.
+"""Rendered corridors, halls, rooms of many sizes and the sites of flights, as training views kept in files.
 
-They are seen level, obliquely and from near.
+They are seen level, obliquely and from near. ``python -m edgeslam_torch.train.further.places DIR --places 3000
+--processes 12`` draws them, while `weights` learns from what is there.
 """
 
+import argparse
 from collections.abc import Callable, Iterator
+from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +25,7 @@ from edgeslam_torch.synthetic.house.rooms import (
 )
 from edgeslam_torch.synthetic.house.world import World
 from edgeslam_torch.synthetic.sites.build import JUDGED, named_site
+from edgeslam_torch.train.views.rendered import is_worth_learning
 from edgeslam_torch.types import FloatArray
 
 Rng = np.random.Generator
@@ -36,6 +40,7 @@ NEAREST_M = 0.18
 SITE_SEEDS = (1_000_000, 2_000_000)
 """Of sites to learn from; flights are judged on smaller ones."""
 TRIES = 8
+PLACES_A_FILE = 10
 
 
 def random_place(rng: Rng) -> World:
@@ -111,19 +116,33 @@ def close_view(
     return None
 
 
-def render_places(path: Path, places: int, seed: int = 21) -> None:
-    """Draw all views of ``places`` places and write them to ``path`` (npz), as `views.rendered.load_rendered` reads
-    them; place p depends on (seed, p) alone."""
+def render_files(folder: Path, places: int, seed: int = 21, processes: int = 1) -> None:
+    """Draw views of ``places`` places into ``folder``, `PLACES_A_FILE` a file ``places_NNNNN.npz``, without most of the
+    flat ones; place p depends on (seed, p) alone. Files that are there stay."""
+    folder.mkdir(parents=True, exist_ok=True)
+    firsts = range(0, places, PLACES_A_FILE)
+    work = [(folder / f"places_{first:05d}.npz", first, min(first + PLACES_A_FILE, places), seed) for first in firsts]
+    work = [item for item in work if not item[0].is_file()]
+    with get_context("spawn").Pool(processes) as pool:
+        for _ in tqdm(pool.imap(_render_file, work), total=len(work), desc="rendering places", disable=None):
+            pass
+
+
+def _render_file(work: tuple[Path, int, int, int]) -> None:
+    path, first, end, seed = work
     images, depths, matrices = [], [], []
-    for p in tqdm(range(places), desc="rendering places", disable=None):
+    for p in range(first, end):
         rng = np.random.default_rng((seed, p))
         world = random_place(rng)
         for camera, rendered in _views(rng, world):
+            if not is_worth_learning(rendered.depth_m, rng.random()):
+                continue
             images.append(rendered.image)
             depths.append(rendered.depth_m.astype(np.float16))
             matrices.append(camera.K)
-    temporary = path.with_suffix(".part.npz")
-    np.savez(temporary, image=np.array(images), depth=np.array(depths), K=np.array(matrices))
+    temporary = path.with_suffix(".part")
+    with temporary.open("wb") as file:
+        np.savez(file, image=np.array(images), depth=np.array(depths), K=np.array(matrices))
     temporary.replace(path)
 
 
@@ -146,3 +165,18 @@ def _camera(focal_px: float) -> Camera:
 def _log(rng: Rng, low: float, high: float) -> float:
     """Uniform in the logarithm."""
     return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--places", type=int, default=300)
+    parser.add_argument("--seed", type=int, default=21)
+    parser.add_argument("--processes", type=int, default=1)
+    args = parser.parse_args()
+    render_files(args.folder, args.places, args.seed, args.processes)
+
+
+if __name__ == "__main__":
+    main()

@@ -60,7 +60,7 @@ def random_view(view: View, size: tuple[int, int], config: AugmentConfig, rng: n
     Pure rotations and new intrinsics are homographies of the image, so this is exact; z-depth changes with
     the axis.
     """
-    K, R = _virtual_camera(view, size, config, rng)
+    K, R = virtual_camera(view.K, view.depth_m.shape, size, config, rng)
     warped = warp(view, K, R, size)
     if rng.random() < config.flip:
         warped = mirrored(warped)
@@ -112,14 +112,16 @@ def mirrored(view: View) -> View:
     return View(np.ascontiguousarray(view.image[:, ::-1]), np.ascontiguousarray(view.depth_m[:, ::-1]), K)
 
 
-def _virtual_camera(
-    view: View, size: tuple[int, int], config: AugmentConfig, rng: np.random.Generator
+def virtual_camera(
+    K: FloatArray, shape: tuple[int, ...], size: tuple[int, int], config: AugmentConfig, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
+    """Intrinsics ``(3, 3)`` [px] of a random camera of ``size = (height, width)``, and how it is turned against one of
+    ``shape`` with intrinsics ``K`` (old camera to new camera coordinates)."""
     height, width = size
-    h, w = view.image.shape[:2]
+    h, w = shape
     zoom = np.exp(rng.uniform(*np.log(config.zoom)))
     stretch = np.exp(rng.uniform(-config.aspect, config.aspect) / 2)
-    K = scaled_K(view.K, width / w * zoom * stretch, height / h * zoom / stretch)
+    K = scaled_K(K, width / w * zoom * stretch, height / h * zoom / stretch)
     room = config.shift * width * max(zoom, 1.0)
     K[0, 2] += (1 - zoom * stretch) * width / 2 + rng.uniform(-room, room)
     K[1, 2] += (1 - zoom / stretch) * height / 2 + rng.uniform(-room, room)

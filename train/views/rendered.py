@@ -9,6 +9,7 @@ from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.synthetic.house.rooms import random_room
 from edgeslam_torch.synthetic.house.rooms import random_view as view_of_room
 from edgeslam_torch.train.views.augment import View
+from edgeslam_torch.types import FloatArray
 
 WIDTH, HEIGHT = 320, 240
 FOCAL_PX = (210.0, 360.0)
@@ -41,14 +42,20 @@ def render_rooms(path: Path, rooms: int, views_per_room: int = 6, seed: int = 7)
 def load_rendered(path: Path, seed: int = 0) -> list[View]:
     """The stored views without most of the flat ones."""
     rng = np.random.default_rng(seed)
-    views = []
+    return [view for view in stored_views(path) if is_worth_learning(view.depth_m, rng.random())]
+
+
+def stored_views(path: Path) -> list[View]:
+    """All views of a file."""
     with np.load(path) as stored:
-        for image, depth, K in zip(stored["image"], stored["depth"], stored["K"], strict=True):
-            known = depth[depth > 0]
-            lottery = rng.random()
-            if len(known) == 0:
-                continue
-            low, high = np.percentile(known, (10, 90))
-            if high > MIN_SPREAD * low or lottery < KEEP_FLAT:
-                views.append(View(image, depth.astype(np.float32), K))
-    return views
+        parts = zip(stored["image"], stored["depth"], stored["K"], strict=True)
+        return [View(image, depth.astype(np.float32), K) for image, depth, K in parts]
+
+
+def is_worth_learning(depth_m: FloatArray, lottery: float) -> bool:
+    """Whether a view shows depth, or, as ``lottery`` in [0, 1) is below `KEEP_FLAT`, some at least."""
+    known = depth_m[depth_m > 0]
+    if len(known) == 0:
+        return False
+    low, high = np.percentile(known, (10, 90))
+    return bool(high > MIN_SPREAD * low or lottery < KEEP_FLAT)

@@ -3,9 +3,9 @@
 import argparse
 import logging
 import os
-from pathlib import Path
 from typing import TYPE_CHECKING
 
+from edgeslam_torch.command_line import weights_file
 from edgeslam_torch.commands.training._inputs import (
     Item,
     add_shared_arguments,
@@ -36,7 +36,12 @@ HELP = "adapt the depth network to recordings: labelled, unlabelled or output fo
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's options."""
     add_shared_arguments(parser, steps=100, batch=6)
-    parser.add_argument("--weights", type=Path, help="weights to start from (default: the shipped ones)")
+    parser.add_argument(
+        "--weights",
+        type=weights_file,
+        metavar="FILE|NAME",
+        help="weights to start from: a file, 'default' or 'broad' (default: default)",
+    )
     parser.add_argument("--ignore-depth", action="store_true", help="ignore depth maps of recordings")
     parser.add_argument("--lr", type=float, default=3e-4, help="learning rate of the decoder; the encoder's is a fifth")
     parser.add_argument(

@@ -13,7 +13,7 @@ from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.synthetic.house.rooms import blank_corridor
 from edgeslam_torch.train.further import places
 from edgeslam_torch.train.further.mean import mean_of
-from edgeslam_torch.train.views.rendered import load_rendered
+from edgeslam_torch.train.views.rendered import stored_views
 
 
 @pytest.fixture(scope="module")
@@ -61,13 +61,23 @@ def test_a_place_depends_on_its_number_alone(tmp_path: Path, monkeypatch: pytest
     monkeypatch.setattr(places, "NEAR_VIEWS", 1)
     monkeypatch.setattr(places, "WIDTH", 64)
     monkeypatch.setattr(places, "HEIGHT", 48)
-    for count in (1, 2):
-        places.render_places(tmp_path / f"{count}.npz", count)
-    with np.load(tmp_path / "1.npz") as one, np.load(tmp_path / "2.npz") as two:
+    monkeypatch.setattr(places, "PLACES_A_FILE", 2)
+    for name, count in (("one", 1), ("two", 2)):
+        places._render_file((tmp_path / name, 0, count, 21))
+    with np.load(tmp_path / "one") as one, np.load(tmp_path / "two") as two:
         assert 0 < len(one["image"]) < len(two["image"])
         for name in ("image", "depth", "K"):
             np.testing.assert_array_equal(one[name], two[name][: len(one[name])])
-    assert all((v.depth_m > 0).any() for v in load_rendered(tmp_path / "2.npz"))
+    assert all((v.depth_m > 0).any() for v in stored_views(tmp_path / "two"))
+
+
+@pytest.mark.slow
+def test_files_that_are_there_stay(tmp_path: Path) -> None:
+    kept = tmp_path / "places_00000.npz"
+    kept.write_bytes(b"kept")
+    places.render_files(tmp_path, places.PLACES_A_FILE)
+    assert kept.read_bytes() == b"kept"
+    assert list(tmp_path.iterdir()) == [kept]
 
 
 def test_the_mean_lies_between_and_is_of_one_network() -> None:
