@@ -82,7 +82,7 @@ class Metres:
             self.fit = found[1]
         if found is not None and found[0].sigma < _BELIEVED:
             self.told = replace(found[0], sigma=math.hypot(found[0].sigma, unrest))
-        elif not self._still_trusted(trust):
+        elif not self._still_trusted(trust) or self._of_heights():
             self.told, self.fit = None, TelemetryFit(shortfall_m_s=self.fit.shortfall_m_s)
         # else nothing new to say: hover, pure rotation, or telemetry missing
 
@@ -93,9 +93,15 @@ class Metres:
             value = math.exp(found[0].log_scale)
             self.guess = ScaleEstimate(value, value * sigma, found[0].source)
 
-    def follow(self, told: LogScale, log_ratio: float) -> None:
-        """Take a scale along with a map that has grown by ``exp(log_ratio)``."""
-        self.told = replace(told, log_scale=told.log_scale - log_ratio)
+    def follow(self, log_ratio: float) -> None:
+        """Take the scale along with a map that has grown by ``exp(log_ratio)``."""
+        if self.told is not None:
+            self.told = replace(self.told, log_scale=self.told.log_scale - log_ratio)
+
+    def _of_heights(self) -> bool:
+        """Whether heights alone had told the scale: of a map that has turned away from what they had seen they tell
+        nothing any more."""
+        return self.told is not None and self.told.source == "height"
 
     def _still_trusted(self, trust: Trust) -> bool:
         """Whether all that the held opinion rests on may still tell the scale."""
@@ -120,6 +126,11 @@ class Metres:
         """By the depth network, right or wrong; None before anything has been compared."""
         depth = self._depth.scale()
         return None if depth is None else math.exp(depth.log_scale)
+
+    def network_wander_log(self) -> float:
+        """By how much the depth network's ratio to the map changes from keyframe to keyframe."""
+        depth = self._depth.scale()
+        return 0.0 if depth is None else depth.wander_log
 
     def rough(self) -> float | None:
         """For what counts as motion."""

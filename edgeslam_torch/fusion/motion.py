@@ -33,7 +33,6 @@ from edgeslam_torch.fusion.prediction import (
 from edgeslam_torch.fusion.published import Published
 from edgeslam_torch.fusion.remembered import Remembered
 from edgeslam_torch.fusion.scale.camera_mount import Mount, estimate_mount
-from edgeslam_torch.fusion.scale.log_scale import LogScale
 from edgeslam_torch.fusion.snapshot import Present, Snapshot
 from edgeslam_torch.fusion.telemetry.comparison import Comparison, FlightSoFar
 from edgeslam_torch.fusion.telemetry.delay import DelaySearch
@@ -125,19 +124,19 @@ class MotionFusion:
             self._remember_refined(stamp_s, self.config.window_s)
             self._refit()
         elif self.metres.told is not None and stamp_s - max(self._fitted_s, self._followed_s) >= _REFIT_S:
-            self._follow_map(self.metres.told, stamp_s)
+            self._follow_map(stamp_s)
         if self._trust.velocity and self._trust.motion:
             self._filter.see(visual, Metric(self.scale(), self.flight.delay.delay))
         else:
             self._filter.clear()
 
-    def _follow_map(self, told: LogScale, stamp_s: float) -> None:
+    def _follow_map(self, stamp_s: float) -> None:
         """Take the scale along with a map that refinement has enlarged since the last fit."""
         self._followed_s = stamp_s
         before = self._memory.displacements()
         self._remember_refined(stamp_s, REACH_S)
         log_ratio = math.log(grown(before, self._memory.displacements(), stamp_s))
-        self.metres.follow(told, log_ratio)
+        self.metres.follow(log_ratio)
 
     def add_earlier(self, stamps_s: FloatArray, T_w_c: FloatArray, sigma_t: float, sigma_r_rad: float) -> None:
         """Frames on which a new piece of map rests, before its first tracked one: they have moved with the drone, too.
@@ -437,8 +436,8 @@ class MotionFusion:
         if turned is None:
             return
         orientation.found = turned
-        network = metres.network()
-        present = FlightSoFar(self._memory, self._track, turned.R_b_c, metres.rough(), network)
+        network, wander_log = metres.network(), metres.network_wander_log()
+        present = FlightSoFar(self._memory, self._track, turned.R_b_c, metres.rough(), network, wander_log)
         self._comparison.judge(self._trust, present, self.flight.delay.delay, turned.R_w_m, flying)
         self._trust.at_odds = None
         unrest = self._unrest.sigma if flying else 0.0

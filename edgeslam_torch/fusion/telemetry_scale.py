@@ -16,6 +16,7 @@ from edgeslam_torch.fusion.scale.joint_scale import (
     displacement_evidence,
     height_evidence,
     solved,
+    turned_since,
 )
 from edgeslam_torch.fusion.scale.log_scale import LogScale, floor_segments
 from edgeslam_torch.fusion.scale.present import PRESENT_S, Parted, has_changed, parted, present_scale
@@ -55,6 +56,9 @@ _HEIGHT_BIN_S = 0.5
 _HEIGHT_SOURCES = {"tof": "sigma_tof_m", "h": "sigma_h_m", "baro": "sigma_baro_m"}
 _HEIGHT_STEP_M = {"tof": 0.01, "h": 0.1, "baro": 0.01}
 """Steps in which the SDK tells them."""
+_OF_A_VIEW = 0.15
+"""By how much the network's metres usually differ between two views that share nothing. So do the units of the parts of
+a map whose drone only turns: no parallax holds them together."""
 _LEAST_CLIMB_M = 0.05
 _LEAST_CLIMB_SIGMAS = 2.0
 _LEAST_MOVING, _LEAST_SHARE, _ROUGH_LOG = 4, 0.25, 0.2
@@ -261,17 +265,14 @@ class TelemetryScale:
         rough = self._rough(moved)
         if rough is None:
             return None
-        height = self._by_height(rough, moved)
-        given = [
-            g
-            for g in (
-                self._alone("telemetry", moved, systematic, rough),
-                self._alone("height", height, self._config.height_systematic_log, rough),
-            )
-            if g is not None
-        ]
+        velocity = self._alone("telemetry", moved, systematic, rough)
+        # What velocities do not know as well as the units of views differ by, they do not rule out.
+        vouching = moved if velocity is not None and velocity.sigma < _OF_A_VIEW else None
+        given = [g for g in (velocity, self._height_alone(rough, vouching)) if g is not None]
         if len(given) == 2 and at_odds(given[0].opinion, given[1].opinion):
             given = self._settled(*given)
+            if [g.name for g in given] == ["height"]:  # no surer than without the velocities that were wrong
+                given = [g for g in (self._height_alone(rough, None),) if g is not None]
         elif len(given) == 1 and given[0].name == "height" and self._nonsense(given[0]):
             given = []
         together = solved([g.evidence for g in given], tilt) if given else None
@@ -296,6 +297,9 @@ class TelemetryScale:
         evidence = evidence.softened(systematic * rough)
         single = solved([evidence], self._tilt_rad)
         return None if single is None or single[1] >= _MOST_SIGMA else _Given(name, evidence, *single)
+
+    def _height_alone(self, rough: float, moved: Evidence | None) -> _Given | None:
+        return self._alone("height", self._by_height(rough, moved), self._config.height_systematic_log, rough)
 
     def _settled(self, velocity: _Given, height: _Given) -> list[_Given]:
         """Of velocities and heights that cannot both be right the one that the depth network confirms, if it does."""
@@ -441,8 +445,10 @@ class TelemetryScale:
             if not self._trust.height(Reading(name)):
                 continue
             tilt = self._tilt_rad
-            aged = self._aged(times[here])
-            wander = self._wander(moved)
+            aged, wander = self._aged(times[here]), self._wander(moved)
+            if moved is None:
+                by_views = np.interp(times[here], stamps_s, self._of_other_views(seen.T, wander))
+                aged = by_views if aged is None else aged + by_views
             evidence = height_evidence(p, z[here], times[here], segment, sigma_map, sigma, scale, tilt, aged, wander)
             if evidence is not None:
                 evidence = evidence.softened(scale * _by_steps(z[here], _HEIGHT_STEP_M[name]))
@@ -455,6 +461,11 @@ class TelemetryScale:
             if best_sigma < _GOOD_HEIGHT:
                 break
         return best
+
+    def _of_other_views(self, T: FloatArray, wander: float) -> FloatArray:
+        """How much more a map has aged ``(N,)`` that wanders so, as it turned away from what it showed at ``T``."""
+        by_view = max(_OF_A_VIEW, self._present.network_wander_log)
+        return turned_since(T) * (by_view / wander) ** 2
 
     def _wander(self, moved: Evidence | None) -> float:
         """How much the map's scale changes as it ages: by the displacements, if they tell.

@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from edgeslam_torch.fusion.displacement import TelemetryModel
 from edgeslam_torch.geometry.camera import Camera
@@ -27,6 +28,10 @@ from edgeslam_torch.optim.problem import (
 from edgeslam_torch.optim.unit import MIN_EXTENT, with_same_depths, with_same_way
 from edgeslam_torch.types import IntArray
 
+HOLDING = 20
+"""Earlier keyframes at most that hold a wide window where the camera is back."""
+MIN_SHARED = 15
+"""Anchors in common from which on two keyframes are covisible, as in `SlamMap.covisible`."""
 UNKNOWN_SCALE_LOG = 1.0
 """Standard deviation of the log of the metres per map unit where nothing but the window's own telemetry tells them."""
 
@@ -86,8 +91,9 @@ def recent_map(slam_map: SlamMap, newest: Keyframe, most: int) -> Window | None:
     """The newest ``most`` keyframes of a piece of map as one window.
 
     The earlier keyframe that sees most of the same anchors holds it, its own first one if there is none, and its older
-    part holds the unit (`with_same_way`): two poses beside each other would not. None for fewer than three, or a camera
-    that never moved.
+    part holds the unit (`with_same_way`): two poses beside each other would not. Where the camera has come back to what
+    earlier keyframes had seen, these hold it as well: known ground does not follow what telemetry says of one visit
+    (docs/decisions/0148). None for fewer than three, or a camera that never moved.
     """
     piece = slam_map.piece_of(newest.id)
     keyframes = [k for id, k in sorted(slam_map.keyframes.items()) if slam_map.piece_of(id) == piece]
@@ -95,11 +101,31 @@ def recent_map(slam_map: SlamMap, newest: Keyframe, most: int) -> Window | None:
     anchor = slam_map.anchors_seen_by(recent)
     if earlier:
         shared = slam_map.shared_counts(anchor)
+        again = seen_again(earlier, recent)
         earlier.sort(key=lambda k: (-shared.get(k.id, 0), -k.id))
-        window = Window(recent, earlier[:1], anchor, Weight.WIDE, settled=True)
+        holding = [k for k in earlier if k.id in again][:HOLDING]
+        window = Window(recent, holding or earlier[:1], anchor, Weight.WIDE, settled=True)
     else:
         window = Window(recent[1:], recent[:1], anchor, Weight.WIDE, settled=True)
     return window if len(window.free) >= 2 and held_extent(window) is not None else None
+
+
+def seen_again(earlier: list[Keyframe], recent: list[Keyframe]) -> set[int]:
+    """Ids of those earlier keyframes whose place was out of view and is in view again in a recent one.
+
+    Args:
+        earlier: In the order of time.
+        recent: Those that followed, in the order of time.
+    """
+    members = [*earlier, *recent]
+    held = [k.anchor[k.anchor >= 0] for k in members]
+    row = np.repeat(np.arange(len(members)), [len(h) for h in held])
+    sees = csr_array((np.ones(len(row), np.int32), (row, np.concatenate(held))))
+    covisible = (sees @ sees[: len(earlier)].T).toarray() >= MIN_SHARED
+    later = np.arange(len(members))[:, None] > np.arange(len(earlier))
+    lost = np.logical_or.accumulate(~covisible & later, axis=0)
+    back = (covisible & lost)[len(earlier) :].any(axis=0)
+    return {k.id for k, again in zip(earlier, back.tolist(), strict=True) if again}
 
 
 def refine_all(

@@ -1,14 +1,18 @@
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.fusion.config import FusionConfig
+from edgeslam_torch.fusion.metres import Metres
 from edgeslam_torch.fusion.motion import MotionFusion
 from edgeslam_torch.fusion.scale.depth_scale import DepthRatio
+from edgeslam_torch.fusion.scale.log_scale import LogScale
 from edgeslam_torch.fusion.telemetry.whole_steps import Rounding
-from edgeslam_torch.fusion.telemetry_scale import TelemetryScale
+from edgeslam_torch.fusion.telemetry_scale import TelemetryFit, TelemetryScale
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.synthetic.flights.telemetry import EXACT, TelemetryFaults, simulate
@@ -362,6 +366,42 @@ def test_height_changes_alone_tell_the_scale_of_a_climb(rng, replay, swinging):
     fusion, gauge, _ = fused(rng, climb, replay)
     assert "height" in fusion.scale().source
     assert fusion.scale().value == pytest.approx(gauge.scale, rel=0.04)
+
+
+def test_a_drone_that_only_turns_forgets_the_metres_of_its_climb(swinging, replay):
+    """A quarter of a metre up in seven seconds, of which velocities tell nothing; then round on the spot: the map in
+    view
+    shares nothing any more with what the climb told. A drone that glances to the side keeps them."""
+    t = np.arange(0.0, 14.0, 0.05)
+    risen = np.clip(t / 7.0, 0, 1)
+
+    def informed(fusion, motion, gauge, samples):
+        for _ in range(50):
+            fusion.metres.add_depth_ratio(DepthRatio(math.log(1.5 * gauge.scale), 0.05))
+        replay(fusion, motion, gauge, samples)
+
+    told = {}
+    for turned_rad in (0.0, 0.5, 1.5, 3.0):
+        yaw = 0.2 * np.sin(t) + turned_rad * np.clip((t - 7.0) / 5.0, 0, 1)
+        T_w_b = np.tile(np.eye(4), (len(t), 1, 1))
+        T_w_b[:, :3, :3] = Rotation.from_euler("z", yaw[:, None]).as_matrix()
+        T_w_b[:, 2, 3] = 0.4 + 0.25 * risen**2 * (3 - 2 * risen)
+        motion = replace(swinging(1.0), stamps_s=t, T_w_c=T_w_b @ T_B_C)
+        fusion, gauge, _ = fused(np.random.default_rng(0), motion, informed, TelemetryFaults(video_delay_s=0.0))
+        told[turned_rad] = fusion.metres.told
+    assert told[0.0].source == "height" and told[0.0].sigma < 0.13
+    assert told[0.0].sigma < told[0.5].sigma < told[1.5].sigma < told[3.0].sigma
+    assert told[3.0].sigma > 0.25, "three views away, each of a unit that is .15 another"
+
+
+@pytest.mark.parametrize(("source", "held"), [("height", False), ("telemetry+height", True)])
+@pytest.mark.parametrize("found", [None, (LogScale(0.1, 0.4, "height"), TelemetryFit())], ids=["nothing", "unsure"])
+def test_metres_by_heights_alone_are_not_held_when_heights_do_not_bear_them_out(source, held, found):
+    trusting = SimpleNamespace(velocity=True, height=lambda reading: True, at_odds=None)
+    metres = Metres(FusionConfig(), 0.0)
+    metres.take((LogScale(0.0, 0.1, source), TelemetryFit()), 0.0, trusting)
+    metres.take(found, 0.0, trusting)
+    assert (metres.told is not None) == held
 
 
 def test_velocities_and_heights_that_disagree_widen_sigma(rng, swinging, replay):

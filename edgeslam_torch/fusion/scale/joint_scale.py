@@ -44,6 +44,8 @@ _WANDER = (USUAL_WANDER, 0.09, 0.27, MOST_WANDER)
 """Standard deviations of how much a map's log scale changes while its age grows by a factor of e: in the first seconds
 by 2 to 14 %, later by 1 to 2 %; along bare walls the scale triples. No less than usual: a flight's velocities cannot
 tell 1 from 3 %."""
+_VIEW_RAD = math.radians(60.0)
+"""Width of a usual camera's view."""
 _YOUNG_S = 1.0
 """Age before which a map is no younger."""
 _BIN_S = 0.5
@@ -291,6 +293,13 @@ def _unrest(white: FloatArray, fit: "_Fit", J: FloatArray, latent: FloatArray, t
 def aged_since(stamps_s: FloatArray, began_s: float, now_s: float) -> FloatArray:
     """Logarithm of the map's age now over its age at each stamp ``(N,)``; a map drifts most while it is young."""
     return np.asarray(np.log((now_s - began_s + _YOUNG_S) / (np.maximum(stamps_s - began_s, 0.0) + _YOUNG_S)))
+
+
+def turned_since(T: FloatArray) -> FloatArray:
+    """Widths of view ``(N,)`` by which a camera at ``T`` ``(N, 4, 4)`` has turned at most from what it sees now."""
+    cosine = 0.5 * (np.einsum("nij,ij->n", T[:, :3, :3], T[-1, :3, :3]) - 1.0)
+    angle = np.arccos(np.clip(cosine, -1.0, 1.0))
+    return np.asarray(np.maximum.accumulate(angle[::-1])[::-1] / _VIEW_RAD)
 
 
 def _common(aged: FloatArray) -> FloatArray:

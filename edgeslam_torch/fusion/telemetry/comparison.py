@@ -41,6 +41,8 @@ class FlightSoFar:
     """Metres per map unit, for what counts as motion."""
     network: LogScale | None = None
     """Scale by the depth network, a witness where velocities and heights contradict each other."""
+    network_wander_log: float = 0.0
+    """By how much the network's ratio to the map changes from keyframe to keyframe."""
 
 
 class Comparison:

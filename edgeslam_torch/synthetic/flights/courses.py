@@ -45,6 +45,8 @@ class Course:
 
 AROUND_BLOCK = partial(fly_around, sides_m=BLOCK_M, plan=FlightPlan(speed_m_s=0.8))
 AROUND_BUILDING = partial(fly_around, sides_m=BUILDING_M, plan=FlightPlan(speed_m_s=0.8))
+WIND = FlightPlan(wind_m_s2=0.5, gust_m_s2=0.3)
+"""As under an open window: three degrees of lean, and gusts that move the drone by 8 cm to each side."""
 LOW_LIGHT = CameraFaults(gain=0.2, read_noise=2.5, shot_noise=0.35, vignetting=0.3, shutter_s=0.02)
 """A fifth of the light at a slow shutter: walls at about 40 grey levels, noise of 3, blur of some pixels in a turn."""
 
@@ -59,6 +61,11 @@ COURSES = {
     "building": Course(building, AROUND_BUILDING, seconds=64.0, rate_hz=15.0),
     "climb": Course(pilot=climb),
     "yaw": Course(pilot=turn),
+    "windy_room": Course(pilot=partial(fly, plan=WIND)),
+    "windy_corridor": Course(corridor, partial(fly, plan=WIND)),
+    "windy_blank_corridor": Course(blank_corridor, partial(fly, plan=WIND)),
+    "windy_climb": Course(pilot=partial(climb, plan=WIND)),
+    "windy_hover_first": Course(pilot=partial(fly_after_hover, plan=WIND)),
     "low_light": Course(faults=LOW_LIGHT),
     "turn_first": Course(pilot=partial(fly_after_hover, turning=True)),
     "hover_first": Course(pilot=fly_after_hover),

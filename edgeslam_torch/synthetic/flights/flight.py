@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.mount import camera_on_body
+from edgeslam_torch.synthetic.flights.wind import blown
 from edgeslam_torch.synthetic.house.world import World
 from edgeslam_torch.types import FloatArray
 
@@ -52,6 +53,10 @@ class FlightPlan:
     """Minimum free view; the drone turns away from nearer surfaces."""
     wobble_m: float = 0.006
     wobble_rad: float = np.deg2rad(0.35)
+    wind_m_s2: float = 0.0
+    """Acceleration by a steady wind, against which the drone leans: 1 are 6 degrees."""
+    gust_m_s2: float = 0.0
+    """Standard deviation of that by gusts, on each level axis: .3 move a hovering drone by 8 cm."""
     camera_tilt_rad: float = np.deg2rad(12.0)
     """Camera's downward tilt; a Tello's is about 12 degrees."""
 
@@ -251,6 +256,11 @@ def _sampled(
     state, velocity, acceleration = (spline(flown, nu=k) for k in range(3))
     frequency, phase = rng.uniform(0.4, 2.2, (6, 4)), rng.uniform(0, 2 * np.pi, (6, 4))
     waves = np.sin(2 * np.pi * frequency * stamps[:, None, None] + phase).mean(2) * 2.0 * fade[:, None]  # (F, 6)
+    if plan.wind_m_s2 or plan.gust_m_s2:
+        moved, speed, leaning = blown(rng, stamps, plan.wind_m_s2, plan.gust_m_s2)
+        state[:, :3] += moved
+        velocity[:, :3] += speed
+        acceleration[:, :3] += leaning
     p_w = state[:, :3] + plan.wobble_m * waves[:, :3]
     wobble_velocity = np.gradient(plan.wobble_m * waves[:, :3], stamps, axis=0) if len(stamps) > 1 else 0.0 * p_w
     yaw = state[:, 3]
