@@ -28,8 +28,6 @@ from edgeslam_torch.optim.problem import (
 from edgeslam_torch.optim.unit import MIN_EXTENT, with_same_depths, with_same_way
 from edgeslam_torch.types import IntArray
 
-HOLDING = 20
-"""Earlier keyframes at most that hold a wide window where the camera is back."""
 MIN_SHARED = 15
 """Anchors in common from which on two keyframes are covisible, as in `SlamMap.covisible`."""
 UNKNOWN_SCALE_LOG = 1.0
@@ -91,27 +89,27 @@ def recent_map(slam_map: SlamMap, newest: Keyframe, most: int) -> Window | None:
     """The newest ``most`` keyframes of a piece of map as one window.
 
     The earlier keyframe that sees most of the same anchors holds it, its own first one if there is none, and its older
-    part holds the unit (`with_same_way`): two poses beside each other would not. Where the camera has come back to what
-    earlier keyframes had seen, these hold it as well: known ground does not follow what telemetry says of one visit
-    (docs/decisions/0148). None for fewer than three, or a camera that never moved.
+    part holds the unit (`with_same_way`): two poses beside each other would not. None for fewer than three, or a camera
+    that never moved, or one that is back where it was before them: known ground has its unit, and what telemetry says
+    of one visit more would tear its anchors from the keyframes that made it (docs/decisions/0148).
     """
     piece = slam_map.piece_of(newest.id)
     keyframes = [k for id, k in sorted(slam_map.keyframes.items()) if slam_map.piece_of(id) == piece]
     recent, earlier = keyframes[-most:], keyframes[:-most]
     anchor = slam_map.anchors_seen_by(recent)
     if earlier:
+        if is_back(earlier, recent):
+            return None
         shared = slam_map.shared_counts(anchor)
-        again = seen_again(earlier, recent)
         earlier.sort(key=lambda k: (-shared.get(k.id, 0), -k.id))
-        holding = [k for k in earlier if k.id in again][:HOLDING]
-        window = Window(recent, holding or earlier[:1], anchor, Weight.WIDE, settled=True)
+        window = Window(recent, earlier[:1], anchor, Weight.WIDE, settled=True)
     else:
         window = Window(recent[1:], recent[:1], anchor, Weight.WIDE, settled=True)
     return window if len(window.free) >= 2 and held_extent(window) is not None else None
 
 
-def seen_again(earlier: list[Keyframe], recent: list[Keyframe]) -> set[int]:
-    """Ids of those earlier keyframes whose place was out of view and is in view again in a recent one.
+def is_back(earlier: list[Keyframe], recent: list[Keyframe]) -> bool:
+    """Whether a recent keyframe sees what earlier ones had seen and what had been out of view since.
 
     Args:
         earlier: In the order of time.
@@ -124,8 +122,7 @@ def seen_again(earlier: list[Keyframe], recent: list[Keyframe]) -> set[int]:
     covisible = (sees @ sees[: len(earlier)].T).toarray() >= MIN_SHARED
     later = np.arange(len(members))[:, None] > np.arange(len(earlier))
     lost = np.logical_or.accumulate(~covisible & later, axis=0)
-    back = (covisible & lost)[len(earlier) :].any(axis=0)
-    return {k.id for k, again in zip(earlier, back.tolist(), strict=True) if again}
+    return bool((covisible & lost)[len(earlier) :].any())
 
 
 def refine_all(

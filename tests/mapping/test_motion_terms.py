@@ -18,7 +18,15 @@ from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.mapping.last_refinement import lm_config
 from edgeslam_torch.mapping.mapper import WIDE_EVERY, Mapper
 from edgeslam_torch.mapping.motion_terms import ALIKE, motion_factors
-from edgeslam_torch.mapping.refinement import Window, recent_map, refine, whole_map, window_problem
+from edgeslam_torch.mapping.refinement import (
+    MIN_SHARED,
+    Window,
+    is_back,
+    recent_map,
+    refine,
+    whole_map,
+    window_problem,
+)
 from edgeslam_torch.optim.problem import LmConfig
 from edgeslam_torch.synthetic.flights.telemetry import EXACT, simulate
 
@@ -110,6 +118,39 @@ def test_a_drift_that_is_taken_back_leaves_older_keyframes_their_size(rng, most)
     assert spread_of(points, 20 - most if most < 20 else 0, 10) == pytest.approx(old, rel=0.02)
     assert spread_of(points, split, 20) == pytest.approx(new, rel=0.12)
     check_map(points.map)
+
+
+@pytest.fixture
+def there_and_back(rng):
+    """Twelve keyframes: the first and the last four see the same half of the room, those between the other half."""
+    points = PointMap(rng, 600, 12)
+    points.fill()
+    for keyframe in points.keyframes:
+        between = 4 <= keyframe.id < 8
+        other = np.flatnonzero((keyframe.anchor >= 0) & (keyframe.anchor % 2 != between))
+        points.map.forget_observations(keyframe, other)
+    return points
+
+
+def test_a_camera_is_back_where_a_place_was_out_of_view(there_and_back):
+    keyframes = there_and_back.keyframes
+    assert is_back(keyframes[:6], keyframes[6:])
+    assert is_back(keyframes[:6], keyframes[6:9])
+    assert not is_back(keyframes[:6], keyframes[6:8]), "what it sees has been in view all the time"
+    assert not is_back(keyframes[:2], keyframes[2:4])
+    assert not is_back(keyframes[:2], keyframes[9:]), "nothing between tells that it was out of view"
+    for keyframe in keyframes[8:]:
+        held = np.flatnonzero(keyframe.anchor >= 0)
+        there_and_back.map.forget_observations(keyframe, held[MIN_SHARED - 1 :])
+    assert not is_back(keyframes[:6], keyframes[6:]), "too few anchors in common"
+
+
+def test_known_ground_does_not_follow_telemetry(there_and_back):
+    newest = there_and_back.keyframes
+    assert recent_map(there_and_back.map, newest[-1], 6) is None
+    for keyframe in newest[8:]:
+        there_and_back.map.remove_keyframe(keyframe)
+    assert [k.id for k in recent_map(there_and_back.map, newest[7], 6).free] == [2, 3, 4, 5, 6, 7]
 
 
 def spread_of(points, first, last):
