@@ -61,6 +61,9 @@ _OF_A_VIEW = 0.15
 a map whose drone only turns: no parallax holds them together."""
 _LEAST_CLIMB_M = 0.05
 _LEAST_CLIMB_SIGMAS = 2.0
+_LEAST_CHANGES = 2
+"""Changes of height beyond that within a second from which on heights alone tell metres: without any, their slope is
+that of what drifts, the sensor or the map."""
 _LEAST_MOVING, _LEAST_SHARE, _ROUGH_LOG = 4, 0.25, 0.2
 """Moving intervals, and share of the motion that velocities must explain, for a ratio of lengths to mean anything, and
 that ratio's error."""
@@ -443,6 +446,8 @@ class TelemetryScale:
             segment = floor_segments(times[here], z[here], scale * p[:, 2], step_m=max(0.08, 4.0 * sigma))
             self._judge_height(Reading(name), p[:, 2:], z[here, None], times[here], segment, scale)
             if not self._trust.height(Reading(name)):
+                continue
+            if moved is None and self._trust.latest[Reading(name)].count < _LEAST_CHANGES:
                 continue
             tilt = self._tilt_rad
             aged, wander = self._aged(times[here]), self._wander(moved)

@@ -394,6 +394,24 @@ def test_a_drone_that_only_turns_forgets_the_metres_of_its_climb(swinging, repla
     assert told[3.0].sigma > 0.25, "three views away, each of a unit that is .15 another"
 
 
+def test_heights_that_hardly_change_tell_no_metres(swinging, replay):
+    """A drone that hovers and glances about, and rises by 15 cm in ten seconds: so do its sensors, and its map, by drift."""
+    t = np.arange(0.0, 12.0, 0.05)
+
+    def informed(fusion, motion, gauge, samples):
+        for _ in range(50):
+            fusion.metres.add_depth_ratio(DepthRatio(math.log(1.5 * gauge.scale), 0.05))
+        replay(fusion, motion, gauge, samples)
+
+    T_w_b = np.tile(np.eye(4), (len(t), 1, 1))
+    T_w_b[:, :3, :3] = Rotation.from_euler("z", 0.2 * np.sin(t)[:, None]).as_matrix()
+    T_w_b[:, 2, 3] = 1.0 + 0.015 * t
+    motion = replace(swinging(1.0), stamps_s=t, T_w_c=T_w_b @ T_B_C)
+    for seed in range(3):
+        fusion, _, _ = fused(np.random.default_rng(seed), motion, informed, TelemetryFaults(video_delay_s=0.0))
+        assert fusion.metres.told is None
+
+
 @pytest.mark.parametrize(("source", "held"), [("height", False), ("telemetry+height", True)])
 @pytest.mark.parametrize("found", [None, (LogScale(0.1, 0.4, "height"), TelemetryFit())], ids=["nothing", "unsure"])
 def test_metres_by_heights_alone_are_not_held_when_heights_do_not_bear_them_out(source, held, found):
