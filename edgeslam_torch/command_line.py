@@ -10,7 +10,6 @@ import os
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from pathlib import Path
 from typing import NoReturn, TextIO
 
 from edgeslam_torch import __version__
@@ -63,13 +62,6 @@ def _finite_number(text: str) -> float:
     if not math.isfinite(value):
         raise argparse.ArgumentTypeError(f"must be a finite number, got {text[:40]!r}")
     return value
-
-
-def weights_file(text: str) -> Path:
-    """A weights file, or one that comes with the package by its name: the type of an option."""
-    from edgeslam_torch.models.record import SHIPPED_WEIGHTS
-
-    return SHIPPED_WEIGHTS.get(text, Path(text))
 
 
 def run_command(arguments: list[str], commands: Commands) -> int:

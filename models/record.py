@@ -165,3 +165,8 @@ def upstream_metadata(state: Mapping[str, HasShape]) -> Metadata:
         data=("NYU Depth v2",),
         licence="MIT (dwofk/fast-depth)",
     )
+
+
+def weights_file(text: str) -> Path:
+    """A weights file, or one that comes with the package by its name: the type of an option."""
+    return SHIPPED_WEIGHTS.get(text, Path(text))

@@ -5,8 +5,8 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from edgeslam_torch.command_line import weights_file
 from edgeslam_torch.errors import ConfigError, OutputError
+from edgeslam_torch.models.record import weights_file
 
 if TYPE_CHECKING:
     from edgeslam_torch.models.download import Fetched, Remote

@@ -4,13 +4,13 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.sparse import csr_array
 
 from edgeslam_torch.fusion.displacement import TelemetryModel
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.robust_statistics import CHI2_2DOF_95
 from edgeslam_torch.losses.robust import Kernel
 from edgeslam_torch.map.keyframe import Keyframe
+from edgeslam_torch.map.known_ground import is_back
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.mapping.freed_depths import Weight, motion_priors
 from edgeslam_torch.mapping.motion_terms import ALIKE, motion_factors
@@ -28,8 +28,6 @@ from edgeslam_torch.optim.problem import (
 from edgeslam_torch.optim.unit import MIN_EXTENT, with_same_depths, with_same_way
 from edgeslam_torch.types import IntArray
 
-MIN_SHARED = 15
-"""Anchors in common from which on two keyframes are covisible, as in `SlamMap.covisible`."""
 UNKNOWN_SCALE_LOG = 1.0
 """Standard deviation of the log of the metres per map unit where nothing but the window's own telemetry tells them."""
 
@@ -106,23 +104,6 @@ def recent_map(slam_map: SlamMap, newest: Keyframe, most: int) -> Window | None:
     else:
         window = Window(recent[1:], recent[:1], anchor, Weight.WIDE, settled=True)
     return window if len(window.free) >= 2 and held_extent(window) is not None else None
-
-
-def is_back(earlier: list[Keyframe], recent: list[Keyframe]) -> bool:
-    """Whether a recent keyframe sees what earlier ones had seen and what had been out of view since.
-
-    Args:
-        earlier: In the order of time.
-        recent: Those that followed, in the order of time.
-    """
-    members = [*earlier, *recent]
-    held = [k.anchor[k.anchor >= 0] for k in members]
-    row = np.repeat(np.arange(len(members)), [len(h) for h in held])
-    sees = csr_array((np.ones(len(row), np.int32), (row, np.concatenate(held))))
-    covisible = (sees @ sees[: len(earlier)].T).toarray() >= MIN_SHARED
-    later = np.arange(len(members))[:, None] > np.arange(len(earlier))
-    lost = np.logical_or.accumulate(~covisible & later, axis=0)
-    return bool((covisible & lost)[len(earlier) :].any())
 
 
 def refine_all(

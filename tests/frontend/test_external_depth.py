@@ -8,13 +8,13 @@ import onnx
 import pytest
 from small_networks import FAR_M, NEAR_M, RELATIVE, describe, green_network, node
 
-from edgeslam_torch.command_line import weights_file
 from edgeslam_torch.errors import WeightsError
 from edgeslam_torch.frontend.depth_check import CheckedDepth
 from edgeslam_torch.frontend.depth_network import DepthPredictor, open_depth, weights_path
 from edgeslam_torch.frontend.external_depth import ExternalDepth, relative_depth
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.models.onnx.presets import PRESETS, preset_file
+from edgeslam_torch.models.record import weights_file
 
 CAMERA = Camera(192, 128, 160.0, 160.0, 95.5, 63.5)
 SIZE = "input_height = 128\ninput_width = 192\n"

@@ -395,7 +395,7 @@ def test_a_drone_that_only_turns_forgets_the_metres_of_its_climb(swinging, repla
 
 
 def test_heights_that_hardly_change_tell_no_metres(swinging, replay):
-    """A drone that hovers and glances about, and rises by 15 cm in ten seconds: so do its sensors, and its map, by drift."""
+    """A drone that hovers and glances about, and rises by 15 cm in ten seconds: so sensors and maps drift."""
     t = np.arange(0.0, 12.0, 0.05)
 
     def informed(fusion, motion, gauge, samples):

@@ -15,13 +15,12 @@ from edgeslam_torch.fusion.displacement import TelemetryModel
 from edgeslam_torch.fusion.telemetry.track import TelemetryTrack
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.mount import camera_on_body
+from edgeslam_torch.map.known_ground import MIN_SHARED, is_back
 from edgeslam_torch.mapping.last_refinement import lm_config
 from edgeslam_torch.mapping.mapper import WIDE_EVERY, Mapper
 from edgeslam_torch.mapping.motion_terms import ALIKE, motion_factors
 from edgeslam_torch.mapping.refinement import (
-    MIN_SHARED,
     Window,
-    is_back,
     recent_map,
     refine,
     whole_map,

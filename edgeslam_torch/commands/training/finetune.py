@@ -5,7 +5,6 @@ import logging
 import os
 from typing import TYPE_CHECKING
 
-from edgeslam_torch.command_line import weights_file
 from edgeslam_torch.commands.training._inputs import (
     Item,
     add_shared_arguments,
@@ -19,6 +18,7 @@ from edgeslam_torch.commands.training._inputs import (
     validation_folders,
 )
 from edgeslam_torch.errors import ConfigError
+from edgeslam_torch.models.record import weights_file
 
 if TYPE_CHECKING:
     from edgeslam_torch.models.fastdepth import FastDepth
