@@ -55,18 +55,16 @@ def test_each_pool_has_its_share_and_its_weight() -> None:
 
 
 def test_depth_is_that_of_the_focal_length_learnt_at() -> None:
-    """A wall at 2 m fills the view alike at any zoom; nearer by as much as the focal length is longer."""
-    given = signal(pool("wall", 2.0, 1.0))
-    batch = given.draw(slots())
-    mean, std = (torch.tensor(v).view(3, 1, 1) for v in (METADATA.mean, METADATA.std))
-    assert ((batch["image"] * std + mean) >= 0).all()
-    zooms = AugmentConfig().zoom
-    # The pool's 320 px become 64: a focal length of 64 px at a zoom of 1, seen as if it were 60.
+    """A wall at 2 m, seen with a longer focal length than that of training, is told as nearer by as much."""
+    K = np.array([[300.0, 0, 159.5], [0, 300.0, 119.5], [0, 0, 1]])
+    wall = View(np.full((240, 320, 3), 128, np.uint8), np.full((240, 320), 2.0, np.float32), K)
+    given = signal(Pool("wall", on_device([wall], device_signal.POOL_SIZE, torch.device("cpu")), 1.0))
+    batch = given.draw(slots(count=200))
     told = torch.where(batch["mask"], batch["log_depth"], torch.nan).flatten(1).nanmedian(1).values.exp()
-    least, most = (2.0 * 60 / (64 * zoom) for zoom in (zooms[1], zooms[0]))
-    stretch = 0.1  # 60 x 80 pictures become 240 x 320, and these 32 x 64: not squares any more
-    assert (told > least * (1 - stretch) * 0.9).all() and (told < most * (1 + stretch) * 1.5).all()
-    assert told.max() / told.min() > 1.3
+    fitted_px = 300.0 * np.sqrt(64 / 320 * 32 / 240)
+    nearest, farthest = (2.0 * METADATA.focal_px / (fitted_px * zoom) for zoom in AugmentConfig().zoom[::-1])
+    assert nearest * 0.99 < told.min() < nearest * 1.1
+    assert farthest * 0.9 < told.max() < farthest * 1.01
 
 
 def test_a_batch_is_a_function_of_seed_and_step() -> None:
