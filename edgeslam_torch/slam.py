@@ -307,18 +307,20 @@ class EdgeSlam:
             cloud = self.map.anchors.cloud(self.map.anchors_seen_by(self._shown_keyframes()))
         return self._system.published.cloud(cloud)
 
-    def surroundings(self) -> FloatArray:
-        """Anchors and edge points ``(N, 3)`` float64 of keyframes that see what the newest frame sees, as published.
+    def surroundings(self) -> tuple[FloatArray, FloatArray]:
+        """Anchors ``(N, 3)`` and edge points ``(M, 3)`` float64 of keyframes that see what the newest frame sees, as
+        published.
 
-        What an obstacle is told by: a consistent snapshot in a millisecond; both whole maps take thirty to fifty.
+        What an obstacle is told by, without what is known of the next room: a consistent snapshot in a millisecond;
+        both whole maps take thirty to fifty.
         """
         if not self.log.records:
-            return np.zeros((0, 3))
+            return np.zeros((0, 3)), np.zeros((0, 3))
         with self.map.lock:
             reference = self.map.keyframes[self.map.heir_of(self.log.records[-1].keyframe_id)[0]]
             seen = self.map.anchors_seen_by([reference, *self.map.covisible(reference, _AROUND)])
-            p_w = np.concatenate([self.map.anchors.p_w[seen], self.edges.around(reference)])
-        return self._system.published.points(p_w)
+            p_w, edges_w = self.map.anchors.p_w[seen], self.edges.around(reference)
+        return self._system.published.points(p_w), self._system.published.points(edges_w)
 
     def observations(self) -> Observations:
         """Where keyframes saw the anchors of `anchors`, as a consistent snapshot."""

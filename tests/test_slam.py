@@ -233,10 +233,21 @@ def test_edge_map_and_anchors_lie_on_the_surfaces(run, scale_m):
 
 def test_surroundings_are_points_of_both_maps_that_lie_on_the_surfaces():
     slam, _ = panels_run()
-    p_w = slam.surroundings()
-    assert len(p_w) > 1000
-    distance = panels().world.distance_to_surface(in_the_world(slam, p_w))
+    anchors, edges = slam.surroundings()
+    assert len(anchors) > 300 and len(edges) > 700
+    distance = panels().world.distance_to_surface(in_the_world(slam, np.concatenate([anchors, edges])))
     assert np.median(distance) < 0.02 and np.mean(distance < 0.1) > 0.9
+
+
+def test_surroundings_are_what_the_newest_keyframe_and_its_neighbours_see(monkeypatch):
+    """Of another room's points those that lie in the picture's direction would count as seen."""
+    slam, _ = panels_run()
+    newest = slam.map.keyframes[slam.map.heir_of(slam.log.records[-1].keyframe_id)[0]]
+    monkeypatch.setattr(slam.map, "covisible", lambda keyframe, count: [])
+    anchors, _ = slam.surroundings()
+    own = slam.map.anchors.p_w[slam.map.anchors_seen_by([newest])]
+    np.testing.assert_allclose(anchors, slam._system.published.points(own))
+    assert len(anchors) < len(slam.anchors().p_w)
 
 
 def test_two_runs_give_the_same_bytes():
@@ -335,7 +346,7 @@ def test_no_frame_at_all():
     slam.finish()
     assert slam.trajectory()[1].shape == (0, 4, 4)
     assert slam.edge_map().p_w.shape == (0, 3)
-    assert slam.surroundings().shape == (0, 3)
+    assert [points.shape for points in slam.surroundings()] == [(0, 3), (0, 3)]
 
 
 @pytest.mark.parametrize("depth", [True, False])

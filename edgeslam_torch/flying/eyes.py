@@ -192,19 +192,22 @@ class SlamEyes:
         if not _tracks(output) and (self._last_fit(output) is None or not _shows(image)):
             return None
         depth, T_w_c = self._network(image, self._camera), output.T_w_c
-        fit = self._fitted(depth, output) if _tracks(output) else self._last_fit(output)
+        anchors, edges = self._slam.surroundings()
+        fit = (self._fitted(depth, anchors, output) if _tracks(output) else None) or self._last_fit(output)
         if fit is None:
             return None
         fitted = fit.applied(depth)
         part = (slice(_STEP // 2, None, _STEP), slice(_STEP // 2, None, _STEP))
         small = DepthMap(fitted.depth_m[part], fitted.sigma_log[part])
-        uv, z = seen_points(self._slam.surroundings(), self._K_small, T_w_c, small.depth_m.shape)
+        uv, z = seen_points(np.concatenate([anchors, edges]), self._K_small, T_w_c, small.depth_m.shape)
         kept = agreeing(uv, z, small.depth_m.shape[1])
         return with_nearer_points(small, uv[kept], z[kept])
 
-    def _fitted(self, depth: DepthMap, output: SlamOutput) -> NearFit | None:
-        """The network's depth against the map's points in the picture, kept for pictures without any."""
-        anchors = self._slam.anchors().p_w.astype(np.float64)
+    def _fitted(self, depth: DepthMap, anchors: FloatArray, output: SlamOutput) -> NearFit | None:
+        """The network's depth against the map's points in the picture, kept for pictures without any.
+
+        Of all points of the map those of the next room, behind the wall, would be more than those that are seen.
+        """
         fit = fit_to_points(depth, *seen_points(anchors, self._camera.K, output.T_w_c, depth.depth_m.shape))
         if fit is not None:
             self._fit = fit.alone(), output.stamp_s, output.revision

@@ -22,7 +22,7 @@ def eyes():
     across = np.linspace(-0.4, 0.4, 10)
     points = np.array([[x, y, DISTANCE_M] for x in across for y in across])
     made._network = lambda image, camera: told
-    made._slam = SimpleNamespace(anchors=lambda: SimpleNamespace(p_w=points), surroundings=lambda: np.zeros((0, 3)))
+    made._slam = SimpleNamespace(surroundings=lambda: (points, np.zeros((0, 3))))
     return made
 
 
@@ -44,6 +44,22 @@ def test_a_bare_wall_is_as_far_as_the_network_says_by_the_last_fit_and_less_sure
     carried = told(eyes, 2.0, "lost")
     np.testing.assert_allclose(carried.depth_m, DISTANCE_M, rtol=0.02)
     assert carried.sigma_log.min() >= 0.29 > np.median(fitted.sigma_log)
+
+
+def test_a_picture_with_too_few_points_goes_by_the_last_fit(eyes):
+    told(eyes, 1.0, "tracking")
+    eyes._slam = SimpleNamespace(surroundings=lambda: (np.zeros((0, 3)), np.zeros((0, 3))))
+    np.testing.assert_allclose(told(eyes, 2.0, "tracking").depth_m, DISTANCE_M, rtol=0.02)
+    assert told(eyes, 5.1, "tracking") is None
+
+
+def test_edges_of_the_map_stand_before_what_the_network_sees(eyes):
+    points, _ = eyes._slam.surroundings()
+    rim = np.array([[0.1, y, 0.8] for y in np.linspace(-0.02, 0.02, 9)])
+    eyes._slam = SimpleNamespace(surroundings=lambda: (points, rim))
+    depth = told(eyes, 1.0, "tracking").depth_m
+    assert np.nanmin(depth) == pytest.approx(0.8, rel=0.01)
+    assert np.median(depth) == pytest.approx(DISTANCE_M, rel=0.02), "they do not take part in the fit"
 
 
 def test_a_fit_that_is_old_or_in_another_unit_tells_nothing(eyes):

@@ -142,8 +142,31 @@ def test_pillars_are_no_exit_once_their_surroundings_are_seen():
     """Seen from two places as a wall with a door, and then it turns out that the wall ends beside it."""
     watch = watched([0.0, 0.2, 0.4, 0.6], surroundings(wall(0.9)))
     assert len(watch.exits) == 1
-    watch.look(surroundings(lambda a, b: wall(0.9)(a, b) & (np.abs(b) < 1.2)), sight(0.6, stamp_s=5.0))
+    for k in range(5):
+        watch.look(surroundings(PILLARS), sight(0.6, stamp_s=5.0 + 0.5 * k))
     assert not watch.exits
+
+
+PILLARS = lambda a, b: wall(0.9)(a, b) & (np.abs(b) < 1.2)  # noqa: E731
+
+
+def test_a_hole_in_the_wall_beside_a_door_takes_it_back_neither_for_a_moment_nor_from_afar():
+    """`two_rooms` 790: seen from eighteen places, and gone as the drone looked back from its take-off."""
+    watch = watched([0.0, 0.2, 0.4, 0.6, 0.6, 0.6, 0.6], surroundings(wall(0.9)))
+    for k in range(3):
+        watch.look(surroundings(PILLARS), sight(0.6, stamp_s=5.0 + 0.5 * k))
+        assert len(watch.exits) == 1
+    for k in range(40):
+        watch.look(surroundings(PILLARS), sight(-2.2, stamp_s=6.0 + 0.5 * k))
+    assert len(watch.exits) == 1
+
+
+@pytest.mark.parametrize(("apart", "count"), [(0.8, 1), (1.4, 2)])
+def test_a_passage_has_one_door(apart, count):
+    """A door, and what stands before it as wide apart."""
+    both = surroundings(lambda a, b: wall(0.9)(a, b) | wall(0.9, at=2.0 - apart)(a, b))
+    watch = watched([-1.0, -0.8, -0.6, -0.4, -0.2], both)
+    assert len(watch.exits) == count
 
 
 def test_no_look_without_metres():

@@ -6,7 +6,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from edgeslam_torch.geometry.rotations import wrapped
-from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.moved import Moved
 from edgeslam_torch.navigation.openings.detour import has_detour
 from edgeslam_torch.navigation.openings.exits import WIDEST_M, Gap, gaps
@@ -18,6 +17,8 @@ from edgeslam_torch.types import FloatArray
 _EVERY_S = 0.5
 _SAME_M, _SAME_RAD = 0.5, math.radians(35.0)
 """A look within these of an earlier one is of the same opening."""
+_PASSAGE_M = 1.0
+"""Distance along a passage within which it has one door."""
 _PLACES_M = 0.5
 """Distance between two places that count as two."""
 _NEAR_M = 4.0
@@ -57,6 +58,8 @@ class _Seen:
     places_w: list[FloatArray]
     near: int = 0
     missed: int = 0
+    parting: int = 0
+    """Looks from near by in which no way led round it, less those in which one did."""
 
     @property
     def centre_w(self) -> FloatArray:
@@ -90,8 +93,10 @@ class ExitWatch:
             self._note(gap, here)
         self._seen = [seen for seen in self._seen if seen.missed <= 2 * max(len(seen.gaps), _LOOKS)]
         good = [s for s in self._seen if s.near >= _LOOKS and s.near > s.missed and _places(s.places_w) >= 2]
-        exits = [e for seen in good if (e := _exit(seen, sight)).width_m <= WIDEST_M and not _passed_by(e, walls.layer)]
-        self.exits = tuple(sorted(exits, key=lambda e: float(np.linalg.norm(e.centre_w[:2] - here))))
+        good.sort(key=lambda s: -s.near)
+        exits = [e for seen in good if (e := _exit(seen, sight)).width_m <= WIDEST_M and _parts(seen, e, walls, here)]
+        single = [e for k, e in enumerate(exits) if not any(_one_passage(e, other) for other in exits[:k])]
+        self.exits = tuple(sorted(single, key=lambda e: float(np.linalg.norm(e.centre_w[:2] - here))))
 
     def carry(self, moved: Moved) -> None:
         """Take what was found along with the map; `exits` are those of the next look."""
@@ -128,9 +133,22 @@ def _exit(seen: _Seen, sight: Sight) -> Exit:
                 _places(seen.places_w))  # fmt: skip
 
 
-def _passed_by(exit_: Exit, layer: Layer) -> bool:
-    """Whether it is the space between two things in one room."""
-    return has_detour(layer, exit_.centre_w[:2], exit_.normal_w[:2], exit_.width_m)
+def _parts(seen: _Seen, exit_: Exit, walls: Walls, here_w: FloatArray) -> bool:
+    """Whether it parts two rooms, and is not the space between two things in one, as most looks have it: a wall that is
+    looked at again from far away gets holes."""
+    if np.linalg.norm(exit_.centre_w[:2] - here_w) < _NEAR_M:
+        round_ = has_detour(walls.layer, exit_.centre_w[:2], exit_.normal_w[:2], exit_.width_m)
+        seen.parting += -1 if round_ else 1
+    return seen.parting > 0
+
+
+def _one_passage(exit_: Exit, other: Exit) -> bool:
+    """Whether both are one behind the other, nearer than two doors are: a door, and something that stands before it."""
+    offset, normal = exit_.centre_w - other.centre_w, other.normal_w
+    along = abs(float(offset @ normal))
+    beside = math.sqrt(max(0.0, float(offset @ offset) - along**2))
+    alike = abs(float(exit_.normal_w @ normal)) > math.cos(_SAME_RAD)
+    return alike and along < _PASSAGE_M and beside < 0.5 * max(exit_.width_m, other.width_m)
 
 
 def _carried(gap: Gap, centre_w: FloatArray, beyond_w: FloatArray, ratio: float) -> Gap:
