@@ -8,7 +8,7 @@ import numpy as np
 
 from edgeslam_torch.config import SlamConfig
 from edgeslam_torch.flying.home import GROUND_M, Home, metres_per_unit
-from edgeslam_torch.frontend.depth_network import DepthNetwork, open_depth
+from edgeslam_torch.frontend.depth_network import DepthNetwork, open_depth, weights_path
 from edgeslam_torch.fusion.health import disagreement
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
@@ -23,6 +23,8 @@ from edgeslam_torch.types import DepthMap, FloatArray, Frame, Health, SlamOutput
 
 IMAGE_WIDTH = 480
 """Wider pictures are halved until they are not wider than this: the width at which flights were judged."""
+_WEIGHTS = "near"
+"""Of the depth that obstacles and openings are told by, which the map's points bring to the map's unit."""
 _DEPTH_EVERY = 3
 """Frames from one depth map to the next: 5 a second."""
 _STEP = 4
@@ -58,7 +60,7 @@ class SlamEyes:
         self._camera = camera.scaled(width, height)
         self._slam = EdgeSlam(self._camera, SlamConfig(seed=seed), realtime=realtime)
         self._K_small = self._camera.scaled(width // _STEP, height // _STEP).K
-        self._network: DepthNetwork = open_depth()
+        self._network: DepthNetwork = open_depth(weights_path(_WEIGHTS))
         self._T_b_c = camera_on_body()
         self._lock = threading.Lock()
         self._samples: list[TelemetrySample] = []

@@ -7,6 +7,9 @@ import pytest
 
 from edgeslam_torch.flying.eyes import SlamEyes, _contradicted
 from edgeslam_torch.geometry.camera import PRESETS
+from edgeslam_torch.geometry.mount import TELLO_TILT_RAD, camera_on_body
+from edgeslam_torch.synthetic.house.render import render
+from edgeslam_torch.synthetic.sites.build import named_site
 from edgeslam_torch.types import DepthMap, ScaleEstimate
 
 CAMERA = PRESETS["tello"].scaled(480, 360)
@@ -76,6 +79,23 @@ def test_the_dark_is_no_wall(eyes):
     assert told(eyes, 2.0, "lost", image=dark) is None
     assert told(eyes, 2.0, "lost", image=np.full((360, 480, 3), 200, np.uint8)) is None
     assert told(eyes, 2.0, "lost") is not None
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_what_lies_behind_a_door_is_told_from_before_it(seed):
+    """The default weights tell a wall there, at .53 to .61 of the distance."""
+    site = named_site("corridor", seed)
+    door, camera = site.exits[0], CAMERA.scaled(240, 180)
+    T_w_b = np.eye(4)
+    T_w_b[:3, :3] = np.column_stack([door.normal_w, np.cross([0, 0, 1], door.normal_w), [0, 0, 1]])
+    T_w_b[:3, 3] = [*(door.centre_w - 2.5 * door.normal_w)[:2], 1.1]
+    rendered = render(site.world, camera, site.T_site_w @ T_w_b @ camera_on_body(TELLO_TILT_RAD))
+    told = SlamEyes(CAMERA)._network(rendered.image, camera).depth_m
+    told *= np.median(rendered.depth_m) / np.median(told)
+    behind = rendered.depth_m > 3.2
+    behind[100:] = False  # the floor
+    assert behind.sum() > 2000
+    assert abs(np.median(np.log(told / rendered.depth_m)[behind])) < 0.3
 
 
 @pytest.mark.parametrize(

@@ -37,6 +37,8 @@ LEVEL_VIEWS, OBLIQUE_VIEWS, NEAR_VIEWS = 8, 5, 5
 """Of each place."""
 NEAREST_M = 0.18
 """Least fifth percentile of an oblique or near view's depth: nearer, a single texture fills it."""
+SITE_SHARE = 0.4
+"""Of the places: what a drone hits stands there."""
 SITE_SEEDS = (1_000_000, 2_000_000)
 """Of sites to learn from; flights are judged on smaller ones."""
 TRIES = 8
@@ -45,7 +47,7 @@ PLACES_A_FILE = 10
 
 def random_place(rng: Rng) -> World:
     """A place of random kind and size: what a drone flies through that `random_room` does not have."""
-    if rng.random() < 0.25:
+    if rng.random() < SITE_SHARE:
         return named_site(str(rng.choice((*JUDGED, "doors"))), int(rng.integers(*SITE_SEEDS))).world
     kind = rng.random()
     if kind < 0.3:
