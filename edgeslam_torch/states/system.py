@@ -1,5 +1,6 @@
 """Parts shared by all states: map, motion, scale, and the creation of keyframes."""
 
+import math
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 
@@ -163,10 +164,19 @@ class System:
             self.apart_sigma = self._apart_sigma(piece)
 
     def _apart_sigma(self, piece: int) -> float:
-        if piece == self.map.piece_of(self.log.records[0].keyframe_id):
+        return self.published.scale * self.between(piece, self._first_piece())
+
+    def between(self, piece: int, other: int) -> float:
+        """Standard deviation per axis [map units] of where the camera is in one piece of map as seen from another;
+        infinite where nothing relates them, as those of an earlier flight."""
+        if piece == other:
             return 0.0
         scale, centre = self.fusion.scale(), se3.inverse(self.motion.T_c_w)[:3, 3]
-        return self.published.scale * self.apart.sigma(piece, centre, scale.sigma / scale.value)
+        later = {piece, other} - {self._first_piece()}
+        return math.hypot(*(self.apart.sigma(p, centre, scale.sigma / scale.value) for p in later))
+
+    def _first_piece(self) -> int:
+        return self.map.piece_of(self.log.records[0].keyframe_id)
 
     # -- keyframes ---------------------------------------------------------------------------------------------
 

@@ -1,10 +1,11 @@
 """Tracking in the map by flow, by matching, and by edges where points are few; creation of keyframes."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
 
-from edgeslam_torch.atlas.loops import is_near
+from edgeslam_torch.atlas.loops import MAX_DRIFT_RAD, SIGMAS, is_near
 from edgeslam_torch.atlas.places import lookalikes
 from edgeslam_torch.atlas.saved import BEFORE_S
 from edgeslam_torch.geometry import se3
@@ -26,7 +27,7 @@ from edgeslam_torch.tracking.flow import (
 )
 from edgeslam_torch.tracking.keyframe_choice import KNOWN_SHARE, due_by_flow, few_matches, is_due, known_share
 from edgeslam_torch.tracking.lazy_view import LazyView
-from edgeslam_torch.tracking.relocaliser import Reach, Relocaliser, candidates
+from edgeslam_torch.tracking.relocaliser import Reach, Relocaliser, apart, candidates
 from edgeslam_torch.tracking.tracker import Track, View, make_view, parallax_to
 from edgeslam_torch.types import FloatArray, Frame, FrameStatus, IntArray
 
@@ -245,18 +246,22 @@ class Tracking:
 
     def _may_be_at(self, track: Track, stamp_s: float) -> bool:
         """Whether the drone can have come to where a frame looks like: a wall with the same paper is found again three
-        metres on, by several frames. Without sensors, or in another piece of map, images decide alone."""
+        metres on, and a shelf like the one across the room, by several frames. Images decide alone without sensors, in
+        the map of an earlier flight, and in a piece of map to which nothing relates the camera's."""
         system = self.system
         told, records = system.carried(stamp_s), system.log.records
         if told is None or not records:
             return True
         here, there = system.map.heir_of(records[-1].keyframe_id)[0], system.tracker.local_keyframes(track.anchor)[0]
-        apart = system.map.piece_of(here) != system.map.piece_of(there.id) or there.stamp_s == BEFORE_S
-        if apart:
+        between = system.between(system.map.piece_of(here), system.map.piece_of(there.id))
+        if there.stamp_s == BEFORE_S or not math.isfinite(between):
             return True
-        shift = float(np.linalg.norm(se3.inverse(track.T_c_w)[:3, 3] - told.T_w_c[:3, 3]))
+        shift, turn = apart(track.T_c_w, se3.inverse(told.T_w_c))
         depth = float(np.median(se3.transform(track.T_c_w, system.map.anchors.p_w[track.anchor])[:, 2]))
-        return is_near(system.map, system.map.keyframes[here], there, shift, depth, told.sigma_t)
+        sigma = math.hypot(told.sigma_t, between)
+        return turn <= MAX_DRIFT_RAD + SIGMAS * told.sigma_r_rad and is_near(
+            system.map, system.map.keyframes[here], there, shift, depth, sigma
+        )
 
     # -- by edges ----------------------------------------------------------------------------------------------
 

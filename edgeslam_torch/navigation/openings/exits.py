@@ -14,9 +14,9 @@ from edgeslam_torch.types import FloatArray
 
 NARROWEST_M, WIDEST_M = 0.6, 1.5
 """Width of an exit: a drone passes, a door is no wider (a wing of a double door is 1.2 m)."""
-_JAMB_M, _WALL_M = 0.2, 0.6
-"""Wall in line with the opening, with space before or behind it: at each side at least, and at both together. Things
-that stand along a corridor narrow it, and so do its own walls where they bulge; they do not make a wall of it."""
+_JAMB_M, _WALL_SHARE = 0.2, 0.7
+"""Wall in line with the opening: metres at each side at least, and share of the opening's width at both sides together.
+Things that stand along a corridor narrow it; they do not make a wall of it."""
 _ALONGSIDE_M = 1.2
 """How far to each side wall counts."""
 _BEYOND_M = (0.25, 0.65)
@@ -24,9 +24,9 @@ _BEYOND_M = (0.25, 0.65)
 _BESIDE_M = 0.2
 """How far beside the opening's ends the space must widen: a door may be this near to a corner."""
 _WIDER_M = 0.3
-"""How much wider than the opening the space is on either side at least: walls that bulge by a cell or two, or lie aslant,
-make no door of a corridor."""
-_FREE_SHARE, _SOLID_SHARE, _FACED_SHARE = 0.8, 0.3, 0.5
+"""How much wider than the opening the space is on either side at least: walls that bulge by a cell or two, or that lie
+aslant, make no door of a corridor."""
+_FREE_SHARE, _SOLID_SHARE = 0.8, 0.3
 _SAME_M = 0.5
 """Two openings nearer than this are one: no wall between two doors is thinner."""
 
@@ -61,7 +61,7 @@ def _wall(grid: Turned, t: int) -> np.ndarray:
 def _openings(grid: Turned, t: int) -> list[tuple[int, int]]:
     """Ends of what is free between two parts of a wall in row ``t`` and the rows beside it."""
     wall = _wall(grid, t)
-    if wall.sum() * grid.cell_m < _WALL_M:
+    if wall.sum() * grid.cell_m < _WALL_SHARE * NARROWEST_M:
         return []
     free = np.asarray(grid.free[t - 1 : t + 2].all(0))
     parts = [part for part in runs(wall) if (part[1] - part[0]) * grid.cell_m >= _JAMB_M - 1e-9]
@@ -81,21 +81,16 @@ def _gap(grid: Turned, t: int, low: int, high: int) -> Gap | None:
     if not _in_a_wall(grid, t, low, high):
         return None
     reach = round(_ALONGSIDE_M / grid.cell_m)
-    wall = _wall(grid, t) & _faced(grid, t)
-    jambs = [grid.cell_m * wall[part].sum() for part in (slice(max(0, low - reach), low), slice(high, high + reach))]
-    if min(jambs) < _JAMB_M - 1e-9 or sum(jambs) < _WALL_M - 1e-9:
-        return None
+    wall = _wall(grid, t)
+    length = grid.cell_m * (wall[max(0, low - reach) : low].sum() + wall[high : high + reach].sum())
     width = (high - low + 1) * grid.cell_m  # a cell that a wall only touches is solid: half of each end's is open
+    if length < _WALL_SHARE * width:
+        return None
     rows = np.arange(t - 1, t + 2)
     beside = grid.upright[rows, max(0, low - 2) : low].any(1) | grid.upright[rows, high : high + 2].any(1)
     centre = grid.at(0.5 * (low + high - 1), float(rows[beside].mean()) if beside.any() else float(t))
     away = float((centre - grid.centre_w) @ grid.left_w)
-    return Gap(centre, grid.left_w * (1.0 if away >= 0 else -1.0), width, float(sum(jambs)))
-
-
-def _faced(grid: Turned, t: int) -> np.ndarray:
-    """Where there is space before or behind a row ``(N,)``: a corridor's own wall has none in the row across it."""
-    return np.asarray(np.any([grid.free[_band(grid, t, side)].mean(0) >= _FACED_SHARE for side in (-1, 1)], axis=0))
+    return Gap(centre, grid.left_w * (1.0 if away >= 0 else -1.0), width, float(length))
 
 
 def _leads(grid: Turned, t: int, low: int, high: int, side: int) -> bool:
