@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from edgeslam_torch.geometry.rotations import wrapped
+from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.moved import Moved
 from edgeslam_torch.navigation.openings.detour import has_detour
 from edgeslam_torch.navigation.openings.exits import WIDEST_M, Gap, gaps
@@ -59,7 +60,7 @@ class _Seen:
     near: int = 0
     missed: int = 0
     parting: int = 0
-    """Looks from near by in which no way led round it, less those in which one did."""
+    """Looks from near by in which no way led round it, less those in which one did: most of them decide."""
 
     @property
     def centre_w(self) -> FloatArray:
@@ -94,7 +95,11 @@ class ExitWatch:
         self._seen = [seen for seen in self._seen if seen.missed <= 2 * max(len(seen.gaps), _LOOKS)]
         good = [s for s in self._seen if s.near >= _LOOKS and s.near > s.missed and _places(s.places_w) >= 2]
         good.sort(key=lambda s: -s.near)
-        exits = [e for seen in good if (e := _exit(seen, sight)).width_m <= WIDEST_M and _parts(seen, e, walls, here)]
+        told = [(seen, e) for seen in good if (e := _exit(seen, sight)).width_m <= WIDEST_M]
+        for seen, exit_ in told:
+            if np.linalg.norm(exit_.centre_w[:2] - here) < _NEAR_M:  # from afar a wall gets holes
+                seen.parting += -1 if _passed_by(exit_, walls.layer) else 1
+        exits = [e for seen, e in told if seen.parting > 0]
         single = [e for k, e in enumerate(exits) if not any(_one_passage(e, other) for other in exits[:k])]
         self.exits = tuple(sorted(single, key=lambda e: float(np.linalg.norm(e.centre_w[:2] - here))))
 
@@ -133,13 +138,9 @@ def _exit(seen: _Seen, sight: Sight) -> Exit:
                 _places(seen.places_w))  # fmt: skip
 
 
-def _parts(seen: _Seen, exit_: Exit, walls: Walls, here_w: FloatArray) -> bool:
-    """Whether it parts two rooms, and is not the space between two things in one, as most looks have it: a wall that is
-    looked at again from far away gets holes."""
-    if np.linalg.norm(exit_.centre_w[:2] - here_w) < _NEAR_M:
-        round_ = has_detour(walls.layer, exit_.centre_w[:2], exit_.normal_w[:2], exit_.width_m)
-        seen.parting += -1 if round_ else 1
-    return seen.parting > 0
+def _passed_by(exit_: Exit, layer: Layer) -> bool:
+    """Whether it is the space between two things in one room."""
+    return has_detour(layer, exit_.centre_w[:2], exit_.normal_w[:2], exit_.width_m)
 
 
 def _one_passage(exit_: Exit, other: Exit) -> bool:
