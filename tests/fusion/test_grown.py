@@ -37,6 +37,15 @@ def test_what_a_window_still_mends_says_nothing_of_the_unit():
     assert grown(before, replace(before, moved=moved), 20.0) == pytest.approx(1.02, rel=1e-12)
 
 
+def test_poses_that_were_mended_say_nothing_of_the_unit():
+    """A drone that hovers, two of whose few displacements are mended when pieces are joined, the longest by a third."""
+    before = steps(16, way=0.03, sigma=0.002)
+    before.moved[5, 0] = 0.045
+    after = before.moved.copy()
+    after[5, 0], after[9, 0] = 0.03, 0.021
+    assert grown(before, replace(before, moved=after), 21.0) == 1.0
+
+
 @pytest.mark.parametrize("before", [steps(way=0.04), steps(count=8), steps(count=0)])
 def test_noise_and_a_young_map_tell_nothing(before):
     assert grown(before, replace(before, moved=2.0 * before.moved), 8.0) == 1.0

@@ -9,6 +9,7 @@ import math
 import numpy as np
 
 from edgeslam_torch.fusion.telemetry.visual_memory import Displacements
+from edgeslam_torch.types import FloatArray
 
 REACH_S = 30.0
 """Age of poses that are looked at."""
@@ -36,5 +37,12 @@ def grown(before: Displacements, after: Displacements, now_s: float) -> float:
     told = (age_s > _SETTLED_S) & (age_s < REACH_S) & (then > _LEAST_SIGMAS * before.sigma)
     if int(told.sum()) < _LEAST_COUNT:
         return 1.0
-    ratio = float(now[told] @ then[told] / (then[told] @ then[told]))
+    ratio = _middle(now[told] / then[told], then[told] ** 2)
     return ratio if math.isfinite(ratio) and ratio > 0.0 else 1.0
+
+
+def _middle(ratio: FloatArray, weight: FloatArray) -> float:
+    """Weighted median: a new unit enlarges all displacements alike; what was mended changes a few, and by much."""
+    order = np.argsort(ratio)
+    up_to = np.cumsum(weight[order])
+    return float(ratio[order][np.searchsorted(up_to, 0.5 * up_to[-1])])
