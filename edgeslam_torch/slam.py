@@ -138,6 +138,7 @@ class EdgeSlam:
             self._system.fusion.scale_around,
             self._system.fusion.scale_along,
             self._system.apart.carried_sigma,
+            self._system.fusion.orientation.facing_along,
         )
         self._joining = Joining(self._system, atlas)
         self._earlier: EarlierFlights | None = None

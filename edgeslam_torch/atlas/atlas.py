@@ -25,6 +25,7 @@ from edgeslam_torch.atlas.loops import (
 )
 from edgeslam_torch.atlas.places import MIN_VOTES, lookalikes
 from edgeslam_torch.atlas.saved import BEFORE_S
+from edgeslam_torch.atlas.turned import Facing, Turned, angle_between, is_turned, turn_about
 from edgeslam_torch.atlas.unit import AGAIN_S as UNIT_AGAIN_S
 from edgeslam_torch.atlas.unit import Rescaled, about, is_other
 from edgeslam_torch.atlas.weld import look_around, move_piece, share_anchors, weld
@@ -105,6 +106,8 @@ class Atlas:
         metres_along: The same along some frames, by their stamps ``(F,)`` and poses ``(F, 4, 4)``.
         carried: Standard deviation per axis [map units] of where a piece, by its number, began, if the drone's sensors
             carried the camera there; infinite otherwise.
+        facing_along: How the map of some frames, by their stamps ``(F,)`` and poses ``(F, 4, 4)``, is turned in the
+            drone's world, if its attitude tells.
     """
 
     def __init__(
@@ -117,6 +120,7 @@ class Atlas:
         metres: Callable[[float], ScaleEstimate | None] = lambda _: None,
         metres_along: Callable[[FloatArray, FloatArray], ScaleEstimate | None] = lambda *_: None,
         carried: Callable[[int], float] = lambda _: np.inf,
+        facing_along: Callable[[FloatArray, FloatArray], Facing | None] = lambda *_: None,
     ) -> None:
         self.tracker = tracker
         self.map = tracker.map
@@ -127,6 +131,7 @@ class Atlas:
         self.metres = metres
         self.metres_along = metres_along
         self.carried = carried
+        self.facing_along = facing_along
         self.joins: list[Join] = []
         self.closures: list[Closure] = []
         self.known_scale: dict[int, ScaleEstimate] = {}
@@ -141,8 +146,8 @@ class Atlas:
         """Stamp at which the last of them was."""
         self._looked_back: Keyframe | None = None
         """The newest keyframe that was asked for a loop."""
-        self._unit_s = -np.inf
-        """Stamp at which the unit of the camera's piece was last compared."""
+        self._aligned_s = -np.inf
+        """Stamp at which the camera's piece was last compared with the flight's first one."""
 
     def strangers(self, piece: int) -> list[Keyframe]:
         """Keyframes of other pieces that have something to be recognised by."""
@@ -242,26 +247,43 @@ class Atlas:
         """Whether what a link rests on is one plane, such as a wall whose paper looks the same a metre on."""
         return on_one_plane(self.map.anchors.p_w[one.anchor], one.depth)
 
-    def rescale(self, stamp_s: float) -> Rescaled | None:
-        """Bring the camera's piece to the unit of the flight's first one, if the drone's sensors tell another.
+    def align(self, stamp_s: float) -> Rescaled | Turned | None:
+        """Turn the camera's piece as the flight's first one is turned, or bring it to its unit, if the drone's sensors
+        tell another.
 
         The map must belong to the caller.
         """
         records = self.log.records
-        if not records or stamp_s - self._unit_s < UNIT_AGAIN_S:
+        if not records or stamp_s - self._aligned_s < UNIT_AGAIN_S:
             return None
         first, piece = (self.map.piece_of(records[k].keyframe_id) for k in (0, -1))
         if piece == first or piece in self.known_scale:
             return None
-        self._unit_s = stamp_s
+        self._aligned_s = stamp_s
+        change = self._turned(stamp_s, piece, first) or self._rescaled(stamp_s, piece, first)
+        if change is not None:
+            move_piece(self.map, self.edges, self.log, piece, change.S)
+            self._links = []  # their similarities hold for pieces as they were
+        return change
+
+    def _turned(self, stamp_s: float, piece: int, first: int) -> Turned | None:
+        mine, other = (self.facing_along(*self._frames_of(p)) for p in (piece, first))
+        if mine is None or other is None:
+            return None
+        angle, sigma = angle_between(mine, other)
+        if not is_turned(angle, sigma):
+            return None
+        return Turned(stamp_s, piece, turn_about(self._began(piece), mine[0], angle), angle, sigma)
+
+    def _rescaled(self, stamp_s: float, piece: int, first: int) -> Rescaled | None:
         told = self._size_told(piece, first)
         if told is None or not is_other(*told):
             return None
-        began = min(id for id in self.map.keyframes if self.map.piece_of(id) == piece)
-        S = about(self.map.keyframes[began].centre_w, told[0])
-        move_piece(self.map, self.edges, self.log, piece, S)
-        self._links = []  # their similarities hold for pieces as they were
-        return Rescaled(stamp_s, piece, S, told[1])
+        return Rescaled(stamp_s, piece, about(self._began(piece), told[0]), told[1])
+
+    def _began(self, piece: int) -> FloatArray:
+        """Where a piece began ``(3,)``."""
+        return self.map.keyframes[min(id for id in self.map.keyframes if self.map.piece_of(id) == piece)].centre_w
 
     def _size_between(self, keyframe: Keyframe, other: Keyframe) -> tuple[float, float] | None:
         return self._size_told(*(self.map.piece_of(k.id) for k in (keyframe, other)))
@@ -275,10 +297,14 @@ class Atlas:
         return here.value / there.value, sigma
 
     def _metres_of(self, piece: int) -> ScaleEstimate | None:
+        return self.metres_along(*self._frames_of(piece))
+
+    def _frames_of(self, piece: int) -> tuple[FloatArray, FloatArray]:
+        """Stamps ``(F,)`` and poses ``(F, 4, 4)`` of the frames that a piece supports."""
         support = self.log.support()
         use = (support.piece == piece) & support.supported
         stamps_s, T_w_c = self.log.poses()
-        return self.metres_along(stamps_s[use], T_w_c[use])
+        return stamps_s[use], T_w_c[use]
 
     def _settle(self, found: Link) -> Join | Closure | None:
         """Make one of what a link connects if another one agrees; earlier keyframes are asked for it."""

@@ -325,7 +325,8 @@ class MotionFusion:
     def _carried(self) -> Carried:
         sigma = self.config.sigma_velocity_m_s
         T_b_c, R_w_m = self.orientation.T_b_c, self.orientation.R_w_m
-        return Carried(self._track, self.delay_s, T_b_c, R_w_m, self.scale(), self.metres.fit, sigma)
+        delay_s, doubt_s = self.delay_s, self.flight.delay_sigma_s
+        return Carried(self._track, delay_s, doubt_s, T_b_c, R_w_m, self.scale(), self.metres.fit, sigma)
 
     def mount(self) -> Mount | None:
         """How the camera sits on the body, estimated from the flight; ``None`` without enough motion."""

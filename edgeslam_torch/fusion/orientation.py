@@ -8,7 +8,8 @@ from edgeslam_torch.fusion.displacement import DELAY_S, is_steady
 from edgeslam_torch.fusion.remembered import Remembered
 from edgeslam_torch.fusion.scale.camera_mount import Turned, mount_by_turns
 from edgeslam_torch.fusion.telemetry.alignment import attitudes, map_to_world
-from edgeslam_torch.geometry.rotations import rotation_vector
+from edgeslam_torch.fusion.telemetry.visual_memory import Sightings
+from edgeslam_torch.geometry.rotations import mean_rotation, rotation_vector
 from edgeslam_torch.types import FloatArray
 
 _TURNED_S = 5.0
@@ -17,6 +18,8 @@ _AT_ONCE_S = 0.5
 """Time from the first frame in which the first attitude comes if it comes at all: five messages."""
 _STAMPED_S = 0.05
 """Standard deviation of a message's moment: half of the time from one to the next."""
+_LEAST_FACING = 30
+"""Frames that tell how a map is turned: one or two seconds, in which a drone has seldom turned evenly."""
 
 
 class Orientation:
@@ -102,6 +105,23 @@ class Orientation:
         R_m_c = R_w_m.T @ flight.track.attitude(around) @ R_b_c
         doubt = max(float(np.linalg.norm(rotation_vector(R_m_c[0].T @ R_m_c[k]))) for k in (1, 2))
         return R_m_c[0].T, doubt
+
+    def facing_along(self, stamps_s: FloatArray, T_w_c: FloatArray) -> tuple[FloatArray, float] | None:
+        """``R_w_m`` ``(3, 3)`` of some frames, ``(F,)`` and ``(F, 4, 4)``, and the standard deviation of its turn about
+        the vertical [rad]: how they differ, and a mount that is not known better. None where telemetry has not proven
+        to be of this flight, or covers too few."""
+        flight = self._flight
+        if not (flight.trust.turns and math.isfinite(flight.delay_sigma_s)):
+            return None
+        shown = Sightings(stamps_s, T_w_c, np.zeros(len(stamps_s)))
+        told = attitudes(shown, flight.track, flight.delay_s)
+        if told is None or len(told.stamp_s) < _LEAST_FACING:
+            return None
+        each = told.R_w_b @ self.T_b_c[:3, :3] @ np.swapaxes(told.R_m_c, 1, 2)
+        R_w_m = mean_rotation(each)
+        D = each @ R_w_m.T
+        angle = np.arctan2(D[:, 1, 0] - D[:, 0, 1], D[:, 0, 0] + D[:, 1, 1])
+        return R_w_m, math.hypot(flight.config.alignment_sigma_rad, float(np.sqrt(np.mean(angle**2))))
 
     def upright(self) -> FloatArray | None:
         """``R_w_m`` where attitude may turn the world: when it has proven to be of this flight, or as the one may that

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from edgeslam_torch.fusion.displacement import DELAY_S
 from edgeslam_torch.fusion.filter.filter_feed import FilterView
 from edgeslam_torch.fusion.telemetry.track import TelemetryTrack
 from edgeslam_torch.fusion.telemetry.visual_memory import VisualPose
@@ -100,6 +101,8 @@ class Carried:
 
     track: TelemetryTrack
     delay_s: float
+    delay_sigma_s: float
+    """Infinite while the delay is a guess."""
     T_b_c: FloatArray
     """Camera in the body ``(4, 4)`` [m]."""
     R_w_m: FloatArray | None
@@ -121,9 +124,9 @@ class Carried:
         T = last.T.copy()
         T[:3, :3] = last.T[:3, :3] @ R_c_b @ R_w_b[0].T @ R_w_b[1] @ R_c_b.T
         gap = float(times[1] - times[0])
-        scale = self.scale
+        scale, late_rad = self.scale, self._late_rad(times)
         if self.R_w_m is None or not math.isfinite(scale.sigma):
-            return PoseEstimate(stamp_s, T, math.inf, 0.01 + 0.01 * gap, "telemetry")
+            return PoseEstimate(stamp_s, T, math.inf, math.hypot(0.01 + 0.01 * gap, late_rad), "telemetry")
         moved = np.diff(self.track.displacement(times, self.fit.shortfall_m_s), axis=0)[0]
         if self.fit.moved is not None:
             moved = moved - self.fit.moved.bias * gap
@@ -132,7 +135,15 @@ class Carried:
         walk = self.sigma_velocity_m_s * math.sqrt(0.1 * gap) + 0.02 * gap
         sigma_m = math.hypot(walk, float(np.linalg.norm(moved)) * scale.sigma / scale.value)
         sigma_t = last.sigma_t + sigma_m / scale.value
-        return PoseEstimate(stamp_s, T, sigma_t, math.radians(0.5) + 0.002 * gap, "telemetry")
+        sigma_r_rad = math.hypot(math.radians(0.5) + 0.002 * gap, late_rad)
+        return PoseEstimate(stamp_s, T, sigma_t, sigma_r_rad, "telemetry")
+
+    def _late_rad(self, times: FloatArray) -> float:
+        """By how much a turn between two moments is another one if the video is later or earlier than believed."""
+        late_s = min(self.delay_sigma_s, DELAY_S)
+        R_w_b = [self.track.attitude(times + by_s) for by_s in (0.0, -late_s, late_s)]
+        turned = [R[0].T @ R[1] for R in R_w_b]
+        return max(float(np.linalg.norm(rotation_vector(turned[0].T @ other))) for other in turned[1:])
 
 
 def between(visual: PoseEstimate, telemetry: PoseEstimate, share: float) -> PoseEstimate:

@@ -6,7 +6,7 @@ until both pieces are found to be one.
 """
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -43,6 +43,11 @@ class Apart:
             sigma_t = math.hypot(sigma_t, self.sigma(before, centre, 0.0))
             sigma_r_rad = math.hypot(sigma_r_rad, earlier.sigma_r_rad)
         self.begun[piece] = _Begun(np.array(centre, dtype=np.float64), sigma_t, sigma_r_rad)
+
+    def turned(self, piece: int, sigma_r_rad: float) -> None:
+        """A piece was turned about where it began, as sure as that is."""
+        if piece in self.begun:
+            self.begun[piece] = replace(self.begun[piece], sigma_r_rad=sigma_r_rad)
 
     def carried_sigma(self, piece: int) -> float:
         """Standard deviation per axis [map units] of where a piece began; infinite unless the drone's sensors carried

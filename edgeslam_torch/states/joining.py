@@ -7,13 +7,14 @@ import numpy as np
 
 from edgeslam_torch.atlas.atlas import Atlas, Join
 from edgeslam_torch.atlas.loops import Closure
+from edgeslam_torch.atlas.turned import Turned
 from edgeslam_torch.atlas.unit import Rescaled
 from edgeslam_torch.fusion.published import Published
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.states.system import System
 from edgeslam_torch.types import FloatArray
 
-_COUNTED: dict[type, str] = {Join: "joined", Closure: "loops_closed", Rescaled: "rescaled"}
+_COUNTED: dict[type, str] = {Join: "joined", Closure: "loops_closed", Rescaled: "rescaled", Turned: "turned"}
 """Names of the events of the summary."""
 
 
@@ -40,9 +41,9 @@ class Joining:
         if len(self.system.map.begun) > 1:
             self._notice_return()
             before = self._last()
-            if (rescaled := self.atlas.rescale(stamp_s)) is not None:
-                self._follow(rescaled, *before)
-                words.append(rescaled.in_words())
+            if (aligned := self.atlas.align(stamp_s)) is not None:
+                self._follow(aligned, *before)
+                words.append(aligned.in_words())
         while (change := self._once(stamp_s)) is not None:
             words.append(change.in_words())
         return "; ".join(words)
@@ -90,7 +91,7 @@ class Joining:
             self._follow(change, *before)
         return change
 
-    def _follow(self, change: Join | Closure | Rescaled, last: int, piece: int, T_k_w: FloatArray) -> None:
+    def _follow(self, change: Join | Closure | Rescaled | Turned, last: int, piece: int, T_k_w: FloatArray) -> None:
         """Take the live pose and the metres along with a map that has changed since the newest frame was tied to it."""
         system = self.system
         T_c_k = system.motion.T_c_w @ se3.inverse(T_k_w)
@@ -101,5 +102,7 @@ class Joining:
         system.fusion.revise(*system.log.poses())
         # Poses published before belong to a map that has moved since.
         system.published = replace(system.published, revision=system.published.revision + 1)
+        if isinstance(change, Turned):
+            system.apart.turned(change.piece, change.sigma_rad)
         kind = _COUNTED[type(change)]
         system.events[kind] = system.events.get(kind, 0) + 1

@@ -384,7 +384,7 @@ def test_a_piece_is_brought_to_the_unit_of_the_first_one(rng):
     before = [k.centre_w for k in pieces.keyframes]
     pixels = [pixels_of(pieces, k) for k in pieces.keyframes]
     atlas = pieces.atlas(metres_along=metres_along(2.0 * 1.5))
-    done = atlas.rescale(1.0)
+    done = atlas.align(1.0)
     assert (done.piece, sim3.scale_of(done.S)) == (1, pytest.approx(1.5))
     assert done.growth(1, 5) == pytest.approx(1.5) and done.growth(0, 1) == 1.0
     began = before[4]
@@ -393,7 +393,7 @@ def test_a_piece_is_brought_to_the_unit_of_the_first_one(rng):
         np.testing.assert_allclose(keyframe.centre_w, there, atol=1e-9)
         np.testing.assert_allclose(pixels_of(pieces, keyframe), pixels[k], atol=1e-6)
     check_map(pieces.map)
-    assert atlas.rescale(1.0 + 0.9 * AGAIN_S) is None, "not at each frame"
+    assert atlas.align(1.0 + 0.9 * AGAIN_S) is None, "not at each frame"
 
 
 @pytest.mark.parametrize(
@@ -414,7 +414,7 @@ def test_a_piece_keeps_its_unit_where_nothing_is_surely_wrong(rng, second, sigma
 
     pieces = Pieces(rng, misplaced=CARRIED)
     before = [k.T_c_w.copy() for k in pieces.keyframes]
-    assert pieces.atlas(metres_along=told).rescale(1.0) is None, why
+    assert pieces.atlas(metres_along=told).align(1.0) is None, why
     for keyframe, T_c_w in zip(pieces.keyframes, before, strict=True):
         np.testing.assert_array_equal(keyframe.T_c_w, T_c_w)
 
@@ -423,10 +423,55 @@ def test_the_first_piece_and_that_of_an_earlier_flight_keep_their_unit(rng):
     pieces = Pieces(rng, misplaced=CARRIED)
     atlas = pieces.atlas(metres_along=metres_along(3.0))
     atlas.known_scale[1] = ScaleEstimate(1.0, 0.02, "atlas")
-    assert atlas.rescale(1.0) is None
+    assert atlas.align(1.0) is None
     atlas = pieces.atlas(metres_along=metres_along(3.0))
     del pieces.log.records[4:]  # the camera is in the first piece
-    assert atlas.rescale(1.0) is None
+    assert atlas.align(1.0) is None
+
+
+def facing_along(second_rad, sigma_rad=0.05):
+    """How either piece is turned in the drone's world, by the stamps of its frames: the second one further to the left,
+    in a map that lies on its side."""
+    side = se3.exp(np.array([0.0, 0.0, 0.0, 0.3, -1.2, 0.4]))[:3, :3]
+
+    def told(stamps_s, T_w_c):
+        turn = second_rad if stamps_s[0] > 0.0 else 0.0
+        return np.array(se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, turn]))[:3, :3] @ side), sigma_rad
+
+    return side, told
+
+
+@pytest.mark.parametrize("angle", [0.4, -0.7])
+def test_a_piece_is_turned_as_the_first_one(rng, angle):
+    """About where it began and about the vertical; what its cameras see stays the same."""
+    pieces = Pieces(rng, misplaced=CARRIED)
+    before = [k.T_c_w for k in pieces.keyframes]
+    pixels = [pixels_of(pieces, k) for k in pieces.keyframes]
+    side, told = facing_along(angle)
+    atlas = pieces.atlas(facing_along=told)
+    done = atlas.align(1.0)
+    assert (done.piece, done.growth(1, 5)) == (1, 1.0)
+    assert done.in_words() == f"piece 1 turned by {np.rad2deg(angle):.1f} degrees (sigma 4.1) to the heading before it"
+    began = -before[4][:3, :3].T @ before[4][:3, 3]
+    for k, keyframe in enumerate(pieces.keyframes):
+        np.testing.assert_allclose(pixels_of(pieces, keyframe), pixels[k], atol=1e-6)
+        if k < 4:
+            np.testing.assert_array_equal(keyframe.T_c_w, before[k])
+            continue
+        # In the world of the first piece a camera of the second one now faces where its own world has it.
+        R_w_m = told(np.ones(1), None)[0]
+        np.testing.assert_allclose(side @ keyframe.T_c_w[:3, :3].T, R_w_m @ before[k][:3, :3].T, atol=1e-9)
+        way = -before[k][:3, :3].T @ before[k][:3, 3] - began
+        np.testing.assert_allclose(side @ (keyframe.centre_w - began), R_w_m @ way, atol=1e-9)
+    check_map(pieces.map)
+    assert atlas.align(1.0 + 0.9 * AGAIN_S) is None, "not at each frame"
+
+
+@pytest.mark.parametrize(("angle", "sigma"), [(0.2, 0.05), (0.0, 0.001)])
+def test_a_piece_stays_turned_as_it_is_where_nothing_is_surely_wrong(rng, angle, sigma):
+    """0.2 rad are within three of both sigmas together."""
+    pieces = Pieces(rng, misplaced=CARRIED)
+    assert pieces.atlas(facing_along=facing_along(angle, sigma)[1]).align(1.0) is None
 
 
 def pixels_of(pieces, keyframe):

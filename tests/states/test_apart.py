@@ -31,6 +31,15 @@ def test_a_turn_that_is_not_known_counts_by_the_way_flown_in_the_piece():
     assert apart.sigma(1, camera, 0.02) >= worst_axis
 
 
+def test_a_piece_that_was_turned_is_as_sure_of_its_heading_as_what_told_it():
+    apart = Apart()
+    apart.begin(1, 0, np.zeros(3), 0.3, 0.5)
+    apart.turned(1, 0.1)
+    assert apart.sigma(1, np.array([4.0, 0.0, 0.0]), 0.0) == pytest.approx(0.5)
+    apart.turned(2, 0.1)
+    assert apart.sigma(2, np.zeros(3), 0.0) == math.inf, "a piece that nothing relates"
+
+
 def test_a_piece_after_another_is_in_doubt_by_both():
     apart = Apart()
     apart.begin(1, 0, np.zeros(3), 0.3, 0.0)

@@ -7,9 +7,11 @@ import pytest
 
 from edgeslam_torch.atlas.atlas import Join
 from edgeslam_torch.atlas.loops import Closure
+from edgeslam_torch.atlas.turned import Turned, turn_about
 from edgeslam_torch.atlas.unit import Rescaled, about
 from edgeslam_torch.fusion.published import Published
 from edgeslam_torch.geometry import se3, sim3
+from edgeslam_torch.states.apart import Apart
 from edgeslam_torch.states.joining import Joining
 from edgeslam_torch.tracking.motion_model import MotionModel
 from edgeslam_torch.types import ScaleEstimate
@@ -51,7 +53,7 @@ class Pieces:
             update=update,
             ask_all_again=lambda: None,
             ask_again=lambda: self.again.append(self.piece),
-            rescale=lambda stamp_s: None,
+            align=lambda stamp_s: None,
             is_up_to_date=False,
             is_divided=True,
             known_scale={},
@@ -71,6 +73,7 @@ def system_of(pieces, motion, busy=False):
     mapping = SimpleNamespace(busy=busy)
     again = lambda: revised.append("ratios")  # noqa: E731
     return SimpleNamespace(
+        apart=Apart(),
         compare_depths_again=again,
         log=log,
         map=pieces,
@@ -131,7 +134,7 @@ def test_the_pose_goes_along_when_a_loop_is_closed(rng):
         return Closure(1.0, 1, 30.0, 0.2, 0.1, 1.2, 2, 300, {KEYFRAME: 1.5, 3: 1.1})
 
     system = system_of(pieces, motion)
-    words = Joining(system, SimpleNamespace(update=update, rescale=lambda _: None, is_up_to_date=False)).update()
+    words = Joining(system, SimpleNamespace(update=update, align=lambda _: None, is_up_to_date=False)).update()
     assert words.startswith("loop closed in piece 1, a place seen again after 30.0 s: 2 keyframes agree, 300 keypoints")
     np.testing.assert_allclose(se3.transform(motion.T_c_w, sim3.transform(S, p)), 1.5 * before, atol=1e-9)
     assert (system.published.revision, system.events) == (1, {"loops_closed": 1})
@@ -150,12 +153,32 @@ def test_the_pose_goes_along_when_its_piece_gets_the_unit_of_another(rng):
         return Rescaled(7.0, 1, grown, 0.05)
 
     system = system_of(pieces, motion)
-    atlas = SimpleNamespace(rescale=rescale, update=lambda _: None, is_up_to_date=False)
+    atlas = SimpleNamespace(align=rescale, update=lambda _: None, is_up_to_date=False)
     words = Joining(system, atlas).update()
     assert words == "piece 1 scaled by 1.300 (sigma 5.0 %) to the metres before it"
     np.testing.assert_allclose(se3.transform(motion.T_c_w, sim3.transform(grown, p)), 1.3 * before, atol=1e-9)
     assert (system.published.revision, system.events) == (1, {"rescaled": 1})
     assert system.fusion.revised == ["ratios", ("stamps", "poses")]
+
+
+def test_the_pose_goes_along_when_its_piece_is_turned(rng):
+    T_k_w, motion = moving(rng)
+    p = rng.normal(size=(20, 3))
+    before = se3.transform(motion.T_c_w, p)
+    pieces = Pieces(T_k_w)
+    S = turn_about(np.array([1.0, -2.0, 0.5]), np.eye(3), 0.4)
+
+    def align(stamp_s):
+        pieces.T_k_w = sim3.moved_camera(S, T_k_w)
+        return Turned(7.0, 1, S, 0.4, 0.05)
+
+    system = system_of(pieces, motion)
+    system.apart.begin(1, 0, np.zeros(3), 0.0, 0.5)
+    atlas = SimpleNamespace(align=align, update=lambda _: None, is_up_to_date=False)
+    assert Joining(system, atlas).update() == "piece 1 turned by 22.9 degrees (sigma 2.9) to the heading before it"
+    np.testing.assert_allclose(se3.transform(motion.T_c_w, sim3.transform(S, p)), before, atol=1e-9)
+    assert (system.published.revision, system.events) == (1, {"turned": 1})
+    assert system.apart.sigma(1, np.array([2.0, 0.0, 0.0]), 0.0) == pytest.approx(0.1)
 
 
 @pytest.mark.parametrize("finish", [False, True])
