@@ -21,7 +21,7 @@ from edgeslam_torch.navigation.openings.pathways import Pathway, pathways
 from edgeslam_torch.navigation.openings.watch import Exit
 from edgeslam_torch.navigation.pilot import Phase
 from edgeslam_torch.navigation.sight import Sight
-from edgeslam_torch.navigation.tasks import Explore, GoTo, Task
+from edgeslam_torch.navigation.tasks import ARRIVED_M, Explore, GoTo, Task
 from edgeslam_torch.types import FloatArray
 
 HOME_BECAUSE = "battery low: home"
@@ -31,6 +31,8 @@ APART = "to {:.2g} m: what telemetry leaves open between this piece of map and t
 """What an outcome adds where nothing that is seen says so."""
 BEYOND_M = 0.8
 """How far behind an exit it stops."""
+_THERE_M = ARRIVED_M + 0.05
+"""Distance from a goal, by the drone's own pose, that needs no words: it drifts a little while it stops."""
 _LEAST_CORRIDOR_M = 1.0
 """Way that must have been flown to have followed anything."""
 
@@ -135,11 +137,13 @@ class Navigator:
     def go_to(self, goal_w: Sequence[float] | FloatArray) -> Outcome:
         """Fly to a point ``(3,)`` around what is in the way; at the height of flight, which the point must be near.
 
+        Before a bare wall, where no picture tells the pose, it stays up to half a metre away, and the reason says so.
+
         Raises:
             FlightRefused: If the point is none, beyond the fence, inside something solid or at another height; or there
                 are no metres yet.
         """
-        return self.fly(GoTo(self._goal(goal_w)), "there")
+        return self._fly_to(self._goal(goal_w), "there")
 
     def explore(self, seconds: float) -> Outcome:
         """Fly to where the known space ends, again and again, and look around on the way; reached when time is over or
@@ -185,7 +189,7 @@ class Navigator:
             FlightRefused: As `go_to`.
         """
         there = exit_.beyond(BEYOND_M)
-        return self.fly(GoTo(self._goal([there[0], there[1], self.limits.height_m])), "through the exit")
+        return self._fly_to(self._goal([there[0], there[1], self.limits.height_m]), "through the exit")
 
     def follow_corridor(self, seconds: float = 120.0) -> Outcome:
         """Follow the corridor that the drone is in, ahead and round corners, through no door.
@@ -249,6 +253,14 @@ class Navigator:
         path_m, clearance_m = self.cockpit.flown()
         self.craft.land("as told")
         return Outcome(self.craft.over == "as told", f"landed: {self.craft.over}", clearance_m, path_m)
+
+    def _fly_to(self, goal_w: FloatArray, done: str) -> Outcome:
+        """Fly to a checked point ``(3,)``; the outcome says if it came as near only as its pose is known."""
+        task = GoTo(goal_w)
+        outcome, sight = self.fly(task, done), self.cockpit.sight
+        if not outcome.reached or sight is None or (away_m := task.away_m(sight)) < _THERE_M:
+            return outcome
+        return replace(outcome, reason=f"{done}, {away_m:.2f} m short of it where no picture tells" + self._rests_on())
 
     def _goal(self, goal_w: Sequence[float] | FloatArray) -> FloatArray:
         goal = check_goal(goal_w, self.limits)

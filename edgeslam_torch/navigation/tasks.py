@@ -17,6 +17,9 @@ from edgeslam_torch.types import FloatArray
 ARRIVED_M = 0.15
 _MOST_DOUBT_M = 0.3
 """Doubt about where it is that may count as having arrived, at most."""
+_NEAREST_M, _TRIES = 0.5, 3
+"""How near its goal a drone stays that has lost its pose there, and was brought back, this often: what carries it on
+are velocities that a Tello cuts off, and it would come no nearer until its battery is empty."""
 
 
 class Task(Protocol):
@@ -52,12 +55,16 @@ class LooksAhead:
         return None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class GoTo(LooksAhead):
     """Fly to a point."""
 
     goal_w: FloatArray
     """``(3,)`` in the drone's world [m]."""
+    _losses: int = 0
+    """How often the pose was lost near the goal, and something else than to go on was done about it."""
+    _lost: bool = False
+    """Whether it is now."""
 
     def goals(self, layer: Layer, sight: Sight) -> np.ndarray:
         """The goal's cell; where the grid ends, the last one towards it."""
@@ -75,10 +82,22 @@ class GoTo(LooksAhead):
         Before a bare wall telemetry carries it no farther, and a standard deviation of its metres may be more than what
         is left of the way.
         """
+        away_m = self.away_m(sight)
+        self._note_loss(sight, away_m)
         carried_out = not sight.tracked and sight.position_sigma_m >= CARRIED_SIGMA_M
         reach_m = max(ARRIVED_M, min(_doubt_m(sight), _MOST_DOUBT_M)) if carried_out else ARRIVED_M
-        near = float(np.linalg.norm(sight.p_w[:2] - self.goal_w[:2])) < reach_m
-        return near and float(np.linalg.norm(sight.velocity_w)) < 0.15
+        reach_m = _NEAREST_M if self._losses >= _TRIES else reach_m
+        return away_m < reach_m and float(np.linalg.norm(sight.velocity_w)) < 0.15
+
+    def away_m(self, sight: Sight) -> float:
+        """Level distance from the goal [m], by the drone's own pose."""
+        return float(np.linalg.norm(sight.p_w[:2] - self.goal_w[:2]))
+
+    def _note_loss(self, sight: Sight, away_m: float) -> None:
+        if sight.tracked:
+            self._lost = False
+        elif sight.hindered and not self._lost and away_m < _NEAREST_M:
+            self._losses, self._lost = self._losses + 1, True
 
     def carry(self, moved: Moved) -> None:
         """A goal in metres from the take-off stays what it is."""

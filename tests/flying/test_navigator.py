@@ -111,6 +111,16 @@ def test_an_outcome_says_what_it_rests_on(tracked, apart_m, reason):
     assert explored.reason == reason.replace("home", "nothing is left to see")
 
 
+@pytest.mark.parametrize(("x", "reason"), [(2.1, "there"), (1.6, "there, 0.40 m short of it where no picture tells")])
+def test_an_outcome_says_how_near_to_its_goal_it_is(x, reason):
+    nav = navigator()
+    nav.craft.flying, nav.craft.fly = True, lambda until: None
+    nav.cockpit.sight = Sight(9.0, np.array([x, 0.0, 1.15]), 0.0, np.zeros(3))
+    nav.cockpit.known = lambda: None
+    nav.cockpit.ended = lambda: Phase.DONE
+    assert nav.go_to((2.0, 0.0, 1.15)).reason == reason
+
+
 @pytest.mark.slow
 def test_there_and_back_with_outcomes():
     with navigator() as nav:

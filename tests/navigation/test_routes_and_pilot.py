@@ -431,6 +431,18 @@ def test_where_telemetry_carries_it_no_farther_its_doubt_is_near_enough(off_m, s
     assert goal.done(lost) == arrived
 
 
+@pytest.mark.parametrize(("off_m", "tries", "arrived"), [(0.4, 3, True), (0.4, 2, False), (0.55, 9, False)])
+def test_a_pose_that_is_lost_near_the_goal_again_and_again_comes_no_nearer(off_m, tries, arrived):
+    """Brought back each time, it finds its pose again; each loss is told at every moment that it lasts."""
+    goal, there = GoTo(np.array([12.0, 0.0, 1.15])), replace(at(12.0 - off_m, 0.0), position_sigma_m=0.05)
+    for _ in range(tries):
+        assert not goal.done(replace(at(11.0, 0.0)))
+        assert not goal.done(replace(there, tracked=False)), "carried on"
+        done = [goal.done(replace(there, tracked=False, hindered=True)) for _ in range(5)]
+    assert done == 5 * [arrived]
+    assert not goal.done(at(11.0, 0.0))
+
+
 def test_a_hulls_distance_is_for_the_unseen_not_for_solids():
     """A gap of half a metre is narrower than it flies through; a look in vain does not change that."""
     assert after_looking(before_a_strip(gap_m=1.2)).forward_m_s > 0.1
