@@ -1,4 +1,4 @@
-"""A piece of map that is turned otherwise than the flight's first one: the drone's attitude tells, and it is turned.
+"""A piece of map that is turned otherwise than the flight's first one: the drone's attitude tells.
 
 A piece begins at a predicted pose. In a turn, before the video's delay is known, that may look tens of degrees beside
 where the camera looks, and images of two pieces that show nothing in common never tell.
@@ -9,11 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from edgeslam_torch.geometry import sim3
-from edgeslam_torch.geometry.rotations import matrix_from_rpy
+from edgeslam_torch.geometry.rotations import matrix_from_rpy, turn_left
 from edgeslam_torch.types import FloatArray
 
 SIGMAS = 3.0
-
 
 Facing = tuple[FloatArray, float]
 """How some frames' map is turned in the drone's world, ``R_w_m`` ``(3, 3)``, and the standard deviation [rad] of its
@@ -46,9 +45,7 @@ def angle_between(mine: Facing, other: Facing) -> tuple[float, float]:
     """Angle [rad] about the vertical, to the left, by which a piece must be turned to be turned as another one, and its
     standard deviation."""
     (R_w_mine, mine_rad), (R_w_other, other_rad) = mine, other
-    D = R_w_mine @ R_w_other.T
-    angle = float(np.arctan2(D[1, 0] - D[0, 1], D[0, 0] + D[1, 1]))
-    return angle, float(np.hypot(mine_rad, other_rad))
+    return float(turn_left(R_w_mine @ R_w_other.T)), float(np.hypot(mine_rad, other_rad))
 
 
 def is_turned(angle_rad: float, sigma_rad: float) -> bool:

@@ -255,12 +255,12 @@ class Navigator:
         return Outcome(self.craft.over == "as told", f"landed: {self.craft.over}", clearance_m, path_m)
 
     def _fly_to(self, goal_w: FloatArray, done: str) -> Outcome:
-        """Fly to a checked point ``(3,)``; the outcome says if it came as near only as its pose is known."""
+        """Fly to a checked point ``(3,)``; the outcome says how near it came where that is not at once clear."""
         task = GoTo(goal_w)
         outcome, sight = self.fly(task, done), self.cockpit.sight
         if not outcome.reached or sight is None or (away_m := task.away_m(sight)) < _THERE_M:
             return outcome
-        return replace(outcome, reason=f"{done}, {away_m:.2f} m short of it where no picture tells" + self._rests_on())
+        return replace(outcome, reason=f"{done}, {away_m:.2f} m from it by its own pose" + self._rests_on())
 
     def _goal(self, goal_w: Sequence[float] | FloatArray) -> FloatArray:
         goal = check_goal(goal_w, self.limits)

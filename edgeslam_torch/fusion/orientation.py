@@ -9,7 +9,7 @@ from edgeslam_torch.fusion.remembered import Remembered
 from edgeslam_torch.fusion.scale.camera_mount import Turned, mount_by_turns
 from edgeslam_torch.fusion.telemetry.alignment import attitudes, map_to_world
 from edgeslam_torch.fusion.telemetry.visual_memory import Sightings
-from edgeslam_torch.geometry.rotations import mean_rotation, rotation_vector
+from edgeslam_torch.geometry.rotations import mean_rotation, rotation_vector, turn_left
 from edgeslam_torch.types import FloatArray
 
 _TURNED_S = 5.0
@@ -19,7 +19,7 @@ _AT_ONCE_S = 0.5
 _STAMPED_S = 0.05
 """Standard deviation of a message's moment: half of the time from one to the next."""
 _LEAST_FACING = 30
-"""Frames that tell how a map is turned: one or two seconds, in which a drone has seldom turned evenly."""
+"""Frames that tell how a map is turned: one or two seconds."""
 
 
 class Orientation:
@@ -119,8 +119,7 @@ class Orientation:
             return None
         each = told.R_w_b @ self.T_b_c[:3, :3] @ np.swapaxes(told.R_m_c, 1, 2)
         R_w_m = mean_rotation(each)
-        D = each @ R_w_m.T
-        angle = np.arctan2(D[:, 1, 0] - D[:, 0, 1], D[:, 0, 0] + D[:, 1, 1])
+        angle = turn_left(each @ R_w_m.T)
         return R_w_m, math.hypot(flight.config.alignment_sigma_rad, float(np.sqrt(np.mean(angle**2))))
 
     def upright(self) -> FloatArray | None:

@@ -111,7 +111,7 @@ def test_an_outcome_says_what_it_rests_on(tracked, apart_m, reason):
     assert explored.reason == reason.replace("home", "nothing is left to see")
 
 
-@pytest.mark.parametrize(("x", "reason"), [(2.1, "there"), (1.6, "there, 0.40 m short of it where no picture tells")])
+@pytest.mark.parametrize(("x", "reason"), [(2.1, "there"), (1.6, "there, 0.40 m from it by its own pose")])
 def test_an_outcome_says_how_near_to_its_goal_it_is(x, reason):
     nav = navigator()
     nav.craft.flying, nav.craft.fly = True, lambda until: None
