@@ -35,6 +35,9 @@ place, a hundred keypoints with one scale; a right place 0.2 to 0.4 once the cam
 MAX_DRIFT = 0.1
 """Most that a map drifts, in shares of the way: several times the usual 1 to 3 %. A place that is farther from where
 the map has it is another one that looks alike, as doors and wallpaper do."""
+HELD_DRIFT = 0.03
+"""The same of a piece of map whose metres and heading the drone's sensors hold: a wall whose paper repeats every 1.6 m
+is no place that one comes back to after 17 m."""
 MAX_DRIFT_RAD = np.deg2rad(20.0)
 """Most that it turns."""
 DRIFT_LOG = 0.03
@@ -160,7 +163,8 @@ def is_plausible(slam_map: SlamMap, link: Link, told: Drift | None = None) -> bo
     """
     way, steps = _shortest_way(slam_map, link)
     shift, turn = _off(link, link.keyframe.T_c_w)
-    near = shift * link.depth <= MAX_DRIFT * way + MAX_SHIFT * link.depth
+    drift_share = MAX_DRIFT if told is None else HELD_DRIFT
+    near = shift * link.depth <= drift_share * way + MAX_SHIFT * link.depth
     drift = told or Drift(0.0, DRIFT_LOG * np.sqrt(steps))
     return near and turn <= MAX_DRIFT_RAD and drift.allows(float(np.log(sim3.scale_of(link.S))))
 
@@ -173,16 +177,22 @@ def _shortest_way(slam_map: SlamMap, link: Link) -> tuple[float, int]:
     piece = slam_map.piece_of(link.keyframe.id)
     members = [k for id, k in sorted(slam_map.keyframes.items()) if slam_map.piece_of(id) == piece]
     row_of = {k.id: row for row, k in enumerate(members)}
-    centre = np.stack([k.centre_w for k in members])
-    i, j = np.array(list(_shared(slam_map, members)), dtype=np.int64).reshape(-1, 2).T
-    apart = np.linalg.norm(centre[i] - centre[j], axis=1) + _NO_WAY
-    graph = csr_array((apart, (i, j)), shape=(len(members), len(members)))
     here, there = row_of[link.keyframe.id], row_of[link.other.id]
-    length, before = dijkstra(graph, directed=False, indices=here, return_predecessors=True)
+    ways = _ways(slam_map, members, np.ones(len(members)))
+    length, before = dijkstra(ways, directed=False, indices=here, return_predecessors=True)
     steps, at = 1, there
     while at != here:
         steps, at = steps + min(abs(at - int(before[at])), NEIGHBOURS), int(before[at])
     return float(length[there]), steps
+
+
+def _ways(slam_map: SlamMap, members: list[Keyframe], weight: FloatArray) -> csr_array:
+    """Lengths of the ways from keyframes ``(K,)`` to the one before and to those that see the same, each times the
+    weight ``(K,)`` of the newer one."""
+    centre = np.stack([k.centre_w for k in members])
+    i, j = np.array(list(_shared(slam_map, members)), dtype=np.int64).reshape(-1, 2).T
+    apart = np.linalg.norm(centre[i] - centre[j], axis=1) * weight[i] + _NO_WAY
+    return csr_array((apart, (i, j)), shape=(len(members), len(members)))
 
 
 def is_carried(slam_map: SlamMap, link: Link, sigma: float) -> bool:
@@ -212,10 +222,19 @@ def is_near(slam_map: SlamMap, one: Keyframe, other: Keyframe, shift: float, dep
         depth: That the camera sees.
         sigma: Standard deviation per axis of what the sensors say.
     """
-    ids = sorted((one.id, other.id))
-    centres = np.stack([k.centre_w for id, k in sorted(slam_map.keyframes.items()) if ids[0] <= id <= ids[1]])
-    way = float(np.linalg.norm(np.diff(centres, axis=0), axis=1).sum())
-    return shift <= MAX_DRIFT * way + MAX_SHIFT * depth + SIGMAS * sigma
+    return shift <= _drift(slam_map, one, other) + MAX_SHIFT * depth + SIGMAS * sigma
+
+
+def _drift(slam_map: SlamMap, one: Keyframe, other: Keyframe) -> float:
+    """Most that a map which the drone's sensors hold drifts between two keyframes, along the way that the map knows on
+    which it does least [map units]. The unit of a piece that is not joined to the older one's may be wrong for a while.
+    """
+    members = [k for _, k in sorted(slam_map.keyframes.items())]
+    oldest = min(slam_map.piece_of(one.id), slam_map.piece_of(other.id))
+    share = np.array([HELD_DRIFT if slam_map.piece_of(k.id) == oldest else MAX_DRIFT for k in members])
+    row_of = {k.id: row for row, k in enumerate(members)}
+    ways = _ways(slam_map, members, share)
+    return float(dijkstra(ways, directed=False, indices=row_of[one.id])[row_of[other.id]])
 
 
 def is_within_reach(slam_map: SlamMap, camera: Camera, link: Link) -> bool:

@@ -1,6 +1,7 @@
 """Tasks that a flight has beside those of `navigation.tasks`: to stay where it is, and to go back the way it came."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,6 +9,7 @@ import numpy as np
 from edgeslam_torch.geometry.rotations import wrapped
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.moved import Moved
+from edgeslam_torch.navigation.openings.watch import Candidate
 from edgeslam_torch.navigation.sight import Sight
 from edgeslam_torch.navigation.tasks import LooksAhead
 from edgeslam_torch.types import FloatArray
@@ -73,6 +75,9 @@ class WayHome:
         """Whether the drone is above its take-off, slow, and has looked as it did there."""
         near = float(np.linalg.norm(sight.p_w[:2])) < HOME_M
         return sight.stamp_s >= self._looked_s and near and float(np.linalg.norm(sight.velocity_w)) < _SLOW_M_S
+
+    def consider(self, candidates: Sequence[Candidate]) -> None:
+        """It passes every opening by."""
 
     def heading_rad(self, sight: Sight) -> float | None:
         """The heading of the take-off, which is 0, for seconds when it comes near."""

@@ -1,6 +1,7 @@
 """What a flight is for: where to go next, and when it is done."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -8,8 +9,10 @@ import numpy as np
 
 from edgeslam_torch.navigation.exploring.around import LooksAround
 from edgeslam_torch.navigation.exploring.frontiers import Looks, frontiers, reachable
+from edgeslam_torch.navigation.exploring.second_look import SecondLook
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.moved import Moved
+from edgeslam_torch.navigation.openings.watch import Candidate
 from edgeslam_torch.navigation.sight import Sight
 from edgeslam_torch.navigation.supervisor import CARRIED_SIGMA_M
 from edgeslam_torch.types import FloatArray
@@ -34,6 +37,9 @@ class Task(Protocol):
     def carry(self, moved: Moved) -> None:
         """Take remembered places along with the map."""
 
+    def consider(self, candidates: Sequence[Candidate]) -> None:
+        """Take note of what looked like an opening from one place only, before `goals` is asked."""
+
     def heading_rad(self, sight: Sight) -> float | None:
         """Where to look now, standing; None to look where it flies."""
 
@@ -42,9 +48,12 @@ class Task(Protocol):
 
 
 class LooksAhead:
-    """Part of a task during which the drone looks where it flies, always."""
+    """Part of a task during which the drone looks where it flies, always, and at no opening."""
 
     __slots__ = ()
+
+    def consider(self, candidates: Sequence[Candidate]) -> None:
+        """It does not."""
 
     def heading_rad(self, sight: Sight) -> float | None:
         """None: ahead."""
@@ -112,16 +121,22 @@ def _doubt_m(sight: Sight) -> float:
 class Explore:
     """Fly to where the known free space ends, until it ends nowhere or time is over, and look around on the way.
 
-    A camera of 55 degrees that looks where it flies sees of the wall that it comes through the two jambs.
+    A camera of 55 degrees that looks where it flies sees of the wall that it comes through the two jambs. What looks
+    like an opening from one place only is looked at from another one.
     """
 
     until_s: float = np.inf
     """On the clock of the sights."""
     _looks: Looks = field(default_factory=Looks)
     _around: LooksAround = field(default_factory=LooksAround)
+    _second: SecondLook = field(default_factory=SecondLook)
 
     def goals(self, layer: Layer, sight: Sight) -> np.ndarray:
-        """Cells at the middle of each border between free and unseen."""
+        """Cells to look from at what may be an opening; else those at the middle of each border of the unseen."""
+        second = self._second.goals(layer, sight)
+        if len(second):
+            self._looks.go_on()
+            return second
         return self._looks.worth(reachable(frontiers(layer), layer, sight.p_w[:2]), layer, sight)
 
     def done(self, sight: Sight) -> bool:
@@ -132,10 +147,16 @@ class Explore:
         """Take the places along that were looked at, and looked around at."""
         self._looks.carry(moved)
         self._around.carry(moved)
+        self._second.carry(moved)
+
+    def consider(self, candidates: Sequence[Candidate]) -> None:
+        """What to look at once more."""
+        self._second.consider(candidates)
 
     def heading_rad(self, sight: Sight) -> float | None:
-        """Left and right, standing, wherever it has not looked around."""
-        return self._around.heading_rad(sight)
+        """Left and right, standing, wherever it has not looked around; at what may be an opening, where it shows."""
+        around = self._around.heading_rad(sight)
+        return around if around is not None else self._second.heading_rad(sight)
 
     def faces_rad(self, sight: Sight) -> float | None:
         """None: ahead."""

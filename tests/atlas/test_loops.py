@@ -289,6 +289,9 @@ def test_what_is_near_a_closed_loop_has_not_drifted_by_as_much_as_the_way_round(
     off[:3, 3] = 1.0 * beside.keyframe.T_c_w[0, :3]  # along the wall
     alike = replace(beside, S=off @ beside.S)
     assert is_plausible(ring.map, beside) and is_plausible(ring.map, alike)
+    held = Drift(0.0, 0.1)
+    assert is_plausible(ring.map, beside, held)
+    assert not is_plausible(ring.map, alike, held), "a map whose metres are known drifts less"
     share_anchors(ring.map, [found])
     assert is_plausible(ring.map, beside)
     assert not is_plausible(ring.map, alike)

@@ -108,6 +108,17 @@ def test_an_exit_is_seen_from_two_places():
     assert exit_.beyond(1.0)[0] == pytest.approx(3.0, abs=0.12)
 
 
+def test_what_was_seen_from_one_place_is_a_candidate_until_it_is_seen_from_another():
+    walls = surroundings(wall(0.9))
+    assert watched([0.0] * 2, walls).candidates == (), "two looks are chance"
+    (candidate,) = watched([0.0] * 8, walls).candidates
+    assert candidate.centre_w == pytest.approx([2.0, 0.0], abs=0.12)
+    assert abs(candidate.normal_w[0]) == pytest.approx(1.0, abs=0.05)
+    assert candidate.place_w == pytest.approx([0.0, 0.0])
+    assert watched([0.0, 0.1, 0.2, 0.6], walls).candidates == ()
+    assert watched([0.0] * 8, surroundings(PILLARS)).candidates == (), "what can be passed by"
+
+
 def test_its_normal_keeps_its_side_when_the_drone_has_flown_through():
     (exit_,) = watched([0.0, 0.6, 1.2, 2.8, 3.4], surroundings(wall(0.9))).exits
     assert exit_.normal_w[0] == pytest.approx(1.0, abs=0.05)

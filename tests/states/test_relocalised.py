@@ -25,16 +25,25 @@ class Flown:
         self.between = between
         stamps = [BEFORE_S if earlier and k < 3 else float(k) for k in range(6)]
         self.keyframes = {
-            k: SimpleNamespace(id=k, centre_w=np.array([float(k), 0.0, 0.0]), stamp_s=stamps[k]) for k in range(6)
+            k: SimpleNamespace(
+                id=k,
+                centre_w=np.array([float(k), 0.0, 0.0]),
+                stamp_s=stamps[k],
+                anchor=np.zeros(int(k >= 4), dtype=np.int64),
+            )
+            for k in range(6)
         }
         self.piece_of = dict.fromkeys(range(6), 0)
         self.told = PoseEstimate(6.0, placed(5.0), sigma, 0.01, "filter")
         self.asked = []
+        self.sees_again = {}
+        """Anchors that the two newest keyframes share with others."""
 
     def system(self):
         slam_map = SimpleNamespace(
             keyframes=self.keyframes,
             heir_of=lambda k: (k, np.eye(4)),
+            shared_counts=lambda anchors: self.sees_again if len(anchors) else {},
             piece_of=self.piece_of.__getitem__,
             anchors=SimpleNamespace(p_w=np.array([[0.0, 0.0, 2.0], [5.0, 0.0, 2.0]])),
         )
@@ -65,10 +74,34 @@ def test_a_frame_is_not_found_again_where_the_drone_cannot_have_come_to():
     assert flown.finds(2.5) is None and flown.asked == []
 
 
-@pytest.mark.parametrize(("x", "sigma", "may"), [(4.4, 0.01, True), (4.0, 0.01, False), (4.0, 0.2, True)])
+@pytest.mark.parametrize(("x", "sigma", "may"), [(4.7, 0.01, True), (4.5, 0.01, False), (4.5, 0.1, True)])
 def test_a_map_drifts_and_sensors_doubt(x, sigma, may):
-    """A tenth of the way and of the depth, and three sigmas: .7 and 1.3 units."""
+    """Three percent of the way, a tenth of the depth, and three sigmas: .38 and .65 units."""
     assert (Flown(sigma).finds(x) is not None) == may
+
+
+def test_a_way_that_leads_back_to_what_was_seen_before_is_short():
+    """`blank_walls` 797: home again after forty metres, found again on the same wallpaper 1.3 m on."""
+    flown = Flown()
+    for k in range(6):
+        flown.keyframes[k].centre_w = np.array([10.0 * k if k < 5 else 5.0, 0.0, 0.0])
+    assert flown.finds(3.7) is not None, "a way of 75 units"
+    flown.sees_again = {0: 30}
+    assert flown.finds(3.7) is None, "a way of 5"
+    assert flown.finds(4.7) is not None
+
+
+def test_a_new_piece_is_no_farther_from_the_way_back_than_the_one_before():
+    """The same, and a piece that begins there: its own unit is in doubt, not where the way before it led."""
+    flown = Flown(between=0.01)
+    flown.keyframes[4].centre_w = np.array([4.9, 0.0, 0.0])
+    for k in range(1, 4):
+        flown.keyframes[k].centre_w = np.array([10.0 * k, 0.0, 0.0])
+    flown.piece_of[5] = 1
+    assert flown.finds(3.7) is not None
+    flown.sees_again = {0: 30}
+    assert flown.finds(3.7) is None
+    assert flown.finds(4.7) is not None
 
 
 def test_a_frame_is_not_found_again_where_it_would_have_turned_as_the_drone_has_not():

@@ -71,6 +71,10 @@ class Looks:
             self._nothing_s = sight.stamp_s
         return np.asarray(kept)
 
+    def go_on(self) -> None:
+        """There is something else to look at."""
+        self._nothing_s = math.nan
+
     def over(self, now_s: float) -> bool:
         """Whether there was nothing left to look at for as long as a look around takes."""
         return now_s - self._nothing_s > _ROUND_S  # false while it is NaN

@@ -20,7 +20,7 @@ _SAME_M, _SAME_RAD = 0.5, math.radians(35.0)
 """A look within these of an earlier one is of the same opening."""
 _PASSAGE_M = 1.0
 """Distance along a passage within which it has one door."""
-_PLACES_M = 0.5
+PLACES_M = 0.5
 """Distance between two places that count as two."""
 _NEAR_M = 4.0
 """Farther away a door is a few cells of uncertain depth: such looks are kept and do not count."""
@@ -51,6 +51,18 @@ class Exit:
         return np.asarray(self.centre_w + away_m * self.normal_w)
 
 
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """What looked like an opening, again and again, from one place only."""
+
+    centre_w: FloatArray
+    """``(2,)`` [m]."""
+    normal_w: FloatArray
+    """``(2,)`` level unit vector through it."""
+    place_w: FloatArray
+    """``(2,)`` the place [m]."""
+
+
 @dataclass(slots=True)
 class _Seen:
     """One opening, look by look."""
@@ -73,6 +85,8 @@ class ExitWatch:
 
     exits: tuple[Exit, ...] = ()
     """What counts as an exit now, the nearest first; replaced as a whole, so that other threads may read it."""
+    candidates: tuple[Candidate, ...] = ()
+    """What may be one, if it looks so from elsewhere, too."""
     _seen: list[_Seen] = field(default_factory=list)
     _looked_s: float = -math.inf
 
@@ -93,7 +107,8 @@ class ExitWatch:
         for gap in found:
             self._note(gap, here)
         self._seen = [seen for seen in self._seen if seen.missed <= 2 * max(len(seen.gaps), _LOOKS)]
-        good = [s for s in self._seen if s.near >= _LOOKS and s.near > s.missed and _places(s.places_w) >= 2]
+        often = [s for s in self._seen if s.near >= _LOOKS and s.near > s.missed]
+        good = [s for s in often if _places(s.places_w) >= 2]
         good.sort(key=lambda s: -s.near)
         told = [(seen, e) for seen in good if (e := _exit(seen, sight)).width_m <= WIDEST_M]
         for seen, exit_ in told:
@@ -102,6 +117,12 @@ class ExitWatch:
         exits = [e for seen, e in told if seen.parting > 0]
         single = [e for k, e in enumerate(exits) if not any(_one_passage(e, other) for other in exits[:k])]
         self.exits = tuple(sorted(single, key=lambda e: float(np.linalg.norm(e.centre_w[:2] - here))))
+        once = [(s, _exit(s, sight)) for s in often if _places(s.places_w) < 2]
+        self.candidates = tuple(
+            Candidate(e.centre_w[:2], e.normal_w[:2], s.places_w[0])
+            for s, e in once
+            if e.width_m <= WIDEST_M and not _passed_by(e, walls.layer)
+        )
 
     def carry(self, moved: Moved) -> None:
         """Take what was found along with the map; `exits` are those of the next look."""
@@ -174,6 +195,6 @@ def _places(places_w: list[FloatArray]) -> int:
     """How many of the places lie apart from each other."""
     kept: list[FloatArray] = []
     for place in places_w:
-        if all(np.linalg.norm(place - other) >= _PLACES_M for other in kept):
+        if all(np.linalg.norm(place - other) >= PLACES_M for other in kept):
             kept.append(place)
     return len(kept)

@@ -1,0 +1,105 @@
+"""A second look at what looked like an opening: from a place before it where it was not seen from yet.
+
+A way that is closed beside a door, or a search that ends before it, leaves an opening seen from one place, which is
+none yet: from there a gap between two things, or a wrong depth, looks the same.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from edgeslam_torch.navigation.exploring.frontiers import reachable
+from edgeslam_torch.navigation.layer import Layer
+from edgeslam_torch.navigation.moved import Moved
+from edgeslam_torch.navigation.openings.watch import PLACES_M, Candidate
+from edgeslam_torch.navigation.sight import Sight
+from edgeslam_torch.types import FloatArray
+
+_BEFORE_M = (0.8, 2.0)
+"""Distance before the wall from which its opening fills no more than a camera's picture, and is not beyond trust."""
+_ASIDE = 1.0
+"""How far aside of the opening, in shares of that distance: half a right angle, from where its far jamb is seen."""
+_ELSEWHERE_M = PLACES_M + 0.1
+"""Distance from where it was seen: a pose is not known to the centimetre."""
+_PASSED_M = 0.3
+"""Distance from solids of where it stands to look."""
+_STANDS_S = 4.0
+"""Time of a look: a turn by a right angle, and five of those that count."""
+_SOUGHT_S = 30.0
+"""Time after which the way there is given up: six metres, and a look around on it."""
+_SAME_M = 0.5
+"""An opening moves as it is looked at."""
+
+
+@dataclass(slots=True)
+class _Tried:
+    """What was done about a candidate."""
+
+    centre_w: FloatArray
+    until_s: float = np.inf
+    """When it is given up."""
+    stands: bool = False
+    """Whether the drone has come to where it shows."""
+
+
+@dataclass(slots=True)
+class SecondLook:
+    """Where to go and look, for as long as that may tell more."""
+
+    _candidates: Sequence[Candidate] = ()
+    _tried: list[_Tried] = field(default_factory=list)
+
+    def consider(self, candidates: Sequence[Candidate]) -> None:
+        """What is worth a second look now."""
+        self._candidates = candidates
+
+    def goals(self, layer: Layer, sight: Sight) -> np.ndarray:
+        """Cells ``(G, 2)`` that can be reached, from which to look at one of them."""
+        cells = np.argwhere(layer.free & (layer.from_solid_m > _PASSED_M))
+        cells = reachable(cells, layer, sight.p_w[:2])
+        found = [np.zeros((0, 2), int)]
+        for candidate, tried in self._worth(sight.stamp_s):
+            there = cells[_shows(candidate, layer.centres(cells).reshape(-1, 2))]
+            if len(there):
+                tried.until_s = min(tried.until_s, sight.stamp_s + _SOUGHT_S)
+            found.append(there)
+        return np.concatenate(found)
+
+    def heading_rad(self, sight: Sight) -> float | None:
+        """Where to look, standing where one of them shows; None elsewhere."""
+        for candidate, tried in self._worth(sight.stamp_s):
+            if _shows(candidate, sight.p_w[None, :2])[0]:
+                if not tried.stands:
+                    tried.stands, tried.until_s = True, sight.stamp_s + _STANDS_S
+                step = candidate.centre_w - sight.p_w[:2]
+                return float(np.arctan2(step[1], step[0]))
+        return None
+
+    def carry(self, moved: Moved) -> None:
+        """Take the places along with the map; candidates come anew."""
+        places = moved.points(np.array([tried.centre_w for tried in self._tried]).reshape(-1, 2))
+        for tried, place in zip(self._tried, places, strict=True):
+            tried.centre_w = place
+        self._candidates = ()
+
+    def _worth(self, now_s: float) -> list[tuple[Candidate, _Tried]]:
+        """Those that were not given up."""
+        both = [(candidate, self._of(candidate)) for candidate in self._candidates]
+        return [(candidate, tried) for candidate, tried in both if now_s < tried.until_s]
+
+    def _of(self, candidate: Candidate) -> _Tried:
+        for tried in self._tried:
+            if np.linalg.norm(tried.centre_w - candidate.centre_w) < _SAME_M:
+                return tried
+        self._tried.append(_Tried(candidate.centre_w.copy()))
+        return self._tried[-1]
+
+
+def _shows(candidate: Candidate, p_w: FloatArray) -> np.ndarray:
+    """``(P,)`` whether places ``(P, 2)`` lie before an opening, on the side that it was seen from, and elsewhere."""
+    away = (candidate.place_w - candidate.centre_w) @ candidate.normal_w
+    before = (p_w - candidate.centre_w) @ candidate.normal_w * (1.0 if away >= 0 else -1.0)
+    aside = np.abs((p_w - candidate.centre_w) @ np.array([-candidate.normal_w[1], candidate.normal_w[0]]))
+    elsewhere = np.linalg.norm(p_w - candidate.place_w, axis=1) >= _ELSEWHERE_M
+    return np.asarray((before >= _BEFORE_M[0]) & (before <= _BEFORE_M[1]) & (aside <= _ASIDE * before) & elsewhere)

@@ -1,0 +1,100 @@
+"""A second look at what looked like an opening from one place."""
+
+import math
+
+import numpy as np
+import pytest
+
+from edgeslam_torch.navigation.exploring.second_look import SecondLook
+from edgeslam_torch.navigation.layer import Layer
+from edgeslam_torch.navigation.moved import Moved
+from edgeslam_torch.navigation.openings.watch import Candidate
+from edgeslam_torch.navigation.sight import Sight
+from edgeslam_torch.navigation.tasks import Explore
+
+DOOR = Candidate(np.array([3.0, 0.0]), np.array([1.0, 0.0]), np.array([1.5, 1.0]))
+"""In a wall across x, seen from its left half."""
+
+
+def at(x, y, now_s=0.0):
+    return Sight(now_s, np.array([x, y, 1.15]), 0.0, np.zeros(3))
+
+
+def room(solid=None):
+    """Six metres by six around the door; its wall at x of 3."""
+    x, y = np.meshgrid((np.arange(60) + 0.5) * 0.1, (np.arange(60) + 0.5) * 0.1 - 3.0, indexing="ij")
+    is_solid = (np.abs(x - 3.0) < 0.1) & (np.abs(y) > 0.45)
+    is_solid |= solid(x, y) if solid else False
+    return Layer(~is_solid, is_solid, np.array([0.0, -3.0]), 0.1)
+
+
+def wanted(look, layer, here=(0.5, 1.0), now_s=0.0):
+    return layer.centres(look.goals(layer, at(*here, now_s))).reshape(-1, 2)
+
+
+def considering(*candidates):
+    look = SecondLook()
+    look.consider(candidates)
+    return look
+
+
+@pytest.mark.parametrize("turned", [1.0, -1.0], ids=["normal away", "normal towards"])
+def test_it_looks_from_before_the_opening_and_elsewhere(turned):
+    places = wanted(considering(Candidate(DOOR.centre_w, turned * DOOR.normal_w, DOOR.place_w)), room())
+    assert len(places)
+    before = 3.0 - places[:, 0]
+    assert before.min() >= 0.8
+    assert before.max() <= 2.0, "on the side that it was seen from, and not from afar"
+    assert (np.abs(places[:, 1]) <= before).all(), "not along the wall"
+    assert np.linalg.norm(places - DOOR.place_w, axis=1).min() >= 0.6
+
+
+def test_no_place_that_nothing_leads_to():
+    fence = room(lambda x, y: np.abs(x - 0.8) < 0.1)
+    assert len(wanted(considering(DOOR), fence)) == 0
+    table = room(lambda x, y: (np.abs(x - 1.5) < 0.2) & (np.abs(y) < 0.5))
+    assert np.abs(wanted(considering(DOOR), table) - [1.5, 0.0]).max(1).min() > 0.2
+
+
+def test_it_stands_and_looks_at_the_opening_for_seconds():
+    look = considering(DOOR)
+    assert look.heading_rad(at(1.5, 1.0)) is None, "from where it was seen"
+    assert look.heading_rad(at(2.0, -0.5, 1.0)) == pytest.approx(math.atan2(0.5, 1.0))
+    assert look.heading_rad(at(2.0, -0.5, 4.9)) is not None
+    assert look.heading_rad(at(2.0, -0.5, 5.1)) is None
+    assert len(wanted(look, room(), now_s=5.2)) == 0, "nor is it flown to once more"
+
+
+def test_a_place_that_it_does_not_come_to_is_given_up():
+    look = considering(DOOR)
+    assert len(wanted(look, room(), now_s=10.0))
+    assert len(wanted(look, room(), now_s=39.0))
+    assert len(wanted(look, room(), now_s=41.0)) == 0
+    other = Candidate(np.array([3.0, -2.0]), DOOR.normal_w, np.array([1.5, -2.5]))
+    look.consider([DOOR, other])
+    assert len(wanted(look, room(), now_s=42.0)), "another one is not"
+
+
+def test_what_was_tried_goes_along_with_the_map():
+    """Metres become twice as long: what was given up at 3 m is at 6."""
+    look = considering(DOOR)
+    look.heading_rad(at(2.0, -0.5, 0.0))
+    look.carry(Moved(np.eye(4)[None], np.eye(4)[None], 2.0))
+    assert look.heading_rad(at(2.0, -0.5, 5.0)) is None, "what it was told lay where the map was"
+    look.consider([Candidate(np.array([6.0, 0.0]), DOOR.normal_w, np.array([3.0, 2.0]))])
+    assert look.heading_rad(at(5.0, 0.0, 5.0)) is None
+    look.consider([DOOR])
+    assert look.heading_rad(at(2.0, -0.5, 5.0)) is not None
+
+
+def test_exploring_goes_on_while_there_is_an_opening_to_look_at():
+    """All is known: it would end after a look around."""
+    known = Layer(np.ones((60, 60), bool), np.zeros((60, 60), bool), np.array([0.0, -3.0]), 0.1)
+    ends, goes_on = Explore(), Explore()
+    for now_s in np.arange(0.0, 20.0, 0.5):
+        if now_s == 5.0:
+            goes_on.consider([DOOR])
+        ends.goals(known, at(0.5, 1.0, now_s))
+        assert len(goes_on.goals(known, at(0.5, 1.0, now_s))) == 0 or now_s >= 5.0
+    assert ends.done(at(0.5, 1.0, 20.0))
+    assert not goes_on.done(at(0.5, 1.0, 20.0))
