@@ -13,7 +13,7 @@ from edgeslam_torch.navigation.moved import Moved
 from edgeslam_torch.navigation.openings.detour import has_detour
 from edgeslam_torch.navigation.openings.exits import gaps
 from edgeslam_torch.navigation.openings.pathways import pathways
-from edgeslam_torch.navigation.openings.turned import Walls, wall_directions
+from edgeslam_torch.navigation.openings.turned import Walls, along_walls, wall_directions
 from edgeslam_torch.navigation.openings.watch import ExitWatch
 from edgeslam_torch.navigation.pilot import Pilot
 from edgeslam_torch.navigation.sight import Sight
@@ -48,7 +48,7 @@ def wall(gap, at=2.0, middle=0.0):
 @pytest.mark.parametrize("angle", ANGLES)
 @pytest.mark.parametrize(("gap", "middle"), [(0.7, 0.0), (0.9, -0.8), (1.2, 0.6)])
 def test_a_doorway_is_where_it_is(angle, gap, middle):
-    (found,) = gaps(surroundings(wall(gap, middle=middle), angle=angle), HERE)
+    (found,) = gaps(along_walls(surroundings(wall(gap, middle=middle), angle=angle), HERE))
     assert turned_back(found.centre_w, angle) == pytest.approx([2.0, middle], abs=0.12)
     assert turned_back(found.normal_w, angle) == pytest.approx([1.0, 0.0], abs=0.1), "away from where it is seen"
     assert found.width_m == pytest.approx(gap, abs=0.16)
@@ -83,7 +83,7 @@ def bulging(a, b):
 @pytest.mark.parametrize("angle", [0.0, 0.5])
 def test_what_is_no_exit(case, solid, unseen, low, angle):
     seen = surroundings(solid, unseen or (lambda a, b: np.zeros(a.shape, bool)), angle, low)
-    assert gaps(seen, HERE) == [], case
+    assert gaps(along_walls(seen, HERE)) == [], case
 
 
 def sight(x, y=0.0, stamp_s=0.0, yaw=0.0, **fields):

@@ -5,11 +5,12 @@ opening and is none must also have a wall to both sides in one line, and space t
 cupboards that face each other across a corridor have not.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
-from edgeslam_torch.navigation.openings.turned import Turned, Walls, runs, turned, wall_directions
+from edgeslam_torch.navigation.openings.turned import Turned, runs
 from edgeslam_torch.types import FloatArray
 
 NARROWEST_M, WIDEST_M = 0.6, 1.5
@@ -44,59 +45,69 @@ class Gap:
     """Wall in line with it, to both sides together: the more, the surer."""
 
 
-def gaps(walls: Walls, here_w: FloatArray) -> list[Gap]:
-    """Openings around a place ``(2,)``, the surest first."""
-    found = []
-    for angle in wall_directions(walls, here_w):
-        grid = turned(walls, here_w, angle)
-        found += [_gap(grid, t, *ends) for t in range(2, len(grid.free) - 2) for ends in _openings(grid, t)]
-    return _distinct([gap for gap in found if gap is not None])
+def gaps(grids: list[Turned]) -> list[Gap]:
+    """Openings around a place, by what is there `along_walls`, the surest first."""
+    found = [_gap(grid, t, *ends) for grid in grids for t, *ends in jambs(grid) if _is_free(grid, t, *ends)]
+    return distinct([gap for gap in found if gap is not None])
 
 
-def _wall(grid: Turned, t: int) -> np.ndarray:
-    """Where a row, or one beside it, stands upright, ``(N,)``."""
-    return np.asarray(grid.upright[t - 1 : t + 2].any(0))
+def jambs(grid: Turned) -> Iterator[tuple[int, int, int]]:
+    """What may be an exit between two parts of a wall: its row, with the rows beside it, the last cell of the one part
+    and the first of the other."""
+    least = _WALL_SHARE * NARROWEST_M / grid.cell_m
+    for t in np.flatnonzero(grid.wall[2:-2].sum(1) >= least) + 2:
+        parts = [part for part in runs(grid.wall[t]) if (part[1] - part[0]) * grid.cell_m >= _JAMB_M - 1e-9]
+        for (_, low), (high, _) in zip(parts[:-1], parts[1:], strict=True):
+            if NARROWEST_M <= (high - low + 1) * grid.cell_m <= WIDEST_M + grid.cell_m:
+                yield int(t), int(low), int(high)
 
 
-def _openings(grid: Turned, t: int) -> list[tuple[int, int]]:
-    """Ends of what is free between two parts of a wall in row ``t`` and the rows beside it."""
-    wall = _wall(grid, t)
-    if wall.sum() * grid.cell_m < _WALL_SHARE * NARROWEST_M:
-        return []
-    free = np.asarray(grid.free[t - 1 : t + 2].all(0))
-    parts = [part for part in runs(wall) if (part[1] - part[0]) * grid.cell_m >= _JAMB_M - 1e-9]
-    out = []
-    for (_, low), (high, _) in zip(parts[:-1], parts[1:], strict=True):
-        width = (high - low + 1) * grid.cell_m
-        # A cell at each end may have been seen too little to be known.
-        if NARROWEST_M <= width <= WIDEST_M + grid.cell_m and free[low + 1 : high - 1].all():
-            out.append((int(low), int(high)))
-    return out
+def is_in_line(grid: Turned, t: int, low: int, high: int) -> bool:
+    """Whether there is enough wall in line with an opening to call it one in a wall."""
+    return _alongside_m(grid, t, low, high) >= _WALL_SHARE * (high - low + 1) * grid.cell_m
+
+
+def band(grid: Turned, t: int, side: int) -> np.ndarray:
+    """Rows before or behind the wall, from a frame's depth to where a drone stands."""
+    near, far = (round(x / grid.cell_m) for x in _BEYOND_M)
+    rows = t + side * np.arange(near, far + 1)
+    return np.asarray(rows[(rows >= 0) & (rows < len(grid.free))])
+
+
+def gap_of(grid: Turned, t: int, low: int, high: int) -> Gap:
+    """The opening between two cells of a row, in the middle of the wall beside it."""
+    width = (high - low + 1) * grid.cell_m  # a cell that a wall only touches is solid: half of each end's is open
+    rows = np.arange(t - 1, t + 2)
+    beside = grid.upright[rows, max(0, low - 2) : low].any(1) | grid.upright[rows, high : high + 2].any(1)
+    centre = grid.at(0.5 * (low + high - 1), float(rows[beside].mean()) if beside.any() else float(t))
+    away = float((centre - grid.centre_w) @ grid.left_w)
+    return Gap(centre, grid.left_w * (1.0 if away >= 0 else -1.0), width, _alongside_m(grid, t, low, high))
+
+
+def _alongside_m(grid: Turned, t: int, low: int, high: int) -> float:
+    """Metres of wall beside an opening, to both sides together."""
+    reach, wall = round(_ALONGSIDE_M / grid.cell_m), grid.wall[t]
+    return float(grid.cell_m * (wall[max(0, low - reach) : low].sum() + wall[high : high + reach].sum()))
+
+
+def _is_free(grid: Turned, t: int, low: int, high: int) -> bool:
+    """Whether all of it is; a cell at each end may have been seen too little to be known."""
+    return bool(grid.free[t - 1 : t + 2, low + 1 : high - 1].all())
 
 
 def _gap(grid: Turned, t: int, low: int, high: int) -> Gap | None:
     """The opening between two cells of a row, if it leads from somewhere to somewhere."""
     if not all(_leads(grid, t, low, high, side) and _widens(grid, t, low, high, side) for side in (-1, 1)):
         return None
-    if not _in_a_wall(grid, t, low, high):
+    if not (_in_a_wall(grid, t, low, high) and is_in_line(grid, t, low, high)):
         return None
-    reach = round(_ALONGSIDE_M / grid.cell_m)
-    wall = _wall(grid, t)
-    length = grid.cell_m * (wall[max(0, low - reach) : low].sum() + wall[high : high + reach].sum())
-    width = (high - low + 1) * grid.cell_m  # a cell that a wall only touches is solid: half of each end's is open
-    if length < _WALL_SHARE * width:
-        return None
-    rows = np.arange(t - 1, t + 2)
-    beside = grid.upright[rows, max(0, low - 2) : low].any(1) | grid.upright[rows, high : high + 2].any(1)
-    centre = grid.at(0.5 * (low + high - 1), float(rows[beside].mean()) if beside.any() else float(t))
-    away = float((centre - grid.centre_w) @ grid.left_w)
-    return Gap(centre, grid.left_w * (1.0 if away >= 0 else -1.0), width, float(length))
+    return gap_of(grid, t, low, high)
 
 
 def _leads(grid: Turned, t: int, low: int, high: int, side: int) -> bool:
     """Whether there is space on one side of the wall."""
     fifth = (high - low) // 5
-    before = grid.free[_band(grid, t, side), low + fifth : high - fifth]
+    before = grid.free[band(grid, t, side), low + fifth : high - fifth]
     return before.size > 0 and float(before.mean()) >= _FREE_SHARE
 
 
@@ -104,7 +115,7 @@ def _widens(grid: Turned, t: int, low: int, high: int, side: int) -> bool:
     """Whether what is not known to be solid is wider on one side than the opening."""
     middle = (low + high) // 2
     widths = []
-    for row in grid.solid[_band(grid, t, side)]:
+    for row in grid.solid[band(grid, t, side)]:
         left, right = np.flatnonzero(row[: middle + 1]), np.flatnonzero(row[middle:])
         ends = left[-1] if len(left) else -1, middle + right[0] if len(right) else len(row)
         widths.append(ends[1] - ends[0] - 1)
@@ -119,19 +130,12 @@ def _in_a_wall(grid: Turned, t: int, low: int, high: int) -> bool:
     width = round(_BESIDE_M / grid.cell_m)
     ends = slice(max(0, low - width), low), slice(high, high + width)
     closed = np.array(
-        [[grid.solid[_band(grid, t, side), end].mean() >= _SOLID_SHARE for end in ends] for side in (-1, 1)]
+        [[grid.solid[band(grid, t, side), end].mean() >= _SOLID_SHARE for end in ends] for side in (-1, 1)]
     )
     return not (closed.all(axis=0).any() or closed.all(axis=1).any())
 
 
-def _band(grid: Turned, t: int, side: int) -> np.ndarray:
-    """Rows before or behind the wall."""
-    near, far = (round(x / grid.cell_m) for x in _BEYOND_M)
-    rows = t + side * np.arange(near, far + 1)
-    return np.asarray(rows[(rows >= 0) & (rows < len(grid.free))])
-
-
-def _distinct(found: list[Gap]) -> list[Gap]:
+def distinct(found: list[Gap]) -> list[Gap]:
     """One of those that overlap: the one with most wall."""
     kept: list[Gap] = []
     for gap in sorted(found, key=lambda g: -g.wall_m):

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -26,7 +27,7 @@ class Walls:
     """``(X, Y)`` bool."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Turned:
     """Square of cells around a place; ``[t, s]``: s along the direction, t to its left."""
 
@@ -43,6 +44,12 @@ class Turned:
     def left_w(self) -> FloatArray:
         """``(2,)`` unit vector of t."""
         return np.array([-self.along_w[1], self.along_w[0]])
+
+    @cached_property
+    def wall(self) -> np.ndarray:
+        """``(N, N)`` where a row, or one beside it, stands upright."""
+        rows = np.pad(self.upright, ((1, 1), (0, 0)))
+        return np.asarray(rows[:-2] | rows[1:-1] | rows[2:])
 
     def at(self, s: float, t: float) -> FloatArray:
         """Point ``(2,)`` of the world at a cell, which may lie between cells."""
@@ -63,6 +70,11 @@ def turned(walls: Walls, centre_w: FloatArray, angle_rad: float) -> Turned:
     i, j = np.moveaxis(np.where(inside[..., None], index, 0), -1, 0)
     free, solid, upright = (mask[i, j] & inside for mask in (layer.free, layer.solid, walls.upright))
     return Turned(free, solid, upright, np.asarray(centre_w, dtype=np.float64), along, layer.cell_m)
+
+
+def along_walls(walls: Walls, centre_w: FloatArray) -> list[Turned]:
+    """What is around a place ``(2,)``, along each direction of its walls."""
+    return [turned(walls, centre_w, angle) for angle in wall_directions(walls, centre_w)]
 
 
 def wall_directions(walls: Walls, centre_w: FloatArray) -> list[float]:

@@ -10,7 +10,8 @@ from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.moved import Moved
 from edgeslam_torch.navigation.openings.detour import has_detour
 from edgeslam_torch.navigation.openings.exits import WIDEST_M, Gap, gaps
-from edgeslam_torch.navigation.openings.turned import Walls
+from edgeslam_torch.navigation.openings.glimpses import NEAR_M, glimpses
+from edgeslam_torch.navigation.openings.turned import Walls, along_walls
 from edgeslam_torch.navigation.sight import Sight
 from edgeslam_torch.navigation.supervisor import CARRIED_SIGMA_M
 from edgeslam_torch.types import FloatArray
@@ -22,8 +23,6 @@ _PASSAGE_M = 1.0
 """Distance along a passage within which it has one door."""
 PLACES_M = 0.5
 """Distance between two places that count as two."""
-_NEAR_M = 4.0
-"""Farther away a door is a few cells of uncertain depth: such looks are kept and do not count."""
 _FIELD_RAD = math.radians(20.0)
 """Half the camera's field of view, less a margin: an opening within it that is not found again counts against it."""
 _LOOKS = 3
@@ -53,14 +52,14 @@ class Exit:
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """What looked like an opening, again and again, from one place only."""
+    """What looked like an opening, again and again, from one place only, or in a glimpse."""
 
     centre_w: FloatArray
     """``(2,)`` [m]."""
     normal_w: FloatArray
     """``(2,)`` level unit vector through it."""
     place_w: FloatArray
-    """``(2,)`` the place [m]."""
+    """``(2,)`` where it was seen from first [m]."""
 
 
 @dataclass(slots=True)
@@ -88,6 +87,7 @@ class ExitWatch:
     candidates: tuple[Candidate, ...] = ()
     """What may be one, if it looks so from elsewhere, too."""
     _seen: list[_Seen] = field(default_factory=list)
+    _glimpsed: list[_Seen] = field(default_factory=list)
     _looked_s: float = -math.inf
 
     def due(self, sight: Sight) -> bool:
@@ -97,50 +97,62 @@ class ExitWatch:
         return placed and sight.stamp_s - self._looked_s >= _EVERY_S
 
     def look(self, walls: Walls, sight: Sight) -> None:
-        """Compare what the grid shows now with what it showed before."""
+        """Compare what the grid shows now with what it showed before; from farther away than `NEAR_M` none counts."""
         self._looked_s = sight.stamp_s
         here = sight.p_w[:2]
-        found = gaps(walls, here)
+        grids = along_walls(walls, here)
+        found = gaps(grids)
         for seen in self._seen:
             if not any(_same(gap, seen) for gap in found) and _in_view(seen.centre_w, sight):
                 seen.missed += 1
         for gap in found:
-            self._note(gap, here)
+            _note(self._seen, gap, here)
         self._seen = [seen for seen in self._seen if seen.missed <= 2 * max(len(seen.gaps), _LOOKS)]
         often = [s for s in self._seen if s.near >= _LOOKS and s.near > s.missed]
         good = [s for s in often if _places(s.places_w) >= 2]
         good.sort(key=lambda s: -s.near)
         told = [(seen, e) for seen in good if (e := _exit(seen, sight)).width_m <= WIDEST_M]
         for seen, exit_ in told:
-            if np.linalg.norm(exit_.centre_w[:2] - here) < _NEAR_M:  # from afar a wall gets holes
+            if np.linalg.norm(exit_.centre_w[:2] - here) < NEAR_M:  # from afar a wall gets holes
                 seen.parting += -1 if _passed_by(exit_, walls.layer) else 1
         exits = [e for seen, e in told if seen.parting > 0]
         single = [e for k, e in enumerate(exits) if not any(_one_passage(e, other) for other in exits[:k])]
         self.exits = tuple(sorted(single, key=lambda e: float(np.linalg.norm(e.centre_w[:2] - here))))
-        once = [(s, _exit(s, sight)) for s in often if _places(s.places_w) < 2]
-        self.candidates = tuple(
-            Candidate(e.centre_w[:2], e.normal_w[:2], s.places_w[0])
-            for s, e in once
-            if e.width_m <= WIDEST_M and not _passed_by(e, walls.layer)
-        )
+        glimpsed = glimpses(grids, sight.view, here) if sight.view is not None else []
+        for gap in glimpsed:
+            _note(self._glimpsed, gap, here)
+        once = [s for s in often if _places(s.places_w) < 2]
+        once += [s for s in self._glimpsed if s.near >= _LOOKS and not any(_same(s.gaps[0], o) for o in often)]
+        self.candidates = tuple(_candidate(s) for s in once if not _parts_nothing(s, walls.layer))
 
     def carry(self, moved: Moved) -> None:
         """Take what was found along with the map; `exits` are those of the next look."""
-        for seen in self._seen:
+        for seen in [*self._seen, *self._glimpsed]:
             centres = moved.points(np.array([gap.centre_w for gap in seen.gaps]))
             beyond = moved.points(np.array([gap.centre_w + 0.1 * gap.normal_w for gap in seen.gaps]))
             seen.gaps = [_carried(*gap, moved.ratio) for gap in zip(seen.gaps, centres, beyond, strict=True)]
             seen.places_w = list(moved.points(np.array(seen.places_w).reshape(-1, 2)))
 
-    def _note(self, gap: Gap, here_w: FloatArray) -> None:
-        seen = next((s for s in self._seen if _same(gap, s)), None)
-        if seen is None:
-            seen = _Seen([], [])
-            self._seen.append(seen)
-        seen.gaps.append(gap)
-        if np.linalg.norm(gap.centre_w - here_w) < _NEAR_M:
-            seen.near += 1
-            seen.places_w.append(here_w.copy())
+
+def _note(among: list[_Seen], gap: Gap, here_w: FloatArray) -> None:
+    seen = next((s for s in among if _same(gap, s)), None)
+    if seen is None:
+        seen = _Seen([], [])
+        among.append(seen)
+    seen.gaps.append(gap)
+    if np.linalg.norm(gap.centre_w - here_w) < NEAR_M:
+        seen.near += 1
+        seen.places_w.append(here_w.copy())
+
+
+def _candidate(seen: _Seen) -> Candidate:
+    return Candidate(seen.centre_w, seen.gaps[0].normal_w, seen.places_w[0])
+
+
+def _parts_nothing(seen: _Seen, layer: Layer) -> bool:
+    """Whether it is too wide, or the space between two things in one room."""
+    width_m = float(np.median([gap.width_m for gap in seen.gaps]))
+    return width_m > WIDEST_M or has_detour(layer, seen.centre_w, seen.gaps[0].normal_w, width_m)
 
 
 def _exit(seen: _Seen, sight: Sight) -> Exit:
@@ -188,7 +200,7 @@ def _same(gap: Gap, seen: _Seen) -> bool:
 def _in_view(centre_w: FloatArray, sight: Sight) -> bool:
     offset = centre_w - sight.p_w[:2]
     bearing = float(wrapped(np.array(math.atan2(offset[1], offset[0]) - sight.yaw_rad)))
-    return 1.0 < float(np.linalg.norm(offset)) < _NEAR_M and abs(bearing) < _FIELD_RAD
+    return 1.0 < float(np.linalg.norm(offset)) < NEAR_M and abs(bearing) < _FIELD_RAD
 
 
 def _places(places_w: list[FloatArray]) -> int:
