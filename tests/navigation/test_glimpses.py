@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from edgeslam_torch.navigation.layer import Layer
+from edgeslam_torch.navigation.moved import Moved
 from edgeslam_torch.navigation.openings.glimpses import glimpses
 from edgeslam_torch.navigation.openings.turned import Walls, along_walls
 from edgeslam_torch.navigation.openings.watch import ExitWatch
@@ -106,3 +107,17 @@ def test_three_glimpses_are_a_candidate_and_no_exit():
         watch.look(walls(free_beyond=True), Sight(0.5 * k, here, 0.0, np.zeros(3), view=view))
     assert len(watch.exits) == 1
     assert watch.candidates == (), "it is one now"
+
+
+def test_what_was_glimpsed_goes_along_with_the_map():
+    watch, T = ExitWatch(), looking(0.5, 0.0, 0.0)
+    for k in range(3):
+        here = np.array([0.5, 0.0, HEIGHT_M])
+        watch.look(walls(), Sight(0.5 * k, here, 0.0, np.zeros(3), view=picture(T, (-0.45, 0.45), 2.0)))
+    away = np.eye(4)
+    away[1, 3] = 1.0
+    watch.carry(Moved(np.eye(4)[None], away[None]))
+    watch.look(walls((0.55, 1.45)), Sight(2.0, np.array([0.5, 1.0, HEIGHT_M]), 0.0, np.zeros(3)))
+    (candidate,) = watch.candidates
+    assert candidate.centre_w == pytest.approx([2.0, 1.0], abs=0.12)
+    assert candidate.place_w == pytest.approx([0.5, 1.0])

@@ -18,7 +18,7 @@ from edgeslam_torch.navigation.openings.watch import ExitWatch
 from edgeslam_torch.navigation.pilot import Pilot
 from edgeslam_torch.navigation.sight import Sight
 from edgeslam_torch.navigation.space import Space
-from edgeslam_torch.navigation.tasks import GoTo
+from edgeslam_torch.navigation.tasks import Explore, GoTo
 
 ANGLES = [0.0, 0.3, math.pi / 4, 1.9]
 HERE = np.zeros(2)
@@ -351,6 +351,17 @@ def test_the_pilot_takes_what_is_low_for_no_wall():
     first, second = (tuple(walls.layer.cells(np.array([x, 0.05]))) for x in (1.05, 2.05))
     assert walls.layer.solid[first] and walls.layer.solid[second]
     assert walls.upright[first] and not walls.upright[second]
+
+
+def test_the_pilot_tells_its_task_of_candidates(monkeypatch):
+    monkeypatch.setattr(Pilot, "walls", lambda self: surroundings(wall(0.9)))
+    task = Explore()
+    pilot = Pilot(task)
+    pilot.exits = watched([0.0] * 8, surroundings(wall(0.9)))
+    pilot.update(sight(0.0, stamp_s=9.0))
+    assert pilot.exits.candidates
+    assert task.heading_rad(sight(1.0, stamp_s=9.1)) is not None, "it looks around first"
+    assert len(task.goals(surroundings(wall(0.9)).layer, sight(-1.0, stamp_s=9.2)))
 
 
 def test_what_is_unseen_beside_the_way_is_no_way_on():

@@ -101,29 +101,34 @@ class ExitWatch:
         self._looked_s = sight.stamp_s
         here = sight.p_w[:2]
         grids = along_walls(walls, here)
-        found = gaps(grids)
+        self._count(gaps(grids), sight)
+        for gap in glimpses(grids, sight.view, here) if sight.view is not None else []:
+            _note(self._glimpsed, gap, here)
+        often = [s for s in self._seen if s.near >= _LOOKS and s.near > s.missed]
+        self.exits = self._exits([s for s in often if _places(s.places_w) >= 2], walls.layer, sight)
+        once = [s for s in often if _places(s.places_w) < 2]
+        once += [s for s in self._glimpsed if s.near >= _LOOKS and not any(_same(s.gaps[0], o) for o in often)]
+        self.candidates = tuple(_candidate(s) for s in once if not _parts_nothing(s, walls.layer))
+
+    def _count(self, found: list[Gap], sight: Sight) -> None:
+        """What speaks for and against what was seen before."""
         for seen in self._seen:
             if not any(_same(gap, seen) for gap in found) and _in_view(seen.centre_w, sight):
                 seen.missed += 1
         for gap in found:
-            _note(self._seen, gap, here)
+            _note(self._seen, gap, sight.p_w[:2])
         self._seen = [seen for seen in self._seen if seen.missed <= 2 * max(len(seen.gaps), _LOOKS)]
-        often = [s for s in self._seen if s.near >= _LOOKS and s.near > s.missed]
-        good = [s for s in often if _places(s.places_w) >= 2]
+
+    def _exits(self, good: list[_Seen], layer: Layer, sight: Sight) -> tuple[Exit, ...]:
+        """Those that part two rooms, one of each passage."""
         good.sort(key=lambda s: -s.near)
         told = [(seen, e) for seen in good if (e := _exit(seen, sight)).width_m <= WIDEST_M]
         for seen, exit_ in told:
-            if np.linalg.norm(exit_.centre_w[:2] - here) < NEAR_M:  # from afar a wall gets holes
-                seen.parting += -1 if _passed_by(exit_, walls.layer) else 1
+            if np.linalg.norm(exit_.centre_w[:2] - sight.p_w[:2]) < NEAR_M:  # from afar a wall gets holes
+                seen.parting += -1 if _passed_by(exit_, layer) else 1
         exits = [e for seen, e in told if seen.parting > 0]
         single = [e for k, e in enumerate(exits) if not any(_one_passage(e, other) for other in exits[:k])]
-        self.exits = tuple(sorted(single, key=lambda e: float(np.linalg.norm(e.centre_w[:2] - here))))
-        glimpsed = glimpses(grids, sight.view, here) if sight.view is not None else []
-        for gap in glimpsed:
-            _note(self._glimpsed, gap, here)
-        once = [s for s in often if _places(s.places_w) < 2]
-        once += [s for s in self._glimpsed if s.near >= _LOOKS and not any(_same(s.gaps[0], o) for o in often)]
-        self.candidates = tuple(_candidate(s) for s in once if not _parts_nothing(s, walls.layer))
+        return tuple(sorted(single, key=lambda e: float(np.linalg.norm(e.centre_w[:2] - sight.p_w[:2]))))
 
     def carry(self, moved: Moved) -> None:
         """Take what was found along with the map; `exits` are those of the next look."""
