@@ -235,7 +235,8 @@ class Atlas:
         if found is None or (not found.by_images and self._is_flat(found)):
             return None
         told = drift_told(*(self.metres(k.stamp_s) for k in (keyframe, other)))
-        return found if is_plausible(self.map, found, told) else None
+        held = self._metres_of(self.map.piece_of(keyframe.id)) is not None
+        return found if is_plausible(self.map, found, told, held) else None
 
     def _may_lie_so(self, one: Link) -> bool:
         """Whether a link between two pieces agrees with what the drone's sensors say of where they lie."""

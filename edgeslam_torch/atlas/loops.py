@@ -151,7 +151,7 @@ def far_keyframes(slam_map: SlamMap, keyframe: Keyframe) -> list[Keyframe]:
     return [k for k in older if near.get(k.id, 0) < MIN_SHARED]
 
 
-def is_plausible(slam_map: SlamMap, link: Link, told: Drift | None = None) -> bool:
+def is_plausible(slam_map: SlamMap, link: Link, told: Drift | None = None, held: bool = False) -> bool:
     """Whether a map can have drifted as much as a link says on the way from its older keyframe to its newer one.
 
     That is the shortest of those that the map knows: once a loop is closed, what is near to it has hardly drifted.
@@ -160,10 +160,11 @@ def is_plausible(slam_map: SlamMap, link: Link, told: Drift | None = None) -> bo
         slam_map: With both ends.
         link: Between them.
         told: What others than the images say of how its scale drifted.
+        held: Whether the drone's sensors hold the piece: its metres are known, if not at this moment.
     """
     way, steps = _shortest_way(slam_map, link)
     shift, turn = _off(link, link.keyframe.T_c_w)
-    drift_share = MAX_DRIFT if told is None else HELD_DRIFT
+    drift_share = HELD_DRIFT if held else MAX_DRIFT
     near = shift * link.depth <= drift_share * way + MAX_SHIFT * link.depth
     drift = told or Drift(0.0, DRIFT_LOG * np.sqrt(steps))
     return near and turn <= MAX_DRIFT_RAD and drift.allows(float(np.log(sim3.scale_of(link.S))))

@@ -266,6 +266,20 @@ def test_telemetry_decides_whether_a_link_is_plausible(rng):
     assert closed(ring, ring.atlas(metres=lambda stamp_s: ScaleEstimate(np.exp(grown / ROUND * stamp_s), 0.01)))
 
 
+def test_a_map_that_telemetry_holds_closes_no_loop_that_is_beyond_its_drift(rng):
+    """A metre off on a way of 12 m, while the drone turns on the spot and nothing tells metres at that moment."""
+    far = 4.0 * DRIFT * [1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0]
+    for drift, telemetry, closes in [
+        (far, None, True),
+        (far, ScaleEstimate(1.0, 0.02), False),
+        (DRIFT, ScaleEstimate(1.0, 0.02), True),
+    ]:
+        ring = Ring(rng, drift=drift)
+        atlas = ring.atlas()
+        atlas.metres_along = lambda *_, told=telemetry: told
+        assert bool(closed(ring, atlas)) == closes
+
+
 def test_the_longer_the_way_the_more_may_a_map_have_grown(rng):
     """By images alone: keyframes hand the scale on, and each may change it a little."""
     ring = Ring(rng, drift=0.0 * DRIFT)
@@ -289,9 +303,8 @@ def test_what_is_near_a_closed_loop_has_not_drifted_by_as_much_as_the_way_round(
     off[:3, 3] = 1.0 * beside.keyframe.T_c_w[0, :3]  # along the wall
     alike = replace(beside, S=off @ beside.S)
     assert is_plausible(ring.map, beside) and is_plausible(ring.map, alike)
-    held = Drift(0.0, 0.1)
-    assert is_plausible(ring.map, beside, held)
-    assert not is_plausible(ring.map, alike, held), "a map whose metres are known drifts less"
+    assert is_plausible(ring.map, beside, held=True)
+    assert not is_plausible(ring.map, alike, held=True), "a map whose metres are known drifts less"
     share_anchors(ring.map, [found])
     assert is_plausible(ring.map, beside)
     assert not is_plausible(ring.map, alike)
