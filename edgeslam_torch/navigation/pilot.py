@@ -8,6 +8,7 @@ import numpy as np
 
 from edgeslam_torch.geometry.rotations import wrapped
 from edgeslam_torch.navigation.arcs import Arcs, candidates
+from edgeslam_torch.navigation.hindered.losses import Losses
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.limits import NavLimits
 from edgeslam_torch.navigation.moved import Moved
@@ -55,6 +56,9 @@ _LEVEL_S = 40.0
 _LOST_S = 15.0
 """Time without progress, two looks left and right, after which what closes the way is doubted and looked at anew; the
 next time, the task is given up."""
+_LOST_M, _LOSSES = 1.5, 5
+"""Losses of the pose about one place after which the task is given up: each is a turn back to what was known and the
+same way again, and telemetry carries the pose by decimetres more each time."""
 _DITHERS_S = 5.0
 """Time without progress after which movements to and fro have shown all that they can: it rises for another view."""
 _ELSEWHERE_M = 0.5
@@ -121,6 +125,8 @@ class Pilot:
     """Whether the present look is another one from about the same place, which counts as lack of progress."""
     _doubted_w: FloatArray | None = None
     """``(2,)`` where it doubted what closed its way last."""
+    _losses: Losses = field(default_factory=lambda: Losses(_LOST_M))
+    """Of the pose, since the task began."""
     _piece: int = 0
     """Piece of map that it is in."""
     _piece_s: float = -math.inf
@@ -131,6 +137,7 @@ class Pilot:
         self.task, self.phase = task, Phase.FLYING
         self._plan, self._planned_s, self._tries_narrow, self._doubted_w = None, -math.inf, True, None
         self._progress_s, self._least, self._waiting_s = math.nan, math.inf, math.nan
+        self._losses = Losses(_LOST_M)
 
     def walls(self) -> Walls:
         """What is known at the height of flight, and what of it stands upright."""
@@ -162,8 +169,12 @@ class Pilot:
         self._level_s = math.nan
         if self.phase in (Phase.DONE, Phase.STUCK):
             return self._at_height(sight, HOVER)
+        self._losses.note(sight)
         if self.task.done(sight):
             self.phase = Phase.DONE
+            return self._at_height(sight, HOVER)
+        if self._losses.count >= _LOSSES:
+            self.phase = Phase.STUCK
             return self._at_height(sight, HOVER)
         return self._at_height(sight, self._fly(sight))
 
@@ -192,6 +203,7 @@ class Pilot:
         self.space.rebuild(moved)
         self.exits.carry(moved)
         self.task.carry(moved)
+        self._losses.carry(moved)
         if self._looked_w is not None:
             self._looked_w = moved.points(self._looked_w[None])[0]
         if self._doubted_w is not None:

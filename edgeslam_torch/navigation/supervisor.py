@@ -11,10 +11,10 @@ from enum import StrEnum
 import numpy as np
 
 from edgeslam_torch.geometry.rotations import wrapped
+from edgeslam_torch.navigation.hindered.push import PUSHED_M_S, Push
 from edgeslam_torch.navigation.limits import NavLimits
 from edgeslam_torch.navigation.moved import Moved
 from edgeslam_torch.navigation.pace import STEP_M_S, told, varied
-from edgeslam_torch.navigation.push import PUSHED_M_S, Push
 from edgeslam_torch.navigation.sight import Sight, Touch, Wish
 from edgeslam_torch.types import FloatArray
 

@@ -10,6 +10,7 @@ import numpy as np
 from edgeslam_torch.navigation.exploring.around import LooksAround
 from edgeslam_torch.navigation.exploring.frontiers import Looks, frontiers, reachable
 from edgeslam_torch.navigation.exploring.second_look import SecondLook
+from edgeslam_torch.navigation.hindered.losses import Losses
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.moved import Moved
 from edgeslam_torch.navigation.openings.watch import Candidate
@@ -70,10 +71,8 @@ class GoTo(LooksAhead):
 
     goal_w: FloatArray
     """``(3,)`` in the drone's world [m]."""
-    _losses: int = 0
-    """How often the pose was lost near the goal, and something else than to go on was done about it."""
-    _lost: bool = False
-    """Whether it is now."""
+    _losses: Losses = field(default_factory=lambda: Losses(math.inf))
+    """Near the goal."""
 
     def goals(self, layer: Layer, sight: Sight) -> np.ndarray:
         """The goal's cell; where the grid ends, the last one towards it."""
@@ -92,21 +91,16 @@ class GoTo(LooksAhead):
         is left of the way.
         """
         away_m = self.away_m(sight)
-        self._note_loss(sight, away_m)
+        if sight.tracked or away_m < _NEAREST_M:
+            self._losses.note(sight)
         carried_out = not sight.tracked and sight.position_sigma_m >= CARRIED_SIGMA_M
         reach_m = max(ARRIVED_M, min(_doubt_m(sight), _MOST_DOUBT_M)) if carried_out else ARRIVED_M
-        reach_m = _NEAREST_M if self._losses >= _TRIES else reach_m
+        reach_m = _NEAREST_M if self._losses.count >= _TRIES else reach_m
         return away_m < reach_m and float(np.linalg.norm(sight.velocity_w)) < 0.15
 
     def away_m(self, sight: Sight) -> float:
         """Level distance from the goal [m], by the drone's own pose."""
         return float(np.linalg.norm(sight.p_w[:2] - self.goal_w[:2]))
-
-    def _note_loss(self, sight: Sight, away_m: float) -> None:
-        if sight.tracked:
-            self._lost = False
-        elif sight.hindered and not self._lost and away_m < _NEAREST_M:
-            self._losses, self._lost = self._losses + 1, True
 
     def carry(self, moved: Moved) -> None:
         """A goal in metres from the take-off stays what it is."""

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from edgeslam_torch.navigation.push import Push
+from edgeslam_torch.navigation.hindered.push import Push
 from edgeslam_torch.navigation.sight import Sight
 
 AHEAD = np.array([1.0, 0.0])

@@ -435,12 +435,32 @@ def test_where_telemetry_carries_it_no_farther_its_doubt_is_near_enough(off_m, s
 def test_a_pose_that_is_lost_near_the_goal_again_and_again_comes_no_nearer(off_m, tries, arrived):
     """Brought back each time, it finds its pose again; each loss is told at every moment that it lasts."""
     goal, there = GoTo(np.array([12.0, 0.0, 1.15])), replace(at(12.0 - off_m, 0.0), position_sigma_m=0.05)
+    for _ in range(3):  # what is lost on the way says nothing about the goal
+        goal.done(at(10.9, 0.0))
+        goal.done(at(11.0, 0.0, tracked=False, hindered=True))
     for _ in range(tries):
         assert not goal.done(replace(at(11.0, 0.0)))
         assert not goal.done(replace(there, tracked=False)), "carried on"
         done = [goal.done(replace(there, tracked=False, hindered=True)) for _ in range(5)]
     assert done == 5 * [arrived]
     assert not goal.done(at(11.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("places", "gives_up"), [([0.0] * 5, True), ([0.0] * 4, False), ([0, 0, 0, 0, 2, 2, 2, 0, 0], False)]
+)
+def test_it_gives_up_where_its_pose_is_lost_again_and_again(places, gives_up):
+    """Five times within a metre and a half; a loss is told at every moment that it lasts, and is another one after the
+    pose was known. A new task begins anew."""
+    pilot, now_s = before_a_free_way(), 10.0
+    for x in places:
+        for lost in (False, True, True):
+            now_s += 0.1
+            pilot.update(at(x, 0.0, now_s, tracked=not lost, hindered=lost))
+    assert (pilot.phase is Phase.STUCK) == gives_up
+    pilot.begin(pilot.task)
+    pilot.update(at(0.0, 0.0, now_s + 0.1))
+    assert pilot.phase is not Phase.STUCK
 
 
 def test_a_hulls_distance_is_for_the_unseen_not_for_solids():

@@ -1,1 +1,1 @@
-"""Exploring: where the known space ends, and where it was looked around."""
+"""Exploring: where the known space ends, where it was looked around, and what is looked at twice."""
