@@ -140,6 +140,19 @@ def test_an_opening_that_closes_under_closer_looks_is_forgotten():
     assert watch.exits == ()
 
 
+def test_what_many_looks_told_is_not_told_while_later_ones_show_a_wall():
+    """Two rooms, seed 798: a poster that was told to be six metres deep, from afar."""
+    door, closed = surroundings(wall(0.9)), surroundings(wall(0.0))
+    watch = watched([0.0, 0.2, 0.4, 0.6] * 10, door)
+    for k in range(20):
+        watch.look(closed, sight(0.6, stamp_s=30.0 + 0.5 * k))
+    assert len(watch.exits) == 1, "half a minute against ten seconds"
+    watch.look(closed, sight(0.6, stamp_s=40.0))
+    assert watch.exits == ()
+    watch.look(door, sight(0.6, stamp_s=40.5))
+    assert len(watch.exits) == 1
+
+
 @pytest.mark.parametrize("angle", ANGLES)
 @pytest.mark.parametrize(
     ("solid", "unseen", "detour"),

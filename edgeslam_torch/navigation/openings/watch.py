@@ -26,6 +26,9 @@ PLACES_M = 0.5
 _FIELD_RAD = math.radians(20.0)
 """Half the camera's field of view, less a margin: an opening within it that is not found again counts against it."""
 _LOOKS = 3
+_GONE = 20
+"""Looks at it, ten seconds, that show no opening, one after the other: later ones know more than earlier ones, so what
+fifty of them told before is not told until it is seen again."""
 _CELL_SIGMAS = 1.0 / math.sqrt(6.0)
 """Standard deviation of a width between two cells, in cells: each end is anywhere in its own."""
 
@@ -70,6 +73,8 @@ class _Seen:
     places_w: list[FloatArray]
     near: int = 0
     missed: int = 0
+    gone: int = 0
+    """Those missed since it was seen last."""
     parting: int = 0
     """Looks from near by in which no way led round it, less those in which one did: most of them decide."""
 
@@ -104,7 +109,7 @@ class ExitWatch:
         self._count(gaps(grids), sight)
         for gap in glimpses(grids, sight.view, here) if sight.view is not None else []:
             _note(self._glimpsed, gap, here)
-        often = [s for s in self._seen if s.near >= _LOOKS and s.near > s.missed]
+        often = [s for s in self._seen if s.near >= _LOOKS and s.near > s.missed and s.gone <= _GONE]
         self.exits = self._exits([s for s in often if _places(s.places_w) >= 2], walls.layer, sight)
         once = [s for s in often if _places(s.places_w) < 2]
         once += [s for s in self._glimpsed if s.near >= _LOOKS and not any(_same(s.gaps[0], o) for o in often)]
@@ -114,7 +119,7 @@ class ExitWatch:
         """What speaks for and against what was seen before."""
         for seen in self._seen:
             if not any(_same(gap, seen) for gap in found) and _in_view(seen.centre_w, sight):
-                seen.missed += 1
+                seen.missed, seen.gone = seen.missed + 1, seen.gone + 1
         for gap in found:
             _note(self._seen, gap, sight.p_w[:2])
         self._seen = [seen for seen in self._seen if seen.missed <= 2 * max(len(seen.gaps), _LOOKS)]
@@ -145,6 +150,7 @@ def _note(among: list[_Seen], gap: Gap, here_w: FloatArray) -> None:
         seen = _Seen([], [])
         among.append(seen)
     seen.gaps.append(gap)
+    seen.gone = 0
     if np.linalg.norm(gap.centre_w - here_w) < NEAR_M:
         seen.near += 1
         seen.places_w.append(here_w.copy())
