@@ -223,7 +223,8 @@ def is_near(slam_map: SlamMap, one: Keyframe, other: Keyframe, shift: float, dep
         depth: That the camera sees.
         sigma: Standard deviation per axis of what the sensors say.
     """
-    return shift <= _drift(slam_map, one, other) + MAX_SHIFT * depth + SIGMAS * sigma
+    more = shift - MAX_SHIFT * depth - SIGMAS * sigma
+    return more <= 0.0 or more <= _drift(slam_map, one, other)  # which takes as long as a frame in a large map
 
 
 def _drift(slam_map: SlamMap, one: Keyframe, other: Keyframe) -> float:
