@@ -76,6 +76,10 @@ class WayHome:
         near = float(np.linalg.norm(sight.p_w[:2])) < HOME_M
         return sight.stamp_s >= self._looked_s and near and float(np.linalg.norm(sight.velocity_w)) < _SLOW_M_S
 
+    def gives_up(self, losses: int) -> bool:
+        """No: there is nothing else to fly for."""
+        return False
+
     def consider(self, candidates: Sequence[Candidate]) -> None:
         """It passes every opening by."""
 

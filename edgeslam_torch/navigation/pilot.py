@@ -56,9 +56,8 @@ _LEVEL_S = 40.0
 _LOST_S = 15.0
 """Time without progress, two looks left and right, after which what closes the way is doubted and looked at anew; the
 next time, the task is given up."""
-_LOST_M, _LOSSES = 1.5, 5
-"""Losses of the pose about one place after which the task is given up: each is a turn back to what was known and the
-same way again, and telemetry carries the pose by decimetres more each time."""
+_LOST_M = 1.5
+"""Distance within which losses of the pose are about one place."""
 _DITHERS_S = 5.0
 """Time without progress after which movements to and fro have shown all that they can: it rises for another view."""
 _ELSEWHERE_M = 0.5
@@ -173,7 +172,7 @@ class Pilot:
         if self.task.done(sight):
             self.phase = Phase.DONE
             return self._at_height(sight, HOVER)
-        if self._losses.count >= _LOSSES:
+        if self.task.gives_up(self._losses.count):
             self.phase = Phase.STUCK
             return self._at_height(sight, HOVER)
         return self._at_height(sight, self._fly(sight))

@@ -19,6 +19,7 @@ from edgeslam_torch.navigation.supervisor import CARRIED_SIGMA_M
 from edgeslam_torch.types import FloatArray
 
 ARRIVED_M = 0.15
+MOST_LOSSES = 5
 _MOST_DOUBT_M = 0.3
 """Doubt about where it is that may count as having arrived, at most."""
 _NEAREST_M, _TRIES = 0.5, 3
@@ -35,6 +36,9 @@ class Task(Protocol):
     def done(self, sight: Sight) -> bool:
         """Whether it is reached."""
 
+    def gives_up(self, losses: int) -> bool:
+        """Whether losing the pose so often about one place ends it."""
+
     def carry(self, moved: Moved) -> None:
         """Take remembered places along with the map."""
 
@@ -49,9 +53,15 @@ class Task(Protocol):
 
 
 class LooksAhead:
-    """Part of a task during which the drone looks where it flies, always, and at no opening."""
+    """Part of a task during which the drone looks where it flies, always, and at no opening, until its pose is lost
+    again and again: each time is a turn back to what was known and the same way once more, and telemetry carries it by
+    decimetres."""
 
     __slots__ = ()
+
+    def gives_up(self, losses: int) -> bool:
+        """After `MOST_LOSSES`."""
+        return losses >= MOST_LOSSES
 
     def consider(self, candidates: Sequence[Candidate]) -> None:
         """It does not."""
@@ -142,6 +152,10 @@ class Explore:
         self._looks.carry(moved)
         self._around.carry(moved)
         self._second.carry(moved)
+
+    def gives_up(self, losses: int) -> bool:
+        """No: there is elsewhere to look, and time is limited."""
+        return False
 
     def consider(self, candidates: Sequence[Candidate]) -> None:
         """What to look at once more."""

@@ -8,6 +8,7 @@ import pytest
 from views import facing_a_wall
 
 from edgeslam_torch.drone.emulator.drone import DroneModel
+from edgeslam_torch.flying.errands import WayHome
 from edgeslam_torch.navigation.arcs import candidates, flown
 from edgeslam_torch.navigation.exploring.frontiers import frontiers
 from edgeslam_torch.navigation.layer import Layer
@@ -16,7 +17,7 @@ from edgeslam_torch.navigation.moved import Moved
 from edgeslam_torch.navigation.pilot import Phase, Pilot
 from edgeslam_torch.navigation.route import cost_to_go
 from edgeslam_torch.navigation.sight import Sight, Touch, Wish
-from edgeslam_torch.navigation.tasks import GoTo
+from edgeslam_torch.navigation.tasks import Explore, GoTo
 
 
 def hall(size=60, wall=None, unseen=None):
@@ -461,6 +462,16 @@ def test_it_gives_up_where_its_pose_is_lost_again_and_again(places, gives_up):
     pilot.begin(pilot.task)
     pilot.update(at(0.0, 0.0, now_s + 0.1))
     assert pilot.phase is not Phase.STUCK
+
+
+@pytest.mark.parametrize("task", [Explore(), WayHome(np.zeros((0, 2)))], ids=["explore", "home"])
+def test_who_searches_and_who_comes_home_does_not_give_up(task):
+    """`blank_walls` 798: five losses in half a minute of a search, and five a metre from home."""
+    pilot = before_a_free_way()
+    pilot.begin(task)
+    for k in range(12):
+        pilot.update(at(2.0, 0.0, 10.0 + 0.1 * k, tracked=bool(k % 2), hindered=not k % 2))
+    assert pilot._losses.count == 6 and pilot.phase is not Phase.STUCK
 
 
 def test_a_hulls_distance_is_for_the_unseen_not_for_solids():
