@@ -87,8 +87,11 @@ def test_what_is_behind_the_camera_or_far_away_is_not_glimpsed():
     assert seen(walls(), picture(far, (-0.45, 0.45), 2.0), (-2.5, 0.0)) == []
 
 
-def test_a_camera_that_looks_at_the_floor_has_no_level_ray():
-    T = looking(0.5, 0.0, 0.0, tilt_rad=math.radians(60.0))
+@pytest.mark.parametrize("tilt_deg", [60.0, 90.0])
+def test_a_camera_that_looks_at_the_floor_has_no_level_ray(tilt_deg):
+    T = looking(0.5, 0.0, 0.0, tilt_rad=math.radians(tilt_deg))
+    if tilt_deg == 90.0:
+        T[2, :3] = 0.0, 0.0, -1.0  # to the last bit
     assert seen(walls(), picture(T, (-0.45, 0.45), 2.0)) == []
 
 

@@ -70,13 +70,14 @@ def _level(view: View) -> _Rays:
     K, R = view.K, view.T_w_c[:3, :3]
     u = np.arange(view.depth_m.shape[1])
     x = (u - K[0, 2]) / K[0, 0]
-    y = -(R[2, 0] * x + R[2, 2]) / R[2, 1]  # level: no part of the ray is upwards
-    v = np.round(K[1, 2] + K[1, 1] * y).astype(int)
+    with np.errstate(divide="ignore", invalid="ignore"):  # it may look straight down
+        y = -(R[2, 0] * x + R[2, 2]) / R[2, 1]  # level: no part of the ray is upwards
+        v = np.round(K[1, 2] + K[1, 1] * y)
     seen = (v >= 0) & (v < len(view.depth_m))
-    depth = np.where(seen, view.depth_m[np.clip(v, 0, len(view.depth_m) - 1), u], np.nan)
-    step = np.stack([x, y, np.ones(len(u))], axis=1) @ R.T
+    depth = np.where(seen, view.depth_m[np.where(seen, v, 0).astype(int), u], np.nan)
     good = depth > 0
-    return _Rays(view.T_w_c[:2, 3], step[good, :2], np.asarray(depth[good], dtype=np.float64))
+    step = np.stack([x, y, np.ones(len(u))], axis=1)[good] @ R.T
+    return _Rays(view.T_w_c[:2, 3], step[:, :2], np.asarray(depth[good], dtype=np.float64))
 
 
 def _goes_through(rays: _Rays, gap: Gap) -> bool:
