@@ -239,7 +239,7 @@ class Navigator:
                 self.craft.land(HOME_BECAUSE)
             return Outcome(False, HOME_BECAUSE, clearance_m, path_m)
         if self.cockpit.ended() is not Phase.DONE:
-            return Outcome(False, str(Phase.STUCK), clearance_m, path_m)
+            return Outcome(False, self.cockpit.pilot.why_stuck(), clearance_m, path_m)
         return Outcome(True, done + self._rests_on(), clearance_m, path_m)
 
     def land(self) -> Outcome:

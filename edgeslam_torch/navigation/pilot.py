@@ -143,6 +143,13 @@ class Pilot:
         layer = self.space.layer(self.limits.height_m, self.limits.radius_m + BAND_M)
         return Walls(layer, self.space.upright(*_UPRIGHT_M, _UPRIGHT_SHARE))
 
+    def why_stuck(self) -> str:
+        """What keeps it from going on, in words, once it is `Phase.STUCK`."""
+        return "its pose is lost there again and again" if self._gives_up() else str(Phase.STUCK)
+
+    def _gives_up(self) -> bool:
+        return self.task.gives_up(self._losses.count)
+
     def touched(self, touch: Touch) -> None:
         """Something holds it that no view shows: not there again."""
         self.space.touched(touch, self.limits.radius_m + 0.5 * CELL_M)
@@ -172,7 +179,7 @@ class Pilot:
         if self.task.done(sight):
             self.phase = Phase.DONE
             return self._at_height(sight, HOVER)
-        if self.task.gives_up(self._losses.count):
+        if self._gives_up():
             self.phase = Phase.STUCK
             return self._at_height(sight, HOVER)
         return self._at_height(sight, self._fly(sight))
