@@ -1,26 +1,45 @@
 """Whether the camera is back on ground that an earlier part of the map shows."""
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from edgeslam_torch.map.keyframe import Keyframe
+from edgeslam_torch.types import FloatArray
 
 MIN_SHARED = 15
 """Anchors in common from which on two keyframes are covisible, as in `SlamMap.covisible`."""
+OUT_OF_VIEW = 5
+"""Anchors in common below which a keyframe does not show what another one does: along a straight way these fade, and
+are now more, now less than `MIN_SHARED`."""
 
 
-def is_back(earlier: list[Keyframe], recent: list[Keyframe]) -> bool:
-    """Whether a recent keyframe sees what earlier ones had seen and what had been out of view since.
+def is_back(earlier: list[Keyframe], recent: list[Keyframe], reach: FloatArray) -> bool:
+    """Whether a recent keyframe sees what earlier ones had seen and what was out of view while the camera was away.
 
     Args:
         earlier: In the order of time.
         recent: Those that followed, in the order of time.
+        reach: How far from each of both ``(K,)`` [map units] a camera has only turned.
     """
     members = [*earlier, *recent]
+    shared = _shared(members, len(earlier))
+    number = np.arange(len(members))
+    covisible = (shared >= MIN_SHARED) & (number[:, None] >= number[: len(earlier)])
+    last = np.maximum.accumulate(np.where(covisible, number[:, None], -1), axis=0)
+    centre = np.stack([k.centre_w for k in members])
+    away = np.linalg.norm(centre[:, None] - centre, axis=2) > reach[:, None]
+    back = np.zeros_like(covisible)
+    for before, place in np.argwhere(covisible[1:] & ~covisible[:-1] & (last[:-1] >= 0)).tolist():
+        gap = slice(last[before, place] + 1, before + 1)
+        back[before + 1, place] = bool(np.any((shared[gap, place] < OUT_OF_VIEW) & away[before + 1, gap]))
+    known = np.logical_or.accumulate(back, axis=0)
+    return bool((covisible & known)[len(earlier) :].any())
+
+
+def _shared(members: list[Keyframe], earlier: int) -> NDArray[np.int32]:
+    """How many anchors each of some keyframes has in common with each of the first ones of them, ``(K, E)``."""
     held = [k.anchor[k.anchor >= 0] for k in members]
     row = np.repeat(np.arange(len(members)), [len(h) for h in held])
     sees = csr_array((np.ones(len(row), np.int32), (row, np.concatenate(held))))
-    covisible = (sees @ sees[: len(earlier)].T).toarray() >= MIN_SHARED
-    later = np.arange(len(members))[:, None] > np.arange(len(earlier))
-    lost = np.logical_or.accumulate(~covisible & later, axis=0)
-    return bool((covisible & lost)[len(earlier) :].any())
+    return np.asarray((sees @ sees[:earlier].T).toarray())

@@ -31,6 +31,9 @@ from edgeslam_torch.types import IntArray
 UNKNOWN_SCALE_LOG = 1.0
 """Standard deviation of the log of the metres per map unit where nothing but the window's own telemetry tells them."""
 
+SPOT = 0.5
+"""Way of a camera, relative to the depth that it sees, up to which it has turned on the spot and been nowhere else."""
+
 
 @dataclass(frozen=True, slots=True)
 class Window:
@@ -96,7 +99,7 @@ def recent_map(slam_map: SlamMap, newest: Keyframe, most: int) -> Window | None:
     recent, earlier = keyframes[-most:], keyframes[:-most]
     anchor = slam_map.anchors_seen_by(recent)
     if earlier:
-        if is_back(earlier, recent):
+        if is_back(earlier, recent, np.array([SPOT * (slam_map.median_depth(k) or 0.0) for k in keyframes])):
             return None
         shared = slam_map.shared_counts(anchor)
         earlier.sort(key=lambda k: (-shared.get(k.id, 0), -k.id))

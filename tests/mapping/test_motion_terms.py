@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from functools import reduce
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from edgeslam_torch.fusion.displacement import TelemetryModel
 from edgeslam_torch.fusion.telemetry.track import TelemetryTrack
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.mount import camera_on_body
+from edgeslam_torch.map.keyframe import NO_ANCHOR
 from edgeslam_torch.map.known_ground import MIN_SHARED, is_back
 from edgeslam_torch.mapping.last_refinement import lm_config
 from edgeslam_torch.mapping.mapper import WIDE_EVERY, Mapper
@@ -131,21 +133,56 @@ def there_and_back(rng):
     return points
 
 
+def back(keyframes, earlier, last, reach=0.0):
+    """`is_back` of the first ``last`` keyframes, the first ``earlier`` of which are not recent."""
+    return is_back(keyframes[:earlier], keyframes[earlier:last], np.full(last, reach))
+
+
 def test_a_camera_is_back_where_a_place_was_out_of_view(there_and_back):
     keyframes = there_and_back.keyframes
-    assert is_back(keyframes[:6], keyframes[6:])
-    assert is_back(keyframes[:6], keyframes[6:9])
-    assert not is_back(keyframes[:6], keyframes[6:8]), "what it sees has been in view all the time"
-    assert not is_back(keyframes[:2], keyframes[2:4])
-    assert not is_back(keyframes[:2], keyframes[9:]), "nothing between tells that it was out of view"
+    assert back(keyframes, 6, 12)
+    assert back(keyframes, 6, 9)
+    assert not back(keyframes, 6, 8), "what it sees has been in view all the time"
+    assert not back(keyframes, 2, 4)
+    assert not is_back(keyframes[:2], keyframes[9:], np.zeros(5)), "nothing between tells that it was out of view"
+    assert is_back(keyframes[:9], keyframes[9:], np.zeros(12)), "it came back before the recent ones, and stayed"
     for keyframe in keyframes[8:]:
         held = np.flatnonzero(keyframe.anchor >= 0)
         there_and_back.map.forget_observations(keyframe, held[MIN_SHARED - 1 :])
-    assert not is_back(keyframes[:6], keyframes[6:]), "too few anchors in common"
+    assert not back(keyframes, 6, 12), "too few anchors in common"
+
+
+def test_a_camera_that_only_turned_is_not_back(there_and_back):
+    keyframes = there_and_back.keyframes
+    way = max(np.linalg.norm(keyframes[8].centre_w - k.centre_w) for k in keyframes[4:8])
+    assert not back(keyframes, 6, 12, 1.01 * way)
+    assert back(keyframes, 6, 12, 0.99 * way)
+
+
+def test_a_camera_that_turned_elsewhere_before_is_not_back(there_and_back):
+    """It turns where it begins, flies on with the place in view, and turns again."""
+    keyframes = there_and_back.keyframes
+    keyframes[1].anchor[:] = NO_ANCHOR
+    for keyframe in keyframes:
+        at = np.array([10.0 if keyframe.id > 2 else 0.0, 0.0, 0.0])
+        keyframe.T_c_w[:3, 3] = -keyframe.T_c_w[:3, :3] @ at
+    assert not back(keyframes, 4, 12, 1.0)
+
+
+def test_a_place_that_fades_was_not_out_of_view(there_and_back):
+    keyframes = there_and_back.keyframes
+    common = reduce(np.intersect1d, [k.anchor[k.anchor >= 0] for k in keyframes[:4]])
+    for few in (3, MIN_SHARED // 2):
+        for keyframe in keyframes[4:8]:
+            keyframe.anchor[:few] = common[:few]
+        assert back(keyframes, 4, 12) == (few == 3)
 
 
 def test_known_ground_does_not_follow_telemetry(there_and_back):
     newest = there_and_back.keyframes
+    assert recent_map(there_and_back.map, newest[-1], 6) is not None, "it only turned"
+    for keyframe in newest[4:8]:
+        keyframe.T_c_w[:3, 3] += 5.0
     assert recent_map(there_and_back.map, newest[-1], 6) is None
     for keyframe in newest[8:]:
         there_and_back.map.remove_keyframe(keyframe)
