@@ -9,7 +9,7 @@ from edgeslam_torch.drone.emulator.room import drone_at
 from edgeslam_torch.drone.sdk_state import parse_state
 from edgeslam_torch.drone.tello import StateMessage
 from edgeslam_torch.flying.cockpit import Cockpit
-from edgeslam_torch.flying.eyes import SlamEyes
+from edgeslam_torch.flying.eyes.slam_eyes import SlamEyes
 from edgeslam_torch.flying.recorder import Recorder
 from edgeslam_torch.geometry.mount import TELLO_TILT_RAD
 from edgeslam_torch.navigation.sight import View

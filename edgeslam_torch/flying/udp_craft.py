@@ -10,7 +10,7 @@ from edgeslam_torch.calibration.camera_choice import choose_camera
 from edgeslam_torch.drone.answers import TelloError
 from edgeslam_torch.drone.tello import StateMessage, Tello, TelloAddress
 from edgeslam_torch.flying.cockpit import Cockpit
-from edgeslam_torch.flying.eyes import SlamEyes
+from edgeslam_torch.flying.eyes.slam_eyes import SlamEyes
 from edgeslam_torch.flying.recorder import Recorder
 from edgeslam_torch.navigation.sight import View
 from edgeslam_torch.types import Frame

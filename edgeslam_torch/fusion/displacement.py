@@ -55,6 +55,8 @@ _UNPROVEN_S = 3.0
 _STEADY_RAD = math.radians(15.0)
 """Lean of a drone that takes off and flies slowly, at most; a camera in a hand rolls by more, and its attitude may be
 another moment's until it has proven otherwise."""
+_STILL_M_S = 0.05
+"""Speed along an axis up to which a drone stands, whatever a map unit is: half a step of the SDK."""
 _LEAST_WEIGHT = 1e-4
 _BENT = 0.2
 """Share of a way by which the map may be off without the reading being a wild one: that is what is to be mended."""
@@ -136,6 +138,8 @@ class TelemetryModel:
     """Whether it has turned as the images did."""
     young: bool = False
     """Whether the map has begun seconds ago."""
+    standing: bool = False
+    """Whether, where velocities may not speak, those of a drone that stands may: nothing is nothing in any unit."""
 
     @property
     def knows_metres(self) -> bool:
@@ -161,7 +165,7 @@ class TelemetryModel:
         Returns:
             The Gaussian, or None where telemetry is silent.
         """
-        if len(stamps_s) < 2 or len(self.track) < 2 or not (self.velocity or self.height is not None):
+        if len(stamps_s) < 2 or len(self.track) < 2 or not (self.velocity or self.standing or self.height is not None):
             return None
         sigma = self.scale_sigma_log if scale_sigma_log is None else scale_sigma_log
         at_s = stamps_s - self.delay_s
@@ -169,6 +173,8 @@ class TelemetryModel:
         parts = []
         if self.velocity:
             parts.append(self._displacements(at_s, per_scale_w))
+        elif self.standing:
+            parts.append(_still(self._displacements(at_s, np.zeros_like(per_scale_w)), at_s))
         if self.height is not None:
             parts.append(self._heights(at_s, per_scale_w))
         rows = _stacked([part for part in parts if part is not None])
@@ -309,6 +315,26 @@ class TelemetryModel:
 def is_steady(track: TelemetryTrack, at_s: FloatArray) -> NDArray[np.bool_]:
     """Whether a drone leans at moments ``(N,)`` as one that takes off does, whichever moment near by is meant."""
     return np.asarray(track.leaned(at_s, _UNPROVEN_S) < _STEADY_RAD)
+
+
+def _still(rows: _Rows | None, at_s: FloatArray) -> _Rows | None:
+    """Of displacements between moments ``(K,)`` those along axes along which the drone stands."""
+    if rows is None:
+        return None
+    lasted_s = rows.D.sum(2) @ at_s
+    keep = np.flatnonzero(np.abs(rows.told) < _STILL_M_S * lasted_s)
+    if len(keep) == 0:
+        return None
+    group = np.unique(rows.group[keep], return_inverse=True)[1]
+    return _Rows(
+        rows.D[keep],
+        rows.told[keep],
+        rows.white[keep],
+        rows.slow[np.ix_(keep, keep)],
+        rows.common[keep],
+        group,
+        rows.way[keep],
+    )
 
 
 def _stacked(parts: list[_Rows]) -> _Rows | None:

@@ -144,10 +144,14 @@ class Metres:
 
     def velocity_speaks(self, trust: Trust) -> bool:
         """Whether velocities may pull at the map: not by metres that heights alone told, and hardly know."""
-        told, odds = self.told, trust.at_odds
+        told = self.told
         if told is None or not ("telemetry" in told.source or told.sigma < _SURE):
             return False
-        return trust.velocity and (odds is None or odds.kept == "telemetry")
+        return self.velocity_is_right(trust)
+
+    def velocity_is_right(self, trust: Trust) -> bool:
+        """Whether velocities are this flight's, and nothing that is used instead contradicts them."""
+        return trust.velocity and (trust.at_odds is None or trust.at_odds.kept == "telemetry")
 
     def sources(self) -> tuple[ScaleEstimate, ...]:
         """Scale by each source alone, used or not."""

@@ -402,6 +402,7 @@ class MotionFusion:
             self.metres.fit.truncates,
             self._trust.attitude,
             self._trust.turns,
+            standing=told is not None and self.metres.velocity_is_right(self._trust),
         )
 
     # --- estimation ----------------------------------------------------------------------------------------------

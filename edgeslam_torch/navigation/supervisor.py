@@ -26,8 +26,9 @@ BACK_S = 1.5
 """Time of trouble after which it backs up along the way it came, which was free."""
 LAND_S = 10.0
 """Time of trouble after which it lands."""
-UNSURE_LAND_S = 20.0
-"""The same when metres are doubtful: five times up and down where it has been, which is what tells them."""
+UNSURE_LAND_S = 30.0
+"""The same when metres are doubtful: seven times up and down where it has been, which is what tells them, of this map
+or, where that tells none for eight seconds, of the next (`flying/eyes/fresh_start.py`)."""
 _BACK_M, _BACK_M_S = 1.0, 0.25
 """Way back, and its mean speed: without a picture telemetry alone says how far it came."""
 SCALE_SIGMA = 0.10

@@ -1,16 +1,19 @@
 """What a pilot is told of a picture that has no place in the map."""
 
 from types import SimpleNamespace
+from typing import ClassVar
 
 import numpy as np
 import pytest
 
-from edgeslam_torch.flying.eyes import SlamEyes, _contradicted
+from edgeslam_torch.flying.eyes.fresh_start import PATIENCE_S
+from edgeslam_torch.flying.eyes.home import GROUND_M
+from edgeslam_torch.flying.eyes.slam_eyes import SlamEyes, _contradicted
 from edgeslam_torch.geometry.camera import PRESETS
 from edgeslam_torch.geometry.mount import TELLO_TILT_RAD, camera_on_body
 from edgeslam_torch.synthetic.house.render import render
 from edgeslam_torch.synthetic.sites.build import named_site
-from edgeslam_torch.types import DepthMap, ScaleEstimate
+from edgeslam_torch.types import DepthMap, ScaleEstimate, TelemetrySample
 
 CAMERA = PRESETS["tello"].scaled(480, 360)
 DISTANCE_M = 1.5
@@ -114,3 +117,46 @@ def test_a_network_contradicts_nothing_that_velocities_and_heights_confirm(used,
         scale=ScaleEstimate(2.55, 0.05, used), sources=(*sources, ScaleEstimate(network, 0.2 * network, "depth"))
     )
     assert _contradicted(health) == contradicted
+
+
+class Slam:
+    """One that never tells metres, and remembers what it was given."""
+
+    made: ClassVar[list] = []
+
+    def __init__(self, camera, config, realtime):
+        self.frames, self.closed = [], False
+        self.made.append(self)
+
+    def step(self, frame, telemetry):
+        self.frames.append((frame.index, len(telemetry)))
+        health = SimpleNamespace(state="lost")
+        return SimpleNamespace(
+            metric=False, health=health, unit=1.0, revision=0, T_w_c=np.eye(4), stamp_s=frame.stamp_s
+        )
+
+    def trajectory(self):
+        return np.zeros(len(self.frames)), np.repeat(np.eye(4)[None], len(self.frames), axis=0)
+
+    def pose_now(self, now_s, samples):
+        return None
+
+    def close(self):
+        self.closed = True
+
+
+def test_a_map_that_tells_no_metres_in_the_air_is_given_up_for_a_new_one(monkeypatch):
+    monkeypatch.setattr("edgeslam_torch.flying.eyes.slam_eyes.EdgeSlam", Slam)
+    Slam.made.clear()
+    eyes, revisions = SlamEyes(CAMERA), []
+    for k, now_s in enumerate(np.arange(0.0, 1.5 * PATIENCE_S, 1 / 15)):
+        if k % 2 == 0:
+            eyes.heard(TelemetrySample(now_s, np.zeros(3), np.array([0.0, 0.0, 0.3]), 0.9))
+        eyes.seen(bare_wall(), now_s, now_s)
+        revisions.append(eyes._changes)
+        assert eyes.sight(now_s).p_w[2] == pytest.approx(GROUND_M if len(Slam.made) == 1 else 0.9 + GROUND_M)
+    first, second = Slam.made
+    assert first.closed and not second.closed
+    assert len(first.frames) == pytest.approx(15 * PATIENCE_S, abs=3)
+    assert second.frames[0] == (0, 1), "it begins anew, and is told which way is up"
+    assert len(set(revisions)) == 2, "a pilot forgets what it was told before"

@@ -398,6 +398,7 @@ def test_velocities_pull_at_the_map_where_they_go_with_metres_that_are_known(sou
     fusion.flight.trust.judge(Reading.VELOCITY, Agreement(0.99, 30))
     fusion.flight.trust.at_odds = None if kept == "" else AtOdds(10.0, 1.0, kept)
     assert fusion.telemetry().velocity is speaks
+    assert fusion.telemetry().standing is (kept in ("", "telemetry")), "that it stands is right in any unit"
 
 
 def test_gravity_speaks_before_metres_are_known_if_the_map_began_upright():

@@ -5,7 +5,7 @@ import numpy as np
 from edgeslam_torch.drone.emulator.lockstep import Event, Picture, State
 from edgeslam_torch.drone.sdk_state import parse_state, sample_from_sdk
 from edgeslam_torch.eval.judge.navigation.conditions import Conditions
-from edgeslam_torch.flying import eyes
+from edgeslam_torch.flying.eyes import slam_eyes
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.navigation.sight import Sight, View
 
@@ -13,11 +13,11 @@ IMAGE_SIZE = (480, 360)
 
 
 class SlamEyes:
-    """`flying.eyes.SlamEyes` fed from events in lockstep, with pictures that may go dark."""
+    """`flying.eyes.slam_eyes.SlamEyes` fed from events in lockstep, with pictures that may go dark."""
 
     def __init__(self, camera: Camera, conditions: Conditions, seed: int) -> None:
         self._conditions = conditions
-        self._eyes = eyes.SlamEyes(camera, seed)
+        self._eyes = slam_eyes.SlamEyes(camera, seed)
 
     def sight(self, now_s: float, events: list[Event]) -> Sight:
         """The moment, from what arrived since the last one."""

@@ -7,7 +7,8 @@ import cv2
 import numpy as np
 
 from edgeslam_torch.config import SlamConfig
-from edgeslam_torch.flying.home import GROUND_M, Home, metres_per_unit
+from edgeslam_torch.flying.eyes.fresh_start import FreshStart
+from edgeslam_torch.flying.eyes.home import GROUND_M, TAKE_OFF, Home, Place, metres_per_unit
 from edgeslam_torch.frontend.depth_network import DepthNetwork, open_depth, weights_path
 from edgeslam_torch.fusion.health import disagreement
 from edgeslam_torch.geometry import se3
@@ -44,7 +45,7 @@ _MOVES_EVERY_S = 3.0
 class SlamEyes:
     """Pictures and state messages through `EdgeSlam`; the pose is made up for the video's delay.
 
-    The world is that of `flying.home`, in the best metres that the SLAM knows: its published unit may be off by more.
+    The world is that of `home`, in the best metres that the SLAM knows: its published unit may be off by more.
     `heard` and `sight` may be called from any thread, also while `seen` works; `seen` from one thread.
 
     Args:
@@ -58,36 +59,44 @@ class SlamEyes:
         while width > IMAGE_WIDTH and width % 2 == height % 2 == 0:
             width, height = width // 2, height // 2
         self._camera = camera.scaled(width, height)
-        self._slam = EdgeSlam(self._camera, SlamConfig(seed=seed), realtime=realtime)
+        self._seed, self._realtime = seed, realtime
+        self._fresh = FreshStart()
         self._K_small = self._camera.scaled(width // _STEP, height // _STEP).K
         self._network: DepthNetwork = open_depth(weights_path(_WEIGHTS))
         self._T_b_c = camera_on_body()
         self._lock = threading.Lock()
         self._samples: list[TelemetrySample] = []
         """Of which no finished step knows."""
-        self._frames = 0
         self._captured_s = 0.0
+        self._battery = 1.0
+        self._told_height_m, self._told_speed_m_s = np.nan, np.nan
+        self._revision = self._changes = 0
+        """The latter is how often its metres changed."""
+        self._begin(TAKE_OFF)
+
+    def _begin(self, place: Place) -> None:
+        """Begin a map, and know nothing of another one."""
+        self._slam = EdgeSlam(self._camera, SlamConfig(seed=self._seed), realtime=self._realtime)
+        self._began = place
+        self._frames = 0
         self._output: SlamOutput | None = None
         self._home = Home(np.eye(3), 1.0, np.zeros(3))
         self._fit: tuple[NearFit, float, int] | None = None
         """The last fit of depth to points, when its picture arrived, and in which unit."""
         self._metres = np.nan
         """Metres per map unit by which it goes; NaN while the published unit is all there is."""
-        self._battery = 1.0
-        self._told_height_m, self._told_speed_m_s = np.nan, np.nan
         self._shown: tuple[FloatArray, float, int] = np.zeros((0, 4, 4)), 1.0, 0
         """When the last view was made: poses ``(F, 4, 4)`` of all pictures, metres per map unit, and the revision."""
         self._told: deque[tuple[int, FloatArray]] = deque(maxlen=KEPT)
         """Pictures whose views were told, and their poses as they were told last."""
         self._told_unit, self._told_revision, self._moved_s = 1.0, 0, -np.inf
         self._revision = 0
-        self._changes = 0
-        """How often its metres changed."""
 
     def heard(self, sample: TelemetrySample) -> None:
         """Take a state message."""
         with self._lock:
             self._samples.append(sample)
+            self._fresh.heard(sample)
             if np.isfinite(sample.battery):
                 self._battery = sample.battery
             if np.isfinite(sample.height_m):
@@ -101,6 +110,14 @@ class SlamEyes:
             image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
         with self._lock:
             batch = list(self._samples)
+            metric = self._output is not None and self._output.metric
+            # The first picture of a map wants to be told which way is up.
+            given_up = self._slam if self._fresh.is_due(arrived_s, metric) and batch else None
+            if given_up is not None:
+                self._changes += self._revision + 1  # what was told before is of another map
+                self._begin(self._fresh.begin())
+        if given_up is not None:
+            given_up.close()
         output = self._slam.step(Frame(self._frames, arrived_s, image), batch)
         T_slam = self._slam.trajectory()[1]
         self._frames += 1
@@ -111,7 +128,7 @@ class SlamEyes:
         may_move = depth is not None and captured_s - self._moved_s > _MOVES_EVERY_S
         metres = metres_per_unit(self._metres, output, may_move)
         unit = metres if np.isfinite(metres) else output.unit
-        home = Home.of(T_slam[0], unit / output.unit, self._T_b_c)
+        home = Home.of(T_slam[0], unit / output.unit, self._T_b_c, self._began)
         with self._lock:
             del self._samples[: len(batch)]
             self._output, self._captured_s, self._home = output, captured_s, home
@@ -125,15 +142,15 @@ class SlamEyes:
         """The moment, with a new view if there is one, and with it how the map moved since the last."""
         with self._lock:
             output, captured_s, home, changes = self._output, self._captured_s, self._home, self._changes
+            slam, began = self._slam, self._began
             samples, battery = list(self._samples), self._battery
             told, told_speed = self._told_height_m, self._told_speed_m_s
-        pose = self._slam.pose_now(now_s, samples)
+        pose = slam.pose_now(now_s, samples)
         if pose is None or output is None or output.health is None:
-            nowhere = np.array([0.0, 0.0, GROUND_M])
             return Sight(
                 now_s,
-                nowhere,
-                0.0,
+                began.position_m,
+                began.yaw_rad,
                 np.zeros(3),
                 metric=False,
                 tracked=False,

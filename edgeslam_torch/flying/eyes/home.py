@@ -15,6 +15,18 @@ _OFF = 0.01
 
 
 @dataclass(frozen=True, slots=True)
+class Place:
+    """Where a body is in the drone's own world, and whereto it is turned."""
+
+    position_m: FloatArray
+    """``(3,)``"""
+    yaw_rad: float
+
+
+TAKE_OFF = Place(np.array([0.0, 0.0, GROUND_M]), 0.0)
+
+
+@dataclass(frozen=True, slots=True)
 class Home:
     """Similarity from the SLAM's published world ``w`` to the drone's own: ``scale R p + shift_m``."""
 
@@ -26,20 +38,21 @@ class Home:
     """``(3,)``."""
 
     @staticmethod
-    def of(T_w_first: FloatArray, scale: float, T_b_c: FloatArray) -> "Home":
-        """The world that begins below the first picture's body.
+    def of(T_w_first: FloatArray, scale: float, T_b_c: FloatArray, began: Place = TAKE_OFF) -> "Home":
+        """The world that begins below the body of the picture at the take-off.
 
         Args:
-            T_w_first: ``T_w_c`` of the first picture ``(4, 4)``, in published units.
+            T_w_first: ``T_w_c`` of the SLAM's first picture ``(4, 4)``, in published units.
             scale: Metres per published unit.
             T_b_c: Camera on the body ``(4, 4)`` [m].
+            began: Where that was taken.
         """
         T_w_b = T_w_first @ se3.inverse(T_b_c)
-        yaw = math.atan2(T_w_b[1, 0], T_w_b[0, 0])
+        yaw = math.atan2(T_w_b[1, 0], T_w_b[0, 0]) - began.yaw_rad
         c, s = math.cos(yaw), math.sin(yaw)
         R = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
         body_m = scale * (R @ T_w_first[:3, 3]) + R @ (T_w_b[:3, 3] - T_w_first[:3, 3])
-        return Home(R, scale, np.array([0.0, 0.0, GROUND_M]) - body_m)
+        return Home(R, scale, began.position_m - body_m)
 
     def poses(self, T_w_c: FloatArray) -> FloatArray:
         """``T_w_c`` ``(..., 4, 4)`` in the drone's own world [m]."""
