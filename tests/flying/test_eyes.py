@@ -120,7 +120,7 @@ def test_a_network_contradicts_nothing_that_velocities_and_heights_confirm(used,
 
 
 class Slam:
-    """One that never tells metres, and remembers what it was given."""
+    """One that has no metres but the network's, and remembers what it was given."""
 
     made: ClassVar[list] = []
 
@@ -130,10 +130,9 @@ class Slam:
 
     def step(self, frame, telemetry):
         self.frames.append((frame.index, len(telemetry)))
-        health = SimpleNamespace(state="lost")
-        return SimpleNamespace(
-            metric=False, health=health, unit=1.0, revision=0, T_w_c=np.eye(4), stamp_s=frame.stamp_s
-        )
+        lost, guess = SimpleNamespace(state="lost"), ScaleEstimate(2.0, 0.9, "depth")
+        told = {"metric": True, "scale": guess, "health": lost, "unit": 1.0, "revision": 0, "stamp_s": frame.stamp_s}
+        return SimpleNamespace(T_w_c=np.eye(4), **told)
 
     def trajectory(self):
         return np.zeros(len(self.frames)), np.repeat(np.eye(4)[None], len(self.frames), axis=0)

@@ -19,9 +19,9 @@ def flown(samples):
     return fresh
 
 
-def due(fresh, until_s, metric=lambda t: False, from_s=0.0):
+def due(fresh, until_s, sure=lambda t: False, from_s=0.0):
     """The first picture of 15 a second at which it is time."""
-    return next((t for t in np.arange(from_s, until_s, 1 / 15) if fresh.is_due(t, metric(t))), None)
+    return next((t for t in np.arange(from_s, until_s, 1 / 15) if fresh.is_due(t, sure(t))), None)
 
 
 def test_a_map_without_metres_is_given_up_after_a_while_in_the_air_and_the_next_one_too():
@@ -46,8 +46,9 @@ def test_metres_end_the_wait():
         [sample(0.0, height_m=np.nan)],
         [sample(0.0, velocity=(np.nan, 0.0, 0.0))],
         [sample(t, velocity=(0.5, 0.0, 0.0)) for t in np.arange(0.0, 2.4, 0.1)],
+        [sample(t, velocity=(0.5 if t < 2.4 else -0.5, 0.0, 0.0)) for t in np.arange(0.0, 4.8, 0.1)],
     ],
-    ids=["nothing told", "on the floor", "no height", "no velocity", "it has flown away"],
+    ids=["nothing told", "on the floor", "no height", "no velocity", "it has flown away", "and back"],
 )
 def test_what_is_not_known_to_hover_near_its_take_off_keeps_its_map(samples):
     assert due(flown(samples), 60.0) is None

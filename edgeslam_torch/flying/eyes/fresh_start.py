@@ -1,4 +1,4 @@
-"""When a map that tells no metres is given up for a new one, and where that begins.
+"""When a map that tells no sure metres is given up for a new one, and where that begins.
 
 A map that was begun on the floor may be wrong from its first second: planks of a floor look alike, the map sinks while
 the drone climbs, and all that is added to it agrees. A new one, begun in the air, stands after as many seconds.
@@ -12,11 +12,12 @@ from edgeslam_torch.flying.eyes.home import GROUND_M, TAKE_OFF, Place
 from edgeslam_torch.types import TelemetrySample
 
 PATIENCE_S = 8.0
-"""Time in the air without metres: a map that tells them does so within six seconds of a drone that goes up and down."""
+"""Time in the air without sure metres: a map that tells them does so within six seconds of a drone that goes up and
+down."""
 IN_AIR_M = 0.3
 """Told height above the floor from which on a drone is in the air, in three of the SDK's steps."""
 NEAR_M = 1.0
-"""Way from the take-off, by the drone's own velocities, beyond which a map is kept whatever it tells: it knows the way
+"""Way from the take-off, by the drone's own velocities, after which a map is kept whatever it tells: it knows the way
 back, and velocities in steps of a decimetre a second do not."""
 
 
@@ -29,8 +30,9 @@ class FreshStart:
         self._last: TelemetrySample | None = None
         self._moved_m = np.zeros(3)
         """Way since the first one in the axes of power-on."""
+        self._has_left = False
         self._since_s = math.nan
-        """Since when it has been in the air without metres."""
+        """Since when it has been in the air without sure metres."""
 
     def heard(self, sample: TelemetrySample) -> None:
         """Take a state message; one without velocity, attitude and height tells nothing."""
@@ -39,18 +41,19 @@ class FreshStart:
         if self._last is not None:
             pause_s = sample.stamp_s - self._last.stamp_s
             self._moved_m += 0.5 * pause_s * (self._last.velocity_m_s + sample.velocity_m_s)
+            self._has_left = self._has_left or bool(np.linalg.norm(self._moved_m[:2]) > NEAR_M)
         self._began = self._began or sample
         self._last = sample
 
-    def is_due(self, stamp_s: float, metric: bool) -> bool:
+    def is_due(self, stamp_s: float, sure: bool) -> bool:
         """Whether it is time for a new map; asked at each picture.
 
         Args:
             stamp_s: Of the picture.
-            metric: Whether the map tells metres.
+            sure: Whether the map tells metres that one can fly by.
         """
         flies = self._last is not None and self._last.height_m >= IN_AIR_M
-        if metric or not flies or np.linalg.norm(self._moved_m[:2]) > NEAR_M:
+        if sure or not flies or self._has_left:
             self._since_s = math.nan
             return False
         if math.isnan(self._since_s):

@@ -19,6 +19,7 @@ from edgeslam_torch.navigation.near.depth import NearFit, fit_to_points
 from edgeslam_torch.navigation.near.points import agreeing, seen_points, with_nearer_points
 from edgeslam_torch.navigation.sight import Sight, View
 from edgeslam_torch.navigation.space import CELL_M, KEPT
+from edgeslam_torch.navigation.supervisor import SCALE_SIGMA
 from edgeslam_torch.slam import EdgeSlam
 from edgeslam_torch.types import DepthMap, FloatArray, Frame, Health, SlamOutput, TelemetrySample
 
@@ -110,9 +111,9 @@ class SlamEyes:
             image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
         with self._lock:
             batch = list(self._samples)
-            metric = self._output is not None and self._output.metric
             # The first picture of a map wants to be told which way is up.
-            given_up = self._slam if self._fresh.is_due(arrived_s, metric) and batch else None
+            due = self._fresh.is_due(arrived_s, self._output is not None and _is_sure(self._output)) and bool(batch)
+            given_up = self._slam if due else None
             if given_up is not None:
                 self._changes += self._revision + 1  # what was told before is of another map
                 self._begin(self._fresh.begin())
@@ -122,8 +123,8 @@ class SlamEyes:
         T_slam = self._slam.trajectory()[1]
         self._frames += 1
         revised, self._revision = output.revision != self._revision, output.revision
-        due = revised or self._frames % _DEPTH_EVERY == 0
-        depth = self._depth(image, output) if due else None
+        shows = revised or self._frames % _DEPTH_EVERY == 0
+        depth = self._depth(image, output) if shows else None
         # A pilot is told of new metres together with a view in them.
         may_move = depth is not None and captured_s - self._moved_s > _MOVES_EVERY_S
         metres = metres_per_unit(self._metres, output, may_move)
@@ -243,6 +244,11 @@ class SlamEyes:
         """Depth in published units as a pilot is told of it, in metres."""
         metres = home.scale * depth.depth_m
         return View(captured_s, metres, depth.sigma_log, self._K_small, home.poses(T_w_c), self._frames - 1)
+
+
+def _is_sure(output: SlamOutput) -> bool:
+    """Whether its metres are what a supervisor lets a drone fly by."""
+    return output.metric and output.scale.sigma <= SCALE_SIGMA * output.scale.value
 
 
 def _tracks(output: SlamOutput) -> bool:
