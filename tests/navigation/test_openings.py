@@ -179,6 +179,30 @@ def test_pillars_are_no_exit_once_their_surroundings_are_seen():
     assert not watch.exits
 
 
+def test_ten_seconds_that_know_a_way_round_outvote_what_did_not_know_it_yet():
+    """`cluttered_room` 800: a gap beside a cupboard, for forty seconds seen from behind it alone."""
+    door, pillars = surroundings(wall(0.9)), surroundings(PILLARS)
+    watch = watched([0.0, 0.2, 0.4, 0.6] * 20, door)
+    for k in range(19):
+        watch.look(pillars, sight(0.6, stamp_s=50.0 + 0.5 * k))
+    assert len(watch.exits) == 1
+    watch.look(pillars, sight(0.6, stamp_s=60.0))
+    assert watch.exits == ()
+    for k in range(20):
+        watch.look(door, sight(0.6, stamp_s=61.0 + 0.5 * k))
+        assert watch.exits == (), "a moment later a speck closes the way round"
+    watch.look(door, sight(0.6, stamp_s=72.0))
+    assert len(watch.exits) == 1
+
+
+def test_a_way_round_that_comes_and_goes_takes_back_no_door():
+    door, pillars = surroundings(wall(0.9)), surroundings(PILLARS)
+    watch = watched([0.0, 0.2, 0.4, 0.6] * 3, door)
+    for k in range(60):
+        watch.look(pillars if k % 2 else door, sight(0.6, stamp_s=10.0 + 0.5 * k))
+    assert len(watch.exits) == 1
+
+
 PILLARS = lambda a, b: wall(0.9)(a, b) & (np.abs(b) < 1.2)  # noqa: E731
 
 

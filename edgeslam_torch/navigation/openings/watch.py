@@ -77,10 +77,19 @@ class _Seen:
     """Those missed since it was seen last."""
     parting: int = 0
     """Looks from near by in which no way led round it, less those in which one did: most of them decide."""
+    round: int = 0
+    """The last of these, on end, in which one did."""
 
     @property
     def centre_w(self) -> FloatArray:
         return np.asarray(np.median([g.centre_w for g in self.gaps], axis=0))
+
+    def note_way_round(self, known: bool) -> None:
+        """One more look: looks from when no way round it was known yet do not outvote ten seconds that know one."""
+        self.round = self.round + 1 if known else 0
+        self.parting = self.parting + (-1 if known else 1)
+        if self.round >= _GONE:
+            self.parting = min(self.parting, -self.round)
 
 
 @dataclass(slots=True)
@@ -130,7 +139,7 @@ class ExitWatch:
         told = [(seen, e) for seen in good if (e := _exit(seen, sight)).width_m <= WIDEST_M]
         for seen, exit_ in told:
             if np.linalg.norm(exit_.centre_w[:2] - sight.p_w[:2]) < NEAR_M:  # from afar a wall gets holes
-                seen.parting += -1 if _passed_by(exit_, layer) else 1
+                seen.note_way_round(_passed_by(exit_, layer))
         exits = [e for seen, e in told if seen.parting > 0]
         single = [e for k, e in enumerate(exits) if not any(_one_passage(e, other) for other in exits[:k])]
         return tuple(sorted(single, key=lambda e: float(np.linalg.norm(e.centre_w[:2] - sight.p_w[:2]))))
