@@ -159,3 +159,5 @@ def test_a_map_that_tells_no_metres_in_the_air_is_given_up_for_a_new_one(monkeyp
     assert len(first.frames) == pytest.approx(15 * PATIENCE_S, abs=3)
     assert second.frames[0] == (0, 1), "it begins anew, and is told which way is up"
     assert len(set(revisions)) == 2, "a pilot forgets what it was told before"
+    late = SimpleNamespace(picture=eyes._first - 1, T_w_c=np.eye(4), stamp_s=now_s)
+    assert eyes._moved(late) is None and not eyes._told, "a view of the old map that comes late"

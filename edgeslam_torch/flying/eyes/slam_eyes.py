@@ -71,15 +71,18 @@ class SlamEyes:
         self._captured_s = 0.0
         self._battery = 1.0
         self._told_height_m, self._told_speed_m_s = np.nan, np.nan
-        self._revision = self._changes = 0
-        """The latter is how often its metres changed."""
-        self._begin(TAKE_OFF)
+        self._revision = self._changes = self._frames = 0
+        """The second is how often its metres changed."""
+        self._begin(self._new_slam(), TAKE_OFF)
 
-    def _begin(self, place: Place) -> None:
+    def _new_slam(self) -> EdgeSlam:
+        return EdgeSlam(self._camera, SlamConfig(seed=self._seed), realtime=self._realtime)
+
+    def _begin(self, slam: EdgeSlam, place: Place) -> None:
         """Begin a map, and know nothing of another one."""
-        self._slam = EdgeSlam(self._camera, SlamConfig(seed=self._seed), realtime=self._realtime)
-        self._began = place
-        self._frames = 0
+        self._slam, self._began = slam, place
+        self._first = self._frames
+        """Number of the picture that the map begins with."""
         self._output: SlamOutput | None = None
         self._home = Home(np.eye(3), 1.0, np.zeros(3))
         self._fit: tuple[NearFit, float, int] | None = None
@@ -111,15 +114,10 @@ class SlamEyes:
             image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
         with self._lock:
             batch = list(self._samples)
-            # The first picture of a map wants to be told which way is up.
-            due = self._fresh.is_due(arrived_s, self._output is not None and _is_sure(self._output)) and bool(batch)
-            given_up = self._slam if due else None
-            if given_up is not None:
-                self._changes += self._revision + 1  # what was told before is of another map
-                self._begin(self._fresh.begin())
-        if given_up is not None:
-            given_up.close()
-        output = self._slam.step(Frame(self._frames, arrived_s, image), batch)
+            due = self._fresh.is_due(arrived_s, self._output is not None and _is_sure(self._output))
+        if due and batch:  # the first picture of a map wants to be told which way is up
+            self._begin_again()
+        output = self._slam.step(Frame(self._frames - self._first, arrived_s, image), batch)
         T_slam = self._slam.trajectory()[1]
         self._frames += 1
         revised, self._revision = output.revision != self._revision, output.revision
@@ -138,6 +136,14 @@ class SlamEyes:
             if depth is not None:
                 self._shown = home.poses(T_slam), unit, output.revision + self._changes
         return None if depth is None else self._view(depth, home, output.T_w_c, captured_s)
+
+    def _begin_again(self) -> None:
+        """Give the map up for a new one, while others look: a new SLAM takes some tenths of a second."""
+        fresh, given_up = self._new_slam(), self._slam
+        with self._lock:
+            self._changes += self._revision + 1  # what was told before is of another map
+            self._begin(fresh, self._fresh.begin())
+        given_up.close()
 
     def sight(self, now_s: float, view: View | None = None) -> Sight:
         """The moment, with a new view if there is one, and with it how the map moved since the last."""
@@ -193,17 +199,19 @@ class SlamEyes:
     def _moved(self, view: View) -> Moved | None:
         """How the views that were told have moved when this one was made; this one counts as told from now on."""
         with self._lock:
-            T_w_c, unit, revision = self._shown
-        found = None
-        if self._told:
-            before = np.array([T for _, T in self._told])
-            after = T_w_c[[picture for picture, _ in self._told]]
-            revised = revision != self._told_revision
-            if revised or (view.stamp_s - self._moved_s > _MOVES_EVERY_S and moves(before, after, CELL_M)):
-                found, self._moved_s = Moved(before, after, unit / self._told_unit), view.stamp_s
-                self._told = deque(((k, T) for (k, _), T in zip(self._told, after, strict=True)), self._told.maxlen)
-        self._told.append((view.picture, view.T_w_c))
-        self._told_unit, self._told_revision = unit, revision
+            (T_w_c, unit, revision), first = self._shown, self._first
+            if view.picture < first:  # of a map that was given up meanwhile
+                return None
+            found = None
+            if self._told:
+                before = np.array([T for _, T in self._told])
+                after = T_w_c[[picture - first for picture, _ in self._told]]
+                revised = revision != self._told_revision
+                if revised or (view.stamp_s - self._moved_s > _MOVES_EVERY_S and moves(before, after, CELL_M)):
+                    found, self._moved_s = Moved(before, after, unit / self._told_unit), view.stamp_s
+                    self._told = deque(((k, T) for (k, _), T in zip(self._told, after, strict=True)), self._told.maxlen)
+            self._told.append((view.picture, view.T_w_c))
+            self._told_unit, self._told_revision = unit, revision
         return found
 
     def _depth(self, image: np.ndarray, output: SlamOutput) -> DepthMap | None:
