@@ -45,7 +45,7 @@ class Home:
             T_w_first: ``T_w_c`` of the SLAM's first picture ``(4, 4)``, in published units.
             scale: Metres per published unit.
             T_b_c: Camera on the body ``(4, 4)`` [m].
-            began: Where that was taken.
+            began: Where its body was in this world.
         """
         T_w_b = T_w_first @ se3.inverse(T_b_c)
         yaw = math.atan2(T_w_b[1, 0], T_w_b[0, 0]) - began.yaw_rad
