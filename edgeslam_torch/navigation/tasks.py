@@ -22,6 +22,8 @@ ARRIVED_M = 0.15
 MOST_LOSSES = 5
 _MOST_DOUBT_M = 0.3
 """Doubt about where it is that may count as having arrived, at most."""
+_NEAR_BY_M = 2.4
+"""Distance to the unseen, of two looks around, within which it is flown to before what is known is looked at again."""
 _NEAREST_M, _TRIES = 0.5, 3
 """How near its goal a drone stays that has lost its pose there, and was brought back, this often: what carries it on
 are velocities that a Tello cuts off, and it would come no nearer until its battery is empty."""
@@ -134,14 +136,27 @@ class Explore:
     _looks: Looks = field(default_factory=Looks)
     _around: LooksAround = field(default_factory=LooksAround)
     _second: SecondLook = field(default_factory=SecondLook)
+    _closely: bool = False
+    """Whether nothing near by is left to see but by looking more closely."""
 
     def goals(self, layer: Layer, sight: Sight) -> np.ndarray:
-        """Cells to look from at what may be an opening; else those at the middle of each border of the unseen."""
-        second = self._second.goals(layer, sight)
-        if len(second):
+        """Cells to look from at what may be an opening, on the way; those at the middle of each border of the unseen;
+        what is left of the first; and at last those between where it has looked around.
+
+        To fly back for every doubt would leave no time for what was never seen.
+        """
+        here = sight.p_w[:2]
+        borders = self._looks.worth(reachable(frontiers(layer), layer, here), layer, sight)
+        away_m = np.linalg.norm(layer.centres(borders).reshape(-1, 2) - here, axis=1)
+        self._closely = bool((away_m > _NEAR_BY_M).all())
+        found = self._second.on_the_way(layer, sight)
+        if len(found) == 0 and len(borders) == 0:
+            found = self._second.goals(layer, sight)
+            if len(found) == 0:
+                found = reachable(self._around.between(layer), layer, here)
+        if len(found):
             self._looks.go_on()
-            return second
-        return self._looks.worth(reachable(frontiers(layer), layer, sight.p_w[:2]), layer, sight)
+        return found if len(found) else borders
 
     def done(self, sight: Sight) -> bool:
         """Whether the time is over, or nothing is left to see."""
@@ -163,7 +178,7 @@ class Explore:
 
     def heading_rad(self, sight: Sight) -> float | None:
         """Left and right, standing, wherever it has not looked around; at what may be an opening, where it shows."""
-        around = self._around.heading_rad(sight)
+        around = self._around.heading_rad(sight, self._closely)
         return around if around is not None else self._second.heading_rad(sight)
 
     def faces_rad(self, sight: Sight) -> float | None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from edgeslam_torch.navigation.exploring.around import LooksAround
+from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.moved import Moved
 from edgeslam_torch.navigation.sight import Sight
 
@@ -40,6 +41,25 @@ def test_once_about_a_place():
     assert not looked(looks, 1.1, begin_s=20.0)
     assert looked(looks, 1.3, begin_s=30.0)
     assert not looked(looks, 0.1, begin_s=40.0)
+
+
+def test_half_way_between_two_places_is_another_one_if_it_looks_closely():
+    looks = LooksAround()
+    for k, x in enumerate([0.0, 1.3]):
+        assert looked(looks, x, begin_s=20.0 * k)
+    assert looks.heading_rad(at(50.0, 0.65, 10.0)) is None
+    assert looks.heading_rad(at(51.0, 0.65, 10.0), closely=True) is not None
+
+
+def test_between_is_half_way_where_it_can_be_and_has_not_been():
+    looks = LooksAround()
+    for k, x in enumerate([0.0, 1.3, 2.6, 5.5]):
+        assert looked(looks, x, begin_s=20.0 * k)
+    x, _ = np.meshgrid(np.arange(80) * 0.1, np.arange(10) * 0.1, indexing="ij")
+    layer = Layer(np.abs(x - 1.9) > 0.3, np.zeros(x.shape, bool), np.array([-0.05, -0.05]), 0.1)
+    assert layer.centres(looks.between(layer)) == pytest.approx(np.array([[0.65, 0.0]]), abs=0.06)
+    looks.heading_rad(at(100.0, 0.66, 10.0), closely=True)
+    assert len(looks.between(layer)) == 0
 
 
 def test_a_lost_pose_and_a_drone_that_does_not_turn_end_it():

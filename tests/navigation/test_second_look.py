@@ -32,6 +32,14 @@ def wanted(look, layer, here=(0.5, 1.0), now_s=0.0):
     return layer.centres(look.goals(layer, at(*here, now_s))).reshape(-1, 2)
 
 
+def test_what_is_on_the_way_is_near():
+    look = considering(DOOR)
+    near = room().centres(look.on_the_way(room(), at(1.2, -0.5)))
+    assert len(near)
+    assert np.linalg.norm(near - [1.2, -0.5], axis=1).max() <= 1.2
+    assert len(look.on_the_way(room(), at(0.5, 2.5))) == 0
+
+
 def considering(*candidates):
     look = SecondLook()
     look.consider(candidates)
@@ -42,6 +50,11 @@ def considering(*candidates):
 def test_it_looks_from_before_the_opening_and_elsewhere(turned):
     places = wanted(considering(Candidate(DOOR.centre_w, turned * DOOR.normal_w, DOOR.place_w)), room())
     assert len(places)
+    look = considering(DOOR)
+    for place in places:
+        for angle in np.arange(0.0, 6.3, 0.4):
+            near = place + 0.13 * np.array([math.cos(angle), math.sin(angle)])
+            assert look.heading_rad(at(*near)) is not None, "a pilot comes within fifteen centimetres"
     before = 3.0 - places[:, 0]
     assert before.min() >= 0.8
     assert before.max() <= 2.0, "on the side that it was seen from, and not from afar"
@@ -85,6 +98,46 @@ def test_what_was_tried_goes_along_with_the_map():
     assert look.heading_rad(at(5.0, 0.0, 5.0)) is None
     look.consider([DOOR])
     assert look.heading_rad(at(1.8, -0.5, 5.0)) is not None
+
+
+def test_exploring_flies_back_for_a_doubt_when_nothing_is_left_to_see():
+    """A border of the unseen at the right; a door to look at a good way behind the drone, or beside it."""
+    x, y = np.meshgrid((np.arange(60) + 0.5) * 0.1, (np.arange(60) + 0.5) * 0.1 - 3.0, indexing="ij")
+    ends = Layer(np.broadcast_to(x < 5.0, y.shape), np.zeros((60, 60), bool), np.array([0.0, -3.0]), 0.1)
+    known = Layer(np.ones((60, 60), bool), np.zeros((60, 60), bool), np.array([0.0, -3.0]), 0.1)
+    door = Candidate(np.array([0.5, 0.0]), np.array([-1.0, 0.0]), np.array([2.0, 1.5]))
+    task = Explore()
+    task.consider([door])
+    assert ends.centres(task.goals(ends, at(4.5, 0.0)))[:, 0].min() > 4.5, "there is a border ahead"
+    assert ends.centres(task.goals(ends, at(2.2, 0.0, 0.5)))[:, 0].max() < 2.6, "it is on the way"
+    assert known.centres(task.goals(known, at(4.5, 0.0, 1.0)))[:, 0].max() < 2.6, "nothing is left to see"
+
+
+def test_exploring_looks_around_more_closely_when_nothing_else_is_left():
+    known = Layer(np.ones((60, 60), bool), np.zeros((60, 60), bool), np.array([0.0, -3.0]), 0.1)
+    task = Explore()
+    assert len(task.goals(known, at(1.0, 0.0))) == 0
+    for k, x in enumerate([1.0, 2.3]):
+        task.heading_rad(at(x, 0.0, 20.0 * k))
+        task.heading_rad(at(x, 0.0, 20.0 * k + 15.0))  # it does not turn, and gives that up
+    goals = known.centres(task.goals(known, at(2.3, 0.0, 40.0)))
+    assert goals == pytest.approx(np.array([[1.65, 0.05]]), abs=0.06)
+    assert task.heading_rad(at(1.66, 0.0, 45.0)) is not None
+    task.heading_rad(at(1.66, 0.0, 60.0))
+    assert len(task.goals(known, at(1.66, 0.0, 61.0))) == 0
+    assert not task.done(at(1.66, 0.0, 61.0)) and task.done(at(1.66, 0.0, 75.0))
+
+
+@pytest.mark.parametrize(("border_x", "closely"), [(5.0, True), (3.0, False)])
+def test_on_another_pass_exploring_looks_more_closely_far_from_what_is_unseen(border_x, closely):
+    x, y = np.meshgrid((np.arange(60) + 0.5) * 0.1, (np.arange(60) + 0.5) * 0.1 - 3.0, indexing="ij")
+    ends = Layer(np.broadcast_to(x < border_x, y.shape), np.zeros((60, 60), bool), np.array([0.0, -3.0]), 0.1)
+    task = Explore()
+    for k, place in enumerate([1.0, 2.3]):
+        task.heading_rad(at(place, 0.0, 20.0 * k))
+        task.heading_rad(at(place, 0.0, 20.0 * k + 15.0))
+    assert len(task.goals(ends, at(1.65, 0.0, 40.0)))
+    assert (task.heading_rad(at(1.65, 0.0, 40.1)) is not None) == closely
 
 
 def test_exploring_goes_on_while_there_is_an_opening_to_look_at():

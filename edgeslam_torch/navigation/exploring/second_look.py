@@ -23,12 +23,17 @@ _ASIDE = 0.5
 seen through it, and free space does not open."""
 _ELSEWHERE_M = PLACES_M + 0.1
 """Distance from where it was seen: a pose is not known to the centimetre."""
+_INSIDE_M = 0.15
+"""How far inside of where an opening shows a drone is sent: at its border it would stand, as near as pilots come to
+a goal."""
 _PASSED_M = 0.3
 """Distance from solids of where it stands to look."""
 _STANDS_S = 4.0
 """Time of a look: a turn by a right angle, and five of those that count."""
 _SOUGHT_S = 30.0
 """Time after which the way there is given up: six metres, and a look around on it."""
+_ON_THE_WAY_M = 1.2
+"""Distance of a place to look from that is no detour: as far as from one look around to the next."""
 _SAME_M = 0.5
 """An opening moves as it is looked at."""
 
@@ -55,13 +60,24 @@ class SecondLook:
         """What is worth a second look now."""
         self._candidates = candidates
 
+    def on_the_way(self, layer: Layer, sight: Sight) -> np.ndarray:
+        """Those of the cells of `goals` that are near."""
+        return self._from(self._standing(layer, sight, _ON_THE_WAY_M), layer, sight)
+
     def goals(self, layer: Layer, sight: Sight) -> np.ndarray:
         """Cells ``(G, 2)`` that can be reached, from which to look at one of them."""
+        return self._from(self._standing(layer, sight, np.inf), layer, sight)
+
+    def _standing(self, layer: Layer, sight: Sight, reach_m: float) -> np.ndarray:
+        """Cells ``(C, 2)`` where a drone can stand, no farther than this."""
         cells = np.argwhere(layer.free & (layer.from_solid_m > _PASSED_M))
-        cells = reachable(cells, layer, sight.p_w[:2])
+        near = np.linalg.norm(layer.centres(cells).reshape(-1, 2) - sight.p_w[:2], axis=1) <= reach_m
+        return reachable(cells[near], layer, sight.p_w[:2])
+
+    def _from(self, cells: np.ndarray, layer: Layer, sight: Sight) -> np.ndarray:
         found = [np.zeros((0, 2), int)]
         for candidate, tried in self._worth(sight.stamp_s):
-            there = cells[_shows(candidate, layer.centres(cells).reshape(-1, 2))]
+            there = cells[_shows(candidate, layer.centres(cells).reshape(-1, 2), _INSIDE_M)]
             if len(there):
                 tried.until_s = min(tried.until_s, sight.stamp_s + _SOUGHT_S)
             found.append(there)
@@ -97,10 +113,12 @@ class SecondLook:
         return self._tried[-1]
 
 
-def _shows(candidate: Candidate, p_w: FloatArray) -> np.ndarray:
-    """``(P,)`` whether places ``(P, 2)`` lie before an opening, on the side that it was seen from, and elsewhere."""
+def _shows(candidate: Candidate, p_w: FloatArray, inside_m: float = 0.0) -> np.ndarray:
+    """``(P,)`` whether places ``(P, 2)`` lie before an opening, on the side that it was seen from, and elsewhere, and
+    not at the border of that."""
     away = (candidate.place_w - candidate.centre_w) @ candidate.normal_w
     before = (p_w - candidate.centre_w) @ candidate.normal_w * (1.0 if away >= 0 else -1.0)
     aside = np.abs((p_w - candidate.centre_w) @ np.array([-candidate.normal_w[1], candidate.normal_w[0]]))
-    elsewhere = np.linalg.norm(p_w - candidate.place_w, axis=1) >= _ELSEWHERE_M
-    return np.asarray((before >= _BEFORE_M[0]) & (before <= _BEFORE_M[1]) & (aside <= _ASIDE * before) & elsewhere)
+    elsewhere = np.linalg.norm(p_w - candidate.place_w, axis=1) >= _ELSEWHERE_M + inside_m
+    apart = (before >= _BEFORE_M[0] + inside_m) & (before <= _BEFORE_M[1] - inside_m)
+    return np.asarray(apart & (aside <= _ASIDE * before - inside_m) & elsewhere)

@@ -28,6 +28,8 @@ _WIDER_M = 0.3
 """How much wider than the opening the space is on either side at least: walls that bulge by a cell or two, or that lie
 aslant, make no door of a corridor."""
 _FREE_SHARE, _SOLID_SHARE = 0.8, 0.3
+PARTLY_FREE = 0.3
+"""Share of an opening's cells that are known to be free if it may be one."""
 _SAME_M = 0.5
 """Two openings nearer than this are one: no wall between two doors is thinner."""
 
@@ -43,12 +45,17 @@ class Gap:
     width_m: float
     wall_m: float
     """Wall in line with it, to both sides together: the more, the surer."""
+    is_free: bool
+    """Whether all of it is known to be."""
 
 
-def gaps(grids: list[Turned]) -> list[Gap]:
-    """Openings around a place, by what is there `along_walls`, the surest first."""
-    found = [_gap(grid, t, *ends) for grid in grids for t, *ends in jambs(grid) if _is_free(grid, t, *ends)]
-    return distinct([gap for gap in found if gap is not None])
+def openings(grids: list[Turned]) -> list[Gap]:
+    """What leads through a wall around a place, by what is there `along_walls`, once for every row of the wall.
+
+    Also what is known to be free in a part alone, though there is space on both sides: frames smear into their doors.
+    """
+    found = [_gap(grid, t, *ends) for grid in grids for t, *ends in jambs(grid)]
+    return [gap for gap in found if gap is not None]
 
 
 def jambs(grid: Turned) -> Iterator[tuple[int, int, int]]:
@@ -81,7 +88,8 @@ def gap_of(grid: Turned, t: int, low: int, high: int) -> Gap:
     beside = grid.upright[rows, max(0, low - 2) : low].any(1) | grid.upright[rows, high : high + 2].any(1)
     centre = grid.at(0.5 * (low + high - 1), float(rows[beside].mean()) if beside.any() else float(t))
     away = float((centre - grid.centre_w) @ grid.left_w)
-    return Gap(centre, grid.left_w * (1.0 if away >= 0 else -1.0), width, _alongside_m(grid, t, low, high))
+    normal = grid.left_w * (1.0 if away >= 0 else -1.0)
+    return Gap(centre, normal, width, _alongside_m(grid, t, low, high), bool(_inside(grid, t, low, high).all()))
 
 
 def _alongside_m(grid: Turned, t: int, low: int, high: int) -> float:
@@ -90,13 +98,15 @@ def _alongside_m(grid: Turned, t: int, low: int, high: int) -> float:
     return float(grid.cell_m * (wall[max(0, low - reach) : low].sum() + wall[high : high + reach].sum()))
 
 
-def _is_free(grid: Turned, t: int, low: int, high: int) -> bool:
-    """Whether all of it is; a cell at each end may have been seen too little to be known."""
-    return bool(grid.free[t - 1 : t + 2, low + 1 : high - 1].all())
+def _inside(grid: Turned, t: int, low: int, high: int) -> np.ndarray:
+    """What of an opening is free; a cell at each end may have been seen too little to be known."""
+    return grid.free[t - 1 : t + 2, low + 1 : high - 1]
 
 
 def _gap(grid: Turned, t: int, low: int, high: int) -> Gap | None:
     """The opening between two cells of a row, if it leads from somewhere to somewhere."""
+    if _inside(grid, t, low, high).mean() < PARTLY_FREE:
+        return None
     if not all(_leads(grid, t, low, high, side) and _widens(grid, t, low, high, side) for side in (-1, 1)):
         return None
     if not (_in_a_wall(grid, t, low, high) and is_in_line(grid, t, low, high)):
@@ -136,7 +146,7 @@ def _in_a_wall(grid: Turned, t: int, low: int, high: int) -> bool:
 
 
 def distinct(found: list[Gap]) -> list[Gap]:
-    """One of those that overlap: the one with most wall."""
+    """One of those that overlap: the one with most wall; the surest first."""
     kept: list[Gap] = []
     for gap in sorted(found, key=lambda g: -g.wall_m):
         if all(np.linalg.norm(gap.centre_w - other.centre_w) > _SAME_M for other in kept):

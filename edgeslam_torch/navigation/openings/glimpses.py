@@ -9,14 +9,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edgeslam_torch.navigation.openings.exits import Gap, band, distinct, gap_of, is_in_line, jambs
+from edgeslam_torch.navigation.openings.exits import PARTLY_FREE, Gap, band, distinct, gap_of, is_in_line, jambs
 from edgeslam_torch.navigation.openings.turned import Turned
 from edgeslam_torch.navigation.sight import View
 from edgeslam_torch.types import FloatArray
 
 NEAR_M = 4.0
 """Farther away a door is a few pixels of uncertain depth."""
-_FREE_SHARE, _SOLID_SHARE = 0.3, 0.3
+_SOLID_SHARE = 0.3
 """Of the opening's cells some are known to be free; of its width little is known to be closed."""
 _BEFORE_SHARE = 0.5
 """Of the cells before it: a place to look from."""
@@ -60,7 +60,7 @@ def _unclosed(grid: Turned) -> Iterator[Gap]:
         inside, fifth = np.s_[t - 1 : t + 2, low + 1 : high - 1], (high - low) // 5
         before = grid.free[band(grid, t, -1 if t > middle else 1), low + fifth : high - fifth]
         room = before.size > 0 and before.mean() >= _BEFORE_SHARE
-        open_ = grid.free[inside].mean() >= _FREE_SHARE and grid.solid[inside].any(0).mean() <= _SOLID_SHARE
+        open_ = grid.free[inside].mean() >= PARTLY_FREE and grid.solid[inside].any(0).mean() <= _SOLID_SHARE
         if room and open_ and is_in_line(grid, t, low, high):
             yield gap_of(grid, t, low, high)
 

@@ -9,7 +9,7 @@ from edgeslam_torch.geometry.rotations import wrapped
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.moved import Moved
 from edgeslam_torch.navigation.openings.detour import has_detour
-from edgeslam_torch.navigation.openings.exits import WIDEST_M, Gap, gaps
+from edgeslam_torch.navigation.openings.exits import WIDEST_M, Gap, distinct, openings
 from edgeslam_torch.navigation.openings.glimpses import NEAR_M, glimpses
 from edgeslam_torch.navigation.openings.turned import Walls, along_walls
 from edgeslam_torch.navigation.sight import Sight
@@ -25,10 +25,14 @@ PLACES_M = 0.5
 """Distance between two places that count as two."""
 _FIELD_RAD = math.radians(20.0)
 """Half the camera's field of view, less a margin: an opening within it that is not found again counts against it."""
+NEAREST_M = 0.8
+"""From nearer an opening is more than what a camera sees."""
 _LOOKS = 3
-_GONE = 20
-"""Looks at it, ten seconds, that show no opening, one after the other: later ones know more than earlier ones, so what
-fifty of them told before is not told until it is seen again."""
+_GONE = 8
+"""Looks at it, as long as a second look takes, that show nothing open there, one after the other: later ones know more
+than earlier ones, so what fifty of them told before is not told until it is seen again."""
+_WAY_ROUND = 20
+"""Looks on end, ten seconds, in which a way leads round it."""
 _CELL_SIGMAS = 1.0 / math.sqrt(6.0)
 """Standard deviation of a width between two cells, in cells: each end is anywhere in its own."""
 
@@ -72,7 +76,10 @@ class _Seen:
     gaps: list[Gap]
     places_w: list[FloatArray]
     near: int = 0
+    shown: int = 0
+    """Looks at it, from `_in_view`, that show something open there ..."""
     missed: int = 0
+    """... and those that do not."""
     gone: int = 0
     """Those missed since it was seen last."""
     parting: int = 0
@@ -88,7 +95,7 @@ class _Seen:
         """One more look: looks from when no way round it was known yet do not outvote ten seconds that know one."""
         self.round = self.round + 1 if known else 0
         self.parting = self.parting + (-1 if known else 1)
-        if self.round >= _GONE:
+        if self.round >= _WAY_ROUND:
             self.parting = min(self.parting, -self.round)
 
 
@@ -108,28 +115,37 @@ class ExitWatch:
         """Whether it is time for another look. In a piece of map that may lie half a hull elsewhere none counts, for or
         against what was found."""
         placed = sight.metric and sight.tracked and sight.apart_sigma_m <= CARRIED_SIGMA_M
-        return placed and sight.stamp_s - self._looked_s >= _EVERY_S
+        return placed and sight.view is not None and sight.stamp_s - self._looked_s >= _EVERY_S
 
     def look(self, walls: Walls, sight: Sight) -> None:
         """Compare what the grid shows now with what it showed before; from farther away than `NEAR_M` none counts."""
         self._looked_s = sight.stamp_s
         here = sight.p_w[:2]
         grids = along_walls(walls, here)
-        self._count(gaps(grids), sight)
-        for gap in glimpses(grids, sight.view, here) if sight.view is not None else []:
+        found = openings(grids)
+        partly = distinct(found)
+        self._count(distinct([gap for gap in found if gap.is_free]), partly, sight)
+        glimpsed = glimpses(grids, sight.view, here) if sight.view is not None else []
+        for gap in distinct([*partly, *glimpsed]):
             _note(self._glimpsed, gap, here)
-        often = [s for s in self._seen if s.near >= _LOOKS and s.near > s.missed and s.gone <= _GONE]
-        self.exits = self._exits([s for s in often if _places(s.places_w) >= 2], walls.layer, sight)
-        once = [s for s in often if _places(s.places_w) < 2]
-        once += [s for s in self._glimpsed if s.near >= _LOOKS and not any(_same(s.gaps[0], o) for o in often)]
-        self.candidates = tuple(_candidate(s) for s in once if not _parts_nothing(s, walls.layer))
+        often = [s for s in self._seen if s.near >= _LOOKS]
+        open_ = [s for s in often if s.gone <= _GONE]
+        twice = [s for s in open_ if _places(s.places_w) >= 2]
+        self.exits = self._exits([s for s in twice if s.shown >= s.missed], walls.layer, sight)
+        doubted = [s for s in open_ if s.shown <= s.missed or _places(s.places_w) < 2]
+        doubted += [s for s in self._glimpsed if s.near >= _LOOKS and not any(_same(s.gaps[0], o) for o in often)]
+        self.candidates = tuple(_candidate(s) for s in doubted if not _parts_nothing(s, walls.layer))
 
-    def _count(self, found: list[Gap], sight: Sight) -> None:
-        """What speaks for and against what was seen before."""
+    def _count(self, free: list[Gap], partly: list[Gap], sight: Sight) -> None:
+        """What speaks for and against what was seen before: what is not looked at stays as it was."""
         for seen in self._seen:
-            if not any(_same(gap, seen) for gap in found) and _in_view(seen.centre_w, sight):
+            if not _in_view(seen.centre_w, sight):
+                continue
+            if any(_same(gap, seen) for gap in partly):
+                seen.shown, seen.gone = seen.shown + 1, 0
+            else:
                 seen.missed, seen.gone = seen.missed + 1, seen.gone + 1
-        for gap in found:
+        for gap in free:
             _note(self._seen, gap, sight.p_w[:2])
         self._seen = [seen for seen in self._seen if seen.missed <= 2 * max(len(seen.gaps), _LOOKS)]
 
@@ -220,7 +236,7 @@ def _same(gap: Gap, seen: _Seen) -> bool:
 def _in_view(centre_w: FloatArray, sight: Sight) -> bool:
     offset = centre_w - sight.p_w[:2]
     bearing = float(wrapped(np.array(math.atan2(offset[1], offset[0]) - sight.yaw_rad)))
-    return 1.0 < float(np.linalg.norm(offset)) < NEAR_M and abs(bearing) < _FIELD_RAD
+    return NEAREST_M < float(np.linalg.norm(offset)) < NEAR_M and abs(bearing) < _FIELD_RAD
 
 
 def _places(places_w: list[FloatArray]) -> int:
