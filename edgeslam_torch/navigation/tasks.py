@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from edgeslam_torch.navigation.exploring.around import LooksAround
-from edgeslam_torch.navigation.exploring.frontiers import Looks, frontiers, reachable
+from edgeslam_torch.navigation.exploring.frontiers import WIDE_M, Looks, frontiers, reachable
 from edgeslam_torch.navigation.exploring.second_look import SecondLook
 from edgeslam_torch.navigation.hindered.losses import Losses
 from edgeslam_torch.navigation.layer import Layer
@@ -140,23 +140,29 @@ class Explore:
     """Whether nothing near by is left to see but by looking more closely."""
 
     def goals(self, layer: Layer, sight: Sight) -> np.ndarray:
-        """Cells to look from at what may be an opening, on the way; those at the middle of each border of the unseen;
-        what is left of the first; and at last those between where it has looked around.
+        """Cells to look from at what may be an opening, on the way; those at the middle of each wide border of the
+        unseen; the other openings; narrow borders; and at last those between where it has looked around.
 
-        To fly back for every doubt would leave no time for what was never seen.
+        To fly back for every doubt, or to look behind every chair, would leave no time for what was never seen.
         """
         here = sight.p_w[:2]
         borders = self._looks.worth(reachable(frontiers(layer), layer, here), layer, sight)
         away_m = np.linalg.norm(layer.centres(borders).reshape(-1, 2) - here, axis=1)
         self._closely = bool((away_m > _NEAR_BY_M).all())
-        found = self._second.on_the_way(layer, sight)
-        if len(found) == 0 and len(borders) == 0:
-            found = self._second.goals(layer, sight)
-            if len(found) == 0:
-                found = reachable(self._around.between(layer), layer, here)
-        if len(found):
+        if len(found := self._second.on_the_way(layer, sight)):
+            return self._goes_on(found)
+        wide = (borders[:, None] == frontiers(layer, WIDE_M)).all(-1).any(1)
+        if wide.any():
+            return borders[wide]
+        if len(found := self._second.goals(layer, sight)):
+            return self._goes_on(found)
+        return borders if len(borders) else self._goes_on(reachable(self._around.between(layer), layer, here))
+
+    def _goes_on(self, cells: np.ndarray) -> np.ndarray:
+        """It is not over as long as there are cells."""
+        if len(cells):
             self._looks.go_on()
-        return found if len(found) else borders
+        return cells
 
     def done(self, sight: Sight) -> bool:
         """Whether the time is over, or nothing is left to see."""

@@ -113,6 +113,22 @@ def test_exploring_flies_back_for_a_doubt_when_nothing_is_left_to_see():
     assert known.centres(task.goals(known, at(4.5, 0.0, 1.0)))[:, 0].max() < 2.6, "nothing is left to see"
 
 
+def test_exploring_leaves_narrow_borders_for_later():
+    """What is unseen in a thing near by, the open end of the room, and a door to look at."""
+    x, y = np.meshgrid((np.arange(60) + 0.5) * 0.1, (np.arange(60) + 0.5) * 0.1 - 3.0, indexing="ij")
+    corner = (np.abs(x - 3.0) < 0.5) & (np.abs(y - 2.2) < 0.5)
+    thing = (np.abs(x - 3.0) < 0.75) & (y > 1.7) & (y < 2.95) & ~corner
+    low = np.array([0.0, -3.0])
+    both, narrow = (Layer(~corner & ~thing & (x < end), thing, low, 0.1) for end in (5.0, 9.0))
+    door = Candidate(np.array([0.5, -1.0]), np.array([-1.0, 0.0]), np.array([2.0, 0.5]))
+    task = Explore()
+    task.consider([door])
+    assert both.centres(task.goals(both, at(4.0, 0.5)))[:, 0].min() > 4.5, "the open end"
+    assert narrow.centres(task.goals(narrow, at(4.0, 0.5, 0.5)))[:, 1].max() < 0.0, "then the door"
+    task.consider([])
+    assert narrow.centres(task.goals(narrow, at(4.0, 0.5, 1.0)))[:, 1].min() > 1.0, "then the corner"
+
+
 def test_exploring_looks_around_more_closely_when_nothing_else_is_left():
     known = Layer(np.ones((60, 60), bool), np.zeros((60, 60), bool), np.array([0.0, -3.0]), 0.1)
     task = Explore()

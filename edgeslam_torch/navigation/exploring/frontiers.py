@@ -13,8 +13,10 @@ from edgeslam_torch.types import FloatArray
 
 _PASSED_M = 0.25
 """Distance from solids at which a drone passes: what of a border is nearer to one leads nowhere."""
-_FRONTIER_M = 0.3
+FRONTIER_M = 0.3
 """Smaller borders of the unseen are gaps between rays, not places to go; a doorway of 0.85 m has this much."""
+WIDE_M = 1.0
+"""Wider ones are rooms and corridors; narrow ones are doorways, of which there are other signs, and behind things."""
 _NEAR_M = 1.2
 """From nearer a look should show what is behind the border."""
 _LOOKED_S = 4.0
@@ -25,15 +27,15 @@ _ROUND_S = 13.0
 """Time of a full turn where no way is known, with a second to spare: after it there is nothing left to see."""
 
 
-def frontiers(layer: Layer) -> np.ndarray:
-    """One cell ``(F, 2)`` for each border between free and unseen that is wide enough to fly through."""
+def frontiers(layer: Layer, least_m: float = FRONTIER_M) -> np.ndarray:
+    """One cell ``(F, 2)`` for each border between free and unseen that is wide enough to fly through, or wider."""
     unseen = ~layer.free & ~layer.solid
     border = layer.free & ndimage.binary_dilation(unseen) & (layer.from_solid_m > _PASSED_M)
     parts, count = ndimage.label(border, np.ones((3, 3)))
     out = []
     for part in range(1, count + 1):
         cells = np.argwhere(parts == part)
-        if len(cells) * layer.cell_m >= _FRONTIER_M:
+        if len(cells) * layer.cell_m >= least_m:
             out.append(cells[int(np.argmin(((cells - cells.mean(0)) ** 2).sum(1)))])
     return np.array(out, dtype=int).reshape(-1, 2)
 

@@ -28,6 +28,8 @@ _FIELD_RAD = math.radians(20.0)
 NEAREST_M = 0.8
 """From nearer an opening is more than what a camera sees."""
 _LOOKS = 3
+_GLIMPSES = 2
+"""Looks that make a doubt: as many as a drone has that flies past a door."""
 _GONE = 8
 """Looks at it, as long as a second look takes, that show nothing open there, one after the other: later ones know more
 than earlier ones, so what fifty of them told before is not told until it is seen again."""
@@ -133,7 +135,7 @@ class ExitWatch:
         twice = [s for s in open_ if _places(s.places_w) >= 2]
         self.exits = self._exits([s for s in twice if s.shown >= s.missed], walls.layer, sight)
         doubted = [s for s in open_ if s.shown <= s.missed or _places(s.places_w) < 2]
-        doubted += [s for s in self._glimpsed if s.near >= _LOOKS and not any(_same(s.gaps[0], o) for o in often)]
+        doubted += [s for s in self._glimpsed if s.near >= _GLIMPSES and not any(_same(s.gaps[0], o) for o in often)]
         self.candidates = tuple(_candidate(s) for s in doubted if not _parts_nothing(s, walls.layer))
 
     def _count(self, free: list[Gap], partly: list[Gap], sight: Sight) -> None:
