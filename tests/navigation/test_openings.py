@@ -196,13 +196,27 @@ def test_an_exit_was_seen_by_looks_at_it():
         watch.look(door, sight(x, stamp_s=0.5 * k, yaw=math.pi))
     assert len(watch.exits) == 1, "nothing speaks against it"
     assert len(watch.candidates) == 1, "to be looked at"
-    watch.look(closed, sight(0.0, stamp_s=20.0))
+    for k in range(3):
+        assert len(watch.exits) == 1, "one look or two are chance"
+        watch.look(closed, sight(0.0, stamp_s=20.0 + 0.5 * k))
     assert watch.exits == ()
     assert len(watch.candidates) == 1
-    for k in range(2):
-        watch.look(door, sight(0.0, stamp_s=21.0 + 0.5 * k))
+    for k in range(4):
+        watch.look(door, sight(0.0, stamp_s=22.0 + 0.5 * k))
     assert len(watch.exits) == 1
     assert watch.candidates == (), "looked at"
+
+
+@pytest.mark.parametrize(
+    ("case", "x", "y", "yaw_deg"),
+    [("along the wall", 1.4, -1.6, 68.0), ("from afar", -0.7, 0.0, 0.0), ("elsewhere", 0.6, 0.0, 30.0)],
+)
+def test_looks_that_see_nothing_of_an_exit_do_not_speak_against_it(case, x, y, yaw_deg):
+    """`doors` 804: a door beside the corridor, taken back by a drone that flew along it."""
+    watch = watched([0.0, 0.2, 0.4, 0.6], surroundings(wall(0.9)))
+    for k in range(20):
+        watch.look(surroundings(wall(0.0)), sight(x, y, 5.0 + 0.5 * k, math.radians(yaw_deg)))
+    assert len(watch.exits) == 1, case
 
 
 def test_a_look_at_what_is_open_in_part_does_not_speak_against_it():

@@ -18,9 +18,9 @@ from edgeslam_torch.types import FloatArray
 
 _BEFORE_M = (0.8, 2.0)
 """Distance before the wall from which its opening fills no more than a camera's picture, and is not beyond trust."""
-_ASIDE = 0.5
-"""How far aside of the opening, in shares of that distance: 27 degrees. From farther aside its far jamb is what is
-seen through it, and free space does not open."""
+_ASIDE = 0.3
+"""How far aside of the opening, in shares of that distance: 17 degrees. From farther aside its far jamb is what is
+seen through it, and free space opens by a slit."""
 _ELSEWHERE_M = PLACES_M + 0.1
 """Distance from where it was seen: a pose is not known to the centimetre."""
 _INSIDE_M = 0.15

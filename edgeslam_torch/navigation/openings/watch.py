@@ -25,8 +25,10 @@ PLACES_M = 0.5
 """Distance between two places that count as two."""
 _FIELD_RAD = math.radians(20.0)
 """Half the camera's field of view, less a margin: an opening within it that is not found again counts against it."""
-NEAREST_M = 0.8
-"""From nearer an opening is more than what a camera sees."""
+_SQUARELY_COS = math.cos(math.radians(50.0))
+"""Angle to an opening's normal from which on it is seen aslant."""
+NEAREST_M, _FARTHEST_M = 0.8, 2.5
+"""From nearer an opening is more than what a camera sees; from farther away it closes and opens with every depth."""
 _LOOKS = 3
 _GLIMPSES = 2
 """Looks that make a doubt: as many as a drone has that flies past a door."""
@@ -79,7 +81,7 @@ class _Seen:
     places_w: list[FloatArray]
     near: int = 0
     shown: int = 0
-    """Looks at it, from `_in_view`, that show something open there ..."""
+    """Looks at it (`_is_looked_at`) that show something open there ..."""
     missed: int = 0
     """... and those that do not."""
     gone: int = 0
@@ -133,7 +135,7 @@ class ExitWatch:
         often = [s for s in self._seen if s.near >= _LOOKS]
         open_ = [s for s in often if s.gone <= _GONE]
         twice = [s for s in open_ if _places(s.places_w) >= 2]
-        self.exits = self._exits([s for s in twice if s.shown >= s.missed], walls.layer, sight)
+        self.exits = self._exits([s for s in twice if s.missed < s.shown + _LOOKS], walls.layer, sight)
         doubted = [s for s in open_ if s.shown <= s.missed or _places(s.places_w) < 2]
         doubted += [s for s in self._glimpsed if s.near >= _GLIMPSES and not any(_same(s.gaps[0], o) for o in often)]
         self.candidates = tuple(_candidate(s) for s in doubted if not _parts_nothing(s, walls.layer))
@@ -141,7 +143,7 @@ class ExitWatch:
     def _count(self, free: list[Gap], partly: list[Gap], sight: Sight) -> None:
         """What speaks for and against what was seen before: what is not looked at stays as it was."""
         for seen in self._seen:
-            if not _in_view(seen.centre_w, sight):
+            if not _is_looked_at(seen, sight):
                 continue
             if any(_same(gap, seen) for gap in partly):
                 seen.shown, seen.gone = seen.shown + 1, 0
@@ -235,10 +237,13 @@ def _same(gap: Gap, seen: _Seen) -> bool:
     return turned < _SAME_RAD and float(np.linalg.norm(gap.centre_w - seen.centre_w)) < _SAME_M
 
 
-def _in_view(centre_w: FloatArray, sight: Sight) -> bool:
-    offset = centre_w - sight.p_w[:2]
+def _is_looked_at(seen: _Seen, sight: Sight) -> bool:
+    """Whether a camera has an opening before it, and not aslant: along a wall it sees nothing of a door."""
+    offset = seen.centre_w - sight.p_w[:2]
+    away = float(np.linalg.norm(offset))
     bearing = float(wrapped(np.array(math.atan2(offset[1], offset[0]) - sight.yaw_rad)))
-    return NEAREST_M < float(np.linalg.norm(offset)) < NEAR_M and abs(bearing) < _FIELD_RAD
+    squarely = abs(float(offset @ seen.gaps[0].normal_w)) > _SQUARELY_COS * away
+    return NEAREST_M < away < _FARTHEST_M and abs(bearing) < _FIELD_RAD and squarely
 
 
 def _places(places_w: list[FloatArray]) -> int:
