@@ -13,10 +13,10 @@ from edgeslam_torch.types import FloatArray
 
 _PASSED_M = 0.25
 """Distance from solids at which a drone passes: what of a border is nearer to one leads nowhere."""
-FRONTIER_M = 0.3
+_FRONTIER_M = 0.3
 """Smaller borders of the unseen are gaps between rays, not places to go; a doorway of 0.85 m has this much."""
 WIDE_M = 1.0
-"""Wider ones are rooms and corridors; narrow ones are doorways, of which there are other signs, and behind things."""
+"""Wider ones are rooms and corridors; narrow ones are doorways, which other signs tell of, and gaps behind things."""
 _NEAR_M = 1.2
 """From nearer a look should show what is behind the border."""
 _LOOKED_S = 4.0
@@ -27,7 +27,7 @@ _ROUND_S = 13.0
 """Time of a full turn where no way is known, with a second to spare: after it there is nothing left to see."""
 
 
-def frontiers(layer: Layer, least_m: float = FRONTIER_M) -> np.ndarray:
+def frontiers(layer: Layer, least_m: float = _FRONTIER_M) -> np.ndarray:
     """One cell ``(F, 2)`` for each border between free and unseen that is wide enough to fly through, or wider."""
     unseen = ~layer.free & ~layer.solid
     border = layer.free & ndimage.binary_dilation(unseen) & (layer.from_solid_m > _PASSED_M)

@@ -27,7 +27,7 @@ _FIELD_RAD = math.radians(20.0)
 """Half the camera's field of view, less a margin: an opening within it that is not found again counts against it."""
 _SQUARELY_COS = math.cos(math.radians(50.0))
 """Angle to an opening's normal from which on it is seen aslant."""
-NEAREST_M, _FARTHEST_M = 0.8, 2.5
+_NEAREST_M, _FARTHEST_M = 0.8, 2.5
 """From nearer an opening is more than what a camera sees; from farther away it closes and opens with every depth."""
 _LOOKS = 3
 _GLIMPSES = 2
@@ -243,7 +243,7 @@ def _is_looked_at(seen: _Seen, sight: Sight) -> bool:
     away = float(np.linalg.norm(offset))
     bearing = float(wrapped(np.array(math.atan2(offset[1], offset[0]) - sight.yaw_rad)))
     squarely = abs(float(offset @ seen.gaps[0].normal_w)) > _SQUARELY_COS * away
-    return NEAREST_M < away < _FARTHEST_M and abs(bearing) < _FIELD_RAD and squarely
+    return _NEAREST_M < away < _FARTHEST_M and abs(bearing) < _FIELD_RAD and squarely
 
 
 def _places(places_w: list[FloatArray]) -> int:
