@@ -309,8 +309,8 @@ class EdgeSlam:
         return self._system.published.cloud(cloud)
 
     def surroundings(self) -> tuple[FloatArray, FloatArray]:
-        """Anchors ``(N, 3)`` and edge points ``(M, 3)`` float64 of keyframes that see what the newest frame sees, as
-        published.
+        """Triangulated anchors ``(N, 3)`` and edge points ``(M, 3)`` float64 of keyframes that see what the newest
+        frame sees, as published.
 
         What an obstacle is told by, without what is known of the next room: a consistent snapshot in a millisecond;
         both whole maps take thirty to fifty.
@@ -320,6 +320,7 @@ class EdgeSlam:
         with self.map.lock:
             reference = self.map.keyframes[self.map.heir_of(self.log.records[-1].keyframe_id)[0]]
             seen = self.map.anchors_seen_by([reference, *self.map.covisible(reference, _AROUND)])
+            seen = seen[~self.map.anchors.from_depth[seen]]  # a network's guesses tell nothing of another network
             p_w, edges_w = self.map.anchors.p_w[seen], self.edges.around(reference)
         return self._system.published.points(p_w), self._system.published.points(edges_w)
 

@@ -245,9 +245,13 @@ def test_surroundings_are_what_the_newest_keyframe_and_its_neighbours_see(monkey
     newest = slam.map.keyframes[slam.map.heir_of(slam.log.records[-1].keyframe_id)[0]]
     monkeypatch.setattr(slam.map, "covisible", lambda keyframe, count: [])
     anchors, _ = slam.surroundings()
-    own = slam.map.anchors.p_w[slam.map.anchors_seen_by([newest])]
+    seen = slam.map.anchors_seen_by([newest])
+    guessed = slam.map.anchors.from_depth[seen]
+    own = slam.map.anchors.p_w[seen[~guessed]]
     np.testing.assert_allclose(anchors, slam._system.published.points(own))
     assert len(anchors) < len(slam.anchors().p_w)
+    monkeypatch.setattr(slam.map.anchors, "from_depth", np.ones_like(slam.map.anchors.from_depth))
+    assert len(slam.surroundings()[0]) == 0, "what a network guessed is no point of the map"
 
 
 def test_two_runs_give_the_same_bytes():

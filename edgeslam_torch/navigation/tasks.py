@@ -22,8 +22,6 @@ ARRIVED_M = 0.15
 MOST_LOSSES = 5
 _MOST_DOUBT_M = 0.3
 """Doubt about where it is that may count as having arrived, at most."""
-_NEAR_BY_M = 2.4
-"""Distance to the unseen, of two looks around, within which it is flown to before what is known is looked at again."""
 _NEAREST_M, _TRIES = 0.5, 3
 """How near its goal a drone stays that has lost its pose there, and was brought back, this often: what carries it on
 are velocities that a Tello cuts off, and it would come no nearer until its battery is empty."""
@@ -136,27 +134,24 @@ class Explore:
     _looks: Looks = field(default_factory=Looks)
     _around: LooksAround = field(default_factory=LooksAround)
     _second: SecondLook = field(default_factory=SecondLook)
-    _closely: bool = False
-    """Whether nothing near by is left to see but by looking more closely."""
 
     def goals(self, layer: Layer, sight: Sight) -> np.ndarray:
         """Cells to look from at what may be an opening, on the way; those at the middle of each wide border of the
-        unseen; the other openings; narrow borders; and at last those between where it has looked around.
-
-        To fly back for every doubt, or to look behind every chair, would leave no time for what was never seen.
+        unseen, and to look from at what was not looked at from before, or may be an opening elsewhere, the nearest of
+        which is flown to; then narrow borders, behind chairs and in corners, and openings once more that a look left in
+        doubt.
         """
         here = sight.p_w[:2]
         borders = self._looks.worth(reachable(frontiers(layer), layer, here), layer, sight)
-        away_m = np.linalg.norm(layer.centres(borders).reshape(-1, 2) - here, axis=1)
-        self._closely = bool((away_m > _NEAR_BY_M).all())
         if len(found := self._second.on_the_way(layer, sight)):
             return self._goes_on(found)
         wide = (borders[:, None] == frontiers(layer, WIDE_M)).all(-1).any(1)
-        if wide.any():
-            return borders[wide]
-        if len(found := self._second.goals(layer, sight)):
+        found = np.concatenate([borders[wide], self._around.goals(layer, sight), self._second.goals(layer, sight)])
+        if len(found):
             return self._goes_on(found)
-        return borders if len(borders) else self._goes_on(reachable(self._around.between(layer), layer, here))
+        self._second.once_more(sight.stamp_s)
+        again = self._second.goals(layer, sight)
+        return np.concatenate([borders, self._goes_on(again)])
 
     def _goes_on(self, cells: np.ndarray) -> np.ndarray:
         """It is not over as long as there are cells."""
@@ -183,8 +178,8 @@ class Explore:
         self._second.consider(candidates)
 
     def heading_rad(self, sight: Sight) -> float | None:
-        """Left and right, standing, wherever it has not looked around; at what may be an opening, where it shows."""
-        around = self._around.heading_rad(sight, self._closely)
+        """At what it has not looked at from before, standing; at what may be an opening, where it shows."""
+        around = self._around.heading_rad(sight)
         return around if around is not None else self._second.heading_rad(sight)
 
     def faces_rad(self, sight: Sight) -> float | None:

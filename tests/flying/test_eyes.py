@@ -39,7 +39,13 @@ def bare_wall():
 
 def told(eyes, stamp_s, state, revision=3, image=None):
     output = SimpleNamespace(
-        health=SimpleNamespace(state=state), stamp_s=stamp_s, revision=revision, T_w_c=np.eye(4), unit=1.0
+        health=SimpleNamespace(state=state),
+        stamp_s=stamp_s,
+        revision=revision,
+        T_w_c=np.eye(4),
+        unit=1.0,
+        metric=True,
+        scale=ScaleEstimate(1.0, 0.02, "telemetry"),
     )
     return eyes._depth(bare_wall() if image is None else image, output)
 
@@ -57,6 +63,29 @@ def test_a_picture_with_too_few_points_goes_by_the_last_fit(eyes):
     eyes._slam = SimpleNamespace(surroundings=lambda: (np.zeros((0, 3)), np.zeros((0, 3))))
     np.testing.assert_allclose(told(eyes, 2.0, "tracking").depth_m, DISTANCE_M, rtol=0.02)
     assert told(eyes, 5.1, "tracking") is None
+
+
+def test_a_picture_whose_points_are_in_another_unit_goes_by_the_usual_metre(eyes):
+    """After a turn on the spot a new piece of map is 3 times as large as it says."""
+    eyes._unit = 3, 1.0
+    for k in range(20):
+        told(eyes, 1.0 + 0.2 * k, "tracking")
+    points, _ = eyes._slam.surroundings()
+    eyes._slam = SimpleNamespace(surroundings=lambda: (3.0 * points, np.zeros((0, 3))))
+    for k in range(6):
+        depth = told(eyes, 5.0 + 0.2 * k, "tracking")
+    np.testing.assert_allclose(depth.depth_m, DISTANCE_M, rtol=0.02)
+    assert depth.sigma_log.min() >= 0.29
+    assert eyes._usual.doubt == pytest.approx(2.0, rel=0.05)
+
+
+def test_what_is_usual_bridges_pictures_without_points_as_long_as_the_unit_lasts(eyes):
+    eyes._unit = 3, 1.0
+    for k in range(20):
+        told(eyes, 1.0 + 0.2 * k, "tracking")
+    eyes._slam = SimpleNamespace(surroundings=lambda: (np.zeros((0, 3)), np.zeros((0, 3))))
+    np.testing.assert_allclose(told(eyes, 60.0, "tracking").depth_m, DISTANCE_M, rtol=0.02)
+    assert told(eyes, 60.0, "tracking", revision=4) is None
 
 
 def test_edges_of_the_map_stand_before_what_the_network_sees(eyes):
@@ -117,6 +146,18 @@ def test_a_network_contradicts_nothing_that_velocities_and_heights_confirm(used,
         scale=ScaleEstimate(2.55, 0.05, used), sources=(*sources, ScaleEstimate(network, 0.2 * network, "depth"))
     )
     assert _contradicted(health) == contradicted
+
+
+def test_a_doubtful_metre_is_told(eyes):
+    """By the SLAM's own sources it is sure to 2 %."""
+    sure = ScaleEstimate(1.0, 0.02, "telemetry")
+    health = SimpleNamespace(state="tracking", scale=sure, sources=(), apart_sigma=0.0, drift_sigma=0.0, metric=True)
+    pose = SimpleNamespace(T_w_c=np.eye(4), covariance=1e-4 * np.eye(6), velocity_w=np.zeros(3), revision=0)
+    eyes._slam = SimpleNamespace(pose_now=lambda now_s, samples: pose)
+    eyes._output = SimpleNamespace(health=health, piece=0)
+    assert eyes.sight(1.0).scale_sigma == pytest.approx(0.02)
+    eyes._usual._against, eyes._usual._off_log = 5, np.log(3.0)
+    assert eyes.sight(1.0).scale_sigma == pytest.approx(2.0, rel=0.01)
 
 
 class Slam:

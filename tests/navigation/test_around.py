@@ -5,7 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from edgeslam_torch.navigation.exploring.around import LooksAround
+from edgeslam_torch.navigation.exploring.around import LooksAround, _in_turn
+from edgeslam_torch.navigation.exploring.coverage import Borders
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.moved import Moved
 from edgeslam_torch.navigation.sight import Sight
@@ -15,65 +16,110 @@ def at(now_s, x, yaw_deg, tracked=True):
     return Sight(now_s, np.array([x, 0.0, 1.15]), math.radians(yaw_deg), np.zeros(3), tracked=tracked)
 
 
-def looked(looks, x, yaw_deg=10.0, begin_s=0.0, seconds=12.0, turns=True):
+def corridor(long_m=6.0):
+    """Two metres wide, from 1 m behind the drone to where it ends."""
+    x, y = np.meshgrid((np.arange(100) + 0.5) * 0.1 - 2.0, (np.arange(60) + 0.5) * 0.1 - 3.0, indexing="ij")
+    free = (np.abs(y) < 0.95) & (x > -1.0) & (x < long_m)
+    return Layer(free, ~free, np.array([-2.0, -3.0]), 0.1)
+
+
+CORRIDOR = corridor()
+
+
+def asked(looks, x, now_s=0.0, layer=CORRIDOR):
+    """Places ``(G, 2)`` from which to look."""
+    return layer.centres(looks.goals(layer, at(now_s, x, 0.0))).reshape(-1, 2)
+
+
+def looked(looks, x, yaw_deg=0.0, begin_s=0.0, seconds=20.0, turns=True):
     """Headings [degrees] that a drone has which turns by 60 degrees a second to where it is asked to look."""
     seen = []
+    asked(looks, x, begin_s)
     for k in range(round(20 * seconds)):
         wanted = looks.heading_rad(at(begin_s + k / 20, x, yaw_deg))
         if wanted is None:
             break
         error = (math.degrees(wanted) - yaw_deg + 180.0) % 360.0 - 180.0
         yaw_deg += float(np.clip(error, -3.0, 3.0)) if turns else 0.0
-        seen.append(yaw_deg)
+        seen.append((yaw_deg + 180.0) % 360.0 - 180.0)
     return seen
 
 
-def test_it_looks_to_both_sides_and_ahead_again():
-    seen = looked(LooksAround(), 0.0)
-    assert min(seen) == pytest.approx(10.0 - 75.0, abs=9.0)
-    assert max(seen) == pytest.approx(10.0 + 75.0, abs=9.0)
-    assert seen[-1] == pytest.approx(10.0, abs=9.0)
+def test_it_looks_at_both_walls_beside_it_from_before():
+    seen = np.array(looked(LooksAround(), 2.0))
+    for side in (1.0, -1.0):
+        assert (np.abs(side * seen - 90.0) < 8.0).any(), "a door beside the corridor comes to the picture's middle"
+    assert len(seen) < 20 * 10, "in less than ten seconds"
 
 
-def test_once_about_a_place():
+def test_what_it_has_looked_at_is_not_looked_at_again():
     looks = LooksAround()
-    assert looked(looks, 0.0)
-    assert not looked(looks, 1.1, begin_s=20.0)
-    assert looked(looks, 1.3, begin_s=30.0)
-    assert not looked(looks, 0.1, begin_s=40.0)
+    assert looked(looks, 2.0)
+    looks.goals(CORRIDOR, at(30.0, 2.0, 0.0))
+    left = looks._left.p_w
+    beside = (np.abs(left[:, 0] - 2.0) < 0.9) & (np.abs(left[:, 1]) < 1.1)
+    assert beside.sum() * 0.1 < 0.4, "of four metres of wall"
+    assert not looked(looks, 2.1, begin_s=40.0), "and there it does not stand again"
 
 
-def test_half_way_between_two_places_is_another_one_if_it_looks_closely():
+def test_it_is_sent_to_where_most_is_left_until_all_is_looked_at():
+    looks, x, stands = LooksAround(), 0.0, 0
+    for k in range(20):
+        looked(looks, x, begin_s=30.0 * k)
+        if len(places := asked(looks, x, 30.0 * k + 20.0)) == 0:
+            break
+        assert np.abs(places[:, 1]).max() < 0.65, "thirty centimetres from a wall at least"
+        x, stands = float(places[np.argmin(np.abs(places[:, 0] - x)), 0]), stands + 1
+    assert 3 <= stands < 12
+    left = looks._left.p_w
+    sides = (np.abs(left[:, 0] - 2.5) < 2.5) & (np.abs(left[:, 1]) < 1.1)
+    assert sides.sum() * 0.1 < 2.0, "of ten metres of wall beside the way"
+
+
+def test_a_view_ahead_alone_is_looked_at_only_if_there_is_a_doors_width_of_it():
     looks = LooksAround()
-    for k, x in enumerate([0.0, 1.3]):
-        assert looked(looks, x, begin_s=20.0 * k)
-    assert looks.heading_rad(at(50.0, 0.65, 10.0)) is None
-    assert looks.heading_rad(at(51.0, 0.65, 10.0), closely=True) is not None
+    assert looks.heading_rad(at(0.0, 2.0, 0.0)) is None, "nothing is known yet"
+    x, y = np.meshgrid((np.arange(60) + 0.5) * 0.1, (np.arange(60) + 0.5) * 0.1 - 3.0, indexing="ij")
+    small = Layer(np.hypot(x - 2.0, y) < 0.5, np.zeros(x.shape, bool), np.array([0.0, -3.0]), 0.1)
+    looks.goals(small, at(0.1, 2.0, 0.0))
+    assert looks.heading_rad(at(0.2, 2.0, 0.0)) is None, "all is nearer than a door fits into a picture"
 
 
-def test_between_is_half_way_where_it_can_be_and_has_not_been():
+def test_where_a_look_showed_nothing_it_is_not_sent_once_more():
     looks = LooksAround()
-    for k, x in enumerate([0.0, 1.3, 2.6, 5.5]):
-        assert looked(looks, x, begin_s=20.0 * k)
-    x, _ = np.meshgrid(np.arange(80) * 0.1, np.arange(10) * 0.1, indexing="ij")
-    layer = Layer(np.abs(x - 1.9) > 0.3, np.zeros(x.shape, bool), np.array([-0.05, -0.05]), 0.1)
-    assert layer.centres(looks.between(layer)) == pytest.approx(np.array([[0.65, 0.0]]), abs=0.06)
-    looks.heading_rad(at(100.0, 0.66, 10.0), closely=True)
-    assert len(looks.between(layer)) == 0
+    best = asked(looks, 2.0)[0]
+    looked(looks, float(best[0]), turns=False)
+    places = asked(looks, float(best[0]), 30.0)
+    assert len(places) and np.linalg.norm(places - [best[0], 0.0], axis=1).min() > 0.4
+
+
+@pytest.mark.parametrize(("cells", "stands"), [(4, False), (8, True)])
+def test_less_than_a_doors_width_of_wall_is_no_reason_to_stand(cells, stands):
+    looks = LooksAround()
+    looks._left = Borders(np.array([[2.0 + 0.1 * k, 1.0] for k in range(cells)]), np.tile([0.0, -1.0], (cells, 1)))
+    assert (looks.heading_rad(at(0.0, 2.2, 0.0)) is not None) == stands
 
 
 def test_a_lost_pose_and_a_drone_that_does_not_turn_end_it():
     looks = LooksAround()
-    assert looks.heading_rad(at(0.0, 0.0, 10.0)) is not None
-    assert looks.heading_rad(at(0.1, 0.0, 10.0, tracked=False)) is None
-    assert looks.heading_rad(at(0.2, 0.0, 10.0)) is None
-    assert len(looked(LooksAround(), 0.0, seconds=20.0, turns=False)) == pytest.approx(240, abs=2)
+    asked(looks, 2.0)
+    assert looks.heading_rad(at(0.0, 2.0, 0.0)) is not None
+    assert looks.heading_rad(at(0.1, 2.0, 0.0, tracked=False)) is None
+    assert looks.heading_rad(at(0.2, 2.0, 0.0)) is None
+    assert len(looked(LooksAround(), 2.0, seconds=20.0, turns=False)) == pytest.approx(320, abs=2)
 
 
 def test_places_go_along_with_the_map():
-    """Metres become twice as long: 1.3 m from the first place is .65 of today's."""
+    """Metres become twice as long: where it has looked around, 2 m from its take-off, is 4 m from it."""
     looks = LooksAround()
-    assert looked(looks, 1.0)
+    assert looked(looks, 2.0)
     looks.carry(Moved(np.eye(4)[None], np.eye(4)[None], 2.0))
-    assert not looked(looks, 1.9, begin_s=20.0)
-    assert looked(looks, 0.7, begin_s=30.0)
+    assert not looked(looks, 4.1, begin_s=30.0)
+    assert looked(looks, 2.0, begin_s=60.0)
+
+
+def test_headings_follow_each_other_the_short_way_round():
+    assert _in_turn([math.radians(a) for a in (-100.0, 160.0, 60.0)]) == pytest.approx(
+        [math.radians(a) for a in (60.0, 160.0, -100.0)]
+    )
+    assert _in_turn([]) == []

@@ -100,66 +100,111 @@ def test_what_was_tried_goes_along_with_the_map():
     assert look.heading_rad(at(1.8, -0.3, 5.0)) is not None
 
 
-def test_exploring_flies_back_for_a_doubt_when_nothing_is_left_to_see():
-    """A border of the unseen at the right; a door to look at a good way behind the drone, or beside it."""
+def test_what_was_seen_in_a_glimpse_may_be_looked_at_from_where_that_was():
+    """In a corridor of two metres there is no other place before a door."""
+    before = np.array([1.8, 0.0])
+    assert considering(Candidate(DOOR.centre_w, DOOR.normal_w, before)).heading_rad(at(*before)) is None
+    glimpsed = considering(Candidate(DOOR.centre_w, DOOR.normal_w, before, elsewhere=False))
+    assert glimpsed.heading_rad(at(*before)) == pytest.approx(0.0)
+    assert np.linalg.norm(wanted(glimpsed, room()) - before, axis=1).min() < 0.1
+
+
+def test_what_a_look_left_in_doubt_is_looked_at_from_elsewhere_twice_more():
+    look, stood = considering(DOOR), []
+    for k in range(4):
+        look.once_more(10.0 * k)
+        places = wanted(look, room(), now_s=10.0 * k)
+        if k == 3:
+            assert len(places) == 0, "three times in all"
+            break
+        assert all(np.linalg.norm(places - place, axis=1).min() > 0.3 for place in stood)
+        stood.append(places[0])
+        assert look.heading_rad(at(*places[0], 10.0 * k)) is not None
+        look.once_more(10.0 * k + 3.9)
+        assert look.heading_rad(at(*places[0], 10.0 * k + 4.1)) is None
+    assert len(stood) == 3
+
+
+def test_what_no_way_led_to_is_not_tried_once_more():
+    look = considering(DOOR)
+    assert len(wanted(look, room(), now_s=0.0))
+    look.once_more(31.0)
+    assert len(wanted(look, room(), now_s=31.0)) == 0
+
+
+def plain(end_m=9.0, corner=False):
+    """A room of six metres by six; what is beyond ``end_m`` was not seen, nor is a corner behind something."""
     x, y = np.meshgrid((np.arange(60) + 0.5) * 0.1, (np.arange(60) + 0.5) * 0.1 - 3.0, indexing="ij")
-    ends = Layer(np.broadcast_to(x < 5.0, y.shape), np.zeros((60, 60), bool), np.array([0.0, -3.0]), 0.1)
-    known = Layer(np.ones((60, 60), bool), np.zeros((60, 60), bool), np.array([0.0, -3.0]), 0.1)
+    unseen = (np.abs(x - 3.0) < 0.5) & (np.abs(y - 2.2) < 0.5) if corner else np.zeros(x.shape, bool)
+    thing = (np.abs(x - 3.0) < 0.75) & (y > 1.7) & (y < 2.95) & ~unseen if corner else unseen
+    return Layer(~unseen & ~thing & (x < end_m), thing, np.array([0.0, -3.0]), 0.1)
+
+
+def goals(task, layer, x, y, now_s=0.0):
+    return layer.centres(task.goals(layer, at(x, y, now_s))).reshape(-1, 2)
+
+
+def test_exploring_flies_to_borders_walls_and_doubts_whichever_is_near():
     door = Candidate(np.array([0.5, 0.0]), np.array([-1.0, 0.0]), np.array([2.0, 1.5]))
     task = Explore()
     task.consider([door])
-    assert ends.centres(task.goals(ends, at(4.5, 0.0)))[:, 0].min() > 4.5, "there is a border ahead"
-    assert ends.centres(task.goals(ends, at(2.2, 0.0, 0.5)))[:, 0].max() < 2.6, "it is on the way"
-    assert known.centres(task.goals(known, at(4.5, 0.0, 1.0)))[:, 0].max() < 2.6, "nothing is left to see"
+    found = goals(task, plain(5.0), 4.5, 0.0)
+    assert found[:, 0].max() > 4.5, "the border of what was never seen"
+    assert found[:, 0].min() < 2.6, "and the door"
+    assert goals(task, plain(5.0), 2.2, 0.0, 0.5)[:, 0].max() < 2.6, "the door alone where it is on the way"
+
+
+def test_exploring_looks_at_every_wall_from_before_and_then_ends():
+    """A drone that is at its goal at once; of the border of the unseen it sees no more."""
+    task, layer, x, y, yaw = Explore(), plain(5.0), 2.0, 0.0, 0.0
+    for now_s in np.arange(0.0, 400.0, 0.1):
+        sight = Sight(now_s, np.array([x, y, 1.15]), yaw, np.zeros(3))
+        if task.done(sight):
+            break
+        if (heading := task.heading_rad(sight)) is not None:
+            yaw += float(np.clip(math.remainder(heading - yaw, 2.0 * math.pi), -0.1, 0.1))
+        elif len(found := goals(task, layer, x, y, now_s)):
+            x, y = found[np.argmin(np.hypot(*(found - [x, y]).T))]
+    assert now_s < 399.0
+    task._around.goals(layer, at(x, y))
+    assert len(task._around._left.p_w) * 0.1 < 2.0, "of 22 m of wall"
 
 
 def test_exploring_leaves_narrow_borders_for_later():
     """What is unseen in a thing near by, the open end of the room, and a door to look at."""
-    x, y = np.meshgrid((np.arange(60) + 0.5) * 0.1, (np.arange(60) + 0.5) * 0.1 - 3.0, indexing="ij")
-    corner = (np.abs(x - 3.0) < 0.5) & (np.abs(y - 2.2) < 0.5)
-    thing = (np.abs(x - 3.0) < 0.75) & (y > 1.7) & (y < 2.95) & ~corner
-    low = np.array([0.0, -3.0])
-    both, narrow = (Layer(~corner & ~thing & (x < end), thing, low, 0.1) for end in (5.0, 9.0))
     door = Candidate(np.array([0.5, -1.0]), np.array([-1.0, 0.0]), np.array([2.0, 0.5]))
     task = Explore()
+    task._around = Nothing()
     task.consider([door])
-    assert both.centres(task.goals(both, at(4.0, 0.5)))[:, 0].min() > 4.5, "the open end"
-    assert narrow.centres(task.goals(narrow, at(4.0, 0.5, 0.5)))[:, 1].max() < 0.0, "then the door"
+    corner = [3.0, 1.5]
+    near = [np.linalg.norm(goals(task, plain(end, True), 4.0, 0.5) - corner, axis=1).min() for end in (5.0, 9.0)]
+    assert min(near) > 0.5
     task.consider([])
-    assert narrow.centres(task.goals(narrow, at(4.0, 0.5, 1.0)))[:, 1].min() > 1.0, "then the corner"
+    assert goals(task, plain(9.0, True), 4.0, 0.5, 1.0)[:, 1].min() > 1.0, "then the corner"
 
 
-def test_exploring_looks_around_more_closely_when_nothing_else_is_left():
-    known = Layer(np.ones((60, 60), bool), np.zeros((60, 60), bool), np.array([0.0, -3.0]), 0.1)
+class Nothing:
+    """Looks around that have nothing to look at."""
+
+    def goals(self, layer, sight):
+        return np.zeros((0, 2), int)
+
+
+def test_exploring_looks_once_more_at_what_is_in_doubt_when_nothing_else_is_left():
     task = Explore()
-    assert len(task.goals(known, at(1.0, 0.0))) == 0
-    for k, x in enumerate([1.0, 2.3]):
-        task.heading_rad(at(x, 0.0, 20.0 * k))
-        task.heading_rad(at(x, 0.0, 20.0 * k + 15.0))  # it does not turn, and gives that up
-    goals = known.centres(task.goals(known, at(2.3, 0.0, 40.0)))
-    assert goals == pytest.approx(np.array([[1.65, 0.05]]), abs=0.06)
-    assert task.heading_rad(at(1.66, 0.0, 45.0)) is not None
-    task.heading_rad(at(1.66, 0.0, 60.0))
-    assert len(task.goals(known, at(1.66, 0.0, 61.0))) == 0
-    assert not task.done(at(1.66, 0.0, 61.0)) and task.done(at(1.66, 0.0, 75.0))
-
-
-@pytest.mark.parametrize(("border_x", "closely"), [(5.0, True), (3.0, False)])
-def test_on_another_pass_exploring_looks_more_closely_far_from_what_is_unseen(border_x, closely):
-    x, y = np.meshgrid((np.arange(60) + 0.5) * 0.1, (np.arange(60) + 0.5) * 0.1 - 3.0, indexing="ij")
-    ends = Layer(np.broadcast_to(x < border_x, y.shape), np.zeros((60, 60), bool), np.array([0.0, -3.0]), 0.1)
-    task = Explore()
-    for k, place in enumerate([1.0, 2.3]):
-        task.heading_rad(at(place, 0.0, 20.0 * k))
-        task.heading_rad(at(place, 0.0, 20.0 * k + 15.0))
-    assert len(task.goals(ends, at(1.65, 0.0, 40.0)))
-    assert (task.heading_rad(at(1.65, 0.0, 40.1)) is not None) == closely
+    task._around = Nothing()
+    task.consider([DOOR])
+    assert len(goals(task, plain(), 0.5, 1.0))
+    task._second.heading_rad(at(1.8, -0.3, 1.0))
+    again = goals(task, plain(), 1.8, -0.3, 6.0)
+    assert len(again) and np.linalg.norm(again - [1.8, -0.3], axis=1).min() > 0.3
 
 
 def test_exploring_goes_on_while_there_is_an_opening_to_look_at():
-    """All is known: it would end after a look around."""
+    """All is known and looked at: it would end after a look around."""
     known = Layer(np.ones((60, 60), bool), np.zeros((60, 60), bool), np.array([0.0, -3.0]), 0.1)
     ends, goes_on = Explore(), Explore()
+    ends._around = goes_on._around = Nothing()
     for now_s in np.arange(0.0, 20.0, 0.5):
         if now_s == 5.0:
             goes_on.consider([DOOR])

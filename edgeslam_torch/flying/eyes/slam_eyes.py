@@ -17,6 +17,7 @@ from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.navigation.moved import Moved, moves
 from edgeslam_torch.navigation.near.depth import NearFit, fit_to_points
 from edgeslam_torch.navigation.near.points import agreeing, seen_points, with_nearer_points
+from edgeslam_torch.navigation.near.usual import UsualMetre
 from edgeslam_torch.navigation.sight import Sight, View
 from edgeslam_torch.navigation.space import CELL_M, KEPT
 from edgeslam_torch.navigation.supervisor import SCALE_SIGMA
@@ -87,6 +88,8 @@ class SlamEyes:
         self._home = Home(np.eye(3), 1.0, np.zeros(3))
         self._fit: tuple[NearFit, float, int] | None = None
         """The last fit of depth to points, when its picture arrived, and in which unit."""
+        self._usual, self._unit = UsualMetre(), (0, 1.0)
+        """The second: revision, and metres for a published unit in it."""
         self._metres = np.nan
         """Metres per map unit by which it goes; NaN while the published unit is all there is."""
         self._shown: tuple[FloatArray, float, int] = np.zeros((0, 4, 4)), 1.0, 0
@@ -131,6 +134,7 @@ class SlamEyes:
         with self._lock:
             del self._samples[: len(batch)]
             self._output, self._captured_s, self._home = output, captured_s, home
+            self._unit = output.revision, home.scale
             self._changes += int(np.isfinite(metres) and metres != self._metres)
             self._metres = metres
             if depth is not None:
@@ -168,7 +172,7 @@ class SlamEyes:
             )
         health = output.health
         T_w_b = home.poses(pose.T_w_c) @ se3.inverse(self._T_b_c)
-        relative = health.scale.sigma / health.scale.value
+        relative = float(np.hypot(health.scale.sigma / health.scale.value, self._usual.doubt))
         sigma = home.scale * float(np.sqrt(np.clip(np.trace(pose.covariance[:3, :3]) / 3.0, 0.0, None)))
         return Sight(
             now_s,
@@ -237,6 +241,14 @@ class SlamEyes:
         Of all points of the map those of the next room, behind the wall, would be more than those that are seen.
         """
         fit = fit_to_points(depth, *seen_points(anchors, self._camera.K, output.T_w_c, depth.depth_m.shape))
+        revision, unit_m = self._unit
+        if revision == output.revision:
+            believed = fit is not None and self._usual.believes(fit, unit_m, _is_sure(output))
+            usual = self._usual.line(unit_m)
+            if fit is None or not believed:
+                fit = usual
+            elif usual is not None:
+                fit = usual.through(fit)
         if fit is not None:
             self._fit = fit.alone(), output.stamp_s, output.revision
         return fit

@@ -1,4 +1,4 @@
-"""Where a drone that explores looks around, and where it has done so."""
+"""Where a drone that explores looks around: at what it has not looked at from before."""
 
 import math
 from dataclasses import dataclass, field
@@ -6,66 +6,80 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from edgeslam_torch.geometry.rotations import wrapped
+from edgeslam_torch.navigation.exploring.coverage import Borders, Coverage, borders
+from edgeslam_torch.navigation.exploring.frontiers import reachable
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.moved import Moved
+from edgeslam_torch.navigation.openings.watch import FIELD_RAD
 from edgeslam_torch.navigation.sight import Sight
 from edgeslam_torch.types import FloatArray
 
 _EVERY_M = 1.2
-"""Way from one look around to the next: a door of 0.85 m is seen from two places."""
-_BETWEEN_M = 0.5
-"""Distance from all places where half way between two of them is another one, on another pass: what was seen aslant
-from both is seen squarely from there."""
-_HALF_WAY_M = 0.25
-"""Distance from half way that counts as there."""
-_SIDE_RAD = math.radians(75.0)
-"""Turn to each side: half of a camera's 55 degrees more are seen, so all but what is behind."""
-_THERE_RAD = math.radians(8.0)
-_GIVEN_UP_S = 12.0
-"""Time of a look: five quarter turns at 60 degrees a second, twice."""
+"""Way from one look around to the next, in passing: a door of 0.85 m is seen from two places."""
+_AGAIN_M = 0.4
+"""Nearer than this to a place where it has looked around it looks at nothing new."""
+_THERE_M = 0.25
+"""Distance from a place that counts as there: a pilot comes no nearer."""
+_WORTH_M = 0.6
+"""Least length of border that is worth a look: the narrowest exit."""
+_REST_M = 0.3
+"""Less than this, to one side, is left."""
+_PASSED_M = 0.3
+"""Distance from solids of where it stands to look."""
+_COARSE = 3
+"""Every so many cells are asked in both directions."""
+_MOST = 8
+"""Places at a time: the nearest of them is flown to."""
+_THERE_RAD = math.radians(4.0)
+_SHOWN_RAD = FIELD_RAD - _THERE_RAD
+"""To each side of a heading, when it is reached."""
+_GIVEN_UP_S = 16.0
+"""Time of a look: one and a half turns at 60 degrees a second, with time to rest, and half as much again."""
 
 
 @dataclass(slots=True)
 class LooksAround:
-    """Asks for headings, one after the other, at places that are a way apart."""
+    """Asks for headings, one after the other, wherever there is something to look at from before."""
 
+    _coverage: Coverage = field(default_factory=Coverage)
+    _left: Borders = field(default_factory=lambda: Borders(np.zeros((0, 2)), np.zeros((0, 2))))
+    """What was not looked at, when last asked."""
+    _spots_w: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
+    """``(G, 2)`` from where to look at it."""
     _places_w: list[FloatArray] = field(default_factory=list)
     """``(2,)`` where it looked around."""
     _headings: list[float] = field(default_factory=list)
     """Still to be looked at, last first."""
     _since_s: float = math.nan
 
-    def between(self, layer: Layer) -> np.ndarray:
-        """Free cells ``(G, 2)`` half way from one place to the next, where it has not looked around."""
-        cells = layer.cells(self._half_way())
-        return np.asarray(cells[layer.free[cells[:, 0], cells[:, 1]]])
-
-    def _half_way(self) -> FloatArray:
-        """Those places ``(H, 2)``."""
-        places = np.array(self._places_w).reshape(-1, 2)
-        steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
-        middle = (0.5 * (places[1:] + places[:-1]))[steps < 2.0 * _EVERY_M]
-        return middle[np.array([self._away_m(p_w) > _BETWEEN_M for p_w in middle], dtype=bool)]
-
-    def _away_m(self, here_w: FloatArray) -> float:
-        return min((float(np.linalg.norm(here_w - place)) for place in self._places_w), default=math.inf)
-
-    def _is_new(self, here_w: FloatArray, closely: bool) -> bool:
-        if self._away_m(here_w) > _EVERY_M:
-            return True
-        return closely and bool((np.linalg.norm(self._half_way() - here_w, axis=1) < _HALF_WAY_M).any())
-
-    def heading_rad(self, sight: Sight, closely: bool = False) -> float | None:
-        """Where to look now; None to look ahead. A pose that is lost in a turn ends the look.
-
-        Args:
-            sight: Of this moment.
-            closely: Whether half way between two places counts as another one, on another pass.
-        """
+    def goals(self, layer: Layer, sight: Sight) -> np.ndarray:
+        """Cells ``(G, 2)`` from each of which most is looked at that is not from those before it."""
         here = sight.p_w[:2]
-        if not self._headings and self._is_new(here, closely):
+        self._left = self._coverage.unlooked(borders(layer, here))
+        free = layer.free[::_COARSE, ::_COARSE] & (layer.from_solid_m[::_COARSE, ::_COARSE] > _PASSED_M)
+        cells = reachable(np.argwhere(free) * _COARSE, layer, here)
+        p_w = layer.centres(cells).reshape(-1, 2)
+        away = np.linalg.norm(p_w - here, axis=1)
+        new = np.array([self._away_m(p) > _AGAIN_M for p in p_w], dtype=bool)
+        shown = self._left.before(p_w) & new[:, None]
+        chosen: list[int] = []
+        while len(cells) and len(chosen) < _MOST:
+            gain_m = shown.sum(1) * layer.cell_m
+            best = int(np.argmax(np.where(gain_m >= _WORTH_M, gain_m - 0.1 * away, -np.inf)))
+            if gain_m[best] < _WORTH_M:
+                break
+            chosen.append(best)
+            shown &= ~shown[best]
+        self._spots_w = p_w[chosen]
+        return np.asarray(cells[chosen])
+
+    def heading_rad(self, sight: Sight) -> float | None:
+        """Where to look now; None to look ahead. A pose that is lost in a turn ends the look."""
+        self._coverage.note(sight)
+        here = sight.p_w[:2]
+        if not self._headings and self._is_new(here):
             self._places_w.append(here.copy())
-            self._headings = [sight.yaw_rad + side * _SIDE_RAD for side in (0.0, 1.0, -1.0)]
+            self._headings = [sight.yaw_rad + turn for turn in reversed(_in_turn(self._sides(here, sight.yaw_rad)))]
             self._since_s = sight.stamp_s
         if not sight.tracked or sight.stamp_s - self._since_s > _GIVEN_UP_S:
             self._headings = []
@@ -75,4 +89,42 @@ class LooksAround:
 
     def carry(self, moved: Moved) -> None:
         """Take the places along with the map; directions of level flight hardly turn with it."""
+        self._coverage.carry(moved)
         self._places_w = list(moved.points(np.array(self._places_w).reshape(-1, 2)))
+        self._spots_w = moved.points(self._spots_w)
+        self._left = Borders(moved.points(self._left.p_w), self._left.normal_w)
+
+    def _away_m(self, here_w: FloatArray) -> float:
+        return min((float(np.linalg.norm(here_w - place)) for place in self._places_w), default=math.inf)
+
+    def _is_new(self, here_w: FloatArray) -> bool:
+        """Whether to stand and look: a way from the last time, if it is worth it, or where it was sent for that."""
+        if self._away_m(here_w) > _EVERY_M:
+            return float(self._left.before(here_w[None]).sum()) * 0.1 >= _WORTH_M
+        there = (np.linalg.norm(self._spots_w - here_w, axis=1) < _THERE_M).any()
+        return bool(there) and self._away_m(here_w) > _AGAIN_M - _THERE_M
+
+    def _sides(self, here_w: FloatArray, yaw_rad: float) -> list[float]:
+        """Turns from its heading that show what is to be looked at from here, most first."""
+        step = self._left.p_w[self._left.before(here_w[None])[0]] - here_w
+        left = np.asarray(wrapped(np.arctan2(step[:, 1], step[:, 0]) - yaw_rad))
+        tried = np.arange(-175.0, 180.0, 5.0) * math.pi / 180.0
+        found: list[float] = []
+        while len(left):
+            shown = np.abs(wrapped(left - tried[:, None])) < _SHOWN_RAD
+            best = int(np.argmax(shown.sum(1)))
+            if shown[best].sum() * 0.1 < _REST_M:
+                break
+            found.append(float(tried[best]))
+            left = left[~shown[best]]
+        return found
+
+
+def _in_turn(turns_rad: list[float]) -> list[float]:
+    """The nearest first, then the nearest to that."""
+    left, order = np.array(turns_rad), [0.0]
+    while len(left):
+        nearest = int(np.argmin(np.abs(wrapped(left - order[-1]))))
+        order.append(float(left[nearest]))
+        left = np.delete(left, nearest)
+    return order[1:]

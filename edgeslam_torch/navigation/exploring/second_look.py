@@ -36,6 +36,10 @@ _ON_THE_WAY_M = 1.2
 """Distance of a place to look from that is no detour: as far as from one look around to the next."""
 _SAME_M = 0.5
 """An opening moves as it is looked at."""
+_TIMES = 3
+"""Looks at one opening in all, if nothing else is left to do: what half of it showed has another middle ..."""
+_APART_M = 0.3
+"""... and is looked at from another place."""
 
 
 @dataclass(slots=True)
@@ -45,8 +49,19 @@ class _Tried:
     centre_w: FloatArray
     until_s: float = np.inf
     """When it is given up."""
-    stands: bool = False
-    """Whether the drone has come to where it shows."""
+    stood_w: list[FloatArray] = field(default_factory=list)
+    """``(2,)`` from where it was looked at, look by look."""
+    times: int = 1
+
+    @property
+    def stands(self) -> bool:
+        """Whether the drone has come to where it shows this time."""
+        return len(self.stood_w) == self.times
+
+    def is_new(self, p_w: np.ndarray) -> np.ndarray:
+        """``(P,)`` whether places ``(P, 2)`` are others than those of earlier looks."""
+        before = np.array(self.stood_w[: self.times - 1]).reshape(-1, 2)
+        return np.asarray((np.linalg.norm(p_w[:, None] - before, axis=-1) > _APART_M).all(axis=1))
 
 
 @dataclass(slots=True)
@@ -77,7 +92,8 @@ class SecondLook:
     def _from(self, cells: np.ndarray, layer: Layer, sight: Sight) -> np.ndarray:
         found = [np.zeros((0, 2), int)]
         for candidate, tried in self._worth(sight.stamp_s):
-            there = cells[_shows(candidate, layer.centres(cells).reshape(-1, 2), _INSIDE_M)]
+            p_w = layer.centres(cells).reshape(-1, 2)
+            there = cells[_shows(candidate, p_w, _INSIDE_M) & tried.is_new(p_w)]
             if len(there):
                 tried.until_s = min(tried.until_s, sight.stamp_s + _SOUGHT_S)
             found.append(there)
@@ -86,18 +102,25 @@ class SecondLook:
     def heading_rad(self, sight: Sight) -> float | None:
         """Where to look, standing where one of them shows; None elsewhere."""
         for candidate, tried in self._worth(sight.stamp_s):
-            if _shows(candidate, sight.p_w[None, :2])[0]:
+            if _shows(candidate, sight.p_w[None, :2])[0] and tried.is_new(sight.p_w[None, :2])[0]:
                 if not tried.stands:
-                    tried.stands, tried.until_s = True, sight.stamp_s + _STANDS_S
+                    tried.stood_w.append(sight.p_w[:2].copy())
+                    tried.until_s = sight.stamp_s + _STANDS_S
                 step = candidate.centre_w - sight.p_w[:2]
                 return float(np.arctan2(step[1], step[0]))
         return None
 
+    def once_more(self, now_s: float) -> None:
+        """What was looked at and given up is worth another look: there is nothing else to do."""
+        for tried in (self._of(candidate) for candidate in self._candidates):
+            if now_s >= tried.until_s and tried.stands and tried.times < _TIMES:
+                tried.times, tried.until_s = tried.times + 1, np.inf
+
     def carry(self, moved: Moved) -> None:
         """Take the places along with the map; candidates come anew."""
-        places = moved.points(np.array([tried.centre_w for tried in self._tried]).reshape(-1, 2))
-        for tried, place in zip(self._tried, places, strict=True):
-            tried.centre_w = place
+        for tried in self._tried:
+            places = moved.points(np.array([tried.centre_w, *tried.stood_w]))
+            tried.centre_w, tried.stood_w = places[0], list(places[1:])
         self._candidates = ()
 
     def _worth(self, now_s: float) -> list[tuple[Candidate, _Tried]]:
@@ -120,5 +143,6 @@ def _shows(candidate: Candidate, p_w: FloatArray, inside_m: float = 0.0) -> np.n
     before = (p_w - candidate.centre_w) @ candidate.normal_w * (1.0 if away >= 0 else -1.0)
     aside = np.abs((p_w - candidate.centre_w) @ np.array([-candidate.normal_w[1], candidate.normal_w[0]]))
     elsewhere = np.linalg.norm(p_w - candidate.place_w, axis=1) >= _ELSEWHERE_M + inside_m
+    elsewhere |= not candidate.elsewhere
     apart = (before >= _BEFORE_M[0] + inside_m) & (before <= _BEFORE_M[1] - inside_m)
     return np.asarray(apart & (aside <= _ASIDE * before - inside_m) & elsewhere)

@@ -21,7 +21,7 @@ _LEAST_SIGMA = 0.03
 _SLOPES = (0.6, 2.0)
 _NEAR_SHARE = 0.06
 """Of the picture's width: 4 degrees of a Tello's, over which a network's error hardly changes."""
-_ALONE_SIGMA = 0.3
+ALONE_SIGMA = 0.3
 """Of depth that rests on the network alone."""
 _LINE_POINTS = 3.0
 """Points that outweigh the line."""
@@ -29,6 +29,11 @@ _BLOCK, _STRIDE = 8, 4
 """Side of the grid's cells [px], and of the pixels that share a mean."""
 _LEVEL_LOG, _BEYOND = 0.2, 3
 """Depth of the grid's cells, and cells before and behind all points that these say nothing of."""
+
+
+_INDEPENDENT = 5.0
+"""Errors of a picture's depth that have nothing to do with each other: all points of it together outweigh the usual
+line no more than so many."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,10 +51,30 @@ class NearFit:
     """``(P,)`` logarithm of the line's depth there."""
     residual: FloatArray = field(default_factory=lambda: np.zeros(0))
     """``(P,)`` logarithm of map depth over the line there."""
+    bends: bool = False
+    """Whether the line is not that of its points, and gives way to them at their depths."""
+
+    @property
+    def network_log(self) -> FloatArray:
+        """``(P,)`` logarithm of network depth at the points."""
+        return (self.level - self.offset) / self.slope
+
+    @property
+    def ratio_log(self) -> float:
+        """Logarithm of map depth over network depth, in the median of the points."""
+        return float(np.median(self.level + self.residual - self.network_log))
 
     def alone(self) -> "NearFit":
         """The line without its points: of another picture than theirs."""
         return NearFit(self.offset, self.slope, self.sigma_log, self.points)
+
+    def through(self, points: "NearFit") -> "NearFit":
+        """This line, which many pictures agree on, with the points of one picture: beyond their depths it stays, and
+        the room behind a door is as far as usual, however wrong the network is about the wall."""
+        level = self.offset + self.slope * points.network_log
+        residual = points.level + points.residual - level
+        spread = max(1.4826 * float(np.median(np.abs(residual - np.median(residual)))), _LEAST_SIGMA)
+        return NearFit(self.offset, self.slope, spread, points.points, points.uv, level, residual, bends=True)
 
     def applied(self, depth: DepthMap) -> DepthMap:
         """Depth in metres, with the line's errors made up for near the points; unknown where the network's is.
@@ -58,7 +83,12 @@ class NearFit:
         """
         known = np.isfinite(depth.depth_m) & (depth.depth_m > 0)
         log_m = self.offset + self.slope * np.log(np.where(known, depth.depth_m, 1.0))
-        error, sigma = local_error(self.uv, self.level, self.residual, self.sigma_log, log_m)
+        level, residual = self.level, self.residual
+        if self.bends:
+            log_m = log_m + _bend(level, residual, log_m)
+            level = level + _bend(self.level, self.residual, level)
+            residual = self.level + self.residual - level
+        error, sigma = local_error(self.uv, level, residual, self.sigma_log, log_m)
         metres = np.where(known, np.exp(log_m + error), np.nan).astype(np.float32)
         return DepthMap(metres, sigma)
 
@@ -87,13 +117,24 @@ def fit_near(network_m: FloatArray, map_m: FloatArray) -> NearFit | None:
     return NearFit(float(line[0] - slope * middle), slope, spread, int(usable.sum()))
 
 
+def _bend(level: FloatArray, residual: FloatArray, at: FloatArray) -> FloatArray:
+    """What points say of a line's error at depths of any shape: a mean with Gaussian weights over `_LEVEL_LOG`, towards
+    the line. Points far from the others are hidden, or hide them, and count less (Huber)."""
+    off = np.abs(residual - np.median(residual))
+    bound = _HUBER * max(1.4826 * float(np.median(off)), _LEAST_SIGMA)
+    weight = np.minimum(1.0, bound / np.maximum(off, 1e-9)) * _INDEPENDENT / len(level)
+    knots = np.arange(float(level.min()) - 1.0, float(level.max()) + 1.0, 0.25 * _LEVEL_LOG)
+    kernel = weight * np.exp(-0.5 * ((knots[:, None] - level) / _LEVEL_LOG) ** 2)
+    return np.asarray(np.interp(at, knots, kernel @ residual / (kernel.sum(axis=1) + 1.0)))
+
+
 def local_error(
     uv: FloatArray, level: FloatArray, residual: FloatArray, spread: float, log_m: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """What points ``(P, 2)`` with residuals ``(P,)`` say of a line's error at every pixel, and its standard deviation.
 
     Means with Gaussian weights over `_NEAR_SHARE` of the picture's width and over `_LEVEL_LOG` of the line's depth (a
-    bilateral grid: Chen, Paris and Durand 2007), towards the line (error 0, standard deviation at least `_ALONE_SIGMA`)
+    bilateral grid: Chen, Paris and Durand 2007), towards the line (error 0, standard deviation at least `ALONE_SIGMA`)
     with the weight of `_LINE_POINTS` points: the frame of a door tells nothing of the room that is seen through it,
     where a network that fits this room to 7 % was seen to be 40 % too near. Points more than three spreads farther than
     the line are hidden by what the network sees; those that are nearer are none that it hides.
@@ -135,7 +176,7 @@ def local_error(
     n, sum_r, sum_rr = moments
     mean = sum_r / (n + _LINE_POINTS)
     about_mean = np.maximum(sum_rr - 2.0 * mean * sum_r + n * mean * mean, 0.0)
-    unsupported = max(spread, _ALONE_SIGMA) ** 2 + mean * mean
+    unsupported = max(spread, ALONE_SIGMA) ** 2 + mean * mean
     variance = (about_mean + _LINE_POINTS * unsupported) / (n + _LINE_POINTS)
     sigma = np.maximum(np.sqrt(variance), _LEAST_SIGMA)
     return _enlarged(mean, log_m.shape), _enlarged(sigma, log_m.shape)

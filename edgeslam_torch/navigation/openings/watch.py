@@ -23,11 +23,11 @@ _PASSAGE_M = 1.0
 """Distance along a passage within which it has one door."""
 PLACES_M = 0.5
 """Distance between two places that count as two."""
-_FIELD_RAD = math.radians(20.0)
+FIELD_RAD = math.radians(20.0)
 """Half the camera's field of view, less a margin: an opening within it that is not found again counts against it."""
 _SQUARELY_COS = math.cos(math.radians(50.0))
 """Angle to an opening's normal from which on it is seen aslant."""
-_NEAREST_M, _FARTHEST_M = 0.8, 2.5
+_NEAREST_M, FARTHEST_M = 0.8, 2.5
 """From nearer an opening is more than what a camera sees; from farther away it closes and opens with every depth."""
 _LOOKS = 3
 _GLIMPSES = 2
@@ -71,6 +71,8 @@ class Candidate:
     """``(2,)`` level unit vector through it."""
     place_w: FloatArray
     """``(2,)`` where it was seen from first [m]."""
+    elsewhere: bool = True
+    """Whether it must be looked at from another place than that: it was seen open from there, not in a glimpse."""
 
 
 @dataclass(slots=True)
@@ -135,10 +137,11 @@ class ExitWatch:
         often = [s for s in self._seen if s.near >= _LOOKS]
         open_ = [s for s in often if s.gone <= _GONE]
         twice = [s for s in open_ if _places(s.places_w) >= 2]
-        self.exits = self._exits([s for s in twice if s.missed < s.shown + _LOOKS], walls.layer, sight)
-        doubted = [s for s in open_ if s.shown <= s.missed or _places(s.places_w) < 2]
-        doubted += [s for s in self._glimpsed if s.near >= _GLIMPSES and not any(_same(s.gaps[0], o) for o in often)]
-        self.candidates = tuple(_candidate(s) for s in doubted if not _parts_nothing(s, walls.layer))
+        self.exits = self._exits([s for s in twice if s.shown and s.missed < s.shown + _LOOKS], walls.layer, sight)
+        doubted = [(s, _places(s.places_w) < 2) for s in open_ if s.shown <= s.missed or _places(s.places_w) < 2]
+        glimpsed_often = [s for s in self._glimpsed if s.near >= _GLIMPSES]
+        doubted += [(s, False) for s in glimpsed_often if not any(_same(s.gaps[0], other) for other in often)]
+        self.candidates = tuple(_candidate(*doubt) for doubt in doubted if not _parts_nothing(doubt[0], walls.layer))
 
     def _count(self, free: list[Gap], partly: list[Gap], sight: Sight) -> None:
         """What speaks for and against what was seen before: what is not looked at stays as it was."""
@@ -185,8 +188,8 @@ def _note(among: list[_Seen], gap: Gap, here_w: FloatArray) -> None:
         seen.places_w.append(here_w.copy())
 
 
-def _candidate(seen: _Seen) -> Candidate:
-    return Candidate(seen.centre_w, seen.gaps[0].normal_w, seen.places_w[0])
+def _candidate(seen: _Seen, elsewhere: bool) -> Candidate:
+    return Candidate(seen.centre_w, seen.gaps[0].normal_w, seen.places_w[0], elsewhere)
 
 
 def _parts_nothing(seen: _Seen, layer: Layer) -> bool:
@@ -243,7 +246,7 @@ def _is_looked_at(seen: _Seen, sight: Sight) -> bool:
     away = float(np.linalg.norm(offset))
     bearing = float(wrapped(np.array(math.atan2(offset[1], offset[0]) - sight.yaw_rad)))
     squarely = abs(float(offset @ seen.gaps[0].normal_w)) > _SQUARELY_COS * away
-    return _NEAREST_M < away < _FARTHEST_M and abs(bearing) < _FIELD_RAD and squarely
+    return _NEAREST_M < away < FARTHEST_M and abs(bearing) < FIELD_RAD and squarely
 
 
 def _places(places_w: list[FloatArray]) -> int:

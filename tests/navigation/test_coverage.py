@@ -1,0 +1,95 @@
+"""What a search has looked at from before."""
+
+import math
+
+import numpy as np
+import pytest
+
+from edgeslam_torch.navigation.exploring.coverage import Borders, Coverage, borders
+from edgeslam_torch.navigation.layer import Layer
+from edgeslam_torch.navigation.moved import Moved
+from edgeslam_torch.navigation.sight import Sight
+
+WALL = Borders(np.array([[x, 1.0] for x in np.arange(-3.0, 3.05, 0.1)]), np.tile([0.0, -1.0], (61, 1)))
+"""One metre to the left of a drone that flies along x."""
+
+
+def at(x, y, yaw_deg, tracked=True):
+    return Sight(0.0, np.array([x, y, 1.15]), math.radians(yaw_deg), np.zeros(3), tracked=tracked)
+
+
+def corridor(free=lambda x, y: np.abs(y) < 0.95, solid=lambda x, y: np.zeros(x.shape, bool)):
+    x, y = np.meshgrid((np.arange(80) + 0.5) * 0.1 - 4.0, (np.arange(60) + 0.5) * 0.1 - 3.0, indexing="ij")
+    is_solid = solid(x, y)
+    return Layer(free(x, y) & ~is_solid, is_solid, np.array([-4.0, -3.0]), 0.1)
+
+
+def unlooked(*sights):
+    coverage = Coverage()
+    for sight in sights:
+        coverage.note(sight)
+    return coverage.unlooked(WALL)
+
+
+def test_what_is_before_the_drone_within_twenty_degrees_is_looked_at():
+    left = unlooked(at(0.0, 0.0, 90.0)).p_w[:, 0]
+    reach = math.tan(math.radians(20.0))
+    np.testing.assert_allclose(left, [x for x in WALL.p_w[:, 0] if abs(x) > reach], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("case", "sight"),
+    [
+        ("along the wall", at(-2.0, 0.0, 18.0)),
+        ("away from it", at(0.0, 0.0, -90.0)),
+        ("from behind it", at(0.0, 2.0, -90.0)),
+        ("from so near that a door does not fit", at(0.0, 0.45, 90.0)),
+        ("from afar", at(0.0, -1.6, 90.0)),
+        ("by telemetry", at(0.0, 0.0, 90.0, tracked=False)),
+    ],
+)
+def test_other_views_look_at_none_of_it(case, sight):
+    assert len(unlooked(sight).p_w) == len(WALL.p_w), case
+
+
+def test_views_add_up_and_alike_ones_are_kept_once():
+    coverage = Coverage()
+    for x in (-0.6, 0.0, 0.05, 0.6):
+        for yaw in (88.0, 91.0):
+            coverage.note(at(x, 0.0, yaw))
+    assert len(coverage._views) == 3
+    assert np.abs(coverage.unlooked(WALL).p_w[:, 0]).min() > 0.9
+
+
+def test_views_go_along_with_the_map():
+    """Metres become twice as long: what was seen 2 m away is 1 m away."""
+    coverage = Coverage()
+    coverage.note(at(2.0, 0.0, 90.0))
+    coverage.carry(Moved(np.eye(4)[None], np.eye(4)[None], 0.5))
+    left = coverage.unlooked(WALL).p_w[:, 0]
+    assert not ((left > 0.7) & (left < 1.3)).any()
+
+
+def test_borders_are_where_the_free_space_ends_and_face_it():
+    found = borders(corridor(), np.array([0.0, 0.0]))
+    long = np.abs(found.p_w[:, 0]) < 3.0
+    np.testing.assert_allclose(np.abs(found.p_w[long, 1]), 0.95, atol=0.11)
+    facing = found.normal_w[long] @ [0.0, 1.0] * -np.sign(found.p_w[long, 1])
+    assert facing.min() > 0.99
+    assert long.sum() == pytest.approx(2 * 60, abs=4), "both sides"
+
+
+def test_a_thing_in_the_room_and_another_room_are_no_borders_to_look_at():
+    """A chair; and space behind a wall, as rays through a window leave it."""
+    chair = corridor(solid=lambda x, y: (np.abs(x - 1.0) < 0.2) & (np.abs(y) < 0.2))
+    around = np.linalg.norm(borders(chair, np.array([0.0, 0.0])).p_w - [1.0, 0.0], axis=1)
+    assert around.min() > 0.6
+    beyond = corridor(free=lambda x, y: (np.abs(y) < 0.95) | ((y > 1.5) & (y < 2.5)))
+    assert borders(beyond, np.array([0.0, 0.0])).p_w[:, 1].max() < 1.1
+    assert borders(beyond, np.array([0.0, 2.0])).p_w[:, 1].min() > 1.2
+
+
+def test_nothing_known_has_no_borders():
+    nothing = corridor(free=lambda x, y: np.zeros(x.shape, bool))
+    assert len(borders(nothing, np.array([0.0, 0.0])).p_w) == 0
+    assert len(Coverage().unlooked(borders(nothing, np.array([0.0, 0.0]))).p_w) == 0
