@@ -99,6 +99,18 @@ def test_points_of_a_wall_say_nothing_of_the_room_behind_its_door(rng):
     assert np.median(own.applied(depth).depth_m[:, 110:]) < 2.0, "by its own line it is a fifth nearer"
 
 
+def test_away_from_its_points_a_picture_is_surer_than_one_without(rng):
+    """But not as sure as beside them."""
+    usual = knows(rng, 1.0)
+    network = np.full((120, 160), 1.0, np.float32)
+    depth = DepthMap(network, np.zeros_like(network))
+    uv = rng.integers([0, 0], [50, 120], (300, 2)).astype(float)
+    sigma = usual.line(1.0).through(fit_to_points(depth, uv, np.ones(300))).applied(depth).sigma_log
+    assert np.median(sigma[:, 5:45]) < 0.1
+    assert np.median(sigma[:, 120:]) == pytest.approx(0.2, abs=0.01)
+    assert np.median(usual.line(1.0).applied(depth).sigma_log) == pytest.approx(0.3, abs=0.01)
+
+
 def test_points_at_all_depths_bend_the_line_everywhere(rng):
     """A network that compresses depth, as the usual one has not."""
     true = rng.uniform(0.6, 5.0, (120, 160)).astype(np.float32)
