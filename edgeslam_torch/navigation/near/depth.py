@@ -144,9 +144,9 @@ def local_error(
 
     Means with Gaussian weights over `_NEAR_SHARE` of the picture's width and over `_LEVEL_LOG` of the line's depth (a
     bilateral grid: Chen, Paris and Durand 2007), towards the line (error 0, standard deviation ``alone_sigma`` at
-    least) with the weight of `_LINE_POINTS` points: the frame of a door tells nothing of the room that is seen through it,
-    where a network that fits this room to 7 % was seen to be 40 % too near. Points more than three spreads farther than
-    the line are hidden by what the network sees; those that are nearer are none that it hides.
+    least) with the weight of `_LINE_POINTS` points: the frame of a door tells nothing of the room that is seen through
+    it, where a network that fits this room to 7 % was seen to be 40 % too near. Points more than three spreads farther
+    than the line are hidden by what the network sees; those that are nearer are none that it hides.
 
     Args:
         uv: Where the points are [px].
