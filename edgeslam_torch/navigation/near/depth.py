@@ -5,6 +5,7 @@ is near is said to be farther than it is, which is the wrong side. The map's own
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -88,8 +89,9 @@ class NearFit:
         log_m = self.offset + self.slope * np.log(np.where(known, depth.depth_m, 1.0))
         level, residual = self.level, self.residual
         if self.bends:
-            log_m = log_m + _bend(level, residual, log_m)
-            level = level + _bend(self.level, self.residual, level)
+            bend = _bend(level, residual)
+            log_m = log_m + bend(log_m)
+            level = level + bend(level)
             residual = self.level + self.residual - level
         alone = _USUAL_SIGMA if self.bends else ALONE_SIGMA
         error, sigma = local_error(self.uv, level, residual, self.sigma_log, log_m, alone)
@@ -121,15 +123,25 @@ def fit_near(network_m: FloatArray, map_m: FloatArray) -> NearFit | None:
     return NearFit(float(line[0] - slope * middle), slope, spread, int(usable.sum()))
 
 
-def _bend(level: FloatArray, residual: FloatArray, at: FloatArray) -> FloatArray:
-    """What points say of a line's error at depths of any shape: a mean with Gaussian weights over `_LEVEL_LOG`, towards
-    the line. Points far from the others are hidden, or hide them, and count less (Huber)."""
+def _bend(level: FloatArray, residual: FloatArray) -> Callable[[FloatArray], FloatArray]:
+    """What points say of a line's error at any depths: a mean with Gaussian weights over `_LEVEL_LOG`, towards it.
+
+    Points far from the others are hidden, or hide them, and count less (Huber).
+    """
     off = np.abs(residual - np.median(residual))
     bound = _HUBER * max(1.4826 * float(np.median(off)), _LEAST_SIGMA)
     weight = np.minimum(1.0, bound / np.maximum(off, 1e-9)) * _INDEPENDENT / len(level)
-    knots = np.arange(float(level.min()) - 1.0, float(level.max()) + 1.0, 0.25 * _LEVEL_LOG)
-    kernel = weight * np.exp(-0.5 * ((knots[:, None] - level) / _LEVEL_LOG) ** 2)
-    return np.asarray(np.interp(at, knots, kernel @ residual / (kernel.sum(axis=1) + 1.0)))
+    step = _LEVEL_LOG / 16.0
+    knots = np.arange(float(level.min()) - 1.0, float(level.max()) + 1.0, step)
+    coarse = knots[::4]
+    kernel = weight * np.exp(-0.5 * ((coarse[:, None] - level) / _LEVEL_LOG) ** 2)
+    error = np.interp(knots, coarse, kernel @ residual / (kernel.sum(axis=1) + 1.0)).astype(np.float32)
+
+    def bend(at: FloatArray) -> FloatArray:
+        nearest = ((at - (knots[0] - 0.5 * step)) * np.float32(1.0 / step)).astype(np.int32)
+        return error[np.clip(nearest, 0, len(knots) - 1)]
+
+    return bend
 
 
 def local_error(
