@@ -96,7 +96,7 @@ def test_where_a_look_showed_nothing_it_is_not_sent_once_more():
 @pytest.mark.parametrize(("cells", "stands"), [(4, False), (8, True)])
 def test_less_than_a_doors_width_of_wall_is_no_reason_to_stand(cells, stands):
     looks = LooksAround()
-    looks._left = Borders(np.array([[2.0 + 0.1 * k, 1.0] for k in range(cells)]), np.tile([0.0, -1.0], (cells, 1)))
+    looks._left = Borders(np.array([[2.0 + 0.1 * k, 1.0] for k in range(cells)]), np.tile([0.0, -1.0], (cells, 1)), 0.1)
     assert (looks.heading_rad(at(0.0, 2.2, 0.0)) is not None) == stands
 
 

@@ -10,7 +10,7 @@ from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.moved import Moved
 from edgeslam_torch.navigation.sight import Sight
 
-WALL = Borders(np.array([[x, 1.0] for x in np.arange(-3.0, 3.05, 0.1)]), np.tile([0.0, -1.0], (61, 1)))
+WALL = Borders(np.array([[x, 1.0] for x in np.arange(-3.0, 3.05, 0.1)]), np.tile([0.0, -1.0], (61, 1)), 0.1)
 """One metre to the left of a drone that flies along x."""
 
 

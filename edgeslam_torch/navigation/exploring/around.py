@@ -1,7 +1,7 @@
 """Where a drone that explores looks around: at what it has not looked at from before."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -42,7 +42,7 @@ class LooksAround:
     """Asks for headings, one after the other, wherever there is something to look at from before."""
 
     _coverage: Coverage = field(default_factory=Coverage)
-    _left: Borders = field(default_factory=lambda: Borders(np.zeros((0, 2)), np.zeros((0, 2))))
+    _left: Borders = field(default_factory=lambda: Borders(np.zeros((0, 2)), np.zeros((0, 2)), 0.0))
     """What was not looked at, when last asked."""
     _spots_w: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
     """``(G, 2)`` from where to look at it."""
@@ -60,11 +60,10 @@ class LooksAround:
         cells = reachable(np.argwhere(free) * _COARSE, layer, here)
         p_w = layer.centres(cells).reshape(-1, 2)
         away = np.linalg.norm(p_w - here, axis=1)
-        new = np.array([self._away_m(p) > _AGAIN_M for p in p_w], dtype=bool)
-        shown = self._left.before(p_w) & new[:, None]
+        shown = self._left.before(p_w) & (self._away_m(p_w) > _AGAIN_M)[:, None]
         chosen: list[int] = []
         while len(cells) and len(chosen) < _MOST:
-            gain_m = shown.sum(1) * layer.cell_m
+            gain_m = shown.sum(1) * self._left.cell_m
             best = int(np.argmax(np.where(gain_m >= _WORTH_M, gain_m - 0.1 * away, -np.inf)))
             if gain_m[best] < _WORTH_M:
                 break
@@ -92,17 +91,20 @@ class LooksAround:
         self._coverage.carry(moved)
         self._places_w = list(moved.points(np.array(self._places_w).reshape(-1, 2)))
         self._spots_w = moved.points(self._spots_w)
-        self._left = Borders(moved.points(self._left.p_w), self._left.normal_w)
+        self._left = replace(self._left, p_w=moved.points(self._left.p_w))
 
-    def _away_m(self, here_w: FloatArray) -> float:
-        return min((float(np.linalg.norm(here_w - place)) for place in self._places_w), default=math.inf)
+    def _away_m(self, p_w: FloatArray) -> FloatArray:
+        """Distance of places ``(P, 2)`` from where it has looked around; infinite before it has."""
+        places = np.array(self._places_w).reshape(-1, 2)
+        return np.asarray(np.linalg.norm(p_w[:, None] - places, axis=-1).min(axis=1, initial=math.inf))
 
     def _is_new(self, here_w: FloatArray) -> bool:
         """Whether to stand and look: a way from the last time, if it is worth it, or where it was sent for that."""
-        if self._away_m(here_w) > _EVERY_M:
-            return float(self._left.before(here_w[None]).sum()) * 0.1 >= _WORTH_M
+        away_m = float(self._away_m(here_w[None])[0])
+        if away_m > _EVERY_M:
+            return bool(self._left.before(here_w[None]).sum() * self._left.cell_m >= _WORTH_M)
         there = (np.linalg.norm(self._spots_w - here_w, axis=1) < _THERE_M).any()
-        return bool(there) and self._away_m(here_w) > _AGAIN_M - _THERE_M
+        return bool(there) and away_m > _AGAIN_M - _THERE_M
 
     def _sides(self, here_w: FloatArray, yaw_rad: float) -> list[float]:
         """Turns from its heading that show what is to be looked at from here, most first."""
@@ -113,7 +115,7 @@ class LooksAround:
         while len(left):
             shown = np.abs(wrapped(left - tried[:, None])) < _SHOWN_RAD
             best = int(np.argmax(shown.sum(1)))
-            if shown[best].sum() * 0.1 < _REST_M:
+            if shown[best].sum() * self._left.cell_m < _REST_M:
                 break
             found.append(float(tried[best]))
             left = left[~shown[best]]

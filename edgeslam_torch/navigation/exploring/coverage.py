@@ -37,9 +37,11 @@ class Borders:
     """``(N, 2)`` [m]."""
     normal_w: FloatArray
     """``(N, 2)`` unit vectors into the free space."""
+    cell_m: float
+    """Length of each."""
 
     def __getitem__(self, some: np.ndarray) -> "Borders":
-        return Borders(self.p_w[some], self.normal_w[some])
+        return Borders(self.p_w[some], self.normal_w[some], self.cell_m)
 
     def before(self, here_w: FloatArray) -> np.ndarray:
         """``(M, N)`` whether each is seen from before, and not too far, from places ``(M, 2)``."""
@@ -63,7 +65,8 @@ def borders(layer: Layer, here_w: FloatArray) -> Borders:
     normal = np.stack([g[edge] for g in np.gradient(smooth)], axis=1)
     length = np.linalg.norm(normal, axis=1)
     good = length > 1e-3
-    return Borders(layer.centres(cells[good]).reshape(-1, 2), (normal[good] / length[good, None]).astype(np.float64))
+    facing = (normal[good] / length[good, None]).astype(np.float64)
+    return Borders(layer.centres(cells[good]).reshape(-1, 2), facing, layer.cell_m)
 
 
 @dataclass(slots=True)
