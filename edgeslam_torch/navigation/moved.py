@@ -1,11 +1,12 @@
 """How a map moved under a pilot: what was remembered in its axes goes along with the nearest view."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from edgeslam_torch.geometry import se3
-from edgeslam_torch.types import FloatArray
+from edgeslam_torch.types import FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,6 +19,8 @@ class Moved:
     """``(N, 4, 4)`` the same views now."""
     ratio: float = 1.0
     """Of lengths now to lengths then."""
+    pictures: IntArray | None = None
+    """``(N,)`` numbers of the pictures that the views were seen in, ascending; None: they have none."""
 
     def poses(self, T_w_c: FloatArray) -> FloatArray:
         """Poses ``(M, 4, 4)``, each carried along with the view nearest to it."""
@@ -26,12 +29,22 @@ class Moved:
         relative[:, :3, 3] *= self.ratio
         return np.asarray(self.after_w[k] @ relative)
 
-    def points(self, p_w: FloatArray) -> FloatArray:
-        """Points ``(M, 3)``, or places ``(M, 2)`` at the height of their views, likewise."""
+    def points(self, p_w: FloatArray, seen_in: Sequence[int] | None = None) -> FloatArray:
+        """Points ``(M, 3)``, or places ``(M, 2)`` at the height of their views, likewise.
+
+        Args:
+            p_w: Where they were.
+            seen_in: Numbers of the pictures that showed them: they go along with the view nearest to that in time, not
+                with a piece of map that lay across them by mistake. -1 where that is not known.
+        """
         p_w = np.asarray(p_w, dtype=np.float64)
         if len(p_w) == 0:
             return p_w
         k = self._nearest(p_w)
+        if seen_in is not None and self.pictures is not None:
+            seen = np.asarray(seen_in)
+            in_time = np.abs(seen[:, None] - self.pictures).argmin(axis=1)
+            k = np.where(seen >= 0, in_time, k)
         before, after = self.before_w[k], self.after_w[k]
         step = np.zeros((len(p_w), 3))
         step[:, : p_w.shape[1]] = p_w - before[:, : p_w.shape[1], 3]

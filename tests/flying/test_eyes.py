@@ -148,6 +148,22 @@ def test_a_network_contradicts_nothing_that_velocities_and_heights_confirm(used,
     assert _contradicted(health) == contradicted
 
 
+def test_a_pilot_hears_how_old_views_moved_too(eyes):
+    """Of those that it keeps no longer one in two seconds."""
+    poses = np.repeat(np.eye(4)[None], 2000, axis=0)
+    for k in range(600):
+        eyes._shown = poses, 1.0, 0
+        assert eyes._moved(SimpleNamespace(picture=3 * k, T_w_c=np.eye(4), stamp_s=0.2 * k)) is None
+    poses[:100, 0, 3] = 1.0
+    eyes._shown = poses, 1.0, 1
+    moved = eyes._moved(SimpleNamespace(picture=1800, T_w_c=np.eye(4), stamp_s=120.0))
+    assert len(moved.pictures) == pytest.approx(240 + 36, abs=1)
+    assert (np.diff(moved.pictures) > 0).all()
+    assert moved.points(np.zeros((2, 2)), [30, 1500]) == pytest.approx(np.array([[1.0, 0.0], [0.0, 0.0]]))
+    assert eyes._moved(SimpleNamespace(picture=1803, T_w_c=np.eye(4), stamp_s=120.2)) is None
+    assert [T[0, 3] for picture, T in eyes._long_told if picture < 100] == [1.0] * 4
+
+
 def test_a_doubtful_metre_is_told(eyes):
     """By the SLAM's own sources it is sure to 2 %."""
     sure = ScaleEstimate(1.0, 0.02, "telemetry")

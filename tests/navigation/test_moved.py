@@ -42,6 +42,21 @@ def test_of_views_at_one_place_the_newest_counts():
     assert both.points(np.array([[1.0, 0.0]])) == pytest.approx(np.array([[1.0, 0.5]]))
 
 
+def test_what_a_picture_showed_goes_along_with_the_view_of_that_time():
+    """A piece of map lay across the first one by mistake, and moves away from it."""
+    across = Moved(
+        np.array([pose(4.0, 0.0), pose(8.0, 0.0), pose(4.0, 0.0)]),
+        np.array([pose(4.0, 0.0), pose(8.0, 0.0), pose(5.5, 0.0)]),
+        pictures=np.array([10, 20, 50]),
+    )
+    door = np.array([[5.0, 1.0], [5.0, 1.0], [5.0, 1.0], [5.0, 1.0]])
+    moved = across.points(door, [10, 13, 48, -1])
+    assert moved == pytest.approx(np.array([[5.0, 1.0], [5.0, 1.0], [6.5, 1.0], [6.5, 1.0]]))
+    assert across.points(door[:1]) == pytest.approx(np.array([[6.5, 1.0]])), "which picture is not known"
+    unnumbered = Moved(across.before_w, across.after_w)
+    assert unnumbered.points(door[:1], [10]) == pytest.approx(np.array([[6.5, 1.0]]))
+
+
 def test_nothing_remembered_moves_to_nothing():
     assert Moved(BEFORE, AFTER).points(np.zeros((0, 3))).shape == (0, 3)
 

@@ -429,6 +429,20 @@ def test_upright_is_what_fills_the_height():
         space.upright(1.0, 9.0, 0.5)
 
 
+def test_an_exit_stays_where_its_pictures_stay():
+    """`doors` 808: a piece of map that lay across the door by mistake took it along by a metre when it was mended."""
+    walls, watch = surroundings(wall(0.9)), ExitWatch()
+    for k, x in enumerate([0.0, 0.2, 0.4, 0.6]):
+        view = View(0.5 * k, np.zeros((2, 2)), np.zeros((2, 2)), np.eye(3), np.eye(4), picture=10 + k)
+        watch.look(walls, sight(x, stamp_s=0.5 * k, view=view))
+    before, after = np.stack([np.eye(4)] * 2), np.stack([np.eye(4)] * 2)
+    before[1, 0, 3], after[1, 0, 3] = 2.0, 3.0
+    watch.carry(Moved(before, after, pictures=np.array([10, 90])))
+    unseen = surroundings(lambda a, b: np.zeros(a.shape, bool), lambda a, b: np.ones(a.shape, bool))
+    watch.look(unseen, sight(0.0, stamp_s=3.0, yaw=-2.0))
+    assert [e.centre_w[:2] for e in watch.exits] == [pytest.approx([2.0, 0.0], abs=0.15)]
+
+
 def test_exits_go_along_with_the_map():
     """Its metres become twice as long and the map turns square to the left about the origin."""
     watch = watched([0.0, 0.2, 0.4, 0.6], surroundings(wall(0.9)))

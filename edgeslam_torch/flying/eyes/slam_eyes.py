@@ -40,6 +40,8 @@ shades, and the network sees walls in the dark, too."""
 _LOST = ("lost", "starting")
 _DISAGREE_SIGMAS, _MEASURED = 3.0, {"telemetry", "height"}
 _WIDEST_SIGMA_M = 0.2
+_THINNED = 10
+"""Two seconds: in these the map does not move in itself."""
 _MOVES_EVERY_S = 3.0
 """Least time between two moves of the map in one unit: each costs a pilot as much as all its views together."""
 
@@ -94,6 +96,8 @@ class SlamEyes:
         """Metres per map unit by which it goes; NaN while the published unit is all there is."""
         self._shown: tuple[FloatArray, float, int] = np.zeros((0, 4, 4)), 1.0, 0
         """When the last view was made: poses ``(F, 4, 4)`` of all pictures, metres per map unit, and the revision."""
+        self._long_told: list[tuple[int, FloatArray]] = []
+        """One in `_THINNED` of those that a pilot keeps no longer: what was found in them goes along with the map."""
         self._told: deque[tuple[int, FloatArray]] = deque(maxlen=KEPT)
         """Pictures whose views were told, and their poses as they were told last."""
         self._told_unit, self._told_revision, self._moved_s = 1.0, 0, -np.inf
@@ -208,12 +212,18 @@ class SlamEyes:
                 return None
             found = None
             if self._told:
-                before = np.array([T for _, T in self._told])
-                after = T_w_c[[picture - first for picture, _ in self._told]]
+                told = [*self._long_told, *self._told]
+                pictures, before = np.array([picture for picture, _ in told]), np.array([T for _, T in told])
+                after, kept = T_w_c[pictures - first], slice(len(self._long_told), None)
                 revised = revision != self._told_revision
-                if revised or (view.stamp_s - self._moved_s > _MOVES_EVERY_S and moves(before, after, CELL_M)):
-                    found, self._moved_s = Moved(before, after, unit / self._told_unit), view.stamp_s
-                    self._told = deque(((k, T) for (k, _), T in zip(self._told, after, strict=True)), self._told.maxlen)
+                if revised or (
+                    view.stamp_s - self._moved_s > _MOVES_EVERY_S and moves(before[kept], after[kept], CELL_M)
+                ):
+                    found, self._moved_s = Moved(before, after, unit / self._told_unit, pictures), view.stamp_s
+                    told = list(zip(pictures.tolist(), after, strict=True))
+                    self._long_told, self._told = told[: kept.start], deque(told[kept], self._told.maxlen)
+            if len(self._told) == KEPT and self._told[0][0] % (_THINNED * _DEPTH_EVERY) < _DEPTH_EVERY:
+                self._long_told.append(self._told[0])
             self._told.append((view.picture, view.T_w_c))
             self._told_unit, self._told_revision = unit, revision
         return found

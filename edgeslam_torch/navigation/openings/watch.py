@@ -80,6 +80,8 @@ class _Seen:
     """One opening, look by look."""
 
     gaps: list[Gap]
+    pictures: list[int]
+    """Number of the picture that each was seen in."""
     places_w: list[FloatArray]
     near: int = 0
     shown: int = 0
@@ -133,7 +135,7 @@ class ExitWatch:
         self._count(distinct([gap for gap in found if gap.is_free]), partly, sight)
         glimpsed = glimpses(grids, sight.view, here) if sight.view is not None else []
         for gap in distinct([*partly, *glimpsed]):
-            _note(self._glimpsed, gap, here)
+            _note(self._glimpsed, gap, sight)
         often = [s for s in self._seen if s.near >= _LOOKS]
         open_ = [s for s in often if s.gone <= _GONE]
         twice = [s for s in open_ if _places(s.places_w) >= 2]
@@ -153,7 +155,7 @@ class ExitWatch:
             else:
                 seen.missed, seen.gone = seen.missed + 1, seen.gone + 1
         for gap in free:
-            _note(self._seen, gap, sight.p_w[:2])
+            _note(self._seen, gap, sight)
         self._seen = [seen for seen in self._seen if seen.missed <= 2 * max(len(seen.gaps), _LOOKS)]
 
     def _exits(self, good: list[_Seen], layer: Layer, sight: Sight) -> tuple[Exit, ...]:
@@ -170,18 +172,20 @@ class ExitWatch:
     def carry(self, moved: Moved) -> None:
         """Take what was found along with the map; `exits` are those of the next look."""
         for seen in [*self._seen, *self._glimpsed]:
-            centres = moved.points(np.array([gap.centre_w for gap in seen.gaps]))
-            beyond = moved.points(np.array([gap.centre_w + 0.1 * gap.normal_w for gap in seen.gaps]))
+            centres = moved.points(np.array([gap.centre_w for gap in seen.gaps]), seen.pictures)
+            beyond = moved.points(np.array([gap.centre_w + 0.1 * gap.normal_w for gap in seen.gaps]), seen.pictures)
             seen.gaps = [_carried(*gap, moved.ratio) for gap in zip(seen.gaps, centres, beyond, strict=True)]
             seen.places_w = list(moved.points(np.array(seen.places_w).reshape(-1, 2)))
 
 
-def _note(among: list[_Seen], gap: Gap, here_w: FloatArray) -> None:
+def _note(among: list[_Seen], gap: Gap, sight: Sight) -> None:
+    here_w = sight.p_w[:2]
     seen = next((s for s in among if _same(gap, s)), None)
     if seen is None:
-        seen = _Seen([], [])
+        seen = _Seen([], [], [])
         among.append(seen)
     seen.gaps.append(gap)
+    seen.pictures.append(-1 if sight.view is None else sight.view.picture)
     seen.gone = 0
     if np.linalg.norm(gap.centre_w - here_w) < NEAR_M:
         seen.near += 1
