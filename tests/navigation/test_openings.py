@@ -197,15 +197,45 @@ def test_an_exit_was_seen_by_looks_at_it():
     assert watch.exits == (), "nothing speaks for it"
     assert len(watch.candidates) == 1, "to be looked at"
     watch.look(door, sight(0.0, stamp_s=15.0))
-    for k in range(4):
+    assert watch.exits == (), "one look is chance"
+    watch.look(door, sight(0.0, stamp_s=15.5))
+    for k in range(5):
         assert len(watch.exits) == 1, "one look or two more against it are chance"
         watch.look(closed, sight(0.0, stamp_s=20.0 + 0.5 * k))
     assert watch.exits == ()
     assert len(watch.candidates) == 1
-    for k in range(4):
-        watch.look(door, sight(0.0, stamp_s=22.0 + 0.5 * k))
+    for k in range(5):
+        watch.look(door, sight(0.0, stamp_s=23.0 + 0.5 * k))
     assert len(watch.exits) == 1
     assert watch.candidates == (), "looked at"
+
+
+def flown(ys, closed=False):
+    """A watch that saw a door, was flown along a line through the wall, and sees the wall closed afterwards."""
+    watch = watched([0.0, 0.2, 0.4, 0.6], surroundings(wall(0.9)))
+    for k, x in enumerate(np.arange(1.2, 3.2, 0.2)):
+        watch.look(surroundings(wall(0.9)), sight(x, ys, 3.0 + 0.5 * k))
+    for k in range(12):
+        watch.look(surroundings(wall(0.0)), sight(3.4, ys, 9.0 + 0.5 * k, math.atan2(-ys, -1.4)))
+    return watch
+
+
+def test_what_it_flew_through_is_an_exit_whatever_looks_show_later():
+    """`two_rooms` 809: walls half a metre thick on the map, by two rooms that see them .2 m apart."""
+    assert len(flown(0.0).exits) == 1
+    assert flown(0.0).candidates == ()
+    assert flown(0.8).exits == (), "beside it"
+
+
+def test_a_jump_of_the_pose_is_no_way_through():
+    watch = watched([0.0, 0.2, 0.4, 0.6], surroundings(wall(0.9)))
+    for k, x in enumerate([1.2, 3.0]):
+        watch.look(surroundings(wall(0.9)), sight(x, 0.0, 3.0 + 0.5 * k))
+    assert not any(seen.flown for seen in watch._seen)
+    watch.look(surroundings(wall(0.9)), sight(2.6, 0.0, 4.5))
+    watch.carry(Moved(np.eye(4)[None], np.eye(4)[None]))
+    watch.look(surroundings(wall(0.9)), sight(1.8, 0.0, 5.0))
+    assert not any(seen.flown for seen in watch._seen), "nor is a map that moved"
 
 
 @pytest.mark.parametrize(

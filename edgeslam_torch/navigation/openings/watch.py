@@ -30,6 +30,10 @@ _SQUARELY_COS = math.cos(math.radians(50.0))
 _NEAREST_M, FARTHEST_M = 0.8, 2.5
 """From nearer an opening is more than what a camera sees; from farther away it closes and opens with every depth."""
 _LOOKS = 3
+_SHOWN = 2
+"""Looks from before it that an exit needs: one is chance."""
+_STEP_M = 1.0
+"""Way from one look to the next in which it is known what the drone flew through."""
 _GLIMPSES = 2
 """Looks that make a doubt: as many as a drone has that flies past a door."""
 _GONE = 8
@@ -94,10 +98,17 @@ class _Seen:
     """Looks from near by in which no way led round it, less those in which one did: most of them decide."""
     round: int = 0
     """The last of these, on end, in which one did."""
+    flown: bool = False
+    """Whether the drone has flown through it: it is open, whatever looks show."""
 
     @property
     def centre_w(self) -> FloatArray:
         return np.asarray(np.median([g.centre_w for g in self.gaps], axis=0))
+
+    @property
+    def is_shown(self) -> bool:
+        """Whether looks at it show it open, more than one, and few that do not."""
+        return self.shown >= _SHOWN and self.missed < self.shown + _LOOKS
 
     def note_way_round(self, known: bool) -> None:
         """One more look: looks from when no way round it was known yet do not outvote ten seconds that know one."""
@@ -118,6 +129,8 @@ class ExitWatch:
     _seen: list[_Seen] = field(default_factory=list)
     _glimpsed: list[_Seen] = field(default_factory=list)
     _looked_s: float = -math.inf
+    _looked_w: FloatArray | None = None
+    """``(2,)`` from where it looked last."""
 
     def due(self, sight: Sight) -> bool:
         """Whether it is time for another look. In a piece of map that may lie half a hull elsewhere none counts, for or
@@ -133,14 +146,18 @@ class ExitWatch:
         found = openings(grids)
         partly = distinct(found)
         self._count(distinct([gap for gap in found if gap.is_free]), partly, sight)
+        for seen in self._seen:
+            seen.flown |= self._looked_w is not None and _leads_through(seen, self._looked_w, here)
+        self._looked_w = here.copy()
         glimpsed = glimpses(grids, sight.view, here) if sight.view is not None else []
         for gap in distinct([*partly, *glimpsed]):
             _note(self._glimpsed, gap, sight)
         often = [s for s in self._seen if s.near >= _LOOKS]
-        open_ = [s for s in often if s.gone <= _GONE]
+        open_ = [s for s in often if s.flown or s.gone <= _GONE]
         twice = [s for s in open_ if _places(s.places_w) >= 2]
-        self.exits = self._exits([s for s in twice if s.shown and s.missed < s.shown + _LOOKS], walls.layer, sight)
-        doubted = [(s, _places(s.places_w) < 2) for s in open_ if s.shown <= s.missed or _places(s.places_w) < 2]
+        self.exits = self._exits([s for s in twice if s.flown or s.is_shown], walls.layer, sight)
+        unsure = [s for s in open_ if not s.flown and (s.shown <= max(s.missed, 1) or _places(s.places_w) < 2)]
+        doubted = [(s, _places(s.places_w) < 2) for s in unsure]
         glimpsed_often = [s for s in self._glimpsed if s.near >= _GLIMPSES]
         doubted += [(s, False) for s in glimpsed_often if not any(_same(s.gaps[0], other) for other in often)]
         self.candidates = tuple(_candidate(*doubt) for doubt in doubted if not _parts_nothing(doubt[0], walls.layer))
@@ -176,6 +193,7 @@ class ExitWatch:
             beyond = moved.points(np.array([gap.centre_w + 0.1 * gap.normal_w for gap in seen.gaps]), seen.pictures)
             seen.gaps = [_carried(*gap, moved.ratio) for gap in zip(seen.gaps, centres, beyond, strict=True)]
             seen.places_w = list(moved.points(np.array(seen.places_w).reshape(-1, 2)))
+        self._looked_w = None
 
 
 def _note(among: list[_Seen], gap: Gap, sight: Sight) -> None:
@@ -224,12 +242,14 @@ def _passed_by(exit_: Exit, layer: Layer) -> bool:
 
 
 def _one_passage(exit_: Exit, other: Exit) -> bool:
-    """Whether both are one behind the other, nearer than two doors are: a door, and something that stands before it."""
+    """Whether both are one opening, seen along two directions, or lie one behind the other, nearer than two doors do: a
+    door, and something that stands before it."""
     offset, normal = exit_.centre_w - other.centre_w, other.normal_w
     along = abs(float(offset @ normal))
     beside = math.sqrt(max(0.0, float(offset @ offset) - along**2))
     alike = abs(float(exit_.normal_w @ normal)) > math.cos(_SAME_RAD)
-    return alike and along < _PASSAGE_M and beside < 0.5 * max(exit_.width_m, other.width_m)
+    behind = alike and along < _PASSAGE_M and beside < 0.5 * max(exit_.width_m, other.width_m)
+    return behind or float(np.linalg.norm(offset)) < _SAME_M
 
 
 def _carried(gap: Gap, centre_w: FloatArray, beyond_w: FloatArray, ratio: float) -> Gap:
@@ -251,6 +271,17 @@ def _is_looked_at(seen: _Seen, sight: Sight) -> bool:
     bearing = float(wrapped(np.array(math.atan2(offset[1], offset[0]) - sight.yaw_rad)))
     squarely = abs(float(offset @ seen.gaps[0].normal_w)) > _SQUARELY_COS * away
     return _NEAREST_M < away < FARTHEST_M and abs(bearing) < FIELD_RAD and squarely
+
+
+def _leads_through(seen: _Seen, from_w: FloatArray, to_w: FloatArray) -> bool:
+    """Whether a short straight way ``(2,)`` to ``(2,)`` leads through an opening."""
+    normal, centre = seen.gaps[0].normal_w, seen.centre_w
+    before, behind = float((from_w - centre) @ normal), float((to_w - centre) @ normal)
+    if before * behind >= 0.0 or np.linalg.norm(to_w - from_w) > _STEP_M:
+        return False
+    crossing = from_w + before / (before - behind) * (to_w - from_w) - centre
+    width_m = float(np.median([gap.width_m for gap in seen.gaps]))
+    return abs(float(crossing @ np.array([-normal[1], normal[0]]))) < 0.5 * width_m
 
 
 def _places(places_w: list[FloatArray]) -> int:
