@@ -20,6 +20,8 @@ from edgeslam_torch.atlas.saved import SavedAtlas, Unit, pack, unpack
 from edgeslam_torch.config import SlamConfig
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.frontend.depth_check import CheckedDepth, DepthFunction
+from edgeslam_torch.frontend.edges import extract_edges
+from edgeslam_torch.frontend.image import as_grey
 from edgeslam_torch.frontend.orb import OrbExtractor
 from edgeslam_torch.frontend.repeats import REPEATED, RepeatedImages
 from edgeslam_torch.fusion.motion import MotionFusion
@@ -32,7 +34,9 @@ from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.map.observed import observations
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.map.trajectory import TrajectoryLog
-from edgeslam_torch.mapping.edge_map import EdgeMap
+from edgeslam_torch.mapping.edges.edge_depth import StereoView
+from edgeslam_torch.mapping.edges.edge_map import EdgeMap
+from edgeslam_torch.mapping.edges.fresh_edges import MOST, measure_fresh_edges
 from edgeslam_torch.mapping.last_refinement import last_refinement, lm_config
 from edgeslam_torch.mapping.mapper import Mapper
 from edgeslam_torch.mapping.pipeline import MappingPipeline
@@ -63,6 +67,8 @@ from edgeslam_torch.types import (
 
 _AROUND = 8
 """Keyframes whose anchors are around the newest frame."""
+_SEEN_AGAIN = 12
+"""Keyframes in which its edges are looked for."""
 
 
 class EdgeSlam:
@@ -323,6 +329,32 @@ class EdgeSlam:
             seen = seen[~self.map.anchors.from_depth[seen]]  # a network's guesses tell nothing of another network
             p_w, edges_w = self.map.anchors.p_w[seen], self.edges.around(reference)
         return self._system.published.points(p_w), self._system.published.points(edges_w)
+
+    def fresh_edges(self, image: np.ndarray, nearest: float, farthest: float) -> tuple[FloatArray, FloatArray]:
+        """Edges of the newest frame whose depth keyframes around it tell, before any other frame has confirmed them.
+
+        What is near is told a few milliseconds after its picture; `edge_map` has it two seconds later, and surely.
+
+        Args:
+            image: The newest frame's, undistorted.
+            nearest: Least depth that is searched, in published units.
+            farthest: Greatest depth.
+
+        Returns:
+            Undistorted pixels ``(N, 2)`` and z-depths ``(N,)`` in published units; none before the first frame.
+        """
+        if not self.log.records:
+            return np.zeros((0, 2)), np.zeros(0)
+        with self.map.lock:
+            newest = self.log.records[-1]
+            T_c_w = newest.T_c_k @ self.map.pose_of(newest.keyframe_id)
+            reference = self.map.keyframes[self.map.heir_of(newest.keyframe_id)[0]]
+            near = [reference, *self.map.covisible(reference, _SEEN_AGAIN)]
+            around = [StereoView(k.grey, k.T_c_w) for k in near if k.grey is not None]
+        edges = extract_edges(image, self.config.edges.canny_low, self.config.edges.canny_high, MOST)
+        frame, unit = StereoView(as_grey(image), T_c_w), self._system.published.scale
+        uv, z = measure_fresh_edges(frame, edges, around, nearest / unit, farthest / unit, self.camera)
+        return uv, unit * z
 
     def observations(self) -> Observations:
         """Where keyframes saw the anchors of `anchors`, as a consistent snapshot."""

@@ -254,6 +254,22 @@ def test_surroundings_are_what_the_newest_keyframe_and_its_neighbours_see(monkey
     assert len(slam.surroundings()[0]) == 0, "what a network guessed is no point of the map"
 
 
+def test_fresh_edges_lie_on_the_surfaces_in_published_units():
+    """Single edges that no other keyframe has confirmed: nine of ten within a tenth of 3 m."""
+    slam, _ = panels_run()
+    uv, z = slam.fresh_edges(panels().frames[-1].image, 0.3, 10.0)
+    assert len(z) > 100
+    p_w = se3.transform(slam.trajectory()[1][-1], panels().camera.back_project(uv, z))
+    distance = panels().world.distance_to_surface(in_the_world(slam, p_w))
+    assert np.median(distance) < 0.05
+    assert np.mean(distance < 0.3) > 0.9
+
+
+def test_before_the_first_frame_no_edge_is_fresh():
+    uv, z = EdgeSlam(panels().camera, depth=panels().depth_function()).fresh_edges(panels().frames[0].image, 0.3, 10.0)
+    assert uv.shape == (0, 2) and len(z) == 0
+
+
 def test_two_runs_give_the_same_bytes():
     (a, out_a), (b, out_b) = short_run(), go(panels().frames[:16])
     assert a.trajectory()[1].tobytes() == b.trajectory()[1].tobytes()

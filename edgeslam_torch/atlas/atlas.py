@@ -32,7 +32,7 @@ from edgeslam_torch.atlas.weld import look_around, move_piece, share_anchors, we
 from edgeslam_torch.geometry import sim3
 from edgeslam_torch.map.keyframe import NO_ANCHOR, Keyframe
 from edgeslam_torch.map.trajectory import TrajectoryLog
-from edgeslam_torch.mapping.edge_map import EdgeMap
+from edgeslam_torch.mapping.edges.edge_map import EdgeMap
 from edgeslam_torch.optim.problem import LmConfig
 from edgeslam_torch.tracking.tracker import Tracker
 from edgeslam_torch.types import FloatArray, ScaleEstimate

@@ -19,7 +19,7 @@ from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.map.trajectory import TrajectoryLog
-from edgeslam_torch.mapping.edge_map import EdgeMap
+from edgeslam_torch.mapping.edges.edge_map import EdgeMap
 from edgeslam_torch.optim.pose_graph import PoseGraph, solve
 from edgeslam_torch.types import FloatArray, IntArray, ScaleEstimate
 

@@ -14,7 +14,7 @@ from edgeslam_torch.geometry import se3, sim3
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.map.keyframe import NO_ANCHOR, Keyframe, make_keyframe
 from edgeslam_torch.map.slam_map import SlamMap
-from edgeslam_torch.mapping.edge_map import EdgeMap, EdgePoints
+from edgeslam_torch.mapping.edges.edge_map import EdgeMap, EdgePoints
 from edgeslam_torch.types import FloatArray, FrameFeatures, IntArray, ScaleEstimate
 
 EARLIER_FLIGHT = "map of an earlier flight"

@@ -11,7 +11,7 @@ from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.map.anchors import Anchors
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.map.trajectory import TrajectoryLog
-from edgeslam_torch.mapping.edge_map import EdgeMap
+from edgeslam_torch.mapping.edges.edge_map import EdgeMap
 from edgeslam_torch.mapping.fuse import look_for, merge, observe_or_pair
 from edgeslam_torch.mapping.refinement import refine_all
 from edgeslam_torch.optim.problem import LmConfig

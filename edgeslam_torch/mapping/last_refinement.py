@@ -11,7 +11,7 @@ from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.losses.robust import Kernel
 from edgeslam_torch.losses.weighting import AdaptiveScales
 from edgeslam_torch.map.slam_map import SlamMap
-from edgeslam_torch.mapping.edge_map import EdgeMap
+from edgeslam_torch.mapping.edges.edge_map import EdgeMap
 from edgeslam_torch.mapping.freed_depths import Weight
 from edgeslam_torch.mapping.fuse import fuse_all
 from edgeslam_torch.mapping.motion_terms import ALIKE_AT_THE_END

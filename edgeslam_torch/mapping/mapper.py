@@ -16,7 +16,7 @@ from edgeslam_torch.map.growth import depths, take_along
 from edgeslam_torch.map.keyframe import NO_ANCHOR, Keyframe
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.map.sub_pixel import align
-from edgeslam_torch.mapping.edge_map import EdgeMap
+from edgeslam_torch.mapping.edges.edge_map import EdgeMap
 from edgeslam_torch.mapping.fuse import fuse_young
 from edgeslam_torch.mapping.new_anchors import epipolar_matches, triangulate_matches
 from edgeslam_torch.mapping.prior_anchors import (

@@ -12,7 +12,7 @@ from edgeslam_torch.fusion.displacement import TelemetryModel
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.map.depth_prior import sample
 from edgeslam_torch.map.keyframe import Keyframe
-from edgeslam_torch.mapping.edge_map import EdgeMap
+from edgeslam_torch.mapping.edges.edge_map import EdgeMap
 from edgeslam_torch.mapping.mapper import Mapper
 from edgeslam_torch.stage_times import timed
 from edgeslam_torch.types import FloatArray, Frame

@@ -10,7 +10,7 @@ from edgeslam_torch.frontend.edges import extract_edges
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.losses.cycle import CycleForm
 from edgeslam_torch.map.keyframe import Keyframe
-from edgeslam_torch.mapping.edge_map import EdgeMap, EdgePoints
+from edgeslam_torch.mapping.edges.edge_map import EdgeMap, EdgePoints
 from edgeslam_torch.mapping.window_terms import (
     PlacedEdges,
     Structure,

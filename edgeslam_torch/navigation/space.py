@@ -292,16 +292,23 @@ def _alike(one: View, other: View) -> bool:
 
 
 def _smaller(view: View) -> View:
-    """At the size at which it is remembered: the nearest of the pixels that fall together."""
+    """At the size at which it is remembered: the nearest of the pixels that fall together, as sure as that one is."""
     height, width = view.depth_m.shape
     step = max(1, -(-width // _SMALL[0]), -(-height // _SMALL[1]))
     if step == 1:
         return view
     known = np.where(np.isfinite(view.depth_m) & (view.depth_m > 0), view.depth_m, 0.0).astype(np.float32)
-    rows, columns = height // step, width // step
-    blocks = known[: rows * step, : columns * step].reshape(rows, step, columns, step)
+    depth, sigma = _blocks(known, step), _blocks(view.sigma_log, step)
+    nearest = depth.argmin(axis=2, keepdims=True)
+    depth, sigma = (np.take_along_axis(grid, nearest, axis=2)[..., 0] for grid in (depth, sigma))
     K = view.K.copy()
     K[:2] /= step
     K[:2, 2] += 0.5 / step - 0.5
-    sigma = view.sigma_log[: rows * step : step, : columns * step : step]
-    return replace(view, depth_m=blocks.min(axis=(1, 3)), sigma_log=sigma, K=K)
+    return replace(view, depth_m=depth, sigma_log=sigma, K=K)
+
+
+def _blocks(grid: FloatArray, step: int) -> FloatArray:
+    """Pixels that fall together ``(H // step, W // step, step * step)``."""
+    rows, columns = (n // step for n in grid.shape)
+    cut = grid[: rows * step, : columns * step].reshape(rows, step, columns, step)
+    return cut.swapaxes(1, 2).reshape(rows, columns, step * step)

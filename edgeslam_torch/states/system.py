@@ -17,7 +17,7 @@ from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.map.trajectory import TrajectoryLog
-from edgeslam_torch.mapping.edge_map import EdgeMap
+from edgeslam_torch.mapping.edges.edge_map import EdgeMap
 from edgeslam_torch.mapping.pipeline import Mapped, MappingPipeline
 from edgeslam_torch.stage_times import timed
 from edgeslam_torch.states.apart import Apart

@@ -16,7 +16,7 @@ from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.map.slam_map import SlamMap
-from edgeslam_torch.mapping.edge_map import EdgeMap
+from edgeslam_torch.mapping.edges.edge_map import EdgeMap
 from edgeslam_torch.optim.pose_only import PoseConfig, PoseResult, refine_pose
 from edgeslam_torch.tracking.expectation import Expectation
 from edgeslam_torch.types import FloatArray, IntArray

@@ -36,7 +36,7 @@ from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.map.trajectory import TrajectoryLog
 from edgeslam_torch.mapping import prior_anchors
-from edgeslam_torch.mapping.edge_map import EdgeMap
+from edgeslam_torch.mapping.edges.edge_map import EdgeMap
 from edgeslam_torch.mapping.last_refinement import last_refinement
 from edgeslam_torch.readers.source import open_source
 from edgeslam_torch.slam import EdgeSlam

@@ -39,7 +39,7 @@ from edgeslam_torch.eval.metrics.align import umeyama
 from edgeslam_torch.geometry import se3, sim3
 from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.map.slam_map import SlamMap
-from edgeslam_torch.mapping.edge_map import EdgeMap
+from edgeslam_torch.mapping.edges.edge_map import EdgeMap
 from edgeslam_torch.readers.source import Recording, open_source
 from edgeslam_torch.run import settle_camera
 from edgeslam_torch.slam import EdgeSlam

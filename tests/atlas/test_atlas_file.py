@@ -15,7 +15,7 @@ from edgeslam_torch.files.tensor_file import write_tensors
 from edgeslam_torch.geometry import se3, sim3
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.map.slam_map import SlamMap
-from edgeslam_torch.mapping.edge_map import EdgeMap, EdgePoints
+from edgeslam_torch.mapping.edges.edge_map import EdgeMap, EdgePoints
 from edgeslam_torch.types import ScaleEstimate
 
 S = sim3.exp(np.array([0.5, -0.8, 0.3, 0.4, -0.3, 0.6, np.log(1.4)]))

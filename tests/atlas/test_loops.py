@@ -18,7 +18,7 @@ from edgeslam_torch.geometry import se3, sim3
 from edgeslam_torch.map.keyframe import make_keyframe
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.map.trajectory import TrajectoryLog
-from edgeslam_torch.mapping.edge_map import EdgeMap, EdgePoints
+from edgeslam_torch.mapping.edges.edge_map import EdgeMap, EdgePoints
 from edgeslam_torch.mapping.refinement import refine_all
 from edgeslam_torch.optim.problem import LmConfig
 from edgeslam_torch.tracking.tracker import Tracker

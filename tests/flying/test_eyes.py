@@ -1,5 +1,6 @@
 """What a pilot is told of a picture that has no place in the map."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import ClassVar
 
@@ -7,7 +8,7 @@ import numpy as np
 import pytest
 
 from edgeslam_torch.flying.eyes.fresh_start import PATIENCE_S
-from edgeslam_torch.flying.eyes.home import GROUND_M
+from edgeslam_torch.flying.eyes.home import GROUND_M, Home
 from edgeslam_torch.flying.eyes.slam_eyes import SlamEyes, _contradicted
 from edgeslam_torch.geometry.camera import PRESETS
 from edgeslam_torch.geometry.mount import TELLO_TILT_RAD, camera_on_body
@@ -20,6 +21,15 @@ DISTANCE_M = 1.5
 """Of a wall across the camera's axis."""
 
 
+def a_map(points, edges=None, fresh=None):
+    """A SLAM that knows points ``(N, 3)`` and edges, and is told pixels and depths of the newest picture's edges."""
+    none = np.zeros((0, 2)), np.zeros(0)
+    return SimpleNamespace(
+        surroundings=lambda: (points, np.zeros((0, 3)) if edges is None else edges),
+        fresh_edges=fresh or (lambda image, nearest, farthest: none),
+    )
+
+
 @pytest.fixture
 def eyes():
     """Eyes whose network says twice the distance of everything, and whose map has points of the wall."""
@@ -28,7 +38,7 @@ def eyes():
     across = np.linspace(-0.4, 0.4, 10)
     points = np.array([[x, y, DISTANCE_M] for x in across for y in across])
     made._network = lambda image, camera: told
-    made._slam = SimpleNamespace(surroundings=lambda: (points, np.zeros((0, 3))))
+    made._slam = a_map(points)
     return made
 
 
@@ -60,7 +70,7 @@ def test_a_bare_wall_is_as_far_as_the_network_says_by_the_last_fit_and_less_sure
 
 def test_a_picture_with_too_few_points_goes_by_the_last_fit(eyes):
     told(eyes, 1.0, "tracking")
-    eyes._slam = SimpleNamespace(surroundings=lambda: (np.zeros((0, 3)), np.zeros((0, 3))))
+    eyes._slam = a_map(np.zeros((0, 3)))
     np.testing.assert_allclose(told(eyes, 2.0, "tracking").depth_m, DISTANCE_M, rtol=0.02)
     assert told(eyes, 5.1, "tracking") is None
 
@@ -71,7 +81,7 @@ def test_a_picture_whose_points_are_in_another_unit_goes_by_the_usual_metre(eyes
     for k in range(20):
         told(eyes, 1.0 + 0.2 * k, "tracking")
     points, _ = eyes._slam.surroundings()
-    eyes._slam = SimpleNamespace(surroundings=lambda: (3.0 * points, np.zeros((0, 3))))
+    eyes._slam = a_map(3.0 * points)
     for k in range(6):
         depth = told(eyes, 5.0 + 0.2 * k, "tracking")
     np.testing.assert_allclose(depth.depth_m, DISTANCE_M, rtol=0.02)
@@ -83,7 +93,7 @@ def test_what_is_usual_bridges_pictures_without_points_as_long_as_the_unit_lasts
     eyes._unit = 3, 1.0
     for k in range(20):
         told(eyes, 1.0 + 0.2 * k, "tracking")
-    eyes._slam = SimpleNamespace(surroundings=lambda: (np.zeros((0, 3)), np.zeros((0, 3))))
+    eyes._slam = a_map(np.zeros((0, 3)))
     np.testing.assert_allclose(told(eyes, 60.0, "tracking").depth_m, DISTANCE_M, rtol=0.02)
     assert told(eyes, 60.0, "tracking", revision=4) is None
 
@@ -91,10 +101,40 @@ def test_what_is_usual_bridges_pictures_without_points_as_long_as_the_unit_lasts
 def test_edges_of_the_map_stand_before_what_the_network_sees(eyes):
     points, _ = eyes._slam.surroundings()
     rim = np.array([[0.1, y, 0.8] for y in np.linspace(-0.02, 0.02, 9)])
-    eyes._slam = SimpleNamespace(surroundings=lambda: (points, rim))
+    eyes._slam = a_map(points, rim)
     depth = told(eyes, 1.0, "tracking").depth_m
     assert np.nanmin(depth) == pytest.approx(0.8, rel=0.01)
     assert np.median(depth) == pytest.approx(DISTANCE_M, rel=0.02), "they do not take part in the fit"
+
+
+def test_edges_of_the_newest_picture_stand_before_what_the_network_sees(eyes):
+    """Before a keyframe confirms them; asked for in published units, of half a metre here."""
+    asked = []
+
+    def fresh(image, nearest, farthest):
+        asked.append((nearest, farthest))
+        return np.array([[240.0, 180.0], [241.0, 183.0], [242.0, 186.0], [60.0, 60.0]]), np.array([0.8, 0.8, 0.8, 0.5])
+
+    points, _ = eyes._slam.surroundings()
+    eyes._slam = a_map(points, fresh=fresh)
+    eyes._home = Home(np.eye(3), 0.5, np.zeros(3))
+    depth = told(eyes, 1.0, "tracking").depth_m
+    assert asked == [(0.6, 12.0)]
+    v, u = np.nonzero(depth < 1.0)
+    assert depth[v, u] == pytest.approx(0.8)
+    assert set(u) == {60} and set(v) <= {45, 46}, "and the one that no other agrees with does not"
+    told(eyes, 2.0, "lost")
+    assert len(asked) == 1, "a picture without a place in the map tells none"
+
+
+def test_depth_is_that_of_the_picture_without_the_lens(eyes):
+    bent = replace(CAMERA, distortion=(-0.2, 0.05, 0.0, 0.0, 0.0))
+    seen = []
+    eyes._network, network = lambda image, camera: (seen.append(image), network(image, camera))[1], eyes._network
+    eyes._camera = bent
+    told(eyes, 1.0, "tracking")
+    np.testing.assert_array_equal(seen[0], bent.undistort_image(bare_wall()))
+    assert (seen[0] != bare_wall()).any()
 
 
 def test_a_fit_that_is_old_or_in_another_unit_tells_nothing(eyes):

@@ -9,7 +9,7 @@ from rendered import CAMERA, film, patchwork, sideways
 
 from edgeslam_torch.frontend.edges import extract_edges
 from edgeslam_torch.geometry import se3
-from edgeslam_torch.mapping.edge_depth import EdgeDepth, StereoView, measure_edge_depth
+from edgeslam_torch.mapping.edges.edge_depth import EdgeDepth, StereoView, measure_edge_depth
 from edgeslam_torch.synthetic.house.world import Quad, Texture, World
 
 

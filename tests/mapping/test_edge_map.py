@@ -10,7 +10,7 @@ from edgeslam_torch.config import EdgeConfig
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.map.depth_prior import depth_prior
 from edgeslam_torch.map.edge_agreement import AGREE_PX, USUAL_BEND, PaintedEdges
-from edgeslam_torch.mapping.edge_map import PRIOR_CELL_PX, EdgeMap, EdgePoints, fuse_voxels
+from edgeslam_torch.mapping.edges.edge_map import PRIOR_CELL_PX, EdgeMap, EdgePoints, fuse_voxels
 
 
 def test_two_points_of_one_cell_worked_by_hand():

@@ -15,7 +15,7 @@ from edgeslam_torch.losses.robust import Kernel
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.map.trajectory import TrajectoryLog
 from edgeslam_torch.mapping import refinement
-from edgeslam_torch.mapping.edge_map import EdgeMap
+from edgeslam_torch.mapping.edges.edge_map import EdgeMap
 from edgeslam_torch.mapping.last_refinement import last_refinement, lm_config
 from edgeslam_torch.mapping.motion_terms import MotionFactors
 from edgeslam_torch.optim.problem import StopReason, WindowResult

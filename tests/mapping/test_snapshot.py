@@ -13,7 +13,7 @@ from point_map import CAMERA, PointMap
 from edgeslam_torch.config import DepthConfig, EdgeConfig, SlamConfig
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.map.trajectory import TrajectoryLog
-from edgeslam_torch.mapping.edge_map import EdgeMap, EdgePoints
+from edgeslam_torch.mapping.edges.edge_map import EdgeMap, EdgePoints
 from edgeslam_torch.slam import EdgeSlam
 
 

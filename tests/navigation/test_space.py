@@ -55,6 +55,22 @@ def test_a_thin_thing_is_not_carved_away_by_what_is_behind_it():
     assert not cell(layer, 3.0, 0.0)[0]
 
 
+def test_a_point_in_a_fine_picture_keeps_its_own_sigma_when_the_picture_is_made_smaller():
+    """A network that is sure to 30 % fills nothing beyond a metre; a point of the map before it does."""
+    view = facing_a_wall(4.0)
+    depth, sigma = (np.repeat(np.repeat(grid, 2, 0), 2, 1) for grid in (view.depth_m, view.sigma_log))
+    depth[:, 81], sigma[:] = 1.55, 0.3
+    sigma[:, 81] = 0.05
+    K_fine = view.K.copy()
+    K_fine[:2] *= 2.0
+    K_fine[:2, 2] += 0.5
+    space = Space()
+    space.observe(replace(view, depth_m=depth, sigma_log=sigma, K=K_fine))
+    layer = space.layer(1.15, 0.15)
+    at = 1.55 * np.array([1.0, -(40.0 - 39.5) / 77.0])  # the coarse picture's column 40
+    assert cell(layer, *at)[1]
+
+
 def test_a_ramp_between_something_near_and_the_wall_behind_it_fills_nothing():
     """A network draws no edge but a ramp: a door's frame at 1 m, and the room behind it."""
     view = facing_a_wall(3.0)

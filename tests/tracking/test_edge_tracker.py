@@ -12,7 +12,7 @@ from edgeslam_torch.frontend.orb import OrbExtractor
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.map.keyframe import make_keyframe
 from edgeslam_torch.map.slam_map import SlamMap
-from edgeslam_torch.mapping.edge_map import EdgeMap, EdgePoints
+from edgeslam_torch.mapping.edges.edge_map import EdgeMap, EdgePoints
 from edgeslam_torch.tracking.edge_tracker import EdgeImage, EdgeTracker, PointsInFrame
 
 STRIPES = np.repeat((np.arange(320) // 20 % 2 * 120 + 60)[None].astype(np.uint8), 240, axis=0)

@@ -32,6 +32,8 @@ _DEPTH_EVERY = 3
 """Frames from one depth map to the next: 5 a second."""
 _STEP = 4
 """Depth is handed on at a quarter of the picture's size."""
+_FRESH_M = 0.3, 6.0
+"""Depths at which edges of a picture are looked for at once."""
 _CARRIED_S = 4.0
 """Time after a pose is lost in which depth goes on by the last fit: a bare wall shows no point to fit it to."""
 _DARK, _FLAT = 25.0, 2.0
@@ -233,6 +235,7 @@ class SlamEyes:
         points, and these where they stand before it; None with too few of them."""
         if not _tracks(output) and (self._last_fit(output) is None or not _shows(image)):
             return None
+        image = self._camera.undistort_image(image)
         depth, T_w_c = self._network(image, self._camera), output.T_w_c
         anchors, edges = self._slam.surroundings()
         fit = (self._fitted(depth, anchors, output) if _tracks(output) else None) or self._last_fit(output)
@@ -242,6 +245,9 @@ class SlamEyes:
         part = (slice(_STEP // 2, None, _STEP), slice(_STEP // 2, None, _STEP))
         small = DepthMap(fitted.depth_m[part], fitted.sigma_log[part])
         uv, z = seen_points(np.concatenate([anchors, edges]), self._K_small, T_w_c, small.depth_m.shape)
+        if _tracks(output):
+            fresh_uv, fresh_z = self._slam.fresh_edges(image, *(m / self._home.scale for m in _FRESH_M))
+            uv, z = np.concatenate([uv, (fresh_uv + 0.5) / _STEP - 0.5]), np.concatenate([z, fresh_z])
         kept = agreeing(uv, z, small.depth_m.shape[1])
         return with_nearer_points(small, uv[kept], z[kept])
 

@@ -14,7 +14,7 @@ from edgeslam_torch.map.depth_prior import MIN_ANCHORS, depth_prior
 from edgeslam_torch.map.edge_agreement import PaintedEdges, View, bend
 from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.map.slam_map import SlamMap
-from edgeslam_torch.mapping.edge_depth import StereoView, measure_edge_depth
+from edgeslam_torch.mapping.edges.edge_depth import StereoView, measure_edge_depth
 from edgeslam_torch.types import FloatArray, IntArray, PointCloud
 
 AGREE_DEPTH = 0.04

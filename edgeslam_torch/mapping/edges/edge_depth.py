@@ -110,6 +110,7 @@ def measure_edge_depth(
     prior_sigma_log: FloatArray,
     targets: list[StereoView],
     camera: Camera,
+    most: int = HYPOTHESES[1],
 ) -> EdgeDepth:
     """Inverse depth of edge pixels ``(E, 2)`` of the host by multi-view search.
 
@@ -121,6 +122,7 @@ def measure_edge_depth(
         prior_sigma_log: Its log standard deviation; the search spans two and a half either way.
         targets: Other keyframes with some baseline.
         camera: Intrinsics.
+        most: Number of hypotheses of the coarse search.
     """
     inverse_depth, sigma = np.full(len(uv), np.nan), np.full(len(uv), np.nan)
     if len(uv) == 0 or not targets:
@@ -130,7 +132,7 @@ def measure_edge_depth(
     low, high = ((1.0 / (prior_depth * reach)).astype(np.float32), (reach / prior_depth).astype(np.float32))
     with np.errstate(divide="ignore", invalid="ignore"):  # pixels of edges beside or behind a target; infinite costs
         lines = [_epipolar_lines(host, target, pixel, across, camera) for target in targets]
-        edges, rho, step = _coarse_search(_smooth(host.grey), pixel, across, lines, low, high, camera)
+        edges, rho, step = _coarse_search(_smooth(host.grey), pixel, across, lines, low, high, camera, most)
         for part in _parts(len(edges)):
             some = edges[part]
             profile = _profile(host.grey, pixel.take(some, axis=1), across.take(some, axis=1), _FINE)
@@ -168,6 +170,7 @@ def _coarse_search(
     low: FloatArray,
     high: FloatArray,
     camera: Camera,
+    most: int,
 ) -> tuple[IntArray, FloatArray, FloatArray]:
     """Edges ``(N,)`` with a unique minimum, its inverse depth and the search's step."""
     ends = [_measurable(line, low, high, camera) for line in lines]
@@ -175,7 +178,7 @@ def _coarse_search(
     searched = np.flatnonzero(share.sum(axis=0) >= MIN_SHARE)
     if len(searched) == 0:
         return searched, low[:0], low[:0]
-    count = int(np.clip(length[share > 0].mean() / STEP_PX + 1.5, *HYPOTHESES))
+    count = int(np.clip(length[share > 0].mean() / STEP_PX + 1.5, HYPOTHESES[0], most))
     step = (high - low) / np.float32(count - 1)
     smooth = [_Lines(_smooth(line.grey), line.ray, line.step, line.normal) for line in lines]
     found = []
