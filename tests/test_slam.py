@@ -254,15 +254,21 @@ def test_surroundings_are_what_the_newest_keyframe_and_its_neighbours_see(monkey
     assert len(slam.surroundings()[0]) == 0, "what a network guessed is no point of the map"
 
 
-def test_fresh_edges_lie_on_the_surfaces_in_published_units():
+def test_fresh_edges_lie_on_the_surfaces_in_published_units(monkeypatch):
     """Single edges that no other keyframe has confirmed: nine of ten within a tenth of 3 m."""
     slam, _ = panels_run()
-    uv, z = slam.fresh_edges(panels().frames[-1].image, 0.3, 10.0)
+    newest = panels().frames[-1].image
+    uv, z = slam.fresh_edges(newest, 0.3, 10.0)
     assert len(z) > 100
     p_w = se3.transform(slam.trajectory()[1][-1], panels().camera.back_project(uv, z))
     distance = panels().world.distance_to_surface(in_the_world(slam, p_w))
     assert np.median(distance) < 0.05
     assert np.mean(distance < 0.3) > 0.9
+    published = slam._system.published
+    monkeypatch.setattr(slam._system, "published", replace(published, scale=2.0 * published.scale))
+    again, doubled = slam.fresh_edges(newest, 0.6, 20.0)
+    np.testing.assert_array_equal(uv, again)
+    np.testing.assert_allclose(doubled, 2.0 * z)
 
 
 def test_before_the_first_frame_no_edge_is_fresh():

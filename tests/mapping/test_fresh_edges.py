@@ -85,18 +85,20 @@ def test_without_another_view_nothing_is_told(around):
     assert z.shape == (0,)
 
 
-def test_over_too_short_a_way_nothing_is_told():
-    flight = board_before_a_wall()
-    short = flight.T_w_c.copy()
-    short[:, :3, 3] *= 0.1  # two centimetres at most
-    assert len(measured(stereo(flight, short))[1]) == 0
+def test_views_from_the_same_place_do_not_take_the_places_of_those_that_tell():
+    alone, _ = measured(stereo(board_before_a_wall()))
+    crowded, _ = measured(stereo(board_before_a_wall()), (4, 4, 4, 4, 0, 1, 2, 3))
+    np.testing.assert_array_equal(alone, crowded)
+
+
+def test_a_view_from_far_away_is_not_asked():
+    """From .5 to 2 m the longest baseline is .19 m: the first of these views is .2 m away, the second .15."""
+    assert len(measured(stereo(board_before_a_wall()), (0,), nearest=0.5, farthest=2.0)[1]) == 0
+    assert len(measured(stereo(board_before_a_wall()), (1,), nearest=0.5, farthest=2.0)[1]) > 10
 
 
 def test_no_depth_is_told_that_half_a_pixel_makes_unsure():
-    """At 10 m the longest baseline, .2 m, is 5 px: half a pixel is 10 %."""
-    flight = board_before_a_wall()
-    far = flight.T_w_c.copy()
-    far[:, :3, 3] *= 5.0
-    _, z = measured(stereo(flight, far), nearest=3.5, farthest=60.0)
-    assert len(z) > 50
-    assert z.max() < CAMERA.fx * 1.0 * 2.0 * SIGMA_LOG  # f b / half a pixel, of the longest of them
+    """Over 5 cm the wall at 3 m is 4.3 px from where it would be infinitely far away: half of one is more than 10 %."""
+    _, z = measured(stereo(board_before_a_wall()), (3,))
+    assert len(z) > 30
+    assert z.max() < SIGMA_LOG * CAMERA.fx * 0.05 / 0.5

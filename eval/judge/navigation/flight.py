@@ -72,6 +72,8 @@ def fly(case: Case, limits: NavLimits | None = None) -> Flown:
     known = errand.cockpit.exits()
     found.exits = [len(site.exits), len(known), right_exits(known, site)]
     found.near = [eyes.counts.sectors, eyes.counts.too_far, eyes.counts.surely_too_far]
+    if eyes.depth_age_s:
+        found.depth_age_s = np.round(np.percentile(eyes.depth_age_s, [50, 95]), 3).tolist()
     return found
 
 

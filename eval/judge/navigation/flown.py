@@ -1,5 +1,6 @@
 """What is flown to be judged, and what came of it."""
 
+import math
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -50,6 +51,8 @@ class Flown:
     cpu_worst_ms: float = 0.0
     near: list[int] = field(default_factory=lambda: [0, 0, 0])
     """Sectors with something at .3 to 1 m; of them told .3 m too far; even at two sigmas (`near_counts`)."""
+    depth_age_s: list[float] = field(default_factory=lambda: [math.nan, math.nan])
+    """Since the picture of the newest depth, when the pilot plans by it: median, and in 95 % of the moments."""
     off: list[int] = field(default_factory=lambda: [0, 0])
     """Moments with metres; of them, those with a pose that is farther off than it says (`is_beyond`)."""
     off_m: float = 0.0

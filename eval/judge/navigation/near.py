@@ -66,16 +66,23 @@ class _Eyes(Protocol):
 
 
 class WatchedEyes:
-    """Passes sights on and counts, in each metric view, what is near and told to be far."""
+    """Passes sights on and counts, in each metric view, what is near and told to be far, and how old depth is."""
 
     def __init__(self, eyes: _Eyes, site: Site) -> None:
         self.counts = NearCounts()
+        self.depth_age_s: list[float] = []
+        """Of each moment since the first depth: the age of the picture of the newest."""
+        self._seen_s = math.nan
         self._eyes, self._site = eyes, site
         self._T_b_c = camera_on_body()
 
     def sight(self, now_s: float, events: list[Event]) -> Sight:
         """The sight of the eyes behind."""
         sight = self._eyes.sight(now_s, events)
+        if sight.view is not None:
+            self._seen_s = sight.view.stamp_s
+        if math.isfinite(self._seen_s):
+            self.depth_age_s.append(now_s - self._seen_s)
         if sight.view is not None and sight.metric:
             for event in events:
                 if isinstance(event, Picture) and event.captured_s == sight.view.stamp_s:

@@ -14,8 +14,8 @@ HEAD = (
     "| time over oracle | cruise [m/s] | CPU a tick, worst [ms] |\n|---|---|---|---|---|---|---|---|---|---|---|---|\n"
 )
 NEAR_HEAD = (
-    "\n| eyes | sectors of 3.7 degrees with something at .3 to 1 m | told more than .3 m too far | less two sigmas |\n"
-    "|---|---|---|---|\n"
+    "\n| eyes | sectors of 3.7 degrees with something at .3 to 1 m | told more than .3 m too far | less two sigmas "
+    "| age of the newest depth, 95 % [s] |\n|---|---|---|---|---|\n"
 )
 OFF_HEAD = (
     "\n| eyes | moments with metres | pose more than .1 m beyond three of its sigmas | flights in which it was "
@@ -71,9 +71,13 @@ def _near(flights: Sequence[Flown]) -> str:
     """A second table, of what is near and told to be far; nothing where nothing was near."""
     rows = []
     for eyes in sorted({f.case.eyes for f in flights}):
-        sectors, too_far, surely = np.sum([f.near for f in flights if f.case.eyes == eyes], axis=0).tolist()
+        group = [f for f in flights if f.case.eyes == eyes]
+        sectors, too_far, surely = np.sum([f.near for f in group], axis=0).tolist()
         if sectors:
-            rows.append(f"| {eyes} | {sectors} | {100 * too_far / sectors:.1f} % | {100 * surely / sectors:.1f} % |\n")
+            ages = [f.depth_age_s for f in group if math.isfinite(f.depth_age_s[0])] or [[math.nan, math.nan]]
+            age = np.median(ages, axis=0)
+            shares = f"{100 * too_far / sectors:.1f} % | {100 * surely / sectors:.1f} %"
+            rows.append(f"| {eyes} | {sectors} | {shares} | {age[0]:.2f}, {age[1]:.2f} |\n")
     return NEAR_HEAD + "".join(rows) if rows else ""
 
 
