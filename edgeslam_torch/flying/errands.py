@@ -9,7 +9,7 @@ import numpy as np
 from edgeslam_torch.geometry.rotations import wrapped
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.moved import Moved
-from edgeslam_torch.navigation.openings.watch import Candidate
+from edgeslam_torch.navigation.openings.watch import Candidate, Exit
 from edgeslam_torch.navigation.sight import Sight
 from edgeslam_torch.navigation.tasks import LooksAhead
 from edgeslam_torch.types import FloatArray
@@ -80,7 +80,7 @@ class WayHome:
         """No: there is nothing else to fly for."""
         return False
 
-    def consider(self, candidates: Sequence[Candidate]) -> None:
+    def consider(self, candidates: Sequence[Candidate], exits: Sequence[Exit] = ()) -> None:
         """It passes every opening by."""
 
     def heading_rad(self, sight: Sight) -> float | None:

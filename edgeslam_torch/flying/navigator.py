@@ -15,7 +15,7 @@ from edgeslam_torch.flying.errands import Stay, WayHome
 from edgeslam_torch.flying.outcome import FlightRefused, Outcome
 from edgeslam_torch.flying.recorder import Recorder
 from edgeslam_torch.flying.simulated import is_simulated, site_of
-from edgeslam_torch.navigation.corridor import FollowCorridor
+from edgeslam_torch.navigation.corridor.follow import FollowCorridor
 from edgeslam_torch.navigation.limits import NavLimits
 from edgeslam_torch.navigation.openings.pathways import Pathway, pathways
 from edgeslam_torch.navigation.openings.watch import Exit

@@ -202,7 +202,7 @@ class Pilot:
         self.space.flown(sight.p_w, self.limits.radius_m + BAND_M)
         if self.exits.due(sight):
             self.exits.look(self.walls(), sight)
-            self.task.consider(self.exits.candidates)
+            self.task.consider(self.exits.candidates, self.exits.exits)
 
     def _carry(self, moved: Moved) -> None:
         """Bring what is known along with the map that moved; that is no progress."""

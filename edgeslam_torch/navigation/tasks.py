@@ -13,7 +13,7 @@ from edgeslam_torch.navigation.exploring.second_look import SecondLook
 from edgeslam_torch.navigation.hindered.losses import Losses
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.moved import Moved
-from edgeslam_torch.navigation.openings.watch import Candidate
+from edgeslam_torch.navigation.openings.watch import Candidate, Exit
 from edgeslam_torch.navigation.sight import Sight
 from edgeslam_torch.navigation.supervisor import CARRIED_SIGMA_M
 from edgeslam_torch.types import FloatArray
@@ -42,8 +42,8 @@ class Task(Protocol):
     def carry(self, moved: Moved) -> None:
         """Take remembered places along with the map."""
 
-    def consider(self, candidates: Sequence[Candidate]) -> None:
-        """Take note of what looked like an opening from one place only, before `goals` is asked."""
+    def consider(self, candidates: Sequence[Candidate], exits: Sequence[Exit] = ()) -> None:
+        """Take note of what looked like an opening from one place only, and of exits, before `goals` is asked."""
 
     def heading_rad(self, sight: Sight) -> float | None:
         """Where to look now, standing; None to look where it flies."""
@@ -63,7 +63,7 @@ class LooksAhead:
         """After `MOST_LOSSES`."""
         return losses >= MOST_LOSSES
 
-    def consider(self, candidates: Sequence[Candidate]) -> None:
+    def consider(self, candidates: Sequence[Candidate], exits: Sequence[Exit] = ()) -> None:
         """It does not."""
 
     def heading_rad(self, sight: Sight) -> float | None:
@@ -173,7 +173,7 @@ class Explore:
         """No: there is elsewhere to look, and time is limited."""
         return False
 
-    def consider(self, candidates: Sequence[Candidate]) -> None:
+    def consider(self, candidates: Sequence[Candidate], exits: Sequence[Exit] = ()) -> None:
         """What to look at once more."""
         self._second.consider(candidates)
 

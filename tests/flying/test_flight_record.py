@@ -14,7 +14,7 @@ from edgeslam_torch.flying.recorder import EXITS, Recorder
 from edgeslam_torch.flying.replay import replay, told
 from edgeslam_torch.geometry.camera import PRESETS
 from edgeslam_torch.geometry.mount import camera_on_body
-from edgeslam_torch.navigation.corridor import FollowCorridor
+from edgeslam_torch.navigation.corridor.follow import FollowCorridor
 from edgeslam_torch.navigation.flight_record import PLAN, Decision, NewTask, PlanLog, read_plan
 from edgeslam_torch.navigation.limits import NavLimits
 from edgeslam_torch.navigation.openings.watch import Exit

@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from edgeslam_torch.navigation.corridor import FollowCorridor
 from edgeslam_torch.navigation.exploring.frontiers import Looks, reachable
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.moved import Moved
@@ -373,60 +372,6 @@ def test_without_walls_there_is_no_direction():
     assert wall_directions(surroundings(lambda a, b: np.zeros(a.shape, bool)), HERE) == []
 
 
-def corner(a, b):
-    """A corridor of 2 m from behind the origin to a wall at 4 m, where another leads to the left."""
-    along, turn = (np.abs(b) < 1.0) & (a < 4.0), (b > -1.0) & (a > 2.0) & (a < 4.0)
-    return ~(along | turn)
-
-
-def test_a_corridor_is_followed_ahead_then_round_its_corner():
-    task = FollowCorridor()
-    ahead = surroundings(corner, lambda a, b: (a > 1.5) | (a < -1.0)).layer
-    (cell,) = task.goals(ahead, sight(0.0))
-    assert ahead.centres(cell)[0] > 1.0
-    whole = surroundings(corner, lambda a, b: (b > 2.0) | (a < -1.0)).layer
-    for k in range(4):
-        (cell,) = task.goals(whole, sight(0.9 * k, stamp_s=k))
-    (cell,) = task.goals(whole, sight(3.0, stamp_s=5.0, yaw=1.5))
-    assert whole.centres(cell)[1] > 1.0, "not back to what is unseen behind the start"
-
-
-def test_what_is_unseen_behind_the_start_is_where_it_came_from():
-    """Two metres behind it, which is not beside its way: at the end of the corridor it does not turn back to it."""
-    layer = surroundings(lambda a, b: (np.abs(b) > 1.0) | (a > 4.0), lambda a, b: a < -2.0).layer
-    task = FollowCorridor()
-    task.goals(layer, sight(0.0))
-    assert len(task.goals(layer, sight(3.3, stamp_s=5.0))) == 0
-
-
-def test_an_end_is_something_solid_ahead_not_the_lack_of_a_way():
-    """At 1 m before the end with a door in its middle; in the middle of it; where the sides alone are near."""
-    task = FollowCorridor()
-    ending = surroundings(lambda a, b: wall(0.9)(a, b) | (np.abs(b) > 1.0) & (np.abs(b) < 1.2)).layer
-    task.goals(ending, sight(-1.0))
-    assert not task.wall
-    task.goals(ending, sight(1.0, stamp_s=4.0))
-    assert task.wall
-
-
-def test_a_door_is_no_corridor():
-    """Free space behind a doorway is not part of what is followed: the goal stays before it."""
-    lined = surroundings(lambda a, b: wall(0.9)(a, b) | (np.abs(b) > 1.0) & (np.abs(b) < 1.2) & (a < 2.0)).layer
-    (cell,) = FollowCorridor().goals(lined, sight(0.0))
-    assert lined.centres(cell)[0] < 1.9
-
-
-def test_a_corridor_ends_in_a_room():
-    task, room = FollowCorridor(), surroundings(lambda a, b: np.maximum(np.abs(a), np.abs(b)) > 2.5).layer
-    for k in range(5):
-        task.goals(room, sight(0.3 * k - 0.6, stamp_s=k))
-        done = task.done(sight(0.3 * k - 0.6, stamp_s=k))
-    assert not done, "a metre must have been flown: a take-off in a room is no corridor's end"
-    task.goals(room, sight(0.6, stamp_s=5.0))
-    task.goals(room, sight(0.6, stamp_s=8.0))
-    assert task.done(sight(0.6, stamp_s=8.0)) and task.room
-
-
 def test_what_is_looked_at_in_vain_is_left():
     looks, layer = Looks(), surroundings(lambda a, b: np.zeros(a.shape, bool)).layer
     near, far = layer.cells(np.array([[0.5, 0.0]])), layer.cells(np.array([[4.0, 0.0]]))
@@ -533,12 +478,15 @@ def test_the_pilot_tells_its_task_of_candidates(monkeypatch):
     assert len(task.goals(surroundings(wall(0.9)).layer, sight(-1.0, stamp_s=9.2)))
 
 
-def test_what_is_unseen_beside_the_way_is_no_way_on():
-    """Unseen ground half a metre behind the start, and nothing else to see: the far end is the goal."""
-    closed = lambda a, b: (np.abs(b) > 1.0) | (a > 4.0)  # noqa: E731
-    layer = surroundings(closed, lambda a, b: a < -0.5).layer
-    task = FollowCorridor()
-    (cell,) = task.goals(layer, sight(0.0))
-    assert layer.centres(cell)[0] > 3.0
-    task.goals(layer, sight(3.2, stamp_s=5.0))
-    assert len(task.goals(layer, sight(3.3, stamp_s=5.5))) == 0
+def test_the_pilot_tells_its_task_of_exits(monkeypatch):
+    monkeypatch.setattr(Pilot, "walls", lambda self: surroundings(wall(0.9)))
+    told = []
+
+    class Listens(GoTo):
+        def consider(self, candidates, exits=()):
+            told.extend(exits)
+
+    pilot = Pilot(Listens(np.array([3.0, 0.0, 1.15])))
+    pilot.exits = watched([0.0, 0.2, 0.4, 0.6], surroundings(wall(0.9)))
+    pilot.update(sight(0.6, stamp_s=9.0, view=VIEW))
+    assert [e.centre_w[0] for e in told] == [pytest.approx(2.0, abs=0.15)]

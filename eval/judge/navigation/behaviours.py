@@ -7,7 +7,7 @@ import numpy as np
 
 from edgeslam_torch.eval.judge.navigation.flown import Flown
 from edgeslam_torch.flying.errands import WayHome
-from edgeslam_torch.navigation.corridor import FollowCorridor
+from edgeslam_torch.navigation.corridor.follow import FollowCorridor
 from edgeslam_torch.navigation.openings.watch import Exit
 from edgeslam_torch.navigation.tasks import Explore, GoTo, Task
 from edgeslam_torch.synthetic.sites.site import Site

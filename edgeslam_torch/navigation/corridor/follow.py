@@ -1,0 +1,126 @@
+"""The task of following a corridor, round its corners, to where it ends or opens into a room."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from edgeslam_torch.navigation.corridor.onward import far_middle, is_ahead, is_walled, mouths, straight, wide
+from edgeslam_torch.navigation.corridor.trail import PASSED_M, Trail, aside
+from edgeslam_torch.navigation.exploring.frontiers import Looks
+from edgeslam_torch.navigation.layer import Layer
+from edgeslam_torch.navigation.moved import Moved
+from edgeslam_torch.navigation.openings.pathways import WIDEST_M
+from edgeslam_torch.navigation.openings.watch import Candidate, Exit
+from edgeslam_torch.navigation.sight import Sight
+from edgeslam_torch.navigation.tasks import LooksAhead
+from edgeslam_torch.types import FloatArray
+
+_TURN_COST_M = 6.0
+"""A corridor that turns off is followed before one that turns back, as far as a drone sees."""
+_BLIND_M = 1.5
+"""How far ahead it wants to go where nothing ahead is known."""
+_ROOM_S = 2.0
+_SQUARE_COS = math.cos(math.radians(35.0))
+"""A door whose normal is nearer than this to the direction of the corridor is across it."""
+
+
+@dataclass(slots=True)
+class FollowCorridor(LooksAhead):
+    """Fly on along the corridor that the drone is in, in its middle; through no door that is known to be one."""
+
+    until_s: float = np.inf
+    """On the clock of the sights."""
+    room: bool = False
+    """Whether it ended where the corridor is wider than a corridor."""
+    wall: bool = False
+    """Whether something solid is close ahead: nothing to follow without it is not the corridor's end."""
+    _looks: Looks = field(default_factory=Looks)
+    _trail: Trail | None = None
+    _end_w: FloatArray | None = None
+    """``(2, 2)`` where the corridor ended before a wall, and its direction there."""
+    _wide_s: float = math.nan
+    _target_w: FloatArray | None = None
+    """``(2,)`` in the corridor that turns off which it flies to."""
+    _doors: list[tuple[FloatArray, FloatArray]] = field(default_factory=list)
+    """``(2,)`` middle and unit normal of what is, or may be, a door."""
+
+    def consider(self, candidates: Sequence[Candidate], exits: Sequence[Exit] = ()) -> None:
+        """Doors end a corridor."""
+        self._doors = [(c.centre_w, c.normal_w) for c in candidates]
+        self._doors += [(e.centre_w[:2], e.normal_w[:2]) for e in exits]
+
+    def goals(self, layer: Layer, sight: Sight) -> np.ndarray:
+        """Cells ``(G, 2)`` to follow: what is wide and ahead, else what turns off, else straight on through what is
+        narrow; before a wall, holes in the sides. None where there is nothing of these."""
+        here = sight.p_w[:2]
+        self._trail = self._trail or Trail.beginning(sight)
+        self._trail.fly(here)
+        self._note_width(layer, sight)
+        axis = self._trail.direction(layer, here)
+        self.wall = is_walled(layer, here, axis)
+        return self._looks.worth(self._onward(layer, here, axis, self._trail), layer, sight)
+
+    def done(self, sight: Sight) -> bool:
+        """Whether the corridor ended, or the time."""
+        self.room = sight.stamp_s - self._wide_s > _ROOM_S
+        return self.room or self._looks.over(sight.stamp_s) or sight.stamp_s >= self.until_s
+
+    def carry(self, moved: Moved) -> None:
+        """Take what is remembered along with the map."""
+        self._looks.carry(moved)
+        if self._trail is not None:
+            self._trail.carry(moved)
+        self._doors = [(moved.points(middle[None])[0], normal) for middle, normal in self._doors]
+        if self._end_w is not None:
+            self._end_w[:1] = moved.points(self._end_w[:1])
+        if self._target_w is not None:
+            self._target_w = moved.points(self._target_w[None])[0]
+
+    def _onward(self, layer: Layer, here: FloatArray, axis: FloatArray, trail: Trail) -> np.ndarray:
+        cells = wide(layer, here)
+        places = layer.centres(cells)
+        if len(ahead := cells[is_ahead(places, here, axis) & trail.leads_on(places)]):
+            self._end_w = None
+            return far_middle(layer, ahead, axis)
+        trail.end(here)
+        if len(off := cells[trail.turns_off(places, here)]):
+            return self._nearest(layer, off, here, axis)
+        if len(narrow := straight(layer, here, axis, self._to_door(here, axis))):
+            return far_middle(layer, narrow, axis)
+        if not self.wall:
+            return layer.cells(here + _BLIND_M * axis)[None]
+        if self._end_w is None:
+            self._end_w = np.array([here, axis])
+        return mouths(layer, *self._end_w)
+
+    def _nearest(self, layer: Layer, cells: np.ndarray, here: FloatArray, axis: FloatArray) -> np.ndarray:
+        """Of what turns off the nearest, ``(1, 2)``; it stays with what it chose."""
+        places = layer.centres(cells)
+        step = places - here
+        far = np.linalg.norm(step, axis=1)
+        cost = far + _TURN_COST_M * (1.0 - (step @ axis) / np.maximum(far, 1e-6))
+        if self._target_w is not None:
+            cost -= 0.5 * (np.linalg.norm(places - self._target_w, axis=1) < 0.7)
+        best = int(np.argmin(cost))
+        self._target_w = places[best]
+        return cells[[best]]
+
+    def _to_door(self, here: FloatArray, axis: FloatArray) -> float:
+        """Way straight ahead to the first door across the corridor; infinite where there is none."""
+        ways = [
+            float((middle - here) @ axis)
+            for middle, normal in self._doors
+            if abs(float(normal @ axis)) > _SQUARE_COS and abs(float(aside(middle - here, axis))) < PASSED_M
+        ]
+        return min([way for way in ways if way > 0.0], default=math.inf)
+
+    def _note_width(self, layer: Layer, sight: Sight) -> None:
+        """A room is where nothing solid is within half a corridor's width, and all of that is seen."""
+        assert self._trail is not None
+        away = float(layer.clearance_at(sight.p_w[None, :2])[0])
+        if 2.0 * away <= WIDEST_M or len(self._trail.places_w) < 2:
+            self._wide_s = math.nan
+        elif math.isnan(self._wide_s):
+            self._wide_s = sight.stamp_s

@@ -1,0 +1,214 @@
+"""Following a corridor, against corridors whose walls are known."""
+
+import math
+
+import numpy as np
+import pytest
+
+from edgeslam_torch.navigation.corridor.follow import FollowCorridor
+from edgeslam_torch.navigation.layer import Layer
+from edgeslam_torch.navigation.moved import Moved
+from edgeslam_torch.navigation.openings.watch import Candidate, Exit
+from edgeslam_torch.navigation.sight import Sight
+
+
+def seen(is_solid, is_unseen=lambda x, y: np.zeros(x.shape, bool)):
+    """A square of 12 m around the origin."""
+    x, y = np.meshgrid((np.arange(120) + 0.5) * 0.1 - 6.0, (np.arange(120) + 0.5) * 0.1 - 6.0, indexing="ij")
+    solid, unseen = is_solid(x, y), is_unseen(x, y)
+    return Layer(~solid & ~unseen, solid & ~unseen, np.array([-6.0, -6.0]), 0.1)
+
+
+def sight(x, y=0.0, stamp_s=0.0, yaw=0.0):
+    return Sight(stamp_s, np.array([x, y, 1.15]), yaw, np.zeros(3))
+
+
+def place(task, layer, at):
+    """Where it wants to go ``(2,)``."""
+    (cell,) = task.goals(layer, at)
+    return layer.centres(cell)
+
+
+def follow(task, layer, *way):
+    """Where it wants to go at the end of a way."""
+    for k, (x, y) in enumerate(way[:-1]):
+        task.goals(layer, sight(x, y, 0.5 * k))
+    return place(task, layer, sight(*way[-1], 0.5 * len(way)))
+
+
+def sides(width=2.0, end=5.0):
+    """A straight corridor along x, closed at its end."""
+    return lambda x, y: (np.abs(y) > 0.5 * width) | (x > end)
+
+
+def with_door(gap, at=2.0):
+    """A wall across a corridor of 2 m, with an opening of this width in its middle."""
+    across = lambda x, y: (np.abs(x - at) < 0.1) & (np.abs(y) > 0.5 * gap - 0.05)  # noqa: E731
+    return lambda x, y: sides()(x, y) | across(x, y)
+
+
+def corner(x, y):
+    """A corridor of 2 m from behind the origin to a wall at 4 m, where another leads to the left."""
+    along, turn = (np.abs(y) < 1.0) & (x < 4.0), (y > -1.0) & (x > 2.0) & (x < 4.0)
+    return ~(along | turn)
+
+
+def test_a_corridor_is_followed_ahead_then_round_its_corner():
+    task = FollowCorridor()
+    ahead = seen(corner, lambda x, y: (x > 1.5) | (x < -1.0))
+    assert place(task, ahead, sight(0.0))[0] > 1.0
+    whole = seen(corner, lambda x, y: (y > 2.0) | (x < -1.0))
+    for k in range(4):
+        task.goals(whole, sight(0.9 * k, stamp_s=k))
+    assert place(task, whole, sight(3.0, stamp_s=5.0, yaw=1.5))[1] > 1.0, "not back to what is unseen behind the start"
+
+
+def test_the_goal_is_in_the_middle_of_the_far_end():
+    """Whatever is unseen beside the way, and however aslant it flies."""
+    layer = seen(sides(), lambda x, y: np.abs(y - 0.9) < 0.2)
+    assert place(FollowCorridor(), layer, sight(0.0, yaw=0.35)) == pytest.approx([4.4, 0.0], abs=0.2)
+
+
+def test_a_drone_that_flies_aslant_goes_on_along_the_walls():
+    """After a metre at 20 degrees to them: something stood at one side."""
+    layer = seen(lambda x, y: sides()(x, y) | (np.abs(x - 3.0) < 0.2) & (y > 0.9))
+    last = follow(FollowCorridor(), layer, (-1.0, -0.4), (-0.5, -0.2), (0.0, 0.0), (0.3, 0.1))
+    assert last == pytest.approx([4.4, 0.0], abs=0.2)
+
+
+def test_what_is_unseen_behind_the_start_is_where_it_came_from():
+    """Two metres behind it, which is not beside its way: at the end of the corridor it does not turn back to it."""
+    layer = seen(lambda x, y: (np.abs(y) > 1.0) | (x > 4.0), lambda x, y: x < -2.0)
+    task = FollowCorridor()
+    task.goals(layer, sight(0.0))
+    assert len(task.goals(layer, sight(3.3, stamp_s=5.0))) == 0
+
+
+@pytest.mark.parametrize("width", [2.0, 2.6])
+def test_the_corridor_flown_along_one_side_is_no_way_on(width):
+    layer = seen(sides(width), lambda x, y: np.abs(y - 0.5 * width + 0.1) < 0.1)
+    way = [(x, 0.6 - 0.5 * width) for x in np.arange(-4.0, 4.7, 0.4)]
+    with pytest.raises(ValueError, match="unpack"):
+        follow(FollowCorridor(), layer, *way)
+
+
+def test_an_end_is_something_solid_ahead_not_the_lack_of_a_way():
+    """At 1 m before the end with a door in its middle; in the middle of it; where the sides alone are near."""
+    task = FollowCorridor()
+    ending = seen(with_door(0.9))
+    task.goals(ending, sight(-1.0))
+    assert not task.wall
+    task.goals(ending, sight(1.0, stamp_s=4.0))
+    assert task.wall
+
+
+def test_a_door_is_no_corridor():
+    """Free space behind a doorway is not part of what is followed: the goal stays before it."""
+    assert place(FollowCorridor(), seen(with_door(0.9)), sight(0.0))[0] < 1.9
+
+
+def test_what_is_narrow_straight_ahead_is_flown_through_unless_it_is_a_door():
+    """Depth that is too near makes a corridor as narrow as a door for half a metre."""
+    narrow = seen(lambda x, y: sides()(x, y) | (np.abs(x - 2.0) < 0.3) & (np.abs(y) > 0.4))
+    way = [(x, 0.0) for x in (-1.0, -0.5, 0.0, 0.5, 1.0, 1.3)]
+    assert follow(FollowCorridor(), narrow, *way)[0] > 4.0
+    ahead, to_the_left = np.array([1.0, 0.0]), np.array([0.0, 1.0])
+    for middle, normal, far in ((1.8, ahead, False), (1.8, to_the_left, True), (-3.0, ahead, True)):
+        task = FollowCorridor()
+        task.consider([Candidate(np.array([middle, 0.2]), normal, np.array([0.0, 0.0]))])
+        last = follow(task, narrow, *[(x, 0.0) for x in (-1.0, -0.5, 0.0, 0.5)], (1.0, 0.0))
+        assert bool(last[0] > 4.0) is far
+    task, wide = FollowCorridor(), np.array([1.8, 0.2, 1.15])
+    task.consider([], [Exit(wide, np.array([1.0, 0.0, 0.0]), 0.9, 0.1, 0.1, 2)])
+    assert follow(task, narrow, *[(x, 0.0) for x in (-1.0, -0.5, 0.0, 0.5)], (1.0, 0.0))[0] < 1.8
+
+
+def test_a_speck_beside_the_start_does_not_end_it():
+    """`blank_walls` 812: what is wide and free begins farther than a metre away."""
+    speck = lambda x, y: (np.abs(x - 0.4) < 0.1) & (np.abs(y - 0.5) < 0.1)  # noqa: E731
+    layer = seen(lambda x, y: sides()(x, y) | speck(x, y) | (x < 0.7) & (y < -0.5))
+    assert place(FollowCorridor(), layer, sight(0.0))[0] > 3.0
+
+
+def test_where_nothing_is_known_ahead_it_wants_to_go_ahead():
+    nothing = seen(lambda x, y: np.abs(y) > 1.0, lambda x, y: np.abs(x) > 0.3)
+    assert place(FollowCorridor(), nothing, sight(0.0)) == pytest.approx([1.5, 0.0], abs=0.1)
+    assert len(FollowCorridor().goals(seen(lambda x, y: x > 1.2, lambda x, y: np.abs(x) > 0.3), sight(0.0)))
+    assert len(FollowCorridor().goals(seen(sides(end=0.9), lambda x, y: x < -0.3), sight(0.4))) == 0
+
+
+def test_a_drone_that_is_brought_back_goes_on_ahead():
+    """Its pose was lost, and the supervisor flew it back along its way."""
+    layer = seen(sides(), lambda x, y: x > 4.0)
+    way = [(x, 0.0) for x in np.arange(-4.0, 2.1, 0.5)]
+    assert follow(FollowCorridor(), layer, *way, (1.0, 0.1), (0.0, 0.0), (-1.0, 0.0))[0] > 3.0
+
+
+def stub(x, y):
+    """A corridor of 2 m that ends at 3 m; from -1 to 1 m another leads to the left."""
+    return ~((np.abs(y) < 1.0) & (x < 3.0) | (np.abs(x) < 1.0) & (y > 0.0))
+
+
+def test_from_a_dead_end_it_comes_back_to_what_turns_off():
+    task, layer = FollowCorridor(), seen(stub)
+    to_its_end = [(x, 0.0) for x in np.arange(-4.0, 2.3, 0.4)]
+    assert follow(task, layer, *to_its_end)[1] > 1.6
+    for x in (1.6, 1.0, 0.5, 0.1):
+        assert place(task, layer, sight(x, 0.1, 20.0 - x))[1] > 1.6, "not into the dead end again"
+    for y in (0.6, 1.2, 1.8):
+        last = place(task, layer, sight(0.0, y, 30.0 + y))
+    assert last == pytest.approx([0.0, 5.4], abs=0.4), "ahead is where it flies now"
+
+
+def test_what_turns_off_is_flown_to_as_soon_as_its_mouth_is_seen():
+    """`l_corridor` 811: of it a drone sees, from its dead end, a tongue of half a metre's width."""
+    mouth = lambda x, y: (np.abs(x) < 0.9) & (y < 1.2) | (np.abs(x - 0.3 + 0.5 * (y - 1.0)) < 0.2) & (y < 1.8)  # noqa: E731
+    layer = seen(stub, lambda x, y: (y > 0.9) & ~mouth(x, y))
+    last = follow(FollowCorridor(), layer, *[(x, -0.2) for x in np.arange(-4.0, 2.3, 0.4)])
+    assert last == pytest.approx([0.0, 1.6], abs=0.3)
+
+
+def test_before_a_wall_it_looks_into_the_holes_in_the_sides():
+    """`l_corridor` 812: in passing nothing of what turns off was seen but that no wall is there."""
+    layer = seen(stub, lambda x, y: (y > 0.9) & (np.abs(x) < 1.0))
+    to_its_end = [(x, 0.0) for x in np.arange(-4.0, 2.5, 0.4)]
+    assert follow(FollowCorridor(), layer, *to_its_end) == pytest.approx([0.0, 1.2], abs=0.2)
+    door = seen(lambda x, y: (np.abs(y) > 1.0) & ((np.abs(x) > 0.5) | (y < 0.0)) | (x > 3.0), lambda x, y: y > 1.1)
+    task = FollowCorridor()
+    for k, (x, y) in enumerate(to_its_end):
+        found = task.goals(door, sight(x, y, 0.5 * k))
+    assert task.wall and len(found) == 0, "a door is none"
+
+
+def test_it_moves_with_the_map():
+    """Two metres to the left: the way flown stays the way flown, and what turns off what it flies to."""
+    from_, to = np.eye(4)[None], np.eye(4)[None]
+    to[0, 1, 3] = 2.0
+    for shape, left_m in ((stub, 3.6), (sides(end=3.0), math.nan)):
+        task = FollowCorridor()
+        for k, x in enumerate(np.arange(-4.0, 2.5, 0.4)):
+            task.goals(seen(shape), sight(x, 0.0, 0.5 * k))
+        task.carry(Moved(from_, to))
+        moved = seen(lambda x, y: shape(x, y - 2.0))  # noqa: B023
+        found = moved.centres(task.goals(moved, sight(2.4, 2.0, 30.0)))
+        assert (found[:, 1] > left_m).all() if math.isfinite(left_m) else len(found) == 0
+
+
+def test_a_corridor_ends_in_a_room():
+    task, room = FollowCorridor(), seen(lambda x, y: np.maximum(np.abs(x), np.abs(y)) > 2.5)
+    for k in range(5):
+        task.goals(room, sight(0.3 * k - 0.6, stamp_s=k))
+        done = task.done(sight(0.3 * k - 0.6, stamp_s=k))
+    assert not done, "a metre must have been flown: a take-off in a room is no corridor's end"
+    task.goals(room, sight(0.6, stamp_s=5.0))
+    task.goals(room, sight(0.6, stamp_s=8.0))
+    assert task.done(sight(0.6, stamp_s=8.0)) and task.room
+
+
+def test_what_is_unseen_beside_the_way_is_no_way_on():
+    """Unseen ground half a metre behind the start, and nothing else to see: the far end is the goal."""
+    layer = seen(lambda x, y: (np.abs(y) > 1.0) | (x > 4.0), lambda x, y: x < -0.5)
+    task = FollowCorridor()
+    assert place(task, layer, sight(0.0))[0] > 3.0
+    task.goals(layer, sight(3.2, stamp_s=5.0))
+    assert len(task.goals(layer, sight(3.3, stamp_s=5.5))) == 0
