@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from edgeslam_torch.navigation.corridor.follow import FollowCorridor
+from edgeslam_torch.navigation.corridor.onward import mouths
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.moved import Moved
 from edgeslam_torch.navigation.openings.watch import Candidate, Exit
@@ -173,11 +174,26 @@ def test_before_a_wall_it_looks_into_the_holes_in_the_sides():
     layer = seen(stub, lambda x, y: (y > 0.9) & (np.abs(x) < 1.0))
     to_its_end = [(x, 0.0) for x in np.arange(-4.0, 2.5, 0.4)]
     assert follow(FollowCorridor(), layer, *to_its_end) == pytest.approx([0.0, 1.2], abs=0.2)
+    specks = seen(lambda x, y: stub(x, y) | (np.abs(x) < 0.1) & (np.abs(y - 0.6) < 0.1), lambda x, y: y > 2.0)
+    assert len(mouths(specks, np.array([2.4, 0.0]), np.array([1.0, 0.0]))) == 1, "`l_corridor` 816"
     door = seen(lambda x, y: (np.abs(y) > 1.0) & ((np.abs(x) > 0.5) | (y < 0.0)) | (x > 3.0), lambda x, y: y > 1.1)
     task = FollowCorridor()
     for k, (x, y) in enumerate(to_its_end):
         found = task.goals(door, sight(x, y, 0.5 * k))
     assert task.wall and len(found) == 0, "a door is none"
+
+
+def test_what_is_between_it_and_the_wall_is_no_way_on():
+    """`l_corridor` 817 and 818: between a hole in the side and a last step to the wall it stayed where it was."""
+    layer, mouth = seen(stub, lambda x, y: (y > 0.9) & (np.abs(x) < 1.0)), pytest.approx([0.0, 1.2], abs=0.2)
+    task, to_its_end = FollowCorridor(), [(x, 0.0) for x in np.arange(-4.0, 2.5, 0.4)]
+    assert follow(task, layer, *to_its_end) == mouth
+    assert place(task, layer, sight(1.9, 0.0, 12.0)) == mouth
+    task = FollowCorridor()
+    assert follow(task, layer, *to_its_end[:-1])[0] > 2.3
+    for k in range(12):
+        found = task.goals(layer, sight(2.0, 0.0, 10.0 + 0.5 * k))
+    assert layer.centres(found)[0] == mouth, "it comes no nearer to the wall"
 
 
 def test_it_moves_with_the_map():

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from edgeslam_torch.navigation.corridor.onward import far_middle, is_ahead, is_walled, mouths, straight, wide
-from edgeslam_torch.navigation.corridor.trail import PASSED_M, Trail, aside
+from edgeslam_torch.navigation.corridor.trail import DEAD_END_M, PASSED_M, Trail, aside
 from edgeslam_torch.navigation.exploring.frontiers import Looks
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.moved import Moved
@@ -79,7 +79,7 @@ class FollowCorridor(LooksAhead):
             self._target_w = moved.points(self._target_w[None])[0]
 
     def _onward(self, layer: Layer, here: FloatArray, axis: FloatArray, trail: Trail) -> np.ndarray:
-        cells = wide(layer, here)
+        cells = self._left(layer, wide(layer, here))
         places = layer.centres(cells)
         if len(ahead := cells[is_ahead(places, here, axis) & trail.leads_on(places)]):
             self._end_w = None
@@ -87,13 +87,20 @@ class FollowCorridor(LooksAhead):
         trail.end(here)
         if len(off := cells[trail.turns_off(places, here)]):
             return self._nearest(layer, off, here, axis)
-        if len(narrow := straight(layer, here, axis, self._to_door(here, axis))):
-            return far_middle(layer, narrow, axis)
+        narrow = straight(layer, here, axis, self._to_door(here, axis))
+        if self._end_w is not None:  # what is between here and the wall is no way on
+            narrow = narrow[np.linalg.norm(layer.centres(narrow) - self._end_w[0], axis=1) > DEAD_END_M]
+        if len(narrow := self._left(layer, far_middle(layer, narrow, axis))):
+            return narrow
         if not self.wall:
             return layer.cells(here + _BLIND_M * axis)[None]
         if self._end_w is None:
             self._end_w = np.array([here, axis])
         return mouths(layer, *self._end_w)
+
+    def _left(self, layer: Layer, cells: np.ndarray) -> np.ndarray:
+        """Those of the cells ``(N, 2)`` that were not looked at in vain."""
+        return cells[self._looks.left(layer.centres(cells))]
 
     def _nearest(self, layer: Layer, cells: np.ndarray, here: FloatArray, axis: FloatArray) -> np.ndarray:
         """Of what turns off the nearest, ``(1, 2)``; it stays with what it chose."""

@@ -28,6 +28,8 @@ _SAME_M = 0.3
 """Ends of ways that differ by less are as far."""
 _WALL_M, _ABREAST_M = 2.0, 0.5
 """How near a wall ahead ends a corridor, and how far to each side it is looked for: there may be a door in it."""
+_SPECK_M2 = 0.08
+"""Smaller solids, of a wrong depth, stand before what turns off; a wall between two doors is more."""
 _BACK_M, _MOUTH_M = 6.0, 1.2
 """How far back from a wall ahead holes in the sides are looked for, and how far to the side it looks into them."""
 
@@ -82,15 +84,21 @@ def mouths(layer: Layer, end_w: FloatArray, axis: FloatArray) -> np.ndarray:
     """
     along = np.arange(0.0, _BACK_M, layer.cell_m)
     out = np.arange(0.0, PASSED_M, 0.5 * layer.cell_m)
-    places = []
+    solid, places = _walls(layer), []
     for left in (np.array([-axis[1], axis[0]]), np.array([axis[1], -axis[0]])):
         cells = layer.cells(end_w - along[:, None, None] * axis + out[:, None] * left)
-        open_ = ~layer.solid[cells[..., 0], cells[..., 1]].any(axis=1)
+        open_ = ~solid[cells[..., 0], cells[..., 1]].any(axis=1)
         for low, high in runs(open_):
             width_m = (high - low) * layer.cell_m
             if low > 0 and high < len(along) and 2.0 * BERTH_M <= width_m <= WIDEST_M:
                 places.append(end_w - 0.5 * (low + high) * layer.cell_m * axis + _MOUTH_M * left)
     return layer.cells(np.array(places).reshape(-1, 2))
+
+
+def _walls(layer: Layer) -> np.ndarray:
+    """``(X, Y)`` bool: what is solid, less specks."""
+    parts, _ = ndimage.label(layer.solid, np.ones((3, 3)))
+    return np.asarray(layer.solid & (np.bincount(parts.ravel())[parts] * layer.cell_m**2 >= _SPECK_M2))
 
 
 def _part(

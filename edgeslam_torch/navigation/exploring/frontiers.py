@@ -64,14 +64,17 @@ class Looks:
         places = layer.centres(cells).reshape(-1, 2)
         for place in places[np.linalg.norm(places - sight.p_w[:2], axis=1) < _NEAR_M]:
             self._spend(place, passed)
-        vain = [place for place, spent_s in self._near if spent_s > _LOOKED_S]
-        good = [all(np.linalg.norm(place - other) > _SAME_M for other in vain) for place in places]
-        kept = cells[np.array(good, dtype=bool)]
+        kept = cells[self.left(places)]
         if len(kept):
             self._nothing_s = math.nan
         elif math.isnan(self._nothing_s):
             self._nothing_s = sight.stamp_s
         return np.asarray(kept)
+
+    def left(self, p_w: FloatArray) -> np.ndarray:
+        """Which of the places ``(N, 2)`` were not looked at in vain."""
+        vain = np.array([place for place, spent_s in self._near if spent_s > _LOOKED_S]).reshape(-1, 2)
+        return np.asarray((np.linalg.norm(p_w[:, None] - vain, axis=2) > _SAME_M).all(axis=1))
 
     def go_on(self) -> None:
         """There is something else to look at."""
