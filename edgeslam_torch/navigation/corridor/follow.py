@@ -6,8 +6,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from edgeslam_torch.navigation.corridor.glance import Glance
 from edgeslam_torch.navigation.corridor.onward import far_middle, is_ahead, is_walled, mouths, straight, wide
-from edgeslam_torch.navigation.corridor.trail import DEAD_END_M, PASSED_M, Trail, aside
+from edgeslam_torch.navigation.corridor.trail import PASSED_M, Trail, aside
 from edgeslam_torch.navigation.exploring.frontiers import Looks
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.moved import Moved
@@ -38,8 +39,8 @@ class FollowCorridor(LooksAhead):
     """Whether something solid is close ahead: nothing to follow without it is not the corridor's end."""
     _looks: Looks = field(default_factory=Looks)
     _trail: Trail | None = None
-    _end_w: FloatArray | None = None
-    """``(2, 2)`` where the corridor ended before a wall, and its direction there."""
+    _end: Glance | None = None
+    """Where the corridor seems to end before a wall."""
     _wide_s: float = math.nan
     _target_w: FloatArray | None = None
     """``(2,)`` in the corridor that turns off which it flies to."""
@@ -60,12 +61,17 @@ class FollowCorridor(LooksAhead):
         self._note_width(layer, sight)
         axis = self._trail.direction(layer, here)
         self.wall = is_walled(layer, here, axis)
-        return self._looks.worth(self._onward(layer, here, axis, self._trail), layer, sight)
+        return self._looks.worth(self._onward(layer, sight, axis, self._trail), layer, sight)
+
+    def heading_rad(self, sight: Sight) -> float | None:
+        """To the sides, where it seems to end; else ahead."""
+        return None if self._end is None else self._end.heading_rad(sight)
 
     def done(self, sight: Sight) -> bool:
         """Whether the corridor ended, or the time."""
         self.room = sight.stamp_s - self._wide_s > _ROOM_S
-        return self.room or self._looks.over(sight.stamp_s) or sight.stamp_s >= self.until_s
+        ended = self._looks.over(sight.stamp_s) or (self._end is not None and self._end.over)
+        return self.room or ended or sight.stamp_s >= self.until_s
 
     def carry(self, moved: Moved) -> None:
         """Take what is remembered along with the map."""
@@ -73,30 +79,34 @@ class FollowCorridor(LooksAhead):
         if self._trail is not None:
             self._trail.carry(moved)
         self._doors = [(moved.points(middle[None])[0], normal) for middle, normal in self._doors]
-        if self._end_w is not None:
-            self._end_w[:1] = moved.points(self._end_w[:1])
+        if self._end is not None:
+            self._end.carry(moved)
         if self._target_w is not None:
             self._target_w = moved.points(self._target_w[None])[0]
 
-    def _onward(self, layer: Layer, here: FloatArray, axis: FloatArray, trail: Trail) -> np.ndarray:
+    def _onward(self, layer: Layer, sight: Sight, axis: FloatArray, trail: Trail) -> np.ndarray:
+        here = sight.p_w[:2]
         cells = self._left(layer, wide(layer, here))
         places = layer.centres(cells)
         if len(ahead := cells[is_ahead(places, here, axis) & trail.leads_on(places)]):
-            self._end_w = None
+            self._end = None
             return far_middle(layer, ahead, axis)
         trail.end(here)
         if len(off := cells[trail.turns_off(places, here)]):
             return self._nearest(layer, off, here, axis)
         narrow = straight(layer, here, axis, self._to_door(here, axis))
-        if self._end_w is not None:  # what is between here and the wall is no way on
-            narrow = narrow[np.linalg.norm(layer.centres(narrow) - self._end_w[0], axis=1) > DEAD_END_M]
+        if self._end is not None:  # what is between here and the wall is no way on
+            narrow = narrow[trail.leads_on(layer.centres(narrow))]
         if len(narrow := self._left(layer, far_middle(layer, narrow, axis))):
             return narrow
-        if not self.wall:
+        if not self.wall and self._end is None:
             return layer.cells(here + _BLIND_M * axis)[None]
-        if self._end_w is None:
-            self._end_w = np.array([here, axis])
-        return mouths(layer, *self._end_w)
+        if self._end is None:
+            self._end = Glance(here.copy(), axis)
+        if len(found := self._left(layer, mouths(layer, self._end.end_w, self._end.axis))):
+            return found
+        goal = self._end.goal(layer, sight)
+        return layer.cells(np.zeros((0, 2)) if goal is None else goal[None])
 
     def _left(self, layer: Layer, cells: np.ndarray) -> np.ndarray:
         """Those of the cells ``(N, 2)`` that were not looked at in vain."""

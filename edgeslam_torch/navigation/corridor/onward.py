@@ -28,6 +28,8 @@ _SAME_M = 0.3
 """Ends of ways that differ by less are as far."""
 _WALL_M, _ABREAST_M = 2.0, 0.5
 """How near a wall ahead ends a corridor, and how far to each side it is looked for: there may be a door in it."""
+_BESIDE_M, _KNOWN_SHARE = (1.1, 3.3), 0.75
+"""Way back from the end along which a turn on the spot shows the sides aslant; what share of a wall is known of one."""
 _SPECK_M2 = 0.08
 """Smaller solids, of a wrong depth, stand before what turns off; a wall between two doors is more."""
 _BACK_M, _MOUTH_M = 6.0, 1.2
@@ -83,16 +85,29 @@ def mouths(layer: Layer, end_w: FloatArray, axis: FloatArray) -> np.ndarray:
         axis: ``(2,)`` unit vector of its direction there.
     """
     along = np.arange(0.0, _BACK_M, layer.cell_m)
-    out = np.arange(0.0, PASSED_M, 0.5 * layer.cell_m)
-    solid, places = _walls(layer), []
+    walls, places = _walls(layer), []
     for left in (np.array([-axis[1], axis[0]]), np.array([axis[1], -axis[0]])):
-        cells = layer.cells(end_w - along[:, None, None] * axis + out[:, None] * left)
-        open_ = ~solid[cells[..., 0], cells[..., 1]].any(axis=1)
-        for low, high in runs(open_):
+        for low, high in runs(~_meet(walls, layer, end_w - along[:, None] * axis, left)):
             width_m = (high - low) * layer.cell_m
             if low > 0 and high < len(along) and 2.0 * BERTH_M <= width_m <= WIDEST_M:
                 places.append(end_w - 0.5 * (low + high) * layer.cell_m * axis + _MOUTH_M * left)
     return layer.cells(np.array(places).reshape(-1, 2))
+
+
+def unknown_sides(layer: Layer, end_w: FloatArray, axis: FloatArray) -> list[FloatArray]:
+    """Directions ``(2,)`` to the sides of a corridor before its end in which most of what is there is not known to be
+    a wall: what turns off may be there."""
+    along = np.arange(*_BESIDE_M, layer.cell_m)
+    walls, from_w = _walls(layer), end_w - along[:, None] * axis
+    sides = (np.array([-axis[1], axis[0]]), np.array([axis[1], -axis[0]]))
+    return [left for left in sides if _meet(walls, layer, from_w, left).mean() < _KNOWN_SHARE]
+
+
+def _meet(walls: np.ndarray, layer: Layer, from_w: FloatArray, left: FloatArray) -> np.ndarray:
+    """Which of the rays from places ``(N, 2)`` to one side meet a wall within half the widest corridor."""
+    out = np.arange(0.0, PASSED_M, 0.5 * layer.cell_m)
+    cells = layer.cells(from_w[:, None] + out[:, None] * left)
+    return np.asarray(walls[cells[..., 0], cells[..., 1]].any(axis=1))
 
 
 def _walls(layer: Layer) -> np.ndarray:

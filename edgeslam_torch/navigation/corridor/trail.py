@@ -18,7 +18,7 @@ _HEADING_M = 1.0
 """Way over which the direction of flight is taken."""
 _ALONG_WALLS_COS = math.cos(math.radians(25.0))
 """A drone that keeps clear of things on one side flies aslant to the walls by no more than this."""
-DEAD_END_M = 1.5
+_DEAD_END_M = 1.5
 """What is within this of where there was no way ahead is no way ahead from elsewhere."""
 _SAME_M = 0.3
 
@@ -70,7 +70,7 @@ class Trail:
 
     def leads_on(self, p_w: FloatArray) -> np.ndarray:
         """Which of the places ``(N, 2)`` ahead are in no dead end."""
-        return _apart(p_w, self._dead_ends_w, DEAD_END_M)
+        return _apart(p_w, self._dead_ends_w, _DEAD_END_M)
 
     def turns_off(self, p_w: FloatArray, here_w: FloatArray) -> np.ndarray:
         """Which of the places ``(N, 2)`` are not in the corridor that was flown up to here, nor behind its start."""
