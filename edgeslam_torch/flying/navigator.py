@@ -192,7 +192,7 @@ class Navigator:
         return self._fly_to(self._goal([there[0], there[1], self.limits.height_m]), "through the exit")
 
     def follow_corridor(self, seconds: float = 120.0) -> Outcome:
-        """Follow the corridor that the drone is in, ahead and round corners, through no door.
+        """Follow the corridor that the drone is in, ahead and round corners, through no door that it knows.
 
         Raises:
             FlightRefused: As `explore`.

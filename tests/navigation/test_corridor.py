@@ -216,6 +216,19 @@ def test_a_look_to_the_side_ends_with_the_pose():
     assert place(task, layer, sight(0.3, 0.0, 25.5)) == pytest.approx([2.4, 0.0], abs=0.1)
 
 
+def test_a_mouth_that_depth_has_made_narrow_is_flown_into_unless_it_is_a_door():
+    """`l_corridor` 822: two metres wide, and one metre on the map."""
+    layer = seen(lambda x, y: stub(x, y) | (np.abs(x) > 0.5) & (y > 0.8))
+    door = Exit(np.array([0.0, 1.0, 1.15]), np.array([0.0, 1.0, 0.0]), 1.0, 0.1, 0.1, 2)
+    may_be = Candidate(door.centre_w[:2], door.normal_w[:2], np.array([-1.0, 0.0]))
+    for candidates, exits, flies in (([], [], True), ([may_be], [], True), ([], [door], False)):
+        task = FollowCorridor()
+        task.consider(candidates, exits)
+        for k, x in enumerate(np.arange(-4.0, 2.5, 0.4)):
+            found = task.goals(layer, sight(x, 0.0, 0.5 * k))
+        assert bool((layer.centres(found)[:, 1] > 1.6).any()) is flies
+
+
 def test_what_is_between_it_and_the_wall_is_no_way_on():
     """`l_corridor` 817 and 818: between a hole in the side and a last step to the wall it stayed where it was."""
     layer, mouth = seen(stub, lambda x, y: (y > 0.9) & (np.abs(x) < 1.0)), pytest.approx([0.0, 1.2], abs=0.2)

@@ -7,7 +7,15 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from edgeslam_torch.navigation.corridor.glance import Glance
-from edgeslam_torch.navigation.corridor.onward import far_middle, is_ahead, is_walled, mouths, straight, wide
+from edgeslam_torch.navigation.corridor.onward import (
+    SMEARED_BERTH_M,
+    far_middle,
+    is_ahead,
+    is_walled,
+    mouths,
+    straight,
+    wide,
+)
 from edgeslam_torch.navigation.corridor.trail import PASSED_M, Trail, aside
 from edgeslam_torch.navigation.exploring.frontiers import Looks
 from edgeslam_torch.navigation.layer import Layer
@@ -45,12 +53,14 @@ class FollowCorridor(LooksAhead):
     _target_w: FloatArray | None = None
     """``(2,)`` in the corridor that turns off which it flies to."""
     _doors: list[tuple[FloatArray, FloatArray]] = field(default_factory=list)
-    """``(2,)`` middle and unit normal of what is, or may be, a door."""
+    """``(2,)`` middle and unit normal of each exit."""
+    _doubtful: list[tuple[FloatArray, FloatArray]] = field(default_factory=list)
+    """The same of what may be one; a corridor whose mouth depth has made narrow looks so, too."""
 
     def consider(self, candidates: Sequence[Candidate], exits: Sequence[Exit] = ()) -> None:
         """Doors end a corridor."""
-        self._doors = [(c.centre_w, c.normal_w) for c in candidates]
-        self._doors += [(e.centre_w[:2], e.normal_w[:2]) for e in exits]
+        self._doors = [(e.centre_w[:2], e.normal_w[:2]) for e in exits]
+        self._doubtful = [(c.centre_w, c.normal_w) for c in candidates]
 
     def goals(self, layer: Layer, sight: Sight) -> np.ndarray:
         """Cells ``(G, 2)`` to follow: what is wide and ahead, else what turns off, else straight on through what is
@@ -79,6 +89,7 @@ class FollowCorridor(LooksAhead):
         if self._trail is not None:
             self._trail.carry(moved)
         self._doors = [(moved.points(middle[None])[0], normal) for middle, normal in self._doors]
+        self._doubtful = [(moved.points(middle[None])[0], normal) for middle, normal in self._doubtful]
         if self._end is not None:
             self._end.carry(moved)
         if self._target_w is not None:
@@ -103,6 +114,10 @@ class FollowCorridor(LooksAhead):
             return layer.cells(here + _BLIND_M * axis)[None]
         if self._end is None:
             self._end = Glance(here.copy(), axis)
+        cells = self._left(layer, wide(layer, here, SMEARED_BERTH_M))
+        places = layer.centres(cells)
+        if len(off := cells[trail.turns_off(places, here) & self._is_this_side(places, here)]):
+            return self._nearest(layer, off, here, axis)
         if len(found := self._left(layer, mouths(layer, self._end.end_w, self._end.axis))):
             return found
         goal = self._end.goal(layer, sight)
@@ -124,11 +139,19 @@ class FollowCorridor(LooksAhead):
         self._target_w = places[best]
         return cells[[best]]
 
+    def _is_this_side(self, p_w: FloatArray, here: FloatArray) -> np.ndarray:
+        """Which of the places ``(N, 2)`` are behind no door, as wide as the widest corridor."""
+        good = np.ones(len(p_w), dtype=bool)
+        for middle, normal in self._doors:
+            behind = ((p_w - middle) @ normal) * float((here - middle) @ normal) < 0.0
+            good &= ~(behind & (np.abs(aside(p_w - middle, normal)) < PASSED_M))
+        return good
+
     def _to_door(self, here: FloatArray, axis: FloatArray) -> float:
         """Way straight ahead to the first door across the corridor; infinite where there is none."""
         ways = [
             float((middle - here) @ axis)
-            for middle, normal in self._doors
+            for middle, normal in (*self._doors, *self._doubtful)
             if abs(float(normal @ axis)) > _SQUARE_COS and abs(float(aside(middle - here, axis))) < PASSED_M
         ]
         return min([way for way in ways if way > 0.0], default=math.inf)

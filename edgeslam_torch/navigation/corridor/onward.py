@@ -14,6 +14,8 @@ from edgeslam_torch.types import FloatArray
 
 BERTH_M = 0.55
 """Distance from every solid of what is followed: a corridor is wider than twice this, a doorway is not."""
+SMEARED_BERTH_M = 0.4
+"""The same where nothing else leads on, of a mouth of two metres that depth has made narrow."""
 ARRIVED_M = 0.6
 """Less free way ahead is none."""
 _NARROW_M = 0.3
@@ -36,9 +38,9 @@ _BACK_M, _MOUTH_M = 6.0, 1.2
 """How far back from a wall ahead holes in the sides are looked for, and how far to the side it looks into them."""
 
 
-def wide(layer: Layer, here_w: FloatArray) -> np.ndarray:
+def wide(layer: Layer, here_w: FloatArray, berth_m: float = BERTH_M) -> np.ndarray:
     """Cells ``(N, 2)`` of the wide free space that a drone is in or beside."""
-    return _part(layer, here_w, BERTH_M)
+    return _part(layer, here_w, berth_m)
 
 
 def is_ahead(p_w: FloatArray, here_w: FloatArray, axis: FloatArray) -> np.ndarray:
