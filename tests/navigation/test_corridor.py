@@ -229,6 +229,17 @@ def test_a_mouth_that_depth_has_made_narrow_is_flown_into_unless_it_is_a_door():
         assert bool((layer.centres(found)[:, 1] > 1.6).any()) is flies
 
 
+def test_a_bare_wall_before_which_the_pose_is_lost_ends_it():
+    """`l_corridor` 823: at the end of it, and "no way"."""
+    task, layer = FollowCorridor(), seen(stub, lambda x, y: (np.abs(y) > 0.9) & (x < 2.6))
+    for k, x in enumerate(np.arange(-4.0, 2.5, 0.4)):
+        task.goals(layer, sight(x, 0.0, 0.5 * k))
+    for k in range(3):
+        assert not task.done(sight(2.4, 0.0, 9.0 + k))
+        task.done(replace(sight(2.4, 0.0, 9.5 + k), tracked=False, hindered=True))
+    assert task.done(sight(2.4, 0.0, 12.0)) and task.wall
+
+
 def test_what_is_between_it_and_the_wall_is_no_way_on():
     """`l_corridor` 817 and 818: between a hole in the side and a last step to the wall it stayed where it was."""
     layer, mouth = seen(stub, lambda x, y: (y > 0.9) & (np.abs(x) < 1.0)), pytest.approx([0.0, 1.2], abs=0.2)

@@ -23,7 +23,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     goto.add_argument("z", type=float, nargs="?", metavar="Z", help="height of the whole flight above the floor")
     explore = verbs.add_parser("explore", help="fly to where the known space ends, again and again")
     explore.add_argument("seconds", type=float, metavar="SECONDS", help="for how long")
-    corridor = verbs.add_parser("corridor", help="follow the corridor that it is in, round corners, through no door that it knows")
+    corridor = verbs.add_parser(
+        "corridor", help="follow the corridor that it is in, round corners, through no door that it knows"
+    )
     exit_ = verbs.add_parser("exit", help="explore until an exit is known, and fly through it")
     for verb, longest_s in ((corridor, 120.0), (exit_, 180.0)):
         said = f"for how long (default: {longest_s:.0f})"

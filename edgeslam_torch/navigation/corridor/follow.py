@@ -18,6 +18,7 @@ from edgeslam_torch.navigation.corridor.onward import (
 )
 from edgeslam_torch.navigation.corridor.trail import PASSED_M, Trail, aside
 from edgeslam_torch.navigation.exploring.frontiers import Looks
+from edgeslam_torch.navigation.hindered.losses import Losses
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.moved import Moved
 from edgeslam_torch.navigation.openings.pathways import WIDEST_M
@@ -31,6 +32,8 @@ _TURN_COST_M = 6.0
 _BLIND_M = 1.5
 """How far ahead it wants to go where nothing ahead is known."""
 _ROOM_S = 2.0
+_MOST_LOSSES = 3
+"""Of the pose, before a bare wall that ends a corridor: it cannot look around there."""
 _SQUARE_COS = math.cos(math.radians(35.0))
 """A door whose normal is nearer than this to the direction of the corridor is across it."""
 
@@ -49,6 +52,8 @@ class FollowCorridor(LooksAhead):
     _trail: Trail | None = None
     _end: Glance | None = None
     """Where the corridor seems to end before a wall."""
+    _losses: Losses = field(default_factory=lambda: Losses(math.inf))
+    """Of the pose, before walls where it seems to end."""
     _wide_s: float = math.nan
     _target_w: FloatArray | None = None
     """``(2,)`` in the corridor that turns off which it flies to."""
@@ -80,12 +85,16 @@ class FollowCorridor(LooksAhead):
     def done(self, sight: Sight) -> bool:
         """Whether the corridor ended, or the time."""
         self.room = sight.stamp_s - self._wide_s > _ROOM_S
-        ended = self._looks.over(sight.stamp_s) or (self._end is not None and self._end.over)
+        ended = self._looks.over(sight.stamp_s)
+        if self._end is not None:
+            self._losses.note(sight)
+            ended |= self._end.over or self._losses.count >= _MOST_LOSSES
         return self.room or ended or sight.stamp_s >= self.until_s
 
     def carry(self, moved: Moved) -> None:
         """Take what is remembered along with the map."""
         self._looks.carry(moved)
+        self._losses.carry(moved)
         if self._trail is not None:
             self._trail.carry(moved)
         self._doors = [(moved.points(middle[None])[0], normal) for middle, normal in self._doors]
