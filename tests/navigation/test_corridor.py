@@ -229,6 +229,21 @@ def test_a_mouth_that_depth_has_made_narrow_is_flown_into_unless_it_is_a_door():
         assert bool((layer.centres(found)[:, 1] > 1.6).any()) is flies
 
 
+def test_from_a_hole_that_is_none_it_comes_back_to_the_end():
+    """`blank_walls` 828: a hole four metres back, which closed as it was looked into."""
+    task, hole = FollowCorridor(), seen(lambda x, y: sides(end=3.0)(x, y) & ~((np.abs(x + 1.0) < 0.9) & (y > 0.0)))
+    closed = seen(sides(end=3.0))
+    hole = Layer(hole.free & closed.free, hole.solid, hole.corner_w, hole.cell_m)
+    for k, x in enumerate(np.arange(-4.0, 2.5, 0.4)):
+        found = task.goals(hole, sight(x, 0.0, 0.5 * k))
+    assert hole.centres(found)[0] == pytest.approx([-1.0, 1.2], abs=0.2)
+    for x in (2.0, 1.5, 1.0, 0.5, 0.0, -0.5, -1.0):
+        task.goals(hole, sight(x, 0.0, 12.0 - x))
+    assert len(task.goals(closed, sight(-1.0, 0.0, 14.0))) == 0, "a turn on the spot"
+    assert place(task, closed, sight(-1.0, 0.0, 27.0)) == pytest.approx([2.4, 0.0], abs=0.1)
+    assert not task.done(sight(-1.0, 0.0, 27.0))
+
+
 def test_a_bare_wall_before_which_the_pose_is_lost_ends_it():
     """`l_corridor` 823: at the end of it, and "no way"."""
     task, layer = FollowCorridor(), seen(stub, lambda x, y: (np.abs(y) > 0.9) & (x < 2.6))

@@ -122,7 +122,7 @@ class FollowCorridor(LooksAhead):
         if not self.wall and self._end is None:
             return layer.cells(here + _BLIND_M * axis)[None]
         if self._end is None:
-            self._end = Glance(here.copy(), axis)
+            self._end, self._losses = Glance(here.copy(), axis), Losses(math.inf)
         cells = self._left(layer, wide(layer, here, SMEARED_BERTH_M))
         places = layer.centres(cells)
         if len(off := cells[trail.turns_off(places, here) & self._is_this_side(places, here)]):

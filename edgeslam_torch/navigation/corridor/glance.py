@@ -47,9 +47,7 @@ class Glance:
         place = self.end_w - _BACK_M * self.axis
         if self._headings is None:
             sides = unknown_sides(layer, self.end_w, self.axis)
-            if not sides:
-                return None
-            if since_s > _TURN_S + _GIVEN_UP_S:
+            if not sides or since_s > _TURN_S + _GIVEN_UP_S:
                 self._headings = []
             elif np.linalg.norm(sight.p_w[:2] - place) < _THERE_M:
                 self._headings = [math.atan2(side[1], side[0]) for side in sides]
