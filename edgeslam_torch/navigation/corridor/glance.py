@@ -53,7 +53,7 @@ class Glance:
                 self._headings = [math.atan2(side[1], side[0]) for side in sides]
             else:
                 return place
-        self.over = float(np.linalg.norm(sight.p_w[:2] - self.end_w)) < 2.0 * _THERE_M
+        self.over = float(np.linalg.norm(sight.p_w[:2] - self.end_w)) < _THERE_M
         return None if self.over else self.end_w
 
     def heading_rad(self, sight: Sight) -> float | None:
