@@ -194,6 +194,8 @@ class Navigator:
     def follow_corridor(self, seconds: float = 120.0) -> Outcome:
         """Follow the corridor that the drone is in, ahead and round corners, through no door that it knows.
 
+        That it ends says that a wall is ahead and that nothing was seen to lead on, not that nothing does.
+
         Raises:
             FlightRefused: As `explore`.
         """

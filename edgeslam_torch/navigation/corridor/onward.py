@@ -12,11 +12,11 @@ from edgeslam_torch.navigation.openings.pathways import WIDEST_M
 from edgeslam_torch.navigation.openings.turned import runs
 from edgeslam_torch.types import FloatArray
 
-BERTH_M = 0.55
+_BERTH_M = 0.55
 """Distance from every solid of what is followed: a corridor is wider than twice this, a doorway is not."""
 SMEARED_BERTH_M = 0.4
 """The same where nothing else leads on, of a mouth of two metres that depth has made narrow."""
-ARRIVED_M = 0.6
+_ARRIVED_M = 0.6
 """Less free way ahead is none."""
 _NARROW_M = 0.3
 """Distance from solids straight ahead, where depth that is too near makes a corridor as narrow as a door: what a drone
@@ -38,7 +38,7 @@ _BACK_M, _MOUTH_M = 6.0, 1.2
 """How far back from a wall ahead holes in the sides are looked for, and how far to the side it looks into them."""
 
 
-def wide(layer: Layer, here_w: FloatArray, berth_m: float = BERTH_M) -> np.ndarray:
+def wide(layer: Layer, here_w: FloatArray, berth_m: float = _BERTH_M) -> np.ndarray:
     """Cells ``(N, 2)`` of the wide free space that a drone is in or beside."""
     return _part(layer, here_w, berth_m)
 
@@ -47,14 +47,14 @@ def is_ahead(p_w: FloatArray, here_w: FloatArray, axis: FloatArray) -> np.ndarra
     """Which of the places ``(N, 2)`` are ahead, and worth the way."""
     step = p_w - here_w
     along = step @ axis
-    return np.asarray((along > ARRIVED_M) & (along > _AHEAD_COS * np.linalg.norm(step, axis=1)))
+    return np.asarray((along > _ARRIVED_M) & (along > _AHEAD_COS * np.linalg.norm(step, axis=1)))
 
 
 def straight(layer: Layer, here_w: FloatArray, axis: FloatArray, before_m: float) -> np.ndarray:
     """Cells ``(N, 2)`` straight ahead that a drone reaches, through what is narrow, nearer than ``before_m``."""
     cells = _part(layer, here_w, _NARROW_M, lambda p_w: np.abs(aside(p_w - here_w, axis)) < _STRIP_M)
     along = (layer.centres(cells) - here_w) @ axis
-    return cells[(along > ARRIVED_M) & (along < before_m)]
+    return cells[(along > _ARRIVED_M) & (along < before_m)]
 
 
 def far_middle(layer: Layer, cells: np.ndarray, axis: FloatArray) -> np.ndarray:
@@ -91,7 +91,7 @@ def mouths(layer: Layer, end_w: FloatArray, axis: FloatArray) -> np.ndarray:
     for left in (np.array([-axis[1], axis[0]]), np.array([axis[1], -axis[0]])):
         for low, high in runs(~_meet(walls, layer, end_w - along[:, None] * axis, left)):
             width_m = (high - low) * layer.cell_m
-            if low > 0 and high < len(along) and 2.0 * BERTH_M <= width_m <= WIDEST_M:
+            if low > 0 and high < len(along) and 2.0 * _BERTH_M <= width_m <= WIDEST_M:
                 places.append(end_w - 0.5 * (low + high) * layer.cell_m * axis + _MOUTH_M * left)
     return layer.cells(np.array(places).reshape(-1, 2))
 
