@@ -93,7 +93,7 @@ def test_the_corridor_flown_along_one_side_is_no_way_on(width):
     task = FollowCorridor()
     for k, (x, y) in enumerate(way):
         found = task.goals(layer, sight(x, y, 0.5 * k))
-    assert (layer.centres(found)[:, 0] > 1.5).all(), "at most a look to the sides, near the end"
+    assert len(found) == 0, "a turn on the spot at the end"
 
 
 def test_an_end_is_something_solid_ahead_not_the_lack_of_a_way():
@@ -148,6 +148,10 @@ def test_a_drone_that_is_brought_back_goes_on_ahead():
     assert follow(FollowCorridor(), layer, *way, (1.0, 0.1), (0.0, 0.0), (-1.0, 0.0))[0] > 3.0
 
 
+ALONG_X = np.array([[x, 0.0] for x in range(3)])
+"""A way, a metre from place to place."""
+
+
 def stub(x, y):
     """A corridor of 2 m that ends at 3 m; from -1 to 1 m another leads to the left."""
     return ~((np.abs(y) < 1.0) & (x < 3.0) | (np.abs(x) < 1.0) & (y > 0.0))
@@ -178,9 +182,19 @@ def test_before_a_wall_it_looks_into_the_holes_in_the_sides():
     to_its_end = [(x, 0.0) for x in np.arange(-4.0, 2.5, 0.4)]
     assert follow(FollowCorridor(), layer, *to_its_end) == pytest.approx([0.0, 1.2], abs=0.2)
     specks = seen(lambda x, y: stub(x, y) | (np.abs(x) < 0.1) & (np.abs(y - 0.6) < 0.1), lambda x, y: y > 2.0)
-    assert len(mouths(specks, np.array([2.4, 0.0]), np.array([1.0, 0.0]))) == 1, "`l_corridor` 816"
+    assert len(mouths(specks, np.array([2.4, 0.0]), np.array([1.0, 0.0]), ALONG_X)) == 1, "`l_corridor` 816"
     door = seen(lambda x, y: (np.abs(y) > 1.0) & ((np.abs(x) > 0.5) | (y < 0.0)) | (x > 3.0), lambda x, y: y > 1.1)
-    assert len(mouths(door, np.array([2.4, 0.0]), np.array([1.0, 0.0]))) == 0, "a door is none"
+    assert len(mouths(door, np.array([2.4, 0.0]), np.array([1.0, 0.0]), ALONG_X)) == 0, "a door is none"
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_the_corridor_that_it_came_from_is_no_hole_in_the_side(side):
+    """`l_corridor` 830: from the end of the other corridor it flew back to the dead end."""
+    layer = seen(stub, lambda x, y: (np.abs(x) < 1.0) & (y < -2.0))
+    end, axis = np.array([0.0, 4.0]), np.array([0.0, 1.0])
+    assert len(mouths(layer, end, axis, np.stack([np.zeros(5), np.arange(5.0)], 1))) == 2, "never flown through"
+    to_the_dead_end = ALONG_X * [side, 1.0] + [0.0, 0.4]
+    assert layer.centres(mouths(layer, end, axis, to_the_dead_end))[:, 0] * side == pytest.approx([-1.2], abs=0.1)
 
 
 def before_a_wall(task, layer):
@@ -239,9 +253,29 @@ def test_from_a_hole_that_is_none_it_comes_back_to_the_end():
     assert hole.centres(found)[0] == pytest.approx([-1.0, 1.2], abs=0.2)
     for x in (2.0, 1.5, 1.0, 0.5, 0.0, -0.5, -1.0):
         task.goals(hole, sight(x, 0.0, 12.0 - x))
-    assert len(task.goals(closed, sight(-1.0, 0.0, 14.0))) == 0, "a turn on the spot"
-    assert place(task, closed, sight(-1.0, 0.0, 27.0)) == pytest.approx([2.4, 0.0], abs=0.1)
-    assert not task.done(sight(-1.0, 0.0, 27.0))
+    assert place(task, closed, sight(-1.0, 0.0, 14.0)) == pytest.approx([2.4, 0.0], abs=0.1)
+    assert place(task, closed, sight(1.0, 0.0, 20.0)) == pytest.approx([2.4, 0.0], abs=0.1)
+    assert len(task.goals(closed, sight(2.2, 0.0, 24.0))) == 0, "a turn on the spot"
+    assert not task.done(sight(2.2, 0.0, 36.0))
+    assert len(task.goals(closed, sight(2.2, 0.0, 36.6))) == 0 and task.done(sight(2.2, 0.0, 36.6))
+
+
+def test_a_way_back_to_the_end_that_there_is_none_of_ends_it():
+    task, layer = FollowCorridor(), seen(stub, lambda x, y: (y > 0.9) & (np.abs(x) < 1.0))
+    for k, x in enumerate(np.arange(-4.0, 2.5, 0.4)):
+        task.goals(layer, sight(x, 0.0, 0.5 * k))
+    lose(task, sight(1.0, 0.0, 9.0))
+    assert place(task, layer, sight(1.0, 0.0, 13.0)) == pytest.approx([2.4, 0.0], abs=0.1)
+    assert not task.done(sight(1.0, 0.0, 13.0))
+    task.goals(layer, sight(1.0, 0.0, 34.0))
+    assert task.done(sight(1.0, 0.0, 34.0))
+
+
+def lose(task, at):
+    """The pose, for the third time, at a place."""
+    for k in range(3):
+        assert not task.done(replace(at, stamp_s=at.stamp_s + k))
+        task.done(replace(at, stamp_s=at.stamp_s + k + 0.5, tracked=False, hindered=True))
 
 
 def test_a_bare_wall_before_which_the_pose_is_lost_ends_it():
@@ -249,10 +283,21 @@ def test_a_bare_wall_before_which_the_pose_is_lost_ends_it():
     task, layer = FollowCorridor(), seen(stub, lambda x, y: (np.abs(y) > 0.9) & (x < 2.6))
     for k, x in enumerate(np.arange(-4.0, 2.5, 0.4)):
         task.goals(layer, sight(x, 0.0, 0.5 * k))
-    for k in range(3):
-        assert not task.done(sight(2.4, 0.0, 9.0 + k))
-        task.done(replace(sight(2.4, 0.0, 9.5 + k), tracked=False, hindered=True))
-    assert task.done(sight(2.4, 0.0, 12.0)) and task.wall
+    lose(task, sight(1.9, 0.0, 9.0))
+    assert task.done(sight(1.9, 0.0, 12.0)) and task.wall
+
+
+def test_where_the_pose_is_lost_looking_into_a_hole_it_comes_back_to_the_end():
+    """`corridor` 830: it had been before the door, looked into a hole in a bare wall, and landed there."""
+    task, layer = FollowCorridor(), seen(stub, lambda x, y: (y > 0.9) & (np.abs(x) < 1.0))
+    for k, x in enumerate(np.arange(-4.0, 2.5, 0.4)):
+        found = task.goals(layer, sight(x, 0.0, 0.5 * k))
+    assert layer.centres(found)[0] == pytest.approx([0.0, 1.2], abs=0.2)
+    lose(task, sight(0.0, 0.0, 9.0))
+    assert place(task, layer, sight(0.0, 0.0, 12.0)) == pytest.approx([2.4, 0.0], abs=0.1)
+    assert not task.done(sight(0.0, 0.0, 12.0))
+    task.goals(layer, sight(1.6, 0.0, 15.0))
+    assert task.done(sight(1.6, 0.0, 15.0))
 
 
 def test_what_is_between_it_and_the_wall_is_no_way_on():

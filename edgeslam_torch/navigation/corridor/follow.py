@@ -88,7 +88,9 @@ class FollowCorridor(LooksAhead):
         ended = self._looks.over(sight.stamp_s)
         if self._end is not None:
             self._losses.note(sight)
-            ended |= self._end.over or self._losses.count >= _MOST_LOSSES
+            if self._losses.count >= _MOST_LOSSES:
+                self._end.give_up(sight)
+            ended |= self._end.over
         return self.room or ended or sight.stamp_s >= self.until_s
 
     def carry(self, moved: Moved) -> None:
@@ -123,14 +125,18 @@ class FollowCorridor(LooksAhead):
             return layer.cells(here + _BLIND_M * axis)[None]
         if self._end is None:
             self._end, self._losses = Glance(here.copy(), axis), Losses(math.inf)
-        cells = self._left(layer, wide(layer, here, SMEARED_BERTH_M))
-        places = layer.centres(cells)
-        if len(off := cells[trail.turns_off(places, here) & self._is_this_side(places, here)]):
-            return self._nearest(layer, off, here, axis)
-        if len(found := self._left(layer, mouths(layer, self._end.end_w, self._end.axis))):
+        if not self._end.given_up and len(found := self._beside(layer, self._end, here, trail)):
             return found
         goal = self._end.goal(layer, sight)
         return layer.cells(np.zeros((0, 2)) if goal is None else goal[None])
+
+    def _beside(self, layer: Layer, end: Glance, here: FloatArray, trail: Trail) -> np.ndarray:
+        """Before a wall: what turns off though its mouth is narrow on the map, else holes in the sides."""
+        cells = self._left(layer, wide(layer, here, SMEARED_BERTH_M))
+        places = layer.centres(cells)
+        if len(off := cells[trail.turns_off(places, here) & self._is_this_side(places, here)]):
+            return self._nearest(layer, off, here, end.axis)
+        return self._left(layer, mouths(layer, end.end_w, end.axis, trail.places_w))
 
     def _left(self, layer: Layer, cells: np.ndarray) -> np.ndarray:
         """Those of the cells ``(N, 2)`` that were not looked at in vain."""

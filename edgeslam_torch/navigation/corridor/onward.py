@@ -36,6 +36,8 @@ _SPECK_M2 = 0.08
 """Smaller solids, of a wrong depth, stand before what turns off; a wall between two doors is more."""
 _BACK_M, _MOUTH_M = 6.0, 1.2
 """How far back from a wall ahead holes in the sides are looked for, and how far to the side it looks into them."""
+_THROUGH_M = (-0.3, 1.2)
+"""How far beyond there a way through a hole has been somewhere; one past it, along a side of the corridor, has not."""
 
 
 def wide(layer: Layer, here_w: FloatArray, berth_m: float = _BERTH_M) -> np.ndarray:
@@ -76,7 +78,7 @@ def is_walled(layer: Layer, here_w: FloatArray, axis: FloatArray) -> bool:
     return bool(layer.solid[cells[..., 0], cells[..., 1]].any())
 
 
-def mouths(layer: Layer, end_w: FloatArray, axis: FloatArray) -> np.ndarray:
+def mouths(layer: Layer, end_w: FloatArray, axis: FloatArray, flown_w: FloatArray) -> np.ndarray:
     """Cells ``(N, 2)`` where a side of a corridor that ended before a wall has a hole as wide as a corridor.
 
     What turns off is hardly seen in passing: a picture ends before its far corner comes into it.
@@ -85,6 +87,7 @@ def mouths(layer: Layer, end_w: FloatArray, axis: FloatArray) -> np.ndarray:
         layer: What is known.
         end_w: ``(2,)`` where it ended.
         axis: ``(2,)`` unit vector of its direction there.
+        flown_w: ``(N, 2)`` the way, a metre apart: a hole that it came through leads back.
     """
     along = np.arange(0.0, _BACK_M, layer.cell_m)
     walls, places = _walls(layer), []
@@ -92,7 +95,11 @@ def mouths(layer: Layer, end_w: FloatArray, axis: FloatArray) -> np.ndarray:
         for low, high in runs(~_meet(walls, layer, end_w - along[:, None] * axis, left)):
             width_m = (high - low) * layer.cell_m
             if low > 0 and high < len(along) and 2.0 * _BERTH_M <= width_m <= WIDEST_M:
-                places.append(end_w - 0.5 * (low + high) * layer.cell_m * axis + _MOUTH_M * left)
+                place = end_w - 0.5 * (low + high) * layer.cell_m * axis + _MOUTH_M * left
+                along_m, out_m = np.array([axis, left]) @ (flown_w - place).T
+                through = (np.abs(along_m) < 0.5 * width_m) & (_THROUGH_M[0] < out_m) & (out_m < _THROUGH_M[1])
+                if not through.any():
+                    places.append(place)
     return layer.cells(np.array(places).reshape(-1, 2))
 
 
