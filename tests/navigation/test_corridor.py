@@ -260,6 +260,19 @@ def test_from_a_hole_that_is_none_it_comes_back_to_the_end():
     assert len(task.goals(closed, sight(2.2, 0.0, 36.6))) == 0 and task.done(sight(2.2, 0.0, 36.6))
 
 
+def test_an_end_that_was_come_back_to_is_the_one_that_it_was():
+    """`corridor` 832: it had been 1.2 m before the door, and ended 1.6 m before it, after another turn."""
+    task, hole = FollowCorridor(), seen(stub, lambda x, y: (y > 0.9) & (np.abs(x) < 1.0))
+    shorter = seen(lambda x, y: sides(end=2.6)(x, y))
+    for k, x in enumerate(np.arange(-4.0, 2.5, 0.4)):
+        task.goals(hole, sight(x, 0.0, 0.5 * k))
+    for k, x in enumerate((2.0, 1.0, 0.5)):
+        task.goals(hole, sight(x, 0.0, 10.0 + k))
+    assert place(task, seen(sides(end=4.0)), sight(0.0, 0.0, 13.0))[0] > 3.0, "there is more to it than it seemed"
+    assert place(task, shorter, sight(1.9, 0.0, 15.0)) == pytest.approx([2.4, 0.0], abs=0.1)
+    assert len(task.goals(shorter, sight(2.2, 0.0, 16.0))) == 0
+
+
 def test_a_way_back_to_the_end_that_there_is_none_of_ends_it():
     task, layer = FollowCorridor(), seen(stub, lambda x, y: (y > 0.9) & (np.abs(x) < 1.0))
     for k, x in enumerate(np.arange(-4.0, 2.5, 0.4)):

@@ -51,7 +51,9 @@ class FollowCorridor(LooksAhead):
     _looks: Looks = field(default_factory=Looks)
     _trail: Trail | None = None
     _end: Glance | None = None
-    """Where the corridor seems to end before a wall."""
+    """Where the corridor seems to end, or seemed to last, before a wall."""
+    _ending: bool = False
+    """Whether it seems to now."""
     _losses: Losses = field(default_factory=lambda: Losses(math.inf))
     """Of the pose, before walls where it seems to end."""
     _wide_s: float = math.nan
@@ -80,13 +82,13 @@ class FollowCorridor(LooksAhead):
 
     def heading_rad(self, sight: Sight) -> float | None:
         """To the sides, where it seems to end; else ahead."""
-        return None if self._end is None else self._end.heading_rad(sight)
+        return self._end.heading_rad(sight) if self._ending and self._end is not None else None
 
     def done(self, sight: Sight) -> bool:
         """Whether the corridor ended, or the time."""
         self.room = sight.stamp_s - self._wide_s > _ROOM_S
         ended = self._looks.over(sight.stamp_s)
-        if self._end is not None:
+        if self._ending and self._end is not None:
             self._losses.note(sight)
             if self._losses.count >= _MOST_LOSSES:
                 self._end.give_up(sight)
@@ -111,20 +113,21 @@ class FollowCorridor(LooksAhead):
         cells = self._left(layer, wide(layer, here))
         places = layer.centres(cells)
         if len(ahead := cells[is_ahead(places, here, axis) & trail.leads_on(places)]):
-            self._end = None
+            self._ending = False
             return far_middle(layer, ahead, axis)
         trail.end(here)
         if len(off := cells[trail.turns_off(places, here)]):
             return self._nearest(layer, off, here, axis)
         narrow = straight(layer, here, axis, self._to_door(here, axis))
-        if self._end is not None:  # what is between here and the wall is no way on
+        if self._ending:  # what is between here and the wall is no way on
             narrow = narrow[trail.leads_on(layer.centres(narrow))]
         if len(narrow := self._left(layer, far_middle(layer, narrow, axis))):
             return narrow
-        if not self.wall and self._end is None:
+        if not self.wall and not self._ending:
             return layer.cells(here + _BLIND_M * axis)[None]
-        if self._end is None:
+        if self._end is None or not (self._ending or self._end.is_near(here)):
             self._end, self._losses = Glance(here.copy(), axis), Losses(math.inf)
+        self._ending = True
         if not self._end.given_up and len(found := self._beside(layer, self._end, here, trail)):
             return found
         goal = self._end.goal(layer, sight)

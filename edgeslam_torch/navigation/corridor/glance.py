@@ -22,6 +22,8 @@ _TURN_S = 12.5
 """Time of a turn on the spot, 30 degrees a second: what turns off right there is seen by that."""
 _GIVEN_UP_S = 20.0
 """Time for a way of metres: one that does not come there looks from where it is."""
+_SAME_END_M = 1.5
+"""Ends that are nearer to each other are one: what is known ahead changes while it looks to the sides."""
 _ABOUT_M = 1.0
 """How near the end it may stay when it gives up: before a bare wall the pose is lost again."""
 
@@ -69,6 +71,10 @@ class Glance:
             late = False
         self.over = late or _away(sight, self.end_w) < (_ABOUT_M if self.given_up else _THERE_M)
         return None if self.over else self.end_w
+
+    def is_near(self, here_w: FloatArray) -> bool:
+        """Whether a corridor that seems to end here ``(2,)`` seems to end there."""
+        return float(np.linalg.norm(here_w - self.end_w)) < _SAME_END_M
 
     def give_up(self, sight: Sight) -> None:
         """Look at nothing more: back to the end, unless it is about there."""
