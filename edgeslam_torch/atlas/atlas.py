@@ -248,11 +248,16 @@ class Atlas:
         """Whether what a link rests on is one plane, such as a wall whose paper looks the same a metre on."""
         return on_one_plane(self.map.anchors.p_w[one.anchor], one.depth)
 
-    def align(self, stamp_s: float) -> Rescaled | Turned | None:
+    def align(self, stamp_s: float, now: tuple[float, float] | None = None) -> Rescaled | Turned | None:
         """Turn the camera's piece as the flight's first one is turned, or bring it to its unit, if the drone's sensors
         tell another.
 
         The map must belong to the caller.
+
+        Args:
+            stamp_s: Present time.
+            now: Size of the first piece relative to the camera's as the drone flies, if that is surely another, and
+                its standard deviation in the logarithm.
         """
         records = self.log.records
         if not records or stamp_s - self._aligned_s < UNIT_AGAIN_S:
@@ -261,7 +266,7 @@ class Atlas:
         if piece == first or piece in self.known_scale:
             return None
         self._aligned_s = stamp_s
-        change = self._turned(stamp_s, piece, first) or self._rescaled(stamp_s, piece, first)
+        change = self._turned(stamp_s, piece, first) or self._rescaled(stamp_s, piece, first, now)
         if change is not None:
             move_piece(self.map, self.edges, self.log, piece, change.S)
             self._links = []  # their similarities hold for pieces as they were
@@ -276,11 +281,11 @@ class Atlas:
             return None
         return Turned(stamp_s, piece, turn_about(self._began(piece), mine[0], angle), angle, sigma)
 
-    def _rescaled(self, stamp_s: float, piece: int, first: int) -> Rescaled | None:
-        told = self._size_told(piece, first)
-        if told is None or not is_other(*told):
-            return None
-        return Rescaled(stamp_s, piece, about(self._began(piece), told[0]), told[1])
+    def _rescaled(self, stamp_s: float, piece: int, first: int, now: tuple[float, float] | None) -> Rescaled | None:
+        for told in (self._size_told(piece, first), now):  # velocities along all of it, and heights, too, lately
+            if told is not None and is_other(*told):
+                return Rescaled(stamp_s, piece, about(self._began(piece), told[0]), told[1])
+        return None
 
     def _began(self, piece: int) -> FloatArray:
         """Where a piece began ``(3,)``."""

@@ -264,10 +264,12 @@ class MotionFusion:
             return with_velocity(told, last, previous, self.scale())
         return self._predict_unfiltered(last, previous, stamp_s)
 
-    def republished(self, published: Published, centre_map: FloatArray) -> Published:
-        """What is published, upright and in the unit that is known or guessed now; ``centre_map`` ``(3,)`` stays where
-        it is."""
+    def republished(self, published: Published, centre_map: FloatArray, held: bool) -> Published:
+        """What is published, upright and, unless its unit is ``held``, in the unit that is known or guessed now;
+        ``centre_map`` ``(3,)`` stays where it is."""
         published = published.turned_upright(self.orientation.upright(), centre_map)
+        if held:
+            return published
         return published.guessed_anew(self.metres.guess, centre_map).revised(self.scale(), centre_map)
 
     def present(

@@ -116,12 +116,16 @@ class Published:
             estimate: Metres per map unit.
             centre_map: Point of the map ``(3,)`` that stays where it is published.
         """
+        if not self.is_wrong_by(estimate):
+            return self
+        return replace(self._rescaled(estimate.value, centre_map), guessed=False)
+
+    def is_wrong_by(self, estimate: ScaleEstimate) -> bool:
+        """Whether an estimate [metres per map unit] is measured, sure, and contradicts the published scale."""
         measured = not MEASURED.isdisjoint(estimate.source.split("+"))
         sure = GUESS_SURE if self.guessed else SURE
         wrong = self.contradicts(estimate) or self._worse_guess(estimate)
-        if not (measured and estimate.sigma < sure * estimate.value and wrong):
-            return self
-        return replace(self._rescaled(estimate.value, centre_map), guessed=False)
+        return measured and estimate.sigma < sure * estimate.value and wrong
 
 
 def first_pose(rpy_rad: FloatArray, T_b_c: FloatArray) -> FloatArray:

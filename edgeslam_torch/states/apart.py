@@ -10,7 +10,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from edgeslam_torch.types import FloatArray
+from edgeslam_torch.atlas.unit import is_other
+from edgeslam_torch.types import FloatArray, ScaleEstimate
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,6 +28,17 @@ class Apart:
     """What is known of the pieces that began after the flight's first one, by their numbers."""
 
     begun: dict[int, _Begun] = field(default_factory=dict)
+    unit: ScaleEstimate = field(default_factory=ScaleEstimate)
+    """Metres per map unit, as they were told when the camera was last in the first piece."""
+
+    def other_unit(self, piece: int, told: ScaleEstimate) -> tuple[float, float] | None:
+        """By how much what is told now of a later piece's unit surely differs from the first one's, and the standard
+        deviation of the logarithm of that; None where it does not, or nobody knows."""
+        if piece not in self.begun or not (math.isfinite(told.sigma) and math.isfinite(self.unit.sigma)):
+            return None
+        sigma = math.hypot(told.sigma / told.value, self.unit.sigma / self.unit.value)
+        ratio = told.value / self.unit.value
+        return (ratio, sigma) if is_other(ratio, sigma) else None
 
     def begin(self, piece: int, before: int, centre: FloatArray, sigma_t: float, sigma_r_rad: float) -> None:
         """A piece begins at a predicted pose.
@@ -48,6 +60,11 @@ class Apart:
         """A piece was turned about where it began, as sure as that is."""
         if piece in self.begun:
             self.begun[piece] = replace(self.begun[piece], sigma_r_rad=sigma_r_rad)
+
+    def moved(self, piece: int, grown: float) -> None:
+        """A piece was moved to another, and is larger by a factor."""
+        if piece not in self.begun and math.isfinite(self.unit.sigma):
+            self.unit = replace(self.unit, value=self.unit.value / grown, sigma=self.unit.sigma / grown)
 
     def carried_sigma(self, piece: int) -> float:
         """Standard deviation per axis [map units] of where a piece began; infinite unless the drone's sensors carried

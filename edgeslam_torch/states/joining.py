@@ -10,7 +10,7 @@ from edgeslam_torch.atlas.loops import Closure
 from edgeslam_torch.atlas.turned import Turned
 from edgeslam_torch.atlas.unit import Rescaled
 from edgeslam_torch.fusion.published import Published
-from edgeslam_torch.geometry import se3
+from edgeslam_torch.geometry import se3, sim3
 from edgeslam_torch.states.system import System
 from edgeslam_torch.types import FloatArray
 
@@ -41,7 +41,7 @@ class Joining:
         if len(self.system.map.begun) > 1:
             self._notice_return()
             before = self._last()
-            if (aligned := self.atlas.align(stamp_s)) is not None:
+            if (aligned := self.atlas.align(stamp_s, self.system.other_unit())) is not None:
                 self._follow(aligned, *before)
                 words.append(aligned.in_words())
         while (change := self._once(stamp_s)) is not None:
@@ -104,5 +104,7 @@ class Joining:
         system.published = replace(system.published, revision=system.published.revision + 1)
         if isinstance(change, Turned):
             system.apart.turned(change.piece, change.sigma_rad)
+        elif isinstance(change, Join):
+            system.apart.moved(change.moved, sim3.scale_of(change.S))
         kind = _COUNTED[type(change)]
         system.events[kind] = system.events.get(kind, 0) + 1

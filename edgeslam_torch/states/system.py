@@ -144,9 +144,22 @@ class System:
         T_w_c = se3.inverse(track.T_c_w)
         with self.timed("fusion"):
             self.fusion.add_visual(stamp_s, T_w_c, *_sigmas(track))
-            self.published = self.fusion.republished(self.published, T_w_c[:3, 3])
+            held = self.other_unit() is not None
+            self.published = self.fusion.republished(self.published, T_w_c[:3, 3], held)
+            if self._piece() not in self.apart.begun:
+                self.apart.unit = self.fusion.scale()
         if self.apart.begun:
-            self.apart_sigma = self._apart_sigma(self.map.piece_of(self.log.records[-1].keyframe_id))
+            self.apart_sigma = self._apart_sigma(self._piece())
+
+    def other_unit(self) -> tuple[float, float] | None:
+        """As `Apart.other_unit`, of the camera's piece, if what is told now would revise the published unit: it is that
+        piece's, which is brought to the first one's, as all that lies before it is published in that."""
+        told, piece = self.fusion.scale(), self._piece()
+        return self.apart.other_unit(piece, told) if self.published.is_wrong_by(told) else None
+
+    def _piece(self) -> int:
+        """Which the newest frame is tied to."""
+        return self.map.piece_of(self.log.records[-1].keyframe_id) if self.log.records else self.map.piece
 
     def see_again(self, since_s: float, track: Track) -> None:
         """Pass the logged frames since a stamp, which a map supports now, to the fusion, as sure as ``track``."""

@@ -396,6 +396,22 @@ def test_a_piece_is_brought_to_the_unit_of_the_first_one(rng):
     assert atlas.align(1.0 + 0.9 * AGAIN_S) is None, "not at each frame"
 
 
+@pytest.mark.parametrize("along", [2.0 * 1.02, None])
+def test_what_the_drone_tells_as_it_flies_counts_where_velocities_along_a_piece_tell_nothing_else(rng, along):
+    """A drone that climbs on the spot in its piece: heights alone tell the unit."""
+
+    def told(stamps_s, T_w_c):
+        value = 2.0 if stamps_s[0] == 0.0 else along
+        return None if value is None else ScaleEstimate(value, 0.02 * value, "telemetry")
+
+    assert sim3.scale_of(Pieces(rng, misplaced=CARRIED).atlas(metres_along=told).align(1.0, (0.9, 0.02)).S) == (
+        pytest.approx(0.9)
+    )
+    assert Pieces(rng, misplaced=CARRIED).atlas(metres_along=told).align(1.0, (0.97, 0.02)) is None
+    surely = Pieces(rng, misplaced=CARRIED).atlas(metres_along=metres_along(2.0 * 1.5))
+    assert sim3.scale_of(surely.align(1.0, (0.9, 0.02)).S) == pytest.approx(1.5), "all of the piece before the present"
+
+
 @pytest.mark.parametrize(
     ("second", "sigma", "why"),
     [

@@ -68,8 +68,11 @@ def output(scale, sigma=0.02, metric=True):
         (0.6, output(0.62), False, 0.6),
         (0.6, output(0.62, metric=False), True, 0.6),
         (0.6, output(1.0, sigma=math.inf), True, 0.6),
+        (0.6, output(0.53, sigma=0.11), True, 0.6),
+        (0.6, output(0.4, sigma=0.05), True, 0.4),
+        (math.nan, output(0.53, sigma=0.11), True, 0.53),
     ],
-    ids=["first", "grew", "shrank", "hardly", "not now", "no metres", "no estimate"],
+    ids=["first", "grew", "shrank", "hardly", "not now", "no metres", "no estimate", "unsure", "no room", "rough"],
 )
 def test_it_goes_by_the_best_estimate_where_that_is_worth_a_move(known, newest, may_move, metres):
     assert metres_per_unit(known, newest, may_move) == metres

@@ -254,7 +254,9 @@ def test_from_a_hole_that_is_none_it_comes_back_to_the_end():
     for x in (2.0, 1.5, 1.0, 0.5, 0.0, -0.5, -1.0):
         task.goals(hole, sight(x, 0.0, 12.0 - x))
     assert place(task, closed, sight(-1.0, 0.0, 14.0)) == pytest.approx([2.4, 0.0], abs=0.1)
-    assert place(task, closed, sight(1.0, 0.0, 20.0)) == pytest.approx([2.4, 0.0], abs=0.1)
+    for k in range(6):  # slowly: a place that it comes to is not looked at in vain
+        assert place(task, closed, sight(1.3 + 0.1 * k, 0.0, 16.0 + k)) == pytest.approx([2.4, 0.0], abs=0.1)
+        assert not task.done(sight(1.3 + 0.1 * k, 0.0, 16.0 + k))
     assert len(task.goals(closed, sight(2.2, 0.0, 24.0))) == 0, "a turn on the spot"
     assert not task.done(sight(2.2, 0.0, 36.0))
     assert len(task.goals(closed, sight(2.2, 0.0, 36.6))) == 0 and task.done(sight(2.2, 0.0, 36.6))
@@ -268,7 +270,7 @@ def test_an_end_that_was_come_back_to_is_the_one_that_it_was():
         task.goals(hole, sight(x, 0.0, 0.5 * k))
     for k, x in enumerate((2.0, 1.0, 0.5)):
         task.goals(hole, sight(x, 0.0, 10.0 + k))
-    assert place(task, seen(sides(end=4.0)), sight(0.0, 0.0, 13.0))[0] > 3.0, "there is more to it than it seemed"
+    assert place(task, seen(sides(end=5.6)), sight(0.0, 0.0, 13.0))[0] > 4.0, "there is more to it than it seemed"
     assert place(task, shorter, sight(1.9, 0.0, 15.0)) == pytest.approx([2.4, 0.0], abs=0.1)
     assert len(task.goals(shorter, sight(2.2, 0.0, 16.0))) == 0
 

@@ -53,7 +53,7 @@ class Pieces:
             update=update,
             ask_all_again=lambda: None,
             ask_again=lambda: self.again.append(self.piece),
-            align=lambda stamp_s: None,
+            align=lambda stamp_s, now: None,
             is_up_to_date=False,
             is_divided=True,
             known_scale={},
@@ -81,6 +81,7 @@ def system_of(pieces, motion, busy=False):
         fusion=fusion,
         mapping=mapping,
         published=Published(2.0),
+        other_unit=lambda: None,
         events={},
     )
 
@@ -134,7 +135,7 @@ def test_the_pose_goes_along_when_a_loop_is_closed(rng):
         return Closure(1.0, 1, 30.0, 0.2, 0.1, 1.2, 2, 300, {KEYFRAME: 1.5, 3: 1.1})
 
     system = system_of(pieces, motion)
-    words = Joining(system, SimpleNamespace(update=update, align=lambda _: None, is_up_to_date=False)).update()
+    words = Joining(system, SimpleNamespace(update=update, align=lambda *_: None, is_up_to_date=False)).update()
     assert words.startswith("loop closed in piece 1, a place seen again after 30.0 s: 2 keyframes agree, 300 keypoints")
     np.testing.assert_allclose(se3.transform(motion.T_c_w, sim3.transform(S, p)), 1.5 * before, atol=1e-9)
     assert (system.published.revision, system.events) == (1, {"loops_closed": 1})
@@ -148,7 +149,7 @@ def test_the_pose_goes_along_when_its_piece_gets_the_unit_of_another(rng):
     pieces = Pieces(T_k_w)
     grown = about(np.array([1.0, -2.0, 0.5]), 1.3)
 
-    def rescale(stamp_s):
+    def rescale(stamp_s, now):
         pieces.T_k_w = sim3.moved_camera(grown, T_k_w)
         return Rescaled(7.0, 1, grown, 0.05)
 
@@ -168,7 +169,7 @@ def test_the_pose_goes_along_when_its_piece_is_turned(rng):
     pieces = Pieces(T_k_w)
     S = turn_about(np.array([1.0, -2.0, 0.5]), np.eye(3), 0.4)
 
-    def align(stamp_s):
+    def align(stamp_s, now):
         pieces.T_k_w = sim3.moved_camera(S, T_k_w)
         return Turned(7.0, 1, S, 0.4, 0.05)
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from edgeslam_torch.fusion.published import CONTRADICTION, SURE
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.types import FloatArray, SlamOutput
 
@@ -66,7 +67,7 @@ def metres_per_unit(known: float, output: SlamOutput, may_move: bool) -> float:
     """Metres per map unit that a flight goes by from now on.
 
     The published unit stays what it is until it is surely wrong, so that a trajectory is not bent; a goal in metres is
-    better reached by the best estimate.
+    better reached by the best estimate. One that is not sure moves what is known only if it leaves no room for it.
 
     Args:
         known: What it went by so far; not finite if nothing told metres yet.
@@ -75,5 +76,6 @@ def metres_per_unit(known: float, output: SlamOutput, may_move: bool) -> float:
     """
     if not may_move or not output.metric or not math.isfinite(output.scale.sigma):
         return known
-    best = output.scale.value
-    return known if math.isfinite(known) and abs(math.log(best / known)) < _OFF else best
+    best, sigma_log = output.scale.value, output.scale.sigma / output.scale.value
+    least = _OFF if sigma_log < SURE else max(_OFF, CONTRADICTION * sigma_log)
+    return known if math.isfinite(known) and abs(math.log(best / known)) < least else best

@@ -78,7 +78,11 @@ class FollowCorridor(LooksAhead):
         self._note_width(layer, sight)
         axis = self._trail.direction(layer, here)
         self.wall = is_walled(layer, here, axis)
-        return self._looks.worth(self._onward(layer, sight, axis, self._trail), layer, sight)
+        found = self._looks.worth(self._onward(layer, sight, axis, self._trail), layer, sight)
+        if len(found) or not self._ending or self._end is None:
+            return found
+        goal = self._end.goal(layer, sight)
+        return layer.cells(np.zeros((0, 2)) if goal is None else goal[None])
 
     def heading_rad(self, sight: Sight) -> float | None:
         """To the sides, where it seems to end; else ahead."""
@@ -87,13 +91,7 @@ class FollowCorridor(LooksAhead):
     def done(self, sight: Sight) -> bool:
         """Whether the corridor ended, or the time."""
         self.room = sight.stamp_s - self._wide_s > _ROOM_S
-        ended = self._looks.over(sight.stamp_s)
-        if self._ending and self._end is not None:
-            self._losses.note(sight)
-            if self._losses.count >= _MOST_LOSSES:
-                self._end.give_up(sight)
-            ended |= self._end.over
-        return self.room or ended or sight.stamp_s >= self.until_s
+        return self.room or self._has_ended(sight) or sight.stamp_s >= self.until_s
 
     def carry(self, moved: Moved) -> None:
         """Take what is remembered along with the map."""
@@ -107,6 +105,14 @@ class FollowCorridor(LooksAhead):
             self._end.carry(moved)
         if self._target_w is not None:
             self._target_w = moved.points(self._target_w[None])[0]
+
+    def _has_ended(self, sight: Sight) -> bool:
+        if not self._ending or self._end is None:
+            return self._looks.over(sight.stamp_s)
+        self._losses.note(sight)
+        if self._losses.count >= _MOST_LOSSES:
+            self._end.give_up(sight)
+        return self._end.over
 
     def _onward(self, layer: Layer, sight: Sight, axis: FloatArray, trail: Trail) -> np.ndarray:
         here = sight.p_w[:2]
@@ -128,10 +134,7 @@ class FollowCorridor(LooksAhead):
         if self._end is None or not (self._ending or self._end.is_near(here)):
             self._end, self._losses = Glance(here.copy(), axis), Losses(math.inf)
         self._ending = True
-        if not self._end.given_up and len(found := self._beside(layer, self._end, here, trail)):
-            return found
-        goal = self._end.goal(layer, sight)
-        return layer.cells(np.zeros((0, 2)) if goal is None else goal[None])
+        return cells[:0] if self._end.given_up else self._beside(layer, self._end, here, trail)
 
     def _beside(self, layer: Layer, end: Glance, here: FloatArray, trail: Trail) -> np.ndarray:
         """Before a wall: what turns off though its mouth is narrow on the map, else holes in the sides."""
