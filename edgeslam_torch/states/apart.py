@@ -29,7 +29,7 @@ class Apart:
 
     begun: dict[int, _Begun] = field(default_factory=dict)
     unit: ScaleEstimate = field(default_factory=ScaleEstimate)
-    """Metres per map unit, as they were told when the camera was last in the first piece."""
+    """Metres per map unit, as they were told when the camera left the first piece."""
 
     def other_unit(self, piece: int, told: ScaleEstimate) -> tuple[float, float] | None:
         """By how much what is told now of a later piece's unit surely differs from the first one's, and the standard

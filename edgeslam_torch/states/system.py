@@ -144,10 +144,8 @@ class System:
         T_w_c = se3.inverse(track.T_c_w)
         with self.timed("fusion"):
             self.fusion.add_visual(stamp_s, T_w_c, *_sigmas(track))
-            held = self.other_unit() is not None
+            held = bool(self.apart.begun) and self.other_unit() is not None
             self.published = self.fusion.republished(self.published, T_w_c[:3, 3], held)
-            if self._piece() not in self.apart.begun:
-                self.apart.unit = self.fusion.scale()
         if self.apart.begun:
             self.apart_sigma = self._apart_sigma(self._piece())
 
@@ -159,7 +157,7 @@ class System:
 
     def _piece(self) -> int:
         """Which the newest frame is tied to."""
-        return self.map.piece_of(self.log.records[-1].keyframe_id) if self.log.records else self.map.piece
+        return self.map.piece_of(self.log.records[-1].keyframe_id)
 
     def see_again(self, since_s: float, track: Track) -> None:
         """Pass the logged frames since a stamp, which a map supports now, to the fusion, as sure as ``track``."""
@@ -172,6 +170,8 @@ class System:
         earlier = (self.map.piece_of(r.keyframe_id) for r in reversed(self.log.records))
         before, told = next((p for p in earlier if p != piece), None), self.carried(stamp_s)
         if before is not None:
+            if before not in self.apart.begun:
+                self.apart.unit = self.fusion.scale()
             sigma_t, sigma_r = (np.inf, np.inf) if told is None else (told.sigma_t, told.sigma_r_rad)
             self.apart.begin(piece, before, se3.inverse(self.motion.T_c_w)[:3, 3], sigma_t, sigma_r)
             self.apart_sigma = self._apart_sigma(piece)

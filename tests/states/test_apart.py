@@ -118,6 +118,7 @@ def test_what_tells_another_unit_in_a_later_piece_is_of_that_piece(first, now, i
     made.carried_to(1, 1.0)
     made.log.records.append(SimpleNamespace(keyframe_id=1))
     made.fusion.scale = lambda: now
+    made.carried_to(2, 1.5)  # from a later one: nothing new of the first
     see(made, placed(7.0))
     assert made.published.scale == (0.6 if is_of_the_piece else 0.5)
     if is_of_the_piece:
