@@ -192,7 +192,9 @@ def test_the_corridor_that_it_came_from_is_no_hole_in_the_side(side):
     """`l_corridor` 830: from the end of the other corridor it flew back to the dead end."""
     layer = seen(stub, lambda x, y: (np.abs(x) < 1.0) & (y < -2.0))
     end, axis = np.array([0.0, 4.0]), np.array([0.0, 1.0])
-    assert len(mouths(layer, end, axis, np.stack([np.zeros(5), np.arange(5.0)], 1))) == 2, "never flown through"
+    for past in (0.0, 0.8 * side):
+        way = np.stack([np.full(5, past), np.arange(5.0)], 1)
+        assert len(mouths(layer, end, axis, way)) == 2, "flown past, not through"
     to_the_dead_end = ALONG_X * [side, 1.0] + [0.0, 0.4]
     assert layer.centres(mouths(layer, end, axis, to_the_dead_end))[:, 0] * side == pytest.approx([-1.2], abs=0.1)
 
