@@ -98,6 +98,8 @@ class Joining:
         scale = change.growth(piece, last)
         T_c_k[:3, 3] *= scale
         system.motion.carry(T_c_k @ system.map.pose_of(last), scale)
+        if isinstance(change, Rescaled):  # metres that are held, where the flight tells no new ones, are of this piece
+            system.fusion.metres.follow(math.log(scale))
         system.compare_depths_again()
         system.fusion.revise(*system.log.poses())
         # Poses published before belong to a map that has moved since.

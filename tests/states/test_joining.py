@@ -67,7 +67,7 @@ def system_of(pieces, motion, busy=False):
     fusion = SimpleNamespace(
         revise=lambda *poses: revised.append(poses),
         revised=revised,
-        metres=SimpleNamespace(remember=remembered.append),
+        metres=SimpleNamespace(remember=remembered.append, follow=lambda log: revised.append(pytest.approx(log))),
         remembered=remembered,
     )
     mapping = SimpleNamespace(busy=busy)
@@ -159,7 +159,7 @@ def test_the_pose_goes_along_when_its_piece_gets_the_unit_of_another(rng):
     assert words == "piece 1 scaled by 1.300 (sigma 5.0 %) to the metres before it"
     np.testing.assert_allclose(se3.transform(motion.T_c_w, sim3.transform(grown, p)), 1.3 * before, atol=1e-9)
     assert (system.published.revision, system.events) == (1, {"rescaled": 1})
-    assert system.fusion.revised == ["ratios", ("stamps", "poses")]
+    assert system.fusion.revised == [np.log(1.3), "ratios", ("stamps", "poses")], "held metres do not scale it again"
 
 
 def test_the_pose_goes_along_when_its_piece_is_turned(rng):
