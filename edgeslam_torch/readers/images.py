@@ -65,10 +65,19 @@ def read_pixels(path: Path, flags: int) -> NDArray[Any]:
     Raises:
         SourceError: If the file is missing, empty, damaged, too large or no image.
     """
-    data = _bytes(path)
+    return decode(_bytes(path), path, flags)
+
+
+def decode(data: bytes, name: str | Path, flags: int) -> NDArray[Any]:
+    """The image in these bytes, as ``cv2.imread`` would return it.
+
+    Raises:
+        SourceError: If they are empty, damaged, too large or no image.
+    """
+    _check_bytes(data, name)
     if data.startswith(_JPEG):
-        _grey_of_jpeg(data, path)
-    return _decoded(data, path, flags)
+        _grey_of_jpeg(data, name)
+    return _decoded(data, name, flags)
 
 
 def pixels_or_none(path: Path, flags: int) -> NDArray[Any] | None:
@@ -113,18 +122,23 @@ def _bytes(path: Path) -> bytes:
         raise SourceError(f"{path}: {error.strerror or error}") from error
     if data is None:
         raise SourceError(f"{path}: no such file")
-    if not data:
-        raise SourceError(f"{path}: empty file")
-    if data.startswith(_JPEG) and data.rfind(b"\xff\xd9", max(0, len(data) - 65536)) < 0:  # no end marker
-        raise SourceError(f"{path}: truncated image")
-    size_px = image_size(data)
-    if size_px is None:
-        raise SourceError(f"{path}: cannot be decoded as an image")
-    check_size(*size_px, path)
+    _check_bytes(data, path)
     return data
 
 
-def _grey_of_jpeg(data: bytes, path: Path) -> NDArray[np.uint8]:
+def _check_bytes(data: bytes, name: str | Path) -> None:
+    """Reject what is no whole image, or too large a one, before anything is decoded."""
+    if not data:
+        raise SourceError(f"{name}: empty image")
+    if data.startswith(_JPEG) and data.rfind(b"\xff\xd9", max(0, len(data) - 65536)) < 0:  # no end marker
+        raise SourceError(f"{name}: truncated image")
+    size_px = image_size(data)
+    if size_px is None:
+        raise SourceError(f"{name}: cannot be decoded as an image")
+    check_size(*size_px, name)
+
+
+def _grey_of_jpeg(data: bytes, path: str | Path) -> NDArray[np.uint8]:
     """``(H, W)``.
 
     By OpenCV's library (libjpeg-turbo) with the same values, but warnings are errors: OpenCV returns an image for
@@ -141,7 +155,7 @@ def _grey_of_jpeg(data: bytes, path: Path) -> NDArray[np.uint8]:
     return np.asarray(grey[:, :, 0], dtype=np.uint8)
 
 
-def _decoded(data: bytes, path: Path | None, flags: int) -> NDArray[Any]:
+def _decoded(data: bytes, path: str | Path | None, flags: int) -> NDArray[Any]:
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error as error:

@@ -1,19 +1,26 @@
-"""`Bag`: topics and messages of a ROS 1 bag, a ROS 2 folder or file, or an MCAP file, streamed by rosbags."""
+"""`Bag`: topics and messages of a ROS 1 bag, a ROS 2 folder or file, or an MCAP file, one or split, streamed."""
 
 import importlib
+import math
 import struct
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import islice
+from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any
 
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.extras import needs_extra
+from edgeslam_torch.readers.bags.limits import check_definition_text, check_types, readers
+from edgeslam_torch.readers.bags.mcap_file import McapFile, profile
 
 SUFFIXES = (".bag", ".db3", ".mcap")
 METADATA = "metadata.yaml"
+_UNFINISHED = ".active"
+"""What a recorder appends to the name while it writes."""
+_MAX_GAP_S, _MAX_OVERLAP_S = 10.0, 1.0
+"""Between the files that a recorder split: writers leave tenths of a second, other recordings lie minutes apart."""
 _DAMAGED = (
     OSError,
     ValueError,
@@ -24,6 +31,7 @@ _DAMAGED = (
     ArithmeticError,
     EOFError,
     RuntimeError,
+    MemoryError,
     struct.error,
 )
 """What rosbags and the decompressors raise for damaged files, beside their own exceptions."""
@@ -31,7 +39,6 @@ _REMEDIES = (
     ("reindex", "it was not closed properly; repair it with: rosbag reindex"),
     ("index", "it was not closed properly; repair it with: rosbag reindex"),
     ("end magic", "it was not closed properly; repair it with: mcap recover"),
-    ("Profile is not ros2", "it holds no ROS 2 messages"),
 )
 
 
@@ -61,7 +68,7 @@ def is_bag(path: Path) -> bool:
     """Whether a file or folder looks like a recording of ROS."""
     if path.is_dir():
         return bool(_storage_files(path))
-    return path.suffix.lower() in SUFFIXES
+    return path.name.lower().removesuffix(_UNFINISHED).endswith(SUFFIXES)
 
 
 class Bag:
@@ -75,18 +82,31 @@ class Bag:
             MissingPackageError: If rosbags is not installed.
         """
         self.path = path
-        self._file = _to_open(path)
-        self._is_ros1 = self._file.suffix.lower() == ".bag"
+        self._files = _files(path)
         self._stores: dict[str, Any] = {}
-        with self._opened() as reader:
-            self.begin_s, self.end_s = 1e-9 * reader.start_time, 1e-9 * max(reader.start_time, reader.end_time - 1)
-            counts: dict[str, tuple[str, int]] = {}
-            self._definitions: dict[str, tuple[str, Any]] = {}
-            for connection in reader.connections:
-                kind, count = counts.get(connection.topic, (connection.msgtype, 0))
-                counts[connection.topic] = (kind, count + (connection.msgcount if kind == connection.msgtype else 0))
-                self._definitions.setdefault(connection.topic, (connection.msgtype, connection.msgdef))
-        self.topics = tuple(Topic(name, _short(kind), count) for name, (kind, count) in sorted(counts.items()))
+        self._definitions: dict[str, tuple[str, Any, bool]] = {}
+        """Topic to type, definition and whether its messages are encoded as in ROS 1."""
+        counts: dict[str, int] = {}
+        spans: list[tuple[float, float, Path]] = []
+        for file in self._files:
+            with self._opened(file) as reader:
+                spans.append((1e-9 * reader.start_time, 1e-9 * max(reader.start_time, reader.end_time - 1), file))
+                for connection in reader.connections:
+                    name, kind, count = connection.topic, connection.msgtype, connection.msgcount
+                    if not (isinstance(name, str) and isinstance(kind, str) and isinstance(count, int)):
+                        raise ValueError(f"topic {str(name)[:40]!r} has no name, type or count")
+                    is_ros1 = _is_ros1(file) or connection.ext.serialization_format == "ros1"
+                    first = self._definitions.setdefault(name, (kind, connection.msgdef, is_ros1))
+                    counts[name] = counts.get(name, 0) + (count if kind == first[0] else 0)
+        filled = sorted(span for span in spans if span[1] < 2**62 * 1e-9)
+        if not all(math.isfinite(begin) for begin, _, _ in filled):
+            raise SourceError(f"{path}: times of receipt that are no numbers")
+        self._files = [file for _, _, file in filled] or self._files
+        for (_, end, one), (begin, _, other) in pairwise(filled):
+            if not end - _MAX_OVERLAP_S <= begin <= end + _MAX_GAP_S:
+                raise SourceError(f"{path}: {one.name} and {other.name} do not follow each other; give one of them")
+        self.begin_s, self.end_s = (filled[0][0], filled[-1][1]) if filled else (0.0, 0.0)
+        self.topics = tuple(Topic(name, _short(self._definitions[name][0]), counts[name]) for name in sorted(counts))
 
     @property
     def duration_s(self) -> float:
@@ -101,10 +121,15 @@ class Bag:
         """
         if not names:
             return
-        with self._opened() as reader:
-            wanted = [c for c in reader.connections if c.topic in names and c.msgtype == self._definitions[c.topic][0]]
-            for connection, received_ns, data in reader.messages(wanted) if wanted else ():
-                yield Raw(connection.topic, 1e-9 * received_ns, data)
+        for file in self._files:
+            with self._opened(file) as reader:
+                known = self._definitions
+                wanted = [c for c in reader.connections if c.topic in names and c.msgtype == known[c.topic][0]]
+                for connection, received_ns, data in reader.messages(wanted) if wanted else ():
+                    received_s = 1e-9 * received_ns
+                    if not math.isfinite(received_s):
+                        raise ValueError("a time of receipt that is no number")
+                    yield Raw(connection.topic, received_s, data)
 
     def first(self, name: str, count: int) -> list[tuple[Raw, Any]]:
         """The topic's first messages, and what they decode to."""
@@ -116,41 +141,51 @@ class Bag:
         Raises:
             SourceError: If the message is damaged, or the bag has no definition of its type.
         """
-        kind = self._definitions[raw.topic][0]
+        kind, _, is_ros1 = self._definitions[raw.topic]
         with self._no_damage(f"{self.path}: {raw.topic}"):
             store = self._store(raw.topic)
-            read = store.deserialize_ros1 if self._is_ros1 else store.deserialize_cdr
+            read = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
             return read(raw.data, kind)
 
     def _store(self, topic: str) -> Any:
         """Type store that knows the topic's type: the bag's own definition, else ROS's."""
-        kind, definition = self._definitions[topic]
+        kind, definition, is_ros1 = self._definitions[topic]
         if kind in self._stores:
             return self._stores[kind]
         with needs_extra("bags", f"{self.path}: a ROS bag"):
             from rosbags.interfaces import MessageDefinitionFormat
             from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
         if definition.format is MessageDefinitionFormat.NONE:
-            store = get_typestore(Stores.ROS1_NOETIC if self._is_ros1 else Stores.LATEST)
+            store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.LATEST)
             if kind not in store.fielddefs:
                 raise SourceError(f"{self.path}: {topic}: the bag holds no definition of {_short(kind)}")
         else:
             store = get_typestore(Stores.EMPTY)
-            if definition.format is MessageDefinitionFormat.MSG:
-                store.register(get_types_from_msg(definition.data, kind))
-            else:
-                for part in definition.data.split("=" * 80 + "\n"):
-                    store.register(get_types_from_idl(part.split("\n", 1)[1] if part.startswith("IDL: ") else part))
+            is_idl = definition.format is not MessageDefinitionFormat.MSG
+            check_definition_text(definition.data, topic, is_idl)
+            parts = definition.data.split("=" * 80 + "\n") if is_idl else ()
+            for part in parts:
+                types = get_types_from_idl(part.split("\n", 1)[1] if part.startswith("IDL: ") else part)
+                check_types(types, topic)
+                store.register(types)
+            if not is_idl:
+                types = get_types_from_msg(definition.data, kind)
+                check_types(types, topic)
+                store.register(types)
         self._stores[kind] = store
         return store
 
     @contextmanager
-    def _opened(self) -> Iterator[Any]:
+    def _opened(self, file: Path) -> Iterator[Any]:
         with needs_extra("bags", f"{self.path}: a ROS bag"):
-            from rosbags.rosbag1 import Reader as Reader1
-            from rosbags.rosbag2 import Reader as Reader2
-        with self._no_damage(str(self.path)), (Reader1 if self._is_ros1 else Reader2)(self._file) as reader:
-            yield reader
+            ros1, ros2 = readers()
+        with self._no_damage(str(self.path)):
+            if not _is_ros1(file) and file.is_file() and profile(file) not in (None, "ros2"):
+                with needs_extra("bags", f"{file}: an MCAP file"), McapFile(file) as reader:
+                    yield reader
+            else:
+                with (ros1 if _is_ros1(file) else ros2)(file) as reader:
+                    yield reader
 
     @contextmanager
     def _no_damage(self, name: str) -> Iterator[None]:
@@ -178,25 +213,33 @@ def _library_errors() -> tuple[type[Exception], ...]:
 
         # backports.zstd before Python 3.14, compression.zstd since
         zstd = importlib.import_module("rosbags.rosbag2.storage_mcap").zstd
-    return ReaderError1, ReaderError2, SerdeError, TypesysError, apsw.Error, zstd.ZstdError
+    with needs_extra("bags", "an MCAP file"):
+        from mcap.exceptions import McapError
+    return ReaderError1, ReaderError2, SerdeError, TypesysError, apsw.Error, zstd.ZstdError, McapError
+
+
+def _is_ros1(file: Path) -> bool:
+    return file.name.lower().removesuffix(_UNFINISHED).endswith(".bag")
 
 
 def _storage_files(folder: Path) -> list[Path]:
-    """Files of a ROS 2 recording in a folder."""
-    return sorted(
-        child for child in folder.iterdir() if child.suffix.lower() in SUFFIXES[1:] or child.name.endswith(".db3.zstd")
-    )
+    """Files of a recording in a folder; ``.bag`` files count where nothing else lies beside them."""
+    children = sorted(folder.iterdir())
+    ros2 = [c for c in children if c.suffix.lower() in SUFFIXES[1:] or c.name.endswith(".db3.zstd")]
+    only_bags = bool(children) and all(c.is_file() and c.suffix.lower() in (".bag", ".yaml", ".txt") for c in children)
+    return ros2 or [c for c in children if only_bags and c.suffix.lower() == ".bag"]
 
 
-def _to_open(path: Path) -> Path:
-    """What rosbags opens: a file, or a folder with its metadata."""
-    if path.is_dir() and not (path / METADATA).is_file():
-        files = _storage_files(path)
-        if len(files) != 1:
-            names = ", ".join(file.name for file in files[:4])
-            raise SourceError(f"{path}: no {METADATA} beside {names}; give one of these files")
-        return files[0]
-    return path
+def _files(path: Path) -> list[Path]:
+    """What is opened one after the other: a file, a folder with its metadata, or the files of one without."""
+    if not path.is_dir() or (path / METADATA).is_file():
+        return [path]
+    files = _storage_files(path)
+    if len({file.suffix.lower() for file in files}) > 1:
+        raise SourceError(
+            f"{path}: no {METADATA} beside {', '.join(f.name for f in files[:4])}; give one of these files"
+        )
+    return files
 
 
 def _short(kind: str) -> str:

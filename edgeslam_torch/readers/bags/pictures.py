@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgeslam_torch.errors import SourceError
-from edgeslam_torch.readers.images import check_size
+from edgeslam_torch.readers.images import check_size, decode
 
 _CHANNELS = {"mono8": 1, "8UC1": 1, "8UC3": 3, "8UC4": 4, "rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4}
-_CHANNELS |= {"yuv422": 2, "yuv422_yuy2": 2, "uyvy": 2, "yuyv": 2, "mono16": 1}
+_CHANNELS |= {"yuv422": 2, "yuv422_yuy2": 2, "uyvy": 2, "yuyv": 2, "mono16": 1, "16UC1": 1}
 _TO_BGR = {
     "rgb8": cv2.COLOR_RGB2BGR,
     "rgba8": cv2.COLOR_RGBA2BGR,
@@ -28,6 +28,8 @@ _TO_BGR = {
     "bayer_grbg": cv2.COLOR_BayerGB2BGR,
 }
 _DEPTH = ("16UC1", "32FC1", "64FC1", "compressedDepth")
+THERMAL = "16UC1"
+"""Depth maps have this encoding, and so have the pictures of thermal cameras: who names the topic means pictures."""
 SUPPORTED = "mono8, mono16, rgb8, bgr8, rgba8, bgra8, bayer_*, yuv422, jpeg and png"
 
 
@@ -56,16 +58,12 @@ class PictureDecoder:
             SourceError: If the encoding is a depth map's or not known, or the picture is damaged.
         """
         form = depth_format(message)
-        if form is not None:
+        if form not in (None, THERMAL):
             raise SourceError(f"{self.name}: depth maps ({form}), not pictures; give the camera's --topic")
         if hasattr(message, "encoding"):
             return self._plain(message)
-        picture = cv2.imdecode(np.asarray(message.data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
-        if picture is None:
-            raise SourceError(
-                f"{self.name}: compressed as {_format(message)[:40]!r} cannot be decoded; {SUPPORTED} are read"
-            )
-        check_size(picture.shape[1], picture.shape[0], self.name)
+        data = np.asarray(message.data, dtype=np.uint8).tobytes()
+        picture = decode(data, f"{self.name}: compressed as {_format(message)[:40]!r}", cv2.IMREAD_UNCHANGED)
         if picture.dtype != np.uint8:
             picture = self._eight_bits(picture)
         return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGRA2BGR) if picture.shape[2:] == (4,) else picture)
@@ -77,9 +75,11 @@ class PictureDecoder:
         if channels is None:
             raise SourceError(f"{self.name}: encoding {encoding[:40]!r} is not supported; {SUPPORTED} are")
         check_size(width, height, self.name)
-        deep = encoding == "mono16" or bool(bayer and bayer[2] == "16")
+        deep = encoding in ("mono16", THERMAL) or bool(bayer and bayer[2] == "16")
         row = width * channels * (2 if deep else 1)
         step, data = int(message.step) or row, np.asarray(message.data, dtype=np.uint8)
+        if height == 1:
+            step = row
         if width < 1 or height < 1 or step < row or data.size < step * (height - 1) + row:
             raise SourceError(
                 f"{self.name}: {data.size} bytes are too few for a {width}x{height} picture in {encoding}"
@@ -93,7 +93,10 @@ class PictureDecoder:
         else:
             image = np.ascontiguousarray(pixels).reshape((height, width, channels) if channels > 1 else (height, width))
         code = _TO_BGR.get(bayer[1] if bayer else encoding)
-        return image if code is None else np.asarray(cv2.cvtColor(image, code), np.uint8)
+        try:
+            return image if code is None else np.asarray(cv2.cvtColor(image, code), np.uint8)
+        except cv2.error as error:
+            raise SourceError(f"{self.name}: {encoding} cannot have {width}x{height} pixels") from error
 
     def _eight_bits(self, image: np.ndarray) -> NDArray[np.uint8]:
         """Cameras send 10, 12 or 14 bits in 16: the first picture's brightest pixel tells how many."""

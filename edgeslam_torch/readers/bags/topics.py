@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.readers.bags.bag import Bag, Topic
-from edgeslam_torch.readers.bags.pictures import depth_format
+from edgeslam_torch.readers.bags.pictures import THERMAL, depth_format
 
 IMAGE, CAMERA = "image", "camera"
 TELEMETRY = ("tello", "odom", "velocity", "imu", "range", "battery")
@@ -74,6 +74,10 @@ def choose(bag: Bag, wanted: Sequence[str] = ()) -> Choice:
     image = _image(bag, wishes.get(IMAGE))
     telemetry, remarks = _telemetry(bag, wishes)
     asked = frozenset(role for role, name in wishes.items() if name != _NOTHING)
+    if depth_of(bag, next(topic for topic in bag.topics if topic.name == image)) == THERMAL:
+        remarks.append(
+            f"{image}: {THERMAL} is read as 16-bit pictures, since the topic was named; depth maps look alike"
+        )
     return Choice(image, _camera(bag, image, wishes.get(CAMERA)), telemetry, asked, tuple(remarks))
 
 
@@ -105,7 +109,7 @@ def _image(bag: Bag, wish: str | None) -> str:
     candidates = [topic for topic in bag.topics if role_of(topic) == IMAGE]
     if wish is not None:
         form = depth_of(bag, next(topic for topic in candidates if topic.name == wish))
-        if form is not None:
+        if form not in (None, THERMAL):
             raise SourceError(f"--topic {wish}: depth maps ({form}), not a camera's pictures")
         return wish
     filled = [topic for topic in candidates if topic.count]
@@ -122,7 +126,8 @@ def _image(bag: Bag, wish: str | None) -> str:
         raise SourceError(f"{bag.path}: {count} cameras ({listing}); choose one, such as --topic {names[0]}")
     if forms:
         name, form = next(iter(forms.items()))
-        raise SourceError(f"{bag.path}: depth maps only ({name}: {form}); a camera's pictures are needed")
+        thermal = f"; if they are a thermal camera's pictures: --topic {name}" if form == THERMAL else ""
+        raise SourceError(f"{bag.path}: depth maps only ({name}: {form}); a camera's pictures are needed{thermal}")
     kinds = ", ".join(sorted({topic.kind for topic in bag.topics})[:5]) or "nothing"
     raise SourceError(f"{bag.path}: no pictures in it (found {kinds}); needed: sensor_msgs/Image or CompressedImage")
 

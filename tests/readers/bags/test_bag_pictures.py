@@ -89,10 +89,9 @@ def test_jpeg_and_png():
 
 
 def test_what_is_no_picture_is_refused_in_one_line():
-    for encoding in ("16UC1", "32FC1"):
-        assert depth_format(_message(encoding, [0] * 4, 1, 1)) == encoding
-        with pytest.raises(SourceError, match="depth maps"):
-            _read(encoding, [0] * 4, 1, 1)
+    assert depth_format(_message("16UC1", [0] * 4, 1, 1)) == "16UC1"
+    with pytest.raises(SourceError, match="depth maps"):
+        _read("32FC1", [0] * 4, 1, 1)
     with pytest.raises(SourceError, match="'nv12' is not supported; mono8"):
         _read("nv12", [0] * 6, 2, 2)
     with pytest.raises(SourceError, match="too few"):
@@ -101,5 +100,34 @@ def test_what_is_no_picture_is_refused_in_one_line():
         _read("rgb8", [], 0, 0)
     with pytest.raises(SourceError, match="million pixels"):
         _read("mono8", [0], 10**6, 10**6)
-    with pytest.raises(SourceError, match="'h264' cannot be decoded"):
+    with pytest.raises(SourceError, match="'h264'.*cannot be decoded"):
         PictureDecoder("x").decode(SimpleNamespace(format="h264", data=np.zeros(20, np.uint8)))
+
+
+@pytest.mark.parametrize(("encoding", "width", "height"), [("yuyv", 3, 3), ("uyvy", 1, 1), ("yuv422", 5, 1)])
+def test_sizes_that_an_encoding_cannot_have_are_refused_in_one_line(encoding, width, height):
+    with pytest.raises(SourceError, match=encoding):
+        _read(encoding, [128] * (2 * width * height), width, height)
+
+
+def test_a_row_of_four_gigabytes_in_one_line_costs_no_memory():
+    message = _message("mono8", [7] * 6, 6, 1)
+    message.step = 4_000_000_000
+    assert (PictureDecoder("x").decode(message) == 7).all()
+
+
+def test_compressed_pictures_are_checked_as_files_are():
+    picture = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 256, (40, 60), dtype=np.uint8), (0, 0), 2)
+    jpeg = cv2.imencode(".jpg", picture)[1].tobytes()
+    huge = bytearray(cv2.imencode(".png", picture)[1].tobytes())
+    huge[16:24] = (30_000).to_bytes(4, "big") * 2
+    damaged = bytearray(jpeg)
+    damaged[len(jpeg) // 2 : len(jpeg) // 2 + 40] = b"\xff" * 40
+    for data, word in (
+        (b"", "empty"),
+        (jpeg[:-40], "truncated"),
+        (bytes(damaged), "damaged"),
+        (bytes(huge), "million"),
+    ):
+        with pytest.raises(SourceError, match=word):
+            PictureDecoder("x").decode(SimpleNamespace(format="jpeg", data=np.frombuffer(data, np.uint8)))
