@@ -49,13 +49,17 @@ class Variant:
     """Frame that it starts from."""
     focal: float = 1.0
     """Factor on the focal length given to the system."""
+    perturb_px: float = 0.0
+    """Start at the frame numbered as the seed, and move the calibration by so much: how far chance goes."""
 
     def frames_of(self, length: int) -> int:
         """Frames that are left of ``length``."""
         return max(0, -(-(length - self.first) // self.rate))
 
-    def applied_to(self, recording: Recording) -> Recording:
-        """The recording, changed."""
+    def applied_to(self, recording: Recording, seed: int = 0) -> Recording:
+        """The recording, changed; ``seed`` is the draw of a perturbation."""
+        if self.perturb_px:
+            recording = sources.perturbed(recording, seed, self.perturb_px)
         if self.first:
             recording = sources.start_at(recording, self.first)
         if self.rate > 1:
@@ -76,6 +80,7 @@ VARIANTS = {
     "from_300": Variant(first=300),
     "focal_up": Variant(focal=1.03),
     "focal_down": Variant(focal=0.97),
+    "perturbed": Variant(perturb_px=0.01),
 }
 """Names after the slash in a cell's name."""
 

@@ -84,7 +84,7 @@ def _opened(cell: Cell, folder: Path, flights_root: Path) -> tuple[Recording, Tr
         drawn = Drawn(dataset.truth, dataset.frame_stamps_s, cell.seed)
         return replace(source, telemetry=KINDS[cell.telemetry](drawn)), Truth(place)
     truth = Truth(place, place if dataset.depth is not None else None)
-    return VARIANTS[cell.variant].applied_to(source) if cell.variant else source, truth
+    return VARIANTS[cell.variant].applied_to(source, cell.seed) if cell.variant else source, truth
 
 
 def _first_flight(cell: Cell, flights_root: Path) -> tuple[Recording, Truth]:

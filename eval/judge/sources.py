@@ -79,6 +79,17 @@ def with_focal_length(recording: Recording, factor: float) -> Recording:
     return replace(recording, camera=replace(camera, fx=factor * camera.fx, fy=factor * camera.fy))
 
 
+def perturbed(recording: Recording, draw: int, sigma_px: float) -> Recording:
+    """The recording from its ``draw``-th frame on, with a calibration off by ``sigma_px``: far below what a keypoint is
+    located to, so that results which differ by it are chance, and only their median and range are worth quoting.
+    """
+    camera = recording.camera
+    off = np.random.default_rng(draw).normal(0.0, sigma_px, 4)
+    values = (np.array([camera.fx, camera.fy, camera.cx, camera.cy]) + off).tolist()
+    other = replace(camera, **dict(zip(("fx", "fy", "cx", "cy"), values, strict=True)))
+    return replace(start_at(recording, draw), camera=other)
+
+
 @dataclass(frozen=True, slots=True)
 class Cut:
     """Stretches of a recording played one after the other, at one frame a period."""

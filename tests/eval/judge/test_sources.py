@@ -98,3 +98,14 @@ def test_backwards_plays_from_the_end_in_the_same_span(tmp_path, write_images):
     assert [f.path.name for f in frames] == names[::-1]
     assert [f.index for f in frames] == [0, 1, 2]
     assert [f.stamp_s for f in frames] == pytest.approx([1.0, 1.2, 1.3])
+
+
+def test_a_perturbation_is_drawn_by_the_seed_and_far_below_a_pixel(numbered):
+    variant = Variant(perturb_px=0.01)
+    first, second = (variant.applied_to(numbered, seed) for seed in (1, 2))
+    assert [image for _, _, image in seen(first)] == list(range(1, 20))
+    assert [image for _, _, image in seen(second)] == list(range(2, 20))
+    names = ("fx", "fy", "cx", "cy")
+    moves = [abs(getattr(one.camera, k) - getattr(CAMERA, k)) for one in (first, second) for k in names]
+    assert min(moves) > 0.0 and max(moves) < 0.05
+    assert first.camera != second.camera and variant.applied_to(numbered, 1).camera == first.camera
