@@ -1,4 +1,4 @@
-"""Association of estimated and true poses by time; detects the usual mistakes of time stamps."""
+"""Association of estimated and true poses by time; names the usual mistakes of time stamps."""
 
 from dataclasses import dataclass
 
@@ -10,13 +10,11 @@ from edgeslam_torch.types import FloatArray, IntArray
 DEFAULT_MAX_DT_S = 0.02
 """Largest time between matched poses; the TUM tools' and evo's usual value for 30 Hz video."""
 
-_SINCE_1970_S = 1e6
+SINCE_1970_S = 1e6
 """Stamps above this [s] count from 1970, those below from the start of something."""
 
-_FEW = 10
-"""Number of poses too small to infer the length of a recording."""
-
-_UNITS = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
+_MIN_SHARE = 0.1
+"""Two files of one recording pair at least this share of the poses that they could."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,9 +27,6 @@ class Association:
     """``(M,)`` indices into the estimated stamps."""
     offset_s: float = 0.0
     """Added to the estimated stamps before matching."""
-    factor: float = 1.0
-    """The estimated stamps were multiplied by this first (1e-9 when the file holds nanoseconds)."""
-    notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.truth)
@@ -66,74 +61,56 @@ def associate(
     max_dt_s: float = DEFAULT_MAX_DT_S,
     offset_s: float = 0.0,
 ) -> Association:
-    """Match estimated to true stamps, recognising milliseconds, microseconds and nanoseconds.
+    """Match estimated to true stamps.
 
     Args:
         truth_s: True stamps ``(N,)`` [s], increasing.
-        estimate_s: Estimated stamps ``(M,)``, increasing.
+        estimate_s: Estimated stamps ``(M,)`` [s], increasing.
         max_dt_s: Largest time between matched poses [s].
         offset_s: Added to the estimated stamps [s].
 
     Raises:
-        EvaluationError: If nothing matches; the message says which of the usual mistakes it looks like.
+        EvaluationError: If hardly anything matches; the message says which of the usual mistakes it looks like.
     """
-    factor, notes = unit_factor(truth_s, estimate_s)
-    stamps = estimate_s * factor + offset_s
+    stamps = estimate_s + offset_s
     i, j = match(truth_s, stamps, max_dt_s)
     if len(i) == 0:
-        reasons = [_why_nothing_matches(truth_s, stamps, max_dt_s), *notes]
-        raise EvaluationError("; ".join(reasons))
-    return Association(i, j, offset_s, factor, tuple(notes))
+        raise EvaluationError(_why_nothing_matches(truth_s, stamps, max_dt_s))
+    possible = possible_pairs(truth_s, stamps)
+    if len(i) < _MIN_SHARE * possible:
+        gap = _typical_distance_s(truth_s, stamps)
+        raise EvaluationError(
+            f"only {len(i)} of {possible} poses found a partner within {max_dt_s:g} s, typically {gap:.3f} s apart: "
+            "another unit of time, an --offset, or a larger --max-dt"
+        )
+    return Association(i, j, offset_s)
 
 
-def unit_factor(truth_s: FloatArray, estimate_s: FloatArray) -> tuple[float, list[str]]:
-    """Factor that brings the estimated stamps to the truth's unit, when it is a power of a thousand, and a note of it.
-
-    Clocks that start at 0 overlap in any unit, so stamps that do overlap are still suspected when one list lasts
-    more than 200 times as long as the other, unless both count from 1970 (they overlap by no accident then) or one
-    holds a handful of poses at a like rate. When no unit makes them overlap, the two clocks start at different
-    times, and how long the lists last still tells the unit.
-    """
-    span_t, span_e = truth_s[-1] - truth_s[0], estimate_s[-1] - estimate_s[0]
-    ratio = span_e / span_t if span_t > 0 and span_e > 0 else 1.0
-    if _overlap(truth_s, estimate_s) >= 0:
-        few = min(len(truth_s), len(estimate_s)) < _FEW and 1 / 200 < _gap(estimate_s) / _gap(truth_s) < 200
-        if 1 / 200 < ratio < 200 or few or min(truth_s[0], estimate_s[0]) > _SINCE_1970_S:
-            return 1.0, []
-    candidates = {
-        factor: f"{whose} stamps are {name}, the other file's seconds: converted"
-        for name, per_second in _UNITS.items()
-        for factor, whose in ((1.0 / per_second, "the estimate's"), (per_second, "the ground truth's"))
-    }
-    for factor, note in candidates.items():
-        alike = 1 / 200 < ratio * factor < 200
-        if alike and _overlap(truth_s, estimate_s * factor) > 0.1 * min(span_t, span_e * factor):
-            return factor, [note]
-    likeliest = min(candidates, key=lambda factor: abs(np.log(ratio * factor)))
-    if not 1 / 200 < ratio < 200 and 1 / 30 < ratio * likeliest < 30:
-        return likeliest, [candidates[likeliest]]
-    return 1.0, []
+def possible_pairs(truth_s: FloatArray, estimate_s: FloatArray) -> int:
+    """Poses of the list that has fewer in the time that both have."""
+    first, last = max(truth_s[0], estimate_s[0]), min(truth_s[-1], estimate_s[-1])
+    return min(int(((t >= first) & (t <= last)).sum()) for t in (truth_s, estimate_s))
 
 
-def _overlap(a: FloatArray, b: FloatArray) -> float:
+def overlap_s(a: FloatArray, b: FloatArray) -> float:
+    """Time [s] that two lists of stamps have in common; negative between lists that do not meet."""
     return float(min(a[-1], b[-1]) - max(a[0], b[0]))
 
 
-def _gap(stamps_s: FloatArray) -> float:
-    """Typical time from one stamp to the next [s]."""
-    return float(np.median(np.diff(stamps_s))) if len(stamps_s) > 1 else 1.0
+def _typical_distance_s(truth_s: FloatArray, estimate_s: FloatArray) -> float:
+    return float(np.median(np.abs(truth_s[nearest(truth_s, estimate_s)] - estimate_s)))
 
 
 def _why_nothing_matches(truth_s: FloatArray, estimate_s: FloatArray, max_dt_s: float) -> str:
     t0, t1, e0, e1 = truth_s[0], truth_s[-1], estimate_s[0], estimate_s[-1]
     spans = f"ground truth {t0:.3f}..{t1:.3f} s, estimate {e0:.3f}..{e1:.3f} s"
-    if _overlap(truth_s, estimate_s) >= 0:
-        gap = float(np.median(np.abs(truth_s[nearest(truth_s, estimate_s)] - estimate_s)))
+    if overlap_s(truth_s, estimate_s) >= 0:
+        gap = _typical_distance_s(truth_s, estimate_s)
         return (
             f"no poses within {max_dt_s:g} s of each other, typically {gap:.3f} s apart; try --max-dt {2 * gap:.2g} "
             f"({spans})"
         )
-    if min(t0, e0) < _SINCE_1970_S < max(t0, e0):
+    if min(t0, e0) < SINCE_1970_S < max(t0, e0):
         return (
             f"one clock starts near 0 and the other counts from 1970 ({spans}); if they start together, use "
             f"--offset {t0 - e0:.6f}"

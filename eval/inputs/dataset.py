@@ -88,7 +88,13 @@ def open_depth(folder: Path | str) -> MeasuredDepth:
 
 
 def interpolate(trajectory: Trajectory, stamps_s: FloatArray) -> tuple[FloatArray, np.ndarray]:
-    """Poses ``(N, 4, 4)`` at ``stamps_s`` and which of them lie within the trajectory's time and no long gap."""
+    """Poses ``(N, 4, 4)`` at ``stamps_s`` and which of them lie within the trajectory's time and no long gap.
+
+    Raises:
+        EvaluationError: If the trajectory has positions alone.
+    """
+    if not trajectory.oriented:
+        raise EvaluationError(f"{trajectory.source}: positions without orientations, which are needed here")
     known = trajectory.stamps_s
     T = np.tile(np.eye(4), (len(stamps_s), 1, 1))
     if len(known) < 2:

@@ -4,7 +4,7 @@ All give poses of the camera in the world; those of a body whose camera is not k
 refuses what cannot be a trajectory with one line that names the file and the likely mistake.
 """
 
-import io
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,18 +14,29 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.eval.errors import EvaluationError
+from edgeslam_torch.eval.inputs.columns import Columns, columns_by_name, columns_by_number
 from edgeslam_torch.files.record_files import plain_yaml
 from edgeslam_torch.geometry import se3
+from edgeslam_torch.readers.listing import seconds_from
 from edgeslam_torch.types import FloatArray
 
 SEVEN_SCENES_HZ = 30.0
 """The 7-Scenes files carry no stamps; the sensor ran at 30 Hz."""
 
+ROWS, FRAMES = "rows", "frames"
+"""What stamps were made up from (`Trajectory.numbered`)."""
+
 _TIMES = "times.txt"
 """Stamps beside poses whose format has none, as KITTI has them."""
 
-_OF_THE_BODY = ("state_groundtruth_estimate0", "mocap0")
-"""Folders of an EuRoC sequence whose poses are the body's; those of cam0 differ by the mount in its ``sensor.yaml``."""
+_EUROC = ("state_groundtruth_estimate0", "mocap0", "vicon0", "leica0")
+"""Folders of an EuRoC or TUM-VI sequence with true poses: of the body, or of a marker that is mounted on it."""
+
+_TOO_FEW_DIGITS = 0.3
+"""Share of rows that repeat a stamp with another position from which the stamps are taken for rounded ones."""
+
+_UNIT_APART = re.compile(r"\s+(?=[\[(])")
+"""Between a name and its unit: ``timestamp [ns]`` is one column."""
 
 _LARGE_TEXT = 1 << 20
 _MAX_FILE_BYTES = 1 << 30
@@ -44,13 +55,18 @@ class Trajectory:
     """File it came from, for messages."""
     notes: tuple[str, ...] = ()
     """What the reader corrected or assumed."""
-    rows: FloatArray | None = None
-    """``(N, 7)`` position and quaternion as the file gives them, so that a wrong order can be recognised."""
-    stamped: bool = True
-    """False when the file has no stamps and they were made up from the rows' numbers."""
+    numbered: str = ""
+    """`ROWS` or `FRAMES` when the file has no stamps and they were made up from the numbers of its rows or frames."""
+    oriented: bool = True
+    """False when the file gives positions alone: rotations are the identity then."""
 
     def __len__(self) -> int:
         return len(self.stamps_s)
+
+    @property
+    def stamped(self) -> bool:
+        """Whether the stamps are the file's own."""
+        return not self.numbered
 
     @property
     def positions(self) -> FloatArray:
@@ -59,8 +75,7 @@ class Trajectory:
 
     def take(self, index: NDArray[np.integer] | NDArray[np.bool_] | slice) -> "Trajectory":
         """The poses at ``index``."""
-        rows = None if self.rows is None else self.rows[index]
-        return replace(self, stamps_s=self.stamps_s[index], T_w_c=self.T_w_c[index], rows=rows)
+        return replace(self, stamps_s=self.stamps_s[index], T_w_c=self.T_w_c[index])
 
 
 def read_trajectory(path: Path | str, stamps_s: FloatArray | None = None) -> Trajectory:
@@ -77,19 +92,21 @@ def read_trajectory(path: Path | str, stamps_s: FloatArray | None = None) -> Tra
     path = Path(path)
     if path.is_dir():
         return _read_folder(path)
-    table, first_line = _read_table(path)
-    columns = table.shape[1]
-    if columns == 8:
-        return _from_rows(table[:, 0], table[:, 1:8], path)
-    if columns == 12:
+    table, first_line, header = _read_table(path)
+    count = table.shape[1]
+    try:
+        columns = columns_by_name(header) if len(header) == count else None
+    except EvaluationError as error:
+        raise EvaluationError(f"{path}: {error}") from error
+    if columns is None and count == 12:
         return _from_kitti(table, path, stamps_s)
-    if columns in (11, 17) or (columns > 8 and path.suffix == ".csv"):  # EuRoC: ns, p, q (w first), v, biases
-        return _of_camera(_from_rows(table[:, 0] * 1e-9, table[:, [1, 2, 3, 5, 6, 7, 4]], path), path)
-    hint = " (positions without orientation?)" if columns == 4 else ""
-    raise EvaluationError(
-        f"{path}: {columns} number(s) a row from line {first_line} on{hint}; TUM has 8 (t x y z qx qy qz qw), "
-        "KITTI 12, EuRoC 17"
-    )
+    columns = columns or columns_by_number(count, euroc=path.resolve().parent.name in _EUROC)
+    if columns is None:
+        raise EvaluationError(
+            f"{path}: {count} number(s) a row from line {first_line} on; TUM has 8 (t x y z qx qy qz qw), KITTI 12, "
+            "EuRoC 17, positions alone 4, and other tables need a header that names the columns"
+        )
+    return _of_camera(_from_columns(table, columns, path), path)
 
 
 def write_tum(trajectory: Trajectory, path: Path | str) -> None:
@@ -151,6 +168,8 @@ def _read_folder(folder: Path) -> Trajectory:
         "groundtruth.txt",
         "mav0/state_groundtruth_estimate0/data.csv",
         "state_groundtruth_estimate0/data.csv",
+        "mav0/mocap0/data.csv",
+        "mocap0/data.csv",
         "data.csv",
         "poses.txt",
     )
@@ -163,50 +182,52 @@ def _read_folder(folder: Path) -> Trajectory:
     raise EvaluationError(f"{folder}: no trajectory in this folder (looked for {', '.join(names)}, *.pose.txt)")
 
 
-def _read_table(path: Path) -> tuple[FloatArray, int]:
-    """Numbers of a text table and the line of its first row."""
+def _read_table(path: Path) -> tuple[FloatArray, int, list[str]]:
+    """Numbers of a text table, the line of its first row, and the words of the line before it."""
     text = _read_text(path)
-    if len(text) > _LARGE_TEXT:
-        table = _quickly(text)
-        if table is not None:
-            return table, 1
-    rows: list[list[float]] = []
     lines = text.splitlines()
-    first_line, first_words = 0, ""
-    for number, line in enumerate(lines, start=1):
-        fields = line.split("#", 1)[0].replace(",", " ").split()
-        if not fields:
-            continue
-        try:
-            rows.append([float(x) for x in fields])
-        except ValueError as error:
-            if not rows:  # a header without '#'
-                first_words = first_words or line.strip()[:60]
-                continue
-            raise EvaluationError(f"{path}: line {number} is not numbers: {line.strip()[:60]!r}") from error
-        first_line = first_line or number
-        if len(rows[-1]) != len(rows[0]):
-            if number == len(lines) and not text.endswith("\n"):
-                rows.pop()  # the last line is incomplete
-                break
+    first = next((number for number, line in enumerate(lines) if _numbers(line) is not None), None)
+    before = next((words for line in reversed(lines[:first]) if (words := line.strip(" #%\t"))), "")
+    if first is None:
+        if before and any(line.strip() and not line.lstrip().startswith("#") for line in lines):
             raise EvaluationError(
-                f"{path}: line {number} has {len(rows[-1])} numbers, line {first_line} has {len(rows[0])}"
+                f"{path}: no line of numbers in it, the first is {lines[0].strip()[:60]!r}; a TUM trajectory has "
+                "'t x y z qx qy qz qw' on each line, between spaces or commas"
             )
-    if not rows and first_words:
-        raise EvaluationError(
-            f"{path}: no line of numbers in it, the first is {first_words!r}; a TUM trajectory has "
-            "'t x y z qx qy qz qw' on each line, between spaces or commas"
-        )
-    if not rows:
         raise EvaluationError(f"{path}: the file holds no poses (did the run stop before its first frame?)")
-    return np.array(rows), first_line
+    commas = "," in lines[first]
+    header = [word.strip() for word in (before.split(",") if commas else _UNIT_APART.sub("", before).split())]
+    table = _quickly(lines[first:], commas) if len(text) > _LARGE_TEXT else None
+    if table is not None:
+        return table, first + 1, header
+    rows: list[list[float]] = []
+    for number, line in enumerate(lines[first:], start=first + 1):
+        if not line.split("#", 1)[0].strip():
+            continue
+        row = _numbers(line)
+        if row is None:
+            raise EvaluationError(f"{path}: line {number} is not numbers: {line.strip()[:60]!r}")
+        if rows and len(row) != len(rows[0]):
+            if number == len(lines) and not text.endswith("\n"):
+                break  # the last line is incomplete
+            raise EvaluationError(f"{path}: line {number} has {len(row)} numbers, line {first + 1} has {len(rows[0])}")
+        rows.append(row)
+    return np.array(rows), first + 1, header
+
+
+def _numbers(line: str) -> list[float] | None:
+    """Numbers of a line; None if it has none or anything else."""
+    try:
+        return [float(word) for word in line.split("#", 1)[0].replace(",", " ").split()] or None
+    except ValueError:
+        return None
 
 
 def _read_text(path: Path) -> str:
     try:
         if path.stat().st_size > _MAX_FILE_BYTES:
             raise EvaluationError(f"{path}: {path.stat().st_size / 1e9:.1f} GB is too large for a trajectory file")
-        return path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8-sig")
     except FileNotFoundError as error:
         raise EvaluationError(f"{path}: no such trajectory file") from error
     except UnicodeDecodeError as error:
@@ -215,62 +236,88 @@ def _read_text(path: Path) -> str:
         raise EvaluationError(f"{path}: cannot be read ({error.strerror})") from error
 
 
-def _quickly(text: str) -> FloatArray | None:
+def _quickly(lines: list[str], commas: bool) -> FloatArray | None:
     """The table by NumPy's reader, ten times as fast; None on any irregularity."""
-    commas = "," in text[: text.find("\n", len(text) // 2)].rsplit("\n", 1)[-1]
     try:
-        return np.loadtxt(io.StringIO(text), dtype=np.float64, delimiter="," if commas else None, ndmin=2)
+        return np.loadtxt(lines, dtype=np.float64, delimiter="," if commas else None, ndmin=2)
     except ValueError:
         return None
 
 
-def _from_rows(stamps_s: FloatArray, rows: FloatArray, path: Path) -> Trajectory:
-    """Trajectory from stamps and ``x y z qx qy qz qw``, cleaned and checked."""
-    notes: list[str] = []
-    finite = np.isfinite(stamps_s) & np.isfinite(rows).all(axis=1)
+def _from_columns(table: FloatArray, columns: Columns, path: Path) -> Trajectory:
+    """Trajectory from a table, cleaned and checked."""
+    stamps_s, notes = _seconds(table, columns)
+    poses = table[:, [*columns.position, *(columns.quaternion or ())]]
+    finite = np.isfinite(stamps_s) & np.isfinite(poses).all(axis=1)
     if not finite.any():
         raise EvaluationError(f"{path}: every pose holds a NaN or infinity")
     if not finite.all():
-        notes.append(f"{np.count_nonzero(~finite)} of {len(rows)} poses are not finite and were left out")
-    stamps_s, rows = stamps_s[finite], rows[finite]
-    norms = np.linalg.norm(rows[:, 3:], axis=1)
-    odd = np.abs(norms - 1.0) > 0.05  # files with three decimals stay within 0.005
-    if odd.mean() > 0.5:
-        raise EvaluationError(
-            f"{path}: the last four numbers of a row are no unit quaternion (norm {np.median(norms):.3g}); "
-            "the order must be t x y z qx qy qz qw"
-        )
-    if odd.any():
-        notes.append(f"{np.count_nonzero(odd)} poses without a unit quaternion were left out")
-        stamps_s, rows = stamps_s[~odd], rows[~odd]
-    stamps_s, rows, more = _increasing(stamps_s, rows)
-    T = np.tile(np.eye(4), (len(rows), 1, 1))
-    T[:, :3, :3] = Rotation.from_quat(rows[:, 3:]).as_matrix()
-    T[:, :3, 3] = rows[:, :3]
-    return Trajectory(stamps_s, T, str(path), tuple(notes + more), rows)
+        notes.append(f"{np.count_nonzero(~finite)} of {len(poses)} poses are not finite and were left out")
+    stamps_s, poses = stamps_s[finite], poses[finite]
+    if columns.quaternion is not None:
+        norms = np.linalg.norm(poses[:, 3:], axis=1)
+        odd = np.abs(norms - 1.0) > 0.05  # files with three decimals stay within 0.005
+        if odd.mean() > 0.5:
+            raise EvaluationError(
+                f"{path}: the last four numbers of a row are no unit quaternion (norm {np.median(norms):.3g}); "
+                "the order must be t x y z qx qy qz qw, or a header must name the columns"
+            )
+        if odd.any():
+            notes.append(f"{np.count_nonzero(odd)} poses without a unit quaternion were left out")
+            stamps_s, poses = stamps_s[~odd], poses[~odd]
+    T = np.tile(np.eye(4), (len(poses), 1, 1))
+    if columns.quaternion is not None:
+        T[:, :3, :3] = Rotation.from_quat(poses[:, 3:]).as_matrix()
+    T[:, :3, 3] = columns.metres * poses[:, :3]
+    stamps_s, T, more = _increasing(stamps_s, T, str(path))
+    return Trajectory(stamps_s, T, str(path), tuple(notes + more), oriented=columns.quaternion is not None)
 
 
-def _of_camera(body: Trajectory, path: Path) -> Trajectory:
-    """EuRoC's true poses, which are the body's, as those of ``cam0``: its images are what a run sees."""
-    sensor = path.resolve().parent.parent / "cam0" / "sensor.yaml"
-    if path.resolve().parent.name not in _OF_THE_BODY or not sensor.is_file():
-        return body
+def _seconds(table: FloatArray, columns: Columns) -> tuple[FloatArray, list[str]]:
+    """Stamps of a table's rows [s], and what was assumed of them."""
+    units = [1.0 if unit is None else unit for _, unit in columns.time]
+    stamps = table[:, [index for index, _ in columns.time]] @ np.array(units)
+    if columns.time[0][1] is not None:
+        return stamps, []
+    stamps_s, unit = seconds_from(stamps.tolist())
+    return stamps_s, [] if unit == "s" else [f"the stamps are {unit}: converted to seconds"]
+
+
+def _of_camera(mine: Trajectory, path: Path) -> Trajectory:
+    """EuRoC's and TUM-VI's true poses, of the body or of a marker on it, as those of ``cam0``, which a run sees."""
+    folder = path.resolve().parent
+    if folder.name not in _EUROC:
+        return mine
+    T_b_c = _mount(folder.parent / "cam0" / "sensor.yaml")
+    if T_b_c is None or not mine.oriented:
+        why = "no cam0/sensor.yaml with T_BS beside it" if mine.oriented else "it has positions alone"
+        note = f"the poses are those of {folder.name}'s body, not of the camera on it: {why}"
+        return replace(mine, notes=(*mine.notes, note))
+    T_b_s = _mount(folder / "sensor.yaml")
+    T_s_c = T_b_c if T_b_s is None else se3.inverse(T_b_s) @ T_b_c
+    note = "the body's poses were turned into cam0's (T_BS of its sensor.yaml)"
+    return replace(mine, T_w_c=mine.T_w_c @ T_s_c, notes=(*mine.notes, note))
+
+
+def _mount(sensor: Path) -> FloatArray | None:
+    """``T_BS`` of an EuRoC ``sensor.yaml``, the sensor's pose on the body; None where there is none."""
+    if not sensor.is_file():
+        return None
     try:
         record = plain_yaml(sensor.read_text(encoding="utf-8"))
         if not isinstance(record, dict) or "T_BS" not in record:
-            return body
-        T_b_c = np.array(record["T_BS"]["data"], dtype=np.float64).reshape(4, 4)
+            return None
+        T_b_s = np.array(record["T_BS"]["data"], dtype=np.float64).reshape(4, 4)
     except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
-        raise EvaluationError(f"{sensor}: T_BS, the camera's pose on the body, cannot be read ({error})") from error
-    R = T_b_c[:3, :3]
-    if not np.isfinite(T_b_c).all() or np.abs(R @ R.T - np.eye(3)).max() > 0.01 or np.linalg.det(R) < 0:
-        raise EvaluationError(f"{sensor}: T_BS, the camera's pose on the body, is no rotation and translation")
-    note = "the body's poses were turned into cam0's (T_BS of its sensor.yaml)"
-    return replace(body, T_w_c=body.T_w_c @ T_b_c, notes=(*body.notes, note))
+        raise EvaluationError(f"{sensor}: T_BS, the sensor's pose on the body, cannot be read ({error})") from error
+    R = T_b_s[:3, :3]
+    if not np.isfinite(T_b_s).all() or np.abs(R @ R.T - np.eye(3)).max() > 0.01 or np.linalg.det(R) < 0:
+        raise EvaluationError(f"{sensor}: T_BS, the sensor's pose on the body, is no rotation and translation")
+    return T_b_s
 
 
-def _increasing(stamps_s: FloatArray, rows: FloatArray) -> tuple[FloatArray, FloatArray, list[str]]:
-    """Rows in order of time, one a stamp."""
+def _increasing(stamps_s: FloatArray, T: FloatArray, source: str) -> tuple[FloatArray, FloatArray, list[str]]:
+    """Poses in order of time, one a stamp."""
     notes: list[str] = []
     steps = np.diff(stamps_s)
     if len(steps) and np.all(steps < 0):
@@ -278,11 +325,17 @@ def _increasing(stamps_s: FloatArray, rows: FloatArray) -> tuple[FloatArray, Flo
     elif np.any(steps < 0):
         notes.append(f"{np.count_nonzero(steps < 0)} rows are out of order in time: sorted")
     order = np.argsort(stamps_s, kind="stable")
-    stamps_s, rows = stamps_s[order], rows[order]
-    first = np.concatenate([[True], np.diff(stamps_s) > 0])
-    if not first.all():
-        notes.append(f"{np.count_nonzero(~first)} row(s) repeat a stamp: the first of each was kept")
-    return stamps_s[first], rows[first], notes
+    stamps_s, T = stamps_s[order], T[order]
+    again = np.diff(stamps_s, prepend=-np.inf) <= 0
+    moved = again & np.any(np.diff(T[:, :3, 3], axis=0, prepend=T[:1, :3, 3]) != 0, axis=1)
+    if moved.sum() > _TOO_FEW_DIGITS * len(T):
+        raise EvaluationError(
+            f"{source}: {np.count_nonzero(moved)} of {len(T)} rows repeat a stamp ({stamps_s[again][0]:.6f}) with "
+            "another pose: stamps written with too few digits; write microseconds, as '%.6f' does"
+        )
+    if again.any():
+        notes.append(f"{np.count_nonzero(again)} row(s) repeat a stamp: the first of each was kept")
+    return stamps_s[~again], T[~again], notes
 
 
 def _from_matrices(stamps_s: FloatArray, T: FloatArray, source: str, notes: list[str]) -> Trajectory:
@@ -295,14 +348,16 @@ def _from_matrices(stamps_s: FloatArray, T: FloatArray, source: str, notes: list
     if np.median(np.abs(np.linalg.det(T[:, :3, :3]) - 1.0)) > 0.05:
         raise EvaluationError(f"{source}: the 3x3 parts are no rotations (determinant not 1)")
     T[:, :3, :3] = Rotation.from_matrix(T[:, :3, :3]).as_matrix()
-    stamps_s, T, more = _increasing(stamps_s, T)
+    stamps_s, T, more = _increasing(stamps_s, T, source)
     return Trajectory(stamps_s, T, source, tuple(notes + more))
 
 
 def _from_kitti(table: FloatArray, path: Path, stamps_s: FloatArray | None) -> Trajectory:
     notes: list[str] = []
-    if stamps_s is None and path.with_name(_TIMES).is_file():
-        stamps_s = _read_table(path.with_name(_TIMES))[0][:, 0]
+    if stamps_s is None:
+        sequence = path.parent.parent / "sequences" / path.stem / _TIMES  # of poses/00.txt, as KITTI has them
+        times = next((file for file in (path.with_name(_TIMES), sequence) if file.is_file()), None)
+        stamps_s = None if times is None else seconds_from(_read_table(times)[0][:, 0].tolist())[0]
     stamped = stamps_s is not None
     if stamps_s is None:
         notes.append("no times.txt beside the KITTI poses: rows are matched by number, at 10 Hz")
@@ -312,7 +367,7 @@ def _from_kitti(table: FloatArray, path: Path, stamps_s: FloatArray | None) -> T
     T = np.tile(np.eye(4), (len(table), 1, 1))
     T[:, :3, :] = table.reshape(-1, 3, 4)
     found = _from_matrices(np.asarray(stamps_s, dtype=np.float64), T, str(path), notes)
-    return replace(found, stamped=stamped)
+    return replace(found, numbered="" if stamped else ROWS)
 
 
 def _from_seven_scenes(files: list[Path], folder: Path) -> Trajectory:
@@ -329,4 +384,4 @@ def _from_seven_scenes(files: list[Path], folder: Path) -> Trajectory:
             raise EvaluationError(f"{folder}: {len(files)} poses but {len(stamps_s)} stamps in {_TIMES}")
         return _from_matrices(stamps_s, T, str(folder), [])
     note = f"7-Scenes has no stamps: frame number / {SEVEN_SCENES_HZ:g} s"
-    return replace(_from_matrices(numbers / SEVEN_SCENES_HZ, T, str(folder), [note]), stamped=False)
+    return replace(_from_matrices(numbers / SEVEN_SCENES_HZ, T, str(folder), [note]), numbered=FRAMES)

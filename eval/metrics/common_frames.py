@@ -7,6 +7,7 @@ import numpy as np
 
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.inputs.associate import DEFAULT_MAX_DT_S, associate, nearest
+from edgeslam_torch.eval.inputs.clocks import on_one_clock
 from edgeslam_torch.eval.inputs.trajectory_files import Trajectory
 from edgeslam_torch.eval.metrics.align import AlignmentKind
 from edgeslam_torch.eval.metrics.trajectory_error import TrajectoryScore, score_trajectory
@@ -39,9 +40,9 @@ def score_common(
     """
     clocked = []
     for name, estimate in estimates:
-        clock = associate(truth.stamps_s, estimate.stamps_s, max_dt_s, offset_s)
-        stamps = estimate.stamps_s * clock.factor + clock.offset_s
-        clocked.append((name, replace(estimate, stamps_s=stamps)))
+        truth, estimate = on_one_clock(truth, estimate)
+        associate(truth.stamps_s, estimate.stamps_s, max_dt_s, offset_s)
+        clocked.append((name, replace(estimate, stamps_s=estimate.stamps_s + offset_s)))
     frames = min((e.stamps_s for _, e in clocked), key=len)
     kept = np.ones(len(frames), dtype=bool)
     for _, estimate in clocked:

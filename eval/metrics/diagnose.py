@@ -1,16 +1,21 @@
-"""Diagnosis of large trajectory errors: each finding names the mistake and its remedy."""
+"""Diagnosis of large trajectory errors: each finding names the mistake, whose it is, and its remedy.
 
-from dataclasses import replace
+Every mistake is looked for in both files: a ground truth is made by people and their converters, too.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.eval.errors import EvaluationError
-from edgeslam_torch.eval.inputs.associate import DEFAULT_MAX_DT_S, match
+from edgeslam_torch.eval.inputs.associate import DEFAULT_MAX_DT_S, match, possible_pairs
+from edgeslam_torch.eval.inputs.clocks import on_one_clock
 from edgeslam_torch.eval.inputs.trajectory_files import Trajectory
 from edgeslam_torch.eval.metrics.align import AlignmentKind, umeyama
 from edgeslam_torch.eval.metrics.clock_offset import best_offset
-from edgeslam_torch.eval.metrics.trajectory_error import TrajectoryScore
+from edgeslam_torch.eval.metrics.trajectory_error import TrajectoryScore, without_orientation
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.types import FloatArray
 
@@ -26,44 +31,67 @@ _ROTATION_POOR_DEG = 8.0
 _FEW = 10
 """Minimum number of matched poses for a diagnosis."""
 
+_ESTIMATE, _TRUTH, _BOTH = "the estimate's", "the ground truth's", "both files'"
+_EITHER = "one file's (which one's cannot be told)"
+
 _MIRROR = np.diag([1.0, 1.0, -1.0, 1.0])
-_MIRRORED = "the positions are mirrored: two axes swapped, one negated, or a left-handed world"
+_MIRRORED = "the positions are mirrored: in one file two axes are swapped, one negated, or its world is left-handed"
+_INVERSE = "poses look like world-to-camera; a trajectory must hold camera-to-world (their inverse)"
+_INVERTED = "orientations look inverted (world-to-camera rotation with camera-to-world positions)"
+_W_FIRST = "quaternions look like qw qx qy qz; TUM files need qx qy qz qw, other orders a header that names the columns"
 
 _UNEXPLAINED = "the orientations do not follow the truth's, and no usual mistake explains it: judge translation only"
 
 _LENGTH_UNITS = {0.01: "centimetres", 0.001: "millimetres"}
 
 
+@dataclass(frozen=True, slots=True)
+class _Suspect:
+    """A mistake, and the error that is left when it is undone."""
+
+    whose: str
+    mistake: str
+    error: float
+
+    @property
+    def text(self) -> str:
+        return f"{self.whose} {self.mistake}".strip()
+
+
 def explain(
     truth: Trajectory, estimate: Trajectory, score: TrajectoryScore, max_dt_s: float = DEFAULT_MAX_DT_S
 ) -> list[str]:
-    """Findings about ``estimate``, the most likely mistake first; empty when nothing is suspicious."""
-    notes = [f"{estimate.source}: {note}" for note in (*estimate.notes, *score.association.notes)]
-    notes += [f"{truth.source}: {note}" for note in truth.notes]
+    """Findings about the two files, the most likely mistake first; empty when nothing is suspicious."""
+    truth, estimate = on_one_clock(truth, estimate)
+    notes = [f"{file.source}: {note}" for file in (estimate, truth) for note in file.notes]
     if score.matched < _FEW:
         few = f"only {score.matched} poses have ground truth: an alignment fits almost anything to so few"
         return [*notes, few]
+    estimate = replace(estimate, stamps_s=estimate.stamps_s + score.association.offset_s)
     notes += _match_notes(truth, estimate, score)
     notes += _scale_notes(score)
     if score.alignment.degenerate:
         notes.append("the motion is along a line: rotation about it is not determined, judge translation only")
-    clock = score.association
-    estimate = replace(estimate, stamps_s=estimate.stamps_s * clock.factor + clock.offset_s)
-    shape = _sim3_error(truth, estimate, max_dt_s)
-    if np.isfinite(shape) and shape > _POOR * score.fixed_position_m:
+    bare = without_orientation(truth, estimate)
+    if bare is not None:
+        whose = _TRUTH if bare is truth else _ESTIMATE
+        lacks = "orientations are all the same" if bare.oriented else "file has positions alone"
+        notes.append(f"{whose} {lacks}: figures that need orientations are left out")
+    shape = _misfit(truth, estimate, max_dt_s)
+    if np.isfinite(shape) and shape > _POOR:
         return notes + _shape_notes(truth, estimate, shape, score, max_dt_s)
+    if bare is not None:
+        return notes
     found = _rotation_notes(truth, estimate, score)
     if found == [_UNEXPLAINED]:  # in motion that is nearly flat a mirror hardly shows in the positions
-        mirrored = _sim3_error(truth, replace(estimate, T_w_c=_MIRROR @ estimate.T_w_c), max_dt_s)
+        mirrored = _misfit(truth, replace(estimate, T_w_c=_MIRROR @ estimate.T_w_c), max_dt_s)
         found = [_MIRRORED] if mirrored < _BETTER * shape else found
     return notes + found
 
 
 def _match_notes(truth: Trajectory, estimate: Trajectory, score: TrajectoryScore) -> list[str]:
     """Fewer pairs than there could be."""
-    stamps = estimate.stamps_s * score.association.factor + score.association.offset_s
-    both = (max(truth.stamps_s[0], stamps[0]), min(truth.stamps_s[-1], stamps[-1]))
-    possible = min(int(((t >= both[0]) & (t <= both[1])).sum()) for t in (truth.stamps_s, stamps))
+    possible = possible_pairs(truth.stamps_s, estimate.stamps_s)
     if score.matched < 0.5 * possible:
         return [f"only {score.matched} of {possible} poses found a partner in time: a larger --max-dt, or --offset?"]
     return []
@@ -72,8 +100,13 @@ def _match_notes(truth: Trajectory, estimate: Trajectory, score: TrajectoryScore
 def _scale_notes(score: TrajectoryScore) -> list[str]:
     kind, scale = score.alignment.kind, score.scale
     for metres, name in _LENGTH_UNITS.items():
-        if np.isfinite(scale) and 0.8 * metres < scale < 1.25 * metres:
+        if 0.8 * metres < scale < 1.25 * metres:
             return [f"the estimate is {1 / scale:.0f} times the true size: its lengths look like {name}, not metres"]
+        if 0.8 / metres < scale < 1.25 / metres:
+            return [
+                f"the ground truth is {scale:.0f} times the size of the estimate: its lengths look like {name}, and so "
+                "are the errors (unless the estimate has no metric scale)"
+            ]
     if kind is not AlignmentKind.SIM3 and np.isfinite(scale) and abs(scale - 1.0) > 0.2:
         return [
             f"judged without scale ({kind.value}), but the estimate is {1 / scale:.3g} times the true size: only the "
@@ -88,25 +121,28 @@ def _shape_notes(
     truth: Trajectory, estimate: Trajectory, shape: float, score: TrajectoryScore, max_dt_s: float
 ) -> list[str]:
     """The mistake whose undoing explains the positions best; else how bad they are."""
-    T = estimate.T_w_c
-    undone = {
-        "the poses look like world-to-camera; a trajectory must hold camera-to-world (their inverse)": se3.inverse(T),
-        "the poses run backwards in time against their stamps": T[::-1],
-        _MIRRORED: _MIRROR @ T,
-    }
-    suspects = [(_sim3_error(truth, replace(estimate, T_w_c=T), max_dt_s), text) for text, T in undone.items()]
+    undone = [
+        (whose, _INVERSE, t, e)
+        for whose, t, e in _combinations(truth, estimate, _inverse)
+        if truth.oriented or whose == _ESTIMATE
+        if estimate.oriented or whose == _TRUTH
+    ]
+    undone += [
+        ("", "the poses run backwards in time against their stamps", truth, _with(estimate, estimate.T_w_c[::-1])),
+        ("", _MIRRORED, truth, _with(estimate, _MIRROR @ estimate.T_w_c)),
+    ]
+    suspects = [_Suspect(whose, mistake, _misfit(t, e, max_dt_s)) for whose, mistake, t, e in undone]
     late = best_offset(truth, estimate)
     if abs(late.shift_s) > max_dt_s:
         remedy = f"with --offset {score.association.offset_s + late.shift_s:.2f} the ATE is {late.ate_m:.3f} m"
-        suspects.append((late.ate_m, f"the stamps are late or early by {late.shift_s:.2f} s: {remedy}"))
-    error, text = min(suspects)
-    if error < min(_BETTER * shape, _POOR * score.fixed_position_m):
-        return [text]
-    share = shape / score.fixed_position_m
+        suspects.append(_Suspect("", f"the stamps are late or early by {late.shift_s:.2f} s: {remedy}", late.share))
+    named = _likeliest(suspects, min(_BETTER * shape, _POOR))
+    if named is not None:
+        return [named]
     verdict = "the trajectory is probably of another sequence, or the run failed"
     return [
-        f"ATE is {share:.0%} of what a fixed position scores ({score.fixed_position_m:.3f} m): "
-        + (verdict if share > 0.7 else "the run drifted or broke")
+        f"ATE is {shape:.0%} of what a fixed position scores ({score.fixed_position_m:.3f} m): "
+        + (verdict if shape > 0.7 else "the run drifted or broke")
     ]
 
 
@@ -116,25 +152,22 @@ def _rotation_notes(truth: Trajectory, estimate: Trajectory, score: TrajectorySc
     Two measures: the angle to the truth, which a wrong order or inverse makes large, and the spread of that error
     about its mean, which a constant turn between two bodies (camera and marker frame) leaves small.
     """
-    R = estimate.T_w_c[:, :3, :3]
-    angle, spread = _rotation_error(truth, R, score)
+    angle, spread = _rotation_error(truth, estimate, score)
     if angle < _ROTATION_POOR_DEG:
         return []
-    if _spread_deg(R) < 0.1 and _spread_deg(truth.T_w_c[:, :3, :3]) > 2.0:
-        return ["every orientation in the file is the same: whoever wrote it left the orientation out"]
-    mended = {
-        "the orientations look inverted (world-to-camera rotation with camera-to-world positions)": np.swapaxes(R, 1, 2)
-    }
-    if estimate.rows is not None:  # the file's columns read as qw qx qy qz
-        swapped = Rotation.from_quat(estimate.rows[:, [4, 5, 6, 3]]).as_matrix()
-        mended["the quaternions look like qw qx qy qz; TUM files need qx qy qz qw"] = swapped
-    errors = {text: _rotation_error(truth, R_mended, score) for text, R_mended in mended.items()}
-    text = min(errors, key=lambda key: errors[key][0])
-    if errors[text][0] < min(_BETTER * angle, _ROTATION_POOR_DEG):
-        return [text]
-    text = min(errors, key=lambda key: errors[key][1])
-    if spread > _ROTATION_POOR_DEG and errors[text][1] < _BETTER * spread:
-        return [text]
+    errors = [
+        (whose, mistake, *_rotation_error(t, e, score))
+        for mistake, undo in ((_INVERTED, _transposed), (_W_FIRST, _read_w_first))
+        for whose, t, e in _combinations(truth, estimate, undo)
+        if whose != _BOTH  # which explains mirrored positions as well
+    ]
+    named = _likeliest(
+        [_Suspect(whose, mistake, left) for whose, mistake, left, _ in errors], min(_BETTER * angle, _ROTATION_POOR_DEG)
+    )
+    if named is None and spread > _ROTATION_POOR_DEG:
+        named = _likeliest([_Suspect(whose, mistake, left) for whose, mistake, _, left in errors], _BETTER * spread)
+    if named is not None:
+        return [named]
     if angle > 20.0 and spread < 0.2 * angle:
         return [
             f"orientations differ by a constant {angle:.0f} deg: the two describe different bodies "
@@ -143,31 +176,72 @@ def _rotation_notes(truth: Trajectory, estimate: Trajectory, score: TrajectorySc
     return [_UNEXPLAINED] if spread > _ROTATION_POOR_DEG else []
 
 
-def _sim3_error(truth: Trajectory, estimate: Trajectory, max_dt_s: float) -> float:
-    """Sim(3) ATE [m] of an estimate on the truth's clock, infinite when too few poses match."""
+def _combinations(
+    truth: Trajectory, estimate: Trajectory, undo: Callable[[Trajectory], Trajectory]
+) -> list[tuple[str, Trajectory, Trajectory]]:
+    """A mistake undone in one file, in the other, in both."""
+    return [
+        (_ESTIMATE, truth, undo(estimate)),
+        (_TRUTH, undo(truth), estimate),
+        (_BOTH, undo(truth), undo(estimate)),
+    ]
+
+
+def _likeliest(suspects: Sequence[_Suspect], limit: float) -> str | None:
+    """The mistake that explains most, if it leaves less error than ``limit``, and whose it is, if that can be told."""
+    best = min(suspects, key=lambda suspect: suspect.error)
+    if not best.error < limit:
+        return None
+    alike = [s for s in suspects if s.mistake == best.mistake and s.error < 2.0 * best.error + 0.1 * limit]
+    return (best if len(alike) == 1 else replace(best, whose=_EITHER)).text
+
+
+def _with(trajectory: Trajectory, T_w_c: FloatArray) -> Trajectory:
+    return replace(trajectory, T_w_c=T_w_c)
+
+
+def _inverse(trajectory: Trajectory) -> Trajectory:
+    return _with(trajectory, se3.inverse(trajectory.T_w_c))
+
+
+def _transposed(trajectory: Trajectory) -> Trajectory:
+    return _turned(trajectory, np.swapaxes(trajectory.T_w_c[:, :3, :3], 1, 2))
+
+
+def _read_w_first(trajectory: Trajectory) -> Trajectory:
+    """What was read as qx qy qz qw taken for qw qx qy qz."""
+    read = Rotation.from_matrix(trajectory.T_w_c[:, :3, :3]).as_quat()
+    return _turned(trajectory, Rotation.from_quat(read[:, [1, 2, 3, 0]]).as_matrix())
+
+
+def _turned(trajectory: Trajectory, R: FloatArray) -> Trajectory:
+    T = trajectory.T_w_c.copy()
+    T[:, :3, :3] = R
+    return _with(trajectory, T)
+
+
+def _misfit(truth: Trajectory, estimate: Trajectory, max_dt_s: float) -> float:
+    """Sim(3) ATE of an estimate on the truth's clock, over what a fixed position would score; infinite when too few
+    poses match."""
     i, j = match(truth.stamps_s, estimate.stamps_s, max_dt_s)
     if len(i) < 3:
         return float("inf")
     p, q = estimate.positions[j], truth.positions[i]
+    still = float(np.sqrt(np.mean(np.sum((q - q.mean(axis=0)) ** 2, axis=1))))
     try:
         error = umeyama(p, q).points(p) - q
     except EvaluationError:
         return float("inf")
-    return float(np.sqrt(np.mean(np.sum(error**2, axis=1))))
+    return float(np.sqrt(np.mean(np.sum(error**2, axis=1)))) / still if still > 0 else float("inf")
 
 
-def _rotation_error(truth: Trajectory, R: FloatArray, score: TrajectoryScore) -> tuple[float, float]:
-    """Median angle [deg] of orientations ``(M, 3, 3)``, aligned, to the truth, and median of its spread about its mean.
+def _rotation_error(truth: Trajectory, estimate: Trajectory, score: TrajectoryScore) -> tuple[float, float]:
+    """Median angle [deg] of aligned orientations to the truth's, and median of its spread about its mean.
 
     The angle *between* two poses cannot tell: the scalar product of quaternions is the same in any order.
     """
     pairs = score.association
-    R_true = truth.T_w_c[pairs.truth, :3, :3]
-    error = Rotation.from_matrix(np.swapaxes(R_true, 1, 2) @ score.alignment.R @ R[pairs.estimate])
+    R_true, R = truth.T_w_c[pairs.truth, :3, :3], estimate.T_w_c[pairs.estimate, :3, :3]
+    error = Rotation.from_matrix(np.swapaxes(R_true, 1, 2) @ score.alignment.R @ R)
     spread = (error.mean().inv() * error).magnitude()
     return float(np.degrees(np.median(error.magnitude()))), float(np.degrees(np.median(spread)))
-
-
-def _spread_deg(R: FloatArray) -> float:
-    """Largest angle [deg] between the first of rotations ``(M, 3, 3)`` and another."""
-    return float(np.degrees(Rotation.from_matrix(R[0].T @ R).magnitude().max()))

@@ -9,6 +9,7 @@ import numpy as np
 
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.inputs.associate import DEFAULT_MAX_DT_S, Association
+from edgeslam_torch.eval.inputs.clocks import on_one_clock
 from edgeslam_torch.eval.inputs.dataset import EvalDataset, interpolate, open_dataset
 from edgeslam_torch.eval.inputs.run_folder import RunFolder, is_supported, open_run
 from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, read_trajectory
@@ -16,7 +17,7 @@ from edgeslam_torch.eval.metrics.align import AlignmentKind, umeyama
 from edgeslam_torch.eval.metrics.diagnose import explain
 from edgeslam_torch.eval.metrics.edge_map_score import THRESHOLDS_M, MapScore, score_map
 from edgeslam_torch.eval.metrics.surface import surface_truth
-from edgeslam_torch.eval.metrics.trajectory_error import TrajectoryScore, score_trajectory
+from edgeslam_torch.eval.metrics.trajectory_error import TrajectoryScore, score_trajectory, without_orientation
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +104,8 @@ def evaluate_run(
     dataset_dir = Path(dataset_dir)
     dataset = open_dataset(dataset_dir) if dataset_dir.is_dir() else None
     truth = dataset.truth if dataset is not None else read_trajectory(dataset_dir)
-    run = _stamped(run, dataset)
+    truth, trajectory = on_one_clock(truth, _stamped(run.trajectory, dataset))
+    run = replace(run, trajectory=trajectory)
     sim3 = score_trajectory(truth, run.trajectory, AlignmentKind.SIM3, max_dt_s, offset_s)
     se3 = score_trajectory(truth, run.trajectory, AlignmentKind.SE3, max_dt_s, offset_s)
     raw = score_trajectory(truth, run.trajectory, AlignmentKind.NONE, max_dt_s, offset_s)
@@ -112,7 +114,7 @@ def evaluate_run(
         online = score_trajectory(truth, run.online, AlignmentKind.SIM3, max_dt_s, offset_s).ate_m.rmse
     depth_dataset = open_dataset(depth_truth_dir) if depth_truth_dir is not None else dataset
     map_score, map_note = _map_score(run, depth_dataset, sim3, thresholds_m) if judge_map else (None, "not asked for")
-    one_second = sim3.relative[1]
+    one_second = next((r for r in sim3.relative if r.delta == "1 s"), None)
     coverage, with_pose, first = _coverage(run, dataset, truth, sim3.association)
     judged = se3 if run.units == "metres" else sim3
     return RunScore(
@@ -129,8 +131,8 @@ def evaluate_run(
         first_pose_s=first,
         matched=sim3.matched,
         rotation_deg=sim3.rotation_deg.rmse,
-        rpe_1s_m=one_second.translation_m.rmse,
-        rpe_1s_deg=one_second.rotation_deg.rmse,
+        rpe_1s_m=one_second.translation_m.rmse if one_second is not None else float("nan"),
+        rpe_1s_deg=one_second.rotation_deg.rmse if one_second is not None else float("nan"),
         full_transform=sim3.full_transform.rmse,
         fixed_position_m=sim3.fixed_position_m,
         map=map_score,
@@ -142,13 +144,12 @@ def evaluate_run(
     )
 
 
-def _stamped(run: RunFolder, dataset: EvalDataset | None) -> RunFolder:
+def _stamped(mine: Trajectory, dataset: EvalDataset | None) -> Trajectory:
     """A file without stamps (KITTI, 7-Scenes) that has a pose for every image gets the images' stamps."""
-    mine = run.trajectory
     if mine.stamped or dataset is None or len(mine) != len(dataset.frame_stamps_s):
-        return run
+        return mine
     note = "no stamps in the file: its poses are taken for the data set's images, in order"
-    return replace(run, trajectory=replace(mine, stamps_s=dataset.frame_stamps_s, stamped=True, notes=(note,)))
+    return replace(mine, stamps_s=dataset.frame_stamps_s, numbered="", notes=(note,))
 
 
 def _map_score(
@@ -161,6 +162,8 @@ def _map_score(
         return None, f"{run.path}: no edge_map.ply"
     if dataset is None or dataset.depth is None:
         return None, "the data set has no depth maps"
+    if without_orientation(dataset.truth, run.trajectory) is dataset.truth:
+        return None, "the ground truth has no orientations, so where its depth maps lie is not known"
     truth = surface_truth(dataset.folder.resolve())
     alignment = sim3.alignment
     if not dataset.depth.is_registered:
@@ -185,12 +188,12 @@ def _coverage(
         frames = frames[:limit]  # with --max-frames the run has fewer
     if len(frames) == 0:
         span = float(truth.stamps_s[-1] - truth.stamps_s[0])
-        mine = run.trajectory.stamps_s * clock.factor + clock.offset_s
+        mine = run.trajectory.stamps_s + clock.offset_s
         inside = mine[(mine >= truth.stamps_s[0] - 1.0) & (mine <= truth.stamps_s[-1] + 1.0)]
         share = min(1.0, float(inside[-1] - inside[0]) / span) if len(inside) > 1 and span > 0 else 0.0
         return share, share, float(inside[0] - truth.stamps_s[0]) if len(inside) else float("nan")
     count = len(frames)
-    first = _first_trusted(run) * clock.factor + clock.offset_s - float(frames[0])
+    first = _first_trusted(run) + clock.offset_s - float(frames[0])
     return min(1.0, run.trusted_frames / count), min(1.0, len(run.trajectory) / count), first
 
 

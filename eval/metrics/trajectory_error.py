@@ -5,13 +5,14 @@ its translation part is ATE, its rotation angle APE's rotation, and ``||E - I||_
 that the paper prints as its 0.046 (eq. 30 without the lost ``- I``). RPE is Sturm et al. 2012, eq. 2.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.eval.errors import EvaluationError
-from edgeslam_torch.eval.inputs.associate import DEFAULT_MAX_DT_S, Association, associate, nearest, unit_factor
+from edgeslam_torch.eval.inputs.associate import DEFAULT_MAX_DT_S, Association, associate, nearest
+from edgeslam_torch.eval.inputs.clocks import on_one_clock
 from edgeslam_torch.eval.inputs.trajectory_files import Trajectory
 from edgeslam_torch.eval.metrics.align import Alignment, AlignmentKind, umeyama
 from edgeslam_torch.eval.metrics.clock_offset import any_offset
@@ -20,6 +21,13 @@ from edgeslam_torch.types import FloatArray, IntArray
 
 DRIFT_SEGMENTS_M = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
 """Lengths of path over which drift is given; those longer than the sequence are left out."""
+
+_STILL_M, _JITTER_M = 1e-5, 1e-3
+"""RMS distance from its mean below which a truth does not move: at all, or by a tracker's jitter alone (tenths of a
+millimetre, consecutive poses as far apart as any two)."""
+
+_TURNED_ALIKE_DEG, _TURNING_DEG = 0.1, 2.0
+"""All orientations of a file within the first while the other file turns by the second: they were left out."""
 
 _PATH_TOLERANCE = 0.1
 """A pair of poses counts for 1 m when the path between them is 1 m within this fraction (evo's default)."""
@@ -83,6 +91,7 @@ class TrajectoryScore:
     full_transform: Stats
     """``||T_truth^-1 T_estimate - I||_F``: unitless, mixes metres with rotation; for comparison with the paper."""
     relative: tuple[RelativeError, ...]
+    """Empty, as is `drift`, and rotations NaN, where one of the two files has no orientations."""
     drift: tuple[Drift, ...]
     scale: float
     """What the estimate must be multiplied by to have the truth's size (from Sim(3), whatever the alignment)."""
@@ -118,6 +127,7 @@ def score_trajectory(
     Raises:
         EvaluationError: If the two cannot be compared.
     """
+    truth, estimate = on_one_clock(truth, estimate)
     try:
         pairs = associate(truth.stamps_s, estimate.stamps_s, max_dt_s, offset_s)
     except EvaluationError as reason:
@@ -127,6 +137,14 @@ def score_trajectory(
         raise EvaluationError(f"{estimate.source}: {len(pairs)} pose has ground truth; a trajectory needs at least 2")
     stamps = truth.stamps_s[pairs.truth]
     T_true, T_raw = truth.T_w_c[pairs.truth], estimate.T_w_c[pairs.estimate]
+    fixed_position_m = _fixed_position(T_true)
+    path_m = float(_path(T_true)[-1])
+    jitter = fixed_position_m < _JITTER_M and path_m > 0.5 * len(pairs) * fixed_position_m
+    if fixed_position_m < _STILL_M or jitter:
+        raise EvaluationError(
+            f"{truth.source}: the ground truth never moves ({1000 * fixed_position_m:.2g} mm about its mean over the "
+            f"{len(pairs)} matched poses): nothing to compare with"
+        )
     try:
         found = umeyama(T_raw[:, :3, 3], T_true[:, :3, 3], alignment)
     except EvaluationError as reason:
@@ -135,31 +153,47 @@ def score_trajectory(
     T = found.poses(T_raw)
     error = se3.inverse(T_true) @ T
     error_m = np.linalg.norm(error[:, :3, 3], axis=1)
+    oriented = without_orientation(truth, estimate) is None
+    if not oriented:
+        error = np.full_like(error, np.nan)
     error_deg = _angle_deg(error)
-    centred = T_true[:, :3, 3] - T_true[:, :3, 3].mean(axis=0)
     return TrajectoryScore(
         alignment=found,
         association=pairs,
         ate_m=Stats.of(error_m),
         rotation_deg=Stats.of(error_deg),
         full_transform=Stats.of(np.linalg.norm(error - np.eye(4), axis=(1, 2))),
-        relative=relative_errors(T_true, T, stamps, max_dt_s),
-        drift=drift(T_true, T),
+        relative=relative_errors(T_true, T, stamps, max_dt_s) if oriented else (),
+        drift=drift(T_true, T) if oriented else (),
         scale=scale,
         matched=len(pairs),
-        truth_path_m=float(_path(T_true)[-1]),
-        fixed_position_m=float(np.sqrt(np.mean(np.sum(centred**2, axis=1)))),
+        truth_path_m=path_m,
+        fixed_position_m=fixed_position_m,
         stamps_s=stamps,
         error_m=error_m,
         error_deg=error_deg,
     )
 
 
+def without_orientation(truth: Trajectory, estimate: Trajectory) -> Trajectory | None:
+    """The one of the two that does not tell how the camera is turned: it has positions alone, or one orientation for
+    all poses while the other one's camera turns."""
+    for mine, other in ((truth, estimate), (estimate, truth)):
+        if not mine.oriented or (_spread_deg(mine) < _TURNED_ALIKE_DEG and _spread_deg(other) > _TURNING_DEG):
+            return mine
+    return None
+
+
+def _spread_deg(trajectory: Trajectory) -> float:
+    """Largest angle [deg] between the first orientation and another."""
+    R = trajectory.T_w_c[:, :3, :3]
+    return float(np.degrees(Rotation.from_matrix(R[0].T @ R).magnitude().max()))
+
+
 def _clock_hints(truth: Trajectory, estimate: Trajectory) -> list[str]:
     """What else is known when no stamps match: how they were made up, and the offset that the shapes ask for."""
-    hints = [f"{t.source}: {note}" for t in (truth, estimate) if not t.stamped for note in t.notes]
-    factor, _ = unit_factor(truth.stamps_s, estimate.stamps_s)
-    found = any_offset(truth, replace(estimate, stamps_s=estimate.stamps_s * factor))
+    hints = [f"{t.source}: {note}" for t in (truth, estimate) for note in t.notes]
+    found = any_offset(truth, estimate)
     if found.share < 0.2:
         hints.append(f"the shapes fit best with --offset {found.shift_s:.2f} (ATE {found.ate_m:.3f} m)")
     elif 0.5 < found.share < np.inf:
@@ -212,14 +246,20 @@ def _relative(name: str, T_true: FloatArray, T: FloatArray, i: IntArray, j: IntA
 
 
 def _angle_deg(T: FloatArray) -> FloatArray:
-    if len(T) == 0:
-        return np.zeros(0)
+    if len(T) == 0 or not np.isfinite(T).all():
+        return np.full(len(T), np.nan)
     return np.degrees(Rotation.from_matrix(T[:, :3, :3]).magnitude())
 
 
 def _path(T: FloatArray) -> FloatArray:
     steps = np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1)
     return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def _fixed_position(T: FloatArray) -> float:
+    """RMS distance of positions from their mean."""
+    centred = T[:, :3, 3] - T[:, :3, 3].mean(axis=0)
+    return float(np.sqrt(np.mean(np.sum(centred**2, axis=1))))
 
 
 def _scale(estimate: FloatArray, truth: FloatArray) -> float:

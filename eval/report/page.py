@@ -404,9 +404,8 @@ def _error(score: RunScore | None, begin: float) -> dict[str, Any] | None:
     if score is None or score.sim3 is None:
         return None
     found = score.sim3
-    # Drawn against the run's own clock; where that was in other units the matched times still span it.
     return {
-        "t": _rounded(found.stamps_s - (begin * found.association.factor + found.association.offset_s), 4),
+        "t": _rounded(found.stamps_s - (begin + found.association.offset_s), 4),
         "cm": _rounded(100 * found.error_m, 3),
         "deg": _rounded(found.error_deg, 3),
         "note": words.error_note(score),

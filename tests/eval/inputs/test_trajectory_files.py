@@ -1,11 +1,15 @@
 """Trajectory files are read back as written, and refused with the likely mistake when they are none."""
 
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.eval.errors import EvaluationError
+from edgeslam_torch.eval.inputs.clocks import on_one_clock
 from edgeslam_torch.eval.inputs.trajectory_files import WRITERS, Trajectory, read_trajectory
 
 
@@ -50,7 +54,10 @@ GOOD = ["0.0 0 0 0 0 0 0 1", "0.1 1 0 0 0 0 0 1", "0.2 2 0 0 0 0 0 1"]
         (["# only a header"], "holds no poses"),
         (["frame; pose"], "no line of numbers in it, the first is 'frame; pose'"),
         (["0.0 nan 0 0 0 0 0 1"], "NaN"),
-        (["0.0 0 0 0", "1.0 0 0 0"], "positions without orientation"),
+        (["0.0 0 0", "1.0 0 0"], r"3 number\(s\) a row.*header"),
+        (["time x y theta", "0.0 0 0 0", "1.0 0 0 0"], "no column for z"),
+        (["t [h] x y z", *(f"{t} 0 0 0" for t in range(4))], "not known: s, ms"),
+        ([f"1.7e+09 {k} 0 0 0 0 0 1" for k in range(9)], "too few digits"),
         (["0.0 1 2 3 10 20 30 40", "0.1 1 2 3 10 20 30 40"], "no unit quaternion"),
         ([*GOOD, "0.3 1 2"], "line 4 has 3 numbers"),
         ([*GOOD, "0.3 one 0 0 0 0 0 1"], "line 4 is not numbers"),
@@ -145,3 +152,104 @@ def test_euroc_mount_that_is_none_is_refused(sensor: str, loop: Trajectory, tmp_
     truth = euroc_folder(tmp_path, loop, sensor)
     with pytest.raises(EvaluationError, match=r"sensor\.yaml: T_BS"):
         read_trajectory(truth)
+
+
+def named(header: str, order: str, loop: Trajectory, stamp: Callable[[float], str], metre: float = 1.0) -> str:
+    """A table of ``loop`` with commas: its columns in any order, ``.`` for one that nobody asked for."""
+    q = Rotation.from_matrix(loop.T_w_c[:, :3, :3]).as_quat()
+    lines = [header]
+    for t, p, r in zip(loop.stamps_s, loop.positions * metre, q, strict=True):
+        words = {"t": stamp(t), ".": "7"} | {k: f"{v:.9f}" for k, v in zip("xyzabcd", (*p, *r), strict=True)}
+        lines.append(",".join(words[k] for k in order))
+    return "\n".join(lines) + "\n"
+
+
+def ns(t: float) -> str:
+    return f"{round(t * 1e9)}"
+
+
+@pytest.mark.parametrize("begin", [0.0, 1.7e9], ids=["since start", "since 1970"])
+@pytest.mark.parametrize(
+    ("header", "order", "stamp", "metre"),
+    [
+        ("#timestamp [ns],p_x,p_y,p_z,q_w,q_x,q_y,q_z", "txyzdabc", ns, 1.0),
+        (
+            "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []",
+            "txyzdabc",
+            ns,
+            1,
+        ),
+        ("timestamp,tx,ty,tz,qx,qy,qz,qw,lost", "txyzabcd.", str, 1.0),
+        ("num,t,x,y,z,qx,qy,qz,qw", ".txyzabcd", str, 1.0),
+        ("time_ms,qw,qx,qy,qz,pos_x_mm,pos_y_mm,pos_z_mm", "tdabcxyz", lambda t: f"{1e3 * t:.3f}", 1e3),
+        (
+            "field.header.seq,field.header.stamp,field.pose.position.x,field.pose.position.y,field.pose.position.z,"
+            "field.pose.orientation.x,field.pose.orientation.y,field.pose.orientation.z,field.pose.orientation.w,"
+            "field.twist.linear.x",
+            ".txyzabcd.",
+            str,
+            1.0,
+        ),
+    ],
+)
+def test_columns_are_found_by_their_names(
+    header: str, order: str, stamp: Callable[[float], str], metre: float, begin: float, loop: Trajectory, tmp_path: Path
+) -> None:
+    loop = replace(loop, stamps_s=begin + loop.stamps_s)
+    (tmp_path / "t.csv").write_text(named(header, order, loop, stamp, metre))
+    found = read_trajectory(tmp_path / "t.csv")
+    np.testing.assert_allclose(found.stamps_s, loop.stamps_s, atol=1e-5)
+    np.testing.assert_allclose(found.T_w_c, loop.T_w_c, atol=1e-6)
+
+
+def test_seconds_and_nanoseconds_in_two_columns_are_added(tmp_path: Path) -> None:
+    (tmp_path / "t.csv").write_text(
+        "header.stamp.sec,header.stamp.nanosec,x,y,z\n5,250000000,1,2,3\n5,750000000,2,2,3\n"
+    )
+    found = read_trajectory(tmp_path / "t.csv")
+    assert found.stamps_s.tolist() == [5.25, 5.75] and not found.oriented
+
+
+def test_positions_alone_are_a_trajectory(loop: Trajectory, tmp_path: Path) -> None:
+    np.savetxt(tmp_path / "p.txt", np.c_[loop.stamps_s, loop.positions])
+    found = read_trajectory(tmp_path / "p.txt")
+    assert not found.oriented
+    np.testing.assert_allclose(found.positions, loop.positions)
+
+
+@pytest.mark.parametrize("digits", [0, 1])
+def test_rounded_stamps_are_named_as_the_cause(digits: int, loop: Trajectory, tmp_path: Path) -> None:
+    rows = [f"{t:.{digits}f} {x} {y} {z} 0 0 0 1" for t, (x, y, z) in zip(loop.stamps_s, loop.positions, strict=True)]
+    with pytest.raises(EvaluationError, match="digits"):
+        read_trajectory(tum(tmp_path / "t.txt", rows))
+
+
+def test_pose_of_a_marker_goes_through_its_own_mount(loop: Trajectory, tmp_path: Path) -> None:
+    """EuRoC's vicon0: marker to body to camera."""
+    truth = euroc_folder(tmp_path, loop, _MOUNT)
+    (truth.parent / "sensor.yaml").write_text(_MOUNT)
+    np.testing.assert_allclose(read_trajectory(truth).T_w_c, loop.T_w_c, atol=1e-8)
+
+
+def test_tum_vi_truth_is_found_and_becomes_the_cameras(loop: Trajectory, tmp_path: Path) -> None:
+    mocap = tmp_path / "mav0" / "mocap0" / "data.csv"
+    mocap.parent.mkdir(parents=True)
+    (tmp_path / "mav0" / "cam0").mkdir()
+    (tmp_path / "mav0" / "cam0" / "sensor.yaml").write_text(_MOUNT)
+    mocap.write_text(named("#timestamp [ns],p_x,p_y,p_z,q_w,q_x,q_y,q_z", "txyzdabc", loop, ns))
+    for place in (tmp_path, mocap):
+        found = read_trajectory(place)
+        np.testing.assert_allclose(found.stamps_s, loop.stamps_s, atol=1e-6)
+        np.testing.assert_allclose(found.positions, loop.positions + 0.5 * loop.T_w_c[:, :3, 0], atol=1e-6)
+    mocap.write_text(mocap.read_text().split("\n", 1)[1])
+    np.testing.assert_allclose(read_trajectory(mocap).T_w_c, found.T_w_c, atol=1e-6)  # by its place alone
+
+
+def test_rows_of_kitti_without_times_take_those_of_as_many_poses(loop: Trajectory, tmp_path: Path) -> None:
+    WRITERS["kitti"](loop, tmp_path / "poses.txt")
+    (tmp_path / "times.txt").unlink()
+    rows = read_trajectory(tmp_path / "poses.txt")
+    np.testing.assert_allclose(on_one_clock(rows, loop)[0].stamps_s, loop.stamps_s)
+    np.testing.assert_allclose(on_one_clock(loop, rows)[1].stamps_s, loop.stamps_s)
+    with pytest.raises(EvaluationError, match=r"times\.txt"):
+        on_one_clock(rows, loop.take(slice(0, 150)))
