@@ -158,10 +158,11 @@ def read_table(path: Path, error: type[EdgeSlamError], columns: int | None = Non
     header: tuple[str, ...] = ()
     if rows and not any(_is_value(cell) for cell in rows[0].cells):
         header = tuple(rows.pop(0).cells)
-    elif rows and above:
+        above = [data[0][1]]
+    if rows and above:
         width = len(rows[0].cells)
         words = (_split(above[-1].lstrip("#% "), s, columns) for s in (separator, _BLANKS, *_SEPARATORS))
-        header = next((tuple(names) for names in words if len(names) == width), ())
+        header = next((tuple(names) for names in words if len(names) == width), header)
     _drop_empty_end(rows, len(header))
     comments = tuple(line.lstrip("#% ") for _, line in lines if line.startswith(_COMMENTS))
     return Table(path, header, tuple(rows), comments, error, bool(text) and not text.endswith(("\n", "\r")))

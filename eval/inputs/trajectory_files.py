@@ -4,8 +4,7 @@ All give poses of the camera in the world; those of a body whose camera is not k
 refuses what cannot be a trajectory with one line that names the file and the likely mistake.
 """
 
-import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,8 +15,9 @@ from scipy.spatial.transform import Rotation
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.inputs.columns import Columns, columns_by_name, columns_by_number
 from edgeslam_torch.files.record_files import plain_yaml
+from edgeslam_torch.files.tables import Table, read_table
+from edgeslam_torch.files.time_units import UNKNOWN, seconds_of
 from edgeslam_torch.geometry import se3
-from edgeslam_torch.readers.listing import seconds_from
 from edgeslam_torch.types import FloatArray
 
 SEVEN_SCENES_HZ = 30.0
@@ -34,13 +34,6 @@ _EUROC = ("state_groundtruth_estimate0", "mocap0", "vicon0", "leica0")
 
 _TOO_FEW_DIGITS = 0.3
 """Share of rows that repeat a stamp with another position from which the stamps are taken for rounded ones."""
-
-_UNIT_APART = re.compile(r"\s+(?=[\[(])")
-"""Between a name and its unit: ``timestamp [ns]`` is one column."""
-
-_LARGE_TEXT = 1 << 20
-_MAX_FILE_BYTES = 1 << 30
-"""A gigabyte of poses is 80 hours at 100 Hz: larger files are something else (a bag, a video)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,18 +85,18 @@ def read_trajectory(path: Path | str, stamps_s: FloatArray | None = None) -> Tra
     path = Path(path)
     if path.is_dir():
         return _read_folder(path)
-    table, first_line, header = _read_table(path)
-    count = table.shape[1]
+    table = _read_table(path)
+    count = len(table.rows[0].cells)
     try:
-        columns = columns_by_name(header) if len(header) == count else None
+        columns = columns_by_name(table.header) if len(table.header) == count else None
     except EvaluationError as error:
         raise EvaluationError(f"{path}: {error}") from error
     if columns is None and count == 12:
-        return _from_kitti(table, path, stamps_s)
+        return _from_kitti(table.numbers(), path, stamps_s)
     columns = columns or columns_by_number(count, euroc=path.resolve().parent.name in _EUROC)
     if columns is None:
         raise EvaluationError(
-            f"{path}: {count} number(s) a row from line {first_line} on; TUM has 8 (t x y z qx qy qz qw), KITTI 12, "
+            f"{path}: {count} column(s) from line {table.rows[0].line} on; TUM has 8 (t x y z qx qy qz qw), KITTI 12, "
             "EuRoC 17, positions alone 4, and other tables need a header that names the columns"
         )
     return _of_camera(_from_columns(table, columns, path), path)
@@ -182,72 +175,25 @@ def _read_folder(folder: Path) -> Trajectory:
     raise EvaluationError(f"{folder}: no trajectory in this folder (looked for {', '.join(names)}, *.pose.txt)")
 
 
-def _read_table(path: Path) -> tuple[FloatArray, int, list[str]]:
-    """Numbers of a text table, the line of its first row, and the words of the line before it."""
-    text = _read_text(path)
-    lines = text.splitlines()
-    first = next((number for number, line in enumerate(lines) if _numbers(line) is not None), None)
-    before = next((words for line in reversed(lines[:first]) if (words := line.strip(" #%\t"))), "")
-    if first is None:
-        if before and any(line.strip() and not line.lstrip().startswith("#") for line in lines):
-            raise EvaluationError(
-                f"{path}: no line of numbers in it, the first is {lines[0].strip()[:60]!r}; a TUM trajectory has "
-                "'t x y z qx qy qz qw' on each line, between spaces or commas"
-            )
-        raise EvaluationError(f"{path}: the file holds no poses (did the run stop before its first frame?)")
-    commas = "," in lines[first]
-    header = [word.strip() for word in (before.split(",") if commas else _UNIT_APART.sub("", before).split())]
-    table = _quickly(lines[first:], commas) if len(text) > _LARGE_TEXT else None
-    if table is not None:
-        return table, first + 1, header
-    rows: list[list[float]] = []
-    for number, line in enumerate(lines[first:], start=first + 1):
-        if not line.split("#", 1)[0].strip():
-            continue
-        row = _numbers(line)
-        if row is None:
-            raise EvaluationError(f"{path}: line {number} is not numbers: {line.strip()[:60]!r}")
-        if rows and len(row) != len(rows[0]):
-            if number == len(lines) and not text.endswith("\n"):
-                break  # the last line is incomplete
-            raise EvaluationError(f"{path}: line {number} has {len(row)} numbers, line {first + 1} has {len(rows[0])}")
-        rows.append(row)
-    return np.array(rows), first + 1, header
+def _read_table(path: Path) -> Table:
+    """Rows of a text table, of which there is at least one."""
+    table = read_table(path, EvaluationError)
+    if table.rows:
+        return table
+    if table.header:
+        raise EvaluationError(
+            f"{path}: no line of numbers in it, the first is {' '.join(table.header)[:60]!r}; a TUM trajectory has "
+            "'t x y z qx qy qz qw' on each line, between spaces or commas"
+        )
+    raise EvaluationError(f"{path}: the file holds no poses (did the run stop before its first frame?)")
 
 
-def _numbers(line: str) -> list[float] | None:
-    """Numbers of a line; None if it has none or anything else."""
-    try:
-        return [float(word) for word in line.split("#", 1)[0].replace(",", " ").split()] or None
-    except ValueError:
-        return None
-
-
-def _read_text(path: Path) -> str:
-    try:
-        if path.stat().st_size > _MAX_FILE_BYTES:
-            raise EvaluationError(f"{path}: {path.stat().st_size / 1e9:.1f} GB is too large for a trajectory file")
-        return path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError as error:
-        raise EvaluationError(f"{path}: no such trajectory file") from error
-    except UnicodeDecodeError as error:
-        raise EvaluationError(f"{path}: not a text file, so not a trajectory") from error
-    except OSError as error:
-        raise EvaluationError(f"{path}: cannot be read ({error.strerror})") from error
-
-
-def _quickly(lines: list[str], commas: bool) -> FloatArray | None:
-    """The table by NumPy's reader, ten times as fast; None on any irregularity."""
-    try:
-        return np.loadtxt(lines, dtype=np.float64, delimiter="," if commas else None, ndmin=2)
-    except ValueError:
-        return None
-
-
-def _from_columns(table: FloatArray, columns: Columns, path: Path) -> Trajectory:
+def _from_columns(table: Table, columns: Columns, path: Path) -> Trajectory:
     """Trajectory from a table, cleaned and checked."""
-    stamps_s, notes = _seconds(table, columns)
-    poses = table[:, [*columns.position, *(columns.quaternion or ())]]
+    rotation = columns.quaternion or ()
+    numbers = table.numbers([*columns.position, *rotation, *(index for index, _ in columns.time)])
+    poses, time = np.split(numbers, [3 + len(rotation)], axis=1)
+    stamps_s, notes = _seconds(time, [unit for _, unit in columns.time])
     finite = np.isfinite(stamps_s) & np.isfinite(poses).all(axis=1)
     if not finite.any():
         raise EvaluationError(f"{path}: every pose holds a NaN or infinity")
@@ -269,18 +215,16 @@ def _from_columns(table: FloatArray, columns: Columns, path: Path) -> Trajectory
     if columns.quaternion is not None:
         T[:, :3, :3] = Rotation.from_quat(poses[:, 3:]).as_matrix()
     T[:, :3, 3] = columns.metres * poses[:, :3]
-    stamps_s, T, more = _increasing(stamps_s, T, str(path))
-    return Trajectory(stamps_s, T, str(path), tuple(notes + more), oriented=columns.quaternion is not None)
+    stamps_s, T_w_c, more = _increasing(stamps_s, T, str(path))
+    return Trajectory(stamps_s, T_w_c, str(path), tuple(notes + more), oriented=columns.quaternion is not None)
 
 
-def _seconds(table: FloatArray, columns: Columns) -> tuple[FloatArray, list[str]]:
-    """Stamps of a table's rows [s], and what was assumed of them."""
-    units = [1.0 if unit is None else unit for _, unit in columns.time]
-    stamps = table[:, [index for index, _ in columns.time]] @ np.array(units)
-    if columns.time[0][1] is not None:
-        return stamps, []
-    stamps_s, unit = seconds_from(stamps.tolist())
-    return stamps_s, [] if unit == "s" else [f"the stamps are {unit}: converted to seconds"]
+def _seconds(time: FloatArray, units: Sequence[float | None]) -> tuple[FloatArray, list[str]]:
+    """Stamps [s] from the columns that add up to them, and what was assumed of them."""
+    if units[0] is not None:
+        return time @ np.array(units, dtype=np.float64), []
+    stamps_s, unit = seconds_of(time[:, 0])
+    return stamps_s, [] if unit in ("s", UNKNOWN) else [f"the stamps are {unit}: converted to seconds"]
 
 
 def _of_camera(mine: Trajectory, path: Path) -> Trajectory:
@@ -357,7 +301,7 @@ def _from_kitti(table: FloatArray, path: Path, stamps_s: FloatArray | None) -> T
     if stamps_s is None:
         sequence = path.parent.parent / "sequences" / path.stem / _TIMES  # of poses/00.txt, as KITTI has them
         times = next((file for file in (path.with_name(_TIMES), sequence) if file.is_file()), None)
-        stamps_s = None if times is None else seconds_from(_read_table(times)[0][:, 0].tolist())[0]
+        stamps_s = None if times is None else seconds_of(_read_table(times).numbers([0])[:, 0])[0]
     stamped = stamps_s is not None
     if stamps_s is None:
         notes.append("no times.txt beside the KITTI poses: rows are matched by number, at 10 Hz")
@@ -374,12 +318,12 @@ def _from_seven_scenes(files: list[Path], folder: Path) -> Trajectory:
     numbers = np.array([int("".join(c for c in file.name.split(".")[0] if c.isdigit()) or -1) for file in files])
     T = np.empty((len(files), 4, 4))
     for i, file in enumerate(files):
-        table = _read_table(file)[0]
+        table = _read_table(file).numbers()
         if table.shape != (4, 4):
             raise EvaluationError(f"{file}: a 7-Scenes pose is 4x4 numbers, got {table.shape[0]}x{table.shape[1]}")
         T[i] = table
     if (folder / _TIMES).is_file():
-        stamps_s = _read_table(folder / _TIMES)[0][:, 0]
+        stamps_s = seconds_of(_read_table(folder / _TIMES).numbers([0])[:, 0])[0]
         if len(stamps_s) != len(files):
             raise EvaluationError(f"{folder}: {len(files)} poses but {len(stamps_s)} stamps in {_TIMES}")
         return _from_matrices(stamps_s, T, str(folder), [])

@@ -52,15 +52,15 @@ GOOD = ["0.0 0 0 0 0 0 0 1", "0.1 1 0 0 0 0 0 1", "0.2 2 0 0 0 0 0 1"]
     [
         ([], "holds no poses"),
         (["# only a header"], "holds no poses"),
-        (["frame; pose"], "no line of numbers in it, the first is 'frame; pose'"),
+        (["frame; pose"], "no line of numbers in it, the first is 'frame pose'"),
         (["0.0 nan 0 0 0 0 0 1"], "NaN"),
-        (["0.0 0 0", "1.0 0 0"], r"3 number\(s\) a row.*header"),
+        (["0.0 0 0", "1.0 0 0"], r"3 column\(s\).*header"),
         (["time x y theta", "0.0 0 0 0", "1.0 0 0 0"], "no column for z"),
-        (["t [h] x y z", *(f"{t} 0 0 0" for t in range(4))], "not known: s, ms"),
+        (["t [h],x,y,z", *(f"{t},0,0,0" for t in range(4))], "not known: s, ms"),
         ([f"1.7e+09 {k} 0 0 0 0 0 1" for k in range(9)], "too few digits"),
         (["0.0 1 2 3 10 20 30 40", "0.1 1 2 3 10 20 30 40"], "no unit quaternion"),
-        ([*GOOD, "0.3 1 2"], "line 4 has 3 numbers"),
-        ([*GOOD, "0.3 one 0 0 0 0 0 1"], "line 4 is not numbers"),
+        ([*GOOD, "0.3 1 2"], "line 4 has 3 columns"),
+        ([*GOOD, "0.3 one 0 0 0 0 0 1"], "line 4, column 2 is not a number"),
     ],
 )
 def test_what_is_no_trajectory_is_named(rows: list[str], words: str, tmp_path: Path) -> None:
@@ -73,7 +73,7 @@ def test_missing_binary_and_empty_folders_are_named(tmp_path: Path) -> None:
     (tmp_path / "b.txt").write_bytes(bytes(range(256)))
     with pytest.raises(EvaluationError, match="not a text file"):
         read_trajectory(tmp_path / "b.txt")
-    with pytest.raises(EvaluationError, match="no such trajectory"):
+    with pytest.raises(EvaluationError, match="no such file"):
         read_trajectory(tmp_path / "none.txt")
     with pytest.raises(EvaluationError, match="no trajectory in this folder"):
         read_trajectory(tmp_path)
@@ -105,14 +105,14 @@ def test_large_files_read_the_same_as_small_ones(tmp_path: Path) -> None:
         found = read_trajectory(tmp_path / name)
         assert len(found) == 60_000 and found.positions[-1, 0] == 59_999
     (tmp_path / "broken").write_text(rows + "6000.0 1 2\n")
-    with pytest.raises(EvaluationError, match="line 60001 has 3 numbers"):
+    with pytest.raises(EvaluationError, match="line 60001 has 3 columns"):
         read_trajectory(tmp_path / "broken")
 
 
 def test_huge_file_is_not_read(tmp_path: Path) -> None:
     with (tmp_path / "flight.bag").open("wb") as file:
         file.truncate(3 << 30)  # sparse: takes no room
-    with pytest.raises(EvaluationError, match="3.2 GB is too large for a trajectory"):
+    with pytest.raises(EvaluationError, match="3221 MB, more than"):
         read_trajectory(tmp_path / "flight.bag")
 
 
