@@ -1,8 +1,9 @@
 """The contract of every loss: signed residuals for Levenberg-Marquardt, one number an item for training.
 
 Inputs without a batch axis give a scalar ``()``, batches ``(B, ...)`` one value an item ``(B,)``. What was not observed
-(outside a mask, NaN in an observation) is left out, with a gradient of zero whatever stands there. NaN in a prediction
-that counts gives NaN: a network that has diverged is seen. Half inputs are computed, and returned, in float32.
+(outside a mask, NaN or infinity in an observation) is left out, with a gradient of zero whatever stands there. What is
+not finite in a prediction that counts gives NaN (the terms of `depth_terms` may give infinity): a network that has
+diverged is seen. A finite loss has finite gradients. Half inputs are computed, and returned, in float32.
 """
 
 from enum import StrEnum
@@ -93,12 +94,17 @@ def masked(value: Tensor, valid: Tensor, lost: Tensor | None = None) -> Residual
     Args:
         value: Residuals ``(..., R)``.
         valid: Which count ``(...)``.
-        lost: Elements whose prediction is NaN ``(...)``: they count, as NaN.
+        lost: Elements whose prediction is not finite ``(...)``, from `lost_of`: they count, as NaN.
     """
     value = torch.where(valid[..., None], value, 0.0)
     if lost is None:
         return Residuals(value, valid)
     return Residuals(torch.where(lost[..., None], torch.nan, value), valid | lost)
+
+
+def lost_of(seen: Tensor, K: Tensor, *predicted: Tensor) -> Tensor:
+    """Which observed elements ``(..., N)`` have a prediction ``(..., N, D)`` or calibration that is not finite."""
+    return seen & ~(torch.cat(predicted, -1).isfinite().all(-1) & K.isfinite().all((-1, -2))[..., None])
 
 
 def back_project(uv: Tensor, depth_m: Tensor, K: Tensor) -> Tensor:

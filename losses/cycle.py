@@ -4,7 +4,6 @@ from enum import StrEnum
 from typing import TYPE_CHECKING
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from edgeslam_torch.losses.base import (
@@ -12,12 +11,14 @@ from edgeslam_torch.losses.base import (
     ResidualLoss,
     Residuals,
     back_project,
+    lost_of,
     masked,
     move,
     project,
 )
 from edgeslam_torch.losses.inputs import check_shapes, in_full_precision
 from edgeslam_torch.losses.robust import Kernel
+from edgeslam_torch.losses.sampling import sample
 
 
 class CycleForm(StrEnum):
@@ -75,8 +76,8 @@ class CycleLoss(ResidualLoss):
             T_j_i: Motion from frame i to frame j ``(4, 4)``, in the depths' unit.
             uv: Edge pixels in frame i ``(N, 2)``; NaN for none.
             depth_i: Their z-depths ``(N,)``; 0 where unknown.
-            depth_j: Depth map of frame j ``(H, W)``, or the depths ``(N,)`` already sampled there; 0 or NaN where
-                unknown.
+            depth_j: Depth map of frame j ``(H, W)``, or the depths ``(N,)`` already sampled there; 0, NaN or infinite
+                where unknown.
             K: Calibration matrix ``(3, 3)`` [px].
 
         Returns:
@@ -94,16 +95,16 @@ class CycleLoss(ResidualLoss):
             depth_j=(depth_j, "H W" if is_map else "N"),
             K=(K, "? 3 3"),
         )
-        seen = uv.isfinite().all(-1) & ~(depth_i <= 0)  # a depth of NaN counts: it is a prediction
+        seen = uv.isfinite().all(-1) & ~(depth_i <= 0)  # NaN and infinity count: it is a prediction
         uv, depth_i = uv.where(seen[..., None], 0.0), depth_i.where(seen, 1.0)
         p_j = move(T_j_i, back_project(uv, depth_i, K))  # eqs. (17), (18)
         uv_j, front = project(p_j, K)  # eq. (19)
         if is_map:
             d_j, known = sample_depth(depth_j, uv_j)
         else:
-            known = depth_j > 0
+            known = _known(depth_j)
             d_j = depth_j.where(known, 0.0)
-        lost = seen & p_j.isnan().any(-1)
+        lost = lost_of(seen, K, p_j, uv_j)
         valid = seen & front & known
         z = p_j[..., 2]
         relative = (z - d_j) / torch.where(valid, z + d_j, 1.0)
@@ -128,7 +129,7 @@ class CycleLoss(ResidualLoss):
             uv: Edge pixels in frame i ``(N, 2)`` or ``(B, N, 2)`` [px]; NaN for none.
             depth_i: Their z-depths ``(N,)`` or ``(B, N)``; 0 where unknown.
             depth_j: Depth map of frame j ``(H, W)`` or ``(B, H, W)``, or the depths sampled there, shaped as
-                ``depth_i``; 0 or NaN where unknown.
+                ``depth_i``; 0, NaN or infinite where unknown.
             K: Calibration matrix ``(3, 3)`` or ``(B, 3, 3)`` [px].
 
         Raises:
@@ -150,7 +151,7 @@ def sample_depth(depth: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
     """Bilinear depths of a map at pixels, and which pixels lie inside and touch no hole.
 
     Args:
-        depth: ``(H, W)`` or ``(B, H, W)``; 0, negative or NaN in holes.
+        depth: ``(H, W)`` or ``(B, H, W)``; 0, negative, NaN or infinite in holes.
         uv: ``(N, 2)`` or ``(B, N, 2)`` [px].
 
     Returns:
@@ -160,10 +161,12 @@ def sample_depth(depth: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
     size = torch.tensor((W - 1, H - 1), dtype=uv.dtype, device=uv.device)
     inside = ((uv >= 0) & (uv <= size)).all(-1)
     grid = torch.where(inside[..., None], 2.0 * uv / size - 1.0, 0.0)
-    hole = ~(depth > 0)
+    hole = ~_known(depth)
     maps = torch.stack((depth.where(~hole, 0.0), hole.to(depth.dtype)), -3)
-    out = F.grid_sample(
-        maps.reshape(-1, 2, H, W), grid.reshape(-1, 1, grid.shape[-2], 2), align_corners=True, padding_mode="border"
-    )
+    out = sample(maps.reshape(-1, 2, H, W), grid.reshape(-1, 1, grid.shape[-2], 2))
     out = out.reshape(*depth.shape[:-2], 2, -1)
     return out[..., 0, :], inside & (out[..., 1, :] == 0)
+
+
+def _known(depth: Tensor) -> Tensor:
+    return (depth > 0) & depth.isfinite()

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from edgeslam_torch.losses.base import ResidualLoss, Residuals, back_project, masked, move, project
+from edgeslam_torch.losses.base import ResidualLoss, Residuals, back_project, lost_of, masked, move, project
 from edgeslam_torch.losses.inputs import check_shapes, in_full_precision
 
 
@@ -52,7 +52,7 @@ class EdgeAlignmentLoss(ResidualLoss):
         p_j = move(T_j_i, back_project(uv, depth_i.where(seen, 1.0), K))
         predicted, front = project(p_j, K)
         across = ((predicted - uv_j) * normal_j).sum(-1, keepdim=True)
-        return masked(across, seen & front, seen & p_j.isnan().any(-1))
+        return masked(across, seen & front, lost_of(seen, K, p_j, predicted))
 
     @in_full_precision
     def forward(self, T_j_i: Tensor, uv: Tensor, depth_i: Tensor, uv_j: Tensor, normal_j: Tensor, K: Tensor) -> Tensor:

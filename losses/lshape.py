@@ -11,6 +11,7 @@ from edgeslam_torch.losses.base import (
     ResidualLoss,
     Residuals,
     back_project,
+    lost_of,
     masked,
     move,
     project,
@@ -81,7 +82,7 @@ class AngleLoss(ResidualLoss):
         p = back_project(uv.flatten(-3, -2), depth_i.flatten(-2), K)  # (..., 3 C, 3)
         if self.form is AngleForm.CROSS_VIEW:
             p = move(T_j_i, p)
-        lost = seen & p.isnan().any(-1).unflatten(-1, (-1, 3)).any(-1)
+        lost = lost_of(seen, K, p.unflatten(-2, (-1, 3)).flatten(-2))
         if self.form is AngleForm.RIGHT_ANGLE:
             cos, proper = _cosine_of_arms(p.unflatten(-2, (-1, 3)))
             return masked(cos[..., None], seen & proper & (cos.detach().abs() < self.gate_cos), lost)
@@ -164,7 +165,7 @@ class CollinearityLoss(ResidualLoss):
             check_shapes(p=(p, "C 2 M 3"), mask=(mask, "C 2 M"))
             check_mask(mask)
         given = torch.ones(p.shape[:-1], dtype=torch.bool, device=p.device) if mask is None else mask
-        lost = given & p.isnan().any(-1)
+        lost = given & ~p.isfinite().all(-1)
         p = p.where((given & ~lost)[..., None], 0.0)
         weight = given.to(p.dtype)[..., None]
         count = weight.sum(-2, keepdim=True)

@@ -11,7 +11,9 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from edgeslam_torch.losses.base import back_project, move, project
+from edgeslam_torch.losses.depth_terms import masked_mean
 from edgeslam_torch.losses.inputs import check_shapes, in_full_precision
+from edgeslam_torch.losses.sampling import finite_part, sample
 
 SSIM_WEIGHT = 0.85
 _C1, _C2 = 0.01**2, 0.03**2
@@ -34,8 +36,14 @@ def warp_to(image_j: Tensor, depth_i: Tensor, T_j_i: Tensor, K: Tensor) -> tuple
         K: Intrinsics of both ``(B, 3, 3)`` [px].
 
     Returns:
-        Warped image ``(B, 3, H, W)`` and where it is valid (known, in front, inside) ``(B, 1, H, W)``.
+        Warped image ``(B, 3, H, W)`` and where it is valid (finite, known, in front, inside) ``(B, 1, H, W)``.
     """
+    warped, valid, whole = _warped(image_j, depth_i, T_j_i, K)
+    return warped, valid & whole
+
+
+def _warped(image_j: Tensor, depth_i: Tensor, T_j_i: Tensor, K: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """`warp_to`, whose valid pixels are returned apart from those that touch no hole of ``image_j``."""
     B, _, H, W = depth_i.shape
     v, u = torch.meshgrid(
         torch.arange(H, dtype=depth_i.dtype, device=depth_i.device),
@@ -44,14 +52,17 @@ def warp_to(image_j: Tensor, depth_i: Tensor, T_j_i: Tensor, K: Tensor) -> tuple
     )
     pixels = torch.stack((u, v), -1).reshape(1, -1, 2)
     depth = depth_i.flatten(1)
-    known = ~(depth <= 0)
+    known = (depth > 0) & depth.isfinite()
     p_j = move(T_j_i, back_project(pixels, depth.where(known, 1.0), K))
     uv, front = project(p_j, K, NEAREST)
     size = uv.new_tensor((W - 1, H - 1))
     valid = (known & front & ((uv >= -ROUNDING_PX) & (uv <= size + ROUNDING_PX)).all(-1)).reshape(B, 1, H, W)
     # Values far outside would overflow float32 in the sampler's derivative.
     grid = (2.0 * uv / size - 1.0).clamp(-2, 2).reshape(B, H, W, 2)
-    return F.grid_sample(image_j, grid, padding_mode="border", align_corners=True), valid
+    image, seen = finite_part(image_j)
+    hole = (~seen).any(1, keepdim=True).to(image.dtype)
+    out = sample(torch.cat((image, hole), 1), grid)
+    return out[:, :-1], valid, out[:, -1:] == 0
 
 
 @in_full_precision
@@ -80,10 +91,10 @@ class PhotometricLoss(nn.Module):
 
     @in_full_precision
     def forward(self, image_i: Tensor, images_j: Tensor, depth_i: Tensor, T_j_i: Tensor, K: Tensor) -> Tensor:
-        """Mean per image ``(B,)``; NaN for a depth or motion of NaN.
+        """Mean per image ``(B,)``; NaN for a depth or motion that is not finite.
 
         Args:
-            image_i: ``(B, 3, H, W)`` in [0, 1].
+            image_i: ``(B, 3, H, W)`` in [0, 1]; NaN or infinite where not observed, as in the source frames.
             images_j: Source frames ``(B, S, 3, H, W)``.
             depth_i: Predicted z-depth ``(B, 1, H, W)`` [m, or the motions' unit]; 0 where unknown.
             T_j_i: Motions from frame i to the source frames ``(B, S, 4, 4)``.
@@ -99,20 +110,30 @@ class PhotometricLoss(nn.Module):
             T_j_i=(T_j_i, "B S 4 4"),
             K=(K, "B 3 3"),
         )
+        image_i, seen_i = finite_part(image_i)
         costs, still = [], []
+        lost = ~((depth_i <= 0) | depth_i.isfinite()).flatten(1).all(1)
+        lost = lost | ~torch.cat((T_j_i.flatten(1), K.flatten(1)), 1).isfinite().all(1)
         for s in range(images_j.shape[1]):
-            warped, valid = warp_to(images_j[:, s], depth_i, T_j_i[:, s], K)
-            cost = dissimilarity(warped, image_i)
+            warped, valid, whole = _warped(images_j[:, s], depth_i, T_j_i[:, s], K)
+            image_j, seen_j = finite_part(images_j[:, s])
+            valid = valid & _windows((whole & seen_i & seen_j).all(1, keepdim=True))
+            cost, unmoved = dissimilarity(warped, image_i), dissimilarity(image_j, image_i)
+            lost = lost | ~(cost.isfinite() & unmoved.isfinite()).flatten(1).all(1)
             costs.append(torch.where(valid, cost, 1e3))
-            still.append(dissimilarity(images_j[:, s], image_i))
+            still.append(unmoved)
         best, unmoved = torch.stack(costs).amin(0), torch.stack(still).amin(0)
         mask = (best < unmoved.detach()) & (best < 1e2)
         mean = torch.where(mask, best, 0.0).flatten(1).sum(1) / mask.flatten(1).sum(1).clamp(min=1)
-        lost = depth_i.isnan().flatten(1).any(1) | T_j_i.isnan().flatten(1).any(1)
         return torch.where(lost, torch.nan, mean)
 
     if TYPE_CHECKING:
         __call__ = forward
+
+
+def _windows(whole: Tensor) -> Tensor:
+    """Pixels ``(B, 1, H, W)`` whose window of 3 x 3 pixels is whole."""
+    return F.max_pool2d((~whole).float(), 3, 1, 1) == 0
 
 
 class SmoothnessLoss(nn.Module):
@@ -127,19 +148,22 @@ class SmoothnessLoss(nn.Module):
 
         Args:
             log_depth: Predicted ``(B, 1, H, W)`` [log m].
-            image: ``(B, 3, H, W)`` in [0, 1].
+            image: ``(B, 3, H, W)`` in [0, 1]; NaN or infinite where not observed.
 
         Raises:
             ValueError: If shapes do not fit.
         """
         check_shapes(log_depth=(log_depth, "B 1 H W"), image=(image, "B 3 H W"))
+        image, seen = finite_part(image)
+        seen = seen.all(1, keepdim=True)
         total = log_depth.new_zeros(log_depth.shape[0])
         for dim in (-1, -2):
             bend = log_depth.diff(n=2, dim=dim).abs()
             contrast = image.diff(dim=dim).abs().mean(1, keepdim=True)
             n = contrast.shape[dim] - 1
             weight = torch.exp(-10.0 * torch.maximum(contrast.narrow(dim, 0, n), contrast.narrow(dim, 1, n)))
-            total = total + (bend * weight).flatten(1).mean(1)
+            known = seen.narrow(dim, 0, n) & seen.narrow(dim, 1, n) & seen.narrow(dim, 2, n)
+            total = total + masked_mean(bend * weight, known)
         return total
 
     if TYPE_CHECKING:

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 from torch import Tensor
 
-from edgeslam_torch.losses.base import ResidualLoss, Residuals, masked, move, project
+from edgeslam_torch.losses.base import ResidualLoss, Residuals, lost_of, masked, move, project
 from edgeslam_torch.losses.inputs import check_mask, check_shapes, in_full_precision
 
 
@@ -40,8 +40,9 @@ class ReprojectionLoss(ResidualLoss):
             seen = seen & mask
         p_w = p_w.where(seen.any(-2)[..., None], 0.0)  # NaN times a gradient of zero would be NaN
         p_c = move(T_c_w, p_w[..., None, :, :])
-        predicted, front = project(p_c, K if K.ndim == 2 else K[:, None])
-        lost = seen & p_c.isnan().any(-1)
+        K = K if K.ndim == 2 else K[:, None]
+        predicted, front = project(p_c, K)
+        lost = lost_of(seen, K, p_c, predicted)
         return masked(predicted - uv.where(seen[..., None], 0.0), seen & front, lost)
 
     @in_full_precision

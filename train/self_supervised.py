@@ -14,6 +14,7 @@ from edgeslam_torch.losses.depth_terms import LaplaceNll, masked_mean
 from edgeslam_torch.losses.lshape import AngleLoss, CollinearityLoss, LShapeLoss
 from edgeslam_torch.losses.photometric import PhotometricLoss, SmoothnessLoss
 from edgeslam_torch.losses.robust import Kernel
+from edgeslam_torch.losses.sampling import sample
 from edgeslam_torch.losses.total import TotalLoss
 from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.models.trainable import Prediction
@@ -236,4 +237,4 @@ def _at(maps: Tensor, uv: Tensor) -> Tensor:
     """Bilinear samples ``(B, N)`` of ``(B, 1, H, W)`` at pixels ``(B, N, 2)``."""
     size = maps.new_tensor((maps.shape[-1] - 1, maps.shape[-2] - 1))
     grid = (2.0 * uv / size - 1.0)[:, None]
-    return torch.nn.functional.grid_sample(maps, grid, align_corners=True, padding_mode="border")[:, 0, 0]
+    return sample(maps, grid)[:, 0, 0]

@@ -1,12 +1,14 @@
 """What every public loss promises to training loops that are not ours: precision, NaN, shapes, batches, tracing."""
 
 import inspect
+from pathlib import Path
 
 import pytest
 import torch
 from loss_cases import CASES, B, Case, H, W
 from torch import Tensor, nn
 
+import edgeslam_torch
 from edgeslam_torch import losses
 
 EVERY = pytest.mark.parametrize("case", [pytest.param(case, id=name) for name, case in CASES.items()])
@@ -216,3 +218,67 @@ def test_exported_for_any_batch_it_gives_the_same(case):
     program = torch.export.export(case.loss, (), given, dynamic_shapes={name: {0: batch} for name in given})
     for some in (given, larger(given)):
         torch.testing.assert_close(program.module()(**some), case.loss(**some))
+
+
+def holed(case: Case, name: str, hole: float, everywhere: bool) -> tuple[Tensor, dict[str, Tensor]]:
+    """Loss and every input's gradient with the first number of an input, or all of the first item's, replaced."""
+    given = {key: x.clone() for key, x in case.given().items()}
+    item = given[name].view(B, -1)[0]
+    item[slice(None) if everywhere else slice(1)] = hole
+    inputs = {key: x.requires_grad_() for key, x in given.items() if x.is_floating_point()}
+    value = case.loss(**given)
+    slopes = torch.autograd.grad(value.sum(), list(inputs.values()), allow_unused=True)
+    return value.detach(), {k: s for k, s in zip(inputs, slopes, strict=True) if s is not None}
+
+
+@pytest.mark.parametrize("everywhere", [False, True], ids=["one", "all"])
+@pytest.mark.parametrize("hole", [torch.nan, torch.inf, -torch.inf, 1e30])
+@EVERY
+def test_finite_loss_has_finite_gradients_and_holes_leave_no_trace(case, hole, everywhere):
+    for name, x in case.given().items():
+        if not x.is_floating_point():
+            continue
+        value, slopes = holed(case, name, hole, everywhere)
+        for b in range(B):
+            for by, slope in slopes.items():
+                assert not value[b].isfinite() or slope[b].isfinite().all(), (name, by)
+        if value[0].isfinite() and hole != 1e30:  # left out: as with any other mark of a hole
+            other, same = holed(case, name, -torch.inf if "depth" in name else torch.nan, everywhere)
+            torch.testing.assert_close(other, value)
+            torch.testing.assert_close(same, slopes)
+
+
+@pytest.mark.parametrize("filled", [torch.inf, -torch.inf, -7.0, 1e200])
+@pytest.mark.parametrize("case", [pytest.param(c, id=n) for n, c in CASES.items() if c.out])
+def test_what_stands_in_a_masked_place_does_not_matter(case, filled):
+    def slopes(number: float) -> tuple[Tensor, ...]:
+        given = {name: x.clone() for name, x in case.given().items()}
+        for name, numbers in case.with_it.items():
+            given[name].view(B, -1)[0, :numbers] = number
+        chosen = given[case.out].view(B, -1)
+        chosen[0, 0] = False if chosen.dtype is torch.bool else torch.nan
+        inputs = [x.requires_grad_() for x in given.values() if x.is_floating_point()]
+        found = torch.autograd.grad(case.loss(**given).sum(), inputs, allow_unused=True)
+        return tuple(slope for slope in found if slope is not None)
+
+    torch.testing.assert_close(slopes(filled), slopes(1.0))
+
+
+def test_holes_of_a_map_are_holes_however_they_are_marked():
+    def slopes(hole: float) -> tuple[Tensor, ...]:
+        given = {name: x.clone().requires_grad_() for name, x in CASES["cycle"].given().items()}
+        depth = given["depth_j"].detach().clone()
+        depth[:, 4:8, 5:11] = hole
+        given["depth_j"] = depth.requires_grad_()
+        return torch.autograd.grad(CASES["cycle"].loss(**given).sum(), list(given.values()), allow_unused=True)
+
+    for hole in (torch.nan, torch.inf, -torch.inf, -3.0):
+        torch.testing.assert_close(slopes(hole), slopes(0.0))
+
+
+def test_only_one_place_samples_maps():
+    """Torch's own sampler crashes the process in its derivative at pixels that are not finite."""
+    package = Path(edgeslam_torch.__file__).parent
+    folders = [package, *(p.resolve() for p in package.iterdir() if p.is_symlink())]
+    files = {file for folder in folders for file in folder.rglob("*.py")}
+    assert [p.name for p in files if "grid_sample(" in p.read_text("utf-8")] == ["sampling.py"]

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from edgeslam_torch.losses.sampling import sample
 from edgeslam_torch.train.views.augment import AugmentConfig, View, fitted_view, virtual_camera
 from edgeslam_torch.types import FloatArray
 
@@ -91,8 +92,8 @@ def warped(views: Views, K: FloatArray, R: FloatArray, size: tuple[int, int]) ->
     old = rays @ torch.from_numpy(views.K).to(device).mT
     uv = (old[..., :2] / old[..., 2:].clamp(min=1e-6)).float()
     grid = ((2 * uv + 1) / torch.tensor([w, h], device=device) - 1).view(-1, height, width, 2)
-    image = functional.grid_sample(views.image.float() / 255, grid, padding_mode="reflection", align_corners=False)
-    depth = functional.grid_sample(views.depth_m.float(), grid, mode="nearest", align_corners=False)
+    image = sample(views.image.float() / 255, grid, padding_mode="reflection", align_corners=False)
+    depth = sample(views.depth_m.float(), grid, mode="nearest", padding_mode="zeros", align_corners=False)
     return image, depth / rays[..., 2].float().view(-1, 1, height, width).clamp(min=0.1)
 
 
