@@ -280,12 +280,23 @@ class _Run:
                 output = self.slam.step(frame, telemetry.until(frame.stamp_s), features)
                 step_ms = 1e3 * (time.perf_counter() - started)
                 self.tally.add(output, step_ms)
-                if not self.writer.append(output, step_ms):
+                if not self.writer.append(output, step_ms, self._image_name(frame)):
                     return
                 for listener in self.listeners:
                     listener.on_frame(frame, output, self.slam)
         finally:
             prepared.close()
+
+    def _image_name(self, frame: Frame) -> str:
+        """The frame's file, relative to the recording's folder."""
+        if frame.path is None:
+            return ""
+        whole = frame.path.parent.resolve() / frame.path.name
+        return (
+            str(whole.relative_to(self.source.location))
+            if whole.is_relative_to(self.source.location)
+            else frame.path.name
+        )
 
     def _prepared(self, frames: Iterator[Frame]) -> Generator[tuple[Frame, Any]]:
         """Frames with their features; for recordings, a second thread extracts the next ones."""

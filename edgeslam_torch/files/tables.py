@@ -188,15 +188,14 @@ def _separator(lines: Sequence[str]) -> str | None:
     decimal_comma = _has_decimal_comma(lines)
     if not decimal_comma and lines and all(_all_numbers(line) for line in lines):
         return None
-    best, best_share = _BLANKS, 0.0
+    fits = {}
     for separator in _SEPARATORS:
-        if separator == "," and decimal_comma:
-            continue
-        counts = Counter(len(_cells(line, separator)) for line in lines)
-        share = max((n for width, n in counts.items() if width > 1), default=0)
-        if share > best_share:
-            best, best_share = separator, share
-    return best
+        rows = [_cells(line, separator) for line in lines if separator != "," or not decimal_comma]
+        rows = [row for row in rows if len(row) > 1]
+        same_width = max(Counter(len(row) for row in rows).values(), default=0)
+        fits[separator] = (sum(number(row[0]) is not None for row in rows), same_width)
+    best = max(fits, key=lambda separator: fits[separator])  # the first one of equals
+    return best if fits[best][1] else _BLANKS
 
 
 def _has_decimal_comma(lines: Sequence[str]) -> bool:

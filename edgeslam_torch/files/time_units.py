@@ -6,6 +6,7 @@ from numpy.typing import ArrayLike
 from edgeslam_torch.types import FloatArray
 
 SECONDS_PER_UNIT = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+NAMES = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
 PLAUSIBLE_GAPS_S = (1e-3, 10.0)
 """Time from one image, pose or message to the next: a thousand a second to six a minute."""
 _USUAL_GAP_S = 1 / 30
@@ -15,6 +16,11 @@ MAX_STAMP_S = 1e11
 """Larger ones are no time [s]: the year 5138."""
 _UNIX_S = (9e8, 4e9)
 """Seconds since 1970 of any recording: 1998 to 2096."""
+
+
+def is_date(seconds: ArrayLike) -> bool:
+    """Whether most of these seconds [s] count from 1970 to a date of our time."""
+    return bool(_UNIX_S[0] <= np.median(np.asarray(seconds)) <= _UNIX_S[1])
 
 
 def seconds_of(stamps: ArrayLike, gaps_s: tuple[float, float] = PLAUSIBLE_GAPS_S) -> tuple[FloatArray, str]:
@@ -37,7 +43,7 @@ def seconds_of(stamps: ArrayLike, gaps_s: tuple[float, float] = PLAUSIBLE_GAPS_S
     size = float(np.median(finite)) if len(finite) else 0.0
     gaps = finite[1:] - finite[:-1]
     gaps = gaps[gaps > 0]
-    dated = [unit for unit, factor in SECONDS_PER_UNIT.items() if _UNIX_S[0] <= size * factor <= _UNIX_S[1]]
+    dated = [unit for unit, factor in SECONDS_PER_UNIT.items() if is_date(size * factor)]
     if not len(gaps):
         unit = (dated or ["s"])[0]
         return array * SECONDS_PER_UNIT[unit], unit

@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgeslam_torch.errors import SourceError
+from edgeslam_torch.files.time_units import UNKNOWN, is_date, seconds_of
 from edgeslam_torch.readers.image_size import image_size
-from edgeslam_torch.readers.listing import ImageEntry, Problem, in_order, seconds_from
-from edgeslam_torch.types import Frame
+from edgeslam_torch.readers.listing import ImageEntry, Problem, entries_in_time, in_order
+from edgeslam_torch.types import FloatArray, Frame
 
 SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp"})
 MAX_PIXELS = 50_000_000
@@ -21,6 +22,8 @@ _MAX_BYTES = 8 * MAX_PIXELS
 """Maximum size of a file: 16 bits and four channels, uncompressed."""
 _JPEG = b"\xff\xd8"
 _EXIF = b"Exif\0\0"
+_COUNTER_STEP = 1000
+"""Numbers in names that are this far apart count microseconds or nanoseconds rather than frames."""
 ASSUMED_HZ = 30.0
 """Assumed rate of images without time stamps; that of webcams, Kinects and the Tello."""
 
@@ -122,6 +125,8 @@ def _bytes(path: Path) -> bytes:
         raise SourceError(f"{path}: {error.strerror or error}") from error
     if data is None:
         raise SourceError(f"{path}: no such file")
+    if not data:
+        raise SourceError(f"{path}: empty file")
     _check_bytes(data, path)
     return data
 
@@ -171,20 +176,21 @@ def image_files(folder: Path) -> list[Path]:
     return sorted((p for p in files if p.is_file()), key=_natural)
 
 
-def entries_from_names(files: Sequence[Path]) -> list[ImageEntry]:
-    """Entries with stamps read from names like ``1305031102.175304.png`` or ``1403636579763555584.png``.
-
-    Names without a time (``frame_0012.png``) are numbered at 30 Hz.
-    """
-    stamps = _stamps_in_names(files)
-    if stamps is None:
-        stamps = [i / ASSUMED_HZ for i in range(len(files))]
-    return [ImageEntry(i, stamp, path) for i, (stamp, path) in enumerate(zip(stamps, files, strict=True))]
-
-
 def list_image_folder(folder: Path) -> tuple[list[ImageEntry], list[Problem]]:
-    """Images of a folder without a list."""
-    return in_order(entries_from_names(image_files(folder)), str(folder))
+    """Images of a folder without a list, by the times in their names, else by their order at `ASSUMED_HZ`.
+
+    Raises:
+        SourceError: If most names have the same time.
+    """
+    files = image_files(folder)
+    stamps = _stamps_in_names(files)
+    if stamps is not None:
+        return entries_in_time(stamps, files, str(folder))
+    kept, problems = in_order([ImageEntry(i, i / ASSUMED_HZ, path) for i, path in enumerate(files)], str(folder))
+    if len(files) > 1:
+        reason = f"file names hold no times: {ASSUMED_HZ:.0f} images/s are assumed; rgb.txt with 'stamp path' says it"
+        problems.append(Problem(str(folder), reason, frames=0))
+    return kept, problems
 
 
 def frames_of(entries: Sequence[ImageEntry], size: tuple[int, int], problems: list[Problem]) -> Iterator[Frame]:
@@ -226,18 +232,21 @@ def first_size(entries: Sequence[ImageEntry], name: str) -> tuple[int, int]:
     raise SourceError(f"{name}: none of its images can be read ({len(entries)} listed; the first: {first})")
 
 
-def _stamps_in_names(files: Sequence[Path]) -> list[float] | None:
+def _stamps_in_names(files: Sequence[Path]) -> FloatArray | None:
+    """Stamps that are names such as ``1305031102.175304.png`` or ``1403636579763555584.png``, in any unit; None of
+    names without a time and of counters (``000012.png``)."""
     stems = [path.stem for path in files]
     if not stems or not all(re.fullmatch(r"\d+(\.\d+)?", stem) for stem in stems):
         return None
-    has_point = any("." in stem for stem in stems)
-    stamps, unit = seconds_from([float(stem) for stem in stems])
-    if not has_point and unit == "s" and float(np.median(stamps)) < 1e9:
-        return None  # 000012.png counts frames
-    gaps = np.diff(np.sort(stamps))
-    if len(gaps) and not 1e-4 < float(np.median(gaps)) < 60.0:
+    stamps = np.array([float(stem) for stem in stems])
+    seconds, unit = seconds_of(stamps)
+    if unit == UNKNOWN:
         return None
-    return stamps.tolist()
+    if not any("." in stem for stem in stems) and not is_date(seconds):
+        gaps = np.diff(np.sort(stamps))
+        if not len(gaps) or np.median(gaps) < _COUNTER_STEP:
+            return None
+    return stamps
 
 
 def _natural(path: Path) -> tuple[list[int | str], str]:

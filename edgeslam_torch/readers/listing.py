@@ -8,8 +8,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from edgeslam_torch.errors import SourceError
+from edgeslam_torch.files.tables import number, read_table
+from edgeslam_torch.files.time_units import MAX_STAMP_S, NAMES, UNKNOWN, is_date, seconds_of
 from edgeslam_torch.types import FloatArray, IntArray
 
 
@@ -32,54 +35,69 @@ class ImageEntry:
     path: Path
 
 
-def seconds_from(stamps: Sequence[float]) -> tuple[FloatArray, str]:
-    """Stamps in seconds and their original unit, inferred from their magnitude.
-
-    Unix time is about 2e9 s now; the ranges of the units do not overlap before the year 5138.
-
-    Example:
-        >>> seconds_from([1403636579763555584.0])[1]
-        'ns'
-    """
-    array = np.asarray(stamps, dtype=np.float64)
-    size = float(np.median(np.abs(array))) if len(array) else 0.0
-    for unit, limit, factor in (("ns", 1e17, 1e-9), ("us", 1e14, 1e-6), ("ms", 1e11, 1e-3)):
-        if size >= limit:
-            return array * factor, unit
-    return array, "s"
-
-
 def read_list(path: Path) -> tuple[list[tuple[float, str]], list[Problem]]:
     """Rows ``stamp path`` of a list; other lines become problems.
 
     Raises:
         SourceError: If the file is not text.
     """
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (UnicodeDecodeError, OSError) as error:
-        raise SourceError(f"{path}: cannot be read as a text list of images ({error})") from error
     rows: list[tuple[float, str]] = []
     problems: list[Problem] = []
-    for number, line in enumerate(text.splitlines(), start=1):
-        line = line.strip()
-        if not line or line.startswith("#"):
+    table = read_table(path, SourceError, columns=2)
+    if table.header and not table.rows:
+        problems.append(Problem(f"{path}:1", f"not 'stamp path': {' '.join(table.header)[:60]!r}"))
+    for row in table.rows:
+        value = number(row.cells[0])
+        if value is None or not math.isfinite(value) or len(row.cells) < 2 or not row.cells[1]:
+            problems.append(Problem(f"{path}:{row.line}", f"not 'stamp path': {' '.join(row.cells)[:60]!r}"))
             continue
-        stamp, _, name = line.replace(",", " ", 1).partition(" ")
-        value = _finite(stamp)
-        if value is None or not name.strip():
-            problems.append(Problem(f"{path}:{number}", f"not 'stamp path': {line[:60]!r}"))
-            continue
-        rows.append((value, name.strip()))
+        rows.append((value, row.cells[1]))
     return rows, problems
 
 
-def _finite(text: str) -> float | None:
-    try:
-        value = float(text)
-    except ValueError:
-        return None
-    return value if math.isfinite(value) else None
+def read_times(path: Path) -> FloatArray:
+    """Stamps of a file with one a line.
+
+    Raises:
+        SourceError: If it is not such a file.
+    """
+    return read_table(path, SourceError).numbers([0])[:, 0]
+
+
+def entries_in_time(
+    stamps: ArrayLike, paths: Sequence[Path], name: str, unit: str = "s"
+) -> tuple[list[ImageEntry], list[Problem]]:
+    """Images in time order, as `in_order`, from stamps in any unit.
+
+    Args:
+        stamps: One an image.
+        paths: The images.
+        name: File or folder that lists them, for messages.
+        unit: Unit that the stamps should have; another one is a remark.
+
+    Raises:
+        SourceError: As `in_order`.
+    """
+    seconds, remarks = image_times(stamps, name, unit)
+    entries = [ImageEntry(i, stamp, path) for i, (stamp, path) in enumerate(zip(seconds.tolist(), paths, strict=True))]
+    kept, problems = in_order(entries, name)
+    return kept, [*remarks, *problems]
+
+
+def image_times(stamps: ArrayLike, name: str, unit: str = "s") -> tuple[FloatArray, list[Problem]]:
+    """Stamps in seconds, and a remark if they are in another unit than ``unit`` or plausible in none.
+
+    Dates of our time are in no doubt and need no remark. ``name`` is for messages.
+    """
+    seconds, found = seconds_of(stamps)
+    if found == unit or (found != UNKNOWN and is_date(seconds)):
+        return seconds, []
+    gap = np.median(np.abs(np.diff(seconds)))
+    if found == UNKNOWN:
+        reason = f"stamps are {gap:.3g} apart, which is the time between two images in no unit; taken as seconds"
+    else:
+        reason = f"stamps are read as {NAMES[found]}: the images are {gap:.3g} s apart"
+    return seconds, [Problem(name, reason, frames=0)]
 
 
 def in_order(entries: Sequence[ImageEntry], name: str) -> tuple[list[ImageEntry], list[Problem]]:
@@ -91,9 +109,23 @@ def in_order(entries: Sequence[ImageEntry], name: str) -> tuple[list[ImageEntry]
     Args:
         entries: As listed.
         name: File or folder that lists them, for messages.
+
+    Raises:
+        SourceError: If most images have the stamp of another one.
     """
+    problems = [
+        Problem(str(entry.path), f"stamp {entry.stamp_s:g} is no time; image left out")
+        for entry in entries
+        if not abs(entry.stamp_s) <= MAX_STAMP_S
+    ]
+    entries = [entry for entry in entries if abs(entry.stamp_s) <= MAX_STAMP_S]
     stamps = np.array([entry.stamp_s for entry in entries])
-    problems: list[Problem] = []
+    different = len(np.unique(stamps))
+    if 2 * different < len(entries):
+        raise SourceError(
+            f"{name}: {len(entries)} images have only {different} different stamps, such as {stamps[0]:.6f}; each "
+            "image needs its own (were their decimals cut off?)"
+        )
     keep = _longest_increasing(stamps)
     if len(keep) < 0.9 * len(entries) and np.any(np.diff(stamps) < 0):
         falls = bool(np.all(np.diff(stamps) <= 0))

@@ -54,6 +54,7 @@ STATUS_COLUMNS = (
     "revision",
     "unit",
     "step_ms",
+    "image",
 )
 """Columns of ``status.csv``, followed by one column ``<stage>_ms`` per stage."""
 
@@ -103,14 +104,15 @@ class RunWriter:
         except OSError as error:
             raise OutputError(f"{folder}: cannot write results there ({error.strerror or error})") from error
 
-    def append(self, output: SlamOutput, step_ms: float) -> bool:
-        """Add one frame to the trajectories and the status table; False after a write error."""
+    def append(self, output: SlamOutput, step_ms: float, image: str = "") -> bool:
+        """Add one frame, with the name of its image file, to the trajectories and the status table; False after a write
+        error."""
         if self.failure is not None:
             return False
         try:
             if self._live is None:
                 self._live = self._begun()
-            self._live.add(output, step_ms)
+            self._live.add(output, step_ms, image)
         except OSError as error:
             self.failure = f"{self.folder}: cannot write any more ({error.strerror or error})"
             return False
@@ -201,23 +203,23 @@ class _LiveFiles:
         self._trajectory = Appender(folder / TRAJECTORY, TRAJECTORY_HEADER)
         self._online = Appender(folder / ONLINE, TRAJECTORY_HEADER)
 
-    def add(self, output: SlamOutput, step_ms: float) -> None:
+    def add(self, output: SlamOutput, step_ms: float, image: str) -> None:
         line = tum_line(output.stamp_s, output.T_w_c)
         self._trajectory.write(line)
         self._online.write(line)
-        self._write_status(output, step_ms)
+        self._write_status(output, step_ms, image)
 
     def close(self) -> None:
         for file in (self._trajectory, self._online, self._status):
             file.close()
 
-    def _write_status(self, output: SlamOutput, step_ms: float) -> None:
+    def _write_status(self, output: SlamOutput, step_ms: float, image: str) -> None:
         new = [stage for stage in output.stage_ms if stage not in self._stages]
         if new:  # columns for stages that ran later
             self._stages += new
             self._rewrite_status(self._status_rows())
         stages = [_number(output.stage_ms.get(stage, math.nan), 3) for stage in self._stages]
-        self._status.write(_csv_line([*_status_row(output, step_ms), *stages]))
+        self._status.write(_csv_line([*_status_row(output, step_ms, image), *stages]))
 
     def settle(self, support: Support) -> None:
         """Replace each frame's live support by that of its final pose."""
@@ -271,7 +273,7 @@ def _plain(value: Any) -> Any:
     return str(value)
 
 
-def _status_row(output: SlamOutput, step_ms: float) -> list[str]:
+def _status_row(output: SlamOutput, step_ms: float, image: str) -> list[str]:
     return [
         str(output.index),
         f"{output.stamp_s:.6f}",
@@ -290,6 +292,7 @@ def _status_row(output: SlamOutput, step_ms: float) -> list[str]:
         str(output.revision),
         _number(output.unit, 6),
         _number(step_ms, 3),
+        image,
     ]
 
 

@@ -183,7 +183,7 @@ def test_image_of_another_size_is_left_out(tmp_path, write_images):
     write_images(tmp_path, ["3.png"], (32, 24))
     source = open_source(tmp_path)
     assert len(list(source.frames())) == 2
-    assert "32x24" in source.problems[0].reason
+    assert "32x24" in source.problems[-1].reason
 
 
 def test_malformed_lines_of_a_list_are_named(tmp_path, write_tum):

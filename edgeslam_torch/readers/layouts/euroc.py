@@ -3,8 +3,8 @@
 from pathlib import Path
 
 from edgeslam_torch.errors import SourceError
-from edgeslam_torch.readers.images import entries_from_names, image_files
-from edgeslam_torch.readers.listing import ImageEntry, Problem, in_order, read_list
+from edgeslam_torch.readers.images import list_image_folder
+from edgeslam_torch.readers.listing import ImageEntry, Problem, entries_in_time, read_list
 from edgeslam_torch.readers.sequence import Sequence
 
 KIND = "euroc"
@@ -50,10 +50,10 @@ def _images(folder: Path) -> tuple[list[ImageEntry], list[Problem]]:
     """
     listing = folder / "data.csv"
     if not listing.is_file():
-        return in_order(entries_from_names(image_files(folder / "data")), str(folder / "data"))
+        return list_image_folder(folder / "data")
     rows, problems = read_list(listing)
     if not rows:
         raise SourceError(f"{listing}: lists no image; each line is 'nanoseconds,file name'")
-    entries = [ImageEntry(i, stamp * 1e-9, folder / "data" / name) for i, (stamp, name) in enumerate(rows)]
-    kept, more = in_order(entries, str(listing))
+    stamps, names = zip(*rows, strict=True)
+    kept, more = entries_in_time(stamps, [folder / "data" / name for name in names], str(listing), unit="ns")
     return kept, problems + more

@@ -7,10 +7,10 @@ the left grey one (``image_0``). True poses are those of the grey camera, 6 cm b
 import math
 from pathlib import Path
 
-from edgeslam_torch.errors import CalibrationError, SourceError
+from edgeslam_torch.errors import CalibrationError
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.readers.images import first_size, image_files
-from edgeslam_torch.readers.listing import ImageEntry, Problem, in_order
+from edgeslam_torch.readers.listing import ImageEntry, Problem, image_times, in_order, read_times
 from edgeslam_torch.readers.sequence import Sequence
 
 KIND = "kitti"
@@ -27,13 +27,12 @@ def recognises(folder: Path) -> bool:
 def read(folder: Path) -> Sequence:
     """Images with the stamps of ``times.txt``, whose line is the number in an image's name."""
     name = next(name for name in _CAMERAS if (folder / name).is_dir())
-    stamps = _times(folder / "times.txt")
+    stamps, problems = image_times(read_times(folder / "times.txt"), str(folder / "times.txt"))
     entries: list[ImageEntry] = []
-    problems: list[Problem] = []
     for path in image_files(folder / name):
         number = int(path.stem) if path.stem.isdecimal() else -1
         if 0 <= number < len(stamps):
-            entries.append(ImageEntry(len(entries), stamps[number], path))
+            entries.append(ImageEntry(len(entries), float(stamps[number]), path))
         else:
             problems.append(Problem(str(path), "its name is no line of times.txt"))
     kept, more = in_order(entries, str(folder / name))
@@ -44,19 +43,9 @@ def read(folder: Path) -> Sequence:
         tuple(kept),
         (*problems, *more),
         groundtruth=truth if truth.is_file() else None,
-        groundtruth_stamps_s=tuple(stamps),
+        groundtruth_stamps_s=tuple(stamps.tolist()),
         camera=_camera(folder / "calib.txt", _CAMERAS[name], kept),
     )
-
-
-def _times(path: Path) -> list[float]:
-    try:
-        stamps = [float(word) for word in path.read_text(encoding="utf-8").split()]
-    except (ValueError, OSError) as error:
-        raise SourceError(f"{path}: each line must be seconds since the first image ({error})") from error
-    if not all(math.isfinite(stamp) for stamp in stamps):
-        raise SourceError(f"{path}: a stamp is not finite")
-    return stamps
 
 
 def _camera(path: Path, matrix: str, images: list[ImageEntry]) -> Camera | None:

@@ -9,10 +9,11 @@ import numpy as np
 
 from edgeslam_torch.errors import CalibrationError, SourceError
 from edgeslam_torch.files.record_files import read_mapping
+from edgeslam_torch.files.tables import read_table
 from edgeslam_torch.geometry.camera import PRESETS, Camera
-from edgeslam_torch.readers.images import entries_from_names, image_files
+from edgeslam_torch.readers.images import image_files, list_image_folder
 from edgeslam_torch.readers.layouts import seven_scenes
-from edgeslam_torch.readers.listing import ImageEntry, Problem, in_order, read_list, seconds_from
+from edgeslam_torch.readers.listing import ImageEntry, Problem, entries_in_time, read_list
 from edgeslam_torch.readers.sequence import DepthMaps, Sequence
 
 KIND = "tum"
@@ -63,24 +64,26 @@ def read(folder: Path) -> Sequence:
 def _images(folder: Path) -> tuple[list[ImageEntry], list[Problem]]:
     listing = find_list(folder)
     if listing is None:
-        return in_order(entries_from_names(image_files(folder / "rgb")), str(folder / "rgb"))
-    rows, problems = read_list(listing)
-    if not rows:
+        return list_image_folder(folder / "rgb")
+    entries, problems = _listed(listing)
+    if not entries:
         raise SourceError(f"{listing}: lists no image; a line is 'stamp path', such as '12.34 rgb/12.34.png'")
-    stamps, _ = seconds_from([stamp for stamp, _ in rows])
-    entries = [ImageEntry(i, float(stamps[i]), folder / name) for i, (_, name) in enumerate(rows)]
-    kept, more = in_order(entries, str(listing))
-    return kept, problems + more
+    return entries, problems
+
+
+def _listed(listing: Path) -> tuple[list[ImageEntry], list[Problem]]:
+    """Entries of a list of files beside it, in time order."""
+    rows, problems = read_list(listing)
+    paths = [listing.parent / name for _, name in rows]
+    entries, more = entries_in_time([stamp for stamp, _ in rows], paths, str(listing))
+    return entries, problems + more
 
 
 def _depth(folder: Path) -> DepthMaps:
     """Maps of ``depth.txt``, whose comments may say ``value / 1000`` and ``not registered`` (then 7-Scenes' Kinect)."""
     listing = folder / DEPTH_LIST
-    rows, problems = read_list(listing)
-    stamps, _ = seconds_from([stamp for stamp, _ in rows])
-    entries = [ImageEntry(i, float(stamps[i]), folder / name) for i, (_, name) in enumerate(rows)]
-    kept, more = in_order(entries, str(listing))
-    said = " ".join(line for line in listing.read_text("utf-8-sig").splitlines() if line.startswith("#")).lower()
+    kept, problems = _listed(listing)
+    said = " ".join(read_table(listing, SourceError).comments).lower()
     stated = re.search(r"value\s*/\s*(\d+)", said)
     units, remarks = (float(stated[1]), []) if stated else _units_per_metre(folder)
     other = "not registered" in said
@@ -90,7 +93,7 @@ def _depth(folder: Path) -> DepthMaps:
         1.0 / units,
         seven_scenes.DEPTH_CAMERA if other else None,
         seven_scenes.T_COLOUR_DEPTH if other else np.eye(4),
-        (*problems, *more, *remarks),
+        (*problems, *remarks),
     )
 
 

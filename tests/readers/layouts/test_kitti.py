@@ -55,5 +55,5 @@ def test_bad_files_are_named(sequence):
     with pytest.raises(CalibrationError, match=r"calib\.txt: no line 'P2:'"):
         open_source(sequence)
     (sequence / "times.txt").write_text("0.0\nlater\n")
-    with pytest.raises(SourceError, match=r"times\.txt: each line"):
+    with pytest.raises(SourceError, match=r"times\.txt: line 2"):
         open_source(sequence)

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
+from edgeslam_torch.errors import SourceError
 from edgeslam_torch.eval.inputs.dataset import open_dataset
 from edgeslam_torch.readers import layouts as package
 from edgeslam_torch.readers.layouts import layout_of, layouts
@@ -94,3 +95,48 @@ def test_nothing_outside_their_folder_names_a_layout():
     for path in (path for path in paths if path.parent.name != "layouts"):
         text = path.read_text(encoding="utf-8")
         assert not [m for m in modules if f"readers.layouts.{m}" in text or f"readers.layouts import {m}" in text], path
+
+
+def stamped(i: int, factor: float, begin_s: float = 1305031102.2) -> str:
+    return f"{(begin_s + i / 30) * factor:.{6 if factor == 1 else 0}f}"
+
+
+@pytest.mark.parametrize("factor", [1, 1e3, 1e6, 1e9])
+@pytest.mark.parametrize("kind", ["tum", "euroc", "kitti", "mono_vo"])
+def test_stamps_of_a_layout_may_be_in_any_unit(tmp_path: Path, write_images, kind, factor):
+    lists = {
+        "tum": ("rgb.txt", "rgb", "{0} rgb/{1}"),
+        "euroc": ("mav0/cam0/data.csv", "mav0/cam0/data", "{0},{1}"),
+        "kitti": ("times.txt", "image_0", "{0}"),
+        "mono_vo": ("times.txt", "images", "{2} {0} 12.5"),
+    }
+    listing, images, line = lists[kind]
+    names = [f"{i:05d}.png" for i in range(12)]
+    write_images(tmp_path / images, names)
+    rows = [line.format(stamped(i, factor), name, name[:5]) for i, name in enumerate(names)]
+    (tmp_path / listing).write_text("\n".join(rows) + "\n")
+    cv2.imwrite(str(tmp_path / "vignette.png"), np.full((48, 64), 65535, np.uint16))
+    source = open_source(tmp_path)
+    stamps = [frame.stamp_s for frame in source.frames()]
+    assert source.kind == kind
+    assert np.allclose(stamps, [1305031102.2 + i / 30 for i in range(12)], atol=2e-3)
+
+
+@pytest.mark.parametrize("begin", [0, 328551511918592, 1403636579763555584])
+def test_names_may_be_nanoseconds(tmp_path: Path, write_images, begin):
+    write_images(tmp_path, [f"{begin + i * 33333333}.png" for i in range(12)])
+    source = open_source(tmp_path)
+    assert np.allclose(np.diff([frame.stamp_s for frame in source.frames()]), 1 / 30, rtol=1e-3)
+
+
+def test_an_assumed_rate_is_said(tmp_path: Path, write_images):
+    write_images(tmp_path, [f"{i:06d}.png" for i in range(4)])
+    assert any("30 images/s" in problem.reason for problem in open_source(tmp_path).problems)
+
+
+@pytest.mark.parametrize("rows", [["0.1"], ["a 0.1", "b 0.2"]])
+def test_times_that_do_not_fit_the_images_are_refused(tmp_path: Path, write_images, rows):
+    write_images(tmp_path / "images", [f"{i}.png" for i in range(4)])
+    (tmp_path / "times.txt").write_text("\n".join(rows))
+    with pytest.raises(SourceError, match="times.txt"):
+        open_source(tmp_path)
