@@ -2,7 +2,6 @@
 
 import argparse
 import difflib
-import errno
 import importlib
 import logging
 import math
@@ -10,9 +9,10 @@ import os
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import NoReturn, TextIO
+from typing import NoReturn
 
 from edgeslam_torch import __version__
+from edgeslam_torch.console import console, exit_code
 from edgeslam_torch.errors import EdgeSlamError
 
 Commands = Mapping[str, tuple[str, str]]
@@ -20,7 +20,6 @@ Commands = Mapping[str, tuple[str, str]]
 
 EXIT_ERROR = 1
 EXIT_USAGE = 2
-EXIT_HUNG_UP = 129
 
 
 class Parser(argparse.ArgumentParser):
@@ -66,6 +65,18 @@ def _finite_number(text: str) -> float:
 
 def run_command(arguments: list[str], commands: Commands) -> int:
     """Run one of the commands; returns the exit code."""
+    with console() as (out, err):
+        try:
+            code = _run_command(arguments, commands)
+        except SystemExit as end:
+            if end.code:
+                raise
+            code = 0  # --help
+        out.flush()
+        return exit_code(code, out, err)
+
+
+def _run_command(arguments: list[str], commands: Commands) -> int:
     parser = _top_parser(commands)
     split = next((i for i, word in enumerate(arguments) if not word.startswith("-")), len(arguments))
     top, unknown = parser.parse_known_args(arguments[:split])
@@ -86,21 +97,6 @@ def run_command(arguments: list[str], commands: Commands) -> int:
             raise
         sys.stderr.write(f"edgeslam: error: {_one_line(error)}\n")
         return EXIT_ERROR
-    except BrokenPipeError:  # the reader of the pipe, such as head, has closed it
-        _mute(sys.stdout)
-        return 0
-    except OSError as error:
-        if error.errno != errno.EIO or sys.stderr.isatty():
-            raise
-        _mute(sys.stdout, sys.stderr)  # the terminal was closed; results so far are on disk
-        return EXIT_HUNG_UP
-
-
-def _mute(*streams: TextIO) -> None:
-    """Discard further output."""
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    for stream in streams:
-        os.dup2(nowhere, stream.fileno())
 
 
 def _call(name: str, entry: tuple[str, str], arguments: list[str], verbose: bool) -> int:

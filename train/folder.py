@@ -4,10 +4,8 @@
 """
 
 import dataclasses
-import errno
 import json
 import shutil
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from enum import StrEnum
@@ -182,8 +180,6 @@ def out_folder(path: Path, existing: Existing = Existing.SAME) -> Iterator[OutFo
             if made and rank() == 0 and not any(path.iterdir()):
                 path.rmdir()
     except OSError as error:
-        if isinstance(error, BrokenPipeError) or (error.errno == errno.EIO and sys.stderr.isatty()):
-            raise  # from the terminal, not the disk
         raise OutputError(f"{error.filename or path}: {error.strerror or error}") from error
 
 

@@ -1,9 +1,7 @@
 """``edgeslam record``: record a flight or a camera into a folder that all other commands read."""
 
 import argparse
-import os
 import signal
-import sys
 import threading
 import time
 from collections.abc import Callable
@@ -206,9 +204,4 @@ class _Signals:
 
 
 def _say(text: str) -> None:
-    """Print; ignore a closed terminal or pipe."""
-    try:
-        print(text, flush=True)
-    except OSError:
-        with open(os.devnull, "wb") as nowhere:
-            os.dup2(nowhere.fileno(), sys.stdout.fileno())
+    print(text, flush=True)

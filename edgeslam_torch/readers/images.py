@@ -134,7 +134,7 @@ def _bytes(path: Path) -> bytes:
 def _check_bytes(data: bytes, name: str | Path) -> None:
     """Reject what is no whole image, or too large a one, before anything is decoded."""
     if not data:
-        raise SourceError(f"{name}: empty image")
+        raise SourceError(f"{name}: empty file")
     if data.startswith(_JPEG) and data.rfind(b"\xff\xd9", max(0, len(data) - 65536)) < 0:  # no end marker
         raise SourceError(f"{name}: truncated image")
     size_px = image_size(data)

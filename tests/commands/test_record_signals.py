@@ -5,7 +5,7 @@ import signal
 
 import pytest
 
-from edgeslam_torch.commands.record import _say, _Signals
+from edgeslam_torch.commands.record import _Signals
 
 NAMES = [name for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT") if hasattr(signal, name)]
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="signals as POSIX has them")
@@ -56,16 +56,3 @@ def test_what_nohup_ignores_stays_ignored():
     with _Signals() as signals:
         signal.raise_signal(signal.SIGHUP)
         assert signals.exit_code == 0
-
-
-def test_a_terminal_that_is_gone_ends_nothing(monkeypatch):
-    def gone(*_, **__):
-        raise OSError(5, "Input/output error")
-
-    moved = []
-    monkeypatch.setattr("builtins.print", gone)
-    monkeypatch.setattr(os, "dup2", lambda old, new: moved.append(new))
-    with open(os.devnull, "w") as nowhere:
-        monkeypatch.setattr("sys.stdout", nowhere)
-        _say("landing")
-        assert moved == [nowhere.fileno()]
