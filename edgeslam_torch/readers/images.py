@@ -1,7 +1,9 @@
 """Image files: decoding one, and a folder of them as a source."""
 
 import re
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,7 @@ from numpy.typing import NDArray
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.files.time_units import UNKNOWN, is_date, seconds_of
 from edgeslam_torch.readers.image_size import image_size
+from edgeslam_torch.readers.levels import FIRST, Levels, levels_of
 from edgeslam_torch.readers.listing import ImageEntry, Problem, entries_in_time, in_order
 from edgeslam_torch.types import FloatArray, Frame
 
@@ -20,6 +23,10 @@ MAX_PIXELS = 50_000_000
 """Maximum pixels of an image; 8K video has 33 million. Larger ones are rejected before decoding."""
 _MAX_BYTES = 8 * MAX_PIXELS
 """Maximum size of a file: 16 bits and four channels, uncompressed."""
+_AS_IT_IS = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH
+"""Grey or colour of any depth, without transparency."""
+_LOOKED_AT = 50
+"""Images, spread over a recording, whose sizes tell that of the recording."""
 _JPEG = b"\xff\xd8"
 _EXIF = b"Exif\0\0"
 _COUNTER_STEP = 1000
@@ -63,7 +70,7 @@ def read_image(path: Path) -> NDArray[np.uint8]:
 
 
 def read_pixels(path: Path, flags: int) -> NDArray[Any]:
-    """The image as returned by ``cv2.imread`` with these flags.
+    """The image as `decode` returns it.
 
     Raises:
         SourceError: If the file is missing, empty, damaged, too large or no image.
@@ -72,7 +79,8 @@ def read_pixels(path: Path, flags: int) -> NDArray[Any]:
 
 
 def decode(data: bytes, name: str | Path, flags: int) -> NDArray[Any]:
-    """The image in these bytes, as ``cv2.imread`` would return it.
+    """The image in these bytes, as ``cv2.imread`` would return it; more than eight bits become eight by `levels_of`
+    unless the flags ask for them.
 
     Raises:
         SourceError: If they are empty, damaged, too large or no image.
@@ -80,7 +88,10 @@ def decode(data: bytes, name: str | Path, flags: int) -> NDArray[Any]:
     _check_bytes(data, name)
     if data.startswith(_JPEG):
         _grey_of_jpeg(data, name)
-    return _decoded(data, name, flags)
+    if flags == cv2.IMREAD_UNCHANGED or flags & cv2.IMREAD_ANYDEPTH:
+        return _decoded(data, name, flags)
+    image = _decoded(data, name, flags | cv2.IMREAD_ANYDEPTH)
+    return image if image.dtype == np.uint8 else levels_of([image]).eight_bits(image)
 
 
 def pixels_or_none(path: Path, flags: int) -> NDArray[Any] | None:
@@ -91,8 +102,12 @@ def pixels_or_none(path: Path, flags: int) -> NDArray[Any] | None:
         return None
 
 
-def read_frame(entry: ImageEntry) -> Frame:
+def read_frame(entry: ImageEntry, levels: Callable[[], Levels] | None = None) -> Frame:
     """The frame of one image file.
+
+    Args:
+        entry: The file and its stamp.
+        levels: The recording's, asked for when the image has more than eight bits; default: by this image alone.
 
     Raises:
         SourceError: If the file is missing, empty, damaged, too large or no image.
@@ -100,8 +115,10 @@ def read_frame(entry: ImageEntry) -> Frame:
     data = _bytes(entry.path)
     if data.startswith(_JPEG):
         return JpegFrame(entry.index, entry.stamp_s, data, entry.path)
-    image = np.asarray(_decoded(data, entry.path, cv2.IMREAD_ANYCOLOR), dtype=np.uint8)
-    return Frame(entry.index, entry.stamp_s, image, entry.path)
+    image = _decoded(data, entry.path, _AS_IT_IS)
+    if image.dtype != np.uint8:
+        image = (levels_of([image]) if levels is None else levels()).eight_bits(image)
+    return Frame(entry.index, entry.stamp_s, np.asarray(image, dtype=np.uint8), entry.path)
 
 
 def check_size(width: int, height: int, name: str | Path | None) -> None:
@@ -199,11 +216,20 @@ def frames_of(entries: Sequence[ImageEntry], size: tuple[int, int], problems: li
     Args:
         entries: In time order.
         size: ``(width, height)`` that the camera is calibrated for.
-        problems: List to which each skipped image is added.
+        problems: List to which each skipped image is added, and what becomes of more than eight bits.
     """
-    for entry in entries:
+
+    at = 0
+
+    @cache
+    def levels() -> Levels:
+        found = levels_of(_deep(entries[at : at + FIRST]))
+        problems.append(Problem(str(entries[at].path.parent), f"more than 8 bits: {found.words}", frames=0))
+        return found
+
+    for at, entry in enumerate(entries):  # noqa: B007, of `levels`
         try:
-            frame = read_frame(entry)
+            frame = read_frame(entry, levels)
         except SourceError as error:
             problems.append(Problem(str(entry.path), str(error).removeprefix(f"{entry.path}: ")))
             continue
@@ -215,21 +241,46 @@ def frames_of(entries: Sequence[ImageEntry], size: tuple[int, int], problems: li
         yield frame
 
 
-def first_size(entries: Sequence[ImageEntry], name: str) -> tuple[int, int]:
-    """``(width, height)`` of the first image that can be read.
+def usual_size(entries: Sequence[ImageEntry], name: str) -> tuple[int, int]:
+    """``(width, height)`` of most images, by a sample of them.
 
     Raises:
-        SourceError: If none can.
+        SourceError: If none can be read, or no size is that of at least half of them.
     """
+    sample = entries[:: max(1, len(entries) // _LOOKED_AT)]
+    sizes: dict[ImageEntry, tuple[int, int]] = {}
     first = ""
-    for entry in entries:
+    for entry in sample:
         try:
-            image = read_image(entry.path)
+            sizes[entry] = image_size(_bytes(entry.path)) or (0, 0)
         except SourceError as error:
             first = first or str(error)
-            continue
-        return image.shape[1], image.shape[0]
+    for size, count in Counter(sizes.values()).most_common():
+        if 2 * count < len(sizes):
+            found = ", ".join(f"{width}x{height}" for width, height in list(dict.fromkeys(sizes.values()))[:4])
+            raise SourceError(f"{name}: images of several sizes ({found}), none of which most of them have")
+        for entry in (entry for entry in sizes if sizes[entry] == size):
+            try:
+                height, width = read_pixels(entry.path, cv2.IMREAD_GRAYSCALE).shape  # turned as its EXIF data says
+            except SourceError as error:
+                first = first or str(error)
+                continue
+            return width, height
+    rest = [entry for entry in entries if entry not in sample]
+    if rest:
+        return usual_size(rest, name)
     raise SourceError(f"{name}: none of its images can be read ({len(entries)} listed; the first: {first})")
+
+
+def _deep(entries: Sequence[ImageEntry]) -> Iterator[NDArray[Any]]:
+    """Images of more than eight bits among these."""
+    for entry in entries:
+        try:
+            image = read_pixels(entry.path, _AS_IT_IS)
+        except SourceError:
+            continue
+        if image.dtype != np.uint8:
+            yield image
 
 
 def _stamps_in_names(files: Sequence[Path]) -> FloatArray | None:

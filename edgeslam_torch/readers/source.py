@@ -238,7 +238,7 @@ def _listed(sequence: ImageSequence, place: Path) -> _Content:
     return _Content(
         sequence.kind,
         lambda size, found: images.frames_of(sequence.images, size, found),
-        images.first_size(sequence.images, str(place)),
+        images.usual_size(sequence.images, str(place)),
         len(sequence.images),
         list(sequence.problems),
         sequence.folder,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from edgeslam_torch.errors import SourceError
-from edgeslam_torch.readers.images import frames_of, pixels_or_none, read_frame, read_image, read_pixels
+from edgeslam_torch.readers.images import frames_of, pixels_or_none, read_frame, read_image, read_pixels, usual_size
 from edgeslam_torch.readers.listing import ImageEntry
 
 
@@ -125,3 +125,39 @@ def test_a_file_too_large_for_an_image_is_not_read(tmp_path):
         file.truncate(1 << 40)
     with pytest.raises(SourceError, match="a.png: 1099512 MB is too large for an image"):
         read_image(tmp_path / "a.png")
+
+
+@pytest.mark.parametrize("channels", [1, 3, 4])
+def test_sixteen_bits_keep_their_contrast_and_are_said_once(tmp_path, channels):
+    grey = np.arange(80 * 60).reshape(60, 80) % 251
+    deep = (7000 + np.repeat(grey[..., None], channels, axis=2)).astype(np.uint16)
+    entries = [ImageEntry(i, i / 10, tmp_path / f"{i}.png") for i in range(15)]
+    for entry in entries:
+        cv2.imwrite(str(entry.path), deep.squeeze())
+    problems = []
+    frames = list(frames_of(entries, (80, 60), problems))
+    assert len(frames) == 15
+    assert frames[14].image.shape == ((60, 80) if channels == 1 else (60, 80, 3))
+    assert np.ptp(frames[14].image.astype(int)) > 150
+    assert ["8 bits" in problem.reason for problem in problems] == [True]
+    assert np.ptp(read_image(entries[0].path).astype(int)) > 150
+
+
+@pytest.mark.parametrize("odd", [0, 3])
+def test_the_size_of_most_images_is_the_recordings(tmp_path, odd):
+    entries = [ImageEntry(i, i / 10, tmp_path / f"{i}.png") for i in range(6)]
+    for entry in entries:
+        cv2.imwrite(str(entry.path), picture()[:: 1 + (entry.index == odd)])
+    assert usual_size(entries, "here") == picture().shape[1::-1]
+    for i in range(6):
+        cv2.imwrite(str(entries[i].path), picture()[: 32 + i])
+    with pytest.raises(SourceError, match="here: images of several sizes"):
+        usual_size(entries, "here")
+
+
+def test_the_size_of_a_turned_jpeg_is_that_of_its_pixels(entry):
+    listed = entry("a.jpg", picture())
+    tiff = b"MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0"
+    exif = b"\xff\xe1" + (8 + len(tiff)).to_bytes(2, "big") + b"Exif\0\0" + tiff
+    listed.path.write_bytes(b"\xff\xd8" + exif + listed.path.read_bytes()[2:])
+    assert usual_size([listed], "here") == (60, 80)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.readers.images import check_size, decode
+from edgeslam_torch.readers.levels import Levels, levels_of
 
 _CHANNELS = {"mono8": 1, "8UC1": 1, "8UC3": 3, "8UC4": 4, "rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4}
 _CHANNELS |= {"yuv422": 2, "yuv422_yuy2": 2, "uyvy": 2, "yuyv": 2, "mono16": 1, "16UC1": 1}
@@ -44,15 +45,36 @@ def _format(message: Any) -> str:
 
 
 class PictureDecoder:
-    """Reads the pictures of one topic; 16 bits are scaled to 8 as the first picture needs."""
+    """Reads the pictures of one topic."""
 
-    def __init__(self, name: str) -> None:
-        """``name``: file and topic, for messages."""
+    def __init__(self, name: str, levels: Levels | None = None) -> None:
+        """Choose the levels of pictures of more than eight bits.
+
+        Args:
+            name: File and topic, for messages.
+            levels: Default: by the first such picture.
+        """
         self.name = name
-        self._shift: int | None = None
+        self._levels = levels
 
     def decode(self, message: Any) -> NDArray[np.uint8]:
-        """``(H, W, 3)`` BGR or ``(H, W)`` grey.
+        """``(H, W, 3)`` BGR or ``(H, W)`` grey, of eight bits.
+
+        Raises:
+            SourceError: As `pixels`.
+        """
+        picture, code = self.pixels(message)
+        if picture.dtype != np.uint8:
+            self._levels = self._levels or levels_of([picture])
+            picture = self._levels.eight_bits(picture)
+        try:
+            return np.asarray(picture if code is None else cv2.cvtColor(picture, code), np.uint8)
+        except cv2.error as error:
+            height, width = picture.shape[:2]
+            raise SourceError(f"{self.name}: {_format(message)[:40]} cannot have {width}x{height} pixels") from error
+
+    def pixels(self, message: Any) -> tuple[NDArray[Any], int | None]:
+        """The picture with all its bits, and OpenCV's code that makes it BGR; None for grey and BGR.
 
         Raises:
             SourceError: If the encoding is a depth map's or not known, or the picture is damaged.
@@ -64,11 +86,9 @@ class PictureDecoder:
             return self._plain(message)
         data = np.asarray(message.data, dtype=np.uint8).tobytes()
         picture = decode(data, f"{self.name}: compressed as {_format(message)[:40]!r}", cv2.IMREAD_UNCHANGED)
-        if picture.dtype != np.uint8:
-            picture = self._eight_bits(picture)
-        return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGRA2BGR) if picture.shape[2:] == (4,) else picture)
+        return picture, cv2.COLOR_BGRA2BGR if picture.shape[2:] == (4,) else None
 
-    def _plain(self, message: Any) -> NDArray[np.uint8]:
+    def _plain(self, message: Any) -> tuple[NDArray[Any], int | None]:
         encoding, (width, height) = str(message.encoding), (int(message.width), int(message.height))
         bayer = re.fullmatch(r"(bayer_(?:rggb|bggr|gbrg|grbg))(8|16)", encoding)
         channels = 1 if bayer else _CHANNELS.get(encoding)
@@ -89,17 +109,7 @@ class PictureDecoder:
         pixels = padded.reshape(height, step)[:, :row]
         if deep:
             order = ">u2" if message.is_bigendian else "<u2"
-            image = self._eight_bits(np.ascontiguousarray(pixels).view(order).reshape(height, width))
+            image = np.ascontiguousarray(pixels).view(order).reshape(height, width).astype(np.uint16)
         else:
             image = np.ascontiguousarray(pixels).reshape((height, width, channels) if channels > 1 else (height, width))
-        code = _TO_BGR.get(bayer[1] if bayer else encoding)
-        try:
-            return image if code is None else np.asarray(cv2.cvtColor(image, code), np.uint8)
-        except cv2.error as error:
-            raise SourceError(f"{self.name}: {encoding} cannot have {width}x{height} pixels") from error
-
-    def _eight_bits(self, image: np.ndarray) -> NDArray[np.uint8]:
-        """Cameras send 10, 12 or 14 bits in 16: the first picture's brightest pixel tells how many."""
-        if self._shift is None:
-            self._shift = max(0, int(image.max(initial=0)).bit_length() - 8)
-        return np.asarray(np.minimum(image.astype(np.uint16) >> self._shift, 255), np.uint8)
+        return image, _TO_BGR.get(bayer[1] if bayer else encoding)

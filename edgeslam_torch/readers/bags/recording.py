@@ -1,9 +1,14 @@
 """A bag as a recording: pictures with stamps, calibration, telemetry."""
 
 import math
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.geometry.camera import Camera
@@ -13,6 +18,7 @@ from edgeslam_torch.readers.bags.lens import camera_from_info
 from edgeslam_torch.readers.bags.pictures import PictureDecoder
 from edgeslam_torch.readers.bags.telemetry import read_bag_telemetry
 from edgeslam_torch.readers.bags.topics import Choice, choose
+from edgeslam_torch.readers.levels import FIRST, Levels, levels_of
 from edgeslam_torch.readers.listing import Problem
 from edgeslam_torch.types import Frame, TelemetrySample
 
@@ -37,12 +43,14 @@ class BagRecording:
     """One line each, for the user."""
     offset: Offset
     """Of the pictures' header stamps."""
+    levels: Levels | None
+    """Of pictures of more than eight bits."""
 
     def frames(self, problems: list[Problem]) -> Iterator[Frame]:
         """Pictures with increasing stamps, read a chunk of the file at a time; skipped ones go to ``problems``."""
         name = self.choice.image
         label = f"{self.bag.path.name}:{name}"
-        decoder, clock = PictureDecoder(label), TopicClock(self.offset.value_s, self.offset.fault is None)
+        decoder, clock = PictureDecoder(label, self.levels), TopicClock(self.offset.value_s, self.offset.fault is None)
         last = -math.inf
         for index, raw in enumerate(self.bag.messages([name])):
             where = f"{label}, picture {index}"
@@ -84,13 +92,15 @@ def open_bag(path: Path, topics: Sequence[str] = (), calibrated: bool = False) -
     count = next(topic.count for topic in bag.topics if topic.name == choice.image)
     remarks = list(choice.remarks)
     camera = None if calibrated else _camera(bag, choice, remarks)
-    size = _first_size(bag, choice.image)
+    size, levels = _first_look(bag, choice.image)
+    if levels is not None:
+        remarks.append(f"{choice.image}: more than 8 bits: {levels.words}")
     offset, clocks = _clocks(bag, choice, remarks)
     telemetry, said = read_bag_telemetry(bag, choice.telemetry, choice.asked, clocks)
     for name, clock in clocks.items():
         if clock.mended:
             remarks.append(f"{name}: {clock.mended} header stamps jump; the times between receipts were used for them")
-    return BagRecording(bag, choice, size, count, camera, telemetry, (*remarks, *said), offset)
+    return BagRecording(bag, choice, size, count, camera, telemetry, (*remarks, *said), offset, levels)
 
 
 def _camera(bag: Bag, choice: Choice, remarks: list[str]) -> Camera | None:
@@ -104,21 +114,29 @@ def _camera(bag: Bag, choice: Choice, remarks: list[str]) -> Camera | None:
     return camera
 
 
-def _first_size(bag: Bag, name: str) -> tuple[int, int]:
-    """Size of the first picture that can be read among the first `_LOOKED_AT`.
+def _first_look(bag: Bag, name: str) -> tuple[tuple[int, int], Levels | None]:
+    """Size of most pictures among the first `_LOOKED_AT`, and levels of those of more than eight bits.
 
     Raises:
-        SourceError: If none can.
+        SourceError: If none can be read.
     """
     decoder, first = PictureDecoder(f"{bag.path.name}:{name}"), ""
+    sizes: list[tuple[int, int]] = []
+    deep: list[NDArray[Any]] = []
     for raw, _ in zip(bag.messages([name]), range(_LOOKED_AT), strict=False):
         try:
-            image = decoder.decode(bag.decode(raw))
+            message = bag.decode(raw)
+            picture, _code = decoder.pixels(message)
+            height, width = decoder.decode(message).shape[:2]
         except SourceError as error:
             first = first or str(error)
             continue
-        return image.shape[1], image.shape[0]
-    raise SourceError(first or f"{bag.path}: {name} holds no message")
+        sizes.append((width, height))
+        if picture.dtype != np.uint8 and len(deep) < FIRST:
+            deep.append(picture)
+    if not sizes:
+        raise SourceError(first or f"{bag.path}: {name} holds no message")
+    return Counter(sizes).most_common(1)[0][0], levels_of(deep) if deep else None
 
 
 def _clocks(bag: Bag, choice: Choice, remarks: list[str]) -> tuple[Offset, dict[str, TopicClock]]:

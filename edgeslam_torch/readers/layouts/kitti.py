@@ -9,7 +9,7 @@ from pathlib import Path
 
 from edgeslam_torch.errors import CalibrationError
 from edgeslam_torch.geometry.camera import Camera
-from edgeslam_torch.readers.images import first_size, image_files
+from edgeslam_torch.readers.images import image_files, usual_size
 from edgeslam_torch.readers.listing import ImageEntry, Problem, image_times, in_order, read_times
 from edgeslam_torch.readers.sequence import Sequence
 
@@ -60,4 +60,4 @@ def _camera(path: Path, matrix: str, images: list[ImageEntry]) -> Camera | None:
         raise CalibrationError(f"{path}: no line '{matrix}:' with the 12 numbers of a projection matrix") from error
     if not (0 < fx < math.inf and 0 < fy < math.inf and math.isfinite(cx) and math.isfinite(cy)):
         raise CalibrationError(f"{path}: {matrix} is no camera's projection matrix")
-    return Camera(*first_size(images, str(path.parent)), fx, fy, cx, cy, source=f"KITTI's calibration {matrix}")
+    return Camera(*usual_size(images, str(path.parent)), fx, fy, cx, cy, source=f"KITTI's calibration {matrix}")
