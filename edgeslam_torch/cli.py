@@ -14,6 +14,7 @@ COMMANDS = {
     "run": ("edgeslam_torch.commands.run", "trajectory and edge map from a recording, a video or a live camera"),
     "topics": ("edgeslam_torch.commands.topics", "what a ROS bag holds, and what a run would use of it"),
     "eval": ("edgeslam_torch.commands.judging.eval", "judge runs or trajectory files against ground truth"),
+    "compare": ("edgeslam_torch.commands.judging.compare", "two runs side by side, against one ground truth"),
     "bench": ("edgeslam_torch.commands.judging.bench", "accuracy and speed in one table, beside other systems"),
     "judge": (
         "edgeslam_torch.commands.judging.judge",

@@ -66,6 +66,17 @@ class RunFolder:
             return None
 
     @property
+    def own_truth(self) -> Path | None:
+        """Ground truth of the recording that the run read, when it is still there, or in the run's own folder."""
+        folder = self.source
+        if folder is not None and (
+            (folder / "groundtruth.txt").is_file() or (folder / "mav0").is_dir() or any(folder.glob("*.pose.txt"))
+        ):
+            return folder
+        files = (self.path / name for name in ("groundtruth.txt", "ground_truth.txt"))
+        return next((file for file in files if file.is_file()), None)
+
+    @property
     def pose_rows(self) -> tuple[dict[str, str], ...]:
         """Rows of ``status.csv`` that belong to poses of ``trajectory``: of a run in pieces, those of the largest."""
         if len(self.status) == len(self.trajectory):

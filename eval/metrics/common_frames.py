@@ -59,20 +59,3 @@ def score_common(
         scores = (score_trajectory(truth, few, kind, max_dt_s) for kind in (AlignmentKind.SIM3, AlignmentKind.SE3))
         out.append(CommonScore(name, len(estimate), *scores))
     return out
-
-
-def markdown_common(scores: Sequence[CommonScore]) -> str:
-    """Their errors side by side."""
-    common = scores[0].sim3.matched
-    lines = [
-        f"On the {common} frames that all {len(scores)} have (with ground truth), each aligned by itself:",
-        "",
-        "| run | own poses | ATE Sim(3) [m] | ATE SE(3) [m] | max [m] | rotation [deg] | scale - 1 |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    for s in scores:
-        lines.append(
-            f"| {s.name} | {s.frames} | {s.sim3.ate_m.rmse:.4f} | {s.se3.ate_m.rmse:.4f} | {s.sim3.ate_m.max:.4f} "
-            f"| {s.sim3.rotation_deg.rmse:.2f} | {s.sim3.scale - 1:+.1%} |"
-        )
-    return "\n".join(lines)

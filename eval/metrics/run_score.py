@@ -65,7 +65,7 @@ class RunScore:
     """The full Sim(3) score, for plots; not part of `to_dict`."""
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain numbers and strings for JSON."""
+        """Plain numbers and strings for JSON; None for a figure that there is not."""
         record = asdict(replace(self, sim3=None))
         record.pop("sim3")
         if self.sim3 is not None:
@@ -74,7 +74,7 @@ class RunScore:
             record["ate_sim3"] = asdict(self.sim3.ate_m)
             record["rotation"] = asdict(self.sim3.rotation_deg)
             record["truth_path_m"] = self.sim3.truth_path_m
-        return record
+        return finite(record)
 
 
 def evaluate_run(
@@ -142,6 +142,17 @@ def evaluate_run(
         notes=tuple(explain(truth, run.trajectory, judged, max_dt_s)),
         sim3=sim3,
     )
+
+
+def finite(value: Any) -> Any:
+    """Nested numbers that are not finite as None: JSON has no NaN."""
+    if isinstance(value, dict):
+        return {key: finite(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [finite(item) for item in value]
+    if isinstance(value, (float, np.floating)) and not np.isfinite(value):
+        return None
+    return value
 
 
 def _stamped(mine: Trajectory, dataset: EvalDataset | None) -> Trajectory:

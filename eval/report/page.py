@@ -20,7 +20,7 @@ from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.inputs.associate import match
 from edgeslam_torch.eval.inputs.run_folder import RunFolder, is_keyframe, open_run
 from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, read_trajectory
-from edgeslam_torch.eval.metrics.run_score import RunScore, evaluate_run
+from edgeslam_torch.eval.metrics.run_score import RunScore, evaluate_run, finite
 from edgeslam_torch.eval.report import words
 from edgeslam_torch.eval.report.flight_section import flight_section
 from edgeslam_torch.eval.report.keyframe_pictures import keyframe_pictures
@@ -88,7 +88,7 @@ def render(run: RunFolder, score: RunScore | None = None, truth: Trajectory | No
     anchors = _subset(run.cloud("anchors.ply"), _MAX_ANCHORS)
     turn = upright(run.trajectory, score, truth)
     data, packed_edges, packed_anchors = _payload(run, edges, anchors, score, truth, turn)
-    text = json.dumps(_finite(data), allow_nan=False, separators=(",", ":"), default=_plain).replace("<", "\\u003c")
+    text = json.dumps(finite(data), allow_nan=False, separators=(",", ":"), default=_plain).replace("<", "\\u003c")
     script = "\n".join((_PAGE / name).read_text(encoding="utf-8") for name in _SCRIPTS)
     parts = {
         "style": (_PAGE / "style.css").read_text(encoding="utf-8"),
@@ -109,7 +109,7 @@ def judge_run(
 ) -> tuple[RunScore | None, Trajectory | None]:
     """Score and true trajectory; without a given ground truth, what the source folder offers, if anything."""
     given = groundtruth is not None
-    place = Path(groundtruth) if groundtruth is not None else _source_folder(run)
+    place = Path(groundtruth) if groundtruth is not None else run.own_truth
     if place is None:
         return None, None
     try:
@@ -118,19 +118,6 @@ def judge_run(
         if given:
             raise
         return None, None
-
-
-def _source_folder(run: RunFolder) -> Path | None:
-    """The recording that the run read, when it is still there and has ground truth."""
-    folder = run.source
-    if folder is not None and (
-        (folder / "groundtruth.txt").is_file() or (folder / "mav0").is_dir() or any(folder.glob("*.pose.txt"))
-    ):
-        return folder
-    for name in ("groundtruth.txt", "ground_truth.txt"):
-        if (run.path / name).is_file():
-            return run.path / name
-    return None
 
 
 def _payload(
@@ -440,17 +427,6 @@ def _config(run: RunFolder) -> str | None:
 
 def _rounded(values: FloatArray, digits: int) -> list[Any]:
     return list(np.round(np.asarray(values, dtype=np.float64), digits).tolist())
-
-
-def _finite(value: Any) -> Any:
-    """Nested numbers that are not finite as None: JSON has no NaN, and a score of a motionless truth is one."""
-    if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_finite(item) for item in value]
-    if isinstance(value, (float, np.floating)) and not np.isfinite(value):
-        return None
-    return value
 
 
 def _plain(value: object) -> object:

@@ -1,5 +1,6 @@
 """Pictures of a trajectory's error (matplotlib, imported only here)."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import matplotlib
@@ -10,6 +11,26 @@ import numpy as np
 
 from edgeslam_torch.eval.inputs.trajectory_files import Trajectory
 from edgeslam_torch.eval.metrics.trajectory_error import TrajectoryScore
+
+
+def plot_overlay(
+    truth: Trajectory, estimates: Sequence[tuple[str, Trajectory, TrajectoryScore]], path: Path | str
+) -> None:
+    """All trajectories aligned over the truth, from above and from the side, as PNG."""
+    figure, axes = plt.subplots(1, 2, figsize=(12, 6), layout="constrained")
+    pairs = [score.association.truth for _, _, score in estimates]
+    true = truth.positions[slice(min(p.min() for p in pairs), max(p.max() for p in pairs) + 1)]
+    for axis, (a, b, names) in zip(axes, ((0, 1, "xy"), (0, 2, "xz")), strict=True):
+        axis.plot(true[:, a], true[:, b], color="0.6", lw=3, label="ground truth")
+        for name, estimate, score in estimates:
+            p = score.alignment.points(estimate.positions)
+            axis.plot(p[:, a], p[:, b], lw=1, label=f"{name} ({score.ate_m.rmse:.4f} m)")
+        axis.set_aspect("equal", adjustable="datalim")
+        axis.set_xlabel(f"{names[0]} [m]")
+        axis.set_ylabel(f"{names[1]} [m]")
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
 
 
 def plot_errors(truth: Trajectory, estimate: Trajectory, score: TrajectoryScore, path: Path | str) -> None:

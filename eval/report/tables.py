@@ -1,10 +1,12 @@
-"""Scores as Markdown: every run on its own line, the median under them."""
+"""Scores as tables, aligned text for a terminal or Markdown: every run on its own line."""
 
+import textwrap
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from edgeslam_torch.eval.metrics.common_frames import CommonScore
 from edgeslam_torch.eval.metrics.edge_map_score import THRESHOLDS_M
 from edgeslam_torch.eval.metrics.run_score import RunScore
 
@@ -46,6 +48,9 @@ TRAJECTORY_COLUMNS = (
     Column("poses", lambda s: s.matched, "{:.0f}"),
 )
 
+TERMINAL_COLUMNS = tuple(c for c in TRAJECTORY_COLUMNS if "unitless" not in c.title)
+"""What fits beside one another; the paper's unitless figure is in the details."""
+
 MAP_COLUMNS = (
     Column("points", _map("points"), "{:.0f}"),
     Column("judged", _map("judged_share"), "{:.0%}"),
@@ -58,41 +63,94 @@ MAP_COLUMNS = (
 )
 
 
-def markdown_table(scores: Sequence[RunScore], columns: Sequence[Column], title: str = "run") -> str:
-    """Table of every run; with several runs also their median."""
-    used = [c for c in columns if any(np.isfinite(c.value(s)) for s in scores)]
-    lines = ["| " + " | ".join([title, *(c.title for c in used)]) + " |", "|" + "---|" * (len(used) + 1)]
-    for score in scores:
-        lines.append("| " + " | ".join([score.name, *(c.cell(c.value(score)) for c in used)]) + " |")
-    if len(scores) > 1:
-        medians = [c.cell(_median([c.value(s) for s in scores])) for c in used]
-        lines.append("| " + " | ".join([f"**median of {len(scores)}**", *medians]) + " |")
-    return "\n".join(lines)
+def text_table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Aligned columns, the first to the left, titles above them in as many lines as their words need.
+
+    Example:
+        >>> print(text_table(["run", "ATE [m]"], [["a", "0.0100"], ["other", "0.2"]]))
+                  ATE
+        run       [m]
+        a      0.0100
+        other     0.2
+    """
+    cells = list(zip(*rows, strict=True))
+    widths = [
+        max(max(map(len, words), default=0), *(len(word) for word in ([title] if i == 0 else title.split())))
+        for i, (title, words) in enumerate(zip(titles, cells, strict=True))
+    ]
+    heads = [[title] if i == 0 else textwrap.wrap(title, widths[i]) for i, title in enumerate(titles)]
+    height = max(map(len, heads))
+    above = zip(*([""] * (height - len(head)) + head for head in heads), strict=True)
+    lines = [
+        "  ".join(
+            [line[0].ljust(widths[0]), *(word.rjust(width) for word, width in zip(line[1:], widths[1:], strict=True))]
+        )
+        for line in (*above, *rows)
+    ]
+    return "\n".join(line.rstrip() for line in lines)
 
 
-def markdown_report(scores: Sequence[RunScore]) -> str:
+def markdown_table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """The same as Markdown."""
+    lines = ["| " + " | ".join(titles) + " |", "|" + "---|" * len(titles)]
+    return "\n".join(lines + ["| " + " | ".join(row) + " |" for row in rows])
+
+
+def report(scores: Sequence[RunScore], markdown: bool = False) -> str:
     """Trajectory table, map table and findings."""
+    table = markdown_table if markdown else text_table
     parts = [f"Ground truth: {', '.join(sorted({s.dataset for s in scores}))}", ""]
-    parts += [markdown_table(scores, TRAJECTORY_COLUMNS)]
+    parts += [table(*_cells(scores, TRAJECTORY_COLUMNS if markdown else TERMINAL_COLUMNS))]
     if any(s.map is not None for s in scores):
         parts += ["", "Edge map against measured depth, aligned by the trajectory's Sim(3):", ""]
-        parts += [markdown_table([s for s in scores if s.map is not None], MAP_COLUMNS)]
+        parts += [table(*_cells([s for s in scores if s.map is not None], MAP_COLUMNS))]
     parts += [""] + [f"- {s.name}: {note}" for s in scores for note in _notes(s)]
     return "\n".join(parts).rstrip() + "\n"
+
+
+def report_of_two(first: RunScore, second: RunScore) -> str:
+    """Every figure of two runs, and the second's minus the first's."""
+    rows = []
+    for column in (*TRAJECTORY_COLUMNS, *MAP_COLUMNS):
+        a, b = column.value(first), column.value(second)
+        if np.isfinite(a) or np.isfinite(b):
+            difference = (
+                column.text.replace("{:", "{:+").replace("++", "+").format(b - a) if np.isfinite(b - a) else "-"
+            )
+            rows.append([column.title, column.cell(a), column.cell(b), difference])
+    lines = [f"A: {first.name}", f"B: {second.name}", f"Ground truth: {first.dataset}", ""]
+    lines += [text_table(["", "A", "B", "B - A"], rows), ""]
+    lines += [f"- {letter}: {note}" for letter, s in zip("AB", (first, second), strict=True) for note in _notes(s)]
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def common_report(scores: Sequence[CommonScore], markdown: bool = False) -> str:
+    """Errors of several trajectories on their common frames."""
+    titles = ["run", "own poses", "ATE Sim(3) [m]", "ATE SE(3) [m]", "max [m]", "rotation [deg]", "scale - 1"]
+    rows = []
+    for s in scores:
+        degrees = f"{s.sim3.rotation_deg.rmse:.2f}" if np.isfinite(s.sim3.rotation_deg.rmse) else "-"
+        metres = (f"{m:.4f}" for m in (s.sim3.ate_m.rmse, s.se3.ate_m.rmse, s.sim3.ate_m.max))
+        rows.append([s.name, str(s.frames), *metres, degrees, f"{s.sim3.scale - 1:+.1%}"])
+    count = f"{scores[0].sim3.matched} frames that all {len(scores)} have"
+    head = f"On the {count} (with ground truth), each aligned by itself:"
+    return f"{head}\n\n" + (markdown_table if markdown else text_table)(titles, rows)
+
+
+def _cells(scores: Sequence[RunScore], columns: Sequence[Column]) -> tuple[list[str], list[list[str]]]:
+    """Titles and rows, without the columns that no run has."""
+    used = [c for c in columns if any(np.isfinite(c.value(s)) for s in scores)]
+    return ["run", *(c.title for c in used)], [[s.name, *(c.cell(c.value(s)) for c in used)] for s in scores]
 
 
 def _notes(score: RunScore) -> list[str]:
     notes = list(score.notes)
     if score.units == "arbitrary":
         notes.append("the run's units are arbitrary (no metric scale): only the Sim(3) figures mean anything")
-    if score.units == "unknown" and np.isfinite(score.scale_error) and abs(score.scale_error) > 0.2:
+    named = any(" times the " in note for note in notes)
+    if score.units == "unknown" and abs(score.scale_error) > 0.2 and not named:
         notes.append("not of the truth's size: if it is monocular, only the Sim(3) figures mean anything")
     if score.scale_inside_95 is not None:
         inside = "inside" if score.scale_inside_95 else "OUTSIDE"
         notes.append(f"the true scale is {inside} the run's own 95 % interval")
     return notes
-
-
-def _median(values: Sequence[float]) -> float:
-    finite = [v for v in values if np.isfinite(v)]
-    return float(np.median(finite)) if finite else float("nan")

@@ -2,15 +2,17 @@
 
 import argparse
 import json
+import math
 import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from edgeslam_torch.errors import EdgeSlamError, OutputError
+from edgeslam_torch.errors import ConfigError, EdgeSlamError, OutputError
 from edgeslam_torch.extras import needs_extra
 
 if TYPE_CHECKING:
+    from edgeslam_torch.eval.metrics.common_frames import CommonScore
     from edgeslam_torch.eval.metrics.run_score import RunScore
 
 
@@ -21,8 +23,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--groundtruth",
         "-g",
         type=Path,
-        required=True,
-        help="data set folder or trajectory file (TUM, EuRoC, KITTI, 7-Scenes)",
+        help="data set folder or trajectory file (TUM, EuRoC, TUM-VI, KITTI, 7-Scenes, or a table that names its "
+        "columns; default: that of the recording which the run read)",
     )
     parser.add_argument(
         "--depth-gt", type=Path, help="data set whose depth maps judge the map (default: --groundtruth)"
@@ -48,8 +50,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="also evaluate all of them on their common frames (a system that starts late has fewer)",
     )
     parser.add_argument("--json", type=Path, help="write all figures here")
-    parser.add_argument("--markdown", type=Path, help="write the tables here")
-    parser.add_argument("--plots", type=Path, help="write one picture per run into this folder")
+    parser.add_argument(
+        "--markdown", type=Path, metavar="FILE", help="write the tables here as Markdown ('-': print it)"
+    )
+    parser.add_argument(
+        "--plots",
+        type=Path,
+        metavar="DIR",
+        help="write a picture of each run's errors into this folder, and one of all trajectories over the truth",
+    )
     parser.add_argument(
         "--convert",
         nargs=2,
@@ -61,17 +70,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     """Print the tables; 0 when every run could be judged."""
     from edgeslam_torch.eval.metrics.run_score import evaluate_run
-    from edgeslam_torch.eval.report.tables import markdown_report
 
     if args.depth_maps:
         return _depth_maps(args)
     scores: list[RunScore] = []
-    judged: list[Path] = []
+    judged: list[tuple[Path, Path]] = []
     failures: list[str] = []
     for run in args.runs:
         try:
-            scores.append(evaluate_run(run, args.groundtruth, args.depth_gt, args.max_dt, args.offset))
-            judged.append(run)
+            truth = groundtruth_of(run, args.groundtruth)
+            scores.append(evaluate_run(run, truth, args.depth_gt, args.max_dt, args.offset))
+            judged.append((run, truth))
         except EdgeSlamError as error:
             if len(args.runs) == 1:
                 raise
@@ -80,19 +89,41 @@ def main(args: argparse.Namespace) -> int:
         sys.stderr.write(f"edgeslam: error: {failure}\n")
     if not scores:
         return 1
-    args.runs = judged
-    scores = _told_apart(scores, judged)
-    report = markdown_report(scores)
-    if args.common_frames and len(scores) > 1:
-        report += "\n" + _common(args, scores) + "\n"
-    if len(scores) == 1:
-        report += "\n" + _details(scores[0])
-    print(report)
+    scores = _told_apart(scores, [run for run, _ in judged])
+    common = _common(args, scores, judged) if args.common_frames and len(scores) > 1 else None
+    to_print = args.markdown == Path("-")
+    print(_text(scores, common, markdown=to_print))
     try:
-        _write_files(args, scores, report)
+        if args.markdown is not None and not to_print:
+            args.markdown.write_text(_text(scores, common, markdown=True), encoding="utf-8")
+        _write_files(args, scores, judged)
     except OSError as error:
         raise OutputError(f"{error.filename}: cannot be written ({error.strerror})") from error
     return 1 if failures else 0
+
+
+def groundtruth_of(run: Path, given: Path | None) -> Path:
+    """The ground truth given, else that of the recording which the run read.
+
+    Raises:
+        EvaluationError: If there is none.
+    """
+    from edgeslam_torch.eval.errors import EvaluationError
+    from edgeslam_torch.eval.inputs.run_folder import open_run
+
+    truth = given or open_run(run).own_truth
+    if truth is None:
+        raise EvaluationError(f"{run}: no ground truth known for it; give --groundtruth FILE or DIR")
+    return truth
+
+
+def _text(scores: "list[RunScore]", common: "list[CommonScore] | None", markdown: bool) -> str:
+    from edgeslam_torch.eval.report.tables import common_report, report
+
+    text = report(scores, markdown)
+    if common is not None:
+        text += "\n" + common_report(common, markdown) + "\n"
+    return text + "\n" + _details(scores[0]) if len(scores) == 1 else text
 
 
 def _told_apart(scores: "list[RunScore]", runs: list[Path]) -> "list[RunScore]":
@@ -102,12 +133,28 @@ def _told_apart(scores: "list[RunScore]", runs: list[Path]) -> "list[RunScore]":
     return [replace(score, name=str(run)) for score, run in zip(scores, runs, strict=True)]
 
 
-def _common(args: argparse.Namespace, scores: "list[RunScore]") -> str:
+def _common(args: argparse.Namespace, scores: "list[RunScore]", judged: list[tuple[Path, Path]]) -> "list[CommonScore]":
     from edgeslam_torch.eval.inputs.trajectory_files import read_trajectory
-    from edgeslam_torch.eval.metrics.common_frames import markdown_common, score_common
+    from edgeslam_torch.eval.metrics.common_frames import score_common
 
-    estimates = [(s.name, read_trajectory(run)) for s, run in zip(scores, args.runs, strict=True)]
-    return markdown_common(score_common(read_trajectory(args.groundtruth), estimates, args.max_dt, args.offset))
+    truth = one_groundtruth([truth for _, truth in judged])
+    estimates = [(s.name, read_trajectory(run)) for s, (run, _) in zip(scores, judged, strict=True)]
+    return score_common(read_trajectory(truth), estimates, args.max_dt, args.offset)
+
+
+def one_groundtruth(truths: list[Path]) -> Path:
+    """The ground truth that all have in common.
+
+    Raises:
+        EvaluationError: If they have several.
+    """
+    from edgeslam_torch.eval.errors import EvaluationError
+
+    different = {truth.resolve(): truth for truth in truths}
+    if len(different) > 1:
+        names = ", ".join(str(truth) for truth in different.values())
+        raise EvaluationError(f"runs of different recordings ({names}); give --groundtruth if it is that of all")
+    return truths[0]
 
 
 def _depth_maps(args: argparse.Namespace) -> int:
@@ -116,6 +163,8 @@ def _depth_maps(args: argparse.Namespace) -> int:
     from edgeslam_torch.eval.metrics.depth_error import compare_folders, compare_with_recording, markdown_depth
 
     truth = args.groundtruth
+    if truth is None:
+        raise ConfigError("--depth-maps needs --groundtruth: a recording's folder, or maps of the same names")
     if (truth / "depth.txt").is_file() or any(truth.glob("*.depth.png")):
         reports = {str(run): compare_with_recording(run, truth) for run in args.runs}
     else:
@@ -132,33 +181,39 @@ def _depth_maps(args: argparse.Namespace) -> int:
     return 0
 
 
-def _write_files(args: argparse.Namespace, scores: list[Any], report: str) -> None:
+def _write_files(args: argparse.Namespace, scores: "list[RunScore]", judged: list[tuple[Path, Path]]) -> None:
     from edgeslam_torch.eval.inputs.trajectory_files import WRITERS, read_trajectory
 
-    if args.markdown is not None:
-        args.markdown.write_text(report, encoding="utf-8")
     if args.json is not None:
         args.json.write_text(json.dumps([s.to_dict() for s in scores], indent=1, default=str) + "\n", encoding="utf-8")
     if args.plots is not None:
-        _plot(args.plots, args, scores)
+        _plot(args.plots, scores, judged)
     if args.convert is not None:
         name, target = args.convert
         if name not in WRITERS:
             raise OutputError(f"--convert {name}: known formats are {', '.join(WRITERS)}")
-        WRITERS[name](read_trajectory(args.runs[0]), target)
+        trajectory = read_trajectory(judged[0][0])
+        if not trajectory.oriented:
+            raise OutputError(f"{trajectory.source}: positions alone, and {name} has orientations: not converted")
+        WRITERS[name](trajectory, target)
 
 
-def _plot(folder: Path, args: argparse.Namespace, scores: list[Any]) -> None:
+def _plot(folder: Path, scores: "list[RunScore]", judged: list[tuple[Path, Path]]) -> None:
     from edgeslam_torch.eval.inputs.trajectory_files import read_trajectory
 
     with needs_extra("plots", "--plots"):
-        from edgeslam_torch.eval.report.plots import plot_errors
+        from edgeslam_torch.eval.report.plots import plot_errors, plot_overlay
 
     folder.mkdir(parents=True, exist_ok=True)
-    truth = read_trajectory(args.groundtruth)
-    for number, (run, score) in enumerate(zip(args.runs, scores, strict=True)):
-        if score.sim3 is not None:
-            plot_errors(truth, read_trajectory(run), score.sim3, folder / f"{number:02d}_{score.name}.png")
+    overlays: dict[Path, list[tuple[str, Any, Any]]] = {}
+    for number, ((run, place), score) in enumerate(zip(judged, scores, strict=True)):
+        estimate = read_trajectory(run)
+        assert score.sim3 is not None, "`evaluate_run` gives it"
+        overlays.setdefault(place, []).append((score.name, estimate, score.sim3))
+        plot_errors(read_trajectory(place), estimate, score.sim3, folder / f"{number:02d}_{Path(score.name).name}.png")
+    for number, (place, drawn) in enumerate(overlays.items()):
+        name = "trajectories.png" if len(overlays) == 1 else f"trajectories_{number:02d}.png"
+        plot_overlay(read_trajectory(place), drawn, folder / name)
 
 
 def _details(score: Any) -> str:
@@ -171,7 +226,9 @@ def _details(score: Any) -> str:
         f"max {found.ate_m.max:.6f} rmse {found.ate_m.rmse:.6f} m over {found.matched} pairs, "
         f"{found.truth_path_m:.2f} m of path, scale {found.scale:.6f}",
     ]
-    for r in found.relative:
+    if math.isfinite(score.full_transform):
+        lines.append(f"full transform (the paper's figure, unitless): {score.full_transform:.4f} rmse")
+    for r in (r for r in found.relative if r.pairs):
         lines.append(
             f"RPE over {r.delta}: {r.translation_m.rmse:.4f} m, {r.rotation_deg.rmse:.3f} deg rmse ({r.pairs} pairs)"
         )

@@ -7,7 +7,8 @@ import pytest
 
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.inputs.trajectory_files import Trajectory
-from edgeslam_torch.eval.metrics.common_frames import markdown_common, score_common
+from edgeslam_torch.eval.metrics.common_frames import score_common
+from edgeslam_torch.eval.report.tables import common_report
 
 
 @pytest.fixture
@@ -27,7 +28,7 @@ def test_frames_that_one_lacks_do_not_count_against_the_other(loop: Trajectory, 
     assert ours.sim3.matched == theirs.sim3.matched == 140
     assert ours.sim3.ate_m.rmse < 0.01 and theirs.sim3.ate_m.rmse < 1e-9
     assert theirs.sim3.scale == pytest.approx(2.0)
-    text = markdown_common([ours, theirs])
+    text = common_report([ours, theirs], markdown=True)
     assert "On the 140 frames that all 2 have" in text and "| late | 140 | 0.0000 |" in text
 
 

@@ -1,0 +1,50 @@
+"""``edgeslam compare``: every figure of two runs or trajectory files side by side, against one ground truth."""
+
+import argparse
+import json
+from pathlib import Path
+
+from edgeslam_torch.commands.judging.eval import groundtruth_of, one_groundtruth
+from edgeslam_torch.errors import OutputError
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's options."""
+    parser.add_argument("first", type=Path, metavar="A", help="output folder of 'edgeslam run', or a trajectory file")
+    parser.add_argument("second", type=Path, metavar="B", help="the other one")
+    parser.add_argument(
+        "--groundtruth",
+        "-g",
+        type=Path,
+        metavar="FILE|DIR",
+        help="data set folder or trajectory file (default: that of the recording which the runs read)",
+    )
+    parser.add_argument("--max-dt", type=float, default=0.02, metavar="S", help="maximum time between matched poses")
+    parser.add_argument("--offset", type=float, default=0.0, metavar="S", help="added to the stamps of both")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write all figures here")
+
+
+def main(args: argparse.Namespace) -> int:
+    """Print the table of differences."""
+    from edgeslam_torch.eval.inputs.run_folder import open_run
+    from edgeslam_torch.eval.inputs.trajectory_files import read_trajectory
+    from edgeslam_torch.eval.metrics.common_frames import score_common
+    from edgeslam_torch.eval.metrics.run_score import evaluate_run
+    from edgeslam_torch.eval.report.tables import common_report, report_of_two
+
+    both = (args.first, args.second)
+    known = [truth for run in both if (truth := args.groundtruth or open_run(run).own_truth) is not None]
+    truth = one_groundtruth(known or [groundtruth_of(args.first, None)])
+    first, second = (evaluate_run(run, truth, max_dt_s=args.max_dt, offset_s=args.offset) for run in both)
+    names = zip("AB", both, strict=True)
+    common = score_common(
+        read_trajectory(truth), [(name, read_trajectory(run)) for name, run in names], args.max_dt, args.offset
+    )
+    print(report_of_two(first, second))
+    print(common_report(common))
+    if args.json is not None:
+        try:
+            args.json.write_text(json.dumps([first.to_dict(), second.to_dict()], indent=1, default=str) + "\n")
+        except OSError as error:
+            raise OutputError(f"{error.filename}: cannot be written ({error.strerror})") from error
+    return 0
