@@ -75,7 +75,7 @@ def console() -> Iterator[tuple[Console, Console]]:
     """Standard output and error as `Console` while a command runs."""
     before = sys.stdout, sys.stderr
     out, err = Console(before[0]), Console(before[1])
-    sys.stdout, sys.stderr = out, err  # type: ignore[assignment]
+    sys.stdout, sys.stderr = out, err
     try:
         yield out, err
     finally:

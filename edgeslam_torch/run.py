@@ -9,7 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from enum import StrEnum
 from itertools import islice
@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 from edgeslam_torch.calibration.camera_choice import GUESS, GUESS_COST, GUESS_WARNING
 from edgeslam_torch.config import SlamConfig
 from edgeslam_torch.errors import SourceError
+from edgeslam_torch.files.atomic import write_text
 from edgeslam_torch.files.config_file import to_toml
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.camera_file import save_camera
@@ -41,7 +42,7 @@ from edgeslam_torch.types import (
 )
 from edgeslam_torch.writers.map_picture import write_map_picture
 from edgeslam_torch.writers.observations import write_observations
-from edgeslam_torch.writers.run_writer import CAMERA, OBSERVATIONS, PICTURE, RunWriter
+from edgeslam_torch.writers.run_writer import CAMERA, OBSERVATIONS, PICTURE, SUMMARY, RunWriter, summary_text
 
 if TYPE_CHECKING:
     from edgeslam_torch.atlas.saved import SavedAtlas
@@ -384,7 +385,11 @@ class _Run:
             from edgeslam_torch.atlas.atlas_file import write_atlas
 
             extras.append((str(self.atlas.save.resolve()), lambda path: write_atlas(path, saved)))
-        self.writer.finish(summary, stamps, poses, support, edge_map, anchors, scale.units, extras)
+        missing = self.writer.finish(summary, stamps, poses, support, edge_map, anchors, scale.units, extras)
+        if saved is not None and any(line.startswith(str(self.atlas.save.resolve())) for line in missing):
+            summary["saved_atlas"] = None  # it was announced before it could be written
+            with suppress(OSError):
+                write_text(self.writer.folder / SUMMARY, summary_text(summary))
         self.result = RunResult(
             self.writer.folder, summary, stamps, poses, self.interrupt.requested, self.writer.failure
         )

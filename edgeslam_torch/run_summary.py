@@ -3,6 +3,7 @@
 import os
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -137,7 +138,13 @@ def _camera(camera: Camera) -> dict[str, Any]:
 
 
 def peak_rss_mb() -> float | None:
-    """Largest memory of this process so far [MB]; None where unavailable."""
+    """Largest memory of this process so far [MB]; None where unavailable.
+
+    Linux keeps ``ru_maxrss`` over ``exec``: a small process that a large one starts reports its parent's.
+    """
+    with suppress(OSError, ValueError, IndexError):
+        status = Path("/proc/self/status").read_text("ascii", "replace")
+        return int(status.partition("VmHWM:")[2].split()[0]) / 2**10
     try:
         import resource
     except ImportError:  # Windows

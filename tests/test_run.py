@@ -4,13 +4,17 @@ import gc
 import json
 import os
 import signal
+import subprocess
+import sys
 import time
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 from fake_slam import FakeSlam
 
+from edgeslam_torch import run_summary
 from edgeslam_torch.config import SlamConfig
 from edgeslam_torch.errors import EdgeSlamError, SourceError, WeightsError
 from edgeslam_torch.eval.inputs.run_folder import open_run
@@ -19,7 +23,7 @@ from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.camera_file import save_camera
 from edgeslam_torch.readers.pace import Counter, at_their_pace
 from edgeslam_torch.readers.source import open_source
-from edgeslam_torch.run import Mode, _load_slam, run
+from edgeslam_torch.run import AtlasFiles, Mode, _load_slam, run
 from edgeslam_torch.types import Frame, TelemetrySample
 from edgeslam_torch.writers.ply import read_ply
 
@@ -346,3 +350,25 @@ def test_loading_the_system_leaves_the_collector_as_it_was():
         assert gc.get_freeze_count() > 1000
     finally:
         gc.unfreeze()
+
+
+def test_an_atlas_that_could_not_be_written_is_not_said_to_be_saved(tmp_path, write_tum, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    slam = FakeSlam()
+    slam.saved_atlas = lambda name: SimpleNamespace(summary=lambda: {"keyframes": 3, "anchors": 5, "flights": 1})
+    monkeypatch.setattr("edgeslam_torch.atlas.atlas_file.write_atlas", full)
+    atlas = AtlasFiles(save=tmp_path / "a.atlas")
+    result = run(open_source(write_tum(tmp_path / "seq", 3)), tmp_path / "out", make_slam=fake(slam), atlas=atlas)
+    assert "No space left" in result.failure
+    assert result.summary["saved_atlas"] is None
+    assert json.loads((result.folder / "summary.json").read_text())["saved_atlas"] is None
+
+
+def test_memory_is_the_runs_own_and_not_that_of_the_process_that_started_it():
+    code = "from edgeslam_torch.run_summary import peak_rss_mb; print(peak_rss_mb())"
+    large = np.ones(100 << 20, np.uint8)  # 100 MB that a child takes over by fork
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    here = run_summary.peak_rss_mb()
+    assert float(done.stdout) < here - 0.9 * large.nbytes / 2**20

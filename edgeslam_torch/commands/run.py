@@ -123,7 +123,7 @@ def main(args: argparse.Namespace) -> int:
     out = args.out if args.out is not None else Path("runs") / source.name
     show_bar = sys.stderr.isatty() if args.progress is None else args.progress
     listeners: list[Listener] = []
-    files = ExitStack()
+    files, saved = ExitStack(), None
     if args.viewer or args.save_rrd is not None:
         from edgeslam_torch.viewer.live_view import LiveView
 
@@ -140,11 +140,13 @@ def main(args: argparse.Namespace) -> int:
     if not args.no_report and result.failure is None:
         write_page(result)
     _report(result, source)
-    if result.failure is not None:
-        from edgeslam_torch.errors import OutputError
+    from edgeslam_torch.errors import OutputError
 
+    if result.failure is not None:
         frames = result.summary["frames"]
         raise OutputError(f"{result.failure}; what the folder holds is valid, up to frame {frames}")
+    if saved is not None and saved.failure is not None:
+        raise OutputError(f"{saved.failure}; the results in {result.folder} are complete")
     if result.interrupted:
         sys.stderr.write(
             f"edgeslam: interrupted after {result.summary['frames']} frames; results are in {result.folder}\n"

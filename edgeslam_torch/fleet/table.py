@@ -137,8 +137,11 @@ def _plain(value: Any) -> Any:
 
 
 def _no_formula(cell: Any) -> Any:
-    """Text that a spreadsheet would take for a formula, such as a recording called ``=cmd()``, stays text."""
-    return f"'{cell}" if isinstance(cell, str) and cell[:1] in ("=", "+", "-", "@") else cell
+    """Text that a spreadsheet would take for a formula, such as a recording called ``=cmd()``, stays text.
+
+    Spreadsheets skip blanks before a formula, and take the signs of full width for the plain ones.
+    """
+    return f"'{cell}" if isinstance(cell, str) and cell.lstrip()[:1] in tuple("=+-@\uff1d\uff0b\uff0d\uff20") else cell
 
 
 def _finite(value: Any) -> Any:

@@ -46,7 +46,8 @@ class McapView:
         self._keyframes = 0
         self._due = 1.0
         self._last_s = 0.0
-        self._failed = False
+        self.failure: str | None = None
+        """Why there is no file; None while it grows, and when it is complete."""
 
     def on_frame(self, frame: Frame, output: SlamOutput, slam: "Slam") -> None:
         """Write pose, picture and state; for keyframes also features, and now and then path and map."""
@@ -68,14 +69,14 @@ class McapView:
         return messages.cloud(self._file, self._last_s, slam.anchors())
 
     def _guarded(self, write: Callable[[], None]) -> None:
-        if self._failed:
+        if self.failure is not None:
             return
         try:
             write()
         except OSError as error:
-            self._failed = True
+            self.failure = f"{self._file.path}: cannot be written ({error.strerror or error})"
             self._file.abandon()
-            logger.warning("%s: cannot be written (%s); the run goes on", self._file.path, error.strerror or error)
+            logger.warning("%s; the run goes on", self.failure)
 
     def _write_frame(self, frame: Frame, output: SlamOutput, slam: "Slam") -> None:
         ros, t = self._file, output.stamp_s

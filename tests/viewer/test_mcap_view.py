@@ -201,6 +201,7 @@ def test_a_full_disk_ends_the_file_and_not_the_run(tmp_path, monkeypatch, caplog
     view.on_frame(_picture(0), slam.outputs[0], slam)
     view.on_finish(slam)
     assert "No space left" in caplog.text and list(tmp_path.iterdir()) == []
+    assert "No space left" in view.failure, "the command ends with an error"
 
 
 def test_no_file_is_left_of_a_run_without_frames(tmp_path):
