@@ -1,13 +1,13 @@
 """``edgeslam record``: record a flight or a camera into a folder that all other commands read."""
 
 import argparse
-import signal
 import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from types import FrameType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from edgeslam_torch.commands.flying.signals import Signals, say
 
 if TYPE_CHECKING:
     from edgeslam_torch.drone.tello import StateMessage, Tello
@@ -41,11 +41,11 @@ def main(args: argparse.Namespace) -> int:
         raise ConfigError(f"{args.source}: --fly is for a drone (tello://HOST)")
     if (args.max_frames is not None and args.max_frames < 1) or (args.duration is not None and args.duration <= 0):
         raise ConfigError("--max-frames and --duration must be positive")
-    with _Signals() as signals:
+    with Signals() as signals:
         try:
             source, messages, tello = _open(args, is_drone)
         except KeyboardInterrupt:
-            _say("interrupted; nothing was recorded")
+            say("interrupted; nothing was recorded")
             return signals.exit_code
         try:
             _record(args, source, messages, tello if args.fly else None, signals)
@@ -68,7 +68,7 @@ def _record(
     source: "LiveSource",
     messages: "list[StateMessage]",
     tello: "Tello | None",
-    signals: "_Signals",
+    signals: Signals,
 ) -> None:
     """One recording, with a summary after landing.
 
@@ -81,10 +81,10 @@ def _record(
     folder = args.out or Path("flights") / time.strftime("%Y%m%d-%H%M%S")
     told = len(source.warnings)
     for warning in source.warnings:
-        _say(f"warning: {warning}")
+        say(f"warning: {warning}")
     failure: EdgeSlamError | None = None
     with FlightWriter(folder, source.camera, args.source.startswith("tello://"), args.lossless) as writer:
-        _say(f"recording to {folder}; Ctrl-C ends it")
+        say(f"recording to {folder}; Ctrl-C ends it")
         # From here on no signal interrupts a flight or its landing; without a flight, a second signal does.
         signals.tell(source.end, patient=tello is not None)
         try:
@@ -93,17 +93,17 @@ def _record(
             failure = error
         finally:
             if tello is not None and tello.airborne:  # in a thread: a stopped terminal must not delay the landing
-                threading.Thread(target=_say, args=("landing",), daemon=True).start()
+                threading.Thread(target=say, args=("landing",), daemon=True).start()
             source.close()  # lands; its state messages are recorded too
         try:
             _write_states(writer, messages)
         except EdgeSlamError as error:
             failure = failure or error
-        _say(f"{writer.frames} frames, {writer.states} state messages in {folder}")
+        say(f"{writer.frames} frames, {writer.states} state messages in {folder}")
     for warning in source.warnings[told:]:
-        _say(f"warning: {warning}")
+        say(f"warning: {warning}")
     for problem in source.problems:
-        _say(f"note: {problem.file}: {problem.reason}")
+        say(f"note: {problem.file}: {problem.reason}")
     if failure is not None:
         raise failure
 
@@ -160,48 +160,3 @@ def _start_pilot(tello: "Tello") -> Callable[[], None]:
             raise failures[0]
 
     return check
-
-
-class _Signals:
-    """Ctrl-C, ``kill``, a closed terminal: each ends the recording, none interrupts a landing.
-
-    Signals that are ignored already (``nohup``) stay ignored.
-    """
-
-    def __init__(self) -> None:
-        self.number = 0
-        """First signal received."""
-        self._end: Callable[[], None] | None = None
-        self._patient = False
-        self._old: dict[int, Any] = {}
-
-    @property
-    def exit_code(self) -> int:
-        """Exit code as for a program ended by a signal; 0 without a signal."""
-        return 128 + self.number if self.number else 0
-
-    def tell(self, end: Callable[[], None], patient: bool) -> None:
-        """Call ``end`` on a signal instead of interrupting: always if ``patient``, else once."""
-        self._end, self._patient = end, patient
-
-    def __enter__(self) -> "_Signals":
-        if threading.current_thread() is threading.main_thread():
-            for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGBREAK"):  # no platform has all of them
-                number = getattr(signal, name, None)
-                if number is not None and signal.getsignal(number) is not signal.SIG_IGN:
-                    self._old[number] = signal.signal(number, self._on_signal)
-        return self
-
-    def __exit__(self, *unused: object) -> None:
-        for number, handler in self._old.items():
-            signal.signal(number, handler)
-
-    def _on_signal(self, number: int, frame: FrameType | None) -> None:
-        again, self.number = self.number != 0, self.number or number
-        if self._end is None or (again and not self._patient):
-            raise KeyboardInterrupt
-        self._end()
-
-
-def _say(text: str) -> None:
-    print(text, flush=True)

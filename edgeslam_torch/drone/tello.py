@@ -37,6 +37,12 @@ _PARTING = ("land", "streamoff")
 _FRESH_S = 1.0
 """Maximum age of state messages."""
 _RISEN_CM = 20.0
+_QUIET_S = 1.5
+"""Without state or pictures for this time a drone is asked for them again: after a restart it sends neither."""
+_ASK_S = 1.0
+"""Time between two such requests."""
+_ASK_ANSWER_S = 0.3
+"""Wait for an answer to one, short against the times of `TelloLimits` that end a flight."""
 _STEADY_CM = 6.0
 _STEADY_S = 1.5
 
@@ -107,6 +113,8 @@ class Tello:
         self.latest: StateMessage | None = None
         self.malformed = 0
         """State packets without a single readable field."""
+        self.silences = 0
+        """How often state came again after a silence: a restart, or no Wi-Fi for a while."""
         self._on_state, self._on_picture = on_state, on_picture
         self._replies: queue.Queue[str] = queue.Queue()
         self._sending = threading.RLock()
@@ -117,7 +125,7 @@ class Tello:
         """The same permanently after `close`: a pending take-off is not sent."""
         self._stopping = threading.Event()
         self._closed = threading.Event()
-        self._last_sent_s = -math.inf
+        self._last_sent_s = self._last_asked_s = -math.inf
         self._flight_begin_s = math.inf
         self._took_off_s = -math.inf
         """When the last take-off was sent."""
@@ -500,6 +508,7 @@ class Tello:
             if "bat" not in fields and "pitch" not in fields:
                 self.malformed += 1
                 continue
+            self.silences += self.latest is not None and stamp - self.latest.stamp_s > _QUIET_S
             message = StateMessage(stamp, packet.decode("ascii", errors="replace").strip(), fields)
             self.latest = message
             self._rose |= self._airborne and self._risen()
@@ -563,6 +572,9 @@ class Tello:
             if self._airborne and reason and not self._leaving.is_set():
                 self.stop_reason = reason
                 self._land_because(reason)
+            elif missing := self._missing(now):
+                if now - self._last_asked_s > _ASK_S:
+                    self._ask(missing)
             elif now - self._last_sent_s > self.limits.keep_alive_s and math.isfinite(self._last_sent_s):
                 self._keep_alive()
 
@@ -582,14 +594,36 @@ class Tello:
         state_s = self.latest.stamp_s if self.latest is not None else self._flight_begin_s
         if now - max(state_s, self._flight_begin_s) > self.limits.state_loss_s:
             return f"no state for {self.limits.state_loss_s:.0f} s"
-        if self._video is not None:
-            newest = self._video.newest
-            picture_s = max(newest.stamp_s if newest is not None else 0.0, self._video_begin_s, self._flight_begin_s)
-            if now - picture_s > self.limits.video_loss_s:
-                return f"no video for {self.limits.video_loss_s:.0f} s"
+        if now - max(self._pictured_s(), self._flight_begin_s) > self.limits.video_loss_s:
+            return f"no video for {self.limits.video_loss_s:.0f} s"
         if self._rose and self._grounded() and not self._over():
             return "the drone came down by itself"
         return self._unfit()
+
+    def _pictured_s(self) -> float:
+        """When the newest picture came, or pictures were first asked for; infinite before that."""
+        newest = self._video.newest if self._video is not None else None
+        return max(newest.stamp_s if newest is not None else 0.0, self._video_begin_s)
+
+    def _missing(self, now: float) -> list[str]:
+        """What to ask for of what came before and no longer comes."""
+        if self.latest is None:
+            return []
+        words = ["command"] if now - self.latest.stamp_s > _QUIET_S else []
+        return [*words, "streamon"] if now - self._pictured_s() > _QUIET_S else words
+
+    def _ask(self, missing: list[str]) -> None:
+        """Enter SDK mode again and ask for video again, which a drone that flies on takes without harm."""
+        if not self._sending.acquire(blocking=False):
+            return
+        try:
+            self._last_asked_s = self.clock.now()
+            for command in missing:
+                self.send(command, timeout_s=_ASK_ANSWER_S, retries=0)
+        except TelloError:
+            logger.debug("%s: no answer yet", self.address.host)
+        finally:
+            self._sending.release()
 
     def _keep_alive(self) -> None:
         if not self._sending.acquire(blocking=False):

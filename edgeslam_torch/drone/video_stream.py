@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from edgeslam_torch.drone.udp import Inlet
+from edgeslam_torch.errors import SourceError
 from edgeslam_torch.extras import needs_extra
 
 logger = logging.getLogger(__name__)
@@ -19,6 +20,8 @@ CHUNK = 1460
 """Bytes of a full datagram; a shorter one ends a picture."""
 _MAX_PICTURE = 4 * 1024 * 1024
 _RECEIVE_BUFFER = 4 * 1024 * 1024
+_OTHER_SIZE_S = 2.0
+"""Pictures of another size for this time are another camera; fewer are left out."""
 
 
 def import_av() -> Any:
@@ -57,6 +60,41 @@ class Picture:
     """``(H, W, 3)`` BGR."""
     count: int
     """Pictures decoded so far, this one included."""
+
+
+class OneSize:
+    """Pictures of one size, that of the calibration: odd ones are left out, and the end is a camera that has changed.
+
+    Args:
+        size: Width and height [px].
+    """
+
+    def __init__(self, size: tuple[int, int]) -> None:
+        self.size = size
+        self.odd = 0
+        """Pictures of another size so far."""
+        self._odd_since_s: float | None = None
+
+    def fits(self, picture: Picture) -> bool:
+        """Whether a picture has the size.
+
+        Raises:
+            SourceError: If pictures of another size have come for `_OTHER_SIZE_S`.
+        """
+        size = (picture.image.shape[1], picture.image.shape[0])
+        if size == self.size:
+            self._odd_since_s = None
+            return True
+        self.odd += 1
+        if self._odd_since_s is None:
+            self._odd_since_s = picture.stamp_s
+        if picture.stamp_s - self._odd_since_s < _OTHER_SIZE_S:
+            return False
+        now, before = ("{}x{}".format(*s) for s in (size, self.size))
+        raise SourceError(
+            f"pictures are {now} now and were {before}: the resolution was changed in mid-stream; start again, "
+            f"with a calibration for {now}"
+        )
 
 
 class PictureAssembler:

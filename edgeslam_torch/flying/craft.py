@@ -34,5 +34,8 @@ class Craft(Protocol):
     def land(self, why: str) -> None:
         """Land and wait until it stands."""
 
+    def stop(self, why: str) -> None:
+        """Ask for a landing, if it flies, and return at once; callable from a signal handler."""
+
     def close(self) -> None:
         """Land if it flies, and leave."""

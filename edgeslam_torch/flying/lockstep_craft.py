@@ -38,6 +38,7 @@ class LockstepCraft:
         self.tello = tello or LockstepTello(drone, paint, seed=site.seed)
         self.over = ""
         self.flying = False
+        self._land_because: str | None = None
         self.battery = math.nan
         self._cockpit = cockpit
         self._eyes = SlamEyes(self.camera, site.seed)
@@ -58,6 +59,9 @@ class LockstepCraft:
     def fly(self, until: Callable[[], bool]) -> None:
         """As `Craft`."""
         while self.flying and not until():
+            if self._land_because is not None:
+                self.land(self._land_because)
+                return
             self._tick()
             sight = self._eyes.sight(self.tello.clock_s, self._view)
             self._view = None
@@ -74,6 +78,11 @@ class LockstepCraft:
         if self.flying:
             self.flying, self.over = False, why
             self._ask("land")
+
+    def stop(self, why: str) -> None:
+        """As `Craft`."""
+        if self.flying:
+            self._land_because = why
 
     def close(self) -> None:
         """As `Craft`."""

@@ -9,6 +9,8 @@ from pathlib import Path
 from edgeslam_torch.calibration.camera_choice import choose_camera
 from edgeslam_torch.drone.answers import TelloError
 from edgeslam_torch.drone.tello import StateMessage, Tello, TelloAddress
+from edgeslam_torch.drone.video_stream import OneSize
+from edgeslam_torch.errors import SourceError
 from edgeslam_torch.flying.cockpit import Cockpit
 from edgeslam_torch.flying.eyes.slam_eyes import SlamEyes
 from edgeslam_torch.flying.recorder import Recorder
@@ -77,6 +79,7 @@ class UdpCraft:
             if first is None:
                 raise TelloError(f"{address.host}: no picture in {_FIRST_PICTURE_S:.0f} s")
             size = (first.image.shape[1], first.image.shape[0])
+            self._one_size = OneSize(size)
             self.camera, self.warnings = choose_camera(size, camera, is_drone=True)
             if recorder is not None:
                 recorder.begin(self.camera)
@@ -119,8 +122,13 @@ class UdpCraft:
     def land(self, why: str) -> None:
         """As `Craft`: asks the thread that watches, which does nothing else any more."""
         if self.flying:
-            self._land_because = self._land_because or why
+            self.stop(why)
             self._landed.wait(_LAND_S)
+
+    def stop(self, why: str) -> None:
+        """As `Craft`."""
+        if self.flying:
+            self._land_because = self._land_because or why
 
     def close(self) -> None:
         """As `Craft`."""
@@ -149,6 +157,12 @@ class UdpCraft:
             if picture is None:
                 continue
             count, begin_s = picture.count, self.tello.clock.now()
+            try:
+                if not self._one_size.fits(picture):
+                    continue
+            except SourceError as error:
+                self.stop(str(error))
+                continue
             view = self._eyes.seen(picture.image, picture.stamp_s, picture.stamp_s - _VIDEO_DELAY_S)
             if view is not None:
                 with self._view_lock:

@@ -11,7 +11,7 @@ import numpy as np
 
 from edgeslam_torch.calibration.camera_choice import choose_camera
 from edgeslam_torch.drone.tello import StateMessage, Tello, TelloAddress, TelloError
-from edgeslam_torch.drone.video_stream import ArrivalClock, Picture
+from edgeslam_torch.drone.video_stream import ArrivalClock, OneSize, Picture
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.readers.gstreamer import SCHEME, GStreamerCapture
@@ -22,6 +22,8 @@ FIRST_PICTURE_S = 10.0
 """A Tello's first pictures cannot be decoded until a keyframe comes."""
 SILENCE_S = 10.0
 """After this time without a picture the source has ended."""
+RESTART_S = 40.0
+"""The same for a drone: so long it may take to be restarted, and this computer to be in its Wi-Fi again."""
 _MAX_NAME = 60
 """Characters of an address in a folder's name."""
 _SLICE_S = 0.1
@@ -68,13 +70,17 @@ class LiveSource:
         self.telemetry = telemetry
         self.length = max_frames
         self.problems: list[Problem] = []
+        self.silent_s = 0.0
+        """Since the last picture."""
         self._feed = feed
+        self._silence_s = RESTART_S if is_drone else SILENCE_S
         self._told_to_end = self._closed = False
         first = feed.wait(0, FIRST_PICTURE_S)
         if first is None:
             feed.close()
             raise SourceError(f"{location}: no picture in {FIRST_PICTURE_S:.0f} s")
         size = (first.image.shape[1], first.image.shape[0])
+        self._one_size = OneSize(size)
         try:
             self.camera: Camera
             self.warnings: list[str]
@@ -89,6 +95,7 @@ class LiveSource:
 
         Raises:
             TelloError: If a guard has ended the flight.
+            SourceError: If the pictures' size has changed for good; single odd ones are left out.
         """
         last = given = 0
         try:
@@ -96,20 +103,36 @@ class LiveSource:
                 picture = self._next(last)
                 if picture is None:
                     return
-                last, given = picture.count, given + 1
-                yield Frame(picture.count - 1, picture.stamp_s, picture.image)
+                last = picture.count
+                if self._fits(picture):
+                    given += 1
+                    yield Frame(picture.count - 1, picture.stamp_s, picture.image)
         finally:
             self.close()
 
     def _next(self, last: int) -> Picture | None:
-        for _ in range(round(SILENCE_S / _SLICE_S)):
+        for waited in range(round(self._silence_s / _SLICE_S)):
+            self.silent_s = waited * _SLICE_S
             if self._told_to_end:
                 return None
             picture = self._feed.wait(last, _SLICE_S)
             if picture is not None:
+                self.silent_s = 0.0
                 return picture
-        self.problems.append(Problem(self.location, f"no picture for {SILENCE_S:.0f} s; ended", frames=0))
+        self.problems.append(Problem(self.location, f"no picture for {self._silence_s:.0f} s; ended", frames=0))
         return None
+
+    def _fits(self, picture: Picture) -> bool:
+        try:
+            if self._one_size.fits(picture):
+                return True
+        except SourceError as error:
+            raise SourceError(f"{self.location}: {error}") from error
+        if self._one_size.odd == 1:  # it and those like it are gaps in the index, which are counted
+            height, width = picture.image.shape[:2]
+            reason = "is {}x{}, not {}x{}; such pictures are left out".format(width, height, *self._one_size.size)
+            self.problems.append(Problem(f"picture {picture.count}", reason, frames=0))
+        return False
 
     def end(self) -> None:
         """End `frames` after the current picture; callable from any thread or a signal handler."""
@@ -147,6 +170,11 @@ class TelloFeed:
         if refused:
             listing = ", ".join(f"{channel} {count}" for channel, count in refused.items())
             remarks.append(f"{sum(refused.values())} packets from others than the drone were refused ({listing})")
+        if self.tello.silences:
+            times = "once" if self.tello.silences == 1 else f"{self.tello.silences} times"
+            remarks.append(
+                f"the drone fell silent {times} and was asked to go on; if it was restarted, its own axes began anew"
+            )
         if self.tello.malformed:
             remarks.append(f"{self.tello.malformed} state messages could not be read")
         return remarks

@@ -1,11 +1,11 @@
-"""What a signal does to ``edgeslam record``, without a drone; `tests/drone/test_ways_out.py` has one."""
+"""What a signal does to ``edgeslam record`` and ``fly``, without a drone; `tests/drone/test_ways_out.py` has one."""
 
 import os
 import signal
 
 import pytest
 
-from edgeslam_torch.commands.record import _Signals
+from edgeslam_torch.commands.flying.signals import Signals
 
 NAMES = [name for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT") if hasattr(signal, name)]
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="signals as POSIX has them")
@@ -25,7 +25,7 @@ def as_started_from_a_terminal():
 @pytest.mark.parametrize("name", NAMES)
 def test_before_the_recording_a_signal_interrupts(name):
     number = getattr(signal, name)
-    with _Signals() as signals, pytest.raises(KeyboardInterrupt):
+    with Signals() as signals, pytest.raises(KeyboardInterrupt):
         signal.raise_signal(number)
     assert signals.exit_code == 128 + number
     assert signal.getsignal(number) is signal.SIG_DFL
@@ -34,7 +34,7 @@ def test_before_the_recording_a_signal_interrupts(name):
 @pytest.mark.parametrize("name", NAMES)
 def test_in_flight_no_signal_interrupts_however_often_it_comes(name):
     ends = []
-    with _Signals() as signals:
+    with Signals() as signals:
         signals.tell(lambda: ends.append(name), patient=True)
         for _ in range(5):
             signal.raise_signal(getattr(signal, name))
@@ -44,7 +44,7 @@ def test_in_flight_no_signal_interrupts_however_often_it_comes(name):
 
 
 def test_without_a_flight_the_second_signal_interrupts():
-    with _Signals() as signals, pytest.raises(KeyboardInterrupt):
+    with Signals() as signals, pytest.raises(KeyboardInterrupt):
         signals.tell(lambda: None, patient=False)
         signal.raise_signal(signal.SIGINT)
         assert signals.number == signal.SIGINT
@@ -53,6 +53,6 @@ def test_without_a_flight_the_second_signal_interrupts():
 
 def test_what_nohup_ignores_stays_ignored():
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    with _Signals() as signals:
+    with Signals() as signals:
         signal.raise_signal(signal.SIGHUP)
         assert signals.exit_code == 0

@@ -51,6 +51,19 @@ def emulate():
         emulator.stop()
 
 
+def test_a_drone_that_was_restarted_is_asked_for_state_and_video_again(emulate):
+    emulator, address = emulate()
+    with Tello(address) as tello:
+        tello.connect(PATIENCE_S)
+        video = tello.start_video()
+        assert video.wait(0, PATIENCE_S) is not None
+        emulator.heard.clear()
+        emulator.interpreter.sdk_mode = emulator.interpreter.stream = False
+        until(lambda: emulator.heard[:2] == ["command", "streamon"])
+        until(lambda: tello.silences == 1)
+        assert video.wait(video.newest.count, PATIENCE_S) is not None
+
+
 QUICK = TelloLimits(timeout_s=1.0, retries=3, keep_alive_s=0.5, state_loss_s=PATIENCE_S, video_loss_s=3.0)
 
 
@@ -98,6 +111,7 @@ def test_lands_when_the_video_goes_away(emulate):
         tello.connect(PATIENCE_S)
         tello.start_video().wait(0, PATIENCE_S)
         tello.take_off()
+        listen_in(emulator, lambda text: Reply("error") if text == "streamon" else None)
         emulator.interpreter.stream = False
         until(lambda: emulator.drone.mode is Mode.GROUND)
         assert "no video" in tello.stop_reason

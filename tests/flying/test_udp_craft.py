@@ -1,5 +1,7 @@
 """The threads of a flight over UDP, against an emulator whose true state the eyes tell."""
 
+import os
+import signal
 import threading
 import time
 
@@ -7,6 +9,8 @@ import numpy as np
 import pytest
 from emulated import SwiftDrone, emulated, until
 
+from edgeslam_torch.cli import main
+from edgeslam_torch.drone import video_stream
 from edgeslam_torch.drone.address import TelloAddress
 from edgeslam_torch.drone.emulator.drone import Mode
 from edgeslam_torch.flying import udp_craft
@@ -17,6 +21,7 @@ from edgeslam_torch.navigation.limits import NavLimits
 from edgeslam_torch.navigation.pilot import Phase
 from edgeslam_torch.navigation.sight import Sight, Wish
 from edgeslam_torch.navigation.supervisor import Danger
+from edgeslam_torch.readers.source import open_source
 
 pytest.importorskip("av")
 
@@ -131,6 +136,41 @@ def test_leaving_lands_it(flight):
     craft.close()
     assert craft.over == "the program left"
     until(lambda: emulator.drone.mode is Mode.GROUND)
+
+
+def test_another_resolution_in_mid_stream_lands_it(flight, monkeypatch):
+    emulator, craft, _ = flight
+    craft.take_off()
+    monkeypatch.setattr(video_stream, "_OTHER_SIZE_S", 0.1)
+    craft._one_size.size = (960, 720)
+    craft.fly(lambda: False)
+    assert "resolution" in craft.over
+    until(lambda: emulator.drone.mode is Mode.GROUND)
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT"])
+@pytest.mark.skipif(os.name != "posix", reason="signals as POSIX has them")
+def test_a_signal_ends_a_flight_in_order(tmp_path, monkeypatch, capsys, name):
+    monkeypatch.setattr(udp_craft, "SlamEyes", Truth)
+    number = getattr(signal, name)
+    before = signal.signal(number, signal.SIG_DFL)
+    monkeypatch.setattr(Truth, "drone", SwiftDrone())
+    in_the_air = threading.Thread(
+        target=lambda: (until(lambda: Truth.drone.p_w[2] > 0.95), os.kill(os.getpid(), number))
+    )
+    try:
+        with emulated(Truth.drone) as (emulator, location):
+            in_the_air.start()
+            options = ["--fly", "--drone", location, "--camera", "tello", "--record", str(tmp_path / "flight")]
+            assert main(["fly", "home", *options]) == 128 + number
+            assert emulator.drone.mode is Mode.GROUND and "land" in emulator.heard
+    finally:
+        in_the_air.join()
+        signal.signal(number, before)
+    said = capsys.readouterr().out
+    assert f"by {name}" in said and "recorded:" in said
+    recorded = open_source(tmp_path / "flight")
+    assert len(list(recorded.frames())) > 0 and not recorded.problems
 
 
 def test_nothing_moves_without_leave(monkeypatch):

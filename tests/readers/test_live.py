@@ -39,6 +39,27 @@ def test_frames_carry_the_gaps_of_what_was_missed():
     assert source.length is None
 
 
+def sized(feed, counts):
+    """The same feed with pictures of half the size among these counts."""
+    feed.pictures = [Picture(p.stamp_s, p.image[:24, :32], p.count) if p.count in counts else p for p in feed.pictures]
+    return feed
+
+
+def test_a_picture_of_an_odd_size_is_left_out_and_said():
+    source = LiveSource("webcam:0", sized(FakeFeed(range(1, 9)), {3, 4, 6}), [], None, None, is_drone=False)
+    assert [f.index for f in source.frames()] == [0, 1, 4, 6, 7]
+    assert sum("32x24, not 64x48" in problem.reason for problem in source.problems) == 1
+
+
+def test_another_resolution_for_seconds_ends_the_source_with_its_reason():
+    feed = sized(FakeFeed(range(1, 90)), range(10, 90))
+    frames = LiveSource("webcam:0", feed, [], None, None, is_drone=False).frames()
+    assert sum(1 for _, frame in zip(range(9), frames, strict=False) if frame.image.shape[:2] == (48, 64)) == 9
+    with pytest.raises(SourceError, match=r"webcam:0: pictures are 32x24 now and were 64x48.*start again"):
+        next(frames)
+    assert feed.closed == 1
+
+
 def test_device_is_given_back_when_the_taker_stops_early():
     feed = FakeFeed(range(1, 50))
     frames = LiveSource("webcam:0", feed, [], None, None, is_drone=False).frames()

@@ -1,9 +1,12 @@
 """``edgeslam fly``: fly a Tello by its own map; nothing moves without --fly."""
 
 import argparse
+import importlib
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from edgeslam_torch.commands.flying.signals import Signals, say
 
 if TYPE_CHECKING:
     from edgeslam_torch.flying.navigator import Navigator
@@ -63,18 +66,38 @@ def main(args: argparse.Namespace) -> int:
     if args.verb == "replay":
         return _replay(args)
     from edgeslam_torch.errors import ConfigError
-    from edgeslam_torch.flying.keys import keys
-    from edgeslam_torch.flying.navigator import Navigator
 
     if args.fly and args.dry_run:
         raise ConfigError("--fly and --dry-run contradict each other")
     limits = _limits(args)
     _check(args, limits)
     for line in _plan(args, limits):
-        print(line, flush=True)
+        say(line)
     if args.dry_run:
-        print("nothing was sent to the drone")
+        say("nothing was sent to the drone")
         return 0
+    with Signals() as signals:
+        try:
+            signals.tell(lambda: None, patient=True)  # an import that is interrupted raises anything
+            for craft in ("udp_craft", "lockstep_craft"):
+                importlib.import_module(f"edgeslam_torch.flying.{craft}")
+            if signals.number:
+                raise KeyboardInterrupt
+            signals.tell(None, patient=False)
+            code = _connect(args, limits, signals)
+        except KeyboardInterrupt:
+            say(f"ended by {signals.name}")
+            code = signals.exit_code
+    if args.fly and args.record is not None and args.record.is_dir():
+        say(f"recorded: {args.record} (edgeslam run {args.record} maps it again)")
+    return code
+
+
+def _connect(args: argparse.Namespace, limits: "NavLimits", signals: Signals) -> int:
+    """Open the drone, and fly if told to; however that ends, it lands and the record is closed."""
+    from edgeslam_torch.flying.keys import keys
+    from edgeslam_torch.flying.navigator import Navigator
+
     record = args.record if args.fly else None
     with ExitStack() as open_:
         listeners = []
@@ -84,17 +107,27 @@ def main(args: argparse.Namespace) -> int:
             listeners.append(FlightView(args.drone, args.save_rrd))
             open_.callback(listeners[0].close)
         nav = open_.enter_context(Navigator.open(args.drone, args.fly, limits, args.camera, listeners, record))
+        open_.callback(signals.tell, lambda: None, patient=True)  # nothing interrupts the landing and what is closed
         charge = nav.craft.battery
         known = f"battery {100 * charge:.0f} %, " if charge == charge else ""
         camera = nav.craft.camera
-        print(f"{args.drone}: {known}pictures {camera.width}x{camera.height}, calibration: {camera.source}", flush=True)
+        say(f"{args.drone}: {known}pictures {camera.width}x{camera.height}, calibration: {camera.source}")
         if not args.fly:
-            print("nothing moved: add --fly to fly this")
+            say("nothing moved: add --fly to fly this")
             return 0
+
+        def end() -> None:
+            """On a signal: land and go on in order; before the take-off is over there is nothing to go on with."""
+            if not nav.craft.flying and not nav.craft.over:
+                raise KeyboardInterrupt
+            nav.craft.stop(f"by {signals.name}")
+
         with keys(nav.cockpit.hold, lambda: nav.craft.land("by the keyboard")) as listens:
             if listens:
-                print("space hovers and lets go again, l or q lands, Ctrl-C lands", flush=True)
-            return _fly(args, nav)
+                say("space hovers and lets go again, l or q lands, Ctrl-C lands")
+            signals.tell(end, patient=True)
+            reached = _fly(args, nav)
+    return signals.exit_code or (0 if reached else EXIT_NOT_REACHED)
 
 
 def _replay(args: argparse.Namespace) -> int:
@@ -172,7 +205,7 @@ def _plan(args: argparse.Namespace, limits: "NavLimits") -> list[str]:
     ]
 
 
-def _fly(args: argparse.Namespace, nav: "Navigator") -> int:
+def _fly(args: argparse.Namespace, nav: "Navigator") -> bool:
     outcome = _told("take-off", nav.take_off())
     if nav.craft.flying and outcome.reached:
         outcome = _verb(args, nav)
@@ -180,9 +213,7 @@ def _fly(args: argparse.Namespace, nav: "Navigator") -> int:
         _told("return", nav.return_home())
     if nav.craft.flying:
         _told("landing", nav.land())
-    if nav.recorder is not None:
-        print(f"recorded: {nav.recorder.folder} (edgeslam run {nav.recorder.folder} maps it again)")
-    return 0 if outcome.reached else EXIT_NOT_REACHED
+    return outcome.reached
 
 
 def _verb(args: argparse.Namespace, nav: "Navigator") -> "Outcome":
@@ -207,22 +238,20 @@ def _tell_openings(nav: "Navigator") -> None:
     """The records of exits and pathways, a line each."""
     for exit_ in nav.exits():
         x, y = exit_.centre_w[:2]
-        print(
+        say(
             f"  exit at ({x:.2f}, {y:.2f}) +- {exit_.position_sigma_m:.2f} m, {exit_.width_m:.2f} +- "
-            f"{exit_.width_sigma_m:.2f} m wide, seen from {exit_.places} places",
-            flush=True,
+            f"{exit_.width_sigma_m:.2f} m wide, seen from {exit_.places} places"
         )
     for way in nav.pathways() if nav.craft.flying else ():
         (x0, y0), (x1, y1) = way.ends_w
-        print(
+        say(
             f"  corridor from ({x0:.1f}, {y0:.1f}) to ({x1:.1f}, {y1:.1f}), {way.width_m:.1f} +- "
-            f"{way.width_sigma_m:.1f} m wide",
-            flush=True,
+            f"{way.width_sigma_m:.1f} m wide"
         )
 
 
 def _told(what: str, outcome: "Outcome") -> "Outcome":
     clear = outcome.min_clearance_m
     known = f", nearest solid on its map {clear:.2f} m from the hull" if clear == clear else ""
-    print(f"{what}: {outcome.reason}; {outcome.path_m:.1f} m flown{known}", flush=True)
+    say(f"{what}: {outcome.reason}; {outcome.path_m:.1f} m flown{known}")
     return outcome
