@@ -7,13 +7,30 @@ from pathlib import Path
 
 from edgeslam_torch.errors import CalibrationError
 from edgeslam_torch.geometry.camera import GUESSED_FOCAL_SIGMA, PRESETS, Camera
-from edgeslam_torch.geometry.camera_file import load_camera
+from edgeslam_torch.geometry.camera_file import load_camera, read_camera
 from edgeslam_torch.geometry.lens import unique_share
 
-CALIBRATION_FILES = ("camera.yaml", "ost.yaml", "sensor.yaml")
+CALIBRATION_FILES = (
+    *("camera.yaml", "ost.yaml", "sensor.yaml", "camera.yml", "camera.xml", "camera.json", "camera.txt"),
+    *("camera_info.yaml", "camchain.yaml", "calibration.yaml", "calibration.yml", "intrinsics.yaml", "cameras.txt"),
+    "transforms.json",
+)
+"""Names of calibrations beside images: ours, ROS's, EuRoC's, and those of the formats that are read."""
 _ASPECT_TOLERANCE = 0.005
 """Relative; KITTI's 1241x376 halved is off by 0.001, 4:3 and 16:9 differ by 0.33."""
 
+_PLAIN_SCALES = (2.0, 0.5, 3.0, 1.0 / 3.0, 1.5, 2.0 / 3.0, 4.0, 0.25)
+"""Sizes of the images that a calibration was made for, relative to the images', that its principal point betrays."""
+_SCALE_TOLERANCE = 0.2
+"""Relative to the difference from 1; principal points of real cameras lie within a tenth of the middle (EuRoC's cam0:
+0.04)."""
+_MAX_OFF_MIDDLE = 0.5
+"""Relative to half the width or height."""
+_MAX_PIXEL_ASPECT = 1.1
+"""Maximum ratio of the focal lengths without a word; digitised PAL video has 1.07, anamorphic video 1.33."""
+
+TELLO_SIZES = ((960, 720), (648, 478))
+"""Resolutions of its video, high and low."""
 _TELLO_FOCAL_SIGMA = 0.01
 """Five measured drones lie within 1 % of their median."""
 
@@ -55,17 +72,18 @@ def choose_camera(
     """
     if own is not None and given is None:
         camera, notes = fitted(own, size, own.source)
-        return camera, [*notes, *_lens_doubts(camera, own.source)]
+        return camera, [*notes, *_doubts(camera, own.source)]
     found = given if given is not None else _calibration_in(folders)
     if found is not None:
-        camera, notes = fitted(load_camera(found), size, str(found))
-        return camera, [*notes, *_lens_doubts(camera, str(found))]
+        camera, remarks = read_camera(found, size)
+        camera, notes = fitted(camera, size, str(found))
+        return camera, [*remarks, *notes, *_doubts(camera, str(found))]
     if default is not None:
         camera, notes = fitted(default, size, default.source)
         return camera, [*notes, f"no calibration found: using {camera.source}; give --camera FILE for yours"]
-    if is_drone and size == (PRESETS["tello"].width, PRESETS["tello"].height):
+    if is_drone and size in TELLO_SIZES:
         source = "default for a Tello (median of five drones)"
-        camera = replace(PRESETS["tello"], source=source, focal_sigma=_TELLO_FOCAL_SIGMA)
+        camera = replace(_tello(size), source=source, focal_sigma=_TELLO_FOCAL_SIGMA)
         note = f"no calibration found: using the {camera.source}; yours may differ by 1 % in focal length"
         return camera, [note]
     focal = 1.2 * max(size)
@@ -78,14 +96,47 @@ def choose_camera(
     return camera, warnings
 
 
-def _lens_doubts(camera: Camera, name: str) -> list[str]:
+def _tello(size: tuple[int, int]) -> Camera:
+    """The Tello's lens at another resolution: same width of view, square pixels, same middle row."""
+    tello = PRESETS["tello"]
+    scale = size[0] / tello.width
+    whole = tello.scaled(size[0], round(tello.height * scale))
+    return replace(whole, height=size[1], fy=whole.fx, cy=whole.cy + 0.5 * (size[1] - whole.height))
+
+
+def _doubts(camera: Camera, name: str) -> list[str]:
+    """Warnings about a calibration that is possible and unlikely.
+
+    Raises:
+        CalibrationError: If it is that of larger or smaller images.
+    """
+    doubts = []
     share = unique_share(camera)
-    if share == 1.0:
-        return []
-    return [
-        f"{name}: its distortion turns back at {100 * share:.0f} % of the way to the border, pixels beyond are "
-        "misplaced; calibrate with pictures in which the board reaches the corners"
-    ]
+    if share < 1.0:
+        doubts.append(
+            f"{name}: its distortion turns back at {100 * share:.0f} % of the way to the border, pixels beyond are "
+            "misplaced; calibrate with pictures in which the board reaches the corners"
+        )
+    if not 1.0 / _MAX_PIXEL_ASPECT <= camera.fx / camera.fy <= _MAX_PIXEL_ASPECT:
+        doubts.append(
+            f"{name}: fx is {camera.fx / camera.fy:.2f} times fy, pixels of nearly all cameras are square; a mistyped "
+            "number, or images stretched after the calibration?"
+        )
+    ratios = [2.0 * (camera.cx + 0.5) / camera.width, 2.0 * (camera.cy + 0.5) / camera.height]
+    for plain in _PLAIN_SCALES:
+        if all(abs(ratio - plain) < _SCALE_TOLERANCE * abs(plain - 1.0) for ratio in ratios):
+            made_for = f"{round(plain * camera.width)}x{round(plain * camera.height)}"
+            raise CalibrationError(
+                f"{name}: the principal point ({camera.cx:g}, {camera.cy:g}) lies in the middle of {made_for} images, "
+                f"these are {camera.width}x{camera.height}; if it was made for those, state width and height "
+                f"{made_for} in it and it is scaled"
+            )
+    if any(abs(ratio - 1.0) > _MAX_OFF_MIDDLE for ratio in ratios):
+        doubts.append(
+            f"{name}: the principal point ({camera.cx:g}, {camera.cy:g}) is more than a quarter off the middle of "
+            f"{camera.width}x{camera.height} images; is it the calibration of other images, or of a crop?"
+        )
+    return doubts
 
 
 def fitted(camera: Camera, size: tuple[int, int], name: str) -> tuple[Camera, list[str]]:

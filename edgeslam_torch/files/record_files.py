@@ -1,6 +1,7 @@
 """JSON, TOML and YAML files, read safely: any content gives a record or a one-line error."""
 
 import json
+import re
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
@@ -15,10 +16,12 @@ MAX_DOTS = 300
 
 
 def plain_yaml(text: str) -> Any:
-    """Parse YAML without aliases, which can expand to gigabytes; OpenCV's header line is accepted.
+    """Parse the first document of a YAML file without aliases, which can expand to gigabytes.
+
+    OpenCV's header line is accepted, tags such as ``!!opencv-matrix`` are ignored.
 
     Raises:
-        ValueError: If it is malformed.
+        ValueError: If it is malformed, or a key stands twice.
         RecursionError: If it is nested too deeply.
     """
     import yaml
@@ -29,8 +32,20 @@ def plain_yaml(text: str) -> Any:
                 raise ValueError("aliases are not read")
             return super().compose_node(parent, index)
 
+        def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
+            names = [key.value for key, _ in node.value if isinstance(key.value, str)]
+            if len(set(names)) < len(names):
+                raise ValueError(f"{next(name for name in names if names.count(name) > 1)[:40]!r} stands twice")
+            return super().construct_mapping(node, deep)
+
+        def construct_tagged(self, _: str, node: Any) -> Any:
+            if isinstance(node, yaml.MappingNode):
+                return self.construct_mapping(node, deep=True)
+            return self.construct_sequence(node, deep=True) if isinstance(node, yaml.SequenceNode) else node.value
+
+    Loader.add_multi_constructor("", Loader.construct_tagged)
     try:
-        return yaml.load(text.replace("%YAML:1.0", ""), Loader)
+        return next(iter(yaml.load_all(re.sub(r"\A\s*%YAML.*", "", text), Loader)), None)
     except yaml.YAMLError as error:
         raise ValueError(" ".join(str(error).split())) from error
 

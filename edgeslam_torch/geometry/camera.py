@@ -44,8 +44,8 @@ class Camera:
             raise CalibrationError(f"image size and focal lengths must be positive: {self}")
         if not np.all(np.isfinite(numbers)):
             raise CalibrationError(f"calibration holds a number that is not finite: {self}")
-        if self.focal_sigma < 0:
-            raise CalibrationError(f"focal_sigma must be at least 0, got {self.focal_sigma}")
+        if not 0 <= self.focal_sigma <= 1:
+            raise CalibrationError(f"focal_sigma must be at least 0 and at most 1, got {self.focal_sigma:g}")
 
     @property
     def K(self) -> FloatArray:

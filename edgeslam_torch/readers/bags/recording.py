@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.readers.bags.bag import Bag
+from edgeslam_torch.readers.bags.camera_info import camera_from_info
 from edgeslam_torch.readers.bags.clock import Offset, TopicClock, disagree, header_s, measure
-from edgeslam_torch.readers.bags.lens import camera_from_info
 from edgeslam_torch.readers.bags.pictures import PictureDecoder
 from edgeslam_torch.readers.bags.telemetry import read_bag_telemetry
 from edgeslam_torch.readers.bags.topics import Choice, choose
@@ -108,7 +108,8 @@ def _camera(bag: Bag, choice: Choice, remarks: list[str]) -> Camera | None:
     if not first or choice.camera is None:
         return None
     rectified = "rect" in choice.image.removesuffix("/compressed").rpartition("/")[2]
-    camera = camera_from_info(first[0][1], f"{bag.path.name}:{choice.camera}", rectified)
+    camera, said = camera_from_info(first[0][1], f"{bag.path.name}:{choice.camera}", rectified)
+    remarks += said
     if camera is None:
         remarks.append(f"{choice.camera}: an empty calibration (all zeros), so it is not used")
     return camera

@@ -1,0 +1,1 @@
+"""Calibration files of other programs: their text, their keys, their lens models."""
