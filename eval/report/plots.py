@@ -30,7 +30,7 @@ def plot_overlay(
         axis.set_xlabel(f"{names[0]} [m]")
         axis.set_ylabel(f"{names[1]} [m]")
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)
-    figure.savefig(path, dpi=110)
+    write_atomically(Path(path), lambda file: figure.savefig(file, dpi=110, format="png"))
     plt.close(figure)
 
 
