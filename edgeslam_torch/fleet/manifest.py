@@ -19,7 +19,7 @@ from edgeslam_torch.readers.source import LIVE_SCHEMES
 COLUMNS = ("recording", "name", "camera", "telemetry", "topic", "truth", "settings")
 """Of a CSV table; only the first must be there."""
 _MAX_NAME = 80
-_FILES = video.SUFFIXES | {".bag", ".db3", ".mcap"}
+_FILES = (video.SUFFIXES - video.PREVIEWS) | {".bag", ".db3", ".mcap"}
 """Files in a folder that are recordings by themselves."""
 
 

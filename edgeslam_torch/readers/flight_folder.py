@@ -5,7 +5,7 @@ from pathlib import Path
 
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.readers import video
-from edgeslam_torch.readers.listing import read_list
+from edgeslam_torch.readers.listing import Problem, image_times, read_list
 from edgeslam_torch.types import TelemetrySample
 
 TELEMETRY = "telemetry.csv"
@@ -57,21 +57,24 @@ def telemetry_gap(samples: Sequence[TelemetrySample], first_s: float, last_s: fl
 
 
 def find_video(folder: Path) -> Path | None:
-    """The folder's only video; None when it has none.
+    """The folder's only video, its small copies apart; None when it has none.
 
     Raises:
         SourceError: If it has several.
     """
     files = sorted(p for p in folder.iterdir() if p.suffix.lower() in video.SUFFIXES and p.is_file())
+    files = [p for p in files if p.suffix.lower() not in video.PREVIEWS] or files
     if len(files) > 1:
         raise SourceError(f"{folder}: {len(files)} videos in it; give one of them, such as {files[0]}")
     return files[0] if files else None
 
 
-def video_stamps(path: Path) -> list[float] | None:
-    """Stamps of a recorded video's frames, from ``<video>_stamps.txt`` beside it (``stamp index`` a line)."""
+def video_stamps(path: Path) -> tuple[list[float] | None, list[Problem]]:
+    """Stamps of a recorded video's frames [s], from ``<video>_stamps.txt`` beside it (``stamp index`` a line), and
+    remarks; None without it."""
     listing = path.with_name(f"{path.stem}_stamps.txt")
     if not listing.is_file():
-        return None
+        return None, []
     rows, _ = read_list(listing)
-    return [stamp for stamp, _ in rows]
+    stamps, remarks = image_times([stamp for stamp, _ in rows], str(listing))
+    return stamps.tolist(), remarks

@@ -21,6 +21,8 @@ from edgeslam_torch.types import FloatArray, Frame
 SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp"})
 MAX_PIXELS = 50_000_000
 """Maximum pixels of an image; 8K video has 33 million. Larger ones are rejected before decoding."""
+MIN_SIDE = 32
+"""Minimum width and height [px]; ORB describes a keypoint by 31 px around it."""
 _MAX_BYTES = 8 * MAX_PIXELS
 """Maximum size of a file: 16 bits and four channels, uncompressed."""
 _AS_IT_IS = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH
@@ -130,6 +132,20 @@ def check_size(width: int, height: int, name: str | Path | None) -> None:
     if width * height > MAX_PIXELS:
         limit = MAX_PIXELS // 1_000_000
         raise SourceError(f"{name}: image is {width}x{height}, more than {limit} million pixels are not read")
+
+
+def check_trackable(size: tuple[int, int], name: str | Path) -> None:
+    """Reject images that are too small to be tracked.
+
+    Args:
+        size: ``(width, height)`` [px].
+        name: Source, for the message.
+
+    Raises:
+        SourceError: If a side is shorter than `MIN_SIDE`.
+    """
+    if min(size) < MIN_SIDE:
+        raise SourceError(f"{name}: images of {size[0]}x{size[1]} are too small to be tracked (at least {MIN_SIDE} px)")
 
 
 def _bytes(path: Path) -> bytes:

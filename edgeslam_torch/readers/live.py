@@ -15,6 +15,7 @@ from edgeslam_torch.drone.video_stream import ArrivalClock, OneSize, Picture
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.readers.gstreamer import SCHEME, GStreamerCapture
+from edgeslam_torch.readers.images import check_trackable
 from edgeslam_torch.readers.listing import Problem
 from edgeslam_torch.types import Frame, TelemetrySample
 
@@ -82,6 +83,7 @@ class LiveSource:
         size = (first.image.shape[1], first.image.shape[0])
         self._one_size = OneSize(size)
         try:
+            check_trackable(size, location)
             self.camera: Camera
             self.warnings: list[str]
             self.camera, self.warnings = choose_camera(size, camera, (), None, is_drone)

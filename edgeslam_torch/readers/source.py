@@ -147,6 +147,7 @@ def open_source(
         raise SourceError(f"{path}: --topic is for ROS bags ({', '.join(SUFFIXES)})")
     else:
         content = _content(path)
+    images.check_trackable(content.size, path)
     folders = [path, content.folder] if path.is_dir() else [content.folder]
     telemetry_file = flight_folder.telemetry_file(folders, telemetry)
     samples, remarks = (list(content.telemetry), []) if telemetry_file is None else read_telemetry(telemetry_file)
@@ -223,12 +224,16 @@ def _folder_content(folder: Path) -> _Content:
 
 
 def _video_content(path: Path, groundtruth: Path | None) -> _Content:
-    clip = video.Video(path, flight_folder.video_stamps(path))
+    stamps, problems = flight_folder.video_stamps(path)
+    clip = video.Video(path, stamps)
+    if clip.rate_is_assumed:
+        reason = f"a raw stream holds no times: {clip.rate_hz:g} images/s are assumed; put it into .mp4 with its rate"
+        problems.append(Problem(str(path), reason, frames=0))
 
     def decode(_: tuple[int, int], problems: list[Problem]) -> Iterator[Frame]:
         return clip.frames(problems)
 
-    return _Content("video", decode, clip.size, clip.count, [], path.parent, groundtruth)
+    return _Content("video", decode, clip.size, clip.count, problems, path.parent, groundtruth)
 
 
 def _listed(sequence: ImageSequence, place: Path) -> _Content:

@@ -14,8 +14,15 @@ from edgeslam_torch.types import Frame
 
 SUFFIXES = frozenset(
     f".{name}"
-    for name in ["mp4", "avi", "mov", "mkv", "webm", "m4v", "mpg", "mpeg", "ts", "h264", "264", "mjpeg", "wmv", "flv"]
+    for name in [
+        *("mp4", "avi", "mov", "mkv", "webm", "m4v", "mpg", "mpeg", "ts", "mts", "m2ts", "vob", "mxf", "wmv", "asf"),
+        *("flv", "3gp", "3g2", "ogv", "y4m", "lrv", "h264", "264", "h265", "265", "hevc", "mjpeg"),
+    ]
 )
+PREVIEWS = frozenset({".lrv"})
+"""Small copies that GoPro cameras write beside their videos."""
+_RAW = frozenset({".h264", ".264", ".h265", ".265", ".hevc", ".mjpeg"})
+"""Elementary streams, without times; FFmpeg assumes 25 frames a second."""
 
 
 class Video:
@@ -37,6 +44,8 @@ class Video:
         check_size(int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT)), path)
         rate = capture.get(cv2.CAP_PROP_FPS)
         self.rate_hz = rate if math.isfinite(rate) and 0.0 < rate <= 1000.0 else ASSUMED_HZ
+        self.rate_is_assumed = stamps_s is None and (path.suffix.lower() in _RAW or self.rate_hz != rate)
+        """Whether neither the file nor a list says when its frames were taken."""
         count = capture.get(cv2.CAP_PROP_FRAME_COUNT)
         self.count = int(count) if math.isfinite(count) and count > 0 else None
         ok, image = capture.read()

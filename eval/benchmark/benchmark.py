@@ -38,7 +38,6 @@ from edgeslam_torch.eval.benchmark.machine_speed import MachineSpeed, disturbanc
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.inputs.dataset import open_dataset
 from edgeslam_torch.eval.metrics.run_score import RunScore, evaluate_run
-from edgeslam_torch.files.atomic import write_text
 
 SYNTHETIC = "synthetic"
 """Name of the simulated flight among the sequences."""
@@ -322,7 +321,7 @@ def _commit() -> str:
 
 
 def _save(record: dict[str, Any], path: Path) -> None:
-    write_text(path, json.dumps(record, indent=1, default=str) + "\n")
+    path.write_text(json.dumps(record, indent=1, default=str) + "\n", encoding="utf-8")
 
 
 def _one_line(run: dict[str, Any]) -> str:

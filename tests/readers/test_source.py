@@ -330,3 +330,41 @@ def test_real_sequence_opens_without_complaint(data_dir):
     assert frames[0].stamp_s == pytest.approx(1305031102.175304)
     assert frames[0].image.shape == (480, 640, 3)
     assert (source.problems, source.warnings) == ([], [])
+
+
+def write_y4m(path, count):
+    """YUV4MPEG2, which needs no encoder."""
+    frame = b"FRAME\n" + np.random.default_rng(0).integers(0, 255, 64 * 48 * 3 // 2, dtype=np.uint8).tobytes()
+    path.write_bytes(b"YUV4MPEG2 W64 H48 F30:1 Ip A1:1 C420jpeg\n" + count * frame)
+
+
+@pytest.mark.parametrize("suffix", [".y4m", ".mts", ".lrv", ".3gp", ".hevc", ".H265", ".m2ts"])
+def test_names_of_videos(tmp_path, suffix):
+    """FFmpeg goes by the content; the name only tells that it is a video."""
+    path = tmp_path / f"clip{suffix}"
+    write_y4m(path, 5)
+    source = open_source(path)
+    assert [round(frame.stamp_s, 3) for frame in source.frames()] == [0.0, 0.033, 0.067, 0.1, 0.133]
+    raw = suffix.lower() in (".hevc", ".h265")
+    assert any("are assumed" in problem.reason for problem in source.problems) == raw
+    assert open_source(tmp_path).kind == "video"
+
+
+def test_the_small_copy_beside_a_video_is_no_second_one(tmp_path):
+    write_y4m(tmp_path / "GX010001.mp4", 3)
+    write_y4m(tmp_path / "GL010001.lrv", 2)
+    assert len(list(open_source(tmp_path).frames())) == 3
+
+
+def test_stamps_beside_a_video_may_be_nanoseconds(tmp_path):
+    write_y4m(tmp_path / "clip.y4m", 3)
+    (tmp_path / "clip_stamps.txt").write_text("".join(f"{50_000_000 * i} {i}\n" for i in range(3)))
+    source = open_source(tmp_path)
+    assert [frame.stamp_s for frame in source.frames()] == pytest.approx([0.0, 0.05, 0.1])
+
+
+@pytest.mark.parametrize("size", [(1, 1), (640, 8), (16, 480)])
+def test_images_too_small_to_be_tracked_are_refused(tmp_path, write_images, size):
+    write_images(tmp_path, ["1.png", "2.png"], size)
+    with pytest.raises(SourceError, match="too small"):
+        open_source(tmp_path)

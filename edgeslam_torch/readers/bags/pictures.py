@@ -109,7 +109,7 @@ class PictureDecoder:
         pixels = padded.reshape(height, step)[:, :row]
         if deep:
             order = ">u2" if message.is_bigendian else "<u2"
-            image = np.ascontiguousarray(pixels).view(order).reshape(height, width).astype(np.uint16)
+            image: NDArray[Any] = np.ascontiguousarray(pixels).view(order).reshape(height, width).astype(np.uint16)
         else:
             image = np.ascontiguousarray(pixels).reshape((height, width, channels) if channels > 1 else (height, width))
         return image, _TO_BGR.get(bayer[1] if bayer else encoding)
