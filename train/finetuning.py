@@ -15,6 +15,7 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 from edgeslam_torch.errors import SourceError
+from edgeslam_torch.files.plain import subfolder
 from edgeslam_torch.models.checkpoint import restored, save_checkpoint
 from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.models.trainable import DepthModule
@@ -135,7 +136,7 @@ def finetune(
     tuned = _tuned_metadata(metadata, data)
     watching = list(hooks)
     if rank() == 0:
-        watching = [ProgressBar(), *hooks, *curves(out.path / TENSORBOARD, tuned, _pictures(data, held_out))]
+        watching = [ProgressBar(), *hooks, *curves(subfolder(out.path, TENSORBOARD), tuned, _pictures(data, held_out))]
 
     def validate(averaged: DepthModule) -> dict[str, float]:
         return _metrics(score(averaged, metadata, held_out))
@@ -196,7 +197,7 @@ def _kept_in(cache: TeacherCache | None, out: OutFolder) -> Callable[[int, str, 
     """Where depth of the k-th run is kept, by its number, name and all that it depends on."""
 
     def place(number: int, name: str, content: str) -> Path:
-        return out.path / TEACHER / f"{number}-{name}" if cache is None else cache.entry(name, content)
+        return subfolder(out.path, TEACHER) / f"{number}-{name}" if cache is None else cache.entry(name, content)
 
     return place
 

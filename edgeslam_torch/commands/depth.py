@@ -94,17 +94,16 @@ def write_depth(folder: Path, stem: str, depth: "DepthMap", with_sigma: bool = F
     Raises:
         OSError: If a file cannot be written.
     """
-    import cv2
-
+    from edgeslam_torch.files.atomic import write_atomically
+    from edgeslam_torch.files.plain import write_image
     from edgeslam_torch.writers.depth_picture import colour
 
-    np.save(folder / f"{stem}.npy", depth.depth_m)
+    write_atomically(folder / f"{stem}.npy", lambda file: np.save(file, depth.depth_m))
     millimetres = np.clip(np.nan_to_num(depth.depth_m) * 1000.0 + 0.5, 0, MAX_MILLIMETRES).astype(np.uint16)
     for name, image in ((f"{stem}.png", millimetres), (f"{stem}_colour.png", colour(depth.depth_m))):
-        if not cv2.imwrite(str(folder / name), image):
-            raise OSError(0, "OpenCV could not write the image", str(folder / name))
+        write_image(folder / name, image)
     if with_sigma:
-        np.save(folder / f"{stem}_sigma.npy", depth.sigma_log)
+        write_atomically(folder / f"{stem}_sigma.npy", lambda file: np.save(file, depth.sigma_log))
 
 
 def _believable(depth: "DepthMap") -> "tuple[DepthMap, float]":

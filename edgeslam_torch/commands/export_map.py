@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from edgeslam_torch.errors import OutputError
+from edgeslam_torch.files.plain import subfolder
 
 if TYPE_CHECKING:
     from edgeslam_torch.eval.inputs.run_folder import RunFolder
@@ -96,7 +97,7 @@ def _colmap(run: "RunFolder", cloud: "PointCloud", args: argparse.Namespace) -> 
     from edgeslam_torch.geometry.camera_file import load_camera
     from edgeslam_torch.writers.maps.colmap import write_colmap
 
-    folder: Path = args.out or run.path / "colmap"
+    folder: Path = args.out or subfolder(run.path, "colmap")
     camera = load_camera(run.path / "camera.yaml")
     seen, anchors, index = _seen(run)
     paths = image_paths(run, seen.stamps_s)
@@ -110,7 +111,7 @@ def _nerfstudio(run: "RunFolder", cloud: "PointCloud", args: argparse.Namespace)
     from edgeslam_torch.geometry.camera_file import load_camera
     from edgeslam_torch.writers.maps.nerfstudio import write_nerfstudio
 
-    folder: Path = args.out or run.path / "nerfstudio"
+    folder: Path = args.out or subfolder(run.path, "nerfstudio")
     camera = load_camera(run.path / "camera.yaml")
     seen, anchors, index = _seen(run)
     paths = [path for path in image_paths(run, seen.stamps_s) if path is not None]

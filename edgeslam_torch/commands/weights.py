@@ -108,13 +108,14 @@ def _describe(name: str, raw: Path, target: Path) -> None:
     """Put the network and its description in place, once it proves to be one."""
     import shutil
 
-    from edgeslam_torch.files.atomic import write_text
+    from edgeslam_torch.files.atomic import write_atomically, write_text
     from edgeslam_torch.models.onnx.external import read_external
 
     write_text(raw.with_suffix(".toml"), f'preset = "{name}"\n')
     read_external(raw)
     if target != raw:
-        shutil.copyfile(raw, target)
+        with raw.open("rb") as content:
+            write_atomically(target, lambda file: shutil.copyfileobj(content, file))
         write_text(target.with_suffix(".toml"), f'preset = "{name}"\n')
 
 

@@ -18,6 +18,7 @@ from edgeslam_torch.errors import OutputError, SourceError
 from edgeslam_torch.extras import needs_extra
 from edgeslam_torch.files.atomic import write_text
 from edgeslam_torch.files.download import FAILURES, Progress, discard, fetch, reason_of, remember, remembered
+from edgeslam_torch.files.plain import subfolder
 
 DOWNLOADS = ".downloads"
 """Folder of archives beside the recordings: parts, checksums, and archives that are kept."""
@@ -107,9 +108,8 @@ def get(
         OutputError: If the disk is full, or the folder cannot be written to.
         MissingPackageError: Without the ``[data]`` extra.
     """
-    downloads = root / DOWNLOADS
     try:
-        downloads.mkdir(parents=True, exist_ok=True)
+        downloads = subfolder(root, DOWNLOADS)
         for archive in dict.fromkeys(recording.archive for recording in recordings):
             own = [recording for recording in recordings if recording.archive == archive]
             origin = _fetched(archive, downloads, progress, given)
@@ -226,8 +226,8 @@ def _place(
         PREPARED[recording.collection.layout](part, _truth(recording, root / DOWNLOADS, progress))
         check_recording(part)
         write_text(part / ORIGIN, json.dumps(_origin_record(recording, origin), indent=1) + "\n")
-        target = root / recording.name
-        target.parent.mkdir(parents=True, exist_ok=True)
+        *collection, name = recording.name.split("/")
+        target = subfolder(root, *collection) / name
         part.rename(target)
     finally:
         shutil.rmtree(part, ignore_errors=True)

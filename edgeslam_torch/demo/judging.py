@@ -13,6 +13,7 @@ from edgeslam_torch.demo.flight import DemoSettings, Recorded
 from edgeslam_torch.errors import OutputError
 from edgeslam_torch.eval.inputs.run_folder import open_run
 from edgeslam_torch.eval.metrics.run_score import RunScore, evaluate_run
+from edgeslam_torch.files.atomic import write_text
 from edgeslam_torch.readers.source import open_source
 from edgeslam_torch.run import Listener, RunResult, run
 from edgeslam_torch.synthetic.house.world import World
@@ -101,6 +102,6 @@ def write_score(path: Path, demo: DemoResult, settings: DemoSettings) -> None:
         "map": asdict(demo.map) if demo.map is not None else None,
     }
     try:
-        path.write_text(json.dumps(record_, indent=2, default=float) + "\n", encoding="utf-8")
+        write_text(path, json.dumps(record_, indent=2, default=float) + "\n")
     except OSError as error:
         raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error

@@ -4,6 +4,8 @@ import errno
 import os
 from pathlib import Path
 
+from edgeslam_torch.files.plain import create, extend
+
 
 class Appender:
     """Appends lines; a line that does not fit on the disk is removed completely.
@@ -17,7 +19,7 @@ class Appender:
     """
 
     def __init__(self, path: Path, header: str | None) -> None:
-        self._file = path.open("ab" if header is None else "wb", buffering=0)
+        self._file = extend(path) if header is None else create(path)
         self._good = self._file.seek(0, os.SEEK_END)
         if header is not None:
             self.write(header)

@@ -1,26 +1,51 @@
 """Atomic file writing: a reader sees the old or the new file, never half of one."""
 
+import io
 import os
+import re
+import secrets
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO
+
+from edgeslam_torch.files.plain import check_replaceable, open_exclusively
+
+_PARTIAL = ".edgeslam-{}.part"
+_PARTIAL_NAME = re.compile(r"\.edgeslam-[0-9a-f]{16}\.part")
+
+
+def partial_beside(path: Path) -> Path:
+    """Unforeseeable name for a file that will be ``path`` when it is complete."""
+    return path.with_name(_PARTIAL.format(secrets.token_hex(8)))
+
+
+def remove_partials(folder: Path) -> None:
+    """Remove what killed processes have left in a folder of ours."""
+    for path in folder.iterdir():
+        if _PARTIAL_NAME.fullmatch(path.name):
+            path.unlink(missing_ok=True)
 
 
 def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
     """Let ``write`` fill a temporary file beside ``path``, then move it into place.
 
+    A link at ``path`` is replaced, not followed.
+
     Raises:
-        OSError: If writing fails; an older file at ``path`` is kept.
+        OSError: If writing fails, or ``path`` is no plain file; an older file at ``path`` is kept.
     """
-    partial = path.with_name(f".{path.name}.part")
+    check_replaceable(path)
+    partial = partial_beside(path)
     try:
-        with partial.open("wb") as file:
+        with io.BufferedWriter(open_exclusively(partial)) as file:
             write(file)
             file.flush()
             os.fsync(file.fileno())
         partial.replace(path)
     finally:
-        partial.unlink(missing_ok=True)
+        with suppress(OSError):
+            partial.unlink(missing_ok=True)
 
 
 def write_text(path: Path, text: str) -> None:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from edgeslam_torch.files.atomic import write_text
+from edgeslam_torch.files.plain import create, extend
 
 CHUNK = 1 << 16
 TIMEOUT_S = 30.0
@@ -57,8 +58,8 @@ def fetch(url: str, part: Path, max_bytes: int, progress: Progress | None = None
             raise OSError(f"the disk has no room for {total - have} bytes")
         etag = response.headers.get("ETag", "")
         if etag.startswith('"') and etag.isascii():  # weak ones do not promise the same bytes
-            tag.write_text(etag, "ascii")
-        with part.open("ab" if have else "wb") as file:
+            write_text(tag, etag)
+        with extend(part) if have else create(part) as file:
             while chunk := response.read(CHUNK):
                 file.write(chunk)
                 have += len(chunk)

@@ -16,6 +16,7 @@ from edgeslam_torch.config import SlamConfig
 from edgeslam_torch.errors import ConfigError, OutputError
 from edgeslam_torch.files.atomic import write_text
 from edgeslam_torch.files.config_file import load_config, to_toml
+from edgeslam_torch.files.plain import subfolder
 from edgeslam_torch.files.signature import signature
 from edgeslam_torch.fleet.manifest import Flight
 
@@ -67,7 +68,7 @@ class BatchFolder:
         if names and RECORD not in names:
             raise OutputError(f"{path}: holds {min(names)}, which no batch wrote; give another folder to --out")
         for name in (FLIGHTS, JOBS, WORK, PICTURES):
-            (self.path / name).mkdir(exist_ok=True)
+            subfolder(self.path, name)
         if RECORD not in names:
             write_text(self.path / RECORD, "{}\n")
 
@@ -109,15 +110,13 @@ class BatchFolder:
     def prepare(self, task: Task) -> Path:
         """The folder of a task to be done now; results of other settings move to ``older``."""
         name = task.flight.name
-        job = self.path / JOBS / name
-        job.mkdir(exist_ok=True)
+        job = subfolder(self.path, JOBS, name)
         (job / RESULT).unlink(missing_ok=True)
         (self.path / PICTURES / f"{name}.jpg").unlink(missing_ok=True)
         finished = self.path / FLIGHTS / name
         if finished.is_dir():
-            older = self.path / OLDER / name
+            older = subfolder(self.path, OLDER) / name
             shutil.rmtree(older, ignore_errors=True)
-            older.parent.mkdir(exist_ok=True)
             finished.rename(older)
         write_text(job / CONFIG, task.config)
         write_text(job / TASK, json.dumps(task.content | {"key": task.key}, indent=1) + "\n")

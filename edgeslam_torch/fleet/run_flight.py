@@ -39,6 +39,8 @@ def main(folder: Path) -> int:
     batch, name = Path(task["batch"]), task["name"]
     work = batch / WORK / name
     shutil.rmtree(work, ignore_errors=True)  # of a process that was killed
+    if work.is_symlink():
+        work.unlink()
     try:
         config = load_config(SlamConfig(), folder / CONFIG, ())
         source = open_source(

@@ -6,6 +6,7 @@ from pathlib import Path
 import yaml
 
 from edgeslam_torch.errors import CalibrationError
+from edgeslam_torch.files.atomic import write_text
 from edgeslam_torch.geometry.calibrations.keys import camera_of
 from edgeslam_torch.geometry.calibrations.text import MAX_JSON_BYTES, record_of
 from edgeslam_torch.geometry.camera import PRESETS, Camera
@@ -26,7 +27,7 @@ def save_camera(path: Path, camera: Camera) -> None:
         "source": camera.source,
         "focal_sigma": float(camera.focal_sigma),
     }
-    Path(path).write_text(yaml.safe_dump(record, sort_keys=False))
+    write_text(Path(path), yaml.safe_dump(record, sort_keys=False))
 
 
 def load_camera(name: str | Path) -> Camera:

@@ -1,5 +1,6 @@
 """Work in processes of its own, some at a time: time and memory of each are bounded, and a stop ends all of them."""
 
+import io
 import multiprocessing
 import os
 import signal
@@ -13,6 +14,8 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import IO, TypeVar
+
+from edgeslam_torch.files.plain import create
 
 POLL_S = 0.05
 """Time between two looks at a process; what it takes in between is not noticed."""
@@ -75,7 +78,7 @@ class Job:
             OSError: If the log or the process cannot be made.
         """
         self._log_path = log
-        self._log = log.open("w", encoding="utf-8")
+        self._log = io.TextIOWrapper(create(log), encoding="utf-8", write_through=True)
         self._limits = limits
         self._begun_s = time.monotonic()
         self._peak_mb: float | None = None

@@ -11,6 +11,7 @@ import numpy as np
 
 from edgeslam_torch.errors import OutputError
 from edgeslam_torch.extras import needs_extra
+from edgeslam_torch.files.plain import create
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.types import FloatArray, PointCloud, SlamOutput
 
@@ -173,6 +174,6 @@ def check_writable(path: Path) -> None:
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.open("wb").close()
+        create(path).close()  # rerun itself would follow a link
     except OSError as error:
         raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error

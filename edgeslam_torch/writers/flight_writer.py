@@ -9,6 +9,7 @@ import cv2
 from edgeslam_torch.drone.tello import StateMessage
 from edgeslam_torch.errors import EdgeSlamError, OutputError
 from edgeslam_torch.files.appender import Appender
+from edgeslam_torch.files.plain import subfolder, write_image
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.camera_file import save_camera
 from edgeslam_torch.readers.telemetry_csv import TelemetryWriter
@@ -39,7 +40,7 @@ class FlightWriter:
         if held is not None:
             raise OutputError(f"{folder}: holds {held} already, of a recording or a run; give another folder")
         try:
-            (folder / "rgb").mkdir(parents=True, exist_ok=True)
+            subfolder(folder, "rgb")
             save_camera(folder / "camera.yaml", camera)
             self._list = Appender(folder / "rgb.txt", "# stamp_s file\n")
             self._raw = Appender(folder / "state.txt", "") if with_telemetry else None
@@ -57,10 +58,7 @@ class FlightWriter:
         path = self.folder / name
 
         def write() -> None:
-            ok, data = cv2.imencode(f".{self._suffix}", frame.image, self._options)
-            if not ok:
-                raise OSError(f"cannot encode as {self._suffix}")
-            path.write_bytes(data.tobytes())
+            write_image(path, frame.image, self._options)
             self._list.write(f"{frame.stamp_s:.6f} {name}\n")
 
         try:

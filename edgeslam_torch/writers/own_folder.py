@@ -1,5 +1,6 @@
 """Folders that a run may write into: empty ones or those of earlier runs, one run at a time."""
 
+import errno
 import json
 import os
 import socket
@@ -7,9 +8,10 @@ import time
 from collections.abc import Collection
 from contextlib import suppress
 from pathlib import Path
-from typing import TextIO
+from typing import BinaryIO
 
 from edgeslam_torch.errors import OutputError
+from edgeslam_torch.files.plain import open_shared
 from edgeslam_torch.readers.images import image_files
 from edgeslam_torch.readers.video import SUFFIXES as VIDEOS
 
@@ -26,6 +28,10 @@ _SUMMARY_KEYS = frozenset({"version", "frames", "statuses"})
 _RECORDING = ("rgb.txt", "rgb", "mav0", "cam0", "data.csv", "sensor.yaml", "ost.yaml", "telemetry.csv")
 """File names that only recordings have."""
 _LOCK = ".lock"
+_NOT_PLAIN = (errno.ELOOP, errno.EINVAL, errno.EISDIR, errno.ENXIO)
+"""What opening a link, a pipe, a folder or a socket gives."""
+_HOLDER = "process "
+"""Beginning of its text."""
 
 
 def check_free(folder: Path, outputs: Collection[str]) -> None:
@@ -86,8 +92,9 @@ class FolderLock:
             self._file.close()
             self._file = self._open()
         self._file.truncate(0)
-        self._file.write(f"process {os.getpid()} on {socket.gethostname()} since {time.strftime('%Y-%m-%d %H:%M:%S')}")
-        self._file.flush()
+        self._file.seek(0)
+        since = time.strftime("%Y-%m-%d %H:%M:%S")
+        self._file.write(f"{_HOLDER}{os.getpid()} on {socket.gethostname()} since {since}".encode())
 
     def release(self) -> None:
         """Release the lock; may be called repeatedly."""
@@ -96,20 +103,31 @@ class FolderLock:
                 self._path.unlink()
             self._file.close()
 
-    def _open(self) -> TextIO:
-        file = self._path.open("a+", encoding="utf-8")
+    def _open(self) -> BinaryIO:
+        folder = self._path.parent
+        try:
+            file = open_shared(self._path)
+        except OSError as error:
+            if error.errno in _NOT_PLAIN:
+                raise OutputError(f"{folder}: {self._not_ours()}") from error
+            raise
+        holder = file.read(200).decode("utf-8", errors="replace")
         try:
             if fcntl is not None:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            file.seek(0)
-            holder = file.read(200) or "another process"
             file.close()
-            folder = self._path.parent
+            holder = holder or "another process"
             raise OutputError(f"{folder}: {holder} writes a run there; give another folder to --out") from None
         except OSError:
             pass  # a file system without locks
+        if holder and not holder.startswith(_HOLDER):
+            file.close()
+            raise OutputError(f"{folder}: {self._not_ours()}")
         return file
+
+    def _not_ours(self) -> str:
+        return f"holds {self._path.name}, which no run wrote; give another folder to --out"
 
     def _is_there(self) -> bool:
         try:

@@ -15,7 +15,7 @@ import numpy as np
 
 from edgeslam_torch.errors import OutputError
 from edgeslam_torch.files.appender import Appender
-from edgeslam_torch.files.atomic import write_text
+from edgeslam_torch.files.atomic import remove_partials, write_text
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.types import FloatArray, PointCloud, SlamOutput, Support, Units
 from edgeslam_torch.writers.own_folder import STATUS, SUMMARY, FolderLock, check_free
@@ -188,6 +188,7 @@ class RunWriter:
             (self.folder / name).unlink(missing_ok=True)
         for path in self.folder.glob(PIECE.format("*")):
             path.unlink(missing_ok=True)
+        remove_partials(self.folder)
         live = _LiveFiles(self.folder)
         write_text(self.folder / CONFIG, self._config_toml)
         return live

@@ -30,6 +30,7 @@ from edgeslam_torch.eval.metrics.align import AlignmentKind, umeyama
 from edgeslam_torch.eval.metrics.edge_map_score import score_map
 from edgeslam_torch.eval.metrics.surface import surface_truth
 from edgeslam_torch.eval.metrics.trajectory_error import score_trajectory
+from edgeslam_torch.files.atomic import write_text
 from edgeslam_torch.files.config_file import load_config
 from edgeslam_torch.files.record_files import read_mapping
 from edgeslam_torch.geometry.camera import Camera
@@ -208,7 +209,7 @@ def run_ablation(settings: AblationSettings, out: Path, say: Callable[[str], Non
                     figures = _finish(flight, window, dataset)
                     run = {"sequence": name, "seed": seed, "figures": figures, "error": ""}
                     record["rows"][row.name]["runs"].append(run)
-                    path.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+                    write_text(path, json.dumps(record, indent=1) + "\n")
                     say(f"{name}, seed {seed}, {row.name}: ATE {figures['ate_sim3_m']:.4f} m")
     return record
 

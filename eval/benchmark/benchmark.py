@@ -38,6 +38,7 @@ from edgeslam_torch.eval.benchmark.machine_speed import MachineSpeed, disturbanc
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.inputs.dataset import open_dataset
 from edgeslam_torch.eval.metrics.run_score import RunScore, evaluate_run
+from edgeslam_torch.files.atomic import write_text
 
 SYNTHETIC = "synthetic"
 """Name of the simulated flight among the sequences."""
@@ -321,7 +322,7 @@ def _commit() -> str:
 
 
 def _save(record: dict[str, Any], path: Path) -> None:
-    path.write_text(json.dumps(record, indent=1, default=str) + "\n", encoding="utf-8")
+    write_text(path, json.dumps(record, indent=1, default=str) + "\n")
 
 
 def _one_line(run: dict[str, Any]) -> str:

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.inputs.columns import Columns, columns_by_name, columns_by_number
+from edgeslam_torch.files.atomic import write_atomically, write_text
 from edgeslam_torch.files.record_files import plain_yaml
 from edgeslam_torch.files.tables import Table, read_table
 from edgeslam_torch.files.time_units import UNKNOWN, seconds_of
@@ -108,7 +109,7 @@ def write_tum(trajectory: Trajectory, path: Path | str) -> None:
         f"{stamp:.6f} " + " ".join(f"{x:.9f}" for x in se3.pose_to_tum(T))
         for stamp, T in zip(trajectory.stamps_s, trajectory.T_w_c, strict=True)
     ]
-    Path(path).write_text("# timestamp tx ty tz qx qy qz qw\n" + "\n".join(rows) + "\n", encoding="ascii")
+    write_text(Path(path), "# timestamp tx ty tz qx qy qz qw\n" + "\n".join(rows) + "\n")
 
 
 def write_euroc(trajectory: Trajectory, path: Path | str) -> None:
@@ -119,14 +120,14 @@ def write_euroc(trajectory: Trajectory, path: Path | str) -> None:
         x = se3.pose_to_tum(T)
         numbers = [f"{v:.9f}" for v in (*x[:3], x[6], *x[3:6])] + ["0"] * 9
         rows.append(f"{round(stamp * 1e9)}," + ",".join(numbers))
-    Path(path).write_text(header + "\n" + "\n".join(rows) + "\n", encoding="ascii")
+    write_text(Path(path), header + "\n" + "\n".join(rows) + "\n")
 
 
 def write_kitti(trajectory: Trajectory, path: Path | str) -> None:
     """Write 12 numbers a row and the stamps to ``times.txt`` beside it."""
     path = Path(path)
-    np.savetxt(path, trajectory.T_w_c[:, :3, :].reshape(-1, 12), fmt="%.9e")
-    np.savetxt(path.with_name(_TIMES), trajectory.stamps_s, fmt="%.9f")
+    _write_numbers(path, trajectory.T_w_c[:, :3, :].reshape(-1, 12), "%.9e")
+    _write_numbers(path.with_name(_TIMES), trajectory.stamps_s, "%.9f")
 
 
 def write_seven_scenes(trajectory: Trajectory, folder: Path | str) -> None:
@@ -142,9 +143,13 @@ def write_seven_scenes(trajectory: Trajectory, folder: Path | str) -> None:
     own = numbers[0] >= 0 and numbers[-1] < 10**6 and np.abs(frames - numbers).max() < 0.01
     if not own:
         numbers = np.arange(len(numbers))
-        np.savetxt(folder / _TIMES, trajectory.stamps_s, fmt="%.9f")
+        _write_numbers(folder / _TIMES, trajectory.stamps_s, "%.9f")
     for number, T in zip(numbers, trajectory.T_w_c, strict=True):
-        np.savetxt(folder / f"frame-{number:06d}.pose.txt", T, fmt="%.9e")
+        _write_numbers(folder / f"frame-{number:06d}.pose.txt", T, "%.9e")
+
+
+def _write_numbers(path: Path, table: FloatArray, number: str) -> None:
+    write_atomically(path, lambda file: np.savetxt(file, table, fmt=number))
 
 
 WRITERS: dict[str, Callable[[Trajectory, Path | str], None]] = {

@@ -36,6 +36,7 @@ from edgeslam_torch.eval.inputs.dataset import interpolate, open_dataset
 from edgeslam_torch.eval.judge import sources
 from edgeslam_torch.eval.judge.cells import find_recordings
 from edgeslam_torch.eval.metrics.align import umeyama
+from edgeslam_torch.files.atomic import write_atomically
 from edgeslam_torch.geometry import se3, sim3
 from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.map.slam_map import SlamMap
@@ -109,7 +110,7 @@ def fly_half(folder: Path, name: str, half: int, out: Path) -> Half:
         source = sources.first_frames(source, middle) if half == 0 else sources.start_at(source, middle)
         atlas, stamps = _flown(source, name)
         write_atlas(file, atlas)
-        np.save(stamps_file, stamps)
+        write_atomically(stamps_file, lambda file: np.save(file, stamps))
     atlas, stamps = read_atlas(file), np.load(stamps_file)
     T_w_c, known = interpolate(open_dataset(folder).truth, stamps)
     T_w_c = np.where(known[:, None, None], T_w_c, np.nan)
@@ -125,7 +126,7 @@ def fly_room(seed: int, path: int, out: Path) -> Half:
     if not (file.is_file() and stamps_file.is_file()):
         atlas, stamps = _flown(_pictures(world, flight, seed), name)
         write_atlas(file, atlas)
-        np.save(stamps_file, stamps)
+        write_atomically(stamps_file, lambda file: np.save(file, stamps))
     stamps = np.load(stamps_file)
     rows = np.abs(flight.stamps_s[None, :] - stamps[:, None]).argmin(axis=1)
     later_s = path * (ROOM_S + AWAY_S)

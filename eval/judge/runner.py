@@ -13,6 +13,7 @@ from typing import IO, Any
 from edgeslam_torch import __version__
 from edgeslam_torch.eval.judge.cells import Cell
 from edgeslam_torch.files.atomic import write_text
+from edgeslam_torch.files.plain import subfolder
 from edgeslam_torch.jobs.watched import Job, Limits, Start, run_each, start_module
 
 CELL, RESULT, LOG = "cell.json", "result.json", "log.txt"
@@ -146,8 +147,7 @@ def _others(cells: Sequence[Cell], settings: JudgeSettings, out: Path, commit: s
 
 def _prepared(cell: Cell, settings: JudgeSettings, commit: str, out: Path) -> Path:
     """The cell's folder, with what its process has to do and no result."""
-    folder = out / "cells" / cell.slug
-    folder.mkdir(parents=True, exist_ok=True)
+    folder = subfolder(out, "cells", cell.slug)
     (folder / RESULT).unlink(missing_ok=True)
     flights = settings.flights or out / "flights"
     flights.mkdir(parents=True, exist_ok=True)

@@ -11,6 +11,7 @@ import numpy as np
 
 from edgeslam_torch.eval.inputs.trajectory_files import Trajectory
 from edgeslam_torch.eval.metrics.trajectory_error import TrajectoryScore
+from edgeslam_torch.files.atomic import write_atomically
 
 
 def plot_overlay(
@@ -29,7 +30,7 @@ def plot_overlay(
         axis.set_xlabel(f"{names[0]} [m]")
         axis.set_ylabel(f"{names[1]} [m]")
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)
-    figure.savefig(path, dpi=110)
+    write_atomically(Path(path), lambda file: figure.savefig(file, dpi=110, format="png"))
     plt.close(figure)
 
 
@@ -58,5 +59,5 @@ def plot_errors(truth: Trajectory, estimate: Trajectory, score: TrajectoryScore,
     figure.suptitle(
         f"{score.alignment.kind}: ATE RMSE {score.ate_m.rmse:.4f} m, {score.matched} poses, scale {score.scale:.4f}"
     )
-    figure.savefig(path, dpi=110)
+    write_atomically(Path(path), lambda file: figure.savefig(file, dpi=110, format="png"))
     plt.close(figure)

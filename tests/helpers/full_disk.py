@@ -4,6 +4,8 @@ from pathlib import Path
 
 import pytest
 
+from edgeslam_torch.files import appender, plain
+
 
 class FullDisk:
     """Files of a name: while ``room`` is set, a write leaves that many bytes and says so, as POSIX has it.
@@ -15,13 +17,13 @@ class FullDisk:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
         self.room: int | None = None
-        opened = Path.open
+        opened = plain.create
 
-        def open_on_it(path: Path, mode: str = "r", *arguments, **named):
-            file = opened(path, mode, *arguments, **named)
-            return _File(file, self) if path.name == name and "r" not in mode else file
+        def create_on_it(path: Path):
+            file = opened(path)
+            return _File(file, self) if path.name == name else file
 
-        monkeypatch.setattr(Path, "open", open_on_it)
+        monkeypatch.setattr(appender, "create", create_on_it)
 
 
 class _File:

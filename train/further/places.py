@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
+from edgeslam_torch.files.atomic import write_atomically
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.synthetic.house.render import Rendered, render
 from edgeslam_torch.synthetic.house.rooms import (
@@ -142,10 +143,8 @@ def _render_file(work: tuple[Path, int, int, int]) -> None:
             images.append(rendered.image)
             depths.append(rendered.depth_m.astype(np.float16))
             matrices.append(camera.K)
-    temporary = path.with_suffix(".part")
-    with temporary.open("wb") as file:
-        np.savez(file, image=np.array(images), depth=np.array(depths), K=np.array(matrices))
-    temporary.replace(path)
+    arrays = {"image": np.array(images), "depth": np.array(depths), "K": np.array(matrices)}
+    write_atomically(path, lambda file: np.savez(file, allow_pickle=False, **arrays))
 
 
 def _views(rng: Rng, world: World) -> Iterator[tuple[Camera, Rendered]]:

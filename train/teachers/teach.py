@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgeslam_torch.files.atomic import write_atomically
+from edgeslam_torch.files.plain import subfolder
 from edgeslam_torch.train.processes.counting import counted
 from edgeslam_torch.train.processes.distributed import share_of, wait_for_all
 from edgeslam_torch.train.teachers.densify import densify
@@ -77,7 +78,7 @@ def teach(predict: Predict, sequence: PosedSequence, log_scale: float, folder: P
         OSError: If the file cannot be written.
         ProcessError: If another process of the group is gone.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    subfolder(folder.parent, folder.name)
     count = min(MOST, len(sequence.views))
     chosen = np.unique(np.linspace(0, len(sequence.views) - 1, count).astype(int)).tolist()
     with_partners = [i for i in chosen if sequence.partners[i]]

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
+from edgeslam_torch.files.atomic import write_atomically
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.synthetic.house.rooms import random_room
 from edgeslam_torch.synthetic.house.rooms import random_view as view_of_room
@@ -34,9 +35,8 @@ def render_rooms(path: Path, rooms: int, views_per_room: int = 6, seed: int = 7)
             images.append(rendered.image)
             depths.append(rendered.depth_m.astype(np.float16))
             matrices.append(camera.K)
-    temporary = path.with_suffix(".part.npz")
-    np.savez(temporary, image=np.array(images), depth=np.array(depths), K=np.array(matrices))
-    temporary.replace(path)
+    arrays = {"image": np.array(images), "depth": np.array(depths), "K": np.array(matrices)}
+    write_atomically(path, lambda file: np.savez(file, allow_pickle=False, **arrays))
 
 
 def load_rendered(path: Path, seed: int = 0) -> list[View]:

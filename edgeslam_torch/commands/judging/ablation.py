@@ -7,6 +7,7 @@ import time
 from pathlib import Path
 
 from edgeslam_torch.errors import OutputError, SourceError
+from edgeslam_torch.files.atomic import write_text
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -44,7 +45,7 @@ def main(args: argparse.Namespace) -> int:
     try:
         text = markdown_ablation(run_ablation(settings, out, _say))
         if args.markdown is not None:
-            args.markdown.write_text(text, encoding="utf-8")
+            write_text(args.markdown, text)
     except OSError as error:
         raise OutputError(f"{error.filename}: cannot be written ({error.strerror or error})") from error
     print(text)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from edgeslam_torch.errors import OutputError
+from edgeslam_torch.files.atomic import write_text
 
 if TYPE_CHECKING:
     from edgeslam_torch.eval.benchmark.benchmark import BenchSettings
@@ -103,9 +104,9 @@ def main(args: argparse.Namespace) -> int:
         record = benchmark.run_benchmark(settings, out, _say)
         text = benchmark.markdown_bench(record)
         if args.json is not None:
-            args.json.write_text(json.dumps(record, indent=1, default=str) + "\n", encoding="utf-8")
+            write_text(args.json, json.dumps(record, indent=1, default=str) + "\n")
         if args.markdown is not None:
-            args.markdown.write_text(text, encoding="utf-8")
+            write_text(args.markdown, text)
     except OSError as error:
         raise OutputError(f"{error.filename}: cannot be written ({error.strerror or error})") from error
     print(text)
@@ -130,9 +131,9 @@ def _networks(settings: "BenchSettings", args: argparse.Namespace, out: Path) ->
         records = compare_networks(settings, args.depth, out, _say)
         text = markdown_networks(records)
         if args.json is not None:
-            args.json.write_text(json.dumps(records, indent=1, default=str) + "\n", encoding="utf-8")
+            write_text(args.json, json.dumps(records, indent=1, default=str) + "\n")
         if args.markdown is not None:
-            args.markdown.write_text(text, encoding="utf-8")
+            write_text(args.markdown, text)
     except OSError as error:
         raise OutputError(f"{error.filename}: cannot be written ({error.strerror or error})") from error
     print(text)

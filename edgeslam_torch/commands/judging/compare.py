@@ -6,6 +6,7 @@ from pathlib import Path
 
 from edgeslam_torch.commands.judging.eval import groundtruth_of, one_groundtruth
 from edgeslam_torch.errors import OutputError
+from edgeslam_torch.files.atomic import write_text
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -44,7 +45,7 @@ def main(args: argparse.Namespace) -> int:
     print(common_report(common))
     if args.json is not None:
         try:
-            args.json.write_text(json.dumps([first.to_dict(), second.to_dict()], indent=1, default=str) + "\n")
+            write_text(args.json, json.dumps([first.to_dict(), second.to_dict()], indent=1, default=str) + "\n")
         except OSError as error:
             raise OutputError(f"{error.filename}: cannot be written ({error.strerror})") from error
     return 0

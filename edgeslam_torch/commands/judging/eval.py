@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from edgeslam_torch.errors import ConfigError, EdgeSlamError, OutputError
 from edgeslam_torch.extras import needs_extra
+from edgeslam_torch.files.atomic import write_text
 
 if TYPE_CHECKING:
     from edgeslam_torch.eval.metrics.common_frames import CommonScore
@@ -95,7 +96,7 @@ def main(args: argparse.Namespace) -> int:
     print(_text(scores, common, markdown=to_print))
     try:
         if args.markdown is not None and not to_print:
-            args.markdown.write_text(_text(scores, common, markdown=True), encoding="utf-8")
+            write_text(args.markdown, _text(scores, common, markdown=True))
         _write_files(args, scores, judged)
     except OSError as error:
         raise OutputError(f"{error.filename}: cannot be written ({error.strerror})") from error
@@ -173,9 +174,9 @@ def _depth_maps(args: argparse.Namespace) -> int:
     print(text)
     try:
         if args.markdown is not None:
-            args.markdown.write_text(text, encoding="utf-8")
+            write_text(args.markdown, text)
         if args.json is not None:
-            args.json.write_text(json.dumps({k: asdict(v) for k, v in reports.items()}, indent=1) + "\n")
+            write_text(args.json, json.dumps({k: asdict(v) for k, v in reports.items()}, indent=1) + "\n")
     except OSError as error:
         raise OutputError(f"{error.filename}: cannot be written ({error.strerror})") from error
     return 0
@@ -185,7 +186,7 @@ def _write_files(args: argparse.Namespace, scores: "list[RunScore]", judged: lis
     from edgeslam_torch.eval.inputs.trajectory_files import WRITERS, read_trajectory
 
     if args.json is not None:
-        args.json.write_text(json.dumps([s.to_dict() for s in scores], indent=1, default=str) + "\n", encoding="utf-8")
+        write_text(args.json, json.dumps([s.to_dict() for s in scores], indent=1, default=str) + "\n")
     if args.plots is not None:
         _plot(args.plots, scores, judged)
     if args.convert is not None:

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 from edgeslam_torch.errors import ConfigError, OutputError
+from edgeslam_torch.files.atomic import write_text
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -60,8 +61,8 @@ def main(args: argparse.Namespace) -> int:
         text = markdown(record, bars)
         if before is not None:
             text += "\n" + markdown_against(before, record)
-        (args.out / RECORD).write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
-        (args.out / "judge.md").write_text(text, encoding="utf-8")
+        write_text(args.out / RECORD, json.dumps(record, indent=1) + "\n")
+        write_text(args.out / "judge.md", text)
     except OSError as error:
         raise OutputError(f"{error.filename}: cannot be written ({error.strerror or error})") from error
     print(text)

@@ -14,6 +14,7 @@ from types import FrameType
 from typing import TYPE_CHECKING
 
 from edgeslam_torch.errors import ConfigError, SourceError
+from edgeslam_torch.files.plain import subfolder
 
 if TYPE_CHECKING:
     from edgeslam_torch.train.folder import OutFolder
@@ -277,7 +278,7 @@ def posed_run(
 
     folder = item.path
     if item.kind == "recording":
-        folder = out.path / "slam" / item.name
+        folder = subfolder(out.path, "slam") / item.name
         by_first(lambda: ensure_run(item.path, folder, weights, camera, max_frames, out.path))
     return load_run(folder, max_frames=max_frames)
 

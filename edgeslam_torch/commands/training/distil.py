@@ -17,6 +17,7 @@ from edgeslam_torch.commands.training._inputs import (
     validation_folders,
 )
 from edgeslam_torch.errors import ConfigError
+from edgeslam_torch.files.plain import subfolder
 
 if TYPE_CHECKING:
     from edgeslam_torch.frontend.depth_network import DepthNetwork
@@ -133,7 +134,7 @@ def _labelled(
         if not (teacher.is_metric or run.metric):
             raise ConfigError(f"{item.path}: neither the teacher nor the run gives metres; add telemetry to it")
         scale = None if teacher.is_metric else 0.0
-        folder = out.path / "labels" / f"{number}-{item.name}-{sha256[:12]}"
+        folder = subfolder(out.path, "labels") / f"{number}-{item.name}-{sha256[:12]}"
         if cache is not None:
             folder = cache.entry(item.name, str(posed_set(run).sha256), sha256, repr(scale))
         labels = label(teacher, run, scale, folder)

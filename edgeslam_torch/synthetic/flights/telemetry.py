@@ -10,6 +10,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, Slerp
 
+from edgeslam_torch.files.atomic import write_text
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.types import FloatArray, TelemetrySample
 
@@ -105,7 +106,7 @@ class TelemetryLog:
         lines = [",".join(("stamp_s", *FIELDS))]
         for stamp, row in zip(self.stamps_s, self.rows, strict=True):
             lines.append(",".join([f"{stamp:.6f}", *(f"{x:.6f}".rstrip("0").rstrip(".") for x in row)]))
-        Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
+        write_text(Path(path), "\n".join(lines) + "\n")
 
 
 def simulate(

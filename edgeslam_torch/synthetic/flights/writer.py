@@ -8,6 +8,8 @@ import cv2
 import numpy as np
 
 from edgeslam_torch.errors import OutputError
+from edgeslam_torch.files.atomic import write_text
+from edgeslam_torch.files.plain import subfolder, write_image
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.camera_file import save_camera
@@ -59,9 +61,9 @@ def write_flight(
     T_w_c = flight.T_w_c
     rgb, depth = ["# timestamp filename"], ["# timestamp filename"]
     try:
-        (folder / "rgb").mkdir(parents=True, exist_ok=True)
+        subfolder(folder, "rgb")
         if depth_every:
-            (folder / "depth").mkdir(exist_ok=True)
+            subfolder(folder, "depth")
         save_camera(folder / "camera.yaml", camera)
         _write_text(folder / "groundtruth.txt", _groundtruth_lines(flight.stamps_s, T_w_c))
         if telemetry is not None:
@@ -73,10 +75,10 @@ def write_flight(
             twist = flight.twist_c(i)
             image = degraded(rng, view.image, view.depth_m, camera, faults, stamp_s=stamp, twist_c=twist)
             options = [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality] if jpeg_quality else []
-            _write_image(folder / "rgb" / f"{_name(stamp)}{suffix}", image, options)
+            write_image(folder / "rgb" / f"{_name(stamp)}{suffix}", image, options)
             if depth_every and i % depth_every == 0:
                 steps = np.clip(np.rint(view.depth_m * DEPTH_PER_METRE), 0, 65535).astype(np.uint16)
-                _write_image(folder / "depth" / f"{_name(stamp)}.png", steps, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+                write_image(folder / "depth" / f"{_name(stamp)}.png", steps, [cv2.IMWRITE_PNG_COMPRESSION, 1])
 
         pool = ThreadPoolExecutor(max_workers=threads)
         try:
@@ -110,11 +112,4 @@ def _groundtruth_lines(stamps_s: FloatArray, T_w_c: FloatArray) -> list[str]:
 
 
 def _write_text(path: Path, lines: list[str]) -> None:
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
-
-
-def _write_image(path: Path, image: np.ndarray, options: list[int]) -> None:
-    ok, packed = cv2.imencode(path.suffix, image, options)
-    if not ok:
-        raise OutputError(f"{path}: OpenCV cannot encode the image")
-    path.write_bytes(packed.tobytes())
+    write_text(path, "\n".join(lines) + "\n")

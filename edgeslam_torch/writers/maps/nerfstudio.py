@@ -13,8 +13,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from edgeslam_torch.errors import OutputError, SourceError
+from edgeslam_torch.errors import SourceError
 from edgeslam_torch.files.atomic import write_text
+from edgeslam_torch.files.plain import subfolder, write_image
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.types import FloatArray, Observations, PointCloud
@@ -49,15 +50,15 @@ def write_nerfstudio(
         SourceError: If an image cannot be read, or has another size than the calibration.
     """
     for name in ("images", "masks", "depth"):
-        (folder / name).mkdir(parents=True, exist_ok=True)
+        subfolder(folder, name)
     mask = valid_pixels(camera)
     frames = []
     for number, (path, T) in enumerate(zip(images, T_w_c, strict=True)):
         name = f"{number:05d}.png"
         own = seen.keyframe == number
-        _write(folder / "images" / name, camera.undistort_image(_image(path, camera)))
-        _write(folder / "masks" / name, mask)
-        _write(folder / "depth" / name, sparse_depth(camera, T, anchors.p_w[seen.anchor[own]], seen.uv[own]))
+        write_image(folder / "images" / name, camera.undistort_image(_image(path, camera)))
+        write_image(folder / "masks" / name, mask)
+        write_image(folder / "depth" / name, sparse_depth(camera, T, anchors.p_w[seen.anchor[own]], seen.uv[own]))
         files = {"file_path": "images", "mask_path": "masks", "depth_file_path": "depth"}
         frames.append({key: f"{place}/{name}" for key, place in files.items()} | {"transform_matrix": gl_pose(T)})
     write_ply(folder / "edge_map.ply", cloud)
@@ -112,10 +113,3 @@ def _image(path: Path, camera: Camera) -> np.ndarray:
         size = f"{image.shape[1]}x{image.shape[0]}"
         raise SourceError(f"{path}: is {size}, the run's calibration {camera.width}x{camera.height}")
     return image
-
-
-def _write(path: Path, image: np.ndarray) -> None:
-    done, data = cv2.imencode(".png", image)
-    if not done:
-        raise OutputError(f"{path}: cannot be written as PNG")
-    path.write_bytes(data.tobytes())

@@ -1,11 +1,14 @@
 """`RosFile`: an MCAP file of ROS 2 messages; rosbags encodes them, the mcap library writes them."""
 
+import io
 import os
 from pathlib import Path
 from typing import Any
 
 from edgeslam_torch.errors import OutputError
 from edgeslam_torch.extras import needs_extra
+from edgeslam_torch.files.atomic import partial_beside
+from edgeslam_torch.files.plain import open_exclusively
 
 
 class RosFile:
@@ -23,7 +26,7 @@ class RosFile:
             from rosbags.typesys import Stores, get_typestore
 
         self.path = path
-        self._part = path.with_name(f".{path.name}.part")
+        self._part = partial_beside(path)
         self._store: Any = get_typestore(Stores.ROS2_HUMBLE)
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
@@ -31,7 +34,7 @@ class RosFile:
             if path.is_dir():
                 raise OutputError(f"{path}: is a folder; give a file, such as {path / 'run.mcap'}")
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = self._part.open("wb")
+            self._file = io.BufferedWriter(open_exclusively(self._part))
         except OSError as error:
             raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error
         self._writer: Any = Writer(self._file)

@@ -6,14 +6,13 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
 from pathlib import Path
 
-import cv2
-
 from edgeslam_torch.eval.judge.navigation.film import film_strip
 from edgeslam_torch.eval.judge.navigation.flight import fly
 from edgeslam_torch.eval.judge.navigation.flown import Case, Flown
 from edgeslam_torch.eval.judge.navigation.pictures import top_view
 from edgeslam_torch.eval.judge.navigation.table import markdown
 from edgeslam_torch.files.atomic import write_text
+from edgeslam_torch.files.plain import write_image
 from edgeslam_torch.jobs.watched import end_with_parent_process
 
 FAILED = "failed"
@@ -55,10 +54,10 @@ def judge_flights(cases: Sequence[Case], out: Path, jobs: int, say: Callable[[st
     seen = [flown for flown in flights if flown.track_w]
     for flown in sorted(seen, key=lambda f: (f.reached, not f.contacts, f.clearance_min_m))[:_WORST]:
         name = f"{_name(flown.case)}.png"
-        cv2.imwrite(str(out / f"top_{name}"), top_view(flown))
+        write_image(out / f"top_{name}", top_view(flown))
         strip = film_strip(flown)
         if strip is not None:
-            cv2.imwrite(str(out / f"film_{name}"), strip)
+            write_image(out / f"film_{name}", strip)
     return flights
 
 
