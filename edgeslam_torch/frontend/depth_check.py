@@ -24,6 +24,12 @@ MIN_SHARE = 0.5
 """Minimum share of plausible pixels. Sky and windows cover part of an image; a network that fails on most of it
 cannot be trusted on the rest."""
 
+ORDER_MAPS, ORDER_SIDE = 5, 48
+"""Maps whose order is compared with that of another network, at about so many pixels a side."""
+CONTRADICTION = -0.3
+"""Rank correlation below which two networks contradict each other about what is nearer. Networks for the same scene have
+0.5 and more; exchanged, as much below zero."""
+
 
 def usable(depth: DepthMap) -> NDArray[np.bool_]:
     """Pixels whose depth and sigma are finite, positive and plausible, ``(H, W)``."""
@@ -34,8 +40,22 @@ def usable(depth: DepthMap) -> NDArray[np.bool_]:
     )
 
 
+def order_agreement(depth: DepthMap, reference: DepthMap) -> float:
+    """Rank correlation of two depth maps of one image, -1 to 1; NaN where too little is known."""
+    steps = tuple(slice(None, None, max(1, side // ORDER_SIDE)) for side in depth.depth_m.shape)
+    known = usable(depth)[steps] & usable(reference)[steps]
+    if np.count_nonzero(known) < ORDER_SIDE:
+        return float("nan")
+    ranks = [m.depth_m[steps][known].argsort().argsort() for m in (depth, reference)]
+    return float(np.corrcoef(*ranks)[0, 1])
+
+
 class CheckedDepth:
     """Wraps a depth function and discards implausible pixels and maps.
+
+    A function with an attribute ``reference``, another depth function, is compared with it in its first `ORDER_MAPS`
+    maps: one that takes for far what the other takes for near is not used. Its ``said_instead`` says how it should have
+    been read. A map started from depth that is inside out stays so, and agrees with it.
 
     Args:
         depth: Function to check.
@@ -47,6 +67,8 @@ class CheckedDepth:
         """Depth maps requested."""
         self.refused = 0
         """Maps with less than `MIN_SHARE` usable pixels."""
+        self._agreement: list[float] = []
+        self._contradiction: str | None = None
 
     def __call__(self, image: np.ndarray, camera: Camera) -> DepthMap | None:
         """The depth map with NaN where it is not usable; None if too few pixels are."""
@@ -59,7 +81,26 @@ class CheckedDepth:
         if share < MIN_SHARE:
             self._refuse(share)
             return None
+        if self._contradicted(depth, image, camera):
+            return None
         return depth if share == 1.0 else replace(depth, depth_m=np.where(good, depth.depth_m, np.float32(np.nan)))
+
+    def _contradicted(self, depth: DepthMap, image: np.ndarray, camera: Camera) -> bool:
+        """Whether the maps so far show near and far exchanged."""
+        reference = getattr(self.depth, "reference", None)
+        if reference is None:
+            return False
+        if len(self._agreement) < ORDER_MAPS:
+            other = reference(image, camera)
+            found = order_agreement(depth, other)
+            self._agreement.append(0.0 if np.isnan(found) else found)
+            if np.median(self._agreement) < CONTRADICTION and self._contradiction is None:
+                self._contradiction = (
+                    "the depth network takes for far what the shipped network takes for near: such depth is not used; "
+                    + self.depth.said_instead(image, camera, other)  # type: ignore[attr-defined]
+                )
+                logger.warning(self._contradiction)
+        return bool(np.median(self._agreement) < CONTRADICTION)
 
     def _refuse(self, share: float) -> None:
         self.refused += 1
@@ -73,6 +114,8 @@ class CheckedDepth:
 
     def warning(self) -> str | None:
         """Warning about rejected maps; None if there were none."""
+        if self._contradiction and np.median(self._agreement) < CONTRADICTION:
+            return self._contradiction
         if not self.refused:
             return None
         return (

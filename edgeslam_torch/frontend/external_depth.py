@@ -15,6 +15,7 @@ from edgeslam_torch.models.onnx.external import Gives, read_external
 from edgeslam_torch.types import DepthMap, FloatArray
 
 if TYPE_CHECKING:
+    from edgeslam_torch.frontend.depth_network import DepthNetwork
     from edgeslam_torch.models.onnx.file import OnnxFile
 
 FARTHEST = 2.0
@@ -23,6 +24,8 @@ its 98th percentile at 1.4 to 2.7 (medians of eight recordings; 1.2 to 3.2 in ni
 FARTHEST_PERCENTILE = 2.0
 BEYOND = 4.0
 """Factor on `FARTHEST` beyond which relative depth is unknown."""
+SAME_UNIT = 1.5
+"""Median ratio of depths, as a logarithm (a factor of 4.5), within which two networks speak of the same unit."""
 _TRIAL_SIDE = 112
 """Side of the test images [px], rounded up: eight patches of a vision transformer."""
 
@@ -51,6 +54,7 @@ class ExternalDepth:
         self.backend = words_of("onnxruntime", device_of(self._session))
         self._fixed = [side if isinstance(side, int) else None for side in self._session.get_inputs()[0].shape[2:]]
         self._try_out()
+        self._shipped: DepthNetwork | None = None
 
     @property
     def is_metric(self) -> bool:
@@ -70,23 +74,52 @@ class ExternalDepth:
         Raises:
             ValueError: If the image's size is not the camera's or it has neither one nor three channels.
         """
-        check_image(image, camera)
         network = self.network
-        training = (network.input_height, network.input_width)
-        height, width = self._taken(*network_size(camera.height, camera.width, training, network.multiple))
-        small, sigma = self._run(preprocess(image, height, width, network))
-        to_image = (camera.width, camera.height)
-        given = np.asarray(cv2.resize(small, to_image, interpolation=cv2.INTER_LINEAR), np.float32)
-        sigma_log = (
-            np.full(given.shape, network.sigma_log, np.float32)
-            if sigma is None
-            else np.asarray(cv2.resize(sigma, to_image, interpolation=cv2.INTER_LINEAR), np.float32)
-        )
+        given, sigma_log = self._given(image, camera)
         if network.is_relative:
             return DepthMap(relative_depth(given), sigma_log, is_relative=True)
+        height, width = self._input_size(camera)
         lens = camera.scaled(width, height)
         longer = float(np.sqrt(lens.fx * lens.fy)) / network.focal_px if network.focal_px else 1.0
         return DepthMap(np.asarray(longer * _metres(given, network.gives), np.float32), sigma_log)
+
+    def _input_size(self, camera: Camera) -> tuple[int, int]:
+        training = (self.network.input_height, self.network.input_width)
+        return self._taken(*network_size(camera.height, camera.width, training, self.network.multiple))
+
+    def _given(self, image: NDArray[np.uint8], camera: Camera) -> tuple[FloatArray, FloatArray]:
+        """The network's numbers as they are, and their sigma, at the image's size ``(H, W)``."""
+        check_image(image, camera)
+        small, sigma = self._run(preprocess(image, *self._input_size(camera), self.network))
+        to_image = (camera.width, camera.height)
+        given = np.asarray(cv2.resize(small, to_image, interpolation=cv2.INTER_LINEAR), np.float32)
+        if sigma is None:
+            return given, np.full(given.shape, self.network.sigma_log, np.float32)
+        return given, np.asarray(cv2.resize(sigma, to_image, interpolation=cv2.INTER_LINEAR), np.float32)
+
+    def reference(self, image: NDArray[np.uint8], camera: Camera) -> DepthMap:
+        """Depth by the shipped network, which says what is nearer."""
+        if self._shipped is None:
+            from edgeslam_torch.frontend.depth_network import DepthPredictor
+
+            self._shipped = DepthPredictor()
+        return self._shipped(image, camera)
+
+    def said_instead(self, image: NDArray[np.uint8], camera: Camera, reference: DepthMap) -> str:
+        """Which ``gives`` fits the network's numbers for an image better, given another's depth of it."""
+        given = self._given(image, camera)[0]
+        known = np.isfinite(given) & np.isfinite(reference.depth_m)
+        z = reference.depth_m[known]
+        with np.errstate(over="ignore", invalid="ignore"):
+            apart = {
+                gives: float(np.nanmedian(np.abs(np.log(_metres(given, gives)[known] / z))))
+                for gives in (Gives.METRES, Gives.LOG_METRES, Gives.INVERSE_METRES)
+            }
+        if self.network.gives in (Gives.METRES, Gives.LOG_METRES):  # they fell where the other's depth rises
+            fits = Gives.INVERSE_METRES if apart[Gives.INVERSE_METRES] < SAME_UNIT else Gives.RELATIVE_INVERSE
+        else:
+            fits = Gives.LOG_METRES if apart[Gives.LOG_METRES] < apart[Gives.METRES] else Gives.METRES
+        return f"{self.weights.name} is described as {self.network.gives}, its numbers look like gives = '{fits}'"
 
     def _taken(self, height: int, width: int) -> tuple[int, int]:
         """The size, with the sides that the graph fixes."""

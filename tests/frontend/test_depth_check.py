@@ -80,3 +80,33 @@ def test_a_function_that_knows_nothing_is_no_failure() -> None:
     checked = CheckedDepth(lambda image, camera: None)
     assert checked(IMAGE, CAMERA) is None
     assert checked.warning() is None
+
+
+class Described:
+    """A network whose depth is ``power`` of the truth, beside one that gives the truth."""
+
+    def __init__(self, power: float, relative: bool) -> None:
+        across = np.tile(np.linspace(1, 4, 320, dtype=np.float32), (240, 1))
+        sigma = np.full_like(across, 0.2)
+        self.map, self.truth = DepthMap(across**power, sigma, is_relative=relative), DepthMap(across, sigma)
+
+    def __call__(self, image, camera):
+        return self.map
+
+    def reference(self, image, camera):
+        return self.truth
+
+    def said_instead(self, image, camera, reference):
+        return "gives = 'metres'"
+
+
+@pytest.mark.parametrize("relative", [False, True])
+def test_depth_inside_out_is_not_used_and_said_once(relative, caplog) -> None:
+    checked = CheckedDepth(Described(-1.0, relative))
+    with caplog.at_level(logging.WARNING):
+        assert [checked(IMAGE, CAMERA) for _ in range(8)] == [None] * 8
+    assert len(caplog.records) == 1
+    assert "gives = 'metres'" in (checked.warning() or "")
+    right = CheckedDepth(Described(0.7, relative))
+    assert right(IMAGE, CAMERA) is right.depth.map
+    assert right.warning() is None

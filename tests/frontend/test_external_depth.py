@@ -15,6 +15,7 @@ from edgeslam_torch.frontend.external_depth import ExternalDepth, relative_depth
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.models.onnx.presets import PRESETS, preset_file
 from edgeslam_torch.models.record import weights_file
+from edgeslam_torch.types import DepthMap
 
 CAMERA = Camera(192, 128, 160.0, 160.0, 95.5, 63.5)
 SIZE = "input_height = 128\ninput_width = 192\n"
@@ -231,3 +232,20 @@ def test_weights_that_come_with_the_package_have_names(image):
 def test_a_name_that_nobody_knows_lists_what_there_is():
     with pytest.raises(WeightsError, match="midas-small"):
         weights_path("midas_small")
+
+
+@pytest.mark.parametrize(
+    ("numbers", "described"),
+    [
+        ("metres", "relative_inverse"),
+        ("metres", "inverse_metres"),
+        ("log_metres", "relative_inverse"),
+        ("inverse_metres", "metres"),
+        ("relative_inverse", "metres"),
+    ],
+)
+def test_what_the_numbers_are_is_told_from_depth_that_is_right(tmp_path, image, numbers, described):
+    path = describe(green_network(tmp_path / "net.onnx", **GREEN[numbers]), f'gives = "{described}"\n{SIZE}')
+    truth = NEAR_M + (FAR_M - NEAR_M) * image[..., 1].astype(np.float32) / 255
+    said = ExternalDepth(path).said_instead(image, CAMERA, DepthMap(truth, np.ones_like(truth)))
+    assert f"gives = '{numbers}'" in said
