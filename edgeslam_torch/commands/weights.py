@@ -9,6 +9,8 @@ from edgeslam_torch.errors import ConfigError, OutputError
 from edgeslam_torch.models.record import weights_file
 
 if TYPE_CHECKING:
+    from onnx import ModelProto
+
     from edgeslam_torch.models.download import Fetched, Remote
     from edgeslam_torch.models.onnx.external import ExternalNetwork
     from edgeslam_torch.models.record import Metadata
@@ -164,7 +166,7 @@ def _size_and_record(path: Path) -> "tuple[str, Metadata | ExternalNetwork]":
 
         file = parse_onnx(path)
         metadata = read_onnx(file)[1] if file.is_ours else read_external(file)[1]
-        return _operations(path), metadata
+        return _operations(file.model), metadata
     from edgeslam_torch.models.checkpoint import load_checkpoint
     from edgeslam_torch.models.complexity import measure_complexity
 
@@ -174,15 +176,15 @@ def _size_and_record(path: Path) -> "tuple[str, Metadata | ExternalNetwork]":
     return f"\n{size.parameters / 1e6:.2f} M parameters, {size.macs / 1e9:.2f} GMAC per image", metadata
 
 
-def _operations(path: Path) -> str:
+def _operations(model: "ModelProto") -> str:
     """Multiply-accumulates of an ONNX file, on a line of their own; nothing where its size is open."""
     import onnx
 
     from edgeslam_torch.models.onnx.operations import count_operations
 
     try:
-        count = count_operations(onnx.load(path))
-    except ValueError:
+        count = count_operations(model)
+    except (ValueError, onnx.shape_inference.InferenceError):
         return ""
     total = count.int8_macs + count.float_macs
     share = count.int8_macs / max(total, 1)

@@ -27,8 +27,8 @@ cannot be trusted on the rest."""
 ORDER_MAPS, ORDER_SIDE = 5, 48
 """Maps whose order is compared with that of another network, at about so many pixels a side."""
 CONTRADICTION = -0.3
-"""Rank correlation below which two networks contradict each other about what is nearer. Networks for the same scene have
-0.5 and more; exchanged, as much below zero."""
+"""Rank correlation below which two networks contradict each other about what is nearer. Those of one scene have 0.5
+and more; exchanged, as much below zero."""
 
 
 def usable(depth: DepthMap) -> NDArray[np.bool_]:
@@ -47,7 +47,7 @@ def order_agreement(depth: DepthMap, reference: DepthMap) -> float:
     if np.count_nonzero(known) < ORDER_SIDE:
         return float("nan")
     ranks = [m.depth_m[steps][known].argsort().argsort() for m in (depth, reference)]
-    return float(np.corrcoef(*ranks)[0, 1])
+    return float(np.asarray(np.corrcoef(*ranks))[0, 1])
 
 
 class CheckedDepth:
@@ -87,20 +87,20 @@ class CheckedDepth:
 
     def _contradicted(self, depth: DepthMap, image: np.ndarray, camera: Camera) -> bool:
         """Whether the maps so far show near and far exchanged."""
-        reference = getattr(self.depth, "reference", None)
-        if reference is None:
-            return False
-        if len(self._agreement) < ORDER_MAPS:
+        if len(self._agreement) < ORDER_MAPS and (reference := getattr(self.depth, "reference", None)) is not None:
             other = reference(image, camera)
             found = order_agreement(depth, other)
             self._agreement.append(0.0 if np.isnan(found) else found)
-            if np.median(self._agreement) < CONTRADICTION and self._contradiction is None:
+            if self._inside_out() and self._contradiction is None:
                 self._contradiction = (
                     "the depth network takes for far what the shipped network takes for near: such depth is not used; "
                     + self.depth.said_instead(image, camera, other)  # type: ignore[attr-defined]
                 )
                 logger.warning(self._contradiction)
-        return bool(np.median(self._agreement) < CONTRADICTION)
+        return self._inside_out()
+
+    def _inside_out(self) -> bool:
+        return bool(self._agreement) and bool(np.median(self._agreement) < CONTRADICTION)
 
     def _refuse(self, share: float) -> None:
         self.refused += 1
@@ -114,7 +114,7 @@ class CheckedDepth:
 
     def warning(self) -> str | None:
         """Warning about rejected maps; None if there were none."""
-        if self._contradiction and np.median(self._agreement) < CONTRADICTION:
+        if self._inside_out():
             return self._contradiction
         if not self.refused:
             return None

@@ -8,9 +8,18 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from edgeslam_torch.errors import WeightsError
+from edgeslam_torch.errors import EdgeSlamError, WeightsError
 from edgeslam_torch.frontend.network_input import check_image, network_size, preprocess
-from edgeslam_torch.frontend.onnx_session import device_of, first_line, has_onnxruntime, open_session, words_of
+from edgeslam_torch.frontend.onnx_session import (
+    EXIT_REFUSED,
+    bound_memory,
+    device_of,
+    first_line,
+    has_onnxruntime,
+    open_session,
+    try_apart,
+    words_of,
+)
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.models.device import check_device, find_device, onnxruntime_has_cuda
 from edgeslam_torch.models.layout import MAX_LOG_DEPTH
@@ -20,6 +29,7 @@ from edgeslam_torch.types import DepthMap, FloatArray
 if TYPE_CHECKING:
     import torch
 
+    from edgeslam_torch.frontend.external_depth import ExternalDepth
     from edgeslam_torch.models.onnx.file import OnnxFile
 
 logger = logging.getLogger(__name__)
@@ -65,6 +75,24 @@ def open_depth(
     """
     if weights is None or weights.suffix != ".onnx":
         return DepthPredictor(weights, backend, threads, device)
+    try_apart(weights)
+    return _open_onnx(weights, backend, threads, device)
+
+
+def trial(path: str) -> int:
+    """What `try_apart` runs in a process of its own; exit code 0 if the network can be used."""
+    bound_memory(Path(path))
+    try:
+        _open_onnx(Path(path)).try_larger()
+    except EdgeSlamError as error:
+        print(error)
+        return EXIT_REFUSED
+    return 0
+
+
+def _open_onnx(
+    weights: Path, backend: str = "onnxruntime", threads: int = 1, device: str = "cpu"
+) -> "DepthPredictor | ExternalDepth":
     from edgeslam_torch.models.onnx.file import parse_onnx
 
     file = parse_onnx(weights)
@@ -72,7 +100,7 @@ def open_depth(
         return DepthPredictor(file, backend, threads, device)
     from edgeslam_torch.frontend.external_depth import ExternalDepth
 
-    return ExternalDepth(file, threads, device)
+    return ExternalDepth(file, threads, device, DepthPredictor)
 
 
 def weights_path(name: str) -> Path | None:
@@ -143,6 +171,11 @@ class DepthPredictor:
         self.weights = weights if isinstance(weights, Path) else weights.path
         self._engine = _open_engine(weights, self.weights, backend, threads, device)
         _try_out(self._engine, self.weights)
+
+    def try_larger(self) -> None:
+        """Run it on an image of the training size, where memory that grows faster than the image shows."""
+        height, width = self._engine.fixed_size or _training_size(self.metadata)
+        self._engine.run(np.zeros((1, 3, height, width), np.float32))
 
     is_metric = True
 

@@ -1,5 +1,9 @@
 """Stage 1, depth: networks of others as ONNX files, in metres for the given camera or relative."""
 
+import logging
+import time
+from collections.abc import Callable
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -8,15 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgeslam_torch.errors import WeightsError
+from edgeslam_torch.frontend.depth_check import DepthFunction
 from edgeslam_torch.frontend.network_input import check_image, network_size, preprocess
 from edgeslam_torch.frontend.onnx_session import device_of, first_line, open_session, words_of
 from edgeslam_torch.geometry.camera import Camera
-from edgeslam_torch.models.onnx.external import Gives, read_external
+from edgeslam_torch.models.onnx.external import Gives, channels_last, read_external
 from edgeslam_torch.types import DepthMap, FloatArray
 
 if TYPE_CHECKING:
-    from edgeslam_torch.frontend.depth_network import DepthNetwork
     from edgeslam_torch.models.onnx.file import OnnxFile
+
+logger = logging.getLogger(__name__)
 
 FARTHEST = 2.0
 """The far end of what a relative network sees, relative to the median depth, before the map says it. Measured depth has
@@ -24,6 +30,15 @@ its 98th percentile at 1.4 to 2.7 (medians of eight recordings; 1.2 to 3.2 in ni
 FARTHEST_PERCENTILE = 2.0
 BEYOND = 4.0
 """Factor on `FARTHEST` beyond which relative depth is unknown."""
+NUMBERS = {
+    "tensor(float)": np.float32,
+    "tensor(float16)": np.float16,
+    "tensor(double)": np.float64,
+    "tensor(uint8)": np.uint8,
+}
+"""What a network may take, in onnxruntime's words."""
+SLOW_S = 1.0
+"""Time of one image beyond which a smaller input is suggested."""
 SAME_UNIT = 1.5
 """Median ratio of depths, as a logarithm (a factor of 4.5), within which two networks speak of the same unit."""
 _TRIAL_SIDE = 112
@@ -37,6 +52,7 @@ class ExternalDepth:
         weights: The ``.onnx`` file.
         threads: Threads per inference.
         device: ``cpu``, ``cuda``, or ``auto``: CUDA where onnxruntime has it.
+        open_reference: Opens another network, which tells whether near and far are exchanged (`CheckedDepth`).
 
     Raises:
         ConfigError: If there is no such device.
@@ -47,14 +63,32 @@ class ExternalDepth:
         True
     """
 
-    def __init__(self, weights: "Path | OnnxFile", threads: int = 1, device: str = "cpu") -> None:
+    def __init__(
+        self,
+        weights: "Path | OnnxFile",
+        threads: int = 1,
+        device: str = "cpu",
+        open_reference: Callable[[], DepthFunction] | None = None,
+    ) -> None:
         self.weights = weights if isinstance(weights, Path) else weights.path
         content, self.network = read_external(weights)
         self._session = open_session(content, self.weights, threads, device)
         self.backend = words_of("onnxruntime", device_of(self._session))
-        self._fixed = [side if isinstance(side, int) else None for side in self._session.get_inputs()[0].shape[2:]]
+        ends = {end.name: end for end in self._session.get_inputs()}
+        if list(ends) != [self.network.input]:
+            raise WeightsError(f"{self.weights}: it must take one image; its inputs are {', '.join(ends)}")
+        taken = ends[self.network.input]
+        sides = [side if isinstance(side, int) else 0 for side in taken.shape]
+        self._channels_last = channels_last(sides)
+        self._fixed = sides[1:3] if self._channels_last else sides[2:]
+        if taken.type not in NUMBERS:
+            raise WeightsError(f"{self.weights}: it takes {taken.type}, not one of {', '.join(NUMBERS)}")
+        self._numbers = NUMBERS[taken.type]
+        if self._numbers is np.uint8 and not (set(self.network.mean) == {0.0} and set(self.network.std) == {1.0}):
+            raise WeightsError(f"{self.weights}: it takes whole numbers from 0 to 255: leave out mean and std")
+        self._said_slow = False
         self._try_out()
-        self._shipped: DepthNetwork | None = None
+        self._open_reference = open_reference
 
     @property
     def is_metric(self) -> bool:
@@ -90,20 +124,26 @@ class ExternalDepth:
     def _given(self, image: NDArray[np.uint8], camera: Camera) -> tuple[FloatArray, FloatArray]:
         """The network's numbers as they are, and their sigma, at the image's size ``(H, W)``."""
         check_image(image, camera)
-        small, sigma = self._run(preprocess(image, *self._input_size(camera), self.network))
+        height, width = self._input_size(camera)
+        start_s = time.perf_counter()
+        small, sigma = self._run(preprocess(image, height, width, self.network))
+        took_s = time.perf_counter() - start_s
+        if took_s > SLOW_S and not all(self._fixed) and not self._said_slow:
+            self._said_slow = True
+            logger.warning(
+                f"{self.weights.name} took {took_s:.1f} s for one image of {width}x{height}: smaller input_height and "
+                f"input_width in its description cost less"
+            )
         to_image = (camera.width, camera.height)
         given = np.asarray(cv2.resize(small, to_image, interpolation=cv2.INTER_LINEAR), np.float32)
         if sigma is None:
             return given, np.full(given.shape, self.network.sigma_log, np.float32)
         return given, np.asarray(cv2.resize(sigma, to_image, interpolation=cv2.INTER_LINEAR), np.float32)
 
-    def reference(self, image: NDArray[np.uint8], camera: Camera) -> DepthMap:
-        """Depth by the shipped network, which says what is nearer."""
-        if self._shipped is None:
-            from edgeslam_torch.frontend.depth_network import DepthPredictor
-
-            self._shipped = DepthPredictor()
-        return self._shipped(image, camera)
+    @cached_property
+    def reference(self) -> DepthFunction | None:
+        """Depth by the other network; None without one."""
+        return None if self._open_reference is None else self._open_reference()
 
     def said_instead(self, image: NDArray[np.uint8], camera: Camera, reference: DepthMap) -> str:
         """Which ``gives`` fits the network's numbers for an image better, given another's depth of it."""
@@ -133,17 +173,33 @@ class ExternalDepth:
         """
         names = [name for name in (self.network.depth, self.network.sigma) if name]
         try:
-            found = [np.asarray(array, np.float32) for array in self._session.run(names, {self.network.input: image})]
-            planes = [array.reshape(array.shape[-2:]) for array in found]  # (1, 1, h, w) or (1, h, w): one plane
+            found = self._session.run(names, {self.network.input: self._as_taken(image)})
+            planes = [_plane(np.asarray(array, np.float32)) for array in found]
         except Exception as error:  # onnxruntime's errors have no common base class
             size = f"{image.shape[2]}x{image.shape[3]}"
             raise WeightsError(f"{self.weights}: cannot be run on {size} pixels ({first_line(error)})") from error
         return planes[0], planes[1] if self.network.sigma else None
 
+    def _as_taken(self, image: FloatArray) -> NDArray[np.generic]:
+        """The input ``(1, 3, H, W)`` in the layout and the numbers of the graph."""
+        if self._channels_last:
+            image = np.ascontiguousarray(image.transpose(0, 2, 3, 1))
+        if self._numbers is np.uint8:
+            image = np.clip(np.rint(255.0 * image), 0, 255)
+        return image.astype(self._numbers, copy=False)
+
+    def try_larger(self) -> None:
+        """Run it on images of twice the side, where memory that grows with the square of the pixels shows."""
+        height, width = self._trial_size(2 * _TRIAL_SIDE)
+        self._run(np.zeros((1, 3, height, width), np.float32))
+
+    def _trial_size(self, side: int) -> tuple[int, int]:
+        side = -(-side // self.network.multiple) * self.network.multiple
+        return self._taken(side, side)
+
     def _try_out(self) -> None:
         """Reject a network that gives no depth for two simple images, or the same for both."""
-        side = -(-_TRIAL_SIDE // self.network.multiple) * self.network.multiple
-        height, width = self._taken(side, side)
+        height, width = self._trial_size(_TRIAL_SIDE)
         across, down = np.meshgrid(np.linspace(0, 255, width), np.linspace(0, 255, height))
         picture = np.stack([across, down, 255 - across], axis=2).astype(np.uint8)
         answers = []
@@ -155,6 +211,15 @@ class ExternalDepth:
             answers.append(given)
         if np.array_equal(answers[0], answers[1], equal_nan=True):
             raise WeightsError(f"{self.weights}: gives the same depth whatever it sees")
+
+
+def _plane(array: FloatArray) -> FloatArray:
+    """``(h, w)`` of ``(1, 1, h, w)``, ``(1, h, w, 1)``, ``(1, h, w)``."""
+    while array.ndim > 2 and 1 in (array.shape[0], array.shape[-1]):
+        array = array[0] if array.shape[0] == 1 else array[..., 0]
+    if array.ndim != 2:
+        raise ValueError(f"its depth has the shape {array.shape}, not one plane")
+    return array
 
 
 def _metres(given: FloatArray, gives: str) -> FloatArray:

@@ -2,6 +2,8 @@
 
 import importlib.util
 import logging
+import subprocess
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,6 +15,15 @@ if TYPE_CHECKING:
 
 
 logger = logging.getLogger(__name__)
+TIMEOUT_S = 120.0
+MEMORY_BYTES = 3 << 30
+"""Address space of the process, of which interpreter and libraries take 1.1 GB; and `PER_BYTE` for each of the file."""
+PER_BYTE = 6
+"""The file, the parsed file, the session's weights, and what they are packed to."""
+EXIT_REFUSED = 3
+_TRIAL = "import sys; from edgeslam_torch.frontend.depth_network import trial; sys.exit(trial(sys.argv[1]))"
+MAX_REASON = 2000
+"""Characters of an error's words; names in a file may be as long as the file."""
 
 
 def has_onnxruntime() -> bool:
@@ -53,6 +64,40 @@ def open_session(content: bytes, weights: Path, threads: int, device: str = "cpu
     return session
 
 
+def try_apart(path: Path) -> None:
+    """Open a network and run it on small images in a process of its own, within bounds: a few bytes may ask for
+    gigabytes, or for ever.
+
+    Raises:
+        WeightsError: If that fails, takes too long or too much memory; as `open_depth` would say where it says so.
+    """
+    command = [sys.executable, "-c", _TRIAL, str(path)]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT_S, stdin=subprocess.DEVNULL)
+    except subprocess.TimeoutExpired:
+        raise WeightsError(f"{path}: refused: it did not run on a small image within {TIMEOUT_S:.0f} s") from None
+    if done.returncode == EXIT_REFUSED:
+        raise WeightsError(done.stdout.strip())
+    if done.returncode:
+        raise WeightsError(
+            f"{path}: refused: it crashes, or takes more than {MEMORY_BYTES >> 30} GiB for a small image"
+        )
+
+
+def bound_memory(path: Path) -> None:
+    """Bound this process's memory to what a network in a file may need, where the system can."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return
+    bound = MEMORY_BYTES + PER_BYTE * path.stat().st_size
+    try:
+        resource.setrlimit(resource.RLIMIT_AS, (bound, bound))
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    except (OSError, ValueError):  # a lower bound is set, or the system knows none
+        return
+
+
 def device_of(session: "InferenceSession") -> str:
     """``cpu`` or ``cuda``."""
     return "cuda" if session.get_providers()[0] == "CUDAExecutionProvider" else "cpu"
@@ -65,4 +110,4 @@ def words_of(runtime: str, device: str) -> str:
 
 def first_line(error: Exception) -> str:
     """An error's words on one line."""
-    return " ".join(str(error).split())[:160]
+    return " ".join(str(error).split())[:MAX_REASON]

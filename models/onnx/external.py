@@ -4,6 +4,8 @@ The file may say so itself, in its property ``edgeslam.depth`` (JSON); otherwise
 """
 
 import json
+import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
@@ -18,9 +20,13 @@ from edgeslam_torch.models.onnx.file import OnnxFile, parse_onnx
 from edgeslam_torch.models.onnx.presets import PRESETS
 from edgeslam_torch.models.record import MAX_INPUT_PX, STD_RANGE
 
+logger = logging.getLogger(__name__)
+
 PROPERTY = "edgeslam.depth"
 """Key of the record among a file's properties."""
 MAX_MULTIPLE = 256
+FREE_SIDE_PX = 518
+"""Side of the input of a network that takes any and states none: that of the vision transformers for depth."""
 SIGMA_RANGE = (0.01, 2.0)
 """Plausible standard deviations of log depth: 1 % to a factor of 7."""
 
@@ -50,8 +56,8 @@ class ExternalNetwork:
     """The input is ``(rgb - mean) / std`` with rgb in [0, 1]."""
     input_height: int = 0
     input_width: int = 0
-    """Size of the training images [px]; 0 for the graph's own fixed size. A graph of dynamic size gets the image's
-    shape at about so many pixels."""
+    """Size of the training images [px]; 0 for the graph's own fixed size, else `FREE_SIDE_PX`. A graph of dynamic
+    size gets the image's shape at about so many pixels."""
     multiple: int = 1
     """Height and width of the input must be multiples of this: 14 or 16 for vision transformers."""
     focal_px: float = 0.0
@@ -91,6 +97,11 @@ class ExternalNetwork:
         return self.gives == Gives.RELATIVE_INVERSE
 
 
+def channels_last(sides: Sequence[int]) -> bool:
+    """Whether an input of these four sizes, 0 where one is free, is ``(1, H, W, 3)`` rather than ``(1, 3, H, W)``."""
+    return sides[3] == 3 and sides[1] != 3
+
+
 def read_external(file: OnnxFile | Path) -> tuple[bytes, ExternalNetwork]:
     """An ONNX depth network of others and its description.
 
@@ -102,9 +113,6 @@ def read_external(file: OnnxFile | Path) -> tuple[bytes, ExternalNetwork]:
     """
     file = file if isinstance(file, OnnxFile) else parse_onnx(file)
     path, model = file.path, file.model
-    outside = next((t.name for t in model.graph.initializer if t.data_location == onnx.TensorProto.EXTERNAL), None)
-    if outside is not None:
-        raise WeightsError(f"{path}: {outside} lies outside the file; save the network as one file")
     return file.content, _with_fixed_size(_description(model, path), model, path)
 
 
@@ -124,7 +132,7 @@ def _description(model: onnx.ModelProto, path: Path) -> ExternalNetwork:
         known = {} if preset is None else PRESETS[preset].description
         origin = f"{path}: {PROPERTY}" if own is not None else str(beside)
         return laid_over(_start(known, record, origin), {**known, **record}, origin)
-    except (ConfigError, ValueError) as error:
+    except (ConfigError, ValueError, TypeError, OverflowError) as error:
         said = str(error)
         raise WeightsError(said if said.startswith((str(path), str(beside))) else f"{path}: {said}") from None
 
@@ -164,20 +172,31 @@ def _with_fixed_size(network: ExternalNetwork, model: onnx.ModelProto, path: Pat
         )
     shape = chosen[0].type.tensor_type.shape.dim
     sides = [d.dim_value for d in shape]
-    if len(sides) != 4 or sides[1] not in (0, 3):
-        raise WeightsError(f"{path}: its input is {sides}, expected [1, 3, H, W]")
-    for name in (network.depth or outputs[0], network.sigma):
+    if len(sides) != 4 or not (sides[1] in (0, 3) or channels_last(sides)):
+        raise WeightsError(f"{path}: its input is {sides}, expected [1, 3, H, W] or [1, H, W, 3]")
+    depths = [name for name in outputs if name != network.sigma]
+    if not depths:
+        raise WeightsError(f"{path}: it has no output for depth")
+    if not network.depth and len(depths) > 1:
+        logger.warning(
+            f"{path}: takes the first of its outputs {', '.join(depths)} as depth; for another, say depth = NAME"
+        )
+    for name in (network.depth or depths[0], network.sigma):
         if name and name not in outputs:
             raise WeightsError(f"{path}: no output {name!r}; there are {', '.join(outputs)}")
-    size = dict(zip(("input_height", "input_width"), sides[2:], strict=True))
+    rows = sides[1:3] if channels_last(sides) else sides[2:]
+    size = dict(zip(("input_height", "input_width"), rows, strict=True))
     fixed = {name: side for name, side in size.items() if side}
     if any(getattr(network, name) not in (0, side) for name, side in fixed.items()):
         raise WeightsError(
-            f"{path}: it takes images of {sides[2]}x{sides[3]} (height x width), not of the described size"
+            f"{path}: it takes images of {rows[0]}x{rows[1]} (height x width), not of the described size"
         )
-    network = replace(network, input=chosen[0].name, depth=network.depth or outputs[0], **fixed)
-    if not (network.input_height and network.input_width):
-        raise WeightsError(
-            f"{path}: it takes images of any size: say input_height and input_width, those of its training"
-        )
-    return network
+    free = [name for name in size if not (size[name] or getattr(network, name))]
+    if free:
+        side = FREE_SIDE_PX // network.multiple * network.multiple
+        fixed |= dict.fromkeys(free, side)
+        logger.warning(f"{path}: it takes images of any size, and gets {side} px; say {' and '.join(free)} for another")
+    try:
+        return replace(network, input=chosen[0].name, depth=network.depth or depths[0], **fixed)
+    except ValueError as error:
+        raise WeightsError(f"{path}: {error}") from None

@@ -1,6 +1,7 @@
 """Exported ONNX files, checked before they run; importing this needs no torch."""
 
-from collections.abc import Iterator
+import os
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -8,15 +9,17 @@ import numpy as np
 import onnx
 from google.protobuf.message import DecodeError
 from onnx import TensorProto, numpy_helper
+from onnx.external_data_helper import load_external_data_for_tensor
 
 from edgeslam_torch.errors import WeightsError
 from edgeslam_torch.models.layout import INPUT_MULTIPLE
 from edgeslam_torch.models.record import HEADER_KEY, MAX_INPUT_PX, Metadata, metadata_from_json
-from edgeslam_torch.models.weights_file import open_weights
+from edgeslam_torch.models.weights_file import MAX_FILE_BYTES, open_weights
 
 INPUT, LOG_DEPTH, SIGMA = "image", "log_depth", "sigma_log"
 MAX_VALUE = 1e9
 """Maximum constant of an exported network: batch norm multiplies weights of up to 1e6."""
+LOOPS = ("Loop", "Scan", "SequenceMap")
 _FLOATS = (TensorProto.FLOAT, TensorProto.FLOAT16, TensorProto.DOUBLE)
 
 
@@ -35,21 +38,60 @@ class OnnxFile:
 
 
 def parse_onnx(path: Path) -> OnnxFile:
-    """Read a file; nothing in it is checked yet.
+    """Read a file, with the numbers that lie in files beside it; nothing in it is checked yet, but that it ends.
 
     Raises:
-        WeightsError: If it is missing or no ONNX file.
+        WeightsError: If it is missing or no ONNX file, needs files that are not beside it, or holds a loop.
     """
     try:
         with open_weights(path) as file:
             content = file.read()
-        return OnnxFile(path, content, onnx.load_model_from_string(content))
+        model = onnx.load_model_from_string(content)
+        for graph in every_graph(model):
+            loops = [node.op_type for node in graph if node.op_type in LOOPS]
+            if loops:
+                raise WeightsError(f"holds a {loops[0]}: nobody can tell whether it ends; export the network without")
+        if _brought_in(model, path):
+            content = model.SerializeToString()
+        return OnnxFile(path, content, model)
     except OSError as error:
         raise WeightsError(f"{path}: cannot read the weights ({error.strerror or error})") from error
-    except (DecodeError, ValueError, TypeError) as error:
+    except (DecodeError, ValueError, TypeError, RuntimeError, onnx.checker.ValidationError) as error:
         raise WeightsError(f"{path}: damaged or not an ONNX file ({' '.join(str(error).split())[:80]})") from None
     except WeightsError as error:
         raise WeightsError(f"{path}: {error}") from None
+
+
+def every_graph(model: onnx.ModelProto) -> Iterator[Sequence[onnx.NodeProto]]:
+    """Nodes of the graph, of its functions, and of the graphs within nodes."""
+    waiting = [model.graph.node, *(function.node for function in model.functions)]
+    while waiting:
+        nodes = waiting.pop()
+        yield nodes
+        for node in nodes:
+            for attribute in node.attribute:
+                waiting += [graph.node for graph in (attribute.g, *attribute.graphs) if graph.node]
+
+
+def _brought_in(model: onnx.ModelProto, path: Path) -> bool:
+    """Read the numbers that lie in other files of the same folder into the model; whether there were any."""
+    outside = [t for t in _constants(model.graph) if t.data_location == TensorProto.EXTERNAL]
+    total = path.stat().st_size
+    for tensor in outside:
+        entry = {part.key: part.value for part in tensor.external_data}
+        name = entry.get("location", "")
+        if Path(name).name != name:
+            raise WeightsError(f"its numbers lie in {name!r}, outside the file's folder; save the network as one file")
+        with open_weights(path.parent / name) as opened:
+            whole = opened.seek(0, os.SEEK_END)
+        total += int(entry.get("length", whole))
+    if total > MAX_FILE_BYTES:
+        raise WeightsError(f"{total >> 20} MiB with its data, more than any network that is read here")
+    for tensor in outside:
+        load_external_data_for_tensor(tensor, str(path.parent))
+        tensor.data_location = TensorProto.DEFAULT
+        del tensor.external_data[:]
+    return bool(outside)
 
 
 def read_onnx(file: OnnxFile | Path) -> tuple[bytes, Metadata]:

@@ -29,6 +29,13 @@ def count_operations(model: onnx.ModelProto) -> Operations:
     graph = onnx.shape_inference.infer_shapes(model).graph
     shapes = {value.name: _shape(value) for value in (*graph.value_info, *graph.output)}
     stored = {tensor.name: tensor for tensor in graph.initializer}
+    stored |= {
+        node.output[0]: attribute.t
+        for node in graph.node
+        if node.op_type == "Constant" and node.output
+        for attribute in node.attribute
+        if attribute.name == "value"
+    }
     makers = {name: node for node in graph.node for name in node.output}
     counts, weight_bytes = {True: 0, False: 0}, 0
     for node in graph.node:
@@ -36,9 +43,12 @@ def count_operations(model: onnx.ModelProto) -> Operations:
             continue
         sources = [makers.get(name) for name in node.input[:2]]
         quantised = all(source is not None and source.op_type in _QUANTISED for source in sources)
-        name = node.input[1]
+        name, steps = (node.input[1] if len(node.input) > 1 else ""), len(graph.node)
         while name not in stored:
-            name = makers[name].input[0]
+            maker, steps = makers.get(name), steps - 1
+            if maker is None or not maker.input or steps < 0:
+                raise ValueError(f"the weights of {node.output[0]} are computed, not stored")
+            name = maker.input[0]
         weight = numpy_helper.to_array(stored[name])
         size = shapes.get(node.output[0])
         if size is None:

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import onnx
 import pytest
+from onnx import TensorProto
 from small_networks import FAR_M, NEAR_M, RELATIVE, describe, green_network, node
 
 from edgeslam_torch.errors import WeightsError
@@ -93,8 +94,6 @@ def test_input_fits_the_image_in_multiples_of_the_networks_patches(tmp_path):
     }
     path = green_network(tmp_path / "net.onnx", nodes, "again", constants=constants, size=("h", 126))
     text = 'gives = "metres"\nmultiple = 14\ninput_height = 84\n'
-    with pytest.raises(WeightsError, match="say input_height and input_width"):
-        open_depth(describe(green_network(tmp_path / "free.onnx"), text))
     network = open_depth(describe(path, text))
     assert network(np.zeros((96, 144, 3), np.uint8), Camera(144, 96, 99.0, 99.0, 71.5, 47.5)).depth_m.shape == (96, 144)
 
@@ -249,3 +248,59 @@ def test_what_the_numbers_are_is_told_from_depth_that_is_right(tmp_path, image, 
     truth = NEAR_M + (FAR_M - NEAR_M) * image[..., 1].astype(np.float32) / 255
     said = ExternalDepth(path).said_instead(image, CAMERA, DepthMap(truth, np.ones_like(truth)))
     assert f"gives = '{numbers}'" in said
+
+
+@pytest.mark.parametrize("last", [False, True])
+@pytest.mark.parametrize("size", [("h", "w"), (128, 192)])
+@pytest.mark.parametrize("numbers", [TensorProto.FLOAT, TensorProto.FLOAT16, TensorProto.DOUBLE, TensorProto.UINT8])
+def test_input_comes_in_the_graphs_numbers_and_layout(tmp_path, image, numbers, size, last):
+    path = green_network(tmp_path / "net.onnx", numbers=numbers, last=last, size=size)
+    found = open_depth(describe(path, f'gives = "metres"\n{SIZE}'))(image, CAMERA)
+    np.testing.assert_allclose(found.depth_m[:, :80], NEAR_M, rtol=1e-3)
+    np.testing.assert_allclose(found.depth_m[:, 112:], FAR_M, rtol=1e-3)
+
+
+def test_input_of_any_size_gets_a_usual_one_and_says_so(tmp_path, caplog):
+    network = open_depth(describe(green_network(tmp_path / "net.onnx"), 'gives = "metres"\nmultiple = 14\n'))
+    assert network.network.input_height == network.network.input_width == 518
+    assert "say input_height and input_width" in caplog.text
+
+
+def test_of_several_outputs_the_first_is_said(tmp_path, caplog):
+    path = green_network(tmp_path / "net.onnx", [node("Log", "depth", "log")], "depth log")
+    open_depth(describe(path, f'gives = "metres"\n{SIZE}'))
+    assert "say depth" in caplog.text
+
+
+def test_numbers_in_a_file_beside_it_are_read_and_no_others(tmp_path, image):
+    whole = onnx.load(green_network(tmp_path / "whole.onnx"))
+    path = tmp_path / "net.onnx"
+    onnx.save(whole, path, save_as_external_data=True, location="net.onnx.data", size_threshold=0)
+    describe(path, f'gives = "metres"\n{SIZE}')
+    np.testing.assert_allclose(open_depth(path)(image, CAMERA).depth_m[:, 112:], FAR_M, rtol=1e-5)
+    (tmp_path / "net.onnx.data").rename(tmp_path.parent / "net.onnx.data")
+    with pytest.raises(WeightsError, match="no such"):
+        open_depth(path)
+    model = onnx.load(path, load_external_data=False)
+    for entry in (entry for tensor in model.graph.initializer for entry in tensor.external_data):
+        entry.value = "../net.onnx.data" if entry.key == "location" else entry.value
+    path.write_bytes(model.SerializeToString())
+    with pytest.raises(WeightsError, match="save the network as one file"):
+        open_depth(path)
+
+
+@pytest.mark.parametrize(
+    "record",
+    ['{"gives": ["metres"]}', '{"gives": "metres", "preset": []}', '{"gives": "metres", "mean": [[1], 2, 3]}', "[[[["],
+)
+def test_record_of_odd_types_is_one_line(tmp_path, record):
+    model = onnx.load(green_network(tmp_path / "net.onnx"))
+    model.metadata_props.add(key="edgeslam.depth", value=record)
+    onnx.save(model, tmp_path / "net.onnx")
+    with pytest.raises(WeightsError):
+        open_depth(tmp_path / "net.onnx")
+
+
+def test_fixed_size_beyond_the_largest_is_one_line(tmp_path):
+    with pytest.raises(WeightsError, match="input_height must be from"):
+        open_depth(describe(green_network(tmp_path / "net.onnx", size=(4096, 4096)), 'gives = "metres"\n'))

@@ -19,6 +19,8 @@ def green_network(
     channels=3,
     constants=None,
     plane=False,
+    numbers=TensorProto.FLOAT,
+    last=False,
 ):
     """``depth = 1 + 3 green`` of RGB in [0, 1], and what further nodes make of it.
 
@@ -31,23 +33,31 @@ def green_network(
         channels: Of the input.
         constants: Further constants by name.
         plane: Whether outputs are ``(1, h, w)`` rather than ``(1, 1, h, w)``.
+        numbers: Type of the input's; whole ones go to 255.
+        last: Whether the input's channels are its last axis.
     """
-    numbers = {"green": [[[[0.0]], [[FAR_M - NEAR_M]], [[0.0]]]], "near": [NEAR_M]} | (constants or {})
-    made = [helper.make_node("Conv", [input, "green", "near"], ["depth"]), *nodes]
+    gain = (FAR_M - NEAR_M) / (255.0 if numbers == TensorProto.UINT8 else 1.0)
+    stored = {"green": [[[[0.0]], [[gain]], [[0.0]]]], "near": [NEAR_M]} | (constants or {})
+    made = [
+        helper.make_node("Cast", [input], ["float"], to=TensorProto.FLOAT),
+        helper.make_node("Transpose", ["float"], ["rgb"], perm=[0, 3, 1, 2] if last else [0, 1, 2, 3]),
+        helper.make_node("Conv", ["rgb", "green", "near"], ["depth"]),
+        *nodes,
+    ]
     outputs = output.split()
     if plane:
-        numbers["axes"] = np.array([1], np.int64)
+        stored["axes"] = np.array([1], np.int64)
         made += [helper.make_node("Squeeze", [name, "axes"], [f"{name}_plane"]) for name in outputs]
         outputs = [f"{name}_plane" for name in outputs]
     value = helper.make_tensor_value_info
     graph = helper.make_graph(
         made,
         "green",
-        [value(input, TensorProto.FLOAT, [1, channels, *size])],
+        [value(input, numbers, [1, *size, channels] if last else [1, channels, *size])],
         [value(name, TensorProto.FLOAT, None) for name in outputs],
         [
             numpy_helper.from_array(x if isinstance(x, np.ndarray) else np.array(x, np.float32), name)
-            for name, x in numbers.items()
+            for name, x in stored.items()
         ],
     )
     onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9), str(path))

@@ -38,3 +38,12 @@ def test_operations_are_those_by_hand() -> None:
 def test_open_size_has_no_number() -> None:
     with pytest.raises(ValueError, match="size of out is open"):
         count_operations(network(False, "width"))
+
+
+def test_weights_in_constant_nodes_count_alike() -> None:
+    model = network(False)
+    moved = {tensor.name: tensor for tensor in model.graph.initializer}
+    del model.graph.initializer[:]
+    for name, tensor in moved.items():
+        model.graph.node.insert(0, onnx.helper.make_node("Constant", [], [name], value=tensor))
+    assert count_operations(model) == count_operations(network(False))
