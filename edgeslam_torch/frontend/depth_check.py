@@ -46,8 +46,8 @@ def order_agreement(depth: DepthMap, reference: DepthMap) -> float:
     known = usable(depth)[steps] & usable(reference)[steps]
     if np.count_nonzero(known) < ORDER_SIDE:
         return float("nan")
-    ranks = [m.depth_m[steps][known].argsort().argsort() for m in (depth, reference)]
-    return float(np.asarray(np.corrcoef(*ranks))[0, 1])
+    one, two = (m.depth_m[steps][known].argsort().argsort() for m in (depth, reference))
+    return float(np.asarray(np.corrcoef(one, two))[0, 1])
 
 
 class CheckedDepth:

@@ -124,9 +124,7 @@ def five_numbers(
 
 
 def _too_wide(model: str) -> CalibrationError:
-    return CalibrationError(
-        f"its {model} lens of such a wide view is not supported by plumb_bob; rectify the images"
-    )
+    return CalibrationError(f"its {model} lens of such a wide view is not supported by plumb_bob; rectify the images")
 
 
 def _plain(name: str) -> str:
