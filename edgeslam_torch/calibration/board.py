@@ -1,7 +1,7 @@
-"""Camera calibration from pictures of a chessboard or ChArUco board (Zhang 2000, by OpenCV)."""
+"""Camera calibration from pictures of a chessboard, ChArUco board or AprilGrid (Zhang 2000, by OpenCV)."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -9,14 +9,19 @@ import numpy as np
 from edgeslam_torch.errors import CalibrationError
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.lens import check_camera, unique_share
-from edgeslam_torch.types import FloatArray
+from edgeslam_torch.types import FloatArray, IntArray
 
 _COMMON = ((9, 6), (8, 6), (10, 7), (9, 7), (11, 8), (8, 5), (7, 6), (7, 5), (6, 5), (6, 4), (5, 4))
 """Inner corners of common boards, tried when the size is not given."""
 _MIN_PICTURES = 4
+_MAX_VIEWS = 80
+"""Views of a long video that are used, evenly spaced; the solver's time grows with their number."""
 _GRID = (8, 6)
 """Grid of cells for measuring coverage."""
 _MIN_CHARUCO = 8
+_MIN_TAGS = 4
+_GROUPS = 5
+"""Groups of pictures that are left out in turn, to tell how well the focal length is known."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,7 +29,8 @@ class Board:
     """A printed pattern."""
 
     columns: int = 0
-    """Chessboard: inner corners across; ChArUco: squares across. 0 detects a chessboard's size."""
+    """Chessboard: inner corners across; ChArUco: squares across; AprilGrid: tags across. 0 detects a chessboard's
+    size."""
     rows: int = 0
     square_m: float = 0.025
     """Side of a square; intrinsics do not depend on it."""
@@ -32,11 +38,18 @@ class Board:
     marker_m: float = 0.018
     dictionary: str = "DICT_5X5_100"
     """Name of OpenCV's ArUco dictionary (ChArUco only)."""
+    tag_spacing: float = 0.0
+    """AprilGrid (Kalibr's, tags 36h11): gap between tags relative to their side, which is `square_m`; 0 for the other
+    boards."""
 
     def __post_init__(self) -> None:
-        if (self.columns, self.rows) != (0, 0) and min(self.columns, self.rows) < 3:
+        if not 0.0 <= self.tag_spacing <= 2.0:
+            raise CalibrationError(f"the gap between tags relative to their side is 0 to 2, got {self.tag_spacing:g}")
+        if self.tag_spacing > 0.0 and min(self.columns, self.rows) < 2:
+            raise CalibrationError("an AprilGrid needs its number of tags, 2x2 at least")
+        if self.tag_spacing == 0.0 and (self.columns, self.rows) != (0, 0) and min(self.columns, self.rows) < 3:
             raise CalibrationError(f"a board of {self.columns}x{self.rows} is too small; 3x3 at least")
-        if self.square_m <= 0 or not 0 < self.marker_m < self.square_m:
+        if self.square_m <= 0 or (self.charuco and not 0 < self.marker_m < self.square_m):
             raise CalibrationError("a board's square must be positive and larger than its marker")
         if self.charuco and (self.columns == 0 or not hasattr(cv2.aruco, self.dictionary)):
             raise CalibrationError("ChArUco needs the number of squares and one of OpenCV's dictionaries, DICT_5X5_100")
@@ -87,6 +100,8 @@ def find_board(name: str, grey: np.ndarray, board: Board) -> View | None:
     visible."""
     if board.charuco:
         return _find_charuco(name, grey, board)
+    if board.tag_spacing > 0.0:
+        return _find_aprilgrid(name, grey, board)
     uv = _chessboard(grey, (board.columns, board.rows), exact=True)
     if uv is None:
         return None
@@ -136,6 +151,54 @@ def _find_charuco(name: str, grey: np.ndarray, board: Board) -> View | None:
     return View(name, np.asarray(corners, dtype=np.float32).reshape(-1, 2), p)
 
 
+def _find_aprilgrid(name: str, grey: np.ndarray, board: Board) -> View | None:
+    """Corners of the visible tags of Kalibr's AprilGrid.
+
+    Whether ids count from the lower or the upper row, and which corner of a tag comes first, differs between
+    programs; a homography tells.
+    """
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+    for border in (2, 1):  # Kalibr prints two bits of border, others one
+        parameters = cv2.aruco.DetectorParameters()
+        parameters.markerBorderBits = border
+        corners, ids, _ = cv2.aruco.ArucoDetector(dictionary, parameters).detectMarkers(grey)
+        number = np.zeros(0, int) if ids is None else np.asarray(ids, int).ravel()
+        kept = number < board.columns * board.rows
+        if np.count_nonzero(kept) >= _MIN_TAGS:
+            break
+    else:
+        return None
+    number = number[kept]
+    uv = np.asarray(corners, dtype=np.float32).reshape(-1, 4, 2)[kept]
+    # The gaps' black squares touch the tags' corners: a third of the gap reaches no other edge.
+    side = float(np.median(np.linalg.norm(uv - np.roll(uv, 1, axis=1), axis=2)))
+    half = int(np.clip(side * board.tag_spacing / 3.0, 2, 10))
+    criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-3)
+    exact = cv2.cornerSubPix(grey, uv.reshape(-1, 1, 2).copy(), (half, half), (-1, -1), criteria).reshape(-1, 2)
+    places = [_aprilgrid_corners(number, board, first, up) for first in range(4) for up in (True, False)]
+    misses = [_homography_miss(place[:, :2], exact) for place in places]
+    return View(name, exact.astype(np.float32), places[int(np.argmin(misses))].astype(np.float32))
+
+
+def _aprilgrid_corners(number: IntArray, board: Board, first: int, upwards: bool) -> FloatArray:
+    """Corners ``(4 N, 3)`` [m] of tags on the board, y down."""
+    pitch = board.square_m * (1.0 + board.tag_spacing)
+    row = number // board.columns
+    place = np.stack([number % board.columns, board.rows - 1 - row if upwards else row], axis=1) * pitch
+    corner = np.roll([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]], first, axis=0) * board.square_m
+    flat = (place[:, None] + corner).reshape(-1, 2)
+    return np.column_stack([flat, np.zeros(len(flat))])
+
+
+def _homography_miss(p: FloatArray, uv: FloatArray) -> float:
+    """RMS [px] by which the best homography misses."""
+    H, _ = cv2.findHomography(p, uv, 0)
+    if H is None:
+        return np.inf
+    there = cv2.perspectiveTransform(p.reshape(-1, 1, 2), H).reshape(-1, 2)
+    return float(np.sqrt(np.mean((there - uv) ** 2)))
+
+
 def calibrate(
     pictures: Iterable[tuple[str, np.ndarray]], board: Board, source: str = "calibration"
 ) -> CalibrationResult:
@@ -182,7 +245,8 @@ def calibrate(
             f"{len(views)} usable pictures, {_MIN_PICTURES} are the least (20 are good); {seen}; "
             "give the inner corners with --board COLUMNSxROWS"
         )
-    return _solve(views, size, board, rejected, source)
+    kept = np.unique(np.linspace(0, len(views) - 1, min(len(views), _MAX_VIEWS)).round().astype(int))
+    return _solve([views[i] for i in kept], size, board, rejected, source)
 
 
 def _same_view(a: View, b: View) -> bool:
@@ -213,9 +277,10 @@ def _solve(
             f"its corners miss by {errors[worst]:.2f} px, the others by {np.median(errors):.2f} px"
         )
         del views[worst]
-    camera = _camera_of(np.asarray(K, float), np.asarray(distortion, float).ravel()[:5], size, source)
-    tilt = max(float(np.degrees(np.arccos(min(1.0, abs(cv2.Rodrigues(r)[0][2, 2]))))) for r in turns)
     spread = np.asarray(sigma).ravel()
+    camera = _camera_of(np.asarray(K, float), np.asarray(distortion, float).ravel()[:5], size, source)
+    camera = replace(camera, focal_sigma=min(1.0, _focal_sigma(p, uv, size, float(spread[0]) / camera.fx)))
+    tilt = max(float(np.degrees(np.arccos(min(1.0, abs(cv2.Rodrigues(r)[0][2, 2]))))) for r in turns)
     result = CalibrationResult(
         camera,
         float(rms),
@@ -228,6 +293,24 @@ def _solve(
     )
     result.warnings.extend(_doubts(result))
     return result
+
+
+def _focal_sigma(p: list[FloatArray], uv: list[FloatArray], size: tuple[int, int], formal: float) -> float:
+    """Relative standard deviation of the focal length: the formal one, or a jackknife's over groups of pictures, which
+    includes a bent board and moved pictures."""
+    groups = min(_GROUPS, len(p) - _MIN_PICTURES + 1)
+    found = []
+    for group in range(groups if groups > 1 else 0):
+        kept = [i for i in range(len(p)) if i % groups != group]
+        if len(kept) < _MIN_PICTURES - 1:
+            continue
+        _, K, *_ = cv2.calibrateCamera(
+            [p[i] for i in kept], [uv[i] for i in kept], size, np.eye(3), np.zeros(5), flags=cv2.CALIB_FIX_K3
+        )
+        found.append(float(np.log(max(K[0, 0], 1.0))))
+    if len(found) < 2:
+        return formal
+    return max(formal, float(np.sqrt((len(found) - 1) * np.var(found))))
 
 
 def _camera_of(K: FloatArray, distortion: FloatArray, size: tuple[int, int], source: str) -> Camera:

@@ -1,6 +1,7 @@
-"""``edgeslam calibrate``: camera.yaml from pictures of a chessboard or ChArUco board, or from a live camera."""
+"""``edgeslam calibrate``: camera.yaml from pictures, a video, a bag or a live camera that show a board."""
 
 import argparse
+import math
 import re
 import time
 from collections.abc import Iterator
@@ -16,16 +17,25 @@ if TYPE_CHECKING:
 
 _PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".ppm", ".pgm")
 _LIVE_GAP_S = 1.0
+_RECORDED_GAP_S = 0.5
+"""Of each such stretch of a recording the sharpest picture is used."""
+_MAX_NAMED = 20
+"""Pictures left out that are named one by one."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's options."""
     parser.add_argument(
-        "images", nargs="+", metavar="IMAGES", help="pictures or folders of them; or tello://HOST, webcam:N, rtsp://..."
+        "images",
+        nargs="+",
+        metavar="IMAGES",
+        help="pictures, folders of them, a video, a bag, a recording; or tello://HOST, webcam:N",
     )
     parser.add_argument("--board", metavar="COLSxROWS", help="inner corners of a chessboard (default: found by trying)")
     parser.add_argument("--charuco", metavar="COLSxROWS", help="a ChArUco board with so many squares instead")
-    parser.add_argument("--square", type=float, default=25.0, metavar="MM", help="side of a square")
+    parser.add_argument("--aprilgrid", metavar="COLSxROWS", help="an AprilGrid (Kalibr's) with so many tags instead")
+    parser.add_argument("--square", type=float, default=25.0, metavar="MM", help="side of a square, or of an AprilTag")
+    parser.add_argument("--spacing", type=float, default=0.3, metavar="X", help="AprilGrid: gap / side of a tag")
     parser.add_argument("--marker", type=float, default=18.0, metavar="MM", help="side of a ChArUco marker")
     parser.add_argument("--dictionary", default="DICT_5X5_100", help="of the ChArUco markers (default: DICT_5X5_100)")
     parser.add_argument("--out", type=Path, default=Path("camera.yaml"), metavar="FILE", help="default: camera.yaml")
@@ -38,10 +48,13 @@ def main(args: argparse.Namespace) -> int:
     from edgeslam_torch.errors import CalibrationError, ConfigError, OutputError
     from edgeslam_torch.readers.source import LIVE_SCHEMES
 
-    if args.board and args.charuco:
-        raise ConfigError("give --board or --charuco, not both")
-    columns, rows = _size(args.charuco or args.board)
-    board = Board(columns, rows, args.square / 1e3, bool(args.charuco), args.marker / 1e3, args.dictionary)
+    if sum(map(bool, (args.board, args.charuco, args.aprilgrid))) > 1:
+        raise ConfigError("give --board, --charuco or --aprilgrid, one of them")
+    if args.aprilgrid and not args.spacing > 0:
+        raise ConfigError(f"--spacing is the gap between tags relative to their side, such as 0.3, got {args.spacing}")
+    columns, rows = _size(args.charuco or args.aprilgrid or args.board)
+    spacing = args.spacing if args.aprilgrid else 0.0
+    board = Board(columns, rows, args.square / 1e3, bool(args.charuco), args.marker / 1e3, args.dictionary, spacing)
     unreadable: dict[str, str] = {}
     live = args.images[0].startswith(LIVE_SCHEMES)
     if live and len(args.images) > 1:
@@ -60,10 +73,14 @@ def main(args: argparse.Namespace) -> int:
     except OSError as error:
         raise OutputError(f"{args.out}: cannot be written: {error.strerror or error}") from error
     camera, sigma = result.camera, result.sigma
-    for name, reason in {**unreadable, **result.rejected}.items():
+    left_out = {**unreadable, **result.rejected}
+    for name, reason in list(left_out.items())[:_MAX_NAMED]:
         print(f"left out: {name}: {reason}")
+    if len(left_out) > _MAX_NAMED:
+        print(f"left out: {len(left_out) - _MAX_NAMED} more")
     for name in ("fx", "fy", "cx", "cy"):
         print(f"{name} {getattr(camera, name):9.3f} +- {sigma[name]:.3f} px")
+    print(f"focal length known to {100 * camera.focal_sigma:.2g} %")
     print("distortion " + " ".join(f"{k:.5f}" for k in camera.distortion))
     print(
         f"{len(result.used)} pictures of a {result.board.columns}x{result.board.rows} board, "
@@ -95,19 +112,42 @@ def _pictures(names: list[str], unreadable: dict[str, str]) -> "Iterator[tuple[s
 
     for name in names:
         path = Path(name).expanduser()
+        if not path.exists():
+            raise SourceError(f"{path}: no such picture, folder or recording")
+        files = [path] if path.suffix.lower() in _PICTURES else []
         if path.is_dir():
             files = sorted(p for p in path.iterdir() if p.suffix.lower() in _PICTURES)
-            if not files:
-                raise SourceError(f"{path}: no pictures in it ({', '.join(_PICTURES)})")
-        elif path.is_file():
-            files = [path]
-        else:
-            raise SourceError(f"{path}: no such picture or folder")
+        if not files:
+            yield from _recorded_pictures(path, unreadable)
         for file in files:
             try:
                 yield str(file), read_pixels(file, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
             except SourceError as error:
                 unreadable[str(file)] = str(error).removeprefix(f"{file}: ")
+
+
+def _recorded_pictures(path: Path, unreadable: dict[str, str]) -> "Iterator[tuple[str, np.ndarray]]":
+    """The sharpest picture of each half second of a video, bag or recording."""
+    import cv2
+
+    from edgeslam_torch.readers.listing import Problem
+    from edgeslam_torch.readers.source import frames_without_camera
+
+    problems: list[Problem] = []
+    best: tuple[float, str, np.ndarray] | None = None
+    until_s = -math.inf
+    for frame in frames_without_camera(path, problems):
+        grey = cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY) if frame.image.ndim == 3 else frame.image
+        sharpness = float(cv2.Laplacian(grey, cv2.CV_16S).var())
+        if frame.stamp_s >= until_s:
+            if best is not None:
+                yield best[1:]
+            best, until_s = None, frame.stamp_s + _RECORDED_GAP_S
+        if best is None or sharpness > best[0]:
+            best = sharpness, f"{path.name}, frame {frame.index}", grey
+    if best is not None:
+        yield best[1:]
+    unreadable |= {problem.file: problem.reason for problem in problems if problem.frames}
 
 
 def _live_pictures(spec: str, board: "Board", views: int) -> "Iterator[tuple[str, np.ndarray]]":

@@ -171,6 +171,17 @@ def open_source(
     )
 
 
+def frames_without_camera(path: Path, problems: list[Problem]) -> Iterator[Frame]:
+    """Frames of a recording whose calibration is neither needed nor read.
+
+    Raises:
+        SourceError: As `open_source`.
+    """
+    content = _bag_content(path, (), True) if path.exists() and is_bag(path) else _content(path)
+    problems += content.problems
+    return content.decode(content.size, problems)
+
+
 def _content(path: Path) -> _Content:
     try:
         if path.is_dir():

@@ -57,6 +57,60 @@ def test_charuco_board_is_found_even_when_partly_out_of_sight(rng):
     assert result.rms_px < 0.5
 
 
+def aprilgrid(columns=6, rows=5, side=100, gap=30, border=2, upwards=True):
+    """Kalibr's board: tags with black squares between their corners."""
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+    pitch = side + gap
+    picture = np.full((rows * pitch + 3 * gap, columns * pitch + 3 * gap), 255, np.uint8)
+    for y in range(rows + 1):
+        for x in range(columns + 1):
+            picture[gap + y * pitch : 2 * gap + y * pitch, gap + x * pitch : 2 * gap + x * pitch] = 0
+    for number in range(columns * rows):
+        row, x = divmod(number, columns)
+        y = rows - 1 - row if upwards else row
+        tag = cv2.aruco.generateImageMarker(dictionary, number, side, borderBits=border)
+        corner = 2 * gap + y * pitch, 2 * gap + x * pitch
+        picture[corner[0] : corner[0] + side, corner[1] : corner[1] + side] = tag
+    return picture
+
+
+@pytest.mark.parametrize(("border", "upwards", "turned"), [(2, True, 0), (1, False, 0), (2, True, 2)])
+def test_aprilgrid_is_found_whatever_its_order_and_border(rng, border, upwards, turned):
+    picture = np.rot90(aprilgrid(border=border, upwards=upwards), turned)
+    result = calibrate(views(rng, picture, 10, width_m=0.4), Board(6, 5, tag_spacing=0.3))
+    assert result.camera.fx == pytest.approx(CAMERA.fx, rel=0.01)
+    assert result.rms_px < 0.3
+
+
+def test_the_file_says_how_well_the_focal_length_is_known(rng):
+    result = calibrate(views(rng, chessboard(), 12), Board(8, 6))
+    off = abs(result.camera.fx / CAMERA.fx - 1.0)
+    assert 1e-4 < result.camera.focal_sigma < 0.02
+    assert off < 4.0 * result.camera.focal_sigma
+
+
+@pytest.mark.parametrize("kind", ["video", "recording"])
+def test_a_video_and_a_recording_are_calibrated(rng, tmp_path, kind):
+    pictures = [image for _, image in views(rng, chessboard(), 8)]
+    source = tmp_path / "clip.avi"
+    if kind == "video":
+        writer = cv2.VideoWriter(str(source), cv2.VideoWriter.fourcc(*"MJPG"), 2, (640, 480))
+        for image in pictures:
+            writer.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
+        writer.release()
+    else:
+        source = tmp_path / "flight"
+        (source / "rgb").mkdir(parents=True)
+        for i, image in enumerate(pictures):
+            cv2.imwrite(str(source / "rgb" / f"{i}.png"), image)
+        (source / "rgb.txt").write_text("".join(f"{0.6 * i} rgb/{i}.png\n" for i in range(len(pictures))))
+        (source / "camera.yaml").write_text("is not needed: yet\n")
+    assert main(["calibrate", str(source), "--board", "8x6", "--out", str(tmp_path / "c.yaml")]) == 0
+    camera = load_camera(tmp_path / "c.yaml")
+    assert camera.fx == pytest.approx(CAMERA.fx, rel=0.01)
+    assert camera.focal_sigma > 0
+
+
 def test_bad_pictures_are_left_out_by_name_and_reason(rng):
     good = list(views(rng, chessboard(), 9))
     pictures = [
@@ -130,7 +184,9 @@ def test_pictures_that_cannot_be_read_are_named_when_too_few_are_left(tmp_path, 
     assert "bomb.pgm: image is 17000x17000" in said
 
 
-@pytest.mark.parametrize("arguments", [["nowhere"], ["--board", "8by6"], ["--board", "8x6", "--charuco", "9x7"]])
+@pytest.mark.parametrize(
+    "arguments", [["nowhere"], ["--board", "8by6"], ["--board", "8x6", "--charuco", "9x7"], ["--aprilgrid", "1x1"]]
+)
 def test_command_refuses_in_one_line(arguments, tmp_path, capsys):
     given = arguments if arguments == ["nowhere"] else [str(tmp_path), *arguments]
     assert main(["calibrate", *given, "--out", str(tmp_path / "c.yaml")]) == 1
