@@ -174,7 +174,8 @@ def _find_aprilgrid(name: str, grey: np.ndarray, board: Board) -> View | None:
     side = float(np.median(np.linalg.norm(uv - np.roll(uv, 1, axis=1), axis=2)))
     half = int(np.clip(side * board.tag_spacing / 3.0, 2, 10))
     criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-3)
-    exact = cv2.cornerSubPix(grey, uv.reshape(-1, 1, 2).copy(), (half, half), (-1, -1), criteria).reshape(-1, 2)
+    refined = cv2.cornerSubPix(grey, uv.reshape(-1, 1, 2).copy(), (half, half), (-1, -1), criteria)
+    exact: FloatArray = np.asarray(refined, dtype=np.float64).reshape(-1, 2)
     places = [_aprilgrid_corners(number, board, first, up) for first in range(4) for up in (True, False)]
     misses = [_homography_miss(place[:, :2], exact) for place in places]
     return View(name, exact.astype(np.float32), places[int(np.argmin(misses))].astype(np.float32))
@@ -186,7 +187,7 @@ def _aprilgrid_corners(number: IntArray, board: Board, first: int, upwards: bool
     row = number // board.columns
     place = np.stack([number % board.columns, board.rows - 1 - row if upwards else row], axis=1) * pitch
     corner = np.roll([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]], first, axis=0) * board.square_m
-    flat = (place[:, None] + corner).reshape(-1, 2)
+    flat: FloatArray = (place[:, None] + corner).reshape(-1, 2)
     return np.column_stack([flat, np.zeros(len(flat))])
 
 
