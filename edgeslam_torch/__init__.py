@@ -1,19 +1,11 @@
 """Metric monocular SLAM with a semi-dense edge map; see README.md.
 
-Importing this package imports next to nothing: the names below load on first use.
+Importing this package imports next to nothing: the names below load on first use. Type checkers and editors read
+them in ``__init__.pyi``.
 """
 
 import importlib
 import os
-
-TYPE_CHECKING = False
-if TYPE_CHECKING:  # as type checkers read it; `typing` itself takes longer to load than all the rest here
-    from edgeslam_torch.config import SlamConfig
-    from edgeslam_torch.errors import EdgeSlamError
-    from edgeslam_torch.geometry.camera import Camera
-    from edgeslam_torch.readers.source import open_source
-    from edgeslam_torch.slam import EdgeSlam
-    from edgeslam_torch.types import Frame, SlamOutput, TelemetrySample
 
 # torch's OpenMP threads spin while they wait; with a busy second core that turns a 26 ms inference
 # into 419 ms (docs/decisions/0025-threads-and-seeds.md). Both must be set before torch is first imported.
@@ -36,7 +28,9 @@ _LAZY = {
     "SlamConfig": "edgeslam_torch.config",
     "SlamOutput": "edgeslam_torch.types",
     "TelemetrySample": "edgeslam_torch.types",
+    "load_camera": "edgeslam_torch.geometry.camera_file",
     "open_source": "edgeslam_torch.readers.source",
+    "run": "edgeslam_torch.run",
 }
 __all__ = [
     "Camera",
@@ -47,17 +41,19 @@ __all__ = [
     "SlamOutput",
     "TelemetrySample",
     "__version__",
+    "load_camera",
     "open_source",
+    "run",
 ]
 
 
-if not TYPE_CHECKING:  # a type checker takes the imports above, and says so where a name is wrong
+def __getattr__(name: str) -> object:
+    if name in _LAZY:
+        module = importlib.import_module(_LAZY[name])
+        globals()[name] = module if name == "run" else getattr(module, name)  # that module is the function as well
+        return globals()[name]
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
-    def __getattr__(name):
-        if name in _LAZY:
-            globals()[name] = getattr(importlib.import_module(_LAZY[name]), name)
-            return globals()[name]
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
-    def __dir__():
-        return sorted({*globals(), *__all__})
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from itertools import islice
 from pathlib import Path
-from types import FrameType
+from types import FrameType, ModuleType
 from typing import TYPE_CHECKING, Any, Protocol
 
 from edgeslam_torch.calibration.camera_choice import GUESS, GUESS_COST, GUESS_WARNING
@@ -25,16 +25,16 @@ from edgeslam_torch.files.config_file import to_toml
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.camera_file import save_camera
 from edgeslam_torch.readers.flight_folder import telemetry_gap
-from edgeslam_torch.readers.pace import Counter, at_their_pace
+from edgeslam_torch.readers.pace import Counter, TelemetryCursor, at_their_pace
 from edgeslam_torch.readers.read_ahead import read_ahead
 from edgeslam_torch.readers.source import Source
-from edgeslam_torch.run_summary import Tally, summarise, without_folders
 from edgeslam_torch.types import (
     FloatArray,
     Frame,
     Observations,
     Piece,
     PointCloud,
+    Record,
     ScaleEstimate,
     SlamOutput,
     Support,
@@ -42,6 +42,7 @@ from edgeslam_torch.types import (
 )
 from edgeslam_torch.writers.map_picture import write_map_picture
 from edgeslam_torch.writers.observations import write_observations
+from edgeslam_torch.writers.run_summary import Tally, summarise, without_folders
 from edgeslam_torch.writers.run_writer import CAMERA, OBSERVATIONS, PICTURE, SUMMARY, RunWriter, summary_text
 
 if TYPE_CHECKING:
@@ -153,8 +154,8 @@ class AtlasFiles:
     """File to write the map to in the end."""
 
 
-@dataclass(frozen=True, slots=True)
-class RunResult:
+@dataclass(frozen=True, slots=True, repr=False)
+class RunResult(Record):
     """Result of a run."""
 
     folder: Path
@@ -172,7 +173,7 @@ class RunResult:
 
 def run(
     source: Source,
-    out_dir: Path,
+    out_dir: str | Path,
     config: SlamConfig | None = None,
     mode: Mode = Mode.OFFLINE,
     listeners: Sequence[Listener] = (),
@@ -199,7 +200,7 @@ def run(
         SourceError: If the source provides no frame, or fails during the run (after the results are written).
     """
     config, atlas = config or SlamConfig(), atlas or AtlasFiles()
-    with closing(source), closing(RunWriter(out_dir, [Path(source.location)], to_toml(config))) as writer:
+    with closing(source), closing(RunWriter(Path(out_dir), [Path(source.location)], to_toml(config))) as writer:
         slam = (make_slam or _edge_slam)(source.camera, config, mode is Mode.REALTIME)
         if atlas.load is not None:
             slam.load_atlas(atlas.load)
@@ -272,7 +273,7 @@ class _Run:
         if self.mode is Mode.REALTIME and not self.source.live:
             frames = at_their_pace(frames, self.dropped)
         prepared = self._prepared(frames)
-        telemetry = _TelemetryCursor(self.source.telemetry)
+        telemetry = TelemetryCursor(self.source.telemetry)
         try:
             while (item := self._next(prepared)) is not None:
                 frame, features = item
@@ -406,20 +407,6 @@ class _Run:
         return f"{self.source.name}: provided no frame{why}"
 
 
-class _TelemetryCursor:
-    """Telemetry that arrived since the last frame; the list may grow concurrently."""
-
-    def __init__(self, samples: list[TelemetrySample]) -> None:
-        self._samples = samples
-        self._next = 0
-
-    def until(self, stamp_s: float) -> list[TelemetrySample]:
-        first = self._next
-        while self._next < len(self._samples) and self._samples[self._next].stamp_s <= stamp_s:
-            self._next += 1
-        return self._samples[first : self._next]
-
-
 class _Interrupt:
     """Ctrl-C, a closed terminal or ``kill`` request a stop: the run ends and writes its results.
 
@@ -474,3 +461,12 @@ def _load_slam() -> None:
         gc.freeze()
         if was_on:
             gc.enable()
+
+
+class _CallableModule(ModuleType):
+    """``edgeslam_torch.run`` is this module and, called, its `run`: an import of either name finds both."""
+
+    __call__ = staticmethod(run)
+
+
+sys.modules[__name__].__class__ = _CallableModule

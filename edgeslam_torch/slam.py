@@ -7,7 +7,8 @@ state, and returns the results.
 from collections.abc import Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import replace
-from typing import Any
+from types import TracebackType
+from typing import Any, Self
 
 import cv2
 import numpy as np
@@ -63,6 +64,8 @@ from edgeslam_torch.types import (
     SlamOutput,
     Support,
     TelemetrySample,
+    check_frame,
+    check_telemetry,
 )
 
 _AROUND = 8
@@ -84,8 +87,8 @@ class EdgeSlam:
 
     Example:
         >>> slam = EdgeSlam(source.camera)                                   # doctest: +SKIP
-        >>> for frame in source.frames():                                    # doctest: +SKIP
-        ...     print(slam.step(frame).T_w_c[:3, 3])
+        >>> for frame, telemetry in source.steps():                          # doctest: +SKIP
+        ...     print(slam.step(frame, telemetry).T_w_c[:3, 3])
         >>> slam.finish()                                                    # doctest: +SKIP
         >>> stamps, poses = slam.trajectory()                                # doctest: +SKIP
     """
@@ -98,6 +101,10 @@ class EdgeSlam:
         realtime: bool = False,
         executor: Executor | None = None,
     ) -> None:
+        if not isinstance(camera, Camera):
+            raise TypeError(f"a Camera is expected, got {type(camera).__name__}: source.camera, or load_camera(FILE)")
+        if config is not None and not isinstance(config, SlamConfig):
+            raise TypeError(f"a SlamConfig is expected, got {type(config).__name__}")
         # One thread each: spinning thread pools slow each other down (docs/decisions/0025).
         cv2.setNumThreads(1)
         torch.set_num_threads(1)
@@ -153,6 +160,22 @@ class EdgeSlam:
         self._lost = Lost(self._system, self._tracking, self._starting)
         cv2.setRNGSeed(config.seed)
 
+    def __repr__(self) -> str:
+        camera, unit = self.camera, self.scale.units
+        return (
+            f"EdgeSlam({camera.width}x{camera.height}, f {camera.fx:.1f} px, {self.state}: {len(self.log.records)} "
+            f"frames, {len(self.map.keyframes)} keyframes, {unit})"
+        )
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Stop what runs in the background; results can still be read."""
+        self.close()
+
     @property
     def state(self) -> State:
         """Current state: what the newest pose is based on."""
@@ -194,7 +217,9 @@ class EdgeSlam:
 
         Raises:
             SourceError: If the image is not of the camera's size.
+            TypeError, ValueError: As `check_frame`.
         """
+        check_frame(frame)
         seen = LazyView(frame, self.camera, self._extract)
         if self._tracking.needs_features:
             _ = seen.view
@@ -215,7 +240,11 @@ class EdgeSlam:
 
         Raises:
             SourceError: If the image is not of the camera's size, or the stamp does not increase.
+            TypeError, ValueError: If the frame is no `Frame` of a uint8 image, or telemetry no list of
+                `TelemetrySample`; nothing has changed then.
         """
+        check_frame(frame)
+        check_telemetry(telemetry)
         if frame.stamp_s <= self._system.motion.stamp_s:
             raise SourceError(f"{frame.name}: stamp {frame.stamp_s} s does not follow {self._system.motion.stamp_s} s")
         system = self._system

@@ -5,9 +5,12 @@ z forward). ``T_w_c`` takes camera coordinates to world coordinates. Metres, rad
 integers. Arrays are numpy, float64 for poses and float32 for bulk data, unless a field says otherwise.
 """
 
-from dataclasses import dataclass, field
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
 from enum import StrEnum
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +24,38 @@ FloatArray = NDArray[np.floating]
 IntArray = NDArray[np.integer]
 
 
-@dataclass(frozen=True, slots=True)
-class Frame:
+_SHOWN = 4
+"""Numbers of an array that `Record` still shows by value."""
+
+
+class Record:
+    """Base of records that hold arrays: shown by their shapes, since a page of numbers tells nobody anything."""
+
+    __slots__ = ()
+
+    def __repr__(self) -> str:
+        shown = ", ".join(f"{f.name}={_short(getattr(self, f.name))}" for f in fields(self))  # type: ignore[arg-type]
+        return f"{type(self).__name__}({shown})"
+
+
+def _short(value: Any) -> str:
+    """A field in a few words."""
+    if isinstance(value, StrEnum):
+        return str(value)
+    if isinstance(value, float):
+        return f"{value:.10g}"
+    if isinstance(value, (list, tuple, dict)) and len(value) > _SHOWN:
+        return f"{type(value).__name__} of {len(value)}"
+    shape, dtype = getattr(value, "shape", None), getattr(value, "dtype", None)
+    if not isinstance(shape, tuple) or dtype is None:
+        return repr(value)
+    if len(shape) == 1 and shape[0] <= _SHOWN and np.issubdtype(dtype, np.number):
+        return f"[{', '.join(f'{x:.4g}' for x in value)}]"
+    return f"<{'x'.join(map(str, shape))} {dtype}>"
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class Frame(Record):
     """One camera image."""
 
     index: int
@@ -41,9 +74,42 @@ class Frame:
         """Its file or its number, for messages."""
         return str(self.path or f"frame {self.index}")
 
+    @classmethod
+    def from_rgb(cls, index: int, stamp_s: float, image: Any) -> "Frame":
+        """A frame of an RGB or grey image as networks have it: an array or a tensor of any device.
 
-@dataclass(frozen=True, slots=True)
-class TelemetrySample:
+        Args:
+            index: Position in the source, from 0.
+            stamp_s: Time of exposure [s].
+            image: ``(H, W, 3)``, ``(3, H, W)``, ``(H, W)`` or ``(1, H, W)``; uint8, or floating point in [0, 1].
+
+        Raises:
+            TypeError: If it is no image of these types.
+            ValueError: If it has another shape, or values outside of [0, 1].
+
+        Example:
+            >>> Frame.from_rgb(0, 0.0, np.full((3, 4, 6), 0.5, np.float32))
+            Frame(index=0, stamp_s=0, image=<4x6x3 uint8>, path=None, grey=None)
+        """
+        pixels = np.asarray(image.detach().cpu() if hasattr(image, "detach") else image)
+        if pixels.ndim == 3 and pixels.shape[0] in (1, 3) and pixels.shape[2] not in (1, 3):
+            pixels = pixels.transpose(1, 2, 0)
+        if pixels.ndim == 3 and pixels.shape[2] == 1:
+            pixels = pixels[..., 0]
+        if pixels.ndim not in (2, 3) or (pixels.ndim == 3 and pixels.shape[2] != 3) or not pixels.size:
+            raise ValueError(f"an RGB image is (H, W, 3) or (3, H, W), a grey one (H, W), got {np.shape(image)}")
+        if np.issubdtype(pixels.dtype, np.floating):
+            low, high = float(pixels.min()), float(pixels.max())
+            if not (low >= 0.0 and high <= 1.0):  # false for NaN as well
+                raise ValueError(f"floating-point images lie in [0, 1], got {low:g} to {high:g}")
+            pixels = np.rint(255.0 * pixels.astype(np.float32)).astype(np.uint8)
+        if pixels.dtype != np.uint8:
+            raise TypeError(f"an image is uint8, or floating point in [0, 1], got {pixels.dtype}")
+        return cls(index, stamp_s, np.ascontiguousarray(pixels[..., ::-1] if pixels.ndim == 3 else pixels))
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class TelemetrySample(Record):
     """One state message of the drone in SI units; a missing field is NaN.
 
     Velocity is in the frame fixed at power-on, rotated to our world axes (x forward at power-on, y left, z up);
@@ -68,8 +134,47 @@ class TelemetrySample:
     """Charge in [0, 1]."""
 
 
-@dataclass(frozen=True, slots=True)
-class FrameFeatures:
+def check_frame(frame: Frame) -> None:
+    """Refuse what is no frame, or whose image is not as OpenCV reads it.
+
+    Raises:
+        TypeError: If it is no `Frame`, or its image no array of uint8.
+        ValueError: If the image has another shape, or the stamp is not a finite number.
+    """
+    if not isinstance(frame, Frame):
+        raise TypeError(f"a Frame is expected, got {type(frame).__name__}: Frame(index, stamp_s, image)")
+    image = frame.image
+    remedy = "make it by Frame.from_rgb(index, stamp_s, image), which takes RGB, tensors and floating point in [0, 1]"
+    if not isinstance(image, np.ndarray) or image.dtype != np.uint8:
+        got = f"{type(image).__name__} {getattr(image, 'dtype', '')} {tuple(getattr(image, 'shape', ()))}"
+        raise TypeError(
+            f"{frame.name}: an image is a numpy array of uint8, (H, W, 3) BGR or (H, W), got {got}; {remedy}"
+        )
+    if image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3):
+        raise ValueError(f"{frame.name}: an image is (H, W, 3) BGR or (H, W), got {image.shape}; {remedy}")
+    if not math.isfinite(frame.stamp_s):
+        raise ValueError(f"{frame.name}: the stamp must be a finite number of seconds, got {frame.stamp_s}")
+
+
+def check_telemetry(telemetry: Sequence[TelemetrySample]) -> None:
+    """Refuse what are no state messages.
+
+    Raises:
+        TypeError: If it is no sequence of `TelemetrySample`.
+        ValueError: If one has a vector of another length than 3.
+    """
+    if not isinstance(telemetry, Sequence):
+        raise TypeError(f"telemetry is a list of TelemetrySample, got {type(telemetry).__name__}")
+    for sample in telemetry:
+        if not isinstance(sample, TelemetrySample):
+            raise TypeError(f"telemetry is a list of TelemetrySample, got a list with {type(sample).__name__}")
+        for name in ("velocity_m_s", "rpy_rad", "acceleration_m_s2"):
+            if not isinstance(value := getattr(sample, name), np.ndarray) or value.shape != (3,):
+                raise ValueError(f"telemetry: {name} is an array of 3 numbers, got {_short(value)}")
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class FrameFeatures(Record):
     """ORB keypoints of one frame (stage 1)."""
 
     uv: FloatArray
@@ -84,8 +189,8 @@ class FrameFeatures:
     """Whether the image has too few clear corners, so that fainter ones are among these."""
 
 
-@dataclass(frozen=True, slots=True)
-class Edges:
+@dataclass(frozen=True, slots=True, repr=False)
+class Edges(Record):
     """Canny edge pixels of one keyframe (stage 1)."""
 
     uv: FloatArray
@@ -96,8 +201,8 @@ class Edges:
     """``(E, 3)`` RGB."""
 
 
-@dataclass(frozen=True, slots=True)
-class DepthMap:
+@dataclass(frozen=True, slots=True, repr=False)
+class DepthMap(Record):
     """Depth network output for one image (stage 1)."""
 
     depth_m: FloatArray
@@ -119,8 +224,8 @@ class MotionKind(StrEnum):
     DEGENERATE = "degenerate"
 
 
-@dataclass(frozen=True, slots=True)
-class RelativePose:
+@dataclass(frozen=True, slots=True, repr=False)
+class RelativePose(Record):
     """Two-view motion from the essential matrix (stage 2), paper eqs. (2)-(5)."""
 
     kind: MotionKind
@@ -191,8 +296,8 @@ class Piece:
     """Where its first pose and scale come from, in words."""
 
 
-@dataclass(frozen=True, slots=True)
-class Support:
+@dataclass(frozen=True, slots=True, repr=False)
+class Support(Record):
     """What supports each frame's final pose."""
 
     piece: IntArray
@@ -271,8 +376,8 @@ class Health:
         return ", ".join(words)
 
 
-@dataclass(frozen=True, slots=True)
-class SlamOutput:
+@dataclass(frozen=True, slots=True, repr=False)
+class SlamOutput(Record):
     """Result of `EdgeSlam.step` for one frame."""
 
     index: int
@@ -303,8 +408,8 @@ class SlamOutput:
     """Length of a map unit in the unit of ``T_w_c``; a revision changes it."""
 
 
-@dataclass(frozen=True, slots=True)
-class PoseNow:
+@dataclass(frozen=True, slots=True, repr=False)
+class PoseNow(Record):
     """Where the camera is at a moment, with the delay of the video made up for.
 
     Frame: the world of `SlamOutput.T_w_c`. Unit: metres where ``metric``, else the unit of the published trajectory.
@@ -330,8 +435,8 @@ class PoseNow:
     """As in `SlamOutput`."""
 
 
-@dataclass(frozen=True, slots=True)
-class PointCloud:
+@dataclass(frozen=True, slots=True, repr=False)
+class PointCloud(Record):
     """Points with colour and uncertainty, in the trajectory's world frame."""
 
     p_w: FloatArray
@@ -344,8 +449,8 @@ class PointCloud:
     """``(P,)`` keyframes that observed the point, int32."""
 
 
-@dataclass(frozen=True, slots=True)
-class Observations:
+@dataclass(frozen=True, slots=True, repr=False)
+class Observations(Record):
     """Anchors that keyframes observed."""
 
     stamps_s: FloatArray

@@ -75,7 +75,7 @@ def calls() -> tuple[Call, ...]:
 def listed() -> list[str]:
     """Modules of `EdgeSlam.step`'s part of the page's list, in its order."""
     text = TABLE.read_text(encoding="utf-8").split("## From a recording to an output folder", 1)[1]
-    part = text.split("EdgeSlam.step", 1)[1].split("run_summary.py", 1)[0]
+    part = text.split("EdgeSlam.step", 1)[1].split("writers/run_summary.py", 1)[0]
     return [f"edgeslam_torch.{name.replace('/', '.')}" for name in re.findall(r"([\w/]+)\.py", part)]
 
 

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from fake_slam import FakeSlam
 
-from edgeslam_torch import run_summary
 from edgeslam_torch.config import SlamConfig
 from edgeslam_torch.errors import EdgeSlamError, SourceError, WeightsError
 from edgeslam_torch.eval.inputs.run_folder import open_run
@@ -25,6 +24,7 @@ from edgeslam_torch.readers.pace import Counter, at_their_pace
 from edgeslam_torch.readers.source import open_source
 from edgeslam_torch.run import AtlasFiles, Mode, _load_slam, run
 from edgeslam_torch.types import Frame, TelemetrySample
+from edgeslam_torch.writers import run_summary
 from edgeslam_torch.writers.ply import read_ply
 
 FILES = {
@@ -367,7 +367,7 @@ def test_an_atlas_that_could_not_be_written_is_not_said_to_be_saved(tmp_path, wr
 
 
 def test_memory_is_the_runs_own_and_not_that_of_the_process_that_started_it():
-    code = "from edgeslam_torch.run_summary import peak_rss_mb; print(peak_rss_mb())"
+    code = "from edgeslam_torch.writers.run_summary import peak_rss_mb; print(peak_rss_mb())"
     large = np.ones(100 << 20, np.uint8)  # 100 MB that a child takes over by fork
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     here = run_summary.peak_rss_mb()

@@ -44,8 +44,8 @@ def scale(x: torch.Tensor) -> Residuals:
 
 def run(path: str) -> EdgeSlam:
     slam = EdgeSlam(Camera(640, 480, 500.0, 500.0, 319.5, 239.5), SlamConfig())
-    for frame in open_source(path).frames():
-        slam.step(frame).status.name.lower()
+    for frame, telemetry in open_source(path).steps():
+        slam.step(frame, telemetry).status.name.lower()
     slam.stop()  # type: ignore[attr-defined]
     return slam
 """
@@ -65,7 +65,17 @@ def test_names_are_not_hidden_by_modules_of_the_same_name():
     for package in PUBLIC:
         module = importlib.import_module(package)
         homes = {path.stem for folder in module.__path__ for path in Path(folder).iterdir()}
-        assert homes & set(module.__all__) == set()
+        same = homes & set(module.__all__)
+        assert all(callable(getattr(module, name)) for name in same)
+        assert same <= {"run"}  # a module that can be called
+
+
+def test_editors_are_told_of_the_names_that_load_on_first_use():
+    stub = (Path(edgeslam_torch.__file__).parent / "__init__.pyi").read_text()
+    listed = re.findall(r'^    "(\w+)",$', stub, re.MULTILINE)
+    imported = re.findall(r"^from .* import (\w+) as \1$", stub, re.MULTILINE)
+    assert listed == edgeslam_torch.__all__
+    assert {*imported, "__version__"} == set(listed)
 
 
 def test_type_checkers_are_told_that_there_are_types():

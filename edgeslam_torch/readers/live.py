@@ -17,6 +17,7 @@ from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.readers.gstreamer import SCHEME, GStreamerCapture
 from edgeslam_torch.readers.images import check_trackable
 from edgeslam_torch.readers.listing import Problem
+from edgeslam_torch.readers.pace import Steps
 from edgeslam_torch.types import Frame, TelemetrySample
 
 FIRST_PICTURE_S = 10.0
@@ -44,7 +45,7 @@ class Feed(Protocol):
         """Release the device."""
 
 
-class LiveSource:
+class LiveSource(Steps):
     """A free-running camera; implements `edgeslam_torch.readers.source.Source`."""
 
     kind = "live"

@@ -1,11 +1,12 @@
-"""Playback of a recording at its original rate."""
+"""How frames are handed on: with the telemetry that arrived since the last, or at their original rate."""
 
 import queue
 import threading
 import time
 from collections.abc import Iterator
 
-from edgeslam_torch.types import Frame
+from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.types import Frame, TelemetrySample
 
 REALTIME_QUEUE = 15
 """Frames that may wait for a slow step, half a second at 30 a second.
@@ -13,6 +14,46 @@ REALTIME_QUEUE = 15
 The step that starts the map takes 0.3 s on a PC; tracking a frame takes a third of the time between two, so that what
 waited is soon caught up with.
 """
+
+
+class TelemetryCursor:
+    """Telemetry that arrived since the last frame; the list may grow concurrently."""
+
+    def __init__(self, samples: list[TelemetrySample]) -> None:
+        self._samples = samples
+        self._next = 0
+
+    def until(self, stamp_s: float) -> list[TelemetrySample]:
+        """Samples up to a stamp that were not given before."""
+        first = self._next
+        while self._next < len(self._samples) and self._samples[self._next].stamp_s <= stamp_s:
+            self._next += 1
+        return self._samples[first : self._next]
+
+
+class Steps:
+    """Base of sources."""
+
+    name: str
+    kind: str
+    camera: Camera
+    telemetry: list[TelemetrySample]
+    length: int | None
+
+    def frames(self) -> Iterator[Frame]:
+        """As `edgeslam_torch.readers.source.Source`."""
+        raise NotImplementedError
+
+    def steps(self) -> Iterator[tuple[Frame, list[TelemetrySample]]]:
+        """Each frame with the state messages that arrived since the one before: what `EdgeSlam.step` takes."""
+        cursor = TelemetryCursor(self.telemetry)
+        for frame in self.frames():
+            yield frame, cursor.until(frame.stamp_s)
+
+    def __repr__(self) -> str:
+        long = "frames" if self.length is None else f"at most {self.length} frames"
+        size = f"{self.camera.width}x{self.camera.height}"
+        return f"{type(self).__name__}({self.name!r}, {self.kind}, {size}, {long}, {len(self.telemetry)} telemetry)"
 
 
 class Counter:

@@ -16,6 +16,7 @@ from edgeslam_torch.readers.bags.bag import SUFFIXES, is_bag
 from edgeslam_torch.readers.bags.recording import open_bag
 from edgeslam_torch.readers.layouts import layout_of, read_sequence, tum
 from edgeslam_torch.readers.listing import ImageEntry, Problem
+from edgeslam_torch.readers.pace import Steps
 from edgeslam_torch.readers.read_ahead import read_ahead
 from edgeslam_torch.readers.sequence import Sequence as ImageSequence
 from edgeslam_torch.readers.telemetry_csv import read_telemetry
@@ -60,12 +61,15 @@ class Source(Protocol):
     def frames(self) -> Iterator[Frame]:
         """Frames in time order."""
 
+    def steps(self) -> Iterator[tuple[Frame, list[TelemetrySample]]]:
+        """Each frame with the telemetry that arrived since the one before."""
+
     def close(self) -> None:
         """Release the device; may be called repeatedly."""
 
 
-@dataclass
-class Recording:
+@dataclass(repr=False)
+class Recording(Steps):
     """A source on disk; `frames` may be called repeatedly."""
 
     name: str

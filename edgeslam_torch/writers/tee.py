@@ -12,6 +12,7 @@ from edgeslam_torch.errors import OutputError
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.readers.listing import Problem
 from edgeslam_torch.readers.live import LiveSource
+from edgeslam_torch.readers.pace import Steps
 from edgeslam_torch.types import Frame, TelemetrySample
 from edgeslam_torch.writers.flight_writer import FlightWriter
 
@@ -21,7 +22,7 @@ _WAITING = 60
 """Maximum queue of frames for the disk (two seconds, 120 MB at 960x720); beyond, camera frames are skipped."""
 
 
-class RecordedLive:
+class RecordedLive(Steps):
     """Implements `edgeslam_torch.readers.source.Source`: frames taken from it are also recorded.
 
     Only frames that were taken are recorded, so that a replay processes the same frames.

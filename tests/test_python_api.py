@@ -1,0 +1,108 @@
+"""What a Python user gives to the system and sees of it."""
+
+import importlib
+
+import numpy as np
+import pytest
+import torch
+
+import edgeslam_torch
+from edgeslam_torch import Camera, EdgeSlam, Frame, SlamConfig, TelemetrySample
+from edgeslam_torch.config import DepthConfig
+from edgeslam_torch.geometry.camera_file import save_camera
+from edgeslam_torch.readers.source import open_source
+
+CAMERA = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)
+NO_NETWORK = SlamConfig(depth=DepthConfig(weights="none"))
+RGB = np.random.default_rng(0).integers(0, 256, (48, 64, 3), dtype=np.uint8)
+BGR = Frame(0, 0.0, RGB[..., ::-1].copy())
+
+
+@pytest.mark.parametrize(
+    "image",
+    [
+        RGB,
+        RGB / 255.0,
+        (RGB / 255.0).astype(np.float32).transpose(2, 0, 1),
+        torch.from_numpy(RGB),
+        torch.from_numpy(RGB).permute(2, 0, 1),
+        (torch.from_numpy(RGB).permute(2, 0, 1) / 255.0).requires_grad_(),
+    ],
+)
+def test_rgb_of_any_kind_becomes_the_same_frame(image):
+    frame = Frame.from_rgb(0, 0.0, image)
+    assert frame.image.dtype == np.uint8 and np.array_equal(frame.image, BGR.image)
+
+
+@pytest.mark.parametrize("image", [RGB * 1.0, np.full((48, 64), np.nan), RGB[..., :2], RGB.astype(np.int16), [[1]], {}])
+def test_what_is_no_rgb_image_is_refused(image):
+    with pytest.raises((TypeError, ValueError), match="image"):
+        Frame.from_rgb(0, 0.0, image)
+
+
+@pytest.mark.parametrize(
+    "frame",
+    [
+        {"image": RGB},
+        RGB,
+        Frame(0, 0.0, RGB / 255.0),
+        Frame(0, 0.0, torch.from_numpy(RGB)),
+        Frame(0, 0.0, RGB.transpose(2, 0, 1)),
+        Frame(0, 0.0, None),
+        Frame(0, float("nan"), RGB),
+    ],
+)
+def test_what_is_no_frame_is_refused_at_once(frame):
+    with EdgeSlam(CAMERA, NO_NETWORK) as slam:
+        for call in (slam.step, slam.prepare):
+            with pytest.raises((TypeError, ValueError), match=r"Frame\(index|Frame.from_rgb|finite"):
+                call(frame)
+        assert slam.step(BGR).index == 0
+
+
+@pytest.mark.parametrize(
+    "telemetry",
+    [{"stamp_s": 0.0}, None, TelemetrySample(0.0), [{}], np.zeros(3), [TelemetrySample(0.0, velocity_m_s=(1, 2))]],
+)
+def test_what_is_no_telemetry_is_refused_at_once(telemetry):
+    slam = EdgeSlam(CAMERA, NO_NETWORK)
+    with pytest.raises((TypeError, ValueError), match="telemetry"):
+        slam.step(BGR, telemetry)
+
+
+def test_what_is_no_camera_is_refused_at_once():
+    with pytest.raises(TypeError, match="load_camera"):
+        EdgeSlam({"fx": 500.0})
+
+
+def test_records_are_shown_by_shapes():
+    slam = EdgeSlam(CAMERA, NO_NETWORK)
+    output = slam.step(BGR)
+    assert "image=<48x64x3 uint8>" in repr(BGR)
+    assert "T_w_c=<4x4 float64>" in repr(output) and "status=" in repr(output)
+    assert "velocity_m_s=[1, 2, 3]" in repr(TelemetrySample(0.0, np.array([1.0, 2.0, 3.0])))
+    assert "1 frames" in repr(slam) and "64x48" in repr(slam)
+    shown = [BGR, output, slam, slam.edge_map(), slam.anchors(), slam.support(), slam.observations(), CAMERA]
+    assert max(len(repr(record)) for record in shown) < 1200
+
+
+def test_steps_pair_each_frame_with_the_telemetry_since_the_last(tmp_path, write_images):
+    write_images(tmp_path, [f"{k}.png" for k in range(4)])
+    save_camera(tmp_path / "camera.yaml", CAMERA)
+    (tmp_path / "telemetry.csv").write_text("stamp_s,bat\n" + "".join(f"{0.01 * k:.3f},{k}\n" for k in range(9)))
+    source = open_source(tmp_path)
+    steps = list(source.steps())
+    assert [f.index for f, _ in steps] == [f.index for f in source.frames()]
+    stamps = [sample.stamp_s for _, samples in steps for sample in samples]
+    assert stamps == [s.stamp_s for s in source.telemetry if s.stamp_s <= steps[-1][0].stamp_s]
+    assert all(sample.stamp_s <= frame.stamp_s for frame, samples in steps for sample in samples)
+    assert "telemetry" in repr(source) and len(repr(source)) < 200
+
+
+def test_run_is_a_name_of_the_package_however_it_is_imported():
+    module = importlib.import_module("edgeslam_torch.run")
+    assert callable(edgeslam_torch.run)
+    assert edgeslam_torch.run.Mode is module.Mode
+    assert "run" in edgeslam_torch.__all__
+    with pytest.raises(TypeError, match="source"):  # it is called, and no source is given
+        edgeslam_torch.run()
