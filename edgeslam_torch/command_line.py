@@ -4,63 +4,22 @@ import argparse
 import difflib
 import importlib
 import logging
-import math
 import os
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import NoReturn
+from types import ModuleType
 
 from edgeslam_torch import __version__
 from edgeslam_torch.console import console, exit_code
 from edgeslam_torch.errors import EdgeSlamError
+from edgeslam_torch.help.pages import described, listing
+from edgeslam_torch.help.parser import EXIT_USAGE, Parser
 
 Commands = Mapping[str, tuple[str, str]]
 """Name: (module, one line of help)."""
 
 EXIT_ERROR = 1
-EXIT_USAGE = 2
-
-
-class Parser(argparse.ArgumentParser):
-    """Suggests corrections; options cannot be abbreviated, so that new options break no script."""
-
-    def __init__(self, *args: object, **kwargs: object) -> None:
-        kwargs.setdefault("allow_abbrev", False)
-        super().__init__(*args, **kwargs)  # type: ignore[arg-type]
-        self.register("type", int, _whole_number)
-        self.register("type", float, _finite_number)
-
-    def error(self, message: str) -> NoReturn:
-        """One line, and exit."""
-        sys.stderr.write(f"{self.prog}: error: {message}; see {self.prog} --help\n")
-        sys.exit(EXIT_USAGE)
-
-    def options(self) -> list[str]:
-        """All options."""
-        return [name for action in self._actions for name in action.option_strings]
-
-
-def _whole_number(text: str) -> int:
-    """Argument type for integers."""
-    try:
-        value = int(text)
-    except ValueError:
-        value = None
-    if value is None or not -(2**31) <= value < 2**31:
-        raise argparse.ArgumentTypeError(f"must be a whole number of at most 32 bits, got {text[:40]!r}")
-    return value
-
-
-def _finite_number(text: str) -> float:
-    """Argument type for finite floats."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise argparse.ArgumentTypeError(f"must be a finite number, got {text[:40]!r}")
-    return value
 
 
 def run_command(arguments: list[str], commands: Commands) -> int:
@@ -78,10 +37,17 @@ def run_command(arguments: list[str], commands: Commands) -> int:
 
 def _run_command(arguments: list[str], commands: Commands) -> int:
     parser = _top_parser(commands)
-    split = next((i for i, word in enumerate(arguments) if not word.startswith("-")), len(arguments))
+    values = {i + 1 for i, word in enumerate(arguments) if word == "--print-completion"}
+    words = (i for i, word in enumerate(arguments) if not word.startswith("-") and i not in values)
+    split = next(words, len(arguments))
     top, unknown = parser.parse_known_args(arguments[:split])
     if unknown:
         parser.error(_unknown_arguments(unknown, parser.options()))
+    if top.print_completion is not None:
+        import shtab
+
+        print(shtab.complete(full_parser(commands), top.print_completion))
+        return 0
     if split == len(arguments):
         parser.print_help()
         return EXIT_USAGE
@@ -101,10 +67,8 @@ def _run_command(arguments: list[str], commands: Commands) -> int:
 
 def _call(name: str, entry: tuple[str, str], arguments: list[str], verbose: bool) -> int:
     module = importlib.import_module(entry[0])
-    parser = Parser(prog=f"edgeslam {name}", description=(module.__doc__ or entry[1]).strip().splitlines()[0])
-    module.add_arguments(parser)
-    if "--verbose" not in parser.options():
-        parser.add_argument("-v", "--verbose", action="store_true", help="debug messages, and tracebacks of errors")
+    parser = Parser(prog=f"edgeslam {name}", **described(name, module.__doc__ or entry[1]))
+    _add_arguments(parser, module)
     args, unknown = parser.parse_known_args(arguments)
     if unknown:
         parser.error(_unknown_arguments(unknown, parser.options()))
@@ -112,18 +76,35 @@ def _call(name: str, entry: tuple[str, str], arguments: list[str], verbose: bool
         return int(module.main(args))
 
 
+def _add_arguments(parser: Parser, module: ModuleType) -> None:
+    module.add_arguments(parser)
+    if "--verbose" not in parser.options():
+        parser.add_argument("-v", "--verbose", action="store_true", help="debug messages, and tracebacks of errors")
+
+
+def full_parser(commands: Commands) -> Parser:
+    """All commands with all their options in one parser, for completion and other static tools."""
+    parser = _top_parser(commands)
+    below = parser.add_subparsers(metavar="COMMAND")
+    for name, entry in commands.items():
+        module = importlib.import_module(entry[0])
+        _add_arguments(below.add_parser(name, help=entry[1], **described(name, module.__doc__ or entry[1])), module)
+    return parser
+
+
 def _top_parser(commands: Commands) -> Parser:
-    width = max((len(name) for name in commands), default=0)
-    listing = "\n".join(f"  {name:<{width}}  {entry[1]}" for name, entry in commands.items())
     parser = Parser(
         prog="edgeslam",
         usage="edgeslam [-v] COMMAND ...",
         description="Metric monocular SLAM with a semi-dense edge map.",
-        epilog=f"commands:\n{listing}\n\n'edgeslam COMMAND --help' tells the options of one.",
+        epilog=f"commands:\n\n{listing(commands)}\n\n'edgeslam COMMAND --help' tells options and examples of one.",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"edgeslam {__version__}")
     parser.add_argument("-v", "--verbose", action="store_true", help="debug messages, and tracebacks of errors")
+    parser.add_argument(
+        "--print-completion", choices=("bash", "zsh", "tcsh"), help="print a completion script for this shell, and exit"
+    )
     return parser
 
 

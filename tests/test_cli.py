@@ -1,9 +1,11 @@
 """The command line as a user meets it: every mistake gets one line that says what to do."""
 
+import argparse
 import json
 import logging
 import os
 import pty
+import shlex
 import signal
 import subprocess
 import sys
@@ -17,8 +19,10 @@ from fake_slam import FakeSlam
 
 import edgeslam_torch.run
 from edgeslam_torch import __version__, cli
+from edgeslam_torch.command_line import full_parser
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.camera_file import save_camera
+from edgeslam_torch.help.examples import EXAMPLES, GROUPS
 
 
 @pytest.fixture
@@ -71,6 +75,19 @@ def test_lossless_without_record_is_refused(edgeslam, recording):
     code, _, err = edgeslam("run", recording, "--lossless")
     assert code == 1
     assert "--lossless is for --record" in err
+
+
+def test_a_part_of_a_recording_is_run(edgeslam, recording, tmp_path):
+    def stamps(name, *words):
+        assert edgeslam("run", recording, "-o", tmp_path / name, *words)[0] == 0
+        rows = (tmp_path / name / "status.csv").read_text().splitlines()
+        return [row.split(",")[rows[0].split(",").index("stamp_s")] for row in rows[1:]]
+
+    whole = stamps("whole")
+    assert stamps("part", "--start", "1", "--stride", "2", "--max-frames", "2") == whole[1:4:2]
+    code, _, err = edgeslam("run", recording, "-o", tmp_path / "none", "--start", "5000")
+    assert code == 1 and "5000" in err
+    assert edgeslam("run", "webcam:0", "--stride", "2")[0] == 1
 
 
 def test_run_without_out_goes_into_runs(edgeslam, recording, tmp_path, monkeypatch):
@@ -209,6 +226,45 @@ def test_every_command_has_help(edgeslam):
         code, out, _ = edgeslam(name, "--help")
         assert code == 0
         assert out.startswith(f"usage: edgeslam {name}")
+
+
+def test_every_command_has_a_group_and_examples_that_parse():
+    assert sorted(name for names in GROUPS.values() for name in names) == sorted(cli.COMMANDS)
+    parser = full_parser(cli.available())
+    for name in cli.COMMANDS:
+        for line in EXAMPLES[name]:
+            words = shlex.split(line)
+            assert words[:2] == ["edgeslam", name]
+            if name not in ("finetune", "distil"):  # whose weights must exist
+                parser.parse_args(words[1:])
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh"])
+def test_completion_knows_commands_and_options(shell, edgeslam):
+    code, out, _ = edgeslam("--print-completion", shell)
+    assert code == 0 and "export-map" in out and "--save-atlas" in out
+
+
+def test_completion_is_printed_without_loading_torch():
+    code = (
+        "import sys, edgeslam_torch.cli as c; c.main(['--print-completion', 'bash']); assert 'torch' not in sys.modules"
+    )
+    assert subprocess.run([sys.executable, "-c", code], stdout=subprocess.DEVNULL).returncode == 0
+
+
+def test_one_word_for_one_option():
+    """A network is ``--depth``, a setting ``--set``, the output ``--out`` and ``-o``, whatever the command."""
+    parser = full_parser(cli.available())
+    commands = next(
+        a for a in parser._actions if a.dest == argparse.SUPPRESS and a.choices and "run" in a.choices
+    ).choices
+    options = {name: p.options() for name, p in commands.items()}
+    for name, found in options.items():
+        assert ("--out" in found) == ("-o" in found), name
+    for name in ("run", "demo", "batch", "bench", "judge", "ablation"):
+        assert "--set" in options[name]
+    for name in ("run", "demo", "batch", "bench", "depth", "finetune"):
+        assert "--depth" in options[name]
 
 
 def test_commands_without_a_module_are_not_offered(edgeslam, monkeypatch):

@@ -24,7 +24,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default="room",
         help="room, corridor or block (once around four corridors; default: room)",
     )
-    parser.add_argument("--seconds", type=float, metavar="N", help="length of the flight (default: 16; block: 64)")
+    parser.add_argument("--duration", type=float, metavar="S", help="length of the flight [s] (default: 16; block: 64)")
+    parser.add_argument("--seconds", type=float, dest="duration", default=argparse.SUPPRESS, help=argparse.SUPPRESS)
     parser.add_argument("--rate", type=float, metavar="HZ", help="images per second (default: 20; block: 15)")
     parser.add_argument(
         "--seed", type=int, default=0, help="another number gives another place and flight (default: 0)"
@@ -33,7 +34,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--delay", type=float, default=0.5, metavar="S", help="video delay behind telemetry (default: 0.5)"
     )
-    parser.add_argument("--loss", type=float, default=0.0, metavar="SHARE", help="share of telemetry lost (default: 0)")
+    parser.add_argument(
+        "--loss", type=float, default=0.0, metavar="PERCENT", help="telemetry that is lost (default: 0)"
+    )
     parser.add_argument(
         "--battery", type=float, default=87.0, metavar="PERCENT", help="charge at take-off (default: 87)"
     )
@@ -129,12 +132,14 @@ def _settings(args: argparse.Namespace) -> "DemoSettings":
 
     if args.seed < 0:
         raise ConfigError(f"--seed must not be negative, got {args.seed}")
+    if 0 < args.loss < 1:
+        raise ConfigError(f"--loss is in percent: {100 * args.loss:g} for a share of {args.loss:g}")
     try:
-        faults = TelemetryFaults(video_delay_s=args.delay, loss=args.loss, battery_start=args.battery / 100.0)
+        faults = TelemetryFaults(video_delay_s=args.delay, loss=args.loss / 100.0, battery_start=args.battery / 100.0)
     except ValueError as error:
-        raise ConfigError(f"--loss must lie in [0, 1) and --battery in (0, 100]: {error}") from error
+        raise ConfigError(f"--loss must lie in [0, 100) and --battery in (0, 100]: {error}") from error
     course = WORLDS.get(args.world, Course())
-    seconds = course.seconds if args.seconds is None else args.seconds
+    seconds = course.seconds if args.duration is None else args.duration
     rate_hz = course.rate_hz if args.rate is None else args.rate
     if not 160 <= args.width <= 1920 or args.width % 4:
         raise ConfigError(f"--width must be 160 to 1920 and a multiple of 4, got {args.width}")

@@ -36,8 +36,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--camera", metavar="FILE|PRESET", help="calibration (default: the source's own camera.yaml); metres follow it"
     )
     parser.add_argument(
-        "--weights", default="default", metavar="FILE|NAME", help="weights, broad, an ONNX file or a downloaded network"
+        "--depth", default="default", metavar="FILE|NAME", help="weights, broad, an ONNX file or a downloaded network"
     )
+    parser.add_argument("--weights", dest="depth", default=argparse.SUPPRESS, help=argparse.SUPPRESS)
     parser.add_argument("--backend", choices=("onnxruntime", "torch"), default="onnxruntime", help="what runs it")
     parser.add_argument(
         "--device",
@@ -58,7 +59,7 @@ def main(args: argparse.Namespace) -> int:
     from edgeslam_torch.frontend.depth_check import MIN_SHARE
     from edgeslam_torch.frontend.depth_network import open_depth, weights_path
 
-    network = open_depth(weights_path(args.weights), args.backend, args.threads, args.device)
+    network = open_depth(weights_path(args.depth), args.backend, args.threads, args.device)
     if not network.is_metric:
         raise ConfigError(f"{network.weights}: gives depth up to scale and shift; a map has both: edgeslam run --depth")
     camera, frames, length, warnings, problems = _frames(args.source, args.camera, args.max_frames)

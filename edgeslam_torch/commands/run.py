@@ -61,6 +61,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--save-atlas", type=Path, metavar="FILE", help="save the map for later flights (--atlas)")
     parser.add_argument("--record", type=Path, metavar="DIR", help="record a live source, to run it again")
     parser.add_argument("--lossless", action="store_true", help="record PNG instead of JPEG (quality 95)")
+    parser.add_argument("--start", type=_whole, default=0, metavar="N", help="leave out the first N frames")
+    parser.add_argument("--stride", type=_positive_int, default=1, metavar="N", help="use every N-th frame")
     parser.add_argument("--max-frames", type=_positive_int, metavar="N", help="stop after N frames")
     parser.add_argument("--config", type=Path, metavar="FILE.toml", help="settings; a run's config.toml is one")
     parser.add_argument(
@@ -100,7 +102,6 @@ def main(args: argparse.Namespace) -> int:
     """Run, and print a short summary."""
     from edgeslam_torch.errors import ConfigError
     from edgeslam_torch.progress import make_progress
-    from edgeslam_torch.readers.source import open_source
     from edgeslam_torch.run import AtlasFiles, Listener, Mode, run, settle_camera
 
     if args.lossless and args.record is None:
@@ -108,10 +109,7 @@ def main(args: argparse.Namespace) -> int:
     config = resolved_config(args)
     _check_atlas_can_be_saved(args.save_atlas)
     earlier = _earlier_flights(args.atlas)
-    if args.record is not None:
-        source = _recorded(args)
-    else:
-        source = open_source(args.source, args.camera, args.telemetry, args.max_frames, args.topic)
+    source = _source(args)
     if earlier is None or not _take_its_camera(source, earlier):
         settle_camera(source)
     if earlier is not None:
@@ -153,6 +151,20 @@ def main(args: argparse.Namespace) -> int:
         )
         return EXIT_INTERRUPTED
     return 0
+
+
+def _source(args: argparse.Namespace) -> "Source":
+    """The source, or the part of a recording that was asked for."""
+    from edgeslam_torch.errors import ConfigError
+    from edgeslam_torch.readers.source import LIVE_SCHEMES, Recording, open_source
+
+    whole = args.start == 0 and args.stride == 1
+    if not whole and args.source.startswith(LIVE_SCHEMES):
+        raise ConfigError(f"{args.source}: --start and --stride are for recordings")
+    if args.record is not None:
+        return _recorded(args)
+    source = open_source(args.source, args.camera, args.telemetry, args.max_frames, args.topic)
+    return source if whole or not isinstance(source, Recording) else source.part(args.start, args.stride)
 
 
 def _recorded(args: argparse.Namespace) -> "Source":
@@ -327,11 +339,15 @@ def _say(text: str) -> None:
     sys.stderr.write(f"edgeslam: {text}\n")
 
 
-def _positive_int(text: str) -> int:
+def _whole(text: str, least: int = 0) -> int:
     try:
         value = int(text)
     except ValueError:
-        value = 0
-    if not 1 <= value < 2**31:
-        raise argparse.ArgumentTypeError(f"must be a whole number of at least 1, got {text[:40]!r}")
+        value = -1
+    if not least <= value < 2**31:
+        raise argparse.ArgumentTypeError(f"must be a whole number of at least {least}, got {text[:40]!r}")
     return value
+
+
+def _positive_int(text: str) -> int:
+    return _whole(text, 1)

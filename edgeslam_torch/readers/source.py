@@ -3,7 +3,7 @@
 import importlib
 import importlib.util
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
 from typing import Protocol
@@ -85,6 +85,10 @@ class Recording(Steps):
     warnings: list[str] = field(default_factory=list)
     live: bool = False
     max_frames: int | None = None
+    start: int = 0
+    """Frames left out at the beginning."""
+    stride: int = 1
+    """Of those that are left, one in so many is used."""
 
     def __post_init__(self) -> None:
         self._listed = tuple(self.problems)
@@ -92,7 +96,20 @@ class Recording(Steps):
     def frames(self) -> Iterator[Frame]:
         """Frames in time order; the next one is decoded while the caller works on this one."""
         self.problems[:] = self._listed
-        return read_ahead(islice(self.decode(self.problems), self.max_frames))
+        chosen = islice(self.decode(self.problems), self.start, None, self.stride)
+        return read_ahead(islice(chosen, self.max_frames))
+
+    def part(self, start: int, stride: int) -> "Recording":
+        """Every ``stride``-th frame from number ``start`` on, and no telemetry from before a second ahead of them.
+
+        Raises:
+            SourceError: If there is no frame so late.
+        """
+        first = next(islice(self.decode([]), start, None), None)
+        if first is None:
+            raise SourceError(f"{self.location}: no frame from number {start} on")
+        telemetry = [sample for sample in self.telemetry if sample.stamp_s >= first.stamp_s - 1.0]
+        return replace(self, start=start, stride=stride, length=None, telemetry=telemetry)
 
     def close(self) -> None:
         """Nothing to release."""

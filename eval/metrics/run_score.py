@@ -204,7 +204,8 @@ def _coverage(
         share = min(1.0, float(inside[-1] - inside[0]) / span) if len(inside) > 1 and span > 0 else 0.0
         return share, share, float(inside[0] - truth.stamps_s[0]) if len(inside) else float("nan")
     count = len(frames)
-    first = _first_trusted(run) + clock.offset_s - float(frames[0])
+    begin = max(float(frames[0]), float(run.status[0].get("stamp_s") or "nan")) if run.status else float(frames[0])
+    first = _first_trusted(run) + clock.offset_s - begin
     return min(1.0, run.trusted_frames / count), min(1.0, len(run.trajectory) / count), first
 
 

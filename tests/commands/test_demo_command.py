@@ -17,7 +17,7 @@ def test_record_only_leaves_a_recording_that_can_be_run(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], world: str
 ) -> None:
     assert (
-        main(["demo", "--out", str(tmp_path), "--world", world, "--seconds", "1", "--rate", "5", "--record-only"]) == 0
+        main(["demo", "--out", str(tmp_path), "--world", world, "--duration", "1", "--rate", "5", "--record-only"]) == 0
     )
     source = open_source(str(tmp_path / "flight"))
     frames = list(source.frames())
@@ -29,7 +29,7 @@ def test_record_only_leaves_a_recording_that_can_be_run(
 
 
 def test_many_recordings_have_different_places_and_are_not_made_again(tmp_path: Path) -> None:
-    options = ["--world", "corridor", "--seconds", "1", "--rate", "5", "--width", "160", "--seed", "3"]
+    options = ["--world", "corridor", "--duration", "1", "--rate", "5", "--width", "160", "--seed", "3"]
     assert main(["demo", "--out", str(tmp_path), "--record-only", "--flights", "2", *options]) == 0
     images = [open_source(str(tmp_path / f"flight_000{i}")).frames() for i in (3, 4)]
     first, second = (next(frames).image for frames in images)
@@ -92,9 +92,9 @@ def test_demo_flight_meets_its_bars(tmp_path: Path, world: str, scale_bar: float
     ("arguments", "message"),
     [
         (["--world", "castle"], "no world 'castle'; there are room, corridor"),
-        (["--seconds", "0"], "1 to 3600 seconds"),
+        (["--duration", "0"], "1 to 3600 seconds"),
         (["--images", "awful"], "no image quality 'awful'"),
-        (["--loss", "1.5"], "--loss must lie in"),
+        (["--loss", "150"], "--loss must lie in"),
         (["--seed", "-3"], "--seed must not be negative"),
         (["--flights", "3"], "--flights needs --record-only"),
         (["--width", "641"], "--width must be"),

@@ -31,7 +31,7 @@ def data(tmp_path):
 @pytest.mark.slow
 def test_table_is_printed_written_and_compared(data, tmp_path, capsys):
     out = tmp_path / "out"
-    command = ["judge", str(data), "--jobs", "1", "--first-seed", "3", "--change", "depth.weights=none"]
+    command = ["judge", str(data), "--jobs", "1", "--first-seed", "3", "--set", "depth.weights=none"]
     assert cli.main([*command, "--out", str(out)]) == 0
     printed = capsys.readouterr().out
     assert "| stairs |" in printed and "| frames |" in printed

@@ -9,6 +9,8 @@ from pathlib import Path
 from edgeslam_torch.errors import ConfigError, OutputError
 from edgeslam_torch.files.atomic import write_text
 
+CELLS = ("base", "variants", "flights", "telemetry", "all")
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's options."""
@@ -19,10 +21,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--only", action="append", default=[], metavar="GLOB", help="only cells whose names match; may be repeated"
     )
     parser.add_argument(
-        "--set",
-        choices=("base", "variants", "flights", "telemetry", "all"),
+        "--cells",
+        choices=CELLS,
         default="base",
-        dest="which",
         help="recordings as they are, their variants, simulations, made telemetry, or all (default: base)",
     )
     parser.add_argument("--seeds", type=int, default=1, metavar="N", help="runs of every cell (default: 1)")
@@ -31,8 +32,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--timeout", type=float, default=900.0, metavar="S", help="longest cell [s] (default: 900)")
     parser.add_argument("--max-frames", type=int, metavar="N", help="stop every run after N frames")
     parser.add_argument(
-        "--change", action="append", default=[], metavar="SECTION.KEY=VALUE", help="change one setting of every run"
+        "--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="change one setting of every run"
     )
+    parser.add_argument("--change", action="append", dest="set", default=argparse.SUPPRESS, help=argparse.SUPPRESS)
     parser.add_argument(
         "--out", type=Path, required=True, metavar="DIR", help="results; finished cells are not repeated"
     )
@@ -52,10 +54,13 @@ def main(args: argparse.Namespace) -> int:
     data = args.data or (Path(os.environ["EDGESLAM_DATA"]) if os.environ.get("EDGESLAM_DATA") else None)
     bars = read_bars(args.bars or BARS)
     before = read_record(args.against) if args.against is not None else None
+    old = [name for name in args.set if name in CELLS]
+    if old:
+        raise ConfigError(f"--set changes settings; which cells are run is said by --cells {old[0]}")
     if args.jobs < 1 or args.seeds < 1 or args.first_seed < 0:
         raise ConfigError("--jobs and --seeds must be at least 1, --first-seed at least 0")
-    cells = list_cells(data, args.which, range(args.first_seed, args.first_seed + args.seeds), args.only)
-    settings = JudgeSettings(tuple(args.change), args.max_frames, args.jobs, args.timeout, args.flights)
+    cells = list_cells(data, args.cells, range(args.first_seed, args.first_seed + args.seeds), args.only)
+    settings = JudgeSettings(tuple(args.set), args.max_frames, args.jobs, args.timeout, args.flights)
     try:
         record = judge(cells, settings, args.out, _say)
         text = markdown(record, bars)

@@ -37,11 +37,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's options."""
     add_shared_arguments(parser, steps=100, batch=6)
     parser.add_argument(
-        "--weights",
+        "--depth",
+        dest="weights",
         type=weights_file,
         metavar="FILE|NAME",
         help="weights to start from: a file, 'default' or 'broad' (default: default)",
     )
+    parser.add_argument("--weights", type=weights_file, default=argparse.SUPPRESS, help=argparse.SUPPRESS)
     parser.add_argument("--ignore-depth", action="store_true", help="ignore depth maps of recordings")
     parser.add_argument("--lr", type=float, default=3e-4, help="learning rate of the decoder; the encoder's is a fifth")
     parser.add_argument(

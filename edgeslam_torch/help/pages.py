@@ -1,0 +1,30 @@
+"""The list of commands by groups, and what a command's help says beside the options."""
+
+import argparse
+from collections.abc import Mapping
+from typing import Any
+
+from edgeslam_torch.help.examples import EXAMPLES, GROUPS
+
+
+def described(name: str, text: str) -> dict[str, Any]:
+    """Arguments of a command's parser: the first line of its documentation, and examples."""
+    examples = "\n".join(f"  {line}" for line in EXAMPLES.get(name, ()))
+    return {
+        "description": text.strip().splitlines()[0],
+        "epilog": f"examples:\n{examples}" if examples else None,
+        "formatter_class": argparse.RawDescriptionHelpFormatter,
+    }
+
+
+def listing(commands: Mapping[str, tuple[str, str]]) -> str:
+    """The commands by groups, each with its line of help."""
+    width = max((len(name) for name in commands), default=0)
+    grouped = {title: [name for name in names if name in commands] for title, names in GROUPS.items()}
+    known = {name for names in grouped.values() for name in names}
+    grouped["more"] = [name for name in commands if name not in known]
+    return "\n\n".join(
+        "\n".join([f" {title}", *(f"  {name:<{width}}  {commands[name][1]}" for name in names)])
+        for title, names in grouped.items()
+        if names
+    )
