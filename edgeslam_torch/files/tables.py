@@ -152,8 +152,7 @@ def read_table(path: Path, error: type[EdgeSlamError], columns: int | None = Non
     data = [(i, line) for i, line in lines if not line.startswith(_COMMENTS)]
     begin = data[0][0] if data else math.inf
     above = [line for i, line in lines if i < begin]
-    sample = [line for _, line in data[1 : 1 + _LOOKED_AT]] or [line for _, line in data[:1]]
-    separator = _separator(sample)
+    separator = _separator([line for _, line in data[: 1 + _LOOKED_AT]])
     rows = [Row(i, _split(line, separator, columns)) for i, line in data]
     header: tuple[str, ...] = ()
     if rows and not any(_is_value(cell) for cell in rows[0].cells):
@@ -184,9 +183,14 @@ def _is_value(cell: str) -> bool:
 
 
 def _separator(lines: Sequence[str]) -> str | None:
-    """The separator of most lines; None where any will do, since all is numbers."""
-    decimal_comma = _has_decimal_comma(lines)
-    if not decimal_comma and lines and all(_all_numbers(line) for line in lines):
+    """The separator of most lines; None where any will do, since all is numbers.
+
+    Args:
+        lines: Of the table, the first of which may be its header.
+    """
+    rows_alone = lines[1:] or lines
+    decimal_comma = _has_decimal_comma(rows_alone)
+    if not decimal_comma and rows_alone and all(_all_numbers(line) for line in rows_alone):
         return None
     fits = {}
     for separator in _SEPARATORS:

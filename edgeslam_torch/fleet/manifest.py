@@ -1,6 +1,5 @@
 """What a batch runs on: folders, globs and CSV tables of recordings become a list of flights."""
 
-import csv
 import difflib
 import glob
 import os
@@ -10,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from edgeslam_torch.errors import ConfigError, SourceError
+from edgeslam_torch.files.tables import Row, read_table
 from edgeslam_torch.geometry.camera import PRESETS
 from edgeslam_torch.readers import video
 from edgeslam_torch.readers.images import image_files
@@ -99,17 +99,11 @@ def _flight(recording: Path) -> Flight:
 
 
 def _of_table(table: Path) -> list[Flight]:
-    try:
-        with table.open(newline="", encoding="utf-8-sig") as file:
-            rows = list(csv.DictReader(file, skipinitialspace=True))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise ConfigError(
-            f"{table}: cannot be read as a table ({getattr(error, 'strerror', None) or error})"
-        ) from error
-    if not rows:
+    content = read_table(table, ConfigError)
+    if not content.rows:
         raise ConfigError(f"{table}: no recording in it; its first line is {','.join(COLUMNS)}, or some of these")
-    _check_columns(table, [name for name in rows[0] if name is not None])
-    return [_of_row(table, line, row) for line, row in enumerate(rows, start=2)]
+    _check_columns(table, content.header)
+    return [_of_row(table, content.header, row) for row in content.rows]
 
 
 def _check_columns(table: Path, names: Iterable[str]) -> None:
@@ -122,11 +116,11 @@ def _check_columns(table: Path, names: Iterable[str]) -> None:
         raise ConfigError(f"{table}: no column 'recording'; its first line is {','.join(COLUMNS)}, or some of these")
 
 
-def _of_row(table: Path, line: int, row: dict[str, str]) -> Flight:
-    origin = f"{table}, line {line}"
-    if None in row:
+def _of_row(table: Path, header: Sequence[str], row: Row) -> Flight:
+    origin = f"{table}, line {row.line}"
+    if len(row.cells) > len(header):
         raise ConfigError(f"{origin}: more cells than columns; put a cell with a comma in quotes")
-    cells = {name: (row.get(name) or "").strip() for name in COLUMNS}
+    cells = dict.fromkeys(COLUMNS, "") | dict(zip(header, row.cells, strict=False))
     if not cells["recording"]:
         raise ConfigError(f"{origin}: no recording")
     if cells["recording"].startswith(LIVE_SCHEMES):

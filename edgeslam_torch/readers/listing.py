@@ -51,8 +51,15 @@ def read_list(path: Path) -> tuple[list[tuple[float, str]], list[Problem]]:
         if value is None or not math.isfinite(value) or len(row.cells) < 2 or not row.cells[1]:
             problems.append(Problem(f"{path}:{row.line}", f"not 'stamp path': {' '.join(row.cells)[:60]!r}"))
             continue
-        rows.append((value, row.cells[1]))
+        name = row.cells[1]
+        rows.append((value, name if "/" in name else name.replace("\\", "/")))  # Windows' separators
     return rows, problems
+
+
+def nothing_listed(path: Path, line: str, problems: Sequence[Problem]) -> SourceError:
+    """Error of a list without a usable image; ``line`` says how one looks."""
+    first = f" ({problems[0].file}: {problems[0].reason})" if problems else ""
+    return SourceError(f"{path}: lists no image; a line is {line}{first}")
 
 
 def read_times(path: Path) -> FloatArray:

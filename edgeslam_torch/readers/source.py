@@ -32,6 +32,8 @@ ARCHIVES = {
     ".7z": "an archive: unpack it first",
 }
 
+_FEW = 3
+"""Fewer images are no recording: a calibration's vignette, a title picture."""
 PANORAMAS = (".insv", ".360")
 """Raw files of Insta360 and GoPro cameras: two fisheye pictures side by side."""
 
@@ -252,6 +254,12 @@ def _folder_content(folder: Path) -> _Content:
     if recorded is not None:
         return _video_content(recorded, truth)
     found, problems = images.list_image_folder(folder)
+    inside = {child.name: len(images.image_files(child)) for child in _folders_in(folder)} if len(found) < _FEW else {}
+    if found and inside and max(inside.values()) > len(found):
+        more = max(inside, key=lambda name: inside[name])
+        raise SourceError(
+            f"{folder}: {len(found)} image(s), but {inside[more]} in its folder {more}; give one of the two"
+        )
     return _listed(ImageSequence("images", folder, tuple(found), tuple(problems), truth), folder)
 
 
@@ -297,6 +305,10 @@ def _nothing_in(folder: Path) -> str:
     suffixes = sorted({child.suffix.lower() or child.name for child in children})
     found = ", ".join(suffixes[:5])
     return f"{folder}: no images or video in it (found {found}); images must be .png or .jpg"
+
+
+def _folders_in(folder: Path) -> list[Path]:
+    return sorted(child for child in folder.iterdir() if child.is_dir() and not child.name.startswith("."))
 
 
 def _looks_like_sequence(folder: Path) -> bool:

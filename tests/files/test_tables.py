@@ -112,3 +112,8 @@ def test_units_at_their_limits():
     assert seconds_of([1.4e18])[1] == "ns"
     assert seconds_of([])[1] == "s"
     assert seconds_of([5.0, np.nan, 5.0, 1e154])[1] == UNKNOWN
+
+
+def test_the_separator_is_that_of_the_header(tmp_path):
+    path = written(tmp_path, "recording,settings\na.mp4,x=1;y=2\nb.mp4,x=1;y=2\n")
+    assert [row.cells for row in read_table(path, SourceError).rows] == [["a.mp4", "x=1;y=2"], ["b.mp4", "x=1;y=2"]]

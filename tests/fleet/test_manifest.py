@@ -98,3 +98,14 @@ def test_what_is_not_there_is_named(tmp_path):
         names(tmp_path)
     with pytest.raises(SourceError, match="not live sources"):
         names("webcam:0")
+
+
+@pytest.mark.parametrize("separator", [",", ";", "\t"])
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_a_table_is_read_as_a_spreadsheet_saves_it(tmp_path, separator, encoding):
+    lines = [["recording", "settings"], ["a.mp4", '"flow.enabled=false;seed=1"'], ["b.mp4", ""]]
+    path = tmp_path / "flights.csv"
+    path.write_bytes("\r\n".join(map(separator.join, lines)).encode(encoding))
+    first, second = read_manifests([str(path)])
+    assert first.settings == ("flow.enabled=false", "seed=1")
+    assert second.recording.name == "b.mp4"

@@ -368,3 +368,10 @@ def test_images_too_small_to_be_tracked_are_refused(tmp_path, write_images, size
     write_images(tmp_path, ["1.png", "2.png"], size)
     with pytest.raises(SourceError, match="too small"):
         open_source(tmp_path)
+
+
+def test_a_picture_beside_the_folder_of_images_is_not_the_recording(tmp_path, write_images):
+    write_images(tmp_path, ["title.png"])
+    write_images(tmp_path / "frames", [f"{i}.png" for i in range(5)])
+    with pytest.raises(SourceError, match="5 in its folder frames"):
+        open_source(tmp_path)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.readers.images import list_image_folder
-from edgeslam_torch.readers.listing import ImageEntry, Problem, entries_in_time, read_list
+from edgeslam_torch.readers.listing import ImageEntry, Problem, entries_in_time, nothing_listed, read_list
 from edgeslam_torch.readers.sequence import Sequence
 
 KIND = "euroc"
@@ -53,7 +53,7 @@ def _images(folder: Path) -> tuple[list[ImageEntry], list[Problem]]:
         return list_image_folder(folder / "data")
     rows, problems = read_list(listing)
     if not rows:
-        raise SourceError(f"{listing}: lists no image; each line is 'nanoseconds,file name'")
+        raise nothing_listed(listing, "'nanoseconds,file name'", problems)
     stamps, names = zip(*rows, strict=True)
     kept, more = entries_in_time(stamps, [folder / "data" / name for name in names], str(listing), unit="ns")
     return kept, problems + more

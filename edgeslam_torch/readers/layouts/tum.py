@@ -13,7 +13,7 @@ from edgeslam_torch.files.tables import read_table
 from edgeslam_torch.geometry.camera import PRESETS, Camera
 from edgeslam_torch.readers.images import image_files, list_image_folder
 from edgeslam_torch.readers.layouts import seven_scenes
-from edgeslam_torch.readers.listing import ImageEntry, Problem, entries_in_time, read_list
+from edgeslam_torch.readers.listing import ImageEntry, Problem, entries_in_time, nothing_listed, read_list
 from edgeslam_torch.readers.sequence import DepthMaps, Sequence
 
 KIND = "tum"
@@ -67,7 +67,7 @@ def _images(folder: Path) -> tuple[list[ImageEntry], list[Problem]]:
         return list_image_folder(folder / "rgb")
     entries, problems = _listed(listing)
     if not entries:
-        raise SourceError(f"{listing}: lists no image; a line is 'stamp path', such as '12.34 rgb/12.34.png'")
+        raise nothing_listed(listing, "'stamp path', such as '12.34 rgb/12.34.png'", problems)
     return entries, problems
 
 
