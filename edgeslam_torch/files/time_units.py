@@ -41,7 +41,8 @@ def seconds_of(stamps: ArrayLike, gaps_s: tuple[float, float] = PLAUSIBLE_GAPS_S
     array = np.asarray(stamps, dtype=np.float64)
     finite = np.sort(array[np.isfinite(array)])
     size = float(np.median(finite)) if len(finite) else 0.0
-    gaps = finite[1:] - finite[:-1]
+    with np.errstate(over="ignore"):
+        gaps = finite[1:] - finite[:-1]
     gaps = gaps[gaps > 0]
     dated = [unit for unit, factor in SECONDS_PER_UNIT.items() if is_date(size * factor)]
     if not len(gaps):

@@ -263,28 +263,25 @@ def usual_size(entries: Sequence[ImageEntry], name: str) -> tuple[int, int]:
     Raises:
         SourceError: If none can be read, or no size is that of at least half of them.
     """
-    sample = entries[:: max(1, len(entries) // _LOOKED_AT)]
-    sizes: dict[ImageEntry, tuple[int, int]] = {}
     first = ""
-    for entry in sample:
-        try:
-            sizes[entry] = image_size(_bytes(entry.path)) or (0, 0)
-        except SourceError as error:
-            first = first or str(error)
-    for size, count in Counter(sizes.values()).most_common():
-        if 2 * count < len(sizes):
-            found = ", ".join(f"{width}x{height}" for width, height in list(dict.fromkeys(sizes.values()))[:4])
-            raise SourceError(f"{name}: images of several sizes ({found}), none of which most of them have")
-        for entry in (entry for entry in sizes if sizes[entry] == size):
+    for sample in (entries[:: max(1, len(entries) // _LOOKED_AT)], entries):
+        sizes: dict[ImageEntry, tuple[int, int]] = {}
+        for entry in sample:
             try:
-                height, width = read_pixels(entry.path, cv2.IMREAD_GRAYSCALE).shape  # turned as its EXIF data says
+                sizes[entry] = image_size(_bytes(entry.path)) or (0, 0)
             except SourceError as error:
                 first = first or str(error)
-                continue
-            return width, height
-    rest = [entry for entry in entries if entry not in sample]
-    if rest:
-        return usual_size(rest, name)
+        for size, count in Counter(sizes.values()).most_common():
+            if 2 * count < len(sizes):
+                found = ", ".join(f"{width}x{height}" for width, height in list(dict.fromkeys(sizes.values()))[:4])
+                raise SourceError(f"{name}: images of several sizes ({found}), none of which most of them have")
+            for entry in (entry for entry in sizes if sizes[entry] == size):
+                try:
+                    height, width = read_pixels(entry.path, cv2.IMREAD_GRAYSCALE).shape  # turned as EXIF data says
+                except SourceError as error:
+                    first = first or str(error)
+                    continue
+                return width, height
     raise SourceError(f"{name}: none of its images can be read ({len(entries)} listed; the first: {first})")
 
 

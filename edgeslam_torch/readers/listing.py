@@ -15,6 +15,9 @@ from edgeslam_torch.files.tables import number, read_table
 from edgeslam_torch.files.time_units import MAX_STAMP_S, NAMES, UNKNOWN, is_date, seconds_of
 from edgeslam_torch.types import FloatArray, IntArray
 
+_MAX_BYTES = 64 << 20
+"""Maximum size of a list; a million images take 60 MB."""
+
 
 class Problem(NamedTuple):
     """A defect of a source: what was skipped and why, or a remark."""
@@ -43,7 +46,7 @@ def read_list(path: Path) -> tuple[list[tuple[float, str]], list[Problem]]:
     """
     rows: list[tuple[float, str]] = []
     problems: list[Problem] = []
-    table = read_table(path, SourceError, columns=2)
+    table = read_table(path, SourceError, columns=2, max_bytes=_MAX_BYTES)
     if table.header and not table.rows:
         problems.append(Problem(f"{path}:1", f"not 'stamp path': {' '.join(table.header)[:60]!r}"))
     for row in table.rows:
@@ -68,7 +71,7 @@ def read_times(path: Path) -> FloatArray:
     Raises:
         SourceError: If it is not such a file.
     """
-    return read_table(path, SourceError).numbers([0])[:, 0]
+    return read_table(path, SourceError, max_bytes=_MAX_BYTES).numbers([0])[:, 0]
 
 
 def entries_in_time(
@@ -97,7 +100,7 @@ def image_times(stamps: ArrayLike, name: str, unit: str = "s") -> tuple[FloatArr
     Dates of our time are in no doubt and need no remark. ``name`` is for messages.
     """
     seconds, found = seconds_of(stamps)
-    if found == unit or (found != UNKNOWN and is_date(seconds)):
+    if len(seconds) < 2 or found == unit or (found != UNKNOWN and is_date(seconds)):
         return seconds, []
     gap = np.median(np.abs(np.diff(seconds)))
     if found == UNKNOWN:
