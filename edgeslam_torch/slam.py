@@ -459,7 +459,8 @@ class EdgeSlam:
         pieces = [p for p in self.pieces() if p.supported > 0]
         if len(pieces) < 2:
             return None
-        spans = ", ".join(f"{p.number} ({p.first_s:.1f} to {p.last_s:.1f} s)" for p in pieces)
+        began_s = min(p.first_s for p in self.pieces())
+        spans = ", ".join(f"{p.number} ({p.first_s - began_s:.1f} to {p.last_s - began_s:.1f} s)" for p in pieces)
         return f"the map is in {len(pieces)} pieces that were never joined, {spans}: poses across them do not relate"
 
     # -- helpers -----------------------------------------------------------------------------------------------

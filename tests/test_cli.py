@@ -378,3 +378,19 @@ def test_closed_terminal_leaves_a_map(write_tum, tmp_path):
     assert child.wait() == 129
     assert (out / "edge_map.ply").is_file()
     assert json.loads((out / "summary.json").read_text())["ended_early"] == "interrupted"
+
+
+def test_runs_without_out_are_numbered_and_none_is_replaced(edgeslam, recording, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("seq", "seq-2", "seq-3"):
+        assert edgeslam("run", recording, "--no-report")[0] == 0
+        assert (tmp_path / "runs" / name / "trajectory.txt").is_file()
+
+
+def test_a_recording_is_no_run_to_view_or_report(edgeslam, recording):
+    (recording / "groundtruth.txt").write_text("100.0 0 0 0 0 0 0 1\n100.1 0 0 0 0 0 0 1\n")
+    before = sorted(recording.iterdir())
+    for command in (("view", "--print"), ("report",)):
+        code, _, err = edgeslam(command[0], recording, *command[1:])
+        assert code == 1 and "no run wrote" in err
+    assert sorted(recording.iterdir()) == before

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from edgeslam_torch.commands.flying.signals import Signals, say
+from edgeslam_torch.commands.flying._signals import Signals, say
 
 if TYPE_CHECKING:
     from edgeslam_torch.drone.tello import StateMessage, Tello

@@ -5,6 +5,7 @@ import os
 import sys
 from contextlib import ExitStack
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="TUM, 7-Scenes, EuRoC or image folder, video file, flight recording, ROS bag, tello://HOST, webcam:N, "
         "rtsp://..., http://..., gst:PIPELINE",
     )
-    parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the results (default: runs/NAME)")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the results (default: runs/NAME, numbered)")
     parser.add_argument(
         "--camera",
         metavar="FILE|PRESET",
@@ -118,7 +119,7 @@ def main(args: argparse.Namespace) -> int:
         _say(f"warning: {warning}")
     _say(_camera_words(source.camera))
     mode = Mode(args.mode) if args.mode else (Mode.REALTIME if source.live else Mode.OFFLINE)
-    out = args.out if args.out is not None else Path("runs") / source.name
+    out = args.out if args.out is not None else _new_folder(Path("runs") / source.name)
     show_bar = sys.stderr.isatty() if args.progress is None else args.progress
     listeners: list[Listener] = []
     files, saved = ExitStack(), None
@@ -165,6 +166,12 @@ def _source(args: argparse.Namespace) -> "Source":
         return _recorded(args)
     source = open_source(args.source, args.camera, args.telemetry, args.max_frames, args.topic)
     return source if whole or not isinstance(source, Recording) else source.part(args.start, args.stride)
+
+
+def _new_folder(folder: Path) -> Path:
+    """``runs/NAME``, or ``runs/NAME-2`` and so on beside older runs: none is replaced unless ``--out`` names it."""
+    candidates = (folder if number == 1 else folder.with_name(f"{folder.name}-{number}") for number in count(1))
+    return next(path for path in candidates if not path.exists() or (path.is_dir() and not any(path.iterdir())))
 
 
 def _recorded(args: argparse.Namespace) -> "Source":

@@ -164,8 +164,8 @@ class Metres:
         return self._settled().warning
 
     def warnings(self) -> list[str]:
-        """The same, and what is wrong with the depth network here."""
-        depth = self._depth.scale()
+        """The same, and what is wrong with the depth network here, where its metres are needed."""
+        depth = self._depth.scale() if self.told is None else None
         own = (None if depth is None else depth.warning(), self.contradiction())
         return [said for said in own if said is not None]
 

@@ -52,7 +52,7 @@ def telemetry_gap(samples: Sequence[TelemetrySample], first_s: float, last_s: fl
         return None
     return (
         f"no telemetry during {missing_s:.1f} of {last_s - first_s:.1f} s of video "
-        f"(it runs from {begin_s:.1f} to {end_s:.1f} s, the frames from {first_s:.1f} to {last_s:.1f} s)"
+        f"(it runs from {begin_s - first_s:.1f} to {end_s - first_s:.1f} s after the first frame)"
     )
 
 

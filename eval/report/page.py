@@ -27,6 +27,7 @@ from edgeslam_torch.eval.report.keyframe_pictures import keyframe_pictures
 from edgeslam_torch.files.atomic import write_text
 from edgeslam_torch.readers.images import pixels_or_none
 from edgeslam_torch.types import FloatArray, PointCloud
+from edgeslam_torch.writers.own_folder import check_free
 
 STATUSES = ("starting", "initialised", "tracked", "relocalised", "predicted", "lost")
 """In the order of the page's colours."""
@@ -71,11 +72,14 @@ def write_report(
         judge_map: Compare the map with the data set's depth maps too (some ten seconds).
 
     Raises:
-        EdgeSlamError: If the folder holds no run, or the given ground truth does not fit it.
+        EdgeSlamError: If the folder holds no run, or is a recording and ``out`` is None, or the given ground truth does
+            not fit it.
     """
     run = open_run(run_dir)
     if run.path.is_file():
         raise EvaluationError(f"{run.path}: a report needs a run's folder, this is a single file")
+    if out is None:
+        check_free(run.path, ())
     out = Path(out) if out is not None else run.path / "report.html"
     score, truth = judge_run(run, groundtruth, judge_map)
     write_text(out, render(run, score, truth))

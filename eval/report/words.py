@@ -54,11 +54,17 @@ def story(run: RunFolder, score: RunScore | None) -> str:
             sentences.append(f"{_count(summary.get(key))} of them were {words}.")
     if run.status:
         share = 100.0 * tracked / max(1, frames)
-        whole = "Every frame was" if tracked >= frames else f"{share:.1f} % of the frames were"
-        sentences.append(f"{whole} tracked against the map" + _first(run) + ".")
         lost = summary.get("lost_events")
+        if tracked < frames:
+            sentences.append(f"{share:.1f} % of the frames were tracked against the map{_first(run)}.")
+        elif lost:  # each was given its place by the end
+            sentences.append(f"Every frame has a place in the final map{_first(run)}.")
+        else:
+            sentences.append(f"Every frame was tracked against the map{_first(run)}.")
         if isinstance(lost, int) and (lost or tracked):
-            sentences.append("Tracking was never lost." if lost == 0 else f"Tracking was lost {_times(lost)}.")
+            sentences.append(
+                f"While running, tracking was lost {_times(lost)}." if lost else "Tracking was never lost."
+            )
     sentences.append(_scale_sentence(summary))
     sentences.append(_pieces_sentence(summary))
     sentences.append(_found_again_sentence(summary))

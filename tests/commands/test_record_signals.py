@@ -5,7 +5,7 @@ import signal
 
 import pytest
 
-from edgeslam_torch.commands.flying.signals import Signals
+from edgeslam_torch.commands.flying._signals import Signals
 
 NAMES = [name for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT") if hasattr(signal, name)]
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="signals as POSIX has them")

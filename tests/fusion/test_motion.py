@@ -246,7 +246,7 @@ def test_a_network_that_sees_no_depth_gives_no_metres_and_says_so():
         fusion.metres.add_depth_ratio(DepthRatio(math.log(3.0), 0.3, slope=0.0))
     assert fusion.scale().units is Units.ARBITRARY
     (warning,) = fusion.warnings()
-    assert "out of its domain" in warning
+    assert "out of its domain" in warning and "finetune" in warning
 
 
 def test_telemetry_keeps_a_smaller_sigma_than_depth_under_a_guessed_focal_length(rng, swinging, replay):

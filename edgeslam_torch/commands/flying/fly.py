@@ -6,7 +6,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from edgeslam_torch.commands.flying.signals import Signals, say
+from edgeslam_torch.commands.flying._signals import Signals, say
 
 if TYPE_CHECKING:
     from edgeslam_torch.flying.navigator import Navigator

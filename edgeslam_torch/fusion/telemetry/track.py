@@ -342,7 +342,7 @@ class TelemetryTrack:
             return []
         between = np.diff(self.readings.stamp_s)
         length_s = float(between[frozen[1:] & frozen[:-1]].sum())
-        first_s = float(self.readings.stamp_s[np.argmax(frozen)])
+        first_s = float(self.readings.stamp_s[np.argmax(frozen)] - self.readings.stamp_s[0])
         return [
             f"telemetry repeats one message to the bit for {length_s:.1f} s in all, first at {first_s:.1f} s: ignored"
         ]

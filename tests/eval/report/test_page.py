@@ -1,6 +1,7 @@
 """Contents of ``report.html``, also for hostile names and numbers."""
 
 import json
+import re
 import shutil
 from collections.abc import Callable
 from html.parser import HTMLParser
@@ -166,6 +167,16 @@ def test_page_counts_the_frames_that_the_terminal_counts(run: Path) -> None:
     assert "150 of them were left out" in page.data["story"]
     assert "50 of them were dropped to keep up." in page.data["story"]
     assert "49.2\u00a0% of the frames were tracked" in page.data["story"]  # 197 of 400
+
+
+def test_a_loss_that_was_made_good_is_not_told_as_a_contradiction(run: Path) -> None:
+    table = (run / "status.csv").read_text()
+    (run / "status.csv").write_text(re.sub("predicted|lost", "tracked", table))
+    frames = len(table.splitlines()) - 1
+    story = Page(write_report(with_summary(run, offered=frames, lost_events=1), judge_map=False)).data["story"]
+    assert "lost once" in story and "Every frame was tracked" not in story
+    story = Page(write_report(with_summary(run, offered=frames, lost_events=0), judge_map=False)).data["story"]
+    assert "never lost" in story and "Every frame was tracked" in story
 
 
 @pytest.mark.parametrize(
