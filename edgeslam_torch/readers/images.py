@@ -4,6 +4,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from functools import cache
+from os.path import commonprefix
 from pathlib import Path
 from typing import Any
 
@@ -297,9 +298,11 @@ def _deep(entries: Sequence[ImageEntry]) -> Iterator[NDArray[Any]]:
 
 
 def _stamps_in_names(files: Sequence[Path]) -> FloatArray | None:
-    """Stamps that are names such as ``1305031102.175304.png`` or ``1403636579763555584.png``, in any unit; None of
+    """Stamps that are names such as ``1305031102.175304.png`` or ``cam0_1403636579763555584.png``, in any unit; None of
     names without a time and of counters (``000012.png``)."""
     stems = [path.stem for path in files]
+    prefix = re.sub(r"[\d.]*$", "", commonprefix(stems))
+    stems = [stem.removeprefix(prefix) for stem in stems]
     if not stems or not all(re.fullmatch(r"\d+(\.\d+)?", stem) for stem in stems):
         return None
     stamps = np.array([float(stem) for stem in stems])

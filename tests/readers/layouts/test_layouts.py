@@ -123,14 +123,15 @@ def test_stamps_of_a_layout_may_be_in_any_unit(tmp_path: Path, write_images, kin
 
 
 @pytest.mark.parametrize("begin", [0, 328551511918592, 1403636579763555584])
-def test_names_may_be_nanoseconds(tmp_path: Path, write_images, begin):
-    write_images(tmp_path, [f"{begin + i * 33333333}.png" for i in range(12)])
+@pytest.mark.parametrize("prefix", ["", "frame_", "cam0-"])
+def test_names_may_be_nanoseconds(tmp_path: Path, write_images, begin, prefix):
+    write_images(tmp_path, [f"{prefix}{begin + i * 33333333}.png" for i in range(12)])
     source = open_source(tmp_path)
     assert np.allclose(np.diff([frame.stamp_s for frame in source.frames()]), 1 / 30, rtol=1e-3)
 
 
 def test_an_assumed_rate_is_said(tmp_path: Path, write_images):
-    write_images(tmp_path, [f"{i:06d}.png" for i in range(4)])
+    write_images(tmp_path, [f"img_{i:06d}.png" for i in range(4)])
     assert any("30 images/s" in problem.reason for problem in open_source(tmp_path).problems)
 
 
