@@ -1,5 +1,6 @@
 """The run loop around a SLAM system that knows the answer."""
 
+import csv
 import gc
 import json
 import os
@@ -94,6 +95,14 @@ def test_lost_frames_are_counted_once_a_loss(tmp_path, write_tum):
     summary = run(open_source(folder), tmp_path / "out", make_slam=fake(FakeSlam())).summary
     assert (summary["tracked"], summary["lost_events"], summary["coverage"]) == (7, 1, 0.7)
     assert summary["statuses"] == {"tracked": 7, "predicted": 3}
+
+
+def test_status_names_each_frames_image(tmp_path, write_tum):
+    folder = write_tum(tmp_path / "seq", 3)
+    result = run(open_source(folder), tmp_path / "out", make_slam=fake(FakeSlam()))
+    with (result.folder / "status.csv").open() as file:
+        named = [row["image"] for row in csv.DictReader(file)]
+    assert named == sorted(str(path.relative_to(folder)) for path in (folder / "rgb").iterdir())
 
 
 def test_unreadable_image_costs_coverage_and_is_named(tmp_path, write_tum):
