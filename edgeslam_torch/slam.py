@@ -322,7 +322,7 @@ class EdgeSlam:
         if np.isfinite(estimate.sigma):
             held = self._system.published
             self._system.published = Published(estimate.value, held.R, upright=held.upright)
-        self._calibration_warning = calibration_warning(self.camera, self.keyframes())
+        self._calibration_warning = calibration_warning(self.camera, self.keyframes(), self.map.anchors.p_w)
 
     def trajectory(self) -> tuple[FloatArray, FloatArray]:
         """Stamps ``(F,)`` and refined ``T_w_c`` ``(F, 4, 4)`` of all frames so far."""

@@ -10,11 +10,15 @@ from rendered import film, stairs_world
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import GUESSED_FOCAL_SIGMA, Camera
 from edgeslam_torch.map.keyframe import make_keyframe
+from edgeslam_torch.optim.local_ba import refine_window
+from edgeslam_torch.optim.problem import LmConfig
 from edgeslam_torch.synthetic import box_room
 from edgeslam_torch.tracking.self_calibration import (
     FocalEstimate,
+    _map_problem,
     calibration_warning,
     contradicts,
+    focal_from_map,
     focal_from_matches,
     focal_of,
     guess_camera,
@@ -206,6 +210,28 @@ def test_a_calibration_of_another_lens_is_contradicted(rng, factor):
 
 def test_the_right_calibration_is_left_in_peace(rng):
     assert calibration_warning(TRUE_LENS, walked_keyframes(rng)) is None
+
+
+def adapted(camera, keyframes, p_w):
+    """Map of a run with a wrong focal length: poses and anchors as a refinement leaves them."""
+    problem = _map_problem(camera, keyframes, p_w)
+    result = refine_window(problem, LmConfig(max_iterations=50, mu=1e-8))
+    for keyframe, T_c_w in zip(keyframes, result.T_c_w, strict=True):
+        keyframe.T_c_w = T_c_w
+    moved = p_w.copy()
+    seen = np.unique(np.concatenate([k.anchor[k.anchor >= 0] for k in keyframes]))
+    moved[seen] = result.p_w
+    return moved
+
+
+@pytest.mark.parametrize("factor", [0.7, 1.0, 1.3])
+def test_a_refined_map_tells_the_focal_length_and_its_sigma(factor):
+    keyframes = walked_keyframes(np.random.default_rng(3))
+    camera = another_lens(factor)
+    estimate = focal_from_map(camera, keyframes, adapted(camera, keyframes, cloud(np.random.default_rng(3))))
+    assert estimate.focal_px == pytest.approx(500.0, rel=0.03)
+    assert abs(estimate.focal_px - 500.0) < 2.0 * estimate.sigma_px
+    assert contradicts(estimate, camera) is (factor != 1.0)
 
 
 def test_a_guess_that_says_so_is_not_contradicted(rng):
