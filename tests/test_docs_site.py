@@ -6,7 +6,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import pytest
 from browser import PROGRAM, Browser
@@ -111,8 +111,31 @@ def test_formulas_keep_their_place_in_a_docstring() -> None:
     found = formulas.formulas_as_mathml(text)
     assert found.startswith('Model:\n\n    <span class="formula"><math ')
     assert found.count("<math") == 2 and "math:" not in found
-    assert found.endswith("</math> known.\n")
+    assert found.endswith("</math></span> known.\n")
     assert "<mi>log</mi><mspace" in found
+
+
+def test_formula_at_the_start_of_a_line_does_not_split_its_paragraph() -> None:
+    markdown = pytest.importorskip("markdown")
+    text = formulas.formulas_as_mathml("A height above\n:math:`h + c`, which is unknown.\n")
+    assert markdown.markdown(text, extensions=["md_in_html"]).count("<p>") == 1
+
+
+def test_formulas_of_a_page_are_set() -> None:
+    found = formulas.fenced_as_mathml("Before.\n\n```math\n\\frac{a}{b}\n```\n\n```\nmath\n```\n")
+    assert found.count("<math") == 1 and "```math" not in found and "```\nmath\n```" in found
+
+
+def test_example_becomes_a_section_that_is_set_as_code() -> None:
+    thing = SimpleNamespace(docstring=SimpleNamespace(value="Double.\n\nExample:\n    >>> 2 * 2\n    4\n"))
+    formulas.Formulas().on_object(obj=thing)
+    assert "\nExamples:\n    >>>" in thing.docstring.value
+
+
+def test_search_prefers_guides_and_leaves_internals_out() -> None:
+    assert hooks.searched("tello.md")["boost"] > 1 > hooks.searched("decisions/0001-x.md")["boost"]
+    assert hooks.searched("api/edgeslam_torch/commands/run.md") == {"exclude": True}
+    assert hooks.searched("api/edgeslam_torch/losses/cycle.md") == {"exclude": False}
 
 
 def test_formula_that_cannot_be_set_is_an_error() -> None:

@@ -1,4 +1,4 @@
-"""An extension of griffe, which reads docstrings: formulas as MathML, which browsers set by themselves."""
+"""An extension of griffe, which reads docstrings: formulas as MathML, which browsers set, and examples."""
 
 import re
 from typing import Any
@@ -6,16 +6,20 @@ from typing import Any
 import latex2mathml.converter
 from griffe import Extension, Object
 
+_BLOCK = re.compile(r"^( *)\.\. math::(.*(?:\n(?:\1 +\S.*| *(?=\n|$)))*)", re.MULTILINE)
+_FENCED = re.compile(r"^```math\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+_EXAMPLE = re.compile(r"^Example:[ \t]*$", re.MULTILINE)
 _SPECIAL_IN_MARKDOWN = {ord(c): f"&#{ord(c)};" for c in "*_[]`"}
 
 
 class Formulas(Extension):
-    """``.. math::`` blocks and ``:math:`` roles in every docstring."""
+    """``.. math::`` blocks, ``:math:`` roles and ``Example:`` sections in every docstring."""
 
     def on_object(self, *, obj: Object, **kwargs: Any) -> None:
         """Rewrite its docstring."""
-        if obj.docstring is not None and "math:" in obj.docstring.value:
-            obj.docstring.value = formulas_as_mathml(obj.docstring.value)
+        if obj.docstring is not None:
+            text = _EXAMPLE.sub("Examples:", obj.docstring.value)  # the only name of this section that griffe knows
+            obj.docstring.value = formulas_as_mathml(text) if "math:" in text else text
 
 
 def formulas_as_mathml(docstring: str) -> str:
@@ -24,9 +28,17 @@ def formulas_as_mathml(docstring: str) -> str:
     Raises:
         ValueError: If one has a command that is not known.
     """
-    block = re.compile(r"^( *)\.\. math::(.*(?:\n(?:\1 +\S.*| *(?=\n)))*)", re.MULTILINE)
-    text = block.sub(lambda m: f'{m[1]}<span class="formula">{mathml(m[2], "block")}</span>\n', docstring)
-    return re.sub(r":math:`([^`]+)`", lambda m: mathml(m[1], "inline"), text)
+    text = _BLOCK.sub(lambda m: f'{m[1]}<span class="formula">{mathml(m[2], "block")}</span>\n', docstring)
+    return re.sub(r":math:`([^`]+)`", lambda m: f"<span>{mathml(m[1], 'inline')}</span>", text)
+
+
+def fenced_as_mathml(markdown: str) -> str:
+    """A page with its ``math`` blocks, which GitHub shows too, set.
+
+    Raises:
+        ValueError: If one has a command that is not known.
+    """
+    return _FENCED.sub(lambda m: f'<span class="formula">{mathml(m[1], "block")}</span>\n', markdown)
 
 
 def mathml(latex: str, display: str) -> str:

@@ -19,7 +19,8 @@ from mkdocs.structure.pages import Page
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
-from notebook_page import notebook_page  # noqa: E402  # beside this file, which MkDocs loads by its path
+from formulas import fenced_as_mathml  # noqa: E402  # beside this file, which MkDocs loads by its path
+from notebook_page import notebook_page  # noqa: E402
 
 FROM_THE_ROOT = {"README.md": "index.md"} | {
     f"{name}.md": f"{name}.md" for name in ("CHANGELOG", "CONTRIBUTING", "SECURITY")
@@ -27,6 +28,10 @@ FROM_THE_ROOT = {"README.md": "index.md"} | {
 """Files at the root, and the pages that they become."""
 LINKED_FOLDERS = ("models", "losses", "train", "eval")
 NOTEBOOKS = ROOT / "examples" / "notebooks"
+INTERNAL = ("commands", "help", "jobs", "cli", "command_line", "console", "run_summary", "states", "eval.judge")
+"""Parts of the package that a user neither imports nor reads about: their pages are there, but not searched."""
+_GUIDES_FIRST, _RECORDS_LAST = 4.0, 0.5
+"""Weights of pages in the search; those of the API have 1."""
 _LINK = re.compile(r"(?<=\]\()([^)#\s:]+)(#[^)\s]*)?(?=\))")
 _FENCED = re.compile(r"(^```.*?^```)", re.MULTILINE | re.DOTALL)
 
@@ -71,13 +76,24 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Turn links to where their pages are."""
+    """Turn links to where their pages are, set formulas, weigh the page for the search."""
+    page.meta["search"] = searched(page.file.src_uri)
+    markdown = fenced_as_mathml(markdown)
     here = home(page.file.src_uri)
     parts = _FENCED.split(markdown)
     parts[::2] = [
         _LINK.sub(lambda m: turned(m[1], page.file.src_uri, here) + (m[2] or ""), text) for text in parts[::2]
     ]
     return "".join(parts)
+
+
+def searched(uri: str) -> dict[str, Any]:
+    """How the search treats a page."""
+    if uri.startswith("api/"):
+        module = uri.removeprefix("api/edgeslam_torch/").removesuffix(".md").removesuffix("/index").replace("/", ".")
+        return {"exclude": any(module == name or module.startswith(f"{name}.") for name in INTERNAL)}
+    records = uri == "CHANGELOG.md" or uri.startswith(("decisions/", "experiments/"))
+    return {"boost": _RECORDS_LAST if records else _GUIDES_FIRST}
 
 
 def unfold(entry: dict[str, Any]) -> None:
