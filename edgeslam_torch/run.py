@@ -387,7 +387,8 @@ class _Run:
 
             extras.append((str(self.atlas.save.resolve()), lambda path: write_atlas(path, saved)))
         missing = self.writer.finish(summary, stamps, poses, support, edge_map, anchors, scale.units, extras)
-        if saved is not None and any(line.startswith(str(self.atlas.save.resolve())) for line in missing):
+        atlas = None if self.atlas.save is None else str(self.atlas.save.resolve())
+        if atlas is not None and any(line.startswith(atlas) for line in missing):
             summary["saved_atlas"] = None  # it was announced before it could be written
             with suppress(OSError):
                 write_text(self.writer.folder / SUMMARY, summary_text(summary))
