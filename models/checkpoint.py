@@ -21,10 +21,9 @@ from edgeslam_torch.models.record import (
     HEADER_KEY,
     Metadata,
     metadata_from_record,
-    upstream_metadata,
 )
 from edgeslam_torch.models.torch_file import is_zip, open_checkpoint
-from edgeslam_torch.models.weights_file import Array, check_weights, read_weights
+from edgeslam_torch.models.weights_file import Array, check_weights, metadata_without_record, read_weights
 
 Network = TypeVar("Network", bound=nn.Module)
 
@@ -118,5 +117,5 @@ def _read_torch(path: Path) -> tuple[dict[str, Array], Metadata]:
         if checkpoint.is_module:
             raise WeightsError("holds a whole pickled network; convert it first: `edgeslam weights convert`")
         record = checkpoint.record
-        metadata = upstream_metadata(checkpoint.state) if record is None else metadata_from_record(record)
+        metadata = metadata_without_record(checkpoint.state, path) if record is None else metadata_from_record(record)
         return check_weights(checkpoint.state, metadata), metadata

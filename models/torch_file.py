@@ -14,7 +14,7 @@ import numpy as np
 
 from edgeslam_torch.errors import WeightsError
 from edgeslam_torch.models.inert_pickle import Call, External, InertPickle, Instance, Name
-from edgeslam_torch.models.weights_file import open_weights
+from edgeslam_torch.models.weights_file import open_weights, plain_name
 
 _LEGACY_MAGIC = 0x1950A86A20F9469CFC6C
 _LEGACY_PROTOCOL = 1001
@@ -85,7 +85,7 @@ class Checkpoint(NamedTuple):
     """Contents of a torch file."""
 
     state: Mapping[str, TorchTensor]
-    """Tensors by name, without DataParallel's prefix ``module.``."""
+    """Tensors by name, by `plain_name`."""
     record: Any
     """Value of ``metadata`` beside them, or None."""
     is_module: bool
@@ -94,7 +94,7 @@ class Checkpoint(NamedTuple):
 
 @contextmanager
 def open_checkpoint(path: Path) -> Iterator[Checkpoint]:
-    """The tensors of ``checkpoint['model']``, ``checkpoint['state_dict']``, a bare module or a bare state dict.
+    """The tensors of ``checkpoint['model']``, ``'state_dict'`` or ``'model_state_dict'``, a bare module or state dict.
 
     Raises:
         WeightsError: If the file is missing or damaged, or refers to anything but tensors and modules; also from inside
@@ -248,7 +248,8 @@ def _checkpoint(reader: _ZipReader | _LegacyReader) -> Checkpoint:
     content, record = reader.content, None
     if isinstance(content, dict):
         record = content.get("metadata")
-        content = content.get("model", content.get("state_dict", content))
+        found = (content[key] for key in ("model", "state_dict", "model_state_dict") if key in content)
+        content = next(found, content)
     tensors: dict[str, TorchTensor] = {}
     if isinstance(content, Instance):
         _collect(content, reader.bytes_of, tensors)
@@ -259,7 +260,7 @@ def _checkpoint(reader: _ZipReader | _LegacyReader) -> Checkpoint:
         tensors = {name: tensor for name, tensor in found.items() if tensor is not None}
     if not tensors:
         raise WeightsError("holds no network")
-    state = {name.removeprefix("module."): tensor for name, tensor in tensors.items()}
+    state = {plain_name(name): tensor for name, tensor in tensors.items()}
     return Checkpoint(state, record, isinstance(content, Instance))
 
 

@@ -4,8 +4,10 @@ Nothing is read before the header is checked against the file's size and the net
 costs at most its own size.
 """
 
+import logging
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, BinaryIO, Protocol
 
@@ -14,8 +16,10 @@ from numpy.typing import NDArray
 
 from edgeslam_torch.errors import WeightsError
 from edgeslam_torch.files.tensor_file import Damaged, Entry, OtherFormat, read_entries
-from edgeslam_torch.models.layout import STEP_COUNTER, Variant, check_shapes
+from edgeslam_torch.models.layout import STEP_COUNTER, HasShape, Variant, check_shapes
 from edgeslam_torch.models.record import HEADER_KEY, OTHER_NETWORK, Metadata, metadata_from_json, upstream_metadata
+
+logger = logging.getLogger(__name__)
 
 Array = NDArray[Any]
 MAX_FILE_BYTES = 1 << 29
@@ -47,10 +51,17 @@ class Stored(Protocol):
         """Its numbers in row-major order, little endian."""
 
 
+def plain_name(name: str) -> str:
+    """A parameter's name without what DataParallel, `torch.compile` and Lightning put before it."""
+    while (rest := name.removeprefix("module.").removeprefix("_orig_mod.").removeprefix("model.")) != name:
+        name = rest
+    return name
+
+
 def read_weights(path: Path) -> tuple[dict[str, Array], Metadata]:
     """Parameters of a safetensors file in float32 and its metadata.
 
-    A file without metadata is assumed to be upstream's.
+    A file without metadata is fed as upstream's, with a warning.
 
     Raises:
         WeightsError: If the file is missing, damaged, of another network, or has implausible values.
@@ -59,12 +70,26 @@ def read_weights(path: Path) -> tuple[dict[str, Array], Metadata]:
         with open_weights(path) as file:
             metadata, entries = _read_header(file)
             if metadata is None:
-                metadata = upstream_metadata(entries)
+                metadata = metadata_without_record(entries, path)
             return check_weights(entries, metadata), metadata
     except OSError as error:
         raise WeightsError(f"{path}: cannot read the weights ({error.strerror or error})") from error
     except WeightsError as error:
         raise WeightsError(f"{path}: {error}") from None
+
+
+def metadata_without_record(state: Mapping[str, HasShape], path: Path) -> Metadata:
+    """How to feed FastDepth weights that say nothing of themselves, as its authors do; their origin is not known.
+
+    Raises:
+        WeightsError: If they are of another network.
+    """
+    metadata = replace(upstream_metadata(state), data=(), licence="", notes="no record; fed as the authors' weights")
+    logger.warning(
+        f"{path}: has no record: taken for FastDepth that gives metres for RGB in [0, 1] at "
+        f"{metadata.input_width}x{metadata.input_height}, f {metadata.focal_px:.0f} px; origin and licence unknown"
+    )
+    return metadata
 
 
 def read_header(path: Path) -> Metadata:
@@ -160,4 +185,5 @@ def _read_header(file: BinaryIO) -> tuple[Metadata | None, dict[str, Entry]]:
     record = remarks.get(HEADER_KEY)
     if not isinstance(record, str | None):
         raise WeightsError("its metadata cannot be used: it is no text")
+    entries = {plain_name(name): entry for name, entry in entries.items()}
     return None if record is None else metadata_from_json(record), entries

@@ -16,7 +16,7 @@ from scipy.ndimage import map_coordinates
 
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.files.plain import subfolder
-from edgeslam_torch.models.checkpoint import restored, save_checkpoint
+from edgeslam_torch.models.checkpoint import load_checkpoint, restored, save_checkpoint
 from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.models.trainable import DepthModule
 from edgeslam_torch.train.calibrate_sigma import calibrate_sigma
@@ -32,6 +32,7 @@ from edgeslam_torch.train.teachers.teach import Taught, teach
 from edgeslam_torch.train.validate import DepthScores, can_be_scored, metres_by, predict_metres, score
 from edgeslam_torch.train.views.augment import View
 from edgeslam_torch.train.views.datasets import DepthFolder
+from edgeslam_torch.train.views.labels import check_labels
 from edgeslam_torch.train.views.posed import PosedSequence, PosedView
 from edgeslam_torch.train.watchers import ProgressBar, curves
 
@@ -129,6 +130,9 @@ def finetune(
     )
     if (done := by_first(lambda: out.finished(given))) is not None:
         return dataclasses.replace(done, nothing_to_do=True)
+    shipped, its_metadata = load_checkpoint()
+    labelled = [*data.labelled, *data.validation]
+    by_first(lambda: check_labels(labelled, lambda view: predict_metres(shipped, its_metadata, view)[0]))
     by_first(lambda: out.begin(given))
     start = copy.deepcopy(network).eval()
     signals, held_out = _prepared(start, metadata, data, from_runs, _kept_in(cache, out))

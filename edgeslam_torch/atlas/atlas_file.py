@@ -25,6 +25,10 @@ MAX_FILE_BYTES = 1 << 30
 """Maximum file size: 200 keyframes with 400 000 edge points have 25 MB."""
 MAX_NUMBER = 1e6
 """Maximum absolute value of a length: kilometres in any unit of ours."""
+LEAST_SIGMA = 1e-4
+"""Relative standard deviation of metres below which they are no measurement: telemetry and depth reach 1 %."""
+PLAUSIBLE_M = (0.02, 500.0)
+"""Median distance of a map's points from its keyframes [m]."""
 MAX_PIECES, MAX_FLIGHTS, MAX_LEVELS = 1000, 1000, 20
 
 COLUMNS: dict[str, tuple[str, tuple[int, ...]]] = {
@@ -114,7 +118,7 @@ def is_atlas(path: Path) -> bool:
     return HEADER_KEY in remarks
 
 
-def check_fits(atlas: SavedAtlas, camera: Camera, scale_factor: float, path: Path) -> None:
+def check_fits(atlas: SavedAtlas, camera: Camera, scale_factor: float, path: Path, levels: int = MAX_LEVELS) -> None:
     """Refuse an atlas that was made through another lens, or with another image pyramid.
 
     Raises:
@@ -125,6 +129,9 @@ def check_fits(atlas: SavedAtlas, camera: Camera, scale_factor: float, path: Pat
         raise AtlasError(f"{path}: made with another camera ({made}; this one: {now})")
     if atlas.scale_factor != scale_factor:
         raise AtlasError(f"{path}: made with orb.scale_factor {atlas.scale_factor:g}, this run has {scale_factor:g}")
+    used = int(atlas.arrays["keypoint.octave"].max(initial=0)) + 1
+    if used > levels:
+        raise AtlasError(f"{path}: made with orb.levels {used}, this run has {levels}; give --set orb.levels={used}")
 
 
 def _piece(scale: ScaleEstimate) -> dict[str, Any]:
@@ -235,9 +242,30 @@ def _check(atlas: SavedAtlas) -> None:
     _require(_within(a["host.keyframe"], 0, len(ids)), "edges belong to no keyframe")
     _require(_within(a["keypoint.octave"], 0, MAX_LEVELS), "a keypoint is on no pyramid level")
     _check_anchors(a, len(ids))
+    _check_metres(atlas)
     size = np.array([atlas.camera.width, atlas.camera.height])
     for name in ("keypoint.uv", "edge.uv"):
         _require(((a[name] >= -size) & (a[name] <= 2 * size)).all(), f"{name} lies far outside the image")
+
+
+def _check_metres(atlas: SavedAtlas) -> None:
+    """Refuse metres that no measurement of ours can know so well, or by which the map is no place for a camera."""
+    a = atlas.arrays
+    for piece, scale in enumerate(atlas.scale):
+        if not math.isfinite(scale.sigma):
+            continue
+        if scale.sigma < LEAST_SIGMA * scale.value:
+            raise Damaged(f"it claims {scale.value:g} metres a unit to {scale.sigma:g}; nothing measures so well")
+        rows = np.flatnonzero(a["keyframe.piece"] == piece)
+        T = a["keyframe.T_c_w"][rows]
+        held = np.split(a["keypoint.anchor"], np.cumsum(a["keyframe.keypoints"])[:-1])
+        distance = [
+            np.linalg.norm(a["anchor.p_w"][held[k][held[k] >= 0]] @ t[:3, :3].T + t[:3, 3], axis=1)
+            for k, t in zip(rows, T, strict=True)
+        ]
+        median_m = scale.value * float(np.median(np.concatenate(distance)))
+        if not PLAUSIBLE_M[0] <= median_m <= PLAUSIBLE_M[1]:
+            raise Damaged(f"by its {scale.value:g} metres a unit its points are {median_m:g} m away")
 
 
 def _check_anchors(a: dict[str, Array], keyframes: int) -> None:

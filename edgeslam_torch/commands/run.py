@@ -215,7 +215,7 @@ def _take_its_camera(source: "Source", atlas: "SavedAtlas") -> bool:
 def _check_fits(atlas: "SavedAtlas", source: "Source", config: "SlamConfig", path: Path) -> None:
     from edgeslam_torch.atlas.atlas_file import check_fits
 
-    check_fits(atlas, source.camera, config.orb.scale_factor, path)
+    check_fits(atlas, source.camera, config.orb.scale_factor, path, config.orb.levels)
 
 
 def _check_atlas_can_be_saved(path: Path | None) -> None:

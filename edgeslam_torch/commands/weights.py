@@ -103,7 +103,7 @@ def _fetch(remote: "Remote", target: Path, sha256: str | None) -> "Fetched":
 def _converted(_: str, raw: Path, target: Path) -> None:
     from edgeslam_torch.models.convert import convert_upstream
 
-    convert_upstream(raw, target)
+    convert_upstream(raw, target, official=True)
 
 
 def _describe(name: str, raw: Path, target: Path) -> None:

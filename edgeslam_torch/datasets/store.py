@@ -6,7 +6,8 @@ import json
 import logging
 import shutil
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -114,9 +115,10 @@ def get(
             own = [recording for recording in recordings if recording.archive == archive]
             origin = _fetched(archive, downloads, progress, given)
             say(f"{archive.file}: sha256 {origin.sha256}, {origin.verified}")
-            for recording in own:
-                _place(recording, given or downloads / archive.file, origin, root, progress)
-                say(str(root / recording.name))
+            with _remembered_if_good(archive, downloads, origin, given):
+                for recording in own:
+                    _place(recording, given or downloads / archive.file, origin, root, progress)
+                    say(str(root / recording.name))
             if not keep and given is None:
                 (downloads / archive.file).unlink()
     except OSError as error:
@@ -134,7 +136,6 @@ def _fetched(archive: Archive, downloads: Path, progress: Callable[[str], Progre
     else:
         url = _download(archive, target, expected, progress(archive.file))
         found = _digest(target, "sha256")
-    remember(target, found)
     if archive.checksum:
         who = "its publisher states" if archive.checksum_by == "publisher" else "independent projects recorded"
         return Origin(url, found, f"the checksum that {who}")
@@ -142,6 +143,23 @@ def _fetched(archive: Archive, downloads: Path, progress: Callable[[str], Progre
         return Origin(url, found, "the same as at the first download")
     how = "" if url.startswith("https:") or given is not None else ", and it came unencrypted"
     return Origin(url, found, f"trusted on first use: no checksum is known{how}; the next download must match")
+
+
+@contextmanager
+def _remembered_if_good(archive: Archive, downloads: Path, origin: Origin, given: Path | None) -> Iterator[None]:
+    """Remember an archive's checksum once its content proves to be what it should; else forget what came.
+
+    An error page, or half a file, must not be what the next download has to match.
+    """
+    target = downloads / archive.file
+    known = archive.checksum is not None or remembered(target) is not None
+    try:
+        yield
+    except SourceError:
+        if given is None and not known:
+            target.unlink(missing_ok=True)
+        raise
+    remember(target, origin.sha256)
 
 
 def _download(archive: Archive, target: Path, expected: str | None, progress: Progress) -> str:
@@ -237,8 +255,9 @@ def _truth(recording: Recording, downloads: Path, progress: Callable[[str], Prog
     """Content of the true poses' file from an archive of its own, if the recording has one."""
     if recording.truth is None:
         return None
-    _fetched(recording.truth, downloads, progress, None)
-    return member_ending(downloads / recording.truth.file, f"mono_gt/{Path(recording.inside).name}.txt")
+    origin = _fetched(recording.truth, downloads, progress, None)
+    with _remembered_if_good(recording.truth, downloads, origin, None):
+        return member_ending(downloads / recording.truth.file, f"mono_gt/{Path(recording.inside).name}.txt")
 
 
 def _origin_record(recording: Recording, origin: Origin) -> dict[str, Any]:

@@ -1,6 +1,8 @@
 """Archives unpacked as if their authors were hostile: nothing leaves the folder, no links, a bounded size."""
 
+import lzma
 import shutil
+import struct
 import tarfile
 import zipfile
 import zlib
@@ -19,6 +21,13 @@ MAX_GROWTH = 20
 _JUNK = ("__MACOSX", ".DS_Store", "Thumbs.db")
 _NOT_IN_NAMES = frozenset("\\:\0")
 """Separators and drives of other systems."""
+_DAMAGED = (
+    *(zipfile.BadZipFile, tarfile.TarError, zlib.error, lzma.LZMAError, struct.error, EOFError),
+    *(RuntimeError, NotImplementedError, ValueError, LookupError, OverflowError),
+)
+"""What Python's archives raise for bytes that are none; names that are no text are a `ValueError`."""
+MAX_TAR_HEADER_BYTES = 1 << 20
+"""Of one extended header, which `tarfile` reads whole."""
 _ARCHIVES = (".zip", ".tgz", ".tar.gz", ".tar")
 
 
@@ -112,6 +121,18 @@ def _copy(source: IO[bytes], target: Path, size: int, archive: Path) -> None:
             raise SourceError(f"{archive}: damaged: {target.name} is not as long as it says")
 
 
+class _TarInfo(tarfile.TarInfo):
+    """Refuses extended headers of any length."""
+
+    def _proc_member(self, archive: tarfile.TarFile) -> tarfile.TarInfo:
+        kinds = (tarfile.XHDTYPE, tarfile.XGLTYPE, tarfile.SOLARIS_XHDTYPE)
+        if self.type in (*kinds, tarfile.GNUTYPE_LONGNAME, tarfile.GNUTYPE_LONGLINK) and (
+            self.size > MAX_TAR_HEADER_BYTES
+        ):
+            raise tarfile.ReadError(f"a header of {self.size} bytes")
+        return super()._proc_member(archive)  # type: ignore[misc, no-any-return]
+
+
 class _Reader:
     """Reads members of an open archive."""
 
@@ -136,9 +157,9 @@ def _opened(archive: Path) -> Iterator[tuple[list[_Member], _Reader]]:
             with zipfile.ZipFile(archive) as opened:
                 yield _checked(archive, [_of_zip(archive, info) for info in opened.infolist()]), _Reader(opened)
         else:
-            with tarfile.open(archive) as opened:
+            with tarfile.open(archive, tarinfo=_TarInfo) as opened:
                 yield _checked(archive, [_of_tar(archive, info) for info in opened]), _Reader(opened)
-    except (zipfile.BadZipFile, tarfile.TarError, zlib.error, EOFError, RuntimeError, NotImplementedError) as error:
+    except _DAMAGED as error:
         raise SourceError(f"{archive}: damaged, or no archive ({' '.join(str(error).split())[:120]})") from error
 
 

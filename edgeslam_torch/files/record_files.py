@@ -71,6 +71,8 @@ def read_mapping(path: Path, kind: str, error: type[EdgeSlamError]) -> dict[str,
         EdgeSlamError: ``error``, with the file's name, if it cannot be read, is malformed, or holds no record.
     """
     try:
+        if path.exists() and not path.is_file():
+            raise error(f"{path}: not a file")
         size = path.stat().st_size
         if size > MAX_BYTES[kind]:
             raise error(f"{path}: not {kind} of ours ({size / 1e6:.1f} MB)")

@@ -5,6 +5,9 @@ from torch import Tensor
 
 from edgeslam_torch.frontend.canny import canny_batch
 
+RANGE_MARGIN = 0.5
+"""How far interpolation and noise may carry images out of [0, 1]."""
+
 
 def edge_pixels(
     images: Tensor, count: int, low: float = 50.0, high: float = 120.0, generator: torch.Generator | None = None
@@ -22,10 +25,16 @@ def edge_pixels(
         ``(B, count, 2)`` [px], x first; NaN, which the losses leave out, where an image has fewer edges. No gradient.
 
     Raises:
-        ValueError: If the images have another shape.
+        ValueError: If the images have another shape or range.
     """
     if images.ndim != 4 or images.shape[1] not in (1, 3):
         raise ValueError(f"images must be (B, 1 or 3, H, W), got {tuple(images.shape)}")
+    darkest, brightest = images.detach().aminmax() if images.numel() else (0.0, 0.0)
+    if not (images.is_floating_point() and darkest >= -RANGE_MARGIN and brightest <= 1.0 + RANGE_MARGIN):
+        raise ValueError(
+            f"images must be floats in [0, 1], got {images.dtype} from {float(darkest):g} to {float(brightest):g}; "
+            f"divide grey levels by 255"
+        )
     mask = canny_batch(images.detach().float(), low, high).flatten(1)
     # The largest of random keys, edges first, are a draw without replacement.
     key = torch.rand(mask.shape, generator=generator, device=images.device) + mask

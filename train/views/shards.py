@@ -24,6 +24,9 @@ from numpy.typing import NDArray
 
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.files.atomic import write_atomically
+from edgeslam_torch.models.record import FOCAL_RANGE
+from edgeslam_torch.readers.image_size import image_size
+from edgeslam_torch.readers.images import MAX_PIXELS
 from edgeslam_torch.train.views.augment import View
 from edgeslam_torch.train.views.datasets import MAX_SHOWN, DepthFolder, load_depth_folder, reduced
 from edgeslam_torch.types import FloatArray
@@ -36,6 +39,7 @@ DEPTH_PER_M = 1000.0
 """Of a depth.png whose json says nothing else."""
 TAIL = 64
 """Bytes at the end of each file that tell changed content [bytes]."""
+_UNREADABLE = (OSError, ValueError, IndexError, OverflowError, MemoryError, RecursionError, cv2.error)
 PER_SHARD = 1000
 """Samples in a file that `write_shards` writes; about 200 MB."""
 
@@ -87,7 +91,7 @@ class ShardedViews(Sequence[View]):
         sample = self._samples[index]
         try:
             return reduced(_decoded(sample), self._width)
-        except (OSError, ValueError, KeyError, TypeError, AttributeError, cv2.error) as error:
+        except (*_UNREADABLE, KeyError, TypeError, AttributeError) as error:
             why = " ".join(str(error).split())[:120]
             raise SourceError(f"{sample.shard}: {sample.name} cannot be read ({why})") from error
 
@@ -203,6 +207,9 @@ def _decoded(sample: _Sample) -> View:
     with sample.shard.open("rb") as file:
         content = {kind: _read(file, sample.files[kind]) for kind in (image_kind, depth_kind, "json")}
     record = json.loads(content["json"])
+    if not isinstance(record, dict):
+        raise ValueError("json: no table")
+    _check_size(content[image_kind], image_kind)
     image = cv2.imdecode(np.frombuffer(content[image_kind], np.uint8), cv2.IMREAD_COLOR)
     if image is None:
         raise ValueError(f"{image_kind}: no image")
@@ -210,7 +217,9 @@ def _decoded(sample: _Sample) -> View:
     if depth_m.shape != image.shape[:2]:
         raise ValueError(f"depth {depth_m.shape[::-1]} of an image {image.shape[1::-1]}")
     fx, fy, cx, cy = (float(record[name]) for name in ("fx", "fy", "cx", "cy"))
-    if not (np.isfinite([fx, fy, cx, cy]).all() and fx > 0 and fy > 0):
+    height, width = image.shape[:2]
+    allowed = FOCAL_RANGE[0] * width <= min(fx, fy) and max(fx, fy) <= FOCAL_RANGE[1] * width
+    if not (allowed and -width <= cx <= 2 * width and -height <= cy <= 2 * height):
         raise ValueError("fx, fy, cx, cy are no calibration")
     return View(np.asarray(image, np.uint8), depth_m, np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]))
 
@@ -219,12 +228,24 @@ def _depth(content: bytes, kind: str, per_m: float) -> FloatArray:
     """Metres ``(H, W)`` float32, 0 where unknown."""
     if kind == "depth.npy":
         depth = np.load(io.BytesIO(content), allow_pickle=False).astype(np.float32)
+        if depth.ndim != 2:
+            raise ValueError(f"depth.npy: {depth.ndim} dimensions")
     else:
+        _check_size(content, kind)
         stored = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
         if stored is None or stored.dtype != np.uint16 or per_m <= 0:
             raise ValueError("depth.png: no 16-bit image")
         depth = stored.astype(np.float32) / np.float32(per_m)
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0.0))
+
+
+def _check_size(content: bytes, kind: str) -> None:
+    """Refuse a picture whose pixels would fill the memory, before they are decoded."""
+    size = image_size(content)
+    if size is None:
+        raise ValueError(f"{kind}: no image")
+    if size[0] * size[1] > MAX_PIXELS:
+        raise ValueError(f"{kind}: {size[0]}x{size[1]} px")
 
 
 def _read(file: io.BufferedReader, place: _Place) -> bytes:
