@@ -56,6 +56,8 @@ MAX_PARTS = 5000
 """Maximum modules and tensors of a network; FastDepth has 130 and 300, and a module may occur under several names."""
 MAX_DIRECTORY_BYTES = 1 << 20
 """Maximum size of a zip's directory; FastDepth's has 20 kB."""
+STATES = ("model", "state_dict", "model_state_dict")
+"""Where training scripts keep the network in a checkpoint."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -248,8 +250,7 @@ def _checkpoint(reader: _ZipReader | _LegacyReader) -> Checkpoint:
     content, record = reader.content, None
     if isinstance(content, dict):
         record = content.get("metadata")
-        found = (content[key] for key in ("model", "state_dict", "model_state_dict") if key in content)
-        content = next(found, content)
+        content = next((content[key] for key in STATES if key in content), content)
     tensors: dict[str, TorchTensor] = {}
     if isinstance(content, Instance):
         _collect(content, reader.bytes_of, tensors)

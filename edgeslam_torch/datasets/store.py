@@ -152,7 +152,7 @@ def _remembered_if_good(archive: Archive, downloads: Path, origin: Origin, given
     An error page, or half a file, must not be what the next download has to match.
     """
     target = downloads / archive.file
-    known = archive.checksum is not None or remembered(target) is not None
+    known = bool(archive.checksum or remembered(target))
     try:
         yield
     except SourceError:

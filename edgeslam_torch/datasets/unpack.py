@@ -130,7 +130,7 @@ class _TarInfo(tarfile.TarInfo):
             self.size > MAX_TAR_HEADER_BYTES
         ):
             raise tarfile.ReadError(f"a header of {self.size} bytes")
-        return super()._proc_member(archive)  # type: ignore[misc, no-any-return]
+        return super()._proc_member(archive)  # type: ignore[misc]
 
 
 class _Reader:

@@ -176,6 +176,23 @@ def test_an_atlas_of_another_lens_is_refused(rng, tmp_path, change, match):
         check_fits(saved, CAMERA, 1.5, tmp_path)
 
 
+def test_an_atlas_of_more_levels_is_refused_with_the_remedy(rng, tmp_path):
+    saved = Flown(rng).saved()
+    used = int(saved.arrays["keypoint.octave"].max()) + 1
+    check_fits(saved, CAMERA, SCALE_FACTOR, tmp_path, used)
+    with pytest.raises(AtlasError, match=f"--set orb.levels={used}"):
+        check_fits(saved, CAMERA, SCALE_FACTOR, tmp_path, used - 1)
+
+
+@pytest.mark.parametrize(("metres", "sigma"), [(1.0, 1e-9), (1000.0, 1e-9), (1000.0, 20.0), (1e-4, 1e-5)])
+def test_metres_that_nobody_could_have_measured_are_refused(rng, tmp_path, metres, sigma):
+    saved = Flown(rng).saved()
+    scale = tuple(ScaleEstimate(metres, sigma, "depth") for _ in saved.scale)
+    write_atlas(tmp_path / "a.safetensors", replace(saved, scale=scale))
+    with pytest.raises(AtlasError, match="metres a unit"):
+        read_atlas(tmp_path / "a.safetensors")
+
+
 # -- files that are refused --------------------------------------------------------------------------------------
 
 

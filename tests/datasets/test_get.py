@@ -201,6 +201,14 @@ def test_first_download_is_trusted_and_a_changed_second_one_is_not(one, publishe
     assert not target.exists()
 
 
+@pytest.mark.parametrize("bad", [b"<html>gone</html>", b"", tgz({"rgbd_dataset_freiburg1_xyz/readme": b"moved"})])
+def test_a_bad_first_answer_is_not_what_the_next_must_match(one, publisher, tmp_path, bad):
+    one(bad)
+    assert get(tmp_path, "tum_fr1_a") == 1
+    publisher.files["/a.tgz"] = tum()
+    assert get(tmp_path, "tum_fr1_a") == 0
+
+
 def test_archive_by_hand_is_checked_and_kept(one, tmp_path, capsys):
     content = tum()
     one(b"", checksum=f"sha256:{sha256(content)}", checksum_by="agreed")

@@ -1,6 +1,9 @@
 """Archives, kind and hostile."""
 
+import bz2
+import gzip
 import io
+import lzma
 import stat
 import tarfile
 import zipfile
@@ -120,3 +123,26 @@ def test_one_file_by_the_end_of_its_path(tmp_path):
     assert member_ending(archive, "mono_gt/ME000.txt") == b"1 2"
     with pytest.raises(SourceError, match="has 2 files ME000.txt, not one"):
         member_ending(archive, "ME000.txt")
+
+
+def pax_of(size):
+    """A tar whose extended header has so many bytes."""
+    entry = tarfile.TarInfo("header")
+    entry.type, entry.size = tarfile.XHDTYPE, size
+    return entry.tobuf() + bytes(-(-size // 512) * 512) + tarfile.TarInfo("a").tobuf() + bytes(1024)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"\xfd7zXZ\x00\x00\x04" + bytes(200),
+        lzma.compress(bytes(5000))[:-30],
+        bz2.compress(bytes(5000))[:-9],
+        gzip.compress(pax_of(64 << 20)),
+        pax_of(600).replace(bytes(600), b"999999999999 path=" + bytes(582), 1),
+    ],
+    ids=["xz", "cut xz", "cut bz2", "long header", "odd header"],
+)
+def test_odd_archives_are_one_line(put, content):
+    with pytest.raises(SourceError, match="a.tgz"):
+        put(content)

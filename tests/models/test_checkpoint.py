@@ -59,6 +59,18 @@ def test_plain_torch_state_dict_is_read_as_upstreams(tmp_path: Path) -> None:
     assert torch.equal(loaded.state_dict()["conv3.3.weight"], network.state_dict()["conv3.3.weight"])
 
 
+@pytest.mark.parametrize("prefix", ["", "module.", "_orig_mod.", "model.", "model._orig_mod.module."])
+@pytest.mark.parametrize("key", [None, "model", "state_dict", "model_state_dict"])
+def test_wrappers_around_a_network_are_taken_off_and_no_origin_is_made_up(tmp_path, prefix, key, caplog) -> None:
+    network = FastDepth(Variant.PRUNED)
+    state = {prefix + name: value for name, value in network.state_dict().items()}
+    torch.save(state if key is None else {key: state, "epoch": 3}, tmp_path / "w.pt")
+    loaded, metadata = load_checkpoint(tmp_path / "w.pt")
+    assert torch.equal(loaded.state_dict()["conv3.3.weight"], network.state_dict()["conv3.3.weight"])
+    assert (metadata.licence, metadata.data) == ("", ())
+    assert "no record" in caplog.text
+
+
 def test_missing_truncated_and_foreign_files_are_named(tmp_path: Path) -> None:
     with pytest.raises(WeightsError, match="no such weights"):
         load_checkpoint(tmp_path / "none.safetensors")
