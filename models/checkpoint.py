@@ -23,7 +23,7 @@ from edgeslam_torch.models.record import (
     metadata_from_record,
 )
 from edgeslam_torch.models.torch_file import is_zip, open_checkpoint
-from edgeslam_torch.models.weights_file import Array, check_weights, metadata_without_record, read_weights
+from edgeslam_torch.models.weights_file import Array, check_weights, metadata_without_record, open_weights, read_weights
 
 Network = TypeVar("Network", bound=nn.Module)
 
@@ -106,9 +106,9 @@ def _stored(tensor: Tensor, half: bool) -> Tensor:
 
 def _is_torch_zip(path: Path) -> bool:
     try:
-        with path.open("rb") as file:
+        with open_weights(path) as file:  # regular files only: a pipe never ends
             return is_zip(file)
-    except OSError:
+    except (OSError, WeightsError):
         return False  # `read_weights` says why
 
 

@@ -71,6 +71,13 @@ def test_wrappers_around_a_network_are_taken_off_and_no_origin_is_made_up(tmp_pa
     assert "no record" in caplog.text
 
 
+@pytest.mark.parametrize("name", ["w.safetensors", "w.pt"])
+def test_a_pipe_is_no_weights_file(tmp_path, name) -> None:
+    os.mkfifo(tmp_path / name)
+    with pytest.raises(WeightsError, match="not a file"):
+        load_checkpoint(tmp_path / name)
+
+
 def test_missing_truncated_and_foreign_files_are_named(tmp_path: Path) -> None:
     with pytest.raises(WeightsError, match="no such weights"):
         load_checkpoint(tmp_path / "none.safetensors")
