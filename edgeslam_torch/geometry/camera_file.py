@@ -1,7 +1,10 @@
 """Calibration files: writing ours, reading those of many programs."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import yaml
 
@@ -54,12 +57,35 @@ def read_camera(name: str | Path, size: tuple[int, int] | None = None) -> tuple[
     path = Path(name)
     if not path.is_file():
         raise CalibrationError(f"no camera file or preset {str(name)!r}; presets: {', '.join(PRESETS)}")
-    try:
-        if path.stat().st_size > MAX_JSON_BYTES:
-            raise ValueError(f"{path.stat().st_size / 1e6:.0f} MB is too large")
-        record, remarks = record_of(path.read_bytes())
+    with _named(path):
+        record, remarks = _record(path)
         camera, more = camera_of(record, str(Path(*path.parts[-2:])), size)
         check_camera(camera)
+    return camera, [f"{path}: {remark}" for remark in [*remarks, *more]]
+
+
+def camera_keys(path: Path) -> dict[str, Any]:
+    """Keys and values of a calibration file of any of the formats, as they stand there.
+
+    Raises:
+        CalibrationError: If it is malformed.
+    """
+    with _named(path):
+        return _record(path)[0]
+
+
+def _record(path: Path) -> tuple[dict[str, Any], list[str]]:
+    size = path.stat().st_size
+    if size > MAX_JSON_BYTES:
+        raise ValueError(f"{size / 1e6:.0f} MB is too large")
+    return record_of(path.read_bytes())
+
+
+@contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """Every error of a file's content as one line with its name."""
+    try:
+        yield
     except OSError as error:
         raise CalibrationError(f"{path}: {error.strerror or error}") from error
     except CalibrationError as error:
@@ -71,4 +97,3 @@ def read_camera(name: str | Path, size: tuple[int, int] | None = None) -> tuple[
         raise CalibrationError(
             f"{path}: not a camera calibration ({reason}); it needs width, height, fx, fy, cx, cy"
         ) from error
-    return camera, [f"{path}: {remark}" for remark in [*remarks, *more]]

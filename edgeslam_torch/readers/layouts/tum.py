@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from edgeslam_torch.errors import CalibrationError, SourceError
-from edgeslam_torch.files.record_files import read_mapping
 from edgeslam_torch.files.tables import read_table
 from edgeslam_torch.geometry.camera import PRESETS, Camera
+from edgeslam_torch.geometry.camera_file import camera_keys
 from edgeslam_torch.readers.images import image_files, list_image_folder
 from edgeslam_torch.readers.layouts import seven_scenes
 from edgeslam_torch.readers.listing import ImageEntry, Problem, entries_in_time, nothing_listed, read_list
@@ -19,6 +19,7 @@ from edgeslam_torch.readers.sequence import DepthMaps, Sequence
 KIND = "tum"
 LISTS = ("rgb.txt", "images.txt")
 DEPTH_LIST = "depth.txt"
+_DEPTH_SCALE_KEYS = ("depth_scale", "DepthMapFactor", "RGBD.DepthMapFactor")
 _TUM_UNITS_PER_METRE = 5000.0
 """https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats"""
 
@@ -98,13 +99,14 @@ def _depth(folder: Path) -> DepthMaps:
 
 
 def _units_per_metre(folder: Path) -> tuple[float, list[Problem]]:
-    """``depth_scale`` of the folder's camera.yaml, else the 5000 of TUM's file format page and a remark."""
+    """``depth_scale`` (ORB-SLAM: ``DepthMapFactor``) of the folder's camera.yaml, else the 5000 of TUM's file format
+    page and a remark."""
     file = folder / "camera.yaml"
-    record = read_mapping(file, "YAML", CalibrationError) if file.is_file() else {}
-    if "depth_scale" not in record:
+    record = camera_keys(file) if file.is_file() else {}
+    stated = next((record[key] for key in _DEPTH_SCALE_KEYS if key in record), None)
+    if stated is None:
         reason = f"does not say the unit of its depth maps; taken as TUM's, {_TUM_UNITS_PER_METRE:.0f} to a metre"
         return _TUM_UNITS_PER_METRE, [Problem(str(folder / DEPTH_LIST), reason, frames=0)]
-    stated = record["depth_scale"]
     if isinstance(stated, bool) or not isinstance(stated, int | float) or not 0 < stated < math.inf:
         raise CalibrationError(f"{file}: depth_scale must be a positive number, got {stated!r}")
     return float(stated), []
