@@ -120,7 +120,7 @@ class MotionFusion:
             return
         visual = VisualPose(stamp_s, np.array(T_w_c, dtype=np.float64), sigma_t, sigma_r_rad)
         self._memory.add(visual)
-        if self._is_due(stamp_s):
+        if self._is_due(stamp_s) or (stamp_s - self._fitted_s >= _FIRST_FIT_S and self.orientation.has_parted()):
             self._remember_refined(stamp_s, self.config.window_s)
             self._refit()
         elif self.metres.told is not None and stamp_s - max(self._fitted_s, self._followed_s) >= _REFIT_S:

@@ -7,7 +7,8 @@ import numpy as np
 from edgeslam_torch.fusion.displacement import DELAY_S, is_steady
 from edgeslam_torch.fusion.remembered import Remembered
 from edgeslam_torch.fusion.scale.camera_mount import Turned, mount_by_turns
-from edgeslam_torch.fusion.telemetry.alignment import attitudes, map_to_world
+from edgeslam_torch.fusion.telemetry.alignment import LATELY, attitudes, map_to_world
+from edgeslam_torch.fusion.telemetry.comparison import MOST_APART_RAD
 from edgeslam_torch.fusion.telemetry.visual_memory import Sightings
 from edgeslam_torch.geometry.rotations import mean_rotation, rotation_vector, turn_left
 from edgeslam_torch.types import FloatArray
@@ -73,6 +74,17 @@ class Orientation:
         if flight.trust.turns:
             return mount_by_turns(told.R_m_c, told.R_w_b, told.stamp_s, R_b_c, sigma_rad)
         return Turned(R_b_c, told.map_to_world(R_b_c), np.full(3, sigma_rad))
+
+    def has_parted(self) -> bool:
+        """Whether attitude that had proven to be of this flight has just turned otherwise than the images."""
+        flight, found = self._flight, self.found
+        if found is None or not (flight.trust.turns and math.isfinite(flight.delay_sigma_s)):
+            return False
+        told = attitudes(flight.memory.newest(LATELY), flight.track, flight.delay_s)
+        if told is None:
+            return False
+        apart = rotation_vector(told.map_to_world(found.R_b_c) @ found.R_w_m.T)
+        return float(np.linalg.norm(apart)) > MOST_APART_RAD
 
     def vertical(self, stamp_s: float) -> tuple[FloatArray, float] | None:
         """The map's z axis ``(3,)`` in a frame's camera by the drone's attitude, and how far [rad] that leaned within

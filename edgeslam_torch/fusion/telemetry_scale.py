@@ -281,13 +281,15 @@ class TelemetryScale:
         together = solved([g.evidence for g in given], tilt) if given else None
         if together is None:
             return None
-        gap = 0.0
+        gap = parted_log = 0.0
         if len(given) == 2:
             one, other = (g.opinion for g in given)
             gap = abs(one.log_scale - other.log_scale) / math.hypot(one.sigma, other.sigma)
+            if contradict(one, other):  # one of them is wrong, and nothing tells which
+                parted_log = max(abs(g.log_scale - math.log(together[0])) for g in (one, other))
         sources = {g.name: SourceScale(g.scale, g.scale * g.sigma) for g in given}
         # Birge ratio: sources that disagree beyond their sigmas widen the result.
-        sigma = max(1.0, gap) * math.hypot(together[1], _shared_drift(given))
+        sigma = max(parted_log, max(1.0, gap) * math.hypot(together[1], _shared_drift(given)))
         log_odds = (0.0 if moved is None else moved.log_likelihood) - 0.5 * min(gap, _MOST_GAP) ** 2
         moved = moved if "telemetry" in sources else None
         shortfall_m_s = 0.5 * self._config.velocity_step_m_s if rounding is Rounding.TRUNCATE else 0.0

@@ -204,7 +204,70 @@ def test_attitude_of_another_flight_is_named_and_takes_the_heights_with_it(rng, 
 
     _, fusion, _ = told_of(rng, replay, swinging(18.0), spoil)
     assert "height" not in fusion.scale().source
-    assert any("roll, pitch and yaw explain" in w for w in fusion.warnings())
+    assert any("attitude" in w for w in fusion.warnings())
+
+
+def column(field, axis, change):
+    """Right telemetry but for one column."""
+
+    def spoil(rng, samples, motion):
+        values = np.array([getattr(s, field) for s in samples])
+        values[:, axis] = change(values[:, axis])
+        return [replace(s, **{field: v}) for s, v in zip(samples, values, strict=True)]
+
+    return spoil
+
+
+def half_way(change):
+    return lambda x: np.concatenate([x[: len(x) // 2], change(x[len(x) // 2 :])])
+
+
+@pytest.mark.parametrize(
+    ("axis", "change"),
+    [
+        (2, np.zeros_like),
+        (2, np.negative),
+        (2, half_way(lambda x: x + math.pi / 2)),
+        (2, half_way(lambda x: 0.0 * x + x[0])),
+        (1, np.negative),
+    ],
+    ids=["yaw stuck", "yaw mirrored", "yaw jumping", "yaw stuck in flight", "pitch mirrored"],
+)
+def test_attitude_with_one_wrong_column_is_named_and_nothing_rests_on_it(rng, swinging, replay, axis, change):
+    without, fusion, _ = told_of(rng, replay, swinging(18.0), column("rpy_rad", axis, change))
+    assert fusion.scale() == without
+    assert fusion.orientation.upright() is None
+    assert any(("roll", "pitch", "yaw")[axis] in w for w in fusion.warnings())
+
+
+def test_telemetry_without_attitude_is_as_good_as_none(rng, swinging, replay):
+    without, fusion, _ = told_of(rng, replay, swinging(18.0), column("rpy_rad", 2, lambda x: math.nan * x))
+    assert fusion.scale() == without
+    assert fusion.orientation.upright() is None
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize(
+    "change",
+    [np.zeros_like, np.negative, half_way(lambda x: x + 1.0)],
+    ids=["stuck", "mirrored", "jumping"],
+)
+def test_velocities_with_one_wrong_column_tell_no_scale(rng, swinging, replay, axis, change):
+    def spoil(rng, samples, motion):
+        return column("velocity_m_s", axis, change)(rng, no_heights(samples), motion)
+
+    _, fusion, _ = told_of(rng, replay, swinging(18.0), spoil)
+    assert "telemetry" not in fusion.scale().source
+    assert any("velocities are not used" in w for w in fusion.warnings())
+
+
+def test_velocities_and_heights_that_contradict_each_other_are_not_surer_than_they_are_apart(rng, swinging, replay):
+    def halved(rng, samples, motion):
+        return [replace(s, velocity_m_s=0.5 * s.velocity_m_s) for s in samples]
+
+    _, fusion, gauge = told_of(rng, replay, swinging(18.0, size_m=0.5), halved)
+    scale = fusion.scale()
+    assert abs(math.log(scale.value / gauge.scale)) < 2.0 * scale.sigma / scale.value
 
 
 @pytest.mark.parametrize("late_s", [1.2, -2.0])

@@ -3,11 +3,16 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from edgeslam_torch.fusion.scale.camera_mount import mount_by_turns
 from edgeslam_torch.fusion.telemetry.track import TelemetryTrack
 from edgeslam_torch.fusion.telemetry.visual_memory import Displacements, Sightings
 from edgeslam_torch.geometry.rotations import mean_rotation
 from edgeslam_torch.types import FloatArray
+
+LATELY = 5
+"""Pictures that a fault is noticed in at once: half a second."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +39,40 @@ class Turns:
     """``(N, 3, 3)`` by the images."""
     told: FloatArray
     """``(N, 3, 3)`` by telemetry."""
+
+
+@dataclass(frozen=True, slots=True)
+class Apart:
+    """How far attitude and images are apart, beside how the images say that the body turned; about body axes [rad]."""
+
+    apart: FloatArray
+    """``(3,)`` root mean square of the rotation between both."""
+    lately: FloatArray
+    """``(3,)`` the same over the newest `LATELY` pictures: a fault that has just begun."""
+    seen: FloatArray
+    """``(3,)`` standard deviation of roll, pitch and yaw by the images."""
+    rate: FloatArray
+    """``(3,)`` root mean square of their rates [rad/s]."""
+
+
+def apart(told: Attitudes, R_b_c: FloatArray, sigma_rad: float) -> Apart:
+    """Attitude against the images over the whole flight, the mount and the turn of the map being those that fit best.
+
+    Unlike increments, sums of them show a jump, a reading that froze and a wrong sign alike: the rotation from the map
+    to the power-on world is one and the same in all pictures, or the attitude is not that of this camera.
+
+    Args:
+        told: Both.
+        R_b_c: Camera in the body as it was given ``(3, 3)``.
+        sigma_rad: How far off that may be.
+    """
+    turned = mount_by_turns(told.R_m_c, told.R_w_b, told.stamp_s, R_b_c, sigma_rad)
+    seen = turned.R_w_m @ told.R_m_c @ turned.R_b_c.T
+    off = Rotation.from_matrix(np.swapaxes(seen, 1, 2) @ told.R_w_b).as_rotvec()
+    rpy = np.unwrap(Rotation.from_matrix(seen).as_euler("ZYX")[:, ::-1], axis=0)
+    rate = np.diff(rpy, axis=0) / np.diff(told.stamp_s)[:, None]
+    rms = [np.sqrt(np.mean(x**2, axis=0)) for x in (off, off[-LATELY:], rate)]
+    return Apart(rms[0], rms[1], np.std(rpy, axis=0), rms[2])
 
 
 def attitudes(sightings: Sightings, track: TelemetryTrack, delay_s: float) -> Attitudes | None:

@@ -8,9 +8,18 @@ from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.fusion.config import FusionConfig
 from edgeslam_torch.fusion.scale.log_scale import LogScale
-from edgeslam_torch.fusion.telemetry.alignment import map_to_world, turns
+from edgeslam_torch.fusion.telemetry.alignment import Attitudes, apart, attitudes, map_to_world, turns
 from edgeslam_torch.fusion.telemetry.delay import GROWTH, Delay
-from edgeslam_torch.fusion.telemetry.plausibility import Agreement, Reading, Reread, Trust, Verdict, agreement
+from edgeslam_torch.fusion.telemetry.plausibility import (
+    ATTITUDE,
+    Agreement,
+    Reading,
+    Reread,
+    Trust,
+    Verdict,
+    agreement,
+    broken_columns,
+)
 from edgeslam_torch.fusion.telemetry.track import TelemetryTrack, Turn
 from edgeslam_torch.fusion.telemetry.visual_memory import Displacements, VisualMemory
 from edgeslam_torch.types import FloatArray
@@ -27,6 +36,13 @@ _MUCH_LIKELIER = 6.0
 """Log likelihood ratio; half the intervals count as independent."""
 _LEAST_TURN_RAD_S = math.radians(2.0)
 """Whole degrees twice a second are noise below."""
+_FEW_ATTITUDES = 15
+"""Pictures that are compared with attitude at least: a second and a half."""
+_APART_SHARE, _APART_RAD, MOST_APART_RAD = 0.5, math.radians(2.0), math.radians(6.0)
+"""Root mean square by which attitude and images may be apart about an axis: this share of how the body turned about it,
+within bounds. Right attitude (whole degrees, mount 7 degrees off) is 0.3 to 1 degree apart on six recordings; a frozen
+column is apart by the whole turn, a mirrored one by twice that, one that jumps by a share of the jump."""
+_DELAY_STEP_S = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,25 +76,27 @@ class Comparison:
         well: a good fit is no proof of the frame. While ``flying`` this is asked as the flight grows, in the end in
         any case.
         """
+        attitude = self._attitude(present, delay)
+        if attitude is not None:
+            trust.judge(Reading.ATTITUDE, attitude)
         now, n = self._velocity(present, delay.value_s, R_w_m), present.memory.count
         grown = not flying or n >= GROWTH * self._looked_wide_at
         look = now.count >= _TO_LOOK_ELSEWHERE and grown
         if look:
             self._looked_wide_at = n
-            turn = self._fits_turned(present, now, delay.value_s, R_w_m)
+            turn = self._fits_turned(present, now, delay.value_s, R_w_m) if trust.attitude else None
             if turn is not None:
                 trust.reread = Reread(turn, now)
                 present.track.read_as(turn)
                 now = self._velocity(present, delay.value_s, R_w_m)
                 trust.forget(Reading.VELOCITY)
+        if not math.isfinite(delay.sigma_s):  # at another moment every column has another motion
+            now = replace(now, broken=())
         if now.correlation >= _FITS_WELL:
             trust.elsewhere_s = None
         elif look:
             trust.elsewhere_s = self._fits_elsewhere(present, now, delay.value_s)
         trust.judge(Reading.VELOCITY, now)
-        attitude = self._attitude(present, delay.value_s)
-        if attitude is not None:
-            trust.judge(Reading.ATTITUDE, attitude)
 
     def _fits_turned(self, present: FlightSoFar, now: Agreement, delay_s: float, R_w_m: FloatArray) -> Turn | None:
         """The frame in which the velocities surely fit better than in the one they are read in."""
@@ -114,16 +132,43 @@ class Comparison:
         told = track.displacement(moved.to_s - delay_s) - track.displacement(moved.from_s - delay_s)
         slow = self._config.min_speed_m_s
         least_seen = math.inf if present.rough_scale is None else 2.0 * slow / present.rough_scale
-        return agreement(moved.moved @ R_w_m.T / duration, told / duration, least_seen, slow, early=True)
+        seen, told = moved.moved @ R_w_m.T / duration, told / duration
+        found = agreement(seen, told, least_seen, slow, early=True)
+        R_w = track.axes()[np.searchsorted(track.readings.stamp_s, 0.5 * (moved.from_s + moved.to_s) - delay_s)]
+        seen, told = (np.einsum("nwa,nw->na", R_w, v) for v in (seen, told))
+        return replace(found, broken=broken_columns(seen, told))
 
-    def _attitude(self, present: FlightSoFar, delay_s: float) -> Agreement | None:
+    def _attitude(self, present: FlightSoFar, delay: Delay) -> Agreement | None:
         """How attitude goes with them; None where there is none."""
-        moved = _in_common(present, delay_s)
-        if len(moved) == 0 or not present.track.has_attitude:
+        moved = _in_common(present, delay.value_s)
+        if len(moved) == 0:
             return None
-        both = turns(moved.on_telemetry_clock(delay_s), present.track, present.R_b_c)
+        both = turns(moved.on_telemetry_clock(delay.value_s), present.track, present.R_b_c)
         seen, told = (Rotation.from_matrix(R).as_rotvec() / moved.duration_s[:, None] for R in (both.seen, both.told))
-        return agreement(seen, told, _LEAST_TURN_RAD_S, 1.5 * _LEAST_TURN_RAD_S)
+        found = agreement(seen, told, _LEAST_TURN_RAD_S, 1.5 * _LEAST_TURN_RAD_S)
+        return replace(found, broken=self._broken_attitude(present, delay))
+
+    def _broken_attitude(self, present: FlightSoFar, delay: Delay) -> tuple[str, ...]:
+        """Columns of attitude that part from the images, at the delay known or at any that may be."""
+        known, sightings = math.isfinite(delay.sigma_s), present.memory.sightings()
+        low, high = self._config.delay_range_s
+        delays_s = [delay.value_s] if known else np.arange(low, high + 1e-9, _DELAY_STEP_S).tolist()
+        ratios = []
+        for delay_s in delays_s:
+            told = attitudes(sightings, present.track, delay_s)
+            if told is not None and len(told.stamp_s) >= _FEW_ATTITUDES:
+                ratios.append(self._parted(told, present.R_b_c, delay.sigma_s if known else _DELAY_STEP_S))
+        if not ratios:
+            return ()
+        best = min(ratios, key=max)
+        return tuple(name for name, ratio in zip(ATTITUDE, best.tolist(), strict=True) if ratio > 1.0)
+
+    def _parted(self, told: Attitudes, R_b_c: FloatArray, delay_sigma_s: float) -> FloatArray:
+        """How far they are apart about each axis, in what is allowed ``(3,)``."""
+        found = apart(told, R_b_c, self._config.alignment_sigma_rad)
+        share = np.clip(_APART_SHARE * found.seen, _APART_RAD, MOST_APART_RAD)
+        late = delay_sigma_s * found.rate
+        return np.maximum(found.apart / np.hypot(share, late), found.lately / np.hypot(MOST_APART_RAD, 2.0 * late))
 
 
 def _in_common(present: FlightSoFar, delay_s: float) -> Displacements:

@@ -33,6 +33,11 @@ _EVEN = 0.8
 _WINSOR = 3.0
 """Times the median at which lengths are cut off."""
 _SMALL_SHARE = 0.3
+_KEPT = 0.9
+"""Share of the intervals that must fit."""
+_LEFT_OVER, _LEFT_OVER_M_S = 0.5, 0.06
+"""What may be left over of one velocity (root mean square): a share of the speed along its axis, and what truncation to
+steps of 0.1 m/s leaves [m/s]. Right ones of eight recordings stay below both."""
 _LARGE_QUANTILE = 0.9
 """Intervals shorter than this share of the long ones (the length at this quantile) count as standing still."""
 
@@ -48,6 +53,9 @@ class Reading(StrEnum):
 
 
 HEIGHTS = (Reading.TOF, Reading.H, Reading.BARO)
+ATTITUDE = ("roll", "pitch", "yaw")
+VELOCITY = ("velocity x", "velocity y", "velocity z")
+"""Names of the columns."""
 
 
 class Verdict(StrEnum):
@@ -72,6 +80,8 @@ class Agreement:
     """The same with the means left in: near 1 for an even motion, which proves nothing and contradicts nothing."""
     early: bool = False
     """Whether few intervals may prove it."""
+    broken: tuple[str, ...] = ()
+    """Columns that on their own contradict the images: missing motion, frozen, jumping or of the wrong sign."""
 
     @property
     def share(self) -> float:
@@ -87,7 +97,9 @@ class Agreement:
 
     @property
     def verdict(self) -> Verdict:
-        """Agreement has to be proven, and so has contradiction."""
+        """Agreement has to be proven, and so has contradiction; one broken column spoils the whole."""
+        if self.broken:
+            return Verdict.CONTRADICTS
         least = _EARLY_COUNT if self.early else LEAST_COUNT
         if self.count >= least and self.correlation >= self.needed:
             return Verdict.AGREES
@@ -120,6 +132,27 @@ def agreement(
     x, y = _tamed(seen[moving]), _tamed(told[moving])
     varying = _correlation(x - x.mean(axis=0), y - y.mean(axis=0))
     return Agreement(varying, count, dimensions, _correlation(x, y), early)
+
+
+def broken_columns(seen: FloatArray, told: FloatArray) -> tuple[str, ...]:
+    """Velocities that contradict the images each on its own.
+
+    Args:
+        seen: By the images ``(N, 3)`` [map units/s], axes of the columns.
+        told: By telemetry ``(N, 3)`` [m/s].
+
+    Returns:
+        Names of those that leave over more than right ones do, whatever a map unit is; the worst intervals are left
+        out. A mean counts: a velocity that froze differs from the images by it.
+    """
+    if len(seen) < _TO_CONTRADICT:
+        return ()
+    scale = max(float(np.sum(told * seen)) / max(float(np.sum(seen**2)), 1e-30), 0.0)
+    left = np.abs(told - scale * seen)
+    kept = np.sort(left, axis=0)[: int(_KEPT * len(left))]
+    speed = np.sqrt(np.maximum(np.mean(told**2, axis=0), scale**2 * np.mean(seen**2, axis=0)))
+    apart = np.sqrt(np.mean(kept**2, axis=0)) > np.maximum(_LEFT_OVER * speed, _LEFT_OVER_M_S)
+    return tuple(name for name, is_apart in zip(VELOCITY, apart.tolist(), strict=True) if is_apart)
 
 
 def _moving(x: FloatArray, least: float) -> NDArray[np.bool_]:
@@ -279,11 +312,8 @@ class Trust:
         said = [] if self.reread is None else [self.reread.warning(velocity)]
         attitude = self.latest.get(Reading.ATTITUDE)
         if attitude is not None and self.verdict(Reading.ATTITUDE) is Verdict.CONTRADICTS:
-            said.append(
-                f"telemetry's roll, pitch and yaw explain {100 * attitude.share:.0f} % of the turns in the images: "
-                "its heights are not used, and the vertical may be wrong"
-            )
-        if velocity is not None and not self.velocity:
+            said.append(f"telemetry's velocities are not used, nor its heights and attitude: {_apart(attitude)}")
+        elif velocity is not None and not self.velocity:
             said.append(f"telemetry's velocities are not used: {_why(velocity, 'motion')}")
         if velocity is not None and self.velocity and not self.tells_scale and velocity.count >= _TO_CONTRADICT:
             said.append(
@@ -301,7 +331,16 @@ class Trust:
         return said
 
 
+def _apart(found: Agreement) -> str:
+    """How far from the images attitude is."""
+    if not found.broken:
+        return f"roll, pitch and yaw explain {100 * found.share:.0f} % of the turns in the images"
+    return f"{', '.join(found.broken)}: other turns than in the images (frozen, jumping, of the wrong sign?)"
+
+
 def _why(found: Agreement, motion: str) -> str:
+    if found.broken:
+        return f"{', '.join(found.broken)}: another motion than in the images (frozen, jumping, of the wrong sign?)"
     if found.count < (_EARLY_COUNT if found.early else LEAST_COUNT):
         return f"too little {motion} in common with the images to compare"
     if found.steady >= _EVEN and found.correlation < _DOUBTFUL[found.dimensions]:

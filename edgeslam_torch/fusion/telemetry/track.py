@@ -48,6 +48,8 @@ class Readings:
     """``(N,)`` each [m], NaN where missing."""
     has_velocity: NDArray[np.bool_]
     """``(N,)``"""
+    has_attitude: NDArray[np.bool_]
+    """``(N,)`` whether the newest attitude is no older than a hole may be."""
     frozen: NDArray[np.bool_]
     """``(N,)`` part of a run that repeats one message to the bit."""
 
@@ -58,8 +60,8 @@ class Readings:
 
     @property
     def valid(self) -> NDArray[np.bool_]:
-        """``(N,)`` whether the velocity may be used."""
-        return self.has_velocity & ~self.frozen
+        """``(N,)`` whether velocity and attitude may be used: neither means anything without the other."""
+        return self.has_velocity & self.has_attitude & ~self.frozen
 
 
 _AROUND = np.linspace(-1.0, 1.0, 25)
@@ -232,6 +234,7 @@ class TelemetryTrack:
             height=column("height_m"),
             baro=column("baro_m"),
             has_velocity=_all(np.isfinite(told)),
+            has_attitude=_known_lately(stamp, _all(np.isfinite(raw_rpy)), self._max_gap_s),
             frozen=_frozen(stamp, told, raw_rpy),
         )
 
@@ -288,7 +291,8 @@ class TelemetryTrack:
         return share**2 + (1.0 - share) ** 2
 
     def covered(self, from_s: FloatArray, to_s: FloatArray) -> NDArray[np.bool_]:
-        """Whether each interval lies within readings without a hole, a frozen stretch or a missing velocity."""
+        """Whether each interval lies within readings without a hole, a frozen stretch, or a missing velocity or
+        attitude."""
         if len(self._samples) < 2:
             return np.zeros(len(from_s), dtype=bool)
         stamp, valid = self.readings.stamp_s, self.readings.valid
@@ -381,6 +385,12 @@ def _integral(stamp: FloatArray, velocity: FloatArray) -> FloatArray:
 def _all(true: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Whether all three of each row ``(N, 3)`` are: `numpy.all` along rows of three takes four times as long."""
     return np.asarray(true[:, 0] & true[:, 1] & true[:, 2])
+
+
+def _known_lately(stamp: FloatArray, known: NDArray[np.bool_], reach_s: float) -> NDArray[np.bool_]:
+    """Whether at each reading the newest known one, itself or one before, is no older than ``reach_s``."""
+    newest_s = np.maximum.accumulate(np.where(known, stamp, -np.inf))
+    return np.asarray(stamp - newest_s <= reach_s)
 
 
 def _filled(rows: FloatArray) -> FloatArray:

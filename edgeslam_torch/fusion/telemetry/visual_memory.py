@@ -209,6 +209,10 @@ class VisualMemory:
         some = list(islice(newest_first, 0, None, 3))
         return _arrays(some) if len(some) >= _FEW else None
 
+    def newest(self, count: int) -> Sightings:
+        """So many at most, in order, as arrays."""
+        return _arrays(list(islice(reversed(self._sightings), count))[::-1])
+
     def sightings(self) -> Sightings:
         """All of them as arrays."""
         if self._shown is None:

@@ -3,7 +3,7 @@
 10 Hz, whole dm/s, degrees and centimetres, half a second ahead of the video, drift that grows as the battery drains.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -120,6 +120,55 @@ def body(drawn: Drawn) -> Samples:
     ]
 
 
+HEIGHTS = ("tof_m", "height_m", "baro_m")
+"""Fields of a sample that tell heights."""
+
+
+def missing(column: FloatArray) -> FloatArray:
+    """Nothing is told."""
+    return np.full_like(column, np.nan)
+
+
+def stuck(column: FloatArray) -> FloatArray:
+    """The first reading throughout."""
+    return np.full_like(column, column[0])
+
+
+def mirrored(column: FloatArray) -> FloatArray:
+    """The other sign."""
+    return -column
+
+
+def halved(column: FloatArray) -> FloatArray:
+    """Half of it."""
+    return 0.5 * column
+
+
+def jumping(by: float) -> Callable[[FloatArray], FloatArray]:
+    """A step of ``by`` in the middle."""
+    return lambda column: (
+        column + by * (np.arange(len(column)) >= len(column) // 2).reshape((-1,) + (1,) * (column.ndim - 1))
+    )
+
+
+def spoilt(
+    fields: Sequence[str], change: Callable[[FloatArray], FloatArray], axis: int | None = None
+) -> Callable[[Drawn], Samples]:
+    """Right telemetry but for some fields of its samples, or one axis of a field, which a function changes."""
+
+    def make(drawn: Drawn) -> Samples:
+        samples = rounded(drawn)
+        for name in fields:
+            values = np.array([getattr(s, name) for s in samples])
+            where = slice(None) if axis is None else (slice(None), axis)
+            values[where] = change(values[where])
+            told = values.tolist() if values.ndim == 1 else list(values)
+            samples = [replace(s, **{name: value}) for s, value in zip(samples, told, strict=True)]
+        return samples
+
+    return make
+
+
 def _told(drawn: Drawn, velocities: Callable[[FloatArray], FloatArray] = np.rint) -> Samples:
     """As the drone sends it; ``velocities`` makes whole numbers of those in dm/s."""
     truth, stamps = drawn.truth, drawn.stamps_s
@@ -156,5 +205,18 @@ KINDS: dict[str, Callable[[Drawn], Samples]] = {
     "random": random_velocities,
     "centimetres": centimetres,
     "body": body,
+    "attitude_missing": spoilt(["rpy_rad"], missing),
+    "roll_mirrored": spoilt(["rpy_rad"], mirrored, 0),
+    "pitch_mirrored": spoilt(["rpy_rad"], mirrored, 1),
+    "yaw_stuck": spoilt(["rpy_rad"], stuck, 2),
+    "yaw_mirrored": spoilt(["rpy_rad"], mirrored, 2),
+    "yaw_jumping": spoilt(["rpy_rad"], jumping(np.pi / 2), 2),
+    "velocity_stuck": spoilt(["velocity_m_s"], stuck, 0),
+    "velocity_mirrored": spoilt(["velocity_m_s"], mirrored, 1),
+    "velocity_jumping": spoilt(["velocity_m_s"], jumping(1.0), 0),
+    "velocity_halved": spoilt(["velocity_m_s"], halved),
+    "heights_stuck": spoilt(HEIGHTS, stuck),
+    "heights_mirrored": spoilt(HEIGHTS, lambda z: 2.0 * z[0] - z),
+    "heights_jumping": spoilt(HEIGHTS, jumping(1.0)),
 }
 """By the name in a cell's name; the first two are right."""
