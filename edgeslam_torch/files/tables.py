@@ -160,7 +160,7 @@ def read_table(path: Path, error: type[EdgeSlamError], columns: int | None = Non
         above = [data[0][1]]
     if rows and above:
         width = len(rows[0].cells)
-        words = (_split(above[-1].lstrip("#% "), s, columns) for s in (separator, _BLANKS, *_SEPARATORS))
+        words = (_split(above[-1].lstrip("#% "), s, columns) for s in (separator, *_SEPARATORS))
         header = next((tuple(names) for names in words if len(names) == width), header)
     _drop_empty_end(rows, len(header))
     comments = tuple(line.lstrip("#% ") for _, line in lines if line.startswith(_COMMENTS))

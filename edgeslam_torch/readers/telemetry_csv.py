@@ -6,7 +6,7 @@ The reader also accepts other logs: other column names, milliseconds, units and 
 import logging
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -16,7 +16,11 @@ import numpy as np
 
 from edgeslam_torch.drone.sdk_state import FIELDS, sample_from_sdk, to_number
 from edgeslam_torch.errors import EdgeSlamError
+from edgeslam_torch.files import tables
 from edgeslam_torch.files.appender import Appender
+from edgeslam_torch.files.time_units import NAMES, UNKNOWN, seconds_of
+from edgeslam_torch.readers.telemetry_columns import QUANTITIES, UNITS, column_of, unit_factor
+from edgeslam_torch.readers.telemetry_foreign import foreign_log
 from edgeslam_torch.readers.velocity_frame import body_frame_evidence
 from edgeslam_torch.types import FloatArray, TelemetrySample
 
@@ -44,30 +48,15 @@ _STAMPS = {
 }
 """Column names of the clock, most reliable first; factor 0: unit inferred from the spacing. The SDK's ``time`` counts
 whole seconds of motor time and is the last resort."""
-_ALIASES = {
-    "vx": "vgx",
-    "vy": "vgy",
-    "vz": "vgz",
-    "speed_x": "vgx",
-    "speed_y": "vgy",
-    "speed_z": "vgz",
-    "ax": "agx",
-    "ay": "agy",
-    "az": "agz",
-    "batt": "bat",
-    "battery": "bat",
-    "height": "h",
-    "barometer": "baro",
-    "tof_distance": "tof",
-    "distance_tof": "tof",
-}
-_UNITS = ("cm", "dm", "m", "deg", "degrees", "pct", "percent", "%", "cm_s", "dm_s", "m_s", "mg", "c")
-"""Unit suffixes of column names in other logs; the unit of velocities is inferred from the data regardless."""
-_VELOCITY = ("vgx", "vgy", "vgz")
 _ATTITUDE = ("pitch", "roll", "yaw")
-_SEPARATORS = ",;\t"
+_VELOCITY = ("vgx", "vgy", "vgz")
 _MAX_COLUMNS = 256
 _MAX_BYTES = 512 * 1024 * 1024
+_GAPS_S = (1e-3, 5.0)
+"""Time between messages; a Tello sends ten a second."""
+_WRAP = 2.0**32
+"""A clock of 32 bits begins anew here: milliseconds after 50 days, microseconds after 72 minutes."""
+_DAY_S = 86400.0
 
 
 class TelemetryError(EdgeSlamError):
@@ -99,6 +88,10 @@ class TelemetryTable:
     """SDK name to ``(M,)``, NaN where missing."""
     skipped: int
     """Skipped rows: malformed, or not newer than the previous one."""
+    stated: frozenset[str] = frozenset()
+    """Columns whose unit the file states."""
+    remarks: tuple[str, ...] = ()
+    """What the file holds that cannot be used, in sentences."""
 
     def samples(self, units: TelemetryUnits | None = None) -> list[TelemetrySample]:
         """SI units and our axes."""
@@ -116,7 +109,7 @@ class TelemetryTable:
         """Warnings about the file ``name``."""
         if len(self.stamps_s) == 0:
             return [f"{name}: holds no state message, so the run goes without telemetry"]
-        said = []
+        said = [f"{name}: {remark}" for remark in self.remarks]
         if self.skipped:
             rows = len(self.stamps_s) + self.skipped
             said.append(f"{name}: {self.skipped} of {rows} rows left out, malformed or not newer than the row before")
@@ -153,88 +146,131 @@ def read_table(path: Path) -> TelemetryTable:
     Raises:
         TelemetryError: As `read_telemetry`.
     """
-    try:
-        if path.stat().st_size > _MAX_BYTES:
-            raise TelemetryError(f"{path}: larger than any flight; is this telemetry?")
-        text = path.read_text(encoding="utf-8-sig", errors="strict")
-    except UnicodeDecodeError as error:
-        raise TelemetryError(f"{path}: not a text file; telemetry is comma-separated text") from error
-    except OSError as error:
-        raise TelemetryError(f"{path}: cannot be read: {error.strerror or error}") from error
-    lines = text.splitlines()
-    header_at = next((i for i, line in enumerate(lines) if line.strip()), None)
-    if header_at is None:
+    foreign = foreign_log(path)
+    if foreign is not None:
+        raise TelemetryError(f"{path}: {foreign}")
+    text = tables.read_table(path, TelemetryError, max_bytes=_MAX_BYTES)
+    if not (text.header or text.rows):
         raise TelemetryError(f"{path}: empty; it needs a header line such as {','.join(HEADER[:4])},...")
-    separator = max(_SEPARATORS, key=lines[header_at].count)
-    names = [_plain(name) for name in lines[header_at].lstrip("#").split(separator)]
+    if not text.header:
+        raise TelemetryError(f"{path}: no header line that names its columns, such as {','.join(HEADER[:4])},...")
+    names = [_plain(name) for name in text.header]
     clock = next((name for name in _STAMPS if name in names), None)
-    columns: dict[str, int] = {}
+    columns: dict[str, _Column] = {}
     for i, name in enumerate(names[:_MAX_COLUMNS]):
-        known = next((n for n in (name, _ALIASES.get(name, ""), _bare(name)) if n in FIELDS), None)
-        if known is not None and name != clock:
-            columns.setdefault(known, i)
+        known = None if name == clock else column_of(text.header[i])
+        if known is not None:
+            if math.isnan(known[1]):
+                units = ", ".join(dict.fromkeys(UNITS[QUANTITIES[known[0]]]))
+                raise TelemetryError(f"{path}: the unit of column {text.header[i]!r} is not known: {units} are")
+            columns.setdefault(known[0], _Column(i, *known))
     if clock is None or not columns:
         missing = f"no clock ({', '.join(_STAMPS)})" if clock is None else f"no known column ({', '.join(FIELDS)})"
         raise TelemetryError(f"{path}: {missing} in its header line; give a telemetry.csv")
-    rows, skipped = _rows(lines[header_at + 1 :], separator, len(names), names.index(clock), list(columns.values()))
+    at = names.index(clock)
+    rows, skipped = _rows(text.rows, len(names), at, list(columns.values()))
+    if text.rows and not rows:
+        seen = text.rows[0].cells[at : at + 1]
+        raise TelemetryError(
+            f"{path}: none of its {len(text.rows)} rows has a time in column {text.header[at]!r} ({', '.join(seen)!r}) "
+            f"and {len(names)} columns; it must be seconds, milliseconds, or date and time"
+        )
     table = np.array(rows, dtype=np.float64).reshape(len(rows), 1 + len(columns))
-    stamps = table[:, 0] * (_STAMPS[clock] or _seconds_per_unit(table[:, 0]))
-    values: dict[str, FloatArray] = {name: table[:, 1 + i] for i, name in enumerate(columns)}
-    return TelemetryTable(stamps, values, skipped)
+    stamps, remarks = _seconds(table[:, 0], _STAMPS[clock], text.header[at])
+    values = {name: table[:, 1 + i] for i, name in enumerate(columns)}
+    for name, column in columns.items():
+        cell = next((row.cells[column.index] for row in text.rows if row.cells[column.index : column.index + 1]), "")
+        if rows and cell and np.isnan(values[name]).all():
+            remarks.append(f"column {text.header[column.index]!r} holds no number ({cell[:20]!r})")
+    stated = frozenset(name for name, column in columns.items() if column.stated)
+    return TelemetryTable(stamps, values, skipped, stated, tuple(remarks))
+
+
+@dataclass(frozen=True, slots=True)
+class _Column:
+    """Where a field is, and in which unit."""
+
+    index: int
+    name: str
+    factor: float
+    """SDK units per unit of the file."""
+    stated: bool
+
+
+def _seconds(stamps: FloatArray, factor: float, name: str) -> tuple[FloatArray, list[str]]:
+    """Stamps in seconds, by the unit that is stated or, where none is or it is implausible, by their spacing."""
+    unknown = f"the times in column {name!r} are plausible in no unit from nanoseconds to seconds"
+    if not factor:
+        seconds, unit = seconds_of(stamps, _GAPS_S)
+        return seconds, [unknown] if unit == UNKNOWN else []
+    seconds, unit = seconds_of(stamps * factor)
+    if unit in ("s", UNKNOWN):
+        return stamps * factor, [unknown] if unit == UNKNOWN else []
+    unit = seconds_of(stamps)[1]
+    return seconds_of(stamps)[0], [f"the times in column {name!r} are taken for {NAMES.get(unit, 'seconds')}"]
 
 
 def _plain(name: str) -> str:
-    """A column's name without quotes, brackets, case and slashes: ``"Tof (cm)"`` to ``tof_cm``."""
-    return "_".join(re.sub(r"[\"'()\[\]]", " ", name).replace("/", "_").lower().split())
-
-
-def _bare(name: str) -> str:
-    """The name without its unit."""
-    for unit in sorted(_UNITS, key=len, reverse=True):
-        if name.endswith(f"_{unit}"):
-            short = name.removesuffix(f"_{unit}")
-            return _ALIASES.get(short, short)
-    return ""
+    """A clock's name without quotes, brackets, case and slashes: ``"Time (millisecond)"`` to ``time_ms``."""
+    plain = "_".join(re.sub(r"[\"'()\[\]]", " ", name).replace("/", "_").lower().split())
+    return re.sub(r"_(m|u|n)?(?:illi|icro|ano)?s(?:ec|econds?)?$", lambda found: f"_{found[1] or ''}s", plain)
 
 
 def _rows(
-    lines: list[str], separator: str, width: int, clock: int, columns: list[int]
+    lines: Sequence[tables.Row], width: int, clock: int, columns: Sequence[_Column]
 ) -> tuple[list[list[float]], int]:
     rows: list[list[float]] = []
-    skipped, last = 0, -math.inf
+    skipped, last, turns = 0, -math.inf, 0.0
     for line in lines:
-        if not line.strip() or line.lstrip().startswith("#"):
-            continue
-        cells = [cell.strip().strip("\"'") for cell in line.split(separator)]
-        if len(cells) == width + 1 and not cells[-1]:
-            cells.pop()  # a separator at the end of each row
-        stamp = _moment(cells[clock]) if len(cells) == width else math.nan
+        cells = line.cells[:-1] if len(line.cells) == width + 1 and not line.cells[-1] else line.cells
+        stamp, period = _moment(cells[clock]) if len(cells) == width else (math.nan, _WRAP)
+        if stamp + turns < last - 0.5 * period and last - turns <= period:  # the clock began anew
+            turns += period
+        stamp += turns
         if not stamp > last or abs(stamp) > 1e19:
             skipped += 1
             continue
-        rows.append([stamp, *(to_number(cells[i]) for i in columns)])
+        rows.append([stamp, *(_value(cells[c.index], c) for c in columns)])
         last = stamp
     return rows, skipped
 
 
-def _moment(text: str) -> float:
-    """A number, or Unix seconds of a date and time (UTC unless stated)."""
+def _value(text: str, column: _Column) -> float:
+    """A cell in the SDK's unit, with a unit of its own or not; NaN for anything else."""
     number = to_number(text)
-    if math.isfinite(number) or len(text) < 16:
-        return number
-    try:
-        moment = datetime.fromisoformat(text)
-    except ValueError:
+    if math.isnan(number):
+        number = tables.number(text) or math.nan
+    if math.isfinite(number):
+        return number * column.factor
+    found = re.fullmatch(r"([+-]?[\d.,]+)\s*([^\d\s].*)", text)
+    number = None if found is None else tables.number(found[1])
+    if found is None or number is None:
         return math.nan
-    return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
+    return number * unit_factor(column.name, found[2])
 
 
-def _seconds_per_unit(stamps: FloatArray) -> float:
-    """A Tello sends at 10 Hz: the spacing distinguishes seconds, milliseconds, microseconds and nanoseconds."""
-    if len(stamps) < 2:
-        return 1.0
-    spacing = float(np.median(np.diff(stamps)))
-    return next((unit for unit, limit in ((1.0, 5.0), (1e-3, 5e3), (1e-6, 5e6)) if spacing < limit), 1e-9)
+def _moment(text: str) -> tuple[float, float]:
+    """A number, or seconds of a date and time (Unix, UTC unless stated) or of a time of day; and when it begins anew.
+
+    Example:
+        >>> _moment("12:00:01.5")[0], _moment("01.05.2024 12:00:00")[0]
+        (43201.5, 1714564800.0)
+    """
+    number = tables.number(text)
+    if number is not None:
+        return number, _WRAP
+    day = re.fullmatch(r"(\d{1,2}):(\d{2}):(\d{2}(?:[.,]\d+)?)", text)
+    if day is not None:
+        return 3600.0 * int(day[1]) + 60.0 * int(day[2]) + float(day[3].replace(",", ".")), _DAY_S
+    text = re.sub(r"^(\d{4})[/.](\d{1,2})[/.](\d{1,2}),?", r"\1-\2-\3", text)
+    text = re.sub(r"^(\d{1,2})\.(\d{1,2})\.(\d{4}),?", lambda d: f"{d[3]}-{int(d[2]):02}-{int(d[1]):02}", text)
+    try:
+        moment = datetime.fromisoformat(text.replace(", ", " ")) if len(text) >= 16 else None
+    except ValueError:
+        moment = None
+    if moment is None:
+        return math.nan, _WRAP
+    return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp(), _WRAP
 
 
 def detect_units(table: TelemetryTable) -> TelemetryUnits:
@@ -243,7 +279,12 @@ def detect_units(table: TelemetryTable) -> TelemetryUnits:
     Without evidence they are the SDK's: dm/s, z down, world of power-on.
     """
     ratio, words = body_frame_evidence(table.stamps_s, table.values)
-    return replace(_vertical_units(table), body_frame=ratio > 0, frame_evidence=words)
+    units = replace(_vertical_units(table), body_frame=ratio > 0, frame_evidence=words)
+    if table.stated.isdisjoint(_VELOCITY):
+        return units
+    return replace(
+        units, velocity_m_s=0.1, evidence=f"the unit of its header line, z {'down' if units.z_down else 'up'}"
+    )
 
 
 def _turned_to_world(values: dict[str, FloatArray]) -> dict[str, FloatArray]:
