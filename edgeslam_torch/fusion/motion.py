@@ -135,8 +135,7 @@ class MotionFusion:
         self._followed_s = stamp_s
         before = self._memory.displacements()
         self._remember_refined(stamp_s, REACH_S)
-        log_ratio = math.log(grown(before, self._memory.displacements(), stamp_s))
-        self.metres.follow(log_ratio)
+        self.metres.follow(math.log(grown(before, self._memory.displacements(), stamp_s)))
 
     def add_earlier(self, stamps_s: FloatArray, T_w_c: FloatArray, sigma_t: float, sigma_r_rad: float) -> None:
         """Frames on which a new piece of map rests, before its first tracked one: they have moved with the drone, too.

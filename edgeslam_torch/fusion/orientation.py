@@ -78,13 +78,11 @@ class Orientation:
     def has_parted(self) -> bool:
         """Whether attitude that had proven to be of this flight has just turned otherwise than the images."""
         flight, found = self._flight, self.found
-        if found is None or not (flight.trust.turns and math.isfinite(flight.delay_sigma_s)):
+        asked = found is not None and flight.trust.turns and math.isfinite(flight.delay_sigma_s)
+        told = attitudes(flight.memory.newest(LATELY), flight.track, flight.delay_s) if asked else None
+        if told is None or found is None:
             return False
-        told = attitudes(flight.memory.newest(LATELY), flight.track, flight.delay_s)
-        if told is None:
-            return False
-        apart = rotation_vector(told.map_to_world(found.R_b_c) @ found.R_w_m.T)
-        return float(np.linalg.norm(apart)) > MOST_APART_RAD
+        return float(np.linalg.norm(rotation_vector(told.map_to_world(found.R_b_c) @ found.R_w_m.T))) > MOST_APART_RAD
 
     def vertical(self, stamp_s: float) -> tuple[FloatArray, float] | None:
         """The map's z axis ``(3,)`` in a frame's camera by the drone's attitude, and how far [rad] that leaned within

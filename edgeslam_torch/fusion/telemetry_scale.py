@@ -285,7 +285,7 @@ class TelemetryScale:
         if len(given) == 2:
             one, other = (g.opinion for g in given)
             gap = abs(one.log_scale - other.log_scale) / math.hypot(one.sigma, other.sigma)
-            if contradict(one, other):  # one of them is wrong, and nothing tells which
+            if contradict(one, other):  # one of them is wrong: the sigma covers both
                 parted_log = max(abs(g.log_scale - math.log(together[0])) for g in (one, other))
         sources = {g.name: SourceScale(g.scale, g.scale * g.sigma) for g in given}
         # Birge ratio: sources that disagree beyond their sigmas widen the result.

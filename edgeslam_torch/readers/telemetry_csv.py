@@ -19,8 +19,8 @@ from edgeslam_torch.errors import EdgeSlamError
 from edgeslam_torch.files import tables
 from edgeslam_torch.files.appender import Appender
 from edgeslam_torch.files.time_units import NAMES, UNKNOWN, seconds_of
-from edgeslam_torch.readers.telemetry_columns import QUANTITIES, UNITS, column_of, unit_factor
-from edgeslam_torch.readers.telemetry_foreign import foreign_log
+from edgeslam_torch.readers.logs.columns import QUANTITIES, UNITS, column_of, unit_factor
+from edgeslam_torch.readers.logs.foreign import foreign_log
 from edgeslam_torch.readers.velocity_frame import body_frame_evidence
 from edgeslam_torch.types import FloatArray, TelemetrySample
 
