@@ -177,7 +177,7 @@ def read_table(path: Path) -> TelemetryTable:
         )
     table = np.array(rows, dtype=np.float64).reshape(len(rows), 1 + len(columns))
     stamps, remarks = _seconds(table[:, 0], _STAMPS[clock], text.header[at])
-    values = {name: table[:, 1 + i] for i, name in enumerate(columns)}
+    values: dict[str, FloatArray] = {name: table[:, 1 + i] for i, name in enumerate(columns)}
     for name, column in columns.items():
         cell = next((row.cells[column.index] for row in text.rows if row.cells[column.index : column.index + 1]), "")
         if rows and cell and np.isnan(values[name]).all():
@@ -243,10 +243,10 @@ def _value(text: str, column: _Column) -> float:
     if math.isfinite(number):
         return number * column.factor
     found = re.fullmatch(r"([+-]?[\d.,]+)\s*([^\d\s].*)", text)
-    number = None if found is None else tables.number(found[1])
-    if found is None or number is None:
+    amount = None if found is None else tables.number(found[1])
+    if found is None or amount is None:
         return math.nan
-    return number * unit_factor(column.name, found[2])
+    return amount * unit_factor(column.name, found[2])
 
 
 def _moment(text: str) -> tuple[float, float]:
