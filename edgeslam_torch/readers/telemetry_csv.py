@@ -14,7 +14,7 @@ from types import TracebackType
 
 import numpy as np
 
-from edgeslam_torch.drone.sdk_state import FIELDS, sample_from_sdk, to_number
+from edgeslam_torch.drone.sdk_state import FIELDS, sample_from_sdk
 from edgeslam_torch.errors import EdgeSlamError
 from edgeslam_torch.files import tables
 from edgeslam_torch.files.appender import Appender
@@ -237,10 +237,8 @@ def _rows(
 
 def _value(text: str, column: _Column) -> float:
     """A cell in the SDK's unit, with a unit of its own or not; NaN for anything else."""
-    number = to_number(text)
-    if math.isnan(number):
-        number = tables.number(text) or math.nan
-    if math.isfinite(number):
+    number = tables.number(text)
+    if number is not None and math.isfinite(number):
         return number * column.factor
     found = re.fullmatch(r"([+-]?[\d.,]+)\s*([^\d\s].*)", text)
     amount = None if found is None else tables.number(found[1])
