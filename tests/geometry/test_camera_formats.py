@@ -65,6 +65,7 @@ NERF |= dict(zip(K_KEYS, D, strict=True)) | {"k3": 0, "k4": 0, "frames": [{"file
 FORMATS = {
     "ours": OWN + f"model: pinhole\ndistortion: [{LIST}]\nfocal_sigma: 0.0\ndepth_scale: 1000\n",
     "k1 keys": OWN + ONE_A_LINE,
+    "in braces": "{" + (OWN + ONE_A_LINE).strip().replace("\n", ", ") + "}",
     "k1 keys, no dot": OWN + ONE_A_LINE.replace("1.76187114e-05", "176187114e-13"),
     "upper-case keys": OWN.upper() + ONE_A_LINE.upper(),
     **{name: OWN + f"{name}: [{LIST}]\n" for name in ("dist_coeffs", "D", "distortion_coefficients", "distCoeffs")},

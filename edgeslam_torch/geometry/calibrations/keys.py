@@ -94,6 +94,8 @@ def camera_of(record: dict[str, Any], source: str, size: tuple[int, int] | None)
     """
     remarks: list[str] = []
     _refuse_parts(record)
+    if "cam0_calib" in record:  # VINS-Fusion's settings
+        raise CalibrationError(f"the calibration is in another file, {str(record['cam0_calib'])[:60]!r}; give that")
     stated, coefficients, lenses = _sorted(_one_camera(record, remarks), remarks)
     width, height = _size(stated, size, remarks)
     fx, fy, cx, cy, more = _intrinsics(stated, width, height)

@@ -51,7 +51,11 @@ def record_of(data: bytes) -> tuple[dict[str, Any], list[str]]:
     if text.startswith("<"):
         return _xml(text), []
     if text.startswith("{"):
-        return _nerfstudio(json.loads(text)), []
+        try:
+            return _nerfstudio(json.loads(text)), []
+        except json.JSONDecodeError:  # YAML may begin with a brace, too
+            if len(data) > MAX_BYTES:
+                raise
     lines = [
         line.split() for line in text.replace(",", " ").split("\n") if line.strip() and line.strip()[0] not in "#%"
     ]
