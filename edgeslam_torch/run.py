@@ -42,7 +42,7 @@ from edgeslam_torch.types import (
 )
 from edgeslam_torch.writers.map_picture import write_map_picture
 from edgeslam_torch.writers.observations import write_observations
-from edgeslam_torch.writers.run_summary import Tally, summarise, without_folders
+from edgeslam_torch.writers.run_summary import Tally, summarise, up_in_words, without_folders
 from edgeslam_torch.writers.run_writer import CAMERA, OBSERVATIONS, PICTURE, SUMMARY, RunWriter, summary_text
 
 if TYPE_CHECKING:
@@ -204,6 +204,9 @@ def run(
         slam = (make_slam or _edge_slam)(source.camera, config, mode is Mode.REALTIME)
         if atlas.load is not None:
             slam.load_atlas(atlas.load)
+        force = getattr(source, "force", None)
+        if force is not None and hasattr(slam, "feel"):
+            slam.feel(force)
         return _Run(source, writer, slam, config, mode, listeners, atlas).go()
 
 
@@ -344,6 +347,7 @@ class _Run:
         self.slam.close()  # a consistent snapshot follows, even if the refinement was stopped
         stamps, poses = self.slam.trajectory()
         edge_map, anchors, scale = self.slam.edge_map(), self.slam.anchors(), self.slam.scale
+        up = getattr(self.slam, "up", None)
         for listener in self.listeners:
             listener.on_finish(self.slam)
         saved = None if self.atlas.save is None else self.slam.saved_atlas(self.source.name)
@@ -352,6 +356,7 @@ class _Run:
             **summarise(
                 self.source, self.tally, self.slam.pieces(), scale, self.dropped.value, loop_s, finish_s, cpu_s
             ),
+            "up": up_in_words(up),
             "warnings": [*self.source.warnings, *self.slam.warnings(), *self._telemetry_gap(stamps)],
             "map": {
                 "keyframes": len(self.slam.keyframes()),
@@ -375,7 +380,7 @@ class _Run:
         title = f"{self.source.name}: {self.tally.frames} frames, {len(edge_map.p_w)} edge points"
 
         def picture(path: Path) -> None:
-            write_map_picture(path, edge_map, poses[support.whole()], scale.units, title)
+            write_map_picture(path, edge_map, poses[support.whole()], scale.units, title, up is not None)
 
         extras = [
             (CAMERA, lambda path: save_camera(path, self.source.camera)),

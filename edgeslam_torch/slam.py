@@ -30,6 +30,7 @@ from edgeslam_torch.fusion.published import Published, first_pose
 from edgeslam_torch.fusion.snapshot import Present
 from edgeslam_torch.geometry import se3, sim3
 from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.geometry.level import SpecificForce, Up
 from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.map.observed import observations
@@ -39,6 +40,8 @@ from edgeslam_torch.mapping.edges.edge_depth import StereoView
 from edgeslam_torch.mapping.edges.edge_map import EdgeMap
 from edgeslam_torch.mapping.edges.fresh_edges import MOST, measure_fresh_edges
 from edgeslam_torch.mapping.last_refinement import last_refinement, lm_config
+from edgeslam_torch.mapping.level.gravity import best_known, up_by_gravity
+from edgeslam_torch.mapping.level.straight_edges import up_by_edges
 from edgeslam_torch.mapping.mapper import Mapper
 from edgeslam_torch.mapping.pipeline import MappingPipeline
 from edgeslam_torch.states.joining import Joining
@@ -119,6 +122,10 @@ class EdgeSlam:
         self._repeats = RepeatedImages()
         self._calibration_warning: str | None = None
         self._losses: dict[str, float] = {}
+        self._force: SpecificForce | None = None
+        self.up: Up | None = None
+        """Where up is in the published world, after `finish`: z, but in the axes of an earlier flight. None if that is
+        not known; z is then what the first camera had for up."""
         self._T_b_c = camera_on_body(np.deg2rad(config.mount.tilt_deg), config.mount.forward_m)
         if executor is None and realtime:
             executor = ThreadPoolExecutor(1, thread_name_prefix="mapping")
@@ -322,7 +329,31 @@ class EdgeSlam:
         if np.isfinite(estimate.sigma):
             held = self._system.published
             self._system.published = Published(estimate.value, held.R, upright=held.upright)
+        self._find_up()
         self._calibration_warning = calibration_warning(self.camera, self.keyframes(), self.map.anchors.p_w)
+
+    def feel(self, force: SpecificForce) -> None:
+        """Readings of an accelerometer over the whole recording; they tell where up is, nothing else."""
+        self._force = force
+
+    def _find_up(self) -> None:
+        """By the drone's attitude, which the world follows already; else by accelerometer and edges, after which it is
+        turned, unless its axes are those of an earlier flight."""
+        system = self._system
+        if system.published.upright and (self._earlier is None or system.fusion.orientation.began_upright):
+            self.up = Up(np.array([0.0, 0.0, 1.0]), self.config.fusion.alignment_sigma_rad, "telemetry")
+            return
+        shown = self._shown_keyframes()
+        by_edges = up_by_edges(shown, self.edges.hosts, self.camera)
+        whole = self.support().whole()
+        stamps_s, T_w_c = self.log.poses()
+        felt = None if self._force is None else up_by_gravity(self._force, stamps_s[whole], T_w_c[whole])
+        up = best_known(felt, by_edges)
+        if up is None:
+            return
+        if not system.published.upright:
+            system.published = system.published.levelled(up.direction, np.zeros(3))
+        self.up = replace(up, direction=system.published.R @ up.direction)
 
     def trajectory(self) -> tuple[FloatArray, FloatArray]:
         """Stamps ``(F,)`` and refined ``T_w_c`` ``(F, 4, 4)`` of all frames so far."""
@@ -444,6 +475,7 @@ class EdgeSlam:
         """Limits of the results, in sentences for the run's summary."""
         depth = None if self.depth is None else self.depth.warning()
         apart = None if self._earlier is None else self._earlier.warning(self.support())
+        held = self._system.published.upright
         warnings = (
             self._machine.warning(),
             depth,
@@ -451,7 +483,7 @@ class EdgeSlam:
             apart,
             self._repeats.warning(),
             self._calibration_warning,
-            None if self._system.published.upright else self._system.fusion.orientation.leaning(),
+            None if held or self.up is not None else self._system.fusion.orientation.leaning(),
         )
         return [warning for warning in warnings if warning is not None] + self._system.fusion.warnings()
 

@@ -28,6 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--resolution", type=float, default=0.05, metavar="M", help="side of an occupancy cell [m]")
     parser.add_argument("--min-z", type=float, metavar="M", help="lowest obstacle (default: 0.5 m below the camera)")
     parser.add_argument("--max-z", type=float, metavar="M", help="highest obstacle (default: 0.5 m above the camera)")
+    parser.add_argument("--z-is-up", action="store_true", help="occupancy: take the map for level")
 
 
 def main(args: argparse.Namespace) -> int:
@@ -155,6 +156,11 @@ def _occupancy(run: "RunFolder", cloud: "PointCloud", args: argparse.Namespace) 
 
     if run.units == "arbitrary":
         raise OutputError(f"{run.path}: no occupancy grid without metric scale; run with a depth network or telemetry")
+    if run.up == "unknown" and not args.z_is_up:
+        raise OutputError(
+            f"{run.path}: no occupancy grid of a map that may be tilted: up is not known (older runs do not say; run "
+            "again, with telemetry or accelerometer.txt); if z is up, say so with --z-is-up"
+        )
     heights = None
     if args.min_z is not None or args.max_z is not None:
         middle = float(np.median(run.trajectory.positions[:, 2]))

@@ -1,11 +1,12 @@
-"""Transform from map units and axes to the published world: metric if known, z up.
+"""Transform from map units and axes to the published world: metric and z up, each if known.
 
 The map itself is never rescaled, and while flying its units are published as they are: the depth network's metres at
 its start, or arbitrary ones. Only sensors of the drone that are sure and contradict what is published revise it, and
 each revision is an event that the output counts: a scale that follows every new estimate would bend the trajectory.
 The similarity then scales about the current camera, so that the live pose does not jump. The final results use the
 final scale throughout. A map that began before the drone had told its attitude is turned upright about the camera when
-it has, once, which is a revision too.
+it has, once, which is a revision too. Without telemetry, edges or an accelerometer level the final results
+(`mapping/level/`); live poses have the axes of the first camera.
 """
 
 import math
@@ -100,10 +101,14 @@ class Published:
         """
         if self.upright or R_w_m is None:
             return self
-        turn, _ = Rotation.align_vectors([[0.0, 0.0, 1.0]], [self.R @ R_w_m[2]])
+        turned = self.levelled(R_w_m[2], centre_map)
+        return replace(turned, revision=self.revision + 1, upright=True)
+
+    def levelled(self, up_map: FloatArray, centre_map: FloatArray) -> "Published":
+        """The same with a direction ``(3,)`` of the map up, by the smallest turn; ``centre_map`` as above."""
+        turn, _ = Rotation.align_vectors([[0.0, 0.0, 1.0]], [self.R @ up_map])
         R = turn.as_matrix() @ self.R
-        offset = self.offset + self.scale * ((self.R - R) @ centre_map)
-        return replace(self, R=R, offset=offset, revision=self.revision + 1, upright=True)
+        return replace(self, R=R, offset=self.offset + self.scale * ((self.R - R) @ centre_map))
 
     def _rescaled(self, scale: float, centre_map: FloatArray) -> "Published":
         offset = self.offset + (self.scale - scale) * (self.R @ centre_map)

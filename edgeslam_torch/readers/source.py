@@ -11,10 +11,12 @@ from typing import Protocol
 from edgeslam_torch.calibration.camera_choice import choose_camera
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.geometry.level import SpecificForce
 from edgeslam_torch.readers import flight_folder, images, video
 from edgeslam_torch.readers.bags.bag import SUFFIXES, is_bag
 from edgeslam_torch.readers.bags.recording import open_bag
 from edgeslam_torch.readers.layouts import layout_of, read_sequence, tum
+from edgeslam_torch.readers.layouts.accelerometer import read_specific_force
 from edgeslam_torch.readers.listing import ImageEntry, Problem
 from edgeslam_torch.readers.pace import Steps
 from edgeslam_torch.readers.read_ahead import read_ahead
@@ -91,6 +93,8 @@ class Recording(Steps):
     """Frames left out at the beginning."""
     stride: int = 1
     """Of those that are left, one in so many is used."""
+    force: SpecificForce | None = None
+    """What an accelerometer beside the images felt."""
 
     def __post_init__(self) -> None:
         self._listed = tuple(self.problems)
@@ -174,6 +178,7 @@ def open_source(
     folders = [path, content.folder] if path.is_dir() else [content.folder]
     telemetry_file = flight_folder.telemetry_file(folders, telemetry)
     samples, remarks = (list(content.telemetry), []) if telemetry_file is None else read_telemetry(telemetry_file)
+    force, felt = read_specific_force(folders)
     default = content.default_camera
     chosen, warnings = choose_camera(content.size, camera, folders, default, bool(samples), content.own_camera)
     length = content.length
@@ -189,8 +194,9 @@ def open_source(
         telemetry=samples,
         groundtruth=content.groundtruth,
         problems=content.problems,
-        warnings=[*warnings, *remarks],
+        warnings=[*warnings, *remarks, *felt],
         max_frames=max_frames,
+        force=force,
     )
 
 

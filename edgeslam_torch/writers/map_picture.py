@@ -35,7 +35,9 @@ _EYE_TAN = 0.75
 """Tangent of half the camera's-eye view angle; slightly wider than common cameras."""
 
 
-def write_map_picture(path: Path, cloud: PointCloud, T_w_c: FloatArray, units: Units, title: str) -> None:
+def write_map_picture(
+    path: Path, cloud: PointCloud, T_w_c: FloatArray, units: Units, title: str, level: bool = True
+) -> None:
     """Draw the map from above (+z), from the side (across the scene's main direction) and as the camera saw it.
 
     Args:
@@ -44,6 +46,7 @@ def write_map_picture(path: Path, cloud: PointCloud, T_w_c: FloatArray, units: U
         T_w_c: ``(F, 4, 4)`` trajectory.
         units: Labels of the axes.
         title: Title of the picture.
+        level: Whether z is known to be up.
 
     Raises:
         OSError: If the file cannot be written.
@@ -55,8 +58,8 @@ def write_map_picture(path: Path, cloud: PointCloud, T_w_c: FloatArray, units: U
     across = np.array([-along[1], along[0], 0.0])
     unit = "m" if units is Units.METRES else "arbitrary units"
     for left, name, axis, upward in (
-        (_LEFT[0], "from above", "across", across),
-        (_LEFT[1], "from the side", "height", np.array([0.0, 0.0, 1.0])),
+        (_LEFT[0], "from above" if level else "along z (up not known)", "across", across),
+        (_LEFT[1], *(("from the side", "height") if level else ("across z (up not known)", "z")), np.eye(3)[2]),
     ):
         basis = np.stack([along, upward], axis=1)
         _draw_view(picture, (left, _TOP), points @ basis, colour, centres @ basis)

@@ -1,5 +1,6 @@
 """``summary.json``: a run in numbers."""
 
+import math
 import os
 import sys
 from collections.abc import Sequence
@@ -12,6 +13,7 @@ import numpy as np
 
 from edgeslam_torch import __version__
 from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.geometry.level import Up
 from edgeslam_torch.readers.source import Source
 from edgeslam_torch.types import Piece, ScaleEstimate, SlamOutput
 
@@ -105,6 +107,14 @@ def summarise(
         "telemetry_samples": len(source.telemetry),
         "problems": [{"file": problem.file, "reason": problem.reason} for problem in source.problems[:MAX_PROBLEMS]],
     }
+
+
+def up_in_words(up: Up | None) -> dict[str, Any]:
+    """What tells that z is up, and how well; ``unknown`` where z is what the first camera had for up."""
+    if up is None:
+        return {"source": "unknown", "sigma_deg": None}
+    off_rad = math.acos(min(1.0, float(up.direction[2])))  # nothing, but in the axes of an earlier flight
+    return {"source": up.source, "sigma_deg": math.degrees(math.hypot(up.sigma_rad, off_rad))}
 
 
 def without_folders(summary: dict[str, Any], folder: Path) -> dict[str, Any]:

@@ -40,6 +40,13 @@ class RunFolder:
         scale = self.summary.get("scale")
         return str(scale.get("units", "unknown")) if isinstance(scale, dict) else "unknown"
 
+    @property
+    def up(self) -> str:
+        """What tells that z is up (``telemetry``, ``edges``, ...); ``unknown`` when nothing does, or an older run does
+        not say."""
+        up = self.summary.get("up")
+        return str(up.get("source", "unknown")) if isinstance(up, dict) else "unknown"
+
     def cloud(self, name: str = "edge_map.ply") -> PointCloud | None:
         """Point cloud of the folder, None when it is not there."""
         file = self.path / name

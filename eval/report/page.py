@@ -90,7 +90,7 @@ def render(run: RunFolder, score: RunScore | None = None, truth: Trajectory | No
     """The page as text."""
     edges = _subset(run.cloud("edge_map.ply"), MAX_POINTS)
     anchors = _subset(run.cloud("anchors.ply"), _MAX_ANCHORS)
-    turn = upright(run.trajectory, score, truth)
+    turn = upright(run.trajectory, score, truth) if run.up == "unknown" else np.eye(3)
     data, packed_edges, packed_anchors = _payload(run, edges, anchors, score, truth, turn)
     text = json.dumps(finite(data), allow_nan=False, separators=(",", ":"), default=_plain).replace("<", "\\u003c")
     script = "\n".join((_PAGE / name).read_text(encoding="utf-8") for name in _SCRIPTS)

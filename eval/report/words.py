@@ -112,6 +112,15 @@ def tiles(run: RunFolder, score: RunScore | None, points: int) -> list[dict[str,
             add("unknown", "", "scale")
         else:
             add(f"\u00b1{100 * sigma / value:.1f}" if value else "?", "%", "scale, 1 sigma")
+    up = summary.get("up")
+    if isinstance(up, dict):
+        sigma_deg = _float(up.get("sigma_deg"))
+        known = math.isfinite(sigma_deg)
+        add(
+            f"\u00b1{sigma_deg:.1f}" if known else "unknown",
+            "\u00b0" if known else "",
+            "up, 1 sigma" if known else "up",
+        )
     for key, name, text in (
         ("fps", "frames per second", "{:.1f}"),
         ("cpu_ms_per_frame", "CPU per frame", "{:.0f}"),

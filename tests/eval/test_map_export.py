@@ -228,6 +228,20 @@ def test_occupancy_needs_metres(run_folder: Callable[..., Path], tmp_path: Path)
         export(tmp_path / "a", "--format", "occupancy")
 
 
+@pytest.mark.parametrize("up", [None, {"source": "unknown", "sigma_deg": None}])
+def test_occupancy_of_a_map_that_may_be_tilted_is_refused_unless_told(
+    up: dict[str, object] | None, run_folder: Callable[..., Path], tmp_path: Path
+) -> None:
+    run_folder(tmp_path / "a")
+    path = tmp_path / "a" / "summary.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "up": up}))
+    with pytest.raises(EdgeSlamError, match="--z-is-up"):
+        export(tmp_path / "a", "--format", "occupancy")
+    assert export(tmp_path / "a", "--format", "occupancy", "--z-is-up") == 0
+    path.write_text(json.dumps({**json.loads(path.read_text()), "up": {"source": "edges", "sigma_deg": 2.0}}))
+    assert export(tmp_path / "a", "--format", "occupancy") == 0
+
+
 @pytest.mark.parametrize("scale", ["null", "{}", None], ids=["null", "empty", "no summary"])
 def test_unknown_units_are_said(
     scale: str | None, run_folder: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -1,0 +1,68 @@
+"""Where up is by straight edges of a simulated world: segments that lie along three axes and across one of them."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from edgeslam_torch.mapping.level.straight_edges import Segments, vertical
+
+LEVEL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+"""``R_w_c`` of a level camera that looks along x."""
+
+
+def cameras(count=24, pan_deg=60.0, pitch_deg=-20.0, roll_deg=0.0):
+    """Rotations of a camera that pans about the vertical."""
+    held = Rotation.from_euler("ZX", [roll_deg, pitch_deg], degrees=True).as_matrix()
+    pans = Rotation.from_euler("z", np.linspace(0.0, pan_deg, count)[:, None], degrees=True).as_matrix()
+    return pans @ LEVEL @ held
+
+
+def room(rng, count=24, per_keyframe=20, verticals=0.3, clutter=0.2, noise_rad=0.01):
+    """Verticals, horizontals of two main directions and of any, and clutter."""
+    n = count * per_keyframe
+    yaw = np.where(rng.random(n) < 0.6, rng.integers(0, 2, n) * np.pi / 2, rng.uniform(0, np.pi, n))
+    d = np.stack([np.cos(yaw), np.sin(yaw), np.zeros(n)], axis=1)
+    kind = rng.random(n)
+    d[kind < verticals] = [0.0, 0.0, 1.0]
+    random = kind > 1.0 - clutter
+    d[random] = rng.normal(size=(random.sum(), 3))
+    d += noise_rad * rng.normal(size=(n, 3))
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    normal = np.cross(d, rng.normal(size=(n, 3)))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    keyframe = np.repeat(np.arange(count), per_keyframe)
+    return Segments(normal, d, np.full(n, 0.05), rng.uniform(0.1, 0.3, n), keyframe)
+
+
+def turned(segments, R):
+    return Segments(
+        segments.normal @ R.T, segments.direction @ R.T, segments.sigma_rad, segments.length, segments.keyframe
+    )
+
+
+@pytest.mark.parametrize("pitch_deg, roll_deg", [(0.0, 0.0), (-40.0, 0.0), (-30.0, 25.0), (15.0, -25.0)])
+@pytest.mark.parametrize("verticals", [0.0, 0.3])
+def test_a_room_tells_where_up_is_however_the_map_leans(rng, pitch_deg, roll_deg, verticals):
+    R_m_w = Rotation.from_euler("xyz", [0.6, -0.3, 1.0]).as_matrix()
+    R_w_c = cameras(pitch_deg=pitch_deg, roll_deg=roll_deg)
+    up = vertical(turned(room(rng, verticals=verticals), R_m_w), R_m_w @ R_w_c)
+    assert up is not None
+    assert np.degrees(np.arccos(up.direction @ R_m_w[:, 2])) < 1.0
+    assert np.radians(1.0) < up.sigma_rad < np.radians(4.0)
+
+
+@pytest.mark.parametrize("roll_deg", [90.0, -90.0, 80.0])
+def test_a_turned_phone_is_not_taken_for_a_tilted_room(rng, roll_deg):
+    assert vertical(room(rng), cameras(roll_deg=roll_deg)) is None
+
+
+def test_clutter_tells_nothing(rng):
+    assert vertical(room(rng, clutter=1.0, verticals=0.0), cameras()) is None
+
+
+def test_a_guessed_lens_is_not_relied_on(rng):
+    assert vertical(room(rng), cameras(), focal_sigma=0.45) is None
+
+
+def test_few_segments_tell_nothing(rng):
+    assert vertical(room(rng, per_keyframe=1), cameras()) is None
