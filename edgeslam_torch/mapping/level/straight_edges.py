@@ -18,7 +18,7 @@ from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.level import Up
 from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.mapping.edges.edge_map import NEARLY, EdgePoints
-from edgeslam_torch.types import FloatArray
+from edgeslam_torch.types import FloatArray, IntArray
 
 _MOST_KEYFRAMES, _MOST_SEGMENTS = 40, 800
 """That vote, spread evenly over the run, the longest: bounds the time to half a second."""
@@ -77,10 +77,10 @@ class Segments:
     """``(S,)`` of the direction along the great circle."""
     length: FloatArray
     """``(S,)`` in the picture, in focal lengths."""
-    keyframe: FloatArray
+    keyframe: IntArray
     """``(S,)`` number of the keyframe."""
 
-    def take(self, which: FloatArray) -> "Segments":
+    def take(self, which: IntArray) -> "Segments":
         """Some of them."""
         return Segments(
             self.normal[which], self.direction[which], self.sigma_rad[which], self.length[which], self.keyframe[which]
@@ -174,7 +174,7 @@ def segments_of(
 
 
 def _affine(
-    of: FloatArray, t: FloatArray, y: FloatArray, sigma: FloatArray, count: int
+    of: IntArray, t: FloatArray, y: FloatArray, sigma: FloatArray, count: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Values at ``t`` 0 and 1 ``(count,)`` of straight lines through grouped points, and sigma of their slopes."""
     weight = 1.0 / sigma**2
@@ -239,7 +239,8 @@ def _support(v: FloatArray, segments: Segments) -> _Support:
 
 
 def _peaks(v: FloatArray, support: FloatArray, most: int = 8) -> list[FloatArray]:
-    left, peaks = support.copy(), []
+    left = support.copy()
+    peaks: list[FloatArray] = []
     while len(peaks) < most and left.max() > 0:
         peaks.append(v[int(left.argmax())])
         left[np.abs(v @ peaks[-1]) > _APART] = 0.0
