@@ -10,13 +10,13 @@ from typing import Protocol
 
 from edgeslam_torch.calibration.camera_choice import choose_camera
 from edgeslam_torch.errors import SourceError
+from edgeslam_torch.geometry.accelerometer_file import read_specific_force
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.level import SpecificForce
 from edgeslam_torch.readers import flight_folder, images, video
 from edgeslam_torch.readers.bags.bag import SUFFIXES, is_bag
 from edgeslam_torch.readers.bags.recording import open_bag
 from edgeslam_torch.readers.layouts import layout_of, read_sequence, tum
-from edgeslam_torch.readers.layouts.accelerometer import read_specific_force
 from edgeslam_torch.readers.listing import ImageEntry, Problem
 from edgeslam_torch.readers.pace import Steps
 from edgeslam_torch.readers.read_ahead import read_ahead

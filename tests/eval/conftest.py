@@ -61,6 +61,7 @@ def make_run_folder(folder: Path, points: int = 2000, scale: float = 1.0, rate_h
         "cpu_ms_per_frame": 33.1,
         "peak_rss_mb": 412.0,
         "scale": {"value": 1.0, "sigma": 0.03, "source": "depth", "units": "metres"},
+        "up": {"source": "edges", "sigma_deg": 1.8},
     }
     (folder / "summary.json").write_text(json.dumps(summary))
     (folder / "config.toml").write_text("[tracking]\nkeypoints = 1000\n")

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from edgeslam_torch.readers.layouts.accelerometer import read_specific_force
+from edgeslam_torch.geometry.accelerometer_file import read_specific_force
 
 MOUNT = """time_offset_s: 0.0
 T_imu_cam:
