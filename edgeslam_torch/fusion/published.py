@@ -2,11 +2,9 @@
 
 The map itself is never rescaled, and while flying its units are published as they are: the depth network's metres at
 its start, or arbitrary ones. Only sensors of the drone that are sure and contradict what is published revise it, and
-each revision is an event that the output counts: a scale that follows every new estimate would bend the trajectory.
-The similarity then scales about the current camera, so that the live pose does not jump. The final results use the
-final scale throughout. A map that began before the drone had told its attitude is turned upright about the camera when
-it has, once, which is a revision too. Without telemetry, edges or an accelerometer level the final results
-(`mapping/level/`); live poses have the axes of the first camera.
+each revision counts: a scale that follows every estimate would bend the trajectory. The similarity then scales about
+the camera, so that the live pose does not jump. A map that began before the drone's attitude was known is turned upright
+once, likewise. Final results use the final scale, and without telemetry are levelled by `mapping/level/`.
 """
 
 import math
