@@ -1,10 +1,8 @@
 """Transform from map units and axes to the published world: metric and z up, each if known.
 
-The map itself is never rescaled, and while flying its units are published as they are: the depth network's metres at
-its start, or arbitrary ones. Only sensors of the drone that are sure and contradict what is published revise it, and
-each revision counts: a scale that follows every estimate would bend the trajectory. The similarity then scales about
-the camera, so that the live pose does not jump. A map that began before the drone's attitude was known is turned upright
-once, likewise. Final results use the final scale, and without telemetry are levelled by `mapping/level/`.
+The map itself is never rescaled; its units are published as they are, until sensors of the drone that are sure
+contradict them: a revision, about the camera, so that the live pose does not jump. One more turns a map upright that
+began before the drone's attitude was known. Final results without telemetry are levelled by `mapping/level/`.
 """
 
 import math
