@@ -13,6 +13,7 @@ from types import ModuleType
 from edgeslam_torch import __version__
 from edgeslam_torch.console import console, exit_code
 from edgeslam_torch.errors import EdgeSlamError
+from edgeslam_torch.files.output_file import add_overwrite, check_outputs
 from edgeslam_torch.help.pages import described, listing
 from edgeslam_torch.help.parser import EXIT_USAGE, Parser
 
@@ -72,12 +73,14 @@ def _call(name: str, entry: tuple[str, str], arguments: list[str], verbose: bool
     args, unknown = parser.parse_known_args(arguments)
     if unknown:
         parser.error(_unknown_arguments(unknown, parser.options()))
+    check_outputs(parser, args)
     with _messages(verbose):
         return int(module.main(args))
 
 
 def _add_arguments(parser: Parser, module: ModuleType) -> None:
     module.add_arguments(parser)
+    add_overwrite(parser)
     if "--verbose" not in parser.options():
         parser.add_argument("-v", "--verbose", action="store_true", help="debug messages, and tracebacks of errors")
 

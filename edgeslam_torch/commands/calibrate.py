@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from edgeslam_torch.files.output_file import output_file
 from edgeslam_torch.geometry.camera_file import save_camera
 
 if TYPE_CHECKING:
@@ -38,7 +39,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--spacing", type=float, default=0.3, metavar="X", help="AprilGrid: gap / side of a tag")
     parser.add_argument("--marker", type=float, default=18.0, metavar="MM", help="side of a ChArUco marker")
     parser.add_argument("--dictionary", default="DICT_5X5_100", help="of the ChArUco markers (default: DICT_5X5_100)")
-    parser.add_argument("--out", type=Path, default=Path("camera.yaml"), metavar="FILE", help="default: camera.yaml")
+    parser.add_argument(
+        "--out", type=output_file, default=Path("camera.yaml"), metavar="FILE", help="default: camera.yaml"
+    )
     parser.add_argument("--views", type=int, default=25, metavar="N", help="pictures taken from a live camera")
 
 

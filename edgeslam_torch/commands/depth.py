@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from edgeslam_torch.errors import ConfigError, OutputError
+from edgeslam_torch.files.output_file import add_overwrite_to, check_new
 
 if TYPE_CHECKING:
     from edgeslam_torch.geometry.camera import Camera
@@ -48,6 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--threads", type=_positive, default=1, metavar="N", help="threads of one inference")
     parser.add_argument("--max-frames", type=_positive, metavar="N", help="stop after N images")
+    add_overwrite_to(parser)
     parser.add_argument("--sigma", action="store_true", help="write STEM_sigma.npy, too")
 
 
@@ -74,7 +76,10 @@ def main(args: argparse.Namespace) -> int:
             depth = network(np.asarray(camera.undistort_image(frame.image), np.uint8), camera)
             depth, share = _believable(depth)
             shares.append(share)
-            write_depth(args.out, _stem(frame, stems), depth, args.sigma)
+            stem = _stem(frame, stems)
+            for name in _names(stem, args.sigma):
+                check_new(args.out / name, args.overwrite)
+            write_depth(args.out, stem, depth, args.sigma)
     except OSError as error:
         raise OutputError(f"{error.filename or args.out}: cannot be written ({error.strerror or error})") from error
     for problem in problems[:_MAX_PROBLEMS_SHOWN]:
@@ -105,6 +110,11 @@ def write_depth(folder: Path, stem: str, depth: "DepthMap", with_sigma: bool = F
         write_image(folder / name, image)
     if with_sigma:
         write_atomically(folder / f"{stem}_sigma.npy", lambda file: np.save(file, depth.sigma_log))
+
+
+def _names(stem: str, with_sigma: bool) -> list[str]:
+    names = [f"{stem}.npy", f"{stem}.png", f"{stem}_colour.png"]
+    return [*names, f"{stem}_sigma.npy"] if with_sigma else names
 
 
 def _believable(depth: "DepthMap") -> "tuple[DepthMap, float]":

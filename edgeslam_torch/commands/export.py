@@ -12,6 +12,7 @@ import numpy as np
 from edgeslam_torch.errors import ConfigError, OutputError
 from edgeslam_torch.extras import needs_extra
 from edgeslam_torch.files.atomic import write_atomically
+from edgeslam_torch.files.output_file import output_file
 
 if TYPE_CHECKING:
     from torch import nn
@@ -31,7 +32,7 @@ TIMED_RUNS = 40
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's options."""
     parser.add_argument("weights", nargs="?", type=Path, help="weights (.safetensors); the shipped ones by default")
-    parser.add_argument("--out", "-o", type=Path, required=True, help="ONNX file to write")
+    parser.add_argument("--out", "-o", type=output_file, required=True, help="ONNX file to write")
     parser.add_argument("--int8", action="store_true", help="static int8 quantisation; needs --calibrate")
     parser.add_argument("--fp16", action="store_true", help="store weights as float16")
     parser.add_argument("--calibrate", help="images, recording or video like those it will see")

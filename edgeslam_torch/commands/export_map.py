@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from edgeslam_torch.errors import OutputError
+from edgeslam_torch.files.output_file import add_overwrite_to, check_new
 from edgeslam_torch.files.plain import subfolder
 
 if TYPE_CHECKING:
@@ -21,6 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("run", type=Path, metavar="DIR", help="output folder of 'edgeslam run'")
     parser.add_argument("--format", choices=FORMATS, required=True)
     parser.add_argument("--out", type=Path, help="file, folder (colmap, nerfstudio) or file stem (occupancy)")
+    add_overwrite_to(parser)
     parser.add_argument("--max-sigma", type=float, metavar="M", help="omit points with a larger sigma than this [m]")
     parser.add_argument(
         "--min-observations", type=int, default=1, metavar="N", help="omit points with fewer observations"
@@ -36,6 +38,9 @@ def main(args: argparse.Namespace) -> int:
     from edgeslam_torch.eval.inputs.run_folder import open_run
 
     run = open_run(args.run)
+    if args.out is not None:
+        for path in _files(args.out, args.format):
+            check_new(path, args.overwrite)
     cloud = _chosen(run, args)
     try:
         place = _WRITERS[args.format](run, cloud, args)
@@ -47,6 +52,18 @@ def main(args: argparse.Namespace) -> int:
     elif run.units == "unknown":
         print("the folder does not say whether the run is metric: lengths are in its own units")
     return 0
+
+
+def _files(out: Path, kind: str) -> list[Path]:
+    """What will be written, the folders of nerfstudio's pictures by their first."""
+    if kind == "occupancy":
+        return [out.with_suffix(suffix) for suffix in (".pgm", ".yaml")]
+    if kind == "colmap":
+        return [out / name for name in ("cameras.txt", "images.txt", "points3D.txt")]
+    if kind == "nerfstudio":
+        pictures = [out / folder / "00000.png" for folder in ("images", "masks", "depth")]
+        return [out / "transforms.json", out / "edge_map.ply", *pictures]
+    return [out]
 
 
 def _chosen(run: "RunFolder", args: argparse.Namespace) -> "PointCloud":

@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 
 from edgeslam_torch.errors import ConfigError, OutputError
+from edgeslam_torch.files.output_file import add_overwrite_to, check_new, output_file
 
 COMPARISON = "comparison.html"
 
@@ -22,10 +23,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--out",
-        type=Path,
+        type=output_file,
         metavar="FILE",
         help=f"page of two runs side by side (default: {COMPARISON} beside the first of two)",
     )
+    add_overwrite_to(parser)
 
 
 def main(args: argparse.Namespace) -> int:
@@ -52,6 +54,7 @@ def _compared(args: argparse.Namespace) -> Path:
 
     first, second = args.runs
     out: Path = args.out if args.out is not None else first.resolve().parent / COMPARISON
+    check_new(out, args.overwrite)
     try:
         return write_comparison(first, second, out, args.groundtruth, judge_map=not args.no_map_score)
     except OSError as error:

@@ -9,6 +9,8 @@ from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from edgeslam_torch.files.output_file import output_file
+
 if TYPE_CHECKING:
     from edgeslam_torch.atlas.saved import SavedAtlas
     from edgeslam_torch.config import SlamConfig
@@ -59,7 +61,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--atlas", type=Path, metavar="FILE", help="fly in the map of an earlier flight, once recognised"
     )
-    parser.add_argument("--save-atlas", type=Path, metavar="FILE", help="save the map for later flights (--atlas)")
+    parser.add_argument(
+        "--save-atlas", type=output_file, metavar="FILE", help="save the map for later flights (--atlas)"
+    )
     parser.add_argument("--record", type=Path, metavar="DIR", help="record a live source, to run it again")
     parser.add_argument("--lossless", action="store_true", help="record PNG instead of JPEG (quality 95)")
     parser.add_argument("--start", type=_whole, default=0, metavar="N", help="leave out the first N frames")
@@ -80,10 +84,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="progress bar (default: when the output is a terminal; a line every few seconds otherwise)",
     )
     parser.add_argument("--viewer", action="store_true", help="watch it in rerun ([viewer] extra)")
-    parser.add_argument("--save-rrd", type=Path, metavar="FILE", help="save the rerun recording to a file instead")
+    parser.add_argument(
+        "--save-rrd", type=output_file, metavar="FILE", help="save the rerun recording to a file instead"
+    )
     parser.add_argument(
         "--save-mcap",
-        type=Path,
+        type=output_file,
         metavar="FILE",
         help="save the run as ROS 2 messages, for Foxglove and RViz ([bags] extra)",
     )
@@ -232,7 +238,7 @@ def _check_atlas_can_be_saved(path: Path | None) -> None:
         from edgeslam_torch.atlas.atlas_file import is_atlas
 
         if not is_atlas(path):
-            raise OutputError(f"{path}: exists and is no atlas; give another file to --save-atlas")
+            raise OutputError(f"{path}: is no atlas and stays; give another file to --save-atlas")
 
 
 def _atlas_words(summary: dict[str, Any]) -> list[str]:

@@ -5,6 +5,7 @@ import webbrowser
 from pathlib import Path
 
 from edgeslam_torch.errors import OutputError
+from edgeslam_torch.files.output_file import output_file
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -13,7 +14,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--viewer", action="store_true", help="the rerun viewer instead of the browser ([viewer] extra)"
     )
-    parser.add_argument("--save-rrd", type=Path, metavar="FILE", help="write a rerun recording instead of showing it")
+    parser.add_argument(
+        "--save-rrd", type=output_file, metavar="FILE", help="write a rerun recording instead of showing it"
+    )
     parser.add_argument("--print", action="store_true", dest="only_print", help="only print the path of the page")
 
 

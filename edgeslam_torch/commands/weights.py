@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from edgeslam_torch.errors import ConfigError, OutputError
+from edgeslam_torch.files.output_file import output_file
 from edgeslam_torch.models.record import weights_file
 
 if TYPE_CHECKING:
@@ -24,13 +25,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     actions.add_parser("list", help="shipped, downloaded and downloadable weights")
     download = actions.add_parser("download", help="fetch official FastDepth weights, or a network of others")
     download.add_argument("name", help="as 'list' prints it")
-    download.add_argument("--out", "-o", type=Path, help="where to put the file (default: the cache)")
+    download.add_argument("--out", "-o", type=output_file, help="where to put the file (default: the cache)")
     download.add_argument(
         "--sha256", type=_sha256, help="expected SHA-256 of the download (default: that of the first download)"
     )
     convert = actions.add_parser("convert", help="convert an official .pth.tar to .safetensors without executing it")
     convert.add_argument("checkpoint", type=Path)
-    convert.add_argument("--out", "-o", type=Path, required=True)
+    convert.add_argument("--out", "-o", type=output_file, required=True)
     inspect = actions.add_parser("inspect", help="print the metadata of a weights file")
     inspect.add_argument(
         "weights",

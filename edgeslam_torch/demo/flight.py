@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from edgeslam_torch.errors import ConfigError, OutputError
+from edgeslam_torch.files.record_files import read_mapping
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.synthetic.flights.courses import COURSES, RATE_HZ, SECONDS, record_flight, simulated_camera
 from edgeslam_torch.synthetic.flights.degrade import CLEAN, CameraFaults
@@ -104,8 +105,22 @@ def record(folder: Path, settings: DemoSettings, on_frame: Callable[[int], None]
     return Recorded(folder, world, flight, time.perf_counter() - start)
 
 
+def _is_demo(recording: Path) -> bool:
+    try:
+        camera = read_mapping(recording / "camera.yaml", "YAML", OutputError)
+        return bool(camera.get("source") == simulated_camera().source)
+    except OutputError:
+        return False
+
+
 def _clear(recording: Path) -> None:
-    """Take away the images of an older demo: a shorter flight must not keep the longer one's."""
+    """Take away the images of an older demo: a shorter flight must not keep the longer one's.
+
+    Raises:
+        OutputError: If the folder holds something else.
+    """
+    if recording.is_dir() and any(recording.iterdir()) and not _is_demo(recording):
+        raise OutputError(f"{recording}: holds what no demo recorded; give another folder to --out")
     try:
         for folder in ("rgb", "depth"):
             for file in sorted((recording / folder).glob("*.*")):

@@ -1,5 +1,6 @@
 """Recording of a flight that is consistent at any moment, also after a crash."""
 
+import os
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -36,7 +37,9 @@ class FlightWriter:
         self.frames = self.states = 0
         self._suffix = "png" if lossless else "jpg"
         self._options = [] if lossless else [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
-        held = next((name for name in _FILES if (folder / name).exists()), None)
+        held = next((name for name in _FILES if os.path.lexists(folder / name)), None)
+        if held is None and (folder / "rgb").is_dir() and any((folder / "rgb").iterdir()):
+            held = "rgb"
         if held is not None:
             raise OutputError(f"{folder}: holds {held} already, of a recording or a run; give another folder")
         try:

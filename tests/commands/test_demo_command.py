@@ -8,7 +8,7 @@ import pytest
 
 from edgeslam_torch.cli import main
 from edgeslam_torch.demo import DemoSettings, map_accuracy, record, run_and_judge
-from edgeslam_torch.errors import ConfigError
+from edgeslam_torch.errors import ConfigError, OutputError
 from edgeslam_torch.readers.source import open_source
 
 
@@ -45,6 +45,14 @@ def test_shorter_demo_leaves_nothing_of_the_longer_one(tmp_path: Path) -> None:
     for seconds in (2.0, 1.0):
         record(tmp_path, DemoSettings(world="corridor", seconds=seconds, rate_hz=5.0, width=160, height=120))
     assert len(list((tmp_path / "rgb").iterdir())) == 5
+
+
+def test_a_demo_clears_no_recording_of_somebody_else(tmp_path: Path) -> None:
+    (tmp_path / "rgb").mkdir()
+    (tmp_path / "rgb" / "1.0.png").write_text("theirs")
+    with pytest.raises(OutputError, match="--out"):
+        record(tmp_path, DemoSettings(world="corridor", seconds=1.0, rate_hz=5.0, width=160, height=120))
+    assert (tmp_path / "rgb" / "1.0.png").read_text() == "theirs"
 
 
 @pytest.mark.slow

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from edgeslam_torch.commands.flying._signals import Signals, say
+from edgeslam_torch.files.output_file import output_file
 
 if TYPE_CHECKING:
     from edgeslam_torch.flying.navigator import Navigator
@@ -54,7 +55,7 @@ def _add_common(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--back", action="store_true", help="return to the take-off before landing")
     parser.add_argument("--record", type=Path, metavar="DIR", help="record pictures, state and decisions")
     parser.add_argument("--viewer", action="store_true", help="watch space, way and reasons in rerun ([viewer] extra)")
-    parser.add_argument("--save-rrd", type=Path, metavar="FILE", help="save that recording to a file instead")
+    parser.add_argument("--save-rrd", type=output_file, metavar="FILE", help="save that recording to a file instead")
     parser.add_argument("--camera", metavar="FILE|PRESET", help="calibration of the drone's camera")
     parser.add_argument("--speed", type=float, metavar="M_S", help="cruising speed (default: 0.5)")
     parser.add_argument("--height", type=float, metavar="M", help="height of flight (default: 1.15)")

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from edgeslam_torch.errors import OutputError, SourceError
 from edgeslam_torch.files.atomic import write_text
+from edgeslam_torch.files.output_file import output_file
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -23,7 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", type=Path, metavar="DIR", help="folder for the results; finished runs are not repeated"
     )
-    parser.add_argument("--markdown", type=Path, metavar="FILE", help="also write the tables here")
+    parser.add_argument("--markdown", type=output_file, metavar="FILE", help="also write the tables here")
 
 
 def main(args: argparse.Namespace) -> int:

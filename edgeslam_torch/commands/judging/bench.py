@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from edgeslam_torch.errors import OutputError
 from edgeslam_torch.files.atomic import write_text
+from edgeslam_torch.files.output_file import output_file
 
 if TYPE_CHECKING:
     from edgeslam_torch.eval.benchmark.benchmark import BenchSettings
@@ -64,8 +65,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="of those flights at a time (default: 1)")
     parser.add_argument("--no-micro", action="store_true", help="omit the times of solver and depth network")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the runs (default: runs/bench-TIME)")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="also write the results here")
-    parser.add_argument("--markdown", type=Path, metavar="FILE", help="also write the tables here")
+    parser.add_argument("--json", type=output_file, metavar="FILE", help="also write the results here")
+    parser.add_argument("--markdown", type=output_file, metavar="FILE", help="also write the tables here")
     parser.add_argument(
         "--compare", nargs=2, type=Path, metavar=("A", "B"), help="only compare two results, A before B"
     )

@@ -7,6 +7,7 @@ from pathlib import Path
 from edgeslam_torch.commands.judging.eval import groundtruth_of, one_groundtruth
 from edgeslam_torch.errors import OutputError
 from edgeslam_torch.files.atomic import write_text
+from edgeslam_torch.files.output_file import output_file
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -22,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--max-dt", type=float, default=0.02, metavar="S", help="maximum time between matched poses")
     parser.add_argument("--offset", type=float, default=0.0, metavar="S", help="added to the stamps of both")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write all figures here")
+    parser.add_argument("--json", type=output_file, metavar="FILE", help="write all figures here")
 
 
 def main(args: argparse.Namespace) -> int:

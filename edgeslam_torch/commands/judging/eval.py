@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from edgeslam_torch.errors import ConfigError, EdgeSlamError, OutputError
 from edgeslam_torch.extras import needs_extra
 from edgeslam_torch.files.atomic import write_text
+from edgeslam_torch.files.output_file import add_overwrite_to, check_new, output_file
 
 if TYPE_CHECKING:
     from edgeslam_torch.eval.metrics.common_frames import CommonScore
@@ -50,9 +51,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="also evaluate all of them on their common frames (a system that starts late has fewer)",
     )
-    parser.add_argument("--json", type=Path, help="write all figures here")
+    parser.add_argument("--json", type=output_file, help="write all figures here")
     parser.add_argument(
-        "--markdown", type=Path, metavar="FILE", help="write the tables here as Markdown ('-': print it)"
+        "--markdown", type=output_file, metavar="FILE", help="write the tables here as Markdown ('-': print it)"
     )
     parser.add_argument(
         "--plots",
@@ -66,6 +67,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar=("FORMAT", "PATH"),
         help="also write the (first) trajectory as tum, euroc, kitti or 7scenes",
     )
+    add_overwrite_to(parser)
 
 
 def main(args: argparse.Namespace) -> int:
@@ -188,7 +190,7 @@ def _write_files(args: argparse.Namespace, scores: "list[RunScore]", judged: lis
     if args.json is not None:
         write_text(args.json, json.dumps([s.to_dict() for s in scores], indent=1, default=str) + "\n")
     if args.plots is not None:
-        _plot(args.plots, scores, judged)
+        _plot(args.plots, scores, judged, args.overwrite)
     if args.convert is not None:
         name, target = args.convert
         if name not in WRITERS:
@@ -196,10 +198,19 @@ def _write_files(args: argparse.Namespace, scores: "list[RunScore]", judged: lis
         trajectory = read_trajectory(judged[0][0])
         if not trajectory.oriented:
             raise OutputError(f"{trajectory.source}: positions alone, and {name} has orientations: not converted")
+        for path in _conversion(name, Path(target)):
+            check_new(path, args.overwrite, "--convert")
         WRITERS[name](trajectory, target)
 
 
-def _plot(folder: Path, scores: "list[RunScore]", judged: list[tuple[Path, Path]]) -> None:
+def _conversion(name: str, target: Path) -> list[Path]:
+    """What would be written, of many poses the first that is there."""
+    if name == "7scenes":
+        return [*sorted(target.glob("*.pose.txt"))[:1], target / "times.txt"]
+    return [target, target.with_name("times.txt")] if name == "kitti" else [target]
+
+
+def _plot(folder: Path, scores: "list[RunScore]", judged: list[tuple[Path, Path]], overwrite: bool) -> None:
     from edgeslam_torch.eval.inputs.trajectory_files import read_trajectory
 
     with needs_extra("plots", "--plots"):
@@ -211,9 +222,12 @@ def _plot(folder: Path, scores: "list[RunScore]", judged: list[tuple[Path, Path]
         estimate = read_trajectory(run)
         assert score.sim3 is not None, "`evaluate_run` gives it"
         overlays.setdefault(place, []).append((score.name, estimate, score.sim3))
-        plot_errors(read_trajectory(place), estimate, score.sim3, folder / f"{number:02d}_{Path(score.name).name}.png")
+        picture = folder / f"{number:02d}_{Path(score.name).name}.png"
+        check_new(picture, overwrite, "--plots")
+        plot_errors(read_trajectory(place), estimate, score.sim3, picture)
     for number, (place, drawn) in enumerate(overlays.items()):
         name = "trajectories.png" if len(overlays) == 1 else f"trajectories_{number:02d}.png"
+        check_new(folder / name, overwrite, "--plots")
         plot_overlay(read_trajectory(place), drawn, folder / name)
 
 

@@ -1,0 +1,97 @@
+"""Files that the user names for a command to write: nothing is replaced unasked.
+
+One rule for every command: what exists is replaced with ``--overwrite`` alone, and what the command reads never, by
+whatever name or hard link it is given. Folders of runs have a rule of their own, `edgeslam_torch.writers.own_folder`.
+"""
+
+import argparse
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from edgeslam_torch.errors import OutputError
+
+STDOUT = Path("-")
+"""Printed, where a command offers it."""
+
+
+def output_file(text: str) -> Path:
+    """Argument type of such a file: `add_overwrite` and `check_outputs` find options by it."""
+    return Path(text)
+
+
+def add_overwrite(parser: argparse.ArgumentParser) -> None:
+    """Declare ``--overwrite`` where a file to write can be named."""
+    for each in _parsers(parser):
+        if any(action.type is output_file for action in each._actions):
+            add_overwrite_to(each)
+
+
+def add_overwrite_to(parser: argparse.ArgumentParser) -> None:
+    """Declare ``--overwrite``, once."""
+    if "--overwrite" not in parser._option_string_actions:
+        parser.add_argument("--overwrite", action="store_true", help="replace files that exist")
+
+
+def check_outputs(parser: argparse.ArgumentParser, args: argparse.Namespace) -> None:
+    """Check all files to write, before anything is done.
+
+    Raises:
+        OutputError: If one exists and may not be replaced.
+    """
+    actions = {a.dest: a for each in _parsers(parser) for a in each._actions if a.type is output_file}
+    read = [path for name, value in vars(args).items() if name not in actions for path in _paths(value)]
+    named: list[Path] = []
+    for dest, action in actions.items():
+        path: Path | None = getattr(args, dest, None)
+        if path is None or path == STDOUT:
+            continue
+        option = max(action.option_strings, key=len)
+        if any(_same(path, other) for other in named):
+            raise OutputError(f"{path}: given twice; give another file to {option}")
+        named.append(path)
+        if any(_same(path, other) for other in read):
+            raise OutputError(f"{path}: is what the command reads; give another file to {option}")
+        check_new(path, args.overwrite, option)
+
+
+def check_new(path: Path, overwrite: bool, option: str = "--out") -> None:
+    """Check that a file may be written.
+
+    Args:
+        path: The file.
+        overwrite: Whether it may be replaced.
+        option: Where it comes from.
+
+    Raises:
+        OutputError: If it exists and may not be replaced, or is a folder.
+    """
+    if path.is_dir():
+        raise OutputError(f"{path}: is a folder; give a file to {option}")
+    if os.path.lexists(path) and not overwrite:
+        raise OutputError(f"{path}: exists; give another file to {option}, or --overwrite to replace it")
+
+
+def _parsers(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
+    """The parser, and those of its actions."""
+    yield parser
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for inner in action.choices.values():
+                yield from _parsers(inner)
+
+
+def _paths(value: Any) -> Iterator[str | Path]:
+    if isinstance(value, str | Path):
+        yield value
+    elif isinstance(value, list | tuple):
+        for item in value:
+            yield from _paths(item)
+
+
+def _same(path: Path, other: str | Path) -> bool:
+    try:
+        return os.path.realpath(path) == os.path.realpath(other) or os.path.samefile(path, other)
+    except (OSError, ValueError):  # no file, or no name of one
+        return False

@@ -1,0 +1,98 @@
+"""No command replaces a file unasked, and none what it reads."""
+
+import argparse
+import os
+from pathlib import Path
+
+import pytest
+
+from edgeslam_torch.cli import main
+from edgeslam_torch.errors import OutputError
+from edgeslam_torch.files.output_file import add_overwrite, check_new, check_outputs, output_file
+
+
+@pytest.fixture
+def parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("inputs", nargs="+")
+    parser.add_argument("--json", type=output_file)
+    parser.add_argument("--markdown", "-m", type=output_file)
+    add_overwrite(parser)
+    return parser
+
+
+def _check(parser: argparse.ArgumentParser, *words: object) -> None:
+    check_outputs(parser, parser.parse_args([str(word) for word in words]))
+
+
+def test_a_new_file_needs_no_leave(parser, tmp_path: Path) -> None:
+    _check(parser, tmp_path, "x" * 5000, "a\0b", "webcam:0", "--json", tmp_path / "a", "-m", "-")
+
+
+@pytest.mark.parametrize("kind", ["file", "link", "dangling link"])
+def test_what_exists_is_replaced_with_overwrite_alone(parser, tmp_path: Path, kind: str) -> None:
+    path = tmp_path / "a"
+    if kind != "file":
+        path.symlink_to(tmp_path / "b")
+    if kind != "dangling link":
+        (tmp_path / ("b" if kind == "link" else "a")).touch()
+    with pytest.raises(OutputError, match="--overwrite"):
+        _check(parser, "in", "--json", path)
+    _check(parser, "in", "--json", path, "--overwrite")
+
+
+@pytest.mark.parametrize("spelling", ["same", "relative", "symlink", "hard link"])
+def test_what_is_read_is_never_replaced(parser, tmp_path: Path, monkeypatch, spelling: str) -> None:
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "truth.txt"
+    path.write_text("truth")
+    if spelling == "symlink":
+        (tmp_path / "other").symlink_to(path)
+    if spelling == "hard link":
+        os.link(path, tmp_path / "other")
+    other = {"same": path, "relative": Path("truth.txt")}.get(spelling, tmp_path / "other")
+    with pytest.raises(OutputError, match="reads"):
+        _check(parser, "first", path, "--json", other, "--overwrite")
+
+
+def test_two_results_need_two_files(parser, tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match="twice"):
+        _check(parser, "in", "--json", tmp_path / "a", "-m", tmp_path / "." / "a")
+
+
+def test_a_folder_is_no_file(tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match="folder"):
+        check_new(tmp_path, overwrite=True)
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "run IN --save-mcap FILE",
+        "run IN --save-rrd FILE",
+        "run IN --save-atlas FILE",
+        "eval IN -g IN --json FILE",
+        "eval IN -g IN --markdown FILE",
+        "eval IN -g IN --json FILE --overwrite",
+        "eval IN -g IN --convert tum FILE",
+        "compare IN IN -g IN --json FILE",
+        "calibrate IN --out FILE",
+        "export --out FILE",
+        "report IN IN --out FILE",
+        "bench --json FILE",
+        "ablation --markdown FILE",
+        "view IN --save-rrd FILE",
+        "weights convert IN --out FILE",
+        "weights download broad --out FILE",
+    ],
+)
+def test_commands_leave_what_is_there(command: str, tmp_path: Path, capsys) -> None:
+    path = tmp_path / "truth.txt"
+    path.write_text("".join(f"{i / 10:.1f} {i / 7:.4f} {(i % 5) / 3:.4f} 0 0 0 0 1\n" for i in range(60)))
+    before = path.read_bytes()
+    words = [{"IN": str(path), "FILE": str(path)}.get(word, word) for word in command.split()]
+    assert main(words) == 1
+    assert path.read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir()] == ["truth.txt"]
+    last = capsys.readouterr().err.strip().splitlines()[-1]
+    assert last.startswith("edgeslam: error: ") and str(path) in last
