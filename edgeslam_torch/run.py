@@ -256,6 +256,8 @@ class _Run:
         self.tally = Tally()
         self.dropped = Counter()
         self.interrupt = _Interrupt()
+        self.stopped_by: str | None = None
+        """What ended the loop before its time, in words."""
         self.result: RunResult | None = None
         self.last_index: int | None = None
 
@@ -264,6 +266,9 @@ class _Run:
         with self.interrupt:
             try:
                 self._loop()
+            except BaseException as error:
+                self.stopped_by = " ".join(str(error).split()) or type(error).__name__
+                raise
             finally:  # also when the source fails: keep what was done so far
                 if self.tally.frames:
                     self._write(time.perf_counter() - wall, cpu)
@@ -373,7 +378,7 @@ class _Run:
             "mode": str(self.mode),
             "seed": self.config.seed,
             "interrupted": self.interrupt.requested,
-            "ended_early": "interrupted" if self.interrupt.requested else self.writer.failure,
+            "ended_early": "interrupted" if self.interrupt.requested else self.stopped_by or self.writer.failure,
         }
         summary = without_folders(summary, self.writer.folder)
         support = self.slam.support()

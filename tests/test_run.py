@@ -63,6 +63,29 @@ def test_folder_holds_everything(tmp_path, write_tum):
     assert cv2.imread(str(result.folder / "map.png")).shape[1] > 1000
 
 
+@pytest.mark.parametrize(
+    "error", [SourceError("the camera is gone"), RuntimeError("the camera is gone"), MemoryError()]
+)
+@pytest.mark.parametrize("where", ["step", "listener"])
+def test_what_ends_a_run_early_is_in_the_summary_and_raised(tmp_path, write_tum, error, where):
+    def fail(frame, *_):
+        if frame.index == 4:
+            raise error
+        return step(frame, *_) if where == "step" else None
+
+    slam = FakeSlam()
+    step = slam.step
+    if where == "step":
+        slam.step = fail
+    listeners = [SimpleNamespace(on_frame=fail, on_finish=lambda _: None)] if where == "listener" else []
+    source = open_source(write_tum(tmp_path / "seq", 12))
+    with pytest.raises(type(error)):
+        run(source, tmp_path / "out", make_slam=fake(slam), listeners=listeners)
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["ended_early"] == (str(error) or "MemoryError")
+    assert summary["frames"] == (4 if where == "step" else 5)
+
+
 def test_every_file_has_the_rights_that_the_umask_leaves(tmp_path, write_tum):
     before = os.umask(0o027)
     try:
