@@ -628,6 +628,16 @@ def test_a_frozen_video_says_so_and_shows_no_motion():
     assert any("stood still" in w for w in slam.warnings())
 
 
+@pytest.mark.parametrize(("speed_m_s", "accused"), [(0.0, False), (0.4, True)])
+def test_a_hover_is_no_video_that_stood_still(speed_m_s, accused):
+    frames = [replace(panels().frames[0], index=k, stamp_s=1.0 + k / 15) for k in range(45)]
+    slam = EdgeSlam(CAMERA, NO_NETWORK)
+    for frame in frames:
+        told = TelemetrySample(frame.stamp_s, np.array([speed_m_s, 0.0, 0.0]), np.array([0.0, 0.0, 0.3]))
+        slam.step(frame, [told])
+    assert any("stood still" in w for w in slam.warnings()) == accused
+
+
 def test_telemetry_that_the_images_do_not_bear_out_is_a_warning_of_the_system():
     """4 s of flight with velocities of 0."""
     slam = EdgeSlam(CAMERA, NO_NETWORK, depth=panels().depth_function())

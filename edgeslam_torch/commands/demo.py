@@ -63,7 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Run the demo and print the results."""
-    from edgeslam_torch.commands.run import resolved_config, write_page
+    from edgeslam_torch.commands.run import check_tracked, resolved_config, write_page
     from edgeslam_torch.demo import record, run_and_judge
     from edgeslam_torch.progress import make_progress
 
@@ -81,7 +81,10 @@ def main(args: argparse.Namespace) -> int:
         demo = run_and_judge(args.out, recorded, settings, config, [progress])
     write_page(demo.run)
     print(report(demo))
-    return EXIT_INTERRUPTED if demo.run.interrupted else 0
+    if demo.run.interrupted:
+        return EXIT_INTERRUPTED
+    check_tracked(demo.run)
+    return 0
 
 
 def _record_many(args: argparse.Namespace, settings: "DemoSettings") -> int:

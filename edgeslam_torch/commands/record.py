@@ -4,6 +4,7 @@ import argparse
 import threading
 import time
 from collections.abc import Callable
+from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,6 +14,14 @@ if TYPE_CHECKING:
     from edgeslam_torch.drone.tello import StateMessage, Tello
     from edgeslam_torch.readers.live import LiveSource
     from edgeslam_torch.writers.flight_writer import FlightWriter
+
+
+_SWEEP_M = (
+    (0.0, 0.0, 0.5), (0.0, 0.0, -0.5), (0.0, 0.5, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 0.5), (0.0, 1.0, 0.0),
+    (0.0, -0.5, -0.5),
+)  # fmt: skip
+"""Moves of ``--fly`` forward, left, up, which come back to where they began."""
+_TURNS_RAD = (0.5, -1.0, 0.5)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -28,7 +37,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--fly",
         action="store_true",
-        help="fly: take off, climb and descend half a metre (for scale), turn, hover, land",
+        help="fly: take off, sweep up, down and to both sides by half a metre and turn, again and again, land; needs a "
+        "metre of free space around",
     )
 
 
@@ -132,7 +142,10 @@ def _write_states(writer: "FlightWriter", messages: "list[StateMessage]") -> Non
 
 
 def _start_pilot(tello: "Tello") -> Callable[[], None]:
-    """Start a short flight in its own thread; the returned function raises its error, if any."""
+    """Sweep in a thread of its own until the flight ends; the returned function raises its error, if any.
+
+    Sideways and up and down is what shows depth and scale; a hover shows neither.
+    """
     import logging
     from functools import partial
 
@@ -144,8 +157,9 @@ def _start_pilot(tello: "Tello") -> Callable[[], None]:
     def fly() -> None:
         try:
             tello.take_off()
-            steps = [partial(tello.move, 0.0, 0.0, 0.5), partial(tello.move, 0.0, 0.0, -0.5)]
-            for step in [*steps, partial(tello.turn, 0.7), partial(tello.turn, -0.7)]:
+            moves = [partial(tello.move, *by) for by in _SWEEP_M]
+            turns = [partial(tello.turn, by) for by in _TURNS_RAD]
+            for step in cycle([*moves, *turns]):
                 try:
                     step()
                 except NoAnswer as error:  # a lost packet; the next step does not depend on it

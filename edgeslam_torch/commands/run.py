@@ -157,6 +157,7 @@ def main(args: argparse.Namespace) -> int:
             f"edgeslam: interrupted after {result.summary['frames']} frames; results are in {result.folder}\n"
         )
         return EXIT_INTERRUPTED
+    check_tracked(result)
     return 0
 
 
@@ -178,6 +179,21 @@ def _new_folder(folder: Path) -> Path:
     """``runs/NAME``, or ``runs/NAME-2`` and so on beside older runs: none is replaced unless ``--out`` names it."""
     candidates = (folder if number == 1 else folder.with_name(f"{folder.name}-{number}") for number in count(1))
     return next(path for path in candidates if not path.exists() or (path.is_dir() and not any(path.iterdir())))
+
+
+def check_tracked(result: "RunResult") -> None:
+    """A run that tracked nothing is no success.
+
+    Raises:
+        SourceError: If no frame was tracked.
+    """
+    from edgeslam_torch.errors import SourceError
+
+    if not result.summary["tracked"]:
+        raise SourceError(
+            f"no frame was tracked against a map ({result.summary['last_reason'] or 'no reason known'}): the poses in "
+            f"{result.folder} are guesses; the camera must move sideways, up or down, and see something with texture"
+        )
 
 
 def _recorded(args: argparse.Namespace) -> "Source":
@@ -297,11 +313,6 @@ def _report(result: "RunResult", source: "Source") -> None:
         _say(f"left out: {summary['left_out']} in all, listed in {result.folder / 'summary.json'}")
     for warning in summary["warnings"][len(source.warnings) :]:  # the source's warnings were printed before the run
         _say(f"warning: {warning}")
-    if not summary["tracked"]:
-        _say(
-            f"warning: no frame was tracked against a map ({summary['last_reason'] or 'no reason known'}); "
-            "the poses are guesses"
-        )
     missed = "".join(
         f"; {summary[key]} {words}"
         for key, words in (("left_out", "left out"), ("dropped_frames", "dropped to keep up"))

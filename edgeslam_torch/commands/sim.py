@@ -90,8 +90,10 @@ def main(args: argparse.Namespace) -> int:
                 f"Tello emulator: commands on {host}:{emulator.command_port}, state to port {args.state_port}, ", end=""
             )
             print(f"video to port {args.video_port}; Ctrl-C stops it", flush=True)
+            address = _address(args, emulator.command_port)
             print(
-                f"try: edgeslam run tello://{args.bind}:{emulator.command_port}:{args.state_port}:{args.video_port}",
+                f"it stands on the floor; try: edgeslam record {address} --fly --duration 30 --out flights/first, "
+                "then: edgeslam run flights/first",
                 flush=True,
             )
             end_s = math.inf if args.duration is None else time.monotonic() + args.duration
@@ -102,6 +104,13 @@ def main(args: argparse.Namespace) -> int:
     finally:
         signal.signal(signal.SIGTERM, previous)
     return 0
+
+
+def _address(args: argparse.Namespace, command_port: int) -> str:
+    """How a client on this machine names it, ports only where they are not the usual ones."""
+    host = "127.0.0.1" if args.bind == "0.0.0.0" else args.bind
+    ports = (command_port, args.state_port, args.video_port)
+    return f"tello://{host}" + ("" if ports == (8889, 8890, 11111) else ":{}:{}:{}".format(*ports))
 
 
 def _site(name: str, seed: int) -> "Site":

@@ -1,5 +1,7 @@
 """Images that repeat the one before them: a frozen camera, a stuck encoder, or a frame rate raised by copies."""
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -36,12 +38,13 @@ class RepeatedImages:
             self._long[self._since_s] = stamp_s
         return True
 
-    def warning(self) -> str | None:
-        """Warning about long stretches; None without any."""
-        if not self._long:
+    def warning(self, hovers: Callable[[float, float], bool] = lambda from_s, to_s: False) -> str | None:
+        """Warning about long stretches in which the camera did not hover; None without any."""
+        stretches = [stretch for stretch in self._long.items() if not hovers(*stretch)]
+        if not stretches:
             return None
-        first, last = max(self._long.items(), key=lambda stretch: stretch[1] - stretch[0])
-        times = "" if len(self._long) == 1 else f" {len(self._long)} times, the longest"
+        first, last = max(stretches, key=lambda stretch: stretch[1] - stretch[0])
+        times = "" if len(stretches) == 1 else f" {len(stretches)} times, the longest"
         return (
             f"the video stood still{times} from {first:.1f} to {last:.1f} s, the same image again and again: "
             "where the camera moved meanwhile is not known"

@@ -22,6 +22,10 @@ _FROZEN_S = 1.5
 _PACKET_S = 0.15
 _RECENT = 50
 """Messages that are looked through for a charge: five seconds."""
+_HOVER_M_S, _HOVER_RAD = 0.15, math.radians(3.0)
+"""Velocity and turn within which a drone hovers: a Tello tells whole decimetres a second and degrees."""
+_LATE_S = 1.0
+"""Greatest delay of a video behind telemetry: what is told of so much less time is certain to belong to the images."""
 _UPRIGHT = math.cos(math.radians(18.0))
 """Cosine of the lean above which the range sensor's slanted ray is 5 % too long."""
 
@@ -254,6 +258,17 @@ class TelemetryTrack:
         inside = np.clip(stamps_s, stamp[0], stamp[-1])
         beyond = np.clip(np.asarray(stamps_s) - stamp[-1], 0.0, _PACKET_S)  # one packet ahead at the last velocity
         return cubic(stamp, path, velocity, inside) + beyond[:, None] * velocity[-1]
+
+    def hovers(self, from_s: float, to_s: float) -> bool:
+        """Whether every reading of an interval, less the video's delay at its end, tells of no motion."""
+        if not self._samples:
+            return False
+        told = self.readings
+        first, last = np.searchsorted(told.stamp_s, (from_s, max(from_s, to_s - _LATE_S)))
+        if last - first < (to_s - from_s - _LATE_S) / self._max_gap_s or first == last:
+            return False
+        still = np.abs(told.velocity[first:last]).max() < _HOVER_M_S  # false for NaN as well
+        return bool(still and np.ptp(told.rpy[first:last], axis=0).max() < _HOVER_RAD)
 
     def copy(self) -> "TelemetryTrack":
         """The track as it is now, for another thread."""
