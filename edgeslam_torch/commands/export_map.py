@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
 _SAME_S = 1e-3
 """Stamps that differ by less are the same frame's."""
+_KEEP = "of a bag or a video, 'edgeslam run --keep-images' keeps them"
 FORMATS = ("ply", "pcd", "las", "colmap", "nerfstudio", "occupancy")
 
 
@@ -121,6 +122,11 @@ def _colmap(run: "RunFolder", cloud: "PointCloud", args: argparse.Namespace) -> 
     paths = image_paths(run, seen.stamps_s)
     names = [p.name if p is not None else f"{t:.6f}.jpg" for p, t in zip(paths, seen.stamps_s, strict=True)]
     write_colmap(folder, camera, names, run.trajectory.T_w_c[index], cloud, anchors, seen)
+    missing, renamed = paths.count(None), [name for name in names if " " in name]
+    if missing:
+        print(f"{missing} of {len(names)} images are not there; {_KEEP}")
+    if renamed:
+        print(f"{len(renamed)} names have blanks, which COLMAP does not take: rename them with '_', as {renamed[0]!r}")
     return folder
 
 
@@ -135,7 +141,7 @@ def _nerfstudio(run: "RunFolder", cloud: "PointCloud", args: argparse.Namespace)
     paths = [path for path in image_paths(run, seen.stamps_s) if path is not None]
     if len(paths) < len(index):
         have = f"{len(index) - len(paths)} of {len(index)} images of the keyframes are not there"
-        raise OutputError(f"{run.path}: {have}; run 'edgeslam run' on a folder of images")
+        raise OutputError(f"{run.path}: {have}; {_KEEP}")
     write_nerfstudio(folder, camera, paths, run.trajectory.T_w_c[index], cloud, anchors, seen)
     return folder
 

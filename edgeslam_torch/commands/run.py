@@ -93,6 +93,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="save the run as ROS 2 messages, for Foxglove and RViz ([bags] extra)",
     )
+    parser.add_argument(
+        "--keep-images", action="store_true", help="keep keyframes' images: COLMAP and nerfstudio need files"
+    )
     parser.add_argument("--no-report", action="store_true", help="do not write the page report.html")
 
 
@@ -133,6 +136,10 @@ def main(args: argparse.Namespace) -> int:
         from edgeslam_torch.viewer.live_view import LiveView
 
         listeners.append(LiveView(source.name, source.camera, args.save_rrd))
+    if args.keep_images:
+        from edgeslam_torch.writers.keyframe_images import KeyframeImages
+
+        listeners.append(KeyframeImages(out))
     if args.save_mcap is not None:
         from edgeslam_torch.viewer.mcap_view import McapView
 

@@ -15,6 +15,7 @@ from edgeslam_torch.readers import images
 from edgeslam_torch.readers.layouts import layout_of
 from edgeslam_torch.readers.listing import ImageEntry
 from edgeslam_torch.types import FloatArray, PointCloud
+from edgeslam_torch.writers.keyframe_images import kept_images
 
 _CELL_PX = 8
 """Side of the cells in which nearer points hide farther ones."""
@@ -50,16 +51,17 @@ def keyframe_pictures(run: RunFolder, cloud: PointCloud, stamps_s: FloatArray) -
 
 
 def image_paths(run: RunFolder, stamps_s: FloatArray) -> list[Path | None]:
-    """Image files of the run's source at ``stamps_s``; None where there is none, or the source has no image files."""
+    """Image files at ``stamps_s``: of the run's source, else those that the run kept; None where there is none."""
     try:
-        entries = _entries(run)
+        files = {entry.stamp_s: entry.path for entry in _entries(run)}
     except (EdgeSlamError, OSError):
-        entries = []
-    if not entries:
+        files = {}
+    files = files or kept_images(run.path)
+    if not files:
         return [None] * len(stamps_s)
-    known = np.array([entry.stamp_s for entry in entries])
-    index = nearest(known, np.asarray(stamps_s))
-    return [entries[i].path if abs(known[i] - t) < 1e-3 else None for i, t in zip(index, stamps_s, strict=True)]
+    known = np.array(sorted(files))
+    at = [float(known[i]) for i in nearest(known, np.asarray(stamps_s))]
+    return [files[near] if abs(near - t) < 1e-3 else None for near, t in zip(at, stamps_s, strict=True)]
 
 
 def draw_edges(image: np.ndarray, camera: Camera, T_c_w: FloatArray, cloud: PointCloud) -> np.ndarray:
