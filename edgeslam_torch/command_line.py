@@ -21,6 +21,8 @@ Commands = Mapping[str, tuple[str, str]]
 """Name: (module, one line of help)."""
 
 EXIT_ERROR = 1
+_MOST_SHOWN = 2000
+"""Characters of an error; a name of five thousand is none that anybody reads."""
 
 
 def run_command(arguments: list[str], commands: Commands) -> int:
@@ -59,7 +61,7 @@ def _run_command(arguments: list[str], commands: Commands) -> int:
     _quiet_libraries(verbose)
     try:
         return _call(name, commands[name], rest, verbose)
-    except EdgeSlamError as error:
+    except (EdgeSlamError, OSError) as error:
         if verbose:
             raise
         sys.stderr.write(f"edgeslam: error: {_one_line(error)}\n")
@@ -155,4 +157,9 @@ def _quiet_libraries(verbose: bool) -> None:
 
 
 def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split()) or type(error).__name__
+    """What went wrong; of what the system refused the file and the reason, neither of them pages long."""
+    text = str(error)
+    if isinstance(error, OSError) and error.strerror is not None:
+        text = f"{error.filename}: {error.strerror}" if error.filename is not None else error.strerror
+    words = " ".join(text.split()) or type(error).__name__
+    return words if len(words) <= _MOST_SHOWN else f"{words[: _MOST_SHOWN // 2]} ... {words[-_MOST_SHOWN // 2 :]}"

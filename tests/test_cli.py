@@ -394,3 +394,9 @@ def test_a_recording_is_no_run_to_view_or_report(edgeslam, recording):
         code, _, err = edgeslam(command[0], recording, *command[1:])
         assert code == 1 and "no run wrote" in err
     assert sorted(recording.iterdir()) == before
+
+
+@pytest.mark.parametrize("source", ["a" * 5000, "webcam:99999999999", "webcam:\u0663", "b/" * 3000])
+def test_impossible_sources_are_one_short_line(edgeslam, source):
+    code, _, err = edgeslam("run", source)
+    assert code == 1 and len(err.splitlines()) == 1 and len(err) < 3000

@@ -8,6 +8,7 @@ that a replay decides the same.
 import base64
 import importlib
 import json
+import math
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, is_dataclass
@@ -24,6 +25,8 @@ from edgeslam_torch.navigation.tasks import Task
 
 PLAN = "plan.jsonl"
 _HEAD = {"format": "edgeslam planner", "version": 1}
+_MAX_BYTES = 1 << 26
+"""Of a line, and of an array in it: the largest view of a pilot has 2 MB."""
 _OURS = ("edgeslam_torch.navigation.", "edgeslam_torch.flying.")
 """Where records of a flight are defined: no other name in a file is looked up."""
 
@@ -83,7 +86,7 @@ def read_plan(path: Path) -> Iterator[Entry]:
     """
     try:
         with path.open("rb") as file:
-            lines = iter(file)
+            lines = iter(lambda: file.readline(_MAX_BYTES), b"")
             head = _parsed(next(lines, b""), path, 1)
             if not isinstance(head, dict) or head.get("format") != _HEAD["format"]:
                 raise SourceError(f"{path}: not a planner's record")
@@ -102,7 +105,7 @@ def read_plan(path: Path) -> Iterator[Entry]:
 def _parsed(line: bytes, path: Path, number: int) -> Any:
     try:
         return json.loads(line)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise SourceError(f"{path}: line {number} is damaged or not a planner's record") from error
 
 
@@ -111,7 +114,7 @@ def _entry(value: Any, path: Path, number: int) -> Entry:
         entry = _decoded(value)
     except EdgeSlamError as error:
         raise SourceError(f"{path}: line {number}: {error}") from error
-    except (TypeError, ValueError, KeyError, AttributeError, zlib.error) as error:
+    except (TypeError, ValueError, KeyError, AttributeError, RecursionError, MemoryError, zlib.error) as error:
         raise SourceError(f"{path}: line {number} is damaged ({error})") from error
     if not isinstance(entry, Entry):
         raise SourceError(f"{path}: line {number} is no entry of a planner's record")
@@ -141,8 +144,13 @@ def _decoded(value: Any) -> Any:
     if not isinstance(value, dict):
         return value
     if "zlib" in value:
-        data = zlib.decompress(base64.b64decode(value["zlib"]))
-        return np.frombuffer(data, np.dtype(value["dtype"])).reshape(value["shape"]).copy()
+        kind, shape = np.dtype(value["dtype"]), [int(length) for length in value["shape"]]
+        size = math.prod(shape) * kind.itemsize
+        if kind.kind not in "fiub" or not 0 <= size <= _MAX_BYTES:
+            raise ValueError(f"an array of {size} bytes")
+        unpacker = zlib.decompressobj()
+        data = unpacker.decompress(base64.b64decode(value["zlib"]), size + 1)  # no more than the array needs
+        return np.frombuffer(data, kind).reshape(shape).copy()
     return _kind(value["kind"])(**{name: _decoded(x) for name, x in value.items() if name != "kind"})
 
 

@@ -286,7 +286,7 @@ def open_live(spec: str, camera: str | Path | None = None, max_frames: int | Non
     device: int | str = spec
     if spec.startswith("webcam:"):
         number = spec.removeprefix("webcam:")
-        if not (number.isascii() and number.isdigit()):
+        if not (number.isascii() and number.isdigit() and len(number) < 6):
             raise SourceError(f"{spec}: give webcam:N with a number, such as webcam:0")
         device = int(number)
     shown = without_password(spec)

@@ -9,6 +9,9 @@ from edgeslam_torch.errors import SourceError
 from edgeslam_torch.files.atomic import write_atomically
 from edgeslam_torch.types import Observations
 
+_MAX_BYTES = 1 << 29
+"""Of the tables, unpacked: an hour of flight has some 50 MB; a damaged or hostile file may claim any size."""
+
 
 def write_observations(path: Path, seen: Observations) -> None:
     """Write the file, atomically.
@@ -32,11 +35,14 @@ def read_observations(path: Path) -> Observations:
         SourceError: If it is missing or damaged.
     """
     try:
+        with zipfile.ZipFile(path) as packed:
+            if sum(member.file_size for member in packed.infolist()) > _MAX_BYTES:
+                raise SourceError(f"{path}: unpacks to more than {_MAX_BYTES >> 20} MiB; it is not read")
         with np.load(path, allow_pickle=False) as file:
             seen = Observations(file["stamps_s"], file["keyframe"], file["anchor"], file["uv"])
     except FileNotFoundError as error:
         raise SourceError(f"{path}: not there; the run was made by an older version, make it again") from error
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, KeyError, EOFError, MemoryError, zipfile.BadZipFile, NotImplementedError) as error:
         raise SourceError(f"{path}: damaged ({error}); make the run again") from error
     count = len(seen.keyframe)
     if seen.anchor.shape != (count,) or seen.uv.shape != (count, 2) or seen.stamps_s.ndim != 1:

@@ -1,6 +1,9 @@
 """A planner's record holds exactly what it saw and decided, survives a crash, and asks a new planner the same."""
 
+import base64
+import json
 import math
+import zlib
 from dataclasses import replace
 
 import numpy as np
@@ -140,6 +143,12 @@ def test_a_file_that_a_crash_cut_off_is_good_up_to_there(tmp_path):
     assert found.steps[-1].before is None
 
 
+def _array(shape) -> bytes:
+    """A line whose array unpacks to 100 MB, whatever its shape."""
+    packed = base64.b64encode(zlib.compress(bytes(100_000_000))).decode()
+    return (json.dumps({"dtype": "<f8", "shape": shape, "zlib": packed}) + "\n").encode()
+
+
 @pytest.mark.parametrize(
     ("damage", "words"),
     [
@@ -150,6 +159,10 @@ def test_a_file_that_a_crash_cut_off_is_good_up_to_there(tmp_path):
         (lambda lines: [lines[0], b'{"kind": "edgeslam_torch.config:SlamConfig"}\n'], "SlamConfig is not known"),
         (lambda lines: [lines[0], lines[1], lines[2].replace(b"GoTo", b"GoBy"), *lines[3:]], "GoBy is not known"),
         (lambda lines: [lines[0], *lines[3:]], "does not begin with the flight's limits"),
+        (lambda lines: [lines[0], _array(shape=[3])], "line 2 is damaged"),
+        (lambda lines: [lines[0], _array(shape=[10**12])], "line 2 is damaged"),
+        (lambda lines: [lines[0], _array(shape=[-1])], "line 2 is damaged"),
+        (lambda lines: [lines[0], b"[" * 100_000 + b"]" * 100_000 + b"\n"], "line 2 is damaged"),
         (lambda lines: lines[:2], "never saw anything"),
         (lambda lines: [], "not a planner's record"),
     ],

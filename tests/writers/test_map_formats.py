@@ -1,9 +1,11 @@
 """A map in the formats of others: points, images and pixels agree, also for readers that we did not write."""
 
 import importlib.util
+import io
 import json
 import subprocess
 import sys
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -81,7 +83,7 @@ def test_observations_come_back_as_they_were(seen: Observations, tmp_path: Path)
         np.testing.assert_array_equal(getattr(again, name), getattr(seen, name))
 
 
-@pytest.mark.parametrize("damage", ["missing", "text", "cut", "foreign", "short"])
+@pytest.mark.parametrize("damage", ["missing", "text", "cut", "foreign", "short", "claim"])
 def test_damaged_observations_are_one_line(damage: str, seen: Observations, tmp_path: Path) -> None:
     path = tmp_path / "o.npz"
     write_observations(path, seen if damage != "short" else replace(seen, uv=seen.uv[:3]))
@@ -91,6 +93,11 @@ def test_damaged_observations_are_one_line(damage: str, seen: Observations, tmp_
         path.write_text("nothing")
     elif damage == "cut":
         path.write_bytes(path.read_bytes()[:300])
+    elif damage == "claim":  # a table of 8 TB
+        head = io.BytesIO()
+        np.lib.format.write_array_header_1_0(head, {"descr": "<f8", "fortran_order": False, "shape": (10**12,)})
+        with zipfile.ZipFile(path, "w") as packed:
+            packed.writestr("stamps_s.npy", head.getvalue())
     elif damage == "foreign":
         write_observations(path, replace(seen, keyframe=seen.keyframe + 5))
     with pytest.raises(SourceError, match=r"o\.npz: [^\n]*again"):
