@@ -330,7 +330,7 @@ class EdgeSlam:
             held = self._system.published
             self._system.published = Published(estimate.value, held.R, upright=held.upright)
         self._find_up()
-        self._calibration_warning = calibration_warning(self.camera, self.keyframes(), self.map.anchors.p_w)
+        self._calibration_warning = calibration_warning(self.camera, self._shown_keyframes(), self.map.anchors.p_w)
 
     def feel(self, force: SpecificForce) -> None:
         """Readings of an accelerometer over the whole recording; they tell where up is, nothing else."""

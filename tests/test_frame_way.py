@@ -19,7 +19,7 @@ from edgeslam_torch.types import FrameStatus
 HOPS = 51
 """Different calls from one folder into another on a tracked frame's way, without those into `geometry` and `types`."""
 
-CLIMBS = 10
+CLIMBS = 11
 """Times that the way goes on in a higher row of the table than before, in the order in which it first enters files."""
 
 ROOT = Path(edgeslam_torch.__file__).parent

@@ -47,6 +47,8 @@ _CONTRADICTION = 0.15
 icsl_corridor (planes), and euroc_mh05_a, whose strong distortion compensates a wrong length. The map's refinement
 detects them on tum_fr1_xyz, too (1.23 and 0.84 for 1.43 and 0.77), and finds right ones within 1.3 % on five
 recordings and 10 % off on planes (fr3_notexture_a)."""
+_MIN_REFINED = 20
+"""Keyframes: a dozen of a sideways step fit half the focal length at other depths, and their sigma says nothing."""
 _REFINED_KEYFRAMES, _REFINED_ANCHORS = 40, 600
 """Of the map, for a refinement with a free focal length: up to 1.5 s of CPU, once per run."""
 _REFINEMENT = LmConfig(diagnostics=False, max_iterations=30, mu=1e-8, cost_tolerance=1e-6)
@@ -227,7 +229,7 @@ def _refined_with(problem: WindowProblem, camera: Camera, log_scale: float) -> W
 
 def _map_problem(camera: Camera, keyframes: Sequence[Keyframe], p_w: FloatArray) -> WindowProblem | None:
     """Keyframes, and the anchors that most of them see; None if they are few or did not move."""
-    if len(keyframes) < _MIN_CHECKED:
+    if len(keyframes) < _MIN_REFINED:
         return None
     held = [keyframe.keypoints_with_anchor() for keyframe in keyframes]
     anchor = np.concatenate([keyframe.anchor[at] for keyframe, at in zip(keyframes, held, strict=True)])

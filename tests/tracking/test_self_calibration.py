@@ -226,7 +226,7 @@ def adapted(camera, keyframes, p_w):
 
 @pytest.mark.parametrize("factor", [0.7, 1.0, 1.3])
 def test_a_refined_map_tells_the_focal_length_and_its_sigma(factor):
-    keyframes = walked_keyframes(np.random.default_rng(3))
+    keyframes = walked_keyframes(np.random.default_rng(3), 24)
     camera = another_lens(factor)
     estimate = focal_from_map(camera, keyframes, adapted(camera, keyframes, cloud(np.random.default_rng(3))))
     assert estimate.focal_px == pytest.approx(500.0, rel=0.03)
