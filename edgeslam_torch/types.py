@@ -75,7 +75,7 @@ class Frame(Record):
         return str(self.path or f"frame {self.index}")
 
     @classmethod
-    def from_rgb(cls, index: int, stamp_s: float, image: Any) -> "Frame":
+    def from_rgb(cls, index: int, stamp_s: float, image: object) -> "Frame":
         """A frame of an RGB or grey image as networks have it: an array or a tensor of any device.
 
         Args:
@@ -91,13 +91,14 @@ class Frame(Record):
             >>> Frame.from_rgb(0, 0.0, np.full((3, 4, 6), 0.5, np.float32))
             Frame(index=0, stamp_s=0, image=<4x6x3 uint8>, path=None, grey=None)
         """
-        pixels = np.asarray(image.detach().cpu() if hasattr(image, "detach") else image)
+        detach = getattr(image, "detach", None)
+        pixels: Any = np.asarray(image if detach is None else detach().cpu())
         if pixels.ndim == 3 and pixels.shape[0] in (1, 3) and pixels.shape[2] not in (1, 3):
             pixels = pixels.transpose(1, 2, 0)
         if pixels.ndim == 3 and pixels.shape[2] == 1:
             pixels = pixels[..., 0]
         if pixels.ndim not in (2, 3) or (pixels.ndim == 3 and pixels.shape[2] != 3) or not pixels.size:
-            raise ValueError(f"an RGB image is (H, W, 3) or (3, H, W), a grey one (H, W), got {np.shape(image)}")
+            raise ValueError(f"an RGB image is (H, W, 3) or (3, H, W), a grey one (H, W), got {pixels.shape}")
         if np.issubdtype(pixels.dtype, np.floating):
             low, high = float(pixels.min()), float(pixels.max())
             if not (low >= 0.0 and high <= 1.0):  # false for NaN as well

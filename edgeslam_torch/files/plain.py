@@ -80,8 +80,12 @@ def write_new(path: Path, data: bytes) -> None:
         OSError: If it cannot be written.
     """
     with create(path) as file:
-        if file.write(data) != len(data):
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+        left = memoryview(data)
+        while left:  # after a part, the next call says why not all fits
+            written = file.write(left)
+            if not written:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+            left = left[written:]
 
 
 def write_image(path: Path, image: Any, options: Sequence[int] = ()) -> None:
