@@ -8,7 +8,7 @@ import importlib
 import os
 
 # torch's OpenMP threads spin while they wait; with a busy second core that turns a 26 ms inference
-# into 419 ms (docs/decisions/0025-threads-and-seeds.md). Both must be set before torch is first imported.
+# into 419 ms (docs/decisions/24-threads-and-seeds.md). Both must be set before torch is first imported.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 os.environ.setdefault("GOMP_SPINCOUNT", "0")
 

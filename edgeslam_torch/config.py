@@ -147,8 +147,8 @@ class InitialisationConfig:
     """Standard deviation of the second camera's position relative to the baseline above which initialisation waits:
     0.08 are 4.6 degrees of direction."""
     max_direction_sigma_alone: float = 0.05
-    """The same, 2.9 degrees, without a depth network to resolve the two-fold ambiguity of a small motion
-    (docs/decisions/0007: fr1_xyz 9.5 mm, 25 mm at 0.08)."""
+    """The same, 2.9 degrees, without a depth network: a small rotation and a small translation move an image in nearly
+    the same way, and only parallax, or predicted depth, resolves the two-fold ambiguity."""
 
     def __post_init__(self) -> None:
         _positive(self, "min_parallax_deg", "min_points", "max_reprojection_px", "keyframe_gap_s", "max_keyframes")
@@ -259,7 +259,7 @@ class WindowConfig:
     """Stage 4: which losses refine poses, anchors and edge depths, and in which form.
 
     Each term is off, in the default form, or ``literal``: the paper's equation as printed
-    (``docs/equations.md``). Edge and corner terms join the last refinement, after all edges are measured, and the
+    (``docs/theory/README.md``). Edge and corner terms join the last refinement, after all edges are measured, and the
     windows while flying as ``in_flight`` says.
     """
 

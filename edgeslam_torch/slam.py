@@ -108,7 +108,7 @@ class EdgeSlam:
             raise TypeError(f"a Camera is expected, got {type(camera).__name__}: source.camera, or load_camera(FILE)")
         if config is not None and not isinstance(config, SlamConfig):
             raise TypeError(f"a SlamConfig is expected, got {type(config).__name__}")
-        # One thread each: spinning thread pools slow each other down (docs/decisions/0025).
+        # One thread each: spinning thread pools slow each other down (docs/decisions/24-threads-and-seeds.md).
         cv2.setNumThreads(1)
         torch.set_num_threads(1)
         self.camera = camera

@@ -37,7 +37,7 @@ class CycleLoss(ResidualLoss):
 
     Note:
         The paper's pixel form is exactly zero for a camera that does not move, whatever the depths
-        (docs/decisions/0013-cycle-loss.md); the relative depth is the default because it does not shrink the baseline.
+        (docs/decisions/08-cycle-loss.md); the relative depth is the default because it does not shrink the baseline.
     """
 
     def __init__(

@@ -38,7 +38,7 @@ class AngleLoss(ResidualLoss):
 
     Note:
         The cosine is computed directly; the paper's cos(arccos(.)) has an infinite derivative at straight angles
-        (docs/decisions/0014-l-shape-loss.md).
+        (docs/decisions/09-l-shape-loss.md).
     """
 
     def __init__(
@@ -129,7 +129,7 @@ class CollinearityLoss(ResidualLoss):
 
     Note:
         Offsets are divided by the arm's length unless ``literal``: in metres they shrink with the depth
-        (docs/decisions/0014-l-shape-loss.md). The line's direction is a constant for the gradient; at the best fit its
+        (docs/decisions/09-l-shape-loss.md). The line's direction is a constant for the gradient; at the best fit its
         own derivative drops out. The length is no constant: held, it would leave the gradient the one of the metres.
     """
 

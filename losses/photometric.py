@@ -1,7 +1,7 @@
 """Photometric reprojection for self-supervised depth (Godard et al., ICCV 2019): training only.
 
 SSIM and warp are own ones: kornia's are slower, and its warp does not say which pixels it could see
-(docs/decisions/0092-kornia.md). Tests hold them together.
+(docs/decisions/10-canny.md). Tests hold them together.
 """
 
 from typing import TYPE_CHECKING

@@ -20,7 +20,7 @@ MAY_USE = {part: row.may_use | set(LAYERS[0].parts) for row in LAYERS for part i
 """Everybody may use the first row."""
 
 NEVER = {"evo", "djitellopy", "open3d", "torchvision", "pypose"}
-"""GPL, or measured and found wanting (docs/decisions/0028); tests may use some as outside oracles."""
+"""GPL, or measured and found wanting (docs/decisions/27-dependencies.md); tests may use some as outside oracles."""
 
 ORACLES = {"gtsam": "edgeslam_torch.optim.benchmark"}
 """Packages that one module may compare with when they happen to be installed."""

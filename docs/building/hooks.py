@@ -92,7 +92,7 @@ def searched(uri: str) -> dict[str, Any]:
     if uri.startswith("api/"):
         module = uri.removeprefix("api/edgeslam_torch/").removesuffix(".md").removesuffix("/index").replace("/", ".")
         return {"exclude": any(module == name or module.startswith(f"{name}.") for name in INTERNAL)}
-    records = uri == "CHANGELOG.md" or uri.startswith(("decisions/", "experiments/"))
+    records = uri == "CHANGELOG.md" or uri.startswith("decisions/")
     return {"boost": _RECORDS_LAST if records else _GUIDES_FIRST}
 
 

@@ -40,7 +40,8 @@ PLANE_FITS = 5
 """Fits of the plane, each to that part alone."""
 PLANE_SHARE = 0.2
 """Share of the anchors in view that must be found where they lie on one plane: floors and walls with the same paint
-look alike in many places, and a patch of one was found in another room with 0.12 to 0.16 (docs/decisions/0087)."""
+look the same in many places, and a patch of one is found in another room with 0.12 to 0.16
+(docs/decisions/20-loops.md)."""
 MIN_PART = 5
 """Keypoints in a quarter of the view whose median says something."""
 MAX_SHIFT = 0.1

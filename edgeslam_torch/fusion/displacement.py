@@ -10,8 +10,7 @@ changes where furniture passes below. The errors are added up from what they are
 of the rounding, whose error stays in part as long as its reading and else for a second; a velocity bias that decays in
 seconds; and, common to all, the scale, the map's tilt, the video's delay and whether the drone rounds or truncates.
 These nuisance parameters are columns of the covariance, so that the solver does not see them. The scale's column is the
-map's own way :math:`s\,p`: with :math:`d` in its place, a map that disagrees would cost less the smaller it is
-(docs/decisions/0081).
+map's own way :math:`s\,p`: with :math:`d` in its place, a map that disagrees would cost less the smaller it is.
 """
 
 import math

@@ -375,7 +375,7 @@ class MotionFusion:
         """Telemetry and its tie to the map as they are now, for refinement; None while there is none.
 
         Until its metres are known gravity alone speaks, if the map was begun upright: the mean of attitudes that
-        `Orientation.R_w_m` is has the map's own tilt in it by then (docs/decisions/0108).
+        `Orientation.R_w_m` is has the map's own tilt in it by then, and would hold that.
         """
         model = self._model()
         return None if model is None else replace(model, track=self._track.copy())

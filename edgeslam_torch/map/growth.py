@@ -1,7 +1,7 @@
 """What anchors and keyframes remember in map units, taken along where a refinement changes the scale of their place.
 
 A window changes the scale by too little to matter. Telemetry that takes back a drift changes it by half and more:
-anchors would be looked for on the wrong pyramid level, and priors would pull back (docs/decisions/0111).
+anchors would be looked for on the wrong pyramid level, and priors would pull back.
 """
 
 import numpy as np

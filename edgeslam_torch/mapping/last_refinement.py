@@ -30,7 +30,7 @@ ITERATIONS = 30
 COST_TOLERANCE = 1e-5
 MU = 1e-8
 """Every refinement goes to the end: a drift of the scale, or a turn taken for a shift, is a slow mode, which a solver
-that stops at a percent of the cost, or is damped by the stiff modes, never reaches (docs/decisions/0084)."""
+that stops at a percent of the cost, or is damped by the stiff modes, never reaches (docs/decisions/12-solver.md)."""
 
 
 def lm_config(config: WindowConfig) -> LmConfig:

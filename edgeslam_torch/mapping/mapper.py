@@ -33,8 +33,8 @@ from edgeslam_torch.optim.problem import LmConfig, WindowResult
 from edgeslam_torch.types import FloatArray, IntArray
 
 WIDE = 60
-"""Keyframes of a wide window: some 20 s of flight. With 25 a drifted scale swings past the true one
-(docs/decisions/0111)."""
+"""Keyframes of a wide window: some 20 s of flight. Of 25, two fixed poses determine the scale of so
+few that a drifted one swings past the truth."""
 WIDE_EVERY = 4
 """Windows until the next wide one: about a second in flight."""
 WIDE_STEPS = 100
@@ -115,8 +115,7 @@ class Mapper:
     def _take_back_drift(self, keyframe: Keyframe, telemetry: TelemetryModel) -> None:
         """Refine the recent map with telemetry every few keyframes.
 
-        The fixed keyframes around a window hold its scale, right or drifted, against telemetry
-        (docs/decisions/0111).
+        The fixed keyframes around a window hold its scale, right or drifted, against telemetry.
         """
         self._windows += 1
         if self._windows < WIDE_EVERY:

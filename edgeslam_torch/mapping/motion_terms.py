@@ -14,16 +14,16 @@ from edgeslam_torch.optim.problem import CentreFactor, GravityFactor, HeadingFac
 
 ALIKE = 120.0
 """Keypoints err together: a window's thousands of reprojections, taken for independent, hold a wrong scale against
-telemetry whose covariance is honest. So many of them count as one in flight (docs/decisions/0052): thirty while corners
-were whole pixels, more since they are aligned to a fifth of one (docs/decisions/0145)."""
+telemetry whose covariance is honest. So many of them count as one in flight, four times as many as for corners
+on whole pixels, since they are aligned to a fifth of one (docs/decisions/15-telemetry-in-windows.md)."""
 ATTITUDE = 0.25
 """Share of that for attitude, if it is more than one: its errors, of leaning and of the mount, do not average."""
 ALIKE_AT_THE_END = 1.0
 """The same in the last refinement: what drifted was taken back in flight, and telemetry's own errors, which have
-a memory of seconds, would bend the map (docs/decisions/0139)."""
+a memory of seconds, would bend the map."""
 GUESSED = 3000.0
 """The same for gravity in a young map while nothing has told metres: what turns and what moves is told apart by guessed
-depths, which err together in all of the picture (docs/decisions/0114)."""
+depths, which err together in all of the picture."""
 
 
 @dataclass(frozen=True, slots=True)

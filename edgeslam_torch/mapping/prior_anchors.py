@@ -20,7 +20,7 @@ STEPS = 4
 """Gauss-Newton steps in one variable, starting from the prior."""
 MIN_SIGMA_LOG = 0.5
 """Minimum relative sigma of a predicted depth. A network compresses the depth of unseen scenes (in a hall, to a
-quarter of the range of log depth), which its own sigma does not show (docs/decisions/0006)."""
+quarter of the range of log depth), which its own sigma does not show (docs/decisions/05-first-frame.md)."""
 MIN_SHARE = 0.05
 """Lower bound of the inverse depth relative to the prior's, in front of the camera."""
 

@@ -75,7 +75,7 @@ def young_map(slam_map: SlamMap, newest: Keyframe, most: int) -> Window | None:
     """The whole piece of map of the newest keyframe, while it has at most ``most`` keyframes.
 
     A map that began with predicted depths of a wrong shape has a turn where there was a shift, and the other way round,
-    which a window with two fixed poses, one of them wrong, cannot undo (docs/decisions/0083).
+    which a window with two fixed poses, one of them wrong, cannot undo.
     None for fewer than three keyframes, or a camera that never moved.
     """
     piece = slam_map.piece_of(newest.id)
@@ -92,7 +92,7 @@ def recent_map(slam_map: SlamMap, newest: Keyframe, most: int) -> Window | None:
     The earlier keyframe that sees most of the same anchors holds it, its own first one if there is none, and its older
     part holds the unit (`with_same_way`): two poses beside each other would not. None for fewer than three, or a camera
     that never moved, or one that is back where it was before them: known ground has its unit, and what telemetry says
-    of one visit more would tear its anchors from the keyframes that made it (docs/decisions/0148).
+    of one visit more would tear its anchors from the keyframes that made it.
     """
     piece = slam_map.piece_of(newest.id)
     keyframes = [k for id, k in sorted(slam_map.keyframes.items()) if slam_map.piece_of(id) == piece]
@@ -256,7 +256,7 @@ def write_back(slam_map: SlamMap, window: Window, keypoint: list[IntArray], resu
     """Write the result of `window_problem` back to the map; outlier observations are removed.
 
     Not where the solver ran out of steps: half-way, residuals do not tell which observations are wrong, and a keyframe
-    that loses its right ones hangs on nothing (docs/decisions/0111).
+    that loses its right ones hangs on nothing.
     """
     if result.stop is StopReason.NOT_FINITE:  # its residuals say nothing, so no observation disagrees
         return

@@ -28,7 +28,7 @@ from edgeslam_torch.types import FloatArray, Frame, FrameStatus
 ADOPT_SHARE = 0.6
 """Share of the maximum number of inliers below which the view has changed, and the depth network's map is adopted,
 since parallax may never come (rotation, climb, hover); two views are no longer asked then, as they rest on the few
-points that are left (docs/decisions/0074). At 0.4 two views come first on redkitchen and its map is
+points that are left. At 0.4 two views come first on redkitchen and its map is
 better (median 3.7 against 4.2 cm); on bare boards they come first in some seeds, and are wrong (ATE .011 to .030 m;
 .0105 in all five seeds at 0.6)."""
 

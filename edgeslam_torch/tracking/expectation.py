@@ -39,7 +39,10 @@ class Vertical:
 
 @dataclass(frozen=True, slots=True)
 class Attitude:
-    """The camera's rotation as the drone's attitude has it, by the map of the last seconds (docs/decisions/0119)."""
+    """The camera's rotation as the drone's attitude has it, by the map of the last seconds.
+
+    It moves no pose by itself (docs/decisions/17-images-decide.md).
+    """
 
     R_c_w: FloatArray
     """``(3, 3)`` map to camera."""
@@ -61,7 +64,7 @@ class Attitude:
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where the drone's sensors carry the camera, by the map of the last seconds (docs/decisions/0135)."""
+    """Where the drone's sensors carry the camera, by the map of the last seconds."""
 
     R_w_m: FloatArray
     """``(3, 3)`` map to the axes of the drone's world."""

@@ -18,7 +18,7 @@ SHORTEST_GAP_S = 0.04
 
 OLD_S = 10.0
 """Age from which on a keyframe counts as one of an earlier visit: a hand that waves, or a turn on the spot, brings
-another view of what it is looking at, which the map profits from (docs/decisions/0079)."""
+another view of what it is looking at, which the map profits from (docs/decisions/03-keyframes.md)."""
 KNOWN_SHARE = 0.8
 """Share of a view that earlier visits must have seen for it to add nothing: 0.81 and more from the third pass over a
 place on, below 0.05 on new ground."""
@@ -27,7 +27,7 @@ VISITS = 10
 LONG_AGO_S = 30.0
 """Age from which on a keyframe counts as one of a visit that is over: what the drone flies over now it has left."""
 ALIKE_RAD = np.deg2rad(15.0)
-"""Angle between two views of a place up to which their keypoints are recognised (docs/decisions/0078)."""
+"""Angle between two views of a place up to which their keypoints are recognised."""
 ALIKE_LEVELS = 2
 """Pyramid levels between them up to which they are."""
 CHANCE = 0.05

@@ -22,7 +22,7 @@ MIN_MATCHES = 20
 LIKELY_SHARE = 0.12
 """Minimum share of found anchors among those in view (or among the frame's keypoints, if fewer) of a likely place.
 Wrong places reach 0.09 in a corridor whose doors repeat and 0.06 in furnished rooms; right ones have 0.2 and more in
-95 % of redkitchen's frames (docs/decisions/0050-relocalisation.md)."""
+95 % of redkitchen's frames (docs/decisions/18-relocalisation.md)."""
 SURE_SHARE = 0.2
 """The same for a place within reach that needs no further confirmation. While the reachable region is a single place,
 as in the first 0.2 s, a likely one is accepted."""

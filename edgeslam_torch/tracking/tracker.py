@@ -24,7 +24,7 @@ ENOUGH_FOR_ROUGH = 250
 """Maximum number of the last frame's anchors in the first pass; more only cost time."""
 
 FINE = PoseConfig(rounds=3, robust_rounds=1, cost_tolerance=1e-2)
-"""The pass on all matches; its tolerance is 0.1 standard deviations (docs/decisions/0017)."""
+"""The pass on all matches; its tolerance is 0.1 standard deviations: less than the frame's own noise."""
 
 WIDER = 2.5
 """Factor on the radius of a second search: 15 px become 37, which are 4 degrees at 525 px: a turn of 120 degrees a

@@ -1,6 +1,7 @@
 """The benchmark's figures, their noise, and the comparison of two records.
 
-Three kinds of figures, three kinds of noise; docs/decisions/0026-benchmark-noise.md gives the reasons:
+Accuracy repeats to the byte for a seed and speed does not (on a shared machine a run takes 1.5 times as long minutes
+later), so figures have their own kinds of noise:
 
 - accuracy: offline the same seed gives the same bytes, so what differs is the seed. Two medians differ by chance by
   ``2 sqrt(s_a^2/n_a + s_b^2/n_b)``, with ``s`` the sample standard deviation over the seeds;

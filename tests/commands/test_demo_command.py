@@ -67,8 +67,7 @@ def test_demo_runs_and_judges_itself(tmp_path: Path) -> None:
     assert demo.score.ate_sim3_m < 0.025
     assert demo.score.ate_online_sim3_m < 0.08
     assert abs(demo.score.scale_error) < 0.05
-    # So short a flight states too little: 1.9 sigmas off in the mean square of nine seeds, .8 in flights of 20 s
-    # (docs/experiments/known-limitations.md).
+    # So short a flight states too little: 1.9 sigmas off in the mean square of nine seeds, .8 in flights of 20 s.
     assert abs(demo.score.scale_error) < 3.5 * demo.run.summary["scale"]["sigma"] / demo.run.summary["scale"]["value"]
     assert demo.map is not None
     assert demo.map.points > 11_500

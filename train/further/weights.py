@@ -2,7 +2,6 @@
 
 It goes on from the shipped weights with rendered corridors, halls, sites and views from near (`places`) beside
 recordings; ``--leave-out`` keeps one of these for judging. `mean` then averages the weights of before and after.
-docs/experiments/depth-weights.md has the figures.
 """
 
 import argparse

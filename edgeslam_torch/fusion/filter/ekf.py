@@ -274,7 +274,7 @@ class Ekf:
                 return Outcome.REFUSED
             outcome = Outcome.RECOVERED
             # The filter was overconfident: inflate what the measurement tells of, according to the innovation. All of
-            # the covariance would grow for ever with it, as nothing measures the absolute place (docs/decisions/0134).
+            # the covariance would grow for ever with it, as nothing measures the absolute place.
             grown = min(self.nis / n, 1e4) - 1.0
             known = S.copy()
             known.ravel()[:: n + 1] -= noise

@@ -9,7 +9,7 @@ single anchors around their keyframe's ratio, and by how much the ratios wander,
 .. math:: \sigma^2 = \sigma_0^2 + a_b^2 (1 - b)^2 + a_s^2 s^2 + a_w^2 w^2
 
 The coefficients are fitted to the true errors over recordings, simulated flights and spoilt images of both
-(docs/decisions/0060-sigma-of-the-depth-network.md). Where the sum is too large the network is out of its domain.
+(docs/decisions/21-depth-sigma.md). Where the sum is too large the network is out of its domain.
 """
 
 import math

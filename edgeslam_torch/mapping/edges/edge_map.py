@@ -145,7 +145,7 @@ class EdgeMap:
         """Change the depths of each keyframe's edges as refinement has changed those of its anchors since.
 
         They were measured with the poses of their time. A refinement that changes the scale of a place moves anchors
-        and poses, and edges that stay behind pull the poses back in the next one (docs/decisions/0076). Where more than
+        and poses, and edges that stay behind pull the poses back in the next one. Where more than
         a scale has changed, they are measured again.
         """
         for i, host in enumerate(self.hosts):

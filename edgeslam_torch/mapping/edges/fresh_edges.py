@@ -2,7 +2,7 @@
 
 `EdgeMap` measures a keyframe's edges when others have followed and keeps what two of them agree on: two seconds after
 the picture, which is late for what is in the way. These here are one picture's word, against keyframes that are there
-already. Nine of ten that agree with two others are right to a fifth (docs/decisions/0158); where the camera has only
+already. Nine of ten that agree with two others are right to a fifth; where the camera has only
 turned there is none.
 """
 

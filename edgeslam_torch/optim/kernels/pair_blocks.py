@@ -2,7 +2,7 @@
 
 Residuals are differentiated by the *relative* pose of host and target, six columns, whatever the window's size;
 blocks are eliminated in those columns, one dense product per tile of blocks (`optim.kernels.tiles`); only then does the
-adjoint map them to the two poses: ``xi_rel = xi_target - Ad(T_target_host) xi_host``. docs/solver.md derives it.
+adjoint map them to the two poses: ``xi_rel = xi_target - Ad(T_target_host) xi_host``. docs/theory/window.md derives it.
 """
 
 from abc import ABC, abstractmethod

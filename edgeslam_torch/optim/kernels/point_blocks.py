@@ -5,7 +5,7 @@ pose's tangent taken in the world, about a centre ``c`` near the anchors, both d
 ``B = (d r / d p_c) R`` by the anchor and ``B [I, -hat(p_w - c)]`` by the pose. So an observation is summarised by
 ``B^T B`` and ``B^T r``, nine numbers; the anchor's block is their sum, the pose's block a sum of their products with
 powers of the anchor's position, and their coupling is ``[I; hat(p_w - c)] B^T B``. The adjoint maps the pose system
-to the cameras' tangents, in which the solver damps and steps. docs/solver.md derives it.
+to the cameras' tangents, in which the solver damps and steps.
 
 Observations lie in tiles of one pose each, so that a pose's rotation is a factor of a batched product; empty slots
 have zero weight.
