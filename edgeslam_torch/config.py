@@ -47,7 +47,9 @@ class OrbConfig:
     candidates: int = 1500
     """Corners detected before they are spread evenly."""
     scale_factor: float = 1.2
+    """Ratio of the sizes of two pyramid levels; as in ORB-SLAM2."""
     levels: int = 8
+    """Pyramid levels; as in ORB-SLAM2."""
     fast_threshold: int = 12
     """FAST threshold in grey levels; low, because the strongest corners of every cell are kept."""
     fast_faint: int = 4
@@ -139,6 +141,7 @@ class InitialisationConfig:
     min_points: int = 80
     """Minimum number of well triangulated anchors."""
     max_reprojection_px: float = 2.0
+    """Maximum reprojection error of a triangulated anchor in either view."""
     keyframe_gap_s: float = 0.15
     """Minimum time between the intermediate frames that become keyframes after initialisation."""
     max_keyframes: int = 12
@@ -218,8 +221,9 @@ class EdgeConfig:
     """Stages 1 and 3: Canny edges and the semi-dense edge map."""
 
     canny_low: float = 40.0
+    """Grey-level gradient (L2 norm, 3x3 Sobel) from which on a pixel continues an edge."""
     canny_high: float = 100.0
-    """Grey-level gradient thresholds, L2 norm, 3x3 Sobel."""
+    """The same for a pixel that starts an edge."""
     max_pixels: int = 5000
     """Edge pixels kept per keyframe, evenly thinned."""
     delay_keyframes: int = 3

@@ -6,7 +6,7 @@
 
 It fine-tunes the shipped network on a run's images, two at a time, by map points, photometry and the edge cycle. Any
 network from images ``(B, 3, H, W)`` to log depth ``(B, 1, H, W)`` can stand in `log_depth`; the losses are explained in
-``docs/training-your-own.md``. ``edgeslam finetune`` does more (measured depth, validation, resumes).
+``docs/guides/your-own-loop.md``. ``edgeslam finetune`` does more (measured depth, validation, resumes).
 """
 
 import argparse

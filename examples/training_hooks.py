@@ -2,7 +2,7 @@
 
     edgeslam finetune FLIGHT --out tuned --hook training_hooks.py:OwnLoss --hook training_hooks.py:stop
 
-``docs/training-your-own.md`` lists the events, and what may be read and changed in each.
+``docs/guides/your-own-loop.md`` lists the events, and what may be read and changed in each.
 """
 
 import csv

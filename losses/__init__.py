@@ -1,7 +1,7 @@
 """Losses shared by Levenberg-Marquardt refinement and depth training.
 
 Each takes tensors of one device and returns one value an item: ``(B,)`` for a batch ``(B, ...)``. What all promise is
-written in `edgeslam_torch.losses.base`; docs/training-your-own.md has them in a loop of one's own.
+written in `edgeslam_torch.losses.base`; docs/guides/your-own-loop.md has them in a loop of one's own.
 """
 
 if __name__ == "losses":

@@ -1,4 +1,4 @@
-"""The first three commands of docs/tello.md, as a user types them: only the ports are free ones."""
+"""The first three commands of docs/guides/tello.md, as a user types them: only the ports are free ones."""
 
 import json
 import os
@@ -12,7 +12,7 @@ import pytest
 from free_ports import free_ports
 
 pytest.importorskip("av", reason="PyAV is not installed: the [drone] extra")
-GUIDE = Path(__file__).resolve().parent.parent / "docs" / "tello.md"
+GUIDE = Path(__file__).resolve().parent.parent / "docs" / "guides" / "tello.md"
 
 
 def commands():
@@ -38,7 +38,7 @@ def test_the_guide_can_be_followed(tmp_path):
     command, state, video = free_ports(3)
     sim += [f"--command-port={command}", f"--state-port={state}", f"--video-port={video}"]
     record[record.index("tello://127.0.0.1")] += f":{command}:{state}:{video}"
-    where = {"cwd": tmp_path, "env": os.environ | {"PYTHONPATH": str(GUIDE.parent.parent)}, "text": True}
+    where = {"cwd": tmp_path, "env": os.environ | {"PYTHONPATH": str(GUIDE.parents[2])}, "text": True}
     with subprocess.Popen(edgeslam(sim), stdout=subprocess.PIPE, **where) as drone:
         try:
             assert "Tello emulator" in drone.stdout.readline()

@@ -1,4 +1,4 @@
-"""Depth training: data, recipe and hooks; docs/training-your-own.md says how to use them.
+"""Depth training: data, recipe and hooks; docs/guides/your-own-loop.md says how to use them.
 
 The names below load on first use.
 """

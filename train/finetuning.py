@@ -47,8 +47,7 @@ class FromRuns(StrEnum):
     """Supervision for images without labels."""
 
     TEACHER = "teacher"
-    """Dense depth measured with the run's poses: most accurate, and four times as fast as pairs
-    (docs/model_card.md)."""
+    """Dense depth measured with the run's poses: most accurate, and four times as fast as pairs."""
     PAIRS = "pairs"
     """Losses on pairs of images: photometric, map points, cycle, L-shape."""
     BOTH = "both"

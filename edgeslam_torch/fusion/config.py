@@ -42,13 +42,11 @@ class FusionConfig:
     literal: bool = False
     """Paper eqs. (8)-(14) as printed: no time step in Q, no wrap, no gate, absolute visual update."""
     velocity_frame: Literal["world", "body"] = "world"
-    """Frame of ``TelemetrySample.velocity_m_s``: three real flights say the power-on world, paper eq. (9) says body."""
-
+    """Frame of ``TelemetrySample.velocity_m_s``: that of power-on on real flights; paper eq. (9) assumes the body's."""
     velocity_rounding: Literal["auto", "nearest", "truncate"] = "auto"
-    """How the drone makes whole steps of its velocity. A Tello reads 0 twice as often as any other step when its
-    velocity sweeps through 0, so it truncates, and reads half a step low; ``auto`` tells from the flight itself."""
+    """How the drone quantises its velocity: a Tello truncates. ``auto`` estimates it from the flight."""
     velocity_step_m_s: float = 0.1
-
+    """Step of the velocity readings; the SDK's are whole decimetres per second."""
     beta: float = 1.0
     """Growth of the process noise with the spent battery, paper eq. (10)."""
     lambda_tau: float = 0.5
@@ -60,8 +58,7 @@ class FusionConfig:
     sigma_attitude_rad: float = math.radians(0.36)
     """Error of one attitude reading: 1 deg / sqrt(12) of quantisation that repeats while the drone hovers."""
     sigma_turn_rad_sqrt_s: float = 0.05
-    """Random walk of the angles between readings, on top of the turning that the readings themselves show: what makes
-    the stated rotation as far off as it is (`eval.benchmark.consistency`; .06 states up to a third more)."""
+    """Random walk of the angles between readings; fitted so that rotation errors match their covariance."""
     sigma_bias_m_s: float = 0.03
     """Velocity bias at the start (0 takes the bias out of the state: the paper's six states)."""
     bias_walk_m_s_sqrt_s: float = 0.015
@@ -69,14 +66,15 @@ class FusionConfig:
     floor_position_m: float = 1e-3
     """Least process noise [m/sqrt(s)]: keeps the covariance positive whatever the other settings are."""
     initial_sigma_position_m: float = 0.0
+    """Standard deviation of the first position; 0, since it is the origin of the filter's world."""
     initial_sigma_angle_rad: float = math.radians(1.0)
+    """Standard deviation of the first attitude, per axis; attitude is read in whole degrees."""
     gate_probability: float = 0.95
     """Innovations beyond this quantile of chi-square are refused."""
     refusals_before_recovery: int = 5
     """Refusals in a row after which the covariance is inflated and the measurement taken."""
     buffer_s: float = 3.0
-    """How far back a late measurement is still put in its place."""
-
+    """How far back a late measurement is still inserted in time order."""
     delay_s: float | None = None
     """Video delay behind telemetry [s]; ``None`` estimates it from the motion."""
     delay_range_s: tuple[float, float] = (-0.2, 1.2)
@@ -84,12 +82,11 @@ class FusionConfig:
     interval_s: float = 0.5
     """Length of one displacement: long against the pose noise, short against a hand's or drone's swing."""
     window_s: float = 120.0
-    """Displacements older than this are forgotten."""
+    """Age beyond which displacements are dropped."""
     max_gap_s: float = 0.35
     """A longer hole in telemetry or tracking ends a displacement."""
     alignment_sigma_rad: float = math.radians(3.0)
-    """How far the camera's mount may be off, per axis, and with it the attitude-derived rotation from map to power-on
-    world, until the flight's turns say it better."""
+    """Standard deviation of the camera's mount, per axis, until it is estimated from the flight's turns."""
     min_speed_m_s: float = 0.06
     """RMS metric speed below which an interval does not constrain the scale (hover, turning on the spot)."""
     systematic_log: float = 0.008
@@ -97,14 +94,15 @@ class FusionConfig:
     height_systematic_log: float = 0.02
     """The same of height, compared with a climb of decimetres: over that the map itself bends by a centimetre."""
     truncation_systematic_log: float = 0.015
-    """The same when readings are truncated: the remainders rest on a noise before them that is assumed."""
+    """The same when readings are truncated: the mean remainder depends on an assumed noise."""
     sigma_tof_m: float = 0.015
+    """Standard deviation of a reading of the range sensor (SDK ``tof``)."""
     sigma_h_m: float = 0.06
-    """SDK ``h`` moves in steps of 10 cm."""
+    """Standard deviation of the SDK's ``h``, which moves in steps of 10 cm."""
     sigma_baro_m: float = 0.15
+    """Standard deviation of a reading of the barometer."""
     depth_bias_log: float = 0.1
-    """Error of the depth network's scale that all keyframes of a scene share and nothing gives away; what does give it
-    away comes on top (`fusion/scale/depth_scale.py`)."""
+    """Scale error of the depth network that all keyframes of a scene share; the estimated part is added to it."""
 
     def __post_init__(self) -> None:
         for name in _POSITIVE:

@@ -22,7 +22,7 @@ from edgeslam_torch.models.onnx.file import INPUT, LOG_DEPTH, SIGMA
 
 MIN_CALIBRATION_IMAGES = 8
 CALIBRATION_PERCENTILE = 99.99
-"""Percentile at which activations are clipped, so that outliers do not reduce the resolution (docs/model_card.md)."""
+"""Percentile at which activations are clipped, so that outliers do not reduce the resolution."""
 
 
 def quantize_int8(source: Path, target: Path, images: Iterable[NDArray[np.float32]]) -> None:

@@ -93,8 +93,7 @@ def add_shared_arguments(parser: argparse.ArgumentParser, steps: int, batch: int
         action="append",
         default=[],
         metavar="MODULE:NAME",
-        help="a training hook of your own, FILE.py:NAME too: losses, loggers, early stops (docs/training-your-own.md); "
-        "may be given more than once",
+        help="a training hook of your own, FILE.py:NAME too: losses, loggers, early stops; may be given more than once",
     )
 
 

@@ -6,7 +6,7 @@ increments and compared with the pose. Thus the jitter of a visual pose counts o
 before and after it, as if they were independent; only the drift of the map accumulates.
 
 Note:
-    The printed filter and the corrected default differ in seven points (docs/tello.md, "The filter");
+    The printed filter and the corrected default differ in seven points (docs/theory/sensors.md);
     ``FusionConfig.literal`` selects the printed one.
 """
 

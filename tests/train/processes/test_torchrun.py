@@ -1,4 +1,4 @@
-"""``edgeslam finetune`` in two processes, as docs/training.md starts it."""
+"""``edgeslam finetune`` in two processes, as docs/guides/training.md starts it."""
 
 import os
 import shutil
