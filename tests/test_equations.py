@@ -1,4 +1,4 @@
-"""docs/equations.md says where each equation runs: every name exists, and is called on a small simulated flight."""
+"""docs/theory/README.md says where each equation runs: every name exists, and is called on a small simulated flight."""
 
 import importlib
 import inspect
@@ -31,7 +31,8 @@ from edgeslam_torch.train.self_supervised import SelfSupervised
 from edgeslam_torch.train.signals import Slot
 from edgeslam_torch.train.views.posed import load_run
 
-PAGE = Path(__file__).parents[1] / "docs" / "equations.md"
+ROOT = Path(__file__).parents[1]
+PAGE = ROOT / "docs" / "theory" / "README.md"
 WINDOW = WindowConfig(angle="arms", collinearity="relative")
 
 
@@ -128,6 +129,15 @@ def test_every_equation_of_the_paper_has_a_row() -> None:
 def test_only_what_is_said_to_run_nowhere_has_no_name() -> None:
     empty = [row[0] for row in rows() if re.fullmatch(r"[\d, ]+", row[0]) and "`" not in row[2]]
     assert empty == []
+
+
+@pytest.mark.parametrize("page", sorted(PAGE.parent.glob("*.md")), ids=lambda path: path.stem)
+def test_what_the_theory_names_exists(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    for name in re.findall(r"`(edgeslam_torch(?:\.\w+)+)`", text):
+        assert resolve(name)
+    for path in re.findall(r"`([\w/]+/[\w/]*(?:\.py)?)`", text):
+        assert (ROOT / path).exists() or (ROOT / "edgeslam_torch" / path).exists(), path
 
 
 @pytest.mark.parametrize("name", named())

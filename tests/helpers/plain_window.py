@@ -1,5 +1,6 @@
-"""The window's normal equations as docs/solver.md states them, for tests: plain residuals, derivatives by automatic
-differentiation, one dense matrix. Slow and short; the kernels in `edgeslam_torch/optim/kernels` are held to it.
+"""The window's normal equations as docs/theory/window.md states them, for tests: plain residuals, derivatives by
+automatic differentiation, one dense matrix. Slow and short; the kernels in
+`edgeslam_torch/optim/kernels` are compared with it.
 """
 
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""The solver's kernels against the plain window of docs/solver.md: cost, gradient and step of whole windows."""
+"""The solver's kernels against the plain window of docs/theory/window.md: cost, gradient and step of whole windows."""
 
 from dataclasses import replace
 
