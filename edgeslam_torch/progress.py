@@ -107,5 +107,5 @@ class ProgressLines:
 def status_words(output: SlamOutput) -> str:
     """Status of one frame with its reason and the uncertainty of its metres, short."""
     reason = f" ({output.reason})" if output.reason else ""
-    health = "" if output.health is None else f", {output.health.in_words()}"
+    health = "" if output.health is None else f", {output.health}"
     return f"{output.status}{reason}, {output.inliers} inliers{health}"

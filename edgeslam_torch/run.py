@@ -112,7 +112,7 @@ class Slam(Protocol):
         """Pieces of map that the frames belong to."""
 
     def joins(self) -> Sequence[Any]:
-        """Pieces that were joined; ``in_words`` gives the evidence."""
+        """Pieces that were joined; ``str`` gives the evidence."""
 
     def closures(self) -> Sequence[Any]:
         """Loops that were closed, likewise."""
@@ -370,8 +370,8 @@ class _Run:
             },
             "losses": {k: v for k, v in self.slam.losses().items() if math.isfinite(v)},
             "events": dict(self.slam.events),
-            "joins": [join.in_words() for join in self.slam.joins()],
-            "loops": [closure.in_words() for closure in self.slam.closures()],
+            "joins": [str(join) for join in self.slam.joins()],
+            "loops": [str(closure) for closure in self.slam.closures()],
             "atlas": None if self.atlas.load is None else self.slam.earlier_flights(),
             "saved_atlas": None if saved is None else saved.summary(),
             "fusion": {k: v for k, v in self.slam.telemetry_statistics().items() if math.isfinite(v)},

@@ -15,8 +15,8 @@ import numpy as np
 import torch
 
 from edgeslam_torch.atlas.atlas import Atlas, Join
-from edgeslam_torch.atlas.earlier import EarlierFlights
 from edgeslam_torch.atlas.loops import Closure
+from edgeslam_torch.atlas.prior_map import PriorMaps
 from edgeslam_torch.atlas.saved import SavedAtlas, Unit, pack, unpack
 from edgeslam_torch.config import SlamConfig
 from edgeslam_torch.errors import SourceError
@@ -26,7 +26,7 @@ from edgeslam_torch.frontend.image import as_grey
 from edgeslam_torch.frontend.orb import OrbExtractor
 from edgeslam_torch.frontend.repeats import REPEATED, RepeatedImages
 from edgeslam_torch.fusion.motion import MotionFusion
-from edgeslam_torch.fusion.published import Published, first_pose
+from edgeslam_torch.fusion.output_frame import OutputFrame, first_pose
 from edgeslam_torch.fusion.snapshot import Present
 from edgeslam_torch.geometry import se3, sim3
 from edgeslam_torch.geometry.camera import Camera
@@ -44,9 +44,9 @@ from edgeslam_torch.mapping.level.gravity import best_known, up_by_gravity
 from edgeslam_torch.mapping.level.straight_edges import up_by_edges
 from edgeslam_torch.mapping.mapper import Mapper
 from edgeslam_torch.mapping.pipeline import MappingPipeline
-from edgeslam_torch.states.joining import Joining
 from edgeslam_torch.states.lost import Lost
 from edgeslam_torch.states.machine import Machine, State
+from edgeslam_torch.states.map_merging import MapMerging
 from edgeslam_torch.states.starting import FIRST_FRAME, Starting
 from edgeslam_torch.states.step import Step
 from edgeslam_torch.states.system import System
@@ -160,8 +160,8 @@ class EdgeSlam:
             self._system.apart.carried_sigma,
             self._system.fusion.orientation.facing_along,
         )
-        self._joining = Joining(self._system, atlas)
-        self._earlier: EarlierFlights | None = None
+        self._joining = MapMerging(self._system, atlas)
+        self._earlier: PriorMaps | None = None
         self._tracking = Tracking(self._system)
         self._starting = Starting(self._system, self._tracking, atlas, lm, realtime)
         self._lost = Lost(self._system, self._tracking, self._starting)
@@ -203,7 +203,7 @@ class EdgeSlam:
         if self.map.keyframes:
             raise ValueError("an atlas is loaded before the first frame")
         unpack(saved, self.map, self.edges, self.camera)
-        self._earlier = EarlierFlights(saved.flights, saved.keyframes, len(saved.scale))
+        self._earlier = PriorMaps(saved.flights, saved.keyframes, len(saved.scale))
         self._joining.atlas.known_scale.update(enumerate(saved.scale))
 
     def saved_atlas(self, flight: str) -> SavedAtlas:
@@ -328,7 +328,7 @@ class EdgeSlam:
         estimate = self.scale
         if np.isfinite(estimate.sigma):
             held = self._system.published
-            self._system.published = Published(estimate.value, held.R, upright=held.upright)
+            self._system.published = OutputFrame(estimate.value, held.R, upright=held.upright)
         self._find_up()
         self._calibration_warning = calibration_warning(self.camera, self._shown_keyframes(), self.map.anchors.p_w)
 
@@ -384,7 +384,7 @@ class EdgeSlam:
         if not self.log.records:
             return np.zeros((0, 3)), np.zeros((0, 3))
         with self.map.lock:
-            reference = self.map.keyframes[self.map.heir_of(self.log.records[-1].keyframe_id)[0]]
+            reference = self.map.keyframes[self.map.resolve(self.log.records[-1].keyframe_id)[0]]
             seen = self.map.anchors_seen_by([reference, *self.map.covisible(reference, _AROUND)])
             seen = seen[~self.map.anchors.from_depth[seen]]  # a network's guesses tell nothing of another network
             p_w, edges_w = self.map.anchors.p_w[seen], self.edges.around(reference)
@@ -408,7 +408,7 @@ class EdgeSlam:
         with self.map.lock:
             newest = self.log.records[-1]
             T_c_w = newest.T_c_k @ self.map.pose_of(newest.keyframe_id)
-            reference = self.map.keyframes[self.map.heir_of(newest.keyframe_id)[0]]
+            reference = self.map.keyframes[self.map.resolve(newest.keyframe_id)[0]]
             near = [reference, *self.map.covisible(reference, _SEEN_AGAIN)]
             around = [StereoView(k.grey, k.T_c_w) for k in near if k.grey is not None]
         edges = extract_edges(image, self.config.edges.canny_low, self.config.edges.canny_high, MOST)

@@ -360,7 +360,7 @@ class Health:
         """Standard deviation per axis of the newest pose, seen from where the flight began [published unit]."""
         return float(np.hypot(self.apart_sigma, self.drift_sigma))
 
-    def in_words(self) -> str:
+    def __str__(self) -> str:
         """For a status line: metres, disagreement, telemetry and battery, as far as there is something to say."""
         relative = self.scale.sigma / self.scale.value
         words = [f"metres to {100.0 * relative:.0f} %" if self.metric else "no metres"]

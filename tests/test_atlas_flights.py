@@ -10,7 +10,7 @@ from point_map import check_map
 from rendered import CAMERA, film, sideways, stairs_world
 
 from edgeslam_torch.atlas.atlas_file import read_atlas, write_atlas
-from edgeslam_torch.atlas.earlier import FOUND
+from edgeslam_torch.atlas.prior_map import FOUND
 from edgeslam_torch.cli import main
 from edgeslam_torch.config import DepthConfig, SlamConfig
 from edgeslam_torch.eval.metrics.align import umeyama

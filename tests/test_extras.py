@@ -62,7 +62,7 @@ GUARDED_BY_A_CALL = {
     "eval/report/plots.py": "commands/judging/eval.py imports it with the extra's name",
     "edgeslam_torch/readers/bags/limits.py": "`Bag` calls it where the extra is there",
     "edgeslam_torch/readers/bags/mcap_file.py": "likewise",
-    "train/watchers.py": "TensorBoard is made by `curves`, where it is installed",
+    "train/callbacks.py": "TensorBoard is made by `curves`, where it is installed",
 }
 """Files whose importer or maker looks first."""
 

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from edgeslam_torch.config import DepthConfig, OrbConfig, SlamConfig
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.eval.metrics.align import umeyama
-from edgeslam_torch.fusion.published import T_LEVEL, first_pose
+from edgeslam_torch.fusion.output_frame import T_LEVEL, first_pose
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.geometry.rotations import rpy_from_matrix
@@ -242,7 +242,7 @@ def test_surroundings_are_points_of_both_maps_that_lie_on_the_surfaces():
 def test_surroundings_are_what_the_newest_keyframe_and_its_neighbours_see(monkeypatch):
     """Of another room's points those that lie in the picture's direction would count as seen."""
     slam, _ = panels_run()
-    newest = slam.map.keyframes[slam.map.heir_of(slam.log.records[-1].keyframe_id)[0]]
+    newest = slam.map.keyframes[slam.map.resolve(slam.log.records[-1].keyframe_id)[0]]
     monkeypatch.setattr(slam.map, "covisible", lambda keyframe, count: [])
     anchors, _ = slam.surroundings()
     seen = slam.map.anchors_seen_by([newest])

@@ -10,10 +10,10 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from edgeslam_torch.train.callbacks import ProgressBar, TensorBoard
     from edgeslam_torch.train.finetuning import Data, FromRuns, finetune
     from edgeslam_torch.train.folder import Existing, OutFolder, out_folder
     from edgeslam_torch.train.hook_names import named_hooks
-    from edgeslam_torch.train.outcome import Outcome
     from edgeslam_torch.train.processes.distributed import process_group, rank, world
     from edgeslam_torch.train.recipe import (
         DivergedError,
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
         Validation,
         train,
     )
+    from edgeslam_torch.train.result import Outcome
     from edgeslam_torch.train.self_supervised import SelfSupervised, SelfSupervisedWeights
     from edgeslam_torch.train.signals import Signal, Slot, Source, Supervised, SupervisedWeights
     from edgeslam_torch.train.validate import DepthScores, image_tensor, predict_metres, score
@@ -35,7 +36,6 @@ if TYPE_CHECKING:
     from edgeslam_torch.train.views.posed import PosedSequence, PosedView, load_run, relative_motion
     from edgeslam_torch.train.views.shards import load_shards, write_shards
     from edgeslam_torch.train.views.straight import straight_edges
-    from edgeslam_torch.train.watchers import ProgressBar, TensorBoard
 
 _HOMES = {
     "finetuning": "Data FromRuns finetune",

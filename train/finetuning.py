@@ -20,11 +20,12 @@ from edgeslam_torch.models.checkpoint import load_checkpoint, restored, save_che
 from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.models.trainable import DepthModule
 from edgeslam_torch.train.calibrate_sigma import calibrate_sigma
+from edgeslam_torch.train.callbacks import ProgressBar, curves
 from edgeslam_torch.train.folder import TEACHER, TENSORBOARD, WEIGHTS, OutFolder
-from edgeslam_torch.train.given import HOOKS, Given, labelled_set, posed_set, weights_name
-from edgeslam_torch.train.outcome import Outcome
+from edgeslam_torch.train.inputs import HOOKS, Inputs, labelled_set, posed_set, weights_name
 from edgeslam_torch.train.processes.distributed import by_first, rank
 from edgeslam_torch.train.recipe import BEST, FINAL, Hooks, TrainConfig, TrainState, changes_losses, train
+from edgeslam_torch.train.result import Outcome
 from edgeslam_torch.train.self_supervised import SelfSupervised, fit_log_scale
 from edgeslam_torch.train.signals import Signal, Source, Supervised
 from edgeslam_torch.train.teachers.cache import TeacherCache
@@ -34,7 +35,6 @@ from edgeslam_torch.train.views.augment import View
 from edgeslam_torch.train.views.datasets import DepthFolder
 from edgeslam_torch.train.views.labels import check_labels
 from edgeslam_torch.train.views.posed import PosedSequence, PosedView
-from edgeslam_torch.train.watchers import ProgressBar, curves
 
 logger = logging.getLogger(__name__)
 
@@ -121,7 +121,7 @@ def finetune(
         OSError: If the file cannot be written.
     """
     data = data.usable()
-    given = Given(
+    given = Inputs(
         weights_name(network, metadata),
         (*map(labelled_set, data.labelled), *map(posed_set, data.posed)),
         tuple(map(labelled_set, data.validation)),

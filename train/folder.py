@@ -15,10 +15,10 @@ from typing import Any
 from edgeslam_torch import __version__
 from edgeslam_torch.errors import ConfigError, OutputError
 from edgeslam_torch.files.atomic import write_text
-from edgeslam_torch.train.given import NOT_COMPARED, Given, given_from_json
-from edgeslam_torch.train.outcome import Outcome
+from edgeslam_torch.train.inputs import NOT_COMPARED, Inputs, given_from_json
 from edgeslam_torch.train.processes.distributed import by_first, rank, world
 from edgeslam_torch.train.recipe import BEST, CURVE, FINAL, LAST, saved_step
+from edgeslam_torch.train.result import Outcome
 from edgeslam_torch.writers.own_folder import FolderLock, check_free
 
 RECORD, WEIGHTS = "finetune.json", "weights.safetensors"
@@ -60,7 +60,7 @@ class OutFolder:
         """Whether training here writes this file."""
         return any((self.path / name).is_file() and file.samefile(self.path / name) for name in FILES)
 
-    def check(self, given: Given) -> None:
+    def check(self, given: Inputs) -> None:
         """Check whether training with ``given`` may begin or resume here; writes nothing.
 
         Raises:
@@ -92,7 +92,7 @@ class OutFolder:
                 f"{self.path}: holds another fine-tuning ({'; '.join(different)}); give another --out, or {way_out}"
             )
 
-    def begin(self, given: Given) -> int:
+    def begin(self, given: Inputs) -> int:
         """Record the inputs, and remove files of other trainings.
 
         Returns:
@@ -116,7 +116,7 @@ class OutFolder:
         self._write({"given": dataclasses.asdict(given), "sessions": sessions, "outcome": None})
         return step
 
-    def finished(self, given: Given) -> Outcome | None:
+    def finished(self, given: Inputs) -> Outcome | None:
         """Outcome of the training, if exactly this was done before."""
         record = self._record()
         if record is None or record["outcome"] is None or self.existing is Existing.OVERWRITE:

@@ -23,12 +23,12 @@ from edgeslam_torch.atlas.loops import (
     is_within_reach,
     spread,
 )
-from edgeslam_torch.atlas.places import MIN_VOTES, lookalikes
+from edgeslam_torch.atlas.map_merging import look_around, move_piece, share_anchors, weld
+from edgeslam_torch.atlas.place_recognition import MIN_VOTES, lookalikes
 from edgeslam_torch.atlas.saved import BEFORE_S
-from edgeslam_torch.atlas.turned import Facing, Turned, angle_between, is_turned, turn_about
-from edgeslam_torch.atlas.unit import AGAIN_S as UNIT_AGAIN_S
-from edgeslam_torch.atlas.unit import Rescaled, about, is_other
-from edgeslam_torch.atlas.weld import look_around, move_piece, share_anchors, weld
+from edgeslam_torch.atlas.submap_heading import Facing, Turned, angle_between, is_turned, turn_about
+from edgeslam_torch.atlas.submap_scale import AGAIN_S as UNIT_AGAIN_S
+from edgeslam_torch.atlas.submap_scale import Rescaled, about, is_other
 from edgeslam_torch.geometry import sim3
 from edgeslam_torch.map.keyframe import NO_ANCHOR, Keyframe
 from edgeslam_torch.map.trajectory import TrajectoryLog
@@ -84,7 +84,7 @@ class Join:
         """Factor by which the map grew around a keyframe that belonged to a piece."""
         return (sim3.scale_of(self.S) if self.moved == piece else 1.0) * self.grown.get(keyframe_id, 1.0)
 
-    def in_words(self) -> str:
+    def __str__(self) -> str:
         """For `status.csv` and the summary."""
         scale = sim3.scale_of(self.S)
         return (

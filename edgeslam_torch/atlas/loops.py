@@ -12,8 +12,8 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
 from edgeslam_torch.atlas.links import MAX_SHIFT, Link
+from edgeslam_torch.atlas.map_merging import move_anchors, move_keyframes
 from edgeslam_torch.atlas.saved import BEFORE_S
-from edgeslam_torch.atlas.weld import move_anchors, move_keyframes
 from edgeslam_torch.geometry import se3, sim3
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.map.keyframe import Keyframe
@@ -48,7 +48,7 @@ _CARRIED_SHARED = 100
 _NO_WAY = 1e-9
 """Length of a way between two cameras in one place [map units]: a graph takes 0 for no way at all."""
 WITHIN_PX = 5.0
-"""Offset up to which tracking and the window find the old anchors by themselves, as in `mapping/reobserve.py`."""
+"""Offset up to which tracking and the window find the old anchors by themselves (`mapping/local_loop_closure.py`)."""
 SIGMAS = 3.0
 """Difference of scale beyond which it is not chance."""
 WITHIN_LOG = 0.1
@@ -120,7 +120,7 @@ class Closure:
         """Factor by which the map grew around a keyframe."""
         return self.grown.get(keyframe_id, 1.0)
 
-    def in_words(self) -> str:
+    def __str__(self) -> str:
         """For `status.csv` and the summary."""
         since = f"after {self.away_s:.1f} s" if np.isfinite(self.away_s) else "from an earlier flight"
         return (
@@ -283,7 +283,7 @@ def spread(
             move_anchors(slam_map.anchors, ids, S[id])
         move_keyframes(slam_map, edges, log, S)
     grown = {id: sim3.scale_of(moved) for id, moved in S.items()}
-    grown |= {id: grown[heir] for id in slam_map.links if (heir := slam_map.heir_of(id)[0]) in grown}
+    grown |= {id: grown[heir] for id in slam_map.links if (heir := slam_map.resolve(id)[0]) in grown}
     shift, turn = _off(best, before)
     return Closure(
         max(one.keyframe.stamp_s for one in links),
@@ -371,6 +371,6 @@ def _hosted(slam_map: SlamMap, members: list[Keyframe]) -> dict[int, IntArray]:
     owner = owner[:-1]
     alive = {k.id for k in members}
     for id in np.flatnonzero((owner >= 0) & anchors.from_depth):
-        heir = slam_map.heir_of(int(anchors.host[id]))[0] if anchors.host[id] >= 0 else -1
+        heir = slam_map.resolve(int(anchors.host[id]))[0] if anchors.host[id] >= 0 else -1
         owner[id] = heir if heir in alive else owner[id]
     return {k.id: np.flatnonzero(owner == k.id) for k in members}

@@ -86,10 +86,10 @@ def pack(
     pieces = sorted({slam_map.piece_of(id) for id in alive})
     unit = [units.get(piece, Unit(np.eye(4), ScaleEstimate())) for piece in pieces]
     # Where edges and depth priors rest on a removed keyframe, its place relative to a surviving one is kept.
-    hosts = [h for h in edges.hosts if len(h.uv) and slam_map.heir_of(h.keyframe_id)[0] in alive]
+    hosts = [h for h in edges.hosts if len(h.uv) and slam_map.resolve(h.keyframe_id)[0] in alive]
     prior_hosts = slam_map.anchors.host[anchor][slam_map.anchors.from_depth[anchor]].tolist()
     removed = sorted({*prior_hosts, *(h.keyframe_id for h in hosts)} - alive)
-    heirs = {id: slam_map.heir_of(id) for id in removed}
+    heirs = {id: slam_map.resolve(id) for id in removed}
     piece_of = {k.id: pieces.index(slam_map.piece_of(k.id)) for k in keyframes}
     piece_of |= {id: piece_of[heir] for id, (heir, _) in heirs.items()}
     number = {id: n for n, id in enumerate(sorted([*alive, *removed]))}
@@ -156,7 +156,7 @@ def _worth_keeping(slam_map: SlamMap) -> tuple[list[Keyframe], IntArray]:
     anchors, anchor = slam_map.anchors, slam_map.anchors_seen_by(keyframes)
     anchor = anchor[np.abs(anchors.p_w[anchor]).max(axis=1, initial=0.0) <= FARTHEST]
     alive = {k.id for k in keyframes if (k.anchor != NO_ANCHOR).any()}
-    held_by = np.array([slam_map.heir_of(int(h))[0] if h >= 0 else -1 for h in anchors.host[anchor]], dtype=np.int64)
+    held_by = np.array([slam_map.resolve(int(h))[0] if h >= 0 else -1 for h in anchors.host[anchor]], dtype=np.int64)
     anchor = anchor[~anchors.from_depth[anchor] | np.isin(held_by, sorted(alive))]
     kept = np.zeros(len(anchors.alive) + 1, dtype=bool)  # the last row answers for NO_ANCHOR
     kept[anchor] = True

@@ -81,7 +81,7 @@ def main(args: argparse.Namespace) -> int:
         raise OutputError(f"{error.filename}: cannot be written ({error.strerror or error})") from error
     failed = [row for row in rows if row.state == FAILED]
     for row in failed:
-        print(row.in_words())
+        print(str(row))
     print(f"{counts(rows)['done']} of {len(rows)} flights finished, {len(failed)} failed")
     print(f"results: {args.out / PAGE}, {args.out / TABLE}")
     return 1 if failed else 0

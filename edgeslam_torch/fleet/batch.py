@@ -101,7 +101,7 @@ def _work(
         for done, (task, ended) in enumerate(ends, start=1):
             row = _row_after(folder, task, ended)
             rows[row.name] = row
-            say(f"[{done}/{len(waiting)}] {row.in_words()}")
+            say(f"[{done}/{len(waiting)}] {row}")
             if time.monotonic() - written_s > WRITE_EVERY_S:
                 _write(folder, list(rows.values()))
                 written_s = time.monotonic()

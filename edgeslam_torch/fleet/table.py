@@ -75,7 +75,7 @@ class Row:
     figures: dict[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 
-    def in_words(self) -> str:
+    def __str__(self) -> str:
         """One line."""
         again = f", attempt {self.attempts}" if self.attempts > 1 else ""
         if self.state != DONE:

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from edgeslam_torch.flying.outcome import FlightRefused
+from edgeslam_torch.flying.result import FlightRefused
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.limits import NavLimits
 from edgeslam_torch.types import FloatArray

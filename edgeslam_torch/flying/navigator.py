@@ -9,18 +9,18 @@ from types import TracebackType
 from edgeslam_torch.calibration.camera_choice import GUESS
 from edgeslam_torch.drone.address import TelloAddress
 from edgeslam_torch.flying.checks import check_fit, check_goal
-from edgeslam_torch.flying.cockpit import Cockpit, Listener
-from edgeslam_torch.flying.craft import Craft
-from edgeslam_torch.flying.errands import Stay, WayHome
-from edgeslam_torch.flying.outcome import FlightRefused, Outcome
+from edgeslam_torch.flying.flight_controller import FlightController, Listener
 from edgeslam_torch.flying.recorder import Recorder
+from edgeslam_torch.flying.result import FlightRefused, Outcome
 from edgeslam_torch.flying.simulated import is_simulated, site_of
+from edgeslam_torch.flying.tasks import Stay, WayHome
+from edgeslam_torch.flying.vehicle import Vehicle
 from edgeslam_torch.navigation.corridor.follow import FollowCorridor
+from edgeslam_torch.navigation.drone_state import DroneState
 from edgeslam_torch.navigation.limits import NavLimits
+from edgeslam_torch.navigation.openings.exit_tracker import Exit
 from edgeslam_torch.navigation.openings.pathways import Pathway, pathways
-from edgeslam_torch.navigation.openings.watch import Exit
 from edgeslam_torch.navigation.pilot import Phase
-from edgeslam_torch.navigation.sight import Sight
 from edgeslam_torch.navigation.tasks import ARRIVED_M, Explore, GoTo, Task
 from edgeslam_torch.types import FloatArray
 
@@ -51,12 +51,16 @@ class Navigator:
     """
 
     def __init__(
-        self, craft: Craft, cockpit: Cockpit, allow_motion: bool = False, recorder: Recorder | None = None
+        self,
+        vehicle: Vehicle,
+        flight_controller: FlightController,
+        allow_motion: bool = False,
+        recorder: Recorder | None = None,
     ) -> None:
         """Take over a drone; `open` is the way in."""
         self.recorder = recorder
-        self.craft, self.cockpit, self.allow_motion = craft, cockpit, allow_motion
-        self.limits = cockpit.limits
+        self.vehicle, self.flight_controller, self.allow_motion = vehicle, flight_controller, allow_motion
+        self.limits = flight_controller.limits
 
     @classmethod
     def open(
@@ -87,20 +91,20 @@ class Navigator:
         limits = limits or NavLimits()
         recorder = None if record is None else Recorder(Path(record), limits)
         if recorder is None:
-            cockpit = Cockpit(limits, listeners)
+            flight_controller = FlightController(limits, listeners)
         else:
-            cockpit = Cockpit(limits, [*listeners, recorder.moment], recorder.planner)
-        craft: Craft
+            flight_controller = FlightController(limits, [*listeners, recorder.moment], recorder.planner)
+        vehicle: Vehicle
         if is_simulated(location):
-            from edgeslam_torch.flying.lockstep_craft import LockstepCraft
+            from edgeslam_torch.flying.lockstep_vehicle import LockstepVehicle
 
-            craft = LockstepCraft(site_of(location), cockpit, recorder=recorder)
+            vehicle = LockstepVehicle(site_of(location), flight_controller, recorder=recorder)
         else:
-            from edgeslam_torch.flying.udp_craft import UdpCraft
+            from edgeslam_torch.flying.udp_vehicle import UdpVehicle
 
             address = TelloAddress.parse(location)
-            craft = UdpCraft(address, cockpit, allow_motion, camera, recorder=recorder)
-        return cls(craft, cockpit, allow_motion, recorder)
+            vehicle = UdpVehicle(address, flight_controller, allow_motion, camera, recorder=recorder)
+        return cls(vehicle, flight_controller, allow_motion, recorder)
 
     def __enter__(self) -> "Navigator":
         return self
@@ -113,7 +117,7 @@ class Navigator:
     def close(self) -> None:
         """Land if it flies, and leave."""
         try:
-            self.craft.close()
+            self.vehicle.close()
         finally:
             if self.recorder is not None:
                 self.recorder.close()
@@ -125,13 +129,13 @@ class Navigator:
             FlightRefused: If it may not or should not fly.
             TelloError: If the drone does not rise.
         """
-        if self.craft.flying:
+        if self.vehicle.flying:
             raise FlightRefused("it flies already")
-        if self.craft.over:
-            raise FlightRefused(f"this flight is over ({self.craft.over}); open another navigator for the next")
-        check_fit(self.allow_motion, self.craft.battery, self.limits, self.craft.camera.source.startswith(GUESS))
-        self.cockpit.begin(Stay())
-        self.craft.take_off()
+        if self.vehicle.over:
+            raise FlightRefused(f"this flight is over ({self.vehicle.over}); open another navigator for the next")
+        check_fit(self.allow_motion, self.vehicle.battery, self.limits, self.vehicle.camera.source.startswith(GUESS))
+        self.flight_controller.begin(Stay())
+        self.vehicle.take_off()
         return self.fly(Stay(), "in the air")
 
     def go_to(self, goal_w: Sequence[float] | FloatArray) -> Outcome:
@@ -164,7 +168,7 @@ class Navigator:
         """
         until_s = self._until_s(seconds)
         outcome = self.fly(Explore(until_s), "the time is over", lambda: bool(self.exits()))
-        if not self.craft.flying:
+        if not self.vehicle.flying:
             return outcome
         if self.exits():
             return replace(outcome, reached=True, reason="an exit is known")
@@ -172,7 +176,7 @@ class Navigator:
 
     def exits(self) -> tuple[Exit, ...]:
         """Openings of a door's width in a wall that were seen from two places so far, the nearest first."""
-        return self.cockpit.exits()
+        return self.flight_controller.exits()
 
     def pathways(self) -> list[Pathway]:
         """Free corridors around the drone, the longest first.
@@ -180,7 +184,7 @@ class Navigator:
         Raises:
             FlightRefused: If it does not fly.
         """
-        return pathways(self.cockpit.walls(), self._flying_sight().p_w[:2])
+        return pathways(self.flight_controller.walls(), self._flying_sight().p_w[:2])
 
     def go_through(self, exit_: Exit) -> Outcome:
         """Fly through an exit of `exits`, and stop `BEYOND_M` behind it.
@@ -216,7 +220,7 @@ class Navigator:
             FlightRefused: If it does not fly.
         """
         self._flying_sight()
-        return self.fly(WayHome(self.cockpit.track()), "home", to_home=True)
+        return self.fly(WayHome(self.flight_controller.track()), "home", to_home=True)
 
     def fly(self, task: Task, done: str, until: Callable[[], bool] = lambda: False, to_home: bool = False) -> Outcome:
         """Fly any task of `navigation.tasks` to its end; home and down when the battery is low.
@@ -227,21 +231,23 @@ class Navigator:
             until: Ends the task early; then it hovers.
             to_home: Whether the task itself leads home.
         """
-        self.cockpit.begin(task)
-        self.craft.fly(lambda: self.cockpit.ended() is not None or until() or (not to_home and self._wants_home()))
-        path_m, clearance_m = self.cockpit.flown()
-        if not self.craft.flying:
-            return Outcome(False, self.craft.over, clearance_m, path_m)
-        if self.cockpit.ended() is None and until():
-            self.cockpit.begin(Stay())
+        self.flight_controller.begin(task)
+        self.vehicle.fly(
+            lambda: self.flight_controller.ended() is not None or until() or (not to_home and self._wants_home())
+        )
+        path_m, clearance_m = self.flight_controller.flown()
+        if not self.vehicle.flying:
+            return Outcome(False, self.vehicle.over, clearance_m, path_m)
+        if self.flight_controller.ended() is None and until():
+            self.flight_controller.begin(Stay())
             return Outcome(True, done, clearance_m, path_m)
-        if self.cockpit.ended() is None:
+        if self.flight_controller.ended() is None:
             self.return_home()
-            if self.craft.flying:
-                self.craft.land(HOME_BECAUSE)
+            if self.vehicle.flying:
+                self.vehicle.land(HOME_BECAUSE)
             return Outcome(False, HOME_BECAUSE, clearance_m, path_m)
-        if self.cockpit.ended() is not Phase.DONE:
-            return Outcome(False, self.cockpit.pilot.why_stuck(), clearance_m, path_m)
+        if self.flight_controller.ended() is not Phase.DONE:
+            return Outcome(False, self.flight_controller.pilot.why_stuck(), clearance_m, path_m)
         return Outcome(True, done + self._rests_on(), clearance_m, path_m)
 
     def land(self) -> Outcome:
@@ -250,16 +256,16 @@ class Navigator:
         Raises:
             FlightRefused: If it does not fly.
         """
-        if not self.craft.flying:
-            raise FlightRefused(f"it does not fly{f': {self.craft.over}' if self.craft.over else ''}")
-        path_m, clearance_m = self.cockpit.flown()
-        self.craft.land("as told")
-        return Outcome(self.craft.over == "as told", f"landed: {self.craft.over}", clearance_m, path_m)
+        if not self.vehicle.flying:
+            raise FlightRefused(f"it does not fly{f': {self.vehicle.over}' if self.vehicle.over else ''}")
+        path_m, clearance_m = self.flight_controller.flown()
+        self.vehicle.land("as told")
+        return Outcome(self.vehicle.over == "as told", f"landed: {self.vehicle.over}", clearance_m, path_m)
 
     def _fly_to(self, goal_w: FloatArray, done: str) -> Outcome:
         """Fly to a checked point ``(3,)``; the outcome says how near it came where that is not at once clear."""
         task = GoTo(goal_w)
-        outcome, sight = self.fly(task, done), self.cockpit.sight
+        outcome, sight = self.fly(task, done), self.flight_controller.sight
         if not outcome.reached or sight is None or (away_m := task.away_m(sight)) < _THERE_M:
             return outcome
         return replace(outcome, reason=f"{done}, {away_m:.2f} m from it by its own pose" + self._rests_on())
@@ -267,17 +273,17 @@ class Navigator:
     def _goal(self, goal_w: Sequence[float] | FloatArray) -> FloatArray:
         goal = check_goal(goal_w, self.limits)
         self._flying_sight()
-        return check_goal(goal, self.limits, self.cockpit.known())
+        return check_goal(goal, self.limits, self.flight_controller.known())
 
-    def _flying_sight(self) -> Sight:
+    def _flying_sight(self) -> DroneState:
         """The newest moment of a flight with metres.
 
         Raises:
             FlightRefused: If there is none.
         """
-        sight = self.cockpit.sight
-        if not self.craft.flying or sight is None:
-            why = f" ({self.craft.over})" if self.craft.over else ": take off first"
+        sight = self.flight_controller.sight
+        if not self.vehicle.flying or sight is None:
+            why = f" ({self.vehicle.over})" if self.vehicle.over else ": take off first"
             raise FlightRefused(f"it does not fly{why}")
         if not sight.metric:
             raise FlightRefused(
@@ -297,12 +303,12 @@ class Navigator:
 
     def _in_time(self, outcome: Outcome, until_s: float, why: str) -> Outcome:
         """The outcome with another reason if its task was done before its time was over."""
-        early = self.cockpit.sight is not None and self.cockpit.sight.stamp_s < until_s
+        early = self.flight_controller.sight is not None and self.flight_controller.sight.stamp_s < until_s
         return replace(outcome, reason=why + self._rests_on()) if outcome.reached and early else outcome
 
     def _rests_on(self) -> str:
         """What a reached outcome has to say of the pose that it rests on."""
-        sight = self.cockpit.sight
+        sight = self.flight_controller.sight
         if sight is None:
             return ""
         if not sight.tracked:
@@ -312,4 +318,4 @@ class Navigator:
         return f", {APART.format(sight.apart_sigma_m)}" if sight.apart_sigma_m > 0 else ""
 
     def _wants_home(self) -> bool:
-        return self.cockpit.last is not None and self.cockpit.last.home
+        return self.flight_controller.last is not None and self.flight_controller.last.home

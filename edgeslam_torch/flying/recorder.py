@@ -10,12 +10,12 @@ from edgeslam_torch.drone.tello import StateMessage
 from edgeslam_torch.errors import EdgeSlamError, OutputError
 from edgeslam_torch.files.appender import Appender
 from edgeslam_torch.files.atomic import write_text
-from edgeslam_torch.flying.cockpit import Moment
+from edgeslam_torch.flying.flight_controller import Moment
 from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.navigation.drone_state import Contact, DroneState
 from edgeslam_torch.navigation.flight_record import PLAN, Decision, NewTask, PlanLog
 from edgeslam_torch.navigation.limits import NavLimits
-from edgeslam_torch.navigation.openings.watch import Exit
-from edgeslam_torch.navigation.sight import Sight, Touch
+from edgeslam_torch.navigation.openings.exit_tracker import Exit
 from edgeslam_torch.types import Frame
 from edgeslam_torch.writers.flight_writer import FlightWriter
 
@@ -81,7 +81,7 @@ class Recorder:
                 self._guarded(lambda _: moments.write(_line(moment)))
                 self._note_exits(moment.pilot.exits.exits)
 
-    def planner(self, entry: NewTask | Touch | Sight | Decision) -> None:
+    def planner(self, entry: NewTask | Contact | DroneState | Decision) -> None:
         """Write what the planner is given, or what it decided."""
         with self._lock:
             plan = self._plan

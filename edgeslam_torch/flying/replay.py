@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from edgeslam_torch.errors import SourceError
-from edgeslam_torch.flying.cockpit import Cockpit
+from edgeslam_torch.flying.flight_controller import FlightController
+from edgeslam_torch.navigation.drone_state import Contact, DroneState, VelocityCommand
 from edgeslam_torch.navigation.flight_record import PLAN, Decision, NewTask, read_plan
 from edgeslam_torch.navigation.limits import NavLimits
-from edgeslam_torch.navigation.sight import Sight, Touch, Wish
 
 _SAME = 0.02
 """Wishes that differ by less [m/s, rad/s] are the same to a Tello, whose sticks have steps of a hundredth."""
@@ -23,7 +23,7 @@ _SAME = 0.02
 class Step:
     """One decision, then and now."""
 
-    sight: Sight
+    sight: DroneState
     before: Decision | None
     """None where the recorded planner never answered: it hung, failed, or the program ended."""
     now: Decision
@@ -71,25 +71,25 @@ def replay(folder: Path, **limits: float) -> Replay:
     if not isinstance(recorded, NavLimits):
         raise SourceError(f"{path}: does not begin with the flight's limits")
     used = replace(recorded, **limits)
-    cockpit, seen, steps, tasks = Cockpit(used), None, [], []
+    flight_controller, seen, steps, tasks = FlightController(used), None, [], []
     for entry in entries:
         if isinstance(entry, Decision):
             if seen is not None:
-                steps.append(_decided(cockpit, seen, entry))
+                steps.append(_decided(flight_controller, seen, entry))
             seen = None
             continue
         if seen is not None:  # no answer was recorded
-            steps.append(_decided(cockpit, seen, None))
+            steps.append(_decided(flight_controller, seen, None))
             seen = None
         if isinstance(entry, NewTask):
-            cockpit.begin(entry.task)
+            flight_controller.begin(entry.task)
             tasks.append(type(entry.task).__name__)
-        elif isinstance(entry, Touch):
-            cockpit.feel(entry)
-        elif isinstance(entry, Sight):
+        elif isinstance(entry, Contact):
+            flight_controller.feel(entry)
+        elif isinstance(entry, DroneState):
             seen = entry
     if seen is not None:
-        steps.append(_decided(cockpit, seen, None))
+        steps.append(_decided(flight_controller, seen, None))
     if not steps:
         raise SourceError(f"{path}: the planner of this flight never saw anything")
     return Replay(used, tuple(steps), tuple(tasks))
@@ -112,17 +112,17 @@ def told(found: Replay) -> list[str]:
     return lines
 
 
-def _decided(cockpit: Cockpit, sight: Sight, before: Decision | None) -> Step:
+def _decided(flight_controller: FlightController, sight: DroneState, before: Decision | None) -> Step:
     began = time.perf_counter()
-    now = cockpit.plan(sight)
+    now = flight_controller.plan(sight)
     return Step(sight, before, now, time.perf_counter() - began)
 
 
-def _sticks(wish: Wish) -> np.ndarray:
+def _sticks(wish: VelocityCommand) -> np.ndarray:
     return np.array([wish.forward_m_s, wish.left_m_s, wish.up_m_s, wish.turn_left_rad_s])
 
 
-def _place(sight: Sight) -> str:
+def _place(sight: DroneState) -> str:
     return "({:.2f}, {:.2f}, {:.2f}) m".format(*sight.p_w)
 
 

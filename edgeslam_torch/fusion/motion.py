@@ -19,8 +19,8 @@ from edgeslam_torch.fusion.dead_reckoning import Reckoned, reckoned
 from edgeslam_torch.fusion.displacement import TelemetryModel
 from edgeslam_torch.fusion.filter.filter_feed import FilterFeed, Metric
 from edgeslam_torch.fusion.health import disagreement
-from edgeslam_torch.fusion.metres import Metres
 from edgeslam_torch.fusion.orientation import Orientation
+from edgeslam_torch.fusion.output_frame import OutputFrame
 from edgeslam_torch.fusion.prediction import (
     VISUAL_REACH_S,
     Carried,
@@ -30,17 +30,17 @@ from edgeslam_torch.fusion.prediction import (
     by_vision,
     with_velocity,
 )
-from edgeslam_torch.fusion.published import Published
 from edgeslam_torch.fusion.remembered import Remembered
 from edgeslam_torch.fusion.scale.camera_mount import Mount, estimate_mount
+from edgeslam_torch.fusion.scale_estimator import ScaleEstimator
 from edgeslam_torch.fusion.snapshot import Present, Snapshot
 from edgeslam_torch.fusion.telemetry.comparison import Comparison, FlightSoFar
 from edgeslam_torch.fusion.telemetry.delay import DelaySearch
-from edgeslam_torch.fusion.telemetry.grown import REACH_S, grown
 from edgeslam_torch.fusion.telemetry.local_scale import drift_in_words, scale_around, scale_of
-from edgeslam_torch.fusion.telemetry.plausibility import HEIGHTS, Trust
+from edgeslam_torch.fusion.telemetry.scale_change import REACH_S, grown
+from edgeslam_torch.fusion.telemetry.scale_convergence import ScaleConvergence
+from edgeslam_torch.fusion.telemetry.sensor_validation import HEIGHTS, SensorGate
 from edgeslam_torch.fusion.telemetry.track import TelemetryTrack
-from edgeslam_torch.fusion.telemetry.unrest import Unrest
 from edgeslam_torch.fusion.telemetry.visual_memory import VisualMemory, VisualPose
 from edgeslam_torch.fusion.telemetry_scale import TelemetryScale
 from edgeslam_torch.types import FloatArray, Health, ScaleEstimate, TelemetrySample
@@ -76,13 +76,13 @@ class MotionFusion:
             TelemetryTrack(config.velocity_frame, config.max_gap_s),
             VisualMemory(config.interval_s, config.window_s, config.max_gap_s),
             DelaySearch(config, given[:3, :3]),
-            Trust(),
+            SensorGate(),
         )
         self.orientation = Orientation(self.flight, given)
-        self.metres = Metres(config, focal_sigma)
+        self.metres = ScaleEstimator(config, focal_sigma)
         self._comparison = Comparison(config)
         self._filter = FilterFeed(config, given)
-        self._unrest = Unrest()
+        self._unrest = ScaleConvergence()
         self._drift: str | None = None
         """That parts of the map have different scales, in words."""
         self._fitted_s = self._followed_s = -math.inf
@@ -263,7 +263,7 @@ class MotionFusion:
             return with_velocity(told, last, previous, self.scale())
         return self._predict_unfiltered(last, previous, stamp_s)
 
-    def republished(self, published: Published, centre_map: FloatArray, held: bool) -> Published:
+    def republished(self, published: OutputFrame, centre_map: FloatArray, held: bool) -> OutputFrame:
         """What is published, upright and, unless its unit is ``held``, in the unit that is known or guessed now;
         ``centre_map`` ``(3,)`` stays where it is."""
         published = published.turned_upright(self.orientation.upright(), centre_map)
@@ -272,7 +272,7 @@ class MotionFusion:
         return published.guessed_anew(self.metres.guess, centre_map).revised(self.scale(), centre_map)
 
     def present(
-        self, stamp_s: float, state: str, published: Published, apart_sigma: float = 0.0, drift_sigma: float = 0.0
+        self, stamp_s: float, state: str, published: OutputFrame, apart_sigma: float = 0.0, drift_sigma: float = 0.0
     ) -> Present:
         """What is known after a frame: the motion, and the reliability of its metres.
 
@@ -417,7 +417,7 @@ class MotionFusion:
         return self.flight.memory
 
     @property
-    def _trust(self) -> Trust:
+    def _trust(self) -> SensorGate:
         return self.flight.trust
 
     def _is_due(self, stamp_s: float) -> bool:
@@ -446,13 +446,13 @@ class MotionFusion:
         unrest = self._unrest.sigma if flying else 0.0
         held = metres.held()
 
-        def scale(trust: Trust) -> TelemetryScale:
+        def scale(trust: SensorGate) -> TelemetryScale:
             T_b_c = orientation.T_b_c
             return TelemetryScale(self.config, T_b_c, present, trust, self.delay_s, turned, held, flying)
 
         metres.take(scale(self._trust).opinion(), unrest, self._trust)
         guesses = flying and metres.told is None
-        metres.suppose(scale(self._trust.supposing_heights()).opinion() if guesses else None, unrest)
+        metres.provisional_scale(scale(self._trust.supposing_heights()).opinion() if guesses else None, unrest)
         oldest = self._memory.sightings().stamps_s[0]
         self._drift = drift_in_words(self.scale_around, float(oldest), last.stamp_s)
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from edgeslam_torch.fusion.config import FusionConfig
 from edgeslam_torch.fusion.telemetry.delay import DelaySearch
-from edgeslam_torch.fusion.telemetry.plausibility import Trust
+from edgeslam_torch.fusion.telemetry.sensor_validation import SensorGate
 from edgeslam_torch.fusion.telemetry.track import TelemetryTrack
 from edgeslam_torch.fusion.telemetry.visual_memory import VisualMemory
 
@@ -17,7 +17,7 @@ class Remembered:
     track: TelemetryTrack
     memory: VisualMemory
     delay: DelaySearch
-    trust: Trust
+    trust: SensorGate
 
     @property
     def delay_s(self) -> float:

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from edgeslam_torch.fusion.filter.filter_feed import FilterView, FrozenFilter
+from edgeslam_torch.fusion.output_frame import OutputFrame
 from edgeslam_torch.fusion.prediction import by_vision
-from edgeslam_torch.fusion.published import Published
 from edgeslam_torch.fusion.telemetry.visual_memory import VisualPose
 from edgeslam_torch.types import FloatArray, Health, PoseNow, ScaleEstimate, TelemetrySample
 
@@ -34,7 +34,7 @@ class Present:
     """State after a frame: the snapshot, the published world, and their reliability."""
 
     snapshot: Snapshot | None = None
-    published: Published = field(default_factory=Published)
+    published: OutputFrame = field(default_factory=OutputFrame)
     metric: bool = False
     health: Health | None = None
     """None before the first frame."""

@@ -19,24 +19,24 @@ from edgeslam_torch.fusion.scale.joint_scale import (
     turned_since,
 )
 from edgeslam_torch.fusion.scale.log_scale import LogScale, floor_segments
-from edgeslam_torch.fusion.scale.present import PRESENT_S, Parted, has_changed, parted, present_scale
+from edgeslam_torch.fusion.scale.windowed_scale import PRESENT_S, Parted, has_changed, parted, present_scale
 from edgeslam_torch.fusion.telemetry.comparison import FlightSoFar
-from edgeslam_torch.fusion.telemetry.plausibility import (
+from edgeslam_torch.fusion.telemetry.sensor_validation import (
     LEAST_COUNT,
     AtOdds,
     Reading,
-    Trust,
+    SensorGate,
     Verdict,
     agreement,
     changes,
 )
-from edgeslam_torch.fusion.telemetry.visual_memory import Displacements
-from edgeslam_torch.fusion.telemetry.whole_steps import (
+from edgeslam_torch.fusion.telemetry.velocity_quantisation import (
     Rounding,
     SeenVelocity,
     remainder_gain,
     seen_velocity,
 )
+from edgeslam_torch.fusion.telemetry.visual_memory import Displacements
 from edgeslam_torch.types import FloatArray, IntArray
 
 _MOST_ROUNDS = 5
@@ -172,7 +172,7 @@ def _by_steps(z_m: FloatArray, step_m: float) -> float:
 
 
 class TelemetryScale:
-    """Scale from displacements and height at one moment; `Trust` learns what the heights are worth.
+    """Scale from displacements and height at one moment; `SensorGate` learns what the heights are worth.
 
     Args:
         config: Settings.
@@ -190,7 +190,7 @@ class TelemetryScale:
         config: FusionConfig,
         T_b_c: FloatArray,
         present: FlightSoFar,
-        trust: Trust,
+        trust: SensorGate,
         delay_s: float,
         turned: Turned,
         held: float | None,

@@ -43,7 +43,7 @@ class SlamMap:
 
     def pose_of(self, keyframe_id: int) -> FloatArray:
         """``T_c_w`` of a keyframe, alive or removed."""
-        heir, T_keyframe_heir = self.heir_of(keyframe_id)
+        heir, T_keyframe_heir = self.resolve(keyframe_id)
         return T_keyframe_heir @ self.keyframes[heir].T_c_w
 
     def median_depth(self, keyframe: Keyframe) -> float | None:
@@ -52,7 +52,7 @@ class SlamMap:
         z = se3.transform(keyframe.T_c_w, self.anchors.p_w[held])[:, 2]
         return float(np.median(z[z > 0])) if (z > 0).any() else None
 
-    def heir_of(self, keyframe_id: int) -> tuple[int, FloatArray]:
+    def resolve(self, keyframe_id: int) -> tuple[int, FloatArray]:
         """The surviving keyframe that a keyframe is linked to (itself if alive), and the transform to it."""
         chain = []
         T = np.eye(4)
@@ -107,7 +107,7 @@ class SlamMap:
     def scale_links(self, scale_of: dict[int, float]) -> None:
         """Follow keyframes around which the map was scaled, by their ids: the ways from removed ones to them."""
         for removed in list(self.links):
-            heir, T = self.heir_of(removed)
+            heir, T = self.resolve(removed)
             if heir in scale_of:
                 self.links[removed] = (heir, se3.scaled(T, scale_of[heir]))
 

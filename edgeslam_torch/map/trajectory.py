@@ -90,7 +90,7 @@ class TrajectoryLog:
         """Follow keyframes around which the map was scaled, by their ids: the ways from them to their frames."""
         before = None
         for record in self.records:
-            grown = scale_of.get(self.map.heir_of(record.keyframe_id)[0], 1.0)
+            grown = scale_of.get(self.map.resolve(record.keyframe_id)[0], 1.0)
             if record.T_c_before is not None:
                 record.T_c_before = se3.scaled(record.T_c_before, grown if before is None else before)
             record.T_c_k = se3.scaled(record.T_c_k, grown)

@@ -14,9 +14,9 @@ from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.mapping.edges.edge_map import EdgeMap
 from edgeslam_torch.mapping.freed_depths import Weight
 from edgeslam_torch.mapping.fuse import fuse_all
+from edgeslam_torch.mapping.local_loop_closure import MAX_DRIFT_PX, reobserve_all
 from edgeslam_torch.mapping.motion_terms import ALIKE_AT_THE_END
 from edgeslam_torch.mapping.refinement import refine_all, whole_map, window_problem, write_back
-from edgeslam_torch.mapping.reobserve import MAX_DRIFT_PX, reobserve_all
 from edgeslam_torch.mapping.window_edges import WindowEdges
 from edgeslam_torch.optim.adaptive import term_residuals, with_scales
 from edgeslam_torch.optim.local_ba import refine_window
@@ -24,7 +24,7 @@ from edgeslam_torch.optim.problem import LmConfig, StopReason, WindowProblem, Wi
 
 logger = logging.getLogger(__name__)
 
-ALIKE = 2.4
+EFFECTIVE_SAMPLES = 2.4
 """Errors of neighbours on one edge are correlated: about six count as one (the root of six)."""
 ITERATIONS = 30
 COST_TOLERANCE = 1e-5
@@ -113,7 +113,7 @@ def refine_with_edges(
             return result
         if config.adaptive:
             scales = scales.updated(term_residuals(problem))
-            problem = with_scales(problem, scales, ALIKE)
+            problem = with_scales(problem, scales, EFFECTIVE_SAMPLES)
             logger.debug("term scales %s", {k: round(t.sigma, 4) for k, t in scales.terms.items()})
         result = refine_window(problem, lm)
         if result.stop is StopReason.NOT_FINITE:

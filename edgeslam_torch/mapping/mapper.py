@@ -18,6 +18,7 @@ from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.map.sub_pixel import align
 from edgeslam_torch.mapping.edges.edge_map import EdgeMap
 from edgeslam_torch.mapping.fuse import fuse_young
+from edgeslam_torch.mapping.local_loop_closure import MAX_DRIFT_PX, reobserve
 from edgeslam_torch.mapping.new_anchors import epipolar_matches, triangulate_matches
 from edgeslam_torch.mapping.prior_anchors import (
     add_on_prior,
@@ -27,7 +28,6 @@ from edgeslam_torch.mapping.prior_anchors import (
     rays,
 )
 from edgeslam_torch.mapping.refinement import choose_window, recent_map, refine, refine_all, young_map
-from edgeslam_torch.mapping.reobserve import MAX_DRIFT_PX, reobserve
 from edgeslam_torch.mapping.window_edges import WindowEdges
 from edgeslam_torch.optim.problem import LmConfig, WindowResult
 from edgeslam_torch.types import FloatArray, IntArray

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from edgeslam_torch.fusion.acceleration_prior import inertia
 from edgeslam_torch.fusion.displacement import TelemetryModel
 from edgeslam_torch.fusion.heading import headings
-from edgeslam_torch.fusion.inertia import inertia
 from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.optim.problem import CentreFactor, GravityFactor, HeadingFactor
 
-ALIKE = 120.0
+EFFECTIVE_SAMPLES = 120.0
 """Keypoints err together: a window's thousands of reprojections, taken for independent, hold a wrong scale against
 telemetry whose covariance is honest. So many of them count as one in flight, four times as many as for corners
 on whole pixels, since they are aligned to a fifth of one (docs/decisions/15-telemetry-in-windows.md)."""
@@ -40,7 +40,7 @@ def motion_factors(
     keyframes: Sequence[Keyframe],
     piece: Sequence[int],
     scale_sigma_log: float | None = None,
-    alike: float = ALIKE,
+    effective_samples: float = EFFECTIVE_SAMPLES,
 ) -> MotionFactors:
     """Factors between keyframes that follow each other in time, piece by piece.
 
@@ -49,7 +49,7 @@ def motion_factors(
         keyframes: Of the window, in the order of its poses.
         piece: Number of each one's piece of map: where one lies relative to another is not known.
         scale_sigma_log: How far the scale may be off, common to all; the model's own doubt when None.
-        alike: How many keypoints count as one beside it.
+        effective_samples: How many keypoints count as one beside it.
     """
     if model is None:
         return MotionFactors()
@@ -63,11 +63,18 @@ def motion_factors(
         stamps = np.array([keyframes[i].stamp_s for i in order])
         told = model.positions(stamps, np.stack([keyframes[i].centre_w for i in order]), scale_sigma_log)
         if told is not None:
-            centres.append(CentreFactor(order, alike * told.information, alike * told.vector, alike * told.constant))
+            centres.append(
+                CentreFactor(
+                    order,
+                    effective_samples * told.information,
+                    effective_samples * told.vector,
+                    effective_samples * told.constant,
+                )
+            )
         inert = inertia(stamps, model.scale) if model.knows_metres else None
         if inert is not None:
-            centres.append(CentreFactor(order, alike * inert, np.zeros(len(inert)), 0.0))
-        up, attitude = model.up(stamps), max(1.0, ATTITUDE * alike)
+            centres.append(CentreFactor(order, effective_samples * inert, np.zeros(len(inert)), 0.0))
+        up, attitude = model.up(stamps), max(1.0, ATTITUDE * effective_samples)
         if up is not None:
             share = GUESSED if model.holds_level else attitude
             gravity.append(GravityFactor(order[up.frame], up.up_c, up.up_m, up.sigma_rad / math.sqrt(share)))

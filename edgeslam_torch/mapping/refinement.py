@@ -10,10 +10,10 @@ from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.geometry.robust_statistics import CHI2_2DOF_95
 from edgeslam_torch.losses.robust import Kernel
 from edgeslam_torch.map.keyframe import Keyframe
-from edgeslam_torch.map.known_ground import is_back
+from edgeslam_torch.map.revisit import is_back
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.mapping.freed_depths import Weight, motion_priors
-from edgeslam_torch.mapping.motion_terms import ALIKE, motion_factors
+from edgeslam_torch.mapping.motion_terms import EFFECTIVE_SAMPLES, motion_factors
 from edgeslam_torch.mapping.prior_anchors import depth_priors, mostly_on_priors
 from edgeslam_torch.mapping.window_edges import WindowEdges
 from edgeslam_torch.optim.local_ba import refine_window
@@ -49,7 +49,7 @@ class Window:
     settled: bool = False
     """Written back only if the solver has reached a minimum: half-way the newest keyframes, which are being tracked on,
     can be anywhere."""
-    alike: float = ALIKE
+    effective_samples: float = EFFECTIVE_SAMPLES
     """How many of its keypoints count as one beside telemetry."""
 
 
@@ -115,19 +115,23 @@ def refine_all(
     config: LmConfig,
     telemetry: TelemetryModel | None = None,
     freed: Weight = Weight.NONE,
-    alike: float = ALIKE,
+    effective_samples: float = EFFECTIVE_SAMPLES,
 ) -> WindowResult | None:
     """Refine every keyframe of the map at once; None when there is nothing to refine, see `whole_map`."""
-    window = whole_map(slam_map, freed, alike)
+    window = whole_map(slam_map, freed, effective_samples)
     return None if window is None else refine(slam_map, window, camera, config, telemetry)
 
 
-def whole_map(slam_map: SlamMap, freed: Weight = Weight.NONE, alike: float = ALIKE) -> Window | None:
+def whole_map(
+    slam_map: SlamMap, freed: Weight = Weight.NONE, effective_samples: float = EFFECTIVE_SAMPLES
+) -> Window | None:
     """All keyframes as one window, the first pose fixed; None for fewer than three, or a camera that never moved."""
     keyframes = [slam_map.keyframes[id] for id in sorted(slam_map.keyframes)]
     if len(keyframes) < 3:
         return None
-    window = Window(keyframes[1:], keyframes[:1], slam_map.anchors_seen_by(keyframes), freed, alike=alike)
+    window = Window(
+        keyframes[1:], keyframes[:1], slam_map.anchors_seen_by(keyframes), freed, effective_samples=effective_samples
+    )
     return window if held_extent(window) is not None else None
 
 
@@ -204,7 +208,7 @@ def window_problem(
     uv = np.concatenate([k.features.uv[s] for k, s in zip(keyframes, keypoint, strict=True)])
     octave = np.concatenate([k.features.octave[s] for k, s in zip(keyframes, keypoint, strict=True)])
     aligned = np.concatenate([k.aligned_px[s] for k, s in zip(keyframes, keypoint, strict=True)])
-    alike = config.kernel is Kernel.L2
+    effective_samples = config.kernel is Kernel.L2
     growth = slam_map.scale_factor ** np.arange(slam_map.levels, dtype=np.float64)
     sigma_px = np.where(np.isnan(aligned), growth[octave], aligned)
     unsure = slam_map.anchors.from_depth[window.anchor]
@@ -213,7 +217,9 @@ def window_problem(
     priors, hosts = depth_priors(slam_map, window.anchor, [k.id for k in keyframes])
     # Where the scale is held by one distance alone, that one is arbitrary.
     doubt = UNKNOWN_SCALE_LOG if extent is not None else None
-    told = motion_factors(telemetry, keyframes, [slam_map.piece_of(k.id) for k in keyframes], doubt, window.alike)
+    told = motion_factors(
+        telemetry, keyframes, [slam_map.piece_of(k.id) for k in keyframes], doubt, window.effective_samples
+    )
     motions = tracked_motions(slam_map, keyframes)
     problem = WindowProblem(
         T_c_w=np.stack([*(k.T_c_w for k in keyframes), *(slam_map.pose_of(id) for id in hosts)]),
@@ -222,7 +228,7 @@ def window_problem(
         obs_pose=np.concatenate(pose),
         obs_anchor=row,
         uv=uv.astype(np.float64),
-        inv_sigma=np.ones(len(row)) if alike else 1.0 / sigma_px,
+        inv_sigma=np.ones(len(row)) if effective_samples else 1.0 / sigma_px,
         K=(camera.fx, camera.fy, camera.cx, camera.cy),
         relative_priors=motions,
         scale_priors=() if extent is None else (extent,),

@@ -6,7 +6,7 @@ import numpy as np
 
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.limits import NavLimits
-from edgeslam_torch.navigation.pace import told
+from edgeslam_torch.navigation.speed_dither import told
 from edgeslam_torch.types import FloatArray
 
 _HORIZON_S = 0.6

@@ -19,8 +19,8 @@ import numpy as np
 
 from edgeslam_torch.errors import EdgeSlamError, OutputError, SourceError
 from edgeslam_torch.files.appender import Appender
+from edgeslam_torch.navigation.drone_state import Contact, DroneState, VelocityCommand
 from edgeslam_torch.navigation.limits import NavLimits
-from edgeslam_torch.navigation.sight import Sight, Touch, Wish
 from edgeslam_torch.navigation.tasks import Task
 
 PLAN = "plan.jsonl"
@@ -35,7 +35,7 @@ _OURS = ("edgeslam_torch.navigation.", "edgeslam_torch.flying.")
 class Decision:
     """What the planner wished after a sight, and what it was doing."""
 
-    wish: Wish
+    wish: VelocityCommand
     phase: str
 
 
@@ -46,7 +46,7 @@ class NewTask:
     task: Task
 
 
-Entry = NavLimits | NewTask | Touch | Sight | Decision
+Entry = NavLimits | NewTask | Contact | DroneState | Decision
 
 
 class PlanLog:

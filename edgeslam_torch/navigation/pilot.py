@@ -8,16 +8,16 @@ import numpy as np
 
 from edgeslam_torch.geometry.rotations import wrapped
 from edgeslam_torch.navigation.arcs import Arcs, candidates
-from edgeslam_torch.navigation.hindered.losses import Losses
+from edgeslam_torch.navigation.contact.losses import Losses
+from edgeslam_torch.navigation.drone_state import HOVER, Contact, DroneState, VelocityCommand
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.limits import NavLimits
-from edgeslam_torch.navigation.moved import Moved
-from edgeslam_torch.navigation.openings.turned import Walls
-from edgeslam_torch.navigation.openings.watch import ExitWatch
-from edgeslam_torch.navigation.pace import varied
+from edgeslam_torch.navigation.map_update import MapUpdate
+from edgeslam_torch.navigation.openings.exit_tracker import ExitTracker
+from edgeslam_torch.navigation.openings.wall_frame import Walls
 from edgeslam_torch.navigation.route import CostToGo, cost_to_go
-from edgeslam_torch.navigation.sight import HOVER, Sight, Touch, Wish
 from edgeslam_torch.navigation.space import CELL_M, Space
+from edgeslam_torch.navigation.speed_dither import varied
 from edgeslam_torch.navigation.supervisor import CARRIED_SIGMA_M
 from edgeslam_torch.navigation.tasks import Task
 from edgeslam_torch.types import FloatArray
@@ -93,7 +93,7 @@ class Pilot:
     """The last layer, for pictures."""
     way_w: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
     """The last way, for pictures."""
-    exits: ExitWatch = field(default_factory=ExitWatch)
+    exits: ExitTracker = field(default_factory=ExitTracker)
     """What was found of exits on the way, whatever the task."""
     _plan: CostToGo | None = None
     _goals: np.ndarray = field(default_factory=lambda: np.zeros((0, 2), int))
@@ -150,12 +150,12 @@ class Pilot:
     def _gives_up(self) -> bool:
         return self.task.gives_up(self._losses.count)
 
-    def touched(self, touch: Touch) -> None:
+    def touched(self, touch: Contact) -> None:
         """Something holds it that no view shows: not there again."""
         self.space.touched(touch, self.limits.radius_m + 0.5 * CELL_M)
         self._plan = None
 
-    def update(self, sight: Sight) -> Wish:
+    def update(self, sight: DroneState) -> VelocityCommand:
         """Take in what is seen, and decide.
 
         Raises:
@@ -164,7 +164,7 @@ class Pilot:
         if not (np.isfinite(sight.p_w).all() and np.isfinite(sight.velocity_w).all()):
             raise ValueError("a pilot needs to know where the drone is, and how fast")
         if sight.revision != self._revision and sight.moved is None and sight.stamp_s - self._revised_s < _MOVES_S:
-            return Wish(why="its metres were revised: wait for a view in the new ones")
+            return VelocityCommand(why="its metres were revised: wait for a view in the new ones")
         self._take_in(sight)
         looks = self.phase in (Phase.RISING, Phase.SWEEPING, Phase.SINKING)
         if sight.hindered or (looks and not self._looks_again):  # that is no lack of progress
@@ -184,7 +184,7 @@ class Pilot:
             return self._at_height(sight, HOVER)
         return self._at_height(sight, self._fly(sight))
 
-    def _take_in(self, sight: Sight) -> None:
+    def _take_in(self, sight: DroneState) -> None:
         if sight.moved is not None:
             self._carry(sight.moved)
         elif sight.revision != self._revision:
@@ -204,7 +204,7 @@ class Pilot:
             self.exits.look(self.walls(), sight)
             self.task.consider(self.exits.candidates, self.exits.exits)
 
-    def _carry(self, moved: Moved) -> None:
+    def _carry(self, moved: MapUpdate) -> None:
         """Bring what is known along with the map that moved; that is no progress."""
         self.space.rebuild(moved)
         self.exits.carry(moved)
@@ -217,7 +217,7 @@ class Pilot:
         self._plan, self._least = None, math.nan
         self._progress_w = moved.points(self._progress_w[None])[0]
 
-    def _mind_pieces(self, sight: Sight) -> None:
+    def _mind_pieces(self, sight: DroneState) -> None:
         """What was seen in other pieces of map counts as long as it is known where they lie to this one."""
         if sight.piece != self._piece:
             self._piece, self._piece_s = sight.piece, sight.stamp_s - sight.blind_s
@@ -228,11 +228,11 @@ class Pilot:
 
     def _forget(self) -> None:
         """Begin anew: nothing says how what is known relates to the new metres."""
-        self.space, self.exits = Space(), ExitWatch()
+        self.space, self.exits = Space(), ExitTracker()
         self._plan, self._least, self._progress_s = None, math.inf, math.nan
         self.phase = Phase.RISING
 
-    def _level(self, sight: Sight) -> Wish:
+    def _level(self, sight: DroneState) -> VelocityCommand:
         """Rise above the height of flight, look left and right, and come back to it."""
         low, high = self.limits.height_m, self.limits.height_m + _LOOK_M
         if math.isnan(self._level_s):
@@ -249,14 +249,14 @@ class Pilot:
             if abs(error) < math.radians(8.0):
                 self._sweep.pop()
             if self._sweep:
-                return Wish(0.0, 0.0, self._climb(high - sight.p_w[2]), self._turn(error), str(self.phase))
+                return VelocityCommand(0.0, 0.0, self._climb(high - sight.p_w[2]), self._turn(error), str(self.phase))
             self.phase = Phase.SINKING
         if self.phase is Phase.SINKING and sight.p_w[2] < low + 0.06:
             self.phase, self._waiting_s = Phase.FLYING, math.nan
         target = high if self.phase is Phase.RISING else low
-        return Wish(up_m_s=self._climb(target - sight.p_w[2]), why=str(self.phase))
+        return VelocityCommand(up_m_s=self._climb(target - sight.p_w[2]), why=str(self.phase))
 
-    def _worth_a_look(self, sight: Sight) -> list[float]:
+    def _worth_a_look(self, sight: DroneState) -> list[float]:
         """Headings of the sweep but those on the side where the pose was lost: a wall that shows nothing."""
         ahead = self._sweep[0]
         off = wrapped(np.array([sight.yaw_rad - ahead, *(h - ahead for h in self._sweep)]))
@@ -270,17 +270,17 @@ class Pilot:
     def _climb(self, error_m: float) -> float:
         return float(np.clip(1.5 * error_m, -self.limits.climb_m_s, self.limits.climb_m_s))
 
-    def _at_height(self, sight: Sight, wish: Wish) -> Wish:
+    def _at_height(self, sight: DroneState, wish: VelocityCommand) -> VelocityCommand:
         # A pose that telemetry carries drifts in height, too: by velocities that are cut off. The drone measures it.
         carried = not sight.tracked and math.isfinite(sight.told_height_m)
         up = self._climb(self.limits.height_m - (sight.told_height_m if carried else float(sight.p_w[2])))
-        return Wish(wish.forward_m_s, wish.left_m_s, up, wish.turn_left_rad_s, wish.why)
+        return VelocityCommand(wish.forward_m_s, wish.left_m_s, up, wish.turn_left_rad_s, wish.why)
 
-    def _fly(self, sight: Sight) -> Wish:
+    def _fly(self, sight: DroneState) -> VelocityCommand:
         heading = self.task.heading_rad(sight)
         if heading is not None:
             self._progress_s = sight.stamp_s
-            return Wish(
+            return VelocityCommand(
                 turn_left_rad_s=self._turn(float(wrapped(np.array(heading - sight.yaw_rad)))),
                 why="stand and look where the task wants",
             )
@@ -299,7 +299,7 @@ class Pilot:
             self._rise(sight)
             return HOVER
         if not math.isfinite(now):
-            return Wish(turn_left_rad_s=self._search(sight), why="no way is known: look around")
+            return VelocityCommand(turn_left_rad_s=self._search(sight), why="no way is known: look around")
         self.way_w = plan.way(here, 3.0)
         ahead, faced = self._bearing(here), self.task.faces_rad(sight)
         error = float(wrapped(np.array((ahead if faced is None else faced) - sight.yaw_rad)))
@@ -309,16 +309,16 @@ class Pilot:
             return self._look(sight, error, turn)
         self._waiting_s = math.nan
         c, s = math.cos(sight.yaw_rad), math.sin(sight.yaw_rad)
-        return Wish(c * chosen[0] + s * chosen[1], c * chosen[1] - s * chosen[0], 0.0, turn, "along the way")
+        return VelocityCommand(c * chosen[0] + s * chosen[1], c * chosen[1] - s * chosen[0], 0.0, turn, "along the way")
 
-    def _is_narrow(self, sight: Sight) -> bool:
+    def _is_narrow(self, sight: DroneState) -> bool:
         """Whether the way just ahead is narrower than it flies through."""
         assert self.layer is not None
         ahead = self.way_w[: round(_NARROW_AHEAD_M / CELL_M)]
         need = self.limits.clearance_m(sight.position_sigma_m) - 0.5 * CELL_M
         return bool((self.layer.from_solid_at(ahead) <= need).any())
 
-    def _search(self, sight: Sight) -> float:
+    def _search(self, sight: DroneState) -> float:
         """Rate of turn [rad/s] that looks left and right of where the goal is; all around if it is nowhere.
 
         A full turn would leave behind all that it knows, and what hides the way is between it and the goal.
@@ -331,7 +331,7 @@ class Pilot:
         wanted = math.atan2(step[1], step[0]) + side * _SEARCH_RAD
         return self._turn(float(wrapped(np.array(wanted - sight.yaw_rad))))
 
-    def _planned(self, sight: Sight) -> CostToGo:
+    def _planned(self, sight: DroneState) -> CostToGo:
         """The plan, made anew when it is half a second old."""
         half = self.limits.radius_m + BAND_M
         self.layer = self.space.layer(self.limits.height_m, half)
@@ -348,7 +348,7 @@ class Pilot:
         far = self.way_w[min(len(self.way_w) - 1, round(_AHEAD_M / 0.1))] - here
         return math.atan2(far[1], far[0])
 
-    def _chosen(self, sight: Sight, plan: CostToGo, ahead: float, error: float) -> FloatArray | None:
+    def _chosen(self, sight: DroneState, plan: CostToGo, ahead: float, error: float) -> FloatArray | None:
         """Velocity ``(2,)`` in the world of the best candidate; None when standing is as good."""
         assert self.layer is not None
         fastest = varied(self.limits.speed_m_s, sight.stamp_s)
@@ -373,7 +373,7 @@ class Pilot:
         """Whether a look from about here showed no way, and what is unseen is not what it has doubted to be solid."""
         return _about(self._looked_w, here) and not _about(self._doubted_w, here)
 
-    def _squeezes(self, arcs: Arcs, sight: Sight) -> np.ndarray:
+    def _squeezes(self, arcs: Arcs, sight: DroneState) -> np.ndarray:
         """``(C,)`` slow movements that keep their clearance from every solid and only a hull's from the unseen.
 
         What is beside the drone and nearer than 0.6 m is below its picture or above it: no look from here shows it.
@@ -383,18 +383,18 @@ class Pilot:
         away = arcs.from_solid_m >= self.limits.clearance_m(sight.position_sigma_m)
         return np.asarray(slow & away & (arcs.clearance_m >= hull))
 
-    def _goes_back(self, arcs: Arcs, sight: Sight) -> np.ndarray:
+    def _goes_back(self, arcs: Arcs, sight: DroneState) -> np.ndarray:
         """``(C,)`` slow movements along the way that it flew: through a door whose frame was never seen from behind."""
         slow = np.linalg.norm(arcs.velocity_w, axis=1) < _SQUEEZE * self.limits.speed_m_s + 1e-6
         hull = self._hull_m(sight)
         passes = (arcs.from_solid_m >= hull + 0.5 * CELL_M) & (arcs.clearance_m >= hull)
         return np.asarray(slow & passes & self.space.was_at(arcs.p_w).all(axis=1))
 
-    def _hull_m(self, sight: Sight) -> float:
+    def _hull_m(self, sight: DroneState) -> float:
         """Distance of the drone's centre from what its hull may be beside."""
         return self.limits.radius_m + 2.0 * sight.position_sigma_m
 
-    def _score(self, arcs: Arcs, plan: CostToGo, sight: Sight, error: float) -> FloatArray:
+    def _score(self, arcs: Arcs, plan: CostToGo, sight: DroneState, error: float) -> FloatArray:
         """Metres to go after each candidate, and what its lack of clearance is worth."""
         score = np.asarray(plan.at(arcs.end_w), dtype=np.float64).copy()
         away = arcs.from_solid_m if self._may_squeeze(sight.p_w[:2]) else arcs.clearance_m
@@ -406,14 +406,14 @@ class Pilot:
         score[unseen | turning] = np.inf
         return score
 
-    def _rise(self, sight: Sight) -> None:
+    def _rise(self, sight: DroneState) -> None:
         """See the way from higher."""
         self.phase, self._waiting_s = Phase.RISING, math.nan
         self._looks_again = _about(self._looked_w, sight.p_w[:2])
         self._looked_w = sight.p_w[:2].copy()
         self._tries_narrow &= not self._is_narrow(sight)
 
-    def _start_over(self, sight: Sight) -> None:
+    def _start_over(self, sight: DroneState) -> None:
         """Doubt what closes the way and look around anew, once about a place: it may be the trace of a wrong depth or
         of a pose that has been put right since. What is unseen is not flown into; but two views through what was solid
         free it now, where it took up to ten, so nothing of it is passed at a hull's distance."""
@@ -426,16 +426,16 @@ class Pilot:
         self._rise(sight)
         self._tries_narrow = True
 
-    def _look(self, sight: Sight, error: float, turn: float) -> Wish:
+    def _look(self, sight: DroneState, error: float, turn: float) -> VelocityCommand:
         """Turn to where the way goes; if that shows nothing, see it from higher."""
         if abs(error) > math.radians(8.0):
             self._waiting_s = math.nan
-            return Wish(turn_left_rad_s=turn, why="look along the way")
+            return VelocityCommand(turn_left_rad_s=turn, why="look along the way")
         if math.isnan(self._waiting_s):
             self._waiting_s = sight.stamp_s
         elif sight.stamp_s - self._waiting_s > _PATIENCE_S and sight.tracked:  # else there is no view to come
             self._rise(sight)
-        return Wish(turn_left_rad_s=turn, why="wait for a view of the way")
+        return VelocityCommand(turn_left_rad_s=turn, why="wait for a view of the way")
 
 
 def _about(place_w: FloatArray | None, here: FloatArray) -> bool:

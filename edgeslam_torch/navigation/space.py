@@ -10,9 +10,9 @@ from dataclasses import dataclass, field, replace
 import cv2
 import numpy as np
 
+from edgeslam_torch.navigation.drone_state import Contact, View
 from edgeslam_torch.navigation.layer import Layer
-from edgeslam_torch.navigation.moved import Moved
-from edgeslam_torch.navigation.sight import Touch, View
+from edgeslam_torch.navigation.map_update import MapUpdate
 from edgeslam_torch.types import FloatArray
 
 CELL_M = 0.1
@@ -106,7 +106,7 @@ class Space:
         i, j = np.moveaxis(np.where(inside[..., None], at, 0), -1, 0)
         return np.asarray(inside & (cv2.dilate(self._way, _NEIGHBOURS)[i, j] > 0))
 
-    def touched(self, touch: Touch, reach_m: float) -> None:
+    def touched(self, touch: Contact, reach_m: float) -> None:
         """There is a solid from now on, whatever is seen, ``reach_m`` from the drone's centre."""
         angle = np.arctan2(touch.towards_w[1], touch.towards_w[0]) + _TOUCHED_RAD * np.array([-1.0, 0.0, 1.0])
         level = touch.p_w[:2] + reach_m * np.column_stack([np.cos(angle), np.sin(angle)])
@@ -126,7 +126,7 @@ class Space:
             way[new[0], new[1]] = self._way[old[0], old[1]]
         self._odds, self._way, self._corner = moved, way, self._corner + step
 
-    def rebuild(self, moved: Moved) -> None:
+    def rebuild(self, moved: MapUpdate) -> None:
         """Build the grid anew from the views that are remembered, after the map moved."""
         if self._views:
             poses = moved.poses(np.array([view.T_w_c for view in self._views]))

@@ -11,11 +11,11 @@ from enum import StrEnum
 import numpy as np
 
 from edgeslam_torch.geometry.rotations import wrapped
-from edgeslam_torch.navigation.hindered.push import PUSHED_M_S, Push
+from edgeslam_torch.navigation.contact.push import PUSHED_M_S, Push
+from edgeslam_torch.navigation.drone_state import Contact, DroneState, VelocityCommand
 from edgeslam_torch.navigation.limits import NavLimits
-from edgeslam_torch.navigation.moved import Moved
-from edgeslam_torch.navigation.pace import STEP_M_S, told, varied
-from edgeslam_torch.navigation.sight import Sight, Touch, Wish
+from edgeslam_torch.navigation.map_update import MapUpdate
+from edgeslam_torch.navigation.speed_dither import STEP_M_S, told, varied
 from edgeslam_torch.types import FloatArray
 
 STALE_S = 0.3
@@ -28,7 +28,7 @@ LAND_S = 10.0
 """Time of trouble after which it lands."""
 UNSURE_LAND_S = 30.0
 """The same when metres are doubtful: seven times up and down where it has been, which is what tells them, of this map
-or, where that tells none for eight seconds, of the next (`flying/eyes/fresh_start.py`)."""
+or, where that tells none for eight seconds, of the next (`flying/perception/map_reset.py`)."""
 _BACK_M, _BACK_M_S = 1.0, 0.25
 """Way back, and its mean speed: without a picture telemetry alone says how far it came."""
 SCALE_SIGMA = 0.10
@@ -75,12 +75,12 @@ _FOLLOWED = (Danger.NONE, Danger.CARRIED, Danger.BATTERY_HOME)
 class Order:
     """What the drone is told."""
 
-    wish: Wish
+    wish: VelocityCommand
     land: bool = False
     home: bool = False
     """Whether the pilot should fly home."""
     danger: Danger = Danger.NONE
-    touch: Touch | None = None
+    touch: Contact | None = None
     """What the pilot should know of since it was just felt."""
 
     @property
@@ -98,8 +98,8 @@ class Supervisor:
     """Once it lands, it lands."""
     held: bool = False
     """Whether a person wants it to hover."""
-    _sight: Sight | None = None
-    _wish: Wish | None = None
+    _sight: DroneState | None = None
+    _wish: VelocityCommand | None = None
     _wished_s: float = -math.inf
     _since_s: float = math.nan
     """Since when it is in trouble."""
@@ -123,7 +123,7 @@ class Supervisor:
     _headings: deque[tuple[float, float]] = field(default_factory=deque)
     """Moments and headings of the last `_BEFORE_S` with a pose that rests on a map."""
 
-    def see(self, sight: Sight) -> None:
+    def see(self, sight: DroneState) -> None:
         """The newest sight."""
         self._sight = sight
         if sight.tracked:
@@ -137,29 +137,29 @@ class Supervisor:
         if moved and self._danger(sight, sight.stamp_s) is Danger.NONE:
             self._trail.append(sight.p_w.copy())
 
-    def carry(self, moved: Moved) -> None:
+    def carry(self, moved: MapUpdate) -> None:
         """Take the way flown along with the map."""
         self._trail = deque(moved.points(np.array(self._trail).reshape(-1, 3)), maxlen=self._trail.maxlen)
         if self._known_w is not None:
             self._known_w = moved.points(self._known_w[None])[0]
 
-    def propose(self, wish: Wish, now_s: float) -> None:
+    def propose(self, wish: VelocityCommand, now_s: float) -> None:
         """The pilot's newest wish; it counts for `STALE_S`."""
         self._wish, self._wished_s = wish, now_s
 
     def order(self, now_s: float) -> Order:
         """What the drone is told now."""
         if self._sight is None:
-            return Order(Wish(why="no sight yet"), danger=Danger.NO_WISH)
+            return Order(VelocityCommand(why="no sight yet"), danger=Danger.NO_WISH)
         danger = self._danger(self._sight, now_s)
         self._told = danger in (Danger.NONE, Danger.HELD) and not self.held
         home = self._sight.battery <= self.limits.home_battery
         if danger is Danger.BATTERY or self.landing:
             self.landing = True
-            return Order(Wish(why=str(danger)), land=True, danger=danger)
+            return Order(VelocityCommand(why=str(danger)), land=True, danger=danger)
         if self.held:
             self._since_s = math.nan
-            return Order(Wish(why=str(Danger.HAND)), danger=Danger.HAND)
+            return Order(VelocityCommand(why=str(Danger.HAND)), danger=Danger.HAND)
         if danger is Danger.NONE:
             self._since_s = math.nan
             assert self._wish is not None
@@ -170,17 +170,17 @@ class Supervisor:
         in_vain = trouble_s > patience_s or now_s - self._since_s > UNSURE_LAND_S
         if in_vain or (danger is Danger.HELD and trouble_s > BACK_S + self._back_s):
             self.landing = True
-            return Order(Wish(why=str(danger)), land=True, danger=danger)
+            return Order(VelocityCommand(why=str(danger)), land=True, danger=danger)
         felt = danger is Danger.HELD and trouble_s == 0.0
-        touch = Touch(self._sight.p_w.copy(), self._pushed_w(self._wish)) if felt else None
+        touch = Contact(self._sight.p_w.copy(), self._pushed_w(self._wish)) if felt else None
         wish = self._meanwhile(danger, trouble_s)
         if self._backs_in_vain(wish, now_s):
             self._trail.clear()
-            touch = Touch(self._sight.p_w.copy(), self._pushed_w(wish))
-            wish = Wish(why=f"{danger}: hover")
+            touch = Contact(self._sight.p_w.copy(), self._pushed_w(wish))
+            wish = VelocityCommand(why=f"{danger}: hover")
         return Order(wish, home=home, danger=danger, touch=touch)
 
-    def _backs_in_vain(self, wish: Wish, now_s: float) -> bool:
+    def _backs_in_vain(self, wish: VelocityCommand, now_s: float) -> bool:
         """Whether something holds it on its way back, which the map has in another place."""
         assert self._sight is not None
         return self._backward.holds(self._sight, self._push_w(wish), now_s)
@@ -203,7 +203,7 @@ class Supervisor:
             return 0.0
         return float(np.linalg.norm(self._sight.p_w[:2] - self._known_w[:2]))
 
-    def _danger(self, sight: Sight, now_s: float) -> Danger:
+    def _danger(self, sight: DroneState, now_s: float) -> Danger:
         late = sight.blind_s + max(0.0, now_s - sight.stamp_s)
         checks = (
             (sight.battery <= self.limits.land_battery, Danger.BATTERY),
@@ -218,28 +218,28 @@ class Supervisor:
         )
         return next((danger for holds, danger in checks if holds), Danger.NONE)
 
-    def _is_carried(self, sight: Sight) -> bool:
+    def _is_carried(self, sight: DroneState) -> bool:
         """Whether it goes on by telemetry alone: on its way, not in a turn to what it may not know."""
         flies = self._wish is not None and math.hypot(self._wish.forward_m_s, self._wish.left_m_s) > 0.0
         return flies and sight.position_sigma_m < CARRIED_SIGMA_M
 
-    def _is_held(self, sight: Sight, now_s: float) -> bool:
+    def _is_held(self, sight: DroneState, now_s: float) -> bool:
         """Whether it was told to move for a while and did not; a wish that was not passed on moves nothing."""
         return self._onward.holds(sight, self._push_w(self._wish) if self._told else None, now_s)
 
-    def _pushed_w(self, wish: Wish | None) -> FloatArray:
+    def _pushed_w(self, wish: VelocityCommand | None) -> FloatArray:
         """Direction ``(2,)`` of a wish in the world."""
         assert self._sight is not None and wish is not None
         c, s = math.cos(self._sight.yaw_rad), math.sin(self._sight.yaw_rad)
         forward, left = wish.forward_m_s, wish.left_m_s
         return np.array([c * forward - s * left, s * forward + c * left]) / math.hypot(forward, left)
 
-    def _push_w(self, wish: Wish | None) -> FloatArray | None:
+    def _push_w(self, wish: VelocityCommand | None) -> FloatArray | None:
         """The same of a wish that is to move it; None where it need not."""
         pushes = wish is not None and math.hypot(wish.forward_m_s, wish.left_m_s) > PUSHED_M_S
         return self._pushed_w(wish) if pushes else None
 
-    def _is_apart(self, sight: Sight, now_s: float) -> bool:
+    def _is_apart(self, sight: DroneState, now_s: float) -> bool:
         """Whether the pose goes its own way: a map that is sure of its metres, and another height than the drone's."""
         off = abs(sight.told_height_m - float(sight.p_w[2]))
         if _doubtful(sight) or not off > _APART_M:  # false too where the drone says nothing
@@ -249,7 +249,7 @@ class Supervisor:
             self._apart_s = now_s
         return now_s - self._apart_s > _APART_S
 
-    def _leaves(self, sight: Sight) -> bool:
+    def _leaves(self, sight: DroneState) -> bool:
         """Whether it is beyond the fence and wants to go farther."""
         assert self._home_w is not None
         away = sight.p_w[:2] - self._home_w[:2]
@@ -259,31 +259,31 @@ class Supervisor:
             return False
         return float(away @ self._pushed_w(self._wish)) > 0
 
-    def _within_heights(self, wish: Wish) -> Wish:
+    def _within_heights(self, wish: VelocityCommand) -> VelocityCommand:
         assert self._sight is not None
         heights, up = _heights_m(self._sight), wish.up_m_s
         if max(heights) > self.limits.highest_m:
             up = min(up, 0.0)
         if min(heights) < self.limits.lowest_m:
             up = max(up, 0.0)
-        return Wish(wish.forward_m_s, wish.left_m_s, up, wish.turn_left_rad_s, wish.why)
+        return VelocityCommand(wish.forward_m_s, wish.left_m_s, up, wish.turn_left_rad_s, wish.why)
 
-    def _meanwhile(self, danger: Danger, trouble_s: float) -> Wish:
+    def _meanwhile(self, danger: Danger, trouble_s: float) -> VelocityCommand:
         """Hover; then what may mend it."""
         assert self._sight is not None
         if danger in _UNSURE:
             rising = int(trouble_s / _WIGGLE_S) % 2 == 0
-            wish = Wish(up_m_s=_WIGGLE_M_S if rising else -_WIGGLE_M_S, why=f"{danger}: up and down")
+            wish = VelocityCommand(up_m_s=_WIGGLE_M_S if rising else -_WIGGLE_M_S, why=f"{danger}: up and down")
             return self._within_heights(wish)
         if danger is Danger.LOST and trouble_s <= BACK_S:
-            return Wish(turn_left_rad_s=self._turn_back(_KNOWN_S), why=f"{danger}: turn to what was known")
+            return VelocityCommand(turn_left_rad_s=self._turn_back(_KNOWN_S), why=f"{danger}: turn to what was known")
         backing = BACK_S < trouble_s < BACK_S + self._back_s
         if danger in (Danger.BLIND, Danger.LOST, Danger.HELD) and backing:  # not where the pose itself is wrong
             turn = self._turn_back(_BEFORE_S) if danger is Danger.LOST else 0.0
             return replace(self._back(danger, trouble_s), turn_left_rad_s=turn)
         if danger is Danger.LOST and trouble_s > BACK_S + self._back_s:
-            return Wish(turn_left_rad_s=0.5 * self.limits.turn_rad_s, why=f"{danger}: look around")
-        return Wish(why=f"{danger}: hover")
+            return VelocityCommand(turn_left_rad_s=0.5 * self.limits.turn_rad_s, why=f"{danger}: look around")
+        return VelocityCommand(why=f"{danger}: hover")
 
     def _turn_back(self, before_s: float) -> float:
         """Rate of the turn [rad/s] to where it looked this long before its pose was lost."""
@@ -295,7 +295,7 @@ class Supervisor:
         error = float(wrapped(np.array(yaw - self._sight.yaw_rad)))
         return float(np.clip(2.0 * error, -self.limits.turn_rad_s, self.limits.turn_rad_s))
 
-    def _back(self, danger: Danger, trouble_s: float) -> Wish:
+    def _back(self, danger: Danger, trouble_s: float) -> VelocityCommand:
         """Along the trail, away from where the trouble began."""
         assert self._sight is not None
         here = self._sight.p_w[:2]
@@ -304,12 +304,14 @@ class Supervisor:
         while self._trail and (len(self._trail) - 1 > nearest or away[len(self._trail) - 1] < 2 * _TRAIL_M):
             self._trail.pop()
         if not self._trail:
-            return Wish(why=f"{danger}: hover")
+            return VelocityCommand(why=f"{danger}: hover")
         step = self._trail[-1][:2] - here
         speed_m_s = varied(_BACK_M_S + 0.5 * STEP_M_S, trouble_s)
         v_w = told(step * (speed_m_s / float(np.linalg.norm(step))))
         c, s = math.cos(self._sight.yaw_rad), math.sin(self._sight.yaw_rad)
-        return Wish(c * v_w[0] + s * v_w[1], c * v_w[1] - s * v_w[0], 0.0, 0.0, f"{danger}: back the way it came")
+        return VelocityCommand(
+            c * v_w[0] + s * v_w[1], c * v_w[1] - s * v_w[0], 0.0, 0.0, f"{danger}: back the way it came"
+        )
 
 
 def _latest_approach(away_m: FloatArray) -> int:
@@ -322,12 +324,12 @@ def _latest_approach(away_m: FloatArray) -> int:
     return int(np.flatnonzero(passes)[-1])
 
 
-def _doubtful(sight: Sight) -> bool:
+def _doubtful(sight: DroneState) -> bool:
     """Whether the map's metres are."""
     return not sight.metric or sight.scale_sigma > SCALE_SIGMA or sight.conflict
 
 
-def _heights_m(sight: Sight) -> list[float]:
+def _heights_m(sight: DroneState) -> list[float]:
     """Heights above the floor by the drone and by the map, as far as they are known and not doubtful; at least one."""
     told, mapped = sight.told_height_m, float(sight.p_w[2])
     if not math.isfinite(told):

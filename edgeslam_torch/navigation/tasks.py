@@ -7,14 +7,14 @@ from typing import Protocol
 
 import numpy as np
 
+from edgeslam_torch.navigation.contact.losses import Losses
+from edgeslam_torch.navigation.drone_state import DroneState
 from edgeslam_torch.navigation.exploring.around import LooksAround
 from edgeslam_torch.navigation.exploring.frontiers import WIDE_M, Looks, frontiers, reachable
 from edgeslam_torch.navigation.exploring.second_look import SecondLook
-from edgeslam_torch.navigation.hindered.losses import Losses
 from edgeslam_torch.navigation.layer import Layer
-from edgeslam_torch.navigation.moved import Moved
-from edgeslam_torch.navigation.openings.watch import Candidate, Exit
-from edgeslam_torch.navigation.sight import Sight
+from edgeslam_torch.navigation.map_update import MapUpdate
+from edgeslam_torch.navigation.openings.exit_tracker import Candidate, Exit
 from edgeslam_torch.navigation.supervisor import CARRIED_SIGMA_M
 from edgeslam_torch.types import FloatArray
 
@@ -30,25 +30,25 @@ are velocities that a Tello cuts off, and it would come no nearer until its batt
 class Task(Protocol):
     """One behaviour."""
 
-    def goals(self, layer: Layer, sight: Sight) -> np.ndarray:
+    def goals(self, layer: Layer, sight: DroneState) -> np.ndarray:
         """Cells ``(G, 2)`` worth going to; empty when there is nothing left to do."""
 
-    def done(self, sight: Sight) -> bool:
+    def done(self, sight: DroneState) -> bool:
         """Whether it is reached."""
 
     def gives_up(self, losses: int) -> bool:
         """Whether losing the pose so often about one place ends it."""
 
-    def carry(self, moved: Moved) -> None:
+    def carry(self, moved: MapUpdate) -> None:
         """Take remembered places along with the map."""
 
     def consider(self, candidates: Sequence[Candidate], exits: Sequence[Exit] = ()) -> None:
         """Take note of what looked like an opening from one place only, and of exits, before `goals` is asked."""
 
-    def heading_rad(self, sight: Sight) -> float | None:
+    def heading_rad(self, sight: DroneState) -> float | None:
         """Where to look now, standing; None to look where it flies."""
 
-    def faces_rad(self, sight: Sight) -> float | None:
+    def faces_rad(self, sight: DroneState) -> float | None:
         """Where to look while it flies, slowly and through what it knows; None to look where it flies."""
 
 
@@ -66,11 +66,11 @@ class LooksAhead:
     def consider(self, candidates: Sequence[Candidate], exits: Sequence[Exit] = ()) -> None:
         """It does not."""
 
-    def heading_rad(self, sight: Sight) -> float | None:
+    def heading_rad(self, sight: DroneState) -> float | None:
         """None: ahead."""
         return None
 
-    def faces_rad(self, sight: Sight) -> float | None:
+    def faces_rad(self, sight: DroneState) -> float | None:
         """None: ahead."""
         return None
 
@@ -84,7 +84,7 @@ class GoTo(LooksAhead):
     _losses: Losses = field(default_factory=lambda: Losses(math.inf))
     """Near the goal."""
 
-    def goals(self, layer: Layer, sight: Sight) -> np.ndarray:
+    def goals(self, layer: Layer, sight: DroneState) -> np.ndarray:
         """The goal's cell; where the grid ends, the last one towards it."""
         low = layer.corner_w + layer.cell_m
         high = layer.corner_w + (np.array(layer.free.shape) - 1) * layer.cell_m
@@ -94,7 +94,7 @@ class GoTo(LooksAhead):
         share = float(np.nanmin(np.where(step == 0, np.inf, room)))
         return layer.cells(sight.p_w[:2] + min(1.0, share) * step)[None]
 
-    def done(self, sight: Sight) -> bool:
+    def done(self, sight: DroneState) -> bool:
         """Whether the drone is there, and slow; or as near as it can know.
 
         Before a bare wall telemetry carries it no farther, and a standard deviation of its metres may be more than what
@@ -108,15 +108,15 @@ class GoTo(LooksAhead):
         reach_m = _NEAREST_M if self._losses.count >= _TRIES else reach_m
         return away_m < reach_m and float(np.linalg.norm(sight.velocity_w)) < 0.15
 
-    def away_m(self, sight: Sight) -> float:
+    def away_m(self, sight: DroneState) -> float:
         """Level distance from the goal [m], by the drone's own pose."""
         return float(np.linalg.norm(sight.p_w[:2] - self.goal_w[:2]))
 
-    def carry(self, moved: Moved) -> None:
+    def carry(self, moved: MapUpdate) -> None:
         """A goal in metres from the take-off stays what it is."""
 
 
-def _doubt_m(sight: Sight) -> float:
+def _doubt_m(sight: DroneState) -> float:
     """Standard deviation of where it is in metres from the take-off."""
     return math.hypot(sight.position_sigma_m, sight.scale_sigma * float(np.linalg.norm(sight.p_w[:2])))
 
@@ -135,7 +135,7 @@ class Explore:
     _around: LooksAround = field(default_factory=LooksAround)
     _second: SecondLook = field(default_factory=SecondLook)
 
-    def goals(self, layer: Layer, sight: Sight) -> np.ndarray:
+    def goals(self, layer: Layer, sight: DroneState) -> np.ndarray:
         """Cells to look from at what may be an opening, on the way; those at the middle of each wide border of the
         unseen, and to look from at what was not looked at from before, or may be an opening elsewhere, the nearest of
         which is flown to; then narrow borders, behind chairs and in corners, and openings once more that a look left in
@@ -159,11 +159,11 @@ class Explore:
             self._looks.go_on()
         return cells
 
-    def done(self, sight: Sight) -> bool:
+    def done(self, sight: DroneState) -> bool:
         """Whether the time is over, or nothing is left to see."""
         return sight.stamp_s >= self.until_s or self._looks.over(sight.stamp_s)
 
-    def carry(self, moved: Moved) -> None:
+    def carry(self, moved: MapUpdate) -> None:
         """Take the places along that were looked at, and looked around at."""
         self._looks.carry(moved)
         self._around.carry(moved)
@@ -177,11 +177,11 @@ class Explore:
         """What to look at once more."""
         self._second.consider(candidates)
 
-    def heading_rad(self, sight: Sight) -> float | None:
+    def heading_rad(self, sight: DroneState) -> float | None:
         """At what it has not looked at from before, standing; at what may be an opening, where it shows."""
         around = self._around.heading_rad(sight)
         return around if around is not None else self._second.heading_rad(sight)
 
-    def faces_rad(self, sight: Sight) -> float | None:
+    def faces_rad(self, sight: DroneState) -> float | None:
         """None: ahead."""
         return None

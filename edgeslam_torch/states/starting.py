@@ -7,14 +7,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgeslam_torch.atlas.atlas import CLOSER_LOOKS, Atlas
-from edgeslam_torch.atlas.places import lookalikes
+from edgeslam_torch.atlas.place_recognition import lookalikes
 from edgeslam_torch.frontend.aperture import are_corners
 from edgeslam_torch.frontend.image import as_grey, colours_at
 from edgeslam_torch.map.depth_prior import sample
 from edgeslam_torch.map.keyframe import Keyframe, make_keyframe
 from edgeslam_torch.optim.problem import LmConfig
-from edgeslam_torch.states.backfill import MAX_FRAMES
 from edgeslam_torch.states.machine import Event
+from edgeslam_torch.states.retroactive_localisation import MAX_FRAMES
 from edgeslam_torch.states.step import Step
 from edgeslam_torch.states.system import MIN_KEYPOINTS, System
 from edgeslam_torch.states.tracking import Tracking

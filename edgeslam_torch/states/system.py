@@ -9,8 +9,8 @@ import numpy as np
 from edgeslam_torch.config import SlamConfig
 from edgeslam_torch.fusion.displacement import TelemetryModel
 from edgeslam_torch.fusion.motion import MotionFusion
+from edgeslam_torch.fusion.output_frame import OutputFrame
 from edgeslam_torch.fusion.prediction import PoseEstimate
-from edgeslam_torch.fusion.published import Published
 from edgeslam_torch.fusion.scale.depth_scale import DepthRatio, compared
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
@@ -20,10 +20,10 @@ from edgeslam_torch.map.trajectory import TrajectoryLog
 from edgeslam_torch.mapping.edges.edge_map import EdgeMap
 from edgeslam_torch.mapping.pipeline import Mapped, MappingPipeline
 from edgeslam_torch.stage_times import timed
-from edgeslam_torch.states.apart import Apart
 from edgeslam_torch.states.drift import SHARE, Drift
-from edgeslam_torch.tracking.expectation import Attitude, Expectation, Place, Told, Vertical
+from edgeslam_torch.states.submap_uncertainty import Apart
 from edgeslam_torch.tracking.motion_model import MotionModel
+from edgeslam_torch.tracking.pose_prior import Attitude, Place, Told, TrackingPrior, Vertical
 from edgeslam_torch.tracking.relocaliser import Reach, reach_after
 from edgeslam_torch.tracking.tracker import Track, Tracker
 from edgeslam_torch.types import FloatArray, Frame
@@ -59,7 +59,7 @@ class System:
     mapping: MappingPipeline
     fusion: MotionFusion
     motion: MotionModel
-    published: Published = field(default_factory=Published)
+    published: OutputFrame = field(default_factory=OutputFrame)
     events: dict[str, int] = field(
         default_factory=lambda: {"lost": 0, "relocalised": 0, "restarted": 0, "initialisations_refused": 0, "denied": 0}
     )
@@ -101,7 +101,7 @@ class System:
                 return se3.inverse(estimate.T_w_c)
         return self.motion.predict(stamp_s)
 
-    def expectation(self, stamp_s: float, T_predicted: FloatArray) -> Expectation | None:
+    def expectation(self, stamp_s: float, T_predicted: FloatArray) -> TrackingPrior | None:
         """The predicted pose with the uncertainty due to accelerations; None without a scale.
 
         While its map is young, roll and pitch are the drone's: images then hardly tell a climb from a turn.
@@ -112,7 +112,7 @@ class System:
         vertical = None if told is None else Vertical(*told)
         by_motion = self.motion.expectation(stamp_s, T_predicted, self.published.scale)
         moved = self.told(stamp_s)
-        return Expectation(by_motion, vertical, None if moved is None else moved.place)
+        return TrackingPrior(by_motion, vertical, None if moved is None else moved.place)
 
     def told(self, stamp_s: float) -> Told | None:
         """What the drone's sensors tell of a frame's pose; None where none has proven to be of this flight."""

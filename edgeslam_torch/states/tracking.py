@@ -6,13 +6,13 @@ from dataclasses import replace
 import numpy as np
 
 from edgeslam_torch.atlas.loops import MAX_DRIFT_RAD, SIGMAS, is_near
-from edgeslam_torch.atlas.places import lookalikes
+from edgeslam_torch.atlas.place_recognition import lookalikes
 from edgeslam_torch.atlas.saved import BEFORE_S
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.map.keyframe import Keyframe, make_keyframe, tracked_motion
 from edgeslam_torch.mapping.prior_anchors import depth_slack_px, mostly_on_priors
-from edgeslam_torch.states.backfill import Backfill
 from edgeslam_torch.states.machine import Event
+from edgeslam_torch.states.retroactive_localisation import RetroactiveLocalisation
 from edgeslam_torch.states.step import Located, Step
 from edgeslam_torch.states.system import System
 from edgeslam_torch.tracking.edge_tracker import MIN_EDGES, EdgeTracker, PointsInFrame
@@ -45,7 +45,7 @@ class Tracking:
         )
         self._edge_tracker = EdgeTracker(system.map, system.edges, system.camera, system.config.tracking.edges)
         self.relocaliser = Relocaliser(system.tracker)
-        self.backfill = Backfill(system)
+        self.backfill = RetroactiveLocalisation(system)
         self._template: Template | None = None
         """Template for tracking the next frames; None without a map."""
         self._recent: IntArray = np.zeros(0, dtype=np.int64)
@@ -103,10 +103,10 @@ class Tracking:
         show the same pose again it stays: telemetry alone moves none.
         """
         told, template = self.system.told(frame.stamp_s), self._template
-        if told is None or not told.denies(located.track.T_c_w):
+        if told is None or not told.is_outlier(located.track.T_c_w):
             return located
         again = self._locate(frame, seen, told.applied_to(T_predicted))
-        if again is None or told.denies(again.track.T_c_w):
+        if again is None or told.is_outlier(again.track.T_c_w):
             self._template = template
             self.system.events["denied"] += 1
             return replace(located, denied=True)
@@ -252,7 +252,7 @@ class Tracking:
         told, records = system.carried(stamp_s), system.log.records
         if told is None or not records:
             return True
-        here, there = system.map.heir_of(records[-1].keyframe_id)[0], system.tracker.local_keyframes(track.anchor)[0]
+        here, there = system.map.resolve(records[-1].keyframe_id)[0], system.tracker.local_keyframes(track.anchor)[0]
         between = system.between(system.map.piece_of(here), system.map.piece_of(there.id))
         if there.stamp_s == BEFORE_S or not math.isfinite(between):
             return True
@@ -299,7 +299,7 @@ class Tracking:
     def _denied(self, T_c_w: FloatArray, stamp_s: float) -> bool:
         """Whether the drone has not moved as a pose ``(4, 4)`` by edges has; parallel ones hold few directions."""
         told = self.system.told(stamp_s)
-        return told is not None and told.denies(T_c_w)
+        return told is not None and told.is_outlier(T_c_w)
 
     # -- keyframes ---------------------------------------------------------------------------------------------
 
@@ -348,5 +348,5 @@ def _in_words(located: Located) -> str:
     elif located.relocalised:
         said.append("found again among the keyframes")
     if located.denied:
-        said.append("the drone's own motion denies it")
+        said.append("the drone's own motion is_outlier it")
     return "; ".join(said)

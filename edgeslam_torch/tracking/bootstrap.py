@@ -13,7 +13,6 @@ from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.mapping.prior_anchors import prior_of
 from edgeslam_torch.mapping.refinement import Window, refine
 from edgeslam_torch.optim.problem import LmConfig
-from edgeslam_torch.tracking.expectation import Expectation
 from edgeslam_torch.tracking.initialiser import (
     BootstrapView,
     Consensus,
@@ -22,6 +21,7 @@ from edgeslam_torch.tracking.initialiser import (
     poses_of_witnesses,
     two_view_map,
 )
+from edgeslam_torch.tracking.pose_prior import TrackingPrior
 from edgeslam_torch.tracking.tracker import Track, Tracker, View
 from edgeslam_torch.types import FloatArray, Frame, IntArray
 
@@ -124,7 +124,7 @@ class Bootstrap:
         with self.map.lock:
             self.map.remove_anchors(self._guessed)
 
-    def track(self, view: View, T_predicted: FloatArray, expected: Expectation | None = None) -> Track | None:
+    def track(self, view: View, T_predicted: FloatArray, expected: TrackingPrior | None = None) -> Track | None:
         """Pose against the predicted map; the pose is rough, the matches are reliable."""
         radius = 2.0 * self.tracker.config.motion_radius_px
         track = self.tracker.refine(view, T_predicted, self._guessed, radius, expected=expected)

@@ -18,7 +18,7 @@ from edgeslam_torch.map.keyframe import Keyframe
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.mapping.edges.edge_map import EdgeMap
 from edgeslam_torch.optim.pose_only import PoseConfig, PoseResult, refine_pose
-from edgeslam_torch.tracking.expectation import Expectation
+from edgeslam_torch.tracking.pose_prior import TrackingPrior
 from edgeslam_torch.types import FloatArray, IntArray
 
 HOSTS = 5
@@ -33,7 +33,7 @@ REACH_PX = (12.0, 4.0, 4.0)
 """Association distance in each round; larger for the prediction than for its refinements."""
 AGREE_PX = 1.5
 """Maximum distance across the edge of an inlier: two sigmas of a single edge pixel."""
-ALIKE = np.cos(np.deg2rad(30.0))
+SAME_SIDE_COS = np.cos(np.deg2rad(30.0))
 """Minimum cosine between the normals of a projected edge and its partner (30 degrees). In a cluttered image, one
 point in ten has such an edge by chance."""
 MIN_EDGES = 80
@@ -105,7 +105,7 @@ class EdgeTracker:
         grey: NDArray[np.uint8],
         T_c_w: FloatArray,
         points: PointsInFrame | None = None,
-        expected: Expectation | None = None,
+        expected: TrackingPrior | None = None,
     ) -> EdgePose | None:
         """Pose near a predicted one from edges, beside points; None without measured edges or with too few inliers.
 
@@ -135,7 +135,7 @@ class EdgeTracker:
         return EdgePose(T_c_w, result.covariance, result.inliers[:count], len(edges.uv), in_view, depth)
 
     def _solve(
-        self, T_c_w: FloatArray, points: PointsInFrame, edges: PointsInFrame, expected: Expectation | None
+        self, T_c_w: FloatArray, points: PointsInFrame, edges: PointsInFrame, expected: TrackingPrior | None
     ) -> PoseResult:
         camera = self.camera
         return refine_pose(
@@ -172,7 +172,7 @@ class EdgeTracker:
         inside = seen.contains(uv)
         front, uv = front[inside], uv[inside]
         pixel, normal, near = seen.nearest(uv, reach_px)
-        near &= np.einsum("ij,ij->i", normal, known.normal[front]) > ALIKE  # the same side must be bright
+        near &= np.einsum("ij,ij->i", normal, known.normal[front]) > SAME_SIDE_COS  # the same side must be bright
         tangent = np.stack([-normal[:, 1], normal[:, 0]], axis=1)
         pixels = self.camera.undistort_points(pixel[near].astype(np.float32)).astype(np.float64)
         count = int(near.sum())

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from edgeslam_torch.extras import needs_extra
-from edgeslam_torch.flying.cockpit import Moment
+from edgeslam_torch.flying.flight_controller import Moment
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.types import FloatArray
 from edgeslam_torch.viewer.rerun_viewer import check_writable

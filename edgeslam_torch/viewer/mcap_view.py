@@ -141,7 +141,7 @@ def state_of(output: SlamOutput) -> list[tuple[str, int, str, Mapping[str, objec
     health = output.health
     doubtful = not output.metric or (health is not None and health.disagreement > DISAGREEMENT)
     said = "metres" if output.metric else "no metres"
-    said = said if health is None else health.in_words()
+    said = said if health is None else str(health)
     lines.append(("edgeslam: scale", _WARNING if doubtful else _OK, said, scale | _of_health(health)))
     return lines
 

@@ -20,7 +20,7 @@ from scipy.special import chdtri
 from edgeslam_torch.eval.benchmark.pose_now import Asked, Errors, Truth, judge, told
 from edgeslam_torch.fusion.config import FusionConfig
 from edgeslam_torch.fusion.motion import MotionFusion
-from edgeslam_torch.fusion.published import Published
+from edgeslam_torch.fusion.output_frame import OutputFrame
 from edgeslam_torch.fusion.snapshot import Present
 from edgeslam_torch.synthetic.flights.courses import COURSES, RATE_HZ
 from edgeslam_torch.synthetic.flights.flight import FlightPlan
@@ -85,7 +85,7 @@ def _stretched(truth: Truth, factor: float) -> Truth:
 
 def ask(fusion: MotionFusion, seen: Seen, telemetry: Sequence[TelemetrySample]) -> list[Asked]:
     """The present pose a few times a second, in metres of the true scale."""
-    published, answers, sent = Published(seen.metres_per_unit), [], 0
+    published, answers, sent = OutputFrame(seen.metres_per_unit), [], 0
     for i, (stamp, T) in enumerate(zip(seen.stamps_s.tolist(), seen.T_m_c, strict=True)):
         end = sent
         while end < len(telemetry) and telemetry[end].stamp_s <= stamp:

@@ -11,7 +11,7 @@ from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.inputs.dataset import open_dataset
 from edgeslam_torch.eval.judge import sources
 from edgeslam_torch.eval.judge.flights import NONE
-from edgeslam_torch.eval.judge.telemetry.made import KINDS
+from edgeslam_torch.eval.judge.telemetry.simulated_telemetry import KINDS
 from edgeslam_torch.readers.source import Recording
 from edgeslam_torch.synthetic.flights.courses import COURSES
 

@@ -251,7 +251,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     final = slam.trajectory()[1]
     truth = flight.T_w_c[: len(final)]
     for change in slam.closures():
-        say(f"{change.stamp_s:.1f} s: {change.in_words()}")
+        say(f"{change.stamp_s:.1f} s: {change}")
     errors = zip(*(errors_of_passes(T_w_c, truth, flight.pass_frames) for T_w_c in (live, final)), strict=True)
     rows = [
         [*_row(passes[: k + 1]), *(f"{error:.4f}" for error in pair)]

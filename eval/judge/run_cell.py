@@ -19,7 +19,7 @@ from edgeslam_torch.eval.judge import flights, second_flight, sources
 from edgeslam_torch.eval.judge.cells import BACKWARDS, CUT, CUT_FRAMES, HALF, KIDNAP, SECOND_FLIGHT, VARIANTS, Cell
 from edgeslam_torch.eval.judge.runner import CELL, RESULT
 from edgeslam_torch.eval.judge.score import Truth, score
-from edgeslam_torch.eval.judge.telemetry.made import KINDS, Drawn
+from edgeslam_torch.eval.judge.telemetry.simulated_telemetry import KINDS, Drawn
 from edgeslam_torch.files.atomic import write_text
 from edgeslam_torch.files.config_file import load_config
 from edgeslam_torch.jobs.watched import end_with_parent

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from edgeslam_torch.eval.judge.bars import Bar, Row, verdicts_of_cell, verdicts_of_groups
+from edgeslam_torch.eval.judge.thresholds import Bar, Row, verdicts_of_cell, verdicts_of_groups
 
 _FOOTNOTES = (
     "end, live: share of the frames whose pose rests on the map, at the end and when they came. path: ATE in % of the "

@@ -10,10 +10,10 @@ from edgeslam_torch.atlas import links
 from edgeslam_torch.atlas.atlas import Atlas, _apart_enough, _sigma_log
 from edgeslam_torch.atlas.links import common_scale, link, on_one_plane, view_of
 from edgeslam_torch.atlas.loops import bridge
-from edgeslam_torch.atlas.places import lookalikes
+from edgeslam_torch.atlas.map_merging import move_piece
+from edgeslam_torch.atlas.place_recognition import lookalikes
 from edgeslam_torch.atlas.saved import BEFORE_S
-from edgeslam_torch.atlas.unit import AGAIN_S
-from edgeslam_torch.atlas.weld import move_piece
+from edgeslam_torch.atlas.submap_scale import AGAIN_S
 from edgeslam_torch.config import EdgeConfig, OrbConfig, TrackingConfig
 from edgeslam_torch.frontend.matching import words
 from edgeslam_torch.geometry import se3, sim3
@@ -79,7 +79,7 @@ def test_two_pieces_of_one_place_become_one(rng):
     join = pieces.atlas().update()
     assert (join.piece, join.absorbed, join.links >= 2) == (0, 1, True)
     assert sim3.scale_of(join.S) == pytest.approx(1 / 1.4 if join.moved == 1 else 1.4, rel=0.02)
-    assert "piece 1 joined piece 0" in join.in_words()
+    assert "piece 1 joined piece 0" in str(join)
     check_map(pieces.map)
     assert {pieces.map.piece_of(k.id) for k in pieces.keyframes} == {0}
     assert pieces.position_error() < 0.01
@@ -467,7 +467,7 @@ def test_a_piece_is_turned_as_the_first_one(rng, angle):
     atlas = pieces.atlas(facing_along=told)
     done = atlas.align(1.0)
     assert (done.piece, done.growth(1, 5)) == (1, 1.0)
-    assert done.in_words() == f"piece 1 turned by {np.rad2deg(angle):.1f} degrees (sigma 4.1) to the heading before it"
+    assert str(done) == f"piece 1 turned by {np.rad2deg(angle):.1f} degrees (sigma 4.1) to the heading before it"
     began = -before[4][:3, :3].T @ before[4][:3, 3]
     for k, keyframe in enumerate(pieces.keyframes):
         np.testing.assert_allclose(pixels_of(pieces, keyframe), pixels[k], atol=1e-6)

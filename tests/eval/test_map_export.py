@@ -148,10 +148,10 @@ def test_bare_wall_with_edges_behind_it_is_not_free() -> None:
     """A wall without edges at 1 m hides edges at 3 m, which were seen from the other room alone: nobody looked
     through the wall, so neither it nor the space behind it is free, seen from here."""
     beside, behind = wall_at(1.0)[:20], wall_at(3.0)
-    eyes = np.array([[0.0, 0.0, 1.0], [2.0, 0.0, 1.0]])
+    perception = np.array([[0.0, 0.0, 1.0], [2.0, 0.0, 1.0]])
     here, there = seen_from((0.0, 0.0, 1.0), beside), seen_from((2.0, 0.0, 1.0), behind)
     lines = SightLines(*(np.concatenate(pair) for pair in zip(astuple(here), astuple(there), strict=True)))
-    grid = occupancy_grid(np.concatenate([beside, behind]), lines, eyes)
+    grid = occupancy_grid(np.concatenate([beside, behind]), lines, perception)
     assert value_at(grid, 1.0, 0.0) == UNKNOWN, "the bare wall"
     assert value_at(grid, 0.5, 0.0) == UNKNOWN, "nothing says how far the bare wall is"
     assert value_at(grid, 0.5, -0.47) == FREE, "before what was seen of the wall"

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from edgeslam_torch.flying.checks import check_fit, check_goal
-from edgeslam_torch.flying.outcome import FlightRefused
+from edgeslam_torch.flying.result import FlightRefused
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.limits import NavLimits
 

@@ -11,17 +11,17 @@ import pytest
 
 from edgeslam_torch.cli import main
 from edgeslam_torch.errors import OutputError, SourceError
-from edgeslam_torch.flying.cockpit import Cockpit
-from edgeslam_torch.flying.errands import WayHome
+from edgeslam_torch.flying.flight_controller import FlightController
 from edgeslam_torch.flying.recorder import EXITS, Recorder
 from edgeslam_torch.flying.replay import replay, told
+from edgeslam_torch.flying.tasks import WayHome
 from edgeslam_torch.geometry.camera import PRESETS
 from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.navigation.corridor.follow import FollowCorridor
+from edgeslam_torch.navigation.drone_state import HOVER, Contact, DroneState, View
 from edgeslam_torch.navigation.flight_record import PLAN, Decision, NewTask, PlanLog, read_plan
 from edgeslam_torch.navigation.limits import NavLimits
-from edgeslam_torch.navigation.openings.watch import Exit
-from edgeslam_torch.navigation.sight import HOVER, Sight, Touch, View
+from edgeslam_torch.navigation.openings.exit_tracker import Exit
 from edgeslam_torch.navigation.tasks import Explore, GoTo
 
 TICK_S = 0.1
@@ -36,24 +36,24 @@ def sight(now_s, p, v=(0.0, 0.0, 0.0), yaw=0.0):
     depth = np.full((30, 40), 3.0, np.float32)
     K = np.array([[38.5, 0.0, 19.5], [0.0, 38.5, 14.5], [0.0, 0.0, 1.0]])
     view = View(now_s, depth, np.full_like(depth, 0.02), K, turn @ T) if round(now_s / TICK_S) % 2 == 0 else None
-    return Sight(now_s, np.array(p), yaw, np.array(v), view=view)
+    return DroneState(now_s, np.array(p), yaw, np.array(v), view=view)
 
 
 def fly(path, seconds, held_x=math.inf):
     """A drone that follows every wish, until a pane that nobody sees holds it, recorded."""
     log = PlanLog(path / PLAN, NavLimits())
-    cockpit = Cockpit(NavLimits(), witness=log.add)
-    cockpit.begin(GoTo(np.array([1.5, 0.2, 1.15])))
+    flight_controller = FlightController(NavLimits(), witness=log.add)
+    flight_controller.begin(GoTo(np.array([1.5, 0.2, 1.15])))
     p, v, yaw, decisions = np.array([0.0, 0.0, 0.9]), np.zeros(3), 0.0, []
     for k in range(round(seconds / TICK_S)):
-        decisions.append(cockpit.plan(sight(k * TICK_S, p, v, yaw)))
+        decisions.append(flight_controller.plan(sight(k * TICK_S, p, v, yaw)))
         w, (c, s) = decisions[-1].wish, (math.cos(yaw), math.sin(yaw))
         v = np.array([c * w.forward_m_s - s * w.left_m_s, s * w.forward_m_s + c * w.left_m_s, w.up_m_s])
         if p[0] + TICK_S * v[0] > held_x:
             v = np.zeros(3)
         p, yaw = p + TICK_S * v, yaw + TICK_S * w.turn_left_rad_s
         if math.isfinite(held_x):
-            cockpit.order(sight(k * TICK_S, p, v, yaw))
+            flight_controller.order(sight(k * TICK_S, p, v, yaw))
     log.close()
     return decisions
 
@@ -101,7 +101,7 @@ def test_the_same_planner_decides_the_same(flight):
 def test_what_was_felt_and_not_seen_turns_it_away_and_is_replayed(tmp_path):
     decisions = fly(tmp_path, 15.0, held_x=0.6)
     entries = list(read_plan(tmp_path / PLAN))
-    touches = [k for k, entry in enumerate(entries) if isinstance(entry, Touch)]
+    touches = [k for k, entry in enumerate(entries) if isinstance(entry, Contact)]
     assert touches and entries[touches[0]].p_w[0] == pytest.approx(0.6, abs=0.05)
     assert entries[touches[0]].towards_w[0] > 0.7
     before, after = (next(e for e in entries[touches[0] + s :: s] if isinstance(e, Decision)) for s in (-1, 1))
@@ -119,15 +119,15 @@ def test_another_speed_limit_decides_otherwise(flight):
 
 def test_what_a_planner_hung_on_is_in_the_file(tmp_path):
     log = PlanLog(tmp_path / PLAN, NavLimits())
-    cockpit = Cockpit(NavLimits(), witness=log.add)
-    cockpit.plan(sight(0.0, (0.0, 0.0, 0.9)))
+    flight_controller = FlightController(NavLimits(), witness=log.add)
+    flight_controller.plan(sight(0.0, (0.0, 0.0, 0.9)))
 
     def hangs(seen):
         raise KeyboardInterrupt
 
-    cockpit.pilot = type("Hung", (), {"update": staticmethod(hangs)})()
+    flight_controller.pilot = type("Hung", (), {"update": staticmethod(hangs)})()
     with pytest.raises(KeyboardInterrupt):
-        cockpit.plan(sight(0.1, (0.0, 0.0, 0.9)))
+        flight_controller.plan(sight(0.1, (0.0, 0.0, 0.9)))
     log.close()
     found = replay(tmp_path)
     assert [step.before is None for step in found.steps] == [False, True]
@@ -200,12 +200,12 @@ def test_a_task_that_no_file_can_hold_is_said(tmp_path):
 def test_exits_are_recorded_as_they_become_known(tmp_path):
     recorder = Recorder(tmp_path / "flight", NavLimits())
     recorder.begin(PRESETS["tello"])
-    cockpit = Cockpit(NavLimits(), [recorder.moment])
-    cockpit.order(sight(0.0, (0.0, 0.0, 1.1)))
+    flight_controller = FlightController(NavLimits(), [recorder.moment])
+    flight_controller.order(sight(0.0, (0.0, 0.0, 1.1)))
     assert not (tmp_path / "flight" / EXITS).exists()
     ahead = np.array([1.0, 0.0, 0.0])
-    cockpit.pilot.exits.exits = (Exit(np.array([2.0, 0.5, 1.1]), ahead, 0.9, 0.05, 0.1, 3),)
-    cockpit.order(sight(0.1, (0.0, 0.0, 1.1)))
+    flight_controller.pilot.exits.exits = (Exit(np.array([2.0, 0.5, 1.1]), ahead, 0.9, 0.05, 0.1, 3),)
+    flight_controller.order(sight(0.1, (0.0, 0.0, 1.1)))
     recorder.close()
     assert recorder.failure is None
     lines = (tmp_path / "flight" / EXITS).read_text().splitlines()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from edgeslam_torch.flying.eyes.home import GROUND_M, TAKE_OFF, Home, Place, metres_per_unit
+from edgeslam_torch.flying.perception.home import GROUND_M, TAKE_OFF, Home, Place, metres_per_unit
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.types import FrameStatus, ScaleEstimate, SlamOutput

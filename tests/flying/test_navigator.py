@@ -1,4 +1,4 @@
-"""Verbs and their outcomes, over a craft that follows orders exactly, in a room that its pilot has seen."""
+"""Verbs and their outcomes, over a vehicle that follows orders exactly, in a room that its pilot has seen."""
 
 import math
 
@@ -6,29 +6,29 @@ import numpy as np
 import pytest
 
 from edgeslam_torch.errors import SourceError
-from edgeslam_torch.flying.cockpit import Cockpit
-from edgeslam_torch.flying.errands import Stay
+from edgeslam_torch.flying.flight_controller import FlightController
 from edgeslam_torch.flying.navigator import APART, CARRIED, LONE, Navigator
-from edgeslam_torch.flying.outcome import FlightRefused
+from edgeslam_torch.flying.result import FlightRefused
+from edgeslam_torch.flying.tasks import Stay
 from edgeslam_torch.geometry.camera import PRESETS
 from edgeslam_torch.geometry.mount import camera_on_body
+from edgeslam_torch.navigation.drone_state import DroneState, View
 from edgeslam_torch.navigation.limits import NavLimits
 from edgeslam_torch.navigation.pilot import Phase
-from edgeslam_torch.navigation.sight import Sight, View
 
 TICK_S = 0.05
 WALL_M = 4.0
 
 
-class ObedientCraft:
+class ObedientVehicle:
     """Moves at once as told, before a wall at x = `WALL_M` that it sees when it looks there; free elsewhere.
 
     ``door``: the wall is at 2.5 m, from -2 to 2, with a doorway of 0.9 m, and behind it is another at `WALL_M` + 2.
     """
 
-    def __init__(self, cockpit, metric=True, battery=1.0, door=False):
+    def __init__(self, flight_controller, metric=True, battery=1.0, door=False):
         self.door = door
-        self.cockpit, self.camera, self.over = cockpit, PRESETS["tello"], ""
+        self.flight_controller, self.camera, self.over = flight_controller, PRESETS["tello"], ""
         self.flying, self.battery, self.metric, self.ticks = False, battery, metric, 0
         self.p, self.yaw, self.v, self.now_s = np.array([0.0, 0.0, 0.1]), 0.0, np.zeros(3), 0.0
 
@@ -40,11 +40,11 @@ class ObedientCraft:
             self.now_s += TICK_S
             self.ticks += 1
             self.p = self.p + TICK_S * self.v
-            sight = Sight(
+            sight = DroneState(
                 self.now_s, self.p, self.yaw, self.v, metric=self.metric, battery=self.battery, view=self._view()
             )
-            self.cockpit.plan(sight)
-            order = self.cockpit.order(sight)
+            self.flight_controller.plan(sight)
+            order = self.flight_controller.order(sight)
             if order.land:
                 self.land(str(order.danger))
             w, (c, s) = order.wish, (math.cos(self.yaw), math.sin(self.yaw))
@@ -85,9 +85,9 @@ class ObedientCraft:
         return np.where((np.abs(across) < 2.0) & (np.abs(across) > 0.45), to(2.5), to(WALL_M + 2.0))
 
 
-def navigator(allow_motion=True, **craft):
-    cockpit = Cockpit(NavLimits())
-    return Navigator(ObedientCraft(cockpit, **craft), cockpit, allow_motion)
+def navigator(allow_motion=True, **vehicle):
+    flight_controller = FlightController(NavLimits())
+    return Navigator(ObedientVehicle(flight_controller, **vehicle), flight_controller, allow_motion)
 
 
 @pytest.mark.parametrize(
@@ -102,9 +102,9 @@ def navigator(allow_motion=True, **craft):
 )
 def test_an_outcome_says_what_it_rests_on(tracked, apart_m, reason):
     nav = navigator()
-    nav.craft.flying, nav.craft.fly = True, lambda until: None
-    nav.cockpit.sight = Sight(9.0, np.zeros(3), 0.0, np.zeros(3), tracked=tracked, apart_sigma_m=apart_m)
-    nav.cockpit.ended = lambda: Phase.DONE
+    nav.vehicle.flying, nav.vehicle.fly = True, lambda until: None
+    nav.flight_controller.sight = DroneState(9.0, np.zeros(3), 0.0, np.zeros(3), tracked=tracked, apart_sigma_m=apart_m)
+    nav.flight_controller.ended = lambda: Phase.DONE
     outcome = nav.fly(Stay(), "home")
     assert (outcome.reached, outcome.reason) == (True, reason)
     explored = nav.explore(60.0)
@@ -114,10 +114,10 @@ def test_an_outcome_says_what_it_rests_on(tracked, apart_m, reason):
 @pytest.mark.parametrize(("x", "reason"), [(2.1, "there"), (1.6, "there, 0.40 m from it by its own pose")])
 def test_an_outcome_says_how_near_to_its_goal_it_is(x, reason):
     nav = navigator()
-    nav.craft.flying, nav.craft.fly = True, lambda until: None
-    nav.cockpit.sight = Sight(9.0, np.array([x, 0.0, 1.15]), 0.0, np.zeros(3))
-    nav.cockpit.known = lambda: None
-    nav.cockpit.ended = lambda: Phase.DONE
+    nav.vehicle.flying, nav.vehicle.fly = True, lambda until: None
+    nav.flight_controller.sight = DroneState(9.0, np.array([x, 0.0, 1.15]), 0.0, np.zeros(3))
+    nav.flight_controller.known = lambda: None
+    nav.flight_controller.ended = lambda: Phase.DONE
     assert nav.go_to((2.0, 0.0, 1.15)).reason == reason
 
 
@@ -127,13 +127,13 @@ def test_there_and_back_with_outcomes():
         assert nav.take_off().reached
         there = nav.go_to((2.5, 0.5, 1.15))
         assert there.reached and there.reason == "there"
-        assert np.linalg.norm(nav.craft.p[:2] - [2.5, 0.5]) < 0.25
+        assert np.linalg.norm(nav.vehicle.p[:2] - [2.5, 0.5]) < 0.25
         assert 2.2 < there.path_m < 4.0
-        assert there.min_clearance_m == pytest.approx(WALL_M - nav.craft.p[0] - 0.1, abs=0.25)
+        assert there.min_clearance_m == pytest.approx(WALL_M - nav.vehicle.p[0] - 0.1, abs=0.25)
         home = nav.return_home()
-        assert home.reached and np.linalg.norm(nav.craft.p[:2]) < 0.2
+        assert home.reached and np.linalg.norm(nav.vehicle.p[:2]) < 0.2
         landed = nav.land()
-        assert landed.reached and not nav.craft.flying
+        assert landed.reached and not nav.vehicle.flying
 
 
 def test_goals_in_the_wall_are_refused_and_it_stays_in_the_air():
@@ -141,19 +141,19 @@ def test_goals_in_the_wall_are_refused_and_it_stays_in_the_air():
         nav.take_off()
         with pytest.raises(FlightRefused, match="solid"):
             nav.go_to((WALL_M + 0.05, 0.0, 1.15))
-        assert nav.craft.flying
-    assert nav.craft.over == "the program left"
+        assert nav.vehicle.flying
+    assert nav.vehicle.over == "the program left"
 
 
 def test_goals_before_metres_are_refused_and_no_metres_end_in_a_landing():
     with navigator(metric=False) as nav:
-        nav.craft.take_off()
-        nav.cockpit.order(Sight(0.0, nav.craft.p, 0.0, np.zeros(3), metric=False))
+        nav.vehicle.take_off()
+        nav.flight_controller.order(DroneState(0.0, nav.vehicle.p, 0.0, np.zeros(3), metric=False))
         with pytest.raises(FlightRefused, match="no metres yet"):
             nav.go_to((1.0, 0.0, 1.15))
     with navigator(metric=False) as nav:
         outcome = nav.take_off()
-        assert not outcome.reached and "no metres" in outcome.reason and not nav.craft.flying
+        assert not outcome.reached and "no metres" in outcome.reason and not nav.vehicle.flying
 
 
 @pytest.mark.slow
@@ -161,10 +161,10 @@ def test_a_low_battery_brings_it_home_and_down():
     with navigator() as nav:
         nav.take_off()
         nav.go_to((2.0, 0.0, 1.15))
-        nav.craft.battery = 0.2
+        nav.vehicle.battery = 0.2
         outcome = nav.go_to((2.0, 2.0, 1.15))
         assert not outcome.reached and "battery low" in outcome.reason
-        assert not nav.craft.flying and np.linalg.norm(nav.craft.p[:2]) < 0.2
+        assert not nav.vehicle.flying and np.linalg.norm(nav.vehicle.p[:2]) < 0.2
         with pytest.raises(FlightRefused, match="over"):
             nav.take_off()
 
@@ -172,9 +172,9 @@ def test_a_low_battery_brings_it_home_and_down():
 def test_exploring_ends_in_time():
     with navigator() as nav:
         nav.take_off()
-        begin = nav.craft.now_s
+        begin = nav.vehicle.now_s
         assert nav.explore(5.0).reached
-        assert 5.0 <= nav.craft.now_s - begin < 5.5
+        assert 5.0 <= nav.vehicle.now_s - begin < 5.5
         with pytest.raises(FlightRefused, match="more than 0"):
             nav.explore(float("nan"))
 
@@ -192,7 +192,7 @@ def test_an_exit_is_found_and_flown_through():
         assert exit_.width_m == pytest.approx(0.9, abs=0.15)
         through = nav.go_through(exit_)
         assert through.reached and through.reason == "through the exit"
-        assert nav.craft.p[:2] == pytest.approx([3.3, 0.0], abs=0.35)
+        assert nav.vehicle.p[:2] == pytest.approx([3.3, 0.0], abs=0.35)
 
 
 def test_nothing_ahead_is_no_corridor():

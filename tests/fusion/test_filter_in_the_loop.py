@@ -11,7 +11,7 @@ from edgeslam_torch.fusion.config import FusionConfig
 from edgeslam_torch.fusion.filter.delayed import BufferedEkf, PoseSigma
 from edgeslam_torch.fusion.filter.filter_feed import FilterFeed
 from edgeslam_torch.fusion.motion import MotionFusion
-from edgeslam_torch.fusion.published import Published
+from edgeslam_torch.fusion.output_frame import OutputFrame
 from edgeslam_torch.fusion.snapshot import Present
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.mount import camera_on_body
@@ -67,7 +67,7 @@ class Flown:
 
     def metric(self):
         """What `EdgeSlam` would publish, in metres of the true scale."""
-        return Present(self.fusion.snapshot(), Published(self.gauge.scale), True)
+        return Present(self.fusion.snapshot(), OutputFrame(self.gauge.scale), True)
 
 
 def steps_ahead(flown, gap_s):

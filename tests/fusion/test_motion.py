@@ -7,11 +7,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.fusion.config import FusionConfig
-from edgeslam_torch.fusion.metres import Metres
 from edgeslam_torch.fusion.motion import MotionFusion
 from edgeslam_torch.fusion.scale.depth_scale import DepthRatio
 from edgeslam_torch.fusion.scale.log_scale import LogScale
-from edgeslam_torch.fusion.telemetry.whole_steps import Rounding
+from edgeslam_torch.fusion.scale_estimator import ScaleEstimator
+from edgeslam_torch.fusion.telemetry.velocity_quantisation import Rounding
 from edgeslam_torch.fusion.telemetry_scale import TelemetryFit, TelemetryScale
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.mount import camera_on_body
@@ -416,7 +416,7 @@ def test_heights_that_hardly_change_tell_no_metres(swinging, replay):
 @pytest.mark.parametrize("found", [None, (LogScale(0.1, 0.4, "height"), TelemetryFit())], ids=["nothing", "unsure"])
 def test_metres_by_heights_alone_are_not_held_when_heights_do_not_bear_them_out(source, held, found):
     trusting = SimpleNamespace(velocity=True, height=lambda reading: True, at_odds=None)
-    metres = Metres(FusionConfig(), 0.0)
+    metres = ScaleEstimator(FusionConfig(), 0.0)
     metres.take((LogScale(0.0, 0.1, source), TelemetryFit()), 0.0, trusting)
     metres.take(found, 0.0, trusting)
     assert (metres.told is not None) == held

@@ -8,7 +8,7 @@ import pytest
 from edgeslam_torch.fusion.config import FusionConfig
 from edgeslam_torch.fusion.displacement import DELAY_S
 from edgeslam_torch.fusion.motion import MotionFusion
-from edgeslam_torch.fusion.telemetry.plausibility import Agreement, Reading
+from edgeslam_torch.fusion.telemetry.sensor_validation import Agreement, Reading
 from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.types import TelemetrySample
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from edgeslam_torch.geometry.mount import camera_on_body
-from edgeslam_torch.navigation.sight import View
+from edgeslam_torch.navigation.drone_state import View
 
 K = np.array([[77.0, 0.0, 39.5], [0.0, 77.0, 29.5], [0.0, 0.0, 1.0]])
 

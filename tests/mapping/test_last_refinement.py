@@ -129,8 +129,8 @@ def test_in_the_last_refinement_telemetry_counts_as_often_as_it_was_heard(monkey
     flight()
     asked = []
 
-    def factors(model, keyframes, piece, doubt, alike):
-        asked.append(alike)
+    def factors(model, keyframes, piece, doubt, effective_samples):
+        asked.append(effective_samples)
         return MotionFactors()
 
     monkeypatch.setattr(refinement, "motion_factors", factors)

@@ -17,10 +17,10 @@ from edgeslam_torch.fusion.telemetry.track import TelemetryTrack
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.mount import camera_on_body
 from edgeslam_torch.map.keyframe import NO_ANCHOR
-from edgeslam_torch.map.known_ground import MIN_SHARED, is_back
+from edgeslam_torch.map.revisit import MIN_SHARED, is_back
 from edgeslam_torch.mapping.last_refinement import lm_config
 from edgeslam_torch.mapping.mapper import WIDE_EVERY, Mapper
-from edgeslam_torch.mapping.motion_terms import ALIKE, motion_factors
+from edgeslam_torch.mapping.motion_terms import EFFECTIVE_SAMPLES, motion_factors
 from edgeslam_torch.mapping.refinement import (
     Window,
     recent_map,
@@ -340,11 +340,12 @@ def test_a_whole_map_may_count_telemetry_as_often_as_it_was_heard(rng, halves):
     model, keyframes = telemetry_of(rng, halves), halves.keyframes
     flying = Window(keyframes[1:], keyframes[:1], halves.map.anchors_seen_by(keyframes))
     one, often = (
-        window_problem(halves.map, w, CAMERA, LmConfig(), model)[0] for w in (whole_map(halves.map, alike=1.0), flying)
+        window_problem(halves.map, w, CAMERA, LmConfig(), model)[0]
+        for w in (whole_map(halves.map, effective_samples=1.0), flying)
     )
     for once, again in zip(one.centres, often.centres, strict=True):
-        np.testing.assert_allclose(ALIKE * once.information, again.information, rtol=1e-6)
-        np.testing.assert_allclose(ALIKE * once.vector, again.vector, rtol=1e-6, atol=1e-9)
+        np.testing.assert_allclose(EFFECTIVE_SAMPLES * once.information, again.information, rtol=1e-6)
+        np.testing.assert_allclose(EFFECTIVE_SAMPLES * once.vector, again.vector, rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(one.gravity[0].sigma_rad, math.sqrt(30.0) * often.gravity[0].sigma_rad)
     np.testing.assert_allclose(30.0 * one.headings[0].information, often.headings[0].information)
 

@@ -74,7 +74,7 @@ def test_a_window_that_cannot_be_refined_is_left_as_it_is(points, what):
 
 @pytest.mark.parametrize(("kernel", "sigma_px"), [(Kernel.HUBER, 1.2**3), (Kernel.L2, 1.0)])
 def test_keypoints_count_as_precisely_as_their_level_tells(points, kernel, sigma_px):
-    """A keypoint of level 3 scatters by 1.728 px; in the paper's plain squares all count alike."""
+    """A keypoint of level 3 scatters by 1.728 px; in the paper's plain squares all count effective_samples."""
     window = choose_window(points.map, points.keyframes[-1], 4, 15)
     coarse = points.keyframes[-1]
     coarse.features.octave[:] = 3

@@ -5,15 +5,15 @@ import math
 import numpy as np
 import pytest
 
+from edgeslam_torch.navigation.drone_state import DroneState
 from edgeslam_torch.navigation.exploring.around import LooksAround, _in_turn
 from edgeslam_torch.navigation.exploring.coverage import Borders
 from edgeslam_torch.navigation.layer import Layer
-from edgeslam_torch.navigation.moved import Moved
-from edgeslam_torch.navigation.sight import Sight
+from edgeslam_torch.navigation.map_update import MapUpdate
 
 
 def at(now_s, x, yaw_deg, tracked=True):
-    return Sight(now_s, np.array([x, 0.0, 1.15]), math.radians(yaw_deg), np.zeros(3), tracked=tracked)
+    return DroneState(now_s, np.array([x, 0.0, 1.15]), math.radians(yaw_deg), np.zeros(3), tracked=tracked)
 
 
 def corridor(long_m=6.0):
@@ -113,7 +113,7 @@ def test_places_go_along_with_the_map():
     """Metres become twice as long: where it has looked around, 2 m from its take-off, is 4 m from it."""
     looks = LooksAround()
     assert looked(looks, 2.0)
-    looks.carry(Moved(np.eye(4)[None], np.eye(4)[None], 2.0))
+    looks.carry(MapUpdate(np.eye(4)[None], np.eye(4)[None], 2.0))
     assert not looked(looks, 4.1, begin_s=30.0)
     assert looked(looks, 2.0, begin_s=60.0)
 

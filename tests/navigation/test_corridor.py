@@ -6,12 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from edgeslam_torch.navigation.corridor.corridor_geometry import mouths
 from edgeslam_torch.navigation.corridor.follow import FollowCorridor
-from edgeslam_torch.navigation.corridor.onward import mouths
+from edgeslam_torch.navigation.drone_state import DroneState
 from edgeslam_torch.navigation.layer import Layer
-from edgeslam_torch.navigation.moved import Moved
-from edgeslam_torch.navigation.openings.watch import Candidate, Exit
-from edgeslam_torch.navigation.sight import Sight
+from edgeslam_torch.navigation.map_update import MapUpdate
+from edgeslam_torch.navigation.openings.exit_tracker import Candidate, Exit
 
 
 def seen(is_solid, is_unseen=lambda x, y: np.zeros(x.shape, bool)):
@@ -22,7 +22,7 @@ def seen(is_solid, is_unseen=lambda x, y: np.zeros(x.shape, bool)):
 
 
 def sight(x, y=0.0, stamp_s=0.0, yaw=0.0):
-    return Sight(stamp_s, np.array([x, y, 1.15]), yaw, np.zeros(3))
+    return DroneState(stamp_s, np.array([x, y, 1.15]), yaw, np.zeros(3))
 
 
 def place(task, layer, at):
@@ -338,7 +338,7 @@ def test_it_moves_with_the_map():
         task = FollowCorridor()
         for k, x in enumerate(np.arange(-4.0, 2.5, 0.4)):
             task.goals(seen(shape), sight(x, 0.0, 0.5 * k))
-        task.carry(Moved(from_, to))
+        task.carry(MapUpdate(from_, to))
         moved = seen(lambda x, y: shape(x, y - 2.0))  # noqa: B023
         found = moved.centres(task.goals(moved, sight(2.4, 2.0, 30.0)))
         assert (found[:, 1] > left_m).all() if math.isfinite(left_m) else len(found) == 0

@@ -5,17 +5,17 @@ import math
 import numpy as np
 import pytest
 
+from edgeslam_torch.navigation.drone_state import DroneState
 from edgeslam_torch.navigation.exploring.coverage import Borders, Coverage, borders
 from edgeslam_torch.navigation.layer import Layer
-from edgeslam_torch.navigation.moved import Moved
-from edgeslam_torch.navigation.sight import Sight
+from edgeslam_torch.navigation.map_update import MapUpdate
 
 WALL = Borders(np.array([[x, 1.0] for x in np.arange(-3.0, 3.05, 0.1)]), np.tile([0.0, -1.0], (61, 1)), 0.1)
 """One metre to the left of a drone that flies along x."""
 
 
 def at(x, y, yaw_deg, tracked=True):
-    return Sight(0.0, np.array([x, y, 1.15]), math.radians(yaw_deg), np.zeros(3), tracked=tracked)
+    return DroneState(0.0, np.array([x, y, 1.15]), math.radians(yaw_deg), np.zeros(3), tracked=tracked)
 
 
 def corridor(free=lambda x, y: np.abs(y) < 0.95, solid=lambda x, y: np.zeros(x.shape, bool)):
@@ -65,7 +65,7 @@ def test_views_go_along_with_the_map():
     """Metres become twice as long: what was seen 2 m away is 1 m away."""
     coverage = Coverage()
     coverage.note(at(2.0, 0.0, 90.0))
-    coverage.carry(Moved(np.eye(4)[None], np.eye(4)[None], 0.5))
+    coverage.carry(MapUpdate(np.eye(4)[None], np.eye(4)[None], 0.5))
     left = coverage.unlooked(WALL).p_w[:, 0]
     assert not ((left > 0.7) & (left < 1.3)).any()
 

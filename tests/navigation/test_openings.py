@@ -6,16 +6,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from edgeslam_torch.navigation.drone_state import DroneState, View
 from edgeslam_torch.navigation.exploring.frontiers import Looks, reachable
 from edgeslam_torch.navigation.layer import Layer
-from edgeslam_torch.navigation.moved import Moved
+from edgeslam_torch.navigation.map_update import MapUpdate
 from edgeslam_torch.navigation.openings.detour import has_detour
+from edgeslam_torch.navigation.openings.exit_tracker import ExitTracker
 from edgeslam_torch.navigation.openings.exits import distinct, openings
 from edgeslam_torch.navigation.openings.pathways import pathways
-from edgeslam_torch.navigation.openings.turned import Walls, along_walls, wall_directions
-from edgeslam_torch.navigation.openings.watch import ExitWatch
+from edgeslam_torch.navigation.openings.wall_frame import Walls, along_walls, wall_directions
 from edgeslam_torch.navigation.pilot import Pilot
-from edgeslam_torch.navigation.sight import Sight, View
 from edgeslam_torch.navigation.space import Space
 from edgeslam_torch.navigation.tasks import Explore, GoTo
 
@@ -120,11 +120,11 @@ def test_what_can_be_no_door(case, walls):
 
 
 def sight(x, y=0.0, stamp_s=0.0, yaw=0.0, **fields):
-    return Sight(stamp_s, np.array([x, y, 1.15]), yaw, np.zeros(3), **fields)
+    return DroneState(stamp_s, np.array([x, y, 1.15]), yaw, np.zeros(3), **fields)
 
 
 def watched(places, walls):
-    watch = ExitWatch()
+    watch = ExitTracker()
     for k, x in enumerate(places):
         watch.look(walls, sight(x, stamp_s=0.5 * k))
     return watch
@@ -158,7 +158,7 @@ def test_its_normal_keeps_its_side_when_the_drone_has_flown_through():
 
 
 def test_its_sigma_has_that_of_the_metres():
-    walls, watch = surroundings(wall(0.9)), ExitWatch()
+    walls, watch = surroundings(wall(0.9)), ExitTracker()
     for k, x in enumerate([0.0, 0.2, 0.4, 0.6]):
         watch.look(walls, sight(x, stamp_s=0.5 * k, scale_sigma=0.2))
     (exit_,) = watch.exits
@@ -190,7 +190,7 @@ def test_what_many_looks_told_is_not_told_while_later_ones_show_a_wall():
 def test_an_exit_was_seen_by_looks_at_it():
     """`doors` 802: a corridor that noise narrows, seen again and again by a drone that flies away from it."""
     door, closed = surroundings(wall(0.9)), surroundings(wall(0.0))
-    watch = ExitWatch()
+    watch = ExitTracker()
     for k, x in enumerate([1.0, 0.4, 0.0, -0.4] * 5):
         watch.look(door, sight(x, stamp_s=0.5 * k, yaw=math.pi))
     assert watch.exits == (), "nothing speaks for it"
@@ -232,7 +232,7 @@ def test_a_jump_of_the_pose_is_no_way_through():
         watch.look(surroundings(wall(0.9)), sight(x, 0.0, 3.0 + 0.5 * k))
     assert not any(seen.flown for seen in watch._seen)
     watch.look(surroundings(wall(0.9)), sight(2.6, 0.0, 4.5))
-    watch.carry(Moved(np.eye(4)[None], np.eye(4)[None]))
+    watch.carry(MapUpdate(np.eye(4)[None], np.eye(4)[None]))
     watch.look(surroundings(wall(0.9)), sight(1.8, 0.0, 5.0))
     assert not any(seen.flown for seen in watch._seen), "nor is a map that moved"
 
@@ -340,15 +340,15 @@ VIEW = View(0.0, np.ones((3, 4)), np.full((3, 4), 0.1), np.eye(3), np.eye(4))
 
 
 def test_no_look_without_a_view_or_metres():
-    assert ExitWatch().due(sight(0.0, view=VIEW))
-    assert not ExitWatch().due(sight(0.0)), "what the grid shows is no older than the last one"
-    assert not ExitWatch().due(sight(0.0, view=VIEW, metric=False))
-    assert not ExitWatch().due(sight(0.0, view=VIEW, tracked=False))
+    assert ExitTracker().due(sight(0.0, view=VIEW))
+    assert not ExitTracker().due(sight(0.0)), "what the grid shows is no older than the last one"
+    assert not ExitTracker().due(sight(0.0, view=VIEW, metric=False))
+    assert not ExitTracker().due(sight(0.0, view=VIEW, tracked=False))
 
 
 def test_no_look_counts_in_a_piece_of_map_that_may_lie_elsewhere():
-    assert ExitWatch().due(sight(0.0, view=VIEW, apart_sigma_m=0.1))
-    assert not ExitWatch().due(sight(0.0, view=VIEW, apart_sigma_m=0.13))
+    assert ExitTracker().due(sight(0.0, view=VIEW, apart_sigma_m=0.1))
+    assert not ExitTracker().due(sight(0.0, view=VIEW, apart_sigma_m=0.13))
 
 
 @pytest.mark.parametrize("angle", ANGLES)
@@ -406,13 +406,13 @@ def test_upright_is_what_fills_the_height():
 
 def test_an_exit_stays_where_its_pictures_stay():
     """`doors` 808: a piece of map that lay across the door by mistake took it along by a metre when it was mended."""
-    walls, watch = surroundings(wall(0.9)), ExitWatch()
+    walls, watch = surroundings(wall(0.9)), ExitTracker()
     for k, x in enumerate([0.0, 0.2, 0.4, 0.6]):
         view = View(0.5 * k, np.zeros((2, 2)), np.zeros((2, 2)), np.eye(3), np.eye(4), picture=10 + k)
         watch.look(walls, sight(x, stamp_s=0.5 * k, view=view))
     before, after = np.stack([np.eye(4)] * 2), np.stack([np.eye(4)] * 2)
     before[1, 0, 3], after[1, 0, 3] = 2.0, 3.0
-    watch.carry(Moved(before, after, pictures=np.array([10, 90])))
+    watch.carry(MapUpdate(before, after, pictures=np.array([10, 90])))
     unseen = surroundings(lambda a, b: np.zeros(a.shape, bool), lambda a, b: np.ones(a.shape, bool))
     watch.look(unseen, sight(0.0, stamp_s=3.0, yaw=-2.0))
     assert [e.centre_w[:2] for e in watch.exits] == [pytest.approx([2.0, 0.0], abs=0.15)]
@@ -423,7 +423,7 @@ def test_exits_go_along_with_the_map():
     watch = watched([0.0, 0.2, 0.4, 0.6], surroundings(wall(0.9)))
     before = np.eye(4)[None]
     after = np.array([[[0.0, -1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]])
-    watch.carry(Moved(before, after, 1.3))
+    watch.carry(MapUpdate(before, after, 1.3))
     unseen = surroundings(lambda a, b: np.zeros(a.shape, bool), lambda a, b: np.ones(a.shape, bool))
     watch.look(unseen, sight(0.0, stamp_s=3.0, yaw=-2.0))
     (exit_,) = watch.exits
@@ -449,7 +449,7 @@ def test_a_revised_unit_keeps_exits_that_a_view_carries_along():
     pilot.update(sight(0.0, stamp_s=9.0))
     assert len(pilot.exits.exits) == 1
     here = np.eye(4)[None]
-    pilot.update(replace(sight(0.0, stamp_s=9.1, yaw=2.0), revision=1, moved=Moved(here, here, 1.2)))
+    pilot.update(replace(sight(0.0, stamp_s=9.1, yaw=2.0), revision=1, moved=MapUpdate(here, here, 1.2)))
     pilot.update(replace(sight(0.0, stamp_s=9.7, yaw=2.0, view=VIEW), revision=1))
     assert [e.centre_w[0] for e in pilot.exits.exits] == [pytest.approx(2.4, abs=0.15)]
 

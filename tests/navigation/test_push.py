@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from edgeslam_torch.navigation.hindered.push import Push
-from edgeslam_torch.navigation.sight import Sight
+from edgeslam_torch.navigation.contact.push import Push
+from edgeslam_torch.navigation.drone_state import DroneState
 
 AHEAD = np.array([1.0, 0.0])
 
@@ -14,7 +14,7 @@ def held_after_s(velocities_w, told_m_s, towards_w=lambda k: AHEAD, seconds=6.0)
     push = Push()
     for k in range(round(20 * seconds)):
         now = k / 20
-        sight = Sight(now, np.zeros(3), 0.0, np.array([*velocities_w(k), 0.0]), told_speed_m_s=told_m_s(k))
+        sight = DroneState(now, np.zeros(3), 0.0, np.array([*velocities_w(k), 0.0]), told_speed_m_s=told_m_s(k))
         if push.holds(sight, towards_w(k), now):
             return now
     return None
@@ -63,7 +63,7 @@ def test_a_pause_begins_it_anew():
 
 def test_what_it_was_told_before_a_pause_does_not_count():
     push = Push()
-    still = Sight(0.0, np.zeros(3), 0.0, np.zeros(3))
+    still = DroneState(0.0, np.zeros(3), 0.0, np.zeros(3))
     assert not any(push.holds(still, AHEAD, k / 20) for k in range(20))
     assert not push.holds(still, AHEAD, 9.0)
     assert any(push.holds(still, AHEAD, 9.0 + k / 20) for k in range(40))

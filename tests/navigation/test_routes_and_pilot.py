@@ -8,15 +8,15 @@ import pytest
 from views import facing_a_wall
 
 from edgeslam_torch.drone.emulator.drone import DroneModel
-from edgeslam_torch.flying.errands import WayHome
+from edgeslam_torch.flying.tasks import WayHome
 from edgeslam_torch.navigation.arcs import candidates, flown
+from edgeslam_torch.navigation.drone_state import Contact, DroneState, VelocityCommand
 from edgeslam_torch.navigation.exploring.frontiers import frontiers
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.limits import NavLimits
-from edgeslam_torch.navigation.moved import Moved
+from edgeslam_torch.navigation.map_update import MapUpdate
 from edgeslam_torch.navigation.pilot import Phase, Pilot
 from edgeslam_torch.navigation.route import cost_to_go
-from edgeslam_torch.navigation.sight import Sight, Touch, Wish
 from edgeslam_torch.navigation.tasks import Explore, GoTo
 
 
@@ -141,11 +141,11 @@ def test_frontiers_are_where_the_known_ends():
 @pytest.mark.parametrize(
     ("wish", "sticks"),
     [
-        (Wish(forward_m_s=0.5), (0.0, 0.5, 0.0, 0.0)),
-        (Wish(left_m_s=0.5), (-0.5, 0.0, 0.0, 0.0)),
-        (Wish(up_m_s=0.2), (0.0, 0.0, 0.2, 0.0)),
-        (Wish(turn_left_rad_s=math.radians(50.0)), (0.0, 0.0, 0.0, -0.5)),
-        (Wish(forward_m_s=9.0), (0.0, 1.0, 0.0, 0.0)),
+        (VelocityCommand(forward_m_s=0.5), (0.0, 0.5, 0.0, 0.0)),
+        (VelocityCommand(left_m_s=0.5), (-0.5, 0.0, 0.0, 0.0)),
+        (VelocityCommand(up_m_s=0.2), (0.0, 0.0, 0.2, 0.0)),
+        (VelocityCommand(turn_left_rad_s=math.radians(50.0)), (0.0, 0.0, 0.0, -0.5)),
+        (VelocityCommand(forward_m_s=9.0), (0.0, 1.0, 0.0, 0.0)),
     ],
 )
 def test_wishes_become_sticks(wish, sticks):
@@ -154,11 +154,11 @@ def test_wishes_become_sticks(wish, sticks):
 
 def test_a_wish_that_is_no_number_is_refused():
     with pytest.raises(ValueError, match="finite"):
-        Wish(forward_m_s=math.nan).sticks()
+        VelocityCommand(forward_m_s=math.nan).sticks()
 
 
 def at(x, y, stamp_s=0.0, yaw_rad=0.0, speed_m_s=0.0, **fields):
-    return Sight(stamp_s, np.array([x, y, 1.15]), yaw_rad, np.array([speed_m_s, 0.0, 0.0]), **fields)
+    return DroneState(stamp_s, np.array([x, y, 1.15]), yaw_rad, np.array([speed_m_s, 0.0, 0.0]), **fields)
 
 
 def test_a_pilot_without_a_position_decides_nothing():
@@ -174,7 +174,7 @@ def test_a_pilot_that_sees_nothing_does_not_leave_what_it_knows():
     for _ in range(500):
         drone.step(0.01)
     for k in range(300):
-        now = Sight(k / 15, drone.p_w.copy(), drone.yaw, drone.velocity.copy())
+        now = DroneState(k / 15, drone.p_w.copy(), drone.yaw, drone.velocity.copy())
         right, forward, up, clockwise = pilot.update(now).sticks()
         drone.rc = (right, forward, up, clockwise)
         for _ in range(7):
@@ -189,7 +189,7 @@ def test_a_sweep_leaves_out_the_side_where_the_pose_is_lost():
     for k in range(400):
         lost = yaw < math.radians(-30.0)
         height = min(1.4, 0.05 * k) if pilot.phase is Phase.RISING else 1.4
-        wish = pilot.update(Sight(k / 20, np.array([0.0, 0.0, height]), yaw, np.zeros(3), tracked=not lost))
+        wish = pilot.update(DroneState(k / 20, np.array([0.0, 0.0, height]), yaw, np.zeros(3), tracked=not lost))
         if pilot.phase is not Phase.RISING and pilot.phase is not Phase.SWEEPING:
             break
         seen.append(yaw)
@@ -322,7 +322,7 @@ def test_small_movements_to_and_fro_are_ended_by_a_look_from_higher_once():
 def test_what_closes_the_way_is_doubted_once_before_the_task_is_given_up():
     pilot = before_a_free_way()
     closed(pilot)
-    pilot.touched(Touch(np.array([0.0, 3.0, 1.15]), np.array([0.0, 1.0])))
+    pilot.touched(Contact(np.array([0.0, 3.0, 1.15]), np.array([0.0, 1.0])))
     phases = stays(pilot, 14.5)
     assert set(phases) == {Phase.FLYING} and pilot.space.layer(1.15, 0.15).solid.any()
     phases = stays(pilot, 1.0, 14.5)
@@ -365,7 +365,7 @@ def test_a_map_that_moves_is_no_progress():
     for k in range(36):
         after = before.copy()
         after[0, 3] = 0.1 * (k % 2 == 0)
-        moved = Moved(before[None], after[None])
+        moved = MapUpdate(before[None], after[None])
         before = after
         pilot.update(replace(at(after[0, 3], 0.0, stamp_s=0.5 * k), moved=moved if k else None))
         if pilot.phase is Phase.RISING:

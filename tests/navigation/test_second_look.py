@@ -5,11 +5,11 @@ import math
 import numpy as np
 import pytest
 
+from edgeslam_torch.navigation.drone_state import DroneState
 from edgeslam_torch.navigation.exploring.second_look import SecondLook
 from edgeslam_torch.navigation.layer import Layer
-from edgeslam_torch.navigation.moved import Moved
-from edgeslam_torch.navigation.openings.watch import Candidate
-from edgeslam_torch.navigation.sight import Sight
+from edgeslam_torch.navigation.map_update import MapUpdate
+from edgeslam_torch.navigation.openings.exit_tracker import Candidate
 from edgeslam_torch.navigation.tasks import Explore
 
 DOOR = Candidate(np.array([3.0, 0.0]), np.array([1.0, 0.0]), np.array([1.5, 1.0]))
@@ -17,7 +17,7 @@ DOOR = Candidate(np.array([3.0, 0.0]), np.array([1.0, 0.0]), np.array([1.5, 1.0]
 
 
 def at(x, y, now_s=0.0):
-    return Sight(now_s, np.array([x, y, 1.15]), 0.0, np.zeros(3))
+    return DroneState(now_s, np.array([x, y, 1.15]), 0.0, np.zeros(3))
 
 
 def room(solid=None):
@@ -92,7 +92,7 @@ def test_what_was_tried_goes_along_with_the_map():
     """Metres become twice as long: what was given up at 3 m is at 6."""
     look = considering(DOOR)
     look.heading_rad(at(1.8, -0.3, 0.0))
-    look.carry(Moved(np.eye(4)[None], np.eye(4)[None], 2.0))
+    look.carry(MapUpdate(np.eye(4)[None], np.eye(4)[None], 2.0))
     assert look.heading_rad(at(1.8, -0.3, 5.0)) is None, "what it was told lay where the map was"
     look.consider([Candidate(np.array([6.0, 0.0]), DOOR.normal_w, np.array([3.0, 2.0]))])
     assert look.heading_rad(at(5.0, 0.0, 5.0)) is None
@@ -158,7 +158,7 @@ def test_exploring_looks_at_every_wall_from_before_and_then_ends():
     """A drone that is at its goal at once; of the border of the unseen it sees no more."""
     task, layer, x, y, yaw = Explore(), plain(5.0), 2.0, 0.0, 0.0
     for now_s in np.arange(0.0, 400.0, 0.1):
-        sight = Sight(now_s, np.array([x, y, 1.15]), yaw, np.zeros(3))
+        sight = DroneState(now_s, np.array([x, y, 1.15]), yaw, np.zeros(3))
         if task.done(sight):
             break
         if (heading := task.heading_rad(sight)) is not None:

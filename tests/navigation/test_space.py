@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from views import K, facing_a_wall
 
-from edgeslam_torch.navigation.moved import Moved
-from edgeslam_torch.navigation.sight import Touch
+from edgeslam_torch.navigation.drone_state import Contact
+from edgeslam_torch.navigation.map_update import MapUpdate
 from edgeslam_torch.navigation.space import Space
 
 
@@ -113,7 +113,7 @@ def test_where_it_flew_is_free():
 def test_it_bends_with_the_map():
     space = Space()
     seen(space)
-    space.rebuild(Moved(facing_a_wall().T_w_c[None], facing_a_wall(x=1.0).T_w_c[None]))
+    space.rebuild(MapUpdate(facing_a_wall().T_w_c[None], facing_a_wall(x=1.0).T_w_c[None]))
     layer = space.layer(1.15, 0.15)
     assert cell(layer, 2.55, 0.05) == (True, False)
     assert cell(layer, 3.05, 0.05)[1] or cell(layer, 2.95, 0.05)[1]
@@ -126,7 +126,7 @@ def test_it_grows_with_the_unit():
     seen(space)
     space.flown(np.array([0.0, 1.0, 1.15]), 0.2)
     here = facing_a_wall().T_w_c[None]
-    space.rebuild(Moved(here, here, 1.5))
+    space.rebuild(MapUpdate(here, here, 1.5))
     layer = space.layer(1.15, 0.15)
     assert cell(layer, 2.55, 0.05) == (True, False)
     assert cell(layer, 3.05, 0.05)[1] or cell(layer, 2.95, 0.05)[1]
@@ -139,14 +139,14 @@ def test_what_it_hovers_before_fills_no_memory_and_what_it_passed_is_kept():
     for k in range(300):
         space.observe(facing_a_wall(x=0.01 * min(k, 100)))
     here = np.array([facing_a_wall(x=x).T_w_c for x in (0.0, 1.0)])
-    space.rebuild(Moved(here, here))
+    space.rebuild(MapUpdate(here, here))
     layer = space.layer(1.15, 0.15)
     assert cell(layer, 0.75, 0.05) == (True, False) and cell(layer, 1.55, 0.05) == (True, False)
 
 
 def test_a_doubted_wall_is_unseen_until_it_is_seen_again_also_after_the_map_moved():
     """Before it is free all the while, and nobody frees it."""
-    space, moved = Space(), Moved(facing_a_wall().T_w_c[None], facing_a_wall(x=1.0).T_w_c[None])
+    space, moved = Space(), MapUpdate(facing_a_wall().T_w_c[None], facing_a_wall(x=1.0).T_w_c[None])
     seen(space)
     space.doubt_solids()
     layer = space.layer(1.15, 0.15)
@@ -156,7 +156,7 @@ def test_a_doubted_wall_is_unseen_until_it_is_seen_again_also_after_the_map_move
     assert cell(layer, 2.55, 0.05) == (True, False) and not layer.solid.any()
     layer = seen(space, x=1.0)
     assert cell(layer, 3.05, 0.05)[1] or cell(layer, 2.95, 0.05)[1]
-    space.rebuild(Moved(moved.after_w, moved.after_w))
+    space.rebuild(MapUpdate(moved.after_w, moved.after_w))
     assert space.layer(1.15, 0.15).solid.any(), "what was seen again stays"
 
 
@@ -203,7 +203,7 @@ def test_what_was_touched_is_solid_whatever_is_seen():
     space = Space()
     layer = seen(space, distance_m=4.0)
     assert cell(layer, 1.22, 0.05) == (True, False)
-    space.touched(Touch(np.array([1.05, 0.05, 1.15]), np.array([1.0, 0.0])), 0.17)
+    space.touched(Contact(np.array([1.05, 0.05, 1.15]), np.array([1.0, 0.0])), 0.17)
     layer = seen(space, distance_m=4.0)
     assert cell(layer, 1.22, 0.05) == (False, True), "ahead of the drone"
     assert cell(layer, 0.88, 0.05) == (True, False), "not behind it"
@@ -212,18 +212,18 @@ def test_what_was_touched_is_solid_whatever_is_seen():
 
 def test_what_was_touched_moves_with_the_map():
     space = Space()
-    space.touched(Touch(np.array([1.05, 0.05, 1.15]), np.array([1.0, 0.0])), 0.17)
+    space.touched(Contact(np.array([1.05, 0.05, 1.15]), np.array([1.0, 0.0])), 0.17)
     T = np.eye(4)[None]
     shifted = T.copy()
     shifted[0, :3, 3] = [1.0, 2.0, 0.0]
-    space.rebuild(Moved(T, shifted, 1.0))
+    space.rebuild(MapUpdate(T, shifted, 1.0))
     layer = space.layer(1.15, 0.15)
     assert cell(layer, 2.22, 2.05)[1] and not cell(layer, 1.22, 0.05)[1]
 
 
 def test_a_touch_beyond_the_grid_is_no_error():
     space = Space()
-    space.touched(Touch(np.array([100.0, 0.0, 1.15]), np.array([1.0, 0.0])), 0.17)
+    space.touched(Contact(np.array([100.0, 0.0, 1.15]), np.array([1.0, 0.0])), 0.17)
     assert not space.layer(1.15, 0.15).solid.any()
 
 
@@ -236,7 +236,7 @@ def test_where_it_flew_is_known_as_the_grid_and_the_map_move():
     assert space.was_at(places).tolist() == [True, True, False, False]
     space.follow(np.array([3.0, 0.0, 1.15]))
     assert space.was_at(places).tolist() == [True, True, False, False]
-    space.rebuild(Moved(np.eye(4)[None], np.eye(4)[None], 2.0))
+    space.rebuild(MapUpdate(np.eye(4)[None], np.eye(4)[None], 2.0))
     assert space.was_at(places).tolist() == [True, False, True, True]
     assert not space.was_at(np.array([50.0, 0.0]))
 
@@ -246,7 +246,7 @@ def test_what_was_seen_and_felt_before_a_moment_can_be_forgotten():
     for stamp_s, yaw in ((1.0, 0.0), (1.2, 0.0), (1.4, 0.0), (5.0, np.pi / 2), (5.2, np.pi / 2), (5.4, np.pi / 2)):
         space.observe(replace(facing_a_wall(yaw=yaw), stamp_s=stamp_s))
     space.flown(np.array([-3.0, 0.0, 1.15]), 0.3)
-    space.touched(Touch(np.array([0.0, -2.0, 1.15]), np.array([0.0, -1.0])), 0.3)
+    space.touched(Contact(np.array([0.0, -2.0, 1.15]), np.array([0.0, -1.0])), 0.3)
     layer = space.layer(1.15, 0.15)
     assert cell(layer, 1.55, 0.05)[0] and cell(layer, 0.05, 1.55)[0] and cell(layer, -3.0, 0.0)[0]
     space.forget_before(5.0)

@@ -6,19 +6,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from edgeslam_torch.navigation.drone_state import DroneState, VelocityCommand
 from edgeslam_torch.navigation.limits import NavLimits
-from edgeslam_torch.navigation.moved import Moved
-from edgeslam_torch.navigation.sight import Sight, Wish
+from edgeslam_torch.navigation.map_update import MapUpdate
 from edgeslam_torch.navigation.supervisor import LAND_S, UNSURE_LAND_S, Danger, Supervisor
 
-AHEAD = Wish(forward_m_s=0.5, why="ahead")
+AHEAD = VelocityCommand(forward_m_s=0.5, why="ahead")
 BACK = np.array([-0.2, 0.0, 0.0])
 """As it moves while it backs up."""
 
 
 def sight(now_s, x=0.0, **fields):
     fields = {"velocity_w": np.array([0.5, 0.0, 0.0]), "seen_s": now_s - 0.4} | fields
-    return Sight(now_s, np.array([x, 0.0, 1.1]), 0.0, **fields)
+    return DroneState(now_s, np.array([x, 0.0, 1.1]), 0.0, **fields)
 
 
 def flown(supervisor, seconds, change=lambda s: s, wish=AHEAD, begin_s=0.0, x=0.0):
@@ -55,7 +55,7 @@ def test_an_old_picture_stops_it_and_it_backs_up_the_way_it_came():
         supervisor,
         LAND_S + 1.5,
         lambda s: replace(s, p_w=np.array([1.5, 0.0, 1.1]), velocity_w=np.zeros(3), seen_s=2.6),
-        wish=Wish(),
+        wish=VelocityCommand(),
         begin_s=3.0,
     )
     assert blind[0].danger is Danger.NONE  # 0.4 s old, as always
@@ -88,7 +88,9 @@ def test_telemetry_carries_it_past_what_shows_nothing_as_long_as_it_is_sure_of_i
     carried = {"tracked": False, "position_sigma_m": 0.1}
     orders = flown(supervisor, 1.0, lambda s: replace(s, **carried), begin_s=1.0, x=0.5)
     assert all(o.wish == AHEAD and o.danger is Danger.CARRIED for o in orders)  # done, and said
-    waiting = flown(supervisor, 0.2, lambda s: replace(s, **carried), Wish(turn_left_rad_s=0.5), begin_s=2.0, x=1.0)
+    waiting = flown(
+        supervisor, 0.2, lambda s: replace(s, **carried), VelocityCommand(turn_left_rad_s=0.5), begin_s=2.0, x=1.0
+    )
     assert {o.danger for o in waiting} == {Danger.LOST}  # it turns to what it may not know either
 
 
@@ -165,7 +167,7 @@ def test_a_pose_lost_in_a_turn_is_looked_for_where_it_was_known():
         now, lost = k / 20, k > 30
         yaw = min(k, 30) / 30 * math.radians(45.0) if not lost else yaw + turns[-1] / 20
         supervisor.see(replace(sight(now), yaw_rad=yaw, tracked=not lost, velocity_w=np.zeros(3)))
-        supervisor.propose(Wish(turn_left_rad_s=0.5), now)
+        supervisor.propose(VelocityCommand(turn_left_rad_s=0.5), now)
         turns.append(supervisor.order(now).wish.turn_left_rad_s)
     assert max(turns[31:40]) < -0.5
     assert yaw == pytest.approx(math.radians(45.0 * (30 - 24) / 30), abs=math.radians(5.0))
@@ -199,7 +201,7 @@ def test_what_holds_the_drone_is_told_once_with_its_direction():
     for k in range(60):
         now = 1.0 + k / 15
         supervisor.see(replace(sight(now), **still))
-        supervisor.propose(Wish(left_m_s=0.4), now)
+        supervisor.propose(VelocityCommand(left_m_s=0.4), now)
         touches.append(supervisor.order(now).touch)
     (touch,) = [t for t in touches if t is not None]
     np.testing.assert_allclose(touch.p_w, [0.5, 0, 1.1])
@@ -231,7 +233,7 @@ def test_the_fence_stops_what_leads_out_and_lets_it_return():
     flown(out, 1.0)
     at_fence = lambda s: replace(s, p_w=np.array([2.1, 0.0, 1.1]))  # noqa: E731
     assert flown(out, 0.5, at_fence, begin_s=1.0)[-1].danger is Danger.FENCE
-    back = flown(out, 0.5, at_fence, wish=Wish(forward_m_s=-0.3), begin_s=1.5)
+    back = flown(out, 0.5, at_fence, wish=VelocityCommand(forward_m_s=-0.3), begin_s=1.5)
     assert back[-1].danger is Danger.NONE
 
 
@@ -242,11 +244,15 @@ def test_before_it_sees_anything_it_does_nothing():
 
 def test_heights_are_kept():
     limits = NavLimits(lowest_m=0.5, highest_m=1.5)
-    rising = flown(Supervisor(limits), 0.5, lambda s: replace(s, p_w=np.array([0, 0, 1.6])), wish=Wish(up_m_s=0.3))
+    rising = flown(
+        Supervisor(limits), 0.5, lambda s: replace(s, p_w=np.array([0, 0, 1.6])), wish=VelocityCommand(up_m_s=0.3)
+    )
     assert rising[-1].wish.up_m_s == 0.0
-    sinking = flown(Supervisor(limits), 0.5, lambda s: replace(s, p_w=np.array([0, 0, 0.4])), wish=Wish(up_m_s=-0.3))
+    sinking = flown(
+        Supervisor(limits), 0.5, lambda s: replace(s, p_w=np.array([0, 0, 0.4])), wish=VelocityCommand(up_m_s=-0.3)
+    )
     assert sinking[-1].wish.up_m_s == 0.0
-    assert math.isclose(flown(Supervisor(limits), 0.5, wish=Wish(up_m_s=0.3))[-1].wish.up_m_s, 0.3)
+    assert math.isclose(flown(Supervisor(limits), 0.5, wish=VelocityCommand(up_m_s=0.3))[-1].wish.up_m_s, 0.3)
 
 
 def test_doubtful_metres_have_longer_to_mend_and_still_end_in_a_landing():
@@ -299,9 +305,9 @@ def test_heights_apart_mean_nothing_while_metres_are_not_sure():
 
 def test_neither_height_may_be_beyond_the_limits():
     """The map says 1.2 m, the drone 2.0 m: it rises no more, and sinks if it wants to."""
-    rising = flown(Supervisor(), 0.5, lambda s: replace(s, told_height_m=2.0), wish=Wish(up_m_s=0.3))
+    rising = flown(Supervisor(), 0.5, lambda s: replace(s, told_height_m=2.0), wish=VelocityCommand(up_m_s=0.3))
     assert all(o.wish.up_m_s == 0.0 for o in rising)
-    sinking = flown(Supervisor(), 0.5, lambda s: replace(s, told_height_m=2.0), wish=Wish(up_m_s=-0.3))
+    sinking = flown(Supervisor(), 0.5, lambda s: replace(s, told_height_m=2.0), wish=VelocityCommand(up_m_s=-0.3))
     assert all(o.wish.up_m_s == -0.3 for o in sinking)
 
 
@@ -310,7 +316,9 @@ def test_a_way_back_that_something_stands_in_is_given_up_and_told():
     supervisor = Supervisor()
     flown(supervisor, 3.0)
     here = {"p_w": np.array([1.5, 0.0, 1.1]), "velocity_w": np.array([0.02, 0.0, 0.0]), "tracked": False}
-    lost = flown(supervisor, 9.0, lambda s: replace(s, **here, position_sigma_m=0.2), begin_s=3.0, wish=Wish())
+    lost = flown(
+        supervisor, 9.0, lambda s: replace(s, **here, position_sigma_m=0.2), begin_s=3.0, wish=VelocityCommand()
+    )
     backing = [o.wish.why.endswith("back the way it came") for o in lost]
     assert sum(backing) / 20 == pytest.approx(1.55, abs=0.1)
     (touch,) = [o.touch for o in lost if o.touch is not None]
@@ -323,9 +331,9 @@ def test_metres_that_change_while_it_is_carried_are_no_way_flown():
     supervisor = Supervisor()
     flown(supervisor, 2.0)
     flown(supervisor, 1.0, lambda s: replace(s, tracked=False, position_sigma_m=0.1), begin_s=2.0, x=1.0)
-    supervisor.carry(Moved(np.eye(4)[None], np.eye(4)[None], 2.0))
+    supervisor.carry(MapUpdate(np.eye(4)[None], np.eye(4)[None], 2.0))
     there = {"p_w": np.array([2.95, 0.0, 2.2]), "velocity_w": BACK, "tracked": False, "position_sigma_m": 0.2}
-    lost = flown(supervisor, 11.0, lambda s: replace(s, **there), wish=Wish(), begin_s=3.0)
+    lost = flown(supervisor, 11.0, lambda s: replace(s, **there), wish=VelocityCommand(), begin_s=3.0)
     backing = [o.wish.why.endswith("back the way it came") for o in lost]
     assert sum(backing) / 20 == pytest.approx(8.0, abs=0.3)
 
@@ -335,12 +343,12 @@ def test_the_way_back_goes_along_with_the_map():
     supervisor = Supervisor()
     flown(supervisor, 3.0)
     here = np.eye(4)[None]
-    supervisor.carry(Moved(here, here, 2.0))
+    supervisor.carry(MapUpdate(here, here, 2.0))
     blind = flown(
         supervisor,
         4.0,
         lambda s: replace(s, p_w=np.array([2.95, 0.0, 2.2]), velocity_w=np.zeros(3), seen_s=2.6),
-        wish=Wish(),
+        wish=VelocityCommand(),
         begin_s=3.0,
     )
     assert blind[60].wish.forward_m_s < -0.1

@@ -1,4 +1,4 @@
-"""Poses that the drone's attitude or its place denies: before a wall whose pattern repeats, corners on whole pixels
+"""Poses that the drone's attitude or its place is_outlier: before a wall whose pattern repeats, corners on whole pixels
 take any neighbour. (Aligned to a part of a pixel they are seldom deceived, and nothing would be left to deny.)"""
 
 from functools import lru_cache
@@ -100,7 +100,7 @@ def test_attitude_that_lies_moves_no_pose_that_the_images_prove():
     assert [out.status for out in lied] == [out.status for out in untold]
     for a, b in zip(lied, untold, strict=True):
         np.testing.assert_allclose(a.T_w_c, b.T_w_c, atol=2e-3)
-    assert "denies it" in lied[-1].reason and not untold[-1].reason
+    assert "is_outlier it" in lied[-1].reason and not untold[-1].reason
 
 
 def true_centre(flight, k):
@@ -135,4 +135,4 @@ def test_a_place_that_lies_moves_no_pose_that_the_images_prove():
     assert [out.status for out in lied] == [out.status for out in untold]
     for a, b in zip(lied, untold, strict=True):
         np.testing.assert_allclose(a.T_w_c, b.T_w_c, atol=2e-3)
-    assert "denies it" in lied[-1].reason and not untold[-1].reason
+    assert "is_outlier it" in lied[-1].reason and not untold[-1].reason

@@ -9,8 +9,8 @@ from rendered import CAMERA, film, sideways, stairs_world
 
 from edgeslam_torch.config import DepthConfig, SlamConfig
 from edgeslam_torch.eval.metrics.align import umeyama
-from edgeslam_torch.fusion.metres import Metres
 from edgeslam_torch.fusion.motion import MotionFusion
+from edgeslam_torch.fusion.scale_estimator import ScaleEstimator
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.slam import EdgeSlam
 from edgeslam_torch.types import DepthMap, TelemetrySample, Units
@@ -53,7 +53,7 @@ def test_depths_that_the_network_gave_do_not_confirm_the_network(monkeypatch):
     poses = np.stack([se3.exp(np.array([0.0, 0.0, 0.0, 0.0, a, 0.0])) for a in turn])
     turning = film(stairs_world(), CAMERA, poses)
     slam = EdgeSlam(CAMERA, NO_NETWORK, depth=turning.depth_function())
-    told = spied(monkeypatch, "add_depth_ratio", of=Metres)
+    told = spied(monkeypatch, "add_depth_ratio", of=ScaleEstimator)
     for frame in turning.frames:
         slam.step(frame)
     assert len(slam.map.anchors) > 300

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from edgeslam_torch.config import SlamConfig
-from edgeslam_torch.fusion.published import Published
+from edgeslam_torch.fusion.output_frame import OutputFrame
 from edgeslam_torch.states.starting import Starting
 from edgeslam_torch.types import DepthMap
 
@@ -16,7 +16,7 @@ def guessed(network_unit, published, depth_m=3.0):
     depth = DepthMap(np.full((24, 32), depth_m, np.float32), np.full((24, 32), 0.2, np.float32))
     keyframe = SimpleNamespace(depth=depth, features=SimpleNamespace(uv=np.array([[5.0, 6.0], [20.0, 12.0]])))
     fusion = SimpleNamespace(metres=SimpleNamespace(network_unit=lambda: network_unit))
-    system = SimpleNamespace(config=SlamConfig(), fusion=fusion, published=Published(published))
+    system = SimpleNamespace(config=SlamConfig(), fusion=fusion, published=OutputFrame(published))
     starting = Starting.__new__(Starting)
     starting.system = system
     return starting._guess_depth(keyframe)[:, 0]

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from edgeslam_torch.fusion.published import Published
+from edgeslam_torch.fusion.output_frame import OutputFrame
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.states.drift import SHARE
 from edgeslam_torch.states.system import System
@@ -53,7 +53,7 @@ def test_a_correction_of_the_map_is_told_to_the_fusion_as_such():
     refined = se3.exp(np.array([0.12, -0.01, 0.31, 0.01, 0.1, 0.02]))
     mapped = SimpleNamespace(keyframes=[SimpleNamespace(T_c_w=refined)], T_tracked=tracked, stage_ms={})
     asked.compare_depth = lambda keyframe: None
-    asked.map, asked.drift, asked.published = None, SimpleNamespace(add=lambda *_: None, newest=3.0), Published(2.0)
+    asked.map, asked.drift, asked.published = None, SimpleNamespace(add=lambda *_: None, newest=3.0), OutputFrame(2.0)
     System.absorb(asked, mapped)
     after = se3.inverse(asked.motion.T_c_w)
     assert np.linalg.norm(after - before) > 0.01

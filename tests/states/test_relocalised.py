@@ -42,7 +42,7 @@ class Flown:
     def system(self):
         slam_map = SimpleNamespace(
             keyframes=self.keyframes,
-            heir_of=lambda k: (k, np.eye(4)),
+            resolve=lambda k: (k, np.eye(4)),
             shared_counts=lambda anchors: self.sees_again if len(anchors) else {},
             piece_of=self.piece_of.__getitem__,
             anchors=SimpleNamespace(p_w=np.array([[0.0, 0.0, 2.0], [5.0, 0.0, 2.0]])),

@@ -7,7 +7,7 @@ import pytest
 import torch
 from posed_run import write_run
 
-from edgeslam_torch.train import watchers
+from edgeslam_torch.train import callbacks
 
 
 @pytest.fixture(autouse=True)
@@ -22,7 +22,7 @@ def one_thread() -> Iterator[None]:
 @pytest.fixture(autouse=True)
 def small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """In TensorBoard: writing them would take longer than the training."""
-    monkeypatch.setattr(watchers, "PICTURE_SIZE", (80, 60))
+    monkeypatch.setattr(callbacks, "PICTURE_SIZE", (80, 60))
 
 
 @pytest.fixture(scope="session")

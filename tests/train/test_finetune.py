@@ -20,8 +20,8 @@ from edgeslam_torch.models.checkpoint import build_network, load_checkpoint, sav
 from edgeslam_torch.models.fastdepth import Widths
 from edgeslam_torch.models.record import Metadata
 from edgeslam_torch.train import recipe
+from edgeslam_torch.train.callbacks import ProgressBar
 from edgeslam_torch.train.recipe import TrainState, saved_step
-from edgeslam_torch.train.watchers import ProgressBar
 from edgeslam_torch.writers.own_folder import FolderLock
 
 METADATA = Metadata(

@@ -11,7 +11,7 @@ from edgeslam_torch.files.output_file import output_file
 
 if TYPE_CHECKING:
     from edgeslam_torch.flying.navigator import Navigator
-    from edgeslam_torch.flying.outcome import Outcome
+    from edgeslam_torch.flying.result import Outcome
     from edgeslam_torch.navigation.limits import NavLimits
 
 EXIT_NOT_REACHED = 3
@@ -80,8 +80,8 @@ def main(args: argparse.Namespace) -> int:
     with Signals() as signals:
         try:
             signals.tell(lambda: None, patient=True)  # an import that is interrupted raises anything
-            for craft in ("udp_craft", "lockstep_craft"):
-                importlib.import_module(f"edgeslam_torch.flying.{craft}")
+            for vehicle in ("udp_vehicle", "lockstep_vehicle"):
+                importlib.import_module(f"edgeslam_torch.flying.{vehicle}")
             if signals.number:
                 raise KeyboardInterrupt
             signals.tell(None, patient=False)
@@ -109,9 +109,9 @@ def _connect(args: argparse.Namespace, limits: "NavLimits", signals: Signals) ->
             open_.callback(listeners[0].close)
         nav = open_.enter_context(Navigator.open(args.drone, args.fly, limits, args.camera, listeners, record))
         open_.callback(signals.tell, lambda: None, patient=True)  # nothing interrupts the landing and what is closed
-        charge = nav.craft.battery
+        charge = nav.vehicle.battery
         known = f"battery {100 * charge:.0f} %, " if charge == charge else ""
-        camera = nav.craft.camera
+        camera = nav.vehicle.camera
         say(f"{args.drone}: {known}pictures {camera.width}x{camera.height}, calibration: {camera.source}")
         if not args.fly:
             say("nothing moved: add --fly to fly this")
@@ -119,11 +119,11 @@ def _connect(args: argparse.Namespace, limits: "NavLimits", signals: Signals) ->
 
         def end() -> None:
             """On a signal: land and go on in order; before the take-off is over there is nothing to go on with."""
-            if not nav.craft.flying and not nav.craft.over:
+            if not nav.vehicle.flying and not nav.vehicle.over:
                 raise KeyboardInterrupt
-            nav.craft.stop(f"by {signals.name}")
+            nav.vehicle.stop(f"by {signals.name}")
 
-        with keys(nav.cockpit.hold, lambda: nav.craft.land("by the keyboard")) as listens:
+        with keys(nav.flight_controller.hold, lambda: nav.vehicle.land("by the keyboard")) as listens:
             if listens:
                 say("space hovers and lets go again, l or q lands, Ctrl-C lands")
             signals.tell(end, patient=True)
@@ -208,11 +208,11 @@ def _plan(args: argparse.Namespace, limits: "NavLimits") -> list[str]:
 
 def _fly(args: argparse.Namespace, nav: "Navigator") -> bool:
     outcome = _told("take-off", nav.take_off())
-    if nav.craft.flying and outcome.reached:
+    if nav.vehicle.flying and outcome.reached:
         outcome = _verb(args, nav)
-    if nav.craft.flying and args.back and args.verb != "home":
+    if nav.vehicle.flying and args.back and args.verb != "home":
         _told("return", nav.return_home())
-    if nav.craft.flying:
+    if nav.vehicle.flying:
         _told("landing", nav.land())
     return outcome.reached
 
@@ -231,7 +231,7 @@ def _verb(args: argparse.Namespace, nav: "Navigator") -> "Outcome":
     if args.verb == "exit":
         outcome = _told("search", nav.find_exits(args.seconds))
         _tell_openings(nav)
-        return _told("exit", nav.go_through(nav.exits()[0])) if nav.craft.flying and nav.exits() else outcome
+        return _told("exit", nav.go_through(nav.exits()[0])) if nav.vehicle.flying and nav.exits() else outcome
     return _told("home", nav.return_home())
 
 
@@ -243,7 +243,7 @@ def _tell_openings(nav: "Navigator") -> None:
             f"  exit at ({x:.2f}, {y:.2f}) +- {exit_.position_sigma_m:.2f} m, {exit_.width_m:.2f} +- "
             f"{exit_.width_sigma_m:.2f} m wide, seen from {exit_.places} places"
         )
-    for way in nav.pathways() if nav.craft.flying else ():
+    for way in nav.pathways() if nav.vehicle.flying else ():
         (x0, y0), (x1, y1) = way.ends_w
         say(
             f"  corridor from ({x0:.1f}, {y0:.1f}) to ({x1:.1f}, {y1:.1f}), {way.width_m:.1f} +- "

@@ -57,7 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--first-seed", type=int, default=0, metavar="N", help="of those flights (default: 0)")
     parser.add_argument(
-        "--eyes",
+        "--perception",
         choices=("truth", "slam"),
         default="truth",
         help="what their pilot is told: the true pose and depth (default), or what the SLAM knows",
@@ -166,7 +166,7 @@ def _navigation(args: argparse.Namespace) -> int:
     out = args.out or Path("runs") / time.strftime("navigation-%Y%m%d-%H%M%S")
     seeds = range(args.first_seed, args.first_seed + args.seeds)
     cases = [
-        Case(world, seed, fault, args.eyes, behaviour)
+        Case(world, seed, fault, args.perception, behaviour)
         for behaviour in behaviours
         for fault in faults
         for world in worlds

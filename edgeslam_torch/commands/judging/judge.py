@@ -45,11 +45,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Run the missing cells, print and write the table; 1 when a cell has no result."""
-    from edgeslam_torch.eval.judge.against import RECORD, markdown_against, read_record
-    from edgeslam_torch.eval.judge.bars import BARS, read_bars
     from edgeslam_torch.eval.judge.cells import list_cells
+    from edgeslam_torch.eval.judge.compare import RECORD, markdown_against, read_record
     from edgeslam_torch.eval.judge.runner import JudgeSettings, judge
     from edgeslam_torch.eval.judge.table import markdown
+    from edgeslam_torch.eval.judge.thresholds import BARS, read_bars
 
     data = args.data or (Path(os.environ["EDGESLAM_DATA"]) if os.environ.get("EDGESLAM_DATA") else None)
     bars = read_bars(args.bars or BARS)

@@ -18,8 +18,8 @@ from edgeslam_torch.files.plain import subfolder
 
 if TYPE_CHECKING:
     from edgeslam_torch.train.folder import OutFolder
-    from edgeslam_torch.train.outcome import Outcome
     from edgeslam_torch.train.recipe import TrainConfig
+    from edgeslam_torch.train.result import Outcome
     from edgeslam_torch.train.teachers.cache import TeacherCache
     from edgeslam_torch.train.views.datasets import DepthFolder
     from edgeslam_torch.train.views.posed import PosedSequence

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from edgeslam_torch.models.record import Metadata
     from edgeslam_torch.train.finetuning import Data
     from edgeslam_torch.train.folder import OutFolder
-    from edgeslam_torch.train.outcome import Outcome
     from edgeslam_torch.train.recipe import Hooks, TrainConfig
+    from edgeslam_torch.train.result import Outcome
 
 HELP = "teach a drone-sized network what a larger depth network knows, on recordings without labels"
 
@@ -99,12 +99,12 @@ def _distil(
 ) -> "Outcome":
     from edgeslam_torch.models.checkpoint import file_hash
     from edgeslam_torch.train.finetuning import FromRuns, finetune, settings_of
-    from edgeslam_torch.train.given import DataSet, Given, weights_name
+    from edgeslam_torch.train.inputs import DataSet, Inputs, weights_name
     from edgeslam_torch.train.processes.distributed import by_first, rank
 
     sha256 = file_hash(teacher.weights)
     reading = {"teacher": f"{teacher.weights.name} {sha256[:12]}", "max_frames": args.max_frames, "camera": args.camera}
-    expected = Given(
+    expected = Inputs(
         weights_name(student, metadata),
         tuple(DataSet(item.name, "depth") for item in items),
         tuple(DataSet(os.path.basename(os.path.abspath(path)), "depth") for path in args.validate),
@@ -123,7 +123,7 @@ def _labelled(
 ) -> "Data":
     """The recordings with the teacher's depth; metres are the teacher's, or the run's where it has none."""
     from edgeslam_torch.train.finetuning import Data
-    from edgeslam_torch.train.given import posed_set
+    from edgeslam_torch.train.inputs import posed_set
     from edgeslam_torch.train.processes.distributed import rank
     from edgeslam_torch.train.teachers.distil import label
 

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from edgeslam_torch.models.record import Metadata
     from edgeslam_torch.train.finetuning import Data
     from edgeslam_torch.train.folder import OutFolder
-    from edgeslam_torch.train.outcome import Outcome
     from edgeslam_torch.train.recipe import Hooks, TrainConfig
+    from edgeslam_torch.train.result import Outcome
 
 logger = logging.getLogger(__name__)
 
@@ -80,12 +80,12 @@ def _finetune(
     out: "OutFolder",
 ) -> "Outcome":
     from edgeslam_torch.train.finetuning import FromRuns, finetune, settings_of
-    from edgeslam_torch.train.given import DataSet, Given, weights_name
+    from edgeslam_torch.train.inputs import DataSet, Inputs, weights_name
     from edgeslam_torch.train.processes.distributed import by_first, rank
 
     from_runs = FromRuns(args.from_runs)
     reading = {name: getattr(args, name) for name in ("ignore_depth", "max_frames", "camera")}
-    expected = Given(
+    expected = Inputs(
         weights_name(network, metadata),
         tuple(DataSet(item.name, "depth" if item.kind == "depth" else "run") for item in items),
         tuple(DataSet(os.path.basename(os.path.abspath(path)), "depth") for path in args.validate),

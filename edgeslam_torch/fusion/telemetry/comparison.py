@@ -10,12 +10,12 @@ from edgeslam_torch.fusion.config import FusionConfig
 from edgeslam_torch.fusion.scale.log_scale import LogScale
 from edgeslam_torch.fusion.telemetry.alignment import Attitudes, apart, attitudes, map_to_world, turns
 from edgeslam_torch.fusion.telemetry.delay import GROWTH, Delay
-from edgeslam_torch.fusion.telemetry.plausibility import (
+from edgeslam_torch.fusion.telemetry.sensor_validation import (
     ATTITUDE,
     Agreement,
     Reading,
     Reread,
-    Trust,
+    SensorGate,
     Verdict,
     agreement,
     broken_columns,
@@ -62,13 +62,15 @@ class FlightSoFar:
 
 
 class Comparison:
-    """Updates `Trust` with verdicts on velocities and attitude; stores when other delays were last tested."""
+    """Updates `SensorGate` with verdicts on velocities and attitude; stores when other delays were last tested."""
 
     def __init__(self, config: FusionConfig) -> None:
         self._config = config
         self._looked_wide_at = 0
 
-    def judge(self, trust: Trust, present: FlightSoFar, delay: Delay, R_w_m: FloatArray, flying: bool = False) -> None:
+    def judge(
+        self, trust: SensorGate, present: FlightSoFar, delay: Delay, R_w_m: FloatArray, flying: bool = False
+    ) -> None:
         """Compare at the delay in use, in other frames and, if that fits badly, at other delays.
 
         Velocities that fit significantly better in another frame are read in that frame from now on, overriding

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from edgeslam_torch.navigation.corridor.glance import Glance
-from edgeslam_torch.navigation.corridor.onward import (
+from edgeslam_torch.navigation.contact.losses import Losses
+from edgeslam_torch.navigation.corridor.corridor_geometry import (
     SMEARED_BERTH_M,
     far_middle,
     is_ahead,
@@ -16,14 +16,14 @@ from edgeslam_torch.navigation.corridor.onward import (
     straight,
     wide,
 )
+from edgeslam_torch.navigation.corridor.dead_end_scan import Glance
 from edgeslam_torch.navigation.corridor.trail import PASSED_M, Trail, aside
+from edgeslam_torch.navigation.drone_state import DroneState
 from edgeslam_torch.navigation.exploring.frontiers import Looks
-from edgeslam_torch.navigation.hindered.losses import Losses
 from edgeslam_torch.navigation.layer import Layer
-from edgeslam_torch.navigation.moved import Moved
+from edgeslam_torch.navigation.map_update import MapUpdate
+from edgeslam_torch.navigation.openings.exit_tracker import Candidate, Exit
 from edgeslam_torch.navigation.openings.pathways import WIDEST_M
-from edgeslam_torch.navigation.openings.watch import Candidate, Exit
-from edgeslam_torch.navigation.sight import Sight
 from edgeslam_torch.navigation.tasks import LooksAhead
 from edgeslam_torch.types import FloatArray
 
@@ -69,7 +69,7 @@ class FollowCorridor(LooksAhead):
         self._doors = [(e.centre_w[:2], e.normal_w[:2]) for e in exits]
         self._doubtful = [(c.centre_w, c.normal_w) for c in candidates]
 
-    def goals(self, layer: Layer, sight: Sight) -> np.ndarray:
+    def goals(self, layer: Layer, sight: DroneState) -> np.ndarray:
         """Cells ``(G, 2)`` to follow: what is wide and ahead, else what turns off, else straight on through what is
         narrow; before a wall, holes in the sides. None where there is nothing of these."""
         here = sight.p_w[:2]
@@ -84,16 +84,16 @@ class FollowCorridor(LooksAhead):
         goal = self._end.goal(layer, sight)
         return layer.cells(np.zeros((0, 2)) if goal is None else goal[None])
 
-    def heading_rad(self, sight: Sight) -> float | None:
+    def heading_rad(self, sight: DroneState) -> float | None:
         """To the sides, where it seems to end; else ahead."""
         return self._end.heading_rad(sight) if self._ending and self._end is not None else None
 
-    def done(self, sight: Sight) -> bool:
+    def done(self, sight: DroneState) -> bool:
         """Whether the corridor ended, or the time."""
         self.room = sight.stamp_s - self._wide_s > _ROOM_S
         return self.room or self._has_ended(sight) or sight.stamp_s >= self.until_s
 
-    def carry(self, moved: Moved) -> None:
+    def carry(self, moved: MapUpdate) -> None:
         """Take what is remembered along with the map."""
         self._looks.carry(moved)
         self._losses.carry(moved)
@@ -106,7 +106,7 @@ class FollowCorridor(LooksAhead):
         if self._target_w is not None:
             self._target_w = moved.points(self._target_w[None])[0]
 
-    def _has_ended(self, sight: Sight) -> bool:
+    def _has_ended(self, sight: DroneState) -> bool:
         if not self._ending or self._end is None:
             return self._looks.over(sight.stamp_s)
         self._losses.note(sight)
@@ -114,7 +114,7 @@ class FollowCorridor(LooksAhead):
             self._end.give_up(sight)
         return self._end.over
 
-    def _onward(self, layer: Layer, sight: Sight, axis: FloatArray, trail: Trail) -> np.ndarray:
+    def _onward(self, layer: Layer, sight: DroneState, axis: FloatArray, trail: Trail) -> np.ndarray:
         here = sight.p_w[:2]
         cells = self._left(layer, wide(layer, here))
         places = layer.centres(cells)
@@ -177,7 +177,7 @@ class FollowCorridor(LooksAhead):
         ]
         return min([way for way in ways if way > 0.0], default=math.inf)
 
-    def _note_width(self, layer: Layer, sight: Sight) -> None:
+    def _note_width(self, layer: Layer, sight: DroneState) -> None:
         """A room is where nothing solid is within half a corridor's width, and all of that is seen."""
         assert self._trail is not None
         away = float(layer.clearance_at(sight.p_w[None, :2])[0])

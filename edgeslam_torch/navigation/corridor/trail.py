@@ -5,11 +5,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from edgeslam_torch.navigation.drone_state import DroneState
 from edgeslam_torch.navigation.layer import Layer
-from edgeslam_torch.navigation.moved import Moved
+from edgeslam_torch.navigation.map_update import MapUpdate
 from edgeslam_torch.navigation.openings.pathways import WIDEST_M
-from edgeslam_torch.navigation.openings.turned import Walls, wall_directions
-from edgeslam_torch.navigation.sight import Sight
+from edgeslam_torch.navigation.openings.wall_frame import Walls, wall_directions
 from edgeslam_torch.types import FloatArray
 
 PASSED_M = 0.5 * WIDEST_M
@@ -37,7 +37,7 @@ class Trail:
     """``(D, 2)`` places from which nothing led on ahead."""
 
     @staticmethod
-    def beginning(sight: Sight) -> "Trail":
+    def beginning(sight: DroneState) -> "Trail":
         """At the drone's place, along its nose."""
         nose = np.array([math.cos(sight.yaw_rad), math.sin(sight.yaw_rad)])
         return Trail(sight.p_w[None, :2].copy(), nose, nose)
@@ -78,7 +78,7 @@ class Trail:
         behind = (step @ self.began_w < 0.0) & (np.abs(aside(step, self.began_w)) < PASSED_M)
         return _apart(p_w, np.concatenate([self.places_w, here_w[None]]), PASSED_M) & ~behind
 
-    def carry(self, moved: Moved) -> None:
+    def carry(self, moved: MapUpdate) -> None:
         """Take the places along with the map; directions of level flight hardly turn with it."""
         self.places_w = moved.points(self.places_w)
         self._dead_ends_w = moved.points(self._dead_ends_w)

@@ -6,12 +6,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from edgeslam_torch.geometry.rotations import wrapped
+from edgeslam_torch.navigation.drone_state import DroneState
 from edgeslam_torch.navigation.exploring.coverage import Borders, Coverage, borders
 from edgeslam_torch.navigation.exploring.frontiers import reachable
 from edgeslam_torch.navigation.layer import Layer
-from edgeslam_torch.navigation.moved import Moved
-from edgeslam_torch.navigation.openings.watch import FIELD_RAD
-from edgeslam_torch.navigation.sight import Sight
+from edgeslam_torch.navigation.map_update import MapUpdate
+from edgeslam_torch.navigation.openings.exit_tracker import FIELD_RAD
 from edgeslam_torch.types import FloatArray
 
 _EVERY_M = 1.2
@@ -52,7 +52,7 @@ class LooksAround:
     """Still to be looked at, last first."""
     _since_s: float = math.nan
 
-    def goals(self, layer: Layer, sight: Sight) -> np.ndarray:
+    def goals(self, layer: Layer, sight: DroneState) -> np.ndarray:
         """Cells ``(G, 2)`` from each of which most is looked at that is not from those before it."""
         here = sight.p_w[:2]
         self._left = self._coverage.unlooked(borders(layer, here))
@@ -72,7 +72,7 @@ class LooksAround:
         self._spots_w = p_w[chosen]
         return np.asarray(cells[chosen])
 
-    def heading_rad(self, sight: Sight) -> float | None:
+    def heading_rad(self, sight: DroneState) -> float | None:
         """Where to look now; None to look ahead. A pose that is lost in a turn ends the look."""
         self._coverage.note(sight)
         here = sight.p_w[:2]
@@ -86,7 +86,7 @@ class LooksAround:
             self._headings.pop()
         return self._headings[-1] if self._headings else None
 
-    def carry(self, moved: Moved) -> None:
+    def carry(self, moved: MapUpdate) -> None:
         """Take the places along with the map; directions of level flight hardly turn with it."""
         self._coverage.carry(moved)
         self._places_w = list(moved.points(np.array(self._places_w).reshape(-1, 2)))

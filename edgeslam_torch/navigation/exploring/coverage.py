@@ -8,10 +8,10 @@ import numpy as np
 from scipy import ndimage
 
 from edgeslam_torch.geometry.rotations import wrapped
+from edgeslam_torch.navigation.drone_state import DroneState
 from edgeslam_torch.navigation.layer import Layer
-from edgeslam_torch.navigation.moved import Moved
-from edgeslam_torch.navigation.openings.watch import FARTHEST_M, FIELD_RAD
-from edgeslam_torch.navigation.sight import Sight
+from edgeslam_torch.navigation.map_update import MapUpdate
+from edgeslam_torch.navigation.openings.exit_tracker import FARTHEST_M, FIELD_RAD
 from edgeslam_torch.types import FloatArray
 
 _NEAREST_M = 0.6
@@ -76,7 +76,7 @@ class Coverage:
     _views: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
     """``(V, 3)`` place [m] and heading [rad]."""
 
-    def note(self, sight: Sight) -> None:
+    def note(self, sight: DroneState) -> None:
         """What a camera shows now counts as looked at; where the pose is carried, nothing does."""
         if not sight.tracked:
             return
@@ -95,6 +95,6 @@ class Coverage:
         shown = all_.before(self._views[:, :2]) & (np.abs(wrapped(bearing)) < FIELD_RAD)
         return all_[np.flatnonzero(~shown.any(axis=0))]
 
-    def carry(self, moved: Moved) -> None:
+    def carry(self, moved: MapUpdate) -> None:
         """Take the places along with the map; directions of level flight hardly turn with it."""
         self._views[:, :2] = moved.points(self._views[:, :2])

@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy import ndimage
 
+from edgeslam_torch.navigation.drone_state import DroneState
 from edgeslam_torch.navigation.layer import Layer
-from edgeslam_torch.navigation.moved import Moved
-from edgeslam_torch.navigation.sight import Sight
+from edgeslam_torch.navigation.map_update import MapUpdate
 from edgeslam_torch.types import FloatArray
 
 _PASSED_M = 0.25
@@ -57,7 +57,7 @@ class Looks:
     _asked_s: float = math.nan
     _nothing_s: float = math.nan
 
-    def worth(self, cells: np.ndarray, layer: Layer, sight: Sight) -> np.ndarray:
+    def worth(self, cells: np.ndarray, layer: Layer, sight: DroneState) -> np.ndarray:
         """Those of the cells ``(G, 2)`` that were not looked at in vain; to be asked at every plan."""
         passed = 0.0 if math.isnan(self._asked_s) else min(sight.stamp_s - self._asked_s, 1.0)
         self._asked_s = sight.stamp_s
@@ -84,7 +84,7 @@ class Looks:
         """Whether there was nothing left to look at for as long as a look around takes."""
         return now_s - self._nothing_s > _ROUND_S  # false while it is NaN
 
-    def carry(self, moved: Moved) -> None:
+    def carry(self, moved: MapUpdate) -> None:
         """Take the places along with the map."""
         places = moved.points(np.array([place for place, _ in self._near]).reshape(-1, 2))
         self._near = [(place, spent_s) for place, (_, spent_s) in zip(places, self._near, strict=True)]

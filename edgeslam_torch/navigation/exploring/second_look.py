@@ -9,11 +9,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from edgeslam_torch.navigation.drone_state import DroneState
 from edgeslam_torch.navigation.exploring.frontiers import reachable
 from edgeslam_torch.navigation.layer import Layer
-from edgeslam_torch.navigation.moved import Moved
-from edgeslam_torch.navigation.openings.watch import PLACES_M, Candidate
-from edgeslam_torch.navigation.sight import Sight
+from edgeslam_torch.navigation.map_update import MapUpdate
+from edgeslam_torch.navigation.openings.exit_tracker import PLACES_M, Candidate
 from edgeslam_torch.types import FloatArray
 
 _BEFORE_M = (0.8, 2.0)
@@ -75,21 +75,21 @@ class SecondLook:
         """What is worth a second look now."""
         self._candidates = candidates
 
-    def on_the_way(self, layer: Layer, sight: Sight) -> np.ndarray:
+    def on_the_way(self, layer: Layer, sight: DroneState) -> np.ndarray:
         """Those of the cells of `goals` that are near."""
         return self._from(self._standing(layer, sight, _ON_THE_WAY_M), layer, sight)
 
-    def goals(self, layer: Layer, sight: Sight) -> np.ndarray:
+    def goals(self, layer: Layer, sight: DroneState) -> np.ndarray:
         """Cells ``(G, 2)`` that can be reached, from which to look at one of them."""
         return self._from(self._standing(layer, sight, np.inf), layer, sight)
 
-    def _standing(self, layer: Layer, sight: Sight, reach_m: float) -> np.ndarray:
+    def _standing(self, layer: Layer, sight: DroneState, reach_m: float) -> np.ndarray:
         """Cells ``(C, 2)`` where a drone can stand, no farther than this."""
         cells = np.argwhere(layer.free & (layer.from_solid_m > _PASSED_M))
         near = np.linalg.norm(layer.centres(cells).reshape(-1, 2) - sight.p_w[:2], axis=1) <= reach_m
         return reachable(cells[near], layer, sight.p_w[:2])
 
-    def _from(self, cells: np.ndarray, layer: Layer, sight: Sight) -> np.ndarray:
+    def _from(self, cells: np.ndarray, layer: Layer, sight: DroneState) -> np.ndarray:
         found = [np.zeros((0, 2), int)]
         for candidate, tried in self._worth(sight.stamp_s):
             p_w = layer.centres(cells).reshape(-1, 2)
@@ -99,7 +99,7 @@ class SecondLook:
             found.append(there)
         return np.concatenate(found)
 
-    def heading_rad(self, sight: Sight) -> float | None:
+    def heading_rad(self, sight: DroneState) -> float | None:
         """Where to look, standing where one of them shows; None elsewhere."""
         for candidate, tried in self._worth(sight.stamp_s):
             if _shows(candidate, sight.p_w[None, :2])[0] and tried.is_new(sight.p_w[None, :2])[0]:
@@ -116,7 +116,7 @@ class SecondLook:
             if now_s >= tried.until_s and tried.stands and tried.times < _TIMES:
                 tried.times, tried.until_s = tried.times + 1, np.inf
 
-    def carry(self, moved: Moved) -> None:
+    def carry(self, moved: MapUpdate) -> None:
         """Take the places along with the map; candidates come anew."""
         for tried in self._tried:
             places = moved.points(np.array([tried.centre_w, *tried.stood_w]))

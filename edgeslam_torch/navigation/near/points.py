@@ -10,7 +10,7 @@ from edgeslam_torch.types import DepthMap, FloatArray
 
 SIGMA_LOG = 0.05
 """Of a depth that points of the map tell."""
-ALIKE = 3
+MIN_AGREEING = 3
 """Points that must agree before they tell an obstacle: single ones are wrong more often than one is so small."""
 MIN_DEPTH = 0.1
 """Points nearer to the camera are none [m]."""
@@ -32,7 +32,7 @@ def seen_points(
 
 
 def agreeing(uv: FloatArray, z: FloatArray, width: int) -> np.ndarray:
-    """Rows of the points that share a small part of a picture and a range of depths with at least `ALIKE` in all.
+    """Rows of the points that share a small part of a picture and a range of depths with `MIN_AGREEING` in all.
 
     Cells are laid twice, the second time by half a cell further, so that no border parts what is together.
 
@@ -48,7 +48,7 @@ def agreeing(uv: FloatArray, z: FloatArray, width: int) -> np.ndarray:
         extent = cell.max(axis=0, initial=0) + 1
         key = (cell[:, 0] * extent[1] + cell[:, 1]) * extent[2] + cell[:, 2]
         _, group, count = np.unique(key, return_inverse=True, return_counts=True)
-        together |= count[group] >= ALIKE
+        together |= count[group] >= MIN_AGREEING
     return np.flatnonzero(together)
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edgeslam_torch.navigation.openings.turned import Turned, runs
+from edgeslam_torch.navigation.openings.wall_frame import Turned, runs
 from edgeslam_torch.types import FloatArray
 
 NARROWEST_M, WIDEST_M = 0.6, 1.5

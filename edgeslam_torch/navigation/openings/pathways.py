@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edgeslam_torch.navigation.openings.turned import Turned, Walls, runs, turned, wall_directions
+from edgeslam_torch.navigation.openings.wall_frame import Turned, Walls, runs, turned, wall_directions
 from edgeslam_torch.types import FloatArray
 
 NARROWEST_M, WIDEST_M = 0.8, 3.2

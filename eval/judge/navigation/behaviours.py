@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from edgeslam_torch.eval.judge.navigation.flown import Flown
-from edgeslam_torch.flying.errands import WayHome
+from edgeslam_torch.flying.tasks import WayHome
 from edgeslam_torch.navigation.corridor.follow import FollowCorridor
-from edgeslam_torch.navigation.openings.watch import Exit
+from edgeslam_torch.navigation.openings.exit_tracker import Exit
 from edgeslam_torch.navigation.tasks import Explore, GoTo, Task
 from edgeslam_torch.synthetic.sites.site import Site
 from edgeslam_torch.types import FloatArray

@@ -14,16 +14,16 @@ from edgeslam_torch.drone.emulator.lockstep import Event, LockstepTello
 from edgeslam_torch.drone.emulator.room import drone_at
 from edgeslam_torch.eval.judge.navigation.behaviours import BEHAVIOURS, Behaviour, Moment, right_exits
 from edgeslam_torch.eval.judge.navigation.conditions import FAULTS
-from edgeslam_torch.eval.judge.navigation.eyes import DEPTH_SIZE, TrueEyes, nothing_painted
 from edgeslam_torch.eval.judge.navigation.flown import Case, Flown
-from edgeslam_torch.eval.judge.navigation.near import WatchedEyes
+from edgeslam_torch.eval.judge.navigation.near import WatchedPerception
 from edgeslam_torch.eval.judge.navigation.oracle import shortest_m
-from edgeslam_torch.eval.judge.navigation.slam_eyes import IMAGE_SIZE, SlamEyes
-from edgeslam_torch.flying.cockpit import Cockpit
+from edgeslam_torch.eval.judge.navigation.perception import DEPTH_SIZE, TruePerception, nothing_painted
+from edgeslam_torch.eval.judge.navigation.slam_perception import IMAGE_SIZE, SlamPerception
+from edgeslam_torch.flying.flight_controller import FlightController
 from edgeslam_torch.geometry.mount import TELLO_TILT_RAD
+from edgeslam_torch.navigation.drone_state import DroneState
 from edgeslam_torch.navigation.limits import NavLimits
 from edgeslam_torch.navigation.pilot import Phase
-from edgeslam_torch.navigation.sight import Sight
 from edgeslam_torch.synthetic.sites.build import named_site
 from edgeslam_torch.synthetic.sites.site import Site
 from edgeslam_torch.types import FloatArray
@@ -37,10 +37,10 @@ _FREE_M = 0.6
 """Clearance from which cruising is free."""
 
 
-class Eyes(Protocol):
+class Perception(Protocol):
     """Tells a pilot what it may know."""
 
-    def sight(self, now_s: float, events: list[Event]) -> Sight:
+    def sight(self, now_s: float, events: list[Event]) -> DroneState:
         """The moment, from what arrived since the last one."""
 
 
@@ -58,31 +58,35 @@ def fly(case: Case, limits: NavLimits | None = None) -> Flown:
     site = named_site(case.world, case.seed)
     wind = np.array([0.0, conditions.wind_m_s, 0.0])
     air = Air(wind, 0.5 * conditions.wind_m_s, np.random.default_rng([case.seed, 1]))
-    size = IMAGE_SIZE if case.eyes == "slam" else DEPTH_SIZE
+    size = IMAGE_SIZE if case.perception == "slam" else DEPTH_SIZE
     drone, paint, camera = drone_at(site, TELLO_TILT_RAD, size, conditions.battery, air)
-    tello = LockstepTello(drone, paint if case.eyes == "slam" else nothing_painted, conditions.radio, case.seed)
-    seeing: Eyes = SlamEyes(camera, conditions, case.seed) if case.eyes == "slam" else TrueEyes(site, drone, conditions)
-    eyes = WatchedEyes(seeing, site)
-    errand = _Errand(site, BEHAVIOURS[case.behaviour], Cockpit(limits), conditions.scale)
+    tello = LockstepTello(drone, paint if case.perception == "slam" else nothing_painted, conditions.radio, case.seed)
+    seeing: Perception = (
+        SlamPerception(camera, conditions, case.seed)
+        if case.perception == "slam"
+        else TruePerception(site, drone, conditions)
+    )
+    perception = WatchedPerception(seeing, site)
+    errand = _Task(site, BEHAVIOURS[case.behaviour], FlightController(limits), conditions.scale)
     found = Flown(case)
     if case.behaviour == "goto":
         found.oracle_s = _take_off_s(limits) + shortest_m(site, limits) / limits.speed_m_s
-    ticks = _fly(tello, eyes, errand, conditions.hung_s, found)
+    ticks = _fly(tello, perception, errand, conditions.hung_s, found)
     _sum_up(found, site, drone, ticks, BEHAVIOURS[case.behaviour])
-    known = errand.cockpit.exits()
+    known = errand.flight_controller.exits()
     found.exits = [len(site.exits), len(known), right_exits(known, site)]
-    found.near = [eyes.counts.sectors, eyes.counts.too_far, eyes.counts.surely_too_far]
-    if eyes.depth_age_s:
-        found.depth_age_s = np.round(np.percentile(eyes.depth_age_s, [50, 95]), 3).tolist()
+    found.near = [perception.counts.sectors, perception.counts.too_far, perception.counts.surely_too_far]
+    if perception.depth_age_s:
+        found.depth_age_s = np.round(np.percentile(perception.depth_age_s, [50, 95]), 3).tolist()
     return found
 
 
-def is_beyond(sight: Sight, p_w: FloatArray) -> bool:
+def is_beyond(sight: DroneState, p_w: FloatArray) -> bool:
     """Whether a pose is farther from the truth than all that is said of it allows: of the pose itself, of where its
     piece of map lies, of what the map has drifted by, and of the metres from the take-off.
 
     Example:
-        >>> sight = Sight(0.0, np.array([3.2, 0.0, 1.0]), 0.0, np.zeros(3), scale_sigma=0.02)
+        >>> sight = DroneState(0.0, np.array([3.2, 0.0, 1.0]), 0.0, np.zeros(3), scale_sigma=0.02)
         >>> is_beyond(sight, np.array([3.0, 0.0, 1.0])), is_beyond(sight, np.array([2.8, 0.0, 1.0]))
         (False, True)
     """
@@ -91,24 +95,24 @@ def is_beyond(sight: Sight, p_w: FloatArray) -> bool:
     return float(np.linalg.norm(sight.p_w[:2] - p_w[:2])) > _SIGMAS * sigma + _NO_HARM_M
 
 
-class _Errand:
-    """What the cockpit is to do, one task after the other, however the one before ended."""
+class _Task:
+    """What the flight_controller is to do, one task after the other, however the one before ended."""
 
-    def __init__(self, site: Site, behaviour: Behaviour, cockpit: Cockpit, scale: float) -> None:
-        self.cockpit, self.limit_s = cockpit, behaviour.limit_s
+    def __init__(self, site: Site, behaviour: Behaviour, flight_controller: FlightController, scale: float) -> None:
+        self.flight_controller, self.limit_s = flight_controller, behaviour.limit_s
         self._site, self._scale, self._steps = site, scale, list(behaviour.steps)
         self._first = True
 
     def go_on(self, now_s: float) -> None:
         """Give the next task when there is none; the first is taken up while it still rises and looks around."""
-        if self._steps and (self._first or self.cockpit.ended() is not None):
+        if self._steps and (self._first or self.flight_controller.ended() is not None):
             step = self._steps.pop(0)
-            self.cockpit.begin(step(Moment(self._site, now_s, self._scale, self.cockpit.track())))
+            self.flight_controller.begin(step(Moment(self._site, now_s, self._scale, self.flight_controller.track())))
             self._first = False
 
     def over(self) -> bool:
         """Whether all tasks have ended."""
-        return self.cockpit.ended() is not None and not self._steps
+        return self.flight_controller.ended() is not None and not self._steps
 
 
 @dataclass(slots=True)
@@ -123,8 +127,8 @@ class _Tick:
 
 def _fly(
     tello: LockstepTello,
-    eyes: Eyes,
-    errand: _Errand,
+    perception: Perception,
+    errand: _Task,
     hung_s: tuple[float, float] | None,
     found: Flown,
 ) -> list[_Tick]:
@@ -138,7 +142,7 @@ def _fly(
         found.crashed |= any(t.crashed for t in touched)
         if drone.mode is Mode.GROUND and tello.clock_s > 2.0:
             break
-        sight = eyes.sight(tello.clock_s, events)
+        sight = perception.sight(tello.clock_s, events)
         if sight.metric:
             found.off[0] += 1
             found.off[1] += is_beyond(sight, drone.p_w)
@@ -148,15 +152,18 @@ def _fly(
         began = time.process_time()
         if hung_s is None or not hung_s[0] <= tello.clock_s < hung_s[1]:
             errand.go_on(sight.stamp_s)
-            errand.cockpit.plan(sight)
-        order = errand.cockpit.order(sight)
+            errand.flight_controller.plan(sight)
+        order = errand.flight_controller.order(sight)
         cpu_s = time.process_time() - began
         speed, clear_m = float(np.linalg.norm(drone.velocity)), drone.clearance(drone.p_w)
         ticks.append(_Tick(tello.clock_s, drone.p_w.copy(), drone.rpy(), speed, clear_m, cpu_s))
         if order.danger and str(order.danger) not in dangers:
             dangers.append(str(order.danger))
         if errand.over():
-            found.ended, found.time_s = found.ended or str(errand.cockpit.ended()), found.time_s or tello.clock_s
+            found.ended, found.time_s = (
+                found.ended or str(errand.flight_controller.ended()),
+                found.time_s or tello.clock_s,
+            )
             landing = True
             tello.send("land")
         elif order.land:

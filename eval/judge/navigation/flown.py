@@ -12,7 +12,7 @@ class Case:
     world: str
     seed: int
     fault: str = "none"
-    eyes: str = "truth"
+    perception: str = "truth"
     """``truth`` or ``slam``: what the pilot is told."""
     behaviour: str = "goto"
     """One of `behaviours.BEHAVIOURS`."""

@@ -9,7 +9,7 @@ import numpy as np
 from edgeslam_torch.drone.emulator.lockstep import Event, Picture
 from edgeslam_torch.geometry.camera import PRESETS
 from edgeslam_torch.geometry.mount import camera_on_body
-from edgeslam_torch.navigation.sight import Sight, View
+from edgeslam_torch.navigation.drone_state import DroneState, View
 from edgeslam_torch.synthetic.house.render import render
 from edgeslam_torch.synthetic.sites.site import Site
 from edgeslam_torch.types import FloatArray
@@ -61,24 +61,24 @@ def near_counts(view: View, true_m: FloatArray) -> NearCounts:
     return counts
 
 
-class _Eyes(Protocol):
-    def sight(self, now_s: float, events: list[Event]) -> Sight: ...
+class _Perception(Protocol):
+    def sight(self, now_s: float, events: list[Event]) -> DroneState: ...
 
 
-class WatchedEyes:
+class WatchedPerception:
     """Passes sights on and counts, in each metric view, what is near and told to be far, and how old depth is."""
 
-    def __init__(self, eyes: _Eyes, site: Site) -> None:
+    def __init__(self, perception: _Perception, site: Site) -> None:
         self.counts = NearCounts()
         self.depth_age_s: list[float] = []
         """Of each moment since the first depth: the age of the picture of the newest."""
         self._seen_s = math.nan
-        self._eyes, self._site = eyes, site
+        self._perception, self._site = perception, site
         self._T_b_c = camera_on_body()
 
-    def sight(self, now_s: float, events: list[Event]) -> Sight:
-        """The sight of the eyes behind."""
-        sight = self._eyes.sight(now_s, events)
+    def sight(self, now_s: float, events: list[Event]) -> DroneState:
+        """The sight of the perception behind."""
+        sight = self._perception.sight(now_s, events)
         if sight.view is not None:
             self._seen_s = sight.view.stamp_s
         if math.isfinite(self._seen_s):

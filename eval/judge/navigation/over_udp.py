@@ -92,7 +92,7 @@ def _fly(address: str, goal_w: np.ndarray, record: Path | None) -> tuple[bool, s
             outcome = nav.take_off()
             if outcome.reached:
                 outcome = nav.go_to((*goal_w[:2], nav.limits.height_m))
-            if nav.craft.flying:
+            if nav.vehicle.flying:
                 nav.land()
     except EdgeSlamError as error:
         return False, str(error)

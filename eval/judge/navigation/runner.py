@@ -62,7 +62,7 @@ def judge_flights(cases: Sequence[Case], out: Path, jobs: int, say: Callable[[st
 
 
 def _name(case: Case) -> str:
-    name = f"{case.world}_{case.seed}_{case.fault}_{case.eyes}"
+    name = f"{case.world}_{case.seed}_{case.fault}_{case.perception}"
     return name if case.behaviour == "goto" else f"{name}_{case.behaviour}"
 
 
@@ -82,7 +82,7 @@ def _line(flown: Flown) -> str:
     told = f"; {', '.join(flown.dangers)}" if flown.dangers else ""
     there, found, right = flown.exits
     return (
-        f"{flown.case.behaviour} {flown.case.world} {flown.case.seed} {flown.case.fault} by {flown.case.eyes}: "
+        f"{flown.case.behaviour} {flown.case.world} {flown.case.seed} {flown.case.fault} by {flown.case.perception}: "
         f"{flown.ended} after {flown.time_s:.1f} s "
         f"(oracle {flown.oracle_s:.1f}), {flown.distance_m:.2f} m from the goal, "
         f"{flown.home_m:.2f} m from the take-off, {flown.contacts} contacts, "

@@ -9,19 +9,19 @@ from edgeslam_torch.eval.judge.navigation.flown import Flown
 
 _Z = 1.959964
 HEAD = (
-    "| world | behaviour | fault | eyes | flights | reached | contact | no contact, on the floor in the end "
+    "| world | behaviour | fault | perception | flights | reached | contact | no contact, on the floor in the end "
     "| clearance p5, min [m] "
     "| time over oracle | cruise [m/s] | CPU a tick, worst [ms] |\n|---|---|---|---|---|---|---|---|---|---|---|---|\n"
 )
 NEAR_HEAD = (
-    "\n| eyes | sectors of 3.7 degrees with something at .3 to 1 m | told more than .3 m too far | less two sigmas "
+    "\n| perception | sectors of 3.7° with something at .3 to 1 m | told more than .3 m too far | less two sigmas "
     "| age of the newest depth, 95 % [s] |\n|---|---|---|---|---|\n"
 )
 OFF_HEAD = (
-    "\n| eyes | moments with metres | pose more than .1 m beyond three of its sigmas | flights in which it was "
+    "\n| perception | moments with metres | pose more than .1 m beyond three of its sigmas | flights in which it was "
     "| error at most, median and worst [m] |\n|---|---|---|---|---|\n"
 )
-EXITS_HEAD = "\n| behaviour | eyes | exits there | found | precision | recall |\n|---|---|---|---|---|---|\n"
+EXITS_HEAD = "\n| behaviour | perception | exits there | found | precision | recall |\n|---|---|---|---|---|---|\n"
 
 
 def wilson(successes: int, trials: int) -> tuple[float, float]:
@@ -44,61 +44,63 @@ def markdown(flights: Sequence[Flown]) -> str:
     groups: dict[tuple[str, ...], list[Flown]] = {}
     for flown in flights:
         case = flown.case
-        groups.setdefault((case.eyes, case.behaviour, case.fault, case.world), []).append(flown)
+        groups.setdefault((case.perception, case.behaviour, case.fault, case.world), []).append(flown)
     rows = [_row(key[::-1], groups[key]) for key in sorted(groups)]
     plain = [f for f in flights if f.case.fault == "none"]
     faulty = [f for f in flights if f.case.fault != "none"]
     for name, group in (("all", plain), ("all with a fault", faulty)):
         if len({(f.case.world, f.case.fault) for f in group}) > 1:
-            eyes, behaviour = (", ".join(sorted({getattr(f.case, k) for f in group})) for k in ("eyes", "behaviour"))
-            rows.append(_row((name, "none" if group is plain else "any", behaviour, eyes), group))
+            perception, behaviour = (
+                ", ".join(sorted({getattr(f.case, k) for f in group})) for k in ("perception", "behaviour")
+            )
+            rows.append(_row((name, "none" if group is plain else "any", behaviour, perception), group))
     return HEAD + "".join(rows) + _exits(flights) + _near(flights) + _off(flights)
 
 
 def _exits(flights: Sequence[Flown]) -> str:
     """A table of exits; nothing where there are none and none was found."""
     rows = []
-    for eyes, behaviour in sorted({(f.case.eyes, f.case.behaviour) for f in flights}):
-        group = [f.exits for f in flights if (f.case.eyes, f.case.behaviour) == (eyes, behaviour)]
+    for perception, behaviour in sorted({(f.case.perception, f.case.behaviour) for f in flights}):
+        group = [f.exits for f in flights if (f.case.perception, f.case.behaviour) == (perception, behaviour)]
         there, found, right = np.sum(group, axis=0).tolist()
         if there or found:
             shares = f"{_share(right, found)} | {_share(right, there)}"
-            rows.append(f"| {behaviour} | {eyes} | {there} | {found} | {shares} |\n")
+            rows.append(f"| {behaviour} | {perception} | {there} | {found} | {shares} |\n")
     return EXITS_HEAD + "".join(rows) if rows else ""
 
 
 def _near(flights: Sequence[Flown]) -> str:
     """A second table, of what is near and told to be far; nothing where nothing was near."""
     rows = []
-    for eyes in sorted({f.case.eyes for f in flights}):
-        group = [f for f in flights if f.case.eyes == eyes]
+    for perception in sorted({f.case.perception for f in flights}):
+        group = [f for f in flights if f.case.perception == perception]
         sectors, too_far, surely = np.sum([f.near for f in group], axis=0).tolist()
         if sectors:
             ages = [f.depth_age_s for f in group if math.isfinite(f.depth_age_s[0])] or [[math.nan, math.nan]]
             age = np.median(ages, axis=0)
             shares = f"{100 * too_far / sectors:.1f} % | {100 * surely / sectors:.1f} %"
-            rows.append(f"| {eyes} | {sectors} | {shares} | {age[0]:.2f}, {age[1]:.2f} |\n")
+            rows.append(f"| {perception} | {sectors} | {shares} | {age[0]:.2f}, {age[1]:.2f} |\n")
     return NEAR_HEAD + "".join(rows) if rows else ""
 
 
 def _off(flights: Sequence[Flown]) -> str:
     """A third table, of poses that are farther off than they say; nothing where no flight had metres."""
     rows = []
-    for eyes in sorted({f.case.eyes for f in flights}):
-        group = [f for f in flights if f.case.eyes == eyes and f.off[0]]
+    for perception in sorted({f.case.perception for f in flights}):
+        group = [f for f in flights if f.case.perception == perception and f.off[0]]
         if group:
             moments, beyond = np.sum([f.off for f in group], axis=0).tolist()
             worst = [f.off_m for f in group]
             rows.append(
-                f"| {eyes} | {moments} | {100 * beyond / moments:.1f} % | {sum(f.off[1] > 0 for f in group)} of "
+                f"| {perception} | {moments} | {100 * beyond / moments:.1f} % | {sum(f.off[1] > 0 for f in group)} of "
                 f"{len(group)} | {np.median(worst):.2f}, {max(worst):.2f} |\n"
             )
     return OFF_HEAD + "".join(rows) if rows else ""
 
 
 def _row(names: tuple[str, ...], group: Sequence[Flown]) -> str:
-    """``names``: world, fault, behaviour, eyes."""
-    world, fault, behaviour, eyes = names
+    """``names``: world, fault, behaviour, perception."""
+    world, fault, behaviour, perception = names
     n = len(group)
     ratio = [f.time_s / f.oracle_s for f in group if f.reached and f.oracle_s]
     cruise = [f.cruise_m_s for f in group if math.isfinite(f.cruise_m_s)]
@@ -106,7 +108,7 @@ def _row(names: tuple[str, ...], group: Sequence[Flown]) -> str:
         world,
         behaviour,
         fault,
-        eyes,
+        perception,
         str(n),
         _share(sum(f.reached for f in group), n),
         _share(sum(f.contacts > 0 for f in group), n),

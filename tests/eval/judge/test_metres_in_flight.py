@@ -6,7 +6,7 @@ import pytest
 from edgeslam_torch.drone.emulator.lockstep import LockstepTello
 from edgeslam_torch.drone.emulator.room import drone_at
 from edgeslam_torch.eval.judge.navigation.conditions import FAULTS
-from edgeslam_torch.eval.judge.navigation.slam_eyes import IMAGE_SIZE, SlamEyes
+from edgeslam_torch.eval.judge.navigation.slam_perception import IMAGE_SIZE, SlamPerception
 from edgeslam_torch.geometry.mount import TELLO_TILT_RAD
 from edgeslam_torch.synthetic.sites.build import named_site
 
@@ -18,11 +18,11 @@ def test_what_a_pilot_knows_is_moved_with_its_metres_and_the_drone_is_where_it_s
     """Up and down for 8 s, then ahead through a corridor for 8 s."""
     site = named_site("corridor", 300)
     drone, paint, camera = drone_at(site, TELLO_TILT_RAD, IMAGE_SIZE)
-    tello, eyes = LockstepTello(drone, paint, seed=300), SlamEyes(camera, FAULTS["none"], 300)
+    tello, perception = LockstepTello(drone, paint, seed=300), SlamPerception(camera, FAULTS["none"], 300)
     tello.send("takeoff")
     before, ratios = None, []
     while tello.clock_s < 18.0:
-        sight = eyes.sight(tello.clock_s, tello.advance(TICK_S))
+        sight = perception.sight(tello.clock_s, tello.advance(TICK_S))
         tello.send(sticks(tello.clock_s))
         if before is not None and before.revision > 0 and sight.revision != before.revision:
             assert sight.view is not None and sight.moved is not None

@@ -11,15 +11,15 @@ from edgeslam_torch.eval.judge.navigation.behaviours import BEHAVIOURS, corridor
 from edgeslam_torch.eval.judge.navigation.film import film_strip, moments
 from edgeslam_torch.eval.judge.navigation.flight import contact_events, fly
 from edgeslam_torch.eval.judge.navigation.flown import Case, Flown
-from edgeslam_torch.eval.judge.navigation.near import WatchedEyes, near_counts
+from edgeslam_torch.eval.judge.navigation.near import WatchedPerception, near_counts
 from edgeslam_torch.eval.judge.navigation.oracle import shortest_m, true_layer
 from edgeslam_torch.eval.judge.navigation.pictures import top_view
 from edgeslam_torch.eval.judge.navigation.runner import judge_flights
 from edgeslam_torch.eval.judge.navigation.table import markdown
 from edgeslam_torch.geometry.camera import PRESETS
+from edgeslam_torch.navigation.drone_state import DroneState, View
 from edgeslam_torch.navigation.limits import NavLimits
-from edgeslam_torch.navigation.openings.watch import Exit
-from edgeslam_torch.navigation.sight import Sight, View
+from edgeslam_torch.navigation.openings.exit_tracker import Exit
 from edgeslam_torch.synthetic.sites.build import named_site
 
 
@@ -133,12 +133,12 @@ def test_depth_grows_old_until_there_is_a_newer_one():
     class Told:
         def sight(self, now_s, events):
             view = replace(view_of(np.full((90, 120), 3.0)), stamp_s=now_s - 0.4) if now_s in (1.0, 1.6) else None
-            return Sight(now_s, np.zeros(3), 0.0, np.zeros(3), view=view)
+            return DroneState(now_s, np.zeros(3), 0.0, np.zeros(3), view=view)
 
-    eyes = WatchedEyes(Told(), named_site("corridor", 0))
+    perception = WatchedPerception(Told(), named_site("corridor", 0))
     for now_s in (0.8, 1.0, 1.2, 1.4, 1.6):
-        eyes.sight(now_s, [])
-    assert eyes.depth_age_s == pytest.approx([0.4, 0.6, 0.8, 0.4])
+        perception.sight(now_s, [])
+    assert perception.depth_age_s == pytest.approx([0.4, 0.6, 0.8, 0.4])
 
 
 def test_touches_in_a_row_are_one_contact():

@@ -1,0 +1,304 @@
+"""What a pilot is told: what the SLAM knows, from pictures and state messages alone."""
+
+import threading
+from collections import deque
+
+import cv2
+import numpy as np
+
+from edgeslam_torch.config import SlamConfig
+from edgeslam_torch.flying.perception.home import GROUND_M, TAKE_OFF, Home, Place, metres_per_unit
+from edgeslam_torch.flying.perception.map_reset import FreshStart
+from edgeslam_torch.frontend.depth_network import DepthNetwork, open_depth, weights_path
+from edgeslam_torch.fusion.health import disagreement
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.geometry.mount import camera_on_body
+from edgeslam_torch.navigation.drone_state import DroneState, View
+from edgeslam_torch.navigation.map_update import MapUpdate, moves
+from edgeslam_torch.navigation.near.depth import NearFit, fit_to_points
+from edgeslam_torch.navigation.near.depth_bias import DepthBias
+from edgeslam_torch.navigation.near.points import agreeing, seen_points, with_nearer_points
+from edgeslam_torch.navigation.space import CELL_M, KEPT
+from edgeslam_torch.navigation.supervisor import SCALE_SIGMA
+from edgeslam_torch.slam import EdgeSlam
+from edgeslam_torch.types import DepthMap, FloatArray, Frame, Health, SlamOutput, TelemetrySample
+
+IMAGE_WIDTH = 480
+"""Wider pictures are halved until they are not wider than this: the width at which flights were judged."""
+_WEIGHTS = "near"
+"""Of the depth that obstacles and openings are told by, which the map's points bring to the map's unit."""
+_DEPTH_EVERY = 3
+"""Frames from one depth map to the next: 5 a second."""
+_STEP = 4
+"""Depth is handed on at a quarter of the picture's size."""
+_FRESH_M = 0.3, 6.0
+"""Depths at which edges of a picture are looked for at once."""
+_CARRIED_S = 4.0
+"""Time after a pose is lost in which depth goes on by the last fit: a bare wall shows no point to fit it to."""
+_DARK, _FLAT = 25.0, 2.0
+"""Mean and standard deviation [of 255] of a picture below which the light is out, or the lens covered: a bare wall has
+shades, and the network sees walls in the dark, too."""
+_LOST = ("lost", "starting")
+_DISAGREE_SIGMAS, _MEASURED = 3.0, {"telemetry", "height"}
+_WIDEST_SIGMA_M = 0.2
+_THINNED = 10
+"""Two seconds: in these the map does not move in itself."""
+_MOVES_EVERY_S = 3.0
+"""Least time between two moves of the map in one unit: each costs a pilot as much as all its views together."""
+
+
+class SlamPerception:
+    """Pictures and state messages through `EdgeSlam`; the pose is made up for the video's delay.
+
+    The world is that of `home`, in the best metres that the SLAM knows: its published unit may be off by more.
+    `heard` and `sight` may be called from any thread, also while `seen` works; `seen` from one thread.
+
+    Args:
+        camera: Of the pictures.
+        seed: Of the SLAM.
+        realtime: Whether mapping works beside the pictures, as in flight, or within them, as in repeatable tests.
+    """
+
+    def __init__(self, camera: Camera, seed: int = 0, realtime: bool = False) -> None:
+        width, height = camera.width, camera.height
+        while width > IMAGE_WIDTH and width % 2 == height % 2 == 0:
+            width, height = width // 2, height // 2
+        self._camera = camera.scaled(width, height)
+        self._seed, self._realtime = seed, realtime
+        self._fresh = FreshStart()
+        self._K_small = self._camera.scaled(width // _STEP, height // _STEP).K
+        self._network: DepthNetwork = open_depth(weights_path(_WEIGHTS))
+        self._T_b_c = camera_on_body()
+        self._lock = threading.Lock()
+        self._samples: list[TelemetrySample] = []
+        """Of which no finished step knows."""
+        self._captured_s = 0.0
+        self._battery = 1.0
+        self._told_height_m, self._told_speed_m_s = np.nan, np.nan
+        self._revision = self._changes = self._frames = 0
+        """The second is how often its metres changed."""
+        self._begin(self._new_slam(), TAKE_OFF)
+
+    def _new_slam(self) -> EdgeSlam:
+        return EdgeSlam(self._camera, SlamConfig(seed=self._seed), realtime=self._realtime)
+
+    def _begin(self, slam: EdgeSlam, place: Place) -> None:
+        """Begin a map, and know nothing of another one."""
+        self._slam, self._began = slam, place
+        self._first = self._frames
+        """Number of the picture that the map begins with."""
+        self._output: SlamOutput | None = None
+        self._home = Home(np.eye(3), 1.0, np.zeros(3))
+        self._fit: tuple[NearFit, float, int] | None = None
+        """The last fit of depth to points, when its picture arrived, and in which unit."""
+        self._usual, self._unit = DepthBias(), (0, 1.0)
+        """The second: revision, and metres for a published unit in it."""
+        self._metres = np.nan
+        """Metres per map unit by which it goes; NaN while the published unit is all there is."""
+        self._shown: tuple[FloatArray, float, int] = np.zeros((0, 4, 4)), 1.0, 0
+        """When the last view was made: poses ``(F, 4, 4)`` of all pictures, metres per map unit, and the revision."""
+        self._long_told: list[tuple[int, FloatArray]] = []
+        """One in `_THINNED` of those that a pilot keeps no longer: what was found in them goes along with the map."""
+        self._told: deque[tuple[int, FloatArray]] = deque(maxlen=KEPT)
+        """Pictures whose views were told, and their poses as they were told last."""
+        self._told_unit, self._told_revision, self._moved_s = 1.0, 0, -np.inf
+        self._revision = 0
+
+    def heard(self, sample: TelemetrySample) -> None:
+        """Take a state message."""
+        with self._lock:
+            self._samples.append(sample)
+            self._fresh.heard(sample)
+            if np.isfinite(sample.battery):
+                self._battery = sample.battery
+            if np.isfinite(sample.height_m):
+                self._told_height_m = sample.height_m + GROUND_M
+            self._told_speed_m_s = float(np.linalg.norm(sample.velocity_m_s[:2]))
+
+    def seen(self, image: np.ndarray, arrived_s: float, captured_s: float) -> View | None:
+        """Take a picture ``(H, W, 3)`` BGR; every few pictures of a mapped place give depth in metres."""
+        size = (self._camera.width, self._camera.height)
+        if image.shape[1::-1] != size:
+            image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+        with self._lock:
+            batch = list(self._samples)
+            due = self._fresh.is_due(arrived_s, self._output is not None and _is_sure(self._output))
+        if due and batch:  # the first picture of a map wants to be told which way is up
+            self._begin_again()
+        output = self._slam.step(Frame(self._frames - self._first, arrived_s, image), batch)
+        T_slam = self._slam.trajectory()[1]
+        self._frames += 1
+        revised, self._revision = output.revision != self._revision, output.revision
+        shows = revised or self._frames % _DEPTH_EVERY == 0
+        depth = self._depth(image, output) if shows else None
+        # A pilot is told of new metres together with a view in them.
+        may_move = depth is not None and captured_s - self._moved_s > _MOVES_EVERY_S
+        metres = metres_per_unit(self._metres, output, may_move)
+        unit = metres if np.isfinite(metres) else output.unit
+        home = Home.of(T_slam[0], unit / output.unit, self._T_b_c, self._began)
+        with self._lock:
+            del self._samples[: len(batch)]
+            self._output, self._captured_s, self._home = output, captured_s, home
+            self._unit = output.revision, home.scale
+            self._changes += int(np.isfinite(metres) and metres != self._metres)
+            self._metres = metres
+            if depth is not None:
+                self._shown = home.poses(T_slam), unit, output.revision + self._changes
+        return None if depth is None else self._view(depth, home, output.T_w_c, captured_s)
+
+    def _begin_again(self) -> None:
+        """Give the map up for a new one, while others look: a new SLAM takes some tenths of a second."""
+        fresh, given_up = self._new_slam(), self._slam
+        with self._lock:
+            self._changes += self._revision + 1  # what was told before is of another map
+            self._begin(fresh, self._fresh.begin())
+        given_up.close()
+
+    def sight(self, now_s: float, view: View | None = None) -> DroneState:
+        """The moment, with a new view if there is one, and with it how the map moved since the last."""
+        with self._lock:
+            output, captured_s, home, changes = self._output, self._captured_s, self._home, self._changes
+            slam, began = self._slam, self._began
+            samples, battery = list(self._samples), self._battery
+            told, told_speed = self._told_height_m, self._told_speed_m_s
+        pose = slam.pose_now(now_s, samples)
+        if pose is None or output is None or output.health is None:
+            return DroneState(
+                now_s,
+                began.position_m,
+                began.yaw_rad,
+                np.zeros(3),
+                metric=False,
+                tracked=False,
+                seen_s=captured_s,
+                battery=battery,
+                told_height_m=told,
+                told_speed_m_s=told_speed,
+            )
+        health = output.health
+        T_w_b = home.poses(pose.T_w_c) @ se3.inverse(self._T_b_c)
+        relative = float(np.hypot(health.scale.sigma / health.scale.value, self._usual.doubt))
+        sigma = home.scale * float(np.sqrt(np.clip(np.trace(pose.covariance[:3, :3]) / 3.0, 0.0, None)))
+        return DroneState(
+            now_s,
+            T_w_b[:3, 3],
+            float(np.arctan2(T_w_b[1, 0], T_w_b[0, 0])),
+            home.scale * (home.R @ np.asarray(pose.velocity_w)),
+            position_sigma_m=min(sigma, _WIDEST_SIGMA_M),
+            apart_sigma_m=home.scale * health.apart_sigma,
+            drift_sigma_m=home.scale * health.drift_sigma,
+            piece=output.piece,
+            scale_sigma=relative if np.isfinite(relative) else 1.0,
+            metric=health.metric,
+            tracked=_tracks(output),
+            conflict=_contradicted(health),
+            seen_s=captured_s,
+            battery=battery,
+            told_height_m=told,
+            told_speed_m_s=told_speed,
+            view=view,
+            revision=pose.revision + changes,
+            moved=None if view is None else self._moved(view),
+        )
+
+    def close(self) -> None:
+        """Stop the SLAM's threads."""
+        self._slam.close()
+
+    def _moved(self, view: View) -> MapUpdate | None:
+        """How the views that were told have moved when this one was made; this one counts as told from now on."""
+        with self._lock:
+            (T_w_c, unit, revision), first = self._shown, self._first
+            if view.picture < first:  # of a map that was given up meanwhile
+                return None
+            found = None
+            if self._told:
+                told = [*self._long_told, *self._told]
+                pictures, before = np.array([picture for picture, _ in told]), np.array([T for _, T in told])
+                after, kept = T_w_c[pictures - first], slice(len(self._long_told), None)
+                revised = revision != self._told_revision
+                if revised or (
+                    view.stamp_s - self._moved_s > _MOVES_EVERY_S and moves(before[kept], after[kept], CELL_M)
+                ):
+                    found, self._moved_s = MapUpdate(before, after, unit / self._told_unit, pictures), view.stamp_s
+                    told = list(zip(pictures.tolist(), after, strict=True))
+                    self._long_told, self._told = told[: kept.start], deque(told[kept], self._told.maxlen)
+            if len(self._told) == KEPT and self._told[0][0] % (_THINNED * _DEPTH_EVERY) < _DEPTH_EVERY:
+                self._long_told.append(self._told[0])
+            self._told.append((view.picture, view.T_w_c))
+            self._told_unit, self._told_revision = unit, revision
+        return found
+
+    def _depth(self, image: np.ndarray, output: SlamOutput) -> DepthMap | None:
+        """Depth at a quarter of the picture's size, in published units: the network's, brought to them by the map's
+        points, and these where they stand before it; None with too few of them."""
+        if not _tracks(output) and (self._last_fit(output) is None or not _shows(image)):
+            return None
+        image = self._camera.undistort_image(image)
+        depth, T_w_c = self._network(image, self._camera), output.T_w_c
+        anchors, edges = self._slam.surroundings()
+        fit = (self._fitted(depth, anchors, output) if _tracks(output) else None) or self._last_fit(output)
+        if fit is None:
+            return None
+        fitted = fit.applied(depth)
+        part = (slice(_STEP // 2, None, _STEP), slice(_STEP // 2, None, _STEP))
+        small = DepthMap(fitted.depth_m[part], fitted.sigma_log[part])
+        uv, z = seen_points(np.concatenate([anchors, edges]), self._K_small, T_w_c, small.depth_m.shape)
+        if _tracks(output):
+            fresh_uv, fresh_z = self._slam.fresh_edges(image, *(m / self._home.scale for m in _FRESH_M))
+            uv, z = np.concatenate([uv, (fresh_uv + 0.5) / _STEP - 0.5]), np.concatenate([z, fresh_z])
+        kept = agreeing(uv, z, small.depth_m.shape[1])
+        return with_nearer_points(small, uv[kept], z[kept])
+
+    def _fitted(self, depth: DepthMap, anchors: FloatArray, output: SlamOutput) -> NearFit | None:
+        """The network's depth against the map's points in the picture, kept for pictures without any.
+
+        Of all points of the map those of the next room, behind the wall, would be more than those that are seen.
+        """
+        fit = fit_to_points(depth, *seen_points(anchors, self._camera.K, output.T_w_c, depth.depth_m.shape))
+        revision, unit_m = self._unit
+        if revision == output.revision:
+            believed = fit is not None and self._usual.believes(fit, unit_m, _is_sure(output))
+            usual = self._usual.line(unit_m)
+            if fit is None or not believed:
+                fit = usual
+            elif usual is not None:
+                fit = usual.through(fit)
+        if fit is not None:
+            self._fit = fit.alone(), output.stamp_s, output.revision
+        return fit
+
+    def _last_fit(self, output: SlamOutput) -> NearFit | None:
+        """The last fit, for a picture without a place in the map; None if it is too old, or in another unit."""
+        if self._fit is None:
+            return None
+        fit, at_s, revision = self._fit
+        return fit if output.stamp_s - at_s < _CARRIED_S and output.revision == revision else None
+
+    def _view(self, depth: DepthMap, home: Home, T_w_c: FloatArray, captured_s: float) -> View:
+        """Depth in published units as a pilot is told of it, in metres."""
+        metres = home.scale * depth.depth_m
+        return View(captured_s, metres, depth.sigma_log, self._K_small, home.poses(T_w_c), self._frames - 1)
+
+
+def _is_sure(output: SlamOutput) -> bool:
+    """Whether its metres are what a supervisor lets a drone fly by."""
+    return output.metric and output.scale.sigma <= SCALE_SIGMA * output.scale.value
+
+
+def _tracks(output: SlamOutput) -> bool:
+    return output.health is not None and output.health.state not in _LOST
+
+
+def _contradicted(health: Health) -> bool:
+    """Whether sources of scale contradict each other, and nothing settles it: velocities and heights that confirm each
+    other do against a depth network that was trained elsewhere."""
+    confirmed = set(health.scale.source.split("+")) >= _MEASURED
+    asked = [s for s in health.sources if s.source in _MEASURED] if confirmed else health.sources
+    return disagreement(asked) > _DISAGREE_SIGMAS
+
+
+def _shows(image: np.ndarray) -> bool:
+    """Whether a picture shows anything, if only a bare wall."""
+    return bool(image.mean() > _DARK and image.std() > _FLAT)

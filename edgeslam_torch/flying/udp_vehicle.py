@@ -1,0 +1,219 @@
+"""A Tello over UDP, flown by three threads: one sees, one plans, and one watches over both and owns the sticks."""
+
+import logging
+import math
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+from edgeslam_torch.calibration.camera_choice import choose_camera
+from edgeslam_torch.drone.answers import TelloError
+from edgeslam_torch.drone.tello import StateMessage, Tello, TelloAddress
+from edgeslam_torch.drone.video_stream import OneSize
+from edgeslam_torch.errors import SourceError
+from edgeslam_torch.flying.flight_controller import FlightController
+from edgeslam_torch.flying.perception.slam_perception import SlamPerception
+from edgeslam_torch.flying.recorder import Recorder
+from edgeslam_torch.navigation.drone_state import View
+from edgeslam_torch.types import Frame
+
+logger = logging.getLogger(__name__)
+
+TICK_S = 0.05
+_VIDEO_DELAY_S = 0.35
+"""From light to the arrival of a Tello's picture, which carries no time: 0.3 to 0.5 s."""
+_FIRST_PICTURE_S = 10.0
+_PICTURE_S = 1.0 / 15.0
+"""Least time from one picture to the next that is looked at: a Tello sends 30 a second. 15 are what flights in lockstep
+were judged with; the rest of two cores belongs to the planner and to the map."""
+_POLL_S = 0.02
+_LAND_S = 60.0
+"""Longest wait for a landing: as often as the client repeats it, and the way down."""
+_THINK_S = 0.5
+"""Time that a thread is given to end."""
+
+
+class UdpVehicle:
+    """A Tello, its perception and its flight_controller.
+
+    The thread that watches asks for an order every `TICK_S` and alone sends ``rc`` and ``land``: it waits neither for
+    the planner nor for the pictures. If it fails itself, it lands; if the whole program dies, `Guard` does.
+
+    Args:
+        address: Of the drone.
+        flight_controller: What flies it.
+        allow_motion: Whether it may move.
+        camera: File or preset of the calibration; the Tello's when None.
+        recorder: Told every picture and state message.
+
+    Raises:
+        TelloError: If the drone does not answer, or sends no state or picture.
+        CalibrationError: If the calibration is malformed.
+    """
+
+    def __init__(
+        self,
+        address: TelloAddress,
+        flight_controller: FlightController,
+        allow_motion: bool = False,
+        camera: str | Path | None = None,
+        seed: int = 0,
+        recorder: Recorder | None = None,
+    ) -> None:
+        self.over = ""
+        self._flight_controller = flight_controller
+        self._flying = threading.Event()
+        self._landed = threading.Event()
+        self._land_because: str | None = None
+        self._stopping = threading.Event()
+        self._threads: list[threading.Thread] = []
+        self._view: View | None = None
+        self._view_lock = threading.Lock()
+        self._perception: SlamPerception | None = None
+        self._recorder = recorder
+        self.tello = Tello(address, allow_motion, on_state=self._hear)
+        try:
+            self.tello.connect()
+            self._video = self.tello.start_video()
+            first = self._video.wait(0, _FIRST_PICTURE_S)
+            if first is None:
+                raise TelloError(f"{address.host}: no picture in {_FIRST_PICTURE_S:.0f} s")
+            size = (first.image.shape[1], first.image.shape[0])
+            self._one_size = OneSize(size)
+            self.camera, self.warnings = choose_camera(size, camera, is_drone=True)
+            if recorder is not None:
+                recorder.begin(self.camera)
+            self._perception = SlamPerception(self.camera, seed, realtime=True)
+            assert self.tello.latest is not None  # `connect` waited for it
+            self._perception.heard(
+                self.tello.latest.sample()
+            )  # without an attitude the world of the first picture leans
+        except BaseException:
+            self.tello.close()
+            raise
+        for name, work in (("see", self._see), ("plan", self._plan), ("watch", self._watch)):
+            self._threads.append(threading.Thread(target=work, name=f"fly-{name}", daemon=True))
+            self._threads[-1].start()
+
+    @property
+    def flying(self) -> bool:
+        """As `Vehicle`."""
+        return self._flying.is_set()
+
+    @property
+    def battery(self) -> float:
+        """As `Vehicle`."""
+        latest = self.tello.latest
+        return math.nan if latest is None else latest.sample().battery
+
+    def take_off(self) -> None:
+        """As `Vehicle`.
+
+        Raises:
+            TelloError: If the drone does not.
+        """
+        self.tello.take_off()
+        self._landed.clear()
+        self._flying.set()
+
+    def fly(self, until: Callable[[], bool]) -> None:
+        """As `Vehicle`."""
+        while self.flying and not until():
+            self._stopping.wait(_POLL_S)
+
+    def land(self, why: str) -> None:
+        """As `Vehicle`: asks the thread that watches, which does nothing else any more."""
+        if self.flying:
+            self.stop(why)
+            self._landed.wait(_LAND_S)
+
+    def stop(self, why: str) -> None:
+        """As `Vehicle`."""
+        if self.flying:
+            self._land_because = self._land_because or why
+
+    def close(self) -> None:
+        """As `Vehicle`."""
+        try:
+            self.land("the program left")
+        finally:
+            self._stopping.set()
+            self.tello.close()  # lands too, should the thread above have died
+            for thread in self._threads:
+                thread.join(_THINK_S)
+            if self._perception is not None:
+                self._perception.close()
+
+    def _hear(self, message: StateMessage) -> None:
+        if self._perception is not None:
+            self._perception.heard(message.sample())
+        if self._recorder is not None:
+            self._recorder.state(message)
+
+    def _see(self) -> None:
+        """The newest picture, again and again."""
+        assert self._perception is not None
+        count = 0
+        while not self._stopping.is_set():
+            picture = self._video.wait(count, TICK_S)
+            if picture is None:
+                continue
+            count, begin_s = picture.count, self.tello.clock.now()
+            try:
+                if not self._one_size.fits(picture):
+                    continue
+            except SourceError as error:
+                self.stop(str(error))
+                continue
+            view = self._perception.seen(picture.image, picture.stamp_s, picture.stamp_s - _VIDEO_DELAY_S)
+            if view is not None:
+                with self._view_lock:
+                    self._view = view
+            if self._recorder is not None:
+                self._recorder.picture(Frame(picture.count - 1, picture.stamp_s, picture.image))
+            self._stopping.wait(max(0.0, begin_s + _PICTURE_S - self.tello.clock.now()))
+
+    def _plan(self) -> None:
+        """A wish for the newest moment, again and again."""
+        assert self._perception is not None
+        while not self._stopping.wait(TICK_S):
+            if not self.flying:
+                continue
+            with self._view_lock:
+                view, self._view = self._view, None
+            self._flight_controller.plan(self._perception.sight(self.tello.clock.now(), view))
+
+    def _watch(self) -> None:
+        """Orders to the drone; whatever goes wrong here ends with a landing."""
+        while not self._stopping.wait(TICK_S):
+            if not self.flying:
+                continue
+            try:
+                self._tick()
+            except TelloError as error:  # a guard of the client lands it, such as the one for lost state
+                self._end(self.tello.stop_reason or str(error))
+            except Exception as error:
+                logger.exception("the supervisor failed; landing")
+                self._end(f"the supervisor failed: {error}")
+
+    def _tick(self) -> None:
+        assert self._perception is not None
+        if self._land_because is not None:
+            self._end(self._land_because)
+            return
+        order = self._flight_controller.order(self._perception.sight(self.tello.clock.now()))
+        if order.land:
+            self._end(str(order.danger))
+        else:
+            self.tello.rc(*order.wish.sticks())
+
+    def _end(self, why: str) -> None:
+        self.over = why
+        try:
+            self.tello.land()
+        except TelloError as error:
+            self.over = f"{why}; {error}"
+        finally:
+            self._land_because = None
+            self._flying.clear()
+            self._landed.set()

@@ -1,0 +1,138 @@
+"""Transform from map units and axes to the published world: metric and z up, each if known.
+
+The map itself is never rescaled; its units are published as they are, until sensors of the drone that are sure
+contradict them: a revision, about the camera, so that the live pose does not jump. One more turns a map upright that
+began before the drone's attitude was known. Final results without telemetry are levelled by `mapping/level/`.
+"""
+
+import math
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.types import FloatArray, PointCloud, ScaleEstimate
+
+T_LEVEL = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+"""``T_w_c`` of a level camera that looks along world x: the first pose when nothing tells the attitude."""
+
+SURE = 0.1
+"""Maximum relative sigma of a scale that may revise the published one: better than any depth network in a new
+place."""
+
+CONTRADICTION = 2.0
+"""Deviation of the published scale that triggers a revision [sigmas]."""
+
+GUESS_SURE = 0.15
+_GUESS_CONTRADICTION, _GUESS_OFF = 1.0, 0.05
+"""The same while the unit is still the one that the map began with, and the least deviation of its logarithm: depth
+networks have stated 0.16 at best. A guess is given up as soon as measured metres are likely to be nearer to the truth,
+unless a revision would hardly tell."""
+
+MEASURED = frozenset({"telemetry", "height"})
+"""Sources that measure metres; a depth network has guessed them at the start already."""
+
+
+@dataclass(frozen=True, slots=True)
+class OutputFrame:
+    """Similarity ``p_published = scale R p_map + offset``."""
+
+    scale: float = 1.0
+    R: FloatArray = field(default_factory=lambda: np.eye(3))
+    offset: FloatArray = field(default_factory=lambda: np.zeros(3))
+    revision: int = 0
+    """How often the scale was revised so far."""
+    guessed: bool = True
+    """Whether its unit is still a guess: nothing proven has told metres."""
+    upright: bool = False
+    """Whether its axes stay what they are: z is up by the drone's attitude, or they are those of an earlier flight."""
+
+    def pose(self, T_w_c: FloatArray) -> FloatArray:
+        """Poses ``(..., 4, 4)`` of the map as published."""
+        out = np.array(T_w_c, dtype=np.float64)
+        out[..., :3, :3] = self.R @ T_w_c[..., :3, :3]
+        out[..., :3, 3] = self.points(T_w_c[..., :3, 3])
+        return out
+
+    def points(self, p: FloatArray) -> FloatArray:
+        """Points ``(..., 3)`` of the map as published."""
+        return self.scale * (p @ self.R.T) + self.offset
+
+    def cloud(self, cloud: PointCloud) -> PointCloud:
+        """A point cloud of the map as published."""
+        p = self.points(cloud.p_w.astype(np.float64)).astype(np.float32)
+        return replace(cloud, p_w=p, sigma_m=(self.scale * cloud.sigma_m).astype(np.float32))
+
+    def is_metric(self, estimate: ScaleEstimate) -> bool:
+        """Whether the published unit is a metre within the uncertainty of an estimate [metres per map unit]."""
+        return math.isfinite(estimate.sigma) and not self.contradicts(estimate)
+
+    def contradicts(self, estimate: ScaleEstimate) -> bool:
+        """Whether an estimate [metres per map unit] leaves no room for the published scale."""
+        sigma = estimate.sigma / estimate.value
+        return bool(self._off(estimate) > CONTRADICTION * sigma)
+
+    def _off(self, estimate: ScaleEstimate) -> float:
+        """Deviation of the published scale from an estimate, in the logarithm."""
+        return abs(math.log(estimate.value / self.scale))
+
+    def _worse_guess(self, estimate: ScaleEstimate) -> bool:
+        """Whether the published scale is the first guess, and surely worse than an estimate."""
+        off = self._off(estimate)
+        return self.guessed and off > max(_GUESS_OFF, _GUESS_CONTRADICTION * estimate.sigma / estimate.value)
+
+    def guessed_anew(self, guess: ScaleEstimate | None, centre_map: FloatArray) -> "OutputFrame":
+        """The same with a better guess of its unit; arguments as for `revised`."""
+        if guess is None or not self._worse_guess(guess):
+            return self
+        return self._rescaled(guess.value, centre_map)
+
+    def turned_upright(self, R_w_m: FloatArray | None, centre_map: FloatArray) -> "OutputFrame":
+        """The same with z up, by the smallest turn, if it is not yet and an attitude tells where up is.
+
+        Args:
+            R_w_m: Rotation ``(3, 3)`` from the map to a world whose z is up; None as long as nothing tells it.
+            centre_map: Point of the map ``(3,)`` that stays where it is published.
+        """
+        if self.upright or R_w_m is None:
+            return self
+        turned = self.levelled(R_w_m[2], centre_map)
+        return replace(turned, revision=self.revision + 1, upright=True)
+
+    def levelled(self, up_map: FloatArray, centre_map: FloatArray) -> "OutputFrame":
+        """The same with a direction ``(3,)`` of the map up, by the smallest turn; ``centre_map`` as above."""
+        turn, _ = Rotation.align_vectors([[0.0, 0.0, 1.0]], [self.R @ up_map])
+        R = turn.as_matrix() @ self.R
+        return replace(self, R=R, offset=self.offset + self.scale * ((self.R - R) @ centre_map))
+
+    def _rescaled(self, scale: float, centre_map: FloatArray) -> "OutputFrame":
+        offset = self.offset + (self.scale - scale) * (self.R @ centre_map)
+        return replace(self, scale=scale, offset=offset, revision=self.revision + 1)
+
+    def revised(self, estimate: ScaleEstimate, centre_map: FloatArray) -> "OutputFrame":
+        """The same at an estimated scale, if that is measured, sure and contradicts the published one.
+
+        Args:
+            estimate: Metres per map unit.
+            centre_map: Point of the map ``(3,)`` that stays where it is published.
+        """
+        if not self.is_wrong_by(estimate):
+            return self
+        return replace(self._rescaled(estimate.value, centre_map), guessed=False)
+
+    def is_wrong_by(self, estimate: ScaleEstimate) -> bool:
+        """Whether an estimate [metres per map unit] is measured, sure, and contradicts the published scale."""
+        measured = not MEASURED.isdisjoint(estimate.source.split("+"))
+        sure = GUESS_SURE if self.guessed else SURE
+        wrong = self.contradicts(estimate) or self._worse_guess(estimate)
+        return measured and estimate.sigma < sure * estimate.value and wrong
+
+
+def first_pose(rpy_rad: FloatArray, T_b_c: FloatArray) -> FloatArray:
+    """``T_w_c`` at the origin from the drone's attitude ``(3,)``; level and forward when it is not known."""
+    if not np.isfinite(rpy_rad).all():
+        return T_LEVEL.copy()
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_euler("ZYX", rpy_rad[::-1]).as_matrix() @ T_b_c[:3, :3]
+    return se3.orthonormalised(T)

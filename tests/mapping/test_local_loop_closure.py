@@ -1,0 +1,121 @@
+"""A returning camera observes its old anchors again despite drift."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from point_map import CAMERA, PointMap, check_map, small_motion
+
+from edgeslam_torch.frontend.keypoint_grid import KeypointGrid
+from edgeslam_torch.frontend.matching import words
+from edgeslam_torch.geometry import se3
+from edgeslam_torch.mapping.local_loop_closure import reobserve, reobserve_all, revisit_candidate
+from edgeslam_torch.mapping.refinement import refine_all
+from edgeslam_torch.optim.problem import LmConfig
+
+LATER = (3, 4, 5)
+
+
+def drifted(rng, drift, same_place=True):
+    """Views 3 to 5 with anchors of their own, all moved by ``drift``; the last of them stands where view 1 stood."""
+    points = PointMap(rng, 400, 6)
+    points.world.T_c_w[5] = points.world.T_c_w[1]
+    last = points.keyframes[5]
+    seen = points.point_of[5] = points.point_of[1]
+    last.features = points.keyframes[1].features
+    last.words, last.grid = points.keyframes[1].words, points.keyframes[1].grid
+    last.aligned_px = points.keyframes[1].aligned_px.copy()
+    last.anchor = np.full(len(seen), -1, dtype=np.int64)
+    last.T_c_w = points.world.T_c_w[1].copy()
+    points.fill((0, 1, 2))
+    known = np.unique(np.concatenate([points.point_of[v] for v in LATER]))
+    if not same_place:
+        points.descriptors = rng.integers(0, 256, points.descriptors.shape, dtype=np.uint8)
+        last.words = words(points.descriptors[seen])
+    anchor_of = np.full(len(points.world.p_w), -1)
+    anchor_of[known] = points.map.anchors.add(
+        se3.transform(drift, points.world.p_w[known]),
+        words(points.descriptors[known]),
+        3,
+        False,
+        np.zeros((len(known), 3), np.uint8),
+    )
+    for v in LATER:
+        keyframe = points.keyframes[v]
+        keyframe.T_c_w = keyframe.T_c_w @ se3.inverse(drift)
+        keyframe.anchor[:] = anchor_of[points.point_of[v]]
+        points.map.add_keyframe(keyframe)
+    points.map.refresh_anchors(anchor_of[known])
+    return points
+
+
+@pytest.fixture
+def drift(rng):
+    return small_motion(rng, 0.04, 0.02)
+
+
+def test_returning_camera_is_joined_and_the_drift_goes(rng, drift):
+    points = drifted(rng, drift)
+    last = points.keyframes[5]
+    assert revisit_candidate(points.map, last) is points.keyframes[1]
+    before = len(points.map.anchors)
+    held = points.keyframes[1].keypoints_with_anchor()
+    p_w = points.map.anchors.p_w[points.keyframes[1].anchor[held]]
+    true = CAMERA.project(se3.transform(last.T_c_w @ drift, p_w))
+    shift = np.linalg.norm(CAMERA.project(se3.transform(last.T_c_w, p_w)) - true, axis=1)
+    assert reobserve(points.map, CAMERA, last) == pytest.approx(np.median(shift), rel=0.3)
+    check_map(points.map)
+    assert before - len(points.map.anchors) > 50
+    for _ in range(2):
+        refine_all(points.map, CAMERA, LmConfig(max_iterations=50, cost_tolerance=1e-9, diagnostics=False))
+        reobserve_all(points.map, CAMERA)
+    check_map(points.map)
+    apart = se3.log(last.T_c_w @ se3.inverse(points.keyframes[1].T_c_w))
+    assert np.abs(apart).max() < 0.1 * np.abs(se3.log(drift)).max()
+
+
+def test_another_place_that_looks_different_is_not_joined(rng, drift):
+    points = drifted(rng, drift, same_place=False)
+    held = points.keyframes[5].anchor.copy()
+    assert reobserve(points.map, CAMERA, points.keyframes[5]) is None
+    check_map(points.map)
+    np.testing.assert_array_equal(points.keyframes[5].anchor, held)
+
+
+def test_keyframes_that_know_each_other_are_left_alone(rng):
+    points = PointMap(rng, 300, 4)
+    points.fill()
+    assert revisit_candidate(points.map, points.keyframes[0]) is None, "none is older"
+    assert reobserve_all(points.map, CAMERA) == []
+    check_map(points.map)
+
+
+def test_keyframe_without_anchors_has_no_revisit_candidate(rng):
+    points = PointMap(rng, 300, 3)
+    points.fill()
+    points.map.forget_observations(points.keyframes[2], points.keyframes[2].keypoints_with_anchor())
+    assert revisit_candidate(points.map, points.keyframes[2]) is None
+
+
+def test_a_place_of_which_most_does_not_fit_is_not_joined(rng, drift):
+    """Two keypoints in three were moved anywhere nearby: enough of the rest agree, but that is not the place."""
+    points = drifted(rng, drift)
+    last = points.keyframes[5]
+    moved = rng.permutation(len(last.anchor))[: 2 * len(last.anchor) // 3]
+    uv = last.features.uv.copy()
+    uv[moved] += rng.uniform(-18, 18, (len(moved), 2)).astype(np.float32)
+    last.features = replace(last.features, uv=uv)
+    last.grid = KeypointGrid(uv)
+    held = last.anchor.copy()
+    assert reobserve(points.map, CAMERA, last) is None
+    np.testing.assert_array_equal(last.anchor, held)
+
+
+def test_a_keyframe_that_shares_the_anchors_of_its_neighbour_is_no_revisit(rng):
+    """It is at the place of a keyframe with which it already shares anchors."""
+    points = drifted(rng, np.eye(4))
+    last, first = points.keyframes[5], points.keyframes[1]
+    assert revisit_candidate(points.map, last) is first
+    shared = np.flatnonzero((last.anchor >= 0) & (first.anchor >= 0))[:20]
+    points.map.merge_anchors(last.anchor[shared], first.anchor[shared])
+    assert revisit_candidate(points.map, last) is not first

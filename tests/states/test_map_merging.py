@@ -1,0 +1,241 @@
+"""The live pose goes along when the piece of map that it hangs on is moved."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from edgeslam_torch.atlas.atlas import Join
+from edgeslam_torch.atlas.loops import Closure
+from edgeslam_torch.atlas.submap_heading import Turned, turn_about
+from edgeslam_torch.atlas.submap_scale import Rescaled, about
+from edgeslam_torch.fusion.output_frame import OutputFrame
+from edgeslam_torch.geometry import se3, sim3
+from edgeslam_torch.states.map_merging import MapMerging
+from edgeslam_torch.states.submap_uncertainty import Apart
+from edgeslam_torch.tracking.motion_model import MotionModel
+from edgeslam_torch.types import ScaleEstimate
+
+S = sim3.exp(np.array([0.4, -0.2, 0.7, 0.3, -0.5, 0.2, np.log(1.5)]))
+KEYFRAME = 7
+
+
+class Pieces:
+    """A map of two pieces; the camera's one is number 1."""
+
+    def __init__(self, T_k_w):
+        self.T_k_w, self.piece = T_k_w, 1
+        self.begun = {0: "first", 1: "second"}
+        self.asked = 0
+        self.again = []
+
+    def piece_of(self, keyframe_id):
+        assert keyframe_id == KEYFRAME
+        return self.piece
+
+    def pose_of(self, keyframe_id):
+        assert keyframe_id == KEYFRAME
+        return self.T_k_w
+
+    def atlas(self, moved):
+        """Finds one join, of which the camera's piece is moved if it is number ``moved``."""
+
+        def update(stamp_s):
+            self.asked += 1
+            if self.piece == 0:
+                return None
+            self.piece = 0
+            if moved == 1:
+                self.T_k_w = sim3.moved_camera(S, self.T_k_w)
+            return Join(1.0, 0, 1, moved, S if moved == 1 else sim3.inverse(S), 0.01, 2, 300)
+
+        return SimpleNamespace(
+            update=update,
+            ask_all_again=lambda: None,
+            ask_again=lambda: self.again.append(self.piece),
+            align=lambda stamp_s, now: None,
+            is_up_to_date=False,
+            is_divided=True,
+            known_scale={},
+        )
+
+
+def system_of(pieces, motion, busy=False):
+    log = SimpleNamespace(records=[SimpleNamespace(keyframe_id=KEYFRAME)], poses=lambda: ("stamps", "poses"))
+    revised = []
+    remembered = []
+    fusion = SimpleNamespace(
+        revise=lambda *poses: revised.append(poses),
+        revised=revised,
+        metres=SimpleNamespace(remember=remembered.append, follow=lambda log: revised.append(pytest.approx(log))),
+        remembered=remembered,
+    )
+    mapping = SimpleNamespace(busy=busy)
+    again = lambda: revised.append("ratios")  # noqa: E731
+    return SimpleNamespace(
+        apart=Apart(),
+        compare_depths_again=again,
+        log=log,
+        map=pieces,
+        motion=motion,
+        fusion=fusion,
+        mapping=mapping,
+        published=OutputFrame(2.0),
+        other_unit=lambda: None,
+        events={},
+    )
+
+
+def moving(rng):
+    """A camera with a velocity, some way from its keyframe."""
+    T_k_w = se3.exp(rng.normal(size=6))
+    motion = MotionModel(se3.exp(0.1 * rng.normal(size=6)) @ T_k_w)
+    motion.stamp_s = 1.0
+    motion.move(1.1, se3.exp(0.1 * rng.normal(size=6)) @ motion.T_c_w)
+    motion.stamp_s = 1.1
+    return T_k_w, motion
+
+
+def test_the_pose_and_its_future_go_along_with_their_piece(rng):
+    """What the camera sees of its piece, now and by prediction, is the same picture, scaled."""
+    T_k_w, motion = moving(rng)
+    p = rng.normal(size=(20, 3))
+    before = [se3.transform(T, p) for T in (motion.T_c_w, motion.predict(1.3))]
+    system = system_of(Pieces(T_k_w), motion)
+    words = MapMerging(system, system.map.atlas(moved=1)).update()
+    assert words.startswith("piece 1 joined piece 0")
+    after = [se3.transform(T, sim3.transform(S, p)) for T in (motion.T_c_w, motion.predict(1.3))]
+    np.testing.assert_allclose(after, 1.5 * np.array(before), atol=1e-9)
+    assert (system.published.scale, system.published.revision) == (2.0, 1)
+    assert system.events == {"joined": 1}
+    assert system.fusion.revised == ["ratios", ("stamps", "poses")], "in the unit that the piece has now"
+    assert system.map.asked == 2, "until there is no other join"
+
+
+def test_the_pose_stays_where_the_other_piece_comes_to_it(rng):
+    T_k_w, motion = moving(rng)
+    before = motion.T_c_w, motion.predict(1.3)
+    system = system_of(Pieces(T_k_w), motion)
+    MapMerging(system, system.map.atlas(moved=0)).update()
+    np.testing.assert_allclose((motion.T_c_w, motion.predict(1.3)), before, atol=1e-12)
+
+
+def test_the_pose_goes_along_when_a_loop_is_closed(rng):
+    """By as much as the map grew around its keyframe, however much that was elsewhere."""
+    T_k_w, motion = moving(rng)
+    p = rng.normal(size=(20, 3))
+    before = se3.transform(motion.T_c_w, p)
+    pieces = Pieces(T_k_w)
+
+    def update(stamp_s):
+        if pieces.asked:
+            return None
+        pieces.asked += 1
+        pieces.T_k_w = sim3.moved_camera(S, T_k_w)
+        return Closure(1.0, 1, 30.0, 0.2, 0.1, 1.2, 2, 300, {KEYFRAME: 1.5, 3: 1.1})
+
+    system = system_of(pieces, motion)
+    words = MapMerging(system, SimpleNamespace(update=update, align=lambda *_: None, is_up_to_date=False)).update()
+    assert words.startswith("loop closed in piece 1, a place seen again after 30.0 s: 2 keyframes agree, 300 keypoints")
+    np.testing.assert_allclose(se3.transform(motion.T_c_w, sim3.transform(S, p)), 1.5 * before, atol=1e-9)
+    assert (system.published.revision, system.events) == (1, {"loops_closed": 1})
+    assert system.fusion.revised == ["ratios", ("stamps", "poses")]
+
+
+def test_the_pose_goes_along_when_its_piece_gets_the_unit_of_another(rng):
+    T_k_w, motion = moving(rng)
+    p = rng.normal(size=(20, 3))
+    before = se3.transform(motion.T_c_w, p)
+    pieces = Pieces(T_k_w)
+    grown = about(np.array([1.0, -2.0, 0.5]), 1.3)
+
+    def rescale(stamp_s, now):
+        pieces.T_k_w = sim3.moved_camera(grown, T_k_w)
+        return Rescaled(7.0, 1, grown, 0.05)
+
+    system = system_of(pieces, motion)
+    atlas = SimpleNamespace(align=rescale, update=lambda _: None, is_up_to_date=False)
+    words = MapMerging(system, atlas).update()
+    assert words == "piece 1 scaled by 1.300 (sigma 5.0 %) to the metres before it"
+    np.testing.assert_allclose(se3.transform(motion.T_c_w, sim3.transform(grown, p)), 1.3 * before, atol=1e-9)
+    assert (system.published.revision, system.events) == (1, {"rescaled": 1})
+    assert system.fusion.revised == [np.log(1.3), "ratios", ("stamps", "poses")], "held metres do not scale it again"
+
+
+def test_the_pose_goes_along_when_its_piece_is_turned(rng):
+    T_k_w, motion = moving(rng)
+    p = rng.normal(size=(20, 3))
+    before = se3.transform(motion.T_c_w, p)
+    pieces = Pieces(T_k_w)
+    S = turn_about(np.array([1.0, -2.0, 0.5]), np.eye(3), 0.4)
+
+    def align(stamp_s, now):
+        pieces.T_k_w = sim3.moved_camera(S, T_k_w)
+        return Turned(7.0, 1, S, 0.4, 0.05)
+
+    system = system_of(pieces, motion)
+    system.apart.begin(1, 0, np.zeros(3), 0.0, 0.5)
+    atlas = SimpleNamespace(align=align, update=lambda _: None, is_up_to_date=False)
+    assert MapMerging(system, atlas).update() == "piece 1 turned by 22.9 degrees (sigma 2.9) to the heading before it"
+    np.testing.assert_allclose(se3.transform(motion.T_c_w, sim3.transform(S, p)), before, atol=1e-9)
+    assert (system.published.revision, system.events) == (1, {"turned": 1})
+    assert system.apart.sigma(1, np.array([2.0, 0.0, 0.0]), 0.0) == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize("finish", [False, True])
+def test_nothing_is_joined_while_the_worker_maps(rng, finish):
+    T_k_w, motion = moving(rng)
+    system = system_of(Pieces(T_k_w), motion, busy=True)
+    joining = MapMerging(system, system.map.atlas(moved=1))
+    if finish:
+        joining.finish()
+    else:
+        assert joining.update() == ""
+    assert system.map.asked == 0
+    assert system.events == {}
+
+
+def test_the_metres_of_an_earlier_flight_hold_in_its_map_and_nowhere_else(rng):
+    T_k_w, motion = moving(rng)
+    system = system_of(Pieces(T_k_w), motion)
+    atlas = system.map.atlas(moved=1)
+    known = ScaleEstimate(1.0, 0.02, "depth")
+    atlas.known_scale[0] = known
+    joining = MapMerging(system, atlas)
+    joining.enter(1)
+    assert (system.published.scale, system.published.revision) == (2.0, 0)
+    joining.enter(0)
+    assert (system.published.scale, system.published.revision) == (1.0, 1), "and whoever reads poses is told"
+    joining.enter(0)
+    system.published = OutputFrame(1.1, revision=2)  # telemetry has contradicted it since
+    joining.enter(0)
+    assert (system.published.scale, system.published.revision) == (1.1, 2)
+    assert system.fusion.remembered == [None, known]
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_the_axes_of_an_earlier_flight_hold_in_its_map(rng, turned):
+    """A world that this flight turned upright by its own attitude is not that of the earlier one."""
+    T_k_w, motion = moving(rng)
+    system = system_of(Pieces(T_k_w), motion)
+    R_w_m = se3.exp(np.array([0.0, 0.0, 0.0, 0.2, 0.0, 0.0]))[:3, :3]
+    system.published = OutputFrame(1.0).turned_upright(R_w_m if turned else None, np.zeros(3))
+    atlas = system.map.atlas(moved=1)
+    atlas.known_scale[0] = ScaleEstimate(1.0, 0.02, "depth")
+    MapMerging(system, atlas).enter(0)
+    np.testing.assert_array_equal(system.published.R, np.eye(3))
+    assert system.published.revision == 2 * int(turned)
+    assert system.published.turned_upright(R_w_m, np.zeros(3)) is system.published
+
+
+def test_pieces_are_compared_again_when_the_camera_returns_from_one_to_an_earlier_one(rng):
+    """The one that it left is complete; one that it has just begun is not."""
+    T_k_w, motion = moving(rng)
+    system = system_of(Pieces(T_k_w), motion)
+    atlas = system.map.atlas(moved=1)
+    atlas.is_up_to_date = True
+    joining = MapMerging(system, atlas)
+    for piece, asked in ((0, 0), (1, 0), (1, 0), (0, 1), (0, 1), (1, 1), (0, 2)):
+        system.map.piece = piece
+        joining.update()
+        assert len(system.map.again) == asked

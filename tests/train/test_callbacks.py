@@ -1,0 +1,65 @@
+"""TensorBoard holds each step once, whatever was interrupted."""
+
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.summary.writer import event_file_writer
+
+from edgeslam_torch.models.checkpoint import build_network
+from edgeslam_torch.models.fastdepth import Widths
+from edgeslam_torch.models.record import Metadata
+from edgeslam_torch.train.callbacks import ProgressBar, TensorBoard
+from edgeslam_torch.train.recipe import Hooks, TrainConfig, TrainState, train
+from edgeslam_torch.train.signals import Source, Supervised
+from edgeslam_torch.train.views.augment import View
+
+METADATA = Metadata(input_height=32, input_width=64, focal_px=50.0)
+VIEW = View(
+    np.full((32, 64, 3), 90, np.uint8),
+    np.full((32, 64), 2.0, np.float32),
+    np.array([[50.0, 0, 31.5], [0, 50.0, 15.5], [0, 0, 1]]),
+)
+CONFIG = TrainConfig(steps=9, batch=1, warmup_steps=1, validate_every=3, checkpoint_every=4)
+
+
+class _Killed(Hooks):
+    """Ends like a killed process: the last steps are not saved."""
+
+    def __init__(self, step: int) -> None:
+        self.step = step
+
+    def on_step(self, state: TrainState, losses: dict[str, float]) -> None:
+        if state.step == self.step:
+            state.shown = None  # what a rescue would need
+            raise KeyboardInterrupt
+
+
+def run(out: Path, config: TrainConfig, *more: Hooks) -> TrainState:
+    torch.manual_seed(0)
+    network = build_network(METADATA, Widths((4,) + (8,) * 13, (8,) * 5))
+    hooks = [ProgressBar(), TensorBoard(out / "tensorboard", METADATA, [VIEW]), *more]
+    signal = Supervised([Source("made", [VIEW], 1.0)], METADATA)
+    return train(network, METADATA, [signal], config, out, lambda n: {"score": 1.0}, hooks)
+
+
+def test_steps_are_in_tensorboard_once_after_interrupts_and_more_steps(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Files of one second are read in the order of their names, where a counter of the process puts 10 before 9; runs
+    # of their own have seconds of their own.
+    monkeypatch.setattr(event_file_writer, "_global_uid", event_file_writer.AtomicCounter(1000))
+    for step in (2, 7):  # before the first checkpoint, and between two
+        with pytest.raises(KeyboardInterrupt):
+            run(tmp_path, CONFIG, _Killed(step))
+    run(tmp_path, CONFIG)
+    run(tmp_path, replace(CONFIG, steps=11))
+    events = EventAccumulator(str(tmp_path / "tensorboard"))
+    events.Reload()
+    for tag, expected in (("loss/sum", range(1, 12)), ("lr", range(1, 12)), ("validation/score", [3, 6, 9, 11])):
+        assert Counter(event.step for event in events.Scalars(tag)) == Counter(expected), tag
+    assert [event.step for event in events.Images("view 0")] == [3, 6, 9, 11]

@@ -1,0 +1,183 @@
+"""Rendered corridors, halls, rooms of many sizes and the sites of flights, as training views kept in files.
+
+They are seen level, obliquely and from near. ``python -m edgeslam_torch.train.recipes.rendered_views DIR --places 3000
+--processes 12`` draws them, while `weights` learns from what is there.
+"""
+
+import argparse
+from collections.abc import Callable, Iterator
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from edgeslam_torch.files.atomic import write_atomically
+from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.synthetic.house.render import Rendered, render
+from edgeslam_torch.synthetic.house.rooms import (
+    blank_corridor,
+    building,
+    corridor,
+    look,
+    random_room,
+    random_view,
+    room,
+)
+from edgeslam_torch.synthetic.house.world import World
+from edgeslam_torch.synthetic.sites.build import JUDGED, named_site
+from edgeslam_torch.train.views.rendered import is_worth_learning
+from edgeslam_torch.types import FloatArray
+
+Rng = np.random.Generator
+WIDTH, HEIGHT = 320, 240
+LEVEL_FOCAL_PX = (140.0, 380.0)
+"""Of the 320 pixel wide images: 98 to 46 degrees across."""
+OBLIQUE_FOCAL_PX = (130.0, 300.0)
+LEVEL_VIEWS, OBLIQUE_VIEWS, NEAR_VIEWS = 8, 5, 5
+"""Of each place."""
+NEAREST_M = 0.18
+"""Least fifth percentile of an oblique or near view's depth: nearer, a single texture fills it."""
+SITE_SHARE = 0.4
+"""Of the places: what a drone hits stands there."""
+SITE_SEEDS = (1_000_000, 2_000_000)
+"""Of sites to learn from; flights are judged on smaller ones."""
+TRIES = 8
+PLACES_A_FILE = 10
+
+
+def random_place(rng: Rng) -> World:
+    """A place of random kind and size: what a drone flies through that `random_room` does not have."""
+    if rng.random() < SITE_SHARE:
+        return named_site(str(rng.choice((*JUDGED, "doors"))), int(rng.integers(*SITE_SEEDS))).world
+    kind = rng.random()
+    if kind < 0.3:
+        return random_room(rng)
+    if kind < 0.5:
+        return corridor(rng, length_m=_log(rng, 6, 24), width_m=_log(rng, 1.5, 4.0), height_m=_log(rng, 2.3, 3.6))
+    if kind < 0.68:
+        return blank_corridor(rng, length_m=_log(rng, 6, 24), width_m=_log(rng, 1.5, 4.0), height_m=_log(rng, 2.3, 3.6))
+    if kind < 0.8:  # as wide as a hall
+        return blank_corridor(rng, length_m=_log(rng, 8, 24), width_m=_log(rng, 4.0, 11.0), height_m=_log(rng, 2.6, 6))
+    if kind < 0.95:
+        return room(rng, size_m=(_log(rng, 6, 16), _log(rng, 5, 11), _log(rng, 2.4, 5)))
+    return building(rng, side_m=_log(rng, 3.2, 5.0), opening_m=rng.uniform(0.9, 1.8))
+
+
+def oblique_pose(rng: Rng, world: World) -> FloatArray | None:
+    """A pose ``T_w_c`` 0.3 to 1.3 m from a wall, 5 to 75 degrees from along it, tilted and rolled; None without a free
+    place."""
+    low, high = world.bounds_w
+    for _ in range(60):
+        p = rng.uniform(low + 0.3, high - 0.3)
+        p[2] = np.clip(rng.normal(1.3, 0.5), 0.25, high[2] - 0.25)
+        wall, distance = int(rng.integers(4)), _log(rng, 0.3, 1.3)
+        axis, at_low = wall // 2, wall % 2 == 0
+        if distance > 0.6 * (high - low)[axis]:
+            continue
+        p[axis] = low[axis] + distance if at_low else high[axis] - distance
+        if world.clearance(p) < min(0.2, 0.8 * distance):
+            continue
+        towards = np.zeros(2)
+        towards[axis] = -1.0 if at_low else 1.0
+        along = np.array([-towards[1], towards[0]]) * (1 if rng.random() < 0.5 else -1)
+        turned = np.deg2rad(rng.uniform(5.0, 75.0))
+        ahead = np.cos(turned) * along + np.sin(turned) * towards
+        down = float(np.clip(rng.normal(0.1, 0.4), -1.0, 1.2))
+        return look(p, float(np.arctan2(ahead[1], ahead[0])), down, float(rng.normal(0.0, 0.45)))
+    return None
+
+
+def near_pose(rng: Rng, world: World) -> FloatArray | None:
+    """A pose ``T_w_c`` of a drone that has something 0.35 to 1 m beside or before it; None without a free place."""
+    low, high = world.bounds_w
+    wanted = _log(rng, 0.35, 1.0)
+    for _ in range(60):
+        p = rng.uniform(low + 0.3, high - 0.3)
+        p[2] = np.clip(rng.normal(1.1, 0.3), 0.3, high[2] - 0.3)
+        away = float(world.clearance(p))
+        if not 0.8 * wanted < away < 1.25 * wanted:
+            continue
+        towards = away - np.array([float(world.clearance(p + step)) for step in 0.05 * np.eye(3)[:2]])
+        if np.linalg.norm(towards) < 0.025:  # the floor or the ceiling is nearest
+            continue
+        yaw = float(np.arctan2(towards[1], towards[0])) + float(rng.normal(0.0, 0.6))
+        return look(p, yaw, float(np.clip(rng.normal(0.05, 0.12), -0.5, 0.5)), float(rng.normal(0.0, 0.06)))
+    return None
+
+
+def close_view(
+    rng: Rng, camera: Camera, world: World, pose: Callable[[Rng, World], FloatArray | None]
+) -> Rendered | None:
+    """A view from `oblique_pose` or `near_pose` that is not filled by what is next to the lens; None without one."""
+    for _ in range(TRIES):
+        T_w_c = pose(rng, world)
+        if T_w_c is None:
+            return None
+        if np.percentile(render(world, camera.scaled(40, 30), T_w_c, antialias=False).depth_m, 5) > NEAREST_M:
+            return render(world, camera, T_w_c)
+    return None
+
+
+def render_files(folder: Path, places: int, seed: int = 21, processes: int = 1) -> None:
+    """Draw views of ``places`` places into ``folder``, `PLACES_A_FILE` a file ``places_NNNNN.npz``, without most of the
+    flat ones; place p depends on (seed, p) alone. Files that are there stay."""
+    folder.mkdir(parents=True, exist_ok=True)
+    firsts = range(0, places, PLACES_A_FILE)
+    work = [(folder / f"places_{first:05d}.npz", first, min(first + PLACES_A_FILE, places), seed) for first in firsts]
+    work = [item for item in work if not item[0].is_file()]
+    with get_context("spawn").Pool(processes) as pool:
+        for _ in tqdm(pool.imap(_render_file, work), total=len(work), desc="rendering places", disable=None):
+            pass
+
+
+def _render_file(work: tuple[Path, int, int, int]) -> None:
+    path, first, end, seed = work
+    images, depths, matrices = [], [], []
+    for p in range(first, end):
+        rng = np.random.default_rng((seed, p))
+        world = random_place(rng)
+        for camera, rendered in _views(rng, world):
+            if not is_worth_learning(rendered.depth_m, rng.random()):
+                continue
+            images.append(rendered.image)
+            depths.append(rendered.depth_m.astype(np.float16))
+            matrices.append(camera.K)
+    arrays = {"image": np.array(images), "depth": np.array(depths), "K": np.array(matrices)}
+    write_atomically(path, lambda file: np.savez(file, allow_pickle=False, **arrays))
+
+
+def _views(rng: Rng, world: World) -> Iterator[tuple[Camera, Rendered]]:
+    """All views of a place that there are."""
+    for kind in ["level"] * LEVEL_VIEWS + ["oblique"] * OBLIQUE_VIEWS + ["near"] * NEAR_VIEWS:
+        camera = _camera(_log(rng, *(OBLIQUE_FOCAL_PX if kind == "oblique" else LEVEL_FOCAL_PX)))
+        if kind == "level":
+            rendered: Rendered | None = random_view(rng, camera, world)
+        else:
+            rendered = close_view(rng, camera, world, oblique_pose if kind == "oblique" else near_pose)
+        if rendered is not None:
+            yield camera, rendered
+
+
+def _camera(focal_px: float) -> Camera:
+    return Camera(WIDTH, HEIGHT, focal_px, focal_px, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
+
+
+def _log(rng: Rng, low: float, high: float) -> float:
+    """Uniform in the logarithm."""
+    return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--places", type=int, default=300)
+    parser.add_argument("--seed", type=int, default=21)
+    parser.add_argument("--processes", type=int, default=1)
+    args = parser.parse_args()
+    render_files(args.folder, args.places, args.seed, args.processes)
+
+
+if __name__ == "__main__":
+    main()
