@@ -41,7 +41,7 @@ _HOMES = {
     "finetuning": "Data FromRuns finetune",
     "hook_names": "named_hooks",
     "folder": "Existing OutFolder out_folder",
-    "outcome": "Outcome",
+    "result": "Outcome",
     "processes.distributed": "process_group rank world",
     "recipe": "DivergedError Drawn Hooks NonFiniteLossError TrainConfig TrainState Validation train",
     "self_supervised": "SelfSupervised SelfSupervisedWeights",
@@ -54,7 +54,7 @@ _HOMES = {
     "views.posed": "PosedSequence PosedView load_run relative_motion",
     "views.shards": "load_shards write_shards",
     "views.straight": "straight_edges",
-    "watchers": "ProgressBar TensorBoard",
+    "callbacks": "ProgressBar TensorBoard",
 }
 _LAZY = {name: f"edgeslam_torch.train.{home}" for home, names in _HOMES.items() for name in names.split()}
 

@@ -85,9 +85,7 @@ class UdpVehicle:
                 recorder.begin(self.camera)
             self._perception = SlamPerception(self.camera, seed, realtime=True)
             assert self.tello.latest is not None  # `connect` waited for it
-            self._perception.heard(
-                self.tello.latest.sample()
-            )  # without an attitude the world of the first picture leans
+            self._perception.heard(self.tello.latest.sample())  # without an attitude the first world leans
         except BaseException:
             self.tello.close()
             raise

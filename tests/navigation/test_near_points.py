@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from edgeslam_torch.navigation.near.points import ALIKE, SIGMA_LOG, agreeing, seen_points, with_nearer_points
+from edgeslam_torch.navigation.near.points import MIN_AGREEING, SIGMA_LOG, agreeing, seen_points, with_nearer_points
 from edgeslam_torch.types import DepthMap
 
 K = np.array([[100.0, 0.0, 59.5], [0.0, 100.0, 44.5], [0.0, 0.0, 1.0]])
@@ -11,7 +11,7 @@ WALL = DepthMap(np.full((90, 120), 3.0, np.float32), np.full((90, 120), 0.3, np.
 AT = np.array([[60.2, 44.8]])
 
 
-def cluster(z=0.8, u=60.0, v=45.0, count=ALIKE):
+def cluster(z=0.8, u=60.0, v=45.0, count=MIN_AGREEING):
     """Points within half a pixel of each other."""
     return np.column_stack([u + 0.1 * np.arange(count), np.full(count, v)]), np.full(count, z)
 
@@ -47,15 +47,15 @@ def test_a_map_without_points_changes_nothing():
 
 
 def test_points_agree_when_there_are_enough_in_one_place():
-    assert agreeing(*cluster(), 120).tolist() == list(range(ALIKE))
-    assert len(agreeing(*cluster(count=ALIKE - 1), 120)) == 0
+    assert agreeing(*cluster(), 120).tolist() == list(range(MIN_AGREEING))
+    assert len(agreeing(*cluster(count=MIN_AGREEING - 1), 120)) == 0
     assert len(agreeing(np.array([[20.0, 20.0], [60.0, 45.0], [100.0, 70.0]]), np.full(3, 0.8), 120)) == 0
     assert len(agreeing(cluster()[0], np.array([0.8, 1.2, 1.9]), 120)) == 0, "behind each other is not together"
 
 
 @pytest.mark.parametrize("shift", np.linspace(0.0, 2.4, 9))
 def test_no_border_of_cells_parts_what_is_together(shift):
-    assert len(agreeing(*cluster(0.8 * np.exp(0.05 * shift), u=59.0 + shift), 120)) == ALIKE
+    assert len(agreeing(*cluster(0.8 * np.exp(0.05 * shift), u=59.0 + shift), 120)) == MIN_AGREEING
 
 
 def test_points_are_seen_where_they_are_and_not_from_behind():
