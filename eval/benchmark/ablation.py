@@ -21,8 +21,9 @@ import numpy as np
 
 from edgeslam_torch import __version__
 from edgeslam_torch.config import SlamConfig, WindowConfig
-from edgeslam_torch.eval.benchmark.benchmark import find_sequences, machine
+from edgeslam_torch.eval.benchmark.benchmark import find_sequences
 from edgeslam_torch.eval.benchmark.compare import compare
+from edgeslam_torch.eval.benchmark.conditions import machine
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.inputs.dataset import EvalDataset, interpolate, open_dataset
 from edgeslam_torch.eval.inputs.trajectory_files import Trajectory

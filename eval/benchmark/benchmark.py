@@ -6,7 +6,6 @@ other load is measured. `compare` derives noise and verdicts.
 
 import json
 import os
-import platform
 import subprocess
 import sys
 import time
@@ -34,6 +33,7 @@ from edgeslam_torch.eval.benchmark.compare import (
     sequences_of,
     stage_metrics,
 )
+from edgeslam_torch.eval.benchmark.conditions import code_state, machine
 from edgeslam_torch.eval.benchmark.machine_speed import MachineSpeed, disturbance, read_cpu_times
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.inputs.dataset import open_dataset
@@ -125,7 +125,7 @@ def run_benchmark(settings: BenchSettings, out: Path, say: Callable[[str], None]
     record: dict[str, Any] = {
         "format": FORMAT,
         "version": __version__,
-        "commit": _commit(),
+        "commit": code_state(),
         "made": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
         "machine": machine(),
         "seeds": list(settings.seeds),
@@ -231,21 +231,6 @@ def read_peers(path: Path = _PEERS) -> list[dict[str, Any]]:
     return list(tomllib.loads(path.read_text(encoding="utf-8"))["peer"])
 
 
-def machine() -> dict[str, Any]:
-    """Conditions that times depend on."""
-    model = ""
-    cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.is_file():
-        lines = cpuinfo.read_text(encoding="utf-8", errors="replace").splitlines()
-        model = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), "")
-    return {
-        "cpu": model or platform.processor() or platform.machine(),
-        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
-        "system": platform.platform(),
-        "python": platform.python_version(),
-    }
-
-
 def _between(before: dict[str, float], after: dict[str, float]) -> dict[str, float]:
     """The reference work's times while a run went on: the mean of right before and right after."""
     return {key: (before[key] + after[key]) / 2 for key in before}
@@ -307,18 +292,6 @@ def _record_synthetic(out: Path, settings: BenchSettings, say: Callable[[str], N
         if done.returncode != 0:
             raise EvaluationError(f"the synthetic flight could not be recorded: {done.stderr.strip()[-300:]}")
     return flight
-
-
-def _commit() -> str:
-    """Commit of the source tree, with a mark when it has changes; empty outside one."""
-    here = Path(__file__).resolve().parent
-    try:
-        head = subprocess.run(
-            ["git", "-C", str(here), "describe", "--always", "--dirty"], capture_output=True, text=True, check=False
-        )
-    except OSError:
-        return ""
-    return head.stdout.strip() if head.returncode == 0 else ""
 
 
 def _save(record: dict[str, Any], path: Path) -> None:

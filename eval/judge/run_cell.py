@@ -5,6 +5,7 @@ In a separate process, so that failures are isolated and memory and CPU time are
 
 import json
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ import numpy as np
 
 from edgeslam_torch.config import SlamConfig
 from edgeslam_torch.errors import EdgeSlamError
+from edgeslam_torch.eval.benchmark.machine_speed import orb_pass_ms
 from edgeslam_torch.eval.inputs.dataset import interpolate, open_dataset
 from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, write_tum
 from edgeslam_torch.eval.judge import flights, second_flight, sources
@@ -34,9 +36,13 @@ RUN = "run"
 
 def main(folder: Path) -> int:
     """Leave ``result.json`` in the folder; without one, the last line on stderr says why."""
+    begin_s = time.monotonic()
     spec: dict[str, Any] = json.loads((folder / CELL).read_text(encoding="utf-8"))
     cell = Cell(**spec["cell"])
     config = load_config(replace(SlamConfig(), seed=cell.seed), None, spec["overrides"])
+    begin_cpu_s = time.process_time()
+    before_ms = orb_pass_ms()
+    timing_s = time.process_time() - begin_cpu_s
     try:
         source, truth = _opened(cell, folder, Path(spec["flights"]))
         if spec["max_frames"] is not None:
@@ -48,15 +54,19 @@ def main(folder: Path) -> int:
         else:
             settle_camera(source)
             result = run(source, folder / RUN, config)
+        cpu_ms = 1e3 * (time.process_time() - timing_s) / max(result.summary["frames"], 1)
+        orb_ms = (before_ms + orb_pass_ms()) / 2
         if result.interrupted or result.failure is not None:
             sys.stderr.write(f"{result.failure or 'interrupted'}\n")
             return 1
         figures, notes = score(folder / RUN, truth)
+        figures |= {"cpu_ms": cpu_ms, "orb_ms": orb_ms, "cpu_orb": cpu_ms / orb_ms}
         if cell.variant == SECOND_FLIGHT:
             figures |= second_flight.compared(folder / RUN, truth, folder / second_flight.FIRST, first_truth)
     except EdgeSlamError as error:
         sys.stderr.write(f"{error}\n")
         return 1
+    figures["took_s"] = time.monotonic() - begin_s
     write_text(folder / RESULT, json.dumps({"key": spec["key"], "figures": figures, "notes": notes}, indent=1) + "\n")
     return 0
 

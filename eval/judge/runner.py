@@ -1,6 +1,5 @@
 """Runs cells in separate processes, some at a time; an interrupted judge resumes."""
 
-import hashlib
 import json
 import subprocess
 import time
@@ -11,6 +10,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from edgeslam_torch import __version__
+from edgeslam_torch.eval.benchmark.conditions import code_state
 from edgeslam_torch.eval.judge.cells import Cell
 from edgeslam_torch.files.atomic import write_text
 from edgeslam_torch.files.plain import subfolder
@@ -100,24 +100,6 @@ def _order(row: dict[str, Any]) -> tuple[bool, str, int]:
 def start_cell(folder: Path, log: IO[str]) -> subprocess.Popen[str]:
     """The process that runs a cell's folder."""
     return start_module("edgeslam_torch.eval.judge.run_cell", folder, log)
-
-
-def code_state() -> str:
-    """Commit of the source tree, with a digest of what was changed since; the version outside a checkout."""
-    here = Path(__file__).resolve().parent
-    head = _git(here, "rev-parse", "--short", "HEAD")
-    if not head:
-        return f"version {__version__}"
-    changes = _git(here, "diff", "HEAD") + _git(here, "status", "--porcelain")
-    return f"{head}+{hashlib.sha256(changes.encode()).hexdigest()[:8]}" if changes else head
-
-
-def _git(folder: Path, *arguments: str) -> str:
-    try:
-        done = subprocess.run(["git", "-C", str(folder), *arguments], capture_output=True, text=True, check=False)
-    except OSError:
-        return ""
-    return done.stdout.strip() if done.returncode == 0 else ""
 
 
 def _key(cell: Cell, settings: JudgeSettings, commit: str) -> str:

@@ -85,7 +85,6 @@ def _own_figures(run: RunFolder) -> dict[str, Any]:
         "said": float(any("telemetry" in warning for warning in summary.get("warnings") or ())),
         "map_points": counts.get("edge_points"),
         "anchors": counts.get("anchors"),
-        "cpu_ms": summary.get("cpu_ms_per_frame"),
         "wall_s": summary.get("duration_s"),
         "memory_mb": summary.get("peak_rss_mb"),
     }

@@ -38,6 +38,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", type=Path, required=True, metavar="DIR", help="results; finished cells are not repeated"
     )
+    parser.add_argument(
+        "--release",
+        type=Path,
+        metavar="FILE.json",
+        help="instead run what the documents quote, and write its figures here (docs/results)",
+    )
     parser.add_argument("--flights", type=Path, metavar="DIR", help="cache of simulated flights (default: in --out)")
     parser.add_argument("--bars", type=Path, metavar="FILE", help="limits to check (default: the project's own)")
     parser.add_argument("--against", type=Path, metavar="DIR", help="also compare with another judge's --out")
@@ -47,6 +53,7 @@ def main(args: argparse.Namespace) -> int:
     """Run the missing cells, print and write the table; 1 when a cell has no result."""
     from edgeslam_torch.eval.judge.cells import list_cells
     from edgeslam_torch.eval.judge.compare import RECORD, markdown_against, read_record
+    from edgeslam_torch.eval.judge.release import command_outputs, last_cost, release_cells, release_record
     from edgeslam_torch.eval.judge.runner import JudgeSettings, judge
     from edgeslam_torch.eval.judge.table import markdown
     from edgeslam_torch.eval.judge.thresholds import BARS, read_bars
@@ -59,13 +66,26 @@ def main(args: argparse.Namespace) -> int:
         raise ConfigError(f"--set changes settings; which cells are run is said by --cells {old[0]}")
     if args.jobs < 1 or args.seeds < 1 or args.first_seed < 0:
         raise ConfigError("--jobs and --seeds must be at least 1, --first-seed at least 0")
-    cells = list_cells(data, args.cells, range(args.first_seed, args.first_seed + args.seeds), args.only)
+    if args.release is not None and (args.only or args.set or args.max_frames):
+        raise ConfigError(
+            "--release has cells of its own and default settings: leave --only, --set and --max-frames out"
+        )
+    if args.release is not None:
+        cells = release_cells(data)
+        _say(f"release: {len(cells)} runs{last_cost(args.release)}; call it again to go on where it was interrupted")
+    else:
+        cells = list_cells(data, args.cells, range(args.first_seed, args.first_seed + args.seeds), args.only)
     settings = JudgeSettings(tuple(args.set), args.max_frames, args.jobs, args.timeout, args.flights)
     try:
         record = judge(cells, settings, args.out, _say)
         text = markdown(record, bars)
         if before is not None:
             text += "\n" + markdown_against(before, record)
+        if args.release is not None:
+            assert data is not None
+            outputs = command_outputs(data, args.out, record["commit"], _say)
+            release = release_record(record["rows"], record["commit"], outputs)
+            write_text(args.release, json.dumps(release, indent=1) + "\n")
         write_text(args.out / RECORD, json.dumps(record, indent=1) + "\n")
         write_text(args.out / "judge.md", text)
     except OSError as error:

@@ -1,0 +1,46 @@
+"""Under what conditions figures were made: the machine, and the state of the code."""
+
+import hashlib
+import os
+import platform
+import subprocess
+from pathlib import Path
+from typing import Any
+
+from edgeslam_torch import __version__
+
+_CODE = tuple(f":(top){folder}" for folder in ("edgeslam_torch", "models", "losses", "train", "eval"))
+"""What figures depend on: documents and tests may change without making them old."""
+
+
+def machine() -> dict[str, Any]:
+    """Conditions that times depend on."""
+    model = ""
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.is_file():
+        lines = cpuinfo.read_text(encoding="utf-8", errors="replace").splitlines()
+        model = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), "")
+    return {
+        "cpu": model or platform.processor() or platform.machine(),
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "system": platform.platform(),
+        "python": platform.python_version(),
+    }
+
+
+def code_state() -> str:
+    """Commit that last changed the code, with a digest of what was changed since; the version outside a checkout."""
+    head = _git("log", "-1", "--format=%h", "--", *_CODE)
+    if not head:
+        return f"version {__version__}"
+    changes = _git("diff", "HEAD", "--", *_CODE) + _git("status", "--porcelain", "--", *_CODE)
+    return f"{head}+{hashlib.sha256(changes.encode()).hexdigest()[:8]}" if changes else head
+
+
+def _git(*arguments: str) -> str:
+    command = ["git", "-C", str(Path(__file__).resolve().parent), *arguments]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+    except OSError:
+        return ""
+    return done.stdout.strip() if done.returncode == 0 else ""

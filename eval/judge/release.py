@@ -1,0 +1,155 @@
+"""One release's results as data: which runs its documents quote, and their figures in one record."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from edgeslam_torch import __version__
+from edgeslam_torch.eval.benchmark.conditions import machine
+from edgeslam_torch.eval.errors import EvaluationError
+from edgeslam_torch.eval.judge.cells import Cell, find_recordings, list_cells
+from edgeslam_torch.eval.judge.thresholds import Row
+from edgeslam_torch.files.atomic import write_text
+from edgeslam_torch.files.record_files import read_mapping
+
+RUNS = {
+    "tum_fr1_xyz": 3,
+    "7scenes_redkitchen": 3,
+    "tum_fr1_rpy_depth": 3,
+    "euroc_mh05_a": 3,
+    "fr3_notexture_a": 3,
+    "hololens_a/perturbed": 8,
+    "tartan_hospital/perturbed": 8,
+    "telemetry/rounded/tum_fr1_xyz": 3,
+    "telemetry/rounded/7scenes_redkitchen": 3,
+    "telemetry/rounded/euroc_mh05_a": 3,
+    "telemetry/rounded/tartan_hospital": 3,
+    "flight/room": 3,
+    "flight/corridor": 3,
+    "flight/block": 1,
+}
+"""Cells with their number of seeds; of recordings on which chance decides, starts and calibrations are perturbed."""
+
+COMMANDS = {
+    "demo": "edgeslam demo --out runs/demo",
+    "run": "edgeslam run tum_fr1_xyz --out runs/fr1",
+    "fly": "edgeslam fly goto 3 0 --drone sim://l_corridor:3 --fly",
+    "finetune": "edgeslam finetune 7scenes_redkitchen --steps 40 --out tuned",
+    "export": "edgeslam export tuned/weights.safetensors --out model.onnx --int8 --calibrate tum_fr1_rpy_depth",
+}
+"""Commands whose output the documents show, in this order: later ones use what earlier ones wrote."""
+
+FIGURES = {
+    "frames": 0,
+    "supported_end": 4,
+    "supported_live": 4,
+    "ate_m": 4,
+    "se3_m": 4,
+    "online_m": 4,
+    "path_m": 1,
+    "scale_sim3": 4,
+    "scale": 4,
+    "scale_sigma": 4,
+    "map_points": 0,
+    "map_median_m": 4,
+    "map_within_5cm": 3,
+    "cpu_ms": 1,
+    "orb_ms": 2,
+    "cpu_orb": 2,
+    "memory_mb": 0,
+}
+"""What is kept of a run, with decimals; names as in the judge's record."""
+
+
+def release_cells(data: Path | None) -> list[Cell]:
+    """Every run of a release.
+
+    Raises:
+        EvaluationError: If a recording is missing.
+    """
+    found = list_cells(data, "all", range(max(RUNS.values())), tuple(RUNS))
+    missing = RUNS.keys() - {cell.name for cell in found}
+    if missing:
+        raise EvaluationError(f"a release needs all of its recordings; missing: {', '.join(sorted(missing))}")
+    return [cell for cell in found if cell.seed < RUNS[cell.name]]
+
+
+def last_cost(path: Path) -> str:
+    """What the record that will be replaced took, in words; empty without one."""
+    if not path.is_file():
+        return ""
+    last = read_mapping(path, "JSON", EvaluationError)
+    return f", {last.get('took_minutes')} minutes of one process in {last.get('version')}"
+
+
+def release_record(rows: Sequence[Row], commit: str, outputs: dict[str, list[str]]) -> dict[str, Any]:
+    """Medians and ranges of the release's runs with their conditions.
+
+    Raises:
+        EvaluationError: If a run has no result, or the code is no commit: a release would state what nobody can repeat.
+    """
+    if "+" in commit:
+        raise EvaluationError(f"the code has uncommitted changes ({commit}): a release is of a commit")
+    failed = [f"{row['cell']} seed {row['seed']}: {row['error']}" for row in rows if row["error"]]
+    if failed:
+        raise EvaluationError(f"no release: {len(failed)} runs failed, such as {failed[0]}")
+    cells = {}
+    for name, seeds in RUNS.items():
+        own = [row["figures"] for row in rows if row["cell"] == name and row["seed"] < seeds]
+        if len(own) < seeds:
+            raise EvaluationError(f"no release: {name} has {len(own)} of {seeds} runs")
+        known = {key: [f[key] for f in own if f.get(key) is not None] for key in FIGURES}
+        spread = {k: [_rounded(g(v), k) for g in (np.median, np.min, np.max)] for k, v in known.items() if v}
+        cells[name] = {"seeds": seeds, **spread}
+    everything = [row["figures"] for row in rows]
+    return {
+        "version": __version__,
+        "commit": commit,
+        "date": time.strftime("%Y-%m-%d", time.gmtime()),
+        "machine": machine() | {"orb_ms": _rounded(np.median([f["orb_ms"] for f in everything]), "orb_ms")},
+        "took_minutes": round(sum(f["took_s"] for f in everything) / 60.0),
+        "spread": ["median", "lowest", "highest"],
+        "runs": cells,
+        "outputs": outputs,
+    }
+
+
+def _rounded(value: Any, figure: str) -> float | int:
+    decimals = FIGURES[figure]
+    return round(float(value), decimals) if decimals else round(float(value))
+
+
+def command_outputs(data: Path, out: Path, commit: str, say: Callable[[str], None]) -> dict[str, list[str]]:
+    """Lines that the documents' commands print; what an earlier call with the same code left in ``out`` is taken.
+
+    Raises:
+        EvaluationError: If one fails.
+    """
+    folder = out / "commands"
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, (recording, _) in find_recordings(data).items():
+        if not (folder / name).exists():
+            (folder / name).symlink_to(recording)
+    kept = folder / "outputs.json"
+    found = read_mapping(kept, "JSON", EvaluationError) if kept.is_file() else {}
+    if found.get("key") != [commit, COMMANDS]:
+        found = {"key": [commit, COMMANDS], "lines": {}}
+    for name, command in COMMANDS.items():
+        if name not in found["lines"]:
+            say(f"$ {command}")
+            words = [sys.executable, "-m", "edgeslam_torch.cli", *command.split()[1:]]
+            words += ["--overwrite"] if name in ("finetune", "export") else []  # what another commit left
+            environment = os.environ | {"COLUMNS": "100"}
+            done = subprocess.run(words, cwd=folder, capture_output=True, text=True, env=environment, check=False)
+            if done.returncode != 0:
+                raise EvaluationError(f"{command}: {(done.stderr or done.stdout).strip()[-300:]}")
+            found["lines"][name] = done.stdout.splitlines()
+            write_text(kept, json.dumps(found, indent=1) + "\n")
+    return dict(found["lines"])
