@@ -219,24 +219,3 @@ def test_every_decision_record_is_in_the_index() -> None:
     index = (records / "README.md").read_text(encoding="utf-8")
     missing = [path.name for path in sorted(records.glob("[0-9]*.md")) if f"({path.name})" not in index]
     assert not missing
-
-
-def guides() -> list[Path]:
-    """Everything that is a page, as the repository has it."""
-    return [ROOT / name for name in hooks.FROM_THE_ROOT] + sorted((ROOT / "docs").rglob("*.md"))
-
-
-def test_no_link_between_guides_is_broken() -> None:
-    broken = []
-    for guide in guides():
-        text = re.sub(r"```.*?```", "", guide.read_text(encoding="utf-8"), flags=re.DOTALL)
-        for target in re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", text):
-            if "://" not in target and not target.startswith("mailto:") and not (guide.parent / target).exists():
-                broken.append(f"{guide.relative_to(ROOT)}: {target}")
-    assert broken == []
-
-
-def test_no_guide_installs_the_package_from_an_index() -> None:
-    for path in guides():
-        found = re.findall(r"pip install[^\n]*edgeslam.torch", path.read_text(encoding="utf-8"))
-        assert not found, f"{path}: the package is on no index; pip install ."

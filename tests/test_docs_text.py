@@ -1,0 +1,107 @@
+"""What the documents say of the program: commands, imports, links, and the files that a run writes."""
+
+import ast
+import importlib
+import json
+import re
+import shlex
+import sys
+from pathlib import Path
+
+import pytest
+from fake_slam import FakeSlam
+
+import edgeslam_torch.run
+from edgeslam_torch import cli
+from edgeslam_torch.command_line import full_parser
+from edgeslam_torch.drone.sdk_state import FIELDS
+from edgeslam_torch.geometry.camera import Camera
+from edgeslam_torch.geometry.camera_file import save_camera
+from edgeslam_torch.writers.run_writer import OUTPUTS, PIECE, STATUS_COLUMNS
+
+pytest.importorskip("griffe", reason="the documentation's tools are not installed")
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT / "docs" / "building"))
+from reference import api_pages, commands_page  # noqa: E402  # beside the documents, outside the package
+
+DOCS = [ROOT / f"{name}.md" for name in ("README", "CHANGELOG", "CONTRIBUTING", "SECURITY")]
+DOCS += sorted(path for path in (ROOT / "docs").rglob("*.md") if "building" not in path.parts)
+GUIDES = [path for path in DOCS if path.parent.name in ("start", "guides")]
+GENERATED = {ROOT / "docs" / page for page in ("reference/settings.md", "reference/commands.md", *api_pages())}
+TAKES_WEIGHTS = {"finetune", "distil"}
+"""Commands that refuse weights which are not there; of them the options alone are compared."""
+
+
+def commands() -> list[tuple[str, str]]:
+    """Page and line of each command in an indented block."""
+    return [
+        (page.name, line)
+        for page in GUIDES
+        for line in re.findall(r"^    (?:\$ )?(edgeslam [^\n]+)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    ]
+
+
+def test_every_command_is_one_that_the_program_takes(capsys: pytest.CaptureFixture[str]) -> None:
+    parser, wrong = full_parser(cli.available()), []
+    for page, line in commands():
+        words = [word for word in shlex.split(line, comments=True)[1:] if word != "..."]
+        try:
+            if words[0] in TAKES_WEIGHTS:
+                options = {word for word in words if word.startswith("--")}
+                wrong += [(page, line, "")] if options - option_names(words[0]) else []
+            else:
+                parser.parse_args(words)
+        except SystemExit as end:
+            if end.code:
+                wrong.append((page, line, capsys.readouterr().err.strip()))
+    assert wrong == [] and len(commands()) > 80
+
+
+def option_names(command: str) -> set[str]:
+    return set(re.findall(r"--[a-z][\w-]*", commands_page().split(f"\n## edgeslam {command}\n")[1].split("\n## ")[0]))
+
+
+def imports() -> set[tuple[str, str]]:
+    """Module and name of what Python code in the documents imports from the package."""
+    blocks = [
+        block
+        for page in DOCS
+        for block in re.findall(r"^```python\n(.*?)^```$", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
+    ]
+    nodes = [node for block in blocks for node in ast.walk(ast.parse(block)) if isinstance(node, ast.ImportFrom)]
+    ours = [node for node in nodes if (node.module or "").startswith("edgeslam_torch")]
+    return {(str(node.module), name.name) for node in ours for name in node.names}
+
+
+@pytest.mark.parametrize(("module", "name"), sorted(imports()))
+def test_every_import_exists(module: str, name: str) -> None:
+    assert hasattr(importlib.import_module(module), name)
+
+
+def test_no_link_between_documents_is_broken() -> None:
+    broken = []
+    for page in DOCS:
+        text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+        for target in re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", text):
+            path = (page.parent / target).resolve()
+            if "://" not in target and not target.startswith("mailto:") and not (path.exists() or path in GENERATED):
+                broken.append(f"{page.relative_to(ROOT)}: {target}")
+    assert broken == []
+
+
+def test_the_package_is_installed_from_the_clone() -> None:
+    for page in DOCS:
+        found = re.findall(r"pip install[^\n]*edgeslam.torch", page.read_text(encoding="utf-8"))
+        assert not found, f"{page}: the package is on no index; pip install ."
+
+
+def test_the_page_of_files_names_all_that_a_run_writes(tmp_path, write_tum, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(edgeslam_torch.run, "_edge_slam", lambda camera, config, realtime: FakeSlam())
+    recording = write_tum(tmp_path / "seq", 6)
+    save_camera(recording / "camera.yaml", Camera(64, 48, 50.0, 50.0, 31.5, 23.5))
+    assert cli.main(["run", str(recording), "--out", str(tmp_path / "out"), "--no-report"]) == 0
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text(encoding="utf-8"))
+    page = (ROOT / "docs" / "reference" / "files.md").read_text(encoding="utf-8")
+    words = set(re.findall(r"[\w.]+", page))
+    written = {path.name for path in (tmp_path / "out").iterdir()} | {*OUTPUTS, PIECE.format("N")}
+    assert {*written, *STATUS_COLUMNS, *FIELDS, *summary} - words == set()
