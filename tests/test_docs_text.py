@@ -54,7 +54,7 @@ def test_every_command_is_one_that_the_program_takes(capsys: pytest.CaptureFixtu
         except SystemExit as end:
             if end.code:
                 wrong.append((page, line, capsys.readouterr().err.strip()))
-    assert wrong == [] and len(commands()) > 80
+    assert wrong == [] and len(commands()) > 40
 
 
 def option_names(command: str) -> set[str]:
