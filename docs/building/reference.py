@@ -23,7 +23,7 @@ NAMES = {
         "drone.tello.Tello",
         "drone.address.TelloAddress",
         "flying.navigator.Navigator",
-        "flying.outcome.Outcome",
+        "flying.result.Outcome",
         "navigation.limits.NavLimits",
     ),
     "eval": ("eval.metrics.run_score.evaluate_run", "eval.metrics.run_score.RunScore", "eval.metrics.align.umeyama"),
