@@ -17,7 +17,7 @@ from edgeslam_torch import EdgeSlam, open_source
 from edgeslam_torch.eval.report.keyframe_pictures import draw_edges
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
-from edgeslam_torch.progress import status_words
+from edgeslam_torch.terminal.run_progress import status_words
 from edgeslam_torch.types import FloatArray, PointCloud
 from edgeslam_torch.writers.raster_axes import BACKGROUND, text
 

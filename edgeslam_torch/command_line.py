@@ -11,11 +11,11 @@ from contextlib import contextmanager
 from types import ModuleType
 
 from edgeslam_torch import __version__
-from edgeslam_torch.console import console, exit_code
 from edgeslam_torch.errors import EdgeSlamError
 from edgeslam_torch.files.output_file import add_overwrite, check_outputs
 from edgeslam_torch.help.pages import described, listing
 from edgeslam_torch.help.parser import EXIT_USAGE, Parser
+from edgeslam_torch.terminal.console import console, exit_code
 
 Commands = Mapping[str, tuple[str, str]]
 """Name: (module, one line of help)."""

@@ -141,7 +141,10 @@ class Listener(Protocol):
         """Called after every step, in the loop's thread."""
 
     def on_finish(self, slam: Slam) -> None:
-        """Called once, after the last refinement, before the results are written."""
+        """Called once, after the last refinement, before the results are written.
+
+        A listener that has ``on_last_frame(slam)``, too, is called before the last refinement.
+        """
 
 
 @dataclass(frozen=True, slots=True)
@@ -343,6 +346,9 @@ class _Run:
 
     def _write(self, loop_s: float, cpu_start_s: float) -> None:
         started = time.perf_counter()
+        for listener in self.listeners:
+            if hasattr(listener, "on_last_frame"):
+                listener.on_last_frame(self.slam)
         try:
             self.slam.finish()
         except KeyboardInterrupt:

@@ -121,14 +121,15 @@ def test_default_calibration_is_named_with_its_cost(edgeslam, recording, tmp_pat
     assert "bends the trajectory" in err
 
 
-def test_progress_lines_and_bar(edgeslam, recording, tmp_path, monkeypatch):
-    monkeypatch.setattr("edgeslam_torch.progress.LINE_EVERY_S", 0.0)
-    _, _, err = edgeslam("run", recording, "--out", tmp_path / "o", "--no-report")
-    assert "6/6 frames" in err
-    assert "frames/s" in err
-    _, _, err = edgeslam("run", recording, "--out", tmp_path / "o", "--no-report", "--progress")
-    assert "100%" in err
-    assert "tracked" in err
+@pytest.mark.parametrize("redraw", [[], ["--progress"]])
+def test_progress_tells_loading_frames_and_the_last_refinement(edgeslam, recording, tmp_path, monkeypatch, redraw):
+    monkeypatch.setattr("edgeslam_torch.terminal.progress.LINE_EVERY_S", 0.0)
+    monkeypatch.setattr("edgeslam_torch.terminal.progress.SHOWN_EVERY_S", 0.001)
+    _, _, err = edgeslam("run", recording, "--out", tmp_path / "o", "--no-report", *redraw)
+    assert "opening the source" in err
+    assert "6 of 6 frames" in err
+    assert "last refinement" in err
+    assert ("\r" in err) == bool(redraw)
 
 
 MISTAKES = [

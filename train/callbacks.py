@@ -11,7 +11,8 @@ import numpy as np
 
 from edgeslam_torch.extras import install_command
 from edgeslam_torch.models.record import Metadata
-from edgeslam_torch.train.processes.counting import Count
+from edgeslam_torch.terminal.progress import Progress
+from edgeslam_torch.train.processes.distributed import rank
 from edgeslam_torch.train.recipe import Hooks, TrainConfig, TrainState
 from edgeslam_torch.train.validate import predict_metres
 from edgeslam_torch.train.views.augment import View
@@ -22,25 +23,27 @@ PICTURE_SIZE = (320, 240)
 
 
 class ProgressBar(Hooks):
-    """Step, loss, learning rate, time left: a bar on a terminal, a line every few seconds elsewhere."""
+    """Step, loss, learning rate, time left."""
 
     def __init__(self) -> None:
-        self._count: Count | None = None
+        self._progress: Progress | None = None
 
     def on_start(self, state: TrainState, config: TrainConfig) -> None:
         """Begin where the run stands."""
-        self._count = Count(config.steps, "training", "step", done=state.step)
+        self._progress = Progress("training", config.steps, "step", done=state.step, shown=rank() == 0)
 
     def on_step(self, state: TrainState, losses: dict[str, float]) -> None:
         """Advance."""
-        assert self._count is not None
+        assert self._progress is not None
         rate = state.optimiser.param_groups[-1]["lr"]
-        self._count.advance(f"loss {sum(losses.values()):.4f}, lr {rate:.1e}")
+        words = f"loss {sum(losses.values()):.4f}, lr {rate:.1e}"
+        self._progress.words = lambda: words
+        self._progress.advance()
 
     def close(self) -> None:
         """Leave the terminal's line."""
-        if self._count is not None:
-            self._count.close()
+        if self._progress is not None:
+            self._progress.close()
 
 
 def curves(folder: Path, metadata: Metadata, views: Sequence[View]) -> list[Hooks]:

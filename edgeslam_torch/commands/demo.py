@@ -1,7 +1,6 @@
 """Fly a simulated drone through a simulated house, run the pipeline, and compare with the truth."""
 
 import argparse
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -65,21 +64,22 @@ def main(args: argparse.Namespace) -> int:
     """Run the demo and print the results."""
     from edgeslam_torch.commands.run import check_tracked, resolved_config, write_page
     from edgeslam_torch.demo import record, run_and_judge
-    from edgeslam_torch.progress import make_progress
+    from edgeslam_torch.terminal.run_progress import RunProgress
 
     settings = _settings(args)
     config = resolved_config(args)
     if args.flights is not None:
         return _record_many(args, settings)
-    rendered = _Rendered(settings.frames)
-    recorded = record(args.out / "flight", settings, rendered)
-    rendered.done()
-    if args.record_only:
-        print(f"recording: {recorded.folder} (try: edgeslam run {recorded.folder})")
-        return 0
-    with make_progress(settings.frames, sys.stderr.isatty()) as progress:
+    with RunProgress("preparing the flight") as progress:
+        progress.phase("rendering the flight", settings.frames, "image")
+        recorded = record(args.out / "flight", settings, lambda done: progress.reach(done, settings.frames))
+        if args.record_only:
+            print(f"recording: {recorded.folder} (try: edgeslam run {recorded.folder})")
+            return 0
+        progress.phase("loading the system")
         demo = run_and_judge(args.out, recorded, settings, config, [progress])
-    write_page(demo.run)
+        progress.phase("making the report")
+        write_page(demo.run)
     print(report(demo))
     if demo.run.interrupted:
         return EXIT_INTERRUPTED
@@ -149,23 +149,3 @@ def _settings(args: argparse.Namespace) -> "DemoSettings":
     size = {"width": args.width, "height": args.width * 3 // 4}
     settings = DemoSettings(args.world, seconds, rate_hz, args.seed, args.images, **size)
     return replace(settings, telemetry=None if args.no_telemetry else faults)
-
-
-class _Rendered:
-    """Reports the progress of rendering."""
-
-    def __init__(self, total: int) -> None:
-        self._total = total
-        self._shown = sys.stderr.isatty()
-
-    def __call__(self, done: int) -> None:
-        if self._shown and (done % 10 == 0 or done == self._total):
-            sys.stderr.write(f"\redgeslam: rendering the flight: {done}/{self._total}")
-            if done == self._total:
-                self.done()
-
-    def done(self) -> None:
-        """End the line."""
-        if self._shown:
-            sys.stderr.write("\n")
-            self._shown = False

@@ -56,10 +56,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     """Write ``STEM.npy`` (float32 metres), ``STEM.png`` (16-bit millimetres) and ``STEM_colour.png`` per
     image."""
-    from tqdm import tqdm
-
     from edgeslam_torch.frontend.depth_check import MIN_SHARE
     from edgeslam_torch.frontend.depth_network import open_depth, weights_path
+    from edgeslam_torch.terminal.progress import counted
 
     network = open_depth(weights_path(args.depth), args.backend, args.threads, args.device)
     if not network.is_metric:
@@ -71,7 +70,7 @@ def main(args: argparse.Namespace) -> int:
     stems: set[str] = set()
     try:
         args.out.mkdir(parents=True, exist_ok=True)
-        for frame in tqdm(frames, total=length, unit="image", disable=None):
+        for frame in counted(frames, "depth", "image", length):
             _spare_the_source(args.out, frame.path)
             depth = network(np.asarray(camera.undistort_image(frame.image), np.uint8), camera)
             depth, share = _believable(depth)

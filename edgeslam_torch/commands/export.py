@@ -3,6 +3,7 @@
 import argparse
 import importlib
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
@@ -58,28 +59,33 @@ def main(args: argparse.Namespace) -> int:
         raise ConfigError("--int8 and --fp16 exclude each other")
     if args.int8 and args.calibrate is None:
         raise ConfigError("--int8 needs --calibrate DATA: real frames like those the network will see")
+    from edgeslam_torch.terminal.progress import Progress, counted
+
     network, metadata = load_checkpoint(args.weights)
     height, width = _size(args.size, metadata)
     opset = _opset(min(args.opset, OLD_RUNTIME_OPSET) if args.old_runtime else args.opset)
-    images = _images(args.calibrate, height, width, metadata)
+    images = list(counted(_images(args.calibrate, height, width, metadata), "reading", "image"))
     if args.int8 and len(images) < MIN_CALIBRATION_IMAGES:
         raise ConfigError(f"{args.calibrate}: --int8 needs {MIN_CALIBRATION_IMAGES} images, there are {len(images)}")
     try:
         args.out.parent.mkdir(parents=True, exist_ok=True)
-        with TemporaryDirectory() as folder:
+        with TemporaryDirectory() as folder, Progress("exporting") as progress:
             plain = Path(folder) / "float32.onnx"
             options = ExportOptions(height, width, opset, args.dynamic_size, args.dynamic_batch)
             export_onnx(network, metadata, plain, options)
             models = {"float32": _Model(plain)}
+            progress.phase("comparing with torch")
             _require_parity(models["float32"], deployed(network, metadata), images[:CHECK_IMAGES])
             target = plain
             if args.int8 or args.fp16:
+                progress.phase(f"quantising, calibrated on {len(images)} images" if args.int8 else "storing float16")
                 target = Path(folder) / "target.onnx"
                 if args.int8:
                     quantize_int8(plain, target, images)
                 else:
                     store_float16(plain, target)
                 models["int8" if args.int8 else "float16"] = _Model(target)
+            progress.phase("timing")
             print(_table(models, images[:CHECK_IMAGES]))
             write_atomically(args.out, lambda file: file.write(target.read_bytes()))
     except OSError as error:
@@ -117,21 +123,22 @@ def _opset(wanted: int) -> int:
     return wanted
 
 
-def _images(source: str | None, height: int, width: int, metadata: "Metadata") -> "list[FloatArray]":
+def _images(source: str | None, height: int, width: int, metadata: "Metadata") -> "Iterator[FloatArray]":
     """Preprocessed frames, spread evenly over the source; noise-free ramps when there is none."""
     from edgeslam_torch.frontend.network_input import preprocess
 
     if source is None:
         ramp = np.linspace(0, 255, 640 * 480 * 3).reshape(480, 640, 3).astype(np.uint8)
         flips = (ramp, np.ascontiguousarray(ramp[::-1]), np.ascontiguousarray(ramp[:, ::-1]))
-        return [preprocess(image, height, width, metadata) for image in flips]
+        yield from (preprocess(image, height, width, metadata) for image in flips)
+        return
     from edgeslam_torch.readers.source import open_source
 
     opened = open_source(source)
     step = max((opened.length or CALIBRATION_IMAGES) // CALIBRATION_IMAGES, 1)
     kept = (f for i, f in enumerate(opened.frames()) if i % step == 0)
     undistorted = (np.asarray(opened.camera.undistort_image(f.image), np.uint8) for f in kept)
-    return [preprocess(image, height, width, metadata) for image in undistorted]
+    yield from (preprocess(image, height, width, metadata) for image in undistorted)
 
 
 def _require_parity(model: "_Model", module: "nn.Module", images: "list[FloatArray]") -> None:

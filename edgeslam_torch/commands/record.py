@@ -1,6 +1,7 @@
 """``edgeslam record``: record a flight or a camera into a folder that all other commands read."""
 
 import argparse
+import math
 import threading
 import time
 from collections.abc import Callable
@@ -8,11 +9,14 @@ from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from edgeslam_torch.commands.flying._signals import Signals, say
 
 if TYPE_CHECKING:
     from edgeslam_torch.drone.tello import StateMessage, Tello
     from edgeslam_torch.readers.live import LiveSource
+    from edgeslam_torch.terminal.progress import Progress
     from edgeslam_torch.writers.flight_writer import FlightWriter
 
 
@@ -22,6 +26,8 @@ _SWEEP_M = (
 )  # fmt: skip
 """Moves of ``--fly`` forward, left, up, which come back to where they began."""
 _TURNS_RAD = (0.5, -1.0, 0.5)
+_GAP_S = 0.5
+"""Longest time that one state message's velocity stands for; they come ten times a second."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -45,20 +51,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     """Record until stopped, and print a summary."""
     from edgeslam_torch.errors import ConfigError
+    from edgeslam_torch.terminal.progress import Progress
 
     is_drone = args.source.startswith("tello://")
     if args.fly and not is_drone:
         raise ConfigError(f"{args.source}: --fly is for a drone (tello://HOST)")
     if (args.max_frames is not None and args.max_frames < 1) or (args.duration is not None and args.duration <= 0):
         raise ConfigError("--max-frames and --duration must be positive")
-    with Signals() as signals:
+    with Progress("waits for the drone" if is_drone else "waits for the camera") as progress, Signals() as signals:
         try:
             source, messages, tello = _open(args, is_drone)
         except KeyboardInterrupt:
             say("interrupted; nothing was recorded")
             return signals.exit_code
         try:
-            _record(args, source, messages, tello if args.fly else None, signals)
+            _record(args, source, messages, tello if args.fly else None, signals, progress)
         finally:
             source.close()
     return signals.exit_code
@@ -79,6 +86,7 @@ def _record(
     messages: "list[StateMessage]",
     tello: "Tello | None",
     signals: Signals,
+    progress: "Progress",
 ) -> None:
     """One recording, with a summary after landing.
 
@@ -97,11 +105,15 @@ def _record(
         say(f"recording to {folder}; Ctrl-C ends it")
         # From here on no signal interrupts a flight or its landing; without a flight, a second signal does.
         signals.tell(source.end, patient=tello is not None)
+        status = _Status(source, messages)
+        progress.phase("recording", args.max_frames, "picture")
+        progress.words = status.text
         try:
-            _write_frames(source, writer, messages, tello, args.duration)
+            _write_frames(source, writer, messages, tello, args.duration, progress, status)
         except EdgeSlamError as error:
             failure = error
         finally:
+            status.ends = True
             if tello is not None and tello.airborne:  # in a thread: a stopped terminal must not delay the landing
                 threading.Thread(target=say, args=("landing",), daemon=True).start()
             source.close()  # lands; its state messages are recorded too
@@ -124,16 +136,49 @@ def _write_frames(
     messages: "list[StateMessage]",
     tello: "Tello | None",
     duration_s: float | None,
+    progress: "Progress",
+    status: "_Status",
 ) -> None:
     """Raises `TelloError` when the flight did not go as it should."""
     begin = time.monotonic()
-    check = _start_pilot(tello) if tello is not None else lambda: None
+    check = _start_pilot(tello, status) if tello is not None else lambda: None
     for frame in source.frames():
         writer.add_frame(frame)
+        progress.advance()
         _write_states(writer, messages)
         if duration_s is not None and time.monotonic() - begin > duration_s:
             break
         check()
+
+
+class _Status:
+    """What the pilot does, what a drone says of itself, and how long nothing was seen."""
+
+    def __init__(self, source: "LiveSource", messages: "list[StateMessage]") -> None:
+        self._source, self._messages = source, messages
+        self._read, self._flown_m, self._at_s = 0, 0.0, math.nan
+        self.doing = ""
+        """What the pilot does."""
+        self.ends = False
+
+    def text(self) -> str:
+        """Battery, height and way of the newest state; the way by its velocities, the only ones there are."""
+        from edgeslam_torch.terminal.run_progress import height_text
+
+        parts = [("landing" if self.doing else "ending") if self.ends else self.doing]
+        if not self.ends and self._source.silent_s >= 1.0:
+            parts.append(f"no picture for {self._source.silent_s:.0f} s")
+        sample = None
+        for message in self._messages[self._read :]:
+            sample = message.sample()
+            step_m = float(np.linalg.norm(sample.velocity_m_s)) * min(sample.stamp_s - self._at_s, _GAP_S)
+            self._flown_m += step_m if math.isfinite(step_m) else 0.0
+            self._at_s = sample.stamp_s
+            self._read += 1
+        if self._messages:
+            sample = sample or self._messages[-1].sample()
+            parts += [f"battery {100 * sample.battery:.0f} %", height_text(sample), f"{self._flown_m:.1f} m flown"]
+        return ", ".join(part for part in parts if part)
 
 
 def _write_states(writer: "FlightWriter", messages: "list[StateMessage]") -> None:
@@ -141,7 +186,7 @@ def _write_states(writer: "FlightWriter", messages: "list[StateMessage]") -> Non
         writer.add_state(messages[writer.states])
 
 
-def _start_pilot(tello: "Tello") -> Callable[[], None]:
+def _start_pilot(tello: "Tello", status: "_Status") -> Callable[[], None]:
     """Sweep in a thread of its own until the flight ends; the returned function raises its error, if any.
 
     Sideways and up and down is what shows depth and scale; a hover shows neither.
@@ -156,10 +201,16 @@ def _start_pilot(tello: "Tello") -> Callable[[], None]:
 
     def fly() -> None:
         try:
+            status.doing = "taking off, waits for the drone to hover"
             tello.take_off()
-            moves = [partial(tello.move, *by) for by in _SWEEP_M]
-            turns = [partial(tello.turn, by) for by in _TURNS_RAD]
-            for step in cycle([*moves, *turns]):
+            moves = [
+                (partial(tello.move, *by), "moving {:g} m forward, {:g} left, {:g} up".format(*by)) for by in _SWEEP_M
+            ]
+            turns = [
+                (partial(tello.turn, by), f"turning {math.degrees(by):.0f} degrees to the left") for by in _TURNS_RAD
+            ]
+            for step, words in cycle([*moves, *turns]):
+                status.doing = f"{words}, waits for its answer"
                 try:
                     step()
                 except NoAnswer as error:  # a lost packet; the next step does not depend on it

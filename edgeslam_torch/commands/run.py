@@ -81,7 +81,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--progress",
         action=argparse.BooleanOptionalAction,
-        help="progress bar (default: when the output is a terminal; a line every few seconds otherwise)",
+        help="redraw one line (default: when the output is a terminal; a line every few seconds otherwise)",
     )
     parser.add_argument("--viewer", action="store_true", help="watch it in rerun ([viewer] extra)")
     parser.add_argument(
@@ -111,46 +111,47 @@ def add_device(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     """Run, and print a short summary."""
     from edgeslam_torch.errors import ConfigError
-    from edgeslam_torch.progress import make_progress
     from edgeslam_torch.run import AtlasFiles, Listener, Mode, run, settle_camera
+    from edgeslam_torch.terminal.run_progress import RunProgress
 
     if args.lossless and args.record is None:
         raise ConfigError("--lossless is for --record DIR")
     config = resolved_config(args)
     _check_atlas_can_be_saved(args.save_atlas)
-    earlier = _earlier_flights(args.atlas)
-    source = _source(args)
-    if earlier is None or not _take_its_camera(source, earlier):
-        settle_camera(source)
-    if earlier is not None:
-        _check_fits(earlier, source, config, args.atlas)
-    for warning in source.warnings:
-        _say(f"warning: {warning}")
-    _say(_camera_words(source.camera))
-    mode = Mode(args.mode) if args.mode else (Mode.REALTIME if source.live else Mode.OFFLINE)
-    out = args.out if args.out is not None else _new_folder(Path("runs") / source.name)
-    show_bar = sys.stderr.isatty() if args.progress is None else args.progress
-    listeners: list[Listener] = []
-    files, saved = ExitStack(), None
-    if args.viewer or args.save_rrd is not None:
-        from edgeslam_torch.viewer.live_view import LiveView
+    with ExitStack() as files:
+        progress = files.enter_context(RunProgress("opening the source", args.progress))
+        earlier = _earlier_flights(args.atlas)
+        source = _source(args)
+        if earlier is None or not _take_its_camera(source, earlier):
+            settle_camera(source)
+        if earlier is not None:
+            _check_fits(earlier, source, config, args.atlas)
+        for warning in source.warnings:
+            _say(f"warning: {warning}")
+        _say(_camera_words(source.camera))
+        mode = Mode(args.mode) if args.mode else (Mode.REALTIME if source.live else Mode.OFFLINE)
+        out = args.out if args.out is not None else _new_folder(Path("runs") / source.name)
+        progress.follow(source)
+        listeners: list[Listener] = [progress]
+        saved = None
+        if args.viewer or args.save_rrd is not None:
+            from edgeslam_torch.viewer.live_view import LiveView
 
-        listeners.append(LiveView(source.name, source.camera, args.save_rrd))
-    if args.keep_images:
-        from edgeslam_torch.writers.keyframe_images import KeyframeImages
+            listeners.append(LiveView(source.name, source.camera, args.save_rrd))
+        if args.keep_images:
+            from edgeslam_torch.writers.keyframe_images import KeyframeImages
 
-        listeners.append(KeyframeImages(out))
-    if args.save_mcap is not None:
-        from edgeslam_torch.viewer.mcap_view import McapView
+            listeners.append(KeyframeImages(out))
+        if args.save_mcap is not None:
+            from edgeslam_torch.viewer.mcap_view import McapView
 
-        saved = McapView(source.camera, args.save_mcap)
-        listeners.append(saved)
-        files.callback(saved.close)
-    with files, make_progress(source.length, show_bar) as progress:
-        atlas = AtlasFiles(earlier, args.save_atlas)
-        result = run(source, out, config, mode, [progress, *listeners], atlas=atlas)
-    if not args.no_report and result.failure is None:
-        write_page(result)
+            saved = McapView(source.camera, args.save_mcap)
+            listeners.append(saved)
+            files.callback(saved.close)
+        result = run(source, out, config, mode, listeners, atlas=AtlasFiles(earlier, args.save_atlas))
+        if not args.no_report and result.failure is None:
+            progress.phase("making the report")
+            write_page(result)
     _report(result, source)
     from edgeslam_torch.errors import OutputError
 

@@ -88,17 +88,11 @@ def _download(args: argparse.Namespace) -> None:
 
 
 def _fetch(remote: "Remote", target: Path, sha256: str | None) -> "Fetched":
-    from tqdm import tqdm
-
     from edgeslam_torch.models.download import download
+    from edgeslam_torch.terminal.progress import Progress
 
-    with tqdm(unit="B", unit_scale=True, desc=remote.name, disable=None) as bar:
-
-        def show(have: int, total: int) -> None:
-            bar.total = total or None
-            bar.update(have - bar.n)
-
-        return download(remote.urls, target, sha256, show)
+    with Progress(remote.name, unit="MB") as progress:
+        return download(remote.urls, target, sha256, progress.downloaded)
 
 
 def _converted(_: str, raw: Path, target: Path) -> None:

@@ -8,7 +8,8 @@ from pathlib import Path
 from edgeslam_torch.datasets.catalogue import Collection, Recording, chosen
 from edgeslam_torch.datasets.store import check_space, get, missing, needed_bytes
 from edgeslam_torch.errors import ConfigError
-from edgeslam_torch.files.download import Progress
+from edgeslam_torch.files.download import Progress as DownloadProgress
+from edgeslam_torch.terminal.progress import Progress
 
 
 def recordings_folder(given: Path | None) -> Path:
@@ -55,8 +56,13 @@ def fetch(
     unpacked = gigabytes(needed_bytes(wanted, root))
     say(f"to {root}: {count}, {gigabytes(size)} to download, {unpacked} of disk while unpacking")
     _ask({recording.collection: None for recording in wanted}, agree, say)
-    with _Bars() as bars:
-        get(wanted, root, bars.of, say, archive, keep)
+    with Progress("downloading") as progress:
+
+        def of(name: str) -> DownloadProgress:
+            progress.phase(name, unit="MB")
+            return progress.downloaded
+
+        get(wanted, root, of, say, archive, keep)
     return recordings
 
 
@@ -82,30 +88,3 @@ def _ask(collections: dict[Collection, None], agree: bool, say: Callable[[str], 
 def gigabytes(size: int) -> str:
     """A size in words."""
     return f"{size / 1e9:.2f} GB" if size else "size not known"
-
-
-class _Bars:
-    """A bar for each download."""
-
-    def __init__(self) -> None:
-        self._close: list[Callable[[], None]] = []
-
-    def __enter__(self) -> "_Bars":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for close in self._close:
-            close()
-
-    def of(self, name: str) -> Progress:
-        """The progress of one file."""
-        from tqdm import tqdm
-
-        bar = tqdm(unit="B", unit_scale=True, desc=name, disable=None)
-        self._close.append(bar.close)
-
-        def show(have: int, total: int) -> None:
-            bar.total = total or None
-            bar.update(have - bar.n)
-
-        return show

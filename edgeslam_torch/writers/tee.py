@@ -61,6 +61,11 @@ class RecordedLive(Steps):
         self._thread.start()
         self._closed = False
 
+    @property
+    def silent_s(self) -> float:
+        """Since the last picture."""
+        return self._source.silent_s
+
     def frames(self) -> Iterator[Frame]:
         """Frames of the source; a write error ends the recording, not the flight."""
         try:

@@ -10,7 +10,6 @@ from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
 from edgeslam_torch.files.atomic import write_atomically
 from edgeslam_torch.geometry.camera import Camera
@@ -26,6 +25,7 @@ from edgeslam_torch.synthetic.house.rooms import (
 )
 from edgeslam_torch.synthetic.house.world import World
 from edgeslam_torch.synthetic.sites.build import JUDGED, named_site
+from edgeslam_torch.terminal.progress import counted
 from edgeslam_torch.train.views.rendered import is_worth_learning
 from edgeslam_torch.types import FloatArray
 
@@ -127,7 +127,7 @@ def render_files(folder: Path, places: int, seed: int = 21, processes: int = 1) 
     work = [(folder / f"places_{first:05d}.npz", first, min(first + PLACES_A_FILE, places), seed) for first in firsts]
     work = [item for item in work if not item[0].is_file()]
     with get_context("spawn").Pool(processes) as pool:
-        for _ in tqdm(pool.imap(_render_file, work), total=len(work), desc="rendering places", disable=None):
+        for _ in counted(pool.imap(_render_file, work), "rendering places", "file", len(work)):
             pass
 
 

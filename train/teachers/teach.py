@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from edgeslam_torch.files.atomic import write_atomically
 from edgeslam_torch.files.plain import subfolder
-from edgeslam_torch.train.processes.counting import counted
-from edgeslam_torch.train.processes.distributed import share_of, wait_for_all
+from edgeslam_torch.terminal.progress import counted
+from edgeslam_torch.train.processes.distributed import rank, share_of, wait_for_all
 from edgeslam_torch.train.teachers.densify import densify
 from edgeslam_torch.train.teachers.plane_sweep import sweep_depth
 from edgeslam_torch.train.views.augment import View, fitted_view
@@ -82,12 +82,12 @@ def teach(predict: Predict, sequence: PosedSequence, log_scale: float, folder: P
     count = min(MOST, len(sequence.views))
     chosen = np.unique(np.linspace(0, len(sequence.views) - 1, count).astype(int)).tolist()
     with_partners = [i for i in chosen if sequence.partners[i]]
-    for i in counted(share_of(with_partners), f"{sequence.name}: depth by the run's poses", "image"):
+    for i in counted(share_of(with_partners), f"{sequence.name}: depth by the run's poses", "image", shown=rank() == 0):
         if not (path := folder / f"swept_{i}.npy").is_file():
             _save(path, _sweep(sequence, i))
     wait_for_all()
     swept = {i: _swept(sequence.views[i], np.load(folder / f"swept_{i}.npy")) for i in with_partners}
-    for i in counted(share_of(chosen), f"{sequence.name}: depth elsewhere", "image"):
+    for i in counted(share_of(chosen), f"{sequence.name}: depth elsewhere", "image", shown=rank() == 0):
         if not (path := folder / f"dense_{i}.npy").is_file():
             measured = _confirmed(swept, i) if i in swept else np.zeros((1, 1), np.float32)
             _save(path, _completed(predict, sequence.views[i], measured, log_scale))

@@ -16,7 +16,8 @@ from edgeslam_torch.readers.images import pixels_or_none
 from edgeslam_torch.readers.layouts import read_sequence
 from edgeslam_torch.readers.listing import Problem
 from edgeslam_torch.readers.sequence import DepthMaps
-from edgeslam_torch.train.processes.counting import counted
+from edgeslam_torch.terminal.progress import counted
+from edgeslam_torch.train.processes.distributed import rank
 from edgeslam_torch.train.views.augment import View, fitted_view
 from edgeslam_torch.types import FloatArray
 
@@ -70,7 +71,7 @@ def load_depth_folder(
     pairs = _pairs(np.array([entry.stamp_s for entry in colours]), maps.stamps_s, stride, max_gap_s)
     left_out = [_words(problem) for problem in (*sequence.problems, *maps.problems) if problem.frames]
     views = []
-    for colour, depth in counted(pairs, f"reading {folder.name}", "image"):
+    for colour, depth in counted(pairs, f"reading {folder.name}", "image", shown=rank() == 0):
         view = _read_view(colours[colour].path, maps, depth, camera)
         if isinstance(view, str):
             left_out.append(view)

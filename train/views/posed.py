@@ -18,7 +18,8 @@ from edgeslam_torch.eval.inputs.run_folder import is_supported, read_status
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.readers.source import open_source
-from edgeslam_torch.train.processes.counting import Count
+from edgeslam_torch.terminal.progress import Progress
+from edgeslam_torch.train.processes.distributed import rank
 from edgeslam_torch.train.views.augment import View, fitted_view
 from edgeslam_torch.types import FloatArray
 from edgeslam_torch.writers.ply import read_ply
@@ -117,7 +118,7 @@ def load_run(
     camera = folder / "camera.yaml"
     opened = open_source(recording, camera if camera.is_file() else None, max_frames=max_frames)
     step = max(len(poses) // max_views, 1)
-    count = Count(opened.length or len(poses), f"reading {folder.name}", "image")
+    count = Progress(f"reading {folder.name}", opened.length or len(poses), "image", shown=rank() == 0)
     views = []
     with closing(opened), closing(count):
         for frame in opened.frames():

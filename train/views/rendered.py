@@ -3,12 +3,12 @@
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
 from edgeslam_torch.files.atomic import write_atomically
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.synthetic.house.rooms import random_room
 from edgeslam_torch.synthetic.house.rooms import random_view as view_of_room
+from edgeslam_torch.terminal.progress import counted
 from edgeslam_torch.train.views.augment import View
 from edgeslam_torch.types import FloatArray
 
@@ -25,7 +25,7 @@ def render_rooms(path: Path, rooms: int, views_per_room: int = 6, seed: int = 7)
     """Draw ``rooms * views_per_room`` views and write them to ``path`` (npz); room r depends on (seed, r)
     alone."""
     images, depths, matrices = [], [], []
-    for r in tqdm(range(rooms), desc="rendering rooms", disable=None):
+    for r in counted(range(rooms), "rendering rooms", "room"):
         rng = np.random.default_rng((seed, r))
         world = random_room(rng)
         for _ in range(views_per_room):

@@ -2,7 +2,6 @@
 
 import json
 import logging
-import sys
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -11,9 +10,9 @@ from edgeslam_torch.config import DepthConfig, SlamConfig
 from edgeslam_torch.errors import OutputError
 from edgeslam_torch.files.atomic import write_text
 from edgeslam_torch.files.signature import signature
-from edgeslam_torch.progress import make_progress
 from edgeslam_torch.readers.source import open_source
 from edgeslam_torch.run import run, settle_camera
+from edgeslam_torch.terminal.run_progress import RunProgress
 from edgeslam_torch.train.views.posed import is_run_folder
 
 logger = logging.getLogger(__name__)
@@ -59,7 +58,8 @@ def ensure_run(
     settle_camera(source)
     for warning in source.warnings:
         logger.warning("%s: %s", source.name, warning)
-    with make_progress(source.length, sys.stderr.isatty()) as progress:
+    with RunProgress(f"running {source.name}") as progress:
+        progress.follow(source)
         result = run(source, out, config, listeners=[progress])
     if result.interrupted:
         raise KeyboardInterrupt

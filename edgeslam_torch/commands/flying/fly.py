@@ -2,7 +2,9 @@
 
 import argparse
 import importlib
+import math
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,6 +15,7 @@ if TYPE_CHECKING:
     from edgeslam_torch.flying.navigator import Navigator
     from edgeslam_torch.flying.result import Outcome
     from edgeslam_torch.navigation.limits import NavLimits
+    from edgeslam_torch.terminal.progress import Progress
 
 EXIT_NOT_REACHED = 3
 """The flight ended well, but not where it was to go."""
@@ -77,7 +80,9 @@ def main(args: argparse.Namespace) -> int:
     if args.dry_run:
         say("nothing was sent to the drone")
         return 0
-    with Signals() as signals:
+    from edgeslam_torch.terminal.progress import Progress
+
+    with Progress("loading") as progress, Signals() as signals:
         try:
             signals.tell(lambda: None, patient=True)  # an import that is interrupted raises anything
             for vehicle in ("udp_vehicle", "lockstep_vehicle"):
@@ -85,7 +90,7 @@ def main(args: argparse.Namespace) -> int:
             if signals.number:
                 raise KeyboardInterrupt
             signals.tell(None, patient=False)
-            code = _connect(args, limits, signals)
+            code = _connect(args, limits, signals, progress)
         except KeyboardInterrupt:
             say(f"ended by {signals.name}")
             code = signals.exit_code
@@ -94,7 +99,7 @@ def main(args: argparse.Namespace) -> int:
     return code
 
 
-def _connect(args: argparse.Namespace, limits: "NavLimits", signals: Signals) -> int:
+def _connect(args: argparse.Namespace, limits: "NavLimits", signals: Signals, progress: "Progress") -> int:
     """Open the drone, and fly if told to; however that ends, it lands and the record is closed."""
     from edgeslam_torch.flying.keys import keys
     from edgeslam_torch.flying.navigator import Navigator
@@ -107,6 +112,7 @@ def _connect(args: argparse.Namespace, limits: "NavLimits", signals: Signals) ->
 
             listeners.append(FlightView(args.drone, args.save_rrd))
             open_.callback(listeners[0].close)
+        progress.phase(f"waits for {args.drone}")
         nav = open_.enter_context(Navigator.open(args.drone, args.fly, limits, args.camera, listeners, record))
         open_.callback(signals.tell, lambda: None, patient=True)  # nothing interrupts the landing and what is closed
         charge = nav.vehicle.battery
@@ -127,6 +133,8 @@ def _connect(args: argparse.Namespace, limits: "NavLimits", signals: Signals) ->
             if listens:
                 say("space hovers and lets go again, l or q lands, Ctrl-C lands")
             signals.tell(end, patient=True)
+            progress.phase("")
+            progress.words = partial(_status, nav)
             reached = _fly(args, nav)
     return signals.exit_code or (0 if reached else EXIT_NOT_REACHED)
 
@@ -179,8 +187,6 @@ def _check(args: argparse.Namespace, limits: "NavLimits") -> None:
 
 def _plan(args: argparse.Namespace, limits: "NavLimits") -> list[str]:
     """What would be flown, in words."""
-    import math
-
     what = "return above the take-off"
     if args.verb == "goto":
         away = math.hypot(args.x, args.y)
@@ -215,6 +221,28 @@ def _fly(args: argparse.Namespace, nav: "Navigator") -> bool:
     if nav.vehicle.flying:
         _told("landing", nav.land())
     return outcome.reached
+
+
+def _status(nav: "Navigator") -> str:
+    """Phase and reason, battery, height, pose and way, as far as they are known."""
+    import numpy as np
+
+    from edgeslam_torch.terminal.run_progress import position_text
+
+    charge, sight, order = nav.craft.battery, nav.cockpit.sight, nav.cockpit.last
+    phase, parts = "taking off", [f"battery {100 * charge:.0f} %"] if charge == charge else []
+    if sight is None:
+        phase = "taking off, waits for the drone to hover"
+    elif order is not None:
+        phase = "landing" if order.land or not nav.craft.flying else str(nav.cockpit.pilot.phase)
+        track = nav.cockpit.track()
+        height = f"height {sight.told_height_m:.2f} m" if math.isfinite(sight.told_height_m) else ""
+        unit = "m" if sight.metric else "units, the map has no metres yet"
+        flown = float(np.linalg.norm(np.diff(track, axis=0), axis=1).sum())
+        place = f"{position_text(sight.p_w)} +- {sight.home_sigma_m:.2g} {unit}"
+        lost = "" if sight.tracked else "pose by telemetry alone"
+        parts = ["" if order.wish.why == phase else order.wish.why, *parts, height, place, lost, f"{flown:.1f} m flown"]
+    return ", ".join(part for part in (phase, *parts) if part)
 
 
 def _verb(args: argparse.Namespace, nav: "Navigator") -> "Outcome":

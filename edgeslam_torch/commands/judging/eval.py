@@ -73,13 +73,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     """Print the tables; 0 when every run could be judged."""
     from edgeslam_torch.eval.metrics.run_score import evaluate_run
+    from edgeslam_torch.terminal.progress import counted
 
     if args.depth_maps:
         return _depth_maps(args)
     scores: list[RunScore] = []
     judged: list[tuple[Path, Path]] = []
     failures: list[str] = []
-    for run in args.runs:
+    for run in counted(args.runs, "judging trajectories and maps", "run"):
         try:
             truth = groundtruth_of(run, args.groundtruth)
             scores.append(evaluate_run(run, truth, args.depth_gt, args.max_dt, args.offset))

@@ -8,6 +8,8 @@ letter must not end a run whose results go to a folder.
 import errno
 import os
 import sys
+import threading
+import unicodedata
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import Any, TextIO
@@ -19,24 +21,69 @@ _CONTROL = {
     if chr(code) not in "\r\n\t"
 }
 """C0 and C1 controls, and marks that turn the direction of writing."""
-_OF_PROGRESS_BARS = ("\x1b[A", "\x1b[K")
-"""One line up, clear the line: tqdm sends them alone."""
+_COLUMNS = 80
+"""Width of a terminal that does not know its own, or says 0."""
+_MOMENT_S = 0.5
+"""Longest wait for another thread's line: a terminal may be stopped (Ctrl-S), and a drone must land nevertheless."""
 
 
 class Console:
-    """A text stream that drops what cannot be printed, and remembers why."""
+    """A text stream that drops what cannot be printed, and remembers why; its last line may be a status."""
 
-    def __init__(self, stream: TextIO | None) -> None:
-        """``stream``: None when the descriptor was closed before the program began (``2>&-``)."""
+    def __init__(self, stream: TextIO | None, below: "Console | None" = None) -> None:
+        """``stream`` is None when the descriptor was closed before the program began (``2>&-``); ``below`` is the
+        stream whose status stands below what this one prints, itself by default."""
         self._stream = stream
         self.error: OSError | None = None
         """Why nothing more is printed."""
+        self._below = below or self
+        self._lock = threading.RLock()
+        self._status = ""
+        """What `show` has put on the terminal's last line."""
+        self._line_ended = True
 
     def write(self, text: str) -> int:
-        """Print without control characters."""
+        """Print without control characters, above the status."""
+        below = self._below
+        with below._alone():
+            if text and self.isatty():
+                below._replace_status("")
+                below._line_ended = text.endswith("\n")
+            self._print(text)
+        return len(text)
+
+    def show(self, status: str) -> None:
+        """Replace the status on the terminal's last line; an empty one takes it away."""
+        with self._alone():
+            if self._line_ended:
+                self._replace_status(_cut(status.translate(_CONTROL).replace("\n", " "), self._columns() - 1))
+                self.flush()
+
+    def _replace_status(self, status: str) -> None:
+        if status or self._status:
+            blanks = " " * max(0, _width(self._status) - _width(status))
+            self._print(f"\r{status}{blanks}" + ("" if status else "\r"))
+        self._status = status
+
+    @contextmanager
+    def _alone(self) -> Iterator[None]:
+        got = self._lock.acquire(timeout=_MOMENT_S)
+        try:
+            yield
+        finally:
+            if got:
+                self._lock.release()
+
+    def _columns(self) -> int:
+        try:
+            return os.get_terminal_size(self.fileno()).columns or _COLUMNS
+        except (OSError, ValueError, AttributeError):
+            return _COLUMNS
+
+    def _print(self, text: str) -> None:
         stream = self._stream
         if stream is not None and self.error is None:
-            shown = text if text in _OF_PROGRESS_BARS else text.translate(_CONTROL)
+            shown = text.translate(_CONTROL)
             try:
                 try:
                     stream.write(shown)
@@ -44,7 +91,6 @@ class Console:
                     stream.write(shown.encode(stream.encoding, "replace").decode(stream.encoding))
             except OSError as error:
                 self._give_up(error)
-        return len(text)
 
     def flush(self) -> None:
         """Print what waits."""
@@ -70,11 +116,23 @@ class Console:
         return getattr(self._stream, name)
 
 
+def _width(text: str) -> int:
+    """Columns that it takes on a terminal."""
+    return sum(2 if unicodedata.east_asian_width(c) in "FW" else 1 for c in text)
+
+
+def _cut(text: str, columns: int) -> str:
+    while _width(text) > columns:
+        text = text[:-1]
+    return text
+
+
 @contextmanager
 def console() -> Iterator[tuple[Console, Console]]:
     """Standard output and error as `Console` while a command runs."""
     before = sys.stdout, sys.stderr
-    out, err = Console(before[0]), Console(before[1])
+    err = Console(before[1])
+    out = Console(before[0], err)
     sys.stdout, sys.stderr = out, err
     try:
         yield out, err

@@ -1,0 +1,155 @@
+"""Progress of long work: on a terminal, in a log file, in a group of processes, and what stands beside it."""
+
+import errno
+import fcntl
+import io
+import os
+import pty
+import re
+import struct
+import termios
+
+import numpy as np
+import pytest
+from fake_slam import FakeSlam
+
+from edgeslam_torch.terminal import progress as module
+from edgeslam_torch.terminal.console import Console
+from edgeslam_torch.terminal.progress import Progress, counted
+from edgeslam_torch.terminal.run_progress import RunProgress
+from edgeslam_torch.types import Frame
+
+
+@pytest.fixture(autouse=True)
+def unhurried(monkeypatch):
+    """Tests show it themselves."""
+    monkeypatch.setattr(module, "SHOWN_EVERY_S", 1e6)
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def lines(total: int, done: int, every_s: float) -> list[str]:
+    clock, stream = Clock(), io.StringIO()
+    with Progress("training", total, "step", done, stream=stream, clock=clock) as progress:
+        for k in range(done, total):
+            clock.now += every_s
+            progress.words = f"loss {k}".__str__
+            progress.advance()
+            progress.show()
+    return stream.getvalue().splitlines()
+
+
+def test_a_line_every_five_seconds_where_there_is_no_terminal() -> None:
+    shown = lines(40, 0, 1.0)
+    assert len(shown) == 8
+    assert shown[0] == "edgeslam: training, 5 of 40 steps, 1.0 steps/s, 35 s left, loss 4"
+
+
+def test_what_was_done_before_is_no_part_of_the_rate() -> None:
+    assert re.search(r"91 of 100 steps, 0\.2 steps/s, 45 s left", lines(100, 90, 5.0)[0])
+
+
+def test_slow_work_is_not_repeated_word_for_word() -> None:
+    clock, stream = Clock(), io.StringIO()
+    with Progress("last refinement", stream=stream, clock=clock) as progress:
+        for _ in range(10):
+            clock.now += 60.0
+            progress.show()
+    assert stream.getvalue() == "edgeslam: last refinement\n"
+
+
+@pytest.mark.parametrize("columns", [0, 30, 200])
+def test_a_terminal_of_any_width_gets_one_line_that_fits(columns: int) -> None:
+    master, slave = pty.openpty()
+    fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", 24, columns, 0, 0))
+    with os.fdopen(slave, "w", encoding="utf-8") as terminal, Progress("深度 " * 30, stream=terminal) as progress:
+        progress.show()
+        shown = os.read(master, 10000).decode()
+    os.close(master)
+    assert shown.startswith("\redgeslam: 深度")
+    assert "\n" not in shown
+    assert sum(2 if c in "深度" else 1 for c in shown[1:]) < (columns or 80)
+
+
+def test_messages_take_the_line_away_and_do_not_mix_with_it() -> None:
+    stream = io.StringIO()
+    console = Console(stream)
+    stream.isatty = lambda: True
+    with Progress("flying", stream=console) as progress:
+        progress.show()
+        console.write("edgeslam: warning: w")
+        progress.show()  # not into a line that is being written
+        console.write("\n")
+        progress.show()
+    screen = render(stream.getvalue())
+    assert screen == ["edgeslam: warning: w", ""]
+    assert stream.getvalue().count("flying") == 2
+
+
+def render(text: str) -> list[str]:
+    """What a terminal would show."""
+    rows = []
+    for row in text.split("\n"):
+        cells: list[str] = []
+        for part in row.split("\r"):
+            cells[: len(part)] = part
+        rows.append("".join(cells).rstrip())
+    return rows
+
+
+def test_work_within_work_is_shown_alone() -> None:
+    stream = io.StringIO()
+    with Progress("outer", redraw=True, stream=stream) as outer:
+        with Progress("inner", redraw=True, stream=stream) as inner:
+            outer.show()
+            inner.show()
+        assert "outer" not in stream.getvalue() and "inner" in stream.getvalue()
+        outer.show()
+        assert "outer" in stream.getvalue()
+
+
+def test_other_processes_of_a_group_are_silent() -> None:
+    stream = io.StringIO()
+    with Progress("training", redraw=True, shown=False, stream=stream) as progress:
+        progress.show()
+    assert stream.getvalue() == ""
+
+
+def test_a_closed_terminal_does_not_end_the_work() -> None:
+    stream = io.StringIO()
+    stream.write = lambda text: (_ for _ in ()).throw(OSError(errno.EIO, "gone"))
+    with Progress("work", redraw=True, stream=stream) as progress:
+        progress.show()
+
+
+def test_counted_gives_the_items() -> None:
+    assert list(counted(["a", "b"], "reading", "image")) == ["a", "b"]
+
+
+def test_downloads_are_told_in_megabytes() -> None:
+    clock = Clock()
+    with Progress("file", unit="MB", stream=io.StringIO(), clock=clock) as progress:
+        clock.now += 2.0
+        progress.downloaded(3_000_000, 12_000_000)
+        assert progress.text() == "file, 3.0 of 12.0 MB, 1.5 MB/s, 6 s left"
+        progress.downloaded(3_000_000, 0)
+        assert progress.text() == "file, 3.0 MB, 1.5 MB/s"
+
+
+def test_a_run_tells_frames_pose_way_and_the_last_refinement() -> None:
+    slam, image = FakeSlam(), np.full((4, 4), 9, np.uint8)
+    with RunProgress("opening") as progress:
+        for i in range(3):
+            frame = Frame(i, i / 30, image)
+            progress.on_frame(frame, slam.step(frame), slam)
+        said = progress.text()
+        assert said.startswith("3 frames")
+        assert "tracked, 80 inliers" in said and "at (" in said and "travelled" in said
+        progress.on_last_frame(slam)
+        assert progress.text() == "last refinement"
