@@ -134,7 +134,7 @@ def _connect(args: argparse.Namespace, limits: "NavLimits", signals: Signals, pr
                 say("space hovers and lets go again, l or q lands, Ctrl-C lands")
             signals.tell(end, patient=True)
             progress.phase("")
-            progress.words = partial(_status, nav)
+            progress.words = partial(_status_text, nav)
             reached = _fly(args, nav)
     return signals.exit_code or (0 if reached else EXIT_NOT_REACHED)
 
@@ -223,19 +223,20 @@ def _fly(args: argparse.Namespace, nav: "Navigator") -> bool:
     return outcome.reached
 
 
-def _status(nav: "Navigator") -> str:
+def _status_text(nav: "Navigator") -> str:
     """Phase and reason, battery, height, pose and way, as far as they are known."""
     import numpy as np
 
     from edgeslam_torch.terminal.run_progress import position_text
 
-    charge, sight, order = nav.craft.battery, nav.cockpit.sight, nav.cockpit.last
+    controller = nav.flight_controller
+    charge, sight, order = nav.vehicle.battery, controller.sight, controller.last
     phase, parts = "taking off", [f"battery {100 * charge:.0f} %"] if charge == charge else []
     if sight is None:
         phase = "taking off, waits for the drone to hover"
     elif order is not None:
-        phase = "landing" if order.land or not nav.craft.flying else str(nav.cockpit.pilot.phase)
-        track = nav.cockpit.track()
+        phase = "landing" if order.land or not nav.vehicle.flying else str(controller.pilot.phase)
+        track = controller.track()
         height = f"height {sight.told_height_m:.2f} m" if math.isfinite(sight.told_height_m) else ""
         unit = "m" if sight.metric else "units, the map has no metres yet"
         flown = float(np.linalg.norm(np.diff(track, axis=0), axis=1).sum())
