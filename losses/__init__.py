@@ -1,7 +1,7 @@
 """Losses shared by Levenberg-Marquardt refinement and depth training.
 
-Each takes tensors of one device and returns one value an item: ``(B,)`` for a batch ``(B, ...)``. What all promise is
-written in `edgeslam_torch.losses.base`; docs/guides/your-own-loop.md has them in a loop of one's own.
+Each takes tensors of one device and returns one value per item: ``(B,)`` for a batch ``(B, ...)``. What all of them
+guarantee is in `edgeslam_torch.losses.base`; docs/guides/your-own-loop.md shows them in a training loop.
 """
 
 if __name__ == "losses":

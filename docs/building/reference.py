@@ -27,7 +27,7 @@ NAMES = {
         "navigation.limits.NavLimits",
     ),
     "eval": ("eval.metrics.run_score.evaluate_run", "eval.metrics.run_score.RunScore", "eval.metrics.align.umeyama"),
-    "sources": (
+    "networks": (
         "types.FrameStatus",
         "frontend.depth_network.open_depth",
         "demo.flight.DemoSettings",
@@ -35,6 +35,7 @@ NAMES = {
     ),
 }
 """Page: names of other modules that guides and examples use."""
+TITLES = {"drone": "Drone and flight", "eval": "Evaluation", "networks": "Depth networks and simulation"}
 
 UNITS = {
     "m_s_sqrt_s": "m/s/√s",
@@ -132,7 +133,7 @@ def _is_shown(action: argparse.Action) -> bool:
 
 def _option(parser: argparse.ArgumentParser, action: argparse.Action) -> str:
     formatter = parser._get_formatter()
-    names = formatter._format_action_invocation(action).replace("|", "\\|")
+    names = formatter._format_action_invocation(action)
     text = " ".join(formatter._expand_help(action).split()) if action.help else ""
     return f"| `{names}` | {_plain(text)} |"
 
@@ -152,10 +153,11 @@ def api_pages() -> dict[str, str]:
         paths = [member.target_path if member.is_alias else member.path for member in exported]
         found[page] = _api_page(name, module.docstring.value if module.docstring else "", paths)
     for page, names in NAMES.items():
-        found[page] = _api_page(page, "", [f"edgeslam_torch.{name}" for name in names])
+        found[page] = _api_page(TITLES[page], "", [f"edgeslam_torch.{name}" for name in names], full_path=True)
     return {f"reference/api/{page}.md": text for page, text in found.items()}
 
 
-def _api_page(title: str, text: str, paths: list[str]) -> str:
-    blocks = [f"::: {path}\n    options:\n      heading_level: 2\n      show_root_full_path: false" for path in paths]
+def _api_page(title: str, text: str, paths: list[str], full_path: bool = False) -> str:
+    options = f"    options:\n      heading_level: 2\n      show_root_full_path: {str(full_path).lower()}"
+    blocks = [f"::: {path}\n{options}" for path in paths]
     return "\n\n".join([f"# {title}", text, *blocks]) + "\n"
