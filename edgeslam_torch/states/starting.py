@@ -27,10 +27,9 @@ from edgeslam_torch.types import FloatArray, Frame, FrameStatus
 
 ADOPT_SHARE = 0.6
 """Share of the maximum number of inliers below which the view has changed, and the depth network's map is adopted,
-since parallax may never come (rotation, climb, hover); two views are no longer asked then, as they rest on the few
-points that are left. At 0.4 two views come first on redkitchen and its map is
-better (median 3.7 against 4.2 cm); on bare boards they come first in some seeds, and are wrong (ATE .011 to .030 m;
-.0105 in all five seeds at 0.6)."""
+since parallax may never come (rotation, climb, hover); two views are not tried any more then, as they rest on the few
+points that are left. A lower share lets two views come first more often, which is better where corners are many and
+wrong on bare boards, where a few random samples decide."""
 
 MIN_INLIERS = 15
 """Minimum number of inliers; fewer could agree with a wrong pose."""
