@@ -86,8 +86,8 @@ class Displacements:
     def joined(self) -> "Displacements":
         """Two neighbours made one once there are many.
 
-        Over half a second a map's own errors are a tenth of the displacement and more, and noise in the regressor biases
-        the scale towards zero; over a second they have hardly grown, and the displacement has doubled.
+        Over half a second a map's own errors are a tenth of the displacement and more, and noise in the regressor
+        biases the scale towards zero; over a second they have hardly grown, and the displacement has doubled.
         """
         if len(self) < _MANY_DISPLACEMENTS:
             return self
