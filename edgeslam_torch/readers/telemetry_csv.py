@@ -19,7 +19,8 @@ from edgeslam_torch.errors import EdgeSlamError
 from edgeslam_torch.files import tables
 from edgeslam_torch.files.appender import Appender
 from edgeslam_torch.files.time_units import NAMES, UNKNOWN, seconds_of
-from edgeslam_torch.readers.logs.columns import QUANTITIES, UNITS, column_of, unit_factor
+from edgeslam_torch.files.units import known_units
+from edgeslam_torch.readers.logs.columns import QUANTITIES, column_of, unit_factor
 from edgeslam_torch.readers.logs.foreign import foreign_log
 from edgeslam_torch.readers.velocity_frame import body_frame_evidence
 from edgeslam_torch.types import FloatArray, TelemetrySample
@@ -161,8 +162,8 @@ def read_table(path: Path) -> TelemetryTable:
         known = None if name == clock else column_of(text.header[i])
         if known is not None:
             if math.isnan(known[1]):
-                units = ", ".join(dict.fromkeys(UNITS[QUANTITIES[known[0]]]))
-                raise TelemetryError(f"{path}: the unit of column {text.header[i]!r} is not known: {units} are")
+                units = known_units(QUANTITIES[known[0]][0])
+                raise TelemetryError(f"{path}: the unit of column {text.header[i]!r} is not known: {units}")
             columns.setdefault(known[0], _Column(i, *known))
     if clock is None or not columns:
         missing = f"no clock ({', '.join(_STAMPS)})" if clock is None else f"no known column ({', '.join(FIELDS)})"

@@ -1,23 +1,14 @@
 """Which column of a table of poses is what: by the names in its header, else by their number."""
 
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 from edgeslam_torch.eval.errors import EvaluationError
+from edgeslam_torch.files.units import UNITS, known_units, si_per_unit, split_unit
 
-_SECONDS = {
-    1.0: ("s", "sec", "secs", "second", "seconds"),
-    1e-3: ("ms", "msec", "msecs", "millisecond", "milliseconds"),
-    1e-6: ("us", "usec", "usecs", "microsecond", "microseconds", "µs"),
-    1e-9: ("ns", "nsec", "nsecs", "nanosec", "nanosecs", "nanosecond", "nanoseconds"),
-}
-_METRES = {1.0: ("m", "meter", "meters", "metre", "metres"), 1e-2: ("cm",), 1e-3: ("mm",), 0.3048: ("ft", "feet")}
-_TIME_UNITS = {name: factor for factor, names in _SECONDS.items() for name in names}
-_LENGTH_UNITS = {name: factor for factor, names in _METRES.items() for name in names}
-
-_UNIT = re.compile(r"\s*[\[(]([^\])]*)[\])]\s*$")
-_TIME = re.compile(rf"(?:.*header)?(?:(?:timestamp|time|stamp|t)s?|(?=...))(?P<unit>{'|'.join(_TIME_UNITS)})?")
+_TIME = re.compile(rf"(?:.*header)?(?:(?:timestamp|time|stamp|t)s?|(?=...))(?P<unit>{'|'.join(UNITS['time'])})?")
 _OWNER = r"(?:.*pose|.*transform)?"
 _POSITION = re.compile(
     rf"{_OWNER}(?:p|t|pos|position|trans|translation|location)?(?:rsr)?(?P<axis>[xyz])(?P<unit>m|cm|mm)?"
@@ -59,10 +50,10 @@ def columns_by_name(names: Sequence[str]) -> Columns | None:
     for index, name in enumerate(names):
         base, unit = _split_unit(name)
         if found := _TIME.fullmatch(base):
-            time[base] = (index, _seconds(unit or found["unit"] or "", name))
+            time[base] = (index, _in_si("time", unit or found["unit"] or "", name))
         elif found := _POSITION.fullmatch(base):
             axes.setdefault(found["axis"], []).append(index)
-            metres.add(_in_metres(unit or found["unit"] or "", name))
+            metres.add(_in_si("length", unit or found["unit"] or "", name) or 1.0)
         elif found := _QUATERNION.fullmatch(base):
             axes.setdefault("q" + found["axis"], []).append(index)
     if not axes:
@@ -106,19 +97,15 @@ def _one_time(found: dict[str, tuple[int, float | None]]) -> tuple[tuple[int, fl
 
 def _split_unit(name: str) -> tuple[str, str]:
     """A name reduced to letters and digits, and the unit in brackets after it."""
-    found = _UNIT.search(name)
-    unit = found[1].strip().lower() if found else ""
-    base = name[: found.start()] if found else name
+    base, unit = split_unit(name)
     return re.sub(r"[^a-z0-9]", "", base.lower()), unit
 
 
-def _seconds(unit: str, name: str) -> float | None:
-    if unit and unit not in _TIME_UNITS:
-        raise EvaluationError(f"the unit of {name!r} is not known: s, ms, us or ns")
-    return _TIME_UNITS.get(unit)
-
-
-def _in_metres(unit: str, name: str) -> float:
-    if unit and unit not in _LENGTH_UNITS:
-        raise EvaluationError(f"the unit of {name!r} is not known: m, cm, mm or ft")
-    return _LENGTH_UNITS.get(unit, 1.0)
+def _in_si(quantity: str, unit: str, name: str) -> float | None:
+    """SI units per unit; None where the header states none."""
+    if not unit:
+        return None
+    factor = si_per_unit(quantity, unit)
+    if math.isnan(factor):
+        raise EvaluationError(f"the unit of {name!r} is not known: {known_units(quantity)}")
+    return factor

@@ -3,7 +3,8 @@
 import math
 import re
 
-from edgeslam_torch.drone.sdk_state import FIELDS, GRAVITY_M_S2
+from edgeslam_torch.drone.sdk_state import FIELDS
+from edgeslam_torch.files.units import si_per_unit, split_unit
 
 _ALIASES = {
     "vx": "vgx",
@@ -22,71 +23,17 @@ _ALIASES = {
     "tof_distance": "tof",
     "distance_tof": "tof",
 }
+_SPEED, _ANGLE, _LENGTH = ("speed", 0.1), ("angle", math.pi / 180), ("length", 0.01)
+_ACCELERATION = ("acceleration", si_per_unit("acceleration", "mg"))
 QUANTITIES = {
-    "vgx": "speed",
-    "vgy": "speed",
-    "vgz": "speed",
-    "pitch": "angle",
-    "roll": "angle",
-    "yaw": "angle",
-    "tof": "length",
-    "h": "length",
-    "baro": "altitude",
-    "bat": "charge",
-    "agx": "acceleration",
-    "agy": "acceleration",
-    "agz": "acceleration",
+    **dict.fromkeys(("vgx", "vgy", "vgz"), _SPEED),
+    **dict.fromkeys(("pitch", "roll", "yaw"), _ANGLE),
+    **dict.fromkeys(("tof", "h"), _LENGTH),
+    "baro": ("length", 1.0),
+    "bat": ("share", 0.01),
+    **dict.fromkeys(("agx", "agy", "agz"), _ACCELERATION),
 }
-"""What each field of the SDK is."""
-_LENGTHS_M = {
-    "cm": 0.01,
-    "dm": 0.1,
-    "m": 1.0,
-    "mm": 1e-3,
-    "ft": 0.3048,
-    "feet": 0.3048,
-    "in": 0.0254,
-    "metres": 1.0,
-    "meters": 1.0,
-}
-_SPEEDS_M_S = {
-    **{f"{length}/s": metres for length, metres in _LENGTHS_M.items()},
-    "mps": 1.0,
-    "km/h": 1 / 3.6,
-    "kmh": 1 / 3.6,
-    "kph": 1 / 3.6,
-    "mph": 0.44704,
-    "fps": 0.3048,
-    "kn": 1852 / 3600,
-    "kt": 1852 / 3600,
-    "knots": 1852 / 3600,
-}
-_DEGREE = math.pi / 180
-UNITS = {
-    "speed": {unit: metres / 0.1 for unit, metres in _SPEEDS_M_S.items()},
-    "angle": {
-        "deg": 1.0,
-        "degree": 1.0,
-        "degrees": 1.0,
-        "\N{DEGREE SIGN}": 1.0,
-        "rad": 1 / _DEGREE,
-        "radian": 1 / _DEGREE,
-        "radians": 1 / _DEGREE,
-        "mrad": 1e-3 / _DEGREE,
-    },
-    "length": {unit: metres / 0.01 for unit, metres in _LENGTHS_M.items()},
-    "altitude": _LENGTHS_M,
-    "charge": {"%": 1.0, "pct": 1.0, "percent": 1.0},
-    "acceleration": {
-        "mg": 1.0,
-        "g": 1e3,
-        "m/s2": 1e3 / GRAVITY_M_S2,
-        "m/s^2": 1e3 / GRAVITY_M_S2,
-        "m/s\N{SUPERSCRIPT TWO}": 1e3 / GRAVITY_M_S2,
-        "cm/s2": 10.0 / GRAVITY_M_S2,
-    },
-}
-"""Units by quantity: the SDK's units (dm/s, degrees, cm, metres, percent, thousandths of g) per unit."""
+"""What each field of the SDK is, and its unit there in SI: dm/s, degrees, cm, metres, percent, thousandths of g."""
 
 
 def column_of(header: str) -> tuple[str, float, bool] | None:
@@ -100,9 +47,7 @@ def column_of(header: str) -> tuple[str, float, bool] | None:
         >>> column_of("Tof (m)"), column_of("yaw_deg"), column_of("height")
         (('tof', 100.0, True), ('yaw', 1.0, True), ('h', 1.0, False))
     """
-    text = header.strip(" \"'").lower()
-    bracket = re.fullmatch(r"(.*?)[\s_]*[(\[]\s*(.*?)\s*[)\]]", text)
-    name, unit = (bracket[1], bracket[2]) if bracket else (text, "")
+    name, unit = split_unit(header.strip(" \"'").lower())
     field = _field(name)
     if field is not None:
         return field, unit_factor(field, unit) if unit else 1.0, bool(unit)
@@ -117,7 +62,8 @@ def column_of(header: str) -> tuple[str, float, bool] | None:
 
 def unit_factor(field: str, unit: str) -> float:
     """SDK units of a field per unit; NaN where that is none of it."""
-    return UNITS[QUANTITIES[field]].get(unit.strip(" .").lower().replace(" ", "").replace("_", "/"), math.nan)
+    quantity, sdk_unit = QUANTITIES[field]
+    return si_per_unit(quantity, unit) / sdk_unit
 
 
 def _field(name: str) -> str | None:
