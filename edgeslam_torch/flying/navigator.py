@@ -259,8 +259,8 @@ class Navigator:
         if not self.vehicle.flying:
             raise FlightRefused(f"it does not fly{f': {self.vehicle.over}' if self.vehicle.over else ''}")
         path_m, clearance_m = self.flight_controller.flown()
-        self.vehicle.land("as told")
-        return Outcome(self.vehicle.over == "as told", f"landed: {self.vehicle.over}", clearance_m, path_m)
+        self.vehicle.land("as commanded")
+        return Outcome(self.vehicle.over == "as commanded", f"landed: {self.vehicle.over}", clearance_m, path_m)
 
     def _fly_to(self, goal_w: FloatArray, done: str) -> Outcome:
         """Fly to a checked point ``(3,)``; the outcome says how near it came where that is not at once clear."""
