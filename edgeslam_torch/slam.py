@@ -481,7 +481,7 @@ class EdgeSlam:
             depth,
             self._warning_of_pieces(),
             apart,
-            self._repeats.warning(self._system.fusion._track.hovers),
+            self._repeats.warning(self._system.fusion.flight.track.hovers),
             self._calibration_warning,
             None if held or self.up is not None else self._system.fusion.orientation.leaning(),
         )

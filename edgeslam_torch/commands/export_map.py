@@ -47,7 +47,7 @@ def main(args: argparse.Namespace) -> int:
         place = _WRITERS[args.format](run, cloud, args)
     except OSError as error:
         raise OutputError(f"{error.filename or args.out}: cannot be written ({error.strerror or error})") from error
-    print(f"{len(cloud.p_w)} points: {place}")
+    print(f"{len(cloud.p_w)} points: {place}; {run.vertical}")
     if run.units == "arbitrary":
         print("the run's units are arbitrary (no metric scale): lengths in this file are not metres")
     elif run.units == "unknown":
@@ -91,7 +91,7 @@ def _ply(run: "RunFolder", cloud: "PointCloud", args: argparse.Namespace) -> Pat
 
     path: Path = args.out or run.path / "export.ply"
     centres_w = run.trajectory.positions[run.keyframe_poses()]
-    write_ply(path, cloud, normals=edge_directions(cloud.p_w, centres_w))
+    write_ply(path, cloud, (f"units: {run.units}", run.vertical), edge_directions(cloud.p_w, centres_w))
     return path
 
 
@@ -99,7 +99,7 @@ def _las(run: "RunFolder", cloud: "PointCloud", args: argparse.Namespace) -> Pat
     from edgeslam_torch.writers.maps.las import write_las
 
     path: Path = args.out or run.path / "edge_map.las"
-    write_las(path, cloud)
+    write_las(path, cloud, run.vertical)
     return path
 
 
@@ -107,7 +107,7 @@ def _pcd(run: "RunFolder", cloud: "PointCloud", args: argparse.Namespace) -> Pat
     from edgeslam_torch.writers.maps.pcd import write_pcd
 
     path: Path = args.out or run.path / "edge_map.pcd"
-    write_pcd(path, cloud)
+    write_pcd(path, cloud, run.vertical)
     return path
 
 
@@ -121,7 +121,7 @@ def _colmap(run: "RunFolder", cloud: "PointCloud", args: argparse.Namespace) -> 
     seen, anchors, index = _seen(run)
     paths = image_paths(run, seen.stamps_s)
     names = [p.name if p is not None else f"{t:.6f}.jpg" for p, t in zip(paths, seen.stamps_s, strict=True)]
-    write_colmap(folder, camera, names, run.trajectory.T_w_c[index], cloud, anchors, seen)
+    write_colmap(folder, camera, names, run.trajectory.T_w_c[index], cloud, anchors, seen, run.vertical)
     missing, renamed = paths.count(None), [name for name in names if " " in name]
     if missing:
         print(f"{missing} of {len(names)} images are not there; {_KEEP}")
@@ -142,7 +142,7 @@ def _nerfstudio(run: "RunFolder", cloud: "PointCloud", args: argparse.Namespace)
     if len(paths) < len(index):
         have = f"{len(index) - len(paths)} of {len(index)} images of the keyframes are not there"
         raise OutputError(f"{run.path}: {have}; {_KEEP}")
-    write_nerfstudio(folder, camera, paths, run.trajectory.T_w_c[index], cloud, anchors, seen)
+    write_nerfstudio(folder, camera, paths, run.trajectory.T_w_c[index], cloud, anchors, seen, run.vertical)
     return folder
 
 

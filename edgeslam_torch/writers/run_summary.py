@@ -117,6 +117,14 @@ def up_in_words(up: Up | None) -> dict[str, Any]:
     return {"source": up.source, "sigma_deg": math.degrees(math.hypot(up.sigma_rad, off_rad))}
 
 
+def vertical_text(up: Any) -> str:
+    """What a summary's ``up`` says of the world's z axis; nothing else is believed."""
+    match up:
+        case {"source": str(source), "sigma_deg": int() | float() as sigma_deg} if source != "unknown":
+            return f"z up by {source.replace('+', ' and ')}, sigma {sigma_deg:.1f} degrees"
+    return "z as the first camera had it: up is not known"
+
+
 def without_folders(summary: dict[str, Any], folder: Path) -> dict[str, Any]:
     """The summary without absolute paths: files by their names within the recording, and the recording relative to
     the run's ``folder``; both stay valid when the two are moved together.

@@ -20,6 +20,7 @@ from edgeslam_torch.geometry import se3
 from edgeslam_torch.types import FloatArray, PointCloud, SlamOutput, Support, Units
 from edgeslam_torch.writers.own_folder import STATUS, SUMMARY, FolderLock, check_free
 from edgeslam_torch.writers.ply import write_ply
+from edgeslam_torch.writers.run_summary import vertical_text
 
 TRAJECTORY = "trajectory.txt"
 ONLINE = "trajectory_online.txt"
@@ -147,7 +148,7 @@ class RunWriter:
         self._reserve.close()
         comments = (
             f"units: {units}",
-            f"frame: world of trajectory.txt, {_axes(summary)}",
+            f"frame: world of trajectory.txt, {vertical_text(summary.get('up'))}",
             "sigma: standard deviation along the ray",
         )
         rows = [tum_line(stamp, T) for stamp, T in zip(stamps_s, T_w_c, strict=True)]
@@ -242,14 +243,6 @@ class _LiveFiles:
             write_text(self._table, _csv_line(header) + "".join(padded))
         finally:
             self._status = Appender(self._table, None)
-
-
-def _axes(summary: dict[str, Any]) -> str:
-    """What a summary says of the world's z axis."""
-    up = summary.get("up") or {}
-    if up.get("source", "unknown") == "unknown":
-        return "z as the first camera had it: up is not known"
-    return f"z up by {up['source'].replace('+', ' and ')}, sigma {up['sigma_deg']:.1f} degrees"
 
 
 def _piece_file(number: int, rows: Sequence[str], support: Support) -> tuple[str, Callable[[Path], None]]:

@@ -13,6 +13,7 @@ from edgeslam_torch.eval.inputs.trajectory_files import Trajectory, read_traject
 from edgeslam_torch.files.record_files import read_mapping
 from edgeslam_torch.types import PointCloud
 from edgeslam_torch.writers.ply import read_ply
+from edgeslam_torch.writers.run_summary import vertical_text
 
 _SUPPORTED = frozenset({"initialised", "tracked", "relocalised"})
 """Status of a frame whose pose rests on the map, in tables of version 0.1, which have no column that says so."""
@@ -46,6 +47,11 @@ class RunFolder:
         not say."""
         up = self.summary.get("up")
         return str(up.get("source", "unknown")) if isinstance(up, dict) else "unknown"
+
+    @property
+    def vertical(self) -> str:
+        """The same in a sentence, with its standard deviation."""
+        return vertical_text(self.summary.get("up"))
 
     def cloud(self, name: str = "edge_map.ply") -> PointCloud | None:
         """Point cloud of the folder, None when it is not there."""

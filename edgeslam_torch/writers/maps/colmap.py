@@ -30,6 +30,7 @@ def write_colmap(
     cloud: PointCloud,
     anchors: PointCloud | None = None,
     seen: Observations | None = None,
+    comment: str = "",
 ) -> None:
     """Write the model.
 
@@ -41,6 +42,7 @@ def write_colmap(
         cloud: Points of edges; their sigma is stored as COLMAP's reprojection error, in pixels at 1 m.
         anchors: What ``seen`` refers to; left out without it.
         seen: Anchors in the images, whose order is that of ``names``.
+        comment: Line above the images and the points.
 
     Raises:
         OSError: If the file cannot be written.
@@ -49,11 +51,14 @@ def write_colmap(
     write_text(folder / "cameras.txt", _camera_text(camera))
     if anchors is None or seen is None:
         anchors, seen = NO_POINTS, _UNSEEN
-    write_text(folder / "images.txt", _images_text(names, T_w_c, seen, camera))
+    head = f"# {comment}\n" if comment else ""
+    write_text(folder / "images.txt", head + _images_text(names, T_w_c, seen, camera))
     tracks = _tracks(seen, len(anchors.p_w))
     lines = _points_lines(anchors, camera.fx, tracks, first=1)
     lines += _points_lines(cloud, camera.fx, [""] * len(cloud.p_w), first=1 + len(anchors.p_w))
-    write_text(folder / "points3D.txt", "\n".join(["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]", *lines]) + "\n")
+    write_text(
+        folder / "points3D.txt", head + "\n".join(["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]", *lines]) + "\n"
+    )
 
 
 def _camera_text(camera: Camera) -> str:

@@ -33,6 +33,7 @@ def write_nerfstudio(
     cloud: PointCloud,
     anchors: PointCloud,
     seen: Observations,
+    comment: str = "",
 ) -> None:
     """Write the folder.
 
@@ -44,6 +45,7 @@ def write_nerfstudio(
         cloud: Edge map, for splatting to begin with (``edge_map.ply``).
         anchors: What ``seen`` refers to.
         seen: Undistorted pixels of anchors.
+        comment: Kept in ``transforms.json`` and the cloud.
 
     Raises:
         OSError: If something cannot be written.
@@ -61,8 +63,10 @@ def write_nerfstudio(
         write_image(folder / "depth" / name, sparse_depth(camera, T, anchors.p_w[seen.anchor[own]], seen.uv[own]))
         files = {"file_path": "images", "mask_path": "masks", "depth_file_path": "depth"}
         frames.append({key: f"{place}/{name}" for key, place in files.items()} | {"transform_matrix": gl_pose(T)})
-    write_ply(folder / "edge_map.ply", cloud)
-    write_text(folder / "transforms.json", json.dumps(_head(camera) | {"frames": frames}, indent=1) + "\n")
+    write_ply(folder / "edge_map.ply", cloud, (comment,) if comment else ())
+    write_text(
+        folder / "transforms.json", json.dumps(_head(camera) | {"comment": comment, "frames": frames}, indent=1) + "\n"
+    )
 
 
 def gl_pose(T_w_c: FloatArray) -> list[list[float]]:

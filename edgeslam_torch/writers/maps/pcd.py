@@ -11,8 +11,8 @@ POINT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<f4"), ("si
 """``rgb`` is 0x00RRGGBB in the bits of a float, as in PCL."""
 
 
-def write_pcd(path: Path, cloud: PointCloud) -> None:
-    """Write a cloud, atomically.
+def write_pcd(path: Path, cloud: PointCloud, comment: str = "") -> None:
+    """Write a cloud, atomically, with a comment in its header.
 
     Raises:
         OSError: If the file cannot be written.
@@ -26,6 +26,7 @@ def write_pcd(path: Path, cloud: PointCloud) -> None:
     names = POINT.names or ()
     header = [
         "# .PCD v0.7 - Point Cloud Data file format",
+        *([f"# {comment}"] if comment else []),
         "VERSION 0.7",
         "FIELDS " + " ".join(names),
         "SIZE " + " ".join("4" for _ in names),
@@ -38,5 +39,5 @@ def write_pcd(path: Path, cloud: PointCloud) -> None:
         "DATA binary",
         "",
     ]
-    data = "\n".join(header).encode("ascii") + points.tobytes()
+    data = "\n".join(header).encode("ascii", errors="replace") + points.tobytes()
     write_atomically(path, lambda file: file.write(data))
