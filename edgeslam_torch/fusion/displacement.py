@@ -133,8 +133,6 @@ class TelemetryModel:
     """Probability that velocities are truncated, not rounded."""
     attitude: bool = True
     """Whether attitude may speak."""
-    attitude_proven: bool = True
-    """Whether it has turned as the images did."""
     young: bool = False
     """Whether the map has begun seconds ago."""
     standing: bool = False
@@ -185,7 +183,7 @@ class TelemetryModel:
             return None
         at_s = stamps_s - self.delay_s
         use = self.track.covered(at_s, at_s)
-        if not self.attitude_proven:
+        if not self.knows_metres:  # half a degree of lean is motion to a map without parallax, and its depths run away
             use &= is_steady(self.track, at_s)
         frame = np.flatnonzero(use)
         if len(frame) == 0:

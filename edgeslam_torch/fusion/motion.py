@@ -31,7 +31,6 @@ from edgeslam_torch.fusion.prediction import (
     with_velocity,
 )
 from edgeslam_torch.fusion.remembered import Remembered
-from edgeslam_torch.fusion.scale.camera_mount import Mount, estimate_mount
 from edgeslam_torch.fusion.scale_estimator import ScaleEstimator
 from edgeslam_torch.fusion.snapshot import Present, Snapshot
 from edgeslam_torch.fusion.telemetry.comparison import Comparison, FlightSoFar
@@ -329,26 +328,6 @@ class MotionFusion:
         delay_s, doubt_s = self.delay_s, self.flight.delay_sigma_s
         return Carried(self._track, delay_s, doubt_s, T_b_c, R_w_m, self.scale(), self.metres.fit, sigma)
 
-    def mount(self) -> Mount | None:
-        """How the camera sits on the body, estimated from the flight; ``None`` without enough motion."""
-        if self._memory.count == 0 or len(self._track) < 2 or not self._trust.velocity:
-            return None
-        moved = self._memory.displacements().on_telemetry_clock(self.delay_s)
-        use = self._track.covered(moved.from_s, moved.to_s)
-        if not use.any():
-            return None
-        moved = moved.only(use)
-        told = self._track.displacement(moved.to_s, self.metres.fit.shortfall_m_s)
-        told -= self._track.displacement(moved.from_s, self.metres.fit.shortfall_m_s)
-        return estimate_mount(
-            np.einsum("nji,nj->ni", moved.R_from, moved.moved),
-            np.einsum("nji,nj->ni", self._track.attitude(moved.from_s), told),
-            moved.duration_s,
-            moved.sigma,
-            self.config.sigma_velocity_m_s,
-            self.orientation.given[:3, :3],
-        )
-
     def statistics(self) -> dict[str, float]:
         """Counters and the state of the estimates, for the report."""
         numbers: dict[str, float] = dict(self._counts)
@@ -359,10 +338,6 @@ class MotionFusion:
         numbers["video delay s"] = self.delay_s
         numbers["video delay sigma s"] = self.flight.delay_sigma_s
         numbers.update({f"agreement {reading}": found.share for reading, found in self._trust.latest.items()})
-        mount = self.mount()
-        if mount is not None:
-            numbers["camera tilt deg"] = math.degrees(mount.tilt_rad)
-            numbers["camera tilt sigma deg"] = math.degrees(mount.tilt_sigma_rad)
         numbers["camera mount turned deg"] = math.degrees(self.orientation.mount_turned_rad)
         return numbers | self.metres.statistics()
 
@@ -402,7 +377,6 @@ class MotionFusion:
             heights[0] if told is not None and heights and (odds is None or odds.kept == "height") else None,
             self.metres.fit.truncates,
             self._trust.attitude,
-            self._trust.turns,
             standing=told is not None and self.metres.velocity_is_right(self._trust),
         )
 

@@ -105,7 +105,7 @@ class ScaleEstimator:
 
     def _still_trusted(self, trust: SensorGate) -> bool:
         """Whether all that the held opinion rests on may still tell the scale."""
-        trusted = {"telemetry": trust.velocity, "height": any(map(trust.height, HEIGHTS))}
+        trusted = {"telemetry": trust.velocity and trust.tells_scale, "height": any(map(trust.height, HEIGHTS))}
         settled = trust.at_odds is None or trust.at_odds.kept is not None
         return settled and all(trusted[source] for source in self.fit.sources)
 

@@ -7,8 +7,9 @@ import numpy as np
 
 from edgeslam_torch.fusion.config import FusionConfig
 from edgeslam_torch.fusion.scale.camera_mount import Turned
-from edgeslam_torch.fusion.scale.consensus import at_odds, contradict, sided_with
+from edgeslam_torch.fusion.scale.consensus import CONTRADICTION, at_odds, contradict, sided_with
 from edgeslam_torch.fusion.scale.joint_scale import (
+    MIN_DISPLACEMENTS,
     MOST_WANDER,
     USUAL_WANDER,
     Evidence,
@@ -19,7 +20,7 @@ from edgeslam_torch.fusion.scale.joint_scale import (
     turned_since,
 )
 from edgeslam_torch.fusion.scale.log_scale import LogScale, floor_segments
-from edgeslam_torch.fusion.scale.windowed_scale import PRESENT_S, Parted, has_changed, parted, present_scale
+from edgeslam_torch.fusion.scale.windowed_scale import PRESENT_S, Parted, has_changed, present_scale
 from edgeslam_torch.fusion.telemetry.comparison import FlightSoFar
 from edgeslam_torch.fusion.telemetry.sensor_validation import (
     LEAST_COUNT,
@@ -46,8 +47,6 @@ _MOST_CHANGE = 0.5
 _UNDITHERED = 0.05
 """Error of all remainders together, in steps: with 0.2 to 0.3 steps of noise before the rounding a reading is off by
 0.15 to 0.05 steps in the mean, up or down with the speed, and the speeds of a flight average two thirds of it."""
-_MOST_GAP = 6.0
-"""Sigmas between velocity and height beyond which one hypothesis is not made any less probable."""
 _MOST_SIGMA = 0.5
 """Relative sigma beyond which a source on its own says nothing."""
 _GOOD_HEIGHT = 0.2
@@ -110,6 +109,7 @@ class _Hypothesis:
     log_odds: float
     """How well it explains the displacements, up to a constant, less what puts velocity and height apart."""
     fit: TelemetryFit
+    at_odds: AtOdds | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -219,9 +219,14 @@ class TelemetryScale:
         }
         tried = (Rounding.NEAREST, Rounding.TRUNCATE) if fixed is None else (fixed,)
         moved = {r: self._by_displacements(r) for r in tried}
-        if any(evidence is None for evidence in moved.values()):  # what cannot be compared is not chosen from
+        compared = all(evidence is not None for evidence in moved.values())
+        if not compared:  # what cannot be compared is not chosen from
             moved = dict.fromkeys(tried)
-        self._trust.tells_scale = all(evidence is not None for evidence in moved.values())
+        few = self._shown is None or len(self._shown.intervals) < MIN_DISPLACEMENTS
+        torn = all(evidence is not None and evidence.torn for evidence in moved.values())
+        self._trust.tells_scale = few or (compared and not torn)
+        if torn:
+            return None
         found = {r: h for r in tried if (h := self._together(r, moved[r], systematic[r])) is not None}
         if not found:
             return None
@@ -230,6 +235,7 @@ class TelemetryScale:
         share /= share.sum()
         mixed = list(zip(share.tolist(), found.values(), strict=True))
         best = max(mixed, key=lambda m: m[0])[1]
+        self._trust.at_odds = best.at_odds
         mean = sum(p * o.log_scale for p, o in mixed)
         variance = sum(p * (o.sigma**2 + (o.log_scale - mean) ** 2) for p, o in mixed)
         truncates = dict(zip(found, share.tolist(), strict=True)).get(Rounding.TRUNCATE, 0.0)
@@ -239,7 +245,7 @@ class TelemetryScale:
     def _unless_parted(self, before: LogScale, fit: TelemetryFit) -> tuple[LogScale, TelemetryFit]:
         """What the flight says, or the last seconds where these leave no room for it."""
         now = (self._at_present() or self._lately()) if self._flying else None
-        if now is None or not parted(now, before):
+        if now is None or not at_odds(now, before):
             self._trust.parted = None
             return before, fit
         self._trust.parted = Parted(now, before)
@@ -272,11 +278,12 @@ class TelemetryScale:
         # What velocities do not know as well as the units of views differ by, they do not rule out.
         vouching = moved if velocity is not None and velocity.sigma < _OF_A_VIEW else None
         given = [g for g in (velocity, self._height_alone(rough, vouching)) if g is not None]
-        if len(given) == 2 and at_odds(given[0].opinion, given[1].opinion):
-            given = self._settled(*given)
-            if [g.name for g in given] == ["height"]:  # no surer than without the velocities that were wrong
+        odds = self._at_odds(*given) if len(given) == 2 else None
+        if odds is not None and odds.kept is not None:
+            given = [g for g in given if g.name == odds.kept]
+            if odds.kept == "height":  # no surer than without the velocities that were wrong
                 given = [g for g in (self._height_alone(rough, None),) if g is not None]
-        elif len(given) == 1 and given[0].name == "height" and self._nonsense(given[0]):
+        elif [g.name for g in given] == ["height"] and self._nonsense(given[0]):
             given = []
         together = solved([g.evidence for g in given], tilt) if given else None
         if together is None:
@@ -286,14 +293,15 @@ class TelemetryScale:
             one, other = (g.opinion for g in given)
             gap = abs(one.log_scale - other.log_scale) / math.hypot(one.sigma, other.sigma)
             if contradict(one, other):  # one of them is wrong: the sigma covers both
-                parted_log = max(abs(g.log_scale - math.log(together[0])) for g in (one, other))
+                parted_log = abs(one.log_scale - other.log_scale)
         sources = {g.name: SourceScale(g.scale, g.scale * g.sigma) for g in given}
         # Birge ratio: sources that disagree beyond their sigmas widen the result.
         sigma = max(parted_log, max(1.0, gap) * math.hypot(together[1], _shared_drift(given)))
-        log_odds = (0.0 if moved is None else moved.log_likelihood) - 0.5 * min(gap, _MOST_GAP) ** 2
+        log_odds = (0.0 if moved is None else moved.log_likelihood) - 0.5 * min(gap, CONTRADICTION) ** 2
         moved = moved if "telemetry" in sources else None
         shortfall_m_s = 0.5 * self._config.velocity_step_m_s if rounding is Rounding.TRUNCATE else 0.0
-        return _Hypothesis(math.log(together[0]), sigma, log_odds, TelemetryFit(moved, sources, shortfall_m_s))
+        fit = TelemetryFit(moved, sources, shortfall_m_s)
+        return _Hypothesis(math.log(together[0]), sigma, log_odds, fit, odds)
 
     def _alone(self, name: str, evidence: Evidence | None, systematic: float, rough: float) -> _Given | None:
         """What one kind of evidence says, with the error that no averaging removes."""
@@ -306,11 +314,13 @@ class TelemetryScale:
     def _height_alone(self, rough: float, moved: Evidence | None) -> _Given | None:
         return self._alone("height", self._by_height(rough, moved), self._config.height_systematic_log, rough)
 
-    def _settled(self, velocity: _Given, height: _Given) -> list[_Given]:
-        """Of velocities and heights that cannot both be right the one that the depth network confirms, if it does."""
-        kept = sided_with(velocity.opinion, height.opinion, self._present.network)
-        self._trust.at_odds = AtOdds(velocity.scale, height.scale, None if kept is None else kept.source)
-        return [given for given in (velocity, height) if kept is not None and given.name == kept.source]
+    def _at_odds(self, velocity: _Given, height: _Given) -> AtOdds | None:
+        """Velocities and heights that cannot both be right, and which one the depth network confirms, if it does."""
+        one, other = velocity.opinion, height.opinion
+        if not at_odds(one, other):
+            return None
+        kept = sided_with(one, other, self._present.network)
+        return AtOdds(velocity.scale, height.scale, None if kept is None else kept.source)
 
     def _nonsense(self, height: _Given) -> bool:
         """Whether velocities that cannot tell the scale themselves still leave no room for that of heights alone.

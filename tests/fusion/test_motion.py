@@ -415,7 +415,7 @@ def test_heights_that_hardly_change_tell_no_metres(swinging, replay):
 @pytest.mark.parametrize(("source", "held"), [("height", False), ("telemetry+height", True)])
 @pytest.mark.parametrize("found", [None, (LogScale(0.1, 0.4, "height"), TelemetryFit())], ids=["nothing", "unsure"])
 def test_metres_by_heights_alone_are_not_held_when_heights_do_not_bear_them_out(source, held, found):
-    trusting = SimpleNamespace(velocity=True, height=lambda reading: True, at_odds=None)
+    trusting = SimpleNamespace(velocity=True, tells_scale=True, height=lambda reading: True, at_odds=None)
     metres = ScaleEstimator(FusionConfig(), 0.0)
     metres.take((LogScale(0.0, 0.1, source), TelemetryFit()), 0.0, trusting)
     metres.take(found, 0.0, trusting)
@@ -480,20 +480,6 @@ def test_filter_takes_vision_for_as_noisy_as_it_is(rng, swinging, replay, noise_
     told = fusion.statistics()
     assert told["ekf visual accepted"] > 100
     assert told.get("ekf visual refused", 0) < 0.1 * told["ekf visual accepted"]
-
-
-@pytest.mark.parametrize("true_tilt_deg", [12.0, 25.0])
-def test_tilt_of_the_camera_is_estimated_from_the_flight(rng, swinging, replay, true_tilt_deg):
-    """Assumed 12 degrees; the drone carries its camera differently."""
-    base = swinging(30.0)
-    T_true = camera_on_body(math.radians(true_tilt_deg))
-    motion = replace(base, T_w_c=base.T_w_c @ se3.inverse(T_B_C) @ T_true)
-    samples = simulate(rng, motion.stamps_s, motion.T_w_c, T_true).samples()
-    fusion = MotionFusion(FusionConfig(), T_B_C)
-    replay(fusion, motion, motion.in_gauge(rng), samples)
-    mount = fusion.mount()
-    assert math.degrees(mount.tilt_rad) == pytest.approx(true_tilt_deg, abs=3.0)
-    assert math.degrees(mount.tilt_sigma_rad) < 3.0
 
 
 def test_statistics_are_plain_numbers(rng, swinging, replay):

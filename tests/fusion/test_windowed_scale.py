@@ -5,8 +5,9 @@ import math
 import numpy as np
 import pytest
 
+from edgeslam_torch.fusion.scale.consensus import at_odds
 from edgeslam_torch.fusion.scale.log_scale import LogScale
-from edgeslam_torch.fusion.scale.windowed_scale import Parted, has_changed, parted, present_scale
+from edgeslam_torch.fusion.scale.windowed_scale import Parted, has_changed, present_scale
 
 
 def flown(count=4, speed=0.5, metres_per_unit=2.0, noise=0.0, seed=0):
@@ -49,9 +50,9 @@ def test_ways_in_two_directions_tell_nothing():
 
 def test_only_what_leaves_no_room_counts():
     before = LogScale(0.0, 0.03, "height")
-    assert parted(LogScale(math.log(4.0), 0.1, "telemetry"), before)
-    assert not parted(LogScale(math.log(1.4), 0.01, "telemetry"), before)  # a usual drift
-    assert not parted(LogScale(math.log(1.7), 0.2, "telemetry"), before)  # not sure
+    assert at_odds(LogScale(math.log(4.0), 0.1, "telemetry"), before)
+    assert not at_odds(LogScale(math.log(1.4), 0.01, "telemetry"), before)  # a usual drift
+    assert not at_odds(LogScale(math.log(1.7), 0.2, "telemetry"), before)  # not sure
 
 
 def test_it_is_said_with_both_scales():

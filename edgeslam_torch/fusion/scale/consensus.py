@@ -15,7 +15,7 @@ from edgeslam_torch.fusion.scale.log_scale import LogScale
 CONTRADICTION = 3.0
 """Sigmas of the difference; right opinions are that far apart in 0.3 % of the cases."""
 _AT_ODDS = 5.0
-_AT_ODDS_LOG = math.log(2.0)
+AT_ODDS_LOG = math.log(1.5)
 """Sigmas and factor between two opinions beyond which one of them is nonsense."""
 _WRONG_UNIT_LOG = 0.5 * math.log(10.0)
 """Units of velocity differ by tens: beyond half of that a wrong unit explains a contradiction better than any error."""
@@ -28,7 +28,7 @@ def contradict(a: LogScale, b: LogScale) -> bool:
 
 def at_odds(a: LogScale, b: LogScale) -> bool:
     """Whether one of two opinions must be nonsense, not merely off by more than it says."""
-    return _apart(a, b) > max(_AT_ODDS_LOG, _AT_ODDS * math.hypot(a.sigma, b.sigma))
+    return _apart(a, b) > max(AT_ODDS_LOG, _AT_ODDS * math.hypot(a.sigma, b.sigma))
 
 
 def _apart(a: LogScale, b: LogScale) -> float:

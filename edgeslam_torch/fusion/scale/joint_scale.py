@@ -25,7 +25,9 @@ from edgeslam_torch.geometry.se3 import hat
 from edgeslam_torch.types import FloatArray, IntArray
 
 _LEAST_WEIGHT = 1e-3
-_MIN_DISPLACEMENTS = 6
+_LEAST_WAY = 0.5
+"""Share of the way by the images that a fit must explain for its scale to be the map's."""
+MIN_DISPLACEMENTS = 6
 _MIN_HEIGHTS = 4
 _MOST_PARTS = 4
 """Parts of a flight whose scales are compared: of a tenth of it there is too little to tell."""
@@ -73,6 +75,8 @@ class Evidence:
     """How much the map's scale changes; displacements tell, heights do not."""
     drift_sigma: float = 0.0
     """Relative error of the present scale because of that; velocities and heights share it."""
+    torn: bool = False
+    """Whether no scale fits the greater part of the way that the images saw: the map has none."""
 
     def softened(self, sigma: float) -> "Evidence":
         """The same with an error of the scale [m per map unit] that no averaging removes."""
@@ -134,7 +138,7 @@ def displacement_evidence(
     """
     n = len(moved_map)
     length = float(np.sum(moved_map**2))
-    if n < _MIN_DISPLACEMENTS or not length > 0:
+    if n < MIN_DISPLACEMENTS or not length > 0:
         return None
     sigma_map = np.minimum(sigma_map, 0.3 * math.sqrt(length / (3 * n)))
     apart_s = from_s[:, None] - from_s[None]
@@ -170,12 +174,13 @@ def displacement_evidence(
         drift = fit.slow - fit.bias  # the map's, so it is in the regressor as well
         partner = moved_map + ((s * sigma_map**2 / variance) * clean + drift / s).T
         latent = np.concatenate([partner[:, :, None], -hat(partner)], axis=2).transpose(1, 0, 2)
-    if fit is None or float(weight.sum()) < _MIN_DISPLACEMENTS:
+    if fit is None or float(weight.sum()) < MIN_DISPLACEMENTS:
         return None
     rms = math.sqrt(float(np.sum(weight * clean**2)) / max(3.0 * float(weight.sum()), 1e-9))
     bias_m_s = fit.bias[:, -1] / duration_s[-1]
-    evidence = Evidence(fit.information, fit.vector, rms, bias_m_s, fit.log_likelihood, wander)
-    return evidence.softened(_unrest(white, fit, J, latent, target))
+    torn = float(weight @ np.sum(moved_map**2, axis=1)) < _LEAST_WAY * length
+    evidence = Evidence(fit.information, fit.vector, rms, bias_m_s, fit.log_likelihood, wander, torn=torn)
+    return evidence.softened(_unrest(sigma_m**2 + (s * sigma_map) ** 2, fit, J, latent, target))
 
 
 def height_evidence(
@@ -264,11 +269,12 @@ def height_evidence(
 def _unrest(white: FloatArray, fit: "_Fit", J: FloatArray, latent: FloatArray, target: FloatArray) -> float:
     """Error of the mean scale [m per map unit] because parts of the flight have scales that differ beyond their noise.
 
-    A map that drifts in scale, or telemetry that is right in part: no averaging within a part tells of it. The variance
-    between parts is that of a random-effects model (DerSimonian and Laird 1986).
+    A map that drifts in scale, or telemetry that is right in part: no averaging within a part tells of it. What the fit
+    has left out counts here as well: it is a part of the map whose scale is another. The variance between parts is that
+    of a random-effects model (DerSimonian and Laird 1986).
     """
     n = len(white)
-    parts = min(_MOST_PARTS, n // _MIN_DISPLACEMENTS)
+    parts = min(_MOST_PARTS, n // MIN_DISPLACEMENTS)
     if parts < 2:
         return 0.0
     C = fit.noise.covariance.copy()

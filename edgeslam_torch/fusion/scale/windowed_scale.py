@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from edgeslam_torch.fusion.scale.consensus import AT_ODDS_LOG
 from edgeslam_torch.fusion.scale.log_scale import LogScale
 from edgeslam_torch.types import FloatArray
 
@@ -21,7 +22,6 @@ _SAME_WAY = 0.9
 _LEAST_SIGMA = 0.05
 _OF_STEP = 0.4
 """Standard deviation of a velocity that is rounded or truncated, one does not know which, in steps."""
-_PARTED_LOG, _PARTED_SIGMAS = math.log(1.5), 5.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,13 +67,7 @@ def present_scale(
     return LogScale(math.log(way_m / way), sigma, "telemetry")
 
 
-def parted(now: LogScale, before: LogScale) -> bool:
-    """Whether the present scale cannot be that of the flight before."""
-    apart = abs(now.log_scale - before.log_scale)
-    return apart > max(_PARTED_LOG, _PARTED_SIGMAS * math.hypot(now.sigma, before.sigma))
-
-
 def has_changed(now: LogScale, moved_map: FloatArray, moved_m: FloatArray) -> bool:
     """Whether the ways before ``(N, 3)``, told and seen, had another scale: a wrong unit is wrong all the time."""
     told, seen = (float(np.linalg.norm(way, axis=1).sum()) for way in (moved_m, moved_map))
-    return told > 0 and seen > 0 and abs(now.log_scale - math.log(told / seen)) > _PARTED_LOG
+    return told > 0 and seen > 0 and abs(now.log_scale - math.log(told / seen)) > AT_ODDS_LOG
