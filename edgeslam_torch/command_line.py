@@ -5,13 +5,14 @@ import difflib
 import importlib
 import logging
 import os
+import stat
 import sys
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import ModuleType
 
 from edgeslam_torch import __version__
-from edgeslam_torch.errors import EdgeSlamError
+from edgeslam_torch.errors import EdgeSlamError, SourceError
 from edgeslam_torch.files.output_file import add_overwrite, check_outputs
 from edgeslam_torch.help.pages import described, listing
 from edgeslam_torch.help.parser import EXIT_USAGE, Parser
@@ -76,8 +77,25 @@ def _call(name: str, entry: tuple[str, str], arguments: list[str], verbose: bool
     if unknown:
         parser.error(_unknown_arguments(unknown, parser.options()))
     check_outputs(parser, args)
+    _check_plain(args)
     with _messages(verbose):
         return int(module.main(args))
+
+
+def _check_plain(args: argparse.Namespace) -> None:
+    """Refuse pipes, sockets and devices by name: reading one may never end.
+
+    Raises:
+        SourceError: If an option or argument names one.
+    """
+    for given in vars(args).values():
+        for value in given if isinstance(given, list | tuple) else (given,):
+            if isinstance(value, str | os.PathLike):
+                for name in {os.fspath(value), os.fspath(value).rpartition("=")[2]}:
+                    with suppress(OSError, ValueError):
+                        kind = os.stat(name).st_mode
+                        if not (stat.S_ISREG(kind) or stat.S_ISDIR(kind)):
+                            raise SourceError(f"{name}: is no plain file or folder")
 
 
 def _add_arguments(parser: Parser, module: ModuleType) -> None:

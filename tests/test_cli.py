@@ -401,3 +401,38 @@ def test_a_recording_is_no_run_to_view_or_report(edgeslam, recording):
 def test_impossible_sources_are_one_short_line(edgeslam, source):
     code, _, err = edgeslam("run", source)
     assert code == 1 and len(err.splitlines()) == 1 and len(err) < 3000
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes here")
+@pytest.mark.parametrize(
+    "words",
+    [
+        "run {p}",
+        "run {seq} --camera {p}",
+        "run {seq} --telemetry {p}",
+        "run {seq} --depth {p}",
+        "run {seq} --set depth.weights={p}",
+        "run {seq} --config {p}",
+        "run {seq} --atlas {p}",
+        "eval {p} -g {p}",
+        "compare {p} {p}",
+        "report {p}",
+        "view {p}",
+        "batch {p} -o {tmp}/o",
+        "topics {p}",
+        "depth {p} -o {tmp}/o",
+        "export {p} -o {tmp}/o.onnx",
+        "export-map {p} --format ply",
+        "weights inspect {p}",
+        "calibrate {p} --board 8x6",
+        "fly replay {p}",
+        "finetune {p} -o {tmp}/o",
+        "distil {p} --teacher {p} -o {tmp}/o",
+    ],
+)
+def test_pipes_and_devices_are_refused_wherever_they_are_named(edgeslam, recording, tmp_path, words):
+    os.mkfifo(tmp_path / "pipe")
+    for name in (tmp_path / "pipe", "/dev/zero"):
+        code, _, err = edgeslam(*words.format(p=name, seq=recording, tmp=tmp_path).split())
+        assert (code, len(err.strip().splitlines())) == (1, 1)
+        assert "no plain file" in err

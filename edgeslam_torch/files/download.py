@@ -3,6 +3,8 @@
 import http.client
 import re
 import shutil
+import threading
+import time
 import urllib.error
 import urllib.request
 from collections.abc import Callable
@@ -15,6 +17,13 @@ from edgeslam_torch.files.plain import create, extend
 
 CHUNK = 1 << 16
 TIMEOUT_S = 30.0
+ANSWER_S = 90.0
+"""Longest wait for an answer with its headers: a server may send one byte at a time."""
+LOWEST_SPEED = 10e3
+"""Bytes a second, over `WATCHED_S` each; a slower server is given up. It also ends the time that a file may take."""
+WATCHED_S = 60.0
+LONGEST_S = 12 * 3600.0
+"""A file that takes longer goes on where it broke off, when asked for again."""
 USER_AGENT = "edgeslam-torch"
 """Some repositories of universities refuse Python's own."""
 
@@ -32,7 +41,8 @@ def fetch(url: str, part: Path, max_bytes: int, progress: Progress | None = None
         progress: See `Progress`.
 
     Raises:
-        OSError: If the connection cannot be made or breaks (`urllib.error.URLError` is one), or the disk is full.
+        OSError: If the connection cannot be made, breaks (`urllib.error.URLError` is one) or is too slow, or the disk
+            is full.
         http.client.HTTPException: If the answer is no HTTP.
         ValueError: If the server sends too much, or another piece than was asked for.
     """
@@ -44,7 +54,7 @@ def fetch(url: str, part: Path, max_bytes: int, progress: Progress | None = None
         with suppress(OSError):
             request.add_header("If-Range", tag.read_text("ascii"))
     try:
-        response = urllib.request.build_opener(KeepEncryption).open(request, timeout=TIMEOUT_S)
+        response = _answer(request)
     except urllib.error.HTTPError as error:
         if error.code == 416 and have:  # the partial file was complete
             return
@@ -60,15 +70,44 @@ def fetch(url: str, part: Path, max_bytes: int, progress: Progress | None = None
         if etag.startswith('"') and etag.isascii():  # weak ones do not promise the same bytes
             write_text(tag, etag)
         with extend(part) if have else create(part) as file:
-            while chunk := response.read(CHUNK):
+            began_s = watched_s = time.monotonic()
+            watched = have
+            while chunk := response.read1(CHUNK):
                 file.write(chunk)
                 have += len(chunk)
                 if have > max_bytes:
                     raise ValueError("the server sends without end")
                 if progress is not None:
                     progress(have, total)
+                now_s = time.monotonic()
+                if now_s - began_s > LONGEST_S:
+                    raise TimeoutError(f"it takes more than {LONGEST_S / 3600:.0f} hours")
+                if now_s - watched_s > WATCHED_S:
+                    if have - watched < LOWEST_SPEED * (now_s - watched_s):
+                        raise TimeoutError(f"the server sends less than {LOWEST_SPEED / 1e3:.0f} kB/s")
+                    watched_s, watched = now_s, have
         if total and have < total:
             raise OSError(f"connection lost after {have} of {total} bytes")
+
+
+def _answer(request: urllib.request.Request) -> Any:
+    """The server's answer, its body unread; the time-out of a socket begins anew with every byte."""
+    found: list[Any] = []
+
+    def ask() -> None:
+        try:
+            found.append(urllib.request.build_opener(KeepEncryption).open(request, timeout=TIMEOUT_S))
+        except Exception as error:
+            found.append(error)
+
+    thread = threading.Thread(target=ask, name="download", daemon=True)
+    thread.start()
+    thread.join(ANSWER_S)
+    if not found:
+        raise TimeoutError(f"no answer in {ANSWER_S:.0f} s")
+    if isinstance(found[0], Exception):
+        raise found[0]
+    return found[0]
 
 
 def discard(part: Path) -> None:

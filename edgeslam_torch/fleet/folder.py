@@ -17,6 +17,7 @@ from edgeslam_torch.errors import ConfigError, OutputError
 from edgeslam_torch.files.atomic import write_text
 from edgeslam_torch.files.config_file import load_config, to_toml
 from edgeslam_torch.files.plain import subfolder
+from edgeslam_torch.files.record_files import read_mapping
 from edgeslam_torch.files.signature import signature
 from edgeslam_torch.fleet.manifest import Flight
 
@@ -101,10 +102,10 @@ class BatchFolder:
     def result(self, task: Task) -> dict[str, Any] | None:
         """The result of this very task from before, if the flight finished."""
         try:
-            found = json.loads((self.path / JOBS / task.flight.name / RESULT).read_text(encoding="utf-8"))
-        except (OSError, ValueError):
+            found = read_mapping(self.path / JOBS / task.flight.name / RESULT, "JSON", OutputError)
+        except OutputError:
             return None
-        ours = isinstance(found, dict) and found.get("key") == task.key
+        ours = found.get("key") == task.key
         return found if ours and (self.path / FLIGHTS / task.flight.name).is_dir() else None
 
     def prepare(self, task: Task) -> Path:

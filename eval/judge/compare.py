@@ -1,6 +1,5 @@
 """Two records side by side: ratios of medians, and what got worse by more than the noise of seeds."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +11,7 @@ from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.judge.runner import FORMAT
 from edgeslam_torch.eval.judge.table import aligned
 from edgeslam_torch.eval.judge.thresholds import Row
+from edgeslam_torch.files.record_files import read_mapping
 
 RECORD = "judge.json"
 _SIGMAS = 2.0
@@ -56,11 +56,9 @@ def read_record(folder: Path) -> dict[str, Any]:
         EvaluationError: If there is none.
     """
     path = folder / RECORD
-    try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise EvaluationError(f"{path}: cannot be read as a judge's result ({error})") from error
-    if not isinstance(record, dict) or record.get("format") != FORMAT or "rows" not in record:
+    record = read_mapping(path, "JSON", EvaluationError)
+    rows = record.get("rows")
+    if record.get("format") != FORMAT or not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
         raise EvaluationError(f"{path}: not a result of 'edgeslam judge' (format {FORMAT})")
     return record
 

@@ -11,9 +11,11 @@ from typing import IO, Any
 
 from edgeslam_torch import __version__
 from edgeslam_torch.eval.benchmark.conditions import code_state
+from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.judge.cells import Cell
 from edgeslam_torch.files.atomic import write_text
 from edgeslam_torch.files.plain import subfolder
+from edgeslam_torch.files.record_files import read_mapping
 from edgeslam_torch.jobs.watched import Job, Limits, Start, run_each, start_module
 
 CELL, RESULT, LOG = "cell.json", "result.json", "log.txt"
@@ -110,17 +112,20 @@ def _key(cell: Cell, settings: JudgeSettings, commit: str) -> str:
 def _result(folder: Path, key: str) -> dict[str, Any] | None:
     """The result in a cell's folder, if it is whole and has this key."""
     try:
-        found = json.loads((folder / RESULT).read_text(encoding="utf-8"))
-    except (OSError, json.JSONDecodeError, UnicodeDecodeError):
+        found = read_mapping(folder / RESULT, "JSON", EvaluationError)
+    except EvaluationError:
         return None
-    return found if isinstance(found, dict) and found.get("key") == key else None
+    return found if found.get("key") == key else None
 
 
 def _others(cells: Sequence[Cell], settings: JudgeSettings, out: Path, commit: str) -> list[dict[str, Any]]:
     """Rows of results in ``out`` of the same code and settings, of cells not asked for now."""
     rows = []
     for path in sorted((out / "cells").glob(f"*/{CELL}")):
-        cell = Cell(**json.loads(path.read_text(encoding="utf-8"))["cell"])
+        try:
+            cell = Cell(**read_mapping(path, "JSON", EvaluationError)["cell"])
+        except (TypeError, KeyError, ValueError) as error:
+            raise EvaluationError(f"{path}: no cell of a judge ({error}); give another --out") from error
         found = _result(path.parent, _key(cell, settings, commit))
         if cell not in cells and found is not None:
             rows.append(_row(cell, found))

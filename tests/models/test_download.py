@@ -2,6 +2,7 @@
 
 import hashlib
 import io
+import socket
 import threading
 import urllib.error
 import urllib.request
@@ -12,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from edgeslam_torch.errors import WeightsError
+from edgeslam_torch.files import download as fetching
 from edgeslam_torch.files.download import KeepEncryption, remember, remembered
 from edgeslam_torch.models.download import REMOTES, cache_folder, download
 
@@ -158,3 +160,24 @@ def test_cache_folder_follows_the_environment(monkeypatch: pytest.MonkeyPatch, t
     monkeypatch.delenv("EDGESLAM_CACHE")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "x"))
     assert cache_folder() == tmp_path / "x" / "edgeslam"
+
+
+def test_a_server_that_drips_is_given_up(server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fetching, "WATCHED_S", -1.0)
+    monkeypatch.setattr(fetching, "LOWEST_SPEED", 1e15)
+    with pytest.raises(TimeoutError, match="kB/s"):
+        fetching.fetch(f"{server}/good", tmp_path / "part", 1 << 30)
+
+
+def test_a_server_that_never_ends_is_given_up(server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fetching, "LONGEST_S", -1.0)
+    with pytest.raises(TimeoutError, match="hours"):
+        fetching.fetch(f"{server}/good", tmp_path / "part", 1 << 30)
+
+
+def test_a_server_that_accepts_and_says_nothing_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fetching, "ANSWER_S", 0.05)
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        url = f"http://127.0.0.1:{silent.getsockname()[1]}/x"
+        with pytest.raises(TimeoutError, match="no answer"):
+            fetching.fetch(url, tmp_path / "part", 1 << 30)

@@ -1,6 +1,5 @@
 """Poses and sparse depth of a SLAM run, for self-supervised training."""
 
-import json
 import logging
 import os
 from collections.abc import Sequence
@@ -15,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.eval.inputs.run_folder import is_supported, read_status
+from edgeslam_torch.files.record_files import read_mapping
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.geometry.camera import Camera
 from edgeslam_torch.readers.source import open_source
@@ -102,7 +102,7 @@ def load_run(
     """
     folder = Path(os.path.abspath(folder))
     try:
-        summary = json.loads((folder / "summary.json").read_text())
+        summary = read_mapping(folder / "summary.json", "JSON", SourceError)
         rows = np.loadtxt(folder / "trajectory.txt", ndmin=2)
         recording = source if source is not None else str(folder.resolve() / summary["source"]["path"])
         poses = {round(float(row[0]), 6): _pose(row) for row in rows}

@@ -74,7 +74,7 @@ def _earlier(file: Path, case: Case) -> Flown | None:
     try:
         record = json.loads(file.read_text(encoding="utf-8"))
         return Flown(**{**record, "case": case, "dangers": tuple(record["dangers"])})
-    except (OSError, ValueError, TypeError, KeyError):
+    except (OSError, ValueError, TypeError, KeyError, RecursionError):
         return None
 
 
