@@ -12,13 +12,14 @@ PYTEST_ARGS ?=
 WORKERS ?= logical
 DEMO_ARGS ?= --out runs/demo
 MUTANTS_ARGS ?=
+JUDGE_ARGS ?=
 STAMP := $(VENV)/.installed
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help install demo test test-slow mutants lint docs notebooks wheel clean
+.PHONY: help install demo test test-slow mutants lint docs results notebooks wheel clean
 
 help:
-	@echo "make demo | test | test-slow | mutants | lint | docs | wheel | clean"
+	@echo "make demo | test | test-slow | mutants | lint | docs | results | wheel | clean"
 
 install: $(STAMP)
 
@@ -63,6 +64,11 @@ wheel: $(STAMP)
 docs: $(STAMP)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build -q
 	@echo "docs: open site/index.html"
+
+# Runs what the documents quote (an hour on two cores; goes on where it was interrupted), and puts it into them.
+results: $(STAMP)
+	$(BIN)/edgeslam judge --release docs/results/0.3.json --out runs/release $(JUDGE_ARGS)
+	$(BIN)/python docs/building/results_pages.py
 
 # Runs the notebooks and keeps what they show.
 notebooks: $(STAMP)

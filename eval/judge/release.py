@@ -150,6 +150,6 @@ def command_outputs(data: Path, out: Path, commit: str, say: Callable[[str], Non
             done = subprocess.run(words, cwd=folder, capture_output=True, text=True, env=environment, check=False)
             if done.returncode != 0:
                 raise EvaluationError(f"{command}: {(done.stderr or done.stdout).strip()[-300:]}")
-            found["lines"][name] = done.stdout.splitlines()
+            found["lines"][name] = [f"$ {command}", *(line.rstrip() for line in done.stdout.splitlines())]
             write_text(kept, json.dumps(found, indent=1) + "\n")
     return dict(found["lines"])

@@ -67,9 +67,7 @@ def main(args: argparse.Namespace) -> int:
     if args.jobs < 1 or args.seeds < 1 or args.first_seed < 0:
         raise ConfigError("--jobs and --seeds must be at least 1, --first-seed at least 0")
     if args.release is not None and (args.only or args.set or args.max_frames):
-        raise ConfigError(
-            "--release has cells of its own and default settings: leave --only, --set and --max-frames out"
-        )
+        raise ConfigError("--release runs its own cells with default settings: omit --only, --set and --max-frames")
     if args.release is not None:
         cells = release_cells(data)
         _say(f"release: {len(cells)} runs{last_cost(args.release)}; call it again to go on where it was interrupted")
@@ -81,13 +79,13 @@ def main(args: argparse.Namespace) -> int:
         text = markdown(record, bars)
         if before is not None:
             text += "\n" + markdown_against(before, record)
+        write_text(args.out / RECORD, json.dumps(record, indent=1) + "\n")
+        write_text(args.out / "judge.md", text)
         if args.release is not None:
             assert data is not None
             outputs = command_outputs(data, args.out, record["commit"], _say)
             release = release_record(record["rows"], record["commit"], outputs)
             write_text(args.release, json.dumps(release, indent=1) + "\n")
-        write_text(args.out / RECORD, json.dumps(record, indent=1) + "\n")
-        write_text(args.out / "judge.md", text)
     except OSError as error:
         raise OutputError(f"{error.filename}: cannot be written ({error.strerror or error})") from error
     print(text)
