@@ -157,7 +157,7 @@ class EdgeSlam:
             config.mapping.loop_closure,
             self._system.fusion.scale_around,
             self._system.fusion.scale_along,
-            self._system.apart.carried_sigma,
+            self._system.submap_uncertainty.start_sigma,
             self._system.fusion.orientation.facing_along,
         )
         self._joining = MapMerging(self._system, atlas)
@@ -276,9 +276,9 @@ class EdgeSlam:
         step = self._step(frame, seen)
         if self._earlier is not None:
             self._joining.enter(self.map.piece_of(step.keyframe.id))
-        self._machine.meet(step.event, frame.stamp_s)
+        self._machine.apply(step.event, frame.stamp_s)
         system.motion.stamp_s = frame.stamp_s
-        doubts = system.apart_sigma, system.drift_sigma
+        doubts = system.submap_sigma, system.drift_sigma
         self._present = system.fusion.present(frame.stamp_s, str(self.state), system.published, *doubts)
         return self._output(frame, step, joined)
 
@@ -474,13 +474,13 @@ class EdgeSlam:
     def warnings(self) -> list[str]:
         """Limits of the results, in sentences for the run's summary."""
         depth = None if self.depth is None else self.depth.warning()
-        apart = None if self._earlier is None else self._earlier.warning(self.support())
+        map_mismatch = None if self._earlier is None else self._earlier.warning(self.support())
         held = self._system.published.upright
         warnings = (
             self._machine.warning(),
             depth,
             self._warning_of_pieces(),
-            apart,
+            map_mismatch,
             self._repeats.warning(self._system.fusion.flight.track.hovers),
             self._calibration_warning,
             None if held or self.up is not None else self._system.fusion.orientation.leaning(),

@@ -348,7 +348,7 @@ class Health:
     """Whether the Kalman filter predicts the pose: `EdgeSlam.pose_now` makes up for the delay."""
     doubts: tuple[str, ...] = ()
     """What is not used, and why, in sentences."""
-    apart_sigma: float = 0.0
+    submap_sigma: float = 0.0
     """Standard deviation per axis of the newest pose against the piece of map in which the flight began [published
     unit]: what the drone's sensors leave open that carried the camera from one to the other. 0 in one map."""
     drift_sigma: float = 0.0
@@ -358,7 +358,7 @@ class Health:
     @property
     def home_sigma(self) -> float:
         """Standard deviation per axis of the newest pose, seen from where the flight began [published unit]."""
-        return float(np.hypot(self.apart_sigma, self.drift_sigma))
+        return float(np.hypot(self.submap_sigma, self.drift_sigma))
 
     def __str__(self) -> str:
         """For a status line: metres, disagreement, telemetry and battery, as far as there is something to say."""
@@ -366,9 +366,9 @@ class Health:
         words = [f"metres to {100.0 * relative:.0f} %" if self.metric else "no metres"]
         if self.disagreement > DISAGREEMENT:
             words.append(f"sources {self.disagreement:.0f} sigmas apart")
-        if np.isinf(self.apart_sigma):
+        if np.isinf(self.submap_sigma):
             words.append("nothing relates this piece of map to where the flight began")
-        elif self.apart_sigma > 0:
+        elif self.submap_sigma > 0:
             words.append(f"{self.home_sigma:.2g} {'m' if self.metric else 'units'} unsure of where the flight began")
         if SILENCE_S < self.telemetry_age_s < np.inf:
             words.append(f"telemetry silent for {self.telemetry_age_s:.1f} s")

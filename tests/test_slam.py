@@ -455,7 +455,7 @@ def test_black_stretch_is_predicted_and_then_found_again():
     assert statuses(outputs)[18:23] == [FrameStatus.PREDICTED] * 5
     assert {o.reason for o in outputs[18:23]} == {"only 0 keypoints"}
     assert statuses(outputs)[23] is FrameStatus.RELOCALISED
-    assert outputs[23].reason == "found again among the keyframes"
+    assert outputs[23].reason == "relocalised among the keyframes"
     assert (slam.events["lost"], slam.events["relocalised"]) == (1, 1)
     seen = np.r_[0:18, 23:30]
     assert ate(slam.trajectory()[1][seen], panels().T_w_c[seen]) < 0.012
@@ -513,8 +513,8 @@ def test_after_a_long_loss_a_new_piece_of_map_begins():
     assert [(p.number, p.frames, p.supported) for p in slam.pieces()] == [(0, 23, 16), (1, 22, 0)]
     assert [o.piece for o in outputs] == [0] * 23 + [1] * 22
     assert slam.events["restarted"] == 1
-    assert {o.health.apart_sigma for o in outputs[:23]} == {0.0}
-    assert outputs[23].health.apart_sigma > 0.1
+    assert {o.health.submap_sigma for o in outputs[:23]} == {0.0}
+    assert outputs[23].health.submap_sigma > 0.1
     T = slam.trajectory()[1]
     assert ate(T[:16], panels().T_w_c[:16]) < 0.012  # what was mapped before is kept
     assert np.linalg.norm(T[44, :3, 3] - T[23, :3, 3]) < 0.05
@@ -566,7 +566,7 @@ def test_two_pieces_are_joined_when_the_second_comes_to_the_place_of_the_first()
     assert slam.warnings() == []
     assert ate(slam.trajectory()[1], long.T_w_c[order]) < 0.03  # of 3.3 m; a second piece at the prediction: 0.5
     # The live pose went along with its piece.
-    assert {o.health.apart_sigma == 0.0 for o in outputs[told[0].index :]} == {True}
+    assert {o.health.submap_sigma == 0.0 for o in outputs[told[0].index :]} == {True}
     after = np.stack([o.T_w_c for o in outputs[told[0].index :]])
     assert ate(after, long.T_w_c[order][told[0].index :]) < 0.01
 

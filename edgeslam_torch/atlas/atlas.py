@@ -24,7 +24,7 @@ from edgeslam_torch.atlas.loops import (
     spread,
 )
 from edgeslam_torch.atlas.map_merging import look_around, move_piece, share_anchors, weld
-from edgeslam_torch.atlas.place_recognition import MIN_VOTES, lookalikes
+from edgeslam_torch.atlas.place_recognition import MIN_VOTES, revisit_candidates
 from edgeslam_torch.atlas.saved import BEFORE_S
 from edgeslam_torch.atlas.submap_heading import Facing, Turned, angle_between, is_turned, turn_about
 from edgeslam_torch.atlas.submap_scale import AGAIN_S as UNIT_AGAIN_S
@@ -224,7 +224,7 @@ class Atlas:
     def _alike(
         self, keyframe: Keyframe, among: list[Keyframe], most: int, min_votes: int = MIN_VOTES
     ) -> list[Keyframe]:
-        return lookalikes(self.map, keyframe.words, among, most, min_votes) if among else []
+        return revisit_candidates(self.map, keyframe.words, among, most, min_votes) if among else []
 
     def _link(self, keyframe: Keyframe, other: Keyframe) -> Link | None:
         """A link that may be true: within a piece, places that look alike and are far apart are not one."""

@@ -16,7 +16,14 @@ import numpy as np
 from edgeslam_torch.geometry import se3, sim3
 from edgeslam_torch.geometry.robust_statistics import robust_sigma
 from edgeslam_torch.map.keyframe import Keyframe
-from edgeslam_torch.tracking.relocaliser import LIKELY_SHARE, LIKELY_SPREAD, Place, apart, match_keyframe, place_of
+from edgeslam_torch.tracking.relocaliser import (
+    LIKELY_SHARE,
+    LIKELY_SPREAD,
+    Place,
+    match_keyframe,
+    place_of,
+    pose_difference,
+)
 from edgeslam_torch.tracking.tracker import Track, Tracker, View
 from edgeslam_torch.types import FloatArray, IntArray
 
@@ -80,7 +87,7 @@ class Link:
     def agrees(self, other: "Link") -> bool:
         """Whether another link between the same pieces says the same of where this keyframe is, and how large."""
         here, there = (sim3.moved_camera(S, self.keyframe.T_c_w) for S in (self.S, other.S))
-        shift, turn = apart(here, there)
+        shift, turn = pose_difference(here, there)
         scales = np.log(sim3.scale_of(self.S) / sim3.scale_of(other.S))
         same = abs(scales) <= 3.0 * float(np.hypot(self.sigma_log, other.sigma_log)) + 0.02
         return bool(same and shift <= MAX_SHIFT * self.depth and turn <= MAX_TURN_RAD)
@@ -125,7 +132,7 @@ def link(
     back = _place(tracker, other, keyframe, min_share)
     if back is None:
         return None
-    shift, turn = apart(back.track.T_c_w, sim3.moved_camera(sim3.inverse(S), other.T_c_w))
+    shift, turn = pose_difference(back.track.T_c_w, sim3.moved_camera(sim3.inverse(S), other.T_c_w))
     if shift > MAX_SHIFT * back.depth or turn > MAX_TURN_RAD:
         return None
     track = there.track

@@ -21,7 +21,7 @@ MIN_VOTES = 8
 """Votes above which a keyframe becomes a revisit candidate: places in other rooms get at most 4."""
 
 
-def lookalikes(
+def revisit_candidates(
     slam_map: SlamMap, words: NDArray[np.uint64], among: list[Keyframe], most: int, min_votes: int = MIN_VOTES
 ) -> list[Keyframe]:
     """Keyframes that see most of the anchors that an image's keypoints resemble, best first.

@@ -226,7 +226,7 @@ class MotionFusion:
         asked = self.metres.told is None and self.orientation.began_upright
         return self.orientation.vertical(stamp_s) if asked else None
 
-    def told(self, stamp_s: float) -> tuple[tuple[FloatArray, float] | None, Reckoned | None]:
+    def attitude_and_position(self, stamp_s: float) -> tuple[tuple[FloatArray, float] | None, Reckoned | None]:
         """What `Orientation.turned` and `reckoned` say of a frame."""
         return self.orientation.turned(stamp_s), self.reckoned(stamp_s)
 
@@ -271,7 +271,7 @@ class MotionFusion:
         return published.guessed_anew(self.metres.guess, centre_map).revised(self.scale(), centre_map)
 
     def present(
-        self, stamp_s: float, state: str, published: OutputFrame, apart_sigma: float = 0.0, drift_sigma: float = 0.0
+        self, stamp_s: float, state: str, published: OutputFrame, submap_sigma: float = 0.0, drift_sigma: float = 0.0
     ) -> Present:
         """What is known after a frame: the motion, and the reliability of its metres.
 
@@ -279,11 +279,11 @@ class MotionFusion:
             stamp_s: Stamp of the frame.
             state: What carries its pose.
             published: What is published of the map.
-            apart_sigma: As in `Health`.
+            submap_sigma: As in `Health`.
             drift_sigma: As in `Health`.
         """
         known = self.health(stamp_s, state, published.is_metric(self.scale()))
-        health = replace(known, apart_sigma=apart_sigma, drift_sigma=drift_sigma)
+        health = replace(known, submap_sigma=submap_sigma, drift_sigma=drift_sigma)
         return Present(self.snapshot(), published, health.metric, health)
 
     def health(self, stamp_s: float, state: str, metric: bool) -> Health:

@@ -1,4 +1,4 @@
-"""Lost: the pose is predicted, every frame tries to relocalise, and after a while a new piece of map is started."""
+"""Lost: the pose is predicted, every frame tries to relocalise, and after a while a new submap is started."""
 
 import numpy as np
 
@@ -13,10 +13,10 @@ from edgeslam_torch.tracking.tracker import View
 from edgeslam_torch.types import FloatArray, Frame, FrameStatus
 
 LOST_BEFORE_RESTART_S = 0.65
-"""Time without a pose after which a new piece of map is started from the predicted one."""
+"""Time without a pose after which a new submap is started at the predicted one."""
 
 UNCONFIRMED = "looks like a known place, the next frames must agree"
-"""Reason of an unconfirmed relocalisation, in words."""
+"""Reason given for an unconfirmed relocalisation."""
 
 
 class Lost:
@@ -28,7 +28,7 @@ class Lost:
         self.starting = starting
 
     def step(self, frame: Frame, seen: LazyView, machine: Machine) -> Step:
-        """Relocalise the frame, else predict its pose or start a new piece."""
+        """Relocalise the frame, else predict its pose or start a new submap."""
         T_predicted = self.system.predict(frame.stamp_s, lost=True)
         found = self.tracking.search(frame, seen, T_predicted, machine.lost_frames)
         return found or self.miss(frame, seen.view, T_predicted, machine.lost_since_s)
@@ -39,9 +39,9 @@ class Lost:
         return self.miss(frame, view, self.system.predict(frame.stamp_s, lost=False), np.inf)
 
     def miss(self, frame: Frame, view: View, T_predicted: FloatArray, lost_since_s: float) -> Step:
-        """Predict the pose, or start a new piece of map there after a longer loss."""
+        """Predict the pose, or start a new submap there after a longer loss."""
         system = self.system
-        self.tracking.backfill.keep(frame.index, view)
+        self.tracking.retroactive.keep(frame.index, view)
         system.motion.drift(T_predicted)
         system.fusion.add_visual(frame.stamp_s, se3.inverse(T_predicted), np.inf, np.inf, tracked=False)
         seen = len(view.features.uv)

@@ -2,12 +2,12 @@
 
 ::
 
-       two views, map from depth, earlier piece            edges alone
+       two views, map from depth, earlier submap           edges alone
     STARTING ---------------------------> TRACKING <----------------------> EDGES_ONLY
       ^   ^ \\                              |    ^           points             |
       |   |  \\ too little texture          |    |                              |
-      |   +-- guess out of sight            | no pose                           | no pose
-      |        \\                           v    | found again                  |
+      |   +-- first view lost               | no pose                           | no pose
+      |        \\                           v    | relocalised                  |
       +---------+-----------------------> LOST ---+ <---------------------------+
          lost for too long
 """
@@ -21,25 +21,25 @@ class State(StrEnum):
     """What the current pose is based on."""
 
     STARTING = "starting"
-    """Predicted depths of the first keyframe of a piece; nothing is triangulated yet."""
+    """Predicted depths of a submap's first keyframe; nothing is triangulated yet."""
     TRACKING = "tracking"
-    """Keypoints of the map, with or without edges beside them."""
+    """Keypoints of the map, with or without edges."""
     EDGES_ONLY = "edges only"
     """Edges of the map; too few keypoints agree."""
     LOST = "lost"
-    """A prediction."""
+    """Motion prediction."""
 
 
 class Event(StrEnum):
     """Outcome of a frame."""
 
     BEGUN = "begun"
-    """A piece of map was started with predicted depths."""
+    """A submap was started with predicted depths."""
     NO_TEXTURE = "too little texture to begin"
     WAITING = "waiting for parallax"
-    MAP_STANDS = "map stands"
+    MAP_READY = "map ready"
     """A map exists, from two views or from the depth network if the view changed before there was parallax."""
-    RETURNED = "found in an earlier piece of map"
+    RETURNED = "found in an earlier submap"
     POINTS = "found by points"
     EDGES = "found by edges alone"
     NOTHING = "not found"
@@ -50,16 +50,16 @@ _FOUND = {Event.POINTS: State.TRACKING, Event.EDGES: State.EDGES_ONLY, Event.NOT
 TRANSITIONS: dict[State, dict[Event, State]] = {
     State.STARTING: {
         Event.WAITING: State.STARTING,
-        Event.BEGUN: State.STARTING,  # the guess went out of sight: the next attempt
+        Event.BEGUN: State.STARTING,  # the first keyframe left the view: next attempt
         Event.NO_TEXTURE: State.LOST,
-        Event.MAP_STANDS: State.TRACKING,
+        Event.MAP_READY: State.TRACKING,
         Event.RETURNED: State.TRACKING,
     },
     State.TRACKING: _FOUND,
     State.EDGES_ONLY: _FOUND,
     State.LOST: {Event.POINTS: State.TRACKING, Event.NOTHING: State.LOST, Event.BEGUN: State.STARTING},
 }
-"""Transitions. The states' code causes no other events; wherever an event is listed it leads to the same state."""
+"""Transitions. The states cause no other events; an event leads to the same state wherever it is listed."""
 
 LEADS_TO: dict[Event, State] = {event: state for row in TRANSITIONS.values() for event, state in row.items()}
 """State after each event, also after one that its state does not list."""
@@ -70,8 +70,8 @@ class Machine:
 
     Example:
         >>> machine = Machine()
-        >>> for stamp_s, event in enumerate([Event.BEGUN, Event.MAP_STANDS, Event.NOTHING, Event.NOTHING]):
-        ...     machine.meet(event, stamp_s)
+        >>> for stamp_s, event in enumerate([Event.BEGUN, Event.MAP_READY, Event.NOTHING, Event.NOTHING]):
+        ...     machine.apply(event, stamp_s)
         >>> machine.state, machine.lost_frames, machine.lost_since_s
         (<State.LOST: 'lost'>, 2, 2)
     """
@@ -81,12 +81,12 @@ class Machine:
         self.lost_frames = 0
         """Frames in a row without a pose."""
         self.lost_since_s = math.inf
-        """Stamp of the first of them; infinite while not lost, minus infinity without a map to return to."""
+        """Stamp of the first of them; infinite while not lost, minus infinity without a map to relocalise in."""
         self.unexpected: Counter[str] = Counter()
-        """Events that their state does not list: errors of this program, by state and event in words."""
+        """Events that their state does not list: programming errors, counted by state and event."""
 
-    def meet(self, event: Event, stamp_s: float) -> None:
-        """Apply an event. One that the current state does not list is counted, and leads where it leads elsewhere."""
+    def apply(self, event: Event, stamp_s: float) -> None:
+        """Apply an event. One that the current state does not list is counted and applied all the same."""
         if event not in TRANSITIONS[self.state]:
             self.unexpected[f"{event} while {self.state}"] += 1
         self.state = LEADS_TO[event]
@@ -100,7 +100,7 @@ class Machine:
             self.lost_since_s = stamp_s
 
     def warning(self) -> str | None:
-        """What the states did that the table does not list; None if nothing."""
+        """Unlisted transitions that occurred; None if there were none."""
         if not self.unexpected:
             return None
         cases = ", ".join(f"{what} ({count} times)" for what, count in self.unexpected.items())

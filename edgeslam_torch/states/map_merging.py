@@ -1,4 +1,4 @@
-"""Joining of pieces, and closing of loops, between two frames; the current pose is transformed along."""
+"""Merging of submaps and loop closure between two frames; the current pose is transformed with the map."""
 
 import math
 from dataclasses import replace
@@ -15,25 +15,25 @@ from edgeslam_torch.states.system import System
 from edgeslam_torch.types import FloatArray
 
 _COUNTED: dict[type, str] = {Join: "joined", Closure: "loops_closed", Rescaled: "rescaled", Turned: "turned"}
-"""Names of the events of the summary."""
+"""Keys of these events in the summary."""
 
 
 class MapMerging:
-    """Queries the atlas while the map is not in use elsewhere."""
+    """Runs the atlas while the map is not in use elsewhere."""
 
     def __init__(self, system: System, atlas: Atlas) -> None:
         self.system = system
         self.atlas = atlas
         self._piece: int | None = None
-        """Whose metres hold."""
+        """Submap whose scale is published."""
         self._left: int | None = None
-        """Piece that the camera was in when the last frame was done."""
+        """Submap of the previous frame."""
 
     def update(self, stamp_s: float = math.inf) -> str:
-        """Join pieces, and close loops, that the newest keyframes connect; returns it in words, empty without any.
+        """Merge submaps and close loops that the newest keyframes connect; returns a description, empty without any.
 
         Args:
-            stamp_s: Of the present frame.
+            stamp_s: Stamp of the present frame.
         """
         if self.system.mapping.busy:
             return ""
@@ -41,7 +41,7 @@ class MapMerging:
         if len(self.system.map.begun) > 1:
             self._notice_return()
             before = self._last()
-            if (aligned := self.atlas.align(stamp_s, self.system.other_unit())) is not None:
+            if (aligned := self.atlas.align(stamp_s, self.system.scale_ratio())) is not None:
                 self._follow(aligned, *before)
                 words.append(str(aligned))
         while (change := self._once(stamp_s)) is not None:
@@ -49,7 +49,7 @@ class MapMerging:
         return "; ".join(words)
 
     def enter(self, piece: int) -> None:
-        """Take over the metres of the camera's piece of map where an earlier flight has left them."""
+        """Publish in the metric scale of the camera's submap where an earlier flight has determined it."""
         system = self.system
         if piece == self._piece:
             return
@@ -64,7 +64,7 @@ class MapMerging:
         system.published = published
 
     def _notice_return(self) -> None:
-        """When the camera returns to an earlier piece, the one that it left is complete: both are compared again."""
+        """When the camera returns to an earlier submap, the one that it left is complete: compare both again."""
         piece = self.system.map.piece_of(self.system.log.records[-1].keyframe_id)
         returned = self._left is not None and piece < self._left
         self._left = piece
@@ -72,13 +72,13 @@ class MapMerging:
             self.atlas.ask_again()
 
     def finish(self) -> None:
-        """Query every keyframe again where there are several pieces, since they have grown."""
+        """Query every keyframe once more if there are several submaps, since these have grown."""
         if self.atlas.is_divided:
             self.atlas.ask_all_again()
         self.update()
 
     def _last(self) -> tuple[int, int, FloatArray]:
-        """Keyframe that the newest frame is tied to, its piece, and its pose."""
+        """Reference keyframe of the newest frame, its submap, and its pose."""
         last = self.system.log.records[-1].keyframe_id
         return last, self.system.map.piece_of(last), self.system.map.pose_of(last)
 
@@ -92,21 +92,21 @@ class MapMerging:
         return change
 
     def _follow(self, change: Join | Closure | Rescaled | Turned, last: int, piece: int, T_k_w: FloatArray) -> None:
-        """Take the live pose and the metres along with a map that has changed since the newest frame was tied to it."""
+        """Transform the current pose and the metric scale with a map that changed after the newest frame."""
         system = self.system
         T_c_k = system.motion.T_c_w @ se3.inverse(T_k_w)
         scale = change.growth(piece, last)
         T_c_k[:3, 3] *= scale
-        system.motion.carry(T_c_k @ system.map.pose_of(last), scale)
-        if isinstance(change, Rescaled):  # metres that are held, where the flight tells no new ones, are of this piece
+        system.motion.transform(T_c_k @ system.map.pose_of(last), scale)
+        if isinstance(change, Rescaled):  # the scale estimate without new measurements is that of this submap
             system.fusion.metres.follow(math.log(scale))
         system.compare_depths_again()
         system.fusion.revise(*system.log.poses())
-        # Poses published before belong to a map that has moved since.
+        # Poses published before belong to the map before the change.
         system.published = replace(system.published, revision=system.published.revision + 1)
         if isinstance(change, Turned):
-            system.apart.turned(change.piece, change.sigma_rad)
+            system.submap_uncertainty.turned(change.piece, change.sigma_rad)
         elif isinstance(change, Join):
-            system.apart.moved(change.moved, sim3.scale_of(change.S))
+            system.submap_uncertainty.moved(change.moved, sim3.scale_of(change.S))
         kind = _COUNTED[type(change)]
         system.events[kind] = system.events.get(kind, 0) + 1

@@ -1,4 +1,4 @@
-"""Poses for lost frames, computed backwards in time once the map that they show exists.
+"""Poses of lost frames, computed backwards in time once their place is mapped.
 
 A kidnapped camera sees its new place at once, but that place is mapped or recognised later.
 """
@@ -12,7 +12,7 @@ from edgeslam_torch.types import FloatArray, IntArray
 MAX_FRAMES = 60
 """Maximum number of lost frames whose features are kept (3 MB): two seconds at 30 Hz."""
 MISSES = 2
-"""Consecutive failures after which earlier frames are given up."""
+"""Consecutive failures after which the search through earlier frames stops."""
 
 
 class RetroactiveLocalisation:
@@ -23,19 +23,19 @@ class RetroactiveLocalisation:
         self._lost: list[tuple[int, View]] = []
 
     def keep(self, index: int, view: View) -> None:
-        """Store a frame without a pose, by its index; beyond the limit the oldest is dropped."""
+        """Store a frame without a pose by its index; beyond the limit the oldest is dropped."""
         self._lost = [*self._lost[1 - MAX_FRAMES :], (index, view)]
 
     def place(self, keyframe: Keyframe, T_c_w: FloatArray, anchors: IntArray) -> int:
         """Track the lost frames one by one, newest first.
 
         Args:
-            keyframe: Their poses are tied to it.
+            keyframe: Reference keyframe for their poses.
             T_c_w: ``(4, 4)`` pose of the frame that followed them.
-            anchors: What that frame sees.
+            anchors: Anchors visible in that frame.
 
         Returns:
-            How many were found.
+            Number of frames localised.
         """
         tracker, poses, missed = self.system.tracker, {}, 0
         for index, view in reversed(self._lost):

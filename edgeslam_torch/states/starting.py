@@ -1,5 +1,4 @@
-"""Start of a piece of map: predicted depths at its first keyframe, until two views or a changed view establish the
-map."""
+"""Start of a submap: predicted depths at its first keyframe, until two views or a changed view establish the map."""
 
 from dataclasses import replace
 
@@ -7,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgeslam_torch.atlas.atlas import CLOSER_LOOKS, Atlas
-from edgeslam_torch.atlas.place_recognition import lookalikes
+from edgeslam_torch.atlas.place_recognition import revisit_candidates
 from edgeslam_torch.frontend.aperture import are_corners
 from edgeslam_torch.frontend.image import as_grey, colours_at
 from edgeslam_torch.map.depth_prior import sample
@@ -35,29 +34,28 @@ MIN_INLIERS = 15
 """Minimum number of inliers; fewer could agree with a wrong pose."""
 
 HANDOVER_INLIERS = 50
-"""Number of inliers below which the next attempt starts from the current frame."""
+"""Number of inliers below which the next attempt starts at the current frame."""
 
 MAX_WAITING_IN_REAL_TIME = 3
-"""Maximum number of intermediate frames that become keyframes in real time; while they are mapped, no other keyframe
-can be."""
+"""Maximum number of intermediate frames that become keyframes in real time; mapping them blocks other keyframes."""
 
 FIRST_FRAME = "first frame, depth guessed"
 AFTER_LOSS = "new piece of map after loss: pose predicted, depth guessed"
-"""How a piece of map was started, in words."""
+"""Origin of a submap."""
 
 NOWHERE = Reach(np.eye(4), -np.inf, -np.inf)
-"""Of a camera that may be in another piece of map: no place is expected, so that several frames must agree."""
+"""For a camera that may be in another submap: no position is expected, so that several frames must agree."""
 
 DEPTH_MAP = "map from the depth network, no parallax yet"
 
 
 class Starting:
-    """The state before a map stands.
+    """The state before a map exists.
 
     Args:
         system: Shared parts.
         tracking: State that takes over once there is a map.
-        atlas: Atlas of the earlier pieces.
+        atlas: Atlas of the earlier submaps.
         lm: Solver settings.
         realtime: Limits the number of waiting frames.
     """
@@ -73,15 +71,15 @@ class Starting:
             self.config = replace(self.config, max_keyframes=most)
         self._attempt: Bootstrap | None = None
         self._seen: list[tuple[int, View]] = []
-        """Frames of the attempt, the newest ones: placed later if an earlier piece is recognised."""
+        """Newest frames of the attempt, localised later if an earlier submap is recognised."""
 
     def begin(self, frame: Frame, view: View, reason: str) -> Step:
-        """Start a piece of map at the current pose with predicted depths.
+        """Start a submap at the current pose with predicted depths.
 
         Args:
             frame: Present frame.
             view: Its features.
-            reason: How the piece is begun, in words.
+            reason: Origin of the submap.
         """
         system, slam_map = self.system, self.system.map
         system.collect(wait=True)
@@ -100,7 +98,7 @@ class Starting:
             system.mapping.look(frame, keyframe)
         guess = self._guess_depth(keyframe)
         slam_map.begin_piece(reason)
-        system.carried_to(slam_map.piece, frame.stamp_s)
+        system.begin_submap(slam_map.piece, frame.stamp_s)
         system.fusion.begin_piece()
         colour = colours_at(keyframe.image, view.features.uv)
         self._seen = [(frame.index, view)]
@@ -122,7 +120,7 @@ class Starting:
         if back is not None:
             self._give_up()
             for index, its_view in self._seen:
-                self.tracking.backfill.keep(index, its_view)
+                self.tracking.retroactive.keep(index, its_view)
             return replace(self.tracking.return_to(frame, seen, back.T_c_w, back), event=Event.RETURNED)
         self._seen = [*self._seen[1 - MAX_FRAMES :], (frame.index, view)]
         if track is None or track.inliers < MIN_INLIERS:
@@ -139,11 +137,11 @@ class Starting:
         if leaving:
             with self.system.timed("mapping"), self.system.map.lock:
                 started = attempt.adopt(frame, view, track)
-            return self._stands(frame, seen, started, DEPTH_MAP, track, two_view)
+            return self._hand_over(frame, seen, started, DEPTH_MAP, track, two_view)
         if two_view.ok:
             with self.system.timed("mapping"), self.system.map.lock:
                 started = attempt.replace_map(frame, view, two_view, self.lm)
-            return self._stands(frame, seen, started, "two views", track, two_view)
+            return self._hand_over(frame, seen, started, "two views", track, two_view)
         attempt.wait(frame, view, track)
         if track.inliers < HANDOVER_INLIERS:
             return self.begin(frame, view, "first keyframe out of sight before parallax sufficed")
@@ -159,17 +157,17 @@ class Starting:
             self._attempt = None
 
     def _find_earlier_piece(self, attempt: Bootstrap, frame: Frame, view: View) -> Track | None:
-        """Relocalise the frame in an earlier piece, whose relative pose is unknown."""
+        """Relocalise the frame in an earlier submap, whose relative pose is unknown."""
         strangers = self.atlas.strangers(self.system.map.piece_of(attempt.reference.id))
         if not strangers:
             return None
-        asked = lookalikes(self.system.map, view.words, strangers, CLOSER_LOOKS)
-        return self.tracking.find(frame, view, asked, NOWHERE)
+        keyframes = revisit_candidates(self.system.map, view.words, strangers, CLOSER_LOOKS)
+        return self.tracking.find(frame, view, keyframes, NOWHERE)
 
     def _track(self, attempt: Bootstrap, frame: Frame, view: View) -> Track | None:
         system = self.system
         T_predicted = system.predict(frame.stamp_s, lost=False)
-        track = attempt.track(view, T_predicted, system.expectation(frame.stamp_s, T_predicted))
+        track = attempt.track(view, T_predicted, system.pose_prior(frame.stamp_s, T_predicted))
         if track is None or track.inliers < system.config.tracking.min_inliers:  # a fast rotation: search everywhere
             newest = candidates(system.tracker, T_predicted, 1, 0)
             track = next(filter(None, (match_keyframe(system.tracker, view, k) for k in newest)), None)
@@ -177,7 +175,7 @@ class Starting:
                 return None
         return track
 
-    def _stands(
+    def _hand_over(
         self, frame: Frame, seen: LazyView, started: StartedMap, reason: str, track: Track, two_view: TwoView
     ) -> Step:
         """Hand over to tracking with the new map."""
@@ -186,15 +184,15 @@ class Starting:
         self._attempt, self._seen = None, []
         system = self.system
         system.log.replace(started.T_c_w, [reference, *(k for _, k in started.new)])
-        system.see_again(reference.stamp_s, track)
+        system.add_earlier(reference.stamp_s, track)
         system.motion.T_c_w = started.T_c_w[max(started.T_c_w)]
         system.motion.move(frame.stamp_s, keyframe.T_c_w)
         system.edges.announce(reference)
         system.compare_depth(reference)
         self.tracking.begin(seen, started.new)
-        self.tracking.backfill.place(reference, reference.T_c_w, reference.anchor[reference.anchor >= 0])
+        self.tracking.retroactive.place(reference, reference.T_c_w, reference.anchor[reference.anchor >= 0])
         return Step(
-            Event.MAP_STANDS, keyframe, FrameStatus.INITIALISED, reason, track, two_view.parallax_rad, is_keyframe=True
+            Event.MAP_READY, keyframe, FrameStatus.INITIALISED, reason, track, two_view.parallax_rad, is_keyframe=True
         )
 
     def _corners(self, frame: Frame, view: View) -> NDArray[np.bool_]:
@@ -216,7 +214,7 @@ class Starting:
         if keyframe.depth is not None and keyframe.depth.is_relative:  # its shape alone
             guess[:, 0] = self._earlier_depth() * np.where(known, network_m, 1.0) / np.median(network_m[known])
             return guess
-        # A network that is wrong here was as wrong before: the new piece gets the unit of the one that was lost.
+        # The network's scale error is constant in a scene: the new submap inherits the scale of the previous one.
         per_unit = self.system.fusion.metres.network_unit() or self.system.published.scale
         guess[:, 0] = np.where(known, network_m, np.nanmedian(network_m)) / per_unit
         guess[known, 1] = sigma_log[known]

@@ -17,12 +17,12 @@ class Step:
     """Reference keyframe of the pose."""
     status: FrameStatus
     reason: str = ""
-    """Reason for the status, in words."""
+    """Reason for the status."""
     track: Track | None = None
     parallax_rad: float = 0.0
     is_keyframe: bool = False
     T_c_before: FloatArray | None = None
-    """``(4, 4)`` of a new keyframe: as tracked, relative to the keyframe of the frame before."""
+    """``(4, 4)`` as tracked before mapping, relative to the reference keyframe of the previous frame."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,5 +44,5 @@ class Located:
     relocalised: bool = False
     edges: int = 0
     """Number of edge points used for the pose."""
-    denied: bool = False
-    """Whether the drone's sensors deny the pose, and the images hold it all the same."""
+    contradicted: bool = False
+    """Whether the drone's sensors contradict the pose, and matching confirmed it all the same."""

@@ -1,8 +1,7 @@
-"""How well it is known where a piece of map lies that was begun where the camera had been carried to without a map.
+"""Uncertainty of a submap that was started at a predicted pose, relative to the first one.
 
-Poses of different pieces are unrelated as far as images go. The drone's sensors, or constant velocity, relate them: by
-the predicted pose with which a piece begins, in the unit that its depths were guessed in. What that leaves open stays
-until both pieces are found to be one.
+Images do not relate submaps until they are merged. Until then the predicted pose at which a submap starts relates them,
+if the drone's sensors predicted it; its depths are in a scale of their own.
 """
 
 import math
@@ -17,31 +16,31 @@ from edgeslam_torch.types import FloatArray, ScaleEstimate
 @dataclass(frozen=True, slots=True)
 class _Begun:
     centre: FloatArray
-    """``(3,)`` of the camera [map units]."""
+    """``(3,)`` camera centre [map units]."""
     sigma_t: float
-    """Standard deviation of it per axis [map units], that of the piece before included."""
+    """Standard deviation of the centre per axis [map units], including that of the previous submap."""
     sigma_r_rad: float
 
 
 @dataclass(slots=True)
-class Apart:
-    """What is known of the pieces that began after the flight's first one, by their numbers."""
+class SubmapUncertainty:
+    """Uncertainty of the submaps after the first one, by their numbers."""
 
-    begun: dict[int, _Begun] = field(default_factory=dict)
+    starts: dict[int, _Begun] = field(default_factory=dict)
     unit: ScaleEstimate = field(default_factory=ScaleEstimate)
-    """Metres per map unit, as they were told when the camera left the first piece."""
+    """Metres per map unit of the first submap, as estimated when the camera left it."""
 
-    def other_unit(self, piece: int, told: ScaleEstimate) -> tuple[float, float] | None:
-        """By how much what is told now of a later piece's unit surely differs from the first one's, and the standard
-        deviation of the logarithm of that; None where it does not, or nobody knows."""
-        if piece not in self.begun or not (math.isfinite(told.sigma) and math.isfinite(self.unit.sigma)):
+    def scale_ratio(self, piece: int, scale: ScaleEstimate) -> tuple[float, float] | None:
+        """Ratio of a later submap's scale to that of the first one and the standard deviation of its logarithm; None
+        where the ratio is not significant or unknown."""
+        if piece not in self.starts or not (math.isfinite(scale.sigma) and math.isfinite(self.unit.sigma)):
             return None
-        sigma = math.hypot(told.sigma / told.value, self.unit.sigma / self.unit.value)
-        ratio = told.value / self.unit.value
+        sigma = math.hypot(scale.sigma / scale.value, self.unit.sigma / self.unit.value)
+        ratio = scale.value / self.unit.value
         return (ratio, sigma) if is_other(ratio, sigma) else None
 
     def begin(self, piece: int, before: int, centre: FloatArray, sigma_t: float, sigma_r_rad: float) -> None:
-        """A piece begins at a predicted pose.
+        """Add a submap that starts at a predicted pose.
 
         Args:
             piece: Its number.
@@ -50,48 +49,47 @@ class Apart:
             sigma_t: Standard deviation of the prediction's translation per axis [map units].
             sigma_r_rad: The same of its rotation.
         """
-        earlier = self.begun.get(before)
+        earlier = self.starts.get(before)
         if earlier is not None:
             sigma_t = math.hypot(sigma_t, self.sigma(before, centre, 0.0))
             sigma_r_rad = math.hypot(sigma_r_rad, earlier.sigma_r_rad)
-        self.begun[piece] = _Begun(np.array(centre, dtype=np.float64), sigma_t, sigma_r_rad)
+        self.starts[piece] = _Begun(np.array(centre, dtype=np.float64), sigma_t, sigma_r_rad)
 
     def turned(self, piece: int, sigma_r_rad: float) -> None:
-        """A piece was turned about where it began, as sure as that is."""
-        if piece in self.begun:
-            self.begun[piece] = replace(self.begun[piece], sigma_r_rad=sigma_r_rad)
+        """Replace the rotational uncertainty of a submap that was rotated about its start."""
+        if piece in self.starts:
+            self.starts[piece] = replace(self.starts[piece], sigma_r_rad=sigma_r_rad)
 
     def moved(self, piece: int, grown: float) -> None:
-        """A piece was moved to another, and is larger by a factor."""
-        if piece not in self.begun and math.isfinite(self.unit.sigma):
+        """Update the first scale after a submap was merged into another and grew by a factor."""
+        if piece not in self.starts and math.isfinite(self.unit.sigma):
             self.unit = replace(self.unit, value=self.unit.value / grown, sigma=self.unit.sigma / grown)
 
-    def carried_sigma(self, piece: int) -> float:
-        """Standard deviation per axis [map units] of where a piece began; infinite unless the drone's sensors carried
-        the camera there."""
-        begun = self.begun.get(piece)
-        return math.inf if begun is None else begun.sigma_t
+    def start_sigma(self, piece: int) -> float:
+        """Standard deviation per axis [map units] of a submap's start; infinite unless sensors predicted it."""
+        start = self.starts.get(piece)
+        return math.inf if start is None else start.sigma_t
 
     def sigma(self, piece: int, centre: FloatArray, sigma_scale: float) -> float:
-        """Standard deviation per axis [map units] of a camera of a piece in the world of the first one; infinite for
-        one that nothing relates to it, as that of an earlier flight.
+        """Standard deviation per axis [map units] of a camera of a submap in the world of the first one; infinite for
+        an unrelated submap, as that of an earlier flight.
 
         Args:
-            piece: Number of the piece as the map is now: pieces that were joined have the lower of their numbers.
+            piece: Its present number: merged submaps have the lower of their numbers.
             centre: The camera ``(3,)`` [map units].
-            sigma_scale: Relative standard deviation of a piece's unit.
+            sigma_scale: Relative standard deviation of a submap's scale.
 
         Example:
-            >>> apart = Apart()
-            >>> apart.begin(1, 0, np.zeros(3), 0.1, 0.02)
-            >>> round(apart.sigma(1, np.array([3.0, 0, 0]), 0.0), 3)
+            >>> uncertainty = SubmapUncertainty()
+            >>> uncertainty.begin(1, 0, np.zeros(3), 0.1, 0.02)
+            >>> round(uncertainty.sigma(1, np.array([3.0, 0, 0]), 0.0), 3)
             0.117
         """
-        begun = self.begun.get(piece)
-        if begun is None:
+        start = self.starts.get(piece)
+        if start is None:
             return math.inf
-        way = float(np.linalg.norm(centre - begun.centre))
+        way = float(np.linalg.norm(centre - start.centre))
         if way == 0.0:
-            return begun.sigma_t
-        # Both pieces have a unit of their own.
-        return math.hypot(begun.sigma_t, way * begun.sigma_r_rad, way * math.sqrt(2.0) * sigma_scale)
+            return start.sigma_t
+        # Both submaps have a scale of their own.
+        return math.hypot(start.sigma_t, way * start.sigma_r_rad, way * math.sqrt(2.0) * sigma_scale)

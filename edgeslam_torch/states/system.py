@@ -21,9 +21,9 @@ from edgeslam_torch.mapping.edges.edge_map import EdgeMap
 from edgeslam_torch.mapping.pipeline import Mapped, MappingPipeline
 from edgeslam_torch.stage_times import timed
 from edgeslam_torch.states.drift import SHARE, Drift
-from edgeslam_torch.states.submap_uncertainty import Apart
+from edgeslam_torch.states.submap_uncertainty import SubmapUncertainty
 from edgeslam_torch.tracking.motion_model import MotionModel
-from edgeslam_torch.tracking.pose_prior import Attitude, Place, Told, TrackingPrior, Vertical
+from edgeslam_torch.tracking.pose_prior import Attitude, Place, SensorPrior, TrackingPrior, Vertical
 from edgeslam_torch.tracking.relocaliser import Reach, reach_after
 from edgeslam_torch.tracking.tracker import Track, Tracker
 from edgeslam_torch.types import FloatArray, Frame
@@ -31,15 +31,15 @@ from edgeslam_torch.types import FloatArray, Frame
 MIN_KEYPOINTS = 100
 """Fewer keypoints than this cannot start a map."""
 
-YOUNG_S = 10.0
-"""Time after the beginning of a map in which the drone's roll and pitch hold its frames, if nothing has told metres: a
-take-off and a look up and down take as long, and by then something has parallax."""
+NEW_MAP_S = 10.0
+"""Age of a submap up to which the drone's roll and pitch constrain its frames if the metric scale is unknown; later
+there is parallax."""
 MIN_GAP_S = 0.15
 """Time between frames from which on the filter predicts the pose for tracking. Telemetry comes every 0.1 s in whole
-degrees: over less, constant velocity predicts better, and flow that starts from a worse prediction ends worse."""
+degrees: over shorter gaps constant velocity from images is more accurate."""
 
 _BY_SENSORS = ("filter", "telemetry")
-"""Predictions that carry a camera from one piece of map to another: constant velocity alone relates nothing."""
+"""Predictions that relate two submaps; constant velocity does not."""
 
 UNKNOWN_SIGMA = 0.01
 """Standard deviation of a visual pose without a covariance [map units, rad]."""
@@ -60,15 +60,21 @@ class System:
     motion: MotionModel
     published: OutputFrame = field(default_factory=OutputFrame)
     events: dict[str, int] = field(
-        default_factory=lambda: {"lost": 0, "relocalised": 0, "restarted": 0, "initialisations_refused": 0, "denied": 0}
+        default_factory=lambda: {
+            "lost": 0,
+            "relocalised": 0,
+            "restarted": 0,
+            "initialisations_refused": 0,
+            "contradicted": 0,
+        }
     )
-    """Counts of losses, relocalisations, restarts, refused initialisations, and of poses that the images hold although
-    the drone has not moved so."""
+    """Counts of losses, relocalisations, restarts, refused initialisations, and of poses that images confirmed although
+    the drone's sensors contradicted them."""
     has_telemetry: bool = False
     piece_began_s: float = -np.inf
-    """Stamp of the frame with which the newest piece of map began."""
-    apart: Apart = field(default_factory=Apart)
-    apart_sigma: float = 0.0
+    """Stamp of the frame with which the newest submap began."""
+    submap_uncertainty: SubmapUncertainty = field(default_factory=SubmapUncertainty)
+    submap_sigma: float = 0.0
     """As in `Health`, of the newest tracked frame."""
     drift: Drift = field(default_factory=Drift)
     drift_sigma: float = 0.0
@@ -77,8 +83,8 @@ class System:
     """Stamp of the newest keyframe, or of a later frame that needed not become one."""
     shows_nothing_new: bool = False
     """Whether the current image repeats the previous one."""
-    _told: tuple[float, Told | None] = field(default=(-np.inf, None), init=False, repr=False)
-    """What the drone's sensors tell of one frame: it is asked for several times."""
+    _sensor_prior: tuple[float, SensorPrior | None] = field(default=(-np.inf, None), init=False, repr=False)
+    """Sensor prior of one frame by its stamp; it is used several times."""
     stage_ms: dict[str, float] = field(default_factory=dict)
     """Times of the current frame."""
 
@@ -89,47 +95,51 @@ class System:
     # -- motion ------------------------------------------------------------------------------------------------
 
     def predict(self, stamp_s: float, lost: bool) -> FloatArray:
-        """``T_c_w`` expected at a stamp: at constant velocity over short gaps, by telemetry over others.
+        """Predicted ``T_c_w``: constant velocity over short gaps, telemetry over others.
 
-        By the Kalman filter where it is fed; before it knows scale and delay, by telemetry alone.
+        Telemetry goes through the Kalman filter once scale and delay are known.
         """
         gap = stamp_s - self.motion.stamp_s >= MIN_GAP_S
-        if self.has_telemetry and (lost or self.motion.stands or (gap and self.fusion.filtering)):
+        if self.has_telemetry and (lost or self.motion.velocity_unknown or (gap and self.fusion.filtering)):
             estimate = self.fusion.predict(stamp_s)
             if estimate is not None:
                 return se3.inverse(estimate.T_w_c)
         return self.motion.predict(stamp_s)
 
-    def expectation(self, stamp_s: float, T_predicted: FloatArray) -> TrackingPrior | None:
+    def pose_prior(self, stamp_s: float, T_predicted: FloatArray) -> TrackingPrior | None:
         """The predicted pose with the uncertainty due to accelerations; None without a scale.
 
-        While its map is young, roll and pitch are the drone's: images then hardly tell a climb from a turn.
+        In a new map it includes the drone's roll and pitch: with little parallax a climb looks like a turn.
         """
         if not self.mapping.has_metres:
             return None
-        told = self.fusion.vertical(stamp_s) if self._is_young(stamp_s) else None
-        vertical = None if told is None else Vertical(*told)
-        by_motion = self.motion.expectation(stamp_s, T_predicted, self.published.scale)
-        moved = self.told(stamp_s)
-        return TrackingPrior(by_motion, vertical, None if moved is None else moved.place)
+        up = self.fusion.vertical(stamp_s) if self._is_new(stamp_s) else None
+        vertical = None if up is None else Vertical(*up)
+        by_motion = self.motion.pose_prior(stamp_s, T_predicted, self.published.scale)
+        sensors = self.sensor_prior(stamp_s)
+        return TrackingPrior(by_motion, vertical, None if sensors is None else sensors.place)
 
-    def told(self, stamp_s: float) -> Told | None:
-        """What the drone's sensors tell of a frame's pose; None where none has proven to be of this flight."""
-        if self._told[0] != stamp_s:
-            self._told = stamp_s, self._ask(stamp_s) if self.has_telemetry else None
-        return self._told[1]
+    def sensor_prior(self, stamp_s: float) -> SensorPrior | None:
+        """Prior on a frame's pose by the drone's sensors; None without validated ones."""
+        if self._sensor_prior[0] != stamp_s:
+            self._sensor_prior = stamp_s, self._make_sensor_prior(stamp_s) if self.has_telemetry else None
+        return self._sensor_prior[1]
 
-    def _ask(self, stamp_s: float) -> Told | None:
-        turned, reckoned = self.fusion.told(stamp_s)
+    def _make_sensor_prior(self, stamp_s: float) -> SensorPrior | None:
+        turned, reckoned = self.fusion.attitude_and_position(stamp_s)
         if turned is None and reckoned is None:
             return None
         place = None if reckoned is None else Place(reckoned.R_w_m, reckoned.centre, reckoned.doubt)
-        return Told(None if turned is None else Attitude(*turned), place)
+        return SensorPrior(None if turned is None else Attitude(*turned), place)
 
-    def carried(self, stamp_s: float) -> PoseEstimate | None:
-        """Where the drone's sensors say the camera is; None without them."""
-        told = self.fusion.predict(stamp_s)
-        return told if told is not None and told.source in _BY_SENSORS and np.isfinite(told.sigma_t) else None
+    def sensor_prediction(self, stamp_s: float) -> PoseEstimate | None:
+        """Pose predicted by the drone's sensors; None without them."""
+        predicted = self.fusion.predict(stamp_s)
+        return (
+            predicted
+            if predicted is not None and predicted.source in _BY_SENSORS and np.isfinite(predicted.sigma_t)
+            else None
+        )
 
     def reach(self, stamp_s: float, T_predicted: FloatArray) -> Reach:
         """Region that the camera can have reached during frames without a pose."""
@@ -143,49 +153,49 @@ class System:
         T_w_c = se3.inverse(track.T_c_w)
         with self.timed("fusion"):
             self.fusion.add_visual(stamp_s, T_w_c, *_sigmas(track))
-            held = bool(self.apart.begun) and self.other_unit() is not None
-            self.published = self.fusion.republished(self.published, T_w_c[:3, 3], held)
-        if self.apart.begun:
-            self.apart_sigma = self._apart_sigma(self._piece())
+            keep_scale = bool(self.submap_uncertainty.starts) and self.scale_ratio() is not None
+            self.published = self.fusion.republished(self.published, T_w_c[:3, 3], keep_scale)
+        if self.submap_uncertainty.starts:
+            self.submap_sigma = self._submap_sigma(self._piece())
 
-    def other_unit(self) -> tuple[float, float] | None:
-        """As `Apart.other_unit`, of the camera's piece, if what is told now would revise the published unit: it is that
-        piece's, which is brought to the first one's, as all that lies before it is published in that."""
-        told, piece = self.fusion.scale(), self._piece()
-        return self.apart.other_unit(piece, told) if self.published.is_wrong_by(told) else None
+    def scale_ratio(self) -> tuple[float, float] | None:
+        """As `SubmapUncertainty.scale_ratio`, of the camera's submap, if the present estimate would change the
+        published scale: the submap is then rescaled, since earlier output is in the published scale."""
+        scale, piece = self.fusion.scale(), self._piece()
+        return self.submap_uncertainty.scale_ratio(piece, scale) if self.published.is_wrong_by(scale) else None
 
     def _piece(self) -> int:
-        """Which the newest frame is tied to."""
+        """Submap of the newest frame."""
         return self.map.piece_of(self.log.records[-1].keyframe_id)
 
-    def see_again(self, since_s: float, track: Track) -> None:
-        """Pass the logged frames since a stamp, which a map supports now, to the fusion, as sure as ``track``."""
+    def add_earlier(self, since_s: float, track: Track) -> None:
+        """Pass logged frames since a stamp to the fusion once a map supports them; covariance from ``track``."""
         stamps_s, T_w_c = self.log.poses(since_s)
         with self.timed("fusion"):
             self.fusion.add_earlier(stamps_s, T_w_c, *_sigmas(track))
 
-    def carried_to(self, piece: int, stamp_s: float) -> None:
-        """A piece of map begins at the current pose, where prediction has carried the camera."""
+    def begin_submap(self, piece: int, stamp_s: float) -> None:
+        """A submap begins at the current, predicted pose."""
         earlier = (self.map.piece_of(r.keyframe_id) for r in reversed(self.log.records))
-        before, told = next((p for p in earlier if p != piece), None), self.carried(stamp_s)
+        before, predicted = next((p for p in earlier if p != piece), None), self.sensor_prediction(stamp_s)
         if before is not None:
-            if before not in self.apart.begun:
-                self.apart.unit = self.fusion.scale()
-            sigma_t, sigma_r = (np.inf, np.inf) if told is None else (told.sigma_t, told.sigma_r_rad)
-            self.apart.begin(piece, before, se3.inverse(self.motion.T_c_w)[:3, 3], sigma_t, sigma_r)
-            self.apart_sigma = self._apart_sigma(piece)
+            if before not in self.submap_uncertainty.starts:
+                self.submap_uncertainty.unit = self.fusion.scale()
+            sigma_t, sigma_r = (np.inf, np.inf) if predicted is None else (predicted.sigma_t, predicted.sigma_r_rad)
+            self.submap_uncertainty.begin(piece, before, se3.inverse(self.motion.T_c_w)[:3, 3], sigma_t, sigma_r)
+            self.submap_sigma = self._submap_sigma(piece)
 
-    def _apart_sigma(self, piece: int) -> float:
+    def _submap_sigma(self, piece: int) -> float:
         return self.published.scale * self.between(piece, self._first_piece())
 
     def between(self, piece: int, other: int) -> float:
-        """Standard deviation per axis [map units] of where the camera is in one piece of map as seen from another;
-        infinite where nothing relates them, as those of an earlier flight."""
+        """Standard deviation per axis [map units] of the camera's position in one submap as seen from another;
+        infinite for unrelated ones, as those of an earlier flight."""
         if piece == other:
             return 0.0
         scale, centre = self.fusion.scale(), se3.inverse(self.motion.T_c_w)[:3, 3]
         later = {piece, other} - {self._first_piece()}
-        return math.hypot(*(self.apart.sigma(p, centre, scale.sigma / scale.value) for p in later))
+        return math.hypot(*(self.submap_uncertainty.sigma(p, centre, scale.sigma / scale.value) for p in later))
 
     def _first_piece(self) -> int:
         return self.map.piece_of(self.log.records[0].keyframe_id)
@@ -198,14 +208,14 @@ class System:
         return self.absorb(self.mapping.submit(new, self.telemetry("every")))
 
     def telemetry(self, *where: str) -> TelemetryModel | None:
-        """Telemetry as it is now, if the settings want it in one of these refinements."""
+        """Current telemetry, if the settings use it in one of these refinements."""
         wanted = self.has_telemetry and self.config.window.telemetry in where
         model = self.fusion.telemetry() if wanted else None
-        return None if model is None else replace(model, young=self._is_young(self.motion.stamp_s))
+        return None if model is None else replace(model, young=self._is_new(self.motion.stamp_s))
 
-    def _is_young(self, stamp_s: float) -> bool:
-        """Whether the map that a frame is tracked on has begun seconds ago."""
-        return stamp_s - self.piece_began_s < YOUNG_S
+    def _is_new(self, stamp_s: float) -> bool:
+        """Whether the submap of a frame began seconds ago."""
+        return stamp_s - self.piece_began_s < NEW_MAP_S
 
     def collect(self, wait: bool = False) -> None:
         """Collect finished results of real-time mapping; with ``wait`` the caller owns the map afterwards."""
@@ -226,13 +236,13 @@ class System:
         return True
 
     def compare_depth(self, keyframe: Keyframe) -> None:
-        """Compare the network's depth with the map's units."""
+        """Compare the network's depth with the map."""
         ratio = self._depth_ratio(keyframe)
         if ratio is not None:
             self.fusion.metres.add_depth_ratio(ratio)
 
     def compare_depths_again(self) -> None:
-        """Compare every keyframe of the current piece of map again, once the piece has another unit."""
+        """Compare every keyframe of the current submap again after a change of its scale."""
         piece = self.map.piece_of(self.map.latest().id)
         mine = [k for id, k in sorted(self.map.keyframes.items()) if self.map.piece_of(id) == piece]
         self.fusion.metres.replace_depth_ratios([r for k in mine if (r := self._depth_ratio(k)) is not None])
@@ -240,11 +250,12 @@ class System:
     def _depth_ratio(self, keyframe: Keyframe) -> DepthRatio | None:
         if keyframe.network_m is None:
             return None
-        held = keyframe.keypoints_with_anchor()
-        held = held[~self.map.anchors.from_depth[keyframe.anchor[held]]]  # their depth comes from the network itself
-        p_w = self.map.anchors.p_w[keyframe.anchor[held]]
+        anchored = keyframe.keypoints_with_anchor()
+        # Depths from the network itself say nothing about the map's scale.
+        anchored = anchored[~self.map.anchors.from_depth[keyframe.anchor[anchored]]]
+        p_w = self.map.anchors.p_w[keyframe.anchor[anchored]]
         z = (p_w @ keyframe.T_c_w[:3, :3].T + keyframe.T_c_w[:3, 3])[:, 2]
-        return compared(keyframe.network_m[held], z)
+        return compared(keyframe.network_m[anchored], z)
 
 
 def _sigmas(track: Track) -> tuple[float, float]:

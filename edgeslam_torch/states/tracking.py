@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from edgeslam_torch.atlas.loops import MAX_DRIFT_RAD, SIGMAS, is_near
-from edgeslam_torch.atlas.place_recognition import lookalikes
+from edgeslam_torch.atlas.place_recognition import revisit_candidates
 from edgeslam_torch.atlas.saved import BEFORE_S
 from edgeslam_torch.geometry import se3
 from edgeslam_torch.map.keyframe import Keyframe, make_keyframe, tracked_motion
@@ -27,16 +27,16 @@ from edgeslam_torch.tracking.flow import (
 )
 from edgeslam_torch.tracking.keyframe_choice import KNOWN_SHARE, due_by_flow, few_matches, is_due, known_share
 from edgeslam_torch.tracking.lazy_view import LazyView
-from edgeslam_torch.tracking.relocaliser import Reach, Relocaliser, apart, candidates
+from edgeslam_torch.tracking.relocaliser import Reach, Relocaliser, candidates, pose_difference
 from edgeslam_torch.tracking.tracker import Track, View, make_view, parallax_to
 from edgeslam_torch.types import FloatArray, Frame, FrameStatus, IntArray
 
 FEW_INLIERS = 100
-"""Keypoints below which edges take part in a frame's pose: as many as start a map."""
+"""Number of keypoints below which edges contribute to a frame's pose: as many as start a map."""
 
 
 class Tracking:
-    """The states in which the pose is tracked on the map, by points or by edges."""
+    """The states in which the pose is tracked in the map, by points or by edges."""
 
     def __init__(self, system: System) -> None:
         self.system = system
@@ -45,7 +45,7 @@ class Tracking:
         )
         self._edge_tracker = EdgeTracker(system.map, system.edges, system.camera, system.config.tracking.edges)
         self.relocaliser = Relocaliser(system.tracker)
-        self.backfill = RetroactiveLocalisation(system)
+        self.retroactive = RetroactiveLocalisation(system)
         self._template: Template | None = None
         """Template for tracking the next frames; None without a map."""
         self._recent: IntArray = np.zeros(0, dtype=np.int64)
@@ -75,7 +75,7 @@ class Tracking:
         with system.map.lock:
             located = self._locate(frame, seen, T_predicted)
             if located is not None:
-                located = self._as_told(frame, seen, T_predicted, located)
+                located = self._check_with_sensors(frame, seen, T_predicted, located)
             return None if located is None else self.arrive(frame, seen, T_predicted, located)
 
     def _locate(self, frame: Frame, seen: LazyView, T_predicted: FloatArray) -> Located | None:
@@ -87,7 +87,7 @@ class Tracking:
         if followed is not None and followed.trusted:
             located = self._locate_followed(followed, frame.stamp_s)
         # While the worker is busy no keyframe can be created; matching then finds newly mapped anchors.
-        # What has left the view cannot be followed: the frame's own keypoints come first then, flow comes last.
+        # Points that left the view cannot be followed: match the frame's own keypoints first.
         strong = followed is not None and followed.share >= system.config.flow.min_share
         if located is None or located.due or not strong:
             matched = self._match(frame, seen, T_predicted, followed, strong)
@@ -96,20 +96,20 @@ class Tracking:
             located = matched
         return self._by_edges(frame, seen, T_predicted) if located is None else located
 
-    def _as_told(self, frame: Frame, seen: LazyView, T_predicted: FloatArray, located: Located) -> Located:
-        """A pose that the drone's sensors deny is sought once more, where they have it.
+    def _check_with_sensors(self, frame: Frame, seen: LazyView, T_predicted: FloatArray, located: Located) -> Located:
+        """Repeat the search from the sensors' prediction if the drone's sensors contradict a pose.
 
-        Where a pattern repeats, as on wallpaper, images hold a pose by the neighbour of what they show. Where they
-        show the same pose again it stays: telemetry alone moves none.
+        On a repetitive pattern, such as wallpaper, matching may lock on the neighbouring repetition. If the second
+        search gives the same pose it is kept: telemetry alone moves no pose.
         """
-        told, template = self.system.told(frame.stamp_s), self._template
-        if told is None or not told.is_outlier(located.track.T_c_w):
+        sensors, template = self.system.sensor_prior(frame.stamp_s), self._template
+        if sensors is None or not sensors.is_outlier(located.track.T_c_w):
             return located
-        again = self._locate(frame, seen, told.applied_to(T_predicted))
-        if again is None or told.is_outlier(again.track.T_c_w):
+        again = self._locate(frame, seen, sensors.applied_to(T_predicted))
+        if again is None or sensors.is_outlier(again.track.T_c_w):
             self._template = template
-            self.system.events["denied"] += 1
-            return replace(located, denied=True)
+            self.system.events["contradicted"] += 1
+            return replace(located, contradicted=True)
         return again
 
     def search(self, frame: Frame, seen: LazyView, T_predicted: FloatArray, lost_frames: int) -> Step | None:
@@ -122,12 +122,12 @@ class Tracking:
             return None if track is None else self.return_to(frame, seen, T_predicted, track)
 
     def return_to(self, frame: Frame, seen: LazyView, T_predicted: FloatArray, track: Track) -> Step:
-        """Continue in the map at a relocalised place."""
+        """Continue in the map at a relocalised pose."""
         self.system.events["relocalised"] += 1
         located = self._located(track, seen.view, seen, frame.stamp_s, due=False, relocalised=True)
         step = self.arrive(frame, seen, T_predicted, located)
         self.system.motion.stop()
-        self.backfill.place(step.keyframe, track.T_c_w, track.anchor)
+        self.retroactive.place(step.keyframe, track.T_c_w, track.anchor)
         return step
 
     def arrive(self, frame: Frame, seen: LazyView, T_predicted: FloatArray, located: Located) -> Step:
@@ -159,10 +159,10 @@ class Tracking:
     # -- by points ---------------------------------------------------------------------------------------------
 
     def _follow(self, seen: LazyView, T_predicted: FloatArray, stamp_s: float) -> Followed | None:
-        """By optical flow from the last keyframe."""
+        """Optical flow from the last keyframe."""
         if self._template is None or not self.system.config.flow.enabled:
             return None
-        return self._flow.follow(self._template, seen.grey, T_predicted, self.system.expectation(stamp_s, T_predicted))
+        return self._flow.follow(self._template, seen.grey, T_predicted, self.system.pose_prior(stamp_s, T_predicted))
 
     def _locate_followed(self, followed: Followed, stamp_s: float) -> Located:
         reference = self.system.map.keyframes.get(followed.keyframe_id, self.system.map.latest())
@@ -174,8 +174,8 @@ class Tracking:
     def _on_flow_alone(self, seen: LazyView, located: Located, followed: Followed, hurry: bool) -> Located:
         """A frame that is due for a keyframe, but none of whose keypoints matches.
 
-        A sharper one than a blurred one will come, unless in a ``hurry``: most of what is followed has left the view.
-        Where the keyframe that is followed is faint as well, it is not blur that makes corners few but a bare wall.
+        A blurred one waits for a sharper frame, unless in a ``hurry``: most of the followed points have left the view.
+        If the followed keyframe has weak corners as well, the wall lacks texture and the image is not blurred.
         """
         blurred = seen.view.features.faint and not located.reference.features.faint
         if blurred and not hurry:
@@ -187,7 +187,7 @@ class Tracking:
     def _match(
         self, frame: Frame, seen: LazyView, T_predicted: FloatArray, followed: Followed | None, strong: bool
     ) -> Located | None:
-        """By the frame's own keypoints: where flow fails, and where a ``strong`` flow has called a keyframe due."""
+        """Match the frame's own keypoints: where flow fails, or where a ``strong`` flow called a keyframe due."""
         with self.system.timed("features"):
             view = seen.view
         with self.system.timed("tracking"):
@@ -212,13 +212,13 @@ class Tracking:
         self, frame: Frame, view: View, T_predicted: FloatArray, followed: Followed | None, strong: bool
     ) -> tuple[Track | None, bool]:
         """Track near flow's result or the prediction, else relocalise; and whether it was relocalised."""
-        tracker, expected = self.system.tracker, self.system.expectation(frame.stamp_s, T_predicted)
+        tracker, expected = self.system.tracker, self.system.pose_prior(frame.stamp_s, T_predicted)
         if followed is not None and strong:
             track = tracker.track_near(view, followed.track.T_c_w, followed.track.anchor, expected)
             return None if track is None else join(track, followed, view, self.system.config.orb.scale_factor), False
         track = tracker.track(view, T_predicted, self._recent, expected)
         if track is None and followed is not None:
-            # After a jerk, or in a blurred image, what little flow holds is nearer than the prediction.
+            # After a jerk, or in a blurred image, the result of flow is nearer than the prediction.
             track = tracker.track_near(view, followed.track.T_c_w, followed.track.anchor, expected)
         if track is not None:
             return track, False
@@ -231,13 +231,13 @@ class Tracking:
         tries = system.config.tracking.relocalisation_keyframes
         near = candidates(system.tracker, T_predicted, tries - tries // 2, lost_frames)
         others = [k for k in system.map.keyframes.values() if not any(k is n for n in near)]
-        alike = lookalikes(system.map, view.words, others, tries // 2)
-        return self.find(frame, view, [*near, *alike], system.reach(frame.stamp_s, T_predicted))
+        revisits = revisit_candidates(system.map, view.words, others, tries // 2)
+        return self.find(frame, view, [*near, *revisits], system.reach(frame.stamp_s, T_predicted))
 
-    def find(self, frame: Frame, view: View, asked: list[Keyframe], reach: Reach) -> Track | None:
-        """Relocalise a frame among keyframes; earlier unconfirmed frames get their poses too."""
+    def find(self, frame: Frame, view: View, keyframes: list[Keyframe], reach: Reach) -> Track | None:
+        """Relocalise a frame among keyframes; earlier unconfirmed frames get their poses as well."""
         system = self.system
-        found = self.relocaliser.find(frame.index, view, asked, reach)
+        found = self.relocaliser.find(frame.index, view, keyframes, reach)
         if found is None or not self._may_be_at(found.track, frame.stamp_s):
             return None
         if found.earlier:
@@ -245,21 +245,21 @@ class Tracking:
         return found.track
 
     def _may_be_at(self, track: Track, stamp_s: float) -> bool:
-        """Whether the drone can have come to where a frame looks like: a wall with the same paper is found again three
-        metres on, and a shelf like the one across the room, by several frames. Images decide alone without sensors, in
-        the map of an earlier flight, and in a piece of map to which nothing relates the camera's."""
+        """Whether a relocalised pose is within reach of the sensors' prediction: on repetitive walls several frames
+        match metres away. Images decide alone without sensors, in the map of an earlier flight, and in a submap that is
+        unrelated to the camera's."""
         system = self.system
-        told, records = system.carried(stamp_s), system.log.records
-        if told is None or not records:
+        predicted, records = system.sensor_prediction(stamp_s), system.log.records
+        if predicted is None or not records:
             return True
         here, there = system.map.resolve(records[-1].keyframe_id)[0], system.tracker.local_keyframes(track.anchor)[0]
         between = system.between(system.map.piece_of(here), system.map.piece_of(there.id))
         if there.stamp_s == BEFORE_S or not math.isfinite(between):
             return True
-        shift, turn = apart(track.T_c_w, se3.inverse(told.T_w_c))
+        shift, turn = pose_difference(track.T_c_w, se3.inverse(predicted.T_w_c))
         depth = float(np.median(se3.transform(track.T_c_w, system.map.anchors.p_w[track.anchor])[:, 2]))
-        sigma = math.hypot(told.sigma_t, between)
-        return turn <= MAX_DRIFT_RAD + SIGMAS * told.sigma_r_rad and is_near(
+        sigma = math.hypot(predicted.sigma_t, between)
+        return turn <= MAX_DRIFT_RAD + SIGMAS * predicted.sigma_r_rad and is_near(
             system.map, system.map.keyframes[here], there, shift, depth, sigma
         )
 
@@ -268,9 +268,9 @@ class Tracking:
     def _by_edges(self, frame: Frame, seen: LazyView, T_predicted: FloatArray) -> Located | None:
         """The pose from edges alone."""
         with self.system.timed("edges"):
-            expected = self.system.expectation(frame.stamp_s, T_predicted)
+            expected = self.system.pose_prior(frame.stamp_s, T_predicted)
             alone = self._edge_tracker.refine(seen.grey, T_predicted, None, expected)
-        if alone is None or not alone.is_fixed or self._denied(alone.T_c_w, frame.stamp_s):
+        if alone is None or not alone.is_fixed or self._contradicts_sensors(alone.T_c_w, frame.stamp_s):
             return None
         none = np.zeros(0, dtype=np.int64)
         track = Track(alone.T_c_w, none, none, none, none, alone.covariance)
@@ -287,24 +287,24 @@ class Tracking:
             np.zeros((len(anchor), 2)) if slack is None else slack,
         )
         with system.timed("edges"):
-            expected = system.expectation(frame.stamp_s, T_predicted)
+            expected = system.pose_prior(frame.stamp_s, T_predicted)
             both = self._edge_tracker.refine(seen.grey, located.track.T_c_w, points, expected)
         if both is None or both.edges < MIN_EDGES or both.points.mean() < 0.5:
             return located
-        if self._denied(both.T_c_w, frame.stamp_s):
+        if self._contradicts_sensors(both.T_c_w, frame.stamp_s):
             return located
         track = replace(located.track, T_c_w=both.T_c_w, covariance=both.covariance)
         return replace(located, track=track, edges=both.edges)
 
-    def _denied(self, T_c_w: FloatArray, stamp_s: float) -> bool:
-        """Whether the drone has not moved as a pose ``(4, 4)`` by edges has; parallel ones hold few directions."""
-        told = self.system.told(stamp_s)
-        return told is not None and told.is_outlier(T_c_w)
+    def _contradicts_sensors(self, T_c_w: FloatArray, stamp_s: float) -> bool:
+        """Whether the sensors contradict a pose ``(4, 4)`` by edges; parallel edges constrain few directions."""
+        sensors = self.system.sensor_prior(stamp_s)
+        return sensors is not None and sensors.is_outlier(T_c_w)
 
     # -- keyframes ---------------------------------------------------------------------------------------------
 
     def _adds_nothing(self, stamp_s: float, located: Located) -> bool:
-        """Whether keyframes of earlier visits have seen what there is to see; it is not asked again at once."""
+        """Whether earlier keyframes have already seen most of the view; the next check follows after a gap."""
         system = self.system
         if located.view is None or located.track.inliers < FEW_INLIERS:
             return False
@@ -316,7 +316,7 @@ class Tracking:
         return True
 
     def _insert_keyframe(self, frame: Frame, seen: LazyView, located: Located) -> Keyframe | None:
-        """Map a new keyframe; None when real-time mapping is still busy with the last one."""
+        """Map a new keyframe; None while real-time mapping is busy with the last one."""
         system = self.system
         if system.mapping.busy or located.view is None:
             system.events["keyframes_skipped"] = system.events.get("keyframes_skipped", 0) + 1
@@ -341,12 +341,12 @@ class Tracking:
 
 
 def _in_words(located: Located) -> str:
-    """Reason of a pose that is not simply tracked on keypoints, in words."""
-    inliers, said = located.track.inliers, []
+    """Reason of a pose that is not simply tracked on keypoints."""
+    inliers, reasons = located.track.inliers, []
     if located.edges:
-        said.append(f"by {located.edges} edge points" + (f" beside {inliers} keypoints" if inliers else ""))
+        reasons.append(f"by {located.edges} edge points" + (f" and {inliers} keypoints" if inliers else ""))
     elif located.relocalised:
-        said.append("found again among the keyframes")
-    if located.denied:
-        said.append("the drone's own motion is_outlier it")
-    return "; ".join(said)
+        reasons.append("relocalised among the keyframes")
+    if located.contradicted:
+        reasons.append("contradicted by the drone's sensors")
+    return "; ".join(reasons)

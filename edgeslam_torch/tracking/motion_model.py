@@ -35,7 +35,7 @@ class MotionModel:
         """Tangent of the camera's motion per second, left-applied to ``T_c_w``."""
 
     @property
-    def stands(self) -> bool:
+    def velocity_unknown(self) -> bool:
         """Whether no velocity is known."""
         return not np.any(self._velocity)
 
@@ -44,10 +44,12 @@ class MotionModel:
         # Each pose is a product with the previous one: projected to SE(3), rounding errors do not accumulate.
         return se3.orthonormalised(se3.exp(self._velocity * (stamp_s - self.stamp_s)) @ self.T_c_w)
 
-    def expectation(self, stamp_s: float, T_predicted: FloatArray, metres_per_unit: float) -> PosePrior:
+    def pose_prior(self, stamp_s: float, T_predicted: FloatArray, metres_per_unit: float) -> PosePrior:
         """A predicted pose with its uncertainty due to accelerations since the newest frame."""
         dt = stamp_s - self.stamp_s
-        speed, turn = (SPEED_M_S, ANGULAR_SPEED_RAD_S) if self.stands else (0.0, 0.0)  # it may have moved all the time
+        speed, turn = (
+            (SPEED_M_S, ANGULAR_SPEED_RAD_S) if self.velocity_unknown else (0.0, 0.0)
+        )  # it may have moved all the time
         sigma_t = math.hypot(speed * dt, 0.5 * ACCELERATION_M_S2 * dt**2) / metres_per_unit
         sigma_r = math.hypot(turn * dt, 0.5 * ANGULAR_ACCELERATION_RAD_S2 * dt**2)
         return PosePrior(0, T_predicted, np.diag([sigma_t**-2] * 3 + [sigma_r**-2] * 3))
@@ -67,7 +69,7 @@ class MotionModel:
         """Reset the velocity after a discontinuity."""
         self._velocity = np.zeros(6)
 
-    def carry(self, T_c_w: FloatArray, scale: float) -> None:
+    def transform(self, T_c_w: FloatArray, scale: float) -> None:
         """Transform with a map that was moved and scaled."""
         self.T_c_w = se3.orthonormalised(T_c_w)
         self._velocity = self._velocity * np.array([scale] * 3 + [1.0] * 3)

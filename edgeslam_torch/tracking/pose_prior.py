@@ -116,7 +116,7 @@ class Place:
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
+class SensorPrior:
     """What the drone's sensors tell of a frame's pose, at least one of the two."""
 
     attitude: Attitude | None = None

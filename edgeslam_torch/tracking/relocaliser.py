@@ -62,7 +62,7 @@ class Reach:
 
     def holds(self, place: "Place") -> bool:
         """Whether a place is within reach, with a tolerance."""
-        shift, turn = apart(place.track.T_c_w, self.T_c_w)
+        shift, turn = pose_difference(place.track.T_c_w, self.T_c_w)
         near = shift <= self._shift(place.depth) + APART * place.depth
         return near and turn <= self.turn_rad + MAX_APART_RAD
 
@@ -72,7 +72,7 @@ class Reach:
         near = self._shift(place.depth)
         if near <= APART * place.depth:
             return self.holds(place)
-        shift, turn = apart(place.track.T_c_w, self.T_c_w)
+        shift, turn = pose_difference(place.track.T_c_w, self.T_c_w)
         return near <= NEXT_ALIKE * place.depth and shift <= APART * place.depth and turn <= MAX_APART_RAD
 
     def _shift(self, depth: float) -> float:
@@ -101,7 +101,7 @@ class Place:
 
     def is_as(self, other: "Place") -> bool:
         """Whether two poses belong to one place."""
-        shift, turn = apart(self.track.T_c_w, other.track.T_c_w)
+        shift, turn = pose_difference(self.track.T_c_w, other.track.T_c_w)
         return shift <= APART * min(self.depth, other.depth) and turn <= MAX_APART_RAD
 
 
@@ -239,7 +239,7 @@ def match_keyframe(tracker: Tracker, view: View, keyframe: Keyframe) -> Track | 
     return tracker.track(view, first.T_c_w, first.anchor)
 
 
-def apart(T_c_w: FloatArray, other: FloatArray) -> tuple[float, float]:
+def pose_difference(T_c_w: FloatArray, other: FloatArray) -> tuple[float, float]:
     """Distance of two cameras [map units] and the rotation between them [rad]."""
     centre, there = (-T[:3, :3].T @ T[:3, 3] for T in (T_c_w, other))
     cosine = 0.5 * (float(np.trace(T_c_w[:3, :3] @ other[:3, :3].T)) - 1.0)

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from edgeslam_torch.atlas.atlas_file import read_atlas, write_atlas
 from edgeslam_torch.atlas.links import Link, link
-from edgeslam_torch.atlas.place_recognition import lookalikes
+from edgeslam_torch.atlas.place_recognition import revisit_candidates
 from edgeslam_torch.atlas.saved import SavedAtlas, unpack
 from edgeslam_torch.config import SlamConfig
 from edgeslam_torch.errors import EdgeSlamError
@@ -200,7 +200,9 @@ def _shifted(atlas: SavedAtlas, first: int, pieces: int) -> SavedAtlas:
 def _links(tracker: Tracker, mine: list[Keyframe], theirs: list[Keyframe]) -> list[Link]:
     found = []
     for keyframe in mine:
-        tries = (link(tracker, keyframe, k) for k in lookalikes(tracker.map, keyframe.words, theirs, CLOSER_LOOKS))
+        tries = (
+            link(tracker, keyframe, k) for k in revisit_candidates(tracker.map, keyframe.words, theirs, CLOSER_LOOKS)
+        )
         found += [one for one in tries if one is not None][:1]
     return found
 

@@ -11,7 +11,7 @@ from edgeslam_torch.atlas.atlas import Atlas, _apart_enough, _sigma_log
 from edgeslam_torch.atlas.links import common_scale, link, on_one_plane, view_of
 from edgeslam_torch.atlas.loops import bridge
 from edgeslam_torch.atlas.map_merging import move_piece
-from edgeslam_torch.atlas.place_recognition import lookalikes
+from edgeslam_torch.atlas.place_recognition import revisit_candidates
 from edgeslam_torch.atlas.saved import BEFORE_S
 from edgeslam_torch.atlas.submap_scale import AGAIN_S
 from edgeslam_torch.config import EdgeConfig, OrbConfig, TrackingConfig
@@ -186,12 +186,12 @@ def test_depths_that_do_not_agree_are_no_scale(rng):
 
 def test_lookalikes_are_the_keyframes_that_see_the_same(rng):
     pieces = Pieces(rng)
-    found = lookalikes(pieces.map, pieces.keyframes[4].words, pieces.keyframes[:4], 3)
+    found = revisit_candidates(pieces.map, pieces.keyframes[4].words, pieces.keyframes[:4], 3)
     assert len(found) == 3
     stranger = rng.integers(0, 2**63, (500, 4)).astype(np.uint64)
-    assert lookalikes(pieces.map, stranger, pieces.keyframes[:4], 3) == []
-    assert lookalikes(pieces.map, stranger[:0], pieces.keyframes[:4], 3) == []
-    assert lookalikes(pieces.map, stranger, [], 3) == []
+    assert revisit_candidates(pieces.map, stranger, pieces.keyframes[:4], 3) == []
+    assert revisit_candidates(pieces.map, stranger[:0], pieces.keyframes[:4], 3) == []
+    assert revisit_candidates(pieces.map, stranger, [], 3) == []
 
 
 def test_moving_a_piece_changes_nothing_that_its_cameras_see(rng):

@@ -210,7 +210,7 @@ def test_a_pilot_hears_how_old_views_moved_too(perception):
 def test_a_doubtful_metre_is_told(perception):
     """By the SLAM's own sources it is sure to 2 %."""
     sure = ScaleEstimate(1.0, 0.02, "telemetry")
-    health = SimpleNamespace(state="tracking", scale=sure, sources=(), apart_sigma=0.0, drift_sigma=0.0, metric=True)
+    health = SimpleNamespace(state="tracking", scale=sure, sources=(), submap_sigma=0.0, drift_sigma=0.0, metric=True)
     pose = SimpleNamespace(T_w_c=np.eye(4), covariance=1e-4 * np.eye(6), velocity_w=np.zeros(3), revision=0)
     perception._slam = SimpleNamespace(pose_now=lambda now_s, samples: pose)
     perception._output = SimpleNamespace(health=health, piece=0)

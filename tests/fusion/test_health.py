@@ -30,9 +30,9 @@ def test_words_name_what_is_wrong_and_nothing_else():
     assert replace(good, metric=False).in_words() == "no metres, battery 63 %"
     bad = replace(good, telemetry_age_s=4.2, disagreement=7.0, battery=math.nan)
     assert str(bad) == "metres to 3 %, sources 7 sigmas apart, telemetry silent for 4.2 s"
-    apart = replace(good, apart_sigma=0.3, drift_sigma=0.4)
+    apart = replace(good, submap_sigma=0.3, drift_sigma=0.4)
     assert str(apart) == "metres to 3 %, 0.5 m unsure of where the flight began, battery 63 %"
-    lone = replace(good, apart_sigma=math.inf).in_words()
+    lone = replace(good, submap_sigma=math.inf).in_words()
     assert lone == "metres to 3 %, nothing relates this piece of map to where the flight began, battery 63 %"
     assert Health(9.0, "tracking", True, SURE).in_words() == "metres to 3 %", "no drone, no word of it"
 

@@ -1,4 +1,4 @@
-"""What the network says of the map's unit follows the map when that gets another unit."""
+"""Network-to-map depth ratios follow a change of the submap's scale."""
 
 from types import SimpleNamespace
 
@@ -15,8 +15,8 @@ METRES = 2.5
 """Network metres per map unit."""
 
 
-def test_ratios_are_those_of_the_map_as_it_is_now(rng):
-    """The current piece grows by three; another piece, in a unit of its own, has no say."""
+def test_depth_ratios_are_recomputed_after_a_change_of_scale(rng):
+    """The current submap grows by three; another submap with its own scale is left out."""
     points = PointMap(rng, 300, 6)
     points.fill()
     for view, keyframe in enumerate(points.keyframes):

@@ -1,4 +1,4 @@
-"""What a map may have drifted by: by the way to what it knows."""
+"""Drift of a map from the length of its covisibility path."""
 
 from types import SimpleNamespace
 
@@ -9,7 +9,7 @@ from edgeslam_torch.states.drift import Drift
 
 
 class Chain:
-    """Keyframes a metre apart along x, each of which sees what its neighbours see, and what else is said."""
+    """Keyframes along x with one metre spacing; each is covisible with its neighbours and with given others."""
 
     def __init__(self, also=()):
         self.keyframes, self.also = [], {frozenset(pair) for pair in also}
@@ -25,17 +25,17 @@ class Chain:
         return drift.newest
 
 
-def test_it_grows_with_the_way_there_and_back():
+def test_drift_grows_along_the_path():
     drift, chain = Drift(), Chain()
     assert [chain.grow(drift, x) for x in (0.0, 1.0, 2.0, 1.0, 0.0)] == pytest.approx([0.0, 1.0, 2.0, 3.0, 4.0])
 
 
-def test_it_is_short_again_where_a_place_is_known_again():
+def test_a_revisit_shortens_the_path():
     drift, chain = Drift(), Chain(also=[(0, 4)])
     assert [chain.grow(drift, x) for x in (0.0, 1.0, 2.0, 1.0, 0.2, 1.2)][4:] == pytest.approx([0.2, 1.2])
 
 
-def test_what_sees_nothing_known_has_drifted_as_what_was_before():
+def test_a_keyframe_without_covisible_ones_keeps_the_last_drift():
     drift, chain = Drift(), Chain()
     for x in (0.0, 1.0, 2.0):
         chain.grow(drift, x)

@@ -1,4 +1,4 @@
-"""Evidence for the scale, from image to metres: sources, signs and sigmas."""
+"""Scale measurements from image to metres: sources, signs and sigmas."""
 
 from dataclasses import replace
 from functools import lru_cache
@@ -28,8 +28,8 @@ def length(T_w_c):
 
 
 @pytest.mark.parametrize("factor", [0.5, 2.0])
-def test_a_first_depth_map_that_is_off_is_put_right_by_those_that_follow(factor):
-    """The first map sets the map's unit; a dozen later ones say what that is in metres."""
+def test_later_depth_maps_correct_a_wrong_first_one(factor):
+    """The first depth map sets the map's scale; a dozen later ones measure it in metres."""
     known, calls = panels().depth_function(), []
 
     def depth(image, camera):
@@ -44,11 +44,13 @@ def test_a_first_depth_map_that_is_off_is_put_right_by_those_that_follow(factor)
     live = length(slam.trajectory()[1])
     slam.finish()
     assert length(slam.trajectory()[1]) == pytest.approx(length(panels().T_w_c), rel=0.1)
-    assert live == pytest.approx(factor * length(panels().T_w_c), rel=0.1), "live units do not follow a guess"
+    assert live == pytest.approx(factor * length(panels().T_w_c), rel=0.1), (
+        "the live scale does not follow one depth map"
+    )
 
 
-def test_depths_that_the_network_gave_do_not_confirm_the_network(monkeypatch):
-    """A camera that only turns: every anchor lies where the network put it, which says nothing of the network."""
+def test_depths_from_the_network_do_not_confirm_the_network(monkeypatch):
+    """A camera that only rotates: every anchor has the network's depth."""
     turn = np.linspace(0.0, 0.5, 30)
     poses = np.stack([se3.exp(np.array([0.0, 0.0, 0.0, 0.0, a, 0.0])) for a in turn])
     turning = film(stairs_world(), CAMERA, poses)
@@ -62,7 +64,7 @@ def test_depths_that_the_network_gave_do_not_confirm_the_network(monkeypatch):
 
 
 def spied(monkeypatch, name, of=MotionFusion):
-    """Arguments of all calls of one of fusion's methods from now on."""
+    """Arguments of all later calls of one of fusion's methods."""
     calls, inner = [], getattr(of, name)
 
     def method(fusion, *arguments, **named):
@@ -74,7 +76,7 @@ def spied(monkeypatch, name, of=MotionFusion):
 
 
 def test_visual_sigma_is_that_of_the_visual_errors(monkeypatch):
-    """From one frame to the next, in map units: within a factor of three, be it too large or too small."""
+    """Between consecutive frames, in map units: within a factor of three."""
     slam = EdgeSlam(CAMERA, NO_NETWORK)
     told = spied(monkeypatch, "add_visual")
     for frame in panels().frames:
@@ -90,7 +92,7 @@ def test_visual_sigma_is_that_of_the_visual_errors(monkeypatch):
     assert off / 3.0 < sigma < 3.0 * off + 0.002
 
 
-def test_frames_that_were_lost_are_counted_and_are_no_evidence():
+def test_lost_frames_are_counted_and_give_no_measurement():
     black = np.zeros((240, 320, 3), np.uint8)
     frames = panels().with_images(lambda i, image: black if 18 <= i < 23 else image)
     slam = EdgeSlam(CAMERA, NO_NETWORK)
@@ -99,7 +101,7 @@ def test_frames_that_were_lost_are_counted_and_are_no_evidence():
     assert slam.telemetry_statistics()["visual not tracked"] == 5
 
 
-def test_the_last_word_on_the_scale_rests_on_the_refined_poses(monkeypatch):
+def test_the_final_scale_is_computed_from_refined_poses(monkeypatch):
     slam = EdgeSlam(CAMERA, NO_NETWORK, depth=panels().depth_function())
     for frame in panels().frames:
         slam.step(frame)
@@ -109,12 +111,12 @@ def test_the_last_word_on_the_scale_rests_on_the_refined_poses(monkeypatch):
     ((stamps, T_w_c),) = told
     np.testing.assert_array_equal(stamps, panels().stamps_s)
     np.testing.assert_array_equal(T_w_c, slam.log.poses()[1])
-    assert np.abs(T_w_c - before).max() > 1e-6, "refinement has moved them"
+    assert np.abs(T_w_c - before).max() > 1e-6, "refinement changed them"
     assert slam.scale.units is Units.METRES
 
 
-def test_one_scale_for_all_of_a_frozen_stretch(monkeypatch):
-    """A video that stands still gives its last new image once, and nothing until it moves again."""
+def test_a_frozen_video_gives_one_measurement(monkeypatch):
+    """A frozen video gives its last new image once, and nothing until it moves again."""
     frames = list(panels().frames[:24])
     frozen = [replace(frames[-1], index=24 + k, stamp_s=frames[-1].stamp_s + (k + 1) / 30) for k in range(5)]
     later = [replace(f, stamp_s=f.stamp_s + 5 / 30, index=f.index + 5) for f in panels().frames[24:]]

@@ -1,4 +1,4 @@
-"""Depths that a piece of map begins with."""
+"""Depths with which a submap begins."""
 
 from types import SimpleNamespace
 
@@ -12,7 +12,7 @@ from edgeslam_torch.types import DepthMap
 
 
 def guessed(network_unit, published, depth_m=3.0):
-    """Depth [map units] of the keypoints of a picture that the network says is this far away, in a flight so far."""
+    """Initial depth [map units] of keypoints that the network puts at this distance."""
     depth = DepthMap(np.full((24, 32), depth_m, np.float32), np.full((24, 32), 0.2, np.float32))
     keyframe = SimpleNamespace(depth=depth, features=SimpleNamespace(uv=np.array([[5.0, 6.0], [20.0, 12.0]])))
     fusion = SimpleNamespace(metres=SimpleNamespace(network_unit=lambda: network_unit))
@@ -25,10 +25,10 @@ def guessed(network_unit, published, depth_m=3.0):
 @pytest.mark.parametrize(
     ("network_unit", "published", "expected"),
     [
-        (None, 1.0, 3.0),  # the first piece: the network's metres are the unit
-        (0.6, 0.9, 5.0),  # the network is a third short here; what is 5 units away it has told at 3 m before
+        (None, 1.0, 3.0),  # the first submap: the network's metres set the scale
+        (0.6, 0.9, 5.0),  # the network underestimates here: 5 units were 3 m before
         (None, 0.5, 6.0),
     ],
 )
-def test_a_new_piece_has_the_unit_in_which_the_network_told_the_one_before(network_unit, published, expected):
+def test_a_new_submap_inherits_the_network_scale_of_the_previous_one(network_unit, published, expected):
     np.testing.assert_allclose(guessed(network_unit, published), expected, rtol=1e-6)

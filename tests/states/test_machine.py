@@ -10,11 +10,11 @@ from edgeslam_torch.states.machine import LEADS_TO, TRANSITIONS, Event, Machine,
 def after(*events: Event) -> Machine:
     machine = Machine()
     for stamp_s, event in enumerate(events):
-        machine.meet(event, float(stamp_s))
+        machine.apply(event, float(stamp_s))
     return machine
 
 
-def test_every_state_is_reached_from_the_start_and_leads_back_to_tracking():
+def test_every_state_is_reachable_and_leads_back_to_tracking():
     reach = {State.STARTING}
     for _ in State:
         reach |= {to for state in reach for to in TRANSITIONS[state].values()}
@@ -26,24 +26,24 @@ def test_every_state_is_reached_from_the_start_and_leads_back_to_tracking():
         assert State.TRACKING in onward
 
 
-def test_a_loss_is_counted_from_its_first_frame_and_forgotten_when_found_again():
-    machine = after(Event.BEGUN, Event.MAP_STANDS, Event.NOTHING, Event.NOTHING, Event.NOTHING)
+def test_a_loss_is_counted_from_its_first_frame_until_relocalisation():
+    machine = after(Event.BEGUN, Event.MAP_READY, Event.NOTHING, Event.NOTHING, Event.NOTHING)
     assert (machine.state, machine.lost_frames, machine.lost_since_s) == (State.LOST, 3, 2.0)
-    machine.meet(Event.POINTS, 5.0)
+    machine.apply(Event.POINTS, 5.0)
     assert (machine.state, machine.lost_frames, machine.lost_since_s) == (State.TRACKING, 0, math.inf)
 
 
-def test_without_texture_there_is_nothing_to_wait_for():
+def test_without_texture_the_restart_is_immediate():
     machine = after(Event.NO_TEXTURE)
     assert (machine.state, machine.lost_since_s) == (State.LOST, -math.inf)
-    machine.meet(Event.BEGUN, 1.0)
+    machine.apply(Event.BEGUN, 1.0)
     assert machine.state is State.STARTING
 
 
-def test_edges_carry_on_from_tracking_and_hand_back():
-    assert after(Event.BEGUN, Event.MAP_STANDS, Event.EDGES).state is State.EDGES_ONLY
-    assert after(Event.BEGUN, Event.MAP_STANDS, Event.EDGES, Event.POINTS).state is State.TRACKING
-    assert after(Event.BEGUN, Event.MAP_STANDS, Event.EDGES, Event.NOTHING).lost_frames == 1
+def test_edges_continue_tracking_and_hand_back_to_points():
+    assert after(Event.BEGUN, Event.MAP_READY, Event.EDGES).state is State.EDGES_ONLY
+    assert after(Event.BEGUN, Event.MAP_READY, Event.EDGES, Event.POINTS).state is State.TRACKING
+    assert after(Event.BEGUN, Event.MAP_READY, Event.EDGES, Event.NOTHING).lost_frames == 1
 
 
 def test_an_event_leads_to_the_same_state_from_everywhere():
@@ -54,13 +54,13 @@ def test_an_event_leads_to_the_same_state_from_everywhere():
 
 @pytest.mark.parametrize("state", State)
 @pytest.mark.parametrize("event", Event)
-def test_every_event_is_survived_in_every_state_and_said_if_unlisted(state, event):
+def test_every_event_is_applied_in_every_state_and_reported_if_unlisted(state, event):
     machine = Machine()
     machine.state = state
-    machine.meet(event, 3.0)
+    machine.apply(event, 3.0)
     assert machine.state is LEADS_TO[event]
     if event in TRANSITIONS[state]:
         assert machine.warning() is None
     else:
-        machine.meet(Event.NOTHING, 4.0)
+        machine.apply(Event.NOTHING, 4.0)
         assert f"{event} while {state} (1 times)" in machine.warning()

@@ -1,4 +1,4 @@
-"""The live pose goes along when the piece of map that it hangs on is moved."""
+"""The live pose is transformed when its submap is."""
 
 from types import SimpleNamespace
 
@@ -12,7 +12,7 @@ from edgeslam_torch.atlas.submap_scale import Rescaled, about
 from edgeslam_torch.fusion.output_frame import OutputFrame
 from edgeslam_torch.geometry import se3, sim3
 from edgeslam_torch.states.map_merging import MapMerging
-from edgeslam_torch.states.submap_uncertainty import Apart
+from edgeslam_torch.states.submap_uncertainty import SubmapUncertainty
 from edgeslam_torch.tracking.motion_model import MotionModel
 from edgeslam_torch.types import ScaleEstimate
 
@@ -21,12 +21,12 @@ KEYFRAME = 7
 
 
 class Pieces:
-    """A map of two pieces; the camera's one is number 1."""
+    """A map of two submaps; the camera is in number 1."""
 
     def __init__(self, T_k_w):
         self.T_k_w, self.piece = T_k_w, 1
         self.begun = {0: "first", 1: "second"}
-        self.asked = 0
+        self.queries = 0
         self.again = []
 
     def piece_of(self, keyframe_id):
@@ -38,10 +38,10 @@ class Pieces:
         return self.T_k_w
 
     def atlas(self, moved):
-        """Finds one join, of which the camera's piece is moved if it is number ``moved``."""
+        """Finds one merge that moves submap number ``moved``."""
 
         def update(stamp_s):
-            self.asked += 1
+            self.queries += 1
             if self.piece == 0:
                 return None
             self.piece = 0
@@ -73,7 +73,7 @@ def system_of(pieces, motion, busy=False):
     mapping = SimpleNamespace(busy=busy)
     again = lambda: revised.append("ratios")  # noqa: E731
     return SimpleNamespace(
-        apart=Apart(),
+        submap_uncertainty=SubmapUncertainty(),
         compare_depths_again=again,
         log=log,
         map=pieces,
@@ -81,13 +81,13 @@ def system_of(pieces, motion, busy=False):
         fusion=fusion,
         mapping=mapping,
         published=OutputFrame(2.0),
-        other_unit=lambda: None,
+        scale_ratio=lambda: None,
         events={},
     )
 
 
 def moving(rng):
-    """A camera with a velocity, some way from its keyframe."""
+    """A moving camera at some distance from its keyframe."""
     T_k_w = se3.exp(rng.normal(size=6))
     motion = MotionModel(se3.exp(0.1 * rng.normal(size=6)) @ T_k_w)
     motion.stamp_s = 1.0
@@ -96,8 +96,8 @@ def moving(rng):
     return T_k_w, motion
 
 
-def test_the_pose_and_its_future_go_along_with_their_piece(rng):
-    """What the camera sees of its piece, now and by prediction, is the same picture, scaled."""
+def test_pose_and_velocity_are_transformed_with_their_submap(rng):
+    """The view of the submap, now and by prediction, stays the same up to scale."""
     T_k_w, motion = moving(rng)
     p = rng.normal(size=(20, 3))
     before = [se3.transform(T, p) for T in (motion.T_c_w, motion.predict(1.3))]
@@ -108,11 +108,11 @@ def test_the_pose_and_its_future_go_along_with_their_piece(rng):
     np.testing.assert_allclose(after, 1.5 * np.array(before), atol=1e-9)
     assert (system.published.scale, system.published.revision) == (2.0, 1)
     assert system.events == {"joined": 1}
-    assert system.fusion.revised == ["ratios", ("stamps", "poses")], "in the unit that the piece has now"
-    assert system.map.asked == 2, "until there is no other join"
+    assert system.fusion.revised == ["ratios", ("stamps", "poses")], "in the submap's new scale"
+    assert system.map.queries == 2, "until there is no other merge"
 
 
-def test_the_pose_stays_where_the_other_piece_comes_to_it(rng):
+def test_the_pose_stays_when_the_other_submap_is_moved(rng):
     T_k_w, motion = moving(rng)
     before = motion.T_c_w, motion.predict(1.3)
     system = system_of(Pieces(T_k_w), motion)
@@ -120,17 +120,17 @@ def test_the_pose_stays_where_the_other_piece_comes_to_it(rng):
     np.testing.assert_allclose((motion.T_c_w, motion.predict(1.3)), before, atol=1e-12)
 
 
-def test_the_pose_goes_along_when_a_loop_is_closed(rng):
-    """By as much as the map grew around its keyframe, however much that was elsewhere."""
+def test_the_pose_is_transformed_by_a_loop_closure(rng):
+    """By the change of scale at its own keyframe."""
     T_k_w, motion = moving(rng)
     p = rng.normal(size=(20, 3))
     before = se3.transform(motion.T_c_w, p)
     pieces = Pieces(T_k_w)
 
     def update(stamp_s):
-        if pieces.asked:
+        if pieces.queries:
             return None
-        pieces.asked += 1
+        pieces.queries += 1
         pieces.T_k_w = sim3.moved_camera(S, T_k_w)
         return Closure(1.0, 1, 30.0, 0.2, 0.1, 1.2, 2, 300, {KEYFRAME: 1.5, 3: 1.1})
 
@@ -142,7 +142,7 @@ def test_the_pose_goes_along_when_a_loop_is_closed(rng):
     assert system.fusion.revised == ["ratios", ("stamps", "poses")]
 
 
-def test_the_pose_goes_along_when_its_piece_gets_the_unit_of_another(rng):
+def test_the_pose_is_transformed_when_its_submap_is_rescaled(rng):
     T_k_w, motion = moving(rng)
     p = rng.normal(size=(20, 3))
     before = se3.transform(motion.T_c_w, p)
@@ -159,10 +159,10 @@ def test_the_pose_goes_along_when_its_piece_gets_the_unit_of_another(rng):
     assert words == "piece 1 scaled by 1.300 (sigma 5.0 %) to the metres before it"
     np.testing.assert_allclose(se3.transform(motion.T_c_w, sim3.transform(grown, p)), 1.3 * before, atol=1e-9)
     assert (system.published.revision, system.events) == (1, {"rescaled": 1})
-    assert system.fusion.revised == [np.log(1.3), "ratios", ("stamps", "poses")], "held metres do not scale it again"
+    assert system.fusion.revised == [np.log(1.3), "ratios", ("stamps", "poses")], "the scale estimate is updated once"
 
 
-def test_the_pose_goes_along_when_its_piece_is_turned(rng):
+def test_the_pose_is_transformed_when_its_submap_is_rotated(rng):
     T_k_w, motion = moving(rng)
     p = rng.normal(size=(20, 3))
     before = se3.transform(motion.T_c_w, p)
@@ -174,16 +174,16 @@ def test_the_pose_goes_along_when_its_piece_is_turned(rng):
         return Turned(7.0, 1, S, 0.4, 0.05)
 
     system = system_of(pieces, motion)
-    system.apart.begin(1, 0, np.zeros(3), 0.0, 0.5)
+    system.submap_uncertainty.begin(1, 0, np.zeros(3), 0.0, 0.5)
     atlas = SimpleNamespace(align=align, update=lambda _: None, is_up_to_date=False)
     assert MapMerging(system, atlas).update() == "piece 1 turned by 22.9 degrees (sigma 2.9) to the heading before it"
     np.testing.assert_allclose(se3.transform(motion.T_c_w, sim3.transform(S, p)), before, atol=1e-9)
     assert (system.published.revision, system.events) == (1, {"turned": 1})
-    assert system.apart.sigma(1, np.array([2.0, 0.0, 0.0]), 0.0) == pytest.approx(0.1)
+    assert system.submap_uncertainty.sigma(1, np.array([2.0, 0.0, 0.0]), 0.0) == pytest.approx(0.1)
 
 
 @pytest.mark.parametrize("finish", [False, True])
-def test_nothing_is_joined_while_the_worker_maps(rng, finish):
+def test_no_merge_while_the_worker_maps(rng, finish):
     T_k_w, motion = moving(rng)
     system = system_of(Pieces(T_k_w), motion, busy=True)
     joining = MapMerging(system, system.map.atlas(moved=1))
@@ -191,11 +191,11 @@ def test_nothing_is_joined_while_the_worker_maps(rng, finish):
         joining.finish()
     else:
         assert joining.update() == ""
-    assert system.map.asked == 0
+    assert system.map.queries == 0
     assert system.events == {}
 
 
-def test_the_metres_of_an_earlier_flight_hold_in_its_map_and_nowhere_else(rng):
+def test_the_scale_of_an_earlier_flight_applies_in_its_submap_only(rng):
     T_k_w, motion = moving(rng)
     system = system_of(Pieces(T_k_w), motion)
     atlas = system.map.atlas(moved=1)
@@ -205,7 +205,7 @@ def test_the_metres_of_an_earlier_flight_hold_in_its_map_and_nowhere_else(rng):
     joining.enter(1)
     assert (system.published.scale, system.published.revision) == (2.0, 0)
     joining.enter(0)
-    assert (system.published.scale, system.published.revision) == (1.0, 1), "and whoever reads poses is told"
+    assert (system.published.scale, system.published.revision) == (1.0, 1), "listeners get a new revision"
     joining.enter(0)
     system.published = OutputFrame(1.1, revision=2)  # telemetry has contradicted it since
     joining.enter(0)
@@ -214,8 +214,8 @@ def test_the_metres_of_an_earlier_flight_hold_in_its_map_and_nowhere_else(rng):
 
 
 @pytest.mark.parametrize("turned", [False, True])
-def test_the_axes_of_an_earlier_flight_hold_in_its_map(rng, turned):
-    """A world that this flight turned upright by its own attitude is not that of the earlier one."""
+def test_the_axes_of_an_earlier_flight_apply_in_its_map(rng, turned):
+    """A world frame levelled by this flight's attitude differs from the earlier one."""
     T_k_w, motion = moving(rng)
     system = system_of(Pieces(T_k_w), motion)
     R_w_m = se3.exp(np.array([0.0, 0.0, 0.0, 0.2, 0.0, 0.0]))[:3, :3]
@@ -228,14 +228,14 @@ def test_the_axes_of_an_earlier_flight_hold_in_its_map(rng, turned):
     assert system.published.turned_upright(R_w_m, np.zeros(3)) is system.published
 
 
-def test_pieces_are_compared_again_when_the_camera_returns_from_one_to_an_earlier_one(rng):
-    """The one that it left is complete; one that it has just begun is not."""
+def test_submaps_are_compared_again_when_the_camera_returns_to_an_earlier_one(rng):
+    """The one that it left is complete; one that has just begun is not."""
     T_k_w, motion = moving(rng)
     system = system_of(Pieces(T_k_w), motion)
     atlas = system.map.atlas(moved=1)
     atlas.is_up_to_date = True
     joining = MapMerging(system, atlas)
-    for piece, asked in ((0, 0), (1, 0), (1, 0), (0, 1), (0, 1), (1, 1), (0, 2)):
+    for piece, queries in ((0, 0), (1, 0), (1, 0), (0, 1), (0, 1), (1, 1), (0, 2)):
         system.map.piece = piece
         joining.update()
-        assert len(system.map.again) == asked
+        assert len(system.map.again) == queries

@@ -1,4 +1,4 @@
-"""What the system asks of the fusion between two frames."""
+"""Pose prediction between two frames."""
 
 from types import SimpleNamespace
 
@@ -12,7 +12,7 @@ from edgeslam_torch.states.system import System
 from edgeslam_torch.tracking.motion_model import MotionModel
 
 TOLD = se3.exp(np.array([0.3, -0.1, 0.2, 0.1, 0.2, -0.3]))
-"""``T_w_c`` that the fusion predicts."""
+"""``T_w_c`` predicted by the fusion."""
 
 
 def system(**fusion):
@@ -29,33 +29,37 @@ def system(**fusion):
 
 
 @pytest.mark.parametrize(("filtering", "lost", "stamp_s"), [(True, False, 0.3), (True, True, 0.2), (False, True, 0.2)])
-def test_the_filter_predicts_over_gaps_once_it_is_fed_and_telemetry_when_lost(filtering, lost, stamp_s):
-    asked = system(filtering=filtering)
-    np.testing.assert_allclose(System.predict(asked, stamp_s, lost), se3.inverse(TOLD), atol=1e-12)
+def test_the_filter_predicts_over_gaps_and_telemetry_predicts_when_lost(filtering, lost, stamp_s):
+    keyframes = system(filtering=filtering)
+    np.testing.assert_allclose(System.predict(keyframes, stamp_s, lost), se3.inverse(TOLD), atol=1e-12)
 
 
 @pytest.mark.parametrize(
     ("has_telemetry", "filtering", "stamp_s"),
     [(True, False, 0.3), (False, True, 0.3), (True, True, 0.2)],  # not fed, no drone, too short a gap
 )
-def test_otherwise_it_is_constant_velocity(has_telemetry, filtering, stamp_s):
-    asked = system(filtering=filtering)
-    asked.has_telemetry = has_telemetry
-    np.testing.assert_array_equal(System.predict(asked, stamp_s, False), asked.motion.predict(stamp_s))
+def test_constant_velocity_otherwise(has_telemetry, filtering, stamp_s):
+    keyframes = system(filtering=filtering)
+    keyframes.has_telemetry = has_telemetry
+    np.testing.assert_array_equal(System.predict(keyframes, stamp_s, False), keyframes.motion.predict(stamp_s))
 
 
-def test_a_correction_of_the_map_is_told_to_the_fusion_as_such():
-    """The camera has not moved: ``T_w_c`` before, moved as the fusion is told, is ``T_w_c`` after."""
+def test_a_correction_of_the_map_is_passed_to_the_fusion():
+    """The camera has not moved: the correction maps ``T_w_c`` before to ``T_w_c`` after."""
     moved = []
-    asked = system(filtering=True, map_moved=moved.append)
-    before = se3.inverse(asked.motion.T_c_w)
+    keyframes = system(filtering=True, map_moved=moved.append)
+    before = se3.inverse(keyframes.motion.T_c_w)
     tracked = se3.exp(np.array([0.1, 0.0, 0.3, 0.0, 0.1, 0.0]))
     refined = se3.exp(np.array([0.12, -0.01, 0.31, 0.01, 0.1, 0.02]))
     mapped = SimpleNamespace(keyframes=[SimpleNamespace(T_c_w=refined)], T_tracked=tracked, stage_ms={})
-    asked.compare_depth = lambda keyframe: None
-    asked.map, asked.drift, asked.published = None, SimpleNamespace(add=lambda *_: None, newest=3.0), OutputFrame(2.0)
-    System.absorb(asked, mapped)
-    after = se3.inverse(asked.motion.T_c_w)
+    keyframes.compare_depth = lambda keyframe: None
+    keyframes.map, keyframes.drift, keyframes.published = (
+        None,
+        SimpleNamespace(add=lambda *_: None, newest=3.0),
+        OutputFrame(2.0),
+    )
+    System.absorb(keyframes, mapped)
+    after = se3.inverse(keyframes.motion.T_c_w)
     assert np.linalg.norm(after - before) > 0.01
     np.testing.assert_allclose(moved[0] @ before, after, atol=1e-9)
-    assert asked.drift_sigma == pytest.approx(2.0 * 3.0 * SHARE)
+    assert keyframes.drift_sigma == pytest.approx(2.0 * 3.0 * SHARE)

@@ -1,4 +1,4 @@
-"""Mapping on another thread while frames are tracked: with a scheduler that the test turns, nothing depends on time."""
+"""Mapping on another thread while frames are tracked, with a scheduler that the test controls."""
 
 import threading
 from dataclasses import replace
@@ -32,7 +32,7 @@ def realtime(scheduler, depth=None):
 
 
 def to_the_map(slam, scheduler):
-    """Steps until a map stands; the frames that are left."""
+    """Steps until there is a map; returns the remaining frames."""
     frames = iter(panels().frames)
     for frame in frames:
         if slam.step(frame).status is FrameStatus.INITIALISED:
@@ -47,7 +47,7 @@ def ate(T_w_c, truth):
 
 
 def move_the_map(slam, M):
-    """What a refinement of everything may do: all of the map, rigidly, by ``p' = M p``."""
+    """A refinement that moves the whole map rigidly by ``p' = M p``."""
     anchors, R = slam.map.anchors, M[:3, :3]
     anchors.p_w[:] = se3.transform(M, anchors.p_w)
     anchors.origin[:] = se3.transform(M, anchors.origin)
@@ -56,7 +56,7 @@ def move_the_map(slam, M):
         keyframe.T_c_w = keyframe.T_c_w @ se3.inverse(M)
 
 
-def test_a_worker_that_is_done_at_once_maps_as_well_as_none():
+def test_a_worker_that_finishes_at_once_gives_the_same_map_as_none():
     scheduler = Scheduler(at_once=True)
     slam = realtime(scheduler)
     outputs = [slam.step(frame) for frame in panels().frames]
@@ -70,7 +70,7 @@ def test_a_worker_that_is_done_at_once_maps_as_well_as_none():
     assert len(slam.edge_map().p_w) > 3000
 
 
-def test_what_refinement_did_to_the_newest_keyframe_carries_the_camera_along():
+def test_refinement_of_the_newest_keyframe_corrects_the_camera_pose():
     """The map moves by 60 cm and 20 degrees while frames are tracked against its old state."""
     M = se3.exp(np.array([0.4, -0.3, 0.3, 0.1, 0.3, -0.15]))
     scheduler = Scheduler()
@@ -82,7 +82,7 @@ def test_what_refinement_did_to_the_newest_keyframe_carries_the_camera_along():
     after = [slam.step(next(frames)) for _ in range(3)]
     assert {o.status for o in after} == {FrameStatus.TRACKED}
     assert slam.events["lost"] == slam.events["relocalised"] == 0
-    # Each camera to the next one as in truth, up to the map's scale, across the leap as well.
+    # Motion between consecutive cameras as in truth up to the map's scale, also across the correction.
     first = before[0].index
     truth = se3.inverse(panels().T_w_c[first]) @ panels().T_w_c[first + 5]
     found = se3.inverse(M @ before[0].T_w_c) @ after[-1].T_w_c
@@ -91,7 +91,7 @@ def test_what_refinement_did_to_the_newest_keyframe_carries_the_camera_along():
     assert cosine > np.cos(np.deg2rad(5.0))
 
 
-def test_while_the_worker_is_busy_no_other_keyframe_is_made_and_each_is_counted():
+def test_a_busy_worker_accepts_no_keyframe_and_each_is_counted():
     scheduler = Scheduler()
     slam = realtime(scheduler)
     frames = to_the_map(slam, scheduler)
@@ -111,7 +111,7 @@ def test_while_the_worker_is_busy_no_other_keyframe_is_made_and_each_is_counted(
     assert ate(slam.trajectory()[1], panels().T_w_c[: len(slam.trajectory()[1])]) < 0.02
 
 
-def test_the_end_waits_for_what_is_being_mapped():
+def test_finish_waits_for_pending_mapping():
     scheduler = Scheduler()
     slam = realtime(scheduler)
     frames = to_the_map(slam, scheduler)
@@ -123,12 +123,12 @@ def test_the_end_waits_for_what_is_being_mapped():
     newest = slam.keyframes()[-1]
     assert newest in scheduler.jobs[-1].result().keyframes
     assert len(newest.keypoints_with_anchor()) > 100
-    assert len(slam.edge_map().p_w) > 0, "edges are measured at the end, the last keyframe's too"
+    assert len(slam.edge_map().p_w) > 0, "edges of the last keyframe are measured at the end"
     slam.close()
     assert scheduler.is_shut
 
 
-def test_a_fault_of_the_mapping_is_raised_where_the_frames_are_stepped():
+def test_an_error_in_mapping_is_raised_by_step():
     def depth(image, camera):
         if scheduler.jobs:
             raise RuntimeError("the network broke")
@@ -141,7 +141,7 @@ def test_a_fault_of_the_mapping_is_raised_where_the_frames_are_stepped():
         slam.step(next(frames))
 
 
-def test_maps_are_read_and_frames_are_tracked_while_the_network_runs():
+def test_reading_and_tracking_continue_while_the_network_runs():
     """A real thread blocks inside the depth network until the others have finished."""
     inside, go_on = threading.Event(), threading.Event()
 
@@ -159,7 +159,7 @@ def test_maps_are_read_and_frames_are_tracked_while_the_network_runs():
     step = slam.step(next(frames))
     stamps, T_w_c = slam.trajectory()
     anchors, edges, keyframes = slam.anchors(), slam.edge_map(), slam.keyframes()
-    assert scheduler.waiting, "all of that while the worker was at it"
+    assert scheduler.waiting, "the worker was busy all the time"
     go_on.set()
     worker.join(120.0)
     assert step.status is FrameStatus.TRACKED
@@ -176,7 +176,7 @@ def dark(frame):
     return replace(frame, image=np.zeros_like(frame.image))
 
 
-def test_a_lost_frame_is_found_again_while_the_worker_is_busy():
+def test_a_lost_frame_is_relocalised_while_the_worker_is_busy():
     scheduler = Scheduler()
     slam = realtime(scheduler)
     frames = to_the_map(slam, scheduler)
@@ -191,7 +191,7 @@ def test_a_lost_frame_is_found_again_while_the_worker_is_busy():
     assert not found.keyframe
 
 
-def test_a_new_piece_of_map_begins_after_what_is_being_mapped():
+def test_a_new_submap_begins_after_pending_mapping():
     """Lost beyond the time-out, then at another place: two threads never write to the map."""
     scheduler = Scheduler()
     slam = realtime(scheduler)

@@ -1,4 +1,4 @@
-"""Where a lost frame may be found again: where the drone's sensors let it be."""
+"""Relocalisation is gated by the pose that the drone's sensors predict."""
 
 from types import SimpleNamespace
 
@@ -19,7 +19,7 @@ def placed(x):
 
 
 class Flown:
-    """Six keyframes along five units, the newest of which was tracked last; what it sees is two units away."""
+    """Six keyframes along five units, the newest of which was tracked last; its points are two units away."""
 
     def __init__(self, sigma=0.01, earlier=False, between=np.inf):
         self.between = between
@@ -34,7 +34,7 @@ class Flown:
             for k in range(6)
         }
         self.piece_of = dict.fromkeys(range(6), 0)
-        self.told = PoseEstimate(6.0, placed(5.0), sigma, 0.01, "filter")
+        self.predicted = PoseEstimate(6.0, placed(5.0), sigma, 0.01, "filter")
         self.asked = []
         self.sees_again = {}
         """Anchors that the two newest keyframes share with others."""
@@ -53,12 +53,12 @@ class Flown:
             log=SimpleNamespace(
                 records=[SimpleNamespace(keyframe_id=5)], replace=lambda *_: self.asked.append("moved")
             ),
-            carried=lambda stamp_s: self.told,
+            sensor_prediction=lambda stamp_s: self.predicted,
             between=lambda piece, other: 0.0 if piece == other else self.between,
         )
 
     def finds(self, x, turned_deg=0.0):
-        """The track that a relocaliser's find at ``(x, 0, 0)``, confirmed by earlier frames, comes to."""
+        """Track of a candidate at ``(x, 0, 0)`` confirmed by earlier frames; None if it is rejected."""
         T_w_c = placed(x)
         T_w_c[:3, :3] = se3.exp(np.array([0, 0, 0, 0, 0, np.deg2rad(turned_deg)]))[:3, :3]
         track = SimpleNamespace(T_c_w=se3.inverse(T_w_c), anchor=np.array([0, 1]))
@@ -68,31 +68,31 @@ class Flown:
         return Tracking.find(state, SimpleNamespace(index=7, stamp_s=6.0), None, [], None)
 
 
-def test_a_frame_is_not_found_again_where_the_drone_cannot_have_come_to():
-    """Two and a half units from where it was carried to, on a way of five; nor are the frames before it moved there."""
+def test_relocalisation_out_of_reach_is_rejected():
+    """2.5 units from the prediction after a path of five; the earlier frames keep their poses as well."""
     flown = Flown()
     assert flown.finds(2.5) is None and flown.asked == []
 
 
 @pytest.mark.parametrize(("x", "sigma", "may"), [(4.7, 0.01, True), (4.5, 0.01, False), (4.5, 0.1, True)])
-def test_a_map_drifts_and_sensors_doubt(x, sigma, may):
-    """Three percent of the way, a tenth of the depth, and three sigmas: .38 and .65 units."""
+def test_the_gate_includes_drift_and_sensor_uncertainty(x, sigma, may):
+    """Three percent of the path, a tenth of the depth, and three sigmas: .38 and .65 units."""
     assert (Flown(sigma).finds(x) is not None) == may
 
 
-def test_a_way_that_leads_back_to_what_was_seen_before_is_short():
-    """`blank_walls` 797: home again after forty metres, found again on the same wallpaper 1.3 m on."""
+def test_the_gate_uses_the_shortest_covisibility_path():
+    """After a long loop back to the start, similar wallpaper 1.3 m away is no match."""
     flown = Flown()
     for k in range(6):
         flown.keyframes[k].centre_w = np.array([10.0 * k if k < 5 else 5.0, 0.0, 0.0])
-    assert flown.finds(3.7) is not None, "a way of 75 units"
+    assert flown.finds(3.7) is not None, "a path of 75 units"
     flown.sees_again = {0: 30}
-    assert flown.finds(3.7) is None, "a way of 5"
+    assert flown.finds(3.7) is None, "a path of 5"
     assert flown.finds(4.7) is not None
 
 
-def test_a_new_piece_is_no_farther_from_the_way_back_than_the_one_before():
-    """The same, and a piece that begins there: its own unit is in doubt, not where the way before it led."""
+def test_the_shortest_path_continues_into_a_new_submap():
+    """The same with a submap that begins there: its scale is uncertain, the path before it is not."""
     flown = Flown(between=0.01)
     flown.keyframes[4].centre_w = np.array([4.9, 0.0, 0.0])
     for k in range(1, 4):
@@ -104,24 +104,24 @@ def test_a_new_piece_is_no_farther_from_the_way_back_than_the_one_before():
     assert flown.finds(4.7) is not None
 
 
-def test_a_frame_is_not_found_again_where_it_would_have_turned_as_the_drone_has_not():
+def test_relocalisation_with_a_wrong_heading_is_rejected():
     """Two sides of a room with the same shelves."""
     assert Flown().finds(5.0, turned_deg=15.0) is not None
     assert Flown().finds(5.0, turned_deg=90.0) is None
 
 
 @pytest.mark.parametrize(("between", "may"), [(0.1, False), (0.5, True), (np.inf, True)])
-def test_a_piece_that_the_drone_was_carried_to_is_where_it_was_carried_to(between, may):
-    """`cluttered_room` 790: lost in a turn, a new piece of map, and found again three metres off, a quarter turned."""
+def test_the_gate_includes_the_uncertainty_between_submaps(between, may):
+    """A new submap after a loss; a candidate three metres away and rotated by a quarter turn."""
     flown = Flown(between=between)
     flown.piece_of[5] = 1
     assert (flown.finds(3.2) is not None) == may
 
 
-def test_images_decide_alone():
-    """Without sensors, in a piece of map that nothing relates to, and in the map of an earlier flight."""
+def test_images_decide_without_related_sensors():
+    """Without sensors, in an unrelated submap, and in the map of an earlier flight."""
     flown = Flown()
-    flown.told = None
+    flown.predicted = None
     assert flown.finds(0.0) is not None
     flown = Flown()
     flown.piece_of[5] = 1

@@ -1,4 +1,4 @@
-"""Lost frames get poses backwards in time, only where the map supports them."""
+"""Lost frames are localised backwards in time, only where the map supports them."""
 
 from types import SimpleNamespace
 
@@ -27,25 +27,25 @@ class Lost:
         self.placed = {}
         log = SimpleNamespace(replace=self._replace)
         tracker = Tracker(self.points.map, CAMERA, OrbConfig(), TrackingConfig())
-        self.backfill = RetroactiveLocalisation(SimpleNamespace(tracker=tracker, log=log))
+        self.retroactive = RetroactiveLocalisation(SimpleNamespace(tracker=tracker, log=log))
 
     def _replace(self, poses, keyframes):
         assert keyframes == [self.keyframe]
         self.placed |= poses
 
     def keep(self, index, known=1.0):
-        """A frame of whose keypoints a share, spread over the image, matches the map."""
+        """A frame of which a share of the keypoints, spread over the image, matches the map."""
         seen = np.flatnonzero(self.points.world.visible[VIEW])
         features = self.points.features(VIEW, seen, 0.5 * self.rng.normal(size=(len(seen), 2)))
         strange = self.rng.random(len(seen)) >= known
         descriptors = features.descriptors.copy()
         descriptors[strange] = self.rng.integers(0, 256, (strange.sum(), 32), dtype=np.uint8)
         features = FrameFeatures(features.uv, features.octave, features.angle_rad, descriptors)
-        self.backfill.keep(index, make_view(features, SCALE_FACTOR))
+        self.retroactive.keep(index, make_view(features, SCALE_FACTOR))
 
     def place(self):
         held = self.keyframe.anchor[self.keyframe.anchor >= 0]
-        return self.backfill.place(self.keyframe, self.points.world.T_c_w[VIEW], held)
+        return self.retroactive.place(self.keyframe, self.points.world.T_c_w[VIEW], held)
 
 
 @pytest.fixture
@@ -53,26 +53,26 @@ def lost(rng):
     return Lost(rng)
 
 
-def test_frames_are_found_where_they_were(lost):
+def test_frames_are_localised_at_their_true_poses(lost):
     for index in (4, 5, 6):
         lost.keep(index)
     assert lost.place() == 3
     assert sorted(lost.placed) == [4, 5, 6]
     for T_c_w in lost.placed.values():
         assert np.linalg.norm(se3.log(T_c_w @ se3.inverse(lost.points.world.T_c_w[VIEW]))[:3]) < 0.03
-    assert lost.place() == 0, "each loss is filled once"
+    assert lost.place() == 0, "each loss is processed once"
 
 
 @pytest.mark.parametrize("share", [0.08, 0.0])
-def test_one_frame_may_be_missed_but_not_two_in_a_row(lost, share):
-    """Of 2000 anchors 8 % agree: enough keypoints for a pose, too few for a place."""
+def test_the_search_continues_after_one_failure_and_ends_after_two(lost, share):
+    """Of 2000 anchors 8 % agree: enough keypoints for a pose, too few to accept it."""
     for index, known in enumerate((1.0, share, share, 1.0, share, 1.0)):
         lost.keep(index, known)
     assert lost.place() == 2
     assert sorted(lost.placed) == [3, 5]
 
 
-def test_of_a_long_loss_the_newest_frames_are_kept(lost, monkeypatch):
+def test_a_long_loss_keeps_its_newest_frames(lost, monkeypatch):
     monkeypatch.setattr(retroactive_localisation, "MAX_FRAMES", 3)
     for index in range(5):
         lost.keep(index)

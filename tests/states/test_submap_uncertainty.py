@@ -1,4 +1,4 @@
-"""How well it is known where a piece of map lies that began after a loss."""
+"""Uncertainty of the pose of a submap that began after a loss."""
 
 import math
 from dataclasses import replace
@@ -10,17 +10,17 @@ import pytest
 from edgeslam_torch.fusion.output_frame import OutputFrame
 from edgeslam_torch.fusion.prediction import PoseEstimate
 from edgeslam_torch.geometry import se3
-from edgeslam_torch.states.submap_uncertainty import Apart
+from edgeslam_torch.states.submap_uncertainty import SubmapUncertainty
 from edgeslam_torch.states.system import System
 from edgeslam_torch.tracking.motion_model import MotionModel
 from edgeslam_torch.types import ScaleEstimate
 
 
-def test_a_turn_that_is_not_known_counts_by_the_way_flown_in_the_piece():
-    """Against the truth: pieces laid down with errors of these sigmas, cameras 3 m along."""
-    rng, apart = np.random.default_rng(3), Apart()
+def test_rotational_uncertainty_grows_with_the_distance_travelled_in_the_submap():
+    """Monte Carlo: submaps placed with errors of these sigmas, cameras 3 m along."""
+    rng, uncertainty = np.random.default_rng(3), SubmapUncertainty()
     begun, camera = np.array([5.0, 1.0, 1.0]), np.array([8.0, 1.0, 1.0])
-    apart.begin(1, 0, begun, 0.1, 0.05)
+    uncertainty.begin(1, 0, begun, 0.1, 0.05)
     off = []
     for _ in range(4000):
         T = se3.exp(np.concatenate([np.zeros(3), rng.normal(0.0, 0.05, 3)]))
@@ -28,33 +28,33 @@ def test_a_turn_that_is_not_known_counts_by_the_way_flown_in_the_piece():
         placed = begun + rng.normal(0.0, 0.1, 3) + grown * (T[:3, :3] @ (camera - begun))
         off.append(placed - camera)
     worst_axis = np.sqrt(np.mean(np.square(off), axis=0)).max()
-    assert apart.sigma(1, camera, 0.02) == pytest.approx(worst_axis, rel=0.25)
-    assert apart.sigma(1, camera, 0.02) >= worst_axis
+    assert uncertainty.sigma(1, camera, 0.02) == pytest.approx(worst_axis, rel=0.25)
+    assert uncertainty.sigma(1, camera, 0.02) >= worst_axis
 
 
-def test_a_piece_that_was_turned_is_as_sure_of_its_heading_as_what_told_it():
-    apart = Apart()
-    apart.begin(1, 0, np.zeros(3), 0.3, 0.5)
-    apart.turned(1, 0.1)
-    assert apart.sigma(1, np.array([4.0, 0.0, 0.0]), 0.0) == pytest.approx(0.5)
-    apart.turned(2, 0.1)
-    assert apart.sigma(2, np.zeros(3), 0.0) == math.inf, "a piece that nothing relates"
+def test_an_aligned_submap_has_the_rotational_uncertainty_of_the_alignment():
+    uncertainty = SubmapUncertainty()
+    uncertainty.begin(1, 0, np.zeros(3), 0.3, 0.5)
+    uncertainty.turned(1, 0.1)
+    assert uncertainty.sigma(1, np.array([4.0, 0.0, 0.0]), 0.0) == pytest.approx(0.5)
+    uncertainty.turned(2, 0.1)
+    assert uncertainty.sigma(2, np.zeros(3), 0.0) == math.inf, "an unrelated submap"
 
 
-def test_a_piece_after_another_is_in_doubt_by_both():
-    apart = Apart()
-    apart.begin(1, 0, np.zeros(3), 0.3, 0.0)
-    apart.begin(2, 1, np.array([0.0, 2.0, 0.0]), 0.4, 0.1)
-    assert apart.sigma(2, np.array([0.0, 2.0, 0.0]), 0.0) == pytest.approx(0.5)
-    assert apart.sigma(2, np.array([0.0, 5.0, 0.0]), 0.0) == pytest.approx(math.hypot(0.5, 0.3))
+def test_uncertainties_of_successive_submaps_add():
+    uncertainty = SubmapUncertainty()
+    uncertainty.begin(1, 0, np.zeros(3), 0.3, 0.0)
+    uncertainty.begin(2, 1, np.array([0.0, 2.0, 0.0]), 0.4, 0.1)
+    assert uncertainty.sigma(2, np.array([0.0, 2.0, 0.0]), 0.0) == pytest.approx(0.5)
+    assert uncertainty.sigma(2, np.array([0.0, 5.0, 0.0]), 0.0) == pytest.approx(math.hypot(0.5, 0.3))
 
 
-def test_what_nothing_relates_is_anywhere():
-    assert math.isinf(Apart().sigma(3, np.zeros(3), 0.0))
+def test_an_unrelated_submap_has_infinite_uncertainty():
+    assert math.isinf(SubmapUncertainty().sigma(3, np.zeros(3), 0.0))
 
 
 def system(T_c_w):
-    """A system whose frames are tied to keyframe 0, in a published unit of two map units, and what piece it is in."""
+    """A system whose frames refer to keyframe 0, with a published scale of 0.5, and the submap of each keyframe."""
     piece_of = {0: 0, 1: 1}
     predicted = PoseEstimate(1.0, se3.inverse(T_c_w), 0.2, 0.01, "filter")
     fusion = SimpleNamespace(
@@ -76,14 +76,14 @@ def placed(x):
 def see(made, T_c_w):
     made.motion.T_c_w = T_c_w
     made.see(2.0, SimpleNamespace(T_c_w=T_c_w, covariance=1e-6 * np.eye(6)))
-    return made.apart_sigma
+    return made.submap_sigma
 
 
-def test_a_system_states_it_in_the_published_unit_until_the_pieces_are_one():
+def test_uncertainty_is_published_in_output_units_until_the_submaps_are_merged():
     made, piece_of = system(placed(4.0))
     assert see(made, placed(4.0)) == 0.0
-    made.carried_to(1, 1.0)
-    assert made.apart_sigma == pytest.approx(0.5 * 0.2)
+    made.begin_submap(1, 1.0)
+    assert made.submap_sigma == pytest.approx(0.5 * 0.2)
     made.log.records.append(SimpleNamespace(keyframe_id=1))
     way = 3.0 * math.hypot(0.01, math.sqrt(2.0) * 0.02)
     assert see(made, placed(7.0)) == pytest.approx(0.5 * math.hypot(0.2, way))
@@ -91,11 +91,11 @@ def test_a_system_states_it_in_the_published_unit_until_the_pieces_are_one():
     assert see(made, placed(7.0)) == 0.0
 
 
-def test_the_first_piece_is_carried_from_nowhere():
+def test_the_first_submap_has_no_uncertainty():
     made, _ = system(np.eye(4))
     made.log.records.clear()
-    made.carried_to(0, 0.0)
-    assert made.apart_sigma == 0.0
+    made.begin_submap(0, 0.0)
+    assert made.submap_sigma == 0.0
 
 
 @pytest.mark.parametrize(
@@ -106,28 +106,28 @@ def test_the_first_piece_is_carried_from_nowhere():
         (ScaleEstimate(0.6, np.inf, "none"), ScaleEstimate(0.5, 0.01, "telemetry+height"), False),
         (ScaleEstimate(0.52, 0.012, "telemetry"), ScaleEstimate(0.5, 0.01, "telemetry+height"), False),
     ],
-    ids=["sure of both", "unsure of the first one", "nothing known of it", "the same"],
+    ids=["both certain", "first uncertain", "first unknown", "equal"],
 )
-def test_what_tells_another_unit_in_a_later_piece_is_of_that_piece(first, now, is_of_the_piece):
-    """`blank_walls` 815: all that the drone had flown before was published 11 % too short, with 2 % stated."""
+def test_a_different_scale_in_a_later_submap_belongs_to_that_submap(first, now, is_of_the_piece):
+    """Applied to the whole map, it would falsify the scale of all earlier output."""
     made, piece_of = system(placed(4.0))
     made.fusion.scale = lambda: first
     made.published = OutputFrame(0.6, guessed=False)
     see(made, placed(4.0))
     made.published = OutputFrame(0.6, guessed=False)
-    made.carried_to(1, 1.0)
+    made.begin_submap(1, 1.0)
     made.log.records.append(SimpleNamespace(keyframe_id=1))
     made.fusion.scale = lambda: now
-    made.carried_to(2, 1.5)  # from a later one: nothing new of the first
+    made.begin_submap(2, 1.5)  # from a later one: nothing new of the first
     see(made, placed(7.0))
     assert made.published.scale == (0.6 if is_of_the_piece else 0.5)
     if is_of_the_piece:
-        assert made.other_unit() == pytest.approx((0.5 / 0.6, math.hypot(0.02, 0.02)))
-        made.apart.moved(1, 3.0)
-        assert made.other_unit()[0] == pytest.approx(0.5 / 0.6), "the first one stayed"
-        made.apart.moved(0, 1.1)
-        assert made.other_unit()[0] == pytest.approx(1.1 * 0.5 / 0.6), "it was joined to a later one, and grew"
+        assert made.scale_ratio() == pytest.approx((0.5 / 0.6, math.hypot(0.02, 0.02)))
+        made.submap_uncertainty.moved(1, 3.0)
+        assert made.scale_ratio()[0] == pytest.approx(0.5 / 0.6), "the first submap is unchanged"
+        made.submap_uncertainty.moved(0, 1.1)
+        assert made.scale_ratio()[0] == pytest.approx(1.1 * 0.5 / 0.6), "it was merged into a later one, and grew"
     piece_of[1] = 0  # joined
-    assert made.other_unit() is None
+    assert made.scale_ratio() is None
     see(made, placed(7.0))
-    assert made.published.scale == 0.5, "now it is of all of the map"
+    assert made.published.scale == 0.5, "after merging it applies to the whole map"

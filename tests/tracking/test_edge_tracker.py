@@ -144,7 +144,7 @@ def test_nearest_edge_is_the_nearest(rng):
     image = EdgeImage.of(STRIPES, 40.0, 100.0)
     uv = rng.uniform(5, 230, (50, 2))
     pixel, normal, near = image.nearest(uv, 6.0)
-    apart = np.linalg.norm(image.pixel[None] - np.rint(uv)[:, None], axis=2)
-    np.testing.assert_allclose(np.linalg.norm(pixel - np.rint(uv), axis=1), apart.min(1), atol=0.5)
+    distance = np.linalg.norm(image.pixel[None] - np.rint(uv)[:, None], axis=2)
+    np.testing.assert_allclose(np.linalg.norm(pixel - np.rint(uv), axis=1), distance.min(1), atol=0.5)
     np.testing.assert_allclose(np.abs(normal[:, 0]), 1.0, atol=1e-6)  # across vertical stripes
     assert (near == (image.distance[np.rint(uv[:, 1]).astype(int), np.rint(uv[:, 0]).astype(int)] <= 6.0)).all()

@@ -432,7 +432,7 @@ def other_explanation(points, found):
     _, turns, shifts, normals = cv2.decomposeHomographyMat(H, CAMERA.K)
     T_true = points.world.T_c_w[4] @ se3.inverse(points.world.T_c_w[0])
     rays = CAMERA.back_project(uv_r, np.ones(len(uv_r)))
-    best, apart = None, 0.0
+    best, distance = None, 0.0
     for R, t, n in zip(turns, shifts, normals, strict=True):
         z = 1.0 / (rays @ n[:, 0])  # the plane n p = 1
         p = rays * z[:, None]
@@ -443,9 +443,9 @@ def other_explanation(points, found):
         grown = np.linalg.norm(T_true[:3, 3]) / np.linalg.norm(t)
         T[:3, 3] *= grown
         off = np.linalg.norm(se3.log(T @ se3.inverse(T_true)))
-        if off > apart:
+        if off > distance:
             first = points.world.T_c_w[0]
-            best, apart = (T @ first, se3.transform(se3.inverse(first), p * grown)), off
+            best, distance = (T @ first, se3.transform(se3.inverse(first), p * grown)), off
     return best
 
 

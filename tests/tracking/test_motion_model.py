@@ -24,7 +24,7 @@ def moving() -> MotionModel:
 
 def test_goes_on_as_it_moved():
     assert np.allclose(se3.inverse(moving().predict(12.5))[:3, 3], [3.5, 0, 0])
-    assert not moving().stands
+    assert not moving().velocity_unknown
 
 
 def test_a_prediction_taken_for_a_pose_fades_and_a_stop_stands():
@@ -34,7 +34,7 @@ def test_a_prediction_taken_for_a_pose_fades_and_a_stop_stands():
     x = se3.inverse(model.predict(12.5))[0, 3]
     assert 2.5 < x < 3.5
     model.stop()
-    assert model.stands
+    assert model.velocity_unknown
     assert np.allclose(model.predict(99.0), at(2.5))
 
 
@@ -49,9 +49,9 @@ def test_a_correction_of_the_keyframe_moves_the_pose_in_the_keyframes_frame():
 
 def test_expectation_grows_with_the_square_of_time_and_is_in_map_units():
     model = moving()
-    near, far = (model.expectation(10.5 + dt, at(1.5), 2.0).information for dt in (0.1, 0.2))
+    near, far = (model.pose_prior(10.5 + dt, at(1.5), 2.0).information for dt in (0.1, 0.2))
     assert np.allclose(np.sqrt(np.diag(near) / np.diag(far)), 4.0)
-    metres = model.expectation(10.6, at(1.5), 1.0).information
+    metres = model.pose_prior(10.6, at(1.5), 1.0).information
     assert np.allclose(np.sqrt(np.diag(near)[:3] / np.diag(metres)[:3]), 2.0)  # a unit is two metres
     assert np.allclose(np.diag(near)[3:], np.diag(metres)[3:])
 
@@ -74,5 +74,5 @@ def test_before_any_velocity_is_known_it_may_have_moved_all_the_time():
     """Half a metre and one radian a second over a tenth, beside what accelerations add."""
     model = MotionModel(at(1.0))
     model.stamp_s = 10.0
-    sigma = 1.0 / np.sqrt(np.diag(model.expectation(10.1, at(1.0), 1.0).information))
+    sigma = 1.0 / np.sqrt(np.diag(model.pose_prior(10.1, at(1.0), 1.0).information))
     assert np.allclose(sigma, [np.hypot(0.05, 0.015)] * 3 + [np.hypot(0.1, 0.1)] * 3)

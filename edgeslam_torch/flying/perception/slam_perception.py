@@ -186,7 +186,7 @@ class SlamPerception:
             float(np.arctan2(T_w_b[1, 0], T_w_b[0, 0])),
             home.scale * (home.R @ np.asarray(pose.velocity_w)),
             position_sigma_m=min(sigma, _WIDEST_SIGMA_M),
-            apart_sigma_m=home.scale * health.apart_sigma,
+            apart_sigma_m=home.scale * health.submap_sigma,
             drift_sigma_m=home.scale * health.drift_sigma,
             piece=output.piece,
             scale_sigma=relative if np.isfinite(relative) else 1.0,

@@ -1,5 +1,5 @@
-"""Poses that the drone's attitude or its place is_outlier: before a wall whose pattern repeats, corners on whole pixels
-take any neighbour. (Aligned to a part of a pixel they are seldom deceived, and nothing would be left to deny.)"""
+"""Poses that the drone's attitude or position contradicts: on a repetitive wall, corners match the neighbouring
+repetition. (Corners on whole pixels; with sub-pixel alignment such mismatches are rare.)"""
 
 from functools import lru_cache
 
@@ -16,12 +16,12 @@ from edgeslam_torch.synthetic.house.world import Quad, Texture, World
 PERIOD_M = 0.24
 """31 px of a wall 2 m away."""
 STEPS_M = (0.15, 0.18)
-"""Way from one frame to the next, for three of them: 20 and 23 px."""
+"""Distance from one frame to the next, for three of them: 20 and 23 px."""
 PICTURE_M = 0.6
 DOUBT_M = 0.08
 STEP_RAD = 0.09
-"""Turn from one frame to the next, for three of them: 23 px. When it ends, the neighbour is nearer to what is
-expected."""
+"""Rotation from one frame to the next, for three of them: 23 px. When it ends, the neighbouring repetition is nearer to
+the prediction."""
 
 
 def papered(poses, picture_m=0.0):
@@ -40,7 +40,7 @@ def papered(poses, picture_m=0.0):
 
 
 def after_eleven(step):
-    """Poses that creep sideways, by three steps ``(6,)`` more after the eleventh, and stop at once."""
+    """Poses that move slowly sideways, with three larger steps ``(6,)`` after the eleventh, then stop."""
     poses = [se3.exp(np.array(step) * np.clip(k - 11, 0, 3)) for k in range(23)]
     for k, T in enumerate(poses):
         T[0, 3] += 0.01 * k
@@ -62,7 +62,7 @@ def passing(axis):
 
 
 def flown(flight, told=lambda stamp_s: None, place=lambda stamp_s: None):
-    """Outputs of a flight where attitude and place are ``told`` as a frame's."""
+    """Outputs of a flight with the given attitude and position measurements."""
     config = SlamConfig(depth=DepthConfig(weights="none"), mapping=MappingConfig(sub_pixel=False))
     slam = EdgeSlam(CAMERA, config, depth=flight.depth_function())
     slam._system.has_telemetry, slam._system.fusion.orientation.turned, slam._system.fusion.reckoned = True, told, place
@@ -70,7 +70,7 @@ def flown(flight, told=lambda stamp_s: None, place=lambda stamp_s: None):
 
 
 def turned_wrongly_deg(told):
-    """How far the last pose before the wallpaper is turned from the true one."""
+    """Rotation error of the last pose in front of the wallpaper."""
     flight = wallpaper()
     R_w_c = np.stack([out.T_w_c[:3, :3] for out in flown(flight, told)])
     relative = (R_w_c[0].T @ R_w_c[-1]).T @ flight.T_w_c[0, :3, :3].T @ flight.T_w_c[-1, :3, :3]
@@ -78,22 +78,22 @@ def turned_wrongly_deg(told):
 
 
 def true_turn(stamp_s):
-    """What attitude tells, in a map whose axes are those of the first camera turned upright."""
+    """True attitude, in a map levelled to the first camera."""
     flight = wallpaper()
     k = int(np.argmin(np.abs(flight.stamps_s - stamp_s)))
     first = se3.inverse(EdgeSlam(CAMERA)._system.motion.T_c_w)
     return (first[:3, :3] @ flight.T_w_c[0, :3, :3].T @ flight.T_w_c[k, :3, :3]).T, 0.0
 
 
-def test_a_repeating_wall_is_no_turn_that_the_drone_has_not_made():
+def test_attitude_prevents_a_mismatch_on_a_repetitive_wall():
     assert turned_wrongly_deg(true_turn) < 2.0
 
 
-def test_without_attitude_the_images_are_all_there_is():
+def test_without_attitude_the_mismatch_remains():
     assert turned_wrongly_deg(lambda stamp_s: None) > 10.0
 
 
-def test_attitude_that_lies_moves_no_pose_that_the_images_prove():
+def test_a_wrong_attitude_does_not_change_a_pose_that_images_confirm():
     flight = film(stairs_world(), CAMERA, sideways(16, 0.03, turn_rad=0.004), step_s=1 / 30)
     lie = se3.exp(np.array([0.0, 0.0, 0.0, 0.1, 0.1, 0.1]))[:3, :3]
     lied, untold = flown(flight, lambda stamp_s: (lie, 0.0)), flown(flight)
@@ -104,13 +104,13 @@ def test_attitude_that_lies_moves_no_pose_that_the_images_prove():
 
 
 def true_centre(flight, k):
-    """Where the camera of a frame is in a map whose axes are those of the first one turned upright."""
+    """True camera centre of a frame in a map levelled to the first camera."""
     first = se3.inverse(EdgeSlam(CAMERA)._system.motion.T_c_w)
     return (first @ se3.inverse(flight.T_w_c[0]) @ flight.T_w_c[k])[:3, 3]
 
 
-def carried(flight):
-    """Where the drone's sensors carry a frame's camera."""
+def sensor_prediction(flight):
+    """Dead-reckoned position of a frame's camera."""
 
     def place(stamp_s):
         k = int(np.argmin(np.abs(flight.stamps_s - stamp_s)))
@@ -120,15 +120,15 @@ def carried(flight):
 
 
 @pytest.mark.parametrize("axis", [0, 1])
-def test_a_repeating_wall_is_no_way_that_the_drone_has_not_gone(axis):
+def test_position_prevents_a_mismatch_on_a_repetitive_wall(axis):
     flight = passing(axis)
-    held, alone = (flown(flight, place=place) for place in (carried(flight), lambda stamp_s: None))
+    held, alone = (flown(flight, place=place) for place in (sensor_prediction(flight), lambda stamp_s: None))
     true = true_centre(flight, len(flight.frames) - 1)
     assert np.abs(held[-1].T_w_c[:3, 3] - true).max() < 1.5 * DOUBT_M
     assert np.abs(alone[-1].T_w_c[:3, 3] - true).max() > 4.0 * DOUBT_M
 
 
-def test_a_place_that_lies_moves_no_pose_that_the_images_prove():
+def test_a_wrong_position_does_not_change_a_pose_that_images_confirm():
     flight = film(stairs_world(), CAMERA, sideways(16, 0.03, turn_rad=0.004), step_s=1 / 30)
     lied = flown(flight, place=lambda stamp_s: Reckoned(np.eye(3), np.array([0.3, -0.5, 0.4]), np.full(3, DOUBT_M)))
     untold = flown(flight)
