@@ -147,7 +147,7 @@ def test_command_saves_and_reports(tmp_path, write_images, capsys):
     ("options", "match"),
     [
         (["--atlas", "none.atlas"], "none.atlas: no such atlas file"),
-        (["--atlas", "text"], "text: not an atlas that can be used: not a safetensors file"),
+        (["--atlas", "text"], "text: not a valid atlas: not a safetensors file"),
         (["--save-atlas", "text"], "text: exists; give another file to --save-atlas"),
         (["--save-atlas", "nowhere/room.atlas"], "nowhere/room.atlas: there is no folder nowhere"),
     ],

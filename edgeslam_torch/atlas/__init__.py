@@ -1,5 +1,6 @@
-"""Pieces of map that are found to be one: a place that looks known, the similarity between the pieces, the weld.
+"""Merging of submaps (pieces of map) and loop closure.
 
-`places.py` asks which keyframes look alike, `links.py` proves that a keyframe shows another piece and how that piece
-lies, `weld.py` moves the smaller piece and makes one map of both, and `atlas.py` decides: two keyframes must agree.
+`place_recognition.py` proposes keyframes, `links.py` verifies that a keyframe shows another submap and estimates the
+similarity between the two, `map_merging.py` moves the smaller submap and merges both, and `atlas.py` decides: two links
+must agree.
 """

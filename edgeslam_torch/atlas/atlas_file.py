@@ -1,6 +1,6 @@
-"""The file of a saved atlas: safetensors with a JSON header, checked whole before anything of it enters a map.
+"""File format of a saved atlas: safetensors with a JSON header, validated as a whole before use.
 
-A file is refused in one line when it is truncated, damaged, hostile, of a newer version or of another lens.
+A truncated, damaged or hostile file, one of a newer version or of another lens is refused in one line.
 """
 
 import dataclasses
@@ -24,11 +24,11 @@ VERSION = 1
 MAX_FILE_BYTES = 1 << 30
 """Maximum file size: 200 keyframes with 400 000 edge points have 25 MB."""
 MAX_NUMBER = 1e6
-"""Maximum absolute value of a length: kilometres in any unit of ours."""
+"""Maximum absolute value of a length: kilometres in any map unit."""
 LEAST_SIGMA = 1e-4
-"""Relative standard deviation of metres below which they are no measurement: telemetry and depth reach 1 %."""
+"""Minimum relative standard deviation of a metric scale; telemetry and depth reach 1 %."""
 PLAUSIBLE_M = (0.02, 500.0)
-"""Median distance of a map's points from its keyframes [m]."""
+"""Plausible median distance of a map's points from its keyframes [m]."""
 MAX_PIECES, MAX_FLIGHTS, MAX_LEVELS = 1000, 1000, 20
 
 COLUMNS: dict[str, tuple[str, tuple[int, ...]]] = {
@@ -65,8 +65,8 @@ COLUMNS: dict[str, tuple[str, tuple[int, ...]]] = {
     "edge.colour": ("U8", (3,)),
     "edge.observations": ("I32", ()),
 }
-"""Type and shape of one row of every column. Rows of one table (the name before the dot) belong together; keypoints
-follow each other keyframe by keyframe, edges host by host."""
+"""Type and row shape of every column. Columns of one table (the name before the dot) have the same number of rows;
+keypoints are ordered by keyframe, edges by host."""
 
 
 def write_atlas(path: Path, atlas: SavedAtlas) -> None:
@@ -90,13 +90,13 @@ def read_atlas(path: Path) -> SavedAtlas:
     """Read and check an atlas.
 
     Raises:
-        AtlasError: In one line, with the file's name.
+        AtlasError: If it is missing or invalid; one line with the file's name.
     """
     if not path.is_file():
         raise AtlasError(f"{path}: no such atlas file")
     try:
         if path.stat().st_size > MAX_FILE_BYTES:
-            raise Damaged(f"more than any atlas of ours ({MAX_FILE_BYTES >> 20} MiB)")
+            raise Damaged(f"larger than any atlas ({MAX_FILE_BYTES >> 20} MiB)")
         with path.open("rb") as file:
             remarks, entries = read_entries(file, {kind: dtype.itemsize for kind, dtype in KINDS.items()})
             atlas = _header(remarks.get(HEADER_KEY), _arrays(entries) if HEADER_KEY in remarks else {})
@@ -104,12 +104,12 @@ def read_atlas(path: Path) -> SavedAtlas:
     except OSError as error:
         raise AtlasError(f"{path}: cannot read the atlas ({error.strerror or error})") from error
     except ValueError as error:
-        raise AtlasError(f"{path}: not an atlas that can be used: {' '.join(str(error).split())[:200]}") from None
+        raise AtlasError(f"{path}: not a valid atlas: {' '.join(str(error).split())[:200]}") from None
     return atlas
 
 
 def is_atlas(path: Path) -> bool:
-    """Whether a file is an atlas of any version, whole or not: one that a newer one may replace."""
+    """Whether a file is an atlas of any version, valid or not, so that a newer one may replace it."""
     try:
         with path.open("rb") as file:
             remarks, _ = read_entries(file, {kind: dtype.itemsize for kind, dtype in KINDS.items()})
@@ -119,10 +119,10 @@ def is_atlas(path: Path) -> bool:
 
 
 def check_fits(atlas: SavedAtlas, camera: Camera, scale_factor: float, path: Path, levels: int = MAX_LEVELS) -> None:
-    """Refuse an atlas that was made through another lens, or with another image pyramid.
+    """Refuse an atlas from another lens, or with another image pyramid.
 
     Raises:
-        AtlasError: Where keypoints would be searched at the wrong pyramid level.
+        AtlasError: If keypoints would be searched at the wrong pyramid level.
     """
     made, now = (f"{c.width}x{c.height}, f {c.fx:.0f} px" for c in (atlas.camera, camera))
     if max(abs(math.log(atlas.camera.fx / camera.fx)), abs(math.log(atlas.camera.fy / camera.fy))) > math.log(1.2):
@@ -143,26 +143,26 @@ def _piece(scale: ScaleEstimate) -> dict[str, Any]:
 
 
 def _header(text: object, arrays: dict[str, Array]) -> SavedAtlas:
-    """The atlas, with a header that makes sense.
+    """The atlas, from a valid header.
 
     Raises:
-        ValueError: If it does not.
+        ValueError: If it is invalid.
     """
     if not isinstance(text, str):
-        raise Damaged("it holds no atlas")
+        raise Damaged("it contains no atlas")
     try:
         record = json.loads(text)
     except RecursionError:
         raise Damaged("its header is nested too deeply") from None
     if not isinstance(record, dict):
-        raise Damaged("its header is no table")
+        raise Damaged("its header is not a table")
     if record.get("version") != VERSION:
         raise Damaged(f"version {reprlib.repr(record.get('version'))}; this program reads version {VERSION}")
     flights, pieces = record.get("flights"), record.get("pieces")
     if not (isinstance(flights, list) and len(flights) <= MAX_FLIGHTS and all(isinstance(f, str) for f in flights)):
         raise Damaged("its header does not name its flights")
     if not (isinstance(pieces, list) and 1 <= len(pieces) <= MAX_PIECES):
-        raise Damaged("its header does not tell its pieces")
+        raise Damaged("its header has no list of pieces")
     factor = _number(record.get("scale_factor"), 1.0, 2.0, "scale_factor")
     names = tuple(f[:200] for f in flights)
     return SavedAtlas(_camera(record.get("camera")), factor, names, tuple(_scale(p) for p in pieces), arrays)
@@ -182,13 +182,13 @@ def _camera(record: object) -> Camera:
             raise ValueError("distortion must have 5 numbers")
         check_camera(camera)
     except (AssertionError, KeyError, TypeError, CalibrationError) as error:
-        raise Damaged(f"its header does not tell its camera ({reprlib.repr(str(error))})") from None
+        raise Damaged(f"the camera in its header is invalid ({reprlib.repr(str(error))})") from None
     return camera
 
 
 def _scale(record: object) -> ScaleEstimate:
     if not isinstance(record, dict):
-        raise Damaged("its header does not tell its pieces")
+        raise Damaged("its header has no list of pieces")
     if "metres" not in record:
         return ScaleEstimate()
     value = _number(record["metres"], 1e-6, 1e6, "metres")
@@ -209,14 +209,14 @@ def _number(value: object, low: float, high: float, name: str) -> float:
 
 
 def _arrays(entries: dict[str, Entry]) -> dict[str, Array]:
-    """All columns, with as many rows as the other columns of their table."""
+    """All columns, with equal numbers of rows within a table."""
     rows: dict[str, int] = {}
     for name, (kind, shape) in COLUMNS.items():
         entry = entries.get(name)
         if entry is None:
             raise Damaged(f"it has no column {name}")
         if entry.kind != kind or len(entry.shape) != 1 + len(shape) or entry.shape[1:] != shape:
-            raise Damaged(f"its column {name} holds {entry.kind} of shape {entry.shape}")
+            raise Damaged(f"its column {name} is {entry.kind} of shape {entry.shape}")
         table = name.partition(".")[0]
         if rows.setdefault(table, entry.shape[0]) != entry.shape[0]:
             raise Damaged(f"its column {name} has {entry.shape[0]} rows, others of its table {rows[table]}")
@@ -224,66 +224,66 @@ def _arrays(entries: dict[str, Entry]) -> dict[str, Array]:
 
 
 def _check(atlas: SavedAtlas) -> None:
-    """Raise `Damaged` where the tables contradict themselves or each other."""
+    """Raise `Damaged` if the tables are inconsistent."""
     a = atlas.arrays
     for name, values in a.items():
         if values.dtype.kind == "f" and not np.abs(values).max(initial=0.0) <= MAX_NUMBER:
-            raise Damaged(f"{name} holds values that are not finite or beyond {MAX_NUMBER:g}")
+            raise Damaged(f"{name} has values that are not finite or beyond {MAX_NUMBER:g}")
     if atlas.keyframes == 0:
         raise Damaged("it has no keyframe")
     ids = np.concatenate([a["keyframe.id"], a["removed.id"]])
-    _require((np.sort(ids) == np.arange(len(ids))).all(), "keyframes are not numbered through")
-    _require(bool(np.isin(a["removed.heir"], a["keyframe.id"]).all()), "a removed keyframe rests on none")
+    _require((np.sort(ids) == np.arange(len(ids))).all(), "keyframes are not numbered consecutively")
+    _require(bool(np.isin(a["removed.heir"], a["keyframe.id"]).all()), "a removed keyframe has no successor")
     pieces = np.unique(a["keyframe.piece"])
-    _require(np.array_equal(pieces, np.arange(len(atlas.scale))), "pieces and keyframes do not go together")
-    _require(_are_poses(a["keyframe.T_c_w"]) and _are_poses(a["removed.T_removed_heir"]), "a pose is no rigid motion")
+    _require(np.array_equal(pieces, np.arange(len(atlas.scale))), "pieces and keyframes do not match")
+    _require(_are_poses(a["keyframe.T_c_w"]) and _are_poses(a["removed.T_removed_heir"]), "a pose is not rigid")
     _require(_divides(a["keyframe.keypoints"], len(a["keypoint.anchor"])), "keypoints do not add up")
     _require(_divides(a["host.edges"], len(a["edge.sigma"])), "edges do not add up")
-    _require(_within(a["host.keyframe"], 0, len(ids)), "edges belong to no keyframe")
-    _require(_within(a["keypoint.octave"], 0, MAX_LEVELS), "a keypoint is on no pyramid level")
+    _require(_within(a["host.keyframe"], 0, len(ids)), "edges refer to a missing keyframe")
+    _require(_within(a["keypoint.octave"], 0, MAX_LEVELS), "a keypoint has an invalid pyramid level")
     _check_anchors(a, len(ids))
     _check_metres(atlas)
     size = np.array([atlas.camera.width, atlas.camera.height])
     for name in ("keypoint.uv", "edge.uv"):
-        _require(((a[name] >= -size) & (a[name] <= 2 * size)).all(), f"{name} lies far outside the image")
+        _require(((a[name] >= -size) & (a[name] <= 2 * size)).all(), f"{name} is far outside the image")
 
 
 def _check_metres(atlas: SavedAtlas) -> None:
-    """Refuse metres that no measurement of ours can know so well, or by which the map is no place for a camera."""
+    """Refuse a metric scale of impossible accuracy, or one that puts points at implausible distances."""
     a = atlas.arrays
     for piece, scale in enumerate(atlas.scale):
         if not math.isfinite(scale.sigma):
             continue
         if scale.sigma < LEAST_SIGMA * scale.value:
-            raise Damaged(f"it claims {scale.value:g} metres a unit to {scale.sigma:g}; nothing measures so well")
+            raise Damaged(f"its scale of {scale.value:g} metres a unit has an implausible sigma of {scale.sigma:g}")
         rows = np.flatnonzero(a["keyframe.piece"] == piece)
         T = a["keyframe.T_c_w"][rows]
-        held = np.split(a["keypoint.anchor"], np.cumsum(a["keyframe.keypoints"])[:-1])
+        observed = np.split(a["keypoint.anchor"], np.cumsum(a["keyframe.keypoints"])[:-1])
         distance = [
-            np.linalg.norm(a["anchor.p_w"][held[k][held[k] >= 0]] @ t[:3, :3].T + t[:3, 3], axis=1)
+            np.linalg.norm(a["anchor.p_w"][observed[k][observed[k] >= 0]] @ t[:3, :3].T + t[:3, 3], axis=1)
             for k, t in zip(rows, T, strict=True)
         ]
         median_m = scale.value * float(np.median(np.concatenate(distance)))
         if not PLAUSIBLE_M[0] <= median_m <= PLAUSIBLE_M[1]:
-            raise Damaged(f"by its {scale.value:g} metres a unit its points are {median_m:g} m away")
+            raise Damaged(f"with {scale.value:g} metres a unit its points are {median_m:g} m away")
 
 
 def _check_anchors(a: dict[str, Array], keyframes: int) -> None:
-    held, count = a["keypoint.anchor"], len(a["anchor.p_w"])
-    _require(_within(held, -1, count), "a keypoint shows an anchor that is not there")
+    observed, count = a["keypoint.anchor"], len(a["anchor.p_w"])
+    _require(_within(observed, -1, count), "a keypoint refers to a missing anchor")
     keyframe = np.repeat(np.arange(len(a["keyframe.keypoints"])), a["keyframe.keypoints"])
-    pair = (keyframe * max(count, 1) + held)[held >= 0]
-    _require(len(np.unique(pair)) == len(pair), "a keyframe sees an anchor twice")
-    _require(len(np.unique(held[held >= 0])) == count, "an anchor is seen by no keyframe")
-    _require(len(np.unique(keyframe[held >= 0])) == len(a["keyframe.id"]), "a keyframe sees nothing")
+    pair = (keyframe * max(count, 1) + observed)[observed >= 0]
+    _require(len(np.unique(pair)) == len(pair), "a keyframe observes an anchor twice")
+    _require(len(np.unique(observed[observed >= 0])) == count, "an anchor has no observation")
+    _require(len(np.unique(keyframe[observed >= 0])) == len(a["keyframe.id"]), "a keyframe observes no anchor")
     guessed = a["anchor.from_depth"] != 0
-    _require(_within(a["anchor.host"][guessed], 0, keyframes), "a depth prior belongs to no keyframe")
+    _require(_within(a["anchor.host"][guessed], 0, keyframes), "a depth prior refers to a missing keyframe")
     _require((a["anchor.prior"][guessed] > 0).all(), "a depth prior is not positive")
     _require((a["anchor.max_distance"] > 0).all(), "an anchor has no distance")
     _require((a["anchor.sigma"] > 0).all() and (a["edge.sigma"] > 0).all(), "a standard deviation is not positive")
-    _require((a["edge.p_c"][:, 2] > 0).all(), "an edge lies behind its camera")
+    _require((a["edge.p_c"][:, 2] > 0).all(), "an edge is behind its camera")
     for name in ("anchor.visible", "anchor.found", "edge.observations"):
-        _require(_within(a[name], 0, 1 << 31), f"{name} is no count")
+        _require(_within(a[name], 0, 1 << 31), f"{name} is not a count")
 
 
 def _require(holds: Any, otherwise: str) -> None:
@@ -296,7 +296,7 @@ def _within(values: IntArray, low: int, end: int) -> bool:
 
 
 def _divides(counts: IntArray, total: int) -> bool:
-    """Whether counts, none negative and none larger than the whole, add up to it."""
+    """Whether counts are non-negative and add up to a total."""
     return _within(counts, 0, total + 1) and int(counts.sum()) == total
 
 

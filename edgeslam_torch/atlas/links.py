@@ -1,11 +1,9 @@
-"""Verification that a keyframe shows another piece of map, and the similarity between the two pieces.
+"""Verification that a keyframe shows another submap, and the similarity between the two.
 
-The keyframe is searched in the other piece as a lost frame is (`tracking/relocaliser.py`), which gives its pose there
-on the evidence of hundreds of keypoints. What a pose leaves open is the scale: keypoints that have an anchor on both
-sides have two depths, and these must not only tell a scale but agree about it, since they come from two reconstructions
-that know nothing of each other. A drone that turns on the spot has no two depths: its own sensors may tell the scale
-there. At last the way back must close: the other keyframe, searched in the first piece, has to be where the similarity
-says.
+The keyframe is relocalised in the other submap like a lost frame (`tracking/relocaliser.py`). This gives its pose there
+from hundreds of keypoints, up to scale: keypoints with an anchor in both submaps have two independent depths, whose
+ratios must agree. A camera that rotates in place has no such pairs; sensors may give the scale then. Finally the other
+keyframe, relocalised in the first submap, must confirm the similarity.
 """
 
 from collections.abc import Callable
@@ -31,61 +29,59 @@ MIN_INLIERS = 50
 MIN_COMMON = 25
 """Keypoints with a triangulated anchor on both sides."""
 AGREE_LOG = 0.15
-"""Difference of a keypoint's two depths from the common scale up to which they agree: three sigmas of 5 %, what
-triangulation over one or two degrees is good for."""
+"""Deviation of a keypoint's log depth ratio from the common scale up to which it agrees: three sigmas of 5 %, the
+accuracy of triangulation with one or two degrees of parallax."""
 MIN_AGREEING = 0.6
-"""Share of those keypoints that must agree on the scale; of depths that have nothing to do with each other a quarter
-does."""
+"""Share of those keypoints that must agree on the scale; of unrelated depths a quarter does."""
 MAX_SIGMA_LOG = 0.03
 """Standard deviation of the common log scale."""
-TOLD_SHARE = 0.2
-"""Share of the anchors in view that must be found where the images tell no scale: wallpaper that repeats reaches 0.16
-at a wrong place."""
+SENSOR_SCALE_SHARE = 0.2
+"""Share of the anchors in view that must be matched where images give no scale; repetitive wallpaper reaches 0.16 at a
+wrong place."""
 PLANE_PART, ON_PLANE = 0.9, 0.02
-"""Part of the anchors within a distance from one plane, relative to the depth, that show no more than that plane."""
+"""Share of the anchors, and their maximum distance from a plane relative to the depth, for a planar scene."""
 PLANE_FITS = 5
-"""Fits of the plane, each to that part alone."""
+"""Iterations of the plane fit, each to that share alone."""
 PLANE_SHARE = 0.2
-"""Share of the anchors in view that must be found where they lie on one plane: floors and walls with the same paint
-look the same in many places, and a patch of one is found in another room with 0.12 to 0.16
-(docs/decisions/20-loops.md)."""
+"""Share of the anchors in view that must be matched if they lie on one plane: similar floors and walls in other rooms
+match with 0.12 to 0.16 (docs/decisions/20-loops.md)."""
 MIN_PART = 5
-"""Keypoints in a quarter of the view whose median says something."""
+"""Minimum number of keypoints in a quarter of the view for a median."""
 MAX_SHIFT = 0.1
-"""Distance of two estimates of one camera, relative to the depth that it sees."""
+"""Distance between two estimates of one camera centre, relative to the depth."""
 MAX_TURN_RAD = np.deg2rad(5.0)
-"""Angle between two estimates of one camera: as much as `MAX_SHIFT` seen at that depth, 6 degrees."""
+"""Angle between two estimates of one camera orientation: `MAX_SHIFT` at that depth corresponds to 6 degrees."""
 
 
-Told = Callable[[Keyframe, Keyframe], tuple[float, float] | None]
-"""Size of the second keyframe's piece relative to the first one's, and the standard deviation of its log, by others
-than the images; None where they do not tell."""
+ScaleBetween = Callable[[Keyframe, Keyframe], tuple[float, float] | None]
+"""Scale of the second keyframe's submap relative to the first one's, and the standard deviation of its log, by sensors
+other than the camera; None if unknown."""
 
 
 @dataclass(frozen=True, slots=True)
 class Link:
-    """A keyframe of one piece seen in another."""
+    """A keyframe of one submap seen in another."""
 
     keyframe: Keyframe
     other: Keyframe
-    """Of the other piece."""
+    """Of the other submap."""
     S: FloatArray
-    """``(4, 4)`` similarity that takes the keyframe's piece to the other."""
+    """``(4, 4)`` similarity from the keyframe's submap to the other."""
     sigma_log: float
-    """Standard deviation of its log scale, as if the two maps were the same but for a similarity."""
+    """Standard deviation of its log scale, if the two submaps differ by a similarity only."""
     bend_log: float
-    """How far the log scale differs from one part of the image to another: the maps are bent."""
+    """Variation of the log scale over the image, due to bending of the maps."""
     keypoint: IntArray
-    """``(M,)`` keypoints of the keyframe that show ..."""
+    """``(M,)`` matched keypoints of the keyframe."""
     anchor: IntArray
-    """... these anchors of the other piece."""
+    """``(M,)`` their anchors in the other submap."""
     depth: float
-    """Median depth that the keyframe sees there [units of the other piece]."""
+    """Median depth of these in the keyframe [units of the other submap]."""
     by_images: bool = True
-    """Whether the images told the scale."""
+    """Whether the scale comes from images."""
 
     def agrees(self, other: "Link") -> bool:
-        """Whether another link between the same pieces says the same of where this keyframe is, and how large."""
+        """Whether another link between the same submaps gives the same pose and scale for this keyframe."""
         here, there = (sim3.moved_camera(S, self.keyframe.T_c_w) for S in (self.S, other.S))
         shift, turn = pose_difference(here, there)
         scales = np.log(sim3.scale_of(self.S) / sim3.scale_of(other.S))
@@ -94,7 +90,7 @@ class Link:
 
 
 def view_of(keyframe: Keyframe, scale_factor: float) -> View:
-    """A keyframe as a frame to be searched."""
+    """A keyframe in the form of a frame to be matched."""
     inv_sigma = scale_factor ** -keyframe.features.octave.astype(np.float64)
     return View(keyframe.features, keyframe.words, keyframe.grid, inv_sigma)
 
@@ -104,16 +100,16 @@ def link(
     keyframe: Keyframe,
     other: Keyframe,
     min_share: float = LIKELY_SHARE,
-    told: Told = lambda *_: None,
+    scale_between: ScaleBetween = lambda *_: None,
 ) -> Link | None:
-    """A keyframe's place in another keyframe's piece; None unless all of it is proven.
+    """Pose of a keyframe in another keyframe's submap; None unless it is verified.
 
     Args:
-        tracker: With the map.
-        keyframe: Whose place is sought.
-        other: Keyframe that may show the same.
-        min_share: Share of the anchors in view that must be found, there and on the way back.
-        told: Asked for the scale where the images show too few depths on both sides.
+        tracker: Contains the map.
+        keyframe: To be located.
+        other: Keyframe that may show the same place.
+        min_share: Share of the anchors in view that must be matched, in both directions.
+        scale_between: Gives the scale where images have too few depths on both sides.
     """
     there = _place(tracker, keyframe, other, min_share)
     if there is None:
@@ -125,7 +121,7 @@ def link(
     if by_images:
         scale = _agreed(keyframe, common)
     else:
-        scale = _told(told, keyframe, other) if there.share >= TOLD_SHARE else None
+        scale = _by_sensors(scale_between, keyframe, other) if there.share >= SENSOR_SCALE_SHARE else None
     if scale is None:
         return None
     S = _similarity(keyframe.T_c_w, there.track.T_c_w, scale[0])
@@ -140,7 +136,7 @@ def link(
 
 
 def _place(tracker: Tracker, keyframe: Keyframe, other: Keyframe, min_share: float) -> Place | None:
-    """Where a keyframe is in the piece of another, if it looks as if it were there."""
+    """Pose of a keyframe in the submap of another, if enough of the view matches."""
     view = view_of(keyframe, tracker.orb.scale_factor)
     track = match_keyframe(tracker, view, other)
     if track is None or track.inliers < MIN_INLIERS:
@@ -150,7 +146,7 @@ def _place(tracker: Tracker, keyframe: Keyframe, other: Keyframe, min_share: flo
 
 
 def on_one_plane(p: FloatArray, depth: float) -> bool:
-    """Whether `PLANE_PART` of some points ``(N, 3)``, seen at a median depth, lie on one plane."""
+    """Whether `PLANE_PART` of points ``(N, 3)`` at a median depth lie on one plane."""
     part = np.ones(len(p), dtype=bool)
     for _ in range(PLANE_FITS):
         middle = p[part].mean(axis=0)
@@ -162,7 +158,7 @@ def on_one_plane(p: FloatArray, depth: float) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class _Depths:
-    """Of keypoints with a triangulated anchor on both sides ``(C,)``, in the units of either."""
+    """Depths of keypoints with a triangulated anchor on both sides ``(C,)``, in either submap's units."""
 
     own: FloatArray
     there: FloatArray
@@ -170,9 +166,9 @@ class _Depths:
 
 
 def common_scale(tracker: Tracker, keyframe: Keyframe, track: Track) -> tuple[float, float, float] | None:
-    """Size of the track's piece relative to the keyframe's own, the standard deviation of its log, and its bend.
+    """Scale of the track's submap relative to the keyframe's, the standard deviation of its log, and its bend.
 
-    None where too few depths are known on both sides or they do not agree.
+    None if too few depths are known on both sides or they do not agree.
     """
     common = _common_depths(tracker, keyframe, track)
     return _agreed(keyframe, common) if len(common.own) >= MIN_COMMON else None
@@ -189,7 +185,7 @@ def _common_depths(tracker: Tracker, keyframe: Keyframe, track: Track) -> _Depth
 
 
 def _agreed(keyframe: Keyframe, common: _Depths) -> tuple[float, float, float] | None:
-    """What the depths say together; None if they do not agree."""
+    """Common scale of the depths; None if they do not agree."""
     ratio = np.log(common.there / common.own)
     middle = float(np.median(ratio))
     agreeing = ratio[np.abs(ratio - middle) <= AGREE_LOG]
@@ -200,14 +196,14 @@ def _agreed(keyframe: Keyframe, common: _Depths) -> tuple[float, float, float] |
     return float(np.exp(np.mean(agreeing))), max(sigma, 1e-3), bend
 
 
-def _told(told: Told, keyframe: Keyframe, other: Keyframe) -> tuple[float, float, float] | None:
-    """The same by others than the images, which know of no bend."""
-    found = told(keyframe, other)
+def _by_sensors(scale_between: ScaleBetween, keyframe: Keyframe, other: Keyframe) -> tuple[float, float, float] | None:
+    """The same from other sensors, without bend."""
+    found = scale_between(keyframe, other)
     return None if found is None else (*found, 0.0)
 
 
 def _bend(ratio: FloatArray, depth: FloatArray, u: FloatArray) -> float:
-    """Scatter of the log scale between near and far, left and right, beyond that of its keypoints ``(N,)``."""
+    """Scatter of the log scale between near and far, left and right, beyond that of single keypoints ``(N,)``."""
     far, right = depth > np.median(depth), u > np.median(u)
     quarters = [ratio[(far == f) & (right == r)] for f in (False, True) for r in (False, True)]
     parts = [quarter for quarter in quarters if len(quarter) >= MIN_PART]
@@ -218,5 +214,5 @@ def _bend(ratio: FloatArray, depth: FloatArray, u: FloatArray) -> float:
 
 
 def _similarity(T_c_own: FloatArray, T_c_there: FloatArray, scale: float) -> FloatArray:
-    """What takes the world of one pose of a camera, scaled, to the world of its other pose."""
+    """Similarity from the world of one pose of a camera to the world of its other pose."""
     return se3.inverse(T_c_there) @ sim3.compose(scale, np.eye(3), np.zeros(3)) @ T_c_own

@@ -1,8 +1,8 @@
-"""A loop inside one piece of map: what its drift was, and how the whole piece makes up for it.
+"""Loop closure inside one submap: the drift, and its distribution over the submap.
 
-Two keyframes that see one place from two ends of a long way say where the newer one should be (`links.py`). A graph of
-all keyframes of the piece (`optim/pose_graph.py`) spreads this over the way between; anchors, edges and frames follow
-their keyframes. What is left is for the refinement that follows.
+Two keyframes that show one place at both ends of a long path give the correction of the newer one (`links.py`). A pose
+graph of all keyframes of the submap (`optim/pose_graph.py`) distributes it over the path; anchors, edges and frames
+move with their keyframes. Refinement follows.
 """
 
 from dataclasses import dataclass, replace
@@ -24,55 +24,54 @@ from edgeslam_torch.optim.pose_graph import PoseGraph, solve
 from edgeslam_torch.types import FloatArray, IntArray, ScaleEstimate
 
 MIN_AWAY_S = 5.0
-"""Time since an older keyframe from which on it may close a loop; before, the window has not lost it yet."""
+"""Minimum age of a keyframe for a loop; younger ones are still in the window."""
 MIN_SHARED = 15
-"""Anchors in common from which on two keyframes are covisible, as in `SlamMap.covisible`."""
+"""Common anchors from which on two keyframes are covisible, as in `SlamMap.covisible`."""
 NEIGHBOURS = 10
-"""Edges from a keyframe to the older ones that it shares most anchors with."""
+"""Maximum number of graph edges from a keyframe to older covisible ones."""
 LOOP_SHARE = 0.2
-"""Share of the anchors in view that must be found at the other end. A wall whose paper repeats reaches 0.16 at a wrong
-place, a hundred keypoints with one scale; a right place 0.2 to 0.4 once the camera is there, and a loop can wait."""
+"""Share of the anchors in view that must be matched at the other end. Repetitive wallpaper reaches 0.16 at a wrong
+place; a true revisit 0.2 to 0.4."""
 MAX_DRIFT = 0.1
-"""Most that a map drifts, in shares of the way: several times the usual 1 to 3 %. A place that is farther from where
-the map has it is another one that looks alike, as doors and wallpaper do."""
-HELD_DRIFT = 0.03
-"""The same of a piece of map whose metres and heading the drone's sensors hold: a wall whose paper repeats every 1.6 m
-is no place that one comes back to after 17 m."""
+"""Maximum drift as a share of the path length, several times the typical 1 to 3 %. A match beyond it is a similar
+place, such as another door or a repetition of the wallpaper."""
+MAX_SENSOR_DRIFT = 0.03
+"""The same for a submap with metric scale and heading from the drone's sensors; on repetitive wallpaper the gate must
+stay below one period after tens of metres."""
 MAX_DRIFT_RAD = np.deg2rad(20.0)
-"""Most that it turns."""
+"""Maximum drift of the rotation."""
 DRIFT_LOG = 0.03
-"""Standard deviation of what the log scale drifts from one keyframe to the next, a random walk: after 15 keyframes, as
-few as a loop has, a factor of 1.12, after the 126 of a round through ten rooms one of 1.4 (2.1 was measured)."""
-_CARRIED_SHARED = 100
-"""Keypoints that a way without images is worth: as much as one between usual keyframes. It drifts by centimetres."""
-_NO_WAY = 1e-9
-"""Length of a way between two cameras in one place [map units]: a graph takes 0 for no way at all."""
+"""Standard deviation of the drift of the log scale between consecutive keyframes, a random walk: a factor of 1.12 after
+15 keyframes, 1.4 after 126."""
+_BRIDGE_SHARED = 100
+"""Equivalent number of common keypoints of a motion predicted by sensors, accurate to centimetres."""
+_MIN_DISTANCE = 1e-9
+"""Minimum length of a graph edge [map units]; a sparse graph takes 0 for a missing edge."""
 WITHIN_PX = 5.0
-"""Offset up to which tracking and the window find the old anchors by themselves (`mapping/local_loop_closure.py`)."""
+"""Offset up to which tracking and the window find the old anchors without a loop (`mapping/local_loop_closure.py`)."""
 SIGMAS = 3.0
-"""Difference of scale beyond which it is not chance."""
+"""Gate for differences of scale."""
 WITHIN_LOG = 0.1
-"""Standard deviation of the log scale of a view against that of the seconds around it, of which telemetry tells: in its
-first ten seconds a map of ten rooms grows by a third."""
+"""Standard deviation of the log scale of a view relative to its neighbourhood of seconds, for which telemetry gives the
+scale."""
 MIN_BASELINE = 0.02
-"""Least distance of two keyframes relative to the depth: without parallax the scale between them is anybody's guess,
-but not worse than this."""
+"""Minimum distance of two keyframes relative to the depth: bounds the weight of their relative scale from below."""
 
 
 @dataclass(frozen=True, slots=True)
 class Drift:
-    """What is known, before a loop is closed, of the factor by which it scales its newer end."""
+    """Predicted log factor by which a loop scales its newer end, before it is closed."""
 
     log: float
     sigma: float
 
     def allows(self, log: float) -> bool:
-        """Whether this logarithm of the factor can be right."""
+        """Whether this logarithm of the factor passes the gate."""
         return abs(log - self.log) <= SIGMAS * self.sigma
 
 
-def drift_told(here: ScaleEstimate | None, there: ScaleEstimate | None) -> Drift | None:
-    """By metres per map unit at the newer and at the older end of a loop; None unless both are known."""
+def expected_drift(here: ScaleEstimate | None, there: ScaleEstimate | None) -> Drift | None:
+    """From metres per map unit at the newer and the older end of a loop; None unless both are known."""
     if here is None or there is None:
         return None
     relative = np.array([here.sigma / here.value, there.sigma / there.value, WITHIN_LOG])
@@ -81,44 +80,44 @@ def drift_told(here: ScaleEstimate | None, there: ScaleEstimate | None) -> Drift
 
 @dataclass(frozen=True, slots=True)
 class Bridge:
-    """What the drone's sensors say of two keyframes in sequence between which the camera was lost."""
+    """Relative pose by the drone's sensors of two consecutive keyframes between which the camera was lost."""
 
     newer: int
-    """Id of the first keyframe of a piece."""
+    """Id of the first keyframe of a submap."""
     older: int
-    """Id of the last one before."""
+    """Id of the keyframe before."""
     T: FloatArray
-    """``(4, 4)`` camera of the older one to that of the newer one, in the older one's unit."""
+    """``(4, 4)`` camera of the older one to that of the newer one, in the older one's scale."""
 
     def scaled(self, scale: float) -> "Bridge":
-        """The same after the older one's unit was scaled."""
+        """The same after a change of the older one's scale."""
         return replace(self, T=se3.scaled(self.T, scale))
 
 
 @dataclass(frozen=True, slots=True)
 class Closure:
-    """A loop that was closed."""
+    """A closed loop."""
 
     stamp_s: float
-    """Of the keyframe that settled it."""
+    """Stamp of the confirming keyframe."""
     piece: int
     away_s: float
-    """Time since the place was seen before; infinite for an earlier flight."""
+    """Time since the previous visit; infinite for an earlier flight."""
     shift: float
-    """How far the camera was off, relative to the depth that it sees."""
+    """Correction of the camera's position, relative to the depth."""
     turn_rad: float
     scale: float
-    """Factor by which the map grew at the newer end."""
+    """Change of scale at the newer end."""
     links: int
-    """Keyframes that agreed."""
+    """Number of keyframes that agreed."""
     matches: int
-    """Keypoints of these that show the older end."""
-    grown: dict[int, float]
-    """Factor by which the map grew around each keyframe, removed ones included."""
+    """Number of their matched keypoints."""
+    scale_change: dict[int, float]
+    """Change of scale at each keyframe, including removed ones."""
 
     def growth(self, piece: int, keyframe_id: int) -> float:
-        """Factor by which the map grew around a keyframe."""
-        return self.grown.get(keyframe_id, 1.0)
+        """Change of scale at a keyframe."""
+        return self.scale_change.get(keyframe_id, 1.0)
 
     def __str__(self) -> str:
         """For `status.csv` and the summary."""
@@ -131,15 +130,15 @@ class Closure:
 
 
 def as_it_is(*_: Keyframe) -> tuple[float, float]:
-    """Size of the older end of a loop relative to the newer one, where images tell none: a piece has one unit, within
-    what it drifts. The loop then tells where its newer end is, and how that is turned."""
+    """Scale of the older end of a loop relative to the newer one without parallax: equal within the drift. The loop
+    then corrects position and rotation."""
     return 1.0, WITHIN_LOG
 
 
 def far_keyframes(slam_map: SlamMap, keyframe: Keyframe) -> list[Keyframe]:
-    """Older keyframes of the same piece that a keyframe is connected with only by a long way.
+    """Older keyframes of the same submap without a short covisibility path to a keyframe.
 
-    Those are left out that share anchors with it, or with keyframes that do.
+    Left out are those that share anchors with it or with its covisible keyframes.
     """
     piece = slam_map.piece_of(keyframe.id)
     older = [k for k in slam_map.keyframes.values() if keyframe.stamp_s - k.stamp_s >= MIN_AWAY_S]
@@ -151,35 +150,36 @@ def far_keyframes(slam_map: SlamMap, keyframe: Keyframe) -> list[Keyframe]:
     return [k for k in older if near.get(k.id, 0) < MIN_SHARED]
 
 
-def is_plausible(slam_map: SlamMap, link: Link, told: Drift | None = None, held: bool = False) -> bool:
-    """Whether a map can have drifted as much as a link says on the way from its older keyframe to its newer one.
+def is_plausible(slam_map: SlamMap, link: Link, expected: Drift | None = None, metric: bool = False) -> bool:
+    """Whether the drift that a link implies is plausible for the path from its older keyframe to its newer one.
 
-    That is the shortest of those that the map knows: once a loop is closed, what is near to it has hardly drifted.
+    The path is the shortest one over covisible keyframes: after a loop closure the drift nearby is small.
 
     Args:
         slam_map: With both ends.
         link: Between them.
-        told: What others than the images say of how its scale drifted.
-        held: Whether the drone's sensors hold the piece: its metres are known, if not at this moment.
+        expected: Drift of the scale by other sensors.
+        metric: Whether the submap's metric scale is known from the drone's sensors.
     """
-    way, steps = _shortest_way(slam_map, link)
+    length, steps = _shortest_path(slam_map, link)
     shift, turn = _off(link, link.keyframe.T_c_w)
-    drift_share = HELD_DRIFT if held else MAX_DRIFT
-    near = shift * link.depth <= drift_share * way + MAX_SHIFT * link.depth
-    drift = told or Drift(0.0, DRIFT_LOG * np.sqrt(steps))
+    drift_share = MAX_SENSOR_DRIFT if metric else MAX_DRIFT
+    near = shift * link.depth <= drift_share * length + MAX_SHIFT * link.depth
+    drift = expected or Drift(0.0, DRIFT_LOG * np.sqrt(steps))
     return near and turn <= MAX_DRIFT_RAD and drift.allows(float(np.log(sim3.scale_of(link.S))))
 
 
-def _shortest_way(slam_map: SlamMap, link: Link) -> tuple[float, int]:
-    """Length of the shortest way between a link's keyframes, from each to the next or to one that sees the same.
+def _shortest_path(slam_map: SlamMap, link: Link) -> tuple[float, int]:
+    """Length of the shortest path between a link's keyframes over consecutive and covisible ones, and its number of
+    steps.
 
-    And how many there are on it: those that it passes over count, but not those of a loop that is closed.
+    A covisible edge counts the keyframes that it skips; a loop closure counts as `NEIGHBOURS` at most.
     """
     piece = slam_map.piece_of(link.keyframe.id)
     members = [k for id, k in sorted(slam_map.keyframes.items()) if slam_map.piece_of(id) == piece]
     row_of = {k.id: row for row, k in enumerate(members)}
     here, there = row_of[link.keyframe.id], row_of[link.other.id]
-    ways = _ways(slam_map, members, np.ones(len(members)))
+    ways = _distances(slam_map, members, np.ones(len(members)))
     length, before = dijkstra(ways, directed=False, indices=here, return_predecessors=True)
     steps, at = 1, there
     while at != here:
@@ -187,25 +187,25 @@ def _shortest_way(slam_map: SlamMap, link: Link) -> tuple[float, int]:
     return float(length[there]), steps
 
 
-def _ways(slam_map: SlamMap, members: list[Keyframe], weight: FloatArray) -> csr_array:
-    """Lengths of the ways from keyframes ``(K,)`` to the one before and to those that see the same, each times the
-    weight ``(K,)`` of the newer one."""
+def _distances(slam_map: SlamMap, members: list[Keyframe], weight: FloatArray) -> csr_array:
+    """Distances of keyframes ``(K,)`` to the previous one and to covisible ones, times the weight ``(K,)`` of the newer
+    one."""
     centre = np.stack([k.centre_w for k in members])
     i, j = np.array(list(_shared(slam_map, members)), dtype=np.int64).reshape(-1, 2).T
-    apart = np.linalg.norm(centre[i] - centre[j], axis=1) * weight[i] + _NO_WAY
-    return csr_array((apart, (i, j)), shape=(len(members), len(members)))
+    distance = np.linalg.norm(centre[i] - centre[j], axis=1) * weight[i] + _MIN_DISTANCE
+    return csr_array((distance, (i, j)), shape=(len(members), len(members)))
 
 
-def is_carried(slam_map: SlamMap, link: Link, sigma: float) -> bool:
-    """Whether two pieces can lie to each other as a link says, the newer one of which was begun where the drone's
-    sensors had carried the camera: nothing but their drift and that of the maps on the way is between them.
+def is_near_prediction(slam_map: SlamMap, link: Link, sigma: float) -> bool:
+    """Whether the relative pose of two submaps by a link agrees with the sensors' prediction of the newer one's start,
+    within its uncertainty and the drift of the maps.
 
-    Both ends of a corridor look alike, doors, depths and all; they are not where the drone can have come to.
+    Both ends of a corridor may look the same, including the depths.
 
     Args:
-        slam_map: With both pieces.
+        slam_map: With both submaps.
         link: Between them.
-        sigma: Standard deviation per axis of where the newer one began [map units].
+        sigma: Standard deviation per axis of the newer one's start [map units].
     """
     shift, turn = _off(link, link.keyframe.T_c_w)
     near = is_near(slam_map, link.keyframe, link.other, shift * link.depth, link.depth, sigma)
@@ -213,34 +213,33 @@ def is_carried(slam_map: SlamMap, link: Link, sigma: float) -> bool:
 
 
 def is_near(slam_map: SlamMap, one: Keyframe, other: Keyframe, shift: float, depth: float, sigma: float) -> bool:
-    """Whether a camera can be this far from where the drone's sensors say, on a map that has drifted on the way.
+    """Whether a camera's distance from the sensors' prediction is within prediction error and drift of the map.
 
     Args:
         slam_map: With the keyframes.
-        one: Where the way ends, or begins.
+        one: One end of the path.
         other: Its other end.
-        shift: Distance [map units].
-        depth: That the camera sees.
-        sigma: Standard deviation per axis of what the sensors say.
+        shift: Distance from the prediction [map units].
+        depth: Median depth in the camera.
+        sigma: Standard deviation of the prediction per axis.
     """
     more = shift - MAX_SHIFT * depth - SIGMAS * sigma
-    return more <= 0.0 or more <= _drift(slam_map, one, other)  # which takes as long as a frame in a large map
+    return more <= 0.0 or more <= _drift(slam_map, one, other)  # as slow as a frame in a large map
 
 
 def _drift(slam_map: SlamMap, one: Keyframe, other: Keyframe) -> float:
-    """Most that a map which the drone's sensors hold drifts between two keyframes, along the way that the map knows on
-    which it does least [map units]. The unit of a piece that is not joined to the older one's may be wrong for a while.
-    """
+    """Maximum drift between two keyframes of a map with sensors, along the path with the least drift [map units]. The
+    scale of a submap that is not merged with the oldest one may be wrong for a while."""
     members = [k for _, k in sorted(slam_map.keyframes.items())]
     oldest = min(slam_map.piece_of(one.id), slam_map.piece_of(other.id))
-    share = np.array([HELD_DRIFT if slam_map.piece_of(k.id) == oldest else MAX_DRIFT for k in members])
+    share = np.array([MAX_SENSOR_DRIFT if slam_map.piece_of(k.id) == oldest else MAX_DRIFT for k in members])
     row_of = {k.id: row for row, k in enumerate(members)}
-    ways = _ways(slam_map, members, share)
+    ways = _distances(slam_map, members, share)
     return float(dijkstra(ways, directed=False, indices=row_of[one.id])[row_of[other.id]])
 
 
 def is_within_reach(slam_map: SlamMap, camera: Camera, link: Link) -> bool:
-    """Whether what a link says of the drift is so little that the window makes up for it."""
+    """Whether the correction by a link is small enough for the window."""
     p_c = se3.transform(link.keyframe.T_c_w, slam_map.anchors.p_w[link.anchor])
     if not (p_c[:, 2] > 0).all():
         return False
@@ -250,7 +249,7 @@ def is_within_reach(slam_map: SlamMap, camera: Camera, link: Link) -> bool:
 
 
 def bridge(slam_map: SlamMap, piece: int, other: int) -> Bridge | None:
-    """Between two pieces, one of which began when the other was lost; None if another one lies between them in time."""
+    """Between two consecutive submaps; None if another one lies between them in time."""
     newer = max(piece, other)
     first = min(k for k in slam_map.keyframes if slam_map.piece_of(k) == newer)
     before = max((k for k in slam_map.keyframes if k < first), default=None)
@@ -261,29 +260,29 @@ def bridge(slam_map: SlamMap, piece: int, other: int) -> Bridge | None:
 
 
 def spread(
-    slam_map: SlamMap, edges: EdgeMap, log: TrajectoryLog, links: list[Link], carried: Bridge | None = None
+    slam_map: SlamMap, edges: EdgeMap, log: TrajectoryLog, links: list[Link], sensed: Bridge | None = None
 ) -> Closure:
-    """Move a piece so that both ends of a loop agree, each keyframe by its share.
+    """Move a submap so that both ends of a loop agree, each keyframe by its share.
 
     Args:
-        slam_map: With the piece.
+        slam_map: With the submap.
         edges: Measured edges, which move with their keyframes.
-        log: Frames, which do so, too.
+        log: Frames, which move with their keyframes.
         links: Between both ends.
-        carried: How two keyframes that show nothing in common lay to each other before the links were known.
+        sensed: Relative pose by sensors of two keyframes without common anchors.
     """
     best = max(links, key=lambda one: len(one.keypoint))
     piece = slam_map.piece_of(best.keyframe.id)
     before = best.keyframe.T_c_w
     members = [k for id, k in sorted(slam_map.keyframes.items()) if slam_map.piece_of(id) == piece]
-    graph = _graph(slam_map, members, links, carried)
+    graph = _graph(slam_map, members, links, sensed)
     S = {k.id: np.linalg.inv(new) @ k.T_c_w for k, new in zip(members, solve(graph), strict=True)}
     with slam_map.lock:
         for id, ids in _hosted(slam_map, members).items():
             move_anchors(slam_map.anchors, ids, S[id])
         move_keyframes(slam_map, edges, log, S)
-    grown = {id: sim3.scale_of(moved) for id, moved in S.items()}
-    grown |= {id: grown[heir] for id in slam_map.links if (heir := slam_map.resolve(id)[0]) in grown}
+    change = {id: sim3.scale_of(moved) for id, moved in S.items()}
+    change |= {id: change[successor] for id in slam_map.links if (successor := slam_map.resolve(id)[0]) in change}
     shift, turn = _off(best, before)
     return Closure(
         max(one.keyframe.stamp_s for one in links),
@@ -291,65 +290,65 @@ def spread(
         best.keyframe.stamp_s - best.other.stamp_s,
         shift,
         turn,
-        grown[best.keyframe.id],
+        change[best.keyframe.id],
         len(links),
         sum(len(one.keypoint) for one in links),
-        grown,
+        change,
     )
 
 
 def _off(link: Link, T_c_w: FloatArray) -> tuple[float, float]:
-    """How far a camera is from where a link says it is: relative to the depth, and the angle [rad]."""
+    """Difference between a camera pose and the one by a link: distance relative to the depth, and angle [rad]."""
     there = sim3.moved_camera(link.S, T_c_w)
     moved = T_c_w @ se3.inverse(there)
     return float(np.linalg.norm(moved[:3, 3])) / link.depth, float(np.linalg.norm(se3.log(moved)[3:]))
 
 
-def _graph(slam_map: SlamMap, members: list[Keyframe], links: list[Link], carried: Bridge | None) -> PoseGraph:
-    """Keyframes in order, what they share as it is, what the links say, and what the drone's sensors do."""
+def _graph(slam_map: SlamMap, members: list[Keyframe], links: list[Link], sensed: Bridge | None) -> PoseGraph:
+    """Keyframes in order with covisibility, link and sensor edges."""
     row_of = {k.id: row for row, k in enumerate(members)}
     depth = [slam_map.median_depth(k) or 1.0 for k in members]
     T = np.stack([k.T_c_w for k in members])
     pairs = _shared(slam_map, members)
     i, j, S_ij, inv_sigma = [], [], [], []
-    if carried is not None:
-        i.append(row_of[carried.newer])
-        j.append(row_of[carried.older])
+    if sensed is not None:
+        i.append(row_of[sensed.newer])
+        j.append(row_of[sensed.older])
         pairs.pop((i[0], j[0]), None)
-        S_ij.append(carried.T)
-        inv_sigma.append(_inv_sigma(_CARRIED_SHARED, depth[i[0]], 1.0))
+        S_ij.append(sensed.T)
+        inv_sigma.append(_inv_sigma(_BRIDGE_SHARED, depth[i[0]], 1.0))
     for (a, b), count in pairs.items():
         i.append(a)
         j.append(b)
         S_ij.append(T[a] @ se3.inverse(T[b]))
-        apart = float(np.linalg.norm(S_ij[-1][:3, 3])) / depth[a]
-        inv_sigma.append(_inv_sigma(count, depth[a], max(apart, MIN_BASELINE)))
+        distance = float(np.linalg.norm(S_ij[-1][:3, 3])) / depth[a]
+        inv_sigma.append(_inv_sigma(count, depth[a], max(distance, MIN_BASELINE)))
     for link in links:
         i.append(row_of[link.keyframe.id])
         j.append(row_of[link.other.id])
         S_ij.append(T[i[-1]] @ sim3.inverse(link.S) @ se3.inverse(T[j[-1]]))
         inv_sigma.append(_inv_sigma(len(link.keypoint), depth[i[-1]], 1.0 if link.by_images else MIN_BASELINE))
     old = np.flatnonzero([k.stamp_s == BEFORE_S for k in members])
-    fixed = old if len(old) else np.zeros(1, dtype=np.int64)  # axes and metres of an earlier flight stay
+    fixed = old if len(old) else np.zeros(1, dtype=np.int64)  # keyframes of an earlier flight define axes and scale
     return PoseGraph(T, fixed, np.array(i), np.array(j), np.stack(S_ij), np.stack(inv_sigma))
 
 
-def _inv_sigma(shared: int, depth: float, apart: float) -> FloatArray:
+def _inv_sigma(shared: int, depth: float, distance: float) -> FloatArray:
     """Weights ``(7,)`` of an edge, up to a common factor.
 
-    Every keypoint that two keyframes share tells a direction. That gives the turn, the shift relative to the depth, and
-    the scale by a parallax: worse, the shorter the way between them.
+    Every common keypoint gives a direction. That constrains the rotation, the translation relative to the depth, and
+    the scale by parallax: less the shorter the baseline.
 
     Args:
         shared: Number of keypoints.
-        depth: That the keyframe sees [map units].
+        depth: Median depth in the keyframe [map units].
         apart: Distance of the keyframes, relative to the depth.
     """
-    return np.sqrt(max(shared, 1)) * np.array([1.0 / depth] * 3 + [1.0] * 3 + [min(apart, 1.0)])
+    return np.sqrt(max(shared, 1)) * np.array([1.0 / depth] * 3 + [1.0] * 3 + [min(distance, 1.0)])
 
 
 def _shared(slam_map: SlamMap, members: list[Keyframe]) -> dict[tuple[int, int], int]:
-    """Anchors that pairs of keyframes share, by their rows, newer one first: the best pairs, and those in sequence."""
+    """Number of common anchors of pairs of keyframes, by rows, newer one first: best pairs, and consecutive ones."""
     row_of = {k.id: row for row, k in enumerate(members)}
     pairs: dict[tuple[int, int], int] = {}
     for row, keyframe in enumerate(members):
@@ -363,14 +362,14 @@ def _shared(slam_map: SlamMap, members: list[Keyframe]) -> dict[tuple[int, int],
 
 
 def _hosted(slam_map: SlamMap, members: list[Keyframe]) -> dict[int, IntArray]:
-    """Ids of the anchors that go with each keyframe: the one that their prior rests on, or the newest observer."""
+    """Ids of the anchors that move with each keyframe: the host of their depth prior, or the newest observer."""
     anchors = slam_map.anchors
-    owner = np.full(len(anchors.alive) + 1, -1, dtype=np.int64)  # the last row answers for NO_ANCHOR
+    owner = np.full(len(anchors.alive) + 1, -1, dtype=np.int64)  # the last row is for NO_ANCHOR
     for keyframe in members:
         owner[keyframe.anchor] = keyframe.id
     owner = owner[:-1]
     alive = {k.id for k in members}
     for id in np.flatnonzero((owner >= 0) & anchors.from_depth):
-        heir = slam_map.resolve(int(anchors.host[id]))[0] if anchors.host[id] >= 0 else -1
-        owner[id] = heir if heir in alive else owner[id]
+        successor = slam_map.resolve(int(anchors.host[id]))[0] if anchors.host[id] >= 0 else -1
+        owner[id] = successor if successor in alive else owner[id]
     return {k.id: np.flatnonzero(owner == k.id) for k in members}

@@ -1,4 +1,4 @@
-"""Make one map of two pieces whose similarity is known: move one, give both the same anchors, refine."""
+"""Merging of two submaps with known similarity: move one, share anchors, refine."""
 
 import logging
 from dataclasses import replace
@@ -20,18 +20,18 @@ from edgeslam_torch.types import FloatArray, IntArray
 logger = logging.getLogger(__name__)
 
 RADIUS_PX = 12.0
-"""Search radius at pyramid level 0 for anchors of the other side in the keyframes around a link: the pieces fit to a
-few per cent of the depth there."""
+"""Search radius at pyramid level 0 for anchors of the other side near a link: the submaps agree to a few per cent of
+the depth there."""
 RATIO = 0.85
 NEIGHBOURS = 10
-"""Keyframes around a link, on either side, whose anchors are looked for in the other side."""
+"""Covisible keyframes of a link, on either side, whose anchors are searched in the other side."""
 ITERATIONS = 20
 
 
 def move_piece(slam_map: SlamMap, edges: EdgeMap, log: TrajectoryLog, piece: int, S: FloatArray) -> None:
-    """Move all that belongs to a piece by a similarity ``(4, 4)``; what its cameras see stays the same.
+    """Move a submap by a similarity ``(4, 4)``; its images stay the same.
 
-    No anchor may be seen from two pieces.
+    No anchor may be observed from two submaps.
     """
     mine = [k for k in slam_map.keyframes.values() if slam_map.piece_of(k.id) == piece]
     with slam_map.lock:
@@ -40,9 +40,9 @@ def move_piece(slam_map: SlamMap, edges: EdgeMap, log: TrajectoryLog, piece: int
 
 
 def move_keyframes(slam_map: SlamMap, edges: EdgeMap, log: TrajectoryLog, S: dict[int, FloatArray]) -> None:
-    """Move keyframes by a similarity ``(4, 4)`` each, and what hangs on them.
+    """Move keyframes by a similarity ``(4, 4)`` each.
 
-    Links to removed keyframes, measured edges, and the frames that are tied to them; anchors are for `move_anchors`.
+    Links to removed keyframes, measured edges, and frames move with them; anchors by `move_anchors`.
     """
     scale = {id: sim3.scale_of(moved) for id, moved in S.items()}
     with slam_map.lock:
@@ -57,7 +57,7 @@ def move_keyframes(slam_map: SlamMap, edges: EdgeMap, log: TrajectoryLog, S: dic
 
 
 def move_anchors(anchors: Anchors, ids: IntArray, S: FloatArray) -> None:
-    """Move anchors ``(M,)``, and the priors that they rest on, by a similarity ``(4, 4)``."""
+    """Move anchors ``(M,)`` and their depth priors by a similarity ``(4, 4)``."""
     scale, R, _ = sim3.parts(S)
     anchors.p_w[ids] = sim3.transform(S, anchors.p_w[ids])
     anchors.origin[ids] = sim3.transform(S, anchors.origin[ids])
@@ -67,24 +67,24 @@ def move_anchors(anchors: Anchors, ids: IntArray, S: FloatArray) -> None:
     anchors.prior[ids] /= scale
 
 
-def weld(slam_map: SlamMap, camera: Camera, links: list[Link], lm: LmConfig) -> int:
-    """Give two pieces, moved to where they belong, the same anchors, and refine what they are now.
+def merge_submaps(slam_map: SlamMap, camera: Camera, links: list[Link], lm: LmConfig) -> int:
+    """Merge the anchors of two aligned submaps and refine the result.
 
     Returns:
-        Anchors of one side that the other was found to have too.
+        Number of anchors found to be common.
     """
     with slam_map.lock:
         fused = share_anchors(slam_map, links)
-    thorough = replace(lm, max_iterations=ITERATIONS if lm.max_iterations else 0)  # none where reprojection is off
+    thorough = replace(lm, max_iterations=ITERATIONS if lm.max_iterations else 0)  # none without reprojection terms
     refine_all(slam_map, camera, thorough)
     fused += look_around(slam_map, camera, links)
     refine_all(slam_map, camera, thorough)
-    logger.info("welded at %d keyframes, %d anchors in common", len(links), fused)
+    logger.info("merged at %d keyframes, %d anchors in common", len(links), fused)
     return fused
 
 
 def share_anchors(slam_map: SlamMap, links: list[Link]) -> int:
-    """Let both ends of links observe the same anchors, and belong to one piece; returns the number of anchors less."""
+    """Let both ends of links observe the same anchors and belong to one submap; returns the number merged."""
     before = len(slam_map.anchors)
     for link in links:
         alive = slam_map.anchors.alive[link.anchor] & ~np.isin(link.anchor, link.keyframe.anchor)
@@ -97,7 +97,7 @@ def share_anchors(slam_map: SlamMap, links: list[Link]) -> int:
 
 
 def look_around(slam_map: SlamMap, camera: Camera, links: list[Link]) -> int:
-    """Look for each side's anchors in the other side's keyframes near links; returns the number of anchors less."""
+    """Search each side's anchors in the other side's keyframes near links; returns the number of anchors merged."""
     with slam_map.lock:
         fused = sum(_look_around(slam_map, camera, link) for link in links)
         slam_map.refresh_anchors(np.flatnonzero(slam_map.anchors.alive))

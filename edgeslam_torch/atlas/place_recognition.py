@@ -14,9 +14,9 @@ from edgeslam_torch.types import IntArray
 
 MOST_VOTERS = 200
 MAX_HAMMING = 50
-"""Bits, of 256; the strict figure of ORB-SLAM2: a vote counts though nothing else is known."""
+"""Bits, of 256; the strict threshold of ORB-SLAM2, since a vote has no geometric check."""
 RATIO = 0.9
-"""Nearest over second nearest anchor."""
+"""Maximum ratio of the nearest to the second nearest distance."""
 MIN_VOTES = 8
 """Votes above which a keyframe becomes a revisit candidate: places in other rooms get at most 4."""
 
@@ -24,14 +24,14 @@ MIN_VOTES = 8
 def revisit_candidates(
     slam_map: SlamMap, words: NDArray[np.uint64], among: list[Keyframe], most: int, min_votes: int = MIN_VOTES
 ) -> list[Keyframe]:
-    """Keyframes that see most of the anchors that an image's keypoints resemble, best first.
+    """Keyframes that observe most of the anchors similar to an image's keypoints, best first.
 
     Args:
         slam_map: Holds the anchors.
         words: Descriptors of the image ``(N, 4)``.
-        among: Keyframes that may be named.
-        most: How many at most.
-        min_votes: Of `MOST_VOTERS` or fewer.
+        among: Keyframes to choose from.
+        most: Maximum number of results.
+        min_votes: Minimum number, of `MOST_VOTERS` or fewer.
     """
     votes = votes_for(slam_map, words, slam_map.anchors_seen_by(among))
     allowed = {keyframe.id for keyframe in among}
@@ -41,7 +41,7 @@ def revisit_candidates(
 
 
 def votes_for(slam_map: SlamMap, words: NDArray[np.uint64], anchors: IntArray) -> IntArray:
-    """Those of the anchors ``(A,)`` that keypoints of an image resemble, each once."""
+    """Those of the anchors ``(A,)`` that match keypoints of an image, each once."""
     voters = words[:: 1 + (len(words) - 1) // MOST_VOTERS] if len(words) else words
     if len(voters) == 0 or len(anchors) < 2:
         return anchors[:0]

@@ -1,4 +1,4 @@
-"""What a flight makes of the map of earlier flights: when it was found again, and how much was flown in it."""
+"""Use of the map of earlier flights: when it was recognised, and how many frames it supports."""
 
 import math
 from dataclasses import dataclass
@@ -7,8 +7,8 @@ from typing import Any
 from edgeslam_torch.map.slam_map import SlamMap
 from edgeslam_torch.types import Support
 
-FOUND = "placed in the map of an earlier flight"
-"""Reason of the first such frame, in words."""
+FOUND = "localised in the map of an earlier flight"
+"""Reason of the first such frame."""
 
 
 @dataclass(slots=True)
@@ -18,16 +18,16 @@ class PriorMaps:
     flights: tuple[str, ...]
     """Their names, oldest first."""
     keyframes: int
-    """That were loaded."""
+    """Number of loaded keyframes."""
     pieces: int
-    """Pieces 0 to ``pieces`` - 1 are theirs."""
+    """Number of loaded submaps, 0 to ``pieces`` - 1."""
     begin_s: float = math.inf
     """Stamp of this flight's first frame."""
     found_s: float = math.inf
-    """Stamp of the first frame that was placed in their map while flying."""
+    """Stamp of the first frame that was localised in them."""
 
     def see(self, stamp_s: float, piece: int, supported: bool) -> str:
-        """Take note of a frame's piece; what is to be said of it in ``status.csv``, mostly nothing."""
+        """Record a frame's submap; returns a note for ``status.csv``, mostly empty."""
         self.begin_s = min(self.begin_s, stamp_s)
         if not supported or piece >= self.pieces or math.isfinite(self.found_s):
             return ""
@@ -35,7 +35,7 @@ class PriorMaps:
         return FOUND
 
     def placed(self, support: Support) -> int:
-        """Frames that the map of earlier flights, with what was added to it, supports."""
+        """Number of frames supported by submaps of earlier flights, including later additions."""
         return int((support.supported & (support.piece < self.pieces)).sum())
 
     def summary(self, support: Support, slam_map: SlamMap) -> dict[str, Any]:
@@ -50,7 +50,7 @@ class PriorMaps:
         }
 
     def warning(self, support: Support) -> str | None:
-        """Said when this flight's map and the loaded one stay apart."""
+        """Warning if this flight's map was not merged with the loaded one."""
         if self.placed(support) > 0:
             return None
         return "no place of the atlas was recognised: this flight's map and poses do not relate to it"

@@ -1,6 +1,6 @@
-"""A map as plain arrays, to be written to a file and flown in again.
+"""A map as plain arrays, to be saved and used by later flights.
 
-Images are not kept: places are recognised by descriptors, and edges are measured already.
+Images are not saved: places are recognised by descriptors, and edges are already measured.
 """
 
 from collections.abc import Iterable
@@ -18,29 +18,28 @@ from edgeslam_torch.mapping.edges.edge_map import EdgeMap, EdgePoints
 from edgeslam_torch.types import FloatArray, FrameFeatures, IntArray, ScaleEstimate
 
 EARLIER_FLIGHT = "map of an earlier flight"
-"""How a piece that was read from a file was begun, in words."""
+"""Origin of a submap that was read from a file."""
 BEFORE_S = -np.inf
-"""Stamp of keyframes of earlier flights: they have no time on this flight's clock."""
+"""Stamp of keyframes of earlier flights, which have no time on this flight's clock."""
 
 FARTHEST = 1e4
-"""Distance from the origin beyond which an anchor tells a direction only [map units], and the file has no number for it
-at last; it is left out."""
+"""Distance from the origin [map units] beyond which an anchor is left out: it constrains directions only."""
 UNKNOWN_SIGMA = 1e6
-"""Stands for an infinite standard deviation in the file."""
+"""Represents an infinite standard deviation in the file."""
 
 
 @dataclass(frozen=True, slots=True)
 class SavedAtlas:
-    """Pieces of map of one or several flights, in the units and axes in which they were published."""
+    """Submaps of one or several flights, in published units and axes."""
 
     camera: Camera
-    """Whose undistorted pixels the keypoints are."""
+    """Camera of the undistorted pixels."""
     scale_factor: float
-    """Between pyramid levels."""
+    """Scale factor between pyramid levels."""
     flights: tuple[str, ...]
-    """Names of the recordings that it was made from, oldest first."""
+    """Names of its recordings, oldest first."""
     scale: tuple[ScaleEstimate, ...]
-    """Metres per unit of every piece, by its number."""
+    """Metres per unit of every submap, by its number."""
     arrays: dict[str, Array]
     """Columns of the tables of `edgeslam_torch.atlas.atlas_file.COLUMNS`."""
 
@@ -61,7 +60,7 @@ class SavedAtlas:
 
 @dataclass(frozen=True, slots=True)
 class Unit:
-    """How a piece is to be saved."""
+    """Units in which to save a submap."""
 
     S: FloatArray
     """``(4, 4)`` similarity from map to published units."""
@@ -75,23 +74,23 @@ def pack(
     """The whole map as arrays.
 
     Args:
-        slam_map: Its keyframes with anchors, and the anchors that they observe, are kept.
+        slam_map: Keyframes with anchors, and their anchors, are saved.
         edges: Measured edges; those of removed keyframes stay with these.
-        camera: Of the keyframes.
+        camera: Camera of the keyframes.
         flights: Names of the recordings.
-        units: How to save each piece, by its number; others are left as they are, without metres.
+        units: Units of each submap, by its number; others are saved as they are, without metric scale.
     """
     keyframes, anchor = _worth_keeping(slam_map)
     alive = {k.id for k in keyframes}
     pieces = sorted({slam_map.piece_of(id) for id in alive})
     unit = [units.get(piece, Unit(np.eye(4), ScaleEstimate())) for piece in pieces]
-    # Where edges and depth priors rest on a removed keyframe, its place relative to a surviving one is kept.
+    # Removed keyframes that host edges or depth priors are saved by their pose relative to a remaining one.
     hosts = [h for h in edges.hosts if len(h.uv) and slam_map.resolve(h.keyframe_id)[0] in alive]
     prior_hosts = slam_map.anchors.host[anchor][slam_map.anchors.from_depth[anchor]].tolist()
     removed = sorted({*prior_hosts, *(h.keyframe_id for h in hosts)} - alive)
-    heirs = {id: slam_map.resolve(id) for id in removed}
+    successors = {id: slam_map.resolve(id) for id in removed}
     piece_of = {k.id: pieces.index(slam_map.piece_of(k.id)) for k in keyframes}
-    piece_of |= {id: piece_of[heir] for id, (heir, _) in heirs.items()}
+    piece_of |= {id: piece_of[successor] for id, (successor, _) in successors.items()}
     number = {id: n for n, id in enumerate(sorted([*alive, *removed]))}
     S = [unit[piece_of[k.id]].S for k in keyframes]
     arrays = {
@@ -100,9 +99,9 @@ def pack(
         "keyframe.T_c_w": np.array([sim3.moved_camera(s, k.T_c_w) for s, k in zip(S, keyframes, strict=True)]),
         "keyframe.keypoints": _ints(len(k.anchor) for k in keyframes),
         "removed.id": _ints(number[id] for id in removed),
-        "removed.heir": _ints(number[heirs[id][0]] for id in removed),
+        "removed.heir": _ints(number[successors[id][0]] for id in removed),
         "removed.T_removed_heir": _stacked(
-            [se3.scaled(heirs[id][1], sim3.scale_of(unit[piece_of[id]].S)) for id in removed], (4, 4)
+            [se3.scaled(successors[id][1], sim3.scale_of(unit[piece_of[id]].S)) for id in removed], (4, 4)
         ),
         **_keypoints(keyframes, anchor, len(slam_map.anchors.alive)),
         **_anchors(slam_map, keyframes, anchor, S, number),
@@ -112,13 +111,13 @@ def pack(
 
 
 def unpack(saved: SavedAtlas, slam_map: SlamMap, edges: EdgeMap, camera: Camera) -> None:
-    """Put a saved atlas into an empty map.
+    """Load a saved atlas into an empty map.
 
     Args:
-        saved: As it was read; its contents are consistent.
-        slam_map: Gets keyframes and anchors; the numbers of the pieces are those of the file.
-        edges: Gets the measured edges.
-        camera: Of the flight that begins; pixels are converted to it.
+        saved: Consistent contents.
+        slam_map: Receives keyframes and anchors; submaps keep their numbers.
+        edges: Receives the measured edges.
+        camera: Of the new flight; pixels are converted to it.
     """
     arrays = saved.arrays
     for _ in saved.scale:
@@ -135,13 +134,13 @@ def unpack(saved: SavedAtlas, slam_map: SlamMap, edges: EdgeMap, camera: Camera)
             arrays["keypoint.descriptor"][part],
         )
         keyframe = make_keyframe(id, -1, BEFORE_S, arrays["keyframe.T_c_w"][row], features)
-        held = arrays["keypoint.anchor"][part]
-        keyframe.anchor[:] = np.where(held >= 0, anchor[held], NO_ANCHOR)
+        metric = arrays["keypoint.anchor"][part]
+        keyframe.anchor[:] = np.where(metric >= 0, anchor[metric], NO_ANCHOR)
         slam_map.restore_keyframe(keyframe, int(arrays["keyframe.piece"][row]))
-    for id, heir, T in zip(
+    for id, successor, T in zip(
         arrays["removed.id"].tolist(), arrays["removed.heir"].tolist(), arrays["removed.T_removed_heir"], strict=True
     ):
-        slam_map.restore_removed(id, heir, T)
+        slam_map.restore_removed(id, successor, T)
     for id, part in zip(arrays["host.keyframe"].tolist(), _split(arrays["host.edges"]), strict=True):
         column = {name: arrays[f"edge.{name}"][part] for name in ("uv", "normal", "p_c", "sigma")}
         column = {name: values.astype(np.float64) for name, values in column.items()}
@@ -151,20 +150,20 @@ def unpack(saved: SavedAtlas, slam_map: SlamMap, edges: EdgeMap, camera: Camera)
 
 
 def _worth_keeping(slam_map: SlamMap) -> tuple[list[Keyframe], IntArray]:
-    """Keyframes that see something, in order, and the anchors that they see; without priors that rest on nothing."""
+    """Keyframes with anchors, in order, and these anchors; without depth priors that have lost their host."""
     keyframes = [slam_map.keyframes[id] for id in sorted(slam_map.keyframes)]
     anchors, anchor = slam_map.anchors, slam_map.anchors_seen_by(keyframes)
     anchor = anchor[np.abs(anchors.p_w[anchor]).max(axis=1, initial=0.0) <= FARTHEST]
     alive = {k.id for k in keyframes if (k.anchor != NO_ANCHOR).any()}
-    held_by = np.array([slam_map.resolve(int(h))[0] if h >= 0 else -1 for h in anchors.host[anchor]], dtype=np.int64)
-    anchor = anchor[~anchors.from_depth[anchor] | np.isin(held_by, sorted(alive))]
-    kept = np.zeros(len(anchors.alive) + 1, dtype=bool)  # the last row answers for NO_ANCHOR
+    host = np.array([slam_map.resolve(int(h))[0] if h >= 0 else -1 for h in anchors.host[anchor]], dtype=np.int64)
+    anchor = anchor[~anchors.from_depth[anchor] | np.isin(host, sorted(alive))]
+    kept = np.zeros(len(anchors.alive) + 1, dtype=bool)  # the last row is for NO_ANCHOR
     kept[anchor] = True
     return [k for k in keyframes if kept[k.anchor].any()], anchor
 
 
 def _keypoints(keyframes: list[Keyframe], anchor: IntArray, capacity: int) -> dict[str, Array]:
-    row_of = np.full(capacity + 1, NO_ANCHOR, dtype=np.int64)  # the last row answers for NO_ANCHOR
+    row_of = np.full(capacity + 1, NO_ANCHOR, dtype=np.int64)  # the last row is for NO_ANCHOR
     row_of[anchor] = np.arange(len(anchor))
     row_of[-1] = NO_ANCHOR
     features = [k.features for k in keyframes]
@@ -233,7 +232,7 @@ def _add_anchors(slam_map: SlamMap, arrays: dict[str, Array]) -> IntArray:
 
 
 def _converted(uv: FloatArray, made_with: Camera, camera: Camera) -> FloatArray:
-    """Undistorted pixels ``(N, 2)`` of one camera as those of another: the same rays."""
+    """Undistorted pixels ``(N, 2)`` of one camera converted to another."""
     a, b = made_with, camera
     if (a.fx, a.fy, a.cx, a.cy) == (b.fx, b.fy, b.cx, b.cy):
         return uv

@@ -1,7 +1,7 @@
-"""A piece of map that is turned otherwise than the flight's first one: the drone's attitude tells.
+"""Correction of a submap's heading to that of the flight's first one by the drone's attitude.
 
-A piece begins at a predicted pose. In a turn, before the video's delay is known, that may look tens of degrees beside
-where the camera looks, and images of two pieces that show nothing in common never tell.
+A submap begins at a predicted pose. In a turn with unknown video delay its heading may be wrong by tens of degrees, and
+images cannot correct it before both submaps show a common place.
 """
 
 from dataclasses import dataclass
@@ -15,41 +15,40 @@ from edgeslam_torch.types import FloatArray
 SIGMAS = 3.0
 
 Facing = tuple[FloatArray, float]
-"""How some frames' map is turned in the drone's world, ``R_w_m`` ``(3, 3)``, and the standard deviation [rad] of its
-turn about the vertical."""
+"""Orientation of a map in the drone's world, ``R_w_m`` ``(3, 3)``, and the standard deviation [rad] of its heading."""
 
 
 @dataclass(frozen=True, slots=True)
 class Turned:
-    """A piece that was turned as another one is."""
+    """A submap that was rotated to the heading of another."""
 
     stamp_s: float
     piece: int
     S: FloatArray
-    """``(4, 4)`` similarity that moved it: about where it began."""
+    """``(4, 4)`` similarity that moved it: a rotation about its start."""
     angle_rad: float
     """About the vertical, to the left."""
     sigma_rad: float
 
     def growth(self, piece: int, keyframe_id: int) -> float:
-        """Factor by which the map grew around a keyframe: none."""
+        """Change of scale at a keyframe: none."""
         return 1.0
 
     def __str__(self) -> str:
         """For `status.csv` and the summary."""
         angle, sigma = np.rad2deg((self.angle_rad, self.sigma_rad))
-        return f"piece {self.piece} turned by {angle:.1f} degrees (sigma {sigma:.1f}) to the heading before it"
+        return f"piece {self.piece} rotated by {angle:.1f} degrees (sigma {sigma:.1f}) to the previous heading"
 
 
 def angle_between(mine: Facing, other: Facing) -> tuple[float, float]:
-    """Angle [rad] about the vertical, to the left, by which a piece must be turned to be turned as another one, and its
-    standard deviation."""
+    """Angle [rad] about the vertical, to the left, from a submap's heading to another one's, and its standard
+    deviation."""
     (R_w_mine, mine_rad), (R_w_other, other_rad) = mine, other
     return float(turn_left(R_w_mine @ R_w_other.T)), float(np.hypot(mine_rad, other_rad))
 
 
 def is_turned(angle_rad: float, sigma_rad: float) -> bool:
-    """Whether an angle is surely not 0.
+    """Whether an angle differs significantly from 0.
 
     Example:
         >>> is_turned(0.4, 0.06), is_turned(0.1, 0.06)
@@ -59,11 +58,11 @@ def is_turned(angle_rad: float, sigma_rad: float) -> bool:
 
 
 def turn_about(centre: FloatArray, R_w_m: FloatArray, angle_rad: float) -> FloatArray:
-    """The similarity ``(4, 4)`` that turns by an angle about the vertical through a point ``(3,)``.
+    """Similarity ``(4, 4)`` that rotates by an angle about the vertical through a point ``(3,)``.
 
     Args:
-        centre: In the map.
-        R_w_m: Map to world ``(3, 3)``, the z axis of which is up.
+        centre: Point in the map.
+        R_w_m: Map to world ``(3, 3)``, z axis up.
         angle_rad: To the left.
 
     Example:

@@ -69,12 +69,12 @@ class MapMerging:
         returned = self._left is not None and piece < self._left
         self._left = piece
         if returned and self.atlas.is_divided:
-            self.atlas.ask_again()
+            self.atlas.search_again()
 
     def finish(self) -> None:
         """Query every keyframe once more if there are several submaps, since these have grown."""
         if self.atlas.is_divided:
-            self.atlas.ask_all_again()
+            self.atlas.search_all_again()
         self.update()
 
     def _last(self) -> tuple[int, int, FloatArray]:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from edgeslam_torch.atlas.atlas import CLOSER_LOOKS, Atlas
+from edgeslam_torch.atlas.atlas import MAX_CANDIDATES, Atlas
 from edgeslam_torch.atlas.place_recognition import revisit_candidates
 from edgeslam_torch.frontend.aperture import are_corners
 from edgeslam_torch.frontend.image import as_grey, colours_at
@@ -158,10 +158,10 @@ class Starting:
 
     def _find_earlier_piece(self, attempt: Bootstrap, frame: Frame, view: View) -> Track | None:
         """Relocalise the frame in an earlier submap, whose relative pose is unknown."""
-        strangers = self.atlas.strangers(self.system.map.piece_of(attempt.reference.id))
-        if not strangers:
+        others = self.atlas.others(self.system.map.piece_of(attempt.reference.id))
+        if not others:
             return None
-        keyframes = revisit_candidates(self.system.map, view.words, strangers, CLOSER_LOOKS)
+        keyframes = revisit_candidates(self.system.map, view.words, others, MAX_CANDIDATES)
         return self.tracking.find(frame, view, keyframes, NOWHERE)
 
     def _track(self, attempt: Bootstrap, frame: Frame, view: View) -> Track | None:

@@ -7,7 +7,7 @@ import pytest
 from point_map import CAMERA, SCALE_FACTOR, PointMap, check_map
 
 from edgeslam_torch.atlas import links
-from edgeslam_torch.atlas.atlas import Atlas, _apart_enough, _sigma_log
+from edgeslam_torch.atlas.atlas import Atlas, _are_independent, _sigma_log
 from edgeslam_torch.atlas.links import common_scale, link, on_one_plane, view_of
 from edgeslam_torch.atlas.loops import bridge
 from edgeslam_torch.atlas.map_merging import move_piece
@@ -95,7 +95,7 @@ def test_a_piece_is_asked_again_only_by_new_keyframes(rng):
     assert atlas.update() is not None
     assert atlas.update() is None
     assert atlas.is_up_to_date
-    atlas.ask_all_again()
+    atlas.search_all_again()
     assert not atlas.is_up_to_date
     assert len(atlas.joins) == 1
 
@@ -104,11 +104,11 @@ def test_keyframes_are_asked_again_one_at_a_time_the_newest_first(rng, monkeypat
     """Not all at once, which would stop the video for a second."""
     pieces = Pieces(rng)
     atlas, asked = pieces.atlas(), []
-    monkeypatch.setattr(atlas, "_ask", lambda keyframe: asked.append(keyframe.id))
+    monkeypatch.setattr(atlas, "_search", lambda keyframe: asked.append(keyframe.id))
     atlas.update(0.0)
     assert (asked, atlas.is_up_to_date) == ([0, 1, 2, 3, 4, 5, 6, 7], True)
     asked.clear()
-    atlas.ask_again()
+    atlas.search_again()
     told = [(atlas.update(1.0 + 0.04 * i), len(asked))[1] for i in range(8)]
     assert (asked, told) == ([7, 6, 5], [1, 1, 1, 2, 2, 2, 3, 3])
     assert not atlas.is_up_to_date
@@ -117,9 +117,9 @@ def test_keyframes_are_asked_again_one_at_a_time_the_newest_first(rng, monkeypat
 def test_what_was_missed_at_first_is_joined_when_asked_again(rng):
     pieces = Pieces(rng)
     atlas = pieces.atlas()
-    atlas._asked = 7  # as if each had been asked before the other piece had grown
+    atlas._searched = 7  # as if each had been asked before the other piece had grown
     assert atlas.update(0.0) is None
-    atlas.ask_again()
+    atlas.search_again()
     joins = [join for i in range(8) if (join := atlas.update(1.0 + i)) is not None]
     assert len(joins) == 1
     assert atlas.is_up_to_date
@@ -331,11 +331,11 @@ def test_where_images_tell_no_scale_the_drones_own_sensors_do(rng):
     pieces = turning(rng, CARRIED)
     keyframe, other = pieces.keyframes[4], pieces.keyframes[3]
     assert link(pieces.tracker, keyframe, other) is None
-    found = link(pieces.tracker, keyframe, other, told=lambda *_: (1 / 1.06, 0.03))
+    found = link(pieces.tracker, keyframe, other, scale_between=lambda *_: (1 / 1.06, 0.03))
     error = sim3.log(found.S @ CARRIED)
     assert np.abs(error[:6]).max() < 0.03 and abs(error[6]) < 0.001
     assert (found.by_images, found.sigma_log) == (False, 0.03)
-    assert link(pieces.tracker, keyframe, other, told=lambda *_: None) is None
+    assert link(pieces.tracker, keyframe, other, scale_between=lambda *_: None) is None
 
 
 def test_wallpaper_is_no_place_whose_scale_is_told(rng, monkeypatch):
@@ -343,14 +343,17 @@ def test_wallpaper_is_no_place_whose_scale_is_told(rng, monkeypatch):
     place = links._place
     monkeypatch.setattr(links, "_place", lambda *args: replace(place(*args), share=0.16))
     monkeypatch.setattr(links, "on_one_plane", lambda *_: False)
-    assert link(pieces.tracker, pieces.keyframes[4], pieces.keyframes[3], told=lambda *_: (1 / 1.06, 0.03)) is None
+    assert (
+        link(pieces.tracker, pieces.keyframes[4], pieces.keyframes[3], scale_between=lambda *_: (1 / 1.06, 0.03))
+        is None
+    )
 
 
 def test_a_drone_that_turned_on_the_spot_joins_the_map_of_its_take_off(rng):
     assert turning(rng, CARRIED).atlas().update() is None
     pieces = turning(rng, CARRIED)
     assert pieces.atlas(metres_along=metres_along(2.0 / 1.06)).update() is None, "nothing says where it began"
-    join = pieces.atlas(metres_along=metres_along(2.0 / 1.06), carried=lambda _: 0.01).update()
+    join = pieces.atlas(metres_along=metres_along(2.0 / 1.06), start_sigma=lambda _: 0.01).update()
     assert (join.piece, join.absorbed) == (0, 1)
     assert sim3.scale_of(join.S) == pytest.approx(1 / 1.06 if join.moved == 1 else 1.06, rel=1e-6)
     assert join.sigma_log == pytest.approx(0.02 * np.sqrt(2.0))
@@ -362,10 +365,10 @@ def test_a_drone_that_turned_on_the_spot_joins_the_map_of_its_take_off(rng):
 def test_what_the_older_piece_has_drifted_by_is_spread_over_it(rng, by_sensors):
     """The newer one began where the drone's sensors had carried it: a step between them would be torn by telemetry."""
     pieces = Pieces(rng, misplaced=CARRIED)
-    join = pieces.atlas(carried=lambda piece: 0.01 if by_sensors and piece == 1 else np.inf).update()
-    assert (sorted(join.grown) == list(range(8))) == by_sensors
+    join = pieces.atlas(start_sigma=lambda piece: 0.01 if by_sensors and piece == 1 else np.inf).update()
+    assert (sorted(join.scale_change) == list(range(8))) == by_sensors
     assert pieces.position_error() < 0.02
-    assert join.growth(join.moved, 7) == pytest.approx(sim3.scale_of(join.S) * join.grown.get(7, 1.0))
+    assert join.growth(join.moved, 7) == pytest.approx(sim3.scale_of(join.S) * join.scale_change.get(7, 1.0))
 
 
 def test_a_bridge_is_between_the_last_keyframe_and_the_first_after_it(rng):
@@ -467,7 +470,7 @@ def test_a_piece_is_turned_as_the_first_one(rng, angle):
     atlas = pieces.atlas(facing_along=told)
     done = atlas.align(1.0)
     assert (done.piece, done.growth(1, 5)) == (1, 1.0)
-    assert str(done) == f"piece 1 turned by {np.rad2deg(angle):.1f} degrees (sigma 4.1) to the heading before it"
+    assert str(done) == f"piece 1 rotated by {np.rad2deg(angle):.1f} degrees (sigma 4.1) to the previous heading"
     began = -before[4][:3, :3].T @ before[4][:3, 3]
     for k, keyframe in enumerate(pieces.keyframes):
         np.testing.assert_allclose(pixels_of(pieces, keyframe), pixels[k], atol=1e-6)
@@ -498,8 +501,8 @@ def pixels_of(pieces, keyframe):
 def test_a_piece_is_not_joined_where_the_drone_cannot_have_come_to(rng):
     """Half a metre and forty degrees off after a way of centimetres: nothing drifts so, however much it looks alike."""
     told = metres_along(2.0 / 1.4)
-    assert turning(rng, MISPLACED).atlas(metres_along=told, carried=lambda _: 0.01).update() is None
-    assert Pieces(rng, misplaced=MISPLACED).atlas(carried=lambda _: 0.01).update() is None
+    assert turning(rng, MISPLACED).atlas(metres_along=told, start_sigma=lambda _: 0.01).update() is None
+    assert Pieces(rng, misplaced=MISPLACED).atlas(start_sigma=lambda _: 0.01).update() is None
     assert Pieces(rng, misplaced=MISPLACED).atlas().update() is not None, "by images alone"
 
 
@@ -507,14 +510,14 @@ def test_where_a_piece_of_an_earlier_flight_lies_no_sensor_tells(rng):
     pieces = Pieces(rng, misplaced=MISPLACED)
     for keyframe in pieces.keyframes[:4]:
         keyframe.stamp_s = BEFORE_S
-    assert pieces.atlas(carried=lambda _: 0.01).update() is not None
+    assert pieces.atlas(start_sigma=lambda _: 0.01).update() is not None
 
 
 @pytest.mark.parametrize(("sigma", "may"), [(0.1, False), (0.4, True)])
 def test_what_the_sensors_leave_open_may_be_made_up_for(rng, sigma, may):
     """More than a metre beside where it was carried to."""
     beside = sim3.exp(np.array([1.3, 0.1, 0.0, 0.0, 0.0, 0.0, 0.0]))
-    join = Pieces(rng, misplaced=beside).atlas(carried=lambda _: sigma).update()
+    join = Pieces(rng, misplaced=beside).atlas(start_sigma=lambda _: sigma).update()
     assert (join is not None) == may
 
 
@@ -582,6 +585,6 @@ def test_one_image_stored_twice_in_the_other_piece_is_one_witness(rng):
     one, other = (link(pieces.tracker, k, pieces.keyframes[3]) for k in pieces.keyframes[4:6])
     stored = pieces.keyframes[3]
     twin = make_keyframe(pieces.map.next_keyframe_id(), 99, 9.0, stored.T_c_w, stored.features)
-    assert not _apart_enough(one, replace(other, other=twin))
-    assert not _apart_enough(replace(one, other=twin), replace(other, keyframe=one.keyframe))
-    assert _apart_enough(one, replace(other, other=pieces.keyframes[1]))
+    assert not _are_independent(one, replace(other, other=twin))
+    assert not _are_independent(replace(one, other=twin), replace(other, keyframe=one.keyframe))
+    assert _are_independent(one, replace(other, other=pieces.keyframes[1]))

@@ -209,7 +209,7 @@ def test_what_is_no_atlas_is_refused(tmp_path):
     (tmp_path / "text").write_text("an atlas")
     refused(tmp_path / "text", "not a safetensors file")
     write_tensors(tmp_path / "weights", {"edgeslam": "{}"}, {"conv": np.zeros(3, np.float32)})
-    refused(tmp_path / "weights", "it holds no atlas")
+    refused(tmp_path / "weights", "it contains no atlas")
     assert not any(is_atlas(tmp_path / name) for name in ("text", "weights", "none"))
 
 
@@ -252,33 +252,33 @@ def set_row(name, row, value):
 @pytest.mark.parametrize(
     ("change", "match"),
     [
-        (set_row("anchor.p_w", (0, 0), np.nan), "anchor.p_w holds values that are not finite"),
-        (set_row("anchor.p_w", (0, 0), 1e9), "anchor.p_w holds values"),
-        (set_row("keyframe.T_c_w", (1, 0, 0), 3.0), "no rigid motion"),
-        (set_row("keyframe.T_c_w", (1, 3, 0), 1.0), "no rigid motion"),
-        (set_row("keyframe.id", 0, 77), "not numbered through"),
-        (set_row("keyframe.id", 0, 1), "not numbered through"),
+        (set_row("anchor.p_w", (0, 0), np.nan), "anchor.p_w has values that are not finite"),
+        (set_row("anchor.p_w", (0, 0), 1e9), "anchor.p_w has values"),
+        (set_row("keyframe.T_c_w", (1, 0, 0), 3.0), "not rigid"),
+        (set_row("keyframe.T_c_w", (1, 3, 0), 1.0), "not rigid"),
+        (set_row("keyframe.id", 0, 77), "not numbered consecutively"),
+        (set_row("keyframe.id", 0, 1), "not numbered consecutively"),
         (set_row("keyframe.piece", 0, 1), "pieces and keyframes"),
         (set_row("keyframe.piece", slice(None), -1), "pieces and keyframes"),
-        (set_row("removed.heir", 0, 2), "rests on none"),
+        (set_row("removed.heir", 0, 2), "has no successor"),
         (set_row("keyframe.keypoints", 0, 10_000_000), "do not add up"),
         (set_row("keyframe.keypoints", 0, -1), "do not add up"),
-        (set_row("keypoint.anchor", 0, 10_000_000), "not there"),
-        (set_row("keypoint.anchor", 0, -2), "not there"),
-        (set_row("keypoint.anchor", slice(0, 2), 3), "sees an anchor twice"),
-        (set_row("keypoint.octave", 0, 99), "no pyramid level"),
+        (set_row("keypoint.anchor", 0, 10_000_000), "missing anchor"),
+        (set_row("keypoint.anchor", 0, -2), "missing anchor"),
+        (set_row("keypoint.anchor", slice(0, 2), 3), "observes an anchor twice"),
+        (set_row("keypoint.octave", 0, 99), "invalid pyramid level"),
         (set_row("keypoint.uv", (0, 0), 1e5), "outside the image"),
-        (set_row("host.keyframe", 0, 9), "belong to no keyframe"),
+        (set_row("host.keyframe", 0, 9), "missing keyframe"),
         (set_row("host.edges", 0, 6), "edges do not add up"),
         (set_row("edge.sigma", 0, 0.0), "not positive"),
         (set_row("edge.p_c", (0, 2), -1.0), "behind its camera"),
         (set_row("anchor.max_distance", 0, 0.0), "no distance"),
-        (set_row("anchor.visible", 0, -1), "no count"),
-        (set_row("anchor.from_depth", slice(None), 1), "depth prior belongs to no keyframe"),
+        (set_row("anchor.visible", 0, -1), "not a count"),
+        (set_row("anchor.from_depth", slice(None), 1), "depth prior refers to a missing keyframe"),
         (lambda a: a.pop("anchor.found"), "it has no column anchor.found"),
         (lambda a: a.update({"anchor.found": a["anchor.found"][:-1]}), "anchor.found has .* rows, others"),
-        (lambda a: a.update({"anchor.found": a["anchor.found"].astype(np.float64)}), "anchor.found holds F64"),
-        (lambda a: a.update({"keypoint.anchor": np.full_like(a["keypoint.anchor"], -1)}), "seen by no keyframe"),
+        (lambda a: a.update({"anchor.found": a["anchor.found"].astype(np.float64)}), "anchor.found is F64"),
+        (lambda a: a.update({"keypoint.anchor": np.full_like(a["keypoint.anchor"], -1)}), "has no observation"),
         (lambda a: a.update({n: v[:0] for n, v in a.items()}), "no keyframe"),
     ],
 )
@@ -304,7 +304,7 @@ def header_of(path):
         ('"fx": 320.0', '"fx": -1', "fx must be"),
         ('"fx": 320.0', '"fx": NaN', "fx must be"),
         ('"fx": 320.0', '"fx": "320"', "fx must be"),
-        ('"fx": 320.0', '"f": 1', "does not tell its camera"),
+        ('"fx": 320.0', '"f": 1', "camera in its header is invalid"),
         ('"width": 640', '"width": 0', "width must be"),
         ('"width": 640', '"width": 1e99', "width must be"),
         ('"scale_factor": 1.2', '"scale_factor": 0', "scale_factor must be"),

@@ -7,9 +7,9 @@ import pytest
 from point_map import CAMERA, SCALE_FACTOR, check_map
 
 from edgeslam_torch.atlas import atlas as atlas_module
-from edgeslam_torch.atlas.atlas import LOOK_BACK_RAD, Atlas
+from edgeslam_torch.atlas.atlas import LOOP_SEARCH_RAD, Atlas
 from edgeslam_torch.atlas.links import link
-from edgeslam_torch.atlas.loops import Drift, drift_told, far_keyframes, is_plausible
+from edgeslam_torch.atlas.loops import Drift, expected_drift, far_keyframes, is_plausible
 from edgeslam_torch.atlas.map_merging import share_anchors
 from edgeslam_torch.atlas.saved import BEFORE_S
 from edgeslam_torch.config import EdgeConfig, OrbConfig, TrackingConfig
@@ -136,7 +136,7 @@ def test_a_closed_loop_takes_the_drift_back(rng):
     assert closure.away_s == pytest.approx(ROUND, abs=4.0)
     newest = ring.keyframes[-1]
     assert closure.scale == pytest.approx(np.exp(-ROUND * DRIFT[6]), rel=0.03)
-    assert closure.growth(0, newest.id) == closure.grown[newest.id]
+    assert closure.growth(0, newest.id) == closure.scale_change[newest.id]
     assert "loop closed in piece 0" in str(closure)
 
 
@@ -163,7 +163,7 @@ def test_anchors_frames_and_edges_follow_their_keyframes(rng):
     anchors.rest_on_prior(ids[:1], last.id, last.centre_w, np.array([[0.5, 0.1]]))
     before = se3.transform(last.T_c_w, anchors.p_w[ids])
     (closure,) = closed(ring, ring.atlas())
-    grown = closure.grown[last.id]
+    grown = closure.scale_change[last.id]
     assert 0.9 < grown < 0.99
     alive = anchors.alive[ids]
     after = se3.transform(last.T_c_w, anchors.p_w[ids])
@@ -174,10 +174,10 @@ def test_anchors_frames_and_edges_follow_their_keyframes(rng):
     np.testing.assert_allclose(edges.sigma, grown)
     np.testing.assert_allclose(anchors.origin[ids[0]], last.centre_w, atol=1e-9)
     np.testing.assert_allclose(anchors.prior[ids[0]], np.array([0.5, 0.1]) / grown)
-    assert closure.grown[removed.id] in (grown, closure.grown[ring.keyframes[13].id])
+    assert closure.scale_change[removed.id] in (grown, closure.scale_change[ring.keyframes[13].id])
     for record in ring.log.records:
         way = np.linalg.norm(record.T_c_k[:3, 3])
-        assert way == pytest.approx(0.1 * closure.grown[record.keyframe_id])
+        assert way == pytest.approx(0.1 * closure.scale_change[record.keyframe_id])
 
 
 def test_without_the_setting_nothing_happens(rng):
@@ -243,14 +243,14 @@ def test_a_keyframe_of_some_seconds_ago_is_not_far(rng):
 
 
 def test_a_drift_that_telemetry_bears_out_may_be_large(rng):
-    told = drift_told(ScaleEstimate(1.8, 0.1), ScaleEstimate(1.0, 0.05))
+    told = expected_drift(ScaleEstimate(1.8, 0.1), ScaleEstimate(1.0, 0.05))
     assert told is not None
     assert told.allows(np.log(1.8))
     assert told.allows(np.log(1.5))
     assert not told.allows(np.log(1.0 / 1.8))
     assert not told.allows(0.0)
-    assert drift_told(None, ScaleEstimate(1.0, 0.05)) is None
-    assert drift_told(ScaleEstimate(1.0, 0.05), None) is None
+    assert expected_drift(None, ScaleEstimate(1.0, 0.05)) is None
+    assert expected_drift(ScaleEstimate(1.0, 0.05), None) is None
 
 
 def test_telemetry_decides_whether_a_link_is_plausible(rng):
@@ -303,8 +303,8 @@ def test_what_is_near_a_closed_loop_has_not_drifted_by_as_much_as_the_way_round(
     off[:3, 3] = 1.0 * beside.keyframe.T_c_w[0, :3]  # along the wall
     alike = replace(beside, S=off @ beside.S)
     assert is_plausible(ring.map, beside) and is_plausible(ring.map, alike)
-    assert is_plausible(ring.map, beside, held=True)
-    assert not is_plausible(ring.map, alike, held=True), "a map whose metres are known drifts less"
+    assert is_plausible(ring.map, beside, metric=True)
+    assert not is_plausible(ring.map, alike, metric=True), "a map whose metres are known drifts less"
     share_anchors(ring.map, [found])
     assert is_plausible(ring.map, beside)
     assert not is_plausible(ring.map, alike)
@@ -343,7 +343,7 @@ def test_where_all_lies_on_one_plane_the_images_must_tell_the_scale(rng, monkeyp
     assert len(closed(flying, flying.atlas())) == 1
 
 
-@pytest.mark.parametrize(("turn", "asked"), [(1.1 * LOOK_BACK_RAD, 4), (0.3 * LOOK_BACK_RAD, 2)])
+@pytest.mark.parametrize(("turn", "asked"), [(1.1 * LOOP_SEARCH_RAD, 4), (0.3 * LOOP_SEARCH_RAD, 2)])
 def test_while_it_turns_it_looks_back_more_often(rng, monkeypatch, turn, asked):
     """Four keyframes within a second, at the last of which a second has passed."""
     ring, looks = Ring(rng), []
@@ -353,5 +353,5 @@ def test_while_it_turns_it_looks_back_more_often(rng, monkeypatch, turn, asked):
     for k in range(4):
         c, s = np.cos(k * turn), np.sin(k * turn)
         R = np.array([[c, 0.0, -s, 0.0], [0.0, 1.0, 0.0, 0.0], [s, 0.0, c, 0.0], [0.0, 0.0, 0.0, 1.0]])
-        atlas._seen_before(replace(first, stamp_s=k / 3.0, T_c_w=R @ first.T_c_w))
+        atlas._loop_candidates(replace(first, stamp_s=k / 3.0, T_c_w=R @ first.T_c_w))
     assert len(looks) == asked

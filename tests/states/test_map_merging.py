@@ -51,8 +51,8 @@ class Pieces:
 
         return SimpleNamespace(
             update=update,
-            ask_all_again=lambda: None,
-            ask_again=lambda: self.again.append(self.piece),
+            search_all_again=lambda: None,
+            search_again=lambda: self.again.append(self.piece),
             align=lambda stamp_s, now: None,
             is_up_to_date=False,
             is_divided=True,
@@ -156,7 +156,7 @@ def test_the_pose_is_transformed_when_its_submap_is_rescaled(rng):
     system = system_of(pieces, motion)
     atlas = SimpleNamespace(align=rescale, update=lambda _: None, is_up_to_date=False)
     words = MapMerging(system, atlas).update()
-    assert words == "piece 1 scaled by 1.300 (sigma 5.0 %) to the metres before it"
+    assert words == "piece 1 scaled by 1.300 (sigma 5.0 %) to the previous metres"
     np.testing.assert_allclose(se3.transform(motion.T_c_w, sim3.transform(grown, p)), 1.3 * before, atol=1e-9)
     assert (system.published.revision, system.events) == (1, {"rescaled": 1})
     assert system.fusion.revised == [np.log(1.3), "ratios", ("stamps", "poses")], "the scale estimate is updated once"
@@ -176,7 +176,7 @@ def test_the_pose_is_transformed_when_its_submap_is_rotated(rng):
     system = system_of(pieces, motion)
     system.submap_uncertainty.begin(1, 0, np.zeros(3), 0.0, 0.5)
     atlas = SimpleNamespace(align=align, update=lambda _: None, is_up_to_date=False)
-    assert MapMerging(system, atlas).update() == "piece 1 turned by 22.9 degrees (sigma 2.9) to the heading before it"
+    assert MapMerging(system, atlas).update() == "piece 1 rotated by 22.9 degrees (sigma 2.9) to the previous heading"
     np.testing.assert_allclose(se3.transform(motion.T_c_w, sim3.transform(S, p)), before, atol=1e-9)
     assert (system.published.revision, system.events) == (1, {"turned": 1})
     assert system.submap_uncertainty.sigma(1, np.array([2.0, 0.0, 0.0]), 0.0) == pytest.approx(0.1)
