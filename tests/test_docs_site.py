@@ -29,7 +29,7 @@ ALL_FOUND = """new Promise((done, fail) => {
     const found = [...document.querySelectorAll('.md-search-result__link')].map(a => a.getAttribute('href'));
     if (found.length || !left) return found.length ? done(found) : fail(new Error('nothing found'));
     field.focus();
-    field.value = left % 2 ? 'video' : 'video file';
+    field.value = left % 2 ? 'webca' : 'webcam';
     field.dispatchEvent(new KeyboardEvent('keyup', {bubbles: true}));
     setTimeout(() => look(left - 1), 1000);
   };

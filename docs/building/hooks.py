@@ -28,8 +28,13 @@ FROM_THE_ROOT = {"README.md": "index.md"} | {
 }
 """Files at the root, and the pages that they become."""
 NOTEBOOKS = ROOT / "examples" / "notebooks"
-BOOSTS = {"start/": 4.0, "guides/": 4.0, "index.md": 4.0, "theory/": 2.0, "decisions/": 0.1, "CHANGELOG.md": 0.1}
-"""Weights of pages in the search by their beginning; all others have 1."""
+BOOSTS = {"index.md": 10.0, "start/": 10.0, "guides/": 10.0, "reference/api/": 1e-3, "reference/": 0.1} | {
+    "theory/": 0.1,
+    "decisions/": 1e-4,
+    "CHANGELOG.md": 1e-4,
+}
+"""Weights of pages in the search by their beginning; all others have 1. A word in a title weighs a thousand times as
+much as in the text: guides precede names of the API only by such factors."""
 _LINK = re.compile(r"(?<=\]\()([^)#\s:]+)(#[^)\s]*)?(?=\))")
 _FENCED = re.compile(r"(^```.*?^```)", re.MULTILINE | re.DOTALL)
 
