@@ -26,18 +26,20 @@ from reference import api_pages, commands_page  # noqa: E402  # beside the docum
 
 DOCS = [ROOT / f"{name}.md" for name in ("README", "CHANGELOG", "CONTRIBUTING", "SECURITY")]
 DOCS += sorted(path for path in (ROOT / "docs").rglob("*.md") if "building" not in path.parts)
-GUIDES = [path for path in DOCS if path.parent.name in ("start", "guides")]
+GUIDES = [path for path in DOCS if path.parent.name in ("start", "guides") or path.name == "README.md"]
 GENERATED = {ROOT / "docs" / page for page in ("reference/settings.md", "reference/commands.md", *api_pages())}
 TAKES_WEIGHTS = {"finetune", "distil"}
 """Commands that refuse weights which are not there; of them the options alone are compared."""
 
 
 def commands() -> list[tuple[str, str]]:
-    """Page and line of each command in an indented block."""
+    """Page and line of each command in a block of code."""
     return [
         (page.name, line)
         for page in GUIDES
-        for line in re.findall(r"^    (?:\$ )?(edgeslam [^\n]+)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+        for line in re.findall(
+            r"^(?:    )?(?:\$ )?(edgeslam [a-z][^\n]+)$", page.read_text(encoding="utf-8"), re.MULTILINE
+        )
     ]
 
 

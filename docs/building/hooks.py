@@ -94,7 +94,6 @@ def fill(entry: dict[str, Any]) -> None:
             for inner in value:
                 if isinstance(inner, dict):
                     fill(inner)
-            entry[title] = [inner for inner in value if exists(inner)]
         elif value == "notebooks/":
             entry[title] = [f"notebooks/{path.stem}.md" for path in notebooks()]
         elif value == "reference/api/":
@@ -103,14 +102,6 @@ def fill(entry: dict[str, Any]) -> None:
             folder = (ROOT / "docs" / value).parent
             others = sorted(path.name for path in folder.glob("*.md") if path.name != "README.md")
             entry[title] = [value, *(f"{folder.name}/{name}" for name in others)]
-
-
-def exists(entry: Any) -> bool:
-    """Whether a page of the menu is there yet."""
-    page = next(iter(entry.values())) if isinstance(entry, dict) else entry
-    page = page[0] if isinstance(page, list) and page else page
-    generated = ("reference/", "notebooks/", *FROM_THE_ROOT.values())
-    return not isinstance(page, str) or page.startswith(generated) or (ROOT / "docs" / page).exists()
 
 
 def network_needs(site: Path) -> list[str]:
