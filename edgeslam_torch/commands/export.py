@@ -32,7 +32,8 @@ TIMED_RUNS = 40
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's options."""
-    parser.add_argument("weights", nargs="?", type=Path, help="weights (.safetensors); the shipped ones by default")
+    parser.add_argument("--depth", default="default", metavar="FILE|NAME", help="weights to export (default: default)")
+    parser.add_argument("depth", nargs="?", default=argparse.SUPPRESS, help=argparse.SUPPRESS)  # as in version 0.2
     parser.add_argument("--out", "-o", type=output_file, required=True, help="ONNX file to write")
     parser.add_argument("--int8", action="store_true", help="static int8 quantisation; needs --calibrate")
     parser.add_argument("--fp16", action="store_true", help="store weights as float16")
@@ -50,6 +51,7 @@ def main(args: argparse.Namespace) -> int:
     """Export, compare with torch on real frames, print the table."""
     with needs_extra("export", "edgeslam export"):
         importlib.import_module("onnxscript")  # torch loads it when it exports, and fails in many words
+    from edgeslam_torch.frontend.depth_network import weights_path
     from edgeslam_torch.models.checkpoint import load_checkpoint
     from edgeslam_torch.models.onnx.export import OLD_RUNTIME_OPSET, ExportOptions, export_onnx
     from edgeslam_torch.models.onnx.fold import deployed
@@ -61,7 +63,7 @@ def main(args: argparse.Namespace) -> int:
         raise ConfigError("--int8 needs --calibrate DATA: real frames like those the network will see")
     from edgeslam_torch.terminal.progress import Progress, counted
 
-    network, metadata = load_checkpoint(args.weights)
+    network, metadata = load_checkpoint(weights_path(args.depth))
     height, width = _size(args.size, metadata)
     opset = _opset(min(args.opset, OLD_RUNTIME_OPSET) if args.old_runtime else args.opset)
     images = list(counted(_images(args.calibrate, height, width, metadata), "reading", "image"))

@@ -50,7 +50,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "distil": ("edgeslam distil recordings/* --teacher depth_anything.onnx -o small",),
     "export": (
         "edgeslam export -o depth.onnx --int8 --calibrate recording/",
-        "edgeslam export mine.safetensors -o mine.onnx",
+        "edgeslam export --depth mine.safetensors -o mine.onnx",
     ),
     "weights": ("edgeslam weights list", "edgeslam weights inspect mine.safetensors"),
     "eval": (

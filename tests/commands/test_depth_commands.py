@@ -153,7 +153,19 @@ def test_int8_export_is_checked_and_runs_on_the_companion_example(
     weights: Path, pictures: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "depth.onnx"
-    code = run("export", weights, "--out", out, "--int8", "--calibrate", pictures, "--old-runtime", "--size", "64x96")
+    code = run(
+        "export",
+        "--depth",
+        weights,
+        "--out",
+        out,
+        "--int8",
+        "--calibrate",
+        pictures,
+        "--old-runtime",
+        "--size",
+        "64x96",
+    )
     assert code == 0
     printed, complaints = capfd.readouterr()
     assert complaints == ""

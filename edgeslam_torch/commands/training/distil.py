@@ -37,12 +37,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--teacher", required=True, metavar="FILE|NAME", help="the larger network, as for 'edgeslam run --depth'"
     )
     parser.add_argument(
-        "--student",
+        "--depth",
         default="mobilenet-nnconv5dw-skipadd",
         metavar="VARIANT|FILE",
-        help="a variant of FastDepth, beginning with the shipped weights where shapes are the same, or weights "
-        "(default: the shipped ones)",
+        help="weights to start from: a file, or a variant of FastDepth, which begins with the shipped weights where "
+        "shapes are the same (default: the shipped ones)",
     )
+    parser.add_argument("--student", dest="depth", default=argparse.SUPPRESS, help=argparse.SUPPRESS)
     add_shared_arguments(parser, steps=400, batch=8)
     parser.add_argument(
         "--lr",
@@ -60,7 +61,7 @@ def main(args: argparse.Namespace) -> int:
     from edgeslam_torch.train.hook_names import named_hooks
 
     teacher = open_depth(weights_path(args.teacher), threads=args.threads)
-    student, metadata, is_new = _student(args.student)
+    student, metadata, is_new = _student(args.depth)
     config = _config(args, is_new)
     hooks = named_hooks(args.hook)
     return in_folder(args, lambda out: _distil(args, items, teacher, student, metadata, config, hooks, out))
@@ -77,7 +78,7 @@ def _student(name: str) -> "tuple[FastDepth, Metadata, bool]":
         network, metadata = new_student(Variant(name))
         return network, metadata, name != Metadata().variant
     if not Path(name).suffix:
-        raise ConfigError(f"--student {name}: no weights file, and no variant; there are {', '.join(Variant)}")
+        raise ConfigError(f"--depth {name}: no weights file, and no variant; there are {', '.join(Variant)}")
     return *load_checkpoint(Path(name)), False
 
 

@@ -151,7 +151,7 @@ def test_distil_command_writes_weights_and_says_what_was_learnt(
     run_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     teacher = teacher_file(tmp_path / "teacher.onnx")
-    words = (run_folder, "--teacher", teacher, "--student", "mobilenet-nnconv5dw-skipadd-pruned")
+    words = (run_folder, "--teacher", teacher, "--depth", "mobilenet-nnconv5dw-skipadd-pruned")
     assert command.main(arguments(tmp_path, *words)) == 0
     printed = capsys.readouterr().out
     assert "pixels measured" in printed and "| before |" in printed
