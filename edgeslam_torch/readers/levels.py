@@ -40,14 +40,17 @@ def levels_of(pictures: Iterable[NDArray[Any]]) -> Levels:
     """Levels by a recording's first pictures.
 
     Where the values fill their bits, the highest eight of the bits in use are kept; where they lie in a narrow range,
-    the range is stretched.
+    the range is stretched. Floating point that fills [0, 1] is that range.
     """
+    pictures = list(pictures)
     values = np.concatenate([_sampled(picture) for picture in pictures])
     values = values[np.isfinite(values)]
     low, high = np.percentile(values, [_OUTLIERS_PERCENT, 100.0 - _OUTLIERS_PERCENT]) if len(values) else (0.0, 0.0)
     bits = max(8, int(min(high, 2.0**62)).bit_length()) if high > low else 16
     if low >= 0.0 and (high == low or (high >= 2.0 and high - low >= _NARROW * 2**bits)):
         return Levels(0.0, float(2**bits), f"{bits} bits in use, of which the highest eight are kept")
+    if pictures[0].dtype.kind == "f" and low >= 0.0 and high - low >= _NARROW and high <= 1.0:
+        return Levels(0.0, 1.0, "floating point in [0, 1], which becomes black to white")
     margin = _MARGIN * max(high - low, 1e-6)
     words = f"values {low:.6g} to {high:.6g} in the first pictures; these and a quarter more become black to white"
     return Levels(float(low - margin), float(high + margin), words)

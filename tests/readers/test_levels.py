@@ -43,3 +43,16 @@ def test_eight_bits_stay_and_colour_is_one_range():
     assert np.array_equal(Levels(10.0, 20.0, "").eight_bits(GREY.astype(np.uint8)), GREY)
     colour = np.stack([16 * GREY, 8 * GREY, 0 * GREY], axis=2).astype(np.uint16)
     assert np.array_equal(levels_of([colour]).eight_bits(colour), np.stack([GREY, GREY // 2, 0 * GREY], axis=2))
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
+@pytest.mark.parametrize("brightest", [1.0, 0.5])
+def test_floating_point_in_0_to_1_keeps_its_contrast(dtype, brightest):
+    picture = (brightest * GREY / 255).astype(dtype)
+    seen = levels_of([picture]).eight_bits(picture).astype(float)
+    assert np.abs(seen - brightest * GREY).max() <= 1.0
+
+
+def test_floating_point_in_a_narrow_range_is_stretched():
+    picture = (0.5 + 0.05 * GREY / 255).astype(np.float32)
+    assert np.ptp(levels_of([picture]).eight_bits(picture).astype(int)) > 150
