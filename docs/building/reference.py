@@ -23,7 +23,7 @@ NAMES = {
         "drone.tello.Tello",
         "drone.address.TelloAddress",
         "flying.navigator.Navigator",
-        "flying.result.Outcome",
+        "flying.result.FlightResult",
         "navigation.limits.NavLimits",
     ),
     "eval": ("eval.metrics.run_score.evaluate_run", "eval.metrics.run_score.RunScore", "eval.metrics.align.umeyama"),

@@ -31,7 +31,7 @@ _STEP_M = 0.1
 class Moment:
     """What was known and decided at one moment, for recorders and viewers."""
 
-    sight: DroneState
+    state: DroneState
     order: Order
     phase: Phase
     pilot: Pilot
@@ -48,7 +48,7 @@ class FlightController:
     """One flight's pilot and supervisor.
 
     `plan` is called from one thread, which may hang; `order` from another, which must not wait for it: they share
-    only a wish and a lock that is held for microseconds.
+    only a command and a lock that is held for microseconds.
     """
 
     def __init__(
@@ -56,7 +56,7 @@ class FlightController:
     ) -> None:
         self.limits = limits
         self.pilot = Pilot(Stay(), limits)
-        self.sight: DroneState | None = None
+        self.state: DroneState | None = None
         """The newest."""
         self.last: Order | None = None
         self._supervisor = Supervisor(limits)
@@ -64,8 +64,8 @@ class FlightController:
         self._witness = witness
         self._lock = threading.Lock()
         self._next: Task | None = None
-        self._held = False
-        self._touch: Contact | None = None
+        self._hold = False
+        self._contact: Contact | None = None
         """What was felt since the pilot planned last."""
         self._track: list[FloatArray] = []
         self._path_m, self._clearance_m = 0.0, math.nan
@@ -82,45 +82,45 @@ class FlightController:
             phase = self.pilot.phase
             return phase if self._next is None and phase in (Phase.DONE, Phase.STUCK) else None
 
-    def hold(self, held: bool) -> None:
+    def hold(self, hold: bool) -> None:
         """Hover whatever the pilot wants, until it is called off: for a person at the keyboard."""
-        self._held = held
+        self._hold = hold
 
-    def feel(self, touch: Contact) -> None:
+    def feel(self, contact: Contact) -> None:
         """Let the pilot know of something that it does not see, when it plans next."""
         with self._lock:
-            self._touch = touch
+            self._contact = contact
 
-    def plan(self, sight: DroneState) -> Decision:
+    def plan(self, state: DroneState) -> Decision:
         """Let the pilot decide; may take its time, or hang."""
         with self._lock:
             task, self._next = self._next, None
-            touch, self._touch = self._touch, None
+            contact, self._contact = self._contact, None
             if task is not None:
                 self._take_up(task)
             if self.last is not None and not self.last.follows:
-                sight = replace(sight, hindered=True)
+                state = replace(state, overridden=True)
         if task is not None:
             self._witness(NewTask(task))
-        if sight.moved is not None:
-            self._carry(sight.moved)
-        if touch is not None:
-            self._witness(touch)
-            self.pilot.touched(touch)
-        self._witness(sight)
-        wish = self.pilot.update(sight)
+        if state.map_update is not None:
+            self._carry(state.map_update)
+        if contact is not None:
+            self._witness(contact)
+            self.pilot.add_contact(contact)
+        self._witness(state)
+        command = self.pilot.update(state)
         with self._lock:
-            self._supervisor.propose(wish, sight.stamp_s)
-        decision = Decision(wish, str(self.pilot.phase))
+            self._supervisor.propose(command, state.stamp_s)
+        decision = Decision(command, str(self.pilot.phase))
         self._witness(decision)
-        self._note_clearance(sight)
+        self._note_clearance(state)
         return decision
 
-    def _carry(self, moved: MapUpdate) -> None:
+    def _carry(self, update: MapUpdate) -> None:
         """Take the way flown along with the map; the pilot does so itself."""
         with self._lock:
-            self._track = list(moved.points(np.array(self._track).reshape(-1, 2)))
-            self._supervisor.carry(moved)
+            self._track = list(update.points(np.array(self._track).reshape(-1, 2)))
+            self._supervisor.carry(update)
 
     def _take_up(self, task: Task) -> None:
         """A first look that is under way is finished."""
@@ -129,17 +129,17 @@ class FlightController:
         else:
             self.pilot.begin(task)
 
-    def order(self, sight: DroneState) -> Order:
+    def order(self, state: DroneState) -> Order:
         """What the drone is told now: takes microseconds, whatever the pilot does."""
         with self._lock:
-            self._supervisor.see(sight)
-            self._supervisor.held = self._held
-            order = self._supervisor.order(sight.stamp_s)
-        if order.touch is not None:
-            self.feel(order.touch)
-        self._note_path(sight)
-        self.sight, self.last = sight, order
-        self._tell(Moment(sight, order, self.pilot.phase, self.pilot))
+            self._supervisor.see(state)
+            self._supervisor.hold = self._hold
+            order = self._supervisor.order(state.stamp_s)
+        if order.contact is not None:
+            self.feel(order.contact)
+        self._note_path(state)
+        self.state, self.last = state, order
+        self._tell(Moment(state, order, self.pilot.phase, self.pilot))
         return order
 
     def _tell(self, moment: Moment) -> None:
@@ -173,8 +173,8 @@ class FlightController:
         with self._lock:
             return self._path_m, self._clearance_m
 
-    def _note_path(self, sight: DroneState) -> None:
-        here = sight.p_w[:2]
+    def _note_path(self, state: DroneState) -> None:
+        here = state.p_w[:2]
         with self._lock:
             step = float(np.linalg.norm(here - self._track[-1])) if self._track else 0.0
             if self._track and step < _STEP_M:
@@ -182,11 +182,11 @@ class FlightController:
             self._track.append(here.copy())
             self._path_m += step
 
-    def _note_clearance(self, sight: DroneState) -> None:
+    def _note_clearance(self, state: DroneState) -> None:
         layer = self.pilot.layer
         if layer is None or not layer.solid.any():
             return
-        i, j = layer.cells(sight.p_w[:2])
+        i, j = layer.cells(state.p_w[:2])
         away = float(layer.from_solid_m[i, j]) - self.limits.radius_m
         with self._lock:
             self._clearance_m = away if math.isnan(self._clearance_m) else min(self._clearance_m, away)

@@ -67,14 +67,14 @@ class LockstepVehicle:
                 self.land(self._land_because)
                 return
             self._tick()
-            sight = self._perception.sight(self.tello.clock_s, self._view)
+            state = self._perception.state(self.tello.clock_s, self._view)
             self._view = None
-            self._flight_controller.plan(sight)
-            order = self._flight_controller.order(sight)
+            self._flight_controller.plan(state)
+            order = self._flight_controller.order(state)
             if order.land:
                 self.land(str(order.danger))
             else:
-                right, forward, up, clockwise = (round(100 * v) for v in order.wish.sticks())
+                right, forward, up, clockwise = (round(100 * v) for v in order.command.sticks())
                 self.tello.send(f"rc {right} {forward} {up} {clockwise}")
 
     def land(self, why: str) -> None:

@@ -11,7 +11,7 @@ from edgeslam_torch.drone.address import TelloAddress
 from edgeslam_torch.flying.checks import check_fit, check_goal
 from edgeslam_torch.flying.flight_controller import FlightController, Listener
 from edgeslam_torch.flying.recorder import Recorder
-from edgeslam_torch.flying.result import FlightRefused, Outcome
+from edgeslam_torch.flying.result import FlightRefused, FlightResult
 from edgeslam_torch.flying.simulated import is_simulated, site_of
 from edgeslam_torch.flying.tasks import Stay, WayHome
 from edgeslam_torch.flying.vehicle import Vehicle
@@ -25,9 +25,9 @@ from edgeslam_torch.navigation.tasks import ARRIVED_M, Explore, GoTo, Task
 from edgeslam_torch.types import FloatArray
 
 HOME_BECAUSE = "battery low: home"
-CARRIED = "by telemetry alone: the pose rests on no map"
-LONE = "in a piece of map that nothing relates to that of the take-off"
-APART = "to {:.2g} m: what telemetry leaves open between this piece of map and that of the take-off"
+DEAD_RECKONING = "by telemetry alone: the pose rests on no map"
+UNRELATED = "in a piece of map that nothing relates to that of the take-off"
+UNCERTAIN = "to {:.2g} m: what telemetry leaves open between this piece of map and that of the take-off"
 """What an outcome adds where nothing that is seen says so."""
 BEYOND_M = 0.8
 """How far behind an exit it stops."""
@@ -122,7 +122,7 @@ class Navigator:
             if self.recorder is not None:
                 self.recorder.close()
 
-    def take_off(self) -> Outcome:
+    def take_off(self) -> FlightResult:
         """Rise, look to both sides, and wait for metres.
 
         Raises:
@@ -138,7 +138,7 @@ class Navigator:
         self.vehicle.take_off()
         return self.fly(Stay(), "in the air")
 
-    def go_to(self, goal_w: Sequence[float] | FloatArray) -> Outcome:
+    def go_to(self, goal_w: Sequence[float] | FloatArray) -> FlightResult:
         """Fly to a point ``(3,)`` around what is in the way; at the height of flight, which the point must be near.
 
         Before a bare wall, where no picture tells the pose, it stays up to half a metre away, and the reason says so.
@@ -149,7 +149,7 @@ class Navigator:
         """
         return self._fly_to(self._goal(goal_w), "there")
 
-    def explore(self, seconds: float) -> Outcome:
+    def explore(self, seconds: float) -> FlightResult:
         """Fly to where the known space ends, again and again, and look around on the way; reached when time is over or
         nothing is left to see.
 
@@ -160,7 +160,7 @@ class Navigator:
         outcome = self.fly(Explore(until_s), "the time is over")
         return self._in_time(outcome, until_s, "nothing is left to see")
 
-    def find_exits(self, seconds: float = 180.0) -> Outcome:
+    def find_exits(self, seconds: float = 180.0) -> FlightResult:
         """Explore until an exit is known; `exits` are the records.
 
         Raises:
@@ -184,9 +184,9 @@ class Navigator:
         Raises:
             FlightRefused: If it does not fly.
         """
-        return pathways(self.flight_controller.walls(), self._flying_sight().p_w[:2])
+        return pathways(self.flight_controller.walls(), self._flying_state().p_w[:2])
 
-    def go_through(self, exit_: Exit) -> Outcome:
+    def go_through(self, exit_: Exit) -> FlightResult:
         """Fly through an exit of `exits`, and stop `BEYOND_M` behind it.
 
         Raises:
@@ -195,7 +195,7 @@ class Navigator:
         there = exit_.beyond(BEYOND_M)
         return self._fly_to(self._goal([there[0], there[1], self.limits.height_m]), "through the exit")
 
-    def follow_corridor(self, seconds: float = 120.0) -> Outcome:
+    def follow_corridor(self, seconds: float = 120.0) -> FlightResult:
         """Follow the corridor that the drone is in, ahead and round corners, through no door that it knows.
 
         That it ends says that a wall is ahead and that nothing was seen to lead on, not that nothing does.
@@ -213,16 +213,18 @@ class Navigator:
             return replace(outcome, reached=False, reason="it sees no way on and no end either")
         return outcome
 
-    def return_home(self) -> Outcome:
+    def return_home(self) -> FlightResult:
         """Fly to the take-off, back along the way where it is far.
 
         Raises:
             FlightRefused: If it does not fly.
         """
-        self._flying_sight()
+        self._flying_state()
         return self.fly(WayHome(self.flight_controller.track()), "home", to_home=True)
 
-    def fly(self, task: Task, done: str, until: Callable[[], bool] = lambda: False, to_home: bool = False) -> Outcome:
+    def fly(
+        self, task: Task, done: str, until: Callable[[], bool] = lambda: False, to_home: bool = False
+    ) -> FlightResult:
         """Fly any task of `navigation.tasks` to its end; home and down when the battery is low.
 
         Args:
@@ -237,20 +239,20 @@ class Navigator:
         )
         path_m, clearance_m = self.flight_controller.flown()
         if not self.vehicle.flying:
-            return Outcome(False, self.vehicle.over, clearance_m, path_m)
+            return FlightResult(False, self.vehicle.over, clearance_m, path_m)
         if self.flight_controller.ended() is None and until():
             self.flight_controller.begin(Stay())
-            return Outcome(True, done, clearance_m, path_m)
+            return FlightResult(True, done, clearance_m, path_m)
         if self.flight_controller.ended() is None:
             self.return_home()
             if self.vehicle.flying:
                 self.vehicle.land(HOME_BECAUSE)
-            return Outcome(False, HOME_BECAUSE, clearance_m, path_m)
+            return FlightResult(False, HOME_BECAUSE, clearance_m, path_m)
         if self.flight_controller.ended() is not Phase.DONE:
-            return Outcome(False, self.flight_controller.pilot.why_stuck(), clearance_m, path_m)
-        return Outcome(True, done + self._rests_on(), clearance_m, path_m)
+            return FlightResult(False, self.flight_controller.pilot.why_stuck(), clearance_m, path_m)
+        return FlightResult(True, done + self._rests_on(), clearance_m, path_m)
 
-    def land(self) -> Outcome:
+    def land(self) -> FlightResult:
         """Land; reached when the drone says that it stands.
 
         Raises:
@@ -260,36 +262,36 @@ class Navigator:
             raise FlightRefused(f"it does not fly{f': {self.vehicle.over}' if self.vehicle.over else ''}")
         path_m, clearance_m = self.flight_controller.flown()
         self.vehicle.land("as commanded")
-        return Outcome(self.vehicle.over == "as commanded", f"landed: {self.vehicle.over}", clearance_m, path_m)
+        return FlightResult(self.vehicle.over == "as commanded", f"landed: {self.vehicle.over}", clearance_m, path_m)
 
-    def _fly_to(self, goal_w: FloatArray, done: str) -> Outcome:
+    def _fly_to(self, goal_w: FloatArray, done: str) -> FlightResult:
         """Fly to a checked point ``(3,)``; the outcome says how near it came where that is not at once clear."""
         task = GoTo(goal_w)
-        outcome, sight = self.fly(task, done), self.flight_controller.sight
-        if not outcome.reached or sight is None or (away_m := task.away_m(sight)) < _THERE_M:
+        outcome, state = self.fly(task, done), self.flight_controller.state
+        if not outcome.reached or state is None or (away_m := task.away_m(state)) < _THERE_M:
             return outcome
         return replace(outcome, reason=f"{done}, {away_m:.2f} m from it by its own pose" + self._rests_on())
 
     def _goal(self, goal_w: Sequence[float] | FloatArray) -> FloatArray:
         goal = check_goal(goal_w, self.limits)
-        self._flying_sight()
+        self._flying_state()
         return check_goal(goal, self.limits, self.flight_controller.known())
 
-    def _flying_sight(self) -> DroneState:
+    def _flying_state(self) -> DroneState:
         """The newest moment of a flight with metres.
 
         Raises:
             FlightRefused: If there is none.
         """
-        sight = self.flight_controller.sight
-        if not self.vehicle.flying or sight is None:
+        state = self.flight_controller.state
+        if not self.vehicle.flying or state is None:
             why = f" ({self.vehicle.over})" if self.vehicle.over else ": take off first"
             raise FlightRefused(f"it does not fly{why}")
-        if not sight.metric:
+        if not state.metric:
             raise FlightRefused(
                 "the map has no metres yet, so a place in metres means nothing; take_off() waits for them"
             )
-        return sight
+        return state
 
     def _until_s(self, seconds: float) -> float:
         """When so many seconds are over.
@@ -299,23 +301,23 @@ class Navigator:
         """
         if not 0 < seconds < 3600:
             raise FlightRefused(f"a flight takes more than 0 s and less than an hour, not {seconds} s")
-        return self._flying_sight().stamp_s + seconds
+        return self._flying_state().stamp_s + seconds
 
-    def _in_time(self, outcome: Outcome, until_s: float, why: str) -> Outcome:
+    def _in_time(self, outcome: FlightResult, until_s: float, why: str) -> FlightResult:
         """The outcome with another reason if its task was done before its time was over."""
-        early = self.flight_controller.sight is not None and self.flight_controller.sight.stamp_s < until_s
+        early = self.flight_controller.state is not None and self.flight_controller.state.stamp_s < until_s
         return replace(outcome, reason=why + self._rests_on()) if outcome.reached and early else outcome
 
     def _rests_on(self) -> str:
         """What a reached outcome has to say of the pose that it rests on."""
-        sight = self.flight_controller.sight
-        if sight is None:
+        state = self.flight_controller.state
+        if state is None:
             return ""
-        if not sight.tracked:
-            return f", {CARRIED}"
-        if math.isinf(sight.apart_sigma_m):
-            return f", {LONE}"
-        return f", {APART.format(sight.apart_sigma_m)}" if sight.apart_sigma_m > 0 else ""
+        if not state.tracked:
+            return f", {DEAD_RECKONING}"
+        if math.isinf(state.submap_sigma_m):
+            return f", {UNRELATED}"
+        return f", {UNCERTAIN.format(state.submap_sigma_m)}" if state.submap_sigma_m > 0 else ""
 
     def _wants_home(self) -> bool:
         return self.flight_controller.last is not None and self.flight_controller.last.home

@@ -121,7 +121,7 @@ def _clearance_m(moment: Moment) -> float:
     layer = moment.pilot.layer
     if layer is None or not layer.solid.any():
         return math.nan
-    i, j = layer.cells(moment.sight.p_w[:2])
+    i, j = layer.cells(moment.state.p_w[:2])
     return float(layer.from_solid_m[i, j]) - moment.pilot.limits.radius_m
 
 
@@ -132,22 +132,22 @@ def _exit_line(exit_: Exit) -> str:
 
 
 def _line(moment: Moment) -> str:
-    sight, order = moment.sight, moment.order
-    wish = order.wish
-    numbers = [*sight.p_w, sight.yaw_rad, *sight.velocity_w, sight.position_sigma_m, sight.scale_sigma]
-    stick = [wish.forward_m_s, wish.left_m_s, wish.up_m_s, wish.turn_left_rad_s]
+    state, order = moment.state, moment.order
+    command = order.command
+    numbers = [*state.p_w, state.yaw_rad, *state.velocity_w, state.position_sigma_m, state.scale_sigma]
+    stick = [command.forward_m_s, command.left_m_s, command.up_m_s, command.turn_left_rad_s]
     fields = [
-        f"{sight.stamp_s:.6f}",
+        f"{state.stamp_s:.6f}",
         *(f"{x:.4f}" for x in numbers),
-        str(int(sight.metric)),
-        str(int(sight.tracked)),
-        f"{sight.blind_s:.3f}",
-        f"{sight.battery:.2f}",
-        str(sight.revision),
+        str(int(state.metric)),
+        str(int(state.tracked)),
+        f"{state.blind_s:.3f}",
+        f"{state.battery:.2f}",
+        str(state.revision),
         f"{_clearance_m(moment):.3f}",
         str(moment.phase),
         str(order.danger),
         *(f"{x:.3f}" for x in stick),
-        wish.why.replace(",", ";"),
+        command.why.replace(",", ";"),
     ]
     return ",".join(fields) + "\n"

@@ -23,7 +23,7 @@ _SAME = 0.02
 class Step:
     """One decision, then and now."""
 
-    sight: DroneState
+    state: DroneState
     before: Decision | None
     """None where the recorded planner never answered: it hung, failed, or the program ended."""
     now: Decision
@@ -35,7 +35,7 @@ class Step:
         """Whether the drone would do the same."""
         if self.before is None or self.before.phase != self.now.phase:
             return False
-        return bool(np.abs(_sticks(self.before.wish) - _sticks(self.now.wish)).max() <= _SAME)
+        return bool(np.abs(_sticks(self.before.command) - _sticks(self.now.command)).max() <= _SAME)
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +62,7 @@ def replay(folder: Path, **limits: float) -> Replay:
         **limits: Fields of `NavLimits` that differ from the recorded flight's.
 
     Raises:
-        SourceError: If the record is missing, damaged, or holds no sight.
+        SourceError: If the record is missing, damaged, or holds no state.
         ValueError: If limits contradict each other.
     """
     path = folder / PLAN
@@ -95,38 +95,38 @@ def replay(folder: Path, **limits: float) -> Replay:
     return Replay(used, tuple(steps), tuple(tasks))
 
 
-def told(found: Replay) -> list[str]:
+def summary(found: Replay) -> list[str]:
     """The replay in words, a line each."""
     steps, differing = found.steps, found.differing
-    began = steps[0].sight.stamp_s
+    began = steps[0].state.stamp_s
     took_ms = 1e3 * np.array([step.planning_s for step in steps])
     lines = [
-        f"{len(steps)} decisions in {steps[-1].sight.stamp_s - began:.1f} s, tasks: {', '.join(found.tasks) or 'none'}",
+        f"{len(steps)} decisions in {steps[-1].state.stamp_s - began:.1f} s, tasks: {', '.join(found.tasks) or 'none'}",
         f"the same: {len(steps) - len(differing)} of {len(steps)}",
     ]
     for step in differing[:1]:
-        lines.append(f"first difference after {step.sight.stamp_s - began:.2f} s, at {_place(step.sight)}:")
+        lines.append(f"first difference after {step.state.stamp_s - began:.2f} s, at {_place(step.state)}:")
         lines.append(f"  then: {'no answer' if step.before is None else _words(step.before)}")
         lines.append(f"  now:  {_words(step.now)}")
     lines.append(f"planning now: median {np.median(took_ms):.1f} ms, 95 % within {np.quantile(took_ms, 0.95):.1f} ms")
     return lines
 
 
-def _decided(flight_controller: FlightController, sight: DroneState, before: Decision | None) -> Step:
+def _decided(flight_controller: FlightController, state: DroneState, before: Decision | None) -> Step:
     began = time.perf_counter()
-    now = flight_controller.plan(sight)
-    return Step(sight, before, now, time.perf_counter() - began)
+    now = flight_controller.plan(state)
+    return Step(state, before, now, time.perf_counter() - began)
 
 
-def _sticks(wish: VelocityCommand) -> np.ndarray:
-    return np.array([wish.forward_m_s, wish.left_m_s, wish.up_m_s, wish.turn_left_rad_s])
+def _sticks(command: VelocityCommand) -> np.ndarray:
+    return np.array([command.forward_m_s, command.left_m_s, command.up_m_s, command.turn_left_rad_s])
 
 
-def _place(sight: DroneState) -> str:
-    return "({:.2f}, {:.2f}, {:.2f}) m".format(*sight.p_w)
+def _place(state: DroneState) -> str:
+    return "({:.2f}, {:.2f}, {:.2f}) m".format(*state.p_w)
 
 
 def _words(decision: Decision) -> str:
-    forward, left, up, turn = _sticks(decision.wish)
+    forward, left, up, turn = _sticks(decision.command)
     moves = f"forward {forward:.2f}, left {left:.2f}, up {up:.2f} m/s, turn left {np.degrees(turn):.0f} deg/s"
-    return f"{decision.phase}; {moves}; {decision.wish.why}"
+    return f"{decision.phase}; {moves}; {decision.command.why}"

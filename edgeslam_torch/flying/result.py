@@ -10,7 +10,7 @@ class FlightRefused(EdgeSlamError):
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class FlightResult:
     """How a verb ended. The drone's own map and pose say so, not the truth."""
 
     reached: bool

@@ -33,15 +33,15 @@ single turn before, and was seen to lie a quarter of a metre elsewhere."""
 class Stay(LooksAhead):
     """Rise, look around, and hover."""
 
-    def goals(self, layer: Layer, sight: DroneState) -> np.ndarray:
+    def goals(self, layer: Layer, state: DroneState) -> np.ndarray:
         """Where it is."""
-        return layer.cells(sight.p_w[:2])[None]
+        return layer.cells(state.p_w[:2])[None]
 
-    def done(self, sight: DroneState) -> bool:
+    def done(self, state: DroneState) -> bool:
         """At once: a pilot asks only when it is at its height."""
         return True
 
-    def carry(self, moved: MapUpdate) -> None:
+    def carry(self, update: MapUpdate) -> None:
         """It remembers nothing."""
 
 
@@ -63,18 +63,18 @@ class WayHome:
     """Since when it wants to."""
     _look_m: float = _LOOK_M
 
-    def goals(self, layer: Layer, sight: DroneState) -> np.ndarray:
+    def goals(self, layer: Layer, state: DroneState) -> np.ndarray:
         """The cell of the oldest point of the way that the grid still holds."""
         points = np.concatenate([np.zeros((1, 2)), self.track_w])
         at = (points - layer.corner_w) / layer.cell_m
         held = ((at >= 1) & (at < np.array(layer.free.shape) - 1)).all(1)
-        oldest = points[int(np.argmax(held))] if held.any() else sight.p_w[:2]
+        oldest = points[int(np.argmax(held))] if held.any() else state.p_w[:2]
         return layer.cells(oldest)[None]
 
-    def done(self, sight: DroneState) -> bool:
+    def done(self, state: DroneState) -> bool:
         """Whether the drone is above its take-off, slow, and has looked as it did there."""
-        near = float(np.linalg.norm(sight.p_w[:2])) < HOME_M
-        return sight.stamp_s >= self._looked_s and near and float(np.linalg.norm(sight.velocity_w)) < _SLOW_M_S
+        near = float(np.linalg.norm(state.p_w[:2])) < HOME_M
+        return state.stamp_s >= self._looked_s and near and float(np.linalg.norm(state.velocity_w)) < _SLOW_M_S
 
     def gives_up(self, losses: int) -> bool:
         """No: there is nothing else to fly for."""
@@ -83,25 +83,25 @@ class WayHome:
     def consider(self, candidates: Sequence[Candidate], exits: Sequence[Exit] = ()) -> None:
         """It passes every opening by."""
 
-    def heading_rad(self, sight: DroneState) -> float | None:
+    def heading_rad(self, state: DroneState) -> float | None:
         """The heading of the take-off, which is 0, for seconds when it comes near."""
-        away = float(np.linalg.norm(sight.p_w[:2]))
-        if not sight.tracked and away < _LOST_M:
+        away = float(np.linalg.norm(state.p_w[:2]))
+        if not state.tracked and away < _LOST_M:
             self._look_m = _LOST_M
-        if sight.stamp_s >= self._looked_s or away > self._look_m:
+        if state.stamp_s >= self._looked_s or away > self._look_m:
             return None
         if math.isnan(self._near_s):
-            self._near_s = sight.stamp_s
-        if math.isnan(self._looks_s) and abs(float(wrapped(np.array(sight.yaw_rad)))) < _AHEAD_RAD:
-            self._looks_s = sight.stamp_s
-        if sight.stamp_s - self._looks_s > _LOOK_S or sight.stamp_s - self._near_s > _GIVEN_UP_S:
-            self._looked_s = sight.stamp_s
+            self._near_s = state.stamp_s
+        if math.isnan(self._looks_s) and abs(float(wrapped(np.array(state.yaw_rad)))) < _AHEAD_RAD:
+            self._looks_s = state.stamp_s
+        if state.stamp_s - self._looks_s > _LOOK_S or state.stamp_s - self._near_s > _GIVEN_UP_S:
+            self._looked_s = state.stamp_s
         return 0.0
 
-    def faces_rad(self, sight: DroneState) -> float | None:
+    def faces_rad(self, state: DroneState) -> float | None:
         """The same heading for the last metre."""
-        return 0.0 if 0.0 <= sight.stamp_s - self._looked_s < _FACES_S else None
+        return 0.0 if 0.0 <= state.stamp_s - self._looked_s < _FACES_S else None
 
-    def carry(self, moved: MapUpdate) -> None:
+    def carry(self, update: MapUpdate) -> None:
         """Take the way along with the map; the take-off stays the origin."""
-        self.track_w = moved.points(self.track_w)
+        self.track_w = update.points(self.track_w)

@@ -172,14 +172,14 @@ class UdpVehicle:
             self._stopping.wait(max(0.0, begin_s + _PICTURE_S - self.tello.clock.now()))
 
     def _plan(self) -> None:
-        """A wish for the newest moment, again and again."""
+        """A command for the newest moment, again and again."""
         assert self._perception is not None
         while not self._stopping.wait(TICK_S):
             if not self.flying:
                 continue
             with self._view_lock:
                 view, self._view = self._view, None
-            self._flight_controller.plan(self._perception.sight(self.tello.clock.now(), view))
+            self._flight_controller.plan(self._perception.state(self.tello.clock.now(), view))
 
     def _watch(self) -> None:
         """Orders to the drone; whatever goes wrong here ends with a landing."""
@@ -199,11 +199,11 @@ class UdpVehicle:
         if self._land_because is not None:
             self._end(self._land_because)
             return
-        order = self._flight_controller.order(self._perception.sight(self.tello.clock.now()))
+        order = self._flight_controller.order(self._perception.state(self.tello.clock.now()))
         if order.land:
             self._end(str(order.danger))
         else:
-            self.tello.rc(*order.wish.sticks())
+            self.tello.rc(*order.command.sticks())
 
     def _end(self, why: str) -> None:
         self.over = why

@@ -6,7 +6,7 @@ import numpy as np
 
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.limits import NavLimits
-from edgeslam_torch.navigation.speed_dither import told
+from edgeslam_torch.navigation.speed_dither import measurable
 from edgeslam_torch.types import FloatArray
 
 _HORIZON_S = 0.6
@@ -58,7 +58,7 @@ def candidates(
     angle = ahead_rad + 2 * np.pi * np.arange(_HEADINGS) / _HEADINGS
     unit = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     wanted = np.concatenate([np.zeros((1, 2)), *(speed_m_s * s * unit for s in _SPEEDS)])
-    wanted = told(wanted) if blind else wanted
+    wanted = measurable(wanted) if blind else wanted
     p = flown(np.asarray(p_w, dtype=np.float64), np.asarray(velocity_w, dtype=np.float64), wanted, limits)
     return Arcs(wanted, p, layer.clearance_at(p).min(axis=1), layer.from_solid_at(p).min(axis=1))
 

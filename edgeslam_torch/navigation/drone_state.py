@@ -37,11 +37,11 @@ class DroneState:
     velocity_w: FloatArray
     """``(3,)`` [m/s]."""
     position_sigma_m: float = 0.02
-    apart_sigma_m: float = 0.0
+    submap_sigma_m: float = 0.0
     """Standard deviation of where the piece of map that it is in lies to that of the take-off; 0 in one map."""
     drift_sigma_m: float = 0.0
     """Standard deviation of what the map may have drifted by since the take-off."""
-    piece: int = 0
+    submap: int = 0
     """Number of the piece of map."""
     scale_sigma: float = 0.0
     """Relative standard deviation of a metre."""
@@ -54,23 +54,23 @@ class DroneState:
     seen_s: float = math.nan
     """When the newest picture that arrived was taken; NaN for now."""
     battery: float = 1.0
-    told_height_m: float = math.nan
+    reported_height_m: float = math.nan
     """Height above the floor of the take-off as the drone itself says; NaN if it does not."""
-    told_speed_m_s: float = math.nan
+    reported_speed_m_s: float = math.nan
     """Level speed as the drone itself says; NaN if it does not."""
     view: View | None = None
     """A new depth map, if there is one."""
     revision: int = 0
     """How often the unit of the positions was revised; after a change, earlier ones mean something else."""
-    moved: MapUpdate | None = None
-    """How the map moved since the last sight with a view; None where it did not."""
-    hindered: bool = False
-    """Whether the last wish was not followed: the supervisor or a hand had something else in mind."""
+    map_update: MapUpdate | None = None
+    """How the map moved since the last state with a view; None where it did not."""
+    overridden: bool = False
+    """Whether the last command was not followed: the supervisor or a hand had something else in mind."""
 
     @property
     def home_sigma_m(self) -> float:
         """Standard deviation of where it is, seen from its take-off, by all that is known but the length of a metre."""
-        return math.hypot(self.position_sigma_m, self.apart_sigma_m, self.drift_sigma_m)
+        return math.hypot(self.position_sigma_m, self.submap_sigma_m, self.drift_sigma_m)
 
     @property
     def blind_s(self) -> float:
@@ -108,7 +108,7 @@ class VelocityCommand:
         """
         values = (-self.left_m_s, self.forward_m_s, self.up_m_s, -self.turn_left_rad_s / math.radians(100.0))
         if not all(map(math.isfinite, values)):
-            raise ValueError(f"a wish must be finite: {self}")
+            raise ValueError(f"a command must be finite: {self}")
         right, forward, up, clockwise = (round(float(np.clip(v, -1.0, 1.0)), 3) for v in values)
         return right, forward, up, clockwise
 

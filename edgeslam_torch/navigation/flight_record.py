@@ -1,6 +1,6 @@
-"""What a planner saw and decided, on disk: a line of JSON for each limit, task, touch, sight and wish, whole or not.
+"""What a planner saw and decided, on disk: a line of JSON for each limit, task, contact, state and command, whole or not.
 
-A sight is written before the planner thinks about it: one that hangs or fails leaves in the file what it hung on. A
+A state is written before the planner thinks about it: one that hangs or fails leaves in the file what it hung on. A
 file that ends in the middle of a line, after a crash or a flat battery, is good up to that line. Numbers are exact, so
 that a replay decides the same.
 """
@@ -33,9 +33,9 @@ _OURS = ("edgeslam_torch.navigation.", "edgeslam_torch.flying.")
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """What the planner wished after a sight, and what it was doing."""
+    """What the planner commanded after a state, and what it was doing."""
 
-    wish: VelocityCommand
+    command: VelocityCommand
     phase: str
 
 

@@ -17,8 +17,8 @@ from edgeslam_torch.navigation.openings.exit_tracker import ExitTracker
 from edgeslam_torch.navigation.openings.wall_frame import Walls
 from edgeslam_torch.navigation.route import CostToGo, cost_to_go
 from edgeslam_torch.navigation.space import CELL_M, Space
-from edgeslam_torch.navigation.speed_dither import varied
-from edgeslam_torch.navigation.supervisor import CARRIED_SIGMA_M
+from edgeslam_torch.navigation.speed_dither import dithered
+from edgeslam_torch.navigation.supervisor import DEAD_RECKONING_SIGMA_M
 from edgeslam_torch.navigation.tasks import Task
 from edgeslam_torch.types import FloatArray
 
@@ -100,9 +100,9 @@ class Pilot:
     """Cells ``(G, 2)`` that it leads to."""
     _planned_s: float = -math.inf
     _progress_s: float = math.nan
-    """When the cost to go was last less than ever; time of first looks, and in which it was hindered, is left out."""
+    """When the cost to go was last less than ever; time of first looks, and in which it was overridden, is left out."""
     _updated_s: float = math.nan
-    """When it took in the last sight."""
+    """When it took in the last state."""
     _least: float = math.inf
     """The least cost to go; NaN where the map has moved since it was known."""
     _progress_w: FloatArray = field(default_factory=lambda: np.zeros(2))
@@ -111,7 +111,7 @@ class Pilot:
     """Since when there is nothing to fly into."""
     _revision: int = 0
     _revised_s: float = -math.inf
-    """When its metres were last those of the sights."""
+    """When its metres were last those of the states."""
     _level_s: float = math.nan
     """Since when it looks around."""
     _sweep: list[float] = field(default_factory=list)
@@ -126,9 +126,9 @@ class Pilot:
     """``(2,)`` where it doubted what closed its way last."""
     _losses: Losses = field(default_factory=lambda: Losses(_LOST_M))
     """Of the pose, since the task began."""
-    _piece: int = 0
+    _submap: int = 0
     """Piece of map that it is in."""
-    _piece_s: float = -math.inf
+    _submap_s: float = -math.inf
     """When the first picture in it was taken; minus infinity once what was seen before has been forgotten."""
 
     def begin(self, task: Task) -> None:
@@ -150,80 +150,80 @@ class Pilot:
     def _gives_up(self) -> bool:
         return self.task.gives_up(self._losses.count)
 
-    def touched(self, touch: Contact) -> None:
+    def add_contact(self, contact: Contact) -> None:
         """Something holds it that no view shows: not there again."""
-        self.space.touched(touch, self.limits.radius_m + 0.5 * CELL_M)
+        self.space.add_contact(contact, self.limits.radius_m + 0.5 * CELL_M)
         self._plan = None
 
-    def update(self, sight: DroneState) -> VelocityCommand:
+    def update(self, state: DroneState) -> VelocityCommand:
         """Take in what is seen, and decide.
 
         Raises:
             ValueError: If the position or the velocity is not finite.
         """
-        if not (np.isfinite(sight.p_w).all() and np.isfinite(sight.velocity_w).all()):
+        if not (np.isfinite(state.p_w).all() and np.isfinite(state.velocity_w).all()):
             raise ValueError("a pilot needs to know where the drone is, and how fast")
-        if sight.revision != self._revision and sight.moved is None and sight.stamp_s - self._revised_s < _MOVES_S:
+        if state.revision != self._revision and state.map_update is None and state.stamp_s - self._revised_s < _MOVES_S:
             return VelocityCommand(why="its metres were revised: wait for a view in the new ones")
-        self._take_in(sight)
+        self._take_in(state)
         looks = self.phase in (Phase.RISING, Phase.SWEEPING, Phase.SINKING)
-        if sight.hindered or (looks and not self._looks_again):  # that is no lack of progress
-            self._progress_s += sight.stamp_s - self._updated_s
-        self._updated_s = sight.stamp_s
+        if state.overridden or (looks and not self._looks_again):  # that is no lack of progress
+            self._progress_s += state.stamp_s - self._updated_s
+        self._updated_s = state.stamp_s
         if looks:
-            return self._level(sight)
+            return self._level(state)
         self._level_s = math.nan
         if self.phase in (Phase.DONE, Phase.STUCK):
-            return self._at_height(sight, HOVER)
-        self._losses.note(sight)
-        if self.task.done(sight):
+            return self._at_height(state, HOVER)
+        self._losses.note(state)
+        if self.task.done(state):
             self.phase = Phase.DONE
-            return self._at_height(sight, HOVER)
+            return self._at_height(state, HOVER)
         if self._gives_up():
             self.phase = Phase.STUCK
-            return self._at_height(sight, HOVER)
-        return self._at_height(sight, self._fly(sight))
+            return self._at_height(state, HOVER)
+        return self._at_height(state, self._fly(state))
 
-    def _take_in(self, sight: DroneState) -> None:
-        if sight.moved is not None:
-            self._carry(sight.moved)
-        elif sight.revision != self._revision:
+    def _take_in(self, state: DroneState) -> None:
+        if state.map_update is not None:
+            self._carry(state.map_update)
+        elif state.revision != self._revision:
             self._forget()
-        self._revision, self._revised_s = sight.revision, sight.stamp_s
-        self._mind_pieces(sight)
+        self._revision, self._revised_s = state.revision, state.stamp_s
+        self._check_submap(state)
         if math.isnan(self._progress_s):
-            self._progress_s = self._updated_s = sight.stamp_s
+            self._progress_s = self._updated_s = state.stamp_s
             if self.phase is Phase.RISING:
                 for z in np.arange(0.1, self.limits.height_m + _LOOK_M, 0.2):
-                    self.space.flown(np.array([*sight.p_w[:2], z]), TAKE_OFF_M)
-        self.space.follow(sight.p_w)
-        if sight.view is not None:
-            self.space.observe(sight.view)
-        self.space.flown(sight.p_w, self.limits.radius_m + BAND_M)
-        if self.exits.due(sight):
-            self.exits.look(self.walls(), sight)
+                    self.space.flown(np.array([*state.p_w[:2], z]), TAKE_OFF_M)
+        self.space.follow(state.p_w)
+        if state.view is not None:
+            self.space.observe(state.view)
+        self.space.flown(state.p_w, self.limits.radius_m + BAND_M)
+        if self.exits.due(state):
+            self.exits.look(self.walls(), state)
             self.task.consider(self.exits.candidates, self.exits.exits)
 
-    def _carry(self, moved: MapUpdate) -> None:
+    def _carry(self, update: MapUpdate) -> None:
         """Bring what is known along with the map that moved; that is no progress."""
-        self.space.rebuild(moved)
-        self.exits.carry(moved)
-        self.task.carry(moved)
-        self._losses.carry(moved)
+        self.space.rebuild(update)
+        self.exits.carry(update)
+        self.task.carry(update)
+        self._losses.carry(update)
         if self._looked_w is not None:
-            self._looked_w = moved.points(self._looked_w[None])[0]
+            self._looked_w = update.points(self._looked_w[None])[0]
         if self._doubted_w is not None:
-            self._doubted_w = moved.points(self._doubted_w[None])[0]
+            self._doubted_w = update.points(self._doubted_w[None])[0]
         self._plan, self._least = None, math.nan
-        self._progress_w = moved.points(self._progress_w[None])[0]
+        self._progress_w = update.points(self._progress_w[None])[0]
 
-    def _mind_pieces(self, sight: DroneState) -> None:
+    def _check_submap(self, state: DroneState) -> None:
         """What was seen in other pieces of map counts as long as it is known where they lie to this one."""
-        if sight.piece != self._piece:
-            self._piece, self._piece_s = sight.piece, sight.stamp_s - sight.blind_s
-        if sight.apart_sigma_m > CARRIED_SIGMA_M and self._piece_s > -math.inf:
-            self.space.forget_before(self._piece_s)
-            self._plan, self._least, self._piece_s = None, math.nan, -math.inf
+        if state.submap != self._submap:
+            self._submap, self._submap_s = state.submap, state.stamp_s - state.blind_s
+        if state.submap_sigma_m > DEAD_RECKONING_SIGMA_M and self._submap_s > -math.inf:
+            self.space.forget_before(self._submap_s)
+            self._plan, self._least, self._submap_s = None, math.nan, -math.inf
             self._looked_w = self._doubted_w = None
 
     def _forget(self) -> None:
@@ -232,35 +232,35 @@ class Pilot:
         self._plan, self._least, self._progress_s = None, math.inf, math.nan
         self.phase = Phase.RISING
 
-    def _level(self, sight: DroneState) -> VelocityCommand:
+    def _level(self, state: DroneState) -> VelocityCommand:
         """Rise above the height of flight, look left and right, and come back to it."""
         low, high = self.limits.height_m, self.limits.height_m + _LOOK_M
         if math.isnan(self._level_s):
-            self._level_s = sight.stamp_s
-        if sight.stamp_s - self._level_s > _LEVEL_S:
+            self._level_s = state.stamp_s
+        if state.stamp_s - self._level_s > _LEVEL_S:
             self.phase = Phase.STUCK
             return HOVER
-        if self.phase is Phase.RISING and sight.p_w[2] > high - 0.06:
+        if self.phase is Phase.RISING and state.p_w[2] > high - 0.06:
             self.phase = Phase.SWEEPING
-            self._sweep = [sight.yaw_rad + side * _SWEEP_RAD for side in (0.0, 1.0, -1.0)]
+            self._sweep = [state.yaw_rad + side * _SWEEP_RAD for side in (0.0, 1.0, -1.0)]
         if self.phase is Phase.SWEEPING:
-            self._sweep = self._worth_a_look(sight)
-            error = float(wrapped(np.array(self._sweep[-1] - sight.yaw_rad)))
+            self._sweep = self._worth_a_look(state)
+            error = float(wrapped(np.array(self._sweep[-1] - state.yaw_rad)))
             if abs(error) < math.radians(8.0):
                 self._sweep.pop()
             if self._sweep:
-                return VelocityCommand(0.0, 0.0, self._climb(high - sight.p_w[2]), self._turn(error), str(self.phase))
+                return VelocityCommand(0.0, 0.0, self._climb(high - state.p_w[2]), self._turn(error), str(self.phase))
             self.phase = Phase.SINKING
-        if self.phase is Phase.SINKING and sight.p_w[2] < low + 0.06:
+        if self.phase is Phase.SINKING and state.p_w[2] < low + 0.06:
             self.phase, self._waiting_s = Phase.FLYING, math.nan
         target = high if self.phase is Phase.RISING else low
-        return VelocityCommand(up_m_s=self._climb(target - sight.p_w[2]), why=str(self.phase))
+        return VelocityCommand(up_m_s=self._climb(target - state.p_w[2]), why=str(self.phase))
 
-    def _worth_a_look(self, sight: DroneState) -> list[float]:
+    def _worth_a_look(self, state: DroneState) -> list[float]:
         """Headings of the sweep but those on the side where the pose was lost: a wall that shows nothing."""
         ahead = self._sweep[0]
-        off = wrapped(np.array([sight.yaw_rad - ahead, *(h - ahead for h in self._sweep)]))
-        if sight.tracked or abs(off[0]) < _AHEAD_RAD:
+        off = wrapped(np.array([state.yaw_rad - ahead, *(h - ahead for h in self._sweep)]))
+        if state.tracked or abs(off[0]) < _AHEAD_RAD:
             return self._sweep
         return [h for h, side in zip(self._sweep, off[1:], strict=True) if side * off[0] < 1e-9]
 
@@ -270,55 +270,55 @@ class Pilot:
     def _climb(self, error_m: float) -> float:
         return float(np.clip(1.5 * error_m, -self.limits.climb_m_s, self.limits.climb_m_s))
 
-    def _at_height(self, sight: DroneState, wish: VelocityCommand) -> VelocityCommand:
+    def _at_height(self, state: DroneState, command: VelocityCommand) -> VelocityCommand:
         # A pose that telemetry carries drifts in height, too: by velocities that are cut off. The drone measures it.
-        carried = not sight.tracked and math.isfinite(sight.told_height_m)
-        up = self._climb(self.limits.height_m - (sight.told_height_m if carried else float(sight.p_w[2])))
-        return VelocityCommand(wish.forward_m_s, wish.left_m_s, up, wish.turn_left_rad_s, wish.why)
+        dead_reckoning = not state.tracked and math.isfinite(state.reported_height_m)
+        up = self._climb(self.limits.height_m - (state.reported_height_m if dead_reckoning else float(state.p_w[2])))
+        return VelocityCommand(command.forward_m_s, command.left_m_s, up, command.turn_left_rad_s, command.why)
 
-    def _fly(self, sight: DroneState) -> VelocityCommand:
-        heading = self.task.heading_rad(sight)
+    def _fly(self, state: DroneState) -> VelocityCommand:
+        heading = self.task.heading_rad(state)
         if heading is not None:
-            self._progress_s = sight.stamp_s
+            self._progress_s = state.stamp_s
             return VelocityCommand(
-                turn_left_rad_s=self._turn(float(wrapped(np.array(heading - sight.yaw_rad)))),
+                turn_left_rad_s=self._turn(float(wrapped(np.array(heading - state.yaw_rad)))),
                 why="stand and look where the task wants",
             )
-        plan = self._planned(sight)
-        here = sight.p_w[:2]
+        plan = self._planned(state)
+        here = state.p_w[:2]
         now = float(plan.at(here))
         if math.isnan(self._least):
             self._least = now
         if now < self._least - 0.1 or float(np.linalg.norm(here - self._progress_w)) > _ELSEWHERE_M:
-            self._least, self._progress_s = min(now, self._least), sight.stamp_s
+            self._least, self._progress_s = min(now, self._least), state.stamp_s
             self._progress_w = here.copy()
-        elif (stands_s := sight.stamp_s - self._progress_s) > _LOST_S:
-            self._start_over(sight)
+        elif (stands_s := state.stamp_s - self._progress_s) > _LOST_S:
+            self._start_over(state)
             return HOVER
-        elif stands_s > _DITHERS_S and math.isfinite(now) and sight.tracked and not _about(self._looked_w, here):
-            self._rise(sight)
+        elif stands_s > _DITHERS_S and math.isfinite(now) and state.tracked and not _about(self._looked_w, here):
+            self._rise(state)
             return HOVER
         if not math.isfinite(now):
-            return VelocityCommand(turn_left_rad_s=self._search(sight), why="no way is known: look around")
+            return VelocityCommand(turn_left_rad_s=self._search(state), why="no way is known: look around")
         self.way_w = plan.way(here, 3.0)
-        ahead, faced = self._bearing(here), self.task.faces_rad(sight)
-        error = float(wrapped(np.array((ahead if faced is None else faced) - sight.yaw_rad)))
+        ahead, faced = self._bearing(here), self.task.faces_rad(state)
+        error = float(wrapped(np.array((ahead if faced is None else faced) - state.yaw_rad)))
         turn = self._turn(error)
-        chosen = self._chosen(sight, plan, ahead, error)
+        chosen = self._chosen(state, plan, ahead, error)
         if chosen is None:
-            return self._look(sight, error, turn)
+            return self._look(state, error, turn)
         self._waiting_s = math.nan
-        c, s = math.cos(sight.yaw_rad), math.sin(sight.yaw_rad)
+        c, s = math.cos(state.yaw_rad), math.sin(state.yaw_rad)
         return VelocityCommand(c * chosen[0] + s * chosen[1], c * chosen[1] - s * chosen[0], 0.0, turn, "along the way")
 
-    def _is_narrow(self, sight: DroneState) -> bool:
+    def _is_narrow(self, state: DroneState) -> bool:
         """Whether the way just ahead is narrower than it flies through."""
         assert self.layer is not None
         ahead = self.way_w[: round(_NARROW_AHEAD_M / CELL_M)]
-        need = self.limits.clearance_m(sight.position_sigma_m) - 0.5 * CELL_M
+        need = self.limits.clearance_m(state.position_sigma_m) - 0.5 * CELL_M
         return bool((self.layer.from_solid_at(ahead) <= need).any())
 
-    def _search(self, sight: DroneState) -> float:
+    def _search(self, state: DroneState) -> float:
         """Rate of turn [rad/s] that looks left and right of where the goal is; all around if it is nowhere.
 
         A full turn would leave behind all that it knows, and what hides the way is between it and the goal.
@@ -326,21 +326,21 @@ class Pilot:
         assert self._plan is not None
         if len(self._goals) == 0:
             return 0.5 * self.limits.turn_rad_s
-        step = self._plan.layer.centres(self._goals).mean(axis=0) - sight.p_w[:2]
-        side = 4.0 * abs(sight.stamp_s / _SEARCH_S % 1.0 - 0.5) - 1.0
+        step = self._plan.layer.centres(self._goals).mean(axis=0) - state.p_w[:2]
+        side = 4.0 * abs(state.stamp_s / _SEARCH_S % 1.0 - 0.5) - 1.0
         wanted = math.atan2(step[1], step[0]) + side * _SEARCH_RAD
-        return self._turn(float(wrapped(np.array(wanted - sight.yaw_rad))))
+        return self._turn(float(wrapped(np.array(wanted - state.yaw_rad))))
 
-    def _planned(self, sight: DroneState) -> CostToGo:
+    def _planned(self, state: DroneState) -> CostToGo:
         """The plan, made anew when it is half a second old."""
         half = self.limits.radius_m + BAND_M
         self.layer = self.space.layer(self.limits.height_m, half)
-        if self._plan is None or sight.stamp_s - self._planned_s >= _REPLAN_S:
-            self._goals = self.task.goals(self.layer, sight)
-            need, here = self.limits.clearance_m(sight.position_sigma_m), self.layer.cells(sight.p_w[:2])
-            narrow = self._hull_m(sight) if self._tries_narrow else math.inf
+        if self._plan is None or state.stamp_s - self._planned_s >= _REPLAN_S:
+            self._goals = self.task.goals(self.layer, state)
+            need, here = self.limits.clearance_m(state.position_sigma_m), self.layer.cells(state.p_w[:2])
+            narrow = self._hull_m(state) if self._tries_narrow else math.inf
             self._plan = cost_to_go(self.layer, self._goals, need, here, _BESIDE_M, narrow)
-            self._planned_s = sight.stamp_s
+            self._planned_s = state.stamp_s
         return self._plan
 
     def _bearing(self, here: FloatArray) -> float:
@@ -348,21 +348,21 @@ class Pilot:
         far = self.way_w[min(len(self.way_w) - 1, round(_AHEAD_M / 0.1))] - here
         return math.atan2(far[1], far[0])
 
-    def _chosen(self, sight: DroneState, plan: CostToGo, ahead: float, error: float) -> FloatArray | None:
+    def _chosen(self, state: DroneState, plan: CostToGo, ahead: float, error: float) -> FloatArray | None:
         """Velocity ``(2,)`` in the world of the best candidate; None when standing is as good."""
         assert self.layer is not None
-        fastest = varied(self.limits.speed_m_s, sight.stamp_s)
-        here, blind = sight.p_w[:2], not sight.tracked
-        arcs = candidates(self.layer, here, sight.velocity_w[:2], ahead, self.limits, fastest, blind)
-        need = self.limits.clearance_m(sight.position_sigma_m)
+        fastest = dithered(self.limits.speed_m_s, state.stamp_s)
+        here, blind = state.p_w[:2], not state.tracked
+        arcs = candidates(self.layer, here, state.velocity_w[:2], ahead, self.limits, fastest, blind)
+        need = self.limits.clearance_m(state.position_sigma_m)
         standing = float(arcs.clearance_m[0])
         good = arcs.clearance_m >= need
         if standing < need:  # too near already: away from it
             good |= arcs.clearance_m >= standing - 1e-3
-        if self._may_squeeze(sight.p_w[:2]):
-            good |= self._squeezes(arcs, sight)
-        good |= self._goes_back(arcs, sight)
-        score = self._score(arcs, plan, sight, error)
+        if self._may_squeeze(state.p_w[:2]):
+            good |= self._squeezes(arcs, state)
+        good |= self._goes_back(arcs, state)
+        score = self._score(arcs, plan, state, error)
         score[~good] = np.inf
         best = int(np.argmin(score))
         if best == 0 or not score[best] < score[0] - _GAIN_M:
@@ -373,68 +373,68 @@ class Pilot:
         """Whether a look from about here showed no way, and what is unseen is not what it has doubted to be solid."""
         return _about(self._looked_w, here) and not _about(self._doubted_w, here)
 
-    def _squeezes(self, arcs: Arcs, sight: DroneState) -> np.ndarray:
+    def _squeezes(self, arcs: Arcs, state: DroneState) -> np.ndarray:
         """``(C,)`` slow movements that keep their clearance from every solid and only a hull's from the unseen.
 
         What is beside the drone and nearer than 0.6 m is below its picture or above it: no look from here shows it.
         """
         slow = np.linalg.norm(arcs.velocity_w, axis=1) < _SQUEEZE * self.limits.speed_m_s + 1e-6
-        hull = self._hull_m(sight)
-        away = arcs.from_solid_m >= self.limits.clearance_m(sight.position_sigma_m)
+        hull = self._hull_m(state)
+        away = arcs.from_solid_m >= self.limits.clearance_m(state.position_sigma_m)
         return np.asarray(slow & away & (arcs.clearance_m >= hull))
 
-    def _goes_back(self, arcs: Arcs, sight: DroneState) -> np.ndarray:
+    def _goes_back(self, arcs: Arcs, state: DroneState) -> np.ndarray:
         """``(C,)`` slow movements along the way that it flew: through a door whose frame was never seen from behind."""
         slow = np.linalg.norm(arcs.velocity_w, axis=1) < _SQUEEZE * self.limits.speed_m_s + 1e-6
-        hull = self._hull_m(sight)
+        hull = self._hull_m(state)
         passes = (arcs.from_solid_m >= hull + 0.5 * CELL_M) & (arcs.clearance_m >= hull)
         return np.asarray(slow & passes & self.space.was_at(arcs.p_w).all(axis=1))
 
-    def _hull_m(self, sight: DroneState) -> float:
+    def _hull_m(self, state: DroneState) -> float:
         """Distance of the drone's centre from what its hull may be beside."""
-        return self.limits.radius_m + 2.0 * sight.position_sigma_m
+        return self.limits.radius_m + 2.0 * state.position_sigma_m
 
-    def _score(self, arcs: Arcs, plan: CostToGo, sight: DroneState, error: float) -> FloatArray:
+    def _score(self, arcs: Arcs, plan: CostToGo, state: DroneState, error: float) -> FloatArray:
         """Metres to go after each candidate, and what its lack of clearance is worth."""
         score = np.asarray(plan.at(arcs.end_w), dtype=np.float64).copy()
-        away = arcs.from_solid_m if self._may_squeeze(sight.p_w[:2]) else arcs.clearance_m
+        away = arcs.from_solid_m if self._may_squeeze(state.p_w[:2]) else arcs.clearance_m
         score += 0.5 * np.clip(_WANTED_M - away, 0.0, None)
         speed = np.linalg.norm(arcs.velocity_w, axis=1)
-        off = np.abs(wrapped(np.arctan2(arcs.velocity_w[:, 1], arcs.velocity_w[:, 0]) - sight.yaw_rad))
+        off = np.abs(wrapped(np.arctan2(arcs.velocity_w[:, 1], arcs.velocity_w[:, 0]) - state.yaw_rad))
         unseen = (off > _FACING_RAD) & (speed > _SIDEWAYS * self.limits.speed_m_s + 1e-6)
         turning = (abs(error) > _FACING_RAD) & (speed > _SIDEWAYS * self.limits.speed_m_s + 1e-6)
         score[unseen | turning] = np.inf
         return score
 
-    def _rise(self, sight: DroneState) -> None:
+    def _rise(self, state: DroneState) -> None:
         """See the way from higher."""
         self.phase, self._waiting_s = Phase.RISING, math.nan
-        self._looks_again = _about(self._looked_w, sight.p_w[:2])
-        self._looked_w = sight.p_w[:2].copy()
-        self._tries_narrow &= not self._is_narrow(sight)
+        self._looks_again = _about(self._looked_w, state.p_w[:2])
+        self._looked_w = state.p_w[:2].copy()
+        self._tries_narrow &= not self._is_narrow(state)
 
-    def _start_over(self, sight: DroneState) -> None:
+    def _start_over(self, state: DroneState) -> None:
         """Doubt what closes the way and look around anew, once about a place: it may be the trace of a wrong depth or
         of a pose that has been put right since. What is unseen is not flown into; but two views through what was solid
         free it now, where it took up to ten, so nothing of it is passed at a hull's distance."""
-        if _about(self._doubted_w, sight.p_w[:2]) or not sight.tracked:
+        if _about(self._doubted_w, state.p_w[:2]) or not state.tracked:
             self.phase = Phase.STUCK
             return
         self.space.doubt_solids()
-        self._plan, self._least, self._progress_s = None, math.inf, sight.stamp_s
-        self._doubted_w, self._looked_w = sight.p_w[:2].copy(), None
-        self._rise(sight)
+        self._plan, self._least, self._progress_s = None, math.inf, state.stamp_s
+        self._doubted_w, self._looked_w = state.p_w[:2].copy(), None
+        self._rise(state)
         self._tries_narrow = True
 
-    def _look(self, sight: DroneState, error: float, turn: float) -> VelocityCommand:
+    def _look(self, state: DroneState, error: float, turn: float) -> VelocityCommand:
         """Turn to where the way goes; if that shows nothing, see it from higher."""
         if abs(error) > math.radians(8.0):
             self._waiting_s = math.nan
             return VelocityCommand(turn_left_rad_s=turn, why="look along the way")
         if math.isnan(self._waiting_s):
-            self._waiting_s = sight.stamp_s
-        elif sight.stamp_s - self._waiting_s > _PATIENCE_S and sight.tracked:  # else there is no view to come
-            self._rise(sight)
+            self._waiting_s = state.stamp_s
+        elif state.stamp_s - self._waiting_s > _PATIENCE_S and state.tracked:  # else there is no view to come
+            self._rise(state)
         return VelocityCommand(turn_left_rad_s=turn, why="wait for a view of the way")
 
 

@@ -34,12 +34,12 @@ _SIGMAS = 2.0
 _MIN_DEPTH_M = 0.15
 _PLACED_M = 0.3
 """Standard deviation above which a surface has no place: it fills nothing, and frees only what is sure."""
-KEPT = 240
+MAX_VIEWS = 240
 """Views that are remembered to rebuild the grid from when the map moves: 24 m of way at the fastest."""
-_SAME_M, _SAME_COS, _ALIKE = 0.1, np.cos(np.radians(4.0)), 3
+_SAME_M, _SAME_COS, _MAX_SAME = 0.1, np.cos(np.radians(4.0)), 3
 """A fourth view from within these of three others takes the place of the last: hovering fills no memory."""
-_TOUCHED_RAD = np.radians(35.0)
-"""To each side of the direction of a touch: what holds a drone is rarely as thin as a cell."""
+_CONTACT_RAD = np.radians(35.0)
+"""To each side of the direction of a contact: what holds a drone is rarely as thin as a cell."""
 _NOWHERE = np.float32(1e6)
 _AROUND, _NEIGHBOURS = np.ones((5, 5), np.uint8), np.ones((3, 3), np.uint8)
 _RAMP, _NEAR_END = 1.5, 1.1
@@ -70,26 +70,26 @@ class Space:
     _flown: deque[tuple[FloatArray, float]] = field(init=False)
     _way: np.ndarray = field(init=False)
     """``(SIDE, SIDE)`` uint8, 1 where it flew."""
-    _touched: FloatArray = field(init=False)
+    _contacts: FloatArray = field(init=False)
     """``(N, 3)`` where the drone was held by what it does not see."""
 
     def __post_init__(self) -> None:
         self._odds = np.zeros((SIDE, SIDE, LEVELS), np.float32)
         self._corner = np.floor(self.centre_w / CELL_M).astype(int) - SIDE // 2
-        self._views = deque(maxlen=KEPT)
+        self._views = deque(maxlen=MAX_VIEWS)
         self._flown = deque(maxlen=4000)
         self._doubted = 0
         self._way = np.zeros((SIDE, SIDE), np.uint8)
-        self._touched = np.zeros((0, 3))
+        self._contacts = np.zeros((0, 3))
 
     def observe(self, view: View) -> None:
         """Carve and fill by a depth map."""
         small = _smaller(view)
-        if len(self._views) >= _ALIKE and _alike(self._views[-_ALIKE], small):
+        if len(self._views) >= _MAX_SAME and _same_view(self._views[-_MAX_SAME], small):
             self._views[-1] = small
             self._doubted = min(self._doubted, len(self._views) - 1)
         else:
-            self._doubted -= int(len(self._views) == KEPT and self._doubted > 0)
+            self._doubted -= int(len(self._views) == MAX_VIEWS and self._doubted > 0)
             self._views.append(small)
         self._add(small)
 
@@ -106,11 +106,11 @@ class Space:
         i, j = np.moveaxis(np.where(inside[..., None], at, 0), -1, 0)
         return np.asarray(inside & (cv2.dilate(self._way, _NEIGHBOURS)[i, j] > 0))
 
-    def touched(self, touch: Contact, reach_m: float) -> None:
+    def add_contact(self, contact: Contact, reach_m: float) -> None:
         """There is a solid from now on, whatever is seen, ``reach_m`` from the drone's centre."""
-        angle = np.arctan2(touch.towards_w[1], touch.towards_w[0]) + _TOUCHED_RAD * np.array([-1.0, 0.0, 1.0])
-        level = touch.p_w[:2] + reach_m * np.column_stack([np.cos(angle), np.sin(angle)])
-        self._touched = np.concatenate([self._touched, np.column_stack([level, np.full(len(level), touch.p_w[2])])])
+        angle = np.arctan2(contact.towards_w[1], contact.towards_w[0]) + _CONTACT_RAD * np.array([-1.0, 0.0, 1.0])
+        level = contact.p_w[:2] + reach_m * np.column_stack([np.cos(angle), np.sin(angle)])
+        self._contacts = np.concatenate([self._contacts, np.column_stack([level, np.full(len(level), contact.p_w[2])])])
 
     def follow(self, p_w: FloatArray) -> None:
         """Move the grid when the drone ``(3,)`` comes near its border; what falls off is forgotten."""
@@ -126,14 +126,14 @@ class Space:
             way[new[0], new[1]] = self._way[old[0], old[1]]
         self._odds, self._way, self._corner = moved, way, self._corner + step
 
-    def rebuild(self, moved: MapUpdate) -> None:
+    def rebuild(self, update: MapUpdate) -> None:
         """Build the grid anew from the views that are remembered, after the map moved."""
         if self._views:
-            poses = moved.poses(np.array([view.T_w_c for view in self._views]))
+            poses = update.poses(np.array([view.T_w_c for view in self._views]))
             for k, (view, T_w_c) in enumerate(zip(self._views, poses, strict=True)):
-                self._views[k] = replace(view, T_w_c=T_w_c, depth_m=moved.ratio * view.depth_m)
-        self._touched = moved.points(self._touched)
-        flown = moved.points(np.array([p_w for p_w, _ in self._flown]).reshape(-1, 3))
+                self._views[k] = replace(view, T_w_c=T_w_c, depth_m=update.ratio * view.depth_m)
+        self._contacts = update.points(self._contacts)
+        flown = update.points(np.array([p_w for p_w, _ in self._flown]).reshape(-1, 3))
         for k, p_w in enumerate(flown):
             self._flown[k] = p_w, self._flown[k][1]
         self._build()
@@ -142,9 +142,9 @@ class Space:
         """Know no more than what the views since a moment showed."""
         kept = [view for view in self._views if view.stamp_s >= seen_s]
         self._doubted = max(0, self._doubted - (len(self._views) - len(kept)))
-        self._views = deque(kept, maxlen=KEPT)
+        self._views = deque(kept, maxlen=MAX_VIEWS)
         self._flown.clear()
-        self._touched = np.zeros((0, 3))
+        self._contacts = np.zeros((0, 3))
         self._build()
 
     def _build(self) -> None:
@@ -168,7 +168,7 @@ class Space:
             raise ValueError(f"a height of {height_m:.2f} m is outside the grid of {LEVELS * CELL_M:.1f} m")
         band = self._odds[:, :, low:high]
         free, solid = np.asarray((band < FREE).all(2)), np.asarray((band > SOLID).any(2))
-        cell = np.floor(self._touched[:, :2] / CELL_M).astype(int) - self._corner
+        cell = np.floor(self._contacts[:, :2] / CELL_M).astype(int) - self._corner
         i, j = cell[((cell >= 0) & (cell < SIDE)).all(axis=1)].T
         free[i, j], solid[i, j] = False, True
         return Layer(free, solid, self._corner * CELL_M, CELL_M)
@@ -286,7 +286,7 @@ def _between(depth: FloatArray) -> np.ndarray:
     return np.asarray((farthest > _RAMP * nearest) & (depth > _NEAR_END * nearest))
 
 
-def _alike(one: View, other: View) -> bool:
+def _same_view(one: View, other: View) -> bool:
     near = float(np.linalg.norm(one.T_w_c[:3, 3] - other.T_w_c[:3, 3])) < _SAME_M
     return near and float(one.T_w_c[:3, 2] @ other.T_w_c[:3, 2]) > _SAME_COS
 

@@ -49,22 +49,24 @@ class FlightView:
 
     def __call__(self, moment: Moment) -> None:
         """Show a moment."""
-        sight, rr = moment.sight, self._rr
+        state, rr = moment.state, self._rr
         if math.isnan(self._began_s):
-            self._began_s = sight.stamp_s
-        if sight.revision != self._revision:  # the earlier way is in another unit
-            self._revision, self._flown = sight.revision, []
-        self._stream.set_time("time", duration=sight.stamp_s - self._began_s)
-        self._flown.append(sight.p_w.copy())
-        nose = 0.3 * np.array([math.cos(sight.yaw_rad), math.sin(sight.yaw_rad), 0.0])
-        self._log("world/drone", rr.Arrows3D(origins=[sight.p_w], vectors=[nose], colors=[_FLOWN]))
-        speed = float(np.linalg.norm(sight.velocity_w))
+            self._began_s = state.stamp_s
+        if state.revision != self._revision:  # the earlier way is in another unit
+            self._revision, self._flown = state.revision, []
+        self._stream.set_time("time", duration=state.stamp_s - self._began_s)
+        self._flown.append(state.p_w.copy())
+        nose = 0.3 * np.array([math.cos(state.yaw_rad), math.sin(state.yaw_rad), 0.0])
+        self._log("world/drone", rr.Arrows3D(origins=[state.p_w], vectors=[nose], colors=[_FLOWN]))
+        speed = float(np.linalg.norm(state.velocity_w))
         self._log("speed/flown", rr.Scalars(speed))
-        self._log("speed/wanted", rr.Scalars(math.hypot(moment.order.wish.forward_m_s, moment.order.wish.left_m_s)))
+        self._log(
+            "speed/wanted", rr.Scalars(math.hypot(moment.order.command.forward_m_s, moment.order.command.left_m_s))
+        )
         self._log("speed/limit", rr.Scalars(moment.pilot.limits.speed_m_s))
         self._say(moment)
-        if not sight.stamp_s - self._shown_s < _EVERY_S:  # also the first time
-            self._shown_s = sight.stamp_s
+        if not state.stamp_s - self._shown_s < _EVERY_S:  # also the first time
+            self._shown_s = state.stamp_s
             self._surroundings(moment)
 
     def close(self) -> None:
@@ -74,7 +76,7 @@ class FlightView:
 
     def _say(self, moment: Moment) -> None:
         """Phase, danger and reason, when they change."""
-        words = f"{moment.phase}; {moment.order.wish.why}"
+        words = f"{moment.phase}; {moment.order.command.why}"
         if moment.order.danger:
             words += f"; {moment.order.danger}"
         if words != self._words:
@@ -82,7 +84,7 @@ class FlightView:
             self._log("reasons", self._rr.TextLog(words))
 
     def _surroundings(self, moment: Moment) -> None:
-        rr, pilot, height = self._rr, moment.pilot, float(moment.sight.p_w[2])
+        rr, pilot, height = self._rr, moment.pilot, float(moment.state.p_w[2])
         self._log("world/flown", rr.LineStrips3D([np.array(self._flown)], colors=[_FLOWN]))
         way = pilot.way_w
         self._log("world/way", rr.LineStrips3D([_raised(way, height)] if len(way) > 1 else [], colors=[_WAY]))

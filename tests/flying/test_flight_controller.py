@@ -20,20 +20,20 @@ AHEAD = VelocityCommand(forward_m_s=0.4, why="ahead")
 class Steady:
     """A pilot that wants one thing, or hangs."""
 
-    def __init__(self, wish=AHEAD):
-        self.wish, self.phase, self.layer, self.task = wish, Phase.FLYING, None, None
+    def __init__(self, command=AHEAD):
+        self.command, self.phase, self.layer, self.task = command, Phase.FLYING, None, None
         self.go_on = threading.Event()
         self.go_on.set()
 
     def begin(self, task):
         self.task, self.phase = task, Phase.FLYING
 
-    def update(self, sight):
+    def update(self, state):
         assert self.go_on.wait(20.0)
-        return self.wish
+        return self.command
 
 
-def sight(now_s, x=0.0, **fields):
+def state(now_s, x=0.0, **fields):
     return DroneState(now_s, np.array([x, 0.0, 1.15]), 0.0, np.array([0.4, 0.0, 0.0]), **fields)
 
 
@@ -45,15 +45,15 @@ def flight_controller():
 
 
 def test_orders_do_not_wait_for_a_pilot_that_hangs(flight_controller):
-    flight_controller.plan(sight(0.0))
-    assert flight_controller.order(sight(0.1)).wish == AHEAD
+    flight_controller.plan(state(0.0))
+    assert flight_controller.order(state(0.1)).command == AHEAD
     flight_controller.pilot.go_on.clear()
-    hung = threading.Thread(target=flight_controller.plan, args=(sight(0.15),))
+    hung = threading.Thread(target=flight_controller.plan, args=(state(0.15),))
     hung.start()
     try:
-        late = flight_controller.order(sight(0.45))
-        assert late.danger is Danger.NO_WISH and late.wish.sticks() == (0.0, 0.0, 0.0, 0.0)
-        lands = [flight_controller.order(sight(0.5 + 0.1 * k)).land for k in range(110)]
+        late = flight_controller.order(state(0.45))
+        assert late.danger is Danger.NO_COMMAND and late.command.sticks() == (0.0, 0.0, 0.0, 0.0)
+        lands = [flight_controller.order(state(0.5 + 0.1 * k)).land for k in range(110)]
         assert not lands[90] and lands[-1]
     finally:
         flight_controller.pilot.go_on.set()
@@ -61,34 +61,34 @@ def test_orders_do_not_wait_for_a_pilot_that_hangs(flight_controller):
 
 
 def test_a_hand_on_the_keyboard_holds_it_and_lets_go(flight_controller):
-    flight_controller.plan(sight(0.0))
+    flight_controller.plan(state(0.0))
     flight_controller.hold(True)
-    held = flight_controller.order(sight(0.1))
-    assert held.danger is Danger.HAND and held.wish.sticks() == (0.0, 0.0, 0.0, 0.0)
+    held = flight_controller.order(state(0.1))
+    assert held.danger is Danger.HOLD and held.command.sticks() == (0.0, 0.0, 0.0, 0.0)
     flight_controller.hold(False)
-    assert flight_controller.order(sight(0.15)).wish == AHEAD
+    assert flight_controller.order(state(0.15)).command == AHEAD
 
 
 def test_a_pilot_knows_that_its_wish_was_not_followed(flight_controller):
     told = []
-    flight_controller.pilot.update = lambda sight: told.append(sight.hindered) or AHEAD
+    flight_controller.pilot.update = lambda state: told.append(state.overridden) or AHEAD
     for held in (False, True, False):
         flight_controller.hold(held)
-        flight_controller.plan(sight(0.0))
-        flight_controller.order(sight(0.1))
-    flight_controller.plan(sight(0.2, hindered=False))
-    flight_controller.plan(sight(0.2, hindered=True))  # as a record of a flight has it
+        flight_controller.plan(state(0.0))
+        flight_controller.order(state(0.1))
+    flight_controller.plan(state(0.2, overridden=False))
+    flight_controller.plan(state(0.2, overridden=True))  # as a record of a flight has it
     assert told == [False, False, True, False, True]
 
 
 def test_an_empty_battery_lands_whoever_holds_it(flight_controller):
     flight_controller.hold(True)
-    assert flight_controller.order(sight(0.1, battery=0.05)).land
+    assert flight_controller.order(state(0.1, battery=0.05)).land
 
 
 def test_way_is_counted_for_each_task_and_the_track_for_the_flight(flight_controller):
     for k in range(21):
-        flight_controller.order(sight(0.05 * k, 0.05 * k))
+        flight_controller.order(state(0.05 * k, 0.05 * k))
     assert flight_controller.flown()[0] == pytest.approx(1.0, abs=0.11)
     flight_controller.begin(object())
     assert flight_controller.flown()[0] == 0.0
@@ -97,7 +97,7 @@ def test_way_is_counted_for_each_task_and_the_track_for_the_flight(flight_contro
     here = np.eye(4)[None]
     flight_controller.pilot.task = Stay()
     flight_controller.begin(Stay())
-    flight_controller.plan(replace(sight(2.0, 0.5), revision=1, moved=MapUpdate(here, here, 1.5)))
+    flight_controller.plan(replace(state(2.0, 0.5), revision=1, map_update=MapUpdate(here, here, 1.5)))
     assert flight_controller.track()[-1] == pytest.approx([1.5 * length, 0.0]), "longer metres, a longer track"
 
 
@@ -106,7 +106,7 @@ def test_a_task_has_ended_only_when_the_pilot_took_it_up(flight_controller):
     assert flight_controller.ended() is Phase.DONE
     flight_controller.begin(object())
     assert flight_controller.ended() is None
-    flight_controller.plan(sight(0.0))
+    flight_controller.plan(state(0.0))
     assert flight_controller.ended() is None and flight_controller.pilot.phase is Phase.FLYING
 
 
@@ -118,6 +118,6 @@ def test_a_listener_that_fails_ends_no_flight(flight_controller):
         raise RuntimeError("no disk")
 
     flight_controller = FlightController(NavLimits(), [failing])
-    flight_controller.order(sight(0.0))
-    flight_controller.order(sight(0.1))
-    assert len(heard) == 1 and heard[0].sight.stamp_s == 0.0
+    flight_controller.order(state(0.0))
+    flight_controller.order(state(0.1))
+    assert len(heard) == 1 and heard[0].state.stamp_s == 0.0

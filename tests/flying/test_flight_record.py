@@ -13,7 +13,7 @@ from edgeslam_torch.cli import main
 from edgeslam_torch.errors import OutputError, SourceError
 from edgeslam_torch.flying.flight_controller import FlightController
 from edgeslam_torch.flying.recorder import EXITS, Recorder
-from edgeslam_torch.flying.replay import replay, told
+from edgeslam_torch.flying.replay import replay, summary
 from edgeslam_torch.flying.tasks import WayHome
 from edgeslam_torch.geometry.camera import PRESETS
 from edgeslam_torch.geometry.mount import camera_on_body
@@ -27,7 +27,7 @@ from edgeslam_torch.navigation.tasks import Explore, GoTo
 TICK_S = 0.1
 
 
-def sight(now_s, p, v=(0.0, 0.0, 0.0), yaw=0.0):
+def state(now_s, p, v=(0.0, 0.0, 0.0), yaw=0.0):
     """An open floor of 3 m, seen five times a second."""
     T = camera_on_body()
     turn = np.eye(4)
@@ -40,20 +40,20 @@ def sight(now_s, p, v=(0.0, 0.0, 0.0), yaw=0.0):
 
 
 def fly(path, seconds, held_x=math.inf):
-    """A drone that follows every wish, until a pane that nobody sees holds it, recorded."""
+    """A drone that follows every command, until a pane that nobody sees holds it, recorded."""
     log = PlanLog(path / PLAN, NavLimits())
     flight_controller = FlightController(NavLimits(), witness=log.add)
     flight_controller.begin(GoTo(np.array([1.5, 0.2, 1.15])))
     p, v, yaw, decisions = np.array([0.0, 0.0, 0.9]), np.zeros(3), 0.0, []
     for k in range(round(seconds / TICK_S)):
-        decisions.append(flight_controller.plan(sight(k * TICK_S, p, v, yaw)))
-        w, (c, s) = decisions[-1].wish, (math.cos(yaw), math.sin(yaw))
+        decisions.append(flight_controller.plan(state(k * TICK_S, p, v, yaw)))
+        w, (c, s) = decisions[-1].command, (math.cos(yaw), math.sin(yaw))
         v = np.array([c * w.forward_m_s - s * w.left_m_s, s * w.forward_m_s + c * w.left_m_s, w.up_m_s])
         if p[0] + TICK_S * v[0] > held_x:
             v = np.zeros(3)
         p, yaw = p + TICK_S * v, yaw + TICK_S * w.turn_left_rad_s
         if math.isfinite(held_x):
-            flight_controller.order(sight(k * TICK_S, p, v, yaw))
+            flight_controller.order(state(k * TICK_S, p, v, yaw))
     log.close()
     return decisions
 
@@ -63,13 +63,13 @@ def flight(tmp_path_factory):
     """Folder and decisions of a flight that gets under way."""
     folder = tmp_path_factory.mktemp("flight")
     decisions = fly(folder, 11.0)
-    assert any(d.phase == "flying" and d.wish.forward_m_s > 0.3 for d in decisions)
+    assert any(d.phase == "flying" and d.command.forward_m_s > 0.3 for d in decisions)
     return folder, decisions
 
 
 def test_entries_come_back_to_the_last_bit(tmp_path):
     limits = NavLimits(speed_m_s=1.0 / 3.0)
-    seen = replace(sight(0.2, (0.1, 1.0 / 3.0, 1.2)), seen_s=math.nan, revision=2, metric=False)
+    seen = replace(state(0.2, (0.1, 1.0 / 3.0, 1.2)), seen_s=math.nan, revision=2, metric=False)
     entries = [
         NewTask(GoTo(np.array([1.0, -2.0, 1.15]))),
         NewTask(Explore(math.inf)),
@@ -105,33 +105,33 @@ def test_what_was_felt_and_not_seen_turns_it_away_and_is_replayed(tmp_path):
     assert touches and entries[touches[0]].p_w[0] == pytest.approx(0.6, abs=0.05)
     assert entries[touches[0]].towards_w[0] > 0.7
     before, after = (next(e for e in entries[touches[0] + s :: s] if isinstance(e, Decision)) for s in (-1, 1))
-    assert before.wish.forward_m_s > 0.2 and after.wish.forward_m_s < 0.05
+    assert before.command.forward_m_s > 0.2 and after.command.forward_m_s < 0.05
     assert [step.now for step in replay(tmp_path).steps] == decisions
 
 
 def test_another_speed_limit_decides_otherwise(flight):
     slower = replay(flight[0], speed_m_s=0.2)
     assert slower.differing and not slower.differing[0].same
-    assert max(step.now.wish.forward_m_s for step in slower.steps) <= 0.2 + 1e-9
-    assert max(step.before.wish.forward_m_s for step in slower.steps) > 0.3
-    assert any("first difference" in line for line in told(slower))
+    assert max(step.now.command.forward_m_s for step in slower.steps) <= 0.2 + 1e-9
+    assert max(step.before.command.forward_m_s for step in slower.steps) > 0.3
+    assert any("first difference" in line for line in summary(slower))
 
 
 def test_what_a_planner_hung_on_is_in_the_file(tmp_path):
     log = PlanLog(tmp_path / PLAN, NavLimits())
     flight_controller = FlightController(NavLimits(), witness=log.add)
-    flight_controller.plan(sight(0.0, (0.0, 0.0, 0.9)))
+    flight_controller.plan(state(0.0, (0.0, 0.0, 0.9)))
 
     def hangs(seen):
         raise KeyboardInterrupt
 
     flight_controller.pilot = type("Hung", (), {"update": staticmethod(hangs)})()
     with pytest.raises(KeyboardInterrupt):
-        flight_controller.plan(sight(0.1, (0.0, 0.0, 0.9)))
+        flight_controller.plan(state(0.1, (0.0, 0.0, 0.9)))
     log.close()
     found = replay(tmp_path)
     assert [step.before is None for step in found.steps] == [False, True]
-    assert "no answer" in "\n".join(told(found))
+    assert "no answer" in "\n".join(summary(found))
 
 
 def test_a_file_that_a_crash_cut_off_is_good_up_to_there(tmp_path):
@@ -170,7 +170,7 @@ def _array(shape) -> bytes:
 def test_damaged_files_are_refused_in_words(damage, words, tmp_path, capsys):
     fly_short = PlanLog(tmp_path / PLAN, NavLimits())
     fly_short.add(NewTask(GoTo(np.ones(3))))
-    fly_short.add(sight(0.0, (0.0, 0.0, 0.9)))
+    fly_short.add(state(0.0, (0.0, 0.0, 0.9)))
     fly_short.close()
     lines = (tmp_path / PLAN).read_bytes().splitlines(keepends=True)
     (tmp_path / PLAN).write_bytes(b"".join(damage(lines)))
@@ -201,11 +201,11 @@ def test_exits_are_recorded_as_they_become_known(tmp_path):
     recorder = Recorder(tmp_path / "flight", NavLimits())
     recorder.begin(PRESETS["tello"])
     flight_controller = FlightController(NavLimits(), [recorder.moment])
-    flight_controller.order(sight(0.0, (0.0, 0.0, 1.1)))
+    flight_controller.order(state(0.0, (0.0, 0.0, 1.1)))
     assert not (tmp_path / "flight" / EXITS).exists()
     ahead = np.array([1.0, 0.0, 0.0])
     flight_controller.pilot.exits.exits = (Exit(np.array([2.0, 0.5, 1.1]), ahead, 0.9, 0.05, 0.1, 3),)
-    flight_controller.order(sight(0.1, (0.0, 0.0, 1.1)))
+    flight_controller.order(state(0.1, (0.0, 0.0, 1.1)))
     recorder.close()
     assert recorder.failure is None
     lines = (tmp_path / "flight" / EXITS).read_text().splitlines()

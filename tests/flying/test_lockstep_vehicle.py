@@ -28,7 +28,7 @@ class Truth:
     def seen(self, image, arrived_s, captured_s):
         assert arrived_s - captured_s == pytest.approx(0.35)
 
-    def sight(self, now_s, view=None):
+    def state(self, now_s, view=None):
         d = DRONES[-1]
         return DroneState(now_s, d.p_w.copy(), d.yaw, d.velocity.copy(), battery=self.samples[-1].battery)
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from edgeslam_torch.flying.perception.home import GROUND_M, TAKE_OFF
-from edgeslam_torch.flying.perception.map_reset import IN_AIR_M, NEAR_M, PATIENCE_S, FreshStart
+from edgeslam_torch.flying.perception.map_reset import IN_AIR_M, NEAR_M, PATIENCE_S, MapReset
 from edgeslam_torch.types import TelemetrySample
 
 
@@ -13,7 +13,7 @@ def sample(stamp_s, velocity=(0.0, 0.0, 0.0), yaw=0.0, height_m=1.0):
 
 
 def flown(samples):
-    fresh = FreshStart()
+    fresh = MapReset()
     for one in samples:
         fresh.heard(one)
     return fresh
@@ -68,4 +68,4 @@ def test_it_begins_where_velocities_carried_it_in_axes_of_the_first_heading():
     place = flown(told).begin()
     np.testing.assert_allclose(place.position_m, [0.5, 0.3, 0.9 + GROUND_M], atol=1e-12)
     assert place.yaw_rad == pytest.approx(np.pi / 2)
-    assert FreshStart().begin() is TAKE_OFF
+    assert MapReset().begin() is TAKE_OFF

@@ -7,7 +7,7 @@ import pytest
 
 from edgeslam_torch.errors import SourceError
 from edgeslam_torch.flying.flight_controller import FlightController
-from edgeslam_torch.flying.navigator import APART, CARRIED, LONE, Navigator
+from edgeslam_torch.flying.navigator import DEAD_RECKONING, UNCERTAIN, UNRELATED, Navigator
 from edgeslam_torch.flying.result import FlightRefused
 from edgeslam_torch.flying.tasks import Stay
 from edgeslam_torch.geometry.camera import PRESETS
@@ -40,14 +40,14 @@ class ObedientVehicle:
             self.now_s += TICK_S
             self.ticks += 1
             self.p = self.p + TICK_S * self.v
-            sight = DroneState(
+            state = DroneState(
                 self.now_s, self.p, self.yaw, self.v, metric=self.metric, battery=self.battery, view=self._view()
             )
-            self.flight_controller.plan(sight)
-            order = self.flight_controller.order(sight)
+            self.flight_controller.plan(state)
+            order = self.flight_controller.order(state)
             if order.land:
                 self.land(str(order.danger))
-            w, (c, s) = order.wish, (math.cos(self.yaw), math.sin(self.yaw))
+            w, (c, s) = order.command, (math.cos(self.yaw), math.sin(self.yaw))
             self.v = np.array([c * w.forward_m_s - s * w.left_m_s, s * w.forward_m_s + c * w.left_m_s, w.up_m_s])
             self.yaw += TICK_S * w.turn_left_rad_s
 
@@ -94,16 +94,18 @@ def navigator(allow_motion=True, **vehicle):
     ("tracked", "apart_m", "reason"),
     [
         (True, 0.0, "home"),
-        (False, 0.0, f"home, {CARRIED}"),
-        (False, 0.3, f"home, {CARRIED}"),
-        (True, 0.31, f"home, {APART.format(0.31)}"),
-        (True, math.inf, f"home, {LONE}"),
+        (False, 0.0, f"home, {DEAD_RECKONING}"),
+        (False, 0.3, f"home, {DEAD_RECKONING}"),
+        (True, 0.31, f"home, {UNCERTAIN.format(0.31)}"),
+        (True, math.inf, f"home, {UNRELATED}"),
     ],
 )
 def test_an_outcome_says_what_it_rests_on(tracked, apart_m, reason):
     nav = navigator()
     nav.vehicle.flying, nav.vehicle.fly = True, lambda until: None
-    nav.flight_controller.sight = DroneState(9.0, np.zeros(3), 0.0, np.zeros(3), tracked=tracked, apart_sigma_m=apart_m)
+    nav.flight_controller.state = DroneState(
+        9.0, np.zeros(3), 0.0, np.zeros(3), tracked=tracked, submap_sigma_m=apart_m
+    )
     nav.flight_controller.ended = lambda: Phase.DONE
     outcome = nav.fly(Stay(), "home")
     assert (outcome.reached, outcome.reason) == (True, reason)
@@ -115,7 +117,7 @@ def test_an_outcome_says_what_it_rests_on(tracked, apart_m, reason):
 def test_an_outcome_says_how_near_to_its_goal_it_is(x, reason):
     nav = navigator()
     nav.vehicle.flying, nav.vehicle.fly = True, lambda until: None
-    nav.flight_controller.sight = DroneState(9.0, np.array([x, 0.0, 1.15]), 0.0, np.zeros(3))
+    nav.flight_controller.state = DroneState(9.0, np.array([x, 0.0, 1.15]), 0.0, np.zeros(3))
     nav.flight_controller.known = lambda: None
     nav.flight_controller.ended = lambda: Phase.DONE
     assert nav.go_to((2.0, 0.0, 1.15)).reason == reason

@@ -86,7 +86,7 @@ def test_a_picture_whose_points_are_in_another_unit_goes_by_the_usual_metre(perc
         depth = told(perception, 5.0 + 0.2 * k, "tracking")
     np.testing.assert_allclose(depth.depth_m, DISTANCE_M, rtol=0.02)
     assert depth.sigma_log.min() >= 0.29
-    assert perception._usual.doubt == pytest.approx(2.0, rel=0.05)
+    assert perception._bias.doubt == pytest.approx(2.0, rel=0.05)
 
 
 def test_what_is_usual_bridges_pictures_without_points_as_long_as_the_unit_lasts(perception):
@@ -196,15 +196,15 @@ def test_a_pilot_hears_how_old_views_moved_too(perception):
     poses = np.repeat(np.eye(4)[None], 2000, axis=0)
     for k in range(600):
         perception._shown = poses, 1.0, 0
-        assert perception._moved(SimpleNamespace(picture=3 * k, T_w_c=np.eye(4), stamp_s=0.2 * k)) is None
+        assert perception._map_update(SimpleNamespace(picture=3 * k, T_w_c=np.eye(4), stamp_s=0.2 * k)) is None
     poses[:100, 0, 3] = 1.0
     perception._shown = poses, 1.0, 1
-    moved = perception._moved(SimpleNamespace(picture=1800, T_w_c=np.eye(4), stamp_s=120.0))
-    assert len(moved.pictures) == pytest.approx(240 + 36, abs=1)
-    assert (np.diff(moved.pictures) > 0).all()
-    assert moved.points(np.zeros((2, 2)), [30, 1500]) == pytest.approx(np.array([[1.0, 0.0], [0.0, 0.0]]))
-    assert perception._moved(SimpleNamespace(picture=1803, T_w_c=np.eye(4), stamp_s=120.2)) is None
-    assert [T[0, 3] for picture, T in perception._long_told if picture < 100] == [1.0] * 4
+    update = perception._map_update(SimpleNamespace(picture=1800, T_w_c=np.eye(4), stamp_s=120.0))
+    assert len(update.pictures) == pytest.approx(240 + 36, abs=1)
+    assert (np.diff(update.pictures) > 0).all()
+    assert update.points(np.zeros((2, 2)), [30, 1500]) == pytest.approx(np.array([[1.0, 0.0], [0.0, 0.0]]))
+    assert perception._map_update(SimpleNamespace(picture=1803, T_w_c=np.eye(4), stamp_s=120.2)) is None
+    assert [T[0, 3] for picture, T in perception._thinned_views if picture < 100] == [1.0] * 4
 
 
 def test_a_doubtful_metre_is_told(perception):
@@ -214,9 +214,9 @@ def test_a_doubtful_metre_is_told(perception):
     pose = SimpleNamespace(T_w_c=np.eye(4), covariance=1e-4 * np.eye(6), velocity_w=np.zeros(3), revision=0)
     perception._slam = SimpleNamespace(pose_now=lambda now_s, samples: pose)
     perception._output = SimpleNamespace(health=health, piece=0)
-    assert perception.sight(1.0).scale_sigma == pytest.approx(0.02)
-    perception._usual._against, perception._usual._off_log = 5, np.log(3.0)
-    assert perception.sight(1.0).scale_sigma == pytest.approx(2.0, rel=0.01)
+    assert perception.state(1.0).scale_sigma == pytest.approx(0.02)
+    perception._bias._against, perception._bias._off_log = 5, np.log(3.0)
+    assert perception.state(1.0).scale_sigma == pytest.approx(2.0, rel=0.01)
 
 
 class Slam:
@@ -253,11 +253,11 @@ def test_a_map_that_tells_no_metres_in_the_air_is_given_up_for_a_new_one(monkeyp
             perception.heard(TelemetrySample(now_s, np.zeros(3), np.array([0.0, 0.0, 0.3]), 0.9))
         perception.seen(bare_wall(), now_s, now_s)
         revisions.append(perception._changes)
-        assert perception.sight(now_s).p_w[2] == pytest.approx(GROUND_M if len(Slam.made) == 1 else 0.9 + GROUND_M)
+        assert perception.state(now_s).p_w[2] == pytest.approx(GROUND_M if len(Slam.made) == 1 else 0.9 + GROUND_M)
     first, second = Slam.made
     assert first.closed and not second.closed
     assert len(first.frames) == pytest.approx(15 * PATIENCE_S, abs=3)
     assert second.frames[0] == (0, 1), "it begins anew, and is told which way is up"
     assert len(set(revisions)) == 2, "a pilot forgets what it was told before"
     late = SimpleNamespace(picture=perception._first - 1, T_w_c=np.eye(4), stamp_s=now_s)
-    assert perception._moved(late) is None and not perception._told, "a view of the old map that comes late"
+    assert perception._map_update(late) is None and not perception._sent_views, "a view of the old map that comes late"

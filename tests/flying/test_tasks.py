@@ -62,9 +62,9 @@ def test_a_drone_that_has_turned_round_looks_ahead_all_the_same(turns):
 def test_a_pilot_stands_and_turns_where_the_task_wants_to_look(yaw_deg, sign):
     pilot = Pilot(way_home())
     pilot.phase = Phase.FLYING
-    wish = pilot.update(at(0.0, x=0.5, yaw_deg=yaw_deg))
-    assert (wish.forward_m_s, wish.left_m_s) == (0.0, 0.0)
-    assert np.sign(wish.turn_left_rad_s) == sign
+    command = pilot.update(at(0.0, x=0.5, yaw_deg=yaw_deg))
+    assert (command.forward_m_s, command.left_m_s) == (0.0, 0.0)
+    assert np.sign(command.turn_left_rad_s) == sign
 
 
 def test_where_its_pose_was_lost_near_home_it_looks_from_farther_away():
@@ -98,5 +98,5 @@ def test_a_pilot_flies_the_last_metre_backwards_and_slowly():
     pilot = Pilot(task, phase=Phase.FLYING)
     for x in np.arange(-0.5, 2.0, 0.1):
         pilot.space.flown(np.array([x, 0.0, NavLimits().height_m]), 0.6)
-    wishes = [pilot.update(at(since_s + 0.1 * k, x=0.55)) for k in range(1, 6)]
-    assert all(-0.2 < wish.forward_m_s < -0.05 and abs(wish.turn_left_rad_s) < 0.05 for wish in wishes)
+    commands = [pilot.update(at(since_s + 0.1 * k, x=0.55)) for k in range(1, 6)]
+    assert all(-0.2 < command.forward_m_s < -0.05 and abs(command.turn_left_rad_s) < 0.05 for command in commands)

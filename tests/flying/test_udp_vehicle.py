@@ -42,7 +42,7 @@ class Truth:
     def seen(self, *unused):
         self.seen_s.append(time.monotonic())
 
-    def sight(self, now_s, view=None):
+    def state(self, now_s, view=None):
         d = self.drone
         moved = np.array([0.2, 0.0, 0.0])  # as if it moved: what is commanded here is not for long
         return DroneState(now_s, d.p_w.copy(), d.yaw, moved, battery=type(self).battery, tracked=type(self).tracked)
@@ -55,16 +55,16 @@ class Steady:
     """A pilot that wants one thing, or hangs."""
 
     def __init__(self):
-        self.wish, self.phase, self.layer, self.task = VelocityCommand(forward_m_s=0.3), Phase.FLYING, None, None
+        self.command, self.phase, self.layer, self.task = VelocityCommand(forward_m_s=0.3), Phase.FLYING, None, None
         self.go_on = threading.Event()
         self.go_on.set()
 
     def begin(self, task):
         self.task = task
 
-    def update(self, sight):
+    def update(self, state):
         self.go_on.wait(60.0)
-        return self.wish
+        return self.command
 
 
 @pytest.fixture
@@ -104,7 +104,7 @@ def test_planner_and_supervisor_fly_and_a_hung_planner_is_stopped(flight):
     until(lambda: forward(emulator) == pytest.approx(0.3))
     flight_controller.pilot.go_on.clear()
     until(lambda: emulator.drone.rc == (0.0, 0.0, 0.0, 0.0))
-    until(lambda: flight_controller.last.danger is Danger.NO_WISH)
+    until(lambda: flight_controller.last.danger is Danger.NO_COMMAND)
     flight_controller.pilot.go_on.set()
     until(lambda: forward(emulator) == pytest.approx(0.3))
     vehicle.land("as commanded")
@@ -124,7 +124,7 @@ def test_an_empty_battery_lands_it(flight, monkeypatch):
 def test_a_supervisor_that_fails_lands_it(flight, monkeypatch):
     emulator, vehicle, flight_controller = flight
     vehicle.take_off()
-    monkeypatch.setattr(flight_controller, "order", lambda sight: 1 / 0)
+    monkeypatch.setattr(flight_controller, "order", lambda state: 1 / 0)
     vehicle.fly(lambda: False)
     assert "failed" in vehicle.over
     until(lambda: emulator.drone.mode is Mode.GROUND)

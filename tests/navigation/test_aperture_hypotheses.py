@@ -8,7 +8,7 @@ import pytest
 from edgeslam_torch.navigation.drone_state import DroneState, View
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.map_update import MapUpdate
-from edgeslam_torch.navigation.openings.aperture_hypotheses import glimpses
+from edgeslam_torch.navigation.openings.aperture_hypotheses import aperture_hypotheses
 from edgeslam_torch.navigation.openings.exit_tracker import ExitTracker
 from edgeslam_torch.navigation.openings.wall_frame import Walls, along_walls
 
@@ -53,7 +53,7 @@ def walls(opening=(-0.45, 0.45), free_beyond=False, shut=0.0):
 
 
 def seen(known, view, here=(0.0, 0.0)):
-    return glimpses(along_walls(known, np.array(here)), view, np.array(here))
+    return aperture_hypotheses(along_walls(known, np.array(here)), view, np.array(here))
 
 
 @pytest.mark.parametrize(("x", "y", "yaw_deg"), [(0.5, 0.0, 0.0), (0.8, -0.6, 30.0), (0.3, 1.2, -40.0)])

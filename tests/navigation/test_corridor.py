@@ -21,7 +21,7 @@ def seen(is_solid, is_unseen=lambda x, y: np.zeros(x.shape, bool)):
     return Layer(~solid & ~unseen, solid & ~unseen, np.array([-6.0, -6.0]), 0.1)
 
 
-def sight(x, y=0.0, stamp_s=0.0, yaw=0.0):
+def state(x, y=0.0, stamp_s=0.0, yaw=0.0):
     return DroneState(stamp_s, np.array([x, y, 1.15]), yaw, np.zeros(3))
 
 
@@ -34,8 +34,8 @@ def place(task, layer, at):
 def follow(task, layer, *way):
     """Where it wants to go at the end of a way."""
     for k, (x, y) in enumerate(way[:-1]):
-        task.goals(layer, sight(x, y, 0.5 * k))
-    return place(task, layer, sight(*way[-1], 0.5 * len(way)))
+        task.goals(layer, state(x, y, 0.5 * k))
+    return place(task, layer, state(*way[-1], 0.5 * len(way)))
 
 
 def sides(width=2.0, end=5.0):
@@ -58,17 +58,17 @@ def corner(x, y):
 def test_a_corridor_is_followed_ahead_then_round_its_corner():
     task = FollowCorridor()
     ahead = seen(corner, lambda x, y: (x > 1.5) | (x < -1.0))
-    assert place(task, ahead, sight(0.0))[0] > 1.0
+    assert place(task, ahead, state(0.0))[0] > 1.0
     whole = seen(corner, lambda x, y: (y > 2.0) | (x < -1.0))
     for k in range(4):
-        task.goals(whole, sight(0.9 * k, stamp_s=k))
-    assert place(task, whole, sight(3.0, stamp_s=5.0, yaw=1.5))[1] > 1.0, "not back to what is unseen behind the start"
+        task.goals(whole, state(0.9 * k, stamp_s=k))
+    assert place(task, whole, state(3.0, stamp_s=5.0, yaw=1.5))[1] > 1.0, "not back to what is unseen behind the start"
 
 
 def test_the_goal_is_in_the_middle_of_the_far_end():
     """Whatever is unseen beside the way, and however aslant it flies."""
     layer = seen(sides(), lambda x, y: np.abs(y - 0.9) < 0.2)
-    assert place(FollowCorridor(), layer, sight(0.0, yaw=0.35)) == pytest.approx([4.4, 0.0], abs=0.2)
+    assert place(FollowCorridor(), layer, state(0.0, yaw=0.35)) == pytest.approx([4.4, 0.0], abs=0.2)
 
 
 def test_a_drone_that_flies_aslant_goes_on_along_the_walls():
@@ -82,8 +82,8 @@ def test_what_is_unseen_behind_the_start_is_where_it_came_from():
     """Two metres behind it, which is not beside its way: at the end of the corridor it does not turn back to it."""
     layer = seen(lambda x, y: (np.abs(y) > 1.0) | (x > 4.0), lambda x, y: x < -2.0)
     task = FollowCorridor()
-    task.goals(layer, sight(0.0))
-    assert len(task.goals(layer, sight(3.3, stamp_s=5.0))) == 0
+    task.goals(layer, state(0.0))
+    assert len(task.goals(layer, state(3.3, stamp_s=5.0))) == 0
 
 
 @pytest.mark.parametrize("width", [2.0, 2.4])
@@ -92,7 +92,7 @@ def test_the_corridor_flown_along_one_side_is_no_way_on(width):
     way = [(x, 0.6 - 0.5 * width) for x in np.arange(-4.0, 4.7, 0.4)]
     task = FollowCorridor()
     for k, (x, y) in enumerate(way):
-        found = task.goals(layer, sight(x, y, 0.5 * k))
+        found = task.goals(layer, state(x, y, 0.5 * k))
     assert len(found) == 0, "a turn on the spot at the end"
 
 
@@ -100,15 +100,15 @@ def test_an_end_is_something_solid_ahead_not_the_lack_of_a_way():
     """At 1 m before the end with a door in its middle; in the middle of it; where the sides alone are near."""
     task = FollowCorridor()
     ending = seen(with_door(0.9))
-    task.goals(ending, sight(-1.0))
+    task.goals(ending, state(-1.0))
     assert not task.wall
-    task.goals(ending, sight(1.0, stamp_s=4.0))
+    task.goals(ending, state(1.0, stamp_s=4.0))
     assert task.wall
 
 
 def test_a_door_is_no_corridor():
     """Free space behind a doorway is not part of what is followed: the goal stays before it."""
-    assert place(FollowCorridor(), seen(with_door(0.9)), sight(0.0))[0] < 1.9
+    assert place(FollowCorridor(), seen(with_door(0.9)), state(0.0))[0] < 1.9
 
 
 def test_what_is_narrow_straight_ahead_is_flown_through_unless_it_is_a_door():
@@ -131,14 +131,14 @@ def test_a_speck_beside_the_start_does_not_end_it():
     """`blank_walls` 812: what is wide and free begins farther than a metre away."""
     speck = lambda x, y: (np.abs(x - 0.4) < 0.1) & (np.abs(y - 0.5) < 0.1)  # noqa: E731
     layer = seen(lambda x, y: sides()(x, y) | speck(x, y) | (x < 0.7) & (y < -0.5))
-    assert place(FollowCorridor(), layer, sight(0.0))[0] > 3.0
+    assert place(FollowCorridor(), layer, state(0.0))[0] > 3.0
 
 
 def test_where_nothing_is_known_ahead_it_wants_to_go_ahead():
     nothing = seen(lambda x, y: np.abs(y) > 1.0, lambda x, y: np.abs(x) > 0.3)
-    assert place(FollowCorridor(), nothing, sight(0.0)) == pytest.approx([1.5, 0.0], abs=0.1)
-    assert len(FollowCorridor().goals(seen(lambda x, y: x > 1.2, lambda x, y: np.abs(x) > 0.3), sight(0.0)))
-    assert len(FollowCorridor().goals(seen(sides(end=0.9)), sight(0.4))) == 0
+    assert place(FollowCorridor(), nothing, state(0.0)) == pytest.approx([1.5, 0.0], abs=0.1)
+    assert len(FollowCorridor().goals(seen(lambda x, y: x > 1.2, lambda x, y: np.abs(x) > 0.3), state(0.0)))
+    assert len(FollowCorridor().goals(seen(sides(end=0.9)), state(0.4))) == 0
 
 
 def test_a_drone_that_is_brought_back_goes_on_ahead():
@@ -162,9 +162,9 @@ def test_from_a_dead_end_it_comes_back_to_what_turns_off():
     to_its_end = [(x, 0.0) for x in np.arange(-4.0, 2.3, 0.4)]
     assert follow(task, layer, *to_its_end)[1] > 1.6
     for x in (1.6, 1.0, 0.5, 0.1):
-        assert place(task, layer, sight(x, 0.1, 20.0 - x))[1] > 1.6, "not into the dead end again"
+        assert place(task, layer, state(x, 0.1, 20.0 - x))[1] > 1.6, "not into the dead end again"
     for y in (0.6, 1.2, 1.8):
-        last = place(task, layer, sight(0.0, y, 30.0 + y))
+        last = place(task, layer, state(0.0, y, 30.0 + y))
     assert last == pytest.approx([0.0, 5.4], abs=0.4), "ahead is where it flies now"
 
 
@@ -202,12 +202,12 @@ def test_the_corridor_that_it_came_from_is_no_hole_in_the_side(side):
 def before_a_wall(task, layer):
     """At the dead end of the stub for as long as a turn takes, and on to where it looks to the sides: what it wants."""
     for k, x in enumerate(np.arange(-4.0, 2.5, 0.4)):
-        found = task.goals(layer, sight(x, 0.0, 0.5 * k))
+        found = task.goals(layer, state(x, 0.0, 0.5 * k))
     assert len(found) == 0, "a turn on the spot first"
-    wanted = place(task, layer, sight(2.4, 0.0, 20.6))
+    wanted = place(task, layer, state(2.4, 0.0, 20.6))
     for x in (2.0, 1.6, 1.2, 0.8, 0.3):
-        assert task.heading_rad(sight(x, 0.0, 24.0 - x)) is None, "not there yet"
-        task.goals(layer, sight(x, 0.0, 24.0 - x))
+        assert task.heading_rad(state(x, 0.0, 24.0 - x)) is None, "not there yet"
+        task.goals(layer, state(x, 0.0, 24.0 - x))
     return wanted
 
 
@@ -215,21 +215,21 @@ def test_sides_that_are_not_known_to_be_walls_are_looked_at_before_it_ends():
     """`l_corridor` 816 and 817: nothing at all was seen of what turns off."""
     layer, task = seen(stub, lambda x, y: (y > 0.9) & (x < 2.6)), FollowCorridor()
     assert before_a_wall(task, layer) == pytest.approx([0.2, 0.0], abs=0.1)
-    assert task.heading_rad(sight(0.3, 0.0, 25.0)) == pytest.approx(math.pi / 2)
-    assert task.heading_rad(sight(0.3, 0.0, 25.9, yaw=1.57)) == pytest.approx(math.pi / 2), "it stands a second"
-    assert task.heading_rad(sight(0.3, 0.0, 26.1, yaw=1.57)) is None, "the right one is known to be a wall"
-    assert place(task, seen(stub), sight(0.3, 0.0, 26.5))[1] > 1.6, "what it saw there"
-    assert place(task, layer, sight(0.3, 0.0, 27.0)) == pytest.approx([2.4, 0.0], abs=0.1), "nothing: back to the end"
-    assert not task.done(sight(1.0, 0.0, 28.0))
-    assert len(task.goals(layer, sight(2.2, 0.0, 30.0))) == 0 and task.done(sight(2.2, 0.0, 30.0))
+    assert task.heading_rad(state(0.3, 0.0, 25.0)) == pytest.approx(math.pi / 2)
+    assert task.heading_rad(state(0.3, 0.0, 25.9, yaw=1.57)) == pytest.approx(math.pi / 2), "it stands a second"
+    assert task.heading_rad(state(0.3, 0.0, 26.1, yaw=1.57)) is None, "the right one is known to be a wall"
+    assert place(task, seen(stub), state(0.3, 0.0, 26.5))[1] > 1.6, "what it saw there"
+    assert place(task, layer, state(0.3, 0.0, 27.0)) == pytest.approx([2.4, 0.0], abs=0.1), "nothing: back to the end"
+    assert not task.done(state(1.0, 0.0, 28.0))
+    assert len(task.goals(layer, state(2.2, 0.0, 30.0))) == 0 and task.done(state(2.2, 0.0, 30.0))
 
 
 def test_a_look_to_the_side_ends_with_the_pose():
     task, layer = FollowCorridor(), seen(stub, lambda x, y: (np.abs(y) > 0.9) & (x < 2.6))
     before_a_wall(task, layer)
-    assert task.heading_rad(replace(sight(0.3, 0.0, 25.0), tracked=False)) is None
-    assert task.heading_rad(sight(0.3, 0.0, 25.1)) is None
-    assert place(task, layer, sight(0.3, 0.0, 25.5)) == pytest.approx([2.4, 0.0], abs=0.1)
+    assert task.heading_rad(replace(state(0.3, 0.0, 25.0), tracked=False)) is None
+    assert task.heading_rad(state(0.3, 0.0, 25.1)) is None
+    assert place(task, layer, state(0.3, 0.0, 25.5)) == pytest.approx([2.4, 0.0], abs=0.1)
 
 
 def test_a_mouth_that_depth_has_made_narrow_is_flown_into_unless_it_is_a_door():
@@ -241,7 +241,7 @@ def test_a_mouth_that_depth_has_made_narrow_is_flown_into_unless_it_is_a_door():
         task = FollowCorridor()
         task.consider(candidates, exits)
         for k, x in enumerate(np.arange(-4.0, 2.5, 0.4)):
-            found = task.goals(layer, sight(x, 0.0, 0.5 * k))
+            found = task.goals(layer, state(x, 0.0, 0.5 * k))
         assert bool((layer.centres(found)[:, 1] > 1.6).any()) is flies
 
 
@@ -251,17 +251,17 @@ def test_from_a_hole_that_is_none_it_comes_back_to_the_end():
     closed = seen(sides(end=3.0))
     hole = Layer(hole.free & closed.free, hole.solid, hole.corner_w, hole.cell_m)
     for k, x in enumerate(np.arange(-4.0, 2.5, 0.4)):
-        found = task.goals(hole, sight(x, 0.0, 0.5 * k))
+        found = task.goals(hole, state(x, 0.0, 0.5 * k))
     assert hole.centres(found)[0] == pytest.approx([-1.0, 1.2], abs=0.2)
     for x in (2.0, 1.5, 1.0, 0.5, 0.0, -0.5, -1.0):
-        task.goals(hole, sight(x, 0.0, 12.0 - x))
-    assert place(task, closed, sight(-1.0, 0.0, 14.0)) == pytest.approx([2.4, 0.0], abs=0.1)
+        task.goals(hole, state(x, 0.0, 12.0 - x))
+    assert place(task, closed, state(-1.0, 0.0, 14.0)) == pytest.approx([2.4, 0.0], abs=0.1)
     for k in range(6):  # slowly: a place that it comes to is not looked at in vain
-        assert place(task, closed, sight(1.3 + 0.1 * k, 0.0, 16.0 + k)) == pytest.approx([2.4, 0.0], abs=0.1)
-        assert not task.done(sight(1.3 + 0.1 * k, 0.0, 16.0 + k))
-    assert len(task.goals(closed, sight(2.2, 0.0, 24.0))) == 0, "a turn on the spot"
-    assert not task.done(sight(2.2, 0.0, 36.0))
-    assert len(task.goals(closed, sight(2.2, 0.0, 36.6))) == 0 and task.done(sight(2.2, 0.0, 36.6))
+        assert place(task, closed, state(1.3 + 0.1 * k, 0.0, 16.0 + k)) == pytest.approx([2.4, 0.0], abs=0.1)
+        assert not task.done(state(1.3 + 0.1 * k, 0.0, 16.0 + k))
+    assert len(task.goals(closed, state(2.2, 0.0, 24.0))) == 0, "a turn on the spot"
+    assert not task.done(state(2.2, 0.0, 36.0))
+    assert len(task.goals(closed, state(2.2, 0.0, 36.6))) == 0 and task.done(state(2.2, 0.0, 36.6))
 
 
 def test_an_end_that_was_come_back_to_is_the_one_that_it_was():
@@ -269,52 +269,52 @@ def test_an_end_that_was_come_back_to_is_the_one_that_it_was():
     task, hole = FollowCorridor(), seen(stub, lambda x, y: (y > 0.9) & (np.abs(x) < 1.0))
     shorter = seen(lambda x, y: sides(end=2.6)(x, y))
     for k, x in enumerate(np.arange(-4.0, 2.5, 0.4)):
-        task.goals(hole, sight(x, 0.0, 0.5 * k))
+        task.goals(hole, state(x, 0.0, 0.5 * k))
     for k, x in enumerate((2.0, 1.0, 0.5)):
-        task.goals(hole, sight(x, 0.0, 10.0 + k))
-    assert place(task, seen(sides(end=5.6)), sight(0.0, 0.0, 13.0))[0] > 4.0, "there is more to it than it seemed"
-    assert place(task, shorter, sight(1.9, 0.0, 15.0)) == pytest.approx([2.4, 0.0], abs=0.1)
-    assert len(task.goals(shorter, sight(2.2, 0.0, 16.0))) == 0
+        task.goals(hole, state(x, 0.0, 10.0 + k))
+    assert place(task, seen(sides(end=5.6)), state(0.0, 0.0, 13.0))[0] > 4.0, "there is more to it than it seemed"
+    assert place(task, shorter, state(1.9, 0.0, 15.0)) == pytest.approx([2.4, 0.0], abs=0.1)
+    assert len(task.goals(shorter, state(2.2, 0.0, 16.0))) == 0
 
 
 def test_a_way_back_to_the_end_that_there_is_none_of_ends_it():
     task, layer = FollowCorridor(), seen(stub, lambda x, y: (y > 0.9) & (np.abs(x) < 1.0))
     for k, x in enumerate(np.arange(-4.0, 2.5, 0.4)):
-        task.goals(layer, sight(x, 0.0, 0.5 * k))
-    lose(task, sight(1.0, 0.0, 9.0))
-    assert place(task, layer, sight(1.0, 0.0, 13.0)) == pytest.approx([2.4, 0.0], abs=0.1)
-    assert not task.done(sight(1.0, 0.0, 13.0))
-    task.goals(layer, sight(1.0, 0.0, 34.0))
-    assert task.done(sight(1.0, 0.0, 34.0))
+        task.goals(layer, state(x, 0.0, 0.5 * k))
+    lose(task, state(1.0, 0.0, 9.0))
+    assert place(task, layer, state(1.0, 0.0, 13.0)) == pytest.approx([2.4, 0.0], abs=0.1)
+    assert not task.done(state(1.0, 0.0, 13.0))
+    task.goals(layer, state(1.0, 0.0, 34.0))
+    assert task.done(state(1.0, 0.0, 34.0))
 
 
 def lose(task, at):
     """The pose, for the third time, at a place."""
     for k in range(3):
         assert not task.done(replace(at, stamp_s=at.stamp_s + k))
-        task.done(replace(at, stamp_s=at.stamp_s + k + 0.5, tracked=False, hindered=True))
+        task.done(replace(at, stamp_s=at.stamp_s + k + 0.5, tracked=False, overridden=True))
 
 
 def test_a_bare_wall_before_which_the_pose_is_lost_ends_it():
     """`l_corridor` 823: at the end of it, and "no way"."""
     task, layer = FollowCorridor(), seen(stub, lambda x, y: (np.abs(y) > 0.9) & (x < 2.6))
     for k, x in enumerate(np.arange(-4.0, 2.5, 0.4)):
-        task.goals(layer, sight(x, 0.0, 0.5 * k))
-    lose(task, sight(1.9, 0.0, 9.0))
-    assert task.done(sight(1.9, 0.0, 12.0)) and task.wall
+        task.goals(layer, state(x, 0.0, 0.5 * k))
+    lose(task, state(1.9, 0.0, 9.0))
+    assert task.done(state(1.9, 0.0, 12.0)) and task.wall
 
 
 def test_where_the_pose_is_lost_looking_into_a_hole_it_comes_back_to_the_end():
     """`corridor` 830: it had been before the door, looked into a hole in a bare wall, and landed there."""
     task, layer = FollowCorridor(), seen(stub, lambda x, y: (y > 0.9) & (np.abs(x) < 1.0))
     for k, x in enumerate(np.arange(-4.0, 2.5, 0.4)):
-        found = task.goals(layer, sight(x, 0.0, 0.5 * k))
+        found = task.goals(layer, state(x, 0.0, 0.5 * k))
     assert layer.centres(found)[0] == pytest.approx([0.0, 1.2], abs=0.2)
-    lose(task, sight(0.0, 0.0, 9.0))
-    assert place(task, layer, sight(0.0, 0.0, 12.0)) == pytest.approx([2.4, 0.0], abs=0.1)
-    assert not task.done(sight(0.0, 0.0, 12.0))
-    task.goals(layer, sight(1.6, 0.0, 15.0))
-    assert task.done(sight(1.6, 0.0, 15.0))
+    lose(task, state(0.0, 0.0, 9.0))
+    assert place(task, layer, state(0.0, 0.0, 12.0)) == pytest.approx([2.4, 0.0], abs=0.1)
+    assert not task.done(state(0.0, 0.0, 12.0))
+    task.goals(layer, state(1.6, 0.0, 15.0))
+    assert task.done(state(1.6, 0.0, 15.0))
 
 
 def test_what_is_between_it_and_the_wall_is_no_way_on():
@@ -322,11 +322,11 @@ def test_what_is_between_it_and_the_wall_is_no_way_on():
     layer, mouth = seen(stub, lambda x, y: (y > 0.9) & (np.abs(x) < 1.0)), pytest.approx([0.0, 1.2], abs=0.2)
     task, to_its_end = FollowCorridor(), [(x, 0.0) for x in np.arange(-4.0, 2.5, 0.4)]
     assert follow(task, layer, *to_its_end) == mouth
-    assert place(task, layer, sight(1.9, 0.0, 12.0)) == mouth
+    assert place(task, layer, state(1.9, 0.0, 12.0)) == mouth
     task = FollowCorridor()
     assert follow(task, layer, *to_its_end[:-1])[0] > 2.3
     for k in range(12):
-        found = task.goals(layer, sight(2.0, 0.0, 10.0 + 0.5 * k))
+        found = task.goals(layer, state(2.0, 0.0, 10.0 + 0.5 * k))
     assert layer.centres(found)[0] == mouth, "it comes no nearer to the wall"
 
 
@@ -337,28 +337,28 @@ def test_it_moves_with_the_map():
     for shape, left_m in ((stub, 3.6), (sides(end=3.0), math.nan)):
         task = FollowCorridor()
         for k, x in enumerate(np.arange(-4.0, 2.5, 0.4)):
-            task.goals(seen(shape), sight(x, 0.0, 0.5 * k))
+            task.goals(seen(shape), state(x, 0.0, 0.5 * k))
         task.carry(MapUpdate(from_, to))
         moved = seen(lambda x, y: shape(x, y - 2.0))  # noqa: B023
-        found = moved.centres(task.goals(moved, sight(2.4, 2.0, 30.0)))
+        found = moved.centres(task.goals(moved, state(2.4, 2.0, 30.0)))
         assert (found[:, 1] > left_m).all() if math.isfinite(left_m) else len(found) == 0
 
 
 def test_a_corridor_ends_in_a_room():
     task, room = FollowCorridor(), seen(lambda x, y: np.maximum(np.abs(x), np.abs(y)) > 2.5)
     for k in range(5):
-        task.goals(room, sight(0.3 * k - 0.6, stamp_s=k))
-        done = task.done(sight(0.3 * k - 0.6, stamp_s=k))
+        task.goals(room, state(0.3 * k - 0.6, stamp_s=k))
+        done = task.done(state(0.3 * k - 0.6, stamp_s=k))
     assert not done, "a metre must have been flown: a take-off in a room is no corridor's end"
-    task.goals(room, sight(0.6, stamp_s=5.0))
-    task.goals(room, sight(0.6, stamp_s=8.0))
-    assert task.done(sight(0.6, stamp_s=8.0)) and task.room
+    task.goals(room, state(0.6, stamp_s=5.0))
+    task.goals(room, state(0.6, stamp_s=8.0))
+    assert task.done(state(0.6, stamp_s=8.0)) and task.room
 
 
 def test_what_is_unseen_beside_the_way_is_no_way_on():
     """Unseen ground half a metre behind the start, and nothing else to see: the far end is the goal."""
     layer = seen(lambda x, y: (np.abs(y) > 1.0) | (x > 4.0), lambda x, y: x < -0.5)
     task = FollowCorridor()
-    assert place(task, layer, sight(0.0))[0] > 3.0
-    task.goals(layer, sight(3.2, stamp_s=5.0))
-    assert len(task.goals(layer, sight(3.3, stamp_s=5.5))) == 0
+    assert place(task, layer, state(0.0))[0] > 3.0
+    task.goals(layer, state(3.2, stamp_s=5.0))
+    assert len(task.goals(layer, state(3.3, stamp_s=5.5))) == 0

@@ -24,10 +24,10 @@ def corridor(free=lambda x, y: np.abs(y) < 0.95, solid=lambda x, y: np.zeros(x.s
     return Layer(free(x, y) & ~is_solid, is_solid, np.array([-4.0, -3.0]), 0.1)
 
 
-def unlooked(*sights):
+def unlooked(*states):
     coverage = Coverage()
-    for sight in sights:
-        coverage.note(sight)
+    for state in states:
+        coverage.note(state)
     return coverage.unlooked(WALL)
 
 
@@ -38,7 +38,7 @@ def test_what_is_before_the_drone_within_twenty_degrees_is_looked_at():
 
 
 @pytest.mark.parametrize(
-    ("case", "sight"),
+    ("case", "state"),
     [
         ("along the wall", at(-2.0, 0.0, 18.0)),
         ("away from it", at(0.0, 0.0, -90.0)),
@@ -48,8 +48,8 @@ def test_what_is_before_the_drone_within_twenty_degrees_is_looked_at():
         ("by telemetry", at(0.0, 0.0, 90.0, tracked=False)),
     ],
 )
-def test_other_views_look_at_none_of_it(case, sight):
-    assert len(unlooked(sight).p_w) == len(WALL.p_w), case
+def test_other_views_look_at_none_of_it(case, state):
+    assert len(unlooked(state).p_w) == len(WALL.p_w), case
 
 
 def test_views_add_up_and_alike_ones_are_kept_once():

@@ -21,7 +21,7 @@ def fit(rng, ratio, count=60):
 def knows(rng, ratio=0.8, unit_m=1.0, pictures=20):
     usual = DepthBias()
     for _ in range(pictures):
-        assert usual.believes(fit(rng, ratio / unit_m), unit_m, sure=True)
+        assert usual.is_consistent(fit(rng, ratio / unit_m), unit_m, sure=True)
     return usual
 
 
@@ -40,40 +40,40 @@ def test_the_usual_line_is_in_the_units_of_the_map(rng):
 
 def test_points_in_another_unit_are_not_believed(rng):
     usual = knows(rng)
-    assert usual.believes(fit(rng, 0.8 * 1.25), 1.0, sure=True), "pictures differ"
+    assert usual.is_consistent(fit(rng, 0.8 * 1.25), 1.0, sure=True), "pictures differ"
     for ratio in (0.8 * 1.8, 0.8 / 1.8):
-        assert not usual.believes(fit(rng, ratio), 1.0, sure=True)
+        assert not usual.is_consistent(fit(rng, ratio), 1.0, sure=True)
     assert np.exp(usual.line(1.0).offset) == pytest.approx(0.8, rel=0.04), "nor remembered"
 
 
 def test_nothing_is_usual_before_some_seconds_of_sure_metres(rng):
     usual = knows(rng, pictures=10)
     assert usual.line(1.0) is None
-    assert usual.believes(fit(rng, 2.4), 1.0, sure=False)
+    assert usual.is_consistent(fit(rng, 2.4), 1.0, sure=False)
     for _ in range(30):
-        usual.believes(fit(rng, 0.8), 1.0, sure=False)
+        usual.is_consistent(fit(rng, 0.8), 1.0, sure=False)
     assert usual.line(1.0) is None
 
 
 def test_what_many_pictures_say_on_end_becomes_usual(rng):
     """The metres that it rested on were wrong, and are right now."""
     usual = knows(rng)
-    believed = [usual.believes(fit(rng, 2.4), 1.0, sure=True) for _ in range(120)]
-    assert not any(believed[:70]) and all(believed[-30:])
+    consistent = [usual.is_consistent(fit(rng, 2.4), 1.0, sure=True) for _ in range(120)]
+    assert not any(consistent[:70]) and all(consistent[-30:])
     assert np.exp(usual.line(1.0).offset) == pytest.approx(2.4, rel=0.04)
 
 
 def test_a_second_of_pictures_in_another_unit_makes_metres_doubtful(rng):
     usual = knows(rng)
     for _ in range(4):
-        usual.believes(fit(rng, 0.8 * 3.0), 1.0, sure=True)
+        usual.is_consistent(fit(rng, 0.8 * 3.0), 1.0, sure=True)
         assert usual.doubt == 0.0, "a picture or two are chance"
-    usual.believes(fit(rng, 0.8 * 3.0), 1.0, sure=True)
+    usual.is_consistent(fit(rng, 0.8 * 3.0), 1.0, sure=True)
     assert usual.doubt == pytest.approx(2.0, rel=0.2)
-    assert usual.believes(fit(rng, 0.8), 1.0, sure=True)
+    assert usual.is_consistent(fit(rng, 0.8), 1.0, sure=True)
     assert usual.doubt == 0.0
     for _ in range(5):
-        usual.believes(fit(rng, 0.8 / 4.0), 1.0, sure=True)
+        usual.is_consistent(fit(rng, 0.8 / 4.0), 1.0, sure=True)
     assert usual.doubt == pytest.approx(0.75, rel=0.1), "too short as well as too long"
 
 
@@ -81,8 +81,8 @@ def test_a_single_picture_between_begins_the_count_anew(rng):
     usual = knows(rng)
     for _ in range(3):
         for _ in range(60):
-            assert not usual.believes(fit(rng, 2.4), 1.0, sure=True)
-        assert usual.believes(fit(rng, 0.8), 1.0, sure=True)
+            assert not usual.is_consistent(fit(rng, 2.4), 1.0, sure=True)
+        assert usual.is_consistent(fit(rng, 0.8), 1.0, sure=True)
 
 
 def test_points_of_a_wall_say_nothing_of_the_room_behind_its_door(rng):
@@ -128,7 +128,7 @@ def test_the_usual_slope_is_that_of_pictures_of_many_depths(rng):
         true = rng.uniform(0.6, 5.0, (40, 60)).astype(np.float32)
         uv = rng.integers([0, 0], [60, 40], (200, 2)).astype(float)
         z = true[uv[:, 1].astype(int), uv[:, 0].astype(int)].astype(float)
-        assert usual.believes(fit_to_points(DepthMap(1.2 * true**0.8, np.zeros_like(true)), uv, z), 1.0, sure=True)
+        assert usual.is_consistent(fit_to_points(DepthMap(1.2 * true**0.8, np.zeros_like(true)), uv, z), 1.0, sure=True)
     line = usual.line(1.0)
     assert line.slope == pytest.approx(1.25, abs=0.04)
     assert line.offset + line.slope * np.log(1.2 * 2.0**0.8) == pytest.approx(np.log(2.0), abs=0.08)

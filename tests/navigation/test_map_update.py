@@ -19,8 +19,8 @@ AFTER = np.array([pose(0.0, 0.0), pose(4.0, 1.0, 1.2, np.pi / 2)])
 
 def test_a_point_turns_and_grows_about_its_view():
     """The second view moved by (0, 1, 0.2) and turned square to the left: what was 1 m before it is 2 m to its left."""
-    moved = MapUpdate(BEFORE, AFTER, 2.0)
-    points = moved.points(np.array([[0.5, 0.0, 1.0], [5.0, 0.0, 1.5]]))
+    update = MapUpdate(BEFORE, AFTER, 2.0)
+    points = update.points(np.array([[0.5, 0.0, 1.0], [5.0, 0.0, 1.5]]))
     assert points == pytest.approx(np.array([[1.0, 0.0, 1.0], [4.0, 3.0, 2.2]]))
 
 

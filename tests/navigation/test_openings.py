@@ -119,14 +119,14 @@ def test_what_can_be_no_door(case, walls):
     assert openings(along_walls(walls, HERE)) == [], case
 
 
-def sight(x, y=0.0, stamp_s=0.0, yaw=0.0, **fields):
+def state(x, y=0.0, stamp_s=0.0, yaw=0.0, **fields):
     return DroneState(stamp_s, np.array([x, y, 1.15]), yaw, np.zeros(3), **fields)
 
 
 def watched(places, walls):
     watch = ExitTracker()
     for k, x in enumerate(places):
-        watch.look(walls, sight(x, stamp_s=0.5 * k))
+        watch.look(walls, state(x, stamp_s=0.5 * k))
     return watch
 
 
@@ -160,7 +160,7 @@ def test_its_normal_keeps_its_side_when_the_drone_has_flown_through():
 def test_its_sigma_has_that_of_the_metres():
     walls, watch = surroundings(wall(0.9)), ExitTracker()
     for k, x in enumerate([0.0, 0.2, 0.4, 0.6]):
-        watch.look(walls, sight(x, stamp_s=0.5 * k, scale_sigma=0.2))
+        watch.look(walls, state(x, stamp_s=0.5 * k, scale_sigma=0.2))
     (exit_,) = watch.exits
     assert exit_.position_sigma_m == pytest.approx(0.2 * 1.4, rel=0.25)
     assert exit_.width_sigma_m > 0.17
@@ -169,7 +169,7 @@ def test_its_sigma_has_that_of_the_metres():
 def test_an_opening_that_closes_under_closer_looks_is_forgotten():
     watch = watched([0.0, 0.2, 0.4, 0.6], surroundings(wall(0.9)))
     for k in range(12):
-        watch.look(surroundings(wall(0.0)), sight(0.6, stamp_s=5.0 + 0.5 * k))
+        watch.look(surroundings(wall(0.0)), state(0.6, stamp_s=5.0 + 0.5 * k))
     assert watch.exits == ()
 
 
@@ -178,12 +178,12 @@ def test_what_many_looks_told_is_not_told_while_later_ones_show_a_wall():
     door, closed = surroundings(wall(0.9)), surroundings(wall(0.0))
     watch = watched([0.0, 0.2, 0.4, 0.6] * 10, door)
     for k in range(8):
-        watch.look(closed, sight(0.6, stamp_s=30.0 + 0.5 * k))
+        watch.look(closed, state(0.6, stamp_s=30.0 + 0.5 * k))
     assert len(watch.exits) == 1, "twenty seconds against four"
-    watch.look(closed, sight(0.6, stamp_s=34.0))
+    watch.look(closed, state(0.6, stamp_s=34.0))
     assert watch.exits == ()
     assert watch.candidates == (), "nor is it worth a second look"
-    watch.look(door, sight(0.6, stamp_s=40.5))
+    watch.look(door, state(0.6, stamp_s=40.5))
     assert len(watch.exits) == 1
 
 
@@ -192,19 +192,19 @@ def test_an_exit_was_seen_by_looks_at_it():
     door, closed = surroundings(wall(0.9)), surroundings(wall(0.0))
     watch = ExitTracker()
     for k, x in enumerate([1.0, 0.4, 0.0, -0.4] * 5):
-        watch.look(door, sight(x, stamp_s=0.5 * k, yaw=math.pi))
+        watch.look(door, state(x, stamp_s=0.5 * k, yaw=math.pi))
     assert watch.exits == (), "nothing speaks for it"
     assert len(watch.candidates) == 1, "to be looked at"
-    watch.look(door, sight(0.0, stamp_s=15.0))
+    watch.look(door, state(0.0, stamp_s=15.0))
     assert watch.exits == (), "one look is chance"
-    watch.look(door, sight(0.0, stamp_s=15.5))
+    watch.look(door, state(0.0, stamp_s=15.5))
     for k in range(5):
         assert len(watch.exits) == 1, "one look or two more against it are chance"
-        watch.look(closed, sight(0.0, stamp_s=20.0 + 0.5 * k))
+        watch.look(closed, state(0.0, stamp_s=20.0 + 0.5 * k))
     assert watch.exits == ()
     assert len(watch.candidates) == 1
     for k in range(5):
-        watch.look(door, sight(0.0, stamp_s=23.0 + 0.5 * k))
+        watch.look(door, state(0.0, stamp_s=23.0 + 0.5 * k))
     assert len(watch.exits) == 1
     assert watch.candidates == (), "looked at"
 
@@ -213,9 +213,9 @@ def flown(ys, closed=False):
     """A watch that saw a door, was flown along a line through the wall, and sees the wall closed afterwards."""
     watch = watched([0.0, 0.2, 0.4, 0.6], surroundings(wall(0.9)))
     for k, x in enumerate(np.arange(1.2, 3.2, 0.2)):
-        watch.look(surroundings(wall(0.9)), sight(x, ys, 3.0 + 0.5 * k))
+        watch.look(surroundings(wall(0.9)), state(x, ys, 3.0 + 0.5 * k))
     for k in range(12):
-        watch.look(surroundings(wall(0.0)), sight(3.4, ys, 9.0 + 0.5 * k, math.atan2(-ys, -1.4)))
+        watch.look(surroundings(wall(0.0)), state(3.4, ys, 9.0 + 0.5 * k, math.atan2(-ys, -1.4)))
     return watch
 
 
@@ -229,11 +229,11 @@ def test_what_it_flew_through_is_an_exit_whatever_looks_show_later():
 def test_a_jump_of_the_pose_is_no_way_through():
     watch = watched([0.0, 0.2, 0.4, 0.6], surroundings(wall(0.9)))
     for k, x in enumerate([1.2, 3.0]):
-        watch.look(surroundings(wall(0.9)), sight(x, 0.0, 3.0 + 0.5 * k))
+        watch.look(surroundings(wall(0.9)), state(x, 0.0, 3.0 + 0.5 * k))
     assert not any(seen.flown for seen in watch._seen)
-    watch.look(surroundings(wall(0.9)), sight(2.6, 0.0, 4.5))
+    watch.look(surroundings(wall(0.9)), state(2.6, 0.0, 4.5))
     watch.carry(MapUpdate(np.eye(4)[None], np.eye(4)[None]))
-    watch.look(surroundings(wall(0.9)), sight(1.8, 0.0, 5.0))
+    watch.look(surroundings(wall(0.9)), state(1.8, 0.0, 5.0))
     assert not any(seen.flown for seen in watch._seen), "nor is a map that moved"
 
 
@@ -245,14 +245,14 @@ def test_looks_that_see_nothing_of_an_exit_do_not_speak_against_it(case, x, y, y
     """`doors` 804: a door beside the corridor, taken back by a drone that flew along it."""
     watch = watched([0.0, 0.2, 0.4, 0.6], surroundings(wall(0.9)))
     for k in range(20):
-        watch.look(surroundings(wall(0.0)), sight(x, y, 5.0 + 0.5 * k, math.radians(yaw_deg)))
+        watch.look(surroundings(wall(0.0)), state(x, y, 5.0 + 0.5 * k, math.radians(yaw_deg)))
     assert len(watch.exits) == 1, case
 
 
 def test_a_look_at_what_is_open_in_part_does_not_speak_against_it():
     watch = watched([0.0, 0.2, 0.4, 0.6], surroundings(wall(0.9)))
     for k in range(20):
-        watch.look(smeared(), sight(0.6, stamp_s=5.0 + 0.5 * k))
+        watch.look(smeared(), state(0.6, stamp_s=5.0 + 0.5 * k))
     assert len(watch.exits) == 1
 
 
@@ -286,7 +286,7 @@ def test_pillars_are_no_exit_once_their_surroundings_are_seen():
     watch = watched([0.0, 0.2, 0.4, 0.6], surroundings(wall(0.9)))
     assert len(watch.exits) == 1
     for k in range(5):
-        watch.look(surroundings(PILLARS), sight(0.6, stamp_s=5.0 + 0.5 * k))
+        watch.look(surroundings(PILLARS), state(0.6, stamp_s=5.0 + 0.5 * k))
     assert not watch.exits
 
 
@@ -295,14 +295,14 @@ def test_ten_seconds_that_know_a_way_round_outvote_what_did_not_know_it_yet():
     door, pillars = surroundings(wall(0.9)), surroundings(PILLARS)
     watch = watched([0.0, 0.2, 0.4, 0.6] * 20, door)
     for k in range(19):
-        watch.look(pillars, sight(0.6, stamp_s=50.0 + 0.5 * k))
+        watch.look(pillars, state(0.6, stamp_s=50.0 + 0.5 * k))
     assert len(watch.exits) == 1
-    watch.look(pillars, sight(0.6, stamp_s=60.0))
+    watch.look(pillars, state(0.6, stamp_s=60.0))
     assert watch.exits == ()
     for k in range(20):
-        watch.look(door, sight(0.6, stamp_s=61.0 + 0.5 * k))
+        watch.look(door, state(0.6, stamp_s=61.0 + 0.5 * k))
         assert watch.exits == (), "a moment later a speck closes the way round"
-    watch.look(door, sight(0.6, stamp_s=72.0))
+    watch.look(door, state(0.6, stamp_s=72.0))
     assert len(watch.exits) == 1
 
 
@@ -310,7 +310,7 @@ def test_a_way_round_that_comes_and_goes_takes_back_no_door():
     door, pillars = surroundings(wall(0.9)), surroundings(PILLARS)
     watch = watched([0.0, 0.2, 0.4, 0.6] * 3, door)
     for k in range(60):
-        watch.look(pillars if k % 2 else door, sight(0.6, stamp_s=10.0 + 0.5 * k))
+        watch.look(pillars if k % 2 else door, state(0.6, stamp_s=10.0 + 0.5 * k))
     assert len(watch.exits) == 1
 
 
@@ -321,10 +321,10 @@ def test_a_hole_in_the_wall_beside_a_door_takes_it_back_neither_for_a_moment_nor
     """`two_rooms` 790: seen from eighteen places, and gone as the drone looked back from its take-off."""
     watch = watched([0.0, 0.2, 0.4, 0.6, 0.6, 0.6, 0.6], surroundings(wall(0.9)))
     for k in range(3):
-        watch.look(surroundings(PILLARS), sight(0.6, stamp_s=5.0 + 0.5 * k))
+        watch.look(surroundings(PILLARS), state(0.6, stamp_s=5.0 + 0.5 * k))
         assert len(watch.exits) == 1
     for k in range(40):
-        watch.look(surroundings(PILLARS), sight(-2.2, stamp_s=6.0 + 0.5 * k))
+        watch.look(surroundings(PILLARS), state(-2.2, stamp_s=6.0 + 0.5 * k))
     assert len(watch.exits) == 1
 
 
@@ -340,15 +340,15 @@ VIEW = View(0.0, np.ones((3, 4)), np.full((3, 4), 0.1), np.eye(3), np.eye(4))
 
 
 def test_no_look_without_a_view_or_metres():
-    assert ExitTracker().due(sight(0.0, view=VIEW))
-    assert not ExitTracker().due(sight(0.0)), "what the grid shows is no older than the last one"
-    assert not ExitTracker().due(sight(0.0, view=VIEW, metric=False))
-    assert not ExitTracker().due(sight(0.0, view=VIEW, tracked=False))
+    assert ExitTracker().due(state(0.0, view=VIEW))
+    assert not ExitTracker().due(state(0.0)), "what the grid shows is no older than the last one"
+    assert not ExitTracker().due(state(0.0, view=VIEW, metric=False))
+    assert not ExitTracker().due(state(0.0, view=VIEW, tracked=False))
 
 
 def test_no_look_counts_in_a_piece_of_map_that_may_lie_elsewhere():
-    assert ExitTracker().due(sight(0.0, view=VIEW, apart_sigma_m=0.1))
-    assert not ExitTracker().due(sight(0.0, view=VIEW, apart_sigma_m=0.13))
+    assert ExitTracker().due(state(0.0, view=VIEW, submap_sigma_m=0.1))
+    assert not ExitTracker().due(state(0.0, view=VIEW, submap_sigma_m=0.13))
 
 
 @pytest.mark.parametrize("angle", ANGLES)
@@ -377,10 +377,10 @@ def test_what_is_looked_at_in_vain_is_left():
     near, far = layer.cells(np.array([[0.5, 0.0]])), layer.cells(np.array([[4.0, 0.0]]))
     both = np.concatenate([near, far])
     for k in range(12):
-        kept = looks.worth(both, layer, sight(0.0, stamp_s=0.5 * k))
+        kept = looks.worth(both, layer, state(0.0, stamp_s=0.5 * k))
     assert kept.tolist() == far.tolist()
     assert not looks.over(100.0)
-    looks.worth(near, layer, sight(0.0, stamp_s=6.0))
+    looks.worth(near, layer, state(0.0, stamp_s=6.0))
     assert not looks.over(18.0) and looks.over(20.0)
 
 
@@ -409,12 +409,12 @@ def test_an_exit_stays_where_its_pictures_stay():
     walls, watch = surroundings(wall(0.9)), ExitTracker()
     for k, x in enumerate([0.0, 0.2, 0.4, 0.6]):
         view = View(0.5 * k, np.zeros((2, 2)), np.zeros((2, 2)), np.eye(3), np.eye(4), picture=10 + k)
-        watch.look(walls, sight(x, stamp_s=0.5 * k, view=view))
+        watch.look(walls, state(x, stamp_s=0.5 * k, view=view))
     before, after = np.stack([np.eye(4)] * 2), np.stack([np.eye(4)] * 2)
     before[1, 0, 3], after[1, 0, 3] = 2.0, 3.0
     watch.carry(MapUpdate(before, after, pictures=np.array([10, 90])))
     unseen = surroundings(lambda a, b: np.zeros(a.shape, bool), lambda a, b: np.ones(a.shape, bool))
-    watch.look(unseen, sight(0.0, stamp_s=3.0, yaw=-2.0))
+    watch.look(unseen, state(0.0, stamp_s=3.0, yaw=-2.0))
     assert [e.centre_w[:2] for e in watch.exits] == [pytest.approx([2.0, 0.0], abs=0.15)]
 
 
@@ -425,7 +425,7 @@ def test_exits_go_along_with_the_map():
     after = np.array([[[0.0, -1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]])
     watch.carry(MapUpdate(before, after, 1.3))
     unseen = surroundings(lambda a, b: np.zeros(a.shape, bool), lambda a, b: np.ones(a.shape, bool))
-    watch.look(unseen, sight(0.0, stamp_s=3.0, yaw=-2.0))
+    watch.look(unseen, state(0.0, stamp_s=3.0, yaw=-2.0))
     (exit_,) = watch.exits
     assert exit_.centre_w[:2] == pytest.approx([0.0, 2.6], abs=0.15)
     assert exit_.normal_w[:2] == pytest.approx([0.0, 1.0], abs=0.1)
@@ -435,22 +435,22 @@ def test_exits_go_along_with_the_map():
 def test_a_revised_unit_forgets_exits_if_no_view_says_where_they_went():
     pilot = Pilot(GoTo(np.array([3.0, 0.0, 1.15])))
     pilot.exits = watched([0.0, 0.2, 0.4, 0.6], surroundings(wall(0.9)))
-    pilot.update(sight(0.0, stamp_s=9.0))
+    pilot.update(state(0.0, stamp_s=9.0))
     assert len(pilot.exits.exits) <= 1
-    waits = pilot.update(replace(sight(0.0, stamp_s=9.1), revision=1))
+    waits = pilot.update(replace(state(0.0, stamp_s=9.1), revision=1))
     assert pilot.exits.exits and "revised" in waits.why and not any(waits.sticks())
-    pilot.update(replace(sight(0.0, stamp_s=10.2), revision=1))
+    pilot.update(replace(state(0.0, stamp_s=10.2), revision=1))
     assert pilot.exits.exits == ()
 
 
 def test_a_revised_unit_keeps_exits_that_a_view_carries_along():
     pilot = Pilot(GoTo(np.array([3.0, 0.0, 1.15])))
     pilot.exits = watched([0.0, 0.2, 0.4, 0.6], surroundings(wall(0.9)))
-    pilot.update(sight(0.0, stamp_s=9.0))
+    pilot.update(state(0.0, stamp_s=9.0))
     assert len(pilot.exits.exits) == 1
     here = np.eye(4)[None]
-    pilot.update(replace(sight(0.0, stamp_s=9.1, yaw=2.0), revision=1, moved=MapUpdate(here, here, 1.2)))
-    pilot.update(replace(sight(0.0, stamp_s=9.7, yaw=2.0, view=VIEW), revision=1))
+    pilot.update(replace(state(0.0, stamp_s=9.1, yaw=2.0), revision=1, map_update=MapUpdate(here, here, 1.2)))
+    pilot.update(replace(state(0.0, stamp_s=9.7, yaw=2.0, view=VIEW), revision=1))
     assert [e.centre_w[0] for e in pilot.exits.exits] == [pytest.approx(2.4, abs=0.15)]
 
 
@@ -472,10 +472,10 @@ def test_the_pilot_tells_its_task_of_candidates(monkeypatch):
     task = Explore()
     pilot = Pilot(task)
     pilot.exits = watched([0.0] * 8, surroundings(wall(0.9)))
-    pilot.update(sight(0.0, stamp_s=9.0, view=VIEW))
+    pilot.update(state(0.0, stamp_s=9.0, view=VIEW))
     assert pilot.exits.candidates
-    assert task.heading_rad(sight(1.0, stamp_s=9.1)) is not None, "it looks around first"
-    assert len(task.goals(surroundings(wall(0.9)).layer, sight(-1.0, stamp_s=9.2)))
+    assert task.heading_rad(state(1.0, stamp_s=9.1)) is not None, "it looks around first"
+    assert len(task.goals(surroundings(wall(0.9)).layer, state(-1.0, stamp_s=9.2)))
 
 
 def test_the_pilot_tells_its_task_of_exits(monkeypatch):
@@ -488,5 +488,5 @@ def test_the_pilot_tells_its_task_of_exits(monkeypatch):
 
     pilot = Pilot(Listens(np.array([3.0, 0.0, 1.15])))
     pilot.exits = watched([0.0, 0.2, 0.4, 0.6], surroundings(wall(0.9)))
-    pilot.update(sight(0.6, stamp_s=9.0, view=VIEW))
+    pilot.update(state(0.6, stamp_s=9.0, view=VIEW))
     assert [e.centre_w[0] for e in told] == [pytest.approx(2.0, abs=0.15)]

@@ -9,13 +9,13 @@ from edgeslam_torch.navigation.drone_state import DroneState
 AHEAD = np.array([1.0, 0.0])
 
 
-def held_after_s(velocities_w, told_m_s, towards_w=lambda k: AHEAD, seconds=6.0):
-    """When it is held first, of a push by 20 sights a second; None if never."""
+def held_after_s(velocities_w, reported_m_s, towards_w=lambda k: AHEAD, seconds=6.0):
+    """When it is held first, of a push by 20 states a second; None if never."""
     push = Push()
     for k in range(round(20 * seconds)):
         now = k / 20
-        sight = DroneState(now, np.zeros(3), 0.0, np.array([*velocities_w(k), 0.0]), told_speed_m_s=told_m_s(k))
-        if push.holds(sight, towards_w(k), now):
+        state = DroneState(now, np.zeros(3), 0.0, np.array([*velocities_w(k), 0.0]), reported_speed_m_s=reported_m_s(k))
+        if push.holds(state, towards_w(k), now):
             return now
     return None
 
@@ -26,7 +26,7 @@ def shaking(k):
 
 
 @pytest.mark.parametrize(
-    ("velocities_w", "told_m_s"),
+    ("velocities_w", "reported_m_s"),
     [
         (lambda k: (0.0, 0.0), lambda k: np.nan),
         (lambda k: (0.03, 0.0), lambda k: 0.3),  # the radio repeats an old message
@@ -34,12 +34,12 @@ def shaking(k):
         (lambda k: (-0.2, 0.0), lambda k: 0.0),  # a pose that runs away
     ],
 )
-def test_it_is_held_after_a_second_and_a_half(velocities_w, told_m_s):
-    assert held_after_s(velocities_w, told_m_s) == pytest.approx(1.55, abs=0.06)
+def test_it_is_held_after_a_second_and_a_half(velocities_w, reported_m_s):
+    assert held_after_s(velocities_w, reported_m_s) == pytest.approx(1.55, abs=0.06)
 
 
 @pytest.mark.parametrize(
-    ("velocities_w", "told_m_s"),
+    ("velocities_w", "reported_m_s"),
     [
         (lambda k: (0.2, 0.0), lambda k: 0.2),
         (lambda k: (0.2, 0.0), lambda k: 0.0),  # the drone repeats that it stands, and the pictures move
@@ -48,8 +48,8 @@ def test_it_is_held_after_a_second_and_a_half(velocities_w, told_m_s):
         (lambda k: (0.0, 0.2), lambda k: 0.2),  # along what it pushes against
     ],
 )
-def test_it_is_not_held_where_it_moves(velocities_w, told_m_s):
-    assert held_after_s(velocities_w, told_m_s) is None
+def test_it_is_not_held_where_it_moves(velocities_w, reported_m_s):
+    assert held_after_s(velocities_w, reported_m_s) is None
 
 
 def test_to_and_fro_is_no_push():

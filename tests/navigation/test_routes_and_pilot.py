@@ -139,7 +139,7 @@ def test_frontiers_are_where_the_known_ends():
 
 
 @pytest.mark.parametrize(
-    ("wish", "sticks"),
+    ("command", "sticks"),
     [
         (VelocityCommand(forward_m_s=0.5), (0.0, 0.5, 0.0, 0.0)),
         (VelocityCommand(left_m_s=0.5), (-0.5, 0.0, 0.0, 0.0)),
@@ -148,8 +148,8 @@ def test_frontiers_are_where_the_known_ends():
         (VelocityCommand(forward_m_s=9.0), (0.0, 1.0, 0.0, 0.0)),
     ],
 )
-def test_wishes_become_sticks(wish, sticks):
-    assert wish.sticks() == pytest.approx(sticks)
+def test_wishes_become_sticks(command, sticks):
+    assert command.sticks() == pytest.approx(sticks)
 
 
 def test_a_wish_that_is_no_number_is_refused():
@@ -189,11 +189,11 @@ def test_a_sweep_leaves_out_the_side_where_the_pose_is_lost():
     for k in range(400):
         lost = yaw < math.radians(-30.0)
         height = min(1.4, 0.05 * k) if pilot.phase is Phase.RISING else 1.4
-        wish = pilot.update(DroneState(k / 20, np.array([0.0, 0.0, height]), yaw, np.zeros(3), tracked=not lost))
+        command = pilot.update(DroneState(k / 20, np.array([0.0, 0.0, height]), yaw, np.zeros(3), tracked=not lost))
         if pilot.phase is not Phase.RISING and pilot.phase is not Phase.SWEEPING:
             break
         seen.append(yaw)
-        yaw += wish.turn_left_rad_s / 20
+        yaw += command.turn_left_rad_s / 20
     assert pilot.phase is Phase.SINKING
     assert math.radians(-35.0) < min(seen) < math.radians(-30.0)
     assert max(seen) > math.radians(36.0)
@@ -203,8 +203,8 @@ def test_its_speed_averages_out_what_telemetry_cuts_off():
     """Readings of whole decimetres a second, with half a step added, are right in the mean along a free way."""
     pilot, speeds = before_a_free_way(), []
     for k in range(15 * 4):
-        wish = pilot.update(at(0.0, 0.0, speed_m_s=0.45, stamp_s=k / 15))
-        speeds.append(wish.forward_m_s)
+        command = pilot.update(at(0.0, 0.0, speed_m_s=0.45, stamp_s=k / 15))
+        speeds.append(command.forward_m_s)
     way, read = sum(speeds), sum(math.floor(10.0 * v) / 10.0 + 0.05 for v in speeds)
     assert read == pytest.approx(way, rel=0.02)
     assert 0.39 < min(speeds) < 0.42 and 0.48 < max(speeds) <= 0.5
@@ -216,8 +216,8 @@ def test_without_a_picture_it_flies_in_no_direction_that_telemetry_does_not_tell
     pilot, sideways = before_a_free_way(), []
     pilot.task = GoTo(np.array([6.0, 0.75, 1.15]))
     for k in range(15):
-        wish = pilot.update(at(0.0, 0.0, speed_m_s=0.45, stamp_s=k / 15, tracked=tracked))
-        sideways.append(abs(wish.left_m_s))
+        command = pilot.update(at(0.0, 0.0, speed_m_s=0.45, stamp_s=k / 15, tracked=tracked))
+        sideways.append(abs(command.left_m_s))
     assert any(0.0 < v < 0.1 for v in sideways) == tracked
 
 
@@ -234,8 +234,8 @@ def test_where_no_way_is_known_it_looks_left_and_right_of_the_goal():
     pilot.task = GoTo(np.array([0.0, 5.0, 1.15]))
     pilot.space.points(np.array([[x, 1.0, z] for x in np.arange(-9.0, 9.0, 0.05) for z in (1.05, 1.15, 1.25)]))
     for k in range(15 * 12):
-        wish = pilot.update(at(0.0, 0.0, yaw_rad=yaw, stamp_s=k / 15))
-        yaw += wish.turn_left_rad_s / 15
+        command = pilot.update(at(0.0, 0.0, yaw_rad=yaw, stamp_s=k / 15))
+        yaw += command.turn_left_rad_s / 15
         seen.append(math.degrees(yaw))
     assert 20.0 < min(seen[60:]) < 45.0
     assert 135.0 < max(seen[60:]) < 160.0
@@ -257,10 +257,10 @@ def before_a_strip(gap_m=None):
 
 
 def after_looking(pilot):
-    """Its wish when it has looked from where it is, in vain."""
+    """Its command when it has looked from where it is, in vain."""
     for k in range(300):
-        wish = pilot.update(replace(at(0.3, 0.05), stamp_s=k / 15))
-        assert math.hypot(wish.forward_m_s, wish.left_m_s) < 0.01
+        command = pilot.update(replace(at(0.3, 0.05), stamp_s=k / 15))
+        assert math.hypot(command.forward_m_s, command.left_m_s) < 0.01
         if pilot.phase is Phase.RISING:
             break
     assert pilot.phase is Phase.RISING
@@ -269,8 +269,8 @@ def after_looking(pilot):
 
 
 def test_after_a_look_in_vain_it_passes_the_unseen_slowly_at_a_hulls_distance():
-    wish = after_looking(before_a_strip())
-    assert 0.1 < wish.forward_m_s <= 0.31
+    command = after_looking(before_a_strip())
+    assert 0.1 < command.forward_m_s <= 0.31
 
 
 @pytest.mark.parametrize(("gap_m", "passes"), [(None, True), (0.7, True), (0.3, False)])
@@ -322,7 +322,7 @@ def test_small_movements_to_and_fro_are_ended_by_a_look_from_higher_once():
 def test_what_closes_the_way_is_doubted_once_before_the_task_is_given_up():
     pilot = before_a_free_way()
     closed(pilot)
-    pilot.touched(Contact(np.array([0.0, 3.0, 1.15]), np.array([0.0, 1.0])))
+    pilot.add_contact(Contact(np.array([0.0, 3.0, 1.15]), np.array([0.0, 1.0])))
     phases = stays(pilot, 14.5)
     assert set(phases) == {Phase.FLYING} and pilot.space.layer(1.15, 0.15).solid.any()
     phases = stays(pilot, 1.0, 14.5)
@@ -352,7 +352,7 @@ def test_a_lost_pose_doubts_nothing():
 def test_time_in_which_its_wishes_are_not_followed_is_no_lack_of_progress():
     pilot = before_a_free_way()
     closed(pilot)
-    assert set(stays(pilot, 30.0, hindered=True)) == {Phase.FLYING}
+    assert set(stays(pilot, 30.0, overridden=True)) == {Phase.FLYING}
     assert Phase.RISING in stays(pilot, 16.0, 30.0)
 
 
@@ -365,9 +365,9 @@ def test_a_map_that_moves_is_no_progress():
     for k in range(36):
         after = before.copy()
         after[0, 3] = 0.1 * (k % 2 == 0)
-        moved = MapUpdate(before[None], after[None])
+        update = MapUpdate(before[None], after[None])
         before = after
-        pilot.update(replace(at(after[0, 3], 0.0, stamp_s=0.5 * k), moved=moved if k else None))
+        pilot.update(replace(at(after[0, 3], 0.0, stamp_s=0.5 * k), map_update=update if k else None))
         if pilot.phase is Phase.RISING:
             pilot.phase = Phase.FLYING
     assert pilot._doubted_w is not None
@@ -386,8 +386,8 @@ def test_what_another_piece_of_map_showed_is_forgotten_when_it_may_lie_elsewhere
     for k in range(4):
         see(1.0 + k / 5, -math.pi / 2)
     for k in range(4):
-        see(3.0 + k / 5, math.pi / 2, piece=1, apart_sigma_m=0.03)
-    see(5.0, math.pi / 2, piece=1, apart_sigma_m=apart_m)
+        see(3.0 + k / 5, math.pi / 2, submap=1, submap_sigma_m=0.03)
+    see(5.0, math.pi / 2, submap=1, submap_sigma_m=apart_m)
     layer = pilot.walls().layer
     old, new = (bool(layer.free[tuple(layer.cells(np.array([0.05, y])))]) for y in (-1.55, 1.55))
     assert (old, new) == (not forgotten, True)
@@ -402,10 +402,10 @@ def test_it_does_not_rise_for_a_view_that_a_lost_pose_cannot_give():
 
 def test_a_carried_pose_keeps_the_height_that_the_drone_measures():
     """It thinks that it sank to .9 m, and rose to 1.4."""
-    told = replace(at(0.0, 0.0), p_w=np.array([0.0, 0.0, 0.9]), told_height_m=1.4)
+    told = replace(at(0.0, 0.0), p_w=np.array([0.0, 0.0, 0.9]), reported_height_m=1.4)
     assert before_a_free_way().update(told).up_m_s > 0.1
     assert before_a_free_way().update(replace(told, tracked=False)).up_m_s < -0.1
-    assert before_a_free_way().update(replace(told, tracked=False, told_height_m=math.nan)).up_m_s > 0.1
+    assert before_a_free_way().update(replace(told, tracked=False, reported_height_m=math.nan)).up_m_s > 0.1
 
 
 @pytest.mark.parametrize(("off_m", "arrived"), [(0.14, True), (0.2, False), (0.28, False)])
@@ -438,11 +438,11 @@ def test_a_pose_that_is_lost_near_the_goal_again_and_again_comes_no_nearer(off_m
     goal, there = GoTo(np.array([12.0, 0.0, 1.15])), replace(at(12.0 - off_m, 0.0), position_sigma_m=0.05)
     for _ in range(3):  # what is lost on the way says nothing about the goal
         goal.done(at(10.9, 0.0))
-        goal.done(at(11.0, 0.0, tracked=False, hindered=True))
+        goal.done(at(11.0, 0.0, tracked=False, overridden=True))
     for _ in range(tries):
         assert not goal.done(replace(at(11.0, 0.0)))
         assert not goal.done(replace(there, tracked=False)), "carried on"
-        done = [goal.done(replace(there, tracked=False, hindered=True)) for _ in range(5)]
+        done = [goal.done(replace(there, tracked=False, overridden=True)) for _ in range(5)]
     assert done == 5 * [arrived]
     assert not goal.done(at(11.0, 0.0))
 
@@ -457,7 +457,7 @@ def test_it_gives_up_where_its_pose_is_lost_again_and_again(places, gives_up):
     for x in places:
         for lost in (False, True, True):
             now_s += 0.1
-            pilot.update(at(x, 0.0, now_s, tracked=not lost, hindered=lost))
+            pilot.update(at(x, 0.0, now_s, tracked=not lost, overridden=lost))
     assert (pilot.phase is Phase.STUCK) == gives_up
     assert pilot.why_stuck() == ("its pose is lost there again and again" if gives_up else "no way")
     pilot.begin(pilot.task)
@@ -471,15 +471,15 @@ def test_who_searches_and_who_comes_home_does_not_give_up(task):
     pilot = before_a_free_way()
     pilot.begin(task)
     for k in range(12):
-        pilot.update(at(2.0, 0.0, 10.0 + 0.1 * k, tracked=bool(k % 2), hindered=not k % 2))
+        pilot.update(at(2.0, 0.0, 10.0 + 0.1 * k, tracked=bool(k % 2), overridden=not k % 2))
     assert pilot._losses.count == 6 and pilot.phase is not Phase.STUCK
 
 
 def test_a_hulls_distance_is_for_the_unseen_not_for_solids():
     """A gap of half a metre is narrower than it flies through; a look in vain does not change that."""
     assert after_looking(before_a_strip(gap_m=1.2)).forward_m_s > 0.1
-    wish = after_looking(before_a_strip(gap_m=0.5))
-    assert math.hypot(wish.forward_m_s, wish.left_m_s) < 0.01
+    command = after_looking(before_a_strip(gap_m=0.5))
+    assert math.hypot(command.forward_m_s, command.left_m_s) < 0.01
 
 
 def test_a_goal_beyond_the_grid_is_aimed_at_from_its_border():

@@ -104,9 +104,9 @@ def test_what_was_seen_in_a_glimpse_may_be_looked_at_from_where_that_was():
     """In a corridor of two metres there is no other place before a door."""
     before = np.array([1.8, 0.0])
     assert considering(Candidate(DOOR.centre_w, DOOR.normal_w, before)).heading_rad(at(*before)) is None
-    glimpsed = considering(Candidate(DOOR.centre_w, DOOR.normal_w, before, elsewhere=False))
-    assert glimpsed.heading_rad(at(*before)) == pytest.approx(0.0)
-    assert np.linalg.norm(wanted(glimpsed, room()) - before, axis=1).min() < 0.1
+    hypotheses = considering(Candidate(DOOR.centre_w, DOOR.normal_w, before, elsewhere=False))
+    assert hypotheses.heading_rad(at(*before)) == pytest.approx(0.0)
+    assert np.linalg.norm(wanted(hypotheses, room()) - before, axis=1).min() < 0.1
 
 
 def test_what_a_look_left_in_doubt_is_looked_at_from_elsewhere_twice_more():
@@ -158,10 +158,10 @@ def test_exploring_looks_at_every_wall_from_before_and_then_ends():
     """A drone that is at its goal at once; of the border of the unseen it sees no more."""
     task, layer, x, y, yaw = Explore(), plain(5.0), 2.0, 0.0, 0.0
     for now_s in np.arange(0.0, 400.0, 0.1):
-        sight = DroneState(now_s, np.array([x, y, 1.15]), yaw, np.zeros(3))
-        if task.done(sight):
+        state = DroneState(now_s, np.array([x, y, 1.15]), yaw, np.zeros(3))
+        if task.done(state):
             break
-        if (heading := task.heading_rad(sight)) is not None:
+        if (heading := task.heading_rad(state)) is not None:
             yaw += float(np.clip(math.remainder(heading - yaw, 2.0 * math.pi), -0.1, 0.1))
         elif len(found := goals(task, layer, x, y, now_s)):
             x, y = found[np.argmin(np.hypot(*(found - [x, y]).T))]
@@ -186,7 +186,7 @@ def test_exploring_leaves_narrow_borders_for_later():
 class Nothing:
     """Looks around that have nothing to look at."""
 
-    def goals(self, layer, sight):
+    def goals(self, layer, state):
         return np.zeros((0, 2), int)
 
 

@@ -146,17 +146,17 @@ def test_what_it_hovers_before_fills_no_memory_and_what_it_passed_is_kept():
 
 def test_a_doubted_wall_is_unseen_until_it_is_seen_again_also_after_the_map_moved():
     """Before it is free all the while, and nobody frees it."""
-    space, moved = Space(), MapUpdate(facing_a_wall().T_w_c[None], facing_a_wall(x=1.0).T_w_c[None])
+    space, update = Space(), MapUpdate(facing_a_wall().T_w_c[None], facing_a_wall(x=1.0).T_w_c[None])
     seen(space)
     space.doubt_solids()
     layer = space.layer(1.15, 0.15)
     assert cell(layer, 1.55, 0.05) == (True, False) and not layer.solid.any() and not cell(layer, 2.05, 0.05)[0]
-    space.rebuild(moved)
+    space.rebuild(update)
     layer = space.layer(1.15, 0.15)
     assert cell(layer, 2.55, 0.05) == (True, False) and not layer.solid.any()
     layer = seen(space, x=1.0)
     assert cell(layer, 3.05, 0.05)[1] or cell(layer, 2.95, 0.05)[1]
-    space.rebuild(MapUpdate(moved.after_w, moved.after_w))
+    space.rebuild(MapUpdate(update.after_w, update.after_w))
     assert space.layer(1.15, 0.15).solid.any(), "what was seen again stays"
 
 
@@ -203,7 +203,7 @@ def test_what_was_touched_is_solid_whatever_is_seen():
     space = Space()
     layer = seen(space, distance_m=4.0)
     assert cell(layer, 1.22, 0.05) == (True, False)
-    space.touched(Contact(np.array([1.05, 0.05, 1.15]), np.array([1.0, 0.0])), 0.17)
+    space.add_contact(Contact(np.array([1.05, 0.05, 1.15]), np.array([1.0, 0.0])), 0.17)
     layer = seen(space, distance_m=4.0)
     assert cell(layer, 1.22, 0.05) == (False, True), "ahead of the drone"
     assert cell(layer, 0.88, 0.05) == (True, False), "not behind it"
@@ -212,7 +212,7 @@ def test_what_was_touched_is_solid_whatever_is_seen():
 
 def test_what_was_touched_moves_with_the_map():
     space = Space()
-    space.touched(Contact(np.array([1.05, 0.05, 1.15]), np.array([1.0, 0.0])), 0.17)
+    space.add_contact(Contact(np.array([1.05, 0.05, 1.15]), np.array([1.0, 0.0])), 0.17)
     T = np.eye(4)[None]
     shifted = T.copy()
     shifted[0, :3, 3] = [1.0, 2.0, 0.0]
@@ -223,7 +223,7 @@ def test_what_was_touched_moves_with_the_map():
 
 def test_a_touch_beyond_the_grid_is_no_error():
     space = Space()
-    space.touched(Contact(np.array([100.0, 0.0, 1.15]), np.array([1.0, 0.0])), 0.17)
+    space.add_contact(Contact(np.array([100.0, 0.0, 1.15]), np.array([1.0, 0.0])), 0.17)
     assert not space.layer(1.15, 0.15).solid.any()
 
 
@@ -246,7 +246,7 @@ def test_what_was_seen_and_felt_before_a_moment_can_be_forgotten():
     for stamp_s, yaw in ((1.0, 0.0), (1.2, 0.0), (1.4, 0.0), (5.0, np.pi / 2), (5.2, np.pi / 2), (5.4, np.pi / 2)):
         space.observe(replace(facing_a_wall(yaw=yaw), stamp_s=stamp_s))
     space.flown(np.array([-3.0, 0.0, 1.15]), 0.3)
-    space.touched(Contact(np.array([0.0, -2.0, 1.15]), np.array([0.0, -1.0])), 0.3)
+    space.add_contact(Contact(np.array([0.0, -2.0, 1.15]), np.array([0.0, -1.0])), 0.3)
     layer = space.layer(1.15, 0.15)
     assert cell(layer, 1.55, 0.05)[0] and cell(layer, 0.05, 1.55)[0] and cell(layer, -3.0, 0.0)[0]
     space.forget_before(5.0)

@@ -16,35 +16,35 @@ BACK = np.array([-0.2, 0.0, 0.0])
 """As it moves while it backs up."""
 
 
-def sight(now_s, x=0.0, **fields):
+def state(now_s, x=0.0, **fields):
     fields = {"velocity_w": np.array([0.5, 0.0, 0.0]), "seen_s": now_s - 0.4} | fields
     return DroneState(now_s, np.array([x, 0.0, 1.1]), 0.0, **fields)
 
 
-def flown(supervisor, seconds, change=lambda s: s, wish=AHEAD, begin_s=0.0, x=0.0):
-    """Orders of a straight flight; ``change`` spoils its sights, ``wish`` None is a pilot that hangs."""
+def flown(supervisor, seconds, change=lambda s: s, command=AHEAD, begin_s=0.0, x=0.0):
+    """Orders of a straight flight; ``change`` spoils its states, ``command`` None is a pilot that hangs."""
     orders = []
     for k in range(round(20 * seconds)):
         now = begin_s + k / 20
-        supervisor.see(change(sight(now, x + 0.025 * k)))
-        if wish is not None:
-            supervisor.propose(wish, now)
+        supervisor.see(change(state(now, x + 0.025 * k)))
+        if command is not None:
+            supervisor.propose(command, now)
         orders.append(supervisor.order(now))
     return orders
 
 
 def test_a_healthy_flight_is_left_alone():
     orders = flown(Supervisor(), 3.0)
-    assert all(o.wish == AHEAD and not o.land and o.danger is Danger.NONE for o in orders)
+    assert all(o.command == AHEAD and not o.land and o.danger is Danger.NONE for o in orders)
 
 
 def test_a_pilot_that_hangs_gets_its_sticks_centred_then_the_drone_lands():
     supervisor = Supervisor()
     flown(supervisor, 1.0)
-    orders = flown(supervisor, LAND_S + 1.0, wish=None, begin_s=1.0)
+    orders = flown(supervisor, LAND_S + 1.0, command=None, begin_s=1.0)
     at_half_a_second = orders[10]
-    assert at_half_a_second.danger is Danger.NO_WISH
-    assert at_half_a_second.wish.sticks() == (0.0, 0.0, 0.0, 0.0)
+    assert at_half_a_second.danger is Danger.NO_COMMAND
+    assert at_half_a_second.command.sticks() == (0.0, 0.0, 0.0, 0.0)
     assert not orders[150].land and orders[-1].land
 
 
@@ -55,13 +55,13 @@ def test_an_old_picture_stops_it_and_it_backs_up_the_way_it_came():
         supervisor,
         LAND_S + 1.5,
         lambda s: replace(s, p_w=np.array([1.5, 0.0, 1.1]), velocity_w=np.zeros(3), seen_s=2.6),
-        wish=VelocityCommand(),
+        command=VelocityCommand(),
         begin_s=3.0,
     )
     assert blind[0].danger is Danger.NONE  # 0.4 s old, as always
-    assert blind[10].danger is Danger.BLIND and blind[10].wish.forward_m_s == 0.0
-    assert blind[50].wish.forward_m_s < -0.1
-    assert abs(blind[150].wish.forward_m_s) < 1e-9
+    assert blind[10].danger is Danger.BLIND and blind[10].command.forward_m_s == 0.0
+    assert blind[50].command.forward_m_s < -0.1
+    assert abs(blind[150].command.forward_m_s) < 1e-9
     assert blind[-1].land
 
 
@@ -79,7 +79,7 @@ def test_doubt_stops_it(spoilt, danger):
     flown(supervisor, 1.0)
     orders = flown(supervisor, 1.0, lambda s: replace(s, **spoilt), begin_s=1.0)
     assert {o.danger for o in orders} == {danger}
-    assert all(o.wish.forward_m_s == 0.0 for o in orders)
+    assert all(o.command.forward_m_s == 0.0 for o in orders)
 
 
 def test_telemetry_carries_it_past_what_shows_nothing_as_long_as_it_is_sure_of_its_place():
@@ -87,7 +87,7 @@ def test_telemetry_carries_it_past_what_shows_nothing_as_long_as_it_is_sure_of_i
     flown(supervisor, 1.0)
     carried = {"tracked": False, "position_sigma_m": 0.1}
     orders = flown(supervisor, 1.0, lambda s: replace(s, **carried), begin_s=1.0, x=0.5)
-    assert all(o.wish == AHEAD and o.danger is Danger.CARRIED for o in orders)  # done, and said
+    assert all(o.command == AHEAD and o.danger is Danger.DEAD_RECKONING for o in orders)  # done, and said
     waiting = flown(
         supervisor, 0.2, lambda s: replace(s, **carried), VelocityCommand(turn_left_rad_s=0.5), begin_s=2.0, x=1.0
     )
@@ -99,17 +99,17 @@ def test_it_backs_up_to_where_it_was_sure_and_a_metre_farther():
     supervisor = Supervisor()
     flown(supervisor, 2.0)
     flown(supervisor, 2.0, lambda s: replace(s, tracked=False, position_sigma_m=0.1), begin_s=2.0, x=1.0)
-    x, wishes = 1.975, []
+    x, commands = 1.975, []
     for k in range(400):
         now = 4.0 + k / 20
-        supervisor.see(replace(sight(now, x), tracked=False, position_sigma_m=0.2))
+        supervisor.see(replace(state(now, x), tracked=False, position_sigma_m=0.2))
         supervisor.propose(AHEAD, now)
-        wishes.append(supervisor.order(now))
-        x += wishes[-1].wish.forward_m_s / 20
-        if wishes[-1].land:
+        commands.append(supervisor.order(now))
+        x += commands[-1].command.forward_m_s / 20
+        if commands[-1].land:
             break
     assert x == pytest.approx(0.0, abs=0.15)
-    assert max(o.wish.forward_m_s for o in wishes) <= 0.0
+    assert max(o.command.forward_m_s for o in commands) <= 0.0
 
 
 def test_it_backs_up_although_it_has_drifted_beside_its_way():
@@ -118,8 +118,8 @@ def test_it_backs_up_although_it_has_drifted_beside_its_way():
     flown(supervisor, 3.0)
     aside = {"p_w": np.array([0.975, 0.2, 1.1]), "velocity_w": BACK, "tracked": False, "position_sigma_m": 0.2}
     lost = flown(supervisor, 4.0, lambda s: replace(s, **aside), begin_s=3.0)
-    assert lost[-1].wish.why.endswith("back the way it came") and lost[-1].wish.left_m_s < 0.0
-    assert lost[-1].wish.forward_m_s < 1e-6
+    assert lost[-1].command.why.endswith("back the way it came") and lost[-1].command.left_m_s < 0.0
+    assert lost[-1].command.forward_m_s < 1e-6
 
 
 def test_on_its_way_home_it_backs_up_the_way_it_came_not_the_way_it_had_gone():
@@ -127,13 +127,13 @@ def test_on_its_way_home_it_backs_up_the_way_it_came_not_the_way_it_had_gone():
     supervisor = Supervisor()
     flown(supervisor, 6.0)
     for k in range(80):
-        supervisor.see(replace(sight(6.0 + k / 20, 3.0 - 0.025 * k), p_w=np.array([3.0 - 0.025 * k, 0.1, 1.1])))
+        supervisor.see(replace(state(6.0 + k / 20, 3.0 - 0.025 * k), p_w=np.array([3.0 - 0.025 * k, 0.1, 1.1])))
         supervisor.propose(AHEAD, 6.0 + k / 20)
         supervisor.order(6.0 + k / 20)
     stays = {"p_w": np.array([1.0, 0.1, 1.1]), "velocity_w": -BACK, "tracked": False, "position_sigma_m": 0.2}
     lost = flown(supervisor, 4.0, lambda s: replace(s, **stays), begin_s=10.0)
-    backing = [o.wish for o in lost if o.wish.why.endswith("back the way it came")]
-    assert backing and all(wish.forward_m_s > 0.1 for wish in backing)
+    backing = [o.command for o in lost if o.command.why.endswith("back the way it came")]
+    assert backing and all(command.forward_m_s > 0.1 for command in backing)
 
 
 def test_telemetry_tells_how_far_it_backed_up():
@@ -142,7 +142,7 @@ def test_telemetry_tells_how_far_it_backed_up():
     flown(supervisor, 6.0)
     stays = {"p_w": np.array([2.9, 0.0, 1.1]), "velocity_w": BACK, "tracked": False, "position_sigma_m": 0.2}
     lost = flown(supervisor, 5.45, lambda s: replace(s, **stays), begin_s=6.0)
-    speeds = [-o.wish.forward_m_s for o in lost if o.wish.why.endswith("back the way it came")][:80]
+    speeds = [-o.command.forward_m_s for o in lost if o.command.why.endswith("back the way it came")][:80]
     assert len(speeds) >= 75
     told = [math.floor(10.0 * v) / 10.0 + 0.05 for v in speeds]
     assert sum(told) == pytest.approx(sum(speeds), rel=0.03)
@@ -155,8 +155,8 @@ def test_without_a_picture_it_moves_in_no_direction_that_telemetry_does_not_tell
     flown(supervisor, 3.0)
     aside = {"p_w": np.array([0.975, 0.03, 1.1]), "velocity_w": BACK, "tracked": False, "position_sigma_m": 0.2}
     lost = flown(supervisor, 4.0, lambda s: replace(s, **aside), begin_s=3.0)
-    backing = [o.wish for o in lost if o.wish.why.endswith("back the way it came")]
-    assert backing and all(wish.left_m_s == 0.0 and wish.forward_m_s < -0.15 for wish in backing)
+    backing = [o.command for o in lost if o.command.why.endswith("back the way it came")]
+    assert backing and all(command.left_m_s == 0.0 and command.forward_m_s < -0.15 for command in backing)
 
 
 def test_a_pose_lost_in_a_turn_is_looked_for_where_it_was_known():
@@ -166,9 +166,9 @@ def test_a_pose_lost_in_a_turn_is_looked_for_where_it_was_known():
     for k in range(60):
         now, lost = k / 20, k > 30
         yaw = min(k, 30) / 30 * math.radians(45.0) if not lost else yaw + turns[-1] / 20
-        supervisor.see(replace(sight(now), yaw_rad=yaw, tracked=not lost, velocity_w=np.zeros(3)))
+        supervisor.see(replace(state(now), yaw_rad=yaw, tracked=not lost, velocity_w=np.zeros(3)))
         supervisor.propose(VelocityCommand(turn_left_rad_s=0.5), now)
-        turns.append(supervisor.order(now).wish.turn_left_rad_s)
+        turns.append(supervisor.order(now).command.turn_left_rad_s)
     assert max(turns[31:40]) < -0.5
     assert yaw == pytest.approx(math.radians(45.0 * (30 - 24) / 30), abs=math.radians(5.0))
 
@@ -176,10 +176,10 @@ def test_a_pose_lost_in_a_turn_is_looked_for_where_it_was_known():
 def test_doubtful_metres_make_it_rise_and_sink_but_not_leave_its_heights():
     supervisor = Supervisor(NavLimits(highest_m=1.15))
     orders = flown(supervisor, 5.0, lambda s: replace(s, metric=False))
-    up = [o.wish.up_m_s for o in orders]
+    up = [o.command.up_m_s for o in orders]
     assert max(up) > 0.1 and min(up) < -0.1
     high = flown(supervisor, 1.0, lambda s: replace(s, metric=False, p_w=np.array([0, 0, 1.3])), begin_s=5.0)
-    assert max(o.wish.up_m_s for o in high) <= 0.0
+    assert max(o.command.up_m_s for o in high) <= 0.0
 
 
 def test_commanded_and_not_moving_is_a_contact_and_lands_in_the_end():
@@ -189,7 +189,7 @@ def test_commanded_and_not_moving_is_a_contact_and_lands_in_the_end():
         supervisor, 8.0, lambda s: replace(s, p_w=np.array([0.5, 0, 1.1]), velocity_w=np.zeros(3)), begin_s=1.0
     )
     assert held[20].danger is Danger.NONE
-    assert held[40].danger is Danger.HELD
+    assert held[40].danger is Danger.CONTACT
     assert held[-1].land
 
 
@@ -197,19 +197,19 @@ def test_what_holds_the_drone_is_told_once_with_its_direction():
     """It looks along y and is told to go left: along -x."""
     supervisor = Supervisor()
     still = {"p_w": np.array([0.5, 0, 1.1]), "velocity_w": np.zeros(3), "yaw_rad": math.pi / 2}
-    touches = []
+    contacts = []
     for k in range(60):
         now = 1.0 + k / 15
-        supervisor.see(replace(sight(now), **still))
+        supervisor.see(replace(state(now), **still))
         supervisor.propose(VelocityCommand(left_m_s=0.4), now)
-        touches.append(supervisor.order(now).touch)
-    (touch,) = [t for t in touches if t is not None]
-    np.testing.assert_allclose(touch.p_w, [0.5, 0, 1.1])
-    np.testing.assert_allclose(touch.towards_w, [-1.0, 0.0], atol=1e-9)
+        contacts.append(supervisor.order(now).contact)
+    (contact,) = [t for t in contacts if t is not None]
+    np.testing.assert_allclose(contact.p_w, [0.5, 0, 1.1])
+    np.testing.assert_allclose(contact.towards_w, [-1.0, 0.0], atol=1e-9)
 
 
 def test_a_drone_that_is_told_to_wait_is_not_held():
-    """Metres are not sure: it goes up and down whatever the pilot wishes, and that is no contact."""
+    """Metres are not sure: it goes up and down whatever the pilot commands, and that is no contact."""
     supervisor = Supervisor()
     flown(supervisor, 1.0)
     still = {"velocity_w": np.zeros(3), "p_w": np.array([0.5, 0, 1.1])}
@@ -221,7 +221,7 @@ def test_a_drone_that_is_told_to_wait_is_not_held():
 
 def test_battery_calls_home_and_then_lands():
     low = flown(Supervisor(), 1.0, lambda s: replace(s, battery=0.2))
-    assert all(o.home and not o.land and o.wish == AHEAD for o in low)
+    assert all(o.home and not o.land and o.command == AHEAD for o in low)
     empty = Supervisor()
     assert flown(empty, 0.2, lambda s: replace(s, battery=0.08))[-1].land
     assert flown(empty, 0.2, begin_s=0.2)[-1].land  # once it lands, it lands
@@ -233,32 +233,32 @@ def test_the_fence_stops_what_leads_out_and_lets_it_return():
     flown(out, 1.0)
     at_fence = lambda s: replace(s, p_w=np.array([2.1, 0.0, 1.1]))  # noqa: E731
     assert flown(out, 0.5, at_fence, begin_s=1.0)[-1].danger is Danger.FENCE
-    back = flown(out, 0.5, at_fence, wish=VelocityCommand(forward_m_s=-0.3), begin_s=1.5)
+    back = flown(out, 0.5, at_fence, command=VelocityCommand(forward_m_s=-0.3), begin_s=1.5)
     assert back[-1].danger is Danger.NONE
 
 
 def test_before_it_sees_anything_it_does_nothing():
     order = Supervisor().order(0.0)
-    assert order.wish.sticks() == (0.0, 0.0, 0.0, 0.0) and not order.land
+    assert order.command.sticks() == (0.0, 0.0, 0.0, 0.0) and not order.land
 
 
 def test_heights_are_kept():
     limits = NavLimits(lowest_m=0.5, highest_m=1.5)
     rising = flown(
-        Supervisor(limits), 0.5, lambda s: replace(s, p_w=np.array([0, 0, 1.6])), wish=VelocityCommand(up_m_s=0.3)
+        Supervisor(limits), 0.5, lambda s: replace(s, p_w=np.array([0, 0, 1.6])), command=VelocityCommand(up_m_s=0.3)
     )
-    assert rising[-1].wish.up_m_s == 0.0
+    assert rising[-1].command.up_m_s == 0.0
     sinking = flown(
-        Supervisor(limits), 0.5, lambda s: replace(s, p_w=np.array([0, 0, 0.4])), wish=VelocityCommand(up_m_s=-0.3)
+        Supervisor(limits), 0.5, lambda s: replace(s, p_w=np.array([0, 0, 0.4])), command=VelocityCommand(up_m_s=-0.3)
     )
-    assert sinking[-1].wish.up_m_s == 0.0
-    assert math.isclose(flown(Supervisor(limits), 0.5, wish=VelocityCommand(up_m_s=0.3))[-1].wish.up_m_s, 0.3)
+    assert sinking[-1].command.up_m_s == 0.0
+    assert math.isclose(flown(Supervisor(limits), 0.5, command=VelocityCommand(up_m_s=0.3))[-1].command.up_m_s, 0.3)
 
 
 def test_doubtful_metres_have_longer_to_mend_and_still_end_in_a_landing():
     orders = flown(Supervisor(), UNSURE_LAND_S + 1.0, lambda s: replace(s, metric=False, p_w=np.array([0.0, 0.0, 1.1])))
     assert not any(o.land for o in orders[: round(20 * UNSURE_LAND_S) - 1]) and orders[-1].land
-    up = [o.wish.up_m_s for o in orders[:-30]]
+    up = [o.command.up_m_s for o in orders[:-30]]
     assert min(up) < 0 < max(up) and abs(sum(up)) < 41 * max(up), "up and down about where it was"
 
 
@@ -281,34 +281,36 @@ def test_troubles_that_take_turns_end_in_a_landing_too():
 
 def test_heights_of_a_map_without_metres_are_not_believed_when_the_drone_tells_its_own():
     def low_by_a_map(s):
-        return replace(s, metric=False, p_w=np.array([0.0, 0.0, 0.3]), told_height_m=2.0)
+        return replace(s, metric=False, p_w=np.array([0.0, 0.0, 0.3]), reported_height_m=2.0)
 
-    up = [o.wish.up_m_s for o in flown(Supervisor(), 8.0, low_by_a_map)]
+    up = [o.command.up_m_s for o in flown(Supervisor(), 8.0, low_by_a_map)]
     assert max(up) <= 0.0 and min(up) < -0.1, "2 m by its own word: down, whatever the map calls 0.3"
 
 
 def test_a_map_that_is_sure_and_at_another_height_than_the_drone_is_not_flown_by():
     """At a wall without corners the pose sank by 0.5 m while the drone rose by 0.9 m, every frame tracked."""
     supervisor = Supervisor()
-    flown(supervisor, 2.0, lambda s: replace(s, told_height_m=1.4))
-    orders = flown(supervisor, LAND_S + 2.0, lambda s: replace(s, told_height_m=1.7), wish=AHEAD, begin_s=2.0)
+    flown(supervisor, 2.0, lambda s: replace(s, reported_height_m=1.4))
+    orders = flown(supervisor, LAND_S + 2.0, lambda s: replace(s, reported_height_m=1.7), command=AHEAD, begin_s=2.0)
     assert orders[10].danger is Danger.NONE, "a picture that is late in a climb"
-    assert orders[30].danger is Danger.APART
-    assert all(o.wish.sticks()[:2] == (0.0, 0.0) for o in orders[30:]), "by a pose that is wrong no way leads back"
+    assert orders[30].danger is Danger.HEIGHT_CONFLICT
+    assert all(o.command.sticks()[:2] == (0.0, 0.0) for o in orders[30:]), "by a pose that is wrong no way leads back"
     assert orders[-1].land
 
 
 def test_heights_apart_mean_nothing_while_metres_are_not_sure():
-    orders = flown(Supervisor(), 3.0, lambda s: replace(s, told_height_m=1.9, scale_sigma=0.2))
+    orders = flown(Supervisor(), 3.0, lambda s: replace(s, reported_height_m=1.9, scale_sigma=0.2))
     assert {o.danger for o in orders} == {Danger.SCALE}
 
 
 def test_neither_height_may_be_beyond_the_limits():
     """The map says 1.2 m, the drone 2.0 m: it rises no more, and sinks if it wants to."""
-    rising = flown(Supervisor(), 0.5, lambda s: replace(s, told_height_m=2.0), wish=VelocityCommand(up_m_s=0.3))
-    assert all(o.wish.up_m_s == 0.0 for o in rising)
-    sinking = flown(Supervisor(), 0.5, lambda s: replace(s, told_height_m=2.0), wish=VelocityCommand(up_m_s=-0.3))
-    assert all(o.wish.up_m_s == -0.3 for o in sinking)
+    rising = flown(Supervisor(), 0.5, lambda s: replace(s, reported_height_m=2.0), command=VelocityCommand(up_m_s=0.3))
+    assert all(o.command.up_m_s == 0.0 for o in rising)
+    sinking = flown(
+        Supervisor(), 0.5, lambda s: replace(s, reported_height_m=2.0), command=VelocityCommand(up_m_s=-0.3)
+    )
+    assert all(o.command.up_m_s == -0.3 for o in sinking)
 
 
 def test_a_way_back_that_something_stands_in_is_given_up_and_told():
@@ -317,12 +319,12 @@ def test_a_way_back_that_something_stands_in_is_given_up_and_told():
     flown(supervisor, 3.0)
     here = {"p_w": np.array([1.5, 0.0, 1.1]), "velocity_w": np.array([0.02, 0.0, 0.0]), "tracked": False}
     lost = flown(
-        supervisor, 9.0, lambda s: replace(s, **here, position_sigma_m=0.2), begin_s=3.0, wish=VelocityCommand()
+        supervisor, 9.0, lambda s: replace(s, **here, position_sigma_m=0.2), begin_s=3.0, command=VelocityCommand()
     )
-    backing = [o.wish.why.endswith("back the way it came") for o in lost]
+    backing = [o.command.why.endswith("back the way it came") for o in lost]
     assert sum(backing) / 20 == pytest.approx(1.55, abs=0.1)
-    (touch,) = [o.touch for o in lost if o.touch is not None]
-    np.testing.assert_allclose(touch.towards_w, [-1.0, 0.0], atol=0.2)
+    (contact,) = [o.contact for o in lost if o.contact is not None]
+    np.testing.assert_allclose(contact.towards_w, [-1.0, 0.0], atol=0.2)
     assert not any(o.land for o in lost)
 
 
@@ -333,8 +335,8 @@ def test_metres_that_change_while_it_is_carried_are_no_way_flown():
     flown(supervisor, 1.0, lambda s: replace(s, tracked=False, position_sigma_m=0.1), begin_s=2.0, x=1.0)
     supervisor.carry(MapUpdate(np.eye(4)[None], np.eye(4)[None], 2.0))
     there = {"p_w": np.array([2.95, 0.0, 2.2]), "velocity_w": BACK, "tracked": False, "position_sigma_m": 0.2}
-    lost = flown(supervisor, 11.0, lambda s: replace(s, **there), wish=VelocityCommand(), begin_s=3.0)
-    backing = [o.wish.why.endswith("back the way it came") for o in lost]
+    lost = flown(supervisor, 11.0, lambda s: replace(s, **there), command=VelocityCommand(), begin_s=3.0)
+    backing = [o.command.why.endswith("back the way it came") for o in lost]
     assert sum(backing) / 20 == pytest.approx(8.0, abs=0.3)
 
 
@@ -348,7 +350,7 @@ def test_the_way_back_goes_along_with_the_map():
         supervisor,
         4.0,
         lambda s: replace(s, p_w=np.array([2.95, 0.0, 2.2]), velocity_w=np.zeros(3), seen_s=2.6),
-        wish=VelocityCommand(),
+        command=VelocityCommand(),
         begin_s=3.0,
     )
-    assert blind[60].wish.forward_m_s < -0.1
+    assert blind[60].command.forward_m_s < -0.1

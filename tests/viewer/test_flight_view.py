@@ -36,7 +36,7 @@ def view(tmp_path):
     return view
 
 
-def sight(stamp_s, x=0.0, **fields):
+def state(stamp_s, x=0.0, **fields):
     return DroneState(stamp_s, np.array([x, 0.0, 1.1]), 0.0, np.array([0.3, 0.0, 0.0]), **fields)
 
 
@@ -48,7 +48,7 @@ def test_space_way_exits_and_reasons(view):
     flight_controller.pilot.exits.exits = (
         Exit(np.array([2.0, 0.5, 1.1]), np.array([1.0, 0.0, 0.0]), 0.9, 0.05, 0.1, 3),
     )
-    flight_controller.order(sight(0.0))
+    flight_controller.order(state(0.0))
     shown = view._stream.shown
     (cells,) = shown["world/free"]
     assert np.array(cells.centers.as_arrow_array().to_pylist()) == pytest.approx(
@@ -58,7 +58,7 @@ def test_space_way_exits_and_reasons(view):
     (line,) = shown["world/exits"][0].strips.as_arrow_array().to_pylist()
     assert np.array(line) == pytest.approx(np.array([[2.0, 0.05, 1.1], [2.0, 0.95, 1.1]]), abs=1e-6)
     assert len(shown["reasons"]) == 1
-    flight_controller.order(sight(0.1, 0.03))
+    flight_controller.order(state(0.1, 0.03))
     assert len(shown["world/free"]) == 1, "the space is shown twice a second"
     assert len(shown["world/drone"]) == 2 and len(shown["reasons"]) == 1
 
@@ -66,8 +66,8 @@ def test_space_way_exits_and_reasons(view):
 def test_a_revised_unit_begins_the_way_anew(view):
     flight_controller = FlightController(NavLimits(), [view])
     for k in range(4):
-        flight_controller.order(sight(0.1 * k, 0.03 * k))
-    flight_controller.order(sight(1.0, 0.5, revision=1))
+        flight_controller.order(state(0.1 * k, 0.03 * k))
+    flight_controller.order(state(1.0, 0.5, revision=1))
     last = view._stream.shown["world/flown"][-1]
     assert len(last.strips.as_arrow_array().to_pylist()[0]) == 1
 

@@ -21,7 +21,7 @@ NEAR_M = 1.0
 back, and velocities in steps of a decimetre a second do not."""
 
 
-class FreshStart:
+class MapReset:
     """Dead reckoning from the take-off, and the time without metres."""
 
     def __init__(self) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 
 from edgeslam_torch.config import SlamConfig
 from edgeslam_torch.flying.perception.home import GROUND_M, TAKE_OFF, Home, Place, metres_per_unit
-from edgeslam_torch.flying.perception.map_reset import FreshStart
+from edgeslam_torch.flying.perception.map_reset import MapReset
 from edgeslam_torch.frontend.depth_network import DepthNetwork, open_depth, weights_path
 from edgeslam_torch.fusion.health import disagreement
 from edgeslam_torch.geometry import se3
@@ -19,7 +19,7 @@ from edgeslam_torch.navigation.map_update import MapUpdate, moves
 from edgeslam_torch.navigation.near.depth import NearFit, fit_to_points
 from edgeslam_torch.navigation.near.depth_bias import DepthBias
 from edgeslam_torch.navigation.near.points import agreeing, seen_points, with_nearer_points
-from edgeslam_torch.navigation.space import CELL_M, KEPT
+from edgeslam_torch.navigation.space import CELL_M, MAX_VIEWS
 from edgeslam_torch.navigation.supervisor import SCALE_SIGMA
 from edgeslam_torch.slam import EdgeSlam
 from edgeslam_torch.types import DepthMap, FloatArray, Frame, Health, SlamOutput, TelemetrySample
@@ -34,7 +34,7 @@ _STEP = 4
 """Depth is handed on at a quarter of the picture's size."""
 _FRESH_M = 0.3, 6.0
 """Depths at which edges of a picture are looked for at once."""
-_CARRIED_S = 4.0
+_LAST_FIT_S = 4.0
 """Time after a pose is lost in which depth goes on by the last fit: a bare wall shows no point to fit it to."""
 _DARK, _FLAT = 25.0, 2.0
 """Mean and standard deviation [of 255] of a picture below which the light is out, or the lens covered: a bare wall has
@@ -52,7 +52,7 @@ class SlamPerception:
     """Pictures and state messages through `EdgeSlam`; the pose is made up for the video's delay.
 
     The world is that of `home`, in the best metres that the SLAM knows: its published unit may be off by more.
-    `heard` and `sight` may be called from any thread, also while `seen` works; `seen` from one thread.
+    `heard` and `state` may be called from any thread, also while `seen` works; `seen` from one thread.
 
     Args:
         camera: Of the pictures.
@@ -66,7 +66,7 @@ class SlamPerception:
             width, height = width // 2, height // 2
         self._camera = camera.scaled(width, height)
         self._seed, self._realtime = seed, realtime
-        self._fresh = FreshStart()
+        self._map_reset = MapReset()
         self._K_small = self._camera.scaled(width // _STEP, height // _STEP).K
         self._network: DepthNetwork = open_depth(weights_path(_WEIGHTS))
         self._T_b_c = camera_on_body()
@@ -75,7 +75,7 @@ class SlamPerception:
         """Of which no finished step knows."""
         self._captured_s = 0.0
         self._battery = 1.0
-        self._told_height_m, self._told_speed_m_s = np.nan, np.nan
+        self._reported_height_m, self._reported_speed_m_s = np.nan, np.nan
         self._revision = self._changes = self._frames = 0
         """The second is how often its metres changed."""
         self._begin(self._new_slam(), TAKE_OFF)
@@ -92,29 +92,29 @@ class SlamPerception:
         self._home = Home(np.eye(3), 1.0, np.zeros(3))
         self._fit: tuple[NearFit, float, int] | None = None
         """The last fit of depth to points, when its picture arrived, and in which unit."""
-        self._usual, self._unit = DepthBias(), (0, 1.0)
+        self._bias, self._unit = DepthBias(), (0, 1.0)
         """The second: revision, and metres for a published unit in it."""
         self._metres = np.nan
         """Metres per map unit by which it goes; NaN while the published unit is all there is."""
         self._shown: tuple[FloatArray, float, int] = np.zeros((0, 4, 4)), 1.0, 0
         """When the last view was made: poses ``(F, 4, 4)`` of all pictures, metres per map unit, and the revision."""
-        self._long_told: list[tuple[int, FloatArray]] = []
+        self._thinned_views: list[tuple[int, FloatArray]] = []
         """One in `_THINNED` of those that a pilot keeps no longer: what was found in them goes along with the map."""
-        self._told: deque[tuple[int, FloatArray]] = deque(maxlen=KEPT)
+        self._sent_views: deque[tuple[int, FloatArray]] = deque(maxlen=MAX_VIEWS)
         """Pictures whose views were told, and their poses as they were told last."""
-        self._told_unit, self._told_revision, self._moved_s = 1.0, 0, -np.inf
+        self._sent_unit, self._sent_revision, self._moved_s = 1.0, 0, -np.inf
         self._revision = 0
 
     def heard(self, sample: TelemetrySample) -> None:
         """Take a state message."""
         with self._lock:
             self._samples.append(sample)
-            self._fresh.heard(sample)
+            self._map_reset.heard(sample)
             if np.isfinite(sample.battery):
                 self._battery = sample.battery
             if np.isfinite(sample.height_m):
-                self._told_height_m = sample.height_m + GROUND_M
-            self._told_speed_m_s = float(np.linalg.norm(sample.velocity_m_s[:2]))
+                self._reported_height_m = sample.height_m + GROUND_M
+            self._reported_speed_m_s = float(np.linalg.norm(sample.velocity_m_s[:2]))
 
     def seen(self, image: np.ndarray, arrived_s: float, captured_s: float) -> View | None:
         """Take a picture ``(H, W, 3)`` BGR; every few pictures of a mapped place give depth in metres."""
@@ -123,7 +123,7 @@ class SlamPerception:
             image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
         with self._lock:
             batch = list(self._samples)
-            due = self._fresh.is_due(arrived_s, self._output is not None and _is_sure(self._output))
+            due = self._map_reset.is_due(arrived_s, self._output is not None and _is_sure(self._output))
         if due and batch:  # the first picture of a map wants to be told which way is up
             self._begin_again()
         output = self._slam.step(Frame(self._frames - self._first, arrived_s, image), batch)
@@ -152,16 +152,16 @@ class SlamPerception:
         fresh, given_up = self._new_slam(), self._slam
         with self._lock:
             self._changes += self._revision + 1  # what was told before is of another map
-            self._begin(fresh, self._fresh.begin())
+            self._begin(fresh, self._map_reset.begin())
         given_up.close()
 
-    def sight(self, now_s: float, view: View | None = None) -> DroneState:
+    def state(self, now_s: float, view: View | None = None) -> DroneState:
         """The moment, with a new view if there is one, and with it how the map moved since the last."""
         with self._lock:
             output, captured_s, home, changes = self._output, self._captured_s, self._home, self._changes
             slam, began = self._slam, self._began
             samples, battery = list(self._samples), self._battery
-            told, told_speed = self._told_height_m, self._told_speed_m_s
+            reported_height_m, reported_speed_m_s = self._reported_height_m, self._reported_speed_m_s
         pose = slam.pose_now(now_s, samples)
         if pose is None or output is None or output.health is None:
             return DroneState(
@@ -173,12 +173,12 @@ class SlamPerception:
                 tracked=False,
                 seen_s=captured_s,
                 battery=battery,
-                told_height_m=told,
-                told_speed_m_s=told_speed,
+                reported_height_m=reported_height_m,
+                reported_speed_m_s=reported_speed_m_s,
             )
         health = output.health
         T_w_b = home.poses(pose.T_w_c) @ se3.inverse(self._T_b_c)
-        relative = float(np.hypot(health.scale.sigma / health.scale.value, self._usual.doubt))
+        relative = float(np.hypot(health.scale.sigma / health.scale.value, self._bias.doubt))
         sigma = home.scale * float(np.sqrt(np.clip(np.trace(pose.covariance[:3, :3]) / 3.0, 0.0, None)))
         return DroneState(
             now_s,
@@ -186,48 +186,51 @@ class SlamPerception:
             float(np.arctan2(T_w_b[1, 0], T_w_b[0, 0])),
             home.scale * (home.R @ np.asarray(pose.velocity_w)),
             position_sigma_m=min(sigma, _WIDEST_SIGMA_M),
-            apart_sigma_m=home.scale * health.submap_sigma,
+            submap_sigma_m=home.scale * health.submap_sigma,
             drift_sigma_m=home.scale * health.drift_sigma,
-            piece=output.piece,
+            submap=output.piece,
             scale_sigma=relative if np.isfinite(relative) else 1.0,
             metric=health.metric,
             tracked=_tracks(output),
             conflict=_contradicted(health),
             seen_s=captured_s,
             battery=battery,
-            told_height_m=told,
-            told_speed_m_s=told_speed,
+            reported_height_m=reported_height_m,
+            reported_speed_m_s=reported_speed_m_s,
             view=view,
             revision=pose.revision + changes,
-            moved=None if view is None else self._moved(view),
+            map_update=None if view is None else self._map_update(view),
         )
 
     def close(self) -> None:
         """Stop the SLAM's threads."""
         self._slam.close()
 
-    def _moved(self, view: View) -> MapUpdate | None:
+    def _map_update(self, view: View) -> MapUpdate | None:
         """How the views that were told have moved when this one was made; this one counts as told from now on."""
         with self._lock:
             (T_w_c, unit, revision), first = self._shown, self._first
             if view.picture < first:  # of a map that was given up meanwhile
                 return None
             found = None
-            if self._told:
-                told = [*self._long_told, *self._told]
-                pictures, before = np.array([picture for picture, _ in told]), np.array([T for _, T in told])
-                after, kept = T_w_c[pictures - first], slice(len(self._long_told), None)
-                revised = revision != self._told_revision
+            if self._sent_views:
+                sent = [*self._thinned_views, *self._sent_views]
+                pictures, before = np.array([picture for picture, _ in sent]), np.array([T for _, T in sent])
+                after, kept = T_w_c[pictures - first], slice(len(self._thinned_views), None)
+                revised = revision != self._sent_revision
                 if revised or (
                     view.stamp_s - self._moved_s > _MOVES_EVERY_S and moves(before[kept], after[kept], CELL_M)
                 ):
-                    found, self._moved_s = MapUpdate(before, after, unit / self._told_unit, pictures), view.stamp_s
-                    told = list(zip(pictures.tolist(), after, strict=True))
-                    self._long_told, self._told = told[: kept.start], deque(told[kept], self._told.maxlen)
-            if len(self._told) == KEPT and self._told[0][0] % (_THINNED * _DEPTH_EVERY) < _DEPTH_EVERY:
-                self._long_told.append(self._told[0])
-            self._told.append((view.picture, view.T_w_c))
-            self._told_unit, self._told_revision = unit, revision
+                    found, self._moved_s = MapUpdate(before, after, unit / self._sent_unit, pictures), view.stamp_s
+                    sent = list(zip(pictures.tolist(), after, strict=True))
+                    self._thinned_views, self._sent_views = (
+                        sent[: kept.start],
+                        deque(sent[kept], self._sent_views.maxlen),
+                    )
+            if len(self._sent_views) == MAX_VIEWS and self._sent_views[0][0] % (_THINNED * _DEPTH_EVERY) < _DEPTH_EVERY:
+                self._thinned_views.append(self._sent_views[0])
+            self._sent_views.append((view.picture, view.T_w_c))
+            self._sent_unit, self._sent_revision = unit, revision
         return found
 
     def _depth(self, image: np.ndarray, output: SlamOutput) -> DepthMap | None:
@@ -259,9 +262,9 @@ class SlamPerception:
         fit = fit_to_points(depth, *seen_points(anchors, self._camera.K, output.T_w_c, depth.depth_m.shape))
         revision, unit_m = self._unit
         if revision == output.revision:
-            believed = fit is not None and self._usual.believes(fit, unit_m, _is_sure(output))
-            usual = self._usual.line(unit_m)
-            if fit is None or not believed:
+            consistent = fit is not None and self._bias.is_consistent(fit, unit_m, _is_sure(output))
+            usual = self._bias.line(unit_m)
+            if fit is None or not consistent:
                 fit = usual
             elif usual is not None:
                 fit = usual.through(fit)
@@ -274,7 +277,7 @@ class SlamPerception:
         if self._fit is None:
             return None
         fit, at_s, revision = self._fit
-        return fit if output.stamp_s - at_s < _CARRIED_S and output.revision == revision else None
+        return fit if output.stamp_s - at_s < _LAST_FIT_S and output.revision == revision else None
 
     def _view(self, depth: DepthMap, home: Home, T_w_c: FloatArray, captured_s: float) -> View:
         """Depth in published units as a pilot is told of it, in metres."""

@@ -24,18 +24,18 @@ class Losses:
     """``(2,)`` of the first of them."""
     _lost: bool = False
 
-    def note(self, sight: DroneState) -> None:
+    def note(self, state: DroneState) -> None:
         """Take in a moment."""
-        if sight.tracked:
+        if state.tracked:
             self._lost = False
-        elif sight.hindered and not self._lost:
+        elif state.overridden and not self._lost:
             self._lost = True
-            here = sight.p_w[:2]
+            here = state.p_w[:2]
             if self._place_w is None or float(np.linalg.norm(here - self._place_w)) > self.about_m:
                 self._place_w, self.count = here.copy(), 0
             self.count += 1
 
-    def carry(self, moved: MapUpdate) -> None:
+    def carry(self, update: MapUpdate) -> None:
         """Take the place along with the map."""
         if self._place_w is not None:
-            self._place_w = moved.points(self._place_w[None])[0]
+            self._place_w = update.points(self._place_w[None])[0]

@@ -29,7 +29,7 @@ _ABOUT_M = 1.0
 
 
 @dataclass(slots=True)
-class Glance:
+class DeadEndScan:
     """A turn on the spot at the end, a look back from it to each side that is not known to be a wall, and to the end
     again."""
 
@@ -50,58 +50,58 @@ class Glance:
     _turns_s: float = math.nan
     """Since when it turns at the end."""
 
-    def goal(self, layer: Layer, sight: DroneState) -> FloatArray | None:
+    def goal(self, layer: Layer, state: DroneState) -> FloatArray | None:
         """Where to fly ``(2,)``; None when nothing is left to do, and for a turn on the spot."""
-        self._leg_s = sight.stamp_s if math.isnan(self._leg_s) else self._leg_s
-        late = sight.stamp_s - self._leg_s > _GIVEN_UP_S
+        self._leg_s = state.stamp_s if math.isnan(self._leg_s) else self._leg_s
+        late = state.stamp_s - self._leg_s > _GIVEN_UP_S
         if math.isnan(self._turns_s):
-            if not late and _away(sight, self.end_w) > _THERE_M:
+            if not late and _away(state, self.end_w) > _THERE_M:
                 return self.end_w
-            self._turns_s = self._leg_s = sight.stamp_s
-        if sight.stamp_s - self._turns_s < _TURN_S:
-            self._leg_s = sight.stamp_s
+            self._turns_s = self._leg_s = state.stamp_s
+        if state.stamp_s - self._turns_s < _TURN_S:
+            self._leg_s = state.stamp_s
             return None
         if self._headings is None:
             place = self.end_w - _BACK_M * self.axis
             sides = unknown_sides(layer, self.end_w, self.axis)
-            if sides and not late and _away(sight, place) > _THERE_M:
+            if sides and not late and _away(state, place) > _THERE_M:
                 return place
             self._headings = [] if late else [math.atan2(side[1], side[0]) for side in sides]
-            self._leg_s = sight.stamp_s
+            self._leg_s = state.stamp_s
             late = False
-        self.over = late or _away(sight, self.end_w) < (_ABOUT_M if self.given_up else _THERE_M)
+        self.over = late or _away(state, self.end_w) < (_ABOUT_M if self.given_up else _THERE_M)
         return None if self.over else self.end_w
 
     def is_near(self, here_w: FloatArray) -> bool:
         """Whether a corridor that seems to end here ``(2,)`` seems to end there."""
         return float(np.linalg.norm(here_w - self.end_w)) < _SAME_END_M
 
-    def give_up(self, sight: DroneState) -> None:
+    def give_up(self, state: DroneState) -> None:
         """Look at nothing more: back to the end, unless it is about there."""
         if not self.given_up:
             self.given_up, self._headings = True, []
-            self._turns_s, self._leg_s = -math.inf, sight.stamp_s
-        self.over |= _away(sight, self.end_w) < _ABOUT_M
+            self._turns_s, self._leg_s = -math.inf, state.stamp_s
+        self.over |= _away(state, self.end_w) < _ABOUT_M
 
-    def heading_rad(self, sight: DroneState) -> float | None:
+    def heading_rad(self, state: DroneState) -> float | None:
         """Where to look now, standing; a pose that is lost ends it."""
         if not self._headings:
             return None
-        if not sight.tracked:
+        if not state.tracked:
             self._headings = []
             return None
-        if abs(float(wrapped(np.array(self._headings[-1] - sight.yaw_rad)))) > _THERE_RAD:
-            self._reached_s = sight.stamp_s
-        elif sight.stamp_s - self._reached_s > _STANDS_S:
+        if abs(float(wrapped(np.array(self._headings[-1] - state.yaw_rad)))) > _THERE_RAD:
+            self._reached_s = state.stamp_s
+        elif state.stamp_s - self._reached_s > _STANDS_S:
             self._headings.pop()
-            self._reached_s = sight.stamp_s
+            self._reached_s = state.stamp_s
         return self._headings[-1] if self._headings else None
 
-    def carry(self, moved: MapUpdate) -> None:
+    def carry(self, update: MapUpdate) -> None:
         """Take the end along with the map."""
-        self.end_w = moved.points(self.end_w[None])[0]
+        self.end_w = update.points(self.end_w[None])[0]
 
 
-def _away(sight: DroneState, place_w: FloatArray) -> float:
+def _away(state: DroneState, place_w: FloatArray) -> float:
     """Distance of the drone to a place ``(2,)``."""
-    return float(np.linalg.norm(sight.p_w[:2] - place_w))
+    return float(np.linalg.norm(state.p_w[:2] - place_w))

@@ -16,7 +16,7 @@ from edgeslam_torch.navigation.corridor.corridor_geometry import (
     straight,
     wide,
 )
-from edgeslam_torch.navigation.corridor.dead_end_scan import Glance
+from edgeslam_torch.navigation.corridor.dead_end_scan import DeadEndScan
 from edgeslam_torch.navigation.corridor.trail import PASSED_M, Trail, aside
 from edgeslam_torch.navigation.drone_state import DroneState
 from edgeslam_torch.navigation.exploring.frontiers import Looks
@@ -43,14 +43,14 @@ class FollowCorridor(LooksAhead):
     """Fly on along the corridor that the drone is in, in its middle; through no door that is known to be one."""
 
     until_s: float = np.inf
-    """On the clock of the sights."""
+    """On the clock of the states."""
     room: bool = False
     """Whether it ended where the corridor is wider than a corridor."""
     wall: bool = False
     """Whether something solid is close ahead: nothing to follow without it is not the corridor's end."""
     _looks: Looks = field(default_factory=Looks)
     _trail: Trail | None = None
-    _end: Glance | None = None
+    _end: DeadEndScan | None = None
     """Where the corridor seems to end, or seemed to last, before a wall."""
     _ending: bool = False
     """Whether it seems to now."""
@@ -69,53 +69,53 @@ class FollowCorridor(LooksAhead):
         self._doors = [(e.centre_w[:2], e.normal_w[:2]) for e in exits]
         self._doubtful = [(c.centre_w, c.normal_w) for c in candidates]
 
-    def goals(self, layer: Layer, sight: DroneState) -> np.ndarray:
+    def goals(self, layer: Layer, state: DroneState) -> np.ndarray:
         """Cells ``(G, 2)`` to follow: what is wide and ahead, else what turns off, else straight on through what is
         narrow; before a wall, holes in the sides. None where there is nothing of these."""
-        here = sight.p_w[:2]
-        self._trail = self._trail or Trail.beginning(sight)
+        here = state.p_w[:2]
+        self._trail = self._trail or Trail.beginning(state)
         self._trail.fly(here)
-        self._note_width(layer, sight)
+        self._note_width(layer, state)
         axis = self._trail.direction(layer, here)
         self.wall = is_walled(layer, here, axis)
-        found = self._looks.worth(self._onward(layer, sight, axis, self._trail), layer, sight)
+        found = self._looks.worth(self._onward(layer, state, axis, self._trail), layer, state)
         if len(found) or not self._ending or self._end is None:
             return found
-        goal = self._end.goal(layer, sight)
+        goal = self._end.goal(layer, state)
         return layer.cells(np.zeros((0, 2)) if goal is None else goal[None])
 
-    def heading_rad(self, sight: DroneState) -> float | None:
+    def heading_rad(self, state: DroneState) -> float | None:
         """To the sides, where it seems to end; else ahead."""
-        return self._end.heading_rad(sight) if self._ending and self._end is not None else None
+        return self._end.heading_rad(state) if self._ending and self._end is not None else None
 
-    def done(self, sight: DroneState) -> bool:
+    def done(self, state: DroneState) -> bool:
         """Whether the corridor ended, or the time."""
-        self.room = sight.stamp_s - self._wide_s > _ROOM_S
-        return self.room or self._has_ended(sight) or sight.stamp_s >= self.until_s
+        self.room = state.stamp_s - self._wide_s > _ROOM_S
+        return self.room or self._has_ended(state) or state.stamp_s >= self.until_s
 
-    def carry(self, moved: MapUpdate) -> None:
+    def carry(self, update: MapUpdate) -> None:
         """Take what is remembered along with the map."""
-        self._looks.carry(moved)
-        self._losses.carry(moved)
+        self._looks.carry(update)
+        self._losses.carry(update)
         if self._trail is not None:
-            self._trail.carry(moved)
-        self._doors = [(moved.points(middle[None])[0], normal) for middle, normal in self._doors]
-        self._doubtful = [(moved.points(middle[None])[0], normal) for middle, normal in self._doubtful]
+            self._trail.carry(update)
+        self._doors = [(update.points(middle[None])[0], normal) for middle, normal in self._doors]
+        self._doubtful = [(update.points(middle[None])[0], normal) for middle, normal in self._doubtful]
         if self._end is not None:
-            self._end.carry(moved)
+            self._end.carry(update)
         if self._target_w is not None:
-            self._target_w = moved.points(self._target_w[None])[0]
+            self._target_w = update.points(self._target_w[None])[0]
 
-    def _has_ended(self, sight: DroneState) -> bool:
+    def _has_ended(self, state: DroneState) -> bool:
         if not self._ending or self._end is None:
-            return self._looks.over(sight.stamp_s)
-        self._losses.note(sight)
+            return self._looks.over(state.stamp_s)
+        self._losses.note(state)
         if self._losses.count >= _MOST_LOSSES:
-            self._end.give_up(sight)
+            self._end.give_up(state)
         return self._end.over
 
-    def _onward(self, layer: Layer, sight: DroneState, axis: FloatArray, trail: Trail) -> np.ndarray:
-        here = sight.p_w[:2]
+    def _onward(self, layer: Layer, state: DroneState, axis: FloatArray, trail: Trail) -> np.ndarray:
+        here = state.p_w[:2]
         cells = self._left(layer, wide(layer, here))
         places = layer.centres(cells)
         if len(ahead := cells[is_ahead(places, here, axis) & trail.leads_on(places)]):
@@ -132,11 +132,11 @@ class FollowCorridor(LooksAhead):
         if not self.wall and not self._ending:
             return layer.cells(here + _BLIND_M * axis)[None]
         if self._end is None or not (self._ending or self._end.is_near(here)):
-            self._end, self._losses = Glance(here.copy(), axis), Losses(math.inf)
+            self._end, self._losses = DeadEndScan(here.copy(), axis), Losses(math.inf)
         self._ending = True
         return cells[:0] if self._end.given_up else self._beside(layer, self._end, here, trail)
 
-    def _beside(self, layer: Layer, end: Glance, here: FloatArray, trail: Trail) -> np.ndarray:
+    def _beside(self, layer: Layer, end: DeadEndScan, here: FloatArray, trail: Trail) -> np.ndarray:
         """Before a wall: what turns off though its mouth is narrow on the map, else holes in the sides."""
         cells = self._left(layer, wide(layer, here, SMEARED_BERTH_M))
         places = layer.centres(cells)
@@ -177,11 +177,11 @@ class FollowCorridor(LooksAhead):
         ]
         return min([way for way in ways if way > 0.0], default=math.inf)
 
-    def _note_width(self, layer: Layer, sight: DroneState) -> None:
+    def _note_width(self, layer: Layer, state: DroneState) -> None:
         """A room is where nothing solid is within half a corridor's width, and all of that is seen."""
         assert self._trail is not None
-        away = float(layer.clearance_at(sight.p_w[None, :2])[0])
+        away = float(layer.clearance_at(state.p_w[None, :2])[0])
         if 2.0 * away <= WIDEST_M or len(self._trail.places_w) < 2:
             self._wide_s = math.nan
         elif math.isnan(self._wide_s):
-            self._wide_s = sight.stamp_s
+            self._wide_s = state.stamp_s

@@ -37,10 +37,10 @@ class Trail:
     """``(D, 2)`` places from which nothing led on ahead."""
 
     @staticmethod
-    def beginning(sight: DroneState) -> "Trail":
+    def beginning(state: DroneState) -> "Trail":
         """At the drone's place, along its nose."""
-        nose = np.array([math.cos(sight.yaw_rad), math.sin(sight.yaw_rad)])
-        return Trail(sight.p_w[None, :2].copy(), nose, nose)
+        nose = np.array([math.cos(state.yaw_rad), math.sin(state.yaw_rad)])
+        return Trail(state.p_w[None, :2].copy(), nose, nose)
 
     def fly(self, here_w: FloatArray) -> None:
         """Note a place ``(2,)`` that is a metre from all before it: a drone that is brought back still flies ahead."""
@@ -78,10 +78,10 @@ class Trail:
         behind = (step @ self.began_w < 0.0) & (np.abs(aside(step, self.began_w)) < PASSED_M)
         return _apart(p_w, np.concatenate([self.places_w, here_w[None]]), PASSED_M) & ~behind
 
-    def carry(self, moved: MapUpdate) -> None:
+    def carry(self, update: MapUpdate) -> None:
         """Take the places along with the map; directions of level flight hardly turn with it."""
-        self.places_w = moved.points(self.places_w)
-        self._dead_ends_w = moved.points(self._dead_ends_w)
+        self.places_w = update.points(self.places_w)
+        self._dead_ends_w = update.points(self._dead_ends_w)
 
 
 def aside(step: FloatArray, axis: FloatArray) -> FloatArray:

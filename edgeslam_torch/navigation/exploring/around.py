@@ -52,9 +52,9 @@ class LooksAround:
     """Still to be looked at, last first."""
     _since_s: float = math.nan
 
-    def goals(self, layer: Layer, sight: DroneState) -> np.ndarray:
+    def goals(self, layer: Layer, state: DroneState) -> np.ndarray:
         """Cells ``(G, 2)`` from each of which most is looked at that is not from those before it."""
-        here = sight.p_w[:2]
+        here = state.p_w[:2]
         self._left = self._coverage.unlooked(borders(layer, here))
         free = layer.free[::_COARSE, ::_COARSE] & (layer.from_solid_m[::_COARSE, ::_COARSE] > _PASSED_M)
         cells = reachable(np.argwhere(free) * _COARSE, layer, here)
@@ -72,26 +72,26 @@ class LooksAround:
         self._spots_w = p_w[chosen]
         return np.asarray(cells[chosen])
 
-    def heading_rad(self, sight: DroneState) -> float | None:
+    def heading_rad(self, state: DroneState) -> float | None:
         """Where to look now; None to look ahead. A pose that is lost in a turn ends the look."""
-        self._coverage.note(sight)
-        here = sight.p_w[:2]
+        self._coverage.note(state)
+        here = state.p_w[:2]
         if not self._headings and self._is_new(here):
             self._places_w.append(here.copy())
-            self._headings = [sight.yaw_rad + turn for turn in reversed(_in_turn(self._sides(here, sight.yaw_rad)))]
-            self._since_s = sight.stamp_s
-        if not sight.tracked or sight.stamp_s - self._since_s > _GIVEN_UP_S:
+            self._headings = [state.yaw_rad + turn for turn in reversed(_in_turn(self._sides(here, state.yaw_rad)))]
+            self._since_s = state.stamp_s
+        if not state.tracked or state.stamp_s - self._since_s > _GIVEN_UP_S:
             self._headings = []
-        while self._headings and abs(float(wrapped(np.array(self._headings[-1] - sight.yaw_rad)))) < _THERE_RAD:
+        while self._headings and abs(float(wrapped(np.array(self._headings[-1] - state.yaw_rad)))) < _THERE_RAD:
             self._headings.pop()
         return self._headings[-1] if self._headings else None
 
-    def carry(self, moved: MapUpdate) -> None:
+    def carry(self, update: MapUpdate) -> None:
         """Take the places along with the map; directions of level flight hardly turn with it."""
-        self._coverage.carry(moved)
-        self._places_w = list(moved.points(np.array(self._places_w).reshape(-1, 2)))
-        self._spots_w = moved.points(self._spots_w)
-        self._left = replace(self._left, p_w=moved.points(self._left.p_w))
+        self._coverage.carry(update)
+        self._places_w = list(update.points(np.array(self._places_w).reshape(-1, 2)))
+        self._spots_w = update.points(self._spots_w)
+        self._left = replace(self._left, p_w=update.points(self._left.p_w))
 
     def _away_m(self, p_w: FloatArray) -> FloatArray:
         """Distance of places ``(P, 2)`` from where it has looked around; infinite before it has."""

@@ -76,11 +76,11 @@ class Coverage:
     _views: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
     """``(V, 3)`` place [m] and heading [rad]."""
 
-    def note(self, sight: DroneState) -> None:
+    def note(self, state: DroneState) -> None:
         """What a camera shows now counts as looked at; where the pose is carried, nothing does."""
-        if not sight.tracked:
+        if not state.tracked:
             return
-        new = np.array([*sight.p_w[:2], sight.yaw_rad])
+        new = np.array([*state.p_w[:2], state.yaw_rad])
         near = np.linalg.norm(self._views[:, :2] - new[:2], axis=1) < _APART_M
         alike = np.abs(wrapped(self._views[:, 2] - new[2])) < _APART_RAD
         if not (near & alike).any():
@@ -95,6 +95,6 @@ class Coverage:
         shown = all_.before(self._views[:, :2]) & (np.abs(wrapped(bearing)) < FIELD_RAD)
         return all_[np.flatnonzero(~shown.any(axis=0))]
 
-    def carry(self, moved: MapUpdate) -> None:
+    def carry(self, update: MapUpdate) -> None:
         """Take the places along with the map; directions of level flight hardly turn with it."""
-        self._views[:, :2] = moved.points(self._views[:, :2])
+        self._views[:, :2] = update.points(self._views[:, :2])

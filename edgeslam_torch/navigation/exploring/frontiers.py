@@ -57,18 +57,18 @@ class Looks:
     _asked_s: float = math.nan
     _nothing_s: float = math.nan
 
-    def worth(self, cells: np.ndarray, layer: Layer, sight: DroneState) -> np.ndarray:
+    def worth(self, cells: np.ndarray, layer: Layer, state: DroneState) -> np.ndarray:
         """Those of the cells ``(G, 2)`` that were not looked at in vain; to be asked at every plan."""
-        passed = 0.0 if math.isnan(self._asked_s) else min(sight.stamp_s - self._asked_s, 1.0)
-        self._asked_s = sight.stamp_s
+        passed = 0.0 if math.isnan(self._asked_s) else min(state.stamp_s - self._asked_s, 1.0)
+        self._asked_s = state.stamp_s
         places = layer.centres(cells).reshape(-1, 2)
-        for place in places[np.linalg.norm(places - sight.p_w[:2], axis=1) < _NEAR_M]:
+        for place in places[np.linalg.norm(places - state.p_w[:2], axis=1) < _NEAR_M]:
             self._spend(place, passed)
         kept = cells[self.left(places)]
         if len(kept):
             self._nothing_s = math.nan
         elif math.isnan(self._nothing_s):
-            self._nothing_s = sight.stamp_s
+            self._nothing_s = state.stamp_s
         return np.asarray(kept)
 
     def left(self, p_w: FloatArray) -> np.ndarray:
@@ -84,9 +84,9 @@ class Looks:
         """Whether there was nothing left to look at for as long as a look around takes."""
         return now_s - self._nothing_s > _ROUND_S  # false while it is NaN
 
-    def carry(self, moved: MapUpdate) -> None:
+    def carry(self, update: MapUpdate) -> None:
         """Take the places along with the map."""
-        places = moved.points(np.array([place for place, _ in self._near]).reshape(-1, 2))
+        places = update.points(np.array([place for place, _ in self._near]).reshape(-1, 2))
         self._near = [(place, spent_s) for place, (_, spent_s) in zip(places, self._near, strict=True)]
 
     def _spend(self, place_w: FloatArray, passed_s: float) -> None:

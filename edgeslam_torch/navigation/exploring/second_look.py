@@ -75,38 +75,38 @@ class SecondLook:
         """What is worth a second look now."""
         self._candidates = candidates
 
-    def on_the_way(self, layer: Layer, sight: DroneState) -> np.ndarray:
+    def on_the_way(self, layer: Layer, state: DroneState) -> np.ndarray:
         """Those of the cells of `goals` that are near."""
-        return self._from(self._standing(layer, sight, _ON_THE_WAY_M), layer, sight)
+        return self._from(self._standing(layer, state, _ON_THE_WAY_M), layer, state)
 
-    def goals(self, layer: Layer, sight: DroneState) -> np.ndarray:
+    def goals(self, layer: Layer, state: DroneState) -> np.ndarray:
         """Cells ``(G, 2)`` that can be reached, from which to look at one of them."""
-        return self._from(self._standing(layer, sight, np.inf), layer, sight)
+        return self._from(self._standing(layer, state, np.inf), layer, state)
 
-    def _standing(self, layer: Layer, sight: DroneState, reach_m: float) -> np.ndarray:
+    def _standing(self, layer: Layer, state: DroneState, reach_m: float) -> np.ndarray:
         """Cells ``(C, 2)`` where a drone can stand, no farther than this."""
         cells = np.argwhere(layer.free & (layer.from_solid_m > _PASSED_M))
-        near = np.linalg.norm(layer.centres(cells).reshape(-1, 2) - sight.p_w[:2], axis=1) <= reach_m
-        return reachable(cells[near], layer, sight.p_w[:2])
+        near = np.linalg.norm(layer.centres(cells).reshape(-1, 2) - state.p_w[:2], axis=1) <= reach_m
+        return reachable(cells[near], layer, state.p_w[:2])
 
-    def _from(self, cells: np.ndarray, layer: Layer, sight: DroneState) -> np.ndarray:
+    def _from(self, cells: np.ndarray, layer: Layer, state: DroneState) -> np.ndarray:
         found = [np.zeros((0, 2), int)]
-        for candidate, tried in self._worth(sight.stamp_s):
+        for candidate, tried in self._worth(state.stamp_s):
             p_w = layer.centres(cells).reshape(-1, 2)
             there = cells[_shows(candidate, p_w, _INSIDE_M) & tried.is_new(p_w)]
             if len(there):
-                tried.until_s = min(tried.until_s, sight.stamp_s + _SOUGHT_S)
+                tried.until_s = min(tried.until_s, state.stamp_s + _SOUGHT_S)
             found.append(there)
         return np.concatenate(found)
 
-    def heading_rad(self, sight: DroneState) -> float | None:
+    def heading_rad(self, state: DroneState) -> float | None:
         """Where to look, standing where one of them shows; None elsewhere."""
-        for candidate, tried in self._worth(sight.stamp_s):
-            if _shows(candidate, sight.p_w[None, :2])[0] and tried.is_new(sight.p_w[None, :2])[0]:
+        for candidate, tried in self._worth(state.stamp_s):
+            if _shows(candidate, state.p_w[None, :2])[0] and tried.is_new(state.p_w[None, :2])[0]:
                 if not tried.stands:
-                    tried.stood_w.append(sight.p_w[:2].copy())
-                    tried.until_s = sight.stamp_s + _STANDS_S
-                step = candidate.centre_w - sight.p_w[:2]
+                    tried.stood_w.append(state.p_w[:2].copy())
+                    tried.until_s = state.stamp_s + _STANDS_S
+                step = candidate.centre_w - state.p_w[:2]
                 return float(np.arctan2(step[1], step[0]))
         return None
 
@@ -116,10 +116,10 @@ class SecondLook:
             if now_s >= tried.until_s and tried.stands and tried.times < _TIMES:
                 tried.times, tried.until_s = tried.times + 1, np.inf
 
-    def carry(self, moved: MapUpdate) -> None:
+    def carry(self, update: MapUpdate) -> None:
         """Take the places along with the map; candidates come anew."""
         for tried in self._tried:
-            places = moved.points(np.array([tried.centre_w, *tried.stood_w]))
+            places = update.points(np.array([tried.centre_w, *tried.stood_w]))
             tried.centre_w, tried.stood_w = places[0], list(places[1:])
         self._candidates = ()
 

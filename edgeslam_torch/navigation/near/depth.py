@@ -24,7 +24,7 @@ _NEAR_SHARE = 0.06
 """Of the picture's width: 4 degrees of a Tello's, over which a network's error hardly changes."""
 ALONE_SIGMA = 0.3
 """Of depth that rests on the network alone."""
-_USUAL_SIGMA = 0.2
+_BIAS_SIGMA = 0.2
 """Of that in a picture whose points agree with what is usual, away from them: in eight flights 1.4 to 4 % of the pixels
 told at .8 to 3 m were too far by more than twice as much."""
 _LINE_POINTS = 3.0
@@ -93,7 +93,7 @@ class NearFit:
             log_m = log_m + bend(log_m)
             level = level + bend(level)
             residual = self.level + self.residual - level
-        alone = _USUAL_SIGMA if self.bends else ALONE_SIGMA
+        alone = _BIAS_SIGMA if self.bends else ALONE_SIGMA
         error, sigma = local_error(self.uv, level, residual, self.sigma_log, log_m, alone)
         metres = np.where(known, np.exp(log_m + error), np.nan).astype(np.float32)
         return DepthMap(metres, sigma)

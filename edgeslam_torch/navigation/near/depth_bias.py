@@ -32,7 +32,7 @@ class DepthBias:
     there, in the median."""
     _slopes: deque[float] = field(default_factory=lambda: deque(maxlen=_KEPT))
     """Of the lines of wide pictures."""
-    _against: int = 0
+    _outliers: int = 0
     """Pictures on end that say something else."""
     _off_log: float = 0.0
     """By how much the last of them does."""
@@ -40,9 +40,9 @@ class DepthBias:
     @property
     def doubt(self) -> float:
         """By how much, relatively, a metre is off as pictures on end say; 0 where they say what is usual."""
-        return abs(float(np.expm1(self._off_log))) if self._against >= _DOUBTED else 0.0
+        return abs(float(np.expm1(self._off_log))) if self._outliers >= _DOUBTED else 0.0
 
-    def believes(self, fit: NearFit, unit_m: float, sure: bool) -> bool:
+    def is_consistent(self, fit: NearFit, unit_m: float, sure: bool) -> bool:
         """Whether what a picture's points say is not far from what they usually say; remembered if metres are sure.
 
         Args:
@@ -51,14 +51,14 @@ class DepthBias:
             sure: Whether these are known well.
         """
         middle_log, ratio_log = float(np.median(fit.network_log)), fit.ratio_log + float(np.log(unit_m))
-        off_log = ratio_log - self._expected(middle_log) if self._knows() else 0.0
+        off_log = ratio_log - self._expected(middle_log) if self._is_ready() else 0.0
         if abs(off_log) > _SIGMAS * _SPREAD:
-            self._against, self._off_log = self._against + 1, off_log
-            if self._against > _KEPT // 2:  # so long is no turn: what was usual rested on other metres
+            self._outliers, self._off_log = self._outliers + 1, off_log
+            if self._outliers > _KEPT // 2:  # so long is no turn: what was usual rested on other metres
                 self._ratios.clear()
-                self._against = 0
+                self._outliers = 0
             return False
-        self._against = 0
+        self._outliers = 0
         if sure:
             self._ratios.append((middle_log, ratio_log))
             if float(np.std(fit.network_log)) > _WIDE_LOG:
@@ -67,11 +67,11 @@ class DepthBias:
 
     def line(self, unit_m: float) -> NearFit | None:
         """The usual line, of no picture's points; None before there is one."""
-        if not self._knows():
+        if not self._is_ready():
             return None
         return NearFit(self._expected(0.0) - float(np.log(unit_m)), self._slope(), ALONE_SIGMA, 0)
 
-    def _knows(self) -> bool:
+    def _is_ready(self) -> bool:
         return len(self._ratios) >= _LEAST
 
     def _slope(self) -> float:

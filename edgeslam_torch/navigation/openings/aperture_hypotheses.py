@@ -11,7 +11,7 @@ import numpy as np
 
 from edgeslam_torch.navigation.drone_state import View
 from edgeslam_torch.navigation.openings.exits import PARTLY_FREE, Gap, band, distinct, gap_of, is_in_line, jambs
-from edgeslam_torch.navigation.openings.wall_frame import Turned
+from edgeslam_torch.navigation.openings.wall_frame import WallGrid
 from edgeslam_torch.types import FloatArray
 
 NEAR_M = 4.0
@@ -40,7 +40,7 @@ class _Rays:
     """``(R,)``"""
 
 
-def glimpses(grids: list[Turned], view: View, here_w: FloatArray) -> list[Gap]:
+def aperture_hypotheses(grids: list[WallGrid], view: View, here_w: FloatArray) -> list[Gap]:
     """What may be openings in walls, between what is upright, that a view looks through, the surest first.
 
     Args:
@@ -53,7 +53,7 @@ def glimpses(grids: list[Turned], view: View, here_w: FloatArray) -> list[Gap]:
     return distinct([gap for gap in near if _goes_through(rays, gap)])
 
 
-def _unclosed(grid: Turned) -> Iterator[Gap]:
+def _unclosed(grid: WallGrid) -> Iterator[Gap]:
     """Openings that are not known to be closed, with space before them."""
     middle = 0.5 * (len(grid.free) - 1)
     for t, low, high in jambs(grid):

@@ -9,11 +9,11 @@ from edgeslam_torch.geometry.rotations import wrapped
 from edgeslam_torch.navigation.drone_state import DroneState
 from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.map_update import MapUpdate
-from edgeslam_torch.navigation.openings.aperture_hypotheses import NEAR_M, glimpses
+from edgeslam_torch.navigation.openings.aperture_hypotheses import NEAR_M, aperture_hypotheses
 from edgeslam_torch.navigation.openings.detour import has_detour
 from edgeslam_torch.navigation.openings.exits import WIDEST_M, Gap, distinct, openings
 from edgeslam_torch.navigation.openings.wall_frame import Walls, along_walls
-from edgeslam_torch.navigation.supervisor import CARRIED_SIGMA_M
+from edgeslam_torch.navigation.supervisor import DEAD_RECKONING_SIGMA_M
 from edgeslam_torch.types import FloatArray
 
 _EVERY_S = 0.5
@@ -34,7 +34,7 @@ _SHOWN = 2
 """Looks from before it that an exit needs: one is chance."""
 _STEP_M = 1.0
 """Way from one look to the next in which it is known what the drone flew through."""
-_GLIMPSES = 2
+_HYPOTHESIS_LOOKS = 2
 """Looks that make a doubt: as many as a drone has that flies past a door."""
 _GONE = 8
 """Looks at it, as long as a second look takes, that show nothing open there, one after the other: later ones know more
@@ -67,7 +67,7 @@ class Exit:
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """What looked like an opening, again and again, from one place only, or in a glimpse."""
+    """What looked like an opening, again and again, from one place only, or in a hypothesis."""
 
     centre_w: FloatArray
     """``(2,)`` [m]."""
@@ -76,7 +76,7 @@ class Candidate:
     place_w: FloatArray
     """``(2,)`` where it was seen from first [m]."""
     elsewhere: bool = True
-    """Whether it must be looked at from another place than that: it was seen open from there, not in a glimpse."""
+    """Whether it must be looked at from another place than that: it was seen open from there, not in a hypothesis."""
 
 
 @dataclass(slots=True)
@@ -127,83 +127,83 @@ class ExitTracker:
     candidates: tuple[Candidate, ...] = ()
     """What may be one, if it looks so from elsewhere, too."""
     _seen: list[_Seen] = field(default_factory=list)
-    _glimpsed: list[_Seen] = field(default_factory=list)
+    _hypotheses: list[_Seen] = field(default_factory=list)
     _looked_s: float = -math.inf
     _looked_w: FloatArray | None = None
     """``(2,)`` from where it looked last."""
 
-    def due(self, sight: DroneState) -> bool:
+    def due(self, state: DroneState) -> bool:
         """Whether it is time for another look. In a piece of map that may lie half a hull elsewhere none counts, for or
         against what was found."""
-        placed = sight.metric and sight.tracked and sight.apart_sigma_m <= CARRIED_SIGMA_M
-        return placed and sight.view is not None and sight.stamp_s - self._looked_s >= _EVERY_S
+        placed = state.metric and state.tracked and state.submap_sigma_m <= DEAD_RECKONING_SIGMA_M
+        return placed and state.view is not None and state.stamp_s - self._looked_s >= _EVERY_S
 
-    def look(self, walls: Walls, sight: DroneState) -> None:
+    def look(self, walls: Walls, state: DroneState) -> None:
         """Compare what the grid shows now with what it showed before; from farther away than `NEAR_M` none counts."""
-        self._looked_s = sight.stamp_s
-        here = sight.p_w[:2]
+        self._looked_s = state.stamp_s
+        here = state.p_w[:2]
         grids = along_walls(walls, here)
         found = openings(grids)
         partly = distinct(found)
-        self._count(distinct([gap for gap in found if gap.is_free]), partly, sight)
+        self._count(distinct([gap for gap in found if gap.is_free]), partly, state)
         for seen in self._seen:
             seen.flown |= self._looked_w is not None and _leads_through(seen, self._looked_w, here)
         self._looked_w = here.copy()
-        glimpsed = glimpses(grids, sight.view, here) if sight.view is not None else []
-        for gap in distinct([*partly, *glimpsed]):
-            _note(self._glimpsed, gap, sight)
+        hypotheses = aperture_hypotheses(grids, state.view, here) if state.view is not None else []
+        for gap in distinct([*partly, *hypotheses]):
+            _note(self._hypotheses, gap, state)
         often = [s for s in self._seen if s.near >= _LOOKS]
         open_ = [s for s in often if s.flown or s.gone <= _GONE]
         twice = [s for s in open_ if _places(s.places_w) >= 2]
-        self.exits = self._exits([s for s in twice if s.flown or s.is_shown], walls.layer, sight)
+        self.exits = self._exits([s for s in twice if s.flown or s.is_shown], walls.layer, state)
         unsure = [s for s in open_ if not s.flown and (s.shown <= max(s.missed, 1) or _places(s.places_w) < 2)]
         doubted = [(s, _places(s.places_w) < 2) for s in unsure]
-        glimpsed_often = [s for s in self._glimpsed if s.near >= _GLIMPSES]
-        doubted += [(s, False) for s in glimpsed_often if not any(_same(s.gaps[0], other) for other in often)]
+        repeated = [s for s in self._hypotheses if s.near >= _HYPOTHESIS_LOOKS]
+        doubted += [(s, False) for s in repeated if not any(_same(s.gaps[0], other) for other in often)]
         self.candidates = tuple(_candidate(*doubt) for doubt in doubted if not _parts_nothing(doubt[0], walls.layer))
 
-    def _count(self, free: list[Gap], partly: list[Gap], sight: DroneState) -> None:
+    def _count(self, free: list[Gap], partly: list[Gap], state: DroneState) -> None:
         """What speaks for and against what was seen before: what is not looked at stays as it was."""
         for seen in self._seen:
-            if not _is_looked_at(seen, sight):
+            if not _is_looked_at(seen, state):
                 continue
             if any(_same(gap, seen) for gap in partly):
                 seen.shown, seen.gone = seen.shown + 1, 0
             else:
                 seen.missed, seen.gone = seen.missed + 1, seen.gone + 1
         for gap in free:
-            _note(self._seen, gap, sight)
+            _note(self._seen, gap, state)
         self._seen = [seen for seen in self._seen if seen.missed <= 2 * max(len(seen.gaps), _LOOKS)]
 
-    def _exits(self, good: list[_Seen], layer: Layer, sight: DroneState) -> tuple[Exit, ...]:
+    def _exits(self, good: list[_Seen], layer: Layer, state: DroneState) -> tuple[Exit, ...]:
         """Those that part two rooms, one of each passage."""
         good.sort(key=lambda s: -s.near)
-        told = [(seen, e) for seen in good if (e := _exit(seen, sight)).width_m <= WIDEST_M]
+        told = [(seen, e) for seen in good if (e := _exit(seen, state)).width_m <= WIDEST_M]
         for seen, exit_ in told:
-            if np.linalg.norm(exit_.centre_w[:2] - sight.p_w[:2]) < NEAR_M:  # from afar a wall gets holes
+            if np.linalg.norm(exit_.centre_w[:2] - state.p_w[:2]) < NEAR_M:  # from afar a wall gets holes
                 seen.note_way_round(_passed_by(exit_, layer))
         exits = [e for seen, e in told if seen.parting > 0]
         single = [e for k, e in enumerate(exits) if not any(_one_passage(e, other) for other in exits[:k])]
-        return tuple(sorted(single, key=lambda e: float(np.linalg.norm(e.centre_w[:2] - sight.p_w[:2]))))
+        return tuple(sorted(single, key=lambda e: float(np.linalg.norm(e.centre_w[:2] - state.p_w[:2]))))
 
-    def carry(self, moved: MapUpdate) -> None:
+    def carry(self, update: MapUpdate) -> None:
         """Take what was found along with the map; `exits` are those of the next look."""
-        for seen in [*self._seen, *self._glimpsed]:
-            centres = moved.points(np.array([gap.centre_w for gap in seen.gaps]), seen.pictures)
-            beyond = moved.points(np.array([gap.centre_w + 0.1 * gap.normal_w for gap in seen.gaps]), seen.pictures)
-            seen.gaps = [_carried(*gap, moved.ratio) for gap in zip(seen.gaps, centres, beyond, strict=True)]
-            seen.places_w = list(moved.points(np.array(seen.places_w).reshape(-1, 2)))
+        for seen in [*self._seen, *self._hypotheses]:
+            centres = update.points(np.array([gap.centre_w for gap in seen.gaps]), seen.pictures)
+            beyond = update.points(np.array([gap.centre_w + 0.1 * gap.normal_w for gap in seen.gaps]), seen.pictures)
+            seen.gaps = [_carried(*gap, update.ratio) for gap in zip(seen.gaps, centres, beyond, strict=True)]
+            seen.places_w = list(update.points(np.array(seen.places_w).reshape(-1, 2)))
         self._looked_w = None
 
 
-def _note(among: list[_Seen], gap: Gap, sight: DroneState) -> None:
-    here_w = sight.p_w[:2]
+def _note(among: list[_Seen], gap: Gap, state: DroneState) -> None:
+    here_w = state.p_w[:2]
     seen = next((s for s in among if _same(gap, s)), None)
     if seen is None:
         seen = _Seen([], [], [])
         among.append(seen)
     seen.gaps.append(gap)
-    seen.pictures.append(-1 if sight.view is None else sight.view.picture)
+    seen.pictures.append(-1 if state.view is None else state.view.picture)
     seen.gone = 0
     if np.linalg.norm(gap.centre_w - here_w) < NEAR_M:
         seen.near += 1
@@ -220,7 +220,7 @@ def _parts_nothing(seen: _Seen, layer: Layer) -> bool:
     return width_m > WIDEST_M or has_detour(layer, seen.centre_w, seen.gaps[0].normal_w, width_m)
 
 
-def _exit(seen: _Seen, sight: DroneState) -> Exit:
+def _exit(seen: _Seen, state: DroneState) -> Exit:
     """The opening as the looks agree on it."""
     centres, widths = np.array([g.centre_w for g in seen.gaps]), np.array([g.width_m for g in seen.gaps])
     first = seen.gaps[0].normal_w
@@ -228,11 +228,11 @@ def _exit(seen: _Seen, sight: DroneState) -> Exit:
     normal = np.sum(turned, axis=0) / np.linalg.norm(np.sum(turned, axis=0))
     cell = 0.1 * _CELL_SIGMAS
     centre, width = np.median(centres, axis=0), float(np.median(widths))
-    away = float(np.linalg.norm(centre - sight.p_w[:2]))
+    away = float(np.linalg.norm(centre - state.p_w[:2]))
     spread = float(np.sqrt(0.5 * np.mean(((centres - centre) ** 2).sum(1))))
-    position = math.hypot(cell, spread, sight.position_sigma_m, sight.scale_sigma * away)
-    width_sigma = math.hypot(cell, float(np.std(widths)), sight.scale_sigma * width)
-    return Exit(np.array([*centre, sight.p_w[2]]), np.array([*normal, 0.0]), width, width_sigma, position,
+    position = math.hypot(cell, spread, state.position_sigma_m, state.scale_sigma * away)
+    width_sigma = math.hypot(cell, float(np.std(widths)), state.scale_sigma * width)
+    return Exit(np.array([*centre, state.p_w[2]]), np.array([*normal, 0.0]), width, width_sigma, position,
                 _places(seen.places_w))  # fmt: skip
 
 
@@ -264,11 +264,11 @@ def _same(gap: Gap, seen: _Seen) -> bool:
     return turned < _SAME_RAD and float(np.linalg.norm(gap.centre_w - seen.centre_w)) < _SAME_M
 
 
-def _is_looked_at(seen: _Seen, sight: DroneState) -> bool:
+def _is_looked_at(seen: _Seen, state: DroneState) -> bool:
     """Whether a camera has an opening before it, and not aslant: along a wall it sees nothing of a door."""
-    offset = seen.centre_w - sight.p_w[:2]
+    offset = seen.centre_w - state.p_w[:2]
     away = float(np.linalg.norm(offset))
-    bearing = float(wrapped(np.array(math.atan2(offset[1], offset[0]) - sight.yaw_rad)))
+    bearing = float(wrapped(np.array(math.atan2(offset[1], offset[0]) - state.yaw_rad)))
     squarely = abs(float(offset @ seen.gaps[0].normal_w)) > _SQUARELY_COS * away
     return _NEAREST_M < away < FARTHEST_M and abs(bearing) < FIELD_RAD and squarely
 

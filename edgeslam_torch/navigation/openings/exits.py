@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edgeslam_torch.navigation.openings.wall_frame import Turned, runs
+from edgeslam_torch.navigation.openings.wall_frame import WallGrid, runs
 from edgeslam_torch.types import FloatArray
 
 NARROWEST_M, WIDEST_M = 0.6, 1.5
@@ -49,7 +49,7 @@ class Gap:
     """Whether all of it is known to be."""
 
 
-def openings(grids: list[Turned]) -> list[Gap]:
+def openings(grids: list[WallGrid]) -> list[Gap]:
     """What leads through a wall around a place, by what is there `along_walls`, once for every row of the wall.
 
     Also what is known to be free in a part alone, though there is space on both sides: frames smear into their doors.
@@ -58,7 +58,7 @@ def openings(grids: list[Turned]) -> list[Gap]:
     return [gap for gap in found if gap is not None]
 
 
-def jambs(grid: Turned) -> Iterator[tuple[int, int, int]]:
+def jambs(grid: WallGrid) -> Iterator[tuple[int, int, int]]:
     """What may be an exit between two parts of a wall: its row, with the rows beside it, the last cell of the one part
     and the first of the other."""
     least = _WALL_SHARE * NARROWEST_M / grid.cell_m
@@ -69,19 +69,19 @@ def jambs(grid: Turned) -> Iterator[tuple[int, int, int]]:
                 yield int(t), int(low), int(high)
 
 
-def is_in_line(grid: Turned, t: int, low: int, high: int) -> bool:
+def is_in_line(grid: WallGrid, t: int, low: int, high: int) -> bool:
     """Whether there is enough wall in line with an opening to call it one in a wall."""
     return _alongside_m(grid, t, low, high) >= _WALL_SHARE * (high - low + 1) * grid.cell_m
 
 
-def band(grid: Turned, t: int, side: int) -> np.ndarray:
+def band(grid: WallGrid, t: int, side: int) -> np.ndarray:
     """Rows before or behind the wall, from a frame's depth to where a drone stands."""
     near, far = (round(x / grid.cell_m) for x in _BEYOND_M)
     rows = t + side * np.arange(near, far + 1)
     return np.asarray(rows[(rows >= 0) & (rows < len(grid.free))])
 
 
-def gap_of(grid: Turned, t: int, low: int, high: int) -> Gap:
+def gap_of(grid: WallGrid, t: int, low: int, high: int) -> Gap:
     """The opening between two cells of a row, in the middle of the wall beside it."""
     width = (high - low + 1) * grid.cell_m  # a cell that a wall only touches is solid: half of each end's is open
     rows = np.arange(t - 1, t + 2)
@@ -92,18 +92,18 @@ def gap_of(grid: Turned, t: int, low: int, high: int) -> Gap:
     return Gap(centre, normal, width, _alongside_m(grid, t, low, high), bool(_inside(grid, t, low, high).all()))
 
 
-def _alongside_m(grid: Turned, t: int, low: int, high: int) -> float:
+def _alongside_m(grid: WallGrid, t: int, low: int, high: int) -> float:
     """Metres of wall beside an opening, to both sides together."""
     reach, wall = round(_ALONGSIDE_M / grid.cell_m), grid.wall[t]
     return float(grid.cell_m * (wall[max(0, low - reach) : low].sum() + wall[high : high + reach].sum()))
 
 
-def _inside(grid: Turned, t: int, low: int, high: int) -> np.ndarray:
+def _inside(grid: WallGrid, t: int, low: int, high: int) -> np.ndarray:
     """What of an opening is free; a cell at each end may have been seen too little to be known."""
     return grid.free[t - 1 : t + 2, low + 1 : high - 1]
 
 
-def _gap(grid: Turned, t: int, low: int, high: int) -> Gap | None:
+def _gap(grid: WallGrid, t: int, low: int, high: int) -> Gap | None:
     """The opening between two cells of a row, if it leads from somewhere to somewhere."""
     if _inside(grid, t, low, high).mean() < PARTLY_FREE:
         return None
@@ -114,14 +114,14 @@ def _gap(grid: Turned, t: int, low: int, high: int) -> Gap | None:
     return gap_of(grid, t, low, high)
 
 
-def _leads(grid: Turned, t: int, low: int, high: int, side: int) -> bool:
+def _leads(grid: WallGrid, t: int, low: int, high: int, side: int) -> bool:
     """Whether there is space on one side of the wall."""
     fifth = (high - low) // 5
     before = grid.free[band(grid, t, side), low + fifth : high - fifth]
     return before.size > 0 and float(before.mean()) >= _FREE_SHARE
 
 
-def _widens(grid: Turned, t: int, low: int, high: int, side: int) -> bool:
+def _widens(grid: WallGrid, t: int, low: int, high: int, side: int) -> bool:
     """Whether what is not known to be solid is wider on one side than the opening."""
     middle = (low + high) // 2
     widths = []
@@ -132,7 +132,7 @@ def _widens(grid: Turned, t: int, low: int, high: int, side: int) -> bool:
     return len(widths) > 0 and (float(np.median(widths)) - (high - low)) * grid.cell_m >= _WIDER_M - 1e-9
 
 
-def _in_a_wall(grid: Turned, t: int, low: int, high: int) -> bool:
+def _in_a_wall(grid: WallGrid, t: int, low: int, high: int) -> bool:
     """Whether the space widens on each side of the wall, and each end stands free of what leads away from it.
 
     A leaf that stands open closes one corner. Two cupboards close both of a side, a wall that crosses both of an end.

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edgeslam_torch.navigation.openings.wall_frame import Turned, Walls, runs, turned, wall_directions
+from edgeslam_torch.navigation.openings.wall_frame import WallGrid, Walls, runs, wall_directions, wall_grid
 from edgeslam_torch.types import FloatArray
 
 NARROWEST_M, WIDEST_M = 0.8, 3.2
@@ -64,7 +64,7 @@ def pathways(walls: Walls, here_w: FloatArray) -> list[Pathway]:
     """Corridors around a place ``(2,)``, the longest first."""
     found = []
     for angle in wall_directions(walls, here_w):
-        grid = turned(walls, here_w, angle)
+        grid = wall_grid(walls, here_w, angle)
         found += [way for chain in _chains(grid) if (way := _pathway(grid, chain, here_w)) is not None]
     kept: list[Pathway] = []
     for way in sorted(found, key=lambda w: -w.length_m):
@@ -73,7 +73,7 @@ def pathways(walls: Walls, here_w: FloatArray) -> list[Pathway]:
     return kept
 
 
-def _chains(grid: Turned) -> list[list[_Section]]:
+def _chains(grid: WallGrid) -> list[list[_Section]]:
     """Sections that follow each other and overlap."""
     ending: list[list[_Section]] = []
     done: list[list[_Section]] = []
@@ -91,7 +91,7 @@ def _chains(grid: Turned) -> list[list[_Section]]:
     return done + ending
 
 
-def _sections(grid: Turned, s: int) -> list[_Section]:
+def _sections(grid: WallGrid, s: int) -> list[_Section]:
     column, solid = grid.free[:, s], grid.solid[:, s]
     found = []
     for low, high in runs(column):
@@ -107,7 +107,7 @@ def _follows(section: _Section, last: _Section, cell_m: float) -> bool:
     return overlap * cell_m > 0.5 * NARROWEST_M and change < _STEADY_M
 
 
-def _pathway(grid: Turned, chain: list[_Section], here_w: FloatArray) -> Pathway | None:
+def _pathway(grid: WallGrid, chain: list[_Section], here_w: FloatArray) -> Pathway | None:
     widths = np.array([(c.high - c.low + 1) * grid.cell_m for c in chain])
     width, length = float(np.median(widths)), len(chain) * grid.cell_m
     if length < max(_SHORTEST_M, _LONGER * width) or np.mean([c.bound for c in chain]) < _BOUND:

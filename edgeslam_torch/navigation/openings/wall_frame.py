@@ -28,7 +28,7 @@ class Walls:
 
 
 @dataclass(frozen=True)
-class Turned:
+class WallGrid:
     """Square of cells around a place; ``[t, s]``: s along the direction, t to its left."""
 
     free: np.ndarray
@@ -58,7 +58,7 @@ class Turned:
         return np.asarray(self.centre_w + offset)
 
 
-def turned(walls: Walls, centre_w: FloatArray, angle_rad: float) -> Turned:
+def wall_grid(walls: Walls, centre_w: FloatArray, angle_rad: float) -> WallGrid:
     """What is around a place ``(2,)``, along a direction; what lies beyond the layer was not seen."""
     layer = walls.layer
     along = np.array([math.cos(angle_rad), math.sin(angle_rad)])
@@ -69,12 +69,12 @@ def turned(walls: Walls, centre_w: FloatArray, angle_rad: float) -> Turned:
     inside = ((index >= 0) & (index < layer.free.shape)).all(-1)
     i, j = np.moveaxis(np.where(inside[..., None], index, 0), -1, 0)
     free, solid, upright = (mask[i, j] & inside for mask in (layer.free, layer.solid, walls.upright))
-    return Turned(free, solid, upright, np.asarray(centre_w, dtype=np.float64), along, layer.cell_m)
+    return WallGrid(free, solid, upright, np.asarray(centre_w, dtype=np.float64), along, layer.cell_m)
 
 
-def along_walls(walls: Walls, centre_w: FloatArray) -> list[Turned]:
+def along_walls(walls: Walls, centre_w: FloatArray) -> list[WallGrid]:
     """What is around a place ``(2,)``, along each direction of its walls."""
-    return [turned(walls, centre_w, angle) for angle in wall_directions(walls, centre_w)]
+    return [wall_grid(walls, centre_w, angle) for angle in wall_directions(walls, centre_w)]
 
 
 def wall_directions(walls: Walls, centre_w: FloatArray) -> list[float]:
@@ -98,8 +98,8 @@ def wall_directions(walls: Walls, centre_w: FloatArray) -> list[float]:
     for k in np.argsort(-score):
         if score[k] < 0.25 * score.max() or len(found) == 2 * _DIRECTIONS:
             break
-        apart = [abs((angles[k] - other + math.pi / 4) % (math.pi / 2) - math.pi / 4) for other in found]
-        if all(a > _APART_RAD for a in apart):
+        off = [abs((angles[k] - other + math.pi / 4) % (math.pi / 2) - math.pi / 4) for other in found]
+        if all(a > _APART_RAD for a in off):
             found += [float(angles[k]), float((angles[k] + math.pi / 2) % math.pi)]
     return found
 

@@ -40,7 +40,7 @@ _FREE_M = 0.6
 class Perception(Protocol):
     """Tells a pilot what it may know."""
 
-    def sight(self, now_s: float, events: list[Event]) -> DroneState:
+    def state(self, now_s: float, events: list[Event]) -> DroneState:
         """The moment, from what arrived since the last one."""
 
 
@@ -81,18 +81,18 @@ def fly(case: Case, limits: NavLimits | None = None) -> Flown:
     return found
 
 
-def is_beyond(sight: DroneState, p_w: FloatArray) -> bool:
+def is_beyond(state: DroneState, p_w: FloatArray) -> bool:
     """Whether a pose is farther from the truth than all that is said of it allows: of the pose itself, of where its
     piece of map lies, of what the map has drifted by, and of the metres from the take-off.
 
     Example:
-        >>> sight = DroneState(0.0, np.array([3.2, 0.0, 1.0]), 0.0, np.zeros(3), scale_sigma=0.02)
-        >>> is_beyond(sight, np.array([3.0, 0.0, 1.0])), is_beyond(sight, np.array([2.8, 0.0, 1.0]))
+        >>> state = DroneState(0.0, np.array([3.2, 0.0, 1.0]), 0.0, np.zeros(3), scale_sigma=0.02)
+        >>> is_beyond(state, np.array([3.0, 0.0, 1.0])), is_beyond(state, np.array([2.8, 0.0, 1.0]))
         (False, True)
     """
-    way = sight.scale_sigma * float(np.linalg.norm(sight.p_w[:2]))
-    sigma = math.hypot(sight.home_sigma_m, way)
-    return float(np.linalg.norm(sight.p_w[:2] - p_w[:2])) > _SIGMAS * sigma + _NO_HARM_M
+    way = state.scale_sigma * float(np.linalg.norm(state.p_w[:2]))
+    sigma = math.hypot(state.home_sigma_m, way)
+    return float(np.linalg.norm(state.p_w[:2] - p_w[:2])) > _SIGMAS * sigma + _NO_HARM_M
 
 
 class _Task:
@@ -142,18 +142,18 @@ def _fly(
         found.crashed |= any(t.crashed for t in touched)
         if drone.mode is Mode.GROUND and tello.clock_s > 2.0:
             break
-        sight = perception.sight(tello.clock_s, events)
-        if sight.metric:
+        state = perception.state(tello.clock_s, events)
+        if state.metric:
             found.off[0] += 1
-            found.off[1] += is_beyond(sight, drone.p_w)
-            found.off_m = max(found.off_m, float(np.linalg.norm(sight.p_w[:2] - drone.p_w[:2])))
+            found.off[1] += is_beyond(state, drone.p_w)
+            found.off_m = max(found.off_m, float(np.linalg.norm(state.p_w[:2] - drone.p_w[:2])))
         if drone.mode is not Mode.FLYING or landing:
             continue
         began = time.process_time()
         if hung_s is None or not hung_s[0] <= tello.clock_s < hung_s[1]:
-            errand.go_on(sight.stamp_s)
-            errand.flight_controller.plan(sight)
-        order = errand.flight_controller.order(sight)
+            errand.go_on(state.stamp_s)
+            errand.flight_controller.plan(state)
+        order = errand.flight_controller.order(state)
         cpu_s = time.process_time() - began
         speed, clear_m = float(np.linalg.norm(drone.velocity)), drone.clearance(drone.p_w)
         ticks.append(_Tick(tello.clock_s, drone.p_w.copy(), drone.rpy(), speed, clear_m, cpu_s))
@@ -170,7 +170,7 @@ def _fly(
             found.ended, found.time_s, landing = str(order.danger), tello.clock_s, True
             tello.send("land")
         else:
-            right, forward, up, clockwise = (round(100 * v) for v in order.wish.sticks())
+            right, forward, up, clockwise = (round(100 * v) for v in order.command.sticks())
             tello.send(f"rc {right} {forward} {up} {clockwise}")
     found.contacts = contact_events(touches)
     found.landed = drone.mode is Mode.GROUND and not found.crashed

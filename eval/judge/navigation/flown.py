@@ -27,7 +27,7 @@ class Flown:
     ended: str = ""
     """How: the pilot's phase, or why it landed."""
     contacts: int = 0
-    """Events: a touch that lasts, or bounces at once, is one (`contact_events`)."""
+    """Events: a contact that lasts, or bounces at once, is one (`contact_events`)."""
     crashed: bool = False
     landed: bool = False
     time_s: float = 0.0

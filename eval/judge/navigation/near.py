@@ -62,11 +62,11 @@ def near_counts(view: View, true_m: FloatArray) -> NearCounts:
 
 
 class _Perception(Protocol):
-    def sight(self, now_s: float, events: list[Event]) -> DroneState: ...
+    def state(self, now_s: float, events: list[Event]) -> DroneState: ...
 
 
 class WatchedPerception:
-    """Passes sights on and counts, in each metric view, what is near and told to be far, and how old depth is."""
+    """Passes states on and counts, in each metric view, what is near and told to be far, and how old depth is."""
 
     def __init__(self, perception: _Perception, site: Site) -> None:
         self.counts = NearCounts()
@@ -76,18 +76,18 @@ class WatchedPerception:
         self._perception, self._site = perception, site
         self._T_b_c = camera_on_body()
 
-    def sight(self, now_s: float, events: list[Event]) -> DroneState:
-        """The sight of the perception behind."""
-        sight = self._perception.sight(now_s, events)
-        if sight.view is not None:
-            self._seen_s = sight.view.stamp_s
+    def state(self, now_s: float, events: list[Event]) -> DroneState:
+        """The state of the perception behind."""
+        state = self._perception.state(now_s, events)
+        if state.view is not None:
+            self._seen_s = state.view.stamp_s
         if math.isfinite(self._seen_s):
             self.depth_age_s.append(now_s - self._seen_s)
-        if sight.view is not None and sight.metric:
+        if state.view is not None and state.metric:
             for event in events:
-                if isinstance(event, Picture) and event.captured_s == sight.view.stamp_s:
-                    self.counts += near_counts(sight.view, self._true(event, sight.view))
-        return sight
+                if isinstance(event, Picture) and event.captured_s == state.view.stamp_s:
+                    self.counts += near_counts(state.view, self._true(event, state.view))
+        return state
 
     def _true(self, picture: Picture, view: View) -> FloatArray:
         height, width = view.depth_m.shape

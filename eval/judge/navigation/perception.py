@@ -26,7 +26,7 @@ class TruePerception:
         self._T_b_c = camera_on_body()
         self._seen_s = 0.0
 
-    def sight(self, now_s: float, events: list[Event]) -> DroneState:
+    def state(self, now_s: float, events: list[Event]) -> DroneState:
         """The moment, from what arrived since the last one."""
         view = None
         for event in events:

@@ -19,7 +19,7 @@ class SlamPerception:
         self._conditions = conditions
         self._perception = slam_perception.SlamPerception(camera, seed)
 
-    def sight(self, now_s: float, events: list[Event]) -> DroneState:
+    def state(self, now_s: float, events: list[Event]) -> DroneState:
         """The moment, from what arrived since the last one."""
         view = None
         for event in events:
@@ -27,7 +27,7 @@ class SlamPerception:
                 self._perception.heard(sample_from_sdk(event.arrived_s, parse_state(event.text)))
             elif isinstance(event, Picture):
                 view = self._step(event) or view
-        return self._perception.sight(now_s, view)
+        return self._perception.state(now_s, view)
 
     def _step(self, picture: Picture) -> View | None:
         dark = self._conditions.dark_s

@@ -22,9 +22,9 @@ def test_a_climb_before_bare_walls_is_not_taken_for_a_turn():
     tello.send("takeoff")
     told = []
     while tello.clock_s < 9.0:
-        told.append(perception.sight(tello.clock_s, tello.advance(TICK_S)))
+        told.append(perception.state(tello.clock_s, tello.advance(TICK_S)))
         if tello.clock_s > 2.5:
             tello.send(f"rc 0 0 {25 if int(tello.clock_s / 2.0) % 2 else -25} 0")
-    way = np.array([sight.p_w for sight in told if sight.stamp_s > 5.0])
+    way = np.array([state.p_w for state in told if state.stamp_s > 5.0])
     assert np.ptp(way[:, 2]) > 0.1, "it does go up and down"
     assert np.abs(way[:, :2]).max() < 0.15 and told[-1].tracked

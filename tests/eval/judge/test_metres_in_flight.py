@@ -22,15 +22,15 @@ def test_what_a_pilot_knows_is_moved_with_its_metres_and_the_drone_is_where_it_s
     tello.send("takeoff")
     before, ratios = None, []
     while tello.clock_s < 18.0:
-        sight = perception.sight(tello.clock_s, tello.advance(TICK_S))
+        state = perception.state(tello.clock_s, tello.advance(TICK_S))
         tello.send(sticks(tello.clock_s))
-        if before is not None and before.revision > 0 and sight.revision != before.revision:
-            assert sight.view is not None and sight.moved is not None
-            ratios.append(sight.moved.ratio)
-        if sight.moved is not None:
-            carried = sight.moved.points(before.p_w[None])[0]
-            assert np.linalg.norm(carried - sight.p_w) < 0.1
-        before = sight
+        if before is not None and before.revision > 0 and state.revision != before.revision:
+            assert state.view is not None and state.map_update is not None
+            ratios.append(state.update.ratio)
+        if state.map_update is not None:
+            carried = state.update.points(before.p_w[None])[0]
+            assert np.linalg.norm(carried - state.p_w) < 0.1
+        before = state
     assert any(abs(ratio - 1.0) > 0.01 for ratio in ratios), "its metres did become others"
     flown = np.linalg.norm(drone.p_w[:2])
     assert flown > 2.5

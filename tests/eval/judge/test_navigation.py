@@ -131,13 +131,13 @@ def test_the_near_table_is_of_all_flights():
 
 def test_depth_grows_old_until_there_is_a_newer_one():
     class Told:
-        def sight(self, now_s, events):
+        def state(self, now_s, events):
             view = replace(view_of(np.full((90, 120), 3.0)), stamp_s=now_s - 0.4) if now_s in (1.0, 1.6) else None
             return DroneState(now_s, np.zeros(3), 0.0, np.zeros(3), view=view)
 
     perception = WatchedPerception(Told(), named_site("corridor", 0))
     for now_s in (0.8, 1.0, 1.2, 1.4, 1.6):
-        perception.sight(now_s, [])
+        perception.state(now_s, [])
     assert perception.depth_age_s == pytest.approx([0.4, 0.6, 0.8, 0.4])
 
 
