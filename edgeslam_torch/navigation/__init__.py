@@ -1,4 +1,4 @@
-"""Flying by the map: free space, routes through it, and what watches over a flight.
+"""Navigation by the map: free space, path planning, tasks and the supervisor of a flight.
 
-Nothing here knows a drone or an emulator: records come in (`state.py`), wanted velocities go out (`pilot.py`).
+Independent of any drone or emulator: `drone_state.py` defines the input, `pilot.py` computes velocity commands.
 """

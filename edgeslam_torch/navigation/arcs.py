@@ -1,4 +1,4 @@
-"""Candidate movements: each ends in a stop, and all of it must be known to be free."""
+"""Candidate trajectories of the local planner: each ends in a stop and must lie in free space."""
 
 from dataclasses import dataclass
 
@@ -10,7 +10,7 @@ from edgeslam_torch.navigation.speed_dither import measurable
 from edgeslam_torch.types import FloatArray
 
 _HORIZON_S = 0.6
-"""A decision is kept for less than this; beyond it the candidate stops."""
+"""Time for which a candidate keeps its velocity before it stops; longer than a planning cycle."""
 _SAMPLES = 8
 _HEADINGS = 24
 _SPEEDS = (0.3, 0.6, 1.0)
@@ -18,20 +18,20 @@ _SPEEDS = (0.3, 0.6, 1.0)
 
 @dataclass(frozen=True, slots=True)
 class Arcs:
-    """Candidates, the first of which is to stop now."""
+    """Candidate trajectories; the first is to stop now."""
 
     velocity_w: FloatArray
-    """``(C, 2)`` wanted velocity [m/s]."""
+    """``(C, 2)`` commanded velocity [m/s]."""
     p_w: FloatArray
-    """``(C, S, 2)`` positions until each stands [m]."""
+    """``(C, S, 2)`` predicted positions until standstill [m]."""
     clearance_m: FloatArray
-    """``(C,)`` least distance from what is not known to be free, along it."""
+    """``(C,)`` minimum distance to non-free space along the trajectory [m]."""
     from_solid_m: FloatArray
-    """``(C,)`` least distance from what is known to be solid."""
+    """``(C,)`` minimum distance to obstacles along the trajectory [m]."""
 
     @property
     def end_w(self) -> FloatArray:
-        """``(C, 2)`` where each stands."""
+        """``(C, 2)`` final positions [m]."""
         return self.p_w[:, -1]
 
 
@@ -44,16 +44,16 @@ def candidates(
     speed_m_s: float,
     blind: bool = False,
 ) -> Arcs:
-    """Velocities in all directions at some speeds, flown for a moment and stopped.
+    """Trajectories in all directions at several speeds.
 
     Args:
-        layer: What is known to be free.
+        layer: Current layer.
         p_w: Position ``(2,)``.
         velocity_w: Velocity ``(2,)`` [m/s].
-        ahead_rad: One of the directions: that of the way.
-        limits: Reaction and settling of the drone.
-        speed_m_s: The highest of the speeds.
-        blind: Whether telemetry alone will tell where they lead to.
+        ahead_rad: Bearing of the path, one of the directions.
+        limits: Latency and time constant of the drone.
+        speed_m_s: Highest speed.
+        blind: Whether the drone flies by dead reckoning, so that velocities below the quantisation step are useless.
     """
     angle = ahead_rad + 2 * np.pi * np.arange(_HEADINGS) / _HEADINGS
     unit = np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -64,10 +64,7 @@ def candidates(
 
 
 def flown(p_w: FloatArray, velocity_w: FloatArray, wanted_w: FloatArray, limits: NavLimits) -> FloatArray:
-    """Positions ``(C, S, 2)`` of a drone that reacts late, follows ``wanted_w`` ``(C, 2)`` and then stops.
-
-    The speed approaches what is wanted exponentially, as a Tello's does.
-    """
+    """Predicted positions ``(C, S, 2)``: latency, first-order response to ``wanted_w`` ``(C, 2)``, then a stop."""
     tau = limits.settle_s
     late = p_w + limits.reaction_s * velocity_w
     t = np.linspace(0.0, _HORIZON_S, _SAMPLES - 1)[None, :, None]

@@ -1,4 +1,4 @@
-"""What a pilot is told at each moment: where the drone is, and what it saw."""
+"""Planner input and output: drone state, depth view, contact, velocity command."""
 
 import math
 from dataclasses import dataclass
@@ -11,24 +11,24 @@ from edgeslam_torch.types import FloatArray
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """A depth map, and where it was taken."""
+    """A depth map and the pose of its camera."""
 
     stamp_s: float
     depth_m: FloatArray
     """``(H, W)`` z-depth [m]; NaN or at most 0 where unknown."""
     sigma_log: FloatArray
-    """``(H, W)`` standard deviation of its logarithm."""
+    """``(H, W)`` standard deviation of log depth."""
     K: FloatArray
-    """``(3, 3)`` of a camera without distortion [px]."""
+    """``(3, 3)`` intrinsics without distortion [px]."""
     T_w_c: FloatArray
-    """``(4, 4)`` metric; in the drone's world: origin on the floor at power-on, x forward, y left, z up."""
+    """``(4, 4)`` metric pose in the drone's world: origin on the floor at power-on, x forward, y left, z up."""
     picture: int = -1
-    """Number of the picture that it was seen in; -1 where nobody asks."""
+    """Frame number; -1 if unknown."""
 
 
 @dataclass(frozen=True, slots=True)
 class DroneState:
-    """The moment as a pilot knows it."""
+    """Estimated state of the drone at one time."""
 
     stamp_s: float
     p_w: FloatArray
@@ -38,69 +38,69 @@ class DroneState:
     """``(3,)`` [m/s]."""
     position_sigma_m: float = 0.02
     submap_sigma_m: float = 0.0
-    """Standard deviation of where the piece of map that it is in lies to that of the take-off; 0 in one map."""
+    """Standard deviation of the current submap's position relative to the take-off submap; 0 in one submap [m]."""
     drift_sigma_m: float = 0.0
-    """Standard deviation of what the map may have drifted by since the take-off."""
+    """Standard deviation of the map's drift since the take-off [m]."""
     submap: int = 0
-    """Number of the piece of map."""
+    """Number of the current submap."""
     scale_sigma: float = 0.0
-    """Relative standard deviation of a metre."""
+    """Relative standard deviation of the metric scale."""
     metric: bool = True
-    """Whether the unit is a metre at all."""
+    """Whether the scale is metric at all."""
     tracked: bool = True
-    """Whether the pose rests on a map."""
+    """Whether the pose is tracked against the map; otherwise it is dead reckoning by telemetry."""
     conflict: bool = False
-    """Whether sources of scale contradict each other."""
+    """Whether scale sources contradict each other."""
     seen_s: float = math.nan
-    """When the newest picture that arrived was taken; NaN for now."""
+    """Capture time of the newest frame that arrived; NaN for now."""
     battery: float = 1.0
     reported_height_m: float = math.nan
-    """Height above the floor of the take-off as the drone itself says; NaN if it does not."""
+    """Height above the take-off floor reported by the drone [m]; NaN if unavailable."""
     reported_speed_m_s: float = math.nan
-    """Level speed as the drone itself says; NaN if it does not."""
+    """Horizontal speed reported by the drone [m/s]; NaN if unavailable."""
     view: View | None = None
-    """A new depth map, if there is one."""
+    """New depth map, if any."""
     revision: int = 0
-    """How often the unit of the positions was revised; after a change, earlier ones mean something else."""
+    """Number of scale revisions so far; positions of different revisions are not comparable."""
     map_update: MapUpdate | None = None
-    """How the map moved since the last state with a view; None where it did not."""
+    """Correction of the map since the last state with a view; None if it did not change."""
     overridden: bool = False
-    """Whether the last command was not followed: the supervisor or a hand had something else in mind."""
+    """Whether the supervisor or the operator overrode the last command."""
 
     @property
     def home_sigma_m(self) -> float:
-        """Standard deviation of where it is, seen from its take-off, by all that is known but the length of a metre."""
+        """Standard deviation of the position relative to the take-off [m], without scale uncertainty."""
         return math.hypot(self.position_sigma_m, self.submap_sigma_m, self.drift_sigma_m)
 
     @property
     def blind_s(self) -> float:
-        """Age of the newest picture."""
+        """Age of the newest frame [s]."""
         return 0.0 if math.isnan(self.seen_s) else self.stamp_s - self.seen_s
 
 
 @dataclass(frozen=True, slots=True)
 class Contact:
-    """The drone was told to move and did not: something holds it that it does not see."""
+    """The drone was commanded to move and did not: an obstacle that no view shows."""
 
     p_w: FloatArray
-    """``(3,)`` where the drone was [m]."""
+    """``(3,)`` position of the drone [m]."""
     towards_w: FloatArray
-    """``(2,)`` level unit vector of where it was to go."""
+    """``(2,)`` horizontal unit vector of the commanded direction."""
 
 
 @dataclass(frozen=True, slots=True)
 class VelocityCommand:
-    """What the drone should do until the next moment, in its own level axes."""
+    """Velocity setpoint in the drone's level body frame."""
 
     forward_m_s: float = 0.0
     left_m_s: float = 0.0
     up_m_s: float = 0.0
     turn_left_rad_s: float = 0.0
     why: str = ""
-    """For the log and the live view."""
+    """Reason, for the log and the live view."""
 
     def sticks(self) -> tuple[float, float, float, float]:
-        """Right, forward, up, clockwise in [-1, 1], as a Tello reads them: 1 m/s and 100 degrees a second in full.
+        """Stick positions right, forward, up, clockwise in [-1, 1]; a Tello's full scale is 1 m/s and 100 deg/s.
 
         Example:
             >>> VelocityCommand(forward_m_s=0.5, turn_left_rad_s=-0.5).sticks()

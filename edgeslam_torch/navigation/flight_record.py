@@ -1,8 +1,7 @@
-"""What a planner saw and decided, on disk: a line of JSON for each limit, task, contact, state and command, whole or not.
+"""Record of a planner's inputs and decisions: one JSON line per limits, task, contact, state and decision.
 
-A state is written before the planner thinks about it: one that hangs or fails leaves in the file what it hung on. A
-file that ends in the middle of a line, after a crash or a flat battery, is good up to that line. Numbers are exact, so
-that a replay decides the same.
+A state is written before the planner processes it, so that the record shows the input of a hang or crash. A truncated
+last line is ignored. Numbers are exact, so that a replay decides the same.
 """
 
 import base64
@@ -26,14 +25,14 @@ from edgeslam_torch.navigation.tasks import Task
 PLAN = "plan.jsonl"
 _HEAD = {"format": "edgeslam planner", "version": 1}
 _MAX_BYTES = 1 << 26
-"""Of a line, and of an array in it: the largest view of a pilot has 2 MB."""
+"""Maximum size of a line and of an array in it; the largest view has 2 MB."""
 _OURS = ("edgeslam_torch.navigation.", "edgeslam_torch.flying.")
-"""Where records of a flight are defined: no other name in a file is looked up."""
+"""Packages whose dataclasses may occur in a record; no other name is imported."""
 
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """What the planner commanded after a state, and what it was doing."""
+    """The planner's command for a state, and its phase."""
 
     command: VelocityCommand
     phase: str
@@ -41,7 +40,7 @@ class Decision:
 
 @dataclass(frozen=True, slots=True)
 class NewTask:
-    """From here on, the planner flies this."""
+    """Start of a task."""
 
     task: Task
 
@@ -50,11 +49,11 @@ Entry = NavLimits | NewTask | Contact | DroneState | Decision
 
 
 class PlanLog:
-    """Writes the file; every call appends one whole line.
+    """Writes a record; every call appends one line.
 
     Args:
-        path: The file, which replaces an older one.
-        limits: Of the flight.
+        path: File; an existing one is replaced.
+        limits: Limits of the flight.
 
     Raises:
         OSError: If it cannot be written.
@@ -68,8 +67,8 @@ class PlanLog:
         """Append an entry.
 
         Raises:
-            OSError: If the disk is full; the file is good up to here.
-            OutputError: If a task holds something that a file cannot.
+            OSError: If the disk is full; the file stays valid up to here.
+            OutputError: If a task holds a value that cannot be serialised.
         """
         self._file.write(json.dumps(_encoded(entry)) + "\n")
 
@@ -79,10 +78,10 @@ class PlanLog:
 
 
 def read_plan(path: Path) -> Iterator[Entry]:
-    """The entries in order; the first is the flight's limits. A last line that was cut off is left out.
+    """Entries in order, the flight's limits first. A truncated last line is ignored.
 
     Raises:
-        SourceError: If the file is missing, is none of these, or is damaged before its end.
+        SourceError: If the file is missing, of another format, or damaged before its end.
     """
     try:
         with path.open("rb") as file:
@@ -91,13 +90,13 @@ def read_plan(path: Path) -> Iterator[Entry]:
             if not isinstance(head, dict) or head.get("format") != _HEAD["format"]:
                 raise SourceError(f"{path}: not a planner's record")
             if head.get("version") != _HEAD["version"]:
-                raise SourceError(f"{path}: version {head.get('version')} is not known here, only {_HEAD['version']}")
+                raise SourceError(f"{path}: version {head.get('version')} is not supported, only {_HEAD['version']}")
             for number, line in enumerate(lines, 2):
                 if not line.endswith(b"\n"):
-                    return  # the program ended while it wrote this line
+                    return  # truncated by a crash
                 yield _entry(_parsed(line, path, number), path, number)
     except FileNotFoundError as error:
-        raise SourceError(f"{path}: not there; 'edgeslam fly ... --fly --record DIR' writes it") from error
+        raise SourceError(f"{path}: not found; 'edgeslam fly ... --fly --record DIR' writes it") from error
     except OSError as error:
         raise SourceError(f"{path}: cannot be read ({error.strerror or error})") from error
 
@@ -123,7 +122,7 @@ def _entry(value: Any, path: Path, number: int) -> Entry:
 
 def _encoded(value: Any) -> Any:
     if is_dataclass(value) and not isinstance(value, type):
-        # What a record remembers for itself begins with an underscore, and begins anew in a replay.
+        # Internal state starts with an underscore and is rebuilt in a replay.
         kept = {f.name: _encoded(getattr(value, f.name)) for f in fields(value) if f.init and f.name[0] != "_"}
         return {"kind": f"{type(value).__module__}:{type(value).__name__}", **kept}
     if isinstance(value, np.ndarray) and value.dtype.kind in "fiub":
@@ -149,13 +148,13 @@ def _decoded(value: Any) -> Any:
         if kind.kind not in "fiub" or not 0 <= size <= _MAX_BYTES:
             raise ValueError(f"an array of {size} bytes")
         unpacker = zlib.decompressobj()
-        data = unpacker.decompress(base64.b64decode(value["zlib"]), size + 1)  # no more than the array needs
+        data = unpacker.decompress(base64.b64decode(value["zlib"]), size + 1)  # bounded: no decompression bombs
         return np.frombuffer(data, kind).reshape(shape).copy()
     return _kind(value["kind"])(**{name: _decoded(x) for name, x in value.items() if name != "kind"})
 
 
 def _kind(name: str) -> Any:
-    """The record class of this name; only dataclasses of the flight's own folders."""
+    """The dataclass of this name, from `_OURS` only."""
     module, _, word = name.partition(":")
     if module.startswith(_OURS):
         try:
@@ -164,4 +163,4 @@ def _kind(name: str) -> Any:
             found = None
         if isinstance(found, type) and is_dataclass(found):
             return found
-    raise SourceError(f"{name} is not known to this version")
+    raise SourceError(f"{name} is unknown to this version")

@@ -1,4 +1,4 @@
-"""A level cut through free space, as planning uses it."""
+"""Horizontal slice of the occupancy grid, used for planning."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,26 +11,26 @@ from edgeslam_torch.types import FloatArray
 
 @dataclass(frozen=True)
 class Layer:
-    """Free and solid cells at one height; what is neither was not seen."""
+    """Free and occupied cells at one height; cells that are neither are unknown."""
 
     free: np.ndarray
     """``(X, Y)`` bool."""
     solid: np.ndarray
     """``(X, Y)`` bool."""
     corner_w: FloatArray
-    """``(2,)`` low corner of the first cell [m]."""
+    """``(2,)`` lower corner of the first cell [m]."""
     cell_m: float
 
     @cached_property
     def clearance_m(self) -> FloatArray:
-        """``(X, Y)`` distance of each free cell's centre to the border of what is not known to be free; 0 there."""
+        """``(X, Y)`` distance [m] of each free cell's centre to the nearest cell that is not free; 0 elsewhere."""
         padded = np.pad(self.free, 1)
         away = np.asarray(ndimage.distance_transform_edt(padded))[1:-1, 1:-1]
         return np.maximum(away - 0.5, 0.0) * self.cell_m
 
     @cached_property
     def from_solid_m(self) -> FloatArray:
-        """``(X, Y)`` distance of each cell's centre to the border of the nearest solid cell."""
+        """``(X, Y)`` distance [m] of each cell's centre to the border of the nearest occupied cell."""
         if not self.solid.any():
             return np.full(self.solid.shape, np.inf)
         return np.maximum(np.asarray(ndimage.distance_transform_edt(~self.solid)) - 0.5, 0.0) * self.cell_m
@@ -49,7 +49,7 @@ class Layer:
         return self._at(self.clearance_m, p_w, 0.0)
 
     def from_solid_at(self, p_w: FloatArray) -> FloatArray:
-        """Distance from solids [m] at points ``(..., 2)``, interpolated between cells; at most the grid's width."""
+        """Distance to obstacles [m] at points ``(..., 2)``, interpolated between cells; at most the grid's width."""
         widest = max(self.solid.shape) * self.cell_m
         return self._at(np.minimum(self.from_solid_m, widest), p_w, widest)
 

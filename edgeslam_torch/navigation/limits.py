@@ -1,4 +1,4 @@
-"""Limits of a flight, and the body that they are for."""
+"""Limits of a flight and dimensions of the drone."""
 
 import math
 from dataclasses import dataclass
@@ -6,26 +6,26 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class NavLimits:
-    """What a flight must keep to."""
+    """Limits that planner and supervisor enforce."""
 
     speed_m_s: float = 0.5
-    """Cruising speed where there is space."""
+    """Cruising speed in free space."""
     turn_rad_s: float = math.radians(60.0)
     climb_m_s: float = 0.3
     height_m: float = 1.15
-    """Height of flight above the floor."""
+    """Flight height above the floor."""
     lowest_m: float = 0.5
     highest_m: float = 1.9
     radius_m: float = 0.1
-    """Of a sphere that holds the drone."""
+    """Radius of the drone's bounding sphere."""
     margin_m: float = 0.15
-    """Kept beyond the drone's hull and the uncertainties: wash of the propellers, gusts."""
+    """Margin beyond hull and uncertainty, for propeller wash and gusts."""
     fence_m: float = 30.0
-    """Distance from the take-off that is never exceeded."""
+    """Maximum horizontal distance from the take-off."""
     reaction_s: float = 0.2
-    """From a decision to its effect: radio, drone, one picture."""
+    """Latency from a decision to its effect: radio, drone, one frame."""
     settle_s: float = 0.35
-    """Time constant of the drone's speed."""
+    """Time constant of the drone's velocity response."""
     home_battery: float = 0.25
     land_battery: float = 0.10
 
@@ -40,10 +40,9 @@ class NavLimits:
             raise ValueError(f"0 <= land_battery <= home_battery < 1: {self}")
 
     def stopping_m(self, speed_m_s: float) -> float:
-        """Way until it stands, from a speed [m]: the reaction at full speed, then an exponential stop."""
+        """Stopping distance [m] from a speed: latency at constant speed, then exponential decay."""
         return speed_m_s * (self.reaction_s + self.settle_s)
 
     def clearance_m(self, position_sigma_m: float) -> float:
-        """Distance of the drone's centre from everything that is not known to be free [m]: two sigmas beyond its hull
-        and margin."""
+        """Required distance [m] of the drone's centre from non-free space: hull, margin and two standard deviations."""
         return self.radius_m + self.margin_m + 2.0 * position_sigma_m

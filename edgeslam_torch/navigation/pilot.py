@@ -1,4 +1,4 @@
-"""Decides, at every moment, how to move towards a task through what is known to be free."""
+"""Planner: computes velocity commands towards a task's goals through known free space."""
 
 import math
 from dataclasses import dataclass, field
@@ -23,55 +23,55 @@ from edgeslam_torch.navigation.tasks import Task
 from edgeslam_torch.types import FloatArray
 
 BAND_M = 0.05
-"""Free height above and below the drone's hull."""
+"""Required free height above and below the hull."""
 TAKE_OFF_M = 0.5
-"""Radius that a person leaves free around a drone that takes off."""
+"""Radius around the take-off that the operator keeps clear."""
 _LOOK_M = 0.25
-"""Rise above the height of flight from which a camera that is tilted down sees what is at that height before it."""
+"""Rise above the flight height from which the down-tilted camera sees that height ahead."""
 _SWEEP_RAD = math.radians(45.0)
-"""Turn to each side there: a camera of 55 degrees does not see the sides of the way just before it."""
+"""Turn to each side there: a 55 degree field of view misses the sides of the path."""
 _SEARCH_RAD, _SEARCH_S = math.radians(60.0), 8.0
-"""Turn to each side of the goal where no way is known, and time of a turn there and back: 30 degrees a second."""
+"""Amplitude around the goal's bearing of the search for a path, and its period: 30 deg/s."""
 _BESIDE_M = 0.6
-"""How near to a goal that seems to lie in a solid it flies: what is said to be there may be a speck, seen from afar."""
+"""Distance within which cells beside an occupied goal count as goals: from afar, noise may occupy the goal's cell."""
 _AHEAD_RAD = math.radians(10.0)
-"""Turn within which it still looks ahead."""
+"""Heading error that counts as facing ahead."""
 _REPLAN_S = 0.5
 _AHEAD_M = 0.8
-"""Way ahead that the drone turns to."""
+"""Look-ahead distance along the path."""
 _FACING_RAD = math.radians(30.0)
-"""Beyond it the drone turns before it flies: it does not fly where it does not look."""
+"""Heading error beyond which the drone turns first: it flies only where the camera looks."""
 _SIDEWAYS = 0.3
-"""Share of the speed with which it moves where it does not look, through what it saw before."""
+"""Share of the speed outside the field of view, through space observed before."""
 _SQUEEZE = 0.6
-"""Share of the speed with which it passes the unseen at a hull's distance."""
+"""Share of the speed next to unknown cells at hull distance."""
 _GAIN_M = 0.04
-"""Least progress of a movement, in metres of way."""
+"""Minimum reduction of the cost to go by a movement [m]."""
 _MOVES_S = 1.0
-"""Time within which a view should come after a revision of metres, five a second being usual."""
+"""Maximum wait for a view after a scale revision; views come at 5 Hz."""
 _PATIENCE_S = 1.0
-"""Time in which a look must show a way; then it rises for another view."""
+"""Time in which a view must open the path; then the drone rises for another view."""
 _LEVEL_S = 40.0
-"""Time after which a look around is given up: it takes 12 s, and metres are waited for up to 20 s more."""
+"""Timeout of a look around: 12 s for the look and up to 20 s for the metric scale."""
 _LOST_S = 15.0
-"""Time without progress, two looks left and right, after which what closes the way is doubted and looked at anew; the
-next time, the task is given up."""
+"""Time without progress (two looks left and right) after which obstacles are reset and observed anew; the next time the
+task is given up."""
 _LOST_M = 1.5
-"""Distance within which losses of the pose are about one place."""
+"""Distance within which tracking losses belong to one place."""
 _DITHERS_S = 5.0
-"""Time without progress after which movements to and fro have shown all that they can: it rises for another view."""
+"""Time without progress after which the drone rises for another view."""
 _ELSEWHERE_M = 0.5
-"""Way that counts as progress: what is to go may grow when a way turns out to be closed."""
+"""Distance flown that counts as progress even if the cost to go grows, as when a path turns out blocked."""
 _NARROW_AHEAD_M = 2.0
-"""Way ahead in which a gap that is too narrow is what a look was for."""
+"""Distance ahead within which a too narrow gap is attributed to the last look."""
 _WANTED_M = 0.45
-"""Clearance that is wanted where there is space for it."""
+"""Preferred clearance."""
 _UPRIGHT_M, _UPRIGHT_SHARE = (0.7, 1.5), 0.7
-"""Heights that a camera at the height of flight sees of a wall two metres away, and how much of them a wall fills."""
+"""Heights visible on a wall two metres away, and the occupied share that makes a column a wall."""
 
 
 class Phase(StrEnum):
-    """What the pilot is doing."""
+    """State of the planner."""
 
     RISING = "rising to look"
     SWEEPING = "looking left and right"
@@ -83,88 +83,88 @@ class Phase(StrEnum):
 
 @dataclass(slots=True)
 class Pilot:
-    """Flies one task at a time; a new task may be given at any moment."""
+    """Executes one task at a time; a new task may be set at any time."""
 
     task: Task
     limits: NavLimits = field(default_factory=NavLimits)
     space: Space = field(default_factory=Space)
     phase: Phase = Phase.RISING
     layer: Layer | None = None
-    """The last layer, for pictures."""
+    """The last layer, for viewers."""
     way_w: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
-    """The last way, for pictures."""
+    """The last path, for viewers."""
     exits: ExitTracker = field(default_factory=ExitTracker)
-    """What was found of exits on the way, whatever the task."""
+    """Exits found so far, whatever the task."""
     _plan: CostToGo | None = None
     _goals: np.ndarray = field(default_factory=lambda: np.zeros((0, 2), int))
-    """Cells ``(G, 2)`` that it leads to."""
+    """Goal cells ``(G, 2)`` of the plan."""
     _planned_s: float = -math.inf
     _progress_s: float = math.nan
-    """When the cost to go was last less than ever; time of first looks, and in which it was overridden, is left out."""
+    """Time of the last progress; first looks and time while overridden do not count."""
     _updated_s: float = math.nan
-    """When it took in the last state."""
+    """Time of the last state."""
     _least: float = math.inf
-    """The least cost to go; NaN where the map has moved since it was known."""
+    """Lowest cost to go so far; NaN after a map correction."""
     _progress_w: FloatArray = field(default_factory=lambda: np.zeros(2))
-    """``(2,)`` where it was then."""
+    """``(2,)`` position at the last progress."""
     _waiting_s: float = math.nan
-    """Since when there is nothing to fly into."""
+    """Since when no free space opens ahead."""
     _revision: int = 0
     _revised_s: float = -math.inf
-    """When its metres were last those of the states."""
+    """Last time at which the planner's scale was that of the states."""
     _level_s: float = math.nan
-    """Since when it looks around."""
+    """Start of the current look around."""
     _sweep: list[float] = field(default_factory=list)
-    """Headings still to be looked at, last first."""
+    """Remaining headings of the look, last first."""
     _tries_narrow: bool = True
-    """Whether gaps that are too narrow are worth a look: until one was in vain."""
+    """Whether too narrow gaps are still inspected; false after one without success."""
     _looked_w: FloatArray | None = None
-    """``(2,)`` where a look showed no way last."""
+    """``(2,)`` position of the last look without success."""
     _looks_again: bool = False
-    """Whether the present look is another one from about the same place, which counts as lack of progress."""
+    """Whether the current look repeats one from the same place; it counts as lack of progress."""
     _doubted_w: FloatArray | None = None
-    """``(2,)`` where it doubted what closed its way last."""
+    """``(2,)`` position at which obstacles were reset last."""
     _losses: Losses = field(default_factory=lambda: Losses(_LOST_M))
-    """Of the pose, since the task began."""
+    """Tracking losses since the task began."""
     _submap: int = 0
-    """Piece of map that it is in."""
+    """Current submap."""
     _submap_s: float = -math.inf
-    """When the first picture in it was taken; minus infinity once what was seen before has been forgotten."""
+    """Capture time of its first frame; minus infinity once older views have been dropped."""
 
     def begin(self, task: Task) -> None:
-        """Fly something else from now on."""
+        """Switch to another task."""
         self.task, self.phase = task, Phase.FLYING
         self._plan, self._planned_s, self._tries_narrow, self._doubted_w = None, -math.inf, True, None
         self._progress_s, self._least, self._waiting_s = math.nan, math.inf, math.nan
         self._losses = Losses(_LOST_M)
 
     def walls(self) -> Walls:
-        """What is known at the height of flight, and what of it stands upright."""
+        """Layer at the flight height, and which of its occupied cells are upright."""
         layer = self.space.layer(self.limits.height_m, self.limits.radius_m + BAND_M)
         return Walls(layer, self.space.upright(*_UPRIGHT_M, _UPRIGHT_SHARE))
 
     def why_stuck(self) -> str:
-        """What keeps it from going on, in words, once it is `Phase.STUCK`."""
-        return "its pose is lost there again and again" if self._gives_up() else str(Phase.STUCK)
+        """Reason of `Phase.STUCK` in words."""
+        return "tracking is lost there repeatedly" if self._gives_up() else str(Phase.STUCK)
 
     def _gives_up(self) -> bool:
         return self.task.gives_up(self._losses.count)
 
     def add_contact(self, contact: Contact) -> None:
-        """Something holds it that no view shows: not there again."""
+        """Add an obstacle that no view shows."""
         self.space.add_contact(contact, self.limits.radius_m + 0.5 * CELL_M)
         self._plan = None
 
     def update(self, state: DroneState) -> VelocityCommand:
-        """Take in what is seen, and decide.
+        """Integrate a state and compute the command.
 
         Raises:
             ValueError: If the position or the velocity is not finite.
         """
         if not (np.isfinite(state.p_w).all() and np.isfinite(state.velocity_w).all()):
-            raise ValueError("a pilot needs to know where the drone is, and how fast")
+            raise ValueError("position and velocity must be finite")
         if state.revision != self._revision and state.map_update is None and state.stamp_s - self._revised_s < _MOVES_S:
-            return VelocityCommand(why="its metres were revised: wait for a view in the new ones")
+            return VelocityCommand(why="scale revised: waiting for a view")
         self._take_in(state)
         looks = self.phase in (Phase.RISING, Phase.SWEEPING, Phase.SINKING)
         if state.overridden or (looks and not self._looks_again):  # that is no lack of progress
@@ -205,7 +205,7 @@ class Pilot:
             self.task.consider(self.exits.candidates, self.exits.exits)
 
     def _carry(self, update: MapUpdate) -> None:
-        """Bring what is known along with the map that moved; that is no progress."""
+        """Apply a map correction; that is no progress."""
         self.space.rebuild(update)
         self.exits.carry(update)
         self.task.carry(update)
@@ -218,7 +218,7 @@ class Pilot:
         self._progress_w = update.points(self._progress_w[None])[0]
 
     def _check_submap(self, state: DroneState) -> None:
-        """What was seen in other pieces of map counts as long as it is known where they lie to this one."""
+        """Drop views of other submaps if their position relative to this one is too uncertain."""
         if state.submap != self._submap:
             self._submap, self._submap_s = state.submap, state.stamp_s - state.blind_s
         if state.submap_sigma_m > DEAD_RECKONING_SIGMA_M and self._submap_s > -math.inf:
@@ -227,13 +227,13 @@ class Pilot:
             self._looked_w = self._doubted_w = None
 
     def _forget(self) -> None:
-        """Begin anew: nothing says how what is known relates to the new metres."""
+        """Reset: the relation of the old scale to the new one is unknown."""
         self.space, self.exits = Space(), ExitTracker()
         self._plan, self._least, self._progress_s = None, math.inf, math.nan
         self.phase = Phase.RISING
 
     def _level(self, state: DroneState) -> VelocityCommand:
-        """Rise above the height of flight, look left and right, and come back to it."""
+        """Rise above the flight height, look left and right, and descend."""
         low, high = self.limits.height_m, self.limits.height_m + _LOOK_M
         if math.isnan(self._level_s):
             self._level_s = state.stamp_s
@@ -257,7 +257,7 @@ class Pilot:
         return VelocityCommand(up_m_s=self._climb(target - state.p_w[2]), why=str(self.phase))
 
     def _worth_a_look(self, state: DroneState) -> list[float]:
-        """Headings of the sweep but those on the side where the pose was lost: a wall that shows nothing."""
+        """Headings of the sweep without those on the side where tracking was lost: a textureless wall."""
         ahead = self._sweep[0]
         off = wrapped(np.array([state.yaw_rad - ahead, *(h - ahead for h in self._sweep)]))
         if state.tracked or abs(off[0]) < _AHEAD_RAD:
@@ -271,7 +271,7 @@ class Pilot:
         return float(np.clip(1.5 * error_m, -self.limits.climb_m_s, self.limits.climb_m_s))
 
     def _at_height(self, state: DroneState, command: VelocityCommand) -> VelocityCommand:
-        # A pose that telemetry carries drifts in height, too: by velocities that are cut off. The drone measures it.
+        # Dead reckoning by truncated velocities drifts in height; the drone measures its height.
         dead_reckoning = not state.tracked and math.isfinite(state.reported_height_m)
         up = self._climb(self.limits.height_m - (state.reported_height_m if dead_reckoning else float(state.p_w[2])))
         return VelocityCommand(command.forward_m_s, command.left_m_s, up, command.turn_left_rad_s, command.why)
@@ -282,7 +282,7 @@ class Pilot:
             self._progress_s = state.stamp_s
             return VelocityCommand(
                 turn_left_rad_s=self._turn(float(wrapped(np.array(heading - state.yaw_rad)))),
-                why="stand and look where the task wants",
+                why="hover and look",
             )
         plan = self._planned(state)
         here = state.p_w[:2]
@@ -299,7 +299,7 @@ class Pilot:
             self._rise(state)
             return HOVER
         if not math.isfinite(now):
-            return VelocityCommand(turn_left_rad_s=self._search(state), why="no way is known: look around")
+            return VelocityCommand(turn_left_rad_s=self._search(state), why="no path: look around")
         self.way_w = plan.way(here, 3.0)
         ahead, faced = self._bearing(here), self.task.faces_rad(state)
         error = float(wrapped(np.array((ahead if faced is None else faced) - state.yaw_rad)))
@@ -309,19 +309,21 @@ class Pilot:
             return self._look(state, error, turn)
         self._waiting_s = math.nan
         c, s = math.cos(state.yaw_rad), math.sin(state.yaw_rad)
-        return VelocityCommand(c * chosen[0] + s * chosen[1], c * chosen[1] - s * chosen[0], 0.0, turn, "along the way")
+        return VelocityCommand(
+            c * chosen[0] + s * chosen[1], c * chosen[1] - s * chosen[0], 0.0, turn, "along the path"
+        )
 
     def _is_narrow(self, state: DroneState) -> bool:
-        """Whether the way just ahead is narrower than it flies through."""
+        """Whether the path just ahead is too narrow to fly through."""
         assert self.layer is not None
         ahead = self.way_w[: round(_NARROW_AHEAD_M / CELL_M)]
         need = self.limits.clearance_m(state.position_sigma_m) - 0.5 * CELL_M
         return bool((self.layer.from_solid_at(ahead) <= need).any())
 
     def _search(self, state: DroneState) -> float:
-        """Rate of turn [rad/s] that looks left and right of where the goal is; all around if it is nowhere.
+        """Yaw rate [rad/s] of a search left and right of the goal's bearing; a full turn without goals.
 
-        A full turn would leave behind all that it knows, and what hides the way is between it and the goal.
+        A full turn would leave the mapped view, and the blocking obstacle lies towards the goal.
         """
         assert self._plan is not None
         if len(self._goals) == 0:
@@ -332,7 +334,7 @@ class Pilot:
         return self._turn(float(wrapped(np.array(wanted - state.yaw_rad))))
 
     def _planned(self, state: DroneState) -> CostToGo:
-        """The plan, made anew when it is half a second old."""
+        """The plan, updated every `_REPLAN_S`."""
         half = self.limits.radius_m + BAND_M
         self.layer = self.space.layer(self.limits.height_m, half)
         if self._plan is None or state.stamp_s - self._planned_s >= _REPLAN_S:
@@ -344,12 +346,12 @@ class Pilot:
         return self._plan
 
     def _bearing(self, here: FloatArray) -> float:
-        """Direction of the way, `_AHEAD_M` ahead."""
+        """Bearing of the path at `_AHEAD_M` ahead."""
         far = self.way_w[min(len(self.way_w) - 1, round(_AHEAD_M / 0.1))] - here
         return math.atan2(far[1], far[0])
 
     def _chosen(self, state: DroneState, plan: CostToGo, ahead: float, error: float) -> FloatArray | None:
-        """Velocity ``(2,)`` in the world of the best candidate; None when standing is as good."""
+        """World velocity ``(2,)`` of the best candidate; None if hovering is as good."""
         assert self.layer is not None
         fastest = dithered(self.limits.speed_m_s, state.stamp_s)
         here, blind = state.p_w[:2], not state.tracked
@@ -357,7 +359,7 @@ class Pilot:
         need = self.limits.clearance_m(state.position_sigma_m)
         standing = float(arcs.clearance_m[0])
         good = arcs.clearance_m >= need
-        if standing < need:  # too near already: away from it
+        if standing < need:  # already too close: allow moves that increase the clearance
             good |= arcs.clearance_m >= standing - 1e-3
         if self._may_squeeze(state.p_w[:2]):
             good |= self._squeezes(arcs, state)
@@ -370,13 +372,13 @@ class Pilot:
         return arcs.velocity_w[best]
 
     def _may_squeeze(self, here: FloatArray) -> bool:
-        """Whether a look from about here showed no way, and what is unseen is not what it has doubted to be solid."""
+        """Whether a look from here did not open the path, and unknown cells are not obstacles that were reset."""
         return _about(self._looked_w, here) and not _about(self._doubted_w, here)
 
     def _squeezes(self, arcs: Arcs, state: DroneState) -> np.ndarray:
-        """``(C,)`` slow movements that keep their clearance from every solid and only a hull's from the unseen.
+        """``(C,)`` slow moves with full clearance to obstacles, but only hull distance to unknown cells.
 
-        What is beside the drone and nearer than 0.6 m is below its picture or above it: no look from here shows it.
+        Cells within 0.6 m beside the drone lie outside the vertical field of view, so no look from here resolves them.
         """
         slow = np.linalg.norm(arcs.velocity_w, axis=1) < _SQUEEZE * self.limits.speed_m_s + 1e-6
         hull = self._hull_m(state)
@@ -384,18 +386,18 @@ class Pilot:
         return np.asarray(slow & away & (arcs.clearance_m >= hull))
 
     def _goes_back(self, arcs: Arcs, state: DroneState) -> np.ndarray:
-        """``(C,)`` slow movements along the way that it flew: through a door whose frame was never seen from behind."""
+        """``(C,)`` slow moves along the path flown, as through a door whose frame was never seen from behind."""
         slow = np.linalg.norm(arcs.velocity_w, axis=1) < _SQUEEZE * self.limits.speed_m_s + 1e-6
         hull = self._hull_m(state)
         passes = (arcs.from_solid_m >= hull + 0.5 * CELL_M) & (arcs.clearance_m >= hull)
         return np.asarray(slow & passes & self.space.was_at(arcs.p_w).all(axis=1))
 
     def _hull_m(self, state: DroneState) -> float:
-        """Distance of the drone's centre from what its hull may be beside."""
+        """Hull radius plus two standard deviations of the position [m]."""
         return self.limits.radius_m + 2.0 * state.position_sigma_m
 
     def _score(self, arcs: Arcs, plan: CostToGo, state: DroneState, error: float) -> FloatArray:
-        """Metres to go after each candidate, and what its lack of clearance is worth."""
+        """Cost to go after each candidate plus a penalty for low clearance."""
         score = np.asarray(plan.at(arcs.end_w), dtype=np.float64).copy()
         away = arcs.from_solid_m if self._may_squeeze(state.p_w[:2]) else arcs.clearance_m
         score += 0.5 * np.clip(_WANTED_M - away, 0.0, None)
@@ -407,16 +409,17 @@ class Pilot:
         return score
 
     def _rise(self, state: DroneState) -> None:
-        """See the way from higher."""
+        """Rise to see the path from above."""
         self.phase, self._waiting_s = Phase.RISING, math.nan
         self._looks_again = _about(self._looked_w, state.p_w[:2])
         self._looked_w = state.p_w[:2].copy()
         self._tries_narrow &= not self._is_narrow(state)
 
     def _start_over(self, state: DroneState) -> None:
-        """Doubt what closes the way and look around anew, once about a place: it may be the trace of a wrong depth or
-        of a pose that has been put right since. What is unseen is not flown into; but two views through what was solid
-        free it now, where it took up to ten, so nothing of it is passed at a hull's distance."""
+        """Reset the obstacles and look around, once per place: they may stem from a wrong depth or an old pose.
+
+        Reset cells are freed by two views instead of up to ten, so they are not passed at hull distance.
+        """
         if _about(self._doubted_w, state.p_w[:2]) or not state.tracked:
             self.phase = Phase.STUCK
             return
@@ -427,17 +430,17 @@ class Pilot:
         self._tries_narrow = True
 
     def _look(self, state: DroneState, error: float, turn: float) -> VelocityCommand:
-        """Turn to where the way goes; if that shows nothing, see it from higher."""
+        """Turn towards the path; rise if that opens nothing."""
         if abs(error) > math.radians(8.0):
             self._waiting_s = math.nan
-            return VelocityCommand(turn_left_rad_s=turn, why="look along the way")
+            return VelocityCommand(turn_left_rad_s=turn, why="look along the path")
         if math.isnan(self._waiting_s):
             self._waiting_s = state.stamp_s
-        elif state.stamp_s - self._waiting_s > _PATIENCE_S and state.tracked:  # else there is no view to come
+        elif state.stamp_s - self._waiting_s > _PATIENCE_S and state.tracked:  # no views come while tracking is lost
             self._rise(state)
-        return VelocityCommand(turn_left_rad_s=turn, why="wait for a view of the way")
+        return VelocityCommand(turn_left_rad_s=turn, why="wait for a view of the path")
 
 
 def _about(place_w: FloatArray | None, here: FloatArray) -> bool:
-    """Whether a place ``(2,)`` of earlier is this one."""
+    """Whether an earlier place ``(2,)`` is close to the current position."""
     return place_w is not None and float(np.linalg.norm(here - place_w)) < _ELSEWHERE_M

@@ -1,4 +1,4 @@
-"""Ways to a goal: cost to go over a layer, optimistic about what was not seen."""
+"""Global planner: cost to go over a layer, optimistic about unknown cells."""
 
 import math
 from dataclasses import dataclass
@@ -14,17 +14,17 @@ from edgeslam_torch.types import FloatArray
 
 _NEIGHBOURS = ((1, 0), (0, 1), (1, 1), (1, -1))
 _UNSEEN_COST = 2.5
-"""A metre that was not seen costs this much: a known way of less than that is taken instead."""
+"""Cost per metre of unknown space: a known path up to this many times longer is preferred."""
 _NARROW_COST = 10.0
-"""A metre between solids that stand nearer than a way must keep: worth a look from near by, where a gap seen from afar
-mostly is wider, before a detour of as many metres."""
+"""Cost per metre of a gap narrower than the required clearance. Gaps look narrower from afar, so a closer look pays off
+before a detour of this many metres."""
 _TIGHT_M, _TIGHT_COST = 0.45, 2.0
-"""Nearer than this to a solid, a metre costs up to so much more: the middle of a corridor is the shortest way."""
+"""Distance to obstacles below which a metre costs up to this much more, so that paths keep to the middle."""
 
 
 @dataclass(frozen=True, slots=True)
 class CostToGo:
-    """Metres, weighted, from every cell to the nearest goal; infinite where there is no way."""
+    """Weighted path length [m] from every cell to the nearest goal; infinite if unreachable."""
 
     layer: Layer
     cost: FloatArray
@@ -36,7 +36,7 @@ class CostToGo:
         return np.asarray(self.cost[cells[..., 0], cells[..., 1]])
 
     def way(self, p_w: FloatArray, length_m: float) -> FloatArray:
-        """The cheapest way from a point ``(2,)``, ``(N, 2)`` centres of cells, as far as ``length_m`` or the goal."""
+        """Cheapest path from a point ``(2,)``: cell centres ``(N, 2)``, up to ``length_m`` or the goal."""
         here = self.layer.cells(p_w)
         out = [self.layer.centres(here)]
         steps = int(length_m / self.layer.cell_m)
@@ -59,16 +59,15 @@ def cost_to_go(
     beside_m: float = 0.0,
     narrow_m: float = math.inf,
 ) -> CostToGo:
-    """Cheapest way from everywhere to the goals (Dijkstra, from the goals).
+    """Cost to go from every cell to the goals (Dijkstra from the goals).
 
     Args:
-        layer: Free, solid and unseen cells.
-        goals: Cells ``(G, 2)``; those that are blocked lead nowhere.
-        clearance_m: Distance of the drone's centre from solids that a way must keep.
-        here: The drone's cell ``(2,)``; a way may begin nearer to a solid than that.
-        beside_m: If no goal can be reached from there, cells up to this far from one are goals as well, the
-            nearest that can be.
-        narrow_m: Distance from solids down to which a way is planned at a high cost, though it may not be flown.
+        layer: Free, occupied and unknown cells.
+        goals: Cells ``(G, 2)``; blocked ones are ignored.
+        clearance_m: Required distance of the drone's centre from obstacles.
+        here: The drone's cell ``(2,)``; the path may start closer to an obstacle.
+        beside_m: If no goal is reachable, the nearest reachable cells within this distance of one are goals too.
+        narrow_m: Distance from obstacles down to which paths are planned at high cost, though they may not be flown.
     """
     away, slack = layer.from_solid_m, 0.5 * layer.cell_m
     open_ = away > min(clearance_m, narrow_m) - slack
@@ -100,18 +99,18 @@ def cost_to_go(
 
 
 def _from(graph: csr_array, sources: np.ndarray) -> FloatArray:
-    """Cost of every cell from the nearest of the sources ``(X, Y)`` bool; infinite without any."""
+    """Cost of every cell from the nearest source ``(X, Y)`` bool; infinite without sources."""
     index = np.flatnonzero(sources)
     if len(index) == 0:
         return np.full(sources.shape, np.inf)
-    # SciPy 1.13 wants 32 bits; a grid has 25 600 cells.
+    # SciPy 1.13 requires 32-bit indices; a grid has 25 600 cells.
     found = dijkstra(graph, directed=False, indices=index.astype(np.int32), min_only=True)
     return np.asarray(found).reshape(sources.shape)
 
 
 @lru_cache(maxsize=4)
 def _edges(shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, FloatArray]:
-    """Pairs of neighbouring cells, flat, and their distance in cells."""
+    """Flat indices of neighbouring cells and their distance in cells."""
     index = np.arange(shape[0] * shape[1]).reshape(shape)
     first, second, length = [], [], []
     for di, dj in _NEIGHBOURS:

@@ -1,7 +1,7 @@
-"""Free space around a drone: a grid of log-odds that moves with it and bends with the map.
+"""Occupancy grid of log-odds that follows the drone and is rebuilt when the map is corrected.
 
-What was never seen is not free. Depth frees a ray only as far as two of its sigmas before what it shows, since a wall
-that is seen too far away is the one that is hit.
+Unknown space is not free. A depth ray frees cells only up to two standard deviations before its end, since an
+overestimated depth is the dangerous error.
 """
 
 from collections import deque
@@ -17,13 +17,13 @@ from edgeslam_torch.types import FloatArray
 
 CELL_M = 0.1
 SIDE = 160
-"""Cells across: 16 m, of which a drone that sees 5 m far uses what it needs to come home from next door."""
+"""Cells per side: 16 m, enough to plan back through an adjacent room."""
 LEVELS = 24
-"""Cells upwards, from the floor: 2.4 m."""
+"""Cells upwards from the floor: 2.4 m."""
 REACH_M = 5.0
-"""Maximum depth that is used: small obstacles are a pixel beyond."""
+"""Maximum depth used; beyond it small obstacles cover less than a pixel."""
 _MISS, _HIT = np.float32(-0.5), np.float32(1.2)
-"""Log-odds of a cell that a ray passed, that a ray ended in: one hit outweighs two misses."""
+"""Log-odds increments of a cell that a ray passes and that a ray ends in; one hit outweighs two misses."""
 _LIMIT = np.float32(4.0)
 FREE, SOLID = -0.8, 0.4
 """Free after two misses; solid after one hit."""
@@ -33,45 +33,45 @@ _SHIFT = 20
 _SIGMAS = 2.0
 _MIN_DEPTH_M = 0.15
 _PLACED_M = 0.3
-"""Standard deviation above which a surface has no place: it fills nothing, and frees only what is sure."""
+"""Standard deviation of depth [m] above which a ray only frees cells and marks none as occupied."""
 MAX_VIEWS = 240
-"""Views that are remembered to rebuild the grid from when the map moves: 24 m of way at the fastest."""
+"""Views stored to rebuild the grid after a map correction: 24 m of flight at top speed."""
 _SAME_M, _SAME_COS, _MAX_SAME = 0.1, np.cos(np.radians(4.0)), 3
-"""A fourth view from within these of three others takes the place of the last: hovering fills no memory."""
+"""Distance and angle within which views are redundant, and how many of them are stored while hovering."""
 _CONTACT_RAD = np.radians(35.0)
-"""To each side of the direction of a contact: what holds a drone is rarely as thin as a cell."""
+"""Half-angle around a contact's direction that is marked occupied: obstacles are rarely as thin as a cell."""
 _NOWHERE = np.float32(1e6)
 _AROUND, _NEIGHBOURS = np.ones((5, 5), np.uint8), np.ones((3, 3), np.uint8)
 _RAMP, _NEAR_END = 1.5, 1.1
-"""Ratio of depths within four pixels beyond which they are of two things, and how much farther than the nearest the
-nearer thing may be: a wall 0.8 m beside the way, seen along, has 1.4 at `REACH_M`."""
+"""Depth ratio within four pixels that indicates an occlusion edge (a wall seen at a grazing angle from 0.8 m has 1.4 at
+`REACH_M`), and depth ratio to the nearest pixel up to which a pixel belongs to the foreground."""
 _SMALL = (80, 60)
-"""Size at which depth is used [px], the nearest of the pixels that fall together: 7 cm at `REACH_M`."""
+"""Maximum size of depth maps in the grid [px]: 7 cm per pixel at `REACH_M`. Larger maps are min-pooled."""
 
 
 @dataclass(slots=True)
 class Space:
-    """The grid.
+    """Occupancy grid.
 
     Args:
-        centre_w: Where it is at first ``(2,)`` [m].
-        floor_m: Height of its lowest face.
+        centre_w: Initial centre ``(2,)`` [m].
+        floor_m: Height of the lowest face [m].
     """
 
     centre_w: FloatArray = field(default_factory=lambda: np.zeros(2))
     floor_m: float = 0.0
     _odds: FloatArray = field(init=False)
-    """``(SIDE, SIDE, LEVELS)`` log-odds of being solid."""
+    """``(SIDE, SIDE, LEVELS)`` log-odds of occupancy."""
     _corner: np.ndarray = field(init=False)
-    """``(2,)`` int, cell of the world at its corner."""
+    """``(2,)`` int, world cell at the grid's corner."""
     _views: deque[View] = field(init=False)
     _doubted: int = field(init=False)
-    """How many of them, the earliest, only carve since their solids were doubted."""
+    """Number of oldest views that only free cells (`doubt_solids`)."""
     _flown: deque[tuple[FloatArray, float]] = field(init=False)
     _way: np.ndarray = field(init=False)
-    """``(SIDE, SIDE)`` uint8, 1 where it flew."""
+    """``(SIDE, SIDE)`` uint8, 1 where the drone flew."""
     _contacts: FloatArray = field(init=False)
-    """``(N, 3)`` where the drone was held by what it does not see."""
+    """``(N, 3)`` points of contact."""
 
     def __post_init__(self) -> None:
         self._odds = np.zeros((SIDE, SIDE, LEVELS), np.float32)
@@ -83,7 +83,7 @@ class Space:
         self._contacts = np.zeros((0, 3))
 
     def observe(self, view: View) -> None:
-        """Carve and fill by a depth map."""
+        """Integrate a depth map."""
         small = _smaller(view)
         if len(self._views) >= _MAX_SAME and _same_view(self._views[-_MAX_SAME], small):
             self._views[-1] = small
@@ -94,26 +94,25 @@ class Space:
         self._add(small)
 
     def flown(self, p_w: FloatArray, radius_m: float) -> None:
-        """What the drone has flown through is free: a sphere around ``(3,)``, of the drone's radius or, at take-off,
-        of what a person left free around it."""
+        """Mark a sphere around ``(3,)`` as free: the drone's own, or the clear area required at take-off."""
         self._flown.append((np.array(p_w, dtype=np.float64), radius_m))
         self._pass(p_w, radius_m)
 
     def was_at(self, p_w: FloatArray) -> np.ndarray:
-        """Whether the drone flew within a cell of each of the places ``(..., 2)``, bool ``(...)``."""
+        """Whether the drone flew within a cell of points ``(..., 2)``, bool ``(...)``."""
         at = np.floor(np.asarray(p_w) / CELL_M).astype(int) - self._corner
         inside = ((at >= 0) & (at < SIDE)).all(axis=-1)
         i, j = np.moveaxis(np.where(inside[..., None], at, 0), -1, 0)
         return np.asarray(inside & (cv2.dilate(self._way, _NEIGHBOURS)[i, j] > 0))
 
     def add_contact(self, contact: Contact, reach_m: float) -> None:
-        """There is a solid from now on, whatever is seen, ``reach_m`` from the drone's centre."""
+        """Mark an obstacle ``reach_m`` from the drone's centre permanently as occupied."""
         angle = np.arctan2(contact.towards_w[1], contact.towards_w[0]) + _CONTACT_RAD * np.array([-1.0, 0.0, 1.0])
         level = contact.p_w[:2] + reach_m * np.column_stack([np.cos(angle), np.sin(angle)])
         self._contacts = np.concatenate([self._contacts, np.column_stack([level, np.full(len(level), contact.p_w[2])])])
 
     def follow(self, p_w: FloatArray) -> None:
-        """Move the grid when the drone ``(3,)`` comes near its border; what falls off is forgotten."""
+        """Shift the grid when the drone ``(3,)`` leaves its centre; cells that fall off are lost."""
         wanted = np.floor(np.asarray(p_w[:2]) / CELL_M).astype(int) - SIDE // 2
         step = ((wanted - self._corner) / _SHIFT).astype(int) * _SHIFT
         if not step.any():
@@ -127,7 +126,7 @@ class Space:
         self._odds, self._way, self._corner = moved, way, self._corner + step
 
     def rebuild(self, update: MapUpdate) -> None:
-        """Build the grid anew from the views that are remembered, after the map moved."""
+        """Rebuild the grid from the stored views after a map correction."""
         if self._views:
             poses = update.poses(np.array([view.T_w_c for view in self._views]))
             for k, (view, T_w_c) in enumerate(zip(self._views, poses, strict=True)):
@@ -139,7 +138,7 @@ class Space:
         self._build()
 
     def forget_before(self, seen_s: float) -> None:
-        """Know no more than what the views since a moment showed."""
+        """Drop everything but the views since a time."""
         kept = [view for view in self._views if view.stamp_s >= seen_s]
         self._doubted = max(0, self._doubted - (len(self._views) - len(kept)))
         self._views = deque(kept, maxlen=MAX_VIEWS)
@@ -155,13 +154,12 @@ class Space:
             self._pass(p_w, radius_m)
 
     def doubt_solids(self) -> None:
-        """What was seen to be solid is as good as unseen until it is seen again; what is free stays free, and where
-        something held the drone there is something."""
+        """Reset occupied cells to unknown until they are observed again; free cells and contacts stay."""
         self._odds[self._odds > 0.0] = 0.0
         self._doubted = len(self._views)
 
     def layer(self, height_m: float, half_m: float) -> Layer:
-        """What a drone at a height can fly through, if everything within ``half_m`` above and below must be free."""
+        """Slice for flight at a height; a cell is free if all cells within ``half_m`` above and below are."""
         low = int(np.floor((height_m - half_m - self.floor_m) / CELL_M + 1e-6))
         high = int(np.ceil((height_m + half_m - self.floor_m) / CELL_M - 1e-6))
         if low < 0 or high > LEVELS:
@@ -174,7 +172,7 @@ class Space:
         return Layer(free, solid, self._corner * CELL_M, CELL_M)
 
     def upright(self, low_m: float, high_m: float, share: float) -> np.ndarray:
-        """Columns ``(SIDE, SIDE)`` of which at least this share between two heights is known to be solid."""
+        """Columns ``(SIDE, SIDE)`` bool of which at least this share between two heights is occupied."""
         low, high = (round((z - self.floor_m) / CELL_M) for z in (low_m, high_m))
         if not 0 <= low < high <= LEVELS:
             raise ValueError(f"heights {low_m:.2f} to {high_m:.2f} m are outside the grid of {LEVELS * CELL_M:.1f} m")
@@ -187,7 +185,7 @@ class Space:
             self._fill(view, depth)
 
     def _carve(self, view: View, depth: FloatArray) -> None:
-        """Free the cells that lie wholly before everything that their pixels show."""
+        """Free the cells that lie wholly in front of the depth of all pixels that they cover."""
         height, width = depth.shape
         index, p_c = self._cells_before(view, height, width)
         if len(index) == 0:
@@ -195,7 +193,7 @@ class Space:
         z = p_c[:, 2]
         u, v = ((view.K[k, k] * p_c[:, k] / z + view.K[k, 2]) for k in (0, 1))
         sure = depth * np.exp(-_SIGMAS * view.sigma_log.astype(np.float32))
-        # A cell covers several pixels: the nearest of them counts, from a pyramid of minima.
+        # A cell covers several pixels: take their minimum from a pyramid.
         half_px = 0.5 * CELL_M * view.K[0, 0] / z
         level = np.clip(np.ceil(np.log2(np.maximum(half_px, 1.0))), 0, 5).astype(int)
         nearest = np.zeros(len(z), np.float32)
@@ -212,7 +210,7 @@ class Space:
         odds[passed] = np.maximum(odds[passed] + _MISS, -_LIMIT)
 
     def _cells_before(self, view: View, height: int, width: int) -> tuple[np.ndarray, FloatArray]:
-        """Cells in the camera's field of view: flat index ``(N,)`` and centre in its axes ``(N, 3)``."""
+        """Cells in the field of view: flat index ``(N,)`` and centre in the camera frame ``(N, 3)``."""
         T = view.T_w_c
         reach = int(np.ceil(REACH_M / CELL_M))
         here = np.floor(T[:2, 3] / CELL_M).astype(int) - self._corner
@@ -236,7 +234,7 @@ class Space:
         return index[front], p_c[front]
 
     def _fill(self, view: View, depth: FloatArray) -> None:
-        """Mark the cells in which rays end."""
+        """Mark cells in which rays end as occupied."""
         height, width = depth.shape
         known = view.sigma_log * depth < _PLACED_M
         v, u = np.nonzero((depth > _MIN_DEPTH_M) & (depth < REACH_M) & known & ~_between(depth))
@@ -246,7 +244,7 @@ class Space:
         self._mark(p)
 
     def points(self, p_w: FloatArray) -> None:
-        """Mark points of surfaces ``(N, 3)`` [m], such as edges and anchors, as solid."""
+        """Mark surface points ``(N, 3)`` [m], such as edges and anchors, as occupied."""
         self._mark(np.asarray(p_w, dtype=np.float64))
 
     def _mark(self, p_w: FloatArray) -> None:
@@ -259,7 +257,7 @@ class Space:
         odds[index] = np.minimum(np.maximum(odds[index], _MISS) + _HIT, _LIMIT)
 
     def _pass(self, p_w: FloatArray, radius_m: float) -> None:
-        """The drone was here."""
+        """Mark a position of the drone as flown and free."""
         i, j = np.floor(p_w[:2] / CELL_M).astype(int) - self._corner
         if 0 <= i < SIDE and 0 <= j < SIDE:
             self._way[i, j] = 1
@@ -277,9 +275,9 @@ class Space:
 
 
 def _between(depth: FloatArray) -> np.ndarray:
-    """Pixels ``(H, W)`` between something near and something far: a network's ramp from one to the other, no surface.
+    """Pixels ``(H, W)`` on the ramp that a depth network draws across an occlusion edge; there is no surface.
 
-    A door's frame and the room behind it would else close the door.
+    Otherwise the ramp between a door frame and the room behind it would close the door.
     """
     nearest = cv2.erode(np.where(depth > 0, depth, _NOWHERE), _AROUND)
     farthest = cv2.dilate(np.where(depth > 0, depth, np.float32(0.0)), _AROUND)
@@ -292,7 +290,7 @@ def _same_view(one: View, other: View) -> bool:
 
 
 def _smaller(view: View) -> View:
-    """At the size at which it is remembered: the nearest of the pixels that fall together, as sure as that one is."""
+    """The view at storage size, min-pooled; each pixel keeps the standard deviation of the nearest depth."""
     height, width = view.depth_m.shape
     step = max(1, -(-width // _SMALL[0]), -(-height // _SMALL[1]))
     if step == 1:
@@ -308,7 +306,7 @@ def _smaller(view: View) -> View:
 
 
 def _blocks(grid: FloatArray, step: int) -> FloatArray:
-    """Pixels that fall together ``(H // step, W // step, step * step)``."""
+    """Pooling blocks ``(H // step, W // step, step * step)``."""
     rows, columns = (n // step for n in grid.shape)
     cut = grid[: rows * step, : columns * step].reshape(rows, step, columns, step)
     return cut.swapaxes(1, 2).reshape(rows, columns, step * step)

@@ -1,7 +1,7 @@
-"""Velocities of which a Tello tells the truth on average: it cuts what it tells off to whole decimetres a second.
+"""Dithered speeds: a Tello truncates reported velocities to whole dm/s.
 
-One speed kept to would be told up to a whole step too low, and every metre be too short; or too long, where half a step
-is added for what is cut off. A speed that goes evenly through one step is told half a step too low.
+At a constant speed truncation biases the reported velocity by 0 to 1 step, and with it the metric scale. Sweeping the
+speed uniformly over one step decorrelates the error: its mean is then exactly half a step, which can be corrected.
 """
 
 import numpy as np
@@ -9,13 +9,13 @@ import numpy as np
 from edgeslam_torch.types import FloatArray
 
 STEP_M_S = 0.1
-"""In which a Tello tells its velocity."""
+"""Quantisation step of a Tello's reported velocity."""
 _VARIES_S = 4.0
-"""Time in which the speed goes down and up again."""
+"""Period of the triangle wave."""
 
 
 def dithered(fastest_m_s: float, stamp_s: float) -> float:
-    """The speed at a moment: the fastest, and evenly down to a step below it, but not below half of it.
+    """Speed [m/s] at a time: a triangle wave from ``fastest_m_s`` down by one step, at most by half of it.
 
     >>> [round(dithered(0.5, t), 2) for t in (0.0, 1.0, 2.0, 3.0)]
     [0.4, 0.45, 0.5, 0.45]
@@ -25,11 +25,12 @@ def dithered(fastest_m_s: float, stamp_s: float) -> float:
 
 
 def measurable(velocity_w: FloatArray) -> FloatArray:
-    """Velocities ``(..., 2)`` without the components of which nothing is told: a drone that drifts sideways by 5 cm a
-    second, without a picture, is half a metre beside where it is consistent to be after ten seconds.
+    """Velocities ``(..., 2)`` with components below the quantisation step set to 0.
+
+    Telemetry reports such components as 0, so dead reckoning misses them: 5 cm/s are half a metre in ten seconds.
 
     Args:
-        velocity_w: In the drone's power-on axes, in which it tells them [m/s].
+        velocity_w: In the drone's power-on axes, in which it reports them [m/s].
 
     >>> measurable(np.array([-0.25, 0.04]))
     array([-0.25,  0.  ])

@@ -1,6 +1,6 @@
-"""What stands between a pilot and the sticks: it works when the pilot hangs, the picture stops, or metres are doubtful.
+"""Supervisor between planner and drone: handles a hanging planner, missing frames and an uncertain scale.
 
-Every order to the drone comes from here. It knows nothing of routes; it knows when not to fly.
+Every order to the drone comes from here. It does no planning; it decides when a command must not be followed.
 """
 
 import math
@@ -21,49 +21,49 @@ from edgeslam_torch.types import FloatArray
 STALE_S = 0.3
 """Age of a command beyond which the sticks are centred."""
 BLIND_S = 0.7
-"""Age of the picture beyond which nothing new is flown into; a Tello's is 0.3 to 0.5 s old when it arrives."""
+"""Frame age beyond which commands are not followed; a Tello's frame is 0.3 to 0.5 s old when it arrives."""
 BACK_S = 1.5
-"""Time of trouble after which it backs up along the way it came, which was free."""
+"""Duration of a danger after which the drone backs up along the path flown, which was free."""
 LAND_S = 10.0
-"""Time of trouble after which it lands."""
+"""Duration of a danger after which the drone lands."""
 UNSURE_LAND_S = 30.0
-"""The same when metres are doubtful: seven times up and down where it has been, which is what tells them, of this map
-or, where that tells none for eight seconds, of the next (`flying/perception/map_reset.py`)."""
+"""The same for an uncertain scale: time for seven vertical oscillations, which make the scale observable in this map
+or, after eight seconds without success, in the next one (`flying/perception/map_reset.py`)."""
 _BACK_M, _BACK_M_S = 1.0, 0.25
-"""Way back, and its mean speed: without a picture telemetry alone says how far it came."""
+"""Distance and mean speed of backing up; without frames only telemetry measures the distance."""
 SCALE_SIGMA = 0.10
 _KNOWN_S, _BEFORE_S = 1.2, 6.0
-"""How long before its pose was lost it looked at what it knew well: pictures are up to half a second late. If that
-shows nothing, the second."""
+"""Time before the tracking loss whose heading is restored to relocalise (frames are up to half a second late); the
+second value if the first fails."""
 DEAD_RECKONING_SIGMA_M = 0.12
-"""Standard deviation of the position up to which it flies on by telemetry alone where the picture shows nothing: two of
-them are the margin and the hull. A bare wall fills the picture for a metre of way; telemetry carries as far."""
+"""Position standard deviation [m] up to which the drone flies on by dead reckoning: two of them equal margin plus hull.
+Enough for the metre of path along which a bare wall fills the view."""
 _WIGGLE_S, _WIGGLE_M_S = 2.0, 0.25
-"""Up and down, which tells height and telemetry the scale."""
+"""Half period and speed of the vertical oscillation that makes the scale observable."""
 _TRAIL_M = 0.05
 _ONE_WAY_M = 0.3
-"""How far the way back may lie beside the way out."""
+"""Tolerance between the paths out and back."""
 _HEIGHT_CONFLICT_M, _HEIGHT_CONFLICT_S = 0.5, 1.0
-"""Heights of map and drone that are so far apart for so long cannot both be true. Together sure metres of 10 % at the
-highest flight, a video that is 0.5 s late in a climb of 0.4 m/s, and the drone's own decimetres explain 0.45 m."""
+"""Difference of map height and reported height, and its duration, that indicate a wrong pose. A scale error of 10 % at
+the highest flight, a delay of 0.5 s in a climb of 0.4 m/s and the drone's resolution of 0.1 m explain 0.45 m."""
 
 
 class Danger(StrEnum):
-    """Why the pilot's command is not followed, the gravest last."""
+    """Why the planner's command is not followed, by severity."""
 
     NONE = ""
-    DEAD_RECKONING = "carried by telemetry past what shows nothing"
-    """The pilot's command is followed all the same, as when the battery calls it home."""
-    NO_COMMAND = "no command of the pilot: planner late or hung"
+    DEAD_RECKONING = "dead reckoning by telemetry: tracking lost"
+    """The command is followed all the same, as for `BATTERY_HOME`."""
+    NO_COMMAND = "no command: the planner is late or hangs"
     FENCE = "at the fence"
-    SCALE = "metres are not sure"
-    BLIND = "no fresh picture"
-    LOST = "the pose rests on no map"
-    HEIGHT_CONFLICT = "the map and the drone's own height contradict each other"
-    CONTACT = "commanded and not moving: contact"
-    NOT_METRIC = "no metres"
-    HOLD = "held by hand"
-    BATTERY_HOME = "battery low: home"
+    SCALE = "scale uncertain"
+    BLIND = "no recent frame"
+    LOST = "tracking lost"
+    HEIGHT_CONFLICT = "map height and reported height contradict each other"
+    CONTACT = "contact: commanded to move, but not moving"
+    NOT_METRIC = "no metric scale"
+    HOLD = "hover requested by the operator"
+    BATTERY_HOME = "battery low: return home"
     BATTERY = "battery empty: land"
 
 
@@ -73,58 +73,58 @@ _FOLLOWED = (Danger.NONE, Danger.DEAD_RECKONING, Danger.BATTERY_HOME)
 
 @dataclass(frozen=True, slots=True)
 class Order:
-    """What the drone is told."""
+    """Order to the drone."""
 
     command: VelocityCommand
     land: bool = False
     home: bool = False
-    """Whether the pilot should fly home."""
+    """Whether the planner should return home."""
     danger: Danger = Danger.NONE
     contact: Contact | None = None
-    """What the pilot should know of since it was just began."""
+    """Contact that the planner should add to its map."""
 
     @property
     def follows(self) -> bool:
-        """Whether the pilot's command is passed on."""
+        """Whether the planner's command is passed on."""
         return self.danger in _FOLLOWED
 
 
 @dataclass(slots=True)
 class Supervisor:
-    """Watches states and commands; `order` is to be asked at least every 0.1 s, from a thread of its own."""
+    """Checks states and commands; call `order` at least every 0.1 s, from a thread of its own."""
 
     limits: NavLimits = field(default_factory=NavLimits)
     landing: bool = False
-    """Once it lands, it lands."""
+    """A landing is never aborted."""
     hold: bool = False
-    """Whether a person wants it to hover."""
+    """Whether the operator requested hovering."""
     _state: DroneState | None = None
     _command: VelocityCommand | None = None
     _command_s: float = -math.inf
     _since_s: float = math.nan
-    """Since when it is in trouble."""
+    """Start of the current danger."""
     _severe_s: float = math.nan
-    """Since when in other trouble than doubtful metres."""
+    """Start of a danger other than an uncertain scale."""
     _onward: Push = field(default_factory=Push)
-    """Whether it comes on where the pilot wants to."""
+    """Contact detection along the planner's commands."""
     _backward: Push = field(default_factory=Push)
-    """Whether it comes back the way it came."""
+    """Contact detection while backing up."""
     _height_conflict_s: float = math.nan
-    """Since when the heights of map and drone are apart."""
+    """Since when map height and reported height differ."""
     _sent: bool = True
-    """Whether the drone was told the pilot's command at the last order, or would have been but for being held."""
+    """Whether the last order passed the command on, or would have without contact."""
     _trail: deque[FloatArray] = field(default_factory=lambda: deque(maxlen=400))
-    """Where it flew, 5 cm apart."""
+    """Positions flown, `_TRAIL_M` apart."""
     _home_w: FloatArray | None = None
     _known_w: FloatArray | None = None
-    """Where its pose rested on a map last."""
+    """Last tracked position."""
     _back_s: float = math.nan
-    """How long it backs up, if its trouble makes it."""
+    """Duration of backing up."""
     _headings: deque[tuple[float, float]] = field(default_factory=deque)
-    """Moments and headings of the last `_BEFORE_S` with a pose that rests on a map."""
+    """Times and headings of tracked states of the last `_BEFORE_S`."""
 
     def see(self, state: DroneState) -> None:
-        """The newest state."""
+        """Set the newest state."""
         self._state = state
         if state.tracked:
             self._known_w = state.p_w
@@ -138,17 +138,17 @@ class Supervisor:
             self._trail.append(state.p_w.copy())
 
     def carry(self, update: MapUpdate) -> None:
-        """Take the way flown along with the map."""
+        """Apply a map correction to the path flown."""
         self._trail = deque(update.points(np.array(self._trail).reshape(-1, 3)), maxlen=self._trail.maxlen)
         if self._known_w is not None:
             self._known_w = update.points(self._known_w[None])[0]
 
     def propose(self, command: VelocityCommand, now_s: float) -> None:
-        """The pilot's newest command; it counts for `STALE_S`."""
+        """Set the planner's newest command, valid for `STALE_S`."""
         self._command, self._command_s = command, now_s
 
     def order(self, now_s: float) -> Order:
-        """What the drone is told now."""
+        """Order for the drone now."""
         if self._state is None:
             return Order(VelocityCommand(why="no state yet"), danger=Danger.NO_COMMAND)
         danger = self._danger(self._state, now_s)
@@ -163,10 +163,8 @@ class Supervisor:
         if danger is Danger.NONE:
             self._since_s = math.nan
             assert self._command is not None
-            danger_said = danger if self._state.tracked else Danger.DEAD_RECKONING
-            return Order(
-                self._within_heights(self._command), home=home, danger=Danger.BATTERY_HOME if home else danger_said
-            )
+            shown = danger if self._state.tracked else Danger.DEAD_RECKONING
+            return Order(self._within_heights(self._command), home=home, danger=Danger.BATTERY_HOME if home else shown)
         trouble_s = self._trouble_s(danger, now_s)
         patience_s = UNSURE_LAND_S if danger in _UNSURE else LAND_S + self._back_s - _BACK_M / _BACK_M_S
         in_vain = trouble_s > patience_s or now_s - self._since_s > UNSURE_LAND_S
@@ -183,12 +181,12 @@ class Supervisor:
         return Order(command, home=home, danger=danger, contact=contact)
 
     def _backs_in_vain(self, command: VelocityCommand, now_s: float) -> bool:
-        """Whether something holds it on its way back, which the map has in another place."""
+        """Whether an obstacle blocks the way back."""
         assert self._state is not None
         return self._backward.holds(self._state, self._push_w(command), now_s)
 
     def _trouble_s(self, danger: Danger, now_s: float) -> float:
-        """How long it has been in trouble of this gravity: waiting for metres uses up no patience with the rest."""
+        """Duration of a danger of this severity; waiting for the scale does not count for the others."""
         if math.isnan(self._since_s):
             self._since_s, self._severe_s = now_s, math.nan
         if danger in _UNSURE:
@@ -200,7 +198,7 @@ class Supervisor:
         return now_s - self._severe_s
 
     def _dead_reckoned_m(self) -> float:
-        """Way since its pose rested on a map."""
+        """Distance from the last tracked position [m]."""
         if self._known_w is None or self._state is None:
             return 0.0
         return float(np.linalg.norm(self._state.p_w[:2] - self._known_w[:2]))
@@ -221,30 +219,30 @@ class Supervisor:
         return next((danger for holds, danger in checks if holds), Danger.NONE)
 
     def _is_dead_reckoning(self, state: DroneState) -> bool:
-        """Whether it goes on by telemetry alone: on its way, not in a turn to what it may not know."""
+        """Whether it may continue by dead reckoning: in translation only, since a turn may not restore tracking."""
         flies = self._command is not None and math.hypot(self._command.forward_m_s, self._command.left_m_s) > 0.0
         return flies and state.position_sigma_m < DEAD_RECKONING_SIGMA_M
 
     def _in_contact(self, state: DroneState, now_s: float) -> bool:
-        """Whether it was told to move for a while and did not; a command that was not passed on moves nothing."""
+        """Whether the drone does not follow the commands that were passed on."""
         return self._onward.holds(state, self._push_w(self._command) if self._sent else None, now_s)
 
     def _pushed_w(self, command: VelocityCommand | None) -> FloatArray:
-        """Direction ``(2,)`` of a command in the world."""
+        """World direction ``(2,)`` of a command."""
         assert self._state is not None and command is not None
         c, s = math.cos(self._state.yaw_rad), math.sin(self._state.yaw_rad)
         forward, left = command.forward_m_s, command.left_m_s
         return np.array([c * forward - s * left, s * forward + c * left]) / math.hypot(forward, left)
 
     def _push_w(self, command: VelocityCommand | None) -> FloatArray | None:
-        """The same of a command that is to move it; None where it need not."""
+        """The same for commands faster than `PUSHED_M_S`, else None."""
         pushes = command is not None and math.hypot(command.forward_m_s, command.left_m_s) > PUSHED_M_S
         return self._pushed_w(command) if pushes else None
 
     def _heights_conflict(self, state: DroneState, now_s: float) -> bool:
-        """Whether the pose goes its own way: a map that is sure of its metres, and another height than the drone's."""
+        """Whether map height and reported height differ although the scale is certain: the pose is wrong."""
         off = abs(state.reported_height_m - float(state.p_w[2]))
-        if _is_doubtful(state) or not off > _HEIGHT_CONFLICT_M:  # false too where the drone says nothing
+        if _is_doubtful(state) or not off > _HEIGHT_CONFLICT_M:  # also if NaN
             self._height_conflict_s = math.nan
             return False
         if math.isnan(self._height_conflict_s):
@@ -252,7 +250,7 @@ class Supervisor:
         return now_s - self._height_conflict_s > _HEIGHT_CONFLICT_S
 
     def _leaves(self, state: DroneState) -> bool:
-        """Whether it is beyond the fence and wants to go farther."""
+        """Whether the command leads farther beyond the fence."""
         assert self._home_w is not None
         away = state.p_w[:2] - self._home_w[:2]
         if float(np.linalg.norm(away)) < self.limits.fence_m or self._command is None:
@@ -271,16 +269,16 @@ class Supervisor:
         return VelocityCommand(command.forward_m_s, command.left_m_s, up, command.turn_left_rad_s, command.why)
 
     def _meanwhile(self, danger: Danger, trouble_s: float) -> VelocityCommand:
-        """Hover; then what may mend it."""
+        """Hover, then the recovery manoeuvre of the danger."""
         assert self._state is not None
         if danger in _UNSURE:
             rising = int(trouble_s / _WIGGLE_S) % 2 == 0
             command = VelocityCommand(up_m_s=_WIGGLE_M_S if rising else -_WIGGLE_M_S, why=f"{danger}: up and down")
             return self._within_heights(command)
         if danger is Danger.LOST and trouble_s <= BACK_S:
-            return VelocityCommand(turn_left_rad_s=self._turn_back(_KNOWN_S), why=f"{danger}: turn to what was known")
+            return VelocityCommand(turn_left_rad_s=self._turn_back(_KNOWN_S), why=f"{danger}: turn back")
         backing = BACK_S < trouble_s < BACK_S + self._back_s
-        if danger in (Danger.BLIND, Danger.LOST, Danger.CONTACT) and backing:  # not where the pose itself is wrong
+        if danger in (Danger.BLIND, Danger.LOST, Danger.CONTACT) and backing:  # needs a valid pose
             turn = self._turn_back(_BEFORE_S) if danger is Danger.LOST else 0.0
             return replace(self._back(danger, trouble_s), turn_left_rad_s=turn)
         if danger is Danger.LOST and trouble_s > BACK_S + self._back_s:
@@ -288,7 +286,7 @@ class Supervisor:
         return VelocityCommand(why=f"{danger}: hover")
 
     def _turn_back(self, before_s: float) -> float:
-        """Rate of the turn [rad/s] to where it looked this long before its pose was lost."""
+        """Yaw rate [rad/s] towards the heading at this time before tracking was lost."""
         assert self._state is not None
         if not self._headings:
             return 0.0
@@ -298,7 +296,7 @@ class Supervisor:
         return float(np.clip(2.0 * error, -self.limits.turn_rad_s, self.limits.turn_rad_s))
 
     def _back(self, danger: Danger, trouble_s: float) -> VelocityCommand:
-        """Along the trail, away from where the trouble began."""
+        """Velocity back along the path flown."""
         assert self._state is not None
         here = self._state.p_w[:2]
         away = np.linalg.norm(np.array(self._trail).reshape(-1, 3)[:, :2] - here, axis=1)
@@ -312,13 +310,15 @@ class Supervisor:
         v_w = measurable(step * (speed_m_s / float(np.linalg.norm(step))))
         c, s = math.cos(self._state.yaw_rad), math.sin(self._state.yaw_rad)
         return VelocityCommand(
-            c * v_w[0] + s * v_w[1], c * v_w[1] - s * v_w[0], 0.0, 0.0, f"{danger}: back the way it came"
+            c * v_w[0] + s * v_w[1], c * v_w[1] - s * v_w[0], 0.0, 0.0, f"{danger}: back up along the path flown"
         )
 
 
 def _latest_approach(away_m: FloatArray) -> int:
-    """Where along a way, by the distances ``(N,)`` of its points, a place lies: on its latest pass, not on the way out
-    when it is flown back."""
+    """Index of the latest close approach of a path, by the distances ``(N,)`` of its points to a place.
+
+    The path may pass the place on the way out and back; the latest pass counts.
+    """
     if len(away_m) == 0:
         return 0
     padded = np.concatenate([[np.inf], away_m, [np.inf]])
@@ -327,12 +327,12 @@ def _latest_approach(away_m: FloatArray) -> int:
 
 
 def _is_doubtful(state: DroneState) -> bool:
-    """Whether the map's metres are."""
+    """Whether the map's scale is uncertain."""
     return not state.metric or state.scale_sigma > SCALE_SIGMA or state.conflict
 
 
 def _heights_m(state: DroneState) -> list[float]:
-    """Heights above the floor by the drone and by the map, as far as they are known and not doubtful; at least one."""
+    """Reported height and map height above the floor [m], without doubtful ones; at least one."""
     reported, mapped = state.reported_height_m, float(state.p_w[2])
     if not math.isfinite(reported):
         return [mapped]

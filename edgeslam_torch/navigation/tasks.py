@@ -1,4 +1,4 @@
-"""What a flight is for: where to go next, and when it is done."""
+"""Tasks of a flight: where to go next and when it is done."""
 
 import math
 from collections.abc import Sequence
@@ -21,50 +21,48 @@ from edgeslam_torch.types import FloatArray
 ARRIVED_M = 0.15
 MOST_LOSSES = 5
 _MOST_DOUBT_M = 0.3
-"""Doubt about where it is that may count as having arrived, at most."""
+"""Upper bound of the position uncertainty that counts as arrived."""
 _NEAREST_M, _TRIES = 0.5, 3
-"""How near its goal a drone stays that has lost its pose there, and was brought back, this often: what carries it on
-are velocities that a Tello cuts off, and it would come no nearer until its battery is empty."""
+"""Distance from the goal that counts as arrived after tracking was lost near it this often: dead reckoning by truncated
+velocities brings the drone no closer."""
 
 
 class Task(Protocol):
-    """One behaviour."""
+    """Interface of a task."""
 
     def goals(self, layer: Layer, state: DroneState) -> np.ndarray:
-        """Cells ``(G, 2)`` worth going to; empty when there is nothing left to do."""
+        """Goal cells ``(G, 2)``; empty when nothing is left to do."""
 
     def done(self, state: DroneState) -> bool:
-        """Whether it is reached."""
+        """Whether the task is complete."""
 
     def gives_up(self, losses: int) -> bool:
-        """Whether losing the pose so often about one place ends it."""
+        """Whether this many tracking losses at one place end the task."""
 
     def carry(self, update: MapUpdate) -> None:
-        """Take remembered places along with the map."""
+        """Apply a map correction to stored positions."""
 
     def consider(self, candidates: Sequence[Candidate], exits: Sequence[Exit] = ()) -> None:
-        """Take note of what looked like an opening from one place only, and of exits, before `goals` is asked."""
+        """Receive unconfirmed openings and exits; called before `goals`."""
 
     def heading_rad(self, state: DroneState) -> float | None:
-        """Where to look now, standing; None to look where it flies."""
+        """Heading to turn to while hovering; None to face the direction of flight."""
 
     def faces_rad(self, state: DroneState) -> float | None:
-        """Where to look while it flies, slowly and through what it knows; None to look where it flies."""
+        """Heading to keep during slow flight through known space; None to face the direction of flight."""
 
 
 class LooksAhead:
-    """Part of a task during which the drone looks where it flies, always, and at no opening, until its pose is lost
-    again and again: each time is a turn back to what was known and the same way once more, and telemetry carries it by
-    decimetres."""
+    """Mixin: the drone faces the direction of flight, ignores openings, and gives up after repeated tracking losses."""
 
     __slots__ = ()
 
     def gives_up(self, losses: int) -> bool:
-        """After `MOST_LOSSES`."""
+        """After `MOST_LOSSES` losses."""
         return losses >= MOST_LOSSES
 
     def consider(self, candidates: Sequence[Candidate], exits: Sequence[Exit] = ()) -> None:
-        """It does not."""
+        """Ignore openings."""
 
     def heading_rad(self, state: DroneState) -> float | None:
         """None: ahead."""
@@ -82,10 +80,10 @@ class GoTo(LooksAhead):
     goal_w: FloatArray
     """``(3,)`` in the drone's world [m]."""
     _losses: Losses = field(default_factory=lambda: Losses(math.inf))
-    """Near the goal."""
+    """Tracking losses near the goal."""
 
     def goals(self, layer: Layer, state: DroneState) -> np.ndarray:
-        """The goal's cell; where the grid ends, the last one towards it."""
+        """The goal's cell, or the last cell of the grid towards it."""
         low = layer.corner_w + layer.cell_m
         high = layer.corner_w + (np.array(layer.free.shape) - 1) * layer.cell_m
         step = self.goal_w[:2] - state.p_w[:2]
@@ -95,10 +93,9 @@ class GoTo(LooksAhead):
         return layer.cells(state.p_w[:2] + min(1.0, share) * step)[None]
 
     def done(self, state: DroneState) -> bool:
-        """Whether the drone is there, and slow; or as near as it can know.
+        """Whether the drone is at the goal and slow, within its position uncertainty.
 
-        Before a bare wall telemetry carries it no farther, and a standard deviation of its metres may be more than what
-        is left of the way.
+        Near a bare wall tracking is lost, and the uncertainty may exceed the remaining distance.
         """
         away_m = self.away_m(state)
         if state.tracked or away_m < _NEAREST_M:
@@ -109,24 +106,24 @@ class GoTo(LooksAhead):
         return away_m < reach_m and float(np.linalg.norm(state.velocity_w)) < 0.15
 
     def away_m(self, state: DroneState) -> float:
-        """Level distance from the goal [m], by the drone's own pose."""
+        """Horizontal distance to the goal [m] by the estimated pose."""
         return float(np.linalg.norm(state.p_w[:2] - self.goal_w[:2]))
 
     def carry(self, update: MapUpdate) -> None:
-        """A goal in metres from the take-off stays what it is."""
+        """No change: the goal is given in metres from the take-off."""
 
 
 def _doubt_m(state: DroneState) -> float:
-    """Standard deviation of where it is in metres from the take-off."""
+    """Standard deviation [m] of the position relative to the take-off."""
     return math.hypot(state.position_sigma_m, state.scale_sigma * float(np.linalg.norm(state.p_w[:2])))
 
 
 @dataclass(slots=True)
 class Explore:
-    """Fly to where the known free space ends, until it ends nowhere or time is over, and look around on the way.
+    """Frontier exploration with looks to the sides, until no frontier is left or the time is over.
 
-    A camera of 55 degrees that looks where it flies sees of the wall that it comes through the two jambs. What looks
-    like an opening from one place only is looked at from another one.
+    A camera with a 55 degree field of view does not see the wall that the drone comes through, hence the looks to the
+    sides. An opening seen from one place only is inspected from a second one.
     """
 
     until_s: float = np.inf
@@ -136,10 +133,8 @@ class Explore:
     _second: SecondLook = field(default_factory=SecondLook)
 
     def goals(self, layer: Layer, state: DroneState) -> np.ndarray:
-        """Cells to look from at what may be an opening, on the way; those at the middle of each wide border of the
-        unseen, and to look from at what was not looked at from before, or may be an opening elsewhere, the nearest of
-        which is flown to; then narrow borders, behind chairs and in corners, and openings once more that a look left in
-        doubt.
+        """Goal cells in order of priority: viewpoints of candidate openings near the path; wide frontiers, viewpoints
+        of uncovered borders and of other candidates; narrow frontiers and candidates that are still unconfirmed.
         """
         here = state.p_w[:2]
         borders = self._looks.worth(reachable(frontiers(layer), layer, here), layer, state)
@@ -154,31 +149,31 @@ class Explore:
         return np.concatenate([borders, self._goes_on(again)])
 
     def _goes_on(self, cells: np.ndarray) -> np.ndarray:
-        """It is not over as long as there are cells."""
+        """Pass cells on; exploration is not over while there are any."""
         if len(cells):
             self._looks.go_on()
         return cells
 
     def done(self, state: DroneState) -> bool:
-        """Whether the time is over, or nothing is left to see."""
+        """Whether the time is over or nothing is left to explore."""
         return state.stamp_s >= self.until_s or self._looks.over(state.stamp_s)
 
     def carry(self, update: MapUpdate) -> None:
-        """Take the places along that were looked at, and looked around at."""
+        """Apply a map correction to stored positions."""
         self._looks.carry(update)
         self._around.carry(update)
         self._second.carry(update)
 
     def gives_up(self, losses: int) -> bool:
-        """No: there is elsewhere to look, and time is limited."""
+        """Never: other places are left, and time is limited."""
         return False
 
     def consider(self, candidates: Sequence[Candidate], exits: Sequence[Exit] = ()) -> None:
-        """What to look at once more."""
+        """Receive candidate openings."""
         self._second.consider(candidates)
 
     def heading_rad(self, state: DroneState) -> float | None:
-        """At what it has not looked at from before, standing; at what may be an opening, where it shows."""
+        """Heading to an uncovered border or a candidate opening visible from here."""
         around = self._around.heading_rad(state)
         return around if around is not None else self._second.heading_rad(state)
 

@@ -215,7 +215,7 @@ def test_a_doubtful_metre_is_told(perception):
     perception._slam = SimpleNamespace(pose_now=lambda now_s, samples: pose)
     perception._output = SimpleNamespace(health=health, piece=0)
     assert perception.state(1.0).scale_sigma == pytest.approx(0.02)
-    perception._bias._against, perception._bias._off_log = 5, np.log(3.0)
+    perception._bias._outliers, perception._bias._off_log = 5, np.log(3.0)
     assert perception.state(1.0).scale_sigma == pytest.approx(2.0, rel=0.01)
 
 

@@ -459,7 +459,7 @@ def test_it_gives_up_where_its_pose_is_lost_again_and_again(places, gives_up):
             now_s += 0.1
             pilot.update(at(x, 0.0, now_s, tracked=not lost, overridden=lost))
     assert (pilot.phase is Phase.STUCK) == gives_up
-    assert pilot.why_stuck() == ("its pose is lost there again and again" if gives_up else "no way")
+    assert pilot.why_stuck() == ("tracking is lost there repeatedly" if gives_up else "no way")
     pilot.begin(pilot.task)
     pilot.update(at(0.0, 0.0, now_s + 0.1))
     assert pilot.phase is not Phase.STUCK

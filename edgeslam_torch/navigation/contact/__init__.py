@@ -1,1 +1,1 @@
-"""What keeps a drone from its way: something that holds it, and places where its pose is lost."""
+"""Obstruction of the flight: contact with unseen obstacles, and places of repeated tracking loss."""

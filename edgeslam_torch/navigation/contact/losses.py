@@ -1,4 +1,4 @@
-"""How often a pose was lost about one place: what shows nothing once does so again."""
+"""Counter of tracking losses at one place: a textureless view fails repeatedly."""
 
 from dataclasses import dataclass
 
@@ -11,21 +11,21 @@ from edgeslam_torch.types import FloatArray
 
 @dataclass(slots=True)
 class Losses:
-    """Counts losses about which something else than to go on was done, those of one place after the other.
+    """Counts tracking losses that made the supervisor intervene, for one place at a time.
 
     Args:
-        about_m: Distance from the first of them beyond which another place begins.
+        about_m: Distance from the first loss beyond which another place begins.
     """
 
     about_m: float
     count: int = 0
-    """About the present place."""
+    """Losses at the current place."""
     _place_w: FloatArray | None = None
-    """``(2,)`` of the first of them."""
+    """``(2,)`` position of the first loss."""
     _lost: bool = False
 
     def note(self, state: DroneState) -> None:
-        """Take in a moment."""
+        """Process a state."""
         if state.tracked:
             self._lost = False
         elif state.overridden and not self._lost:
@@ -36,6 +36,6 @@ class Losses:
             self.count += 1
 
     def carry(self, update: MapUpdate) -> None:
-        """Take the place along with the map."""
+        """Apply a map correction."""
         if self._place_w is not None:
             self._place_w = update.points(self._place_w[None])[0]

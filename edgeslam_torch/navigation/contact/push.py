@@ -1,4 +1,4 @@
-"""Whether something holds a drone: it was told to move for a while, and did not."""
+"""Contact detection: the drone is commanded to move for a while and does not."""
 
 import math
 from dataclasses import dataclass, field
@@ -9,41 +9,41 @@ from edgeslam_torch.navigation.drone_state import DroneState
 from edgeslam_torch.types import FloatArray
 
 PUSHED_M_S = 0.15
-"""Slower commands say nothing: a drone that drifts may be as fast."""
+"""Minimum commanded speed; a drifting drone may be as fast as slower ones."""
 _STANDS_M_S, _PUSH_S = 0.04, 1.5
 _PAUSE_S = 0.5
-"""Not asked for longer, it was told something else meanwhile."""
+"""Gap between calls after which the detection restarts: other commands were sent meanwhile."""
 _TOLD_M_S = 0.1
-"""A Tello tells whole decimetres a second, cut off: slower is 0."""
+"""Quantisation step of a Tello's reported velocity: lower speeds read 0."""
 
 
 @dataclass(slots=True)
 class Push:
-    """Follows one command after the other.
+    """Compares commanded and achieved motion.
 
-    A pose that shakes beside what is too near to be seen moves at each moment and comes nowhere. The drone's own
-    velocity does not shake, but a radio may repeat an old one: so the pose must not have come half as far, either.
+    Close to a surface the pose estimate jitters without progress, so its speed alone is no evidence of motion. The
+    reported velocity does not jitter, but may be stale: estimated progress must also be below half the expected one.
     """
 
     _since_s: float = math.nan
     _last_s: float = math.nan
     _towards_w: FloatArray = field(default_factory=lambda: np.zeros(2))
     _gone_m: float = 0.0
-    """Way by the pose since then, in the direction of the command."""
+    """Estimated progress since then in the commanded direction [m]."""
     _shook: bool = False
     """Whether the pose moved since then."""
 
     def holds(self, state: DroneState, towards_w: FloatArray | None, now_s: float) -> bool:
-        """Whether something does, now; to be asked at every moment.
+        """Whether an obstacle holds the drone; call it in every control cycle.
 
         Args:
-            state: Of this moment.
-            towards_w: ``(2,)`` level unit vector of a command faster than `PUSHED_M_S` that was passed on; None without.
-            now_s: On the clock of the states.
+            state: Current state.
+            towards_w: ``(2,)`` horizontal direction of a command faster than `PUSHED_M_S` that was sent, else None.
+            now_s: Time on the clock of the states.
         """
         turned = towards_w is not None and float(towards_w @ self._towards_w) < 0.0
         speed = float(np.linalg.norm(state.velocity_w[:2]))
-        stands = state.reported_speed_m_s < _TOLD_M_S  # false where the drone says nothing
+        stands = state.reported_speed_m_s < _TOLD_M_S  # false for NaN
         if towards_w is None or turned or (speed > _STANDS_M_S and not stands):
             self._since_s, self._towards_w = math.nan, np.zeros(2) if towards_w is None else towards_w
             return False

@@ -1,4 +1,4 @@
-"""What leads on from a place in a corridor: what is free, wide enough, and ahead; walls, and holes in them."""
+"""Geometry of a corridor around the drone: free space ahead, walls, and openings in the side walls."""
 
 import math
 from collections.abc import Callable
@@ -13,54 +13,53 @@ from edgeslam_torch.navigation.openings.wall_frame import runs
 from edgeslam_torch.types import FloatArray
 
 _BERTH_M = 0.55
-"""Distance from every solid of what is followed: a corridor is wider than twice this, a doorway is not."""
+"""Clearance of the space that is followed: a corridor is wider than twice this, a doorway is not."""
 SMEARED_BERTH_M = 0.4
-"""The same where nothing else leads on, of a mouth of two metres that depth has made narrow."""
+"""The same for side corridors, whose mouths appear narrowed by depth errors, if nothing else leads on."""
 _ARRIVED_M = 0.6
-"""Less free way ahead is none."""
+"""Minimum free distance ahead."""
 _NARROW_M = 0.3
-"""Distance from solids straight ahead, where depth that is too near makes a corridor as narrow as a door: what a drone
-passes."""
+"""Clearance straight ahead, where underestimated depth may narrow the corridor to a door's width."""
 _STRIP_M = 0.6
-"""How far to each side of the drone straight ahead is."""
+"""Half width of the strip straight ahead."""
 _NEAREST_M = 1.0
-"""How far from the drone what it follows may begin."""
+"""Maximum distance from the drone to the space that it follows."""
 _AHEAD_COS = math.cos(math.radians(35.0))
 _SAME_M = 0.3
-"""Ends of ways that differ by less are as far."""
+"""Distances along the axis that differ by less count as equal."""
 _WALL_M, _ABREAST_M = 2.0, 0.5
-"""How near a wall ahead ends a corridor, and how far to each side it is looked for: there may be a door in it."""
+"""Distance at which a wall ahead ends a corridor, and half width of the search for it: the wall may have a door."""
 _BESIDE_M, _KNOWN_SHARE = (1.1, 3.3), 0.75
-"""Way back from the end along which a turn on the spot shows the sides aslant; what share of a wall is known of one."""
+"""Distances back from the end that a turn there sees only at a grazing angle; share of a known wall."""
 _SPECK_M2 = 0.08
-"""Smaller solids, of a wrong depth, stand before what turns off; a wall between two doors is more."""
+"""Minimum area of a wall; smaller occupied regions are depth noise."""
 _BACK_M, _MOUTH_M = 6.0, 1.2
-"""How far back from a wall ahead holes in the sides are looked for, and how far to the side it looks into them."""
+"""Distance back from the end within which side openings are searched, and distance of the goal into them."""
 _THROUGH_M = (-0.3, 1.2)
-"""How far beyond there a way through a hole has been somewhere; one past it, along a side of the corridor, has not."""
+"""Range beyond the goal in which the path flown shows that the drone came through this opening."""
 
 
 def wide(layer: Layer, here_w: FloatArray, berth_m: float = _BERTH_M) -> np.ndarray:
-    """Cells ``(N, 2)`` of the wide free space that a drone is in or beside."""
+    """Cells ``(N, 2)`` of the wide free space around the drone."""
     return _part(layer, here_w, berth_m)
 
 
 def is_ahead(p_w: FloatArray, here_w: FloatArray, axis: FloatArray) -> np.ndarray:
-    """Which of the places ``(N, 2)`` are ahead, and worth the way."""
+    """Which of the points ``(N, 2)`` are ahead and far enough."""
     step = p_w - here_w
     along = step @ axis
     return np.asarray((along > _ARRIVED_M) & (along > _AHEAD_COS * np.linalg.norm(step, axis=1)))
 
 
 def straight(layer: Layer, here_w: FloatArray, axis: FloatArray, before_m: float) -> np.ndarray:
-    """Cells ``(N, 2)`` straight ahead that a drone reaches, through what is narrow, nearer than ``before_m``."""
+    """Reachable cells ``(N, 2)`` straight ahead, nearer than ``before_m``, also through narrow space."""
     cells = _part(layer, here_w, _NARROW_M, lambda p_w: np.abs(aside(p_w - here_w, axis)) < _STRIP_M)
     along = (layer.centres(cells) - here_w) @ axis
     return cells[(along > _ARRIVED_M) & (along < before_m)]
 
 
 def far_middle(layer: Layer, cells: np.ndarray, axis: FloatArray) -> np.ndarray:
-    """Of the cells ``(N, 2)`` that lie farthest along an axis the one in the middle, ``(1, 2)``; or none."""
+    """Middle one ``(1, 2)`` of the cells ``(N, 2)`` that lie farthest along an axis; none without cells."""
     if len(cells) == 0:
         return cells
     along = layer.centres(cells) @ axis
@@ -70,7 +69,7 @@ def far_middle(layer: Layer, cells: np.ndarray, axis: FloatArray) -> np.ndarray:
 
 
 def is_walled(layer: Layer, here_w: FloatArray, axis: FloatArray) -> bool:
-    """Whether something solid is close ahead, or to a side of what is ahead."""
+    """Whether an obstacle is close ahead, within `_ABREAST_M` to each side."""
     steps = np.arange(0.3, _WALL_M, 0.5 * layer.cell_m)
     left = np.array([-axis[1], axis[0]])
     rays = here_w + steps[:, None, None] * axis + np.array([[-_ABREAST_M], [0.0], [_ABREAST_M]]) * left
@@ -79,15 +78,15 @@ def is_walled(layer: Layer, here_w: FloatArray, axis: FloatArray) -> bool:
 
 
 def mouths(layer: Layer, end_w: FloatArray, axis: FloatArray, flown_w: FloatArray) -> np.ndarray:
-    """Cells ``(N, 2)`` where a side of a corridor that ended before a wall has a hole as wide as a corridor.
+    """Goal cells ``(N, 2)`` in openings of the side walls, as wide as a corridor, before the end of a corridor.
 
-    What turns off is hardly seen in passing: a picture ends before its far corner comes into it.
+    In passing, the camera hardly sees a corridor that turns off: its far corner leaves the field of view.
 
     Args:
-        layer: What is known.
-        end_w: ``(2,)`` where it ended.
+        layer: Current layer.
+        end_w: ``(2,)`` end of the corridor.
         axis: ``(2,)`` unit vector of its direction there.
-        flown_w: ``(N, 2)`` the way, a metre apart: a hole that it came through leads back.
+        flown_w: ``(N, 2)`` path flown, a metre apart; the opening that the drone came through is excluded.
     """
     along = np.arange(0.0, _BACK_M, layer.cell_m)
     walls, places = _walls(layer), []
@@ -104,8 +103,7 @@ def mouths(layer: Layer, end_w: FloatArray, axis: FloatArray, flown_w: FloatArra
 
 
 def unknown_sides(layer: Layer, end_w: FloatArray, axis: FloatArray) -> list[FloatArray]:
-    """Directions ``(2,)`` to the sides of a corridor before its end in which most of what is there is not known to be
-    a wall: what turns off may be there."""
+    """Side directions ``(2,)`` before a corridor's end in which mostly no wall is known: a corridor may turn off."""
     along = np.arange(*_BESIDE_M, layer.cell_m)
     walls, from_w = _walls(layer), end_w - along[:, None] * axis
     sides = (np.array([-axis[1], axis[0]]), np.array([axis[1], -axis[0]]))
@@ -113,14 +111,14 @@ def unknown_sides(layer: Layer, end_w: FloatArray, axis: FloatArray) -> list[Flo
 
 
 def _meet(walls: np.ndarray, layer: Layer, from_w: FloatArray, left: FloatArray) -> np.ndarray:
-    """Which of the rays from places ``(N, 2)`` to one side meet a wall within half the widest corridor."""
+    """Which of the rays from points ``(N, 2)`` to one side meet a wall within half the widest corridor."""
     out = np.arange(0.0, PASSED_M, 0.5 * layer.cell_m)
     cells = layer.cells(from_w[:, None] + out[:, None] * left)
     return np.asarray(walls[cells[..., 0], cells[..., 1]].any(axis=1))
 
 
 def _walls(layer: Layer) -> np.ndarray:
-    """``(X, Y)`` bool: what is solid, less specks."""
+    """``(X, Y)`` bool: occupied cells without small regions."""
     parts, _ = ndimage.label(layer.solid, np.ones((3, 3)))
     return np.asarray(layer.solid & (np.bincount(parts.ravel())[parts] * layer.cell_m**2 >= _SPECK_M2))
 
@@ -128,7 +126,7 @@ def _walls(layer: Layer) -> np.ndarray:
 def _part(
     layer: Layer, here_w: FloatArray, berth_m: float, among: Callable[[FloatArray], np.ndarray] | None = None
 ) -> np.ndarray:
-    """Cells ``(N, 2)`` of the part of free space away from solids that the drone is in or beside."""
+    """Cells ``(N, 2)`` of the connected free space with this clearance around the drone."""
     cells = np.argwhere(layer.free & (layer.from_solid_m >= berth_m))
     if among is not None:
         cells = cells[among(layer.centres(cells))]

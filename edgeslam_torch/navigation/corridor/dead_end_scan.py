@@ -1,4 +1,4 @@
-"""A look to the sides of a corridor that seems to end: what turns off before a dead end is hardly seen in passing."""
+"""Scan of the sides at an apparent dead end: a corridor that turns off is hardly visible in passing."""
 
 import math
 from dataclasses import dataclass
@@ -13,45 +13,44 @@ from edgeslam_torch.navigation.map_update import MapUpdate
 from edgeslam_torch.types import FloatArray
 
 _BACK_M = 2.2
-"""Way back from the end to where it looks: the middle of what a turn at the end shows aslant."""
+"""Distance back from the end to the viewpoint: the middle of what a turn at the end sees at a grazing angle."""
 _THERE_M = 0.3
 _THERE_RAD = math.radians(5.0)
 _STANDS_S = 1.0
-"""Time of a look: five views."""
+"""Duration of a look: five views."""
 _TURN_S = 12.5
-"""Time of a turn on the spot, 30 degrees a second: what turns off right there is seen by that."""
+"""Duration of a full turn at 30 deg/s, which shows corridors that turn off right at the end."""
 _GIVEN_UP_S = 20.0
-"""Time for a way of metres: one that does not come there looks from where it is."""
+"""Timeout of a leg; the drone then looks from where it is."""
 _SAME_END_M = 1.5
-"""Ends that are nearer to each other are one: what is known ahead changes while it looks to the sides."""
+"""Ends closer than this are the same; the map ahead changes during the scan."""
 _ABOUT_M = 1.0
-"""How near the end it may stay when it gives up: before a bare wall the pose is lost again."""
+"""Distance from the end that suffices after giving up: tracking is lost again before a bare wall."""
 
 
 @dataclass(slots=True)
 class DeadEndScan:
-    """A turn on the spot at the end, a look back from it to each side that is not known to be a wall, and to the end
-    again."""
+    """A full turn at the end, a look to each side without a known wall from farther back, and the return to the end."""
 
     end_w: FloatArray
-    """``(2,)`` where the corridor seems to end."""
+    """``(2,)`` apparent end of the corridor."""
     axis: FloatArray
     """``(2,)`` unit vector of its direction there."""
     over: bool = False
-    """Whether it has looked, and is back at the end."""
+    """Whether the scan is complete and the drone is back at the end."""
     given_up: bool = False
-    """Whether nothing is looked at any more."""
+    """Whether the scan was aborted."""
     _headings: list[float] | None = None
-    """Still to be looked at, last first; None before it was there."""
+    """Remaining headings, last first; None before the viewpoint is reached."""
     _reached_s: float = math.nan
-    """Since when it looks at the last of these."""
+    """Since when the drone faces the last of them."""
     _leg_s: float = math.nan
-    """Since when it flies to where it does the next of these things."""
+    """Start of the current leg."""
     _turns_s: float = math.nan
-    """Since when it turns at the end."""
+    """Start of the full turn."""
 
     def goal(self, layer: Layer, state: DroneState) -> FloatArray | None:
-        """Where to fly ``(2,)``; None when nothing is left to do, and for a turn on the spot."""
+        """Goal ``(2,)``; None during the full turn and when the scan is over."""
         self._leg_s = state.stamp_s if math.isnan(self._leg_s) else self._leg_s
         late = state.stamp_s - self._leg_s > _GIVEN_UP_S
         if math.isnan(self._turns_s):
@@ -73,18 +72,18 @@ class DeadEndScan:
         return None if self.over else self.end_w
 
     def is_near(self, here_w: FloatArray) -> bool:
-        """Whether a corridor that seems to end here ``(2,)`` seems to end there."""
+        """Whether an apparent end at ``(2,)`` is the same as this one."""
         return float(np.linalg.norm(here_w - self.end_w)) < _SAME_END_M
 
     def give_up(self, state: DroneState) -> None:
-        """Look at nothing more: back to the end, unless it is about there."""
+        """Abort the scan and return to the end, unless close to it."""
         if not self.given_up:
             self.given_up, self._headings = True, []
             self._turns_s, self._leg_s = -math.inf, state.stamp_s
         self.over |= _away(state, self.end_w) < _ABOUT_M
 
     def heading_rad(self, state: DroneState) -> float | None:
-        """Where to look now, standing; a pose that is lost ends it."""
+        """Heading to turn to while hovering; a tracking loss ends the looks."""
         if not self._headings:
             return None
         if not state.tracked:
@@ -98,10 +97,10 @@ class DeadEndScan:
         return self._headings[-1] if self._headings else None
 
     def carry(self, update: MapUpdate) -> None:
-        """Take the end along with the map."""
+        """Apply a map correction."""
         self.end_w = update.points(self.end_w[None])[0]
 
 
 def _away(state: DroneState, place_w: FloatArray) -> float:
-    """Distance of the drone to a place ``(2,)``."""
+    """Distance of the drone from a point ``(2,)``."""
     return float(np.linalg.norm(state.p_w[:2] - place_w))

@@ -1,4 +1,4 @@
-"""The task of following a corridor, round its corners, to where it ends or opens into a room."""
+"""Task: follow a corridor around its corners until it ends or opens into a room."""
 
 import math
 from collections.abc import Sequence
@@ -28,50 +28,50 @@ from edgeslam_torch.navigation.tasks import LooksAhead
 from edgeslam_torch.types import FloatArray
 
 _TURN_COST_M = 6.0
-"""A corridor that turns off is followed before one that turns back, as far as a drone sees."""
+"""Cost of a turn by 180 degrees: corridors ahead are preferred to those that turn back."""
 _BLIND_M = 1.5
-"""How far ahead it wants to go where nothing ahead is known."""
+"""Distance of the goal ahead in unknown space."""
 _ROOM_S = 2.0
 _MOST_LOSSES = 3
-"""Of the pose, before a bare wall that ends a corridor: it cannot look around there."""
+"""Tracking losses before a bare wall at a corridor's end after which the scan is aborted."""
 _SQUARE_COS = math.cos(math.radians(35.0))
-"""A door whose normal is nearer than this to the direction of the corridor is across it."""
+"""A door whose normal is within 35 degrees of the corridor's direction lies across it."""
 
 
 @dataclass(slots=True)
 class FollowCorridor(LooksAhead):
-    """Fly on along the corridor that the drone is in, in its middle; through no door that is known to be one."""
+    """Follow the current corridor along its middle, through no known door."""
 
     until_s: float = np.inf
-    """On the clock of the states."""
+    """End time on the clock of the states."""
     room: bool = False
-    """Whether it ended where the corridor is wider than a corridor."""
+    """Whether it ended because the corridor opens into a room."""
     wall: bool = False
-    """Whether something solid is close ahead: nothing to follow without it is not the corridor's end."""
+    """Whether an obstacle is close ahead; without one, a missing continuation is no end of the corridor."""
     _looks: Looks = field(default_factory=Looks)
     _trail: Trail | None = None
     _end: DeadEndScan | None = None
-    """Where the corridor seems to end, or seemed to last, before a wall."""
+    """Scan of the last apparent end."""
     _ending: bool = False
-    """Whether it seems to now."""
+    """Whether the corridor appears to end now."""
     _losses: Losses = field(default_factory=lambda: Losses(math.inf))
-    """Of the pose, before walls where it seems to end."""
+    """Tracking losses at the apparent end."""
     _wide_s: float = math.nan
     _target_w: FloatArray | None = None
-    """``(2,)`` in the corridor that turns off which it flies to."""
+    """``(2,)`` current goal in a corridor that turns off."""
     _doors: list[tuple[FloatArray, FloatArray]] = field(default_factory=list)
-    """``(2,)`` middle and unit normal of each exit."""
+    """``(2,)`` centre and unit normal of each exit."""
     _doubtful: list[tuple[FloatArray, FloatArray]] = field(default_factory=list)
-    """The same of what may be one; a corridor whose mouth depth has made narrow looks so, too."""
+    """The same for candidates, which may also be corridors with a mouth narrowed by depth errors."""
 
     def consider(self, candidates: Sequence[Candidate], exits: Sequence[Exit] = ()) -> None:
-        """Doors end a corridor."""
+        """Receive doors, which end a corridor."""
         self._doors = [(e.centre_w[:2], e.normal_w[:2]) for e in exits]
         self._doubtful = [(c.centre_w, c.normal_w) for c in candidates]
 
     def goals(self, layer: Layer, state: DroneState) -> np.ndarray:
-        """Cells ``(G, 2)`` to follow: what is wide and ahead, else what turns off, else straight on through what is
-        narrow; before a wall, holes in the sides. None where there is nothing of these."""
+        """Goal cells ``(G, 2)``: wide space ahead, else a corridor that turns off, else narrow space straight ahead,
+        else openings in the side walls before the end."""
         here = state.p_w[:2]
         self._trail = self._trail or Trail.beginning(state)
         self._trail.fly(here)
@@ -85,16 +85,16 @@ class FollowCorridor(LooksAhead):
         return layer.cells(np.zeros((0, 2)) if goal is None else goal[None])
 
     def heading_rad(self, state: DroneState) -> float | None:
-        """To the sides, where it seems to end; else ahead."""
+        """Headings of the scan at an apparent end, else ahead."""
         return self._end.heading_rad(state) if self._ending and self._end is not None else None
 
     def done(self, state: DroneState) -> bool:
-        """Whether the corridor ended, or the time."""
+        """Whether the corridor ended or the time is over."""
         self.room = state.stamp_s - self._wide_s > _ROOM_S
         return self.room or self._has_ended(state) or state.stamp_s >= self.until_s
 
     def carry(self, update: MapUpdate) -> None:
-        """Take what is remembered along with the map."""
+        """Apply a map correction."""
         self._looks.carry(update)
         self._losses.carry(update)
         if self._trail is not None:
@@ -125,7 +125,7 @@ class FollowCorridor(LooksAhead):
         if len(off := cells[trail.turns_off(places, here)]):
             return self._nearest(layer, off, here, axis)
         narrow = straight(layer, here, axis, self._to_door(here, axis))
-        if self._ending:  # what is between here and the wall is no way on
+        if self._ending:  # space between here and the wall leads nowhere
             narrow = narrow[trail.leads_on(layer.centres(narrow))]
         if len(narrow := self._left(layer, far_middle(layer, narrow, axis))):
             return narrow
@@ -137,7 +137,7 @@ class FollowCorridor(LooksAhead):
         return cells[:0] if self._end.given_up else self._beside(layer, self._end, here, trail)
 
     def _beside(self, layer: Layer, end: DeadEndScan, here: FloatArray, trail: Trail) -> np.ndarray:
-        """Before a wall: what turns off though its mouth is narrow on the map, else holes in the sides."""
+        """Before a wall: corridors that turn off through a narrow mouth, else openings in the side walls."""
         cells = self._left(layer, wide(layer, here, SMEARED_BERTH_M))
         places = layer.centres(cells)
         if len(off := cells[trail.turns_off(places, here) & self._is_this_side(places, here)]):
@@ -145,11 +145,11 @@ class FollowCorridor(LooksAhead):
         return self._left(layer, mouths(layer, end.end_w, end.axis, trail.places_w))
 
     def _left(self, layer: Layer, cells: np.ndarray) -> np.ndarray:
-        """Those of the cells ``(N, 2)`` that were not looked at in vain."""
+        """Cells ``(N, 2)`` that were not inspected without success."""
         return cells[self._looks.left(layer.centres(cells))]
 
     def _nearest(self, layer: Layer, cells: np.ndarray, here: FloatArray, axis: FloatArray) -> np.ndarray:
-        """Of what turns off the nearest, ``(1, 2)``; it stays with what it chose."""
+        """Nearest cell ``(1, 2)`` of corridors that turn off, with hysteresis."""
         places = layer.centres(cells)
         step = places - here
         far = np.linalg.norm(step, axis=1)
@@ -161,7 +161,7 @@ class FollowCorridor(LooksAhead):
         return cells[[best]]
 
     def _is_this_side(self, p_w: FloatArray, here: FloatArray) -> np.ndarray:
-        """Which of the places ``(N, 2)`` are behind no door, as wide as the widest corridor."""
+        """Which of the points ``(N, 2)`` are not behind a door, taken as wide as the widest corridor."""
         good = np.ones(len(p_w), dtype=bool)
         for middle, normal in self._doors:
             behind = ((p_w - middle) @ normal) * float((here - middle) @ normal) < 0.0
@@ -169,7 +169,7 @@ class FollowCorridor(LooksAhead):
         return good
 
     def _to_door(self, here: FloatArray, axis: FloatArray) -> float:
-        """Way straight ahead to the first door across the corridor; infinite where there is none."""
+        """Distance straight ahead to the first door across the corridor [m]; infinite without one."""
         ways = [
             float((middle - here) @ axis)
             for middle, normal in (*self._doors, *self._doubtful)
@@ -178,7 +178,7 @@ class FollowCorridor(LooksAhead):
         return min([way for way in ways if way > 0.0], default=math.inf)
 
     def _note_width(self, layer: Layer, state: DroneState) -> None:
-        """A room is where nothing solid is within half a corridor's width, and all of that is seen."""
+        """Detect a room: all space within half a corridor's width is known to be free."""
         assert self._trail is not None
         away = float(layer.clearance_at(state.p_w[None, :2])[0])
         if 2.0 * away <= WIDEST_M or len(self._trail.places_w) < 2:

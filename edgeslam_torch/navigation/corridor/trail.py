@@ -1,4 +1,4 @@
-"""The way along a corridor so far: its places, its direction, and where it did not lead on."""
+"""Path along a corridor so far: positions, direction, and dead ends."""
 
 import math
 from dataclasses import dataclass, field
@@ -13,37 +13,37 @@ from edgeslam_torch.navigation.openings.wall_frame import Walls, wall_directions
 from edgeslam_torch.types import FloatArray
 
 PASSED_M = 0.5 * WIDEST_M
-"""What is within this of the way that was flown is the same corridor."""
+"""Points within this distance of the path flown are in the same corridor."""
 _HEADING_M = 1.0
-"""Way over which the direction of flight is taken."""
+"""Distance over which the direction of flight is measured."""
 _ALONG_WALLS_COS = math.cos(math.radians(25.0))
-"""A drone that keeps clear of things on one side flies aslant to the walls by no more than this."""
+"""Maximum angle between the direction of flight and the walls while avoiding obstacles."""
 _DEAD_END_M = 1.5
-"""What is within this of where there was no way ahead is no way ahead from elsewhere."""
+"""Radius of a dead end."""
 _SAME_M = 0.3
 
 
 @dataclass(slots=True)
 class Trail:
-    """Where a drone has followed a corridor."""
+    """Path flown along a corridor."""
 
     places_w: FloatArray
-    """``(N, 2)`` on the way flown, a metre apart."""
+    """``(N, 2)`` positions, a metre apart."""
     began_w: FloatArray
-    """``(2,)`` unit vector of its nose at the first of them."""
+    """``(2,)`` unit vector of the heading at the first position."""
     heading_w: FloatArray
-    """``(2,)`` unit vector of the flight over its last new metre; of the nose at first."""
+    """``(2,)`` unit vector of the last new metre of flight; initially of the heading."""
     _dead_ends_w: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
-    """``(D, 2)`` places from which nothing led on ahead."""
+    """``(D, 2)`` positions with no continuation ahead."""
 
     @staticmethod
     def beginning(state: DroneState) -> "Trail":
-        """At the drone's place, along its nose."""
+        """A trail that starts at the drone along its heading."""
         nose = np.array([math.cos(state.yaw_rad), math.sin(state.yaw_rad)])
         return Trail(state.p_w[None, :2].copy(), nose, nose)
 
     def fly(self, here_w: FloatArray) -> None:
-        """Note a place ``(2,)`` that is a metre from all before it: a drone that is brought back still flies ahead."""
+        """Add a position ``(2,)`` that is a metre from all others; backing up adds none."""
         steps = here_w - self.places_w
         away = np.linalg.norm(steps, axis=1)
         last = int(np.argmin(away))
@@ -54,7 +54,7 @@ class Trail:
         self.places_w = np.concatenate([self.places_w, self.places_w[last] + shares[:, None] * steps[last]])
 
     def direction(self, layer: Layer, here_w: FloatArray) -> FloatArray:
-        """Unit vector ``(2,)`` of the corridor: of its walls, where they lead where the drone flies."""
+        """Unit vector ``(2,)`` of the corridor: of its walls if close to the direction of flight, else the latter."""
         angles = np.array(wall_directions(Walls(layer, layer.solid), here_w))
         along = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
         cosines = along @ self.heading_w
@@ -64,28 +64,28 @@ class Trail:
         return np.asarray(along[best] * np.sign(cosines[best]))
 
     def end(self, here_w: FloatArray) -> None:
-        """From here ``(2,)`` nothing leads on ahead."""
+        """Mark a position ``(2,)`` as a dead end."""
         if _apart(here_w[None], self._dead_ends_w, _SAME_M)[0]:
             self._dead_ends_w = np.concatenate([self._dead_ends_w, here_w[None]])
 
     def leads_on(self, p_w: FloatArray) -> np.ndarray:
-        """Which of the places ``(N, 2)`` ahead are in no dead end."""
+        """Which of the points ``(N, 2)`` are in no dead end."""
         return _apart(p_w, self._dead_ends_w, _DEAD_END_M)
 
     def turns_off(self, p_w: FloatArray, here_w: FloatArray) -> np.ndarray:
-        """Which of the places ``(N, 2)`` are not in the corridor that was flown up to here, nor behind its start."""
+        """Which of the points ``(N, 2)`` lie neither in the corridor flown up to here nor behind its start."""
         step = p_w - self.places_w[0]
         behind = (step @ self.began_w < 0.0) & (np.abs(aside(step, self.began_w)) < PASSED_M)
         return _apart(p_w, np.concatenate([self.places_w, here_w[None]]), PASSED_M) & ~behind
 
     def carry(self, update: MapUpdate) -> None:
-        """Take the places along with the map; directions of level flight hardly turn with it."""
+        """Apply a map correction to the positions; its effect on directions is negligible."""
         self.places_w = update.points(self.places_w)
         self._dead_ends_w = update.points(self._dead_ends_w)
 
 
 def aside(step: FloatArray, axis: FloatArray) -> FloatArray:
-    """How far to the left of an axis ``(2,)`` steps ``(..., 2)`` lead.
+    """Component of steps ``(..., 2)`` to the left of an axis ``(2,)``.
 
     Example:
         >>> aside(np.array([3.0, 0.5]), np.array([1.0, 0.0]))
@@ -95,5 +95,5 @@ def aside(step: FloatArray, axis: FloatArray) -> FloatArray:
 
 
 def _apart(p_w: FloatArray, places_w: FloatArray, away_m: float) -> np.ndarray:
-    """Which of the points ``(N, 2)`` are so far from all of the places ``(M, 2)``."""
+    """Which of the points ``(N, 2)`` are farther than ``away_m`` from all places ``(M, 2)``."""
     return np.asarray((np.linalg.norm(p_w[:, None] - places_w, axis=2) > away_m).all(axis=1))

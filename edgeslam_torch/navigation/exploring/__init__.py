@@ -1,1 +1,1 @@
-"""Exploring: where the known space ends, where it was looked around, and what is looked at twice."""
+"""Exploration: frontiers, coverage by the camera, and second looks at candidate openings."""

@@ -1,4 +1,4 @@
-"""Where a drone that explores looks around: at what it has not looked at from before."""
+"""Selection of viewpoints and headings during exploration: borders that the camera has not covered."""
 
 import math
 from dataclasses import dataclass, field, replace
@@ -15,45 +15,45 @@ from edgeslam_torch.navigation.openings.exit_tracker import FIELD_RAD
 from edgeslam_torch.types import FloatArray
 
 _EVERY_M = 1.2
-"""Way from one look around to the next, in passing: a door of 0.85 m is seen from two places."""
+"""Distance between looks along the path: a door of 0.85 m is seen from two places."""
 _AGAIN_M = 0.4
-"""Nearer than this to a place where it has looked around it looks at nothing new."""
+"""Distance from an earlier look below which nothing new is visible."""
 _THERE_M = 0.25
-"""Distance from a place that counts as there: a pilot comes no nearer."""
+"""Distance that counts as arrived; the planner comes no closer."""
 _WORTH_M = 0.6
-"""Least length of border that is worth a look: the narrowest exit."""
+"""Minimum length of uncovered border for a look: the narrowest exit."""
 _REST_M = 0.3
-"""Less than this, to one side, is left."""
+"""Remaining length in one direction that is ignored."""
 _PASSED_M = 0.3
-"""Distance from solids of where it stands to look."""
+"""Distance of viewpoints from obstacles."""
 _COARSE = 3
-"""Every so many cells are asked in both directions."""
+"""Subsampling of candidate viewpoints in cells."""
 _MOST = 8
-"""Places at a time: the nearest of them is flown to."""
+"""Maximum number of viewpoints."""
 _THERE_RAD = math.radians(4.0)
 _SHOWN_RAD = FIELD_RAD - _THERE_RAD
-"""To each side of a heading, when it is reached."""
+"""Half-angle covered when a heading is reached."""
 _GIVEN_UP_S = 16.0
-"""Time of a look: one and a half turns at 60 degrees a second, with time to rest, and half as much again."""
+"""Timeout of a look: one and a half turns at 60 deg/s plus pauses, and half as much again."""
 
 
 @dataclass(slots=True)
 class LooksAround:
-    """Asks for headings, one after the other, wherever there is something to look at from before."""
+    """Proposes viewpoints and headings until all borders are covered."""
 
     _coverage: Coverage = field(default_factory=Coverage)
     _left: Borders = field(default_factory=lambda: Borders(np.zeros((0, 2)), np.zeros((0, 2)), 0.0))
-    """What was not looked at, when last asked."""
+    """Borders not covered at the last call."""
     _spots_w: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
-    """``(G, 2)`` from where to look at it."""
+    """``(G, 2)`` viewpoints of these."""
     _places_w: list[FloatArray] = field(default_factory=list)
-    """``(2,)`` where it looked around."""
+    """``(2,)`` positions of earlier looks."""
     _headings: list[float] = field(default_factory=list)
-    """Still to be looked at, last first."""
+    """Remaining headings, last first."""
     _since_s: float = math.nan
 
     def goals(self, layer: Layer, state: DroneState) -> np.ndarray:
-        """Cells ``(G, 2)`` from each of which most is looked at that is not from those before it."""
+        """Viewpoint cells ``(G, 2)``, greedily by the uncovered border length that each adds."""
         here = state.p_w[:2]
         self._left = self._coverage.unlooked(borders(layer, here))
         free = layer.free[::_COARSE, ::_COARSE] & (layer.from_solid_m[::_COARSE, ::_COARSE] > _PASSED_M)
@@ -73,7 +73,7 @@ class LooksAround:
         return np.asarray(cells[chosen])
 
     def heading_rad(self, state: DroneState) -> float | None:
-        """Where to look now; None to look ahead. A pose that is lost in a turn ends the look."""
+        """Heading to turn to; None to face ahead. A tracking loss ends the look."""
         self._coverage.note(state)
         here = state.p_w[:2]
         if not self._headings and self._is_new(here):
@@ -87,19 +87,19 @@ class LooksAround:
         return self._headings[-1] if self._headings else None
 
     def carry(self, update: MapUpdate) -> None:
-        """Take the places along with the map; directions of level flight hardly turn with it."""
+        """Apply a map correction to the positions; its effect on directions is negligible."""
         self._coverage.carry(update)
         self._places_w = list(update.points(np.array(self._places_w).reshape(-1, 2)))
         self._spots_w = update.points(self._spots_w)
         self._left = replace(self._left, p_w=update.points(self._left.p_w))
 
     def _away_m(self, p_w: FloatArray) -> FloatArray:
-        """Distance of places ``(P, 2)`` from where it has looked around; infinite before it has."""
+        """Distance [m] of points ``(P, 2)`` from the nearest earlier look; infinite without one."""
         places = np.array(self._places_w).reshape(-1, 2)
         return np.asarray(np.linalg.norm(p_w[:, None] - places, axis=-1).min(axis=1, initial=math.inf))
 
     def _is_new(self, here_w: FloatArray) -> bool:
-        """Whether to stand and look: a way from the last time, if it is worth it, or where it was sent for that."""
+        """Whether to look from here: far enough from earlier looks with enough to see, or at a viewpoint."""
         away_m = float(self._away_m(here_w[None])[0])
         if away_m > _EVERY_M:
             return bool(self._left.before(here_w[None]).sum() * self._left.cell_m >= _WORTH_M)
@@ -107,7 +107,7 @@ class LooksAround:
         return bool(there) and away_m > _AGAIN_M - _THERE_M
 
     def _sides(self, here_w: FloatArray, yaw_rad: float) -> list[float]:
-        """Turns from its heading that show what is to be looked at from here, most first."""
+        """Turns from the current heading that cover the borders visible from here, greedily."""
         step = self._left.p_w[self._left.before(here_w[None])[0]] - here_w
         left = np.asarray(wrapped(np.arctan2(step[:, 1], step[:, 0]) - yaw_rad))
         tried = np.arange(-175.0, 180.0, 5.0) * math.pi / 180.0
@@ -123,7 +123,7 @@ class LooksAround:
 
 
 def _in_turn(turns_rad: list[float]) -> list[float]:
-    """The nearest first, then the nearest to that."""
+    """Nearest-neighbour order of turns."""
     left, order = np.array(turns_rad), [0.0]
     while len(left):
         nearest = int(np.argmin(np.abs(wrapped(left - order[-1]))))

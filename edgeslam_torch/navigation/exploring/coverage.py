@@ -1,5 +1,4 @@
-"""Which borders of the free space a camera has looked at from before: what it passes it sees aslant, and of a door
-between two jambs nothing."""
+"""Coverage: borders of free space that the camera has seen frontally; at a grazing angle a door is invisible."""
 
 import math
 from dataclasses import dataclass, field
@@ -15,43 +14,42 @@ from edgeslam_torch.navigation.openings.exit_tracker import FARTHEST_M, FIELD_RA
 from edgeslam_torch.types import FloatArray
 
 _NEAREST_M = 0.6
-"""From nearer less than a door's width is in a picture."""
+"""Minimum distance: from closer a door exceeds the field of view."""
 _SQUARELY_COS = math.cos(math.radians(40.0))
-"""Angle to a border's normal up to which it is looked at from before: through a door in a wall of a hand's breadth half
-a metre is seen."""
+"""Maximum angle to a border's normal for a frontal view: half a metre is visible through a door in a 10 cm wall."""
 _BODY_M = 0.15
-"""What of the free space is narrower than twice this is a slit between rays."""
+"""Half width below which free space is a gap between rays."""
 _LARGE_M2 = 0.5
-"""What is not free and smaller is furniture: no wall, no door."""
+"""Smaller non-free regions are furniture, not walls."""
 _SMOOTH_CELLS = 2.0
-"""Of the free space, so that its border has a direction."""
+"""Smoothing of the free space for border normals [cells]."""
 _APART_M, _APART_RAD = 0.2, math.radians(8.0)
-"""Views nearer than both of these show the same."""
+"""Views closer than both of these are redundant."""
 
 
 @dataclass(frozen=True, slots=True)
 class Borders:
-    """Where free space ends, at something solid or at what was never seen, cell by cell."""
+    """Border cells of free space, towards occupied or unknown cells."""
 
     p_w: FloatArray
     """``(N, 2)`` [m]."""
     normal_w: FloatArray
-    """``(N, 2)`` unit vectors into the free space."""
+    """``(N, 2)`` unit normals into the free space."""
     cell_m: float
-    """Length of each."""
+    """Length of each border cell [m]."""
 
     def __getitem__(self, some: np.ndarray) -> "Borders":
         return Borders(self.p_w[some], self.normal_w[some], self.cell_m)
 
     def before(self, here_w: FloatArray) -> np.ndarray:
-        """``(M, N)`` whether each is seen from before, and not too far, from places ``(M, 2)``."""
+        """``(M, N)`` whether each border is visible frontally and in range from points ``(M, 2)``."""
         step = here_w[:, None] - self.p_w
         away = np.linalg.norm(step, axis=-1)
         return (away > _NEAREST_M) & (away < FARTHEST_M) & ((step * self.normal_w).sum(-1) > _SQUARELY_COS * away)
 
 
 def borders(layer: Layer, here_w: FloatArray) -> Borders:
-    """Those of the free space that a place ``(2,)`` is in."""
+    """Borders of the connected free space around a point ``(2,)``."""
     parts, _ = ndimage.label(layer.clearance_m >= _BODY_M)
     i, j = layer.cells(here_w)
     around = parts[max(0, i - 2) : i + 3, max(0, j - 2) : j + 3]
@@ -71,23 +69,23 @@ def borders(layer: Layer, here_w: FloatArray) -> Borders:
 
 @dataclass(slots=True)
 class Coverage:
-    """Remembers from where it looked, and whereto."""
+    """Record of camera positions and headings."""
 
     _views: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
-    """``(V, 3)`` place [m] and heading [rad]."""
+    """``(V, 3)`` position [m] and heading [rad]."""
 
     def note(self, state: DroneState) -> None:
-        """What a camera shows now counts as looked at; where the pose is carried, nothing does."""
+        """Add the current view; dead-reckoned poses are left out."""
         if not state.tracked:
             return
         new = np.array([*state.p_w[:2], state.yaw_rad])
         near = np.linalg.norm(self._views[:, :2] - new[:2], axis=1) < _APART_M
-        alike = np.abs(wrapped(self._views[:, 2] - new[2])) < _APART_RAD
-        if not (near & alike).any():
+        similar = np.abs(wrapped(self._views[:, 2] - new[2])) < _APART_RAD
+        if not (near & similar).any():
             self._views = np.concatenate([self._views, new[None]])
 
     def unlooked(self, all_: Borders) -> Borders:
-        """Those that no view has shown from before."""
+        """Borders that no view has covered."""
         if not len(self._views) or not len(all_.p_w):
             return all_
         step = all_.p_w - self._views[:, None, :2]
@@ -96,5 +94,5 @@ class Coverage:
         return all_[np.flatnonzero(~shown.any(axis=0))]
 
     def carry(self, update: MapUpdate) -> None:
-        """Take the places along with the map; directions of level flight hardly turn with it."""
+        """Apply a map correction to the positions; its effect on directions is negligible."""
         self._views[:, :2] = update.points(self._views[:, :2])

@@ -1,4 +1,4 @@
-"""Where the known free space ends, and which of those places were looked at in vain."""
+"""Frontiers between free and unknown space, and a record of those inspected without success."""
 
 import math
 from dataclasses import dataclass, field
@@ -12,23 +12,23 @@ from edgeslam_torch.navigation.map_update import MapUpdate
 from edgeslam_torch.types import FloatArray
 
 _PASSED_M = 0.25
-"""Distance from solids at which a drone passes: what of a border is nearer to one leads nowhere."""
+"""Distance from obstacles at which the drone passes; frontiers closer to one are unreachable."""
 _FRONTIER_M = 0.3
-"""Smaller borders of the unseen are gaps between rays, not places to go; a doorway of 0.85 m has this much."""
+"""Minimum frontier length; shorter ones are gaps between rays. A doorway of 0.85 m leaves this much."""
 WIDE_M = 1.0
-"""Wider ones are rooms and corridors; narrow ones are doorways, which other signs tell of, and gaps behind things."""
+"""Length from which a frontier belongs to a room or corridor; shorter ones are doorways and gaps behind furniture."""
 _NEAR_M = 1.2
-"""From nearer a look should show what is behind the border."""
+"""Distance within which a view should resolve a frontier."""
 _LOOKED_S = 4.0
-"""Time near a border after which it stays unseen: what is above or below the picture is not seen from beside it."""
+"""Time near a frontier after which it counts as unresolvable: it lies outside the vertical field of view."""
 _SAME_M = 0.6
-"""Borders move as they are looked at."""
+"""Distance within which frontiers are the same; they move as they are observed."""
 _ROUND_S = 13.0
-"""Time of a full turn where no way is known, with a second to spare: after it there is nothing left to see."""
+"""Duration of a full turn plus a second, after which nothing is left to explore."""
 
 
 def frontiers(layer: Layer, least_m: float = _FRONTIER_M) -> np.ndarray:
-    """One cell ``(F, 2)`` for each border between free and unseen that is wide enough to fly through, or wider."""
+    """One cell ``(F, 2)`` for each frontier of at least ``least_m``."""
     unseen = ~layer.free & ~layer.solid
     border = layer.free & ndimage.binary_dilation(unseen) & (layer.from_solid_m > _PASSED_M)
     parts, count = ndimage.label(border, np.ones((3, 3)))
@@ -41,7 +41,7 @@ def frontiers(layer: Layer, least_m: float = _FRONTIER_M) -> np.ndarray:
 
 
 def reachable(cells: np.ndarray, layer: Layer, here_w: FloatArray) -> np.ndarray:
-    """Those of the cells ``(G, 2)`` to which something that is not solid leads from a place ``(2,)``."""
+    """Cells ``(G, 2)`` connected to a point ``(2,)`` through space without obstacles."""
     parts, _ = ndimage.label(layer.from_solid_m > _PASSED_M - 0.5 * layer.cell_m)
     i, j = layer.cells(here_w)
     around = parts[max(0, i - 2) : i + 3, max(0, j - 2) : j + 3]
@@ -50,15 +50,15 @@ def reachable(cells: np.ndarray, layer: Layer, here_w: FloatArray) -> np.ndarray
 
 @dataclass(slots=True)
 class Looks:
-    """Remembers where a drone looked in vain, and since when nothing is left to look at."""
+    """Record of frontiers inspected without success, and since when none is left."""
 
     _near: list[tuple[FloatArray, float]] = field(default_factory=list)
-    """Places ``(2,)`` with the time spent near them [s]."""
+    """Frontiers ``(2,)`` with the time spent near them [s]."""
     _asked_s: float = math.nan
     _nothing_s: float = math.nan
 
     def worth(self, cells: np.ndarray, layer: Layer, state: DroneState) -> np.ndarray:
-        """Those of the cells ``(G, 2)`` that were not looked at in vain; to be asked at every plan."""
+        """Cells ``(G, 2)`` not yet inspected without success; call it at every plan."""
         passed = 0.0 if math.isnan(self._asked_s) else min(state.stamp_s - self._asked_s, 1.0)
         self._asked_s = state.stamp_s
         places = layer.centres(cells).reshape(-1, 2)
@@ -72,20 +72,20 @@ class Looks:
         return np.asarray(kept)
 
     def left(self, p_w: FloatArray) -> np.ndarray:
-        """Which of the places ``(N, 2)`` were not looked at in vain."""
+        """Which of the points ``(N, 2)`` were not inspected without success."""
         vain = np.array([place for place, spent_s in self._near if spent_s > _LOOKED_S]).reshape(-1, 2)
         return np.asarray((np.linalg.norm(p_w[:, None] - vain, axis=2) > _SAME_M).all(axis=1))
 
     def go_on(self) -> None:
-        """There is something else to look at."""
+        """Reset the end timer: other goals exist."""
         self._nothing_s = math.nan
 
     def over(self, now_s: float) -> bool:
-        """Whether there was nothing left to look at for as long as a look around takes."""
+        """Whether no frontier was left for `_ROUND_S`."""
         return now_s - self._nothing_s > _ROUND_S  # false while it is NaN
 
     def carry(self, update: MapUpdate) -> None:
-        """Take the places along with the map."""
+        """Apply a map correction."""
         places = update.points(np.array([place for place, _ in self._near]).reshape(-1, 2))
         self._near = [(place, spent_s) for place, (_, spent_s) in zip(places, self._near, strict=True)]
 

@@ -1,7 +1,6 @@
-"""A second look at what looked like an opening: from a place before it where it was not seen from yet.
+"""Second look at a candidate opening from another viewpoint in front of it.
 
-A way that is closed beside a door, or a search that ends before it, leaves an opening seen from one place, which is
-none yet: from there a gap between two things, or a wrong depth, looks the same.
+From a single viewpoint an opening is indistinguishable from a gap between two objects or a depth error.
 """
 
 from collections.abc import Sequence
@@ -17,74 +16,73 @@ from edgeslam_torch.navigation.openings.exit_tracker import PLACES_M, Candidate
 from edgeslam_torch.types import FloatArray
 
 _BEFORE_M = (0.8, 2.0)
-"""Distance before the wall from which its opening fills no more than a camera's picture, and is not beyond trust."""
+"""Distances in front of the wall at which an opening fits into the field of view and depth is reliable."""
 _ASIDE = 0.3
-"""How far aside of the opening, in shares of that distance: 17 degrees. From farther aside its far jamb is what is
-seen through it, and free space opens by a slit."""
+"""Lateral offset of the viewpoint over that distance: 17 degrees. From farther aside the far jamb hides the space
+behind."""
 _ELSEWHERE_M = PLACES_M + 0.1
-"""Distance from where it was seen: a pose is not known to the centimetre."""
+"""Minimum distance from the first viewpoint, with a margin for pose errors."""
 _INSIDE_M = 0.15
-"""How far inside of where an opening shows a drone is sent: at its border it would stand, as near as pilots come to
-a goal."""
+"""Margin of goals inside the viewing region: the planner stops slightly short of a goal."""
 _PASSED_M = 0.3
-"""Distance from solids of where it stands to look."""
+"""Distance of viewpoints from obstacles."""
 _STANDS_S = 4.0
-"""Time of a look: a turn by a right angle, and five of those that count."""
+"""Duration of a look: a right-angle turn and five detections."""
 _SOUGHT_S = 30.0
-"""Time after which the way there is given up: six metres, and a look around on it."""
+"""Timeout of the flight to a viewpoint: six metres and one look around."""
 _ON_THE_WAY_M = 1.2
-"""Distance of a place to look from that is no detour: as far as from one look around to the next."""
+"""Distance of a viewpoint that is no detour."""
 _SAME_M = 0.5
-"""An opening moves as it is looked at."""
+"""Distance within which candidates are the same; the estimate moves as it is observed."""
 _TIMES = 3
-"""Looks at one opening in all, if nothing else is left to do: what half of it showed has another middle ..."""
+"""Maximum number of looks at one candidate, if nothing else is left to do ..."""
 _APART_M = 0.3
-"""... and is looked at from another place."""
+"""... and minimum distance between their viewpoints."""
 
 
 @dataclass(slots=True)
 class _Tried:
-    """What was done about a candidate."""
+    """Looks at a candidate."""
 
     centre_w: FloatArray
     until_s: float = np.inf
-    """When it is given up."""
+    """Time at which it is given up."""
     stood_w: list[FloatArray] = field(default_factory=list)
-    """``(2,)`` from where it was looked at, look by look."""
+    """``(2,)`` viewpoint of each look."""
     times: int = 1
 
     @property
     def stands(self) -> bool:
-        """Whether the drone has come to where it shows this time."""
+        """Whether the drone has reached the current viewpoint."""
         return len(self.stood_w) == self.times
 
     def is_new(self, p_w: np.ndarray) -> np.ndarray:
-        """``(P,)`` whether places ``(P, 2)`` are others than those of earlier looks."""
+        """``(P,)`` whether points ``(P, 2)`` differ from the viewpoints of earlier looks."""
         before = np.array(self.stood_w[: self.times - 1]).reshape(-1, 2)
         return np.asarray((np.linalg.norm(p_w[:, None] - before, axis=-1) > _APART_M).all(axis=1))
 
 
 @dataclass(slots=True)
 class SecondLook:
-    """Where to go and look, for as long as that may tell more."""
+    """Viewpoints and headings of second looks."""
 
     _candidates: Sequence[Candidate] = ()
     _tried: list[_Tried] = field(default_factory=list)
 
     def consider(self, candidates: Sequence[Candidate]) -> None:
-        """What is worth a second look now."""
+        """Set the current candidates."""
         self._candidates = candidates
 
     def on_the_way(self, layer: Layer, state: DroneState) -> np.ndarray:
-        """Those of the cells of `goals` that are near."""
+        """Cells of `goals` near the drone."""
         return self._from(self._standing(layer, state, _ON_THE_WAY_M), layer, state)
 
     def goals(self, layer: Layer, state: DroneState) -> np.ndarray:
-        """Cells ``(G, 2)`` that can be reached, from which to look at one of them."""
+        """Reachable viewpoint cells ``(G, 2)``."""
         return self._from(self._standing(layer, state, np.inf), layer, state)
 
     def _standing(self, layer: Layer, state: DroneState, reach_m: float) -> np.ndarray:
-        """Cells ``(C, 2)`` where a drone can stand, no farther than this."""
+        """Reachable cells ``(C, 2)`` with clearance, within ``reach_m``."""
         cells = np.argwhere(layer.free & (layer.from_solid_m > _PASSED_M))
         near = np.linalg.norm(layer.centres(cells).reshape(-1, 2) - state.p_w[:2], axis=1) <= reach_m
         return reachable(cells[near], layer, state.p_w[:2])
@@ -100,7 +98,7 @@ class SecondLook:
         return np.concatenate(found)
 
     def heading_rad(self, state: DroneState) -> float | None:
-        """Where to look, standing where one of them shows; None elsewhere."""
+        """Heading to a candidate visible from here; None otherwise."""
         for candidate, tried in self._worth(state.stamp_s):
             if _shows(candidate, state.p_w[None, :2])[0] and tried.is_new(state.p_w[None, :2])[0]:
                 if not tried.stands:
@@ -111,20 +109,20 @@ class SecondLook:
         return None
 
     def once_more(self, now_s: float) -> None:
-        """What was looked at and given up is worth another look: there is nothing else to do."""
+        """Allow another look at candidates that were given up."""
         for tried in (self._of(candidate) for candidate in self._candidates):
             if now_s >= tried.until_s and tried.stands and tried.times < _TIMES:
                 tried.times, tried.until_s = tried.times + 1, np.inf
 
     def carry(self, update: MapUpdate) -> None:
-        """Take the places along with the map; candidates come anew."""
+        """Apply a map correction; candidates are set anew."""
         for tried in self._tried:
             places = update.points(np.array([tried.centre_w, *tried.stood_w]))
             tried.centre_w, tried.stood_w = places[0], list(places[1:])
         self._candidates = ()
 
     def _worth(self, now_s: float) -> list[tuple[Candidate, _Tried]]:
-        """Those that were not given up."""
+        """Candidates that were not given up."""
         both = [(candidate, self._of(candidate)) for candidate in self._candidates]
         return [(candidate, tried) for candidate, tried in both if now_s < tried.until_s]
 
@@ -137,8 +135,8 @@ class SecondLook:
 
 
 def _shows(candidate: Candidate, p_w: FloatArray, inside_m: float = 0.0) -> np.ndarray:
-    """``(P,)`` whether places ``(P, 2)`` lie before an opening, on the side that it was seen from, and elsewhere, and
-    not at the border of that."""
+    """``(P,)`` whether a candidate is visible from points ``(P, 2)``: in front of it, on the side of its first
+    viewpoint but away from that, and at least ``inside_m`` inside this region."""
     away = (candidate.place_w - candidate.centre_w) @ candidate.normal_w
     before = (p_w - candidate.centre_w) @ candidate.normal_w * (1.0 if away >= 0 else -1.0)
     aside = np.abs((p_w - candidate.centre_w) @ np.array([-candidate.normal_w[1], candidate.normal_w[0]]))

@@ -1,1 +1,1 @@
-"""Depth near the drone: the network's in the map's metres, and points of the map before it."""
+"""Depth near the drone: network depth scaled to the map, and map points in front of it."""

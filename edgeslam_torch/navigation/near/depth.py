@@ -1,7 +1,7 @@
-"""Depth of the network brought to the map's metres, frame by frame, with a sigma that the fit has earned.
+"""Per-frame alignment of network depth to the map's scale, with a standard deviation from the fit.
 
-A network that was trained elsewhere is wrong by tens of percent as a whole and compresses the range of depths: what
-is near is said to be farther than it is, which is the wrong side. The map's own points in the same picture tell both.
+Outside its training domain a depth network is biased by tens of percent and compresses the depth range: near surfaces
+are predicted too far away, which is unsafe. Map points in the same frame determine both errors.
 """
 
 import math
@@ -17,27 +17,25 @@ MIN_POINTS = 20
 _ROUNDS = 6
 _HUBER = 1.5
 _SLOPE_SIGMA = 0.3
-"""Prior of the slope around 1: rooms have shown .3 to .9 of network depth for map depth, that is 1.1 to 3 back."""
+"""Standard deviation of the slope's prior around 1."""
 _LEAST_SIGMA = 0.03
 _SLOPES = (0.6, 2.0)
 _NEAR_SHARE = 0.06
-"""Of the picture's width: 4 degrees of a Tello's, over which a network's error hardly changes."""
+"""Smoothing radius in image widths: 4 degrees of a Tello's camera; network errors correlate over it."""
 ALONE_SIGMA = 0.3
-"""Of depth that rests on the network alone."""
+"""Standard deviation of log depth without map points."""
 _BIAS_SIGMA = 0.2
-"""Of that in a picture whose points agree with what is usual, away from them: in eight flights 1.4 to 4 % of the pixels
-told at .8 to 3 m were too far by more than twice as much."""
+"""The same if the frame's points agree with the bias estimate; away from the points (measured at 0.8 to 3 m)."""
 _LINE_POINTS = 3.0
-"""Points that outweigh the line."""
+"""Weight of the line, in points."""
 _BLOCK, _STRIDE = 8, 4
-"""Side of the grid's cells [px], and of the pixels that share a mean."""
+"""Cell size of the bilateral grid and pixel stride of its evaluation [px]."""
 _LEVEL_LOG, _BEYOND = 0.2, 3
-"""Depth of the grid's cells, and cells before and behind all points that these say nothing of."""
+"""Cell size in log depth, and empty cells before and behind all points."""
 
 
 _INDEPENDENT = 5.0
-"""Errors of a picture's depth that have nothing to do with each other: all points of it together outweigh the usual
-line no more than so many."""
+"""Effective number of independent errors in one frame: upper bound of the points' total weight against the bias line."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,43 +45,43 @@ class NearFit:
     offset: float
     slope: float
     sigma_log: float
-    """Robust spread of single points around it."""
+    """Robust standard deviation of single points around the line."""
     points: int
     uv: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
-    """``(P, 2)`` where in the picture the points are [px]; none: nothing is known of places."""
+    """``(P, 2)`` pixels of the points; empty if unknown."""
     level: FloatArray = field(default_factory=lambda: np.zeros(0))
-    """``(P,)`` logarithm of the line's depth there."""
+    """``(P,)`` log depth by the line."""
     residual: FloatArray = field(default_factory=lambda: np.zeros(0))
-    """``(P,)`` logarithm of map depth over the line there."""
+    """``(P,)`` log map depth less log depth by the line."""
     bends: bool = False
-    """Whether the line is not that of its points, and gives way to them at their depths."""
+    """Whether the line is the bias estimate, corrected towards the points at their depths."""
 
     @property
     def network_log(self) -> FloatArray:
-        """``(P,)`` logarithm of network depth at the points."""
+        """``(P,)`` log network depth at the points."""
         return (self.level - self.offset) / self.slope
 
     @property
     def ratio_log(self) -> float:
-        """Logarithm of map depth over network depth, in the median of the points."""
+        """Median over the points of log map depth less log network depth."""
         return float(np.median(self.level + self.residual - self.network_log))
 
     def alone(self) -> "NearFit":
-        """The line without its points: of another picture than theirs."""
+        """The line without its points, for another frame."""
         return NearFit(self.offset, self.slope, self.sigma_log, self.points)
 
     def through(self, points: "NearFit") -> "NearFit":
-        """This line, which many pictures agree on, with the points of one picture: beyond their depths it stays, and
-        the room behind a door is as far as usual, however wrong the network is about the wall."""
+        """The bias line with the points of one frame; beyond their depths the line itself holds, so that errors on a
+        wall do not extrapolate to the room behind a door."""
         level = self.offset + self.slope * points.network_log
         residual = points.level + points.residual - level
         spread = max(1.4826 * float(np.median(np.abs(residual - np.median(residual)))), _LEAST_SIGMA)
         return NearFit(self.offset, self.slope, spread, points.points, points.uv, level, residual, bends=True)
 
     def applied(self, depth: DepthMap) -> DepthMap:
-        """Depth in metres, with the line's errors made up for near the points; unknown where the network's is.
+        """Depth in map units, corrected by nearby points; unknown where the network's depth is.
 
-        Its sigma is the spread of the points nearby, and the network's own far from all.
+        The standard deviation is the spread of nearby points, and the network's own far from all points.
         """
         known = np.isfinite(depth.depth_m) & (depth.depth_m > 0)
         log_m = self.offset + self.slope * np.log(np.where(known, depth.depth_m, 1.0))
@@ -100,9 +98,9 @@ class NearFit:
 
 
 def fit_near(network_m: FloatArray, map_m: FloatArray) -> NearFit | None:
-    """Robust line between logarithms of network depth and map depth at the same pixels, ``(N,)`` each.
+    """Robust line fit of log map depth against log network depth, ``(N,)`` each.
 
-    Huber weights, a prior of slope 1; None with fewer than `MIN_POINTS` points or no spread to speak of.
+    Huber weights, prior slope 1; None with fewer than `MIN_POINTS` points.
     """
     usable = np.isfinite(network_m) & np.isfinite(map_m) & (network_m > 0) & (map_m > 0)
     if int(usable.sum()) < MIN_POINTS:
@@ -124,9 +122,9 @@ def fit_near(network_m: FloatArray, map_m: FloatArray) -> NearFit | None:
 
 
 def _bend(level: FloatArray, residual: FloatArray) -> Callable[[FloatArray], FloatArray]:
-    """What points say of a line's error at any depths: a mean with Gaussian weights over `_LEVEL_LOG`, towards it.
+    """Error of a line as a function of log depth: Gaussian kernel regression of bandwidth `_LEVEL_LOG`, shrunk to 0.
 
-    Points far from the others are hidden, or hide them, and count less (Huber).
+    Outliers, mostly occlusions, get Huber weights.
     """
     off = np.abs(residual - np.median(residual))
     bound = _HUBER * max(1.4826 * float(np.median(off)), _LEAST_SIGMA)
@@ -152,21 +150,20 @@ def local_error(
     log_m: FloatArray,
     alone_sigma: float = ALONE_SIGMA,
 ) -> tuple[FloatArray, FloatArray]:
-    """What points ``(P, 2)`` with residuals ``(P,)`` say of a line's error at every pixel, and its standard deviation.
+    """Error of a line at every pixel and its standard deviation, from points ``(P, 2)`` with residuals ``(P,)``.
 
-    Means with Gaussian weights over `_NEAR_SHARE` of the picture's width and over `_LEVEL_LOG` of the line's depth (a
-    bilateral grid: Chen, Paris and Durand 2007), towards the line (error 0, standard deviation ``alone_sigma`` at
-    least) with the weight of `_LINE_POINTS` points: the frame of a door tells nothing of the room that is seen through
-    it, where a network that fits this room to 7 % was seen to be 40 % too near. Points more than three spreads farther
-    than the line are hidden by what the network sees; those that are nearer are none that it hides.
+    Gaussian kernel regression over `_NEAR_SHARE` of the image width and `_LEVEL_LOG` in depth (bilateral grid: Chen,
+    Paris and Durand 2007), shrunk to 0 with the weight of `_LINE_POINTS` points. The depth dimension keeps points on a
+    door frame from correcting the room behind it. Points more than three standard deviations behind the line are
+    occluded and left out.
 
     Args:
-        uv: Where the points are [px].
-        level: Logarithm of the line's depth there ``(P,)``.
-        residual: Logarithm of map depth less that.
+        uv: Pixels of the points.
+        level: Log depth by the line at the points ``(P,)``.
+        residual: Log map depth less ``level``.
         spread: Robust standard deviation of the residuals.
-        log_m: Logarithm of the line's depth at every pixel ``(H, W)``.
-        alone_sigma: Of depth without points.
+        log_m: Log depth by the line at every pixel ``(H, W)``.
+        alone_sigma: Standard deviation of log depth without points.
 
     Returns:
         Error and standard deviation ``(H, W)`` float32 each.
@@ -178,7 +175,7 @@ def local_error(
     small = (-(-height // _BLOCK), -(-width // _BLOCK), levels)
 
     def place(u: FloatArray, v: FloatArray, log_depth: FloatArray) -> FloatArray:
-        """Coordinates ``(3, ...)`` in the grid."""
+        """Grid coordinates ``(3, ...)``."""
         high = (log_depth - lowest) / _LEVEL_LOG + _BEYOND
         return np.stack([(v + 0.5) / _BLOCK - 0.5, (u + 0.5) / _BLOCK - 0.5, np.clip(high, 0.0, levels - 1.0)])
 
@@ -188,7 +185,7 @@ def local_error(
     radius = _NEAR_SHARE * width / _BLOCK
     v, u = np.mgrid[_STRIDE // 2 : height : _STRIDE, _STRIDE // 2 : width : _STRIDE]
     at = place(u, v, log_m[v, u])
-    # The weight of one point in its own place is 1; without a point counts are integers.
+    # Normalised so that one point has weight 1 at its own position.
     unit = (2.0 * np.pi) ** 1.5 * radius**2
     moments = []
     for weight in (np.ones(len(r)), r, r * r):
@@ -205,16 +202,16 @@ def local_error(
 
 
 def _enlarged(small: FloatArray, shape: tuple[int, ...]) -> FloatArray:
-    """Each pixel as the one nearest to it that was asked about."""
+    """Nearest-neighbour upsampling by `_STRIDE`."""
     large = small.astype(np.float32).repeat(_STRIDE, axis=0).repeat(_STRIDE, axis=1)
     rest = [max(0, n - k) for n, k in zip(shape, large.shape, strict=True)]
     return np.pad(large, [(0, r) for r in rest], mode="edge")[: shape[0], : shape[1]]
 
 
 def fit_to_points(depth: DepthMap, uv: FloatArray, map_m: FloatArray) -> NearFit | None:
-    """`fit_near` at the pixels ``(N, 2)`` where points of the map are seen, at depths ``(N,)``.
+    """`fit_near` at pixels ``(N, 2)`` of map points with depths ``(N,)``.
 
-    Points that a nearer one hides are outliers of the fit, of which it bears a third.
+    Occluded points are outliers; the fit tolerates up to a third of them.
     """
     u, v = np.rint(uv).astype(int).T
     network_m = depth.depth_m[v, u].astype(np.float64)

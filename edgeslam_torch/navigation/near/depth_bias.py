@@ -1,8 +1,7 @@
-"""The usual metre of a depth network: what its depth has to be multiplied by, as many pictures agree.
+"""Bias of a depth network, estimated over many frames of a flight.
 
-A network that was trained elsewhere is wrong by tens of percent, but by much the same in every picture of a flight. So
-this says what a picture without points of the map, or beyond them, shows; and it tells points whose unit was lost in a
-turn on the spot.
+Outside its training domain a network is biased by tens of percent, but consistently within a flight. The estimate
+scales frames without map points, and detects a wrong map scale, such as after a turn on the spot.
 """
 
 from collections import deque
@@ -13,48 +12,47 @@ import numpy as np
 from edgeslam_torch.navigation.near.depth import ALONE_SIGMA, NearFit
 
 _KEPT, _LEAST = 150, 15
-"""Pictures: half a minute at five a second; fewer than three seconds tell nothing."""
+"""Frames used: half a minute at 5 Hz, at least three seconds."""
 _SPREAD = 0.15
-"""Standard deviation of a picture's ratio from the usual one: .12 and .13 in two flights, logarithm."""
+"""Standard deviation of a frame's log ratio around the bias (measured: 0.12 to 0.13)."""
 _WIDE_LOG = 0.35
-"""Standard deviation of depth among points that tell a slope: from 1 to 3 m."""
+"""Minimum standard deviation of log depth among points to estimate a slope: depths of 1 to 3 m."""
 _SIGMAS = 3.0
 _DOUBTED = 5
-"""Pictures on end, a second, that make it doubtful that a metre is one."""
+"""Consecutive outlier frames, one second, after which the map's scale is in doubt."""
 
 
 @dataclass(slots=True)
 class DepthBias:
-    """Remembers what the points of the last pictures said."""
+    """Running estimate of the network's bias from the map points of recent frames."""
 
     _ratios: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=_KEPT))
-    """Picture by picture: logarithm of the network's depth of its points, and of metres for a metre of the network
-    there, in the median."""
+    """Per frame, medians over its points: log network depth, and log metres per network metre."""
     _slopes: deque[float] = field(default_factory=lambda: deque(maxlen=_KEPT))
-    """Of the lines of wide pictures."""
+    """Slopes of frames with a wide depth range."""
     _outliers: int = 0
-    """Pictures on end that say something else."""
+    """Consecutive outlier frames."""
     _off_log: float = 0.0
-    """By how much the last of them does."""
+    """Log deviation of the last outlier."""
 
     @property
     def doubt(self) -> float:
-        """By how much, relatively, a metre is off as pictures on end say; 0 where they say what is usual."""
+        """Relative scale error indicated by consecutive outliers; 0 while frames agree with the bias."""
         return abs(float(np.expm1(self._off_log))) if self._outliers >= _DOUBTED else 0.0
 
     def is_consistent(self, fit: NearFit, unit_m: float, sure: bool) -> bool:
-        """Whether what a picture's points say is not far from what they usually say; remembered if metres are sure.
+        """Whether a frame's fit agrees with the bias; added to the estimate if the scale is certain.
 
         Args:
-            fit: To these points.
-            unit_m: Metres for a unit of the map.
-            sure: Whether these are known well.
+            fit: Line fit to the frame's points.
+            unit_m: Metres per map unit.
+            sure: Whether ``unit_m`` is certain.
         """
         middle_log, ratio_log = float(np.median(fit.network_log)), fit.ratio_log + float(np.log(unit_m))
         off_log = ratio_log - self._expected(middle_log) if self._is_ready() else 0.0
         if abs(off_log) > _SIGMAS * _SPREAD:
             self._outliers, self._off_log = self._outliers + 1, off_log
-            if self._outliers > _KEPT // 2:  # so long is no turn: what was usual rested on other metres
+            if self._outliers > _KEPT // 2:  # the bias itself was estimated at another scale
                 self._ratios.clear()
                 self._outliers = 0
             return False
@@ -66,7 +64,7 @@ class DepthBias:
         return True
 
     def line(self, unit_m: float) -> NearFit | None:
-        """The usual line, of no picture's points; None before there is one."""
+        """The bias as a line without points; None before it is known."""
         if not self._is_ready():
             return None
         return NearFit(self._expected(0.0) - float(np.log(unit_m)), self._slope(), ALONE_SIGMA, 0)
@@ -78,6 +76,6 @@ class DepthBias:
         return float(np.median(self._slopes)) if len(self._slopes) >= _LEAST else 1.0
 
     def _expected(self, network_log: float) -> float:
-        """Logarithm of metres for a metre of the network at a depth."""
+        """Log metres per network metre at a log network depth."""
         middle, ratio = np.array(self._ratios).T
         return float(np.median(ratio + (self._slope() - 1.0) * (network_log - middle)))

@@ -1,7 +1,7 @@
-"""Points of the map that stand before what a depth map shows: a table's edge that the network looked through.
+"""Map points in front of a depth map, such as a table edge that the network missed.
 
-A network sees the wall behind a plain or thin thing; the edges of that thing are in the map, with the depth that
-several views gave them. Where both are known, the nearer one counts for a drone.
+A depth network often predicts the wall behind a textureless or thin object, whose edges the map has triangulated. Where
+both depths are known, the nearer one counts.
 """
 
 import numpy as np
@@ -9,21 +9,21 @@ import numpy as np
 from edgeslam_torch.types import DepthMap, FloatArray
 
 SIGMA_LOG = 0.05
-"""Of a depth that points of the map tell."""
+"""Standard deviation of log depth of map points."""
 MIN_AGREEING = 3
-"""Points that must agree before they tell an obstacle: single ones are wrong more often than one is so small."""
+"""Points that must agree to count as an obstacle; single ones are mostly outliers."""
 MIN_DEPTH = 0.1
-"""Points nearer to the camera are none [m]."""
+"""Minimum depth of a point [m]."""
 _CELL_SHARE = 0.02
-"""Side of the cells in which points agree, of the picture's width: 1.6 degrees of a Tello's."""
+"""Cell size in shares of the image width: 1.6 degrees of a Tello's camera."""
 _CELL_LOG = 0.12
-"""Their depth, in the logarithm."""
+"""Cell size in log depth."""
 
 
 def seen_points(
     p_w: FloatArray, K: FloatArray, T_w_c: FloatArray, shape: tuple[int, ...]
 ) -> tuple[FloatArray, FloatArray]:
-    """Pixels ``(N, 2)`` and depths ``(N,)`` of points ``(M, 3)`` that a picture ``(H, W)`` from ``T_w_c`` shows."""
+    """Pixels ``(N, 2)`` and depths ``(N,)`` of points ``(M, 3)`` inside an image ``(H, W)`` taken at ``T_w_c``."""
     p_c = (p_w - T_w_c[:3, 3]) @ T_w_c[:3, :3]
     p_c = p_c[p_c[:, 2] > MIN_DEPTH]
     uv = (p_c[:, :2] / p_c[:, 2:]) * [K[0, 0], K[1, 1]] + [K[0, 2], K[1, 2]]
@@ -32,14 +32,14 @@ def seen_points(
 
 
 def agreeing(uv: FloatArray, z: FloatArray, width: int) -> np.ndarray:
-    """Rows of the points that share a small part of a picture and a range of depths with `MIN_AGREEING` in all.
+    """Indices of points that share a cell of pixels and depth with at least `MIN_AGREEING` points.
 
-    Cells are laid twice, the second time by half a cell further, so that no border parts what is together.
+    Two grids, shifted by half a cell, so that no cell border splits a group.
 
     Args:
-        uv: ``(N, 2)`` where points are seen [px].
-        z: ``(N,)`` their depths.
-        width: Of the picture [px].
+        uv: ``(N, 2)`` pixels.
+        z: ``(N,)`` depths.
+        width: Image width [px].
     """
     together = np.zeros(len(z), dtype=bool)
     for shift in (0.0, 0.5):
@@ -53,12 +53,12 @@ def agreeing(uv: FloatArray, z: FloatArray, width: int) -> np.ndarray:
 
 
 def with_nearer_points(depth: DepthMap, uv: FloatArray, z: FloatArray) -> DepthMap:
-    """A depth map that has the depth of points at the pixels at which these are nearer, or its own is unknown.
+    """Depth map with the points' depth where it is nearer or the depth map is unknown.
 
     Args:
         depth: In the unit of the points.
-        uv: ``(N, 2)`` where points are seen [px], inside the picture.
-        z: ``(N,)`` their depths.
+        uv: ``(N, 2)`` pixels inside the image.
+        z: ``(N,)`` depths.
     """
     u, v = np.rint(uv).astype(int).clip(0, np.array(depth.depth_m.shape[::-1]) - 1).T
     points = np.full(depth.depth_m.shape, np.inf, np.float32)

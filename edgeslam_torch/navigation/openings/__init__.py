@@ -1,1 +1,1 @@
-"""Exits and pathways: what the free space around a drone leads to."""
+"""Detection of exits (door-like openings) and pathways (corridors) in free space."""

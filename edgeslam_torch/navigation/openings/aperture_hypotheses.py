@@ -1,7 +1,7 @@
-"""Glimpses: where one picture shows something behind a wall, though free space has not opened there yet.
+"""Aperture hypotheses: openings through which a single view sees beyond a wall before free space confirms them.
 
-Free space is carved as far as depth less two sigmas. Of a door beside a corridor, seen aslant in three pictures, little
-more than the jambs is left by that: worth a look from before it, not an exit.
+Free space is carved only up to depth less two standard deviations. A door beside the path, seen at a grazing angle in
+a few frames, stays mostly unknown: it is worth a look from the front, but no exit yet.
 """
 
 from collections.abc import Iterator
@@ -15,22 +15,22 @@ from edgeslam_torch.navigation.openings.wall_frame import WallGrid
 from edgeslam_torch.types import FloatArray
 
 NEAR_M = 4.0
-"""Farther away a door is a few pixels of uncertain depth."""
+"""Maximum distance; beyond it a door covers a few pixels of uncertain depth."""
 _SOLID_SHARE = 0.3
-"""Of the opening's cells some are known to be free; of its width little is known to be closed."""
+"""Maximum share of the opening's width with occupied cells."""
 _BEFORE_SHARE = 0.5
-"""Of the cells before it: a place to look from."""
+"""Minimum share of free cells in front of the opening."""
 _BEYOND_M = 0.4
-"""Depth behind the wall that is no frame and no niche."""
+"""Minimum depth behind the wall, beyond frames and niches."""
 _MIDDLE = 0.6
-"""Part of the opening's width through which rays count: its jambs smear into it."""
+"""Central share of the opening's width in which rays count; depth smears the jambs into the rest."""
 _MIN_RAYS, _THROUGH_SHARE = 6, 0.6
-"""Level rays that meet the middle of it, and how many of them go on."""
+"""Minimum number of horizontal rays through the centre, and share of them that pass beyond the wall."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Rays:
-    """Level rays of a view."""
+    """Horizontal rays of a view."""
 
     origin_w: FloatArray
     """``(2,)``"""
@@ -41,7 +41,7 @@ class _Rays:
 
 
 def aperture_hypotheses(grids: list[WallGrid], view: View, here_w: FloatArray) -> list[Gap]:
-    """What may be openings in walls, between what is upright, that a view looks through, the surest first.
+    """Openings in walls that a view looks through, the most confident first.
 
     Args:
         grids: What is known around, `along_walls`.
@@ -54,7 +54,7 @@ def aperture_hypotheses(grids: list[WallGrid], view: View, here_w: FloatArray) -
 
 
 def _unclosed(grid: WallGrid) -> Iterator[Gap]:
-    """Openings that are not known to be closed, with space before them."""
+    """Gaps not known to be closed, with free space in front."""
     middle = 0.5 * (len(grid.free) - 1)
     for t, low, high in jambs(grid):
         inside, fifth = np.s_[t - 1 : t + 2, low + 1 : high - 1], (high - low) // 5
@@ -66,7 +66,7 @@ def _unclosed(grid: WallGrid) -> Iterator[Gap]:
 
 
 def _level(view: View) -> _Rays:
-    """Rays that leave a camera level, one per column where its picture has one."""
+    """Horizontal rays of a camera, one per image column where it lies in the image."""
     K, R = view.K, view.T_w_c[:3, :3]
     u = np.arange(view.depth_m.shape[1])
     x = (u - K[0, 2]) / K[0, 0]
@@ -81,7 +81,7 @@ def _level(view: View) -> _Rays:
 
 
 def _goes_through(rays: _Rays, gap: Gap) -> bool:
-    """Whether what meets the middle of an opening is seen to go on behind it."""
+    """Whether rays through the centre of an opening pass beyond the wall."""
     to_wall = float((gap.centre_w - rays.origin_w) @ gap.normal_w)
     towards = rays.step_w @ gap.normal_w
     along = np.array([-gap.normal_w[1], gap.normal_w[0]])

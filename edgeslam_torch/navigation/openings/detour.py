@@ -1,4 +1,4 @@
-"""Whether something else than an opening leads from one side of it to the other: two pillars in a room are no exit."""
+"""Detour test: a gap that can be bypassed, as between two pillars in a room, is no exit."""
 
 import cv2
 import numpy as np
@@ -7,24 +7,23 @@ from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.types import FloatArray
 
 _AROUND_M = 2.0
-"""How far from the opening a way around it counts: furniture is passed within it, two doors of one room are farther
-apart."""
+"""Radius of the search: detours around furniture are shorter, two doors of one room are farther apart."""
 _BODY_M = 0.1
-"""Distance from what is not known to be free that a way keeps: specks of free cells in a wall are none."""
+"""Clearance of a detour; isolated free cells in a wall do not count."""
 _SEAL_M, _ENDS_M = 0.15, 0.2
-"""The opening is closed to this depth on either side, and so far beyond its ends."""
+"""Half depth of the virtual plug in the opening, and its overlap beyond the ends."""
 _SIDES_M = (0.25, 0.65)
-"""Before and behind it."""
+"""Distances in front and behind at which connectivity is tested."""
 
 
 def has_detour(layer: Layer, centre_w: FloatArray, normal_w: FloatArray, width_m: float) -> bool:
     """Whether known free space joins both sides within `_AROUND_M` when the opening is closed.
 
     Args:
-        layer: What is free at the height of flight.
-        centre_w: ``(2,)`` middle of the opening [m].
-        normal_w: ``(2,)`` level unit vector through it.
-        width_m: Of the opening.
+        layer: Layer at the flight height.
+        centre_w: ``(2,)`` centre of the opening [m].
+        normal_w: ``(2,)`` unit normal.
+        width_m: Width of the opening.
     """
     low, high = (layer.cells(centre_w + side * _AROUND_M) for side in (-1.0, 1.0))
     rows, columns = np.meshgrid(*(np.arange(a, b + 1) for a, b in zip(low, high, strict=True)), indexing="ij")

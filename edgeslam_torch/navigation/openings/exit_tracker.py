@@ -1,4 +1,4 @@
-"""Exits over a flight: what one look takes for an opening counts when looks from other places agree."""
+"""Tracking of exits over a flight: a detection is confirmed by detections from other viewpoints."""
 
 import math
 from dataclasses import dataclass, field, replace
@@ -18,31 +18,32 @@ from edgeslam_torch.types import FloatArray
 
 _EVERY_S = 0.5
 _SAME_M, _SAME_RAD = 0.5, math.radians(35.0)
-"""A look within these of an earlier one is of the same opening."""
+"""Distance and angle within which detections belong to the same opening."""
 _PASSAGE_M = 1.0
-"""Distance along a passage within which it has one door."""
+"""Minimum distance between two doors along a passage."""
 PLACES_M = 0.5
-"""Distance between two places that count as two."""
+"""Minimum distance between distinct viewpoints."""
 FIELD_RAD = math.radians(20.0)
-"""Half the camera's field of view, less a margin: an opening within it that is not found again counts against it."""
+"""Half the field of view less a margin; an opening inside it that is not detected counts as missed."""
 _SQUARELY_COS = math.cos(math.radians(50.0))
-"""Angle to an opening's normal from which on it is seen aslant."""
+"""Maximum angle to an opening's normal for a valid view."""
 _NEAREST_M, FARTHEST_M = 0.8, 2.5
-"""From nearer an opening is more than what a camera sees; from farther away it closes and opens with every depth."""
+"""Range of valid views: closer, an opening exceeds the field of view; farther, depth errors open and close it."""
 _LOOKS = 3
+"""Detections that an exit needs."""
 _SHOWN = 2
-"""Looks from before it that an exit needs: one is chance."""
+"""Frontal detections that an exit needs; a single one may be accidental."""
 _STEP_M = 1.0
-"""Way from one look to the next in which it is known what the drone flew through."""
+"""Maximum distance between updates for which the crossing of an opening is detected."""
 _HYPOTHESIS_LOOKS = 2
-"""Looks that make a doubt: as many as a drone has that flies past a door."""
+"""Detections that make a candidate: as many as a drone gets while passing a door."""
 _GONE = 8
-"""Looks at it, as long as a second look takes, that show nothing open there, one after the other: later ones know more
-than earlier ones, so what fifty of them told before is not told until it is seen again."""
+"""Consecutive misses, as many as a second look takes, after which an opening is no longer reported until it is detected
+again. Later views rest on a better map, so they outweigh any number of earlier detections."""
 _WAY_ROUND = 20
-"""Looks on end, ten seconds, in which a way leads round it."""
+"""Consecutive updates (ten seconds) with a detour that override earlier ones without."""
 _CELL_SIGMAS = 1.0 / math.sqrt(6.0)
-"""Standard deviation of a width between two cells, in cells: each end is anywhere in its own."""
+"""Standard deviation of a width between two cells [cells]: both ends are uniform within their cells."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,56 +51,56 @@ class Exit:
     """An opening of a door's width in a wall, free on both sides, seen from at least two places."""
 
     centre_w: FloatArray
-    """``(3,)`` its middle at the height of the drone, in the drone's world [m]."""
+    """``(3,)`` centre at the height of the drone, in the drone's world [m]."""
     normal_w: FloatArray
-    """``(3,)`` level unit vector through it, away from where it was seen first."""
+    """``(3,)`` horizontal unit normal, pointing away from the first viewpoint."""
     width_m: float
     width_sigma_m: float
     position_sigma_m: float
-    """Standard deviation of each level coordinate of the middle, relative to the drone's present place [m]."""
+    """Standard deviation of each horizontal coordinate of the centre, relative to the drone [m]."""
     places: int
-    """From how many places it was seen."""
+    """Number of distinct viewpoints."""
 
     def beyond(self, away_m: float) -> FloatArray:
-        """The point ``(3,)`` behind it; before it with a negative distance."""
+        """Point ``(3,)`` at a distance behind the exit; in front of it if negative."""
         return np.asarray(self.centre_w + away_m * self.normal_w)
 
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """What looked like an opening, again and again, from one place only, or in a hypothesis."""
+    """An unconfirmed opening: detected from one viewpoint only, or an aperture hypothesis."""
 
     centre_w: FloatArray
     """``(2,)`` [m]."""
     normal_w: FloatArray
-    """``(2,)`` level unit vector through it."""
+    """``(2,)`` unit normal."""
     place_w: FloatArray
-    """``(2,)`` where it was seen from first [m]."""
+    """``(2,)`` first viewpoint [m]."""
     elsewhere: bool = True
-    """Whether it must be looked at from another place than that: it was seen open from there, not in a hypothesis."""
+    """Whether it needs another viewpoint; an aperture hypothesis does not."""
 
 
 @dataclass(slots=True)
 class _Seen:
-    """One opening, look by look."""
+    """Detections of one opening."""
 
     gaps: list[Gap]
     pictures: list[int]
-    """Number of the picture that each was seen in."""
+    """Frame number of each detection."""
     places_w: list[FloatArray]
     near: int = 0
     shown: int = 0
-    """Looks at it (`_is_looked_at`) that show something open there ..."""
+    """Valid views (`_is_looked_at`) with a detection ..."""
     missed: int = 0
-    """... and those that do not."""
+    """... and without one."""
     gone: int = 0
-    """Those missed since it was seen last."""
+    """Misses since the last detection."""
     parting: int = 0
-    """Looks from near by in which no way led round it, less those in which one did: most of them decide."""
+    """Close views without a detour less those with one; the majority decides."""
     round: int = 0
-    """The last of these, on end, in which one did."""
+    """Consecutive close views with a detour, up to the last."""
     flown: bool = False
-    """Whether the drone has flown through it: it is open, whatever looks show."""
+    """Whether the drone has flown through it, which proves that it is open."""
 
     @property
     def centre_w(self) -> FloatArray:
@@ -107,11 +108,11 @@ class _Seen:
 
     @property
     def is_shown(self) -> bool:
-        """Whether looks at it show it open, more than one, and few that do not."""
+        """Whether enough valid views detect it and few miss it."""
         return self.shown >= _SHOWN and self.missed < self.shown + _LOOKS
 
     def note_way_round(self, known: bool) -> None:
-        """One more look: looks from when no way round it was known yet do not outvote ten seconds that know one."""
+        """Count a detour test; `_WAY_ROUND` consecutive detours override earlier results, which had less map."""
         self.round = self.round + 1 if known else 0
         self.parting = self.parting + (-1 if known else 1)
         if self.round >= _WAY_ROUND:
@@ -120,26 +121,25 @@ class _Seen:
 
 @dataclass(slots=True)
 class ExitTracker:
-    """Looks for exits while a drone flies."""
+    """Detects and tracks exits during a flight."""
 
     exits: tuple[Exit, ...] = ()
-    """What counts as an exit now, the nearest first; replaced as a whole, so that other threads may read it."""
+    """Confirmed exits, the nearest first; replaced as a whole, so that other threads may read it."""
     candidates: tuple[Candidate, ...] = ()
-    """What may be one, if it looks so from elsewhere, too."""
+    """Unconfirmed openings."""
     _seen: list[_Seen] = field(default_factory=list)
     _hypotheses: list[_Seen] = field(default_factory=list)
     _looked_s: float = -math.inf
     _looked_w: FloatArray | None = None
-    """``(2,)`` from where it looked last."""
+    """``(2,)`` position at the last update."""
 
     def due(self, state: DroneState) -> bool:
-        """Whether it is time for another look. In a piece of map that may lie half a hull elsewhere none counts, for or
-        against what was found."""
+        """Whether it is time for an update. Views in a submap whose position is too uncertain do not count."""
         placed = state.metric and state.tracked and state.submap_sigma_m <= DEAD_RECKONING_SIGMA_M
         return placed and state.view is not None and state.stamp_s - self._looked_s >= _EVERY_S
 
     def look(self, walls: Walls, state: DroneState) -> None:
-        """Compare what the grid shows now with what it showed before; from farther away than `NEAR_M` none counts."""
+        """Update with detections in the current grid; only those within `NEAR_M` count."""
         self._looked_s = state.stamp_s
         here = state.p_w[:2]
         grids = along_walls(walls, here)
@@ -163,7 +163,7 @@ class ExitTracker:
         self.candidates = tuple(_candidate(*doubt) for doubt in doubted if not _parts_nothing(doubt[0], walls.layer))
 
     def _count(self, free: list[Gap], partly: list[Gap], state: DroneState) -> None:
-        """What speaks for and against what was seen before: what is not looked at stays as it was."""
+        """Count detections and misses; openings without a valid view stay unchanged."""
         for seen in self._seen:
             if not _is_looked_at(seen, state):
                 continue
@@ -176,22 +176,22 @@ class ExitTracker:
         self._seen = [seen for seen in self._seen if seen.missed <= 2 * max(len(seen.gaps), _LOOKS)]
 
     def _exits(self, good: list[_Seen], layer: Layer, state: DroneState) -> tuple[Exit, ...]:
-        """Those that part two rooms, one of each passage."""
+        """Openings that separate two rooms, one per passage."""
         good.sort(key=lambda s: -s.near)
-        told = [(seen, e) for seen in good if (e := _exit(seen, state)).width_m <= WIDEST_M]
-        for seen, exit_ in told:
-            if np.linalg.norm(exit_.centre_w[:2] - state.p_w[:2]) < NEAR_M:  # from afar a wall gets holes
+        measured = [(seen, e) for seen in good if (e := _exit(seen, state)).width_m <= WIDEST_M]
+        for seen, exit_ in measured:
+            if np.linalg.norm(exit_.centre_w[:2] - state.p_w[:2]) < NEAR_M:  # from afar walls have holes
                 seen.note_way_round(_passed_by(exit_, layer))
-        exits = [e for seen, e in told if seen.parting > 0]
+        exits = [e for seen, e in measured if seen.parting > 0]
         single = [e for k, e in enumerate(exits) if not any(_one_passage(e, other) for other in exits[:k])]
         return tuple(sorted(single, key=lambda e: float(np.linalg.norm(e.centre_w[:2] - state.p_w[:2]))))
 
     def carry(self, update: MapUpdate) -> None:
-        """Take what was found along with the map; `exits` are those of the next look."""
+        """Apply a map correction; `exits` follow at the next update."""
         for seen in [*self._seen, *self._hypotheses]:
             centres = update.points(np.array([gap.centre_w for gap in seen.gaps]), seen.pictures)
             beyond = update.points(np.array([gap.centre_w + 0.1 * gap.normal_w for gap in seen.gaps]), seen.pictures)
-            seen.gaps = [_carried(*gap, update.ratio) for gap in zip(seen.gaps, centres, beyond, strict=True)]
+            seen.gaps = [_corrected(*gap, update.ratio) for gap in zip(seen.gaps, centres, beyond, strict=True)]
             seen.places_w = list(update.points(np.array(seen.places_w).reshape(-1, 2)))
         self._looked_w = None
 
@@ -215,13 +215,13 @@ def _candidate(seen: _Seen, elsewhere: bool) -> Candidate:
 
 
 def _parts_nothing(seen: _Seen, layer: Layer) -> bool:
-    """Whether it is too wide, or the space between two things in one room."""
+    """Whether it is too wide or a gap within one room."""
     width_m = float(np.median([gap.width_m for gap in seen.gaps]))
     return width_m > WIDEST_M or has_detour(layer, seen.centre_w, seen.gaps[0].normal_w, width_m)
 
 
 def _exit(seen: _Seen, state: DroneState) -> Exit:
-    """The opening as the looks agree on it."""
+    """Robust estimate of an opening from its detections."""
     centres, widths = np.array([g.centre_w for g in seen.gaps]), np.array([g.width_m for g in seen.gaps])
     first = seen.gaps[0].normal_w
     turned = [g.normal_w * np.sign(g.normal_w @ first) for g in seen.gaps]
@@ -237,35 +237,35 @@ def _exit(seen: _Seen, state: DroneState) -> Exit:
 
 
 def _passed_by(exit_: Exit, layer: Layer) -> bool:
-    """Whether it is the space between two things in one room."""
+    """Whether it is a gap within one room."""
     return has_detour(layer, exit_.centre_w[:2], exit_.normal_w[:2], exit_.width_m)
 
 
 def _one_passage(exit_: Exit, other: Exit) -> bool:
-    """Whether both are one opening, seen along two directions, or lie one behind the other, nearer than two doors do: a
-    door, and something that stands before it."""
+    """Whether two exits are the same opening detected along two wall directions, or a door and an obstacle in front of
+    it: one behind the other, closer than two doors."""
     offset, normal = exit_.centre_w - other.centre_w, other.normal_w
     along = abs(float(offset @ normal))
     beside = math.sqrt(max(0.0, float(offset @ offset) - along**2))
-    alike = abs(float(exit_.normal_w @ normal)) > math.cos(_SAME_RAD)
-    behind = alike and along < _PASSAGE_M and beside < 0.5 * max(exit_.width_m, other.width_m)
+    parallel = abs(float(exit_.normal_w @ normal)) > math.cos(_SAME_RAD)
+    behind = parallel and along < _PASSAGE_M and beside < 0.5 * max(exit_.width_m, other.width_m)
     return behind or float(np.linalg.norm(offset)) < _SAME_M
 
 
-def _carried(gap: Gap, centre_w: FloatArray, beyond_w: FloatArray, ratio: float) -> Gap:
-    """The same opening after its middle and a point behind it moved."""
+def _corrected(gap: Gap, centre_w: FloatArray, beyond_w: FloatArray, ratio: float) -> Gap:
+    """The opening after a map correction of its centre and a point behind it."""
     normal = (beyond_w - centre_w) / np.linalg.norm(beyond_w - centre_w)
     return replace(gap, centre_w=centre_w, normal_w=normal, width_m=ratio * gap.width_m)
 
 
 def _same(gap: Gap, seen: _Seen) -> bool:
-    """The normal may point either way: the drone may have flown through."""
+    """Whether a detection belongs to an opening; the sign of the normal depends on the side of the drone."""
     turned = math.acos(min(1.0, abs(float(gap.normal_w @ seen.gaps[0].normal_w)))) if seen.gaps else 0.0
     return turned < _SAME_RAD and float(np.linalg.norm(gap.centre_w - seen.centre_w)) < _SAME_M
 
 
 def _is_looked_at(seen: _Seen, state: DroneState) -> bool:
-    """Whether a camera has an opening before it, and not aslant: along a wall it sees nothing of a door."""
+    """Whether the current view of an opening is valid: in range, in the field of view, not at a grazing angle."""
     offset = seen.centre_w - state.p_w[:2]
     away = float(np.linalg.norm(offset))
     bearing = float(wrapped(np.array(math.atan2(offset[1], offset[0]) - state.yaw_rad)))
@@ -274,7 +274,7 @@ def _is_looked_at(seen: _Seen, state: DroneState) -> bool:
 
 
 def _leads_through(seen: _Seen, from_w: FloatArray, to_w: FloatArray) -> bool:
-    """Whether a short straight way ``(2,)`` to ``(2,)`` leads through an opening."""
+    """Whether the segment from ``(2,)`` to ``(2,)`` crosses an opening."""
     normal, centre = seen.gaps[0].normal_w, seen.centre_w
     before, behind = float((from_w - centre) @ normal), float((to_w - centre) @ normal)
     if before * behind >= 0.0 or np.linalg.norm(to_w - from_w) > _STEP_M:
@@ -285,7 +285,7 @@ def _leads_through(seen: _Seen, from_w: FloatArray, to_w: FloatArray) -> bool:
 
 
 def _places(places_w: list[FloatArray]) -> int:
-    """How many of the places lie apart from each other."""
+    """Number of distinct viewpoints."""
     kept: list[FloatArray] = []
     for place in places_w:
         if all(np.linalg.norm(place - other) >= PLACES_M for other in kept):

@@ -1,8 +1,8 @@
 """Exits: openings of a door's width in a wall, with free space on both sides.
 
-A poster, a closed door and a window's pane are solid to depth, so they leave no opening. What depth takes for an
-opening and is none must also have a wall to both sides in one line, and space that widens before and behind it: two
-cupboards that face each other across a corridor have not.
+Posters, closed doors and window panes are solid in depth and leave no opening. False openings are rejected by two more
+conditions: collinear walls on both sides, and space that widens in front and behind (two cupboards facing each other
+across a corridor fail).
 """
 
 from collections.abc import Iterator
@@ -14,53 +14,51 @@ from edgeslam_torch.navigation.openings.wall_frame import WallGrid, runs
 from edgeslam_torch.types import FloatArray
 
 NARROWEST_M, WIDEST_M = 0.6, 1.5
-"""Width of an exit: a drone passes, a door is no wider (a wing of a double door is 1.2 m)."""
+"""Width of an exit: passable for a drone, at most a door (a wing of a double door has 1.2 m)."""
 _JAMB_M, _WALL_SHARE = 0.2, 0.7
-"""Wall in line with the opening: metres at each side at least, and share of the opening's width at both sides together.
-Things that stand along a corridor narrow it; they do not make a wall of it."""
+"""Collinear wall: minimum length at each side [m], and of both sides together as a share of the opening's width.
+Furniture along a corridor fails."""
 _ALONGSIDE_M = 1.2
-"""How far to each side wall counts."""
+"""Distance to each side within which wall counts."""
 _BEYOND_M = (0.25, 0.65)
-"""Band before and behind the wall in which there must be space: from a frame's depth to where a drone stands."""
+"""Band in front of and behind the wall that must be free, beyond the depth of a door frame."""
 _BESIDE_M = 0.2
-"""How far beside the opening's ends the space must widen: a door may be this near to a corner."""
+"""Distance beside the opening's ends within which the space must widen; a door may be this close to a corner."""
 _WIDER_M = 0.3
-"""How much wider than the opening the space is on either side at least: walls that bulge by a cell or two, or that lie
-aslant, make no door of a corridor."""
+"""Minimum widening of the space on either side; walls that bulge by a cell or two make no door of a corridor."""
 _FREE_SHARE, _SOLID_SHARE = 0.8, 0.3
 PARTLY_FREE = 0.3
-"""Share of an opening's cells that are known to be free if it may be one."""
+"""Minimum share of free cells in a candidate."""
 _SAME_M = 0.5
-"""Two openings nearer than this are one: no wall between two doors is thinner."""
+"""Openings closer than this are the same."""
 
 
 @dataclass(frozen=True, slots=True)
 class Gap:
-    """An opening as one look at the grid shows it."""
+    """An opening detected in one grid."""
 
     centre_w: FloatArray
     """``(2,)`` [m]."""
     normal_w: FloatArray
-    """``(2,)`` level unit vector through it, away from the place that was looked from."""
+    """``(2,)`` unit normal, pointing away from the viewpoint."""
     width_m: float
     wall_m: float
-    """Wall in line with it, to both sides together: the more, the surer."""
+    """Length of collinear wall at both sides together, a measure of confidence [m]."""
     is_free: bool
-    """Whether all of it is known to be."""
+    """Whether all of its cells are free."""
 
 
 def openings(grids: list[WallGrid]) -> list[Gap]:
-    """What leads through a wall around a place, by what is there `along_walls`, once for every row of the wall.
+    """Openings in walls, from grids of `along_walls`; one per row of a wall.
 
-    Also what is known to be free in a part alone, though there is space on both sides: frames smear into their doors.
+    Includes partly free ones with space on both sides, since depth smears frames into their doors.
     """
     found = [_gap(grid, t, *ends) for grid in grids for t, *ends in jambs(grid)]
     return [gap for gap in found if gap is not None]
 
 
 def jambs(grid: WallGrid) -> Iterator[tuple[int, int, int]]:
-    """What may be an exit between two parts of a wall: its row, with the rows beside it, the last cell of the one part
-    and the first of the other."""
+    """Gaps between wall segments: row, last cell of the one segment, first cell of the other."""
     least = _WALL_SHARE * NARROWEST_M / grid.cell_m
     for t in np.flatnonzero(grid.wall[2:-2].sum(1) >= least) + 2:
         parts = [part for part in runs(grid.wall[t]) if (part[1] - part[0]) * grid.cell_m >= _JAMB_M - 1e-9]
@@ -70,20 +68,20 @@ def jambs(grid: WallGrid) -> Iterator[tuple[int, int, int]]:
 
 
 def is_in_line(grid: WallGrid, t: int, low: int, high: int) -> bool:
-    """Whether there is enough wall in line with an opening to call it one in a wall."""
+    """Whether an opening has enough collinear wall."""
     return _alongside_m(grid, t, low, high) >= _WALL_SHARE * (high - low + 1) * grid.cell_m
 
 
 def band(grid: WallGrid, t: int, side: int) -> np.ndarray:
-    """Rows before or behind the wall, from a frame's depth to where a drone stands."""
+    """Rows of the band `_BEYOND_M` on one side of the wall."""
     near, far = (round(x / grid.cell_m) for x in _BEYOND_M)
     rows = t + side * np.arange(near, far + 1)
     return np.asarray(rows[(rows >= 0) & (rows < len(grid.free))])
 
 
 def gap_of(grid: WallGrid, t: int, low: int, high: int) -> Gap:
-    """The opening between two cells of a row, in the middle of the wall beside it."""
-    width = (high - low + 1) * grid.cell_m  # a cell that a wall only touches is solid: half of each end's is open
+    """The opening between two cells of a row, centred in the thickness of the wall."""
+    width = (high - low + 1) * grid.cell_m  # partly covered end cells are occupied: half of each is open
     rows = np.arange(t - 1, t + 2)
     beside = grid.upright[rows, max(0, low - 2) : low].any(1) | grid.upright[rows, high : high + 2].any(1)
     centre = grid.at(0.5 * (low + high - 1), float(rows[beside].mean()) if beside.any() else float(t))
@@ -93,18 +91,18 @@ def gap_of(grid: WallGrid, t: int, low: int, high: int) -> Gap:
 
 
 def _alongside_m(grid: WallGrid, t: int, low: int, high: int) -> float:
-    """Metres of wall beside an opening, to both sides together."""
+    """Length of wall at both sides of an opening together [m]."""
     reach, wall = round(_ALONGSIDE_M / grid.cell_m), grid.wall[t]
     return float(grid.cell_m * (wall[max(0, low - reach) : low].sum() + wall[high : high + reach].sum()))
 
 
 def _inside(grid: WallGrid, t: int, low: int, high: int) -> np.ndarray:
-    """What of an opening is free; a cell at each end may have been seen too little to be known."""
+    """Free cells of an opening without its end cells, which may be unknown."""
     return grid.free[t - 1 : t + 2, low + 1 : high - 1]
 
 
 def _gap(grid: WallGrid, t: int, low: int, high: int) -> Gap | None:
-    """The opening between two cells of a row, if it leads from somewhere to somewhere."""
+    """The opening between two cells of a row, if it passes all tests."""
     if _inside(grid, t, low, high).mean() < PARTLY_FREE:
         return None
     if not all(_leads(grid, t, low, high, side) and _widens(grid, t, low, high, side) for side in (-1, 1)):
@@ -115,14 +113,14 @@ def _gap(grid: WallGrid, t: int, low: int, high: int) -> Gap | None:
 
 
 def _leads(grid: WallGrid, t: int, low: int, high: int, side: int) -> bool:
-    """Whether there is space on one side of the wall."""
+    """Whether one side of the wall is free."""
     fifth = (high - low) // 5
     before = grid.free[band(grid, t, side), low + fifth : high - fifth]
     return before.size > 0 and float(before.mean()) >= _FREE_SHARE
 
 
 def _widens(grid: WallGrid, t: int, low: int, high: int, side: int) -> bool:
-    """Whether what is not known to be solid is wider on one side than the opening."""
+    """Whether the non-occupied space on one side is wider than the opening."""
     middle = (low + high) // 2
     widths = []
     for row in grid.solid[band(grid, t, side)]:
@@ -133,9 +131,9 @@ def _widens(grid: WallGrid, t: int, low: int, high: int, side: int) -> bool:
 
 
 def _in_a_wall(grid: WallGrid, t: int, low: int, high: int) -> bool:
-    """Whether the space widens on each side of the wall, and each end stands free of what leads away from it.
+    """Whether the space widens beside the opening's ends.
 
-    A leaf that stands open closes one corner. Two cupboards close both of a side, a wall that crosses both of an end.
+    An open door leaf closes one of four corners; two cupboards close both of a side, a crossing wall both of an end.
     """
     width = round(_BESIDE_M / grid.cell_m)
     ends = slice(max(0, low - width), low), slice(high, high + width)
@@ -146,7 +144,7 @@ def _in_a_wall(grid: WallGrid, t: int, low: int, high: int) -> bool:
 
 
 def distinct(found: list[Gap]) -> list[Gap]:
-    """One of those that overlap: the one with most wall; the surest first."""
+    """Non-maximum suppression by the length of collinear wall; the most confident first."""
     kept: list[Gap] = []
     for gap in sorted(found, key=lambda g: -g.wall_m):
         if all(np.linalg.norm(gap.centre_w - other.centre_w) > _SAME_M for other in kept):

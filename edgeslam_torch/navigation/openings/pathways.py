@@ -1,4 +1,4 @@
-"""Pathways: free corridors between walls, with their width and direction."""
+"""Pathways: free corridors between walls, with width and direction."""
 
 import math
 from dataclasses import dataclass
@@ -9,13 +9,13 @@ from edgeslam_torch.navigation.openings.wall_frame import WallGrid, Walls, runs,
 from edgeslam_torch.types import FloatArray
 
 NARROWEST_M, WIDEST_M = 0.8, 3.2
-"""Width of a corridor; what is wider is a room."""
+"""Width of a corridor; wider spaces are rooms."""
 _SHORTEST_M, _LONGER = 2.0, 1.5
-"""It is at least this long, and this many times longer than wide."""
+"""Minimum length [m] and minimum ratio of length to width."""
 _STEADY_M = 0.8
-"""Widths of neighbouring sections of one pathway differ by less: a door is no part of the corridor before it."""
+"""Maximum change of width between neighbouring sections; a door ends the corridor."""
 _BOUND = 0.6
-"""Share of its sections that must end at something solid on both sides."""
+"""Minimum share of sections bounded by obstacles on both sides."""
 _CELL_SIGMAS = 1.0 / math.sqrt(6.0)
 
 
@@ -24,14 +24,14 @@ class Pathway:
     """A straight free corridor."""
 
     ends_w: FloatArray
-    """``(2, 2)`` ends of its middle line, the nearer to the drone first [m]."""
+    """``(2, 2)`` ends of the centre line, the nearer to the drone first [m]."""
     width_m: float
-    """Median of its sections."""
+    """Median over the sections."""
     width_sigma_m: float
 
     @property
     def length_m(self) -> float:
-        """Of its middle line."""
+        """Length of the centre line."""
         return float(np.linalg.norm(self.ends_w[1] - self.ends_w[0]))
 
     @property
@@ -40,20 +40,20 @@ class Pathway:
         return np.asarray((self.ends_w[1] - self.ends_w[0]) / self.length_m)
 
     def beside_m(self, p_w: FloatArray) -> float:
-        """Distance of a point ``(2,)`` from its middle line."""
+        """Distance of a point ``(2,)`` from the centre line."""
         along = float(np.clip((p_w - self.ends_w[0]) @ self.direction_w, 0.0, self.length_m))
         return float(np.linalg.norm(p_w - self.ends_w[0] - along * self.direction_w))
 
 
 @dataclass(frozen=True, slots=True)
 class _Section:
-    """Free cells across the direction, from a low to a high cell of a column."""
+    """Free cells across the corridor, from a low to a high cell of a column."""
 
     s: int
     low: int
     high: int
     bound: bool
-    """Whether something solid ends it on both sides."""
+    """Whether obstacles bound it on both sides."""
 
     @property
     def middle(self) -> float:
@@ -61,7 +61,7 @@ class _Section:
 
 
 def pathways(walls: Walls, here_w: FloatArray) -> list[Pathway]:
-    """Corridors around a place ``(2,)``, the longest first."""
+    """Corridors around a point ``(2,)``, the longest first."""
     found = []
     for angle in wall_directions(walls, here_w):
         grid = wall_grid(walls, here_w, angle)
@@ -74,7 +74,7 @@ def pathways(walls: Walls, here_w: FloatArray) -> list[Pathway]:
 
 
 def _chains(grid: WallGrid) -> list[list[_Section]]:
-    """Sections that follow each other and overlap."""
+    """Chains of successive overlapping sections."""
     ending: list[list[_Section]] = []
     done: list[list[_Section]] = []
     for s in range(grid.free.shape[1]):
@@ -112,7 +112,7 @@ def _pathway(grid: WallGrid, chain: list[_Section], here_w: FloatArray) -> Pathw
     width, length = float(np.median(widths)), len(chain) * grid.cell_m
     if length < max(_SHORTEST_M, _LONGER * width) or np.mean([c.bound for c in chain]) < _BOUND:
         return None
-    # A line through the middles: furniture at one side moves some of them.
+    # Fit a line: furniture at one side shifts some of the midpoints.
     slope, at = np.polyfit([c.s for c in chain], [c.middle for c in chain], 1)
     if abs(math.atan(slope)) > math.radians(15.0):
         return None
@@ -123,7 +123,7 @@ def _pathway(grid: WallGrid, chain: list[_Section], here_w: FloatArray) -> Pathw
 
 
 def _within(way: Pathway, other: Pathway) -> bool:
-    """Whether most of a pathway is part of a longer one."""
+    """Whether a pathway is mostly part of a longer one."""
     middle = way.ends_w.mean(0)
     parallel = abs(float(way.direction_w @ other.direction_w)) > math.cos(math.radians(25.0))
     return parallel and other.beside_m(middle) < 0.5 * other.width_m

@@ -1,4 +1,4 @@
-"""The surroundings seen along a direction: free space and walls on a grid whose rows run along a wall."""
+"""Resampling of the layer onto a grid aligned with a wall."""
 
 import math
 from dataclasses import dataclass
@@ -10,17 +10,17 @@ from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.types import FloatArray
 
 REACH_M = 6.0
-"""Half the side of what is looked at: beyond it a wall of centimetres has no place."""
+"""Half side of the grid; beyond it depth does not resolve a wall."""
 _STEP_RAD = math.radians(3.0)
 _APART_RAD = math.radians(12.0)
-"""Walls that differ by less are one direction."""
+"""Minimum angle between distinct wall directions."""
 _DIRECTIONS = 2
-"""With what is square to each: a corridor's end is too short to stand out."""
+"""Number of directions; each also yields its perpendicular, since a corridor's end wall is too short to be detected."""
 
 
 @dataclass(frozen=True, slots=True)
 class Walls:
-    """A layer, and which of its solid cells stand upright, as walls do and tables do not."""
+    """A layer and its upright occupied cells: walls, not tables."""
 
     layer: Layer
     upright: np.ndarray
@@ -29,13 +29,13 @@ class Walls:
 
 @dataclass(frozen=True)
 class WallGrid:
-    """Square of cells around a place; ``[t, s]``: s along the direction, t to its left."""
+    """Square grid around a point, indexed ``[t, s]``: s along the direction, t to its left."""
 
     free: np.ndarray
     solid: np.ndarray
     upright: np.ndarray
     centre_w: FloatArray
-    """``(2,)`` of the square [m]."""
+    """``(2,)`` centre of the square [m]."""
     along_w: FloatArray
     """``(2,)`` unit vector of s."""
     cell_m: float
@@ -47,19 +47,19 @@ class WallGrid:
 
     @cached_property
     def wall(self) -> np.ndarray:
-        """``(N, N)`` where a row, or one beside it, stands upright."""
+        """``(N, N)`` bool: upright cells, dilated by one row."""
         rows = np.pad(self.upright, ((1, 1), (0, 0)))
         return np.asarray(rows[:-2] | rows[1:-1] | rows[2:])
 
     def at(self, s: float, t: float) -> FloatArray:
-        """Point ``(2,)`` of the world at a cell, which may lie between cells."""
+        """World point ``(2,)`` at fractional cell coordinates."""
         half = 0.5 * (self.free.shape[0] - 1)
         offset = ((s - half) * self.along_w + (t - half) * self.left_w) * self.cell_m
         return np.asarray(self.centre_w + offset)
 
 
 def wall_grid(walls: Walls, centre_w: FloatArray, angle_rad: float) -> WallGrid:
-    """What is around a place ``(2,)``, along a direction; what lies beyond the layer was not seen."""
+    """Grid around a point ``(2,)`` along a direction; cells outside the layer are unknown."""
     layer = walls.layer
     along = np.array([math.cos(angle_rad), math.sin(angle_rad)])
     steps = np.arange(-round(REACH_M / layer.cell_m), round(REACH_M / layer.cell_m) + 1) * layer.cell_m
@@ -73,20 +73,19 @@ def wall_grid(walls: Walls, centre_w: FloatArray, angle_rad: float) -> WallGrid:
 
 
 def along_walls(walls: Walls, centre_w: FloatArray) -> list[WallGrid]:
-    """What is around a place ``(2,)``, along each direction of its walls."""
+    """Grids around a point ``(2,)``, one per wall direction."""
     return [wall_grid(walls, centre_w, angle) for angle in wall_directions(walls, centre_w)]
 
 
 def wall_directions(walls: Walls, centre_w: FloatArray) -> list[float]:
-    """Directions in [0, pi) along which upright cells stand in rows, the clearest first, each followed by the one
-    square to it; none where there are no walls."""
+    """Wall directions in [0, pi), the strongest first, each followed by its perpendicular; empty without walls."""
     layer = walls.layer
     p = layer.centres(np.argwhere(walls.upright)) - centre_w
     p = p[np.abs(p).max(axis=1) < REACH_M] if len(p) else p
     if len(p) < 5:
         return []
     angles = np.arange(0.0, math.pi - 1e-9, _STEP_RAD)
-    # How sharply the cells fall into rows: the sum of squares of the rows' counts.
+    # Score of a direction: sum of squared histogram counts across it.
     across = p[:, 1, None] * np.cos(angles) - p[:, 0, None] * np.sin(angles)
     rows = np.floor(across / layer.cell_m).astype(int)
     rows -= rows.min()
@@ -105,7 +104,7 @@ def wall_directions(walls: Walls, centre_w: FloatArray) -> list[float]:
 
 
 def runs(mask: np.ndarray) -> np.ndarray:
-    """Where a mask ``(N,)`` is true without a gap: ``(R, 2)`` first cell and the one after the last.
+    """Runs of a mask ``(N,)``: ``(R, 2)`` first index and one past the last.
 
     Example:
         >>> runs(np.array([True, True, False, True])).tolist()
