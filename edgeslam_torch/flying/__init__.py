@@ -1,4 +1,4 @@
-"""A drone that flies by its map: what sees, what plans, what watches over both, and `navigator.Navigator` to call.
+"""Autonomous flight by the map: perception, planning, supervision, and the API `navigator.Navigator`.
 
-Only emulated drones have flown by it so far; no real one has.
+Tested with emulated drones only, not with a real one.
 """

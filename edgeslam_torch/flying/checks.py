@@ -1,4 +1,4 @@
-"""What is refused before anything moves, in words."""
+"""Checks before anything moves."""
 
 from collections.abc import Sequence
 
@@ -9,9 +9,9 @@ from edgeslam_torch.navigation.layer import Layer
 from edgeslam_torch.navigation.limits import NavLimits
 from edgeslam_torch.types import FloatArray
 
-NO_FLY = "nothing moves without leave: give --fly (in Python allow_motion=True)"
+NO_FLY = "motion is not allowed: give --fly (in Python allow_motion=True)"
 NEAR_HEIGHT_M = 0.25
-"""Farthest that a goal's height may be from the height of flight."""
+"""Maximum difference between a goal's height and the flight height."""
 
 
 def check_fit(allow_motion: bool, battery: float, limits: NavLimits, guessed_camera: bool) -> None:
@@ -24,26 +24,25 @@ def check_fit(allow_motion: bool, battery: float, limits: NavLimits, guessed_cam
         raise FlightRefused(NO_FLY)
     if guessed_camera:
         raise FlightRefused(
-            "no calibration of this camera, so no metres to fly by: give --camera FILE "
+            "this camera is not calibrated, so the scale is not metric: give --camera FILE "
             "(make one with: edgeslam calibrate)"
         )
     if battery <= limits.home_battery:
         raise FlightRefused(
-            f"battery at {100 * battery:.0f} %: a flight turns home at {100 * limits.home_battery:.0f} %, "
-            "so this one would not begin"
+            f"battery at {100 * battery:.0f} %: a flight returns home at {100 * limits.home_battery:.0f} %"
         )
 
 
 def check_goal(goal_w: Sequence[float] | FloatArray, limits: NavLimits, layer: Layer | None = None) -> FloatArray:
-    """A goal ``(3,)`` that makes sense: finite, within the fence, at the height of flight, not in a known solid.
+    """Validated goal ``(3,)``: finite, within the fence, near the flight height, not inside a known obstacle.
 
     Args:
-        goal_w: In the drone's own world [m].
-        limits: Of the flight.
-        layer: What is known; nothing when None.
+        goal_w: Goal in the drone's world [m].
+        limits: Limits of the flight.
+        layer: Current layer; no obstacle check when None.
 
     Raises:
-        FlightRefused: If it does not.
+        FlightRefused: If the goal is invalid.
     """
     try:
         goal = np.asarray(goal_w, dtype=np.float64)
@@ -56,13 +55,11 @@ def check_goal(goal_w: Sequence[float] | FloatArray, limits: NavLimits, layer: L
         raise FlightRefused(f"the goal is {away:.1f} m from the take-off, the fence is at {limits.fence_m:.1f} m")
     if abs(goal[2] - limits.height_m) > NEAR_HEIGHT_M:
         raise FlightRefused(
-            f"the goal is {goal[2]:.2f} m high, this flight keeps to {limits.height_m:.2f} m "
+            f"the goal is {goal[2]:.2f} m high, but the flight height is {limits.height_m:.2f} m "
             f"(within {NEAR_HEIGHT_M:.2f} m): give NavLimits(height_m=...), --height on the command line"
         )
     if layer is not None and _inside(goal[:2], layer, limits):
-        raise FlightRefused(
-            f"the goal ({goal[0]:.2f}, {goal[1]:.2f}) is inside something solid, or the drone would touch it"
-        )
+        raise FlightRefused(f"the goal ({goal[0]:.2f}, {goal[1]:.2f}) is inside an obstacle or too close to one")
     return goal
 
 

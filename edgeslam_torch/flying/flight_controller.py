@@ -1,4 +1,4 @@
-"""Pilot and supervisor of one flight, which threads share: what is seen goes in, what is flown comes out."""
+"""Planner and supervisor of one flight, shared by threads: states go in, orders come out."""
 
 import logging
 import math
@@ -29,26 +29,26 @@ _STEP_M = 0.1
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """What was known and decided at one moment, for recorders and viewers."""
+    """State and decision of one control cycle, for recorders and viewers."""
 
     state: DroneState
     order: Order
     phase: Phase
     pilot: Pilot
-    """For its layer and its way; another thread may be changing it."""
+    """For its layer and its path; another thread may be changing it."""
 
 
 Witness = Callable[[NewTask | Contact | DroneState | Decision], None]
-"""Told what the planner is given, before it thinks, and what it decided, from the thread that plans."""
+"""Called by the planning thread with every input before it is processed, and with every decision."""
 Listener = Callable[[Moment], None]
-"""Called for every moment from the thread that flies: it must return at once."""
+"""Called by the control thread in every cycle; it must return at once."""
 
 
 class FlightController:
-    """One flight's pilot and supervisor.
+    """Planner and supervisor of one flight.
 
-    `plan` is called from one thread, which may hang; `order` from another, which must not wait for it: they share
-    only a command and a lock that is held for microseconds.
+    `plan` runs in one thread, which may hang; `order` in another, which must not wait for it. They share only a command
+    and a lock that is held for microseconds.
     """
 
     def __init__(
@@ -57,7 +57,7 @@ class FlightController:
         self.limits = limits
         self.pilot = Pilot(Stay(), limits)
         self.state: DroneState | None = None
-        """The newest."""
+        """Newest state."""
         self.last: Order | None = None
         self._supervisor = Supervisor(limits)
         self._listeners = list(listeners)
@@ -66,33 +66,33 @@ class FlightController:
         self._next: Task | None = None
         self._hold = False
         self._contact: Contact | None = None
-        """What was felt since the pilot planned last."""
+        """Contact since the last planning cycle."""
         self._track: list[FloatArray] = []
         self._path_m, self._clearance_m = 0.0, math.nan
 
     def begin(self, task: Task) -> None:
-        """Give the pilot another task, which it takes up the next time that it plans."""
+        """Set another task; it starts in the next planning cycle."""
         with self._lock:
             self._next = task
             self._path_m, self._clearance_m = 0.0, math.nan
 
     def ended(self) -> Phase | None:
-        """How the present task ended; None while it is flown or not yet taken up."""
+        """How the current task ended; None while it runs or has not started."""
         with self._lock:
             phase = self.pilot.phase
             return phase if self._next is None and phase in (Phase.DONE, Phase.STUCK) else None
 
     def hold(self, hold: bool) -> None:
-        """Hover whatever the pilot wants, until it is called off: for a person at the keyboard."""
+        """Hover, overriding the planner, until released; for an operator at the keyboard."""
         self._hold = hold
 
     def feel(self, contact: Contact) -> None:
-        """Let the pilot know of something that it does not see, when it plans next."""
+        """Pass an unseen obstacle to the planner's next cycle."""
         with self._lock:
             self._contact = contact
 
     def plan(self, state: DroneState) -> Decision:
-        """Let the pilot decide; may take its time, or hang."""
+        """Run a planning cycle; may be slow or hang."""
         with self._lock:
             task, self._next = self._next, None
             contact, self._contact = self._contact, None
@@ -117,20 +117,20 @@ class FlightController:
         return decision
 
     def _carry(self, update: MapUpdate) -> None:
-        """Take the way flown along with the map; the pilot does so itself."""
+        """Apply a map correction to the path flown; the planner applies it itself."""
         with self._lock:
             self._track = list(update.points(np.array(self._track).reshape(-1, 2)))
             self._supervisor.carry(update)
 
     def _take_up(self, task: Task) -> None:
-        """A first look that is under way is finished."""
+        """Start a task; a look that is under way is finished first."""
         if self.pilot.phase in (Phase.RISING, Phase.SWEEPING, Phase.SINKING):
             self.pilot.task = task
         else:
             self.pilot.begin(task)
 
     def order(self, state: DroneState) -> Order:
-        """What the drone is told now: takes microseconds, whatever the pilot does."""
+        """Order for the drone now; takes microseconds, whatever the planner does."""
         with self._lock:
             self._supervisor.see(state)
             self._supervisor.hold = self._hold
@@ -143,7 +143,7 @@ class FlightController:
         return order
 
     def _tell(self, moment: Moment) -> None:
-        """A listener that fails must not end a flight."""
+        """Call the listeners; one that fails is removed and does not end the flight."""
         for listener in list(self._listeners):
             try:
                 listener(moment)
@@ -152,24 +152,24 @@ class FlightController:
                 self._listeners.remove(listener)
 
     def known(self) -> Layer:
-        """What the pilot knows of its height of flight."""
+        """Layer at the flight height."""
         return self.pilot.walls().layer
 
     def walls(self) -> Walls:
-        """The same, and what of it stands upright."""
+        """The same with its upright cells."""
         return self.pilot.walls()
 
     def exits(self) -> tuple[Exit, ...]:
-        """What it found of exits, the nearest first."""
+        """Exits found so far, the nearest first."""
         return self.pilot.exits.exits
 
     def track(self) -> FloatArray:
-        """``(N, 2)`` where it flew, oldest first."""
+        """``(N, 2)`` path flown, oldest first."""
         with self._lock:
             return np.array(self._track).reshape(-1, 2)
 
     def flown(self) -> tuple[float, float]:
-        """Way and least clearance of the present task [m]; the clearance is NaN where nothing solid was seen."""
+        """Path length and minimum clearance of the current task [m]; the clearance is NaN without obstacles."""
         with self._lock:
             return self._path_m, self._clearance_m
 

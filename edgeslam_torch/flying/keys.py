@@ -1,4 +1,4 @@
-"""Keys of a terminal during a flight: space hovers and lets go again, l or q lands."""
+"""Keyboard control during a flight: space toggles hovering, l or q lands."""
 
 import os
 import select
@@ -16,8 +16,8 @@ def keys(hold: Callable[[bool], None], land: Callable[[], None]) -> Iterator[boo
     """Listen while the block runs; yields whether there is a terminal to listen to.
 
     Args:
-        hold: Told whether to hover.
-        land: Called once.
+        hold: Called with whether to hover.
+        land: Called once to land.
     """
     if os.name != "posix" or not sys.stdin.isatty():
         yield False
@@ -40,7 +40,7 @@ def keys(hold: Callable[[bool], None], land: Callable[[], None]) -> Iterator[boo
 
 
 def listen(number: int, stopping: threading.Event, hold: Callable[[bool], None], land: Callable[[], None]) -> None:
-    """Read keys from a file descriptor until told to stop, its end, or a landing."""
+    """Read keys from a file descriptor until stopped, end of file, or landing."""
     held = False
     while not stopping.is_set():
         if not select.select([number], [], [], _POLL_S)[0]:

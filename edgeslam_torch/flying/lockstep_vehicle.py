@@ -1,4 +1,4 @@
-"""An emulated drone on a simulated clock, for flights that end the same whatever the machine's load."""
+"""Emulated drone on a simulated clock, for flights that are deterministic under any machine load."""
 
 import math
 from collections.abc import Callable
@@ -22,13 +22,13 @@ _ANSWER_S = 20.0
 
 
 class LockstepVehicle:
-    """Perception, flight_controller and `LockstepTello` in one thread.
+    """Perception, flight controller and `LockstepTello` in one thread.
 
     Args:
-        site: Where it flies.
-        flight_controller: What flies it.
-        tello: Another drone than a healthy one in still air at the site's start.
-        recorder: Told every picture and state message.
+        site: World of the flight.
+        flight_controller: Flight controller.
+        tello: Emulated drone; a healthy one in still air at the site's start when None.
+        recorder: Receives every frame and state message.
     """
 
     def __init__(
@@ -55,7 +55,7 @@ class LockstepVehicle:
         """As `Vehicle`.
 
         Raises:
-            TelloError: If the drone does not.
+            TelloError: If the drone does not take off.
         """
         self._ask("takeoff")
         self.flying = True
@@ -116,7 +116,7 @@ class LockstepVehicle:
         self._pictures += 1
 
     def _ask(self, command: str) -> None:
-        """Send a command and let time pass until it is answered."""
+        """Send a command and advance the clock until it is answered."""
         self.tello.send(command)
         until_s = self.tello.clock_s + _ANSWER_S
         while self.tello.clock_s < until_s:

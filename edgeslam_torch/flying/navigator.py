@@ -1,4 +1,4 @@
-"""Verbs of a flight: `Navigator.open`, `take_off`, `go_to`, `follow_corridor`, `find_exits`, `return_home`, `land`."""
+"""Flight API: `Navigator.open`, `take_off`, `go_to`, `follow_corridor`, `find_exits`, `return_home`, `land`."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -24,24 +24,24 @@ from edgeslam_torch.navigation.pilot import Phase
 from edgeslam_torch.navigation.tasks import ARRIVED_M, Explore, GoTo, Task
 from edgeslam_torch.types import FloatArray
 
-HOME_BECAUSE = "battery low: home"
-DEAD_RECKONING = "by telemetry alone: the pose rests on no map"
-UNRELATED = "in a piece of map that nothing relates to that of the take-off"
-UNCERTAIN = "to {:.2g} m: what telemetry leaves open between this piece of map and that of the take-off"
-"""What an outcome adds where nothing that is seen says so."""
+HOME_BECAUSE = "battery low: return home"
+DEAD_RECKONING = "by dead reckoning: tracking is lost"
+UNRELATED = "in a submap that is not connected to that of the take-off"
+UNCERTAIN = "to {:.2g} m: uncertainty of this submap relative to that of the take-off"
+"""Qualifications of a result whose pose is uncertain."""
 BEYOND_M = 0.8
-"""How far behind an exit it stops."""
+"""Distance behind an exit at which the drone stops."""
 _THERE_M = ARRIVED_M + 0.05
-"""Distance from a goal, by the drone's own pose, that needs no words: it drifts a little while it stops."""
+"""Distance from a goal that is not reported: the drone drifts a little while it stops."""
 _LEAST_CORRIDOR_M = 1.0
-"""Way that must have been flown to have followed anything."""
+"""Minimum path length of a followed corridor."""
 
 
 class Navigator:
-    """One drone that flies by its own map. Use it as a context manager: leaving it lands.
+    """A drone that navigates by its own map. Use it as a context manager: leaving it lands.
 
-    Positions are in the drone's own world: origin on the floor below the take-off, x along the drone's heading there,
-    y left, z up [m].
+    Positions are in the drone's world: origin on the floor below the take-off, x along the heading there, y left,
+    z up [m].
 
     Example:
         >>> from edgeslam_torch.flying.navigator import Navigator
@@ -57,7 +57,7 @@ class Navigator:
         allow_motion: bool = False,
         recorder: Recorder | None = None,
     ) -> None:
-        """Take over a drone; `open` is the way in."""
+        """Use `open` instead."""
         self.recorder = recorder
         self.vehicle, self.flight_controller, self.allow_motion = vehicle, flight_controller, allow_motion
         self.limits = flight_controller.limits
@@ -78,13 +78,13 @@ class Navigator:
             location: ``tello://HOST...`` for a drone or ``edgeslam sim``; ``sim://WORLD[:SEED]`` for an emulated drone
                 on a simulated clock, without network.
             allow_motion: Whether the drone may fly at all.
-            limits: What the flight keeps to.
-            camera: Calibration; the Tello's own when None.
-            listeners: Told every moment of the flight.
+            limits: Limits of the flight.
+            camera: Calibration; the Tello's when None.
+            listeners: Called in every control cycle.
             record: Folder to record the flight to; none by default.
 
         Raises:
-            SourceError: If the location means nothing, or the drone does not answer.
+            SourceError: If the location is invalid or the drone does not answer.
             CalibrationError: If the calibration is malformed.
             OutputError: If the folder holds a recording already or cannot be written.
         """
@@ -115,7 +115,7 @@ class Navigator:
         self.close()
 
     def close(self) -> None:
-        """Land if it flies, and leave."""
+        """Land if flying, and disconnect."""
         try:
             self.vehicle.close()
         finally:
@@ -123,45 +123,44 @@ class Navigator:
                 self.recorder.close()
 
     def take_off(self) -> FlightResult:
-        """Rise, look to both sides, and wait for metres.
+        """Take off, look to both sides, and wait for the metric scale.
 
         Raises:
-            FlightRefused: If it may not or should not fly.
-            TelloError: If the drone does not rise.
+            FlightRefused: If flying is not allowed or not advisable.
+            TelloError: If the drone does not take off.
         """
         if self.vehicle.flying:
-            raise FlightRefused("it flies already")
+            raise FlightRefused("already flying")
         if self.vehicle.over:
-            raise FlightRefused(f"this flight is over ({self.vehicle.over}); open another navigator for the next")
+            raise FlightRefused(f"this flight has ended ({self.vehicle.over}); open a new navigator for the next one")
         check_fit(self.allow_motion, self.vehicle.battery, self.limits, self.vehicle.camera.source.startswith(GUESS))
         self.flight_controller.begin(Stay())
         self.vehicle.take_off()
         return self.fly(Stay(), "in the air")
 
     def go_to(self, goal_w: Sequence[float] | FloatArray) -> FlightResult:
-        """Fly to a point ``(3,)`` around what is in the way; at the height of flight, which the point must be near.
+        """Fly to a point ``(3,)`` around obstacles, at the flight height; the point must be near that height.
 
-        Before a bare wall, where no picture tells the pose, it stays up to half a metre away, and the reason says so.
+        Near a bare wall, where tracking is lost, it stops up to half a metre away, and the reason says so.
 
         Raises:
-            FlightRefused: If the point is none, beyond the fence, inside something solid or at another height; or there
-                are no metres yet.
+            FlightRefused: If the point is invalid, beyond the fence, inside an obstacle or at another height; or if the
+                scale is not metric yet.
         """
         return self._fly_to(self._goal(goal_w), "there")
 
     def explore(self, seconds: float) -> FlightResult:
-        """Fly to where the known space ends, again and again, and look around on the way; reached when time is over or
-        nothing is left to see.
+        """Explore by frontiers; reached when the time is over or nothing is left to explore.
 
         Raises:
-            FlightRefused: If the time is not positive, or it does not fly.
+            FlightRefused: If the time is not positive or the drone is not flying.
         """
         until_s = self._until_s(seconds)
         outcome = self.fly(Explore(until_s), "the time is over")
-        return self._in_time(outcome, until_s, "nothing is left to see")
+        return self._in_time(outcome, until_s, "nothing is left to explore")
 
     def find_exits(self, seconds: float = 180.0) -> FlightResult:
-        """Explore until an exit is known; `exits` are the records.
+        """Explore until an exit is found; `exits` returns it.
 
         Raises:
             FlightRefused: As `explore`.
@@ -171,23 +170,23 @@ class Navigator:
         if not self.vehicle.flying:
             return outcome
         if self.exits():
-            return replace(outcome, reached=True, reason="an exit is known")
-        return replace(self._in_time(outcome, until_s, "nothing is left to see"), reached=False)
+            return replace(outcome, reached=True, reason="an exit was found")
+        return replace(self._in_time(outcome, until_s, "nothing is left to explore"), reached=False)
 
     def exits(self) -> tuple[Exit, ...]:
-        """Openings of a door's width in a wall that were seen from two places so far, the nearest first."""
+        """Door-sized openings in walls, confirmed from two viewpoints so far, the nearest first."""
         return self.flight_controller.exits()
 
     def pathways(self) -> list[Pathway]:
         """Free corridors around the drone, the longest first.
 
         Raises:
-            FlightRefused: If it does not fly.
+            FlightRefused: If the drone is not flying.
         """
         return pathways(self.flight_controller.walls(), self._flying_state().p_w[:2])
 
     def go_through(self, exit_: Exit) -> FlightResult:
-        """Fly through an exit of `exits`, and stop `BEYOND_M` behind it.
+        """Fly through an exit of `exits` and stop `BEYOND_M` behind it.
 
         Raises:
             FlightRefused: As `go_to`.
@@ -196,9 +195,9 @@ class Navigator:
         return self._fly_to(self._goal([there[0], there[1], self.limits.height_m]), "through the exit")
 
     def follow_corridor(self, seconds: float = 120.0) -> FlightResult:
-        """Follow the corridor that the drone is in, ahead and round corners, through no door that it knows.
+        """Follow the current corridor ahead and around corners, through no known door.
 
-        That it ends says that a wall is ahead and that nothing was seen to lead on, not that nothing does.
+        "the corridor ends" means that a wall is ahead and that no continuation was seen; one may still exist.
 
         Raises:
             FlightRefused: As `explore`.
@@ -210,14 +209,14 @@ class Navigator:
         end = "the corridor opens into a room" if task.room else "the corridor ends"
         outcome = self._in_time(outcome, task.until_s, end)
         if outcome.reason.startswith(end) and not (task.room or task.wall):
-            return replace(outcome, reached=False, reason="it sees no way on and no end either")
+            return replace(outcome, reached=False, reason="neither a continuation nor an end is visible")
         return outcome
 
     def return_home(self) -> FlightResult:
-        """Fly to the take-off, back along the way where it is far.
+        """Fly back to the take-off, along the path flown while it is far.
 
         Raises:
-            FlightRefused: If it does not fly.
+            FlightRefused: If the drone is not flying.
         """
         self._flying_state()
         return self.fly(WayHome(self.flight_controller.track()), "home", to_home=True)
@@ -225,12 +224,12 @@ class Navigator:
     def fly(
         self, task: Task, done: str, until: Callable[[], bool] = lambda: False, to_home: bool = False
     ) -> FlightResult:
-        """Fly any task of `navigation.tasks` to its end; home and down when the battery is low.
+        """Execute a task of `navigation.tasks`; return home and land when the battery is low.
 
         Args:
-            task: Where to go, and when it is done.
-            done: What the outcome says when it is.
-            until: Ends the task early; then it hovers.
+            task: Task to execute.
+            done: Reason reported on success.
+            until: Ends the task early; the drone then hovers.
             to_home: Whether the task itself leads home.
         """
         self.flight_controller.begin(task)
@@ -253,24 +252,24 @@ class Navigator:
         return FlightResult(True, done + self._rests_on(), clearance_m, path_m)
 
     def land(self) -> FlightResult:
-        """Land; reached when the drone says that it stands.
+        """Land; reached when the drone reports that it stands.
 
         Raises:
-            FlightRefused: If it does not fly.
+            FlightRefused: If the drone is not flying.
         """
         if not self.vehicle.flying:
-            raise FlightRefused(f"it does not fly{f': {self.vehicle.over}' if self.vehicle.over else ''}")
+            raise FlightRefused(f"not flying{f': {self.vehicle.over}' if self.vehicle.over else ''}")
         path_m, clearance_m = self.flight_controller.flown()
         self.vehicle.land("as commanded")
         return FlightResult(self.vehicle.over == "as commanded", f"landed: {self.vehicle.over}", clearance_m, path_m)
 
     def _fly_to(self, goal_w: FloatArray, done: str) -> FlightResult:
-        """Fly to a checked point ``(3,)``; the outcome says how near it came where that is not at once clear."""
+        """Fly to a checked point ``(3,)``; the reason gives the remaining distance if it is not negligible."""
         task = GoTo(goal_w)
         outcome, state = self.fly(task, done), self.flight_controller.state
         if not outcome.reached or state is None or (away_m := task.away_m(state)) < _THERE_M:
             return outcome
-        return replace(outcome, reason=f"{done}, {away_m:.2f} m from it by its own pose" + self._rests_on())
+        return replace(outcome, reason=f"{done}, {away_m:.2f} m from it by the estimated pose" + self._rests_on())
 
     def _goal(self, goal_w: Sequence[float] | FloatArray) -> FloatArray:
         goal = check_goal(goal_w, self.limits)
@@ -278,7 +277,7 @@ class Navigator:
         return check_goal(goal, self.limits, self.flight_controller.known())
 
     def _flying_state(self) -> DroneState:
-        """The newest moment of a flight with metres.
+        """Newest state of a flight with metric scale.
 
         Raises:
             FlightRefused: If there is none.
@@ -286,30 +285,30 @@ class Navigator:
         state = self.flight_controller.state
         if not self.vehicle.flying or state is None:
             why = f" ({self.vehicle.over})" if self.vehicle.over else ": take off first"
-            raise FlightRefused(f"it does not fly{why}")
+            raise FlightRefused(f"not flying{why}")
         if not state.metric:
             raise FlightRefused(
-                "the map has no metres yet, so a place in metres means nothing; take_off() waits for them"
+                "the map has no metric scale yet, so a position in metres is undefined; take_off() waits for it"
             )
         return state
 
     def _until_s(self, seconds: float) -> float:
-        """When so many seconds are over.
+        """End time after so many seconds.
 
         Raises:
-            FlightRefused: If that is no sensible time, or it does not fly.
+            FlightRefused: If the time is out of range or the drone is not flying.
         """
         if not 0 < seconds < 3600:
-            raise FlightRefused(f"a flight takes more than 0 s and less than an hour, not {seconds} s")
+            raise FlightRefused(f"the time must be more than 0 s and less than an hour, got {seconds} s")
         return self._flying_state().stamp_s + seconds
 
     def _in_time(self, outcome: FlightResult, until_s: float, why: str) -> FlightResult:
-        """The outcome with another reason if its task was done before its time was over."""
+        """The result with another reason if the task was complete before the time was over."""
         early = self.flight_controller.state is not None and self.flight_controller.state.stamp_s < until_s
         return replace(outcome, reason=why + self._rests_on()) if outcome.reached and early else outcome
 
     def _rests_on(self) -> str:
-        """What a reached outcome has to say of the pose that it rests on."""
+        """Qualification of a reached result by the uncertainty of the pose."""
         state = self.flight_controller.state
         if state is None:
             return ""

@@ -1,4 +1,4 @@
-"""A flight on disk: its pictures and state as any recording, and beside them what was known and decided."""
+"""Recording of a flight: frames and state like any recording, plus states and decisions."""
 
 import logging
 import math
@@ -31,14 +31,14 @@ _COLUMNS = (
 
 
 class Recorder:
-    """A folder that ``edgeslam run`` reads, with `MOMENTS`, a line for each order and why, `EXITS`, those known in the
-    end, and ``plan.jsonl``, by which ``edgeslam fly replay`` asks the planner again.
+    """Writes a folder for ``edgeslam run``, with `MOMENTS` (one line per order), `EXITS` (the final ones) and
+    ``plan.jsonl`` for ``edgeslam fly replay``.
 
-    A disk that is full ends the recording, not the flight.
+    A full disk ends the recording, not the flight.
 
     Args:
-        folder: Where; made by `begin`.
-        limits: Of the flight.
+        folder: Output folder, created by `begin`.
+        limits: Limits of the flight.
     """
 
     def __init__(self, folder: Path, limits: NavLimits) -> None:
@@ -52,7 +52,7 @@ class Recorder:
         self._lock = threading.Lock()
 
     def begin(self, camera: Camera) -> None:
-        """Make the folder.
+        """Create the folder.
 
         Raises:
             OutputError: If it holds a recording already or cannot be written.
@@ -62,7 +62,7 @@ class Recorder:
         self._plan = PlanLog(self.folder / PLAN, self._limits)
 
     def picture(self, frame: Frame) -> None:
-        """Write a picture."""
+        """Write a frame."""
         with self._lock:
             if self._writer is not None:
                 self._guarded(lambda writer: writer.add_frame(frame))
@@ -74,7 +74,7 @@ class Recorder:
                 self._guarded(lambda writer: writer.add_state(message))
 
     def moment(self, moment: Moment) -> None:
-        """Write what was known and decided."""
+        """Write a control cycle."""
         with self._lock:
             moments = self._moments
             if moments is not None:
@@ -82,7 +82,7 @@ class Recorder:
                 self._note_exits(moment.pilot.exits.exits)
 
     def planner(self, entry: NewTask | Contact | DroneState | Decision) -> None:
-        """Write what the planner is given, or what it decided."""
+        """Write an input or a decision of the planner."""
         with self._lock:
             plan = self._plan
             if plan is not None:
@@ -100,7 +100,7 @@ class Recorder:
             self._writer = self._moments = self._plan = None
 
     def _note_exits(self, exits: tuple[Exit, ...]) -> None:
-        """Write them when others are known than before; a flight without any leaves no file."""
+        """Write the exits when they change; a flight without exits leaves no file."""
         if exits is not self._exits and (exits or self._exits):
             lines = "".join(_exit_line(exit_) for exit_ in exits)
             self._guarded(lambda _: write_text(self.folder / EXITS, f"{_EXIT_COLUMNS}\n{lines}"))
@@ -117,7 +117,7 @@ class Recorder:
 
 
 def _clearance_m(moment: Moment) -> float:
-    """Between the hull and the nearest solid that the pilot knows; NaN where it knows none."""
+    """Distance between hull and nearest mapped obstacle [m]; NaN without one."""
     layer = moment.pilot.layer
     if layer is None or not layer.solid.any():
         return math.nan

@@ -1,6 +1,6 @@
-"""A recorded flight through the planner again: what would it have done, in this version or with other limits?
+"""Replay of a recorded flight's states through the planner, in this version or with other limits.
 
-The drone is where it was, and sees what it saw: what is compared is each decision, not the flight that would follow.
+States stay as recorded, so single decisions are compared, not the flight that would follow.
 """
 
 import time
@@ -16,23 +16,23 @@ from edgeslam_torch.navigation.flight_record import PLAN, Decision, NewTask, rea
 from edgeslam_torch.navigation.limits import NavLimits
 
 _SAME = 0.02
-"""Wishes that differ by less [m/s, rad/s] are the same to a Tello, whose sticks have steps of a hundredth."""
+"""Commands that differ by less [m/s, rad/s] are equal; a Tello's sticks have a resolution of 0.01."""
 
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One decision, then and now."""
+    """One decision, recorded and replayed."""
 
     state: DroneState
     before: Decision | None
-    """None where the recorded planner never answered: it hung, failed, or the program ended."""
+    """None if the recorded planner did not answer: it hung or failed, or the program ended."""
     now: Decision
     planning_s: float
-    """Time that the decision took now."""
+    """Duration of the replayed decision."""
 
     @property
     def same(self) -> bool:
-        """Whether the drone would do the same."""
+        """Whether both decisions are equal."""
         if self.before is None or self.before.phase != self.now.phase:
             return False
         return bool(np.abs(_sticks(self.before.command) - _sticks(self.now.command)).max() <= _SAME)
@@ -40,30 +40,30 @@ class Step:
 
 @dataclass(frozen=True, slots=True)
 class Replay:
-    """A flight's decisions, then and now."""
+    """Decisions of a flight, recorded and replayed."""
 
     limits: NavLimits
-    """Of the replay."""
+    """Limits of the replay."""
     steps: tuple[Step, ...]
     tasks: tuple[str, ...]
     """Names, in order."""
 
     @property
     def differing(self) -> list[Step]:
-        """Decisions that are not the recorded ones."""
+        """Decisions that differ from the recorded ones."""
         return [step for step in self.steps if not step.same]
 
 
 def replay(folder: Path, **limits: float) -> Replay:
-    """Show a new planner what the recorded one saw.
+    """Run a new planner on the recorded states.
 
     Args:
-        folder: Of `edgeslam fly --record`.
+        folder: Folder of `edgeslam fly --record`.
         **limits: Fields of `NavLimits` that differ from the recorded flight's.
 
     Raises:
         SourceError: If the record is missing, damaged, or holds no state.
-        ValueError: If limits contradict each other.
+        ValueError: If the limits are inconsistent.
     """
     path = folder / PLAN
     entries = read_plan(path)
@@ -91,12 +91,12 @@ def replay(folder: Path, **limits: float) -> Replay:
     if seen is not None:
         steps.append(_decided(flight_controller, seen, None))
     if not steps:
-        raise SourceError(f"{path}: the planner of this flight never saw anything")
+        raise SourceError(f"{path}: the record holds no state")
     return Replay(used, tuple(steps), tuple(tasks))
 
 
 def summary(found: Replay) -> list[str]:
-    """The replay in words, a line each."""
+    """Summary of a replay, one string per line."""
     steps, differing = found.steps, found.differing
     began = steps[0].state.stamp_s
     took_ms = 1e3 * np.array([step.planning_s for step in steps])

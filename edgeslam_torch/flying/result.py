@@ -1,4 +1,4 @@
-"""What became of a verb of a flight, and what is not even begun."""
+"""Result of a flight command, and the error of a refused one."""
 
 from dataclasses import dataclass
 
@@ -6,17 +6,17 @@ from edgeslam_torch.errors import EdgeSlamError
 
 
 class FlightRefused(EdgeSlamError):
-    """What was asked of a flight is wrong or not possible now; nothing moved for it."""
+    """A flight command is invalid or not possible now; nothing moved."""
 
 
 @dataclass(frozen=True, slots=True)
 class FlightResult:
-    """How a verb ended. The drone's own map and pose say so, not the truth."""
+    """How a flight command ended, by the drone's own map and pose, not by ground truth."""
 
     reached: bool
     reason: str
-    """In words; why not, or what is done."""
+    """Explanation in words."""
     min_clearance_m: float
-    """Least distance of the drone's hull to what its map shows as solid [m]; NaN if it showed nothing."""
+    """Minimum distance between hull and mapped obstacles [m]; NaN without obstacles."""
     path_m: float
-    """Level way flown, by its own pose [m]."""
+    """Horizontal path length by the estimated pose [m]."""

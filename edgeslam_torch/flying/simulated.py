@@ -8,19 +8,19 @@ _SCHEME = "sim://"
 
 
 def is_simulated(location: str) -> bool:
-    """Whether it names an emulated drone in lockstep."""
+    """Whether an address is that of an emulated drone in lockstep."""
     return location.startswith(_SCHEME)
 
 
 def site_of(location: str) -> Site:
-    """The world that ``sim://WORLD[:SEED]`` names; seed 0 without one.
+    """The world of ``sim://WORLD[:SEED]``; the seed defaults to 0.
 
     Raises:
-        SourceError: If there is none.
+        SourceError: If the address is invalid.
     """
     name, colon, seed = location.removeprefix(_SCHEME).rstrip("/").partition(":")
     if colon and not (seed.isascii() and seed.isdigit() and len(seed) < 10):
-        raise SourceError(f"{location}: seed {seed!r} is not a whole number; give {_SCHEME}WORLD[:SEED]")
+        raise SourceError(f"{location}: seed {seed!r} is not an integer; give {_SCHEME}WORLD[:SEED]")
     try:
         return named_site(name, int(seed or 0))
     except ValueError as error:

@@ -1,4 +1,4 @@
-"""Tasks that a flight has beside those of `navigation.tasks`: to stay where it is, and to go back the way it came."""
+"""Tasks of a flight beside those of `navigation.tasks`: hover, and return home."""
 
 import math
 from collections.abc import Sequence
@@ -15,56 +15,57 @@ from edgeslam_torch.navigation.tasks import LooksAhead
 from edgeslam_torch.types import FloatArray
 
 HOME_M = 0.15
-"""Distance from the take-off at which the drone is home."""
+"""Distance from the take-off that counts as home."""
 _SLOW_M_S = 0.15
 _LOOK_M, _LOOK_S = 0.6, 3.0
-"""How near to the take-off it looks ahead, and for how long: two keyframes, a loop, and a view in new metres."""
+"""Distance from the take-off at which the drone takes its initial heading, and duration of the look: enough for two
+keyframes, a loop closure and a view at the new scale."""
 _LOST_M = 1.5
-"""The same once its pose was lost this near: a bare wall behind the take-off shows nothing to come home by."""
+"""The same after a tracking loss this close, as by a bare wall behind the take-off."""
 _AHEAD_RAD = math.radians(8.0)
 _GIVEN_UP_S = 12.0
-"""Time to turn and look: half a turn at a third of the usual rate, and the look. A drone may not be able to turn."""
+"""Timeout of turn and look: half a turn at a third of the nominal rate, plus the look."""
 _FACES_S = 12.0
-"""Time in which it flies the last metre as it looks, slowly: what a turn would show is another part of the map, of a
-single turn before, and was seen to lie a quarter of a metre elsewhere."""
+"""Time in which the drone flies the last metre slowly with that heading; turning would switch to another part of the
+map with another drift."""
 
 
 @dataclass(frozen=True, slots=True)
 class Stay(LooksAhead):
-    """Rise, look around, and hover."""
+    """Rise, look around and hover."""
 
     def goals(self, layer: Layer, state: DroneState) -> np.ndarray:
-        """Where it is."""
+        """The current cell."""
         return layer.cells(state.p_w[:2])[None]
 
     def done(self, state: DroneState) -> bool:
-        """At once: a pilot asks only when it is at its height."""
+        """Always: it is only called at the flight height."""
         return True
 
     def carry(self, update: MapUpdate) -> None:
-        """It remembers nothing."""
+        """Nothing is stored."""
 
 
 @dataclass(slots=True)
 class WayHome:
-    """Fly to the take-off, along the way that was flown as long as the take-off lies beyond the grid.
+    """Fly to the take-off; along the path flown while the take-off lies beyond the grid.
 
-    On the way back a camera sees the back of all that it saw on the way there, so that the map drifts by two percent
-    of the way. Near the take-off it looks ahead as it did there, and the map is mended by what it knows again.
+    On the way back the camera faces the opposite direction and revisits nothing, so the map drifts by about 2 % of the
+    path. Near the take-off the drone takes its initial heading, so that a loop closure corrects the drift.
     """
 
     track_w: FloatArray
-    """``(N, 2)`` where it flew, oldest first [m]."""
+    """``(N, 2)`` path flown, oldest first [m]."""
     _looked_s: float = math.inf
-    """When it had looked as at its take-off."""
+    """End of the look with the initial heading."""
     _looks_s: float = math.nan
-    """Since when it looks where it looked at its take-off."""
+    """Start of that look."""
     _near_s: float = math.nan
-    """Since when it wants to."""
+    """Start of the turn to it."""
     _look_m: float = _LOOK_M
 
     def goals(self, layer: Layer, state: DroneState) -> np.ndarray:
-        """The cell of the oldest point of the way that the grid still holds."""
+        """Cell of the oldest point of the path inside the grid."""
         points = np.concatenate([np.zeros((1, 2)), self.track_w])
         at = (points - layer.corner_w) / layer.cell_m
         held = ((at >= 1) & (at < np.array(layer.free.shape) - 1)).all(1)
@@ -72,19 +73,19 @@ class WayHome:
         return layer.cells(oldest)[None]
 
     def done(self, state: DroneState) -> bool:
-        """Whether the drone is above its take-off, slow, and has looked as it did there."""
+        """Whether the drone is above the take-off, slow, and has looked with its initial heading."""
         near = float(np.linalg.norm(state.p_w[:2])) < HOME_M
         return state.stamp_s >= self._looked_s and near and float(np.linalg.norm(state.velocity_w)) < _SLOW_M_S
 
     def gives_up(self, losses: int) -> bool:
-        """No: there is nothing else to fly for."""
+        """Never: there is no alternative."""
         return False
 
     def consider(self, candidates: Sequence[Candidate], exits: Sequence[Exit] = ()) -> None:
-        """It passes every opening by."""
+        """Ignore openings."""
 
     def heading_rad(self, state: DroneState) -> float | None:
-        """The heading of the take-off, which is 0, for seconds when it comes near."""
+        """The heading of the take-off, 0, for `_LOOK_S` near the take-off."""
         away = float(np.linalg.norm(state.p_w[:2]))
         if not state.tracked and away < _LOST_M:
             self._look_m = _LOST_M
@@ -99,9 +100,9 @@ class WayHome:
         return 0.0
 
     def faces_rad(self, state: DroneState) -> float | None:
-        """The same heading for the last metre."""
+        """The same heading over the last metre."""
         return 0.0 if 0.0 <= state.stamp_s - self._looked_s < _FACES_S else None
 
     def carry(self, update: MapUpdate) -> None:
-        """Take the way along with the map; the take-off stays the origin."""
+        """Apply a map correction to the path; the take-off stays the origin."""
         self.track_w = update.points(self.track_w)

@@ -1,4 +1,4 @@
-"""A Tello over UDP, flown by three threads: one sees, one plans, and one watches over both and owns the sticks."""
+"""A Tello over UDP with three threads: perception, planning, and supervision, which alone sends the sticks."""
 
 import logging
 import math
@@ -21,30 +21,30 @@ logger = logging.getLogger(__name__)
 
 TICK_S = 0.05
 _VIDEO_DELAY_S = 0.35
-"""From light to the arrival of a Tello's picture, which carries no time: 0.3 to 0.5 s."""
+"""Latency of a Tello's video from exposure to arrival (0.3 to 0.5 s); frames carry no time stamp."""
 _FIRST_PICTURE_S = 10.0
 _PICTURE_S = 1.0 / 15.0
-"""Least time from one picture to the next that is looked at: a Tello sends 30 a second. 15 are what flights in lockstep
-were judged with; the rest of two cores belongs to the planner and to the map."""
+"""Minimum interval of processed frames; a Tello sends 30 Hz. Two cores also run planner and mapping, and flights in
+lockstep are evaluated at 15 Hz."""
 _POLL_S = 0.02
 _LAND_S = 60.0
-"""Longest wait for a landing: as often as the client repeats it, and the way down."""
+"""Maximum wait for a landing, with the client's repetitions and the descent."""
 _THINK_S = 0.5
-"""Time that a thread is given to end."""
+"""Timeout for a thread to end."""
 
 
 class UdpVehicle:
-    """A Tello, its perception and its flight_controller.
+    """A Tello with perception and flight controller.
 
-    The thread that watches asks for an order every `TICK_S` and alone sends ``rc`` and ``land``: it waits neither for
-    the planner nor for the pictures. If it fails itself, it lands; if the whole program dies, `Guard` does.
+    The supervising thread requests an order every `TICK_S` and alone sends ``rc`` and ``land``; it waits neither for
+    the planner nor for frames. If it fails, it lands; if the whole program dies, `Guard` lands.
 
     Args:
-        address: Of the drone.
-        flight_controller: What flies it.
+        address: Address of the drone.
+        flight_controller: Flight controller.
         allow_motion: Whether it may move.
         camera: File or preset of the calibration; the Tello's when None.
-        recorder: Told every picture and state message.
+        recorder: Receives every frame and state message.
 
     Raises:
         TelloError: If the drone does not answer, or sends no state or picture.
@@ -85,7 +85,7 @@ class UdpVehicle:
                 recorder.begin(self.camera)
             self._perception = SlamPerception(self.camera, seed, realtime=True)
             assert self.tello.latest is not None  # `connect` waited for it
-            self._perception.heard(self.tello.latest.sample())  # without an attitude the first world leans
+            self._perception.heard(self.tello.latest.sample())  # the first map needs an attitude to be level
         except BaseException:
             self.tello.close()
             raise
@@ -108,7 +108,7 @@ class UdpVehicle:
         """As `Vehicle`.
 
         Raises:
-            TelloError: If the drone does not.
+            TelloError: If the drone does not take off.
         """
         self.tello.take_off()
         self._landed.clear()
@@ -120,7 +120,7 @@ class UdpVehicle:
             self._stopping.wait(_POLL_S)
 
     def land(self, why: str) -> None:
-        """As `Vehicle`: asks the thread that watches, which does nothing else any more."""
+        """As `Vehicle`: requests the landing from the supervising thread, which does nothing else from then on."""
         if self.flying:
             self.stop(why)
             self._landed.wait(_LAND_S)
@@ -136,7 +136,7 @@ class UdpVehicle:
             self.land("the program left")
         finally:
             self._stopping.set()
-            self.tello.close()  # lands too, should the thread above have died
+            self.tello.close()  # also lands, in case the thread above has died
             for thread in self._threads:
                 thread.join(_THINK_S)
             if self._perception is not None:
@@ -149,7 +149,7 @@ class UdpVehicle:
             self._recorder.state(message)
 
     def _see(self) -> None:
-        """The newest picture, again and again."""
+        """Perception thread: process the newest frame."""
         assert self._perception is not None
         count = 0
         while not self._stopping.is_set():
@@ -172,7 +172,7 @@ class UdpVehicle:
             self._stopping.wait(max(0.0, begin_s + _PICTURE_S - self.tello.clock.now()))
 
     def _plan(self) -> None:
-        """A command for the newest moment, again and again."""
+        """Planning thread: compute a command for the newest state."""
         assert self._perception is not None
         while not self._stopping.wait(TICK_S):
             if not self.flying:
@@ -182,13 +182,13 @@ class UdpVehicle:
             self._flight_controller.plan(self._perception.state(self.tello.clock.now(), view))
 
     def _watch(self) -> None:
-        """Orders to the drone; whatever goes wrong here ends with a landing."""
+        """Supervising thread: send orders; any failure ends with a landing."""
         while not self._stopping.wait(TICK_S):
             if not self.flying:
                 continue
             try:
                 self._tick()
-            except TelloError as error:  # a guard of the client lands it, such as the one for lost state
+            except TelloError as error:  # a guard of the client lands, e.g. on lost state messages
                 self._end(self.tello.stop_reason or str(error))
             except Exception as error:
                 logger.exception("the supervisor failed; landing")

@@ -42,7 +42,7 @@ def test_without_leave_nothing_moves(capsys):
         (["corridor", "0"], "above 0"),
         (["exit", "9999"], "below 3600"),
         (["home", "--drone", "sim://coridor"], "unknown world 'coridor'"),
-        (["home", "--drone", "sim://corridor:x"], "not a whole number"),
+        (["home", "--drone", "sim://corridor:x"], "not an integer"),
     ],
 )
 def test_what_is_wrong_is_said(arguments, words, capsys):

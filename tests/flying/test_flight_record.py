@@ -163,7 +163,7 @@ def _array(shape) -> bytes:
         (lambda lines: [lines[0], _array(shape=[10**12])], "line 2 is damaged"),
         (lambda lines: [lines[0], _array(shape=[-1])], "line 2 is damaged"),
         (lambda lines: [lines[0], b"[" * 100_000 + b"]" * 100_000 + b"\n"], "line 2 is damaged"),
-        (lambda lines: lines[:2], "never saw anything"),
+        (lambda lines: lines[:2], "holds no state"),
         (lambda lines: [], "not a planner's record"),
     ],
 )

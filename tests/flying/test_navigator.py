@@ -110,10 +110,10 @@ def test_an_outcome_says_what_it_rests_on(tracked, apart_m, reason):
     outcome = nav.fly(Stay(), "home")
     assert (outcome.reached, outcome.reason) == (True, reason)
     explored = nav.explore(60.0)
-    assert explored.reason == reason.replace("home", "nothing is left to see")
+    assert explored.reason == reason.replace("home", "nothing is left to explore")
 
 
-@pytest.mark.parametrize(("x", "reason"), [(2.1, "there"), (1.6, "there, 0.40 m from it by its own pose")])
+@pytest.mark.parametrize(("x", "reason"), [(2.1, "there"), (1.6, "there, 0.40 m from it by the estimated pose")])
 def test_an_outcome_says_how_near_to_its_goal_it_is(x, reason):
     nav = navigator()
     nav.vehicle.flying, nav.vehicle.fly = True, lambda until: None
@@ -151,11 +151,11 @@ def test_goals_before_metres_are_refused_and_no_metres_end_in_a_landing():
     with navigator(metric=False) as nav:
         nav.vehicle.take_off()
         nav.flight_controller.order(DroneState(0.0, nav.vehicle.p, 0.0, np.zeros(3), metric=False))
-        with pytest.raises(FlightRefused, match="no metres yet"):
+        with pytest.raises(FlightRefused, match="no metric scale yet"):
             nav.go_to((1.0, 0.0, 1.15))
     with navigator(metric=False) as nav:
         outcome = nav.take_off()
-        assert not outcome.reached and "no metres" in outcome.reason and not nav.vehicle.flying
+        assert not outcome.reached and "no metric scale" in outcome.reason and not nav.vehicle.flying
 
 
 @pytest.mark.slow
@@ -188,7 +188,7 @@ def test_an_exit_is_found_and_flown_through():
             nav.find_exits()
         nav.take_off()
         found = nav.find_exits(60.0)
-        assert found.reached and found.reason == "an exit is known"
+        assert found.reached and found.reason == "an exit was found"
         exit_ = nav.exits()[0]
         assert exit_.centre_w[:2] == pytest.approx([2.5, 0.0], abs=0.15)
         assert exit_.width_m == pytest.approx(0.9, abs=0.15)

@@ -180,7 +180,7 @@ def test_nothing_moves_without_leave(monkeypatch):
             nav.take_off()
         with pytest.raises(FlightRefused, match="take off first"):
             nav.go_to((1.0, 0.0, 1.15))
-        with pytest.raises(FlightRefused, match="does not fly"):
+        with pytest.raises(FlightRefused, match="not flying"):
             nav.land()
     moving = ("takeoff", "rc", "land", "go", "up", "forward")
     assert not [text for text in emulator.heard if text.split()[0] in moving]

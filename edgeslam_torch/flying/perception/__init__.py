@@ -1,1 +1,1 @@
-"""What a pilot is told of pictures and state messages, in metres and in a world of its own."""
+"""Perception: states for the planner from frames and state messages, metric and in the drone's world."""

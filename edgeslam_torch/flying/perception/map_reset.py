@@ -1,7 +1,7 @@
-"""When a map that tells no sure metres is given up for a new one, and where that begins.
+"""Reset of a map whose scale stays uncertain, and the start pose of the new one.
 
-A map that was begun on the floor may be wrong from its first second: planks of a floor look alike, the map sinks while
-the drone climbs, and all that is added to it agrees. A new one, begun in the air, stands after as many seconds.
+A map initialised on the floor may be wrong from the start: repetitive floor texture causes false matches during the
+climb, and the map stays consistent with them. A new map initialised in the air converges within seconds.
 """
 
 import math
@@ -12,30 +12,29 @@ from edgeslam_torch.flying.perception.home import GROUND_M, TAKE_OFF, Place
 from edgeslam_torch.types import TelemetrySample
 
 PATIENCE_S = 8.0
-"""Time in the air without sure metres: a map that tells them does so within six seconds of a drone that goes up and
-down."""
+"""Time in the air without a certain scale; vertical oscillation makes the scale of a sound map certain within 6 s."""
 IN_AIR_M = 0.3
-"""Told height above the floor from which on a drone is in the air, in three of the SDK's steps."""
+"""Reported height from which the drone is in the air: three steps of the SDK's resolution."""
 NEAR_M = 1.0
-"""Way from the take-off, by the drone's own velocities, after which a map is kept whatever it tells: it knows the way
-back, and velocities in steps of a decimetre a second do not."""
+"""Distance from the take-off by integrated velocities beyond which the map is kept: dead reckoning with velocities
+quantised to 0.1 m/s no longer leads back."""
 
 
 class MapReset:
-    """Dead reckoning from the take-off, and the time without metres."""
+    """Dead reckoning from the take-off, and the time without a certain scale."""
 
     def __init__(self) -> None:
         self._began: TelemetrySample | None = None
         """The first message."""
         self._last: TelemetrySample | None = None
         self._moved_m = np.zeros(3)
-        """Way since the first one in the axes of power-on."""
+        """Displacement since the first message in power-on axes."""
         self._has_left = False
         self._since_s = math.nan
-        """Since when it has been in the air without sure metres."""
+        """Since when it has been in the air without a certain scale."""
 
     def heard(self, sample: TelemetrySample) -> None:
-        """Take a state message; one without velocity, attitude and height tells nothing."""
+        """Process a state message; one without velocity, attitude and height is ignored."""
         if not np.isfinite([*sample.velocity_m_s, *sample.rpy_rad, sample.height_m]).all():
             return
         if self._last is not None:
@@ -46,11 +45,11 @@ class MapReset:
         self._last = sample
 
     def is_due(self, stamp_s: float, sure: bool) -> bool:
-        """Whether it is time for a new map; asked at each picture.
+        """Whether to start a new map; call it for every frame.
 
         Args:
-            stamp_s: Of the picture.
-            sure: Whether the map tells metres that one can fly by.
+            stamp_s: Time of the frame.
+            sure: Whether the map's scale is certain.
         """
         flies = self._last is not None and self._last.height_m >= IN_AIR_M
         if sure or not flies or self._has_left:
@@ -61,7 +60,7 @@ class MapReset:
         return stamp_s - self._since_s >= PATIENCE_S
 
     def begin(self) -> Place:
-        """Where a map that begins now begins, in the drone's own world; the next one must wait as long."""
+        """Start pose of a map that begins now, in the drone's world; restarts the timer."""
         self._since_s = math.nan
         if self._began is None or self._last is None:
             return TAKE_OFF

@@ -1,4 +1,4 @@
-"""What a pilot is told: what the SLAM knows, from pictures and state messages alone."""
+"""Perception by SLAM from frames and state messages."""
 
 import threading
 from collections import deque
@@ -25,39 +25,39 @@ from edgeslam_torch.slam import EdgeSlam
 from edgeslam_torch.types import DepthMap, FloatArray, Frame, Health, SlamOutput, TelemetrySample
 
 IMAGE_WIDTH = 480
-"""Wider pictures are halved until they are not wider than this: the width at which flights were judged."""
+"""Wider images are halved until they fit; flights are evaluated at this width."""
 _WEIGHTS = "near"
-"""Of the depth that obstacles and openings are told by, which the map's points bring to the map's unit."""
+"""Weights of the depth network for obstacles and openings; map points scale it."""
 _DEPTH_EVERY = 3
-"""Frames from one depth map to the next: 5 a second."""
+"""Frames per depth map: 5 Hz."""
 _STEP = 4
-"""Depth is handed on at a quarter of the picture's size."""
+"""Subsampling of depth maps for the planner."""
 _FRESH_M = 0.3, 6.0
-"""Depths at which edges of a picture are looked for at once."""
+"""Depth range in which edges of the current frame are triangulated."""
 _LAST_FIT_S = 4.0
-"""Time after a pose is lost in which depth goes on by the last fit: a bare wall shows no point to fit it to."""
+"""Time after a tracking loss in which the last depth fit is used: a bare wall has no points for a new one."""
 _DARK, _FLAT = 25.0, 2.0
-"""Mean and standard deviation [of 255] of a picture below which the light is out, or the lens covered: a bare wall has
-shades, and the network sees walls in the dark, too."""
+"""Mean and standard deviation [of 255] below which an image is dark or the lens covered; the network would predict
+walls there. A bare wall has more contrast."""
 _LOST = ("lost", "starting")
 _DISAGREE_SIGMAS, _MEASURED = 3.0, {"telemetry", "height"}
 _WIDEST_SIGMA_M = 0.2
 _THINNED = 10
-"""Two seconds: in these the map does not move in itself."""
+"""Thinning of old views, to one in two seconds, over which the map does not deform."""
 _MOVES_EVERY_S = 3.0
-"""Least time between two moves of the map in one unit: each costs a pilot as much as all its views together."""
+"""Minimum time between map corrections at one scale; each makes the planner rebuild its grid."""
 
 
 class SlamPerception:
-    """Pictures and state messages through `EdgeSlam`; the pose is made up for the video's delay.
+    """Runs `EdgeSlam` on frames and state messages; poses are predicted over the video's latency.
 
-    The world is that of `home`, in the best metres that the SLAM knows: its published unit may be off by more.
-    `heard` and `state` may be called from any thread, also while `seen` works; `seen` from one thread.
+    The world is that of `home` at the SLAM's best scale estimate, which may differ from its output unit.
+    `heard` and `state` may be called from any thread, also during `seen`; `seen` from one thread.
 
     Args:
-        camera: Of the pictures.
-        seed: Of the SLAM.
-        realtime: Whether mapping works beside the pictures, as in flight, or within them, as in repeatable tests.
+        camera: Camera of the frames.
+        seed: Seed of the SLAM.
+        realtime: Whether mapping runs in its own thread, as in flight, or synchronously, for repeatable runs.
     """
 
     def __init__(self, camera: Camera, seed: int = 0, realtime: bool = False) -> None:
@@ -72,41 +72,41 @@ class SlamPerception:
         self._T_b_c = camera_on_body()
         self._lock = threading.Lock()
         self._samples: list[TelemetrySample] = []
-        """Of which no finished step knows."""
+        """Messages not yet processed by a SLAM step."""
         self._captured_s = 0.0
         self._battery = 1.0
         self._reported_height_m, self._reported_speed_m_s = np.nan, np.nan
         self._revision = self._changes = self._frames = 0
-        """The second is how often its metres changed."""
+        """The second counts scale changes."""
         self._begin(self._new_slam(), TAKE_OFF)
 
     def _new_slam(self) -> EdgeSlam:
         return EdgeSlam(self._camera, SlamConfig(seed=self._seed), realtime=self._realtime)
 
     def _begin(self, slam: EdgeSlam, place: Place) -> None:
-        """Begin a map, and know nothing of another one."""
+        """Start a new map and reset everything that belongs to the old one."""
         self._slam, self._began = slam, place
         self._first = self._frames
-        """Number of the picture that the map begins with."""
+        """Number of the map's first frame."""
         self._output: SlamOutput | None = None
         self._home = Home(np.eye(3), 1.0, np.zeros(3))
         self._fit: tuple[NearFit, float, int] | None = None
-        """The last fit of depth to points, when its picture arrived, and in which unit."""
+        """Last depth fit, arrival time of its frame, and its scale revision."""
         self._bias, self._unit = DepthBias(), (0, 1.0)
-        """The second: revision, and metres for a published unit in it."""
+        """The second: scale revision, and metres per output unit in it."""
         self._metres = np.nan
-        """Metres per map unit by which it goes; NaN while the published unit is all there is."""
+        """Metres per map unit in use; NaN while the scale is unknown."""
         self._shown: tuple[FloatArray, float, int] = np.zeros((0, 4, 4)), 1.0, 0
-        """When the last view was made: poses ``(F, 4, 4)`` of all pictures, metres per map unit, and the revision."""
+        """At the last view: poses ``(F, 4, 4)`` of all frames, metres per map unit, and the revision."""
         self._thinned_views: list[tuple[int, FloatArray]] = []
-        """One in `_THINNED` of those that a pilot keeps no longer: what was found in them goes along with the map."""
+        """One in `_THINNED` of the views that the planner has dropped, for corrections of what was detected in them."""
         self._sent_views: deque[tuple[int, FloatArray]] = deque(maxlen=MAX_VIEWS)
-        """Pictures whose views were told, and their poses as they were told last."""
+        """Frames whose views the planner has, with their poses as last sent."""
         self._sent_unit, self._sent_revision, self._moved_s = 1.0, 0, -np.inf
         self._revision = 0
 
     def heard(self, sample: TelemetrySample) -> None:
-        """Take a state message."""
+        """Process a state message."""
         with self._lock:
             self._samples.append(sample)
             self._map_reset.heard(sample)
@@ -117,14 +117,14 @@ class SlamPerception:
             self._reported_speed_m_s = float(np.linalg.norm(sample.velocity_m_s[:2]))
 
     def seen(self, image: np.ndarray, arrived_s: float, captured_s: float) -> View | None:
-        """Take a picture ``(H, W, 3)`` BGR; every few pictures of a mapped place give depth in metres."""
+        """Process a frame ``(H, W, 3)`` BGR; every few frames yield a view with metric depth."""
         size = (self._camera.width, self._camera.height)
         if image.shape[1::-1] != size:
             image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
         with self._lock:
             batch = list(self._samples)
             due = self._map_reset.is_due(arrived_s, self._output is not None and _is_sure(self._output))
-        if due and batch:  # the first picture of a map wants to be told which way is up
+        if due and batch:  # a map's first frame needs gravity
             self._begin_again()
         output = self._slam.step(Frame(self._frames - self._first, arrived_s, image), batch)
         T_slam = self._slam.trajectory()[1]
@@ -132,7 +132,7 @@ class SlamPerception:
         revised, self._revision = output.revision != self._revision, output.revision
         shows = revised or self._frames % _DEPTH_EVERY == 0
         depth = self._depth(image, output) if shows else None
-        # A pilot is told of new metres together with a view in them.
+        # A new scale is only sent together with a view at that scale.
         may_move = depth is not None and captured_s - self._moved_s > _MOVES_EVERY_S
         metres = metres_per_unit(self._metres, output, may_move)
         unit = metres if np.isfinite(metres) else output.unit
@@ -148,15 +148,15 @@ class SlamPerception:
         return None if depth is None else self._view(depth, home, output.T_w_c, captured_s)
 
     def _begin_again(self) -> None:
-        """Give the map up for a new one, while others look: a new SLAM takes some tenths of a second."""
+        """Replace the map; the new SLAM is created outside the lock since that takes tenths of a second."""
         fresh, given_up = self._new_slam(), self._slam
         with self._lock:
-            self._changes += self._revision + 1  # what was told before is of another map
+            self._changes += self._revision + 1  # positions sent before are of another map
             self._begin(fresh, self._map_reset.begin())
         given_up.close()
 
     def state(self, now_s: float, view: View | None = None) -> DroneState:
-        """The moment, with a new view if there is one, and with it how the map moved since the last."""
+        """Current state, with a new view if any and the map correction since the last view."""
         with self._lock:
             output, captured_s, home, changes = self._output, self._captured_s, self._home, self._changes
             slam, began = self._slam, self._began
@@ -207,10 +207,10 @@ class SlamPerception:
         self._slam.close()
 
     def _map_update(self, view: View) -> MapUpdate | None:
-        """How the views that were told have moved when this one was made; this one counts as told from now on."""
+        """Correction of the views sent so far at the time of this one, which is added to them."""
         with self._lock:
             (T_w_c, unit, revision), first = self._shown, self._first
-            if view.picture < first:  # of a map that was given up meanwhile
+            if view.picture < first:  # of a map that was replaced meanwhile
                 return None
             found = None
             if self._sent_views:
@@ -234,8 +234,10 @@ class SlamPerception:
         return found
 
     def _depth(self, image: np.ndarray, output: SlamOutput) -> DepthMap | None:
-        """Depth at a quarter of the picture's size, in published units: the network's, brought to them by the map's
-        points, and these where they stand before it; None with too few of them."""
+        """Subsampled depth in output units: network depth scaled by map points, and the points in front of it.
+
+        None with too few points.
+        """
         if not _tracks(output) and (self._last_fit(output) is None or not _shows(image)):
             return None
         image = self._camera.undistort_image(image)
@@ -255,38 +257,38 @@ class SlamPerception:
         return with_nearer_points(small, uv[kept], z[kept])
 
     def _fitted(self, depth: DepthMap, anchors: FloatArray, output: SlamOutput) -> NearFit | None:
-        """The network's depth against the map's points in the picture, kept for pictures without any.
+        """Fit of network depth to the map's points in view, kept for frames without points.
 
-        Of all points of the map those of the next room, behind the wall, would be more than those that are seen.
+        Only nearby points: with the whole map, occluded points of the next room would outnumber the visible ones.
         """
         fit = fit_to_points(depth, *seen_points(anchors, self._camera.K, output.T_w_c, depth.depth_m.shape))
         revision, unit_m = self._unit
         if revision == output.revision:
             consistent = fit is not None and self._bias.is_consistent(fit, unit_m, _is_sure(output))
-            usual = self._bias.line(unit_m)
+            bias = self._bias.line(unit_m)
             if fit is None or not consistent:
-                fit = usual
-            elif usual is not None:
-                fit = usual.through(fit)
+                fit = bias
+            elif bias is not None:
+                fit = bias.through(fit)
         if fit is not None:
             self._fit = fit.alone(), output.stamp_s, output.revision
         return fit
 
     def _last_fit(self, output: SlamOutput) -> NearFit | None:
-        """The last fit, for a picture without a place in the map; None if it is too old, or in another unit."""
+        """The last fit, for frames without tracking; None if too old or at another scale."""
         if self._fit is None:
             return None
         fit, at_s, revision = self._fit
         return fit if output.stamp_s - at_s < _LAST_FIT_S and output.revision == revision else None
 
     def _view(self, depth: DepthMap, home: Home, T_w_c: FloatArray, captured_s: float) -> View:
-        """Depth in published units as a pilot is told of it, in metres."""
+        """A metric view from depth in output units."""
         metres = home.scale * depth.depth_m
         return View(captured_s, metres, depth.sigma_log, self._K_small, home.poses(T_w_c), self._frames - 1)
 
 
 def _is_sure(output: SlamOutput) -> bool:
-    """Whether its metres are what a supervisor lets a drone fly by."""
+    """Whether the scale is certain enough for the supervisor."""
     return output.metric and output.scale.sigma <= SCALE_SIGMA * output.scale.value
 
 
@@ -295,13 +297,13 @@ def _tracks(output: SlamOutput) -> bool:
 
 
 def _contradicted(health: Health) -> bool:
-    """Whether sources of scale contradict each other, and nothing settles it: velocities and heights that confirm each
-    other do against a depth network that was trained elsewhere."""
+    """Whether scale sources contradict each other unresolved; velocities and heights that agree outvote the depth
+    network, which may be outside its training domain."""
     confirmed = set(health.scale.source.split("+")) >= _MEASURED
-    asked = [s for s in health.sources if s.source in _MEASURED] if confirmed else health.sources
-    return disagreement(asked) > _DISAGREE_SIGMAS
+    checked = [s for s in health.sources if s.source in _MEASURED] if confirmed else health.sources
+    return disagreement(checked) > _DISAGREE_SIGMAS
 
 
 def _shows(image: np.ndarray) -> bool:
-    """Whether a picture shows anything, if only a bare wall."""
+    """Whether an image shows anything, if only a bare wall."""
     return bool(image.mean() > _DARK and image.std() > _FLAT)

@@ -35,7 +35,7 @@ _LEVEL_LOG, _BEYOND = 0.2, 3
 
 
 _INDEPENDENT = 5.0
-"""Effective number of independent errors in one frame: upper bound of the points' total weight against the bias line."""
+"""Effective number of independent errors in one frame: bound of the points' total weight against the bias line."""
 
 
 @dataclass(frozen=True, slots=True)
