@@ -25,7 +25,7 @@ if TYPE_CHECKING:
         Validation,
         train,
     )
-    from edgeslam_torch.train.result import Outcome
+    from edgeslam_torch.train.result import TrainingResult
     from edgeslam_torch.train.self_supervised import SelfSupervised, SelfSupervisedWeights
     from edgeslam_torch.train.signals import Signal, Slot, Source, Supervised, SupervisedWeights
     from edgeslam_torch.train.validate import DepthScores, image_tensor, predict_metres, score
@@ -41,7 +41,7 @@ _HOMES = {
     "finetuning": "Data FromRuns finetune",
     "hook_names": "named_hooks",
     "folder": "Existing OutFolder out_folder",
-    "result": "Outcome",
+    "result": "TrainingResult",
     "processes.distributed": "process_group rank world",
     "recipe": "DivergedError Drawn Hooks NonFiniteLossError TrainConfig TrainState Validation train",
     "self_supervised": "SelfSupervised SelfSupervisedWeights",
@@ -70,7 +70,7 @@ __all__ = [
     "Hooks",
     "NonFiniteLossError",
     "OutFolder",
-    "Outcome",
+    "TrainingResult",
     "PosedSequence",
     "PosedView",
     "ProgressBar",

@@ -25,7 +25,7 @@ from edgeslam_torch.train.folder import TEACHER, TENSORBOARD, WEIGHTS, OutFolder
 from edgeslam_torch.train.inputs import HOOKS, Inputs, labelled_set, posed_set, weights_name
 from edgeslam_torch.train.processes.distributed import by_first, rank
 from edgeslam_torch.train.recipe import BEST, FINAL, Hooks, TrainConfig, TrainState, changes_losses, train
-from edgeslam_torch.train.result import Outcome
+from edgeslam_torch.train.result import TrainingResult
 from edgeslam_torch.train.self_supervised import SelfSupervised, fit_log_scale
 from edgeslam_torch.train.signals import Signal, Source, Supervised
 from edgeslam_torch.train.teachers.cache import TeacherCache
@@ -96,7 +96,7 @@ def finetune(
     hooks: Sequence[Hooks] = (),
     cache: TeacherCache | None = None,
     calibrate: bool = False,
-) -> Outcome:
+) -> TrainingResult:
     """Train ``network`` on ``data``; resumes a training in ``out`` with the same inputs.
 
     ``out/weights.safetensors`` holds the best validated weights, including the initial ones; without validation data,
@@ -268,21 +268,21 @@ def _conclude(
     held_out: Sequence[View],
     out: OutFolder,
     calibrate: bool,
-) -> Outcome:
+) -> TrainingResult:
     """Write the better weights with their metadata, and return the outcome."""
     path = out.path / WEIGHTS
     if before is None:
-        outcome = Outcome(path, state.step)
+        outcome = TrainingResult(path, state.step)
         save_checkpoint(state.averaged, outcome.noted_in(tuned), path, half=True)
     elif state.best_step == 0:
         last = restored(start, out.path / FINAL)
-        outcome = Outcome(path, state.step, 0, before, score(last, metadata, held_out), before)
+        outcome = TrainingResult(path, state.step, 0, before, score(last, metadata, held_out), before)
         # Not converted to float16: the initial tensors with their own metadata.
         save_checkpoint(start, outcome.noted_in(metadata), path)
     else:
         last, best = (restored(start, out.path / name) for name in (FINAL, BEST))
         kept = score(best, metadata, held_out)
-        outcome = Outcome(path, state.step, state.best_step, before, score(last, metadata, held_out), kept)
+        outcome = TrainingResult(path, state.step, state.best_step, before, score(last, metadata, held_out), kept)
         record = dataclasses.replace(tuned, metrics={k: round(v, 4) for k, v in _metrics(kept).items() if k != "score"})
         if calibrate:
             record = calibrate_sigma(best, record, held_out)

@@ -18,7 +18,7 @@ from edgeslam_torch.files.atomic import write_text
 from edgeslam_torch.train.inputs import NOT_COMPARED, Inputs, given_from_json
 from edgeslam_torch.train.processes.distributed import by_first, rank, world
 from edgeslam_torch.train.recipe import BEST, CURVE, FINAL, LAST, saved_step
-from edgeslam_torch.train.result import Outcome
+from edgeslam_torch.train.result import TrainingResult
 from edgeslam_torch.writers.own_folder import FolderLock, check_free
 
 RECORD, WEIGHTS = "finetune.json", "weights.safetensors"
@@ -116,7 +116,7 @@ class OutFolder:
         self._write({"given": dataclasses.asdict(given), "sessions": sessions, "outcome": None})
         return step
 
-    def finished(self, given: Inputs) -> Outcome | None:
+    def finished(self, given: Inputs) -> TrainingResult | None:
         """Outcome of the training, if exactly this was done before."""
         record = self._record()
         if record is None or record["outcome"] is None or self.existing is Existing.OVERWRITE:
@@ -125,9 +125,9 @@ class OutFolder:
             return None
         if given_from_json(record["given"]).differences(given, ()):
             return None
-        return Outcome.from_json(record["outcome"], self.path / WEIGHTS)
+        return TrainingResult.from_json(record["outcome"], self.path / WEIGHTS)
 
-    def finish(self, outcome: Outcome) -> None:
+    def finish(self, outcome: TrainingResult) -> None:
         """Record the outcome.
 
         Raises:
@@ -155,7 +155,7 @@ class OutFolder:
             record = json.loads(path.read_text(encoding="utf-8"))
             given_from_json(record["given"])
             if record["outcome"] is not None:
-                Outcome.from_json(record["outcome"], self.path / WEIGHTS)
+                TrainingResult.from_json(record["outcome"], self.path / WEIGHTS)
             return {"given": record["given"], "sessions": list(record["sessions"]), "outcome": record["outcome"]}
         except (ValueError, KeyError, TypeError, RecursionError) as error:
             raise OutputError(f"{path}: unreadable ({type(error).__name__}); give another --out") from error

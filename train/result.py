@@ -10,7 +10,7 @@ from edgeslam_torch.train.validate import DepthScores
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class TrainingResult:
     """Scores are on the validation views; None when there are none."""
 
     weights: Path
@@ -31,14 +31,14 @@ class Outcome:
         return record
 
     @staticmethod
-    def from_json(record: dict[str, Any], weights: Path) -> "Outcome":
+    def from_json(record: dict[str, Any], weights: Path) -> "TrainingResult":
         """Inverse of `to_json`.
 
         Raises:
             KeyError, TypeError: If the record is another one.
         """
         before, last, kept = (record[k] and DepthScores(**record[k]) for k in ("before", "last", "kept"))
-        return Outcome(weights, record["steps"], record["kept_step"], before, last, kept)
+        return TrainingResult(weights, record["steps"], record["kept_step"], before, last, kept)
 
     def describe(self) -> str:
         """A short table, and which weights were kept."""

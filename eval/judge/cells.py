@@ -25,16 +25,16 @@ KIDNAP = ((0, 250), (420, 600), (100, 250))
 """Frames of `KIDNAPPED`: away from a place without warning, and back to it."""
 KIDNAPPED = "7scenes_redkitchen"
 SECOND_FLIGHT = "second_flight"
-"""Variant whose first flight saves its map and whose second flies in it: of `KIDNAPPED` the first and the second
+"""Variant with two flights: the first saves its map, the second starts with it. Of `KIDNAPPED` the first and the second
 `HALF` frames, of a simulation two paths through one world."""
 HALF = 300
 CUT, CUT_FRAMES = "cut", 160
-"""Variant that shows so many frames of a simulation, and then as many of the next seed's: two places, two pieces."""
+"""Variant that joins this many frames of a simulation and of the next seed's: two places, two submaps."""
 CUT_COURSES = ("room", "corridor")
 FLOWN_AGAIN = ("room", "building")
-"""Courses that are flown twice: from another place, and from where the first flight took off."""
+"""Courses with a second flight: from another place, and from the first take-off."""
 WITH_TELEMETRY = ("tum_fr1_xyz", "7scenes_redkitchen", "euroc_mh05_a", "tartan_hospital")
-"""Recordings that telemetry is made for."""
+"""Recordings with simulated telemetry."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,16 +44,16 @@ class Variant:
     rate: int = 1
     """Every n-th frame."""
     shrink: int = 1
-    """Images smaller by this factor."""
+    """Factor by which images are reduced."""
     first: int = 0
     """Frame that it starts from."""
     focal: float = 1.0
     """Factor on the focal length given to the system."""
     perturb_px: float = 0.0
-    """Start at the frame numbered as the seed, and move the calibration by so much: how far chance goes."""
+    """Start at the frame numbered as the seed with a perturbed calibration [px], to measure the scatter of results."""
 
     def frames_of(self, length: int) -> int:
-        """Frames that are left of ``length``."""
+        """Number of frames left of ``length``."""
         return max(0, -(-(length - self.first) // self.rate))
 
     def applied_to(self, recording: Recording, seed: int = 0) -> Recording:
@@ -95,17 +95,17 @@ class Cell:
     name: str
     """``RECORDING``, ``RECORDING/VARIANT``, ``flight/COURSE``, ``none/KIND`` or ``telemetry/KIND/RECORDING``."""
     seed: int
-    """Of the system; of a simulation the world's too, and the draw of made telemetry."""
+    """Seed of the system, of a simulation's world and of simulated telemetry."""
     folder: str = ""
-    """Of the recording."""
+    """Folder of the recording."""
     variant: str = ""
     """A name in `VARIANTS`, `BACKWARDS`, ``kidnap``, `CUT` or `SECOND_FLIGHT`."""
     course: str = ""
-    """Of a simulated flight: a name in `courses.COURSES`."""
+    """Course of a simulated flight: a name in `courses.COURSES`."""
     nothing: str = ""
-    """What a source without anything to see shows: a name in `flights.NONE`."""
+    """Source without usable images: a name in `flights.NONE`."""
     telemetry: str = ""
-    """Telemetry made along the recording: a name in `telemetry.made.KINDS`."""
+    """Simulated telemetry: a name in `telemetry.simulated_telemetry.KINDS`."""
 
     @property
     def base(self) -> str:

@@ -30,8 +30,8 @@ class Compared:
     floor: float
     """Difference below which two medians count as equal: relative for errors, absolute for shares."""
     one_seed: float
-    """The same where a record has one seed: two sigma of a difference of two runs, measured on tum_fr1_xyz and
-    7scenes_redkitchen with three seeds each (0ecd978); a recording on which runs get lost scatters more."""
+    """The same for a record with one seed: two standard deviations of a difference of two runs, measured with three
+    seeds on two recordings (tum_fr1_xyz, 7scenes_redkitchen); recordings with tracking losses scatter more."""
     relative: bool = True
 
 
@@ -93,7 +93,7 @@ def markdown_against(before: dict[str, Any], after: dict[str, Any]) -> str:
     parts += [f"worse: {', '.join(worse) if worse else 'nothing'}"]
     if any(len(_rows(record, name)) == 1 for record in (before, after) for name in names):
         parts += [
-            "cells with one seed: that of two recordings is taken for their noise; CPU also follows the machine's load"
+            "cells with one seed: noise as measured on two recordings; CPU time also depends on the machine's load"
         ]
     return "\n".join(parts) + "\n"
 

@@ -28,17 +28,17 @@ from edgeslam_torch.synthetic.flights.courses import (
 from edgeslam_torch.synthetic.house.render import render
 
 NONE = ("noise", "black", "frozen")
-"""Sources that show nothing to make a map of."""
+"""Sources without usable images."""
 NONE_FRAMES = 150
 
 
 def flight_folder(root: Path, course: str, seed: int, flight: int = 0) -> Path:
-    """Folder of a course's recording, made when it is not there; another simulator has another folder.
+    """Folder of a course's recording, recorded if missing; each version of the simulator has its own folder.
 
     Args:
-        root: Where the recordings are.
+        root: Folder of the recordings.
         course: A name in `COURSES`.
-        seed: Of the world.
+        seed: Seed of the world.
         flight: Number of a further flight in the same world, on another path; 0 for the course itself.
 
     Raises:
@@ -62,7 +62,7 @@ def flight_folder(root: Path, course: str, seed: int, flight: int = 0) -> Path:
 
 
 def nothing_to_see(kind: str, seed: int) -> Recording:
-    """Images of noise, black ones, or one picture of a room again and again."""
+    """Images of noise, black images, or a single image repeated."""
     camera = simulated_camera()
     shape = (camera.height, camera.width, 3)
     if kind == "noise":
@@ -97,7 +97,7 @@ def _record_again(folder: Path, course: Course, seed: int, flight: int) -> None:
 
 
 def main(course: str, seed: int, folder: Path, flight: int = 0) -> int:
-    """Record into a folder of its own, and give it the name ``folder`` when it is whole; the first of several stays."""
+    """Record into a temporary folder and rename it to ``folder`` when complete; the first of several processes wins."""
     with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as own:
         part = Path(own) / folder.name
         if flight == 0:

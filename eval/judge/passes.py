@@ -1,16 +1,15 @@
-"""A long flight over ground that becomes known: what each pass adds to the map, and what a frame costs by then.
+"""Long flights with revisits: growth of the map and cost of a frame, pass by pass.
 
-The first frames of a recording, to and fro, with fresh noise on every picture::
+The first frames of a recording, forwards and backwards, with fresh noise on every image::
 
     python -m edgeslam_torch.eval.judge.passes --recording DIR --frames 300 --passes 7
 
-Round and round through a simulated building of ten rooms, or around a block of corridors, drawn while it is flown: no
-lap is flown like another one::
+Laps through a simulated building of ten rooms or around a block of corridors, rendered on the fly, each on another
+path::
 
     python -m edgeslam_torch.eval.judge.passes --world building --seed 0 --minutes 20 --width 320
 
-Times are of one thread, without the drawing of the pictures. An interrupt (Ctrl-C) ends the flight, and what was flown
-is judged.
+Times are of one thread, without rendering. An interrupt (Ctrl-C) ends the flight, and the part flown is evaluated.
 """
 
 import argparse
@@ -45,12 +44,12 @@ from edgeslam_torch.synthetic.house.world import World
 from edgeslam_torch.types import FloatArray, Frame, TelemetrySample
 
 NOISE = 2.0
-"""Standard deviation of the noise added to a recording's pictures [grey levels]: as much as a cheap camera's own."""
+"""Standard deviation of the noise added to a recording's images [grey levels], typical of a cheap camera."""
 RATE_HZ, SPEED_M_S = 15.0, 0.8
 MIN_FRAMES = 30
-"""Fewer are no pass: a map needs a second."""
+"""Minimum length of a pass: one second."""
 LAP_S = 56.0
-"""Once around either world: 40 m, slower at the corners."""
+"""Duration of a lap: 40 m, slower at the corners."""
 WORLDS: dict[str, tuple[Callable[[np.random.Generator], World], tuple[float, float]]] = {
     "building": (building, BUILDING_M),
     "block": (block, BLOCK_M),
@@ -75,7 +74,7 @@ class LongFlight:
 
 @dataclass(frozen=True, slots=True)
 class Pass:
-    """One pass, as it was when it ended."""
+    """State at the end of a pass."""
 
     frames: int
     supported: int
@@ -101,7 +100,7 @@ class Pass:
 
 
 def to_and_fro(folder: Path, count: int, passes: int, noise: float = NOISE, seed: int = 0) -> LongFlight:
-    """The first frames of a recording forwards, backwards, forwards and so on, at its own rate.
+    """The first frames of a recording, alternately forwards and backwards, at its own rate.
 
     Raises:
         EdgeSlamError: If it cannot be read.
@@ -126,7 +125,7 @@ def to_and_fro(folder: Path, count: int, passes: int, noise: float = NOISE, seed
 
 
 def around(name: str, seed: int, minutes: float, width: int = 640) -> LongFlight:
-    """Round and round through one of `WORLDS`, with a Tello's telemetry; pictures are ``width`` pixels wide."""
+    """Laps through one of `WORLDS` with a Tello's telemetry; images are ``width`` pixels wide."""
     rng = np.random.default_rng(seed)
     build, sides_m = WORLDS[name]
     world, camera, faults = build(rng), simulated_camera(width, 3 * width // 4), CameraFaults()
@@ -149,7 +148,7 @@ def around(name: str, seed: int, minutes: float, width: int = 640) -> LongFlight
 def fly(
     flight: LongFlight, say: Callable[[str], None], stopped: Callable[[], bool] = lambda: False
 ) -> tuple[EdgeSlam, list[Pass], FloatArray]:
-    """Fly it, until stopped; the system, the passes, and the poses ``(F, 4, 4)`` as they were known live."""
+    """Run the flight until stopped; returns the system, the passes, and the live poses ``(F, 4, 4)``."""
     slam = EdgeSlam(flight.camera, SlamConfig())
     passes: list[Pass] = []
     live, cpu_ms, told = [], [], 0
@@ -188,7 +187,7 @@ def _row(passes: Sequence[Pass]) -> list[str]:
 
 
 def _memory_mb() -> float:
-    """Of this process, now; its peak where the system does not say."""
+    """Current memory of this process; its peak if the system does not report it."""
     try:
         pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
     except OSError:
@@ -215,7 +214,7 @@ def points_a_room(points: FloatArray, estimate: FloatArray, truth: FloatArray) -
 
 
 def interrupted() -> Callable[[], bool]:
-    """Whether an interrupt was asked for since; the frame at hand is finished first."""
+    """Whether an interrupt was requested; the current frame is finished first."""
     asked: list[int] = []
     signal.signal(signal.SIGINT, lambda number, _: asked.append(number))
     return lambda: bool(asked)

@@ -1,18 +1,18 @@
-"""Are places recognised, and only where they are? Every keyframe of one map is asked whether it shows another one.
+"""Precision and recall of place recognition: every keyframe of one map is matched against another map.
 
-Every recording is flown in two halves, each from its own start, so that there are maps of one place that know nothing
-of each other, and maps of different places::
+Every recording is processed in two halves, each from scratch, which yields independent maps of the same place and maps
+of different places::
 
     python -m edgeslam_torch.eval.judge.place_recognition --data DIR --out DIR
 
-Or simulated rooms are, no two of them alike, each on one path or several::
+Alternatively simulated rooms, all different, each on one path or several::
 
     python -m edgeslam_torch.eval.judge.place_recognition --rooms 15 --paths 1 --out DIR
 
-A link between different places is false, and so is one between halves that puts the camera more than half a metre or
-twenty degrees from where the truth has it. A keyframe revisits a place when a keyframe of the other half was within
-half a metre and twenty degrees of it by the truth, five seconds away or more; it is recalled when a keyframe of the
-following second is linked rightly. Maps are kept in ``--out`` and used again.
+A link between different places is false, and so is one between halves whose camera pose is wrong by more than 0.5 m or
+20 degrees. A keyframe is a revisit when the true pose of a keyframe of the other half is within 0.5 m and 20 degrees
+and at least five seconds away; it is recalled when a keyframe of the following second is linked correctly. Maps are
+kept in ``--out`` and reused.
 """
 
 import argparse
@@ -55,11 +55,11 @@ from edgeslam_torch.types import FloatArray, IntArray
 NEAR_M, NEAR_RAD = 0.5, np.deg2rad(20.0)
 AWAY_S, WITHIN_S = 5.0, 1.0
 CLOSER_LOOKS = 3
-"""Keyframes of the other map that each is compared with, as in flight."""
+"""Number of candidate keyframes per keyframe, as in flight."""
 ROOM_S, ROOM_HZ = 12.0, 10.0
 """Length and rate of a flight through a simulated room."""
 SAME_PLACE = ({"tum_fr1_xyz", "tum_fr1_rpy_depth"},)
-"""Recordings of one place: links between them are neither right nor wrong here."""
+"""Recordings of the same place; links between them are not scored."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,18 +86,18 @@ class Half:
 
 @dataclass(frozen=True, slots=True)
 class Pair:
-    """What was found between two maps."""
+    """Links between two maps."""
 
     links: int
     false: int
     agreeing: bool
-    """Whether two false links agree: the pieces would have been joined."""
+    """Whether two false links agree, so that the submaps would have been merged."""
     revisits: int = 0
     recalled: int = 0
 
 
 def fly_half(folder: Path, name: str, half: int, out: Path) -> Half:
-    """Fly the first or the second half of a recording, or take the map that an earlier call has left.
+    """Map of the first or second half of a recording, reused from an earlier call if present.
 
     Raises:
         EdgeSlamError: If it cannot be read.
@@ -118,7 +118,7 @@ def fly_half(folder: Path, name: str, half: int, out: Path) -> Half:
 
 
 def fly_room(seed: int, path: int, out: Path) -> Half:
-    """Fly one of several paths through a simulated room, or take the map that an earlier call has left."""
+    """Map of one of several paths through a simulated room, reused from an earlier call if present."""
     world = COURSES["room"].world(np.random.default_rng(seed))
     flight = fly(np.random.default_rng([seed, path]), world, round(ROOM_S * ROOM_HZ), rate_hz=ROOM_HZ)
     name = f"room {seed}"
@@ -159,7 +159,7 @@ def _flown(source: Recording, name: str) -> tuple[SavedAtlas, FloatArray]:
 
 
 def compare(a: Half, b: Half, config: SlamConfig) -> Pair:
-    """Ask every keyframe of either map whether it shows the other one."""
+    """Match every keyframe of either map against the other."""
     slam_map = SlamMap(a.atlas.scale_factor, config.orb.levels)
     camera = a.atlas.camera
     edges = EdgeMap(slam_map, camera, config.edges, config.depth.prior_sigma_log)
@@ -215,7 +215,7 @@ def _two_agree(links: list[Link]) -> bool:
 
 
 def _right(links: list[Link], mine: list[Keyframe], theirs: list[Keyframe], a: Half, b: Half) -> list[bool]:
-    """Which links put their camera where the truth has it, seen from the other keyframe; all where that is unknown."""
+    """Which links have a correct relative pose; all if the truth is unknown."""
     here, there = ({k.id: row for row, k in enumerate(side)} for side in (mine, theirs))
     metres, answers = b.metres, []
     for one in links:
@@ -228,7 +228,7 @@ def _right(links: list[Link], mine: list[Keyframe], theirs: list[Keyframe], a: H
 
 
 def _near(a: FloatArray, b: FloatArray) -> NDArray[np.bool_]:
-    """Which poses ``(N, 4, 4)`` are near which ``(M, 4, 4)``: bool ``(N, M)``; none where one is not known."""
+    """Which poses ``(N, 4, 4)`` are near which ``(M, 4, 4)``: bool ``(N, M)``; False where unknown."""
     apart = np.linalg.norm(a[:, None, :3, 3] - b[None, :, :3, 3], axis=2)
     cosine = 0.5 * (np.einsum("nij,mij->nm", a[:, :3, :3], b[:, :3, :3]) - 1.0)
     near: NDArray[np.bool_] = (apart <= NEAR_M) & (cosine >= np.cos(NEAR_RAD))
@@ -236,7 +236,7 @@ def _near(a: FloatArray, b: FloatArray) -> NDArray[np.bool_]:
 
 
 def _revisits(here: Half, there: Half) -> IntArray:
-    """Rows of the keyframes that show a place that the other half knows."""
+    """Indices of keyframes that are revisits of the other half."""
     away = np.abs(here.stamps_s[:, None] - there.stamps_s[None, :]) >= AWAY_S
     return np.flatnonzero((_near(here.T_w_c, there.T_w_c) & away).any(axis=1))
 

@@ -35,7 +35,7 @@ RUN = "run"
 
 
 def main(folder: Path) -> int:
-    """Leave ``result.json`` in the folder; without one, the last line on stderr says why."""
+    """Write ``result.json`` to the folder; on failure the last line on stderr gives the reason."""
     begin_s = time.monotonic()
     spec: dict[str, Any] = json.loads((folder / CELL).read_text(encoding="utf-8"))
     cell = Cell(**spec["cell"])
@@ -98,7 +98,7 @@ def _opened(cell: Cell, folder: Path, flights_root: Path) -> tuple[Recording, Tr
 
 
 def _first_flight(cell: Cell, flights_root: Path) -> tuple[Recording, Truth]:
-    """Source of the flight whose map the cell's own flight begins with."""
+    """Source of the flight whose map the cell's flight starts with."""
     if cell.course:
         place = flights.flight_folder(flights_root, cell.course, cell.seed)
         return _recording(place), Truth(place)
@@ -117,7 +117,7 @@ def _distances(cell: Cell, p_w: FloatArray) -> FloatArray:
 
 
 def _kidnapped(source: Recording, place: Path, truth_file: Path) -> tuple[Recording, Truth]:
-    """The recording cut, and its ground truth cut alike into a file."""
+    """The cut recording, with its ground truth cut the same way into a file."""
     dataset = open_dataset(place)
     plan = sources.Cut(KIDNAP, dataset.frame_stamps_s)
     T_w_c, known = interpolate(dataset.truth, dataset.frame_stamps_s[plan.originals])
@@ -126,7 +126,7 @@ def _kidnapped(source: Recording, place: Path, truth_file: Path) -> tuple[Record
 
 
 def _backwards(source: Recording, place: Path, truth_file: Path) -> tuple[Recording, Truth]:
-    """The recording from its end, and its ground truth turned round alike into a file."""
+    """The reversed recording, with its ground truth reversed the same way into a file."""
     sequence = read_sequence(place)
     assert sequence is not None, "a recording with truth has a layout"
     stamps_s = np.array([entry.stamp_s for entry in sequence.images])

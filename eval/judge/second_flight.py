@@ -1,9 +1,8 @@
-"""The cell of two flights: the first saves its map, the second flies in it and is judged.
+"""Cell of two flights: the first saves its map, the second starts with it and is scored.
 
-What counts is whether the place is recognised at once, and whether a metre is as long as the day before. A second
-flight may begin where the first has never looked: by depth maps it is found out when a known place comes into view. The
-unit, too, is measured by them, beside the length of the way: where a camera moved along its view, and where across it,
-a bent map or truth makes units of the same map differ by some per cent.
+Scored are the time to relocalise and the agreement of both scales. A second flight may start outside the first map, so
+depth maps determine when a known place comes into view. The scale is measured by depth maps as well as by path lengths,
+since bending of map or ground truth changes the latter by some per cent.
 """
 
 import math
@@ -35,22 +34,22 @@ VIEWS_S = 0.5
 GRID_PX = 16
 """Distance of the pixels that are compared."""
 KNOWN_SHARE, KNOWN_RAD, KNOWN_RATIO = 0.5, np.deg2rad(20.0), 1.5
-"""A view is known when half of it was in one view of the first flight, from within this angle and ratio of distances:
-as different as two pictures may be that share keypoints."""
+"""A view is known when this share of it was in one view of the first flight within this angle and ratio of distances,
+the limits of keypoint matching."""
 SAME_DEPTH = 0.05
 """Relative difference of two depths of one point."""
 SAME_UNIT = 0.15
-"""The same while a map's unit is sought."""
+"""The same while a map's scale is estimated."""
 
 
 def fly_first(source: Recording, folder: Path, config: SlamConfig) -> RunResult:
-    """Fly and save the map in ``folder``."""
+    """Run the first flight and save its map in ``folder``."""
     settle_camera(source)
     return run(source, folder / FIRST, config, atlas=AtlasFiles(save=folder / ATLAS))
 
 
 def fly_second(source: Recording, out: Path, folder: Path, config: SlamConfig) -> RunResult:
-    """Fly in the map of the first flight."""
+    """Run the second flight with the map of the first."""
     from edgeslam_torch.atlas.atlas_file import read_atlas
 
     settle_camera(source)
@@ -116,7 +115,7 @@ class View:
         return np.where(depth > 0, depth, np.nan)
 
     def knows(self, p_w: FloatArray, centre_w: FloatArray) -> FloatArray:
-        """Which points ``(N, 3)``, seen from another place ``(3,)``, it shows much like from there."""
+        """Which points ``(N, 3)`` it shows similarly to a view from another position ``(3,)``."""
         p_c = se3.transform(se3.inverse(self.T_w_c), p_w)
         visible = np.abs(self.depths_at(p_c) / np.maximum(p_c[:, 2], 1e-9) - 1.0) <= SAME_DEPTH
         mine, theirs = p_w - self.T_w_c[:3, 3], p_w - centre_w

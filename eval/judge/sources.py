@@ -47,7 +47,7 @@ def every(recording: Recording, step: int) -> Recording:
 
 
 def start_at(recording: Recording, first: int) -> Recording:
-    """Without the first frames, and without the telemetry from before a second ahead of the first that stays."""
+    """Without the first frames; telemetry starts one second before the first remaining frame."""
     length = None if recording.length is None else max(0, recording.length - first)
     later = _picked(recording, lambda frames: islice(frames, first, None), length)
     start = next(later.decode([]), None) if recording.telemetry else None
@@ -80,8 +80,9 @@ def with_focal_length(recording: Recording, factor: float) -> Recording:
 
 
 def perturbed(recording: Recording, draw: int, sigma_px: float) -> Recording:
-    """The recording from its ``draw``-th frame on, with a calibration off by ``sigma_px``: far below what a keypoint is
-    located to, so that results which differ by it are chance, and only their median and range are worth quoting.
+    """The recording from its ``draw``-th frame on, with its calibration perturbed by ``sigma_px``.
+
+    The perturbation is far below the accuracy of keypoints, so it measures the scatter of results by chance.
     """
     camera = recording.camera
     off = np.random.default_rng(draw).normal(0.0, sigma_px, 4)
@@ -112,7 +113,7 @@ class Cut:
 
 
 def cut(recording: Recording, plan: Cut) -> Recording:
-    """The stretches of ``plan`` as one recording, without telemetry; its ground truth must be cut alike."""
+    """The stretches of ``plan`` as one recording, without telemetry; its ground truth must be cut the same way."""
     stamps = plan.new_stamps_s
 
     def decode(problems: list[Problem]) -> Iterator[Frame]:
@@ -140,7 +141,7 @@ def followed_by(first: Recording, second: Recording, count: int, rate_hz: float)
 
 
 def backwards(recording: Recording, images: Sequence[ImageEntry]) -> Recording:
-    """The last image first, without telemetry; its ground truth must be turned round alike.
+    """The last image first, without telemetry; its ground truth must be reversed the same way.
 
     Args:
         recording: As it was taken.
@@ -157,7 +158,7 @@ def backwards(recording: Recording, images: Sequence[ImageEntry]) -> Recording:
 
 
 def mirrored_stamps_s(stamps_s: FloatArray) -> FloatArray:
-    """When each frame ``(F,)`` comes if time runs from the last to the first, in the same span."""
+    """Time-reversed stamps ``(F,)`` over the same interval."""
     return stamps_s[0] + stamps_s[-1] - stamps_s
 
 

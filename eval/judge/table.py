@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from edgeslam_torch.eval.judge.thresholds import Bar, Row, verdicts_of_cell, verdicts_of_groups
+from edgeslam_torch.eval.judge.thresholds import Row, Threshold, verdicts_of_cell, verdicts_of_groups
 
 _FOOTNOTES = (
     "end, live: share of the frames whose pose rests on the map, at the end and when they came. path: ATE in % of the "
@@ -78,12 +78,12 @@ COLUMNS = (
 )
 
 
-def markdown(record: dict[str, Any], bars: Sequence[Bar]) -> str:
-    """Medians and bars, what passed, footnotes, and every run when there are several a cell."""
+def markdown(record: dict[str, Any], thresholds: Sequence[Threshold]) -> str:
+    """Medians and thresholds, what passed, footnotes, and every run when there are several a cell."""
     rows = record["rows"]
     names = list(dict.fromkeys(row["cell"] for row in rows))
-    parts = [_conditions(record), "", aligned(_header(), [_line(name, rows, bars) for name in names])]
-    parts += ["", *_outcome(names, rows, bars)]
+    parts = [_conditions(record), "", aligned(_header(), [_line(name, rows, thresholds) for name in names])]
+    parts += ["", *_outcome(names, rows, thresholds)]
     notes = [f"- {_run_name(row)}: {note}" for row in rows for note in row["notes"]]
     parts += ["", *notes] if notes else []
     parts += ["", *_FOOTNOTES]
@@ -115,38 +115,39 @@ def _conditions(record: dict[str, Any]) -> str:
 
 
 def _header() -> list[str]:
-    return ["cell", *(c.title for c in COLUMNS), "bars"]
+    return ["cell", *(c.title for c in COLUMNS), "thresholds"]
 
 
-def _line(name: str, rows: Sequence[Row], bars: Sequence[Bar]) -> list[str]:
+def _line(name: str, rows: Sequence[Row], thresholds: Sequence[Threshold]) -> list[str]:
     own = [row for row in rows if row["cell"] == name]
     cells = [c.cell([row["figures"].get(c.figure) for row in own]) for c in COLUMNS]
-    return [name, *cells, _bars_cell(name, own, rows, bars)]
+    return [name, *cells, _thresholds_cell(name, own, rows, thresholds)]
 
 
-def _bars_cell(name: str, own: Sequence[Row], rows: Sequence[Row], bars: Sequence[Bar]) -> str:
+def _thresholds_cell(name: str, own: Sequence[Row], rows: Sequence[Row], thresholds: Sequence[Threshold]) -> str:
     errors = [row["error"] for row in own if row["error"]]
     if errors:
         return f"FAIL {len(errors)} of {len(own)} runs"
-    verdicts = verdicts_of_cell(name, rows, bars)
+    verdicts = verdicts_of_cell(name, rows, thresholds)
     if not verdicts:
         return "-"
     passed = sum(v.ok for v in verdicts)
     return "pass" if passed == len(verdicts) else f"FAIL {len(verdicts) - passed} of {len(verdicts)}"
 
 
-def _outcome(names: Sequence[str], rows: Sequence[Row], bars: Sequence[Bar]) -> list[str]:
-    """How many cells pass, what fails, and the bars that only a share of runs must pass."""
-    judged = [_bars_cell(name, [r for r in rows if r["cell"] == name], rows, bars) for name in names]
-    with_bars = [text for text in judged if text != "-"]
-    lines = [f"{sum(text == 'pass' for text in with_bars)} of {len(with_bars)} cells with bars pass."]
+def _outcome(names: Sequence[str], rows: Sequence[Row], thresholds: Sequence[Threshold]) -> list[str]:
+    """How many cells pass, what fails, and the thresholds that only a share of runs must pass."""
+    judged = [_thresholds_cell(name, [r for r in rows if r["cell"] == name], rows, thresholds) for name in names]
+    with_thresholds = [text for text in judged if text != "-"]
+    lines = [f"{sum(text == 'pass' for text in with_thresholds)} of {len(with_thresholds)} cells with thresholds pass."]
     lines += [f"- {_run_name(row)}: no result: {row['error']}" for row in rows if row["error"]]
     for name in names:
-        failed = [str(v) for v in verdicts_of_cell(name, rows, bars) if not v.ok]
+        failed = [str(v) for v in verdicts_of_cell(name, rows, thresholds) if not v.ok]
         lines += [f"- {name}: {'; '.join(failed)}"] if failed else []
-    for v in verdicts_of_groups(rows, bars):
+    for v in verdicts_of_groups(rows, thresholds):
         word = "pass" if v.ok else "FAIL"
-        lines.append(f"- {', '.join(v.bar.cells)}: {v.bar} in {v.bar.share:.0%}: {v.passed} of {v.runs}, {word}")
+        cells = ", ".join(v.threshold.cells)
+        lines.append(f"- {cells}: {v.threshold} in {v.threshold.share:.0%}: {v.passed} of {v.runs}, {word}")
     return lines
 
 

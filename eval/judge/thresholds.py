@@ -12,14 +12,14 @@ import numpy as np
 
 from edgeslam_torch.eval.errors import EvaluationError
 
-BARS = Path(__file__).with_name("thresholds.toml")
+THRESHOLDS = Path(__file__).with_name("thresholds.toml")
 _LIMITS = ("at_least", "at_most", "at_most_times_base")
 
 Row = dict[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
-class Bar:
+class Threshold:
     """A limit for one figure of some cells."""
 
     cells: tuple[str, ...]
@@ -60,7 +60,7 @@ class Bar:
 class Verdict:
     """Result of a limit for the runs of some cells."""
 
-    bar: Bar
+    threshold: Threshold
     passed: int
     runs: int
     worst: float | None
@@ -69,63 +69,69 @@ class Verdict:
     @property
     def ok(self) -> bool:
         """Whether enough of the runs pass."""
-        return self.passed >= self.bar.share * self.runs - 1e-9
+        return self.passed >= self.threshold.share * self.runs - 1e-9
 
     def __str__(self) -> str:
         value = "none" if self.worst is None else f"{self.worst:.3g}"
-        return f"{self.bar} ({self.passed}/{self.runs}, worst {value})"
+        return f"{self.threshold} ({self.passed}/{self.runs}, worst {value})"
 
 
-def read_bars(path: Path = BARS) -> list[Bar]:
+def read_thresholds(path: Path = THRESHOLDS) -> list[Threshold]:
     """Limits of a TOML file; its header describes the format.
 
     Raises:
         EvaluationError: If it cannot be read or holds something else.
     """
     try:
-        tables = tomllib.loads(path.read_text(encoding="utf-8")).get("bar", [])
+        tables = tomllib.loads(path.read_text(encoding="utf-8")).get("threshold", [])
     except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise EvaluationError(f"{path}: cannot be read as bars ({error})") from error
-    bars = []
+        raise EvaluationError(f"{path}: cannot be read as thresholds ({error})") from error
+    thresholds = []
     for table in tables:
         cells = tuple(table.get("cells", ()))
         for figure, limit in table.items():
             if figure != "cells":
-                bars.append(_bar(cells, figure, limit, path))
-    return bars
+                thresholds.append(_threshold(cells, figure, limit, path))
+    return thresholds
 
 
-def _bar(cells: tuple[str, ...], figure: str, limit: Any, path: Path) -> Bar:
+def _threshold(cells: tuple[str, ...], figure: str, limit: Any, path: Path) -> Threshold:
     kinds = [k for k in _LIMITS if isinstance(limit, dict) and k in limit]
     if not cells or len(kinds) != 1 or set(limit) - {*kinds, "share"}:
         raise EvaluationError(f"{path}: {figure} needs cells, and one of {', '.join(_LIMITS)}; got {limit!r}")
-    return Bar(cells, figure, kinds[0], float(limit[kinds[0]]), float(limit.get("share", 1.0)))
+    return Threshold(cells, figure, kinds[0], float(limit[kinds[0]]), float(limit.get("share", 1.0)))
 
 
-def verdicts_of_cell(cell: str, rows: Sequence[Row], bars: Iterable[Bar]) -> list[Verdict]:
-    """How the runs of one cell stand to the bars that every run must pass."""
+def verdicts_of_cell(cell: str, rows: Sequence[Row], thresholds: Iterable[Threshold]) -> list[Verdict]:
+    """Verdicts of one cell on thresholds that every run must pass."""
     own = [row for row in rows if row["cell"] == cell]
-    found = [_verdict(bar, own, rows) for bar in bars if bar.share == 1.0 and bar.covers(cell)]
+    found = [
+        _verdict(threshold, own, rows) for threshold in thresholds if threshold.share == 1.0 and threshold.covers(cell)
+    ]
     return [verdict for verdict in found if verdict.runs]
 
 
-def verdicts_of_groups(rows: Sequence[Row], bars: Iterable[Bar]) -> list[Verdict]:
-    """How all runs together stand to the bars that only a share of them must pass."""
-    groups = [(bar, [r for r in rows if bar.covers(r["cell"])]) for bar in bars if bar.share < 1.0]
-    return [_verdict(bar, covered, rows) for bar, covered in groups if covered]
+def verdicts_of_groups(rows: Sequence[Row], thresholds: Iterable[Threshold]) -> list[Verdict]:
+    """Verdicts of all runs on thresholds that only a share of them must pass."""
+    groups = [
+        (threshold, [r for r in rows if threshold.covers(r["cell"])])
+        for threshold in thresholds
+        if threshold.share < 1.0
+    ]
+    return [_verdict(threshold, covered, rows) for threshold, covered in groups if covered]
 
 
-def _verdict(bar: Bar, covered: Sequence[Row], rows: Sequence[Row]) -> Verdict:
-    based = [(row, _base(row, bar.figure, rows)) for row in covered]
-    if bar.kind == "at_most_times_base":  # without its base a variant cannot be judged
+def _verdict(threshold: Threshold, covered: Sequence[Row], rows: Sequence[Row]) -> Verdict:
+    based = [(row, _base(row, threshold.figure, rows)) for row in covered]
+    if threshold.kind == "at_most_times_base":  # without its base a variant cannot be judged
         based = [(row, base) for row, base in based if base is not None]
         covered = [row for row, _ in based]
-    passed = sum(bar.passes(row, base) for row, base in based)
-    values = [row["figures"].get(bar.figure) for row in covered]
+    passed = sum(threshold.passes(row, base) for row, base in based)
+    values = [row["figures"].get(threshold.figure) for row in covered]
     known = [v for v in values if v is not None]
-    worst = min(known, default=None) if bar.kind == "at_least" else max(known, default=None)
+    worst = min(known, default=None) if threshold.kind == "at_least" else max(known, default=None)
     worst = worst if len(known) == len(values) else None
-    return Verdict(bar, passed, len(covered), worst)
+    return Verdict(threshold, passed, len(covered), worst)
 
 
 def _base(row: Row, figure: str, rows: Sequence[Row]) -> float | None:

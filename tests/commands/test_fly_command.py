@@ -12,7 +12,7 @@ from edgeslam_torch.flying.keys import listen
 def test_a_dry_run_shows_the_plan_and_asks_nobody(capsys):
     assert main(["fly", "goto", "3", "-4", "--dry-run", "--back", "--speed", "0.25"]) == 0
     out = capsys.readouterr().out
-    assert "5.0 m as the crow flies, at least 20 s" in out
+    assert "5.0 m in a straight line, at least 20 s" in out
     assert out.index("take off") < out.index("fly to (3, -4)") < out.index("return") < out.index("4. land")
     assert "nothing was sent" in out
 

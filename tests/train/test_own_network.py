@@ -16,7 +16,16 @@ from edgeslam_torch.models.checkpoint import restored, save_checkpoint
 from edgeslam_torch.models.onnx.export import ExportOptions, export_onnx
 from edgeslam_torch.models.record import OTHER_NETWORK, Metadata
 from edgeslam_torch.models.trainable import DepthModule, Prediction
-from edgeslam_torch.train import Data, Existing, Outcome, TrainConfig, finetune, load_depth_folder, load_run, out_folder
+from edgeslam_torch.train import (
+    Data,
+    Existing,
+    TrainConfig,
+    TrainingResult,
+    finetune,
+    load_depth_folder,
+    load_run,
+    out_folder,
+)
 from edgeslam_torch.train.validate import score
 
 METADATA = Metadata(
@@ -41,7 +50,7 @@ class Rows(DepthModule):
         return Prediction(line + self.layer(x), None)
 
 
-def taught(network: DepthModule, data: Data, out: Path) -> Outcome:
+def taught(network: DepthModule, data: Data, out: Path) -> TrainingResult:
     with out_folder(out, Existing.SAME) as folder:
         return finetune(network, METADATA, data, CONFIG, folder)
 

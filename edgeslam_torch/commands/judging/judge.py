@@ -45,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="instead run what the documents quote, and write its figures here (docs/results)",
     )
     parser.add_argument("--flights", type=Path, metavar="DIR", help="cache of simulated flights (default: in --out)")
-    parser.add_argument("--bars", type=Path, metavar="FILE", help="limits to check (default: the project's own)")
+    parser.add_argument("--thresholds", type=Path, metavar="FILE", help="limits to check (default: the project's own)")
     parser.add_argument("--against", type=Path, metavar="DIR", help="also compare with another judge's --out")
 
 
@@ -56,10 +56,10 @@ def main(args: argparse.Namespace) -> int:
     from edgeslam_torch.eval.judge.release import command_outputs, last_cost, release_cells, release_record
     from edgeslam_torch.eval.judge.runner import JudgeSettings, judge
     from edgeslam_torch.eval.judge.table import markdown
-    from edgeslam_torch.eval.judge.thresholds import BARS, read_bars
+    from edgeslam_torch.eval.judge.thresholds import THRESHOLDS, read_thresholds
 
     data = args.data or (Path(os.environ["EDGESLAM_DATA"]) if os.environ.get("EDGESLAM_DATA") else None)
-    bars = read_bars(args.bars or BARS)
+    thresholds = read_thresholds(args.thresholds or THRESHOLDS)
     before = read_record(args.against) if args.against is not None else None
     old = [name for name in args.set if name in CELLS]
     if old:
@@ -76,7 +76,7 @@ def main(args: argparse.Namespace) -> int:
     settings = JudgeSettings(tuple(args.set), args.max_frames, args.jobs, args.timeout, args.flights)
     try:
         record = judge(cells, settings, args.out, _say)
-        text = markdown(record, bars)
+        text = markdown(record, thresholds)
         if before is not None:
             text += "\n" + markdown_against(before, record)
         write_text(args.out / RECORD, json.dumps(record, indent=1) + "\n")

@@ -19,7 +19,7 @@ from edgeslam_torch.files.plain import subfolder
 if TYPE_CHECKING:
     from edgeslam_torch.train.folder import OutFolder
     from edgeslam_torch.train.recipe import TrainConfig
-    from edgeslam_torch.train.result import Outcome
+    from edgeslam_torch.train.result import TrainingResult
     from edgeslam_torch.train.teachers.cache import TeacherCache
     from edgeslam_torch.train.views.datasets import DepthFolder
     from edgeslam_torch.train.views.posed import PosedSequence
@@ -154,7 +154,7 @@ def train_config(args: argparse.Namespace, lr: float, frozen_stages: int, freeze
         raise ConfigError(f"--{error}") from error
 
 
-def in_folder(args: argparse.Namespace, work: "Callable[[OutFolder], Outcome]") -> int:
+def in_folder(args: argparse.Namespace, work: "Callable[[OutFolder], TrainingResult]") -> int:
     """Train in ``--out``, alone or as one of ``torchrun``'s processes, and print the outcome; the exit code."""
     import torch
 

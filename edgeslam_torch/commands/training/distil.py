@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from edgeslam_torch.train.finetuning import Data
     from edgeslam_torch.train.folder import OutFolder
     from edgeslam_torch.train.recipe import Hooks, TrainConfig
-    from edgeslam_torch.train.result import Outcome
+    from edgeslam_torch.train.result import TrainingResult
 
 HELP = "teach a drone-sized network what a larger depth network knows, on recordings without labels"
 
@@ -97,7 +97,7 @@ def _distil(
     config: "TrainConfig",
     hooks: "list[Hooks]",
     out: "OutFolder",
-) -> "Outcome":
+) -> "TrainingResult":
     from edgeslam_torch.models.checkpoint import file_hash
     from edgeslam_torch.train.finetuning import FromRuns, finetune, settings_of
     from edgeslam_torch.train.inputs import DataSet, Inputs, weights_name

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from edgeslam_torch.train.finetuning import Data
     from edgeslam_torch.train.folder import OutFolder
     from edgeslam_torch.train.recipe import Hooks, TrainConfig
-    from edgeslam_torch.train.result import Outcome
+    from edgeslam_torch.train.result import TrainingResult
 
 logger = logging.getLogger(__name__)
 
@@ -78,7 +78,7 @@ def _finetune(
     config: "TrainConfig",
     hooks: "list[Hooks]",
     out: "OutFolder",
-) -> "Outcome":
+) -> "TrainingResult":
     from edgeslam_torch.train.finetuning import FromRuns, finetune, settings_of
     from edgeslam_torch.train.inputs import DataSet, Inputs, weights_name
     from edgeslam_torch.train.processes.distributed import by_first, rank

@@ -1,1 +1,1 @@
-"""Flights through named worlds in lockstep, judged on what is really there, never by the drone's own map."""
+"""Flights through simulated worlds in lockstep, scored by ground truth, never by the drone's own map."""

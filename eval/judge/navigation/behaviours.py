@@ -1,4 +1,4 @@
-"""What a judged flight is for: its tasks, one after the other, and what counts as reached."""
+"""Behaviours: sequences of tasks with success criteria."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -14,35 +14,35 @@ from edgeslam_torch.synthetic.sites.site import Site
 from edgeslam_torch.types import FloatArray
 
 REACHED_M = 0.35
-"""Of the true goal, when the pilot says that it is there."""
+"""Distance to the true goal that counts as reached when the planner reports it."""
 HOME_M = 0.3
-"""Of the true take-off."""
+"""Distance to the true take-off that counts as home."""
 EXPLORED_S = 180.0
-"""Time in which a room and what is next door are looked at from everywhere, by a drone that stops to look."""
+"""Time to explore a room and its neighbours."""
 _END_M = 1.6
-"""Of a corridor's true end: the drone stops 0.6 m before a wall."""
+"""Distance to a corridor's true end that counts as reached; the drone stops 0.6 m before a wall."""
 _SAME_EXIT_M, _SAME_EXIT_COS = 0.5, np.cos(np.radians(35.0))
 
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """When the next task begins."""
+    """State at the start of a task."""
 
     site: Site
     clock_s: float
     scale: float
-    """The pilot's metre in true metres."""
+    """True metres per estimated metre."""
     track_w: FloatArray
-    """``(N, 2)`` where the drone flew, as it knows."""
+    """``(N, 2)`` path flown by the estimated pose."""
 
 
 @dataclass(frozen=True, slots=True)
 class Behaviour:
-    """Tasks and their judge."""
+    """Tasks and their success criterion."""
 
     steps: tuple[Callable[[Moment], Task], ...]
     reached: Callable[[Flown, Site], bool]
-    """Whether a flight without contact, the last task of which is done, came where it should."""
+    """Whether a flight that completed its last task without contact reached its goal."""
     limit_s: float = 120.0
 
 
@@ -76,12 +76,12 @@ def _at_an_end(flown: Flown, site: Site) -> bool:
 
 
 def is_corridor(world: str) -> bool:
-    """Whether a named site can be followed from its start."""
+    """Whether a named site is a corridor."""
     return world == "blank_walls" or world.endswith("corridor")
 
 
 def corridor_ends(site: Site) -> list[FloatArray]:
-    """Places ``(2,)`` at which following the corridor from the start may end: a door, or the end of an arm.
+    """Points ``(2,)`` at which a corridor followed from the start may end: a door, or the end of an arm.
 
     Raises:
         ValueError: If the site is no corridor.
@@ -100,11 +100,11 @@ BEHAVIOURS = {
     "corridor": Behaviour((_corridor,), _at_an_end, 160.0),
     "exits": Behaviour((_explore, _home), _at_home, 420.0),
 }
-"""By name; ``exits`` explores for `EXPLORED_S` and comes home, and what counts is also which exits it knows."""
+"""By name; ``exits`` explores for `EXPLORED_S` and returns home, and the exits found are scored, too."""
 
 
 def right_exits(found: Sequence[Exit], site: Site) -> int:
-    """How many of the site's exits are among those found: within half a metre, and through the same wall.
+    """Number of the site's exits among those found: within half a metre and in the same wall.
 
     Example:
         >>> from edgeslam_torch.synthetic.sites.build import named_site

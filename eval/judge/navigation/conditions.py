@@ -1,4 +1,4 @@
-"""Faults that a flight must end well with."""
+"""Injected faults that a flight must survive."""
 
 from dataclasses import dataclass, field
 
@@ -7,19 +7,19 @@ from edgeslam_torch.drone.emulator.lockstep import Outage, Radio
 
 @dataclass(frozen=True, slots=True)
 class Conditions:
-    """What goes wrong in a flight."""
+    """Faults of a flight."""
 
     radio: Radio = field(default_factory=Radio)
     wind_m_s: float = 0.0
-    """Across the take-off's heading; half of it again as gusts."""
+    """Constant wind across the take-off heading, plus gusts of half of it."""
     scale: float = 1.0
-    """The pilot's metre in true metres: 1.3 believes everything to be 1.3 times nearer than it is."""
+    """True metres per estimated metre: at 1.3 all distances are underestimated by 1.3."""
     stated_scale_sigma: float = 0.0
     battery: float = 1.0
     hung_s: tuple[float, float] | None = None
-    """When the planner hangs."""
+    """Interval in which the planner hangs."""
     dark_s: tuple[float, float] | None = None
-    """When the pictures are black."""
+    """Interval with black frames."""
 
 
 FAULTS = {
@@ -35,4 +35,4 @@ FAULTS = {
     "battery": Conditions(battery=0.28),
     "hung": Conditions(hung_s=(14.0, 60.0)),
 }
-"""By name; ``scale_unsaid`` states no sigma: what a silently wrong scale does."""
+"""By name; ``scale_unsaid`` is a wrong scale with zero standard deviation."""

@@ -29,19 +29,19 @@ from edgeslam_torch.synthetic.sites.site import Site
 from edgeslam_torch.types import FloatArray
 
 TICK_S = 1.0 / 15.0
-_APART_S = 1.0
-"""Touches nearer in time belong to one event: the body bounces every 10 ms while something pushes it."""
+_SAME_EVENT_S = 1.0
+"""Contacts closer in time belong to one event: the simulated body bounces every 10 ms at an obstacle."""
 _SIGMAS, _NO_HARM_M = 3.0, 0.1
-"""Error of a pose that is more than is said, and more than the hull's own size."""
+"""Bound of a consistent pose error: standard deviations, plus the hull's radius."""
 _FREE_M = 0.6
-"""Clearance from which cruising is free."""
+"""Clearance above which the cruising speed is measured."""
 
 
 class Perception(Protocol):
-    """Tells a pilot what it may know."""
+    """Source of the planner's states."""
 
     def state(self, now_s: float, events: list[Event]) -> DroneState:
-        """The moment, from what arrived since the last one."""
+        """Current state from the events since the last call."""
 
 
 def fly(case: Case, limits: NavLimits | None = None) -> Flown:
@@ -67,13 +67,13 @@ def fly(case: Case, limits: NavLimits | None = None) -> Flown:
         else TruePerception(site, drone, conditions)
     )
     perception = WatchedPerception(seeing, site)
-    errand = _Task(site, BEHAVIOURS[case.behaviour], FlightController(limits), conditions.scale)
+    tasks = _Task(site, BEHAVIOURS[case.behaviour], FlightController(limits), conditions.scale)
     found = Flown(case)
     if case.behaviour == "goto":
         found.oracle_s = _take_off_s(limits) + shortest_m(site, limits) / limits.speed_m_s
-    ticks = _fly(tello, perception, errand, conditions.hung_s, found)
+    ticks = _fly(tello, perception, tasks, conditions.hung_s, found)
     _sum_up(found, site, drone, ticks, BEHAVIOURS[case.behaviour])
-    known = errand.flight_controller.exits()
+    known = tasks.flight_controller.exits()
     found.exits = [len(site.exits), len(known), right_exits(known, site)]
     found.near = [perception.counts.sectors, perception.counts.too_far, perception.counts.surely_too_far]
     if perception.depth_age_s:
@@ -82,8 +82,7 @@ def fly(case: Case, limits: NavLimits | None = None) -> Flown:
 
 
 def is_beyond(state: DroneState, p_w: FloatArray) -> bool:
-    """Whether a pose is farther from the truth than all that is said of it allows: of the pose itself, of where its
-    piece of map lies, of what the map has drifted by, and of the metres from the take-off.
+    """Whether a pose error exceeds its stated uncertainty: of pose, submap, drift and scale.
 
     Example:
         >>> state = DroneState(0.0, np.array([3.2, 0.0, 1.0]), 0.0, np.zeros(3), scale_sigma=0.02)
@@ -96,7 +95,7 @@ def is_beyond(state: DroneState, p_w: FloatArray) -> bool:
 
 
 class _Task:
-    """What the flight_controller is to do, one task after the other, however the one before ended."""
+    """Gives the flight controller one task after the other, however the previous one ended."""
 
     def __init__(self, site: Site, behaviour: Behaviour, flight_controller: FlightController, scale: float) -> None:
         self.flight_controller, self.limit_s = flight_controller, behaviour.limit_s
@@ -104,7 +103,7 @@ class _Task:
         self._first = True
 
     def go_on(self, now_s: float) -> None:
-        """Give the next task when there is none; the first is taken up while it still rises and looks around."""
+        """Set the next task when the current one has ended; the first is set during the initial look around."""
         if self._steps and (self._first or self.flight_controller.ended() is not None):
             step = self._steps.pop(0)
             self.flight_controller.begin(step(Moment(self._site, now_s, self._scale, self.flight_controller.track())))
@@ -128,14 +127,14 @@ class _Tick:
 def _fly(
     tello: LockstepTello,
     perception: Perception,
-    errand: _Task,
+    tasks: _Task,
     hung_s: tuple[float, float] | None,
     found: Flown,
 ) -> list[_Tick]:
     drone, ticks, dangers, touches = tello.drone, [], [], []
     tello.send("takeoff")
     landing = False
-    while tello.clock_s < errand.limit_s:
+    while tello.clock_s < tasks.limit_s:
         events = tello.advance(TICK_S)
         touched = [e for e in events if isinstance(e, Contact)]
         touches += [t.clock_s for t in touched]
@@ -151,17 +150,17 @@ def _fly(
             continue
         began = time.process_time()
         if hung_s is None or not hung_s[0] <= tello.clock_s < hung_s[1]:
-            errand.go_on(state.stamp_s)
-            errand.flight_controller.plan(state)
-        order = errand.flight_controller.order(state)
+            tasks.go_on(state.stamp_s)
+            tasks.flight_controller.plan(state)
+        order = tasks.flight_controller.order(state)
         cpu_s = time.process_time() - began
         speed, clear_m = float(np.linalg.norm(drone.velocity)), drone.clearance(drone.p_w)
         ticks.append(_Tick(tello.clock_s, drone.p_w.copy(), drone.rpy(), speed, clear_m, cpu_s))
         if order.danger and str(order.danger) not in dangers:
             dangers.append(str(order.danger))
-        if errand.over():
+        if tasks.over():
             found.ended, found.time_s = (
-                found.ended or str(errand.flight_controller.ended()),
+                found.ended or str(tasks.flight_controller.ended()),
                 found.time_s or tello.clock_s,
             )
             landing = True
@@ -180,18 +179,18 @@ def _fly(
     return ticks
 
 
-def contact_events(touches_s: Sequence[float]) -> int:
-    """How many events touches at these times [s], in order, are.
+def contact_events(contacts_s: Sequence[float]) -> int:
+    """Number of contact events, from ordered contact times [s].
 
     Example:
         >>> contact_events([3.00, 3.01, 3.02, 3.9, 8.0])
         2
     """
-    return sum(1 for k, t in enumerate(touches_s) if k == 0 or t - touches_s[k - 1] > _APART_S)
+    return sum(1 for k, t in enumerate(contacts_s) if k == 0 or t - contacts_s[k - 1] > _SAME_EVENT_S)
 
 
 def _sum_up(found: Flown, site: Site, drone: DroneModel, ticks: list[_Tick], behaviour: Behaviour) -> None:
-    """Figures of the ticks."""
+    """Compute the figures from the ticks."""
     if not ticks:
         return
     p = np.array([t.p_w for t in ticks])
@@ -211,5 +210,5 @@ def _sum_up(found: Flown, site: Site, drone: DroneModel, ticks: list[_Tick], beh
 
 
 def _take_off_s(limits: NavLimits) -> float:
-    """Time of the drone's own take-off to 0.8 m, and of the climb to the height of flight."""
+    """Duration of the drone's take-off to 0.8 m and of the climb to the flight height."""
     return 2.5 + (limits.height_m - 0.9) / limits.climb_m_s

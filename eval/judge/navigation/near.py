@@ -1,4 +1,4 @@
-"""Whether what is near is known to be near: the nearest obstacle of each narrow sector of a view, against the truth."""
+"""Accuracy of near depth: the nearest obstacle in each narrow sector of a view against ground truth."""
 
 import math
 from dataclasses import dataclass
@@ -18,18 +18,18 @@ SECTOR_RAD = math.radians(3.7)
 NEAR_M = (0.3, 1.0)
 TOO_FAR_M = 0.3
 _SIGMAS = 2.0
-"""As free space is carved."""
+"""As in the occupancy grid."""
 
 
 @dataclass(frozen=True, slots=True)
 class NearCounts:
-    """Sectors whose nearest surface is really at `NEAR_M`."""
+    """Sectors whose true nearest surface is within `NEAR_M`."""
 
     sectors: int = 0
     too_far: int = 0
-    """Of them, those in which the view's nearest depth is more than `TOO_FAR_M` beyond it."""
+    """Those in which the view's nearest depth is more than `TOO_FAR_M` too far."""
     surely_too_far: int = 0
-    """The same of depth less two sigmas: what free space believes."""
+    """The same for depth less two standard deviations, as used by the occupancy grid."""
 
     def __add__(self, other: "NearCounts") -> "NearCounts":
         return NearCounts(
@@ -43,7 +43,7 @@ def near_counts(view: View, true_m: FloatArray) -> NearCounts:
     """Compare a view with the true depth of its pixels.
 
     Args:
-        view: Depth with its sigma; a sector without any depth is unknown, which is not free, so not too far.
+        view: Depth with standard deviation; a sector without depth is unknown, hence not free and not too far.
         true_m: ``(H, W)`` z-depth [m].
     """
     known = np.isfinite(view.depth_m) & (view.depth_m > 0)
@@ -54,9 +54,9 @@ def near_counts(view: View, true_m: FloatArray) -> NearCounts:
     sector = np.floor((angle - angle[0]) / SECTOR_RAD).astype(int)
     counts = NearCounts()
     for k in range(int(sector[-1]) + 1):
-        nearest, as_told, at_least = (float(d[:, sector == k].min()) for d in (true, told, sure))
+        nearest, expected, at_least = (float(d[:, sector == k].min()) for d in (true, told, sure))
         if NEAR_M[0] <= nearest <= NEAR_M[1]:
-            far = [math.isfinite(d) and d - nearest > TOO_FAR_M for d in (as_told, at_least)]
+            far = [math.isfinite(d) and d - nearest > TOO_FAR_M for d in (expected, at_least)]
             counts += NearCounts(1, int(far[0]), int(far[1]))
     return counts
 
@@ -66,18 +66,18 @@ class _Perception(Protocol):
 
 
 class WatchedPerception:
-    """Passes states on and counts, in each metric view, what is near and told to be far, and how old depth is."""
+    """Wraps a perception and records, per metric view, near-depth errors and the age of depth."""
 
     def __init__(self, perception: _Perception, site: Site) -> None:
         self.counts = NearCounts()
         self.depth_age_s: list[float] = []
-        """Of each moment since the first depth: the age of the picture of the newest."""
+        """Age of the newest depth at each tick."""
         self._seen_s = math.nan
         self._perception, self._site = perception, site
         self._T_b_c = camera_on_body()
 
     def state(self, now_s: float, events: list[Event]) -> DroneState:
-        """The state of the perception behind."""
+        """State of the wrapped perception."""
         state = self._perception.state(now_s, events)
         if state.view is not None:
             self._seen_s = state.view.stamp_s

@@ -1,4 +1,4 @@
-"""The shortest way with the true map, under the pilot's own limits."""
+"""Oracle: the shortest path in the true map under the planner's limits."""
 
 import numpy as np
 
@@ -12,7 +12,7 @@ _CELL_M = 0.1
 
 
 def true_layer(site: Site, limits: NavLimits) -> Layer:
-    """What is really free at the height of flight, in the drone's own world."""
+    """True layer at the flight height, in the drone's world."""
     corners = np.array([[x, y, 0.0] for x in site.world.bounds_w[:, 0] for y in site.world.bounds_w[:, 1]])
     local = (corners - site.T_site_w[:3, 3]) @ site.T_site_w[:3, :3]
     low = np.floor(local[:, :2].min(0) / _CELL_M) * _CELL_M - _CELL_M
@@ -26,7 +26,7 @@ def true_layer(site: Site, limits: NavLimits) -> Layer:
 
 
 def shortest_m(site: Site, limits: NavLimits) -> float:
-    """Length of the way from the start to the goal [m]; infinite if there is none."""
+    """Length of the shortest path from start to goal [m]; infinite if there is none."""
     layer = true_layer(site, limits)
     start = layer.cells(np.zeros(2))
     plan = cost_to_go(layer, layer.cells(site.goal_w[None, :2]), limits.clearance_m(0.0), start)

@@ -24,25 +24,25 @@ from edgeslam_torch.synthetic.sites.build import SITES, named_site
 
 _SIZE = (480, 360)
 _RATE_HZ = 15
-"""Pictures a second: half of a Tello's 30, which are drawn on the machine that has to fly by them. 15 are looked at."""
+"""Frame rate: half of a Tello's, since the same machine renders the frames; 15 Hz are processed in flight."""
 
 
 @dataclass(frozen=True, slots=True)
 class Landed:
-    """What the emulator knows in the end."""
+    """True state at the end of a flight."""
 
     distance_m: float
-    """Level distance to the goal."""
+    """Horizontal distance to the goal."""
     contacts: int
-    """Events, also while it lands."""
+    """Contact events, including the landing."""
     clearance_m: float
-    """Least distance of the hull to a solid in flight; infinite if it never flew."""
+    """Minimum distance of the hull from obstacles in flight; infinite if it never flew."""
     on_floor: bool
-    """With its motors off, and not on furniture."""
+    """Whether it stands on the floor, not on furniture, with motors off."""
 
 
 def emulate(world: str, seed: int, ports: tuple[int, int], pipe: Connection) -> None:
-    """Process of the emulator: sends its command port, waits for a word, sends `Landed`."""
+    """Process of the emulator: sends its command port, waits for a message, sends `Landed`."""
     site = named_site(world, seed)
     drone, paint, _ = drone_at(site, TELLO_TILT_RAD, _SIZE)
     true_m, nearest = drone.clearance, [math.inf]
@@ -86,7 +86,7 @@ def fly_one(world: str, seed: int, record: Path | None = None) -> str:
 
 
 def _fly(address: str, goal_w: np.ndarray, record: Path | None) -> tuple[bool, str]:
-    """Whether it says that it is there, and in words."""
+    """Whether the flight reports success, and its reason."""
     try:
         with Navigator.open(address, allow_motion=True, camera="tello", record=record) as nav:
             outcome = nav.take_off()

@@ -1,4 +1,4 @@
-"""What a pilot is told in the judged flights: the truth, late as the video is."""
+"""Ground truth perception with the latency of the video."""
 
 import math
 
@@ -18,7 +18,7 @@ _SIGMA_LOG = 0.01
 
 
 class TruePerception:
-    """The true present pose and exact depth of the pictures that arrive: tells a planner's faults from perception's."""
+    """True current pose and exact depth of arriving frames, to separate planner faults from perception faults."""
 
     def __init__(self, site: Site, drone: DroneModel, conditions: Conditions) -> None:
         self._site, self._drone, self._conditions = site, drone, conditions
@@ -27,7 +27,7 @@ class TruePerception:
         self._seen_s = 0.0
 
     def state(self, now_s: float, events: list[Event]) -> DroneState:
-        """The moment, from what arrived since the last one."""
+        """Current state from the events since the last call."""
         view = None
         for event in events:
             if isinstance(event, Picture) and not self._dark(event.captured_s):
@@ -58,6 +58,6 @@ class TruePerception:
 
 
 def nothing_painted(T_w_b: np.ndarray) -> np.ndarray:
-    """No picture: perception that know the truth need none."""
+    """An empty image: ground truth perception needs none."""
     assert math.isfinite(float(T_w_b[0, 3]))
     return np.zeros((1, 1, 3), np.uint8)

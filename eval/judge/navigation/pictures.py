@@ -1,4 +1,4 @@
-"""Top views of judged flights: what is there, the way flown, start and goal."""
+"""Top views of judged flights: world, path flown, start and goal."""
 
 import cv2
 import numpy as np
@@ -38,7 +38,7 @@ def top_view(flown: Flown) -> np.ndarray:
 
 
 def captioned(image: np.ndarray, words: str) -> np.ndarray:
-    """The image with white words on a dark strip at its top; it is written into."""
+    """The image with a white caption on a dark strip at its top, in place."""
     cv2.rectangle(image, (0, 0), (image.shape[1], 21), (30, 30, 30), -1)
     cv2.putText(image, words, (6, 15), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (255, 255, 255), 1, cv2.LINE_AA)
     return image

@@ -1,4 +1,4 @@
-"""All flights, several at a time; finished ones are kept, so that a stopped run goes on where it was."""
+"""Runs all flights in parallel; results are kept, so that an interrupted run resumes."""
 
 import json
 from collections.abc import Callable, Sequence
@@ -16,34 +16,34 @@ from edgeslam_torch.files.plain import write_image
 from edgeslam_torch.jobs.watched import end_with_parent_process
 
 FAILED = "failed"
-"""How the ending of a flight begins that ended with an error of ours."""
+"""Prefix of the ending of a flight that raised an error."""
 _WORST = 6
-"""Flights of which a top view and a film strip are written."""
+"""Number of worst flights with a top view and a film strip."""
 
 
 def judge_flights(cases: Sequence[Case], out: Path, jobs: int, say: Callable[[str], None]) -> list[Flown]:
     """Fly all cases, write a record each, ``navigation.md``, top views and film strips of the worst.
 
     Args:
-        cases: What to fly.
-        out: Folder of the results; records of earlier runs are used where the case is the same.
-        jobs: Flights at a time.
-        say: Told a line for each finished flight.
+        cases: Cases to fly.
+        out: Output folder; results of the same cases in it are reused.
+        jobs: Number of parallel flights.
+        say: Called with a line for each finished flight.
 
     Returns:
-        All flights. One that raised an error, or the process of which died, counts as flown and not reached.
+        All flights. One that raised an error or whose process died counts as flown and not reached.
     """
     out.mkdir(parents=True, exist_ok=True)
     found = {case: flown for case in cases if (flown := _earlier(_file(out, case), case)) is not None}
     missing = [case for case in cases if case not in found]
-    # Spawned: a forked process shares the threads' locks of its parent.
+    # Spawned: a forked process would inherit locks held by its parent's threads.
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), initializer=end_with_parent_process) as pool:
         futures = {pool.submit(fly, case): case for case in missing}
         for future in as_completed(futures):
             case = futures[future]
             try:
                 flown = future.result()
-            except Exception as error:  # whatever it is: the others fly on, and this one is flown again the next time
+            except Exception as error:  # any error: the others continue, and this one is repeated in the next run
                 flown = Flown(case, ended=f"{FAILED}: {type(error).__name__}: {error}")
             else:
                 write_text(_file(out, case), json.dumps(flown.record()) + "\n")

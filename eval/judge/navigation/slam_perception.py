@@ -1,4 +1,4 @@
-"""What a pilot is told in the judged flights: what the SLAM knows, from pictures and state lines alone."""
+"""Perception by SLAM in judged flights, from frames and state messages alone."""
 
 import numpy as np
 
@@ -13,14 +13,14 @@ IMAGE_SIZE = (480, 360)
 
 
 class SlamPerception:
-    """`SlamPerception` of a flight, fed from events in lockstep, with pictures that may go dark."""
+    """`SlamPerception` of a flight, fed by events in lockstep, with frames that may go dark."""
 
     def __init__(self, camera: Camera, conditions: Conditions, seed: int) -> None:
         self._conditions = conditions
         self._perception = slam_perception.SlamPerception(camera, seed)
 
     def state(self, now_s: float, events: list[Event]) -> DroneState:
-        """The moment, from what arrived since the last one."""
+        """Current state from the events since the last call."""
         view = None
         for event in events:
             if isinstance(event, State):

@@ -1,4 +1,4 @@
-"""Flights as a table, with intervals that say how much so few flights can tell."""
+"""Table of flights with confidence intervals."""
 
 import math
 from collections.abc import Sequence
@@ -9,17 +9,17 @@ from edgeslam_torch.eval.judge.navigation.flown import Flown
 
 _Z = 1.959964
 HEAD = (
-    "| world | behaviour | fault | perception | flights | reached | contact | no contact, on the floor in the end "
+    "| world | behaviour | fault | perception | flights | reached | contact | no contact and landed on the floor "
     "| clearance p5, min [m] "
     "| time over oracle | cruise [m/s] | CPU a tick, worst [ms] |\n|---|---|---|---|---|---|---|---|---|---|---|---|\n"
 )
 NEAR_HEAD = (
-    "\n| perception | sectors of 3.7° with something at .3 to 1 m | told more than .3 m too far | less two sigmas "
+    "\n| perception | sectors of 3.7° with an obstacle at 0.3 to 1 m | more than 0.3 m too far | less two sigmas "
     "| age of the newest depth, 95 % [s] |\n|---|---|---|---|---|\n"
 )
 OFF_HEAD = (
-    "\n| perception | moments with metres | pose more than .1 m beyond three of its sigmas | flights in which it was "
-    "| error at most, median and worst [m] |\n|---|---|---|---|---|\n"
+    "\n| perception | ticks with metric scale | pose error more than 0.1 m beyond three sigmas | flights with any "
+    "| maximum error, median and worst [m] |\n|---|---|---|---|---|\n"
 )
 EXITS_HEAD = "\n| behaviour | perception | exits there | found | precision | recall |\n|---|---|---|---|---|---|\n"
 
@@ -58,7 +58,7 @@ def markdown(flights: Sequence[Flown]) -> str:
 
 
 def _exits(flights: Sequence[Flown]) -> str:
-    """A table of exits; nothing where there are none and none was found."""
+    """Table of exits; empty without any."""
     rows = []
     for perception, behaviour in sorted({(f.case.perception, f.case.behaviour) for f in flights}):
         group = [f.exits for f in flights if (f.case.perception, f.case.behaviour) == (perception, behaviour)]
@@ -70,7 +70,7 @@ def _exits(flights: Sequence[Flown]) -> str:
 
 
 def _near(flights: Sequence[Flown]) -> str:
-    """A second table, of what is near and told to be far; nothing where nothing was near."""
+    """Table of near-depth errors; empty without near obstacles."""
     rows = []
     for perception in sorted({f.case.perception for f in flights}):
         group = [f for f in flights if f.case.perception == perception]
@@ -84,7 +84,7 @@ def _near(flights: Sequence[Flown]) -> str:
 
 
 def _off(flights: Sequence[Flown]) -> str:
-    """A third table, of poses that are farther off than they say; nothing where no flight had metres."""
+    """Table of inconsistent poses; empty without metric scale."""
     rows = []
     for perception in sorted({f.case.perception for f in flights}):
         group = [f for f in flights if f.case.perception == perception and f.off[0]]

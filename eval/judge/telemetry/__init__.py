@@ -1,1 +1,1 @@
-"""Telemetry made from ground truth, right and faulty, and the scale that a run states while flying."""
+"""Telemetry simulated from ground truth, correct and faulty, and scoring of the live scale."""

@@ -1,7 +1,6 @@
-"""The scale that a run states while flying, against what it truly is.
+"""Scale estimates of a run against the true scale.
 
-Lengths of the published trajectory during the longest time without a revision tell metres per published unit, and so
-metres per map unit: what every estimate of the scale before and after has to be.
+The true metres per map unit follow from the output trajectory over the longest interval without a scale revision.
 """
 
 import math
@@ -37,16 +36,16 @@ class _Stated:
     sigma: float
     revision: int
     measured: bool
-    """Whether sensors of the drone tell it; before, the unit is a guess, revised or not."""
+    """Whether it is measured by the drone's sensors, not a guess."""
     unit: float
-    """Published units per map unit."""
+    """Output units per map unit."""
 
 
 def live_figures(run: RunFolder, truth: Trajectory) -> Figures:
     """Figures of the scale while flying.
 
     Returns:
-        ``first_scale_s`` time until the published unit is the drone's metre, ``first_scale_off`` and
+        ``first_scale_s`` time until the output unit is the drone's metre, ``first_scale_off`` and
         ``first_scale_sigmas`` its log error then, absolute and in stated sigmas; ``beyond_3_sigma`` share of the frames
         after `FROM_S` whose scale is further off than three stated sigmas. Empty where no revision is long enough.
     """

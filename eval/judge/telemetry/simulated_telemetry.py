@@ -19,18 +19,18 @@ from edgeslam_torch.types import FloatArray, TelemetrySample
 OUTAGE_S = 10.0
 """Length of an outage, in the middle; half of a recording that is shorter than twice this."""
 OFF_S = 1.5
-"""Error of stamps: beyond every delay that is allowed."""
+"""Error of stamps, beyond the maximum delay that is estimated."""
 _SPEED_M_S = 0.3
-"""Root mean square of velocities that have nothing to do with the flight, on each axis."""
+"""RMS per axis of velocities that are independent of the flight."""
 _MEMORY = 0.9
-"""Correlation of these from one reading to the next: they change within a second, as real ones do."""
+"""Correlation of successive readings: they decorrelate within a second, as real ones do."""
 
 Samples = list[TelemetrySample]
 
 
 @dataclass(frozen=True, slots=True)
 class Drawn:
-    """Truth that telemetry is made from, and the draw of its noise."""
+    """Ground truth and random draws for simulated telemetry."""
 
     truth: Trajectory
     stamps_s: FloatArray
@@ -39,20 +39,20 @@ class Drawn:
 
     @property
     def outage_s(self) -> tuple[float, float]:
-        """Start and end of the time without news."""
+        """Start and end of the outage."""
         first, last = float(self.stamps_s[0]), float(self.stamps_s[-1])
         half = 0.5 * min(OUTAGE_S, 0.5 * (last - first))
         return 0.5 * (first + last) - half, 0.5 * (first + last) + half
 
 
 def rounded(drawn: Drawn) -> Samples:
-    """Right telemetry, velocities rounded to whole dm/s."""
-    return _told(drawn)
+    """Correct telemetry, velocities rounded to whole dm/s."""
+    return _messages(drawn)
 
 
 def truncated(drawn: Drawn) -> Samples:
-    """Right telemetry, velocities truncated to whole dm/s."""
-    return _told(drawn, np.trunc)
+    """Correct telemetry, velocities truncated to whole dm/s."""
+    return _messages(drawn, np.trunc)
 
 
 def off(drawn: Drawn) -> Samples:
@@ -96,7 +96,7 @@ def other_flight(drawn: Drawn) -> Samples:
 
 
 def random_velocities(drawn: Drawn) -> Samples:
-    """Velocities of chance, and no height; the attitude is right."""
+    """Random velocities and no height; the attitude is correct."""
     samples = rounded(drawn)
     rng = np.random.default_rng([drawn.draw, 1])
     steps = np.sqrt(1.0 - _MEMORY**2) * _SPEED_M_S * rng.standard_normal((len(samples), 3))
@@ -108,24 +108,24 @@ def random_velocities(drawn: Drawn) -> Samples:
 
 
 def centimetres(drawn: Drawn) -> Samples:
-    """The drone tells cm/s, and they are read as dm/s."""
-    return [replace(s, velocity_m_s=10.0 * s.velocity_m_s) for s in _told(drawn, _to_centimetres)]
+    """Velocities in cm/s, read as dm/s."""
+    return [replace(s, velocity_m_s=10.0 * s.velocity_m_s) for s in _messages(drawn, _to_centimetres)]
 
 
 def body(drawn: Drawn) -> Samples:
     """Velocities in body axes, declared to be in the world of power-on."""
     return [
         replace(s, velocity_m_s=0.1 * np.rint(10.0 * matrix_from_rpy(s.rpy_rad).T @ s.velocity_m_s))
-        for s in _told(drawn, _to_centimetres)
+        for s in _messages(drawn, _to_centimetres)
     ]
 
 
 HEIGHTS = ("tof_m", "height_m", "baro_m")
-"""Fields of a sample that tell heights."""
+"""Height fields of a sample."""
 
 
 def missing(column: FloatArray) -> FloatArray:
-    """Nothing is told."""
+    """No readings."""
     return np.full_like(column, np.nan)
 
 
@@ -154,7 +154,7 @@ def jumping(by: float) -> Callable[[FloatArray], FloatArray]:
 def spoilt(
     fields: Sequence[str], change: Callable[[FloatArray], FloatArray], axis: int | None = None
 ) -> Callable[[Drawn], Samples]:
-    """Right telemetry but for some fields of its samples, or one axis of a field, which a function changes."""
+    """Correct telemetry except for some fields, or one axis of a field, changed by a function."""
 
     def make(drawn: Drawn) -> Samples:
         samples = rounded(drawn)
@@ -169,8 +169,8 @@ def spoilt(
     return make
 
 
-def _told(drawn: Drawn, velocities: Callable[[FloatArray], FloatArray] = np.rint) -> Samples:
-    """As the drone sends it; ``velocities`` makes whole numbers of those in dm/s."""
+def _messages(drawn: Drawn, velocities: Callable[[FloatArray], FloatArray] = np.rint) -> Samples:
+    """Messages as sent by the drone; ``velocities`` rounds velocities in dm/s to integers."""
     truth, stamps = drawn.truth, drawn.stamps_s
     near = (truth.stamps_s >= stamps[0] - 1.0) & (truth.stamps_s <= stamps[-1] + 1.0)
     whole, exact = (
@@ -219,4 +219,4 @@ KINDS: dict[str, Callable[[Drawn], Samples]] = {
     "heights_mirrored": spoilt(HEIGHTS, lambda z: 2.0 * z[0] - z),
     "heights_jumping": spoilt(HEIGHTS, jumping(1.0)),
 }
-"""By the name in a cell's name; the first two are right."""
+"""By the name in a cell's name; the first two are correct."""

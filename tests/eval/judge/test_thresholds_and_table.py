@@ -5,7 +5,7 @@ import pytest
 from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.eval.judge.compare import Compared, markdown_against, verdict
 from edgeslam_torch.eval.judge.table import COLUMNS, markdown
-from edgeslam_torch.eval.judge.thresholds import read_bars, verdicts_of_cell, verdicts_of_groups
+from edgeslam_torch.eval.judge.thresholds import read_thresholds, verdicts_of_cell, verdicts_of_groups
 
 ATE = Compared("ate_m", "ATE", "{:.4f}", True, 0.03, 0.05)
 
@@ -19,13 +19,13 @@ def record(*rows, commit="abc"):
 
 
 @pytest.fixture
-def bars(tmp_path):
-    (tmp_path / "bars.toml").write_text(
-        '[[bar]]\ncells = ["desk"]\nate_m = { at_most = 0.02 }\nsupported_end = { at_least = 1.0 }\n'
-        '[[bar]]\ncells = ["desk/*"]\nate_m = { at_most_times_base = 3.0 }\n'
-        '[[bar]]\ncells = ["flight/*"]\nate_percent = { at_most = 0.5, share = 0.75 }\n'
+def thresholds(tmp_path):
+    (tmp_path / "thresholds.toml").write_text(
+        '[[threshold]]\ncells = ["desk"]\nate_m = { at_most = 0.02 }\nsupported_end = { at_least = 1.0 }\n'
+        '[[threshold]]\ncells = ["desk/*"]\nate_m = { at_most_times_base = 3.0 }\n'
+        '[[threshold]]\ncells = ["flight/*"]\nate_percent = { at_most = 0.5, share = 0.75 }\n'
     )
-    return read_bars(tmp_path / "bars.toml")
+    return read_thresholds(tmp_path / "thresholds.toml")
 
 
 def cells_of(text, name):
@@ -34,49 +34,49 @@ def cells_of(text, name):
     return dict(zip(lines[0], next(line for line in lines[1:] if line[0] == name), strict=True))
 
 
-def test_every_seed_must_be_within_the_limit(bars):
+def test_every_seed_must_be_within_the_limit(thresholds):
     rows = [row("desk", 0, ate_m=0.01, supported_end=1.0), row("desk", 1, ate_m=0.03, supported_end=1.0)]
-    ate, supported = verdicts_of_cell("desk", rows, bars)
+    ate, supported = verdicts_of_cell("desk", rows, thresholds)
     assert not ate.ok and (ate.passed, ate.runs, ate.worst) == (1, 2, 0.03)
     assert supported.ok
 
 
-def test_figure_that_is_missing_does_not_pass(bars):
-    assert [v.ok for v in verdicts_of_cell("desk", [row("desk", ate_m=0.01)], bars)] == [True, False]
+def test_figure_that_is_missing_does_not_pass(thresholds):
+    assert [v.ok for v in verdicts_of_cell("desk", [row("desk", ate_m=0.01)], thresholds)] == [True, False]
 
 
-def test_variant_is_held_against_the_median_of_its_base(bars):
+def test_variant_is_held_against_the_median_of_its_base(thresholds):
     base = [row("desk", seed, ate_m=ate) for seed, ate in enumerate((0.01, 0.02, 0.05))]
     near, far = row("desk/half_rate", ate_m=0.06), row("desk/half_size", ate_m=0.061)
-    assert verdicts_of_cell("desk/half_rate", [*base, near], bars)[0].ok
-    assert not verdicts_of_cell("desk/half_size", [*base, far], bars)[0].ok
-    assert verdicts_of_cell("desk/half_size", [far], bars) == [], "without its base it cannot be judged"
+    assert verdicts_of_cell("desk/half_rate", [*base, near], thresholds)[0].ok
+    assert not verdicts_of_cell("desk/half_size", [*base, far], thresholds)[0].ok
+    assert verdicts_of_cell("desk/half_size", [far], thresholds) == [], "without its base it cannot be judged"
 
 
-def test_share_of_all_runs_is_enough_where_a_bar_says_so(bars):
+def test_share_of_all_runs_is_enough_where_a_bar_says_so(thresholds):
     rows = [row(f"flight/{k}", seed, ate_percent=p) for k, seed, p in
             (("room", 0, 0.4), ("room", 1, 0.6), ("hall", 0, 0.1), ("hall", 1, 0.2))]  # fmt: skip
-    (verdict_,) = verdicts_of_groups(rows, bars)
+    (verdict_,) = verdicts_of_groups(rows, thresholds)
     assert verdict_.ok and verdict_.passed == 3
     rows[0]["figures"]["ate_percent"] = 0.7
-    assert not verdicts_of_groups(rows, bars)[0].ok
-    assert verdicts_of_cell("flight/room", rows, bars) == []
+    assert not verdicts_of_groups(rows, thresholds)[0].ok
+    assert verdicts_of_cell("flight/room", rows, thresholds) == []
 
 
 def test_bar_that_says_nothing_is_refused(tmp_path):
-    (tmp_path / "bars.toml").write_text('[[bar]]\ncells = ["a"]\nate_m = { below = 1 }\n')
+    (tmp_path / "thresholds.toml").write_text('[[threshold]]\ncells = ["a"]\nate_m = { below = 1 }\n')
     with pytest.raises(EvaluationError, match="ate_m needs cells, and one of at_least"):
-        read_bars(tmp_path / "bars.toml")
+        read_thresholds(tmp_path / "thresholds.toml")
 
 
 def test_own_bars_name_figures_that_the_judge_has():
     known = {column.figure for column in COLUMNS} | {"online_percent", "metric"}
     known |= {"placed_after_s", "placed", "placed_late_s", "metres_off", "metres_off_depth"}
     known |= {"scale_off", "scale_sigmas", "by_telemetry", "said"}
-    assert {bar.figure for bar in read_bars()} <= known
+    assert {threshold.figure for threshold in read_thresholds()} <= known
 
 
-def test_table_shows_medians_bars_and_failures(bars):
+def test_table_shows_medians_bars_and_failures(thresholds):
     text = markdown(
         record(
             row("desk", 0, ate_m=0.01, supported_end=1.0, map_median_m=0.012),
@@ -84,18 +84,18 @@ def test_table_shows_medians_bars_and_failures(bars):
             row("desk/half_rate", error="killed by signal 9"),
             row("wood", ate_m=0.5),
         ),
-        bars,
+        thresholds,
     )
     desk = cells_of(text, "desk")
     assert desk["ATE"] == "0.0200 [0.0100 0.0300]"
     assert desk["end %"] == "75.0"
     assert desk["median cm"] == "1.20"
-    assert desk["bars"] == "FAIL 2 of 2"
+    assert desk["thresholds"] == "FAIL 2 of 2"
     assert "- desk: ate_m <= 0.02 (1/2, worst 0.03); supported_end >= 1 (1/2, worst 0.5)" in text
-    assert cells_of(text, "desk/half_rate")["bars"] == "FAIL 1 of 1 runs"
+    assert cells_of(text, "desk/half_rate")["thresholds"] == "FAIL 1 of 1 runs"
     assert "- desk/half_rate seed 0: no result: killed by signal 9" in text
-    assert cells_of(text, "wood")["bars"] == "-"
-    assert "0 of 2 cells with bars pass" in text
+    assert cells_of(text, "wood")["thresholds"] == "-"
+    assert "0 of 2 cells with thresholds pass" in text
     assert "not registered to colour by its makers" in text
     widths = {len(line) for line in text.splitlines()[2:7]}
     assert len(widths) == 1, "the columns are aligned"
