@@ -4,4 +4,4 @@ from edgeslam_torch.errors import EdgeSlamError
 
 
 class EvaluationError(EdgeSlamError):
-    """Two files cannot be compared; the message says what is probably wrong with them."""
+    """Two files cannot be compared; the message gives the probable cause."""

@@ -68,7 +68,7 @@ class Row:
     against: str = DEFAULT
     """Name of the row it is compared with."""
     own_sigma: bool = False
-    """Whether the depth network's own sigma is believed, without the lower bound of `prior_anchors.MIN_SIGMA_LOG`."""
+    """Whether the depth network's own sigma is used without the lower bound of `prior_anchors.MIN_SIGMA_LOG`."""
 
 
 ROWS = (
@@ -378,7 +378,7 @@ def _earlier(path: Path, settings: AblationSettings) -> dict[str, Any] | None:
         return None
     record = read_mapping(path, "JSON", EvaluationError)
     if record.get("settings") != _described(settings):
-        raise EvaluationError(f"{path}: made with other settings; give another --out")
+        raise EvaluationError(f"{path}: recorded with other settings; give another --out")
     return record
 
 

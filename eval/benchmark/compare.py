@@ -213,7 +213,7 @@ def busy_runs(record: dict[str, Any]) -> str:
     most, stolen = max(d["others"] for d in busy), max(d["stolen"] for d in busy)
     return (
         f"the machine was busy during {len(busy)} of {len(looked)} runs: other programs used up to {most:.0%} of it, "
-        f"its host took up to {stolen:.0%}; their times say little"
+        f"its host took up to {stolen:.0%}; their times are unreliable"
     )
 
 

@@ -1,4 +1,4 @@
-"""Under what conditions figures were made: the machine, and the state of the code."""
+"""Conditions of a measurement: the machine and the state of the code."""
 
 import hashlib
 import os

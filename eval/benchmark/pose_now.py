@@ -1,4 +1,4 @@
-"""How well `EdgeSlam.pose_now` makes up for a late video: simulated slow flights, the whole pipeline, and the truth.
+"""Accuracy of `EdgeSlam.pose_now` under video latency: simulated slow flights through the whole pipeline.
 
 After every frame the program asks for the present pose, as a pilot would, and compares it with where the drone is by
 then: the frame shows where it was ``--delay`` before. Flights are recorded into ``--folder`` once::
@@ -56,7 +56,7 @@ class Errors:
     nees: list[float] = field(default_factory=list)
     """Of position and rotation since that frame; chi-square with 6 degrees when the covariance is true."""
     asked: int = 0
-    """Answers asked for, with and without the filter."""
+    """Number of requests, with and without the filter."""
 
     def add(self, other: "Errors") -> None:
         """Those of another flight."""
@@ -70,7 +70,7 @@ class Errors:
             return f"{name}: the filter never gave the pose ({self.asked} requests)"
         return (
             f"{name}: pose {_spread(self.absolute_m)}; motion since the last frame {_spread(self.since_seen_m)}, "
-            f"not made up for {_spread(self.late_m)}; velocity {_spread(self.velocity_m_s)} a second; "
+            f"uncompensated {_spread(self.late_m)}; velocity {_spread(self.velocity_m_s)} a second; "
             f"mean NEES {np.mean(self.nees):.1f} of 6; {len(self.absolute_m)} of {self.asked} by the filter"
         )
 

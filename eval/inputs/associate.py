@@ -1,4 +1,4 @@
-"""Association of estimated and true poses by time; names the usual mistakes of time stamps."""
+"""Association of estimated and true poses by time; diagnoses common mistakes in time stamps."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ from edgeslam_torch.eval.errors import EvaluationError
 from edgeslam_torch.types import FloatArray, IntArray
 
 DEFAULT_MAX_DT_S = 0.02
-"""Largest time between matched poses; the TUM tools' and evo's usual value for 30 Hz video."""
+"""Largest time between matched poses; the default of the TUM tools and evo for 30 Hz video."""
 
 SINCE_1970_S = 1e6
 """Stamps above this [s] count from 1970, those below from the start of something."""
@@ -70,7 +70,7 @@ def associate(
         offset_s: Added to the estimated stamps [s].
 
     Raises:
-        EvaluationError: If hardly anything matches; the message says which of the usual mistakes it looks like.
+        EvaluationError: If hardly anything matches; the message names the likely mistake.
     """
     stamps = estimate_s + offset_s
     i, j = match(truth_s, stamps, max_dt_s)
@@ -80,7 +80,7 @@ def associate(
     if len(i) < _MIN_SHARE * possible:
         gap = _typical_distance_s(truth_s, stamps)
         raise EvaluationError(
-            f"only {len(i)} of {possible} poses found a partner within {max_dt_s:g} s, typically {gap:.3f} s apart: "
+            f"only {len(i)} of {possible} poses have a match within {max_dt_s:g} s, typically {gap:.3f} s apart: "
             "another unit of time, an --offset, or a larger --max-dt"
         )
     return Association(i, j, offset_s)

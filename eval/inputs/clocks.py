@@ -1,4 +1,4 @@
-"""Two trajectories on one clock in seconds: what neither file tells by itself is told by the other."""
+"""Two trajectories on one clock in seconds; either file resolves ambiguities of the other."""
 
 from dataclasses import replace
 

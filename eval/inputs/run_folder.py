@@ -43,7 +43,7 @@ class RunFolder:
 
     @property
     def up(self) -> str:
-        """What tells that z is up (``telemetry``, ``edges``, ...); ``unknown`` when nothing does, or an older run does
+        """Source of gravity (``telemetry``, ``edges``, ...); ``unknown`` when nothing does, or an older run does
         not say."""
         up = self.summary.get("up")
         return str(up.get("source", "unknown")) if isinstance(up, dict) else "unknown"
@@ -59,7 +59,7 @@ class RunFolder:
         return read_ply(file) if file.is_file() else None
 
     def keyframe_poses(self) -> list[int]:
-        """Poses of ``trajectory`` that are keyframes; every tenth without a ``status.csv`` that tells."""
+        """Poses of ``trajectory`` that are keyframes; every tenth without that column in ``status.csv``."""
         stamps = [float(r.get("stamp_s") or "nan") for r in self.status if is_keyframe(r)]
         index = nearest(self.trajectory.stamps_s, np.array(stamps)) if stamps else np.zeros(0, dtype=int)
         ok = [int(i) for i, t in zip(index, stamps, strict=True) if abs(self.trajectory.stamps_s[i] - t) < 1e-3]
@@ -67,7 +67,7 @@ class RunFolder:
 
     @property
     def source(self) -> Path | None:
-        """Folder that the run read, when its summary tells and it is still there; relative names start at the run."""
+        """Input folder of the run, if named in its summary and still present; relative to the run's folder."""
         source = self.summary.get("source")
         name = source.get("path") if isinstance(source, dict) else source
         if not isinstance(name, str) or not name:

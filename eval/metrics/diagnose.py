@@ -1,6 +1,6 @@
 """Diagnosis of large trajectory errors: each finding names the mistake, whose it is, and its remedy.
 
-Every mistake is looked for in both files: a ground truth is made by people and their converters, too.
+Both files are tested for every mistake; ground truth may be converted wrongly, too.
 """
 
 from collections.abc import Callable, Sequence
@@ -32,7 +32,7 @@ _FEW = 10
 """Minimum number of matched poses for a diagnosis."""
 
 _ESTIMATE, _TRUTH, _BOTH = "the estimate's", "the ground truth's", "both files'"
-_EITHER = "one file's (which one's cannot be told)"
+_EITHER = "one file's (undecidable which)"
 
 _MIRROR = np.diag([1.0, 1.0, -1.0, 1.0])
 _MIRRORED = "the positions are mirrored: in one file two axes are swapped, one negated, or its world is left-handed"
@@ -40,7 +40,9 @@ _INVERSE = "poses look like world-to-camera; a trajectory must hold camera-to-wo
 _INVERTED = "orientations look inverted (world-to-camera rotation with camera-to-world positions)"
 _W_FIRST = "quaternions look like qw qx qy qz; TUM files need qx qy qz qw, other orders a header that names the columns"
 
-_UNEXPLAINED = "the orientations do not follow the truth's, and no usual mistake explains it: judge translation only"
+_UNEXPLAINED = (
+    "the orientations do not follow the truth's, and no common mistake explains it: evaluate translation only"
+)
 
 _LENGTH_UNITS = {0.01: "centimetres", 0.001: "millimetres"}
 
@@ -188,7 +190,7 @@ def _combinations(
 
 
 def _likeliest(suspects: Sequence[_Suspect], limit: float) -> str | None:
-    """The mistake that explains most, if it leaves less error than ``limit``, and whose it is, if that can be told."""
+    """The mistake that explains most, if its error is below ``limit``, and the file that has it, if decidable."""
     best = min(suspects, key=lambda suspect: suspect.error)
     if not best.error < limit:
         return None
@@ -238,7 +240,7 @@ def _misfit(truth: Trajectory, estimate: Trajectory, max_dt_s: float) -> float:
 def _rotation_error(truth: Trajectory, estimate: Trajectory, score: TrajectoryScore) -> tuple[float, float]:
     """Median angle [deg] of aligned orientations to the truth's, and median of its spread about its mean.
 
-    The angle *between* two poses cannot tell: the scalar product of quaternions is the same in any order.
+    The angle *between* two poses does not help: the scalar product of quaternions is the same in any order.
     """
     pairs = score.association
     R_true, R = truth.T_w_c[pairs.truth, :3, :3], estimate.T_w_c[pairs.estimate, :3, :3]

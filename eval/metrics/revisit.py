@@ -1,4 +1,4 @@
-"""Error at the return: how far apart a trajectory has two passes of one place, a long way from each other."""
+"""Error at the return: distance in the estimate between two distant passes of the same place."""
 
 import numpy as np
 

@@ -113,7 +113,7 @@ def evaluate_run(
     if run.online is not None:
         online = score_trajectory(truth, run.online, AlignmentKind.SIM3, max_dt_s, offset_s).ate_m.rmse
     depth_dataset = open_dataset(depth_truth_dir) if depth_truth_dir is not None else dataset
-    map_score, map_note = _map_score(run, depth_dataset, sim3, thresholds_m) if judge_map else (None, "not asked for")
+    map_score, map_note = _map_score(run, depth_dataset, sim3, thresholds_m) if judge_map else (None, "not requested")
     one_second = next((r for r in sim3.relative if r.delta == "1 s"), None)
     coverage, with_pose, first = _coverage(run, dataset, truth, sim3.association)
     judged = se3 if run.units == "metres" else sim3

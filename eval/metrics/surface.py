@@ -21,7 +21,7 @@ MAX_DEPTH_M = 5.0
 """A Kinect's noise grows with the square of the distance: 7 cm at 5 m (Khoshelham & Elberink 2012)."""
 
 MAX_EDGE_DEPTH_M = 4.0
-"""Edge points farther away are not asked for: their measured depth is worse than the 6 cm they are judged by."""
+"""Maximum depth of reference edges: beyond it, measured depth is worse than the 6 cm tolerance."""
 
 _STRIDE = 2
 """Every second pixel of both directions: 8 mm at 2 m."""
@@ -33,10 +33,10 @@ _EDGE_VOXEL_M = 0.015
 """Edge points of several depth maps in one cube of this size are one edge point, at their mean."""
 
 _EDGE_MAPS = 3
-"""An edge is asked for when this many depth maps put it in the same cube: not the flicker of Canny, nor noisy depth."""
+"""Number of depth maps that must place a reference edge in the same cube, to exclude flicker and noisy depth."""
 
 _EDGE_FRAMES = 40
-"""Depth maps whose edges are asked for, spread evenly over the sequence."""
+"""Depth maps used for reference edges, evenly spaced over the sequence."""
 
 _SINGLE_FRAMES = 30
 """Depth maps that judge a point one by one, spread evenly over the sequence."""
@@ -45,10 +45,10 @@ _HIDDEN_M = 0.1
 """A point this far behind a depth map's surface is hidden there and cannot be compared with that map."""
 
 _CANNY = (50.0, 150.0)
-"""Thresholds of the edges asked for, on the grey image smoothed with sigma 1, L2 gradient."""
+"""Canny thresholds of the reference edges, on the grey image smoothed with sigma 1, L2 gradient."""
 
 _HOLE_PX = 4
-"""Edge pixels this near to an unmeasured pixel are not asked for: their depth is unsure."""
+"""Minimum distance of reference edges from unmeasured pixels, where depth is unreliable."""
 
 _NEAR_PX = 2
 """Depth of an edge is the nearest within this many pixels: the edge belongs to the occluding side."""

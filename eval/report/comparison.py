@@ -23,7 +23,7 @@ _LETTERS = "AB"
 _HEAD = ("", "A", "B", "B \u2212 A")
 _STYLE = Path(__file__).parent / "template" / "style.css"
 _MIN_COMMON = 10
-"""Common frames below which paths are not laid on one another."""
+"""Minimum number of common frames to align two paths."""
 _MORE_STYLE = """
 .two { display: grid; grid-template-columns: 1fr 1fr; gap: 24px; }
 .two img, .two svg { display: block; width: 100%; height: auto; border-radius: 6px; background: var(--panel); }
@@ -54,7 +54,7 @@ class _Side:
 
 @dataclass(frozen=True, slots=True)
 class _Laid:
-    """One path laid on the other, which is in metres if either is."""
+    """One path aligned to the other, which is metric if either is."""
 
     still: int
     """Index of the run that stays where it is; its unit is that of all lengths."""
@@ -213,8 +213,8 @@ def _paths(sides: Sequence[_Side], laid: _Laid | None) -> str:
     there, moved = _LETTERS[laid.still], _LETTERS[1 - laid.still]
     rms, most = float(np.sqrt(np.mean(laid.apart**2))), float(laid.apart.max())
     note = (
-        f"{moved} is laid on {there} by {len(laid.apart)} common frames (turned, moved and made {laid.scale:.4g} times "
-        f"as large); they are then {rms:.3g} {unit} apart (root mean square), {most:.3g} {unit} at most."
+        f"{moved} is aligned to {there} by {len(laid.apart)} common frames (rotated, translated, scaled by "
+        f"{laid.scale:.4g}); the remaining distance is {rms:.3g} {unit} RMS, {most:.3g} {unit} at most."
     )
     chart = line_drawings.chart(laid.times_s, laid.apart, "var(--accent)", f"apart [{unit}]")
     return (
@@ -248,7 +248,7 @@ def _settings(run: RunFolder) -> dict[str, str]:
 
 
 def _values(run: RunFolder) -> dict[str, str]:
-    """``summary.json`` without what the figures tell."""
+    """``summary.json`` without what the figures contain."""
     told = ("source: ", "fps", "cpu", "peak", "stage", "step", "warnings", "pieces", "map: ", "losses: ")
     rows = words.flat_rows(run.summary)
     return {name: value for name, value in rows if not name.startswith(told)}

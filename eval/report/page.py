@@ -281,7 +281,7 @@ def _number(row: dict[str, str], *names: str) -> float:
 def upright(trajectory: Trajectory, score: RunScore | None, truth: Trajectory | None) -> FloatArray:
     """Rotation ``(3, 3)`` that turns the run's world so that z is up on the page.
 
-    A run without telemetry takes its first camera for level; ground truth knows better, when its own z is up. Else a
+    A run without telemetry assumes a level first camera; ground truth has the correct gravity if its z is up. Else a
     world in which the cameras' up is far from z (a trajectory that starts at the identity, z forward) is turned.
     """
     if score is not None and score.sim3 is not None and truth is not None and _camera_up(truth)[2] > 0.2:

@@ -38,7 +38,7 @@ def readable(text: str) -> str:
 
 
 def without_folders(text: str) -> str:
-    """Paths that leave the run's folder, by their last name: a page that is passed on tells nothing about the disk."""
+    """Paths that leave the run's folder, by their last name: a shared page must not reveal local paths."""
     return _LEADING.sub("", text)
 
 
@@ -133,7 +133,7 @@ def tiles(run: RunFolder, score: RunScore | None, points: int) -> list[dict[str,
 
 
 def foot(run: RunFolder) -> str:
-    """How the run was made."""
+    """Settings and versions of the run."""
     parts = ["Made by EdgeSLAM-Torch"]
     for key in ("version", "commit", "mode", "seed", "camera", "command", "started"):
         value = run.summary.get(key)
@@ -285,6 +285,6 @@ def _offered(run: RunFolder) -> int:
 
 
 def _count(value: object) -> int:
-    """A whole number; 0 for what is none."""
+    """An integer; 0 if invalid."""
     number = _float(value)
     return int(number) if math.isfinite(number) else 0

@@ -80,7 +80,7 @@ def test_figures_and_their_difference(two: tuple[Path, Path], tmp_path: Path) ->
 def test_one_path_is_laid_on_the_other(two: tuple[Path, Path], tmp_path: Path) -> None:
     text = Cells(write_comparison(*two, tmp_path / "c.html")).text
     found = re.search(
-        r"B is laid on A by (\d+) common frames .* made ([\d.]+) times as large\); .* then (\S+) m apart", text
+        r"B is aligned to A by (\d+) common frames .* scaled by ([\d.]+)\); .* distance is (\S+) m RMS", text
     )
     assert found is not None
     assert found[1] == "200" and float(found[2]) == pytest.approx(0.5, abs=1e-3) and float(found[3]) < 1e-6
